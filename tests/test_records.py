@@ -1,0 +1,36 @@
+"""Records survive JSON bit for bit: what replay rests on."""
+
+from __future__ import annotations
+
+import msgspec
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from companion import records
+
+
+@given(st.floats(allow_nan=False, allow_infinity=False), st.integers(0, 2**62))
+@settings(deadline=None)
+def test_every_double_and_time_comes_back_the_same(value: float, t_ns: int) -> None:
+    record = records.RsbnFix(t_ns, t_ns + 1, 7, value, -value, value, None, value, value, value)
+    assert records.decode("RsbnFix", records.encode(record)) == record
+
+
+def test_every_kind_is_known_by_name_and_immutable() -> None:
+    for name, kind in records.BY_NAME.items():
+        assert kind.__struct_config__.frozen, name
+        assert kind.__struct_config__.tag == name
+
+
+def test_truth_is_no_input() -> None:
+    assert records.Truth not in records.INPUTS
+    assert not issubclass(records.Truth, records.INPUTS)
+
+
+def test_a_record_of_another_kind_is_refused() -> None:
+    data = records.encode(records.Event(1, 1, 6, "hello"))
+    try:
+        records.decode("Reset", data)
+    except msgspec.ValidationError:
+        return
+    raise AssertionError("an Event was read as a Reset")
