@@ -1,0 +1,83 @@
+"""The WGS84 earth as navigation sees it: radii of curvature, normal gravity, rates of rotation.
+
+Scalars in, scalars out, by `math`: these are called once a message. It knows neither positions in
+space (`geometry`) nor motion (`strapdown`). Rates are angular rates resolved in n (NED).
+
+Sources: NIMA TR8350.2 (third edition, 2000), tables 3.1-3.4; Groves, Principles of GNSS, Inertial and
+Multisensor Integrated Navigation Systems (second edition, 2013), chapter 2, equation numbers as there.
+"""
+
+import math
+from typing import NamedTuple
+
+A = 6378137.0
+"""Semi-major axis, m."""
+F = 1.0 / 298.257223563
+"""Flattening."""
+B = A * (1.0 - F)
+"""Semi-minor axis, m."""
+E2 = F * (2.0 - F)
+"""First eccentricity squared."""
+GM = 3.986004418e14
+"""Geocentric gravitational constant, atmosphere included, m^3/s^2."""
+OMEGA = 7.292115e-5
+"""Rate of rotation, rad/s."""
+G_EQUATOR = 9.7803253359
+"""Normal gravity on the ellipsoid at the equator, m/s^2."""
+G_POLE = 9.8321849378
+"""Normal gravity on the ellipsoid at the poles, m/s^2."""
+
+_SOMIGLIANA_K = B * G_POLE / (A * G_EQUATOR) - 1.0
+_M = OMEGA**2 * A**2 * B / GM
+
+
+class Radii(NamedTuple):
+    """Radii of curvature of the ellipsoid, m (named by the direction of motion, as Groves does)."""
+
+    R_N: float
+    """In the meridian (north-south motion)."""
+    R_E: float
+    """In the prime vertical (east-west motion)."""
+
+
+class RateN(NamedTuple):
+    """An angular rate resolved in n, rad/s."""
+
+    north: float
+    east: float
+    down: float
+
+
+def radii(lat: float) -> Radii:
+    """Radii of curvature at geodetic latitude `lat` (rad): Groves (2.105), (2.106)."""
+    sin_lat = math.sin(lat)
+    w2 = 1.0 - E2 * sin_lat * sin_lat
+    R_E = A / math.sqrt(w2)
+    return Radii(R_E * (1.0 - E2) / w2, R_E)
+
+
+def gravity(lat: float, alt: float = 0.0) -> float:
+    """Magnitude of normal gravity, m/s^2, at `lat` (rad) and `alt` (m above the ellipsoid).
+
+    Somigliana's closed form on the ellipsoid (TR8350.2 (4-1)), second order in height above it (4-3);
+    good to 1e-6 m/s^2 up to 20 km.
+    """
+    s2 = math.sin(lat) ** 2
+    g_0 = G_EQUATOR * (1.0 + _SOMIGLIANA_K * s2) / math.sqrt(1.0 - E2 * s2)
+    h = alt / A
+    return g_0 * (1.0 - 2.0 * (1.0 + F + _M - 2.0 * F * s2) * h + 3.0 * h * h)
+
+
+def earth_rate(lat: float) -> RateN:
+    """Rate of the earth w_ie_n: Groves (2.123)."""
+    return RateN(OMEGA * math.cos(lat), 0.0, -OMEGA * math.sin(lat))
+
+
+def transport_rate(lat: float, alt: float, v_north: float, v_east: float) -> RateN:
+    """Rate of n over the earth w_en_n at velocity (m/s): Groves (5.44).
+
+    Grows without limit towards the poles, where north has no meaning: the caller keeps away from them.
+    """
+    R_N, R_E = radii(lat)
+    lon_rate_cos = v_east / (R_E + alt)
+    return RateN(lon_rate_cos, -v_north / (R_N + alt), -lon_rate_cos * math.tan(lat))

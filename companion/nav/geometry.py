@@ -1,0 +1,205 @@
+"""Where things are: geodetic, ECEF and local positions, lines of sight, the autopilots' flat earths.
+
+Knows the ellipsoid and nothing of motion, time, sensors or errors. A geodetic position is
+`Geodetic(lat, lon, alt)`, radians and metres above WGS84; longitudes that come out lie in [-pi, pi).
+Local vectors are numpy arrays of shape (3,), metres.
+"""
+
+import math
+from typing import Literal, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from companion.nav.earth import E2, A, radii
+
+Vector = npt.NDArray[np.float64]
+Matrix = npt.NDArray[np.float64]
+Projection = Literal["ardupilot", "px4", "tangent"]
+
+_ARDUPILOT_R = 0.011131884502145034 * math.degrees(1e7)
+"""ArduPilot's LOCATION_SCALING_FACTOR (AP_Common/Location.h), m per 1e-7 degree, as a radius."""
+_PX4_R = 6371000.0
+"""CONSTANTS_RADIUS_OF_EARTH of PX4's lib/geo/geo.h, m."""
+_RADIO_R = 4.0 / 3.0 * 6371000.0
+"""Effective radius of the earth for VHF/UHF under standard refraction (ITU-R P.834), m."""
+
+
+class Geodetic(NamedTuple):
+    """A position on WGS84: geodetic latitude and longitude, rad; height above the ellipsoid, m."""
+
+    lat: float
+    lon: float
+    alt: float
+
+
+class Sight(NamedTuple):
+    """A line of sight, at its origin: azimuth from true north clockwise in [0, 2 pi), rad; slant range, m;
+    elevation above the local horizontal, rad."""
+
+    azimuth: float
+    slant_range: float
+    elevation: float
+
+
+def wrap(angle: float) -> float:
+    """The same angle in [-pi, pi)."""
+    wrapped = math.remainder(angle, math.tau)
+    return -math.pi if wrapped == math.pi else wrapped
+
+
+def to_ecef(point: Geodetic) -> Vector:
+    """Geodetic to ECEF, m: Groves (2.112)."""
+    lat, lon, alt = point
+    R_E = radii(lat).R_E
+    rho = (R_E + alt) * math.cos(lat)
+    return np.array([rho * math.cos(lon), rho * math.sin(lon), ((1.0 - E2) * R_E + alt) * math.sin(lat)])
+
+
+def from_ecef(r_e: Vector) -> Geodetic:
+    """ECEF to geodetic in closed form: Vermeille, Journal of Geodesy 76 (2002) 451-454, symbols as there.
+
+    ValueError within about 43 km of the earth's centre, where the form does not hold.
+    """
+    X, Y, Z = (float(c) for c in r_e)
+    e4 = E2 * E2
+    rho = math.hypot(X, Y)
+    p = (rho / A) ** 2
+    q = (1.0 - E2) * (Z / A) ** 2
+    r = (p + q - e4) / 6.0
+    if not r > 0.0:
+        raise ValueError(
+            f"ECEF position ({X:g}, {Y:g}, {Z:g}) m is at the centre of the earth: check its units"
+        )
+    s = e4 * p * q / (4.0 * r**3)
+    t = math.cbrt(1.0 + s + math.sqrt(s * (2.0 + s)))
+    u = r * (1.0 + t + 1.0 / t)
+    v = math.sqrt(u * u + e4 * q)
+    w = E2 * (u + v - q) / (2.0 * v)
+    k = math.sqrt(u + v + w * w) - w
+    D = k * rho / (k + E2)
+    hypot = math.hypot(D, Z)
+    return Geodetic(2.0 * math.atan2(Z, D + hypot), wrap(math.atan2(Y, X)), (k + E2 - 1.0) / k * hypot)
+
+
+def enu_axes(lat: float, lon: float) -> Matrix:
+    """C_e^enu (3, 3): its rows are the east, north and up axes at (lat, lon) in ECEF."""
+    sl, cl, so, co = math.sin(lat), math.cos(lat), math.sin(lon), math.cos(lon)
+    return np.array([[-so, co, 0.0], [-sl * co, -sl * so, cl], [cl * co, cl * so, sl]])
+
+
+def to_enu(point: Geodetic, origin: Geodetic) -> Vector:
+    """East, north, up of `point` in the plane tangent at `origin`, m; exact at any distance."""
+    axes: Matrix = enu_axes(origin.lat, origin.lon)
+    return axes @ (to_ecef(point) - to_ecef(origin))
+
+
+def from_enu(x_enu: Vector, origin: Geodetic) -> Geodetic:
+    """The inverse of `to_enu`."""
+    return from_ecef(to_ecef(origin) + enu_axes(origin.lat, origin.lon).T @ x_enu)
+
+
+def displace(lat: float, lon: float, alt: float, north: float, east: float, down: float) -> Geodetic:
+    """The position a few metres away, through the radii of curvature at (lat, alt).
+
+    First order: wrong by about d^2 tan(lat) / 2R (1 m at 2.7 km and 60 degrees; use `from_enu` beyond).
+    Never to be used at a pole, where east has no meaning.
+    """
+    R_N, R_E = radii(lat)
+    return Geodetic(lat + north / (R_N + alt), wrap(lon + east / ((R_E + alt) * math.cos(lat))), alt - down)
+
+
+def separation(point: Geodetic, reference: Geodetic) -> Vector:
+    """`point` minus `reference` in NED metres: the inverse of `displace` from `reference`.
+
+    An error is computed minus true, so the error of the INS against a fix is `separation(ins, fix)`.
+    """
+    R_N, R_E = radii(reference.lat)
+    north = (point.lat - reference.lat) * (R_N + reference.alt)
+    east = wrap(point.lon - reference.lon) * (R_E + reference.alt) * math.cos(reference.lat)
+    return np.array([north, east, reference.alt - point.alt])
+
+
+def slant_range_azimuth(beacon: Geodetic, aircraft: Geodetic) -> Sight:
+    """What a perfect RSBN, VOR/DME or TACAN ground beacon would tell of the aircraft."""
+    east, north, up = (float(c) for c in to_enu(aircraft, beacon))
+    horizontal = math.hypot(east, north)
+    azimuth = math.atan2(east, north) % math.tau
+    # A tiny negative angle rounds up to 2 pi, which is not in the range promised.
+    return Sight(
+        0.0 if azimuth == math.tau else azimuth, math.hypot(horizontal, up), math.atan2(up, horizontal)
+    )
+
+
+def radio_horizon(height_a: float, height_b: float) -> float:
+    """Greatest distance of direct radio sight between two antennas, m, over a smooth earth of 4/3 radius.
+
+    Heights, m, above that smooth earth; below it counts as on it.
+    """
+    return math.sqrt(2.0 * _RADIO_R) * (math.sqrt(max(height_a, 0.0)) + math.sqrt(max(height_b, 0.0)))
+
+
+def in_radio_sight(beacon: Geodetic, aircraft: Geodetic, ground_alt: float = 0.0) -> bool:
+    """Whether the aircraft is above the beacon's radio horizon over a smooth earth at `ground_alt`, m."""
+    horizon = radio_horizon(beacon.alt - ground_alt, aircraft.alt - ground_alt)
+    return slant_range_azimuth(beacon, aircraft).slant_range <= horizon
+
+
+def local_to_geodetic(projection: Projection, origin: Geodetic, x_n: Vector) -> Geodetic:
+    """The geodetic position an autopilot means by the local NED position `x_n` from its `origin`.
+
+    Each autopilot has a flat earth of its own; reading its local position through another one is off by
+    0.1-0.5 % of the distance (different radii) and more.
+
+    - "ardupilot": Location::offset, a sphere of 6378.1 km, longitudes scaled at the mean latitude;
+    - "px4": MapProjection::reproject, azimuthal equidistant on a sphere of 6371 km;
+    - "tangent": the plane tangent to the ellipsoid, exact.
+    """
+    north, east, down = (float(c) for c in x_n)
+    lat_0, lon_0, alt_0 = origin
+    if projection == "ardupilot":
+        dlat = north / _ARDUPILOT_R
+        dlon = east / (_ARDUPILOT_R * _longitude_scale(lat_0 + 0.5 * dlat))
+        return Geodetic(lat_0 + dlat, wrap(lon_0 + dlon), alt_0 - down)
+    if projection == "px4":
+        c = math.hypot(north, east) / _PX4_R
+        if c == 0.0:
+            return Geodetic(lat_0, lon_0, alt_0 - down)
+        x, y = north / _PX4_R * math.sin(c) / c, east / _PX4_R * math.sin(c) / c
+        lat = math.asin(math.cos(c) * math.sin(lat_0) + x * math.cos(lat_0))
+        dlon = math.atan2(y, math.cos(lat_0) * math.cos(c) - x * math.sin(lat_0))
+        return Geodetic(lat, wrap(lon_0 + dlon), alt_0 - down)
+    if projection == "tangent":
+        return from_enu(np.array([east, north, -down]), origin)
+    raise _unknown(projection)
+
+
+def geodetic_to_local(projection: Projection, origin: Geodetic, point: Geodetic) -> Vector:
+    """The inverse of `local_to_geodetic`: Location::get_distance_NED, MapProjection::project, `to_enu`."""
+    lat_0, lon_0, alt_0 = origin
+    lat, lon, alt = point
+    dlon = wrap(lon - lon_0)
+    if projection == "ardupilot":
+        scale = _longitude_scale(0.5 * (lat + lat_0))
+        return np.array([(lat - lat_0) * _ARDUPILOT_R, dlon * _ARDUPILOT_R * scale, alt_0 - alt])
+    if projection == "px4":
+        # cos(lat_0) sin(lat) - sin(lat_0) cos(lat) cos(dlon), free of cancellation.
+        x = math.sin(lat - lat_0) + 2.0 * math.sin(lat_0) * math.cos(lat) * math.sin(0.5 * dlon) ** 2
+        y = math.cos(lat) * math.sin(dlon)
+        # PX4 takes the acos of this cosine, which rounds near the origin; the arc is the same.
+        cos_c = math.sin(lat_0) * math.sin(lat) + math.cos(lat_0) * math.cos(lat) * math.cos(dlon)
+        sin_c = math.hypot(x, y)
+        k = math.atan2(sin_c, cos_c) / sin_c if sin_c > 0.0 else 1.0
+        return np.array([k * x * _PX4_R, k * y * _PX4_R, alt_0 - alt])
+    if projection == "tangent":
+        east, north, up = to_enu(point, origin)
+        return np.array([north, east, -up])
+    raise _unknown(projection)
+
+
+def _longitude_scale(lat: float) -> float:
+    return max(math.cos(lat), 0.01)  # ArduPilot's floor, so that nothing divides by zero at a pole
+
+
+def _unknown(projection: str) -> ValueError:
+    return ValueError(f"unknown local projection {projection!r}: choose ardupilot, px4 or tangent")
