@@ -48,6 +48,34 @@ class RateN(NamedTuple):
     down: float
 
 
+class Sphere(NamedTuple):
+    """The spherical, uniformly heavy earth of the INS error equations, in any units that agree.
+
+    Stands where an `Earth` (see `strapdown`) is wanted.
+    """
+
+    R: float
+    """Radius."""
+    G: float
+    """Acceleration of gravity."""
+    OMEGA: float
+    """Rate of rotation."""
+
+    def radii(self, lat: float) -> Radii:
+        """The same at every latitude."""
+        return Radii(self.R, self.R)
+
+    def gravity(self, lat: float, alt: float = 0.0) -> float:
+        """The same everywhere."""
+        return self.G
+
+
+SPHERE = Sphere(6371e3, 9.81, OMEGA)
+"""SI."""
+SPHERE_KM_H = Sphere(6371.0, 9.81 * 3.6e3**2 / 1e3, OMEGA * 3.6e3)
+"""Kilometres and hours, as Poddubny writes his example."""
+
+
 def radii(lat: float) -> Radii:
     """Radii of curvature at geodetic latitude `lat` (rad): Groves (2.105), (2.106)."""
     sin_lat = math.sin(lat)

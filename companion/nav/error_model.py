@@ -1,0 +1,187 @@
+"""Error equations of an inertial system to first order: Poddubny's for ships and the full ones for aircraft.
+
+The seven states of the INS, in this order, x north, y east, z down:
+
+    dx, dy      position error: R dphi, R cos(phi) dlam
+    dVN, dVE    velocity error; in `paper` dVE is the rate of dy, in `aircraft` that of the velocity itself
+    PX, PY, PZ  minus the rotation of the platform (the computed n): C~_nb = (I + [P x]) C_nb,
+                so the error of a computed heading is +PZ; a gyro drift E is likewise minus the physical one
+
+Mixing the two senses of rotation turns Schuler's oscillation into a growing exponent, +-4.47 1/h.
+`disturbances` extend the state, `correctors` observe it, `discrete` makes a step of it.
+The equations hold on a sphere and in any consistent units: a `Sphere` brings them in.
+
+Source: V. Poddubny, a stochastic-restrictive model of navigation systems, (1.18) and section 3.
+"""
+
+from collections.abc import Sequence
+from math import cos, pi, sin, tan
+from typing import Literal, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from companion.nav import correctors, disturbances
+from companion.nav.discrete import discretise, euler
+from companion.nav.disturbances import Disturbance, Model, compose
+from companion.nav.earth import SPHERE, SPHERE_KM_H, Sphere
+
+Matrix = npt.NDArray[np.float64]
+
+INS_STATES = ("dx", "dy", "dVN", "dVE", "PX", "PY", "PZ")
+
+
+def paper(
+    lat: float, v_north: float, v_east: float, *, added: Sequence[Disturbance] = (), sphere: Sphere = SPHERE
+) -> Model:
+    """The paper's model (1.18) at a latitude (rad) and a velocity: simple, for ships and slow aircraft.
+
+    DEPARTS FROM (1.18): restores the lost equation PY' = dVN/R - wZ PX + wX PZ + EY.
+    """
+    R, G, Om = sphere
+    t = tan(lat)
+    lon_rate = v_east / (R * cos(lat))
+    wX, wY, wZ = (Om + lon_rate) * cos(lat), -v_north / R, -(Om + lon_rate) * sin(lat)
+    A = np.array(
+        [
+            [0, 0, 1, 0, 0, 0, 0],
+            [0, 0, 0, 1, 0, 0, 0],
+            [0, 0, 0, 2 * wZ, 0, -G, 0],
+            [0, 0, -2 * wZ, 0, G, 0, 0],
+            [-wZ / R, wY * t / R, 0, -1 / R, 0, wZ, -wY],
+            [0, 0, 1 / R, 0, -wZ, 0, wX],
+            [wX / R, -wY * t * t / R, 0, t / R, wY, -wX, 0],
+        ]
+    )
+    return compose(A, INS_STATES, added)
+
+
+def aircraft(
+    lat: float,
+    v_north: float,
+    v_east: float,
+    acceleration_n: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    *,
+    added: Sequence[Disturbance] = (),
+    sphere: Sphere = SPHERE,
+) -> Model:
+    """The model complete to first order, for any speed: the one that flies.
+
+    `acceleration_n` is the rate of change of the velocity, NED: in a turn it couples PZ into the velocity.
+    Vertical errors are not in it: the height channel is aided by the barometer.
+    """
+    R, G, Om = sphere
+    s, c, t = sin(lat), cos(lat), tan(lat)
+    VN, VE = v_north, v_east
+    coriolis = 2 * Om * s + VE * t / R
+    fN = coriolis * VE + acceleration_n[0]
+    fE = -coriolis * VN + acceleration_n[1]
+    fD = -(G - 2 * Om * c * VE - (VN * VN + VE * VE) / R) + acceleration_n[2]
+    wX, wY, wZ = Om * c + VE / R, -VN / R, -(Om * s + VE * t / R)
+    d_coriolis = (2 * Om * c + VE / (R * c * c)) / R  # of the Coriolis factor, per metre north
+    A = np.array(
+        [
+            [0, 0, 1, 0, 0, 0, 0],
+            [VE * t / R, -VN * t / R, 0, 1, 0, 0, 0],
+            [-d_coriolis * VE, 0, 0, -2 * (Om * s + VE * t / R), 0, fD, -fE],
+            [d_coriolis * VN, 0, coriolis, VN * t / R, -fD, 0, fN],
+            [Om * s / R, 0, 0, -1 / R, 0, wZ, -wY],
+            [0, 0, 1 / R, 0, -wZ, 0, wX],
+            [(Om * c + VE / (R * c * c)) / R, 0, 0, t / R, wY, -wX, 0],
+        ]
+    )
+    return compose(A, INS_STATES, added)
+
+
+def twin(first: Model, second: Model, suffix: str = "2", common: Sequence[Disturbance] = ()) -> Model:
+    """Two inertial systems side by side, the second's states marked by `suffix`.
+
+    Disturbances of each are its own; `common` ones (gravity) are declared here and feed both by name.
+    """
+    n = len(first.states)
+    states = (*first.states, *(s + suffix for s in second.states))
+    bare = compose(np.zeros((len(states), len(states))), states, common)
+    A, Q, sigma = bare.A, bare.Q, bare.sigma
+    m = n + len(second.states)
+    A[:n, :n], A[n:m, n:m] = first.A, second.A
+    Q[:n, :n], Q[n:m, n:m] = first.Q, second.Q
+    sigma[:n], sigma[n:m] = first.sigma, second.sigma
+    B = np.zeros((len(bare.states), first.B.shape[1] + second.B.shape[1]))
+    B[:n, : first.B.shape[1]], B[n:m, first.B.shape[1] :] = first.B, second.B
+    C = np.concatenate([first.C, second.C, bare.C])
+    return Model(A, bare.states, Q, np.hstack([B, bare.B]), C, sigma)
+
+
+class Example(NamedTuple):
+    """One step of the paper's section 3, ready for the filters."""
+
+    states: tuple[str, ...]
+    A: Matrix
+    """(16, 16)."""
+    B: Matrix
+    """(16, 2), boolean: the current's increments of a step."""
+    Q: Matrix
+    """(16, 16), the current being driven by the bounded input alone."""
+    Q_markov: Matrix
+    """(16, 16), the current being Markov's (1.30) and nothing bounded: the plain Kalman filter's."""
+    H: Matrix
+    """(2, 16): the log along and across."""
+    R: Matrix
+    """(2, 2)."""
+    C: Matrix
+    """(2,): bounds of the increments of a step."""
+    x0: Matrix
+    """(16,) zero."""
+    P0: Matrix
+    """(16, 16) zero: exact alignment."""
+    dt: float
+    A_continuous: Matrix
+    units: Matrix
+    """(16,): what one unit of km-h-rad is in the units chosen, state by state."""
+
+
+def paper_example(
+    units: Literal["km-h", "SI"] = "km-h", *, exact: bool = True, sigma_E: float = 1e-5, C: float = 0.3
+) -> Example:
+    """Section 3: a ship at 60 degrees north going east at 30 km/h, a log in unknown currents, 0.01 h a step.
+
+    `sigma_E` in rad/h and `C` in km/h a step whatever the units (the text lost both; these fit its figures).
+    `exact` takes Van Loan's step, otherwise the paper's Euler.
+    """
+    if units not in ("km-h", "SI"):
+        raise ValueError(f"units {units!r}: choose km-h or SI")
+    sphere = SPHERE_KM_H if units == "km-h" else SPHERE
+    km, h = (1.0, 1.0) if units == "km-h" else (1e3, 3600.0)
+    lat, K, V, dt = pi / 3, pi / 2, 30.0 * km / h, 0.01 * h
+    R_G = R_c = 10.0 * km
+    a_c, a_E, a_A = 1.0 / h, 0.2 / h, 20.0 / h
+    drift = disturbances.gyro_drift(a_E, sigma_E / h)
+    others = (
+        disturbances.gravity(V, R_G, 1e-5 * sphere.G),
+        disturbances.accelerometer_fast(a_A, 1e-6 * sphere.G),
+    )
+
+    def at_sea(current: Disturbance) -> Model:
+        return paper(lat, 0.0, V, added=(drift, current, *others), sphere=sphere)
+
+    bounded = at_sea(disturbances.current(V, a_c, R_c, bound=C * km / h / dt))
+    markov = at_sea(disturbances.current(V, a_c, R_c, sigma=0.3 * km / h))
+    velocity = correctors.paper_velocity(lat, 0.0, V, sphere)
+    step = (discretise if exact else euler)(bounded.A, bounded.Q, bounded.B, dt)
+    step_markov = (discretise if exact else euler)(markov.A, markov.Q, markov.B, dt)
+    n = len(bounded.states)
+    return Example(
+        states=bounded.states,
+        A=step.A,
+        B=bounded.B,  # as the paper has it on either step: the increment falls at the step's end
+        Q=step.Q,
+        Q_markov=step_markov.Q,
+        H=correctors.rows(bounded.states, *correctors.relative_log(K, V, velocity)),
+        R=np.eye(2) * (0.05 * km / h) ** 2,
+        C=bounded.C * dt,
+        x0=np.zeros(n),
+        P0=np.zeros((n, n)),
+        dt=dt,
+        A_continuous=bounded.A,
+        units=np.array([km] * 2 + [km / h] * 2 + [1.0] * 3 + [1 / h] * 3 + [km / h] * 2 + [km / h**2] * 4),
+    )
