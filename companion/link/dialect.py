@@ -19,14 +19,18 @@ import contextlib
 import difflib
 import io
 import os
+import re
 import struct
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
-from pymavlink.dialects.v20 import all as mavlink
+from pymavlink.dialects.v20 import all as _all
 
 from companion.link import rsbn_dialect as rsbn
+
+#: pymavlink's generated module, for its constants (`mavlink.MAV_TYPE_GCS`).
+mavlink: Any = _all
 
 #: A MAVLink message: an instance of one of pymavlink's generated classes, which carry no types.
 Message = Any
@@ -35,6 +39,21 @@ RsbnMeasurement = rsbn.MAVLink_rsbn_measurement_message
 NavigationStatus = rsbn.MAVLink_navigation_status_message
 
 XML = Path(__file__).with_name("rsbn.xml")
+
+
+class Framed(Protocol):
+    """What `decode` reads of a frame; `companion.link.frame.Frame` is one."""
+
+    @property
+    def msgid(self) -> int: ...  # noqa: D102
+    @property
+    def payload(self) -> bytes: ...  # noqa: D102
+    @property
+    def sequence(self) -> int: ...  # noqa: D102
+    @property
+    def system(self) -> int: ...  # noqa: D102
+    @property
+    def component(self) -> int: ...  # noqa: D102
 
 
 class Field(NamedTuple):
@@ -53,11 +72,13 @@ class MessageType(NamedTuple):
     name: str
     layout: struct.Struct
     crc_extra: int
+    #: Bytes of payload without the extension fields: what MAVLink 1, which trims nothing, sends at least.
+    base_size: int
     #: Names in the order of the wire if every field is one number, else empty.
     scalars: tuple[str, ...]
     #: Fields in the order of the wire.
     fields: tuple[Field, ...]
-    cls: type[Message]
+    cls: Any
     #: Attributes that pymavlink's base class gives every message, to be shared by all of this type.
     base: dict[str, Any]
 
@@ -69,19 +90,25 @@ def _describe(msgid: int, cls: Any) -> MessageType:
     for name, length in zip(cls.ordered_fieldnames, cls.lengths):
         fields.append(Field(name, first, length, types[name] == "char"))
         first += length
+    # mavgen gives default values to the extension fields and to no others; they lie last on the wire.
+    extensions = len(cls.__init__.__defaults__ or ())
+    formats = re.findall(r"\d*[a-zA-Z]", cls.unpacker.format)
+    base_size = struct.calcsize("<" + "".join(formats[: len(formats) - extensions]))
     plain = all(field.length == 1 and not field.text for field in fields)
     blank = object.__new__(cls)
-    mavlink.MAVLink_message.__init__(blank, msgid, cls.msgname)
+    _all.MAVLink_message.__init__(blank, msgid, cls.msgname)
     base = dict(blank.__dict__)
     base |= {"_fieldnames": cls.fieldnames, "_instance_field": cls.instance_field}
     base["_instance_offset"] = cls.instance_offset
     scalars = tuple(cls.ordered_fieldnames) if plain else ()
-    return MessageType(msgid, cls.msgname, cls.unpacker, cls.crc_extra, scalars, tuple(fields), cls, base)
+    return MessageType(
+        msgid, cls.msgname, cls.unpacker, cls.crc_extra, base_size, scalars, tuple(fields), cls, base
+    )
 
 
 #: Every message known, by its id.
 TYPES: Mapping[int, MessageType] = {
-    msgid: _describe(msgid, cls) for msgid, cls in (mavlink.mavlink_map | rsbn.mavlink_map).items()
+    msgid: _describe(msgid, cls) for msgid, cls in (_all.mavlink_map | rsbn.mavlink_map).items()
 }
 _BY_NAME: Mapping[str, MessageType] = {kind.name: kind for kind in TYPES.values()}
 
@@ -119,23 +146,24 @@ def new(name: str, **values: Any) -> Message:
     return kind.cls(**values)
 
 
-def decode(msgid: int, payload: bytes, sequence: int = 0, system: int = 0, component: int = 0) -> Message:
-    """Return the message that `payload` (of any length: trimmed zeros are put back) holds.
+def decode(frame: Framed) -> Message:
+    """Return the message that a frame carries; a payload shorter than the message has its zeros put back.
 
-    KeyError if the id is unknown. The payload is believed: the frame's checksum is the reader's business.
+    KeyError if the id is unknown. The payload is believed: the checksum is the reader's business.
     """
+    msgid, payload = frame.msgid, frame.payload
     kind = TYPES[msgid]
     size = kind.layout.size
     if len(payload) != size:
         payload = payload[:size].ljust(size, b"\0")
     values = kind.layout.unpack(payload)
     message = kind.cls.__new__(kind.cls)
-    header = object.__new__(mavlink.MAVLink_header)
+    header = object.__new__(_all.MAVLink_header)
     header.__dict__ = {
         "mlen": len(payload),
-        "seq": sequence,
-        "srcSystem": system,
-        "srcComponent": component,
+        "seq": frame.sequence,
+        "srcSystem": frame.system,
+        "srcComponent": frame.component,
         "msgId": msgid,
         "incompat_flags": 0,
         "compat_flags": 0,

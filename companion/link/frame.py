@@ -1,0 +1,244 @@
+"""MAVLink frames out of bytes and into bytes. Knows no clock, no socket, no key, and no meaning of a message.
+
+    reader = Reader()
+    for event in reader.receive(data):     # any split of the stream gives the same events
+        ...                                # Frame | UnknownFrame | BadFrame
+    reader.close()                         # at the end of a file: what the buffer still holds
+
+A frame (MAVLink 1 or 2) is accepted when its checksum, which covers header, payload and the check byte of the
+message's layout, is right. After a rejection the search goes on at the very next byte, so a byte lost or
+damaged costs the frame it hit and not the ones that a false length would swallow.
+
+The checksum of an unknown message id cannot be verified. Such a frame is skipped as a whole only if where it
+ends the next one visibly begins (a magic byte, and legal flags if MAVLink 2); otherwise it is taken for noise
+and its inside is searched as well. It is reported, without its payload, and never counted in the sequence.
+
+At most one longest frame and the next one's head wait in the buffer. Nothing here raises on any bytes.
+A signature is kept with its frame and not judged.
+"""
+
+from __future__ import annotations
+
+import enum
+import re
+from typing import NamedTuple
+
+from fastcrc import crc16
+
+from companion.link import dialect
+
+MAGIC_V1, MAGIC_V2 = 0xFE, 0xFD
+SIGNED = 0x01
+SIGNATURE_SIZE = 13
+#: Header, longest payload, checksum, signature.
+LONGEST = 10 + 255 + 2 + SIGNATURE_SIZE
+#: Most bytes that wait: a longest frame of unknown id whose successor's flags are not yet here.
+MOST_WAITING = LONGEST + 2
+#: A run of rejected bytes is reported at this length at the latest.
+LONGEST_RUN = 1024
+
+_MAGIC = re.compile(b"[\xfd\xfe]")
+#: What the checksum takes in after the payload, by message id.
+_CHECK_BYTE = {msgid: bytes([kind.crc_extra]) for msgid, kind in dialect.TYPES.items()}
+_BASE_SIZE = {msgid: kind.base_size for msgid, kind in dialect.TYPES.items()}
+_crc = crc16.mcrf4xx
+
+
+class Frame(NamedTuple):
+    """A frame with a right checksum. `payload` is as sent: MAVLink 2 trims trailing zeros."""
+
+    msgid: int
+    payload: bytes
+    sequence: int
+    system: int
+    component: int
+    #: 13 bytes: link id, timestamp, hash; not verified here.
+    signature: bytes | None
+    #: The whole frame as it came, signature included.
+    raw: bytes
+
+
+class UnknownFrame(NamedTuple):
+    """What looks like a frame of a message that no dialect here knows; nothing in it is verified."""
+
+    msgid: int
+    system: int
+    component: int
+    size: int
+
+
+class Reason(enum.Enum):
+    """Why bytes were rejected."""
+
+    JUNK = "no frame begins here"
+    CHECKSUM = "wrong checksum"
+    LENGTH = "a MAVLink 1 payload shorter than its message"
+    FLAGS = "incompatibility flags that are not understood"
+    UNKNOWN = "unknown message id, and no frame follows where it would end"
+    TORN = "the input ended inside a frame"
+
+
+class BadFrame(NamedTuple):
+    """A run of rejected bytes up to the next frame: why its first byte was rejected, and its length."""
+
+    reason: Reason
+    size: int
+
+
+class Counts(NamedTuple):
+    """Frames of one sender: those that came, and those missing by the sequence numbers."""
+
+    received: int
+    lost: int
+
+
+Event = Frame | UnknownFrame | BadFrame
+
+
+def examine(buffer: bytes, at: int = 0) -> Frame | UnknownFrame | Reason | None:
+    """Judge the bytes from `at` on: a frame, the reason why none begins there, or None if more are needed.
+
+    The step of `Reader`, also good by itself where another container tells the places of frames (tlog).
+    """
+    left = len(buffer) - at
+    if left < 8:
+        return None if left <= 0 or buffer[at] in (MAGIC_V1, MAGIC_V2) else Reason.JUNK
+    magic = buffer[at]
+    signed = 0
+    if magic == MAGIC_V2:
+        signed = buffer[at + 2]
+        if signed > SIGNED:
+            return Reason.FLAGS
+        head = at + 10
+        end = head + buffer[at + 1]
+        size = end + 2 - at + SIGNATURE_SIZE * signed
+        if left < size:
+            return None
+        sequence, system, component = buffer[at + 4 : at + 7]
+        msgid = buffer[at + 7] | buffer[at + 8] << 8 | buffer[at + 9] << 16
+    elif magic == MAGIC_V1:
+        head = at + 6
+        end = head + buffer[at + 1]
+        size = end + 2 - at
+        if left < size:
+            return None
+        sequence, system, component, msgid = buffer[at + 2 : head]
+    else:
+        return Reason.JUNK
+    check_byte = _CHECK_BYTE.get(msgid)
+    if check_byte is None:
+        follows = _begins(buffer, at + size)
+        if follows is None:
+            return None
+        return UnknownFrame(msgid, system, component, size) if follows else Reason.UNKNOWN
+    if _crc(buffer[at + 1 : end] + check_byte) != buffer[end] | buffer[end + 1] << 8:
+        return Reason.CHECKSUM
+    if magic == MAGIC_V1 and end - head < _BASE_SIZE[msgid]:
+        return Reason.LENGTH
+    raw = buffer[at : at + size]
+    signature = raw[-SIGNATURE_SIZE:] if signed else None
+    return Frame(msgid, buffer[head:end], sequence, system, component, signature, raw)
+
+
+def _begins(buffer: bytes, at: int) -> bool | None:
+    """Tell whether a frame seems to begin at `at`; None if that is not yet seen."""
+    head = buffer[at : at + 3]
+    if not head or (head[0] == MAGIC_V2 and len(head) < 3):
+        return None
+    return head[0] == MAGIC_V1 or (head[0] == MAGIC_V2 and head[2] <= SIGNED)
+
+
+class Reader:
+    """Frames of one stream, found however the stream is cut, and counted by sender."""
+
+    def __init__(self) -> None:
+        self._waiting = b""
+        self._run = 0
+        self._run_reason = Reason.JUNK
+        self._senders: dict[tuple[int, int], list[int]] = {}  # next sequence number, received, lost
+
+    def receive(self, data: bytes) -> list[Event]:
+        """Take the next bytes of the stream and return what they complete, in order."""
+        return self._scan(self._waiting + data if self._waiting else bytes(data), ended=False)
+
+    def close(self) -> list[Event]:
+        """Return what the buffer still holds now that nothing follows. The reader may be used again."""
+        events = self._scan(self._waiting, ended=True)
+        self._end_run(events)
+        return events
+
+    @property
+    def waiting(self) -> int:
+        """Bytes that wait for the rest of their frame, at most MOST_WAITING."""
+        return len(self._waiting)
+
+    @property
+    def counts(self) -> dict[tuple[int, int], Counts]:
+        """Frames received and lost by (system, component).
+
+        A step back of the sequence (a reordered or repeated frame, a reboot) counts as no loss; neither can
+        gaps of 128 frames or more be told from one.
+        """
+        return {sender: Counts(received, lost) for sender, (_, received, lost) in self._senders.items()}
+
+    def _scan(self, buffer: bytes, ended: bool) -> list[Event]:
+        events: list[Event] = []
+        at, end = 0, len(buffer)
+        while at < end:
+            found = examine(buffer, at)
+            if isinstance(found, Frame):
+                if self._run:
+                    self._end_run(events)
+                self._count(found)
+                events.append(found)
+                at += len(found.raw)
+            elif isinstance(found, UnknownFrame):
+                self._end_run(events)
+                events.append(found)
+                at += found.size
+            elif found is not None or ended:
+                magic = _MAGIC.search(buffer, at + 1)
+                after = magic.start() if magic else end
+                self._reject(Reason.TORN if found is None else found, after - at, events)
+                at = after
+            else:
+                break
+        self._waiting = buffer[at:]
+        return events
+
+    def _count(self, frame: Frame) -> None:
+        sequence = frame.sequence
+        sender = self._senders.get((frame.system, frame.component))
+        if sender is None:
+            self._senders[frame.system, frame.component] = [sequence + 1 & 0xFF, 1, 0]
+            return
+        gap = sequence - sender[0] & 0xFF
+        if 0 < gap < 128:
+            sender[2] += gap
+        sender[0] = sequence + 1 & 0xFF
+        sender[1] += 1
+
+    def _reject(self, reason: Reason, size: int, events: list[Event]) -> None:
+        if not self._run:
+            self._run_reason = reason
+        self._run += size
+        while self._run >= LONGEST_RUN:
+            events.append(BadFrame(self._run_reason, LONGEST_RUN))
+            self._run -= LONGEST_RUN
+            self._run_reason = Reason.JUNK
+
+    def _end_run(self, events: list[Event]) -> None:
+        if self._run:
+            events.append(BadFrame(self._run_reason, self._run))
+            self._run = 0
+
+
+def encode(message: dialect.Message, sequence: int, system: int, component: int) -> bytes:
+    """Return `message` as an unsigned MAVLink 2 frame. ValueError if a field does not fit its wire type."""
+    msgid = dialect.id_of(message)
+    payload = dialect.payload(message).rstrip(b"\0") or b"\0"
+    header = bytes(
+        (len(payload), 0, 0, sequence, system, component, msgid & 0xFF, msgid >> 8 & 0xFF, msgid >> 16)
+    )
+    body = header + payload
+    return b"\xfd" + body + _crc(body + _CHECK_BYTE[msgid]).to_bytes(2, "little")
