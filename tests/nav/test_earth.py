@@ -49,7 +49,7 @@ def test_gravity_falls_with_height_as_the_exact_field_of_the_ellipsoid(lat_deg: 
 
 
 def _exact_gravity(lat_deg: float, alt: float) -> float:
-    """The closed field of a rotating equipotential ellipsoid (Heiskanen and Moritz, Physical Geodesy, 2-7)."""
+    """The closed field of a rotating equipotential ellipsoid (Heiskanen and Moritz, Physical Geodesy 2-7)."""
     lat = math.radians(lat_deg)
     R_E = earth.radii(lat).R_E
     x, z = (R_E + alt) * math.cos(lat), ((1 - earth.E2) * R_E + alt) * math.sin(lat)

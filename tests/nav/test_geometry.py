@@ -92,7 +92,7 @@ def test_axes_at_the_cardinal_places(
 def test_a_sight_of_pymap3d() -> None:
     """aer (33, 70, 1000) from (42, -82, 200): pymap3d's tests (test_aer.py, test_enu.py), BSD-2-Clause."""
     origin = degrees(42, -82, 200)
-    point = from_enu(np.array([186.277521, 286.84222, 939.69262]), origin)
+    point = from_enu(np.array([186.277521, 286.842228, 939.692621]), origin)
     assert math.degrees(point.lat) == pytest.approx(42.002582, abs=5e-7)
     assert math.degrees(point.lon) == pytest.approx(-81.997752, abs=5e-7)
     assert point.alt == pytest.approx(1139.7018, abs=1e-3)
