@@ -234,7 +234,7 @@ class Solution(Stamped, frozen=True, gc=False, tag=True):
     estimator: str
     lat: float
     lon: float
-    alt: float
+    alt_msl: float
     v_n: Vector3
     covariance: tuple[float, float, float, float, float, float]
     error_n: Vector2
@@ -257,7 +257,7 @@ class Fix(Stamped, frozen=True, gc=False, tag=True):
 
     lat: float
     lon: float
-    alt: float
+    alt_msl: float
     correction_n: Vector2
     covariance: Vector3
     sources: int

@@ -1,0 +1,237 @@
+"""What the operator may set: frozen structures with the unit in every key, and all of their validation.
+
+Flags beat environment beat file. The file is TOML, one table a section; the environment variable of a key is
+`COMPANION_SECTION__KEY`. A mistake is a `ConfigError`, one sentence that names where it stands, the key, and
+the nearest right one; the service does not start on it (exit code 78, EX_CONFIG).
+"""
+
+from __future__ import annotations
+
+import difflib
+import os
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import msgspec
+from msgspec import Meta
+
+Positive = Annotated[float, Meta(gt=0.0, lt=1e9)]
+NotNegative = Annotated[float, Meta(ge=0.0, lt=1e9)]
+Probability = Annotated[float, Meta(gt=0.0, lt=1.0)]
+RateHz = Annotated[float, Meta(ge=0.0, le=400.0)]
+NodeId = Annotated[int, Meta(ge=1, le=255)]
+
+
+class ConfigError(ValueError):
+    """A configuration that cannot be meant; the text says where and what to write instead."""
+
+
+class Section(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """One table of the file."""
+
+
+class Link(Section, frozen=True):
+    """Where the autopilot is, and who we are on its network."""
+
+    connect: tuple[str, ...] = ("udpin:127.0.0.1:14550",)  # each link is one; see `companion run --help`
+    system_id: Annotated[int, Meta(ge=0, le=255)] = 0  # 0: take the autopilot's own
+    component_id: NodeId = 191  # MAV_COMP_ID_ONBOARD_COMPUTER; 197 is visual-inertial odometry
+
+
+class Rates(Section, frozen=True):
+    """What is asked of the autopilot by SET_MESSAGE_INTERVAL; 0 leaves a stream as it is."""
+
+    local_position_hz: RateHz = 10.0
+    gnss_hz: RateHz = 5.0
+    attitude_hz: RateHz = 10.0
+    imu_hz: RateHz = 50.0
+    air_data_hz: RateHz = 5.0
+    status_hz: RateHz = 1.0
+    truth_hz: RateHz = 0.0
+
+
+class Inertial(Section, frozen=True):
+    """The error model of the inertial channel: one standard deviation each.
+
+    The defaults are a navigation-grade unit (0.01 deg/h, 50 ug).
+    """
+
+    gyro_drift_deg_h: Positive = 0.01
+    gyro_correlation_h: Positive = 5.0
+    accelerometer_bias_ug: Positive = 50.0
+    accelerometer_correlation_h: Positive = 1.0
+    position_m: Positive = 20.0
+    velocity_m_s: Positive = 0.5
+    tilt_arcsec: Positive = 20.0
+    heading_arcmin: Positive = 3.0
+    velocity_noise_m_s_sqrt_s: Positive = 0.003
+    height_sigma_m: Positive = 20.0
+
+
+class GnssSection(Section, frozen=True):
+    """How far GNSS is believed. The sigma is the greater of what the receiver states and this floor."""
+
+    sigma_m: Positive = 2.5
+    sigma_velocity_m_s: Positive = 0.2
+    correlation_s: NotNegative = 30.0  # of its noise: fixes closer together tell less than their number
+    every_s: NotNegative = 1.0  # fixes closer together than this are heard but not used
+    use_velocity: bool = True
+    timeout_s: Positive = 3.0
+
+
+class Rsbn(Section, frozen=True):
+    """How far a beacon is believed: the greater of what it states and these floors."""
+
+    sigma_azimuth_deg: Positive = 0.125
+    sigma_range_m: Positive = 100.0
+    sigma_range_percent: NotNegative = 0.015
+    timeout_s: Positive = 10.0
+
+
+class Predictor(Section, frozen=True):
+    """The window of trusted fixes that the guaranteed prediction learns from, and how far it is believed."""
+
+    window_min: Annotated[float, Meta(gt=0.5, le=80.0)] = 25.0
+    bin_s: Annotated[float, Meta(ge=0.1, le=60.0)] = 10.0
+    learn_velocity: bool = False
+    ahead_min: tuple[Annotated[float, Meta(gt=0.0, le=120.0)], ...] = (1.0, 5.0, 10.0, 20.0)
+    limit_m: Positive = 5000.0  # a guaranteed bound beyond this is no position any more
+
+
+class Estimator(Section, frozen=True):
+    """Which estimator feeds the output when fixes stop, and the gate that fixes must pass."""
+
+    output: Literal["minimax", "kalman"] = "minimax"
+    false_rejection: Probability = 1e-6
+    late_s: Annotated[float, Meta(ge=0.0, le=30.0)] = 6.0
+
+
+class Output(Section, frozen=True):
+    """What goes back to the autopilot, and how often."""
+
+    solution_hz: Annotated[float, Meta(gt=0.0, le=50.0)] = 5.0
+    odometry_hz: RateHz = 5.0
+    global_position_sensor_hz: RateHz = 2.0
+    status_hz: RateHz = 1.0
+    global_position_sensor_id: Annotated[int, Meta(ge=0, le=255)] = 1
+
+
+class Log(Section, frozen=True):
+    """Where flights are written."""
+
+    folder: str = "logs"
+    chunk_kib: Annotated[int, Meta(ge=64, le=256)] = 128
+    minimum_free_mib: Annotated[int, Meta(ge=0)] = 512
+    maximum_files: Annotated[int, Meta(ge=1)] = 100
+
+
+class Config(Section, frozen=True):
+    """Everything."""
+
+    link: Link = Link()
+    rates: Rates = Rates()
+    inertial: Inertial = Inertial()
+    gnss: GnssSection = GnssSection()
+    rsbn: Rsbn = Rsbn()
+    predictor: Predictor = Predictor()
+    estimator: Estimator = Estimator()
+    output: Output = Output()
+    log: Log = Log()
+
+
+def load(
+    path: Path | None = None,
+    flags: Mapping[str, Any] | None = None,
+    environment: Mapping[str, str] | None = None,
+) -> Config:
+    """The configuration of file `path`, then environment, then `flags` (keys "section.key").
+
+    Raises `ConfigError` where a file cannot be read, a key is unknown or a value impossible.
+    """
+    tree = _read(path) if path else {}
+    _check_keys(tree, str(path))
+    origin = {(section, key): str(path) for section, table in tree.items() for key in table}
+    for name, text in (os.environ if environment is None else environment).items():
+        if name.startswith("COMPANION_") and "__" in name:
+            section, key = name.removeprefix("COMPANION_").lower().split("__", 1)
+            _check_keys({section: {key: text}}, f"environment variable {name}")
+            tree.setdefault(section, {})[key] = _parsed(text)
+            origin[section, key] = f"environment variable {name}"
+    for name, value in (flags or {}).items():
+        if value is not None:
+            section, key = name.split(".")
+            tree.setdefault(section, {})[key] = value
+            origin[section, key] = "command line"
+    return _convert(tree, origin)
+
+
+def to_toml(config: Config) -> str:
+    """The whole configuration as the TOML that `load` reads back."""
+    lines = []
+    for section in config.__struct_fields__:
+        table = getattr(config, section)
+        lines.append(f"[{section}]")
+        # JSON's strings, numbers, booleans and lists are TOML's too
+        lines += [
+            f"{key} = {msgspec.json.encode(getattr(table, key)).decode()}" for key in table.__struct_fields__
+        ]
+        lines.append("")
+    return "\n".join(lines)
+
+
+def _read(path: Path) -> dict[str, dict[str, Any]]:
+    try:
+        tree = tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise ConfigError(f"{path}: no such file; start from `companion check-config --defaults`") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: cannot be read ({error})") from None
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"{path}: is no TOML: {error}") from None
+    for section, table in tree.items():
+        if not isinstance(table, dict) and section in Config.__struct_fields__:
+            raise ConfigError(f"{path}: `{section}` is a section: write [{section}] and its keys below it")
+    return {name: table if isinstance(table, dict) else {"": table} for name, table in tree.items()}
+
+
+def _check_keys(tree: Mapping[str, Mapping[str, Any]], where: str) -> None:
+    sections = Config.__struct_fields__
+    for section, table in tree.items():
+        if section not in sections:
+            raise ConfigError(f"{where}: there is no section [{section}]{_nearest(section, sections)}")
+        keys = type(getattr(Config(), section)).__struct_fields__
+        for key in table:
+            if key not in keys:
+                raise ConfigError(f"{where}: section [{section}] has no key `{key}`{_nearest(key, keys)}")
+
+
+def _nearest(name: str, known: tuple[str, ...]) -> str:
+    close = difflib.get_close_matches(name, known, 1, 0.4)
+    return f"; did you mean `{close[0]}`?" if close else f"; it has {', '.join(known)}"
+
+
+def _parsed(text: str) -> Any:
+    """An environment variable's text as TOML would read it, else as a string."""
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return text
+
+
+def _convert(tree: Mapping[str, Mapping[str, Any]], origin: Mapping[tuple[str, str], str]) -> Config:
+    sections: dict[str, Any] = {}
+    for section, table in tree.items():
+        kind = type(getattr(Config(), section))
+        for key, value in table.items():
+            try:
+                msgspec.convert({key: value}, kind)
+            except msgspec.ValidationError as error:
+                reason = str(error).split(" - at ")[0].replace("`", "")
+                where = origin[section, key]
+                raise ConfigError(
+                    f"{where}: {section}.{key} = {value!r} is impossible: {reason[0].lower()}{reason[1:]}"
+                ) from None
+        sections[section] = msgspec.convert(table, kind)
+    return Config(**sections)

@@ -1,0 +1,85 @@
+"""The navigator: records in, records out, no clock and no I/O.
+
+`Navigator` folds `step` over what arrives. Measurements that come late are folded in at their own time: it
+keeps the carries of the last seconds, goes back to the one before, and folds forward again. What was given
+out stays given out; a late measurement shows in the next solution.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections import deque
+from typing import NamedTuple
+
+from companion.config import Config
+from companion.records import (
+    GlobalPosition,
+    Gnss,
+    Input,
+    LocalOrigin,
+    LocalPosition,
+    Output,
+    Rejection,
+    RsbnFix,
+    Solution,
+)
+
+from .carry import Carry, Settings, initial
+from .solution import solve
+from .step import step
+
+__all__ = ["Navigator"]
+
+FOLDED = (LocalPosition, LocalOrigin, GlobalPosition, Gnss, RsbnFix)
+
+
+class _Past(NamedTuple):
+    t_ns: int
+    record: Input
+    before: Carry
+
+
+class Navigator:
+    """One aircraft's navigator: `handle` every record in the order of arrival."""
+
+    def __init__(self, config: Config) -> None:
+        self._settings = Settings.of(config)
+        self._carry = initial(self._settings)
+        self._past: deque[_Past] = deque()
+        self._late_ns = round(1e9 * config.estimator.late_s)
+
+    def handle(self, record: Input) -> list[Output]:
+        """What follows from one more record."""
+        if not isinstance(record, FOLDED):
+            return []
+        if self._past and record.t_ns < self._past[-1].t_ns:
+            return self._handle_late(record)
+        self._past.append(_Past(record.t_ns, record, self._carry))
+        while self._past[0].t_ns < record.t_ns - self._late_ns:
+            self._past.popleft()
+        self._carry, outputs = step(self._carry, record, self._settings)
+        return outputs
+
+    def _handle_late(self, record: Input) -> list[Output]:
+        if record.t_ns < self._past[0].t_ns:
+            age = (self._past[-1].t_ns - record.t_ns) * 1e-9
+            name = type(record).__name__
+            limit = self._late_ns * 1e-9
+            return [
+                Rejection(record.t_ns, record.rx_ns, name, "arrived too late to be folded in", age, limit)
+            ]
+        place = bisect_right(self._past, record.t_ns, key=lambda past: past.t_ns)
+        again = [record, *(past.record for past in list(self._past)[place:])]
+        self._carry = self._past[place].before
+        while len(self._past) > place:
+            self._past.pop()
+        given: list[Output] = []
+        for each in again:
+            self._past.append(_Past(each.t_ns, each, self._carry))
+            self._carry, outputs = step(self._carry, each, self._settings)
+            if each is record:
+                given = [out for out in outputs if not isinstance(out, Solution)]
+        if isinstance(record, RsbnFix):
+            self._carry, solution = solve(self._carry, record.rx_ns, self._settings)
+            given += solution
+        return given

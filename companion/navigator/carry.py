@@ -1,0 +1,86 @@
+"""What the navigator remembers between two records, immutable, and what follows from it at an instant."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from scipy.special import chdtri
+
+from companion.config import Config
+from companion.records import Gnss, LocalOrigin, LocalPosition, Mode, Output, Prediction, Source
+
+from . import errorstate, guarantee, inertial, radio
+from .errorstate import ErrorState, Grade
+from .guarantee import Guarantee
+from .inertial import Point, Track
+
+
+class Settings(NamedTuple):
+    """The configuration with what follows from it."""
+
+    config: Config
+    unit: Grade
+    gate: tuple[float, ...]  # chi-square limits for 0, 1, 2, 3 degrees of freedom
+
+    @classmethod
+    def of(cls, config: Config) -> Settings:
+        """Everything derived once."""
+        alarm = config.estimator.false_rejection
+        gate = (0.0, *(float(chdtri(k, alarm)) for k in (1, 2, 3)))
+        return cls(config, errorstate.grade(config.inertial), gate)
+
+
+class Level(NamedTuple):
+    """Height error of the inertial channel against GNSS (m) and its variance."""
+
+    error: float = 0.0
+    variance: float = 400.0
+
+
+class Carry(NamedTuple):
+    """All that the navigator remembers."""
+
+    guarantee: Guarantee
+    origin: LocalOrigin | None = None
+    local: LocalPosition | None = None
+    track: Track = ()
+    state: ErrorState | None = None
+    level: Level = Level()
+    gnss: Gnss | None = None  # the last new one, used or not
+    gnss_heard: radio.Heard | None = None  # the last one believed
+    gnss_ns: int | None = None  # when fixes were last believed
+    rsbn_ns: int | None = None
+    next_ns: int = 0
+    next_ahead_ns: int = 0
+    ahead: tuple[Prediction, ...] = ()
+    mode: Mode = Mode.INITIALISING
+
+
+Step = tuple[Carry, list[Output]]
+
+
+def initial(settings: Settings) -> Carry:
+    """The carry before anything was heard."""
+    return Carry(guarantee.begin(settings.config.predictor))
+
+
+def state_at(carry: Carry, ins: Point, settings: Settings) -> ErrorState:
+    """The error state carried to the time of `ins`; from the grade of the unit before the first fix."""
+    state = carry.state or errorstate.start(ins.t_ns, settings.unit)
+    acceleration = inertial.acceleration(carry.track)
+    return errorstate.predict(state, ins.t_ns, ins.position.lat, ins.v_n, acceleration, settings.unit)
+
+
+def level(ins: Point, carry: Carry) -> Point:
+    """The inertial point at the height that GNSS has taught."""
+    return ins._replace(position=ins.position._replace(alt=ins.position.alt - carry.level.error))
+
+
+def sources(carry: Carry, t_ns: int, settings: Settings) -> Source:
+    """What the position rests on now: fixes younger than their timeouts, over the inertial channel."""
+    config, sources = settings.config, Source.INERTIAL
+    if carry.gnss_ns is not None and (t_ns - carry.gnss_ns) * 1e-9 <= config.gnss.timeout_s:
+        sources |= Source.GNSS
+    if carry.rsbn_ns is not None and (t_ns - carry.rsbn_ns) * 1e-9 <= config.rsbn.timeout_s:
+        sources |= Source.AZIMUTH | Source.RANGE
+    return sources

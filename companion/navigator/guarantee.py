@@ -1,0 +1,152 @@
+"""What can be promised of the inertial error when fixes stop: the minimax predictor kept by the navigator.
+
+Corrections (INS minus radio fix) are averaged over short bins and pushed into one window a channel, north and
+east. The mean of a bin has at most the weighted mean of its sigmas, whatever the correlation, so binning
+costs the guarantee nothing and takes the white part of the noise away. A forecast is made once a second; in
+between the position moves with the forecast velocity, and the bound by the velocity's bound (the triangle
+inequality).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from companion.config import Predictor
+from companion.estimate.predictor import Forecast, Quantity, Window, predict, predict_ahead
+from companion.estimate.predictor import Prediction as Channel
+from companion.records import Prediction, Vector2
+
+REFRESH_NS = 1_000_000_000
+UNLIKE = 2.0  # a fix this many times better or worse than its bin begins a new one
+
+
+class Bin(NamedTuple):
+    """Weighted sums over the fixes of one bin: weight, time from start (s), value and sigma of each axis."""
+
+    quantity: Quantity
+    start_ns: int
+    scale: float
+    weight: float
+    time: float
+    value: Vector2
+    sigma: Vector2
+
+
+class Bounded(NamedTuple):
+    """The INS error now, by minimax: position and velocity, their guaranteed r.m.s. bounds (m, m/s)."""
+
+    error_n: Vector2
+    velocity_error_n: Vector2
+    bound_n: Vector2
+    velocity_bound_n: Vector2
+
+
+class Guarantee(NamedTuple):
+    """Windows of both channels, the bins not yet full, and the last forecast."""
+
+    north: Window
+    east: Window
+    bins: tuple[Bin, ...] = ()
+    held: tuple[Channel, Channel] | None = None
+
+
+def begin(settings: Predictor) -> Guarantee:
+    """Nothing learnt yet."""
+    window = Window(span=60.0 * settings.window_min)
+    return Guarantee(window, window)
+
+
+def learn(
+    g: Guarantee, t_ns: int, quantity: Quantity, value: Vector2, sigma: Vector2, settings: Predictor
+) -> Guarantee:
+    """With one more correction `value` of INS position (m) or velocity (m/s), north and east."""
+    scale = sigma[0] + sigma[1]
+    weight = 1.0 / scale**2
+    mine = next((b for b in g.bins if b.quantity == quantity), None)
+    others = tuple(b for b in g.bins if b.quantity != quantity)
+    if mine is not None:
+        full = (t_ns - mine.start_ns) * 1e-9 >= settings.bin_s
+        if full or not 1.0 / UNLIKE < scale / mine.scale < UNLIKE:
+            g = _close(g)
+            mine, others = None, ()
+    if mine is None:
+        mine = Bin(quantity, t_ns, scale, 0.0, 0.0, (0.0, 0.0), (0.0, 0.0))
+    mine = mine._replace(
+        weight=mine.weight + weight,
+        time=mine.time + weight * (t_ns - mine.start_ns) * 1e-9,
+        value=(mine.value[0] + weight * value[0], mine.value[1] + weight * value[1]),
+        sigma=(mine.sigma[0] + weight * sigma[0], mine.sigma[1] + weight * sigma[1]),
+    )
+    return g._replace(bins=(*others, mine))
+
+
+def bounded(g: Guarantee, t_ns: int) -> tuple[Guarantee, Bounded | None]:
+    """The INS error at `t_ns`; None where the fixes do not determine it (too few, too short)."""
+    held = g.held
+    if held is None or t_ns - held[0].t_ns >= REFRESH_NS or t_ns < held[0].t_ns:
+        held = (
+            predict(g.north, t_ns, start=held[0] if held else None),
+            predict(g.east, t_ns, start=held[1] if held else None),
+        )
+        g = g._replace(held=held)
+    if not (held[0].feasible and held[1].feasible):
+        return g, None
+    dt = (t_ns - held[0].t_ns) * 1e-9
+    north, east = _moved(held[0], dt), _moved(held[1], dt)
+    error, velocity, bound, velocity_bound = zip(north, east, strict=True)
+    return g, Bounded(error, velocity, bound, velocity_bound)
+
+
+def ahead(g: Guarantee, t_ns: int, minutes: tuple[float, ...]) -> tuple[Prediction, ...]:
+    """Bounds for the minutes ahead of `t_ns`, empty where there are none."""
+    times = [t_ns + round(60e9 * m) for m in minutes]
+    found = [
+        [p.position for p in predict_ahead(window, times, ("position",))] for window in (g.north, g.east)
+    ]
+    return tuple(
+        Prediction(60.0 * m, (n.bound, e.bound), (n.ls_claimed, e.ls_claimed), (n.ls_worst, e.ls_worst))
+        for m, n, e in zip(minutes, *found, strict=True)
+        if n is not None and e is not None and n.feasible and e.feasible
+    )
+
+
+def shift(g: Guarantee, north: float, east: float) -> Guarantee:
+    """After the channel jumped by (north, east) m, so did every position error ever measured against it."""
+    bins = tuple(
+        b._replace(value=(b.value[0] + b.weight * north, b.value[1] + b.weight * east))
+        if b.quantity == "position"
+        else b
+        for b in g.bins
+    )
+    return Guarantee(_shifted(g.north, north), _shifted(g.east, east), bins)
+
+
+def _close(g: Guarantee) -> Guarantee:
+    """All bins pushed, oldest first: a window takes its fixes in the order of time."""
+    north, east = g.north, g.east
+    for t_ns, full in sorted((b.start_ns + round(1e9 * b.time / b.weight), b) for b in g.bins):
+        w = full.weight
+        north = north.push(t_ns, full.quantity, full.value[0] / w, full.sigma[0] / w)
+        east = east.push(t_ns, full.quantity, full.value[1] / w, full.sigma[1] / w)
+    return Guarantee(north, east, (), g.held)
+
+
+def _moved(channel: Channel, dt: float) -> tuple[float, float, float, float]:
+    position, velocity = channel.position, channel.velocity
+    assert isinstance(position, Forecast)
+    assert isinstance(velocity, Forecast)
+    return (
+        position.estimate + velocity.estimate * dt,
+        velocity.estimate,
+        position.bound + velocity.bound * dt,
+        velocity.bound,
+    )
+
+
+def _shifted(window: Window, offset: float) -> Window:
+    value = np.where(window.velocity, window.value, window.value + offset)
+    value.setflags(write=False)
+    return replace(window, value=value)

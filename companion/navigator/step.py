@@ -1,0 +1,260 @@
+"""One step of the navigator: `carry, outputs = step(carry, record, settings)`, the carry immutable.
+
+Online, replay and late measurements all go through this one function. Errors are INS minus truth, so what is
+given out is the inertial channel less the estimated error. Two estimators run on one stream: the Gaussian
+error state (the "kalman" of the configuration: maximum-likelihood fusion with memory) and, beside it, the
+minimax prediction with its guaranteed bound. While trusted fixes come the first is the output; when they
+stop, the one the configuration names.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from companion.estimate.fusion import Height, NoFix, Position, maximum_likelihood
+from companion.nav.geometry import displace
+from companion.records import (
+    Event,
+    Fix,
+    GlobalPosition,
+    Gnss,
+    Input,
+    LocalOrigin,
+    LocalPosition,
+    Output,
+    Rejection,
+    Reset,
+    RsbnFix,
+    Source,
+    Vector3,
+)
+
+from . import errorstate, guarantee, inertial, radio
+from .carry import Carry, Level, Settings, Step, level, sources, state_at
+from .errorstate import ErrorState
+from .inertial import Point
+from .solution import solve
+
+TOGETHER_NS = 1_000_000_000  # GNSS this close to a beacon's answer joins its fix
+LEVEL_3D = 3  # GPS_FIX_TYPE_3D_FIX
+BOUND_GATE = 3.0  # a fix within this many guaranteed r.m.s. of the prediction is believed after an outage
+
+
+def step(carry: Carry, record: Input, settings: Settings) -> Step:
+    """The carry and the outputs after one more record; records it has no use for change nothing."""
+    use = _USES.get(type(record))
+    return (carry, []) if use is None else use(carry, record, settings)
+
+
+def _origin(carry: Carry, record: LocalOrigin, settings: Settings) -> Step:
+    old = carry.origin
+    if old is not None and (old.lat, old.lon, old.alt_msl) == (record.lat, record.lon, record.alt_msl):
+        return carry, []
+    text = "local origin known" if old is None else "local origin changed: the track begins anew from it"
+    carry = carry._replace(origin=record, track=(), local=None)
+    return carry, [Event(record.t_ns, record.rx_ns, 6 if old is None else 4, text)]
+
+
+def _global_position(carry: Carry, record: GlobalPosition, settings: Settings) -> Step:
+    """Without a stated origin, the same position said twice, locally and globally, tells where it is."""
+    local = carry.local
+    if carry.origin is not None or local is None or abs(record.t_ns - local.t_ns) > 50_000_000:
+        return carry, []
+    dt = (record.t_ns - local.t_ns) * 1e-9
+    north, east, down = (x + v * dt for x, v in zip(local.x_n, local.v_n, strict=True))
+    lat, lon, alt = displace(record.lat, record.lon, record.alt_msl, -north, -east, -down)
+    origin = LocalOrigin(record.t_ns, record.rx_ns, lat, lon, alt, "ardupilot")
+    return _origin(carry, origin, settings)
+
+
+def _local_position(carry: Carry, record: LocalPosition, settings: Settings) -> Step:
+    before, origin, out = carry.local, carry.origin, list[Output]()
+    carry = carry._replace(local=record)
+    if origin is None:
+        return carry, out
+    if before is not None:
+        if record.t_ns <= before.t_ns:
+            return carry._replace(local=before), out
+        jump = inertial.jump(before, record)
+        if jump is not None:
+            carry = _shifted(carry, jump[0], jump[1])
+            length = math.hypot(jump[0], jump[1])
+            out.append(Reset(record.t_ns, record.rx_ns, "inertial channel", f"it jumped by {length:.1f} m"))
+    carry = carry._replace(track=inertial.extend(carry.track, inertial.point(record, origin)))
+    if record.t_ns >= carry.next_ns:
+        carry, solution = solve(carry, record.rx_ns, settings)
+        out += solution
+    return carry, out
+
+
+def _shifted(carry: Carry, north: float, east: float) -> Carry:
+    """After a jump of the inertial channel: its error jumped with it, where the aircraft is did not."""
+    state = carry.state and errorstate.shift(carry.state, north, east)
+    promise = guarantee.shift(carry.guarantee, north, east)
+    return carry._replace(state=state, guarantee=promise, track=(), gnss_heard=None)
+
+
+def _gnss(carry: Carry, record: Gnss, settings: Settings) -> Step:
+    config = settings.config.gnss
+    if carry.gnss is not None and record.repeats(carry.gnss):
+        return carry, []
+    carry = carry._replace(gnss=record)
+    ins = inertial.at(carry.track, record.t_ns)
+    since = math.inf if carry.gnss_ns is None else (record.t_ns - carry.gnss_ns) * 1e-9
+    if record.fix < LEVEL_3D or ins is None or since < config.every_s:
+        return carry, []
+    heard = radio.from_gnss(record, ins, config)
+    # noise correlated over tau tells, per fix, dt / (2 tau) of what white noise would
+    inflate = max(1.0, 2.0 * config.correlation_s / since)
+    carry, out = _absorb(carry, heard, radio.from_gnss(record, ins, config, inflate), ins, record, settings)
+    if out:
+        return carry, out
+    learnt = _levelled(carry.level, record, ins, inflate)
+    carry = carry._replace(gnss_ns=record.t_ns, gnss_heard=heard, level=learnt)
+    if config.use_velocity and record.v_n is not None:
+        carry = _absorb_velocity(carry, record, record.v_n, ins, inflate, settings)
+    return _learn(carry, heard, ins, record, settings)
+
+
+def _rsbn(carry: Carry, record: RsbnFix, settings: Settings) -> Step:
+    ins = inertial.at(carry.track, record.t_ns)
+    if ins is None:
+        why = "no inertial position at its time"
+        return carry, [Rejection(record.t_ns, record.rx_ns, f"rsbn {record.beacon}", why)]
+    ins = level(ins, carry)
+    heard = radio.from_rsbn(record, ins, settings.config.rsbn)
+    if not heard.observations:
+        return carry, []
+    carry, out = _absorb(carry, heard, heard, ins, record, settings)
+    if out:
+        return carry, out
+    carry = carry._replace(rsbn_ns=record.t_ns)
+    gnss = carry.gnss_heard
+    together = heard
+    if gnss is not None and abs(record.t_ns - gnss.t_ns) <= TOGETHER_NS:
+        # the correction INS minus GNSS of a moment ago is that of now: the error drifts by metres a minute
+        together = radio.Heard(
+            record.t_ns, heard.observations + gnss.observations, heard.sources | gnss.sources
+        )
+    carry, out = _learn(carry, together, ins, record, settings)
+    carry, solution = solve(carry, record.rx_ns, settings)
+    return carry, [*out, *solution]
+
+
+def _absorb(
+    carry: Carry, raw: radio.Heard, used: radio.Heard, ins: Point, record: Gnss | RsbnFix, settings: Settings
+) -> Step:
+    """The error state with what was heard, if it can be believed: gated as `raw`, weighed as `used`.
+
+    An output means it was not believed. The first fix is, and while predicting one within the guaranteed
+    bound is, whatever the Gaussian state claims: then it is the claim that was wrong, and it is widened.
+    """
+    state = state_at(carry, ins, settings)
+    found = radio.innovation(raw, _prior(state, settings))
+    limit = settings.gate[radio.freedom(raw)]
+    if found.cost > limit:
+        if carry.state is not None and not _within_bound(carry, raw, settings):
+            carry = carry._replace(state=state)
+            return carry, [_rejected(record, "innovation beyond its gate (chi-square)", found.cost, limit)]
+        state = errorstate.widen(state, found.cost / limit)
+    if used is not raw or found.cost > limit:
+        found = radio.innovation(used, _prior(state, settings))
+    mean = -found.position[1::-1]  # the place in the plane is minus the error; x east, y north
+    covariance = found.covariance[1::-1, 1::-1]
+    return carry._replace(state=errorstate.absorb_position(state, mean, covariance)), []
+
+
+def _within_bound(carry: Carry, heard: radio.Heard, settings: Settings) -> bool:
+    """Whether a fix lies where the guaranteed prediction allows the aircraft to be; only asked while
+    predicting.
+    """
+    if sources(carry, heard.t_ns, settings) & ~Source.INERTIAL:
+        return False
+    _, promise = guarantee.bounded(carry.guarantee, heard.t_ns)
+    if promise is None:
+        return False
+    (north, east), (bound_n, bound_e) = promise.error_n, promise.bound_n
+    height = settings.config.inertial.height_sigma_m
+    wide = Position(np.array([-east, -north, 0.0]), np.diag([bound_e**2, bound_n**2, height**2]))
+    return radio.innovation(heard, wide).cost <= BOUND_GATE**2
+
+
+def _absorb_velocity(
+    carry: Carry, record: Gnss, v_n: Vector3, ins: Point, inflate: float, settings: Settings
+) -> Carry:
+    assert carry.state is not None
+    config = settings.config.gnss
+    sigma = max(record.sigma_velocity or 0.0, config.sigma_velocity_m_s)
+    error = (ins.v_n[0] - v_n[0], ins.v_n[1] - v_n[1])
+    state, nis = errorstate.absorb_velocity(carry.state, np.array(error), sigma * math.sqrt(inflate))
+    if nis > settings.gate[2]:
+        return carry
+    g = carry.guarantee
+    if settings.config.predictor.learn_velocity:
+        g = guarantee.learn(g, record.t_ns, "velocity", error, (sigma, sigma), settings.config.predictor)
+    return carry._replace(state=state, guarantee=g)
+
+
+def _levelled(old: Level, record: Gnss, ins: Point, inflate: float) -> Level:
+    """The height error against GNSS, followed as a random walk of 5 cm a root second (a barometer drifts)."""
+    r = inflate * max(record.sigma_vertical or 0.0, 5.0) ** 2
+    p = old.variance + 0.0025 * (inflate if math.isfinite(inflate) else 1.0)
+    k = p / (p + r)
+    return Level(old.error + k * (ins.position.alt - record.alt_msl - old.error), (1.0 - k) * p)
+
+
+def _learn(carry: Carry, heard: radio.Heard, ins: Point, record: Gnss | RsbnFix, settings: Settings) -> Step:
+    """The radio fix alone, the INS left out: it teaches the guaranteed predictor and goes to the log."""
+    height = Height(0.0, settings.config.inertial.height_sigma_m)
+    try:
+        fix = maximum_likelihood((*heard.observations, height), start=np.zeros(3))
+    except NoFix:
+        return carry, []  # an azimuth or a range alone is no fix; the error state has had its use of it
+    east, north, up = (float(c) for c in fix.position)
+    correction = (-north, -east)
+    (var_e, cov), var_n = fix.covariance[0, :2].tolist(), float(fix.covariance[1, 1])
+    sigma = (math.sqrt(var_n), math.sqrt(var_e))
+    g = guarantee.learn(
+        carry.guarantee, record.t_ns, "position", correction, sigma, settings.config.predictor
+    )
+    lat, lon, alt = displace(*ins.position, north, east, -up)
+    out = Fix(
+        record.t_ns,
+        record.rx_ns,
+        lat,
+        lon,
+        alt,
+        correction,
+        (var_n, cov, var_e),
+        int(heard.sources),
+        fix.cost,
+        fix.degrees_of_freedom,
+        fix.iterations,
+    )
+    return carry._replace(guarantee=g), [out]
+
+
+def _prior(state: ErrorState, settings: Settings) -> Position:
+    """Where the error state has the aircraft, as an observation in the plane at the INS."""
+    covariance = np.zeros((3, 3))
+    covariance[:2, :2] = state.P[1::-1, 1::-1]
+    covariance[2, 2] = settings.config.inertial.height_sigma_m**2
+    return Position(np.array([-state.x[1], -state.x[0], 0.0]), covariance)
+
+
+def _rejected(record: Gnss | RsbnFix, reason: str, value: float, limit: float) -> Rejection:
+    source = f"gnss {record.receiver}" if isinstance(record, Gnss) else f"rsbn {record.beacon}"
+    return Rejection(record.t_ns, record.rx_ns, source, reason, value, limit)
+
+
+_USES: dict[type, Callable[[Carry, Any, Settings], Step]] = {
+    LocalOrigin: _origin,
+    GlobalPosition: _global_position,
+    LocalPosition: _local_position,
+    Gnss: _gnss,
+    RsbnFix: _rsbn,
+}
