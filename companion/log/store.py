@@ -1,0 +1,198 @@
+"""Lays an MCAP file down on a disk, chunk by chunk, so that it can be cut off after any of its writes.
+
+It knows where the bytes go and what the summary at the end must say; it starts no thread and asks no clock.
+Schemas and channels stand before the chunk that first uses them, not inside it: a chunk lost to a full disk
+then takes no definition with it.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import struct
+import zlib
+from collections import defaultdict
+from collections.abc import Mapping
+from typing import Protocol
+
+import zstandard
+
+from .container import (
+    ATTACHMENT,
+    CHANNEL,
+    CHUNK_INDEX,
+    DATA_END,
+    FOOTER,
+    HEADER,
+    MAGIC,
+    METADATA,
+    METADATA_INDEX,
+    SCHEMA,
+    STATISTICS,
+    SUMMARY_OFFSET,
+    Chunk,
+    pack,
+    record,
+    text,
+    texts,
+)
+
+
+class Disk(Protocol):
+    """Where a file's bytes go; every method may raise OSError."""
+
+    def write(self, data: bytes) -> None:
+        """Append all of `data`."""
+
+    def sync(self) -> None:
+        """Return once what was written survives a loss of power."""
+
+    def truncate(self, size: int) -> None:
+        """Cut off what stands after `size` bytes; the next write goes there."""
+
+    def close(self) -> None:
+        """Let go."""
+
+
+class DiskFile:
+    """A file that is written once from front to back; `reserve` bytes of its disk are left to others."""
+
+    def __init__(self, path: str | os.PathLike[str], reserve: int = 0) -> None:
+        self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o644)
+        self._reserve = reserve
+
+    def write(self, data: bytes) -> None:
+        """See `Disk`; refuses where it would eat into the reserve."""
+        if self._reserve:
+            room = os.fstatvfs(self._fd)
+            if room.f_bavail * room.f_frsize < self._reserve + len(data):
+                raise OSError(errno.ENOSPC, f"less than {self._reserve} bytes would be left on the disk")
+        view = memoryview(data)
+        while view:
+            view = view[os.write(self._fd, view) :]
+
+    def sync(self) -> None:
+        """See `Disk`."""
+        os.fdatasync(self._fd)
+
+    def truncate(self, size: int) -> None:
+        """See `Disk`."""
+        os.ftruncate(self._fd, size)
+        os.lseek(self._fd, size, os.SEEK_SET)
+
+    def close(self) -> None:
+        """See `Disk`."""
+        os.close(self._fd)
+
+
+class Store:
+    """Lays an MCAP file down on `disk`. After every method that returned, the file is readable so far.
+
+    A method that raises OSError has been undone and may be called again.
+    """
+
+    def __init__(self, disk: Disk, library: str) -> None:
+        self._disk = disk
+        self._end = 0
+        self._compress = zstandard.ZstdCompressor(level=1).compress
+        self._schemas: dict[int, bytes] = {}
+        self._channels: dict[int, bytes] = {}
+        self._counts: defaultdict[int, int] = defaultdict(int)
+        self._chunk_indexes: list[bytes] = []
+        self._metadata_indexes: list[bytes] = []
+        self._attachments = 0
+        self._first: int | None = None
+        self._last = 0
+        self._append(MAGIC + record(HEADER, text(""), text(library)))
+
+    def metadata(self, name: str, values: Mapping[str, str]) -> None:
+        """Add one metadata record."""
+        body = record(METADATA, text(name), texts(values))
+        self._append(body)
+        place = struct.pack("<QQ", self._end - len(body), len(body))
+        self._metadata_indexes.append(record(METADATA_INDEX, place, text(name)))
+
+    def attachment(self, content: bytes) -> None:
+        """Add one attachment record as it stood in another file."""
+        self._append(record(ATTACHMENT, content))
+        self._attachments += 1
+
+    def chunk(self, chunk: Chunk, schemas: Mapping[int, bytes], channels: Mapping[int, bytes]) -> None:
+        """Add `chunk`; `schemas` and `channels` are the contents of the records it may refer to, by id."""
+        new = [name for name in chunk.index if name not in self._channels]
+        needed = {name: int.from_bytes(channels[name][2:4], "little") for name in new}
+        new_schemas = {i: schemas[i] for i in needed.values() if i in schemas and i not in self._schemas}
+        definitions = b"".join(record(SCHEMA, content) for content in new_schemas.values())
+        definitions += b"".join(record(CHANNEL, channels[name]) for name in new)
+        body, indexes, first, last, squeezed = pack(chunk, self._compress)
+        self._append(definitions + body + indexes)
+
+        self._schemas |= new_schemas
+        self._channels |= {name: channels[name] for name in new}
+        at = self._end - len(indexes)
+        places = b""
+        for of, entries in chunk.index.items():
+            self._counts[of] += len(entries) // 2
+            places += struct.pack("<HQ", of, at)
+            at += 9 + 6 + 8 * len(entries)
+        self._chunk_indexes.append(
+            record(
+                CHUNK_INDEX,
+                struct.pack("<QQQQ", first, last, self._end - len(indexes) - len(body), len(body)),
+                struct.pack("<I", len(places)) + places,
+                struct.pack("<Q", len(indexes)) + text("zstd"),
+                struct.pack("<QQ", squeezed, len(chunk.data)),
+            )
+        )
+        self._first = first if self._first is None else min(first, self._first)
+        self._last = max(last, self._last)
+
+    def finish(self) -> None:
+        """Write the summary, the footer and the closing magic."""
+        counts = b"".join(struct.pack("<HQ", of, count) for of, count in self._counts.items())
+        statistics = struct.pack(
+            "<QHIIIIQQI",
+            sum(self._counts.values()),
+            len(self._schemas),
+            len(self._channels),
+            self._attachments,
+            len(self._metadata_indexes),
+            len(self._chunk_indexes),
+            self._first or 0,
+            self._last,
+            len(counts),
+        )
+        groups = (
+            (SCHEMA, [record(SCHEMA, content) for content in self._schemas.values()]),
+            (CHANNEL, [record(CHANNEL, content) for content in self._channels.values()]),
+            (STATISTICS, [record(STATISTICS, statistics, counts)]),
+            (CHUNK_INDEX, self._chunk_indexes),
+            (METADATA_INDEX, self._metadata_indexes),
+        )
+        data_end = record(DATA_END, struct.pack("<I", 0))
+        start = self._end + len(data_end)
+        summary, offsets = b"", b""
+        for opcode, members in groups:
+            group = b"".join(members)
+            if group:
+                place = struct.pack("<BQQ", opcode, start + len(summary), len(group))
+                offsets += record(SUMMARY_OFFSET, place)
+                summary += group
+        tail = summary + offsets + struct.pack("<BQQQ", FOOTER, 20, start, start + len(summary))
+        self._append(data_end + tail + struct.pack("<I", zlib.crc32(tail)) + MAGIC)
+
+    def sync(self) -> None:
+        """Put what was written where a loss of power does not reach it."""
+        self._disk.sync()
+
+    def close(self) -> None:
+        """Let the disk go; without `finish` before it the file stays open-ended."""
+        self._disk.close()
+
+    def _append(self, data: bytes) -> None:
+        try:
+            self._disk.write(data)
+        except OSError:
+            self._disk.truncate(self._end)
+            raise
+        self._end += len(data)
