@@ -1,0 +1,245 @@
+"""Guaranteed linear estimation from sampled measurements of any kind, by exchange.
+
+Measurements z_j = H_j x + rho_j, E rho_j = 0, E rho_j^2 <= sigma_j^2, with ANY correlation between the rho.
+Of all linear unbiased estimates of a . x the one whose worst r.m.s. error is least solves (Matasov,
+Martirosyan (1.9)-(1.10))
+
+    minimise sum sigma_j |w_j|   subject to   sum H_j w_j = a                            (primal)
+    maximise a . lambda          subject to   |H_j . lambda| <= sigma_j                  (dual)
+
+A basis of r independent rows, r the rank (4 on the Schuler channel), gives weights by one small solve and is
+feasible whatever their signs, so there is no first phase. Its dual vector is a generalised polynomial H .
+lambda that levels at +-sigma on the basis; the row where it sticks out most enters, and the line search of
+the entering weight tells which leaves: the simplex method, or Remez's exchange. It ends with both values
+equal, and that equality is the proof.
+
+All work is done on orthonormal coordinates, H / sigma = Q S, found once for many targets: there the levelled
+polynomial is known to a few units of the last place however short the window, and least squares costs one
+product, because the same problem with |w|_2 for |w|_1 is solved by w = Q a.
+
+It knows neither time nor navigation: rows are rows. Degenerate targets (weights that vanish) are handled by
+Bland's rule after a stall; unobservable ones raise `Infeasible`. The optimum need not be unique, its value
+is.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple, Self
+
+import numpy as np
+import numpy.typing as npt
+import scipy.linalg
+
+Floats = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.intp]
+
+LEVEL_TOLERANCE = 1e-12  # how far |H lambda| may exceed sigma, relative: also the duality gap left
+RANK_TOLERANCE = 1e-13  # singular values below this share of the largest are rounding
+EXCHANGES_MAX = 1000  # a handful to thirty are usual
+
+
+class Infeasible(ValueError):
+    """The rows do not see the target: no unbiased estimate exists."""
+
+
+class Minimax(NamedTuple):
+    """The minimax estimate w . z and its certificate: a . dual <= least worst error <= bound."""
+
+    weights: Floats  # (n,)
+    bound: float  # sum sigma |w|, the worst r.m.s. error
+    dual: Floats  # (m,) lambda, feasible
+    gap: float  # (bound - a . dual) / bound
+    active: tuple[int, ...]  # rows of the last basis: start the next, similar problem from them
+
+
+class LeastSquares(NamedTuple):
+    """The least-squares estimate w . z, with what it claims and what it may suffer."""
+
+    weights: Floats  # (n,)
+    claimed: float  # one sigma if the errors were uncorrelated
+    worst: float  # sum sigma |w|: under the worst correlation
+
+
+def worst_case(weights: npt.ArrayLike, sigmas: npt.ArrayLike) -> float:
+    """Return sum sigma |w|: the r.m.s. error of w . z under the worst correlation, rho = +-sigma sign w."""
+    return float(np.sum(np.abs(np.asarray(weights) * np.asarray(sigmas))))
+
+
+def white(weights: npt.ArrayLike, sigmas: npt.ArrayLike) -> float:
+    """Return sqrt(sum sigma^2 w^2): the r.m.s. error of w . z under uncorrelated errors."""
+    return float(np.linalg.norm(np.asarray(weights) * np.asarray(sigmas)))
+
+
+def solve(
+    rows: npt.ArrayLike, target: npt.ArrayLike, sigmas: npt.ArrayLike, start: Sequence[int] | None = None
+) -> Minimax:
+    """Return the minimax estimate of target . x; rows (n, m), target (m,), sigmas (n,) or one for all.
+
+    `start` is the `active` of a similar problem. Raises Infeasible where the rows do not determine the
+    target, and ValueError on shapes, NaN or sigmas that are not positive.
+    """
+    return Design.of(rows, sigmas).minimax(target, start)
+
+
+def least_squares(rows: npt.ArrayLike, target: npt.ArrayLike, sigmas: npt.ArrayLike) -> LeastSquares:
+    """Return the weighted least-squares estimate of target . x; arguments and errors as in `solve`."""
+    return Design.of(rows, sigmas).least_squares(target)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Design:
+    """Rows and sigmas, checked and factored once, ready for any number of targets."""
+
+    sigmas: Floats  # (n,)
+    whitened: Floats  # (n, m) H / sigma
+    q: Floats  # (r, n) the rows in orthonormal coordinates: q q^T = 1
+    coordinates: Floats  # (m, r): whitened @ coordinates = q^T
+    unseen: Floats  # (m, m) projector, in scaled columns, on what no row sees
+    columns: Floats  # (m,) scale of each column
+
+    @classmethod
+    def of(cls, rows: npt.ArrayLike, sigmas: npt.ArrayLike) -> Self:
+        """Check rows (n, m) and sigmas (n,) or scalar, and factor them."""
+        rows = np.asarray(rows, dtype=np.float64)
+        if rows.ndim != 2 or rows.shape[0] == 0 or rows.shape[1] == 0:
+            raise ValueError(f"rows has shape {rows.shape}; give (n, m) with one measurement or more")
+        sigmas = np.asarray(sigmas, dtype=np.float64)
+        if sigmas.ndim == 0:
+            sigmas = np.full(len(rows), sigmas)
+        if sigmas.shape != (len(rows),):
+            raise ValueError(f"sigmas has shape {sigmas.shape}, rows {rows.shape}; give one sigma a row")
+        if not np.isfinite(rows).all():
+            i = int(np.argmin(np.isfinite(rows).all(axis=1)))
+            raise ValueError(f"rows[{i}] is not finite; leave a missing measurement out")
+        if not (np.isfinite(sigmas) & (sigmas > 0.0)).all():
+            i = int(np.argmin(np.isfinite(sigmas) & (sigmas > 0.0)))
+            raise ValueError(f"sigmas[{i}] is {sigmas[i]}; give a positive one or leave the row out")
+        whitened = rows / sigmas[:, None]
+        columns = np.abs(whitened).max(axis=0)
+        columns[columns == 0.0] = 1.0
+        triangle = np.linalg.qr(whitened / columns, mode="r")
+        _, singular, v_t = np.linalg.svd(triangle)
+        rank = int(np.count_nonzero(singular > RANK_TOLERANCE * max(singular[0], np.finfo(float).tiny)))
+        seen = v_t[:rank]
+        coordinates = (seen.T / singular[:rank]) / columns[:, None]
+        unseen = np.eye(len(columns)) - seen.T @ seen
+        return cls(
+            sigmas, whitened, np.ascontiguousarray((whitened @ coordinates).T), coordinates, unseen, columns
+        )
+
+    def in_coordinates(self, target: npt.ArrayLike) -> tuple[Floats, Floats]:
+        """Return target (m,) as floats and in the orthonormal coordinates (r,), or raise Infeasible."""
+        a = np.asarray(target, dtype=np.float64)
+        m = len(self.columns)
+        if a.shape != (m,):
+            raise ValueError(f"target has shape {a.shape}; give ({m},), one number an unknown")
+        if not np.isfinite(a).all():
+            raise ValueError(f"target[{int(np.argmin(np.isfinite(a)))}] is not finite; give numbers")
+        scaled = a / self.columns
+        missed = np.abs(self.unseen @ scaled)
+        size = float(np.linalg.norm(scaled))
+        if missed.max() > 1e-9 * size:
+            blamed = ", ".join(str(i) for i in np.flatnonzero((missed > 1e-9 * size) & (a != 0.0)))
+            rank, n = self.q.shape
+            raise Infeasible(
+                f"target is not observable in component {blamed}: {n} rows have rank {rank} of {m}; "
+                "add measurements at other times or of another quantity"
+            )
+        return a, a @ self.coordinates
+
+    def minimax(self, target: npt.ArrayLike, start: Sequence[int] | None = None) -> Minimax:
+        """Solve for one target (m,) by exchange, from the rows `start` if they are a basis."""
+        a, a_q = self.in_coordinates(target)
+        weights = np.zeros(len(self.sigmas))
+        if not a_q.any():
+            return Minimax(weights, 0.0, np.zeros_like(a), 0.0, ())
+        basis, w, dual_q = _exchange(self.q, a_q, self._basis(start))
+        bound = float(np.abs(w).sum())
+        weights[basis] = w / self.sigmas[basis]
+        dual = self.coordinates @ dual_q
+        dual /= max(1.0, float(np.abs(self.whitened @ dual).max()))
+        return Minimax(
+            weights, bound, dual, (bound - float(a @ dual)) / bound, tuple(np.sort(basis).tolist())
+        )
+
+    def least_squares(self, target: npt.ArrayLike) -> LeastSquares:
+        """Solve for one target (m,) in the least-squares sense."""
+        _, a_q = self.in_coordinates(target)
+        whitened_weights = a_q @ self.q
+        return LeastSquares(
+            whitened_weights / self.sigmas, float(np.linalg.norm(a_q)), float(np.abs(whitened_weights).sum())
+        )
+
+    def _basis(self, start: Sequence[int] | None) -> Indices:
+        """Return r independent rows: `start`, else the extremal nodes of a window, else by pivoting."""
+        rank, n = self.q.shape
+        nodes = 0.5 * (1.0 - np.cos(np.pi * np.arange(rank) / max(rank - 1, 1)))
+        for rows in (start, np.round(nodes * (n - 1))):
+            if rows is None or len(rows) != rank:
+                continue
+            basis = np.asarray(rows, dtype=np.intp)
+            if basis.min() >= 0 and basis.max() < n and np.linalg.cond(self.q[:, basis]) < 1e8:
+                return basis
+        return np.asarray(scipy.linalg.qr(self.q, mode="r", pivoting=True)[-1][:rank], dtype=np.intp)
+
+
+def _exchange(q: Floats, a: Floats, basis: Indices) -> tuple[Indices, Floats, Floats]:
+    """Return the optimal basis, its whitened weights and the dual vector, from any independent basis.
+
+    q (r, n), a (r,). The sign of a weight is kept as part of the basis, so that a weight of zero has one too.
+    """
+    basis = basis.copy()
+    sign = np.where(np.linalg.solve(q[:, basis], a) < 0.0, -1.0, 1.0)
+    cost, stalled = np.inf, 0
+    held = (basis.copy(), np.zeros_like(a), np.zeros_like(a))
+    for _ in range(EXCHANGES_MAX):
+        b = q[:, basis]
+        inverse = np.linalg.inv(b)
+        w = inverse @ a
+        w += inverse @ (a - b @ w)
+        if np.abs(b @ w - a).max() > 1e-10 * np.abs(a).max():
+            break  # two rows all but equal: the basis before was optimal to within rounding
+        size = sign * w
+        wrong = size < -1e-13 * np.abs(size).sum()  # by rounding, in a nearly singular basis
+        sign[wrong], size[wrong] = -sign[wrong], -size[wrong]
+        dual = sign @ inverse
+        held = (basis.copy(), w, dual)
+        level = dual @ q
+        excess = np.abs(level)
+        stalled = 0 if (now := float(size.sum())) < cost * (1.0 - 1e-14) else stalled + 1
+        cost = now
+        careful = stalled > 3 * len(a)
+        enter = int(np.argmax(excess > 1.0 + LEVEL_TOLERANCE)) if careful else int(excess.argmax())
+        if excess[enter] <= 1.0 + LEVEL_TOLERANCE:
+            break
+        side = 1.0 if level[enter] > 0.0 else -1.0
+        rate = sign * (inverse @ q[:, enter]) * side  # how fast each |w| of the basis falls
+        leave = (
+            _first_to_vanish(size, rate, basis) if careful else _long_step(size, rate, sign, excess[enter])
+        )
+        basis[leave], sign[leave] = enter, side
+    return held
+
+
+def _long_step(size: Floats, rate: Floats, sign: Floats, excess: float) -> int:
+    """Return which weight leaves, changing `sign` of those passed on the way.
+
+    The cost is convex in the entering weight and its slope, 1 - excess at first, grows by twice the rate of
+    each weight that vanishes; while it stays negative that weight had better change sign than leave.
+    """
+    falling = np.flatnonzero(rate > 1e-11 * np.abs(rate).max())
+    slope = 1.0 - excess
+    for i in falling[np.argsort(size[falling] / rate[falling], kind="stable")]:
+        slope += 2.0 * rate[i]
+        if slope >= 0.0:
+            break
+        sign[i] = -sign[i]
+    return int(i)
+
+
+def _first_to_vanish(size: Floats, rate: Floats, basis: Indices) -> int:
+    """Return the weight that vanishes first, of several the lowest row: Bland's rule."""
+    falling = np.flatnonzero(rate > 1e-11 * np.abs(rate).max())
+    when = np.maximum(size[falling], 0.0) / rate[falling]
+    first = falling[when <= when.min() * (1.0 + 1e-12) + 1e-300]
+    return int(first[np.argmin(basis[first])])

@@ -1,0 +1,110 @@
+"""The Schuler channel: how one horizontal INS error moves, and what its four numbers are in SI units.
+
+Matasov, Martirosyan (2.1), in dimensionless time tau = omega0 t, omega0 = sqrt(g / R):
+
+    gamma' = mu     phi' = mu - vartheta     mu' = -phi     vartheta' = 0
+
+    gamma      position error / R                            [m]      after `Scale.units`
+    phi        tilt less the reduced accelerometer error     [rad]
+    mu         velocity error / (R omega0)                   [m/s]
+    vartheta   constant gyro drift / omega0                  [rad/s]
+
+One channel is one horizontal axis, north or east, along or across the great circle: (2.1) is the same.
+Errors are INS minus truth. What phi and vartheta are in NED, with (P_N, P_E) MINUS the rotation of the
+platform about north and east, (E_N, E_E) minus its physical drift and (A_N, A_E) the accelerometer errors:
+
+    north   dV_N' = -g P_E + A_N,   P_E' =  dV_N / R + E_E    so   phi =  P_E - A_N / g,   drift = -E_E
+    east    dV_E' =  g P_N + A_E,   P_N' = -dV_E / R + E_N    so   phi = -P_N - A_E / g,   drift =  E_N
+
+Another axis at azimuth psi (along the course, say) mixes them like any horizontal vector: cos psi of north
+plus sin psi of east for all four numbers.
+
+It does not know the Earth's rotation, the coupling of the two axes nor the heading error: over an hour or
+two in level flight that is an error of a few per cent; `nav.error_model` has the whole matrix.
+"""
+
+import math
+from typing import Literal, NamedTuple, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+
+Floats = npt.NDArray[np.float64]
+Number = TypeVar("Number", float, Floats)
+
+EARTH_RADIUS = 6_371_000.0  # [m] the sphere of (2.1)
+SCHULER_RATE = 1.2387e-3  # [rad/s] sqrt(g / R); 84.5 min; g = 9.81 m/s^2 would give 1.2409e-3
+ARCSECOND = math.pi / 648_000  # [rad]
+DEG_PER_HOUR = math.pi / 648_000  # [rad/s]; the same number: 3600 s, 3600 arcseconds
+
+STATE = ("gamma", "phi", "mu", "vartheta")
+
+
+class Scale(NamedTuple):
+    """What one unit of dimensionless time and state is in SI: the only place where it meets metres."""
+
+    radius: float = EARTH_RADIUS
+    rate: float = SCHULER_RATE
+
+    @property
+    def units(self) -> tuple[float, float, float, float]:
+        """Multipliers of gamma, phi, mu, vartheta to m, rad, m/s, rad/s."""
+        return (self.radius, 1.0, self.radius * self.rate, self.rate)
+
+
+MEAN_EARTH = Scale()
+
+
+def sine_excess(x: Floats) -> Floats:
+    """Return u(x) = x - sin x to full relative precision, where the difference itself cancels near zero."""
+    return np.where(np.abs(x) < 0.5, x * x * x * _excess_series(x * x), x - np.sin(x))
+
+
+def sine_excess_at(x: float) -> float:
+    """Return `sine_excess` of one number, fifty times faster."""
+    return x * x * x * _excess_series(x * x) if abs(x) < 0.5 else x - math.sin(x)
+
+
+def _excess_series(square: Number) -> Number:
+    """Return (x - sin x) / x^3 from x^2 < 1/4: 1/3! (1 - x^2/(4 5) (1 - x^2/(6 7) (...)))."""
+    series = 1.0 - square / 272.0
+    for k in (15, 13, 11, 9, 7, 5):
+        series = 1.0 - square / ((k - 1) * k) * series
+    return series / 6.0
+
+
+def schuler_row(quantity: Literal["gamma", "mu"], s: npt.ArrayLike) -> Floats:
+    """Return H with H . state = the quantity, measured a dimensionless time s before that state.
+
+    s scalar gives (4,), s (n,) gives (n, 4); s may be negative (measured after). Equation (2.1) solved
+    backwards.
+    """
+    s = np.asarray(s, dtype=np.float64)
+    row = np.empty((*s.shape, 4))
+    versine = 2.0 * np.sin(0.5 * s) ** 2  # 1 - cos s without cancellation
+    if quantity == "gamma":
+        row[..., 0] = 1.0
+        row[..., 1] = -versine
+        row[..., 2] = -np.sin(s)
+        row[..., 3] = -sine_excess(s)
+    elif quantity == "mu":
+        row[..., 0] = 0.0
+        row[..., 1] = np.sin(s)
+        row[..., 2] = np.cos(s)
+        row[..., 3] = versine
+    else:
+        raise ValueError(f"schuler_row: quantity is {quantity!r}; give 'gamma' (position) or 'mu' (velocity)")
+    return row
+
+
+def transition(alpha: float) -> Floats:
+    """Return the (4, 4) matrix that takes the state a dimensionless time alpha ahead: (2.1) forwards."""
+    sin, cos, versine = math.sin(alpha), math.cos(alpha), 2.0 * math.sin(0.5 * alpha) ** 2
+    return np.array(
+        [
+            [1.0, -versine, sin, sine_excess_at(alpha)],
+            [0.0, cos, sin, -sin],
+            [0.0, -sin, cos, versine],
+            [0.0, 0.0, 0.0, 1.0],
+        ]
+    )
