@@ -1,0 +1,80 @@
+"""`companion study horizon` answers in the numbers of the closed form."""
+
+import json
+import math
+from itertools import pairwise
+
+import pytest
+from click.testing import CliRunner
+
+from companion.estimate.minimax import closed_form
+from companion.estimate.schuler import DEG_PER_HOUR, MEAN_EARTH
+from companion.study.horizon import Horizon, command
+
+
+def run(*arguments):
+    return CliRunner().invoke(command, arguments)
+
+
+def test_numbers_of_the_closed_form():
+    answer = json.loads(
+        run("--sigma-m", "30", "--window-min", "15", "--ahead-min", "5,10,20", "--json").stdout
+    )
+    assert [row["ahead_min"] for row in answer["table"]] == [5, 10, 20]
+    grid = 4.03 / 900**2
+    assert [row["position_m"] for row in answer["table"]] == pytest.approx(
+        [391.731747, 1216.97846, 4558.45109], rel=grid
+    )
+    assert answer["table"][0]["velocity_mps"] == pytest.approx(1.90645543, rel=grid)
+    assert answer["table"][0]["tilt_arcsec"] == pytest.approx(109.928437, rel=grid)
+    assert all(row["drift_deg_h"] == pytest.approx(0.163481305, rel=grid) for row in answer["table"])
+    assert answer["table"][1]["ls_claimed_m"] == pytest.approx(70.7, abs=0.05)
+    assert answer["table"][1]["ls_worst_m"] == pytest.approx(1786.5, abs=0.05)
+
+
+def test_how_long_without_fixes():
+    horizon = Horizon(30.0, 900.0)
+    longest = horizon.longest(1000.0)
+    assert horizon.position(longest) <= 1000.0 < horizon.position(longest + 1.0)
+    ahead = [
+        closed_form(900 * MEAN_EARTH.rate, t * MEAN_EARTH.rate).bounds[0] * 30.0
+        for t in (longest, longest + 1)
+    ]
+    assert ahead[0] <= 1000.0 < ahead[1]
+    assert horizon.longest(1.0) == 0.0  # not even now
+    assert f"below 1000 m for {longest / 60:.1f} min" in run("--limit-m", "1000").stdout
+
+
+def test_a_trusted_drift_buys_time_and_never_costs():
+    free = Horizon(30.0, 900.0)
+    kept = [Horizon(30.0, 900.0, drift=grade * DEG_PER_HOUR) for grade in (0.01, 0.1, 10.0)]
+    for minutes in (0, 10, 40, 120):
+        bounds = [horizon.position(60.0 * minutes) for horizon in (*kept, free)]
+        assert all(a <= b * (1 + 1e-10) for a, b in pairwise(bounds))
+    assert kept[0].at(600.0).drift_deg_h == pytest.approx(0.01, rel=1e-9)
+    assert kept[0].longest(1000.0) > 2.0 * free.longest(1000.0)
+
+
+def test_table_grade_and_plot(tmp_path):
+    result = run("--ins", "navigation", "--ahead-min", "30", "--plot", str(tmp_path / "bound.png"))
+    assert result.exit_code == 0, result.output
+    assert "INS drift 0.01 deg/h" in result.stdout and "least squares" in result.stdout
+    assert (tmp_path / "bound.png").read_bytes().startswith(b"\x89PNG")
+    assert math.isinf(Horizon(1.0, 3600.0, 10.0, drift=1e-12).longest(1e9))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (("--ahead-min", "ten"), "not a number nor a list"),
+        (("--ahead-min", "-5,3"), "give minutes from 0 up"),
+        (("--ins", "best"), "no grade"),
+        (("--sigma-m", "-3"), "sigmas[0] is"),
+        (("--window-min", "0"), "give positive seconds"),
+        (("--window-min", "1", "--every-s", "60"), "too few fixes"),
+    ],
+)
+def test_bad_options_are_told(arguments, told):
+    result = run(*arguments)
+    assert result.exit_code == 2
+    assert told in " ".join(result.output.replace("│", " ").split())

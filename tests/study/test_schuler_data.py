@@ -1,0 +1,90 @@
+"""Five real Schuler periods: what the prediction and its bound are worth on a flight nobody simulated."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from companion.estimate.schuler import SCHULER_RATE
+from companion.study.schuler_data import STATED_SIGMA, command, load, run
+
+FLIGHT = Path(__file__).parents[1] / "data" / "schuler_deepwave_ff02_10s.csv.gz"
+ORIGINAL = Path(__file__).parents[2].parent / "shared" / "data" / "schuler" / "deepwave_ff02_20140601.csv"
+HORIZONS = [300.0, 600.0, 1200.0, 2400.0, 3600.0]
+
+
+@pytest.fixture(scope="module")
+def recording():
+    return load(FLIGHT)
+
+
+@pytest.fixture(scope="module")
+def outcomes(recording):
+    return [
+        outcome
+        for channel in ("east", "north")
+        for window in (1800.0, 3600.0, 5400.0)
+        for outcome in run(recording, channel, window, HORIZONS, STATED_SIGMA)
+    ]
+
+
+def test_the_recording_oscillates_at_schulers_rate(recording):
+    """Least squares over the rate itself, on five periods."""
+    seconds, east = recording.t_ns * 1e-9, recording.channels["east"]
+    assert 5.0 < seconds[-1] / 3600.0 < 5.1
+
+    def misfit(rate):
+        model = np.column_stack([np.sin(rate * seconds), np.cos(rate * seconds), np.ones_like(seconds)])
+        return float(np.linalg.lstsq(model, east, rcond=None)[1][0])
+
+    rates = SCHULER_RATE * np.linspace(0.8, 1.2, 401)
+    assert rates[np.argmin([misfit(rate) for rate in rates])] == pytest.approx(SCHULER_RATE, rel=0.03)
+
+
+def test_prediction_beats_the_line_always_and_the_last_error_beyond_ten_minutes(outcomes):
+    assert len(outcomes) == 30 and all(o.n >= 30 for o in outcomes)
+    assert all(o.minimax_rms < 0.75 * o.line_rms for o in outcomes)
+    assert all(o.minimax_rms < 0.91 * o.hold_rms for o in outcomes if o.ahead_min >= 10)
+    assert all(o.minimax_rms < 0.75 * o.hold_rms for o in outcomes if o.channel == "east")
+
+
+def test_stated_bound_holds_where_least_squares_claim_does_not(outcomes):
+    """What is compared with is measured too, and bounds add: the r.m.s. difference is within bound + sigma."""
+    assert all(o.minimax_rms <= o.bound + o.sigma for o in outcomes)
+    assert all(o.inside > 0.65 for o in outcomes)
+    total = sum(o.n for o in outcomes)
+    assert sum(o.n * o.inside for o in outcomes) / total > 0.80
+    assert sum(o.n * o.ls_inside for o in outcomes) / total < 0.40
+    assert all(o.sigma_68 < 1.0 * STATED_SIGMA for o in outcomes)
+
+
+def test_the_bound_scales_with_what_is_stated_and_the_estimate_does_not(recording):
+    once, twice = (run(recording, "north", 3600.0, [600.0], sigma)[0] for sigma in (0.1, 0.2))
+    assert twice.bound == pytest.approx(2.0 * once.bound, rel=1e-9)
+    assert twice.minimax_rms == pytest.approx(once.minimax_rms, rel=1e-6)
+    assert twice.sigma_68 == pytest.approx(once.sigma_68, rel=1e-6)
+
+
+def test_command():
+    arguments = [str(FLIGHT), "--window-min", "60", "--ahead-min", "5,20"]
+    table = CliRunner().invoke(command, arguments)
+    assert table.exit_code == 0 and "minimax" in table.stdout
+    answer = json.loads(CliRunner().invoke(command, [*arguments, "--json"]).stdout)
+    assert [(o["channel"], o["ahead_min"]) for o in answer] == [
+        ("east", 5),
+        ("east", 20),
+        ("north", 5),
+        ("north", 20),
+    ]
+    assert CliRunner().invoke(command, [str(FLIGHT), "--window-min", "x"]).exit_code == 2
+    assert "sigma -1.0" in CliRunner().invoke(command, [*arguments, "--sigma-mps", "-1"]).output
+
+
+@pytest.mark.shared
+@pytest.mark.skipif(not ORIGINAL.exists(), reason="the full recording stands beside the repository")
+def test_the_cut_is_the_recording(recording):
+    whole = load(ORIGINAL)
+    assert (whole.t_ns == recording.t_ns).all()
+    assert (whole.channels["east"] == recording.channels["east"]).all()
