@@ -1,0 +1,1 @@
+"""Benchmarks: each module yields the cases that are worth timing."""
