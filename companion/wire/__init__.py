@@ -1,0 +1,14 @@
+"""MAVLink messages <-> records: the only place where scaling, units and sentinels change. Pure, no clock.
+
+`decode(message, rx_ns, sender)` turns what an autopilot says into records, `encode(solution, receiver)`
+turns what the companion says into messages; each is a table of small functions by message. The simulator's
+half of the mirror (records of sensors -> messages) is `sitl.encode`.
+
+It knows nothing of links, frames of bytes, who may speak (a message is believed to come from the autopilot
+it is handed in for) or of what a record is used for.
+"""
+
+from companion.wire.decode import Autopilot, Clock, Sender, decode
+from companion.wire.encode import ENCODERS, Receiver, accuracy, encode
+
+__all__ = ["ENCODERS", "Autopilot", "Clock", "Receiver", "Sender", "accuracy", "decode", "encode"]
