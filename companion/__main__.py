@@ -1,0 +1,80 @@
+"""The command line: a table of commands, each loaded only when it is called.
+
+A command is a click command in the module that does its work. The simulator's come through entry points, so
+that nothing here imports it: an aircraft may fly without.
+"""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from importlib.metadata import entry_points
+
+import click
+
+from companion import __version__
+from companion.config import ConfigError
+from companion.log.opened import LogError
+
+EX_CONFIG = 78  # sysexits.h
+COMMANDS = {
+    "run": "companion.service:command",
+    "replay": "companion.log.replay:command",
+    "log": "companion.log.command:group",
+    "check-config": "companion.check:command",
+    "bench": "companion.bench.command:command",
+}
+STUDIES = {
+    "horizon": "companion.study.horizon:command",
+    "schuler": "companion.study.schuler_data:command",
+    "weights": "companion.study.weights:command",
+    "restrictive": "companion.study.restrictive:command",
+}
+
+
+class Lazy(click.Group):
+    """A group whose commands are imported when named: `companion --help` stays quick."""
+
+    def __init__(self, table: dict[str, str], plugins: str | None = None, **settings: object) -> None:
+        super().__init__(**settings)  # type: ignore[arg-type]
+        self._table = dict(table)
+        if plugins:
+            self._table |= {entry.name: entry.value for entry in entry_points(group=plugins)}
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """All names, in order."""
+        return sorted({*self._table, *self.commands})
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """The command of that name, imported now."""
+        if cmd_name not in self._table:
+            return super().get_command(ctx, cmd_name)
+        module, attribute = self._table[cmd_name].split(":")
+        command: click.Command = getattr(importlib.import_module(module), attribute)
+        return command
+
+
+cli = Lazy(
+    COMMANDS,
+    "companion.commands",
+    name="companion",
+    help="Keeps an aircraft's position, and a guaranteed bound on it, when GNSS is gone.",
+)
+cli = click.version_option(__version__, prog_name="companion")(cli)
+cli.add_command(Lazy(STUDIES, name="study", help="Numbers and plots behind the estimators."))
+
+
+def main() -> None:
+    """Run the command line; whatever a person can mend ends in one sentence and an exit code."""
+    try:
+        cli(standalone_mode=True)
+    except ConfigError as error:
+        click.echo(f"companion: {error}", err=True)
+        sys.exit(EX_CONFIG)
+    except LogError as error:
+        click.echo(f"companion: {error}", err=True)
+        sys.exit(1)
+
+
+if __name__ == "__main__":
+    main()
