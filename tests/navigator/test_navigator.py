@@ -1,0 +1,265 @@
+"""The navigator as a fold: what it promises, and what late, wild and repeated records may not do to it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from functools import lru_cache
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from companion.config import Config, load
+from companion.nav.discrete import discretise
+from companion.nav.error_model import aircraft
+from companion.nav.geometry import (
+    Geodetic,
+    displace,
+    from_enu,
+    geodetic_to_local,
+    separation,
+    slant_range_azimuth,
+)
+from companion.navigator import Navigator, errorstate
+from companion.records import (
+    Fix,
+    Gnss,
+    LocalOrigin,
+    LocalPosition,
+    Mode,
+    Rejection,
+    Reset,
+    RsbnFix,
+    Solution,
+    Truth,
+)
+
+ORIGIN = Geodetic(math.radians(60.0), math.radians(30.0), 0.0)
+BEACON = Geodetic(math.radians(60.4), math.radians(30.3), 100.0)
+CONFIG = Config()
+NS = 1_000_000_000
+
+
+class Moment:
+    """All that is said in one tenth of a second, and the truth of it."""
+
+    def __init__(self, truth: Geodetic, records: list[Any], ins_error: tuple[float, float]) -> None:
+        self.truth, self.records, self.ins_error = truth, records, ins_error
+
+
+@lru_cache(maxsize=4)
+def flight(duration_s: int, gnss_until: float, rsbn_until: float, seed: int = 1) -> tuple[Moment, ...]:
+    """A circling aircraft whose inertial channel errs as its equations say; GNSS 5 Hz, a beacon 1 Hz."""
+    rng = np.random.default_rng(seed)
+    dt, unit = 0.1, errorstate.grade(CONFIG.inertial)
+    model = aircraft(ORIGIN.lat, 30.0, 0.0, added=unit.disturbances)
+    step = discretise(model.A, model.Q, model.B, dt)
+    noise = np.linalg.cholesky(step.Q + 1e-30 * np.eye(12))
+    x = unit.sigma0 * rng.standard_normal(12)
+    moments = []
+    for k in range(1, round(duration_s / dt)):
+        t = k * dt
+        t_ns = round(t * NS)
+        x = step.A @ x + noise @ rng.standard_normal(12)
+        truth = from_enu(
+            np.array([9000.0 * (1.0 - math.cos(t / 300.0)), 9000.0 * math.sin(t / 300.0), 1000.0]), ORIGIN
+        )
+        v_n = (30.0 * math.cos(t / 300.0), 30.0 * math.sin(t / 300.0), 0.0)
+        ins = displace(*truth, x[0], x[1], 0.0)
+        x_n = tuple(float(c) for c in geodetic_to_local("tangent", ORIGIN, ins))
+        records: list[Any] = [
+            LocalPosition(t_ns, t_ns, x_n, (v_n[0] + float(x[2]), v_n[1] + float(x[3]), 0.0))
+        ]
+        if k % 2 == 0 and t < gnss_until:
+            e, w = 1.5 * rng.standard_normal(2), 0.1 * rng.standard_normal(2)
+            fix = displace(*truth, e[0], e[1], 0.0)
+            v = (v_n[0] + float(w[0]), v_n[1] + float(w[1]), 0.0)
+            records.append(Gnss(t_ns, t_ns, 0, t_ns // 1000, 3, *fix, 1.5, 3.0, v_n=v))
+        if k % 10 == 0 and t < rsbn_until:
+            sight, (a, d) = slant_range_azimuth(BEACON, truth), rng.standard_normal(2)
+            azimuth, distance = sight.azimuth + math.radians(0.125) * a, sight.slant_range + 100.0 * d
+            records.append(RsbnFix(t_ns, t_ns, 7, *BEACON, azimuth, distance, math.radians(0.125), 100.0))
+        moments.append(Moment(truth, records, (float(x[0]), float(x[1]))))
+    return tuple(moments)
+
+
+def origin() -> LocalOrigin:
+    return LocalOrigin(0, 0, *ORIGIN, "tangent")
+
+
+def flown(moments: tuple[Moment, ...], config: Config = CONFIG) -> Iterator[tuple[Moment, list[Any]]]:
+    navigator = Navigator(config)
+    navigator.handle(origin())
+    for moment in moments:
+        yield moment, [out for record in moment.records for out in navigator.handle(record)]
+
+
+def distance(solution: Solution, truth: Geodetic) -> float:
+    north, east, _ = separation(Geodetic(solution.lat, solution.lon, solution.alt_msl), truth)
+    return math.hypot(north, east)
+
+
+def rms(values: list[float]) -> float:
+    return math.sqrt(sum(v * v for v in values) / len(values))
+
+
+@pytest.fixture(scope="module")
+def outage() -> list[tuple[Moment, Solution]]:
+    """Twelve minutes with everything, four with the beacon alone, four with nothing."""
+    found = flown(flight(1200, 720.0, 960.0))
+    return [(moment, out) for moment, outs in found for out in outs if isinstance(out, Solution)]
+
+
+def of(outage: list[tuple[Moment, Solution]], start: float, end: float) -> list[tuple[Moment, Solution]]:
+    return [(m, s) for m, s in outage if start * NS < s.t_ns <= end * NS]
+
+
+def test_with_fixes_the_estimate_beats_the_best_fix(outage: list[tuple[Moment, Solution]]) -> None:
+    gnss = 1.5 * math.sqrt(2.0)
+    assert rms([distance(s, m.truth) for m, s in of(outage, 120, 720)]) < gnss
+    beacon = [slant_range_azimuth(BEACON, m.truth).slant_range for m, _ in of(outage, 720, 960)]
+    fix = rms([math.hypot(100.0, math.radians(0.125) * d) for d in beacon])
+    assert rms([distance(s, m.truth) for m, s in of(outage, 720, 960)]) < 0.25 * fix
+
+
+def test_without_fixes_the_error_stays_inside_the_guaranteed_bound(
+    outage: list[tuple[Moment, Solution]],
+) -> None:
+    alone = of(outage, 971, 1200)
+    assert {s.mode for _, s in alone} == {Mode.PREDICTING}
+    assert {s.estimator for _, s in alone} == {"minimax"}
+    bounds = [s.bound_n for _, s in alone]
+    assert all(b is not None for b in bounds)
+    assert rms([distance(s, m.truth) for m, s in alone]) < rms([math.hypot(*b) for b in bounds if b])
+    assert [math.hypot(*b) for b in bounds if b] == sorted(math.hypot(*b) for b in bounds if b)
+
+
+def test_the_claimed_sigma_is_honest(outage: list[tuple[Moment, Solution]]) -> None:
+    for start, end in ((60, 720), (720, 960)):
+        errors = [distance(s, m.truth) for m, s in of(outage, start, end)]
+        claimed = [math.sqrt(s.covariance[0] + s.covariance[3]) for _, s in of(outage, start, end)]
+        assert rms(errors) < 2.0 * rms(claimed)
+
+
+def test_the_same_records_give_the_same_outputs() -> None:
+    moments = flight(60, 60.0, 60.0)
+    first = [out for _, outs in flown(moments) for out in outs]
+    assert first == [out for _, outs in flown(moments) for out in outs]
+
+
+def test_a_late_answer_is_folded_in_at_its_own_time() -> None:
+    moments = flight(60, 20.0, 60.0)
+    in_time, late = Navigator(CONFIG), Navigator(CONFIG)
+    waiting: list[RsbnFix] = []
+    for navigator in (in_time, late):
+        navigator.handle(origin())
+    for k, moment in enumerate(moments):
+        for record in moment.records:
+            in_time.handle(record)
+            if isinstance(record, RsbnFix):
+                waiting.append(record)
+            else:
+                late.handle(record)
+        if k % 30 == 29 or k == len(moments) - 1:  # answers come up to three seconds late, newest first
+            while waiting:
+                late.handle(waiting.pop())
+    end = 60 * NS + NS // 2
+    tail = LocalPosition(end, end, moments[-1].records[0].x_n, moments[-1].records[0].v_n)
+    a = [out for out in in_time.handle(tail) if isinstance(out, Solution)]
+    b = [out for out in late.handle(tail) if isinstance(out, Solution)]
+    assert a
+    assert b
+    assert math.dist(a[0].error_n, b[0].error_n) < 1e-6
+    np.testing.assert_allclose(a[0].covariance, b[0].covariance, rtol=1e-9)
+
+
+def test_what_is_later_than_the_limit_is_rejected_aloud() -> None:
+    navigator = Navigator(load(flags={"estimator.late_s": 2.0}, environment={}))
+    navigator.handle(origin())
+    records = [r for m in flight(60, 20.0, 60.0) for r in m.records]
+    answer = next(r for r in records if isinstance(r, RsbnFix))
+    for record in records:
+        navigator.handle(record)
+    (out,) = navigator.handle(answer)
+    assert isinstance(out, Rejection)
+    assert out.value is not None
+    assert out.limit == 2.0
+    assert out.value > 50.0
+
+
+def test_a_jump_of_the_inertial_channel_is_no_jump_of_the_estimate() -> None:
+    navigator, seen, errors, resets = Navigator(CONFIG), False, [], []
+    navigator.handle(origin())
+    for moment in flight(90, 90.0, 90.0):
+        for record in moment.records:
+            if isinstance(record, LocalPosition) and record.t_ns > 45 * NS:
+                x, y, z = record.x_n
+                record = msgspec.structs.replace(record, x_n=(x + 97.0, y - 40.0, z))
+                seen = True
+            for out in navigator.handle(record):
+                if isinstance(out, Solution) and out.t_ns > 20 * NS:
+                    errors.append(distance(out, moment.truth))
+                if isinstance(out, Reset):
+                    resets.append(out)
+    assert seen
+    assert len(resets) == 1
+    assert "104.9 m" in resets[0].reason
+    assert max(errors) < 15.0
+
+
+def test_a_gnss_jump_is_refused_and_counted() -> None:
+    navigator, rejections, errors = Navigator(CONFIG), 0, []
+    navigator.handle(origin())
+    for moment in flight(90, 90.0, 90.0):
+        for record in moment.records:
+            if isinstance(record, Gnss) and 50 * NS < record.t_ns < 60 * NS:
+                record = msgspec.structs.replace(record, lat=record.lat + 500.0 / 6.4e6)
+            for out in navigator.handle(record):
+                rejections += isinstance(out, Rejection) and out.source == "gnss 0"
+                if isinstance(out, Solution) and out.t_ns > 20 * NS:
+                    errors.append(distance(out, moment.truth))
+    assert rejections >= 9
+    assert max(errors) < 15.0
+
+
+def test_a_repeated_fix_teaches_once() -> None:
+    moments = flight(30, 30.0, 0.0)
+    once = [o for _, outs in flown(moments) for o in outs]
+    navigator = Navigator(CONFIG)
+    navigator.handle(origin())
+    twice = []
+    for moment in moments:
+        for record in moment.records:
+            twice += navigator.handle(record)
+            if isinstance(record, Gnss):
+                assert navigator.handle(record) == []
+    assert once == twice
+
+
+def test_truth_reaches_nothing() -> None:
+    navigator = Navigator(CONFIG)
+    navigator.handle(origin())
+    truth = Truth(NS, NS, *ORIGIN, (0.0, 0.0, 0.0))
+    before = navigator._carry
+    assert navigator.handle(truth) == []  # type: ignore[arg-type]
+    assert navigator._carry is before
+
+
+def test_an_azimuth_alone_corrects_across_and_is_no_fix() -> None:
+    navigator = Navigator(CONFIG)
+    navigator.handle(origin())
+    fixes, last = [], None
+    for moment in flight(60, 1.0, 60.0):
+        for record in moment.records:
+            if isinstance(record, RsbnFix):
+                record = msgspec.structs.replace(record, slant_range=None)
+            for out in navigator.handle(record):
+                if isinstance(out, Fix) and out.t_ns > 3 * NS:
+                    fixes.append(out)
+                if isinstance(out, Solution):
+                    last = out
+    assert fixes == []
+    assert last is not None
+    assert last.mode is Mode.FIXED

@@ -1,0 +1,61 @@
+"""Configuration: flags beat environment beat file, and a mistake is named where it stands."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from companion.config import Config, ConfigError, load, to_toml
+
+
+def written(tmp_path: Path, text: str) -> Path:
+    path = tmp_path / "companion.toml"
+    path.write_text(text)
+    return path
+
+
+def test_what_is_written_is_read_back(tmp_path: Path) -> None:
+    assert load(written(tmp_path, to_toml(Config())), environment={}) == Config()
+
+
+def test_flags_beat_environment_beat_file(tmp_path: Path) -> None:
+    path = written(tmp_path, "[gnss]\nsigma_m = 4.0\ntimeout_s = 5.0\n[rsbn]\ntimeout_s = 20.0\n")
+    environment = {"COMPANION_GNSS__SIGMA_M": "3.5", "COMPANION_RSBN__TIMEOUT_S": "30", "HOME": "/"}
+    config = load(path, {"rsbn.timeout_s": 40.0, "gnss.every_s": None}, environment)
+    assert (config.gnss.timeout_s, config.gnss.sigma_m, config.rsbn.timeout_s) == (5.0, 3.5, 40.0)
+    assert config.gnss.every_s == Config().gnss.every_s
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("[lnk]\nx = 1", "there is no section [lnk]; did you mean `link`?"),
+        ("[link]\ncomponent = 1", "section [link] has no key `component`; did you mean `component_id`?"),
+        ("[link]\ncomponent_id = 1000", "link.component_id = 1000 is impossible: expected int <= 255"),
+        ("[gnss]\nsigma_m = -1", "gnss.sigma_m = -1 is impossible: expected float > 0.0"),
+        ("[gnss]\nsigma_m = nan", "gnss.sigma_m = nan is impossible: expected float"),
+        ("[gnss]\nsigma_m = 'two'", "gnss.sigma_m = 'two' is impossible: expected float, got str"),
+        ("link = 3", "`link` is a section: write [link] and its keys below it"),
+        ("x = [", "is no TOML"),
+    ],
+)
+def test_a_mistake_is_one_sentence_that_names_it(tmp_path: Path, text: str, said: str) -> None:
+    path = written(tmp_path, text)
+    with pytest.raises(ConfigError) as caught:
+        load(path, environment={})
+    assert said in str(caught.value)
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_mistake_in_the_environment_names_the_variable() -> None:
+    with pytest.raises(ConfigError, match="COMPANION_GNSS__SIGMA_M"):
+        load(environment={"COMPANION_GNSS__SIGMA_M": "-3"})
+    with pytest.raises(ConfigError, match="COMPANION_GNS__SIGMA_M"):
+        load(environment={"COMPANION_GNS__SIGMA_M": "3"})
+
+
+def test_a_missing_file_says_how_to_begin(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="check-config --defaults"):
+        load(tmp_path / "none.toml", environment={})
