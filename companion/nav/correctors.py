@@ -127,7 +127,7 @@ def star(h: float, q: float, lat: float, sphere: Sphere = SPHERE) -> tuple[Row, 
 def free_gyro(h: float, q: float, P: float, lat: float, sphere: Sphere = SPHERE) -> tuple[Row, Row]:
     """A star whose place has errors of its own: dg along the parallel westward, dd in declination (1.22).
 
-    P is the parallactic angle, from the direction to the zenith to that of the pole, counted eastward.
+    P is the parallactic angle: at the star, from the pole to the zenith, counted westward.
     """
     altitude, azimuth = star(h, q, lat, sphere)
     return (

@@ -1,0 +1,352 @@
+"""The error equations against a nonlinear inertial system, published eigenvalues and independent matrices.
+
+data/error_model.json holds matrices and eigenvalues computed independently of this project.
+"""
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from scipy.integrate import solve_ivp
+
+from companion.nav import disturbances as dist
+from companion.nav import error_model
+from companion.nav.correctors import (
+    absolute_log,
+    airspeed,
+    gnss_velocity,
+    paper_velocity,
+    relative_log,
+    rows,
+)
+from companion.nav.earth import SPHERE, SPHERE_KM_H
+from companion.nav.error_model import INS_STATES, aircraft, paper, paper_example, twin
+from companion.nav.strapdown import rates, rotation
+
+Matrix = npt.NDArray[np.float64]
+GOLDEN: dict[str, Any] = json.loads((Path(__file__).parents[1] / "data" / "error_model.json").read_text())
+speeds = [8.0, 30.0, 250.0]
+headings = [0.0, 90.0, 180.0, 225.0]
+
+
+def frequencies(A: Matrix) -> Matrix:
+    """Imaginary parts of a spectrum that must be imaginary, from the greatest down."""
+    eigenvalues = np.linalg.eigvals(A)
+    np.testing.assert_allclose(eigenvalues.real, 0.0, atol=1e-9 * np.abs(eigenvalues).max())
+    return np.sort(eigenvalues.imag)[::-1]
+
+
+# -- independent matrices ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("V", "lat"), [(30.0, math.pi / 4), (250.0, math.pi / 3)])
+@pytest.mark.parametrize(("name", "model"), [("A7_full", aircraft), ("A7_paper", paper)])
+def test_golden_matrices(name: str, model: Any, V: float, lat: float) -> None:
+    golden = np.array(GOLDEN["matrices"][f"{name} V={V:.0f} K=1.570796 phi={lat:.6f}"])
+    np.testing.assert_allclose(model(lat, 0.0, V).A, golden, rtol=1e-14, atol=0.0)
+
+
+def test_golden_sixteen_states() -> None:
+    example = paper_example("km-h")
+    matrices = GOLDEN["matrices"]
+    np.testing.assert_allclose(example.A_continuous, matrices["A16_paper_kmh"], rtol=1e-14, atol=0.0)
+    np.testing.assert_allclose(example.H, matrices["H_paper_kmh"], rtol=1e-14, atol=1e-16)
+    assert example.states == (
+        *INS_STATES,
+        *("EX", "EY", "EZ"),
+        *("VcX", "VcY"),
+        *("GX", "GY"),
+        *("AX", "AY"),
+    )
+
+
+@pytest.mark.parametrize("V", [30.0, 250.0])
+def test_golden_airspeed_rows(V: float) -> None:
+    model = aircraft(
+        1.0, 0.0, V, added=(dist.gyro_drift(1.0), dist.wind(V, 1e-3, 1e4), *_gravity_and_sensors())
+    )
+    H = rows(model.states, *airspeed(math.pi / 2, V))
+    np.testing.assert_allclose(H, GOLDEN["matrices"][f"H_full V={V:.0f} K=1.570796"], atol=1e-15)
+
+
+def _gravity_and_sensors() -> tuple[dist.Disturbance, ...]:
+    return dist.gravity(30.0, 1e4, 1e-4), dist.accelerometer_fast(20 / 3600, 1e-5)
+
+
+# -- spectra -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("golden", "model", "V"),
+    [
+        ("paper V=0", paper, 0.0),
+        ("paper V=30 E", paper, 30.0),
+        ("full V=0 E", aircraft, 0.0),
+        ("full V=30 E", aircraft, 30.0),
+    ],
+)
+def test_golden_spectra(golden: str, model: Any, V: float) -> None:
+    expected = np.sort([imag for _, imag in GOLDEN["eigenvalues"][golden]])[::-1]
+    A = model(math.pi / 3, 0.0, V, sphere=SPHERE_KM_H).A
+    # The reference spectra took fD = -G, leaving out what Coriolis and V^2/R take off the weight: 3e-5 of the
+    # Schuler frequency at 30 km/h. (The reference matrices have it.)
+    A[2, 5], A[3, 4] = -SPHERE_KM_H.G, SPHERE_KM_H.G
+    np.testing.assert_allclose(frequencies(A), expected, rtol=0.0, atol=1e-9)
+
+
+def test_the_laws_of_the_schuler_pair() -> None:
+    """Product of the two frequencies G/R, difference 2 Om sin(phi); then the earth's rate, and a zero."""
+    for lat in (0.1, 0.8, math.pi / 3, 1.3):
+        fast, slow, diurnal, zero = frequencies(paper(lat, 0.0, 0.0, sphere=SPHERE_KM_H).A)[:4]
+        assert fast * slow == pytest.approx(SPHERE_KM_H.G / SPHERE_KM_H.R, rel=1e-9)
+        assert fast - slow == pytest.approx(2.0 * SPHERE_KM_H.OMEGA * math.sin(lat), rel=1e-8)
+        assert diurnal == pytest.approx(SPHERE_KM_H.OMEGA, rel=1e-8)
+        assert zero == pytest.approx(0.0, abs=1e-9)
+
+
+def test_the_schuler_period() -> None:
+    assert 2.0 * math.pi * math.sqrt(SPHERE.R / SPHERE.G) / 60.0 == pytest.approx(84.3913, abs=5e-5)
+
+
+@pytest.mark.parametrize("model", [paper, aircraft])
+@pytest.mark.parametrize("heading", headings)
+@pytest.mark.parametrize("V", speeds)
+def test_no_error_grows_faster_than_the_flight_goes(model: Any, V: float, heading: float) -> None:
+    """At V = 0 the spectrum is imaginary; in motion its real part stays of the order of V/R."""
+    K = math.radians(heading)
+    A = model(math.pi / 3, V * math.cos(K), V * math.sin(K)).A
+    assert np.abs(np.linalg.eigvals(A).real).max() < 3.0 * V / SPHERE.R
+
+
+def test_mixed_senses_of_rotation_would_be_seen() -> None:
+    """P as minus the rotation in the tilts but plus in the velocities: Schuler turns into +-4.47 1/h."""
+    mixed = paper(math.pi / 3, 0.0, 0.0, sphere=SPHERE_KM_H).A.copy()
+    mixed[2:4, 4:7] *= -1.0
+    real = np.sort(np.linalg.eigvals(mixed).real)
+    schuler = math.sqrt(SPHERE_KM_H.G / SPHERE_KM_H.R)
+    assert real[-1] == pytest.approx(schuler, rel=2e-3)
+    assert real[0] == pytest.approx(-schuler, rel=2e-3)
+
+
+# -- the nonlinear inertial system ---------------------------------------------------------------------
+
+
+class Flight:
+    """Steady flight along a rhumb line on the sphere, its ideal sensors, and an INS that runs on them.
+
+    Two level channels: the height is held, as the barometer holds it.
+    """
+
+    lat_0 = math.radians(50.0)
+    seconds = 3600.0
+
+    def __init__(self, V: float, heading_deg: float) -> None:
+        K = math.radians(heading_deg)
+        self.v_n = np.array([V * math.cos(K), V * math.sin(K), 0.0])
+        self.C_nb = rotation(np.array([0.0, 0.0, K])) @ rotation(np.array([0.1, -0.05, 0.0]))
+
+    def sensors(self, t: float) -> tuple[Matrix, Matrix]:
+        """Constant velocity and attitude in n: f_n balances gravity and Coriolis, the body turns with n."""
+        free = rates(self.lat(t), 0.0, self.v_n, np.zeros(3), SPHERE)
+        return self.C_nb.T @ -free.v_n, self.C_nb.T @ free.w_in_n
+
+    def lat(self, t: float) -> float:
+        return self.lat_0 + float(self.v_n[0]) / SPHERE.R * t
+
+    def ins(self, x_0: Matrix) -> Matrix:
+        """Fly the INS from initial errors x_0 (7,): its errors at the end, as the model's states."""
+        lat_0 = self.lat_0 + x_0[0] / SPHERE.R
+        lon_0 = x_0[1] / (SPHERE.R * math.cos(self.lat_0))
+        C_0 = rotation(x_0[4:7]) @ self.C_nb
+        y_0 = np.concatenate([[lat_0, lon_0], self.v_n[:2] + x_0[2:4], C_0.ravel()])
+
+        def slope(t: float, y: Matrix) -> Matrix:
+            f_b, w_b = self.sensors(t)
+            C = y[4:].reshape(3, 3)
+            r = rates(float(y[0]), 0.0, np.array([y[2], y[3], 0.0]), C @ f_b, SPHERE)
+            C_rate = C @ _cross(w_b) - _cross(r.w_in_n) @ C
+            return np.concatenate([[r.lat, r.lon], r.v_n[:2], C_rate.ravel()])
+
+        y = solve_ivp(slope, (0.0, self.seconds), y_0, method="DOP853", rtol=1e-13, atol=1e-15).y[:, -1]
+        lat = self.lat(self.seconds)
+        lon = _lon(self, lat)
+        tilt = y[4:].reshape(3, 3) @ self.C_nb.T
+        P = 0.5 * np.array([tilt[2, 1] - tilt[1, 2], tilt[0, 2] - tilt[2, 0], tilt[1, 0] - tilt[0, 1]])
+        position = [(y[0] - lat) * SPHERE.R, (y[1] - lon) * SPHERE.R * math.cos(lat)]
+        return np.concatenate([position, y[2:4] - self.v_n[:2], P])
+
+    def linear(self, model: Any) -> Matrix:
+        """The transition matrix (7, 7) of the error equations over the same flight."""
+
+        def slope(t: float, Phi: Matrix) -> Matrix:
+            A = model(self.lat(t), float(self.v_n[0]), float(self.v_n[1])).A
+            return np.asarray(A @ Phi.reshape(7, 7)).ravel()
+
+        end = solve_ivp(
+            slope, (0.0, self.seconds), np.eye(7).ravel(), method="DOP853", rtol=1e-11, atol=1e-16
+        )
+        return np.asarray(end.y[:, -1].reshape(7, 7))
+
+
+def _lon(flight: Flight, lat: float) -> float:
+    """Longitude gained along the rhumb line: by the isometric latitude, or the parallel."""
+    vN, vE = float(flight.v_n[0]), float(flight.v_n[1])
+    if abs(vN) < 1e-9 * abs(vE):
+        return vE * flight.seconds / (SPHERE.R * math.cos(lat))
+
+    def psi(b: float) -> float:
+        return math.asinh(math.tan(b))
+
+    return vE / vN * (psi(lat) - psi(flight.lat_0))
+
+
+def _cross(v: Matrix) -> Matrix:
+    x, y, z = v
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
+@pytest.mark.parametrize("heading", headings)
+@pytest.mark.parametrize("V", speeds)
+def test_aircraft_is_the_jacobian_of_a_nonlinear_inertial_system(V: float, heading: float) -> None:
+    """An hour of flight, every initial error perturbed both ways: 1e-6 of the error scale (met: 1e-9)."""
+    flight = Flight(V, heading)
+    scale = np.array([1e3, 1e3, 1.0, 1.0, 2e-4, 2e-4, 2e-4])  # comparable errors of a Schuler cycle
+    Phi = flight.linear(aircraft)
+    rng = np.random.default_rng(7)
+    for _ in range(2):
+        x_0 = 0.02 * scale * rng.uniform(0.5, 1.0, 7) * rng.choice([-1.0, 1.0], 7)
+        nonlinear = 0.5 * (flight.ins(x_0) - flight.ins(-x_0))
+        error_scale = np.abs(Phi) @ np.abs(x_0)
+        assert (np.abs(nonlinear - Phi @ x_0) / error_scale).max() < 1e-6
+
+
+def test_paper_is_only_approximate_at_aircraft_speed() -> None:
+    """Why there are two models: at 250 m/s the paper's is per cents off, at 8 m/s per mille."""
+    scale = 0.02 * np.array([1e3, 1e3, 1.0, 1.0, 2e-4, 2e-4, 2e-4])
+
+    def discrepancy(V: float) -> float:
+        flight = Flight(V, 90.0)
+        Phi, Psi = flight.linear(aircraft), flight.linear(paper)
+        # the paper's dVE is the rate of dy: its true velocity error is a row, not a state
+        H = rows(INS_STATES, *gnss_velocity(paper_velocity(flight.lat_0, 0.0, V)))
+        to_true = np.eye(7)
+        to_true[2:4] = H
+        Psi = to_true @ Psi @ np.linalg.inv(to_true)
+        return float((np.abs((Psi - Phi) @ scale) / (np.abs(Phi) @ scale)).max())
+
+    assert discrepancy(250.0) > 0.01
+    assert discrepancy(8.0) < 0.01
+
+
+# -- units, composition --------------------------------------------------------------------------------
+
+
+def _kalman(example: error_model.Example, Q: Matrix, Z: Matrix) -> Matrix:
+    """A plain Joseph filter, so that this file proves the model without the package's filters."""
+    x, P, out = example.x0, example.P0, []
+    for z in Z:
+        x, P = example.A @ x, example.A @ P @ example.A.T + Q
+        S = example.H @ P @ example.H.T + example.R
+        K = np.linalg.solve(S, example.H @ P).T
+        x = x + K @ (z - example.H @ x)
+        L = np.eye(len(x)) - K @ example.H
+        P = L @ P @ L.T + K @ example.R @ K.T
+        out.append(x)
+    return np.array(out)
+
+
+@pytest.mark.parametrize("exact", [True, False])
+def test_the_example_in_kilometre_hours_and_in_si_gives_the_same_estimates(exact: bool) -> None:
+    km, si = paper_example("km-h", exact=exact), paper_example("SI", exact=exact)
+    T, T_inv = np.diag(km_to_si := si.units), np.diag(1.0 / si.units)
+    assert km.units == pytest.approx(1.0)
+    for a, b in ((T @ km.A @ T_inv, si.A), (T @ km.Q @ T, si.Q), (T @ km.Q_markov @ T, si.Q_markov)):
+        size = np.sqrt(np.outer(np.abs(np.diag(b)), np.abs(np.diag(b)))) + 1e-300
+        assert a == pytest.approx(b, rel=1e-9, abs=float(size.max()) * 1e-12)
+    np.testing.assert_allclose(km.H @ T_inv, si.H / (1e3 / 3600.0), rtol=1e-13, atol=1e-18)
+    np.testing.assert_allclose(km.C / 3.6, si.C, rtol=1e-14)
+    rng = np.random.default_rng(1)
+    Z = 0.3 * np.cumsum(rng.normal(size=(600, 2)), axis=0) * 0.1 + rng.normal(size=(600, 2)) * 0.05
+    for Q_km, Q_si in ((km.Q_markov, si.Q_markov), (_minimax(km), _minimax(si))):
+        x_km, x_si = _kalman(km, Q_km, Z) * km_to_si, _kalman(si, Q_si, Z / 3.6)
+        assert (np.abs(x_km - x_si) / np.abs(x_si).max(axis=0)).max() < 1e-11
+
+
+def _minimax(example: error_model.Example) -> Matrix:
+    return np.asarray(example.Q + example.B @ np.diag(example.C**2) @ example.B.T)
+
+
+def test_the_markov_current_is_the_bounded_one_at_the_equivalent_bound() -> None:
+    """C^2 = 2 (a_c + V/R_c) sigma^2 dt, 0.0849 km/h: the Euler minimax filter is then the plain one."""
+    C = math.sqrt(2.0 * (1.0 + 3.0) * 0.3**2 * 0.01)
+    assert pytest.approx(0.0849, abs=5e-5) == C
+    example = paper_example("km-h", exact=False, C=C)
+    np.testing.assert_allclose(_minimax(example), example.Q_markov, rtol=1e-13)
+
+
+def test_euler_magnifies_schuler_and_the_exact_step_does_not() -> None:
+    """Six hours of Euler's 0.01 h multiply the amplitude by 1.94."""
+    growth = [
+        np.abs(np.linalg.eigvals(paper_example(exact=exact).A[:7, :7])).max() ** 600
+        for exact in (True, False)
+    ]
+    assert growth[0] == pytest.approx(1.0, abs=1e-6)
+    assert growth[1] == pytest.approx(1.94, abs=0.01)
+
+
+def test_unknown_units_are_named() -> None:
+    with pytest.raises(ValueError, match="km-h or SI"):
+        paper_example("miles")  # type: ignore[arg-type]
+
+
+def test_two_systems_share_gravity_and_nothing_else() -> None:
+    one = aircraft(1.0, 10.0, 20.0, added=(dist.gyro_drift(1e-5, 1e-8),))
+    two = aircraft(1.0, 10.0, 20.0, added=(dist.gyro_drift(2e-5, bound=1e-12),))
+    feeds = tuple((f"{v}{s}", g, 1.0) for s in ("", "2") for v, g in (("dVN", "GX"), ("dVE", "GY")))
+    gravity = dist.Disturbance(("GX", "GY"), 1e-3, 1e-4, feeds=feeds)
+    both = twin(one, two, common=(gravity,))
+    assert both.states == (*one.states, *(s + "2" for s in two.states), "GX", "GY")
+    n = len(one.states)
+    np.testing.assert_array_equal(both.A[:n, :n], one.A)
+    np.testing.assert_array_equal(both.A[n : 2 * n, n : 2 * n], two.A)
+    assert not both.A[:n, n : 2 * n].any() and not both.A[n : 2 * n, :n].any()
+    assert both.A[2, -2] == both.A[n + 2, -2] == both.A[n + 3, -1] == 1.0
+    assert both.B.shape == (2 * n + 2, 3) and both.B[n + 7, 0] == 1.0
+    np.testing.assert_array_equal(both.C, two.C)
+
+
+def test_logs_with_the_paper_velocity_are_the_printed_rows() -> None:
+    """(1.19) term by term, at a velocity with both components."""
+    lat, K, V = 0.9, 0.7, 12.0
+    vN, vE = V * math.cos(K), V * math.sin(K)
+    lat_rate, lon_rate = vN / SPHERE.R, vE / (SPHERE.R * math.cos(lat))
+    s, t, sK, cK = math.sin(lat), math.tan(lat), math.sin(K), math.cos(K)
+    states = (*INS_STATES, "VcX", "VcY")
+    along = [-lon_rate * s * sK, lat_rate * t * sK, cK, sK, 0, 0, 0, -cK, -sK]
+    across = [-lon_rate * s * cK, lat_rate * t * cK, -sK, cK, 0, 0, -V, sK, -cK]
+    velocity = paper_velocity(lat, vN, vE)
+    np.testing.assert_allclose(rows(states, *relative_log(K, V, velocity)), [along, across], atol=1e-18)
+    np.testing.assert_allclose(
+        rows(INS_STATES, *absolute_log(K, V, velocity)), [along[:7], across[:7]], atol=1e-18
+    )
+
+
+def test_the_example_carries_the_numbers_of_section_3() -> None:
+    """(1.44), (1.45) term by term on the Euler step, in km and h."""
+    example = paper_example("km-h", exact=False)
+    G, dt, densities = SPHERE_KM_H.G, 0.01, dict.fromkeys(example.states, 0.0)
+    densities |= dict.fromkeys(("EX", "EY", "EZ"), 2 * 0.2 * 1e-5**2)
+    densities |= dict.fromkeys(("GX", "GY"), 2 * 3.0 * (1e-5 * G) ** 2)
+    densities |= dict.fromkeys(("AX", "AY"), 2 * 20.0 * (1e-6 * G) ** 2)
+    np.testing.assert_allclose(example.Q, np.diag(list(densities.values())) * dt, rtol=1e-14)
+    densities |= dict.fromkeys(("VcX", "VcY"), 2 * 4.0 * 0.3**2)
+    np.testing.assert_allclose(example.Q_markov, np.diag(list(densities.values())) * dt, rtol=1e-14)
+    np.testing.assert_allclose(example.A, np.eye(16) + example.A_continuous * dt, rtol=1e-14)
+    np.testing.assert_array_equal(np.argwhere(example.B), [[10, 0], [11, 1]])
+    np.testing.assert_allclose(example.R, 0.05**2 * np.eye(2), rtol=1e-14)
+    np.testing.assert_allclose(example.C, [0.3, 0.3], rtol=1e-14)
+    assert not example.P0.any() and not example.x0.any()
