@@ -9,6 +9,7 @@ inequality).
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -20,6 +21,7 @@ from companion.estimate.predictor import Prediction as Channel
 from companion.records import Prediction, Vector2
 
 REFRESH_NS = 1_000_000_000
+HOPELESS_M = 1e6  # a bound beyond this is as good as none: the window is too short for so far ahead
 UNLIKE = 2.0  # a fix this many times better or worse than its bin begins a new one
 
 
@@ -92,7 +94,7 @@ def bounded(g: Guarantee, t_ns: int) -> tuple[Guarantee, Bounded | None]:
             predict(g.east, t_ns, start=held[1] if held else None),
         )
         g = g._replace(held=held)
-    if not (held[0].feasible and held[1].feasible):
+    if not (held[0].feasible and held[1].feasible) or max(_bound(held[0]), _bound(held[1])) > HOPELESS_M:
         return g, None
     dt = (t_ns - held[0].t_ns) * 1e-9
     north, east = _moved(held[0], dt), _moved(held[1], dt)
@@ -109,7 +111,7 @@ def ahead(g: Guarantee, t_ns: int, minutes: tuple[float, ...]) -> tuple[Predicti
     return tuple(
         Prediction(60.0 * m, (n.bound, e.bound), (n.ls_claimed, e.ls_claimed), (n.ls_worst, e.ls_worst))
         for m, n, e in zip(minutes, *found, strict=True)
-        if n is not None and e is not None and n.feasible and e.feasible
+        if n is not None and e is not None and max(n.bound, e.bound) < HOPELESS_M
     )
 
 
@@ -132,6 +134,10 @@ def _close(g: Guarantee) -> Guarantee:
         north = north.push(t_ns, full.quantity, full.value[0] / w, full.sigma[0] / w)
         east = east.push(t_ns, full.quantity, full.value[1] / w, full.sigma[1] / w)
     return Guarantee(north, east, (), g.held)
+
+
+def _bound(channel: Channel) -> float:
+    return channel.position.bound if channel.position else math.inf
 
 
 def _moved(channel: Channel, dt: float) -> tuple[float, float, float, float]:

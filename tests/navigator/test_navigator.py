@@ -171,8 +171,9 @@ def test_a_late_answer_is_folded_in_at_its_own_time() -> None:
     b = [out for out in late.handle(tail) if isinstance(out, Solution)]
     assert a
     assert b
-    assert math.dist(a[0].error_n, b[0].error_n) < 1e-6
-    np.testing.assert_allclose(a[0].covariance, b[0].covariance, rtol=1e-9)
+    one_millimetre = 1e-3  # solutions fall at other instants, and with them the steps of the error equations
+    assert math.dist(a[0].error_n, b[0].error_n) < one_millimetre
+    np.testing.assert_allclose(a[0].covariance, b[0].covariance, rtol=1e-4)
 
 
 def test_what_is_later_than_the_limit_is_rejected_aloud() -> None:
