@@ -91,9 +91,9 @@ class Design:
     """Rows and sigmas, checked and factored once, ready for any number of targets."""
 
     sigmas: Floats  # (n,)
-    whitened: Floats  # (n, m) H / sigma
+    whitened: Floats  # (m, n) H / sigma, by columns: numpy is fastest along the long axis
     q: Floats  # (r, n) the rows in orthonormal coordinates: q q^T = 1
-    coordinates: Floats  # (m, r): whitened @ coordinates = q^T
+    coordinates: Floats  # (m, r): q = coordinates^T @ whitened
     unseen: Floats  # (m, m) projector, in scaled columns, on what no row sees
     columns: Floats  # (m,) scale of each column
 
@@ -114,18 +114,16 @@ class Design:
         if not (np.isfinite(sigmas) & (sigmas > 0.0)).all():
             i = int(np.argmin(np.isfinite(sigmas) & (sigmas > 0.0)))
             raise ValueError(f"sigmas[{i}] is {sigmas[i]}; give a positive one or leave the row out")
-        whitened = rows / sigmas[:, None]
-        columns = np.abs(whitened).max(axis=0)
+        whitened = np.ascontiguousarray(rows.T) / sigmas
+        columns = np.abs(whitened).max(axis=1)
         columns[columns == 0.0] = 1.0
-        triangle = np.linalg.qr(whitened / columns, mode="r")
+        triangle = np.linalg.qr((whitened / columns[:, None]).T, mode="r")
         _, singular, v_t = np.linalg.svd(triangle)
         rank = int(np.count_nonzero(singular > RANK_TOLERANCE * max(singular[0], np.finfo(float).tiny)))
         seen = v_t[:rank]
         coordinates = (seen.T / singular[:rank]) / columns[:, None]
         unseen = np.eye(len(columns)) - seen.T @ seen
-        return cls(
-            sigmas, whitened, np.ascontiguousarray((whitened @ coordinates).T), coordinates, unseen, columns
-        )
+        return cls(sigmas, whitened, coordinates.T @ whitened, coordinates, unseen, columns)
 
     def in_coordinates(self, target: npt.ArrayLike) -> tuple[Floats, Floats]:
         """Return target (m,) as floats and in the orthonormal coordinates (r,), or raise Infeasible."""
@@ -157,7 +155,7 @@ class Design:
         bound = float(np.abs(w).sum())
         weights[basis] = w / self.sigmas[basis]
         dual = self.coordinates @ dual_q
-        dual /= max(1.0, float(np.abs(self.whitened @ dual).max()))
+        dual /= max(1.0, float(np.abs(dual @ self.whitened).max()))
         return Minimax(
             weights, bound, dual, (bound - float(a @ dual)) / bound, tuple(np.sort(basis).tolist())
         )
@@ -178,7 +176,7 @@ class Design:
             if rows is None or len(rows) != rank:
                 continue
             basis = np.asarray(rows, dtype=np.intp)
-            if basis.min() >= 0 and basis.max() < n and np.linalg.cond(self.q[:, basis]) < 1e8:
+            if basis.min() >= 0 and basis.max() < n and np.linalg.cond(self.q[:, basis]) < 1e6:
                 return basis
         return np.asarray(scipy.linalg.qr(self.q, mode="r", pivoting=True)[-1][:rank], dtype=np.intp)
 
@@ -191,22 +189,24 @@ def _exchange(q: Floats, a: Floats, basis: Indices) -> tuple[Indices, Floats, Fl
     basis = basis.copy()
     sign = np.where(np.linalg.solve(q[:, basis], a) < 0.0, -1.0, 1.0)
     cost, stalled = np.inf, 0
-    held = (basis.copy(), np.zeros_like(a), np.zeros_like(a))
+    held: tuple[Indices, Floats, Floats] | None = None
     for _ in range(EXCHANGES_MAX):
         b = q[:, basis]
         inverse = np.linalg.inv(b)
         w = inverse @ a
         w += inverse @ (a - b @ w)
-        if np.abs(b @ w - a).max() > 1e-10 * np.abs(a).max():
-            break  # two rows all but equal: the basis before was optimal to within rounding
         size = sign * w
         wrong = size < -1e-13 * np.abs(size).sum()  # by rounding, in a nearly singular basis
         sign[wrong], size[wrong] = -sign[wrong], -size[wrong]
+        now = float(size.sum())
+        biased = np.abs(b @ w - a).max() > 1e-10 * max(np.abs(a).max(), 1e-3 * now * np.abs(b).max())
+        if held is not None and (biased or now > cost * (1.0 + 1e-9)):
+            break  # two rows all but equal: the basis before was optimal to within rounding
         dual = sign @ inverse
         held = (basis.copy(), w, dual)
         level = dual @ q
         excess = np.abs(level)
-        stalled = 0 if (now := float(size.sum())) < cost * (1.0 - 1e-14) else stalled + 1
+        stalled = 0 if now < cost * (1.0 - 1e-14) else stalled + 1
         cost = now
         careful = stalled > 3 * len(a)
         enter = int(np.argmax(excess > 1.0 + LEVEL_TOLERANCE)) if careful else int(excess.argmax())
@@ -218,6 +218,7 @@ def _exchange(q: Floats, a: Floats, basis: Indices) -> tuple[Indices, Floats, Fl
             _first_to_vanish(size, rate, basis) if careful else _long_step(size, rate, sign, excess[enter])
         )
         basis[leave], sign[leave] = enter, side
+    assert held is not None
     return held
 
 

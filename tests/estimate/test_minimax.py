@@ -257,6 +257,29 @@ def test_short_windows_are_solved_in_the_middle_of_the_window(T):
     assert abs(result.gap) < 1e-9
 
 
+@settings(max_examples=200, deadline=None)
+@given(
+    exponent=st.floats(-4.0, 1.2),
+    ahead=st.floats(-1.0, 8.0),
+    seed=st.integers(0, 2**32 - 1),
+    k=st.integers(0, 3),
+)
+def test_every_window_carries_its_proof(exponent, ahead, seed, k):
+    """From a tenth of a second to three Schuler periods, with velocities of any quality."""
+    rng, T = np.random.default_rng(seed), 10.0**exponent
+    x = np.sort(rng.uniform(-0.5, 0.5, rng.integers(6, 300))) * T
+    rows = np.vstack([schuler_row("gamma", -x), schuler_row("mu", -x)])
+    sigmas = np.r_[np.ones(len(x)), np.full(len(x), 10.0 ** rng.uniform(-2, 3))] * rng.uniform(
+        0.5, 2.0, 2 * len(x)
+    )
+    target = transition(0.5 * T + max(ahead, -T))[k]
+    result = solve(rows, target, sigmas)
+    size = np.abs(rows).max(axis=0) * np.abs(result.weights).sum()
+    assert (np.abs(rows.T @ result.weights - target) <= 1e-11 * size).all()
+    assert (np.abs(rows @ result.dual) <= sigmas * (1.0 + 1e-12)).all()
+    assert abs(result.gap) < 1e-9
+
+
 def test_a_bad_start_does_no_harm():
     rows = schuler_row("gamma", 1.5 - np.linspace(0, 1, 101))
     good = solve(rows, UNITS[0], 1.0)

@@ -51,7 +51,7 @@ def test_prediction_beats_the_line_always_and_the_last_error_beyond_ten_minutes(
 
 
 def test_stated_bound_holds_where_least_squares_claim_does_not(outcomes):
-    """What is compared with is measured too, and bounds add: the r.m.s. difference is within bound + sigma."""
+    """What is compared with is measured too, and bounds add: r.m.s. differences are within bound + sigma."""
     assert all(o.minimax_rms <= o.bound + o.sigma for o in outcomes)
     assert all(o.inside > 0.65 for o in outcomes)
     total = sum(o.n for o in outcomes)
