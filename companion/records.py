@@ -177,6 +177,12 @@ class RsbnFix(Stamped, frozen=True, gc=False, tag=True):
     sigma_range: float
 
 
+class Reboot(Stamped, frozen=True, gc=False, tag=True):
+    """The autopilot began anew: its origin, its clock and its inertial channel are others from here on."""
+
+    system: int
+
+
 class Truth(Stamped, frozen=True, gc=False, tag=True):
     """What only a simulator knows. It is logged and scored and never reaches the navigator."""
 
@@ -317,6 +323,7 @@ Input: TypeAlias = (
     | FilterStatus
     | SystemTime
     | RsbnFix
+    | Reboot
 )
 Output: TypeAlias = Solution | Fix | Rejection | Reset | Event
 Record: TypeAlias = Input | Output | LinkState | Truth

@@ -19,6 +19,7 @@ from companion.records import (
     LocalOrigin,
     LocalPosition,
     Output,
+    Reboot,
     Rejection,
     RsbnFix,
     Solution,
@@ -30,7 +31,7 @@ from .step import step
 
 __all__ = ["Navigator"]
 
-FOLDED = (LocalPosition, LocalOrigin, GlobalPosition, Gnss, RsbnFix)
+FOLDED = (LocalPosition, LocalOrigin, GlobalPosition, Gnss, RsbnFix, Reboot)
 
 
 class _Past(NamedTuple):

@@ -26,6 +26,7 @@ from companion.records import (
     LocalOrigin,
     LocalPosition,
     Output,
+    Reboot,
     Rejection,
     Reset,
     RsbnFix,
@@ -34,7 +35,7 @@ from companion.records import (
 )
 
 from . import errorstate, guarantee, inertial, radio
-from .carry import Carry, Level, Settings, Step, level, sources, state_at
+from .carry import Carry, Level, Settings, Step, initial, level, sources, state_at
 from .errorstate import ErrorState
 from .inertial import Point
 from .solution import solve
@@ -57,6 +58,12 @@ def _origin(carry: Carry, record: LocalOrigin, settings: Settings) -> Step:
     text = "local origin known" if old is None else "local origin changed: the track begins anew from it"
     carry = carry._replace(origin=record, track=(), local=None)
     return carry, [Event(record.t_ns, record.rx_ns, 6 if old is None else 4, text)]
+
+
+def _reboot(carry: Carry, record: Reboot, settings: Settings) -> Step:
+    """Another inertial channel: what was learnt of the old one's error says nothing of it."""
+    out = Reset(record.t_ns, record.rx_ns, "navigator", f"autopilot {record.system} rebooted")
+    return initial(settings)._replace(mode=carry.mode, next_ns=carry.next_ns), [out]
 
 
 def _global_position(carry: Carry, record: GlobalPosition, settings: Settings) -> Step:
@@ -252,6 +259,7 @@ def _rejected(record: Gnss | RsbnFix, reason: str, value: float, limit: float) -
 
 
 _USES: dict[type, Callable[[Carry, Any, Settings], Step]] = {
+    Reboot: _reboot,
     LocalOrigin: _origin,
     GlobalPosition: _global_position,
     LocalPosition: _local_position,

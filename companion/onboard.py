@@ -1,0 +1,267 @@
+"""The companion without its I/O: sessions, one navigator and one log joined; bytes and instants in, bytes
+out.
+
+    onboard.receive(link, data, now_ns)     # bytes of one link
+    onboard.poll(now_ns)                    # no later than onboard.deadline()
+    onboard.to_send(link)                   # after either: what that link must carry
+
+The asyncio service and the virtual-time loopback drive this same object. It holds no state of navigation; it
+decides who is believed (the one autopilot, and any beacon receiver), what is logged, and when a solution goes
+out.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable
+from typing import Any, Literal, Protocol
+
+from companion.config import Config, Rates
+from companion.link import dialect
+from companion.link.session import (
+    LinkLost,
+    LinkUp,
+    MessageReceived,
+    NotUnderstood,
+    Rebooted,
+    SecondAutopilot,
+    Session,
+)
+from companion.navigator import Navigator
+from companion.records import (
+    INPUTS,
+    Event,
+    LinkState,
+    LocalOrigin,
+    Reboot,
+    Rejection,
+    RsbnFix,
+    Solution,
+    Stamped,
+)
+from companion.wire import Receiver, Sender, decode, encode
+
+SECOND = 1_000_000_000
+MAKES: dict[int, Literal["ardupilot", "px4"]] = {3: "ardupilot", 12: "px4"}  # MAV_AUTOPILOT
+RSBN = dialect.type_named("RSBN_MEASUREMENT").msgid
+GPS_GLOBAL_ORIGIN = dialect.type_named("GPS_GLOBAL_ORIGIN").msgid
+REQUEST_MESSAGE = 512  # MAV_CMD
+ASK_ORIGIN_EVERY = 3 * SECOND
+
+
+class Log(Protocol):
+    """Where records and raw frames go; `companion.log.file.Writer` is one."""
+
+    def record(self, record: Stamped) -> None:
+        """Write one record."""
+
+    def frame(self, link: str, outgoing: bool, data: bytes, t_ns: int) -> None:
+        """Write one frame."""
+
+
+class LinkClock:
+    """A session's clock as `wire` asks for it; `now` is the arrival of what is being decoded."""
+
+    def __init__(self, session: Session) -> None:
+        self._session = session
+        self.now = 0
+
+    def boot_ns(self, boot_ns: int) -> int:
+        """Boot time on our clock."""
+        return self._session.clock.local(boot_ns, self.now)
+
+    def stamp_ns(self, time_usec: int, rx_ns: int) -> int:
+        """A stamp of boot or UNIX time on our clock."""
+        return self._session.to_local_ns(time_usec, rx_ns)
+
+
+class Link:
+    """One link: its session, its clock, and how its autopilot's messages are read."""
+
+    def __init__(self, name: str, config: Config) -> None:
+        self.name = name
+        self.session = Session(
+            component=config.link.component_id,
+            autopilot_system=config.link.system_id or None,
+            rates_hz=wanted(config.rates),
+        )
+        self.clock = LinkClock(self.session)
+        self.sender = Sender(self.clock)
+        self.bad = 0
+        self.origin_at = 0  # when the local origin is next asked for
+
+    @property
+    def lost(self) -> int:
+        """Frames missed, by their sequence numbers, over all who speak here."""
+        return sum(count.lost for count in self.session.reader.counts.values())
+
+    @property
+    def received(self) -> int:
+        """Frames received of all who speak here."""
+        return sum(count.received for count in self.session.reader.counts.values())
+
+
+def wanted(rates: Rates) -> dict[str, float]:
+    """The rates to ask for, by message."""
+    asked = {
+        "LOCAL_POSITION_NED": rates.local_position_hz,
+        "GPS_RAW_INT": rates.gnss_hz,
+        "ATTITUDE": rates.attitude_hz,
+        "RAW_IMU": rates.imu_hz,
+        "HIGHRES_IMU": rates.imu_hz,
+        "VFR_HUD": rates.air_data_hz,
+        "EKF_STATUS_REPORT": rates.status_hz,
+        "SIM_STATE": rates.truth_hz,
+    }
+    return {name: hz for name, hz in asked.items() if hz > 0.0}
+
+
+class Onboard:
+    """Everything between the links' bytes and the log."""
+
+    def __init__(self, config: Config, log: Log, links: Iterable[str] = ("main",)) -> None:
+        self._config = config
+        self._log = log
+        self._navigator = Navigator(config)
+        self.links = {name: Link(name, config) for name in links}
+        self.events: list[Event] = []  # changes of state since the caller last took them
+        self.rejected: Counter[str] = Counter()
+        self._origin: LocalOrigin | None = None
+        output = config.output
+        self._periods = {
+            name: round(SECOND / hz)
+            for name, hz in (
+                ("ODOMETRY", output.odometry_hz),
+                ("GLOBAL_POSITION_SENSOR", output.global_position_sensor_hz),
+                ("NAVIGATION_STATUS", output.status_hz),
+            )
+            if hz > 0.0
+        }
+        self._due = dict.fromkeys(self._periods, 0)
+        self._state_at = 0
+
+    def receive(self, link: str, data: bytes, now_ns: int) -> None:
+        """Take bytes that came over `link`."""
+        self._on_events(self.links[link], self.links[link].session.receive(data, now_ns), now_ns)
+
+    def poll(self, now_ns: int) -> None:
+        """Do what is due."""
+        for link in self.links.values():
+            self._on_events(link, link.session.poll(now_ns), now_ns)
+            if link.session.is_up and self._origin is None and now_ns >= link.origin_at:
+                link.origin_at = now_ns + ASK_ORIGIN_EVERY
+                self._ask_for(link, GPS_GLOBAL_ORIGIN)
+        if now_ns >= self._state_at:
+            self._state_at = now_ns + SECOND
+            for link in self.links.values():
+                self._log.record(self._state(link, now_ns))
+
+    def deadline(self) -> int:
+        """When `poll` must be called at the latest."""
+        return min(self._state_at, *(link.session.deadline() for link in self.links.values()))
+
+    def to_send(self, link: str, now_ns: int) -> list[bytes]:
+        """The frames that `link` must carry now; they are logged as sent."""
+        frames = self.links[link].session.to_send()
+        for data in frames:
+            self._log.frame(link, True, data, now_ns)
+        return frames
+
+    def note(self, severity: int, text: str, now_ns: int) -> None:
+        """Log and tell a change of state."""
+        self._emit(Event(now_ns, now_ns, severity, text))
+
+    def _on_events(self, link: Link, events: list[Any], now_ns: int) -> None:
+        for event in events:
+            if isinstance(event, MessageReceived):
+                self._on_message(link, event)
+            elif isinstance(event, NotUnderstood):
+                link.bad += 1
+            elif isinstance(event, LinkUp):
+                link.sender = link.sender._replace(autopilot=MAKES.get(event.autopilot, "other"))
+                self.note(6, f"{link.name}: autopilot {event.system} heard ({link.sender.autopilot})", now_ns)
+            elif isinstance(event, LinkLost):
+                silent = (now_ns - event.heard_ns) / SECOND
+                self.note(4, f"{link.name}: autopilot {event.system} silent for {silent:.0f} s", now_ns)
+            elif isinstance(event, Rebooted):
+                self._origin = None
+                self.note(4, f"{link.name}: autopilot {event.system} rebooted", now_ns)
+                self._on_record(Reboot(now_ns, now_ns, event.system))
+            elif isinstance(event, SecondAutopilot):
+                text = (
+                    f"{link.name}: a second autopilot, {event.system}, is ignored; we listen to {event.kept}"
+                )
+                self.note(4, text, now_ns)
+
+    def _on_message(self, link: Link, event: MessageReceived) -> None:
+        self._log.frame(link.name, False, event.frame.raw, event.received_ns)
+        if not (event.from_autopilot or event.frame.msgid == RSBN):
+            return
+        link.clock.now = event.received_ns
+        for record in decode(event.message, event.received_ns, link.sender):
+            self._on_record(record)
+
+    def _on_record(self, record: Stamped) -> None:
+        if not isinstance(record, INPUTS):  # truth, or a rejection by `wire`: logged, and no further
+            self._emit(record)
+            return
+        self._log.record(record)
+        if isinstance(record, LocalOrigin):
+            self._origin = record
+        for output in self._navigator.handle(record):  # type: ignore[arg-type]
+            self._emit(output)
+            if isinstance(output, Solution):
+                self._send(output, news=isinstance(record, RsbnFix))
+
+    def _emit(self, record: Stamped) -> None:
+        self._log.record(record)
+        if isinstance(record, Event):
+            self.events.append(record)
+        elif isinstance(record, Rejection):
+            self.rejected[record.source] += 1
+
+    def _send(self, solution: Solution, news: bool) -> None:
+        """The messages that are due, or all on the news of a beacon's fix, to every autopilot heard."""
+        names = [name for name, due in self._due.items() if news or solution.t_ns >= due]
+        if not names:
+            return
+        for name in names:
+            self._due[name] = max(self._due[name] + self._periods[name], solution.t_ns)
+        for link in self.links.values():
+            if link.session.is_up:
+                receiver = Receiver(
+                    link.sender.autopilot,
+                    link.session.autopilot or 0,
+                    origin=self._origin,
+                    sensor_id=self._config.output.global_position_sensor_id,
+                    rejected=self.rejected.total(),
+                )
+                for message in encode(solution, receiver, names):
+                    link.session.send(message)
+
+    def _ask_for(self, link: Link, msgid: int) -> None:
+        link.session.send(
+            dialect.new(
+                "COMMAND_LONG",
+                target_system=link.session.autopilot or 0,
+                target_component=1,
+                command=REQUEST_MESSAGE,
+                param1=msgid,
+            )
+        )
+
+    def _state(self, link: Link, now_ns: int) -> LinkState:
+        clock = link.session.clock
+        offset, uncertainty = clock.offset(now_ns), clock.uncertainty(now_ns)
+        return LinkState(
+            now_ns,
+            now_ns,
+            link.name,
+            link.session.is_up,
+            link.received,
+            link.lost,
+            link.bad,
+            0,
+            offset,
+            None if uncertainty is None else 2 * uncertainty,
+        )
