@@ -1,0 +1,125 @@
+"""How far off everything was: the INS alone, each fix and the corrected estimate against the truth, by phase.
+
+Records in, a table of numbers out. The truth is a function of time, so that a simulator's exact one, a logged
+one and a smoothed track serve alike. It knows nothing of files and of where the phases come from.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from companion.nav.geometry import Geodetic, displace, from_enu, separation
+from companion.records import Gnss, RsbnFix, Solution, Stamped
+
+Floats = npt.NDArray[np.float64]
+TruthAt = Callable[[int], Geodetic | None]
+
+INS, GNSS, RSBN, CORRECTED = "INS alone", "GNSS fix", "RSBN fix", "corrected"
+SOURCES = (INS, GNSS, RSBN, CORRECTED)
+
+
+class Phase(NamedTuple):
+    """A stretch of the flight."""
+
+    name: str
+    start_ns: int
+    end_ns: int
+
+
+class Row(NamedTuple):
+    """Horizontal errors (m) of one phase: r.m.s. and 95th percentile by source, and the guaranteed bound.
+
+    `bound` is the r.m.s. of the bound over the phase, `held` whether the corrected estimate's r.m.s. error is
+    within it, `inside` the share of instants within it; None where no bound could be given.
+    """
+
+    phase: str
+    seconds: float
+    rms: dict[str, float]
+    p95: dict[str, float]
+    bound: float | None
+    held: bool | None
+    inside: float | None
+
+
+class Errors(NamedTuple):
+    """Horizontal errors over a flight: times (ns), metres, and the bound where there is one, else NaN."""
+
+    t_ns: npt.NDArray[np.int64]
+    error: Floats
+    bound: Floats
+
+
+def errors(records: Iterable[Stamped], truth: TruthAt) -> dict[str, Errors]:
+    """The horizontal error of every source against `truth`, which is None where it is not known."""
+    found: dict[str, list[tuple[int, float, float]]] = defaultdict(list)
+
+    def add(source: str, t_ns: int, place: Geodetic, bound: float = math.nan) -> None:
+        true = truth(t_ns)
+        if true is not None:
+            north, east, _ = separation(place, true)
+            found[source].append((t_ns, math.hypot(north, east), bound))
+
+    last: Gnss | None = None
+    for record in records:
+        if isinstance(record, Solution):
+            bound = math.nan if record.bound_n is None else math.hypot(*record.bound_n)
+            corrected = Geodetic(record.lat, record.lon, record.alt_msl)
+            add(CORRECTED, record.t_ns, corrected, bound)
+            add(INS, record.t_ns, displace(*corrected, *record.error_n, 0.0))
+        elif isinstance(record, Gnss) and record.fix >= 3 and (last is None or not record.repeats(last)):
+            last = record
+            add(GNSS, record.t_ns, Geodetic(record.lat, record.lon, record.alt_msl))
+        elif isinstance(record, RsbnFix):
+            true = truth(record.t_ns)
+            if true is not None and (place := beacon_fix(record, true.alt)) is not None:
+                add(RSBN, record.t_ns, place)
+    return {
+        source: Errors(*(np.array(column) for column in zip(*rows, strict=True)))
+        for source, rows in found.items()
+    }
+
+
+def beacon_fix(record: RsbnFix, alt: float) -> Geodetic | None:
+    """The place that a beacon's azimuth and slant range alone give at height `alt` (m); None without both."""
+    if record.azimuth is None or record.slant_range is None:
+        return None
+    beacon, up = Geodetic(record.lat, record.lon, record.alt), alt - record.alt
+    distance = math.sqrt(max(record.slant_range**2 - up * up, 0.0))
+    for _ in range(2):  # the height over the beacon's tangent plane, the earth falling away below it
+        place = from_enu(
+            np.array([distance * math.sin(record.azimuth), distance * math.cos(record.azimuth), up]), beacon
+        )
+        up += alt - place.alt
+        distance = math.sqrt(max(record.slant_range**2 - up * up, 0.0))
+    return place
+
+
+def table(found: dict[str, Errors], phases: Sequence[Phase]) -> list[Row]:
+    """One row a phase."""
+    return [_row(found, phase) for phase in phases]
+
+
+def _row(found: dict[str, Errors], phase: Phase) -> Row:
+    rms, p95 = {}, {}
+    bound = held = inside = None
+    for source, e in found.items():
+        within = (e.t_ns >= phase.start_ns) & (e.t_ns < phase.end_ns)
+        if not within.any():
+            continue
+        error = e.error[within]
+        rms[source] = float(np.sqrt(np.mean(error**2)))
+        p95[source] = float(np.percentile(error, 95.0))
+        known = np.isfinite(e.bound[within])
+        if known.any():
+            promised = e.bound[within][known]
+            bound = float(np.sqrt(np.mean(promised**2)))
+            held = bool(np.mean(error[known] ** 2) <= np.mean(promised**2))
+            inside = float(np.mean(error[known] <= promised))
+    return Row(phase.name, (phase.end_ns - phase.start_ns) * 1e-9, rms, p95, bound, held, inside)
