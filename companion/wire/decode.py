@@ -5,8 +5,8 @@ the record allows it; where the record needs the number, the message becomes a `
 A message that carries no measurement by its own word (no airspeed sensor, a compass without an
 accelerometer) becomes nothing at all.
 
-Headings come out in [0, 2 pi). Times: a boot time or a time of unknown kind goes through the sender's
-`Clock`; what is sent without a time is stamped with its arrival.
+Headings come out in [0, 2 pi). Times go through the sender's `Clock`; what is sent without a time is stamped
+with its arrival.
 """
 
 from __future__ import annotations
@@ -67,14 +67,11 @@ _ESTIMATOR_GPS_GLITCH = 1024  # of ESTIMATOR_STATUS_FLAGS; there 1024 is EKF_UNI
 
 
 class Clock(Protocol):
-    """How a sender's times map onto the companion's one clock, integer nanoseconds."""
+    """How a sender's times map onto the companion's one clock (`link.clock.BootClock` is one)."""
 
-    def boot_ns(self, boot_ns: int) -> int:
-        """The companion's time when the sender's time since boot was `boot_ns`."""
-
-    def stamp_ns(self, time_usec: int, rx_ns: int) -> int:
-        """The same for a time in microseconds since boot or since 1970, told apart by magnitude; 0 is
-        "unknown" and gives `rx_ns`."""
+    def local(self, stamp: int, received: int, /) -> int:
+        """When `stamp` was, all in nanoseconds: time since boot or since 1970, told apart by magnitude; 0 is
+        "unknown" and gives `received`."""
 
 
 class Sender(NamedTuple):
@@ -119,8 +116,12 @@ def _of(*names: str) -> Callable[[_Decoder], _Decoder]:
     return enter
 
 
-def _boot(message: Message, sender: Sender) -> int:
-    return sender.clock.boot_ns(message.time_boot_ms * 1_000_000)
+def _booted(message: Message, rx: int, sender: Sender) -> int:
+    return sender.clock.local(message.time_boot_ms * 1_000_000, rx)
+
+
+def _stamped(message: Message, rx: int, sender: Sender) -> int:
+    return sender.clock.local(message.time_usec * 1000, rx)
 
 
 # ---------------------------------------------------------------------------------------------------------
@@ -148,7 +149,7 @@ def _gnss(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
         v_n = (speed * math.cos(course), speed * math.sin(course), 0.0)
     return (
         Gnss(
-            t_ns=sender.clock.stamp_ns(m.time_usec, rx),
+            t_ns=_stamped(m, rx, sender),
             rx_ns=rx,
             receiver=0 if dialect.id_of(m) == 24 else 1,
             stamp_us=m.time_usec,
@@ -174,21 +175,21 @@ def _gnss(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
 
 @_of("LOCAL_POSITION_NED")
 def _local_position(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
-    return (LocalPosition(_boot(m, sender), rx, vector(m, "x y z"), vector(m, "vx vy vz")),)
+    return (LocalPosition(_booted(m, rx, sender), rx, vector(m, "x y z"), vector(m, "vx vy vz")),)
 
 
 @_of("GPS_GLOBAL_ORIGIN")
 def _local_origin(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
     lat, lon = known_position(m, "latitude", "longitude")
     projection = "tangent" if sender.autopilot == "other" else sender.autopilot
-    t_ns = sender.clock.stamp_ns(m.time_usec, rx)
+    t_ns = _stamped(m, rx, sender)
     return (LocalOrigin(t_ns, rx, lat, lon, m.altitude * 1e-3, projection),)
 
 
 @_of("HOME_POSITION")
 def _home_position(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
     lat, lon = known_position(m, "latitude", "longitude")
-    return (HomePosition(sender.clock.stamp_ns(m.time_usec, rx), rx, lat, lon, m.altitude * 1e-3),)
+    return (HomePosition(_stamped(m, rx, sender), rx, lat, lon, m.altitude * 1e-3),)
 
 
 @_of("GLOBAL_POSITION_INT")
@@ -196,7 +197,7 @@ def _global_position(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]
     lat, lon = known_position(m)
     v_n = vector(m, "vx vy vz", 0.01)
     heading = None if m.hdg == 0xFFFF else wrapped(math.radians(m.hdg * 0.01))
-    t_ns = _boot(m, sender)
+    t_ns = _booted(m, rx, sender)
     return (GlobalPosition(t_ns, rx, lat, lon, m.alt * 1e-3, v_n, m.relative_alt * 1e-3, heading),)
 
 
@@ -204,13 +205,15 @@ def _global_position(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]
 def _attitude(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
     roll, pitch, yaw = vector(m, "roll pitch yaw")
     w_b = maybe_vector(m, "rollspeed pitchspeed yawspeed")
-    return (Attitude(_boot(m, sender), rx, roll, pitch, wrapped(yaw), w_b),)
+    return (Attitude(_booted(m, rx, sender), rx, roll, pitch, wrapped(yaw), w_b),)
 
 
 @_of("ATTITUDE_QUATERNION")
 def _attitude_quaternion(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
     q = number(m, "q1"), number(m, "q2"), number(m, "q3"), number(m, "q4")
-    return (Attitude(_boot(m, sender), rx, *euler(q), maybe_vector(m, "rollspeed pitchspeed yawspeed")),)
+    return (
+        Attitude(_booted(m, rx, sender), rx, *euler(q), maybe_vector(m, "rollspeed pitchspeed yawspeed")),
+    )
 
 
 @_of("EKF_STATUS_REPORT")
@@ -226,13 +229,13 @@ def _estimator_status(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...
     accuracy = maybe(m, "pos_horiz_accuracy") if sender.autopilot == "px4" else None
     ratio = maybe(m, "pos_horiz_ratio") or 0.0
     glitch = bool(m.flags & _ESTIMATOR_GPS_GLITCH)
-    return (FilterStatus(sender.clock.stamp_ns(m.time_usec, rx), rx, m.flags, glitch, ratio, accuracy),)
+    return (FilterStatus(_stamped(m, rx, sender), rx, m.flags, glitch, ratio, accuracy),)
 
 
 @_of("SYSTEM_TIME")
 def _system_time(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
     unix_ns = m.time_unix_usec * 1000 if m.time_unix_usec > _UNIX_AFTER_US else None
-    return (SystemTime(_boot(m, sender), rx, m.time_boot_ms * 1_000_000, unix_ns),)
+    return (SystemTime(_booted(m, rx, sender), rx, m.time_boot_ms * 1_000_000, unix_ns),)
 
 
 # ---------------------------------------------------------------------------------------------------------
@@ -242,7 +245,7 @@ def _system_time(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
 
 @_of("HIGHRES_IMU")
 def _highres_imu(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
-    t_ns = sender.clock.stamp_ns(m.time_usec, rx)
+    t_ns = _stamped(m, rx, sender)
     updated = m.fields_updated
     records: tuple[Stamped, ...] = ()
     if updated & _HIGHRES_INERTIAL == _HIGHRES_INERTIAL:
@@ -268,12 +271,12 @@ def _raw_imu(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
     """By the standard in units of the sensor's own; ArduPilot sends mG and mrad/s, so of it alone."""
     if sender.autopilot != "ardupilot":
         return ()
-    return _scaled_imu(m, sender.clock.stamp_ns(m.time_usec, rx), rx, m.id)
+    return _scaled_imu(m, _stamped(m, rx, sender), rx, m.id)
 
 
 @_of("SCALED_IMU", "SCALED_IMU2", "SCALED_IMU3")
 def _numbered_imu(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
-    return _scaled_imu(m, _boot(m, sender), rx, {26: 0, 116: 1, 129: 2}[dialect.id_of(m)])
+    return _scaled_imu(m, _booted(m, rx, sender), rx, {26: 0, 116: 1, 129: 2}[dialect.id_of(m)])
 
 
 @_of("VFR_HUD")
@@ -317,7 +320,7 @@ def _wind_cov(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
     sigma = maybe(m, "horiz_accuracy") or None
     if sigma is None and sender.autopilot == "px4" and 0.0 < m.var_horiz < math.inf:
         sigma = math.sqrt(0.5 * m.var_horiz)
-    t_ns = sender.clock.stamp_ns(m.time_usec, rx)
+    t_ns = _stamped(m, rx, sender)
     return (Wind(t_ns, rx, vector(m, "wind_x wind_y wind_z"), sigma),)
 
 
@@ -325,7 +328,7 @@ def _wind_cov(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
 def _scaled_pressure(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
     differential = maybe(m, "press_diff", 100.0)
     kelvin = m.temperature * 0.01 + _ZERO_CELSIUS
-    return (Pressure(_boot(m, sender), rx, number(m, "press_abs", 100.0), differential, kelvin),)
+    return (Pressure(_booted(m, rx, sender), rx, number(m, "press_abs", 100.0), differential, kelvin),)
 
 
 @_of("RSBN_MEASUREMENT")
@@ -351,7 +354,7 @@ def _rsbn(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
         sigmas.append(configured if sigma is None else sigma)
     return (
         RsbnFix(
-            t_ns=sender.clock.stamp_ns(m.time_usec, rx),
+            t_ns=_stamped(m, rx, sender),
             rx_ns=rx,
             beacon=m.beacon_id,
             lat=lat,
@@ -385,5 +388,5 @@ def _hil_state(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
     """PX4's; its altitude as that of SIM_STATE."""
     lat, lon = known_position(m)
     w, x, y, z = (float(c) for c in m.attitude_quaternion)
-    t_ns = sender.clock.stamp_ns(m.time_usec, rx)
+    t_ns = _stamped(m, rx, sender)
     return (Truth(t_ns, rx, lat, lon, m.alt * 1e-3, vector(m, "vx vy vz", 0.01), euler((w, x, y, z))),)

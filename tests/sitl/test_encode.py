@@ -15,18 +15,15 @@ LAT, LON = math.radians(-35.3627085), math.radians(149.1656122)
 RX = T + 7
 
 
-class BootClock:
-    def boot_ns(self, boot_ns: int) -> int:
-        return BOOT + boot_ns
-
-    def stamp_ns(self, time_usec: int, rx_ns: int) -> int:
-        return BOOT + time_usec * 1000 if time_usec else rx_ns
+class BootedAt:
+    def local(self, stamp: int, received: int) -> int:
+        return BOOT + stamp if stamp else received
 
 
 def over_the_wire(record: r.Stamped, autopilot: Autopilot) -> tuple[r.Stamped, ...]:
     found = frame.examine(frame.encode(encode(record, Airframe(autopilot, BOOT)), 0, 1, 1))
     assert isinstance(found, frame.Frame)
-    return decode(dialect.decode(found), RX, Sender(BootClock(), autopilot))
+    return decode(dialect.decode(found), RX, Sender(BootedAt(), autopilot))
 
 
 IMU = r.Imu(T, RX, 0, (0.5, -0.25, -9.75), (0.125, -0.0625, 0.25))

@@ -1,0 +1,141 @@
+"""Foreign logs -> records: what the companion would have heard, had it been on that flight.
+
+    source = sources.open_source(path)
+    for record in source: ...           # Stamped records, in order of arrival
+    source.summary()                    # counts, once it is read through
+
+A tlog goes through the link's own Session (who the autopilot is, its reboots, its clock) and through
+`wire.decode`, exactly as in flight; only the transport is missing. The clock is the log writer's UNIX time.
+Where the log nowhere tells the local origin (old autopilots did not), it is inferred from local and global
+positions of one instant.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from companion.link.session import LinkUp, MessageReceived, Rebooted, SecondAutopilot, Session
+from companion.log import tlog
+from companion.nav.geometry import Geodetic, Projection, local_to_geodetic, wrap
+from companion.records import Event, FilterStatus, GlobalPosition, LocalOrigin, LocalPosition, Reset, Stamped
+from companion.wire import Autopilot, Sender, decode
+
+_WARNING, _INFO = 4, 6  # MAV_SEVERITY
+_GPS_GLOBAL_ORIGIN = 49
+_POSITION_ABSOLUTE = 16  # EKF_POS_HORIZ_ABS and ESTIMATOR_POS_HORIZ_ABS
+_MAKES: dict[int, Autopilot] = {3: "ardupilot", 12: "px4"}  # MAV_AUTOPILOT
+
+
+class Summary(NamedTuple):
+    """What a log held. `corrupt` counts chunks that are no frame, `torn` the bytes of an unfinished end."""
+
+    messages: int
+    corrupt: int
+    unknown: int
+    torn: int
+    reboots: int
+    records: int
+
+
+class TlogSource:
+    """The records of one tlog, read once. `autopilot_system` heeds no other than that system id."""
+
+    def __init__(self, log: tlog.Tlog, autopilot_system: int | None = None) -> None:
+        self.log = log
+        self.reboots = self.records = 0
+        self._session = Session(autopilot_system=autopilot_system)
+        self._sender = Sender(self._session.clock)
+        told = any(entry.frame.msgid == _GPS_GLOBAL_ORIGIN for entry in tlog.Tlog(log.data))
+        self._origin = None if told else OriginFinder()
+
+    def __iter__(self) -> Iterator[Stamped]:
+        """Records in order of arrival: inputs, truth, rejections, and a Reset at each reboot."""
+        for rx_ns, found in self.log:
+            for event in self._session.receive(found.raw, rx_ns):
+                for record in self._records(event):
+                    self.records += 1
+                    yield record
+            self._session.to_send()  # answers nobody waits for
+
+    def summary(self) -> Summary:
+        """The counts so far."""
+        log = self.log
+        return Summary(log.messages, log.corrupt, log.unknown, log.torn, self.reboots, self.records)
+
+    def _records(self, event: object) -> Iterator[Stamped]:
+        match event:
+            case MessageReceived(rx_ns, message, _, True):
+                for record in decode(message, rx_ns, self._sender):
+                    yield record
+                    if self._origin and (origin := self._origin.see(record, self._sender.autopilot)):
+                        yield origin
+            case LinkUp(at_ns, system, kind):
+                make = _MAKES.get(kind, "other")
+                self._sender = self._sender._replace(autopilot=make)
+                yield Event(at_ns, at_ns, _INFO, f"autopilot {system} ({make}) is heard")
+            case Rebooted(at_ns, system):
+                self.reboots += 1
+                self._origin = self._origin and OriginFinder()
+                yield Reset(at_ns, at_ns, "flight", f"autopilot {system} began anew: its boot time went back")
+            case SecondAutopilot(at_ns, system, kept):
+                yield Event(at_ns, at_ns, _WARNING, f"autopilot {system} is ignored: {kept} is the vehicle's")
+
+
+class OriginFinder:
+    """The local origin out of a local and a global position of about one instant, where no message tells it.
+
+    Both come from one filter, so they are one point; what is left is the rounding of GLOBAL_POSITION_INT
+    (1 cm) and what the aircraft does within `APART_NS`: 0.2 m r.m.s. on a copter that sends both at 1-2 Hz. Nothing is inferred before the filter vouches for its
+    horizontal position, nor twice.
+    """
+
+    APART_NS = 150_000_000
+
+    def __init__(self) -> None:
+        self._local: LocalPosition | None = None
+        self._global: GlobalPosition | None = None
+        self._sound = False
+        self._found = False
+
+    def see(self, record: Stamped, autopilot: Autopilot) -> LocalOrigin | None:
+        """Take a record; returns the origin once, as soon as it can be told."""
+        if isinstance(record, LocalPosition):
+            self._local = record
+        elif isinstance(record, GlobalPosition):
+            self._global = record
+        elif isinstance(record, FilterStatus):
+            self._sound = bool(record.flags & _POSITION_ABSOLUTE)
+        local, known = self._local, self._global
+        if self._found or not self._sound or local is None or known is None:
+            return None
+        if abs(known.t_ns - local.t_ns) > self.APART_NS:
+            return None
+        self._found = True
+        return _origin_between(local, known, "tangent" if autopilot == "other" else autopilot)
+
+
+def _origin_between(local: LocalPosition, known: GlobalPosition, projection: Projection) -> LocalOrigin:
+    """Where `local` is counted from, `known` being the same point a moment apart."""
+    later_s = (known.t_ns - local.t_ns) * 1e-9
+    x_n = np.array(local.x_n) + later_s * np.array(local.v_n)
+    point = origin = Geodetic(known.lat, known.lon, known.alt_msl)
+    for _ in range(4):  # a contraction: each turn gains the ratio of the distance to the earth's radius
+        back = local_to_geodetic(projection, origin, x_n)
+        origin = Geodetic(
+            origin.lat + point.lat - back.lat,
+            wrap(origin.lon + point.lon - back.lon),
+            origin.alt + point.alt - back.alt,
+        )
+    rx_ns = max(local.rx_ns, known.rx_ns)
+    return LocalOrigin(known.t_ns, rx_ns, origin.lat, origin.lon, origin.alt, projection)
+
+
+def open_source(path: Path, autopilot_system: int | None = None) -> TlogSource:
+    """Open a foreign log by the ending of its name. ValueError, one sentence, if it cannot be read."""
+    if path.suffix.lower() != ".tlog":
+        raise ValueError(f"{path} is of no kind that is read here: give a .tlog")
+    return TlogSource(tlog.read(path), autopilot_system)
