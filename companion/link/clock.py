@@ -1,0 +1,125 @@
+"""The autopilot's time on the companion's clock. Pure: every instant is handed in.
+
+MAVLink stamps its measurements with the time since the autopilot's boot, or with UNIX time. Two ways lead
+from there to the companion's clock, local = boot + offset:
+
+  arrival   Every stamped message gives arrival - stamp = offset + delay with delay >= 0, so the offset lies
+            on the lower envelope of what arrives. The envelope may rise slowly (DRIFT), as fast as two
+            crystals may part. It is there from the first message, needs no answer, and errs by the least
+            delay (late).
+  TIMESYNC  The autopilot's clock read between two readings of ours: offset = middle - reading, in error by
+            half the round trip at most. Among recent answers the one of least round trip is believed, a
+            little less with every second of its age. Preferred while it is fresh and agrees with the
+            arrivals.
+
+A stamp that goes back by seconds is a reboot: everything is forgotten and begun again. (So is the wrap of a
+32-bit millisecond stamp after 49.7 days.)
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import NamedTuple
+
+SECOND = 1_000_000_000
+#: How fast two clocks may part: crystals at the ends of the temperature range.
+DRIFT = 100e-6
+#: A stamp this much older than the newest one means a reboot.
+BACK = 3 * SECOND
+#: TIMESYNC and the arrivals never differ by more, unless one of them means another clock.
+DISAGREE = 1 * SECOND
+#: For so long an answer of TIMESYNC is believed.
+FRESH = 60 * SECOND
+#: Stamps from here on (September 2001) are UNIX time; no autopilot is up for 31 years.
+UNIX_EPOCH_FROM = 10**9 * SECOND
+
+
+class Answer(NamedTuple):
+    """One TIMESYNC answer: the offset it gives, its round trip and when it came, all in ns."""
+
+    offset: int
+    round_trip: int
+    at: int
+
+
+class BootClock:
+    """Maps one autopilot's stamps to the companion's clock. All times are integer nanoseconds."""
+
+    def __init__(self) -> None:
+        self._asked: deque[int] = deque(maxlen=8)
+        self._reset()
+
+    def _reset(self) -> None:
+        self._newest = -1
+        self._envelope: int | None = None
+        self._envelope_at = 0
+        self._answers: deque[Answer] = deque(maxlen=16)
+        self._best: Answer | None = None
+        self._unix_minus_boot: int | None = None
+        self._asked.clear()
+
+    def heard(self, boot: int, received: int) -> bool:
+        """Take the stamp of a message that was stamped when sent. Returns True if it tells of a reboot."""
+        rebooted = boot < self._newest - BACK
+        if rebooted:
+            self._reset()
+        self._newest = max(self._newest, boot)
+        seen = received - boot
+        if self._envelope is None:
+            self._envelope = seen
+        else:
+            raised = self._envelope + int(DRIFT * (received - self._envelope_at))
+            if seen < raised - DISAGREE:
+                self._answers.clear()
+                self._best = None
+            self._envelope = min(raised, seen)
+        self._envelope_at = received
+        return rebooted
+
+    def heard_unix(self, unix: int, boot: int) -> None:
+        """Take a pair of the autopilot's two times, valid at one instant (SYSTEM_TIME). UNIX 0 is not set."""
+        if unix >= UNIX_EPOCH_FROM:
+            self._unix_minus_boot = unix - boot
+
+    def ask(self, now: int) -> int:
+        """Return the stamp to send in a TIMESYNC request."""
+        self._asked.append(now)
+        return now
+
+    def answered(self, asked: int, reading: int, now: int) -> bool:
+        """Take a TIMESYNC answer; False if it is not to a question of ours or means another clock."""
+        if asked not in self._asked:
+            return False
+        self._asked.remove(asked)
+        answer = Answer((asked + now) // 2 - reading, now - asked, now)
+        if self._envelope is not None and abs(answer.offset - self._envelope) > DISAGREE:
+            return False
+        self._answers.append(answer)
+        self._best = min(self._answers, key=lambda a: a.round_trip + 2 * DRIFT * (now - a.at))
+        return True
+
+    def offset(self, now: int) -> int | None:
+        """Return local minus boot time, None before anything was heard."""
+        if self._best is not None and now - self._best.at < FRESH:
+            return self._best.offset
+        return self._envelope
+
+    def uncertainty(self, now: int) -> int | None:
+        """Return half the round trip, plus drift, that the offset rests on; None if on arrivals alone."""
+        if self._best is None or now - self._best.at >= FRESH:
+            return None
+        return self._best.round_trip // 2 + int(DRIFT * (now - self._best.at))
+
+    def local(self, stamp: int, received: int) -> int:
+        """Return when a message stamped `stamp` (since boot, or UNIX) was valid, on the companion's clock.
+
+        Never later than its arrival. The arrival itself where the stamp is 0 or cannot be mapped yet.
+        """
+        offset = self.offset(received)
+        if stamp <= 0 or offset is None:
+            return received
+        if stamp >= UNIX_EPOCH_FROM:
+            if self._unix_minus_boot is None:
+                return received
+            stamp -= self._unix_minus_boot
+        return min(stamp + offset, received)

@@ -1,0 +1,272 @@
+"""One MAVLink link, without its I/O: bytes and instants in, events and bytes out. No clock, no socket.
+
+    events = session.receive(data, now_ns)      # whenever bytes came
+    events = session.poll(now_ns)               # no later than session.deadline()
+    for data in session.to_send(): ...          # after either, and after session.send(message)
+
+It says HEARTBEAT, finds the one autopilot and takes its system id, tells when it comes, goes silent or
+reboots, keeps its time on the companion's clock, answers TIMESYNC and asks for the wanted message rates
+until they come. All else a peer says is handed up as MessageReceived. What messages mean is the business of
+`wire`.
+
+A vehicle has one autopilot: component 1 of a system, with a HEARTBEAT of a real autopilot and not of a
+ground station. The first one heard is kept; another is told once, then ignored altogether. Nothing a peer
+sends raises.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+from companion.link import dialect, frame
+from companion.link.clock import SECOND, BootClock
+from companion.link.dialect import Message
+from companion.link.frame import BadFrame, Frame, UnknownFrame
+from companion.link.streams import Streams
+
+HEARTBEAT_EVERY = SECOND
+TIMESYNC_EVERY = SECOND
+#: The autopilot is lost when nothing of it came for so long.
+LOST_AFTER = 5 * SECOND
+
+HEARTBEAT, SYSTEM_TIME, TIMESYNC = 0, 2, 111
+SET_MESSAGE_INTERVAL = 511
+AUTOPILOT_COMPONENT = 1
+TYPE_ONBOARD_CONTROLLER = 18
+AUTOPILOT_INVALID = 8
+STATE_ACTIVE = 4
+#: HEARTBEAT types that come from no autopilot, whatever their autopilot field says.
+NOT_VEHICLES = frozenset({5, 6, 18, 26, 27, 30, 31, 32, 33, 34, 36, 37, 38, 39, 40, 41, 42})
+#: Messages whose time_boot_ms is new in each: SYSTEM_TIME, ATTITUDE(_QUATERNION), LOCAL_ and GLOBAL_POSITION.
+CLOCKED = frozenset({2, 30, 31, 32, 33})
+
+
+class LinkUp(NamedTuple):
+    """The autopilot is heard, first or again; `autopilot` is MAV_AUTOPILOT (3 ArduPilot, 12 PX4)."""
+
+    at_ns: int
+    system: int
+    autopilot: int
+
+
+class LinkLost(NamedTuple):
+    """Nothing of the autopilot came since `heard_ns`."""
+
+    at_ns: int
+    system: int
+    heard_ns: int
+
+
+class Rebooted(NamedTuple):
+    """The autopilot's boot time went back: its clock, origin and streams begin anew."""
+
+    at_ns: int
+    system: int
+
+
+class SecondAutopilot(NamedTuple):
+    """Another autopilot is on the link and will be ignored; told once for each."""
+
+    at_ns: int
+    system: int
+    kept: int
+
+
+class MessageReceived(NamedTuple):
+    """A message, the frame it came in, and whether the vehicle's autopilot sent it."""
+
+    received_ns: int
+    message: Message
+    frame: Frame
+    from_autopilot: bool
+
+
+class NotUnderstood(NamedTuple):
+    """Bytes that are no frame, or a frame of an unknown message."""
+
+    received_ns: int
+    what: BadFrame | UnknownFrame
+
+
+Event = LinkUp | LinkLost | Rebooted | SecondAutopilot | MessageReceived | NotUnderstood
+
+
+class Session:
+    """One side of one link. All times are integer nanoseconds of the companion's clock."""
+
+    def __init__(
+        self,
+        *,
+        component: int = 191,
+        system: int | None = None,
+        autopilot_system: int | None = None,
+        rates_hz: Mapping[str, float] | None = None,
+    ) -> None:
+        """`system`: our own id, if None the autopilot's (1 until it is heard).
+
+        `autopilot_system`: heed no other. `rates_hz`: rates wanted of the autopilot by message name.
+        ValueError on ids outside 1-255, unknown names and impossible rates.
+        """
+        for name, value in (
+            ("component", component),
+            ("system", system),
+            ("autopilot_system", autopilot_system),
+        ):
+            if value is not None and not 1 <= value <= 255:
+                raise ValueError(f"{name} {value} is not a MAVLink id: give 1 to 255")
+        self.component = component
+        self.state = STATE_ACTIVE
+        self.reader = frame.Reader()
+        self.clock = BootClock()
+        self.streams = Streams({dialect.type_named(n).msgid: hz for n, hz in (rates_hz or {}).items()})
+        self._system = system
+        self._wanted = autopilot_system
+        self._autopilot: int | None = None  # its system id
+        self._kind = AUTOPILOT_INVALID
+        self._heard = 0
+        self._up = False
+        self._ignored: set[int] = set()
+        self._sequence = 0
+        self._outbox: list[bytes] = []
+        self._heartbeat_at = 0
+        self._timesync_at = 0
+        self._handlers = {HEARTBEAT: self._on_heartbeat, TIMESYNC: self._on_timesync}
+
+    @property
+    def system(self) -> int:
+        """Our own system id."""
+        return self._system or self._autopilot or 1
+
+    @property
+    def autopilot(self) -> int | None:
+        """The autopilot's system id, None before it was heard."""
+        return self._autopilot
+
+    @property
+    def is_up(self) -> bool:
+        """Whether the autopilot is heard."""
+        return self._up
+
+    def receive(self, data: bytes, now_ns: int) -> list[Event]:
+        """Take bytes that arrived at `now_ns`; return what they mean, in order."""
+        events: list[Event] = []
+        for found in self.reader.receive(data):
+            if isinstance(found, Frame):
+                self._on_frame(found, now_ns, events)
+            else:
+                events.append(NotUnderstood(now_ns, found))
+        return events
+
+    def poll(self, now_ns: int) -> list[Event]:
+        """Do what is due at `now_ns`; return what the passing of time means."""
+        events: list[Event] = []
+        if self._up and now_ns - self._heard >= LOST_AFTER:
+            self._up = False
+            self.streams.stop()
+            events.append(LinkLost(now_ns, self._autopilot or 0, self._heard))
+        if now_ns >= self._heartbeat_at:
+            self._heartbeat_at = now_ns + HEARTBEAT_EVERY
+            self.send(
+                dialect.new(
+                    "HEARTBEAT",
+                    type=TYPE_ONBOARD_CONTROLLER,
+                    autopilot=AUTOPILOT_INVALID,
+                    system_status=self.state,
+                    mavlink_version=3,
+                )
+            )
+        if self._up and now_ns >= self._timesync_at:
+            self._timesync_at = now_ns + TIMESYNC_EVERY
+            self.send(dialect.new("TIMESYNC", ts1=self.clock.ask(now_ns)))
+        for msgid, rate_hz in self.streams.due(now_ns):
+            self._ask_for(msgid, rate_hz)
+        return events
+
+    def deadline(self) -> int:
+        """Return the instant at which `poll` must be called at the latest."""
+        due = [self._heartbeat_at]
+        if self._up:
+            due += [self._timesync_at, self._heard + LOST_AFTER]
+        if (check := self.streams.deadline()) is not None:
+            due.append(check)
+        return min(due)
+
+    def send(self, message: Message) -> None:
+        """Queue a message for `to_send`. ValueError if a field does not fit its wire type."""
+        self._outbox.append(frame.encode(message, self._sequence, self.system, self.component))
+        self._sequence = self._sequence + 1 & 0xFF
+
+    def to_send(self) -> list[bytes]:
+        """Return the frames to be written now, oldest first, and forget them."""
+        sent, self._outbox = self._outbox, []
+        return sent
+
+    def to_local_ns(self, time_usec: int, received_ns: int) -> int:
+        """Return the local time for which a message stamped `time_usec` (since boot, or UNIX) was valid.
+
+        The arrival where the stamp is 0 or not to be mapped yet; for a time_boot_ms give 1000 times it.
+        """
+        return self.clock.local(time_usec * 1000, received_ns)
+
+    def _on_frame(self, found: Frame, now: int, events: list[Event]) -> None:
+        if found.system in self._ignored:
+            return
+        if found.component == self.component and found.system == self.system:
+            return  # our own, sent back by a router
+        message = dialect.decode(found)
+        if (handler := self._handlers.get(found.msgid)) is not None:
+            handler(message, found, now, events)
+            if found.system in self._ignored:
+                return
+        ours = found.system == self._autopilot and found.component == AUTOPILOT_COMPONENT
+        if ours:
+            self._on_autopilot(message, found, now, events)
+        events.append(MessageReceived(now, message, found, ours))
+
+    def _on_autopilot(self, message: Message, found: Frame, now: int, events: list[Event]) -> None:
+        self._heard = now
+        if not self._up:
+            self._up = True
+            self._timesync_at = now
+            self.streams.start(now)
+            events.append(LinkUp(now, found.system, self._kind))
+        self.streams.heard(found.msgid)
+        if found.msgid in CLOCKED and message.time_boot_ms:
+            boot = message.time_boot_ms * 1_000_000
+            if self.clock.heard(boot, now):
+                self.streams.start(now)
+                events.append(Rebooted(now, found.system))
+            if found.msgid == SYSTEM_TIME:
+                self.clock.heard_unix(message.time_unix_usec * 1000, boot)
+
+    def _on_heartbeat(self, message: Message, found: Frame, now: int, events: list[Event]) -> None:
+        if found.component != AUTOPILOT_COMPONENT or message.autopilot == AUTOPILOT_INVALID:
+            return
+        if message.type in NOT_VEHICLES:
+            return
+        if self._autopilot is None and self._wanted in (None, found.system):
+            self._autopilot = found.system
+        if found.system == self._autopilot:
+            self._kind = message.autopilot
+        else:
+            self._ignored.add(found.system)
+            events.append(SecondAutopilot(now, found.system, self._autopilot or self._wanted or 0))
+
+    def _on_timesync(self, message: Message, found: Frame, now: int, events: list[Event]) -> None:
+        if message.tc1 == 0:
+            self.send(dialect.new("TIMESYNC", tc1=max(now, 1), ts1=message.ts1))
+        elif found.system == self._autopilot and found.component == AUTOPILOT_COMPONENT:
+            self.clock.answered(message.ts1, message.tc1, now)
+
+    def _ask_for(self, msgid: int, rate_hz: float) -> None:
+        self.send(
+            dialect.new(
+                "COMMAND_LONG",
+                target_system=self._autopilot or 0,
+                target_component=AUTOPILOT_COMPONENT,
+                command=SET_MESSAGE_INTERVAL,
+                param1=msgid,
+                param2=1e6 / rate_hz,
+            )
+        )

@@ -1,0 +1,127 @@
+"""The autopilot's time comes out of arrivals and of TIMESYNC, through jitter, drift, lies and a reboot."""
+
+import random
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from companion.link.clock import DRIFT, FRESH, SECOND, BootClock
+
+MS = 1_000_000
+OFFSET = 1000 * SECOND
+UNIX_0 = 1_700_000_000 * SECOND  # of the autopilot's boot
+
+
+def test_before_anything_is_heard_the_arrival_is_all_there_is() -> None:
+    assert BootClock().local(5 * SECOND, 77) == 77
+    assert BootClock().offset(0) is None
+
+
+def test_arrivals_alone_find_the_offset_but_for_the_least_delay() -> None:
+    rng = random.Random(1)
+    clock = BootClock()
+    for i in range(3000):
+        boot = i * 100 * MS
+        clock.heard(boot, boot + OFFSET + int((2 + rng.expovariate(1 / 20.0)) * MS))
+    error = clock.local(200 * SECOND, 10**18) - (200 * SECOND + OFFSET)
+    assert 2 * MS <= error < 3.5 * MS
+    assert clock.uncertainty(300 * SECOND + OFFSET) is None
+
+
+def test_arrivals_follow_a_clock_that_runs_slow() -> None:
+    clock = BootClock()
+    rate = 1 - 50e-6
+    for i in range(36_000):  # an hour at 10 Hz
+        local = OFFSET + i * 100 * MS
+        clock.heard(int((local - OFFSET) * rate), local + (1 + i % 7) * MS)
+    error = clock.local(int((local - OFFSET) * rate), 10**18) - local
+    assert abs(error) < 2 * MS  # without the allowance for drift: 180 ms
+
+
+def test_timesync_errs_by_half_the_round_trip_at_most_and_prefers_the_shortest() -> None:
+    rng = random.Random(2)
+    clock = BootClock()
+    for i in range(100):
+        now = OFFSET + i * SECOND
+        there, back = (int(rng.expovariate(1 / 8.0) * MS) + MS for _ in "ab")
+        asked = clock.ask(now)
+        assert clock.answered(asked, now + there - OFFSET, now + there + back)
+        uncertainty = clock.uncertainty(now + there + back)
+        offset = clock.offset(now + there + back)
+        assert offset is not None and uncertainty is not None
+        assert abs(offset - OFFSET) <= uncertainty
+    assert uncertainty < 4 * MS
+
+
+def test_answers_to_nobody_and_of_another_clock_are_refused() -> None:
+    clock = BootClock()
+    clock.heard(10 * SECOND, 10 * SECOND + OFFSET + MS)
+    now = 11 * SECOND + OFFSET
+    assert not clock.answered(123, 11 * SECOND, now)
+    assert not clock.answered(clock.ask(now), UNIX_0, now + MS)
+    asked = clock.ask(now)
+    assert clock.answered(asked, 11 * SECOND, now + MS)
+    assert not clock.answered(asked, 11 * SECOND, now + MS)  # a replay
+
+
+def test_a_stale_answer_gives_way_to_the_arrivals() -> None:
+    clock = BootClock()
+    clock.heard(SECOND, SECOND + OFFSET + 3 * MS)
+    clock.answered(clock.ask(SECOND + OFFSET), SECOND + MS, SECOND + OFFSET + 2 * MS)
+    assert clock.offset(SECOND + OFFSET + FRESH // 2) == OFFSET
+    assert clock.offset(SECOND + OFFSET + 2 * FRESH) == OFFSET + 3 * MS
+
+
+def test_unix_stamps_are_told_by_their_size_and_mapped_through_system_time() -> None:
+    clock = BootClock()
+    clock.heard(10 * SECOND, 10 * SECOND + OFFSET)
+    arrival = 11 * SECOND + OFFSET
+    assert clock.local(UNIX_0 + 9 * SECOND, arrival) == arrival  # not yet known
+    clock.heard_unix(0, 10 * SECOND)
+    assert clock.local(UNIX_0 + 9 * SECOND, arrival) == arrival
+    clock.heard_unix(UNIX_0 + 10 * SECOND, 10 * SECOND)
+    assert clock.local(UNIX_0 + 9 * SECOND, arrival) == 9 * SECOND + OFFSET
+    assert clock.local(9 * SECOND, arrival) == 9 * SECOND + OFFSET
+    assert clock.local(0, arrival) == arrival
+    assert clock.local(99 * SECOND, arrival) == arrival  # never later than it came
+
+
+def test_a_reboot_begins_everything_anew_and_a_reordered_stamp_nothing() -> None:
+    clock = BootClock()
+    assert not clock.heard(100 * SECOND, 100 * SECOND + OFFSET)
+    clock.heard_unix(UNIX_0, 100 * SECOND)
+    assert not clock.heard(98 * SECOND, 100 * SECOND + OFFSET)
+    assert clock.heard(2 * SECOND, 150 * SECOND + OFFSET)
+    assert clock.local(2 * SECOND, 10**18) == 150 * SECOND + OFFSET
+    assert clock.local(UNIX_0, 151 * SECOND + OFFSET) == 151 * SECOND + OFFSET
+
+
+def test_a_false_stamp_from_the_future_heals_at_the_next_message() -> None:
+    clock = BootClock()
+    clock.heard(10 * SECOND, 10 * SECOND + OFFSET)
+    clock.heard(9000 * SECOND, 10 * SECOND + OFFSET)
+    assert clock.heard(11 * SECOND, 11 * SECOND + OFFSET)
+    assert clock.local(11 * SECOND, 10**18) == 11 * SECOND + OFFSET
+
+
+@settings(deadline=None, max_examples=100)
+@given(
+    st.lists(st.tuples(st.integers(0, 2 * SECOND), st.integers(0, SECOND // 2)), min_size=1, max_size=60),
+    st.floats(-90e-6, 90e-6),
+)
+def test_the_envelope_is_never_early_and_never_later_than_the_best_delay_and_drift(
+    steps: list[tuple[int, int]], drift: float
+) -> None:
+    clock = BootClock()
+    boot, best, offset = SECOND, None, OFFSET
+    start = boot
+    for step, delay in steps:
+        boot += step
+        offset = OFFSET + int(drift * (boot - start))
+        clock.heard(boot, boot + offset + delay)
+        best = delay if best is None else min(best, delay)
+    got = clock.offset(boot + offset)
+    assert got is not None
+    span = boot - start + SECOND
+    assert got >= offset - 10
+    assert got <= offset + best + (DRIFT + 90e-6) * span + 10

@@ -1,0 +1,259 @@
+"""A session and an autopilot joined without a network, on a clock that the test owns."""
+
+import random
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from companion.link import dialect, frame
+from companion.link.session import (
+    BadFrame,
+    Event,
+    LinkLost,
+    LinkUp,
+    MessageReceived,
+    NotUnderstood,
+    Rebooted,
+    SecondAutopilot,
+    Session,
+)
+
+MS = 1_000_000
+SECOND = 1000 * MS
+PLANE, GCS, ARDUPILOT, INVALID = 1, 6, 3, 8
+LOCAL_POSITION = 32
+
+
+class Autopilot:
+    """What a session needs to hear; honours SET_MESSAGE_INTERVAL and answers TIMESYNC unless told not to."""
+
+    def __init__(self, system: int = 7, booted: int = 0) -> None:
+        self.system, self.booted, self.sequence = system, booted, 0
+        self.reader = frame.Reader()
+        self.heard: list[dialect.Message] = []
+        self.intervals: dict[int, int] = {}
+        self.obeys = self.answers = True
+
+    def say(self, name: str, **values: object) -> bytes:
+        self.sequence = self.sequence + 1 & 0xFF
+        return frame.encode(dialect.new(name, **values), self.sequence, self.system, 1)
+
+    def heartbeat(self) -> bytes:
+        return self.say("HEARTBEAT", type=PLANE, autopilot=ARDUPILOT)
+
+    def step(self, now: int, data: bytes) -> bytes:
+        """One millisecond-grid step: hear `data`, say what is due."""
+        boot = now - self.booted
+        said = b""
+        for found in self.reader.receive(data):
+            assert isinstance(found, frame.Frame)
+            message = dialect.decode(found)
+            self.heard.append(message)
+            if found.msgid == 76 and message.command == 511 and self.obeys:
+                self.intervals[int(message.param1)] = int(message.param2) * 1000
+            if found.msgid == 111 and message.tc1 == 0 and self.answers:
+                said += self.say("TIMESYNC", tc1=boot, ts1=message.ts1)
+        if boot % SECOND == 0:
+            said += self.heartbeat()
+        if (every := self.intervals.get(LOCAL_POSITION)) and boot % every < 10 * MS:
+            said += self.say("LOCAL_POSITION_NED", time_boot_ms=boot // MS)
+        return said
+
+    def names(self) -> list[str]:
+        return [message.get_type() for message in self.heard]
+
+
+def run(session: Session, peer: Autopilot | None, start: int, seconds: float, delay: int = 0) -> list[Event]:
+    """Join the two, `delay` each way, in steps of 10 ms; the session is polled at its deadlines only."""
+    events: list[Event] = []
+    to_peer: list[tuple[int, bytes]] = []
+    to_session: list[tuple[int, bytes]] = []
+    now = start
+    while now < start + seconds * SECOND:
+        if now >= session.deadline():
+            events += session.poll(now)
+            assert session.deadline() > now
+        heard = b"".join(d for at, d in to_session if at <= now)
+        to_session = [(at, d) for at, d in to_session if at > now]
+        events += session.receive(heard, now)
+        to_peer += [(now + delay, d) for d in session.to_send()]
+        if peer is not None:
+            data = b"".join(d for at, d in to_peer if at <= now)
+            to_peer = [(at, d) for at, d in to_peer if at > now]
+            if said := peer.step(now, data):
+                to_session.append((now + max(delay, 1), said))
+        now += 10 * MS
+    return events
+
+
+def kinds(events: list[Event]) -> list[type]:
+    return [type(e) for e in events if not isinstance(e, MessageReceived)]
+
+
+def test_an_autopilot_comes_is_adopted_goes_silent_and_comes_back() -> None:
+    session, peer = Session(), Autopilot()
+    events = run(session, peer, 0, 3)
+    assert kinds(events) == [LinkUp]
+    assert events[0].system == 7 == session.system == session.autopilot
+    assert events[0].autopilot == ARDUPILOT and session.is_up
+    events = run(session, None, 3 * SECOND, 10)
+    assert kinds(events) == [LinkLost]
+    lost = next(e for e in events if isinstance(e, LinkLost))
+    assert lost.at_ns - lost.heard_ns == 5 * SECOND and not session.is_up
+    assert kinds(run(session, peer, 13 * SECOND, 3)) == [LinkUp]
+
+
+def test_heartbeats_go_out_each_second_from_the_vehicle_s_own_system() -> None:
+    session, peer = Session(component=197), Autopilot()
+    run(session, peer, 0, 10)
+    beats = [m for m in peer.heard if m.get_type() == "HEARTBEAT"]
+    assert len(beats) == 10
+    assert (beats[-1].type, beats[-1].autopilot, beats[-1].system_status) == (18, INVALID, 4)
+    assert (beats[-1].get_srcSystem(), beats[-1].get_srcComponent()) == (7, 197)
+    assert all(counts.lost == 0 for counts in peer.reader.counts.values())
+
+
+def test_before_anybody_is_heard_it_says_heartbeat_and_nothing_else() -> None:
+    session, silent = Session(rates_hz={"LOCAL_POSITION_NED": 10}), Autopilot()
+    silent.step = lambda now, data: (
+        silent.heard.extend(  # type: ignore[method-assign]
+            dialect.decode(f) for f in silent.reader.receive(data)
+        )
+        or b""
+    )
+    assert run(session, silent, 0, 5) == []
+    assert set(silent.names()) == {"HEARTBEAT"}
+
+
+def test_timesync_finds_the_boot_time_through_a_slow_link() -> None:
+    session, peer = Session(rates_hz={"LOCAL_POSITION_NED": 10}), Autopilot(booted=-500 * SECOND)
+    run(session, peer, 0, 10, delay=30 * MS)
+    assert abs(session.to_local_ns(505_000_000, 10 * SECOND) - 5 * SECOND) <= 10 * MS
+    peer = Autopilot(booted=-500 * SECOND)
+    peer.answers = False
+    session = Session(rates_hz={"LOCAL_POSITION_NED": 10})
+    run(session, peer, 0, 10, delay=30 * MS)
+    assert session.clock.uncertainty(10 * SECOND) is None
+    assert session.to_local_ns(505_000_000, 10 * SECOND) - 5 * SECOND == pytest.approx(40 * MS, abs=11 * MS)
+
+
+def test_a_timesync_question_is_answered_at_once() -> None:
+    session, peer = Session(), Autopilot()
+    session.receive(peer.heartbeat() + peer.say("TIMESYNC", ts1=4242), 9 * SECOND)
+    (answer,) = [dialect.decode(f) for data in session.to_send() for f in frame.Reader().receive(data)]
+    assert (answer.get_type(), answer.tc1, answer.ts1) == ("TIMESYNC", 9 * SECOND, 4242)
+
+
+def test_a_reboot_is_noticed_and_the_streams_are_asked_for_again() -> None:
+    session, peer = Session(rates_hz={"LOCAL_POSITION_NED": 10}), Autopilot(booted=-100 * SECOND)
+    run(session, peer, 0, 10)
+    peer.booted, peer.heard = 9 * SECOND, []
+    events = run(session, peer, 10 * SECOND, 3)
+    assert kinds(events) == [Rebooted]
+    assert "COMMAND_LONG" in peer.names()
+    assert abs(session.to_local_ns(2_000_000, 20 * SECOND) - 11 * SECOND) <= 10 * MS
+
+
+def test_a_rate_that_comes_is_asked_for_once_and_one_that_was_overwritten_again() -> None:
+    session, peer = Session(rates_hz={"LOCAL_POSITION_NED": 10}), Autopilot()
+    run(session, peer, 0, 60)
+    asked = [m for m in peer.heard if m.get_type() == "COMMAND_LONG"]
+    assert [(m.param1, m.param2, m.target_system, m.command) for m in asked] == [(32, 100_000, 7, 511)]
+    wanted, measured = session.streams.rates()[LOCAL_POSITION]
+    assert measured == pytest.approx(wanted, rel=0.05)
+    peer.intervals[LOCAL_POSITION] = SECOND  # a ground station
+    run(session, peer, 60 * SECOND, 12)
+    assert peer.intervals[LOCAL_POSITION] == 100 * MS
+
+
+def test_a_refused_rate_is_asked_for_ever_more_rarely() -> None:
+    session, peer = Session(rates_hz={"LOCAL_POSITION_NED": 10}), Autopilot()
+    peer.obeys = False
+    run(session, peer, 0, 300)
+    assert peer.names().count("COMMAND_LONG") == 8  # at 0, 5, 15, 35, 75, 135, 195, 255 s
+
+
+def test_a_second_autopilot_is_told_once_and_ignored() -> None:
+    session, peer, other = Session(), Autopilot(7), Autopilot(8)
+    events = session.receive(peer.heartbeat() + other.heartbeat() * 3 + other.say("ATTITUDE"), 0)
+    assert kinds(events) == [LinkUp, SecondAutopilot]
+    assert (events[-1].system, events[-1].kept) == (8, 7)
+    assert session.receive(other.heartbeat() + other.say("ATTITUDE", time_boot_ms=5), SECOND) == []
+    assert session.autopilot == 7
+
+
+def test_the_autopilot_named_in_the_configuration_is_waited_for() -> None:
+    session = Session(autopilot_system=8)
+    assert kinds(session.receive(Autopilot(7).heartbeat(), 0)) == [SecondAutopilot]
+    assert kinds(session.receive(Autopilot(8).heartbeat(), 0)) == [LinkUp]
+
+
+def test_ground_stations_and_peripherals_are_no_autopilots_but_are_heard() -> None:
+    session = Session()
+    gcs = frame.encode(dialect.new("HEARTBEAT", type=GCS, autopilot=INVALID), 0, 255, 190)
+    odd_gcs = frame.encode(dialect.new("HEARTBEAT", type=GCS, autopilot=ARDUPILOT), 0, 254, 1)
+    gimbal = frame.encode(dialect.new("HEARTBEAT", type=26, autopilot=INVALID), 0, 1, 154)
+    beacon = frame.encode(dialect.new("RSBN_MEASUREMENT", beacon_id=3), 0, 1, 50)
+    events = session.receive(gcs + odd_gcs + gimbal + beacon, 0)
+    assert [type(e) for e in events] == [MessageReceived] * 4
+    assert not any(e.from_autopilot for e in events)
+    assert session.autopilot is None
+
+
+def test_our_own_frames_sent_back_are_not_heard() -> None:
+    session = Session()
+    session.poll(0)
+    (sent,) = session.to_send()
+    assert session.receive(sent, 1) == []
+
+
+def test_an_acknowledgement_is_handed_up_with_its_frame() -> None:
+    session, peer = Session(), Autopilot()
+    events = session.receive(peer.heartbeat() + peer.say("COMMAND_ACK", command=511, result=0), 5)
+    ack = events[-1]
+    assert isinstance(ack, MessageReceived)
+    assert (ack.message.command, ack.received_ns, ack.from_autopilot, ack.frame.system) == (511, 5, True, 7)
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ({"component": 0}, "component 0 is not a MAVLink id"),
+        ({"system": 256}, "system 256 is not a MAVLink id"),
+        ({"rates_hz": {"LOCAL_POSITION": 1}}, "did you mean LOCAL_POSITION_NED"),
+        ({"rates_hz": {"ATTITUDE": 0}}, "a rate of 0 Hz for message 30"),
+    ],
+)
+def test_impossible_settings_are_named(values: dict, words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        Session(**values)
+
+
+@settings(deadline=None, max_examples=60)
+@given(st.lists(st.one_of(st.binary(max_size=50), st.integers(0, 2**32)), max_size=20))
+def test_no_input_raises_and_the_deadline_stays_ahead(inputs: list[bytes | int]) -> None:
+    session, now = Session(rates_hz={"ATTITUDE": 5}), 0
+    session.receive(Autopilot().heartbeat(), 0)
+    for one in inputs:
+        if isinstance(one, bytes):
+            for event in session.receive(one, now):
+                assert not isinstance(event, NotUnderstood) or isinstance(
+                    event.what, BadFrame | frame.UnknownFrame
+                )
+        else:
+            now += random.Random(one).randrange(3 * SECOND)
+            session.receive(frame_of_anything(one), now)
+        session.poll(now)
+        assert session.deadline() > now
+        assert session.send(dialect.new("HEARTBEAT")) is None
+        assert len(session.to_send()) >= 1
+
+
+def frame_of_anything(seed: int) -> bytes:
+    rng = random.Random(seed)
+    kind = dialect.TYPES[rng.choice(sorted(dialect.TYPES))]
+    found = frame.Frame(
+        kind.msgid, rng.randbytes(kind.layout.size), 0, rng.choice((7, 7, 1, 255)), 1, None, b""
+    )
+    return frame.encode(dialect.decode(found), 0, found.system, 1)
