@@ -1,0 +1,124 @@
+"""RSBN beacons: when a beacon answers an aircraft, and what it says.
+
+An answer is the azimuth of the aircraft at the beacon (true north, clockwise) and the slant range. Beyond
+the beacon's range or the radio horizon there is none; in the cone of silence overhead it has no azimuth.
+It knows nothing of the receiver's message, of time mapping or of faults (`sitl.faults`).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from companion.nav.earth import E2, A
+from companion.nav.geometry import enu_axes
+from companion.records import RsbnFix
+from sitl.flight import Array, Flight
+
+_RADIO_R = 4.0 / 3.0 * 6371000.0
+
+
+@dataclass(frozen=True, slots=True)
+class Beacon:
+    """A ground beacon and the errors of its channel.
+
+    Sigmas are one sigma: RSBN's usual figures, 0.25 degrees and 200 m + 0.03 % of the range, are two.
+    `north_deg` is how far the beacon's north is turned: it is added to every azimuth. `alt` is above the
+    ellipsoid, `ground_alt` that of the smooth earth which the horizon is reckoned over.
+    """
+
+    number: int
+    lat_deg: float
+    lon_deg: float
+    alt: float = 60.0
+    ground_alt: float = 20.0
+    range_limit: float = 350e3
+    sigma_azimuth_deg: float = 0.125
+    sigma_range: float = 100.0
+    sigma_range_share: float = 1.5e-4
+    azimuth_step_deg: float = 0.01
+    range_step: float = 10.0
+    bias_range: float = 0.0
+    north_deg: float = 0.0
+    drop_out: float = 0.01
+    silence_deg: float = 45.0
+    latency_s: float = 0.15
+
+
+def sights(beacon: Beacon, flight: Flight) -> tuple[Array, Array, Array]:
+    """True azimuth in [0, 2 pi), slant range and elevation of the flight's positions at the beacon."""
+
+    def ecef(lat: Array, lon: Array, alt: Array) -> Array:
+        R_E = A / np.sqrt(1.0 - E2 * np.sin(lat) ** 2)
+        rho = (R_E + alt) * np.cos(lat)
+        return np.stack(
+            [rho * np.cos(lon), rho * np.sin(lon), ((1.0 - E2) * R_E + alt) * np.sin(lat)], axis=-1
+        )
+
+    lat, lon = math.radians(beacon.lat_deg), math.radians(beacon.lon_deg)
+    away = ecef(flight.lat, flight.lon, flight.alt) - ecef(np.array(lat), np.array(lon), np.array(beacon.alt))
+    east, north, up = enu_axes(lat, lon) @ away.T
+    level = np.hypot(east, north)
+    return np.arctan2(east, north) % (2.0 * np.pi), np.hypot(level, up), np.arctan2(up, level)
+
+
+def in_reach(beacon: Beacon, flight: Flight) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+    """Where the flight is within the beacon's range limit and above its radio horizon (4/3 earth)."""
+    _, slant, _ = sights(beacon, flight)
+    mast = max(beacon.alt - beacon.ground_alt, 0.0)
+    height = np.maximum(flight.alt - beacon.ground_alt, 0.0)
+    horizon = math.sqrt(2.0 * _RADIO_R) * (np.sqrt(height) + math.sqrt(mast))
+    reached: np.ndarray[tuple[int], np.dtype[np.bool_]] = slant <= np.minimum(horizon, beacon.range_limit)
+    return reached
+
+
+def answers(
+    beacon: Beacon,
+    flight: Flight,
+    rng: np.random.Generator,
+    outages: tuple[tuple[float, float], ...] = (),
+) -> list[RsbnFix]:
+    """The beacon's answers at the flight's times; `t_ns` is flight time, `rx_ns` that plus the latency."""
+    azimuth, slant, elevation = sights(beacon, flight)
+    n = len(flight.t)
+    sigma_azimuth = math.radians(beacon.sigma_azimuth_deg)
+    sigma_range = beacon.sigma_range + beacon.sigma_range_share * slant
+    # Drawn for every moment, heard or not, so that an outage does not change the noise after it.
+    azimuth = azimuth + math.radians(beacon.north_deg) + sigma_azimuth * rng.standard_normal(n)
+    slant = slant + beacon.bias_range + sigma_range * rng.standard_normal(n)
+    heard = in_reach(beacon, flight) & (rng.random(n) >= beacon.drop_out)
+    for start, end in outages:
+        heard &= (flight.t < start) | (flight.t >= end)
+    step = math.radians(beacon.azimuth_step_deg)
+    if step:
+        azimuth = np.round(azimuth / step) * step
+    if beacon.range_step:
+        slant = np.round(slant / beacon.range_step) * beacon.range_step
+    azimuth = np.mod(azimuth, 2.0 * np.pi)
+    silent = elevation > math.radians(beacon.silence_deg)
+    lat, lon = math.radians(beacon.lat_deg), math.radians(beacon.lon_deg)
+    return [
+        RsbnFix(
+            round(t * 1e9),
+            round((t + beacon.latency_s) * 1e9),
+            beacon=beacon.number,
+            lat=lat,
+            lon=lon,
+            alt=beacon.alt,
+            azimuth=None if quiet else a,
+            slant_range=max(d, 0.0),
+            sigma_azimuth=sigma_azimuth,
+            sigma_range=s,
+        )
+        for t, a, d, s, quiet, on in zip(
+            flight.t.tolist(),
+            azimuth.tolist(),
+            slant.tolist(),
+            sigma_range.tolist(),
+            silent.tolist(),
+            heard.tolist(),
+        )
+        if on
+    ]
