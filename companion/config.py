@@ -150,7 +150,13 @@ def load(
 
     Raises `ConfigError` where a file cannot be read, a key is unknown or a value impossible.
     """
-    tree = _read(path) if path else {}
+    try:
+        text = path.read_text(encoding="utf-8") if path else ""
+    except FileNotFoundError:
+        raise ConfigError(f"{path}: no such file; start from `companion check-config --defaults`") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: cannot be read ({error})") from None
+    tree = _tree(text, str(path))
     _check_keys(tree, str(path))
     origin = {(section, key): str(path) for section, table in tree.items() for key in table}
     for name, text in (os.environ if environment is None else environment).items():
@@ -167,6 +173,13 @@ def load(
     return _convert(tree, origin)
 
 
+def parse(text: str, where: str) -> Config:
+    """The configuration written in `text`; `where` names it in a `ConfigError`."""
+    tree = _tree(text, where)
+    _check_keys(tree, where)
+    return _convert(tree, {(section, key): where for section, table in tree.items() for key in table})
+
+
 def to_toml(config: Config) -> str:
     """The whole configuration as the TOML that `load` reads back."""
     lines = []
@@ -181,18 +194,14 @@ def to_toml(config: Config) -> str:
     return "\n".join(lines)
 
 
-def _read(path: Path) -> dict[str, dict[str, Any]]:
+def _tree(text: str, where: str) -> dict[str, dict[str, Any]]:
     try:
-        tree = tomllib.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise ConfigError(f"{path}: no such file; start from `companion check-config --defaults`") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: cannot be read ({error})") from None
+        tree = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"{path}: is no TOML: {error}") from None
+        raise ConfigError(f"{where}: is no TOML: {error}") from None
     for section, table in tree.items():
         if not isinstance(table, dict) and section in Config.__struct_fields__:
-            raise ConfigError(f"{path}: `{section}` is a section: write [{section}] and its keys below it")
+            raise ConfigError(f"{where}: `{section}` is a section: write [{section}] and its keys below it")
     return {name: table if isinstance(table, dict) else {"": table} for name, table in tree.items()}
 
 

@@ -52,31 +52,15 @@ ASK_ORIGIN_EVERY = 3 * SECOND
 class Log(Protocol):
     """Where records and raw frames go; `companion.log.file.Writer` is one."""
 
-    def record(self, record: Stamped) -> None:
-        """Write one record."""
+    def record(self, record: Stamped, channel: str | None = None) -> None:
+        """Write one record, to the channel of its kind if no other is named."""
 
     def frame(self, link: str, outgoing: bool, data: bytes, t_ns: int) -> None:
         """Write one frame."""
 
 
-class LinkClock:
-    """A session's clock as `wire` asks for it; `now` is the arrival of what is being decoded."""
-
-    def __init__(self, session: Session) -> None:
-        self._session = session
-        self.now = 0
-
-    def boot_ns(self, boot_ns: int) -> int:
-        """Boot time on our clock."""
-        return self._session.clock.local(boot_ns, self.now)
-
-    def stamp_ns(self, time_usec: int, rx_ns: int) -> int:
-        """A stamp of boot or UNIX time on our clock."""
-        return self._session.to_local_ns(time_usec, rx_ns)
-
-
 class Link:
-    """One link: its session, its clock, and how its autopilot's messages are read."""
+    """One link: its session, and how its autopilot's messages are read."""
 
     def __init__(self, name: str, config: Config) -> None:
         self.name = name
@@ -85,8 +69,7 @@ class Link:
             autopilot_system=config.link.system_id or None,
             rates_hz=wanted(config.rates),
         )
-        self.clock = LinkClock(self.session)
-        self.sender = Sender(self.clock)
+        self.sender = Sender(self.session.clock)
         self.bad = 0
         self.origin_at = 0  # when the local origin is next asked for
 
@@ -169,7 +152,7 @@ class Onboard:
 
     def note(self, severity: int, text: str, now_ns: int) -> None:
         """Log and tell a change of state."""
-        self._emit(Event(now_ns, now_ns, severity, text))
+        self._emit(Event(now_ns, now_ns, severity, text), "/link/Event")
 
     def _on_events(self, link: Link, events: list[Any], now_ns: int) -> None:
         for event in events:
@@ -197,13 +180,12 @@ class Onboard:
         self._log.frame(link.name, False, event.frame.raw, event.received_ns)
         if not (event.from_autopilot or event.frame.msgid == RSBN):
             return
-        link.clock.now = event.received_ns
         for record in decode(event.message, event.received_ns, link.sender):
             self._on_record(record)
 
     def _on_record(self, record: Stamped) -> None:
         if not isinstance(record, INPUTS):  # truth, or a rejection by `wire`: logged, and no further
-            self._emit(record)
+            self._emit(record, "/link/Rejection" if isinstance(record, Rejection) else None)
             return
         self._log.record(record)
         if isinstance(record, LocalOrigin):
@@ -213,8 +195,8 @@ class Onboard:
             if isinstance(output, Solution):
                 self._send(output, news=isinstance(record, RsbnFix))
 
-    def _emit(self, record: Stamped) -> None:
-        self._log.record(record)
+    def _emit(self, record: Stamped, channel: str | None = None) -> None:
+        self._log.record(record, channel)
         if isinstance(record, Event):
             self.events.append(record)
         elif isinstance(record, Rejection):

@@ -1,0 +1,173 @@
+"""`companion replay`: the navigator that flew, over any log; our own logs must give the same outputs bit for
+bit.
+
+An MCAP log of ours holds what went into the navigator, what came out and the configuration: its inputs are
+handed in again and every output is compared. Any other log has inputs only (`log.sources`); what comes out is
+written.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from itertools import zip_longest
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import click
+from rich.console import Console
+from rich.progress import Progress
+
+from companion import __version__
+from companion.config import Config, load, parse, to_toml
+from companion.log import file, sources
+from companion.log.opened import LogError
+from companion.navigator import Navigator
+from companion.records import INPUTS, Solution, Stamped
+
+CONFIGURATION = "configuration"  # the metadata record, and its key `toml`
+
+
+class Replayed(NamedTuple):
+    """What a replay saw. Of `compared` outputs `different` are not as in flight."""
+
+    inputs: int
+    outputs: dict[str, int]
+    compared: int | None
+    different: int
+    first_difference: str | None
+
+
+def metadata(config: Config) -> dict[str, dict[str, str]]:
+    """What every log of ours says of itself."""
+    return {CONFIGURATION: {"toml": to_toml(config)}, "companion": {"version": __version__}}
+
+
+def configuration(path: Path) -> Config:
+    """The configuration that flew with the log at `path`, the default one where none is told."""
+    text = file.metadata(path).get(CONFIGURATION, {}).get("toml")
+    return Config() if text is None else parse(text, f"{path} (its own configuration)")
+
+
+def replay_own(path: Path, config: Config, sink: Any = None) -> Replayed:
+    """Hand the log's inputs to a navigator and compare what comes out with what came out in flight."""
+    navigator, count, outputs = Navigator(config), Counter[str](), Counter[str]()
+    compared = different = 0
+    first: str | None = None
+    ours: list[Stamped] = []
+    flown: list[Stamped] = []
+
+    def settle() -> None:
+        nonlocal compared, different, first
+        for then, now in zip_longest(flown, ours):
+            compared += 1
+            if then != now:
+                different += 1
+                first = first or f"in flight {then}, now {now}"
+        flown.clear()
+        ours.clear()
+
+    for entry in file.read(path):
+        direction = entry.topic.split("/")[1]
+        if direction == "in":
+            settle()
+            count["in"] += 1
+            if sink is not None:
+                sink.record(entry.value)
+            ours += navigator.handle(entry.value)
+            for output in ours:
+                outputs[type(output).__name__] += 1
+                if sink is not None:
+                    sink.record(output)
+        elif direction == "out":
+            flown.append(entry.value)
+    settle()
+    return Replayed(count["in"], dict(outputs), compared, different, first)
+
+
+def replay_foreign(records: Iterable[Stamped], config: Config, sink: Any) -> Replayed:
+    """Hand the records of a foreign log to a navigator, and write everything to `sink`."""
+    navigator, outputs, inputs = Navigator(config), Counter[str](), 0
+    for record in records:
+        sink.record(record)
+        if isinstance(record, INPUTS):
+            inputs += 1
+            for output in navigator.handle(record):  # type: ignore[arg-type]
+                outputs[type(output).__name__] += 1
+                sink.record(output)
+    return Replayed(inputs, dict(outputs), None, 0, None)
+
+
+def writer(path: Path, config: Config, start_ns: int, start_unix_ns: int) -> file.Writer:
+    """A log for a replay: it waits for the disk, since nobody flies by it."""
+    return file.Writer(
+        path, metadata=metadata(config), start_unix_ns=start_unix_ns, start_ns=start_ns, block=True
+    )
+
+
+@click.command("replay")
+@click.argument("log", type=click.Path(path_type=Path))
+@click.option(
+    "-o", "--output", type=click.Path(path_type=Path), help="Where to write the MCAP of this replay."
+)
+@click.option("--config", "config_file", type=click.Path(path_type=Path), help="Fly with this configuration.")
+@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+def command(log: Path, output: Path | None, config_file: Path | None, as_json: bool) -> None:
+    """Run the navigator over LOG: an MCAP of ours (outputs compared bit for bit), or a MAVLink .tlog.
+
+    A foreign log's replay is written to OUTPUT (by default beside you, as NAME.replay.mcap).
+    """
+    begun = time.perf_counter()
+    own = log.suffix == ".mcap" or log.name.endswith(".mcap.active")
+    config = load(config_file) if config_file or not own else configuration(log)
+    counts: dict[str, int] = {}
+    if own:
+        first = next(iter(file.read(log)), None)
+        if first is None:
+            raise LogError(f"{log} holds no message: there is nothing to replay")
+        sink = None
+        if output is not None:
+            start_ns = getattr(first.value, "rx_ns", 0)
+            sink = writer(output, config, start_ns, first.log_time)
+        found = replay_own(log, config, sink)
+    else:
+        output = output or Path(log.with_suffix(".replay.mcap").name)
+        source = sources.open_source(log)
+        with Progress(console=Console(stderr=True), transient=True) as progress:
+            records = progress.track(_peeked(source), description=f"replay {log.name}")
+            sink = writer(output, config, 0, 0)  # a tlog's times are UNIX already
+            found = replay_foreign(records, config, sink)
+        counts = source.summary()._asdict()
+    if sink is not None:
+        sink.close()
+    seconds = time.perf_counter() - begun
+    if as_json:
+        click.echo(json.dumps({"log": str(log), **counts, **found._asdict(), "seconds": round(seconds, 3)}))
+    else:
+        _print(log, output, counts, found, seconds)
+    if found.different:
+        raise SystemExit(1)
+
+
+def _peeked(source: Iterable[Stamped]) -> Iterator[Stamped]:
+    yield from source
+
+
+def _print(log: Path, output: Path | None, counts: dict[str, int], found: Replayed, seconds: float) -> None:
+    click.echo(f"{log}: {found.inputs} inputs in {seconds:.1f} s")
+    if counts:
+        click.echo("  " + ", ".join(f"{value} {name}" for name, value in counts.items()))
+    click.echo(
+        "  out: " + (", ".join(f"{n} {name}" for name, n in sorted(found.outputs.items())) or "nothing")
+    )
+    if not found.outputs.get(Solution.__name__):
+        click.echo("  no solution: the log has no local position with an origin, or no fix that was believed")
+    if found.compared is not None:
+        same = "all the same, bit for bit" if not found.different else f"{found.different} DIFFERENT"
+        click.echo(f"  compared with the flight: {found.compared} outputs, {same}")
+        if found.first_difference:
+            click.echo(f"  first difference: {found.first_difference}")
+    if output is not None:
+        click.echo(f"  written to {output}")
