@@ -30,7 +30,7 @@ from ..records import BY_NAME, INPUTS, LinkState, Stamped, Truth, encode
 from . import container, location
 from .container import Chunk, Damaged
 from .opened import ACTIVE, Channels, LogError, Recovered, opened, recover
-from .store import Disk, DiskFile, Store
+from .store import Disk, DiskFile, Store, sync_folder
 
 __all__ = [
     "Entry",
@@ -84,8 +84,9 @@ class Writer:
 
     `start_unix_ns` is the wall-clock time at `start_ns` of the companion's clock. `metadata` is kept as
     given, beside a record "log" of version and start times. A chunk holds `chunk_bytes` or what came in
-    `fsync_s` seconds of real time. At most `depth` bytes wait for the disk: beyond, the oldest are dropped and counted,
-    or with `block` (a simulation that runs faster than any disk) the caller waits. `disk` opens the file.
+    `fsync_s` seconds of real time. At most `depth` bytes wait for the disk: beyond, the oldest are dropped
+    and counted, or with `block` (a simulation that runs faster than any disk) the caller waits for a disk
+    that is slow, never for one that refuses. `disk` opens the file.
 
     Raises LogError where the file cannot be begun, and never afterwards: `trouble` says what the disk said
     last, None while all is well, and what waits is tried again for as long as there is room.
@@ -157,12 +158,12 @@ class Writer:
 
         Where the disk refuses or takes longer than `timeout_s` the log stays ".active", to be recovered.
         """
-        if not self._closing:
+        with self._lock:
             self._closing = True
-            self._wake.set()
-            self._thread.join(timeout_s)
-            if self._thread.is_alive():
-                self.trouble = f"the disk did not answer within {timeout_s:g} s"
+        self._wake.set()
+        self._thread.join(timeout_s)
+        if self._thread.is_alive():
+            self.trouble = f"cannot close the log {self.path}: no answer from the disk in {timeout_s:g} s"
         return self.trouble is None
 
     def __enter__(self) -> Writer:
@@ -176,14 +177,17 @@ class Writer:
     # -- in the caller's thread ------------------------------------------------------------------------
 
     def _put(self, number: int, rx_ns: int, t_ns: int, data: bytes) -> None:
-        sequence = self._sequences[number]
-        self._sequences[number] = (sequence + 1) & 0xFFFFFFFF
         log_ns, publish_ns = rx_ns + self._shift, t_ns + self._shift
         if not (
             0 <= log_ns <= _MOST and 0 <= publish_ns <= _MOST
         ):  # a clock gone mad; the record has it exact
             log_ns, publish_ns = min(max(log_ns, 0), _MOST), min(max(publish_ns, 0), _MOST)
         with self._lock:
+            if self._closing:
+                self.dropped += 1
+                return
+            sequence = self._sequences[number]
+            self._sequences[number] = (sequence + 1) & 0xFFFFFFFF
             chunk = self._open
             chunk.add(number, sequence, log_ns, publish_ns, data)
             if len(chunk.data) >= self._chunk_bytes:
@@ -262,16 +266,22 @@ class Writer:
             if tick:
                 with self._lock:
                     self._turn()
-            self._drain()
-            if tick:
-                self._try(self._file.sync)
                 due = time.monotonic() + self._period_s
+            if self._drain() and tick:
+                self._try(self._file.sync)
         with self._lock:
             self._turn()
-        finished = self._drain() and self._try(self._file.finish) and self._try(self._file.sync)
+        written = self._drain()
+        finished = written and self._try(self._file.finish) and self._try(self._file.sync)
         self._file.close()
         if finished:
-            self._try(lambda: os.replace(self.path.with_name(self.path.name + ACTIVE), self.path))
+            self._try(self._name)
+        with self._lock:
+            self.dropped += sum(chunk.messages for chunk in self._waiting)
+
+    def _name(self) -> None:
+        os.replace(self.path.with_name(self.path.name + ACTIVE), self.path)
+        sync_folder(self.path.parent)
 
     def _drain(self) -> bool:
         """Write every chunk that waits; False at the first the disk refuses, which then waits on."""

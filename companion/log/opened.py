@@ -6,6 +6,7 @@ the file was closed. It does not know what the messages are.
 
 from __future__ import annotations
 
+import fcntl
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -14,7 +15,7 @@ from typing import BinaryIO, NamedTuple
 
 from . import container
 from .container import Chunk, Damaged
-from .store import DiskFile, Store
+from .store import DiskFile, Store, sync_folder
 
 ACTIVE = ".active"
 """Stands after the name of a log that is not closed."""
@@ -144,9 +145,14 @@ def recover(path: str | os.PathLike[str]) -> Recovered:
 
     `x.mcap.active` becomes `x.mcap`; of a torn `x.mcap` a copy `x.recovered.mcap` is made. The torn log
     itself goes only after its copy is safely on the disk, and only if it is ".active". A whole log is left
-    as it is. Raises LogError where there is nothing to read or no room for the copy.
+    as it is. Raises LogError where there is nothing to read, where a process still writes it, or where there
+    is no room for the copy.
     """
     with opened(path) as source:
+        try:
+            fcntl.flock(source.file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            raise LogError(f"{path}: is still being written") from None
         if source.closed:
             try:
                 count = sum(_messages(data) for data in source.stretches())
@@ -164,6 +170,7 @@ def recover(path: str | os.PathLike[str]) -> Recovered:
             finally:
                 disk.close()
             os.replace(part, target)
+            sync_folder(target.parent)
             if source.path.suffix == ACTIVE:
                 source.path.unlink()
         except OSError as error:

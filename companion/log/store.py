@@ -8,11 +8,13 @@ then takes no definition with it.
 from __future__ import annotations
 
 import errno
+import fcntl
 import os
 import struct
 import zlib
 from collections import defaultdict
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Protocol
 
 import zstandard
@@ -59,6 +61,8 @@ class DiskFile:
 
     def __init__(self, path: str | os.PathLike[str], reserve: int = 0) -> None:
         self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o644)
+        fcntl.flock(self._fd, fcntl.LOCK_EX)  # tells a log being written from one left behind
+        sync_folder(Path(path).parent)
         self._reserve = reserve
 
     def write(self, data: bytes) -> None:
@@ -83,6 +87,15 @@ class DiskFile:
     def close(self) -> None:
         """See `Disk`."""
         os.close(self._fd)
+
+
+def sync_folder(folder: Path) -> None:
+    """Put a name just made or changed in `folder` where a loss of power does not reach it."""
+    fd = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(fd)
+    finally:
+        os.close(fd)
 
 
 class Store:

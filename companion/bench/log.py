@@ -1,0 +1,71 @@
+"""The log: a record written, and a log read, beside the mcap package on the same records and the same file."""
+
+import atexit
+import itertools
+import shutil
+import tempfile
+from collections import deque
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from mcap.reader import make_reader
+from mcap.writer import CompressionType
+from mcap.writer import Writer as PackageWriter
+
+from companion.log.file import Writer, read
+from companion.records import Imu, encode
+
+MESSAGES = 20_000
+
+
+def imu(i: int) -> Imu:
+    """Return the i-th of records that differ as a sensor's do."""
+    t_ns = i * 20_000_000
+    return Imu(t_ns, t_ns + 1_000_017, 0, (0.1 * i, 0.2, -9.81), (1e-3 / (i + 1), 2e-3, 0.0))
+
+
+def write(path: Path, messages: int) -> None:
+    """Write one closed log of that many records."""
+    with Writer(path, metadata={}, start_unix_ns=10**18, start_ns=0, block=True) as log:
+        for i in range(messages):
+            log.record(imu(i))
+
+
+def cases() -> Iterator[tuple[str, Callable[[], object]]]:
+    """Yield (name, callable): one call writes or reads MESSAGES records, or writes one."""
+    folder = Path(tempfile.mkdtemp())
+    atexit.register(shutil.rmtree, folder, True)
+    path = folder / "read.mcap"
+    write(path, MESSAGES)
+    count = itertools.count()
+    endless = Writer(folder / "endless.mcap", metadata={}, start_unix_ns=10**18, start_ns=0)
+    atexit.register(endless.close)
+    record, records = imu(7), [imu(i) for i in range(MESSAGES)]
+
+    def ours() -> None:
+        with Writer(
+            folder / f"{next(count)}.mcap", metadata={}, start_unix_ns=10**18, start_ns=0, block=True
+        ) as log:
+            for one in records:
+                log.record(one)
+        log.path.unlink()
+
+    def package() -> None:
+        with (folder / "package.mcap").open("wb") as stream:
+            log = PackageWriter(stream, chunk_size=131072, compression=CompressionType.ZSTD)
+            log.start()
+            channel = log.register_channel("/in/Imu", "json", log.register_schema("Imu", "jsonschema", b"{}"))
+            for one in records:
+                log.add_message(channel, one.rx_ns, encode(one), one.t_ns)
+            log.finish()
+
+    def package_read() -> None:
+        with path.open("rb") as stream:
+            deque(make_reader(stream).iter_messages(log_time_order=False), maxlen=0)
+
+    yield "log: one record, in the caller's thread", lambda: endless.record(record)
+    yield f"log: {MESSAGES} records written, synced and closed", ours
+    yield f"mcap: {MESSAGES} records written, unsynced", package
+    yield f"log: {MESSAGES} messages read into records", lambda: deque(read(path), maxlen=0)
+    yield f"log: {MESSAGES} messages read as bytes", lambda: deque(read(path, raw=True), maxlen=0)
+    yield f"mcap: {MESSAGES} messages read as bytes", package_read
