@@ -73,6 +73,9 @@ class Inertial(Section, frozen=True):
 class GnssSection(Section, frozen=True):
     """How far GNSS is believed. The sigma is the greater of what the receiver states and this floor."""
 
+    receiver: Annotated[int, Meta(ge=0, le=1)] = (
+        0  # GPS_RAW_INT is 0, GPS2_RAW 1; what we feed in is never one
+    )
     sigma_m: Positive = 2.5
     sigma_velocity_m_s: Positive = 0.2
     correlation_s: NotNegative = 30.0  # of its noise: fixes closer together tell less than their number

@@ -25,7 +25,7 @@ from companion.config import Config, load, parse, to_toml
 from companion.log import file, sources
 from companion.log.opened import LogError
 from companion.navigator import Navigator
-from companion.records import INPUTS, Solution, Stamped
+from companion.records import INPUTS, OUTPUTS, Solution, Stamped
 
 CONFIGURATION = "configuration"  # the metadata record, and its key `toml`
 
@@ -91,7 +91,8 @@ def replay_foreign(records: Iterable[Stamped], config: Config, sink: Any) -> Rep
     """Hand the records of a foreign log to a navigator, and write everything to `sink`."""
     navigator, outputs, inputs = Navigator(config), Counter[str](), 0
     for record in records:
-        sink.record(record)
+        told = isinstance(record, OUTPUTS)  # by the source, not by the navigator
+        sink.record(record, f"/link/{type(record).__name__}" if told else None)
         if isinstance(record, INPUTS):
             inputs += 1
             for output in navigator.handle(record):  # type: ignore[arg-type]

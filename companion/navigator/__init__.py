@@ -18,6 +18,7 @@ from companion.records import (
     Input,
     LocalOrigin,
     LocalPosition,
+    Mode,
     Output,
     Reboot,
     Rejection,
@@ -26,7 +27,7 @@ from companion.records import (
 )
 
 from .carry import Carry, Settings, initial
-from .solution import solve
+from .solution import announce, solve
 from .step import step
 
 __all__ = ["Navigator"]
@@ -48,18 +49,29 @@ class Navigator:
         self._carry = initial(self._settings)
         self._past: deque[_Past] = deque()
         self._late_ns = round(1e9 * config.estimator.late_s)
+        self._mode = Mode.INITIALISING  # of the last solution given out, and its time
+        self._given_ns = 0
 
     def handle(self, record: Input) -> list[Output]:
         """What follows from one more record."""
         if not isinstance(record, FOLDED):
             return []
+        if isinstance(record, Gnss) and not self._is_news(record):
+            return []
         if self._past and record.t_ns < self._past[-1].t_ns:
-            return self._handle_late(record)
-        self._past.append(_Past(record.t_ns, record, self._carry))
-        while self._past[0].t_ns < record.t_ns - self._late_ns:
-            self._past.popleft()
-        self._carry, outputs = step(self._carry, record, self._settings)
-        return outputs
+            outputs = self._handle_late(record)
+        else:
+            self._past.append(_Past(record.t_ns, record, self._carry))
+            while self._past[0].t_ns < record.t_ns - self._late_ns:
+                self._past.popleft()
+            self._carry, outputs = step(self._carry, record, self._settings)
+        return self._announced(outputs)
+
+    def _is_news(self, record: Gnss) -> bool:
+        """A new fix of the receiver believed in: an autopilot repeats its last one, even with GNSS long lost."""
+        last = self._carry.gnss
+        believed = record.receiver == self._settings.config.gnss.receiver
+        return believed and (last is None or not record.repeats(last))
 
     def _handle_late(self, record: Input) -> list[Output]:
         if record.t_ns < self._past[0].t_ns:
@@ -79,8 +91,20 @@ class Navigator:
             self._past.append(_Past(each.t_ns, each, self._carry))
             self._carry, outputs = step(self._carry, each, self._settings)
             if each is record:
-                given = [out for out in outputs if not isinstance(out, Solution)]
+                given = [out for out in outputs if not isinstance(out, Solution) or out.t_ns > self._given_ns]
         if isinstance(record, RsbnFix):
             self._carry, solution = solve(self._carry, record.rx_ns, self._settings)
             given += solution
         return given
+
+    def _announced(self, outputs: list[Output]) -> list[Output]:
+        """With an event wherever the mode of what is given out changes."""
+        announced: list[Output] = []
+        for output in outputs:
+            announced.append(output)
+            if isinstance(output, Solution):
+                self._given_ns = output.t_ns
+                if output.mode is not self._mode:
+                    self._mode = output.mode
+                    announced.append(announce(output))
+        return announced

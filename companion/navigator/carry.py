@@ -7,7 +7,7 @@ from typing import NamedTuple
 from scipy.special import chdtri
 
 from companion.config import Config
-from companion.records import Gnss, LocalOrigin, LocalPosition, Mode, Output, Prediction, Source
+from companion.records import Gnss, LocalOrigin, LocalPosition, Output, Prediction, Source
 
 from . import errorstate, guarantee, inertial, radio
 from .errorstate import ErrorState, Grade
@@ -53,7 +53,6 @@ class Carry(NamedTuple):
     next_ns: int = 0
     next_ahead_ns: int = 0
     ahead: tuple[Prediction, ...] = ()
-    mode: Mode = Mode.INITIALISING
 
 
 Step = tuple[Carry, list[Output]]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from companion.nav.geometry import displace
-from companion.records import Event, Mode, Output, Solution, Source, Vector2
+from companion.records import Event, Mode, Solution, Source, Vector2
 
 from . import guarantee
 from .carry import Carry, Settings, Step, level, sources, state_at
@@ -15,7 +15,7 @@ AHEAD_NS = 5_000_000_000  # how often the bounds ahead are worked out
 
 
 def solve(carry: Carry, rx_ns: int, settings: Settings) -> Step:
-    """The corrected estimate at the newest inertial point, and an event where the mode changed."""
+    """The corrected estimate at the newest inertial point; nothing before the first fix."""
     if carry.state is None or not carry.track:
         return carry, []
     config = settings.config
@@ -57,14 +57,8 @@ def solve(carry: Carry, rx_ns: int, settings: Settings) -> Step:
         max(0.0, (rx_ns - t_ns) * 1e-9),
         carry.ahead,
     )
-    out: list[Output] = [solution]
-    if mode is not carry.mode:
-        severity = 4 if mode is Mode.UNTRUSTED else 5
-        out.append(
-            Event(t_ns, rx_ns, severity, f"navigation {mode}: {_because(carry, bounded, t_ns, settings)}")
-        )
     next_ns = max(carry.next_ns + round(1e9 / config.output.solution_hz), t_ns)
-    return carry._replace(state=state, guarantee=promise, mode=mode, next_ns=next_ns), out
+    return carry._replace(state=state, guarantee=promise, next_ns=next_ns), [solution]
 
 
 def _mode(carry: Carry, bounded: Bounded | None, t_ns: int, settings: Settings) -> Mode:
@@ -75,10 +69,14 @@ def _mode(carry: Carry, bounded: Bounded | None, t_ns: int, settings: Settings) 
     return Mode.PREDICTING
 
 
-def _because(carry: Carry, bounded: Bounded | None, t_ns: int, settings: Settings) -> str:
-    fixes = sources(carry, t_ns, settings) & ~Source.INERTIAL
-    if fixes:
-        return " and ".join(s.name.lower() for s in fixes if s.name) + " fixes"
-    if bounded is None:
-        return "no fixes, and too few before for a guaranteed prediction"
-    return f"no fixes; the guaranteed bound is {math.hypot(*bounded.bound_n):.0f} m"
+def announce(solution: Solution) -> Event:
+    """The line that tells of a change to this solution's mode."""
+    fixes = [s.name.lower() for s in Source if s.name and s is not Source.INERTIAL and s & solution.sources]
+    if solution.mode is Mode.FIXED:
+        why = " and ".join(fixes) + " fixes"
+    elif solution.bound_n is None:
+        why = "no fixes, and too few before for a guaranteed prediction"
+    else:
+        why = f"no fixes; the guaranteed bound is {math.hypot(*solution.bound_n):.0f} m"
+    severity = 4 if solution.mode is Mode.UNTRUSTED else 5
+    return Event(solution.t_ns, solution.rx_ns, severity, f"navigation {solution.mode}: {why}")

@@ -63,7 +63,7 @@ def _origin(carry: Carry, record: LocalOrigin, settings: Settings) -> Step:
 def _reboot(carry: Carry, record: Reboot, settings: Settings) -> Step:
     """Another inertial channel: what was learnt of the old one's error says nothing of it."""
     out = Reset(record.t_ns, record.rx_ns, "navigator", f"autopilot {record.system} rebooted")
-    return initial(settings)._replace(mode=carry.mode, next_ns=carry.next_ns), [out]
+    return initial(settings)._replace(next_ns=carry.next_ns), [out]
 
 
 def _global_position(carry: Carry, record: GlobalPosition, settings: Settings) -> Step:
@@ -107,8 +107,6 @@ def _shifted(carry: Carry, north: float, east: float) -> Carry:
 
 def _gnss(carry: Carry, record: Gnss, settings: Settings) -> Step:
     config = settings.config.gnss
-    if carry.gnss is not None and record.repeats(carry.gnss):
-        return carry, []
     carry = carry._replace(gnss=record)
     ins = inertial.at(carry.track, record.t_ns)
     since = math.inf if carry.gnss_ns is None else (record.t_ns - carry.gnss_ns) * 1e-9
