@@ -89,8 +89,8 @@ class OriginFinder:
     """The local origin out of a local and a global position of about one instant, where no message tells it.
 
     Both come from one filter, so they are one point; what is left is the rounding of GLOBAL_POSITION_INT
-    (1 cm) and what the aircraft does within `APART_NS`: 0.2 m r.m.s. on a copter that sends both at 1-2 Hz. Nothing is inferred before the filter vouches for its
-    horizontal position, nor twice.
+    (1 cm) and what the aircraft does within `APART_NS`: 0.2 m r.m.s. on a copter that sends both at 1-2 Hz.
+    Nothing is inferred before the filter vouches for its horizontal position, nor twice.
     """
 
     APART_NS = 150_000_000

@@ -78,8 +78,10 @@ class Tlog:
             if self._stamped(begin) and isinstance(frame.examine(self.data, begin + _STAMP), Frame):
                 self.corrupt += 1
                 return begin
-        if self._stamped(at) and self.data[at + _STAMP : at + _STAMP + 1] in (b"", b"\xfd", b"\xfe"):
-            self.torn = len(self.data) - at
+        left = len(self.data) - at
+        begun = self._stamped(at) and self.data[at + _STAMP : at + _STAMP + 1] in (b"", b"\xfd", b"\xfe")
+        if left < _STAMP or (begun and left < _STAMP + frame.LONGEST):
+            self.torn = left
         else:
             self.corrupt += 1
         return len(self.data)
