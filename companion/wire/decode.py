@@ -331,6 +331,16 @@ def _scaled_pressure(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]
     return (Pressure(_booted(m, rx, sender), rx, number(m, "press_abs", 100.0), differential, kelvin),)
 
 
+def _sigma(message: Message, field: str, measured: float | None, configured: float) -> float:
+    """A sigma as sent, or as configured where it is left open."""
+    sigma = maybe(message, field)
+    if sigma is None or (sigma <= 0.0 and measured is None):
+        return configured
+    if sigma <= 0.0:
+        raise Refused(f"{field} {sigma:g} is not positive", sigma, 0.0)
+    return sigma
+
+
 @_of("RSBN_MEASUREMENT")
 def _rsbn(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
     if m.status & _RSBN_TEST:
@@ -346,12 +356,6 @@ def _rsbn(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
         raise Refused(f"azimuth {azimuth:g} rad is no angle in radians", azimuth, math.tau)
     if slant_range is not None and slant_range <= 0.0:
         raise Refused(f"slant range {slant_range:g} m is not positive", slant_range, 0.0)
-    sigmas = []
-    for field, configured in (("sigma_azimuth", sender.sigma_azimuth), ("sigma_range", sender.sigma_range)):
-        sigma = maybe(m, field)
-        if sigma is not None and sigma <= 0.0:
-            raise Refused(f"{field} {sigma:g} is not positive", sigma, 0.0)
-        sigmas.append(configured if sigma is None else sigma)
     return (
         RsbnFix(
             t_ns=_stamped(m, rx, sender),
@@ -362,8 +366,8 @@ def _rsbn(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
             alt=number(m, "beacon_alt"),
             azimuth=None if azimuth is None else wrapped(azimuth),
             slant_range=slant_range,
-            sigma_azimuth=sigmas[0],
-            sigma_range=sigmas[1],
+            sigma_azimuth=_sigma(m, "sigma_azimuth", azimuth, sender.sigma_azimuth),
+            sigma_range=_sigma(m, "sigma_range", slant_range, sender.sigma_range),
         ),
     )
 
