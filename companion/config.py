@@ -10,7 +10,7 @@ from __future__ import annotations
 import difflib
 import os
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -148,8 +148,10 @@ def load(
     path: Path | None = None,
     flags: Mapping[str, Any] | None = None,
     environment: Mapping[str, str] | None = None,
+    pairs: Iterable[str] = (),
 ) -> Config:
-    """The configuration of file `path`, then environment, then `flags` (keys "section.key").
+    """The configuration of file `path`, then environment, then `flags` (keys "section.key", None: unset),
+    then `pairs` ("section.key=value", as typed).
 
     Raises `ConfigError` where a file cannot be read, a key is unknown or a value impossible.
     """
@@ -173,6 +175,14 @@ def load(
             section, key = name.split(".")
             tree.setdefault(section, {})[key] = value
             origin[section, key] = "command line"
+    for pair in pairs:
+        name, _, text = pair.partition("=")
+        section, _, key = name.strip().partition(".")
+        if not key or not text:
+            raise ConfigError(f"--set {pair}: write it as SECTION.KEY=VALUE, for example gnss.sigma_m=3.0")
+        _check_keys({section: {key: text}}, f"--set {pair}")
+        tree.setdefault(section, {})[key] = _parsed(text.strip())
+        origin[section, key] = f"--set {pair}"
     return _convert(tree, origin)
 
 

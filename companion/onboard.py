@@ -107,7 +107,7 @@ class Onboard:
         self._log = log
         self._navigator = Navigator(config)
         self.links = {name: Link(name, config) for name in links}
-        self.events: list[Event] = []  # changes of state since the caller last took them
+        self._events: list[Event] = []
         self.rejected: Counter[str] = Counter()
         self._origin: LocalOrigin | None = None
         output = config.output
@@ -149,6 +149,11 @@ class Onboard:
         for data in frames:
             self._log.frame(link, True, data, now_ns)
         return frames
+
+    def take_events(self) -> list[Event]:
+        """The changes of state since this was last asked."""
+        taken, self._events = self._events, []
+        return taken
 
     def note(self, severity: int, text: str, now_ns: int) -> None:
         """Log and tell a change of state."""
@@ -198,7 +203,7 @@ class Onboard:
     def _emit(self, record: Stamped, channel: str | None = None) -> None:
         self._log.record(record, channel)
         if isinstance(record, Event):
-            self.events.append(record)
+            self._events.append(record)
         elif isinstance(record, Rejection):
             self.rejected[record.source] += 1
 

@@ -68,7 +68,7 @@ class Navigator:
         return self._announced(outputs)
 
     def _is_news(self, record: Gnss) -> bool:
-        """A new fix of the receiver believed in: an autopilot repeats its last one, even with GNSS long lost."""
+        """A new fix of the receiver believed in: an autopilot repeats its last one for ever."""
         last = self._carry.gnss
         believed = record.receiver == self._settings.config.gnss.receiver
         return believed and (last is None or not record.repeats(last))

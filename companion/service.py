@@ -1,0 +1,166 @@
+"""The asyncio shell: links, timers, signals and the log round an `Onboard`. `companion run`.
+
+Everything that decides is below; here bytes are carried, the clock is read and the deadline slept for. A link
+that breaks is opened again for ever, a disk that refuses is reported, and neither stops navigation.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import random
+import signal
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import click
+
+from companion import __version__
+from companion.config import Config, ConfigError, load
+from companion.link.transport import Address, CannotListen, Stream, connections
+from companion.log.file import Writer
+from companion.log.folder import open_log, recover_left
+from companion.log.opened import LogError
+from companion.log.replay import metadata
+from companion.onboard import Onboard
+from companion.records import Event
+
+EX_UNAVAILABLE, EX_CANTCREAT = 69, 73  # sysexits.h
+LOG_CHECK_S = 1.0
+
+
+class Service:
+    """One run of the companion. `tell` is handed every change of state, `now` reads the one clock."""
+
+    def __init__(
+        self,
+        config: Config,
+        log: Writer,
+        tell: Callable[[Event], None],
+        now: Callable[[], int] = time.monotonic_ns,
+    ) -> None:
+        self._addresses = {text: Address.parse(text) for text in config.link.connect}
+        self.onboard = Onboard(config, log, self._addresses)
+        self._log, self._tell, self._now = log, tell, now
+        self._streams: dict[str, Stream] = {}
+        self._stopped = asyncio.Event()
+        self._trouble: str | None = None
+
+    def stop(self) -> None:
+        """End `serve` soon."""
+        self._stopped.set()
+
+    async def serve(self) -> None:
+        """Carry bytes until `stop`. Raises CannotListen where an address to listen on is not to be had."""
+        try:
+            async with asyncio.TaskGroup() as tasks:
+                carrying = [tasks.create_task(self._carry(name)) for name in self._addresses]
+                carrying.append(tasks.create_task(self._keep_time()))
+                await self._stopped.wait()
+                for task in carrying:
+                    task.cancel()
+        except* CannotListen as group:
+            raise group.exceptions[0] from None
+
+    async def _carry(self, name: str) -> None:
+        """One link, opened again for ever."""
+        async for stream in connections(self._addresses[name], random.random, self._say):
+            self._streams[name] = stream
+            try:
+                while True:
+                    data = await stream.read()
+                    self.onboard.receive(name, data, self._now())
+                    self._flush()
+            except ConnectionError as error:
+                self._say(f"{name}: {error}; opening it again")
+            del self._streams[name]
+
+    async def _keep_time(self) -> None:
+        """What is due, and whether the disk is well."""
+        while True:
+            now = self._now()
+            self.onboard.poll(now)
+            if self._log.trouble != self._trouble:
+                self._trouble = self._log.trouble
+                text = f"log: {self._trouble}; navigation goes on" if self._trouble else "log: writing again"
+                self.onboard.note(4 if self._trouble else 6, text, now)
+            self._flush()
+            await asyncio.sleep(max(0.0, min(1e-9 * (self.onboard.deadline() - self._now()), LOG_CHECK_S)))
+
+    def _flush(self) -> None:
+        now = self._now()
+        for name in self._addresses:
+            frames = self.onboard.to_send(name, now)
+            stream = self._streams.get(name)
+            if stream is not None:
+                for data in frames:
+                    stream.write(data)
+        for event in self.onboard.take_events():
+            self._tell(event)
+
+    def _say(self, text: str) -> None:
+        self.onboard.note(5, text, self._now())
+
+
+async def run(config: Config, tell: Callable[[Event], None]) -> None:
+    """Open the log, serve until SIGINT or SIGTERM, close the log."""
+    start_ns, start_unix_ns = time.monotonic_ns(), time.time_ns()
+    settings = config.log
+    for found in recover_left(settings.folder):
+        tell(Event(start_ns, start_ns, 5, f"log: {found.path} recovered, {found.messages} messages"))
+    log = open_log(
+        settings.folder,
+        metadata=metadata(config),
+        start_unix_ns=start_unix_ns,
+        start_ns=start_ns,
+        max_files=settings.maximum_files,
+        min_free=settings.minimum_free_mib << 20,
+        chunk_bytes=settings.chunk_kib << 10,
+    )
+    try:
+        service = Service(config, log, tell)
+        loop = asyncio.get_running_loop()
+        for number in (signal.SIGINT, signal.SIGTERM):
+            loop.add_signal_handler(number, service.stop)
+        service.onboard.note(6, f"companion {__version__}: log {log.path}", time.monotonic_ns())
+        await service.serve()
+    finally:
+        await asyncio.to_thread(log.close)
+        text = f"log: closed as {log.path}" if log.trouble is None else f"log: left torn, {log.trouble}"
+        tell(Event(time.monotonic_ns(), time.monotonic_ns(), 6, text))
+
+
+@click.command("run")
+@click.option("--config", "file", type=click.Path(path_type=Path), help="TOML file; see check-config.")
+@click.option("--connect", multiple=True, help="Link (may be repeated): udpin:HOST:PORT, tcp:HOST:PORT, ...")
+@click.option("--logs", help="Folder for the flight's log.")
+@click.option("--set", "pairs", multiple=True, metavar="SECTION.KEY=VALUE", help="Any other key of the file.")
+def command(file: Path | None, connect: tuple[str, ...], logs: str | None, pairs: tuple[str, ...]) -> None:
+    """Navigate: listen to the autopilot, send it corrected estimates, log everything, until SIGINT or
+    SIGTERM.
+
+    Links are serial:DEVICE:BAUD, udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT and tcpin:HOST:PORT. Exit
+    codes: 0 stopped, 69 an address cannot be listened on, 73 the log folder cannot be written, 78 bad
+    configuration.
+    """
+    flags = {"link.connect": connect or None, "log.folder": logs}
+    config = load(file, flags, pairs=pairs)
+    begun = time.monotonic_ns()
+
+    def tell(event: Event) -> None:
+        click.echo(f"{(event.rx_ns - begun) * 1e-9:9.3f} {event.text}", err=True)
+
+    try:
+        for text in config.link.connect:
+            Address.parse(text)
+    except ValueError as error:
+        raise ConfigError(f"link.connect: {error}") from None
+    try:
+        asyncio.run(run(config, tell))
+    except CannotListen as error:
+        click.echo(f"companion: {error}", err=True)
+        sys.exit(EX_UNAVAILABLE)
+    except LogError as error:
+        click.echo(f"companion: {error}", err=True)
+        sys.exit(EX_CANTCREAT)
