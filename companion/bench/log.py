@@ -1,4 +1,4 @@
-"""The log: a record written, and a log read, beside the mcap package on the same records and the same file."""
+"""The log written and read, beside the mcap package on the same records and the same file."""
 
 import atexit
 import itertools

@@ -393,7 +393,10 @@ def metadata(path: str | os.PathLike[str]) -> dict[str, dict[str, str]]:
             if opcode in (container.CHUNK, container.MESSAGE):
                 break
             if opcode == container.METADATA:
-                name, values = container.metadata(content)
+                try:
+                    name, values = container.metadata(content)
+                except Damaged as error:
+                    raise source.damaged(error) from None
                 found[name] = values
         return found
 

@@ -133,6 +133,11 @@ class Channels:
             return number
         return None
 
+    def __contains__(self, number: int) -> bool:
+        """Whether channel `number` and its schema are defined."""
+        of_schema = container.channel(self.channels[number])[1] if number in self.channels else -1
+        return of_schema == 0 or of_schema in self.schemas
+
     def __getitem__(self, number: int) -> container.Channel:
         """The channel `number`; raises KeyError where it or its schema is not defined."""
         _, of_schema, topic, encoding = container.channel(self.channels[number])
@@ -230,7 +235,7 @@ def _rebuild(data: bytes, known: Channels, chunk: Chunk) -> Chunk:
     for opcode, number, sequence, log_ns, publish_ns, content in container.messages(data):
         if opcode != container.MESSAGE:
             known.define(opcode, content)
-        elif number in known.channels:
+        elif number in known:
             chunk.add(number, sequence, log_ns, publish_ns, content)
     return chunk
 
