@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from companion.link.session import LinkUp, MessageReceived, Rebooted, SecondAutopilot, Session
-from companion.log import tlog
+from companion.log import tlog, uorb
 from companion.nav.geometry import Geodetic, Projection, local_to_geodetic, wrap
 from companion.records import Event, FilterStatus, GlobalPosition, LocalOrigin, LocalPosition, Reset, Stamped
 from companion.wire import Autopilot, Sender, decode
@@ -134,8 +134,28 @@ def _origin_between(local: LocalPosition, known: GlobalPosition, projection: Pro
     return LocalOrigin(known.t_ns, rx_ns, origin.lat, origin.lon, origin.alt, projection)
 
 
-def open_source(path: Path, autopilot_system: int | None = None) -> TlogSource:
-    """Open a foreign log by the ending of its name. ValueError, one sentence, if it cannot be read."""
+class UorbSource:
+    """The records of a folder of PX4 topics; the counts are of records, for there are no frames."""
+
+    def __init__(self, folder: Path) -> None:
+        self._read = uorb.read(folder)
+        self.records = 0
+
+    def __iter__(self) -> Iterator[Stamped]:
+        """Records in order of time."""
+        for record in self._read:
+            self.records += 1
+            yield record
+
+    def summary(self) -> Summary:
+        """The counts so far."""
+        return Summary(self.records, 0, 0, 0, 0, self.records)
+
+
+def open_source(path: Path, autopilot_system: int | None = None) -> TlogSource | UorbSource:
+    """Open a `.tlog` or a folder of PX4 topics. ValueError, one sentence, if it is neither."""
+    if path.is_dir():
+        return UorbSource(path)
     if path.suffix.lower() != ".tlog":
-        raise ValueError(f"{path} is of no kind that is read here: give a .tlog")
+        raise ValueError(f"{path} is of no kind that is read here: give a .tlog or a folder of PX4 topics")
     return TlogSource(tlog.read(path), autopilot_system)

@@ -169,9 +169,47 @@ def test_whole_flights_are_read_to_the_end(name: str) -> None:
     path = SHARED / name
     if not path.exists():
         pytest.skip("the recordings do not stand beside the repository")
-    source = sources.open_source(path)
+    source = sources.TlogSource(tlog.read(path))
     kinds = Counter(type(record) for record in source)
     assert source.summary()[:5] == REAL[name]
     assert kinds[r.LocalPosition] > 1000 and kinds[r.Gnss] > 1000 and kinds[r.LocalOrigin] >= 1
     assert kinds[r.Truth] > 3000 or "dronekit" in name
     assert source.log.torn == REAL[name][3]
+
+
+def test_topics_as_csv_come_in_one_order_of_time(tmp_path: pathlib.Path) -> None:
+    local = "timestamp,ref_lat,ref_lon,ref_alt,x,y,z,vx,vy,vz,xy_valid,z_valid,xy_global,xy_reset_counter"
+    rows = ["1000,45.0,-93.0,275.9,1,2,-3,4,5,6,1,1,1,1", "3000,45.0,-93.0,275.9,99,2,-3,4,5,6,1,1,1,2"]
+    (tmp_path / "vehicle_local_position.csv").write_text("\n".join([local, *rows]))
+    wind = "timestamp,windspeed_north,windspeed_east,covariance_north,covariance_east"
+    (tmp_path / "wind_estimate.csv").write_text(f"{wind}\n2000,3,-4,0.5,0.5")
+    heard = list(sources.open_source(tmp_path))
+    assert [type(record) for record in heard] == [
+        r.LocalOrigin,
+        r.LocalPosition,
+        r.Wind,
+        r.Event,
+        r.LocalPosition,
+    ]
+    assert heard[1] == r.LocalPosition(1_000_000, 1_000_000, (1.0, 2.0, -3.0), (4.0, 5.0, 6.0))
+    (tmp_path / "wind_estimate.csv").write_text(f"{wind}\n2000,north,-4,0.5,0.5")
+    with pytest.raises(ValueError, match=r"wind_estimate.csv, line 2"):
+        list(sources.open_source(tmp_path))
+
+
+def test_an_empty_folder_is_refused_in_a_sentence(tmp_path: pathlib.Path) -> None:
+    with pytest.raises(ValueError, match="holds no topic"):
+        sources.open_source(tmp_path)
+
+
+@pytest.mark.shared
+def test_a_real_fixed_wing_is_read_from_its_topics() -> None:
+    folder = SHARED / "umn_fixed_wing"
+    if not folder.exists():
+        pytest.skip("the recordings do not stand beside the repository")
+    heard = list(sources.open_source(folder))
+    kinds = Counter(type(record) for record in heard)
+    times = [record.t_ns for record in heard]
+    assert times == sorted(times)
+    assert kinds[r.Gnss] > 2000 and kinds[r.LocalPosition] > 4000 and kinds[r.Attitude] > 40_000
+    assert (kinds[r.LocalOrigin], kinds[r.Event]) == (1, 2)
