@@ -26,8 +26,10 @@ SECOND = 1_000_000_000
 DRIFT = 100e-6
 #: A stamp this much older than the newest one means a reboot.
 BACK = 3 * SECOND
-#: TIMESYNC and the arrivals never differ by more, unless one of them means another clock.
-DISAGREE = 1 * SECOND
+#: Arrivals that fall below the envelope by more tell that the autopilot's clock was set.
+JUMP = 1 * SECOND
+#: A TIMESYNC reading that makes the last arrival early, or later than any link is, is of another clock.
+LATEST = 10 * SECOND
 #: For so long an answer of TIMESYNC is believed.
 FRESH = 60 * SECOND
 #: Stamps from here on (September 2001) are UNIX time; no autopilot is up for 31 years.
@@ -53,7 +55,8 @@ class BootClock:
         self._newest = -1
         self._envelope: int | None = None
         self._envelope_at = 0
-        self._answers: deque[Answer] = deque(maxlen=16)
+        self._seen = 0  # the last arrival - stamp
+        self._answers: deque[Answer] = deque(maxlen=8)
         self._best: Answer | None = None
         self._unix_minus_boot: int | None = None
         self._asked.clear()
@@ -64,12 +67,12 @@ class BootClock:
         if rebooted:
             self._reset()
         self._newest = max(self._newest, boot)
-        seen = received - boot
+        self._seen = seen = received - boot
         if self._envelope is None:
             self._envelope = seen
         else:
             raised = self._envelope + int(DRIFT * (received - self._envelope_at))
-            if seen < raised - DISAGREE:
+            if seen < raised - JUMP:
                 self._answers.clear()
                 self._best = None
             self._envelope = min(raised, seen)
@@ -92,8 +95,11 @@ class BootClock:
             return False
         self._asked.remove(asked)
         answer = Answer((asked + now) // 2 - reading, now - asked, now)
-        if self._envelope is not None and abs(answer.offset - self._envelope) > DISAGREE:
-            return False
+        if self._envelope is not None:
+            if not -JUMP <= self._seen - answer.offset <= LATEST:
+                return False
+            # The offset is certainly no less than this: a simulated clock may slip faster than any crystal.
+            self._envelope = max(self._envelope, answer.offset - answer.round_trip // 2)
         self._answers.append(answer)
         self._best = min(self._answers, key=lambda a: a.round_trip + 2 * DRIFT * (now - a.at))
         return True

@@ -21,6 +21,7 @@ from __future__ import annotations
 
 import enum
 import re
+from collections.abc import Callable
 from typing import NamedTuple
 
 from fastcrc import crc16
@@ -233,12 +234,32 @@ class Reader:
             self._run = 0
 
 
-def encode(message: dialect.Message, sequence: int, system: int, component: int) -> bytes:
-    """Return `message` as an unsigned MAVLink 2 frame. ValueError if a field does not fit its wire type."""
+def encode(
+    message: dialect.Message,
+    sequence: int,
+    system: int,
+    component: int,
+    sign: Callable[[bytes], bytes] | None = None,
+) -> bytes:
+    """Return `message` as a MAVLink 2 frame. ValueError if a field does not fit its wire type.
+
+    `sign` gives the 13 bytes of a signature for the frame before them.
+    """
     msgid = dialect.id_of(message)
     payload = dialect.payload(message).rstrip(b"\0") or b"\0"
     header = bytes(
-        (len(payload), 0, 0, sequence, system, component, msgid & 0xFF, msgid >> 8 & 0xFF, msgid >> 16)
+        (
+            len(payload),
+            SIGNED if sign else 0,
+            0,
+            sequence,
+            system,
+            component,
+            msgid & 0xFF,
+            msgid >> 8 & 0xFF,
+            msgid >> 16,
+        )
     )
     body = header + payload
-    return b"\xfd" + body + _crc(body + _CHECK_BYTE[msgid]).to_bytes(2, "little")
+    data = b"\xfd" + body + _crc(body + _CHECK_BYTE[msgid]).to_bytes(2, "little")
+    return data + sign(data) if sign else data

@@ -12,10 +12,13 @@ until they come. All else a peer says is handed up as MessageReceived. What mess
 A vehicle has one autopilot: component 1 of a system, with a HEARTBEAT of a real autopilot and not of a
 ground station. The first one heard is kept; another is told once, then ignored altogether. Nothing a peer
 sends raises.
+
+With a `Signing` all that goes out is signed and what it refuses is told as Refused and goes no further.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
 from typing import NamedTuple
 
@@ -23,6 +26,7 @@ from companion.link import dialect, frame
 from companion.link.clock import SECOND, BootClock
 from companion.link.dialect import Message
 from companion.link.frame import BadFrame, Frame, UnknownFrame
+from companion.link.signing import Refusal, Signing
 from companion.link.streams import Streams
 
 HEARTBEAT_EVERY = SECOND
@@ -89,7 +93,16 @@ class NotUnderstood(NamedTuple):
     what: BadFrame | UnknownFrame
 
 
-Event = LinkUp | LinkLost | Rebooted | SecondAutopilot | MessageReceived | NotUnderstood
+class Refused(NamedTuple):
+    """A frame that was not let in, being unsigned, forged or not of this time; its sender is a mere claim."""
+
+    received_ns: int
+    system: int
+    component: int
+    reason: Refusal
+
+
+Event = LinkUp | LinkLost | Rebooted | SecondAutopilot | MessageReceived | NotUnderstood | Refused
 
 
 class Session:
@@ -102,10 +115,13 @@ class Session:
         system: int | None = None,
         autopilot_system: int | None = None,
         rates_hz: Mapping[str, float] | None = None,
+        signing: Signing | None = None,
+        link_id: int = 0,
     ) -> None:
         """`system`: our own id, if None the autopilot's (1 until it is heard).
 
         `autopilot_system`: heed no other. `rates_hz`: rates wanted of the autopilot by message name.
+        `signing`: one for all links of a key, on which each signs with its own `link_id` (0-255).
         ValueError on ids outside 1-255, unknown names and impossible rates.
         """
         for name, value in (
@@ -115,7 +131,10 @@ class Session:
         ):
             if value is not None and not 1 <= value <= 255:
                 raise ValueError(f"{name} {value} is not a MAVLink id: give 1 to 255")
+        if not 0 <= link_id <= 255:
+            raise ValueError(f"link_id {link_id} does not fit a signature: give 0 to 255")
         self.component = component
+        self.refused: Counter[Refusal] = Counter()
         self.state = STATE_ACTIVE
         self.reader = frame.Reader()
         self.clock = BootClock()
@@ -129,6 +148,9 @@ class Session:
         self._ignored: set[int] = set()
         self._sequence = 0
         self._outbox: list[bytes] = []
+        self._signing = signing
+        self._link_id = link_id
+        self._now = 0  # the last instant handed in
         self._heartbeat_at = 0
         self._timesync_at = 0
         self._handlers = {HEARTBEAT: self._on_heartbeat, TIMESYNC: self._on_timesync}
@@ -150,6 +172,7 @@ class Session:
 
     def receive(self, data: bytes, now_ns: int) -> list[Event]:
         """Take bytes that arrived at `now_ns`; return what they mean, in order."""
+        self._now = now_ns
         events: list[Event] = []
         for found in self.reader.receive(data):
             if isinstance(found, Frame):
@@ -160,6 +183,7 @@ class Session:
 
     def poll(self, now_ns: int) -> list[Event]:
         """Do what is due at `now_ns`; return what the passing of time means."""
+        self._now = now_ns
         events: list[Event] = []
         if self._up and now_ns - self._heard >= LOST_AFTER:
             self._up = False
@@ -194,7 +218,8 @@ class Session:
 
     def send(self, message: Message) -> None:
         """Queue a message for `to_send`. ValueError if a field does not fit its wire type."""
-        self._outbox.append(frame.encode(message, self._sequence, self.system, self.component))
+        sign = self._sign if self._signing else None
+        self._outbox.append(frame.encode(message, self._sequence, self.system, self.component, sign))
         self._sequence = self._sequence + 1 & 0xFF
 
     def to_send(self) -> list[bytes]:
@@ -209,7 +234,15 @@ class Session:
         """
         return self.clock.local(time_usec * 1000, received_ns)
 
+    def _sign(self, data: bytes) -> bytes:
+        assert self._signing is not None
+        return self._signing.sign(data, self._link_id, self._now)
+
     def _on_frame(self, found: Frame, now: int, events: list[Event]) -> None:
+        if self._signing is not None and (reason := self._signing.judge(found, now)) is not None:
+            self.refused[reason] += 1
+            events.append(Refused(now, found.system, found.component, reason))
+            return
         if found.system in self._ignored:
             return
         if found.component == self.component and found.system == self.system:

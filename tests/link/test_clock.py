@@ -53,6 +53,20 @@ def test_timesync_errs_by_half_the_round_trip_at_most_and_prefers_the_shortest()
     assert uncertainty < 4 * MS
 
 
+def test_timesync_follows_a_simulation_that_slips_by_a_hundredth() -> None:
+    clock = BootClock()
+    for i in range(3000):
+        local = OFFSET + i * 100 * MS
+        boot = int((local - OFFSET) * 0.99) + SECOND
+        clock.heard(boot, local + 5 * MS)
+        if i % 10 == 0:
+            assert clock.answered(
+                clock.ask(local), int((local + 2 * MS - OFFSET) * 0.99) + SECOND, local + 4 * MS
+            )
+        error = clock.local(boot, local + 5 * MS) - local
+        assert abs(error) < 100 * MS  # eight answers' age at most
+
+
 def test_answers_to_nobody_and_of_another_clock_are_refused() -> None:
     clock = BootClock()
     clock.heard(10 * SECOND, 10 * SECOND + OFFSET + MS)
