@@ -1,4 +1,4 @@
-"""What goes wrong, as functions on streams: a list of records in, a list of records out; or of chunks of bytes.
+"""What goes wrong, as functions on streams: records in and records out, or chunks of bytes in and out.
 
 `RECORD_FAULTS` act on one kind of record of what the sensors say, inside a window of flight time.
 `LINK_FAULTS` act on the chunks (frames) that leave for the companion. What concerns the autopilot itself

@@ -1,0 +1,341 @@
+"""An autopilot in flight, without its I/O: bytes and instants in, MAVLink frames out. No clock, no socket.
+
+    autopilot.receive(data, now_ns)         # what the companion sent
+    for data in autopilot.poll(now_ns): ... # every frame due; call it no later than autopilot.deadline()
+
+It plays a `World` as ArduPlane (system 1, component 1) or PX4 would: streams of 1 Hz each until
+SET_MESSAGE_INTERVAL asks otherwise, the newest value repeated where a stream is faster than its sensor, its
+own time since boot, TIMESYNC, commands. Beside it speaks an RSBN receiver, a component of its own, which
+sends each answer once. Between the two sides lie the link's latency, jitter and faults.
+
+`now_ns` is the companion's clock; the flight begins at `start_ns` on it. What the companion says to be
+used or looked at is kept in `outputs`. It knows no estimator and lets nothing it is told change the flight.
+"""
+
+from __future__ import annotations
+
+import heapq
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from msgspec.structs import replace
+
+from companion.link import dialect, frame
+from companion.nav.geometry import Geodetic, local_to_geodetic
+from companion.records import (
+    AirData,
+    Attitude,
+    FilterStatus,
+    GlobalPosition,
+    Gnss,
+    HomePosition,
+    Imu,
+    LocalOrigin,
+    LocalPosition,
+    Pressure,
+    RsbnFix,
+    Stamped,
+    SystemTime,
+    Truth,
+)
+from sitl.encode import Airframe, encode
+from sitl.faults import AUTOPILOT_FAULTS, LINK_FAULTS, Chunk, Fault, disturb
+from sitl.scenarios import Scenario
+from sitl.world import World
+
+SECOND = 1_000_000_000
+NEVER = 2**63 - 1
+SYSTEM, COMPONENT, RSBN_COMPONENT = 1, 1, 42
+UNIX_AT_START_NS = 1_767_225_600 * SECOND
+"""The simulated date: 1 January 2026."""
+
+_SET_MESSAGE_INTERVAL, _REQUEST_MESSAGE, _SET_SOURCE, _EXTERNAL_POSITION = 511, 512, 42007, 43003
+_ACCEPTED, _DENIED, _UNSUPPORTED = 0, 2, 3
+_FLAGS_AIDED, _FLAGS_ALONE = 831, 303  # EKF_STATUS_REPORT.flags as ArduPlane has them
+_ALONE_AFTER = 10 * SECOND
+_SLOW_HZ = 0.2
+
+#: What the companion says to be used: kept with the time it came.
+KEPT = frozenset({"ODOMETRY", "GLOBAL_POSITION_SENSOR", "NAVIGATION_STATUS", "VISION_POSITION_ESTIMATE"})
+
+_SENSED: dict[str, type[Stamped]] = {
+    "LOCAL_POSITION_NED": LocalPosition,
+    "ATTITUDE": Attitude,
+    "GPS_RAW_INT": Gnss,
+    "VFR_HUD": AirData,
+    "SCALED_PRESSURE": Pressure,
+}
+_BY_MAKE: dict[str, dict[str, type[Stamped]]] = {
+    "ardupilot": {"RAW_IMU": Imu, "SIM_STATE": Truth},
+    "px4": {"HIGHRES_IMU": Imu, "HIL_STATE_QUATERNION": Truth},
+}
+
+
+class Autopilot:
+    """The aircraft's side of one link. `world` may be handed in to be shared; it must be the scenario's."""
+
+    def __init__(self, scenario: Scenario, start_ns: int = 0, world: World | None = None) -> None:
+        self.scenario = scenario
+        self.world = world or World(scenario)
+        self.outputs: list[tuple[int, Any]] = []
+        self.end_ns = start_ns + round(scenario.duration_s * 1e9)
+        self._start_ns = start_ns
+        self._rng = np.random.default_rng([scenario.seed, 1])
+        self._link_faults = [f for f in scenario.faults if f.name in LINK_FAULTS]
+        self._losses = [f for f in self._link_faults if f.name == "link-loss"]
+        self._own_faults = sorted(
+            (f for f in scenario.faults if f.name in AUTOPILOT_FAULTS), key=lambda f: -f.start_s
+        )
+        self._reader = frame.Reader()
+        self._commands: dict[str, Callable[[Any, int], None]] = {
+            "TIMESYNC": self._on_timesync,
+            "COMMAND_LONG": self._on_command,
+            "COMMAND_INT": self._on_command,
+        }
+        sensed = {**_SENSED, **_BY_MAKE[scenario.autopilot]}
+        self._sensed = {_msgid(name): self.world.streams[kind] for name, kind in sensed.items()}
+        self._rsbn = self.world.streams[RsbnFix]
+        self._rsbn_next = 0
+        self._outbox: list[tuple[int, int, bytes]] = []  # due, order, frame
+        self._order = 0
+        self._released = 0
+        self._latency_ns = round(scenario.link.latency_s * 1e9)
+        self._made: dict[int, Callable[[int], Any]] = {
+            _msgid("HEARTBEAT"): self._heartbeat,
+            _msgid("SYSTEM_TIME"): self._system_time,
+            _msgid("GLOBAL_POSITION_INT"): self._global_position,
+            _msgid("GPS_GLOBAL_ORIGIN"): self._origin,
+            _msgid("HOME_POSITION"): self._home,
+            _msgid("ESTIMATOR_STATUS" if scenario.autopilot == "px4" else "EKF_STATUS_REPORT"): self._status,
+        }
+        self._boot(-round(scenario.boot_before_s * 1e9), 0)
+
+    # -- the sans-IO face ---------------------------------------------------------------------------------
+
+    def receive(self, data: bytes, now_ns: int) -> None:
+        """Take what the companion sent at `now_ns`; a link that is lost is lost both ways."""
+        t = now_ns - self._start_ns
+        if self._losses and not disturb([Chunk(now_ns, data)], t, self._losses, self._rng):
+            return
+        for found in self._reader.receive(data):
+            if isinstance(found, frame.Frame):
+                name = dialect.TYPES[found.msgid].name
+                if name in KEPT:
+                    self.outputs.append((now_ns, dialect.decode(found)))
+                elif name in self._commands:
+                    message = dialect.decode(found)
+                    if getattr(message, "target_system", 0) in (0, SYSTEM):
+                        self._commands[name](message, t + self._latency())
+
+    def poll(self, now_ns: int) -> list[bytes]:
+        """Return every frame that reaches the companion up to `now_ns`, in order."""
+        t = min(now_ns, self.end_ns) - self._start_ns
+        while (self._schedule and self._schedule[0][0] <= t) or self._rsbn_due() <= t:
+            self._emit(min(self._schedule[0][0] if self._schedule else NEVER, self._rsbn_due()))
+        due = []
+        while self._outbox and self._outbox[0][0] <= now_ns:
+            due.append(heapq.heappop(self._outbox)[2])
+        return due
+
+    def deadline(self) -> int:
+        """Return the instant of the next frame, `NEVER` once the flight is over."""
+        t = min(self._schedule[0][0] if self._schedule else NEVER, self._rsbn_due())
+        sending = t + self._start_ns if t + self._start_ns <= self.end_ns else NEVER
+        return min(sending, self._outbox[0][0] if self._outbox else NEVER)
+
+    def rates_hz(self) -> dict[str, float]:
+        """The rate of each stream now, by message name; streams that are off are left out."""
+        return {dialect.TYPES[msgid].name: 1e9 / ns for msgid, ns in self._intervals.items() if ns}
+
+    # -- streams ------------------------------------------------------------------------------------------
+
+    def _boot(self, boot_ns: int, from_ns: int) -> None:
+        """Begin anew: time since boot from `boot_ns`, every stream at its own rate from `from_ns` on."""
+        self._airframe = Airframe(self.scenario.autopilot, boot_ns)
+        self._sequences = {COMPONENT: 0, RSBN_COMPONENT: 0}
+        self._intervals: dict[int, int] = {}
+        self._schedule: list[tuple[int, int]] = []
+        self._newest = dict.fromkeys(self._sensed, -1)
+        for msgid in (*self._made, *self._sensed):
+            self._set_rate(msgid, _default_hz(msgid), from_ns)
+
+    def _set_rate(self, msgid: int, rate_hz: float, t: int) -> None:
+        self._schedule = [entry for entry in self._schedule if entry[1] != msgid]
+        heapq.heapify(self._schedule)
+        self._intervals[msgid] = interval = round(1e9 / rate_hz) if rate_hz else 0
+        if interval:
+            heapq.heappush(self._schedule, (-(-t // interval) * interval, msgid))
+
+    def _emit(self, t: int) -> None:
+        """Make all frames of the instant `t` and hand them to the link."""
+        while self._own_faults and self._own_faults[-1].start_s * 1e9 <= t:
+            self._undergo(self._own_faults.pop())
+            return
+        frames = []
+        while self._schedule and self._schedule[0][0] <= t:
+            msgid = self._schedule[0][1]
+            heapq.heapreplace(self._schedule, (t + self._intervals[msgid], msgid))
+            message = self._message(msgid, t)
+            if message is not None:
+                frames.append(self._frame(message, COMPONENT))
+        while self._rsbn_due() <= t:
+            message = encode(self._rsbn[self._rsbn_next], self._airframe)
+            frames.append(self._frame(message, RSBN_COMPONENT))
+            self._rsbn_next += 1
+        self._transmit(frames, t)
+
+    def _rsbn_due(self) -> int:
+        return self._rsbn[self._rsbn_next].rx_ns if self._rsbn_next < len(self._rsbn) else NEVER
+
+    def _message(self, msgid: int, t: int) -> Any:
+        """The message of a stream at the flight's time `t`, None where there is nothing to say yet."""
+        if msgid in self._made:
+            return self._made[msgid](t)
+        stream, index = self._sensed[msgid], self._newest[msgid]
+        while index + 1 < len(stream) and stream[index + 1].rx_ns <= t:
+            index += 1
+        self._newest[msgid] = index
+        if index < 0:
+            return None
+        record = stream[index]
+        if record.t_ns < self._airframe.boot_ns:
+            return None
+        if isinstance(record, Gnss) and record.stamp_us:
+            moved = -round(self.scenario.boot_before_s * 1e6) - self._airframe.boot_ns // 1000
+            if moved:
+                record = replace(record, stamp_us=max(record.stamp_us + moved, 1))
+        return encode(record, self._airframe)
+
+    def _frame(self, message: Any, component: int) -> bytes:
+        sequence = self._sequences[component]
+        self._sequences[component] = sequence + 1 & 0xFF
+        return frame.encode(message, sequence, SYSTEM, component)
+
+    def _latency(self) -> int:
+        return self._latency_ns + int(self._rng.exponential(self.scenario.link.jitter_s) * 1e9)
+
+    def _transmit(self, frames: list[bytes], t: int) -> None:
+        """Put frames sent at `t` on the link; it keeps their order unless a fault says otherwise."""
+        due = self._released = max(self._released, t + self._start_ns + self._latency())
+        chunks = [Chunk(due, data) for data in frames]
+        if self._link_faults:
+            chunks = disturb(chunks, t, self._link_faults, self._rng)
+        for chunk in chunks:
+            self._order += 1
+            heapq.heappush(self._outbox, (chunk.due_ns, self._order, chunk.data))
+
+    def _undergo(self, fault: Fault) -> None:
+        """A fault of the autopilot itself begins (or, for a clock that leaps back, ends)."""
+        start = round(fault.start_s * 1e9)
+        size = round((AUTOPILOT_FAULTS[fault.name] if fault.size is None else fault.size) * 1e9)
+        if fault.name == "reboot":
+            self._boot(start, start + size)
+            while self._rsbn_due() < start + size:
+                self._rsbn_next += 1
+            return
+        self._airframe = self._airframe._replace(boot_ns=self._airframe.boot_ns - size)
+        if math.isfinite(fault.end_s):
+            back = Fault(fault.name, fault.end_s, math.inf, -size * 1e-9)
+            self._own_faults = sorted([*self._own_faults, back], key=lambda f: -f.start_s)
+
+    # -- messages that no sensor makes ----------------------------------------------------------------------
+
+    def _heartbeat(self, t: int) -> Any:
+        make = 12 if self.scenario.autopilot == "px4" else 3
+        return dialect.new(
+            "HEARTBEAT",
+            type=1,
+            autopilot=make,
+            base_mode=0x9D,
+            custom_mode=10,
+            system_status=4,
+            mavlink_version=3,
+        )
+
+    def _system_time(self, t: int) -> Any:
+        moved = -self._airframe.boot_ns - round(self.scenario.boot_before_s * 1e9)
+        leapt = max(moved, 0)  # a leap forward of the clock moves UNIX time too, a reboot does not
+        record = SystemTime(t, t, boot_ns=t - self._airframe.boot_ns, unix_ns=UNIX_AT_START_NS + t + leapt)
+        return encode(record, self._airframe)
+
+    def _origin(self, t: int) -> Any:
+        lat, lon, alt = self.world.origin
+        return encode(LocalOrigin(t, t, lat, lon, alt - self.scenario.geoid_height), self._airframe)
+
+    def _home(self, t: int) -> Any:
+        lat, lon, alt = self.world.origin
+        return encode(HomePosition(t, t, lat, lon, alt - self.scenario.geoid_height), self._airframe)
+
+    def _last(self, kind: type[Stamped], t: int) -> Any:
+        """The sensor's newest record at `t`; its stream is nearly regular, so the guess is near."""
+        stream = self.world.streams[kind]
+        span = max(stream[-1].rx_ns, 1)
+        index = min(len(stream) - 1, t * (len(stream) - 1) // span + 2)
+        while index > 0 and stream[index].rx_ns > t:
+            index -= 1
+        return stream[index]
+
+    def _global_position(self, t: int) -> Any:
+        local = self._last(LocalPosition, t)
+        if not math.isfinite(local.x_n[0]):
+            return None
+        projection: Any = "px4" if self.scenario.autopilot == "px4" else "ardupilot"
+        place: Geodetic = local_to_geodetic(projection, self.world.origin, np.array(local.x_n))
+        above = place.alt - self.world.origin.alt
+        msl = place.alt - self.scenario.geoid_height
+        heading = self._last(Attitude, t).heading
+        record = GlobalPosition(t, t, place.lat, place.lon, msl, local.v_n, above, heading)
+        return encode(record, self._airframe)
+
+    def _status(self, t: int) -> Any:
+        # The filter gives its aid up only ten seconds after the receiver lost its fix.
+        aided = any(self._last(Gnss, max(t - ago, 0)).fix >= 3 for ago in range(0, _ALONE_AFTER, SECOND))
+        flags = _FLAGS_AIDED if aided else _FLAGS_ALONE
+        return encode(FilterStatus(t, t, flags, False, 0.05, 1.5 if aided else 50.0), self._airframe)
+
+    # -- what the companion asks ----------------------------------------------------------------------------
+
+    def _answer(self, name: str, t: int, **values: Any) -> None:
+        self._transmit([self._frame(dialect.new(name, **values), COMPONENT)], t)
+
+    def _on_timesync(self, message: Any, t: int) -> None:
+        if message.tc1 == 0:
+            self._answer("TIMESYNC", t, tc1=t - self._airframe.boot_ns, ts1=message.ts1)
+
+    def _on_command(self, message: Any, t: int) -> None:
+        command, result = message.command, _UNSUPPORTED
+        if command == _SET_MESSAGE_INTERVAL:
+            msgid, interval_us = int(message.param1), float(message.param2)
+            if msgid in self._intervals:
+                result = _ACCEPTED
+                rate = 0.0 if interval_us < 0.0 else 1e6 / interval_us if interval_us else _default_hz(msgid)
+                self._set_rate(msgid, rate, t)
+        elif command == _REQUEST_MESSAGE and int(message.param1) in self._intervals:
+            wanted = self._message(int(message.param1), t)
+            result = _DENIED if wanted is None else _ACCEPTED
+            if wanted is not None:
+                self._transmit([self._frame(wanted, COMPONENT)], t)
+        elif command == _SET_SOURCE:
+            result = _ACCEPTED
+        elif command == _EXTERNAL_POSITION and dialect.id_of(message) == _msgid("COMMAND_INT"):
+            self.outputs.append((t + self._start_ns, message))
+            result = _ACCEPTED
+        self._answer("COMMAND_ACK", t, command=command, result=result)
+
+
+def _msgid(name: str) -> int:
+    return dialect.type_named(name).msgid
+
+
+_DEFAULT_HZ = {
+    "GPS_GLOBAL_ORIGIN": _SLOW_HZ,
+    "HOME_POSITION": _SLOW_HZ,
+    "SIM_STATE": 0.0,
+    "HIL_STATE_QUATERNION": 0.0,
+}
+
+
+def _default_hz(msgid: int) -> float:
+    return _DEFAULT_HZ.get(dialect.TYPES[msgid].name, 1.0)

@@ -1,0 +1,158 @@
+"""A scenario played out: every record its sensors will ever say, in flight time, and the truth to score by.
+
+`t_ns` is the flight's time, `rx_ns` when the record is there for the autopilot to send. It knows nothing of
+messages, rates asked for, links and the companion's clock: `sitl.autopilot` does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+
+from companion.nav.geometry import Geodetic, geodetic_to_local
+from companion.records import AirData, Attitude, Gnss, Imu, LocalPosition, Pressure, RsbnFix, Stamped, Truth
+from sitl import beacon, sensors
+from sitl.faults import spoil
+from sitl.flight import Array, Flight, fly
+from sitl.scenarios import Scenario
+
+_TURN = 2.0 * np.pi
+
+
+class World:
+    """The flight of a scenario and the streams of its sensors, each in order of arrival.
+
+    `origin` is the autopilot's local origin: the start, geodetic.
+    """
+
+    def __init__(self, scenario: Scenario) -> None:
+        self.scenario = scenario
+        self.flight = fly(scenario.plan)
+        start = self.flight
+        self.origin = Geodetic(float(start.lat[0]), float(start.lon[0]), float(start.alt[0]))
+        # Each sensor has a generator of its own, so that none changes another's noise.
+        seeds = np.random.SeedSequence(scenario.seed).spawn(5 + len(scenario.beacons))
+        ins, gnss, air, imu, faults, *beacons = (np.random.default_rng(seed) for seed in seeds)
+        self.error = sensors.inertial_error(self.flight, sensors.GRADES[scenario.grade], ins)
+        self.streams: dict[type[Stamped], Sequence[Stamped]] = {
+            Imu: self._imu(imu),
+            LocalPosition: self._local_position(),
+            Attitude: self._attitude(),
+            Gnss: self._gnss(gnss),
+            **self._air(air),
+            Truth: self._truth(),
+            RsbnFix: sorted(
+                (
+                    fix
+                    for ground, rng in zip(scenario.beacons, beacons)
+                    for fix in beacon.answers(
+                        ground, self._sampled(scenario.rates.rsbn), rng, scenario.rsbn_outages
+                    )
+                ),
+                key=lambda fix: fix.rx_ns,
+            ),
+        }
+        for kind, stream in self.streams.items():
+            self.streams[kind] = spoil(kind, stream, scenario.faults, faults)
+
+    def truth_at(self, t: Array) -> Flight:
+        """The truth at flight times `t` (s)."""
+        return self.flight.at(t)
+
+    def _sampled(self, rate_hz: float) -> Flight:
+        count = int(self.scenario.duration_s * rate_hz * (1.0 + 1e-12)) + 1
+        return self.flight.at(np.arange(count) / rate_hz)
+
+    def _imu(self, rng: np.random.Generator) -> list[Imu]:
+        flight = self._sampled(self.scenario.rates.imu)
+        f_b, w_b = sensors.imu(flight, sensors.GRADES[self.scenario.grade], rng)
+        rows = zip(_ns(flight.t), f_b.tolist(), w_b.tolist())
+        return [Imu(t, t, 0, tuple(f), tuple(w)) for t, f, w in rows]
+
+    def _local_position(self) -> list[LocalPosition]:
+        flight = self._sampled(self.scenario.rates.local_position)
+        error = sensors.error_at(self.error, flight.t)
+        places = np.stack(sensors.displaced(flight, error.x_n), axis=1).tolist()
+        projection: Literal["px4", "ardupilot"] = "px4" if self.scenario.autopilot == "px4" else "ardupilot"
+        x_n = [geodetic_to_local(projection, self.origin, Geodetic(*place)).tolist() for place in places]
+        v_n = (flight.v_n + error.v_n).tolist()
+        return [LocalPosition(t, t, tuple(x), tuple(v)) for t, x, v in zip(_ns(flight.t), x_n, v_n)]
+
+    def _attitude(self) -> list[Attitude]:
+        flight = self._sampled(self.scenario.rates.attitude)
+        psi = sensors.error_at(self.error, flight.t).psi
+        # The platform is turned by -psi: its tilts along the hull are the errors of roll, pitch.
+        s, c = np.sin(flight.attitude[:, 2]), np.cos(flight.attitude[:, 2])
+        along, across = c * psi[:, 0] + s * psi[:, 1], c * psi[:, 1] - s * psi[:, 0]
+        attitude = flight.attitude + np.stack([along, across, psi[:, 2]], axis=1)
+        attitude[:, 2] %= _TURN
+        return [
+            Attitude(t, t, roll, pitch, heading, tuple(w))
+            for t, (roll, pitch, heading), w in zip(_ns(flight.t), attitude.tolist(), flight.w_b.tolist())
+        ]
+
+    def _gnss(self, rng: np.random.Generator) -> list[Gnss]:
+        model, scenario = self.scenario.gnss, self.scenario
+        fixes = sensors.gnss(self._sampled(scenario.rates.gnss), model, scenario.gnss_outages, rng)
+        stamp_offset = round(scenario.boot_before_s * 1e6)
+        stream = []
+        last = (self.origin.lat, self.origin.lon, self.origin.alt)
+        columns = (fixes.lat.tolist(), fixes.lon.tolist(), fixes.alt.tolist(), fixes.v_n.tolist())
+        for t, lat, lon, alt, v_n, usable in zip(_ns(fixes.t), *columns, fixes.usable.tolist()):
+            if usable:
+                last = (lat, lon, alt)
+            stream.append(
+                Gnss(
+                    t,
+                    t,
+                    receiver=0,
+                    stamp_us=0 if scenario.autopilot == "px4" else t // 1000 + stamp_offset,
+                    fix=3 if usable else 1,
+                    lat=last[0],
+                    lon=last[1],
+                    alt_msl=last[2] - scenario.geoid_height,
+                    alt=last[2],
+                    sigma_horizontal=model.sigma_horizontal if usable else None,
+                    sigma_vertical=model.sigma_horizontal * model.vertical_ratio if usable else None,
+                    v_n=tuple(v_n) if usable else None,
+                    sigma_velocity=model.velocity_m_s if usable else None,
+                    satellites=14 if usable else 0,
+                    hdop=0.8 if usable else None,
+                )
+            )
+        return stream
+
+    def _air(self, rng: np.random.Generator) -> dict[type[Stamped], Sequence[Stamped]]:
+        flight = self._sampled(self.scenario.rates.air)
+        air = sensors.air_data(flight, self.scenario.air, rng)
+        v_n = flight.v_n + sensors.error_at(self.error, flight.t).v_n
+        speeds = np.stack(
+            [air.equivalent_airspeed, np.hypot(v_n[:, 0], v_n[:, 1]), -v_n[:, 2]], axis=1
+        ).tolist()
+        headings, heights = flight.attitude[:, 2].tolist(), (flight.alt - self.scenario.geoid_height).tolist()
+        pressures = np.stack([air.static, air.impact, air.temperature], axis=1).tolist()
+        t_ns = _ns(flight.t)
+        return {
+            AirData: [
+                AirData(t, t, airspeed, False, ground, climb, heading, height)
+                for t, (airspeed, ground, climb), heading, height in zip(t_ns, speeds, headings, heights)
+            ],
+            Pressure: [Pressure(t, t, *values) for t, values in zip(t_ns, pressures)],
+        }
+
+    def _truth(self) -> list[Truth]:
+        flight = self._sampled(self.scenario.rates.truth)
+        places = np.stack([flight.lat, flight.lon, flight.alt], axis=1).tolist()
+        return [
+            Truth(t, t, lat, lon, alt, tuple(v), tuple(attitude))
+            for t, (lat, lon, alt), v, attitude in zip(
+                _ns(flight.t), places, flight.v_n.tolist(), flight.attitude.tolist()
+            )
+        ]
+
+
+def _ns(t: Array) -> list[int]:
+    out: list[int] = np.rint(t * 1e9).astype(np.int64).tolist()
+    return out
