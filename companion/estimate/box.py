@@ -108,4 +108,4 @@ def least_squares(D: Array, r: Array) -> Box:
     free = status == 0
     inverse = np.zeros((m, m))
     inverse[np.ix_(free, free)] = np.linalg.inv(M[np.ix_(free, free)])
-    return Box(found.x, status, inverse)
+    return Box(np.where(free, found.x, status), status, inverse)

@@ -9,13 +9,12 @@ Feedforward leaves the INS alone and corrects its output, X - x. Feedback correc
 is a rule of two sentences: whatever number is taken from the INS is taken from the estimate too, and a
 correction beta of the readings enters the error model as a known input,
 
-    X <- X - c,   x <- x - c;      u <- u - beta,   x <- A x - A_k beta    (A_k: the columns of A of the
-    readings).
+    X <- X - c,   x <- x - c;      u <- u - beta,   x <- A x - A_k beta
 
-P and K are untouched. In a linear problem every mixture therefore gives the same X - x, to rounding. In a
-nonlinear one A and H are taken at the INS's own X, and the schemes part as the square of the errors: with
-coarse sensors feedback keeps the problem linear. If they part as the first power, A is not the Jacobian of
-`mechanise`.
+(A_k the columns of A that belong to the readings). P and K are untouched. In a linear problem every mixture
+therefore gives the same X - x, to rounding. In a nonlinear one A and H are taken at the INS's own X, and the
+schemes part as the square of the errors: with coarse sensors feedback keeps the problem linear. If they part
+as the first power, A is not the Jacobian of `mechanise`.
 
 DEPARTS FROM the paper: x* = X* - X (the sign as printed is the opposite), and its last system reads with
 Gamma2 Delta k1 and K3.
@@ -37,9 +36,8 @@ from companion.estimate.kalman import Array
 class Plant:
     """An INS and its error model; the state is [x (N,), k (of the readings, q), others], n in all.
 
-    mechanise: (X (N,), u (q,)) -> X (N,), one step      transition: (X, u) -> A (n, n), at the step's
-    beginning observe:   X -> G(X) (p,)                            sight:      X -> H (p, n), the errors' sign
-    included
+    mechanise: (X (N,), u (q,)) -> X (N,), one step; transition: its Jacobian A (n, n) at the same (X, u)
+    observe: X -> G(X) (p,); sight: X -> H (p, n) = [-dG/dX, 0, ...]; Q (n, n) of a step, R (p, p)
     """
 
     mechanise: Callable[[Array, Array], Array]
@@ -68,7 +66,7 @@ FEEDBACK = Feed(1.0, 1.0)
 
 
 class Carry(NamedTuple):
-    """INS state X (N,), estimated errors x (n,) and their P (n, n), the correction beta (q,) in the readings."""
+    """INS state X (N,), estimated errors x (n,) and their P (n, n), the correction beta (q,) of readings."""
 
     X: Array
     x: Array
@@ -82,12 +80,11 @@ class Carry(NamedTuple):
 
 
 def step(carry: Carry, u: Array, Z: Array | None, plant: Plant, feed: Feed = FEEDFORWARD) -> Carry:
-    """Mechanise readings u (q,), take in a fix Z (p,) if there is one, and feed back what the scheme wants."""
+    """Mechanise readings u (q,), take in a fix Z (p,) if there is one, and feed back what the scheme says."""
     carry = propagate(carry, u, plant)
     if Z is None:
         return carry
     H = plant.sight(carry.X)
-    # correct() forms its innovation z - H x itself: z is the fix minus what the INS says
     found = kalman.correct(carry.x, carry.P, Z - plant.observe(carry.X), H, plant.R)
     return feed_back(carry._replace(x=found.x, P=found.P), feed)
 

@@ -1,0 +1,259 @@
+"""`companion study restrictive`: the minimax Kalman filter and the restrictive filter R1 on the same flights.
+
+The experiment of Poddubny, section 3: a ship's INS with a log in unknown currents, 16 states, 600 samples in
+six hours, perfect alignment. What drives the currents is the truth of the run; everything else is drawn from
+the model both filters use. The paper's own truth lies on the bounds all the time; the others show what that
+is worth.
+"""
+
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import click
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from companion.estimate import kalman, restrictive
+from companion.estimate.kalman import Array
+from companion.nav.error_model import Example, paper_example
+
+SAMPLES = 600
+NEAR = 0.9  # an input this close to its bound counts as near it
+Generator = np.random.Generator
+
+
+def constant(rng: Generator, runs: int, C: Array, dt: float) -> Array:
+    """On the upper bound for the whole run, both currents.
+
+    The paper does not say which bounds. With both signs alike velocity north gains more than east (1.8 and
+    1.5 times), with opposite signs the two change places.
+    """
+    return np.broadcast_to(C, (runs, SAMPLES, len(C)))
+
+
+def telegraph(rng: Generator, runs: int, C: Array, dt: float) -> Array:
+    """From bound to bound, on average one switch an hour."""
+    switches = rng.random((runs, SAMPLES, len(C))) < dt
+    switches[:, 0] = rng.random((runs, len(C))) < 0.5
+    return C * np.where(np.cumsum(switches, 1) % 2, 1.0, -1.0)
+
+
+def slow(rng: Generator, runs: int, C: Array, dt: float) -> Array:
+    """A sine of 2 to 6 h that reaches a fifth to three fifths of the bound, phase by lot."""
+    shape = (runs, 1, len(C))
+    period, height = rng.uniform(2, 6, shape), rng.uniform(0.2, 0.6, shape)
+    phase = rng.uniform(0, 1, shape)
+    hours = dt * np.arange(SAMPLES)[:, None]
+    return C * height * np.sin(2 * np.pi * (hours / period + phase))
+
+
+def white(rng: Generator, runs: int, C: Array, dt: float) -> Array:
+    """Gaussian and white with variance C^2, the law for which the minimax filter is optimal."""
+    return C * rng.standard_normal((runs, SAMPLES, len(C)))
+
+
+class Truth(NamedTuple):
+    """A row of the table: what drives the currents, and the model of all the rest."""
+
+    title: str
+    inputs: Callable[[Generator, int, Array, float], Array]
+    exact: bool = True
+    sigma_E: float = 1e-5
+
+
+TRUTHS = {
+    "constant": Truth("constant on the bound", constant),
+    "telegraph": Truth("telegraph, one switch an hour", telegraph),
+    "slow": Truth("slow, inside the bounds", slow),
+    "white": Truth("Gaussian white, variance C^2", white),
+    "euler": Truth("constant, Euler's step, sigma_E 3e-6", constant, exact=False, sigma_E=3e-6),
+}
+
+
+class Flights(NamedTuple):
+    """Truth x (T, runs, n), inputs u (T, runs, m), measurements z (T, runs, p): time comes first."""
+
+    x: Array
+    u: Array
+    z: Array
+
+
+def fly(model: Example, truth: Truth, runs: int, rng: Generator) -> Flights:
+    """Draw the flights: W and N from the model, U from the truth."""
+    u = np.moveaxis(truth.inputs(rng, runs, model.C, model.dt), 1, 0)
+    noise = rng.multivariate_normal(np.zeros(len(model.x0)), model.Q, (SAMPLES, runs), method="eigh")
+    x = np.broadcast_to(model.x0, (runs, len(model.x0)))
+    states = np.empty((SAMPLES, *x.shape))
+    for t in range(SAMPLES):
+        states[t] = x = x @ model.A.T + u[t] @ model.B.T + noise[t]
+    sigma = np.sqrt(np.diag(model.R))
+    return Flights(states, u, states @ model.H.T + sigma * rng.standard_normal((SAMPLES, runs, len(sigma))))
+
+
+class Passed(NamedTuple):
+    """A filter over the flights: estimates (T, runs, n), inputs (T, runs, m) or None, NEES by state (n,)."""
+
+    x: Array
+    u: Array | None
+    nees: Array
+    nees_all: float
+
+
+def minimax(model: Example, flights: Flights) -> Passed:
+    """The Kalman filter whose noise is the greatest within the bounds."""
+    Q = kalman.minimax_noise(model.B, model.C, model.Q)
+    x, P = np.broadcast_to(model.x0, flights.x.shape[1:]), model.P0
+    steps = []
+    for z in flights.z:
+        now = kalman.step(x, P, z, model.A, Q, model.H, model.R)
+        x, P = now.x, now.P
+        steps.append((x, None, P))
+    return _passed(flights, steps)
+
+
+def r1(model: Example, flights: Flights) -> Passed:
+    """The restrictive filter; every flight has its own covariance."""
+    runs, n = flights.x.shape[1:]
+    x, P = np.broadcast_to(model.x0, (runs, n)), np.broadcast_to(model.P0, (runs, n, n))
+
+    def steps() -> Iterator[tuple[Array, Array | None, Array]]:
+        nonlocal x, P
+        for z in flights.z:
+            now = restrictive.step(x, P, z, model.A, model.B, model.Q, model.H, model.R, model.C)
+            x, P = now.x, now.P
+            yield x, now.u, P
+
+    return _passed(flights, steps())
+
+
+def _passed(flights: Flights, steps: Any) -> Passed:
+    """Gather the estimates; the NEES by state after the first hour, when every variance has grown."""
+    settled = SAMPLES // 6
+    x, u, by_state, whole = [], [], [], []
+    for t, (x_t, u_t, P_t) in enumerate(steps):
+        x.append(x_t)
+        u.append(u_t)
+        if t >= settled and t % 10 == 0:
+            error = x_t - flights.x[t]
+            by_state.append((error**2 / np.diagonal(P_t, axis1=-2, axis2=-1)).mean(0))
+            whole.append(kalman.nees(error, P_t).mean() / error.shape[-1])
+    inputs = None if u[0] is None else np.array(u)
+    return Passed(np.array(x), inputs, np.mean(by_state, 0), float(np.mean(whole)))
+
+
+def study(name: str, runs: int, seed: int) -> tuple[dict[str, Any], Flights, Passed, Passed, Example]:
+    """One row: rms errors over all runs and six hours, their ratio, inputs on the bound, consistency."""
+    truth = TRUTHS[name]
+    model = paper_example(exact=truth.exact, sigma_E=truth.sigma_E)
+    rng = np.random.default_rng([seed, list(TRUTHS).index(name)])
+    flights = fly(model, truth, runs, rng)
+    coarse, restricted = minimax(model, flights), r1(model, flights)
+    rms = [np.sqrt(np.mean((f.x - flights.x) ** 2, axis=(0, 1))) for f in (coarse, restricted)]
+    assert restricted.u is not None
+    share = np.abs(restricted.u) / model.C
+    row = {
+        "truth": name,
+        "title": truth.title,
+        "runs": runs,
+        "states": list(model.states),
+        "rms_minimax": rms[0].tolist(),
+        "rms_restrictive": rms[1].tolist(),
+        "ratio": (rms[0] / rms[1]).tolist(),
+        "rms_free": np.sqrt(np.mean(flights.x**2, axis=(0, 1))).tolist(),
+        "on_bound": float((share >= 1.0).mean()),
+        "near_bound": float((share >= NEAR).mean()),
+        "nees_minimax": coarse.nees.tolist(),
+        "nees_restrictive": restricted.nees.tolist(),
+        "nees_minimax_per_dimension": coarse.nees_all,
+        "nees_restrictive_per_dimension": restricted.nees_all,
+    }
+    return row, flights, coarse, restricted, model
+
+
+def sheet(rows: list[dict[str, Any]], key: str, title: str, number: str) -> Table:
+    """One table, a row per truth and a column per state."""
+    table = Table(title=title)
+    table.add_column("truth")
+    for state in rows[0]["states"]:
+        table.add_column(state, justify="right")
+    for row in rows:
+        table.add_row(row["truth"], *(format(value, number) for value in row[key]))
+    return table
+
+
+def draw(
+    folder: Path, name: str, flights: Flights, coarse: Passed, restricted: Passed, model: Example
+) -> None:
+    """Figures in the order of the paper's 1-10, of the first run: measurements, inputs, estimates, errors."""
+    from matplotlib.figure import Figure
+
+    folder.mkdir(parents=True, exist_ok=True)
+    assert restricted.u is not None
+    states = model.states
+    groups = [range(i, min(i + 4, len(states))) for i in range(0, len(states), 4)]
+
+    def save(number: int, panels: list[tuple[str, dict[str, Array]]]) -> None:
+        figure = Figure(figsize=(8, 2 * len(panels)), layout="constrained")
+        for axes, (label, curves) in zip(np.atleast_1d(figure.subplots(len(panels), 1)), panels, strict=True):
+            for legend, values in curves.items():
+                axes.plot(values, label=legend, linewidth=0.8)
+            axes.set_ylabel(label)
+            axes.legend(fontsize="x-small", loc="upper right")
+        figure.savefig(folder / f"{name}_{number:02d}.png", dpi=110)
+
+    save(1, [(f"Z{i + 1}", {"measured": flights.z[:, 0, i]}) for i in range(flights.z.shape[-1])])
+    save(
+        2,
+        [
+            (f"U{i + 1}", {"true": flights.u[:, 0, i], "restrictive": restricted.u[:, 0, i]})
+            for i in range(flights.u.shape[-1])
+        ],
+    )
+    x, k, r = (f[:, 0] for f in (flights.x, coarse.x, restricted.x))
+    for number, group in enumerate(groups):
+        curves = [(states[i], {"true": x[:, i], "restrictive": r[:, i], "minimax": k[:, i]}) for i in group]
+        errors = [(states[i], {"restrictive": abs(r - x)[:, i], "minimax": abs(k - x)[:, i]}) for i in group]
+        save(3 + number, curves)
+        save(7 + number, errors)
+
+
+@click.command("restrictive")
+@click.option("--runs", default=200, show_default=True, type=click.IntRange(2), help="flights per truth")
+@click.option("--truth", "names", multiple=True, type=click.Choice(list(TRUTHS)), help="rows; all by default")
+@click.option("--seed", default=1, show_default=True, help="of the random numbers")
+@click.option("--json", "as_json", is_flag=True, help="print plain data")
+@click.option("--plot", type=click.Path(file_okay=False, path_type=Path), help="folder for figures 1-10")
+def command(names: tuple[str, ...], runs: int, seed: int, as_json: bool, plot: Path | None) -> None:
+    """Minimax Kalman filter against the restrictive filter, 16 states, six hours of unknown currents."""
+    rows = []
+    for name in names or tuple(TRUTHS):
+        row, flights, coarse, restricted, model = study(name, runs, seed)
+        rows.append(row)
+        if plot:
+            draw(plot, name, flights, coarse, restricted, model)
+    if as_json:
+        click.echo(json.dumps(rows))
+        return
+    console = Console()
+    console.print(
+        sheet(rows, "ratio", "rms error, minimax / restrictive (above 1: restrictive better)", ".2f")
+    )
+    console.print(sheet(rows, "rms_minimax", "rms error of the minimax filter, km, h, rad", ".2e"))
+    console.print(sheet(rows, "rms_restrictive", "rms error of the restrictive filter", ".2e"))
+    console.print(sheet(rows, "rms_free", "rms error of the INS without correction", ".2e"))
+    console.print(sheet(rows, "nees_minimax", "mean error^2 / variance, minimax (1: consistent)", ".1f"))
+    console.print(sheet(rows, "nees_restrictive", "mean error^2 / variance, restrictive", ".1f"))
+    for row in rows:
+        console.print(
+            f"{row['title']}: U on the bound in {row['on_bound']:.0%} of steps, "
+            f"{row['near_bound']:.0%} within 10 %; "
+            f"NEES per dimension {row['nees_minimax_per_dimension']:.2f} minimax, "
+            f"{row['nees_restrictive_per_dimension']:.2f} restrictive"
+        )
+
+
+if __name__ == "__main__":
+    command()
