@@ -1,0 +1,321 @@
+"""The smoother: three ways to one trajectory, foreign numbers, and what smoothing must do to an error."""
+
+from __future__ import annotations
+
+import json
+import math
+import pathlib
+import tracemalloc
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from companion.estimate import boundary, smoother
+
+DATA = json.loads((pathlib.Path(__file__).parents[1] / "data/map_and_order.json").read_text())["two_state"]
+AGREE = 1e-9
+
+
+def example() -> tuple[Any, ...]:
+    N = len(DATA["z"])
+    return (
+        [DATA["Phi"]] * N,
+        [DATA["Gamma"]] * N,
+        [DATA["D_theta"]] * N,
+        [DATA["H"]] * N,
+        [DATA["sigma2"]] * N,
+        DATA["z"],
+        DATA["m_x0"],
+        DATA["B_x0"],
+    )
+
+
+@pytest.mark.parametrize("solve", [smoother.rts, smoother.two_point])
+def test_foreign_numbers(solve: Any) -> None:
+    found = solve(*example())
+    np.testing.assert_allclose(found.x, DATA["x_smooth"], atol=1e-13)
+    np.testing.assert_allclose(found.s, DATA["s"], atol=1e-13)
+    np.testing.assert_allclose(found.P[0], DATA["P_smooth_0"], atol=1e-14)
+    np.testing.assert_allclose(found.x[0], [0.141426184774452, 0.975138510178567], atol=1e-14)
+    forward = smoother.filtered(*example())
+    np.testing.assert_allclose(forward.x, DATA["x_filter"], atol=1e-13)
+    np.testing.assert_allclose(found.x[-1], forward.x[-1], atol=1e-13)
+    np.testing.assert_allclose(found.P[-1], DATA["P_filter_last"], atol=1e-14)
+
+
+def test_the_equations_of_the_boundary_problem_hold() -> None:
+    Phi, Gamma, D, H, _, z, m, B = (np.array(a) for a in example())
+    found = smoother.two_point(*example())
+    x, s = found.x, [*found.s, np.zeros(2)]
+    np.testing.assert_allclose(x[0], B @ Phi[0].T @ s[0] + m, atol=1e-14)
+    for i in range(len(z)):
+        theta = D[i] @ Gamma[i].T @ s[i]
+        np.testing.assert_allclose(found.theta[i], theta, atol=1e-14)
+        np.testing.assert_allclose(x[i + 1], Phi[i] @ x[i] + Gamma[i] @ theta, atol=1e-13)
+        seen = H[i].T @ (z[i] - H[i] @ x[i + 1]) / DATA["sigma2"]
+        np.testing.assert_allclose(s[i], (Phi[i].T if i < 9 else np.eye(2)) @ s[i + 1] + seen, atol=1e-13)
+
+
+def random_problem(seed: int, n: int, N: int, singular: bool) -> tuple[Any, ...]:
+    """Steps of all kinds: disturbances and measurements of several dimensions, none at some epochs."""
+    rng = np.random.default_rng(seed)
+
+    def covariance(k: int, rank: int) -> Any:
+        root = rng.standard_normal((k, rank))
+        return root @ root.T
+
+    rank = (lambda k: int(rng.integers(0, k + 1))) if singular else (lambda k: k + 2)
+    Phi, Gamma, D, H, R, z = [], [], [], [], [], []
+    for _ in range(N):
+        q, p = int(rng.integers(1, n + 1)), int(rng.integers(0, 3))
+        Phi.append(np.linalg.qr(rng.standard_normal((n, n)))[0] * rng.uniform(0.5, 1.05))
+        Gamma.append(rng.standard_normal((n, q)))
+        D.append(covariance(q, rank(q)))
+        H.append(rng.standard_normal((p, n)) if p else None)
+        R.append(0.1 * np.eye(p) + covariance(p, p) if p else None)
+        z.append(rng.standard_normal(p) if p else None)
+    return Phi, Gamma, D, H, R, z, rng.standard_normal(n), covariance(n, rank(n))
+
+
+def conditioned(problem: tuple[Any, ...]) -> tuple[Any, Any, Any, Any]:
+    """The same by the textbook: everything is linear in (x_0, theta), which are conditioned on all of z."""
+    Phi, Gamma, D, H, R, z, m, B = problem
+    n, N = len(m), len(z)
+    starts = np.cumsum([n, *(len(d) for d in D)])
+    prior = np.zeros((starts[-1], starts[-1]))
+    prior[:n, :n] = B
+    maps = [np.eye(n, starts[-1])]
+    for i in range(N):
+        part = slice(starts[i], starts[i + 1])
+        prior[part, part] = D[i]
+        maps.append(Phi[i] @ maps[-1])
+        maps[-1][:, part] += Gamma[i]
+    mean = np.concatenate((m, np.zeros(starts[-1] - n)))
+    seen = [i for i in range(N) if z[i] is not None]
+    if seen:
+        A = np.vstack([H[i] @ maps[i + 1] for i in seen])
+        noise = np.zeros((len(A), len(A)))
+        at = 0
+        for i in seen:
+            k = len(z[i])
+            noise[at : at + k, at : at + k] = R[i]
+            at += k
+        S = A @ prior @ A.T + noise
+        gain = np.linalg.solve(S, A @ prior).T
+        mean = mean + gain @ (np.concatenate([z[i] for i in seen]) - A @ mean)
+        prior = prior - gain @ S @ gain.T
+    x = np.array([M @ mean for M in maps])
+    P = np.array([M @ prior @ M.T for M in maps])
+    parts = [slice(starts[i], starts[i + 1]) for i in range(N)]
+    return x, P, [mean[p] for p in parts], [prior[p, p] for p in parts]
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 10**6), st.integers(1, 5), st.integers(1, 12), st.booleans())
+def test_all_ways_agree(seed: int, n: int, N: int, singular: bool) -> None:
+    problem = random_problem(seed, n, N, singular)
+    x, P, theta, theta_P = conditioned(problem)
+    H, z = problem[3], problem[5]
+    ways = [smoother.rts(*problem), smoother.two_point(*problem)]
+    ways.append(
+        smoother.gauss_newton(
+            *problem[:3], lambda i, x: (H[i] @ x, H[i]), problem[4], z, *problem[6:]
+        ).smoothed
+    )
+    for found in ways:
+        np.testing.assert_allclose(found.x, x, rtol=AGREE, atol=AGREE)
+        np.testing.assert_allclose(found.P, P, rtol=AGREE, atol=AGREE)
+        np.testing.assert_allclose(found.s, ways[0].s, rtol=AGREE, atol=AGREE * (1 + abs(ways[0].s).max()))
+        for i in range(N):
+            np.testing.assert_allclose(found.theta[i], theta[i], rtol=AGREE, atol=AGREE)
+            np.testing.assert_allclose(found.theta_P[i], theta_P[i], rtol=AGREE, atol=AGREE)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 10**6), st.integers(1, 4), st.integers(2, 10))
+def test_it_is_the_recursion_of_rauch_tung_and_striebel(seed: int, n: int, N: int) -> None:
+    problem = random_problem(seed, n, N, singular=False)
+    Phi, Gamma, D = problem[:3]
+    forward, found = smoother.filtered(*problem), smoother.rts(*problem)
+    x, P = forward.x[-1], forward.P[-1]
+    for i in range(N - 1, -1, -1):
+        ahead = Phi[i] @ forward.P[i] @ Phi[i].T + Gamma[i] @ D[i] @ Gamma[i].T
+        s = np.linalg.solve(ahead, x - Phi[i] @ forward.x[i])
+        np.testing.assert_allclose(found.s[i], s, rtol=1e-7, atol=1e-9 * (1 + abs(found.s).max()))
+        C = np.linalg.solve(ahead, Phi[i] @ forward.P[i]).T
+        x = forward.x[i] + C @ (x - Phi[i] @ forward.x[i])
+        P = forward.P[i] + C @ (P - ahead) @ C.T
+        np.testing.assert_allclose(found.x[i], x, rtol=1e-7, atol=1e-8)
+        np.testing.assert_allclose(found.P[i], P, rtol=1e-7, atol=1e-8)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 10**6), st.integers(1, 3), st.integers(1, 8))
+def test_block_elimination_solves_the_whole_system(seed: int, n: int, N: int) -> None:
+    rng = np.random.default_rng(seed)
+    M, C = rng.standard_normal((N + 1, 2 * n, 2 * n)), 0.5 * rng.standard_normal((N, n, n))
+    M = M + M.mT + 6.0 * n * np.eye(2 * n)
+    whole = np.zeros(((N + 1) * 2 * n,) * 2)
+    for i in range(N + 1):
+        whole[2 * n * i : 2 * n * (i + 1), 2 * n * i : 2 * n * (i + 1)] = M[i]
+    for i in range(N):
+        rows, columns = slice(2 * n * (i + 1), 2 * n * (i + 1) + n), slice(2 * n * i + n, 2 * n * (i + 1))
+        whole[rows, columns], whole[columns, rows] = C[i], C[i].T
+    b = rng.standard_normal((N + 1, 2 * n))
+    y, inverse = boundary.solve(M, C, b)
+    np.testing.assert_allclose(y.ravel(), np.linalg.solve(whole, b.ravel()), atol=1e-10)
+    dense = np.linalg.inv(whole)
+    for i in range(N + 1):
+        block = dense[2 * n * i : 2 * n * (i + 1), 2 * n * i : 2 * n * (i + 1)]
+        np.testing.assert_allclose(inverse[i], block, atol=1e-10)
+
+
+# Azimuth and range to a beacon: an aircraft in the plane (x north, y east), position and velocity
+
+BEACON = np.array([20e3, -15e3])
+SIGMA = np.array([math.radians(0.125), 100.0])
+
+
+def sight(x: Any) -> tuple[Any, Any]:
+    """Azimuth and range from the beacon, and their partials."""
+    north, east = x[:2] - BEACON
+    rho = math.hypot(north, east)
+    H = np.zeros((2, 4))
+    H[0, :2] = -east / rho**2, north / rho**2
+    H[1, :2] = north / rho, east / rho
+    return np.array([math.atan2(east, north), rho]), H
+
+
+def flight(seed: int, N: int = 150) -> tuple[Any, Any, Any]:
+    rng = np.random.default_rng(seed)
+    Phi, Gamma = np.eye(4), np.vstack((0.5 * np.eye(2), np.eye(2)))
+    Phi[:2, 2:] = np.eye(2)
+    D, B = 0.3**2 * np.eye(2), np.diag([2e3, 2e3, 20.0, 20.0]) ** 2
+    m = np.array([0.0, -14e3, 60.0, 0.0])
+    x = [m + np.sqrt(np.diag(B)) * rng.standard_normal(4)]
+    z: list[Any] = []
+    for i in range(N):
+        x.append(Phi @ x[-1] + Gamma @ (0.3 * rng.standard_normal(2)))
+        z.append(None if 40 <= i < 60 else sight(x[-1])[0] + SIGMA * rng.standard_normal(2))
+
+    def h(i: int, state: Any) -> tuple[Any, Any]:
+        value, H = sight(state)
+        value[0] = z[i][0] + math.remainder(value[0] - z[i][0], math.tau)
+        return value, H
+
+    R = [np.diag(SIGMA**2)] * N
+    return ([Phi] * N, [Gamma] * N, [D] * N, h, R, z, m, B), np.array(x), h
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_beacon_only_the_nonlinear_problem_is_solved(seed: int) -> None:
+    problem, _, h = flight(seed)
+    Phi, Gamma, D, _, R, z, m, B = problem
+    found = smoother.gauss_newton(*problem)
+    assert found.iterations < 20
+    x, s = found.x, [*found.smoothed.s, np.zeros(4)]
+    sigma = np.sqrt(np.einsum("ijj->ij", found.P))
+    assert (abs(x[0] - m - B @ Phi[0].T @ s[0]) < 1e-8 * sigma[0]).all()
+    for i in range(len(z)):  # (6.4.12) with h in place of H x
+        s_i = (Phi[i].T if i + 1 < len(z) else np.eye(4)) @ s[i + 1]
+        if z[i] is not None:
+            value, H = h(i, x[i + 1])
+            s_i = s_i + H.T @ np.linalg.solve(R[i], z[i] - value)
+        Q = Gamma[i] @ D[i] @ Gamma[i].T
+        assert (abs(x[i + 1] - Phi[i] @ x[i] - Q @ s_i) < 1e-7 * sigma[i + 1]).all()
+
+
+def test_beacon_only_nothing_near_costs_less() -> None:
+    problem, _, h = flight(7)
+    Phi, Gamma, D, _, R, z, m, B = problem
+    found = smoother.gauss_newton(*problem)
+
+    def criterion(start: Any, theta: Any) -> float:
+        x, total = start, (start - m) @ np.linalg.solve(B, start - m)
+        for i in range(len(z)):
+            x = Phi[i] @ x + Gamma[i] @ theta[i]
+            total += theta[i] @ np.linalg.solve(D[i], theta[i])
+            if z[i] is not None:
+                r = z[i] - h(i, x)[0]
+                total += r @ np.linalg.solve(R[i], r)
+        return float(total)
+
+    theta = np.array(found.smoothed.theta)
+    least = criterion(found.x[0], theta)
+    assert least == pytest.approx(found.cost, rel=1e-9)
+    rng = np.random.default_rng(0)
+    for size in (1e-3, 1e-1):
+        for _ in range(10):
+            start = found.x[0] + size * np.sqrt(np.diag(found.P[0])) * rng.standard_normal(4)
+            assert criterion(start, theta + 0.1 * size * rng.standard_normal(theta.shape)) > least
+
+
+def test_beacon_only_errors_are_as_large_as_promised() -> None:
+    states, disturbances = [], []
+    for seed in range(20):
+        problem, truth, _ = flight(seed, N=100)
+        found = smoother.gauss_newton(*problem)
+        for k in range(0, 101, 20):
+            e = found.x[k] - truth[k]
+            states.append(e @ np.linalg.solve(found.P[k], e))
+        theta, P = found.smoothed.theta, found.smoothed.theta_P
+        for k in range(0, 99, 20):
+            true = truth[k + 1, 2:] - truth[k, 2:]
+            disturbances.append((theta[k] - true) @ np.linalg.solve(P[k], theta[k] - true))
+    assert 3.4 < np.mean(states) < 4.6
+    assert 1.7 < np.mean(disturbances) < 2.3
+
+
+def test_smoothing_makes_every_variance_smaller() -> None:
+    problem = random_problem(3, 4, 40, singular=False)
+    forward, found = smoother.filtered(*problem), smoother.rts(*problem)
+    for k in range(41):
+        assert np.linalg.eigvalsh(forward.P[k] - found.P[k]).min() > -1e-12
+    np.testing.assert_allclose(found.x[-1], forward.x[-1], atol=1e-12)
+
+
+@pytest.mark.parametrize("solve", [smoother.rts, smoother.two_point])
+def test_memory_grows_as_the_length(solve: Any) -> None:
+    peak = []
+    for N in (100, 200, 400):
+        problem = random_problem(0, 6, N, singular=False)
+        tracemalloc.start()
+        solve(*problem)
+        peak.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert peak[2] < 2.2 * peak[1] < 4.84 * peak[0]
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({5: [1.0, 2.0]}, "entries: give one of each"),
+        ({0: [np.eye(3)] * 10}, r"entry 0: Phi \(3, 3\)"),
+        ({3: [np.eye(2)] * 10}, "entry 0: H"),
+        ({4: [0.0] * 10}, "entry 0: covariance R has variance 0"),
+        ({2: [-1.0] * 10}, "entry 0: covariance D has variance -1"),
+        ({5: [math.nan] * 10}, "entry 0: a number is not finite"),
+        ({7: [[1.0, 2.0], [2.0, 1.0]]}, "P0 is not positive semidefinite"),
+    ],
+)
+def test_bad_input_is_one_sentence(change: dict[int, Any], said: str) -> None:
+    problem = list(example())
+    for k, value in change.items():
+        problem[k] = value
+    for solve in (smoother.rts, smoother.two_point):
+        with pytest.raises(ValueError, match=said):
+            solve(*problem)
+
+
+def test_a_wrong_jacobian_is_said() -> None:
+    problem = list(flight(1)[0])
+    right = problem[3]
+    problem[3] = lambda i, x: (right(i, x)[0], -right(i, x)[1])
+    with pytest.raises(ValueError, match=r"Jacobian|within 50 steps"):
+        smoother.gauss_newton(*problem)
+    problem[3] = lambda i, x: (right(i, x)[0][:1], right(i, x)[1])
+    with pytest.raises(ValueError, match="make them fit"):
+        smoother.gauss_newton(*problem)
