@@ -247,19 +247,7 @@ def encode(
     """
     msgid = dialect.id_of(message)
     payload = dialect.payload(message).rstrip(b"\0") or b"\0"
-    header = bytes(
-        (
-            len(payload),
-            SIGNED if sign else 0,
-            0,
-            sequence,
-            system,
-            component,
-            msgid & 0xFF,
-            msgid >> 8 & 0xFF,
-            msgid >> 16,
-        )
-    )
-    body = header + payload
+    header = bytes((len(payload), SIGNED if sign else 0, 0, sequence, system, component))
+    body = header + msgid.to_bytes(3, "little") + payload
     data = b"\xfd" + body + _crc(body + _CHECK_BYTE[msgid]).to_bytes(2, "little")
     return data + sign(data) if sign else data

@@ -14,8 +14,8 @@ not known yet may be behind our time by BEHIND. A stamp farther ahead of our tim
 our time comes from a trusted clock: a recording of a station whose clock once stood wrong would otherwise
 drag everybody along. Without such a clock, time is what genuine frames say.
 
-Kept on disk is a stamp LEAD ahead of all that was sent or accepted, written again before it is passed by
-BEHIND - LEAD.
+Kept on disk is a stamp LEAD ahead of all that was sent or accepted, and written again when only BEHIND is
+left of the lead; after a restart it is our time.
     DEPARTS FROM the guide: an unknown stream may be 50 s behind and not 60, so that nothing that was
     accepted before a restart is accepted once more after it.
 """
@@ -122,7 +122,7 @@ class Signing:
     @property
     def wants_storing(self) -> bool:
         """Whether the stamp on disk is soon passed by."""
-        return self._newest > self._kept - BEHIND
+        return self._newest >= self._kept - BEHIND
 
     def to_store(self) -> int:
         """The stamp to be put on disk now; it is taken for done."""
