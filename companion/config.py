@@ -60,6 +60,7 @@ class Inertial(Section, frozen=True):
 
     gyro_drift_deg_h: Positive = 0.01
     gyro_correlation_h: Positive = 5.0
+    angle_random_walk_deg_sqrt_h: NotNegative = 0.002
     accelerometer_bias_ug: Positive = 50.0
     accelerometer_correlation_h: Positive = 1.0
     position_m: Positive = 20.0
@@ -71,14 +72,16 @@ class Inertial(Section, frozen=True):
 
 
 class GnssSection(Section, frozen=True):
-    """How far GNSS is believed. The sigma is the greater of what the receiver states and this floor."""
+    """How far GNSS is believed. Its position error is a drift of `sigma_m` with `correlation_s`, estimated
+    beside the inertial errors, and white noise of a third of that, more where the receiver states more.
+    """
 
     receiver: Annotated[int, Meta(ge=0, le=1)] = (
         0  # GPS_RAW_INT is 0, GPS2_RAW 1; what we feed in is never one
     )
     sigma_m: Positive = 2.5
-    sigma_velocity_m_s: Positive = 0.2
-    correlation_s: NotNegative = 30.0  # of its noise: fixes closer together tell less than their number
+    sigma_velocity_m_s: Positive = 0.1
+    correlation_s: Positive = 100.0
     every_s: NotNegative = 1.0  # fixes closer together than this are heard but not used
     use_velocity: bool = True
     timeout_s: Positive = 3.0
@@ -99,6 +102,7 @@ class Predictor(Section, frozen=True):
     window_min: Annotated[float, Meta(gt=0.5, le=80.0)] = 25.0
     bin_s: Annotated[float, Meta(ge=0.1, le=60.0)] = 10.0
     learn_velocity: bool = False
+    disturbance_ug: NotNegative = 20.0  # r.m.s. of specific force that the Schuler channel does not know of
     ahead_min: tuple[Annotated[float, Meta(gt=0.0, le=120.0)], ...] = (1.0, 5.0, 10.0, 20.0)
     limit_m: Positive = 5000.0  # a guaranteed bound beyond this is no position any more
 

@@ -159,7 +159,7 @@ def command(file: Path | None, connect: tuple[str, ...], logs: str | None, pairs
     try:
         asyncio.run(run(config, tell))
     except CannotListen as error:
-        click.echo(f"companion: {error}", err=True)
+        click.echo(f"companion: {error.strerror}", err=True)
         sys.exit(EX_UNAVAILABLE)
     except LogError as error:
         click.echo(f"companion: {error}", err=True)

@@ -49,6 +49,7 @@ class Window:
     velocity: npt.NDArray[np.bool_] = field(default_factory=lambda: np.empty(0, np.bool_))
     value: Floats = field(default_factory=lambda: np.empty(0))  # [m] or [m/s], INS minus fix
     sigma: Floats = field(default_factory=lambda: np.empty(0))  # [m] or [m/s]
+    disturbance: float = 0.0  # [m/s^2] r.m.s. of specific force that (2.1) does not know of
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.span) and self.span > 0.0):
@@ -122,7 +123,7 @@ class Window:
     ) -> Self:
         for array in (t_ns, velocity, value, sigma):
             array.setflags(write=False)
-        return type(self)(self.span, self.capacity, t_ns, velocity, value, sigma)
+        return type(self)(self.span, self.capacity, t_ns, velocity, value, sigma, self.disturbance)
 
     def _thinned(self) -> Self:
         """Drop the fix that leaves the least hole between its neighbours of the same quantity."""
@@ -192,9 +193,11 @@ def predict_ahead(
         lost = dict.fromkeys(targets, Forecast(False))
         return [Prediction(int(t), False, "no fixes in the window", **lost) for t in t_ns]
     middle = (int(window.t_ns[0]) + int(window.t_ns[-1])) // 2
-    design, whitened = _design(window, middle, scale)
+    design, whitened = _design(window, middle, int(t_ns[0]), scale)
     predictions = []
     for t in t_ns:
+        if window.disturbance:
+            design, whitened = _design(window, middle, int(t), scale)
         carried = transition((int(t) - middle) * NANO * scale.rate)
         forecasts, reasons = {}, []
         for target in targets:
@@ -216,15 +219,35 @@ def predict_ahead(
     return predictions
 
 
-def _design(window: Window, middle: int, scale: Scale) -> tuple[Design, Floats]:
-    """Return the rows about the middle of the window, factored, and the measurements in sigmas."""
+def _design(window: Window, middle: int, t_ns: int, scale: Scale) -> tuple[Design, Floats]:
+    """Return the dimensionless rows about the middle of the window, factored, and the measurements in sigmas.
+
+    An unknown specific force between a fix and t_ns moves what the fix says of the state at t_ns. Its effect,
+    at most the disturbance times the integral of the channel's response, is one more error of that fix of
+    unknown correlation, and so adds to its sigma: an old fix counts for less, and the bound stays a bound.
+    """
     before = (middle - window.t_ns) * (NANO * scale.rate)
     position, _, velocity, _ = scale.units
     rows = np.empty((len(window), 4))
     rows[~window.velocity] = schuler_row("gamma", before[~window.velocity])
     rows[window.velocity] = schuler_row("mu", before[window.velocity])
-    sigmas = window.sigma / np.where(window.velocity, velocity, position)
-    return Design.of(rows, sigmas), window.value / window.sigma
+    sigma = window.sigma
+    if window.disturbance:
+        age = np.abs(t_ns - window.t_ns) * (NANO * scale.rate)
+        of_position = window.disturbance / scale.rate**2 * _swept(age, 0.0)
+        of_velocity = window.disturbance / scale.rate * _swept(age, 0.5 * math.pi)
+        sigma = sigma + np.where(window.velocity, of_velocity, of_position)
+    return Design.of(rows, sigma / np.where(window.velocity, velocity, position)), window.value / sigma
+
+
+def _swept(x: Floats, phase: float) -> Floats:
+    """Return the integral of |sin(u + phase)| from 0 to x."""
+
+    def to(y: Floats) -> Floats:
+        turns = np.floor(y / math.pi)
+        return 2.0 * turns + 1.0 - np.cos(y - math.pi * turns)
+
+    return to(x + phase) - to(np.full_like(x, phase))
 
 
 def _forecast(

@@ -27,7 +27,7 @@ class Settings(NamedTuple):
         """Everything derived once."""
         alarm = config.estimator.false_rejection
         gate = (0.0, *(float(chdtri(k, alarm)) for k in (1, 2, 3)))
-        return cls(config, errorstate.grade(config.inertial), gate)
+        return cls(config, errorstate.grade(config.inertial, config.gnss), gate)
 
 
 class Level(NamedTuple):

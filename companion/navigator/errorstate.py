@@ -3,10 +3,10 @@ fixes.
 
 The model is `nav.error_model.aircraft` with Markov gyro drift and accelerometer errors: position errors dx
 north and dy east (m), velocity errors (m/s), P minus the rotation of the platform (rad), E minus the gyro
-drift (rad/s), A the accelerometer errors (m/s^2). A fix enters by maximum likelihood with this state as one
-more observation: the position part of the posterior is the fusion's, and the rest follows it by regression.
-That is the Kalman update where the measurement is linear, and the iterated one where it is an azimuth or a
-range.
+drift (rad/s), A the accelerometer errors (m/s^2), and GN, GE the drift of GNSS (m), radio-navigation drift in
+the paper's words. A fix enters by maximum likelihood with this state as one more observation: the position
+part of the posterior is the fusion's, and the rest follows it by regression. That is the Kalman update where
+the measurement is linear, and the iterated one where it is an azimuth or a range.
 """
 
 from __future__ import annotations
@@ -17,22 +17,26 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from companion.config import Inertial
+from companion.config import GnssSection, Inertial
 from companion.nav.disturbances import Disturbance, accelerometer_slow, gyro_drift
 from companion.nav.error_model import aircraft
 from companion.records import Vector2, Vector3
 
 Floats = npt.NDArray[np.float64]
 
-N = 12
+N = 14
 POSITION = slice(0, 2)
 VELOCITY = slice(2, 4)
+TILT = slice(4, 7)
+#: What a radio fix, a beacon's or GNSS's, says of the state: INS minus fix, north and east (2, N).
+BEACON_ROWS = np.eye(2, N)
+GNSS_ROWS = BEACON_ROWS - np.eye(2, N, 12)
 G0 = 9.80665  # [m/s^2] of a bias quoted in micro-g
 STEP_S = 2.0  # the transition is a power series: its fifth term is below 1e-12 of the first here
 
 
 class ErrorState(NamedTuple):
-    """Mean x (12,) and covariance P (12, 12) of INS minus truth at `t_ns`."""
+    """Mean x (N,) and covariance P (N, N) of INS minus truth at `t_ns`."""
 
     t_ns: int
     x: Floats
@@ -40,15 +44,16 @@ class ErrorState(NamedTuple):
 
 
 class Grade(NamedTuple):
-    """The disturbances of the unit and the spectral density of its velocity noise (m/s)^2/s."""
+    """Disturbances of the unit and of GNSS, white spectral densities (N,), first sigmas (N,).
+    """
 
     disturbances: tuple[Disturbance, ...]
-    velocity_density: float
+    density: Floats
     sigma0: Floats
 
 
-def grade(settings: Inertial) -> Grade:
-    """What the configuration says of the unit, in SI."""
+def grade(settings: Inertial, gnss: GnssSection) -> Grade:
+    """What the configuration says of the unit and of GNSS, in SI."""
     drift = math.radians(settings.gyro_drift_deg_h) / 3600.0
     bias = settings.accelerometer_bias_ug * 1e-6 * G0
     tilt = math.radians(settings.tilt_arcsec / 3600.0)
@@ -56,15 +61,14 @@ def grade(settings: Inertial) -> Grade:
     disturbances = (
         gyro_drift(1.0 / (3600.0 * settings.gyro_correlation_h), drift),
         accelerometer_slow(1.0 / (3600.0 * settings.accelerometer_correlation_h), bias),
+        Disturbance(("GN", "GE"), 1.0 / gnss.correlation_s, gnss.sigma_m),
     )
-    sigma0 = (
-        [settings.position_m] * 2
-        + [settings.velocity_m_s] * 2
-        + [tilt, tilt, heading]
-        + [drift] * 3
-        + [bias] * 2
-    )
-    return Grade(disturbances, settings.velocity_noise_m_s_sqrt_s**2, np.array(sigma0))
+    density = np.zeros(N)
+    density[VELOCITY] = settings.velocity_noise_m_s_sqrt_s**2
+    density[TILT] = (math.radians(settings.angle_random_walk_deg_sqrt_h) / 60.0) ** 2
+    sigma0 = [settings.position_m] * 2 + [settings.velocity_m_s] * 2 + [tilt, tilt, heading]
+    sigma0 += [drift] * 3 + [bias] * 2 + [gnss.sigma_m] * 2
+    return Grade(disturbances, density, np.array(sigma0))
 
 
 def start(t_ns: int, unit: Grade) -> ErrorState:
@@ -79,31 +83,30 @@ def predict(state: ErrorState, t_ns: int, lat: float, v_n: Vector3, a_n: Vector2
         return state
     x, P = state.x, state.P
     model = aircraft(lat, v_n[0], v_n[1], (*a_n, 0.0), added=unit.disturbances)
-    model.Q[VELOCITY, VELOCITY] += unit.velocity_density * np.eye(2)
+    density = model.Q + np.diag(unit.density)
     steps = math.ceil(left / STEP_S)
     dt = left / steps
     M = model.A * dt
     M2 = M @ M
     Phi = np.eye(N) + M + M2 / 2.0 + (M2 @ M) / 6.0 + (M2 @ M2) / 24.0
     # trapezoid of the process noise: second order in dt, which is short against every mode
-    Q = 0.5 * dt * (model.Q + Phi @ model.Q @ Phi.T)
+    Q = 0.5 * dt * (density + Phi @ density @ Phi.T)
     for _ in range(steps):
         x = Phi @ x
         P = Phi @ P @ Phi.T + Q
     return ErrorState(t_ns, x, 0.5 * (P + P.T))
 
 
-def absorb_position(state: ErrorState, mean: Floats, covariance: Floats) -> ErrorState:
-    """The state once fusion has turned its position part into `mean` (2,) and `covariance` (2, 2), m north,
-    east.
+def absorb_position(state: ErrorState, H: Floats, mean: Floats, covariance: Floats) -> ErrorState:
+    """The state once fusion has turned H x (2,) into `mean` (2,) with `covariance` (2, 2), m north, east.
 
-    K = P_.p P_pp^-1 carries the change of position to every other state; with nothing learnt it changes
-    nothing.
+    K = P H' (H P H')^-1 carries the change to every state; with nothing learnt it changes nothing.
     """
-    P_pp = state.P[POSITION, POSITION]
-    K = np.linalg.solve(P_pp, state.P[POSITION, :]).T
-    x = state.x + K @ (mean - state.x[POSITION])
-    P = state.P - K @ (P_pp - covariance) @ K.T
+    HP = H @ state.P
+    S = HP @ H.T
+    K = np.linalg.solve(S, HP).T
+    x = state.x + K @ (mean - H @ state.x)
+    P = state.P - K @ (S - covariance) @ K.T
     return ErrorState(state.t_ns, x, 0.5 * (P + P.T))
 
 

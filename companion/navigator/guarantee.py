@@ -20,6 +20,7 @@ from companion.estimate.predictor import Forecast, Quantity, Window, predict, pr
 from companion.estimate.predictor import Prediction as Channel
 from companion.records import Prediction, Vector2
 
+G0 = 9.80665  # [m/s^2] of micro-g
 REFRESH_NS = 1_000_000_000
 HOPELESS_M = 1e6  # a bound beyond this is as good as none: the window is too short for so far ahead
 UNLIKE = 2.0  # a fix this many times better or worse than its bin begins a new one
@@ -57,7 +58,7 @@ class Guarantee(NamedTuple):
 
 def begin(settings: Predictor) -> Guarantee:
     """Nothing learnt yet."""
-    window = Window(span=60.0 * settings.window_min)
+    window = Window(span=60.0 * settings.window_min, disturbance=settings.disturbance_ug * 1e-6 * G0)
     return Guarantee(window, window)
 
 

@@ -31,9 +31,12 @@ class Heard(NamedTuple):
     sources: Source
 
 
-def from_gnss(record: Gnss, ins: Point, settings: GnssSection, inflate: float = 1.0) -> Heard:
-    """A GNSS fix as a horizontal position in the plane at the INS; `inflate` multiplies its variance."""
-    sigma = math.sqrt(inflate) * max(record.sigma_horizontal or 0.0, settings.sigma_m)
+def from_gnss(record: Gnss, ins: Point, settings: GnssSection, drifting: bool = False) -> Heard:
+    """A GNSS fix as a horizontal position at the INS; if `drifting`, with its white noise alone.
+    """
+    sigma = max(record.sigma_horizontal or 0.0, settings.sigma_m)
+    if drifting:
+        sigma = max(math.sqrt(sigma**2 - settings.sigma_m**2), settings.sigma_m / 3.0)
     north, east, _ = separation(Geodetic(record.lat, record.lon, record.alt_msl), ins.position)
     place = Position(np.array([east, north]), sigma**2 * np.eye(2))
     return Heard(record.t_ns, (place,), Source.GNSS)

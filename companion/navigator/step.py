@@ -36,7 +36,7 @@ from companion.records import (
 
 from . import errorstate, guarantee, inertial, radio
 from .carry import Carry, Level, Settings, Step, initial, level, sources, state_at
-from .errorstate import ErrorState
+from .errorstate import ErrorState, Floats
 from .inertial import Point
 from .solution import solve
 
@@ -112,16 +112,15 @@ def _gnss(carry: Carry, record: Gnss, settings: Settings) -> Step:
     since = math.inf if carry.gnss_ns is None else (record.t_ns - carry.gnss_ns) * 1e-9
     if record.fix < LEVEL_3D or ins is None or since < config.every_s:
         return carry, []
-    heard = radio.from_gnss(record, ins, config)
-    # noise correlated over tau tells, per fix, dt / (2 tau) of what white noise would
-    inflate = max(1.0, 2.0 * config.correlation_s / since)
-    carry, out = _absorb(carry, heard, radio.from_gnss(record, ins, config, inflate), ins, record, settings)
+    white = radio.from_gnss(record, ins, config, drifting=True)
+    carry, out = _absorb(carry, white, errorstate.GNSS_ROWS, ins, record, settings)
     if out:
         return carry, out
-    learnt = _levelled(carry.level, record, ins, inflate)
+    heard = radio.from_gnss(record, ins, config)
+    learnt = _levelled(carry.level, record, ins, min(since, config.correlation_s) / config.correlation_s)
     carry = carry._replace(gnss_ns=record.t_ns, gnss_heard=heard, level=learnt)
     if config.use_velocity and record.v_n is not None:
-        carry = _absorb_velocity(carry, record, record.v_n, ins, inflate, settings)
+        carry = _absorb_velocity(carry, record, record.v_n, ins, settings)
     return _learn(carry, heard, ins, record, settings)
 
 
@@ -134,7 +133,7 @@ def _rsbn(carry: Carry, record: RsbnFix, settings: Settings) -> Step:
     heard = radio.from_rsbn(record, ins, settings.config.rsbn)
     if not heard.observations:
         return carry, []
-    carry, out = _absorb(carry, heard, heard, ins, record, settings)
+    carry, out = _absorb(carry, heard, errorstate.BEACON_ROWS, ins, record, settings)
     if out:
         return carry, out
     carry = carry._replace(rsbn_ns=record.t_ns)
@@ -151,26 +150,25 @@ def _rsbn(carry: Carry, record: RsbnFix, settings: Settings) -> Step:
 
 
 def _absorb(
-    carry: Carry, raw: radio.Heard, used: radio.Heard, ins: Point, record: Gnss | RsbnFix, settings: Settings
+    carry: Carry, heard: radio.Heard, H: Floats, ins: Point, record: Gnss | RsbnFix, settings: Settings
 ) -> Step:
-    """The error state with what was heard, if it can be believed: gated as `raw`, weighed as `used`.
+    """The error state with what was heard of H x, if it can be believed; an output means it was not.
 
-    An output means it was not believed. The first fix is, and while predicting one within the guaranteed
-    bound is, whatever the Gaussian state claims: then it is the claim that was wrong, and it is widened.
+    The first fix is believed, and while predicting one within the guaranteed bound is, whatever the Gaussian
+    state claims: then it is the claim that was wrong, and it is widened.
     """
     state = state_at(carry, ins, settings)
-    found = radio.innovation(raw, _prior(state, settings))
-    limit = settings.gate[radio.freedom(raw)]
+    found = radio.innovation(heard, _prior(state, H, settings))
+    limit = settings.gate[radio.freedom(heard)]
     if found.cost > limit:
-        if carry.state is not None and not _within_bound(carry, raw, settings):
+        if carry.state is not None and not _within_bound(carry, heard, settings):
             carry = carry._replace(state=state)
             return carry, [_rejected(record, "innovation beyond its gate (chi-square)", found.cost, limit)]
         state = errorstate.widen(state, found.cost / limit)
-    if used is not raw or found.cost > limit:
-        found = radio.innovation(used, _prior(state, settings))
+        found = radio.innovation(heard, _prior(state, H, settings))
     mean = -found.position[1::-1]  # the place in the plane is minus the error; x east, y north
     covariance = found.covariance[1::-1, 1::-1]
-    return carry._replace(state=errorstate.absorb_position(state, mean, covariance)), []
+    return carry._replace(state=errorstate.absorb_position(state, H, mean, covariance)), []
 
 
 def _within_bound(carry: Carry, heard: radio.Heard, settings: Settings) -> bool:
@@ -188,14 +186,12 @@ def _within_bound(carry: Carry, heard: radio.Heard, settings: Settings) -> bool:
     return radio.innovation(heard, wide).cost <= BOUND_GATE**2
 
 
-def _absorb_velocity(
-    carry: Carry, record: Gnss, v_n: Vector3, ins: Point, inflate: float, settings: Settings
-) -> Carry:
+def _absorb_velocity(carry: Carry, record: Gnss, v_n: Vector3, ins: Point, settings: Settings) -> Carry:
     assert carry.state is not None
     config = settings.config.gnss
     sigma = max(record.sigma_velocity or 0.0, config.sigma_velocity_m_s)
     error = (ins.v_n[0] - v_n[0], ins.v_n[1] - v_n[1])
-    state, nis = errorstate.absorb_velocity(carry.state, np.array(error), sigma * math.sqrt(inflate))
+    state, nis = errorstate.absorb_velocity(carry.state, np.array(error), sigma)
     if nis > settings.gate[2]:
         return carry
     g = carry.guarantee
@@ -204,10 +200,13 @@ def _absorb_velocity(
     return carry._replace(state=state, guarantee=g)
 
 
-def _levelled(old: Level, record: Gnss, ins: Point, inflate: float) -> Level:
-    """The height error against GNSS, followed as a random walk of 5 cm a root second (a barometer drifts)."""
-    r = inflate * max(record.sigma_vertical or 0.0, 5.0) ** 2
-    p = old.variance + 0.0025 * (inflate if math.isfinite(inflate) else 1.0)
+def _levelled(old: Level, record: Gnss, ins: Point, part: float) -> Level:
+    """The height error against GNSS, followed as a random walk of 5 cm a root second (a barometer drifts).
+
+    `part` is the share of one independent fix that this one is worth, its noise being correlated.
+    """
+    r = max(record.sigma_vertical or 0.0, 5.0) ** 2 / part
+    p = old.variance + 0.0025
     k = p / (p + r)
     return Level(old.error + k * (ins.position.alt - record.alt_msl - old.error), (1.0 - k) * p)
 
@@ -243,12 +242,13 @@ def _learn(carry: Carry, heard: radio.Heard, ins: Point, record: Gnss | RsbnFix,
     return carry._replace(guarantee=g), [out]
 
 
-def _prior(state: ErrorState, settings: Settings) -> Position:
+def _prior(state: ErrorState, H: Floats, settings: Settings) -> Position:
     """Where the error state has the aircraft, as an observation in the plane at the INS."""
     covariance = np.zeros((3, 3))
-    covariance[:2, :2] = state.P[1::-1, 1::-1]
+    covariance[:2, :2] = (H @ state.P @ H.T)[::-1, ::-1]
     covariance[2, 2] = settings.config.inertial.height_sigma_m**2
-    return Position(np.array([-state.x[1], -state.x[0], 0.0]), covariance)
+    north, east = (H @ state.x).tolist()
+    return Position(np.array([-east, -north, 0.0]), covariance)
 
 
 def _rejected(record: Gnss | RsbnFix, reason: str, value: float, limit: float) -> Rejection:
