@@ -6,7 +6,7 @@ from click.testing import CliRunner
 
 from companion.study.restrictive import TRUTHS, command
 
-COLUMNS = "dx dy dVN dVE PX PY PZ VcX VcY GX GY AX".split()
+COLUMNS = ["dx", "dy", "dVN", "dVE", "PX", "PY", "PZ", "VcX", "VcY", "GX", "GY", "AX"]
 # rms error of the minimax filter over that of R1, found by an independent program over 200 runs
 RATIOS = {
     "constant": [0.59, 0.58, 1.79, 1.51, 1.21, 1.09, 0.58, 1.73, 1.49, 0.64, 0.69, 1.00],
