@@ -46,7 +46,7 @@ def information(M: Array, kappa: float = np.inf) -> Array:
     scale = np.sqrt(size + (size <= 0.0))
     rho = M / (scale[..., :, None] * scale[..., None, :]) + unseen
     if (np.abs(rho).sum(-1) < 2.0 - BLIND).all():  # Gershgorin: no eigenvalue can be small
-        return unseen
+        return np.asarray(unseen)
     blind = np.linalg.eigvalsh(rho)[..., :1, None] < BLIND
     weight: Array = np.where(blind, identity, unseen)
     return weight
