@@ -1,0 +1,210 @@
+import time
+from collections import Counter, defaultdict
+
+import numpy as np
+import pytest
+
+from companion.link import dialect, frame
+from sitl.autopilot import NEVER, RSBN_COMPONENT, SECOND, Autopilot
+from sitl.faults import Fault
+from sitl.scenarios import named
+from sitl.world import World
+
+START = 1_000 * SECOND
+WORLD = World(named("short"))
+
+
+def autopilot(**changes):
+    scenario = named("short", **changes)
+    shared = WORLD if not changes else None
+    return Autopilot(scenario, START, shared)
+
+
+def say(pilot, name, now=START, **values):
+    pilot.receive(frame.encode(dialect.new(name, **values), 0, 1, 191), now)
+
+
+def ask(pilot, name, rate_hz, now=START):
+    msgid = dialect.type_named(name).msgid
+    interval = 1e6 / rate_hz if rate_hz else -1
+    say(pilot, "COMMAND_LONG", now, target_system=1, command=511, param1=msgid, param2=interval)
+
+
+def listen(pilot, until_s=float("inf")):
+    """[(time, frame)] of all that comes up to a flight time."""
+    heard, reader = [], frame.Reader()
+    while (due := pilot.deadline()) != NEVER and due <= START + until_s * 1e9:
+        for data in pilot.poll(due):
+            heard += [(due, found) for found in reader.receive(data) if isinstance(found, frame.Frame)]
+    return heard
+
+
+def by_name(heard):
+    grouped = defaultdict(list)
+    for due, found in heard:
+        grouped[dialect.TYPES[found.msgid].name].append((due, dialect.decode(found)))
+    return grouped
+
+
+def test_without_requests_each_message_comes_once_a_second():
+    grouped = by_name(listen(autopilot(), 60.0))
+    for name in (
+        "HEARTBEAT",
+        "RAW_IMU",
+        "LOCAL_POSITION_NED",
+        "GPS_RAW_INT",
+        "ATTITUDE",
+        "VFR_HUD",
+        "SYSTEM_TIME",
+    ):
+        assert len(grouped[name]) == 60, name
+    assert "SIM_STATE" not in grouped
+    assert grouped["GPS_GLOBAL_ORIGIN"] and grouped["HOME_POSITION"]
+    assert grouped["HEARTBEAT"][0][1].get_type() == "HEARTBEAT"
+
+
+def test_intervals_are_obeyed_and_acknowledged():
+    pilot = autopilot()
+    for name, rate in (("RAW_IMU", 50), ("LOCAL_POSITION_NED", 10), ("SIM_STATE", 4), ("VFR_HUD", 0)):
+        ask(pilot, name, rate)
+    say(pilot, "COMMAND_LONG", target_system=1, command=511, param1=9999, param2=1e5)
+    grouped = by_name(listen(pilot, 20.0))
+    assert len(grouped["RAW_IMU"]) == pytest.approx(1000, abs=2)
+    assert len(grouped["LOCAL_POSITION_NED"]) == pytest.approx(200, abs=2)
+    assert len(grouped["SIM_STATE"]) == pytest.approx(80, abs=2)
+    assert not grouped["VFR_HUD"]
+    assert [ack.result for _, ack in grouped["COMMAND_ACK"]] == [0, 0, 0, 0, 3]
+
+
+def test_a_fix_is_repeated_when_the_stream_is_faster_than_the_receiver():
+    pilot = autopilot()
+    ask(pilot, "GPS_RAW_INT", 20)
+    stamps = Counter(m.time_usec for _, m in by_name(listen(pilot, 30.0))["GPS_RAW_INT"])
+    counts = list(stamps.values())[2:-2]
+    assert set(counts) == {4}
+
+
+def test_loss_of_gnss_is_told_within_a_second_and_by_the_filter_ten_later():
+    pilot = autopilot()
+    ask(pilot, "GPS_RAW_INT", 5)
+    grouped = by_name(listen(pilot, 240.0))
+    lost = next(due for due, m in grouped["GPS_RAW_INT"] if m.fix_type == 1)
+    assert 0.0 <= (lost - START) * 1e-9 - 180.0 < 1.0
+    alone = next(due for due, m in grouped["EKF_STATUS_REPORT"] if m.flags == 303)
+    assert 9.0 < (alone - START) * 1e-9 - 180.0 < 12.0
+
+
+def test_timesync_gives_the_time_since_boot():
+    pilot = autopilot()
+    now = START + 10 * SECOND
+    listen(pilot, 10.0)
+    say(pilot, "TIMESYNC", now, ts1=now)
+    (arrival, answer), *_ = by_name(listen(pilot, 11.0))["TIMESYNC"]
+    assert answer.ts1 == now
+    boot_offset = (arrival + now) // 2 - answer.tc1
+    assert boot_offset == pytest.approx(START - 37.25 * SECOND, abs=20e6)
+
+
+def test_stamps_are_boot_time_and_no_frame_comes_before_its_time():
+    pilot = autopilot()
+    ask(pilot, "ATTITUDE", 10)
+    for due, m in by_name(listen(pilot, 30.0))["ATTITUDE"]:
+        delay = (due - START) * 1e-9 - (m.time_boot_ms * 1e-3 - 37.25)
+        assert 0.0 < delay < 0.1
+
+
+def test_the_receiver_speaks_for_itself_and_once():
+    heard = [f for _, f in listen(autopilot(), 60.0) if dialect.TYPES[f.msgid].name == "RSBN_MEASUREMENT"]
+    assert {f.component for f in heard} == {RSBN_COMPONENT}
+    stamps = [dialect.decode(f).time_usec for f in heard]
+    assert len(set(stamps)) == len(stamps) == pytest.approx(60, abs=4)
+
+
+def test_no_sequence_number_is_missing_and_nothing_comes_out_of_order():
+    heard = listen(autopilot(), 120.0)
+    last = {}
+    for _, f in heard:
+        if f.component in last:
+            assert f.sequence == last[f.component] + 1 & 0xFF
+        last[f.component] = f.sequence
+    assert [due for due, _ in heard] == sorted(due for due, _ in heard)
+
+
+def test_a_single_message_is_given_on_request():
+    pilot = autopilot()
+    listen(pilot, 2.0)
+    say(pilot, "COMMAND_LONG", START + 2 * SECOND, target_system=1, command=512, param1=49)
+    grouped = by_name(listen(pilot, 2.5))
+    assert len(grouped["GPS_GLOBAL_ORIGIN"]) == 1
+    assert grouped["COMMAND_ACK"][0][1].result == 0
+    assert grouped["GPS_GLOBAL_ORIGIN"][0][1].latitude == 600000000
+
+
+def test_what_the_companion_says_is_kept():
+    pilot = autopilot()
+    say(pilot, "ODOMETRY", START + 5, frame_id=20, child_frame_id=12, x=1.0)
+    say(pilot, "NAVIGATION_STATUS", START + 6)
+    say(pilot, "HEARTBEAT", START + 7)
+    say(pilot, "COMMAND_LONG", START + 8, command=43003, target_system=1)
+    assert [(at, m.get_type()) for at, m in pilot.outputs] == [
+        (START + 5, "ODOMETRY"),
+        (START + 6, "NAVIGATION_STATUS"),
+    ]
+
+
+def test_same_seed_same_bytes_however_it_is_polled():
+    def flown(step_ns):
+        pilot, out, now = autopilot(seed=3), [], START
+        while now <= START + 30 * SECOND:
+            out += pilot.poll(now)
+            now += step_ns
+        return b"".join(out)
+
+    assert flown(SECOND // 100) == flown(SECOND)
+
+
+def test_a_reboot_silences_it_and_begins_anew():
+    pilot = autopilot(faults=(Fault("reboot", 60.0, size=8.0),))
+    ask(pilot, "LOCAL_POSITION_NED", 10)
+    heard = by_name(listen(pilot, 90.0))["LOCAL_POSITION_NED"]
+    arrivals = np.array([due - START for due, _ in heard]) * 1e-9
+    gap = np.argmax(np.diff(arrivals))
+    assert np.diff(arrivals)[gap] == pytest.approx(8.0, abs=1.1)
+    assert heard[gap + 1][1].time_boot_ms < 10_000 < heard[gap][1].time_boot_ms
+    assert np.median(np.diff(arrivals[gap + 1 :])) == pytest.approx(1.0, abs=0.05)
+
+
+def test_the_clock_leaps_by_an_hour_there_and_back():
+    pilot = autopilot(faults=(Fault("clock-jump", 60.0, 90.0),))
+    heard = by_name(listen(pilot, 120.0))["ATTITUDE"]
+    offsets = {round((due - START) * 1e-9 - m.time_boot_ms * 1e-3) for due, m in heard}
+    assert offsets == {-37, -3637}
+
+
+def test_a_lost_link_is_lost_both_ways():
+    pilot = autopilot(faults=(Fault("link-loss", 30.0, 40.0),))
+    ask(pilot, "ATTITUDE", 10, START + 35 * SECOND)
+    assert pilot.rates_hz()["ATTITUDE"] == 1.0
+    arrivals = np.array([due - START for due, _ in listen(pilot, 60.0)]) * 1e-9
+    assert not np.any((arrivals > 30.1) & (arrivals < 40.0))
+
+
+def test_px4_speaks_its_own_messages():
+    pilot = autopilot(autopilot="px4")
+    ask(pilot, "HIL_STATE_QUATERNION", 5)
+    grouped = by_name(listen(pilot, 10.0))
+    assert grouped["HIGHRES_IMU"] and grouped["ESTIMATOR_STATUS"] and grouped["HIL_STATE_QUATERNION"]
+    assert {m.time_usec for _, m in grouped["GPS_RAW_INT"]} == {0}
+    assert "RAW_IMU" not in grouped
+
+
+def test_a_whole_flight_is_emitted_in_seconds():
+    begun = time.process_time()
+    pilot = Autopilot(named("default"), START)
+    for name, rate in (("RAW_IMU", 50), ("LOCAL_POSITION_NED", 10), ("GPS_RAW_INT", 5), ("ATTITUDE", 10)):
+        ask(pilot, name, rate)
+    count = 0
+    while (due := pilot.deadline()) != NEVER:
+        count += len(pilot.poll(due))
+    assert time.process_time() - begun < 8.0
+    assert count > 180_000

@@ -1,0 +1,121 @@
+import time
+
+import numpy as np
+import pytest
+
+from companion.nav import earth
+from companion.nav.geometry import Geodetic, separation
+from companion.nav.strapdown import Inertial, mechanise
+from sitl.flight import CLIMB_RATE, Leg, Plan, Wind, fly, gravity, radii, rotation, step
+from sitl.scenarios import named
+
+PLAN = Plan(
+    (
+        Leg(5, 40, 0, 0),
+        Leg(40, 40, 38, 0),
+        Leg(80, 120, 36, 100),
+        Leg(80, 350, 40, 60),
+    ),
+    winds=(Wind(0, 4, 5), Wind(120, -3, 8)),
+)
+
+
+@pytest.fixture(scope="module")
+def flight():
+    return fly(PLAN)
+
+
+def test_imu_integrates_back_to_the_flight(flight):
+    # The strapdown takes means over a step: those of a smooth signal are its values half way, by Simpson.
+    state = Inertial(
+        flight.lat[0], flight.lon[0], flight.alt[0], flight.v_n[0], rotation(flight.attitude[:1])[0]
+    )
+    for k in range(0, len(flight.t) - 2, 2):
+        f_b = (flight.f_b[k] + 4.0 * flight.f_b[k + 1] + flight.f_b[k + 2]) / 6.0
+        w_b = (flight.w_b[k] + 4.0 * flight.w_b[k + 1] + flight.w_b[k + 2]) / 6.0
+        state = mechanise(state, f_b, w_b, 0.04)
+    end = len(flight.t) - 1 - (len(flight.t) - 1) % 2
+    true = Geodetic(flight.lat[end], flight.lon[end], flight.alt[end])
+    away = separation(Geodetic(state.lat, state.lon, state.alt), true)
+    assert np.linalg.norm(away) < 0.3  # m after 205 s of turns and climbs
+    assert np.abs(state.v_n - flight.v_n[end]).max() < 5e-3
+    assert np.abs(state.C_nb - rotation(flight.attitude[end : end + 1])[0]).max() < 1e-5
+
+
+def test_turns_are_coordinated(flight):
+    assert np.abs(flight.f_b[:, 1]).max() < 1e-9
+    # And the bank is that of the textbook in still air: tan(roll) = V psi'/g.
+    still = fly(Plan((Leg(5, 0, 0, 0), Leg(40, 0, 38, 0), Leg(80, 120, 38, 0))))
+    turn_rate = np.gradient(still.attitude[:, 2], 0.02)
+    middle = (still.t > 60.0) & (still.t < 80.0)
+    bank = np.arctan(38.0 * turn_rate[middle] / 9.82)
+    assert still.attitude[middle, 0] == pytest.approx(bank, abs=1e-3)
+    assert 10.0 < np.degrees(still.attitude[:, 0].max()) < 20.0
+
+
+def test_wind_is_the_difference_of_ground_and_air_velocity(flight):
+    forward = rotation(flight.attitude)[:, :, 0]
+    aloft = flight.t > 70.0
+    air_n = flight.v_n - flight.wind_n
+    assert air_n[aloft] == pytest.approx((flight.airspeed[:, None] * forward)[aloft], abs=1e-9)
+
+
+def test_position_is_the_integral_of_velocity(flight):
+    R_N, R_E = radii(flight.lat)
+    north = np.gradient(flight.lat, 0.02) * (R_N + flight.alt)
+    east = np.gradient(flight.lon, 0.02) * (R_E + flight.alt) * np.cos(flight.lat)
+    assert np.stack([north, east], axis=1)[1:-1] == pytest.approx(flight.v_n[1:-1, :2], abs=1e-3)
+    assert np.gradient(flight.alt, 0.02)[1:-1] == pytest.approx(-flight.v_n[1:-1, 2], abs=1e-3)
+    assert np.abs(flight.v_n[:, 2]).max() <= CLIMB_RATE + 1e-6
+
+
+def test_between_samples_the_flight_is_straight_and_headings_wrap(flight):
+    t = np.array([0.0, 61.237, 100.011, 205.0])
+    at = flight.at(t)
+    assert at.lat == pytest.approx(np.interp(t, flight.t, flight.lat), abs=1e-15)
+    assert np.all((at.attitude[:, 2] >= 0.0) & (at.attitude[:, 2] < 2 * np.pi))
+    exact = flight.at(flight.t[[0, 17, -1]])
+    assert exact.attitude == pytest.approx(flight.attitude[[0, 17, -1]], abs=1e-12)
+
+
+def test_earth_on_arrays_is_the_earth():
+    lats, alts = np.radians([0.0, 30.0, 59.3, -75.0]), np.array([0.0, 100.0, 1200.0, 9000.0])
+    assert gravity(lats, alts) == pytest.approx([earth.gravity(*p) for p in zip(lats, alts)], rel=1e-14)
+    assert np.stack(radii(lats), axis=1) == pytest.approx(
+        np.array([tuple(earth.radii(lat)) for lat in lats]), rel=1e-14
+    )
+
+
+def test_step_is_smooth_and_monotone():
+    y = step(np.linspace(-1.0, 3.0, 401), 0.0, 2.0)
+    assert (y[0], y[-1]) == (0.0, 1.0)
+    assert np.all(np.diff(y) >= 0.0)
+    assert np.diff(y).max() * 100.0 == pytest.approx(2.1875 / 2.0, rel=1e-3)
+
+
+def test_the_default_flight_is_long_fast_far_and_cheap():
+    start = time.process_time()
+    flight = fly(named("default").plan)
+    assert time.process_time() - start < 1.0
+    assert flight.t[-1] >= 40 * 60
+    cruise = flight.airspeed[flight.t > 120.0]
+    assert cruise.min() >= 30.0 and cruise.max() <= 45.0
+    origin = Geodetic(flight.lat[0], flight.lon[0], 0.0)
+    away = [
+        np.linalg.norm(separation(Geodetic(a, b, 0.0), origin))
+        for a, b in zip(flight.lat[::500], flight.lon[::500])
+    ]
+    assert 60e3 < max(away) < 100e3
+
+
+@pytest.mark.parametrize(
+    ("legs", "says"),
+    [
+        ((), "no legs"),
+        ((Leg(0, 0, 30, 0),), "duration"),
+        ((Leg(10, 0, 0, 0), Leg(10, 180, 0, 0)), "too short"),
+    ],
+)
+def test_impossible_plans_are_refused(legs, says):
+    with pytest.raises(ValueError, match=says):
+        fly(Plan(legs))
