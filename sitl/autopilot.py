@@ -218,13 +218,16 @@ class Autopilot:
 
     def _transmit(self, frames: list[bytes], t: int) -> None:
         """Put frames sent at `t` on the link; it keeps their order unless a fault says otherwise."""
-        due = self._released = max(self._released, t + self._start_ns + self._latency())
+        due = t + self._start_ns + self._latency()
         chunks = [Chunk(due, data) for data in frames]
         if self._link_faults:
             chunks = disturb(chunks, t, self._link_faults, self._rng)
-        for chunk in chunks:
+        shuffled = any(f.name == "reordering" and f.covers(t) for f in self._link_faults)
+        for due, data in chunks:
+            if not shuffled:
+                self._released = due = max(self._released, due)
             self._order += 1
-            heapq.heappush(self._outbox, (chunk.due_ns, self._order, chunk.data))
+            heapq.heappush(self._outbox, (due, self._order, data))
 
     def _undergo(self, fault: Fault) -> None:
         """A fault of the autopilot itself begins (or, for a clock that leaps back, ends)."""

@@ -243,7 +243,7 @@ def reordering(chunks: Sequence[Chunk], size: float, rng: Generator) -> list[Chu
 
 
 def link_late(chunks: Sequence[Chunk], size: float, rng: Generator) -> list[Chunk]:
-    """Everything comes `size` seconds late."""
+    """Everything comes `size` seconds late; what is sent after the window waits its turn behind it."""
     return [Chunk(due + round(size * 1e9), data) for due, data in chunks]
 
 

@@ -189,6 +189,22 @@ def test_a_lost_link_is_lost_both_ways():
     assert not np.any((arrivals > 30.1) & (arrivals < 40.0))
 
 
+def test_a_late_link_keeps_its_order_and_a_shuffling_one_does_not():
+    def stamps(name):
+        pilot = autopilot(faults=(Fault(name, 30.0, 40.0),))
+        ask(pilot, "ATTITUDE", 10)
+        heard = by_name(listen(pilot, 60.0))["ATTITUDE"]
+        late = max((due - START) * 1e-9 - (m.time_boot_ms * 1e-3 - 37.25) for due, m in heard)
+        return [m.time_boot_ms for _, m in heard], late
+
+    in_order, late = stamps("link-late")
+    assert in_order == sorted(in_order)
+    assert 5.0 < late < 5.1
+    shuffled, late = stamps("reordering")
+    assert shuffled != sorted(shuffled)
+    assert late < 0.3
+
+
 def test_px4_speaks_its_own_messages():
     pilot = autopilot(autopilot="px4")
     ask(pilot, "HIL_STATE_QUATERNION", 5)
