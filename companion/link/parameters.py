@@ -9,9 +9,9 @@ value that stands, and PARAM_ERROR. What is set is kept: `save` gets the text of
 the operator's own, and where it fails nothing is changed.
 
 Every parameter is a REAL32 on the wire. Ground stations disagree how an integer stands in param_value (as
-PX4's bytes or ArduPilot's cast): MAVProxy and MAVSDK go by the kind of the vehicle's autopilot, QGroundControl
-by the component, and we fly under either autopilot. A REAL32 is the same in both and holds integers up to
-2^24 exactly; greater ones cannot be set.
+PX4's bytes or as ArduPilot's cast): MAVProxy and MAVSDK go by the kind of the vehicle's autopilot,
+QGroundControl by the component, and we fly under either autopilot. A REAL32 is the same in both and holds
+integers up to 2^24 exactly; greater ones cannot be set.
 """
 
 from __future__ import annotations

@@ -76,24 +76,25 @@ class Signing:
         self._key = hashlib.sha256(key)
         self._refuse_unsigned = refuse_unsigned
         self._always_accepted = frozenset(always_accepted)
+        self._begun = timestamp
         self._newest = timestamp  # of all that was sent, accepted or stored
         self._kept = timestamp  # what is on disk
         self._clock: int | None = None  # trusted time less our instant
         self._streams: dict[tuple[int, int, int], int] = {}
 
     def follow(self, unix_ns: int, now_ns: int) -> None:
-        """Take the time of a trusted clock. Stamps never go back: where ours are ahead they wait for it."""
+        """Take the time of a trusted clock. Our stamps never go back; where they are ahead they wait."""
         self._clock = (unix_ns - EPOCH_NS - now_ns) // TICK_NS
 
     def time(self, now_ns: int) -> int:
-        """Our time as a stamp: the trusted clock's, or the newest stamp where that is later."""
+        """Our time as a stamp: the trusted clock's, not before what was stored; else the newest stamp."""
         if self._clock is None:
             return self._newest
-        return max(self._newest, min(self._clock + now_ns // TICK_NS, FARTHEST))
+        return max(self._begun, min(self._clock + now_ns // TICK_NS, FARTHEST))
 
     def sign(self, data: bytes, link_id: int, now_ns: int) -> bytes:
         """The 13 bytes that follow `data`, a whole frame up to its checksum with the flag SIGNED set."""
-        self._newest = max(self.time(now_ns), self._newest + 1)
+        self._newest = max(self._newest + 1, self.time(now_ns))
         head = bytes([link_id]) + self._newest.to_bytes(6, "little")
         return head + self._hash(data + head)
 
