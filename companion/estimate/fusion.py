@@ -71,6 +71,7 @@ _OBSERVABLE = 1e-12  # least ratio of the information's eigenvalues: standard de
 _DAMPING = 1e-14  # least mu, in traces of F: keeps a step finite along a direction that nothing measures
 _STEPS = 100
 _CONVERGED = 1e-8  # a step this long, in standard deviations, is the last
+_LEVEL = 1e-11  # a rise of the cost by less, relative to 1 + cost, is rounding
 _STALLED = 1e-4  # and one this long if rounding no longer lets the cost fall
 _TRIALS = 8  # crossings followed down, the cheapest first
 _LIKELIHOOD_GAP = 9.0  # difference of costs by which one place is preferred to another: three sigma
@@ -252,14 +253,15 @@ def _descend(model: Model, x: Array) -> _Minimum:
         step = np.linalg.solve(F + (mu * trace) * unit, g)
         length = math.sqrt(max(float(step @ g), 0.0))
         trial = model.at(x + step)
-        if trial.cost <= at.cost:
+        if trial.cost <= at.cost + _LEVEL * (1.0 + at.cost):
             x, at, mu = x + step, trial, max(mu / 100.0, floor)
         elif length < _STALLED:
             return _Minimum(x, at, iteration)
         else:
             mu = max(10.0 * mu, 1e-4)
             continue
-        if length < _CONVERGED:
+        # while damped, a step is short for another reason
+        if length < _CONVERGED and mu == floor:
             return _Minimum(x, at, iteration)
     raise NoFix(
         f"no minimum of the cost within {_STEPS} steps (reached {x.round(1).tolist()}): azimuths that do"
