@@ -152,7 +152,9 @@ def _begins(buffer: bytes, at: int) -> bool | None:
 class Reader:
     """Frames of one stream, found however the stream is cut, and counted by sender."""
 
-    def __init__(self) -> None:
+    def __init__(self, counting: bool = True) -> None:
+        """`counting`: count every frame; else whoever judges them is to call `count` for the genuine ones."""
+        self._counting = counting
         self._waiting = b""
         self._run = 0
         self._run_reason = Reason.JUNK
@@ -182,6 +184,19 @@ class Reader:
         """
         return {sender: Counts(received, lost) for sender, (_, received, lost) in self._senders.items()}
 
+    def count(self, frame: Frame) -> None:
+        """Count a frame for its sender, and the ones that are missing before it."""
+        sequence = frame.sequence
+        sender = self._senders.get((frame.system, frame.component))
+        if sender is None:
+            self._senders[frame.system, frame.component] = [sequence + 1 & 0xFF, 1, 0]
+            return
+        gap = sequence - sender[0] & 0xFF
+        if 0 < gap < 128:
+            sender[2] += gap
+        sender[0] = sequence + 1 & 0xFF
+        sender[1] += 1
+
     def _scan(self, buffer: bytes, ended: bool) -> list[Event]:
         events: list[Event] = []
         at, end = 0, len(buffer)
@@ -190,7 +205,8 @@ class Reader:
             if isinstance(found, Frame):
                 if self._run:
                     self._end_run(events)
-                self._count(found)
+                if self._counting:
+                    self.count(found)
                 events.append(found)
                 at += len(found.raw)
             elif isinstance(found, UnknownFrame):
@@ -206,18 +222,6 @@ class Reader:
                 break
         self._waiting = buffer[at:]
         return events
-
-    def _count(self, frame: Frame) -> None:
-        sequence = frame.sequence
-        sender = self._senders.get((frame.system, frame.component))
-        if sender is None:
-            self._senders[frame.system, frame.component] = [sequence + 1 & 0xFF, 1, 0]
-            return
-        gap = sequence - sender[0] & 0xFF
-        if 0 < gap < 128:
-            sender[2] += gap
-        sender[0] = sequence + 1 & 0xFF
-        sender[1] += 1
 
     def _reject(self, reason: Reason, size: int, events: list[Event]) -> None:
         if not self._run:

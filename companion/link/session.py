@@ -136,7 +136,7 @@ class Session:
         self.component = component
         self.refused: Counter[Refusal] = Counter()
         self.state = STATE_ACTIVE
-        self.reader = frame.Reader()
+        self.reader = frame.Reader(counting=False)
         self.clock = BootClock()
         self.streams = Streams({dialect.type_named(n).msgid: hz for n, hz in (rates_hz or {}).items()})
         self._system = system
@@ -243,6 +243,7 @@ class Session:
             self.refused[reason] += 1
             events.append(Refused(now, found.system, found.component, reason))
             return
+        self.reader.count(found)
         if found.system in self._ignored:
             return
         if found.component == self.component and found.system == self.system:

@@ -1,11 +1,13 @@
-"""Real ground stations over loopback UDP, on a vehicle of an ArduPilot heartbeat and our component: they see the
-component, read and set its parameters and get their commands acknowledged, with and without signatures.
+"""Real ground stations over loopback UDP, on a vehicle that has an autopilot's heartbeat and our component.
 
-Each needs its package (the extra `clients`) and is skipped without it.
+They see the component, read and set its parameters and get their commands acknowledged, under either
+autopilot, with and without signatures. Each needs its package (extra `clients`) and is skipped without it.
 """
 
 import contextlib
+import hashlib
 import json
+import os
 import pathlib
 import shutil
 import socket
@@ -21,7 +23,7 @@ from companion.link import dialect, frame
 from companion.link.commands import Commands, Result
 from companion.link.parameters import Parameters, table
 from companion.link.session import MessageReceived, Session
-from companion.link.signing import Signing
+from companion.link.signing import Refusal, Signing
 from companion.link.status_text import StatusText
 from companion.records import Event
 
@@ -54,11 +56,8 @@ class Vehicle(threading.Thread):
             link.connect(("127.0.0.1", self.port))  # where the station listens
             while not self._ended.is_set():
                 now = time.monotonic_ns()
-                out: list[bytes] = []
-                try:
+                with contextlib.suppress(TimeoutError, ConnectionRefusedError):
                     self._hear(self.session.receive(link.recv(65536), now), now)
-                except (TimeoutError, ConnectionRefusedError):
-                    pass
                 self.session.poll(now)
                 for message in [*self.parameters.to_send(now), *self.speaker.to_send(now)]:
                     self.session.send(message)
@@ -69,10 +68,8 @@ class Vehicle(threading.Thread):
                     sign = self._sign if self._signing else None
                     out.append(frame.encode(beat, 0, SYSTEM, 1, sign))
                 for data in out:
-                    try:
+                    with contextlib.suppress(ConnectionRefusedError):
                         link.send(data)
-                    except ConnectionRefusedError:
-                        pass
 
     def stop(self) -> None:
         self._ended.set()
@@ -129,7 +126,7 @@ def test_mavsdk(vehicle: Vehicle) -> None:
             parameters.select_component(COMPONENT, param.ProtocolVersion.V1)
         listed = {p.name: p.value for p in parameters.get_all_params().float_params}
         assert set(listed) == {p.name for p in table()}
-        assert parameters.get_param_float("GNSS_SIGMA_M") == 2.5
+        assert parameters.get_param_float("GNSS_SIGMA_M") == Config().gnss.sigma_m
         parameters.set_param_float("GNSS_SIGMA_M", 4.0)
         assert parameters.get_param_float("GNSS_SIGMA_M") == 4.0
         assert until(lambda: vehicle.parameters.config.gnss.sigma_m == 4.0)
@@ -148,3 +145,103 @@ def test_mavsdk(vehicle: Vehicle) -> None:
         assert until(lambda: results.items() <= {m["command"]: m["result"] for m in said}.items())
     finally:
         sdk.destroy()
+
+
+@pytest.mark.parametrize("vehicle", [ARDUPILOT, PX4], indirect=True)
+def test_mavproxy(vehicle: Vehicle, tmp_path: pathlib.Path) -> None:
+    program = shutil.which("mavproxy.py")
+    if program is None:
+        pytest.skip("mavproxy.py is not on the path")
+    with Proxy(program, vehicle, tmp_path) as proxy:
+        assert until(lambda: "HEARTBEAT" in vehicle.heard)
+        proxy.type("param fetch")
+        assert proxy.says(f"Received {len(table())} parameters")
+        proxy.type("param show GNSS_SIGMA_M")
+        assert proxy.says(f"GNSS_SIGMA_M     {Config().gnss.sigma_m:.1f}")
+        proxy.type("param set GNSS_SIGMA_M 4")
+        assert until(lambda: vehicle.parameters.config.gnss.sigma_m == 4.0)
+        assert proxy.says("GNSS_SIGMA_M is 4.0")  # our STATUSTEXT
+        proxy.type("param set OUT_GPSENS_ID 5")
+        assert until(lambda: vehicle.parameters.config.output.global_position_sensor_id == 5)
+        proxy.type("long 512 148 0 0 0 0 0 0")
+        assert until(lambda: 512 in vehicle.acknowledged)
+        proxy.type("long 400 1 0 0 0 0 0 0")
+        assert proxy.says("COMPONENT_ARM_DISARM: UNSUPPORTED")
+
+
+SIGNING = Signing(hashlib.sha256(PASSPHRASE.encode()).digest())
+SIGNING.follow(time.time_ns(), time.monotonic_ns())
+
+
+@pytest.mark.parametrize("vehicle", [(ARDUPILOT, SIGNING)], indirect=True)
+def test_mavproxy_signed(vehicle: Vehicle, tmp_path: pathlib.Path) -> None:
+    program = shutil.which("mavproxy.py")
+    if program is None:
+        pytest.skip("mavproxy.py is not on the path")
+    refused = vehicle.session.refused
+    with Proxy(program, vehicle, tmp_path) as proxy:
+        assert until(lambda: refused[Refusal.UNSIGNED] > 0)
+        proxy.type("signing key wrong")
+        assert until(lambda: refused[Refusal.FORGED] > 0)
+        assert vehicle.heard == []
+        proxy.type(f"signing key {PASSPHRASE}")
+        assert until(lambda: "HEARTBEAT" in vehicle.heard)
+        proxy.type("param fetch")
+        assert proxy.says(f"Received {len(table())} parameters")
+        proxy.type("param set GNSS_SIGMA_M 4")
+        assert proxy.says("GNSS_SIGMA_M is 4.0")
+    assert vehicle.parameters.config.gnss.sigma_m == 4.0
+    assert not {Refusal.REPLAYED, Refusal.OLD, Refusal.FUTURE} & set(refused)
+
+
+class Proxy:
+    """MAVProxy at a prompt that is a pipe."""
+
+    def __init__(self, program: str, vehicle: Vehicle, folder: pathlib.Path) -> None:
+        self._process = subprocess.Popen(
+            [
+                program,
+                f"--master=udp:127.0.0.1:{vehicle.port}",
+                f"--target-system={SYSTEM}",
+                f"--target-component={COMPONENT}",
+                f"--state-basedir={folder}",
+                "--mav20",
+                "--streamrate=-1",
+                "--default-modules=param,cmdlong,signing",
+            ],
+            cwd=folder,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            env=os.environ | {"HOME": str(folder), "PYTHONUNBUFFERED": "1"},
+        )
+        self._said = ""
+        self._reader = threading.Thread(target=self._read, daemon=True)
+
+    def __enter__(self) -> "Proxy":
+        self._reader.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._process.kill()
+        self._process.wait()
+        self._reader.join()
+        assert self._process.stdin is not None and self._process.stdout is not None
+        self._process.stdin.close()
+        self._process.stdout.close()
+        if error[0] is not None:
+            print(self._said)
+
+    def type(self, line: str) -> None:
+        assert self._process.stdin is not None
+        self._process.stdin.write(line + "\n")
+        self._process.stdin.flush()
+
+    def says(self, text: str) -> bool:
+        return until(lambda: text in self._said)
+
+    def _read(self) -> None:
+        assert self._process.stdout is not None
+        while said := self._process.stdout.read(1):
+            self._said += said

@@ -142,6 +142,33 @@ def test_a_forged_frame_of_the_future_does_not_lock_the_genuine_sender_out() -> 
     assert {(e.system, e.component) for e in events if isinstance(e, Refused)} == {(255, 190)}
 
 
+def test_forged_and_repeated_frames_are_not_counted_as_frames_nor_as_losses() -> None:
+    session, signer, forger = Session(system=1, signing=at_noon()), at_noon(), Signing(OTHER_KEY)
+    for sequence in range(100):
+        for who, number in ((signer, sequence), (forger, sequence + 50 & 0xFF)):
+            sign = lambda data, who=who: who.sign(data, 0, 0)  # noqa: E731
+            data = frame.encode(dialect.new("HEARTBEAT", type=6), number, 255, 190, sign)
+            session.receive(data + data, 0)
+    assert session.reader.counts == {(255, 190): frame.Counts(100, 0)}
+    assert session.refused == {Refusal.FORGED: 200, Refusal.REPLAYED: 100}
+
+
+@settings(deadline=None, max_examples=200)
+@given(at=st.integers(1, 100), flip=st.integers(1, 255))
+def test_no_byte_of_a_genuine_frame_can_be_changed(at: int, flip: int) -> None:
+    raw = bytearray(signed(NOON).raw)
+    at %= len(raw)
+    raw[at] ^= flip
+    end = len(raw) - frame.SIGNATURE_SIZE
+    kind = dialect.TYPES[0]
+    raw[end - 2 : end] = frame.crc16.mcrf4xx(bytes(raw[1 : end - 2]) + bytes([kind.crc_extra])).to_bytes(
+        2, "little"
+    )
+    session = Session(system=1, signing=at_noon())
+    events = session.receive(bytes(raw), 0)
+    assert bytes(raw) == signed(NOON).raw or not any(isinstance(e, MessageReceived) for e in events)
+
+
 def test_stamps_count_by_link_system_and_component() -> None:
     here = at_noon()
     streams = [(0, 255, 190), (1, 255, 190), (0, 254, 190), (0, 255, 191)]
