@@ -1,0 +1,197 @@
+"""`companion study order`: how many terms does an unknown function need, by four bases?
+
+For a signal of its own making, whose true error is known, or for a file of samples: the criterion for every
+order, the order it chooses, and whether the basis spans the signal at all. The mathematics is in
+`estimate.polynomial`.
+"""
+
+import json
+import math
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import click
+import numpy as np
+import numpy.typing as npt
+from rich.console import Console
+from rich.table import Table
+
+from companion.estimate.polynomial import FAMILIES, Family, Order, select_order
+
+Array = npt.NDArray[np.float64]
+
+SPAN_S = 10.0
+
+
+def cubic(t: Array) -> Array:
+    """Four power terms make it."""
+    x: Array = 1.0 + 0.5 * t - 0.12 * t**2 + 0.008 * t**3
+    return x
+
+
+def oscillation(t: Array) -> Array:
+    """The first and the third wave: of the Fourier functions the second and the sixth."""
+    x: Array = np.sin(2.0 * np.pi * t / SPAN_S) + 0.5 * np.sin(6.0 * np.pi * t / SPAN_S)
+    return x
+
+
+SIGNALS: dict[str, Callable[[Array], Array]] = {"cubic": cubic, "oscillation": oscillation}
+
+
+class Samples(NamedTuple):
+    """t (N,) s, z (N,), sigma (N,), and the truth (N,) where it is known."""
+
+    t: Array
+    z: Array
+    sigma: Array
+    truth: Array | None = None
+
+
+class Row(NamedTuple):
+    """One basis: what it chose, the short form's choice, and the true r.m.s. error, where it is known, by
+    the order chosen.
+    """
+
+    basis: str
+    found: Order
+    short: int
+    error: float | None
+
+
+def synthetic(signal: str, count: int, sigma: float, seed: int) -> Samples:
+    """The signal over ten seconds under normal noise that grows by half from `sigma` on."""
+    t = np.linspace(0.0, SPAN_S, count)
+    noise, truth = sigma * (1.0 + 0.5 * t / SPAN_S), SIGNALS[signal](t)
+    return Samples(t, truth + noise * np.random.default_rng(seed).standard_normal(count), noise, truth)
+
+
+def read(file: Path, sigma: float) -> Samples:
+    """Samples of a CSV file: t, z and, if it has a third column, sigma."""
+    try:
+        table = np.loadtxt(file, delimiter=",", ndmin=2, encoding="utf-8")
+    except (ValueError, OSError) as error:
+        raise ValueError(f"{file}: is no table of numbers t,z[,sigma] ({error})") from None
+    if table.shape[1] not in (2, 3):
+        raise ValueError(f"{file}: has {table.shape[1]} columns, give t,z or t,z,sigma")
+    known = table[:, 2] if table.shape[1] == 3 else np.full(len(table), sigma)
+    return Samples(table[:, 0], table[:, 1], known)
+
+
+def study(samples: Samples, bases: Sequence[Family], r_max: int) -> list[Row]:
+    """Every basis on the same samples."""
+    rows = []
+    for basis in bases:
+        found = select_order(samples.t, samples.z, samples.sigma, basis, r_max)
+        error = None
+        if samples.truth is not None:
+            error = float(np.sqrt(np.mean((found.at(samples.t).x - samples.truth) ** 2)))
+        rows.append(Row(basis, found, short_form(samples, found), error))
+    return rows
+
+
+def short_form(samples: Samples, found: Order) -> int:
+    """The order of the least -|a_r|^2 + 2 r dt, which takes the samples for a fine and even grid."""
+    Psi, y = found.basis(samples.t) / samples.sigma[:, None], samples.z / samples.sigma
+    dt = float(samples.t[-1] - samples.t[0]) / (len(y) - 1)
+    values = []
+    for r in range(1, len(found.criterion) + 1):
+        a = np.linalg.lstsq(Psi[:, :r], y, rcond=None)[0]
+        values.append(2.0 * r * dt - float(a @ a))
+    return int(np.argmin(values)) + 1
+
+
+@click.command("order")
+@click.argument("file", required=False, type=click.Path(path_type=Path, exists=True, dir_okay=False))
+@click.option("--signal", type=click.Choice(list(SIGNALS)), default="cubic", show_default=True)
+@click.option(
+    "--basis", "bases", type=click.Choice(FAMILIES), multiple=True, help="May be given again; else all."
+)
+@click.option("--r-max", default=12, show_default=True, help="Greatest number of terms.")
+@click.option("--samples", "count", default=101, show_default=True, help="Of the signal.")
+@click.option("--sigma", default=0.2, show_default=True, help="R.m.s. noise, where FILE has no third column.")
+@click.option("--seed", default=1, show_default=True, help="Of the noise.")
+@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+@click.option("--plot", type=click.Path(path_type=Path, dir_okay=False), help="Draw into this file.")
+def command(
+    file: Path | None,
+    signal: str,
+    bases: tuple[Family, ...],
+    r_max: int,
+    count: int,
+    sigma: float,
+    seed: int,
+    as_json: bool,
+    plot: Path | None,
+) -> None:
+    """How many terms an unknown function needs: of FILE (CSV: t,z or t,z,sigma), or of a made signal."""
+    try:
+        samples = read(file, sigma) if file else synthetic(signal, count, sigma, seed)
+        rows = study(samples, bases or FAMILIES, r_max)  # type: ignore[arg-type]
+    except ValueError as error:
+        raise click.UsageError(str(error)) from None
+    title = str(file) if file else f"{signal}, {count} samples, seed {seed}"
+    if as_json:
+        click.echo(json.dumps({"signal": title, "bases": [_plain(row) for row in rows]}))
+    else:
+        _print(rows, title)
+    if plot is not None:
+        _plot(samples, rows, plot)
+
+
+def _plain(row: Row) -> dict[str, Any]:
+    found = row.found
+    return {
+        "basis": row.basis,
+        "order": found.order,
+        "criterion": found.criterion.tolist(),
+        "coefficients": found.coefficients.tolist(),
+        "order_short_form": row.short,
+        "consistency": found.consistency,
+        "spans": found.spans,
+        "rms_error": row.error,
+    }
+
+
+def _print(rows: Sequence[Row], title: str) -> None:
+    shown = Table(title=title, caption="estimated squared error (6.5.7); the least is starred")
+    shown.add_column("terms", justify="right")
+    for row in rows:
+        shown.add_column(row.basis, justify="right")
+    for k in range(len(rows[0].found.criterion)):
+        cells = (f"{row.found.criterion[k]:.4g}{'*' if k + 1 == row.found.order else ' '}" for row in rows)
+        shown.add_row(str(k + 1), *cells, end_section=k + 1 == len(rows[0].found.criterion))
+    shown.add_row("order", *(str(row.found.order) for row in rows))
+    shown.add_row("short form's", *(str(row.short) for row in rows))
+    shown.add_row("RSS/(N - r_max)", *(f"{row.found.consistency:.3g}" for row in rows))
+    shown.add_row("spans", *("yes" if row.found.spans else "no" for row in rows))
+    if rows[0].error is not None:
+        shown.add_row("true r.m.s. error", *(f"{row.error:.3g}" for row in rows))
+    Console(width=100).print(shown)
+
+
+def _plot(samples: Samples, rows: Sequence[Row], file: Path) -> None:
+    try:
+        from matplotlib.figure import Figure
+    except ImportError:
+        raise click.UsageError("--plot needs matplotlib; install navigation-companion[plot]") from None
+    figure = Figure(figsize=(11.0, 4.5), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    left.plot(samples.t, samples.z, ".", color="0.7", label="samples")
+    if samples.truth is not None:
+        left.plot(samples.t, samples.truth, "k", label="truth")
+    fine = np.linspace(samples.t[0], samples.t[-1], 400)
+    for row in rows:
+        name = f"{row.basis}, {row.found.order} terms{'' if row.found.spans else ' (does not span)'}"
+        (line,) = left.plot(fine, row.found.at(fine).x, label=name)
+        terms = np.arange(1, len(row.found.criterion) + 1)
+        right.plot(terms, row.found.criterion, ".-", color=line.get_color())
+        least = float(row.found.criterion.min())
+        right.plot(row.found.order, least, "o", color=line.get_color())
+    scale = max(min(math.inf, *(abs(float(row.found.criterion.min())) for row in rows)), 1e-3)
+    right.set_yscale("symlog", linthresh=scale)
+    left.set(xlabel="time, s")
+    right.set(xlabel="terms", ylabel="estimated squared error")
+    left.legend()
+    right.grid(visible=True, alpha=0.3)
+    figure.savefig(file)
