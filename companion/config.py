@@ -67,7 +67,7 @@ class Inertial(Section, frozen=True):
     velocity_m_s: Positive = 0.5
     tilt_arcsec: Positive = 20.0
     heading_arcmin: Positive = 3.0
-    velocity_noise_m_s_sqrt_s: Positive = 0.003
+    velocity_noise_m_s_sqrt_s: Positive = 0.001
     height_sigma_m: Positive = 20.0
 
 
@@ -79,10 +79,10 @@ class GnssSection(Section, frozen=True):
     receiver: Annotated[int, Meta(ge=0, le=1)] = (
         0  # GPS_RAW_INT is 0, GPS2_RAW 1; what we feed in is never one
     )
-    sigma_m: Positive = 2.5
+    sigma_m: Positive = 2.0
     sigma_velocity_m_s: Positive = 0.1
-    correlation_s: Positive = 100.0
-    every_s: NotNegative = 1.0  # fixes closer together than this are heard but not used
+    correlation_s: Positive = 60.0
+    every_s: NotNegative = 0.5  # fixes closer together than this are heard but not used
     use_velocity: bool = True
     timeout_s: Positive = 3.0
 

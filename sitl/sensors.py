@@ -86,9 +86,9 @@ class GnssFixes(NamedTuple):
 class GnssModel:
     """A receiver: correlated (first-order Gauss-Markov) and white error, one sigma per axis, m and m/s."""
 
-    correlated_m: float = 1.8
-    correlation_s: float = 120.0
-    white_m: float = 0.4
+    correlated_m: float = 1.5
+    correlation_s: float = 60.0
+    white_m: float = 0.8
     vertical_ratio: float = 1.6
     velocity_m_s: float = 0.08
 

@@ -193,11 +193,12 @@ def predict_ahead(
         lost = dict.fromkeys(targets, Forecast(False))
         return [Prediction(int(t), False, "no fixes in the window", **lost) for t in t_ns]
     middle = (int(window.t_ns[0]) + int(window.t_ns[-1])) // 2
-    design, whitened = _design(window, middle, int(t_ns[0]), scale)
+    factored: tuple[Design, Floats] | None = None
     predictions = []
     for t in t_ns:
-        if window.disturbance:
-            design, whitened = _design(window, middle, int(t), scale)
+        if factored is None or window.disturbance:
+            factored = _design(window, middle, int(t), scale)
+        design, whitened = factored
         carried = transition((int(t) - middle) * NANO * scale.rate)
         forecasts, reasons = {}, []
         for target in targets:

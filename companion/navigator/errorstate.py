@@ -44,8 +44,7 @@ class ErrorState(NamedTuple):
 
 
 class Grade(NamedTuple):
-    """Disturbances of the unit and of GNSS, white spectral densities (N,), first sigmas (N,).
-    """
+    """Disturbances of the unit and of GNSS, white spectral densities (N,), first sigmas (N,)."""
 
     disturbances: tuple[Disturbance, ...]
     density: Floats

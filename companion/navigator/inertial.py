@@ -14,10 +14,10 @@ from typing import NamedTuple
 import numpy as np
 
 from companion.nav.geometry import Geodetic, Projection, displace, local_to_geodetic
-from companion.records import LocalOrigin, LocalPosition, Vector3
+from companion.records import LocalOrigin, LocalPosition, Vector2, Vector3
 
 KEEP = 128  # points: 12 s at 10 Hz, more than a beacon's answer may be late
-REACH_S = 0.5  # a point this far beyond the track is still extrapolated by velocity
+REACH_S = 0.5  # a point this far beyond the track is still extrapolated
 JUMP_M = 5.0  # a step beyond what velocity explains, allowing for JUMP_ACCELERATION
 JUMP_ACCELERATION = 30.0  # [m/s^2]
 
@@ -46,13 +46,13 @@ def extend(track: Track, new: Point) -> Track:
 
 
 def at(track: Track, t_ns: int) -> Point | None:
-    """The point at `t_ns`: between two points linearly, a little beyond the last by velocity, else None."""
+    """The point at `t_ns`: between two points linearly, a little beyond the last carried on, else None."""
     if not track or t_ns < track[0].t_ns:
         return None
     last = track[-1]
     if t_ns >= last.t_ns:
         dt = (t_ns - last.t_ns) * 1e-9
-        return _moved(last, dt, t_ns) if dt <= REACH_S else None
+        return _moved(last, acceleration(track), dt, t_ns) if dt <= REACH_S else None
     later = len(track) - 1
     while track[later - 1].t_ns > t_ns:
         later -= 1
@@ -62,7 +62,7 @@ def at(track: Track, t_ns: int) -> Point | None:
         return None  # a hole in the channel is not bridged
     mix = [p + part * (q - p) for p, q in zip(a.position, b.position, strict=True)]
     if abs(b.position.lon - a.position.lon) > math.pi:  # across the antimeridian
-        return _moved(a, (t_ns - a.t_ns) * 1e-9, t_ns)
+        return _moved(a, acceleration(track), (t_ns - a.t_ns) * 1e-9, t_ns)
     v_n = tuple(p + part * (q - p) for p, q in zip(a.v_n, b.v_n, strict=True))
     return Point(t_ns, Geodetic(*mix), v_n)  # type: ignore[arg-type]
 
@@ -79,15 +79,17 @@ def jump(before: LocalPosition, after: LocalPosition) -> Vector3 | None:
     return step[0], step[1], step[2]
 
 
-def acceleration(track: Track) -> tuple[float, float]:
-    """Horizontal acceleration north and east over the last half second, m/s^2; (0, 0) before it is known."""
+def acceleration(track: Track) -> Vector2:
+    """Horizontal acceleration north and east over the last points, m/s^2; (0, 0) before it is known."""
     if len(track) < 2:
         return 0.0, 0.0
-    a, b = track[max(-6, -len(track))], track[-1]
+    a, b = track[max(-3, -len(track))], track[-1]
     dt = (b.t_ns - a.t_ns) * 1e-9
     return (b.v_n[0] - a.v_n[0]) / dt, (b.v_n[1] - a.v_n[1]) / dt
 
 
-def _moved(start: Point, dt: float, t_ns: int) -> Point:
-    north, east, down = (v * dt for v in start.v_n)
-    return Point(t_ns, displace(*start.position, north, east, down), start.v_n)
+def _moved(start: Point, a_n: Vector2, dt: float, t_ns: int) -> Point:
+    """`start` carried on. A tenth of a second of a turn changes the velocity by ten sigmas of GNSS's."""
+    v_n = (start.v_n[0] + a_n[0] * dt, start.v_n[1] + a_n[1] * dt, start.v_n[2])
+    north, east, down = (0.5 * (v + w) * dt for v, w in zip(start.v_n, v_n, strict=True))
+    return Point(t_ns, displace(*start.position, north, east, down), v_n)

@@ -32,8 +32,7 @@ class Heard(NamedTuple):
 
 
 def from_gnss(record: Gnss, ins: Point, settings: GnssSection, drifting: bool = False) -> Heard:
-    """A GNSS fix as a horizontal position at the INS; if `drifting`, with its white noise alone.
-    """
+    """A GNSS fix as a horizontal position at the INS; if `drifting`, with its white noise alone."""
     sigma = max(record.sigma_horizontal or 0.0, settings.sigma_m)
     if drifting:
         sigma = max(math.sqrt(sigma**2 - settings.sigma_m**2), settings.sigma_m / 3.0)

@@ -56,7 +56,7 @@ def flight(duration_s: int, gnss_until: float, rsbn_until: float, seed: int = 1)
     dt, unit = 0.1, errorstate.grade(CONFIG.inertial, CONFIG.gnss)
     model = aircraft(ORIGIN.lat, 30.0, 0.0, added=unit.disturbances)
     step = discretise(model.A, model.Q, model.B, dt)
-    noise = np.linalg.cholesky(step.Q + 1e-30 * np.eye(len(x)))
+    noise = np.linalg.cholesky(step.Q + 1e-30 * np.eye(len(unit.sigma0)))
     x = unit.sigma0 * rng.standard_normal(12)
     moments = []
     for k in range(1, round(duration_s / dt)):
