@@ -57,12 +57,12 @@ def flight(duration_s: int, gnss_until: float, rsbn_until: float, seed: int = 1)
     model = aircraft(ORIGIN.lat, 30.0, 0.0, added=unit.disturbances)
     step = discretise(model.A, model.Q, model.B, dt)
     noise = np.linalg.cholesky(step.Q + 1e-30 * np.eye(len(unit.sigma0)))
-    x = unit.sigma0 * rng.standard_normal(12)
+    x = unit.sigma0 * rng.standard_normal(len(unit.sigma0))
     moments = []
     for k in range(1, round(duration_s / dt)):
         t = k * dt
         t_ns = round(t * NS)
-        x = step.A @ x + noise @ rng.standard_normal(12)
+        x = step.A @ x + noise @ rng.standard_normal(len(unit.sigma0))
         truth = from_enu(
             np.array([9000.0 * (1.0 - math.cos(t / 300.0)), 9000.0 * math.sin(t / 300.0), 1000.0]), ORIGIN
         )
@@ -173,7 +173,7 @@ def test_a_late_answer_is_folded_in_at_its_own_time() -> None:
     assert b
     one_millimetre = 1e-3  # solutions fall at other instants, and with them the steps of the error equations
     assert math.dist(a[0].error_n, b[0].error_n) < one_millimetre
-    np.testing.assert_allclose(a[0].covariance, b[0].covariance, rtol=1e-4)
+    np.testing.assert_allclose(a[0].covariance, b[0].covariance, rtol=1e-3)
 
 
 def test_what_is_later_than_the_limit_is_rejected_aloud() -> None:
