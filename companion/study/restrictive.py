@@ -174,13 +174,13 @@ def study(name: str, runs: int, seed: int) -> tuple[dict[str, Any], Flights, Pas
 
 
 def sheet(rows: list[dict[str, Any]], key: str, title: str, number: str) -> Table:
-    """One table, a row per truth and a column per state."""
+    """One table, a row per state and a column per truth: it fits a terminal of 80 columns."""
     table = Table(title=title)
-    table.add_column("truth")
-    for state in rows[0]["states"]:
-        table.add_column(state, justify="right")
+    table.add_column("state")
     for row in rows:
-        table.add_row(row["truth"], *(format(value, number) for value in row[key]))
+        table.add_column(row["truth"], justify="right")
+    for i, state in enumerate(rows[0]["states"]):
+        table.add_row(state, *(format(row[key][i], number) for row in rows))
     return table
 
 
