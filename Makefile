@@ -30,7 +30,8 @@ lint: $(STAMP) ## ruff and mypy --strict
 
 lock: ## requirements.lock anew from pyproject.toml (needs uv)
 	uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-emit-index-url \
-	  --no-annotate --no-header --all-extras -o requirements.lock pyproject.toml
+	  --no-annotate --no-header $(foreach e,dev plot report logs campaign,--extra $(e)) \
+	  -o requirements.lock pyproject.toml
 
 clean: ## remove the environment and what tools left
 	rm -rf $(VENV) build *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
