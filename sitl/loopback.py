@@ -178,7 +178,7 @@ def command(
 def _print(flown: Flown, rows: list[score.Row], seconds: float) -> None:
     scenario = flown.autopilot.scenario
     table = Table(title=f"{scenario.name}: horizontal error, r.m.s. / 95 % [m]")
-    for column in ("phase", "min", *score.SOURCES, "guaranteed bound", "held"):
+    for column in ("phase", "min", *score.SOURCES, "bound", "held"):
         table.add_column(column, justify="left" if column == "phase" else "right")
     for row in rows:
         cells = [f"{row.rms[s]:.1f} / {row.p95[s]:.1f}" if s in row.rms else "-" for s in score.SOURCES]
@@ -204,3 +204,7 @@ def _print(flown: Flown, rows: list[score.Row], seconds: float) -> None:
         if isinstance(record, Event | Reset):
             text = record.text if isinstance(record, Event) else f"{record.what}: {record.reason}"
             click.echo(f"  {(record.t_ns - START_NS) * 1e-9:8.1f} s  {text}")
+
+
+def _m(metres: float) -> str:
+    return f"{metres:.1f}" if metres < 99.95 else f"{metres:.0f}"

@@ -86,13 +86,14 @@ def learn(
     return g._replace(bins=(*others, mine))
 
 
-def bounded(g: Guarantee, t_ns: int) -> tuple[Guarantee, Bounded | None]:
+def bounded(g: Guarantee, t_ns: int, settings: Predictor) -> tuple[Guarantee, Bounded | None]:
     """The INS error at `t_ns`; None where the fixes do not determine it (too few, too short)."""
     held = g.held
     if held is None or t_ns - held[0].t_ns >= REFRESH_NS or t_ns < held[0].t_ns:
+        now = _halves(g, t_ns, settings)
         held = (
-            predict(g.north, t_ns, start=held[0] if held else None),
-            predict(g.east, t_ns, start=held[1] if held else None),
+            predict(now.north, t_ns, start=held[0] if held else None),
+            predict(now.east, t_ns, start=held[1] if held else None),
         )
         g = g._replace(held=held)
     if not (held[0].feasible and held[1].feasible) or max(_bound(held[0]), _bound(held[1])) > HOPELESS_M:
@@ -103,11 +104,13 @@ def bounded(g: Guarantee, t_ns: int) -> tuple[Guarantee, Bounded | None]:
     return g, Bounded(error, velocity, bound, velocity_bound)
 
 
-def ahead(g: Guarantee, t_ns: int, minutes: tuple[float, ...]) -> tuple[Prediction, ...]:
-    """Bounds for the minutes ahead of `t_ns`, empty where there are none."""
+def ahead(g: Guarantee, t_ns: int, settings: Predictor) -> tuple[Prediction, ...]:
+    """Bounds for the minutes ahead of `t_ns` that are asked for, empty where there are none."""
+    minutes = settings.ahead_min
     times = [t_ns + round(60e9 * m) for m in minutes]
+    now = _halves(g, t_ns, settings)
     found = [
-        [p.position for p in predict_ahead(window, times, ("position",))] for window in (g.north, g.east)
+        [p.position for p in predict_ahead(window, times, ("position",))] for window in (now.north, now.east)
     ]
     return tuple(
         Prediction(60.0 * m, (n.bound, e.bound), (n.ls_claimed, e.ls_claimed), (n.ls_worst, e.ls_worst))
@@ -135,6 +138,13 @@ def _close(g: Guarantee) -> Guarantee:
         north = north.push(t_ns, full.quantity, full.value[0] / w, full.sigma[0] / w)
         east = east.push(t_ns, full.quantity, full.value[1] / w, full.sigma[1] / w)
     return Guarantee(north, east, (), g.held)
+
+
+def _halves(g: Guarantee, t_ns: int, settings: Predictor) -> Guarantee:
+    """With the open bins once half full: fewer fixes would lend the estimate all their noise."""
+    if all((t_ns - b.start_ns) * 1e-9 >= 0.5 * settings.bin_s for b in g.bins):
+        return _close(g)
+    return g
 
 
 def _bound(channel: Channel) -> float:

@@ -22,10 +22,10 @@ def solve(carry: Carry, rx_ns: int, settings: Settings) -> Step:
     ins = level(carry.track[-1], carry)
     t_ns = ins.t_ns
     state = state_at(carry, ins, settings)
-    promise, bounded = guarantee.bounded(carry.guarantee, t_ns)
+    promise, bounded = guarantee.bounded(carry.guarantee, t_ns, config.predictor)
     if t_ns >= carry.next_ahead_ns:
-        minutes = config.predictor.ahead_min
-        carry = carry._replace(ahead=guarantee.ahead(promise, t_ns, minutes), next_ahead_ns=t_ns + AHEAD_NS)
+        bounds = guarantee.ahead(promise, t_ns, config.predictor)
+        carry = carry._replace(ahead=bounds, next_ahead_ns=t_ns + AHEAD_NS)
     mode = _mode(carry, bounded, t_ns, settings)
     kalman: Vector2 = (float(state.x[0]), float(state.x[1]))
     error, velocity_error = kalman, (float(state.x[2]), float(state.x[3]))

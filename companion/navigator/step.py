@@ -177,7 +177,7 @@ def _within_bound(carry: Carry, heard: radio.Heard, settings: Settings) -> bool:
     """
     if sources(carry, heard.t_ns, settings) & ~Source.INERTIAL:
         return False
-    _, promise = guarantee.bounded(carry.guarantee, heard.t_ns)
+    _, promise = guarantee.bounded(carry.guarantee, heard.t_ns, settings.config.predictor)
     if promise is None:
         return False
     (north, east), (bound_n, bound_e) = promise.error_n, promise.bound_n
