@@ -14,6 +14,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from companion.estimate import boundary, smoother
+from companion.nav.discrete import discretise
+from companion.nav.disturbances import accelerometer_slow, gyro_drift
+from companion.nav.error_model import aircraft
 
 DATA = json.loads((pathlib.Path(__file__).parents[1] / "data/map_and_order.json").read_text())["two_state"]
 AGREE = 1e-9
@@ -275,6 +278,22 @@ def test_smoothing_makes_every_variance_smaller() -> None:
     for k in range(41):
         assert np.linalg.eigvalsh(forward.P[k] - found.P[k]).min() > -1e-12
     np.testing.assert_allclose(found.x[-1], forward.x[-1], atol=1e-12)
+
+
+def test_the_error_model_of_an_ins_for_a_flight() -> None:
+    """Metres, microradians and radians per second in one state, an outage in the middle."""
+    drift, bias = gyro_drift(1.0 / 18000.0, 5e-8), accelerometer_slow(1.0 / 3600.0, 5e-4)
+    model = aircraft(math.radians(60.0), 150.0, 100.0, added=(drift, bias))
+    step = discretise(model.A, model.Q + np.diag([0.0, 0.0, 1e-5, 1e-5] + [0.0] * 8), model.B, 2.0)
+    N, H = 900, np.eye(2, 12)
+    B = np.diag([20.0, 20.0, 0.5, 0.5, 1e-4, 1e-4, 1e-3, 5e-8, 5e-8, 5e-8, 5e-4, 5e-4]) ** 2
+    rng = np.random.default_rng(0)
+    z = [None if 300 <= i < 600 else 3.0 * rng.standard_normal(2) for i in range(N)]
+    problem = [step.A] * N, [np.eye(12)] * N, [step.Q] * N, [H] * N, [9.0 * np.eye(2)] * N, z, np.zeros(12), B
+    one, other = smoother.rts(*problem), smoother.two_point(*problem)
+    sigma = np.sqrt(np.einsum("ijj->ij", one.P))
+    assert (abs(one.x - other.x) < AGREE * sigma).all()
+    assert (abs(one.P - other.P) < AGREE * sigma[:, :, None] * sigma[:, None, :]).all()
 
 
 @pytest.mark.parametrize("solve", [smoother.rts, smoother.two_point])
