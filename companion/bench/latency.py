@@ -1,0 +1,205 @@
+"""Latency: a beacon's answer in by UDP, the corrected estimate out, beside a bare asyncio echo.
+
+A whole `companion run` (log on, real sockets) and an echo of the same datagram stand in processes of their
+own. A tiny autopilot here flies north at 40 m/s, with GNSS, until the navigator has its fix, and then sends
+beacon answers one by one; each is timed until the ODOMETRY that it causes is here. Both peers are asked in
+turn and waited for in the same way, so the ratio of the medians holds whatever the machine does.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import multiprocessing
+import socket
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from typing import Any
+
+import numpy as np
+
+from companion.config import load
+from companion.link import dialect, frame
+from companion.nav.geometry import Geodetic, local_to_geodetic, slant_range_azimuth
+from companion.service import run
+
+ROUNDS = 100
+WARM_UP_S = 4.0
+ROUND_S = 0.1  # local position at 10 Hz
+TIMEOUT_S = 5.0
+LOOPBACK = "127.0.0.1"
+ORIGIN = Geodetic(math.radians(60.0), math.radians(30.0), 50.0)
+BEACON = Geodetic(math.radians(60.05), math.radians(31.07), 80.0)
+V_NORTH, HEIGHT = 40.0, 800.0
+COMPANION, ECHO = "companion: RSBN in to corrected estimate out", "bare asyncio UDP echo"
+
+
+def measure() -> dict[str, list[float]]:
+    """Seconds from a beacon's answer sent to the estimate received, and the echo's round trip, round by
+    round.
+    """
+    with tempfile.TemporaryDirectory() as logs, _peer(_companion, logs) as there, _peer(_echo) as back:
+        autopilot = _Autopilot(there)
+        begun = time.perf_counter()
+        while time.perf_counter() - begun < WARM_UP_S:
+            autopilot.fly()
+            autopilot.rsbn()
+        times: dict[str, list[float]] = {COMPANION: [], ECHO: []}
+        for _ in range(ROUNDS):
+            autopilot.fly()
+            answer = autopilot.rsbn_frame()
+            times[COMPANION].append(autopilot.rsbn(answer))
+            times[ECHO].append(_round_trip(back, answer))
+    return times
+
+
+class _Autopilot:
+    """As little of one as the navigator needs."""
+
+    def __init__(self, sock: socket.socket) -> None:
+        self._sock = sock
+        self._begun = time.perf_counter()
+        self._next = 0.0
+        self._sequence = 0
+
+    def fly(self) -> None:
+        """Wait for the next tenth of a second, say all that is due, and hear out what it causes."""
+        self._next += ROUND_S
+        time.sleep(max(0.0, self._begun + self._next - time.perf_counter()))
+        t, place = self._where()
+        ms = round(t * 1e3)
+        here = [round(math.degrees(x) * 1e7) for x in place[:2]]
+        lat, lon = (round(math.degrees(x) * 1e7) for x in ORIGIN[:2])
+        self._say("HEARTBEAT", type=1, autopilot=3, system_status=4, mavlink_version=3)
+        self._say("GPS_GLOBAL_ORIGIN", latitude=lat, longitude=lon, altitude=round(ORIGIN.alt * 1e3))
+        self._say("LOCAL_POSITION_NED", time_boot_ms=ms, x=V_NORTH * t, z=-HEIGHT, vx=V_NORTH)
+        self._say(
+            "GPS_RAW_INT",
+            time_usec=ms * 1000,
+            fix_type=3,
+            lat=here[0],
+            lon=here[1],
+            alt=round(place.alt * 1e3),
+            eph=80,
+            epv=80,
+            vel=round(V_NORTH * 100),
+            cog=0,
+            satellites_visible=14,
+        )
+        time.sleep(0.4 * ROUND_S)
+        self._drain()
+
+    def rsbn_frame(self) -> bytes:
+        """A beacon's true answer now."""
+        t, place = self._where()
+        sight = slant_range_azimuth(BEACON, place)
+        return self._frame(
+            "RSBN_MEASUREMENT",
+            time_usec=round(t * 1e6),
+            beacon_lat=round(math.degrees(BEACON.lat) * 1e7),
+            beacon_lon=round(math.degrees(BEACON.lon) * 1e7),
+            beacon_alt=BEACON.alt,
+            azimuth=sight.azimuth % math.tau,
+            slant_range=sight.slant_range,
+            sigma_azimuth=math.radians(0.125),
+            sigma_range=100.0,
+            beacon_id=1,
+            status=3,
+        )
+
+    def rsbn(self, answer: bytes | None = None) -> float:
+        """Send a beacon's answer; seconds until the corrected estimate is here (while warming up, perhaps
+        none)."""
+        warming = answer is None
+        answer = answer or self.rsbn_frame()
+        self._drain()
+        begun = time.perf_counter()
+        self._sock.send(answer)
+        while time.perf_counter() - begun < (ROUND_S / 4 if warming else TIMEOUT_S):
+            try:
+                data = self._sock.recv(65536)
+            except (BlockingIOError, TimeoutError, ConnectionRefusedError):
+                continue
+            if _is_odometry(data):
+                return time.perf_counter() - begun
+        if warming:
+            return math.nan
+        raise TimeoutError(f"the companion gave no corrected estimate within {TIMEOUT_S:g} s")
+
+    def _where(self) -> tuple[float, Geodetic]:
+        t = 10.0 + time.perf_counter() - self._begun
+        return t, local_to_geodetic("ardupilot", ORIGIN, np.array([V_NORTH * t, 0.0, -HEIGHT]))
+
+    def _frame(self, name: str, **values: Any) -> bytes:
+        self._sequence = self._sequence + 1 & 0xFF
+        return frame.encode(dialect.new(name, **values), self._sequence, 1, 1)
+
+    def _say(self, name: str, **values: Any) -> None:
+        with suppress(ConnectionRefusedError):  # not there yet
+            self._sock.send(self._frame(name, **values))
+
+    def _drain(self) -> None:
+        self._sock.setblocking(False)
+        try:
+            while True:
+                try:
+                    self._sock.recv(65536)
+                except ConnectionRefusedError:
+                    continue
+        except BlockingIOError:
+            pass
+        self._sock.settimeout(ROUND_S / 4)
+
+
+def _is_odometry(data: bytes) -> bool:
+    return any(
+        isinstance(found, frame.Frame) and dialect.TYPES[found.msgid].name == "ODOMETRY"
+        for found in frame.Reader().receive(data)
+    )
+
+
+def _round_trip(sock: socket.socket, data: bytes) -> float:
+    begun = time.perf_counter()
+    sock.send(data)
+    sock.recv(65536)
+    return time.perf_counter() - begun
+
+
+@contextmanager
+def _peer(serve: Any, *arguments: Any) -> Iterator[socket.socket]:
+    """A process that runs `serve(port, *arguments)`, and a socket connected to its port; ended by SIGTERM."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            probe.bind((LOOPBACK, 0))
+            port = probe.getsockname()[1]
+        process = multiprocessing.get_context("spawn").Process(target=serve, args=(port, *arguments))
+        process.start()
+        try:
+            sock.connect((LOOPBACK, port))
+            sock.settimeout(TIMEOUT_S)
+            yield sock
+        finally:
+            process.terminate()
+            process.join(TIMEOUT_S)
+
+
+def _companion(port: int, logs: str) -> None:
+    flags = {"link.connect": (f"udpin:{LOOPBACK}:{port}",), "log.folder": logs, "log.minimum_free_mib": 0}
+    asyncio.run(run(load(None, flags, {}), lambda event: None))
+
+
+def _echo(port: int) -> None:
+    class Echo(asyncio.DatagramProtocol):
+        def connection_made(self, transport: Any) -> None:
+            self._transport = transport
+
+        def datagram_received(self, data: bytes, addr: Any) -> None:
+            self._transport.sendto(data, addr)
+
+    async def serve() -> None:
+        await asyncio.get_running_loop().create_datagram_endpoint(Echo, local_addr=(LOOPBACK, port))
+        await asyncio.Event().wait()
+
+    asyncio.run(serve())
