@@ -85,38 +85,39 @@ def rts(
 ) -> Smoothed:
     """The smoothed trajectory by a filter forward and a pass backward over its innovations nu.
 
-    Backward in the multipliers s and their covariance L (Bryson and Frazier, 1963), so that no predicted
-    covariance is inverted, which may be singular here; with J = I - K H,
+    Backward in the multipliers s (Bryson and Frazier, 1963) and the information M of what comes after, so
+    that no predicted covariance is inverted, which may be singular here; with Y = M_{i+1} + H' R^-1 H,
 
-        s_i = H' S^-1 nu + J' Phi_{i+1}' s_{i+1},        L_i = H' S^-1 H + J' Phi_{i+1}' L_{i+1} Phi_{i+1} J
-        x_{i|N} = x_{i|i} + P_{i|i} Phi_i' s_i,          P_{i|N} = P_{i|i} - P_{i|i} Phi_i' L_i Phi_i P_{i|i}
+        s_i = H' S^-1 nu + (I - K H)' Phi_{i+1}' s_{i+1},    M_i = Phi_i' (I + Y Q_i)^-1 Y Phi_i
+        x_{i|N} = x_{i|i} + P_{i|i} Phi_i' s_i,              P_{i|N} = (I + P_{i|i} M_i)^-1 P_{i|i}
 
-    which is Rauch, Tung and Striebel's where s_i = P_{i+1|i}^-1 (x_{i+1|N} - x_{i+1|i}) exists. The last
-    difference loses as many digits as P_{i|i} is greater than P_{i|N}.
+    which is Rauch, Tung and Striebel's where s_i = P_{i+1|i}^-1 (x_{i+1|N} - x_{i+1|i}) exists. No covariance
+    is a difference of greater ones. This and `two_point` still lose digits alike to a prior
+    wider by many powers of ten than what is learnt.
     """
     stages, m, B = stages_of(Phi, Gamma, D, H, R, z, m, B)
     N, n = len(stages), len(m)
     x, P = _forward(stages, m, B)
-    s, L = np.zeros((N, n)), np.zeros((n, n))
+    scale = _scale(stages, B)
+    s = np.zeros((N, n))
     theta, theta_P = [m] * N, [B] * N
-    back_s, back_L = np.zeros(n), np.zeros((n, n))  # Phi' s and Phi' L Phi of the stage after
+    back, M = np.zeros(n), np.zeros((n, n))  # Phi' s of the stage after, and what is known of x from after it
     for i in range(N - 1, -1, -1):
         stage = stages[i]
         predicted = kalman.predict(x[i], P[i], stage.Phi, stage.Q)
-        s[i], L = back_s, back_L
+        s[i] = back
+        x[i + 1] += P[i + 1] @ back
+        P[i + 1] = _tempered(P[i + 1], M, scale)
         if len(stage.z):
             G = kalman.gain(predicted.P, stage.H, stage.R)
-            J = np.eye(n) - G.K @ stage.H
-            HS = stage.H.T @ G.S_inverse
-            s[i] = HS @ (stage.z - stage.H @ predicted.x) + J.T @ back_s
-            L = HS @ stage.H + J.T @ back_L @ J
-        if i + 1 < N:
-            x[i + 1] += P[i + 1] @ back_s
-            P[i + 1] = _less(P[i + 1], back_L)
+            nu = stage.z - stage.H @ predicted.x
+            s[i] = back + stage.H.T @ (G.S_inverse @ nu - G.K.T @ back)
+            M = M + stage.H.T @ np.linalg.solve(stage.R, stage.H)
+        L = _tempered(M, predicted.P, 1.0 / scale)
         theta[i], theta_P[i] = _disturbance(stage, s[i], L)
-        back_s, back_L = stage.Phi.T @ s[i], stage.Phi.T @ L @ stage.Phi
-    x[0] += P[0] @ back_s
-    P[0] = _less(P[0], back_L)
+        back, M = stage.Phi.T @ s[i], stage.Phi.T @ _tempered(M, stage.Q, 1.0 / scale) @ stage.Phi
+    x[0] += P[0] @ back
+    P[0] = _tempered(P[0], M, scale)
     return Smoothed(x, P, s, tuple(theta), tuple(theta_P))
 
 
@@ -285,7 +286,10 @@ def _disturbance(stage: Stage, s: Array, L: Array) -> tuple[Array, Array]:
     return DG @ s, stage.D - DG @ L @ DG.T
 
 
-def _less(P: Array, L: Array) -> Array:
-    """P - P L P, exactly symmetric."""
-    difference: Array = P - P @ L @ P
-    return 0.5 * (difference + difference.T)
+def _tempered(A: Array, B: Array, scale: Array) -> Array:
+    """(I + A B)^-1 A for symmetric A, B >= 0, exactly symmetric; A's variables are of the size of `scale`."""
+    outer = np.outer(scale, scale)
+    a = A / outer
+    X = np.linalg.solve(np.eye(len(A)) + a @ (B * outer), a) * outer
+    symmetric: Array = 0.5 * (X + X.T)
+    return symmetric

@@ -6,7 +6,6 @@ order, the order it chooses, and whether the basis spans the signal at all. The 
 """
 
 import json
-import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -49,9 +48,7 @@ class Samples(NamedTuple):
 
 
 class Row(NamedTuple):
-    """One basis: what it chose, the short form's choice, and the true r.m.s. error, where it is known, by
-    the order chosen.
-    """
+    """One basis: what it chose, what the short form would, and the true r.m.s. error where it is known."""
 
     basis: str
     found: Order
@@ -188,7 +185,7 @@ def _plot(samples: Samples, rows: Sequence[Row], file: Path) -> None:
         right.plot(terms, row.found.criterion, ".-", color=line.get_color())
         least = float(row.found.criterion.min())
         right.plot(row.found.order, least, "o", color=line.get_color())
-    scale = max(min(math.inf, *(abs(float(row.found.criterion.min())) for row in rows)), 1e-3)
+    scale = max(min(abs(float(row.found.criterion.min())) for row in rows), 1e-3)
     right.set_yscale("symlog", linthresh=scale)
     left.set(xlabel="time, s")
     right.set(xlabel="terms", ylabel="estimated squared error")

@@ -297,6 +297,22 @@ def test_the_error_model_of_an_ins_for_a_flight() -> None:
 
 
 @pytest.mark.parametrize("solve", [smoother.rts, smoother.two_point])
+def test_a_prior_that_knows_nothing(solve: Any) -> None:
+    """Least squares without a prior; nothing negative comes of taking great covariances from each other."""
+    N = 30
+    rng = np.random.default_rng(0)
+    z = list(rng.standard_normal((N, 1)))
+    step = np.array([[1.0, 1.0], [0.0, 1.0]])
+    problem = [step] * N, [np.eye(2)] * N, [np.zeros((2, 2))] * N, [[1.0, 0.0]] * N, [1.0] * N, z
+    found = solve(*problem, np.zeros(2), 1e12 * np.eye(2))
+    A = np.column_stack((np.ones(N), np.arange(1.0, N + 1.0)))
+    np.testing.assert_allclose(found.P[0], np.linalg.inv(A.T @ A), rtol=1e-3)
+    best = np.linalg.lstsq(A, np.array(z)[:, 0], rcond=None)[0]
+    np.testing.assert_allclose(found.x[0], best, atol=1e-3)
+    assert np.linalg.eigvalsh(found.P).min() > 0.0
+
+
+@pytest.mark.parametrize("solve", [smoother.rts, smoother.two_point])
 def test_memory_grows_as_the_length(solve: Any) -> None:
     peak = []
     for N in (100, 200, 400):

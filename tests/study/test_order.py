@@ -1,12 +1,13 @@
 """`companion study order` tells the order, whether the basis spans the signal, and what a mistake was."""
 
 import json
+import pathlib
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from companion.study.order import command
+from companion.study.order import Samples, command, study
 
 
 def run(*arguments):
@@ -64,3 +65,12 @@ def test_bad_input_is_one_sentence(tmp_path, text, options, said):
     result = run(file, *options)
     assert result.exit_code == 2
     assert said in " ".join(result.output.split())
+
+
+def test_the_short_form_takes_nine_terms_for_a_cubic():
+    data = json.loads((pathlib.Path(__file__).parents[1] / "data/map_and_order.json").read_text())["order"]
+    t = np.linspace(0.0, 10.0, 101)
+    samples = Samples(t, np.array(data["z"]["cubic"]), 0.2 * (1.0 + 0.05 * t))
+    (row,) = study(samples, ["power"], 12)
+    assert row.found.order == data["results"]["cubic"]["power"]["r_J"] == 4
+    assert row.short == data["results"]["cubic"]["power"]["r_simple"] == 9
