@@ -37,6 +37,7 @@ class Link(Section, frozen=True):
 
     connect: tuple[str, ...] = ("udpin:127.0.0.1:14550",)  # each link is one; see `companion run --help`
     system_id: Annotated[int, Meta(ge=0, le=255)] = 0  # 0: take the autopilot's own
+    parameters_file: str = ""  # what ground stations set is kept here and read at the next start
     component_id: NodeId = 191  # MAV_COMP_ID_ONBOARD_COMPUTER; 197 is visual-inertial odometry
 
 
@@ -53,11 +54,14 @@ class Rates(Section, frozen=True):
 
 
 class Inertial(Section, frozen=True):
-    """The error model of the inertial channel: one standard deviation each.
+    """Which inertial channel is corrected, and the error model of an INS's: one standard deviation each.
 
-    The defaults are a navigation-grade unit (0.01 deg/h, 50 ug).
+    `source` "local_position" is an INS whose LOCAL_POSITION_NED takes no part of what we send; "air_data" is
+    dead reckoning of our own, by airspeed and attitude; "auto" is the latter wherever a position goes back to
+    the autopilot. The defaults of the error model are a navigation-grade unit (0.01 deg/h, 50 ug).
     """
 
+    source: Literal["auto", "local_position", "air_data"] = "local_position"
     gyro_drift_deg_h: Positive = 0.01
     gyro_correlation_h: Positive = 5.0
     angle_random_walk_deg_sqrt_h: NotNegative = 0.002
@@ -69,6 +73,22 @@ class Inertial(Section, frozen=True):
     heading_arcmin: Positive = 3.0
     velocity_noise_m_s_sqrt_s: Positive = 0.001
     height_sigma_m: Positive = 20.0
+
+
+class AirDataSection(Section, frozen=True):
+    """The error model of air-data dead reckoning: one standard deviation each.
+
+    Wind changes by `wind_change_m_s_sqrt_s` times the root of the seconds: 1.5 m/s a minute, 3 m/s in four.
+    """
+
+    wind_m_s: Positive = 10.0
+    wind_change_m_s_sqrt_s: Positive = 0.2
+    gust_m_s: Positive = 0.6
+    gust_s: Positive = 0.5
+    airspeed_percent: Positive = 2.0
+    heading_deg: Positive = 1.5
+    correlation_min: Positive = 10.0  # of the errors of airspeed and heading
+    wind_rate_m_s_min: Positive = 1.0  # r.m.s., for the guaranteed prediction
 
 
 class GnssSection(Section, frozen=True):
@@ -124,6 +144,11 @@ class Output(Section, frozen=True):
     status_hz: RateHz = 1.0
     global_position_sensor_id: Annotated[int, Meta(ge=0, le=255)] = 1
 
+    @property
+    def feeds_estimator(self) -> bool:
+        """Whether a position of ours goes into the autopilot's own."""
+        return self.odometry_hz > 0.0 or self.global_position_sensor_hz > 0.0
+
 
 class Log(Section, frozen=True):
     """Where flights are written."""
@@ -134,18 +159,36 @@ class Log(Section, frozen=True):
     maximum_files: Annotated[int, Meta(ge=1)] = 100
 
 
+class Signing(Section, frozen=True):
+    """MAVLink 2 signing; off while there is no key file (32 bytes or 64 hexadecimal digits, mode 0600)."""
+
+    key_file: str = ""
+    stamp_file: str = "signing.stamp"  # the last timestamp, so that a restart replays nothing
+    refuse_unsigned: bool = True
+    always_accepted: tuple[int, ...] = (109,)  # RADIO_STATUS comes from the radio itself
+
+
 class Config(Section, frozen=True):
     """Everything."""
 
     link: Link = Link()
     rates: Rates = Rates()
     inertial: Inertial = Inertial()
+    air_data: AirDataSection = AirDataSection()
     gnss: GnssSection = GnssSection()
     rsbn: Rsbn = Rsbn()
     predictor: Predictor = Predictor()
     estimator: Estimator = Estimator()
     output: Output = Output()
     log: Log = Log()
+    signing: Signing = Signing()
+
+    @property
+    def channel(self) -> Literal["local_position", "air_data"]:
+        """The inertial channel that `inertial.source` means, by what goes back to the autopilot."""
+        if self.inertial.source != "auto":
+            return self.inertial.source
+        return "air_data" if self.output.feeds_estimator else "local_position"
 
 
 def load(
@@ -153,21 +196,20 @@ def load(
     flags: Mapping[str, Any] | None = None,
     environment: Mapping[str, str] | None = None,
     pairs: Iterable[str] = (),
+    tuned: Path | None = None,
 ) -> Config:
     """The configuration of file `path`, then environment, then `flags` (keys "section.key", None: unset),
-    then `pairs` ("section.key=value", as typed).
+    then `pairs` ("section.key=value", as typed). `tuned`, what ground stations set, beats `path` and no more.
 
     Raises `ConfigError` where a file cannot be read, a key is unknown or a value impossible.
     """
-    try:
-        text = path.read_text(encoding="utf-8") if path else ""
-    except FileNotFoundError:
-        raise ConfigError(f"{path}: no such file; start from `companion check-config --defaults`") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: cannot be read ({error})") from None
-    tree = _tree(text, str(path))
-    _check_keys(tree, str(path))
-    origin = {(section, key): str(path) for section, table in tree.items() for key in table}
+    tree: dict[str, dict[str, Any]] = {}
+    origin: dict[tuple[str, str], str] = {}
+    for source in (path, tuned):
+        if source is not None:
+            for section, table in _read(source).items():
+                tree.setdefault(section, {}).update(table)
+                origin |= {(section, key): str(source) for key in table}
     for name, text in (os.environ if environment is None else environment).items():
         if name.startswith("COMPANION_") and "__" in name:
             section, key = name.removeprefix("COMPANION_").lower().split("__", 1)
@@ -209,6 +251,18 @@ def to_toml(config: Config) -> str:
         ]
         lines.append("")
     return "\n".join(lines)
+
+
+def _read(path: Path) -> dict[str, dict[str, Any]]:
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise ConfigError(f"{path}: no such file; start from `companion check-config --defaults`") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: cannot be read ({error})") from None
+    tree = _tree(text, str(path))
+    _check_keys(tree, str(path))
+    return tree
 
 
 def _tree(text: str, where: str) -> dict[str, dict[str, Any]]:

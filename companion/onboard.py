@@ -13,10 +13,11 @@ out.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any, Literal, Protocol
 
-from companion.config import Config, Rates
+from companion.config import Config, Rates, to_toml
+from companion.dialogue import Dialogue
 from companion.link import dialect
 from companion.link.session import (
     LinkLost,
@@ -24,20 +25,24 @@ from companion.link.session import (
     MessageReceived,
     NotUnderstood,
     Rebooted,
+    Refused,
     SecondAutopilot,
     Session,
 )
+from companion.link.signing import Signing
 from companion.navigator import Navigator
 from companion.records import (
     INPUTS,
     Event,
     LinkState,
     LocalOrigin,
+    Mode,
     Reboot,
     Rejection,
     RsbnFix,
     Solution,
     Stamped,
+    Tuning,
 )
 from companion.wire import Receiver, Sender, decode, encode
 
@@ -47,6 +52,10 @@ RSBN = dialect.type_named("RSBN_MEASUREMENT").msgid
 GPS_GLOBAL_ORIGIN = dialect.type_named("GPS_GLOBAL_ORIGIN").msgid
 REQUEST_MESSAGE = 512  # MAV_CMD
 ASK_ORIGIN_EVERY = 3 * SECOND
+STALE_AFTER = 2 * SECOND
+STANDBY, ACTIVE, CRITICAL = 3, 4, 5  # MAV_STATE
+#: COMMAND_INT and _LONG, PARAM_REQUEST_READ, PARAM_REQUEST_LIST, PARAM_SET.
+ASKING = frozenset({75, 76, 20, 21, 23})
 
 
 class Log(Protocol):
@@ -62,12 +71,14 @@ class Log(Protocol):
 class Link:
     """One link: its session, and how its autopilot's messages are read."""
 
-    def __init__(self, name: str, config: Config) -> None:
+    def __init__(self, name: str, config: Config, number: int, signing: Signing | None) -> None:
         self.name = name
         self.session = Session(
             component=config.link.component_id,
             autopilot_system=config.link.system_id or None,
             rates_hz=wanted(config.rates),
+            signing=signing,
+            link_id=number,
         )
         self.sender = Sender(self.session.clock)
         self.bad = 0
@@ -102,25 +113,25 @@ def wanted(rates: Rates) -> dict[str, float]:
 class Onboard:
     """Everything between the links' bytes and the log."""
 
-    def __init__(self, config: Config, log: Log, links: Iterable[str] = ("main",)) -> None:
+    def __init__(
+        self,
+        config: Config,
+        log: Log,
+        links: Iterable[str] = ("main",),
+        signing: Signing | None = None,
+        save: Callable[[str], None] = lambda text: None,
+    ) -> None:
+        """`save` keeps the TOML of what ground stations set; it may raise OSError."""
         self._config = config
         self._log = log
         self._navigator = Navigator(config)
-        self.links = {name: Link(name, config) for name in links}
+        self.links = {name: Link(name, config, number, signing) for number, name in enumerate(links)}
+        self._dialogue = Dialogue(config, {"NAVIGATION_STATUS": self._status}, save)
+        self._solution: Solution | None = None
         self._events: list[Event] = []
         self.rejected: Counter[str] = Counter()
         self._origin: LocalOrigin | None = None
-        output = config.output
-        self._periods = {
-            name: round(SECOND / hz)
-            for name, hz in (
-                ("ODOMETRY", output.odometry_hz),
-                ("GLOBAL_POSITION_SENSOR", output.global_position_sensor_hz),
-                ("NAVIGATION_STATUS", output.status_hz),
-            )
-            if hz > 0.0
-        }
-        self._due = dict.fromkeys(self._periods, 0)
+        self._due: dict[str, int] = {}
         self._state_at = 0
 
     def receive(self, link: str, data: bytes, now_ns: int) -> None:
@@ -137,14 +148,22 @@ class Onboard:
         if now_ns >= self._state_at:
             self._state_at = now_ns + SECOND
             for link in self.links.values():
+                link.session.state = self._system_state(now_ns)
                 self._log.record(self._state(link, now_ns))
 
     def deadline(self) -> int:
         """When `poll` must be called at the latest."""
-        return min(self._state_at, *(link.session.deadline() for link in self.links.values()))
+        due = [self._state_at, *(link.session.deadline() for link in self.links.values())]
+        if (news := self._dialogue.deadline()) is not None:
+            due.append(news)
+        return min(due)
 
     def to_send(self, link: str, now_ns: int) -> list[bytes]:
         """The frames that `link` must carry now; they are logged as sent."""
+        for message in self._dialogue.to_send(now_ns):
+            for each in self.links.values():
+                if each.session.is_up:
+                    each.session.send(message)
         frames = self.links[link].session.to_send()
         for data in frames:
             self._log.frame(link, True, data, now_ns)
@@ -175,6 +194,8 @@ class Onboard:
                 self._origin = None
                 self.note(4, f"{link.name}: autopilot {event.system} rebooted", now_ns)
                 self._on_record(Reboot(now_ns, now_ns, event.system))
+            elif isinstance(event, Refused):
+                self.rejected[f"{link.name}: {event.reason.name.lower()} frame"] += 1
             elif isinstance(event, SecondAutopilot):
                 text = (
                     f"{link.name}: a second autopilot, {event.system}, is ignored; we listen to {event.kept}"
@@ -183,6 +204,13 @@ class Onboard:
 
     def _on_message(self, link: Link, event: MessageReceived) -> None:
         self._log.frame(link.name, False, event.frame.raw, event.received_ns)
+        if event.frame.msgid in ASKING:
+            replies, config = self._dialogue.receive(event, link.session.system)
+            for reply in replies:
+                link.session.send(reply)
+            if config is not None:
+                self._config = config
+                self._on_record(Tuning(event.received_ns, event.received_ns, to_toml(config)))
         if not (event.from_autopilot or event.frame.msgid == RSBN):
             return
         for record in decode(event.message, event.received_ns, link.sender):
@@ -204,27 +232,46 @@ class Onboard:
         self._log.record(record, channel)
         if isinstance(record, Event):
             self._events.append(record)
+            self._dialogue.tell(record, record.rx_ns)
         elif isinstance(record, Rejection):
             self.rejected[record.source] += 1
 
     def _send(self, solution: Solution, news: bool) -> None:
         """The messages that are due, or all on the news of a beacon's fix, to every autopilot heard."""
-        names = [name for name, due in self._due.items() if news or solution.t_ns >= due]
+        self._solution = solution
+        periods = self._dialogue.periods_ns
+        names = [name for name in periods if news or solution.t_ns >= self._due.get(name, 0)]
         if not names:
             return
         for name in names:
-            self._due[name] = max(self._due[name] + self._periods[name], solution.t_ns)
+            self._due[name] = max(self._due.get(name, 0) + periods[name], solution.t_ns)
         for link in self.links.values():
             if link.session.is_up:
-                receiver = Receiver(
-                    link.sender.autopilot,
-                    link.session.autopilot or 0,
-                    origin=self._origin,
-                    sensor_id=self._config.output.global_position_sensor_id,
-                    rejected=self.rejected.total(),
-                )
-                for message in encode(solution, receiver, names):
+                for message in encode(solution, self._receiver(link), names):
                     link.session.send(message)
+
+    def _receiver(self, link: Link) -> Receiver:
+        return Receiver(
+            link.sender.autopilot,
+            link.session.autopilot or 0,
+            origin=self._origin,
+            sensor_id=self._config.output.global_position_sensor_id,
+            rejected=self.rejected.total(),
+        )
+
+    def _status(self) -> Any:
+        """NAVIGATION_STATUS for who asks for it, None before the first solution."""
+        if self._solution is None:
+            return None
+        link = next(iter(self.links.values()))
+        return next(iter(encode(self._solution, self._receiver(link), ("NAVIGATION_STATUS",))), None)
+
+    def _system_state(self, now_ns: int) -> int:
+        """MAV_STATE for our heartbeat: ACTIVE only while solutions come and can be trusted."""
+        if self._solution is None:
+            return STANDBY
+        stale = now_ns - self._solution.rx_ns > STALE_AFTER
+        return CRITICAL if stale or self._solution.mode is Mode.UNTRUSTED else ACTIVE
 
     def _ask_for(self, link: Link, msgid: int) -> None:
         link.session.send(

@@ -183,6 +183,12 @@ class Reboot(Stamped, frozen=True, gc=False, tag=True):
     system: int
 
 
+class Tuning(Stamped, frozen=True, gc=False, tag=True):
+    """A ground station set parameters: the whole configuration from here on, as TOML."""
+
+    toml: str
+
+
 class Truth(Stamped, frozen=True, gc=False, tag=True):
     """What only a simulator knows. It is logged and scored and never reaches the navigator."""
 
@@ -324,6 +330,7 @@ Input: TypeAlias = (
     | SystemTime
     | RsbnFix
     | Reboot
+    | Tuning
 )
 Output: TypeAlias = Solution | Fix | Rejection | Reset | Event
 Record: TypeAlias = Input | Output | LinkState | Truth

@@ -7,17 +7,20 @@ that breaks is opened again for ever, a disk that refuses is reported, and neith
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import random
 import signal
 import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Self
 
 import click
 
 from companion import __version__
 from companion.config import Config, ConfigError, load
+from companion.link.signing import Signing, read_key, store, stored
 from companion.link.transport import Address, CannotListen, Stream, connections
 from companion.log.file import Writer
 from companion.log.folder import open_log, recover_left
@@ -28,6 +31,48 @@ from companion.records import Event
 
 EX_UNAVAILABLE, EX_CANTCREAT = 69, 73  # sysexits.h
 LOG_CHECK_S = 1.0
+
+
+class Keys:
+    """MAVLink 2 signing with its key and the timestamp that must outlive a restart."""
+
+    def __init__(self, signing: Signing, stamp: Path) -> None:
+        self.signing, self._stamp = signing, stamp
+        signing.follow(time.time_ns(), time.monotonic_ns())
+
+    @classmethod
+    def of(cls, config: Config) -> Self | None:
+        """As the configuration says, None without a key. Raises ConfigError for an unusable key."""
+        settings = config.signing
+        if not settings.key_file:
+            return None
+        stamp = Path(settings.stamp_file)
+        try:
+            signing = Signing(
+                read_key(Path(settings.key_file)),
+                timestamp=stored(stamp),
+                refuse_unsigned=settings.refuse_unsigned,
+                always_accepted=settings.always_accepted,
+            )
+        except (OSError, ValueError) as error:
+            raise ConfigError(f"signing.key_file: {error}") from None
+        return cls(signing, stamp)
+
+    async def store(self) -> None:
+        """Keep the timestamp; a disk that refuses costs signed links a minute after the next start."""
+        if self.signing.wants_storing:
+            with contextlib.suppress(OSError):
+                await asyncio.to_thread(store, self._stamp, self.signing.to_store())
+
+
+def keep(config: Config) -> Callable[[str], None]:
+    """What keeps the parameters that ground stations set; nothing without a file for them."""
+
+    def save(text: str) -> None:
+        if config.link.parameters_file:
+            Path(config.link.parameters_file).write_text(text, encoding="utf-8")
+
+    return save
 
 
 class Service:
@@ -41,7 +86,9 @@ class Service:
         now: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         self._addresses = {text: Address.parse(text) for text in config.link.connect}
-        self.onboard = Onboard(config, log, self._addresses)
+        self._keys = Keys.of(config)
+        signing = self._keys.signing if self._keys else None
+        self.onboard = Onboard(config, log, self._addresses, signing, keep(config))
         self._log, self._tell, self._now = log, tell, now
         self._streams: dict[str, Stream] = {}
         self._stopped = asyncio.Event()
@@ -86,6 +133,8 @@ class Service:
                 text = f"log: {self._trouble}; navigation goes on" if self._trouble else "log: writing again"
                 self.onboard.note(4 if self._trouble else 6, text, now)
             self._flush()
+            if self._keys is not None:
+                await self._keys.store()
             await asyncio.sleep(max(0.0, min(1e-9 * (self.onboard.deadline() - self._now()), LOG_CHECK_S)))
 
     def _flush(self) -> None:
@@ -146,6 +195,8 @@ def command(file: Path | None, connect: tuple[str, ...], logs: str | None, pairs
     """
     flags = {"link.connect": connect or None, "log.folder": logs}
     config = load(file, flags, pairs=pairs)
+    if config.link.parameters_file and Path(config.link.parameters_file).exists():
+        config = load(file, flags, pairs=pairs, tuned=Path(config.link.parameters_file))
     begun = time.monotonic_ns()
 
     def tell(event: Event) -> None:

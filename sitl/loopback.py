@@ -71,11 +71,11 @@ def fly(
     """Fly `scenario` from start to end; `tell` is handed the seconds flown, once a second of flight."""
     autopilot, tap = Autopilot(scenario, START_NS), Tap(log)
     onboard = Onboard(config, tap, (LINK,))
-    now, told = START_NS, START_NS
+    now, told, due = START_NS, START_NS, START_NS
     while now <= autopilot.end_ns:
         for data in autopilot.poll(now):
             onboard.receive(LINK, data, now)
-        if now >= onboard.deadline():
+        if now >= due:
             onboard.poll(now)
         for data in onboard.to_send(LINK, now):
             autopilot.receive(data, now)
@@ -83,7 +83,8 @@ def fly(
         if tell is not None and now >= told:
             tell((now - START_NS) * 1e-9)
             told = now + SECOND
-        now = max(now + 1, min(autopilot.deadline(), onboard.deadline()))
+        due = onboard.deadline()
+        now = max(now + 1, min(autopilot.deadline(), due))
     return Flown(autopilot, tap.kept, onboard)
 
 

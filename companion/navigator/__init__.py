@@ -11,7 +11,7 @@ from bisect import bisect_right
 from collections import deque
 from typing import NamedTuple
 
-from companion.config import Config
+from companion.config import Config, parse
 from companion.records import (
     GlobalPosition,
     Gnss,
@@ -24,8 +24,10 @@ from companion.records import (
     Rejection,
     RsbnFix,
     Solution,
+    Tuning,
 )
 
+from . import guarantee
 from .carry import Carry, Settings, initial
 from .solution import announce, solve
 from .step import step
@@ -54,6 +56,9 @@ class Navigator:
 
     def handle(self, record: Input) -> list[Output]:
         """What follows from one more record."""
+        if isinstance(record, Tuning):
+            self._tune(parse(record.toml, "parameters"))
+            return []
         if not isinstance(record, FOLDED):
             return []
         if isinstance(record, Gnss) and not self._is_news(record):
@@ -65,7 +70,18 @@ class Navigator:
             while self._past[0].t_ns < record.t_ns - self._late_ns:
                 self._past.popleft()
             self._carry, outputs = step(self._carry, record, self._settings)
+        if isinstance(record, RsbnFix) and self._carry.rsbn_ns == record.t_ns:  # believed: tell at once
+            self._carry, solution = solve(self._carry, record.rx_ns, self._settings)
+            outputs = [*outputs, *solution]
         return self._announced(outputs)
+
+    def _tune(self, config: Config) -> None:
+        """Go on with another configuration; late measurements are no longer folded in from before it."""
+        self._settings = Settings.of(config)
+        self._late_ns = round(1e9 * config.estimator.late_s)
+        promise = guarantee.tuned(self._carry.guarantee, config.predictor)
+        self._carry = self._carry._replace(guarantee=promise)
+        self._past.clear()
 
     def _is_news(self, record: Gnss) -> bool:
         """A new fix of the receiver believed in: an autopilot repeats its last one for ever."""
@@ -83,7 +99,7 @@ class Navigator:
             ]
         place = bisect_right(self._past, record.t_ns, key=lambda past: past.t_ns)
         again = [record, *(past.record for past in list(self._past)[place:])]
-        self._carry = self._past[place].before
+        self._carry = self._rewound(self._past[place].before)
         while len(self._past) > place:
             self._past.pop()
         given: list[Output] = []
@@ -92,10 +108,13 @@ class Navigator:
             self._carry, outputs = step(self._carry, each, self._settings)
             if each is record:
                 given = [out for out in outputs if not isinstance(out, Solution) or out.t_ns > self._given_ns]
-        if isinstance(record, RsbnFix):
-            self._carry, solution = solve(self._carry, record.rx_ns, self._settings)
-            given += solution
         return given
+
+    def _rewound(self, before: Carry) -> Carry:
+        """An earlier carry, to fold forward from: what was forecast since is not forecast again."""
+        now = self._carry
+        promise = before.guarantee._replace(held=now.guarantee.held)
+        return before._replace(guarantee=promise, ahead=now.ahead, next_ahead_ns=now.next_ahead_ns)
 
     def _announced(self, outputs: list[Output]) -> list[Output]:
         """With an event wherever the mode of what is given out changes."""

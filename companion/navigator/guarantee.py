@@ -62,6 +62,13 @@ def begin(settings: Predictor) -> Guarantee:
     return Guarantee(window, window)
 
 
+def tuned(g: Guarantee, settings: Predictor) -> Guarantee:
+    """What was learnt, under other settings."""
+    fresh = begin(settings).north
+    north, east = (replace(w, span=fresh.span, disturbance=fresh.disturbance) for w in (g.north, g.east))
+    return Guarantee(north, east, g.bins)
+
+
 def learn(
     g: Guarantee, t_ns: int, quantity: Quantity, value: Vector2, sigma: Vector2, settings: Predictor
 ) -> Guarantee:
