@@ -26,6 +26,7 @@ COMMANDS = {
 }
 STUDIES = {
     "horizon": "companion.study.horizon:command",
+    "order": "companion.study.order:command",
     "schuler": "companion.study.schuler_data:command",
     "weights": "companion.study.weights:command",
     "restrictive": "companion.study.restrictive:command",
