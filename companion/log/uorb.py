@@ -61,7 +61,7 @@ def _gnss(row: Row, t: int) -> Iterator[Stamped]:
         t,
         t,
         receiver=0,
-        stamp_us=int(row["time_utc_usec"]),
+        stamp_us=t // 1000,  # a row is a fix; the receiver's time_utc_usec may step once a second only
         fix=int(row["fix_type"]),
         lat=math.radians(int(row["lat"]) / 1e7),
         lon=math.radians(int(row["lon"]) / 1e7),
