@@ -20,10 +20,11 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from scipy.linalg import eigh
 
 from companion.config import Config
 from companion.nav.geometry import Geodetic, displace
-from companion.navigator import FOLDED, errorstate, inertial
+from companion.navigator import FOLDED, inertial
 from companion.navigator.carry import Carry, Settings, initial, level, state_at
 from companion.navigator.errorstate import ErrorState
 from companion.navigator.inertial import Point
@@ -35,10 +36,7 @@ Floats = npt.NDArray[np.float64]
 EVERY_NS = 1_000_000_000
 NEVER_NS = 2**63 - 1
 REACH_NS = 2_000_000_000  # stops farther apart than this are not joined
-#: What no fix sees at once, tilts, gyro drifts and accelerometer errors: given position, velocity and the
-#: drift of GNSS, a fix leaves their conditional covariance as it was. If it grew, the navigator widened P.
-HIDDEN = np.arange(4, 12)
-WIDENED = 1.0 + 1e-3
+WIDENED = 1.0 + 1e-3  # a factor below this is rounding
 
 
 class Flight(NamedTuple):
@@ -206,20 +204,15 @@ def _arrival(carry: Carry, ins: Point, settings: Settings) -> _Stop:
     state = state_at(carry, ins, settings)
     if carry.state is None:
         return _Stop(ins, state, state.x, None, state.P)
-    unit = ErrorState(carry.state.t_ns, np.eye(errorstate.N), np.zeros_like(state.P))
+    unit = ErrorState(carry.state.t_ns, np.eye(len(state.x)), np.zeros_like(state.P))
     one = state_at(carry._replace(state=unit), ins, settings)
     return _Stop(ins, state, state.x, one.x, one.P)
 
 
 def _corrected(stop: _Stop, state: ErrorState) -> _Stop:
     """The stop once a fix made `state` of it, P having been widened first or not."""
-    before, after = (_information(P) for P in (stop.state.P, state.P))
-    factor = float(np.median(before[HIDDEN] / after[HIDDEN]))
+    scale = np.sqrt(np.diag(stop.state.P))
+    outer = np.outer(scale, scale)
+    # a fix makes some combinations of the states better known and leaves the others as they were
+    factor = float(eigh(state.P / outer, stop.state.P / outer, eigvals_only=True)[-1])
     return stop._replace(state=state, fixed=True, widened=factor if factor > WIDENED else 1.0)
-
-
-def _information(P: Floats) -> Floats:
-    """The diagonal of P^-1."""
-    scale = np.sqrt(np.diag(P))
-    inverse: Floats = np.diag(np.linalg.inv(P / np.outer(scale, scale))) / scale**2
-    return inverse

@@ -28,7 +28,7 @@ def flown(seed: int, after: Any = 0.0) -> Any:
 
 @pytest.mark.parametrize("model", [MODEL, None])
 def test_false_alarms_are_rarer_than_allowed(model: Any) -> None:
-    allowed, runs = 0.1, 300
+    allowed, runs = 0.1, 100
     alarms = 0
     for seed in range(runs):
         z = flown(seed) if model is not None else SIGMA * np.random.default_rng(seed).standard_normal(len(T))
