@@ -81,11 +81,9 @@ def read_tables(path: Path) -> Iterator[Stamped]:
     return heapq.merge(onboard, fixes, _imu(columns["IMU"]), told, key=lambda record: record.t_ns)
 
 
-def is_tables(path: Path) -> bool:
-    """Whether the tables are there, in a folder or a `.zip`."""
-    if path.is_dir():
-        return (path / "GPOSonboard.txt").exists()
-    return path.suffix.lower() == ".zip"
+def is_tables(folder: Path) -> bool:
+    """Whether a folder holds the tables."""
+    return (folder / "GPOSonboard.txt").exists()
 
 
 def _table(path: Path, name: str, width: int) -> Floats:

@@ -12,16 +12,26 @@ positions of one instant.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from companion.link.session import LinkUp, MessageReceived, Rebooted, SecondAutopilot, Session
-from companion.log import tlog, uorb
+from companion.log import dataflash, inertialnav, tlog, ulog, uorb
+from companion.log.opened import LogError
 from companion.nav.geometry import Geodetic, Projection, local_to_geodetic, wrap
-from companion.records import Event, FilterStatus, GlobalPosition, LocalOrigin, LocalPosition, Reset, Stamped
+from companion.records import (
+    Event,
+    FilterStatus,
+    GlobalPosition,
+    LocalOrigin,
+    LocalPosition,
+    Reboot,
+    Reset,
+    Stamped,
+)
 from companion.wire import Autopilot, Sender, decode
 
 _WARNING, _INFO = 4, 6  # MAV_SEVERITY
@@ -134,28 +144,50 @@ def _origin_between(local: LocalPosition, known: GlobalPosition, projection: Pro
     return LocalOrigin(known.t_ns, rx_ns, origin.lat, origin.lon, origin.alt, projection)
 
 
-class UorbSource:
-    """The records of a folder of PX4 topics; the counts are of records, for there are no frames."""
+class OnboardSource:
+    """A log written on board, read once; the counts are of records, for there are no frames."""
 
-    def __init__(self, folder: Path) -> None:
-        self._read = uorb.read(folder)
-        self.records = 0
+    def __init__(self, records: Iterable[Stamped]) -> None:
+        self._read = records
+        self.reboots = self.records = 0
 
     def __iter__(self) -> Iterator[Stamped]:
-        """Records in order of time."""
+        """Records in the order of the log."""
         for record in self._read:
             self.records += 1
+            self.reboots += isinstance(record, Reboot)
             yield record
 
     def summary(self) -> Summary:
         """The counts so far."""
-        return Summary(self.records, 0, 0, 0, 0, self.records)
+        return Summary(self.records, 0, 0, 0, self.reboots, self.records)
 
 
-def open_source(path: Path, autopilot_system: int | None = None) -> TlogSource | UorbSource:
-    """Open a `.tlog` or a folder of PX4 topics. ValueError, one sentence, if it is neither."""
+_READERS: dict[str, Callable[[Path], Iterable[Stamped]]] = {
+    ".bin": dataflash.read,
+    ".log": dataflash.read,
+    ".ulg": ulog.read,
+    ".mat": inertialnav.read_matlab,
+    ".zip": inertialnav.read_tables,
+}
+
+
+def open_source(path: Path, autopilot_system: int | None = None) -> TlogSource | OnboardSource:
+    """Open a log of another recorder by its name: a `.tlog`, one written on board, or a folder of topics.
+
+    ValueError or LogError, one sentence, if there is none or it is of no kind that is read.
+    """
+    kind = path.suffix.lower()
+    if kind != ".tlog" and kind not in _READERS and not path.is_dir():
+        raise ValueError(
+            f"{path} is of no kind that is read here: give a .tlog, {', '.join(_READERS)} or a folder of topics"
+        )
+    if not path.exists():
+        raise LogError(f"{path}: no such log")
     if path.is_dir():
-        return UorbSource(path)
-    if path.suffix.lower() != ".tlog":
-        raise ValueError(f"{path} is of no kind that is read here: give a .tlog or a folder of PX4 topics")
-    return TlogSource(tlog.read(path), autopilot_system)
+        return OnboardSource(
+            inertialnav.read_tables(path) if inertialnav.is_tables(path) else uorb.read(path)
+        )
+    if kind == ".tlog":
+        return TlogSource(tlog.read(path), autopilot_system)
+    return OnboardSource(_READERS[kind](path))
