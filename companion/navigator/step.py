@@ -144,9 +144,7 @@ def _rsbn(carry: Carry, record: RsbnFix, settings: Settings) -> Step:
         together = radio.Heard(
             record.t_ns, heard.observations + gnss.observations, heard.sources | gnss.sources
         )
-    carry, out = _learn(carry, together, ins, record, settings)
-    carry, solution = solve(carry, record.rx_ns, settings)
-    return carry, [*out, *solution]
+    return _learn(carry, together, ins, record, settings)
 
 
 def _absorb(
