@@ -5,15 +5,17 @@ from there to the companion's clock, local = boot + offset:
 
   arrival   Every stamped message gives arrival - stamp = offset + delay with delay >= 0, so the offset lies
             on the lower envelope of what arrives. The envelope may rise slowly (DRIFT), as fast as two
-            crystals may part. It is there from the first message, needs no answer, and errs by the least
+            crystals may part, and at once to the least delay of the last WINDOW: a simulator's clock may run
+            slow by a hundredth. It is there from the first message, needs no answer, and errs by the least
             delay (late).
   TIMESYNC  The autopilot's clock read between two readings of ours: offset = middle - reading, in error by
             half the round trip at most. Among recent answers the one of least round trip is believed, a
             little less with every second of its age. Preferred while it is fresh and agrees with the
             arrivals.
 
-A stamp that goes back by seconds is a reboot: everything is forgotten and begun again. (So is the wrap of a
-32-bit millisecond stamp after 49.7 days.)
+Stamps that go back by seconds are a reboot: everything is forgotten and begun again. (So is the wrap of a
+32-bit millisecond stamp after 49.7 days.) One alone may be a straggler or a false one: it is believed when the
+next agrees with it.
 """
 
 from __future__ import annotations
@@ -24,8 +26,10 @@ from typing import NamedTuple
 SECOND = 1_000_000_000
 #: How fast two clocks may part: crystals at the ends of the temperature range.
 DRIFT = 100e-6
-#: A stamp this much older than the newest one means a reboot.
+#: Two stamps this much older than the newest one mean a reboot.
 BACK = 3 * SECOND
+#: The envelope is never below the least delay heard in so long.
+WINDOW = 20 * SECOND
 #: Arrivals that fall below the envelope by more tell that the autopilot's clock was set.
 JUMP = 1 * SECOND
 #: A TIMESYNC reading that makes the last arrival early, or later than any link is, is of another clock.
@@ -56,6 +60,9 @@ class BootClock:
         self._envelope: int | None = None
         self._envelope_at = 0
         self._seen = 0  # the last arrival - stamp
+        # Of the last WINDOW, (arrival, arrival - stamp), increasing in both: the first is the least.
+        self._least: deque[tuple[int, int]] = deque()
+        self._back: tuple[int, int] | None = None  # a stamp gone back, and its arrival - stamp
         self._answers: deque[Answer] = deque(maxlen=8)
         self._best: Answer | None = None
         self._unix_minus_boot: int | None = None
@@ -63,11 +70,23 @@ class BootClock:
 
     def heard(self, boot: int, received: int) -> bool:
         """Take the stamp of a message that was stamped when sent. Returns True if it tells of a reboot."""
-        rebooted = boot < self._newest - BACK
-        if rebooted:
+        seen = received - boot
+        rebooted = False
+        if boot < self._newest - BACK:
+            doubted, self._back = self._back, (boot, seen)
+            if doubted is None or boot < doubted[0] or abs(seen - doubted[1]) > BACK:
+                return False
+            rebooted = True
             self._reset()
+        self._back = None
         self._newest = max(self._newest, boot)
-        self._seen = seen = received - boot
+        self._seen = seen
+        least = self._least
+        while least and least[-1][1] >= seen:
+            least.pop()
+        least.append((received, seen))
+        while least[0][0] < received - WINDOW:
+            least.popleft()
         if self._envelope is None:
             self._envelope = seen
         else:
@@ -75,7 +94,7 @@ class BootClock:
             if seen < raised - JUMP:
                 self._answers.clear()
                 self._best = None
-            self._envelope = min(raised, seen)
+            self._envelope = max(min(raised, seen), least[0][1])
         self._envelope_at = received
         return rebooted
 
