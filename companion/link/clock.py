@@ -14,8 +14,8 @@ from there to the companion's clock, local = boot + offset:
             arrivals.
 
 Stamps that go back by seconds are a reboot: everything is forgotten and begun again. (So is the wrap of a
-32-bit millisecond stamp after 49.7 days.) One alone may be a straggler or a false one: it is believed when the
-next agrees with it.
+32-bit millisecond stamp after 49.7 days.) One alone may be a straggler or a false one: it is believed when
+the next agrees with it.
 """
 
 from __future__ import annotations

@@ -18,6 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from companion.link import dialect
 from companion.link.session import LinkUp, MessageReceived, Rebooted, SecondAutopilot, Session
 from companion.log import dataflash, inertialnav, tlog, ulog, uorb
 from companion.log.opened import LogError
@@ -36,6 +37,7 @@ from companion.wire import Autopilot, Sender, decode
 
 _WARNING, _INFO = 4, 6  # MAV_SEVERITY
 _GPS_GLOBAL_ORIGIN = 49
+_RSBN = dialect.type_named("RSBN_MEASUREMENT").msgid  # a beacon receiver is a component of its own
 _POSITION_ABSOLUTE = 16  # EKF_POS_HORIZ_ABS and ESTIMATOR_POS_HORIZ_ABS
 _MAKES: dict[int, Autopilot] = {3: "ardupilot", 12: "px4"}  # MAV_AUTOPILOT
 
@@ -63,7 +65,7 @@ class TlogSource:
         self._origin = None if told else OriginFinder()
 
     def __iter__(self) -> Iterator[Stamped]:
-        """Records in order of arrival: inputs, truth, rejections, and a Reset at each reboot."""
+        """Records in order of arrival: inputs, truth, rejections, and a Reset and a Reboot where one was."""
         for rx_ns, found in self.log:
             for event in self._session.receive(found.raw, rx_ns):
                 for record in self._records(event):
@@ -78,7 +80,7 @@ class TlogSource:
 
     def _records(self, event: object) -> Iterator[Stamped]:
         match event:
-            case MessageReceived(rx_ns, message, _, True):
+            case MessageReceived(rx_ns, message, found, ours) if ours or found.msgid == _RSBN:
                 for record in decode(message, rx_ns, self._sender):
                     yield record
                     if self._origin and (origin := self._origin.see(record, self._sender.autopilot)):
@@ -91,6 +93,7 @@ class TlogSource:
                 self.reboots += 1
                 self._origin = self._origin and OriginFinder()
                 yield Reset(at_ns, at_ns, "flight", f"autopilot {system} began anew: its boot time went back")
+                yield Reboot(at_ns, at_ns, system)
             case SecondAutopilot(at_ns, system, kept):
                 yield Event(at_ns, at_ns, _WARNING, f"autopilot {system} is ignored: {kept} is the vehicle's")
 

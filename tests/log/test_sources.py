@@ -111,6 +111,7 @@ def test_a_cut_of_a_real_flight_has_its_damage_counted_and_its_reboot_found() ->
         messages=841, corrupt=24, unknown=0, torn=13, reboots=1, records=len(heard)
     )
     resets = [record for record in heard if isinstance(record, r.Reset)]
+    assert [record.system for record in heard if isinstance(record, r.Reboot)] == [1]
     assert [reset.what for reset in resets] == ["flight"]
     assert [record.rx_ns for record in heard] == sorted(record.rx_ns for record in heard)
     assert all(record.t_ns <= record.rx_ns for record in heard)
@@ -130,6 +131,20 @@ def test_the_clock_begins_anew_at_the_reboot() -> None:
     first = attitudes.pop(49)  # after the reboot: alone it may be a straggler, as far as anyone can tell
     assert first.t_ns < first.rx_ns
     assert all(record.t_ns == record.rx_ns for record in attitudes)
+
+
+def test_a_beacon_receiver_beside_the_autopilot_is_heard() -> None:
+    message = dialect.new(
+        "RSBN_MEASUREMENT",
+        beacon_lat=600_000_000,
+        beacon_lon=310_000_000,
+        slant_range=5e4,
+        beacon_id=7,
+        status=2,
+    )
+    log = entry(0, heartbeat()) + entry(1, frame.encode(message, 0, 1, 42))
+    fixes = [record for record in sources.TlogSource(tlog.Tlog(log)) if isinstance(record, r.RsbnFix)]
+    assert [fix.beacon for fix in fixes] == [7]
 
 
 def test_the_origin_is_inferred_where_no_message_tells_it() -> None:
