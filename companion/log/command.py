@@ -54,6 +54,20 @@ def recover_command(log: Path) -> None:
         )
 
 
+@group.command("convert")
+@click.argument("source", type=click.Path(path_type=Path))
+@click.option("-o", "--output", type=click.Path(path_type=Path), required=True, help="The MCAP to write.")
+def convert_command(source: Path, output: Path) -> None:
+    """Write the records of SOURCE, a log of another recorder, as MCAP: inputs and truth, nothing computed."""
+    from . import convert
+
+    try:
+        written = convert.convert(source, output)
+    except LogError as error:
+        _fail(error)
+    click.echo(f"{output}: {written.records} records, {written.reboots} reboots")
+
+
 def _print(found: Info) -> None:
     console = Console()
     rate = 1.0 / found.duration_s if found.duration_s > 0 else 0.0

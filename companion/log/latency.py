@@ -195,6 +195,18 @@ def events(tracks: Iterable[Track]) -> Iterator[Event]:
             )
 
 
+def sentences(tracks: Iterable[Track]) -> Iterator[str]:
+    """For a person: the delay of each boot that can be told, then its glitches."""
+    for track in tracks:
+        if found := estimate(track):
+            yield (
+                f"GNSS is {found.seconds:.2f} s (sigma {found.sigma:.2f}) behind the local position: median"
+                f" distance {found.before:.2f} m, {found.after:.2f} m without it ({found.pairs} fixes)"
+            )
+        for event in events([track]):
+            yield f"{(event.t_ns - track.zero_ns) * 1e-9:.1f} s after the first: {event.text}"
+
+
 def _delay(track: Track, t: Floats, x: Floats) -> float:
     def cost(tau: float) -> float:
         difference = _difference(track, t, x, tau)

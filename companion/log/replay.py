@@ -3,31 +3,37 @@ bit.
 
 An MCAP log of ours holds what went into the navigator, what came out and the configuration: its inputs are
 handed in again and every output is compared. Any other log has inputs only (`log.sources`); what comes out is
-written.
+written. So it is where the replay is to differ from the flight: another configuration (--with), beacons that
+were not heard (--rsbn), fixes that did not come (--outage).
 """
 
 from __future__ import annotations
 
+import heapq
 import json
+import re
 import time
 from collections import Counter
-from collections.abc import Iterable, Iterator
-from itertools import zip_longest
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from itertools import chain, zip_longest
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import click
+from msgspec import structs
 from rich.console import Console
 from rich.progress import Progress
 
 from companion import __version__
-from companion.config import Config, load, parse, to_toml
-from companion.log import file, sources
-from companion.log.opened import LogError
+from companion.config import Config, ConfigError, load, parse, to_toml
+from companion.log import file, latency, simulate, sources
+from companion.log.opened import ACTIVE, LogError
 from companion.navigator import Navigator
 from companion.records import INPUTS, OUTPUTS, Solution, Stamped
 
 CONFIGURATION = "configuration"  # the metadata record, and its key `toml`
+CONVERTED = "converted"  # the metadata record of a log that never flew with us, and its key `from`
 
 
 class Replayed(NamedTuple):
@@ -101,11 +107,114 @@ def replay_foreign(records: Iterable[Stamped], config: Config, sink: Any) -> Rep
     return Replayed(inputs, dict(outputs), None, 0, None)
 
 
-def writer(path: Path, config: Config, start_ns: int, start_unix_ns: int) -> file.Writer:
+def writer(
+    path: Path, described: Mapping[str, Mapping[str, str]], start_ns: int = 0, start_unix_ns: int = 0
+) -> file.Writer:
     """A log for a replay: it waits for the disk, since nobody flies by it."""
-    return file.Writer(
-        path, metadata=metadata(config), start_unix_ns=start_unix_ns, start_ns=start_ns, block=True
-    )
+    return file.Writer(path, metadata=described, start_unix_ns=start_unix_ns, start_ns=start_ns, block=True)
+
+
+def changed(config: Config, text: str) -> Config:
+    """`config` with KEY=VALUE,... as typed: SECTION.KEY, or KEY alone where one section has it, or
+    `estimator` for estimator.output. ConfigError, one sentence, where there is no such key or value.
+    """
+    for pair in re.split(r",(?=[A-Za-z_.]+=)", text):
+        name, _, value = pair.partition("=")
+        name = _full_name(name.strip())
+        try:
+            told = load(environment={}, pairs=[f"{name}={value}"])
+        except ConfigError as error:
+            raise ConfigError(str(error).replace("--set", "--with")) from None
+        section, key = name.split(".")
+        table = structs.replace(getattr(config, section), **{key: getattr(getattr(told, section), key)})
+        config = structs.replace(config, **{section: table})
+    return config
+
+
+def _full_name(name: str) -> str:
+    if "." in name:
+        return name
+    if name == "estimator":
+        return "estimator.output"
+    having = [section for section in Config.__struct_fields__ if hasattr(getattr(Config(), section), name)]
+    if len(having) == 1:
+        return f"{having[0]}.{name}"
+    why = f"sections {', '.join(having)} have one each" if having else "no section has it"
+    raise ConfigError(f"--with {name}: {why}; write it as SECTION.KEY=VALUE, for example gnss.sigma_m=3.0")
+
+
+class Opened(NamedTuple):
+    """The inputs of any log, and what it was given for its times: `summary` counts once they are read."""
+
+    records: Iterable[Stamped]
+    summary: Callable[[], dict[str, int]]
+
+
+def inputs(log: Path) -> Opened:
+    """What went into a navigator in `log`, ours or a foreign one, with the truth where it has any.
+
+    LogError, one sentence, where it cannot be read.
+    """
+    if is_own(log):
+        return Opened(_own_inputs(log), dict)
+    with sentences():
+        source = sources.open_source(log)
+    return Opened(source, lambda: source.summary()._asdict())
+
+
+def is_own(log: Path) -> bool:
+    """Whether the name is that of a log of ours."""
+    return log.suffix == ".mcap" or log.name.endswith(f".mcap{ACTIVE}")
+
+
+def _own_inputs(log: Path) -> Iterator[Stamped]:
+    for entry in file.read(log):
+        if entry.topic.split("/")[1] in ("in", "truth"):
+            yield entry.value
+
+
+@contextmanager
+def sentences() -> Iterator[None]:
+    """What a foreign log's reader says in a ValueError is for the person who gave the log."""
+    try:
+        yield
+    except ConfigError:
+        raise
+    except ValueError as error:
+        raise LogError(str(error)) from None
+    except LogError:
+        raise
+    except OSError as error:
+        raise LogError(f"{error.filename} cannot be read: {error.strerror}") from None
+
+
+def with_radio(
+    log: Path, beacons: Path | None, outages: Sequence[simulate.Outage], seed: int, config: Config
+) -> tuple[Opened, str]:
+    """The inputs of `log` with beacons heard and outages had, and a sentence about the beacons.
+
+    The log is read twice where there are beacons: once for its track.
+    """
+    opened = inputs(log)
+    if beacons is None and not outages:
+        return opened, ""
+    records = iter(opened.records)
+    first = next(records, None)
+    if first is None:
+        raise LogError(f"{log} holds no message: there is nothing to replay")
+    merged, note = chain([first], records), ""
+    if beacons is not None:
+        track = simulate.track_of(inputs(log).records, config)
+        heard = simulate.answers(simulate.read_beacons(beacons), track, seed)
+        numbers = sorted({answer.beacon for answer in heard})
+        note = (
+            f"{len(heard)} RSBN answers of {len(numbers)} beacons ({', '.join(map(str, numbers))}) simulated"
+            f" along {track.origin}, seed {seed}"
+            if heard
+            else f"no beacon of {beacons} is in radio sight along {track.origin}"
+        )
+        merged = heapq.merge(merged, heard, key=lambda record: record.rx_ns)  # type: ignore[assignment]
+    return Opened(simulate.without(merged, outages, first.rx_ns), opened.summary), note
 
 
 @click.command("replay")
@@ -114,46 +223,118 @@ def writer(path: Path, config: Config, start_ns: int, start_unix_ns: int) -> fil
     "-o", "--output", type=click.Path(path_type=Path), help="Where to write the MCAP of this replay."
 )
 @click.option("--config", "config_file", type=click.Path(path_type=Path), help="Fly with this configuration.")
+@click.option(
+    "--with", "changes", multiple=True, metavar="KEY=VALUE,...", help="Fly with these keys changed."
+)
+@click.option("--rsbn", "beacons", type=click.Path(path_type=Path), help="Hear the beacons of this CSV.")
+@click.option(
+    "--outage",
+    "outages",
+    multiple=True,
+    metavar="GNSS:FROM-TO",
+    help="Be deaf to GNSS or RSBN, s of the log.",
+)
+@click.option("--seed", type=click.IntRange(min=0), default=0, help="Of the simulated beacons' noise.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
-def command(log: Path, output: Path | None, config_file: Path | None, as_json: bool) -> None:
-    """Run the navigator over LOG: an MCAP of ours (outputs compared bit for bit), or a MAVLink .tlog.
+def command(
+    log: Path,
+    output: Path | None,
+    config_file: Path | None,
+    changes: tuple[str, ...],
+    beacons: Path | None,
+    outages: tuple[str, ...],
+    seed: int,
+    as_json: bool,
+) -> None:
+    """Run the navigator over LOG: an MCAP of ours (outputs compared bit for bit), or another recorder's.
 
-    A foreign log's replay is written to OUTPUT (by default beside you, as NAME.replay.mcap).
+    Read are MAVLink .tlog, ArduPilot .bin and .log, PX4 .ulg and folders of topics as CSV, InertialNav's .mat
+    and .zip. What differs from a flight of ours is written to OUTPUT (by default beside you, as
+    NAME.replay.mcap). The CSV of beacons has columns id, lat_deg, lon_deg, alt_m and, if you like, range_m;
+    OurAirports' navaids.csv is read too.
     """
     begun = time.perf_counter()
-    own = log.suffix == ".mcap" or log.name.endswith(".mcap.active")
+    try:
+        silent = [simulate.parse_outage(text) for text in outages]
+    except ValueError as error:
+        raise click.UsageError(str(error)) from None
+    own = is_own(log)
     config = load(config_file) if config_file or not own else configuration(log)
+    for text in changes:
+        config = changed(config, text)
+    notes: list[str] = []
     counts: dict[str, int] = {}
-    if own:
-        first = next(iter(file.read(log)), None)
-        if first is None:
-            raise LogError(f"{log} holds no message: there is nothing to replay")
-        sink = None
-        if output is not None:
-            start_ns = getattr(first.value, "rx_ns", 0)
-            sink = writer(output, config, start_ns, first.log_time)
-        found = replay_own(log, config, sink)
+    if own and CONVERTED not in file.metadata(log) and not (changes or beacons or silent):
+        found = _compare(log, output, config)
     else:
-        output = output or Path(log.with_suffix(".replay.mcap").name)
-        source = sources.open_source(log)
-        with Progress(console=Console(stderr=True), transient=True) as progress:
-            records = progress.track(_peeked(source), description=f"replay {log.name}")
-            sink = writer(output, config, 0, 0)  # a tlog's times are UNIX already
-            found = replay_foreign(records, config, sink)
-        counts = source.summary()._asdict()
-    if sink is not None:
-        sink.close()
+        output = output or Path(f"{log.name.split('.mcap')[0] if own else log.stem}.replay.mcap")
+        with sentences():
+            found, notes, counts = _fly(log, output, config, beacons, silent, seed)
     seconds = time.perf_counter() - begun
     if as_json:
-        click.echo(json.dumps({"log": str(log), **counts, **found._asdict(), "seconds": round(seconds, 3)}))
+        report = {"log": str(log), **counts, **found._asdict(), "notes": notes, "seconds": round(seconds, 3)}
+        click.echo(json.dumps(report))
     else:
         _print(log, output, counts, found, seconds)
+        for note in notes:
+            click.echo(f"  {note}")
     if found.different:
         raise SystemExit(1)
 
 
-def _peeked(source: Iterable[Stamped]) -> Iterator[Stamped]:
-    yield from source
+def _compare(log: Path, output: Path | None, config: Config) -> Replayed:
+    """A log of ours as it flew."""
+    first = next(iter(file.read(log)), None)
+    if first is None:
+        raise LogError(f"{log} holds no message: there is nothing to replay")
+    sink = None
+    if output is not None:
+        sink = writer(output, metadata(config), getattr(first.value, "rx_ns", 0), first.log_time)
+    found = replay_own(log, config, sink)
+    if sink is not None:
+        sink.close()
+    return found
+
+
+def _fly(
+    log: Path,
+    output: Path,
+    config: Config,
+    beacons: Path | None,
+    outages: Sequence[simulate.Outage],
+    seed: int,
+) -> tuple[Replayed, list[str], dict[str, int]]:
+    """Any log, otherwise than it flew, written to `output`: what came out, notes for the reader, counts."""
+    opened, note = with_radio(log, beacons, outages, seed, config)
+    watch = latency.Watch()
+    with Progress(console=Console(stderr=True), transient=True) as progress:
+        records = progress.track(_watched(opened.records, watch), description=f"replay {log.name}")
+        sink = writer(output, metadata(config), *_start(log))
+        try:
+            found = replay_foreign(records, config, sink)
+            tracks = watch.tracks()
+            for event in latency.events(tracks):
+                sink.record(event, "/link/Event")
+        finally:
+            sink.close()
+    notes = [note] if note else []
+    if outages:
+        notes.append("the log's local position is as the autopilot had it, its own GNSS included")
+    return found, [*notes, *latency.sentences(tracks)], opened.summary()
+
+
+def _start(log: Path) -> tuple[int, int]:
+    """A record's time and the wall clock's at it: a foreign log's times are UNIX already, or since boot."""
+    if not is_own(log):
+        return 0, 0
+    first = next(iter(file.read(log)), None)
+    return (0, 0) if first is None else (getattr(first.value, "rx_ns", 0), first.log_time)
+
+
+def _watched(records: Iterable[Stamped], watch: latency.Watch) -> Iterator[Stamped]:
+    for record in records:
+        watch.see(record)
+        yield record
 
 
 def _print(log: Path, output: Path | None, counts: dict[str, int], found: Replayed, seconds: float) -> None:

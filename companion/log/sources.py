@@ -183,7 +183,7 @@ def open_source(path: Path, autopilot_system: int | None = None) -> TlogSource |
     kind = path.suffix.lower()
     if kind != ".tlog" and kind not in _READERS and not path.is_dir():
         raise ValueError(
-            f"{path} is of no kind that is read here: give a .tlog, {', '.join(_READERS)} or a folder of topics"
+            f"{path} is of no kind that is read here: give .tlog, {', '.join(_READERS)} or a folder of topics"
         )
     if not path.exists():
         raise LogError(f"{path}: no such log")

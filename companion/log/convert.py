@@ -1,0 +1,32 @@
+"""A log of another recorder as an MCAP of ours: its records, and nothing computed from them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from companion.log import sources
+from companion.log.opened import LogError
+from companion.log.replay import CONVERTED, sentences, writer
+from companion.log.sources import Summary
+from companion.records import OUTPUTS
+
+
+def convert(source: Path, output: Path) -> Summary:
+    """Write the records of `source` to `output`. LogError, one sentence, where it cannot be read or written.
+
+    What the source itself tells (events, refused messages) goes to topics under /link, as in a replay.
+    """
+    with sentences():
+        if output.resolve() == source.resolve() or output.exists():
+            raise LogError(f"{output} is there already: give another name")
+        opened = sources.open_source(source)
+        sink = writer(output, {CONVERTED: {"from": source.name}})
+        try:
+            for record in opened:
+                told = isinstance(record, OUTPUTS)
+                sink.record(record, f"/link/{type(record).__name__}" if told else None)
+        finally:
+            sink.close()
+        if sink.trouble:
+            raise LogError(f"{output} is not whole: {sink.trouble}")
+    return opened.summary()
