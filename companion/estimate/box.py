@@ -9,7 +9,7 @@ covariance hangs on it.
 It does not know what the inputs are.
 """
 
-from functools import lru_cache, reduce
+from functools import lru_cache
 from itertools import product
 from typing import NamedTuple
 
@@ -53,21 +53,35 @@ def information(M: Array, kappa: float = np.inf) -> Array:
 
 
 class ActiveSets(NamedTuple):
-    """All 3^m statuses, free ones first; their masks of free components; the row of `masks` of each."""
+    """All 3^m statuses, free ones first; their free components as 1; the row of `inverses` of each."""
 
-    status: Array
-    free: Array
-    masks: Array
-    mask_of: npt.NDArray[np.intp]
+    status: Status
+    free: Status
+    row: npt.NDArray[np.intp]
 
 
 @lru_cache(maxsize=8)
 def active_sets(m: int) -> ActiveSets:
-    """The candidates of a box of m inputs; there are only 2^m different masks of free ones to invert."""
+    """The candidates of a box of m inputs; there are only 2^m different sets of free ones."""
     statuses = sorted(product((0, -1, 1), repeat=m), key=lambda s: sum(map(abs, s)))
-    status = np.array(statuses, float).reshape(-1, m)
-    masks, mask_of = np.unique(status == 0.0, axis=0, return_inverse=True)
-    return ActiveSets(status, (status == 0.0).astype(float), masks.astype(float), mask_of)
+    status = np.array(statuses, np.int8).reshape(-1, m)
+    free = status == 0
+    return ActiveSets(status, free.astype(np.int8), free @ (1 << np.arange(m)))
+
+
+def inverses(M: Array) -> Array:
+    """M_ff^-1 (2^m, m, m, ...) padded with zeros, of M (m, m, ...); bit k of the row says that k is free.
+
+    By bordering, one component after another set free: w' M w is what is left of M_kk (Schur).
+    """
+    inverse = np.zeros((1 << len(M), *M.shape))
+    for k in range(len(M)):
+        without = inverse[: 1 << k]
+        w = -np.add.reduce(without * M[k], 2)
+        w[:, k] = 1.0
+        left = np.add.reduce(w * M[k], 1)
+        np.add(without, w[:, :, None] * (w / left[:, None])[:, None], out=inverse[1 << k : 2 << k])
+    return inverse
 
 
 def minimum(M: Array, g: Array) -> Box:
@@ -76,18 +90,21 @@ def minimum(M: Array, g: Array) -> Box:
     Every active set gives one candidate and the Kuhn-Tucker conditions accept one of them; the least
     violation is taken, so rounding cannot leave us without an answer.
     """
-    sets = active_sets(g.shape[-1])
-    both = sets.masks[:, :, None] * sets.masks[:, None, :]
-    bound = np.eye(g.shape[-1]) * (1.0 - sets.masks)[:, None, :]
-    inverse = np.linalg.inv(M[..., None, :, :] * both + bound) * both
-    pushed = g[..., None, :] - sets.status @ M
-    v = sets.status + (inverse[..., sets.mask_of, :, :] @ pushed[..., None])[..., 0]
-    slope = g[..., None, :] - v @ M  # points out of the box where v is on its side
-    violation = sets.free * (np.abs(v) - 1.0) - sets.status * slope
-    best = reduce(np.maximum, np.moveaxis(violation, -1, 0)).argmin(-1)
-    flights = tuple(np.indices(best.shape, sparse=True))
+    m = g.shape[-1]
+    sets = active_sets(m)
+    g = g.T.copy()  # flights last: the loops over them are long, those over components short
+    each = np.empty((m, *g.shape))
+    each.T[...] = M
+    inverse = inverses(each)
+    shape = (-1, m) + (1,) * (g.ndim - 1)
+    status, free = sets.status.reshape(shape), sets.free.reshape(shape)
+    pushed = g - np.add.reduce(status[:, None] * each, 2)
+    v = status + np.add.reduce(inverse[sets.row] * pushed[:, None], 2)
+    slope = g - np.add.reduce(v[:, None] * each, 2)  # points out of the box where v is on its side
+    best = np.maximum.reduce(free * (np.abs(v) - 1.0) - status * slope, 1).argmin(0).T
+    flights, whole = tuple(np.indices(best.shape, sparse=True)), slice(None)
     return Box(
-        v[(*flights, best)], sets.status.astype(np.int8)[best], inverse[(*flights, sets.mask_of[best])]
+        v.T[(*flights, whole, best)], sets.status[best], inverse.T[(*flights, whole, whole, sets.row[best])]
     )
 
 
