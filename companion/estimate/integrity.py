@@ -1,0 +1,328 @@
+"""Solution separation: which source lies, and how far off its lie can have drawn the position.
+
+One filter hears every source; beside it a *row* a source hears all but that one. All are Kalman filters over
+the same state, x = INS minus truth with the position errors north and east (m) first. If the models are right
+the full solution is optimal, its error is orthogonal to any difference of solutions, and so the separation
+
+    d = x_full - x_sub   has the covariance   S = P_sub - P_full                        (Brown, McBurney 1988)
+
+whatever they heard together. A source draws its own row least (not at all), so the row that stands apart
+names it. A row may also be *forked* from the full solution and hear all but its source from then on: the same
+law holds, its separation accumulates over minutes what a slow drift adds, with an INS and beacons that were
+calibrated up to the fork. A fault older than the fork is in the forked row too; the row that never heard its
+source has none of it, and the protection level rests on that one.
+
+The row "inertial" hears everything and has process noise added: a larger claimed P than its errors have, so
+that S errs on the side of fewer alarms.
+
+Horizontal protection level, for one faulty source at a time:
+
+    |e_full| <= |d| + |e_sub| <= K_fa sigma(S) + K_md sigma(P_sub),  sigma(C) = sqrt(greatest eigenvalue),
+
+with K = sqrt(-2 ln p), as a normal error in the plane leaves the circle K sigma with probability at most p.
+The second of two faults that overlap is seen only from the first's exclusion on: that one's row, which all
+begin from again, may have heard the second.
+
+It knows no clock, no records, and not what the other states mean. A beacon's bias is one more state, a
+constant that walks slowly: learnt from all others while they are heard and used when they are not.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from .fusion import CONE_OF_SILENCE
+from .observations import Azimuth, Model, Range
+
+Floats = npt.NDArray[np.float64]
+
+INERTIAL = "inertial"
+#: Least variance of a separation (m^2), above rounding and linearisation. It must be small: beside GNSS a
+#: beacon moves the full solution by centimetres, and by how many too many is what tells its bias.
+FLOOR = 1e-6
+
+
+class Row(NamedTuple):
+    """One solution: which source it has not heard since when; "" is the full one, which hears all."""
+
+    without: str
+    since_ns: int
+    never: bool = True  # it has not heard its source before `since_ns` either
+
+
+class Bank(NamedTuple):
+    """The solutions side by side: m rows of means x (m, n) and covariances P (m, n, n), the full one first.
+
+    The last len(biases) states are constant errors of the sources named there, in their measurements' unit.
+    Nothing takes what an `excluded` source says.
+    """
+
+    t_ns: int
+    rows: tuple[Row, ...]
+    x: Floats
+    P: Floats
+    biases: tuple[str, ...] = ()
+    excluded: tuple[str, ...] = ()
+
+    @property
+    def sources(self) -> tuple[str, ...]:
+        """Every source that has a row, in the order they joined."""
+        return tuple(dict.fromkeys(row.without for row in self.rows[1:]))
+
+
+class Measurement(NamedTuple):
+    """What `source` says of the states before the biases: z (p,) = H (p, k) x + unit (p,) bias + N(0, R)."""
+
+    source: str
+    z: Floats
+    H: Floats
+    R: Floats
+    unit: Floats | None = None
+
+
+class Taken(NamedTuple):
+    """The bank after a measurement; normalised innovation squared in the row that it fits best."""
+
+    bank: Bank
+    accepted: bool
+    nis: float
+
+
+class Separation(NamedTuple):
+    """Full minus row, north and east (m), its covariance (m^2), and d' S^-1 d: chi-square of two."""
+
+    row: Row
+    d: Floats
+    S: Floats
+    statistic: float
+
+
+class Blame(NamedTuple):
+    """The source that stands apart most, and by how much less the next: clear once `margin` is large."""
+
+    source: str
+    statistic: float
+    margin: float
+
+
+class Protection(NamedTuple):
+    """Horizontal protection level (m), exceeded with at most `probability`; `by` the source that sets it."""
+
+    level: float
+    probability: float
+    by: str
+    fault_free: float
+
+
+def begin(t_ns: int, x: Floats, P: Floats) -> Bank:
+    """The full solution x (n,), P (n, n) alone, north and east position errors (m) first."""
+    if x.ndim != 1 or len(x) < 2 or P.shape != (len(x), len(x)):
+        raise ValueError(f"x has shape {x.shape} and P {P.shape}: give (n,) and (n, n), position first")
+    return Bank(t_ns, (Row("", t_ns),), x[None].copy(), P[None].copy())
+
+
+def join(bank: Bank, source: str, bias_sigma: float | None = None, forks: int = 0) -> Bank:
+    """With a new source: the row that never hears it, `forks` rows for `fork`, and its bias as a state."""
+    if not source or source in bank.sources:
+        raise ValueError(f"source {source!r} cannot join: give each source one name of its own")
+    row = Row(source, bank.t_ns)
+    rows = (*bank.rows, row, *(row._replace(never=False) for _ in range(forks)))
+    x = np.concatenate((bank.x, np.repeat(bank.x[:1], 1 + forks, axis=0)))
+    P = np.concatenate((bank.P, np.repeat(bank.P[:1], 1 + forks, axis=0)))
+    if bias_sigma is None:
+        return bank._replace(rows=rows, x=x, P=P)
+    m, n = x.shape
+    wider = np.zeros((m, n + 1, n + 1))
+    wider[:, :n, :n] = P
+    wider[:, n, n] = bias_sigma**2
+    x = np.concatenate((x, np.zeros((m, 1))), axis=1)
+    return bank._replace(rows=rows, x=x, P=wider, biases=(*bank.biases, source))
+
+
+def carry(bank: Bank, t_ns: int, Phi: Floats, Q: Floats, loose: Floats, bias_walk: Floats) -> Bank:
+    """All rows at `t_ns` by Phi (k, k), Q (k, k) of the states before the biases.
+
+    `loose` (k,) are the variances added to the row "inertial", and to all while the inertial channel is
+    excluded; `bias_walk` (len(biases),) those added to every bias.
+    """
+    k, n = len(Phi), bank.x.shape[1]
+    F, noise = np.eye(n), np.zeros((n, n))
+    F[:k, :k], noise[:k, :k] = Phi, Q
+    noise[range(k, n), range(k, n)] = bias_walk
+    P = F @ bank.P @ F.T + noise
+    for i, row in enumerate(bank.rows):
+        if row.without == INERTIAL or INERTIAL in bank.excluded:
+            P[i, range(k), range(k)] += loose
+    return bank._replace(t_ns=t_ns, x=bank.x @ F.T, P=0.5 * (P + P.mT))
+
+
+def take(bank: Bank, measurement: Measurement, limit: float) -> Taken:
+    """Every row but the source's own with the measurement; none, if its NIS is beyond `limit` in all.
+
+    One refused by the full solution alone is taken: it may be the full solution that was drawn off.
+    """
+    source, z, H, R, unit = measurement
+    n, p = bank.x.shape[1], len(z)
+    k = n - len(bank.biases)
+    if H.shape != (p, k) or R.shape != (p, p):
+        raise ValueError(f"{source}: H has shape {H.shape} and R {R.shape}: give {(p, k)} and {(p, p)}")
+    wide = np.zeros((p, n))
+    wide[:, :k] = H
+    if unit is not None and source in bank.biases:
+        wide[:, k + bank.biases.index(source)] = unit
+    hears = np.array([row.without != source for row in bank.rows])
+    HP = wide @ bank.P
+    S = HP @ wide.T + R
+    nu = z - bank.x @ wide.T
+    weighted = np.linalg.solve(S, nu[:, :, None])[:, :, 0]
+    nis = float(np.min((nu * weighted).sum(axis=1)[hears]))
+    if source in bank.excluded or not nis <= limit:
+        return Taken(bank, False, nis)
+    K = np.linalg.solve(S, HP).mT
+    K[~hears] = 0.0
+    J = np.eye(n) - K @ wide
+    P = J @ bank.P @ J.mT + K @ R @ K.mT
+    x = bank.x + (K @ nu[:, :, None])[:, :, 0]
+    return Taken(bank._replace(x=x, P=0.5 * (P + P.mT)), True, nis)
+
+
+def sighted(source: str, z: Azimuth | Range, x: Floats, k: int) -> Measurement | None:
+    """An azimuth or a range in the plane tangent at the INS (x east, y north), linearised where `x` has the
+    aircraft, whitened; None inside the beacon's cone of silence.
+    """
+    place = np.array([-x[1], -x[0], 0.0])
+    model = Model((z,), place)
+    if model.above(place, CONE_OF_SILENCE):
+        return None
+    at = model.at(place)
+    H = np.zeros((1, k))
+    H[0, :2] = -at.J[0, 1], -at.J[0, 0]
+    return Measurement(source, at.r + H[:, :2] @ x[:2], H, np.eye(1), np.array([1.0 / z.sigma]))
+
+
+def separations(bank: Bank) -> tuple[Separation, ...]:
+    """Every row's separation in position from the full solution."""
+    found = []
+    for i, row in enumerate(bank.rows[1:], 1):
+        found.append(_separation(bank, 0, i, row))
+    return tuple(found)
+
+
+def threshold(probability: float) -> float:
+    """Limit of a separation's statistic, passed with `probability` where nothing is wrong."""
+    if not 0.0 < probability < 1.0:
+        raise ValueError(f"probability {probability} of a false alarm: give one between 0 and 1")
+    return -2.0 * math.log(probability)
+
+
+def blame(found: tuple[Separation, ...], limit: float) -> Blame | None:
+    """The source whose row stands apart most, if beyond `limit`.
+
+    `margin` is twice the logarithm of the likelihood by which it explains the data better than the next
+    source does: ask for `threshold(p)` of it to accuse the wrong one with probability p.
+    """
+    worst: dict[str, float] = {}
+    for s in found:
+        worst[s.row.without] = max(worst.get(s.row.without, 0.0), s.statistic)
+    ranked = sorted(worst.items(), key=lambda item: -item[1])
+    if not ranked or ranked[0][1] <= limit:
+        return None
+    (source, statistic), *others = ranked
+    return Blame(source, statistic, statistic - (others[0][1] if others else 0.0))
+
+
+def fork(bank: Bank, index: int) -> Bank:
+    """Row `index`, one of a source's forks, begun again from the full solution."""
+    if bank.rows[index].never:
+        raise ValueError(f"row {index} never hears {bank.rows[index].without!r}: fork another")
+    return _copied(bank, 0, index, bank.rows[index]._replace(since_ns=bank.t_ns))
+
+
+def exclude(bank: Bank, source: str, limit: float) -> Bank:
+    """Without `source` from now on, and without what it has done.
+
+    The full solution is taken from the source's oldest fork if that agrees with the row that never heard it,
+    else from this one; all others, which heard it, begin again from there.
+    """
+    mine = [i for i, row in enumerate(bank.rows) if row.without == source]
+    if not mine:
+        raise ValueError(f"no row is without {source!r}: there are {', '.join(bank.sources)}")
+    clean = next(i for i in mine if bank.rows[i].never)
+    forks = sorted((i for i in mine if not bank.rows[i].never), key=lambda i: bank.rows[i].since_ns)
+    chosen = clean
+    if forks and _separation(bank, forks[0], clean, bank.rows[clean]).statistic <= limit:
+        chosen = forks[0]
+    since = bank.rows[chosen].since_ns
+    rows = [row if i in mine else row._replace(since_ns=bank.t_ns) for i, row in enumerate(bank.rows)]
+    rows[0] = Row("", since)
+    m = len(rows)
+    x, P = np.repeat(bank.x[chosen][None], m, axis=0), np.repeat(bank.P[chosen][None], m, axis=0)
+    return bank._replace(rows=tuple(rows), x=x, P=P, excluded=(*bank.excluded, source))
+
+
+def readmit(bank: Bank, source: str) -> Bank:
+    """With `source` heard again; its rows, the full solution's equals meanwhile, part from it now."""
+    if source not in bank.excluded:
+        raise ValueError(f"{source!r} is not excluded")
+    rows, x, P = list(bank.rows), bank.x.copy(), bank.P.copy()
+    for i, row in enumerate(rows):
+        if row.without == source:
+            rows[i], x[i], P[i] = row._replace(since_ns=bank.t_ns), x[0], P[0]
+    left = tuple(name for name in bank.excluded if name != source)
+    return bank._replace(rows=tuple(rows), x=x, P=P, excluded=left)
+
+
+def protection(bank: Bank, false_alarm: float, integrity_risk: float) -> Protection:
+    """The horizontal protection level with separations tested at `false_alarm` each.
+
+    The risk is shared equally by the sources and the case without a fault; that a fault is there counts as
+    certain. An excluded source cannot do harm.
+    """
+    rows = [(i, r) for i, r in enumerate(bank.rows) if i and r.never and r.without not in bank.excluded]
+    K_md = math.sqrt(threshold(integrity_risk / (1 + len(rows))))
+    K_fa = math.sqrt(threshold(false_alarm))
+    fault_free = K_md * _sigma(bank.P[0, :2, :2])
+    level, by = fault_free, ""
+    for i, row in rows:
+        sub = bank.P[i, :2, :2]
+        S = sub - bank.P[0, :2, :2] + FLOOR * np.eye(2)
+        mine = K_fa * _sigma(S) + K_md * _sigma(sub)
+        if mine > level:
+            level, by = mine, row.without
+    return Protection(level, integrity_risk, by, fault_free)
+
+
+def admits(
+    offset: tuple[float, float], bound: tuple[float, float], sigma: tuple[float, float], refusal: float
+) -> bool:
+    """Whether a fix `offset` (north, east, m) from the guaranteed prediction is within what is guaranteed.
+
+    `bound` are the guaranteed r.m.s. bounds, `sigma` the fix's own. Of second moments alone nothing more than
+    Markov's inequality is known: sum (offset^2 / (bound^2 + sigma^2)) has a mean of two at most and is beyond
+    2 / refusal with probability `refusal` at most, however the errors are distributed.
+    """
+    found = sum(o * o / (b * b + s * s) for o, b, s in zip(offset, bound, sigma, strict=True))
+    return found <= 2.0 / refusal
+
+
+def _separation(bank: Bank, full: int, sub: int, row: Row) -> Separation:
+    d = bank.x[full, :2] - bank.x[sub, :2]
+    S = bank.P[sub, :2, :2] - bank.P[full, :2, :2]
+    # what rounding or a refused measurement has made negative is lifted to the floor
+    eigenvalues, V = np.linalg.eigh(0.5 * (S + S.T))
+    eigenvalues = np.maximum(eigenvalues, 0.0) + FLOOR
+    return Separation(row, d, (V * eigenvalues) @ V.T, float(((V.T @ d) ** 2 / eigenvalues).sum()))
+
+
+def _sigma(C: Floats) -> float:
+    return math.sqrt(max(float(np.linalg.eigvalsh(C)[-1]), 0.0))
+
+
+def _copied(bank: Bank, source: int, target: int, row: Row) -> Bank:
+    x, P = bank.x.copy(), bank.P.copy()
+    x[target], P[target] = x[source], P[source]
+    return bank._replace(x=x, P=P, rows=(*bank.rows[:target], row, *bank.rows[target + 1 :]))

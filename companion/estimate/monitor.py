@@ -1,0 +1,125 @@
+"""The watch over the sources: solution separation as a fold over measurements, with exclusions as data.
+
+    monitor, refused = hear(monitor, measurement, allotment)     # every measurement, in the order of time
+    monitor, exclusions = watch(monitor, allotment)              # once a second
+
+`integrity` has the mathematics; here stands when it is asked. A source falls by its separation, clear of
+every other's; or by a run of measurements that no solution can explain. The forks of a source are renewed in
+turn, so that the older is between one and two `fork_s` old, and never while something stands apart.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from scipy.special import chdtri
+
+from .integrity import Bank, Measurement, Separation, blame, exclude, fork, separations, take, threshold
+
+BEYOND = "separation"
+REFUSED = "refused by every solution"
+
+
+class Allotment(NamedTuple):
+    """What may go wrong, as probabilities.
+
+    `alarms_per_hour`: false alarms of the separations, all rows together. They are tested once a second, but
+    one test says little new within `independent_s`. `rejection`: a good measurement refused. `wrong`: the
+    wrong source accused. `run`: refusals in a row that exclude.
+    """
+
+    alarms_per_hour: float = 1e-3
+    independent_s: float = 10.0
+    rejection: float = 1e-6
+    wrong: float = 1e-6
+    run: int = 5
+    fork_s: float = 120.0
+
+    def false_alarm(self, rows: int) -> float:
+        """Of one test of one of `rows` separations."""
+        return self.alarms_per_hour * self.independent_s / 3600.0 / max(rows, 1)
+
+
+class Exclusion(NamedTuple):
+    """A source left out: why, the number that told and its limit. What it said after `since_ns` is undone,
+    which moved the position by `moved` m.
+    """
+
+    t_ns: int
+    source: str
+    reason: str
+    value: float
+    limit: float
+    since_ns: int
+    moved: float
+
+
+class Refusal(NamedTuple):
+    """A measurement not taken: NIS in the solution that it fits best, and the limit."""
+
+    source: str
+    value: float
+    limit: float
+
+
+class Monitor(NamedTuple):
+    """The bank, the run of refusals of each source, whether something stands apart and is not yet clear."""
+
+    bank: Bank
+    runs: tuple[tuple[str, int], ...] = ()
+    unresolved: bool = False
+
+
+def hear(monitor: Monitor, measurement: Measurement, allotment: Allotment) -> tuple[Monitor, Refusal | None]:
+    """One more measurement, at the bank's time."""
+    limit = float(chdtri(len(measurement.z), allotment.rejection))
+    taken = take(monitor.bank, measurement, limit)
+    runs = dict(monitor.runs)
+    runs[measurement.source] = 0 if taken.nis <= limit else runs.get(measurement.source, 0) + 1
+    monitor = monitor._replace(bank=taken.bank, runs=tuple(runs.items()))
+    return monitor, None if taken.accepted else Refusal(measurement.source, taken.nis, limit)
+
+
+def watch(monitor: Monitor, allotment: Allotment) -> tuple[Monitor, list[Exclusion]]:
+    """Test every separation, exclude at most one source, renew the forks."""
+    bank = monitor.bank
+    found = separations(bank)
+    limit = threshold(allotment.false_alarm(len(found)))
+    accused = blame(tuple(s for s in found if s.row.without not in bank.excluded), limit)
+    if accused is not None and accused.margin >= threshold(allotment.wrong):
+        return _excluded(monitor, accused.source, BEYOND, accused.statistic, limit)
+    for source, run in monitor.runs:
+        if run >= allotment.run and source in bank.sources and source not in bank.excluded:
+            return _excluded(monitor, source, REFUSED, float(run), float(allotment.run))
+    if accused is None:
+        bank = _renewed(bank, found, round(1e9 * allotment.fork_s))
+    return monitor._replace(bank=bank, unresolved=accused is not None), []
+
+
+def trusted(monitor: Monitor, source: str) -> bool:
+    """Whether the source is heard: neither excluded nor in a run of refusals."""
+    return source not in monitor.bank.excluded and dict(monitor.runs).get(source, 0) == 0
+
+
+def _excluded(
+    monitor: Monitor, source: str, reason: str, value: float, limit: float
+) -> tuple[Monitor, list[Exclusion]]:
+    before = monitor.bank
+    bank = exclude(before, source, limit)
+    step = bank.x[0, :2] - before.x[0, :2]
+    moved = float((step @ step) ** 0.5)
+    told = Exclusion(bank.t_ns, source, reason, value, limit, bank.rows[0].since_ns, moved)
+    return Monitor(bank, monitor.runs), [told]
+
+
+def _renewed(bank: Bank, found: tuple[Separation, ...], every_ns: int) -> Bank:
+    """Each source's oldest fork begun again once its youngest is `every_ns` old."""
+    forks: dict[str, list[int]] = {}
+    for i, s in enumerate(found, 1):
+        if not s.row.never and s.row.without not in bank.excluded:
+            forks.setdefault(s.row.without, []).append(i)
+    for mine in forks.values():
+        mine.sort(key=lambda i: bank.rows[i].since_ns)
+        if bank.t_ns - bank.rows[mine[-1]].since_ns >= every_ns:
+            bank = fork(bank, mine[0])
+    return bank

@@ -1,0 +1,71 @@
+"""How far a position can be trusted, as a state with hysteresis: worse at once, better only after a while.
+
+A pure fold over evidence. It knows no sources by name and no estimator.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+from typing import NamedTuple
+
+
+class Trust(IntEnum):
+    """From best to worst."""
+
+    NORMAL = 0  # fixes that check each other, the protection level within its limit
+    DEGRADED = 1  # fixes, but a source is excluded or under suspicion, or too little checks them
+    PREDICTING = 2  # no fixes: the inertial error is predicted within a guaranteed bound
+    UNTRUSTED = 3  # no bound, or one beyond its limit
+
+
+class Evidence(NamedTuple):
+    """What is known at one instant; lengths in m, None where there is none."""
+
+    fixes: bool  # a trusted radio fix not older than its timeout
+    suspicion: bool  # a source excluded, or a separation beyond its limit that names none clearly
+    protection: float | None  # horizontal protection level
+    bound: float | None  # guaranteed r.m.s. bound, both axes together
+
+
+class Limits(NamedTuple):
+    """Alert limits (m), the share of them below which a state is left for a better one, and for how long."""
+
+    protection: float = 500.0
+    bound: float = 5000.0
+    clear: float = 0.8
+    settle_s: float = 10.0
+
+
+class Held(NamedTuple):
+    """The state, since when, and since when the evidence has been for a better one."""
+
+    trust: Trust
+    since_ns: int
+    better_ns: int | None = None
+
+
+def judge(evidence: Evidence, limits: Limits, share: float = 1.0) -> Trust:
+    """What the evidence of one instant alone says, both limits multiplied by `share`."""
+    if evidence.fixes:
+        safe = evidence.protection is not None and evidence.protection <= share * limits.protection
+        return Trust.NORMAL if safe and not evidence.suspicion else Trust.DEGRADED
+    if evidence.bound is None or evidence.bound > share * limits.bound:
+        return Trust.UNTRUSTED
+    return Trust.PREDICTING
+
+
+def turn(held: Held, t_ns: int, evidence: Evidence, limits: Limits) -> Held:
+    """The state at `t_ns`: a worse one at once; a better one after `settle_s` without a break of evidence
+    that clears the limits by their share.
+    """
+    now = judge(evidence, limits)
+    if now > held.trust:
+        return Held(now, t_ns)
+    cleared = judge(evidence, limits, limits.clear)
+    if cleared >= held.trust:
+        return held._replace(better_ns=None)
+    if held.better_ns is None:
+        return held._replace(better_ns=t_ns)
+    if (t_ns - held.better_ns) * 1e-9 < limits.settle_s:
+        return held
+    return Held(cleared, t_ns)
