@@ -139,6 +139,7 @@ def test_a_beacon_receiver_beside_the_autopilot_is_heard() -> None:
         beacon_lat=600_000_000,
         beacon_lon=310_000_000,
         slant_range=5e4,
+        sigma_range=100.0,
         beacon_id=7,
         status=2,
     )

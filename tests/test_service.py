@@ -1,0 +1,193 @@
+"""The shell over real sockets, disks and signals: what is wrong gets one line and a code, nothing logged is
+lost."""
+
+import asyncio
+import contextlib
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from companion.config import load
+from companion.link import dialect, frame
+from companion.link.transport import CannotListen
+from companion.log import file
+from companion.records import Event
+from companion.service import EX_CANTCREAT, EX_UNAVAILABLE, Service
+
+LOOPBACK = "127.0.0.1"
+HEARTBEAT = frame.encode(dialect.new("HEARTBEAT", type=1, autopilot=3), 0, 1, 1)
+
+
+def free_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+        sock.bind((LOOPBACK, 0))
+        return sock.getsockname()[1]
+
+
+def log_in(folder: Path) -> file.Writer:
+    return file.Writer(
+        folder / "a.mcap", metadata={}, start_unix_ns=time.time_ns(), start_ns=time.monotonic_ns()
+    )
+
+
+async def until(condition, seconds: float = 10.0) -> None:
+    for _ in range(round(seconds / 0.01)):
+        if condition():
+            return
+        await asyncio.sleep(0.01)
+    raise TimeoutError
+
+
+def serve(tmp_path: Path, connect: tuple[str, ...], play) -> list[Event]:
+    """Run a Service while `play(service, told)` lasts; what it told."""
+    told: list[Event] = []
+
+    async def both() -> None:
+        with log_in(tmp_path) as log:
+            service = Service(load(None, {"link.connect": connect}, {}), log, told.append)
+            serving = asyncio.create_task(service.serve())
+            try:
+                await play(service, told)
+            finally:
+                service.stop()
+                await serving
+
+    asyncio.run(both())
+    return told
+
+
+def test_an_autopilot_on_udp_is_heard_answered_and_logged(tmp_path: Path) -> None:
+    port = free_port()
+    replies: list[bytes] = []
+
+    async def play(service: Service, told: list[Event]) -> None:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+            sock.setblocking(False)
+            sock.connect((LOOPBACK, port))
+
+            def heard() -> bool:
+                try:
+                    sock.send(HEARTBEAT)
+                    replies.append(sock.recv(65536))
+                except (BlockingIOError, ConnectionRefusedError):
+                    pass
+                return len(replies) >= 3
+
+            await until(heard)
+
+    told = serve(tmp_path, (f"udpin:{LOOPBACK}:{port}",), play)
+    assert any("autopilot 1 heard (ardupilot)" in event.text for event in told)
+    names = {
+        dialect.TYPES[found.msgid].name
+        for data in replies
+        for found in frame.Reader().receive(data)
+        if isinstance(found, frame.Frame)
+    }
+    assert names & {"HEARTBEAT", "TIMESYNC", "COMMAND_LONG"}
+    topics = file.info(tmp_path / "a.mcap").counts
+    assert any(topic.endswith("/rx") for topic in topics) and any(topic.endswith("/tx") for topic in topics)
+
+
+def test_an_address_in_use_ends_it_with_a_sentence(tmp_path: Path) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
+        taken.bind((LOOPBACK, 0))
+        connect = f"udpin:{LOOPBACK}:{taken.getsockname()[1]}"
+
+        async def play(service: Service, told: list[Event]) -> None:
+            await asyncio.sleep(0.2)
+
+        with pytest.raises(CannotListen, match="choose another port"):
+            serve(tmp_path, (connect,), play)
+    assert file.info(tmp_path / "a.mcap").closed
+
+
+def test_a_missing_serial_device_is_said_once_and_the_other_link_lives(tmp_path: Path) -> None:
+    port = free_port()
+    missing = f"serial:{tmp_path}/ttyNONE:57600"
+
+    async def play(service: Service, told: list[Event]) -> None:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+            sock.connect((LOOPBACK, port))
+
+            def heard() -> bool:
+                with contextlib.suppress(ConnectionRefusedError):
+                    sock.send(HEARTBEAT)
+                return any("heard" in event.text for event in told)
+
+            await until(heard)
+            await asyncio.sleep(1.0)  # several attempts
+
+    told = serve(tmp_path, (missing, f"udpin:{LOOPBACK}:{port}"), play)
+    assert sum("ttyNONE" in event.text for event in told) == 1
+    assert any("No such file" in event.text for event in told)
+
+
+# -- whole processes ----------------------------------------------------------------------------------------
+
+
+ENVIRONMENT = {name: value for name, value in os.environ.items() if not name.startswith("COMPANION_")}
+RUN = [sys.executable, "-m", "companion", "run"]
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_closes_the_log_whole(tmp_path: Path, number: signal.Signals) -> None:
+    port, logs, said = free_port(), tmp_path / "logs", tmp_path / "said"
+    command = [*RUN, "--connect", f"udpin:{LOOPBACK}:{port}", "--logs", str(logs)]
+    with (
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock,
+        said.open("w") as stderr,
+        subprocess.Popen(command, stderr=stderr, env=ENVIRONMENT) as process,
+    ):
+        sock.connect((LOOPBACK, port))
+        deadline = time.monotonic() + 30.0
+        while "heard" not in said.read_text() and time.monotonic() < deadline:
+            with contextlib.suppress(ConnectionRefusedError):
+                sock.send(HEARTBEAT)
+            time.sleep(0.05)
+        process.send_signal(number)
+        assert process.wait(20) == 0
+    assert "log: closed as" in said.read_text()
+    (log,) = logs.iterdir()
+    assert log.suffix == ".mcap"
+    info = file.info(log)
+    assert info.closed and info.counts["/link/Event"] >= 2
+    assert any(isinstance(e.value, Event) and "heard" in e.value.text for e in file.read(log))
+
+
+def finished(*arguments: str) -> tuple[int, str]:
+    done = subprocess.run([*RUN, *arguments], capture_output=True, text=True, timeout=30, env=ENVIRONMENT)
+    return done.returncode, done.stderr
+
+
+def test_a_port_in_use_exits_69_with_one_line(tmp_path: Path) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
+        taken.bind((LOOPBACK, 0))
+        code, said = finished(
+            "--connect", f"udpin:{LOOPBACK}:{taken.getsockname()[1]}", "--logs", str(tmp_path)
+        )
+    assert code == EX_UNAVAILABLE
+    assert sum(line.startswith("companion: cannot listen") for line in said.splitlines()) == 1
+    assert "Traceback" not in said
+
+
+def test_a_log_folder_that_cannot_be_written_exits_73_with_one_line(tmp_path: Path) -> None:
+    folder = tmp_path / "logs"
+    if os.geteuid() == 0:  # root may write everywhere but into a file
+        folder.write_text("no folder")
+    else:
+        folder.mkdir(mode=0o555)
+    code, said = finished("--logs", str(folder))
+    assert code == EX_CANTCREAT
+    assert len(said.splitlines()) == 1 and str(folder) in said
+
+
+def test_a_bad_link_exits_78_with_one_line(tmp_path: Path) -> None:
+    code, said = finished("--connect", "udp:1.2.3.4", "--logs", str(tmp_path))
+    assert code == 78
+    assert len(said.splitlines()) == 1 and "link.connect" in said
