@@ -1,0 +1,254 @@
+"""What became of a flight in numbers: errors against the best track there is, and whether they fit sigmas.
+
+Arrays in (`gather`), arrays and rows out; the words are `verdict`'s and the pictures `figures`'. Errors are
+estimate minus reference, horizontal, metres.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from scipy.special import gammaincinv
+
+from companion.config import Config, parse
+from companion.log import happenings, score
+from companion.log.gather import Flight, Floats, Table, Told
+from companion.log.happenings import Group, Outage, Rate, is_radio, usable_gnss
+from companion.log.replay import CONFIGURATION
+from companion.log.smooth import smooth_flight
+from companion.nav.earth import radii
+
+REACH_S = 2.0  # a reference is not carried across a longer hole
+
+TRUTH, SMOOTHED, GNSS = "the simulator's truth", "the smoothed track", "GNSS itself"
+
+
+class Reference(NamedTuple):
+    """What errors are counted from: `what` it is, and a track, t (s), lat, lon (rad), all (n,)."""
+
+    what: str
+    t: Floats
+    lat: Floats
+    lon: Floats
+
+
+class Misfit(NamedTuple):
+    """Squared errors by their covariance: times (s), values (n,), degrees of freedom (n,) and what it is."""
+
+    what: str
+    t: Floats
+    value: Floats
+    freedom: Floats
+
+    @property
+    def inside(self) -> float:
+        """The share below the 95 % quantile of chi-square."""
+        return float(np.mean(self.value <= chi2_95(self.freedom)))
+
+    @property
+    def mean(self) -> float:
+        """Of the values over their degrees of freedom: about 1 where sigmas are right."""
+        return float(np.mean(self.value / self.freedom))
+
+
+def chi2_95(freedom: Floats) -> Floats:
+    """The 95 % quantile of chi-square."""
+    return np.asarray(2.0 * gammaincinv(0.5 * freedom, 0.95), dtype=np.float64)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Assessment:
+    """All numbers of a report on one flight; `errors` by source as in `score`, times there ns since t = 0."""
+
+    flight: Flight
+    origin: tuple[float, float]
+    reference: Reference | None
+    phases: list[score.Phase]
+    rows: list[score.Row]
+    errors: dict[str, score.Errors]
+    ins_error: dict[str, Floats]
+    misfits: list[Misfit]
+    groups: list[Group]
+    outages: list[Outage]
+    rates: list[Rate]
+    timeline: list[Told]
+
+    def north_east(self, lat: Floats, lon: Floats) -> tuple[Floats, Floats]:
+        """A local plane at the flight's first position, m; for maps."""
+        R_N, R_E = radii(self.origin[0])
+        lat_0, lon_0 = self.origin
+        return (lat - lat_0) * R_N, _wrapped(lon - lon_0) * R_E * math.cos(lat_0)
+
+
+def assess(flight: Flight) -> Assessment:
+    """Everything there is to say of `flight` in numbers."""
+    reference = _reference(flight)
+    phases = happenings.phases(flight.tables["Solution"], flight.seconds)
+    errors = {} if reference is None else _errors(flight, reference)
+    groups = happenings.groups(flight)
+    outages = happenings.outages(flight)
+    return Assessment(
+        flight=flight,
+        origin=_origin(flight),
+        reference=reference,
+        phases=phases,
+        rows=score.table(errors, phases),
+        errors=errors,
+        ins_error=_ins_error(flight, reference),
+        misfits=_misfits(flight, reference),
+        groups=groups,
+        outages=outages,
+        rates=[
+            happenings.rate(topic, stream, happenings.latency(flight, topic)[1])
+            for topic, stream in flight.streams.items()
+        ],
+        timeline=happenings.timeline(flight, groups, outages),
+    )
+
+
+def _origin(flight: Flight) -> tuple[float, float]:
+    for table in (flight.tables["Solution"], usable_gnss(flight), flight.tables["Truth"]):
+        if len(table["t"]):
+            return float(table["lat"][0]), float(table["lon"][0])
+    return 0.0, 0.0
+
+
+# -- against what ----------------------------------------------------------------------------------------
+
+
+def _reference(flight: Flight) -> Reference | None:
+    """Truth where the log has it, else the track smoothed with all fixes, else GNSS, else nothing."""
+    truth, gnss = flight.tables["Truth"], usable_gnss(flight)
+    if len(truth["t"]) > 1:
+        return _ordered(TRUTH, truth["t"], truth["lat"], truth["lon"])
+    try:
+        track = smooth_flight(flight.heard, configuration(flight))
+    except ValueError:
+        if len(gnss["t"]) > 1:
+            return _ordered(GNSS, gnss["t"], gnss["lat"], gnss["lon"])
+        return None
+    return _ordered(
+        SMOOTHED, 1e-9 * np.asarray(track.t_ns - flight.zero_ns, dtype=float), track.lat, track.lon
+    )
+
+
+def configuration(flight: Flight) -> Config:
+    """What flew, the defaults where the log does not say."""
+    text = flight.metadata.get(CONFIGURATION, {}).get("toml")
+    return Config() if text is None else parse(text, f"{flight.name} (its own configuration)")
+
+
+def _ordered(what: str, t: npt.ArrayLike, lat: Floats, lon: Floats) -> Reference:
+    t, first = np.unique(np.asarray(t, dtype=np.float64), return_index=True)
+    return Reference(what, t, lat[first], np.unwrap(lon[first]))
+
+
+def _at(reference: Reference, t: Floats) -> tuple[Floats, Floats]:
+    """Latitude and longitude of the reference at times `t`, NaN beyond its ends and in its holes."""
+    k = np.clip(np.searchsorted(reference.t, t), 1, len(reference.t) - 1)
+    known = (t >= reference.t[0]) & (t <= reference.t[-1]) & (reference.t[k] - reference.t[k - 1] <= REACH_S)
+    lat = np.where(known, np.interp(t, reference.t, reference.lat), np.nan)
+    return lat, np.where(known, np.interp(t, reference.t, reference.lon), np.nan)
+
+
+def _off(reference: Reference, t: Floats, lat: Floats, lon: Floats) -> tuple[Floats, Floats]:
+    """North and east of a track from the reference, m."""
+    lat_0, lon_0 = _at(reference, t)
+    if not np.isfinite(lat_0).any():
+        return lat_0, lon_0
+    R_N, R_E = radii(float(np.nanmean(lat_0)))
+    north: Floats = (lat - lat_0) * R_N
+    east: Floats = _wrapped(lon - lon_0) * R_E * np.cos(lat_0)
+    return north, east
+
+
+def _wrapped(angle: Floats) -> Floats:
+    wrapped: Floats = (angle + math.pi) % math.tau - math.pi
+    return wrapped
+
+
+def _errors(flight: Flight, reference: Reference) -> dict[str, score.Errors]:
+    solution, gnss = flight.tables["Solution"], usable_gnss(flight)
+    radio = {name: column[is_radio(flight)] for name, column in flight.tables["Fix"].items()}
+    bound = np.hypot(solution["bound_north"], solution["bound_east"])
+    tracks: list[tuple[str, Table]] = [(score.CORRECTED, solution), (score.RSBN, radio)]
+    if reference.what != GNSS:
+        tracks.append((score.GNSS, gnss))
+    found = {}
+    for source, table in tracks:
+        north, east = _off(reference, table["t"], table["lat"], table["lon"])
+        found[source] = _known(table["t"], np.hypot(north, east), bound if table is solution else None)
+        if table is solution:
+            ins = np.hypot(north + table["error_north"], east + table["error_east"])
+            found[score.INS] = _known(table["t"], ins, None)
+    return {source: found[source] for source in score.SOURCES if source in found and len(found[source].t_ns)}
+
+
+def _known(t: Floats, error: Floats, bound: Floats | None) -> score.Errors:
+    known = np.isfinite(error)
+    bound = np.full(len(t), np.nan) if bound is None else bound
+    return score.Errors(np.round(t[known] * 1e9).astype(np.int64), error[known], bound[known])
+
+
+def _ins_error(flight: Flight, reference: Reference | None) -> dict[str, Floats]:
+    """The error of the inertial channel against the reference, beside what `Solution` says of it."""
+    solution = flight.tables["Solution"]
+    if reference is None or not len(solution["t"]):
+        return {}
+    north, east = _off(reference, solution["t"], solution["lat"], solution["lon"])
+    return {
+        "t": solution["t"],
+        "north": north + solution["error_north"],
+        "east": east + solution["error_east"],
+    }
+
+
+# -- consistency -----------------------------------------------------------------------------------------
+
+
+def _misfits(flight: Flight, reference: Reference | None) -> list[Misfit]:
+    fix, solution = flight.tables["Fix"], flight.tables["Solution"]
+    found = []
+    if len(fix["t"]) and len(solution["t"]) > 1:
+        if np.isfinite(fix["normalised"]).any():
+            own = np.isfinite(fix["normalised"])
+            two = np.full(int(own.sum()), 2.0)
+            found.append(Misfit("NIS as flown", fix["t"][own], fix["normalised"][own], two))
+        else:
+            found.append(_innovations(fix, solution))
+        many = fix["freedom"] > 0
+        if many.any() and fix["cost"][many].max() > 1e-9:  # one GNSS position and a height have no residual
+            found.append(Misfit("fix residuals", fix["t"][many], fix["cost"][many], fix["freedom"][many]))
+    if reference is not None and reference.what == TRUTH and len(solution["t"]):
+        north, east = _off(reference, solution["t"], solution["lat"], solution["lon"])
+        value = _squared(north, east, solution["nn"], solution["ne"], solution["ee"])
+        known = np.isfinite(value)
+        if known.any():
+            two = np.full(int(known.sum()), 2.0)
+            found.append(Misfit("NEES", solution["t"][known], value[known], two))
+    return [misfit for misfit in found if len(misfit.t)]
+
+
+def _innovations(fix: Table, solution: Table) -> Misfit:
+    """Each fix against the solution just before it: their difference by the sum of their covariances.
+
+    The sum counts the drift of GNSS twice, in the fix and in the estimate that rests on earlier ones, so that
+    the value errs on the small side.
+    """
+    k = np.searchsorted(solution["t"], fix["t"]) - 1
+    recent = (k >= 0) & (fix["t"] - solution["t"][np.maximum(k, 0)] < 1.0)
+    k = k[recent]
+    north = fix["correction_north"][recent] - solution["error_north"][k]
+    east = fix["correction_east"][recent] - solution["error_east"][k]
+    covariance = (fix[name][recent] + solution[name][k] for name in ("nn", "ne", "ee"))
+    value = _squared(north, east, *covariance)
+    return Misfit("NIS of each fix", fix["t"][recent], value, np.full(len(value), 2.0))
+
+
+def _squared(north: Floats, east: Floats, nn: Floats, ne: Floats, ee: Floats) -> Floats:
+    value: Floats = (ee * north**2 - 2.0 * ne * north * east + nn * east**2) / (nn * ee - ne**2)
+    return value
