@@ -257,11 +257,14 @@ def read(path: Path) -> Dataflash:
     if not binary and b"FMT," not in head:
         raise LogError(f"{path} is no DataFlash log: no message format stands at its beginning")
     kind = DFReader.DFReader_binary if binary else DFReader.DFReader_text
+    reader = kind.__new__(kind)  # in hand also where __init__ fails, which leaves its file open
     try:
         with contextlib.redirect_stderr(io.StringIO()), contextlib.redirect_stdout(io.StringIO()):
-            reader = kind(str(path))
+            reader.__init__(str(path))
     except Exception as error:  # whatever a damaged file makes the reader trip over
         raise LogError(f"{path} is damaged beyond reading: {error or type(error).__name__}") from None
+    finally:
+        reader.filehandle.close()  # it reads a memory map
     if not set(NAMES) & set(reader.name_to_id):
         raise LogError(
             f"{path} is a DataFlash log without any message that is read here: needs GPS, XKF1, ..."
