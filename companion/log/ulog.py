@@ -81,8 +81,8 @@ def _parsed(path: Path) -> Any:
     except ImportError:
         raise LogError(f"{path} needs pyulog: pip install navigation-companion[logs]") from None
     try:
-        with contextlib.redirect_stdout(io.StringIO()):
-            return ULog(str(path), [*_TOPICS, *_TRUTHS])
+        with path.open("rb") as file, contextlib.redirect_stdout(io.StringIO()):
+            return ULog(file, [*_TOPICS, *_TRUTHS])
     except Exception as error:  # whatever a damaged file makes the reader trip over
         raise LogError(f"{path} is damaged beyond reading: {error or type(error).__name__}") from None
 

@@ -27,7 +27,8 @@ UTC = 1_700_000_000_000_000
 
 GPS_NEW = (
     "uint64_t timestamp;uint64_t time_utc_usec;double latitude_deg;double longitude_deg;"
-    "double altitude_msl_m;double altitude_ellipsoid_m;float s_variance_m_s;float eph;float epv;float hdop;float vel_n_m_s;"
+    "double altitude_msl_m;double altitude_ellipsoid_m;"
+    "float s_variance_m_s;float eph;float epv;float hdop;float vel_n_m_s;"
     "float vel_e_m_s;float vel_d_m_s;uint8_t fix_type;bool vel_ned_valid;uint8_t satellites_used;"
 )
 GPS_OLD = (
