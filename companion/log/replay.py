@@ -30,7 +30,7 @@ from companion.config import Config, ConfigError, load, parse, to_toml
 from companion.log import file, latency, simulate, sources
 from companion.log.opened import ACTIVE, LogError
 from companion.navigator import Navigator
-from companion.records import INPUTS, OUTPUTS, Solution, Stamped
+from companion.records import INPUTS, OUTPUTS, Event, Solution, Stamped
 
 CONFIGURATION = "configuration"  # the metadata record, and its key `toml`
 CONVERTED = "converted"  # the metadata record of a log that never flew with us, and its key `from`
@@ -306,14 +306,14 @@ def _fly(
 ) -> tuple[Replayed, list[str], dict[str, int]]:
     """Any log, otherwise than it flew, written to `output`: what came out, notes for the reader, counts."""
     opened, note = with_radio(log, beacons, outages, seed, config)
-    watch = latency.Watch()
+    watch, told = latency.Watch(), set[Stamped]()
     with Progress(console=Console(stderr=True), transient=True) as progress:
-        records = progress.track(_watched(opened.records, watch), description=f"replay {log.name}")
+        records = progress.track(_watched(opened.records, watch, told), description=f"replay {log.name}")
         sink = writer(output, metadata(config), *_start(log))
         try:
             found = replay_foreign(records, config, sink)
             tracks = watch.tracks()
-            for event in latency.events(tracks):
+            for event in set(latency.events(tracks)) - told:
                 sink.record(event, "/link/Event")
         finally:
             sink.close()
@@ -331,9 +331,11 @@ def _start(log: Path) -> tuple[int, int]:
     return (0, 0) if first is None else (getattr(first.value, "rx_ns", 0), first.log_time)
 
 
-def _watched(records: Iterable[Stamped], watch: latency.Watch) -> Iterator[Stamped]:
+def _watched(records: Iterable[Stamped], watch: latency.Watch, told: set[Stamped]) -> Iterator[Stamped]:
     for record in records:
         watch.see(record)
+        if isinstance(record, Event):
+            told.add(record)
         yield record
 
 
