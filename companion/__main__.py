@@ -20,6 +20,7 @@ EX_CONFIG = 78  # sysexits.h
 COMMANDS = {
     "run": "companion.service:command",
     "replay": "companion.log.replay:command",
+    "report": "companion.log.report:command",
     "log": "companion.log.command:group",
     "check-config": "companion.check:command",
     "bench": "companion.bench.command:command",

@@ -62,13 +62,16 @@ def chi2_95(freedom: Floats) -> Floats:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Assessment:
-    """All numbers of a report on one flight; `errors` by source as in `score`, times there ns since t = 0."""
+    """All numbers of a report on one flight; `errors` by source as in `score`, times there ns since t = 0.
+
+    `shares`: of each phase the r.m.s. of error by bound; at most 1 where the bound held."""
 
     flight: Flight
     origin: tuple[float, float]
     reference: Reference | None
     phases: list[score.Phase]
     rows: list[score.Row]
+    shares: list[float | None]
     errors: dict[str, score.Errors]
     ins_error: dict[str, Floats]
     misfits: list[Misfit]
@@ -89,6 +92,11 @@ def assess(flight: Flight) -> Assessment:
     reference = _reference(flight)
     phases = happenings.phases(flight.tables["Solution"], flight.seconds)
     errors = {} if reference is None else _errors(flight, reference)
+    shares = [_share(errors, phase) for phase in phases]
+    rows = [
+        row._replace(held=None if share is None else share <= 1.0)
+        for row, share in zip(score.table(errors, phases), shares, strict=True)
+    ]
     groups = happenings.groups(flight)
     outages = happenings.outages(flight)
     return Assessment(
@@ -96,7 +104,8 @@ def assess(flight: Flight) -> Assessment:
         origin=_origin(flight),
         reference=reference,
         phases=phases,
-        rows=score.table(errors, phases),
+        rows=rows,
+        shares=shares,
         errors=errors,
         ins_error=_ins_error(flight, reference),
         misfits=_misfits(flight, reference),
@@ -186,6 +195,21 @@ def _errors(flight: Flight, reference: Reference) -> dict[str, score.Errors]:
             ins = np.hypot(north + table["error_north"], east + table["error_east"])
             found[score.INS] = _known(table["t"], ins, None)
     return {source: found[source] for source in score.SOURCES if source in found and len(found[source].t_ns)}
+
+
+def _share(errors: dict[str, score.Errors], phase: score.Phase) -> float | None:
+    """The r.m.s. of error by bound over a phase, None without a bound.
+
+    Each moment by the bound of that moment: in the r.m.s. of either alone a wide bound at the start of a
+    phase would cover for a broken one at its end.
+    """
+    e = errors.get(score.CORRECTED)
+    if e is None:
+        return None
+    within = (e.t_ns >= phase.start_ns) & (e.t_ns < phase.end_ns) & np.isfinite(e.bound)
+    if not within.any():
+        return None
+    return float(np.sqrt(np.mean((e.error[within] / e.bound[within]) ** 2)))
 
 
 def _known(t: Floats, error: Floats, bound: Floats | None) -> score.Errors:

@@ -19,7 +19,12 @@ _FONT = "system-ui, -apple-system, 'Segoe UI', Roboto, sans-serif"
 def interactive(figure: Figure) -> dict[str, Any]:
     """The figure as plotly's JSON: `data`, `layout`. Its width is the page's."""
     x: dict[str, Any] = {"title": {"text": figure.x}, "zeroline": False, "gridcolor": GRID}
-    y: dict[str, Any] = {"title": {"text": figure.y}, "zeroline": False, "gridcolor": GRID}
+    y: dict[str, Any] = {
+        "title": {"text": figure.y},
+        "zeroline": False,
+        "gridcolor": GRID,
+        "automargin": True,
+    }
     if figure.log:
         y |= {"type": "log", "dtick": 1, "tickformat": "~g"}
     if figure.zero:
@@ -30,7 +35,7 @@ def interactive(figure: Figure) -> dict[str, Any]:
         x["range"], y["range"] = list(figure.view[:2]), list(figure.view[2:])
     if figure.rows:
         y |= {"tickvals": list(range(1, len(figure.rows) + 1)), "ticktext": list(figure.rows), "title": None}
-        y |= {"range": [len(figure.rows) + 0.6, 0.4], "automargin": True}
+        y |= {"range": [len(figure.rows) + 0.6, 0.4]}
     shapes: list[dict[str, Any]] = [
         {"type": "rect", "xref": "x", "yref": "paper", "x0": x0, "x1": x1, "y0": 0, "y1": 1}
         | {"fillcolor": SHADE, "opacity": 0.5, "line": {"width": 0}, "layer": "below"}
@@ -136,4 +141,4 @@ def _paint(figure: Figure, axes: Any) -> None:
         axes.set_yticks(range(1, len(figure.rows) + 1), figure.rows)
         axes.set_ylim(len(figure.rows) + 0.6, 0.4)
     else:
-        axes.legend(fontsize=7, frameon=False)
+        axes.legend(fontsize=7, frameon=False, ncols=4, loc="upper center", bbox_to_anchor=(0.5, -0.15))

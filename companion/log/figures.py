@@ -13,13 +13,14 @@ import numpy.typing as npt
 from companion.log import happenings, score
 from companion.log.assess import Assessment, chi2_95
 from companion.log.gather import AHEAD, Floats
-from companion.log.plot import COLOURS, TIME, Figure, Line, Style, strided, thinned
+from companion.log.plot import COLOURS, LETTERS, TIME, Figure, Line, Style, strided, thinned
 from companion.log.track import track
 
 
-def figures(flights: Sequence[Assessment], names: Sequence[str]) -> list[Figure]:
-    """Every plot there is something to draw in, for one flight or two (`names` in the legends of two)."""
-    found = (build(flights, [f"{n} " for n in names] if len(flights) > 1 else [""]) for build in _BUILDERS)
+def figures(flights: Sequence[Assessment]) -> list[Figure]:
+    """Every plot there is something to draw in, for one flight or two, which the legends call A and B."""
+    prefixes = [f"{letter} " for letter in LETTERS] if len(flights) > 1 else [""]
+    found = (build(flights, prefixes) for build in _BUILDERS)
     return [figure for figure in found if any(len(line.x) for line in figure.lines)]
 
 
@@ -226,6 +227,8 @@ def _latency(flights: Sequence[Assessment], prefixes: Sequence[str]) -> Figure:
         for topic, role in topics:
             if topic in a.flight.streams:
                 rx, late = happenings.latency(a.flight, topic)
+                if not late.any():  # its recorder kept one time
+                    continue
                 name = f"{prefix}{topic.removeprefix('/in/')}"
                 lines.append(_line(name, role, which, rx, 1e3 * late, style="dots"))
     return Figure("latency", "Latency", TIME, "arrival − validity, ms", lines)

@@ -15,7 +15,7 @@ from companion import __version__
 from companion.log import score
 from companion.log.assess import Assessment
 from companion.log.draw import interactive
-from companion.log.plot import Figure
+from companion.log.plot import LETTERS, Figure
 from companion.log.replay import CONFIGURATION
 from companion.log.verdict import clock, comparison, lasting, metres, verdict
 
@@ -31,6 +31,7 @@ CHAPTERS = (
     ("Events", ()),
     ("Configuration", ()),
 )
+BOOTED_NS = 10**18  # a clock before 2001 counts from power-up
 EVENTS = 400  # lines shown of a log's events
 
 
@@ -39,6 +40,8 @@ def page(flights: Sequence[Assessment], names: Sequence[str], figures: Sequence[
     from plotly.offline import get_plotlyjs
 
     drawn = {figure.key: figure for figure in figures}
+    if len(flights) == 2:
+        names = [f"{letter}: {name}" for letter, name in zip(LETTERS, names, strict=True)]
     tables = {
         "Errors": _phases,
         "Consistency": _consistency,
@@ -85,18 +88,20 @@ def _anchor(title: str) -> str:
 
 def _head(flights: Sequence[Assessment], names: Sequence[str]) -> str:
     parts = ["<header><p class='kind'>Flight report</p>"]
-    parts.append(f"<h1>{' <small>and</small> '.join(escape(name) for name in names)}</h1>")
+    parts.append(f"<h1>{'<br>'.join(escape(name) for name in names)}</h1>")
     if len(flights) == 2:
-        parts.append(f"<p class='verdict'>{escape(comparison(flights[0], flights[1], names))}</p>")
+        parts.append(f"<p class='verdict'>{escape(comparison(flights[0], flights[1]))}</p>")
     for a, name in zip(flights, names, strict=True):
-        when = datetime.fromtimestamp(a.flight.unix_ns * 1e-9, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
+        when = "Date unknown"
+        if a.flight.unix_ns > BOOTED_NS:
+            when = datetime.fromtimestamp(a.flight.unix_ns * 1e-9, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
         title = f"<b class='log'>{escape(name)}</b>" if len(flights) == 2 else ""
         warn = " bad" if any(row.held is False for row in a.rows) else ""
         parts.append(f"<p class='verdict{warn}'>{title}{escape(verdict(a))}</p>")
         parts.append(_tiles(a))
         version = a.flight.metadata.get("companion", {}).get("version")
         flown = f", flown by companion {escape(version)}" if version else ""
-        parts.append(f"<p class='when'>{when}{flown}; times on this page count from there.</p>")
+        parts.append(f"<p class='when'>{when}{flown}; times count from its first message.</p>")
     parts.append("<p class='when'>Drag across a plot to zoom, double-click to see all of it again.</p>")
     return "".join(parts) + "</header>"
 
@@ -152,22 +157,34 @@ def _phases(a: Assessment) -> str:
     if not a.rows or not a.errors:
         return "<p class='note'>No error can be told: there is no truth and no track to smooth.</p>"
     sources = [source for source in score.SOURCES if source in a.errors]
-    head = ["phase", "from", "lasts", *sources, "bound, r.m.s.", "held", "within"]
-    rows = []
+    head = ["phase", "from", "lasts", *sources, "bound, r.m.s.", "error / bound", "held", "within"]
+    rows: list[list[str]] = []
     for row, phase in zip(a.rows, a.phases, strict=True):
         cells = [row.phase, clock(phase.start_ns * 1e-9), lasting(row.seconds)]
         for source in sources:
             known = source in row.rms
-            cells.append(f"{metres(row.rms[source])} / {metres(row.p95[source])}" if known else "–")
+            cells.append(_both(row.rms[source], row.p95[source]) if known else "–")
         cells.append("–" if row.bound is None else metres(row.bound))
+        share = a.shares[len(rows)]
+        cells.append("–" if share is None else f"{share:.2f}")
         cells.append("–" if row.held is None else "yes" if row.held else "NO")
         cells.append("–" if row.inside is None else f"{100.0 * row.inside:.0f} %")
         rows.append(cells)
     said = (
         "" if a.reference is None else f"Horizontal, against {a.reference.what}: r.m.s. / 95th percentile. "
     )
-    note = f"{said}Held: the r.m.s. error is within the bound's; within: the share of moments inside it."
+    note = (
+        f"{said}Error / bound: each moment's error by its own bound, r.m.s., held if at most 1; "
+        "within: the share of moments inside the bound."
+    )
     return _table(head, rows, "cards") + f"<p class='note'>{escape(note)}</p>"
+
+
+def _both(rms: float, p95: float) -> str:
+    """Two lengths, the unit once where it is the same."""
+    first, second = metres(rms), metres(p95)
+    same = first.split()[-1] == second.split()[-1]
+    return f"{first.split()[0] if same else first} / {second}"
 
 
 def _consistency(a: Assessment) -> str:

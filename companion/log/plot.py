@@ -65,6 +65,7 @@ class Figure(NamedTuple):
 
 
 TIME = "time, min"
+LETTERS = "AB"  # what two flights compared are called
 
 
 def thinned(x: Floats, y: Floats, most: int = MOST) -> tuple[Floats, Floats]:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import click
 
-from companion.config import load
+from companion.config import ConfigError, load
 from companion.log.assess import assess
 from companion.log.draw import printed
 from companion.log.figures import figures
@@ -37,27 +37,26 @@ def command(
     config = load(config_file) if config_file else None
     try:
         flights = [assess(open_flight(path, config)) for path in logs]
-        names = _names(logs)
-        drawn = figures(flights, names)
-        html = page(flights, names, drawn)
-        output.write_text(html, encoding="utf-8")
+    except (LogError, ConfigError):
+        raise
+    except ValueError as error:
+        raise LogError(str(error)) from None
+    drawn = figures(flights)
+    try:
+        output.write_text(page(flights, _names(logs), drawn), encoding="utf-8")
         written = [output, *(printed(drawn, pdf, png) if pdf or png else [])]
     except ModuleNotFoundError as error:
         raise LogError(
             f"a report needs {error.name}: install it by `pip install 'navigation-companion[report]'`"
         ) from None
     except OSError as error:
-        raise LogError(f"cannot write the report: {error.filename}: {error.strerror}") from None
-    except LogError:
-        raise
-    except ValueError as error:
-        raise LogError(str(error)) from None
+        raise LogError(f"cannot write the report to {error.filename}: {error.strerror}") from None
     for flight in flights:
         click.echo(verdict(flight))
     click.echo(f"written: {', '.join(str(path) for path in written)}")
 
 
 def _names(logs: tuple[Path, ...]) -> list[str]:
-    """What tells two logs apart: their names, or their paths where those are the same."""
-    names = [path.name for path in logs]
-    return names if len(set(names)) == len(names) else [f"{k}. {path}" for k, path in enumerate(logs, 1)]
+    """What the page calls its logs; a folder more where two have one name."""
+    same = len({path.name for path in logs}) < len(logs)
+    return [f"{path.resolve().parent.name}/{path.name}" if same else path.name for path in logs]

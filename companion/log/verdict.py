@@ -12,6 +12,7 @@ import numpy as np
 from companion.log import score
 from companion.log.assess import GNSS, SMOOTHED, Assessment
 from companion.log.gather import Floats
+from companion.log.plot import LETTERS
 
 WITHOUT_FIXES = ("prediction", "untrusted")
 SHORT_S = 30.0  # what happens in less is not worth a sentence
@@ -49,8 +50,8 @@ def verdict(a: Assessment) -> str:
     return " ".join([*sentences, *a.flight.remarks])
 
 
-def comparison(a: Assessment, b: Assessment, names: Sequence[str]) -> str:
-    """Which of two flights was nearer to its reference, phase by phase."""
+def comparison(a: Assessment, b: Assessment) -> str:
+    """Which of two flights, A or B, was nearer to its reference, phase by phase."""
     if a.reference is None or b.reference is None:
         return "There is nothing to compare errors with."
     theirs = {row.phase: row for row in b.rows}
@@ -63,7 +64,7 @@ def comparison(a: Assessment, b: Assessment, names: Sequence[str]) -> str:
         if abs(pair[0] - pair[1]) < 0.02 * max(pair):
             sentences.append(f"In the phase “{row.phase}” both were off by {metres(pair[0])} r.m.s.")
         else:
-            better, worse = sorted(zip(pair, names, strict=True))
+            better, worse = sorted(zip(pair, LETTERS, strict=True))
             sentences.append(
                 f"In the phase “{row.phase}” {better[1]} was nearer: {metres(better[0])} r.m.s. "
                 f"against {metres(worse[0])} of {worse[1]}."
@@ -144,11 +145,11 @@ def _bound(a: Assessment) -> list[str]:
             f"The guaranteed bound{reached} held in every phase; the error was within it {_percent(inside)} "
             "of the time."
         ]
-    worst = max(broken, key=lambda row: row.rms[score.CORRECTED] / (row.bound or math.inf))
+    share, worst = max((a.shares[a.rows.index(row)] or 0.0, row.phase) for row in broken)
     return [
         f"The guaranteed bound{reached} DID NOT HOLD in {len(broken)} of {len(a.rows)} phases: in the phase "
-        f"“{worst.phase}” the r.m.s. error was {metres(worst.rms[score.CORRECTED])} against "
-        f"{metres(worst.bound or math.nan)}. The error was within the bound {_percent(inside)} of the time."
+        f"“{worst}” the error was {share:.2f} times the bound, r.m.s. The error was within the bound "
+        f"{_percent(inside)} of the time."
     ]
 
 
