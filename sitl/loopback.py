@@ -143,7 +143,8 @@ def command(
         chosen = named(scenario, **({} if seed is None else {"seed": seed}))
     except ValueError as error:
         raise click.BadParameter(str(error), param_hint="--scenario") from None
-    config = load(file, {"log.folder": logs}, pairs=pairs)
+    # the truth goes into the log, for reports
+    config = load(file, {"log.folder": logs, "rates.truth_hz": 10.0}, pairs=pairs)
     begun = time.perf_counter()
     settings = config.log
     log = open_log(
