@@ -10,6 +10,9 @@
       figure.layout.font.size = 10.5;
       figure.layout.margin.l = 46;
       figure.layout.dragmode = false;  // a finger scrolls the page
+      const names = figure.layout.showlegend ? figure.data.filter((trace) => trace.name).length : 0;
+      const plot = document.getElementById("plot-" + key);
+      if (plot) plot.style.height = plot.clientHeight + 17 * Math.max(0, names - 4) + "px";  // a name a line
     }
     return Plotly.newPlot("plot-" + key, figure.data, figure.layout, config);
   };
