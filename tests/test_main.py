@@ -1,0 +1,92 @@
+"""The command line as a person or a program meets it: what it lists, what it prints, how it ends."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from companion import __version__
+from companion.__main__ import cli
+
+COMMANDS = ("bench", "check-config", "log", "loopback", "replay", "run", "sitl")
+CUT = Path(__file__).parent / "data" / "dronekit_copter_cut.tlog"
+
+
+def companion(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "companion", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=60)
+
+
+def test_help_lists_every_command() -> None:
+    done = CliRunner().invoke(cli, ["--help"])
+    assert done.exit_code == 0
+    listed = {line.split()[0] for line in done.output.partition("Commands:")[2].splitlines() if line.split()}
+    assert listed >= set(COMMANDS)
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_command_explains_itself(name: str) -> None:
+    done = CliRunner().invoke(cli, [name, "--help"])
+    assert done.exit_code == 0
+    assert len(done.output) > 100
+
+
+def test_the_version_is_told() -> None:
+    assert __version__ in CliRunner().invoke(cli, ["--version"]).output
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("[predictor]\nwindow_mn = 3\n", ("window_mn", "window_min")),
+        ("[predicter]\n", ("predicter", "predictor")),
+        ("[gnss]\nsigma_m = -1\n", ("gnss.sigma_m",)),
+        ("[gnss\n", ("TOML",)),
+    ],
+)
+@pytest.mark.parametrize("command", [["check-config"], ["run", "--config"], ["loopback", "--config"]])
+def test_a_mistake_in_the_configuration_exits_78_with_one_sentence(
+    tmp_path: Path, command: list[str], text: str, words: tuple[str, ...]
+) -> None:
+    file = tmp_path / "mine.toml"
+    file.write_text(text)
+    if command != ["check-config"] and "mn" not in text:
+        pytest.skip("one case a command is enough")
+    done = companion(*command, file)
+    assert done.returncode == 78
+    assert len(done.stderr.splitlines()) == 1
+    for word in (str(file), *words):
+        assert word in done.stderr
+
+
+def test_json_is_json(tmp_path: Path) -> None:
+    config = CliRunner().invoke(cli, ["check-config", "--json"])
+    assert json.loads(config.stdout)["gnss"]
+    replay = CliRunner().invoke(cli, ["replay", str(CUT), "-o", str(tmp_path / "out.mcap"), "--json"])
+    assert json.loads(replay.stdout)["messages"] == 841
+    info = CliRunner().invoke(cli, ["log", "info", str(tmp_path / "out.mcap"), "--json"])
+    assert json.loads(info.stdout)
+
+
+def test_the_defaults_printed_are_a_configuration(tmp_path: Path) -> None:
+    file = tmp_path / "defaults.toml"
+    file.write_text(CliRunner().invoke(cli, ["check-config", "--defaults"]).stdout)
+    assert CliRunner().invoke(cli, ["check-config", str(file)]).exit_code == 0
+
+
+@pytest.mark.parametrize("command", ["sitl", "loopback"])
+def test_an_unknown_scenario_names_the_nearest(command: str) -> None:
+    done = CliRunner().invoke(cli, [command, "--scenario", "defualt"])
+    assert done.exit_code == 2
+    assert "did you mean default?" in done.output
+
+
+@pytest.mark.parametrize("name", ["nothing.mcap", "nothing.tlog", "nothing.pdf"])
+def test_a_log_that_is_not_there_gets_one_sentence(tmp_path: Path, name: str) -> None:
+    done = companion("replay", tmp_path / name)
+    assert done.returncode == 1
+    assert len(done.stderr.splitlines()) == 1 and name in done.stderr
+    assert not list(tmp_path.iterdir())
