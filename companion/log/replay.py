@@ -9,26 +9,23 @@ were not heard (--rsbn), fixes that did not come (--outage).
 
 from __future__ import annotations
 
-import heapq
 import json
-import re
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from itertools import chain, zip_longest
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import click
-from msgspec import structs
 from rich.console import Console
 from rich.progress import Progress
 
 from companion import __version__
-from companion.config import Config, ConfigError, load, parse, to_toml
-from companion.log import file, latency, simulate, sources
-from companion.log.opened import ACTIVE, LogError
+from companion.config import Config, load, parse, to_toml
+from companion.log import file, latency, simulate
+from companion.log.opened import LogError
+from companion.log.variant import changed, is_own, sentences, with_radio
 from companion.navigator import Navigator
 from companion.records import INPUTS, OUTPUTS, Event, Solution, Stamped
 
@@ -112,109 +109,6 @@ def writer(
 ) -> file.Writer:
     """A log for a replay: it waits for the disk, since nobody flies by it."""
     return file.Writer(path, metadata=described, start_unix_ns=start_unix_ns, start_ns=start_ns, block=True)
-
-
-def changed(config: Config, text: str) -> Config:
-    """`config` with KEY=VALUE,... as typed: SECTION.KEY, or KEY alone where one section has it, or
-    `estimator` for estimator.output. ConfigError, one sentence, where there is no such key or value.
-    """
-    for pair in re.split(r",(?=[A-Za-z_.]+=)", text):
-        name, _, value = pair.partition("=")
-        name = _full_name(name.strip())
-        try:
-            told = load(environment={}, pairs=[f"{name}={value}"])
-        except ConfigError as error:
-            raise ConfigError(str(error).replace("--set", "--with")) from None
-        section, key = name.split(".")
-        table = structs.replace(getattr(config, section), **{key: getattr(getattr(told, section), key)})
-        config = structs.replace(config, **{section: table})
-    return config
-
-
-def _full_name(name: str) -> str:
-    if "." in name:
-        return name
-    if name == "estimator":
-        return "estimator.output"
-    having = [section for section in Config.__struct_fields__ if hasattr(getattr(Config(), section), name)]
-    if len(having) == 1:
-        return f"{having[0]}.{name}"
-    why = f"sections {', '.join(having)} have one each" if having else "no section has it"
-    raise ConfigError(f"--with {name}: {why}; write it as SECTION.KEY=VALUE, for example gnss.sigma_m=3.0")
-
-
-class Opened(NamedTuple):
-    """The inputs of any log, and what it was given for its times: `summary` counts once they are read."""
-
-    records: Iterable[Stamped]
-    summary: Callable[[], dict[str, int]]
-
-
-def inputs(log: Path) -> Opened:
-    """What went into a navigator in `log`, ours or a foreign one, with the truth where it has any.
-
-    LogError, one sentence, where it cannot be read.
-    """
-    if is_own(log):
-        return Opened(_own_inputs(log), dict)
-    with sentences():
-        source = sources.open_source(log)
-    return Opened(source, lambda: source.summary()._asdict())
-
-
-def is_own(log: Path) -> bool:
-    """Whether the name is that of a log of ours."""
-    return log.suffix == ".mcap" or log.name.endswith(f".mcap{ACTIVE}")
-
-
-def _own_inputs(log: Path) -> Iterator[Stamped]:
-    for entry in file.read(log):
-        if entry.topic.split("/")[1] in ("in", "truth"):
-            yield entry.value
-
-
-@contextmanager
-def sentences() -> Iterator[None]:
-    """What a foreign log's reader says in a ValueError is for the person who gave the log."""
-    try:
-        yield
-    except ConfigError:
-        raise
-    except ValueError as error:
-        raise LogError(str(error)) from None
-    except LogError:
-        raise
-    except OSError as error:
-        raise LogError(f"{error.filename} cannot be read: {error.strerror}") from None
-
-
-def with_radio(
-    log: Path, beacons: Path | None, outages: Sequence[simulate.Outage], seed: int, config: Config
-) -> tuple[Opened, str]:
-    """The inputs of `log` with beacons heard and outages had, and a sentence about the beacons.
-
-    The log is read twice where there are beacons: once for its track.
-    """
-    opened = inputs(log)
-    if beacons is None and not outages:
-        return opened, ""
-    records = iter(opened.records)
-    first = next(records, None)
-    if first is None:
-        raise LogError(f"{log} holds no message: there is nothing to replay")
-    merged, note = chain([first], records), ""
-    if beacons is not None:
-        track = simulate.track_of(inputs(log).records, config)
-        heard = simulate.answers(simulate.read_beacons(beacons), track, seed)
-        numbers = sorted({answer.beacon for answer in heard})
-        note = (
-            f"{len(heard)} RSBN answers of {len(numbers)} beacons ({', '.join(map(str, numbers))}) simulated"
-            f" along {track.origin}, seed {seed}"
-            if heard
-            else f"no beacon of {beacons} is in radio sight along {track.origin}"
-        )
-        merged = heapq.merge(merged, heard, key=lambda record: record.rx_ns)  # type: ignore[assignment]
-    return Opened(simulate.without(merged, outages, first.rx_ns), opened.summary), note
 
 
 @click.command("replay")
