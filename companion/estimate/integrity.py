@@ -276,6 +276,18 @@ def readmit(bank: Bank, source: str) -> Bank:
     return bank._replace(rows=tuple(rows), x=x, P=P, excluded=left)
 
 
+def shift(bank: Bank, north: float, east: float) -> Bank:
+    """After the inertial channel itself jumped by (north, east) m: every solution's error jumped with it."""
+    x = bank.x.copy()
+    x[:, :2] += north, east
+    return bank._replace(x=x)
+
+
+def widen(bank: Bank, factor: float) -> Bank:
+    """With every covariance multiplied: what the solutions claimed was proved wrong."""
+    return bank._replace(P=bank.P * factor)
+
+
 def protection(bank: Bank, false_alarm: float, integrity_risk: float) -> Protection:
     """The horizontal protection level with separations tested at `false_alarm` each.
 

@@ -14,7 +14,18 @@ from typing import NamedTuple
 
 from scipy.special import chdtri
 
-from .integrity import Bank, Measurement, Separation, blame, exclude, fork, separations, take, threshold
+from .integrity import (
+    Bank,
+    Measurement,
+    Separation,
+    blame,
+    exclude,
+    fork,
+    readmit,
+    separations,
+    take,
+    threshold,
+)
 
 BEYOND = "separation"
 REFUSED = "refused by every solution"
@@ -25,7 +36,8 @@ class Allotment(NamedTuple):
 
     `alarms_per_hour`: false alarms of the separations, all rows together. They are tested once a second, but
     one test says little new within `independent_s`. `rejection`: a good measurement refused. `wrong`: the
-    wrong source accused. `run`: refusals in a row that exclude.
+    wrong source accused. `run`: refusals in a row that exclude. `settle_s`: how long an excluded source must
+    be admitted without a break before it is heard again.
     """
 
     alarms_per_hour: float = 1e-3
@@ -34,6 +46,7 @@ class Allotment(NamedTuple):
     wrong: float = 1e-6
     run: int = 5
     fork_s: float = 120.0
+    settle_s: float = 10.0
 
     def false_alarm(self, rows: int) -> float:
         """Of one test of one of `rows` separations."""
@@ -68,6 +81,7 @@ class Monitor(NamedTuple):
     bank: Bank
     runs: tuple[tuple[str, int], ...] = ()
     unresolved: bool = False
+    admitted: tuple[tuple[str, int], ...] = ()  # excluded sources, and since when they have been admitted
 
 
 def hear(monitor: Monitor, measurement: Measurement, allotment: Allotment) -> tuple[Monitor, Refusal | None]:
@@ -96,6 +110,23 @@ def watch(monitor: Monitor, allotment: Allotment) -> tuple[Monitor, list[Exclusi
     return monitor._replace(bank=bank, unresolved=accused is not None), []
 
 
+def offer(
+    monitor: Monitor, t_ns: int, source: str, admitted: bool, allotment: Allotment
+) -> tuple[Monitor, bool]:
+    """What an excluded source says, which the gate (`integrity.admits`) has or has not `admitted`; whether it
+    is heard again from now on.
+    """
+    since = dict(monitor.admitted)
+    if not admitted:
+        since.pop(source, None)
+    elif (t_ns - since.setdefault(source, t_ns)) * 1e-9 >= allotment.settle_s:
+        del since[source]
+        runs = tuple(run for run in monitor.runs if run[0] != source)
+        bank = readmit(monitor.bank, source)
+        return monitor._replace(bank=bank, runs=runs, admitted=tuple(since.items())), True
+    return monitor._replace(admitted=tuple(since.items())), False
+
+
 def trusted(monitor: Monitor, source: str) -> bool:
     """Whether the source is heard: neither excluded nor in a run of refusals."""
     return source not in monitor.bank.excluded and dict(monitor.runs).get(source, 0) == 0
@@ -109,7 +140,7 @@ def _excluded(
     step = bank.x[0, :2] - before.x[0, :2]
     moved = float((step @ step) ** 0.5)
     told = Exclusion(bank.t_ns, source, reason, value, limit, bank.rows[0].since_ns, moved)
-    return Monitor(bank, monitor.runs), [told]
+    return monitor._replace(bank=bank, unresolved=False), [told]
 
 
 def _renewed(bank: Bank, found: tuple[Separation, ...], every_ns: int) -> Bank:

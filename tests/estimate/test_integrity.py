@@ -225,6 +225,31 @@ def test_a_run_of_wild_measurements_excludes_and_single_ones_do_not() -> None:
     assert refused == 3 + 20
 
 
+def test_an_excluded_source_comes_back_only_after_a_settled_while_within_the_bound() -> None:
+    allotment = monitor.Allotment(settle_s=10.0)
+    watch = monitor.Monitor(integrity.exclude(fly(8, 30).bank, "gnss", 1.0))
+    for t in range(100):
+        inside = t >= 50 and t != 55  # the spoofer leaves at 50 and is back for a moment
+        offset = (3.0, 4.0) if inside else (900.0, 0.0)
+        admitted = integrity.admits(offset, (30.0, 30.0), (2.0, 2.0), 0.01)
+        assert admitted == inside
+        watch, back = monitor.offer(watch, t * NS, "gnss", admitted, allotment)
+        if back:
+            break
+    assert t == 66
+    assert monitor.trusted(watch, "gnss")
+
+
+def test_a_jump_of_the_channel_moves_every_solution_and_none_apart() -> None:
+    bank = fly(9, 30).bank
+    moved = integrity.shift(bank, 200.0, -50.0)
+    for a, b in zip(integrity.separations(bank), integrity.separations(moved), strict=True):
+        np.testing.assert_allclose(a.d, b.d, atol=1e-9)
+    np.testing.assert_allclose((moved.x - bank.x)[:, :2], [[200.0, -50.0]] * len(bank.rows))
+    wide = integrity.widen(bank, 4.0)
+    assert integrity.protection(wide, 1e-6, 1e-5).level > 1.9 * integrity.protection(bank, 1e-6, 1e-5).level
+
+
 @settings(deadline=None, max_examples=200)
 @given(
     st.lists(st.tuples(st.floats(-1e3, 1e3), st.floats(-1e3, 1e3)), min_size=1, max_size=30),
