@@ -128,9 +128,12 @@ class Predictor(Section, frozen=True):
 
 
 class Estimator(Section, frozen=True):
-    """Which estimator feeds the output when fixes stop, and the gate that fixes must pass."""
+    """Which estimator feeds the output, and the gate that fixes must pass.
 
-    output: Literal["minimax", "kalman"] = "minimax"
+    "minimax" leads when fixes stop, and the error state ("kalman") while they come; "restrictive" throughout.
+    """
+
+    output: Literal["auto", "minimax", "kalman", "restrictive"] = "auto"
     false_rejection: Probability = 1e-6
     late_s: Annotated[float, Meta(ge=0.0, le=30.0)] = 6.0
 
@@ -189,6 +192,16 @@ class Config(Section, frozen=True):
         if self.inertial.source != "auto":
             return self.inertial.source
         return "air_data" if self.output.feeds_estimator else "local_position"
+
+    @property
+    def leading(self) -> Literal["minimax", "kalman", "restrictive"]:
+        """The estimator that `estimator.output` means, "auto" by the channel: on recorded flights by air data
+        the error state was the best of the three. The restrictive one runs by air data only.
+        """
+        local = self.channel == "local_position"
+        if self.estimator.output == "auto":
+            return "minimax" if local else "kalman"
+        return "minimax" if local and self.estimator.output == "restrictive" else self.estimator.output
 
 
 def load(

@@ -50,6 +50,7 @@ class Window:
     value: Floats = field(default_factory=lambda: np.empty(0))  # [m] or [m/s], INS minus fix
     sigma: Floats = field(default_factory=lambda: np.empty(0))  # [m] or [m/s]
     disturbance: float = 0.0  # [m/s^2] r.m.s. of specific force that (2.1) does not know of
+    drifting: bool = False  # nothing restores a velocity error: air-data dead reckoning in a wind
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.span) and self.span > 0.0):
@@ -123,7 +124,8 @@ class Window:
     ) -> Self:
         for array in (t_ns, velocity, value, sigma):
             array.setflags(write=False)
-        return type(self)(self.span, self.capacity, t_ns, velocity, value, sigma, self.disturbance)
+        kept = (t_ns, velocity, value, sigma)
+        return type(self)(self.span, self.capacity, *kept, self.disturbance, self.drifting)
 
     def _thinned(self) -> Self:
         """Drop the fix that leaves the least hole between its neighbours of the same quantity."""
@@ -199,7 +201,8 @@ def predict_ahead(
         if factored is None or window.disturbance:
             factored = _design(window, middle, int(t), scale)
         design, whitened = factored
-        carried = transition((int(t) - middle) * NANO * scale.rate)
+        alpha = (int(t) - middle) * NANO * scale.rate
+        carried = _drift(alpha) if window.drifting else transition(alpha)
         forecasts, reasons = {}, []
         for target in targets:
             k = TARGETS.index(target)
@@ -230,15 +233,27 @@ def _design(window: Window, middle: int, t_ns: int, scale: Scale) -> tuple[Desig
     before = (middle - window.t_ns) * (NANO * scale.rate)
     position, _, velocity, _ = scale.units
     rows = np.empty((len(window), 4))
-    rows[~window.velocity] = schuler_row("gamma", before[~window.velocity])
-    rows[window.velocity] = schuler_row("mu", before[window.velocity])
+    if window.drifting:
+        rows = np.array([_drift(-s)[2 if v else 0] for s, v in zip(before, window.velocity, strict=True)])
+    else:
+        rows[~window.velocity] = schuler_row("gamma", before[~window.velocity])
+        rows[window.velocity] = schuler_row("mu", before[window.velocity])
     sigma = window.sigma
     if window.disturbance:
         age = np.abs(t_ns - window.t_ns) * (NANO * scale.rate)
-        of_position = window.disturbance / scale.rate**2 * _swept(age, 0.0)
-        of_velocity = window.disturbance / scale.rate * _swept(age, 0.5 * math.pi)
+        swept = (0.5 * age**2, age) if window.drifting else (_swept(age, 0.0), _swept(age, 0.5 * math.pi))
+        of_position = window.disturbance / scale.rate**2 * swept[0]
+        of_velocity = window.disturbance / scale.rate * swept[1]
         sigma = sigma + np.where(window.velocity, of_velocity, of_position)
     return Design.of(rows, sigma / np.where(window.velocity, velocity, position)), window.value / sigma
+
+
+def _drift(alpha: float) -> Floats:
+    """Return the (4, 4) matrix that takes gamma a dimensionless time alpha ahead on mu alone, mu constant."""
+    ahead = np.zeros((4, 4))
+    ahead[0, 0] = ahead[2, 2] = 1.0
+    ahead[0, 2] = alpha
+    return ahead
 
 
 def _swept(x: Floats, phase: float) -> Floats:

@@ -13,6 +13,9 @@ from typing import NamedTuple
 
 from companion.config import Config, parse
 from companion.records import (
+    AirData,
+    Attitude,
+    Event,
     GlobalPosition,
     Gnss,
     Input,
@@ -20,6 +23,7 @@ from companion.records import (
     LocalPosition,
     Mode,
     Output,
+    Pressure,
     Reboot,
     Rejection,
     RsbnFix,
@@ -30,11 +34,21 @@ from companion.records import (
 from . import guarantee
 from .carry import Carry, Settings, initial
 from .solution import announce, solve
-from .step import step
+from .step import step, uses
 
 __all__ = ["Navigator"]
 
-FOLDED = (LocalPosition, LocalOrigin, GlobalPosition, Gnss, RsbnFix, Reboot)
+FOLDED = (
+    LocalPosition,
+    LocalOrigin,
+    GlobalPosition,
+    Attitude,
+    AirData,
+    Pressure,
+    Gnss,
+    RsbnFix,
+    Reboot,
+)
 
 
 class _Past(NamedTuple):
@@ -53,14 +67,18 @@ class Navigator:
         self._late_ns = round(1e9 * config.estimator.late_s)
         self._mode = Mode.INITIALISING  # of the last solution given out, and its time
         self._given_ns = 0
+        self._chosen = config.inertial.source == "local_position"  # else the choice is told, once
 
     def handle(self, record: Input) -> list[Output]:
         """What follows from one more record."""
         if isinstance(record, Tuning):
             self._tune(parse(record.toml, "parameters"))
             return []
-        if not isinstance(record, FOLDED):
+        if type(record) not in uses(self._settings.config):
             return []
+        if not self._chosen:
+            self._chosen = True
+            return [_choice(record, self._settings.config), *self.handle(record)]
         if isinstance(record, Gnss) and not self._is_news(record):
             return []
         if self._past and record.t_ns < self._past[-1].t_ns:
@@ -76,11 +94,16 @@ class Navigator:
         return self._announced(outputs)
 
     def _tune(self, config: Config) -> None:
-        """Go on with another configuration; late measurements are no longer folded in from before it."""
-        self._settings = Settings.of(config)
+        """Go on with another configuration; late measurements are no longer folded in from before it.
+
+        Where it means another inertial channel, all that was learnt was of the old one's error.
+        """
+        before, self._settings = self._settings.config.channel, Settings.of(config)
         self._late_ns = round(1e9 * config.estimator.late_s)
-        promise = guarantee.tuned(self._carry.guarantee, config.predictor)
+        promise = guarantee.tuned(self._carry.guarantee, config)
         self._carry = self._carry._replace(guarantee=promise)
+        if config.channel != before:
+            self._carry, self._chosen = initial(self._settings)._replace(next_ns=self._carry.next_ns), False
         self._past.clear()
 
     def _is_news(self, record: Gnss) -> bool:
@@ -127,3 +150,15 @@ class Navigator:
                     self._mode = output.mode
                     announced.append(announce(output))
         return announced
+
+
+def _choice(record: Input, config: Config) -> Event:
+    """The line that tells which inertial channel is corrected, and why."""
+    if config.inertial.source != "auto":
+        why = "configured"
+    elif config.output.feeds_estimator:
+        why = "the autopilot is fed, so its own position is not independent"
+    else:
+        why = "the autopilot is not fed"
+    name = {"air_data": "air-data dead reckoning", "local_position": "the autopilot's local position"}
+    return Event(record.t_ns, record.rx_ns, 6, f"inertial channel: {name[config.channel]} ({why})")

@@ -9,17 +9,21 @@ from scipy.special import chdtri
 from companion.config import Config
 from companion.records import Gnss, LocalOrigin, LocalPosition, Output, Prediction, Source
 
-from . import errorstate, guarantee, inertial, radio
-from .errorstate import ErrorState, Grade
+from . import errorstate, guarantee, inertial, radio, winderror
+from .deadreckoning import Reckoner
+from .errorstate import ErrorModel, ErrorState
 from .guarantee import Guarantee
 from .inertial import Point, Track
+from .restricted import Restrictive
+
+FIXES = Source.GNSS | Source.AZIMUTH | Source.RANGE
 
 
 class Settings(NamedTuple):
     """The configuration with what follows from it."""
 
     config: Config
-    unit: Grade
+    unit: ErrorModel
     gate: tuple[float, ...]  # chi-square limits for 0, 1, 2, 3 degrees of freedom
 
     @classmethod
@@ -27,7 +31,10 @@ class Settings(NamedTuple):
         """Everything derived once."""
         alarm = config.estimator.false_rejection
         gate = (0.0, *(float(chdtri(k, alarm)) for k in (1, 2, 3)))
-        return cls(config, errorstate.grade(config.inertial, config.gnss), gate)
+        unit: ErrorModel = errorstate.grade(config.inertial, config.gnss)
+        if config.channel == "air_data":
+            unit = winderror.grade(config.air_data, config.gnss)
+        return cls(config, unit, gate)
 
 
 class Level(NamedTuple):
@@ -43,8 +50,10 @@ class Carry(NamedTuple):
     guarantee: Guarantee
     origin: LocalOrigin | None = None
     local: LocalPosition | None = None
+    reckoner: Reckoner = Reckoner()
     track: Track = ()
     state: ErrorState | None = None
+    restrictive: Restrictive | None = None  # of air-data dead reckoning
     level: Level = Level()
     gnss: Gnss | None = None  # the last new one, used or not
     gnss_heard: radio.Heard | None = None  # the last one believed
@@ -60,7 +69,7 @@ Step = tuple[Carry, list[Output]]
 
 def initial(settings: Settings) -> Carry:
     """The carry before anything was heard."""
-    return Carry(guarantee.begin(settings.config.predictor))
+    return Carry(guarantee.begin(settings.config))
 
 
 def state_at(carry: Carry, ins: Point, settings: Settings) -> ErrorState:
@@ -78,6 +87,8 @@ def level(ins: Point, carry: Carry) -> Point:
 def sources(carry: Carry, t_ns: int, settings: Settings) -> Source:
     """What the position rests on now: fixes younger than their timeouts, over the inertial channel."""
     config, sources = settings.config, Source.INERTIAL
+    if config.channel == "air_data":
+        sources |= Source.AIR_DATA
     if carry.gnss_ns is not None and (t_ns - carry.gnss_ns) * 1e-9 <= config.gnss.timeout_s:
         sources |= Source.GNSS
     if carry.rsbn_ns is not None and (t_ns - carry.rsbn_ns) * 1e-9 <= config.rsbn.timeout_s:

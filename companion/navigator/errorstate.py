@@ -7,12 +7,15 @@ drift (rad/s), A the accelerometer errors (m/s^2), and GN, GE the drift of GNSS 
 the paper's words. A fix enters by maximum likelihood with this state as one more observation: the position
 part of the posterior is the fusion's, and the rest follows it by regression. That is the Kalman update where
 the measurement is linear, and the iterated one where it is an azimuth or a range.
+
+Another inertial channel has another model (`winderror` of air-data dead reckoning). What all have in common:
+the position error comes first, the drift of GNSS last, and `velocity_rows` tell the velocity error.
 """
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -28,9 +31,6 @@ N = 14
 POSITION = slice(0, 2)
 VELOCITY = slice(2, 4)
 TILT = slice(4, 7)
-#: What a radio fix, a beacon's or GNSS's, says of the state: INS minus fix, north and east (2, N).
-BEACON_ROWS = np.eye(2, N)
-GNSS_ROWS = BEACON_ROWS - np.eye(2, N, 12)
 G0 = 9.80665  # [m/s^2] of a bias quoted in micro-g
 STEP_S = 2.0  # the transition is a power series: its fifth term is below 1e-12 of the first here
 
@@ -43,12 +43,49 @@ class ErrorState(NamedTuple):
     P: Floats
 
 
+class System(NamedTuple):
+    """x' = A x + w, w white of spectral density Q; both (n, n)."""
+
+    A: Floats
+    Q: Floats
+
+
+class ErrorModel(Protocol):
+    """How the errors of one kind of inertial channel move: first sigmas (n,), and what `velocity_noise` (m/s)
+    the channel's velocity has besides.
+    """
+
+    @property
+    def sigma0(self) -> Floats:
+        """First sigmas (n,)."""
+
+    @property
+    def velocity_noise(self) -> float:
+        """White noise of the channel's velocity, m/s, that is no state."""
+
+    def system(self, lat: float, v_n: Vector3, a_n: Vector2) -> System:
+        """The error equations while the channel moves at `v_n` with horizontal acceleration `a_n`."""
+
+    def velocity_rows(self, v_n: Vector3) -> Floats:
+        """H (2, n): the error of the channel's velocity, north and east, is H x."""
+
+
 class Grade(NamedTuple):
-    """Disturbances of the unit and of GNSS, white spectral densities (N,), first sigmas (N,)."""
+    """Of an INS: disturbances of the unit and of GNSS, white spectral densities (N,), first sigmas (N,)."""
 
     disturbances: tuple[Disturbance, ...]
     density: Floats
     sigma0: Floats
+    velocity_noise: float = 0.0
+
+    def system(self, lat: float, v_n: Vector3, a_n: Vector2) -> System:
+        """The INS error equations at this latitude, velocity and acceleration."""
+        model = aircraft(lat, v_n[0], v_n[1], (*a_n, 0.0), added=self.disturbances)
+        return System(model.A, model.Q + np.diag(self.density))
+
+    def velocity_rows(self, v_n: Vector3) -> Floats:
+        """The velocity errors are states."""
+        return np.eye(2, N, 2)
 
 
 def grade(settings: Inertial, gnss: GnssSection) -> Grade:
@@ -70,24 +107,36 @@ def grade(settings: Inertial, gnss: GnssSection) -> Grade:
     return Grade(disturbances, density, np.array(sigma0))
 
 
-def start(t_ns: int, unit: Grade) -> ErrorState:
+def beacon_rows(unit: ErrorModel) -> Floats:
+    """What a beacon's fix says of the state: INS minus fix, north and east, is H x; H (2, n)."""
+    return np.eye(2, len(unit.sigma0))
+
+
+def gnss_rows(unit: ErrorModel) -> Floats:
+    """What a fix of GNSS says of the state, its drift being the last two; H (2, n)."""
+    n = len(unit.sigma0)
+    return np.eye(2, n) - np.eye(2, n, n - 2)
+
+
+def start(t_ns: int, unit: ErrorModel) -> ErrorState:
     """What is known before the first fix: nothing but the grade of the unit."""
-    return ErrorState(t_ns, np.zeros(N), np.diag(unit.sigma0**2))
+    return ErrorState(t_ns, np.zeros(len(unit.sigma0)), np.diag(unit.sigma0**2))
 
 
-def predict(state: ErrorState, t_ns: int, lat: float, v_n: Vector3, a_n: Vector2, unit: Grade) -> ErrorState:
+def predict(
+    state: ErrorState, t_ns: int, lat: float, v_n: Vector3, a_n: Vector2, unit: ErrorModel
+) -> ErrorState:
     """The state at `t_ns`, the INS flying at `v_n` with horizontal acceleration `a_n` in between."""
     left = (t_ns - state.t_ns) * 1e-9
     if left <= 0.0:
         return state
     x, P = state.x, state.P
-    model = aircraft(lat, v_n[0], v_n[1], (*a_n, 0.0), added=unit.disturbances)
-    density = model.Q + np.diag(unit.density)
+    A, density = unit.system(lat, v_n, a_n)
     steps = math.ceil(left / STEP_S)
     dt = left / steps
-    M = model.A * dt
+    M = A * dt
     M2 = M @ M
-    Phi = np.eye(N) + M + M2 / 2.0 + (M2 @ M) / 6.0 + (M2 @ M2) / 24.0
+    Phi = np.eye(len(x)) + M + M2 / 2.0 + (M2 @ M) / 6.0 + (M2 @ M2) / 24.0
     # trapezoid of the process noise: second order in dt, which is short against every mode
     Q = 0.5 * dt * (density + Phi @ density @ Phi.T)
     for _ in range(steps):
@@ -109,15 +158,17 @@ def absorb_position(state: ErrorState, H: Floats, mean: Floats, covariance: Floa
     return ErrorState(state.t_ns, x, 0.5 * (P + P.T))
 
 
-def absorb_velocity(state: ErrorState, velocity_error: Floats, sigma: float) -> tuple[ErrorState, float]:
-    """The state corrected by a measured INS velocity error (2,) m/s, Joseph's form; and the NIS of the
+def absorb_velocity(
+    state: ErrorState, H: Floats, velocity_error: Floats, sigma: float
+) -> tuple[ErrorState, float]:
+    """The state corrected by a measured INS velocity error H x (2,) m/s, Joseph's form; and the NIS of the
     innovation.
     """
-    S = state.P[VELOCITY, VELOCITY] + sigma**2 * np.eye(2)
-    nu = velocity_error - state.x[VELOCITY]
-    K = np.linalg.solve(S, state.P[VELOCITY, :]).T
-    J = np.eye(N)
-    J[:, VELOCITY] -= K
+    HP = H @ state.P
+    S = HP @ H.T + sigma**2 * np.eye(2)
+    nu = velocity_error - H @ state.x
+    K = np.linalg.solve(S, HP).T
+    J = np.eye(len(state.x)) - K @ H
     P = J @ state.P @ J.T + sigma**2 * K @ K.T
     return ErrorState(state.t_ns, state.x + K @ nu, 0.5 * (P + P.T)), float(nu @ np.linalg.solve(S, nu))
 
@@ -129,6 +180,13 @@ def shift(state: ErrorState, north: float, east: float) -> ErrorState:
     x = state.x.copy()
     x[POSITION] += north, east
     return state._replace(x=x)
+
+
+def blur(state: ErrorState, sigma: float) -> ErrorState:
+    """The state after the channel moved by nobody knows how much, `sigma` (m) north and as much east."""
+    P = state.P.copy()
+    P[POSITION, POSITION] += sigma**2 * np.eye(2)
+    return state._replace(P=P)
 
 
 def widen(state: ErrorState, factor: float) -> ErrorState:

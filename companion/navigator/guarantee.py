@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from companion.config import Predictor
+from companion.config import Config, Predictor
 from companion.estimate.predictor import Forecast, Quantity, Window, predict, predict_ahead
 from companion.estimate.predictor import Prediction as Channel
 from companion.records import Prediction, Vector2
@@ -56,15 +56,19 @@ class Guarantee(NamedTuple):
     held: tuple[Channel, Channel] | None = None
 
 
-def begin(settings: Predictor) -> Guarantee:
-    """Nothing learnt yet."""
-    window = Window(span=60.0 * settings.window_min, disturbance=settings.disturbance_ug * 1e-6 * G0)
+def begin(config: Config) -> Guarantee:
+    """Nothing learnt yet. The error of dead reckoning drifts with a wind that changes at a bounded rate."""
+    span = 60.0 * config.predictor.window_min
+    if config.channel == "air_data":
+        window = Window(span, disturbance=config.air_data.wind_rate_m_s_min / 60.0, drifting=True)
+    else:
+        window = Window(span, disturbance=config.predictor.disturbance_ug * 1e-6 * G0)
     return Guarantee(window, window)
 
 
-def tuned(g: Guarantee, settings: Predictor) -> Guarantee:
+def tuned(g: Guarantee, config: Config) -> Guarantee:
     """What was learnt, under other settings."""
-    fresh = begin(settings).north
+    fresh = begin(config).north
     north, east = (replace(w, span=fresh.span, disturbance=fresh.disturbance) for w in (g.north, g.east))
     return Guarantee(north, east, g.bins)
 

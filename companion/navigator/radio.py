@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from companion.config import GnssSection, Rsbn
 from companion.estimate.fusion import Azimuth, Fix, Observation, Position, Range, maximum_likelihood
-from companion.nav.geometry import Geodetic, enu_axes, separation, to_ecef
+from companion.nav.geometry import Geodetic, enu_axes, from_enu, separation, to_ecef
 from companion.records import Gnss, RsbnFix, Source
 
 from .inertial import Point
@@ -58,6 +58,17 @@ def from_rsbn(record: RsbnFix, ins: Point, settings: Rsbn) -> Heard:
         observations.append(Range(place, record.slant_range, max(record.sigma_range, floor)))
         sources |= Source.RANGE
     return Heard(record.t_ns, tuple(observations), sources)
+
+
+def place(record: RsbnFix, alt: float) -> Geodetic | None:
+    """Roughly where azimuth and range are at height `alt`, the earth taken for flat; None without both."""
+    if record.azimuth is None or record.slant_range is None:
+        return None
+    up = alt - record.alt
+    distance = math.sqrt(max(record.slant_range**2 - up * up, 0.0))
+    east, north = distance * math.sin(record.azimuth), distance * math.cos(record.azimuth)
+    beacon = Geodetic(record.lat, record.lon, record.alt)
+    return from_enu(np.array([east, north, up]), beacon)._replace(alt=alt)
 
 
 def innovation(heard: Heard, prior: Position) -> Fix:

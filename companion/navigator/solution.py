@@ -3,15 +3,28 @@
 from __future__ import annotations
 
 import math
+from itertools import combinations
+from typing import NamedTuple
 
 from companion.nav.geometry import displace
-from companion.records import Event, Mode, Solution, Source, Vector2
+from companion.records import Event, Mode, Solution, Source, Vector2, Vector3
 
-from . import guarantee
-from .carry import Carry, Settings, Step, level, sources, state_at
+from . import guarantee, restricted
+from .carry import FIXES, Carry, Settings, Step, level, sources, state_at
+from .errorstate import ErrorState, Floats
 from .guarantee import Bounded
+from .inertial import Point
+from .winderror import WindError
 
 AHEAD_NS = 5_000_000_000  # how often the bounds ahead are worked out
+
+
+class _Estimate(NamedTuple):
+    """The error of the inertial channel by one estimator: m, m/s, and m^2 of north, north-east, east."""
+
+    error_n: Vector2
+    velocity_error_n: Vector2
+    covariance: Vector3
 
 
 def solve(carry: Carry, rx_ns: int, settings: Settings) -> Step:
@@ -27,33 +40,31 @@ def solve(carry: Carry, rx_ns: int, settings: Settings) -> Step:
         bounds = guarantee.ahead(promise, t_ns, config.predictor)
         carry = carry._replace(ahead=bounds, next_ahead_ns=t_ns + AHEAD_NS)
     mode = _mode(carry, bounded, t_ns, settings)
-    kalman: Vector2 = (float(state.x[0]), float(state.x[1]))
-    error, velocity_error = kalman, (float(state.x[2]), float(state.x[3]))
-    P = state.P[:2, :2].tolist()
-    by_minimax = mode is not Mode.FIXED and bounded is not None and config.estimator.output == "minimax"
-    if by_minimax and bounded is not None:
-        error, velocity_error = bounded.error_n, bounded.velocity_error_n
-        P = [[bounded.bound_n[0] ** 2, 0.0], [0.0, bounded.bound_n[1] ** 2]]
-    lat, lon, alt = displace(*ins.position, -error[0], -error[1], 0.0)
+    candidates = _candidates(carry, state, bounded, ins, settings)
+    leads = settings.config.leading
+    if (mode is Mode.FIXED and leads == "minimax") or leads not in candidates:
+        leads = "kalman"
+    error, velocity_error, (var_n, cov, var_e) = candidates[leads]
     north, east, down = ins.v_n
+    lat, lon, alt = displace(*ins.position, -error[0], -error[1], 0.0)
     last = max((t for t in (carry.gnss_ns, carry.rsbn_ns) if t is not None), default=t_ns)
     solution = Solution(
         t_ns,
         rx_ns,
         mode,
-        "minimax" if by_minimax else "kalman",
+        leads,
         lat,
         lon,
         alt,
         (north - velocity_error[0], east - velocity_error[1], down),
-        (P[0][0], P[0][1], 0.0, P[1][1], 0.0, carry.level.variance),
+        (var_n, cov, 0.0, var_e, 0.0, carry.level.variance),
         error,
         velocity_error,
         int(sources(carry, t_ns, settings)),
         max(0.0, (t_ns - last) * 1e-9),
         bounded and bounded.bound_n,
         bounded and bounded.velocity_bound_n,
-        bounded and math.dist(kalman, bounded.error_n),
+        _disagreement(candidates),
         max(0.0, (rx_ns - t_ns) * 1e-9),
         carry.ahead,
     )
@@ -61,8 +72,35 @@ def solve(carry: Carry, rx_ns: int, settings: Settings) -> Step:
     return carry._replace(state=state, guarantee=promise, next_ns=next_ns), [solution]
 
 
+def _candidates(
+    carry: Carry, state: ErrorState, bounded: Bounded | None, ins: Point, settings: Settings
+) -> dict[str, _Estimate]:
+    """What each estimator that runs says of the channel's error."""
+    (dx, dy), (dv_n, dv_e) = state.x[:2].tolist(), (settings.unit.velocity_rows(ins.v_n) @ state.x).tolist()
+    found = {"kalman": _Estimate((dx, dy), (dv_n, dv_e), _triangle(state.P))}
+    if bounded is not None:
+        variances = (bounded.bound_n[0] ** 2, 0.0, bounded.bound_n[1] ** 2)
+        found["minimax"] = _Estimate(bounded.error_n, bounded.velocity_error_n, variances)
+    if carry.restrictive is not None and isinstance(settings.unit, WindError):
+        x, P = restricted.at(carry.restrictive, ins.t_ns, settings.unit)
+        dx, dy, dv_n, dv_e = x.tolist()
+        found["restrictive"] = _Estimate((dx, dy), (dv_n, dv_e), _triangle(P))
+    return found
+
+
+def _triangle(P: Floats) -> Vector3:
+    (var_n, cov), (_, var_e) = P[:2, :2].tolist()
+    return var_n, cov, var_e
+
+
+def _disagreement(candidates: dict[str, _Estimate]) -> float | None:
+    """The greatest distance between two estimators; None where there is only one."""
+    pairs = combinations([c.error_n for c in candidates.values()], 2)
+    return max((math.dist(a, b) for a, b in pairs), default=None)
+
+
 def _mode(carry: Carry, bounded: Bounded | None, t_ns: int, settings: Settings) -> Mode:
-    if sources(carry, t_ns, settings) & ~Source.INERTIAL:
+    if sources(carry, t_ns, settings) & FIXES:
         return Mode.FIXED
     if bounded is None or math.hypot(*bounded.bound_n) > settings.config.predictor.limit_m:
         return Mode.UNTRUSTED
@@ -71,7 +109,7 @@ def _mode(carry: Carry, bounded: Bounded | None, t_ns: int, settings: Settings) 
 
 def announce(solution: Solution) -> Event:
     """The line that tells of a change to this solution's mode."""
-    fixes = [s.name.lower() for s in Source if s.name and s is not Source.INERTIAL and s & solution.sources]
+    fixes = [s.name.lower() for s in Source if s.name and s & FIXES & solution.sources]
     if solution.mode is Mode.FIXED:
         why = " and ".join(fixes) + " fixes"
     elif solution.bound_n is None:

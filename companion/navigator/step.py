@@ -15,9 +15,12 @@ from typing import Any
 
 import numpy as np
 
+from companion.config import Config
 from companion.estimate.fusion import Height, NoFix, Position, maximum_likelihood
 from companion.nav.geometry import displace
 from companion.records import (
+    AirData,
+    Attitude,
     Event,
     Fix,
     GlobalPosition,
@@ -26,6 +29,7 @@ from companion.records import (
     LocalOrigin,
     LocalPosition,
     Output,
+    Pressure,
     Reboot,
     Rejection,
     Reset,
@@ -34,20 +38,24 @@ from companion.records import (
     Vector3,
 )
 
-from . import errorstate, guarantee, inertial, radio
-from .carry import Carry, Level, Settings, Step, initial, level, sources, state_at
+from . import deadreckoning, errorstate, guarantee, inertial, radio, restricted
+from .carry import FIXES, Carry, Level, Settings, Step, initial, level, sources, state_at
 from .errorstate import ErrorState, Floats
 from .inertial import Point
 from .solution import solve
+from .winderror import WindError
 
 TOGETHER_NS = 1_000_000_000  # GNSS this close to a beacon's answer joins its fix
 LEVEL_3D = 3  # GPS_FIX_TYPE_3D_FIX
+BRIDGED_S = 1.0  # a silence of the airspeed up to this long is nothing
+UNKNOWN_M_S = 15.0  # how fast the position is lost in a longer one
+FAR_M = 500.0  # dead reckoning without wind is brought back from this far off
 BOUND_GATE = 3.0  # a fix within this many guaranteed r.m.s. of the prediction is believed after an outage
 
 
 def step(carry: Carry, record: Input, settings: Settings) -> Step:
     """The carry and the outputs after one more record; records it has no use for change nothing."""
-    use = _USES.get(type(record))
+    use = uses(settings.config).get(type(record))
     return (carry, []) if use is None else use(carry, record, settings)
 
 
@@ -102,10 +110,63 @@ def _shifted(carry: Carry, north: float, east: float) -> Carry:
     """After a jump of the inertial channel: its error jumped with it, where the aircraft is did not."""
     state = carry.state and errorstate.shift(carry.state, north, east)
     promise = guarantee.shift(carry.guarantee, north, east)
-    return carry._replace(state=state, guarantee=promise, track=(), gnss_heard=None)
+    bounded = carry.restrictive and restricted.shift(carry.restrictive, north, east)
+    return carry._replace(state=state, guarantee=promise, restrictive=bounded, track=(), gnss_heard=None)
+
+
+def _sense(carry: Carry, record: Attitude | AirData | Pressure, settings: Settings) -> Step:
+    return carry._replace(reckoner=deadreckoning.sense(carry.reckoner, record)), []
+
+
+def _air_data(carry: Carry, record: AirData, settings: Settings) -> Step:
+    """Dead reckoning goes on by one airspeed. The first fix told it where to begin."""
+    if not carry.track:
+        return _sense(carry, record, settings)
+    out = list[Output]()
+    last = carry.track[-1]
+    found = deadreckoning.advance(carry.reckoner, last, record)
+    if found is None:
+        return carry, out
+    reckoner, new = found
+    silent = (new.t_ns - last.t_ns) * 1e-9
+    if silent > BRIDGED_S:
+        carry = _blurred(carry, UNKNOWN_M_S * silent, settings)
+        why = f"no airspeed with attitude for {silent:.1f} s"
+        out.append(Reset(record.t_ns, record.rx_ns, "inertial channel", why))
+    carry = carry._replace(reckoner=reckoner, track=inertial.extend(carry.track, new))
+    if carry.state is not None and math.hypot(*carry.state.x[:2].tolist()) > FAR_M:
+        carry = _moved_home(carry)
+    if record.t_ns >= carry.next_ns:
+        carry, solution = solve(carry, record.rx_ns, settings)
+        out += solution
+    return carry, out
+
+
+def _blurred(carry: Carry, sigma: float, settings: Settings) -> Carry:
+    """After the channel was carried across a silence: what was promised of it is void."""
+    state = carry.state and errorstate.blur(carry.state, sigma)
+    promise = guarantee.begin(settings.config)
+    return carry._replace(state=state, guarantee=promise, restrictive=None, track=carry.track[-1:])
+
+
+def _moved_home(carry: Carry) -> Carry:
+    """The channel moved to where the estimate is, so that its errors stay small against the earth."""
+    assert carry.state is not None
+    north, east = (-carry.state.x[:2]).tolist()
+    track = tuple(p._replace(position=displace(*p.position, north, east, 0.0)) for p in carry.track)
+    return _shifted(carry, north, east)._replace(track=track)
+
+
+def _begun(carry: Carry, record: Gnss | RsbnFix, settings: Settings) -> Carry:
+    """With the first point of dead reckoning, if this fix is the first to tell a place."""
+    if carry.track or settings.config.channel != "air_data":
+        return carry
+    first = deadreckoning.begin(carry.reckoner, record)
+    return carry if first is None else carry._replace(track=(first,))
 
 
 def _gnss(carry: Carry, record: Gnss, settings: Settings) -> Step:
+    carry = _begun(carry, record, settings)
     config = settings.config.gnss
     carry = carry._replace(gnss=record)
     ins = inertial.at(carry.track, record.t_ns)
@@ -113,7 +174,7 @@ def _gnss(carry: Carry, record: Gnss, settings: Settings) -> Step:
     if record.fix < LEVEL_3D or ins is None or since < config.every_s:
         return carry, []
     white = radio.from_gnss(record, ins, config, drifting=True)
-    carry, out = _absorb(carry, white, errorstate.GNSS_ROWS, ins, record, settings)
+    carry, out = _absorb(carry, white, errorstate.gnss_rows(settings.unit), ins, record, settings)
     if out:
         return carry, out
     heard = radio.from_gnss(record, ins, config)
@@ -125,6 +186,7 @@ def _gnss(carry: Carry, record: Gnss, settings: Settings) -> Step:
 
 
 def _rsbn(carry: Carry, record: RsbnFix, settings: Settings) -> Step:
+    carry = _begun(carry, record, settings)
     ins = inertial.at(carry.track, record.t_ns)
     if ins is None:
         why = "no inertial position at its time"
@@ -133,7 +195,7 @@ def _rsbn(carry: Carry, record: RsbnFix, settings: Settings) -> Step:
     heard = radio.from_rsbn(record, ins, settings.config.rsbn)
     if not heard.observations:
         return carry, []
-    carry, out = _absorb(carry, heard, errorstate.BEACON_ROWS, ins, record, settings)
+    carry, out = _absorb(carry, heard, errorstate.beacon_rows(settings.unit), ins, record, settings)
     if out:
         return carry, out
     carry = carry._replace(rsbn_ns=record.t_ns)
@@ -173,7 +235,7 @@ def _within_bound(carry: Carry, heard: radio.Heard, settings: Settings) -> bool:
     """Whether a fix lies where the guaranteed prediction allows the aircraft to be; only asked while
     predicting.
     """
-    if sources(carry, heard.t_ns, settings) & ~Source.INERTIAL:
+    if sources(carry, heard.t_ns, settings) & FIXES:
         return False
     _, promise = guarantee.bounded(carry.guarantee, heard.t_ns, settings.config.predictor)
     if promise is None:
@@ -187,9 +249,11 @@ def _within_bound(carry: Carry, heard: radio.Heard, settings: Settings) -> bool:
 def _absorb_velocity(carry: Carry, record: Gnss, v_n: Vector3, ins: Point, settings: Settings) -> Carry:
     assert carry.state is not None
     config = settings.config.gnss
-    sigma = max(record.sigma_velocity or 0.0, config.sigma_velocity_m_s)
+    measured = max(record.sigma_velocity or 0.0, config.sigma_velocity_m_s)
+    sigma = math.hypot(measured, settings.unit.velocity_noise)
     error = (ins.v_n[0] - v_n[0], ins.v_n[1] - v_n[1])
-    state, nis = errorstate.absorb_velocity(carry.state, np.array(error), sigma)
+    H = settings.unit.velocity_rows(ins.v_n)
+    state, nis = errorstate.absorb_velocity(carry.state, H, np.array(error), sigma)
     if nis > settings.gate[2]:
         return carry
     g = carry.guarantee
@@ -237,7 +301,23 @@ def _learn(carry: Carry, heard: radio.Heard, ins: Point, record: Gnss | RsbnFix,
         fix.degrees_of_freedom,
         fix.iterations,
     )
-    return carry._replace(guarantee=g), [out]
+    return _restrict(carry._replace(guarantee=g), heard, ins, out, settings), [out]
+
+
+def _restrict(carry: Carry, heard: radio.Heard, ins: Point, fix: Fix, settings: Settings) -> Carry:
+    """The same fix for the restrictive estimator, which is kept of dead reckoning only."""
+    unit = settings.unit
+    if not isinstance(unit, WindError) or carry.state is None:
+        return carry
+    if carry.restrictive is None:
+        return carry._replace(restrictive=restricted.begin(carry.state, ins.v_n, unit))
+    var_n, cov, var_e = fix.covariance
+    covariance = np.array([[var_n, cov], [cov, var_e]])
+    white = not heard.sources & Source.GNSS
+    learnt = restricted.learn(
+        carry.restrictive, fix.t_ns, np.array(fix.correction_n), covariance, white, unit
+    )
+    return carry._replace(restrictive=learnt)
 
 
 def _prior(state: ErrorState, H: Floats, settings: Settings) -> Position:
@@ -254,11 +334,18 @@ def _rejected(record: Gnss | RsbnFix, reason: str, value: float, limit: float) -
     return Rejection(record.t_ns, record.rx_ns, source, reason, value, limit)
 
 
-_USES: dict[type, Callable[[Carry, Any, Settings], Step]] = {
-    Reboot: _reboot,
+_Uses = dict[type, Callable[[Carry, Any, Settings], Step]]
+_FIXES: _Uses = {Gnss: _gnss, RsbnFix: _rsbn, Reboot: _reboot}
+_OF_LOCAL_POSITION: _Uses = {
     LocalOrigin: _origin,
     GlobalPosition: _global_position,
     LocalPosition: _local_position,
-    Gnss: _gnss,
-    RsbnFix: _rsbn,
+    **_FIXES,
 }
+#: No position and no velocity of the autopilot's is among them, so none can be fed back to it.
+_OF_AIR_DATA: _Uses = {Attitude: _sense, Pressure: _sense, AirData: _air_data, **_FIXES}
+
+
+def uses(config: Config) -> _Uses:
+    """What each kind of record is good for, by the inertial channel."""
+    return _OF_AIR_DATA if config.channel == "air_data" else _OF_LOCAL_POSITION
