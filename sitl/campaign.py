@@ -174,10 +174,10 @@ def _line(fault: str, flights: list[Result], limits: Limits) -> Line:
 def show(lines: Sequence[Line], limits: Limits, console: Console) -> None:
     """Print the table."""
     flights, failed = sum(line.flights for line in lines), sum(not line.passed for line in lines)
-    grid = Table(title=f"{flights} flights; horizontal errors [m], times to detect [s]")
+    grid = Table(title=f"{flights} flights; horizontal errors in m, times to detect in s")
     heads = "fault", "flights", "detected", "median", "slowest", "excluded", "largest before", "largest"
     for head in (*heads, "misleading", "alarms/h", "bound held", "raised", "harmful", "passed"):
-        grid.add_column(head, justify="left" if head == "fault" else "right")
+        grid.add_column(head, justify="left" if head == "fault" else "right", no_wrap=head == "fault")
     for line in lines:
         grid.add_row(*(_cell(value) for value in line))
     console.print(grid)

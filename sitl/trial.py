@@ -7,7 +7,7 @@ flies. Five minutes are left before the fault for the companion to learn in, and
 It knows nothing of workers, files and tables (`sitl.campaign`). A fault counts as
 
     detected    a measurement of a source that it concerns was rejected, a reset told of it, or that source
-                went out of what the solutions rest on;
+                went out of what the solutions rest on, all before the fault is over;
     excluded    that source went out of what the solutions rest on (what comes no more excludes itself);
     misleading  the error passed `level` for a second or longer while the mode was not "untrusted".
 """
@@ -255,10 +255,10 @@ def score(order: Order, world: World, told: Sequence[Stamped]) -> Result:
     flagged = np.array([s.mode is Mode.UNTRUSTED for s in solutions])
     start = kind.fault.start_s if kind.fault else math.inf
     end = kind.fault.end_s if kind.fault else math.inf
-    lost = [x for x in _lost(solutions, t, kind.bits) if start <= x < end + 10.0]
+    lost = [x for x in _lost(solutions, t, kind.bits) if start <= x < end]
     excluded = lost[0] if lost else None
     seen = [r.t_ns * 1e-9 for r in told if _tells(r, kind.concerns)]
-    detected = min((x for x in (*seen, *lost) if start <= x < end + 10.0), default=None)
+    detected = min((x for x in (*seen, *lost) if start <= x < end), default=None)
     before = (t >= start) & (t <= (end if excluded is None else excluded))
     quiet = (t >= LEARNT_S) & (t < start)
     every = [bit for bit in (Source.GNSS, Source.AZIMUTH) if any(s.sources & bit for s in solutions)]
