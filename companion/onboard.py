@@ -16,7 +16,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable
 from typing import Any, Literal, Protocol
 
-from companion.config import Config, Rates, to_toml
+from companion.config import Config, to_toml
 from companion.dialogue import Dialogue
 from companion.link import dialect
 from companion.link.session import (
@@ -76,7 +76,7 @@ class Link:
         self.session = Session(
             component=config.link.component_id,
             autopilot_system=config.link.system_id or None,
-            rates_hz=wanted(config.rates),
+            rates_hz=wanted(config),
             signing=signing,
             link_id=number,
         )
@@ -95,8 +95,9 @@ class Link:
         return sum(count.received for count in self.session.reader.counts.values())
 
 
-def wanted(rates: Rates) -> dict[str, float]:
+def wanted(config: Config) -> dict[str, float]:
     """The rates to ask for, by message."""
+    rates = config.rates
     asked = {
         "LOCAL_POSITION_NED": rates.local_position_hz,
         "GPS_RAW_INT": rates.gnss_hz,
@@ -104,6 +105,7 @@ def wanted(rates: Rates) -> dict[str, float]:
         "RAW_IMU": rates.imu_hz,
         "HIGHRES_IMU": rates.imu_hz,
         "VFR_HUD": rates.air_data_hz,
+        "SCALED_PRESSURE": rates.air_data_hz if config.channel == "air_data" else 0.0,
         "EKF_STATUS_REPORT": rates.status_hz,
         "SIM_STATE": rates.truth_hz,
     }
