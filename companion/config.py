@@ -130,7 +130,8 @@ class Predictor(Section, frozen=True):
 class Estimator(Section, frozen=True):
     """Which estimator feeds the output, and the gate that fixes must pass.
 
-    "minimax" leads when fixes stop, and the error state ("kalman") while they come; "restrictive" throughout.
+    The error state ("kalman") leads while fixes come, and the one named here when they stop: "minimax" those
+    of beacons too, "restrictive" those of GNSS.
     """
 
     output: Literal["auto", "minimax", "kalman", "restrictive"] = "auto"
@@ -195,8 +196,8 @@ class Config(Section, frozen=True):
 
     @property
     def leading(self) -> Literal["minimax", "kalman", "restrictive"]:
-        """The estimator that `estimator.output` means, "auto" by the channel: on recorded flights by air data
-        the error state was the best of the three. The restrictive one runs by air data only.
+        """The estimator that `estimator.output` means, "auto" by the channel. The restrictive one runs by air
+        data only; there it is as good as the error state on a straight course, and has no states for a turn.
         """
         local = self.channel == "local_position"
         if self.estimator.output == "auto":

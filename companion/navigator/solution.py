@@ -42,7 +42,8 @@ def solve(carry: Carry, rx_ns: int, settings: Settings) -> Step:
     mode = _mode(carry, bounded, t_ns, settings)
     candidates = _candidates(carry, state, bounded, ins, settings)
     leads = settings.config.leading
-    if (mode is Mode.FIXED and leads == "minimax") or leads not in candidates:
+    fixed = sources(carry, t_ns, settings) & (Source.GNSS if leads == "restrictive" else FIXES)
+    if fixed or leads not in candidates:
         leads = "kalman"
     error, velocity_error, (var_n, cov, var_e) = candidates[leads]
     north, east, down = ins.v_n

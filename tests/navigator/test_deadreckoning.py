@@ -155,11 +155,13 @@ def test_with_a_beacon_the_error_is_at_most_half_the_fixes(name: str, seed: int)
         assert found.error[found.t >= 0.0].max() <= two_sigma
 
 
+@pytest.mark.parametrize("leading", ["kalman", "restrictive"])
 @pytest.mark.parametrize("seed", range(3))
-def test_a_minute_without_the_beacon_in_a_changed_wind(seed: int) -> None:
+def test_a_minute_without_the_beacon_in_a_changed_wind(seed: int, leading: str) -> None:
     flown = flight("plane_wind_change")
     records = [r for r in with_beacon(flown, seed, 120.0 * seed, (120.0, 180.0)) if flown.since(r) <= 180.0]
-    found = flown_by(flown, records)
+    air = {"inertial.source": "air_data", "estimator.output": leading}
+    found = flown_by(flown, records, load(flags=air, environment={}))
     assert found.t[-1] > 179.0
     assert found.error[-1] <= 200.0
     inside = found.t >= 120.0
