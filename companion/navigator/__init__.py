@@ -26,12 +26,13 @@ from companion.records import (
     Pressure,
     Reboot,
     Rejection,
+    Reset,
     RsbnFix,
     Solution,
     Tuning,
 )
 
-from . import guarantee
+from . import errorstate, guarantee
 from .carry import Carry, Settings, initial
 from .solution import announce, solve
 from .step import step, uses
@@ -87,11 +88,25 @@ class Navigator:
             self._past.append(_Past(record.t_ns, record, self._carry))
             while self._past[0].t_ns < record.t_ns - self._late_ns:
                 self._past.popleft()
-            self._carry, outputs = step(self._carry, record, self._settings)
+            outputs = self._stepped(record)
         if isinstance(record, RsbnFix) and self._carry.rsbn_ns == record.t_ns:  # believed: tell at once
             self._carry, solution = solve(self._carry, record.rx_ns, self._settings)
             outputs = [*outputs, *solution]
         return self._announced(outputs)
+
+    def _stepped(self, record: Input) -> list[Output]:
+        """One step. What cannot be computed with is refused aloud, and a state gone wrong is begun anew."""
+        t_ns, rx_ns = record.t_ns, record.rx_ns
+        try:
+            carry, outputs = step(self._carry, record, self._settings)
+        except (ArithmeticError, ValueError) as error:  # a singular matrix is a ValueError too
+            why = f"it cannot be computed with: {error}"
+            return [Rejection(t_ns, rx_ns, type(record).__name__, why)]
+        if carry.state is not self._carry.state and not errorstate.is_sound(carry.state):
+            carry = carry._replace(state=None)
+            outputs = [*outputs, Reset(t_ns, rx_ns, "error state", "its covariance was none any more")]
+        self._carry = carry
+        return outputs
 
     def _tune(self, config: Config) -> None:
         """Go on with another configuration; late measurements are no longer folded in from before it.
@@ -128,7 +143,7 @@ class Navigator:
         given: list[Output] = []
         for each in again:
             self._past.append(_Past(each.t_ns, each, self._carry))
-            self._carry, outputs = step(self._carry, each, self._settings)
+            outputs = self._stepped(each)
             if each is record:
                 given = [out for out in outputs if not isinstance(out, Solution) or out.t_ns > self._given_ns]
         return given

@@ -50,6 +50,7 @@ class Carry(NamedTuple):
     guarantee: Guarantee
     origin: LocalOrigin | None = None
     local: LocalPosition | None = None
+    waiting_ns: int | None = None  # since when local positions come without an origin
     reckoner: Reckoner = Reckoner()
     track: Track = ()
     state: ErrorState | None = None

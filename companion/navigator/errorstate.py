@@ -173,6 +173,14 @@ def absorb_velocity(
     return ErrorState(state.t_ns, state.x + K @ nu, 0.5 * (P + P.T)), float(nu @ np.linalg.solve(S, nu))
 
 
+def is_sound(state: ErrorState | None) -> bool:
+    """Whether the numbers are numbers and no variance is negative."""
+    if state is None:
+        return True
+    variances = state.P.diagonal()
+    return bool(np.isfinite(state.x).all() and np.isfinite(state.P).all() and (variances >= 0.0).all())
+
+
 def shift(state: ErrorState, north: float, east: float) -> ErrorState:
     """The state after the channel itself jumped by (north, east) m: the error jumped with it, nothing else
     did.

@@ -46,6 +46,7 @@ from .solution import solve
 from .winderror import WindError
 
 TOGETHER_NS = 1_000_000_000  # GNSS this close to a beacon's answer joins its fix
+PATIENCE_NS = 5_000_000_000  # how long the autopilot is waited for to tell its local origin
 LEVEL_3D = 3  # GPS_FIX_TYPE_3D_FIX
 BRIDGED_S = 1.0  # a silence of the airspeed up to this long is nothing
 UNKNOWN_M_S = 15.0  # how fast the position is lost in a longer one
@@ -76,9 +77,11 @@ def _reboot(carry: Carry, record: Reboot, settings: Settings) -> Step:
 
 def _global_position(carry: Carry, record: GlobalPosition, settings: Settings) -> Step:
     """Without a stated origin, the same position said twice, locally and globally, tells where it is."""
-    local = carry.local
+    local, since = carry.local, carry.waiting_ns
     if carry.origin is not None or local is None or abs(record.t_ns - local.t_ns) > 50_000_000:
         return carry, []
+    if since is None or record.t_ns - since < PATIENCE_NS:
+        return carry, []  # it was asked for, and the autopilot's own word is better
     dt = (record.t_ns - local.t_ns) * 1e-9
     north, east, down = (x + v * dt for x, v in zip(local.x_n, local.v_n, strict=True))
     lat, lon, alt = displace(record.lat, record.lon, record.alt_msl, -north, -east, -down)
@@ -90,7 +93,7 @@ def _local_position(carry: Carry, record: LocalPosition, settings: Settings) -> 
     before, origin, out = carry.local, carry.origin, list[Output]()
     carry = carry._replace(local=record)
     if origin is None:
-        return carry, out
+        return carry._replace(waiting_ns=carry.waiting_ns or record.t_ns), out
     if before is not None:
         if record.t_ns <= before.t_ns:
             return carry._replace(local=before), out

@@ -22,7 +22,7 @@ from companion.nav.geometry import (
     separation,
     slant_range_azimuth,
 )
-from companion.navigator import Navigator, errorstate
+from companion.navigator import Navigator, errorstate, radio
 from companion.records import (
     Fix,
     Gnss,
@@ -264,3 +264,38 @@ def test_an_azimuth_alone_corrects_across_and_is_no_fix() -> None:
     assert fixes == []
     assert last is not None
     assert last.mode is Mode.FIXED
+
+
+def test_what_cannot_be_computed_is_refused_and_the_flight_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    def singular(*_: Any) -> None:
+        raise np.linalg.LinAlgError("Singular matrix")
+
+    moments = flight(30, 30.0, 30.0)
+    navigator, outs = Navigator(CONFIG), []
+    navigator.handle(origin())
+    for k, moment in enumerate(moments):
+        with monkeypatch.context() as patch:
+            if 100 <= k < 120:
+                patch.setattr(radio, "innovation", singular)
+            outs += [out for record in moment.records for out in navigator.handle(record)]
+    refused = [out for out in outs if isinstance(out, Rejection)]
+    assert refused
+    assert "it cannot be computed with: Singular matrix" in {out.reason for out in refused}
+    assert isinstance(outs[-1], Solution | Fix)
+    assert max(out.t_ns for out in outs if isinstance(out, Solution)) > 29 * NS
+
+
+def test_a_state_gone_wrong_is_begun_anew_and_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    absorb = errorstate.absorb_position
+    navigator, outs = Navigator(CONFIG), []
+    navigator.handle(origin())
+    for k, moment in enumerate(flight(60, 60.0, 60.0)):
+        with monkeypatch.context() as patch:
+            if 100 <= k < 112:
+                spoilt = lambda *given: absorb(*given)._replace(P=np.full((14, 14), np.nan))  # noqa: E731
+                patch.setattr(errorstate, "absorb_position", spoilt)
+            outs += [(moment, out) for record in moment.records for out in navigator.handle(record)]
+    resets = [out for _, out in outs if isinstance(out, Reset)]
+    assert {out.what for out in resets} == {"error state"}
+    last_moment, last = [(m, out) for m, out in outs if isinstance(out, Solution)][-1]
+    assert distance(last, last_moment.truth) < 10.0
