@@ -199,10 +199,9 @@ class Config(Section, frozen=True):
         """The estimator that `estimator.output` means, "auto" by the channel. The restrictive one runs by air
         data only; there it is as good as the error state on a straight course, and has no states for a turn.
         """
-        local = self.channel == "local_position"
         if self.estimator.output == "auto":
-            return "minimax" if local else "kalman"
-        return "minimax" if local and self.estimator.output == "restrictive" else self.estimator.output
+            return "minimax" if self.channel == "local_position" else "kalman"
+        return self.estimator.output
 
 
 def load(
@@ -328,4 +327,11 @@ def _convert(tree: Mapping[str, Mapping[str, Any]], origin: Mapping[tuple[str, s
                     f"{where}: {section}.{key} = {value!r} is impossible: {reason[0].lower()}{reason[1:]}"
                 ) from None
         sections[section] = msgspec.convert(table, kind)
-    return Config(**sections)
+    config = Config(**sections)
+    if config.leading == "restrictive" and config.channel != "air_data":
+        where = origin["estimator", "output"]
+        raise ConfigError(
+            f"{where}: estimator.output = 'restrictive' runs by air data only: "
+            "set inertial.source = 'air_data'"
+        )
+    return config

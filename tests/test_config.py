@@ -59,3 +59,10 @@ def test_a_mistake_in_the_environment_names_the_variable() -> None:
 def test_a_missing_file_says_how_to_begin(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="check-config --defaults"):
         load(tmp_path / "none.toml", environment={})
+
+
+def test_the_restrictive_estimator_needs_its_channel() -> None:
+    with pytest.raises(ConfigError, match=r"air data only: set inertial\.source"):
+        load(pairs=["estimator.output=restrictive"], environment={})
+    both = ["estimator.output=restrictive", "inertial.source=air_data"]
+    assert load(pairs=both, environment={}).leading == "restrictive"
