@@ -68,7 +68,7 @@ class Navigator:
         self._late_ns = round(1e9 * config.estimator.late_s)
         self._mode = Mode.INITIALISING  # of the last solution given out, and its time
         self._given_ns = 0
-        self._chosen = config.inertial.source == "local_position"  # else the choice is told, once
+        self._chosen = False  # the inertial channel is told once, with the first record
 
     def handle(self, record: Input) -> list[Output]:
         """What follows from one more record."""
@@ -175,5 +175,9 @@ def _choice(record: Input, config: Config) -> Event:
         why = "the autopilot is fed, so its own position is not independent"
     else:
         why = "the autopilot is not fed"
-    name = {"air_data": "air-data dead reckoning", "local_position": "the autopilot's local position"}
-    return Event(record.t_ns, record.rx_ns, 6, f"inertial channel: {name[config.channel]} ({why})")
+    name = {
+        "air_data": f"air-data dead reckoning ({why})",
+        "local_position": f"the autopilot's local position ({why}); airspeed not used: "
+        "it makes a good INS worse",
+    }
+    return Event(record.t_ns, record.rx_ns, 6, f"inertial channel: {name[config.channel]}")
