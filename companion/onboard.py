@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterable
-from typing import Any, Literal, Protocol
+from typing import Any, Protocol
 
 from companion.config import Config, to_toml
 from companion.dialogue import Dialogue
@@ -44,10 +44,9 @@ from companion.records import (
     Stamped,
     Tuning,
 )
-from companion.wire import Receiver, Sender, decode, encode
+from companion.wire import MAKES, Receiver, Sender, decode, encode
 
 SECOND = 1_000_000_000
-MAKES: dict[int, Literal["ardupilot", "px4"]] = {3: "ardupilot", 12: "px4"}  # MAV_AUTOPILOT
 RSBN = dialect.type_named("RSBN_MEASUREMENT").msgid
 GPS_GLOBAL_ORIGIN = dialect.type_named("GPS_GLOBAL_ORIGIN").msgid
 REQUEST_MESSAGE = 512  # MAV_CMD

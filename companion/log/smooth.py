@@ -25,7 +25,7 @@ from scipy.linalg import eigh
 from companion.config import Config
 from companion.nav.geometry import Geodetic, displace
 from companion.navigator import FOLDED, inertial
-from companion.navigator.carry import Carry, Settings, initial, level, state_at
+from companion.navigator.carry import Carry, Settings, initial, is_news, level, state_at
 from companion.navigator.errorstate import ErrorState
 from companion.navigator.inertial import Point
 from companion.navigator.step import step
@@ -126,7 +126,7 @@ def _forward(records: Iterable[Stamped], settings: Settings) -> list[_Stop]:
     stops: list[_Stop] = []
     carry = initial(settings)
     for record in sorted((r for r in records if isinstance(r, FOLDED)), key=lambda r: r.t_ns):
-        if isinstance(record, Gnss) and not _is_news(record, carry, settings):
+        if isinstance(record, Gnss) and not is_news(record, carry, settings):
             continue
         # no solutions, which would predict at moments of their own, and no bounds ahead: the stops are ours
         carry = carry._replace(next_ns=NEVER_NS, next_ahead_ns=NEVER_NS)
@@ -189,12 +189,6 @@ def _append(stops: list[_Stop], stop: _Stop) -> None:
             widened=last.widened * stop.widened,
         )
     stops.append(stop)
-
-
-def _is_news(record: Gnss, carry: Carry, settings: Settings) -> bool:
-    """As the navigator hears GNSS: one receiver, each fix once."""
-    believed = record.receiver == settings.config.gnss.receiver
-    return believed and (carry.gnss is None or not record.repeats(carry.gnss))
 
 
 def _arrival(carry: Carry, ins: Point, settings: Settings) -> _Stop:

@@ -33,13 +33,12 @@ from companion.records import (
     Reset,
     Stamped,
 )
-from companion.wire import Autopilot, Sender, decode
+from companion.wire import MAKES, Autopilot, Sender, decode
 
 _WARNING, _INFO = 4, 6  # MAV_SEVERITY
 _GPS_GLOBAL_ORIGIN = 49
 _RSBN = dialect.type_named("RSBN_MEASUREMENT").msgid  # a beacon receiver is a component of its own
 _POSITION_ABSOLUTE = 16  # EKF_POS_HORIZ_ABS and ESTIMATOR_POS_HORIZ_ABS
-_MAKES: dict[int, Autopilot] = {3: "ardupilot", 12: "px4"}  # MAV_AUTOPILOT
 
 
 class Summary(NamedTuple):
@@ -86,7 +85,7 @@ class TlogSource:
                     if self._origin and (origin := self._origin.see(record, self._sender.autopilot)):
                         yield origin
             case LinkUp(at_ns, system, kind):
-                make = _MAKES.get(kind, "other")
+                make = MAKES.get(kind, "other")
                 self._sender = self._sender._replace(autopilot=make)
                 yield Event(at_ns, at_ns, _INFO, f"autopilot {system} ({make}) is heard")
             case Rebooted(at_ns, system):

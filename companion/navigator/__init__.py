@@ -33,7 +33,7 @@ from companion.records import (
 )
 
 from . import errorstate, guarantee
-from .carry import Carry, Settings, initial
+from .carry import Carry, Settings, initial, is_news
 from .solution import announce, solve
 from .step import step, uses
 
@@ -80,7 +80,7 @@ class Navigator:
         if not self._chosen:
             self._chosen = True
             return [_choice(record, self._settings.config), *self.handle(record)]
-        if isinstance(record, Gnss) and not self._is_news(record):
+        if isinstance(record, Gnss) and not is_news(record, self._carry, self._settings):
             return []
         if self._past and record.t_ns < self._past[-1].t_ns:
             outputs = self._handle_late(record)
@@ -120,12 +120,6 @@ class Navigator:
         if config.channel != before:
             self._carry, self._chosen = initial(self._settings)._replace(next_ns=self._carry.next_ns), False
         self._past.clear()
-
-    def _is_news(self, record: Gnss) -> bool:
-        """A new fix of the receiver believed in: an autopilot repeats its last one for ever."""
-        last = self._carry.gnss
-        believed = record.receiver == self._settings.config.gnss.receiver
-        return believed and (last is None or not record.repeats(last))
 
     def _handle_late(self, record: Input) -> list[Output]:
         if record.t_ns < self._past[0].t_ns:

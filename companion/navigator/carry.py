@@ -73,6 +73,12 @@ def initial(settings: Settings) -> Carry:
     return Carry(guarantee.begin(settings.config))
 
 
+def is_news(record: Gnss, carry: Carry, settings: Settings) -> bool:
+    """A new fix of the receiver believed in: an autopilot repeats its last one for ever."""
+    believed = record.receiver == settings.config.gnss.receiver
+    return believed and (carry.gnss is None or not record.repeats(carry.gnss))
+
+
 def state_at(carry: Carry, ins: Point, settings: Settings) -> ErrorState:
     """The error state carried to the time of `ins`; from the grade of the unit before the first fix."""
     state = carry.state or errorstate.start(ins.t_ns, settings.unit)

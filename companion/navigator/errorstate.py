@@ -31,7 +31,7 @@ N = 14
 POSITION = slice(0, 2)
 VELOCITY = slice(2, 4)
 TILT = slice(4, 7)
-G0 = 9.80665  # [m/s^2] of a bias quoted in micro-g
+G0 = 9.80665  # [m/s^2] of what is quoted in micro-g
 STEP_S = 2.0  # the transition is a power series: its fifth term is below 1e-12 of the first here
 
 

@@ -20,7 +20,8 @@ from companion.estimate.predictor import Forecast, Quantity, Window, predict, pr
 from companion.estimate.predictor import Prediction as Channel
 from companion.records import Prediction, Vector2
 
-G0 = 9.80665  # [m/s^2] of micro-g
+from .errorstate import G0
+
 REFRESH_NS = 1_000_000_000
 HOPELESS_M = 1e6  # a bound beyond this is as good as none: the window is too short for so far ahead
 UNLIKE = 2.0  # a fix this many times better or worse than its bin begins a new one

@@ -8,7 +8,7 @@ It knows nothing of links, frames of bytes, who may speak (a message is believed
 it is handed in for) or of what a record is used for.
 """
 
-from companion.wire.decode import Autopilot, Clock, Sender, decode
+from companion.wire.decode import MAKES, Autopilot, Clock, Sender, decode
 from companion.wire.encode import ENCODERS, Receiver, accuracy, encode
 
-__all__ = ["ENCODERS", "Autopilot", "Clock", "Receiver", "Sender", "accuracy", "decode", "encode"]
+__all__ = ["ENCODERS", "MAKES", "Autopilot", "Clock", "Receiver", "Sender", "accuracy", "decode", "encode"]

@@ -50,6 +50,7 @@ from companion.wire.fields import (
 )
 
 Autopilot: TypeAlias = Literal["ardupilot", "px4", "other"]
+MAKES: dict[int, Autopilot] = {3: "ardupilot", 12: "px4"}  # MAV_AUTOPILOT
 
 UERE = 4.0
 """User range error, one sigma, m, that turns a dilution of precision into metres where a receiver gives no
