@@ -2,12 +2,17 @@
 
 Everything that decides is below; here bytes are carried, the clock is read and the deadline slept for. A link
 that breaks is opened again for ever, a disk that refuses is reported, and neither stops navigation.
+
+systemd is told "ready" when the log is begun and a link is open, and "alive" each time that bytes or a
+deadline went through the navigator to the end and nothing is overdue, nowhere else: a navigator that hangs
+hangs the loop, the watchdog is not fed, and systemd starts us anew.
 """
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import os
 import random
 import signal
 import sys
@@ -28,9 +33,11 @@ from companion.log.opened import LogError
 from companion.log.replay import metadata
 from companion.onboard import Onboard
 from companion.records import Event
+from companion.systemd import Manager
 
 EX_UNAVAILABLE, EX_CANTCREAT = 69, 73  # sysexits.h
 LOG_CHECK_S = 1.0
+OVERDUE_NS = 2_000_000_000
 
 
 class Keys:
@@ -84,7 +91,9 @@ class Service:
         log: Writer,
         tell: Callable[[Event], None],
         now: Callable[[], int] = time.monotonic_ns,
+        manager: Manager | None = None,
     ) -> None:
+        self._manager = manager or Manager({})
         self._addresses = {text: Address.parse(text) for text in config.link.connect}
         self._keys = Keys.of(config)
         signing = self._keys.signing if self._keys else None
@@ -105,6 +114,7 @@ class Service:
                 carrying = [tasks.create_task(self._carry(name)) for name in self._addresses]
                 carrying.append(tasks.create_task(self._keep_time()))
                 await self._stopped.wait()
+                self._manager.stopping()
                 for task in carrying:
                     task.cancel()
         except* CannotListen as group:
@@ -114,6 +124,7 @@ class Service:
         """One link, opened again for ever."""
         async for stream in connections(self._addresses[name], random.random, self._say):
             self._streams[name] = stream
+            self._manager.ready()
             try:
                 while True:
                     data = await stream.read()
@@ -147,6 +158,9 @@ class Service:
                     stream.write(data)
         for event in self.onboard.take_events():
             self._tell(event)
+            self._manager.status(event.text)
+        if now - self.onboard.deadline() < OVERDUE_NS:
+            self._manager.alive(now)
 
     def _say(self, text: str) -> None:
         self.onboard.note(5, text, self._now())
@@ -168,7 +182,7 @@ async def run(config: Config, tell: Callable[[Event], None]) -> None:
         chunk_bytes=settings.chunk_kib << 10,
     )
     try:
-        service = Service(config, log, tell)
+        service = Service(config, log, tell, manager=Manager(os.environ))
         loop = asyncio.get_running_loop()
         for number in (signal.SIGINT, signal.SIGTERM):
             loop.add_signal_handler(number, service.stop)
