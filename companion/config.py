@@ -10,17 +10,21 @@ from __future__ import annotations
 import difflib
 import os
 import tomllib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import msgspec
 from msgspec import Meta
 
+from companion.profiles import MESSAGES, PROFILES, Name, Via
+
 Positive = Annotated[float, Meta(gt=0.0, lt=1e9)]
 NotNegative = Annotated[float, Meta(ge=0.0, lt=1e9)]
 Probability = Annotated[float, Meta(gt=0.0, lt=1.0)]
 RateHz = Annotated[float, Meta(ge=0.0, le=400.0)]
+OutputHz = Annotated[float, Meta(ge=-1.0, le=50.0)]
 NodeId = Annotated[int, Meta(ge=1, le=255)]
 
 
@@ -56,12 +60,14 @@ class Rates(Section, frozen=True):
 class Inertial(Section, frozen=True):
     """Which inertial channel is corrected, and the error model of an INS's: one standard deviation each.
 
-    `source` "local_position" is an INS whose LOCAL_POSITION_NED takes no part of what we send; "air_data" is
-    dead reckoning of our own, by airspeed and attitude; "auto" is the latter wherever a position goes back to
-    the autopilot. The defaults of the error model are a navigation-grade unit (0.01 deg/h, 50 ug).
+    `source` "local_position" is LOCAL_POSITION_NED; "air_data" is dead reckoning of our own, by airspeed and
+    attitude; "auto" is the latter wherever a position goes back to the autopilot. There the first is refused,
+    unless it is `independent`: that of an INS of its own, which takes no part of what we send. The defaults
+    of the error model are a navigation-grade unit (0.01 deg/h, 50 ug).
     """
 
-    source: Literal["auto", "local_position", "air_data"] = "local_position"
+    source: Literal["auto", "local_position", "air_data"] = "auto"
+    independent: bool = False
     gyro_drift_deg_h: Positive = 0.01
     gyro_correlation_h: Positive = 5.0
     angle_random_walk_deg_sqrt_h: NotNegative = 0.002
@@ -140,18 +146,55 @@ class Estimator(Section, frozen=True):
 
 
 class Output(Section, frozen=True):
-    """What goes back to the autopilot, and how often."""
+    """What goes back to the autopilot, and how often: see `companion.profiles`.
 
-    solution_hz: Annotated[float, Meta(gt=0.0, le=50.0)] = 5.0
-    odometry_hz: RateHz = 5.0
-    global_position_sensor_hz: RateHz = 2.0
+    `via` is the message by which a position is fed, "auto" the best of the profile. A rate written here beats
+    the profile's; -1 is the profile's own, 0 never.
+    """
+
+    profile: Name = "monitor"
+    via: Literal["auto"] | Via = "auto"
+    switch_sources: bool = True  # profile ardupilot: EKF source set 2 while GNSS is lost, else 1
+    solution_hz: Annotated[float, Meta(gt=0.0, le=50.0)] = 5.0  # at least; no less than the fastest message
+    odometry_hz: OutputHz = -1.0
+    vision_hz: OutputHz = -1.0
+    gps_input_hz: OutputHz = -1.0
+    global_position_sensor_hz: OutputHz = -1.0
+    external_position_hz: Annotated[float, Meta(ge=-1.0, le=1.0)] = -1.0  # each is a reset of its estimator
     status_hz: RateHz = 1.0
     global_position_sensor_id: Annotated[int, Meta(ge=0, le=255)] = 1
 
     @property
+    def way(self) -> Via | None:
+        """The way that `via` means, None where the profile has none."""
+        return next(iter(PROFILES[self.profile].ways), None) if self.via == "auto" else self.via
+
+    @property
+    def rates_hz(self) -> Mapping[str, float]:
+        """The rate of each message that we may send, 0 where it does not go out."""
+        return _rates_hz(self)
+
+    @property
     def feeds_estimator(self) -> bool:
         """Whether a position of ours goes into the autopilot's own."""
-        return self.odometry_hz > 0.0 or self.global_position_sensor_hz > 0.0
+        rates = _rates_hz(self)
+        return any(rates[message] > 0.0 for message in MESSAGES.values())
+
+    @property
+    def pace_hz(self) -> float:
+        """How often a solution is wanted."""
+        return max(self.solution_hz, *_rates_hz(self).values())
+
+
+@lru_cache(maxsize=8)
+def _rates_hz(output: Output) -> Mapping[str, float]:
+    ways, chosen = PROFILES[output.profile].ways, output.way
+    rates = {}
+    for via, message in MESSAGES.items():
+        own = ways[via].rate_hz if via == chosen and via in ways else 0.0
+        written: float = getattr(output, f"{via}_hz")
+        rates[message] = own if written < 0.0 else written
+    return {**rates, "NAVIGATION_STATUS": output.status_hz}
 
 
 class Log(Section, frozen=True):
@@ -192,7 +235,8 @@ class Config(Section, frozen=True):
         """The inertial channel that `inertial.source` means, by what goes back to the autopilot."""
         if self.inertial.source != "auto":
             return self.inertial.source
-        return "air_data" if self.output.feeds_estimator else "local_position"
+        fed = self.output.feeds_estimator and not self.inertial.independent
+        return "air_data" if fed else "local_position"
 
     @property
     def leading(self) -> Literal["minimax", "kalman", "restrictive"]:
@@ -328,10 +372,49 @@ def _convert(tree: Mapping[str, Mapping[str, Any]], origin: Mapping[tuple[str, s
                 ) from None
         sections[section] = msgspec.convert(table, kind)
     config = Config(**sections)
-    if config.leading == "restrictive" and config.channel != "air_data":
-        where = origin["estimator", "output"]
-        raise ConfigError(
-            f"{where}: estimator.output = 'restrictive' runs by air data only: "
-            "set inertial.source = 'air_data'"
-        )
+    for section, key, sentence in conflicts(config):
+        raise ConfigError(f"{origin.get((section, key), 'configuration')}: {sentence}")
     return config
+
+
+def conflicts(config: Config) -> Iterator[tuple[str, str, str]]:
+    """What cannot be meant together: the section and key at fault, and a sentence that says what to do."""
+    output, rates = config.output, config.output.rates_hz
+    ways = PROFILES[output.profile].ways
+    if output.via != "auto" and output.via not in ways:
+        choice = f"choose {', '.join(ways)} or auto" if ways else "leave it out"
+        yield (
+            "output",
+            "via",
+            f"output.via = '{output.via}' is no way of profile '{output.profile}': {choice}",
+        )
+    for via, message in MESSAGES.items():
+        key = f"{via}_hz"
+        if rates[message] > 0.0 and via not in ways and output.profile != "custom":
+            why = (
+                "never feeds an autopilot: set output.profile"
+                if output.profile == "monitor"
+                else f"has no reader for it: its autopilot takes {', '.join(ways)}"
+            )
+            yield "output", key, f"output.{key} = {rates[message]:g}, but profile '{output.profile}' {why}"
+    if config.channel == "local_position" and output.feeds_estimator and not config.inertial.independent:
+        yield (
+            "inertial",
+            "source",
+            f"inertial.source = 'local_position' would feed the autopilot its own position back (profile "
+            f"'{output.profile}' feeds its estimator): set inertial.source = 'auto', or inertial.independent "
+            "= true if LOCAL_POSITION_NED is that of an INS of its own, which takes no part of what we send",
+        )
+    if rates["GPS_INPUT"] > 0.0 and config.gnss.receiver == 1:
+        yield (
+            "gnss",
+            "receiver",
+            "gnss.receiver = 1 is the one that GPS_INPUT feeds, so our own position would come back as a "
+            "fix: set gnss.receiver = 0",
+        )
+    if config.leading == "restrictive" and config.channel != "air_data":
+        yield (
+            "estimator",
+            "output",
+            "estimator.output = 'restrictive' runs by air data only: set inertial.source = 'air_data'",
+        )

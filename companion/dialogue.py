@@ -22,13 +22,18 @@ DISABLED_US = -1
 
 
 def intervals_us(output: Output) -> dict[str, int]:
-    """The interval of each message we stream, microseconds."""
-    rates = {
-        "ODOMETRY": output.odometry_hz,
-        "GLOBAL_POSITION_SENSOR": output.global_position_sensor_hz,
-        "NAVIGATION_STATUS": output.status_hz,
+    """The interval of each message we stream, microseconds. What the profile does not send is not among
+    them, so that nobody can ask for it.
+    """
+    return {
+        name: round(1e6 / hz) if hz > 0.0 else DISABLED_US
+        for name, hz in output.rates_hz.items()
+        if hz > 0.0 or name == "NAVIGATION_STATUS"
     }
-    return {name: round(1e6 / hz) if hz > 0.0 else DISABLED_US for name, hz in rates.items()}
+
+
+def _by_id(output: Output) -> dict[int, int]:
+    return {dialect.type_named(name).msgid: us for name, us in intervals_us(output).items()}
 
 
 class Dialogue:
@@ -36,10 +41,10 @@ class Dialogue:
 
     def __init__(self, config: Config, sources: Mapping[str, Source], save: Callable[[str], None]) -> None:
         component = config.link.component_id
-        self._names = {dialect.type_named(name).msgid: name for name in intervals_us(config.output)}
+        self._output = config.output
         self._commands = Commands(
             component,
-            {dialect.type_named(name).msgid: us for name, us in intervals_us(config.output).items()},
+            _by_id(config.output),
             {dialect.type_named(name).msgid: source for name, source in sources.items()},
         )
         self._parameters = Parameters(component, config, save=save)
@@ -49,13 +54,17 @@ class Dialogue:
     def periods_ns(self) -> dict[str, int]:
         """How often each message is to go out now; what is disabled is left out."""
         asked = self._commands.intervals_us.items()
-        return {self._names[msgid]: us * NANO_PER_MICRO for msgid, us in asked if us > 0}
+        return {dialect.TYPES[msgid].name: us * NANO_PER_MICRO for msgid, us in asked if us > 0}
 
     def receive(self, event: MessageReceived, system: int) -> tuple[list[Any], Config | None]:
         """Replies for the link it came on, and the configuration where a parameter changed it."""
         replies = self._commands.receive(event.message, event.frame, system, event.received_ns)
         changes = self._parameters.receive(event.message, event.frame, system, event.received_ns)
-        return replies, changes[-1].config if changes else None
+        config = changes[-1].config if changes else None
+        if config is not None and config.output != self._output:
+            self._output = config.output
+            self._commands.pace(_by_id(config.output))
+        return replies, config
 
     def tell(self, event: Event, now_ns: int) -> None:
         """Have a change of state told as STATUSTEXT, as often as may be."""

@@ -108,6 +108,9 @@ def wanted(config: Config) -> dict[str, float]:
         "EKF_STATUS_REPORT": rates.status_hz,
         "SIM_STATE": rates.truth_hz,
     }
+    paced_by = "VFR_HUD" if config.channel == "air_data" else "LOCAL_POSITION_NED"
+    if 0.0 < asked[paced_by] < config.output.pace_hz:  # a solution comes with a point of the channel
+        asked[paced_by] = config.output.pace_hz
     return {name: hz for name, hz in asked.items() if hz > 0.0}
 
 

@@ -16,12 +16,13 @@ from pathlib import Path
 from typing import NamedTuple
 
 import click
+import msgspec
 import numpy as np
 from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from companion.config import Config, load
+from companion.config import Config, Output, load
 from companion.log import score
 from companion.log.folder import open_log
 from companion.log.replay import metadata
@@ -34,6 +35,8 @@ from sitl.scenarios import SCENARIOS, Phase, Scenario, named
 LINK = "sitl"
 SECOND = 1_000_000_000
 START_NS = 1000 * SECOND  # of the companion's clock at the flight's start: any instant but 0
+#: What the companion sends where [output] is left as it is.
+FED = Output(profile="custom", odometry_hz=5.0, global_position_sensor_hz=2.0)
 KEPT = (Solution, Gnss, RsbnFix, Rejection, Event, Reset)
 
 
@@ -63,6 +66,15 @@ class Flown(NamedTuple):
     autopilot: Autopilot
     kept: list[Stamped]
     onboard: Onboard
+
+
+def simulated(config: Config) -> Config:
+    """`config` for the simulated autopilot: its local position is that of an INS of its own, which takes no
+    part of what it is sent, and it is sent positions where [output] is left as it is.
+    """
+    inertial = msgspec.structs.replace(config.inertial, independent=True)
+    output = FED if config.output == Output() else config.output
+    return msgspec.structs.replace(config, inertial=inertial, output=output)
 
 
 def fly(
@@ -144,7 +156,8 @@ def command(
     except ValueError as error:
         raise click.BadParameter(str(error), param_hint="--scenario") from None
     # the truth goes into the log, for reports
-    config = load(file, {"log.folder": logs, "rates.truth_hz": 10.0}, pairs=pairs)
+    flags = {"log.folder": logs, "rates.truth_hz": 10.0, "inertial.independent": True}
+    config = simulated(load(file, flags, pairs=pairs))
     begun = time.perf_counter()
     settings = config.log
     log = open_log(

@@ -17,13 +17,14 @@ import signal
 import sys
 import time
 from collections.abc import Callable
+from typing import Any
 
 import click
 import numpy as np
 
 from companion.link.clock import SECOND, BootClock
 from companion.link.transport import Address, CannotListen, Stream, connections
-from companion.nav.geometry import Geodetic, separation
+from companion.nav.geometry import Geodetic, local_to_geodetic, separation
 from sitl.autopilot import Autopilot
 from sitl.scenarios import SCENARIOS, Phase, Scenario, named
 
@@ -56,10 +57,10 @@ class Score:
             name = message.get_type()
             if name == "NAVIGATION_STATUS":
                 self._bound = message.bound_horizontal
-            elif name == "GLOBAL_POSITION_SENSOR":
+            elif name in ("GLOBAL_POSITION_SENSOR", "ODOMETRY"):
                 stamp = message.time_usec * 1000
                 self._clock.heard(stamp, at_ns)
-                self._errors.append(self._error(message, self._clock.local(stamp, at_ns)))
+                self._errors.append(self._error(self._place(message), self._clock.local(stamp, at_ns)))
         self._autopilot.outputs.clear()
         if self._heard_ns is not None and now_ns - self._heard_ns > SILENT_AFTER:
             self._heard_ns = None
@@ -75,8 +76,17 @@ class Score:
         bound = f", the last bound {self._bound:.1f} m" if math.isfinite(self._bound) else ""
         return f"{len(errors)} positions came, off by {rms:.1f} m r.m.s., {max(errors):.1f} m at most{bound}"
 
-    def _error(self, message: object, t_ns: int) -> float:
-        lat, lon = (math.radians(getattr(message, name) * 1e-7) for name in ("lat", "lon"))
+    def _place(self, message: Any) -> tuple[float, float]:
+        """Latitude and longitude that a message means, rad."""
+        if message.get_type() == "GLOBAL_POSITION_SENSOR":
+            return math.radians(message.lat * 1e-7), math.radians(message.lon * 1e-7)
+        x_n = np.array([message.x, message.y, 0.0])
+        projection = self._autopilot.scenario.autopilot
+        lat, lon, _ = local_to_geodetic(projection, self._autopilot.world.origin, x_n)
+        return lat, lon
+
+    def _error(self, place: tuple[float, float], t_ns: int) -> float:
+        lat, lon = place
         flight = self._autopilot.world.truth_at(np.array([max(t_ns, 0) * 1e-9]))
         true = Geodetic(float(flight.lat[0]), float(flight.lon[0]), float(flight.alt[0]))
         north, east, _ = separation(Geodetic(lat, lon, true.alt), true)

@@ -207,7 +207,7 @@ def attempt(order: Order) -> Result:
     begun = time.perf_counter()
     try:
         scenario = ordered(order)
-        config = Config(inertial=UNITS[scenario.grade])
+        config = loopback.simulated(Config(inertial=UNITS[scenario.grade]))
         fault = KINDS[order.fault].fault
         by_records = fault is None or (fault.name in RECORD_FAULTS and fault.name != "ins-nan")
         world, told = fly_records(scenario, config) if by_records else fly_bytes(scenario, config)

@@ -6,7 +6,7 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from companion.config import Config
+from companion.config import Config, Inertial, Output
 from companion.link import dialect, frame
 from companion.nav.geometry import Geodetic, local_to_geodetic, slant_range_azimuth
 from companion.navigator import Navigator
@@ -25,6 +25,10 @@ from companion.records import (
     Truth,
 )
 
+CONFIG = Config(
+    inertial=Inertial(independent=True),
+    output=Output(profile="custom", odometry_hz=5.0, global_position_sensor_hz=2.0),
+)
 SECOND, MS = 1_000_000_000, 1_000_000
 START = 5000 * SECOND
 BOOT = START - 30 * SECOND
@@ -57,7 +61,7 @@ class Flight:
 
     def __init__(self) -> None:
         self.log = Log()
-        self.onboard = Onboard(Config(), self.log)
+        self.onboard = Onboard(CONFIG, self.log)
         self.now, self.boot, self.tells_origin = START, BOOT, True
         self.sent: list[tuple[int, dialect.Message]] = []
         self._sequence = 0

@@ -189,7 +189,15 @@ def _peer(serve: Any, *arguments: Any) -> Iterator[socket.socket]:
 
 
 def _companion(port: int, logs: str) -> None:
-    flags = {"link.connect": (f"udpin:{LOOPBACK}:{port}",), "log.folder": logs, "log.minimum_free_mib": 0}
+    flags = {
+        "link.connect": (f"udpin:{LOOPBACK}:{port}",),
+        "log.folder": logs,
+        "log.minimum_free_mib": 0,
+        "inertial.independent": True,
+        "output.profile": "custom",
+        "output.odometry_hz": 5.0,
+        "output.global_position_sensor_hz": 2.0,
+    }
     asyncio.run(run(load(None, flags, {}), lambda event: None))
 
 

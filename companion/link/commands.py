@@ -83,6 +83,10 @@ class Commands:
         #: The interval of each streamed message now, us; -1: not sent.
         self.intervals_us = dict(intervals_us)
 
+    def pace(self, intervals_us: Mapping[int, int]) -> None:
+        """Other default intervals; what was asked before is forgotten."""
+        self._defaults, self.intervals_us = dict(intervals_us), dict(intervals_us)
+
     def receive(self, message: Message, frame: Frame, system: int, now_ns: int) -> list[Message]:
         """Do what a command says and return the answers; nothing for other messages and other addressees.
 

@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from companion.config import Config
+from companion.config import Config, conflicts
 from companion.link import dialect
 from companion.link.bucket import Bucket
 from companion.link.dialect import Message
@@ -41,6 +41,8 @@ VALUES_HZ, VALUES_BURST = 40.0, 10
 CHANGES_HZ, CHANGES_BURST = 5.0, 20
 
 HIDDEN = frozenset({"link", "signing"})
+#: What a ground station must not claim for the aircraft.
+HIDDEN_KEYS = frozenset({("inertial", "independent")})
 _SECTIONS = {"RATES": "RATE", "INERTIAL": "INS", "PREDICTOR": "PRED", "ESTIMATOR": "EST", "OUTPUT": "OUT"}
 #: Applied in this order to names that are too long.
 _SHORT = {
@@ -57,6 +59,7 @@ _SHORT = {
     "AZIMUTH": "AZ",
     "CORRELATION": "CORR",
     "DISTURBANCE": "DIST",
+    "EXTERNAL": "EXT",
     "HEADING": "HDG",
     "LOCAL": "LOC",
     "MAXIMUM": "MAX",
@@ -128,7 +131,7 @@ def _keys() -> Iterator[Parameter]:
             continue
         for field in msgspec.structs.fields(type(getattr(Config(), section))):
             kind = type(field.default)
-            if kind in (float, int, bool):
+            if kind in (float, int, bool) and (section, field.name) not in HIDDEN_KEYS:
                 yield Parameter(name_of(section, field.name), section, field.name, kind)
 
 
@@ -275,11 +278,14 @@ def _meant(parameter: Parameter, wire: float) -> Value:
 
 
 def _with(config: Config, parameter: Parameter, value: Value) -> Config:
-    """`config` with one value changed, checked as a file is. msgspec.ValidationError if it is impossible."""
+    """`config` with one value changed, checked as a file is. ValueError if it is impossible."""
     section = getattr(config, parameter.section)
     changed = msgspec.structs.replace(section, **{parameter.key: value})
     checked = msgspec.convert(msgspec.to_builtins(changed), type(section))
-    return msgspec.structs.replace(config, **{parameter.section: checked})
+    whole = msgspec.structs.replace(config, **{parameter.section: checked})
+    for *_, sentence in conflicts(whole):
+        raise ValueError(sentence)
+    return whole
 
 
 def _real32(value: float) -> float:

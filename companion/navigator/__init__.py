@@ -165,6 +165,8 @@ def _choice(record: Input, config: Config) -> Event:
     """The line that tells which inertial channel is corrected, and why."""
     if config.inertial.source != "auto":
         why = "configured"
+    elif config.inertial.independent:
+        why = "an INS of its own"
     elif config.output.feeds_estimator:
         why = "the autopilot is fed, so its own position is not independent"
     else:

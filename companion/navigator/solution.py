@@ -69,7 +69,7 @@ def solve(carry: Carry, rx_ns: int, settings: Settings) -> Step:
         max(0.0, (rx_ns - t_ns) * 1e-9),
         carry.ahead,
     )
-    next_ns = max(carry.next_ns + round(1e9 / config.output.solution_hz), t_ns)
+    next_ns = max(carry.next_ns + round(1e9 / config.output.pace_hz), t_ns)
     return carry._replace(state=state, guarantee=promise, next_ns=next_ns), [solution]
 
 

@@ -62,7 +62,7 @@ class Receiver(NamedTuple):
 
 def encode(solution: Solution, receiver: Receiver, names: Iterable[str]) -> tuple[Message, ...]:
     """The messages called `names` (keys of `ENCODERS`) that may be sent for `solution`."""
-    made = (ENCODERS[name](solution, receiver) for name in names)
+    made = (ENCODERS[name](solution, receiver) for name in names if name in ENCODERS)
     return tuple(message for message in made if message is not None)
 
 

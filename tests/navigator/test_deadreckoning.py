@@ -222,28 +222,26 @@ def test_nothing_of_the_autopilots_own_position_comes_back_to_it() -> None:
     assert outputs(lies) == plain
 
 
+FED, UNFED = (load(flags={"output.profile": profile}, environment={}) for profile in ("ardupilot", "monitor"))
+
+
 def test_the_channel_is_chosen_by_what_is_fed_and_told() -> None:
-    fed = load(flags={"inertial.source": "auto"}, environment={})
-    silent = {"output.odometry_hz": 0.0, "output.global_position_sensor_hz": 0.0}
-    unfed = load(flags={"inertial.source": "auto", **silent}, environment={})
-    assert (fed.channel, unfed.channel, Config().channel) == ("air_data", "local_position", "local_position")
-    assert (fed.leading, unfed.leading) == ("kalman", "minimax")
+    own = load(flags={"output.profile": "ardupilot", "inertial.independent": True}, environment={})
+    assert (FED.channel, UNFED.channel, own.channel) == ("air_data", "local_position", "local_position")
+    assert (FED.leading, UNFED.leading) == ("kalman", "minimax")
     first = Gnss(NS, NS, 0, 1, 3, 1.0, 0.5, 100.0)
-    events = [out for out in Navigator(fed).handle(first) if isinstance(out, Event)]
+    events = [out for out in Navigator(FED).handle(first) if isinstance(out, Event)]
     assert events[0].text.startswith("inertial channel: air-data dead reckoning")
 
 
 def test_another_channel_in_flight_begins_anew() -> None:
-    auto = load(flags={"inertial.source": "auto"}, environment={})
-    silent = {"output.odometry_hz": 0.0, "output.global_position_sensor_hz": 0.0}
-    unfed = load(flags={"inertial.source": "auto", **silent}, environment={})
     flown = flight("plane_gps_loss")
-    navigator, told, solutions = Navigator(auto), [], 0
+    navigator, told, solutions = Navigator(FED), [], 0
     for record in flown.records:
         if isinstance(record, Truth) or not -60.0 < flown.since(record) < 10.0:
             continue
         if not told or (len(told) == 1 and flown.since(record) > -10.0):
-            config = unfed if told else auto
+            config = UNFED if told else FED
             navigator.handle(Tuning(record.t_ns, record.rx_ns, to_toml(config)))
         outs = navigator.handle(record)
         told += [out.text for out in outs if isinstance(out, Event) and "inertial channel" in out.text]

@@ -11,8 +11,10 @@ from click.testing import CliRunner
 from companion.config import Config
 from companion.log import replay
 from companion.log.score import CORRECTED, GNSS, RSBN
-from sitl.loopback import command, fly, scored
+from sitl.loopback import command, fly, scored, simulated
 from sitl.scenarios import named
+
+CONFIG = simulated(Config())
 
 
 class Memory:
@@ -35,12 +37,12 @@ SEEDS = (1, 2, 3, 4)
 @pytest.fixture(scope="module")
 def flights():
     """The table of each of four flights that differ in noise alone."""
-    return [scored(fly(named("short", seed=seed), Config())) for seed in SEEDS]
+    return [scored(fly(named("short", seed=seed), CONFIG)) for seed in SEEDS]
 
 
 def flown_again(seed: int) -> str:
     log = Memory()
-    fly(named("short", seed=seed), Config(), log)
+    fly(named("short", seed=seed), CONFIG, log)
     return log.digest.hexdigest()
 
 

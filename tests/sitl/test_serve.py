@@ -17,10 +17,12 @@ from companion.log import file
 from companion.onboard import Onboard
 from companion.records import Solution
 from sitl.autopilot import Autopilot
+from sitl.loopback import simulated
 from sitl.scenarios import named
 from sitl.serve import Flying, Score
 
 LOOPBACK = "127.0.0.1"
+FED = ["--set", "output.profile=ardupilot", "--set", "inertial.independent=true"]
 
 
 def free_port() -> int:
@@ -37,7 +39,7 @@ class Silent:
 def test_the_score_is_that_of_the_loopback() -> None:
     """On a virtual clock far from the flight's own: what is scored is metres, as the navigator's is."""
     autopilot, apart = Autopilot(named("short")), 77_000_000_000_000
-    onboard, score, said, now = Onboard(Config(), Silent()), Score(autopilot), [], 0
+    onboard, score, said, now = Onboard(simulated(Config()), Silent()), Score(autopilot), [], 0
     while now < 60_000_000_000:
         for data in autopilot.poll(now):
             onboard.receive("main", data, now + apart)
@@ -75,7 +77,8 @@ def test_two_processes_fly_and_both_end_cleanly(tmp_path: Path) -> None:
         said.open("w") as said_to,
         flown.open("w") as flown_to,
         subprocess.Popen(
-            [*python, "run", "--connect", f"udpin:{LOOPBACK}:{port}", "--logs", str(logs)], stderr=said_to
+            [*python, "run", "--connect", f"udpin:{LOOPBACK}:{port}", "--logs", str(logs), *FED],
+            stderr=said_to,
         ) as companion,
         subprocess.Popen(
             [*python, "sitl", "--scenario", "short", "--connect", f"udpout:{LOOPBACK}:{port}"],
