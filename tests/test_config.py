@@ -66,3 +66,24 @@ def test_the_restrictive_estimator_needs_its_channel() -> None:
         load(pairs=["estimator.output=restrictive"], environment={})
     both = ["estimator.output=restrictive", "inertial.source=air_data"]
     assert load(pairs=both, environment={}).leading == "restrictive"
+
+
+@pytest.mark.parametrize(
+    ("pairs", "said"),
+    [
+        (
+            ["inertial.source=local_position", "output.profile=px4"],
+            "feed the autopilot its own position back",
+        ),
+        (["output.odometry_hz=5"], "profile 'monitor' never feeds an autopilot: set output.profile"),
+        (["output.profile=px4", "output.gps_input_hz=5"], "its autopilot takes global_position_sensor, odom"),
+        (["output.profile=px4", "output.via=gps_input"], "is no way of profile 'px4': choose global_pos"),
+        (["output.profile=custom", "output.via=odometry"], "is no way of profile 'custom': leave it out"),
+        (["output.profile=ardupilot", "output.via=gps_input", "gnss.receiver=1"], "set gnss.receiver = 0"),
+    ],
+)
+def test_what_cannot_be_meant_together_is_refused_in_one_sentence(pairs: list[str], said: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        load(pairs=pairs, environment={})
+    assert said in str(caught.value)
+    assert "\n" not in str(caught.value)
