@@ -325,7 +325,7 @@ def _read(path: Path) -> dict[str, dict[str, Any]]:
 def _tree(text: str, where: str) -> dict[str, dict[str, Any]]:
     try:
         tree = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+    except (ValueError, RecursionError) as error:  # integers of thousands of digits are none of TOML's errors
         raise ConfigError(f"{where}: is no TOML: {error}") from None
     for section, table in tree.items():
         if not isinstance(table, dict) and section in Config.__struct_fields__:
@@ -353,7 +353,7 @@ def _parsed(text: str) -> Any:
     """An environment variable's text as TOML would read it, else as a string."""
     try:
         return tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
+    except (ValueError, RecursionError):
         return text
 
 

@@ -15,7 +15,7 @@ import pytest
 
 from companion.config import load
 from companion.link import dialect, frame
-from companion.link.transport import CannotListen
+from companion.link.transport import Address, CannotListen
 from companion.log import file
 from companion.records import Event
 from companion.service import EX_CANTCREAT, EX_UNAVAILABLE, Service
@@ -92,6 +92,48 @@ def test_an_autopilot_on_udp_is_heard_answered_and_logged(tmp_path: Path) -> Non
     assert names & {"HEARTBEAT", "TIMESYNC", "COMMAND_LONG"}
     topics = file.info(tmp_path / "a.mcap").counts
     assert any(topic.endswith("/rx") for topic in topics) and any(topic.endswith("/tx") for topic in topics)
+
+
+def listening() -> set[str]:
+    """The local addresses of this process's sockets that anybody may speak to."""
+    found = set()
+    for link in Path("/proc/self/fd").iterdir():
+        with contextlib.suppress(OSError):
+            if not os.readlink(link).startswith("socket:"):
+                continue
+        with contextlib.suppress(OSError), socket.socket(fileno=os.dup(int(link.name))) as sock:
+            bound = sock.family in (socket.AF_INET, socket.AF_INET6) and sock.getsockname()[1]
+            accepts = sock.type == socket.SOCK_DGRAM or sock.getsockopt(
+                socket.SOL_SOCKET, socket.SO_ACCEPTCONN
+            )
+            if bound and accepts:
+                found.add(sock.getsockname()[0])
+    return found
+
+
+@pytest.mark.skipif(not os.path.isdir("/proc/self/fd"), reason="sockets are looked up in /proc")
+@pytest.mark.parametrize(
+    ("connect", "heard_at"),
+    [
+        ("udpin:{port}", LOOPBACK),
+        ("tcpin:{port}", LOOPBACK),
+        ("udpin::{port}", LOOPBACK),
+        ("udpin:0.0.0.0:{port}", "0.0.0.0"),  # asked for in so many words
+    ],
+)
+def test_nothing_listens_beyond_the_loopback_unless_configured(
+    tmp_path: Path, connect: str, heard_at: str
+) -> None:
+    seen = set[str]()
+    assert Address.parse(load(None, {}, {}).link.connect[0]).place == LOOPBACK
+
+    async def play(service: Service, told: list[Event]) -> None:
+        await until(lambda: listening() - before)
+        seen.update(listening() - before)
+
+    before = listening()
+    serve(tmp_path, (connect.format(port=free_port()),), play)
+    assert seen == {heard_at}
 
 
 def test_an_address_in_use_ends_it_with_a_sentence(tmp_path: Path) -> None:

@@ -5,9 +5,9 @@
     for data in session.to_send(): ...          # after either, and after session.send(message)
 
 It says HEARTBEAT, finds the one autopilot and takes its system id, tells when it comes, goes silent or
-reboots, keeps its time on the companion's clock, answers TIMESYNC and asks for the wanted message rates
-until they come. All else a peer says is handed up as MessageReceived. What messages mean is the business of
-`wire`.
+reboots, keeps its time on the companion's clock, answers TIMESYNC (so often and no more) and asks for the
+wanted message rates until they come. All else a peer says is handed up as MessageReceived. What messages mean
+is the business of `wire`.
 
 A vehicle has one autopilot: component 1 of a system, with a HEARTBEAT of a real autopilot and not of a
 ground station. The first one heard is kept; another is told once, then ignored altogether. Nothing a peer
@@ -23,6 +23,7 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 from companion.link import dialect, frame
+from companion.link.bucket import Bucket
 from companion.link.clock import SECOND, BootClock
 from companion.link.dialect import Message
 from companion.link.frame import BadFrame, Frame, UnknownFrame
@@ -31,6 +32,8 @@ from companion.link.streams import Streams
 
 HEARTBEAT_EVERY = SECOND
 TIMESYNC_EVERY = SECOND
+#: Answers to TIMESYNC a second, and at once: whoever asks faster is no clock.
+ANSWERS_HZ, ANSWERS_BURST = 20.0, 10
 #: The autopilot is lost when nothing of it came for so long.
 LOST_AFTER = 5 * SECOND
 
@@ -153,6 +156,7 @@ class Session:
         self._now = 0  # the last instant handed in
         self._heartbeat_at = 0
         self._timesync_at = 0
+        self._answers = Bucket(ANSWERS_HZ, ANSWERS_BURST)
         self._handlers = {HEARTBEAT: self._on_heartbeat, TIMESYNC: self._on_timesync}
 
     @property
@@ -289,7 +293,8 @@ class Session:
 
     def _on_timesync(self, message: Message, found: Frame, now: int, events: list[Event]) -> None:
         if message.tc1 == 0:
-            self.send(dialect.new("TIMESYNC", tc1=max(now, 1), ts1=message.ts1))
+            if self._answers.take(now):
+                self.send(dialect.new("TIMESYNC", tc1=max(now, 1), ts1=message.ts1))
         elif found.system == self._autopilot and found.component == AUTOPILOT_COMPONENT:
             self.clock.answered(message.ts1, message.tc1, now)
 

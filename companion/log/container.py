@@ -236,12 +236,20 @@ def unpack_torn(torn: bytes) -> bytes:
         fields.number(8)
         rest = torn[_HEAD.size + fields.at :]
         if compression == "zstd" and 0 < size <= MOST_UNCOMPRESSED:
-            if zstandard.get_frame_parameters(rest).content_size > MOST_UNCOMPRESSED:
-                return b""
-            return zstandard.ZstdDecompressor().decompressobj().decompress(rest)
+            return _as_far_as_it_goes(rest, size)
         return rest if compression == "" else b""
     except (Damaged, zstandard.ZstdError):
         return b""
+
+
+def _as_far_as_it_goes(torn: bytes, size: int) -> bytes:
+    """The whole blocks of a zstd frame, `size` bytes at most: a few bytes of one may stand for gigabytes."""
+    blocks = []
+    with zstandard.ZstdDecompressor(max_window_size=MOST_UNCOMPRESSED).stream_reader(torn) as reader:
+        while size > 0 and (block := reader.read(min(size, 1 << 17))):
+            blocks.append(block)
+            size -= len(block)
+    return b"".join(blocks)
 
 
 def messages(data: bytes) -> Iterator[tuple[int, int, int, int, int, bytes]]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import fcntl
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
@@ -223,7 +223,8 @@ def _copy(source: Opened, target: Store) -> Recovered:
     else:
         if not source.closed:
             lost += source.size - source.end
-            _rebuild(container.unpack_torn(source.tail()), known, loose)
+            with suppress(Damaged):  # torn and damaged: what stood before the damage is kept
+                _rebuild(container.unpack_torn(source.tail()), known, loose)
     keep(loose)
     target.finish()
     target.sync()

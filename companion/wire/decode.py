@@ -58,6 +58,9 @@ accuracy of its own: 7.8 m at 95 % (GPS SPS Performance Standard, 4th edition 20
 G = 9.80665
 """Standard gravity, m/s^2: MAVLink's mG are thousandths of it."""
 _ZERO_CELSIUS = 273.15
+FARTHEST, FASTEST, HIGHEST = 2.1e7, 3e3, 1e5
+"""Beyond these no number is a measurement: half the earth's girth (m), 3 km/s, 100 km. Filters that square
+them would still give numbers, but none that mean anything."""
 _UNIX_AFTER_US = 10**15  # 2001; a smaller number of microseconds is no date
 
 _RSBN_AZIMUTH, _RSBN_RANGE, _RSBN_TEST, _RSBN_MEMORY = 1, 2, 4, 8
@@ -176,7 +179,8 @@ def _gnss(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
 
 @_of("LOCAL_POSITION_NED")
 def _local_position(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
-    return (LocalPosition(_booted(m, rx, sender), rx, vector(m, "x y z"), vector(m, "vx vy vz")),)
+    x_n, v_n = vector(m, "x y z", limit=FARTHEST), vector(m, "vx vy vz", limit=FASTEST)
+    return (LocalPosition(_booted(m, rx, sender), rx, x_n, v_n),)
 
 
 @_of("GPS_GLOBAL_ORIGIN")
@@ -282,9 +286,9 @@ def _numbered_imu(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
 
 @_of("VFR_HUD")
 def _vfr_hud(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
-    airspeed = maybe(m, "airspeed")
-    if airspeed is None:
+    if maybe(m, "airspeed") is None:
         return ()  # PX4's word for "no airspeed"
+    airspeed = number(m, "airspeed", limit=FASTEST)
     heading = wrapped(math.radians(m.heading)) if 0 <= m.heading <= 360 else None
     return (
         AirData(
@@ -303,7 +307,7 @@ def _vfr_hud(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
 def _airspeed(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
     if m.flags & _AIRSPEED_UNHEALTHY:
         raise Refused("the airspeed sensor calls itself unhealthy", float(m.airspeed))
-    return (AirData(rx, rx, number(m, "airspeed")),)
+    return (AirData(rx, rx, number(m, "airspeed", limit=FASTEST)),)
 
 
 @_of("WIND")
@@ -339,6 +343,8 @@ def _sigma(message: Message, field: str, measured: float | None, configured: flo
         return configured
     if sigma <= 0.0:
         raise Refused(f"{field} {sigma:g} is not positive", sigma, 0.0)
+    if sigma > FARTHEST:
+        raise Refused(f"{field} {sigma:g} tells nothing", sigma, FARTHEST)
     return sigma
 
 
@@ -357,6 +363,8 @@ def _rsbn(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
         raise Refused(f"azimuth {azimuth:g} rad is no angle in radians", azimuth, math.tau)
     if slant_range is not None and slant_range <= 0.0:
         raise Refused(f"slant range {slant_range:g} m is not positive", slant_range, 0.0)
+    if slant_range is not None and slant_range > FARTHEST:
+        raise Refused(f"slant range {slant_range:g} m is beyond the earth", slant_range, FARTHEST)
     return (
         RsbnFix(
             t_ns=_stamped(m, rx, sender),
@@ -364,7 +372,7 @@ def _rsbn(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
             beacon=m.beacon_id,
             lat=lat,
             lon=lon,
-            alt=number(m, "beacon_alt"),
+            alt=number(m, "beacon_alt", limit=HIGHEST),
             azimuth=None if azimuth is None else wrapped(azimuth),
             slant_range=slant_range,
             sigma_azimuth=_sigma(m, "sigma_azimuth", azimuth, sender.sigma_azimuth),

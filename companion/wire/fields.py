@@ -25,11 +25,13 @@ class Refused(ValueError):
         self.limit = limit
 
 
-def number(message: Message, field: str, scale: float = 1.0) -> float:
-    """A number that must be there, times `scale`."""
+def number(message: Message, field: str, scale: float = 1.0, limit: float = math.inf) -> float:
+    """A number that must be there, times `scale`, and then no greater than `limit` by magnitude."""
     value = float(getattr(message, field))
     if not math.isfinite(value):
         raise Refused(f"{field} is {value}")
+    if abs(value * scale) > limit:
+        raise Refused(f"{field} {value:g} is beyond anything that flies", value * scale, limit)
     return value * scale
 
 
@@ -39,9 +41,9 @@ def maybe(message: Message, field: str, scale: float = 1.0) -> float | None:
     return value * scale if math.isfinite(value) else None
 
 
-def vector(message: Message, fields: str, scale: float = 1.0) -> Vector3:
-    """Three numbers that must be there, their names in one string."""
-    x, y, z = (number(message, field, scale) for field in fields.split())
+def vector(message: Message, fields: str, scale: float = 1.0, limit: float = math.inf) -> Vector3:
+    """Three numbers that must be there, as `number` has them, their names in one string."""
+    x, y, z = (number(message, field, scale, limit) for field in fields.split())
     return x, y, z
 
 

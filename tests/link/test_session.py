@@ -145,6 +145,15 @@ def test_a_timesync_question_is_answered_at_once() -> None:
     assert (answer.get_type(), answer.tc1, answer.ts1) == ("TIMESYNC", 9 * SECOND, 4242)
 
 
+def test_a_flood_of_timesync_questions_is_answered_at_its_rate() -> None:
+    session, asked = Session(), frame.encode(dialect.new("TIMESYNC", ts1=7), 0, 255, 190)
+    answers = 0
+    for ms in range(2000):
+        session.receive(asked, ms * 1_000_000)
+        answers += len(session.to_send())
+    assert answers == pytest.approx(10 + 2 * 20, abs=1)
+
+
 def test_a_reboot_is_noticed_and_the_streams_are_asked_for_again() -> None:
     session, peer = Session(rates_hz={"LOCAL_POSITION_NED": 10}), Autopilot(booted=-100 * SECOND)
     run(session, peer, 0, 10)
