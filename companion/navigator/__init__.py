@@ -9,7 +9,8 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections import deque
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 from companion.config import Config, parse
 from companion.records import (
@@ -33,9 +34,9 @@ from companion.records import (
 )
 
 from . import errorstate, guarantee
-from .carry import Carry, Settings, initial, is_news
+from .carry import Carry, Settings, Step, initial, is_news
 from .solution import announce, solve
-from .step import step, uses
+from .step import learn, step, uses
 
 __all__ = ["Navigator"]
 
@@ -88,24 +89,37 @@ class Navigator:
             self._past.append(_Past(record.t_ns, record, self._carry))
             while self._past[0].t_ns < record.t_ns - self._late_ns:
                 self._past.popleft()
-            outputs = self._stepped(record)
+            outputs = [*self._learnt()[1], *self._stepped(record)]
         if isinstance(record, RsbnFix) and self._carry.rsbn_ns == record.t_ns:  # believed: tell at once
             self._carry, solution = solve(self._carry, record.rx_ns, self._settings)
             outputs = [*outputs, *solution]
         return self._announced(outputs)
 
+    def _learnt(self) -> tuple[Input | None, list[Output]]:
+        """The lesson left over by the record before is learnt: whose it was, and what follows."""
+        lesson = self._carry.lesson
+        if lesson is None:
+            return None, []
+        self._carry = self._carry._replace(lesson=None)
+        return lesson.record, self._guarded(lesson.record, learn, lesson)
+
     def _stepped(self, record: Input) -> list[Output]:
-        """One step. What cannot be computed with is refused aloud, and a state gone wrong is begun anew."""
-        t_ns, rx_ns = record.t_ns, record.rx_ns
+        """One step; a state gone wrong by it is begun anew."""
+        before = self._carry.state
+        outputs = self._guarded(record, step, record)
+        if self._carry.state is not before and not errorstate.is_sound(self._carry.state):
+            self._carry = self._carry._replace(state=None)
+            why = "its covariance was none any more"
+            outputs = [*outputs, Reset(record.t_ns, record.rx_ns, "error state", why)]
+        return outputs
+
+    def _guarded(self, record: Input, follow: Callable[[Carry, Any, Settings], Step], x: Any) -> list[Output]:
+        """What follows from x; what cannot be computed with is refused aloud and changes nothing."""
         try:
-            carry, outputs = step(self._carry, record, self._settings)
+            self._carry, outputs = follow(self._carry, x, self._settings)
         except (ArithmeticError, ValueError) as error:  # a singular matrix is a ValueError too
             why = f"it cannot be computed with: {error}"
-            return [Rejection(t_ns, rx_ns, type(record).__name__, why)]
-        if carry.state is not self._carry.state and not errorstate.is_sound(carry.state):
-            carry = carry._replace(state=None)
-            outputs = [*outputs, Reset(t_ns, rx_ns, "error state", "its covariance was none any more")]
-        self._carry = carry
+            return [Rejection(record.t_ns, record.rx_ns, type(record).__name__, why)]
         return outputs
 
     def _tune(self, config: Config) -> None:
@@ -137,7 +151,10 @@ class Navigator:
         given: list[Output] = []
         for each in again:
             self._past.append(_Past(each.t_ns, each, self._carry))
+            learner, learnt = self._learnt()
             outputs = self._stepped(each)
+            if learner is record:  # all other lessons were told when they were learnt first
+                given += learnt
             if each is record:
                 given = [out for out in outputs if not isinstance(out, Solution) or out.t_ns > self._given_ns]
         return given

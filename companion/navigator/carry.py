@@ -7,7 +7,7 @@ from typing import NamedTuple
 from scipy.special import chdtri
 
 from companion.config import Config
-from companion.records import Gnss, LocalOrigin, LocalPosition, Output, Prediction, Source
+from companion.records import Gnss, LocalOrigin, LocalPosition, Output, Prediction, RsbnFix, Source
 
 from . import errorstate, guarantee, inertial, radio, winderror
 from .deadreckoning import Reckoner
@@ -44,6 +44,16 @@ class Level(NamedTuple):
     variance: float = 400.0
 
 
+class Lesson(NamedTuple):
+    """A believed fix that has still to teach the guaranteed predictor: what was heard, and the inertial point
+    of its time.
+    """
+
+    record: Gnss | RsbnFix
+    heard: radio.Heard
+    ins: Point
+
+
 class Carry(NamedTuple):
     """All that the navigator remembers."""
 
@@ -58,6 +68,7 @@ class Carry(NamedTuple):
     level: Level = Level()
     gnss: Gnss | None = None  # the last new one, used or not
     gnss_heard: radio.Heard | None = None  # the last one believed
+    lesson: Lesson | None = None  # not yet learnt: a solution must not wait for it
     gnss_ns: int | None = None  # when fixes were last believed
     rsbn_ns: int | None = None
     next_ns: int = 0

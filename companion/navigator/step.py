@@ -1,5 +1,8 @@
 """One step of the navigator: `carry, outputs = step(carry, record, settings)`, the carry immutable.
 
+What a fix teaches the guaranteed predictor is not needed for the solution that it causes. It is left in the
+carry as a lesson, and `learn` makes up for it before the next step, when the solution is out.
+
 Online, replay and late measurements all go through this one function. Errors are INS minus truth, so what is
 given out is the inertial channel less the estimated error. Two estimators run on one stream: the Gaussian
 error state (the "kalman" of the configuration: maximum-likelihood fusion with memory) and, beside it, the
@@ -39,7 +42,7 @@ from companion.records import (
 )
 
 from . import deadreckoning, errorstate, guarantee, inertial, radio, restricted
-from .carry import FIXES, Carry, Level, Settings, Step, initial, level, sources, state_at
+from .carry import FIXES, Carry, Lesson, Level, Settings, Step, initial, level, sources, state_at
 from .errorstate import ErrorState, Floats
 from .inertial import Point
 from .solution import solve
@@ -185,7 +188,7 @@ def _gnss(carry: Carry, record: Gnss, settings: Settings) -> Step:
     carry = carry._replace(gnss_ns=record.t_ns, gnss_heard=heard, level=learnt)
     if config.use_velocity and record.v_n is not None:
         carry = _absorb_velocity(carry, record, record.v_n, ins, settings)
-    return _learn(carry, heard, ins, record, settings)
+    return carry._replace(lesson=Lesson(record, heard, ins)), []
 
 
 def _rsbn(carry: Carry, record: RsbnFix, settings: Settings) -> Step:
@@ -209,7 +212,7 @@ def _rsbn(carry: Carry, record: RsbnFix, settings: Settings) -> Step:
         together = radio.Heard(
             record.t_ns, heard.observations + gnss.observations, heard.sources | gnss.sources
         )
-    return _learn(carry, together, ins, record, settings)
+    return carry._replace(lesson=Lesson(record, together, ins)), []
 
 
 def _absorb(
@@ -276,8 +279,9 @@ def _levelled(old: Level, record: Gnss, ins: Point, part: float) -> Level:
     return Level(old.error + k * (ins.position.alt - record.alt_msl - old.error), (1.0 - k) * p)
 
 
-def _learn(carry: Carry, heard: radio.Heard, ins: Point, record: Gnss | RsbnFix, settings: Settings) -> Step:
+def learn(carry: Carry, lesson: Lesson, settings: Settings) -> Step:
     """The radio fix alone, the INS left out: it teaches the guaranteed predictor and goes to the log."""
+    record, heard, ins = lesson
     height = Height(0.0, settings.config.inertial.height_sigma_m)
     try:
         fix = maximum_likelihood((*heard.observations, height), start=np.zeros(3))
