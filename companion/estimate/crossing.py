@@ -13,7 +13,7 @@ from itertools import combinations
 
 import numpy as np
 
-from companion.estimate.observations import Array, Azimuth, Height, Model, Position, Range
+from companion.estimate.observations import Array, Azimuth, Height, Model, Point, Position, Range
 
 _ABOVE_BEACONS = 1000.0
 """Height above the highest beacon where nothing is known of the height, m."""
@@ -60,19 +60,20 @@ class _Circle:
 _Line = _Ray | _Circle
 
 
-def crossings(model: Model) -> list[Array]:
-    """Points (n,) where the model's lines of position cross two by two; some point of a lone line."""
+def crossings(model: Model) -> list[Point]:
+    """Points where the model's lines of position cross two by two; some point of a lone line."""
     z = _height(model)
     lines = list(_lines(model, z))
     points = [q for a, b in combinations(lines, 2) for q in _cross(a, b)] or [a.foot() for a in lines[:1]]
-    return [np.array([q.real, q.imag, z][: model.n]) for q in points]
+    return [(q.real, q.imag, z) for q in points]
 
 
 def mean_position(model: Model) -> Array | None:
     """Weighted mean (n,) of the positions and heights alone, None where there is no position."""
     if not any(isinstance(z, Position) for z in model.observations):
         return None
-    F, f = model.W.T @ model.W, model.W.T @ model.w
+    known = model.linear
+    F, f = known.J.T @ known.J, known.J.T @ known.r
     if model.n == 3 and F[2, 2] == 0.0:
         F[2, 2], f[2] = 1.0, _height(model)
     return np.asarray(np.linalg.solve(F, f), dtype=np.float64)

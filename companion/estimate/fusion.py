@@ -43,6 +43,7 @@ from companion.estimate.observations import (
     Linearised,
     Model,
     Observation,
+    Point,
     Position,
     Range,
 )
@@ -140,15 +141,15 @@ def maximum_likelihood(
         x0 = mean_position(model)
     if x0 is not None and len(x0) != model.n:
         raise ValueError(f"start has {len(x0)} coordinates, the observations {model.n}: give as many")
-    model, found = _heard_fix(model, x0, cone)
+    model, found = _heard_fix(model, None if x0 is None else model.point(x0), cone)
     covariance = _invert(model, found.at)
-    residuals, shares = model.residuals(found.x)
+    residuals, shares = model.residuals(found.p)
     return Fix(
-        found.x,
+        model.place(found.p),
         covariance,
         found.at.cost,
         found.iterations,
-        len(found.at.r) - model.n,
+        len(found.at.rows) - model.n,
         residuals,
         shares,
         tuple(sorted(model.silent)),
@@ -182,9 +183,10 @@ def _heard(
 ) -> tuple[Model, Linearised]:
     x = _start(position)
     model = Model(observations, x)
+    p = model.point(x)
     if model.n == 3:
-        model = model.without(model.above(x, cone))
-    return model, model.at(x)
+        model = model.without(model.above(p, cone))
+    return model, model.at(p)
 
 
 def _start(start: npt.ArrayLike) -> Array:
@@ -195,34 +197,34 @@ def _start(start: npt.ArrayLike) -> Array:
 
 
 class _Minimum(NamedTuple):
-    x: Array
+    p: Point
     at: Linearised
     iterations: int
 
 
-def _heard_fix(model: Model, x0: Array | None, cone: float) -> tuple[Model, _Minimum]:
+def _heard_fix(model: Model, p0: Point | None, cone: float) -> tuple[Model, _Minimum]:
     """The fix and the model without the azimuths that cannot be heard there; the plane has no cone."""
-    if model.n == 3 and x0 is not None and (silent := model.above(x0, cone)):
+    if model.n == 3 and p0 is not None and (silent := model.above(p0, cone)):
         # near its beacon an azimuth pulls the fix into the singular point, so the others are asked first
         quiet = model.without(silent)
         with contextlib.suppress(NoFix):
-            found = _descend_from(quiet, x0)
-            if silent <= quiet.above(found.x, cone):
-                model, x0 = quiet, found.x
+            found = _descend_from(quiet, p0)
+            if silent <= quiet.above(found.p, cone):
+                model, p0 = quiet, found.p
     while True:
-        found = _descend_from(model, x0)
+        found = _descend_from(model, p0)
         # what the cone takes away stays away, so that this ends
-        silent = model.above(found.x, cone) - model.silent if model.n == 3 else frozenset[int]()
+        silent = model.above(found.p, cone) - model.silent if model.n == 3 else frozenset[int]()
         if not silent:
             return model, found
-        model, x0 = model.without(silent), found.x
+        model, p0 = model.without(silent), found.p
 
 
-def _descend_from(model: Model, x0: Array | None) -> _Minimum:
-    """The minimum reached from x0; from the crossings where x0 is missing or ends in a misfit."""
-    if x0 is not None:
+def _descend_from(model: Model, p0: Point | None) -> _Minimum:
+    """The minimum reached from p0; from the crossings where p0 is missing or ends in a misfit."""
+    if p0 is not None:
         try:
-            found = _descend(model, x0)
+            found = _descend(model, p0)
         except NoFix:
             return _likeliest(model)
         if _plausible(found.at, model.n):
@@ -240,38 +242,60 @@ def _plausible(at: Linearised, n: int) -> bool:
     return at.cost <= k + _PLAUSIBLE * math.sqrt(2.0 * k) + 1e-6
 
 
-def _descend(model: Model, x: Array) -> _Minimum:
+def _descend(model: Model, p: Point) -> _Minimum:
     """Gauss-Newton with Levenberg's damping from x."""
-    at = model.at(x)
+    at = model.at(p)
     floor, mu = _DAMPING, _DAMPING
-    unit = np.eye(model.n)
     for iteration in range(1, _STEPS + 1):
-        F, g = at.J.T @ at.J, at.J.T @ at.r
-        trace = float(F.trace())
-        if trace == 0.0:
-            return _Minimum(x, at, iteration)
-        step = np.linalg.solve(F + (mu * trace) * unit, g)
-        length = math.sqrt(max(float(step @ g), 0.0))
-        trial = model.at(x + step)
+        step, length = _step(at, mu)
+        q = (p[0] + step[0], p[1] + step[1], p[2] + step[2])
+        trial = model.at(q)
         if trial.cost <= at.cost + _LEVEL * (1.0 + at.cost):
-            x, at, mu = x + step, trial, max(mu / 100.0, floor)
+            p, at, mu = q, trial, max(mu / 100.0, floor)
         elif length < _STALLED:
-            return _Minimum(x, at, iteration)
+            return _Minimum(p, at, iteration)
         else:
             mu = max(10.0 * mu, 1e-4)
             continue
         # while damped, a step is short for another reason
         if length < _CONVERGED and mu == floor:
-            return _Minimum(x, at, iteration)
+            return _Minimum(p, at, iteration)
     raise NoFix(
-        f"no minimum of the cost within {_STEPS} steps (reached {x.round(1).tolist()}): azimuths that do"
-        " not meet, or a start too far away; add an observation or give a nearer start"
+        f"no minimum of the cost within {_STEPS} steps (reached {model.place(p).round(1).tolist()}):"
+        " azimuths that do not meet, or a start too far away; add an observation or give a nearer start"
     )
+
+
+def _step(at: Linearised, mu: float) -> tuple[Point, float]:
+    """Levenberg's step (F + mu trace(F) I)^-1 J^T r and its length in standard deviations; F = L D L^T.
+
+    In the plane nothing measures z, and the step has none. No pivot is less than what mu adds.
+    """
+    xx = xy = xz = yy = yz = zz = u = v = w = 0.0
+    for r, a, b, c in at.rows:
+        xx, xy, xz = xx + a * a, xy + a * b, xz + a * c
+        yy, yz, zz = yy + b * b, yz + b * c, zz + c * c
+        u, v, w = u + a * r, v + b * r, w + c * r
+    least = mu * (xx + yy + zz)
+    if least == 0.0:
+        return (0.0, 0.0, 0.0), 0.0
+    d1 = xx + least
+    l21, l31 = xy / d1, xz / d1
+    d2 = max(yy + least - l21 * xy, least)
+    below = yz - l21 * xz
+    l32 = below / d2
+    d3 = max(zz + least - l31 * xz - l32 * below, least)
+    q2 = v - l21 * u
+    q3 = (w - l31 * u - l32 * q2) / d3
+    z = q3
+    y = q2 / d2 - l32 * z
+    x = u / d1 - l21 * y - l31 * z
+    return (x, y, z), math.sqrt(max(x * u + y * v + z * w, 0.0))
 
 
 def _likeliest(model: Model) -> _Minimum:
     """The best minimum reachable from the crossings; Ambiguous if another place is nearly as good."""
-    points = crossings(model) or [np.zeros(model.n)]
+    points = crossings(model) or [(0.0, 0.0, 0.0)]
     points.sort(key=lambda p: model.at(p).cost)
     minima: list[_Minimum] = []
     failure: NoFix | None = None
@@ -287,9 +311,9 @@ def _likeliest(model: Model) -> _Minimum:
     minima.sort(key=lambda m: m.at.cost)
     best = minima[0]
     _invert(model, best.at)  # what is not measured at all is said first
-    rivals = [m for m in minima if m.at.cost - best.at.cost < _LIKELIHOOD_GAP and _apart(m.x, best)]
+    rivals = [m for m in minima if m.at.cost - best.at.cost < _LIKELIHOOD_GAP and _apart(m.p, best)]
     if rivals:
-        places = [best.x, rivals[0].x]
+        places = [model.place(best.p), model.place(rivals[0].p)]
         raise Ambiguous(
             "two places explain the observations: "
             + " and ".join(str(p.round(1).tolist()) for p in places)
@@ -299,10 +323,10 @@ def _likeliest(model: Model) -> _Minimum:
     return best
 
 
-def _apart(x: Array, m: _Minimum) -> bool:
-    """Whether x (n,) is another place than the minimum: more than three standard deviations from it."""
-    d = m.at.J @ (x - m.x)
-    return float(d @ d) > 9.0
+def _apart(p: Point, m: _Minimum) -> bool:
+    """Whether p is another place than the minimum: more than three standard deviations from it."""
+    x, y, z = p[0] - m.p[0], p[1] - m.p[1], p[2] - m.p[2]
+    return sum([(a * x + b * y + c * z) ** 2 for _, a, b, c in m.at.rows]) > 9.0
 
 
 def _invert(model: Model, at: Linearised) -> Array:

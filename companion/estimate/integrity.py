@@ -194,8 +194,8 @@ def sighted(source: str, z: Azimuth | Range, x: Floats, k: int) -> Measurement |
     """An azimuth or a range in the plane tangent at the INS (x east, y north), linearised where `x` has the
     aircraft, whitened; None inside the beacon's cone of silence.
     """
-    place = np.array([-x[1], -x[0], 0.0])
-    model = Model((z,), place)
+    place = (-float(x[1]), -float(x[0]), 0.0)
+    model = Model((z,), np.zeros(3))
     if model.above(place, CONE_OF_SILENCE):
         return None
     at = model.at(place)

@@ -2,7 +2,8 @@
 
 Four values, and `Model`, which turns a list of them into whitened equations. It knows nothing of how the
 equations are solved (`fusion`), of where the errors' sizes come from, nor of the earth: the caller brings
-everything into one Cartesian frame first.
+everything into one Cartesian frame first. The equations are plain numbers: there are two or three unknowns,
+and an array of three costs ten times its arithmetic.
 
 Frame: x east, y north[, z up], metres, any origin; this module keeps the papers' order. Azimuths are counted
 from north clockwise at the beacon, towards the aircraft. A problem has three dimensions as soon as one
@@ -29,6 +30,8 @@ import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
 Point = tuple[float, float, float]
+Row = tuple[float, float, float, float]
+"""One whitened equation at a point: residual, observed minus computed, and the gradient of the computed."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -99,15 +102,15 @@ class _Bearing:
         x, y, z = self.local(p)
         return math.atan2(abs(z), math.hypot(x, y))
 
-    def row(self, p: Point) -> tuple[float, float, float, float]:
+    def row(self, p: Point) -> Row:
         x, y, _ = self.local(p)
         residual = math.remainder(self.A - math.atan2(x, y), math.tau) / self.sigma
         d2 = (x * x + y * y) * self.sigma
         if d2 == 0.0:  # exactly above the beacon every azimuth is as good as any other
-            return residual, 0.0, 0.0, 0.0
+            return (residual, 0.0, 0.0, 0.0)
         de, dn = y / d2, -x / d2
         if self.axes is None:
-            return residual, de, dn, 0.0
+            return (residual, de, dn, 0.0)
         e, n, _ = self.axes
         return (
             residual,
@@ -125,37 +128,47 @@ class _Slant:
     def __init__(self, beacon: Point, D: float, sigma: float) -> None:
         self.beacon, self.D, self.sigma = beacon, D, sigma
 
-    def row(self, p: Point) -> tuple[float, float, float, float]:
+    def row(self, p: Point) -> Row:
         x0, y0, z0 = self.beacon
         x, y, z = p[0] - x0, p[1] - y0, p[2] - z0
         d = math.sqrt(x * x + y * y + z * z)
         if d == 0.0:  # at the beacon any way out is as good as any other: north
-            return self.D / self.sigma, 0.0, 1.0 / self.sigma, 0.0
+            return (self.D / self.sigma, 0.0, 1.0 / self.sigma, 0.0)
         s = d * self.sigma
-        return (self.D - d) / self.sigma, x / s, y / s, z / s
+        return ((self.D - d) / self.sigma, x / s, y / s, z / s)
 
 
 Sight = _Bearing | _Slant
 
 
 class Linearised:
-    """The whitened equations at one point: residuals r, Jacobian J of the computed values, cost r.r."""
+    """The whitened equations at one point and their cost, the sum of squared residuals."""
 
-    __slots__ = ("J", "cost", "r")
+    __slots__ = ("cost", "n", "rows")
 
-    def __init__(self, r: Array, J: Array) -> None:
-        self.r, self.J = r, J
-        self.cost = float(r @ r)
+    def __init__(self, rows: list[Row], n: int) -> None:
+        self.rows, self.n = rows, n
+        self.cost = sum([row[0] * row[0] for row in rows])
+
+    @property
+    def r(self) -> Array:
+        """Residuals (m,)."""
+        return np.array([row[0] for row in self.rows])
+
+    @property
+    def J(self) -> Array:
+        """Jacobian (m, n) of the computed values."""
+        return np.array([row[1 : 1 + self.n] for row in self.rows])
 
 
 class Model:
     """Observations as whitened equations in `n` (2 or 3) unknowns; ValueError names a bad observation.
 
-    Linear observations (positions, heights) become rows W x = w once; azimuths and ranges (`sights`) are
+    Linear observations (positions, heights) are rows of W x = w for good; azimuths and ranges (`sights`) are
     linearised anew at each point.
     """
 
-    __slots__ = ("W", "_whiteners", "n", "observations", "sights", "silent", "sizes", "w")
+    __slots__ = ("_linear", "n", "observations", "sights", "silent")
 
     def __init__(self, observations: Sequence[Observation], start: Array | None = None) -> None:
         if not observations:
@@ -163,51 +176,42 @@ class Model:
         self.observations = observations
         self.n = _dimension(observations, start)
         self.sights: list[Sight | None] = []
-        self.sizes: list[int] = []
         self.silent: frozenset[int] = frozenset()
-        self._whiteners: list[Array | None] = []
-        rows: list[Array] = []
-        values: list[Array] = []
+        self._linear: list[tuple[int, Row]] = []  # of which observation, and w where the residual will stand
         for i, z in enumerate(observations):
             sight: Sight | None = None
-            whitener: Array | None = None
-            size = 1
             if isinstance(z, Position):
-                value, whitener = _whitened(i, z)
-                size = len(value)
-                rows.append(_widened(whitener, self.n))
-                values.append(whitener @ value)
+                self._linear += [(i, row) for row in _whitened(i, z)]
             elif isinstance(z, Height):
                 _check(i, z)
-                whitener = np.array([[1.0 / z.sigma]])
-                rows.append(np.array([[0.0, 0.0, 1.0 / z.sigma]]))
-                values.append(np.array([z.value / z.sigma]))
+                self._linear.append((i, (z.value / z.sigma, 0.0, 0.0, 1.0 / z.sigma)))
             else:
                 sight = _sight(i, z, self.n)
             self.sights.append(sight)
-            self.sizes.append(size)
-            self._whiteners.append(whitener)
-        self.W = np.concatenate(rows) if rows else np.zeros((0, self.n))
-        self.w = np.concatenate(values) if values else np.zeros(0)
+
+    @property
+    def linear(self) -> Linearised:
+        """The positions and heights alone, at the origin."""
+        return Linearised([row for _, row in self._linear], self.n)
 
     def point(self, x: Array) -> Point:
         """Position x (n,) as three numbers, z = 0 in the plane."""
         p = x.tolist()
         return (p[0], p[1], p[2] if self.n == 3 else 0.0)
 
-    def at(self, x: Array) -> Linearised:
-        """Whitened residuals (observed minus computed) and Jacobian at position x (n,)."""
-        p = self.point(x)
-        sight_rows = [s.row(p) for i, s in enumerate(self.sights) if s is not None and i not in self.silent]
-        r = self.w - self.W @ x
-        if not sight_rows:
-            return Linearised(r, self.W)
-        S = np.array(sight_rows)
-        return Linearised(np.concatenate((r, S[:, 0])), np.concatenate((self.W, S[:, 1 : 1 + self.n])))
+    def place(self, p: Point) -> Array:
+        """Point p as a position (n,)."""
+        return np.array(p[: self.n])
 
-    def above(self, x: Array, elevation: float) -> frozenset[int]:
-        """Indices of the azimuths whose beacon sees position x (n,) higher than `elevation` rad."""
-        p = self.point(x)
+    def at(self, p: Point) -> Linearised:
+        """The whitened equations at point p, positions and heights first."""
+        x, y, z = p
+        rows = [(w - a * x - b * y - c * z, a, b, c) for _, (w, a, b, c) in self._linear]
+        rows += [s.row(p) for i, s in enumerate(self.sights) if s is not None and i not in self.silent]
+        return Linearised(rows, self.n)
+
+    def above(self, p: Point, elevation: float) -> frozenset[int]:
+        """Indices of the azimuths whose beacon sees point p higher than `elevation` rad."""
         return frozenset(
             i for i, s in enumerate(self.sights) if isinstance(s, _Bearing) and s.elevation(p) > elevation
         )
@@ -218,30 +222,24 @@ class Model:
         other.silent = self.silent | silent
         return other
 
-    def residuals(self, x: Array) -> tuple[tuple[Array, ...], tuple[float, ...]]:
-        """Per observation at x (n,): observed minus computed in its own unit, and its share of the cost.
+    def residuals(self, p: Point) -> tuple[tuple[Array, ...], tuple[float, ...]]:
+        """Per observation at point p: observed minus computed in its own unit, and its share of the cost.
 
         A silent azimuth has an empty residual and no share.
         """
-        p = self.point(x)
-        residuals: list[Array] = []
-        shares: list[float] = []
-        for i, z in enumerate(self.observations):
-            sight, whitener = self.sights[i], self._whiteners[i]
-            if i in self.silent:
-                e = r = np.zeros(0)
-            elif sight is not None:
-                r = np.array(sight.row(p)[:1])
-                e = r * sight.sigma
-            else:
-                assert whitener is not None
-                if isinstance(z, Position):
-                    e = np.asarray(z.value, dtype=float) - x[: self.sizes[i]]
-                else:
-                    e = np.asarray(z.value, dtype=float) - x[2:]
-                r = whitener @ e
-            residuals.append(e)
-            shares.append(float(r @ r))
+        residuals = [np.zeros(0)] * len(self.observations)
+        shares = [0.0] * len(self.observations)
+        for i, (w, a, b, c) in self._linear:
+            shares[i] += (w - a * p[0] - b * p[1] - c * p[2]) ** 2
+        for i, (o, sight) in enumerate(zip(self.observations, self.sights, strict=True)):
+            if isinstance(o, Position):
+                value = np.asarray(o.value, dtype=float)
+                residuals[i] = value - p[: len(value)]
+            elif isinstance(o, Height):
+                residuals[i] = np.array([o.value - p[2]])
+            elif i not in self.silent and sight is not None:
+                r = sight.row(p)[0]
+                residuals[i], shares[i] = np.array([r * sight.sigma]), r * r
         return tuple(residuals), tuple(shares)
 
 
@@ -272,8 +270,8 @@ def _check(i: int, z: Azimuth | Range | Height) -> None:
         raise ValueError(f"{_name(i, z)}: sigma is {z.sigma}; it must be positive and finite")
 
 
-def _whitened(i: int, z: Position) -> tuple[Array, Array]:
-    """Value and whitener W, W^T W = covariance^-1."""
+def _whitened(i: int, z: Position) -> list[Row]:
+    """The rows of W x = W value, W^T W = covariance^-1."""
     value = np.asarray(z.value, dtype=float)
     C = np.asarray(z.covariance, dtype=float)
     if value.shape not in ((2,), (3,)) or C.shape != 2 * value.shape:
@@ -286,18 +284,15 @@ def _whitened(i: int, z: Position) -> tuple[Array, Array]:
     if not math.isfinite(C.sum()) or np.abs(C - C.T).max() > 1e-9 * abs(C).max():
         raise ValueError(f"{_name(i, z)}: covariance must be finite and symmetric, it is {C.tolist()}")
     try:
-        return value, np.linalg.inv(np.linalg.cholesky(C))
+        W = np.linalg.inv(np.linalg.cholesky(C))
     except np.linalg.LinAlgError:
         raise ValueError(
             f"{_name(i, z)}: covariance is not positive definite (eigenvalues"
             f" {np.linalg.eigvalsh(C).tolist()}); give every axis a positive variance"
         ) from None
-
-
-def _widened(W: Array, n: int) -> Array:
-    if W.shape[1] == n:
-        return W
-    return np.hstack((W, np.zeros((len(W), n - W.shape[1]))))
+    return [
+        (w, a, b, c[0] if c else 0.0) for w, (a, b, *c) in zip((W @ value).tolist(), W.tolist(), strict=True)
+    ]
 
 
 def _sight(i: int, z: Azimuth | Range, n: int) -> Sight:
