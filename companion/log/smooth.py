@@ -28,7 +28,7 @@ from companion.navigator import FOLDED, inertial
 from companion.navigator.carry import Carry, Settings, initial, is_news, level, state_at
 from companion.navigator.errorstate import ErrorState
 from companion.navigator.inertial import Point
-from companion.navigator.step import step
+from companion.navigator.step import learn, step
 from companion.records import Gnss, LocalPosition, RsbnFix, Stamped
 
 Floats = npt.NDArray[np.float64]
@@ -130,6 +130,8 @@ def _forward(records: Iterable[Stamped], settings: Settings) -> list[_Stop]:
             continue
         # no solutions, which would predict at moments of their own, and no bounds ahead: the stops are ours
         carry = carry._replace(next_ns=NEVER_NS, next_ahead_ns=NEVER_NS)
+        if carry.lesson is not None:
+            carry, _ = learn(carry._replace(lesson=None), carry.lesson, settings)
         after = step(carry, record, settings)[0]
         stop = None
         if isinstance(record, LocalPosition):

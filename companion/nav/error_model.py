@@ -65,7 +65,20 @@ def aircraft(
     added: Sequence[Disturbance] = (),
     sphere: Sphere = SPHERE,
 ) -> Model:
-    """The model complete to first order, for any speed: the one that flies.
+    """The model complete to first order, for any speed: the one that flies. Its own states are
+    `aircraft_errors`.
+    """
+    return compose(aircraft_errors(lat, v_north, v_east, acceleration_n, sphere), INS_STATES, added)
+
+
+def aircraft_errors(
+    lat: float,
+    v_north: float,
+    v_east: float,
+    acceleration_n: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    sphere: Sphere = SPHERE,
+) -> Matrix:
+    """A (7, 7) of `INS_STATES` alone, complete to first order.
 
     `acceleration_n` is the rate of change of the velocity, NED: in a turn it couples PZ into the velocity.
     Vertical errors are not in it: the height channel is aided by the barometer.
@@ -79,7 +92,7 @@ def aircraft(
     fD = -(G - 2 * Om * c * VE - (VN * VN + VE * VE) / R) + acceleration_n[2]
     wX, wY, wZ = Om * c + VE / R, -VN / R, -(Om * s + VE * t / R)
     d_coriolis = (2 * Om * c + VE / (R * c * c)) / R  # of the Coriolis factor, per metre north
-    A = np.array(
+    return np.array(
         [
             [0, 0, 1, 0, 0, 0, 0],
             [VE * t / R, -VN * t / R, 0, 1, 0, 0, 0],
@@ -90,7 +103,6 @@ def aircraft(
             [(Om * c + VE / (R * c * c)) / R, 0, 0, t / R, wY, -wX, 0],
         ]
     )
-    return compose(A, INS_STATES, added)
 
 
 def twin(first: Model, second: Model, suffix: str = "2", common: Sequence[Disturbance] = ()) -> Model:

@@ -21,8 +21,8 @@ import numpy as np
 import numpy.typing as npt
 
 from companion.config import GnssSection, Inertial
-from companion.nav.disturbances import Disturbance, accelerometer_slow, gyro_drift
-from companion.nav.error_model import aircraft
+from companion.nav.disturbances import Disturbance, accelerometer_slow, compose, gyro_drift
+from companion.nav.error_model import INS_STATES, aircraft_errors
 from companion.records import Vector2, Vector3
 
 Floats = npt.NDArray[np.float64]
@@ -31,6 +31,7 @@ N = 14
 POSITION = slice(0, 2)
 VELOCITY = slice(2, 4)
 TILT = slice(4, 7)
+INS = slice(0, 7)
 G0 = 9.80665  # [m/s^2] of what is quoted in micro-g
 STEP_S = 2.0  # the transition is a power series: its fifth term is below 1e-12 of the first here
 
@@ -71,17 +72,20 @@ class ErrorModel(Protocol):
 
 
 class Grade(NamedTuple):
-    """Of an INS: disturbances of the unit and of GNSS, white spectral densities (N,), first sigmas (N,)."""
+    """Of an INS: `composed` (N, N) is A with the disturbances of the unit and of GNSS and without the INS's
+    own errors; spectral densities (N, N), first sigmas (N,).
+    """
 
-    disturbances: tuple[Disturbance, ...]
+    composed: Floats
     density: Floats
     sigma0: Floats
     velocity_noise: float = 0.0
 
     def system(self, lat: float, v_n: Vector3, a_n: Vector2) -> System:
         """The INS error equations at this latitude, velocity and acceleration."""
-        model = aircraft(lat, v_n[0], v_n[1], (*a_n, 0.0), added=self.disturbances)
-        return System(model.A, model.Q + np.diag(self.density))
+        A = self.composed.copy()
+        A[INS, INS] = aircraft_errors(lat, v_n[0], v_n[1], (*a_n, 0.0))
+        return System(A, self.density)
 
     def velocity_rows(self, v_n: Vector3) -> Floats:
         """The velocity errors are states."""
@@ -99,12 +103,13 @@ def grade(settings: Inertial, gnss: GnssSection) -> Grade:
         accelerometer_slow(1.0 / (3600.0 * settings.accelerometer_correlation_h), bias),
         Disturbance(("GN", "GE"), 1.0 / gnss.correlation_s, gnss.sigma_m),
     )
-    density = np.zeros(N)
+    bare = compose(np.zeros((7, 7)), INS_STATES, disturbances)
+    density = bare.Q.diagonal().copy()
     density[VELOCITY] = settings.velocity_noise_m_s_sqrt_s**2
     density[TILT] = (math.radians(settings.angle_random_walk_deg_sqrt_h) / 60.0) ** 2
     sigma0 = [settings.position_m] * 2 + [settings.velocity_m_s] * 2 + [tilt, tilt, heading]
     sigma0 += [drift] * 3 + [bias] * 2 + [gnss.sigma_m] * 2
-    return Grade(disturbances, density, np.array(sigma0))
+    return Grade(bare.A, np.diag(density), np.array(sigma0))
 
 
 def beacon_rows(unit: ErrorModel) -> Floats:
@@ -130,19 +135,22 @@ def predict(
     left = (t_ns - state.t_ns) * 1e-9
     if left <= 0.0:
         return state
-    x, P = state.x, state.P
-    A, density = unit.system(lat, v_n, a_n)
     steps = math.ceil(left / STEP_S)
-    dt = left / steps
-    M = A * dt
-    M2 = M @ M
-    Phi = np.eye(len(x)) + M + M2 / 2.0 + (M2 @ M) / 6.0 + (M2 @ M2) / 24.0
-    # trapezoid of the process noise: second order in dt, which is short against every mode
-    Q = 0.5 * dt * (density + Phi @ density @ Phi.T)
+    Phi, Q = transition(left / steps, unit.system(lat, v_n, a_n))
+    x, P = state.x, state.P
     for _ in range(steps):
         x = Phi @ x
         P = Phi @ P @ Phi.T + Q
     return ErrorState(t_ns, x, 0.5 * (P + P.T))
+
+
+def transition(dt: float, system: System) -> tuple[Floats, Floats]:
+    """Phi and the covariance Q of what comes in over `dt` seconds, no more than STEP_S; both (n, n)."""
+    M = system.A * dt
+    M2 = M @ M
+    Phi = np.eye(len(M)) + M + M2 / 2.0 + (M2 @ M) / 6.0 + (M2 @ M2) / 24.0
+    # trapezoid of the process noise: second order in dt, which is short against every mode
+    return Phi, 0.5 * dt * (system.Q + Phi @ system.Q @ Phi.T)
 
 
 def absorb_position(state: ErrorState, H: Floats, mean: Floats, covariance: Floats) -> ErrorState:

@@ -13,7 +13,6 @@ import pytest
 from companion.config import Config
 from companion.log.smooth import Flight, smooth_flight
 from companion.nav.discrete import discretise
-from companion.nav.error_model import aircraft
 from companion.nav.geometry import (
     Geodetic,
     displace,
@@ -45,8 +44,8 @@ def flight(duration_s: int, silent: tuple[int, int], seed: int = 1) -> Flown:
     model, a beacon every 5 s; nothing but the INS in `silent`."""
     rng = np.random.default_rng(seed)
     dt, unit = 0.2, errorstate.grade(CONFIG.inertial, CONFIG.gnss)
-    model = aircraft(ORIGIN.lat, 30.0, 0.0, added=unit.disturbances)
-    step = discretise(model.A, model.Q + np.diag(unit.density), model.B, dt)
+    model = unit.system(ORIGIN.lat, (30.0, 0.0, 0.0), (0.0, 0.0))
+    step = discretise(model.A, model.Q, np.zeros((errorstate.N, 0)), dt)
     root = np.linalg.cholesky(step.Q + 1e-30 * np.eye(errorstate.N))
     x = unit.sigma0 * rng.standard_normal(errorstate.N)
     records: list[Any] = [LocalOrigin(0, 0, *ORIGIN, "tangent")]

@@ -17,7 +17,6 @@ from companion.estimate import integrity, monitor
 from companion.estimate.fusion import Azimuth
 from companion.estimate.integrity import Measurement
 from companion.estimate.monitor import Allotment, Exclusion, Monitor
-from companion.nav.error_model import aircraft
 from companion.nav.geometry import Geodetic, displace, separation
 from companion.navigator import errorstate, inertial, radio
 from companion.records import Gnss, LocalOrigin, LocalPosition, RsbnFix
@@ -29,7 +28,6 @@ NS = 1_000_000_000
 CONFIG = Config()
 UNIT = errorstate.grade(CONFIG.inertial, CONFIG.gnss)
 K = len(UNIT.sigma0)
-DENSITY = np.diag(UNIT.density)
 LOOSE = np.zeros(K)
 LOOSE[2:4] = 0.05**2  # m^2/s^3: an inertial channel that is not believed beyond a minute
 BIAS = {Azimuth: math.radians(0.1)}  # of ranges: 50 m
@@ -51,11 +49,8 @@ def advanced(watch: Monitor, track: inertial.Track, p: inertial.Point) -> Monito
     bank, dt = watch.bank, (p.t_ns - watch.bank.t_ns) * 1e-9
     if dt <= 0.0:
         return watch
-    a_n = (*inertial.acceleration(track), 0.0)
-    model = aircraft(p.position.lat, p.v_n[0], p.v_n[1], a_n, added=UNIT.disturbances)
-    M = model.A * dt
-    Phi = np.eye(K) + M + M @ M / 2.0 + M @ M @ M / 6.0
-    Q = 0.5 * dt * (model.Q + DENSITY + Phi @ (model.Q + DENSITY) @ Phi.T)
+    system = UNIT.system(p.position.lat, p.v_n, inertial.acceleration(track))
+    Phi, Q = errorstate.transition(dt, system)
     still = np.zeros(len(bank.biases))
     return watch._replace(bank=integrity.carry(bank, p.t_ns, Phi, Q, LOOSE * dt, still))
 
