@@ -36,9 +36,11 @@ from companion.records import (
     Event,
     LinkState,
     LocalOrigin,
+    LocalPosition,
     Mode,
     Reboot,
     Rejection,
+    Reset,
     RsbnFix,
     Solution,
     Stamped,
@@ -231,6 +233,10 @@ class Onboard:
             self._emit(output)
             if isinstance(output, Solution):
                 self._send(output, news=isinstance(record, RsbnFix))
+            elif isinstance(output, Reset) and isinstance(record, LocalPosition):
+                self._origin = (
+                    None  # perhaps it is the origin that moved: nothing is counted from it till told
+                )
 
     def _emit(self, record: Stamped, channel: str | None = None) -> None:
         self._log.record(record, channel)

@@ -23,7 +23,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from companion.link import dialect, frame
-from companion.nav.geometry import Geodetic, local_to_geodetic
+from companion.nav.geometry import Geodetic, displace, geodetic_to_local, local_to_geodetic
 from companion.records import (
     AirData,
     Attitude,
@@ -89,6 +89,8 @@ class Autopilot:
             (f for f in scenario.faults if f.name in AUTOPILOT_FAULTS), key=lambda f: -f.start_s
         )
         self._reader = frame.Reader()
+        self._deaf_until = 0  # while it boots
+        self._local_origin, self._origin_moved = self.world.origin, 0.0  # metres north, and as many east
         self._commands: dict[str, Callable[[Any, int], None]] = {
             "TIMESYNC": self._on_timesync,
             "COMMAND_LONG": self._on_command,
@@ -117,7 +119,9 @@ class Autopilot:
     def receive(self, data: bytes, now_ns: int) -> None:
         """Take what the companion sent at `now_ns`; a link that is lost is lost both ways."""
         t = now_ns - self._start_ns
-        if self._losses and not disturb([Chunk(now_ns, data)], t, self._losses, self._rng):
+        if t < self._deaf_until or (
+            self._losses and not disturb([Chunk(now_ns, data)], t, self._losses, self._rng)
+        ):
             return
         for found in self._reader.receive(data):
             if isinstance(found, frame.Frame):
@@ -206,6 +210,8 @@ class Autopilot:
             moved = -round(self.scenario.boot_before_s * 1e6) - self._airframe.boot_ns // 1000
             if moved:
                 record = replace(record, stamp_us=max(record.stamp_us + moved, 1))
+        if isinstance(record, LocalPosition) and self._local_origin != self.world.origin:
+            record = self._from_local_origin(record)
         return encode(record, self._airframe)
 
     def _frame(self, message: Any, component: int) -> bytes:
@@ -230,18 +236,33 @@ class Autopilot:
             heapq.heappush(self._outbox, (due, self._order, data))
 
     def _undergo(self, fault: Fault) -> None:
-        """A fault of the autopilot itself begins (or, for a clock that leaps back, ends)."""
+        """A fault of the autopilot itself begins (or, for what leaps back, ends)."""
         start = round(fault.start_s * 1e9)
-        size = round((AUTOPILOT_FAULTS[fault.name] if fault.size is None else fault.size) * 1e9)
+        size = AUTOPILOT_FAULTS[fault.name] if fault.size is None else fault.size
+        size_ns = round(size * 1e9)
         if fault.name == "reboot":
-            self._boot(start, start + size)
-            while self._rsbn_due() < start + size:
+            self._deaf_until = start + size_ns
+            self._boot(start, self._deaf_until)
+            while self._rsbn_due() < self._deaf_until:
                 self._rsbn_next += 1
             return
-        self._airframe = self._airframe._replace(boot_ns=self._airframe.boot_ns - size)
+        if fault.name == "clock-jump":
+            self._airframe = self._airframe._replace(boot_ns=self._airframe.boot_ns - size_ns)
+        else:
+            self._origin_moved += size * math.sqrt(0.5)
+            self._local_origin = displace(*self.world.origin, self._origin_moved, self._origin_moved, 0.0)
         if math.isfinite(fault.end_s):
-            back = Fault(fault.name, fault.end_s, math.inf, -size * 1e-9)
+            back = Fault(fault.name, fault.end_s, math.inf, -size)
             self._own_faults = sorted([*self._own_faults, back], key=lambda f: -f.start_s)
+
+    def _from_local_origin(self, record: LocalPosition) -> LocalPosition:
+        """The local position counted from where the origin is now; the world counts from its own."""
+        if not math.isfinite(record.x_n[0]):
+            return record
+        projection: Any = self.scenario.autopilot
+        place = local_to_geodetic(projection, self.world.origin, np.array(record.x_n))
+        north, east, down = geodetic_to_local(projection, self._local_origin, place).tolist()
+        return replace(record, x_n=(north, east, down))
 
     # -- messages that no sensor makes ----------------------------------------------------------------------
 
@@ -264,7 +285,7 @@ class Autopilot:
         return encode(record, self._airframe)
 
     def _origin(self, t: int) -> Any:
-        lat, lon, alt = self.world.origin
+        lat, lon, alt = self._local_origin
         return encode(LocalOrigin(t, t, lat, lon, alt - self.scenario.geoid_height), self._airframe)
 
     def _home(self, t: int) -> Any:
@@ -284,7 +305,7 @@ class Autopilot:
         local = self._last(LocalPosition, t)
         if not math.isfinite(local.x_n[0]):
             return None
-        projection: Any = "px4" if self.scenario.autopilot == "px4" else "ardupilot"
+        projection: Any = self.scenario.autopilot
         place: Geodetic = local_to_geodetic(projection, self.world.origin, np.array(local.x_n))
         above = place.alt - self.world.origin.alt
         msl = place.alt - self.scenario.geoid_height

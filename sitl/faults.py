@@ -2,8 +2,9 @@
 
 `RECORD_FAULTS` act on one kind of record of what the sensors say, inside a window of flight time.
 `LINK_FAULTS` act on the chunks (frames) that leave for the companion. What concerns the autopilot itself
-(its reboot, its clock) it carries out alone: `AUTOPILOT_FAULTS` names them. A `Fault` is the order for one:
-name, window, size and, where it matters, which beacon. The size's meaning stands in each function.
+(its reboot, its clock, its local origin) it carries out alone: `AUTOPILOT_FAULTS` names them. A `Fault` is
+the order for one: name, window, size and, where it matters, which beacon. The size's meaning stands in each
+function.
 
 Record faults read `t_ns`, the flight's time, and write `rx_ns` where they delay.
 """
@@ -299,8 +300,9 @@ LINK_FAULTS: dict[str, LinkFault] = {
     "cut": LinkFault(0.1, cut),
 }
 
-#: Name -> usual size: seconds of silence after a reboot, seconds by which every clock leaps.
-AUTOPILOT_FAULTS: dict[str, float] = {"reboot": 8.0, "clock-jump": 3600.0}
+#: Name -> usual size: seconds of silence after a reboot, seconds by which every clock leaps, metres to the
+#: north-east by which the origin of the local position moves (told when GPS_GLOBAL_ORIGIN is next due).
+AUTOPILOT_FAULTS: dict[str, float] = {"reboot": 8.0, "clock-jump": 3600.0, "origin-change": 1000.0}
 
 NAMES: tuple[str, ...] = (*RECORD_FAULTS, *LINK_FAULTS, *AUTOPILOT_FAULTS)
 

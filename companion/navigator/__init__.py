@@ -30,11 +30,12 @@ from companion.records import (
     Reset,
     RsbnFix,
     Solution,
+    Source,
     Tuning,
 )
 
 from . import errorstate, guarantee
-from .carry import Carry, Settings, Step, initial, is_news
+from .carry import FIXES, Carry, Settings, Step, initial, is_news
 from .solution import announce, solve
 from .step import learn, step, uses
 
@@ -67,7 +68,7 @@ class Navigator:
         self._carry = initial(self._settings)
         self._past: deque[_Past] = deque()
         self._late_ns = round(1e9 * config.estimator.late_s)
-        self._mode = Mode.INITIALISING  # of the last solution given out, and its time
+        self._rests_on = Mode.INITIALISING, Source(0)  # mode and fixes of the last solution, and its time
         self._given_ns = 0
         self._chosen = False  # the inertial channel is told once, with the first record
 
@@ -166,14 +167,15 @@ class Navigator:
         return before._replace(guarantee=promise, ahead=now.ahead, next_ahead_ns=now.next_ahead_ns)
 
     def _announced(self, outputs: list[Output]) -> list[Output]:
-        """With an event wherever the mode of what is given out changes."""
+        """With an event wherever the mode of what is given out, or what fixes it rests on, changes."""
         announced: list[Output] = []
         for output in outputs:
             announced.append(output)
             if isinstance(output, Solution):
                 self._given_ns = output.t_ns
-                if output.mode is not self._mode:
-                    self._mode = output.mode
+                rests_on = output.mode, output.sources & FIXES
+                if rests_on != self._rests_on:
+                    self._rests_on = rests_on
                     announced.append(announce(output))
         return announced
 

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from companion.nav.geometry import Geodetic, Projection, displace, local_to_geodetic
+from companion.nav.geometry import Geodetic, Projection, displace, local_to_geodetic, separation
 from companion.records import LocalOrigin, LocalPosition, Vector2, Vector3
 
 KEEP = 128  # points: 12 s at 10 Hz, more than a beacon's answer may be late
@@ -67,13 +67,15 @@ def at(track: Track, t_ns: int) -> Point | None:
     return Point(t_ns, Geodetic(*mix), v_n)  # type: ignore[arg-type]
 
 
-def jump(before: LocalPosition, after: LocalPosition) -> Vector3 | None:
-    """How far the channel stepped (NED, m) beyond what its own velocities explain; None if it did not."""
+def jump(before: Point, after: Point) -> Vector3 | None:
+    """How far the channel stepped (NED, m) beyond what its own velocities explain; None if it did not.
+
+    On the earth, not from the origin: an origin that moves, told before or after the local positions that are
+    counted from it, is a step and its return, and moves nothing in the end.
+    """
     dt = (after.t_ns - before.t_ns) * 1e-9
-    step = [
-        q - p - 0.5 * (v + w) * dt
-        for p, q, v, w in zip(before.x_n, after.x_n, before.v_n, after.v_n, strict=True)
-    ]
+    moved = separation(after.position, before.position).tolist()
+    step = [s - 0.5 * (v + w) * dt for s, v, w in zip(moved, before.v_n, after.v_n, strict=True)]
     if math.hypot(step[0], step[1]) <= JUMP_M + 0.5 * JUMP_ACCELERATION * dt * dt:
         return None
     return step[0], step[1], step[2]

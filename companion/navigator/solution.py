@@ -109,7 +109,7 @@ def _mode(carry: Carry, bounded: Bounded | None, t_ns: int, settings: Settings) 
 
 
 def announce(solution: Solution) -> Event:
-    """The line that tells of a change to this solution's mode."""
+    """The line that tells of a change to this solution's mode, or to the fixes it rests on."""
     fixes = [s.name.lower() for s in Source if s.name and s & FIXES & solution.sources]
     if solution.mode is Mode.FIXED:
         why = " and ".join(fixes) + " fixes"

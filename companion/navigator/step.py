@@ -67,14 +67,21 @@ def _origin(carry: Carry, record: LocalOrigin, settings: Settings) -> Step:
     old = carry.origin
     if old is not None and (old.lat, old.lon, old.alt_msl) == (record.lat, record.lon, record.alt_msl):
         return carry, []
-    text = "local origin known" if old is None else "local origin changed: the track begins anew from it"
-    carry = carry._replace(origin=record, track=(), local=None)
+    text = "local origin known" if old is None else "local origin changed"
+    carry = carry._replace(origin=record)
     return carry, [Event(record.t_ns, record.rx_ns, 6 if old is None else 4, text)]
 
 
 def _reboot(carry: Carry, record: Reboot, settings: Settings) -> Step:
-    """Another inertial channel: what was learnt of the old one's error says nothing of it."""
-    out = Reset(record.t_ns, record.rx_ns, "navigator", f"autopilot {record.system} rebooted")
+    """Another inertial channel: what was learnt of the old one's error says nothing of it.
+
+    Dead reckoning is our own: to it a reboot is a silence, and the wind is what it was.
+    """
+    why = f"autopilot {record.system} rebooted"
+    if settings.config.channel == "air_data":
+        carry = carry._replace(reckoner=deadreckoning.Reckoner(), gnss=None, gnss_heard=None)
+        return carry, [Reset(record.t_ns, record.rx_ns, "air data", why)]
+    out = Reset(record.t_ns, record.rx_ns, "navigator", why)
     return initial(settings)._replace(next_ns=carry.next_ns), [out]
 
 
@@ -97,15 +104,15 @@ def _local_position(carry: Carry, record: LocalPosition, settings: Settings) -> 
     carry = carry._replace(local=record)
     if origin is None:
         return carry._replace(waiting_ns=carry.waiting_ns or record.t_ns), out
-    if before is not None:
-        if record.t_ns <= before.t_ns:
-            return carry._replace(local=before), out
-        jump = inertial.jump(before, record)
-        if jump is not None:
-            carry = _shifted(carry, jump[0], jump[1])
-            length = math.hypot(jump[0], jump[1])
-            out.append(Reset(record.t_ns, record.rx_ns, "inertial channel", f"it jumped by {length:.1f} m"))
-    carry = carry._replace(track=inertial.extend(carry.track, inertial.point(record, origin)))
+    if before is not None and record.t_ns <= before.t_ns:
+        return carry._replace(local=before), out
+    new = inertial.point(record, origin)
+    jump = inertial.jump(carry.track[-1], new) if carry.track else None
+    if jump is not None:
+        carry = _shifted(carry, jump[0], jump[1])
+        length = math.hypot(jump[0], jump[1])
+        out.append(Reset(record.t_ns, record.rx_ns, "inertial channel", f"it jumped by {length:.1f} m"))
+    carry = carry._replace(track=inertial.extend(carry.track, new))
     if record.t_ns >= carry.next_ns:
         carry, solution = solve(carry, record.rx_ns, settings)
         out += solution

@@ -224,3 +224,27 @@ def test_a_whole_flight_is_emitted_in_seconds():
         count += len(pilot.poll(due))
     assert time.process_time() - begun < 8.0
     assert count > 180_000
+
+
+def test_while_it_boots_it_hears_nothing():
+    pilot = autopilot(faults=(Fault("reboot", 60.0, size=8.0),))
+    listen(pilot, 61.0)
+    ask(pilot, "ATTITUDE", 10, START + 65 * SECOND)
+    assert pilot.rates_hz()["ATTITUDE"] == 1.0
+    assert min(due for due, _ in listen(pilot, 70.0)) >= START + 68 * SECOND
+
+
+@pytest.mark.parametrize("make", ["ardupilot", "px4"])
+def test_the_origin_moves_and_the_aircraft_does_not(make):
+    pilot = autopilot(autopilot=make, faults=(Fault("origin-change", 60.0, 90.0, 1000.0),))
+    heard = by_name(listen(pilot, 120.0))
+    north_east = [(m.x, m.y) for _, m in heard["LOCAL_POSITION_NED"]]
+    steps = np.diff(north_east, axis=0) - [(m.vx, m.vy) for _, m in heard["LOCAL_POSITION_NED"]][1:]
+    leaps = {k: step for k, step in enumerate(steps) if np.hypot(*step) > 500.0}
+    assert list(leaps.values()) == [
+        pytest.approx(sign * np.sqrt(0.5) * np.array([1000.0, 1000.0]), abs=15.0) for sign in (-1, 1)
+    ]
+    places = {(m.latitude, m.longitude) for _, m in heard["GPS_GLOBAL_ORIGIN"]}
+    assert len(places) == 2
+    smooth = np.diff([(m.lat, m.lon) for _, m in heard["GLOBAL_POSITION_INT"]], axis=0) * 1e-7 * 111e3
+    assert np.abs(smooth).max() < 100.0
