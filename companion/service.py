@@ -1,7 +1,8 @@
 """The asyncio shell: links, timers, signals and the log round an `Onboard`. `companion run`.
 
 Everything that decides is below; here bytes are carried, the clock is read and the deadline slept for. A link
-that breaks is opened again for ever, a disk that refuses is reported, and neither stops navigation.
+that breaks is opened again for ever, a disk that refuses is reported, and neither stops navigation: whatever
+waits for a disk does so in a thread of its own.
 
 systemd is told "ready" when the log is begun and a link is open, and "alive" each time that bytes or a
 deadline went through the navigator to the end and nothing is overdue, nowhere else: a navigator that hangs
@@ -16,15 +17,18 @@ import os
 import random
 import signal
 import sys
+import threading
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Self
 
 import click
 
 from companion import __version__
-from companion.config import Config, ConfigError, load
+from companion.config import Config, ConfigError, Log, load
+from companion.kept import Kept
 from companion.link.signing import Signing, read_key, store, stored
 from companion.link.transport import Address, CannotListen, Stream, connections
 from companion.log.file import Writer
@@ -37,6 +41,10 @@ from companion.systemd import Manager
 
 EX_UNAVAILABLE, EX_CANTCREAT = 69, 73  # sysexits.h
 LOG_CHECK_S = 1.0
+KEEP_EVERY_S = 1.0
+STOP_S = 5.0  # a disk is waited for at the end
+#: A system clock before 2024 was never set: boards without a battery begin in 1970.
+SET_AFTER_NS = 1_704_067_200_000_000_000
 OVERDUE_NS = 2_000_000_000
 #: Bytes read at one go: noise made to be slow to read (0.3 MB/s) then holds nobody up for more than 0.05 s.
 AT_ONCE = 1 << 14
@@ -47,7 +55,7 @@ class Keys:
 
     def __init__(self, signing: Signing, stamp: Path) -> None:
         self.signing, self._stamp = signing, stamp
-        signing.follow(time.time_ns(), time.monotonic_ns())
+        self.follow()
 
     @classmethod
     def of(cls, config: Config) -> Self | None:
@@ -67,21 +75,16 @@ class Keys:
             raise ConfigError(f"signing.key_file: {error}") from None
         return cls(signing, stamp)
 
-    async def store(self) -> None:
+    def follow(self) -> None:
+        """Take the system's time, which may be set at any moment; one that was never set is none."""
+        if (unix_ns := time.time_ns()) >= SET_AFTER_NS:
+            self.signing.follow(unix_ns, time.monotonic_ns())
+
+    def store(self) -> None:
         """Keep the timestamp; a disk that refuses costs signed links a minute after the next start."""
         if self.signing.wants_storing:
             with contextlib.suppress(OSError):
-                await asyncio.to_thread(store, self._stamp, self.signing.to_store())
-
-
-def keep(config: Config) -> Callable[[str], None]:
-    """What keeps the parameters that ground stations set; nothing without a file for them."""
-
-    def save(text: str) -> None:
-        if config.link.parameters_file:
-            Path(config.link.parameters_file).write_text(text, encoding="utf-8")
-
-    return save
+                store(self._stamp, self.signing.to_store())
 
 
 class Service:
@@ -99,7 +102,8 @@ class Service:
         self._addresses = {text: Address.parse(text) for text in config.link.connect}
         self._keys = Keys.of(config)
         signing = self._keys.signing if self._keys else None
-        self.onboard = Onboard(config, log, self._addresses, signing, keep(config))
+        self._kept = Kept(Path(name) if (name := config.link.parameters_file) else None)
+        self.onboard = Onboard(config, log, self._addresses, signing, self._kept.put)
         self._log, self._tell, self._now = log, tell, now
         self._streams: dict[str, Stream] = {}
         self._stopped = asyncio.Event()
@@ -114,7 +118,7 @@ class Service:
         try:
             async with asyncio.TaskGroup() as tasks:
                 carrying = [tasks.create_task(self._carry(name)) for name in self._addresses]
-                carrying.append(tasks.create_task(self._keep_time()))
+                carrying += [tasks.create_task(self._keep_time()), tasks.create_task(self._keep())]
                 await self._stopped.wait()
                 self._manager.stopping()
                 for task in carrying:
@@ -124,7 +128,7 @@ class Service:
 
     async def _carry(self, name: str) -> None:
         """One link, opened again for ever."""
-        async for stream in connections(self._addresses[name], random.random, self._say):
+        async for stream in connections(self._addresses[name], random.random, self.say):
             self._streams[name] = stream
             self._manager.ready()
             try:
@@ -135,7 +139,7 @@ class Service:
                         self._flush()
                         await asyncio.sleep(0)
             except ConnectionError as error:
-                self._say(f"{name}: {error}; opening it again")
+                self.say(f"{name}: {error}; opening it again")
             del self._streams[name]
 
     async def _keep_time(self) -> None:
@@ -148,9 +152,20 @@ class Service:
                 text = f"log: {self._trouble}; navigation goes on" if self._trouble else "log: writing again"
                 self.onboard.note(4 if self._trouble else 6, text, now)
             self._flush()
-            if self._keys is not None:
-                await self._keys.store()
             await asyncio.sleep(max(0.0, min(1e-9 * (self.onboard.deadline() - self._now()), LOG_CHECK_S)))
+
+    async def _keep(self) -> None:
+        """What must outlive a restart. Only this waits for its disk."""
+        told: str | None = None
+        while True:
+            await asyncio.sleep(KEEP_EVERY_S)
+            if self._keys is not None:
+                self._keys.follow()
+                await asyncio.to_thread(self._keys.store)
+            trouble = await asyncio.to_thread(self._kept.write)
+            if trouble is not None and trouble != told:
+                self.onboard.note(4, f"parameters: {trouble}; none can be set until it is", self._now())
+            told = trouble
 
     def _flush(self) -> None:
         now = self._now()
@@ -166,7 +181,14 @@ class Service:
         if now - self.onboard.deadline() < OVERDUE_NS:
             self._manager.alive(now)
 
-    def _say(self, text: str) -> None:
+    def keep(self) -> None:
+        """Put on disk what must outlive a restart; waits for the disk."""
+        if self._keys is not None:
+            self._keys.store()
+        self._kept.write()
+
+    def say(self, text: str) -> None:
+        """Log and tell what happened to links and files."""
         self.onboard.note(5, text, self._now())
 
 
@@ -174,8 +196,6 @@ async def run(config: Config, tell: Callable[[Event], None]) -> None:
     """Open the log, serve until SIGINT or SIGTERM, close the log."""
     start_ns, start_unix_ns = time.monotonic_ns(), time.time_ns()
     settings = config.log
-    for found in recover_left(settings.folder):
-        tell(Event(start_ns, start_ns, 5, f"log: {found.path} recovered, {found.messages} messages"))
     log = open_log(
         settings.folder,
         metadata=metadata(config),
@@ -191,11 +211,24 @@ async def run(config: Config, tell: Callable[[Event], None]) -> None:
         for number in (signal.SIGINT, signal.SIGTERM):
             loop.add_signal_handler(number, service.stop)
         service.onboard.note(6, f"companion {__version__}: log {log.path}", time.monotonic_ns())
+        recovering = partial(_recover, settings, service, asyncio.get_running_loop())
+        threading.Thread(target=recovering, name="recover", daemon=True).start()
         await service.serve()
+        with contextlib.suppress(TimeoutError):
+            await asyncio.wait_for(asyncio.to_thread(service.keep), STOP_S)
     finally:
         await asyncio.to_thread(log.close)
         text = f"log: closed as {log.path}" if log.trouble is None else f"log: left torn, {log.trouble}"
         tell(Event(time.monotonic_ns(), time.monotonic_ns(), 6, text))
+
+
+def _recover(settings: Log, service: Service, loop: asyncio.AbstractEventLoop) -> None:
+    """Make whole what earlier runs left torn, which takes seconds for each hour of them: navigation is not to
+    wait for it, nor the end of the service (what is begun twice is begun anew)."""
+    for found in recover_left(settings.folder, settings.minimum_free_mib << 20):
+        text = f"log: {found.path} recovered, {found.messages} messages"
+        with contextlib.suppress(RuntimeError):  # the loop has ended
+            loop.call_soon_threadsafe(service.say, text)
 
 
 @click.command("run")
@@ -218,7 +251,8 @@ def command(file: Path | None, connect: tuple[str, ...], logs: str | None, pairs
     begun = time.monotonic_ns()
 
     def tell(event: Event) -> None:
-        click.echo(f"{(event.rx_ns - begun) * 1e-9:9.3f} {event.text}", err=True)
+        with contextlib.suppress(OSError):  # nobody reads it any more: no reason not to navigate
+            click.echo(f"{(event.rx_ns - begun) * 1e-9:9.3f} {event.text}", err=True)
 
     try:
         for text in config.link.connect:

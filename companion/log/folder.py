@@ -36,7 +36,8 @@ def open_log(
     """Begin a log in `folder`, named by its start in UTC (20260131T235959Z.mcap).
 
     At most `max_files` logs of ours are kept, this one included, and of the disk `min_free` bytes are left
-    free: the oldest logs go first. Raises LogError where the folder cannot be made or written to.
+    free: the oldest logs go first, now and while this one is written. Raises LogError where the folder cannot
+    be made or written to.
     """
     folder = Path(folder)
     try:
@@ -53,19 +54,20 @@ def open_log(
         fsync_s=fsync_s,
         depth=depth,
         block=block,
-        disk=partial(DiskFile, reserve=min_free),
+        disk=partial(DiskFile, reserve=min_free, relieve=partial(make_room, folder, max_files - 1)),
     )
 
 
-def recover_left(folder: str | os.PathLike[str]) -> list[Recovered]:
+def recover_left(folder: str | os.PathLike[str], min_free: int = 0) -> list[Recovered]:
     """Make whole every log in `folder` that was left ".active" and that no process is writing any more.
 
-    One that holds nothing to read is left as it is.
+    One that holds nothing to read is left as it is, and so is one whose copy would not leave `min_free` bytes
+    of the disk.
     """
-    saved = []
+    saved: list[Recovered] = []
     for path in sorted(Path(folder).glob(f"*.mcap{ACTIVE}")):
         try:
-            saved.append(recover(path))
+            saved.append(recover(path, min_free))
         except LogError:  # being written, or nothing in it, or no room: it waits for the next start
             continue
     return saved

@@ -145,13 +145,13 @@ class Channels:
         return container.Channel(topic, encoding, name)
 
 
-def recover(path: str | os.PathLike[str]) -> Recovered:
+def recover(path: str | os.PathLike[str], reserve: int = 0) -> Recovered:
     """Make a torn or damaged log whole: every whole chunk, and the whole messages of one torn off.
 
     `x.mcap.active` becomes `x.mcap`; of a torn `x.mcap` a copy `x.recovered.mcap` is made. The torn log
     itself goes only after its copy is safely on the disk, and only if it is ".active". A whole log is left
     as it is. Raises LogError where there is nothing to read, where a process still writes it, or where there
-    is no room for the copy.
+    is no room for the copy beside `reserve` bytes to be left free.
     """
     with opened(path) as source:
         try:
@@ -169,12 +169,13 @@ def recover(path: str | os.PathLike[str]) -> Recovered:
         part = target.with_name(target.name + ".part")
         try:
             part.unlink(missing_ok=True)
-            disk = DiskFile(part)
+            disk = DiskFile(part, reserve)
             try:
                 saved = _copy(source, Store(disk, "companion recover"))
+                os.replace(part, target)
             finally:
                 disk.close()
-            os.replace(part, target)
+                part.unlink(missing_ok=True)  # half a copy only takes the room that a flight needs
             sync_folder(target.parent)
             if source.path.suffix == ACTIVE:
                 source.path.unlink()

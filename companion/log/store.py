@@ -13,7 +13,7 @@ import os
 import struct
 import zlib
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Protocol
 
@@ -57,23 +57,36 @@ class Disk(Protocol):
 
 
 class DiskFile:
-    """A file that is written once from front to back; `reserve` bytes of its disk are left to others."""
+    """A file that is written once from front to back; `reserve` bytes of its disk are left to others.
 
-    def __init__(self, path: str | os.PathLike[str], reserve: int = 0) -> None:
+    `relieve` is called where the room is gone, with the bytes that must be free, and may make some.
+    """
+
+    def __init__(
+        self,
+        path: str | os.PathLike[str],
+        reserve: int = 0,
+        relieve: Callable[[int], object] = lambda wanted: None,
+    ) -> None:
         self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o644)
         fcntl.flock(self._fd, fcntl.LOCK_EX)  # tells a log being written from one left behind
         sync_folder(Path(path).parent)
-        self._reserve = reserve
+        self._reserve, self._relieve = reserve, relieve
 
     def write(self, data: bytes) -> None:
         """See `Disk`; refuses where it would eat into the reserve."""
-        if self._reserve:
-            room = os.fstatvfs(self._fd)
-            if room.f_bavail * room.f_frsize < self._reserve + len(data):
+        wanted = self._reserve + len(data)
+        if self._free() < wanted:
+            self._relieve(wanted)
+            if self._reserve and self._free() < wanted:
                 raise OSError(errno.ENOSPC, f"less than {self._reserve} bytes would be left on the disk")
         view = memoryview(data)
         while view:
             view = view[os.write(self._fd, view) :]
+
+    def _free(self) -> int:
+        room = os.fstatvfs(self._fd)
+        return room.f_bavail * room.f_frsize
 
     def sync(self) -> None:
         """See `Disk`."""
