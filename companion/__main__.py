@@ -63,7 +63,7 @@ cli = Lazy(
     help="Keeps an aircraft's position, and a guaranteed bound on it, when GNSS is gone.",
 )
 cli = click.version_option(__version__, prog_name="companion")(cli)
-cli.add_command(Lazy(STUDIES, name="study", help="Numbers and plots behind the estimators."))
+cli.add_command(Lazy(STUDIES, "companion.studies", name="study", help="Numbers behind the estimators."))
 
 
 def main() -> None:

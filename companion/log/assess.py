@@ -19,7 +19,7 @@ from companion.log import happenings, score
 from companion.log.gather import Flight, Floats, Table, Told
 from companion.log.happenings import Group, Outage, Rate, is_radio, usable_gnss
 from companion.log.replay import CONFIGURATION
-from companion.log.smooth import smooth_flight
+from companion.log.smooth import joined, smooth_flight
 from companion.nav.earth import radii
 
 REACH_S = 2.0  # a reference is not carried across a longer hole
@@ -135,14 +135,13 @@ def _reference(flight: Flight) -> Reference | None:
     if len(truth["t"]) > 1:
         return _ordered(TRUTH, truth["t"], truth["lat"], truth["lon"])
     try:
-        track = smooth_flight(flight.heard, configuration(flight))
+        runs = smooth_flight(flight.heard, configuration(flight))
     except ValueError:
         if len(gnss["t"]) > 1:
             return _ordered(GNSS, gnss["t"], gnss["lat"], gnss["lon"])
         return None
-    return _ordered(
-        SMOOTHED, 1e-9 * np.asarray(track.t_ns - flight.zero_ns, dtype=float), track.lat, track.lon
-    )
+    t_ns, lat, lon, _ = joined(runs)
+    return _ordered(SMOOTHED, 1e-9 * (t_ns - flight.zero_ns), lat, lon)
 
 
 def configuration(flight: Flight) -> Config:

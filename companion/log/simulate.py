@@ -25,7 +25,7 @@ import numpy.typing as npt
 
 from companion.config import Config
 from companion.log.opened import LogError
-from companion.log.smooth import smooth_flight
+from companion.log.smooth import joined, smooth_flight
 from companion.nav.earth import E2, A
 from companion.nav.geometry import enu_axes, radio_horizon
 from companion.navigator import FOLDED
@@ -184,12 +184,10 @@ def track_of(records: Iterable[Stamped], config: Config) -> Track:
             np.array(t, dtype=np.int64), np.array(lat), np.array(lon), np.array(alt), "the log's truth"
         )
     try:
-        flight = smooth_flight(folded, config)
+        runs = smooth_flight(folded, config)
     except ValueError as error:
         raise LogError(f"there is no track to hear beacons along: {error}") from None
-    return Track(
-        flight.t_ns, flight.lat, flight.lon, flight.alt_msl, "the log's own smoothed track, not a truth"
-    )
+    return Track(*joined(runs), "the log's own smoothed track, not a truth")
 
 
 def answers(beacons: Sequence[Beacon], track: Track, seed: int = 0) -> list[RsbnFix]:

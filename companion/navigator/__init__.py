@@ -39,7 +39,7 @@ from .carry import FIXES, Carry, Settings, Step, initial, is_news
 from .solution import announce, solve
 from .step import learn, step, uses
 
-__all__ = ["Navigator"]
+__all__ = ["FOLDED", "Navigator", "learnt", "stepped", "tuned"]
 
 FOLDED = (
     LocalPosition,
@@ -51,6 +51,7 @@ FOLDED = (
     Gnss,
     RsbnFix,
     Reboot,
+    Tuning,
 )
 
 
@@ -99,41 +100,19 @@ class Navigator:
     def _learnt(self) -> tuple[Input | None, list[Output]]:
         """The lesson left over by the record before is learnt: whose it was, and what follows."""
         lesson = self._carry.lesson
-        if lesson is None:
-            return None, []
-        self._carry = self._carry._replace(lesson=None)
-        return lesson.record, self._guarded(lesson.record, learn, lesson)
+        self._carry, outputs = learnt(self._carry, self._settings)
+        return lesson and lesson.record, outputs
 
     def _stepped(self, record: Input) -> list[Output]:
-        """One step; a state gone wrong by it is begun anew."""
-        before = self._carry.state
-        outputs = self._guarded(record, step, record)
-        if self._carry.state is not before and not errorstate.is_sound(self._carry.state):
-            self._carry = self._carry._replace(state=None)
-            why = "its covariance was none any more"
-            outputs = [*outputs, Reset(record.t_ns, record.rx_ns, "error state", why)]
-        return outputs
-
-    def _guarded(self, record: Input, follow: Callable[[Carry, Any, Settings], Step], x: Any) -> list[Output]:
-        """What follows from x; what cannot be computed with is refused aloud and changes nothing."""
-        try:
-            self._carry, outputs = follow(self._carry, x, self._settings)
-        except (ArithmeticError, ValueError) as error:  # a singular matrix is a ValueError too
-            why = f"it cannot be computed with: {error}"
-            return [Rejection(record.t_ns, record.rx_ns, type(record).__name__, why)]
+        self._carry, outputs = stepped(self._carry, record, self._settings)
         return outputs
 
     def _tune(self, config: Config) -> None:
-        """Go on with another configuration; late measurements are no longer folded in from before it.
-
-        Where it means another inertial channel, all that was learnt was of the old one's error.
-        """
-        before, self._settings = self._settings.config.channel, Settings.of(config)
+        """Go on with another configuration; late measurements are no longer folded in from before it."""
+        before = self._settings.config.channel
+        self._settings, self._carry = tuned(self._carry, self._settings, config)
         self._late_ns = round(1e9 * config.estimator.late_s)
-        promise = guarantee.tuned(self._carry.guarantee, config)
-        self._carry = self._carry._replace(guarantee=promise)
-        if config.channel != before:
-            self._carry, self._chosen = initial(self._settings)._replace(next_ns=self._carry.next_ns), False
+        self._chosen = self._chosen and config.channel == before
         self._past.clear()
 
     def _handle_late(self, record: Input) -> list[Output]:
@@ -178,6 +157,46 @@ class Navigator:
                     self._rests_on = rests_on
                     announced.append(announce(output))
         return announced
+
+
+def stepped(carry: Carry, record: Input, settings: Settings) -> Step:
+    """One step, guarded; a state gone wrong by it is begun anew."""
+    after, outputs = _guarded(carry, record, settings, step, record)
+    if after.state is not carry.state and not errorstate.is_sound(after.state):
+        why = "its covariance was none any more"
+        outputs = [*outputs, Reset(record.t_ns, record.rx_ns, "error state", why)]
+        return after._replace(state=None), outputs
+    return after, outputs
+
+
+def learnt(carry: Carry, settings: Settings) -> Step:
+    """The lesson left over by the record before, if there is one, is learnt, guarded."""
+    lesson = carry.lesson
+    if lesson is None:
+        return carry, []
+    return _guarded(carry._replace(lesson=None), lesson.record, settings, learn, lesson)
+
+
+def tuned(carry: Carry, before: Settings, config: Config) -> tuple[Settings, Carry]:
+    """The settings of another configuration, and the carry to go on with under them.
+
+    Where it means another inertial channel, all that was learnt was of the old one's error.
+    """
+    settings = Settings.of(config)
+    if config.channel != before.config.channel:
+        return settings, initial(settings)._replace(next_ns=carry.next_ns)
+    return settings, carry._replace(guarantee=guarantee.tuned(carry.guarantee, config))
+
+
+def _guarded(
+    carry: Carry, record: Input, settings: Settings, follow: Callable[[Carry, Any, Settings], Step], x: Any
+) -> Step:
+    """What follows from x; what cannot be computed with is refused aloud and changes nothing."""
+    try:
+        return follow(carry, x, settings)
+    except (ArithmeticError, ValueError) as error:  # a singular matrix is a ValueError too
+        why = f"it cannot be computed with: {error}"
+        return carry, [Rejection(record.t_ns, record.rx_ns, type(record).__name__, why)]
 
 
 def _choice(record: Input, config: Config) -> Event:

@@ -1,0 +1,72 @@
+"""Smoothing on flights of the simulator: nearer to the truth on both channels, and honest about how near."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from companion.config import Config, Inertial, to_toml
+from companion.log import smooth
+from companion.records import AirData, Tuning
+from sitl import smoothing
+from sitl.scenarios import Scenario, named
+from sitl.world import World
+
+AIR = Config(inertial=Inertial(source="air_data"))
+NS = 1_000_000_000
+
+
+def heard(scenario: Scenario) -> list:
+    return list(smoothing.records(World(scenario)))
+
+
+@pytest.mark.parametrize(
+    ("name", "channel", "ratio"),
+    [("ten-outages", "local_position", 0.9), ("ten-outages", "air_data", 0.5), ("default", "air_data", 0.6)],
+)
+def test_the_smoothed_track_is_nearer_and_honest(name: str, channel: str, ratio: float) -> None:
+    found = smoothing.compare(named(name), channel)
+    assert math.sqrt(found.smoothed / found.filtered) < ratio
+    assert found.misfit_smoothed / found.stops < 1.5
+
+
+def test_flights_are_pooled_where_gnss_never_fails_long() -> None:
+    parts = [smoothing.compare(named("short", seed=seed), "local_position") for seed in range(1, 7)]
+    found = smoothing.pooled(parts)
+    assert found.stops == sum(part.stops for part in parts)
+    assert found.better
+    assert found.misfit_smoothed / found.stops < 1.5
+
+
+def test_what_a_silent_channel_loses_is_noise_of_the_smoother_too() -> None:
+    """Where no fix came, P is Phi P Phi' + Q from stop to stop, also across a silence of the airspeed."""
+    records = heard(named("short"))
+    lull = [r for r in records if not (isinstance(r, AirData) and 240 * NS < r.t_ns < 244 * NS)]
+    stops = smooth._forward(lull, AIR)
+    free = [(a, b) for a, b in itertools.pairwise(stops) if not b.fixed]
+    for before, stop in free:
+        np.testing.assert_allclose(stop.Phi @ before.state.P @ stop.Phi.T + stop.Q, stop.state.P, rtol=1e-6)
+    assert len(free) > 50
+    lost = max(np.trace(stop.Q[:2, :2]) for _, stop in free)
+    assert lost > 2 * (15.0 * 3.0) ** 2  # by 15 m/s for more than 3 s
+
+
+def test_a_channel_chosen_in_flight_parts_it_and_another_sigma_does_not() -> None:
+    records, at = heard(named("short")), 100 * NS
+    (one,) = smooth.smooth_flight([*records, Tuning(at, at, to_toml(Config()))], Config())
+    (same,) = smooth.smooth_flight(records, Config())
+    np.testing.assert_array_equal(one.x, same.x)
+    first, second = smooth.smooth_flight([*records, Tuning(at, at, to_toml(AIR))], Config())
+    assert (first.x.shape[1], second.x.shape[1]) == (14, 8)
+    assert first.t_ns[-1] <= at < second.t_ns[0] < at + 2 * NS
+
+
+def test_the_command_prints_a_line_for_each_case() -> None:
+    found = CliRunner().invoke(smoothing.command, ["--scenario", "short"])
+    assert found.exit_code == 0
+    assert found.output.count("1 of 1") == 2
+    assert CliRunner().invoke(smoothing.command, ["--scenario", "shrot"]).exit_code == 2
