@@ -69,6 +69,7 @@ CONE_OF_SILENCE = math.radians(60.0)
 zenith the linearised azimuth claims an accuracy that it does not have."""
 
 _OBSERVABLE = 1e-12  # least ratio of the information's eigenvalues: standard deviations a million times apart
+_CLEARLY = 1e-9  # and where their product over that of the trace is more, no eigenvalue is needed
 _DAMPING = 1e-14  # least mu, in traces of F: keeps a step finite along a direction that nothing measures
 _STEPS = 100
 _CONVERGED = 1e-8  # a step this long, in standard deviations, is the last
@@ -267,30 +268,68 @@ def _descend(model: Model, p: Point) -> _Minimum:
 
 
 def _step(at: Linearised, mu: float) -> tuple[Point, float]:
-    """Levenberg's step (F + mu trace(F) I)^-1 J^T r and its length in standard deviations; F = L D L^T.
+    """Levenberg's step (F + mu trace(F) I)^-1 J^T r and its length in standard deviations.
 
-    In the plane nothing measures z, and the step has none. No pivot is less than what mu adds.
+    In the plane nothing measures z, and the step has none.
     """
-    xx = xy = xz = yy = yz = zz = u = v = w = 0.0
-    for r, a, b, c in at.rows:
-        xx, xy, xz = xx + a * a, xy + a * b, xz + a * c
-        yy, yz, zz = yy + b * b, yz + b * c, zz + c * c
-        u, v, w = u + a * r, v + b * r, w + c * r
-    least = mu * (xx + yy + zz)
+    F = _information(at)
+    least = mu * (F.xx + F.yy + F.zz)
     if least == 0.0:
         return (0.0, 0.0, 0.0), 0.0
-    d1 = xx + least
-    l21, l31 = xy / d1, xz / d1
-    d2 = max(yy + least - l21 * xy, least)
-    below = yz - l21 * xz
-    l32 = below / d2
-    d3 = max(zz + least - l31 * xz - l32 * below, least)
-    q2 = v - l21 * u
-    q3 = (w - l31 * u - l32 * q2) / d3
-    z = q3
-    y = q2 / d2 - l32 * z
-    x = u / d1 - l21 * y - l31 * z
+    u = v = w = 0.0
+    for r, a, b, c in at.rows:
+        u, v, w = u + a * r, v + b * r, w + c * r
+    x, y, z = _solve(_factors(F, least), u, v, w)
     return (x, y, z), math.sqrt(max(x * u + y * v + z * w, 0.0))
+
+
+class _Information(NamedTuple):
+    """F = J^T J."""
+
+    xx: float
+    xy: float
+    xz: float
+    yy: float
+    yz: float
+    zz: float
+
+
+class _Factors(NamedTuple):
+    """F = L D L^T, the diagonal of L being ones."""
+
+    dx: float
+    dy: float
+    dz: float
+    yx: float
+    zx: float
+    zy: float
+
+
+def _information(at: Linearised) -> _Information:
+    xx = xy = xz = yy = yz = zz = 0.0
+    for _, a, b, c in at.rows:
+        xx, xy, xz = xx + a * a, xy + a * b, xz + a * c
+        yy, yz, zz = yy + b * b, yz + b * c, zz + c * c
+    return _Information(xx, xy, xz, yy, yz, zz)
+
+
+def _factors(F: _Information, least: float) -> _Factors:
+    """Of F + `least` I, which no pivot can fall below."""
+    dx = F.xx + least
+    yx, zx = F.xy / dx, F.xz / dx
+    dy = max(F.yy + least - yx * F.xy, least)
+    below = F.yz - yx * F.xz
+    zy = below / dy
+    dz = max(F.zz + least - zx * F.xz - zy * below, least)
+    return _Factors(dx, dy, dz, yx, zx, zy)
+
+
+def _solve(f: _Factors, u: float, v: float, w: float) -> Point:
+    v -= f.yx * u
+    w -= f.zx * u + f.zy * v
+    z = w / f.dz
+    y = v / f.dy - f.zy * z
+    return u / f.dx - f.yx * y - f.zx * z, y, z
 
 
 def _likeliest(model: Model) -> _Minimum:
@@ -331,6 +370,14 @@ def _apart(p: Point, m: _Minimum) -> bool:
 
 def _invert(model: Model, at: Linearised) -> Array:
     """Covariance F^-1; Unobservable where an eigenvalue of F vanishes against the largest."""
+    F = _information(at)
+    if model.n == 2:
+        F = F._replace(zz=max(F.xx, F.yy))
+    trace = F.xx + F.yy + F.zz
+    f = _factors(F, _DAMPING**2 * trace) if trace > 0.0 else None
+    if f is not None and f.dx * f.dy * f.dz > _CLEARLY * trace**3:  # so is every eigenvalue above the trace
+        columns = _solve(f, 1.0, 0.0, 0.0), _solve(f, 0.0, 1.0, 0.0), _solve(f, 0.0, 0.0, 1.0)
+        return np.array(columns)[: model.n, : model.n]
     eigenvalues, V = np.linalg.eigh(at.J.T @ at.J)
     blind = eigenvalues <= _OBSERVABLE * eigenvalues[-1]
     if blind.any():

@@ -279,20 +279,36 @@ def _whitened(i: int, z: Position) -> list[Row]:
             f"{_name(i, z)}: value has shape {value.shape} and covariance {C.shape};"
             " they must be (2,) and (2, 2), or (3,) and (3, 3)"
         )
-    if not math.isfinite(value.sum()):
+    x, rows = value.tolist(), C.tolist()
+    if not all(map(math.isfinite, x)):
         raise ValueError(f"{_name(i, z)}: value {value} is not finite; leave it out")
-    if not math.isfinite(C.sum()) or np.abs(C - C.T).max() > 1e-9 * abs(C).max():
-        raise ValueError(f"{_name(i, z)}: covariance must be finite and symmetric, it is {C.tolist()}")
-    try:
-        W = np.linalg.inv(np.linalg.cholesky(C))
-    except np.linalg.LinAlgError:
+    scale = max([abs(c) for row in rows for c in row])
+    off = max([abs(rows[j][k] - rows[k][j]) for k in range(len(x)) for j in range(k)])
+    if not (math.isfinite(scale) and off <= 1e-9 * scale):
+        raise ValueError(f"{_name(i, z)}: covariance must be finite and symmetric, it is {rows}")
+    W = _whitener(rows)
+    if W is None:
         raise ValueError(
             f"{_name(i, z)}: covariance is not positive definite (eigenvalues"
             f" {np.linalg.eigvalsh(C).tolist()}); give every axis a positive variance"
-        ) from None
+        )
     return [
-        (w, a, b, c[0] if c else 0.0) for w, (a, b, *c) in zip((W @ value).tolist(), W.tolist(), strict=True)
+        (sum([a * b for a, b in zip(w, x, strict=True)]), w[0], w[1], w[2] if len(x) == 3 else 0.0) for w in W
     ]
+
+
+def _whitener(C: list[list[float]]) -> list[list[float]] | None:
+    """W with W C W^T = I, the unit vectors made orthonormal under C one after the other; None if it cannot be
+    done."""
+    W: list[list[float]] = []
+    for i, column in enumerate(C):
+        along = [sum([a * b for a, b in zip(w, column, strict=True)]) for w in W]
+        rest = column[i] - sum([c * c for c in along])
+        if not rest > 0.0:
+            return None
+        e = [float(k == i) - sum([c * w[k] for c, w in zip(along, W, strict=True)]) for k in range(len(C))]
+        W.append([c / math.sqrt(rest) for c in e])
+    return W
 
 
 def _sight(i: int, z: Azimuth | Range, n: int) -> Sight:
@@ -312,11 +328,21 @@ def _sight(i: int, z: Azimuth | Range, n: int) -> Sight:
     axes = None
     if z.axes is not None:
         C = np.asarray(z.axes, dtype=float)
-        # not (... <= ...) so that a NaN is refused too
-        if n != 3 or C.shape != (3, 3) or not np.abs(C @ C.T - np.eye(3)).max() <= 1e-6:
+        if n != 3 or C.shape != (3, 3) or not _orthonormal(C.tolist()):
             raise ValueError(
                 f"{_name(i, z)}: axes must be a (3, 3) rotation, and the problem of three dimensions"
             )
         e, nn, u = C.tolist()
         axes = (tuple(e), tuple(nn), tuple(u))
     return _Bearing(beacon, float(z.value), float(z.sigma), axes)
+
+
+def _orthonormal(C: list[list[float]]) -> bool:
+    """Whether the rows are unit vectors at right angles; NaN are not."""
+    return all(
+        [
+            abs(sum([a * b for a, b in zip(C[i], C[j], strict=True)]) - (i == j)) <= 1e-6
+            for i in range(3)
+            for j in range(i + 1)
+        ]
+    )

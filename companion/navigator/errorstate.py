@@ -15,6 +15,7 @@ the position error comes first, the drift of GNSS last, and `velocity_rows` tell
 from __future__ import annotations
 
 import math
+from functools import cache
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -114,13 +115,19 @@ def grade(settings: Inertial, gnss: GnssSection) -> Grade:
 
 def beacon_rows(unit: ErrorModel) -> Floats:
     """What a beacon's fix says of the state: INS minus fix, north and east, is H x; H (2, n)."""
-    return np.eye(2, len(unit.sigma0))
+    return _rows(len(unit.sigma0), False)
 
 
 def gnss_rows(unit: ErrorModel) -> Floats:
     """What a fix of GNSS says of the state, its drift being the last two; H (2, n)."""
-    n = len(unit.sigma0)
-    return np.eye(2, n) - np.eye(2, n, n - 2)
+    return _rows(len(unit.sigma0), True)
+
+
+@cache
+def _rows(n: int, drifting: bool) -> Floats:
+    H = np.eye(2, n) - drifting * np.eye(2, n, n - 2)
+    H.setflags(write=False)
+    return H
 
 
 def start(t_ns: int, unit: ErrorModel) -> ErrorState:
@@ -160,7 +167,7 @@ def absorb_position(state: ErrorState, H: Floats, mean: Floats, covariance: Floa
     """
     HP = H @ state.P
     S = HP @ H.T
-    K = np.linalg.solve(S, HP).T
+    K = _over(HP, S)
     x = state.x + K @ (mean - H @ state.x)
     P = state.P - K @ (S - covariance) @ K.T
     return ErrorState(state.t_ns, x, 0.5 * (P + P.T))
@@ -175,10 +182,17 @@ def absorb_velocity(
     HP = H @ state.P
     S = HP @ H.T + sigma**2 * np.eye(2)
     nu = velocity_error - H @ state.x
-    K = np.linalg.solve(S, HP).T
+    K = _over(HP, S)
     J = np.eye(len(state.x)) - K @ H
     P = J @ state.P @ J.T + sigma**2 * K @ K.T
-    return ErrorState(state.t_ns, state.x + K @ nu, 0.5 * (P + P.T)), float(nu @ np.linalg.solve(S, nu))
+    return ErrorState(state.t_ns, state.x + K @ nu, 0.5 * (P + P.T)), float(nu @ _over(nu, S))
+
+
+def _over(X: Floats, S: Floats) -> Floats:
+    """X' S^-1, X (2,) or (2, n), S (2, 2) symmetric; ZeroDivisionError where it is singular."""
+    (a, b), (_, d) = S.tolist()
+    part = 1.0 / (a * d - b * b)
+    return X.T @ np.array(((d * part, -b * part), (-b * part, a * part)))  # type: ignore[no-any-return]
 
 
 def is_sound(state: ErrorState | None) -> bool:

@@ -8,6 +8,7 @@ find there is minus the INS error.
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -43,21 +44,27 @@ def from_gnss(record: Gnss, ins: Point, settings: GnssSection, drifting: bool = 
 
 def from_rsbn(record: RsbnFix, ins: Point, settings: Rsbn) -> Heard:
     """A beacon's azimuth and slant range, whichever are there, with the floors of the configuration."""
-    here, beacon = ins.position, Geodetic(record.lat, record.lon, record.alt)
+    here = ins.position
+    r_beacon, axes_beacon = _on_earth(record.lat, record.lon, record.alt)
     axes = enu_axes(here.lat, here.lon)
-    place = axes @ (to_ecef(beacon) - to_ecef(here))
+    place = axes @ (r_beacon - to_ecef(here))
     observations: list[Observation] = []
     sources = Source(0)
     if record.azimuth is not None:
         sigma = max(record.sigma_azimuth, math.radians(settings.sigma_azimuth_deg))
-        turn = enu_axes(beacon.lat, beacon.lon) @ axes.T
-        observations.append(Azimuth(place, record.azimuth, sigma, turn))
+        observations.append(Azimuth(place, record.azimuth, sigma, axes_beacon @ axes.T))
         sources |= Source.AZIMUTH
     if record.slant_range is not None:
         floor = settings.sigma_range_m + 0.01 * settings.sigma_range_percent * record.slant_range
         observations.append(Range(place, record.slant_range, max(record.sigma_range, floor)))
         sources |= Source.RANGE
     return Heard(record.t_ns, tuple(observations), sources)
+
+
+@lru_cache(maxsize=64)
+def _on_earth(lat: float, lon: float, alt: float) -> tuple[Floats, Floats]:
+    """Of a beacon, which stays where it is: ECEF position (3,) and axes east, north, up (3, 3)."""
+    return to_ecef(Geodetic(lat, lon, alt)), enu_axes(lat, lon)
 
 
 def place(record: RsbnFix, alt: float) -> Geodetic | None:
