@@ -192,7 +192,7 @@ def _over(X: Floats, S: Floats) -> Floats:
     """X' S^-1, X (2,) or (2, n), S (2, 2) symmetric; ZeroDivisionError where it is singular."""
     (a, b), (_, d) = S.tolist()
     part = 1.0 / (a * d - b * b)
-    return X.T @ np.array(((d * part, -b * part), (-b * part, a * part)))  # type: ignore[no-any-return]
+    return X.T @ np.array(((d * part, -b * part), (-b * part, a * part)))
 
 
 def is_sound(state: ErrorState | None) -> bool:
