@@ -22,6 +22,7 @@ COMMANDS = {
     "replay": "companion.log.replay:command",
     "report": "companion.log.report:command",
     "log": "companion.log.command:group",
+    "doctor": "companion.doctor.command:command",
     "check-config": "companion.check:command",
     "bench": "companion.bench.command:command",
 }

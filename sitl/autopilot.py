@@ -42,6 +42,7 @@ from companion.records import (
 )
 from sitl.encode import Airframe, encode
 from sitl.faults import AUTOPILOT_FAULTS, LINK_FAULTS, Chunk, Fault, disturb
+from sitl.parameters import CAPABILITIES, VERSIONS, Parameters
 from sitl.scenarios import Scenario
 from sitl.world import World
 
@@ -80,6 +81,7 @@ class Autopilot:
         self.scenario = scenario
         self.world = world or World(scenario)
         self.outputs: list[tuple[int, Any]] = []
+        self.is_armed = True
         self.end_ns = start_ns + round(scenario.duration_s * 1e9)
         self._start_ns = start_ns
         self._rng = np.random.default_rng([scenario.seed, 1])
@@ -95,11 +97,14 @@ class Autopilot:
             "TIMESYNC": self._on_timesync,
             "COMMAND_LONG": self._on_command,
             "COMMAND_INT": self._on_command,
+            "PARAM_REQUEST_READ": self._on_parameter,
+            "PARAM_SET": self._on_parameter,
         }
         sensed = {**_SENSED, **_BY_MAKE[scenario.autopilot]}
         self._sensed = {_msgid(name): self.world.streams[kind] for name, kind in sensed.items()}
         self._rsbn = self.world.streams[RsbnFix]
         self._rsbn_next = 0
+        self.parameters = Parameters(scenario.autopilot)
         self._outbox: list[tuple[int, int, bytes]] = []  # due, order, frame
         self._order = 0
         self._released = 0
@@ -110,6 +115,7 @@ class Autopilot:
             _msgid("GLOBAL_POSITION_INT"): self._global_position,
             _msgid("GPS_GLOBAL_ORIGIN"): self._origin,
             _msgid("HOME_POSITION"): self._home,
+            _msgid("AUTOPILOT_VERSION"): self._version,
             _msgid("ESTIMATOR_STATUS" if scenario.autopilot == "px4" else "EKF_STATUS_REPORT"): self._status,
         }
         self._boot(-round(scenario.boot_before_s * 1e9), 0)
@@ -272,7 +278,7 @@ class Autopilot:
             "HEARTBEAT",
             type=1,
             autopilot=make,
-            base_mode=0x9D,
+            base_mode=0x9D if self.is_armed else 0x1D,
             custom_mode=10,
             system_status=4,
             mavlink_version=3,
@@ -291,6 +297,12 @@ class Autopilot:
     def _home(self, t: int) -> Any:
         lat, lon, alt = self.world.origin
         return encode(HomePosition(t, t, lat, lon, alt - self.scenario.geoid_height), self._airframe)
+
+    def _version(self, t: int) -> Any:
+        make = self.scenario.autopilot
+        return dialect.new(
+            "AUTOPILOT_VERSION", capabilities=CAPABILITIES[make], flight_sw_version=VERSIONS[make]
+        )
 
     def _last(self, kind: type[Stamped], t: int) -> Any:
         """The sensor's newest record at `t`; its stream is nearly regular, so the guess is near."""
@@ -328,6 +340,12 @@ class Autopilot:
         if message.tc1 == 0:
             self._answer("TIMESYNC", t, tc1=t - self._airframe.boot_ns, ts1=message.ts1)
 
+    def _on_parameter(self, message: Any, t: int) -> None:
+        parameters = self.parameters
+        ask = parameters.read if dialect.id_of(message) == _msgid("PARAM_REQUEST_READ") else parameters.set
+        if (answer := ask(message)) is not None:
+            self._transmit([self._frame(answer, COMPONENT)], t)
+
     def _on_command(self, message: Any, t: int) -> None:
         command, result = message.command, _UNSUPPORTED
         if command == _SET_MESSAGE_INTERVAL:
@@ -356,6 +374,7 @@ def _msgid(name: str) -> int:
 _DEFAULT_HZ = {
     "GPS_GLOBAL_ORIGIN": _SLOW_HZ,
     "HOME_POSITION": _SLOW_HZ,
+    "AUTOPILOT_VERSION": 0.0,
     "SIM_STATE": 0.0,
     "HIL_STATE_QUATERNION": 0.0,
 }

@@ -201,7 +201,10 @@ async def _run(flying: Flying) -> None:
     show_default=True,
     help="Times real time; the companion sees a clock that runs so much too fast.",
 )
-def command(connect: str, scenario: str, seed: int | None, speed: float) -> None:
+@click.option(
+    "--disarmed", is_flag=True, help="Say that it is disarmed: `companion doctor` may set parameters."
+)
+def command(connect: str, scenario: str, seed: int | None, speed: float, disarmed: bool) -> None:
     """Fly a scenario in real time as an autopilot would, for a `companion run` at the other end of the link.
 
     Ends with the flight, at SIGINT or SIGTERM. Exit code 69: the address cannot be listened on.
@@ -219,6 +222,7 @@ def command(connect: str, scenario: str, seed: int | None, speed: float) -> None
         click.echo(f"{seconds:8.1f} s  {text}", err=True)
 
     flying = Flying(chosen, address, speed, tell)
+    flying.autopilot.is_armed = not disarmed
     minutes = chosen.duration_s / 60.0
     click.echo(f"{chosen.name}: {minutes:.0f} min as {chosen.autopilot} over {address}, ^C ends", err=True)
     try:

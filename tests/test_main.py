@@ -11,7 +11,7 @@ from click.testing import CliRunner
 from companion import __version__
 from companion.__main__ import cli
 
-COMMANDS = ("bench", "check-config", "log", "loopback", "replay", "run", "sitl")
+COMMANDS = ("bench", "check-config", "doctor", "log", "loopback", "replay", "run", "sitl")
 CUT = Path(__file__).parent / "data" / "dronekit_copter_cut.tlog"
 
 
