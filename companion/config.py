@@ -181,6 +181,11 @@ class Output(Section, frozen=True):
         return any(rates[message] > 0.0 for message in MESSAGES.values())
 
     @property
+    def switches_sources(self) -> bool:
+        """Whether we tell the autopilot when to take its position from us."""
+        return self.switch_sources and self.profile == "ardupilot"
+
+    @property
     def pace_hz(self) -> float:
         """How often a solution is wanted."""
         return max(self.solution_hz, *_rates_hz(self).values())

@@ -16,8 +16,9 @@ from collections import Counter
 from collections.abc import Callable, Iterable
 from typing import Any, Protocol
 
-from companion.config import Config, to_toml
+from companion.config import Config, ConfigError, conflicts, to_toml
 from companion.dialogue import Dialogue
+from companion.feed import RESET, Feed
 from companion.link import dialect
 from companion.link.session import (
     LinkLost,
@@ -46,11 +47,13 @@ from companion.records import (
     Stamped,
     Tuning,
 )
-from companion.wire import MAKES, Receiver, Sender, decode, encode
+from companion.wire import MAKES, Receiver, Sender, decode, navigation_status
 
 SECOND = 1_000_000_000
 RSBN = dialect.type_named("RSBN_MEASUREMENT").msgid
 GPS_GLOBAL_ORIGIN = dialect.type_named("GPS_GLOBAL_ORIGIN").msgid
+COMMAND_ACK = dialect.type_named("COMMAND_ACK").msgid
+STATUS = "NAVIGATION_STATUS"
 REQUEST_MESSAGE = 512  # MAV_CMD
 ASK_ORIGIN_EVERY = 3 * SECOND
 STALE_AFTER = 2 * SECOND
@@ -82,6 +85,7 @@ class Link:
             link_id=number,
         )
         self.sender = Sender(self.session.clock)
+        self.feed = Feed(config)
         self.bad = 0
         self.origin_at = 0  # when the local origin is next asked for
 
@@ -108,6 +112,8 @@ def wanted(config: Config) -> dict[str, float]:
         "VFR_HUD": rates.air_data_hz,
         "SCALED_PRESSURE": rates.air_data_hz if config.channel == "air_data" else 0.0,
         "EKF_STATUS_REPORT": rates.status_hz,
+        "SYSTEM_TIME": float(config.output.rates_hz["GPS_INPUT"] > 0.0),
+        "GLOBAL_POSITION_INT": 2.0 * (config.output.rates_hz[RESET] > 0.0),
         "SIM_STATE": rates.truth_hz,
     }
     paced_by = "VFR_HUD" if config.channel == "air_data" else "LOCAL_POSITION_NED"
@@ -127,12 +133,16 @@ class Onboard:
         signing: Signing | None = None,
         save: Callable[[str], None] = lambda text: None,
     ) -> None:
-        """`save` keeps the TOML of what ground stations set; it may raise OSError."""
+        """`save` keeps the TOML of what ground stations set; it may raise OSError. Raises ConfigError for
+        what cannot be meant, such as feeding the autopilot its own position.
+        """
+        for *_, sentence in conflicts(config):
+            raise ConfigError(sentence)
         self._config = config
         self._log = log
         self._navigator = Navigator(config)
         self.links = {name: Link(name, config, number, signing) for number, name in enumerate(links)}
-        self._dialogue = Dialogue(config, {"NAVIGATION_STATUS": self._status}, save)
+        self._dialogue = Dialogue(config, {STATUS: self._status}, save)
         self._solution: Solution | None = None
         self._events: list[Event] = []
         self.rejected: Counter[str] = Counter()
@@ -198,6 +208,7 @@ class Onboard:
                 self.note(4, f"{link.name}: autopilot {event.system} silent for {silent:.0f} s", now_ns)
             elif isinstance(event, Rebooted):
                 self._origin = None
+                link.feed.rebooted()
                 self.note(4, f"{link.name}: autopilot {event.system} rebooted", now_ns)
                 self._on_record(Reboot(now_ns, now_ns, event.system))
             elif isinstance(event, Refused):
@@ -216,10 +227,18 @@ class Onboard:
                 link.session.send(reply)
             if config is not None:
                 self._config = config
+                for each in self.links.values():
+                    each.feed.config = config
                 self._on_record(Tuning(event.received_ns, event.received_ns, to_toml(config)))
         if not (event.from_autopilot or event.frame.msgid == RSBN):
             return
+        if (
+            event.frame.msgid == COMMAND_ACK
+            and event.message.target_component == self._config.link.component_id
+        ):
+            link.feed.acknowledged(event.message.command, event.message.result, event.received_ns)
         for record in decode(event.message, event.received_ns, link.sender):
+            link.feed.heard(record)
             self._on_record(record)
 
     def _on_record(self, record: Stamped) -> None:
@@ -230,13 +249,11 @@ class Onboard:
         if isinstance(record, LocalOrigin):
             self._origin = record
         for output in self._navigator.handle(record):  # type: ignore[arg-type]
-            self._emit(output)
             if isinstance(output, Solution):
                 self._send(output, news=isinstance(record, RsbnFix))
             elif isinstance(output, Reset) and isinstance(record, LocalPosition):
-                self._origin = (
-                    None  # perhaps it is the origin that moved: nothing is counted from it till told
-                )
+                self._origin = None  # perhaps that is what moved: nothing is counted from it till told
+            self._emit(output)
 
     def _emit(self, record: Stamped, channel: str | None = None) -> None:
         self._log.record(record, channel)
@@ -247,18 +264,25 @@ class Onboard:
             self.rejected[record.source] += 1
 
     def _send(self, solution: Solution, news: bool) -> None:
-        """The messages that are due, or all on the news of a beacon's fix, to every autopilot heard."""
+        """The messages that are due, or all on the news of a beacon's fix, to every autopilot heard: what
+        steers first.
+        """
         self._solution = solution
         periods = self._dialogue.periods_ns
-        names = [name for name in periods if news or solution.t_ns >= self._due.get(name, 0)]
-        if not names:
-            return
-        for name in names:
+        due = [
+            name for name in periods if (news and name != RESET) or solution.t_ns >= self._due.get(name, 0)
+        ]
+        for name in due:
             self._due[name] = max(self._due.get(name, 0) + periods[name], solution.t_ns)
-        for link in self.links.values():
-            if link.session.is_up:
-                for message in encode(solution, self._receiver(link), names):
-                    link.session.send(message)
+        feeding = [name for name in due if name != STATUS]
+        heard = [link for link in self.links.values() if link.session.is_up]
+        for link in heard if feeding else ():
+            for message in link.feed.messages(solution, feeding, self._receiver(link)):
+                link.session.send(message)
+            for event in link.feed.take_events():
+                self._emit(event, "/link/Event")
+        for link in heard if STATUS in due else ():
+            link.session.send(navigation_status(solution, self._receiver(link)))
 
     def _receiver(self, link: Link) -> Receiver:
         return Receiver(
@@ -266,6 +290,7 @@ class Onboard:
             link.session.autopilot or 0,
             origin=self._origin,
             sensor_id=self._config.output.global_position_sensor_id,
+            unix_ns=link.feed.unix_ns,
             rejected=self.rejected.total(),
         )
 
@@ -274,7 +299,7 @@ class Onboard:
         if self._solution is None:
             return None
         link = next(iter(self.links.values()))
-        return next(iter(encode(self._solution, self._receiver(link), ("NAVIGATION_STATUS",))), None)
+        return navigation_status(self._solution, self._receiver(link))
 
     def _system_state(self, now_ns: int) -> int:
         """MAV_STATE for our heartbeat: ACTIVE only while solutions come and can be trusted."""

@@ -238,7 +238,8 @@ class Solution(Stamped, frozen=True, gc=False, tag=True):
 
     `covariance` is of north, east, down position (m^2), upper triangle. `bound_n` is the guaranteed r.m.s.
     bound north and east (m), None where it cannot be given. `error_n` is the estimated error of the inertial
-    channel (m), `velocity_error_n` that of its velocity (m/s). `horizon_s` counts from the last accepted fix.
+    channel (m), `velocity_error_n` that of its velocity (m/s); `sigma_velocity` is what is left of it on the
+    worse horizontal axis (m/s). `horizon_s` counts from the last accepted fix.
     `disagreement` is the greatest distance between the estimators that run (m).
     """
 
@@ -258,6 +259,7 @@ class Solution(Stamped, frozen=True, gc=False, tag=True):
     disagreement: float | None = None
     inertial_age_s: float = 0.0
     ahead: tuple[Prediction, ...] = ()
+    sigma_velocity: float | None = None
 
 
 class Fix(Stamped, frozen=True, gc=False, tag=True):

@@ -76,9 +76,9 @@ class Flight:
 
     def hear(self, data: bytes) -> None:
         self.onboard.receive("main", data, self.now)
-        self._collect()
+        self.collect()
 
-    def _collect(self) -> None:
+    def collect(self) -> None:
         for data in self.onboard.to_send("main", self.now):
             for found in self._reader.receive(data):
                 self.sent.append((self.now, dialect.decode(found)))
@@ -111,7 +111,7 @@ class Flight:
                     satellites_visible=14,
                 )
             self.onboard.poll(self.now)
-            self._collect()
+            self.collect()
 
     def tell_origin(self) -> None:
         lat, lon = deg_e7(ORIGIN.lat), deg_e7(ORIGIN.lon)
@@ -270,3 +270,4 @@ def test_it_is_polled_when_it_says() -> None:
         assert deadline > flight.now
         flight.now = deadline
         flight.onboard.poll(flight.now)
+        flight.collect()

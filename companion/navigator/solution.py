@@ -20,11 +20,14 @@ AHEAD_NS = 5_000_000_000  # how often the bounds ahead are worked out
 
 
 class _Estimate(NamedTuple):
-    """The error of the inertial channel by one estimator: m, m/s, and m^2 of north, north-east, east."""
+    """The error of the inertial channel by one estimator: m, m/s, and m^2 of north, north-east, east; the
+    variance left of the velocity on its worse axis, m^2/s^2.
+    """
 
     error_n: Vector2
     velocity_error_n: Vector2
     covariance: Vector3
+    velocity_variance: float
 
 
 def solve(carry: Carry, rx_ns: int, settings: Settings) -> Step:
@@ -45,7 +48,7 @@ def solve(carry: Carry, rx_ns: int, settings: Settings) -> Step:
     fixed = sources(carry, t_ns, settings) & (Source.GNSS if leads == "restrictive" else FIXES)
     if fixed or leads not in candidates:
         leads = "kalman"
-    error, velocity_error, (var_n, cov, var_e) = candidates[leads]
+    error, velocity_error, (var_n, cov, var_e), velocity_variance = candidates[leads]
     north, east, down = ins.v_n
     lat, lon, alt = displace(*ins.position, -error[0], -error[1], 0.0)
     last = max((t for t in (carry.gnss_ns, carry.rsbn_ns) if t is not None), default=t_ns)
@@ -68,6 +71,7 @@ def solve(carry: Carry, rx_ns: int, settings: Settings) -> Step:
         _disagreement(candidates),
         max(0.0, (rx_ns - t_ns) * 1e-9),
         carry.ahead,
+        math.sqrt(velocity_variance),
     )
     next_ns = max(carry.next_ns + round(1e9 / config.output.pace_hz), t_ns)
     return carry._replace(state=state, guarantee=promise, next_ns=next_ns), [solution]
@@ -77,15 +81,19 @@ def _candidates(
     carry: Carry, state: ErrorState, bounded: Bounded | None, ins: Point, settings: Settings
 ) -> dict[str, _Estimate]:
     """What each estimator that runs says of the channel's error."""
-    (dx, dy), (dv_n, dv_e) = state.x[:2].tolist(), (settings.unit.velocity_rows(ins.v_n) @ state.x).tolist()
-    found = {"kalman": _Estimate((dx, dy), (dv_n, dv_e), _triangle(state.P))}
+    H = settings.unit.velocity_rows(ins.v_n)
+    (dx, dy), (dv_n, dv_e) = state.x[:2].tolist(), (H @ state.x).tolist()
+    variance = float(((H @ state.P) * H).sum(axis=1).max())
+    found = {"kalman": _Estimate((dx, dy), (dv_n, dv_e), _triangle(state.P), max(variance, 0.0))}
     if bounded is not None:
         variances = (bounded.bound_n[0] ** 2, 0.0, bounded.bound_n[1] ** 2)
-        found["minimax"] = _Estimate(bounded.error_n, bounded.velocity_error_n, variances)
+        variance = max(bounded.velocity_bound_n) ** 2
+        found["minimax"] = _Estimate(bounded.error_n, bounded.velocity_error_n, variances, variance)
     if carry.restrictive is not None and isinstance(settings.unit, WindError):
         x, P = restricted.at(carry.restrictive, ins.t_ns, settings.unit)
         dx, dy, dv_n, dv_e = x.tolist()
-        found["restrictive"] = _Estimate((dx, dy), (dv_n, dv_e), _triangle(P))
+        variance = float(max(P[2, 2], P[3, 3], 0.0))
+        found["restrictive"] = _Estimate((dx, dy), (dv_n, dv_e), _triangle(P), variance)
     return found
 
 

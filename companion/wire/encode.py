@@ -1,35 +1,49 @@
-"""Solution -> messages, as the autopilot at the other end takes them.
+"""A position, or a solution -> messages, as the autopilot at the other end takes them.
 
 Each make reads a standard message in its own way (measured on ArduPlane/ArduCopter 4.7 EKF3 and PX4 EKF2);
-those ways are written down here and nowhere else. Nothing implausible leaves: a solution that is not
-finite, untrusted, or older than the message can say gives no position message. `NAVIGATION_STATUS` always
-goes out, for it says just that.
+those ways are written down here and nowhere else. What feeds an estimator is made of a `gate.Position` only,
+so that nothing implausible can leave; NAVIGATION_STATUS is made of any solution, for it says just that.
 
-Times are the companion's monotonic clock in microseconds: ArduPilot learns the offset of any steady clock,
-PX4 maps it by the TIMESYNC that the session answers with the same clock.
+Every time sent is that of the companion's monotonic clock: ArduPilot learns the offset of one steady clock a
+link, for all messages together, and PX4 maps it by the TIMESYNC that the session answers with the same clock.
+A position is sent as of the instant of sending, so none has an age.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+import struct
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple, TypeAlias
 
 from companion.link import dialect
 from companion.nav.geometry import Geodetic, Projection, geodetic_to_local
-from companion.records import LocalOrigin, Mode, Solution, Source, Vector3
+from companion.records import LocalOrigin, Mode, Solution, Source
 from companion.wire.decode import Autopilot
+from companion.wire.gate import Position
 
 Message: TypeAlias = Any
 
-MAX_AGE_S = 0.25
-"""ArduPilot cannot be told of an older one, and PX4 takes the time of arrival for that of the position."""
+GREATEST_ERROR_M = 100.0
+"""ArduPilot's filter cuts every position error off here: to say more is not possible, and to say less is
+not true."""
+GPS_LAG_NS = 200_000_000
+"""ArduPilot takes a GPS_INPUT for so much older than its arrival."""
+MAV_CMD_EXTERNAL_POSITION_ESTIMATE = 43003
 
-_LOCAL_NED, _BODY_FRD, _LOCAL_FRD = 1, 12, 20  # MAV_FRAME
+_GLOBAL_INT, _LOCAL_NED, _BODY_FRD, _LOCAL_FRD = 5, 1, 12, 20  # MAV_FRAME
 _ESTIMATOR_UNKNOWN = 0  # PX4 refuses GPS, GPS_INS, LIDAR and AUTOPILOT, and drops the variances of NAIVE
 _POSITION_SRC_ESTIMATOR = 6
 _YAW_ERROR = 1.5  # rad, the greatest ArduPilot counts with; the attitude sent means nothing
-_QUALITY = {Mode.FIXED: 100, Mode.PREDICTING: 50}  # per cent; -1 is "failed" and dropped, 0 "unknown"
+_FIXED, _PREDICTED = 100, 50  # quality, per cent; -1 is "failed" and dropped, 0 "unknown"
+
+_SECOND_RECEIVER = 1  # gps_id: the first is the autopilot's own
+_FIX_3D = 3
+_IGNORE_VERTICAL_VELOCITY = 16  # GPS_INPUT_IGNORE_FLAGS
+_SATELLITES, _DOP = 6, 1.0
+"""There are none: ArduPilot checks for 6 and 2.5. The least, lest it prefer us to a receiver with a fix."""
+_GPS_EPOCH_S, _LEAP_S = 315_964_800, 18  # of UNIX time; GPS time is UTC and 18 s since 2017
+_WEEK_MS, _WEEKS = 604_800_000, 1 << 16
 
 _MODES = {Mode.INITIALISING: 0, Mode.FIXED: 1, Mode.PREDICTING: 2, Mode.UNTRUSTED: 3}  # NAVIGATION_MODE
 _ESTIMATORS = ("none", "fusion", "minimax", "kalman", "restrictive", "smoother", "polynomial")
@@ -42,12 +56,16 @@ _SOURCES = {  # NAVIGATION_SOURCE
 }
 
 
+class Unsent(Exception):
+    """A message that cannot be made honestly, and why."""
+
+
 class Receiver(NamedTuple):
     """Who is told, and what only the link and the service know.
 
     `origin` is the autopilot's last local origin, `geoid` the height of mean sea level above the ellipsoid
-    here (m) where a receiver tells it, `sensor_id` PX4's EKF2_AGP0_ID. `reset_counter` counts the solution's
-    jumps, `rejected` the measurements not used.
+    here (m) where a receiver tells it, `sensor_id` PX4's EKF2_AGP0_ID, `unix_ns` UTC less our clock (ns)
+    where it is known, `rejected` the count of measurements not used.
     """
 
     autopilot: Autopilot
@@ -56,62 +74,31 @@ class Receiver(NamedTuple):
     origin: LocalOrigin | None = None
     geoid: float | None = None
     sensor_id: int = 1
-    reset_counter: int = 0
+    unix_ns: int | None = None
     rejected: int = 0
 
 
-def encode(solution: Solution, receiver: Receiver, names: Iterable[str]) -> tuple[Message, ...]:
-    """The messages called `names` (keys of `ENCODERS`) that may be sent for `solution`."""
-    made = (ENCODERS[name](solution, receiver) for name in names if name in ENCODERS)
-    return tuple(message for message in made if message is not None)
+def encode(position: Position, receiver: Receiver, name: str) -> Message:
+    """The message called `name` (a key of `ENCODERS`). `Unsent` where it would not be honest."""
+    return ENCODERS[name](position, receiver)
 
 
-def accuracy(solution: Solution) -> Vector3:
-    """One sigma to state north, east, down, m: the covariance's, or the guaranteed bound where greater."""
-    north, east = math.sqrt(solution.covariance[0]), math.sqrt(solution.covariance[3])
-    if solution.bound_n is not None:
-        north, east = max(north, solution.bound_n[0]), max(east, solution.bound_n[1])
-    return north, east, math.sqrt(solution.covariance[5])
-
-
-def _may_be_sent(solution: Solution) -> bool:
-    """Whether an autopilot may steer by this: trusted, finite, on the earth, fresh, its accuracy stated."""
-    s = solution
-    diagonal = (s.covariance[0], s.covariance[3], s.covariance[5])
-    numbers = (s.lat, s.lon, s.alt_msl, *s.covariance, *(s.bound_n or ()))
-    return (
-        s.mode in _QUALITY
-        and all(map(math.isfinite, numbers))
-        and min(diagonal) > 0.0
-        and abs(s.lat) <= 0.5 * math.pi
-        and abs(s.lon) <= math.pi
-        and 0.0 <= s.inertial_age_s <= MAX_AGE_S
-    )
-
-
-def odometry(solution: Solution, receiver: Receiver) -> Message | None:
+def odometry(position: Position, receiver: Receiver) -> Message:
     """ODOMETRY: the position alone, counted from the autopilot's origin by the autopilot's own projection.
 
-    None without an origin, or where the solution must not be steered by. Velocity and rates are NaN, so that
-    they are not used.
+    Velocity and rates are NaN, so that they are not used.
     """
-    if receiver.origin is None or not _may_be_sent(solution):
-        return None
-    origin = receiver.origin
-    point = Geodetic(solution.lat, solution.lon, solution.alt_msl)
-    x_n = geodetic_to_local(
-        _projection(origin), Geodetic(origin.lat, origin.lon, origin.alt_msl), point
-    ).tolist()
+    x, y, z = _local(position, receiver)
     ardupilot = receiver.autopilot == "ardupilot"
     nan = math.nan
     return dialect.new(
         "ODOMETRY",
-        time_usec=solution.t_ns // 1000,
+        time_usec=position.t_ns // 1000,
         frame_id=_LOCAL_FRD if ardupilot else _LOCAL_NED,
         child_frame_id=_BODY_FRD,
-        x=x_n[0],
-        y=x_n[1],
-        z=x_n[2],
+        x=x,
+        y=y,
+        z=z,
         # PX4 leaves out an attitude of NaN. ArduPilot converts it to angles first: "none" is no rotation.
         q=[1.0, 0.0, 0.0, 0.0] if ardupilot else [nan] * 4,
         vx=nan,
@@ -120,12 +107,44 @@ def odometry(solution: Solution, receiver: Receiver) -> Message | None:
         rollspeed=nan,
         pitchspeed=nan,
         yawspeed=nan,
-        pose_covariance=_ardupilot_covariance(solution) if ardupilot else _pose_covariance(solution),
+        pose_covariance=_covariance(position, ardupilot),
         velocity_covariance=[nan] + [0.0] * 20,
-        reset_counter=receiver.reset_counter % 256,
+        reset_counter=position.resets % 256,
         estimator_type=_ESTIMATOR_UNKNOWN,
-        quality=_QUALITY[solution.mode],
+        quality=_FIXED if position.fixed else _PREDICTED,
     )
+
+
+def vision_position_estimate(position: Position, receiver: Receiver) -> Message:
+    """VISION_POSITION_ESTIMATE: the same local metres and covariance, north, east, down for both makes."""
+    x, y, z = _local(position, receiver)
+    ardupilot = receiver.autopilot == "ardupilot"
+    angle = 0.0 if ardupilot else math.nan
+    return dialect.new(
+        "VISION_POSITION_ESTIMATE",
+        usec=position.t_ns // 1000,
+        x=x,
+        y=y,
+        z=z,
+        roll=angle,
+        pitch=angle,
+        yaw=angle,
+        covariance=_covariance(position, ardupilot),
+        reset_counter=position.resets % 256,
+    )
+
+
+def _local(position: Position, receiver: Receiver) -> tuple[float, float, float]:
+    """North, east, down from the autopilot's origin, m."""
+    origin = receiver.origin
+    if origin is None:
+        raise Unsent("the autopilot's local origin is not known")
+    if receiver.autopilot == "ardupilot" and position.sigma > GREATEST_ERROR_M:
+        raise Unsent(f"its accuracy is worse than the {GREATEST_ERROR_M:g} m that ArduPilot can be told")
+    point = Geodetic(position.lat, position.lon, position.alt_msl)
+    start = Geodetic(origin.lat, origin.lon, origin.alt_msl)
+    x, y, z = geodetic_to_local(_projection(origin), start, point).tolist()
+    return x, y, z
 
 
 def _projection(origin: LocalOrigin) -> Projection:
@@ -135,46 +154,117 @@ def _projection(origin: LocalOrigin) -> Projection:
     raise ValueError(f"unknown local projection {origin.projection!r}: choose ardupilot, px4 or tangent")
 
 
-def _pose_covariance(solution: Solution) -> list[float]:
-    """Upper triangle of 6 x 6, row by row: true variances of the position, none of the attitude."""
-    north, east, down = accuracy(solution)
-    _, c_ne, c_nd, _, c_ed, _ = solution.covariance
-    nan = math.nan
-    position = [north**2, c_ne, c_nd, 0, 0, 0, east**2, c_ed, 0, 0, 0, down**2, 0, 0, 0]
-    return [*map(float, position), nan, nan, nan, nan, nan, nan]
+def _covariance(position: Position, ardupilot: bool) -> list[float]:
+    """Upper triangle of 6 x 6, row by row.
 
-
-def _ardupilot_covariance(solution: Solution) -> list[float]:
-    """ArduPilot reads one number for all axes, A = cbrt(c0^2 + c6^2 + c11^2), and cuts it off at 100 m.
-
-    To say A metres, the worse of both horizontal axes, c0 = c6 = c11 = sqrt(A^3 / 3); so too for the angles.
+    For ArduPilot the horizontal accuracy: it reads one number for all axes, A = cbrt(c0^2 + c6^2 + c11^2), so
+    A metres are said by c0 = c6 = c11 = sqrt(A^3 / 3), and so for the angles. For others the true variances
+    of the position, and none of the attitude.
     """
-    north, east, _ = accuracy(solution)
     covariance = [0.0] * 21
-    covariance[0] = covariance[6] = covariance[11] = math.sqrt(max(north, east) ** 3 / 3.0)
-    covariance[15] = covariance[18] = covariance[20] = math.sqrt(_YAW_ERROR**3 / 3.0)
+    if ardupilot:
+        covariance[0] = covariance[6] = covariance[11] = math.sqrt(position.sigma**3 / 3.0)
+        covariance[15] = covariance[18] = covariance[20] = math.sqrt(_YAW_ERROR**3 / 3.0)
+        return covariance
+    covariance[0], covariance[1], covariance[6] = position.covariance
+    covariance[11] = position.variance_down
+    covariance[15:] = [math.nan] * 6
     return covariance
 
 
-def global_position_sensor(solution: Solution, receiver: Receiver) -> Message | None:
-    """GLOBAL_POSITION_SENSOR, `eph` and `epv` honest; None where the solution must not be steered by."""
-    if not _may_be_sent(solution):
-        return None
-    north, east, down = accuracy(solution)
+def gps_input(position: Position, receiver: Receiver) -> Message:
+    """GPS_INPUT as ArduPilot's second receiver, as of `GPS_LAG_NS` before it arrives.
+
+    With our velocity, always: a message with the ignore flags leaves ArduPilot the velocity of the last one
+    without them, and one that never has any is taken for standing still (51 m r.m.s. where a true velocity
+    gave 4.4 m). It is ours to give: no channel that takes part of the autopilot's may feed it.
+    """
+    if receiver.unix_ns is None:
+        raise Unsent("the time of day is not known")
+    if position.sigma > GREATEST_ERROR_M:
+        raise Unsent(f"its accuracy is worse than the {GREATEST_ERROR_M:g} m that ArduPilot can be told")
+    if position.sigma_velocity is None:
+        raise Unsent("the accuracy of its velocity is not known")
+    then = position.at(position.t_ns - GPS_LAG_NS)
+    gps_ms = (position.t_ns + receiver.unix_ns) // 1_000_000 + (_LEAP_S - _GPS_EPOCH_S) * 1000
+    if not _WEEK_MS <= gps_ms < _WEEKS * _WEEK_MS:
+        raise Unsent("the time of day is not known")
+    north, east, _ = position.v_n
+    return dialect.new(
+        "GPS_INPUT",
+        time_usec=position.t_ns // 1000,
+        gps_id=_SECOND_RECEIVER,
+        ignore_flags=_IGNORE_VERTICAL_VELOCITY,
+        time_week_ms=gps_ms % _WEEK_MS,
+        time_week=gps_ms // _WEEK_MS,
+        fix_type=_FIX_3D,
+        lat=_deg_e7(then.lat),
+        lon=_deg_e7(then.lon),
+        alt=then.alt_msl,
+        hdop=_DOP,
+        vdop=_DOP,
+        vn=north,
+        ve=east,
+        vd=0.0,
+        speed_accuracy=position.sigma_velocity,
+        horiz_accuracy=position.sigma,
+        vert_accuracy=math.sqrt(position.variance_down),
+        satellites_visible=_SATELLITES,
+        yaw=0,
+    )
+
+
+def global_position_sensor(position: Position, receiver: Receiver) -> Message:
+    """GLOBAL_POSITION_SENSOR, `eph` and `epv` honest."""
     return dialect.new(
         "GLOBAL_POSITION_SENSOR",
         target_system=receiver.system,
         target_component=receiver.component,
         id=receiver.sensor_id,
-        time_usec=solution.t_ns // 1000,
+        time_usec=position.t_ns // 1000,
         source=_POSITION_SRC_ESTIMATOR,
-        lat=_deg_e7(solution.lat),
-        lon=_deg_e7(solution.lon),
-        alt_ellipsoid=math.nan if receiver.geoid is None else solution.alt_msl + receiver.geoid,
-        alt=solution.alt_msl,
-        eph=max(north, east),
-        epv=down,
+        lat=_deg_e7(position.lat),
+        lon=_deg_e7(position.lon),
+        alt_ellipsoid=math.nan if receiver.geoid is None else position.alt_msl + receiver.geoid,
+        alt=position.alt_msl,
+        eph=position.sigma,
+        epv=math.sqrt(position.variance_down),
     )
+
+
+def external_position_estimate(position: Position, receiver: Receiver) -> Message:
+    """MAV_CMD_EXTERNAL_POSITION_ESTIMATE, in COMMAND_INT, which alone takes it.
+
+    Both makes take frame 5 (PX4 no other), and a height of NaN (ArduPilot no other). A `param1` of NaN kills
+    ArduPilot; it is rounded down to the single precision of the wire, because a stamp that is late would
+    move the clock that all messages of the link share.
+    """
+    if position.sigma > GREATEST_ERROR_M:
+        raise Unsent(f"its accuracy is worse than {GREATEST_ERROR_M:g} m, and it would be taken for true")
+    return dialect.new(
+        "COMMAND_INT",
+        target_system=receiver.system,
+        target_component=receiver.component,
+        frame=_GLOBAL_INT,
+        command=MAV_CMD_EXTERNAL_POSITION_ESTIMATE,
+        param1=_single_below(position.t_ns * 1e-9),
+        param2=0.0,
+        param3=position.sigma,
+        param4=0.0,
+        x=_deg_e7(position.lat),
+        y=_deg_e7(position.lon),
+        z=math.nan,
+    )
+
+
+def _single_below(value: float) -> float:
+    """The greatest number of single precision that is not above a positive `value`."""
+    packed = struct.pack("<f", value)
+    single: float = struct.unpack("<f", packed)[0]
+    if single > value:
+        (bits,) = struct.unpack("<I", packed)
+        (single,) = struct.unpack("<f", struct.pack("<I", bits - 1))
+    return single
 
 
 def navigation_status(solution: Solution, receiver: Receiver) -> Message:
@@ -209,9 +299,11 @@ def _deg_e7(angle: float) -> int:
     return round(math.degrees(angle) * 1e7)
 
 
-ENCODERS: Mapping[str, Callable[[Solution, Receiver], Message | None]] = {
+ENCODERS: Mapping[str, Callable[[Position, Receiver], Message]] = {
     "ODOMETRY": odometry,
+    "VISION_POSITION_ESTIMATE": vision_position_estimate,
+    "GPS_INPUT": gps_input,
     "GLOBAL_POSITION_SENSOR": global_position_sensor,
-    "NAVIGATION_STATUS": navigation_status,
+    "COMMAND_INT": external_position_estimate,
 }
-"""Every message that a solution can be told by."""
+"""Every message that a position can be told by; of COMMAND_INT, MAV_CMD_EXTERNAL_POSITION_ESTIMATE."""
