@@ -61,12 +61,13 @@ class Inertial(Section, frozen=True):
     """Which inertial channel is corrected, and the error model of an INS's: one standard deviation each.
 
     `source` "local_position" is LOCAL_POSITION_NED; "air_data" is dead reckoning of our own, by airspeed and
-    attitude; "auto" is the latter wherever a position goes back to the autopilot. There the first is refused,
-    unless it is `independent`: that of an INS of its own, which takes no part of what we send. The defaults
-    of the error model are a navigation-grade unit (0.01 deg/h, 50 ug).
+    attitude; "strapdown" by IMU and attitude; "auto" is air data wherever a position goes back to the
+    autopilot. There local position is refused, unless it is `independent`: that of an INS of its own, which
+    takes no part of what we send. The defaults of the error model are a navigation-grade unit (0.01 deg/h,
+    50 ug).
     """
 
-    source: Literal["auto", "local_position", "air_data"] = "auto"
+    source: Literal["auto", "local_position", "air_data", "strapdown"] = "auto"
     independent: bool = False
     gyro_drift_deg_h: Positive = 0.01
     gyro_correlation_h: Positive = 5.0
@@ -95,6 +96,25 @@ class AirDataSection(Section, frozen=True):
     heading_deg: Positive = 1.5
     correlation_min: Positive = 10.0  # of the errors of airspeed and heading
     wind_rate_m_s_min: Positive = 1.0  # r.m.s., for the guaranteed prediction
+
+
+class Strapdown(Section, frozen=True):
+    """The error model of strapdown by the autopilot's attitude: one standard deviation each.
+
+    `tilt_deg` is the attitude's, correlated over `tilt_s`; an autopilot led astray by a wind it does not know
+    of tilts by degrees. What vibration leaves when it is sampled so seldom is `vibration_m_s` in the velocity
+    of an instant and `velocity_noise_m_s_sqrt_s` in its growth.
+    """
+
+    imu: Annotated[int, Meta(ge=0, le=2)] = 0  # which one of several
+    tilt_deg: Positive = 1.5
+    tilt_s: Positive = 30.0
+    accelerometer_m_s2: Positive = 0.1  # with how it is mounted
+    heading_deg: Positive = 2.0
+    correlation_min: Positive = 10.0  # of the errors of accelerometers and heading
+    vibration_m_s: Positive = 0.3
+    velocity_noise_m_s_sqrt_s: Positive = 0.25
+    velocity_m_s: Positive = 30.0  # at the first fix, where it tells none
 
 
 class GnssSection(Section, frozen=True):
@@ -227,6 +247,7 @@ class Config(Section, frozen=True):
     rates: Rates = Rates()
     inertial: Inertial = Inertial()
     air_data: AirDataSection = AirDataSection()
+    strapdown: Strapdown = Strapdown()
     gnss: GnssSection = GnssSection()
     rsbn: Rsbn = Rsbn()
     predictor: Predictor = Predictor()
@@ -236,7 +257,7 @@ class Config(Section, frozen=True):
     signing: Signing = Signing()
 
     @property
-    def channel(self) -> Literal["local_position", "air_data"]:
+    def channel(self) -> Literal["local_position", "air_data", "strapdown"]:
         """The inertial channel that `inertial.source` means, by what goes back to the autopilot."""
         if self.inertial.source != "auto":
             return self.inertial.source

@@ -110,15 +110,16 @@ def wanted(config: Config) -> dict[str, float]:
         "RAW_IMU": rates.imu_hz,
         "HIGHRES_IMU": rates.imu_hz,
         "VFR_HUD": rates.air_data_hz,
-        "SCALED_PRESSURE": rates.air_data_hz if config.channel == "air_data" else 0.0,
+        "SCALED_PRESSURE": 0.0 if config.channel == "local_position" else rates.air_data_hz,
         "EKF_STATUS_REPORT": rates.status_hz,
         "SYSTEM_TIME": float(config.output.rates_hz["GPS_INPUT"] > 0.0),
         "GLOBAL_POSITION_INT": 2.0 * (config.output.rates_hz[RESET] > 0.0),
         "SIM_STATE": rates.truth_hz,
     }
-    paced_by = "VFR_HUD" if config.channel == "air_data" else "LOCAL_POSITION_NED"
-    if 0.0 < asked[paced_by] < config.output.pace_hz:  # a solution comes with a point of the channel
-        asked[paced_by] = config.output.pace_hz
+    paced_by = {"air_data": ["VFR_HUD"], "strapdown": ["RAW_IMU", "HIGHRES_IMU"]}
+    for name in paced_by.get(config.channel, ["LOCAL_POSITION_NED"]):
+        if 0.0 < asked[name] < config.output.pace_hz:  # a solution comes with a point of the channel
+            asked[name] = config.output.pace_hz
     return {name: hz for name, hz in asked.items() if hz > 0.0}
 
 

@@ -19,6 +19,7 @@ from companion.records import (
     Event,
     GlobalPosition,
     Gnss,
+    Imu,
     Input,
     LocalOrigin,
     LocalPosition,
@@ -48,6 +49,7 @@ FOLDED = (
     Attitude,
     AirData,
     Pressure,
+    Imu,
     Gnss,
     RsbnFix,
     Reboot,
@@ -211,6 +213,7 @@ def _choice(record: Input, config: Config) -> Event:
         why = "the autopilot is not fed"
     name = {
         "air_data": f"air-data dead reckoning ({why})",
+        "strapdown": f"strapdown by the autopilot's attitude ({why})",
         "local_position": f"the autopilot's local position ({why}); airspeed not used: "
         "it makes a good INS worse",
     }

@@ -9,12 +9,13 @@ from scipy.special import chdtri
 from companion.config import Config
 from companion.records import Gnss, LocalOrigin, LocalPosition, Output, Prediction, RsbnFix, Source
 
-from . import errorstate, guarantee, inertial, radio, winderror
+from . import errorstate, guarantee, inertial, radio, tilterror, winderror
 from .deadreckoning import Reckoner
 from .errorstate import ErrorModel, ErrorState
 from .guarantee import Guarantee
 from .inertial import Point, Track
 from .restricted import Restrictive
+from .strapped import Strap
 
 FIXES = Source.GNSS | Source.AZIMUTH | Source.RANGE
 
@@ -34,6 +35,8 @@ class Settings(NamedTuple):
         unit: ErrorModel = errorstate.grade(config.inertial, config.gnss)
         if config.channel == "air_data":
             unit = winderror.grade(config.air_data, config.gnss)
+        elif config.channel == "strapdown":
+            unit = tilterror.grade(config.strapdown, config.gnss)
         return cls(config, unit, gate)
 
 
@@ -60,8 +63,9 @@ class Carry(NamedTuple):
     guarantee: Guarantee
     origin: LocalOrigin | None = None
     local: LocalPosition | None = None
-    waiting_ns: int | None = None  # since when local positions come without an origin
+    waiting_ns: int | None = None  # since when positions come that a channel cannot begin with
     reckoner: Reckoner = Reckoner()
+    strap: Strap = Strap()
     track: Track = ()
     state: ErrorState | None = None
     restrictive: Restrictive | None = None  # of air-data dead reckoning

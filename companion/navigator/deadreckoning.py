@@ -41,11 +41,7 @@ class Reckoner(NamedTuple):
 
 def begin(r: Reckoner, fix: Gnss | RsbnFix) -> Point | None:
     """Where the channel begins: the first position anybody tells once there is an airspeed; else None."""
-    if isinstance(fix, RsbnFix):
-        at = place(fix, pressure_altitude(r.static) if r.static else fix.alt)
-    else:
-        alt = pressure_altitude(r.static) if r.static else fix.alt_msl
-        at = Geodetic(fix.lat, fix.lon, alt) if fix.fix >= 3 else None
+    at = first_place(fix, r.static)
     if at is None or r.air is None or not _fresh(r, r.air.t_ns) or abs(fix.t_ns - r.air.t_ns) > STALE_NS:
         return None
     return Point(fix.t_ns, at, (*_air_velocity(r, r.air, at.alt), 0.0))
@@ -67,12 +63,25 @@ def advance(r: Reckoner, last: Point, record: AirData) -> tuple[Reckoner, Point]
         return None
     north, east = _air_velocity(r, record, last.position.alt)
     before = last.v_n
-    alt = pressure_altitude(r.static) if r.static else last.position.alt
-    gain = min(dt / CLIMB_S, 1.0)
-    r = r._replace(climb=r.climb + gain * ((alt - last.position.alt) / dt - r.climb))
+    alt, climb = followed(r.static, r.climb, last.position.alt, dt)
+    r = r._replace(climb=climb)
     moved = displace(*last.position, 0.5 * (before[0] + north) * dt, 0.5 * (before[1] + east) * dt, 0.0)
     v_n: Vector3 = (north, east, -r.climb)
     return r, Point(record.t_ns, moved._replace(alt=alt), v_n)
+
+
+def first_place(fix: Gnss | RsbnFix, static: float | None) -> Geodetic | None:
+    """The position that a fix alone tells, at the height of the pressure (Pa) if it is known; else None."""
+    if isinstance(fix, RsbnFix):
+        return place(fix, pressure_altitude(static) if static else fix.alt)
+    alt = pressure_altitude(static) if static else fix.alt_msl
+    return Geodetic(fix.lat, fix.lon, alt) if fix.fix >= 3 else None
+
+
+def followed(static: float | None, climb: float, alt: float, dt: float) -> Vector2:
+    """Height (m) by the pressure, dt seconds after it was `alt`, and the climb (m/s) once `climb`."""
+    new = pressure_altitude(static) if static else alt
+    return new, climb + min(dt / CLIMB_S, 1.0) * ((new - alt) / dt - climb)
 
 
 def true_airspeed(record: AirData, static: float | None, alt: float) -> float:

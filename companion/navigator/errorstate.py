@@ -203,19 +203,24 @@ def is_sound(state: ErrorState | None) -> bool:
     return bool(np.isfinite(state.x).all() and np.isfinite(state.P).all() and (variances >= 0.0).all())
 
 
-def shift(state: ErrorState, north: float, east: float) -> ErrorState:
+def shift(state: ErrorState, north: float, east: float, v_n: Vector2 | None = None) -> ErrorState:
     """The state after the channel itself jumped by (north, east) m: the error jumped with it, nothing else
-    did.
+    did. With `v_n` (m/s) its velocity jumped too, which is a state of its own then.
     """
     x = state.x.copy()
     x[POSITION] += north, east
+    if v_n is not None:
+        x[VELOCITY] += v_n
     return state._replace(x=x)
 
 
-def blur(state: ErrorState, sigma: float) -> ErrorState:
-    """The state after the channel moved by nobody knows how much, `sigma` (m) north and as much east."""
+def blur(state: ErrorState, sigma: float, sigma_v: float = 0.0) -> ErrorState:
+    """The state after the channel moved by nobody knows how much, `sigma` (m) north and as much east; and
+    turned faster or slower by `sigma_v` (m/s) where its velocity error is a state.
+    """
     P = state.P.copy()
     P[POSITION, POSITION] += sigma**2 * np.eye(2)
+    P[VELOCITY, VELOCITY] += sigma_v**2 * np.eye(2)
     return state._replace(P=P)
 
 

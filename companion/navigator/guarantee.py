@@ -20,6 +20,7 @@ from companion.estimate.predictor import Forecast, Quantity, Window, predict, pr
 from companion.estimate.predictor import Prediction as Channel
 from companion.records import Prediction, Vector2
 
+from . import tilterror
 from .errorstate import G0
 
 REFRESH_NS = 1_000_000_000
@@ -58,10 +59,14 @@ class Guarantee(NamedTuple):
 
 
 def begin(config: Config) -> Guarantee:
-    """Nothing learnt yet. The error of dead reckoning drifts with a wind that changes at a bounded rate."""
+    """Nothing learnt yet. The error of dead reckoning drifts with a wind that changes at a bounded rate, that
+    of strapdown with an unknown acceleration.
+    """
     span = 60.0 * config.predictor.window_min
     if config.channel == "air_data":
         window = Window(span, disturbance=config.air_data.wind_rate_m_s_min / 60.0, drifting=True)
+    elif config.channel == "strapdown":
+        window = Window(span, disturbance=tilterror.unknown_acceleration(config.strapdown), drifting=True)
     else:
         window = Window(span, disturbance=config.predictor.disturbance_ug * 1e-6 * G0)
     return Guarantee(window, window)
@@ -131,15 +136,21 @@ def ahead(g: Guarantee, t_ns: int, settings: Predictor) -> tuple[Prediction, ...
     )
 
 
-def shift(g: Guarantee, north: float, east: float) -> Guarantee:
-    """After the channel jumped by (north, east) m, so did every position error ever measured against it."""
-    bins = tuple(
-        b._replace(value=(b.value[0] + b.weight * north, b.value[1] + b.weight * east))
-        if b.quantity == "position"
-        else b
-        for b in g.bins
-    )
-    return Guarantee(_shifted(g.north, north), _shifted(g.east, east), bins)
+def shift(g: Guarantee, north: float, east: float, v_n: Vector2 = (0.0, 0.0), t_ns: int = 0) -> Guarantee:
+    """After the channel jumped by (north, east) m, so did every position error ever measured against it; with
+    `v_n` (m/s) it is as if it had always moved so much faster, the jump being that at `t_ns`.
+    """
+
+    def moved(b: Bin) -> Bin:
+        n, e = v_n
+        if b.quantity == "velocity":
+            return b._replace(value=(b.value[0] + b.weight * n, b.value[1] + b.weight * e))
+        since = b.time + b.weight * (b.start_ns - t_ns) * 1e-9
+        value = b.value[0] + b.weight * north + n * since, b.value[1] + b.weight * east + e * since
+        return b._replace(value=value)
+
+    window_n, window_e = _shifted(g.north, north, v_n[0], t_ns), _shifted(g.east, east, v_n[1], t_ns)
+    return Guarantee(window_n, window_e, tuple(moved(b) for b in g.bins))
 
 
 def _close(g: Guarantee) -> Guarantee:
@@ -175,7 +186,8 @@ def _moved(channel: Channel, dt: float) -> tuple[float, float, float, float]:
     )
 
 
-def _shifted(window: Window, offset: float) -> Window:
-    value = np.where(window.velocity, window.value, window.value + offset)
+def _shifted(window: Window, offset: float, rate: float, t_ns: int) -> Window:
+    positions = window.value + offset + rate * (window.t_ns - t_ns) * 1e-9
+    value = np.where(window.velocity, window.value + rate, positions)
     value.setflags(write=False)
     return replace(window, value=value)

@@ -17,6 +17,7 @@ from companion.nav.geometry import Geodetic, Projection, displace, local_to_geod
 from companion.records import LocalOrigin, LocalPosition, Vector2, Vector3
 
 KEEP = 128  # points: 12 s at 10 Hz, more than a beacon's answer may be late
+SPACING_NS = 90_000_000
 REACH_S = 0.5  # a point this far beyond the track is still extrapolated
 JUMP_M = 5.0  # a step beyond what velocity explains, allowing for JUMP_ACCELERATION
 JUMP_ACCELERATION = 30.0  # [m/s^2]
@@ -43,6 +44,13 @@ def point(record: LocalPosition, origin: LocalOrigin) -> Point:
 def extend(track: Track, new: Point) -> Track:
     """The track with one more point, its oldest dropped."""
     return (*track[-(KEEP - 1) :], new)
+
+
+def renew(track: Track, new: Point) -> Track:
+    """The same for a channel faster than 10 Hz: its newest point makes way unless a tenth of a second old."""
+    if len(track) > 1 and track[-1].t_ns - track[-2].t_ns < SPACING_NS:
+        track = track[:-1]
+    return extend(track, new)
 
 
 def at(track: Track, t_ns: int) -> Point | None:

@@ -28,6 +28,7 @@ from companion.records import (
     Fix,
     GlobalPosition,
     Gnss,
+    Imu,
     Input,
     LocalOrigin,
     LocalPosition,
@@ -38,10 +39,11 @@ from companion.records import (
     Reset,
     RsbnFix,
     Source,
+    Stamped,
     Vector3,
 )
 
-from . import deadreckoning, errorstate, guarantee, inertial, radio, restricted
+from . import deadreckoning, errorstate, guarantee, inertial, moved, radio, restricted, strapped
 from .carry import FIXES, Carry, Lesson, Level, Settings, Step, initial, level, sources, state_at
 from .errorstate import ErrorState, Floats
 from .inertial import Point
@@ -49,11 +51,14 @@ from .solution import solve
 from .winderror import WindError
 
 TOGETHER_NS = 1_000_000_000  # GNSS this close to a beacon's answer joins its fix
-PATIENCE_NS = 5_000_000_000  # how long the autopilot is waited for to tell its local origin
+PATIENCE_NS = 5_000_000_000  # how long the autopilot is waited for to tell what a channel begins with
 LEVEL_3D = 3  # GPS_FIX_TYPE_3D_FIX
 BRIDGED_S = 1.0  # a silence of the airspeed up to this long is nothing
 UNKNOWN_M_S = 15.0  # how fast the position is lost in a longer one
-FAR_M = 500.0  # dead reckoning without wind is brought back from this far off
+UNKNOWN_M_S2 = 5.0  # and the velocity in one of the IMU,
+TURNED_M_S = 30.0  # until nothing is known of it
+QUIET_NS = 10_000_000_000  # what goes on being refused is told once, and again after so long without
+AGAIN_NS = 60_000_000_000  # how often it is told that nothing can begin
 BOUND_GATE = 3.0  # a fix within this many guaranteed r.m.s. of the prediction is believed after an outage
 
 
@@ -75,12 +80,13 @@ def _origin(carry: Carry, record: LocalOrigin, settings: Settings) -> Step:
 def _reboot(carry: Carry, record: Reboot, settings: Settings) -> Step:
     """Another inertial channel: what was learnt of the old one's error says nothing of it.
 
-    Dead reckoning is our own: to it a reboot is a silence, and the wind is what it was.
+    Dead reckoning and strapdown are our own: to them a reboot is a silence, and the wind is what it was.
     """
     why = f"autopilot {record.system} rebooted"
-    if settings.config.channel == "air_data":
-        carry = carry._replace(reckoner=deadreckoning.Reckoner(), gnss=None, gnss_heard=None)
-        return carry, [Reset(record.t_ns, record.rx_ns, "air data", why)]
+    if settings.config.channel != "local_position":
+        strap = strapped.Strap(refused_ns=record.t_ns)  # that it is not heard goes without saying
+        carry = carry._replace(reckoner=deadreckoning.Reckoner(), strap=strap, gnss=None, gnss_heard=None)
+        return carry, [Reset(record.t_ns, record.rx_ns, settings.config.channel.replace("_", " "), why)]
     out = Reset(record.t_ns, record.rx_ns, "navigator", why)
     return initial(settings)._replace(next_ns=carry.next_ns), [out]
 
@@ -109,22 +115,11 @@ def _local_position(carry: Carry, record: LocalPosition, settings: Settings) -> 
     new = inertial.point(record, origin)
     jump = inertial.jump(carry.track[-1], new) if carry.track else None
     if jump is not None:
-        carry = _shifted(carry, jump[0], jump[1])
+        carry = moved.shifted(carry, jump[0], jump[1])
         length = math.hypot(jump[0], jump[1])
-        out.append(Reset(record.t_ns, record.rx_ns, "inertial channel", f"it jumped by {length:.1f} m"))
+        out.append(_channel(record, f"it jumped by {length:.1f} m"))
     carry = carry._replace(track=inertial.extend(carry.track, new))
-    if record.t_ns >= carry.next_ns:
-        carry, solution = solve(carry, record.rx_ns, settings)
-        out += solution
-    return carry, out
-
-
-def _shifted(carry: Carry, north: float, east: float) -> Carry:
-    """After a jump of the inertial channel: its error jumped with it, where the aircraft is did not."""
-    state = carry.state and errorstate.shift(carry.state, north, east)
-    promise = guarantee.shift(carry.guarantee, north, east)
-    bounded = carry.restrictive and restricted.shift(carry.restrictive, north, east)
-    return carry._replace(state=state, guarantee=promise, restrictive=bounded, track=(), gnss_heard=None)
+    return _given(carry, record, out, settings)
 
 
 def _sense(carry: Carry, record: Attitude | AirData | Pressure, settings: Settings) -> Step:
@@ -143,49 +138,84 @@ def _air_data(carry: Carry, record: AirData, settings: Settings) -> Step:
     reckoner, new = found
     silent = (new.t_ns - last.t_ns) * 1e-9
     if silent > BRIDGED_S:
-        carry = _blurred(carry, UNKNOWN_M_S * silent, settings)
-        why = f"no airspeed with attitude for {silent:.1f} s"
-        out.append(Reset(record.t_ns, record.rx_ns, "inertial channel", why))
+        carry = moved.blurred(carry, settings, UNKNOWN_M_S * silent)
+        out.append(_channel(record, f"no airspeed with attitude for {silent:.1f} s"))
     carry = carry._replace(reckoner=reckoner, track=inertial.extend(carry.track, new))
-    if carry.state is not None and math.hypot(*carry.state.x[:2].tolist()) > FAR_M:
-        carry = _moved_home(carry)
-    if record.t_ns >= carry.next_ns:
-        carry, solution = solve(carry, record.rx_ns, settings)
-        out += solution
-    return carry, out
+    return _given(moved.kept_near(carry, has_velocity=False), record, out, settings)
 
 
-def _blurred(carry: Carry, sigma: float, settings: Settings) -> Carry:
-    """After the channel was carried across a silence: what was promised of it is void."""
-    state = carry.state and errorstate.blur(carry.state, sigma)
-    promise = guarantee.begin(settings.config)
-    return carry._replace(state=state, guarantee=promise, restrictive=None, track=carry.track[-1:])
+def _strap(carry: Carry, record: Attitude | Pressure, settings: Settings) -> Step:
+    return carry._replace(strap=strapped.sense(carry.strap, record)), []
 
 
-def _moved_home(carry: Carry) -> Carry:
-    """The channel moved to where the estimate is, so that its errors stay small against the earth."""
-    assert carry.state is not None
-    north, east = (-carry.state.x[:2]).tolist()
-    track = tuple(p._replace(position=displace(*p.position, north, east, 0.0)) for p in carry.track)
-    return _shifted(carry, north, east)._replace(track=track)
+def _imu(carry: Carry, record: Imu, settings: Settings) -> Step:
+    """Strapdown goes on by one sample, and across a silence straight on."""
+    if record.source != settings.config.strapdown.imu:
+        return carry, []
+    before, out = carry.strap, list[Output]()
+    strap = strapped.hear(before, record)
+    carry = carry._replace(strap=strap)
+    if not carry.track:
+        return carry, out
+    if strap.why:
+        if strap.refused_ns is None or record.t_ns - strap.refused_ns > QUIET_NS:
+            out.append(_channel(record, f"not used: {strap.why}"))
+        return carry._replace(strap=strap._replace(refused_ns=record.t_ns)), out
+    last = carry.track[-1]
+    silent = (record.t_ns - last.t_ns) * 1e-9
+    if silent <= 0.0:
+        return carry, out
+    if silent > strapped.BRIDGED_S or before.imu is None:
+        new = strapped.coast(strap, last)
+        faster = min(UNKNOWN_M_S2 * silent, TURNED_M_S)
+        carry = moved.blurred(carry, settings, faster * silent, faster)
+        out.append(_channel(record, f"no IMU with attitude for {silent:.1f} s"))
+    else:
+        strap, new = strapped.advance(before, strap, last)
+    carry = carry._replace(strap=strap, track=inertial.renew(carry.track, new))
+    return _given(moved.kept_near(carry, has_velocity=True), record, out, settings)
 
 
-def _begun(carry: Carry, record: Gnss | RsbnFix, settings: Settings) -> Carry:
-    """With the first point of dead reckoning, if this fix is the first to tell a place."""
-    if carry.track or settings.config.channel != "air_data":
-        return carry
-    first = deadreckoning.begin(carry.reckoner, record)
-    return carry if first is None else carry._replace(track=(first,))
+def _given(carry: Carry, record: Stamped, out: list[Output], settings: Settings) -> Step:
+    """With a solution once one is due."""
+    if record.t_ns < carry.next_ns:
+        return carry, out
+    carry, solution = solve(carry, record.rx_ns, settings)
+    return carry, out + solution
+
+
+def _channel(record: Stamped, why: str) -> Reset:
+    return Reset(record.t_ns, record.rx_ns, "inertial channel", why)
+
+
+def _begun(carry: Carry, record: Gnss | RsbnFix, settings: Settings) -> Step:
+    """With the first point of a channel of our own, if this fix is the first to tell a place; where it cannot
+    begin, that is told.
+    """
+    channel = settings.config.channel
+    if carry.track or channel == "local_position":
+        return carry, []
+    if channel == "air_data":
+        first, why = deadreckoning.begin(carry.reckoner, record), "no airspeed with attitude is heard"
+    else:
+        first, why = strapped.begin(carry.strap, record), carry.strap.why
+    if first is not None:
+        return carry._replace(track=(first,)), []
+    since = carry.waiting_ns or record.t_ns
+    if record.t_ns - since < PATIENCE_NS or (isinstance(record, Gnss) and record.fix < LEVEL_3D):
+        return carry._replace(waiting_ns=since), []
+    carry = carry._replace(waiting_ns=record.t_ns + AGAIN_NS)
+    return carry, [Event(record.t_ns, record.rx_ns, 4, f"inertial channel cannot begin: {why}")]
 
 
 def _gnss(carry: Carry, record: Gnss, settings: Settings) -> Step:
-    carry = _begun(carry, record, settings)
+    carry, told = _begun(carry, record, settings)
     config = settings.config.gnss
     carry = carry._replace(gnss=record)
     ins = inertial.at(carry.track, record.t_ns)
     since = math.inf if carry.gnss_ns is None else (record.t_ns - carry.gnss_ns) * 1e-9
     if record.fix < LEVEL_3D or ins is None or since < config.every_s:
-        return carry, []
+        return carry, told
     white = radio.from_gnss(record, ins, config, drifting=True)
     carry, out = _absorb(carry, white, errorstate.gnss_rows(settings.unit), ins, record, settings)
     if out:
@@ -199,11 +229,11 @@ def _gnss(carry: Carry, record: Gnss, settings: Settings) -> Step:
 
 
 def _rsbn(carry: Carry, record: RsbnFix, settings: Settings) -> Step:
-    carry = _begun(carry, record, settings)
+    carry, told = _begun(carry, record, settings)
     ins = inertial.at(carry.track, record.t_ns)
     if ins is None:
         why = "no inertial position at its time"
-        return carry, [Rejection(record.t_ns, record.rx_ns, f"rsbn {record.beacon}", why)]
+        return carry, [*told, Rejection(record.t_ns, record.rx_ns, f"rsbn {record.beacon}", why)]
     ins = level(ins, carry)
     heard = radio.from_rsbn(record, ins, settings.config.rsbn)
     if not heard.observations:
@@ -356,10 +386,12 @@ _OF_LOCAL_POSITION: _Uses = {
     LocalPosition: _local_position,
     **_FIXES,
 }
-#: No position and no velocity of the autopilot's is among them, so none can be fed back to it.
+#: No position and no velocity of the autopilot's is among these two, so none can be fed back to it.
 _OF_AIR_DATA: _Uses = {Attitude: _sense, Pressure: _sense, AirData: _air_data, **_FIXES}
+_OF_STRAPDOWN: _Uses = {Attitude: _strap, Pressure: _strap, Imu: _imu, **_FIXES}
+_USES = {"local_position": _OF_LOCAL_POSITION, "air_data": _OF_AIR_DATA, "strapdown": _OF_STRAPDOWN}
 
 
 def uses(config: Config) -> _Uses:
     """What each kind of record is good for, by the inertial channel."""
-    return _OF_AIR_DATA if config.channel == "air_data" else _OF_LOCAL_POSITION
+    return _USES[config.channel]
