@@ -62,16 +62,13 @@ def chi2_95(freedom: Floats) -> Floats:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Assessment:
-    """All numbers of a report on one flight; `errors` by source as in `score`, times there ns since t = 0.
-
-    `shares`: of each phase the r.m.s. of error by bound; at most 1 where the bound held."""
+    """All numbers of a report on one flight; `errors` by source as in `score`, times there ns since t = 0."""
 
     flight: Flight
     origin: tuple[float, float]
     reference: Reference | None
     phases: list[score.Phase]
     rows: list[score.Row]
-    shares: list[float | None]
     errors: dict[str, score.Errors]
     ins_error: dict[str, Floats]
     misfits: list[Misfit]
@@ -92,11 +89,6 @@ def assess(flight: Flight) -> Assessment:
     reference = _reference(flight)
     phases = happenings.phases(flight.tables["Solution"], flight.seconds)
     errors = {} if reference is None else _errors(flight, reference)
-    shares = [_share(errors, phase) for phase in phases]
-    rows = [
-        row._replace(held=None if share is None else share <= 1.0)
-        for row, share in zip(score.table(errors, phases), shares, strict=True)
-    ]
     groups = happenings.groups(flight)
     outages = happenings.outages(flight)
     return Assessment(
@@ -104,8 +96,7 @@ def assess(flight: Flight) -> Assessment:
         origin=_origin(flight),
         reference=reference,
         phases=phases,
-        rows=rows,
-        shares=shares,
+        rows=score.table(errors, phases),
         errors=errors,
         ins_error=_ins_error(flight, reference),
         misfits=_misfits(flight, reference),
@@ -196,21 +187,6 @@ def _errors(flight: Flight, reference: Reference) -> dict[str, score.Errors]:
     return {source: found[source] for source in score.SOURCES if source in found and len(found[source].t_ns)}
 
 
-def _share(errors: dict[str, score.Errors], phase: score.Phase) -> float | None:
-    """The r.m.s. of error by bound over a phase, None without a bound.
-
-    Each moment by the bound of that moment: in the r.m.s. of either alone a wide bound at the start of a
-    phase would cover for a broken one at its end.
-    """
-    e = errors.get(score.CORRECTED)
-    if e is None:
-        return None
-    within = (e.t_ns >= phase.start_ns) & (e.t_ns < phase.end_ns) & np.isfinite(e.bound)
-    if not within.any():
-        return None
-    return float(np.sqrt(np.mean((e.error[within] / e.bound[within]) ** 2)))
-
-
 def _known(t: Floats, error: Floats, bound: Floats | None) -> score.Errors:
     known = np.isfinite(error)
     bound = np.full(len(t), np.nan) if bound is None else bound
@@ -240,7 +216,7 @@ def _misfits(flight: Flight, reference: Reference | None) -> list[Misfit]:
         if np.isfinite(fix["normalised"]).any():
             own = np.isfinite(fix["normalised"])
             two = np.full(int(own.sum()), 2.0)
-            found.append(Misfit("NIS as flown", fix["t"][own], fix["normalised"][own], two))
+            found.append(Misfit("NIS", fix["t"][own], fix["normalised"][own], two))
         else:
             found.append(_innovations(fix, solution))
         many = fix["freedom"] > 0

@@ -6,9 +6,9 @@ from pathlib import Path
 
 from companion.log import sources
 from companion.log.opened import LogError
-from companion.log.replay import CONVERTED, writer
+from companion.log.replay import writer
 from companion.log.sources import Summary
-from companion.log.variant import sentences
+from companion.log.variant import CONVERTED, sentences
 from companion.records import OUTPUTS
 
 

@@ -1,4 +1,4 @@
-"""A flight as arrays: one pass over its records, columns of numbers by kind, times by topic.
+"""Flights as arrays: one pass over the records of a log, columns of numbers by kind, times by topic.
 
 Times become seconds since the flight's first arrival, angles stay radians, absent stays NaN. It knows what a
 record holds and judges nothing; `assess` does.
@@ -9,27 +9,24 @@ from __future__ import annotations
 import math
 from array import array
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from companion.config import Config
-from companion.log import file, sources
-from companion.log.opened import ACTIVE, LogError
-from companion.log.replay import metadata as metadata_of
-from companion.navigator import FOLDED, Navigator
+from companion.log import file, latency
+from companion.log.latency import Latency
+from companion.navigator import FOLDED
 from companion.records import (
-    INPUTS,
     Event,
     FilterStatus,
     Fix,
     Gnss,
     LinkState,
     Mode,
+    Reboot,
     Rejection,
     Reset,
     RsbnFix,
@@ -73,14 +70,15 @@ class Refused(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Flight:
-    """All that a report needs of one log.
+    """All that a report needs of one flight, `part` k of n of the log `name`.
 
     `tables` holds columns (n,) by kind of record, "t" and "rx" (s) among them; a kind that never came has
-    columns of length 0. `unix_ns` is the wall-clock time of t = 0. `heard` are the records themselves that a
-    smoother wants, kept only where the log holds no truth.
+    columns of length 0. `unix_ns` is the wall-clock time of t = 0. `latencies` are of GNSS behind the
+    local position. `heard` are the records themselves that a smoother wants, kept where there is no truth.
     """
 
     name: str
+    part: tuple[int, int]
     unix_ns: int
     zero_ns: int
     seconds: float
@@ -89,6 +87,7 @@ class Flight:
     links: dict[str, Table]
     told: list[Told]
     refused: list[Refused]
+    latencies: list[Latency]
     heard: list[Stamped]
     metadata: dict[str, dict[str, str]]
     remarks: tuple[str, ...]
@@ -168,110 +167,99 @@ def gather(
     unix_ns: int | None = None,
     metadata: dict[str, dict[str, str]] | None = None,
     remarks: tuple[str, ...] = (),
-) -> Flight:
-    """The flight of `records`, each with its topic, in order of arrival; `unix_ns` is the wall-clock time of
-    the first (its own stamp where not told).
+) -> list[Flight]:
+    """The flights of `records`, each with its topic, in order of arrival: a reboot of the autopilot begins a
+    new one. `unix_ns` is the wall-clock time of the first record (its own stamp where not told).
 
     ValueError where there are none.
     """
-    columns = {kind: _Columns(names) for kind, (names, _) in COLUMNS.items()}
-    rows = {kind: row for kind, (_, row) in COLUMNS.items()}
-    links: dict[str, _Columns] = defaultdict(lambda: _Columns(_LINK))
-    times: dict[str, array[int]] = defaultdict(lambda: array("q"))
-    told: list[Stamped] = []
-    heard: list[Stamped] = []
-    last: dict[int, Gnss] = {}
-    zero_ns: int | None = None
-    end_ns = 0
+    parts = [_Gathered()]
     for topic, record in records:
-        if zero_ns is None:
-            zero_ns = record.rx_ns
-        end_ns = max(end_ns, record.rx_ns)
-        times[topic].extend((record.t_ns, record.rx_ns))
-        kind = type(record)
-        if isinstance(record, Gnss):
-            before, last[record.receiver] = last.get(record.receiver), record
-            if before is not None and record.repeats(before):
-                continue
-        if kind in FOLDED:
-            heard.append(record)
-        if kind in rows:
-            columns[kind].add(record, rows[kind](record))
-        elif isinstance(record, LinkState):
-            links[record.link].add(record, _link(record))
-        elif kind in (Event, Reset, Rejection):
-            told.append(record)
-    if zero_ns is None:
+        if isinstance(record, Reboot) and parts[-1].began:
+            parts.append(_Gathered())
+        parts[-1].see(topic, record)
+    if not parts[0].began:
         raise ValueError(f"{name} holds no record: there is nothing to report")
-    streams = {}
-    for topic, both in sorted(times.items()):
-        pair = _seconds(both, zero_ns)
-        streams[topic] = Stream(pair[:, 0], pair[:, 1])
-    return Flight(
-        name=name,
-        unix_ns=zero_ns if unix_ns is None else unix_ns,
-        zero_ns=zero_ns,
-        seconds=(end_ns - zero_ns) * 1e-9,
-        tables={kind.__name__: column.table(zero_ns) for kind, column in columns.items()},
-        streams=streams,
-        links={link: column.table(zero_ns) for link, column in sorted(links.items())},
-        told=[line for record in told if (line := _told(record, zero_ns)) is not None],
-        refused=[
-            Refused((r.t_ns - zero_ns) * 1e-9, r.source, r.reason, _number(r.value), _number(r.limit))
-            for r in told
-            if isinstance(r, Rejection)
-        ],
-        heard=[] if TRUTH in times else heard,
-        metadata=metadata or {},
-        remarks=remarks,
-    )
+    shift = 0 if unix_ns is None else unix_ns - parts[0].zero_ns
+    about = metadata or {}
+    return [
+        part.flight(name, (k, len(parts)), shift, about, remarks) for k, part in enumerate(parts, start=1)
+    ]
 
 
-def _told(record: Stamped, zero_ns: int) -> Told | None:
+class _Gathered:
+    """What was seen so far of one flight."""
+
+    def __init__(self) -> None:
+        self.began = False
+        self.zero_ns = self._end_ns = 0
+        self._columns = {kind: _Columns(names) for kind, (names, _) in COLUMNS.items()}
+        self._links: dict[str, _Columns] = defaultdict(lambda: _Columns(_LINK))
+        self._times: dict[str, array[int]] = defaultdict(lambda: array("q"))
+        self._told: list[Stamped] = []
+        self._heard: list[Stamped] = []
+        self._last: dict[int, Gnss] = {}
+        self._watch = latency.Watch()
+
+    def see(self, topic: str, record: Stamped) -> None:
+        """Take one record. A fix repeated at the stream's rate counts for the rate alone."""
+        if not self.began:
+            self.began, self.zero_ns = True, record.rx_ns
+        self._end_ns = max(self._end_ns, record.rx_ns)
+        self._times[topic].extend((record.t_ns, record.rx_ns))
+        if isinstance(record, Gnss):
+            before, self._last[record.receiver] = self._last.get(record.receiver), record
+            if before is not None and record.repeats(before):
+                return
+        kind = type(record)
+        if kind in FOLDED:
+            self._heard.append(record)
+            self._watch.see(record)
+        if kind in COLUMNS:
+            self._columns[kind].add(record, COLUMNS[kind][1](record))
+        elif isinstance(record, LinkState):
+            self._links[record.link].add(record, _link(record))
+        elif kind in (Event, Reset, Rejection):
+            self._told.append(record)
+
+    def flight(
+        self,
+        name: str,
+        part: tuple[int, int],
+        shift_ns: int,
+        metadata: dict[str, dict[str, str]],
+        remarks: tuple[str, ...],
+    ) -> Flight:
+        """All of it as arrays. What was heard is let go where the truth is known."""
+        pairs = {topic: _seconds(both, self.zero_ns) for topic, both in sorted(self._times.items())}
+        seen = [latency.look(track) for track in self._watch.tracks()]
+        lines = [_told(r, self.zero_ns) for r in self._told if isinstance(r, Event | Reset)]
+        glitches = [_told(event, self.zero_ns)._replace(kind="glitch") for event in latency.events(seen)]
+        found = {(line.t, line.text) for line in glitches}  # a replay has told them already
+        return Flight(
+            name=name,
+            part=part,
+            unix_ns=self.zero_ns + shift_ns,
+            zero_ns=self.zero_ns,
+            seconds=(self._end_ns - self.zero_ns) * 1e-9,
+            tables={kind.__name__: column.table(self.zero_ns) for kind, column in self._columns.items()},
+            streams={topic: Stream(pair[:, 0], pair[:, 1]) for topic, pair in pairs.items()},
+            links={link: column.table(self.zero_ns) for link, column in sorted(self._links.items())},
+            told=[*glitches, *(line for line in lines if (line.t, line.text) not in found)],
+            refused=[_refused(r, self.zero_ns) for r in self._told if isinstance(r, Rejection)],
+            latencies=[one.latency for one in seen if one.latency is not None],
+            heard=[] if TRUTH in self._times else self._heard,
+            metadata=metadata,
+            remarks=remarks,
+        )
+
+
+def _told(record: Event | Reset, zero_ns: int) -> Told:
     t = (record.t_ns - zero_ns) * 1e-9
-    match record:
-        case Event(_, _, severity, text):
-            return Told(t, "event", severity, text)
-        case Reset(_, _, what, reason):
-            return Told(t, "reset", 4, f"{what} began anew: {reason}")
-    return None
+    if isinstance(record, Event):
+        return Told(t, "event", record.severity, record.text)
+    return Told(t, "reset", 4, f"{record.what} began anew: {record.reason}")
 
 
-def open_flight(path: Path, config: Config | None = None) -> Flight:
-    """The flight in the log at `path`: our MCAP as it flew, or a foreign log with the navigator run over it.
-
-    `config` is what the navigator of a foreign log flies with. LogError or ValueError, one sentence each,
-    where the file cannot be read or holds nothing.
-    """
-    if path.suffix == ".mcap" or path.name.endswith(f".mcap{ACTIVE}"):
-        info = file.info(path)
-        first = next(iter(file.read(path)), None)
-        if first is None:
-            raise LogError(f"{path} holds no message: there is nothing to report")
-        torn = f"The log is torn: it was not closed, and {info.bytes_lost} bytes at its end are lost."
-        remarks = () if info.closed else (torn,)
-        return gather(_own(path), path.name, unix_ns=first.log_time, metadata=info.metadata, remarks=remarks)
-    if not path.exists():
-        raise LogError(f"{path}: no such log")
-    flown = config or Config()
-    remark = "Another recorder's log: the navigator was run over it for this report."
-    return gather(_foreign(path, flown), path.name, metadata=metadata_of(flown), remarks=(remark,))
-
-
-def _own(path: Path) -> Iterator[tuple[str, Stamped]]:
-    for entry in file.read(path):
-        if not isinstance(entry.value, bytes):
-            yield entry.topic, entry.value
-
-
-def _foreign(path: Path, config: Config) -> Iterator[tuple[str, Stamped]]:
-    navigator = Navigator(config)
-    for record in sources.open_source(path):
-        if isinstance(record, INPUTS):
-            yield file.topic_of(type(record)), record
-            for output in navigator.handle(record):  # type: ignore[arg-type]
-                yield file.topic_of(type(output)), output
-        elif isinstance(record, Truth | LinkState):
-            yield file.topic_of(type(record)), record
-        else:
-            yield f"/link/{type(record).__name__}", record
+def _refused(r: Rejection, zero_ns: int) -> Refused:
+    return Refused((r.t_ns - zero_ns) * 1e-9, r.source, r.reason, _number(r.value), _number(r.limit))

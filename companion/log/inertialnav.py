@@ -77,7 +77,7 @@ def read_tables(path: Path) -> Iterator[Stamped]:
     """
     columns = {name: _table(path, name, width) for name, width in _WIDTHS.items()}
     fixes, onboard = list(_fixes(columns["GPSraw"])), list(_onboard(columns["GPOSonboard"]))
-    told: list[Event] = list(latency.events(latency.watch([*onboard, *fixes])))
+    told: list[Event] = list(latency.events(map(latency.look, latency.watch([*onboard, *fixes]))))
     return heapq.merge(onboard, fixes, _imu(columns["IMU"]), told, key=lambda record: record.t_ns)
 
 

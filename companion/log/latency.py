@@ -180,12 +180,25 @@ def glitches(track: Track, latency: float = 0.0) -> list[Glitch]:
     return found
 
 
-def events(tracks: Iterable[Track]) -> Iterator[Event]:
+class Seen(NamedTuple):
+    """What a track told: `zero_ns` is its time 0; `latency` None where it cannot be told."""
+
+    zero_ns: int
+    latency: Latency | None
+    glitches: list[Glitch]
+
+
+def look(track: Track) -> Seen:
+    """The delay of a track and, that allowed for, its glitches."""
+    delay = estimate(track)
+    return Seen(track.zero_ns, delay, glitches(track, delay.seconds if delay else 0.0))
+
+
+def events(seen: Iterable[Seen]) -> Iterator[Event]:
     """A line for each glitch, at its beginning; t_ns and rx_ns are the fix's."""
-    for track in tracks:
-        delay = estimate(track)
-        for glitch in glitches(track, delay.seconds if delay else 0.0):
-            at_ns = track.zero_ns + round(glitch.start * 1e9)
+    for one in seen:
+        for glitch in one.glitches:
+            at_ns = one.zero_ns + round(glitch.start * 1e9)
             yield Event(
                 at_ns,
                 at_ns,
@@ -195,16 +208,22 @@ def events(tracks: Iterable[Track]) -> Iterator[Event]:
             )
 
 
-def sentences(tracks: Iterable[Track]) -> Iterator[str]:
+def sentences(seen: Iterable[Seen]) -> Iterator[str]:
     """For a person: the delay of each boot that can be told, then its glitches."""
-    for track in tracks:
-        if found := estimate(track):
-            yield (
-                f"GNSS is {found.seconds:.2f} s (sigma {found.sigma:.2f}) behind the local position: median"
-                f" distance {found.before:.2f} m, {found.after:.2f} m without it ({found.pairs} fixes)"
-            )
-        for event in events([track]):
-            yield f"{(event.t_ns - track.zero_ns) * 1e-9:.1f} s after the first: {event.text}"
+    for one in seen:
+        if one.latency:
+            yield sentence(one.latency)
+        for event in events([one]):
+            yield f"{(event.t_ns - one.zero_ns) * 1e-9:.1f} s after the first: {event.text}"
+
+
+def sentence(found: Latency) -> str:
+    """A delay for a person."""
+    side = "behind" if found.seconds >= 0.0 else "ahead of"
+    return (
+        f"GNSS is {abs(found.seconds):.2f} s (sigma {found.sigma:.2f}) {side} the local position: median"
+        f" distance {found.before:.2f} m, {found.after:.2f} m without it ({found.pairs} fixes)"
+    )
 
 
 def _delay(track: Track, t: Floats, x: Floats) -> float:

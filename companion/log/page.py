@@ -10,12 +10,14 @@ from collections.abc import Callable, Iterable, Sequence
 from datetime import UTC, datetime
 from html import escape
 from importlib.resources import files
+from typing import NamedTuple
 
 from companion import __version__
 from companion.log import score
 from companion.log.assess import Assessment
 from companion.log.draw import interactive
-from companion.log.plot import LETTERS, Figure
+from companion.log.latency import sentence
+from companion.log.plot import Figure
 from companion.log.replay import CONFIGURATION
 from companion.log.verdict import clock, comparison, lasting, metres, verdict
 
@@ -35,13 +37,83 @@ BOOTED_NS = 10**18  # a clock before 2001 counts from power-up
 EVENTS = 400  # lines shown of a log's events
 
 
-def page(flights: Sequence[Assessment], names: Sequence[str], figures: Sequence[Figure]) -> str:
-    """The whole HTML. ModuleNotFoundError where plotly is missing."""
+class Block(NamedTuple):
+    """What stands together: one flight, or two to be compared, their names and their figures."""
+
+    names: Sequence[str]
+    flights: Sequence[Assessment]
+    figures: Sequence[Figure]
+
+
+def page(title: str, blocks: Sequence[Block]) -> str:
+    """The whole HTML: all verdicts first, then the chapters of each block.
+
+    ModuleNotFoundError where plotly is missing.
+    """
     from plotly.offline import get_plotlyjs
 
-    drawn = {figure.key: figure for figure in figures}
-    if len(flights) == 2:
-        names = [f"{letter}: {name}" for letter, name in zip(LETTERS, names, strict=True)]
+    here = files("companion.log")
+    keys = [f"flight{k}_" for k in range(1, len(blocks) + 1)] if len(blocks) > 1 else [""]
+    drawn = {
+        key + figure.key: interactive(figure) for key, block in zip(keys, blocks) for figure in block.figures
+    }
+    data = json.dumps(drawn, separators=(",", ":"))
+    data = data.replace("</", r"<\/")  # no name in a log may end the script
+    return "".join(
+        (
+            "<!doctype html>\n<html lang='en'><head><meta charset='utf-8'>",
+            "<meta name='viewport' content='width=device-width, initial-scale=1'>",
+            "<link rel='icon' href='data:,'>",
+            f"<title>{escape(title)}: flight report</title>",
+            f"<style>{here.joinpath('page.css').read_text('utf-8')}</style></head><body>",
+            _head(title, blocks),
+            *(_block(key, block, len(blocks) > 1) for key, block in zip(keys, blocks)),
+            f"<footer>companion {__version__}</footer>",
+            f"<script>{get_plotlyjs()}</script>",
+            f"<script type='application/json' id='figures'>{data}</script>",
+            f"<script>{here.joinpath('page.js').read_text('utf-8')}</script></body></html>\n",
+        )
+    )
+
+
+def _head(title: str, blocks: Sequence[Block]) -> str:
+    parts = [f"<header><p class='kind'>Flight report</p><h1>{escape(title)}</h1>"]
+    if len(blocks) > 1:
+        parts.append(
+            f"<p class='when'>The autopilot began anew {_times(len(blocks) - 1)}: the log holds "
+            f"{len(blocks)} flights, each with chapters of its own.</p>"
+        )
+    for block in blocks:
+        if len(block.flights) == 2:
+            parts.append(f"<p class='verdict'>{escape(comparison(*block.flights))}</p>")
+        for a, name in zip(block.flights, block.names, strict=True):
+            named = f"<b class='log'>{escape(name)}</b>" if len(blocks) + len(block.flights) > 2 else ""
+            parts.append(_summary(a, named))
+    parts.append("<p class='when'>Drag across a plot to zoom, double-click to see all of it again.</p>")
+    return "".join(parts) + "</header>"
+
+
+def _times(n: int) -> str:
+    return {1: "once", 2: "twice"}.get(n, f"{n} times")
+
+
+def _summary(a: Assessment, named: str) -> str:
+    """Verdict, tiles and date of one flight."""
+    when = "Date unknown"
+    if a.flight.unix_ns > BOOTED_NS:
+        when = datetime.fromtimestamp(a.flight.unix_ns * 1e-9, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
+    version = a.flight.metadata.get("companion", {}).get("version")
+    flown = f", flown by companion {escape(version)}" if version else ""
+    warn = " bad" if any(row.held is False for row in a.rows) else ""
+    return (
+        f"<p class='verdict{warn}'>{named}{escape(verdict(a))}</p>{_tiles(a)}"
+        f"<p class='when'>{when}{flown}; times count from its first message.</p>"
+    )
+
+
+def _block(key: str, block: Block, headed: bool) -> str:
+    """The chapters of one block; `key` begins the ids of its parts."""
+    drawn = {figure.key: figure for figure in block.figures}
     tables = {
         "Errors": _phases,
         "Consistency": _consistency,
@@ -52,58 +124,26 @@ def page(flights: Sequence[Assessment], names: Sequence[str], figures: Sequence[
     }
     chapters = []
     for title, keys in CHAPTERS:
-        inner = "".join(_figure(drawn[key]) for key in keys if key in drawn)
+        inner = "".join(_figure(key, drawn[k]) for k in keys if k in drawn)
         if title in tables:
-            inner += _beside(flights, names, tables[title])
-        if title == "Configuration" and len(flights) == 2:
-            inner = _differences(flights, names) + inner
+            inner += _beside(block, tables[title])
+        if title == "Configuration" and len(block.flights) == 2:
+            inner = _differences(block.flights, block.names) + inner
         if inner:
-            chapters.append((title, inner))
-    here = files("companion.log")
-    data = json.dumps({key: interactive(figure) for key, figure in drawn.items()}, separators=(",", ":"))
-    data = data.replace("</", r"<\/")  # no name in a log may end the script
+            chapters.append((title, key + title.lower().replace(" ", "-"), inner))
     return "".join(
         (
-            "<!doctype html>\n<html lang='en'><head><meta charset='utf-8'>",
-            "<meta name='viewport' content='width=device-width, initial-scale=1'>",
-            "<link rel='icon' href='data:,'>",
-            f"<title>{escape(' and '.join(names))}: flight report</title>",
-            f"<style>{here.joinpath('page.css').read_text('utf-8')}</style></head><body>",
-            _head(flights, names),
+            f"<h2 class='flight'>{escape(block.names[0])}</h2>" if headed else "",
             "<nav>",
-            *(f"<a href='#{_anchor(title)}'>{title}</a>" for title, _ in chapters),
+            *(f"<a href='#{anchor}'>{title}</a>" for title, anchor, _ in chapters),
             "</nav><main>",
-            *(f"<section id='{_anchor(t)}'><h2>{t}</h2>{inner}</section>" for t, inner in chapters),
-            f"</main><footer>companion {__version__}</footer>",
-            f"<script>{get_plotlyjs()}</script>",
-            f"<script type='application/json' id='figures'>{data}</script>",
-            f"<script>{here.joinpath('page.js').read_text('utf-8')}</script></body></html>\n",
+            *(
+                f"<section id='{anchor}'><h2>{title}</h2>{inner}</section>"
+                for title, anchor, inner in chapters
+            ),
+            "</main>",
         )
     )
-
-
-def _anchor(title: str) -> str:
-    return title.lower().replace(" ", "-")
-
-
-def _head(flights: Sequence[Assessment], names: Sequence[str]) -> str:
-    parts = ["<header><p class='kind'>Flight report</p>"]
-    parts.append(f"<h1>{'<br>'.join(escape(name) for name in names)}</h1>")
-    if len(flights) == 2:
-        parts.append(f"<p class='verdict'>{escape(comparison(flights[0], flights[1]))}</p>")
-    for a, name in zip(flights, names, strict=True):
-        when = "Date unknown"
-        if a.flight.unix_ns > BOOTED_NS:
-            when = datetime.fromtimestamp(a.flight.unix_ns * 1e-9, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
-        title = f"<b class='log'>{escape(name)}</b>" if len(flights) == 2 else ""
-        warn = " bad" if any(row.held is False for row in a.rows) else ""
-        parts.append(f"<p class='verdict{warn}'>{title}{escape(verdict(a))}</p>")
-        parts.append(_tiles(a))
-        version = a.flight.metadata.get("companion", {}).get("version")
-        flown = f", flown by companion {escape(version)}" if version else ""
-        parts.append(f"<p class='when'>{when}{flown}; times count from its first message.</p>")
-    parts.append("<p class='when'>Drag across a plot to zoom, double-click to see all of it again.</p>")
-    return "".join(parts) + "</header>"
 
 
 def _tiles(a: Assessment) -> str:
@@ -120,17 +160,17 @@ def _tiles(a: Assessment) -> str:
     return f"<dl class='tiles'>{inner}</dl>"
 
 
-def _figure(figure: Figure) -> str:
+def _figure(key: str, figure: Figure) -> str:
     note = f"<p class='note'>{escape(figure.note)}</p>" if figure.note else ""
     kind = "plot equal" if figure.equal else "plot rows" if figure.rows else "plot"
     caption = f"<figcaption>{escape(figure.title)}</figcaption>"
-    return f"<figure>{caption}<div class='{kind}' id='plot-{figure.key}'></div>{note}</figure>"
+    return f"<figure>{caption}<div class='{kind}' id='plot-{key}{figure.key}'></div>{note}</figure>"
 
 
-def _beside(flights: Sequence[Assessment], names: Sequence[str], table: Callable[[Assessment], str]) -> str:
+def _beside(block: Block, table: Callable[[Assessment], str]) -> str:
     """A table of each flight, under its name where there are two."""
-    inner = [(name, table(a)) for a, name in zip(flights, names, strict=True)]
-    if len(flights) == 1:
+    inner = [(name, table(a)) for a, name in zip(block.flights, block.names, strict=True)]
+    if len(inner) == 1:
         return inner[0][1]
     return "".join(f"<h3>{escape(name)}</h3>{html}" for name, html in inner if html)
 
@@ -157,7 +197,7 @@ def _phases(a: Assessment) -> str:
     if not a.rows or not a.errors:
         return "<p class='note'>No error can be told: there is no truth and no track to smooth.</p>"
     sources = [source for source in score.SOURCES if source in a.errors]
-    head = ["phase", "from", "lasts", *sources, "bound, r.m.s.", "error / bound", "held", "within"]
+    head = ["phase", "from", "lasts", *sources, "bound, r.m.s.", "error / bound", "held", "within", "twice"]
     rows: list[list[str]] = []
     for row, phase in zip(a.rows, a.phases, strict=True):
         cells = [row.phase, clock(phase.start_ns * 1e-9), lasting(row.seconds)]
@@ -165,17 +205,16 @@ def _phases(a: Assessment) -> str:
             known = source in row.rms
             cells.append(_both(row.rms[source], row.p95[source]) if known else "–")
         cells.append("–" if row.bound is None else metres(row.bound))
-        share = a.shares[len(rows)]
-        cells.append("–" if share is None else f"{share:.2f}")
+        cells.append("–" if row.share is None else f"{row.share:.2f}")
         cells.append("–" if row.held is None else "yes" if row.held else "NO")
-        cells.append("–" if row.inside is None else f"{100.0 * row.inside:.0f} %")
+        cells += ["–" if k is None else f"{100.0 * k:.0f} %" for k in (row.inside, row.inside_twice)]
         rows.append(cells)
     said = (
         "" if a.reference is None else f"Horizontal, against {a.reference.what}: r.m.s. / 95th percentile. "
     )
     note = (
-        f"{said}Error / bound: each moment's error by its own bound, r.m.s., held if at most 1; "
-        "within: the share of moments inside the bound."
+        f"{said}The bound is on the r.m.s. error: it held where error / bound, both r.m.s. over the phase, "
+        "is at most 1. Within, twice: the share of moments inside the bound and inside twice the bound."
     )
     return _table(head, rows, "cards") + f"<p class='note'>{escape(note)}</p>"
 
@@ -238,10 +277,9 @@ def _messages(a: Assessment) -> str:
     ]
     if links:
         table += _table(("link", "received", "lost", "bad", "dropped"), links, "small")
-    return (
-        table
-        + "<p class='note'>Gap: the longest between two arrivals. Latency: median / 95th percentile.</p>"
-    )
+    told = [sentence(found) + "." for found in a.flight.latencies]
+    note = " ".join(["Gap: the longest between two arrivals. Latency: median / 95th percentile.", *told])
+    return f"{table}<p class='note'>{escape(note)}</p>"
 
 
 def _events(a: Assessment) -> str:

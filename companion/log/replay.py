@@ -25,22 +25,61 @@ from companion import __version__
 from companion.config import Config, load, parse, to_toml
 from companion.log import file, latency, simulate
 from companion.log.opened import LogError
-from companion.log.variant import changed, is_own, sentences, with_radio
+from companion.log.variant import changed, has_flown, is_own, sentences, with_radio
 from companion.navigator import Navigator
-from companion.records import INPUTS, OUTPUTS, Event, Solution, Stamped
+from companion.records import INPUTS, OUTPUTS, Event, Reboot, Solution, Stamped
 
 CONFIGURATION = "configuration"  # the metadata record, and its key `toml`
-CONVERTED = "converted"  # the metadata record of a log that never flew with us, and its key `from`
+
+
+class Part(NamedTuple):
+    """A flight of the log: from, to (s since the log's first input), inputs and solutions."""
+
+    start_s: float
+    end_s: float
+    inputs: int
+    solutions: int
 
 
 class Replayed(NamedTuple):
-    """What a replay saw. Of `compared` outputs `different` are not as in flight."""
+    """What a replay saw; a reboot begins a flight. Of `compared` outputs `different` are not as in flight."""
 
     inputs: int
     outputs: dict[str, int]
+    flights: list[Part]
     compared: int | None
     different: int
     first_difference: str | None
+
+
+class _Count:
+    """Counts what goes into a navigator and what comes out, by flight."""
+
+    def __init__(self) -> None:
+        self.outputs = Counter[str]()
+        self._start_ns: int | None = None
+        self._parts: list[Part] = []
+
+    def input(self, record: Stamped) -> None:
+        """Count one input."""
+        if self._start_ns is None:
+            self._start_ns = record.rx_ns
+        t = (record.rx_ns - self._start_ns) * 1e-9
+        if not self._parts or isinstance(record, Reboot):
+            self._parts.append(Part(t, t, 0, 0))
+        last = self._parts[-1]
+        self._parts[-1] = last._replace(end_s=max(t, last.end_s), inputs=last.inputs + 1)
+
+    def output(self, record: Stamped) -> None:
+        """Count one output."""
+        self.outputs[type(record).__name__] += 1
+        if isinstance(record, Solution):
+            self._parts[-1] = self._parts[-1]._replace(solutions=self._parts[-1].solutions + 1)
+
+    def found(self, compared: int | None, different: int = 0, first: str | None = None) -> Replayed:
+        """Everything counted."""
+        inputs = sum(part.inputs for part in self._parts)
+        return Replayed(inputs, dict(self.outputs), self._parts, compared, different, first)
 
 
 def metadata(config: Config) -> dict[str, dict[str, str]]:
@@ -56,7 +95,7 @@ def configuration(path: Path) -> Config:
 
 def replay_own(path: Path, config: Config, sink: Any = None) -> Replayed:
     """Hand the log's inputs to a navigator and compare what comes out with what came out in flight."""
-    navigator, count, outputs = Navigator(config), Counter[str](), Counter[str]()
+    navigator, count = Navigator(config), _Count()
     compared = different = 0
     first: str | None = None
     ours: list[Stamped] = []
@@ -73,35 +112,34 @@ def replay_own(path: Path, config: Config, sink: Any = None) -> Replayed:
         ours.clear()
 
     for entry in file.read(path):
-        direction = entry.topic.split("/")[1]
-        if direction == "in":
+        if entry.topic.startswith("/in/") and isinstance(entry.value, Stamped):
             settle()
-            count["in"] += 1
+            count.input(entry.value)
             if sink is not None:
                 sink.record(entry.value)
-            ours += navigator.handle(entry.value)
+            ours += navigator.handle(entry.value)  # type: ignore[arg-type]
             for output in ours:
-                outputs[type(output).__name__] += 1
+                count.output(output)
                 if sink is not None:
                     sink.record(output)
-        elif direction == "out":
+        elif entry.topic.startswith("/out/") and isinstance(entry.value, Stamped):
             flown.append(entry.value)
     settle()
-    return Replayed(count["in"], dict(outputs), compared, different, first)
+    return count.found(compared, different, first)
 
 
 def replay_foreign(records: Iterable[Stamped], config: Config, sink: Any) -> Replayed:
     """Hand the records of a foreign log to a navigator, and write everything to `sink`."""
-    navigator, outputs, inputs = Navigator(config), Counter[str](), 0
+    navigator, count = Navigator(config), _Count()
     for record in records:
         told = isinstance(record, OUTPUTS)  # by the source, not by the navigator
         sink.record(record, f"/link/{type(record).__name__}" if told else None)
         if isinstance(record, INPUTS):
-            inputs += 1
+            count.input(record)
             for output in navigator.handle(record):  # type: ignore[arg-type]
-                outputs[type(output).__name__] += 1
+                count.output(output)
                 sink.record(output)
-    return Replayed(inputs, dict(outputs), None, 0, None)
+    return count.found(None)
 
 
 def writer(
@@ -158,7 +196,7 @@ def command(
         config = changed(config, text)
     notes: list[str] = []
     counts: dict[str, int] = {}
-    if own and CONVERTED not in file.metadata(log) and not (changes or beacons or silent):
+    if has_flown(log) and not (changes or beacons or silent):
         found = _compare(log, output, config)
     else:
         output = output or Path(f"{log.name.split('.mcap')[0] if own else log.stem}.replay.mcap")
@@ -167,6 +205,7 @@ def command(
     seconds = time.perf_counter() - begun
     if as_json:
         report = {"log": str(log), **counts, **found._asdict(), "notes": notes, "seconds": round(seconds, 3)}
+        report["flights"] = [part._asdict() for part in found.flights]
         click.echo(json.dumps(report))
     else:
         _print(log, output, counts, found, seconds)
@@ -206,15 +245,15 @@ def _fly(
         sink = writer(output, metadata(config), *_start(log))
         try:
             found = replay_foreign(records, config, sink)
-            tracks = watch.tracks()
-            for event in set(latency.events(tracks)) - told:
+            seen = [latency.look(track) for track in watch.tracks()]
+            for event in set(latency.events(seen)) - told:
                 sink.record(event, "/link/Event")
         finally:
             sink.close()
     notes = [note] if note else []
     if outages:
         notes.append("the log's local position is as the autopilot had it, its own GNSS included")
-    return found, [*notes, *latency.sentences(tracks)], opened.summary()
+    return found, [*notes, *latency.sentences(seen)], opened.summary()
 
 
 def _start(log: Path) -> tuple[int, int]:
@@ -240,6 +279,11 @@ def _print(log: Path, output: Path | None, counts: dict[str, int], found: Replay
     click.echo(
         "  out: " + (", ".join(f"{n} {name}" for name, n in sorted(found.outputs.items())) or "nothing")
     )
+    if len(found.flights) > 1:
+        click.echo(f"  {len(found.flights)} flights, the autopilot having begun anew in between:")
+        for k, part in enumerate(found.flights, start=1):
+            span = f"{part.start_s:.1f} to {part.end_s:.1f} s"
+            click.echo(f"    {k}: {span}, {part.inputs} inputs, {part.solutions} solutions")
     if not found.outputs.get(Solution.__name__):
         click.echo("  no solution: the log has no local position with an origin, or no fix that was believed")
     if found.compared is not None:

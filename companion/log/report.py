@@ -6,17 +6,20 @@ memory. Errors are counted from the log's own truth, or else from the track smoo
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import click
 
-from companion.config import ConfigError, load
+from companion.config import load
 from companion.log.assess import assess
 from companion.log.draw import printed
 from companion.log.figures import figures
-from companion.log.gather import open_flight
+from companion.log.flights import open_flights
+from companion.log.gather import Flight
 from companion.log.opened import LogError
-from companion.log.page import page
+from companion.log.page import Block, page
+from companion.log.plot import LETTERS, Figure
 from companion.log.verdict import verdict
 
 
@@ -31,29 +34,65 @@ from companion.log.verdict import verdict
 def command(
     logs: tuple[Path, ...], output: Path, pdf: Path | None, png: Path | None, config_file: Path | None
 ) -> None:
-    """Write a page about LOG, or about two logs compared: our MCAP, a MAVLink .tlog, a folder of topics."""
+    """Write a page about LOG, or about two logs compared: our MCAP, or any other that `replay` reads.
+
+    Where the autopilot began anew, a log holds several flights: each has its chapters, and of two logs the
+    longest flights are compared.
+    """
     if len(logs) > 2:
         raise click.UsageError(f"{len(logs)} logs were given: a report is about one, or compares two")
     config = load(config_file) if config_file else None
+    found = [open_flights(path, config) for path in logs]
+    blocks = compared(found, _names(logs)) if len(logs) == 2 else alone(found[0])
     try:
-        flights = [assess(open_flight(path, config)) for path in logs]
-    except (LogError, ConfigError):
-        raise
-    except ValueError as error:
-        raise LogError(str(error)) from None
-    drawn = figures(flights)
-    try:
-        output.write_text(page(flights, _names(logs), drawn), encoding="utf-8")
-        written = [output, *(printed(drawn, pdf, png) if pdf or png else [])]
+        output.write_text(page(" and ".join(_names(logs)), blocks), encoding="utf-8")
+        written = [output, *(printed(_all_figures(blocks), pdf, png) if pdf or png else [])]
     except ModuleNotFoundError as error:
         raise LogError(
             f"a report needs {error.name}: install it by `pip install 'navigation-companion[report]'`"
         ) from None
     except OSError as error:
         raise LogError(f"cannot write the report to {error.filename}: {error.strerror}") from None
-    for flight in flights:
-        click.echo(verdict(flight))
+    for block in blocks:
+        for flight in block.flights:
+            click.echo(verdict(flight))
     click.echo(f"written: {', '.join(str(path) for path in written)}")
+
+
+def alone(flights: Sequence[Flight]) -> list[Block]:
+    """A block for each flight of one log."""
+    blocks = []
+    for flight in flights:
+        a = assess(flight)
+        blocks.append(Block([_called(flight, flight.name)], [a], figures([a])))
+    return blocks
+
+
+def compared(logs: Sequence[Sequence[Flight]], names: Sequence[str]) -> list[Block]:
+    """One block with the longest flight of each of two logs."""
+    chosen = [max(flights, key=lambda flight: flight.seconds) for flights in logs]
+    called = [
+        f"{letter}: {_called(flight, name)}"
+        for letter, flight, name in zip(LETTERS, chosen, names, strict=True)
+    ]
+    both = [assess(flight) for flight in chosen]
+    return [Block(called, both, figures(both))]
+
+
+def _called(flight: Flight, name: str) -> str:
+    k, n = flight.part
+    return name if n == 1 else f"{name}, flight {k} of {n}"
+
+
+def _all_figures(blocks: Sequence[Block]) -> list[Figure]:
+    """Those of all blocks for paper, told apart by the flight."""
+    if len(blocks) == 1:
+        return list(blocks[0].figures)
+    return [
+        figure._replace(key=f"flight{k}_{figure.key}", title=f"Flight {k}. {figure.title}")
+        for k, block in enumerate(blocks, start=1)
+        for figure in block.figures
+    ]
 
 
 def _names(logs: tuple[Path, ...]) -> list[str]:

@@ -21,6 +21,8 @@ from companion.log import file, simulate, sources
 from companion.log.opened import ACTIVE, LogError
 from companion.records import Stamped
 
+CONVERTED = "converted"  # the metadata record of a log that never flew with us, and its key `from`
+
 
 def changed(config: Config, text: str) -> Config:
     """`config` with KEY=VALUE,... as typed: SECTION.KEY, or KEY alone where one section has it, or
@@ -75,9 +77,14 @@ def is_own(log: Path) -> bool:
     return log.suffix == ".mcap" or log.name.endswith(f".mcap{ACTIVE}")
 
 
+def has_flown(log: Path) -> bool:
+    """Whether a log is of ours and holds what a navigator gave out: it is no other recorder's, converted."""
+    return is_own(log) and CONVERTED not in file.metadata(log)
+
+
 def _own_inputs(log: Path) -> Iterator[Stamped]:
     for entry in file.read(log):
-        if entry.topic.split("/")[1] in ("in", "truth"):
+        if entry.topic.startswith(("/in/", "/truth/", "/link/")) and isinstance(entry.value, Stamped):
             yield entry.value
 
 

@@ -16,6 +16,8 @@ from companion.log.plot import LETTERS
 
 WITHOUT_FIXES = ("prediction", "untrusted")
 SHORT_S = 30.0  # what happens in less is not worth a sentence
+CHEBYSHEV = 0.75  # of moments, at least, lie within twice a bound on the r.m.s. that is right
+LATE_S = 0.1  # GNSS behind the local position by less is usual
 FLAT_M = 1.0  # nearer than this to each other, two errors are the same
 
 
@@ -75,13 +77,14 @@ def comparison(a: Assessment, b: Assessment) -> str:
 
 
 def _flown(a: Assessment) -> list[str]:
-    seconds = a.flight.seconds
+    seconds, (k, n) = a.flight.seconds, a.flight.part
+    lasts = f"The log holds {lasting(seconds)}" if n == 1 else f"Flight {k} of {n} lasts {lasting(seconds)}"
     if not len(a.flight.tables["Solution"]["t"]):
         return [
-            f"The log holds {lasting(seconds)} but no estimate: there was no local position with its origin, "
-            "or no fix that was believed."
+            f"{lasts} but no estimate: there was no inertial channel (a local position with its origin, or "
+            "airspeed with attitude), or no fix that was believed."
         ]
-    sentences = [f"The log holds {lasting(seconds)}."]
+    sentences = [f"{lasts}."]
     started = float(a.flight.tables["Solution"]["t"][0])
     holes = [hole for hole in a.outages if hole.end > started]
     if not holes:
@@ -145,11 +148,12 @@ def _bound(a: Assessment) -> list[str]:
             f"The guaranteed bound{reached} held in every phase; the error was within it {_percent(inside)} "
             "of the time."
         ]
-    share, worst = max((a.shares[a.rows.index(row)] or 0.0, row.phase) for row in broken)
+    worst = max(broken, key=lambda row: row.share or 0.0)
+    judged = sum(row.held is not None for row in a.rows)
     return [
-        f"The guaranteed bound{reached} DID NOT HOLD in {len(broken)} of {len(a.rows)} phases: in the phase "
-        f"“{worst}” the error was {share:.2f} times the bound, r.m.s. The error was within the bound "
-        f"{_percent(inside)} of the time."
+        f"The guaranteed bound{reached} DID NOT HOLD in {len(broken)} of {judged} phases: in the phase "
+        f"“{worst.phase}” the error was {worst.share:.2f} times the bound, r.m.s. The error was within the "
+        f"bound {_percent(inside)} of the time."
     ]
 
 
@@ -183,6 +187,11 @@ def _odd(a: Assessment) -> list[str]:
                 f"in the phase “{row.phase}” the corrected estimate ({metres(corrected)}) was worse than the "
                 f"inertial channel alone ({metres(ins)})"
             )
+        if row.inside_twice is not None and row.inside_twice < CHEBYSHEV:
+            found.append(
+                f"in the phase “{row.phase}” the error was within twice the bound of its moment only "
+                f"{_percent(row.inside_twice)} of the time, where 75 % are due"
+            )
     for misfit in a.misfits:
         if misfit.inside < 0.85:
             share = _percent(misfit.inside)
@@ -192,7 +201,13 @@ def _odd(a: Assessment) -> list[str]:
         found.append(f"{len(resets)} reset{'s' * (len(resets) > 1)}, the first at {clock(resets[0].t)}")
     glitches = [line for line in a.timeline if line.kind == "glitch"]
     if glitches:
-        found.append(f"the autopilot reported a GNSS glitch, first at {clock(glitches[0].t)}")
+        more = f", the first of {len(glitches)}" if len(glitches) > 1 else ""
+        found.append(f"{glitches[0].text} (at {clock(glitches[0].t)}{more})")
+    found += [
+        f"GNSS came {one.seconds:.2f} s behind the local position"
+        for one in a.flight.latencies
+        if one.seconds > max(LATE_S, 3.0 * one.sigma)
+    ]
     return [f"Odd: {'; '.join(dict.fromkeys(found))}."] if found else []
 
 

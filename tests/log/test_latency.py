@@ -111,7 +111,7 @@ def test_boots_are_told_apart() -> None:
     assert len(found) == 2
     for each in found:
         assert each is not None and each.seconds == pytest.approx(0.3, abs=0.02)
-    lines = list(latency.sentences(latency.watch(told)))
+    lines = list(latency.sentences(map(latency.look, latency.watch(told))))
     assert len(lines) == 2 and lines[0].startswith("GNSS is 0.30 s")
 
 

@@ -82,14 +82,17 @@ def test_a_phase_is_summed_by_its_own_instants() -> None:
         math.sqrt(sum(t * t for t in range(10)) / 10), rel=1e-5
     )
     assert first.p95[score.CORRECTED] == pytest.approx(np.percentile(range(10), 95.0), rel=1e-5)
-    assert (first.held, first.inside, first.bound) == (True, 1.0, 10.5)
-    assert last.held is False and last.inside == pytest.approx(0.1)
+    assert (first.held, first.inside, first.inside_twice, first.bound) == (True, 1.0, 1.0, 10.5)
+    assert first.share == pytest.approx(first.rms[score.CORRECTED] / 10.5)
+    assert last.held is False and last.inside == pytest.approx(0.1) and last.inside_twice == 1.0
     assert last.seconds == 10.0
 
 
 def test_a_phase_without_records_has_no_numbers() -> None:
     (row,) = score.table(score.errors([solution(1.0, 1.0, 0.0)], truth), [score.Phase("late", 50, 60)])
-    assert row.rms == {} and row.bound is None and row.held is None and row.inside is None
+    assert (
+        row.rms == {} and row.bound is None and row.share is None and row.held is None and row.inside is None
+    )
 
 
 @settings(deadline=None, max_examples=50)

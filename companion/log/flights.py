@@ -1,0 +1,71 @@
+"""Any log as the flights it holds: as they flew with us, or with the navigator run over what was recorded.
+
+An MCAP of ours holds what came out of the navigator. Another recorder's log, and an MCAP converted from one,
+holds inputs only: the navigator is run over it here, in memory.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+from companion.config import Config
+from companion.log import file
+from companion.log.gather import Flight, gather
+from companion.log.opened import LogError
+from companion.log.replay import metadata
+from companion.log.variant import has_flown, inputs, is_own, sentences
+from companion.navigator import Navigator
+from companion.records import INPUTS, OUTPUTS, Stamped
+
+
+def open_flights(path: Path, config: Config | None = None) -> list[Flight]:
+    """The flights in the log at `path`; `config` is what the navigator flies with where none flew.
+
+    LogError, one sentence, where the file cannot be read or holds nothing.
+    """
+    with sentences():
+        first_unix_ns, remarks = None, list[str]()
+        if is_own(path):
+            info = file.info(path)
+            first = next(iter(file.read(path)), None)
+            if first is None:
+                raise LogError(f"{path} holds no message: there is nothing to report")
+            first_unix_ns = first.log_time
+            if not info.closed:
+                lost = f"{info.bytes_lost} bytes at its end are lost"
+                remarks.append(f"The log is torn: it was not closed, and {lost}.")
+            if has_flown(path):
+                return gather(
+                    _as_flown(path),
+                    path.name,
+                    unix_ns=first_unix_ns,
+                    metadata=info.metadata,
+                    remarks=tuple(remarks),
+                )
+        flown = config or Config()
+        remarks.append("Another recorder's log: the navigator was run over it for this report.")
+        return gather(
+            _run_over(inputs(path).records, flown),
+            path.name,
+            unix_ns=first_unix_ns,
+            metadata=metadata(flown),
+            remarks=tuple(remarks),
+        )
+
+
+def _as_flown(path: Path) -> Iterator[tuple[str, Stamped]]:
+    for entry in file.read(path):
+        if not isinstance(entry.value, bytes):
+            yield entry.topic, entry.value
+
+
+def _run_over(records: Iterable[Stamped], config: Config) -> Iterator[tuple[str, Stamped]]:
+    navigator = Navigator(config)
+    for record in records:
+        kind = type(record)
+        told = isinstance(record, OUTPUTS)  # by the source, not by the navigator
+        yield f"/link/{kind.__name__}" if told else file.topic_of(kind), record
+        if isinstance(record, INPUTS):
+            for output in navigator.handle(record):  # type: ignore[arg-type]
+                yield file.topic_of(type(output)), output
