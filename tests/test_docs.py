@@ -1,0 +1,87 @@
+"""The pages for integrators say what the code does: configurations that parse, parameters, rates and times as
+they are in force, bytes that add up."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from companion.config import Config, load, parse
+from companion.link.dialect import type_named
+from companion.onboard import wanted
+from companion.profiles import PROFILES, needed
+
+ROOT = Path(__file__).parents[1]
+PAGES = {name: (ROOT / "docs" / f"{name}.md").read_text() for name in ("ardupilot", "px4", "install")}
+OVERHEAD = 12  # bytes of a MAVLink 2 frame round its payload
+LACKING = {"ardupilot": {"HIGHRES_IMU"}, "px4": {"RAW_IMU", "EKF_STATUS_REPORT"}}
+MAKES = ("ardupilot", "px4")
+
+
+def rows(page: str) -> list[list[str]]:
+    lines = [line for line in PAGES[page].splitlines() if line.startswith("|")]
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+
+
+def row(page: str, first: str) -> list[str]:
+    (found,) = (cells for cells in rows(page) if cells[0].startswith(first))
+    return found
+
+
+def profile(name: str, *pairs: str) -> Config:
+    return load(None, {"output.profile": name}, {}, pairs)
+
+
+@pytest.mark.parametrize("page", MAKES)
+def test_the_configuration_on_the_page_is_one(page: str) -> None:
+    (block,) = re.findall(r"```toml\n(.*?)```", PAGES[page], re.DOTALL)
+    assert parse(block, page).output.profile == page
+
+
+@pytest.mark.parametrize("page", MAKES)
+def test_the_parameters_on_the_page_are_those_that_are_needed(page: str) -> None:
+    for need in needed(profile(page)):
+        cells = row(page, f"`{need.name}`")
+        assert float(cells[1]) == need.value
+        assert ("reboot" in cells[2]) is need.reboot, need.name
+
+
+@pytest.mark.parametrize("page", MAKES)
+def test_the_other_ways_are_told_with_their_rates_and_parameters(page: str) -> None:
+    own = {need.name for need in needed(profile(page))}
+    for via, way in PROFILES[page].ways.items():
+        cells = row(page, f"`{via}`")
+        assert cells[1] == f"{way.rate_hz:g} Hz"
+        for need in needed(profile(page, f"output.via={via}")):
+            assert need.name in own or f"`{need.name}` {need.value:g}" in cells[2]
+
+
+def size(message: str) -> int:
+    return type_named(message).layout.size + OVERHEAD
+
+
+@pytest.mark.parametrize("page", MAKES)
+def test_the_bytes_add_up(page: str) -> None:
+    config = profile(page)
+    asked = sum(size(name) * hz for name, hz in wanted(config).items() if name not in LACKING[page])
+    sent = sum(size(name) * hz for name, hz in config.output.rates_hz.items()) + size("HEARTBEAT")
+    assert float(row(page, "asked for")[1]) == pytest.approx(asked, rel=0.05)
+    assert float(row(page, "sent")[2]) == pytest.approx(sent, rel=0.1)
+    if page == "ardupilot":
+        others = float(row(page, "ArduPilot's other messages")[1])
+        assert (asked + others) / 5760 == pytest.approx(0.8, abs=0.05)  # "four fifths" of 57600 baud
+
+
+def test_what_the_page_says_of_the_unit_stands_in_it() -> None:
+    unit = (ROOT / "deploy" / "companion.service").read_text().splitlines()
+    settings = re.findall(r"`([A-Z][A-Za-z]+=[^`]+)`", PAGES["install"])
+    assert len(settings) >= 6
+    for setting in settings:
+        assert setting in unit or setting == "ReadWritePaths=", setting
+    assert "StartLimitIntervalSec=120" in unit and "StartLimitBurst=10" in unit  # "ten in two minutes"
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_links_lead_somewhere(page: str) -> None:
+    for target in re.findall(r"\]\(([^)#]+)\)", PAGES[page]):
+        assert (ROOT / "docs" / target).exists(), target
