@@ -364,7 +364,8 @@ class Autopilot:
         elif command == _EXTERNAL_POSITION and dialect.id_of(message) == _msgid("COMMAND_INT"):
             self.outputs.append((t + self._start_ns, message))
             result = _ACCEPTED
-        self._answer("COMMAND_ACK", t, command=command, result=result)
+        who = {"target_system": message.get_srcSystem(), "target_component": message.get_srcComponent()}
+        self._answer("COMMAND_ACK", t, command=command, result=result, **who)
 
 
 def _msgid(name: str) -> int:

@@ -74,6 +74,7 @@ def test_intervals_are_obeyed_and_acknowledged():
     assert len(grouped["SIM_STATE"]) == pytest.approx(80, abs=2)
     assert not grouped["VFR_HUD"]
     assert [ack.result for _, ack in grouped["COMMAND_ACK"]] == [0, 0, 0, 0, 3]
+    assert {(ack.target_system, ack.target_component) for _, ack in grouped["COMMAND_ACK"]} == {(1, 191)}
 
 
 def test_a_fix_is_repeated_when_the_stream_is_faster_than_the_receiver():
