@@ -14,6 +14,7 @@ from companion.link.commands import Commands, Source
 from companion.link.parameters import Parameters
 from companion.link.session import MessageReceived
 from companion.link.status_text import StatusText
+from companion.profiles import RESET
 from companion.records import Event
 
 NANO_PER_MICRO = 1000
@@ -22,13 +23,13 @@ DISABLED_US = -1
 
 
 def intervals_us(output: Output) -> dict[str, int]:
-    """The interval of each message we stream, microseconds. What the profile does not send is not among
-    them, so that nobody can ask for it.
+    """The interval of each message that may be asked for, microseconds: not what the profile does not send,
+    nor the command that resets a position, which goes out at our pace alone.
     """
     return {
         name: round(1e6 / hz) if hz > 0.0 else DISABLED_US
         for name, hz in output.rates_hz.items()
-        if hz > 0.0 or name == "NAVIGATION_STATUS"
+        if name != RESET and (hz > 0.0 or name == "NAVIGATION_STATUS")
     }
 
 
@@ -54,7 +55,10 @@ class Dialogue:
     def periods_ns(self) -> dict[str, int]:
         """How often each message is to go out now; what is disabled is left out."""
         asked = self._commands.intervals_us.items()
-        return {dialect.TYPES[msgid].name: us * NANO_PER_MICRO for msgid, us in asked if us > 0}
+        periods = {dialect.TYPES[msgid].name: us * NANO_PER_MICRO for msgid, us in asked if us > 0}
+        if (hz := self._output.rates_hz[RESET]) > 0.0:
+            periods[RESET] = round(1e9 / hz)
+        return periods
 
     def receive(self, event: MessageReceived, system: int) -> tuple[list[Any], Config | None]:
         """Replies for the link it came on, and the configuration where a parameter changed it."""

@@ -11,14 +11,13 @@ from collections.abc import Collection
 
 from companion.config import Config
 from companion.link.dialect import Message
-from companion.profiles import MESSAGES
+from companion.profiles import MESSAGES, RESET
 from companion.records import Event, FilterStatus, GlobalPosition, Gnss, Solution, Source, Stamped, SystemTime
 from companion.resetting import Resetting
 from companion.switching import Switching
 from companion.wire.encode import MAV_CMD_EXTERNAL_POSITION_ESTIMATE, Receiver, Unsent, encode
 from companion.wire.gate import Gate, Position, Withheld
 
-RESET = MESSAGES["external_position"]
 ON_SOURCE_SET_2 = frozenset({MESSAGES["odometry"], MESSAGES["vision"]})
 
 

@@ -18,7 +18,7 @@ from typing import Any, Protocol
 
 from companion.config import Config, ConfigError, conflicts, to_toml
 from companion.dialogue import Dialogue
-from companion.feed import RESET, Feed
+from companion.feed import Feed
 from companion.link import dialect
 from companion.link.session import (
     LinkLost,
@@ -32,6 +32,7 @@ from companion.link.session import (
 )
 from companion.link.signing import Signing
 from companion.navigator import Navigator
+from companion.profiles import RESET
 from companion.records import (
     INPUTS,
     Event,
@@ -274,7 +275,8 @@ class Onboard:
             name for name in periods if (news and name != RESET) or solution.t_ns >= self._due.get(name, 0)
         ]
         for name in due:
-            self._due[name] = max(self._due.get(name, 0) + periods[name], solution.t_ns)
+            next_ns = self._due.get(name, 0) + periods[name]
+            self._due[name] = max(next_ns, solution.t_ns + (periods[name] if name == RESET else 0))
         feeding = [name for name in due if name != STATUS]
         heard = [link for link in self.links.values() if link.session.is_up]
         for link in heard if feeding else ():

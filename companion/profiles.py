@@ -29,6 +29,7 @@ MESSAGES: Mapping[Via, str] = {
     "external_position": "COMMAND_INT",  # of MAV_CMD_EXTERNAL_POSITION_ESTIMATE
 }
 """What carries a position into an autopilot's estimator; NAVIGATION_STATUS is for people."""
+RESET = MESSAGES["external_position"]
 
 
 class Needed(NamedTuple):

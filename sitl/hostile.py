@@ -23,7 +23,7 @@ from typing import NamedTuple
 from fastcrc import crc16
 
 from companion import records
-from companion.config import Config, ConfigError, Inertial, load, parse, to_toml
+from companion.config import Config, ConfigError, Inertial, Output, load, parse, to_toml
 from companion.link import dialect, frame
 from companion.link.clock import BootClock
 from companion.link.session import MessageReceived, Session
@@ -237,15 +237,29 @@ class Sieve:
         if outgoing:
             (found,) = frame.Reader().receive(data)
             assert isinstance(found, frame.Frame), found
+            message = dialect.decode(found)
+            places = [getattr(message, name, 0.0) for name in ("x", "y", "lat", "lon")]
+            assert all(map(math.isfinite, places)), message
+
+
+#: A position by every way there is.
+ALL = Output(
+    profile="custom",
+    odometry_hz=10.0,
+    vision_hz=10.0,
+    gps_input_hz=10.0,
+    global_position_sensor_hz=10.0,
+    external_position_hz=1.0,
+)
 
 
 def hear_onboard(data: bytes) -> None:
     """The whole companion but its sockets: nothing raises, nothing is said that is no frame, time goes on.
 
-    The first byte chooses the inertial channel.
+    The first byte chooses the inertial channel. A position goes out by every way.
     """
-    inertial = Inertial(source="air_data") if data[:1] > b"\x7f" else Inertial()
-    onboard = Onboard(Config(inertial=inertial), Sieve(), (_LINK,))
+    inertial = Inertial(source="air_data") if data[:1] > b"\x7f" else Inertial(independent=True)
+    onboard = Onboard(Config(inertial=inertial, output=ALL), Sieve(), (_LINK,))
     now = START_NS
     for wait_ms, raw in frames(data[1:]):
         then = now + wait_ms * MILLI

@@ -302,6 +302,17 @@ def test_the_position_of_an_autopilot_is_not_reset_while_it_has_gps() -> None:
     assert sum("COMMAND_INT withheld: the autopilot has GPS" in text for text in flight.texts) == 1
 
 
+def test_nobody_can_hurry_the_resets() -> None:
+    flight = Flight(told("output.profile=ardupilot", "output.via=external_position"))
+    flight.gnss = False
+    flight.fly(3.0)
+    flight.say("COMMAND_LONG", target_system=1, target_component=191, command=511, param1=75, param2=50_000)
+    flight.fly(10.0)
+    assert [m.result for m in flight.heard("COMMAND_ACK")] == [2]
+    at = [at for at, m in flight.sent if m.get_type() == "COMMAND_INT"]
+    assert len(at) > 8 and min(np.diff(at)) >= 0.99
+
+
 def test_gps_input_has_the_time_of_day_and_our_own_velocity() -> None:
     flight = Flight(told("output.profile=ardupilot", "output.via=gps_input"))
     flight.fly(30.0)
