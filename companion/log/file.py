@@ -345,7 +345,7 @@ def read(path: str | os.PathLike[str], *, raw: bool = False) -> Iterator[Entry]:
         except (Damaged, KeyError) as error:
             if source.closed:
                 raise source.damaged(error) from None
-        except (msgspec.MsgspecError, RecursionError) as error:
+        except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
             raise LogError(f"{path}: a record is not of this version's kind ({error})") from None
 
 

@@ -24,6 +24,7 @@ from .radio import place
 
 P0 = 101_325.0  # [Pa] of the standard atmosphere at sea level
 LAPSE, T0 = 0.0065, 288.15  # [K/m], [K]
+TROPOPAUSE = 11_000.0  # [m], where the lapse ends
 HEIGHT_EXPONENT = 0.190263  # R L / (g M): T / T0 = (p / P0)^0.19
 DENSITY_EXPONENT = 1.0 - HEIGHT_EXPONENT  # rho / rho0 = (p / P0) / (T / T0)
 STALE_NS = 1_000_000_000  # an attitude older than this turns no airspeed into a velocity
@@ -92,7 +93,7 @@ def true_airspeed(record: AirData, static: float | None, alt: float) -> float:
     """
     if record.true:
         return record.airspeed
-    ratio = static / P0 if static else (1.0 - LAPSE * alt / T0) ** (1.0 / HEIGHT_EXPONENT)
+    ratio = static / P0 if static else (1.0 - LAPSE * min(alt, TROPOPAUSE) / T0) ** (1.0 / HEIGHT_EXPONENT)
     return float(record.airspeed / math.sqrt(ratio**DENSITY_EXPONENT))
 
 

@@ -12,6 +12,8 @@ from companion.config import ConfigError, parse
 from companion.link import dialect, frame
 from companion.log import container, file
 from companion.log.opened import LogError
+from companion.navigator.deadreckoning import true_airspeed
+from companion.records import AirData
 from sitl import hostile
 from sitl.fuzz import NAMES
 from sitl.hostile import TARGETS
@@ -165,3 +167,16 @@ def test_megabytes_of_it_leave_nothing_behind(name: str) -> None:
     finally:
         tracemalloc.stop()
     assert held - before < 16 << 10 and peak - before < 2 * MIB
+
+
+def test_a_record_that_is_no_text_is_one_sentence(tmp_path) -> None:
+    path = tmp_path / "x.mcap"
+    path.write_bytes(hostile.small_log(b'{"type":"E\x87ent","t_ns":5,"rx_ns":5,"severity":6,"text":"x"}'))
+    with pytest.raises(LogError, match="is not of this version's kind"):
+        list(file.read(path))
+
+
+def test_an_airspeed_above_the_sky_is_no_complex_number() -> None:
+    """The standard atmosphere has no temperature above 44 km; a beacon may claim to stand there."""
+    speeds = [true_airspeed(AirData(0, 0, 40.0), None, alt) for alt in (-1e3, 0.0, 11_000.0, 1e5, 2e6)]
+    assert speeds == sorted(speeds) and speeds[-1] < 80.0
