@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help loopback test lint fuzz lock clean
+.PHONY: help loopback test lint fuzz kills soak lock clean
 
 # of each target of `make fuzz`: make fuzz SECONDS=3600
 SECONDS := 120
@@ -37,6 +37,12 @@ fuzz: $(VENV)/.fuzz ## hostile bytes for SECONDS at every door, guided by covera
 $(VENV)/.fuzz: $(STAMP)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check 'atheris>=3,<4'
 	@touch $@
+
+kills: $(STAMP) ## the flying service killed 200 times: what its logs lost
+	$(BIN)/companion kills
+
+soak: $(STAMP) ## a day of flight in virtual time with every fault: what grew
+	$(BIN)/companion soak
 
 lock: ## requirements.lock anew from pyproject.toml (needs uv)
 	uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-emit-index-url \

@@ -88,6 +88,7 @@ class Link:
         self.sender = Sender(self.session.clock)
         self.feed = Feed(config)
         self.bad = 0
+        self.dropped = 0  # frames that the line did not take, told by who carries them
         self.origin_at = 0  # when the local origin is next asked for
 
     @property
@@ -333,7 +334,7 @@ class Onboard:
             link.received,
             link.lost,
             link.bad,
-            0,
+            link.dropped,
             offset,
             None if uncertainty is None else 2 * uncertainty,
         )

@@ -130,6 +130,7 @@ class Service:
         """One link, opened again for ever."""
         async for stream in connections(self._addresses[name], random.random, self.say):
             self._streams[name] = stream
+            link, dropped = self.onboard.links[name], self.onboard.links[name].dropped
             self._manager.ready()
             try:
                 while True:
@@ -137,6 +138,7 @@ class Service:
                     for at in range(0, len(data), AT_ONCE):  # others get their turn between the pieces
                         self.onboard.receive(name, data[at : at + AT_ONCE], self._now())
                         self._flush()
+                        link.dropped = dropped + stream.dropped
                         await asyncio.sleep(0)
             except ConnectionError as error:
                 self.say(f"{name}: {error}; opening it again")
@@ -150,6 +152,7 @@ class Service:
             if self._log.trouble != self._trouble:
                 self._trouble = self._log.trouble
                 text = f"log: {self._trouble}; navigation goes on" if self._trouble else "log: writing again"
+                text += f"; {self._log.dropped} messages lost so far" if self._log.dropped else ""
                 self.onboard.note(4 if self._trouble else 6, text, now)
             self._flush()
             await asyncio.sleep(max(0.0, min(1e-9 * (self.onboard.deadline() - self._now()), LOG_CHECK_S)))
@@ -219,6 +222,7 @@ async def run(config: Config, tell: Callable[[Event], None]) -> None:
     finally:
         await asyncio.to_thread(log.close)
         text = f"log: closed as {log.path}" if log.trouble is None else f"log: left torn, {log.trouble}"
+        text += f"; {log.dropped} messages were lost" if log.dropped else ""
         tell(Event(time.monotonic_ns(), time.monotonic_ns(), 6, text))
 
 

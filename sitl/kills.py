@@ -2,8 +2,9 @@
 
     companion kills --times 200 --seed 1
 
-Each life is a `companion run` of its own, fed a simulated flight over UDP and ended by SIGKILL, in the middle
-of whatever it does: starting, recovering the log of the life before, navigating. What must hold: the log left
+Each life is a `companion run` of its own, fed a simulated flight over UDP and ended by SIGKILL at a moment
+after its first word to the autopilot (one in ten at a moment after its start), in the middle of whatever it
+does: starting, recovering the log of the life before, navigating. What must hold: the log left
 behind can be read as it lies, holds every frame that came up to its last one, and of what was sent no more is
 missing than the last second; and a start later every log is closed, with all that could be read of it torn.
 
@@ -36,7 +37,8 @@ from sitl.world import World
 
 LOOPBACK = "127.0.0.1"
 AT_RISK_S = 1.0  # of what was sent, no more may be lost
-SHORTEST_S, LONGEST_S = 0.2, 5.0  # of a life; a start takes about one
+SHORTEST_S, LONGEST_S = 0.1, 4.0  # of a life
+STILLBORN = 0.1  # share of lives that are counted from the start of the process
 STEP_S = 0.01
 START_S = 60.0
 
@@ -78,7 +80,9 @@ def _lives(times: int, rng: random.Random, folder: Path, scenario: Scenario, wor
     lives = []
     for _ in range(times):
         before = set(folder.iterdir())
-        lived_s, sent = _live(folder, rng.uniform(SHORTEST_S, LONGEST_S), Autopilot(scenario, 0, world))
+        stillborn = rng.random() < STILLBORN
+        seconds = rng.uniform(SHORTEST_S, LONGEST_S)
+        lived_s, sent = _live(folder, seconds, Autopilot(scenario, 0, world), stillborn)
         left = {path for path in folder.glob(f"*{ACTIVE}") if path not in before}
         lives.append(_compared(lived_s, sent, [data for path in left for data in _heard(path)]))
         for path in left:
@@ -93,10 +97,12 @@ def _lives(times: int, rng: random.Random, folder: Path, scenario: Scenario, wor
 
 
 def _live(
-    folder: Path, seconds: float, autopilot: Autopilot, until_recovered: bool = False
+    folder: Path, seconds: float, autopilot: Autopilot, stillborn: bool = False, until_recovered: bool = False
 ) -> tuple[float, list[tuple[float, bytes]]]:
-    """Run the service for `seconds` and kill it; how long it lived after its first word, and what was sent,
-    with the time. `until_recovered`: end it in good order as soon as no log is torn any more.
+    """Run the service for `seconds` after its first word (`stillborn`: after its start) and kill it; how long
+    it lived, and what was sent, with its age at the kill.
+
+    `until_recovered`: end it in good order as soon as no log is torn any more.
     """
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as chosen:
         chosen.bind((LOOPBACK, 0))
@@ -111,7 +117,8 @@ def _live(
     ):
         sock.connect((LOOPBACK, port))
         sock.setblocking(False)
-        while (now := time.monotonic()) < begun + seconds:
+        end = begun + (seconds if stillborn or until_recovered else START_S)
+        while (now := time.monotonic()) < end:
             for data in autopilot.poll(int((now - begun) * 1e9)):
                 try:
                     sock.send(data)
@@ -121,6 +128,7 @@ def _live(
             with contextlib.suppress(BlockingIOError, ConnectionRefusedError):
                 while True:
                     autopilot.receive(sock.recv(65536), int((now - begun) * 1e9))
+                    end = min(end, now + seconds) if not until_recovered else end
             if until_recovered and not any(path.exists() for path in torn):
                 process.send_signal(signal.SIGTERM)
                 process.wait(START_S)

@@ -83,7 +83,15 @@ def fly(
     """Fly `scenario` from start to end; `tell` is handed the seconds flown, once a second of flight."""
     autopilot, tap = Autopilot(scenario, START_NS), Tap(log)
     onboard = Onboard(config, tap, (LINK,))
-    now, told, due = START_NS, START_NS, START_NS
+    join(autopilot, onboard, START_NS, tell)
+    return Flown(autopilot, tap.kept, onboard)
+
+
+def join(
+    autopilot: Autopilot, onboard: Onboard, start_ns: int, tell: Callable[[float], None] | None = None
+) -> None:
+    """Let the two speak with each other from `start_ns`, the flight's start, to the flight's end."""
+    now, told, due = start_ns, start_ns, start_ns
     while now <= autopilot.end_ns:
         for data in autopilot.poll(now):
             onboard.receive(LINK, data, now)
@@ -93,11 +101,10 @@ def fly(
             autopilot.receive(data, now)
         onboard.take_events()
         if tell is not None and now >= told:
-            tell((now - START_NS) * 1e-9)
+            tell((now - start_ns) * 1e-9)
             told = now + SECOND
         due = onboard.deadline()
         now = max(now + 1, min(autopilot.deadline(), due))
-    return Flown(autopilot, tap.kept, onboard)
 
 
 def truth_of(autopilot: Autopilot) -> score.TruthAt:

@@ -233,3 +233,36 @@ def test_a_bad_link_exits_78_with_one_line(tmp_path: Path) -> None:
     code, said = finished("--connect", "udp:1.2.3.4", "--logs", str(tmp_path))
     assert code == 78
     assert len(said.splitlines()) == 1 and "link.connect" in said
+
+
+def test_a_consumer_that_does_not_read_costs_the_oldest_frames_and_they_are_counted(tmp_path: Path) -> None:
+    """A TCP peer that sends and never reads: the newest words wait for it, the log says how many did not."""
+    port = free_port()
+    seen: list[tuple[int, float]] = []
+
+    async def play(service: Service, told: list[Event]) -> None:
+        with socket.socket() as sock:
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2048)
+            await until(lambda: sock.connect_ex((LOOPBACK, port)) == 0)
+            sock.setblocking(False)
+            (link,) = service.onboard.links.values()
+
+            def stuck() -> bool:
+                with contextlib.suppress(BlockingIOError):
+                    sock.send(HEARTBEAT)
+                for _ in range(500):  # far more than any ground station is told
+                    link.session.send(dialect.new("ATTITUDE"))
+                begun = time.perf_counter()
+                service._flush()
+                seen.append((link.dropped, time.perf_counter() - begun))
+                return link.dropped > 1000
+
+            await until(stuck, 20.0)
+            await asyncio.sleep(1.2)  # a state of the link is logged every second
+
+    serve(tmp_path, (f"tcpin:{LOOPBACK}:{port}",), play)
+    assert max(took for _, took in seen) < 0.5  # never waits
+    states = [
+        e.value.dropped for e in file.read(tmp_path / "a.mcap") if type(e.value).__name__ == "LinkState"
+    ]
+    assert states == sorted(states) and states[-1] > 1000

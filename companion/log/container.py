@@ -29,6 +29,8 @@ MOST_UNCOMPRESSED = 1 << 28
 _HEAD = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log time, publish time
 _CHUNK = struct.Struct("<QQQI")  # first, last log time, uncompressed size, crc
+_INDEX = struct.Struct("<BQH")  # opcode, length, channel
+CHUNK_HEAD_SIZE = _HEAD.size + _CHUNK.size + 4 + len("zstd") + 8
 
 
 class Damaged(ValueError):
@@ -176,8 +178,8 @@ class Chunk:
         return sum(map(len, self.index.values())) // 2
 
 
-def pack(chunk: Chunk, compress: Callable[[bytes], bytes]) -> tuple[bytes, bytes, int, int, int]:
-    """The chunk record and its message indexes; first and last log time; bytes after compression."""
+def pack(chunk: Chunk, compress: Callable[[bytes], bytes]) -> tuple[bytes, bytes, int, int]:
+    """The chunk record and its message indexes; first and last log time."""
     data = bytes(chunk.data)
     squeezed = compress(data)
     first = min(min(entries[::2]) for entries in chunk.index.values())
@@ -193,7 +195,22 @@ def pack(chunk: Chunk, compress: Callable[[bytes], bytes]) -> tuple[bytes, bytes
         record(MESSAGE_INDEX, struct.pack(f"<HI{len(entries)}Q", of, 8 * len(entries), *entries))
         for of, entries in chunk.index.items()
     )
-    return body, indexes, first, last, len(squeezed)
+    return body, indexes, first, last
+
+
+def chunk_head(head: bytes) -> tuple[int, int, int, int]:
+    """Of the CHUNK_HEAD_SIZE first bytes that `pack` made: first and last log time, size, size squeezed."""
+    first, last, size, _ = _CHUNK.unpack_from(head, _HEAD.size)
+    return first, last, size, int.from_bytes(head[-8:], "little")
+
+
+def indexed_channels(indexes: bytes) -> Iterator[tuple[int, int]]:
+    """Of message indexes in a row: where each begins, and its channel."""
+    at = 0
+    while at < len(indexes):
+        _, length, of = _INDEX.unpack_from(indexes, at)
+        yield at, of
+        at += _HEAD.size + length
 
 
 def unpack(content: bytes) -> bytes:

@@ -153,6 +153,11 @@ class Writer:
             number = self._define(key, topic, "mavlink", "", None)
         self._put(number, t_ns, t_ns, data)
 
+    @property
+    def waiting(self) -> int:
+        """Bytes that wait for the disk."""
+        return self._waiting_bytes
+
     def close(self, timeout_s: float = 30.0) -> bool:
         """Write all that waits, close the file and give it its name; whether that was done.
 

@@ -12,6 +12,7 @@ import fcntl
 import os
 import struct
 import zlib
+from array import array
 from collections import defaultdict
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -19,6 +20,7 @@ from typing import Protocol
 
 import zstandard
 
+from . import container
 from .container import (
     ATTACHMENT,
     CHANNEL,
@@ -46,6 +48,9 @@ class Disk(Protocol):
     def write(self, data: bytes) -> None:
         """Append all of `data`."""
 
+    def read(self, at: int, size: int) -> bytes:
+        """Return `size` bytes of what was written, from `at` on."""
+
     def sync(self) -> None:
         """Return once what was written survives a loss of power."""
 
@@ -68,7 +73,7 @@ class DiskFile:
         reserve: int = 0,
         relieve: Callable[[int], object] = lambda wanted: None,
     ) -> None:
-        self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o644)
+        self._fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o644)
         fcntl.flock(self._fd, fcntl.LOCK_EX)  # tells a log being written from one left behind
         sync_folder(Path(path).parent)
         self._reserve, self._relieve = reserve, relieve
@@ -87,6 +92,13 @@ class DiskFile:
     def _free(self) -> int:
         room = os.fstatvfs(self._fd)
         return room.f_bavail * room.f_frsize
+
+    def read(self, at: int, size: int) -> bytes:
+        """See `Disk`."""
+        data = os.pread(self._fd, size, at)
+        if len(data) != size:
+            raise OSError(errno.EIO, "what was written cannot be read")
+        return data
 
     def sync(self) -> None:
         """See `Disk`."""
@@ -114,7 +126,8 @@ def sync_folder(folder: Path) -> None:
 class Store:
     """Lays an MCAP file down on `disk`. After every method that returned, the file is readable so far.
 
-    A method that raises OSError has been undone and may be called again.
+    A method that raises OSError has been undone and may be called again. Of a chunk it remembers in 24 bytes
+    where it is: what the summary says of it (half a kilobyte; 40 MB after a day) is read from the disk again.
     """
 
     def __init__(self, disk: Disk, library: str) -> None:
@@ -124,7 +137,7 @@ class Store:
         self._schemas: dict[int, bytes] = {}
         self._channels: dict[int, bytes] = {}
         self._counts: defaultdict[int, int] = defaultdict(int)
-        self._chunk_indexes: list[bytes] = []
+        self._chunks = array("Q")  # of each: where it begins, where its message indexes do, and their end
         self._metadata_indexes: list[bytes] = []
         self._attachments = 0
         self._first: int | None = None
@@ -150,26 +163,15 @@ class Store:
         new_schemas = {i: schemas[i] for i in needed.values() if i in schemas and i not in self._schemas}
         definitions = b"".join(record(SCHEMA, content) for content in new_schemas.values())
         definitions += b"".join(record(CHANNEL, channels[name]) for name in new)
-        body, indexes, first, last, squeezed = pack(chunk, self._compress)
+        body, indexes, first, last = pack(chunk, self._compress)
         self._append(definitions + body + indexes)
 
         self._schemas |= new_schemas
         self._channels |= {name: channels[name] for name in new}
-        at = self._end - len(indexes)
-        places = b""
         for of, entries in chunk.index.items():
             self._counts[of] += len(entries) // 2
-            places += struct.pack("<HQ", of, at)
-            at += 9 + 6 + 8 * len(entries)
-        self._chunk_indexes.append(
-            record(
-                CHUNK_INDEX,
-                struct.pack("<QQQQ", first, last, self._end - len(indexes) - len(body), len(body)),
-                struct.pack("<I", len(places)) + places,
-                struct.pack("<Q", len(indexes)) + text("zstd"),
-                struct.pack("<QQ", squeezed, len(chunk.data)),
-            )
-        )
+        at = self._end - len(indexes)
+        self._chunks.extend((at - len(body), at, self._end))
         self._first = first if self._first is None else min(first, self._first)
         self._last = max(last, self._last)
 
@@ -183,7 +185,7 @@ class Store:
             len(self._channels),
             self._attachments,
             len(self._metadata_indexes),
-            len(self._chunk_indexes),
+            len(self._chunks) // 3,
             self._first or 0,
             self._last,
             len(counts),
@@ -192,7 +194,7 @@ class Store:
             (SCHEMA, [record(SCHEMA, content) for content in self._schemas.values()]),
             (CHANNEL, [record(CHANNEL, content) for content in self._channels.values()]),
             (STATISTICS, [record(STATISTICS, statistics, counts)]),
-            (CHUNK_INDEX, self._chunk_indexes),
+            (CHUNK_INDEX, map(self._chunk_index, *(self._chunks[i::3] for i in range(3)))),
             (METADATA_INDEX, self._metadata_indexes),
         )
         data_end = record(DATA_END, struct.pack("<I", 0))
@@ -206,6 +208,21 @@ class Store:
                 summary += group
         tail = summary + offsets + struct.pack("<BQQQ", FOOTER, 20, start, start + len(summary))
         self._append(data_end + tail + struct.pack("<I", zlib.crc32(tail)) + MAGIC)
+
+    def _chunk_index(self, start: int, at: int, end: int) -> bytes:
+        """The summary's record of the chunk at `start`, whose message indexes lie from `at` to `end`."""
+        first, last, size, squeezed = container.chunk_head(self._disk.read(start, container.CHUNK_HEAD_SIZE))
+        places = b"".join(
+            struct.pack("<HQ", of, at + offset)
+            for offset, of in container.indexed_channels(self._disk.read(at, end - at))
+        )
+        return record(
+            CHUNK_INDEX,
+            struct.pack("<QQQQ", first, last, start, at - start),
+            struct.pack("<I", len(places)) + places,
+            struct.pack("<Q", end - at) + text("zstd"),
+            struct.pack("<QQ", squeezed, size),
+        )
 
     def sync(self) -> None:
         """Put what was written where a loss of power does not reach it."""
