@@ -110,6 +110,6 @@ def of_streams(config: Config, make: str, rates: Mapping[int, tuple[float, float
             continue
         comes = (measured or 0.0) >= ENOUGH * asked
         is_well = comes or (False if READ_AS.get(name) in used else None)
-        advice = "" if comes else "is the line fast enough? does a ground station set other rates?"
+        advice = "" if comes else "too slow a line, or a ground station that sets other rates"
         found.append(Finding(name, f"{measured or 0.0:.1f} Hz", f"{asked:g} Hz", is_well, advice))
     return found

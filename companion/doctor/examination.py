@@ -229,7 +229,7 @@ class Examination:
         session, found = self.session, list[Finding]()
         counts = session.reader.counts.get((session.autopilot or 0, AUTOPILOT_COMPONENT), frame.Counts(0, 0))
         loss = counts.lost / max(counts.lost + counts.received, 1)
-        advice = "a line that is too slow or too long, or not enough ground"
+        advice = "too slow or too long a line, or no common ground"
         found.append(
             Finding(
                 "frames lost", f"{loss:.1%}", f"at most {GREATEST_LOSS:.0%}", loss <= GREATEST_LOSS, advice
@@ -242,16 +242,16 @@ class Examination:
                 "no answer" if half is None else f"{2e-6 * half:.1f} ms there and back",
                 "answers",
                 half is not None,
-                "without it times are those of arrival: let it through the router",
+                "without it times are those of arrival; let it through the router",
             )
         )
         place = "not known"
         if self._origin is not None:
             place = f"{self._origin.latitude * 1e-7:.5f}, {self._origin.longitude * 1e-7:.5f}"
-        advice = "it comes with the first 3D fix: wait under an open sky"
+        advice = "it comes with the first 3D fix; wait under an open sky"
         found.append(Finding("GPS_GLOBAL_ORIGIN", place, "known", self._origin is not None, advice))
         who = f"{session.system}/{session.component}"
-        advice = "another speaks in our name: set link.component_id, unless it is `companion run`"
+        advice = "another speaks in our name; set link.component_id, unless it is `companion run`"
         found.append(
             Finding(
                 "our id", f"{who} {'twice' if self._doubles else 'free'}", "free", not self._doubles, advice
@@ -263,6 +263,12 @@ class Examination:
             found.append(Finding("autopilots", others, "one", bool(self._config.link.system_id), advice))
         if refused := session.refused.total():
             found.append(
-                Finding("frames refused", str(refused), "0", False, "is signing.key_file everyone's?")
+                Finding(
+                    "frames refused",
+                    str(refused),
+                    "0",
+                    False,
+                    "have all sign with the key of signing.key_file",
+                )
             )
         return found

@@ -46,18 +46,13 @@ def parameter_table(diagnosis: Diagnosis) -> Table:
 
 
 def finding_table(diagnosis: Diagnosis) -> Table:
-    """The link and the machine; advice where something is amiss."""
+    """The link and the machine."""
     table = Table(title="link and machine", title_justify="left")
     for column in ("", "what", "found", "needs"):
         table.add_column(column, no_wrap=column in ("", "what"))
-    if diagnosis.amiss:
-        table.add_column("what to do")
     for found in diagnosis.findings:
         state = _NOTE if found.is_well is None else _GOOD if found.is_well else _BAD.format("wrong")
-        cells = [state, found.what, found.found, found.needs]
-        if diagnosis.amiss:
-            cells.append(found.advice if found.is_well is False else "")
-        table.add_row(*cells)
+        table.add_row(state, found.what, found.found, found.needs)
     return table
 
 
@@ -82,8 +77,7 @@ def summary(config: Config, diagnosis: Diagnosis) -> str:
         said.append(f"{_number(there, 'parameter')} not as needed: --apply sets what is there, after a yes.")
     if absent := len(diagnosis.wrong) - there:
         said.append(f"{_number(absent, 'parameter')} absent: is the firmware old, or built without?")
-    if amiss := diagnosis.amiss:
-        said.append(f"{_number(len(amiss), 'other thing')} amiss.")
+    said += [f"{found.what}: {found.advice}." for found in diagnosis.amiss]
     if not said:
         said.append("All is well.")
     if config.output.profile == "monitor":
