@@ -25,7 +25,9 @@ import numpy as np
 from companion.link.clock import SECOND, BootClock
 from companion.link.transport import Address, CannotListen, Stream, connections
 from companion.nav.geometry import Geodetic, local_to_geodetic, separation
+from sitl.attach import command as bridge
 from sitl.autopilot import Autopilot
+from sitl.play import command as play
 from sitl.scenarios import SCENARIOS, Phase, Scenario, named
 
 EX_UNAVAILABLE = 69  # sysexits.h
@@ -190,7 +192,8 @@ async def _run(flying: Flying) -> None:
     await flying.fly()
 
 
-@click.command("sitl")
+@click.group("sitl", invoke_without_command=True, subcommand_metavar="[bridge|play ...]")
+@click.pass_context
 @click.option("--connect", default="udpout:127.0.0.1:14550", show_default=True, help="Link to the companion.")
 @click.option("--scenario", default="default", show_default=True, help=f"One of {', '.join(SCENARIOS)}.")
 @click.option("--seed", type=int, help="Another noise for the same flight.")
@@ -204,11 +207,17 @@ async def _run(flying: Flying) -> None:
 @click.option(
     "--disarmed", is_flag=True, help="Say that it is disarmed: `companion doctor` may set parameters."
 )
-def command(connect: str, scenario: str, seed: int | None, speed: float, disarmed: bool) -> None:
+def command(
+    context: click.Context, connect: str, scenario: str, seed: int | None, speed: float, disarmed: bool
+) -> None:
     """Fly a scenario in real time as an autopilot would, for a `companion run` at the other end of the link.
 
     Ends with the flight, at SIGINT or SIGTERM. Exit code 69: the address cannot be listened on.
+
+    `bridge` attaches to the simulator of a real autopilot, `play` plays a recorded one.
     """
+    if context.invoked_subcommand is not None:
+        return
     try:
         chosen = named(scenario, **({} if seed is None else {"seed": seed}))
     except ValueError as error:
@@ -230,3 +239,7 @@ def command(connect: str, scenario: str, seed: int | None, speed: float, disarme
     except CannotListen as error:
         click.echo(f"companion: {error.strerror}", err=True)
         sys.exit(EX_UNAVAILABLE)
+
+
+command.add_command(bridge)
+command.add_command(play)

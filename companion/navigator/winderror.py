@@ -24,7 +24,7 @@ from .errorstate import Floats, System
 
 N = 8
 WIND, SCALE, HEADING, DRIFT = slice(2, 4), 4, 5, slice(6, 8)
-FIRST_POSITION_M = 20.0
+FIRST_POSITION_M = 2000.0  # nothing is known: the first fix, by which the channel begins, tells all
 
 
 class WindError(NamedTuple):
