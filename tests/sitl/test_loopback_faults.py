@@ -22,7 +22,6 @@ from companion.log import file
 from companion.log.folder import open_log
 from companion.nav.geometry import Geodetic, displace, local_to_geodetic, separation
 from companion.records import Event, LinkState, Reboot, Reset, Solution
-from companion.wire.encode import accuracy
 from sitl.autopilot import UNIX_AT_START_NS
 from sitl.faults import Fault
 from sitl.flight import Leg, Plan, Wind
@@ -94,8 +93,9 @@ def place(solution: Solution) -> Geodetic:
 
 
 def stated(solution: Solution) -> float:
-    north, east, _ = accuracy(solution)
-    return math.hypot(north, east)
+    """One sigma, or the guaranteed bound where it is greater."""
+    sigma = math.sqrt(solution.covariance[0]), math.sqrt(solution.covariance[3])
+    return math.hypot(*map(max, sigma, solution.bound_n or (0.0, 0.0)))
 
 
 @pytest.mark.parametrize("channel", CHANNELS)
