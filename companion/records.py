@@ -266,7 +266,8 @@ class Fix(Stamped, frozen=True, gc=False, tag=True):
     """A maximum-likelihood radio fix, the INS left out: the correction vector INS minus fix, NED (m).
 
     `covariance` is that of north, east (upper triangle); `cost` the chi-square of its residuals with
-    `freedom` degrees of freedom; `normalised` the innovation against the running estimate, squared.
+    `freedom` degrees of freedom; `normalised` the squared innovation of azimuth and range, or of the GNSS
+    position, against the running estimate by its covariance: chi-square with 2 degrees of freedom.
     """
 
     lat: float

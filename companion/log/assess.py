@@ -212,13 +212,9 @@ def _ins_error(flight: Flight, reference: Reference | None) -> dict[str, Floats]
 def _misfits(flight: Flight, reference: Reference | None) -> list[Misfit]:
     fix, solution = flight.tables["Fix"], flight.tables["Solution"]
     found = []
-    if len(fix["t"]) and len(solution["t"]) > 1:
-        if np.isfinite(fix["normalised"]).any():
-            own = np.isfinite(fix["normalised"])
-            two = np.full(int(own.sum()), 2.0)
-            found.append(Misfit("NIS", fix["t"][own], fix["normalised"][own], two))
-        else:
-            found.append(_innovations(fix, solution))
+    if len(fix["t"]):
+        told = np.isfinite(fix["normalised"])
+        found.append(Misfit("NIS", fix["t"][told], fix["normalised"][told], np.full(int(told.sum()), 2.0)))
         many = fix["freedom"] > 0
         if many.any() and fix["cost"][many].max() > 1e-9:  # one GNSS position and a height have no residual
             found.append(Misfit("fix residuals", fix["t"][many], fix["cost"][many], fix["freedom"][many]))
@@ -230,22 +226,6 @@ def _misfits(flight: Flight, reference: Reference | None) -> list[Misfit]:
             two = np.full(int(known.sum()), 2.0)
             found.append(Misfit("NEES", solution["t"][known], value[known], two))
     return [misfit for misfit in found if len(misfit.t)]
-
-
-def _innovations(fix: Table, solution: Table) -> Misfit:
-    """Each fix against the solution just before it: their difference by the sum of their covariances.
-
-    The sum counts the drift of GNSS twice, in the fix and in the estimate that rests on earlier ones, so that
-    the value errs on the small side.
-    """
-    k = np.searchsorted(solution["t"], fix["t"]) - 1
-    recent = (k >= 0) & (fix["t"] - solution["t"][np.maximum(k, 0)] < 1.0)
-    k = k[recent]
-    north = fix["correction_north"][recent] - solution["error_north"][k]
-    east = fix["correction_east"][recent] - solution["error_east"][k]
-    covariance = (fix[name][recent] + solution[name][k] for name in ("nn", "ne", "ee"))
-    value = _squared(north, east, *covariance)
-    return Misfit("NIS of each fix", fix["t"][recent], value, np.full(len(value), 2.0))
 
 
 def _squared(north: Floats, east: Floats, nn: Floats, ne: Floats, ee: Floats) -> Floats:

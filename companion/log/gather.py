@@ -114,11 +114,8 @@ COLUMNS: dict[type[Stamped], tuple[str, Callable[[Any], tuple[float, ...]]]] = {
         _solution,
     ),
     Fix: (
-        "lat lon correction_north correction_east nn ne ee sources cost freedom normalised",
-        lambda r: (
-            *(r.lat, r.lon, *r.correction_n, *r.covariance),
-            *(r.sources, r.cost, r.freedom, _number(r.normalised)),
-        ),
+        "lat lon sources cost freedom normalised",
+        lambda r: (r.lat, r.lon, r.sources, r.cost, r.freedom, _number(r.normalised)),
     ),
     Gnss: (
         "receiver fix lat lon alt sigma",

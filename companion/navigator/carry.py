@@ -72,6 +72,7 @@ class Carry(NamedTuple):
     level: Level = Level()
     gnss: Gnss | None = None  # the last new one, used or not
     gnss_heard: radio.Heard | None = None  # the last one believed
+    innovation: float | None = None  # of the last fix, squared, by its covariance; None if of one number
     lesson: Lesson | None = None  # not yet learnt: a solution must not wait for it
     gnss_ns: int | None = None  # when fixes were last believed
     rsbn_ns: int | None = None

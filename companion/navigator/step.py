@@ -263,6 +263,7 @@ def _absorb(
     state = state_at(carry, ins, settings)
     found = radio.innovation(heard, _prior(state, H, settings))
     limit = settings.gate[radio.freedom(heard)]
+    carry = carry._replace(innovation=found.cost if radio.freedom(heard) == 2 else None)
     if found.cost > limit:
         if carry.state is not None and not _within_bound(carry, heard, settings):
             carry = carry._replace(state=state)
@@ -344,6 +345,7 @@ def learn(carry: Carry, lesson: Lesson, settings: Settings) -> Step:
         fix.cost,
         fix.degrees_of_freedom,
         fix.iterations,
+        carry.innovation,
     )
     return _restrict(carry._replace(guarantee=g), heard, ins, out, settings), [out]
 

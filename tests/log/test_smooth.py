@@ -22,7 +22,7 @@ from companion.nav.geometry import (
     slant_range_azimuth,
 )
 from companion.navigator import Navigator, errorstate
-from companion.records import Gnss, LocalOrigin, LocalPosition, Reboot, RsbnFix, Solution
+from companion.records import Fix, Gnss, LocalOrigin, LocalPosition, Reboot, RsbnFix, Solution
 
 ORIGIN = Geodetic(math.radians(60.0), math.radians(30.0), 0.0)
 BEACON = Geodetic(math.radians(60.4), math.radians(30.3), 100.0)
@@ -118,6 +118,19 @@ def test_the_last_epoch_is_the_filter_in_flight() -> None:
     assert math.dist(found.x[-1, :2], last.error_n) < one_centimetre
     assert math.dist(found.x[-1, 2:4], last.velocity_error_n) < 1e-3
     np.testing.assert_allclose(found.P[-1, 0, 0], last.covariance[0], rtol=1e-3)
+
+
+def test_the_innovations_told_are_chi_square() -> None:
+    found: list[float] = []
+    for seed in range(1, 5):
+        navigator = Navigator(CONFIG)
+        outputs = [
+            out for record in flight(600, (200, 400), seed).records for out in navigator.handle(record)
+        ]
+        found += [out.normalised for out in outputs if isinstance(out, Fix) and out.normalised is not None]
+    assert len(found) > 1000
+    assert 1.5 < np.mean(found) < 2.5
+    assert 0.92 < np.mean(np.array(found) < 5.99) < 0.98
 
 
 def test_no_variance_grows_and_the_claims_are_honest() -> None:
