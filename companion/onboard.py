@@ -267,13 +267,15 @@ class Onboard:
             self.rejected[record.source] += 1
 
     def _send(self, solution: Solution, news: bool) -> None:
-        """The messages that are due, or all on the news of a beacon's fix, to every autopilot heard: what
-        steers first.
+        """The messages that are due, and on the news of a beacon's fix all that steer, to every autopilot
+        heard.
         """
         self._solution = solution
         periods = self._dialogue.periods_ns
         due = [
-            name for name in periods if (news and name != RESET) or solution.t_ns >= self._due.get(name, 0)
+            name
+            for name in periods
+            if (news and name not in (RESET, STATUS)) or solution.t_ns >= self._due.get(name, 0)
         ]
         for name in due:
             next_ns = self._due.get(name, 0) + periods[name]

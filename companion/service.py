@@ -35,7 +35,7 @@ from companion.log.file import Writer
 from companion.log.folder import open_log, recover_left
 from companion.log.opened import LogError
 from companion.log.replay import metadata
-from companion.onboard import Onboard
+from companion.onboard import Link, Onboard
 from companion.records import Event
 from companion.systemd import Manager
 
@@ -46,8 +46,6 @@ STOP_S = 5.0  # a disk is waited for at the end
 #: A system clock before 2024 was never set: boards without a battery begin in 1970.
 SET_AFTER_NS = 1_704_067_200_000_000_000
 OVERDUE_NS = 2_000_000_000
-#: Bytes read at one go: noise made to be slow to read (0.3 MB/s) then holds nobody up for more than 0.05 s.
-AT_ONCE = 1 << 14
 
 
 class Keys:
@@ -130,19 +128,18 @@ class Service:
         """One link, opened again for ever."""
         async for stream in connections(self._addresses[name], random.random, self.say):
             self._streams[name] = stream
-            link, dropped = self.onboard.links[name], self.onboard.links[name].dropped
+            link = self.onboard.links[name]
             self._manager.ready()
             try:
-                while True:
-                    data = await stream.read()
-                    for at in range(0, len(data), AT_ONCE):  # others get their turn between the pieces
-                        self.onboard.receive(name, data[at : at + AT_ONCE], self._now())
-                        self._flush()
-                        link.dropped = dropped + stream.dropped
-                        await asyncio.sleep(0)
+                await stream.hand_to(partial(self._receive, link, stream, link.dropped))
             except ConnectionError as error:
                 self.say(f"{name}: {error}; opening it again")
             del self._streams[name]
+
+    def _receive(self, link: Link, stream: Stream, dropped_before: int, data: bytes) -> None:
+        self.onboard.receive(link.name, data, self._now())
+        self._flush()
+        link.dropped = dropped_before + stream.dropped
 
     async def _keep_time(self) -> None:
         """What is due, and whether the disk is well."""

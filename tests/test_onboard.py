@@ -167,7 +167,7 @@ def test_solutions_go_out_at_their_rates_and_at_once_on_a_beacon_s_answer() -> N
     before = len(flight.sent)
     flight.now += 10 * MS
     flight.rsbn(component=42)  # a receiver that is a component of its own
-    assert {m.get_type() for _, m in flight.sent[before:]} >= {"ODOMETRY", "NAVIGATION_STATUS"}
+    assert {m.get_type() for _, m in flight.sent[before:]} >= {"ODOMETRY", "GLOBAL_POSITION_SENSOR"}
     assert len(flight.log.of(RsbnFix)) == 1
 
 

@@ -194,9 +194,7 @@ def _companion(port: int, logs: str) -> None:
         "log.folder": logs,
         "log.minimum_free_mib": 0,
         "inertial.independent": True,
-        "output.profile": "custom",
-        "output.odometry_hz": 5.0,
-        "output.global_position_sensor_hz": 2.0,
+        "output.profile": "ardupilot",
     }
     asyncio.run(run(load(None, flags, {}), lambda event: None))
 
