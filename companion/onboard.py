@@ -16,6 +16,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable
 from typing import Any, Protocol
 
+from companion.checkup import Checkup
 from companion.config import Config, ConfigError, conflicts, to_toml
 from companion.dialogue import Dialogue
 from companion.feed import Feed
@@ -87,6 +88,7 @@ class Link:
         )
         self.sender = Sender(self.session.clock)
         self.feed = Feed(config)
+        self.checkup = Checkup()
         self.bad = 0
         self.dropped = 0  # frames that the line did not take, told by who carries them
         self.origin_at = 0  # when the local origin is next asked for
@@ -164,6 +166,10 @@ class Onboard:
             if link.session.is_up and self._origin is None and now_ns >= link.origin_at:
                 link.origin_at = now_ns + ASK_ORIGIN_EVERY
                 self._ask_for(link, GPS_GLOBAL_ORIGIN)
+            for event in link.checkup.poll(now_ns):
+                self.note(event.severity, f"{link.name}: {event.text}", now_ns)
+            for message in link.checkup.to_send():
+                link.session.send(message)
         if now_ns >= self._state_at:
             self._state_at = now_ns + SECOND
             for link in self.links.values():
@@ -206,12 +212,14 @@ class Onboard:
             elif isinstance(event, LinkUp):
                 link.sender = link.sender._replace(autopilot=MAKES.get(event.autopilot, "other"))
                 self.note(6, f"{link.name}: autopilot {event.system} heard ({link.sender.autopilot})", now_ns)
+                link.checkup.begin(self._config, event.system, event.autopilot)
             elif isinstance(event, LinkLost):
                 silent = (now_ns - event.heard_ns) / SECOND
                 self.note(4, f"{link.name}: autopilot {event.system} silent for {silent:.0f} s", now_ns)
             elif isinstance(event, Rebooted):
                 self._origin = None
                 link.feed.rebooted()
+                link.checkup.begin(self._config, event.system, link.session.kind)
                 self.note(4, f"{link.name}: autopilot {event.system} rebooted", now_ns)
                 self._on_record(Reboot(now_ns, now_ns, event.system))
             elif isinstance(event, Refused):
@@ -240,6 +248,7 @@ class Onboard:
             and event.message.target_component == self._config.link.component_id
         ):
             link.feed.acknowledged(event.message.command, event.message.result, event.received_ns)
+        link.checkup.receive(event.message, event.frame)
         for record in decode(event.message, event.received_ns, link.sender):
             link.feed.heard(record)
             self._on_record(record)

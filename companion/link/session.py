@@ -170,6 +170,11 @@ class Session:
         return self._autopilot
 
     @property
+    def kind(self) -> int:
+        """The autopilot's MAV_AUTOPILOT, 8 (none) before it was heard."""
+        return self._kind
+
+    @property
     def is_up(self) -> bool:
         """Whether the autopilot is heard."""
         return self._up
