@@ -14,21 +14,24 @@ from companion.link.parameter_client import Value, same
 from companion.link.streams import ENOUGH
 from companion.navigator.step import uses
 from companion.profiles import PROFILES, Needed
-from companion.records import AirData, Attitude, Gnss, LocalPosition, Pressure
+from companion.records import AirData, Attitude, Gnss, Imu, LocalPosition, Pressure
 
 #: Messages that a make does not have; its other ones tell the same.
 LACKING = {
     "ardupilot": frozenset({"HIGHRES_IMU"}),
     "px4": frozenset({"RAW_IMU", "EKF_STATUS_REPORT", "SIM_STATE"}),
 }
-#: What the navigator makes of which stream; the others are logged, and may be missing.
+#: What the navigator makes of which stream: one that its inertial channel does not use may be missing.
 READ_AS: Mapping[str, type] = {
+    "RAW_IMU": Imu,
+    "HIGHRES_IMU": Imu,
     "LOCAL_POSITION_NED": LocalPosition,
     "GPS_RAW_INT": Gnss,
     "ATTITUDE": Attitude,
     "VFR_HUD": AirData,
     "SCALED_PRESSURE": Pressure,
 }
+LOGGED = frozenset({"EKF_STATUS_REPORT", "SIM_STATE"})
 
 
 class ParameterFinding(NamedTuple):
@@ -109,7 +112,8 @@ def of_streams(config: Config, make: str, rates: Mapping[int, tuple[float, float
         if name in LACKING.get(make, ()):
             continue
         comes = (measured or 0.0) >= ENOUGH * asked
-        is_well = comes or (False if READ_AS.get(name) in used else None)
+        idle = name in LOGGED or (name in READ_AS and READ_AS[name] not in used)
+        is_well = comes or (None if idle else False)
         advice = "" if comes else "too slow a line, or a ground station that sets other rates"
         found.append(Finding(name, f"{measured or 0.0:.1f} Hz", f"{asked:g} Hz", is_well, advice))
     return found

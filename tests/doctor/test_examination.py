@@ -162,12 +162,14 @@ def test_what_does_not_come_is_found(swallowed: str, what: str) -> None:
     assert bench.now >= WATCHED_LONGER  # it was given time
 
 
-def test_a_stream_that_is_only_logged_may_be_missing() -> None:
-    bench = Bench("ardupilot")
+@pytest.mark.parametrize(("channel", "well"), [("air_data", None), ("strapdown", False)])
+def test_a_stream_may_be_missing_where_the_inertial_channel_has_no_use_for_it(
+    channel: str, well: bool | None
+) -> None:
+    bench = Bench("ardupilot", profile("ardupilot", f"inertial.source={channel}"))
     bench.to_us = without("RAW_IMU")
-    diagnosis = bench.look()
-    assert "RAW_IMU" not in amiss(diagnosis)
-    assert found(diagnosis, "RAW_IMU").is_well is None and found(diagnosis, "RAW_IMU").found == "0.0 Hz"
+    imu = found(bench.look(), "RAW_IMU")
+    assert imu.is_well is well and imu.found == "0.0 Hz"
 
 
 def test_a_timesync_without_answer_is_found() -> None:
