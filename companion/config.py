@@ -139,6 +139,8 @@ class Rsbn(Section, frozen=True):
     sigma_azimuth_deg: Positive = 0.125
     sigma_range_m: Positive = 100.0
     sigma_range_percent: NotNegative = 0.015
+    bias_azimuth_deg: Positive = 0.1  # constant errors, learnt while other sources are heard
+    bias_range_m: Positive = 50.0
     timeout_s: Positive = 10.0
 
 
@@ -163,6 +165,22 @@ class Estimator(Section, frozen=True):
     output: Literal["auto", "minimax", "kalman", "restrictive"] = "auto"
     false_rejection: Probability = 1e-6
     late_s: Annotated[float, Meta(ge=0.0, le=30.0)] = 6.0
+
+
+class Integrity(Section, frozen=True):
+    """What may go wrong: the horizontal protection level is passed unflagged with probability `risk`, a good
+    source is excluded `alarms_per_hour` times an hour, and one that was excluded is refused with probability
+    `refusal` though it errs no more than the guaranteed prediction allows.
+
+    Trust is normal while the protection level is below `alert_m`, and gets better after `settle_s` without a
+    break, as an excluded source is heard again.
+    """
+
+    risk: Probability = 1e-5
+    alarms_per_hour: Positive = 1e-3
+    refusal: Probability = 0.1
+    alert_m: Positive = 500.0
+    settle_s: NotNegative = 10.0
 
 
 class Output(Section, frozen=True):
@@ -252,6 +270,7 @@ class Config(Section, frozen=True):
     rsbn: Rsbn = Rsbn()
     predictor: Predictor = Predictor()
     estimator: Estimator = Estimator()
+    integrity: Integrity = Integrity()
     output: Output = Output()
     log: Log = Log()
     signing: Signing = Signing()

@@ -13,7 +13,7 @@ ellipsoid, or above mean sea level where the name says `msl` (the geoid is not k
 
 from __future__ import annotations
 
-from enum import IntFlag, StrEnum
+from enum import IntEnum, IntFlag, StrEnum
 from typing import Any, TypeAlias, get_args
 
 import msgspec
@@ -213,6 +213,15 @@ class Mode(StrEnum):
     UNTRUSTED = "untrusted"  # the prediction is infeasible, or its bound passed the stated limit
 
 
+class Trust(IntEnum):
+    """How far the position can be trusted, from best to worst."""
+
+    NORMAL = 0  # fixes that check each other, the protection level within its limit
+    DEGRADED = 1  # fixes, but a source is excluded or under suspicion, or too little checks them
+    PREDICTING = 2  # no fixes: the inertial error is predicted within a guaranteed bound
+    UNTRUSTED = 3  # no bound, or one beyond its limit
+
+
 class Source(IntFlag):
     """What a solution rests on, as bits."""
 
@@ -240,7 +249,9 @@ class Solution(Stamped, frozen=True, gc=False, tag=True):
     bound north and east (m), None where it cannot be given. `error_n` is the estimated error of the inertial
     channel (m), `velocity_error_n` that of its velocity (m/s); `sigma_velocity` is what is left of it on the
     worse horizontal axis (m/s). `horizon_s` counts from the last accepted fix.
-    `disagreement` is the greatest distance between the estimators that run (m).
+    `disagreement` is the greatest distance between the estimators that run (m). `protection` is the
+    horizontal protection level (m): with the configured risk the error is beyond it, whichever one source
+    lies; `trust` says what else must be known of it.
     """
 
     mode: Mode
@@ -260,6 +271,8 @@ class Solution(Stamped, frozen=True, gc=False, tag=True):
     inertial_age_s: float = 0.0
     ahead: tuple[Prediction, ...] = ()
     sigma_velocity: float | None = None
+    protection: float | None = None
+    trust: Trust | None = None
 
 
 class Fix(Stamped, frozen=True, gc=False, tag=True):

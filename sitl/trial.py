@@ -6,10 +6,11 @@ flies. Five minutes are left before the fault for the companion to learn in, and
 
 It knows nothing of workers, files and tables (`sitl.campaign`). A fault counts as
 
-    detected    a measurement of a source that it concerns was rejected, a reset told of it, or that source
-                went out of what the solutions rest on, all before the fault is over;
+    detected    a measurement of a source that it concerns was rejected, a reset told of it, that source went
+                out of what the solutions rest on, or trust got worse, all before the fault is over;
     excluded    that source went out of what the solutions rest on (what comes no more excludes itself);
-    misleading  the error passed `level` for a second or longer while the mode was not "untrusted".
+    misleading  the error passed the protection level for a second or longer while nothing said so: trust was
+                neither "degraded" nor "untrusted".
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from operator import attrgetter
 from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from companion.config import Config, Inertial
 from companion.navigator import Navigator
@@ -41,6 +43,7 @@ from companion.records import (
     Solution,
     Source,
     Stamped,
+    Trust,
 )
 from sitl import loopback
 from sitl.beacon import Beacon
@@ -51,8 +54,8 @@ from sitl.world import World
 
 SECOND = 1_000_000_000
 FAULT_S, OVER_S = 300.0, 540.0
+EXCLUDED = "excluded:"  # how a rejection begins that tells of an exclusion
 LEARNT_S = 60.0  # alarms are counted from here on
-RISK = 1e-5  # of an error beyond the level
 _LEGS = (
     Leg(10, 40, 0, 0),
     Leg(50, 40, 38, 0),
@@ -149,6 +152,7 @@ KINDS: dict[str, Kind] = {
     "reboot": _kind("reboot"),
     "clock-jump": _kind("clock-jump"),
     "second-autopilot": _kind("second-autopilot"),
+    "origin-change": _kind("origin-change"),
 }
 
 
@@ -168,8 +172,10 @@ class Order(NamedTuple):
 class Result(NamedTuple):
     """What came of it. Times from the fault's start (s), errors horizontal (m); None: it did not happen.
 
-    `alarms` are exclusions of good sources in `quiet_s`; `rms_error`, `rms_bound` are over the predicting
-    instants; `raised` is the exception that ended the flight.
+    `normal_m` is the largest error while trust was normal after the fault's start, `beyond_s` how long it
+    was beyond the protection level though flagged. `alarms` are exclusions of good sources in `quiet_s`,
+    before the fault, `wrong` those of sources that it does not concern after its start; `rms_error` and
+    `rms_bound` are over the predicting instants; `raised` is the exception that ended the flight.
     """
 
     key: str
@@ -184,8 +190,11 @@ class Result(NamedTuple):
     before_m: float = 0.0
     largest_m: float = 0.0
     last_m: float = 0.0
+    normal_m: float = 0.0
     misleading_s: float = 0.0
+    beyond_s: float = 0.0
     alarms: int = 0
+    wrong: int = 0
     quiet_s: float = 0.0
     rms_error: float | None = None
     rms_bound: float | None = None
@@ -251,20 +260,30 @@ def score(order: Order, world: World, told: Sequence[Stamped]) -> Result:
     kind, t = KINDS[order.fault], np.array([s.t_ns for s in solutions]) * 1e-9
     error = horizontal_errors(world, solutions, t)
     dt = np.clip(np.diff(t, append=t[-1]), 0.0, 1.0)
-    levels = np.array([level(s) for s in solutions])
-    flagged = np.array([s.mode is Mode.UNTRUSTED for s in solutions])
+    levels = np.array([math.inf if s.protection is None else s.protection for s in solutions])
+    trust = np.array([Trust.UNTRUSTED if s.trust is None else s.trust for s in solutions])
     start = kind.fault.start_s if kind.fault else math.inf
     end = kind.fault.end_s if kind.fault else math.inf
+    on = (t >= start) & (t < end)
     lost = [x for x in _lost(solutions, t, kind.bits) if start <= x < end]
     excluded = lost[0] if lost else None
     seen = [r.t_ns * 1e-9 for r in told if _tells(r, kind.concerns)]
-    detected = min((x for x in (*seen, *lost) if start <= x < end), default=None)
+    worse = t[on & (trust > trust[max(int(on.argmax()) - 1, 0)])].tolist() if on.any() else []
+    detected = min((x for x in (*seen, *lost, *worse) if start <= x < end), default=None)
+    exclusions = [r for r in told if isinstance(r, Rejection) and r.reason.startswith(EXCLUDED)]
+    wrong = [r for r in exclusions if not (kind.concerns and r.source.startswith(kind.concerns))]
     before = (t >= start) & (t <= (end if excluded is None else excluded))
-    quiet = (t >= LEARNT_S) & (t < start)
-    every = [bit for bit in (Source.GNSS, Source.AZIMUTH) if any(s.sources & bit for s in solutions)]
-    alarms = sum(LEARNT_S <= x < start for bit in every for x in _lost(solutions, t, bit))
+    learnt, beyond = t >= LEARNT_S, error > levels
+    flagged = (trust == Trust.DEGRADED) | (trust == Trust.UNTRUSTED)
     predicting = np.array([s.mode is Mode.PREDICTING and s.bound_n is not None for s in solutions])
     bounds = np.array([math.hypot(*(s.bound_n or (0.0, 0.0))) for s in solutions])
+
+    def seconds(mask: npt.NDArray[np.bool_]) -> float:
+        return round(float(dt[mask].sum()), 2)
+
+    def largest(mask: npt.NDArray[np.bool_]) -> float:
+        return round(float(error[mask].max(initial=0.0)), 2)
+
     return Result(
         order.key,
         *order,
@@ -273,22 +292,18 @@ def score(order: Order, world: World, told: Sequence[Stamped]) -> Result:
         len(solutions),
         None if detected is None else round(detected - start, 3),
         None if excluded is None else round(excluded - start, 3),
-        round(float(error[before].max(initial=0.0)), 2),
-        round(float(error[t >= LEARNT_S].max(initial=0.0)), 2),
+        largest(before),
+        largest(learnt),
         round(float(error[-1]), 2),
-        round(float(dt[(error > levels) & ~flagged & (t >= LEARNT_S)].sum()), 2),
-        alarms,
-        round(float(dt[quiet].sum()), 1),
+        largest((t >= start) & (trust == Trust.NORMAL)),
+        seconds(beyond & ~flagged & learnt),
+        seconds(beyond & (trust == Trust.DEGRADED) & learnt),
+        sum(LEARNT_S <= r.t_ns * 1e-9 < start for r in exclusions),
+        sum(r.t_ns * 1e-9 >= start for r in wrong),
+        seconds(learnt & (t < start)),
         _rms(error[predicting]),
         _rms(bounds[predicting]),
     )
-
-
-def level(solution: Solution) -> float:
-    """The horizontal radius (m) that the claimed covariance lets the error leave with probability `RISK`."""
-    nn, ne, _, ee, _, _ = solution.covariance
-    greatest = 0.5 * (nn + ee) + math.hypot(0.5 * (nn - ee), ne)
-    return math.sqrt(-2.0 * math.log(RISK) * greatest)
 
 
 def horizontal_errors(world: World, solutions: Iterable[Solution], t: Array) -> Array:

@@ -20,6 +20,7 @@ Horizontal protection level, for one faulty source at a time:
     |e_full| <= |d| + |e_sub| <= K_fa sigma(S) + K_md sigma(P_sub),  sigma(C) = sqrt(greatest eigenvalue),
 
 with K = sqrt(-2 ln p), as a normal error in the plane leaves the circle K sigma with probability at most p.
+While |d| is beyond its limit and nobody is accused yet, |d| itself stands in the place of the limit.
 The second of two faults that overlap is seen only from the first's exclusion on: that one's row, which all
 begin from again, may have heard the second.
 
@@ -30,6 +31,7 @@ constant that walks slowly: learnt from all others while they are heard and used
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -165,29 +167,22 @@ def take(bank: Bank, measurement: Measurement, limit: float) -> Taken:
 
     One refused by the full solution alone is taken: it may be the full solution that was drawn off.
     """
-    source, z, H, R, unit = measurement
-    n, p = bank.x.shape[1], len(z)
-    k = n - len(bank.biases)
-    if H.shape != (p, k) or R.shape != (p, p):
-        raise ValueError(f"{source}: H has shape {H.shape} and R {R.shape}: give {(p, k)} and {(p, p)}")
-    wide = np.zeros((p, n))
-    wide[:, :k] = H
-    if unit is not None and source in bank.biases:
-        wide[:, k + bank.biases.index(source)] = unit
-    hears = np.array([row.without != source for row in bank.rows])
-    HP = wide @ bank.P
-    S = HP @ wide.T + R
-    nu = z - bank.x @ wide.T
-    weighted = np.linalg.solve(S, nu[:, :, None])[:, :, 0]
-    nis = float(np.min((nu * weighted).sum(axis=1)[hears]))
-    if source in bank.excluded or not nis <= limit:
+    wide, HP, S, nu, nis_of_rows = _innovations(bank, measurement)
+    hears = np.array([row.without != measurement.source for row in bank.rows])
+    nis = float(np.min(nis_of_rows[hears]))
+    if measurement.source in bank.excluded or not nis <= limit:
         return Taken(bank, False, nis)
     K = np.linalg.solve(S, HP).mT
     K[~hears] = 0.0
-    J = np.eye(n) - K @ wide
-    P = J @ bank.P @ J.mT + K @ R @ K.mT
+    J = np.eye(bank.x.shape[1]) - K @ wide
+    P = J @ bank.P @ J.mT + K @ measurement.R @ K.mT
     x = bank.x + (K @ nu[:, :, None])[:, :, 0]
     return Taken(bank._replace(x=x, P=0.5 * (P + P.mT)), True, nis)
+
+
+def surprise(bank: Bank, measurement: Measurement) -> float:
+    """Normalised innovation squared in the full solution, whether the source is excluded or not."""
+    return float(_innovations(bank, measurement)[4][0])
 
 
 def sighted(source: str, z: Azimuth | Range, x: Floats, k: int) -> Measurement | None:
@@ -206,10 +201,10 @@ def sighted(source: str, z: Azimuth | Range, x: Floats, k: int) -> Measurement |
 
 def separations(bank: Bank) -> tuple[Separation, ...]:
     """Every row's separation in position from the full solution."""
-    found = []
-    for i, row in enumerate(bank.rows[1:], 1):
-        found.append(_separation(bank, 0, i, row))
-    return tuple(found)
+    d, S = bank.x[0, :2] - bank.x[1:, :2], bank.P[1:, :2, :2] - bank.P[0, :2, :2]
+    S, statistics = _tested(d, S)
+    rows = zip(bank.rows[1:], d, S, statistics.tolist(), strict=True)
+    return tuple(Separation(row, d, S, statistic) for row, d, S, statistic in rows)
 
 
 def threshold(probability: float) -> float:
@@ -254,8 +249,11 @@ def exclude(bank: Bank, source: str, limit: float) -> Bank:
     clean = next(i for i in mine if bank.rows[i].never)
     forks = sorted((i for i in mine if not bank.rows[i].never), key=lambda i: bank.rows[i].since_ns)
     chosen = clean
-    if forks and _separation(bank, forks[0], clean, bank.rows[clean]).statistic <= limit:
-        chosen = forks[0]
+    if forks:
+        oldest = forks[0]
+        d, S = bank.x[oldest, :2] - bank.x[clean, :2], bank.P[clean, :2, :2] - bank.P[oldest, :2, :2]
+        if _tested(d[None], S[None])[1][0] <= limit:
+            chosen = oldest
     since = bank.rows[chosen].since_ns
     rows = [row if i in mine else row._replace(since_ns=bank.t_ns) for i, row in enumerate(bank.rows)]
     rows[0] = Row("", since)
@@ -264,8 +262,13 @@ def exclude(bank: Bank, source: str, limit: float) -> Bank:
     return bank._replace(rows=tuple(rows), x=x, P=P, excluded=(*bank.excluded, source))
 
 
+def refuse(bank: Bank, source: str) -> Bank:
+    """Without `source` from now on: nothing was taken of it since it went wrong, so nothing is undone."""
+    return bank._replace(excluded=(*bank.excluded, source))
+
+
 def readmit(bank: Bank, source: str) -> Bank:
-    """With `source` heard again; its rows, the full solution's equals meanwhile, part from it now."""
+    """With `source` heard again; its rows part from the full solution now."""
     if source not in bank.excluded:
         raise ValueError(f"{source!r} is not excluded")
     rows, x, P = list(bank.rows), bank.x.copy(), bank.P.copy()
@@ -292,46 +295,75 @@ def protection(bank: Bank, false_alarm: float, integrity_risk: float) -> Protect
     """The horizontal protection level with separations tested at `false_alarm` each.
 
     The risk is shared equally by the sources and the case without a fault; that a fault is there counts as
-    certain. An excluded source cannot do harm.
+    certain. An excluded source's row is the full solution's equal, unless what it said before was kept.
     """
-    rows = [(i, r) for i, r in enumerate(bank.rows) if i and r.never and r.without not in bank.excluded]
+    rows = [(i, r) for i, r in enumerate(bank.rows) if i and r.never]
     K_md = math.sqrt(threshold(integrity_risk / (1 + len(rows))))
     K_fa = math.sqrt(threshold(false_alarm))
-    fault_free = K_md * _sigma(bank.P[0, :2, :2])
+    fault_free = float(K_md * _sigma(bank.P[0, :2, :2]))
     level, by = fault_free, ""
-    for i, row in rows:
-        sub = bank.P[i, :2, :2]
-        S = sub - bank.P[0, :2, :2] + FLOOR * np.eye(2)
-        mine = K_fa * _sigma(S) + K_md * _sigma(sub)
+    index = [i for i, _ in rows]
+    sub = bank.P[index, :2, :2]
+    d = np.hypot(*(bank.x[0, :2] - bank.x[index, :2]).T)
+    levels = np.maximum(K_fa * _sigma(sub - bank.P[0, :2, :2] + FLOOR * np.eye(2)), d) + K_md * _sigma(sub)
+    for (_, row), mine in zip(rows, levels.tolist(), strict=True):
         if mine > level:
             level, by = mine, row.without
     return Protection(level, integrity_risk, by, fault_free)
 
 
 def admits(
-    offset: tuple[float, float], bound: tuple[float, float], sigma: tuple[float, float], refusal: float
-) -> bool:
-    """Whether a fix `offset` (north, east, m) from the guaranteed prediction is within what is guaranteed.
+    offset: Sequence[float], bound: Sequence[float], sigma: Sequence[float], refusal: float
+) -> tuple[float, float]:
+    """How far a fix's `offset` from the guaranteed prediction goes beyond what is guaranteed, and the limit.
 
-    `bound` are the guaranteed r.m.s. bounds, `sigma` the fix's own. Of second moments alone nothing more than
-    Markov's inequality is known: sum (offset^2 / (bound^2 + sigma^2)) has a mean of two at most and is beyond
-    2 / refusal with probability `refusal` at most, however the errors are distributed.
+    `bound` are guaranteed r.m.s. bounds, `sigma` the fix's own, one number a component (m, m/s). Of second
+    moments alone nothing more than Markov's inequality is known: the sum of offset^2 / (bound^2 + sigma^2)
+    over n components has a mean of n at most and is beyond n / refusal with probability `refusal` at most,
+    however the errors are distributed.
     """
     found = sum(o * o / (b * b + s * s) for o, b, s in zip(offset, bound, sigma, strict=True))
-    return found <= 2.0 / refusal
+    return found, len(offset) / refusal
 
 
-def _separation(bank: Bank, full: int, sub: int, row: Row) -> Separation:
-    d = bank.x[full, :2] - bank.x[sub, :2]
-    S = bank.P[sub, :2, :2] - bank.P[full, :2, :2]
+def is_sound(bank: Bank) -> bool:
+    """Whether the numbers are numbers and no variance is negative."""
+    variances = np.diagonal(bank.P, axis1=1, axis2=2)
+    return bool(np.isfinite(bank.x).all() and np.isfinite(bank.P).all() and (variances >= 0.0).all())
+
+
+def _innovations(bank: Bank, measurement: Measurement) -> tuple[Floats, Floats, Floats, Floats, Floats]:
+    """H of all states (p, n); of each row H P (m, p, n), S (m, p, p), innovation (m, p) and its NIS (m,)."""
+    source, z, H, R, unit = measurement
+    n, p = bank.x.shape[1], len(z)
+    k = n - len(bank.biases)
+    if H.shape != (p, k) or R.shape != (p, p):
+        raise ValueError(f"{source}: H has shape {H.shape} and R {R.shape}: give {(p, k)} and {(p, p)}")
+    wide = np.zeros((p, n))
+    wide[:, :k] = H
+    if unit is not None and source in bank.biases:
+        wide[:, k + bank.biases.index(source)] = unit
+    HP = wide @ bank.P
+    S = HP @ wide.T + R
+    nu = z - bank.x @ wide.T
+    weighted = np.linalg.solve(S, nu[:, :, None])[:, :, 0]
+    return wide, HP, S, nu, (nu * weighted).sum(axis=1)
+
+
+def _tested(d: Floats, S: Floats) -> tuple[Floats, Floats]:
+    """Covariances S (m, 2, 2) of separations d (m, 2) made positive, and d' S^-1 d (m,)."""
     # what rounding or a refused measurement has made negative is lifted to the floor
-    eigenvalues, V = np.linalg.eigh(0.5 * (S + S.T))
+    eigenvalues, V = np.linalg.eigh(0.5 * (S + S.mT))
     eigenvalues = np.maximum(eigenvalues, 0.0) + FLOOR
-    return Separation(row, d, (V * eigenvalues) @ V.T, float(((V.T @ d) ** 2 / eigenvalues).sum()))
+    along = (V.mT @ d[..., None])[..., 0]
+    return (V * eigenvalues[:, None, :]) @ V.mT, (along**2 / eigenvalues).sum(axis=1)
 
 
-def _sigma(C: Floats) -> float:
-    return math.sqrt(max(float(np.linalg.eigvalsh(C)[-1]), 0.0))
+def _sigma(C: Floats) -> Floats:
+    """Square root of the greatest eigenvalue of C (..., 2, 2)."""
+    a, b, c = C[..., 0, 0], C[..., 0, 1], C[..., 1, 1]
+    out: Floats = np.sqrt(np.maximum(0.5 * (a + c) + np.hypot(0.5 * (a - c), b), 0.0))
+    return out
 
 
 def _copied(bank: Bank, source: int, target: int, row: Row) -> Bank:

@@ -16,12 +16,14 @@ from scipy.special import chdtri
 
 from .integrity import (
     Bank,
+    Blame,
     Measurement,
     Separation,
     blame,
     exclude,
     fork,
     readmit,
+    refuse,
     separations,
     take,
     threshold,
@@ -101,10 +103,11 @@ def watch(monitor: Monitor, allotment: Allotment) -> tuple[Monitor, list[Exclusi
     limit = threshold(allotment.false_alarm(len(found)))
     accused = blame(tuple(s for s in found if s.row.without not in bank.excluded), limit)
     if accused is not None and accused.margin >= threshold(allotment.wrong):
-        return _excluded(monitor, accused.source, BEYOND, accused.statistic, limit)
+        return _excluded(monitor, accused, limit)
     for source, run in monitor.runs:
         if run >= allotment.run and source in bank.sources and source not in bank.excluded:
-            return _excluded(monitor, source, REFUSED, float(run), float(allotment.run))
+            told = Exclusion(bank.t_ns, source, REFUSED, float(run), float(allotment.run), bank.t_ns, 0.0)
+            return monitor._replace(bank=refuse(bank, source), unresolved=accused is not None), [told]
     if accused is None:
         bank = _renewed(bank, found, round(1e9 * allotment.fork_s))
     return monitor._replace(bank=bank, unresolved=accused is not None), []
@@ -132,14 +135,12 @@ def trusted(monitor: Monitor, source: str) -> bool:
     return source not in monitor.bank.excluded and dict(monitor.runs).get(source, 0) == 0
 
 
-def _excluded(
-    monitor: Monitor, source: str, reason: str, value: float, limit: float
-) -> tuple[Monitor, list[Exclusion]]:
-    before = monitor.bank
+def _excluded(monitor: Monitor, accused: Blame, limit: float) -> tuple[Monitor, list[Exclusion]]:
+    before, (source, value, _) = monitor.bank, accused
     bank = exclude(before, source, limit)
     step = bank.x[0, :2] - before.x[0, :2]
     moved = float((step @ step) ** 0.5)
-    told = Exclusion(bank.t_ns, source, reason, value, limit, bank.rows[0].since_ns, moved)
+    told = Exclusion(bank.t_ns, source, BEYOND, value, limit, bank.rows[0].since_ns, moved)
     return monitor._replace(bank=bank, unresolved=False), [told]
 
 

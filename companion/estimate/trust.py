@@ -5,17 +5,9 @@ A pure fold over evidence. It knows no sources by name and no estimator.
 
 from __future__ import annotations
 
-from enum import IntEnum
 from typing import NamedTuple
 
-
-class Trust(IntEnum):
-    """From best to worst."""
-
-    NORMAL = 0  # fixes that check each other, the protection level within its limit
-    DEGRADED = 1  # fixes, but a source is excluded or under suspicion, or too little checks them
-    PREDICTING = 2  # no fixes: the inertial error is predicted within a guaranteed bound
-    UNTRUSTED = 3  # no bound, or one beyond its limit
+from companion.records import Trust
 
 
 class Evidence(NamedTuple):

@@ -390,6 +390,22 @@ enums["NAVIGATION_MODE"][4] = EnumEntry("NAVIGATION_MODE_LOST", """The autopilot
 NAVIGATION_MODE_ENUM_END = 5
 enums["NAVIGATION_MODE"][5] = EnumEntry("NAVIGATION_MODE_ENUM_END", """""")
 
+# NAVIGATION_TRUST
+enums["NAVIGATION_TRUST"] = Enum()
+enums["NAVIGATION_TRUST"].bitmask = False
+NAVIGATION_TRUST_UNKNOWN = 0
+enums["NAVIGATION_TRUST"][0] = EnumEntry("NAVIGATION_TRUST_UNKNOWN", """Not told.""")
+NAVIGATION_TRUST_NORMAL = 1
+enums["NAVIGATION_TRUST"][1] = EnumEntry("NAVIGATION_TRUST_NORMAL", """Fixes that check each other, the protection level within its limit.""")
+NAVIGATION_TRUST_DEGRADED = 2
+enums["NAVIGATION_TRUST"][2] = EnumEntry("NAVIGATION_TRUST_DEGRADED", """Fixes, but a source is excluded or suspected, or too little checks them.""")
+NAVIGATION_TRUST_PREDICTING = 3
+enums["NAVIGATION_TRUST"][3] = EnumEntry("NAVIGATION_TRUST_PREDICTING", """No trusted fix: the inertial error is predicted, inside the guaranteed bound.""")
+NAVIGATION_TRUST_UNTRUSTED = 4
+enums["NAVIGATION_TRUST"][4] = EnumEntry("NAVIGATION_TRUST_UNTRUSTED", """No bound, or one beyond its limit.""")
+NAVIGATION_TRUST_ENUM_END = 5
+enums["NAVIGATION_TRUST"][5] = EnumEntry("NAVIGATION_TRUST_ENUM_END", """""")
+
 # NAVIGATION_ESTIMATOR
 enums["NAVIGATION_ESTIMATOR"] = Enum()
 enums["NAVIGATION_ESTIMATOR"].bitmask = False
@@ -495,22 +511,22 @@ class MAVLink_navigation_status_message(MAVLink_message):
 
     id = MAVLINK_MSG_ID_NAVIGATION_STATUS
     msgname = "NAVIGATION_STATUS"
-    fieldnames = ["time_usec", "bound_north", "bound_east", "bound_horizontal", "bound_velocity", "sigma_horizontal", "horizon", "disagreement", "ahead", "bound_ahead", "sources", "rejected", "age", "mode", "estimator"]
-    ordered_fieldnames = ["time_usec", "bound_north", "bound_east", "bound_horizontal", "bound_velocity", "sigma_horizontal", "horizon", "disagreement", "ahead", "bound_ahead", "sources", "rejected", "age", "mode", "estimator"]
-    fieldtypes = ["uint64_t", "float", "float", "float", "float", "float", "float", "float", "float", "float", "uint16_t", "uint16_t", "uint16_t", "uint8_t", "uint8_t"]
+    fieldnames = ["time_usec", "bound_north", "bound_east", "bound_horizontal", "bound_velocity", "sigma_horizontal", "horizon", "disagreement", "ahead", "bound_ahead", "sources", "rejected", "age", "mode", "estimator", "protection", "trust"]
+    ordered_fieldnames = ["time_usec", "bound_north", "bound_east", "bound_horizontal", "bound_velocity", "sigma_horizontal", "horizon", "disagreement", "ahead", "bound_ahead", "sources", "rejected", "age", "mode", "estimator", "protection", "trust"]
+    fieldtypes = ["uint64_t", "float", "float", "float", "float", "float", "float", "float", "float", "float", "uint16_t", "uint16_t", "uint16_t", "uint8_t", "uint8_t", "float", "uint8_t"]
     fielddisplays_by_name: Dict[str, str] = {"sources": "bitmask"}
-    fieldenums_by_name: Dict[str, str] = {"sources": "NAVIGATION_SOURCE", "mode": "NAVIGATION_MODE", "estimator": "NAVIGATION_ESTIMATOR"}
-    fieldunits_by_name: Dict[str, str] = {"time_usec": "us", "bound_north": "m", "bound_east": "m", "bound_horizontal": "m", "bound_velocity": "m/s", "sigma_horizontal": "m", "horizon": "s", "disagreement": "m", "ahead": "s", "bound_ahead": "m", "age": "ms"}
-    native_format = bytearray(b"<QfffffffffHHHBB")
-    orders = [0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14]
-    lengths = [1, 1, 1, 1, 1, 1, 1, 1, 4, 4, 1, 1, 1, 1, 1]
-    array_lengths = [0, 0, 0, 0, 0, 0, 0, 0, 4, 4, 0, 0, 0, 0, 0]
+    fieldenums_by_name: Dict[str, str] = {"sources": "NAVIGATION_SOURCE", "mode": "NAVIGATION_MODE", "estimator": "NAVIGATION_ESTIMATOR", "trust": "NAVIGATION_TRUST"}
+    fieldunits_by_name: Dict[str, str] = {"time_usec": "us", "bound_north": "m", "bound_east": "m", "bound_horizontal": "m", "bound_velocity": "m/s", "sigma_horizontal": "m", "horizon": "s", "disagreement": "m", "ahead": "s", "bound_ahead": "m", "age": "ms", "protection": "m"}
+    native_format = bytearray(b"<QfffffffffHHHBBfB")
+    orders = [0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 16]
+    lengths = [1, 1, 1, 1, 1, 1, 1, 1, 4, 4, 1, 1, 1, 1, 1, 1, 1]
+    array_lengths = [0, 0, 0, 0, 0, 0, 0, 0, 4, 4, 0, 0, 0, 0, 0, 0, 0]
     crc_extra = 14
-    unpacker = struct.Struct("<Qfffffff4f4fHHHBB")
+    unpacker = struct.Struct("<Qfffffff4f4fHHHBBfB")
     instance_field = None
     instance_offset = -1
 
-    def __init__(self, time_usec: int, bound_north: float, bound_east: float, bound_horizontal: float, bound_velocity: float, sigma_horizontal: float, horizon: float, disagreement: float, ahead: Sequence[float], bound_ahead: Sequence[float], sources: int, rejected: int, age: int, mode: int, estimator: int):
+    def __init__(self, time_usec: int, bound_north: float, bound_east: float, bound_horizontal: float, bound_velocity: float, sigma_horizontal: float, horizon: float, disagreement: float, ahead: Sequence[float], bound_ahead: Sequence[float], sources: int, rejected: int, age: int, mode: int, estimator: int, protection: float = 0, trust: int = 0):
         MAVLink_message.__init__(self, MAVLink_navigation_status_message.id, MAVLink_navigation_status_message.msgname)
         self._fieldnames = MAVLink_navigation_status_message.fieldnames
         self._instance_field = MAVLink_navigation_status_message.instance_field
@@ -530,9 +546,11 @@ class MAVLink_navigation_status_message(MAVLink_message):
         self.age = age
         self.mode = mode
         self.estimator = estimator
+        self.protection = protection
+        self.trust = trust
 
     def pack(self, mav: "MAVLink", force_mavlink1: bool = False) -> bytes:
-        return self._pack(mav, self.crc_extra, self.unpacker.pack(self.time_usec, self.bound_north, self.bound_east, self.bound_horizontal, self.bound_velocity, self.sigma_horizontal, self.horizon, self.disagreement, self.ahead[0], self.ahead[1], self.ahead[2], self.ahead[3], self.bound_ahead[0], self.bound_ahead[1], self.bound_ahead[2], self.bound_ahead[3], self.sources, self.rejected, self.age, self.mode, self.estimator), force_mavlink1=force_mavlink1)
+        return self._pack(mav, self.crc_extra, self.unpacker.pack(self.time_usec, self.bound_north, self.bound_east, self.bound_horizontal, self.bound_velocity, self.sigma_horizontal, self.horizon, self.disagreement, self.ahead[0], self.ahead[1], self.ahead[2], self.ahead[3], self.bound_ahead[0], self.bound_ahead[1], self.bound_ahead[2], self.bound_ahead[3], self.sources, self.rejected, self.age, self.mode, self.estimator, self.protection, self.trust), force_mavlink1=force_mavlink1)
 
 
 # Define name on the class for backwards compatibility (it is now msgname).
@@ -981,7 +999,7 @@ class MAVLink(object):
         """
         self.send(self.rsbn_measurement_encode(time_usec, beacon_lat, beacon_lon, beacon_alt, azimuth, slant_range, sigma_azimuth, sigma_range, beacon_id, status), force_mavlink1=force_mavlink1)
 
-    def navigation_status_encode(self, time_usec: int, bound_north: float, bound_east: float, bound_horizontal: float, bound_velocity: float, sigma_horizontal: float, horizon: float, disagreement: float, ahead: Sequence[float], bound_ahead: Sequence[float], sources: int, rejected: int, age: int, mode: int, estimator: int) -> MAVLink_navigation_status_message:
+    def navigation_status_encode(self, time_usec: int, bound_north: float, bound_east: float, bound_horizontal: float, bound_velocity: float, sigma_horizontal: float, horizon: float, disagreement: float, ahead: Sequence[float], bound_ahead: Sequence[float], sources: int, rejected: int, age: int, mode: int, estimator: int, protection: float = 0, trust: int = 0) -> MAVLink_navigation_status_message:
         """
         What no standard message carries of the companion's estimate: what it
         rests on, its guaranteed bounds now and in the minutes ahead,
@@ -1002,11 +1020,13 @@ class MAVLink(object):
         age                       : Age of the newest inertial data in the estimate when it was sent (65535: that or more). [ms] (type:uint16_t)
         mode                      : What the estimate rests on. (type:uint8_t, values:NAVIGATION_MODE)
         estimator                 : The estimator in use. (type:uint8_t, values:NAVIGATION_ESTIMATOR)
+        protection                : Horizontal protection level: with the configured risk the error is beyond it, whichever one source lies. 0: not told. [m] (type:float)
+        trust                     : How far the estimate can be trusted. (type:uint8_t, values:NAVIGATION_TRUST)
 
         """
-        return MAVLink_navigation_status_message(time_usec, bound_north, bound_east, bound_horizontal, bound_velocity, sigma_horizontal, horizon, disagreement, ahead, bound_ahead, sources, rejected, age, mode, estimator)
+        return MAVLink_navigation_status_message(time_usec, bound_north, bound_east, bound_horizontal, bound_velocity, sigma_horizontal, horizon, disagreement, ahead, bound_ahead, sources, rejected, age, mode, estimator, protection, trust)
 
-    def navigation_status_send(self, time_usec: int, bound_north: float, bound_east: float, bound_horizontal: float, bound_velocity: float, sigma_horizontal: float, horizon: float, disagreement: float, ahead: Sequence[float], bound_ahead: Sequence[float], sources: int, rejected: int, age: int, mode: int, estimator: int, force_mavlink1: bool = False) -> None:
+    def navigation_status_send(self, time_usec: int, bound_north: float, bound_east: float, bound_horizontal: float, bound_velocity: float, sigma_horizontal: float, horizon: float, disagreement: float, ahead: Sequence[float], bound_ahead: Sequence[float], sources: int, rejected: int, age: int, mode: int, estimator: int, protection: float = 0, trust: int = 0, force_mavlink1: bool = False) -> None:
         """
         What no standard message carries of the companion's estimate: what it
         rests on, its guaranteed bounds now and in the minutes ahead,
@@ -1027,6 +1047,8 @@ class MAVLink(object):
         age                       : Age of the newest inertial data in the estimate when it was sent (65535: that or more). [ms] (type:uint16_t)
         mode                      : What the estimate rests on. (type:uint8_t, values:NAVIGATION_MODE)
         estimator                 : The estimator in use. (type:uint8_t, values:NAVIGATION_ESTIMATOR)
+        protection                : Horizontal protection level: with the configured risk the error is beyond it, whichever one source lies. 0: not told. [m] (type:float)
+        trust                     : How far the estimate can be trusted. (type:uint8_t, values:NAVIGATION_TRUST)
 
         """
-        self.send(self.navigation_status_encode(time_usec, bound_north, bound_east, bound_horizontal, bound_velocity, sigma_horizontal, horizon, disagreement, ahead, bound_ahead, sources, rejected, age, mode, estimator), force_mavlink1=force_mavlink1)
+        self.send(self.navigation_status_encode(time_usec, bound_north, bound_east, bound_horizontal, bound_velocity, sigma_horizontal, horizon, disagreement, ahead, bound_ahead, sources, rejected, age, mode, estimator, protection, trust), force_mavlink1=force_mavlink1)

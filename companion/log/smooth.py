@@ -133,7 +133,12 @@ def _forward(records: Iterable[Stamped], config: Config) -> list[_Stop]:
             continue
         # no solutions, which would predict at moments of their own, and no bounds ahead: the stops are ours
         carry = carry._replace(next_ns=NEVER_NS, next_ahead_ns=NEVER_NS)
+        before = carry.state
         carry, _ = learnt(carry, settings)
+        if stops and before is not None and carry.state is not None and carry.state is not before:
+            last = stops.pop()  # a source was left out, and what it had said before that fix with it
+            renewed = _corrected(last, carry.state)
+            stops.append(renewed._replace(widened=last.widened * renewed.widened))
         after, outputs = stepped(carry, record, settings)
         stop = None
         if isinstance(record, Gnss | RsbnFix):

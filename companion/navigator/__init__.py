@@ -35,10 +35,11 @@ from companion.records import (
     Tuning,
 )
 
-from . import errorstate, guarantee
+from . import errorstate, guarantee, watch
 from .carry import FIXES, Carry, Settings, Step, initial, is_news
+from .lesson import learn
 from .solution import announce, solve
-from .step import learn, step, uses
+from .step import step, uses
 
 __all__ = ["FOLDED", "Navigator", "learnt", "stepped", "tuned"]
 
@@ -73,6 +74,7 @@ class Navigator:
         self._late_ns = round(1e9 * config.estimator.late_s)
         self._rests_on = Mode.INITIALISING, Source(0)  # mode and fixes of the last solution, and its time
         self._given_ns = 0
+        self._told: watch.Watch | None = None
         self._chosen = False  # the inertial channel is told once, with the first record
 
     def handle(self, record: Input) -> list[Output]:
@@ -97,7 +99,14 @@ class Navigator:
         if isinstance(record, RsbnFix) and self._carry.rsbn_ns == record.t_ns:  # believed: tell at once
             self._carry, solution = solve(self._carry, record.rx_ns, self._settings)
             outputs = [*outputs, *solution]
-        return self._announced(outputs)
+        return [*self._announced(outputs), *self._watched(record)]
+
+    def _watched(self, record: Input) -> list[Output]:
+        """What became of the sources since it was last told."""
+        before, self._told = self._told, self._carry.watch
+        if before is self._told or self._told is None:
+            return []
+        return watch.tell(before, self._told, record.rx_ns)
 
     def _learnt(self) -> tuple[Input | None, list[Output]]:
         """The lesson left over by the record before is learnt: whose it was, and what follows."""
@@ -162,13 +171,8 @@ class Navigator:
 
 
 def stepped(carry: Carry, record: Input, settings: Settings) -> Step:
-    """One step, guarded; a state gone wrong by it is begun anew."""
-    after, outputs = _guarded(carry, record, settings, step, record)
-    if after.state is not carry.state and not errorstate.is_sound(after.state):
-        why = "its covariance was none any more"
-        outputs = [*outputs, Reset(record.t_ns, record.rx_ns, "error state", why)]
-        return after._replace(state=None), outputs
-    return after, outputs
+    """One step, guarded."""
+    return _guarded(carry, record, settings, step, record)
 
 
 def learnt(carry: Carry, settings: Settings) -> Step:
@@ -193,12 +197,22 @@ def tuned(carry: Carry, before: Settings, config: Config) -> tuple[Settings, Car
 def _guarded(
     carry: Carry, record: Input, settings: Settings, follow: Callable[[Carry, Any, Settings], Step], x: Any
 ) -> Step:
-    """What follows from x; what cannot be computed with is refused aloud and changes nothing."""
+    """What follows from x; what cannot be computed with is refused aloud and changes nothing, and a state
+    gone wrong by it is begun anew.
+    """
     try:
-        return follow(carry, x, settings)
+        after, outputs = follow(carry, x, settings)
     except (ArithmeticError, ValueError) as error:  # a singular matrix is a ValueError too
         why = f"it cannot be computed with: {error}"
         return carry, [Rejection(record.t_ns, record.rx_ns, type(record).__name__, why)]
+    why = "its covariance was none any more"
+    if after.state is not carry.state and not errorstate.is_sound(after.state):
+        outputs = [*outputs, Reset(record.t_ns, record.rx_ns, "error state", why)]
+        after = after._replace(state=None)
+    if after.watch is not carry.watch and not watch.is_sound(after.watch):
+        outputs = [*outputs, Reset(record.t_ns, record.rx_ns, "integrity monitor", why)]
+        after = after._replace(watch=None)
+    return after, outputs
 
 
 def _choice(record: Input, config: Config) -> Event:

@@ -7,15 +7,19 @@ from typing import NamedTuple
 from scipy.special import chdtri
 
 from companion.config import Config
+from companion.estimate.fusion import Observation
+from companion.estimate.monitor import Allotment
+from companion.estimate.trust import Held
 from companion.records import Gnss, LocalOrigin, LocalPosition, Output, Prediction, RsbnFix, Source
 
-from . import errorstate, guarantee, inertial, radio, tilterror, winderror
+from . import errorstate, guarantee, inertial, radio, tilterror, watch, winderror
 from .deadreckoning import Reckoner
 from .errorstate import ErrorModel, ErrorState
 from .guarantee import Guarantee
 from .inertial import Point, Track
 from .restricted import Restrictive
 from .strapped import Strap
+from .watch import Watch
 
 FIXES = Source.GNSS | Source.AZIMUTH | Source.RANGE
 
@@ -26,6 +30,7 @@ class Settings(NamedTuple):
     config: Config
     unit: ErrorModel
     gate: tuple[float, ...]  # chi-square limits for 0, 1, 2, 3 degrees of freedom
+    allotment: Allotment
 
     @classmethod
     def of(cls, config: Config) -> Settings:
@@ -37,7 +42,7 @@ class Settings(NamedTuple):
             unit = winderror.grade(config.air_data, config.gnss)
         elif config.channel == "strapdown":
             unit = tilterror.grade(config.strapdown, config.gnss)
-        return cls(config, unit, gate)
+        return cls(config, unit, gate, watch.allotment(config))
 
 
 class Level(NamedTuple):
@@ -48,13 +53,16 @@ class Level(NamedTuple):
 
 
 class Lesson(NamedTuple):
-    """A believed fix that has still to teach the guaranteed predictor: what was heard, and the inertial point
-    of its time.
+    """A fix that has still to teach: what was believed of it, for the guaranteed predictor; the inertial
+    point of its time; and a beacon's measurements as they were said, for the integrity monitor. It is `proof`
+    if the guaranteed prediction allows it while the Gaussian state does not: the state's claim was wrong.
     """
 
     record: Gnss | RsbnFix
-    heard: radio.Heard
+    heard: radio.Heard | None
     ins: Point
+    sights: tuple[Observation, ...] = ()
+    proof: bool = False
 
 
 class Carry(NamedTuple):
@@ -74,8 +82,12 @@ class Carry(NamedTuple):
     gnss_heard: radio.Heard | None = None  # the last one believed
     innovation: float | None = None  # of the last fix, squared, by its covariance; None if of one number
     lesson: Lesson | None = None  # not yet learnt: a solution must not wait for it
+    asked_ns: int | None = None  # when GNSS was last used or refused
     gnss_ns: int | None = None  # when fixes were last believed
     rsbn_ns: int | None = None
+    rsbn_told: Source = Source(0)  # which of azimuth and range were, then
+    watch: Watch | None = None  # over the sources; its full solution is `state`
+    held: Held | None = None  # trust, and since when
     next_ns: int = 0
     next_ahead_ns: int = 0
     ahead: tuple[Prediction, ...] = ()
@@ -115,5 +127,5 @@ def sources(carry: Carry, t_ns: int, settings: Settings) -> Source:
     if carry.gnss_ns is not None and (t_ns - carry.gnss_ns) * 1e-9 <= config.gnss.timeout_s:
         sources |= Source.GNSS
     if carry.rsbn_ns is not None and (t_ns - carry.rsbn_ns) * 1e-9 <= config.rsbn.timeout_s:
-        sources |= Source.AZIMUTH | Source.RANGE
+        sources |= carry.rsbn_told
     return sources

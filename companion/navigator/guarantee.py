@@ -153,6 +153,11 @@ def shift(g: Guarantee, north: float, east: float, v_n: Vector2 = (0.0, 0.0), t_
     return Guarantee(window_n, window_e, tuple(moved(b) for b in g.bins))
 
 
+def forget(g: Guarantee, since_ns: int) -> Guarantee:
+    """Without what was learnt after `since_ns`: it was a lie."""
+    return Guarantee(_until(g.north, since_ns), _until(g.east, since_ns))
+
+
 def _close(g: Guarantee) -> Guarantee:
     """All bins pushed, oldest first: a window takes its fixes in the order of time."""
     north, east = g.north, g.east
@@ -184,6 +189,12 @@ def _moved(channel: Channel, dt: float) -> tuple[float, float, float, float]:
         position.bound + velocity.bound * dt,
         velocity.bound,
     )
+
+
+def _until(window: Window, t_ns: int) -> Window:
+    kept = int(window.t_ns.searchsorted(t_ns, "right"))
+    columns = {name: getattr(window, name)[:kept] for name in ("t_ns", "velocity", "value", "sigma")}
+    return replace(window, **columns)
 
 
 def _shifted(window: Window, offset: float, rate: float, t_ns: int) -> Window:

@@ -10,7 +10,7 @@ import math
 from companion.nav.geometry import displace
 from companion.records import Vector2
 
-from . import errorstate, guarantee, restricted
+from . import errorstate, guarantee, restricted, watch
 from .carry import Carry, Settings
 from .errorstate import VELOCITY
 from .inertial import Point
@@ -26,14 +26,17 @@ def shifted(carry: Carry, north: float, east: float, v_n: Vector2 | None = None,
     state = carry.state and errorstate.shift(carry.state, north, east, v_n)
     promise = guarantee.shift(carry.guarantee, north, east, v_n or (0.0, 0.0), t_ns)
     bounded = carry.restrictive and restricted.shift(carry.restrictive, north, east)
-    return carry._replace(state=state, guarantee=promise, restrictive=bounded, track=(), gnss_heard=None)
+    w = carry.watch and watch.shift(carry.watch, north, east, v_n, t_ns)
+    carry = carry._replace(state=state, guarantee=promise, restrictive=bounded, watch=w)
+    return carry._replace(track=(), gnss_heard=None)
 
 
 def blurred(carry: Carry, settings: Settings, sigma: float, sigma_v: float = 0.0) -> Carry:
     """After the channel was carried across a silence: what was promised of it is void."""
     state = carry.state and errorstate.blur(carry.state, sigma, sigma_v)
     promise = guarantee.begin(settings.config)
-    return carry._replace(state=state, guarantee=promise, restrictive=None, track=carry.track[-1:])
+    w = carry.watch and watch.blur(carry.watch, sigma, sigma_v)
+    return carry._replace(state=state, guarantee=promise, restrictive=None, watch=w, track=carry.track[-1:])
 
 
 def kept_near(carry: Carry, has_velocity: bool) -> Carry:

@@ -34,12 +34,20 @@ class Heard(NamedTuple):
 
 def from_gnss(record: Gnss, ins: Point, settings: GnssSection, drifting: bool = False) -> Heard:
     """A GNSS fix as a horizontal position at the INS; if `drifting`, with its white noise alone."""
-    sigma = max(record.sigma_horizontal or 0.0, settings.sigma_m)
-    if drifting:
-        sigma = max(math.sqrt(sigma**2 - settings.sigma_m**2), settings.sigma_m / 3.0)
+    sigma = white_sigma(record, settings) if drifting else _stated(record, settings)
     north, east, _ = separation(Geodetic(record.lat, record.lon, record.alt_msl), ins.position)
     place = Position(np.array([east, north]), sigma**2 * np.eye(2))
     return Heard(record.t_ns, (place,), Source.GNSS)
+
+
+def white_sigma(record: Gnss, settings: GnssSection) -> float:
+    """One sigma an axis (m) of a fix, its drift left out."""
+    stated = _stated(record, settings)
+    return max(math.sqrt(stated**2 - settings.sigma_m**2), settings.sigma_m / 3.0)
+
+
+def _stated(record: Gnss, settings: GnssSection) -> float:
+    return max(record.sigma_horizontal or 0.0, settings.sigma_m)
 
 
 def from_rsbn(record: RsbnFix, ins: Point, settings: Rsbn) -> Heard:

@@ -6,10 +6,12 @@ import math
 from itertools import combinations
 from typing import NamedTuple
 
+from companion.estimate import trust
+from companion.estimate.integrity import INERTIAL
 from companion.nav.geometry import displace
 from companion.records import Event, Mode, Solution, Source, Vector2, Vector3
 
-from . import guarantee, restricted
+from . import guarantee, restricted, watch
 from .carry import FIXES, Carry, Settings, Step, level, sources, state_at
 from .errorstate import ErrorState, Floats
 from .guarantee import Bounded
@@ -51,6 +53,12 @@ def solve(carry: Carry, rx_ns: int, settings: Settings) -> Step:
     error, velocity_error, (var_n, cov, var_e), velocity_variance = candidates[leads]
     north, east, down = ins.v_n
     lat, lon, alt = displace(*ins.position, -error[0], -error[1], 0.0)
+    watched = carry.watch
+    protection = None
+    if watched is not None and watched.protection is not None:
+        # of the monitor's full solution; another one is off by no more than its distance from that besides
+        protection = watched.protection.level + math.dist(error, watch.error_at(watched, ins, settings.unit))
+    held = _trust(carry, bounded, protection, t_ns, settings)
     last = max((t for t in (carry.gnss_ns, carry.rsbn_ns) if t is not None), default=t_ns)
     solution = Solution(
         t_ns,
@@ -72,9 +80,11 @@ def solve(carry: Carry, rx_ns: int, settings: Settings) -> Step:
         max(0.0, (rx_ns - t_ns) * 1e-9),
         carry.ahead,
         math.sqrt(velocity_variance),
+        protection,
+        held.trust,
     )
     next_ns = max(carry.next_ns + round(1e9 / config.output.pace_hz), t_ns)
-    return carry._replace(state=state, guarantee=promise, next_ns=next_ns), [solution]
+    return carry._replace(state=state, guarantee=promise, held=held, next_ns=next_ns), [solution]
 
 
 def _candidates(
@@ -114,6 +124,24 @@ def _mode(carry: Carry, bounded: Bounded | None, t_ns: int, settings: Settings) 
     if bounded is None or math.hypot(*bounded.bound_n) > settings.config.predictor.limit_m:
         return Mode.UNTRUSTED
     return Mode.PREDICTING
+
+
+def _trust(
+    carry: Carry, bounded: Bounded | None, protection: float | None, t_ns: int, settings: Settings
+) -> trust.Held:
+    """How far the output can be trusted."""
+    fixes, w = bool(sources(carry, t_ns, settings) & FIXES), carry.watch
+    suspicion = w is not None and (w.monitor.unresolved or bool(w.exclusions))
+    inertial = watch.excluded(w, INERTIAL)
+    bound = None if bounded is None or inertial else math.hypot(*bounded.bound_n)
+    evidence = trust.Evidence(fixes, suspicion, protection, bound)
+    config = settings.config
+    limits = trust.Limits(
+        config.integrity.alert_m, config.predictor.limit_m, settle_s=config.integrity.settle_s
+    )
+    if carry.held is None:
+        return trust.Held(trust.judge(evidence, limits), t_ns)
+    return trust.turn(carry.held, t_ns, evidence, limits)
 
 
 def announce(solution: Solution) -> Event:

@@ -19,13 +19,12 @@ from typing import Any
 import numpy as np
 
 from companion.config import Config
-from companion.estimate.fusion import Height, NoFix, Position, maximum_likelihood
+from companion.estimate.fusion import Azimuth, Observation, Position, Range
 from companion.nav.geometry import displace
 from companion.records import (
     AirData,
     Attitude,
     Event,
-    Fix,
     GlobalPosition,
     Gnss,
     Imu,
@@ -43,12 +42,13 @@ from companion.records import (
     Vector3,
 )
 
-from . import deadreckoning, errorstate, guarantee, inertial, moved, radio, restricted, strapped
+from . import deadreckoning, errorstate, guarantee, inertial, moved, radio, strapped, watch
 from .carry import FIXES, Carry, Lesson, Level, Settings, Step, initial, level, sources, state_at
 from .errorstate import ErrorState, Floats
 from .inertial import Point
+from .lesson import unheard
 from .solution import solve
-from .winderror import WindError
+from .watch import GNSS
 
 TOGETHER_NS = 1_000_000_000  # GNSS this close to a beacon's answer joins its fix
 PATIENCE_NS = 5_000_000_000  # how long the autopilot is waited for to tell what a channel begins with
@@ -180,7 +180,7 @@ def _given(carry: Carry, record: Stamped, out: list[Output], settings: Settings)
     """With a solution once one is due."""
     if record.t_ns < carry.next_ns:
         return carry, out
-    carry, solution = solve(carry, record.rx_ns, settings)
+    carry, solution = solve(unheard(carry, settings), record.rx_ns, settings)
     return carry, out + solution
 
 
@@ -213,9 +213,13 @@ def _gnss(carry: Carry, record: Gnss, settings: Settings) -> Step:
     config = settings.config.gnss
     carry = carry._replace(gnss=record)
     ins = inertial.at(carry.track, record.t_ns)
-    since = math.inf if carry.gnss_ns is None else (record.t_ns - carry.gnss_ns) * 1e-9
-    if record.fix < LEVEL_3D or ins is None or since < config.every_s:
+    asked = math.inf if carry.asked_ns is None else (record.t_ns - carry.asked_ns) * 1e-9
+    if record.fix < LEVEL_3D or ins is None or asked < config.every_s:
         return carry, told
+    carry = carry._replace(asked_ns=record.t_ns, lesson=Lesson(record, None, ins))
+    if watch.excluded(carry.watch, GNSS):
+        return carry, []
+    since = math.inf if carry.gnss_ns is None else (record.t_ns - carry.gnss_ns) * 1e-9
     white = radio.from_gnss(record, ins, config, drifting=True)
     carry, out = _absorb(carry, white, errorstate.gnss_rows(settings.unit), ins, record, settings)
     if out:
@@ -225,7 +229,7 @@ def _gnss(carry: Carry, record: Gnss, settings: Settings) -> Step:
     carry = carry._replace(gnss_ns=record.t_ns, gnss_heard=heard, level=learnt)
     if config.use_velocity and record.v_n is not None:
         carry = _absorb_velocity(carry, record, record.v_n, ins, settings)
-    return carry._replace(lesson=Lesson(record, heard, ins)), []
+    return carry._replace(lesson=carry.lesson and carry.lesson._replace(heard=heard)), []
 
 
 def _rsbn(carry: Carry, record: RsbnFix, settings: Settings) -> Step:
@@ -235,13 +239,15 @@ def _rsbn(carry: Carry, record: RsbnFix, settings: Settings) -> Step:
         why = "no inertial position at its time"
         return carry, [*told, Rejection(record.t_ns, record.rx_ns, f"rsbn {record.beacon}", why)]
     ins = level(ins, carry)
-    heard = radio.from_rsbn(record, ins, settings.config.rsbn)
+    said = radio.from_rsbn(record, ins, settings.config.rsbn)
+    carry = carry._replace(lesson=Lesson(record, None, ins, said.observations))
+    heard = _calibrated(carry, record, said, settings)
     if not heard.observations:
         return carry, []
     carry, out = _absorb(carry, heard, errorstate.beacon_rows(settings.unit), ins, record, settings)
     if out:
         return carry, out
-    carry = carry._replace(rsbn_ns=record.t_ns)
+    carry = carry._replace(rsbn_ns=record.t_ns, rsbn_told=heard.sources)
     gnss = carry.gnss_heard
     together = heard
     if gnss is not None and abs(record.t_ns - gnss.t_ns) <= TOGETHER_NS:
@@ -249,7 +255,19 @@ def _rsbn(carry: Carry, record: RsbnFix, settings: Settings) -> Step:
         together = radio.Heard(
             record.t_ns, heard.observations + gnss.observations, heard.sources | gnss.sources
         )
-    return carry._replace(lesson=Lesson(record, together, ins)), []
+    return carry._replace(lesson=carry.lesson and carry.lesson._replace(heard=together)), []
+
+
+def _calibrated(carry: Carry, record: RsbnFix, said: radio.Heard, settings: Settings) -> radio.Heard:
+    """What is to be believed of a beacon's answer, less its learnt biases."""
+    kept, told = list[Observation](), Source(0)
+    for z in said.observations:
+        assert isinstance(z, Azimuth | Range)
+        name = watch.named(record.beacon, z)
+        if not watch.excluded(carry.watch, name):
+            kept.append(watch.calibrated(carry.watch, name, z, settings.config))
+            told |= Source.AZIMUTH if isinstance(z, Azimuth) else Source.RANGE
+    return radio.Heard(record.t_ns, tuple(kept), told)
 
 
 def _absorb(
@@ -269,6 +287,7 @@ def _absorb(
             carry = carry._replace(state=state)
             return carry, [_rejected(record, "innovation beyond its gate (chi-square)", found.cost, limit)]
         state = errorstate.widen(state, found.cost / limit)
+        carry = carry._replace(lesson=carry.lesson and carry.lesson._replace(proof=True))
         found = radio.innovation(heard, _prior(state, H, settings))
     mean = -found.position[1::-1]  # the place in the plane is minus the error; x east, y north
     covariance = found.covariance[1::-1, 1::-1]
@@ -315,55 +334,6 @@ def _levelled(old: Level, record: Gnss, ins: Point, part: float) -> Level:
     p = old.variance + 0.0025
     k = p / (p + r)
     return Level(old.error + k * (ins.position.alt - record.alt_msl - old.error), (1.0 - k) * p)
-
-
-def learn(carry: Carry, lesson: Lesson, settings: Settings) -> Step:
-    """The radio fix alone, the INS left out: it teaches the guaranteed predictor and goes to the log."""
-    record, heard, ins = lesson
-    height = Height(0.0, settings.config.inertial.height_sigma_m)
-    try:
-        fix = maximum_likelihood((*heard.observations, height), start=np.zeros(3))
-    except NoFix:
-        return carry, []  # an azimuth or a range alone is no fix; the error state has had its use of it
-    east, north, up = (float(c) for c in fix.position)
-    correction = (-north, -east)
-    (var_e, cov), var_n = fix.covariance[0, :2].tolist(), float(fix.covariance[1, 1])
-    sigma = (math.sqrt(var_n), math.sqrt(var_e))
-    g = guarantee.learn(
-        carry.guarantee, record.t_ns, "position", correction, sigma, settings.config.predictor
-    )
-    lat, lon, alt = displace(*ins.position, north, east, -up)
-    out = Fix(
-        record.t_ns,
-        record.rx_ns,
-        lat,
-        lon,
-        alt,
-        correction,
-        (var_n, cov, var_e),
-        int(heard.sources),
-        fix.cost,
-        fix.degrees_of_freedom,
-        fix.iterations,
-        carry.innovation,
-    )
-    return _restrict(carry._replace(guarantee=g), heard, ins, out, settings), [out]
-
-
-def _restrict(carry: Carry, heard: radio.Heard, ins: Point, fix: Fix, settings: Settings) -> Carry:
-    """The same fix for the restrictive estimator, which is kept of dead reckoning only."""
-    unit = settings.unit
-    if not isinstance(unit, WindError) or carry.state is None:
-        return carry
-    if carry.restrictive is None:
-        return carry._replace(restrictive=restricted.begin(carry.state, ins.v_n, unit))
-    var_n, cov, var_e = fix.covariance
-    covariance = np.array([[var_n, cov], [cov, var_e]])
-    white = not heard.sources & Source.GNSS
-    learnt = restricted.learn(
-        carry.restrictive, fix.t_ns, np.array(fix.correction_n), covariance, white, unit
-    )
-    return carry._replace(restrictive=learnt)
 
 
 def _prior(state: ErrorState, H: Floats, settings: Settings) -> Position:

@@ -292,6 +292,8 @@ def navigation_status(solution: Solution, receiver: Receiver) -> Message:
         else 0xFFFF,
         mode=_MODES[s.mode],
         estimator=_ESTIMATORS.index(s.estimator) if s.estimator in _ESTIMATORS else 0,
+        protection=math.nan if s.protection is None else s.protection,
+        trust=0 if s.trust is None else s.trust + 1,  # NAVIGATION_TRUST: 0 is "not told"
     )
 
 
