@@ -108,6 +108,11 @@ class Flight:
             lat, lon = deg_e7(ORIGIN.lat), deg_e7(ORIGIN.lon)
             self.say("GPS_GLOBAL_ORIGIN", latitude=lat, longitude=lon, altitude=round(ORIGIN.alt * 1e3))
         self.say("ATTITUDE", roll=0.0, pitch=0.0, yaw=0.0, **boot)
+        stamp = boot["time_boot_ms"] * 1000
+        if self.autopilot == 3:
+            self.say("RAW_IMU", time_usec=stamp, zacc=-1000)
+        else:
+            self.say("HIGHRES_IMU", time_usec=stamp, zacc=-9.80665, fields_updated=0x3F)
         self.say("SCALED_PRESSURE", press_abs=915.0, temperature=1500, **boot)
         indicated = SPEED * (915.0 / 1013.25) ** 0.404868
         self.say("VFR_HUD", airspeed=indicated, groundspeed=SPEED, alt=place.alt, climb=0.0, heading=0)
@@ -181,13 +186,14 @@ def lies(name: str, values: dict[str, Any]) -> None:
             values |= {"direction": 12.0, "speed": 25.0, "speed_z": 3.0}
 
 
+@pytest.mark.parametrize("source", ["auto", "strapdown"])
 @pytest.mark.parametrize(("autopilot", "profile", "via"), WAYS)
 def test_nothing_that_the_autopilot_says_of_its_position_comes_back(
-    autopilot: int, profile: str, via: str
+    autopilot: int, profile: str, via: str, source: str
 ) -> None:
     """Bit for bit the same is fed to one that tells the truth and to one that lies."""
-    config = told(f"output.profile={profile}", f"output.via={via}")
-    assert config.channel == "air_data"
+    config = told(f"output.profile={profile}", f"output.via={via}", f"inertial.source={source}")
+    assert config.channel == {"auto": "air_data"}.get(source, source)
     honest, lying = Flight(config, autopilot), Flight(config, autopilot, lies)
     for flight in (honest, lying):
         flight.fly(15.0)
