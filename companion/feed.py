@@ -18,6 +18,7 @@ from companion.switching import Switching
 from companion.wire.encode import MAV_CMD_EXTERNAL_POSITION_ESTIMATE, Receiver, Unsent, encode
 from companion.wire.gate import Gate, Position, Withheld
 
+CALLED = {RESET: "external position"}
 ON_SOURCE_SET_2 = frozenset({MESSAGES["odometry"], MESSAGES["vision"]})
 
 
@@ -65,7 +66,7 @@ class Feed:
                     made[name] = encode(position, receiver, name)
                 except Unsent as unsent:
                     reason = str(unsent)
-            self._tell(self._withheld.note(name, reason, now))
+            self._tell(self._withheld.note(CALLED.get(name, name), reason, now))
         if self.config.output.switches_sources and (by_set := ON_SOURCE_SET_2.intersection(names)):
             self._switching.update(bool(solution.sources & Source.GNSS), not by_set.isdisjoint(made), now)
             return [*made.values(), *self._switching.to_send(receiver.system, now)]

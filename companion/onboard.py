@@ -243,11 +243,10 @@ class Onboard:
                 self._on_record(Tuning(event.received_ns, event.received_ns, to_toml(config)))
         if not (event.from_autopilot or event.frame.msgid == RSBN):
             return
-        if (
-            event.frame.msgid == COMMAND_ACK
-            and event.message.target_component == self._config.link.component_id
-        ):
+        ours = (0, self._config.link.component_id)  # 0: of a sender that names nobody
+        if event.frame.msgid == COMMAND_ACK and event.message.target_component in ours:
             link.feed.acknowledged(event.message.command, event.message.result, event.received_ns)
+            self._tell(link)
         link.checkup.receive(event.message, event.frame)
         for record in decode(event.message, event.received_ns, link.sender):
             link.feed.heard(record)
@@ -294,10 +293,14 @@ class Onboard:
         for link in heard if feeding else ():
             for message in link.feed.messages(solution, feeding, self._receiver(link)):
                 link.session.send(message)
-            for event in link.feed.take_events():
-                self._emit(event, "/link/Event")
+            self._tell(link)
         for link in heard if STATUS in due else ():
             link.session.send(navigation_status(solution, self._receiver(link)))
+
+    def _tell(self, link: Link) -> None:
+        """What there is to tell of what goes out."""
+        for event in link.feed.take_events():
+            self._emit(event, "/link/Event")
 
     def _receiver(self, link: Link) -> Receiver:
         return Receiver(

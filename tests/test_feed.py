@@ -305,7 +305,7 @@ def test_the_position_of_an_autopilot_is_not_reset_while_it_has_gps() -> None:
     sent = flight.heard("COMMAND_INT")
     assert 15 <= len(sent) <= 19  # 1 Hz, and not at once on a beacon's answer
     assert {m.command for m in sent} == {43003}
-    assert sum("COMMAND_INT withheld: the autopilot has GPS" in text for text in flight.texts) == 1
+    assert sum("external position withheld: the autopilot has GPS" in text for text in flight.texts) == 1
 
 
 def test_nobody_can_hurry_the_resets() -> None:
