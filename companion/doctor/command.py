@@ -69,6 +69,10 @@ class Patient:
         """Leave the link."""
         self._stream.close()
 
+    def count_anew(self) -> None:
+        """Count bytes from now on: the streams that were asked for come."""
+        self.bytes, self._begun = 0, time.monotonic()
+
     def line_use(self, address: Address) -> list[Finding]:
         """How full a serial line is in our direction: ten bits a byte."""
         if address.kind != "serial":
@@ -91,6 +95,7 @@ async def examine(patient: Patient, address: Address) -> Diagnosis:
     examination = patient.examination
     if not await patient.until(lambda now: examination.is_heard, HEAR_S):
         raise NoAutopilot(f"no autopilot heard on {address} in {HEAR_S:.0f} s: {_what_came(patient)}")
+    patient.count_anew()
     await patient.until(examination.is_done, LONGEST_S)
     diagnosis = examination.diagnosis(time.monotonic_ns())
     more = (*patient.line_use(address), machine(struct.calcsize("P") * 8))
