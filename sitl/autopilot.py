@@ -41,7 +41,7 @@ from companion.records import (
     Truth,
 )
 from sitl.encode import Airframe, encode
-from sitl.faults import AUTOPILOT_FAULTS, LINK_FAULTS, Chunk, Fault, disturb
+from sitl.faults import AUTOPILOT_FAULTS, LINK_FAULTS, Chunk, Fault, disturb, without_fix
 from sitl.parameters import CAPABILITIES, VERSIONS, Parameters
 from sitl.scenarios import Scenario
 from sitl.world import World
@@ -105,6 +105,7 @@ class Autopilot:
         self._rsbn = self.world.streams[RsbnFix]
         self._rsbn_next = 0
         self.parameters = Parameters(scenario.autopilot)
+        self._gnss_off_ns: int | None = None  # since when its parameter has switched it off
         self._outbox: list[tuple[int, int, bytes]] = []  # due, order, frame
         self._order = 0
         self._released = 0
@@ -212,6 +213,8 @@ class Autopilot:
         record = stream[index]
         if record.t_ns < self._airframe.boot_ns:
             return None
+        if isinstance(record, Gnss) and not self.parameters.gnss_is_on:
+            record = without_fix(record)
         if isinstance(record, Gnss) and record.stamp_us:
             moved = -round(self.scenario.boot_before_s * 1e6) - self._airframe.boot_ns // 1000
             if moved:
@@ -327,7 +330,9 @@ class Autopilot:
 
     def _status(self, t: int) -> Any:
         # The filter gives its aid up only ten seconds after the receiver lost its fix.
-        aided = any(self._last(Gnss, max(t - ago, 0)).fix >= 3 for ago in range(0, _ALONE_AFTER, SECOND))
+        fixes = (self._last(Gnss, max(t - ago, 0)).fix for ago in range(0, _ALONE_AFTER, SECOND))
+        switched_off = self._gnss_off_ns is not None and t - self._gnss_off_ns >= _ALONE_AFTER
+        aided = not switched_off and any(fix >= 3 for fix in fixes)
         flags = _FLAGS_AIDED if aided else _FLAGS_ALONE
         return encode(FilterStatus(t, t, flags, False, 0.05, 1.5 if aided else 50.0), self._airframe)
 
@@ -344,6 +349,8 @@ class Autopilot:
         parameters = self.parameters
         ask = parameters.read if dialect.id_of(message) == _msgid("PARAM_REQUEST_READ") else parameters.set
         if (answer := ask(message)) is not None:
+            since = t if self._gnss_off_ns is None else self._gnss_off_ns
+            self._gnss_off_ns = None if parameters.gnss_is_on else since
             self._transmit([self._frame(answer, COMPONENT)], t)
 
     def _on_command(self, message: Any, t: int) -> None:

@@ -283,7 +283,7 @@ class Bridge:
         if said.stamp_ns:
             self._companion_clock.heard(said.stamp_ns, now_ns)
         t_ns = self._companion_clock.local(said.stamp_ns, now_ns)
-        self.comparison.estimate(t_ns, COMPANION, said.place, said.sigma)
+        self.comparison.estimate(t_ns - said.age_ns, COMPANION, said.place, said.sigma)
 
     # -- what goes ----------------------------------------------------------------------------------------
 

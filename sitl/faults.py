@@ -86,7 +86,12 @@ def gnss_spoof(fix: Gnss, fault: Fault, size: float, rng: Generator) -> Gnss:
 
 
 def gnss_jam(fix: Gnss, fault: Fault, size: float, rng: Generator) -> Gnss:
-    """No fix: the type is 1, the satellites are 0, the last numbers stay."""
+    """No fix."""
+    return without_fix(fix)
+
+
+def without_fix(fix: Gnss) -> Gnss:
+    """The type is 1, the satellites are 0, the last numbers stay."""
     return replace(fix, fix=1, satellites=0, v_n=None, sigma_horizontal=None, sigma_velocity=None)
 
 

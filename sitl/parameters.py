@@ -1,4 +1,5 @@
-"""The simulated autopilot's parameters: the few that decide whether it takes a position from outside.
+"""The simulated autopilot's parameters: the few that decide whether it takes a position from outside, and the
+one by which its simulator switches GNSS.
 
 It answers the parameter protocol as its make does, integers cast to a float (ArduPilot) or as their bytes
 (PX4), and of a parameter that it does not have says nothing. They change nothing in the flight.
@@ -23,8 +24,10 @@ _ARDUPILOT: dict[str, Value] = {
     "GPS2_TYPE": 0,
     "GPS_AUTO_SWITCH": 1,
     "EK3_GPS_CHECK": 31,
+    "SIM_GPS1_ENABLE": 1,
 }
-_PX4: dict[str, Value] = {"EKF2_AGP0_ID": 0, "EKF2_AGP0_CTRL": 0, "EKF2_EV_CTRL": 0}
+_PX4: dict[str, Value] = {"EKF2_AGP0_ID": 0, "EKF2_AGP0_CTRL": 0, "EKF2_EV_CTRL": 0, "SIM_GPS_USED": 10}
+SATELLITES_OF_A_FIX = 4
 #: AUTOPILOT_VERSION.capabilities: COMMAND_INT, MAVLINK2 and the encoding of parameters.
 CAPABILITIES = {"ardupilot": 8 | 8192 | 131072, "px4": 8 | 8192 | 16}
 VERSIONS = {"ardupilot": 4 << 24 | 7 << 16, "px4": 1 << 24 | 17 << 16}
@@ -37,6 +40,12 @@ class Parameters:
         self.values = dict(_PX4 if make == "px4" else _ARDUPILOT)
         self._encoding: Encoding = "bytewise" if make == "px4" else "cast"
         self._kind = INT32 if make == "px4" else INT8
+
+    @property
+    def gnss_is_on(self) -> bool:
+        """Whether the simulated receiver may have a fix."""
+        used = self.values.get("SIM_GPS_USED")
+        return bool(self.values["SIM_GPS1_ENABLE"]) if used is None else used >= SATELLITES_OF_A_FIX
 
     def read(self, message: Any) -> Any:
         """The answer to a PARAM_REQUEST_READ, None where there is none."""

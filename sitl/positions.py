@@ -15,17 +15,21 @@ from companion.link import dialect
 from companion.nav.geometry import Geodetic, local_to_geodetic
 from companion.profiles import MESSAGES
 from companion.records import LocalOrigin
+from companion.wire.encode import GPS_LAG_NS, MAV_CMD_EXTERNAL_POSITION_ESTIMATE
 
 CARRIERS = frozenset(dialect.type_named(name).msgid for name in MESSAGES.values())
-EXTERNAL_POSITION, SET_SOURCE = 43003, 42007  # MAV_CMD
+SET_SOURCE = 42007  # MAV_CMD_SET_EKF_SOURCE_SET
 
 
 class Said(NamedTuple):
-    """A place, one sigma of it (m, None where none is stated) and the sender's time of it, ns (0: none)."""
+    """A place, one sigma of it (m, None where none is stated), the sender's time of sending (ns, 0: not told)
+    and how much older the place is.
+    """
 
     stamp_ns: int
     place: Geodetic
     sigma: float | None
+    age_ns: int = 0
 
 
 def position_of(message: Any, origin: LocalOrigin | None, make: str) -> Said | None:
@@ -47,21 +51,20 @@ def position_of(message: Any, origin: LocalOrigin | None, make: str) -> Said | N
         stamp = message.time_usec if odometry else message.usec
         return Said(stamp * 1000, place, _sigma(covariance, make))
     if name == "COMMAND_INT":
-        if message.command != EXTERNAL_POSITION:
+        if message.command != MAV_CMD_EXTERNAL_POSITION_ESTIMATE:
             return None
-        stamp = round((message.param1 - message.param2) * 1e9) if math.isfinite(message.param1) else 0
-        return Said(stamp, _geodetic(message.x, message.y, math.nan), message.param3)
+        # its time of sending is of single precision: its arrival tells more
+        return Said(0, _geodetic(message.x, message.y, 0.0), message.param3, round(message.param2 * 1e9))
     if name == "GPS_INPUT":
-        return Said(
-            message.time_usec * 1000, _geodetic(message.lat, message.lon, 0.0), message.horiz_accuracy
-        )
+        place = _geodetic(message.lat, message.lon, message.alt)
+        return Said(message.time_usec * 1000, place, message.horiz_accuracy, GPS_LAG_NS)
     return Said(message.time_usec * 1000, _geodetic(message.lat, message.lon, message.alt), message.eph)
 
 
 def feeds(message: Any) -> bool:
     """Whether a message would have an effect on an estimator, by its position or by its sources."""
     if message.get_type() in ("COMMAND_INT", "COMMAND_LONG"):
-        return message.command in (EXTERNAL_POSITION, SET_SOURCE)
+        return message.command in (MAV_CMD_EXTERNAL_POSITION_ESTIMATE, SET_SOURCE)
     return dialect.id_of(message) in CARRIERS
 
 
