@@ -27,11 +27,12 @@ from companion.link.transport import Address, CannotListen, Stream, connections
 from companion.log import simulate
 from companion.log.opened import LogError
 from sitl.beacon import Beacon
-from sitl.bridge import Bridge, Orders, Way
+from sitl.bridge import AUTOPILOT, COMPANION, RSBN, Bridge, Orders, Way
 from sitl.comparison import AFTER_S, Row, Scored, table
 
 EX_UNAVAILABLE, EX_CANTCREAT = 69, 73  # sysexits.h
 LONGEST_SLEEP_S = 0.2
+ORDER = AUTOPILOT, COMPANION, RSBN
 COLUMNS = ("t_s", "source", "north_m", "east_m", "error_m", "sigma_m")
 
 
@@ -145,14 +146,19 @@ class Record:
 def found(bridge: Bridge, end_ns: int) -> list[tuple[str, list[Row]]]:
     """A title and a table for each loss of GNSS, or one for the whole flight if there was none."""
     start_ns = bridge.begun_ns or end_ns
+
+    def rows(from_ns: int, to_ns: int) -> list[Row]:
+        found = table(bridge.comparison.scored, from_ns, to_ns)
+        return sorted(found, key=lambda row: ORDER.index(row.source))
+
     if not bridge.losses:
-        return [("GNSS was there all the time", table(bridge.comparison.scored, start_ns, end_ns))]
+        return [("GNSS was there all the time", rows(start_ns, end_ns))]
     tables = []
     for loss in bridge.losses:
         back_ns = loss.back_ns or end_ns
         title = f"GNSS lost at {(loss.lost_ns - start_ns) * 1e-9:.0f} s"
         title += f" for {(back_ns - loss.lost_ns) * 1e-9:.0f} s"
-        tables.append((title, table(bridge.comparison.scored, loss.lost_ns, back_ns)))
+        tables.append((title, rows(loss.lost_ns, back_ns)))
     return tables
 
 

@@ -6,9 +6,9 @@
     for message in switch.to_send(): ...        # after any of them
 
 Which parameter there is depends on make and age, so all are asked for and the first that answers is it. Seen
-on the wire: SIM_GPS1_ENABLE (ArduPlane 4.7) and SIM_GPS_USED (PX4 of 2026). SIM_GPS_DISABLE (ArduPilot up to
-4.5) and SIM_GPS_BLOCK (PX4 of 2020) are as their sources have them. ArduPilot keeps a parameter over a
-restart: what was switched off is to be switched on again before the end.
+on the wire: SIM_GPS1_ENABLE (ArduPlane 4.7) and SIM_GPS_USED (PX4 of 2026: satellites, four make a fix).
+SIM_GPS_DISABLE, of older ArduPilots, is as their sources have it. ArduPilot keeps a parameter over a restart:
+what was switched off is to be switched on again before the end.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class Knob(NamedTuple):
 
 KNOBS: dict[str, tuple[Knob, ...]] = {
     "ardupilot": (Knob("SIM_GPS1_ENABLE", 1, 0), Knob("SIM_GPS_DISABLE", 0, 1)),
-    "px4": (Knob("SIM_GPS_USED", 10, 0), Knob("SIM_GPS_BLOCK", 0, 1)),
+    "px4": (Knob("SIM_GPS_USED", 10, 0),),
 }
 
 
@@ -91,4 +91,4 @@ class GnssSwitch:
             return []
         if self._knobs:
             return []
-        return [f"the autopilot has no {answer.name} nor any like it: GNSS cannot be switched"]
+        return [f"the autopilot has no {answer.name} nor one like it: GNSS cannot be switched"]

@@ -180,7 +180,7 @@ def test_on_one_link_the_answers_go_to_the_router(entries) -> None:
 
 def test_a_recording_has_no_such_parameter_and_that_is_told(entries) -> None:
     run = Run(entries[: len(entries) // 4], Bridge(orders=Orders(gnss_off_s=2.0)))
-    assert any("nor any like it: GNSS cannot be switched" in line for line in run.told)
+    assert any("nor one like it: GNSS cannot be switched" in line for line in run.told)
 
 
 def test_bytes_cut_anywhere_are_relayed_as_whole_frames(entries) -> None:
