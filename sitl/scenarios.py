@@ -119,6 +119,7 @@ _LEGS = (
     Leg(380, 70, 42, 1000),
     Leg(360, 250, 36, 600),
 )
+_BACK = (Leg(540, 215, 40, 800), Leg(540, 240, 40, 600))  # to make it an hour
 _SHORT = (
     Leg(10, 40, 0, 0),
     Leg(50, 40, 38, 0),
@@ -158,6 +159,7 @@ SCENARIOS: dict[str, Scenario] = {
         DEFAULT,
         _SHORT_SCENARIO,
         _tabled("gnss-loss", gnss_outages=((900.0, math.inf),), rsbn_outages=((0.0, math.inf),)),
+        _tabled("hour", plan=dataclasses.replace(_PLAN, legs=(*_LEGS, *_BACK))),
         _tabled("tactical", grade="tactical"),
         _tabled("mems", grade="mems"),
         _tabled("two-beacons", beacons=(_EAST, _NORTH)),

@@ -57,29 +57,27 @@ class _Count:
 
     def __init__(self) -> None:
         self.outputs = Counter[str]()
-        self._start_ns: int | None = None
-        self._parts: list[Part] = []
+        self._parts: list[list[int]] = []  # of each flight: first and last arrival (ns), inputs, solutions
 
     def input(self, record: Stamped) -> None:
         """Count one input."""
-        if self._start_ns is None:
-            self._start_ns = record.rx_ns
-        t = (record.rx_ns - self._start_ns) * 1e-9
         if not self._parts or isinstance(record, Reboot):
-            self._parts.append(Part(t, t, 0, 0))
-        last = self._parts[-1]
-        self._parts[-1] = last._replace(end_s=max(t, last.end_s), inputs=last.inputs + 1)
+            self._parts.append([record.rx_ns, record.rx_ns, 0, 0])
+        part = self._parts[-1]
+        part[1] = record.rx_ns
+        part[2] += 1
 
     def output(self, record: Stamped) -> None:
         """Count one output."""
         self.outputs[type(record).__name__] += 1
-        if isinstance(record, Solution):
-            self._parts[-1] = self._parts[-1]._replace(solutions=self._parts[-1].solutions + 1)
+        self._parts[-1][3] += isinstance(record, Solution)
 
     def found(self, compared: int | None, different: int = 0, first: str | None = None) -> Replayed:
         """Everything counted."""
-        inputs = sum(part.inputs for part in self._parts)
-        return Replayed(inputs, dict(self.outputs), self._parts, compared, different, first)
+        zero_ns = self._parts[0][0] if self._parts else 0
+        parts = [Part((a - zero_ns) * 1e-9, (b - zero_ns) * 1e-9, *n) for a, b, *n in self._parts]
+        inputs = sum(part.inputs for part in parts)
+        return Replayed(inputs, dict(self.outputs), parts, compared, different, first)
 
 
 def metadata(config: Config) -> dict[str, dict[str, str]]:
