@@ -23,6 +23,7 @@ Map
     records     every value that flows                      config    what the operator may set
     link/       bytes <-> messages (no clock, no sockets but in `transport`)
     wire        messages <-> records                        navigator records -> records (pure)
+    profiles    which message feeds which autopilot         feed      what of a solution goes to it
     nav/        the physics: earth, strapdown, error model, beacons
     estimate/   the mathematics: fusion, minimax, kalman, restrictive, schemes, smoother, polynomial
     log/        MCAP files, replay                          service   the asyncio shell

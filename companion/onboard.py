@@ -17,7 +17,8 @@ from collections.abc import Callable, Iterable
 from typing import Any, Protocol
 
 from companion.checkup import Checkup
-from companion.config import Config, ConfigError, conflicts, to_toml
+from companion.config import Config, ConfigError, to_toml
+from companion.conflicts import conflicts
 from companion.dialogue import Dialogue
 from companion.feed import Feed
 from companion.link import dialect

@@ -1,8 +1,10 @@
 """What an autopilot's estimator is fed: fit to steer by, of the right make, and never its own position."""
 
+import gzip
 import math
 from collections import Counter
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -13,8 +15,24 @@ from companion.config import Config, ConfigError, Inertial, Output, load
 from companion.feed import Feed
 from companion.link import dialect, frame
 from companion.nav.geometry import Geodetic, displace, local_to_geodetic, slant_range_azimuth
+from companion.navigator import Navigator
 from companion.onboard import Onboard, wanted
-from companion.records import Event, Gnss, LocalOrigin, Mode, Solution, Source, SystemTime
+from companion.records import (
+    AirData,
+    Attitude,
+    Event,
+    GlobalPosition,
+    Gnss,
+    LocalOrigin,
+    LocalPosition,
+    Mode,
+    Pressure,
+    RsbnFix,
+    Solution,
+    Source,
+    SystemTime,
+    Truth,
+)
 from companion.wire import Receiver
 
 SECOND, MS = 1_000_000_000, 1_000_000
@@ -378,6 +396,47 @@ def test_odometry_stops_where_its_accuracy_cannot_be_said_and_says_so() -> None:
         "ODOMETRY goes out, 199 withheld so far",
     ]
     assert sum(feed.withheld.values()) == 199
+
+
+RECORDED = Attitude | AirData | Pressure | Truth | Gnss | LocalPosition | GlobalPosition
+
+
+def recorded(name: str) -> list[Any]:
+    """A recorded flight of ArduPlane in which GNSS is lost, cut down to 5 Hz."""
+    with gzip.open(Path(__file__).parent / "data" / f"{name}_cut.jsonl.gz") as file:
+        return [msgspec.json.decode(line, type=RECORDED) for line in file]
+
+
+@pytest.mark.parametrize("name", ["plane_gps_loss", "plane_wind_change"])
+def test_the_gate_is_not_in_the_way_of_a_real_flight(name: str) -> None:
+    """On the recordings, with a beacon 60 km away after the loss and none for a minute of it: everything
+    passes but what ArduPilot could not be told.
+    """
+    records = recorded(name)
+    truths = [r for r in records if isinstance(r, Truth) and r.lat]
+    loss = max(r.t_ns for r in records if isinstance(r, Gnss) and r.fix >= 3)
+    beacon = displace(truths[-1].lat, truths[-1].lon, 100.0, 45e3, -40e3, 0.0)
+    config, rng = told("output.profile=ardupilot", "output.switch_sources=false"), np.random.default_rng(3)
+    navigator, feed = Navigator(config), Feed(config)
+    receiver = Receiver("ardupilot", 1, origin=LocalOrigin(1, 1, *ORIGIN, "ardupilot"))
+    sent, next_ns = Counter[bool](), loss
+    for record in records:
+        given: list[Any] = []
+        if not isinstance(record, Truth):
+            given = navigator.handle(record)
+        elif record.t_ns >= next_ns and not 120.0 < (record.t_ns - loss) * 1e-9 < 180.0:
+            next_ns = record.t_ns + SECOND
+            sight = slant_range_azimuth(beacon, Geodetic(record.lat, record.lon, record.alt))
+            a, d = rng.standard_normal(2)
+            azimuth, away = sight.azimuth + 0.00218 * a, sight.slant_range + 100.0 * d
+            at = record.t_ns, record.rx_ns
+            given = navigator.handle(RsbnFix(*at, 7, *beacon, azimuth % math.tau, away, 0.00218, 100.0))
+        for solution in given:
+            if isinstance(solution, Solution):
+                sent[bool(feed.messages(solution, ["ODOMETRY"], receiver))] += 1
+    reasons = {reason for _, reason in feed.withheld}
+    assert reasons == {"its accuracy is worse than the 100 m that ArduPilot can be told"}
+    assert sent[True] > 1800 and sent[False] < 70
 
 
 def test_px4_is_told_how_bad_it_is() -> None:

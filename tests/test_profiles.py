@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from companion.config import Config, ConfigError, Inertial, Output, conflicts, load
+from companion.config import Config, ConfigError, Inertial, Output, load
+from companion.conflicts import conflicts
 from companion.profiles import MESSAGES, PROFILES, needed
 
 STATUS = {"NAVIGATION_STATUS": 1.0}

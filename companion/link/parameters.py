@@ -23,7 +23,8 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from companion.config import Config, conflicts
+from companion.config import Config
+from companion.conflicts import conflicts
 from companion.link import dialect
 from companion.link.bucket import Bucket
 from companion.link.dialect import Message
