@@ -8,7 +8,7 @@ is linear and works axis by axis; `weights` keeps it in that form. An azimuth an
 nor independent by axes, so here (5) is iterated on the joint problem: with whitened residuals r and
 their Jacobian J at the last position,
 
-    minimise r^T r,   F = J^T J,   step (F + mu I)^-1 J^T r   (Gauss-Newton; mu rises until the cost falls)
+    minimise r^T r,   F = J^T J,   step (F + mu I)^-1 J^T r   (Gauss-Newton; `descent`)
 
 and F at the end is the information, F^-1 the Cramer-Rao bound there. DEPARTS FROM (6): the inverse on the
 second R is restored. DEPARTS FROM (7): one row per observation, azimuth and range with their own partials.
@@ -36,6 +36,7 @@ import numpy.typing as npt
 from scipy.special import gammaincc
 
 from companion.estimate.crossing import converted, crossings, mean_position
+from companion.estimate.descent import Minimum, NoFix, descend, inverse
 from companion.estimate.observations import (
     Array,
     Azimuth,
@@ -69,19 +70,9 @@ CONE_OF_SILENCE = math.radians(60.0)
 zenith the linearised azimuth claims an accuracy that it does not have."""
 
 _OBSERVABLE = 1e-12  # least ratio of the information's eigenvalues: standard deviations a million times apart
-_CLEARLY = 1e-9  # and where their product over that of the trace is more, no eigenvalue is needed
-_DAMPING = 1e-14  # least mu, in traces of F: keeps a step finite along a direction that nothing measures
-_STEPS = 100
-_CONVERGED = 1e-8  # a step this long, in standard deviations, is the last
-_LEVEL = 1e-11  # a rise of the cost by less, relative to 1 + cost, is rounding
-_STALLED = 1e-4  # and one this long if rounding no longer lets the cost fall
 _TRIALS = 8  # crossings followed down, the cheapest first
 _LIKELIHOOD_GAP = 9.0  # difference of costs by which one place is preferred to another: three sigma
 _PLAUSIBLE = 5.0  # a cost this many of its own standard deviations above its mean may be a wrong valley
-
-
-class NoFix(ValueError):
-    """The observations, each fit for use, do not give a position."""
 
 
 class Unobservable(NoFix):
@@ -197,13 +188,7 @@ def _start(start: npt.ArrayLike) -> Array:
     return x
 
 
-class _Minimum(NamedTuple):
-    p: Point
-    at: Linearised
-    iterations: int
-
-
-def _heard_fix(model: Model, p0: Point | None, cone: float) -> tuple[Model, _Minimum]:
+def _heard_fix(model: Model, p0: Point | None, cone: float) -> tuple[Model, Minimum]:
     """The fix and the model without the azimuths that cannot be heard there; the plane has no cone."""
     if model.n == 3 and p0 is not None and (silent := model.above(p0, cone)):
         # near its beacon an azimuth pulls the fix into the singular point, so the others are asked first
@@ -221,11 +206,11 @@ def _heard_fix(model: Model, p0: Point | None, cone: float) -> tuple[Model, _Min
         model, p0 = model.without(silent), found.p
 
 
-def _descend_from(model: Model, p0: Point | None) -> _Minimum:
+def _descend_from(model: Model, p0: Point | None) -> Minimum:
     """The minimum reached from p0; from the crossings where p0 is missing or ends in a misfit."""
     if p0 is not None:
         try:
-            found = _descend(model, p0)
+            found = descend(model, p0)
         except NoFix:
             return _likeliest(model)
         if _plausible(found.at, model.n):
@@ -239,109 +224,20 @@ def _descend_from(model: Model, p0: Point | None) -> _Minimum:
 
 
 def _plausible(at: Linearised, n: int) -> bool:
-    k = max(len(at.r) - n, 0)
+    k = max(len(at.rows) - n, 0)
     return at.cost <= k + _PLAUSIBLE * math.sqrt(2.0 * k) + 1e-6
 
 
-def _descend(model: Model, p: Point) -> _Minimum:
-    """Gauss-Newton with Levenberg's damping from x."""
-    at = model.at(p)
-    floor, mu = _DAMPING, _DAMPING
-    for iteration in range(1, _STEPS + 1):
-        step, length = _step(at, mu)
-        q = (p[0] + step[0], p[1] + step[1], p[2] + step[2])
-        trial = model.at(q)
-        if trial.cost <= at.cost + _LEVEL * (1.0 + at.cost):
-            p, at, mu = q, trial, max(mu / 100.0, floor)
-        elif length < _STALLED:
-            return _Minimum(p, at, iteration)
-        else:
-            mu = max(10.0 * mu, 1e-4)
-            continue
-        # while damped, a step is short for another reason
-        if length < _CONVERGED and mu == floor:
-            return _Minimum(p, at, iteration)
-    raise NoFix(
-        f"no minimum of the cost within {_STEPS} steps (reached {model.place(p).round(1).tolist()}):"
-        " azimuths that do not meet, or a start too far away; add an observation or give a nearer start"
-    )
-
-
-def _step(at: Linearised, mu: float) -> tuple[Point, float]:
-    """Levenberg's step (F + mu trace(F) I)^-1 J^T r and its length in standard deviations.
-
-    In the plane nothing measures z, and the step has none.
-    """
-    F = _information(at)
-    least = mu * (F.xx + F.yy + F.zz)
-    if least == 0.0:
-        return (0.0, 0.0, 0.0), 0.0
-    u = v = w = 0.0
-    for r, a, b, c in at.rows:
-        u, v, w = u + a * r, v + b * r, w + c * r
-    x, y, z = _solve(_factors(F, least), u, v, w)
-    return (x, y, z), math.sqrt(max(x * u + y * v + z * w, 0.0))
-
-
-class _Information(NamedTuple):
-    """F = J^T J."""
-
-    xx: float
-    xy: float
-    xz: float
-    yy: float
-    yz: float
-    zz: float
-
-
-class _Factors(NamedTuple):
-    """F = L D L^T, the diagonal of L being ones."""
-
-    dx: float
-    dy: float
-    dz: float
-    yx: float
-    zx: float
-    zy: float
-
-
-def _information(at: Linearised) -> _Information:
-    xx = xy = xz = yy = yz = zz = 0.0
-    for _, a, b, c in at.rows:
-        xx, xy, xz = xx + a * a, xy + a * b, xz + a * c
-        yy, yz, zz = yy + b * b, yz + b * c, zz + c * c
-    return _Information(xx, xy, xz, yy, yz, zz)
-
-
-def _factors(F: _Information, least: float) -> _Factors:
-    """Of F + `least` I, which no pivot can fall below."""
-    dx = F.xx + least
-    yx, zx = F.xy / dx, F.xz / dx
-    dy = max(F.yy + least - yx * F.xy, least)
-    below = F.yz - yx * F.xz
-    zy = below / dy
-    dz = max(F.zz + least - zx * F.xz - zy * below, least)
-    return _Factors(dx, dy, dz, yx, zx, zy)
-
-
-def _solve(f: _Factors, u: float, v: float, w: float) -> Point:
-    v -= f.yx * u
-    w -= f.zx * u + f.zy * v
-    z = w / f.dz
-    y = v / f.dy - f.zy * z
-    return u / f.dx - f.yx * y - f.zx * z, y, z
-
-
-def _likeliest(model: Model) -> _Minimum:
+def _likeliest(model: Model) -> Minimum:
     """The best minimum reachable from the crossings; Ambiguous if another place is nearly as good."""
     points = crossings(model) or [(0.0, 0.0, 0.0)]
     points.sort(key=lambda p: model.at(p).cost)
-    minima: list[_Minimum] = []
+    minima: list[Minimum] = []
     failure: NoFix | None = None
     for p in points[:_TRIALS]:
         try:
             if all(_apart(p, m) for m in minima):
-                minima.append(_descend(model, p))
+                minima.append(descend(model, p))
         except NoFix as e:
             failure = e
     if not minima:
@@ -362,7 +258,7 @@ def _likeliest(model: Model) -> _Minimum:
     return best
 
 
-def _apart(p: Point, m: _Minimum) -> bool:
+def _apart(p: Point, m: Minimum) -> bool:
     """Whether p is another place than the minimum: more than three standard deviations from it."""
     x, y, z = p[0] - m.p[0], p[1] - m.p[1], p[2] - m.p[2]
     return sum([(a * x + b * y + c * z) ** 2 for _, a, b, c in m.at.rows]) > 9.0
@@ -370,14 +266,8 @@ def _apart(p: Point, m: _Minimum) -> bool:
 
 def _invert(model: Model, at: Linearised) -> Array:
     """Covariance F^-1; Unobservable where an eigenvalue of F vanishes against the largest."""
-    F = _information(at)
-    if model.n == 2:
-        F = F._replace(zz=max(F.xx, F.yy))
-    trace = F.xx + F.yy + F.zz
-    f = _factors(F, _DAMPING**2 * trace) if trace > 0.0 else None
-    if f is not None and f.dx * f.dy * f.dz > _CLEARLY * trace**3:  # so is every eigenvalue above the trace
-        columns = _solve(f, 1.0, 0.0, 0.0), _solve(f, 0.0, 1.0, 0.0), _solve(f, 0.0, 0.0, 1.0)
-        return np.array(columns)[: model.n, : model.n]
+    if (found := inverse(at)) is not None:
+        return found
     eigenvalues, V = np.linalg.eigh(at.J.T @ at.J)
     blind = eigenvalues <= _OBSERVABLE * eigenvalues[-1]
     if blind.any():
