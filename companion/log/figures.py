@@ -150,12 +150,15 @@ def _inertial(axis: str) -> Callable[[Sequence[Assessment], Sequence[str]], Figu
 
 
 def _near(lines: Sequence[Line]) -> tuple[float, float, float, float] | None:
-    """A view of these lines with as much again above and below, whatever else there is."""
+    """A view of these lines with half as much again above and below, whatever else there is."""
     known = [line for line in lines if np.isfinite(line.y).any()]
     if not known:
         return None
-    half = max(1.0, *(2.5 * float(np.nanmax(np.abs(line.y))) for line in known))
-    return min(float(line.x[0]) for line in known), max(float(line.x[-1]) for line in known), -half, half
+    low = min(float(np.nanmin(line.y)) for line in known)
+    high = max(float(np.nanmax(line.y)) for line in known)
+    room = max(1.0, 0.5 * (high - low))
+    start, end = min(float(line.x[0]) for line in known), max(float(line.x[-1]) for line in known)
+    return start, end, low - room, high + room
 
 
 def _ahead(flights: Sequence[Assessment], prefixes: Sequence[str]) -> Figure:

@@ -18,8 +18,14 @@ from companion.log.variant import has_flown, inputs, is_own, sentences
 from companion.navigator import Navigator
 from companion.records import INPUTS, OUTPUTS, Stamped
 
+CHANNELS = {
+    "local_position": "the autopilot's local position, which may rest on that GNSS (see inertial.source)",
+    "air_data": "air-data dead reckoning",
+    "strapdown": "a strapdown reckoning of its own",
+}
 
-def open_flights(path: Path, config: Config | None = None) -> list[Flight]:
+
+def open_flights(path: Path, config: Config) -> list[Flight]:
     """The flights in the log at `path`; `config` is what the navigator flies with where none flew.
 
     LogError, one sentence, where the file cannot be read or holds nothing.
@@ -43,13 +49,15 @@ def open_flights(path: Path, config: Config | None = None) -> list[Flight]:
                     metadata=info.metadata,
                     remarks=tuple(remarks),
                 )
-        flown = config or Config()
-        remarks.append("Another recorder's log: the navigator was run over it for this report.")
+        remarks.append(
+            "Another recorder's log: the navigator was run over it for this report, the inertial channel "
+            f"being {CHANNELS[config.channel]}."
+        )
         return gather(
-            _run_over(inputs(path).records, flown),
+            _run_over(inputs(path).records, config),
             path.name,
             unix_ns=first_unix_ns,
-            metadata=metadata(flown),
+            metadata=metadata(config),
             remarks=tuple(remarks),
         )
 

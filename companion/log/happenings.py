@@ -104,8 +104,8 @@ def _footing(mode: Mode, sources: int) -> str:
 
 
 def outages(flight: Flight) -> list[Outage]:
-    """Holes between usable GNSS fixes, and the end without any, once there was one."""
-    t = np.sort(usable_gnss(flight)["t"])
+    """Holes between the arrivals of usable GNSS fixes, and the end without any, once there was one."""
+    t = np.sort(usable_gnss(flight)["rx"])
     if not len(t):
         return []
     t = np.append(t, max(flight.seconds, t[-1]))

@@ -36,6 +36,7 @@ SLOWEST = 3.0  # m/s
 FEWEST = 40  # pairs in motion
 BLOCKS = 8
 WORSE = 1.1
+LOOSEST_S = 0.1  # a greater sigma tells no delay: the local position drifts faster than it is shifted
 REACH_S = 2.0  # local positions farther apart than this are not interpolated between
 GLITCH_SIGMA_M = 2.0  # a glitch is farther off than four of these and six of what is usual in the flight
 GLITCH_LONGEST_S = 10.0
@@ -143,7 +144,7 @@ def watch(records: Iterable[Stamped]) -> list[Track]:
 
 def estimate(track: Track) -> Latency | None:
     """The delay of GNSS behind the local position; None where too little moved to tell, or where the blocks
-    agree on none: theirs does not bring the two closer.
+    agree on none: their spread is wide, or theirs does not bring the two closer.
     """
     moving = _near(track) & (_speed_at(track) > SLOWEST)
     if int(moving.sum()) < FEWEST:
@@ -155,7 +156,8 @@ def estimate(track: Track) -> Latency | None:
     spread = 1.4826 * float(np.median(np.abs(found - seconds))) / math.sqrt(found.size)
     raw, shifted = (np.hypot(*_difference(track, t, x, tau).T) for tau in (0.0, seconds))
     before, after = float(np.median(raw)), float(np.median(shifted))
-    return Latency(seconds, spread, before, after, t.size) if after <= WORSE * before else None
+    told = spread <= LOOSEST_S and after <= WORSE * before
+    return Latency(seconds, spread, before, after, t.size) if told else None
 
 
 def glitches(track: Track, latency: float = 0.0) -> list[Glitch]:

@@ -103,7 +103,7 @@ def _summary(a: Assessment, named: str) -> str:
     if a.flight.unix_ns > BOOTED_NS:
         when = datetime.fromtimestamp(a.flight.unix_ns * 1e-9, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
     version = a.flight.metadata.get("companion", {}).get("version")
-    flown = f", flown by companion {escape(version)}" if version else ""
+    flown = f", navigator of companion {escape(version)}" if version else ""
     warn = " bad" if any(row.held is False for row in a.rows) else ""
     return (
         f"<p class='verdict{warn}'>{named}{escape(verdict(a))}</p>{_tiles(a)}"

@@ -20,6 +20,7 @@ from companion.log.gather import Flight
 from companion.log.opened import LogError
 from companion.log.page import Block, page
 from companion.log.plot import LETTERS, Figure
+from companion.log.variant import changed
 from companion.log.verdict import verdict
 
 
@@ -31,8 +32,16 @@ from companion.log.verdict import verdict
 @click.option("--pdf", type=click.Path(path_type=Path), help="Write the figures into this PDF too.")
 @click.option("--png", type=click.Path(path_type=Path), help="Write each figure into this folder too.")
 @click.option("--config", "config_file", type=click.Path(path_type=Path), help="For a log that is not ours.")
+@click.option(
+    "--with", "changes", multiple=True, metavar="KEY=VALUE,...", help="Of that, these keys changed."
+)
 def command(
-    logs: tuple[Path, ...], output: Path, pdf: Path | None, png: Path | None, config_file: Path | None
+    logs: tuple[Path, ...],
+    output: Path,
+    pdf: Path | None,
+    png: Path | None,
+    config_file: Path | None,
+    changes: tuple[str, ...],
 ) -> None:
     """Write a page about LOG, or about two logs compared: our MCAP, or any other that `replay` reads.
 
@@ -41,7 +50,9 @@ def command(
     """
     if len(logs) > 2:
         raise click.UsageError(f"{len(logs)} logs were given: a report is about one, or compares two")
-    config = load(config_file) if config_file else None
+    config = load(config_file)
+    for text in changes:
+        config = changed(config, text)
     found = [open_flights(path, config) for path in logs]
     blocks = compared(found, _names(logs)) if len(logs) == 2 else alone(found[0])
     try:

@@ -16,6 +16,7 @@ from companion.log.gather import Floats
 from companion.log.plot import COLOURS, Figure, Line, strided
 
 CIRCLES = 9
+BOUND = "guaranteed bound"
 
 
 def track(flights: Sequence[Assessment], prefixes: Sequence[str]) -> Figure:
@@ -28,13 +29,14 @@ def track(flights: Sequence[Assessment], prefixes: Sequence[str]) -> Figure:
         frame += framed
         lines += framed
         lines += _far(plane, a, prefix, which)
+    bounded = any(line.name.endswith(BOUND) and len(line.x) for line in lines)
     return Figure(
         "track",
         "North and east of the first position",
         "east, m",
         "north, m",
         [line for line in lines if len(line.x)],
-        "Ellipses: the guaranteed r.m.s. bound where there were no fixes.",
+        "Ellipses: the guaranteed r.m.s. bound where there were no fixes." if bounded else "",
         equal=True,
         view=_view([line for line in frame if np.isfinite(line.x).any()]),
     )
@@ -77,7 +79,7 @@ def _ellipses(plane: Assessment, a: Assessment, prefix: str, which: int) -> Line
     north, east = plane.north_east(solution["lat"][chosen], solution["lon"][chosen])
     x = (east[:, None] + solution["bound_east"][chosen, None] * np.sin(angle)).ravel()
     y = (north[:, None] + solution["bound_north"][chosen, None] * np.cos(angle)).ravel()
-    return Line(f"{prefix}guaranteed bound", x, y, COLOURS["bound"][which], width=1.0)
+    return Line(prefix + BOUND, x, y, COLOURS["bound"][which], width=1.0)
 
 
 def _view(frame: Sequence[Line]) -> tuple[float, float, float, float] | None:

@@ -15,6 +15,7 @@ from companion.log.gather import Floats
 from companion.log.plot import LETTERS
 
 WITHOUT_FIXES = ("prediction", "untrusted")
+FAR_M = 30.0  # farther than this from the smoothed track GNSS contradicts it
 SHORT_S = 30.0  # what happens in less is not worth a sentence
 CHEBYSHEV = 0.75  # of moments, at least, lie within twice a bound on the r.m.s. that is right
 LATE_S = 0.1  # GNSS behind the local position by less is usual
@@ -53,27 +54,46 @@ def verdict(a: Assessment) -> str:
 
 
 def comparison(a: Assessment, b: Assessment) -> str:
-    """Which of two flights, A or B, was nearer to its reference, phase by phase."""
+    """Which of two flights, A or B, was nearer to its reference, with fixes and without."""
     if a.reference is None or b.reference is None:
         return "There is nothing to compare errors with."
-    theirs = {row.phase: row for row in b.rows}
+    parts = [_parted(a), _parted(b)]
     sentences = []
-    for row in a.rows:
-        other = theirs.pop(row.phase, None)
-        if other is None or score.CORRECTED not in row.rms or score.CORRECTED not in other.rms:
+    for what, k in (("With fixes", 0), ("Without fixes", 1)):
+        pair = parts[0][k], parts[1][k]
+        if not all(len(error) for error in pair):
+            if any(len(error) for error in pair):
+                letter = LETTERS[0] if len(pair[0]) else LETTERS[1]
+                sentences.append(f"{what} was {letter} alone.")
             continue
-        pair = row.rms[score.CORRECTED], other.rms[score.CORRECTED]
-        if abs(pair[0] - pair[1]) < 0.02 * max(pair):
-            sentences.append(f"In the phase “{row.phase}” both were off by {metres(pair[0])} r.m.s.")
+        rms = _rms(pair[0]), _rms(pair[1])
+        if abs(rms[0] - rms[1]) < 0.02 * max(rms):
+            sentences.append(f"{what} both were off by {metres(rms[0])} r.m.s.")
         else:
-            better, worse = sorted(zip(pair, LETTERS, strict=True))
-            sentences.append(
-                f"In the phase “{row.phase}” {better[1]} was nearer: {metres(better[0])} r.m.s. "
-                f"against {metres(worse[0])} of {worse[1]}."
-            )
+            (less, better), (more, worse) = sorted(zip(rms, LETTERS, strict=True))
+            against = f"{metres(less)} r.m.s. against {metres(more)} of {worse}"
+            sentences.append(f"{what} {better} was nearer: {against}.")
+    lone = [_lone(flight) for flight in (a, b)]
+    if any(lone) and abs(lone[0] - lone[1]) > SHORT_S:
+        spans = [lasting(span) if span else "never" for span in lone]
+        sentences.append(f"A was without for {spans[0]}, B for {spans[1]}.".replace("for never", "never"))
     if a.reference.what != b.reference.what:
         sentences.append("The two are counted from different references, so compare with care.")
-    return " ".join(sentences) or "The two logs have no phase in common."
+    return " ".join(sentences) or "No error is known of one of the two."
+
+
+def _parted(a: Assessment) -> tuple[Floats, Floats]:
+    """The errors of the corrected estimate, with fixes and without."""
+    corrected = a.errors.get(score.CORRECTED)
+    if corrected is None:
+        return np.zeros(0), np.zeros(0)
+    alone = _during(a, corrected, WITHOUT_FIXES)
+    return corrected.error[~alone], corrected.error[alone]
+
+
+def _lone(a: Assessment) -> float:
+    """Seconds without any fix."""
+    return sum(row.end_ns - row.start_ns for row in a.phases if row.name in WITHOUT_FIXES) * 1e-9
 
 
 def _flown(a: Assessment) -> list[str]:
@@ -96,8 +116,7 @@ def _flown(a: Assessment) -> list[str]:
         which = "for" if len(holes) == 1 else "longest for"
         span = lasting(longest.end - longest.start)
         sentences.append(f"GNSS was lost {times}, {which} {span} (from {clock(longest.start)} {until}).")
-    alone = sum(row.end_ns - row.start_ns for row in a.phases if row.name in WITHOUT_FIXES) * 1e-9
-    if alone:
+    if alone := _lone(a):
         sentences.append(f"The position was predicted without any fix for {lasting(alone)}.")
     untrusted = [phase for phase in a.phases if phase.name == "untrusted"]
     if untrusted:
@@ -112,12 +131,8 @@ def _errors(a: Assessment) -> list[str]:
     corrected = a.errors.get(score.CORRECTED)
     if corrected is None or a.reference is None:
         return ["There is neither truth nor a track to smooth, so no error can be told."]
-    alone = _during(a, corrected, WITHOUT_FIXES)
-    parts = []
-    if (~alone).any():
-        parts.append(f"{metres(_rms(corrected.error[~alone]))} with fixes")
-    if alone.any():
-        parts.append(f"{metres(_rms(corrected.error[alone]))} without")
+    found = zip(_parted(a), ("with fixes", "without"), strict=True)
+    parts = [f"{metres(_rms(error))} {how}" for error, how in found if len(error)]
     ins = a.errors.get(score.INS)
     beside = f"; the inertial channel alone {metres(_rms(ins.error))}" if ins is not None else ""
     sentences = [
@@ -128,6 +143,12 @@ def _errors(a: Assessment) -> list[str]:
         sentences.append(
             "The smoothed track rests on the same fixes and error model: what both got wrong it hides."
         )
+        gnss = a.errors.get(score.GNSS)
+        if gnss is not None and (apart := float(np.median(gnss.error))) > FAR_M:
+            sentences.append(
+                f"GNSS AND THAT TRACK ARE {metres(apart)} APART in the median, for GNSS was refused: one of "
+                "them is wrong, and no error told here is to be trusted."
+            )
     elif a.reference.what == GNSS:
         sentences.append("GNSS is no truth: its own error is in these numbers.")
     return sentences
