@@ -30,7 +30,8 @@ FREE_M = 2.0
 FASTEST = 400.0  # [m/s]
 LOWEST_M, HIGHEST_M = -500.0, 30_000.0
 NEAREST_POLE = math.radians(89.0)  # the flat earths of the autopilots end before
-WORST_M = 1000.0  # a sigma beyond this is no position
+BEST_M, WORST_M = 0.01, 1000.0  # a sigma below is nobody's here, and could be 0 on the wire
+SLOWEST = 1e-3  # [m/s], of the sigma of the velocity
 SIGMAS = 3.0
 TELL_EVERY = 5 * SECOND
 
@@ -90,11 +91,11 @@ def fault(solution: Solution) -> str | None:
         return "no aircraft flies so high or low"
     if math.hypot(*s.v_n) > FASTEST:
         return "no aircraft of ours flies so fast"
-    if not (nn > 0.0 and ee > 0.0 and dd > 0.0 and ne * ne <= nn * ee):
+    if not (min(nn, ee, dd) >= BEST_M**2 and ne * ne <= nn * ee):
         return "its covariance is none"
     if max(nn, ee, dd) > WORST_M**2:
         return "its accuracy is worse than 1 km"
-    if s.sigma_velocity is not None and not 0.0 < s.sigma_velocity < FASTEST:
+    if s.sigma_velocity is not None and not SLOWEST <= s.sigma_velocity <= FASTEST:
         return "the accuracy of its velocity is none"
     return None
 

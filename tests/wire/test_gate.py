@@ -71,6 +71,8 @@ NEVER: list[tuple[dict[str, Any], str]] = [
     ({"covariance": (1.0, 0.0, 0.0, -1.0, 0.0, 1.0)}, "covariance"),
     ({"covariance": (1.0, 2.0, 0.0, 1.0, 0.0, 1.0)}, "covariance"),
     ({"covariance": (1.0, 0.0, 0.0, 1.0, 0.0, 0.0)}, "covariance"),
+    ({"covariance": (16.0, 0.0, 0.0, 25.0, 0.0, 7e-116)}, "covariance"),  # 0 in single precision
+    ({"sigma_velocity": 1e-60}, "velocity"),
     ({"covariance": (1.1e6, 0.0, 0.0, 1.0, 0.0, 1.0)}, "1 km"),
     ({"sigma_velocity": NAN}, "velocity"),
     ({"sigma_velocity": 0.0}, "velocity"),
