@@ -33,7 +33,8 @@ from sitl.comparison import AFTER_S, Row, Scored, table
 EX_UNAVAILABLE, EX_CANTCREAT = 69, 73  # sysexits.h
 LONGEST_SLEEP_S = 0.2
 ORDER = AUTOPILOT, COMPANION, RSBN
-COLUMNS = ("t_s", "source", "north_m", "east_m", "error_m", "sigma_m")
+COLUMNS = ("t_s", "source", "north_m", "east_m", "error_m", "sigma_m", "bound_m")
+TRUTH_COLUMNS = ("true_lat_deg", "true_lon_deg", "true_alt_m")
 
 
 class Attached:
@@ -129,14 +130,16 @@ class Record:
         self._file: TextIO = self.path.open("x", newline="", buffering=1)
         self._start_ns = start_ns
         self._lines = csv.writer(self._file)
-        self._lines.writerow(COLUMNS)
+        self._lines.writerow((*COLUMNS, *TRUTH_COLUMNS))
 
     def keep(self, scored: Sequence[Scored]) -> None:
         """Write them."""
         for s in scored:
-            numbers = (f"{value:.2f}" for value in (s.north, s.east, s.error))
-            sigma = "" if s.sigma is None else f"{s.sigma:.2f}"
-            self._lines.writerow((f"{(s.t_ns - self._start_ns) * 1e-9:.3f}", s.source, *numbers, sigma))
+            metres = (s.north, s.east, s.error, s.sigma, s.bound)
+            numbers = ("" if value is None else f"{value:.2f}" for value in metres)
+            place = (f"{math.degrees(angle):.7f}" for angle in (s.true.lat, s.true.lon))
+            t_s = f"{(s.t_ns - self._start_ns) * 1e-9:.3f}"
+            self._lines.writerow((t_s, s.source, *numbers, *place, f"{s.true.alt:.1f}"))
 
     def close(self) -> None:
         """It is whole."""

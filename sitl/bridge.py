@@ -23,29 +23,25 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from msgspec.structs import replace
 
 from companion.link import dialect, frame
 from companion.link.clock import SECOND, BootClock
 from companion.link.session import LinkLost, LinkUp, MessageReceived, Rebooted, Session
 from companion.log.score import beacon_fix
-from companion.nav.geometry import Geodetic, local_to_geodetic, separation
-from companion.records import GlobalPosition, Gnss, LocalOrigin, LocalPosition, RsbnFix, Truth
+from companion.nav.geometry import Geodetic, local_to_geodetic
+from companion.records import GlobalPosition, Gnss, LocalOrigin, LocalPosition, Truth
 from companion.wire.decode import MAKES, Sender, decode
-from sitl.beacon import Beacon, answers
-from sitl.comparison import AFTER_S, Comparison, error_at
-from sitl.encode import Airframe, encode
-from sitl.flight import Flight
+from sitl.answering import Answering
+from sitl.beacon import Beacon
+from sitl.comparison import AFTER_S, Comparison, nearest
 from sitl.gnss_switch import KNOBS, GnssSwitch
 from sitl.positions import CARRIERS, feeds, position_of
 
-COMPONENT, RSBN_COMPONENT, AUTOPILOT_COMPONENT = 193, 42, 1
+COMPONENT, AUTOPILOT_COMPONENT = 193, 1
 RATES_HZ = {"SIM_STATE": 10.0, "HIL_STATE_QUATERNION": 10.0, "GLOBAL_POSITION_INT": 5.0}
-RSBN_EVERY = SECOND
-NEAREST = 8  # beacons that answer: those nearest to where the aircraft is first seen
 ASK_ORIGIN_EVERY = 3 * SECOND
 REQUEST_MESSAGE = 512  # MAV_CMD
-TIMESYNC = 111
+TIMESYNC, NAVIGATION_STATUS = 111, dialect.type_named("NAVIGATION_STATUS").msgid
 SILENT_AFTER = 3 * SECOND
 AUTOPILOT, COMPANION, RSBN = "autopilot", "companion", "RSBN fix alone"
 
@@ -89,8 +85,8 @@ class Bridge:
         self.comparison = Comparison()
         self.losses: list[Loss] = []
         self.begun_ns: int | None = None  # when the autopilot was first heard
-        self._beacons, self._way, self._unaided = list(beacons), way, unaided
-        self._rng = np.random.default_rng([seed, 7])
+        self._way, self._unaided = way, unaided
+        self._answering = Answering(beacons, seed, untimed=way is Way.BESIDE)
         self._session = Session(component=COMPONENT, rates_hz=RATES_HZ)
         self._sender = Sender(self._session.clock)
         self._readers = frame.Reader(), frame.Reader()
@@ -104,14 +100,12 @@ class Bridge:
         self._origin: LocalOrigin | None = None
         self._origin_at = 0
         self._truth_ns: int | None = None
-        self._rsbn_at = 0
-        self._rsbn: list[tuple[int, RsbnFix]] = []  # due, answer; in order
-        self._rsbn_sequence = 0
         self._global_at: int | None = None
         self._fixed = False
         self._marks: list[int] = []  # instants at which the errors are to be told
         self._companion_clock = BootClock()
         self._companion_at: int | None = None
+        self._bound: tuple[int, float] | None = None  # the guaranteed one that it told last, m, and when
         self._told: list[str] = []
         self._uses: dict[type, Callable[[Any], None]] = {
             Truth: self._on_truth,
@@ -142,6 +136,8 @@ class Bridge:
                 continue
             if found.msgid in CARRIERS:
                 self._on_companion(found, now_ns)
+            elif found.msgid == NAVIGATION_STATUS:
+                self._bound = now_ns, dialect.decode(found).bound_horizontal
             if self._way is Way.RELAY and not (self._unaided and feeds(dialect.decode(found))):
                 self._outboxes[0].append(found.raw)
 
@@ -160,8 +156,9 @@ class Bridge:
             self._told += self._switch.poll(now_ns)
             for message in self._switch.to_send():
                 self._session.send(message)
-        while self._rsbn and self._rsbn[0][0] <= now_ns:
-            self._send_rsbn(self._rsbn.pop(0)[1], now_ns)
+        boot_ns, system = self._session.clock.offset(now_ns), self._session.system
+        answers = self._answering.due(now_ns, boot_ns, system)
+        self._outboxes[0 if self._way is Way.SAME else 1].extend(answers)
         while self._marks and self._marks[0] + SECOND <= now_ns:
             self._tell_errors(self._marks.pop(0))
         if self._companion_at is not None and now_ns - self._companion_at > SILENT_AFTER:
@@ -170,14 +167,13 @@ class Bridge:
 
     def deadline(self) -> int:
         """When `poll` must be called at the latest."""
-        due = [self._session.deadline()]
+        due = [self._session.deadline(), self._answering.deadline()]
         if self._session.is_up and self._origin is None:
             due.append(self._origin_at)
         if self.begun_ns is not None and self._due:
             due.append(self.begun_ns + self._due[0][0])
         if self._switch is not None and (at := self._switch.deadline()) is not None:
             due.append(at)
-        due += [self._rsbn[0][0]] if self._rsbn else []
         due += [self._marks[0] + SECOND] if self._marks else []
         return min(due)
 
@@ -231,17 +227,17 @@ class Bridge:
             self.begun_ns = now_ns
             if self._due and make in KNOBS:
                 self._switch = GnssSwitch(make, event.system)
+            elif self._due:
+                self._tell("how to switch GNSS in the simulator of such an autopilot is not known")
 
     def _on_truth(self, truth: Truth) -> None:
         if self._truth_ns is None:
             self._tell("its simulator's truth is heard")
-            self._beacons = sorted(self._beacons, key=lambda beacon: _distance(beacon, truth))[:NEAREST]
         self._truth_ns = truth.t_ns
         self.comparison.truth(truth.t_ns, Geodetic(truth.lat, truth.lon, truth.alt))
-        if truth.t_ns >= self._rsbn_at:
-            due = self._rsbn_at + RSBN_EVERY
-            self._rsbn_at = due if due > truth.t_ns else truth.t_ns + RSBN_EVERY
-            self._answer(truth)
+        for fix in self._answering.along(truth):
+            if (place := beacon_fix(fix, truth.alt)) is not None:
+                self.comparison.estimate(fix.t_ns, RSBN, place)
 
     def _on_global_position(self, record: GlobalPosition) -> None:
         self._global_at = record.rx_ns
@@ -283,40 +279,15 @@ class Bridge:
         if said.stamp_ns:
             self._companion_clock.heard(said.stamp_ns, now_ns)
         t_ns = self._companion_clock.local(said.stamp_ns, now_ns)
-        self.comparison.estimate(t_ns - said.age_ns, COMPANION, said.place, said.sigma)
+        bound = self._bound[1] if self._bound and now_ns - self._bound[0] < SILENT_AFTER else math.nan
+        told = bound if math.isfinite(bound) else None
+        self.comparison.estimate(t_ns - said.age_ns, COMPANION, said.place, said.sigma, told)
 
     # -- what goes ----------------------------------------------------------------------------------------
 
     @property
     def _projection(self) -> Any:
         return "px4" if self._sender.autopilot == "px4" else "ardupilot"
-
-    def _answer(self, truth: Truth) -> None:
-        """The beacons' answers where the aircraft is now."""
-        t, three = np.zeros(1), np.zeros((1, 3))
-        lat, lon, alt = (np.array([value]) for value in (truth.lat, truth.lon, truth.alt))
-        flight = Flight(t, lat, lon, alt, three, three, three, three, three, t)
-        for beacon in self._beacons:
-            for said in answers(beacon, flight, self._rng):
-                fix = replace(said, t_ns=truth.t_ns)
-                place = beacon_fix(fix, truth.alt)
-                if place is not None:
-                    self.comparison.estimate(fix.t_ns, RSBN, place)
-                # without a time it counts as of its arrival, so then there must be no latency
-                late = 0 if self._way is Way.BESIDE else said.rx_ns
-                self._rsbn.append((truth.t_ns + late, fix))
-        self._rsbn.sort(key=lambda entry: entry[0])
-
-    def _send_rsbn(self, fix: RsbnFix, now_ns: int) -> None:
-        offset = self._session.clock.offset(now_ns)
-        if offset is None:
-            return
-        message = encode(fix, Airframe("ardupilot", offset))
-        if self._way is Way.BESIDE:
-            message.time_usec = 0
-        data = frame.encode(message, self._rsbn_sequence, self._session.system, RSBN_COMPONENT)
-        self._rsbn_sequence = self._rsbn_sequence + 1 & 0xFF
-        self._outboxes[0 if self._way is Way.SAME else 1].append(data)
 
     def _ask_for_origin(self) -> None:
         self._session.send(
@@ -335,9 +306,12 @@ class Bridge:
     def _tell_errors(self, mark_ns: int) -> None:
         seconds = round((mark_ns - self.losses[-1].lost_ns) * 1e-9)
         recent = [s for s in self.comparison.scored[-1000:] if s.t_ns > mark_ns - 5 * SECOND]
-        found = {source: error_at(recent, source, mark_ns) for source in (AUTOPILOT, COMPANION)}
-        said = ", ".join(f"{source} {error:.0f} m" for source, error in found.items() if error is not None)
-        self._tell(f"{seconds} s after the loss, off by: {said or 'nobody knows'}")
+        said = []
+        for source in (AUTOPILOT, COMPANION):
+            if (found := nearest(recent, source, mark_ns)) is not None:
+                bound = "" if found.bound is None else f" (guaranteed bound {found.bound:.0f} m)"
+                said.append(f"{source} {found.error:.0f} m{bound}")
+        self._tell(f"{seconds} s after the loss, off by: {', '.join(said) or 'nobody knows'}")
 
     def _take(self, side: int) -> list[bytes]:
         taken = self._outboxes[side][:]
@@ -346,10 +320,3 @@ class Bridge:
 
     def _tell(self, text: str) -> None:
         self._told.append(text)
-
-
-def _distance(beacon: Beacon, truth: Truth) -> float:
-    """Roughly, m."""
-    there = Geodetic(math.radians(beacon.lat_deg), math.radians(beacon.lon_deg), truth.alt)
-    north, east, _ = separation(Geodetic(truth.lat, truth.lon, truth.alt), there).tolist()
-    return math.hypot(north, east)

@@ -25,18 +25,30 @@ NEAR_NS = 2 * SECOND
 
 
 class Scored(NamedTuple):
-    """The horizontal error of one estimate, m: estimate minus truth, and the sigma it stated."""
+    """The horizontal error of one estimate, m: estimate minus truth; the sigma and the guaranteed bound that
+    it stated, m, None where it did not; and the truth.
+    """
 
     t_ns: int
     source: str
     north: float
     east: float
-    sigma: float | None = None
+    sigma: float | None
+    bound: float | None
+    true: Geodetic
 
     @property
     def error(self) -> float:
         """Its length."""
         return math.hypot(self.north, self.east)
+
+
+class _Estimate(NamedTuple):
+    t_ns: int
+    source: str
+    place: Geodetic
+    sigma: float | None
+    bound: float | None
 
 
 class Row(NamedTuple):
@@ -57,7 +69,7 @@ class Comparison:
     def __init__(self) -> None:
         self.scored: list[Scored] = []
         self._truth: deque[tuple[int, Geodetic]] = deque()
-        self._waiting: deque[tuple[int, str, Geodetic, float | None]] = deque(maxlen=MOST_WAITING)
+        self._waiting: deque[_Estimate] = deque(maxlen=MOST_WAITING)
 
     def truth(self, t_ns: int, place: Geodetic) -> None:
         """The aircraft was at `place`. What is not later than the last is not used."""
@@ -67,20 +79,27 @@ class Comparison:
         while self._truth[0][0] < t_ns - REMEMBERED_NS:
             self._truth.popleft()
         for _ in range(len(self._waiting)):
-            self._score(*self._waiting.popleft())
+            self._score(self._waiting.popleft())
 
-    def estimate(self, t_ns: int, source: str, place: Geodetic, sigma: float | None = None) -> None:
-        """`source` says that it was at `place`, to `sigma` metres."""
-        self._score(t_ns, source, place, sigma)
+    def estimate(
+        self,
+        t_ns: int,
+        source: str,
+        place: Geodetic,
+        sigma: float | None = None,
+        bound: float | None = None,
+    ) -> None:
+        """`source` says that it was at `place`, to `sigma` metres and by `bound` metres r.m.s. at most."""
+        self._score(_Estimate(t_ns, source, place, sigma, bound))
 
-    def _score(self, t_ns: int, source: str, place: Geodetic, sigma: float | None) -> None:
-        if not self._truth or t_ns > self._truth[-1][0]:
-            self._waiting.append((t_ns, source, place, sigma))
+    def _score(self, said: _Estimate) -> None:
+        if not self._truth or said.t_ns > self._truth[-1][0]:
+            self._waiting.append(said)
             return
-        true = self._truth_at(t_ns)
+        true = self._truth_at(said.t_ns)
         if true is not None:
-            north, east, _ = separation(place, true).tolist()
-            self.scored.append(Scored(t_ns, source, north, east, sigma))
+            north, east, _ = separation(said.place, true).tolist()
+            self.scored.append(Scored(said.t_ns, said.source, north, east, said.sigma, said.bound, true))
 
     def _truth_at(self, t_ns: int) -> Geodetic | None:
         """Linear between two samples; None before the first, and in a hole."""
@@ -102,10 +121,10 @@ class Comparison:
         )
 
 
-def error_at(scored: Iterable[Scored], source: str, t_ns: int) -> float | None:
-    """The error of `source` at the sample nearest to `t_ns`, None where none is near."""
+def nearest(scored: Iterable[Scored], source: str, t_ns: int) -> Scored | None:
+    """What `source` said next to `t_ns`, None where nothing is near."""
     near = [s for s in scored if s.source == source and abs(s.t_ns - t_ns) <= NEAR_NS]
-    return min(near, key=lambda s: abs(s.t_ns - t_ns)).error if near else None
+    return min(near, key=lambda s: abs(s.t_ns - t_ns), default=None)
 
 
 def table(scored: Sequence[Scored], start_ns: int, end_ns: int) -> list[Row]:
@@ -116,16 +135,13 @@ def table(scored: Sequence[Scored], start_ns: int, end_ns: int) -> list[Row]:
         if not inside:
             continue
         errors = np.array([s.error for s in inside])
-        at = {
-            s: error_at(inside, source, start_ns + s * SECOND)
-            for s in AFTER_S
-            if start_ns + s * SECOND < end_ns
-        }
+        marks = {s: start_ns + s * SECOND for s in AFTER_S}
+        at = {s: nearest(inside, source, mark) for s, mark in marks.items() if mark < end_ns}
         stated = [s.error <= 3.0 * s.sigma for s in inside if s.sigma is not None]
         rows.append(
             Row(
                 source,
-                {s: at.get(s) for s in AFTER_S},
+                {s: found.error if (found := at.get(s)) else None for s in AFTER_S},
                 float(np.sqrt(np.mean(errors**2))),
                 float(errors.max()),
                 len(inside),

@@ -251,7 +251,7 @@ def test_three_processes_over_tcp_and_udp(entries, tmp_path: Path) -> None:
     assert set(rows) == {AUTOPILOT, COMPANION, RSBN}
     assert "the receiver lost its fix" in done.stderr
     lines = Path(found["errors"]).read_text().splitlines()
-    assert lines[0] == "t_s,source,north_m,east_m,error_m,sigma_m"
+    assert lines[0].startswith("t_s,source,north_m,east_m,error_m,sigma_m,bound_m,true_lat_deg")
     assert sum(COMPANION in line for line in lines) > 50
     (flown,) = logs.iterdir()
     kinds = {type(entry.value) for entry in file.read(flown)}
@@ -271,6 +271,16 @@ def test_three_processes_over_tcp_and_udp(entries, tmp_path: Path) -> None:
 def test_a_mistake_is_told_in_one_sentence(arguments, words) -> None:
     done = CliRunner().invoke(command, arguments)
     assert done.exit_code == 2 and words in done.output
+
+
+def test_what_cannot_be_listened_on_or_written_has_its_exit_code(tmp_path: Path) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
+        taken.bind((LOOPBACK, 0))
+        done = CliRunner().invoke(command, ["--connect", f"udpin:{LOOPBACK}:{taken.getsockname()[1]}"])
+    assert done.exit_code == 69 and "cannot listen on" in done.output
+    (tmp_path / "file").touch()
+    done = CliRunner().invoke(command, ["--log", str(tmp_path / "file")])
+    assert done.exit_code == 73 and "cannot be written" in done.output
 
 
 def test_a_list_of_beacons_that_is_none_ends_it(tmp_path: Path) -> None:

@@ -5,7 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from companion.nav.geometry import Geodetic, displace
-from sitl.comparison import Comparison, error_at, table
+from sitl.comparison import Comparison, nearest, table
 
 SECOND = 1_000_000_000
 HOME = Geodetic(0.9, 0.6, 100.0)
@@ -79,4 +79,4 @@ def test_the_table_counts_from_the_loss() -> None:
     assert row.rms == pytest.approx(200.0 / math.sqrt(3.0), rel=0.01)
     assert row.within == 0.0  # drift is four sigmas, less a metre
     assert table(comparison.scored, 500 * SECOND, 600 * SECOND) == []
-    assert error_at(comparison.scored, "other", 60 * SECOND) is None
+    assert nearest(comparison.scored, "other", 60 * SECOND) is None
