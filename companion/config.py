@@ -91,6 +91,7 @@ class AirDataSection(Section, frozen=True):
 
     wind_m_s: Positive = 10.0
     wind_change_m_s_sqrt_s: Positive = 0.2
+    wind_jump_m_s: Positive = 4.0  # north and east, of the jumps in which it mostly changes
     gust_m_s: Positive = 0.6
     gust_s: Positive = 0.5
     airspeed_percent: Positive = 2.0
@@ -287,7 +288,7 @@ class Config(Section, frozen=True):
     @property
     def leading(self) -> Literal["minimax", "kalman", "restrictive"]:
         """The estimator that `estimator.output` means, "auto" by the channel. The restrictive one runs by air
-        data only; there it is as good as the error state on a straight course, and has no states for a turn.
+        data only, and has neither jumps of the wind nor states for a turn.
         """
         if self.estimator.output == "auto":
             return "minimax" if self.channel == "local_position" else "kalman"

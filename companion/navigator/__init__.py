@@ -208,7 +208,7 @@ def _guarded(
     why = "its covariance was none any more"
     if after.state is not carry.state and not errorstate.is_sound(after.state):
         outputs = [*outputs, Reset(record.t_ns, record.rx_ns, "error state", why)]
-        after = after._replace(state=None)
+        after = after._replace(state=None, jumps=None)
     if after.watch is not carry.watch and not watch.is_sound(after.watch):
         outputs = [*outputs, Reset(record.t_ns, record.rx_ns, "integrity monitor", why)]
         after = after._replace(watch=None)

@@ -20,6 +20,7 @@ from .inertial import Point, Track
 from .restricted import Restrictive
 from .strapped import Strap
 from .watch import Watch
+from .windjumps import Jumps
 
 FIXES = Source.GNSS | Source.AZIMUTH | Source.RANGE
 
@@ -76,7 +77,8 @@ class Carry(NamedTuple):
     strap: Strap = Strap()
     track: Track = ()
     state: ErrorState | None = None
-    restrictive: Restrictive | None = None  # of air-data dead reckoning
+    jumps: Jumps | None = None  # of air-data dead reckoning: what `state` is the sum of
+    restrictive: Restrictive | None = None  # of the same
     level: Level = Level()
     gnss: Gnss | None = None  # the last new one, used or not
     gnss_heard: radio.Heard | None = None  # the last one believed

@@ -71,7 +71,7 @@ def _watched(carry: Carry, lesson: Lesson, settings: Settings) -> tuple[Carry, b
         if exclusion not in known:
             carry, taken = _left_out(carry, exclusion, w, settings), False
     if watch.excluded(w, INERTIAL):  # only the monitor lets it loose
-        carry = carry._replace(state=watch.solution(w))
+        carry = carry._replace(state=watch.solution(w), jumps=None)
     return carry._replace(watch=w), taken, out
 
 
@@ -122,7 +122,7 @@ def _left_out(carry: Carry, exclusion: Exclusion, w: Watch, settings: Settings) 
     Beside GNSS a beacon weighs nothing in a fix: of what it taught only that since GNSS was last heard goes.
     """
     promise, since = carry.guarantee, exclusion.since_ns
-    carry = carry._replace(state=watch.solution(w))
+    carry = carry._replace(state=watch.solution(w), jumps=None)
     if exclusion.source == INERTIAL:
         return carry._replace(guarantee=guarantee.begin(settings.config), restrictive=None)
     if exclusion.source == GNSS:

@@ -10,7 +10,7 @@ import math
 from companion.nav.geometry import displace
 from companion.records import Vector2
 
-from . import errorstate, guarantee, restricted, watch
+from . import errorstate, guarantee, restricted, watch, windjumps
 from .carry import Carry, Settings
 from .errorstate import VELOCITY
 from .inertial import Point
@@ -27,7 +27,8 @@ def shifted(carry: Carry, north: float, east: float, v_n: Vector2 | None = None,
     promise = guarantee.shift(carry.guarantee, north, east, v_n or (0.0, 0.0), t_ns)
     bounded = carry.restrictive and restricted.shift(carry.restrictive, north, east)
     w = carry.watch and watch.shift(carry.watch, north, east, v_n, t_ns)
-    carry = carry._replace(state=state, guarantee=promise, restrictive=bounded, watch=w)
+    jumps = windjumps.each(carry.jumps, lambda s: errorstate.shift(s, north, east, v_n))
+    carry = carry._replace(state=state, jumps=jumps, guarantee=promise, restrictive=bounded, watch=w)
     return carry._replace(track=(), gnss_heard=None)
 
 
@@ -36,7 +37,9 @@ def blurred(carry: Carry, settings: Settings, sigma: float, sigma_v: float = 0.0
     state = carry.state and errorstate.blur(carry.state, sigma, sigma_v)
     promise = guarantee.begin(settings.config)
     w = carry.watch and watch.blur(carry.watch, sigma, sigma_v)
-    return carry._replace(state=state, guarantee=promise, restrictive=None, watch=w, track=carry.track[-1:])
+    jumps = windjumps.each(carry.jumps, lambda s: errorstate.blur(s, sigma, sigma_v))
+    carry = carry._replace(state=state, jumps=jumps, guarantee=promise, restrictive=None, watch=w)
+    return carry._replace(track=carry.track[-1:])
 
 
 def kept_near(carry: Carry, has_velocity: bool) -> Carry:

@@ -3,13 +3,14 @@
     X = (dx, dy, dVN, dVE),   X(t+1) = A X(t) + B U(t) + W(t),   |U_i| <= C = q sqrt(3 dt)
 
 U is the change of the wind over one interval and W the gusts (`winderror` has the states and q). A change
-even within its bounds has the variance of the error state's random walk, so the two estimators differ in what
+even within its bounds has the variance of a random walk (`winderror`), so the two differ in what
 they make of the bounds and in nothing else. The interval is fixed, because the filter is not indifferent to
 it: in one second a beacon's fix shows nothing of U. So fixes are averaged over ten seconds; where nothing is
 measured the prediction is the minimax filter's.
 
-On the recorded flights, on a straight course, the two are alike. In a turn this one is worse: it has no
-states for the errors of airspeed and heading, which the error state learns there.
+On the recorded flights it is as good as one such random walk, and a minute without fixes ends half as far
+off again as by a wind that jumps (`windjumps`). In a turn it is worse: it has no states for the errors of
+airspeed and heading, which the error state learns there.
 
 The covariance is conditional on which bounds are active, and overconfident: never a guarantee.
 """

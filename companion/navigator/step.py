@@ -16,10 +16,8 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
-
 from companion.config import Config
-from companion.estimate.fusion import Azimuth, Observation, Position, Range
+from companion.estimate.fusion import Azimuth, Observation, Range
 from companion.nav.geometry import displace
 from companion.records import (
     AirData,
@@ -39,12 +37,10 @@ from companion.records import (
     RsbnFix,
     Source,
     Stamped,
-    Vector3,
 )
 
-from . import deadreckoning, errorstate, guarantee, inertial, moved, radio, strapped, watch
-from .carry import FIXES, Carry, Lesson, Level, Settings, Step, initial, level, sources, state_at
-from .errorstate import ErrorState, Floats
+from . import absorb, deadreckoning, errorstate, inertial, moved, radio, strapped, watch
+from .carry import Carry, Lesson, Level, Settings, Step, initial, level
 from .inertial import Point
 from .lesson import unheard
 from .solution import solve
@@ -59,7 +55,6 @@ UNKNOWN_M_S2 = 5.0  # and the velocity in one of the IMU,
 TURNED_M_S = 30.0  # until nothing is known of it
 QUIET_NS = 10_000_000_000  # what goes on being refused is told once, and again after so long without
 AGAIN_NS = 60_000_000_000  # how often it is told that nothing can begin
-BOUND_GATE = 3.0  # a fix within this many guaranteed r.m.s. of the prediction is believed after an outage
 
 
 def step(carry: Carry, record: Input, settings: Settings) -> Step:
@@ -221,14 +216,14 @@ def _gnss(carry: Carry, record: Gnss, settings: Settings) -> Step:
         return carry, []
     since = math.inf if carry.gnss_ns is None else (record.t_ns - carry.gnss_ns) * 1e-9
     white = radio.from_gnss(record, ins, config, drifting=True)
-    carry, out = _absorb(carry, white, errorstate.gnss_rows(settings.unit), ins, record, settings)
+    carry, out = absorb.position(carry, white, errorstate.gnss_rows(settings.unit), ins, record, settings)
     if out:
         return carry, out
     heard = radio.from_gnss(record, ins, config)
     learnt = _levelled(carry.level, record, ins, min(since, config.correlation_s) / config.correlation_s)
     carry = carry._replace(gnss_ns=record.t_ns, gnss_heard=heard, level=learnt)
     if config.use_velocity and record.v_n is not None:
-        carry = _absorb_velocity(carry, record, record.v_n, ins, settings)
+        carry = absorb.velocity(carry, record, record.v_n, ins, settings)
     return carry._replace(lesson=carry.lesson and carry.lesson._replace(heard=heard)), []
 
 
@@ -244,7 +239,7 @@ def _rsbn(carry: Carry, record: RsbnFix, settings: Settings) -> Step:
     heard = _calibrated(carry, record, said, settings)
     if not heard.observations:
         return carry, []
-    carry, out = _absorb(carry, heard, errorstate.beacon_rows(settings.unit), ins, record, settings)
+    carry, out = absorb.position(carry, heard, errorstate.beacon_rows(settings.unit), ins, record, settings)
     if out:
         return carry, out
     carry = carry._replace(rsbn_ns=record.t_ns, rsbn_told=heard.sources)
@@ -270,61 +265,6 @@ def _calibrated(carry: Carry, record: RsbnFix, said: radio.Heard, settings: Sett
     return radio.Heard(record.t_ns, tuple(kept), told)
 
 
-def _absorb(
-    carry: Carry, heard: radio.Heard, H: Floats, ins: Point, record: Gnss | RsbnFix, settings: Settings
-) -> Step:
-    """The error state with what was heard of H x, if it can be believed; an output means it was not.
-
-    The first fix is believed, and while predicting one within the guaranteed bound is, whatever the Gaussian
-    state claims: then it is the claim that was wrong, and it is widened.
-    """
-    state = state_at(carry, ins, settings)
-    found = radio.innovation(heard, _prior(state, H, settings))
-    limit = settings.gate[radio.freedom(heard)]
-    carry = carry._replace(innovation=found.cost if radio.freedom(heard) == 2 else None)
-    if found.cost > limit:
-        if carry.state is not None and not _within_bound(carry, heard, settings):
-            carry = carry._replace(state=state)
-            return carry, [_rejected(record, "innovation beyond its gate (chi-square)", found.cost, limit)]
-        state = errorstate.widen(state, found.cost / limit)
-        carry = carry._replace(lesson=carry.lesson and carry.lesson._replace(proof=True))
-        found = radio.innovation(heard, _prior(state, H, settings))
-    mean = -found.position[1::-1]  # the place in the plane is minus the error; x east, y north
-    covariance = found.covariance[1::-1, 1::-1]
-    return carry._replace(state=errorstate.absorb_position(state, H, mean, covariance)), []
-
-
-def _within_bound(carry: Carry, heard: radio.Heard, settings: Settings) -> bool:
-    """Whether a fix lies where the guaranteed prediction allows the aircraft to be; only asked while
-    predicting.
-    """
-    if sources(carry, heard.t_ns, settings) & FIXES:
-        return False
-    _, promise = guarantee.bounded(carry.guarantee, heard.t_ns, settings.config.predictor)
-    if promise is None:
-        return False
-    (north, east), (bound_n, bound_e) = promise.error_n, promise.bound_n
-    height = settings.config.inertial.height_sigma_m
-    wide = Position(np.array([-east, -north, 0.0]), np.diag([bound_e**2, bound_n**2, height**2]))
-    return radio.innovation(heard, wide).cost <= BOUND_GATE**2
-
-
-def _absorb_velocity(carry: Carry, record: Gnss, v_n: Vector3, ins: Point, settings: Settings) -> Carry:
-    assert carry.state is not None
-    config = settings.config.gnss
-    measured = max(record.sigma_velocity or 0.0, config.sigma_velocity_m_s)
-    sigma = math.hypot(measured, settings.unit.velocity_noise)
-    error = (ins.v_n[0] - v_n[0], ins.v_n[1] - v_n[1])
-    H = settings.unit.velocity_rows(ins.v_n)
-    state, nis = errorstate.absorb_velocity(carry.state, H, np.array(error), sigma)
-    if nis > settings.gate[2]:
-        return carry
-    g = carry.guarantee
-    if settings.config.predictor.learn_velocity:
-        g = guarantee.learn(g, record.t_ns, "velocity", error, (sigma, sigma), settings.config.predictor)
-    return carry._replace(state=state, guarantee=g)
-
-
 def _levelled(old: Level, record: Gnss, ins: Point, part: float) -> Level:
     """The height error against GNSS, followed as a random walk of 5 cm a root second (a barometer drifts).
 
@@ -334,20 +274,6 @@ def _levelled(old: Level, record: Gnss, ins: Point, part: float) -> Level:
     p = old.variance + 0.0025
     k = p / (p + r)
     return Level(old.error + k * (ins.position.alt - record.alt_msl - old.error), (1.0 - k) * p)
-
-
-def _prior(state: ErrorState, H: Floats, settings: Settings) -> Position:
-    """Where the error state has the aircraft, as an observation in the plane at the INS."""
-    covariance = np.zeros((3, 3))
-    covariance[:2, :2] = (H @ state.P @ H.T)[::-1, ::-1]
-    covariance[2, 2] = settings.config.inertial.height_sigma_m**2
-    north, east = (H @ state.x).tolist()
-    return Position(np.array([-east, -north, 0.0]), covariance)
-
-
-def _rejected(record: Gnss | RsbnFix, reason: str, value: float, limit: float) -> Rejection:
-    source = f"gnss {record.receiver}" if isinstance(record, Gnss) else f"rsbn {record.beacon}"
-    return Rejection(record.t_ns, record.rx_ns, source, reason, value, limit)
 
 
 _Uses = dict[type, Callable[[Carry, Any, Settings], Step]]

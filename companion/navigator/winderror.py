@@ -28,12 +28,15 @@ FIRST_POSITION_M = 2000.0  # nothing is known: the first fix, by which the chann
 
 
 class WindError(NamedTuple):
-    """First sigmas (N,), white spectral densities (N,), decay rates (N,) 1/s, and the gusts' sigma (m/s)."""
+    """First sigmas (N,), white spectral densities (N,), decay rates (N,) 1/s, and the sigmas of gusts and of
+    jumps of the wind (m/s).
+    """
 
     sigma0: Floats
     density: Floats
     decay: Floats
     velocity_noise: float
+    jump: float
 
     def system(self, lat: float, v_n: Vector3, a_n: Vector2) -> System:
         """x' = A x + w, the channel flying through the air at `v_n`; neither latitude nor `a_n` matters."""
@@ -61,4 +64,4 @@ def grade(settings: AirDataSection, gnss: GnssSection) -> WindError:
     density = 2.0 * decay * np.square(sigma0)
     density[:2] = 2.0 * settings.gust_m_s**2 * settings.gust_s
     density[WIND] = settings.wind_change_m_s_sqrt_s**2
-    return WindError(np.array(sigma0), density, decay, settings.gust_m_s)
+    return WindError(np.array(sigma0), density, decay, settings.gust_m_s, settings.wind_jump_m_s)

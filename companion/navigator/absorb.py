@@ -1,0 +1,143 @@
+"""What a fix does to the error state: believed or refused by its innovation, fused by maximum likelihood.
+
+By air data the error state is the sum of a few, one for each history of the wind (`windjumps`); the fix is
+judged by the sum and absorbed by each.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+
+from companion.estimate.fusion import Position
+from companion.records import Gnss, Rejection, RsbnFix, Vector3
+
+from . import errorstate, guarantee, inertial, radio, windjumps
+from .carry import FIXES, Carry, Settings, Step, sources, state_at
+from .errorstate import ErrorState, Floats
+from .inertial import Point
+from .winderror import WindError
+
+BOUND_GATE = 3.0  # a fix within this many guaranteed r.m.s. of the prediction is believed after an outage
+
+
+def position(
+    carry: Carry, heard: radio.Heard, H: Floats, ins: Point, record: Gnss | RsbnFix, settings: Settings
+) -> Step:
+    """The error state with what was heard of H x, if it can be believed; an output means it was not.
+
+    The first fix is believed, and while predicting one within the guaranteed bound is, whatever the Gaussian
+    state claims: then it is the claim that was wrong, and it is widened.
+    """
+    state, factor = state_at(carry, ins, settings), 1.0
+    after, cost, _ = _fused(state, heard, H, settings)
+    limit = settings.gate[radio.freedom(heard)]
+    carry = carry._replace(innovation=cost if radio.freedom(heard) == 2 else None)
+    if cost > limit:
+        if carry.state is not None and not _within_bound(carry, heard, settings):
+            carry = carry._replace(state=state)
+            return carry, [_rejected(record, "innovation beyond its gate (chi-square)", cost, limit)]
+        factor = cost / limit
+        carry = carry._replace(lesson=carry.lesson and carry.lesson._replace(proof=True))
+        after, _, _ = _fused(errorstate.widen(state, factor), heard, H, settings)
+
+    def each(state: ErrorState) -> tuple[ErrorState, float]:
+        after, _, likelihood = _fused(errorstate.widen(state, factor), heard, H, settings)
+        return after, likelihood
+
+    return _weighed(carry, ins, after, each, settings), []
+
+
+def _fused(
+    state: ErrorState, heard: radio.Heard, H: Floats, settings: Settings
+) -> tuple[ErrorState, float, float]:
+    """The state with what was heard of H x, the chi-square of that, and the logarithm of its likelihood, but
+    for what is the same whatever the state was.
+    """
+    prior = _prior(state, H, settings)
+    found = radio.innovation(heard, prior)
+    mean = -found.position[1::-1]  # the place in the plane is minus the error; x east, y north
+    covariance = found.covariance[1::-1, 1::-1]
+    gained = _determinant(covariance) / _determinant(
+        np.asarray(prior.covariance)
+    )  # that of R over that of H P H' + R
+    after = errorstate.absorb_position(state, H, mean, covariance)
+    return after, found.cost, 0.5 * (math.log(gained) - found.cost)
+
+
+def _weighed(
+    carry: Carry,
+    ins: Point,
+    after: ErrorState,
+    each: Callable[[ErrorState], tuple[ErrorState, float]],
+    settings: Settings,
+) -> Carry:
+    """With the state `after` a measurement; by air data the sum of what it makes of `each` hypothesis."""
+    unit = settings.unit
+    if not isinstance(unit, WindError):
+        return carry._replace(state=after)
+    if carry.jumps is None:
+        return carry._replace(state=after, jumps=windjumps.begin(after))
+    jumps = windjumps.at(carry.jumps, ins, inertial.acceleration(carry.track), unit)
+    jumps = windjumps.learn(jumps, each)
+    return carry._replace(state=windjumps.moments(jumps), jumps=jumps)
+
+
+def _determinant(P: Floats) -> float:
+    """Of the horizontal part."""
+    (a, b), (_, d) = P[:2, :2].tolist()
+    return float(a * d - b * b)
+
+
+def _within_bound(carry: Carry, heard: radio.Heard, settings: Settings) -> bool:
+    """Whether a fix lies where the guaranteed prediction allows the aircraft to be; only asked while
+    predicting.
+    """
+    if sources(carry, heard.t_ns, settings) & FIXES:
+        return False
+    _, promise = guarantee.bounded(carry.guarantee, heard.t_ns, settings.config.predictor)
+    if promise is None:
+        return False
+    (north, east), (bound_n, bound_e) = promise.error_n, promise.bound_n
+    height = settings.config.inertial.height_sigma_m
+    wide = Position(np.array([-east, -north, 0.0]), np.diag([bound_e**2, bound_n**2, height**2]))
+    return radio.innovation(heard, wide).cost <= BOUND_GATE**2
+
+
+def velocity(carry: Carry, record: Gnss, v_n: Vector3, ins: Point, settings: Settings) -> Carry:
+    """The error state, and the guaranteed predictor if it is to, with a velocity of GNSS, if believed."""
+    assert carry.state is not None
+    config = settings.config.gnss
+    measured = max(record.sigma_velocity or 0.0, config.sigma_velocity_m_s)
+    sigma = math.hypot(measured, settings.unit.velocity_noise)
+    error = (ins.v_n[0] - v_n[0], ins.v_n[1] - v_n[1])
+    H = settings.unit.velocity_rows(ins.v_n)
+    after, nis = errorstate.absorb_velocity(carry.state, H, np.array(error), sigma)
+    if nis > settings.gate[2]:
+        return carry
+
+    def each(state: ErrorState) -> tuple[ErrorState, float]:
+        after, nis = errorstate.absorb_velocity(state, H, np.array(error), sigma)
+        S = H @ state.P @ H.T + sigma**2 * np.eye(2)
+        return after, -0.5 * (nis + math.log(_determinant(S)))
+
+    g = carry.guarantee
+    if settings.config.predictor.learn_velocity:
+        g = guarantee.learn(g, record.t_ns, "velocity", error, (sigma, sigma), settings.config.predictor)
+    return _weighed(carry._replace(guarantee=g), ins, after, each, settings)
+
+
+def _prior(state: ErrorState, H: Floats, settings: Settings) -> Position:
+    """Where the error state has the aircraft, as an observation in the plane at the INS."""
+    covariance = np.zeros((3, 3))
+    covariance[:2, :2] = (H @ state.P @ H.T)[::-1, ::-1]
+    covariance[2, 2] = settings.config.inertial.height_sigma_m**2
+    north, east = (H @ state.x).tolist()
+    return Position(np.array([-east, -north, 0.0]), covariance)
+
+
+def _rejected(record: Gnss | RsbnFix, reason: str, value: float, limit: float) -> Rejection:
+    source = f"gnss {record.receiver}" if isinstance(record, Gnss) else f"rsbn {record.beacon}"
+    return Rejection(record.t_ns, record.rx_ns, source, reason, value, limit)
