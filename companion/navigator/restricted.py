@@ -76,8 +76,11 @@ def learn(
 
 
 def at(r: Restrictive, t_ns: int, unit: WindError) -> kalman.Prediction:
-    """The error (4,) and its covariance at `t_ns`; fixes of an interval not yet over wait for its end."""
-    A, B, C, Q = _interval((t_ns - r.t_ns) * 1e-9, unit)
+    """The error (4,) and its covariance at `t_ns`; fixes of an interval not yet over wait for its end.
+
+    A solution may be a moment older than the fix it began with: then it is what it was then.
+    """
+    A, B, C, Q = _interval(max(t_ns - r.t_ns, 0) * 1e-9, unit)
     return kalman.predict(r.x, r.P, A, kalman.minimax_noise(B, C, Q))
 
 
