@@ -2,9 +2,10 @@
 
     companion soak --hours 24 --seed 1
 
-An hour is a sortie: the autopilot is switched on, flies, and is switched off; the companion goes on. In every
-sortie some 18 faults, whose kinds and times are drawn by the seed, last half a minute or so and stand two
-minutes apart. A line an hour says what the process holds and how often things happen, and what must not grow:
+An hour is four sorties: the autopilot is switched on, flies a quarter of an hour, and is switched off; the
+companion goes on. In every sortie faults whose kinds and times are drawn by the seed last half a minute or so
+and stand two minutes apart, some 14 in an hour. A line an hour says what the process holds and how often
+things happen. What must not grow:
 
     memory     of the process (resident) and the objects that can be reached from the companion: no more than
                5 % above those at the end of the first hour
@@ -27,7 +28,8 @@ import tempfile
 import time
 import types
 from collections import Counter, deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -47,7 +49,7 @@ from sitl.flight import Leg, Plan, Wind
 from sitl.loopback import LINK, SECOND, START_NS, join, simulated
 from sitl.scenarios import Rates, Scenario
 
-HOUR_S = 3600.0
+SORTIE_S, SORTIES = 900.0, 4  # of an hour
 QUIET_S = 120.0  # at the start of a sortie, and after a fault, before anything is counted as quiet
 FAULT_S = (20.0, 60.0)
 APART_NS = 60 * SECOND  # between two sorties
@@ -69,7 +71,7 @@ class Hour(NamedTuple):
     solutions_hz: float
     messages_hz: float
     received_hz: float
-    quiet_s: float
+    quiet_s: int
     rejections: int
     resets: int
     events: int
@@ -99,35 +101,50 @@ def held(root: object, but: tuple[object, ...] = ()) -> Held:
 
 
 class Tally:
-    """A log that counts on its way to another; `quiet` says whether rates are counted."""
+    """A log that counts on its way to another, and the rates of a quiet time."""
 
     def __init__(self, log: Writer) -> None:
         self._log = log
-        self.quiet = False
+        self.begin()
+
+    def begin(self) -> None:
+        """Count anew."""
         self.counts: Counter[str] = Counter()
-        self.rates: Counter[str] = Counter()
+        self._rates: Counter[str] = Counter()
+        self._quiet = False
+        self.quiet_s = self.waiting = 0
+
+    def listen(self, loud: Sequence[tuple[float, float]], t: float) -> None:
+        """Called at each second `t` of a flight: whether the one that begins is quiet, in none of `loud`."""
+        self._quiet = not any(since <= t + 1.0 and t < until for since, until in loud)
+        self.quiet_s += self._quiet
+        self.waiting = max(self.waiting, self._log.waiting)
+
+    def rate(self, name: str) -> float:
+        """How many of `name` there were in a quiet second."""
+        return round(self._rates[name] / max(self.quiet_s, 1), 3)
 
     def record(self, record: Stamped, channel: str | None = None) -> None:
         """Count and write one record."""
         name = type(record).__name__
         self.counts[name] += 1
-        self.rates[name] += self.quiet
+        self._rates[name] += self._quiet
         self._log.record(record, channel)
 
     def frame(self, link: str, outgoing: bool, data: bytes, t_ns: int) -> None:
         """Count and write one frame."""
-        self.rates["tx" if outgoing else "rx"] += self.quiet
+        self._rates["tx" if outgoing else "rx"] += self._quiet
         self._log.frame(link, outgoing, data, t_ns)
 
 
-def sortie(hour: int, seed: int, duration_s: float = HOUR_S) -> Scenario:
-    """The flight of an hour: round and round within reach of two beacons, faults all along."""
-    rng = random.Random(f"{seed} {hour}")
+def sortie(number: int, seed: int, duration_s: float = SORTIE_S) -> Scenario:
+    """A flight round and round within reach of two beacons, faults all along."""
+    rng = random.Random(f"{seed} {number}")
     sides = math.ceil((duration_s - 60.0) / 240.0)
     legs = [Leg(10, 40, 0, 0), Leg(50, 40, 38, 0)]
-    legs += [Leg((duration_s - 60.0) / sides, (40 + 70 * i) % 360, 38, 200) for i in range(sides)]
+    legs += [Leg((duration_s - 60.0) / sides, (40 + 70 * i) % 360, 38, 100) for i in range(sides)]
     return Scenario(
-        f"sortie {hour}",
+        f"sortie {number}",
         Plan(tuple(legs), winds=(Wind(0, 4, 5),)),
         beacons=(Beacon(1, 60.05, 31.07), Beacon(2, 60.45, 30.0)),
         rates=Rates(imu=1.0, truth=1.0),
@@ -138,17 +155,17 @@ def sortie(hour: int, seed: int, duration_s: float = HOUR_S) -> Scenario:
 
 def _scattered(rng: random.Random, duration_s: float) -> Iterator[Fault]:
     """As many kinds as find room, each once, in any order; a quiet time before each."""
-    names = rng.sample(NAMES, len(NAMES))
-    room = (duration_s - QUIET_S) / (len(names) + 1)
-    step = max(room, QUIET_S + FAULT_S[1] + 10.0)
-    for i, name in enumerate(names):
-        start = QUIET_S + i * step + rng.uniform(0.0, max(step - QUIET_S - FAULT_S[1], 1.0))
+    start = QUIET_S
+    for name in rng.sample(NAMES, len(NAMES)):
+        start += rng.uniform(0.0, 20.0)
         end = start + rng.uniform(*FAULT_S)
-        if end < duration_s - QUIET_S:
-            yield Fault(name, round(start, 1), round(end, 1))
+        if end > duration_s - QUIET_S:
+            return
+        yield Fault(name, round(start, 1), round(end, 1))
+        start = end + QUIET_S + 20.0
 
 
-def soak(hours: int, seed: int, folder: Path, sortie_s: float = HOUR_S) -> Iterator[Hour]:
+def soak(hours: int, seed: int, folder: Path, sortie_s: float = SORTIE_S) -> Iterator[Hour]:
     """Fly, and yield a line after each hour."""
     config = simulated(Config())
     log = Writer(
@@ -163,27 +180,21 @@ def soak(hours: int, seed: int, folder: Path, sortie_s: float = HOUR_S) -> Itera
         onboard = Onboard(config, tally, (LINK,))
         start = START_NS
         for hour in range(1, hours + 1):
-            scenario = sortie(hour, seed, sortie_s)
-            yield _flown(hour, scenario, onboard, tally, log, start)
-            start += round(scenario.duration_s * SECOND) + APART_NS
+            tally.begin()
+            begun, flown_s = time.perf_counter(), 0.0
+            for number in range(SORTIES):
+                scenario = sortie(SORTIES * (hour - 1) + number, seed, sortie_s)
+                loud = [
+                    (0.0, QUIET_S),
+                    *((fault.start_s, fault.end_s + QUIET_S) for fault in scenario.faults),
+                ]
+                join(Autopilot(scenario, start), onboard, start, partial(tally.listen, loud))
+                flown_s += scenario.duration_s
+                start += round(scenario.duration_s * SECOND) + APART_NS
+            yield _line(hour, onboard, tally, log, flown_s / (time.perf_counter() - begun))
 
 
-def _flown(hour: int, scenario: Scenario, onboard: Onboard, tally: Tally, log: Writer, start: int) -> Hour:
-    begun = time.perf_counter()
-    loud = [(fault.start_s, fault.end_s + QUIET_S) for fault in scenario.faults] + [(0.0, QUIET_S)]
-    quiet_s, most = 0, 0
-    tally.counts.clear()
-    tally.rates.clear()
-
-    def each_second(t: float) -> None:
-        nonlocal quiet_s, most
-        tally.quiet = not any(since <= t + 1.0 and t < until for since, until in loud)
-        quiet_s += tally.quiet
-        most = max(most, log.waiting)
-
-    join(Autopilot(scenario, start), onboard, start, each_second)
-    tally.quiet = False
-    took = time.perf_counter() - begun
+def _line(hour: int, onboard: Onboard, tally: Tally, log: Writer, times_real_time: float) -> Hour:
     _give_back()  # the simulator's memory is not the companion's
     objects, longest = held(onboard, but=(tally,))
     return Hour(
@@ -191,16 +202,16 @@ def _flown(hour: int, scenario: Scenario, onboard: Onboard, tally: Tally, log: W
         round(_resident_mib(), 1),
         objects,
         longest,
-        round(most / 1024.0, 1),
+        round(tally.waiting / 1024.0, 1),
         log.dropped,
-        round(tally.rates["Solution"] / max(quiet_s, 1), 3),
-        round(tally.rates["tx"] / max(quiet_s, 1), 3),
-        round(tally.rates["rx"] / max(quiet_s, 1), 3),
-        float(quiet_s),
+        tally.rate("Solution"),
+        tally.rate("tx"),
+        tally.rate("rx"),
+        tally.quiet_s,
         tally.counts["Rejection"],
         tally.counts["Reset"],
         tally.counts["Event"],
-        round(scenario.duration_s / took, 1),
+        round(times_real_time, 1),
     )
 
 

@@ -5,24 +5,22 @@ from itertools import pairwise
 from pathlib import Path
 
 from sitl.faults import NAMES
-from sitl.soak import HOUR_S, QUIET_S, Held, Hour, failures, held, soak, sortie
+from sitl.soak import QUIET_S, SORTIE_S, SORTIES, Held, Hour, failures, held, soak, sortie
 
 
-def test_three_sorties_leave_nothing_behind(tmp_path: Path) -> None:
-    hours = list(soak(3, 1, tmp_path, sortie_s=400.0))
-    assert all(hour.quiet_s > 60.0 and hour.solutions_hz > 4.0 for hour in hours)
-    # the first sortie fills what is bounded by time: windows, histories
-    found = [sentence for sentence in failures(hours[1:]) if "_hz" not in sentence]
-    assert not found and abs(hours[2].objects - hours[1].objects) < 200
+def test_a_few_short_sorties_leave_nothing_behind(tmp_path: Path) -> None:
+    hours = list(soak(2, 1, tmp_path, sortie_s=150.0))
+    assert all(hour.quiet_s > 60 and hour.solutions_hz > 4.0 for hour in hours)
+    assert not [sentence for sentence in failures(hours) if "_hz" not in sentence]
 
 
 def test_the_sorties_of_a_day_have_every_fault_and_quiet_between() -> None:
     seen = set()
-    for hour in range(1, 25):
-        scenario = sortie(hour, 1)
-        assert scenario == sortie(hour, 1) != sortie(hour, 2)
+    for number in range(24 * SORTIES):
+        scenario = sortie(number, 1)
+        assert scenario == sortie(number, 1) != sortie(number, 2)
         spans = sorted((fault.start_s, fault.end_s) for fault in scenario.faults)
-        assert len(spans) > 12 and spans[0][0] >= QUIET_S and spans[-1][1] <= HOUR_S - QUIET_S
+        assert len(spans) >= 3 and spans[0][0] >= QUIET_S and spans[-1][1] <= SORTIE_S - QUIET_S
         assert all(later[0] - before[1] >= QUIET_S for before, later in pairwise(spans))
         seen |= {fault.name for fault in scenario.faults}
     assert seen == set(NAMES)
