@@ -23,6 +23,8 @@ from companion.dialogue import Dialogue
 from companion.feed import Feed
 from companion.link import dialect
 from companion.link.session import (
+    ClockLeapt,
+    FalseTime,
     LinkLost,
     LinkUp,
     MessageReceived,
@@ -223,6 +225,14 @@ class Onboard:
                 link.checkup.begin(self._config, event.system, link.session.kind)
                 self.note(4, f"{link.name}: autopilot {event.system} rebooted", now_ns)
                 self._on_record(Reboot(now_ns, now_ns, event.system))
+            elif isinstance(event, ClockLeapt):
+                leap = event.by_ns / SECOND
+                self.note(
+                    4, f"{link.name}: the clock of autopilot {event.system} leapt by {leap:.1f} s", now_ns
+                )
+            elif isinstance(event, FalseTime):
+                why = "a TIMESYNC answer of another clock"
+                self._on_record(Rejection(now_ns, now_ns, "timesync", why, event.off_ns / SECOND))
             elif isinstance(event, Refused):
                 self.rejected[f"{link.name}: {event.reason.name.lower()} frame"] += 1
             elif isinstance(event, SecondAutopilot):

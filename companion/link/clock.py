@@ -53,6 +53,7 @@ class BootClock:
 
     def __init__(self) -> None:
         self._asked: deque[int] = deque(maxlen=8)
+        self.outlier: int | None = None
         self._reset()
 
     def _reset(self) -> None:
@@ -109,13 +110,19 @@ class BootClock:
         return now
 
     def answered(self, asked: int, reading: int, now: int) -> bool:
-        """Take a TIMESYNC answer; False if it is not to a question of ours or means another clock."""
+        """Take a TIMESYNC answer; False if it is not to a question of ours or means another clock.
+
+        `outlier` then says by how much (ns) it would have the last message arrive early (below 0) or late.
+        """
+        self.outlier = None
         if asked not in self._asked:
             return False
         self._asked.remove(asked)
         answer = Answer((asked + now) // 2 - reading, now - asked, now)
         if self._envelope is not None:
-            if not -JUMP <= self._seen - answer.offset <= LATEST:
+            delay = self._seen - answer.offset
+            if not -JUMP <= delay <= LATEST:
+                self.outlier = delay
                 return False
             # The offset is certainly no less than this: a simulated clock may slip faster than any crystal.
             self._envelope = max(self._envelope, answer.offset - answer.round_trip // 2)

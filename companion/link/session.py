@@ -24,7 +24,7 @@ from typing import NamedTuple
 
 from companion.link import dialect, frame
 from companion.link.bucket import Bucket
-from companion.link.clock import SECOND, BootClock
+from companion.link.clock import JUMP, SECOND, BootClock
 from companion.link.dialect import Message
 from companion.link.frame import BadFrame, Frame, UnknownFrame
 from companion.link.signing import Refusal, Signing
@@ -72,6 +72,22 @@ class Rebooted(NamedTuple):
     system: int
 
 
+class ClockLeapt(NamedTuple):
+    """The autopilot's clock was set: its times are mapped anew from here on, `by_ns` later than before."""
+
+    at_ns: int
+    system: int
+    by_ns: int
+
+
+class FalseTime(NamedTuple):
+    """A TIMESYNC answer that is of another clock, and was not believed: `off_ns` from what arrivals tell."""
+
+    at_ns: int
+    system: int
+    off_ns: int
+
+
 class SecondAutopilot(NamedTuple):
     """Another autopilot is on the link and will be ignored; told once for each."""
 
@@ -105,7 +121,17 @@ class Refused(NamedTuple):
     reason: Refusal
 
 
-Event = LinkUp | LinkLost | Rebooted | SecondAutopilot | MessageReceived | NotUnderstood | Refused
+Event = (
+    LinkUp
+    | LinkLost
+    | Rebooted
+    | ClockLeapt
+    | FalseTime
+    | SecondAutopilot
+    | MessageReceived
+    | NotUnderstood
+    | Refused
+)
 
 
 class Session:
@@ -277,9 +303,12 @@ class Session:
         self.streams.heard(found.msgid)
         if found.msgid in CLOCKED and message.time_boot_ms:
             boot = message.time_boot_ms * 1_000_000
+            before = self.clock.offset(now)
             if self.clock.heard(boot, now):
                 self.streams.start(now)
                 events.append(Rebooted(now, found.system))
+            elif before is not None and abs(by := before - (self.clock.offset(now) or 0)) > JUMP:
+                events.append(ClockLeapt(now, found.system, by))
             if found.msgid == SYSTEM_TIME:
                 self.clock.heard_unix(message.time_unix_usec * 1000, boot)
 
@@ -302,6 +331,8 @@ class Session:
                 self.send(dialect.new("TIMESYNC", tc1=max(now, 1), ts1=message.ts1))
         elif found.system == self._autopilot and found.component == AUTOPILOT_COMPONENT:
             self.clock.answered(message.ts1, message.tc1, now)
+            if (off := self.clock.outlier) is not None:
+                events.append(FalseTime(now, found.system, off))
 
     def _ask_for(self, msgid: int, rate_hz: float) -> None:
         self.send(

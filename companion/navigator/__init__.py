@@ -37,6 +37,7 @@ from companion.records import (
 
 from . import errorstate, guarantee, watch
 from .carry import FIXES, Carry, Settings, Step, initial, is_news
+from .freshness import Freshness
 from .lesson import learn
 from .solution import announce, solve
 from .step import step, uses
@@ -72,6 +73,7 @@ class Navigator:
         self._carry = initial(self._settings)
         self._past: deque[_Past] = deque()
         self._late_ns = round(1e9 * config.estimator.late_s)
+        self._freshness = Freshness()
         self._rests_on = Mode.INITIALISING, Source(0)  # mode and fixes of the last solution, and its time
         self._given_ns = 0
         self._told: watch.Watch | None = None
@@ -87,6 +89,9 @@ class Navigator:
         if not self._chosen:
             self._chosen = True
             return [_choice(record, self._settings.config), *self.handle(record)]
+        stale = self._freshness.judge(record)
+        if stale is not None:
+            return stale
         if isinstance(record, Gnss) and not is_news(record, self._carry, self._settings):
             return []
         if self._past and record.t_ns < self._past[-1].t_ns:

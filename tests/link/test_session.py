@@ -9,7 +9,9 @@ from hypothesis import strategies as st
 from companion.link import dialect, frame
 from companion.link.session import (
     BadFrame,
+    ClockLeapt,
     Event,
+    FalseTime,
     LinkLost,
     LinkUp,
     MessageReceived,
@@ -159,9 +161,32 @@ def test_a_reboot_is_noticed_and_the_streams_are_asked_for_again() -> None:
     run(session, peer, 0, 10)
     peer.booted, peer.heard = 9 * SECOND, []
     events = run(session, peer, 10 * SECOND, 3)
-    assert kinds(events) == [Rebooted]
+    # an answer to TIMESYNC comes before two stamps have told of the reboot: of another clock, it seems
+    assert kinds(events) == [FalseTime, Rebooted]
     assert "COMMAND_LONG" in peer.names()
     assert abs(session.to_local_ns(2_000_000, 20 * SECOND) - 11 * SECOND) <= 10 * MS
+
+
+def test_a_clock_that_leaps_forward_is_told_once_with_its_size_and_followed() -> None:
+    session, peer = Session(rates_hz={"LOCAL_POSITION_NED": 10}), Autopilot(booted=-100 * SECOND)
+    run(session, peer, 0, 10)
+    peer.booted -= 3600 * SECOND
+    events = [e for e in run(session, peer, 10 * SECOND, 10) if isinstance(e, ClockLeapt)]
+    assert [round(e.by_ns / SECOND) for e in events] == [3600]
+    assert abs(session.clock.offset(20 * SECOND) + 3700 * SECOND) <= 10 * MS
+
+
+@pytest.mark.parametrize("off_s", [-7200, -12, 2, 5000])
+def test_a_timesync_answer_of_another_clock_is_told_and_not_believed(off_s: int) -> None:
+    session, peer = Session(rates_hz={"LOCAL_POSITION_NED": 10}), Autopilot(booted=-100 * SECOND)
+    run(session, peer, 0, 10)
+    offset, now = session.clock.offset(10 * SECOND), 10 * SECOND
+    asked = session.clock.ask(now)
+    reading = now - offset - off_s * SECOND
+    data = frame.encode(dialect.new("TIMESYNC", tc1=reading, ts1=asked), 0, peer.system, 1)
+    (event,) = [e for e in session.receive(data, now + MS) if isinstance(e, FalseTime)]
+    assert event.off_ns / SECOND == pytest.approx(-off_s, abs=0.05)
+    assert session.clock.offset(now + MS) == offset
 
 
 def test_a_rate_that_comes_is_asked_for_once_and_one_that_was_overwritten_again() -> None:

@@ -300,7 +300,7 @@ def circling(wind: tuple[float, float], scale: float, heading_error: float) -> R
         v = 25.0 * math.cos(psi) + wind[0], 25.0 * math.sin(psi) + wind[1], 0.0
         here = displace(*here, 0.2 * v[0], 0.2 * v[1], 0.0)
         records.append(Attitude(t_ns, t_ns, 0.0, 0.0, (psi + heading_error) % math.tau))
-        records.append(AirData(t_ns, t_ns, 25.0 * (1.0 + scale), true=True))
+        records.append(AirData(t_ns, t_ns, 25.0 * (1.0 + scale) + 1e-9 * (k % 2), true=True))
         records.append(Truth(t_ns, t_ns, *here, v))
         if k < 900:
             e = 0.7 * rng.standard_normal(2)

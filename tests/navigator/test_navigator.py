@@ -165,7 +165,9 @@ def test_a_late_answer_is_folded_in_at_its_own_time() -> None:
             while waiting:
                 late.handle(waiting.pop())
     end = 60 * NS + NS // 2
-    tail = LocalPosition(end, end, moments[-1].records[0].x_n, moments[-1].records[0].v_n)
+    last = moments[-1].records[0]
+    x_n = tuple(x + v * (end - last.t_ns) / NS for x, v in zip(last.x_n, last.v_n))
+    tail = LocalPosition(end, end, x_n, last.v_n)
     a = [out for out in in_time.handle(tail) if isinstance(out, Solution)]
     b = [out for out in late.handle(tail) if isinstance(out, Solution)]
     assert a

@@ -1,0 +1,148 @@
+"""Whether a record is a measurement made anew, or an old one told again.
+
+    told = freshness.judge(record)      # None: use it; else drop it and tell what is in the list
+
+Streams repeat: an autopilot sends its last fix at the stream's rate, a router sends every frame twice, a
+receiver that hangs goes on with its last numbers under new times. A repeat with the old time is no news and
+nothing is said of it, unless it lasts. The same numbers under a new time are another matter. No two readings
+of a noisy sensor are alike to the last bit, and what moves is not where it was: a position that stands still
+at a speed is false at once, an attitude or an airspeed after seconds, a beacon's answer (rounded to 10 m and
+0.01 degrees: two running are alike once in 1500) at the third of a kind.
+
+It knows no other record than the one before of the same source, and no clock but their times.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+from companion.records import (
+    AirData,
+    Attitude,
+    Gnss,
+    LocalPosition,
+    Output,
+    Reboot,
+    Rejection,
+    RsbnFix,
+    Stamped,
+)
+
+SECOND = 1_000_000_000
+MOVING_M_S = 1.0
+FLYING_M_S = 5.0
+#: So long an old time may be repeated before it is told: streams are faster than their sensors.
+PATIENCE_S = 3.0
+AIRSPEED_S, ATTITUDE_S = 10.0, 2.0
+#: Answers of a beacon alike under new times: with azimuth and range, with one of them.
+ANSWERS, HALF_ANSWERS = 3, 5
+#: Two answers alike and this near are one that came twice, and so are two of anything else: what maps the
+#: autopilot's times is adjusted in between.
+SAME_ANSWER_NS, SAME_NS = 50_000_000, 5_000_000
+TOLD_EVERY = SECOND
+
+
+class Run(NamedTuple):
+    """Records alike of one source: what they say, the first and the last time, and how often it changed."""
+
+    content: tuple[Any, ...]
+    stamp: int
+    since_ns: int  # arrival of the first
+    times: int = 1  # under times of their own
+    told_ns: int | None = None
+
+
+class Law(NamedTuple):
+    """How a kind of record is judged: its source's name, what must change, and when it ought to have.
+
+    `stale` gets the record, under how many times it came alike and for how many seconds.
+    """
+
+    source: Callable[[Any], str]
+    content: Callable[[Any], tuple[Any, ...]]
+    stale: Callable[[Any, int, float], bool]
+
+
+def _moves(v_n: tuple[float, ...] | None) -> bool:
+    return v_n is not None and math.hypot(*v_n) > MOVING_M_S
+
+
+def _enough(record: RsbnFix, times: int, lasted_s: float) -> bool:
+    whole = record.azimuth is not None and record.slant_range is not None
+    return times >= (ANSWERS if whole else HALF_ANSWERS)
+
+
+LAWS: dict[type[Stamped], Law] = {
+    LocalPosition: Law(
+        lambda r: "inertial channel",
+        lambda r: (r.x_n, r.v_n),
+        lambda r, times, lasted_s: _moves(r.v_n),
+    ),
+    Gnss: Law(
+        lambda r: f"gnss {r.receiver}",
+        lambda r: (r.lat, r.lon, r.alt_msl, r.v_n, r.fix),
+        lambda r, times, lasted_s: r.fix >= 3 and _moves(r.v_n),
+    ),
+    Attitude: Law(
+        lambda r: "attitude",
+        lambda r: (r.roll, r.pitch, r.heading, r.w_b),
+        lambda r, times, lasted_s: lasted_s >= ATTITUDE_S,
+    ),
+    AirData: Law(
+        lambda r: "air data",
+        lambda r: (r.airspeed,),
+        lambda r, times, lasted_s: r.airspeed > FLYING_M_S and lasted_s >= AIRSPEED_S,
+    ),
+    RsbnFix: Law(lambda r: f"rsbn {r.beacon}", lambda r: (r.azimuth, r.slant_range), _enough),
+}
+
+
+class Freshness:
+    """The last run of every source; `judge` all records in the order of arrival."""
+
+    def __init__(self) -> None:
+        self._runs: dict[str, Run] = {}
+        self._answers: dict[str, deque[tuple[int, tuple[Any, ...]]]] = {}
+
+    def judge(self, record: Stamped) -> list[Output] | None:
+        """None if `record` may be used, else what is to be told of it, often nothing."""
+        law = LAWS.get(type(record))
+        if law is None:
+            if isinstance(record, Reboot):
+                self._runs.clear()
+            return None
+        source, content = law.source(record), law.content(record)
+        if isinstance(record, RsbnFix) and self._came(source, record.t_ns, content):
+            return []
+        stamp, same = (record.stamp_us, 0) if isinstance(record, Gnss) else (record.t_ns, SAME_NS)
+        run = self._runs.get(source)
+        if run is None or content != run.content:
+            self._runs[source] = Run(content, stamp, record.rx_ns)
+            return None
+        lasted_s = (record.rx_ns - run.since_ns) * 1e-9
+        if abs(stamp - run.stamp) <= same:  # no news; but a sensor that is well would have some by now
+            claimed = not isinstance(record, Gnss) or record.fix >= 3
+            if claimed and lasted_s > PATIENCE_S:
+                return self._told(record, source, run, lasted_s, "its time stands still")
+            return None
+        run = self._runs[source] = run._replace(stamp=stamp, times=run.times + 1)
+        if law.stale(record, run.times, lasted_s):
+            return self._told(record, source, run, lasted_s, "it is frozen: old numbers under a new time")
+        return None
+
+    def _came(self, source: str, t_ns: int, content: tuple[Any, ...]) -> bool:
+        """Whether this answer came before, perhaps on another link; else it is remembered."""
+        known = self._answers.setdefault(source, deque(maxlen=8))
+        if any(abs(t_ns - t) <= SAME_ANSWER_NS and content == c for t, c in known):
+            return True
+        known.append((t_ns, content))
+        return False
+
+    def _told(self, record: Stamped, source: str, run: Run, lasted_s: float, why: str) -> list[Output]:
+        if run.told_ns is not None and record.rx_ns - run.told_ns < TOLD_EVERY:
+            return []
+        self._runs[source] = run._replace(told_ns=record.rx_ns)
+        return [Rejection(record.t_ns, record.rx_ns, source, why, lasted_s)]
