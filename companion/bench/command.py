@@ -66,7 +66,11 @@ def command(names: tuple[str, ...], as_json: bool) -> None:
     found = {}
     for name in names or MODULES:
         module = import_module(f"companion.bench.{name}")
-        found[name] = module.measure() if name == "latency" else measure(module.cases())
+        found[name] = (
+            module.measure()
+            if name == "latency"
+            else measure(module.cases(), getattr(module, "ROUNDS", ROUNDS))
+        )
     if as_json:
         click.echo(json.dumps(found))
         return

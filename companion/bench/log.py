@@ -16,6 +16,8 @@ from companion.log.file import Writer, read
 from companion.records import Imu, encode
 
 MESSAGES = 20_000
+READ = 1_000_000  # messages of the file that is read
+ROUNDS = 3
 
 
 def imu(i: int) -> Imu:
@@ -32,11 +34,11 @@ def write(path: Path, messages: int) -> None:
 
 
 def cases() -> Iterator[tuple[str, Callable[[], object]]]:
-    """Yield (name, callable): one call writes or reads MESSAGES records, or writes one."""
+    """Yield (name, callable): one call writes MESSAGES records, or one, or reads READ."""
     folder = Path(tempfile.mkdtemp())
     atexit.register(shutil.rmtree, folder, True)
     path = folder / "read.mcap"
-    write(path, MESSAGES)
+    write(path, READ)
     count = itertools.count()
     endless = Writer(folder / "endless.mcap", metadata={}, start_unix_ns=10**18, start_ns=0)
     atexit.register(endless.close)
@@ -66,6 +68,6 @@ def cases() -> Iterator[tuple[str, Callable[[], object]]]:
     yield "log: one record, in the caller's thread", lambda: endless.record(record)
     yield f"log: {MESSAGES} records written, synced and closed", ours
     yield f"mcap: {MESSAGES} records written, unsynced", package
-    yield f"log: {MESSAGES} messages read into records", lambda: deque(read(path), maxlen=0)
-    yield f"log: {MESSAGES} messages read as bytes", lambda: deque(read(path, raw=True), maxlen=0)
-    yield f"mcap: {MESSAGES} messages read as bytes", package_read
+    yield f"log: {READ} messages read into records", lambda: deque(read(path), maxlen=0)
+    yield f"log: {READ} messages read as bytes", lambda: deque(read(path, raw=True), maxlen=0)
+    yield f"mcap: {READ} messages read as bytes", package_read

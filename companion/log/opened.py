@@ -116,6 +116,12 @@ def opened(path: str | os.PathLike[str]) -> Iterator[Opened]:
         yield source
 
 
+def is_closed(path: str | os.PathLike[str]) -> bool:
+    """Whether the log at `path` is whole. Raises LogError as `opened` does."""
+    with opened(path) as source:
+        return source.closed
+
+
 class Channels:
     """The schemas and channels a file has defined so far: contents of their records, by id."""
 

@@ -24,7 +24,7 @@ from rich.progress import Progress
 from companion import __version__
 from companion.config import Config, load, parse, to_toml
 from companion.log import file, latency, simulate
-from companion.log.opened import LogError
+from companion.log.opened import LogError, is_closed
 from companion.log.variant import changed, has_flown, is_own, sentences, with_radio
 from companion.navigator import Navigator
 from companion.records import INPUTS, OUTPUTS, Event, Reboot, Solution, Stamped
@@ -194,12 +194,15 @@ def command(
         config = changed(config, text)
     notes: list[str] = []
     counts: dict[str, int] = {}
+    if own and not is_closed(log):
+        notes.append("the log was not closed: what came last is missing")
     if has_flown(log) and not (changes or beacons or silent):
         found = _compare(log, output, config)
     else:
         output = output or Path(f"{log.name.split('.mcap')[0] if own else log.stem}.replay.mcap")
         with sentences():
-            found, notes, counts = _fly(log, output, config, beacons, silent, seed)
+            found, more, counts = _fly(log, output, config, beacons, silent, seed)
+        notes += more
     seconds = time.perf_counter() - begun
     if as_json:
         report = {"log": str(log), **counts, **found._asdict(), "notes": notes, "seconds": round(seconds, 3)}
@@ -224,6 +227,8 @@ def _compare(log: Path, output: Path | None, config: Config) -> Replayed:
     found = replay_own(log, config, sink)
     if sink is not None:
         sink.close()
+    if not found.inputs:
+        raise LogError(f"{log} holds nothing that a navigator was given: there is nothing to replay")
     return found
 
 

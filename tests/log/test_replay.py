@@ -9,7 +9,8 @@ from click.testing import CliRunner
 
 from companion.config import Config
 from companion.log import file, replay
-from companion.records import Reboot, Reset
+from companion.log.opened import LogError
+from companion.records import Event, Reboot, Reset
 
 DATA = Path(__file__).parents[1] / "data"
 SHARED = Path(__file__).parents[2].parent / "shared" / "data"
@@ -77,3 +78,17 @@ def test_whole_flights_give_solutions(name: str, tmp_path: Path) -> None:
     assert found["outputs"]["Solution"] > 900  # at most 5 Hz: from three to ten minutes
     info = file.info(tmp_path / "out.mcap")
     assert info.closed and info.counts["/out/Solution"] == found["outputs"]["Solution"]
+
+
+def test_a_log_without_inputs_and_a_torn_one_are_told(tmp_path: Path) -> None:
+    empty = tmp_path / "empty.mcap"
+    with file.Writer(empty, metadata={}, start_unix_ns=10**18, start_ns=0, block=True) as log:
+        log.record(Event(1, 1, 6, "hello"))
+    done = CliRunner().invoke(replay.command, [str(empty)])
+    assert isinstance(done.exception, LogError) and "nothing to replay" in str(done.exception)
+    replayed(CUT, tmp_path / "out.mcap")
+    whole = (tmp_path / "out.mcap").read_bytes()
+    (tmp_path / "torn.mcap").write_bytes(whole[:-100])
+    done = CliRunner().invoke(replay.command, [str(tmp_path / "torn.mcap")])
+    assert "the log was not closed" in done.output
+    assert "not closed" not in CliRunner().invoke(replay.command, [str(tmp_path / "out.mcap")]).output
