@@ -32,6 +32,7 @@ class Settings(NamedTuple):
     unit: ErrorModel
     gate: tuple[float, ...]  # chi-square limits for 0, 1, 2, 3 degrees of freedom
     allotment: Allotment
+    watched: ErrorModel  # what the integrity monitor takes the channel for
 
     @classmethod
     def of(cls, config: Config) -> Settings:
@@ -39,11 +40,13 @@ class Settings(NamedTuple):
         alarm = config.estimator.false_rejection
         gate = (0.0, *(float(chdtri(k, alarm)) for k in (1, 2, 3)))
         unit: ErrorModel = errorstate.grade(config.inertial, config.gnss)
+        watched: ErrorModel | None = None
         if config.channel == "air_data":
-            unit = winderror.grade(config.air_data, config.gnss)
+            unit = wind = winderror.grade(config.air_data, config.gnss)
+            watched = winderror.overbound(wind)
         elif config.channel == "strapdown":
             unit = tilterror.grade(config.strapdown, config.gnss)
-        return cls(config, unit, gate, watch.allotment(config))
+        return cls(config, unit, gate, watch.allotment(config), watched or unit)
 
 
 class Level(NamedTuple):

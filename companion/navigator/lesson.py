@@ -52,7 +52,7 @@ def _watched(carry: Carry, lesson: Lesson, settings: Settings) -> tuple[Carry, b
     spoke against what was believed.
     """
     record, ins = lesson.record, lesson.ins
-    w = _arrived(carry, carry.watch or watch.begin(ins.t_ns, settings.unit), ins, settings)
+    w = _arrived(carry, carry.watch or watch.begin(ins.t_ns, settings.watched), ins, settings)
     taken, out = True, list[Output]()
     w, measurements = _measured(w, lesson, settings)
     for measurement in measurements:
@@ -90,7 +90,7 @@ def _measured(w: Watch, lesson: Lesson, settings: Settings) -> tuple[Watch, list
 
 
 def _arrived(carry: Carry, w: Watch, ins: Point, settings: Settings) -> Watch:
-    return watch.advance(w, ins, inertial.acceleration(carry.track), settings.unit, settings.config)
+    return watch.advance(w, ins, inertial.acceleration(carry.track), settings.watched, settings.config)
 
 
 def _offered(

@@ -25,6 +25,7 @@ from .errorstate import Floats, System
 N = 8
 WIND, SCALE, HEADING, DRIFT = slice(2, 4), 4, 5, slice(6, 8)
 FIRST_POSITION_M = 2000.0  # nothing is known: the first fix, by which the channel begins, tells all
+FRONT_S = 30.0  # how long a jump of the wind takes at most
 
 
 class WindError(NamedTuple):
@@ -65,3 +66,10 @@ def grade(settings: AirDataSection, gnss: GnssSection) -> WindError:
     density[:2] = 2.0 * settings.gust_m_s**2 * settings.gust_s
     density[WIND] = settings.wind_change_m_s_sqrt_s**2
     return WindError(np.array(sigma0), density, decay, settings.gust_m_s, settings.wind_jump_m_s)
+
+
+def overbound(unit: WindError) -> WindError:
+    """For the integrity monitor, which must not take a jump of the wind for the fault of a beacon."""
+    density = unit.density.copy()
+    density[WIND] = unit.jump**2 / FRONT_S
+    return unit._replace(density=density)

@@ -189,6 +189,17 @@ def test_a_minute_without_the_beacon_by_the_restrictive_estimator(seed: int) -> 
     assert np.all(found.error[inside] <= 3.0 * found.sigma[inside])
 
 
+@pytest.mark.parametrize(("seed", "before"), [(0, 110.0), (1, 110.0), (2, 60.0)])
+def test_a_step_of_the_wind_is_not_taken_for_the_fault_of_a_beacon(seed: int, before: float) -> None:
+    """By the only beacon left, however short GNSS was heard with it before."""
+    flown = flight("plane_wind_change")
+    records = [r for r in with_beacon(flown, seed, 120.0 * seed, NEVER) if flown.since(r) > -before]
+    found = flown_by(flown, records)
+    late = found.t >= 60.0
+    assert rms(found.error[late]) <= 0.5 * raw_rms(flown, records, 60.0, 1e9)
+    assert np.all(found.error[late] <= 3.0 * found.sigma[late])
+
+
 def test_air_data_alone_drifts_no_more_than_the_autopilot_and_says_so() -> None:
     flown = flight("plane_gps_loss")
     found = flown_by(flown, flown.records)
