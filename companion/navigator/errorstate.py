@@ -65,12 +65,6 @@ class ErrorModel(Protocol):
     def velocity_noise(self) -> float:
         """White noise of the channel's velocity, m/s, that is no state."""
 
-    @property
-    def doubt(self) -> Floats:
-        """How many times its density (n,) the noise of each state is, where the channel is to bear witness
-        against another source: what disturbs it is bounded rather than random.
-        """
-
     def system(self, lat: float, v_n: Vector3, a_n: Vector2) -> System:
         """The error equations while the channel moves at `v_n` with horizontal acceleration `a_n`."""
 
@@ -87,11 +81,6 @@ class Grade(NamedTuple):
     density: Floats
     sigma0: Floats
     velocity_noise: float = 0.0
-
-    @property
-    def doubt(self) -> Floats:
-        """An INS errs as its equations say."""
-        return np.ones(N)
 
     def system(self, lat: float, v_n: Vector3, a_n: Vector2) -> System:
         """The INS error equations at this latitude, velocity and acceleration."""

@@ -27,7 +27,6 @@ from .errorstate import G0, VELOCITY, Floats, System
 
 N = 11
 TILT, BODY, HEADING, DRIFT = slice(4, 6), slice(6, 8), 8, slice(9, 11)
-ASTRAY = 3.0
 FIRST_POSITION_M = 1000.0  # the first fix tells it
 
 
@@ -38,13 +37,6 @@ class TiltError(NamedTuple):
     density: Floats
     decay: Floats
     velocity_noise: float
-
-    @property
-    def doubt(self) -> Floats:
-        """An autopilot's attitude that is led astray errs by many times what it usually does."""
-        doubt = np.ones(N)
-        doubt[TILT] = ASTRAY**2
-        return doubt
 
     def system(self, lat: float, v_n: Vector3, a_n: Vector2) -> System:
         """x' = A x + w on the course of `v_n`, the heading's error turning `a_n`; at any latitude."""

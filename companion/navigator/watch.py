@@ -81,8 +81,7 @@ def advance(w: Watch, ins: Point, a_n: Vector2, unit: ErrorModel, config: Config
     left = (ins.t_ns - bank.t_ns) * 1e-9
     if left <= 0.0:
         return w
-    A, density = unit.system(ins.position.lat, ins.v_n, a_n)
-    system = errorstate.System(A, unit.doubt[:, None] ** 0.5 * density * unit.doubt**0.5)
+    system = unit.system(ins.position.lat, ins.v_n, a_n)
     steps = math.ceil(left / errorstate.STEP_S)
     dt = left / steps
     Phi, Q = errorstate.transition(dt, system)

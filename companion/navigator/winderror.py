@@ -24,7 +24,6 @@ from .errorstate import Floats, System
 
 N = 8
 WIND, SCALE, HEADING, DRIFT = slice(2, 4), 4, 5, slice(6, 8)
-FRONT = 5.0
 FIRST_POSITION_M = 2000.0  # nothing is known: the first fix, by which the channel begins, tells all
 FRONT_S = 30.0  # how long a jump of the wind takes at most
 
@@ -39,13 +38,6 @@ class WindError(NamedTuple):
     decay: Floats
     velocity_noise: float
     jump: float
-
-    @property
-    def doubt(self) -> Floats:
-        """A front changes the wind by many times its usual walk."""
-        doubt = np.ones(N)
-        doubt[WIND] = FRONT**2
-        return doubt
 
     def system(self, lat: float, v_n: Vector3, a_n: Vector2) -> System:
         """x' = A x + w, the channel flying through the air at `v_n`; neither latitude nor `a_n` matters."""
