@@ -161,10 +161,12 @@ class Estimator(Section, frozen=True):
     """Which estimator feeds the output, and the gate that fixes must pass.
 
     The error state ("kalman") leads while fixes come, and the one named here when they stop: "minimax" those
-    of beacons too, "restrictive" those of GNSS.
+    of beacons too, "restrictive" those of GNSS. `scheme` "feedback" corrects a channel of our own with every
+    fix, "feedforward" only where it is far off; the autopilot's own local position cannot be corrected.
     """
 
     output: Literal["auto", "minimax", "kalman", "restrictive"] = "auto"
+    scheme: Literal["feedforward", "feedback"] = "feedforward"
     false_rejection: Probability = 1e-6
     late_s: Annotated[float, Meta(ge=0.0, le=30.0)] = 6.0
 

@@ -52,6 +52,13 @@ def conflicts(config: Config) -> Iterator[tuple[str, str, str]]:
             "gnss.receiver = 1 is the one that GPS_INPUT feeds, so our own position would come back as a "
             "fix: set gnss.receiver = 0",
         )
+    if config.estimator.scheme == "feedback" and config.channel == "local_position":
+        yield (
+            "estimator",
+            "scheme",
+            "estimator.scheme = 'feedback' corrects a channel of our own: "
+            "set inertial.source = 'air_data' or 'strapdown'",
+        )
     if config.leading == "restrictive" and config.channel != "air_data":
         yield (
             "estimator",

@@ -190,8 +190,8 @@ def command(
         raise click.UsageError(str(error)) from None
     own = is_own(log)
     config = load(config_file) if config_file or not own else configuration(log)
-    for text in changes:
-        config = changed(config, text)
+    if changes:
+        config = changed(config, ",".join(changes))
     notes: list[str] = []
     counts: dict[str, int] = {}
     if own and not is_closed(log):

@@ -51,8 +51,8 @@ def command(
     if len(logs) > 2:
         raise click.UsageError(f"{len(logs)} logs were given: a report is about one, or compares two")
     config = load(config_file)
-    for text in changes:
-        config = changed(config, text)
+    if changes:
+        config = changed(config, ",".join(changes))
     found = [open_flights(path, config) for path in logs]
     blocks = compared(found, _names(logs)) if len(logs) == 2 else alone(found[0])
     try:

@@ -14,6 +14,7 @@ from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
 
+import msgspec
 from msgspec import structs
 
 from companion.config import Config, ConfigError, load
@@ -26,19 +27,21 @@ CONVERTED = "converted"  # the metadata record of a log that never flew with us,
 
 def changed(config: Config, text: str) -> Config:
     """`config` with KEY=VALUE,... as typed: SECTION.KEY, or KEY alone where one section has it, or
-    `estimator` for estimator.output. ConfigError, one sentence, where there is no such key or value.
+    `estimator` for estimator.output. ConfigError, one sentence, where there is no such key or value, or where
+    they do not go together.
     """
+    pairs = [
+        f"{section}.{key}={msgspec.json.encode(value).decode()}"
+        for section in config.__struct_fields__
+        for key, value in structs.asdict(getattr(config, section)).items()
+    ]
     for pair in re.split(r",(?=[A-Za-z_.]+=)", text):
         name, _, value = pair.partition("=")
-        name = _full_name(name.strip())
-        try:
-            told = load(environment={}, pairs=[f"{name}={value}"])
-        except ConfigError as error:
-            raise ConfigError(str(error).replace("--set", "--with")) from None
-        section, key = name.split(".")
-        table = structs.replace(getattr(config, section), **{key: getattr(getattr(told, section), key)})
-        config = structs.replace(config, **{section: table})
-    return config
+        pairs.append(f"{_full_name(name.strip())}={value}")
+    try:
+        return load(environment={}, pairs=pairs)
+    except ConfigError as error:
+        raise ConfigError(str(error).replace("--set", "--with")) from None
 
 
 def _full_name(name: str) -> str:

@@ -42,17 +42,21 @@ def blurred(carry: Carry, settings: Settings, sigma: float, sigma_v: float = 0.0
     return carry._replace(track=carry.track[-1:])
 
 
-def kept_near(carry: Carry, has_velocity: bool) -> Carry:
+def kept_near(carry: Carry, settings: Settings, has_velocity: bool) -> Carry:
     """With the channel moved to where the estimate is once it is far off, so that its errors stay small
-    against the earth; `has_velocity`: the velocity error is the channel's own and is taken from it too.
+    against the earth, or, in the feedback scheme, with every fix: the same number comes off the channel and
+    off every estimate of its error. `has_velocity`: the velocity error is the channel's own and is taken from
+    it too.
     """
     if carry.state is None:
         return carry
     north, east = (-carry.state.x[:2]).tolist()
     vN, vE = (-carry.state.x[VELOCITY]).tolist() if has_velocity else (0.0, 0.0)
-    if math.hypot(north, east) <= FAR_M and math.hypot(vN, vE) <= FAST_M_S:
-        return carry
     t_ns = carry.state.t_ns
+    fixed = t_ns in (carry.gnss_ns, carry.rsbn_ns) and any((north, east, vN, vE))
+    near = math.hypot(north, east) <= FAR_M and math.hypot(vN, vE) <= FAST_M_S
+    if near and not (fixed and settings.config.estimator.scheme == "feedback"):
+        return carry
 
     def moved(p: Point) -> Point:
         dt = (p.t_ns - t_ns) * 1e-9

@@ -136,7 +136,7 @@ def _air_data(carry: Carry, record: AirData, settings: Settings) -> Step:
         carry = moved.blurred(carry, settings, UNKNOWN_M_S * silent)
         out.append(_channel(record, f"no airspeed with attitude for {silent:.1f} s"))
     carry = carry._replace(reckoner=reckoner, track=inertial.extend(carry.track, new))
-    return _given(moved.kept_near(carry, has_velocity=False), record, out, settings)
+    return _given(moved.kept_near(carry, settings, has_velocity=False), record, out, settings)
 
 
 def _strap(carry: Carry, record: Attitude | Pressure, settings: Settings) -> Step:
@@ -168,7 +168,7 @@ def _imu(carry: Carry, record: Imu, settings: Settings) -> Step:
     else:
         strap, new = strapped.advance(before, strap, last)
     carry = carry._replace(strap=strap, track=inertial.renew(carry.track, new))
-    return _given(moved.kept_near(carry, has_velocity=True), record, out, settings)
+    return _given(moved.kept_near(carry, settings, has_velocity=True), record, out, settings)
 
 
 def _given(carry: Carry, record: Stamped, out: list[Output], settings: Settings) -> Step:

@@ -107,6 +107,7 @@ def test_keys_are_told_short_and_long() -> None:
         ("beta=3", "no section has it"),
         ("gnss.sigma=3", "did you mean `sigma_m`"),
         ("estimator", "write it as SECTION.KEY=VALUE"),
+        ("estimator=kalman,scheme=feedback", "set inertial.source = 'air_data' or 'strapdown'"),
     ):
         with pytest.raises(ConfigError, match=words) as caught:
             variant.changed(Config(), text)
