@@ -3,6 +3,7 @@
     companion campaign --seeds 10                                  # a Dask cluster of this machine's cores
     companion campaign --scheduler tcp://...:8786 --seeds 1000     # one that is there already
     companion campaign --workers 0 --fault gnss-spoof-2            # in this process, without Dask
+    companion campaign --seeds 40 --report tests/reports/campaign.md
 
 Each flight is one line of `flights.jsonl` in the results folder, written by this process as it comes in. What
 is there is not flown again, so that a campaign cut short goes on where it was; a flight whose worker died is
@@ -24,10 +25,14 @@ from rich.console import Console
 from rich.progress import MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from sitl.trial import KINDS, SCENARIOS, Order, Result, attempt
+from sitl.trial import KINDS, SCENARIOS, Order, Result, attempt, by_records
 
 RETRIES = 3  # workers that may die under one flight before it counts as failed
 EX_FAILED = 1
+HEADS = (
+    *("fault", "flights", "detected", "median", "slowest", "excluded", "largest before", "largest"),
+    *("misleading", "beyond", "wrong", "alarms/h", "bound held", "raised", "harmful", "passed"),
+)
 
 
 class Limits(NamedTuple):
@@ -60,9 +65,14 @@ class Line(NamedTuple):
 
 
 def orders(scenarios: Iterable[str], faults: Iterable[str], seeds: int) -> list[Order]:
-    """Every flight, the seeds outermost: a campaign cut short has seen a little of everything."""
+    """Every flight, the seeds outermost: a campaign cut short has seen a little of everything.
+
+    A fault of the link or of the autopilot cares for no grade and no beacon: it is flown in the first
+    scenario only.
+    """
     names, kinds = list(scenarios), list(faults)
-    return [Order(s, f, seed) for seed, s, f in itertools.product(range(1, seeds + 1), names, kinds)]
+    every = itertools.product(range(1, seeds + 1), names, kinds)
+    return [Order(s, f, seed) for seed, s, f in every if s == names[0] or by_records(f)]
 
 
 def stored(path: Path) -> list[Result]:
@@ -179,29 +189,46 @@ def show(lines: Sequence[Line], limits: Limits, console: Console) -> None:
     """Print the table."""
     flights, failed = sum(line.flights for line in lines), sum(not line.passed for line in lines)
     grid = Table(title=f"{flights} flights; horizontal errors in m, times to detect in s")
-    heads = "fault", "flights", "detected", "median", "slowest", "excluded", "largest before", "largest"
-    for head in (
-        *heads,
-        "misleading",
-        "beyond",
-        "wrong",
-        "alarms/h",
-        "bound held",
-        "raised",
-        "harmful",
-        "passed",
-    ):
+    for head in HEADS:
         grid.add_column(head, justify="left" if head == "fault" else "right", no_wrap=head == "fault")
     for line in lines:
         grid.add_row(*(_cell(value) for value in line))
     console.print(grid)
-    console.print(
+    console.print(f"{_meaning(limits)} {len(lines) - failed} of {len(lines)} did.", soft_wrap=True)
+
+
+def report(results: Sequence[Result], limits: Limits, made_by: str) -> str:
+    """The tables of all scenarios as Markdown; `made_by` is the command that makes them again."""
+    scenarios = dict.fromkeys(result.scenario for result in results)
+    quiet = sum(r.quiet_s for r in results) / 3600.0
+    text = [
+        "# Campaign",
+        "",
+        f"{len(results)} flights of {min(r.flown_s for r in results) / 60.0:.0f} minutes or longer, by",
+        "",
+        f"    {made_by}",
+        "",
+        "Horizontal errors in m, times to detect in s. " + _meaning(limits),
+        f"{sum(r.alarms for r in results)} false alarms in {quiet:.1f} h of flight before the faults;"
+        f" {sum(r.misleading_s >= 1.0 for r in results)} flights misled.",
+    ]
+    for scenario in scenarios:
+        lines = table([r for r in results if r.scenario == scenario], limits)
+        rows = [
+            HEADS,
+            ("-" * 3,) + ("--:",) * (len(HEADS) - 1),
+            *([_cell(v) for v in line] for line in lines),
+        ]
+        text += ["", f"## {scenario}", "", *("| " + " | ".join(row) + " |" for row in rows)]
+    return "\n".join(text) + "\n"
+
+
+def _meaning(limits: Limits) -> str:
+    return (
         f"passed: no exception; an undetected fault never more than {limits.harmless_m:g} m off, nor a"
         " detected one while trust is normal; misleading (beyond the protection level, unflagged) in at most"
         f" {limits.misleading:g} of the flights; at most {limits.alarms_per_hour:g} false alarms an hour."
         " beyond: flights beyond the protection level though flagged; wrong: another source was excluded too."
-        f" {len(lines) - failed} of {len(lines)} did.",
-        soft_wrap=True,
     )
 
 
@@ -225,6 +252,7 @@ def _cell(value: Any) -> str:
 @click.option("--harmless-m", type=float, default=Limits().harmless_m, show_default=True)
 @click.option("--misleading", type=float, default=Limits().misleading, show_default=True)
 @click.option("--alarms-per-hour", type=float, default=Limits().alarms_per_hour, show_default=True)
+@click.option("--report", "page", type=click.Path(path_type=Path), help="Write the tables to this .md file.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 def command(
     scenarios: tuple[str, ...],
@@ -236,6 +264,7 @@ def command(
     harmless_m: float,
     misleading: float,
     alarms_per_hour: float,
+    page: Path | None,
     as_json: bool,
 ) -> None:
     """Fly every scenario with every fault and many seeds, and say what was detected, and how far off it led.
@@ -245,9 +274,19 @@ def command(
     limits = Limits(harmless_m, misleading, alarms_per_hour)
     wanted = orders(scenarios or ("one-beacon",), faults or KINDS, seeds)
     try:
-        lines = table(campaign(wanted, results, scheduler, workers), limits)
+        flown = campaign(wanted, results, scheduler, workers)
+        if page is not None:
+            asked = [
+                f"--{name} {value}"
+                for name, many in (("scenario", scenarios), ("fault", faults))
+                for value in many
+            ]
+            made_by = " ".join(["companion campaign", *asked, f"--seeds {seeds} --report {page}"])
+            page.parent.mkdir(parents=True, exist_ok=True)
+            page.write_text(report(flown, limits, made_by))
     except (ValueError, OSError) as error:
         raise SystemExit(f"companion: {error}") from None
+    lines = table(flown, limits)
     if as_json:
         click.echo(json.dumps([line._asdict() for line in lines]))
     else:

@@ -211,15 +211,20 @@ def ordered(order: Order) -> Scenario:
     return dataclasses.replace(base, faults=(fault,) if fault else (), seed=order.seed)
 
 
+def by_records(kind: str) -> bool:
+    """Whether a kind of fault is one of the sensors, flown without messages."""
+    fault = KINDS[kind].fault
+    return fault is None or (fault.name in RECORD_FAULTS and fault.name != "ins-nan")
+
+
 def attempt(order: Order) -> Result:
     """Fly an order; an exception is a result too."""
     begun = time.perf_counter()
     try:
         scenario = ordered(order)
         config = loopback.simulated(Config(inertial=UNITS[scenario.grade]))
-        fault = KINDS[order.fault].fault
-        by_records = fault is None or (fault.name in RECORD_FAULTS and fault.name != "ins-nan")
-        world, told = fly_records(scenario, config) if by_records else fly_bytes(scenario, config)
+        fly = fly_records if by_records(order.fault) else fly_bytes
+        world, told = fly(scenario, config)
         result = score(order, world, told)
     except Exception as error:  # of whatever kind: the campaign goes on and the table says so
         result = Result(order.key, *order, 0.0, 0.0, raised=f"{type(error).__name__}: {error}")
