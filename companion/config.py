@@ -13,7 +13,7 @@ import tomllib
 from collections.abc import Iterable, Mapping
 from functools import lru_cache
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeAlias
 
 import msgspec
 from msgspec import Meta
@@ -26,6 +26,7 @@ NotNegative = Annotated[float, Meta(ge=0.0, lt=1e9)]
 Probability = Annotated[float, Meta(gt=0.0, lt=1.0)]
 RateHz = Annotated[float, Meta(ge=0.0, le=400.0)]
 OutputHz = Annotated[float, Meta(ge=-1.0, le=50.0)]
+Channel: TypeAlias = Literal["local_position", "air_data", "strapdown"]
 NodeId = Annotated[int, Meta(ge=1, le=255)]
 
 
@@ -280,7 +281,7 @@ class Config(Section, frozen=True):
     signing: Signing = Signing()
 
     @property
-    def channel(self) -> Literal["local_position", "air_data", "strapdown"]:
+    def channel(self) -> Channel:
         """The inertial channel that `inertial.source` means, by what goes back to the autopilot."""
         if self.inertial.source != "auto":
             return self.inertial.source

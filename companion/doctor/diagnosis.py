@@ -106,7 +106,7 @@ def of_profile(config: Config, make: str) -> list[Finding]:
 
 def of_streams(config: Config, make: str, rates: Mapping[int, tuple[float, float | None]]) -> list[Finding]:
     """What comes of what was asked for: `rates` are asked and measured (None: not yet), Hz, by message id."""
-    found, used = [], uses(config)
+    found, used = [], uses(config.channel)
     for msgid, (asked, measured) in rates.items():
         name = TYPES[msgid].name
         if name in LACKING.get(make, ()):

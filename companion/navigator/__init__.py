@@ -84,7 +84,7 @@ class Navigator:
         if isinstance(record, Tuning):
             self._tune(parse(record.toml, "parameters"))
             return []
-        if type(record) not in uses(self._settings.config):
+        if type(record) not in uses(self._settings.channel):
             return []
         if not self._chosen:
             self._chosen = True
@@ -125,7 +125,7 @@ class Navigator:
 
     def _tune(self, config: Config) -> None:
         """Go on with another configuration; late measurements are no longer folded in from before it."""
-        before = self._settings.config.channel
+        before = self._settings.channel
         self._settings, self._carry = tuned(self._carry, self._settings, config)
         self._late_ns = round(1e9 * config.estimator.late_s)
         self._chosen = self._chosen and config.channel == before
@@ -194,7 +194,7 @@ def tuned(carry: Carry, before: Settings, config: Config) -> tuple[Settings, Car
     Where it means another inertial channel, all that was learnt was of the old one's error.
     """
     settings = Settings.of(config)
-    if config.channel != before.config.channel:
+    if settings.channel != before.channel:
         return settings, initial(settings)._replace(next_ns=carry.next_ns)
     return settings, carry._replace(guarantee=guarantee.tuned(carry.guarantee, config))
 

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from scipy.special import chdtri
 
-from companion.config import Config
+from companion.config import Channel, Config
 from companion.estimate.fusion import Observation
 from companion.estimate.monitor import Allotment
 from companion.estimate.trust import Held
@@ -33,6 +33,7 @@ class Settings(NamedTuple):
     gate: tuple[float, ...]  # chi-square limits for 0, 1, 2, 3 degrees of freedom
     allotment: Allotment
     watched: ErrorModel  # what the integrity monitor takes the channel for
+    channel: Channel
 
     @classmethod
     def of(cls, config: Config) -> Settings:
@@ -46,7 +47,7 @@ class Settings(NamedTuple):
             watched = winderror.overbound(wind)
         elif config.channel == "strapdown":
             unit = tilterror.grade(config.strapdown, config.gnss)
-        return cls(config, unit, gate, watch.allotment(config), watched or unit)
+        return cls(config, unit, gate, watch.allotment(config), watched or unit, config.channel)
 
 
 class Level(NamedTuple):
@@ -127,7 +128,7 @@ def level(ins: Point, carry: Carry) -> Point:
 def sources(carry: Carry, t_ns: int, settings: Settings) -> Source:
     """What the position rests on now: fixes younger than their timeouts, over the inertial channel."""
     config, sources = settings.config, Source.INERTIAL
-    if config.channel == "air_data":
+    if settings.channel == "air_data":
         sources |= Source.AIR_DATA
     if carry.gnss_ns is not None and (t_ns - carry.gnss_ns) * 1e-9 <= config.gnss.timeout_s:
         sources |= Source.GNSS

@@ -46,18 +46,20 @@ def solve(carry: Carry, rx_ns: int, settings: Settings) -> Step:
         carry = carry._replace(ahead=bounds, next_ahead_ns=t_ns + AHEAD_NS)
     mode = _mode(carry, bounded, t_ns, settings)
     candidates = _candidates(carry, state, bounded, ins, settings)
+    watched = carry.watch and carry.watch.protection
     leads = settings.config.leading
+    if leads == "minimax" and watched and bounded and math.hypot(*bounded.bound_n) > watched.level:
+        leads = "kalman"  # little is left to predict from: what was learnt of an excluded source is gone
     fixed = sources(carry, t_ns, settings) & (Source.GNSS if leads == "restrictive" else FIXES)
     if fixed or leads not in candidates:
         leads = "kalman"
     error, velocity_error, (var_n, cov, var_e), velocity_variance = candidates[leads]
     north, east, down = ins.v_n
     lat, lon, alt = displace(*ins.position, -error[0], -error[1], 0.0)
-    watched = carry.watch
     protection = None
-    if watched is not None and watched.protection is not None:
+    if carry.watch is not None and watched is not None:
         # of the monitor's full solution; another one is off by no more than its distance from that besides
-        protection = watched.protection.level + math.dist(error, watch.error_at(watched, ins, settings.unit))
+        protection = watched.level + math.dist(error, watch.error_at(carry.watch, ins, settings.unit))
     held = _trust(carry, bounded, protection, t_ns, settings)
     last = max((t for t in (carry.gnss_ns, carry.rsbn_ns) if t is not None), default=t_ns)
     solution = Solution(

@@ -16,7 +16,7 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-from companion.config import Config
+from companion.config import Channel
 from companion.estimate.fusion import Azimuth, Observation, Range
 from companion.nav.geometry import displace
 from companion.records import (
@@ -59,7 +59,7 @@ AGAIN_NS = 60_000_000_000  # how often it is told that nothing can begin
 
 def step(carry: Carry, record: Input, settings: Settings) -> Step:
     """The carry and the outputs after one more record; records it has no use for change nothing."""
-    use = uses(settings.config).get(type(record))
+    use = uses(settings.channel).get(type(record))
     return (carry, []) if use is None else use(carry, record, settings)
 
 
@@ -78,10 +78,10 @@ def _reboot(carry: Carry, record: Reboot, settings: Settings) -> Step:
     Dead reckoning and strapdown are our own: to them a reboot is a silence, and the wind is what it was.
     """
     why = f"autopilot {record.system} rebooted"
-    if settings.config.channel != "local_position":
+    if settings.channel != "local_position":
         strap = strapped.Strap(refused_ns=record.t_ns)  # that it is not heard goes without saying
         carry = carry._replace(reckoner=deadreckoning.Reckoner(), strap=strap, gnss=None, gnss_heard=None)
-        return carry, [Reset(record.t_ns, record.rx_ns, settings.config.channel.replace("_", " "), why)]
+        return carry, [Reset(record.t_ns, record.rx_ns, settings.channel.replace("_", " "), why)]
     out = Reset(record.t_ns, record.rx_ns, "navigator", why)
     return initial(settings)._replace(next_ns=carry.next_ns), [out]
 
@@ -187,7 +187,7 @@ def _begun(carry: Carry, record: Gnss | RsbnFix, settings: Settings) -> Step:
     """With the first point of a channel of our own, if this fix is the first to tell a place; where it cannot
     begin, that is told.
     """
-    channel = settings.config.channel
+    channel = settings.channel
     if carry.track or channel == "local_position":
         return carry, []
     if channel == "air_data":
@@ -290,6 +290,6 @@ _OF_STRAPDOWN: _Uses = {Attitude: _strap, Pressure: _strap, Imu: _imu, **_FIXES}
 _USES = {"local_position": _OF_LOCAL_POSITION, "air_data": _OF_AIR_DATA, "strapdown": _OF_STRAPDOWN}
 
 
-def uses(config: Config) -> _Uses:
+def uses(channel: Channel) -> _Uses:
     """What each kind of record is good for, by the inertial channel."""
-    return _USES[config.channel]
+    return _USES[channel]
