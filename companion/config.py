@@ -82,6 +82,7 @@ class Inertial(Section, frozen=True):
     heading_arcmin: Positive = 3.0
     velocity_noise_m_s_sqrt_s: Positive = 0.001
     height_sigma_m: Positive = 20.0
+    strapped_down: bool = True  # its sensors turn with the aircraft, not a gimballed platform's
 
 
 class AirDataSection(Section, frozen=True):

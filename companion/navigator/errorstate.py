@@ -33,6 +33,8 @@ POSITION = slice(0, 2)
 VELOCITY = slice(2, 4)
 TILT = slice(4, 7)
 INS = slice(0, 7)
+GYRO, ACCELEROMETER = (7, 8), (10, 11)  # north and east
+TURNING_M_S = 5.0  # slower, the course says nothing of the heading
 G0 = 9.80665  # [m/s^2] of what is quoted in micro-g
 STEP_S = 2.0  # the transition is a power series: its fifth term is below 1e-12 of the first here
 
@@ -74,18 +76,27 @@ class ErrorModel(Protocol):
 
 class Grade(NamedTuple):
     """Of an INS: `composed` (N, N) is A with the disturbances of the unit and of GNSS and without the INS's
-    own errors; spectral densities (N, N), first sigmas (N,).
+    own errors; spectral densities (N, N), first sigmas (N,). Errors of sensors that are strapped down are
+    `body_fixed`: they turn with the aircraft.
     """
 
     composed: Floats
     density: Floats
     sigma0: Floats
     velocity_noise: float = 0.0
+    body_fixed: bool = False
 
     def system(self, lat: float, v_n: Vector3, a_n: Vector2) -> System:
         """The INS error equations at this latitude, velocity and acceleration."""
         A = self.composed.copy()
         A[INS, INS] = aircraft_errors(lat, v_n[0], v_n[1], (*a_n, 0.0))
+        # a strapped-down sensor's error turns with the aircraft: b_n' = (course rate) down x b_n
+        speed2 = v_n[0] ** 2 + v_n[1] ** 2
+        if self.body_fixed and speed2 > TURNING_M_S**2:
+            rate = (v_n[0] * a_n[1] - v_n[1] * a_n[0]) / speed2
+            for north, east in (GYRO, ACCELEROMETER):
+                A[north, east] -= rate
+                A[east, north] += rate
         return System(A, self.density)
 
     def velocity_rows(self, v_n: Vector3) -> Floats:
@@ -110,7 +121,7 @@ def grade(settings: Inertial, gnss: GnssSection) -> Grade:
     density[TILT] = (math.radians(settings.angle_random_walk_deg_sqrt_h) / 60.0) ** 2
     sigma0 = [settings.position_m] * 2 + [settings.velocity_m_s] * 2 + [tilt, tilt, heading]
     sigma0 += [drift] * 3 + [bias] * 2 + [gnss.sigma_m] * 2
-    return Grade(bare.A, np.diag(density), np.array(sigma0))
+    return Grade(bare.A, np.diag(density), np.array(sigma0), body_fixed=settings.strapped_down)
 
 
 def beacon_rows(unit: ErrorModel) -> Floats:

@@ -23,7 +23,7 @@ from companion.estimate.fusion import Azimuth, Range
 from companion.estimate.integrity import INERTIAL, Measurement, Protection
 from companion.estimate.monitor import Allotment, Exclusion, Monitor, Refusal
 from companion.nav.geometry import Geodetic, separation
-from companion.records import Event, Gnss, Output, Rejection, Vector2
+from companion.records import Event, Gnss, Output, Rejection, Vector2, Vector3
 
 from . import errorstate, radio
 from .errorstate import POSITION, VELOCITY, ErrorModel, ErrorState
@@ -47,6 +47,7 @@ class Watch(NamedTuple):
     protection: Protection | None = None
     exclusions: tuple[Exclusion, ...] = ()  # of the sources left out now
     due_ns: int = 0
+    v_n: Vector3 | None = None  # of the channel, at the bank's time
 
 
 class Verdict(NamedTuple):
@@ -81,6 +82,8 @@ def advance(w: Watch, ins: Point, a_n: Vector2, unit: ErrorModel, config: Config
     left = (ins.t_ns - bank.t_ns) * 1e-9
     if left <= 0.0:
         return w
+    if w.v_n is not None:  # of the whole step: all of a turn's change of velocity meets the heading's error
+        a_n = ((ins.v_n[0] - w.v_n[0]) / left, (ins.v_n[1] - w.v_n[1]) / left)
     system = unit.system(ins.position.lat, ins.v_n, a_n)
     steps = math.ceil(left / errorstate.STEP_S)
     dt = left / steps
@@ -90,7 +93,7 @@ def advance(w: Watch, ins: Point, a_n: Vector2, unit: ErrorModel, config: Config
     walk = np.array([_bias_sigma(name, config) ** 2 for name in bank.biases]) * BIAS_HOUR**2 / 3600.0
     for _ in range(steps):
         bank = integrity.carry(bank, ins.t_ns, Phi, Q, loose, walk * dt)
-    return w._replace(monitor=w.monitor._replace(bank=bank))
+    return w._replace(monitor=w.monitor._replace(bank=bank), v_n=ins.v_n)
 
 
 def solution(w: Watch) -> ErrorState:
@@ -172,7 +175,8 @@ def decide(w: Watch, allotted: Allotment, settings: IntegritySection) -> Watch:
         # nothing measures it: it is believed again once the others have calibrated it anew
         watched, _ = monitor.offer(watched, t_ns, INERTIAL, True, allotted._replace(settle_s=allotted.fork_s))
     left = tuple(e for e in (*w.exclusions, *exclusions) if e.source in watched.bank.excluded)
-    return protected(Watch(watched, None, left, t_ns + DECIDE_NS), allotted, settings)
+    w = w._replace(monitor=watched, exclusions=left, due_ns=t_ns + DECIDE_NS)
+    return protected(w, allotted, settings)
 
 
 def protected(w: Watch, allotted: Allotment, settings: IntegritySection) -> Watch:
@@ -246,7 +250,8 @@ def shift(w: Watch, north: float, east: float, v_n: Vector2 | None = None, t_ns:
     if v_n is not None:
         x[:, POSITION] += np.array(v_n) * ((bank.t_ns - t_ns) * 1e-9)
         x[:, VELOCITY] += v_n
-    return w._replace(monitor=w.monitor._replace(bank=bank._replace(x=x)))
+    faster = w.v_n and v_n and (w.v_n[0] + v_n[0], w.v_n[1] + v_n[1], w.v_n[2])
+    return w._replace(monitor=w.monitor._replace(bank=bank._replace(x=x)), v_n=faster or w.v_n)
 
 
 def blur(w: Watch, sigma: float, sigma_v: float = 0.0) -> Watch:
