@@ -6,11 +6,13 @@ the full solution is optimal, its error is orthogonal to any difference of solut
 
     d = x_full - x_sub   has the covariance   S = P_sub - P_full                        (Brown, McBurney 1988)
 
-whatever they heard together. A source draws its own row least (not at all), so the row that stands apart
-names it. A row may also be *forked* from the full solution and hear all but its source from then on: the same
-law holds, its separation accumulates over minutes what a slow drift adds, with an INS and beacons that were
-calibrated up to the fork. A fault older than the fork is in the forked row too; the row that never heard its
-source has none of it, and the protection level rests on that one.
+whatever they heard together. d' S^-1 d over all states is by how much the source's absence makes the data
+more likely, whatever its lie: so the row that stands apart most names it, once the freedom of S is taken
+off. A lie in position shows in the velocities and tilts that it taught long before it shows in position. A
+row may also be *forked* from the full solution and hear all but its source from then on: the same law
+holds, its separation accumulates over minutes what a slow drift adds, with an INS and beacons that were
+calibrated up to the fork. A fault older than the fork is in the forked row too; the row that never heard
+its source has none of it, and the protection level rests on that one.
 
 The row "inertial" hears everything and has process noise added: a larger claimed P than its errors have, so
 that S errs on the side of fewer alarms.
@@ -36,6 +38,7 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from scipy.special import chdtri
 
 from .fusion import CONE_OF_SILENCE
 from .observations import Azimuth, Model, Range
@@ -46,6 +49,7 @@ INERTIAL = "inertial"
 #: Least variance of a separation (m^2), above rounding and linearisation. It must be small: beside GNSS a
 #: beacon moves the full solution by centimetres, and by how many too many is what tells its bias.
 FLOOR = 1e-6
+ROUNDING = 1e-6  # of a row's variance: a difference of covariances below this is none
 
 
 class Row(NamedTuple):
@@ -95,19 +99,35 @@ class Taken(NamedTuple):
 
 
 class Separation(NamedTuple):
-    """Full minus row, north and east (m), its covariance (m^2), and d' S^-1 d: chi-square of two."""
+    """Full minus row, north and east (m), its covariance (m^2); d' S^-1 d of the position alone, chi-square
+    of two, and of all states, chi-square of `freedom`.
+    """
 
     row: Row
     d: Floats
     S: Floats
+    position: float
     statistic: float
+    freedom: int
+
+    def limit(self, probability: float) -> float:
+        """Of `statistic`, passed with `probability` where nothing is wrong."""
+        return float(chdtri(max(self.freedom, 1), probability))
+
+    def beyond(self, probability: float) -> bool:
+        """Whether one of both tests fails, half of `probability` each."""
+        half = 0.5 * probability
+        return self.position > threshold(half) or self.statistic > self.limit(half)
 
 
 class Blame(NamedTuple):
-    """The source that stands apart most, and by how much less the next: clear once `margin` is large."""
+    """The source that stands apart most, the limit of its statistic, and by how much less the next does:
+    clear once `margin` is large.
+    """
 
     source: str
     statistic: float
+    limit: float
     margin: float
 
 
@@ -201,10 +221,7 @@ def sighted(source: str, z: Azimuth | Range, x: Floats, k: int) -> Measurement |
 
 def separations(bank: Bank) -> tuple[Separation, ...]:
     """Every row's separation in position from the full solution."""
-    d, S = bank.x[0, :2] - bank.x[1:, :2], bank.P[1:, :2, :2] - bank.P[0, :2, :2]
-    S, statistics = _tested(d, S)
-    rows = zip(bank.rows[1:], d, S, statistics.tolist(), strict=True)
-    return tuple(Separation(row, d, S, statistic) for row, d, S, statistic in rows)
+    return _separated(bank, 0, range(1, len(bank.rows)))
 
 
 def threshold(probability: float) -> float:
@@ -214,20 +231,24 @@ def threshold(probability: float) -> float:
     return -2.0 * math.log(probability)
 
 
-def blame(found: tuple[Separation, ...], limit: float) -> Blame | None:
-    """The source whose row stands apart most, if beyond `limit`.
+def blame(found: tuple[Separation, ...], probability: float) -> Blame | None:
+    """The source whose row stands apart most, if any is beyond its limit of this `probability`.
 
     `margin` is twice the logarithm of the likelihood by which it explains the data better than the next
-    source does: ask for `threshold(p)` of it to accuse the wrong one with probability p.
+    source does, each less its freedom: ask for `threshold(p)` of it to accuse the wrong one with
+    probability p.
     """
-    worst: dict[str, float] = {}
-    for s in found:
-        worst[s.row.without] = max(worst.get(s.row.without, 0.0), s.statistic)
-    ranked = sorted(worst.items(), key=lambda item: -item[1])
-    if not ranked or ranked[0][1] <= limit:
+    if not any(s.beyond(probability) for s in found):
         return None
-    (source, statistic), *others = ranked
-    return Blame(source, statistic, statistic - (others[0][1] if others else 0.0))
+    worst: dict[str, Separation] = {}
+    for s in found:
+        other = worst.setdefault(s.row.without, s)
+        if s.statistic - s.freedom > other.statistic - other.freedom:
+            worst[s.row.without] = s
+    first, *others = sorted(worst.values(), key=lambda s: s.freedom - s.statistic)
+    excess = first.statistic - first.freedom
+    margin = excess - (others[0].statistic - others[0].freedom if others else 0.0)
+    return Blame(first.row.without, first.statistic, first.limit(0.5 * probability), margin)
 
 
 def fork(bank: Bank, index: int) -> Bank:
@@ -237,11 +258,12 @@ def fork(bank: Bank, index: int) -> Bank:
     return _copied(bank, 0, index, bank.rows[index]._replace(since_ns=bank.t_ns))
 
 
-def exclude(bank: Bank, source: str, limit: float) -> Bank:
+def exclude(bank: Bank, source: str, probability: float) -> Bank:
     """Without `source` from now on, and without what it has done.
 
-    The full solution is taken from the source's oldest fork if that agrees with the row that never heard it,
-    else from this one; all others, which heard it, begin again from there.
+    The full solution is taken from the source's oldest fork if that agrees with the row that never heard it
+    (it is taken for disagreeing with this `probability` though it does not), else from this one; all others,
+    which heard it, begin again from there.
     """
     mine = [i for i, row in enumerate(bank.rows) if row.without == source]
     if not mine:
@@ -250,10 +272,9 @@ def exclude(bank: Bank, source: str, limit: float) -> Bank:
     forks = sorted((i for i in mine if not bank.rows[i].never), key=lambda i: bank.rows[i].since_ns)
     chosen = clean
     if forks:
-        oldest = forks[0]
-        d, S = bank.x[oldest, :2] - bank.x[clean, :2], bank.P[clean, :2, :2] - bank.P[oldest, :2, :2]
-        if _tested(d[None], S[None])[1][0] <= limit:
-            chosen = oldest
+        (apart,) = _separated(bank, forks[0], [clean])
+        if not apart.beyond(probability):
+            chosen = forks[0]
     since = bank.rows[chosen].since_ns
     rows = [row if i in mine else row._replace(since_ns=bank.t_ns) for i, row in enumerate(bank.rows)]
     rows[0] = Row("", since)
@@ -299,7 +320,7 @@ def protection(bank: Bank, false_alarm: float, integrity_risk: float) -> Protect
     """
     rows = [(i, r) for i, r in enumerate(bank.rows) if i and r.never]
     K_md = math.sqrt(threshold(integrity_risk / (1 + len(rows))))
-    K_fa = math.sqrt(threshold(false_alarm))
+    K_fa = math.sqrt(threshold(0.5 * false_alarm))
     fault_free = float(K_md * _sigma(bank.P[0, :2, :2]))
     level, by = fault_free, ""
     index = [i for i, _ in rows]
@@ -350,13 +371,23 @@ def _innovations(bank: Bank, measurement: Measurement) -> tuple[Floats, Floats, 
     return wide, HP, S, nu, (nu * weighted).sum(axis=1)
 
 
-def _tested(d: Floats, S: Floats) -> tuple[Floats, Floats]:
-    """Covariances S (m, 2, 2) of separations d (m, 2) made positive, and d' S^-1 d (m,)."""
-    # what rounding or a refused measurement has made negative is lifted to the floor
-    eigenvalues, V = np.linalg.eigh(0.5 * (S + S.mT))
+def _separated(bank: Bank, full: int, subs: Sequence[int]) -> tuple[Separation, ...]:
+    d, S = bank.x[full] - bank.x[subs], bank.P[subs] - bank.P[full]
+    # what rounding or a refused measurement has made negative in position is lifted to the floor
+    eigenvalues, V = np.linalg.eigh(0.5 * (S + S.mT)[:, :2, :2])
     eigenvalues = np.maximum(eigenvalues, 0.0) + FLOOR
-    along = (V.mT @ d[..., None])[..., 0]
-    return (V * eigenvalues[:, None, :]) @ V.mT, (along**2 / eigenvalues).sum(axis=1)
+    along = (V.mT @ d[:, :2, None])[..., 0]
+    position = (along**2 / eigenvalues).sum(axis=1)
+    S2 = (V * eigenvalues[:, None, :]) @ V.mT
+    # metres and microradians: only what the row knows less by more than rounding counts
+    scale = np.sqrt(np.maximum(np.diagonal(bank.P[subs], axis1=1, axis2=2), np.finfo(float).tiny))
+    eigenvalues, V = np.linalg.eigh(0.5 * (S + S.mT) / (scale[:, :, None] * scale[:, None, :]))
+    counts = eigenvalues > ROUNDING
+    along = (V.mT @ (d / scale)[..., None])[..., 0]
+    statistic = np.where(counts, along**2 / np.where(counts, eigenvalues, 1.0), 0.0).sum(axis=1)
+    rows = [bank.rows[i] for i in subs]
+    numbers = position.tolist(), statistic.tolist(), counts.sum(axis=1).tolist()
+    return tuple(Separation(*each) for each in zip(rows, d[:, :2], S2, *numbers, strict=True))
 
 
 def _sigma(C: Floats) -> Floats:

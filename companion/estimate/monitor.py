@@ -15,6 +15,7 @@ from typing import NamedTuple
 from scipy.special import chdtri
 
 from .integrity import (
+    INERTIAL,
     Bank,
     Blame,
     Measurement,
@@ -36,10 +37,12 @@ REFUSED = "refused by every solution"
 class Allotment(NamedTuple):
     """What may go wrong, as probabilities.
 
-    `alarms_per_hour`: false alarms of the separations, all rows together. They are tested once a second, but
-    one test says little new within `independent_s`. `rejection`: a good measurement refused. `wrong`: the
-    wrong source accused. `run`: refusals in a row that exclude. `settle_s`: how long an excluded source must
-    be admitted without a break before it is heard again.
+    `alarms_per_hour`: false alarms of the separations, all rows together. They are tested once a second,
+    but one test says little new within `independent_s`. `rejection`: a good measurement refused. `wrong`:
+    the wrong source accused. `run`: refusals in a row that exclude. `settle_s`: how long an excluded source
+    must be admitted without a break before it is heard again, and `slow_s` one that drifted: it may pass
+    for good that long. `hold_s`: how long the inertial channel must stand accused; a jump of a source looks
+    like one of the channel until beacons have averaged enough, and sources jump.
     """
 
     alarms_per_hour: float = 1e-3
@@ -49,6 +52,8 @@ class Allotment(NamedTuple):
     run: int = 5
     fork_s: float = 120.0
     settle_s: float = 10.0
+    slow_s: float = 60.0
+    hold_s: float = 60.0
 
     def false_alarm(self, rows: int) -> float:
         """Of one test of one of `rows` separations."""
@@ -84,6 +89,8 @@ class Monitor(NamedTuple):
     runs: tuple[tuple[str, int], ...] = ()
     unresolved: bool = False
     admitted: tuple[tuple[str, int], ...] = ()  # excluded sources, and since when they have been admitted
+    drifted: tuple[str, ...] = ()  # sources excluded by separation
+    accused_ns: int | None = None  # since when the inertial channel stands accused
 
 
 def hear(monitor: Monitor, measurement: Measurement, allotment: Allotment) -> tuple[Monitor, Refusal | None]:
@@ -100,14 +107,22 @@ def watch(monitor: Monitor, allotment: Allotment) -> tuple[Monitor, list[Exclusi
     """Test every separation, exclude at most one source, renew the forks."""
     bank = monitor.bank
     found = separations(bank)
-    limit = threshold(allotment.false_alarm(len(found)))
-    accused = blame(tuple(s for s in found if s.row.without not in bank.excluded), limit)
-    if accused is not None and accused.margin >= threshold(allotment.wrong):
-        return _excluded(monitor, accused, limit)
+    alarm = allotment.false_alarm(len(found))
+    accused = blame(tuple(s for s in found if s.row.without not in bank.excluded), alarm)
+    clear = accused is not None and accused.margin >= threshold(allotment.wrong)
+    since = None
+    if accused is not None and clear and accused.source == INERTIAL:
+        since = bank.t_ns if monitor.accused_ns is None else monitor.accused_ns
+        clear = (bank.t_ns - since) * 1e-9 >= allotment.hold_s
+    monitor = monitor._replace(accused_ns=since)
+    if accused is not None and clear:
+        return _excluded(monitor, accused, alarm)
     for source, run in monitor.runs:
         if run >= allotment.run and source in bank.sources and source not in bank.excluded:
             told = Exclusion(bank.t_ns, source, REFUSED, float(run), float(allotment.run), bank.t_ns, 0.0)
-            return monitor._replace(bank=refuse(bank, source), unresolved=accused is not None), [told]
+            left = tuple(name for name in monitor.drifted if name != source)
+            refused = monitor._replace(bank=refuse(bank, source), drifted=left)
+            return refused._replace(unresolved=accused is not None), [told]
     if accused is None:
         bank = _renewed(bank, found, round(1e9 * allotment.fork_s))
     return monitor._replace(bank=bank, unresolved=accused is not None), []
@@ -122,7 +137,9 @@ def offer(
     since = dict(monitor.admitted)
     if not admitted:
         since.pop(source, None)
-    elif (t_ns - since.setdefault(source, t_ns)) * 1e-9 >= allotment.settle_s:
+    elif (t_ns - since.setdefault(source, t_ns)) * 1e-9 >= (
+        allotment.slow_s if source in monitor.drifted else allotment.settle_s
+    ):
         del since[source]
         runs = tuple(run for run in monitor.runs if run[0] != source)
         bank = readmit(monitor.bank, source)
@@ -135,13 +152,14 @@ def trusted(monitor: Monitor, source: str) -> bool:
     return source not in monitor.bank.excluded and dict(monitor.runs).get(source, 0) == 0
 
 
-def _excluded(monitor: Monitor, accused: Blame, limit: float) -> tuple[Monitor, list[Exclusion]]:
-    before, (source, value, _) = monitor.bank, accused
-    bank = exclude(before, source, limit)
+def _excluded(monitor: Monitor, accused: Blame, alarm: float) -> tuple[Monitor, list[Exclusion]]:
+    before, (source, value, limit, _) = monitor.bank, accused
+    bank = exclude(before, source, alarm)
     step = bank.x[0, :2] - before.x[0, :2]
     moved = float((step @ step) ** 0.5)
     told = Exclusion(bank.t_ns, source, BEYOND, value, limit, bank.rows[0].since_ns, moved)
-    return monitor._replace(bank=bank, unresolved=False), [told]
+    drifted = (*(name for name in monitor.drifted if name != source), source)
+    return monitor._replace(bank=bank, unresolved=False, drifted=drifted, accused_ns=None), [told]
 
 
 def _renewed(bank: Bank, found: tuple[Separation, ...], every_ns: int) -> Bank:

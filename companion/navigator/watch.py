@@ -173,7 +173,7 @@ def decide(w: Watch, allotted: Allotment, settings: IntegritySection) -> Watch:
     watched, exclusions = monitor.watch(w.monitor, allotted)
     if INERTIAL in watched.bank.excluded:
         # nothing measures it: it is believed again once the others have calibrated it anew
-        watched, _ = monitor.offer(watched, t_ns, INERTIAL, True, allotted._replace(settle_s=allotted.fork_s))
+        watched, _ = monitor.offer(watched, t_ns, INERTIAL, True, allotted._replace(slow_s=allotted.fork_s))
     left = tuple(e for e in (*w.exclusions, *exclusions) if e.source in watched.bank.excluded)
     w = w._replace(monitor=watched, exclusions=left, due_ns=t_ns + DECIDE_NS)
     return protected(w, allotted, settings)

@@ -72,18 +72,29 @@ def honest() -> list[Flight]:
 
 def test_the_separation_has_the_covariance_of_the_difference() -> None:
     """Brown and McBurney's law, on 400 flights: the normalised square has the mean of its chi-square."""
-    statistics = np.array([[s.statistic for s in integrity.separations(f.bank)] for f in honest()])
-    # a row without a scalar source differs along one direction, GNSS's row along two
-    for column, freedom in zip(statistics.T, (2.0, 1.0, 1.0), strict=True):
+    found = [integrity.separations(f.bank) for f in honest()]
+    # in position a row without a scalar source differs along one direction, GNSS's row along two
+    for column, freedom in zip(
+        np.array([[s.position for s in f] for f in found]).T, (2.0, 1.0, 1.0), strict=True
+    ):
         assert abs(column.mean() - freedom) < 4.0 * math.sqrt(2.0 * freedom / len(column))
+    for column, freedom in zip(
+        np.array([[s.statistic for s in f] for f in found]).T, (4.0, 2.0, 2.0), strict=True
+    ):
+        assert abs(column.mean() - freedom) < 4.0 * math.sqrt(2.0 * freedom / len(column))
+    assert {tuple(s.freedom for s in f) for f in found} == {(4, 2, 2)}
 
 
 def test_false_alarms_come_as_often_as_allotted() -> None:
-    limit = integrity.threshold(0.1)
-    gnss = [integrity.separations(f.bank)[0].statistic > limit for f in honest()]
+    limit, found = integrity.threshold(0.1), [integrity.separations(f.bank) for f in honest()]
+    gnss = [s[0].position > limit for s in found]
     assert abs(np.mean(gnss) - 0.1) < 4.0 * math.sqrt(0.1 * 0.9 / len(gnss))
     for i in (1, 2):  # of one direction instead of two: fewer
-        assert np.mean([integrity.separations(f.bank)[i].statistic > limit for f in honest()]) < 0.1
+        assert np.mean([s[i].position > limit for s in found]) < 0.1
+    for i in (0, 1, 2):
+        share = np.mean([s[i].statistic > s[i].limit(0.1) for s in found])
+        assert abs(share - 0.1) < 4.0 * math.sqrt(0.1 * 0.9 / len(found))
+        assert np.mean([s[i].beyond(0.1) for s in found]) < 0.1 + 4.0 * math.sqrt(0.1 * 0.9 / len(found))
 
 
 @pytest.mark.parametrize("slope", [0.0, 0.5, 2.0, 10.0])
@@ -91,10 +102,10 @@ def test_the_protection_level_is_passed_unseen_no_more_often_than_it_says(slope:
     """Whatever the drift: misleading is an error beyond the level and no separation beyond its limit."""
     false_alarm, risk = 0.01, 0.05
     flights = honest() if slope == 0.0 else [fly(s, 25, "gnss", slope, 10) for s in range(150)]
-    limit, misleading = integrity.threshold(false_alarm), 0
+    misleading = 0
     for bank, x in flights:
         level = integrity.protection(bank, false_alarm, risk).level
-        seen = integrity.blame(integrity.separations(bank), limit) is not None
+        seen = integrity.blame(integrity.separations(bank), false_alarm) is not None
         misleading += math.hypot(*(bank.x[0, :2] - x[:2])) > level and not seen
     assert misleading / len(flights) <= risk
 
@@ -103,7 +114,7 @@ def test_the_protection_level_is_passed_unseen_no_more_often_than_it_says(slope:
 @given(st.sampled_from(sorted(SIGMA)), st.integers(0, 10_000))
 def test_the_one_that_jumps_is_the_one_named(liar: str, seed: int) -> None:
     bank = fly(seed, 40, liar, 40.0 * SIGMA[liar] / 25.0, 15).bank
-    found = integrity.blame(integrity.separations(bank), integrity.threshold(1e-6))
+    found = integrity.blame(integrity.separations(bank), 1e-6)
     assert found is not None
     assert found.source == liar
 
@@ -119,7 +130,7 @@ def test_what_is_excluded_leaves_no_trace() -> None:
             if source != "gnss":
                 alone = integrity.take(alone, z, FREE).bank
     assert np.linalg.norm(bank.x[0, :2]) > 100.0
-    bank = integrity.exclude(bank, "gnss", integrity.threshold(1e-6))
+    bank = integrity.exclude(bank, "gnss", 1e-6)
     np.testing.assert_allclose(bank.x[0], alone.x[0], atol=1e-9)
     np.testing.assert_allclose(bank.P[0], alone.P[0], rtol=1e-9, atol=1e-12)
     again = integrity.take(bank, measured("gnss", np.zeros(4), rng), FREE)
@@ -227,7 +238,7 @@ def test_a_run_of_wild_measurements_excludes_and_single_ones_do_not() -> None:
 
 def test_an_excluded_source_comes_back_only_after_a_settled_while_within_the_bound() -> None:
     allotment = monitor.Allotment(settle_s=10.0)
-    watch = monitor.Monitor(integrity.exclude(fly(8, 30).bank, "gnss", 1.0))
+    watch = monitor.Monitor(integrity.exclude(fly(8, 30).bank, "gnss", 0.5))
     for t in range(100):
         inside = t >= 50 and t != 55  # the spoofer leaves at 50 and is back for a moment
         offset = (3.0, 4.0) if inside else (900.0, 0.0)
@@ -274,7 +285,7 @@ def test_bad_input_is_named() -> None:
     with pytest.raises(ValueError, match=r"gnss: H has shape"):
         integrity.take(bank, Measurement("gnss", np.zeros(2), np.eye(2), np.eye(2)), FREE)
     with pytest.raises(ValueError, match=r"there are gnss, north, east"):
-        integrity.exclude(bank, "nobody", 1.0)
+        integrity.exclude(bank, "nobody", 0.5)
     with pytest.raises(ValueError, match=r"not excluded"):
         integrity.readmit(bank, "gnss")
     with pytest.raises(ValueError, match=r"between 0 and 1"):

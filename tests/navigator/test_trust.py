@@ -86,7 +86,7 @@ def test_a_spoofer_is_excluded_at_once_and_taken_back_when_he_has_left(slope: fl
         not s.sources & Source.GNSS for s, t in zip(flight.solutions, flight.t, strict=True) if when < t < END
     )
     (back,) = flight.returns()
-    assert END + Config().integrity.settle_s <= back < END + 60.0
+    assert END + Config().integrity.settle_s <= back < END + 75.0
     assert flight.trust(back + 20.0, math.inf) == {Trust.NORMAL}
     assert flight.worst(back + 20.0) < 10.0
 
