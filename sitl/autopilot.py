@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import heapq
 import math
+from collections import deque
 from collections.abc import Callable
 from typing import Any
 
@@ -41,13 +42,14 @@ from companion.records import (
     Truth,
 )
 from sitl.encode import Airframe, encode
-from sitl.faults import AUTOPILOT_FAULTS, LINK_FAULTS, Chunk, Fault, disturb, without_fix
+from sitl.faults import AUTOPILOT_FAULTS, CONSUMER_FAULTS, LINK_FAULTS, Chunk, Fault, disturb, without_fix
 from sitl.parameters import CAPABILITIES, VERSIONS, Parameters
 from sitl.scenarios import Scenario
 from sitl.world import World
 
 SECOND = 1_000_000_000
 NEVER = 2**63 - 1
+UNREAD = 1024  # frames that wait for a slow consumer at most
 SYSTEM, COMPONENT, RSBN_COMPONENT = 1, 1, 42
 UNIX_AT_START_NS = 1_767_225_600 * SECOND
 """The simulated date: 1 January 2026."""
@@ -90,6 +92,9 @@ class Autopilot:
         self._own_faults = sorted(
             (f for f in scenario.faults if f.name in AUTOPILOT_FAULTS), key=lambda f: -f.start_s
         )
+        self._slow = [f for f in scenario.faults if f.name == "slow-consumer"]
+        self._unread: deque[bytes] = deque(maxlen=UNREAD)
+        self._read_at = 0
         self._reader = frame.Reader()
         self._deaf_until = 0  # while it boots
         self._local_origin, self._origin_moved = self.world.origin, 0.0  # metres north, and as many east
@@ -130,7 +135,7 @@ class Autopilot:
             self._losses and not disturb([Chunk(now_ns, data)], t, self._losses, self._rng)
         ):
             return
-        for found in self._reader.receive(data):
+        for found in self._reader.receive(self._taken(data, t)):
             if isinstance(found, frame.Frame):
                 name = dialect.TYPES[found.msgid].name
                 if name in KEPT:
@@ -139,6 +144,18 @@ class Autopilot:
                     message = dialect.decode(found)
                     if getattr(message, "target_system", 0) in (0, SYSTEM):
                         self._commands[name](message, t + self._latency())
+
+    def _taken(self, data: bytes, t: int) -> bytes:
+        """What of all that came is read now: a slow consumer lets it wait, and of too much the newest."""
+        self._unread.append(data)
+        for fault in self._slow:
+            size = CONSUMER_FAULTS[fault.name] if fault.size is None else fault.size
+            if fault.covers(t) and t - self._read_at < size * SECOND:
+                return b""
+        self._read_at = t
+        data = b"".join(self._unread)
+        self._unread.clear()
+        return data
 
     def poll(self, now_ns: int) -> list[bytes]:
         """Return every frame that reaches the companion up to `now_ns`, in order."""

@@ -2,16 +2,19 @@
 
 `RECORD_FAULTS` act on one kind of record of what the sensors say, inside a window of flight time.
 `LINK_FAULTS` act on the chunks (frames) that leave for the companion. What concerns the autopilot itself
-(its reboot, its clock, its local origin) it carries out alone: `AUTOPILOT_FAULTS` names them. A `Fault` is
-the order for one: name, window, size and, where it matters, which beacon. The size's meaning stands in each
-function.
+(its reboot, its clock, its local origin) it carries out alone: `AUTOPILOT_FAULTS` names them.
+`CONSUMER_FAULTS` are of those who take what the companion gives: the autopilot, and the log's disk
+(`FullDisk`). A `Fault` is the order for one: name, window, size and, where it matters, which beacon. The
+size's meaning stands in each function.
 
 Record faults read `t_ns`, the flight's time, and write `rx_ns` where they delay.
 """
 
 from __future__ import annotations
 
+import errno
 import math
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, TypeAlias, TypeVar
@@ -21,6 +24,7 @@ from fastcrc import crc16
 from msgspec.structs import replace
 
 from companion.link import dialect
+from companion.log.store import DiskFile
 from companion.nav.geometry import displace
 from companion.records import AirData, Gnss, LocalPosition, RsbnFix, Stamped
 
@@ -170,15 +174,29 @@ def each(change: Change) -> Callable[[Sequence[R], Fault, float, Generator], lis
 
 def frozen(stream: Sequence[R], fault: Fault, size: float, rng: Generator) -> list[R]:
     """The last record before the window is said again and again, its own time (or stamp) and all."""
+    return _repeated(stream, fault, lambda last, record: replace(last, t_ns=record.t_ns, rx_ns=record.rx_ns))
+
+
+def stale(stream: Sequence[Gnss], fault: Fault, size: float, rng: Generator) -> list[Gnss]:
+    """The last fix before the window is said again and again under stamps that go on."""
+    return _repeated(
+        stream,
+        fault,
+        lambda last, due: replace(last, t_ns=due.t_ns, rx_ns=due.rx_ns, stamp_us=due.stamp_us),
+    )
+
+
+def _repeated(stream: Sequence[R], fault: Fault, again: Callable[[R, R], R]) -> list[R]:
+    """Inside the window `again` of the last record before it (of the same beacon) and of the one due."""
     out: list[R] = []
-    last: R | None = None
+    last: dict[int | None, R] = {}
     for record in stream:
+        source = getattr(record, "beacon", None)
         if fault.covers(record.t_ns):
-            last = last or record
             # An air-data message has no stamp: it seems new each time. A fix keeps its receiver's stamp.
-            out.append(replace(last, t_ns=record.t_ns, rx_ns=record.rx_ns))
+            out.append(again(last.setdefault(source, record), record))
         else:
-            last = record
+            last[source] = record
             out.append(record)
     return out
 
@@ -203,14 +221,17 @@ RECORD_FAULTS: dict[str, RecordFault] = {
     "gnss-spoof": RecordFault(Gnss, 2.0, each(gnss_spoof)),
     "gnss-jam": RecordFault(Gnss, 0.0, each(gnss_jam)),
     "gnss-frozen": RecordFault(Gnss, 0.0, frozen),
+    "gnss-stale": RecordFault(Gnss, 0.0, stale),
     "gnss-late": RecordFault(Gnss, 5.0, late),
     "beacon-bias": RecordFault(RsbnFix, 1000.0, each(beacon_bias)),
     "beacon-position": RecordFault(RsbnFix, 3000.0, each(beacon_position)),
     "beacon-north": RecordFault(RsbnFix, math.radians(2.0), each(beacon_north)),
     "beacon-multipath": RecordFault(RsbnFix, 1500.0, each(multipath)),
     "beacon-drop-out": RecordFault(RsbnFix, 0.5, each(drop_out)),
+    "beacon-frozen": RecordFault(RsbnFix, 0.0, frozen),
     "beacon-late": RecordFault(RsbnFix, 5.0, late),
     "ins-reset": RecordFault(LocalPosition, 200.0, each(ins_reset)),
+    "ins-frozen": RecordFault(LocalPosition, 0.0, frozen),
     "ins-nan": RecordFault(LocalPosition, 0.0, each(nan_fields)),
     "airspeed-icing": RecordFault(AirData, 0.5, each(icing)),
     "airspeed-frozen": RecordFault(AirData, 0.0, frozen),
@@ -309,7 +330,23 @@ LINK_FAULTS: dict[str, LinkFault] = {
 #: north-east by which the origin of the local position moves (told when GPS_GLOBAL_ORIGIN is next due).
 AUTOPILOT_FAULTS: dict[str, float] = {"reboot": 8.0, "clock-jump": 3600.0, "origin-change": 1000.0}
 
-NAMES: tuple[str, ...] = (*RECORD_FAULTS, *LINK_FAULTS, *AUTOPILOT_FAULTS)
+#: Name -> usual size: seconds between two reads of an autopilot that is slow, nothing for a disk.
+CONSUMER_FAULTS: dict[str, float] = {"slow-consumer": 10.0, "disk-full": 0.0}
+
+NAMES: tuple[str, ...] = (*RECORD_FAULTS, *LINK_FAULTS, *AUTOPILOT_FAULTS, *CONSUMER_FAULTS)
+
+
+class FullDisk(DiskFile):
+    """A disk for the log that takes nothing while `full`."""
+
+    full = False
+
+    def write(self, data: bytes) -> None:
+        """Append all of `data`, or a part and an error, as full disks do."""
+        if self.full:
+            super().write(data[: len(data) // 2])
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        super().write(data)
 
 
 def disturb(chunks: Sequence[Chunk], t_ns: int, faults: Sequence[Fault], rng: Generator) -> list[Chunk]:

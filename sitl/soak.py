@@ -44,7 +44,7 @@ from companion.onboard import Onboard
 from companion.records import Stamped
 from sitl.autopilot import UNIX_AT_START_NS, Autopilot
 from sitl.beacon import Beacon
-from sitl.faults import NAMES, Fault
+from sitl.faults import AUTOPILOT_FAULTS, LINK_FAULTS, RECORD_FAULTS, Fault
 from sitl.flight import Leg, Plan, Wind
 from sitl.loopback import LINK, SECOND, START_NS, join, simulated
 from sitl.scenarios import Rates, Scenario
@@ -55,6 +55,7 @@ FAULT_S = (20.0, 60.0)
 APART_NS = 60 * SECOND  # between two sorties
 MEMORY_GROWTH, RATE_DRIFT = 0.05, 0.01
 LONGEST = 4096  # of a container
+NAMES = (*RECORD_FAULTS, *LINK_FAULTS, *AUTOPILOT_FAULTS, "slow-consumer")
 _CONTAINERS = (list, tuple, dict, set, frozenset, deque)
 _OUTSIDE = (types.ModuleType, type, types.FunctionType, types.BuiltinFunctionType, types.CodeType)
 

@@ -18,15 +18,18 @@ from __future__ import annotations
 import dataclasses
 import heapq
 import math
+import tempfile
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from operator import attrgetter
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from companion.config import Config, Inertial
+from companion.log.file import Writer
 from companion.navigator import Navigator
 from companion.records import (
     AirData,
@@ -46,8 +49,9 @@ from companion.records import (
     Trust,
 )
 from sitl import loopback
+from sitl.autopilot import UNIX_AT_START_NS
 from sitl.beacon import Beacon
-from sitl.faults import RECORD_FAULTS, Fault
+from sitl.faults import RECORD_FAULTS, Fault, FullDisk
 from sitl.flight import Array, Leg, Plan, Wind, radii
 from sitl.scenarios import Rates, Scenario
 from sitl.world import World
@@ -76,6 +80,7 @@ SCENARIOS: dict[str, Scenario] = {
         Scenario("no-beacon", _PLAN, rates=_RATES),
         Scenario("tactical", _PLAN, grade="tactical", beacons=(_EAST,), rates=_RATES),
         Scenario("mems", _PLAN, grade="mems", beacons=(_EAST,), rates=_RATES),
+        Scenario("air-data", _PLAN, beacons=(_EAST,), rates=_RATES),  # no INS: airspeed, attitude and fixes
     )
 }
 
@@ -132,6 +137,7 @@ KINDS: dict[str, Kind] = {
     "gnss-spoof-5": _kind("gnss-spoof", 5.0),
     "gnss-jam": _kind("gnss-jam"),
     "gnss-frozen": _kind("gnss-frozen"),
+    "gnss-stale": _kind("gnss-stale"),
     "gnss-late": _kind("gnss-late"),
     "beacon-bias": _kind("beacon-bias"),
     "beacon-bias-300": _kind("beacon-bias", 300.0),
@@ -139,6 +145,9 @@ KINDS: dict[str, Kind] = {
     "beacon-north": _kind("beacon-north"),
     "beacon-multipath": _kind("beacon-multipath"),
     "beacon-drop-out": _kind("beacon-drop-out"),
+    "beacon-late": _kind("beacon-late"),
+    "beacon-frozen": _kind("beacon-frozen"),
+    "ins-frozen": _kind("ins-frozen", end_s=FAULT_S + 60.0),
     "ins-reset": _kind("ins-reset"),
     "airspeed-icing": _kind("airspeed-icing"),
     "airspeed-frozen": _kind("airspeed-frozen"),
@@ -148,6 +157,9 @@ KINDS: dict[str, Kind] = {
     "bit-errors": _kind("bit-errors", 1e-3),
     "duplicates": _kind("duplicates"),
     "reordering": _kind("reordering"),
+    "garbage": _kind("garbage"),
+    "slow-consumer": _kind("slow-consumer"),
+    "disk-full": _kind("disk-full"),
     "link-late": _kind("link-late", end_s=FAULT_S + 60.0),
     "reboot": _kind("reboot"),
     "clock-jump": _kind("clock-jump"),
@@ -222,7 +234,8 @@ def attempt(order: Order) -> Result:
     begun = time.perf_counter()
     try:
         scenario = ordered(order)
-        config = loopback.simulated(Config(inertial=UNITS[scenario.grade]))
+        inertial = Inertial(source="air_data") if order.scenario == "air-data" else UNITS[scenario.grade]
+        config = loopback.simulated(Config(inertial=inertial))
         fly = fly_records if by_records(order.fault) else fly_bytes
         world, told = fly(scenario, config)
         result = score(order, world, told)
@@ -246,10 +259,41 @@ def fly_records(scenario: Scenario, config: Config) -> tuple[World, list[Stamped
 
 def fly_bytes(scenario: Scenario, config: Config) -> tuple[World, list[Stamped]]:
     """The flight over the simulated link; what the companion said, in the flight's time."""
-    flown = loopback.fly(scenario, config)
+    flown = _fly_logged(scenario, config) if _full(scenario) else loopback.fly(scenario, config)
     kinds = Solution, Rejection, Reset, Event
     told = [r for r in flown.kept if isinstance(r, kinds)]
     return flown.autopilot.world, [_at_flight_time(r) for r in told]
+
+
+def _full(scenario: Scenario) -> list[Fault]:
+    return [fault for fault in scenario.faults if fault.name == "disk-full"]
+
+
+def _fly_logged(scenario: Scenario, config: Config) -> loopback.Flown:
+    """With a log whose disk is full for a while. OSError where it is not whole in the end."""
+    disks: list[FullDisk] = []
+
+    def disk(path: Path) -> FullDisk:
+        disks.append(FullDisk(path))
+        return disks[-1]
+
+    def tell(flown_s: float) -> None:
+        disks[0].full = any(fault.covers(round(flown_s * SECOND)) for fault in _full(scenario))
+
+    with tempfile.TemporaryDirectory() as folder:
+        log = Writer(
+            Path(folder) / "flight.mcap",
+            metadata={},
+            start_unix_ns=UNIX_AT_START_NS,
+            start_ns=loopback.START_NS,
+            block=True,
+            disk=disk,
+        )
+        flown = loopback.fly(scenario, config, log, tell)
+        disks[0].full = False
+        if not log.close() or log.dropped:
+            raise OSError(f"the log lost {log.dropped} messages: {log.trouble or 'full for too long'}")
+    return flown
 
 
 def _at_flight_time(record: Stamped) -> Stamped:

@@ -11,7 +11,9 @@ from there to the companion's clock, local = boot + offset:
   TIMESYNC  The autopilot's clock read between two readings of ours: offset = middle - reading, in error by
             half the round trip at most. Among recent answers the one of least round trip is believed, a
             little less with every second of its age. Preferred while it is fresh and agrees with the
-            arrivals.
+            arrivals. One whose round trip is longer than ROUGH waited somewhere, most likely on one way of
+            the two (an autopilot that reads seldom), and its middle may be off by seconds: it does not take
+            the place of a better one, and alone it only bounds what the arrivals tell.
 
 Stamps that go back by seconds are a reboot: everything is forgotten and begun again. (So is the wrap of a
 32-bit millisecond stamp after 49.7 days.) One alone may be a straggler or a false one: it is believed when
@@ -34,6 +36,8 @@ WINDOW = 20 * SECOND
 JUMP = 1 * SECOND
 #: A TIMESYNC reading that makes the last arrival early, or later than any link is, is of another clock.
 LATEST = 10 * SECOND
+#: A round trip beyond this is no measure of the way.
+ROUGH = SECOND // 4
 #: For so long an answer of TIMESYNC is believed.
 FRESH = 60 * SECOND
 #: Stamps from here on (September 2001) are UNIX time; no autopilot is up for 31 years.
@@ -127,14 +131,20 @@ class BootClock:
             # The offset is certainly no less than this: a simulated clock may slip faster than any crystal.
             self._envelope = max(self._envelope, answer.offset - answer.round_trip // 2)
         self._answers.append(answer)
-        self._best = min(self._answers, key=lambda a: a.round_trip + 2 * DRIFT * (now - a.at))
+        best = min(self._answers, key=lambda a: a.round_trip + 2 * DRIFT * (now - a.at))
+        held = self._best is not None and self._best.round_trip <= ROUGH and now - self._best.at < FRESH
+        if best.round_trip <= ROUGH or not held:
+            self._best = best
         return True
 
     def offset(self, now: int) -> int | None:
         """Return local minus boot time, None before anything was heard."""
-        if self._best is not None and now - self._best.at < FRESH:
-            return self._best.offset
-        return self._envelope
+        best, envelope = self._best, self._envelope
+        if best is None or now - best.at >= FRESH:
+            return envelope
+        if best.round_trip <= ROUGH or envelope is None:
+            return best.offset
+        return min(max(envelope, best.offset - best.round_trip // 2), best.offset + best.round_trip // 2)
 
     def uncertainty(self, now: int) -> int | None:
         """Return half the round trip, plus drift, that the offset rests on; None if on arrivals alone."""

@@ -2,6 +2,7 @@
 
 import random
 
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -171,3 +172,23 @@ def test_the_envelope_is_never_early_and_never_later_than_the_best_delay_and_dri
     span = boot - start + SECOND
     assert got >= offset - 10
     assert got <= offset + best + (DRIFT + 90e-6) * span + 10
+
+
+@pytest.mark.parametrize("every_s", [2, 10])
+def test_an_autopilot_that_reads_seldom_does_not_move_the_clock(every_s: int) -> None:
+    """Questions wait up to ten seconds to be read, answers come at once: each middle is off by half."""
+    clock, offset = BootClock(), 700 * SECOND
+    asked: list[int] = []
+    for ms in range(0, 120_000, 100):
+        now = 1000 * SECOND + ms * 1_000_000
+        clock.heard(now - offset - 5_000_000, now)
+        if ms % 1000 == 0:
+            asked.append(clock.ask(now))
+        if ms > 20_000 and ms % (1000 * every_s) == 900:  # slow from 20 s on; just before the next question
+            for each in asked:
+                clock.answered(each, now - offset, now + 5_000_000)
+            asked.clear()
+        elif ms <= 20_000 and asked:
+            clock.answered(asked.pop(), now - offset, now + 5_000_000)
+        found = clock.offset(now)
+        assert found is not None and abs(found - offset) <= 10_000_000, ms

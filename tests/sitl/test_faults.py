@@ -1,4 +1,5 @@
 import math
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -7,6 +8,7 @@ from companion.link import dialect, frame
 from companion.records import AirData, Gnss, LocalPosition, RsbnFix
 from sitl.faults import (
     AUTOPILOT_FAULTS,
+    CONSUMER_FAULTS,
     LINK_FAULTS,
     NAMES,
     RECORD_FAULTS,
@@ -24,10 +26,10 @@ def stream_of(kind, count=60):
     def one(k):
         t = k * S
         if kind is Gnss:
-            fix = {"lat": 1.0, "lon": 0.5, "alt_msl": 100.0, "v_n": (0.0, 30.0, 0.0), "satellites": 12}
+            fix = {"lat": 1.0, "lon": 0.5, "alt_msl": 100.0 + k, "v_n": (0.0, 30.0, 0.0), "satellites": 12}
             return Gnss(t, t, 0, t // 1000, 3, **fix)
         if kind is RsbnFix:
-            return RsbnFix(t, t, k % 2, 1.0, 0.5, 60.0, 3.0, 50e3, 0.002, 107.5)
+            return RsbnFix(t, t, k % 2, 1.0, 0.5, 60.0 + 1e-3 * k, 3.0, 50e3, 0.002, 107.5)
         if kind is LocalPosition:
             return LocalPosition(t, t, (10.0 * k, 0.0, -100.0), (10.0, 0.0, 0.0))
         return AirData(t, t, 38.0 + 0.1 * k)
@@ -71,6 +73,9 @@ def test_gnss_jammed_has_no_fix_and_frozen_repeats():
     _, after = spoiled("gnss-frozen")
     assert all(r.repeats(after[19]) for r in after[20:40])
     assert not after[40].repeats(after[19])
+    _, after = spoiled("gnss-stale")
+    assert {r.alt_msl for r in after[20:40]} == {after[19].alt_msl}
+    assert not any(b.repeats(a) for a, b in pairwise(after))  # the stamps go on
 
 
 def test_beacons_lie_in_range_azimuth_and_place():
@@ -172,7 +177,9 @@ def test_a_second_autopilot_says_the_same_with_right_checksums():
 
 
 def test_every_fault_has_one_name_and_wrong_orders_are_refused():
-    assert len(set(NAMES)) == len(RECORD_FAULTS) + len(LINK_FAULTS) + len(AUTOPILOT_FAULTS)
+    assert len(set(NAMES)) == len(RECORD_FAULTS) + len(LINK_FAULTS) + len(AUTOPILOT_FAULTS) + len(
+        CONSUMER_FAULTS
+    )
     with pytest.raises(ValueError, match="no fault is called 'gnss-leap'"):
         Fault("gnss-leap", 0.0)
     with pytest.raises(ValueError, match="end after its start"):
