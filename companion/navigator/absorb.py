@@ -36,7 +36,8 @@ def position(
     limit = settings.gate[radio.freedom(heard)]
     carry = carry._replace(innovation=cost if radio.freedom(heard) == 2 else None)
     if cost > limit:
-        if carry.state is not None and not _within_bound(carry, heard, settings):
+        explained = _within_bound(carry, heard, settings) or _by_a_jump(carry, state, heard, H, settings)
+        if carry.state is not None and not explained:
             carry = carry._replace(state=state)
             return carry, [_rejected(record, "innovation beyond its gate (chi-square)", cost, limit)]
         factor = cost / limit
@@ -104,6 +105,20 @@ def _within_bound(carry: Carry, heard: radio.Heard, settings: Settings) -> bool:
     height = settings.config.inertial.height_sigma_m
     wide = Position(np.array([-east, -north, 0.0]), np.diag([bound_e**2, bound_n**2, height**2]))
     return radio.innovation(heard, wide).cost <= BOUND_GATE**2
+
+
+def _by_a_jump(carry: Carry, state: ErrorState, heard: radio.Heard, H: Floats, settings: Settings) -> bool:
+    """Whether a wind that jumped by one sigma right after the last fix explains this one; only asked by air
+    data and while predicting.
+    """
+    last = max((t for t in (carry.gnss_ns, carry.rsbn_ns) if t is not None), default=None)
+    if not isinstance(settings.unit, WindError) or last is None:
+        return False
+    if sources(carry, heard.t_ns, settings) & FIXES:
+        return False
+    blown = settings.unit.jump * (heard.t_ns - last) * 1e-9
+    _, cost, _ = _fused(errorstate.blur(state, blown), heard, H, settings)
+    return cost <= settings.gate[radio.freedom(heard)]
 
 
 def velocity(carry: Carry, record: Gnss, v_n: Vector3, ins: Point, settings: Settings) -> Carry:

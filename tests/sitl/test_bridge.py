@@ -18,7 +18,7 @@ from companion.config import Config, load
 from companion.link import dialect, frame
 from companion.log import file, tlog
 from companion.onboard import Onboard
-from companion.records import RsbnFix, Solution, Truth
+from companion.records import Event, RsbnFix, Solution, Truth
 from sitl.attach import command
 from sitl.beacon import Beacon
 from sitl.bridge import AUTOPILOT, COMPANION, RSBN, Bridge, Orders, Way
@@ -147,6 +147,11 @@ def test_gnss_is_believed_from_the_start_though_a_beacon_was_first(relayed) -> N
     assert not rejected
 
 
+def test_a_wind_that_jumps_is_no_fault_of_the_beacon(relayed) -> None:
+    said = [r.text for r in relayed.log.records if isinstance(r, Event)]
+    assert not [text for text in said if "excluded" in text]
+
+
 def test_it_tells_what_happens(relayed) -> None:
     said = "\n".join(relayed.told)
     for part in (
@@ -212,6 +217,7 @@ def test_the_table_of_a_recorded_flight(log: str, part, profile: str, expected) 
     for seconds, error in expected.items():
         assert rows[AUTOPILOT].at[seconds] == pytest.approx(error, abs=4.0)
     assert rows[COMPANION].rms < 0.5 * rows[RSBN].rms
+    assert not [r for r in run.log.records if isinstance(r, Event) and "excluded" in r.text]
     assert rows[COMPANION].samples > 100
 
 

@@ -42,7 +42,7 @@ class Flown:
     """One flight's log, and the truth."""
 
     def __init__(self, folder: Path, channel: str, **changes) -> None:
-        scenario = Scenario("faults", PLAN, rates=Rates(imu=1.0), **changes)
+        scenario = Scenario("faults", **{"plan": PLAN, "rates": Rates(imu=1.0), **changes})
         config = simulated(load(flags={"rates.imu_hz": 0.0, "inertial.source": channel}, environment={}))
         log = open_log(
             folder, metadata={}, start_unix_ns=UNIX_AT_START_NS, start_ns=START_NS, min_free=0, block=True
@@ -109,6 +109,20 @@ def test_gnss_is_lost_and_comes_back_ten_times(tmp_path: Path, channel: str, bea
     back = r"fixed: gnss and azimuth and range fixes" if beacons else r"fixed: gnss fixes"
     flown.tells(*itertools.chain.from_iterable([lost, back] for _ in outages))
     assert sum(bool(re.search(lost, line)) for line in flown.told()) == len(outages)
+
+
+def test_gnss_is_believed_when_it_comes_back_to_a_wind_that_has_changed(tmp_path: Path) -> None:
+    """Dead reckoning is off by what the wind gained meanwhile, far beyond a random walk of it."""
+    climb = Plan(
+        (Leg(10, 40, 0, 0), Leg(50, 40, 38, 0), Leg(120, 40, 38, 120)),
+        winds=(Wind(0, 4, 5),),  # aloft alone: it is met from 75 to 90 s
+    )
+    flown = Flown(tmp_path, "air_data", plan=climb, gnss_outages=((82.0, 94.0),))
+    flown.tells(r"^84\.\d navigation predicting", r"^94\.\d navigation fixed: gnss")
+    for s in flown.solutions:
+        if (s.t_ns - START_NS) * 1e-9 > 96.0:
+            north, east, _ = separation(place(s), flown.truth(s.t_ns))
+            assert math.hypot(north, east) <= 3.0 * stated(s), s
 
 
 @pytest.mark.parametrize("channel", CHANNELS)
