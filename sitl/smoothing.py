@@ -2,7 +2,7 @@
 
     companion study smoothing --seeds 4
 
-Every scenario's records go through the navigator and `companion.log.smooth`, on both inertial channels; the
+Every scenario's records go through the navigator and `companion.log.smooth`, on each inertial channel; the
 filter and the smoother are compared at the same stops, up to the last fix (after it they are one). Beside the
 errors stand what the covariances claim of them, and the mean squared error by covariance (1 where honest).
 
@@ -27,14 +27,24 @@ from rich.table import Table
 
 from companion.config import Config
 from companion.log.smooth import Run, smooth_flight
-from companion.records import AirData, Attitude, Gnss, LocalOrigin, LocalPosition, Pressure, RsbnFix, Stamped
+from companion.records import (
+    AirData,
+    Attitude,
+    Gnss,
+    Imu,
+    LocalOrigin,
+    LocalPosition,
+    Pressure,
+    RsbnFix,
+    Stamped,
+)
 from sitl.flight import Array, radii
 from sitl.scenarios import SCENARIOS, Scenario, named
 from sitl.trial import UNITS
 from sitl.world import World
 
-CHANNELS = ("local_position", "air_data")
 SENSORS = (LocalPosition, Attitude, Gnss, AirData, Pressure, RsbnFix)
+CHANNELS = {"local_position": SENSORS, "air_data": SENSORS, "strapdown": (Imu, *SENSORS)}
 
 
 class Compared(NamedTuple):
@@ -56,12 +66,12 @@ class Compared(NamedTuple):
         return self.smoothed < self.filtered
 
 
-def records(world: World) -> Iterable[Stamped]:
+def records(world: World, sensors: Sequence[type[Stamped]] = SENSORS) -> Iterable[Stamped]:
     """What the companion hears of a flight, in order of arrival, but for what its wire refuses."""
     origin, scenario = world.origin, world.scenario
     height = origin.alt - scenario.geoid_height
     yield LocalOrigin(0, 0, origin.lat, origin.lon, height, scenario.autopilot)
-    for record in heapq.merge(*(world.streams[kind] for kind in SENSORS), key=attrgetter("rx_ns")):
+    for record in heapq.merge(*(world.streams[kind] for kind in sensors), key=attrgetter("rx_ns")):
         if not isinstance(record, LocalPosition) or all(map(math.isfinite, record.x_n)):
             yield record
 
@@ -71,7 +81,7 @@ def compare(scenario: Scenario, channel: str) -> Compared:
     world = World(scenario)
     unit = UNITS[scenario.grade] if channel == "local_position" else Config().inertial
     config = Config(inertial=structs.replace(unit, source=channel))
-    parts = [_against_truth(run, world) for run in smooth_flight(records(world), config)]
+    parts = [_against_truth(run, world) for run in smooth_flight(records(world, CHANNELS[channel]), config)]
     return pooled(parts)
 
 
@@ -100,7 +110,9 @@ def _misfit(e: Array, P: Array) -> float:
 
 @click.command("smoothing")
 @click.option("--scenario", "names", multiple=True, help="One of the loopback's; all where none is named.")
-@click.option("--channel", "channels", multiple=True, type=click.Choice(CHANNELS), help="Both unless named.")
+@click.option(
+    "--channel", "channels", multiple=True, type=click.Choice(list(CHANNELS)), help="All unless named."
+)
 @click.option("--seeds", type=click.IntRange(min=1), default=1, show_default=True, help="Flights of each.")
 def command(names: tuple[str, ...], channels: tuple[str, ...], seeds: int) -> None:
     """Compare the smoothed track with the filter in flight, by scenario. Exit code 1 if it is worse."""

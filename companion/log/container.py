@@ -2,6 +2,10 @@
 
 It knows the layout (https://mcap.dev/spec, version 0) and nothing of disks, clocks or what a message means.
 Parsing trusts no length it is given: what contradicts itself raises Damaged, what is torn off ends the walk.
+
+Why not the mcap package, which the tests read every log with: its Writer (1.6) offers no way to close a chunk
+each second nor to take back one that the disk refused, and its readers stop at a torn end, where a flight's
+last chunks are. By `companion bench log` it also costs 3 times as much to write and 5 times as much to read.
 """
 
 from __future__ import annotations
