@@ -157,6 +157,7 @@ class Onboard:
         self._origin: LocalOrigin | None = None
         self._due: dict[str, int] = {}
         self._state_at = 0
+        self._stale = False  # solutions have ceased
 
     def receive(self, link: str, data: bytes, now_ns: int) -> None:
         """Take bytes that came over `link`."""
@@ -175,6 +176,7 @@ class Onboard:
                 link.session.send(message)
         if now_ns >= self._state_at:
             self._state_at = now_ns + SECOND
+            self._tell_if_stale(now_ns)
             for link in self.links.values():
                 link.session.state = self._system_state(now_ns)
                 self._log.record(self._state(link, now_ns))
@@ -334,8 +336,17 @@ class Onboard:
         """MAV_STATE for our heartbeat: ACTIVE only while solutions come and can be trusted."""
         if self._solution is None:
             return STANDBY
-        stale = now_ns - self._solution.rx_ns > STALE_AFTER
-        return CRITICAL if stale or self._solution.mode is Mode.UNTRUSTED else ACTIVE
+        return CRITICAL if self._stale or self._solution.mode is Mode.UNTRUSTED else ACTIVE
+
+    def _tell_if_stale(self, now_ns: int) -> None:
+        """When solutions cease, and when they come again: the inertial channel fell silent, or froze."""
+        if self._solution is None:
+            return
+        age = now_ns - self._solution.rx_ns
+        if (age > STALE_AFTER) != self._stale:
+            self._stale = not self._stale
+            ceased = f"no solution for {age / SECOND:.0f} s: the inertial channel gives nothing"
+            self.note(3 if self._stale else 5, ceased if self._stale else "solutions again", now_ns)
 
     def _ask_for(self, link: Link, msgid: int) -> None:
         link.session.send(

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
 
-from sitl import campaign, trial
+from companion.config import Config
+from companion.records import Event, Solution
+from sitl import campaign, loopback, trial
 from sitl.campaign import Limits
-from sitl.faults import NAMES
+from sitl.faults import NAMES, Fault
+from sitl.scenarios import Rates, named
 from sitl.trial import KINDS, SCENARIOS, Order, Result, attempt
 
 
@@ -107,6 +111,18 @@ def test_old_numbers_under_new_times_are_told_at_once_and_do_no_harm(name: str) 
     assert flown.raised is None
     assert flown.detected_s is not None and flown.detected_s < 3.0
     assert flown.largest_m < 100.0
+
+
+def test_when_solutions_cease_it_is_told_and_when_they_come_again() -> None:
+    """The position freezes while the attitude goes on: over the link, as the pilot hears it."""
+    fault = Fault("ins-frozen", 60.0, 75.0)
+    scenario = dataclasses.replace(named("short"), faults=(fault,), rates=Rates(imu=1.0, truth=1.0))
+    kept = loopback.fly(scenario, loopback.simulated(Config())).kept
+    told = [(r.rx_ns * 1e-9 - 1000.0, r.text) for r in kept if isinstance(r, Event)]
+    (ceased,) = [t for t, text in told if "the inertial channel gives nothing" in text]
+    (again,) = [t for t, text in told if text == "solutions again"]
+    assert 60.0 < ceased < 65.0 and 75.0 < again < 78.0
+    assert not [r for r in kept if isinstance(r, Solution) and 61.0 < r.rx_ns * 1e-9 - 1000.0 < 75.0]
 
 
 def test_every_fault_of_the_simulator_is_flown() -> None:
