@@ -25,7 +25,7 @@ from rich.console import Console
 from rich.progress import MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from sitl.trial import KINDS, SCENARIOS, Order, Result, attempt, by_records
+from sitl.trial import KINDS, SCENARIOS, Order, Result, attempt, by_records, matters
 
 RETRIES = 3  # workers that may die under one flight before it counts as failed
 EX_FAILED = 1
@@ -67,12 +67,17 @@ class Line(NamedTuple):
 def orders(scenarios: Iterable[str], faults: Iterable[str], seeds: int) -> list[Order]:
     """Every flight, the seeds outermost: a campaign cut short has seen a little of everything.
 
-    A fault of the link or of the autopilot cares for no grade and no beacon: it is flown in the first
-    scenario only.
+    A fault of the link or of the autopilot, and lateness, care for no grade and no beacon: they are flown in
+    the first scenario only; and none is flown where there is nothing that it concerns.
     """
     names, kinds = list(scenarios), list(faults)
     every = itertools.product(range(1, seeds + 1), names, kinds)
-    return [Order(s, f, seed) for seed, s, f in every if s == names[0] or by_records(f)]
+    once = {f for f in kinds if not by_records(f) or f.endswith("-late")}
+    return [
+        Order(s, f, seed)
+        for seed, s, f in every
+        if (s == names[0] or f not in once) and (matters(s, f) or len(names) == 1)
+    ]
 
 
 def stored(path: Path) -> list[Result]:

@@ -229,6 +229,16 @@ def by_records(kind: str) -> bool:
     return fault is None or (fault.name in RECORD_FAULTS and fault.name != "ins-nan")
 
 
+def matters(scenario: str, kind: str) -> bool:
+    """Whether the scenario has what the fault concerns: a beacon, an INS, or air data as the channel."""
+    concerned = kind.split("-")[0]
+    if concerned == "beacon":
+        return bool(SCENARIOS[scenario].beacons)
+    if concerned in ("airspeed", "wind"):
+        return scenario == "air-data"
+    return concerned != "ins" or scenario != "air-data"
+
+
 def attempt(order: Order) -> Result:
     """Fly an order; an exception is a result too."""
     begun = time.perf_counter()
