@@ -36,16 +36,33 @@ class Cost(NamedTuple):
     peak_mib: float
 
 
+#: The kernel counts to a child what the process that started it held; VmHWM is of the program alone.
+_TOLD = """
+import atexit, os, sys
+atexit.register(lambda: os.write(int(sys.argv.pop()), open("/proc/self/status", "rb").read()))
+from companion.__main__ import cli
+cli(sys.argv[1:-1])
+"""
+
+
 def run(what: str, arguments: Sequence[str]) -> Cost:
     """Run `companion ARGUMENTS` and watch it. CalledProcessError where it fails."""
+    told, tell = os.pipe()
+    command = [sys.executable, "-c", _TOLD, *arguments, str(tell)]
     begun = time.perf_counter()
-    command = [sys.executable, "-m", "companion", *arguments]
-    with subprocess.Popen(command, stdout=subprocess.DEVNULL) as process:
-        _, status, used = os.wait4(process.pid, 0)
-        process.returncode = os.waitstatus_to_exitcode(status)
+    with open(told, "rb") as status:
+        try:
+            process = subprocess.Popen(command, stdout=subprocess.DEVNULL, pass_fds=(tell,))
+        finally:
+            os.close(tell)
+        with process:
+            lines = status.read().decode().splitlines()  # until it ends
+            _, ended, used = os.wait4(process.pid, 0)
+            process.returncode = os.waitstatus_to_exitcode(ended)
     if process.returncode:
         raise subprocess.CalledProcessError(process.returncode, command)
-    return Cost(what, time.perf_counter() - begun, used.ru_utime + used.ru_stime, used.ru_maxrss / 1024.0)
+    peak = next(int(line.split()[1]) for line in lines if line.startswith("VmHWM"))
+    return Cost(what, time.perf_counter() - begun, used.ru_utime + used.ru_stime, peak / 1024.0)
 
 
 def without_truth(whole: Path) -> Path:
