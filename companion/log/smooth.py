@@ -23,8 +23,9 @@ import numpy.typing as npt
 from scipy.linalg import eigh
 
 from companion.config import Config, parse
+from companion.estimate.integrity import INERTIAL
 from companion.nav.geometry import displace
-from companion.navigator import FOLDED, inertial, learnt, stepped, tuned
+from companion.navigator import FOLDED, inertial, learnt, stepped, tuned, watch
 from companion.navigator.carry import Carry, Settings, initial, is_news, level, state_at
 from companion.navigator.errorstate import ErrorState
 from companion.navigator.inertial import Point
@@ -72,7 +73,8 @@ class _Stop(NamedTuple):
 def smooth_flight(records: Iterable[Stamped], config: Config) -> list[Run]:
     """The smoothed runs of a flight, from its records, of any kinds, sorted here by time of validity.
 
-    A run ends where the inertial channel is another: the autopilot began anew, or the operator chose it.
+    A run ends where the inertial channel is another, the autopilot having begun anew or the operator having
+    chosen it, and where a source was excluded together with what it had taught.
     ValueError if the navigator never got an estimate: no inertial channel, or no fix.
     """
     runs: list[list[_Stop]] = []
@@ -121,10 +123,11 @@ def _forward(records: Iterable[Stamped], config: Config) -> list[_Stop]:
     """The navigator over the records, stopped where a fix changed its state, and every second.
 
     `since` is what the channel itself changed since the last stop: by jumping x, by being blurred P.
+    `parted`: the monitor has exchanged the state since, for one without an excluded source of fixes.
     """
     settings = Settings.of(config)
     carry, stops = initial(settings), list[_Stop]()
-    since = ErrorState(0, np.zeros(0), np.zeros((0, 0)))
+    since, parted = ErrorState(0, np.zeros(0), np.zeros((0, 0))), False
     for record in sorted((r for r in records if isinstance(r, FOLDED)), key=lambda r: r.t_ns):
         if isinstance(record, Tuning):
             settings, carry = tuned(carry, settings, parse(record.toml, "parameters in the log"))
@@ -134,7 +137,10 @@ def _forward(records: Iterable[Stamped], config: Config) -> list[_Stop]:
         # no solutions, which would predict at moments of their own, and no bounds ahead: the stops are ours
         carry = carry._replace(next_ns=NEVER_NS, next_ahead_ns=NEVER_NS)
         before = carry.state
+        before = carry.state
         carry, _ = learnt(carry, settings)
+        if carry.state is not before and carry.watch is not None:
+            parted = parted or not watch.excluded(carry.watch, INERTIAL)
         if stops and before is not None and carry.state is not None and carry.state is not before:
             last = stops.pop()  # a source was left out, and what it had said before that fix with it
             renewed = _corrected(last, carry.state)
@@ -155,7 +161,9 @@ def _forward(records: Iterable[Stamped], config: Config) -> list[_Stop]:
                 stop = _arrival(after, after.track[-1], since, settings)
                 after = after._replace(state=stop.state)
         if stop is not None:
-            _append(stops, stop._replace(ins=level(stop.ins, after)), since)
+            stop = stop._replace(ins=level(stop.ins, after), Phi=None if parted else stop.Phi)
+            _append(stops, stop, since)
+            parted = False
             since = ErrorState(stop.ins.t_ns, np.zeros_like(stop.state.x), np.zeros_like(stop.state.P))
         carry = after
     if stops and carry.state is not None and carry.track and carry.track[-1].t_ns > stops[-1].ins.t_ns:
