@@ -6,8 +6,9 @@ flies. Five minutes are left before the fault for the companion to learn in, and
 
 It knows nothing of workers, files and tables (`sitl.campaign`). A fault counts as
 
-    detected    a measurement of a source that it concerns was rejected, a reset told of it, that source went
-                out of what the solutions rest on, or trust got worse, all before the fault is over;
+    detected    a measurement of a source that it concerns was rejected, a reset told of it or a line that
+                sources contradict one another, that source went out of what the solutions rest on, or trust
+                got worse, all before the fault is over;
     excluded    that source went out of what the solutions rest on (what comes no more excludes itself);
     misleading  the error passed the protection level for a second or longer while nothing said so: trust was
                 neither "degraded" nor "untrusted".
@@ -31,6 +32,7 @@ import numpy.typing as npt
 from companion.config import Config, Inertial
 from companion.log.file import Writer
 from companion.navigator import Navigator
+from companion.navigator.watch import CONTRADICT
 from companion.records import (
     AirData,
     Attitude,
@@ -388,7 +390,7 @@ def _lost(solutions: Sequence[Solution], t: Array, bits: Source) -> Iterator[flo
 def _tells(record: Any, concerns: str) -> bool:
     if isinstance(record, Rejection):
         return bool(concerns) and record.source.startswith(concerns)
-    return isinstance(record, Reset)
+    return isinstance(record, Reset) or (isinstance(record, Event) and record.text.startswith(CONTRADICT))
 
 
 def _rms(values: Array) -> float | None:

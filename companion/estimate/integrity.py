@@ -129,6 +129,7 @@ class Blame(NamedTuple):
     statistic: float
     limit: float
     margin: float
+    lead: float  # over the next of those that measure, as a share of its own
 
 
 class Protection(NamedTuple):
@@ -248,7 +249,9 @@ def blame(found: tuple[Separation, ...], probability: float) -> Blame | None:
     first, *others = sorted(worst.values(), key=lambda s: s.freedom - s.statistic)
     excess = first.statistic - first.freedom
     margin = excess - (others[0].statistic - others[0].freedom if others else 0.0)
-    return Blame(first.row.without, first.statistic, first.limit(0.5 * probability), margin)
+    next_excess = max((s.statistic - s.freedom for s in others if s.row.without != INERTIAL), default=0.0)
+    lead = 1.0 - max(next_excess, 0.0) / excess if excess > 0.0 else 0.0
+    return Blame(first.row.without, first.statistic, first.limit(0.5 * probability), margin, lead)
 
 
 def fork(bank: Bank, index: int) -> Bank:

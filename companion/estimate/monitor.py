@@ -32,6 +32,7 @@ from .integrity import (
 
 BEYOND = "separation"
 REFUSED = "refused by every solution"
+LEAD = 0.5  # by which one must stand apart from others that measure: a model's errors grow with the lie
 
 
 class Allotment(NamedTuple):
@@ -109,7 +110,7 @@ def watch(monitor: Monitor, allotment: Allotment) -> tuple[Monitor, list[Exclusi
     found = separations(bank)
     alarm = allotment.false_alarm(len(found))
     accused = blame(tuple(s for s in found if s.row.without not in bank.excluded), alarm)
-    clear = accused is not None and accused.margin >= threshold(allotment.wrong)
+    clear = accused is not None and accused.margin >= threshold(allotment.wrong) and accused.lead >= LEAD
     since = None
     if accused is not None and clear and accused.source == INERTIAL:
         since = bank.t_ns if monitor.accused_ns is None else monitor.accused_ns
@@ -153,7 +154,7 @@ def trusted(monitor: Monitor, source: str) -> bool:
 
 
 def _excluded(monitor: Monitor, accused: Blame, alarm: float) -> tuple[Monitor, list[Exclusion]]:
-    before, (source, value, limit, _) = monitor.bank, accused
+    before, (source, value, limit, *_) = monitor.bank, accused
     bank = exclude(before, source, alarm)
     step = bank.x[0, :2] - before.x[0, :2]
     moved = float((step @ step) ** 0.5)

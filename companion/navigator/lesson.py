@@ -79,7 +79,7 @@ def _measured(w: Watch, lesson: Lesson, settings: Settings) -> tuple[Watch, list
     """What the lesson's fix says to the monitor, its sources joined."""
     record = lesson.record
     if isinstance(record, Gnss):
-        return w, [watch.of_gnss(record, lesson.ins, settings.unit, settings.config)]
+        return w, [watch.of_gnss(record, lesson.ins, settings.watched, settings.config)]
     measurements = []
     for z in lesson.sights:
         assert isinstance(z, Azimuth | Range)

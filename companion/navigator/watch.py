@@ -37,6 +37,7 @@ LOOSER = 8.0  # times the model's own noise, for a channel whose velocity is noi
 DECIDE_NS = 1_000_000_000
 BIAS_HOUR = 0.5  # a beacon's bias walks in an hour by this share of what it may be
 WARNING, NOTICE = 4, 5  # MAV_SEVERITY
+CONTRADICT = "sources contradict one another"
 PLAUSIBLE = 1e-3  # an excluded source must be this plausible to what is still heard, besides the bound
 
 
@@ -191,6 +192,8 @@ def tell(before: Watch | None, after: Watch, rx_ns: int) -> list[Output]:
     known = before.exclusions if before else ()
     t_ns = after.monitor.bank.t_ns
     told = list[Output]()
+    if after.monitor.unresolved and not (before and before.monitor.unresolved):
+        told.append(Event(t_ns, rx_ns, WARNING, f"{CONTRADICT}, none clearly wrong"))
     for e in after.exclusions:
         if e not in known:
             age = (e.t_ns - e.since_ns) * 1e-9

@@ -25,6 +25,7 @@ from .errorstate import Floats, System
 N = 8
 WIND, SCALE, HEADING, DRIFT = slice(2, 4), 4, 5, slice(6, 8)
 FIRST_POSITION_M = 2000.0  # nothing is known: the first fix, by which the channel begins, tells all
+EDDY = 16.0  # times longer than `gust_s` a gust may last: 8 s, an eddy of 300 m at 38 m/s
 FRONT_S = 30.0  # how long a jump of the wind takes at most
 
 
@@ -72,4 +73,5 @@ def overbound(unit: WindError) -> WindError:
     """For the integrity monitor, which must not take a jump of the wind for the fault of a beacon."""
     density = unit.density.copy()
     density[WIND] = unit.jump**2 / FRONT_S
-    return unit._replace(density=density)
+    density[:2] *= EDDY
+    return unit._replace(density=density, velocity_noise=math.sqrt(EDDY) * unit.velocity_noise)
