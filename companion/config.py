@@ -134,6 +134,7 @@ class GnssSection(Section, frozen=True):
     correlation_s: Positive = 60.0
     every_s: NotNegative = 0.5  # fixes closer together than this are heard but not used
     use_velocity: bool = True
+    latency_s: Annotated[float, Meta(ge=0.0, le=2.0)] = 0.0  # age of a fix at the time it bears; reports tell
     timeout_s: Positive = 3.0
 
 

@@ -80,7 +80,7 @@ def compare(scenario: Scenario, channel: str) -> Compared:
     """One flight, filtered and smoothed, against the truth."""
     world = World(scenario)
     unit = UNITS[scenario.grade] if channel == "local_position" else Config().inertial
-    config = Config(inertial=structs.replace(unit, source=channel))
+    config = Config(inertial=structs.replace(unit, source=channel, independent=True))
     parts = [_against_truth(run, world) for run in smooth_flight(records(world, CHANNELS[channel]), config)]
     return pooled(parts)
 

@@ -12,6 +12,8 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+from msgspec import structs
+
 from companion.config import Config, parse
 from companion.records import (
     AirData,
@@ -73,6 +75,7 @@ class Navigator:
         self._carry = initial(self._settings)
         self._past: deque[_Past] = deque()
         self._late_ns = round(1e9 * config.estimator.late_s)
+        self._gnss_latency_ns = round(1e9 * config.gnss.latency_s)
         self._freshness = Freshness()
         self._rests_on = Mode.INITIALISING, Source(0)  # mode and fixes of the last solution, and its time
         self._given_ns = 0
@@ -89,6 +92,8 @@ class Navigator:
         if not self._chosen:
             self._chosen = True
             return [_choice(record, self._settings.config), *self.handle(record)]
+        if isinstance(record, Gnss) and self._gnss_latency_ns:
+            record = structs.replace(record, t_ns=record.t_ns - self._gnss_latency_ns)
         stale = self._freshness.judge(record)
         if stale is not None:
             return stale
@@ -128,6 +133,7 @@ class Navigator:
         before = self._settings.channel
         self._settings, self._carry = tuned(self._carry, self._settings, config)
         self._late_ns = round(1e9 * config.estimator.late_s)
+        self._gnss_latency_ns = round(1e9 * config.gnss.latency_s)
         self._chosen = self._chosen and config.channel == before
         self._past.clear()
 

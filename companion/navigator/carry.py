@@ -40,14 +40,18 @@ class Settings(NamedTuple):
         """Everything derived once."""
         alarm = config.estimator.false_rejection
         gate = (0.0, *(float(chdtri(k, alarm)) for k in (1, 2, 3)))
-        unit: ErrorModel = errorstate.grade(config.inertial, config.gnss)
-        watched: ErrorModel | None = None
+        unit: ErrorModel
+        watched: ErrorModel
         if config.channel == "air_data":
             unit = wind = winderror.grade(config.air_data, config.gnss)
             watched = winderror.overbound(wind)
         elif config.channel == "strapdown":
-            unit = tilterror.grade(config.strapdown, config.gnss)
-        return cls(config, unit, gate, watch.allotment(config), watched or unit, config.channel)
+            unit = watched = tilterror.grade(config.strapdown, config.gnss)
+        else:
+            unit = watched = ins = errorstate.grade(config.inertial, config.gnss)
+            if not config.inertial.independent:
+                watched = errorstate.overbound(ins, config.air_data.wind_jump_m_s)
+        return cls(config, unit, gate, watch.allotment(config), watched, config.channel)
 
 
 class Level(NamedTuple):

@@ -35,6 +35,7 @@ TILT = slice(4, 7)
 INS = slice(0, 7)
 GYRO, ACCELEROMETER = (7, 8), (10, 11)  # north and east
 TURNING_M_S = 5.0  # slower, the course says nothing of the heading
+FRONT_S = 30.0  # how long a jump of the wind takes at most
 G0 = 9.80665  # [m/s^2] of what is quoted in micro-g
 STEP_S = 2.0  # the transition is a power series: its fifth term is below 1e-12 of the first here
 
@@ -122,6 +123,15 @@ def grade(settings: Inertial, gnss: GnssSection) -> Grade:
     sigma0 = [settings.position_m] * 2 + [settings.velocity_m_s] * 2 + [tilt, tilt, heading]
     sigma0 += [drift] * 3 + [bias] * 2 + [gnss.sigma_m] * 2
     return Grade(bare.A, np.diag(density), np.array(sigma0), body_fixed=settings.strapped_down)
+
+
+def overbound(unit: Grade, wind_jump: float) -> Grade:
+    """For the integrity monitor of a local position that is the autopilot's own estimate: without GNSS it
+    reckons by a wind that it takes for known, and is no witness against GNSS as an INS is.
+    """
+    density = unit.density.copy()
+    density[VELOCITY, VELOCITY] += wind_jump**2 / FRONT_S * np.eye(2)
+    return unit._replace(density=density)
 
 
 def beacon_rows(unit: ErrorModel) -> Floats:

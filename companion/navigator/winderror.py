@@ -20,13 +20,12 @@ import numpy as np
 from companion.config import AirDataSection, GnssSection
 from companion.records import Vector2, Vector3
 
-from .errorstate import Floats, System
+from .errorstate import FRONT_S, Floats, System
 
 N = 8
 WIND, SCALE, HEADING, DRIFT = slice(2, 4), 4, 5, slice(6, 8)
 FIRST_POSITION_M = 2000.0  # nothing is known: the first fix, by which the channel begins, tells all
 EDDY = 16.0  # times longer than `gust_s` a gust may last: 8 s, an eddy of 300 m at 38 m/s
-FRONT_S = 30.0  # how long a jump of the wind takes at most
 
 
 class WindError(NamedTuple):

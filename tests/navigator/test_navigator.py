@@ -178,6 +178,20 @@ def test_a_late_answer_is_folded_in_at_its_own_time() -> None:
     np.testing.assert_allclose(a[0].covariance, b[0].covariance, rtol=1e-3, atol=per_mille)
 
 
+def test_a_fix_is_taken_to_be_as_old_as_the_receiver_is_slow() -> None:
+    slow = Navigator(load(flags={"gnss.latency_s": 0.2}, environment={}))
+    slow.handle(origin())
+    told, wanted = [], []
+    for moment in flight(60, 60.0, 0.0):
+        for record in moment.records:
+            if isinstance(record, Gnss):
+                wanted.append(record.t_ns)
+                record = msgspec.structs.replace(record, t_ns=record.t_ns + NS // 5)
+            told += [out.t_ns for out in slow.handle(record) if isinstance(out, Fix)]
+    assert len(told) > 50
+    assert set(told) <= set(wanted)
+
+
 def test_what_is_later_than_the_limit_is_rejected_aloud() -> None:
     navigator = Navigator(load(flags={"estimator.late_s": 2.0}, environment={}))
     navigator.handle(origin())
