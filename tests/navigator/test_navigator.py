@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from companion.config import Config, load
+from companion.config import Config, Inertial, load
 from companion.nav.discrete import discretise
 from companion.nav.geometry import (
     Geodetic,
@@ -37,7 +37,7 @@ from companion.records import (
 
 ORIGIN = Geodetic(math.radians(60.0), math.radians(30.0), 0.0)
 BEACON = Geodetic(math.radians(60.4), math.radians(30.3), 100.0)
-CONFIG = Config()
+CONFIG = Config(inertial=Inertial(independent=True))  # the channel that flies here is one
 NS = 1_000_000_000
 
 
