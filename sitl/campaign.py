@@ -247,7 +247,7 @@ def _cell(value: Any) -> str:
 
 @click.command("campaign")
 @click.option(
-    "--scenario", "scenarios", multiple=True, type=click.Choice(list(SCENARIOS)), help="Again for more."
+    "--scenario", "scenarios", multiple=True, type=click.Choice(list(SCENARIOS)), help="All without it."
 )
 @click.option("--fault", "faults", multiple=True, type=click.Choice(list(KINDS)), help="All without it.")
 @click.option("--seeds", type=click.IntRange(1), default=1, show_default=True, help="Noises for each.")
@@ -277,7 +277,7 @@ def command(
     Ends with 1 where a limit was passed.
     """
     limits = Limits(harmless_m, misleading, alarms_per_hour)
-    wanted = orders(scenarios or ("one-beacon",), faults or KINDS, seeds)
+    wanted = orders(scenarios or SCENARIOS, faults or KINDS, seeds)
     try:
         flown = campaign(wanted, results, scheduler, workers)
         if page is not None:
