@@ -25,6 +25,7 @@ from companion.link import dialect
 from companion.link.session import (
     ClockLeapt,
     FalseTime,
+    LinkLate,
     LinkLost,
     LinkUp,
     MessageReceived,
@@ -232,6 +233,9 @@ class Onboard:
                 self.note(
                     4, f"{link.name}: the clock of autopilot {event.system} leapt by {leap:.1f} s", now_ns
                 )
+            elif isinstance(event, LinkLate):
+                text = f"late by {event.by_ns / SECOND:.1f} s" if event.by_ns else "prompt again"
+                self.note(4 if event.by_ns else 5, f"{link.name}: the link is {text}", now_ns)
             elif isinstance(event, FalseTime):
                 why = "a TIMESYNC answer of another clock"
                 self._on_record(Rejection(now_ns, now_ns, "timesync", why, event.off_ns / SECOND))

@@ -7,8 +7,8 @@ flies. Five minutes are left before the fault for the companion to learn in, and
 It knows nothing of workers, files and tables (`sitl.campaign`). A fault counts as
 
     detected    a measurement of a source that it concerns was rejected, a reset told of it or a line that
-                sources contradict one another, that source went out of what the solutions rest on, or trust
-                got worse, all before the fault is over;
+                sources contradict one another, that the link is late or that the clock leapt, that source
+                went out of what the solutions rest on, or trust got worse, all before the fault is over;
     excluded    that source went out of what the solutions rest on (what comes no more excludes itself);
     misleading  the error passed the protection level for a second or longer while nothing said so: trust was
                 neither "degraded" nor "untrusted".
@@ -60,6 +60,7 @@ from sitl.world import World
 
 SECOND = 1_000_000_000
 FAULT_S, OVER_S = 300.0, 540.0
+TELLING = (CONTRADICT, "the link is late", "the clock of autopilot")  # what events say that tell of a fault
 EXCLUDED = "excluded:"  # how a rejection begins that tells of an exclusion
 LEARNT_S = 60.0  # alarms are counted from here on
 _LEGS = (
@@ -390,7 +391,7 @@ def _lost(solutions: Sequence[Solution], t: Array, bits: Source) -> Iterator[flo
 def _tells(record: Any, concerns: str) -> bool:
     if isinstance(record, Rejection):
         return bool(concerns) and record.source.startswith(concerns)
-    return isinstance(record, Reset) or (isinstance(record, Event) and record.text.startswith(CONTRADICT))
+    return isinstance(record, Reset) or (isinstance(record, Event) and any(t in record.text for t in TELLING))
 
 
 def _rms(values: Array) -> float | None:

@@ -24,7 +24,7 @@ from typing import NamedTuple
 
 from companion.link import dialect, frame
 from companion.link.bucket import Bucket
-from companion.link.clock import JUMP, SECOND, BootClock
+from companion.link.clock import JUMP, LATE, SECOND, BootClock, News
 from companion.link.dialect import Message
 from companion.link.frame import BadFrame, Frame, UnknownFrame
 from companion.link.signing import Refusal, Signing
@@ -43,6 +43,8 @@ AUTOPILOT_COMPONENT = 1
 TYPE_ONBOARD_CONTROLLER = 18
 AUTOPILOT_INVALID = 8
 STATE_ACTIVE = 4
+#: A link is late, or prompt again, once it was for so long: TIMESYNC has had its say by then.
+LATE_FOR = 2 * SECOND
 #: HEARTBEAT types that come from no autopilot, whatever their autopilot field says.
 NOT_VEHICLES = frozenset({5, 6, 18, 26, 27, 30, 31, 32, 33, 34, 36, 37, 38, 39, 40, 41, 42})
 #: Messages whose time_boot_ms is new in each: SYSTEM_TIME, ATTITUDE(_QUATERNION), LOCAL_ and GLOBAL_POSITION.
@@ -74,6 +76,14 @@ class Rebooted(NamedTuple):
 
 class ClockLeapt(NamedTuple):
     """The autopilot's clock was set: its times are mapped anew from here on, `by_ns` later than before."""
+
+    at_ns: int
+    system: int
+    by_ns: int
+
+
+class LinkLate(NamedTuple):
+    """All that comes has come late for a while, `by_ns` now; 0: the link is prompt again."""
 
     at_ns: int
     system: int
@@ -126,6 +136,7 @@ Event = (
     | LinkLost
     | Rebooted
     | ClockLeapt
+    | LinkLate
     | FalseTime
     | SecondAutopilot
     | MessageReceived
@@ -174,6 +185,8 @@ class Session:
         self._kind = AUTOPILOT_INVALID
         self._heard = 0
         self._up = False
+        self._late_told = False
+        self._turned_at: int | None = None  # since when the link is not as late, or as prompt, as was told
         self._ignored: set[int] = set()
         self._sequence = 0
         self._outbox: list[bytes] = []
@@ -304,13 +317,25 @@ class Session:
         if found.msgid in CLOCKED and message.time_boot_ms:
             boot = message.time_boot_ms * 1_000_000
             before = self.clock.offset(now)
-            if self.clock.heard(boot, now):
+            news = self.clock.heard(boot, now)
+            if news is News.REBOOTED:
                 self.streams.start(now)
                 events.append(Rebooted(now, found.system))
-            elif before is not None and abs(by := before - (self.clock.offset(now) or 0)) > JUMP:
-                events.append(ClockLeapt(now, found.system, by))
+            elif news is News.SET:
+                events.append(ClockLeapt(now, found.system, (before or 0) - (self.clock.offset(now) or 0)))
             if found.msgid == SYSTEM_TIME:
                 self.clock.heard_unix(message.time_unix_usec * 1000, boot)
+            self._tell_lateness(now, found.system, events)
+
+    def _tell_lateness(self, now: int, system: int, events: list[Event]) -> None:
+        late = self.clock.lateness(now)
+        if (late > LATE) == self._late_told:
+            self._turned_at = None
+        elif self._turned_at is None:
+            self._turned_at = now
+        elif now - self._turned_at >= LATE_FOR:
+            self._late_told, self._turned_at = not self._late_told, None
+            events.append(LinkLate(now, system, late if self._late_told else 0))
 
     def _on_heartbeat(self, message: Message, found: Frame, now: int, events: list[Event]) -> None:
         if found.component != AUTOPILOT_COMPONENT or message.autopilot == AUTOPILOT_INVALID:
@@ -330,9 +355,12 @@ class Session:
             if self._answers.take(now):
                 self.send(dialect.new("TIMESYNC", tc1=max(now, 1), ts1=message.ts1))
         elif found.system == self._autopilot and found.component == AUTOPILOT_COMPONENT:
+            before = self.clock.offset(now)
             self.clock.answered(message.ts1, message.tc1, now)
             if (off := self.clock.outlier) is not None:
                 events.append(FalseTime(now, found.system, off))
+            elif before is not None and (by := before - (self.clock.offset(now) or 0)) < -JUMP:
+                events.append(ClockLeapt(now, found.system, by))  # it stood still, or was set back
 
     def _ask_for(self, msgid: int, rate_hz: float) -> None:
         self.send(

@@ -6,7 +6,7 @@ A message that carries no measurement by its own word (no airspeed sensor, a com
 accelerometer) becomes nothing at all.
 
 Headings come out in [0, 2 pi). Times go through the sender's `Clock`; what is sent without a time is stamped
-with its arrival.
+with its arrival, less what the link is late by.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ class Clock(Protocol):
 
     def local(self, stamp: int, received: int, /) -> int:
         """When `stamp` was, all in nanoseconds: time since boot or since 1970, told apart by magnitude; 0 is
-        "unknown" and gives `received`."""
+        "unknown" and gives `received`, less what the link is late by."""
 
 
 class Sender(NamedTuple):
@@ -126,6 +126,10 @@ def _booted(message: Message, rx: int, sender: Sender) -> int:
 
 def _stamped(message: Message, rx: int, sender: Sender) -> int:
     return sender.clock.local(message.time_usec * 1000, rx)
+
+
+def _unstamped(rx: int, sender: Sender) -> int:
+    return sender.clock.local(0, rx)
 
 
 # ---------------------------------------------------------------------------------------------------------
@@ -225,7 +229,7 @@ def _attitude_quaternion(m: Message, rx: int, sender: Sender) -> tuple[Stamped, 
 def _ekf_status(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
     """ArduPilot's `pos_horiz_variance` is an innovation test ratio; it says nothing of accuracy."""
     ratio = number(m, "pos_horiz_variance")
-    return (FilterStatus(rx, rx, m.flags, bool(m.flags & _EKF_GPS_GLITCHING), ratio),)
+    return (FilterStatus(_unstamped(rx, sender), rx, m.flags, bool(m.flags & _EKF_GPS_GLITCHING), ratio),)
 
 
 @_of("ESTIMATOR_STATUS")
@@ -292,7 +296,7 @@ def _vfr_hud(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
     heading = wrapped(math.radians(m.heading)) if 0 <= m.heading <= 360 else None
     return (
         AirData(
-            rx,
+            _unstamped(rx, sender),
             rx,
             airspeed,
             groundspeed=maybe(m, "groundspeed"),
@@ -307,7 +311,7 @@ def _vfr_hud(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
 def _airspeed(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
     if m.flags & _AIRSPEED_UNHEALTHY:
         raise Refused("the airspeed sensor calls itself unhealthy", float(m.airspeed))
-    return (AirData(rx, rx, number(m, "airspeed", limit=FASTEST)),)
+    return (AirData(_unstamped(rx, sender), rx, number(m, "airspeed", limit=FASTEST)),)
 
 
 @_of("WIND")
@@ -316,7 +320,11 @@ def _wind(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
     direction, speed, down = number(m, "direction"), number(m, "speed"), number(m, "speed_z")
     horizontal = math.sqrt(max(0.0, speed * speed - down * down))
     towards = math.radians(direction) + math.pi
-    return (Wind(rx, rx, (horizontal * math.cos(towards), horizontal * math.sin(towards), down)),)
+    return (
+        Wind(
+            _unstamped(rx, sender), rx, (horizontal * math.cos(towards), horizontal * math.sin(towards), down)
+        ),
+    )
 
 
 @_of("WIND_COV")
@@ -393,7 +401,7 @@ def _sim_state(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
     lat, lon = known_position(m, "lat_int", "lon_int")
     roll, pitch, yaw = vector(m, "roll pitch yaw")
     v_n = vector(m, "vn ve vd")
-    return (Truth(rx, rx, lat, lon, number(m, "alt"), v_n, (roll, pitch, wrapped(yaw))),)
+    return (Truth(_unstamped(rx, sender), rx, lat, lon, number(m, "alt"), v_n, (roll, pitch, wrapped(yaw))),)
 
 
 @_of("HIL_STATE_QUATERNION")

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from companion.link.clock import DRIFT, FRESH, SECOND, WINDOW, BootClock
+from companion.link.clock import DRIFT, FRESH, SECOND, SLIP, WINDOW, BootClock, News
 
 MS = 1_000_000
 OFFSET = 1000 * SECOND
@@ -192,3 +192,110 @@ def test_an_autopilot_that_reads_seldom_does_not_move_the_clock(every_s: int) ->
             clock.answered(asked.pop(), now - offset, now + 5_000_000)
         found = clock.offset(now)
         assert found is not None and abs(found - offset) <= 10_000_000, ms
+
+
+class Way:
+    """An autopilot at the other end of a link that may be late, played by the second or finer."""
+
+    def __init__(self, answers: bool = True, every_ms: int = 50) -> None:
+        self.clock, self.offset, self.answers, self.every_ms = BootClock(), OFFSET, answers, every_ms
+        self.late = 0
+        self.ms = 0
+        self.arriving: list[tuple[int, int, int]] = []  # when, asked (or 0), stamp or reading
+        self.news: list[News] = []
+        self.sent_by = 0
+
+    def run(self, seconds: float) -> float:
+        """Go on for so long; how wrong (s) a stamp of now was mapped at most."""
+        worst, end = 0.0, self.ms + round(seconds * 1000)
+        while self.ms < end:
+            now = 2 * OFFSET + self.ms * MS
+            self.sent_by = max(self.sent_by, now + self.late + 5 * MS)  # in order
+            self.arriving.append((self.sent_by, 0, now - self.offset))
+            if self.answers and self.ms % 1000 == 0:
+                self.arriving.append((self.sent_by, self.clock.ask(now), now - self.offset + MS))
+            self.ms += self.every_ms
+            while self.arriving and self.arriving[0][0] <= now:
+                at, asked, reading = self.arriving.pop(0)
+                if asked:
+                    self.clock.answered(asked, reading, at)
+                elif (news := self.clock.heard(reading, at)) is not None:
+                    self.news.append(news)
+                worst = max(worst, abs(self.clock.local(reading, at) - (reading + self.offset)) / SECOND)
+        return worst
+
+
+@pytest.mark.parametrize("late_s", [5, 12])
+def test_a_link_late_for_minutes_leaves_the_clock_where_it_was(late_s: int) -> None:
+    way = Way()
+    way.run(30)
+    way.late = late_s * SECOND
+    assert way.run(300) < DRIFT * 300 + 0.01
+    assert way.clock.lateness(2 * OFFSET + way.ms * MS) / SECOND == pytest.approx(late_s, abs=0.1)
+    way.late = 0
+    assert way.run(60) < DRIFT * 300 + 0.01
+    assert way.clock.lateness(2 * OFFSET + way.ms * MS) < 50 * MS
+    assert way.news == []
+
+
+def test_a_link_late_from_the_first_word_is_no_clock_that_leaps_when_it_gets_prompt() -> None:
+    way = Way()
+    way.late = 5 * SECOND
+    way.run(60)
+    way.late = 0
+    way.run(30)
+    assert way.run(30) < 0.01
+    assert way.news == []
+
+
+def test_without_timesync_a_late_link_moves_the_clock_no_faster_than_a_simulator_may_slip() -> None:
+    way = Way(answers=False)
+    way.run(30)
+    way.late = 5 * SECOND
+    assert way.run(60) < SLIP * 60
+    way.late = 0
+    assert way.run(30) < SLIP * 60
+    assert way.run(30) < 0.02
+
+
+@pytest.mark.parametrize(("by_s", "silent_s"), [(0.5, 0), (2, 0), (5, 5), (60, 60)])
+def test_a_clock_that_stood_still_is_followed_at_the_next_answer(by_s: float, silent_s: int) -> None:
+    """Everything arrives late from then on, as on a late link; but the answers come as promptly as ever."""
+    way = Way()
+    way.run(30)
+    way.offset += round(by_s * SECOND)
+    way.ms += silent_s * 1000
+    way.run(1.2)
+    assert way.run(120) < 0.01
+
+
+@pytest.mark.parametrize("by_s", [5, 900])
+def test_a_clock_set_back_is_no_reboot_of_an_autopilot_that_cannot_be_so_young(by_s: int) -> None:
+    way = Way()
+    way.run(30)
+    way.offset += by_s * SECOND
+    way.run(0.2)
+    assert way.news == [News.SET]
+    assert way.run(60) < 0.01
+    assert way.news == [News.SET]
+
+
+@pytest.mark.parametrize("silent_s", [0, 8, 60])
+def test_an_autopilot_that_can_be_so_young_rebooted(silent_s: int) -> None:
+    way = Way()
+    way.run(30)
+    way.ms += silent_s * 1000
+    way.offset = 2 * OFFSET + way.ms * MS - SECOND
+    way.run(0.2)
+    assert way.news == [News.REBOOTED]
+
+
+def test_what_has_no_stamp_is_as_late_as_what_has_one() -> None:
+    clock = BootClock()
+    clock.heard(10 * SECOND, 10 * SECOND + OFFSET)
+    clock.heard(11 * SECOND, 11 * SECOND + OFFSET + 300 * MS)
+    arrival = 11 * SECOND + OFFSET + 310 * MS
+    assert clock.local(0, arrival) == arrival  # a slow link is not a late one
+    clock.heard(12 * SECOND, 17 * SECOND + OFFSET)
+    arrival = 17 * SECOND + OFFSET + 10 * MS
+    assert clock.local(0, arrival) == pytest.approx(arrival - 5 * SECOND, abs=MS)

@@ -1,6 +1,7 @@
 """A session and an autopilot joined without a network, on a clock that the test owns."""
 
 import random
+from collections import deque
 
 import pytest
 from hypothesis import given, settings
@@ -12,6 +13,7 @@ from companion.link.session import (
     ClockLeapt,
     Event,
     FalseTime,
+    LinkLate,
     LinkLost,
     LinkUp,
     MessageReceived,
@@ -174,6 +176,45 @@ def test_a_clock_that_leaps_forward_is_told_once_with_its_size_and_followed() ->
     events = [e for e in run(session, peer, 10 * SECOND, 10) if isinstance(e, ClockLeapt)]
     assert [round(e.by_ns / SECOND) for e in events] == [3600]
     assert abs(session.clock.offset(20 * SECOND) + 3700 * SECOND) <= 10 * MS
+
+
+def test_a_clock_set_back_is_followed_and_is_no_reboot() -> None:
+    session, peer = Session(rates_hz={"LOCAL_POSITION_NED": 10}), Autopilot(booted=-5000 * SECOND)
+    run(session, peer, 0, 10)
+    peer.booted += 3600 * SECOND
+    events = run(session, peer, 10 * SECOND, 10)
+    assert set(kinds(events)) <= {FalseTime, ClockLeapt}  # an answer comes before two stamps have told of it
+    assert [round(e.by_ns / SECOND) for e in events if isinstance(e, ClockLeapt)] == [-3600]
+    assert abs(session.clock.offset(20 * SECOND) + 1400 * SECOND) <= 10 * MS
+
+
+def test_a_clock_that_stood_still_is_told_by_the_next_answer() -> None:
+    session, peer = Session(rates_hz={"LOCAL_POSITION_NED": 10}), Autopilot(booted=-5000 * SECOND)
+    run(session, peer, 0, 10)
+    peer.booted += 4 * SECOND
+    events = [e for e in run(session, peer, 14 * SECOND, 3) if not isinstance(e, MessageReceived)]
+    assert [type(e) for e in events] == [FalseTime, ClockLeapt]  # the first answer comes before a stamp
+    assert events[1].by_ns / SECOND == pytest.approx(-4, abs=0.1)
+    assert abs(session.clock.offset(17 * SECOND) + 4996 * SECOND) <= 10 * MS
+
+
+def test_a_link_that_is_late_is_told_and_so_is_its_being_prompt_again() -> None:
+    """Four seconds one way: the round trips say so, and the clock stays where it was."""
+    session, peer = Session(rates_hz={"LOCAL_POSITION_NED": 10}), Autopilot(booted=-100 * SECOND)
+    run(session, peer, 0, 10)
+    events, waiting = list[Event](), deque[tuple[int, bytes]]()
+    for now in range(10 * SECOND, 100 * SECOND, 10 * MS):
+        events += session.poll(now) if now >= session.deadline() else []
+        said = peer.step(now, b"".join(session.to_send()))
+        late = 4 * SECOND if now < 80 * SECOND else 0
+        waiting.append((max(now + late, waiting[-1][0] if waiting else 0), said))
+        while waiting and waiting[0][0] <= now:
+            events += session.receive(waiting.popleft()[1], now)
+        assert abs(session.clock.offset(now) + 100 * SECOND) <= 20 * MS
+    told = [e for e in events if not isinstance(e, MessageReceived)]
+    assert [type(e) for e in told] == [LinkLate, LinkLate]
+    assert told[0].by_ns / SECOND == pytest.approx(4, abs=0.1)
+    assert told[1].by_ns == 0
 
 
 @pytest.mark.parametrize("off_s", [-7200, -12, 2, 5000])

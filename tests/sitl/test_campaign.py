@@ -105,6 +105,21 @@ def test_a_slow_consumer_does_not_move_the_clock() -> None:
     assert flown.largest_m < 15.0
 
 
+@pytest.mark.parametrize(
+    ("scenario", "name"),
+    [("one-beacon", "link-late"), ("air-data", "link-late"), ("one-beacon", "clock-jump")],
+)
+def test_a_link_that_is_late_and_a_clock_that_leaps_are_told_and_move_nothing(
+    scenario: str, name: str
+) -> None:
+    """Once a late link moved the clock, and a clock set back was a reboot: 220 m, and GNSS was blamed."""
+    flown = attempt(Order(scenario, name, 1))
+    assert flown.raised is None
+    assert (flown.excluded_s, flown.wrong, flown.alarms, flown.misleading_s) == (None, 0, 0, 0.0)
+    assert flown.detected_s is not None and flown.detected_s < 8.0
+    assert flown.largest_m < 15.0
+
+
 @pytest.mark.parametrize("name", ["gnss-stale", "beacon-frozen", "ins-frozen"])
 def test_old_numbers_under_new_times_are_told_at_once_and_do_no_harm(name: str) -> None:
     flown = attempt(Order("one-beacon", name, 1))
