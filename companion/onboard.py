@@ -51,6 +51,7 @@ from companion.records import (
     RsbnFix,
     Solution,
     Stamped,
+    Trust,
     Tuning,
 )
 from companion.wire import MAKES, Receiver, Sender, decode, navigation_status
@@ -340,7 +341,8 @@ class Onboard:
         """MAV_STATE for our heartbeat: ACTIVE only while solutions come and can be trusted."""
         if self._solution is None:
             return STANDBY
-        return CRITICAL if self._stale or self._solution.mode is Mode.UNTRUSTED else ACTIVE
+        untrusted = self._solution.mode is Mode.UNTRUSTED or self._solution.trust is Trust.UNTRUSTED
+        return CRITICAL if self._stale or untrusted else ACTIVE
 
     def _tell_if_stale(self, now_ns: int) -> None:
         """When solutions cease, and when they come again: the inertial channel fell silent, or froze."""

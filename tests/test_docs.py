@@ -8,11 +8,15 @@ import pytest
 
 from companion.config import Config, load, parse
 from companion.link.dialect import type_named
-from companion.onboard import wanted
+from companion.onboard import SECOND, wanted
 from companion.profiles import PROFILES, needed
+from companion.records import Mode, Solution, Trust
+from companion.wire.gate import fault
 
 ROOT = Path(__file__).parents[1]
-PAGES = {name: (ROOT / "docs" / f"{name}.md").read_text() for name in ("ardupilot", "px4", "install")}
+PAGES = {
+    name: (ROOT / "docs" / f"{name}.md").read_text() for name in ("ardupilot", "px4", "install", "outputs")
+}
 OVERHEAD = 12  # bytes of a MAVLink 2 frame round its payload
 LACKING = {"ardupilot": {"HIGHRES_IMU"}, "px4": {"RAW_IMU", "EKF_STATUS_REPORT"}}
 MAKES = ("ardupilot", "px4")
@@ -70,6 +74,21 @@ def test_the_bytes_add_up(page: str) -> None:
     if page == "ardupilot":
         others = float(row(page, "ArduPilot's other messages")[1])
         assert (asked + others) / 5760 == pytest.approx(0.8, abs=0.05)  # "four fifths" of 57600 baud
+
+
+@pytest.mark.parametrize("trust", list(Trust))
+def test_what_the_page_says_of_trust_is_what_the_gate_does(trust: Trust) -> None:
+    solution = Solution(
+        SECOND,
+        SECOND,
+        Mode.FIXED,
+        "kalman",
+        *(1.0, 0.5, 800.0, (30.0, 0.0, 0.0), (16.0, 0.0, 0.0, 16.0, 0.0, 9.0)),
+        *((0.0, 0.0), (0.0, 0.0), 0, 0.0),
+        trust=trust,
+    )
+    _, fused, reset = row("outputs", trust.name.lower())
+    assert fused.split(",")[0] == reset == ("withheld" if fault(solution) else "goes out")
 
 
 def test_what_the_page_says_of_the_unit_stands_in_it() -> None:

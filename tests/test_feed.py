@@ -31,9 +31,10 @@ from companion.records import (
     Solution,
     Source,
     SystemTime,
+    Trust,
     Truth,
 )
-from companion.wire import Receiver
+from companion.wire import ENCODERS, Receiver
 
 SECOND, MS = 1_000_000_000, 1_000_000
 START = 5000 * SECOND
@@ -445,6 +446,19 @@ def test_px4_is_told_how_bad_it_is() -> None:
     solution = at(0.0, covariance=(4e4, 0.0, 0.0, 4e4, 0.0, 25.0))
     (m,) = feed.messages(solution, ["GLOBAL_POSITION_SENSOR"], receiver)
     assert m.eph == 200.0
+
+
+@pytest.mark.parametrize("name", sorted(ENCODERS))
+@pytest.mark.parametrize("trust", list(Trust))
+def test_nothing_untrusted_is_fused_or_resets_anything(name: str, trust: Trust) -> None:
+    """The mode is "fixed" all the while, and the autopilot's GPS is gone."""
+    origin = LocalOrigin(1, 1, *ORIGIN, "ardupilot")
+    receiver = Receiver("ardupilot", 1, origin=origin, unix_ns=UTC_S * 10**9)
+    feed = Feed(told("output.profile=ardupilot", "output.switch_sources=false"))
+    feed.heard(Gnss(START, START, 0, 1, 1, *ORIGIN))
+    feed.heard(GlobalPosition(START, START, *ORIGIN, (0.0, 0.0, 0.0), HEIGHT))
+    sent = feed.messages(at(0.5, trust=trust, sigma_velocity=0.5), [name], receiver)
+    assert [m.get_type() for m in sent] == ([] if trust is Trust.UNTRUSTED else [name])
 
 
 def test_each_refusal_of_the_gate_is_counted_by_message_and_reason() -> None:

@@ -1,5 +1,11 @@
-"""The gate before everything that an autopilot may steer by: what passes is finite, fresh, on the earth, and
-where the last one that passed lets it be. No messages, no clock: it judges solutions by their own times.
+"""The gate before everything that an autopilot may steer by: what passes is trusted, finite, fresh, on the
+earth, and where the last one that passed lets it be. No messages, no clock: it judges solutions by their own
+times.
+
+Trust decides before the mode does: with the first fix after a long while without one the mode is fixed, and
+trust comes back only when it has lasted. What is degraded passes, with the sigma of its estimator: that a
+source may lie is no noise, and a filter that is told a greater sigma ten times a second averages the lie to
+the same place a little later. How far it may be off is for NAVIGATION_STATUS to say (trust, protection).
 
 A solution that passes comes out as a `Position`, carried forward by its own velocity to the instant at which
 it is sent, so that no message has to tell an age (ArduPilot cannot be told one over 0.25 s; PX4 takes the
@@ -19,7 +25,7 @@ from collections import Counter
 from typing import NamedTuple
 
 from companion.nav.geometry import displace, wrap
-from companion.records import Event, Mode, Solution, Vector3
+from companion.records import Event, Mode, Solution, Trust, Vector3
 
 SECOND = 1_000_000_000
 OLDEST_S = 1.0
@@ -79,6 +85,8 @@ def fault(solution: Solution) -> str | None:
     age = (s.rx_ns - s.t_ns) * 1e-9
     if s.mode not in (Mode.FIXED, Mode.PREDICTING):
         return f"navigation is {s.mode}"
+    if s.trust is Trust.UNTRUSTED:
+        return "it is not trusted"
     if not all(map(math.isfinite, (s.lat, s.lon, s.alt_msl, *s.v_n, *s.covariance, s.inertial_age_s))):
         return "it is not finite"
     if not (s.t_ns > 0 and 0 < s.rx_ns < 1 << 63 and max(age, s.inertial_age_s) <= OLDEST_S):

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from companion.link import dialect, frame
 from companion.nav.geometry import displace
-from companion.records import LocalOrigin, Mode, Solution, Source
+from companion.records import LocalOrigin, Mode, Solution, Source, Trust
 from companion.wire import ENCODERS, Gate, Position, Receiver, Unsent, Withheld, encode
 from companion.wire.gate import TELL_EVERY, fault
 
@@ -51,6 +51,8 @@ def moved(seconds: float, north: float = 0.0, east: float = 0.0, **changes: Any)
 NEVER: list[tuple[dict[str, Any], str]] = [
     ({"mode": Mode.INITIALISING}, "initialising"),
     ({"mode": Mode.UNTRUSTED}, "untrusted"),
+    ({"mode": Mode.FIXED, "trust": Trust.UNTRUSTED}, "not trusted"),
+    ({"mode": Mode.PREDICTING, "trust": Trust.UNTRUSTED}, "not trusted"),
     ({"lat": NAN}, "finite"),
     ({"lon": INF}, "finite"),
     ({"alt_msl": -INF}, "finite"),
@@ -98,6 +100,11 @@ def test_what_passes_is_what_came_and_carried_to_its_sending() -> None:
     assert (north, east) == pytest.approx((15.0, 2.5), rel=0.01)
     # a turn of 10 m/s^2, unknown for half a second, is 1.25 m
     assert late.covariance == pytest.approx((16.0 + 1.25**2, 2.0, 25.0 + 1.25**2))
+
+
+@pytest.mark.parametrize("trust", [Trust.NORMAL, Trust.DEGRADED, Trust.PREDICTING, None])
+def test_what_is_not_untrusted_passes_with_the_sigma_of_its_estimator(trust: Trust | None) -> None:
+    assert Gate().admit(changed(trust=trust, protection=400.0)) == Gate().admit(GOOD)
 
 
 def test_across_the_antimeridian() -> None:
