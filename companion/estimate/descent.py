@@ -10,9 +10,7 @@ It goes down from one point; which one, and what the minimum is worth, is `fusio
 import math
 from typing import NamedTuple
 
-import numpy as np
-
-from companion.estimate.observations import Array, Linearised, Model, Point
+from companion.estimate.observations import Linearised, Model, Point
 
 _CLEARLY = 1e-9  # pivots whose product over that of the trace is more hide no small eigenvalue
 _DAMPING = 1e-14  # least mu, in traces of F: keeps a step finite along a direction that nothing measures
@@ -58,8 +56,8 @@ def descend(model: Model, p: Point) -> Minimum:
     )
 
 
-def inverse(at: Linearised) -> Array | None:
-    """F^-1 (n, n), m^2; None where some direction may be measured by nothing."""
+def inverse(at: Linearised) -> tuple[tuple[float, ...], ...] | None:
+    """The n rows of F^-1, m^2; None where some direction may be measured by nothing."""
     F = _information(at)
     if at.n == 2:
         F = F._replace(zz=max(F.xx, F.yy))
@@ -69,8 +67,9 @@ def inverse(at: Linearised) -> Array | None:
     f = _factors(F, _DAMPING**2 * trace)
     if not f.dx * f.dy * f.dz > _CLEARLY * trace**3:
         return None
-    columns = _solve(f, 1.0, 0.0, 0.0), _solve(f, 0.0, 1.0, 0.0), _solve(f, 0.0, 0.0, 1.0)
-    return np.array(columns)[: at.n, : at.n]
+    if at.n == 2:
+        return _solve(f, 1.0, 0.0, 0.0)[:2], _solve(f, 0.0, 1.0, 0.0)[:2]
+    return _solve(f, 1.0, 0.0, 0.0), _solve(f, 0.0, 1.0, 0.0), _solve(f, 0.0, 0.0, 1.0)
 
 
 def _step(at: Linearised, mu: float) -> tuple[Point, float]:

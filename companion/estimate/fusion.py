@@ -56,6 +56,7 @@ __all__ = [
     "Height",
     "NoFix",
     "Observation",
+    "Peak",
     "Position",
     "Range",
     "Unobservable",
@@ -63,6 +64,7 @@ __all__ = [
     "cramer_rao",
     "information",
     "maximum_likelihood",
+    "most_likely",
 ]
 
 CONE_OF_SILENCE = math.radians(60.0)
@@ -117,6 +119,14 @@ class Fix(NamedTuple):
         return float(gammaincc(self.degrees_of_freedom / 2.0, self.cost / 2.0))
 
 
+class Peak(NamedTuple):
+    """The most likely position (m), the rows of its covariance (m^2) and the cost, as in `Fix`."""
+
+    position: Point
+    covariance: tuple[tuple[float, ...], ...]
+    cost: float
+
+
 def maximum_likelihood(
     observations: Sequence[Observation], start: npt.ArrayLike | None = None, cone: float = CONE_OF_SILENCE
 ) -> Fix:
@@ -128,13 +138,13 @@ def maximum_likelihood(
     Ambiguous where good observations do not give a position.
     """
     x0 = None if start is None else _start(start)
-    model = Model(observations, x0)
+    model = Model(observations, 2 if x0 is None else len(x0))
     if x0 is None:
         x0 = mean_position(model)
     if x0 is not None and len(x0) != model.n:
         raise ValueError(f"start has {len(x0)} coordinates, the observations {model.n}: give as many")
     model, found = _heard_fix(model, None if x0 is None else model.point(x0), cone)
-    covariance = _invert(model, found.at)
+    covariance = np.array(_invert(model, found.at))
     residuals, shares = model.residuals(found.p)
     return Fix(
         model.place(found.p),
@@ -146,6 +156,12 @@ def maximum_likelihood(
         shares,
         tuple(sorted(model.silent)),
     )
+
+
+def most_likely(observations: Sequence[Observation], start: Point, cone: float = CONE_OF_SILENCE) -> Peak:
+    """The same in space and in plain numbers, for who asks in flight and for no residuals."""
+    model, found = _heard_fix(Model(observations, 3), start, cone)
+    return Peak(found.p, _invert(model, found.at), found.at.cost)
 
 
 def information(
@@ -167,14 +183,14 @@ def cramer_rao(
 
     Raises Unobservable where a direction is not measured.
     """
-    return _invert(*_heard(observations, position, cone))
+    return np.array(_invert(*_heard(observations, position, cone)))
 
 
 def _heard(
     observations: Sequence[Observation], position: npt.ArrayLike, cone: float
 ) -> tuple[Model, Linearised]:
     x = _start(position)
-    model = Model(observations, x)
+    model = Model(observations, len(x))
     p = model.point(x)
     if model.n == 3:
         model = model.without(model.above(p, cone))
@@ -264,16 +280,15 @@ def _apart(p: Point, m: Minimum) -> bool:
     return sum([(a * x + b * y + c * z) ** 2 for _, a, b, c in m.at.rows]) > 9.0
 
 
-def _invert(model: Model, at: Linearised) -> Array:
-    """Covariance F^-1; Unobservable where an eigenvalue of F vanishes against the largest."""
+def _invert(model: Model, at: Linearised) -> tuple[tuple[float, ...], ...]:
+    """Rows of the covariance F^-1; Unobservable where an eigenvalue of F vanishes against the largest."""
     if (found := inverse(at)) is not None:
         return found
     eigenvalues, V = np.linalg.eigh(at.J.T @ at.J)
     blind = eigenvalues <= _OBSERVABLE * eigenvalues[-1]
     if blind.any():
         raise _unobservable(model, V[:, blind])
-    covariance: Array = (V / eigenvalues) @ V.T
-    return covariance
+    return tuple(map(tuple, ((V / eigenvalues) @ V.T).tolist()))
 
 
 def _unobservable(model: Model, N: Array) -> Unobservable:

@@ -211,7 +211,7 @@ def sighted(source: str, z: Azimuth | Range, x: Floats, k: int) -> Measurement |
     aircraft, whitened; None inside the beacon's cone of silence.
     """
     place = (-float(x[1]), -float(x[0]), 0.0)
-    model = Model((z,), np.zeros(3))
+    model = Model((z,), 3)
     if model.above(place, CONE_OF_SILENCE):
         return None
     at = model.at(place)

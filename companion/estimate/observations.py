@@ -170,23 +170,25 @@ class Model:
 
     __slots__ = ("_linear", "n", "observations", "sights", "silent")
 
-    def __init__(self, observations: Sequence[Observation], start: Array | None = None) -> None:
+    def __init__(self, observations: Sequence[Observation], start: int = 2) -> None:
+        """`start`: of how many coordinates the first place to look at is."""
         if not observations:
             raise ValueError("no observations: give at least a Position, or an Azimuth and a Range")
         self.observations = observations
-        self.n = _dimension(observations, start)
+        where = [_where(i, z) for i, z in enumerate(observations)]
+        self.n = max(start, max([3 if place is None else len(place) for place in where]))
         self.sights: list[Sight | None] = []
         self.silent: frozenset[int] = frozenset()
         self._linear: list[tuple[int, Row]] = []  # of which observation, and w where the residual will stand
-        for i, z in enumerate(observations):
+        for i, (z, place) in enumerate(zip(observations, where, strict=True)):
             sight: Sight | None = None
-            if isinstance(z, Position):
-                self._linear += [(i, row) for row in _whitened(i, z)]
-            elif isinstance(z, Height):
+            if isinstance(z, Height):
                 _check(i, z)
                 self._linear.append((i, (z.value / z.sigma, 0.0, 0.0, 1.0 / z.sigma)))
+            elif isinstance(z, Position):
+                self._linear += [(i, row) for row in _whitened(i, z, place or ())]
             else:
-                sight = _sight(i, z, self.n)
+                sight = _sight(i, z, place or (), self.n)
             self.sights.append(sight)
 
     @property
@@ -243,20 +245,31 @@ class Model:
         return tuple(residuals), tuple(shares)
 
 
-def _dimension(observations: Sequence[Observation], start: Array | None) -> int:
-    n = 2 if start is None else len(start)
-    for i, z in enumerate(observations):
-        if isinstance(z, Height):
-            n = 3
-        elif isinstance(z, Position):
-            n = max(n, np.size(z.value))
-        elif isinstance(z, (Azimuth, Range)):
-            n = max(n, np.size(z.beacon))
-        else:
-            raise ValueError(
-                f"observation {i} is a {type(z).__name__}: give Position, Azimuth, Range or Height"
-            )
-    return n
+def _where(i: int, z: Observation) -> tuple[float, ...] | None:
+    """Coordinates of the position or of the beacon; None of a height."""
+    if isinstance(z, Height):
+        return None
+    if isinstance(z, Position):
+        return _vector(z.value)
+    if isinstance(z, Azimuth | Range):
+        return _vector(z.beacon)
+    raise ValueError(f"observation {i} is a {type(z).__name__}: give Position, Azimuth, Range or Height")
+
+
+def _vector(x: npt.ArrayLike) -> tuple[float, ...]:
+    """Plain numbers as they are, anything else made to them; what is no vector has no coordinates."""
+    if isinstance(x, tuple):
+        return x
+    array = np.asarray(x, dtype=float)
+    return tuple(array.tolist()) if array.ndim == 1 else ()
+
+
+def _matrix(x: npt.ArrayLike) -> tuple[tuple[float, ...], ...]:
+    """The same of a matrix, row by row."""
+    if isinstance(x, tuple):
+        return x
+    array = np.asarray(x, dtype=float)
+    return tuple(map(tuple, array.tolist())) if array.ndim == 2 else ()
 
 
 def _name(i: int, z: Observation) -> str:
@@ -270,79 +283,88 @@ def _check(i: int, z: Azimuth | Range | Height) -> None:
         raise ValueError(f"{_name(i, z)}: sigma is {z.sigma}; it must be positive and finite")
 
 
-def _whitened(i: int, z: Position) -> list[Row]:
+def _whitened(i: int, z: Position, x: tuple[float, ...]) -> list[Row]:
     """The rows of W x = W value, W^T W = covariance^-1."""
-    value = np.asarray(z.value, dtype=float)
-    C = np.asarray(z.covariance, dtype=float)
-    if value.shape not in ((2,), (3,)) or C.shape != 2 * value.shape:
+    n, C = len(x), _matrix(z.covariance)
+    if n not in (2, 3) or [len(row) for row in C] != [n] * n:
         raise ValueError(
-            f"{_name(i, z)}: value has shape {value.shape} and covariance {C.shape};"
+            f"{_name(i, z)}: value has shape {np.shape(z.value)} and covariance {np.shape(z.covariance)};"
             " they must be (2,) and (2, 2), or (3,) and (3, 3)"
         )
-    x, rows = value.tolist(), C.tolist()
     if not all(map(math.isfinite, x)):
-        raise ValueError(f"{_name(i, z)}: value {value} is not finite; leave it out")
-    scale = max([abs(c) for row in rows for c in row])
-    off = max([abs(rows[j][k] - rows[k][j]) for k in range(len(x)) for j in range(k)])
+        raise ValueError(f"{_name(i, z)}: value {list(x)} is not finite; leave it out")
+    scale = max([abs(c) for row in C for c in row])
+    off = max([abs(C[j][k] - C[k][j]) for k in range(n) for j in range(k)])
     if not (math.isfinite(scale) and off <= 1e-9 * scale):
-        raise ValueError(f"{_name(i, z)}: covariance must be finite and symmetric, it is {rows}")
-    W = _whitener(rows)
+        raise ValueError(f"{_name(i, z)}: covariance must be finite and symmetric, it is {C}")
+    W = _whitener(C)
     if W is None:
         raise ValueError(
             f"{_name(i, z)}: covariance is not positive definite (eigenvalues"
             f" {np.linalg.eigvalsh(C).tolist()}); give every axis a positive variance"
         )
-    return [
-        (sum([a * b for a, b in zip(w, x, strict=True)]), w[0], w[1], w[2] if len(x) == 3 else 0.0) for w in W
-    ]
+    if n == 2:
+        return [(a * x[0] + b * x[1], a, b, 0.0) for a, b in W]
+    return [(a * x[0] + b * x[1] + c * x[2], a, b, c) for a, b, c in W]
 
 
-def _whitener(C: list[list[float]]) -> list[list[float]] | None:
+def _whitener(C: tuple[tuple[float, ...], ...]) -> list[tuple[float, ...]] | None:
     """W with W C W^T = I, the unit vectors made orthonormal under C one after the other; None if it cannot be
-    done."""
-    W: list[list[float]] = []
-    for i, column in enumerate(C):
-        along = [sum([a * b for a, b in zip(w, column, strict=True)]) for w in W]
-        rest = column[i] - sum([c * c for c in along])
-        if not rest > 0.0:
-            return None
-        e = [float(k == i) - sum([c * w[k] for c, w in zip(along, W, strict=True)]) for k in range(len(C))]
-        W.append([c / math.sqrt(rest) for c in e])
-    return W
+    done.
+    """
+    xx, xy, yy = C[0][0], C[0][1], C[1][1]
+    if not xx > 0.0:
+        return None
+    u = 1.0 / math.sqrt(xx)
+    yx = xy / xx
+    rest = yy - yx * xy
+    if not rest > 0.0:
+        return None
+    v = 1.0 / math.sqrt(rest)
+    if len(C) == 2:
+        return [(u, 0.0), (-v * yx, v)]
+    (_, _, xz), (_, _, yz), (_, _, zz) = C
+    zy = (yz - yx * xz) / rest
+    zx = xz / xx - yx * zy
+    rest = zz - zx * xz - zy * yz
+    if not rest > 0.0:
+        return None
+    w = 1.0 / math.sqrt(rest)
+    return [(u, 0.0, 0.0), (-v * yx, v, 0.0), (-w * zx, -w * zy, w)]
 
 
-def _sight(i: int, z: Azimuth | Range, n: int) -> Sight:
+def _sight(i: int, z: Azimuth | Range, beacon: tuple[float, ...], n: int) -> Sight:
     _check(i, z)
-    b = np.asarray(z.beacon, dtype=float)
-    if b.shape != (n,):
+    if len(beacon) != n or n > 3:
         raise ValueError(
-            f"{_name(i, z)}: beacon has shape {b.shape} in a problem of {n} dimensions; give {n} coordinates"
+            f"{_name(i, z)}: beacon has shape {np.shape(z.beacon)} in a problem of {n} dimensions;"
+            f" give {min(n, 3)} coordinates"
         )
-    beacon = (float(b[0]), float(b[1]), float(b[2]) if n == 3 else 0.0)
-    if not math.isfinite(sum(beacon)):
+    place = (beacon[0], beacon[1], beacon[2] if n == 3 else 0.0)
+    if not math.isfinite(sum(place)):
         raise ValueError(f"{_name(i, z)}: beacon {beacon} is not finite")
     if isinstance(z, Range):
         if z.value < 0.0:
             raise ValueError(f"{_name(i, z)}: value is {z.value} m; a range is not negative")
-        return _Slant(beacon, float(z.value), float(z.sigma))
-    axes = None
-    if z.axes is not None:
-        C = np.asarray(z.axes, dtype=float)
-        if n != 3 or C.shape != (3, 3) or not _orthonormal(C.tolist()):
-            raise ValueError(
-                f"{_name(i, z)}: axes must be a (3, 3) rotation, and the problem of three dimensions"
-            )
-        e, nn, u = C.tolist()
-        axes = (tuple(e), tuple(nn), tuple(u))
-    return _Bearing(beacon, float(z.value), float(z.sigma), axes)
+        return _Slant(place, z.value, z.sigma)
+    if z.axes is None:
+        return _Bearing(place, z.value, z.sigma, None)
+    C = _matrix(z.axes)
+    if n != 3 or [len(row) for row in C] != [3] * 3 or not _orthonormal(*C):
+        raise ValueError(
+            f"{_name(i, z)}: axes must be a (3, 3) rotation, and the problem of three dimensions"
+        )
+    (xe, ye, ze), (xn, yn, zn), (xu, yu, zu) = C
+    return _Bearing(place, z.value, z.sigma, ((xe, ye, ze), (xn, yn, zn), (xu, yu, zu)))
 
 
-def _orthonormal(C: list[list[float]]) -> bool:
+def _orthonormal(e: tuple[float, ...], n: tuple[float, ...], u: tuple[float, ...]) -> bool:
     """Whether the rows are unit vectors at right angles; NaN are not."""
-    return all(
-        [
-            abs(sum([a * b for a, b in zip(C[i], C[j], strict=True)]) - (i == j)) <= 1e-6
-            for i in range(3)
-            for j in range(i + 1)
-        ]
+    return (
+        abs(e[0] * e[0] + e[1] * e[1] + e[2] * e[2] - 1.0) <= 1e-6
+        and abs(n[0] * n[0] + n[1] * n[1] + n[2] * n[2] - 1.0) <= 1e-6
+        and abs(u[0] * u[0] + u[1] * u[1] + u[2] * u[2] - 1.0) <= 1e-6
+        and abs(e[0] * n[0] + e[1] * n[1] + e[2] * n[2]) <= 1e-6
+        and abs(e[0] * u[0] + e[1] * u[1] + e[2] * u[2]) <= 1e-6
+        and abs(n[0] * u[0] + n[1] * u[1] + n[2] * u[2]) <= 1e-6
     )

@@ -15,6 +15,7 @@ from companion.nav.earth import E2, A, radii
 
 Vector = npt.NDArray[np.float64]
 Matrix = npt.NDArray[np.float64]
+Triple = tuple[float, float, float]
 Projection = Literal["ardupilot", "px4", "tangent"]
 
 _ARDUPILOT_R = 0.011131884502145034 * math.degrees(1e7)
@@ -50,10 +51,15 @@ def wrap(angle: float) -> float:
 
 def to_ecef(point: Geodetic) -> Vector:
     """Geodetic to ECEF, m: Groves (2.112)."""
+    return np.array(ecef(point))
+
+
+def ecef(point: Geodetic) -> Triple:
+    """The same in plain numbers."""
     lat, lon, alt = point
     R_E = radii(lat).R_E
     rho = (R_E + alt) * math.cos(lat)
-    return np.array([rho * math.cos(lon), rho * math.sin(lon), ((1.0 - E2) * R_E + alt) * math.sin(lat)])
+    return rho * math.cos(lon), rho * math.sin(lon), ((1.0 - E2) * R_E + alt) * math.sin(lat)
 
 
 def from_ecef(r_e: Vector) -> Geodetic:
@@ -84,8 +90,13 @@ def from_ecef(r_e: Vector) -> Geodetic:
 
 def enu_axes(lat: float, lon: float) -> Matrix:
     """C_e^enu (3, 3): its rows are the east, north and up axes at (lat, lon) in ECEF."""
+    return np.array(east_north_up(lat, lon))
+
+
+def east_north_up(lat: float, lon: float) -> tuple[Triple, Triple, Triple]:
+    """The same in plain numbers."""
     sl, cl, so, co = math.sin(lat), math.cos(lat), math.sin(lon), math.cos(lon)
-    return np.array([[-so, co, 0.0], [-sl * co, -sl * so, cl], [cl * co, cl * so, sl]])
+    return (-so, co, 0.0), (-sl * co, -sl * so, cl), (cl * co, cl * so, sl)
 
 
 def to_enu(point: Geodetic, origin: Geodetic) -> Vector:

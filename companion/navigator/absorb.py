@@ -11,15 +11,15 @@ from collections.abc import Callable
 
 import numpy as np
 
-from companion.estimate.fusion import Position
 from companion.records import Gnss, Rejection, RsbnFix, Vector3
 
 from . import errorstate, guarantee, inertial, radio, windjumps
 from .carry import FIXES, Carry, Settings, Step, sources, state_at
-from .errorstate import ErrorState, Floats
+from .errorstate import Belief, ErrorState, Floats
 from .inertial import Point
 from .winderror import WindError
 
+NEAR_S = 0.25
 BOUND_GATE = 3.0  # a fix within this many guaranteed r.m.s. of the prediction is believed after an outage
 
 
@@ -31,7 +31,7 @@ def position(
     The first fix is believed, and while predicting one within the guaranteed bound is, whatever the Gaussian
     state claims: then it is the claim that was wrong, and it is widened.
     """
-    state, factor = state_at(carry, ins, settings), 1.0
+    state, H, factor = *_sees(carry, ins, H, isinstance(record, RsbnFix), settings), 1.0
     after, cost, _ = _fused(state, heard, H, settings)
     limit = settings.gate[radio.freedom(heard)]
     carry = carry._replace(innovation=cost if radio.freedom(heard) == 2 else None)
@@ -51,21 +51,30 @@ def position(
     return _weighed(carry, ins, after, each, settings), []
 
 
+def _sees(carry: Carry, ins: Point, H: Floats, coarse: bool, settings: Settings) -> tuple[ErrorState, Floats]:
+    """The error state for a fix at the time of `ins`, and how that sees it.
+
+    A `coarse` fix a moment later changes the state where it stands: what noise comes in of meanwhile is far
+    below its own, and the solution that waits for it is not of a later time either.
+    """
+    state = carry.state
+    if coarse and state is not None and not isinstance(settings.unit, WindError):
+        dt = (ins.t_ns - state.t_ns) * 1e-9
+        if 0.0 <= dt <= NEAR_S:
+            return state, errorstate.carried(H, dt, ins.v_n, settings.unit)
+    return state_at(carry, ins, settings), H
+
+
 def _fused(
     state: ErrorState, heard: radio.Heard, H: Floats, settings: Settings
 ) -> tuple[ErrorState, float, float]:
     """The state with what was heard of H x, the chi-square of that, and the logarithm of its likelihood, but
     for what is the same whatever the state was.
     """
-    prior = _prior(state, H, settings)
-    found = radio.innovation(heard, prior)
-    mean = -found.position[1::-1]  # the place in the plane is minus the error; x east, y north
-    covariance = found.covariance[1::-1, 1::-1]
-    gained = _determinant(covariance) / _determinant(
-        np.asarray(prior.covariance)
-    )  # that of R over that of H P H' + R
-    after = errorstate.absorb_position(state, H, mean, covariance)
-    return after, found.cost, 0.5 * (math.log(gained) - found.cost)
+    before = errorstate.seen(state, H)
+    found, cost = radio.innovation(heard, before.belief, settings.config.inertial.height_sigma_m)
+    gained = _area(found) / _area(before.belief)  # that of R over that of H P H' + R
+    return errorstate.absorb_position(state, before, found), cost, 0.5 * (math.log(gained) - cost)
 
 
 def _weighed(
@@ -86,10 +95,10 @@ def _weighed(
     return carry._replace(state=windjumps.moments(jumps), jumps=jumps)
 
 
-def _determinant(P: Floats) -> float:
-    """Of the horizontal part."""
-    (a, b), (_, d) = P[:2, :2].tolist()
-    return float(a * d - b * b)
+def _area(belief: Belief) -> float:
+    """Determinant of its covariance."""
+    nn, ne, ee = belief.covariance
+    return nn * ee - ne * ne
 
 
 def _within_bound(carry: Carry, heard: radio.Heard, settings: Settings) -> bool:
@@ -101,10 +110,10 @@ def _within_bound(carry: Carry, heard: radio.Heard, settings: Settings) -> bool:
     _, promise = guarantee.bounded(carry.guarantee, heard.t_ns, settings.config.predictor)
     if promise is None:
         return False
-    (north, east), (bound_n, bound_e) = promise.error_n, promise.bound_n
+    bound_n, bound_e = promise.bound_n
     height = settings.config.inertial.height_sigma_m
-    wide = Position(np.array([-east, -north, 0.0]), np.diag([bound_e**2, bound_n**2, height**2]))
-    return radio.innovation(heard, wide).cost <= BOUND_GATE**2
+    wide = Belief(promise.error_n, (bound_n**2, 0.0, bound_e**2))
+    return radio.innovation(heard, wide, height)[1] <= BOUND_GATE**2
 
 
 def _by_a_jump(carry: Carry, state: ErrorState, heard: radio.Heard, H: Floats, settings: Settings) -> bool:
@@ -136,21 +145,12 @@ def velocity(carry: Carry, record: Gnss, v_n: Vector3, ins: Point, settings: Set
     def each(state: ErrorState) -> tuple[ErrorState, float]:
         after, nis = errorstate.absorb_velocity(state, H, np.array(error), sigma)
         S = H @ state.P @ H.T + sigma**2 * np.eye(2)
-        return after, -0.5 * (nis + math.log(_determinant(S)))
+        return after, -0.5 * (nis + math.log(float(np.linalg.det(S))))
 
     g = carry.guarantee
     if settings.config.predictor.learn_velocity:
         g = guarantee.learn(g, record.t_ns, "velocity", error, (sigma, sigma), settings.config.predictor)
     return _weighed(carry._replace(guarantee=g), ins, after, each, settings)
-
-
-def _prior(state: ErrorState, H: Floats, settings: Settings) -> Position:
-    """Where the error state has the aircraft, as an observation in the plane at the INS."""
-    covariance = np.zeros((3, 3))
-    covariance[:2, :2] = (H @ state.P @ H.T)[::-1, ::-1]
-    covariance[2, 2] = settings.config.inertial.height_sigma_m**2
-    north, east = (H @ state.x).tolist()
-    return Position(np.array([-east, -north, 0.0]), covariance)
 
 
 def _rejected(record: Gnss | RsbnFix, reason: str, value: float, limit: float) -> Rejection:

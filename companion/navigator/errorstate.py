@@ -48,6 +48,24 @@ class ErrorState(NamedTuple):
     P: Floats
 
 
+VELOCITY_ROWS = np.eye(2, N, 2)
+VELOCITY_ROWS.setflags(write=False)
+
+
+class Belief(NamedTuple):
+    """The position error: north, east (m), and its covariance, north, north-east, east (m^2)."""
+
+    error_n: Vector2
+    covariance: Vector3
+
+
+class Seen(NamedTuple):
+    """What a fix sees of the state, H x, as `belief`; H P (2, N) ties it to all that is not seen."""
+
+    belief: Belief
+    HP: Floats
+
+
 class System(NamedTuple):
     """x' = A x + w, w white of spectral density Q; both (n, n)."""
 
@@ -102,7 +120,7 @@ class Grade(NamedTuple):
 
     def velocity_rows(self, v_n: Vector3) -> Floats:
         """The velocity errors are states."""
-        return np.eye(2, N, 2)
+        return VELOCITY_ROWS
 
 
 def grade(settings: Inertial, gnss: GnssSection) -> Grade:
@@ -181,16 +199,31 @@ def transition(dt: float, system: System) -> tuple[Floats, Floats]:
     return Phi, 0.5 * dt * (system.Q + Phi @ system.Q @ Phi.T)
 
 
-def absorb_position(state: ErrorState, H: Floats, mean: Floats, covariance: Floats) -> ErrorState:
-    """The state once fusion has turned H x (2,) into `mean` (2,) with `covariance` (2, 2), m north, east.
-
-    K = P H' (H P H')^-1 carries the change to every state; with nothing learnt it changes nothing.
-    """
+def seen(state: ErrorState, H: Floats) -> Seen:
+    """What a fix of H x (2,) sees."""
     HP = H @ state.P
-    S = HP @ H.T
-    K = _over(HP, S)
-    x = state.x + K @ (mean - H @ state.x)
-    P = state.P - K @ (S - covariance) @ K.T
+    north, east = (H @ state.x).tolist()
+    (nn, ne), (_, ee) = (HP @ H.T).tolist()
+    return Seen(Belief((north, east), (nn, ne, ee)), HP)
+
+
+def absorb_position(state: ErrorState, before: Seen, found: Belief) -> ErrorState:
+    """The state once fusion has turned what is seen of it from `before` into `found`.
+
+    K = P H' S^-1, S = H P H', carries the change to every state: x + K (change of H x), P - K (S - C) K'
+    with the covariance C found. With nothing learnt it changes nothing. ZeroDivisionError if S is singular.
+    """
+    (was_n, was_e), (nn, ne, ee) = before.belief
+    (now_n, now_e), (c_nn, c_ne, c_ee) = found
+    part = 1.0 / (nn * ee - ne * ne)
+    i, j, k = ee * part, -ne * part, nn * part  # S^-1
+    n, e = now_n - was_n, now_e - was_e
+    a, b, d = nn - c_nn, ne - c_ne, ee - c_ee
+    p, q, r, s = i * a + j * b, i * b + j * d, j * a + k * b, j * b + k * d  # S^-1 (S - C)
+    cross = p * j + q * k
+    lost = np.array(((p * i + q * j, cross), (cross, r * j + s * k)))  # S^-1 (S - C) S^-1
+    x = state.x + np.array((i * n + j * e, j * n + k * e)) @ before.HP
+    P = state.P - before.HP.T @ (lost @ before.HP)
     return ErrorState(state.t_ns, x, 0.5 * (P + P.T))
 
 
@@ -220,8 +253,8 @@ def is_sound(state: ErrorState | None) -> bool:
     """Whether the numbers are numbers and no variance is negative."""
     if state is None:
         return True
-    variances = state.P.diagonal()
-    return bool(np.isfinite(state.x).all() and np.isfinite(state.P).all() and (variances >= 0.0).all())
+    squares = float(state.x @ state.x) + float(np.vdot(state.P, state.P))  # one that is no number spoils it
+    return math.isfinite(squares) and bool(state.P.diagonal().min() >= 0.0)
 
 
 def shift(state: ErrorState, north: float, east: float, v_n: Vector2 | None = None) -> ErrorState:
@@ -243,6 +276,11 @@ def blur(state: ErrorState, sigma: float, sigma_v: float = 0.0) -> ErrorState:
     P[POSITION, POSITION] += sigma**2 * np.eye(2)
     P[VELOCITY, VELOCITY] += sigma_v**2 * np.eye(2)
     return state._replace(P=P)
+
+
+def carried(H: Floats, dt: float, v_n: Vector3, unit: ErrorModel) -> Floats:
+    """H of what is seen `dt` seconds after the state: the position error has moved on by its velocity."""
+    return H + dt * unit.velocity_rows(v_n)
 
 
 def widen(state: ErrorState, factor: float) -> ErrorState:

@@ -12,16 +12,14 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from companion.config import GnssSection, Rsbn
-from companion.estimate.fusion import Azimuth, Fix, Observation, Position, Range, maximum_likelihood
-from companion.nav.geometry import Geodetic, enu_axes, from_enu, separation, to_ecef
+from companion.estimate.fusion import Azimuth, Height, Observation, Position, Range, most_likely
+from companion.nav.geometry import Geodetic, Triple, east_north_up, ecef, from_enu, separation
 from companion.records import Gnss, RsbnFix, Source
 
+from .errorstate import Belief
 from .inertial import Point
-
-Floats = npt.NDArray[np.float64]
 
 
 class Heard(NamedTuple):
@@ -35,8 +33,8 @@ class Heard(NamedTuple):
 def from_gnss(record: Gnss, ins: Point, settings: GnssSection, drifting: bool = False) -> Heard:
     """A GNSS fix as a horizontal position at the INS; if `drifting`, with its white noise alone."""
     sigma = white_sigma(record, settings) if drifting else _stated(record, settings)
-    north, east, _ = separation(Geodetic(record.lat, record.lon, record.alt_msl), ins.position)
-    place = Position(np.array([east, north]), sigma**2 * np.eye(2))
+    north, east, _ = separation(Geodetic(record.lat, record.lon, record.alt_msl), ins.position).tolist()
+    place = Position((east, north), ((sigma**2, 0.0), (0.0, sigma**2)))
     return Heard(record.t_ns, (place,), Source.GNSS)
 
 
@@ -53,14 +51,16 @@ def _stated(record: Gnss, settings: GnssSection) -> float:
 def from_rsbn(record: RsbnFix, ins: Point, settings: Rsbn) -> Heard:
     """A beacon's azimuth and slant range, whichever are there, with the floors of the configuration."""
     here = ins.position
-    r_beacon, axes_beacon = _on_earth(record.lat, record.lon, record.alt)
-    axes = enu_axes(here.lat, here.lon)
-    place = axes @ (r_beacon - to_ecef(here))
+    (x, y, z), axes_beacon = _on_earth(record.lat, record.lon, record.alt)
+    x_0, y_0, z_0 = ecef(here)
+    axes = east_north_up(here.lat, here.lon)
+    place = _times(axes, (x - x_0, y - y_0, z - z_0))
     observations: list[Observation] = []
     sources = Source(0)
     if record.azimuth is not None:
         sigma = max(record.sigma_azimuth, math.radians(settings.sigma_azimuth_deg))
-        observations.append(Azimuth(place, record.azimuth, sigma, axes_beacon @ axes.T))
+        turned = tuple([_times(axes, axis) for axis in axes_beacon])  # C_e^b C_enu^e, row by row
+        observations.append(Azimuth(place, record.azimuth, sigma, turned))
         sources |= Source.AZIMUTH
     if record.slant_range is not None:
         floor = settings.sigma_range_m + 0.01 * settings.sigma_range_percent * record.slant_range
@@ -70,9 +70,15 @@ def from_rsbn(record: RsbnFix, ins: Point, settings: Rsbn) -> Heard:
 
 
 @lru_cache(maxsize=64)
-def _on_earth(lat: float, lon: float, alt: float) -> tuple[Floats, Floats]:
-    """Of a beacon, which stays where it is: ECEF position (3,) and axes east, north, up (3, 3)."""
-    return to_ecef(Geodetic(lat, lon, alt)), enu_axes(lat, lon)
+def _on_earth(lat: float, lon: float, alt: float) -> tuple[Triple, tuple[Triple, Triple, Triple]]:
+    """Of a beacon, which stays where it is: ECEF position and axes east, north, up."""
+    return ecef(Geodetic(lat, lon, alt)), east_north_up(lat, lon)
+
+
+def _times(C: tuple[Triple, Triple, Triple], v: Triple) -> Triple:
+    (a, b, c), (d, e, f), (g, h, i) = C
+    x, y, z = v
+    return a * x + b * y + c * z, d * x + e * y + f * z, g * x + h * y + i * z
 
 
 def place(record: RsbnFix, alt: float) -> Geodetic | None:
@@ -86,9 +92,17 @@ def place(record: RsbnFix, alt: float) -> Geodetic | None:
     return from_enu(np.array([east, north, up]), beacon)._replace(alt=alt)
 
 
-def innovation(heard: Heard, prior: Position) -> Fix:
-    """The most likely place with the INS as one more observation; its cost is the gate's chi-square."""
-    return maximum_likelihood((prior, *heard.observations), start=np.asarray(prior.value))
+def innovation(heard: Heard, prior: Belief, height_sigma: float) -> tuple[Belief, float]:
+    """The most likely error with what is believed of it as one more observation, and the gate's chi-square:
+    the cost. The height is the INS's, within its sigma.
+    """
+    (north, east), (nn, ne, ee) = prior
+    # the place in the plane is minus the error; x east, y north
+    before = Position((-east, -north), ((ee, ne), (ne, nn)))
+    found = most_likely((before, Height(0.0, height_sigma), *heard.observations), (-east, -north, 0.0))
+    x, y, _ = found.position
+    (ee, ne, _), (_, nn, _), _ = found.covariance
+    return Belief((-y, -x), (nn, ne, ee)), found.cost
 
 
 def freedom(heard: Heard) -> int:
