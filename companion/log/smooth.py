@@ -137,7 +137,6 @@ def _forward(records: Iterable[Stamped], config: Config) -> list[_Stop]:
         # no solutions, which would predict at moments of their own, and no bounds ahead: the stops are ours
         carry = carry._replace(next_ns=NEVER_NS, next_ahead_ns=NEVER_NS)
         before = carry.state
-        before = carry.state
         carry, _ = learnt(carry, settings)
         if carry.state is not before and carry.watch is not None:
             parted = parted or not watch.excluded(carry.watch, INERTIAL)
@@ -145,21 +144,17 @@ def _forward(records: Iterable[Stamped], config: Config) -> list[_Stop]:
             last = stops.pop()  # a source was left out, and what it had said before that fix with it
             renewed = _corrected(last, carry.state)
             stops.append(renewed._replace(widened=last.widened * renewed.widened))
-        after, outputs = stepped(carry, record, settings)
-        stop = None
         if isinstance(record, Gnss | RsbnFix):
-            ins = inertial.at(after.track, record.t_ns)
-            if ins is not None and after.state is not None and after.state is not carry.state:
-                refused = any(isinstance(output, Rejection) for output in outputs)
-                stop = _arrival(carry._replace(track=after.track), ins, since, settings)
-                stop = stop if refused else _corrected(stop, after.state)
-        elif after.state is not None and after.track:
-            if carry.state is not None and after.state is not carry.state:
-                moved, blurred = after.state.x - carry.state.x, after.state.P - carry.state.P
-                since = since._replace(x=since.x + moved, P=since.P + blurred)
-            if not stops or after.track[-1].t_ns >= stops[-1].ins.t_ns + EVERY_NS:
-                stop = _arrival(after, after.track[-1], since, settings)
-                after = after._replace(state=stop.state)
+            after, stop = _fixed(carry, record, since, settings)
+        else:
+            after, stop = stepped(carry, record, settings)[0], None
+            if after.state is not None and after.track:
+                if carry.state is not None and after.state is not carry.state:
+                    moved, blurred = after.state.x - carry.state.x, after.state.P - carry.state.P
+                    since = since._replace(x=since.x + moved, P=since.P + blurred)
+                if not stops or after.track[-1].t_ns >= stops[-1].ins.t_ns + EVERY_NS:
+                    stop = _arrival(after, after.track[-1], since, settings)
+                    after = after._replace(state=stop.state)
         if stop is not None:
             stop = stop._replace(ins=level(stop.ins, after), Phi=None if parted else stop.Phi)
             _append(stops, stop, since)
@@ -170,6 +165,28 @@ def _forward(records: Iterable[Stamped], config: Config) -> list[_Stop]:
         end = _arrival(carry, carry.track[-1], since, settings)
         stops.append(end._replace(ins=level(end.ins, carry)))
     return stops
+
+
+def _fixed(
+    carry: Carry, record: Gnss | RsbnFix, since: ErrorState, settings: Settings
+) -> tuple[Carry, _Stop | None]:
+    """After a fix, for which the state is carried to its time; no stop where it was not used."""
+    ins = inertial.at(carry.track, record.t_ns)
+    if ins is None or carry.state is None:
+        after, _ = stepped(carry, record, settings)
+        ins = inertial.at(after.track, record.t_ns)
+        if ins is None or after.state is None:
+            return after, None
+        return after, _corrected(
+            _arrival(carry._replace(track=after.track), ins, since, settings), after.state
+        )
+    stop = _arrival(carry, ins, since, settings)
+    after, outputs = stepped(carry._replace(state=stop.state), record, settings)
+    if after.state is not stop.state and after.state is not None:
+        return after, _corrected(stop, after.state)
+    if any(isinstance(output, Rejection) for output in outputs):
+        return after, stop
+    return after._replace(state=carry.state), None
 
 
 def _spread(stops: list[_Stop], P: Floats) -> None:

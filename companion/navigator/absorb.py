@@ -19,7 +19,6 @@ from .errorstate import Belief, ErrorState, Floats
 from .inertial import Point
 from .winderror import WindError
 
-NEAR_S = 0.25
 BOUND_GATE = 3.0  # a fix within this many guaranteed r.m.s. of the prediction is believed after an outage
 
 
@@ -60,7 +59,7 @@ def _sees(carry: Carry, ins: Point, H: Floats, coarse: bool, settings: Settings)
     state = carry.state
     if coarse and state is not None and not isinstance(settings.unit, WindError):
         dt = (ins.t_ns - state.t_ns) * 1e-9
-        if 0.0 <= dt <= NEAR_S:
+        if 0.0 <= dt <= errorstate.NEAR_S:
             return state, errorstate.carried(H, dt, ins.v_n, settings.unit)
     return state_at(carry, ins, settings), H
 

@@ -11,7 +11,7 @@ from companion.estimate.integrity import INERTIAL
 from companion.nav.geometry import displace
 from companion.records import Event, Mode, Solution, Source, Vector2, Vector3
 
-from . import guarantee, restricted, watch
+from . import errorstate, guarantee, restricted, watch
 from .carry import FIXES, Carry, Settings, Step, level, sources, state_at
 from .errorstate import ErrorState, Floats
 from .guarantee import Bounded
@@ -39,19 +39,21 @@ def solve(carry: Carry, rx_ns: int, settings: Settings) -> Step:
     config = settings.config
     ins = level(carry.track[-1], carry)
     t_ns = ins.t_ns
-    state = state_at(carry, ins, settings)
+    state, dt = carry.state, max(0.0, (t_ns - carry.state.t_ns) * 1e-9)
+    if dt > errorstate.NEAR_S:
+        state, dt = state_at(carry, ins, settings), 0.0
     promise, bounded = guarantee.bounded(carry.guarantee, t_ns, config.predictor)
     if t_ns >= carry.next_ahead_ns:
         bounds = guarantee.ahead(promise, t_ns, config.predictor)
         carry = carry._replace(ahead=bounds, next_ahead_ns=t_ns + AHEAD_NS)
-    mode = _mode(carry, bounded, t_ns, settings)
-    candidates = _candidates(carry, state, bounded, ins, settings)
+    rests_on = sources(carry, t_ns, settings)
+    fixes = rests_on & FIXES
+    candidates = _candidates(carry, state, dt, bounded, ins, settings)
     watched = carry.watch and carry.watch.protection
     leads = settings.config.leading
     if leads == "minimax" and watched and bounded and math.hypot(*bounded.bound_n) > watched.level:
         leads = "kalman"  # little is left to predict from: what was learnt of an excluded source is gone
-    fixed = sources(carry, t_ns, settings) & (Source.GNSS if leads == "restrictive" else FIXES)
-    if fixed or leads not in candidates:
+    if (rests_on & Source.GNSS if leads == "restrictive" else fixes) or leads not in candidates:
         leads = "kalman"
     error, velocity_error, (var_n, cov, var_e), velocity_variance = candidates[leads]
     north, east, down = ins.v_n
@@ -60,12 +62,12 @@ def solve(carry: Carry, rx_ns: int, settings: Settings) -> Step:
     if carry.watch is not None and watched is not None:
         # of the monitor's full solution; another one is off by no more than its distance from that besides
         protection = watched.level + math.dist(error, watch.error_at(carry.watch, ins, settings.unit))
-    held = _trust(carry, bounded, protection, t_ns, settings)
+    held = _trust(carry, bool(fixes), bounded, protection, t_ns, settings)
     last = max((t for t in (carry.gnss_ns, carry.rsbn_ns) if t is not None), default=t_ns)
     solution = Solution(
         t_ns,
         rx_ns,
-        mode,
+        _mode(bool(fixes), bounded, settings),
         leads,
         lat,
         lon,
@@ -74,7 +76,7 @@ def solve(carry: Carry, rx_ns: int, settings: Settings) -> Step:
         (var_n, cov, 0.0, var_e, 0.0, carry.level.variance),
         error,
         velocity_error,
-        int(sources(carry, t_ns, settings)),
+        int(rests_on),
         max(0.0, (t_ns - last) * 1e-9),
         bounded and bounded.bound_n,
         bounded and bounded.velocity_bound_n,
@@ -90,13 +92,14 @@ def solve(carry: Carry, rx_ns: int, settings: Settings) -> Step:
 
 
 def _candidates(
-    carry: Carry, state: ErrorState, bounded: Bounded | None, ins: Point, settings: Settings
+    carry: Carry, state: ErrorState, dt: float, bounded: Bounded | None, ins: Point, settings: Settings
 ) -> dict[str, _Estimate]:
-    """What each estimator that runs says of the channel's error."""
-    H = settings.unit.velocity_rows(ins.v_n)
-    (dx, dy), (dv_n, dv_e) = state.x[:2].tolist(), (H @ state.x).tolist()
-    variance = float(((H @ state.P) * H).sum(axis=1).max())
-    found = {"kalman": _Estimate((dx, dy), (dv_n, dv_e), _triangle(state.P), max(variance, 0.0))}
+    """What each estimator that runs says of the channel's error; the state is `dt` seconds old."""
+    unit = settings.unit
+    place = errorstate.seen(state, errorstate.carried(errorstate.beacon_rows(unit), dt, ins.v_n, unit)).belief
+    motion = errorstate.seen(state, unit.velocity_rows(ins.v_n)).belief
+    variance = max(motion.covariance[0], motion.covariance[2], 0.0)
+    found = {"kalman": _Estimate(place.error_n, motion.error_n, place.covariance, variance)}
     if bounded is not None:
         variances = (bounded.bound_n[0] ** 2, 0.0, bounded.bound_n[1] ** 2)
         variance = max(bounded.velocity_bound_n) ** 2
@@ -120,8 +123,8 @@ def _disagreement(candidates: dict[str, _Estimate]) -> float | None:
     return max((math.dist(a, b) for a, b in pairs), default=None)
 
 
-def _mode(carry: Carry, bounded: Bounded | None, t_ns: int, settings: Settings) -> Mode:
-    if sources(carry, t_ns, settings) & FIXES:
+def _mode(fixes: bool, bounded: Bounded | None, settings: Settings) -> Mode:
+    if fixes:
         return Mode.FIXED
     if bounded is None or math.hypot(*bounded.bound_n) > settings.config.predictor.limit_m:
         return Mode.UNTRUSTED
@@ -129,10 +132,15 @@ def _mode(carry: Carry, bounded: Bounded | None, t_ns: int, settings: Settings) 
 
 
 def _trust(
-    carry: Carry, bounded: Bounded | None, protection: float | None, t_ns: int, settings: Settings
+    carry: Carry,
+    fixes: bool,
+    bounded: Bounded | None,
+    protection: float | None,
+    t_ns: int,
+    settings: Settings,
 ) -> trust.Held:
     """How far the output can be trusted."""
-    fixes, w = bool(sources(carry, t_ns, settings) & FIXES), carry.watch
+    w = carry.watch
     suspicion = w is not None and (w.monitor.unresolved or bool(w.exclusions))
     inertial = watch.excluded(w, INERTIAL)
     bound = None if bounded is None or inertial else math.hypot(*bounded.bound_n)
