@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterable
-from typing import Any, Protocol
+from typing import Any
 
 from companion.checkup import Checkup
 from companion.config import Config, ConfigError, to_toml
@@ -36,6 +36,7 @@ from companion.link.session import (
     Session,
 )
 from companion.link.signing import Signing
+from companion.log.deferred import Log
 from companion.navigator import Navigator
 from companion.profiles import RESET
 from companion.records import (
@@ -67,16 +68,6 @@ STALE_AFTER = 2 * SECOND
 STANDBY, ACTIVE, CRITICAL = 3, 4, 5  # MAV_STATE
 #: COMMAND_INT and _LONG, PARAM_REQUEST_READ, PARAM_REQUEST_LIST, PARAM_SET.
 ASKING = frozenset({75, 76, 20, 21, 23})
-
-
-class Log(Protocol):
-    """Where records and raw frames go; `companion.log.file.Writer` is one."""
-
-    def record(self, record: Stamped, channel: str | None = None) -> None:
-        """Write one record, to the channel of its kind if no other is named."""
-
-    def frame(self, link: str, outgoing: bool, data: bytes, t_ns: int) -> None:
-        """Write one frame."""
 
 
 class Link:

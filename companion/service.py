@@ -31,6 +31,7 @@ from companion.config import Config, ConfigError, Log, load
 from companion.kept import Kept
 from companion.link.signing import Signing, read_key, store, stored
 from companion.link.transport import Address, CannotListen, Stream, connections
+from companion.log.deferred import Deferred
 from companion.log.file import Writer
 from companion.log.folder import open_log, recover_left
 from companion.log.opened import LogError
@@ -101,7 +102,8 @@ class Service:
         self._keys = Keys.of(config)
         signing = self._keys.signing if self._keys else None
         self._kept = Kept(Path(name) if (name := config.link.parameters_file) else None)
-        self.onboard = Onboard(config, log, self._addresses, signing, self._kept.put)
+        self._deferred = Deferred(log)
+        self.onboard = Onboard(config, self._deferred, self._addresses, signing, self._kept.put)
         self._log, self._tell, self._now = log, tell, now
         self._streams: dict[str, Stream] = {}
         self._stopped = asyncio.Event()
@@ -123,6 +125,8 @@ class Service:
                     task.cancel()
         except* CannotListen as group:
             raise group.exceptions[0] from None
+        finally:
+            self._deferred.settle()
 
     async def _carry(self, name: str) -> None:
         """One link, opened again for ever."""
@@ -180,6 +184,7 @@ class Service:
             self._manager.status(event.text)
         if now - self.onboard.deadline() < OVERDUE_NS:
             self._manager.alive(now)
+        self._deferred.settle()
 
     def keep(self) -> None:
         """Put on disk what must outlive a restart; waits for the disk."""
@@ -190,6 +195,7 @@ class Service:
     def say(self, text: str) -> None:
         """Log and tell what happened to links and files."""
         self.onboard.note(5, text, self._now())
+        self._deferred.settle()
 
 
 async def run(config: Config, tell: Callable[[Event], None]) -> None:

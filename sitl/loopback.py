@@ -24,10 +24,11 @@ from rich.table import Table
 
 from companion.config import Config, Output, load
 from companion.log import score
+from companion.log.deferred import Log
 from companion.log.folder import open_log
 from companion.log.replay import metadata
 from companion.nav.geometry import Geodetic
-from companion.onboard import Log, Onboard
+from companion.onboard import Onboard
 from companion.records import Event, Gnss, Rejection, Reset, RsbnFix, Solution, Stamped
 from sitl.autopilot import UNIX_AT_START_NS, Autopilot
 from sitl.scenarios import SCENARIOS, Phase, Scenario, named

@@ -79,6 +79,8 @@ class MessageType(NamedTuple):
     #: Fields in the order of the wire.
     fields: tuple[Field, ...]
     cls: Any
+    #: What every field is if it is not given.
+    zeros: dict[str, Any]
     #: Attributes that pymavlink's base class gives every message, to be shared by all of this type.
     base: dict[str, Any]
 
@@ -101,8 +103,10 @@ def _describe(msgid: int, cls: Any) -> MessageType:
     base |= {"_fieldnames": cls.fieldnames, "_instance_field": cls.instance_field}
     base["_instance_offset"] = cls.instance_offset
     scalars = tuple(cls.ordered_fieldnames) if plain else ()
+    # arrays are tuples here: all messages of the type share them
+    zeros = {f.name: b"" if f.text else 0 if f.length == 1 else (0,) * f.length for f in fields}
     return MessageType(
-        msgid, cls.msgname, cls.unpacker, cls.crc_extra, base_size, scalars, tuple(fields), cls, base
+        msgid, cls.msgname, cls.unpacker, cls.crc_extra, base_size, scalars, tuple(fields), cls, zeros, base
     )
 
 
@@ -134,16 +138,11 @@ def new(name: str, **values: Any) -> Message:
     Units are those of the wire, named in the message's XML.
     """
     kind = type_named(name)
-    if unknown := values.keys() - {field.name for field in kind.fields}:
-        names = ", ".join(field.name for field in kind.fields)
+    if unknown := values.keys() - kind.zeros.keys():
+        names = ", ".join(kind.zeros)
         raise ValueError(f"{name} has no field {sorted(unknown)[0]!r}; it has {names}")
-    for field in kind.fields:
-        if field.text:
-            value = values.get(field.name, b"")
-            values[field.name] = value.encode() if isinstance(value, str) else value
-        else:
-            values.setdefault(field.name, 0 if field.length == 1 else [0] * field.length)
-    return kind.cls(**values)
+    given = {field: value.encode() if isinstance(value, str) else value for field, value in values.items()}
+    return kind.cls(**kind.zeros | given)
 
 
 def decode(frame: Framed) -> Message:

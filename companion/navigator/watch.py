@@ -9,7 +9,6 @@ an excluded source is heard again only within that prediction's bounds.
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from typing import NamedTuple
 
@@ -151,7 +150,10 @@ def calibrated(w: Watch | None, name: str, z: Azimuth | Range, config: Config) -
         bank = w.monitor.bank
         i = bank.x.shape[1] - len(bank.biases) + bank.biases.index(name)
         bias, variance = float(bank.x[0, i]), float(bank.P[0, i, i])
-    return dataclasses.replace(z, value=z.value - bias, sigma=math.sqrt(z.sigma**2 + variance))
+    value, sigma = z.value - bias, math.sqrt(z.sigma**2 + variance)
+    if isinstance(z, Azimuth):
+        return Azimuth(z.beacon, value, sigma, z.axes)
+    return Range(z.beacon, value, sigma)
 
 
 def hear(w: Watch, measurement: Measurement, allotted: Allotment) -> tuple[Watch, Refusal | None]:
