@@ -37,7 +37,7 @@ GYRO, ACCELEROMETER = (7, 8), (10, 11)  # north and east
 TURNING_M_S = 5.0  # slower, the course says nothing of the heading
 FRONT_S = 30.0  # how long a jump of the wind takes at most
 G0 = 9.80665  # [m/s^2] of what is quoted in micro-g
-NEAR_S = 0.25  # the noise that comes in meanwhile is nothing, and an error moves straight on
+NEAR_S = 0.5  # the noise that comes in meanwhile is nothing, and an error moves straight on
 STEP_S = 2.0  # the transition is a power series: its fifth term is below 1e-12 of the first here
 
 

@@ -87,8 +87,7 @@ def solve(carry: Carry, rx_ns: int, settings: Settings) -> Step:
         protection,
         held.trust,
     )
-    next_ns = max(carry.next_ns + round(1e9 / config.output.pace_hz), t_ns)
-    return carry._replace(state=state, guarantee=promise, held=held, next_ns=next_ns), [solution]
+    return carry._replace(state=state, guarantee=promise, held=held), [solution]
 
 
 def _candidates(

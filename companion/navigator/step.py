@@ -40,7 +40,7 @@ from companion.records import (
 )
 
 from . import absorb, deadreckoning, errorstate, inertial, moved, radio, strapped, watch
-from .carry import Carry, Lesson, Level, Settings, Step, initial, level
+from .carry import Carry, Lesson, Level, Settings, Step, initial, level, state_at
 from .inertial import Point
 from .lesson import unheard
 from .solution import solve
@@ -175,7 +175,13 @@ def _given(carry: Carry, record: Stamped, out: list[Output], settings: Settings)
     """With a solution once one is due."""
     if record.t_ns < carry.next_ns:
         return carry, out
-    carry, solution = solve(unheard(carry, settings), record.rx_ns, settings)
+    carry, ins = unheard(carry, settings), carry.track[-1]
+    if carry.state is not None:  # so that a beacon's answer finds it near
+        carry = carry._replace(state=state_at(carry, ins, settings))
+    carry, solution = solve(carry, record.rx_ns, settings)
+    if solution:
+        next_ns = max(carry.next_ns + round(1e9 / settings.config.output.pace_hz), ins.t_ns)
+        carry = carry._replace(next_ns=next_ns)
     return carry, out + solution
 
 
