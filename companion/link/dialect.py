@@ -79,8 +79,9 @@ class MessageType(NamedTuple):
     #: Fields in the order of the wire.
     fields: tuple[Field, ...]
     cls: Any
-    #: What every field is if it is not given.
+    #: What every field is if it is not given; and which are text.
     zeros: dict[str, Any]
+    texts: tuple[str, ...]
     #: Attributes that pymavlink's base class gives every message, to be shared by all of this type.
     base: dict[str, Any]
 
@@ -105,8 +106,19 @@ def _describe(msgid: int, cls: Any) -> MessageType:
     scalars = tuple(cls.ordered_fieldnames) if plain else ()
     # arrays are tuples here: all messages of the type share them
     zeros = {f.name: b"" if f.text else 0 if f.length == 1 else (0,) * f.length for f in fields}
+    texts = tuple(f.name for f in fields if f.text)
     return MessageType(
-        msgid, cls.msgname, cls.unpacker, cls.crc_extra, base_size, scalars, tuple(fields), cls, zeros, base
+        msgid,
+        cls.msgname,
+        cls.unpacker,
+        cls.crc_extra,
+        base_size,
+        scalars,
+        tuple(fields),
+        cls,
+        zeros,
+        texts,
+        base,
     )
 
 
@@ -141,8 +153,13 @@ def new(name: str, **values: Any) -> Message:
     if unknown := values.keys() - kind.zeros.keys():
         names = ", ".join(kind.zeros)
         raise ValueError(f"{name} has no field {sorted(unknown)[0]!r}; it has {names}")
-    given = {field: value.encode() if isinstance(value, str) else value for field, value in values.items()}
-    return kind.cls(**kind.zeros | given)
+    message = _made(kind, 0, 0, 0, 0)
+    for field in kind.texts:
+        value = values.get(field, b"")
+        raw = value.encode() if isinstance(value, str) else value
+        values |= {field: raw.split(b"\0", 1)[0].decode("ascii", "replace"), f"_{field}_raw": raw}
+    message.__dict__ |= kind.zeros | values
+    return message
 
 
 def decode(frame: Framed) -> Message:
@@ -156,19 +173,8 @@ def decode(frame: Framed) -> Message:
     if len(payload) != size:
         payload = payload[:size].ljust(size, b"\0")
     values = kind.layout.unpack(payload)
-    message = kind.cls.__new__(kind.cls)
-    header = object.__new__(_all.MAVLink_header)
-    header.__dict__ = {
-        "mlen": len(payload),
-        "seq": frame.sequence,
-        "srcSystem": frame.system,
-        "srcComponent": frame.component,
-        "msgId": msgid,
-        "incompat_flags": 0,
-        "compat_flags": 0,
-    }
-    attributes = dict(kind.base)
-    attributes["_header"] = header
+    message = _made(kind, len(payload), frame.sequence, frame.system, frame.component)
+    attributes = message.__dict__
     if kind.scalars:
         attributes.update(zip(kind.scalars, values))
     else:
@@ -179,7 +185,23 @@ def decode(frame: Framed) -> Message:
                 attributes[name] = raw.split(b"\0", 1)[0].decode("ascii", "replace")
             else:
                 attributes[name] = values[first] if length == 1 else list(values[first : first + length])
-    message.__dict__ = attributes
+    return message
+
+
+def _made(kind: MessageType, size: int, sequence: int, system: int, component: int) -> Message:
+    """A message without its fields, made without the constructors that cost more than all else of it."""
+    message = object.__new__(kind.cls)
+    header = object.__new__(_all.MAVLink_header)
+    header.__dict__ = {
+        "mlen": size,
+        "seq": sequence,
+        "srcSystem": system,
+        "srcComponent": component,
+        "msgId": kind.msgid,
+        "incompat_flags": 0,
+        "compat_flags": 0,
+    }
+    message.__dict__ = kind.base | {"_header": header}
     return message
 
 
