@@ -125,10 +125,15 @@ def separation(point: Geodetic, reference: Geodetic) -> Vector:
 
     An error is computed minus true, so the error of the INS against a fix is `separation(ins, fix)`.
     """
+    return np.array(apart(point, reference))
+
+
+def apart(point: Geodetic, reference: Geodetic) -> Triple:
+    """The same in plain numbers."""
     R_N, R_E = radii(reference.lat)
     north = (point.lat - reference.lat) * (R_N + reference.alt)
     east = wrap(point.lon - reference.lon) * (R_E + reference.alt) * math.cos(reference.lat)
-    return np.array([north, east, reference.alt - point.alt])
+    return north, east, reference.alt - point.alt
 
 
 def slant_range_azimuth(beacon: Geodetic, aircraft: Geodetic) -> Sight:

@@ -281,7 +281,7 @@ def blur(state: ErrorState, sigma: float, sigma_v: float = 0.0) -> ErrorState:
 
 def carried(H: Floats, dt: float, v_n: Vector3, unit: ErrorModel) -> Floats:
     """H of what is seen `dt` seconds after the state: the position error has moved on by its velocity."""
-    return H + dt * unit.velocity_rows(v_n)
+    return H + dt * unit.velocity_rows(v_n) if dt else H
 
 
 def widen(state: ErrorState, factor: float) -> ErrorState:

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from companion.nav.geometry import Geodetic, Projection, displace, local_to_geodetic, separation
+from companion.nav.geometry import Geodetic, Projection, apart, displace, local_to_geodetic
 from companion.records import LocalOrigin, LocalPosition, Vector2, Vector3
 
 KEEP = 128  # points: 12 s at 10 Hz, more than a beacon's answer may be late
@@ -82,7 +82,7 @@ def jump(before: Point, after: Point) -> Vector3 | None:
     counted from it, is a step and its return, and moves nothing in the end.
     """
     dt = (after.t_ns - before.t_ns) * 1e-9
-    moved = separation(after.position, before.position).tolist()
+    moved = apart(after.position, before.position)
     step = [s - 0.5 * (v + w) * dt for s, v, w in zip(moved, before.v_n, after.v_n, strict=True)]
     if math.hypot(step[0], step[1]) <= JUMP_M + 0.5 * JUMP_ACCELERATION * dt * dt:
         return None

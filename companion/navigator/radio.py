@@ -15,7 +15,7 @@ import numpy as np
 
 from companion.config import GnssSection, Rsbn
 from companion.estimate.fusion import Azimuth, Height, Observation, Position, Range, most_likely
-from companion.nav.geometry import Geodetic, Triple, east_north_up, ecef, from_enu, separation
+from companion.nav.geometry import Geodetic, Triple, apart, east_north_up, ecef, from_enu
 from companion.records import Gnss, RsbnFix, Source
 
 from .errorstate import Belief
@@ -33,7 +33,7 @@ class Heard(NamedTuple):
 def from_gnss(record: Gnss, ins: Point, settings: GnssSection, drifting: bool = False) -> Heard:
     """A GNSS fix as a horizontal position at the INS; if `drifting`, with its white noise alone."""
     sigma = white_sigma(record, settings) if drifting else _stated(record, settings)
-    north, east, _ = separation(Geodetic(record.lat, record.lon, record.alt_msl), ins.position).tolist()
+    north, east, _ = apart(Geodetic(record.lat, record.lon, record.alt_msl), ins.position)
     place = Position((east, north), ((sigma**2, 0.0), (0.0, sigma**2)))
     return Heard(record.t_ns, (place,), Source.GNSS)
 

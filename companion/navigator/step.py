@@ -248,15 +248,14 @@ def _rsbn(carry: Carry, record: RsbnFix, settings: Settings) -> Step:
     carry, out = absorb.position(carry, heard, errorstate.beacon_rows(settings.unit), ins, record, settings)
     if out:
         return carry, out
-    carry = carry._replace(rsbn_ns=record.t_ns, rsbn_told=heard.sources)
-    gnss = carry.gnss_heard
-    together = heard
+    gnss, together = carry.gnss_heard, heard
     if gnss is not None and abs(record.t_ns - gnss.t_ns) <= TOGETHER_NS:
         # the correction INS minus GNSS of a moment ago is that of now: the error drifts by metres a minute
         together = radio.Heard(
             record.t_ns, heard.observations + gnss.observations, heard.sources | gnss.sources
         )
-    return carry._replace(lesson=carry.lesson and carry.lesson._replace(heard=together)), []
+    lesson = carry.lesson and carry.lesson._replace(heard=together)
+    return carry._replace(rsbn_ns=record.t_ns, rsbn_told=heard.sources, lesson=lesson), []
 
 
 def _calibrated(carry: Carry, record: RsbnFix, said: radio.Heard, settings: Settings) -> radio.Heard:

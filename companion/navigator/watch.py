@@ -21,7 +21,7 @@ from companion.estimate import integrity, monitor
 from companion.estimate.fusion import Azimuth, Range
 from companion.estimate.integrity import INERTIAL, Measurement, Protection
 from companion.estimate.monitor import Allotment, Exclusion, Monitor, Refusal
-from companion.nav.geometry import Geodetic, separation
+from companion.nav.geometry import Geodetic, apart
 from companion.records import Event, Gnss, Output, Rejection, Vector2, Vector3
 
 from . import errorstate, radio
@@ -106,8 +106,9 @@ def solution(w: Watch) -> ErrorState:
 def error_at(w: Watch, ins: Point, unit: ErrorModel) -> Vector2:
     """The position error of the full solution, carried on by its velocity to a moment later."""
     t_ns, x, _ = solution(w)
-    north, east = x[:2] + unit.velocity_rows(ins.v_n) @ x * ((ins.t_ns - t_ns) * 1e-9)
-    return float(north), float(east)
+    H = errorstate.carried(errorstate.beacon_rows(unit), (ins.t_ns - t_ns) * 1e-9, ins.v_n, unit)
+    north, east = (H @ x).tolist()
+    return north, east
 
 
 def excluded(w: Watch | None, source: str) -> bool:
@@ -124,7 +125,7 @@ def of_gnss(record: Gnss, ins: Point, unit: ErrorModel, config: Config) -> Measu
     """Position and, where it is told and used, velocity; the receiver's slow drift is a state."""
     sigma = radio.white_sigma(record, config.gnss)
     H, variance = errorstate.gnss_rows(unit), [sigma**2] * 2
-    z = [*separation(ins.position, Geodetic(record.lat, record.lon, record.alt_msl))[:2]]
+    z = [*apart(ins.position, Geodetic(record.lat, record.lon, record.alt_msl))[:2]]
     if config.gnss.use_velocity and record.v_n is not None:
         told = max(record.sigma_velocity or 0.0, config.gnss.sigma_velocity_m_s)
         z += [ins.v_n[0] - record.v_n[0], ins.v_n[1] - record.v_n[1]]

@@ -24,7 +24,7 @@ import math
 from collections import Counter
 from typing import NamedTuple
 
-from companion.nav.geometry import displace, wrap
+from companion.nav.geometry import Geodetic, apart, displace, wrap
 from companion.records import Event, Mode, Solution, Trust, Vector3
 
 SECOND = 1_000_000_000
@@ -147,8 +147,10 @@ class Gate:
 
 def _jump(last: Position, here: Position, dt: float) -> float:
     """How far `here` is horizontally from where the mean velocity leads in `dt` seconds, m."""
-    north, east = (0.5 * (v + w) * dt for v, w in zip(last.v_n[:2], here.v_n[:2], strict=True))
-    return distance(displace(last.lat, last.lon, last.alt_msl, north, east, 0.0)[:2], (here.lat, here.lon))
+    (v_n, v_e, _), (w_n, w_e, _) = last.v_n, here.v_n
+    place = Geodetic(last.lat, last.lon, last.alt_msl)
+    north, east, _ = apart(Geodetic(here.lat, here.lon, here.alt_msl), place)
+    return math.hypot(north - 0.5 * (v_n + w_n) * dt, east - 0.5 * (v_e + w_e) * dt)
 
 
 def distance(a: tuple[float, float], b: tuple[float, float]) -> float:
