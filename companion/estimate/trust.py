@@ -55,7 +55,7 @@ def turn(held: Held, t_ns: int, evidence: Evidence, limits: Limits) -> Held:
         return Held(now, t_ns)
     cleared = judge(evidence, limits, limits.clear)
     if cleared >= held.trust:
-        return held._replace(better_ns=None)
+        return held if held.better_ns is None else held._replace(better_ns=None)
     if held.better_ns is None:
         return held._replace(better_ns=t_ns)
     if (t_ns - held.better_ns) * 1e-9 < limits.settle_s:

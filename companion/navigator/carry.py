@@ -10,6 +10,7 @@ from companion.config import Channel, Config
 from companion.estimate.fusion import Observation
 from companion.estimate.monitor import Allotment
 from companion.estimate.trust import Held
+from companion.nav.geometry import Geodetic
 from companion.records import Gnss, LocalOrigin, LocalPosition, Output, Prediction, RsbnFix, Source
 
 from . import errorstate, guarantee, inertial, radio, tilterror, watch, winderror
@@ -126,7 +127,8 @@ def state_at(carry: Carry, ins: Point, settings: Settings) -> ErrorState:
 
 def level(ins: Point, carry: Carry) -> Point:
     """The inertial point at the height that GNSS has taught."""
-    return ins._replace(position=ins.position._replace(alt=ins.position.alt - carry.level.error))
+    lat, lon, alt = ins.position
+    return Point(ins.t_ns, Geodetic(lat, lon, alt - carry.level.error), ins.v_n)
 
 
 def sources(carry: Carry, t_ns: int, settings: Settings) -> Source:
