@@ -7,7 +7,8 @@
 
 Each flight is one line of `flights.jsonl` in the results folder, written by this process as it comes in. What
 is there is not flown again, so that a campaign cut short goes on where it was; a flight whose worker died is
-flown by another one. It knows nothing of what a flight is: `sitl.trial` does.
+flown by another one, and where one after the other died under it, by the next campaign. It knows nothing of
+what a flight is: `sitl.trial` does.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from rich.table import Table
 from sitl.trial import KINDS, SCENARIOS, Order, Result, attempt, by_records, matters
 
 RETRIES = 3  # workers that may die under one flight before it counts as failed
+LOST = "worker lost"
 EX_FAILED = 1
 HEADS = (
     *("fault", "flights", "detected", "median", "slowest", "excluded", "largest before", "largest"),
@@ -116,7 +118,7 @@ def run(todo: Sequence[Order], scheduler: str | None, workers: int) -> Iterator[
             if future.status == "finished":
                 yield future.result()
             else:
-                raised = f"worker lost: {future.exception()}"
+                raised = f"{LOST}: {future.exception()}"
                 yield Result(flown[future].key, *flown[future], 0.0, 0.0, raised=raised)
             future.release()
     if cluster is not None:
@@ -138,9 +140,10 @@ def campaign(
     ):
         task = progress.add_task("flights", total=len(wanted), completed=len(known))
         for result in run(todo, scheduler, workers):
-            file.write(json.dumps(result._asdict()).encode() + b"\n")
-            file.flush()
-            os.fsync(file.fileno())
+            if not (result.raised or "").startswith(LOST):
+                file.write(json.dumps(result._asdict()).encode() + b"\n")
+                file.flush()
+                os.fsync(file.fileno())
             known[result.key] = result
             progress.update(task, advance=1, description=result.key)
     return [known[order.key] for order in wanted]

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
+import signal
 from pathlib import Path
 
 import pytest
@@ -167,3 +169,34 @@ def test_dask_brings_back_every_flight(tmp_path: Path) -> None:
     assert [r.key for r in results] == [order.key for order in wanted]
     assert all(r.raised and "scenarios are" in r.raised for r in results)
     assert sorted(campaign.stored(tmp_path / "flights.jsonl")) == sorted(results)
+
+
+def test_a_worker_killed_in_flight_loses_no_flight(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """SIGKILL under the third of six flights; the nanny starts another worker, and it is flown there."""
+    pytest.importorskip("distributed", reason="the extra `campaign` is not installed")
+    killed = tmp_path / "killed"
+
+    def fly(order: Order) -> Result:
+        if order.seed == 3 and not killed.exists():
+            killed.touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+        return Result(order.key, *order, 720.0, 2.0)
+
+    monkeypatch.setattr(campaign, "attempt", fly)
+    wanted = [Order("one-beacon", "none", seed) for seed in range(1, 7)]
+    results = campaign.campaign(wanted, tmp_path, workers=1, quiet=True)
+    assert killed.exists()
+    assert results == [Result(order.key, *order, 720.0, 2.0) for order in wanted]
+    lines = (tmp_path / "flights.jsonl").read_bytes().splitlines()
+    assert sorted(json.loads(line)["seed"] for line in lines) == [1, 2, 3, 4, 5, 6]
+
+
+def test_a_flight_that_no_worker_survived_is_flown_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (order,) = wanted = [Order("one-beacon", "none", 1)]
+    lost, flown = Result(order.key, *order, 0.0, 0.0, raised=f"{campaign.LOST}: it died"), result("none", 1)
+    for came in (lost, flown):
+        monkeypatch.setattr(campaign, "run", lambda *_, came=came: iter([came]))
+        assert campaign.campaign(wanted, tmp_path, quiet=True) == [came]
+    assert campaign.stored(tmp_path / "flights.jsonl") == [flown]
