@@ -60,6 +60,7 @@ from sitl.world import World
 
 SECOND = 1_000_000_000
 FAULT_S, OVER_S = 300.0, 540.0
+TURN_S = 430.0
 TELLING = (CONTRADICT, "the link is late", "the clock of autopilot")  # what events say that tell of a fault
 EXCLUDED = "excluded:"  # how a rejection begins that tells of an exclusion
 LEARNT_S = 60.0  # alarms are counted from here on
@@ -165,6 +166,7 @@ KINDS: dict[str, Kind] = {
     "disk-full": _kind("disk-full"),
     "link-late": _kind("link-late", end_s=FAULT_S + 60.0),
     "reboot": _kind("reboot"),
+    "reboot-turning": Kind(Fault("reboot", TURN_S, OVER_S), bits=Source.GNSS),
     "clock-jump": _kind("clock-jump"),
     "second-autopilot": _kind("second-autopilot"),
     "origin-change": _kind("origin-change"),

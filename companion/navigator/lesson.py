@@ -60,11 +60,10 @@ def _watched(carry: Carry, lesson: Lesson, settings: Settings) -> tuple[Carry, b
             carry, w, told = _offered(carry, w, measurement, record, settings)
             out += told
             continue
-        before = w
-        w, refusal = watch.hear(before, measurement, settings.allotment)
-        if refusal is not None and lesson.proof:
-            w = watch.insist(before, measurement, refusal, settings.allotment)
-        taken = taken and (refusal is None or lesson.proof)
+        if lesson.proof:
+            w = watch.doubted(w, measurement)
+        w, refusal = watch.hear(w, measurement, settings.allotment)
+        taken = taken and refusal is None
     known = w.exclusions
     w = watch.decide(w, settings.allotment, settings.config.integrity)
     for exclusion in w.exclusions:

@@ -163,10 +163,13 @@ def hear(w: Watch, measurement: Measurement, allotted: Allotment) -> tuple[Watch
     return w._replace(monitor=heard), refusal
 
 
-def insist(w: Watch, measurement: Measurement, refusal: Refusal, allotted: Allotment) -> Watch:
-    """With a measurement that was refused and is to be believed: the claims were wrong, and are widened."""
-    wider = integrity.widen(w.monitor.bank, refusal.value / refusal.limit)
-    return hear(w._replace(monitor=w.monitor._replace(bank=wider)), measurement, allotted)[0]
+def doubted(w: Watch, measurement: Measurement) -> Watch:
+    """Before a measurement that is to be believed whatever is claimed: the claims were wrong, and are widened
+    until it is an ordinary one, lest it be held against its source.
+    """
+    bank = w.monitor.bank
+    factor = max(1.0, integrity.surprise(bank, measurement) / len(measurement.z))
+    return w._replace(monitor=w.monitor._replace(bank=integrity.widen(bank, factor)))
 
 
 def decide(w: Watch, allotted: Allotment, settings: IntegritySection) -> Watch:
