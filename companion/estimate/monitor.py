@@ -4,12 +4,14 @@
     monitor, exclusions = watch(monitor, allotment)              # once a second
 
 `integrity` has the mathematics; here stands when it is asked. A source falls by its separation, clear of
-every other's; or by a run of measurements that no solution can explain. The forks of a source are renewed in
-turn, so that the older is between one and two `fork_s` old, and never while something stands apart.
+every other's; by a run of measurements that no solution can explain; or by the word of an arbiter, where
+there is one. The forks of a source are renewed in turn, so that the older is between one and two `fork_s`
+old, and never while something stands apart.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 from scipy.special import chdtri
@@ -17,7 +19,6 @@ from scipy.special import chdtri
 from .integrity import (
     INERTIAL,
     Bank,
-    Blame,
     Measurement,
     Separation,
     blame,
@@ -32,6 +33,7 @@ from .integrity import (
 
 BEYOND = "separation"
 REFUSED = "refused by every solution"
+CONTRADICTED = "contradiction"
 LEAD = 0.5  # by which one must stand apart from others that measure: a model's errors grow with the lie
 
 
@@ -83,15 +85,29 @@ class Refusal(NamedTuple):
     limit: float
 
 
+class Judgement(NamedTuple):
+    """Who lies, None while that is not sure; the number that told and its limit."""
+
+    source: str | None
+    value: float
+    limit: float
+
+
 class Monitor(NamedTuple):
-    """The bank, the run of refusals of each source, whether something stands apart and is not yet clear."""
+    """The bank, the run of refusals of each source, since when something stands apart and is not clear."""
 
     bank: Bank
     runs: tuple[tuple[str, int], ...] = ()
-    unresolved: bool = False
+    refused: tuple[tuple[str, int], ...] = ()  # when a measurement of each source was last refused
+    unresolved_ns: int | None = None
     admitted: tuple[tuple[str, int], ...] = ()  # excluded sources, and since when they have been admitted
     drifted: tuple[str, ...] = ()  # sources excluded by separation
     accused_ns: int | None = None  # since when the inertial channel stands accused
+
+    @property
+    def unresolved(self) -> bool:
+        """Whether something stands apart and is not yet clear."""
+        return self.unresolved_ns is not None
 
 
 def hear(monitor: Monitor, measurement: Measurement, allotment: Allotment) -> tuple[Monitor, Refusal | None]:
@@ -101,32 +117,49 @@ def hear(monitor: Monitor, measurement: Measurement, allotment: Allotment) -> tu
     runs = dict(monitor.runs)
     runs[measurement.source] = 0 if taken.nis <= limit else runs.get(measurement.source, 0) + 1
     monitor = monitor._replace(bank=taken.bank, runs=tuple(runs.items()))
+    if not taken.accepted:
+        refused = dict(monitor.refused) | {measurement.source: monitor.bank.t_ns}
+        monitor = monitor._replace(refused=tuple(refused.items()))
     return monitor, None if taken.accepted else Refusal(measurement.source, taken.nis, limit)
 
 
-def watch(monitor: Monitor, allotment: Allotment) -> tuple[Monitor, list[Exclusion]]:
-    """Test every separation, exclude at most one source, renew the forks."""
+def watch(
+    monitor: Monitor, allotment: Allotment, arbiter: Callable[[], Judgement] | None = None
+) -> tuple[Monitor, list[Exclusion]]:
+    """Test every separation, exclude at most one source, renew the forks.
+
+    An `arbiter` is asked who lies where the separations cannot tell, the channel itself being no witness.
+    """
     bank = monitor.bank
     found = separations(bank)
     alarm = allotment.false_alarm(len(found))
     accused = blame(tuple(s for s in found if s.row.without not in bank.excluded), alarm)
     clear = accused is not None and accused.margin >= threshold(allotment.wrong) and accused.lead >= LEAD
+    if accused is not None and arbiter is not None:
+        clear, (source, value, limit) = False, arbiter()
+        if source is not None:
+            return _excluded(monitor, source, CONTRADICTED, value, limit, alarm)
     since = None
     if accused is not None and clear and accused.source == INERTIAL:
         since = bank.t_ns if monitor.accused_ns is None else monitor.accused_ns
         clear = (bank.t_ns - since) * 1e-9 >= allotment.hold_s
     monitor = monitor._replace(accused_ns=since)
     if accused is not None and clear:
-        return _excluded(monitor, accused, alarm)
+        return _excluded(monitor, accused.source, BEYOND, accused.statistic, accused.limit, alarm)
     for source, run in monitor.runs:
         if run >= allotment.run and source in bank.sources and source not in bank.excluded:
             told = Exclusion(bank.t_ns, source, REFUSED, float(run), float(allotment.run), bank.t_ns, 0.0)
             left = tuple(name for name in monitor.drifted if name != source)
             refused = monitor._replace(bank=refuse(bank, source), drifted=left)
-            return refused._replace(unresolved=accused is not None), [told]
+            return _unresolved(refused, accused is not None), [told]
     if accused is None:
         bank = _renewed(bank, found, round(1e9 * allotment.fork_s))
-    return monitor._replace(bank=bank, unresolved=accused is not None), []
+    return _unresolved(monitor._replace(bank=bank), accused is not None), []
+
+
+def _unresolved(monitor: Monitor, now: bool) -> Monitor:
+    since = monitor.bank.t_ns if monitor.unresolved_ns is None else monitor.unresolved_ns
+    return monitor._replace(unresolved_ns=since if now else None)
 
 
 def offer(
@@ -138,9 +171,7 @@ def offer(
     since = dict(monitor.admitted)
     if not admitted:
         since.pop(source, None)
-    elif (t_ns - since.setdefault(source, t_ns)) * 1e-9 >= (
-        allotment.slow_s if source in monitor.drifted else allotment.settle_s
-    ):
+    elif (t_ns - since.setdefault(source, t_ns)) * 1e-9 >= probation(monitor, source, allotment):
         del since[source]
         runs = tuple(run for run in monitor.runs if run[0] != source)
         bank = readmit(monitor.bank, source)
@@ -148,19 +179,26 @@ def offer(
     return monitor._replace(admitted=tuple(since.items())), False
 
 
+def probation(monitor: Monitor, source: str, allotment: Allotment) -> float:
+    """How long (s) an excluded source must be admitted without a break."""
+    return allotment.slow_s if source in monitor.drifted else allotment.settle_s
+
+
 def trusted(monitor: Monitor, source: str) -> bool:
     """Whether the source is heard: neither excluded nor in a run of refusals."""
     return source not in monitor.bank.excluded and dict(monitor.runs).get(source, 0) == 0
 
 
-def _excluded(monitor: Monitor, accused: Blame, alarm: float) -> tuple[Monitor, list[Exclusion]]:
-    before, (source, value, limit, *_) = monitor.bank, accused
+def _excluded(
+    monitor: Monitor, source: str, reason: str, value: float, limit: float, alarm: float
+) -> tuple[Monitor, list[Exclusion]]:
+    before = monitor.bank
     bank = exclude(before, source, alarm)
     step = bank.x[0, :2] - before.x[0, :2]
     moved = float((step @ step) ** 0.5)
-    told = Exclusion(bank.t_ns, source, BEYOND, value, limit, bank.rows[0].since_ns, moved)
+    told = Exclusion(bank.t_ns, source, reason, value, limit, bank.rows[0].since_ns, moved)
     drifted = (*(name for name in monitor.drifted if name != source), source)
-    return monitor._replace(bank=bank, unresolved=False, drifted=drifted, accused_ns=None), [told]
+    return monitor._replace(bank=bank, unresolved_ns=None, drifted=drifted, accused_ns=None), [told]
 
 
 def _renewed(bank: Bank, found: tuple[Separation, ...], every_ns: int) -> Bank:

@@ -55,7 +55,7 @@ def _watched(carry: Carry, lesson: Lesson, settings: Settings) -> tuple[Carry, b
     w = _arrived(carry, carry.watch or watch.begin(ins.t_ns, settings.watched), ins, settings)
     taken, out = True, list[Output]()
     w, measurements = _measured(w, lesson, settings)
-    for measurement in measurements:
+    for measurement, z in measurements:
         if watch.excluded(w, measurement.source):
             carry, w, told = _offered(carry, w, measurement, record, settings)
             out += told
@@ -64,27 +64,36 @@ def _watched(carry: Carry, lesson: Lesson, settings: Settings) -> tuple[Carry, b
             w = watch.doubted(w, measurement)
         w, refusal = watch.hear(w, measurement, settings.allotment)
         taken = taken and refusal is None
-    known = w.exclusions
-    w = watch.decide(w, settings.allotment, settings.config.integrity)
+        if refusal is None and z is not None:
+            w = watch.compared(w, measurement.source, z, ins, settings.watched)
+    known, unclear = w.exclusions, w.monitor.unresolved
+    w = watch.decide(w, settings.watched, settings.allotment, settings.config)
     for exclusion in w.exclusions:
         if exclusion not in known:
             carry, taken = _left_out(carry, exclusion, w, settings), False
+    if w.monitor.unresolved:  # what is promised rests on nothing that may be a lie
+        taken = False
+        if not unclear:
+            carry = carry._replace(guarantee=guarantee.forget(carry.guarantee, watch.sound_ns(w)))
     if watch.excluded(w, INERTIAL):  # only the monitor lets it loose
         carry = carry._replace(state=watch.solution(w), jumps=None)
     return carry._replace(watch=w), taken, out
 
 
-def _measured(w: Watch, lesson: Lesson, settings: Settings) -> tuple[Watch, list[Measurement]]:
-    """What the lesson's fix says to the monitor, its sources joined."""
+def _measured(
+    w: Watch, lesson: Lesson, settings: Settings
+) -> tuple[Watch, list[tuple[Measurement, Azimuth | Range | None]]]:
+    """What the lesson's fix says to the monitor, its sources joined, each with the sight that it is of."""
     record = lesson.record
     if isinstance(record, Gnss):
-        return w, [watch.of_gnss(record, lesson.ins, settings.watched, settings.config)]
-    measurements = []
+        told = watch.of_gnss(record, lesson.ins, settings.watched, settings.config)
+        return watch.noted(w, told), [(told, None)]
+    measurements = list[tuple[Measurement, Azimuth | Range | None]]()
     for z in lesson.sights:
         assert isinstance(z, Azimuth | Range)
         w, measurement = watch.of_beacon(w, watch.named(record.beacon, z), z, settings.config)
         if measurement is not None:
-            measurements.append(measurement)
+            measurements.append((measurement, z))
     return w, measurements
 
 

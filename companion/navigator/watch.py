@@ -10,6 +10,7 @@ an excluded source is heard again only within that prediction's bounds.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -17,10 +18,11 @@ from scipy.special import chdtri
 
 from companion.config import Config
 from companion.config import Integrity as IntegritySection
-from companion.estimate import integrity, monitor
+from companion.estimate import contradiction, integrity, monitor
+from companion.estimate.contradiction import Sight
 from companion.estimate.fusion import Azimuth, Range
 from companion.estimate.integrity import INERTIAL, Measurement, Protection
-from companion.estimate.monitor import Allotment, Exclusion, Monitor, Refusal
+from companion.estimate.monitor import Allotment, Exclusion, Judgement, Monitor, Refusal
 from companion.nav.geometry import Geodetic, apart
 from companion.records import Event, Gnss, Output, Rejection, Vector2, Vector3
 
@@ -28,9 +30,13 @@ from . import errorstate, radio
 from .errorstate import POSITION, VELOCITY, ErrorModel, ErrorState
 from .guarantee import Bounded
 from .inertial import Point
+from .winderror import WindError
 
 GNSS = "gnss"
 FORKS = 2
+SUSPECT_NS = 60_000_000_000  # a beacon that was refused is under suspicion for so long
+BESIDE_NS = 1_000_000_000  # GNSS this close to a beacon's answer is compared with it
+COMPARED_NS = 10_000_000_000  # for how long a comparison is one of now
 LOOSE_M_S = 0.05  # a root second: an inertial channel that is not believed beyond a minute
 LOOSER = 8.0  # times the model's own noise, for a channel whose velocity is noisier than that
 DECIDE_NS = 1_000_000_000
@@ -38,6 +44,17 @@ BIAS_HOUR = 0.5  # a beacon's bias walks in an hour by this share of what it may
 WARNING, NOTICE = 4, 5  # MAV_SEVERITY
 CONTRADICT = "sources contradict one another"
 PLAUSIBLE = 1e-3  # an excluded source must be this plausible to what is still heard, besides the bound
+
+
+class Offset(NamedTuple):
+    """The channel's error by GNSS, north and east (m)."""
+
+    t_ns: int
+    error_n: Vector2
+
+    def moved(self, north: float, east: float) -> Offset:
+        """After the channel jumped by (north, east) m."""
+        return Offset(self.t_ns, (self.error_n[0] + north, self.error_n[1] + east))
 
 
 class Watch(NamedTuple):
@@ -48,6 +65,8 @@ class Watch(NamedTuple):
     exclusions: tuple[Exclusion, ...] = ()  # of the sources left out now
     due_ns: int = 0
     v_n: Vector3 | None = None  # of the channel, at the bank's time
+    gnss: Offset | None = None  # GNSS's last word, believed or not
+    sights: tuple[Sight, ...] = ()  # of the beacons, from where GNSS says that we are
 
 
 class Verdict(NamedTuple):
@@ -116,6 +135,11 @@ def excluded(w: Watch | None, source: str) -> bool:
     return w is not None and source in w.monitor.bank.excluded
 
 
+def sound_ns(w: Watch) -> int:
+    """Until when what was heard is beyond suspicion, if something stands apart now."""
+    return min((row.since_ns for row in w.monitor.bank.rows if not row.never), default=w.monitor.bank.t_ns)
+
+
 def named(beacon: int, z: Azimuth | Range) -> str:
     """What the monitor calls a beacon's azimuth or range: each stands for itself."""
     return f"rsbn {beacon} {type(z).__name__.lower()}"
@@ -132,6 +156,30 @@ def of_gnss(record: Gnss, ins: Point, unit: ErrorModel, config: Config) -> Measu
         H = np.vstack([H, unit.velocity_rows(ins.v_n)])
         variance += [told**2 + unit.velocity_noise**2] * 2
     return Measurement(GNSS, np.array(z), H, np.diag(variance))
+
+
+def noted(w: Watch, gnss: Measurement) -> Watch:
+    """With GNSS's word, for beacons to be compared with."""
+    north, east = gnss.z[:2].tolist()
+    return w._replace(gnss=Offset(w.monitor.bank.t_ns, (north, east)))
+
+
+def compared(w: Watch, name: str, z: Azimuth | Range, ins: Point, unit: ErrorModel) -> Watch:
+    """With an azimuth or a range as it is seen from where GNSS says that we are, if it says so now. Only
+    where the channel, reckoning by the wind, is no witness.
+    """
+    t_ns = w.monitor.bank.t_ns
+    if not isinstance(unit, WindError) or w.gnss is None or t_ns - w.gnss.t_ns > BESIDE_NS:
+        return w
+    x = np.array(w.gnss.error_n)
+    seen = integrity.sighted(name, z, x, 2)
+    if seen is None or seen.unit is None:
+        return w
+    north, east = seen.H[0].tolist()
+    residual = float((seen.z - seen.H @ x)[0])
+    drift = (unit.velocity_rows(ins.v_n) @ w.monitor.bank.x[0, : len(unit.sigma0)]).tolist()
+    sight = Sight(t_ns, name, residual, (north, east), float(seen.unit[0]), (drift[0], drift[1]))
+    return w._replace(sights=contradiction.keep(w.sights, sight))
 
 
 def of_beacon(w: Watch, name: str, z: Azimuth | Range, config: Config) -> tuple[Watch, Measurement | None]:
@@ -172,18 +220,18 @@ def doubted(w: Watch, measurement: Measurement) -> Watch:
     return w._replace(monitor=w.monitor._replace(bank=integrity.widen(bank, factor)))
 
 
-def decide(w: Watch, allotted: Allotment, settings: IntegritySection) -> Watch:
+def decide(w: Watch, unit: ErrorModel, allotted: Allotment, config: Config) -> Watch:
     """Once a second: who is excluded, and how far off the output may be."""
     t_ns = w.monitor.bank.t_ns
     if t_ns < w.due_ns:
         return w
-    watched, exclusions = monitor.watch(w.monitor, allotted)
+    watched, exclusions = monitor.watch(w.monitor, allotted, _arbiter(w, unit, config))
     if INERTIAL in watched.bank.excluded:
         # nothing measures it: it is believed again once the others have calibrated it anew
         watched, _ = monitor.offer(watched, t_ns, INERTIAL, True, allotted._replace(slow_s=allotted.fork_s))
     left = tuple(e for e in (*w.exclusions, *exclusions) if e.source in watched.bank.excluded)
     w = w._replace(monitor=watched, exclusions=left, due_ns=t_ns + DECIDE_NS)
-    return protected(w, allotted, settings)
+    return protected(w, allotted, config.integrity)
 
 
 def protected(w: Watch, allotted: Allotment, settings: IntegritySection) -> Watch:
@@ -224,8 +272,12 @@ def offer(
     bank = w.monitor.bank
     plausible = integrity.surprise(bank, measurement) <= float(chdtri(len(measurement.z), PLAUSIBLE))
     admitted = value <= limit and plausible
+    if measurement.source == GNSS and config.channel == "air_data":  # the channel is no witness: beacons are
+        admitted = admitted and _agrees(w, allotted)
     heard, back = monitor.offer(w.monitor, bank.t_ns, measurement.source, admitted, allotted)
     left = tuple(e for e in w.exclusions if e.source in heard.bank.excluded)
+    if back:  # what was seen of its lie is no evidence any more
+        w = w._replace(sights=_recent(w, measurement.source, allotted))
     return Verdict(w._replace(monitor=heard, exclusions=left), value, limit, back)
 
 
@@ -260,7 +312,8 @@ def shift(w: Watch, north: float, east: float, v_n: Vector2 | None = None, t_ns:
         x[:, POSITION] += np.array(v_n) * ((bank.t_ns - t_ns) * 1e-9)
         x[:, VELOCITY] += v_n
     faster = w.v_n and v_n and (w.v_n[0] + v_n[0], w.v_n[1] + v_n[1], w.v_n[2])
-    return w._replace(monitor=w.monitor._replace(bank=bank._replace(x=x)), v_n=faster or w.v_n)
+    w = w._replace(monitor=w.monitor._replace(bank=bank._replace(x=x)), v_n=faster or w.v_n)
+    return w._replace(gnss=w.gnss and w.gnss.moved(north, east))
 
 
 def blur(w: Watch, sigma: float, sigma_v: float = 0.0) -> Watch:
@@ -271,12 +324,60 @@ def blur(w: Watch, sigma: float, sigma_v: float = 0.0) -> Watch:
     P = bank.P.copy()
     P[:, POSITION, POSITION] += sigma**2 * np.eye(2)
     P[:, VELOCITY, VELOCITY] += sigma_v**2 * np.eye(2)
-    return w._replace(monitor=w.monitor._replace(bank=bank._replace(P=P)))
+    return w._replace(monitor=w.monitor._replace(bank=bank._replace(P=P)), gnss=None)
 
 
 def is_sound(w: Watch | None) -> bool:
     """Whether all of its numbers are numbers."""
     return w is None or integrity.is_sound(w.monitor.bank)
+
+
+def _arbiter(w: Watch, unit: ErrorModel, config: Config) -> Callable[[], Judgement] | None:
+    """Who tells whether GNSS or a beacon lies where the channel, reckoning by the wind, is no witness; None
+    where it is, or while not both are heard.
+    """
+    bank = w.monitor.bank
+    if not isinstance(unit, WindError) or GNSS in bank.excluded:
+        return None
+    sights = tuple(s for s in w.sights if s.source not in bank.excluded)
+    if not sights or bank.t_ns - sights[-1].t_ns > COMPARED_NS:
+        return None
+
+    def judge() -> Judgement:
+        bias = {name: _bias_sigma(name, config) for name in bank.biases}
+        rate = (config.air_data.wind_change_m_s_sqrt_s / unit.jump) ** 2
+        found = contradiction.weigh(sights, bias, contradiction.Wind(unit.jump, rate))
+        since = bank.t_ns if w.monitor.unresolved_ns is None else w.monitor.unresolved_ns
+        liar = found.liar(_suspect(w.monitor, found.source), (bank.t_ns - since) * 1e-9)
+        value = found.stepped if liar else found.pulled
+        source = GNSS if liar == "" else liar
+        return Judgement(source, value, integrity.threshold(contradiction.SURE))
+
+    return judge
+
+
+def _suspect(m: Monitor, source: str) -> bool:
+    """Whether this source or the other one of its beacon has said what nothing explains, or is left out."""
+    beacon = source.rsplit(" ", 1)[0]
+    lately = {name for name, t_ns in m.refused if m.bank.t_ns - t_ns < SUSPECT_NS}
+    return any(name.startswith(beacon + " ") for name in (*m.bank.excluded, *lately))
+
+
+def _agrees(w: Watch, allotted: Allotment) -> bool:
+    """Whether GNSS, excluded, has been where the beacons see us for as long as it must be admitted."""
+    bank = w.monitor.bank
+    sights = tuple(s for s in _recent(w, GNSS, allotted) if s.source not in bank.excluded)
+    if not sights:
+        return True
+    k = bank.x.shape[1] - len(bank.biases)
+    value = contradiction.apart(sights, bank.x[0, k:], bank.P[0, k:, k:], bank.biases)
+    return value <= integrity.threshold(PLAUSIBLE)
+
+
+def _recent(w: Watch, source: str, allotted: Allotment) -> tuple[Sight, ...]:
+    """The sights since which a source that is left out must be admitted; of others than GNSS all the rest."""
+    since = w.monitor.bank.t_ns - round(1e9 * monitor.probation(w.monitor, source, allotted))
+    return tuple(s for s in w.sights if s.t_ns >= since or source not in (GNSS, s.source))
 
 
 def _bias_sigma(name: str, config: Config) -> float:

@@ -1,0 +1,59 @@
+"""Flights without an INS, one beacon: whoever of GNSS and the beacon lies, the aircraft is not led astray."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+
+from companion.config import Config, Inertial
+from sitl import loopback, trial
+from sitl.trial import SCENARIOS, Order, Result, attempt
+
+HARMLESS_M = 300.0
+
+
+def flown(fault: str, seed: int = 1) -> Result:
+    result = attempt(Order("air-data", fault, seed))
+    assert result.raised is None
+    assert (result.alarms, result.wrong, result.misleading_s) == (0, 0, 0.0)
+    return result
+
+
+@pytest.mark.parametrize("fault", ["gnss-spoof-0.5", "gnss-spoof-5"])
+def test_a_spoofer_is_excluded_and_taken_back_when_he_has_left(fault: str) -> None:
+    result = flown(fault)
+    assert result.excluded_s is not None
+    assert result.largest_m < HARMLESS_M
+    assert result.beyond_s == 0.0
+    assert result.last_m < 10.0  # by GNSS again
+
+
+@pytest.mark.parametrize("fault", ["beacon-bias-300", "beacon-multipath"])
+def test_a_beacon_that_goes_wrong_does_not_cost_gnss(fault: str) -> None:
+    result = flown(fault, 3)
+    assert result.detected_s is not None and result.detected_s < 15.0
+    assert result.largest_m < 10.0
+
+
+def test_air_data_alone_do_not_outvote_gnss_and_a_beacon() -> None:
+    assert flown("airspeed-icing").largest_m < HARMLESS_M
+
+
+def test_a_guarantee_does_not_rest_on_what_is_under_suspicion() -> None:
+    """Everything falls silent while the spoofer is not yet excluded: the bound still holds."""
+    fault = trial.KINDS["gnss-spoof-5"].fault
+    assert fault is not None
+    spoofed = dataclasses.replace(
+        SCENARIOS["air-data"],
+        seed=1,
+        faults=(fault,),
+        gnss_outages=((338.0, 420.0),),
+        rsbn_outages=((338.0, 420.0),),
+    )
+    config = loopback.simulated(Config(inertial=Inertial(source="air_data")))
+    world, told = trial.fly_records(spoofed, config)
+    result = trial.score(Order("air-data", "gnss-spoof-5", 1), world, told)
+    assert result.rms_error is not None and result.rms_bound is not None
+    assert result.rms_error <= result.rms_bound
+    assert result.misleading_s == 0.0
