@@ -18,12 +18,13 @@ from companion.estimate.monitor import Exclusion
 from companion.nav.geometry import displace
 from companion.records import Fix, Gnss, Output, Rejection, RsbnFix, Source
 
-from . import guarantee, inertial, restricted, watch
+from . import guarantee, inertial, restricted, sights, watch
 from .carry import Carry, Lesson, Settings, Step
 from .guarantee import Bounded
 from .inertial import Point
 from .radio import Heard
-from .watch import GNSS, Watch
+from .sights import GNSS
+from .watch import Watch
 from .winderror import WindError
 
 SILENT_NS = 1_000_000_000  # the monitor is carried on without a fix once it is this old
@@ -65,7 +66,8 @@ def _watched(carry: Carry, lesson: Lesson, settings: Settings) -> tuple[Carry, b
         w, refusal = watch.hear(w, measurement, settings.allotment)
         taken = taken and refusal is None
         if refusal is None and z is not None:
-            w = watch.compared(w, measurement.source, z, ins, settings.watched)
+            compared = sights.compared(w.sights, w.monitor, measurement.source, z, ins, settings.watched)
+            w = w._replace(sights=compared)
     known, unclear = w.exclusions, w.monitor.unresolved
     w = watch.decide(w, settings.watched, settings.allotment, settings.config)
     for exclusion in w.exclusions:
@@ -87,7 +89,7 @@ def _measured(
     record = lesson.record
     if isinstance(record, Gnss):
         told = watch.of_gnss(record, lesson.ins, settings.watched, settings.config)
-        return watch.noted(w, told), [(told, None)]
+        return w._replace(sights=sights.noted(w.sights, w.monitor.bank.t_ns, told)), [(told, None)]
     measurements = list[tuple[Measurement, Azimuth | Range | None]]()
     for z in lesson.sights:
         assert isinstance(z, Azimuth | Range)

@@ -81,6 +81,11 @@ def _times(C: tuple[Triple, Triple, Triple], v: Triple) -> Triple:
     return a * x + b * y + c * z, d * x + e * y + f * z, g * x + h * y + i * z
 
 
+def bias_sigma(name: str, settings: Rsbn) -> float:
+    """What the constant error of a beacon's measurement, called as the monitor does, may be: rad or m."""
+    return math.radians(settings.bias_azimuth_deg) if name.endswith("azimuth") else settings.bias_range_m
+
+
 def place(record: RsbnFix, alt: float) -> Geodetic | None:
     """Roughly where azimuth and range are at height `alt`, the earth taken for flat; None without both."""
     if record.azimuth is None or record.slant_range is None:

@@ -43,8 +43,8 @@ from . import absorb, deadreckoning, errorstate, inertial, moved, radio, strappe
 from .carry import Carry, Lesson, Level, Settings, Step, initial, level, state_at
 from .inertial import Point
 from .lesson import unheard
+from .sights import GNSS
 from .solution import solve
-from .watch import GNSS
 
 TOGETHER_NS = 1_000_000_000  # GNSS this close to a beacon's answer joins its fix
 PATIENCE_NS = 5_000_000_000  # how long the autopilot is waited for to tell what a channel begins with

@@ -10,7 +10,6 @@ an excluded source is heard again only within that prediction's bounds.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -18,43 +17,26 @@ from scipy.special import chdtri
 
 from companion.config import Config
 from companion.config import Integrity as IntegritySection
-from companion.estimate import contradiction, integrity, monitor
-from companion.estimate.contradiction import Sight
+from companion.estimate import integrity, monitor
 from companion.estimate.fusion import Azimuth, Range
 from companion.estimate.integrity import INERTIAL, Measurement, Protection
-from companion.estimate.monitor import Allotment, Exclusion, Judgement, Monitor, Refusal
+from companion.estimate.monitor import Allotment, Exclusion, Monitor, Refusal
 from companion.nav.geometry import Geodetic, apart
 from companion.records import Event, Gnss, Output, Rejection, Vector2, Vector3
 
-from . import errorstate, radio
+from . import errorstate, radio, sights
 from .errorstate import POSITION, VELOCITY, ErrorModel, ErrorState
 from .guarantee import Bounded
 from .inertial import Point
-from .winderror import WindError
+from .sights import GNSS, PLAUSIBLE, Sights
 
-GNSS = "gnss"
 FORKS = 2
-SUSPECT_NS = 60_000_000_000  # a beacon that was refused is under suspicion for so long
-BESIDE_NS = 1_000_000_000  # GNSS this close to a beacon's answer is compared with it
-COMPARED_NS = 10_000_000_000  # for how long a comparison is one of now
 LOOSE_M_S = 0.05  # a root second: an inertial channel that is not believed beyond a minute
 LOOSER = 8.0  # times the model's own noise, for a channel whose velocity is noisier than that
 DECIDE_NS = 1_000_000_000
 BIAS_HOUR = 0.5  # a beacon's bias walks in an hour by this share of what it may be
 WARNING, NOTICE = 4, 5  # MAV_SEVERITY
 CONTRADICT = "sources contradict one another"
-PLAUSIBLE = 1e-3  # an excluded source must be this plausible to what is still heard, besides the bound
-
-
-class Offset(NamedTuple):
-    """The channel's error by GNSS, north and east (m)."""
-
-    t_ns: int
-    error_n: Vector2
-
-    def moved(self, north: float, east: float) -> Offset:
-        """After the channel jumped by (north, east) m."""
-        return Offset(self.t_ns, (self.error_n[0] + north, self.error_n[1] + east))
 
 
 class Watch(NamedTuple):
@@ -65,8 +47,7 @@ class Watch(NamedTuple):
     exclusions: tuple[Exclusion, ...] = ()  # of the sources left out now
     due_ns: int = 0
     v_n: Vector3 | None = None  # of the channel, at the bank's time
-    gnss: Offset | None = None  # GNSS's last word, believed or not
-    sights: tuple[Sight, ...] = ()  # of the beacons, from where GNSS says that we are
+    sights: Sights = Sights()
 
 
 class Verdict(NamedTuple):
@@ -109,7 +90,9 @@ def advance(w: Watch, ins: Point, a_n: Vector2, unit: ErrorModel, config: Config
     Phi, Q = errorstate.transition(dt, system)
     moved = (unit.velocity_rows((0.0, 0.0, 0.0)) ** 2).sum(axis=0)
     loose = moved * (LOOSE_M_S**2 + LOOSER * np.diagonal(system.Q)) * dt
-    walk = np.array([_bias_sigma(name, config) ** 2 for name in bank.biases]) * BIAS_HOUR**2 / 3600.0
+    walk = (
+        np.array([radio.bias_sigma(name, config.rsbn) ** 2 for name in bank.biases]) * BIAS_HOUR**2 / 3600.0
+    )
     for _ in range(steps):
         bank = integrity.carry(bank, ins.t_ns, Phi, Q, loose, walk * dt)
     return w._replace(monitor=w.monitor._replace(bank=bank), v_n=ins.v_n)
@@ -158,35 +141,11 @@ def of_gnss(record: Gnss, ins: Point, unit: ErrorModel, config: Config) -> Measu
     return Measurement(GNSS, np.array(z), H, np.diag(variance))
 
 
-def noted(w: Watch, gnss: Measurement) -> Watch:
-    """With GNSS's word, for beacons to be compared with."""
-    north, east = gnss.z[:2].tolist()
-    return w._replace(gnss=Offset(w.monitor.bank.t_ns, (north, east)))
-
-
-def compared(w: Watch, name: str, z: Azimuth | Range, ins: Point, unit: ErrorModel) -> Watch:
-    """With an azimuth or a range as it is seen from where GNSS says that we are, if it says so now. Only
-    where the channel, reckoning by the wind, is no witness.
-    """
-    t_ns = w.monitor.bank.t_ns
-    if not isinstance(unit, WindError) or w.gnss is None or t_ns - w.gnss.t_ns > BESIDE_NS:
-        return w
-    x = np.array(w.gnss.error_n)
-    seen = integrity.sighted(name, z, x, 2)
-    if seen is None or seen.unit is None:
-        return w
-    north, east = seen.H[0].tolist()
-    residual = float((seen.z - seen.H @ x)[0])
-    drift = (unit.velocity_rows(ins.v_n) @ w.monitor.bank.x[0, : len(unit.sigma0)]).tolist()
-    sight = Sight(t_ns, name, residual, (north, east), float(seen.unit[0]), (drift[0], drift[1]))
-    return w._replace(sights=contradiction.keep(w.sights, sight))
-
-
 def of_beacon(w: Watch, name: str, z: Azimuth | Range, config: Config) -> tuple[Watch, Measurement | None]:
     """An azimuth or a range, which joins where it is new; None in the cone of silence."""
     bank = w.monitor.bank
     if name not in bank.sources:
-        bank = integrity.join(bank, name, _bias_sigma(name, config))
+        bank = integrity.join(bank, name, radio.bias_sigma(name, config.rsbn))
         w = w._replace(monitor=w.monitor._replace(bank=bank))
     k = bank.x.shape[1] - len(bank.biases)
     return w, integrity.sighted(name, z, bank.x[0], k)
@@ -194,7 +153,7 @@ def of_beacon(w: Watch, name: str, z: Azimuth | Range, config: Config) -> tuple[
 
 def calibrated(w: Watch | None, name: str, z: Azimuth | Range, config: Config) -> Azimuth | Range:
     """The measurement less its learnt bias, whose own uncertainty adds to its sigma."""
-    bias, variance = 0.0, _bias_sigma(name, config) ** 2
+    bias, variance = 0.0, radio.bias_sigma(name, config.rsbn) ** 2
     if w is not None and name in w.monitor.bank.biases:
         bank = w.monitor.bank
         i = bank.x.shape[1] - len(bank.biases) + bank.biases.index(name)
@@ -225,7 +184,9 @@ def decide(w: Watch, unit: ErrorModel, allotted: Allotment, config: Config) -> W
     t_ns = w.monitor.bank.t_ns
     if t_ns < w.due_ns:
         return w
-    watched, exclusions = monitor.watch(w.monitor, allotted, _arbiter(w, unit, config))
+    watched, exclusions = monitor.watch(
+        w.monitor, allotted, sights.arbiter(w.sights, w.monitor, unit, config)
+    )
     if INERTIAL in watched.bank.excluded:
         # nothing measures it: it is believed again once the others have calibrated it anew
         watched, _ = monitor.offer(watched, t_ns, INERTIAL, True, allotted._replace(slow_s=allotted.fork_s))
@@ -273,11 +234,11 @@ def offer(
     plausible = integrity.surprise(bank, measurement) <= float(chdtri(len(measurement.z), PLAUSIBLE))
     admitted = value <= limit and plausible
     if measurement.source == GNSS and config.channel == "air_data":  # the channel is no witness: beacons are
-        admitted = admitted and _agrees(w, allotted)
+        admitted = admitted and sights.agrees(w.sights, w.monitor, allotted)
     heard, back = monitor.offer(w.monitor, bank.t_ns, measurement.source, admitted, allotted)
     left = tuple(e for e in w.exclusions if e.source in heard.bank.excluded)
     if back:  # what was seen of its lie is no evidence any more
-        w = w._replace(sights=_recent(w, measurement.source, allotted))
+        w = w._replace(sights=sights.since_probation(w.sights, w.monitor, measurement.source, allotted))
     return Verdict(w._replace(monitor=heard, exclusions=left), value, limit, back)
 
 
@@ -294,7 +255,7 @@ def beyond(measurement: Measurement, bounded: Bounded | None, config: Config) ->
     bounds = np.abs(G) @ np.array([*bounded.bound_n, *bounded.velocity_bound_n])
     variance = np.diagonal(R).copy()
     if unit is not None:
-        variance += (unit * _bias_sigma(source, config)) ** 2
+        variance += (unit * radio.bias_sigma(source, config.rsbn)) ** 2
     else:
         variance[:2] += config.gnss.sigma_m**2
     offset, sigma = (z - G @ known).tolist(), np.sqrt(variance).tolist()
@@ -313,7 +274,7 @@ def shift(w: Watch, north: float, east: float, v_n: Vector2 | None = None, t_ns:
         x[:, VELOCITY] += v_n
     faster = w.v_n and v_n and (w.v_n[0] + v_n[0], w.v_n[1] + v_n[1], w.v_n[2])
     w = w._replace(monitor=w.monitor._replace(bank=bank._replace(x=x)), v_n=faster or w.v_n)
-    return w._replace(gnss=w.gnss and w.gnss.moved(north, east))
+    return w._replace(sights=sights.shifted(w.sights, north, east))
 
 
 def blur(w: Watch, sigma: float, sigma_v: float = 0.0) -> Watch:
@@ -324,64 +285,11 @@ def blur(w: Watch, sigma: float, sigma_v: float = 0.0) -> Watch:
     P = bank.P.copy()
     P[:, POSITION, POSITION] += sigma**2 * np.eye(2)
     P[:, VELOCITY, VELOCITY] += sigma_v**2 * np.eye(2)
-    return w._replace(monitor=w.monitor._replace(bank=bank._replace(P=P)), gnss=None)
+    return w._replace(
+        monitor=w.monitor._replace(bank=bank._replace(P=P)), sights=w.sights._replace(error_n=None)
+    )
 
 
 def is_sound(w: Watch | None) -> bool:
     """Whether all of its numbers are numbers."""
     return w is None or integrity.is_sound(w.monitor.bank)
-
-
-def _arbiter(w: Watch, unit: ErrorModel, config: Config) -> Callable[[], Judgement] | None:
-    """Who tells whether GNSS or a beacon lies where the channel, reckoning by the wind, is no witness; None
-    where it is, or while not both are heard.
-    """
-    bank = w.monitor.bank
-    if not isinstance(unit, WindError) or GNSS in bank.excluded:
-        return None
-    sights = tuple(s for s in w.sights if s.source not in bank.excluded)
-    if not sights or bank.t_ns - sights[-1].t_ns > COMPARED_NS:
-        return None
-
-    def judge() -> Judgement:
-        bias = {name: _bias_sigma(name, config) for name in bank.biases}
-        rate = (config.air_data.wind_change_m_s_sqrt_s / unit.jump) ** 2
-        found = contradiction.weigh(sights, bias, contradiction.Wind(unit.jump, rate))
-        since = bank.t_ns if w.monitor.unresolved_ns is None else w.monitor.unresolved_ns
-        liar = found.liar(_suspect(w.monitor, found.source), (bank.t_ns - since) * 1e-9)
-        value = found.stepped if liar else found.pulled
-        source = GNSS if liar == "" else liar
-        return Judgement(source, value, integrity.threshold(contradiction.SURE))
-
-    return judge
-
-
-def _suspect(m: Monitor, source: str) -> bool:
-    """Whether this source or the other one of its beacon has said what nothing explains, or is left out."""
-    beacon = source.rsplit(" ", 1)[0]
-    lately = {name for name, t_ns in m.refused if m.bank.t_ns - t_ns < SUSPECT_NS}
-    return any(name.startswith(beacon + " ") for name in (*m.bank.excluded, *lately))
-
-
-def _agrees(w: Watch, allotted: Allotment) -> bool:
-    """Whether GNSS, excluded, has been where the beacons see us for as long as it must be admitted."""
-    bank = w.monitor.bank
-    sights = tuple(s for s in _recent(w, GNSS, allotted) if s.source not in bank.excluded)
-    if not sights:
-        return True
-    k = bank.x.shape[1] - len(bank.biases)
-    value = contradiction.apart(sights, bank.x[0, k:], bank.P[0, k:, k:], bank.biases)
-    return value <= integrity.threshold(PLAUSIBLE)
-
-
-def _recent(w: Watch, source: str, allotted: Allotment) -> tuple[Sight, ...]:
-    """The sights since which a source that is left out must be admitted; of others than GNSS all the rest."""
-    since = w.monitor.bank.t_ns - round(1e9 * monitor.probation(w.monitor, source, allotted))
-    return tuple(s for s in w.sights if s.t_ns >= since or source not in (GNSS, s.source))
-
-
-def _bias_sigma(name: str, config: Config) -> float:
-    """What a beacon's constant error may be, one sigma: rad or m."""
-    if name.endswith("azimuth"):
-        return math.radians(config.rsbn.bias_azimuth_deg)
-    return config.rsbn.bias_range_m
