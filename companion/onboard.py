@@ -4,6 +4,7 @@ out.
     onboard.receive(link, data, now_ns)     # bytes of one link
     onboard.poll(now_ns)                    # no later than onboard.deadline()
     onboard.to_send(link)                   # after either: what that link must carry
+    onboard.settle()                        # then, if there is time: what no answer waits for
 
 The asyncio service and the virtual-time loopback drive this same object. It holds no state of navigation; it
 decides who is believed (the one autopilot, and any beacon receiver), what is logged, and when a solution goes
@@ -155,6 +156,10 @@ class Onboard:
     def receive(self, link: str, data: bytes, now_ns: int) -> None:
         """Take bytes that came over `link`."""
         self._on_events(self.links[link], self.links[link].session.receive(data, now_ns), now_ns)
+
+    def settle(self) -> None:
+        """Do what no answer waits for, once the answers are out; left undone, the next record does it."""
+        self._navigator.settle()
 
     def poll(self, now_ns: int) -> None:
         """Do what is due."""

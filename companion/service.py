@@ -184,6 +184,7 @@ class Service:
             self._manager.status(event.text)
         if now - self.onboard.deadline() < OVERDUE_NS:
             self._manager.alive(now)
+        self.onboard.settle()
         self._deferred.settle()
 
     def keep(self) -> None:

@@ -74,6 +74,7 @@ class Navigator:
         self._settings = Settings.of(config)
         self._carry = initial(self._settings)
         self._past: deque[_Past] = deque()
+        self._owed: list[Output] = []  # learnt since the last record was handled
         self._late_ns = round(1e9 * config.estimator.late_s)
         self._gnss_latency_ns = round(1e9 * config.gnss.latency_s)
         self._freshness = Freshness()
@@ -99,17 +100,26 @@ class Navigator:
             return stale
         if isinstance(record, Gnss) and not is_news(record, self._carry, self._settings):
             return []
+        self.settle()
+        outputs, self._owed = self._owed, []
         if self._past and record.t_ns < self._past[-1].t_ns:
-            outputs = self._handle_late(record)
+            outputs += self._handle_late(record)
         else:
             self._past.append(_Past(record.t_ns, record, self._carry))
-            while self._past[0].t_ns < record.t_ns - self._late_ns:
-                self._past.popleft()
-            outputs = [*self._learnt()[1], *self._stepped(record)]
+            outputs += self._stepped(record)
         if isinstance(record, RsbnFix) and self._carry.rsbn_ns == record.t_ns:  # believed: tell at once
             self._carry, solution = solve(self._carry, record.rx_ns, self._settings)
             outputs = [*outputs, *solution]
         return [*self._announced(outputs), *self._watched(record)]
+
+    def settle(self) -> None:
+        """Learn what the last record taught and let go of what is too old: work that nothing waits for.
+
+        `handle` does it first if it was not done in between; what follows from it is told there all the same.
+        """
+        self._owed += self._learnt()[1]
+        while self._past and self._past[0].t_ns < self._past[-1].t_ns - self._late_ns:
+            self._past.popleft()
 
     def _watched(self, record: Input) -> list[Output]:
         """What became of the sources since it was last told."""
@@ -130,6 +140,7 @@ class Navigator:
 
     def _tune(self, config: Config) -> None:
         """Go on with another configuration; late measurements are no longer folded in from before it."""
+        self.settle()
         before = self._settings.channel
         self._settings, self._carry = tuned(self._carry, self._settings, config)
         self._late_ns = round(1e9 * config.estimator.late_s)
@@ -152,13 +163,14 @@ class Navigator:
             self._past.pop()
         given: list[Output] = []
         for each in again:
-            self._past.append(_Past(each.t_ns, each, self._carry))
             learner, learnt = self._learnt()
+            self._past.append(_Past(each.t_ns, each, self._carry))
             outputs = self._stepped(each)
             if learner is record:  # all other lessons were told when they were learnt first
                 given += learnt
             if each is record:
                 given = [out for out in outputs if not isinstance(out, Solution) or out.t_ns > self._given_ns]
+        self._learnt()
         return given
 
     def _rewound(self, before: Carry) -> Carry:

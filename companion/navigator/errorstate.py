@@ -255,7 +255,7 @@ def is_sound(state: ErrorState | None) -> bool:
     if state is None:
         return True
     squares = float(state.x @ state.x) + float(np.vdot(state.P, state.P))  # one that is no number spoils it
-    return math.isfinite(squares) and bool(state.P.diagonal().min() >= 0.0)
+    return math.isfinite(squares) and min(state.P.diagonal().tolist()) >= 0.0
 
 
 def shift(state: ErrorState, north: float, east: float, v_n: Vector2 | None = None) -> ErrorState:

@@ -33,6 +33,7 @@ from companion.records import (
     RsbnFix,
     Solution,
     Truth,
+    Tuning,
 )
 
 ORIGIN = Geodetic(math.radians(60.0), math.radians(30.0), 0.0)
@@ -176,6 +177,31 @@ def test_a_late_answer_is_folded_in_at_its_own_time() -> None:
     assert math.dist(a[0].error_n, b[0].error_n) < one_millimetre
     per_mille = 1e-3 * a[0].covariance[0]  # the covariance north-east is nearly nothing
     np.testing.assert_allclose(a[0].covariance, b[0].covariance, rtol=1e-3, atol=per_mille)
+
+
+def test_what_is_settled_in_between_changes_nothing() -> None:
+    """The service learns while it waits, a replay when the next record is there: answers come late, one GNSS
+    fix is wild, and parameters are set in flight."""
+    records = [record for moment in flight(60, 60.0, 60.0) for record in moment.records]
+    answers = [record for record in records if isinstance(record, RsbnFix)]
+    wild = next(k for k, record in enumerate(records) if k > 500 and isinstance(record, Gnss))
+    records[wild] = msgspec.structs.replace(records[wild], lat=records[wild].lat + 1e-3)
+    for answer in answers[10::3]:  # 0.7 s late
+        records.remove(answer)
+        later = next(k for k, r in enumerate(records) if r.t_ns > answer.t_ns + 7 * NS // 10)
+        records.insert(later, answer)
+    last = answers[15]  # right after it, its lesson not yet learnt perhaps
+    tuning = Tuning(last.t_ns, last.rx_ns, "[rsbn]\nbias_range_m = 1.0\nbias_azimuth_deg = 0.001\n")
+    records.insert(records.index(last) + 1, tuning)
+    settling, waiting = Navigator(CONFIG), Navigator(CONFIG)
+    settled, left = [], []
+    for record in (origin(), *records):
+        settled += settling.handle(record)
+        settling.settle()
+        left += waiting.handle(record)
+    assert settled == left
+    assert any(isinstance(out, Rejection) for out in left)
+    assert any(isinstance(out, Fix) for out in left)
 
 
 def test_a_fix_is_taken_to_be_as_old_as_the_receiver_is_slow() -> None:
