@@ -211,13 +211,15 @@ def payload(message: Message) -> bytes:
     ValueError if a field does not fit its wire type.
     """
     kind = TYPES[message._header.msgId]
-    values: list[Any] = []
-    for name, _, length, text in kind.fields:
-        value = getattr(message, f"_{name}_raw" if text else name)
-        if length == 1:
-            values.append(value)
-        else:
-            values.extend(value)
+    attributes = message.__dict__
+    values = [attributes[name] for name in kind.scalars]
+    if not kind.scalars:
+        for name, _, length, text in kind.fields:
+            value = attributes[f"_{name}_raw" if text else name]
+            if length == 1:
+                values.append(value)
+            else:
+                values.extend(value)
     try:
         return kind.layout.pack(*values)
     except (struct.error, TypeError) as error:

@@ -63,7 +63,7 @@ class Streams:
         """Return when `due` is next worth calling."""
         if not self._running or not self._streams:
             return None
-        return min(stream.check_at for stream in self._streams.values())
+        return min([stream.check_at for stream in self._streams.values()])
 
     def due(self, now: int) -> list[tuple[int, float]]:
         """Return the (message id, rate) to ask for now, and begin the next windows."""

@@ -43,7 +43,7 @@ def maybe(message: Message, field: str, scale: float = 1.0) -> float | None:
 
 def vector(message: Message, fields: str, scale: float = 1.0, limit: float = math.inf) -> Vector3:
     """Three numbers that must be there, as `number` has them, their names in one string."""
-    x, y, z = (number(message, field, scale, limit) for field in fields.split())
+    x, y, z = [number(message, field, scale, limit) for field in fields.split()]
     return x, y, z
 
 
