@@ -16,20 +16,8 @@ from typing import NamedTuple
 
 from scipy.special import chdtri
 
-from .integrity import (
-    INERTIAL,
-    Bank,
-    Measurement,
-    Separation,
-    blame,
-    exclude,
-    fork,
-    readmit,
-    refuse,
-    separations,
-    take,
-    threshold,
-)
+from .filterbank import INERTIAL, Bank, Measurement, fork, readmit, refuse, take
+from .integrity import Separation, blame, exclude, separations, threshold
 
 BEYOND = "separation"
 REFUSED = "refused by every solution"

@@ -23,7 +23,7 @@ import numpy.typing as npt
 from scipy.linalg import eigh
 
 from companion.config import Config, parse
-from companion.estimate.integrity import INERTIAL
+from companion.estimate.filterbank import INERTIAL
 from companion.nav.geometry import displace
 from companion.navigator import FOLDED, inertial, learnt, stepped, tuned, watch
 from companion.navigator.carry import Carry, Settings, initial, is_news, level, state_at

@@ -12,8 +12,8 @@ import math
 
 import numpy as np
 
+from companion.estimate.filterbank import INERTIAL, Measurement
 from companion.estimate.fusion import Azimuth, Height, NoFix, Range, maximum_likelihood
-from companion.estimate.integrity import INERTIAL, Measurement
 from companion.estimate.monitor import Exclusion
 from companion.nav.geometry import displace
 from companion.records import Fix, Gnss, Output, Rejection, RsbnFix, Source

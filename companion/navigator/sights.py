@@ -13,10 +13,10 @@ from typing import NamedTuple
 import numpy as np
 
 from companion.config import Config
-from companion.estimate import contradiction, integrity, monitor
+from companion.estimate import contradiction, filterbank, integrity, monitor
 from companion.estimate.contradiction import Sight
+from companion.estimate.filterbank import Measurement
 from companion.estimate.fusion import Azimuth, Range
-from companion.estimate.integrity import Measurement
 from companion.estimate.monitor import Allotment, Judgement, Monitor
 from companion.records import Vector2
 
@@ -61,7 +61,7 @@ def compared(s: Sights, m: Monitor, name: str, z: Azimuth | Range, ins: Point, u
     if not isinstance(unit, WindError) or s.error_n is None or t_ns - s.gnss_ns > BESIDE_NS:
         return s
     x = np.array(s.error_n)
-    seen = integrity.sighted(name, z, x, 2)
+    seen = filterbank.sighted(name, z, x, 2)
     if seen is None or seen.unit is None:
         return s
     north, east = seen.H[0].tolist()

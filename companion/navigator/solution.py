@@ -7,7 +7,7 @@ from itertools import combinations
 from typing import NamedTuple
 
 from companion.estimate import trust
-from companion.estimate.integrity import INERTIAL
+from companion.estimate.filterbank import INERTIAL
 from companion.nav.geometry import displace
 from companion.records import Event, Mode, Solution, Source, Vector2, Vector3
 

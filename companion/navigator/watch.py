@@ -1,6 +1,6 @@
 """The integrity monitor of this navigator: its records as the monitor's measurements, its verdicts as ours.
 
-One bank of Gaussian solutions (`estimate.integrity`) over the error state of whatever channel is corrected,
+One bank of Gaussian solutions (`estimate.filterbank`) over the error state of whatever channel is corrected,
 with a constant bias of each beacon's azimuth and range as further states. Beside the error state
 that leads it tells which source to leave out, and how far off the output may be.
 Of the model it asks what every `ErrorModel` tells. It decides nothing about the guaranteed prediction, but
@@ -17,9 +17,10 @@ from scipy.special import chdtri
 
 from companion.config import Config
 from companion.config import Integrity as IntegritySection
-from companion.estimate import integrity, monitor
+from companion.estimate import filterbank, integrity, monitor
+from companion.estimate.filterbank import INERTIAL, Measurement
 from companion.estimate.fusion import Azimuth, Range
-from companion.estimate.integrity import INERTIAL, Measurement, Protection
+from companion.estimate.integrity import Protection
 from companion.estimate.monitor import Allotment, Exclusion, Monitor, Refusal
 from companion.nav.geometry import Geodetic, apart
 from companion.records import Event, Gnss, Output, Rejection, Vector2, Vector3
@@ -71,8 +72,8 @@ def allotment(config: Config) -> Allotment:
 
 def begin(t_ns: int, unit: ErrorModel) -> Watch:
     """Before the first fix: nothing but the grade of the unit."""
-    bank = integrity.begin(t_ns, np.zeros(len(unit.sigma0)), np.diag(unit.sigma0**2))
-    bank = integrity.join(integrity.join(bank, INERTIAL), GNSS, forks=FORKS)
+    bank = filterbank.begin(t_ns, np.zeros(len(unit.sigma0)), np.diag(unit.sigma0**2))
+    bank = filterbank.join(filterbank.join(bank, INERTIAL), GNSS, forks=FORKS)
     return Watch(Monitor(bank))
 
 
@@ -94,7 +95,7 @@ def advance(w: Watch, ins: Point, a_n: Vector2, unit: ErrorModel, config: Config
         np.array([radio.bias_sigma(name, config.rsbn) ** 2 for name in bank.biases]) * BIAS_HOUR**2 / 3600.0
     )
     for _ in range(steps):
-        bank = integrity.carry(bank, ins.t_ns, Phi, Q, loose, walk * dt)
+        bank = filterbank.carry(bank, ins.t_ns, Phi, Q, loose, walk * dt)
     return w._replace(monitor=w.monitor._replace(bank=bank), v_n=ins.v_n)
 
 
@@ -145,10 +146,10 @@ def of_beacon(w: Watch, name: str, z: Azimuth | Range, config: Config) -> tuple[
     """An azimuth or a range, which joins where it is new; None in the cone of silence."""
     bank = w.monitor.bank
     if name not in bank.sources:
-        bank = integrity.join(bank, name, radio.bias_sigma(name, config.rsbn))
+        bank = filterbank.join(bank, name, radio.bias_sigma(name, config.rsbn))
         w = w._replace(monitor=w.monitor._replace(bank=bank))
     k = bank.x.shape[1] - len(bank.biases)
-    return w, integrity.sighted(name, z, bank.x[0], k)
+    return w, filterbank.sighted(name, z, bank.x[0], k)
 
 
 def calibrated(w: Watch | None, name: str, z: Azimuth | Range, config: Config) -> Azimuth | Range:
@@ -175,8 +176,8 @@ def doubted(w: Watch, measurement: Measurement) -> Watch:
     until it is an ordinary one, lest it be held against its source.
     """
     bank = w.monitor.bank
-    factor = max(1.0, integrity.surprise(bank, measurement) / len(measurement.z))
-    return w._replace(monitor=w.monitor._replace(bank=integrity.widen(bank, factor)))
+    factor = max(1.0, filterbank.surprise(bank, measurement) / len(measurement.z))
+    return w._replace(monitor=w.monitor._replace(bank=filterbank.widen(bank, factor)))
 
 
 def decide(w: Watch, unit: ErrorModel, allotted: Allotment, config: Config) -> Watch:
@@ -231,7 +232,7 @@ def offer(
     """An excluded source's word, against the guaranteed prediction and, while others are heard, theirs."""
     value, limit = beyond(measurement, bounded, config)
     bank = w.monitor.bank
-    plausible = integrity.surprise(bank, measurement) <= float(chdtri(len(measurement.z), PLAUSIBLE))
+    plausible = filterbank.surprise(bank, measurement) <= float(chdtri(len(measurement.z), PLAUSIBLE))
     admitted = value <= limit and plausible
     if measurement.source == GNSS and config.channel == "air_data":  # the channel is no witness: beacons are
         admitted = admitted and sights.agrees(w.sights, w.monitor, allotted)
@@ -292,4 +293,4 @@ def blur(w: Watch, sigma: float, sigma_v: float = 0.0) -> Watch:
 
 def is_sound(w: Watch | None) -> bool:
     """Whether all of its numbers are numbers."""
-    return w is None or integrity.is_sound(w.monitor.bank)
+    return w is None or filterbank.is_sound(w.monitor.bank)
