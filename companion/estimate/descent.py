@@ -15,7 +15,7 @@ from companion.estimate.observations import Linearised, Model, Point
 _CLEARLY = 1e-9  # pivots whose product over that of the trace is more hide no small eigenvalue
 _DAMPING = 1e-14  # least mu, in traces of F: keeps a step finite along a direction that nothing measures
 _STEPS = 100
-_CONVERGED = 1e-8  # a step this long, in standard deviations, is the last
+_CONVERGED = 1e-9  # a step this long, in standard deviations, is not worth taking
 _LEVEL = 1e-11  # a rise of the cost by less, relative to 1 + cost, is rounding
 _STALLED = 1e-4  # and one this long if rounding no longer lets the cost fall
 
@@ -38,6 +38,9 @@ def descend(model: Model, p: Point) -> Minimum:
     floor, mu = _DAMPING, _DAMPING
     for iteration in range(1, _STEPS + 1):
         step, length = _step(at, mu)
+        # while damped, a step is short for another reason
+        if length < _CONVERGED and mu == floor:
+            return Minimum(p, at, iteration)
         q = (p[0] + step[0], p[1] + step[1], p[2] + step[2])
         trial = model.at(q)
         if trial.cost <= at.cost + _LEVEL * (1.0 + at.cost):
@@ -46,10 +49,6 @@ def descend(model: Model, p: Point) -> Minimum:
             return Minimum(p, at, iteration)
         else:
             mu = max(10.0 * mu, 1e-4)
-            continue
-        # while damped, a step is short for another reason
-        if length < _CONVERGED and mu == floor:
-            return Minimum(p, at, iteration)
     raise NoFix(
         f"no minimum of the cost within {_STEPS} steps (reached {model.place(p).round(1).tolist()}):"
         " azimuths that do not meet, or a start too far away; add an observation or give a nearer start"
