@@ -144,7 +144,7 @@ def type_named(name: str) -> MessageType:
         raise ValueError(f"no MAVLink message is called {name!r}{hint}") from None
 
 
-def new(name: str, **values: Any) -> Message:
+def new(name: str, /, **values: Any) -> Message:
     """Build a message by its name, fields not given being 0 (text: empty, arrays: all 0).
 
     Units are those of the wire, named in the message's XML.

@@ -129,9 +129,6 @@ def _forward(records: Iterable[Stamped], config: Config) -> list[_Stop]:
     carry, stops = initial(settings), list[_Stop]()
     since, parted = ErrorState(0, np.zeros(0), np.zeros((0, 0))), False
     for record in sorted((r for r in records if isinstance(r, FOLDED)), key=lambda r: r.t_ns):
-        if isinstance(record, Tuning):
-            settings, carry = tuned(carry, settings, parse(record.toml, "parameters in the log"))
-            continue
         if isinstance(record, Gnss) and not is_news(record, carry, settings):
             continue
         # no solutions, which would predict at moments of their own, and no bounds ahead: the stops are ours
@@ -144,6 +141,9 @@ def _forward(records: Iterable[Stamped], config: Config) -> list[_Stop]:
             last = stops.pop()  # a source was left out, and what it had said before that fix with it
             renewed = _corrected(last, carry.state)
             stops.append(renewed._replace(widened=last.widened * renewed.widened))
+        if isinstance(record, Tuning):
+            settings, carry = tuned(carry, settings, parse(record.toml, "parameters in the log"))
+            continue
         if isinstance(record, Gnss | RsbnFix):
             after, stop = _fixed(carry, record, since, settings)
         else:

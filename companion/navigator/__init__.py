@@ -108,8 +108,8 @@ class Navigator:
             self._past.append(_Past(record.t_ns, record, self._carry))
             outputs += self._stepped(record)
         if isinstance(record, RsbnFix) and self._carry.rsbn_ns == record.t_ns:  # believed: tell at once
-            self._carry, solution = solve(self._carry, record.rx_ns, self._settings)
-            outputs = [*outputs, *solution]
+            self._carry, solution = _guarded(self._carry, record, self._settings, _solved, record)
+            outputs += solution
         return [*self._announced(outputs), *self._watched(record)]
 
     def settle(self) -> None:
@@ -146,7 +146,8 @@ class Navigator:
         self._late_ns = round(1e9 * config.estimator.late_s)
         self._gnss_latency_ns = round(1e9 * config.gnss.latency_s)
         self._chosen = self._chosen and config.channel == before
-        self._past.clear()
+        while len(self._past) > 1:  # the last one stays, for what is too late
+            self._past.popleft()
 
     def _handle_late(self, record: Input) -> list[Output]:
         if record.t_ns < self._past[0].t_ns:
@@ -191,6 +192,10 @@ class Navigator:
                     self._rests_on = rests_on
                     announced.append(announce(output))
         return announced
+
+
+def _solved(carry: Carry, record: Input, settings: Settings) -> Step:
+    return solve(carry, record.rx_ns, settings)
 
 
 def stepped(carry: Carry, record: Input, settings: Settings) -> Step:

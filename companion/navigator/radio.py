@@ -82,7 +82,7 @@ def _times(C: tuple[Triple, Triple, Triple], v: Triple) -> Triple:
 
 
 def bias_sigma(name: str, settings: Rsbn) -> float:
-    """What the constant error of a beacon's measurement, called as the monitor does, may be: rad or m."""
+    """One sigma of the constant error of a beacon's measurement, called as the monitor does: rad or m."""
     return math.radians(settings.bias_azimuth_deg) if name.endswith("azimuth") else settings.bias_range_m
 
 

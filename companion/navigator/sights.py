@@ -2,7 +2,7 @@
 
 Air data reckon by a wind that may change, and tell neither from the other. So what a beacon measures is kept
 as it is seen from where GNSS says that we are, and the shape of that decides (`estimate.contradiction`). With
-an INS nothing is kept, and nobody is asked.
+an INS no measurement is kept, and nobody is asked.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ GNSS = "gnss"
 SUSPECT_NS = 60_000_000_000  # a beacon that was refused is under suspicion for so long
 BESIDE_NS = 1_000_000_000  # GNSS this close to a beacon's answer is compared with it
 NOW_NS = 10_000_000_000  # for how long a comparison is one of now
-PLAUSIBLE = 1e-3  # an excluded source must be this plausible to what is still heard
+PLAUSIBLE = 1e-3  # an excluded source must be this plausible to what is still heard, besides the bound
 
 
 class Sights(NamedTuple):

@@ -232,6 +232,22 @@ def test_what_is_later_than_the_limit_is_rejected_aloud() -> None:
     assert out.value > 50.0
 
 
+def test_what_is_too_late_is_so_after_parameters_were_set_too() -> None:
+    navigator = Navigator(CONFIG)
+    navigator.handle(origin())
+    records = [r for m in flight(40, 0.0, 40.0) for r in m.records]
+    answer = next(r for r in records if isinstance(r, RsbnFix) and r.t_ns == 12 * NS)
+    records.remove(answer)
+    for record in records:
+        navigator.handle(record)
+        if record.t_ns == 20 * NS and isinstance(record, RsbnFix):
+            navigator.handle(Tuning(20 * NS, 20 * NS, "[rsbn]\nbias_range_m = 60.0\n"))
+            outputs = navigator.handle(msgspec.structs.replace(answer, rx_ns=20 * NS))
+            assert isinstance(outputs[-1], Rejection)
+            assert outputs[-1].reason == "arrived too late to be folded in"
+            assert not any(isinstance(out, Solution) for out in outputs)
+
+
 def test_a_jump_of_the_inertial_channel_is_no_jump_of_the_estimate() -> None:
     navigator, seen, errors, resets = Navigator(CONFIG), False, [], []
     navigator.handle(origin())
