@@ -30,7 +30,7 @@ ROUNDS = 100
 WARM_UP = 20  # answers before it counts
 PATIENCE_S = 60.0
 ROUND_S = 0.1  # local position at 10 Hz
-REST_S = 0.4 * ROUND_S  # before every question
+REST_S = 0.35 * ROUND_S  # before each question: whoever asks comes straight from sleep, and all is at rest
 TIMEOUT_S = 5.0
 LOOPBACK = "127.0.0.1"
 ORIGIN = Geodetic(math.radians(60.0), math.radians(30.0), 50.0)
@@ -50,14 +50,17 @@ def measure() -> dict[str, list[float]]:
             if time.perf_counter() - begun > PATIENCE_S:
                 raise TimeoutError(f"the companion has no fix after {PATIENCE_S:g} s of flight")
             autopilot.fly()
-            answered += math.isfinite(autopilot.rsbn())
+            answered += math.isfinite(autopilot.rsbn(autopilot.rsbn_frame(), ROUND_S / 4))
         times: dict[str, list[float]] = {COMPANION: [], ECHO: []}
         for _ in range(ROUNDS):
             autopilot.fly()
             answer = autopilot.rsbn_frame()
-            times[COMPANION].append(autopilot.rsbn(answer))
-            time.sleep(REST_S)  # an echo asked at once would find the processor awake, unlike the companion
+            time.sleep(REST_S)
+            times[COMPANION].append(autopilot.rsbn(answer, TIMEOUT_S))
+            time.sleep(REST_S)
             times[ECHO].append(_round_trip(back, answer))
+        if not all(map(math.isfinite, times[COMPANION])):
+            raise TimeoutError(f"the companion gave no corrected estimate within {TIMEOUT_S:g} s")
     return times
 
 
@@ -94,7 +97,7 @@ class _Autopilot:
             cog=0,
             satellites_visible=14,
         )
-        time.sleep(REST_S)
+        time.sleep(0.1 * ROUND_S)
         self._drain()
 
     def rsbn_frame(self) -> bytes:
@@ -115,15 +118,11 @@ class _Autopilot:
             status=3,
         )
 
-    def rsbn(self, answer: bytes | None = None) -> float:
-        """Send a beacon's answer; seconds until the corrected estimate is here (while warming up, perhaps
-        none)."""
-        warming = answer is None
-        answer = answer or self.rsbn_frame()
-        self._drain()
+    def rsbn(self, answer: bytes, patience_s: float) -> float:
+        """Send a beacon's answer; seconds until the corrected estimate is here, NaN if none comes."""
         begun = time.perf_counter()
         self._sock.send(answer)
-        while time.perf_counter() - begun < (ROUND_S / 4 if warming else TIMEOUT_S):
+        while time.perf_counter() - begun < patience_s:
             try:
                 data = self._sock.recv(65536)
             except (BlockingIOError, TimeoutError, ConnectionRefusedError):
@@ -131,9 +130,7 @@ class _Autopilot:
             here = time.perf_counter()  # what it is, is found out afterwards
             if _is_odometry(data):
                 return here - begun
-        if warming:
-            return math.nan
-        raise TimeoutError(f"the companion gave no corrected estimate within {TIMEOUT_S:g} s")
+        return math.nan
 
     def _where(self) -> tuple[float, Geodetic]:
         t = 10.0 + time.perf_counter() - self._begun
