@@ -286,8 +286,8 @@ class Autopilot:
         if not math.isfinite(record.x_n[0]):
             return record
         projection: Any = self.scenario.autopilot
-        place = local_to_geodetic(projection, self.world.origin, np.array(record.x_n))
-        north, east, down = geodetic_to_local(projection, self._local_origin, place).tolist()
+        place = local_to_geodetic(projection, self.world.origin, record.x_n)
+        north, east, down = geodetic_to_local(projection, self._local_origin, place)
         return replace(record, x_n=(north, east, down))
 
     # -- messages that no sensor makes ----------------------------------------------------------------------
@@ -338,7 +338,7 @@ class Autopilot:
         if not math.isfinite(local.x_n[0]):
             return None
         projection: Any = self.scenario.autopilot
-        place: Geodetic = local_to_geodetic(projection, self.world.origin, np.array(local.x_n))
+        place: Geodetic = local_to_geodetic(projection, self.world.origin, local.x_n)
         above = place.alt - self.world.origin.alt
         msl = place.alt - self.scenario.geoid_height
         heading = self._last(Attitude, t).heading

@@ -22,8 +22,6 @@ import math
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from companion.link import dialect, frame
 from companion.link.clock import SECOND, BootClock
 from companion.link.session import LinkLost, LinkUp, MessageReceived, Rebooted, Session
@@ -249,7 +247,7 @@ class Bridge:
         if heard or self._origin is None:
             return
         start = Geodetic(self._origin.lat, self._origin.lon, self._origin.alt_msl)
-        place = local_to_geodetic(self._projection, start, np.array(record.x_n))
+        place = local_to_geodetic(self._projection, start, record.x_n)
         self.comparison.estimate(record.t_ns, AUTOPILOT, place)
 
     def _on_origin(self, record: LocalOrigin) -> None:

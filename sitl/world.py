@@ -76,9 +76,9 @@ class World:
         error = sensors.error_at(self.error, flight.t)
         places = np.stack(sensors.displaced(flight, error.x_n), axis=1).tolist()
         projection: Literal["px4", "ardupilot"] = "px4" if self.scenario.autopilot == "px4" else "ardupilot"
-        x_n = [geodetic_to_local(projection, self.origin, Geodetic(*place)).tolist() for place in places]
+        x_n = [geodetic_to_local(projection, self.origin, Geodetic(*place)) for place in places]
         v_n = (flight.v_n + error.v_n).tolist()
-        return [LocalPosition(t, t, tuple(x), tuple(v)) for t, x, v in zip(_ns(flight.t), x_n, v_n)]
+        return [LocalPosition(t, t, x, tuple(v)) for t, x, v in zip(_ns(flight.t), x_n, v_n)]
 
     def _attitude(self) -> list[Attitude]:
         flight = self._sampled(self.scenario.rates.attitude)

@@ -19,8 +19,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from typing import Any
 
-import numpy as np
-
 from companion.config import load
 from companion.link import dialect, frame
 from companion.nav.geometry import Geodetic, local_to_geodetic, slant_range_azimuth
@@ -134,7 +132,7 @@ class _Autopilot:
 
     def _where(self) -> tuple[float, Geodetic]:
         t = 10.0 + time.perf_counter() - self._begun
-        return t, local_to_geodetic("ardupilot", ORIGIN, np.array([V_NORTH * t, 0.0, -HEIGHT]))
+        return t, local_to_geodetic("ardupilot", ORIGIN, (V_NORTH * t, 0.0, -HEIGHT))
 
     def _frame(self, name: str, **values: Any) -> bytes:
         self._sequence = self._sequence + 1 & 0xFF

@@ -135,6 +135,6 @@ def _onboard(table: Floats) -> Iterator[Stamped]:
         if origin is None:
             origin = point
             yield LocalOrigin(t, t, *origin, "tangent")
-        x, y, z = geodetic_to_local("tangent", origin, point).tolist()
+        x, y, z = geodetic_to_local("tangent", origin, point)
         yield LocalPosition(t, t, (x, y, z), v_n)
         yield GlobalPosition(t, t, *point, v_n, alt - origin.alt)

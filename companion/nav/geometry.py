@@ -6,6 +6,7 @@ Local vectors are numpy arrays of shape (3,), metres.
 """
 
 import math
+from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -161,7 +162,7 @@ def in_radio_sight(beacon: Geodetic, aircraft: Geodetic, ground_alt: float = 0.0
     return slant_range_azimuth(beacon, aircraft).slant_range <= horizon
 
 
-def local_to_geodetic(projection: Projection, origin: Geodetic, x_n: Vector) -> Geodetic:
+def local_to_geodetic(projection: Projection, origin: Geodetic, x_n: Sequence[float] | Vector) -> Geodetic:
     """The geodetic position an autopilot means by the local NED position `x_n` from its `origin`.
 
     Each autopilot has a flat earth of its own; reading its local position through another one is off by
@@ -190,14 +191,14 @@ def local_to_geodetic(projection: Projection, origin: Geodetic, x_n: Vector) -> 
     raise _unknown(projection)
 
 
-def geodetic_to_local(projection: Projection, origin: Geodetic, point: Geodetic) -> Vector:
+def geodetic_to_local(projection: Projection, origin: Geodetic, point: Geodetic) -> Triple:
     """The inverse of `local_to_geodetic`: Location::get_distance_NED, MapProjection::project, `to_enu`."""
     lat_0, lon_0, alt_0 = origin
     lat, lon, alt = point
     dlon = wrap(lon - lon_0)
     if projection == "ardupilot":
         scale = _longitude_scale(0.5 * (lat + lat_0))
-        return np.array([(lat - lat_0) * _ARDUPILOT_R, dlon * _ARDUPILOT_R * scale, alt_0 - alt])
+        return (lat - lat_0) * _ARDUPILOT_R, dlon * _ARDUPILOT_R * scale, alt_0 - alt
     if projection == "px4":
         # cos(lat_0) sin(lat) - sin(lat_0) cos(lat) cos(dlon), free of cancellation.
         x = math.sin(lat - lat_0) + 2.0 * math.sin(lat_0) * math.cos(lat) * math.sin(0.5 * dlon) ** 2
@@ -206,10 +207,10 @@ def geodetic_to_local(projection: Projection, origin: Geodetic, point: Geodetic)
         cos_c = math.sin(lat_0) * math.sin(lat) + math.cos(lat_0) * math.cos(lat) * math.cos(dlon)
         sin_c = math.hypot(x, y)
         k = math.atan2(sin_c, cos_c) / sin_c if sin_c > 0.0 else 1.0
-        return np.array([k * x * _PX4_R, k * y * _PX4_R, alt_0 - alt])
+        return k * x * _PX4_R, k * y * _PX4_R, alt_0 - alt
     if projection == "tangent":
-        east, north, up = to_enu(point, origin)
-        return np.array([north, east, -up])
+        east, north, up = to_enu(point, origin).tolist()
+        return north, east, -up
     raise _unknown(projection)
 
 

@@ -208,6 +208,19 @@ def seen(state: ErrorState, H: Floats) -> Seen:
     return Seen(Belief((north, east), (nn, ne, ee)), HP)
 
 
+def ahead(state: ErrorState, dt: float, v_n: Vector3, unit: ErrorModel) -> tuple[Belief, Belief]:
+    """The errors of position and of velocity (m/s) `dt` seconds on, `carried` in plain numbers."""
+    H = np.concatenate((beacon_rows(unit), unit.velocity_rows(v_n)))
+    n, e, vn, ve = (H @ state.x).tolist()
+    (nn, ne, n_vn, n_ve), (_, ee, e_vn, e_ve), (_, _, vnn, vne), (*_, vee) = (H @ state.P @ H.T).tolist()
+    place = (
+        nn + dt * (2.0 * n_vn + dt * vnn),
+        ne + dt * (n_ve + e_vn + dt * vne),
+        ee + dt * (2.0 * e_ve + dt * vee),
+    )
+    return Belief((n + dt * vn, e + dt * ve), place), Belief((vn, ve), (vnn, vne, vee))
+
+
 def absorb_position(state: ErrorState, before: Seen, found: Belief) -> ErrorState:
     """The state once fusion has turned what is seen of it from `before` into `found`.
 

@@ -11,8 +11,6 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numpy as np
-
 from companion.nav.geometry import Geodetic, Projection, apart, displace, local_to_geodetic
 from companion.records import LocalOrigin, LocalPosition, Vector2, Vector3
 
@@ -38,7 +36,7 @@ def point(record: LocalPosition, origin: LocalOrigin) -> Point:
     """The geodetic point that the autopilot means by its local position."""
     projection: Projection = origin.projection  # type: ignore[assignment]
     start = Geodetic(origin.lat, origin.lon, origin.alt_msl)
-    return Point(record.t_ns, local_to_geodetic(projection, start, np.array(record.x_n)), record.v_n)
+    return Point(record.t_ns, local_to_geodetic(projection, start, record.x_n), record.v_n)
 
 
 def extend(track: Track, new: Point) -> Track:

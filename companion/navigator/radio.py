@@ -48,25 +48,22 @@ def _stated(record: Gnss, settings: GnssSection) -> float:
     return max(record.sigma_horizontal or 0.0, settings.sigma_m)
 
 
-def from_rsbn(record: RsbnFix, ins: Point, settings: Rsbn) -> Heard:
+def from_rsbn(record: RsbnFix, ins: Point, settings: Rsbn) -> tuple[Azimuth | Range, ...]:
     """A beacon's azimuth and slant range, whichever are there, with the floors of the configuration."""
     here = ins.position
     (x, y, z), axes_beacon = _on_earth(record.lat, record.lon, record.alt)
     x_0, y_0, z_0 = ecef(here)
     axes = east_north_up(here.lat, here.lon)
     place = _times(axes, (x - x_0, y - y_0, z - z_0))
-    observations: list[Observation] = []
-    sources = Source(0)
+    observations: list[Azimuth | Range] = []
     if record.azimuth is not None:
         sigma = max(record.sigma_azimuth, math.radians(settings.sigma_azimuth_deg))
         turned = tuple([_times(axes, axis) for axis in axes_beacon])  # C_e^b C_enu^e, row by row
         observations.append(Azimuth(place, record.azimuth, sigma, turned))
-        sources |= Source.AZIMUTH
     if record.slant_range is not None:
         floor = settings.sigma_range_m + 0.01 * settings.sigma_range_percent * record.slant_range
         observations.append(Range(place, record.slant_range, max(record.sigma_range, floor)))
-        sources |= Source.RANGE
-    return Heard(record.t_ns, tuple(observations), sources)
+    return tuple(observations)
 
 
 @lru_cache(maxsize=64)

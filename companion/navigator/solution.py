@@ -95,8 +95,7 @@ def _candidates(
 ) -> dict[str, _Estimate]:
     """What each estimator that runs says of the channel's error; the state is `dt` seconds old."""
     unit = settings.unit
-    place = errorstate.seen(state, errorstate.carried(errorstate.beacon_rows(unit), dt, ins.v_n, unit)).belief
-    motion = errorstate.seen(state, unit.velocity_rows(ins.v_n)).belief
+    place, motion = errorstate.ahead(state, dt, ins.v_n, unit)
     variance = max(motion.covariance[0], motion.covariance[2], 0.0)
     found = {"kalman": _Estimate(place.error_n, motion.error_n, place.covariance, variance)}
     if bounded is not None:

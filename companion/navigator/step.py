@@ -241,7 +241,7 @@ def _rsbn(carry: Carry, record: RsbnFix, settings: Settings) -> Step:
         return carry, [*told, Rejection(record.t_ns, record.rx_ns, f"rsbn {record.beacon}", why)]
     ins = level(ins, carry)
     said = radio.from_rsbn(record, ins, settings.config.rsbn)
-    carry = carry._replace(lesson=Lesson(record, None, ins, said.observations))
+    carry = carry._replace(lesson=Lesson(record, None, ins, said))
     heard = _calibrated(carry, record, said, settings)
     if not heard.observations:
         return carry, []
@@ -258,11 +258,12 @@ def _rsbn(carry: Carry, record: RsbnFix, settings: Settings) -> Step:
     return carry._replace(rsbn_ns=record.t_ns, rsbn_told=heard.sources, lesson=lesson), []
 
 
-def _calibrated(carry: Carry, record: RsbnFix, said: radio.Heard, settings: Settings) -> radio.Heard:
+def _calibrated(
+    carry: Carry, record: RsbnFix, said: tuple[Azimuth | Range, ...], settings: Settings
+) -> radio.Heard:
     """What is to be believed of a beacon's answer, less its learnt biases."""
     kept, told = list[Observation](), Source(0)
-    for z in said.observations:
-        assert isinstance(z, Azimuth | Range)
+    for z in said:
         name = watch.named(record.beacon, z)
         if not watch.excluded(carry.watch, name):
             kept.append(watch.calibrated(carry.watch, name, z, settings.config))

@@ -109,9 +109,12 @@ def solution(w: Watch) -> ErrorState:
 def error_at(w: Watch, ins: Point, unit: ErrorModel) -> Vector2:
     """The position error of the full solution, carried on by its velocity to a moment later."""
     t_ns, x, _ = solution(w)
-    H = errorstate.carried(errorstate.beacon_rows(unit), (ins.t_ns - t_ns) * 1e-9, ins.v_n, unit)
-    north, east = (H @ x).tolist()
-    return north, east
+    dt = (ins.t_ns - t_ns) * 1e-9
+    north, east = x[POSITION].tolist()
+    if not dt:
+        return north, east
+    v_n, v_e = (unit.velocity_rows(ins.v_n) @ x).tolist()
+    return north + dt * v_n, east + dt * v_e
 
 
 def excluded(w: Watch | None, source: str) -> bool:

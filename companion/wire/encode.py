@@ -143,8 +143,7 @@ def _local(position: Position, receiver: Receiver) -> tuple[float, float, float]
         raise Unsent(f"its accuracy is worse than the {GREATEST_ERROR_M:g} m that ArduPilot can be told")
     point = Geodetic(position.lat, position.lon, position.alt_msl)
     start = Geodetic(origin.lat, origin.lon, origin.alt_msl)
-    x, y, z = geodetic_to_local(_projection(origin), start, point).tolist()
-    return x, y, z
+    return geodetic_to_local(_projection(origin), start, point)
 
 
 def _projection(origin: LocalOrigin) -> Projection:
