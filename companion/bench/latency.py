@@ -5,6 +5,10 @@ own. A tiny autopilot here flies north at 40 m/s, with GNSS, until the navigator
 beacon answers one by one; each is timed until the ODOMETRY that it causes is here. Both peers are asked in
 turn, after the same rest, and waited for in the same way, so the ratio of the medians holds whatever the
 machine does.
+
+Who asks has a processor of its own, as an autopilot has. Left to itself the kernel runs a peer as small as
+the echo on the processor that has just asked, and saves it the waking of another one; a message from outside
+is never spared that.
 """
 
 from __future__ import annotations
@@ -12,6 +16,7 @@ from __future__ import annotations
 import asyncio
 import math
 import multiprocessing
+import os
 import socket
 import tempfile
 import time
@@ -41,7 +46,12 @@ def measure() -> dict[str, list[float]]:
     """Seconds from a beacon's answer sent to the estimate received, and the echo's round trip, round by
     round.
     """
-    with tempfile.TemporaryDirectory() as logs, _peer(_companion, logs) as there, _peer(_echo) as back:
+    with (
+        tempfile.TemporaryDirectory() as logs,
+        _apart() as others,
+        _peer(others, _companion, logs) as there,
+        _peer(others, _echo) as back,
+    ):
         autopilot = _Autopilot(there)
         begun, answered = time.perf_counter(), 0
         while answered < WARM_UP:
@@ -170,14 +180,35 @@ def _round_trip(sock: socket.socket, data: bytes) -> float:
 
 
 @contextmanager
-def _peer(serve: Any, *arguments: Any) -> Iterator[socket.socket]:
-    """A process that runs `serve(port, *arguments)`, and a socket connected to its port; ended by SIGTERM."""
+def _apart() -> Iterator[set[int]]:
+    """This process on one processor; the others, for its peers. Where there is one, or the system (not Linux)
+    leaves no choice, all share.
+    """
+    if not hasattr(os, "sched_setaffinity"):
+        yield set()
+        return
+    every = os.sched_getaffinity(0)
+    mine = {min(every)}
+    os.sched_setaffinity(0, mine)
+    try:
+        yield every - mine or every
+    finally:
+        os.sched_setaffinity(0, every)
+
+
+@contextmanager
+def _peer(processors: set[int], serve: Any, *arguments: Any) -> Iterator[socket.socket]:
+    """A process on `processors` (any, if empty) that runs `serve(port, *arguments)`, and a socket connected
+    to its port; ended by SIGTERM.
+    """
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
             probe.bind((LOOPBACK, 0))
             port = probe.getsockname()[1]
         process = multiprocessing.get_context("spawn").Process(target=serve, args=(port, *arguments))
         process.start()
+        if processors:
+            os.sched_setaffinity(process.pid or 0, processors)
         try:
             sock.connect((LOOPBACK, port))
             sock.settimeout(TIMEOUT_S)
