@@ -236,9 +236,10 @@ def test_a_bad_link_exits_78_with_one_line(tmp_path: Path) -> None:
 
 
 def test_a_consumer_that_does_not_read_costs_the_oldest_frames_and_they_are_counted(tmp_path: Path) -> None:
-    """A TCP peer that sends and never reads: the newest words wait for it, the log says how many did not."""
+    """A TCP peer that sends and never reads: the newest words wait for it, the log says how many did not; if
+    it were waited for, this would not end.
+    """
     port = free_port()
-    seen: list[tuple[int, float]] = []
 
     async def play(service: Service, told: list[Event]) -> None:
         with socket.socket() as sock:
@@ -252,16 +253,13 @@ def test_a_consumer_that_does_not_read_costs_the_oldest_frames_and_they_are_coun
                     sock.send(HEARTBEAT)
                 for _ in range(500):  # far more than any ground station is told
                     link.session.send(dialect.new("ATTITUDE"))
-                begun = time.perf_counter()
                 service._flush()
-                seen.append((link.dropped, time.perf_counter() - begun))
                 return link.dropped > 1000
 
             await until(stuck, 20.0)
             await asyncio.sleep(1.2)  # a state of the link is logged every second
 
     serve(tmp_path, (f"tcpin:{LOOPBACK}:{port}",), play)
-    assert max(took for _, took in seen) < 0.5  # never waits
     states = [
         e.value.dropped for e in file.read(tmp_path / "a.mcap") if type(e.value).__name__ == "LinkState"
     ]

@@ -2,7 +2,6 @@
 
 import json
 import math
-import time
 from itertools import pairwise
 from pathlib import Path
 
@@ -287,22 +286,6 @@ def test_a_bad_start_does_no_harm():
     for start in ([], [0, 0, 0, 0], [0, 1, 2, 3], [-1, 5, 7, 9], [5, 50, 99, 101], [1, 2, 3]):
         assert solve(rows, UNITS[0], 1.0, start).bound == pytest.approx(good.bound, rel=1e-12)
     assert solve(rows, np.zeros(4), 1.0).bound == 0.0
-
-
-def test_exchange_is_many_times_faster_than_a_linear_programme():
-    rows = schuler_row("gamma", 1.5 - np.linspace(0, 1, 8001))
-
-    def seconds(task, repeat):
-        times = []
-        for _ in range(repeat):
-            start = time.perf_counter()
-            task()
-            times.append(time.perf_counter() - start)
-        return min(times)
-
-    both, ones = np.vstack([rows, -rows]), np.ones(16002)
-    rival = seconds(lambda: linprog(-UNITS[0], both, ones, bounds=(None, None), method="highs"), 3)
-    assert rival > 20.0 * seconds(lambda: solve(rows, UNITS[0], 1.0), 10)
 
 
 # Laws
