@@ -297,7 +297,8 @@ def test_bound_is_attained_and_never_exceeded(data):
     seed = np.random.default_rng(data.draw(st.integers(0, 2**32 - 1)))
     n = data.draw(st.integers(4, 12))
     rows, sigmas = schuler_row("gamma", 1.5 - np.sort(seed.uniform(0, 1, n))), seed.uniform(0.5, 2.0, n)
-    assume(np.linalg.cond(rows) < 1e8)
+    assume((cond := np.linalg.cond(rows)) < 1e8)
+    rounding = 1e-9 + cond * np.finfo(float).eps  # of weights: where they are unique, both differ by that
     w, bound = (result := solve(rows, UNITS[0], sigmas)).weights, result.bound
     worst = sigmas * np.sign(w)  # rho = +-worst with even odds is an admissible error
     assert w @ np.outer(worst, worst) @ w == pytest.approx(bound**2, rel=1e-12)
@@ -308,7 +309,7 @@ def test_bound_is_attained_and_never_exceeded(data):
     variance = w @ (correlation * np.outer(sigmas, sigmas)) @ w
     assert variance <= bound**2 * (1.0 + 1e-9)
     for other in (least_squares(rows, UNITS[0], sigmas).weights, w):
-        assert worst_case(other, sigmas) >= bound * (1.0 - 1e-9)
+        assert worst_case(other, sigmas) >= bound * (1.0 - rounding)
         assert white(other, sigmas) <= worst_case(other, sigmas)
 
 
