@@ -8,7 +8,8 @@ out.
 
 The asyncio service and the virtual-time loopback drive this same object. It holds no state of navigation; it
 decides who is believed (the one autopilot, and any beacon receiver), what is logged, and when a solution goes
-out.
+out. Of several links that hear the autopilot the first, in the order given, leads: frames that come over the
+others are logged and no more, and what steers goes out over that one alone.
 """
 
 from __future__ import annotations
@@ -93,12 +94,12 @@ class Link:
     @property
     def lost(self) -> int:
         """Frames missed, by their sequence numbers, over all who speak here."""
-        return sum(count.lost for count in self.session.reader.counts.values())
+        return self.session.reader.lost
 
     @property
     def received(self) -> int:
         """Frames received of all who speak here."""
-        return sum(count.received for count in self.session.reader.counts.values())
+        return self.session.reader.received
 
 
 def wanted(config: Config) -> dict[str, float]:
@@ -149,13 +150,18 @@ class Onboard:
         self._events: list[Event] = []
         self.rejected: Counter[str] = Counter()
         self._origin: LocalOrigin | None = None
-        self._due: dict[str, int] = {}
+        self._paced: dict[str, int] = {}  # from when the period of each message is counted
         self._state_at = 0
         self._stale = False  # solutions have ceased
 
     def receive(self, link: str, data: bytes, now_ns: int) -> None:
         """Take bytes that came over `link`."""
         self._on_events(self.links[link], self.links[link].session.receive(data, now_ns), now_ns)
+
+    @property
+    def leading(self) -> Link | None:
+        """The link over which the autopilot is listened to and steered."""
+        return next((link for link in self.links.values() if link.session.is_up), None)
 
     def settle(self) -> None:
         """Do what no answer waits for, once the answers are out; left undone, the next record does it."""
@@ -165,7 +171,7 @@ class Onboard:
         """Do what is due."""
         for link in self.links.values():
             self._on_events(link, link.session.poll(now_ns), now_ns)
-            if link.session.is_up and self._origin is None and now_ns >= link.origin_at:
+            if link is self.leading and self._origin is None and now_ns >= link.origin_at:
                 link.origin_at = now_ns + ASK_ORIGIN_EVERY
                 self._ask_for(link, GPS_GLOBAL_ORIGIN)
             for event in link.checkup.poll(now_ns):
@@ -214,11 +220,17 @@ class Onboard:
                 link.bad += 1
             elif isinstance(event, LinkUp):
                 link.sender = link.sender._replace(autopilot=MAKES.get(event.autopilot, "other"))
-                self.note(6, f"{link.name}: autopilot {event.system} heard ({link.sender.autopilot})", now_ns)
+                text = f"{link.name}: autopilot {event.system} heard ({link.sender.autopilot})"
+                self.note(6, text + self._over_another(link), now_ns)
                 link.checkup.begin(self._config, event.system, event.autopilot)
+                for each in self.links.values():
+                    each.session.heed(event.system)  # there is one aircraft
+                if link is self.leading and self._origin is not None:  # it may have moved in the silence
+                    self._ask_for(link, GPS_GLOBAL_ORIGIN)
             elif isinstance(event, LinkLost):
                 silent = (now_ns - event.heard_ns) / SECOND
-                self.note(4, f"{link.name}: autopilot {event.system} silent for {silent:.0f} s", now_ns)
+                text = f"{link.name}: autopilot {event.system} silent for {silent:.0f} s"
+                self.note(4, text + self._over_another(link), now_ns)
             elif isinstance(event, Rebooted):
                 self._origin = None
                 link.feed.rebooted()
@@ -262,9 +274,11 @@ class Onboard:
             link.feed.acknowledged(event.message.command, event.message.result, event.received_ns)
             self._tell(link)
         link.checkup.receive(event.message, event.frame)
+        again = link.session.is_up and link is not self.leading  # what the leading link brings too
         for record in decode(event.message, event.received_ns, link.sender):
             link.feed.heard(record)
-            self._on_record(record)
+            if not again:
+                self._on_record(record)
 
     def _on_record(self, record: Stamped) -> None:
         if not isinstance(record, INPUTS):  # truth, or a rejection by `wire`: logged, and no further
@@ -289,27 +303,26 @@ class Onboard:
             self.rejected[record.source] += 1
 
     def _send(self, solution: Solution, news: bool) -> None:
-        """The messages that are due, and on the news of a beacon's fix all that steer, to every autopilot
-        heard.
-        """
+        """The messages that are due, and on the news of a beacon's fix all that steer, to the autopilot."""
         self._solution = solution
-        periods = self._dialogue.periods_ns
+        periods, t_ns = self._dialogue.periods_ns, solution.t_ns
         due = [
             name
-            for name in periods
-            if (news and name not in (RESET, STATUS)) or solution.t_ns >= self._due.get(name, 0)
+            for name, period in periods.items()
+            if (news and name not in (RESET, STATUS)) or t_ns >= self._paced.get(name, t_ns - period) + period
         ]
         for name in due:
-            next_ns = self._due.get(name, 0) + periods[name]
-            self._due[name] = max(next_ns, solution.t_ns + (periods[name] if name == RESET else 0))
+            period = periods[name]
+            next_ns = self._paced.get(name, t_ns - period) + period
+            self._paced[name] = max(next_ns, t_ns if name == RESET else t_ns - period)
         feeding = [name for name in due if name != STATUS]
-        heard = [link for link in self.links.values() if link.session.is_up]
-        for link in heard if feeding else ():
-            for message in link.feed.messages(solution, feeding, self._receiver(link)):
-                link.session.send(message)
-            self._tell(link)
-        for link in heard if STATUS in due else ():
-            link.session.send(navigation_status(solution, self._receiver(link)))
+        if feeding and (leading := self.leading) is not None:
+            for message in leading.feed.messages(solution, feeding, self._receiver(leading)):
+                leading.session.send(message)
+            self._tell(leading)
+        for link in self.links.values() if STATUS in due else ():
+            if link.session.is_up:
+                link.session.send(navigation_status(solution, self._receiver(link)))
 
     def _tell(self, link: Link) -> None:
         """What there is to tell of what goes out."""
@@ -349,6 +362,10 @@ class Onboard:
             self._stale = not self._stale
             ceased = f"no solution for {age / SECOND:.0f} s: the inertial channel gives nothing"
             self.note(3 if self._stale else 5, ceased if self._stale else "solutions again", now_ns)
+
+    def _over_another(self, link: Link) -> str:
+        leading = self.leading
+        return "" if leading in (None, link) else f"; it is listened to over {leading.name}"
 
     def _ask_for(self, link: Link, msgid: int) -> None:
         link.session.send(

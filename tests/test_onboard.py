@@ -59,9 +59,9 @@ class Log:
 class Flight:
     """An autopilot that flies north, and the companion beside it, on a clock of the test's own."""
 
-    def __init__(self) -> None:
+    def __init__(self, *links: str) -> None:
         self.log = Log()
-        self.onboard = Onboard(CONFIG, self.log)
+        self.onboard = Onboard(CONFIG, self.log, links or ("main",))
         self.now, self.boot, self.tells_origin = START, BOOT, True
         self.sent: list[tuple[int, dialect.Message]] = []
         self._sequence = 0
@@ -200,6 +200,102 @@ def test_a_second_autopilot_is_told_once_and_changes_nothing() -> None:
     told = [e.text for e in disturbed.log.of(Event) if "second autopilot" in e.text]
     assert len(told) == 1 and "9" in told[0]
     assert disturbed.log.of(Solution) == alone.log.of(Solution)
+
+
+def decoded(frames: list[bytes]) -> list[dialect.Message]:
+    found = [found for data in frames for found in frame.Reader().receive(data)]
+    return [dialect.decode(each) for each in found if isinstance(each, frame.Frame)]
+
+
+def told(flight: Flight) -> list[str]:
+    return [event.text for event in flight.log.of(Event)]
+
+
+class TwoLinks(Flight):
+    """The same autopilot heard over a second link too, that is late; the first may be cut."""
+
+    def __init__(self, late: int) -> None:
+        super().__init__("main", "radio")
+        self.late, self.cut = late, False
+        self.steered: Counter[str] = Counter()
+        self._way: list[tuple[int, bytes]] = []
+
+    def hear(self, data: bytes) -> None:
+        if not self.cut:
+            super().hear(data)
+        self._way.append((self.now + self.late, data))
+        while self._way and self._way[0][0] <= self.now:
+            self.onboard.receive("radio", self._way.pop(0)[1], self.now)
+        for name in ("main", "radio"):
+            for message in decoded(self.onboard.to_send(name, self.now)):
+                self.steered[name] += message.get_type() == "ODOMETRY"
+
+    def collect(self) -> None:
+        pass
+
+
+@pytest.mark.parametrize("late", [0, 400 * MS, 2 * SECOND])
+def test_of_two_links_to_the_autopilot_one_leads(late: int) -> None:
+    alone, both = Flight(), TwoLinks(late)
+    alone.fly(20.0)
+    both.fly(20.0)
+    assert both.log.of(Solution) == alone.log.of(Solution)
+    assert both.steered["radio"] == 0 and both.steered["main"] == len(alone.heard("ODOMETRY"))
+    assert "radio: autopilot 1 heard (ardupilot); it is listened to over main" in told(both)
+
+
+def test_the_other_link_leads_while_the_first_is_silent() -> None:
+    flight = TwoLinks(20 * MS)
+    flight.fly(90.0)
+    flight.cut = True
+    flight.fly(20.0)
+    assert any(t.startswith("main: autopilot 1 silent") and t.endswith("over radio") for t in told(flight))
+    during = [s for s in flight.log.of(Solution) if s.rx_ns > flight.now - 14 * SECOND]
+    assert len(during) >= 65 and flight.steered["radio"] >= 65
+    assert max(math.hypot(*s.error_n) for s in during) < 3.0
+    flight.cut = False
+    before = flight.steered.copy()
+    flight.fly(10.0)
+    assert flight.steered["main"] - before["main"] >= 45
+    assert not flight.log.of(Reset)
+
+
+def test_another_aircraft_on_a_second_link_is_told_and_changes_nothing() -> None:
+    alone, disturbed = Flight(), Flight("main", "radio")
+    alone.fly(6.0)
+    for _ in range(6):
+        disturbed.fly(1.0)
+        for name, values in (
+            ("HEARTBEAT", {"type": 1, "autopilot": 3}),
+            ("LOCAL_POSITION_NED", {"time_boot_ms": 1000, "x": 9e4, "y": 9e4}),
+        ):
+            disturbed.onboard.receive("radio", disturbed.frame(name, system=9, **values), disturbed.now)
+    assert "radio: a second autopilot, 9, is ignored; we listen to 1" in told(disturbed)
+    assert disturbed.log.of(Solution) == alone.log.of(Solution)
+    names = [m.get_type() for m in decoded(disturbed.onboard.to_send("radio", disturbed.now))]
+    assert set(names) == {"HEARTBEAT"}
+
+
+def test_a_rate_that_was_slow_for_a_moment_is_not_slow_for_longer() -> None:
+    flight = Flight()
+    flight.fly(5.0)
+    odometry = dialect.type_named("ODOMETRY").msgid
+    for interval_us in (60e6, 0.0):  # once a minute, and by default again
+        flight.say(
+            "COMMAND_LONG",
+            system=255,
+            component=190,
+            target_system=1,
+            target_component=191,
+            command=511,
+            param1=odometry,
+            param2=interval_us,
+        )
+        flight.fly(2.0)
+    assert [m.result for _, m in flight.sent if m.get_type() == "COMMAND_ACK"] == [0, 0]
+    before = len(flight.heard("ODOMETRY"))
+    flight.fly(10.0)
+    assert len(flight.heard("ODOMETRY")) - before == pytest.approx(50, abs=1)
 
 
 def test_garbage_and_unknown_messages_are_counted_and_it_carries_on() -> None:

@@ -25,8 +25,9 @@ simulator's clock may run slow by a hundredth.
 A stamp that arrives before even TIMESYNC's lower bound lets it (before the envelope, without one) is of a
 clock that was set forward. Stamps that go back by seconds are of a reboot, if the autopilot can be so young:
 everything is forgotten and begun again. (So is the wrap of a 32-bit millisecond stamp after 49.7 days.) If
-not, its clock was set back and only the mapping is begun again. One alone may be a straggler or a false one:
-it is believed when the next agrees with it.
+not, its clock was set back and only the mapping is begun again. After a silence in which the autopilot may
+have booted its stamps need not go back: that they are behind by more than any link is late tells as much. One
+alone may be a straggler or a false one: it is believed when the next agrees with it.
 """
 
 from __future__ import annotations
@@ -118,7 +119,7 @@ class BootClock:
     def heard(self, boot: int, received: int) -> News | None:
         """Take the stamp of a message that was stamped when sent. Returns what it tells of the clock."""
         seen, news = received - boot, None
-        if boot < self._newest - BACK:
+        if boot < self._newest - BACK or self._slept(boot, received):
             doubted, self._back = self._back, (boot, seen)
             if doubted is None or boot < doubted[0] or abs(seen - doubted[1]) > BACK:
                 return None
@@ -145,6 +146,11 @@ class BootClock:
             self._envelope = self._followed(self._envelope, seen, received)
         self._envelope_at = received
         return news
+
+    def _slept(self, boot: int, received: int) -> bool:
+        """Whether this stamp, though no step back, is of one that booted in the silence before it."""
+        offset = self.offset(received)
+        return offset is not None and boot <= received - self._heard_at and received - boot - offset > LATEST
 
     def _possible(self, now: int) -> int:
         """The least offset that there can be: by TIMESYNC, without it by what has arrived."""
@@ -175,7 +181,8 @@ class BootClock:
         return now
 
     def answered(self, asked: int, reading: int, now: int) -> bool:
-        """Take a TIMESYNC answer; False if it is not to a question of ours or means another clock.
+        """Take a TIMESYNC answer; False if it is not to a question of ours, means another clock, or
+        nothing stamped was heard yet.
 
         `outlier` then says by how much (ns) it would have the last message arrive early (below 0) or late.
         """
@@ -183,12 +190,13 @@ class BootClock:
         if asked not in self._asked:
             return False
         self._asked.remove(asked)
+        if self._envelope is None:
+            return False  # nothing was heard that it could be judged by
         answer = Answer(asked, reading, now)
-        if self._envelope is not None:
-            if self._seen - answer.least < -JUMP or self._seen - answer.most > LATEST:
-                self.outlier = self._seen - answer.offset
-                return False
-            self._envelope = max(self._envelope, answer.least)
+        if self._seen - answer.least < -JUMP or self._seen - answer.most > LATEST:
+            self.outlier = self._seen - answer.offset
+            return False
+        self._envelope = max(self._envelope, answer.least)
         # One clock has no two answers that exclude one another: it was set, or slips faster than a crystal.
         self._answers = deque((a for a in self._answers if self._agree(a, answer)), self._answers.maxlen)
         self._answers.append(answer)

@@ -35,6 +35,8 @@ SIGNATURE_SIZE = 13
 LONGEST = 10 + 255 + 2 + SIGNATURE_SIZE
 #: Most bytes that wait: a longest frame of unknown id whose successor's flags are not yet here.
 MOST_WAITING = LONGEST + 2
+#: Senders whose sequence numbers are followed; a line that makes up more of them is counted as a whole.
+MOST_SENDERS = 256
 #: A run of rejected bytes is reported at this length at the latest.
 LONGEST_RUN = 1024
 
@@ -159,6 +161,7 @@ class Reader:
         self._run = 0
         self._run_reason = Reason.JUNK
         self._senders: dict[tuple[int, int], list[int]] = {}  # next sequence number, received, lost
+        self.received = self.lost = 0  # of all senders
 
     def receive(self, data: bytes) -> list[Event]:
         """Take the next bytes of the stream and return what they complete, in order."""
@@ -187,13 +190,16 @@ class Reader:
     def count(self, frame: Frame) -> None:
         """Count a frame for its sender, and the ones that are missing before it."""
         sequence = frame.sequence
+        self.received += 1
         sender = self._senders.get((frame.system, frame.component))
         if sender is None:
-            self._senders[frame.system, frame.component] = [sequence + 1 & 0xFF, 1, 0]
+            if len(self._senders) < MOST_SENDERS:
+                self._senders[frame.system, frame.component] = [sequence + 1 & 0xFF, 1, 0]
             return
         gap = sequence - sender[0] & 0xFF
         if 0 < gap < 128:
             sender[2] += gap
+            self.lost += gap
         sender[0] = sequence + 1 & 0xFF
         sender[1] += 1
 

@@ -218,6 +218,10 @@ class Session:
         """Whether the autopilot is heard."""
         return self._up
 
+    def heed(self, system: int) -> None:
+        """Take no other autopilot than that of `system`, unless one was heard before."""
+        self._wanted = self._wanted or system
+
     def receive(self, data: bytes, now_ns: int) -> list[Event]:
         """Take bytes that arrived at `now_ns`; return what they mean, in order."""
         self._now = now_ns

@@ -182,22 +182,23 @@ def predict(
     left = (t_ns - state.t_ns) * 1e-9
     if left <= 0.0:
         return state
-    steps = math.ceil(left / STEP_S)
-    Phi, Q = transition(left / steps, unit.system(lat, v_n, a_n))
-    x, P = state.x, state.P
-    for _ in range(steps):
-        x = Phi @ x
-        P = Phi @ P @ Phi.T + Q
-    return ErrorState(t_ns, x, 0.5 * (P + P.T))
+    Phi, Q = transition(left, unit.system(lat, v_n, a_n))
+    P = Phi @ state.P @ Phi.T + Q
+    return ErrorState(t_ns, Phi @ state.x, 0.5 * (P + P.T))
 
 
 def transition(dt: float, system: System) -> tuple[Floats, Floats]:
-    """Phi and the covariance Q of what comes in over `dt` seconds, no more than STEP_S; both (n, n)."""
-    M = system.A * dt
+    """Phi and the covariance Q of what comes in over `dt` seconds; both (n, n)."""
+    doublings = max(0, math.ceil(math.log2(dt / STEP_S)))
+    step = dt / 2**doublings
+    M = system.A * step
     M2 = M @ M
     Phi = np.eye(len(M)) + M + M2 / 2.0 + (M2 @ M) / 6.0 + (M2 @ M2) / 24.0
-    # trapezoid of the process noise: second order in dt, which is short against every mode
-    return Phi, 0.5 * dt * (system.Q + Phi @ system.Q @ Phi.T)
+    # trapezoid of the process noise: second order in the step, which is short against every mode
+    Q = 0.5 * step * (system.Q + Phi @ system.Q @ Phi.T)
+    for _ in range(doublings):  # a silence of hours costs a dozen steps
+        Phi, Q = Phi @ Phi, Phi @ Q @ Phi.T + Q
+    return Phi, Q
 
 
 def seen(state: ErrorState, H: Floats) -> Seen:

@@ -34,6 +34,7 @@ from .sights import GNSS, PLAUSIBLE, Sights
 FORKS = 2
 LOOSE_M_S = 0.05  # a root second: an inertial channel that is not believed beyond a minute
 LOOSER = 8.0  # times the model's own noise, for a channel whose velocity is noisier than that
+MOST_STEPS = 64  # across a silence: two minutes in the error state's own steps, a longer one in longer
 DECIDE_NS = 1_000_000_000
 BIAS_HOUR = 0.5  # a beacon's bias walks in an hour by this share of what it may be
 WARNING, NOTICE = 4, 5  # MAV_SEVERITY
@@ -86,7 +87,7 @@ def advance(w: Watch, ins: Point, a_n: Vector2, unit: ErrorModel, config: Config
     if w.v_n is not None:  # of the whole step: all of a turn's change of velocity meets the heading's error
         a_n = ((ins.v_n[0] - w.v_n[0]) / left, (ins.v_n[1] - w.v_n[1]) / left)
     system = unit.system(ins.position.lat, ins.v_n, a_n)
-    steps = math.ceil(left / errorstate.STEP_S)
+    steps = min(math.ceil(left / errorstate.STEP_S), MOST_STEPS)
     dt = left / steps
     Phi, Q = errorstate.transition(dt, system)
     moved = (unit.velocity_rows((0.0, 0.0, 0.0)) ** 2).sum(axis=0)

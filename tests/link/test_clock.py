@@ -44,6 +44,7 @@ def test_timesync_errs_by_half_the_round_trip_at_most_and_prefers_the_shortest()
     clock = BootClock()
     for i in range(100):
         now = OFFSET + i * SECOND
+        clock.heard(now - OFFSET, now + 40 * MS)
         there, back = (int(rng.expovariate(1 / 8.0) * MS) + MS for _ in "ab")
         asked = clock.ask(now)
         assert clock.answered(asked, now + there - OFFSET, now + there + back)
@@ -288,6 +289,39 @@ def test_an_autopilot_that_can_be_so_young_rebooted(silent_s: int) -> None:
     way.offset = 2 * OFFSET + way.ms * MS - SECOND
     way.run(0.2)
     assert way.news == [News.REBOOTED]
+
+
+@pytest.mark.parametrize("up_s", [35, 200, 395])
+def test_a_reboot_in_a_silence_is_noticed_though_its_stamps_do_not_go_back(up_s: int) -> None:
+    way = Way()
+    way.offset = 2 * OFFSET - SECOND  # just booted
+    way.run(30)
+    way.ms += 400_000
+    way.offset += (431 - up_s) * SECOND
+    way.run(0.2)
+    assert way.news == [News.REBOOTED]
+    assert way.run(60) < 0.01
+
+
+@pytest.mark.parametrize(("late_s", "flown_s"), [(9, 30), (60, 900)])
+def test_a_silence_after_which_all_comes_late_is_no_reboot(late_s: int, flown_s: int) -> None:
+    """Late by no more than a link may be; or older than the silence, as what a stalled line brings is."""
+    way = Way()
+    way.offset = 2 * OFFSET - SECOND
+    way.run(flown_s)
+    before = way.clock.offset(OFFSET + way.ms * MS)
+    way.ms += late_s * 1000
+    way.late = late_s * SECOND
+    way.run(1.2)
+    assert way.news == [] and before is not None
+    assert abs((way.clock.offset(OFFSET + way.ms * MS) or 0) - before) < MS
+
+
+def test_the_first_answer_is_not_believed_before_there_is_anything_to_judge_it_by() -> None:
+    clock = BootClock()
+    assert not clock.answered(clock.ask(OFFSET), 10**9 * SECOND, OFFSET + MS)
+    clock.heard(5 * SECOND, OFFSET + 2 * MS)
+    assert clock.offset(OFFSET + 2 * MS) == OFFSET + 2 * MS - 5 * SECOND
 
 
 def test_what_has_no_stamp_is_as_late_as_what_has_one() -> None:

@@ -153,6 +153,12 @@ def test_loss_is_counted_by_sender_and_a_repeat_is_none() -> None:
     assert reader.counts == {(1, 1): frame.Counts(591, 10), (1, 191): frame.Counts(10, 0)}
 
 
+def test_senders_without_end_cost_no_memory_and_are_counted_together() -> None:
+    reader, _ = read(b"".join(encode(dialect.new("HEARTBEAT"), 0, i >> 8, i & 0xFF) for i in range(5000)))
+    assert len(reader.counts) == frame.MOST_SENDERS
+    assert (reader.received, reader.lost) == (5000, 0)
+
+
 def test_more_frames_outlive_dropped_bytes_than_with_pymavlink() -> None:
     rng = random.Random(2024)
     sent = stream(20_000, 6)
