@@ -266,6 +266,7 @@ class Onboard:
                 self._config = config
                 for each in self.links.values():
                     each.feed.config = config
+                    each.session.want(wanted(config), event.received_ns)
                 self._on_record(Tuning(event.received_ns, event.received_ns, to_toml(config)))
         if not (event.from_autopilot or event.frame.msgid == RSBN):
             return

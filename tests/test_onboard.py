@@ -298,6 +298,26 @@ def test_a_rate_that_was_slow_for_a_moment_is_not_slow_for_longer() -> None:
     assert len(flight.heard("ODOMETRY")) - before == pytest.approx(50, abs=1)
 
 
+def test_a_faster_output_set_in_flight_asks_for_a_faster_channel() -> None:
+    flight = Flight()
+    flight.fly(3.0)
+    before = len(flight.sent)
+    flight.say(
+        "PARAM_SET",
+        system=255,
+        component=190,
+        target_system=1,
+        target_component=191,
+        param_id=b"OUT_ODOMETRY_HZ",
+        param_value=20.0,
+        param_type=9,
+    )
+    flight.fly(1.0)
+    asked = [m for _, m in flight.sent[before:] if m.get_type() == "COMMAND_LONG" and m.command == 511]
+    local = dialect.type_named("LOCAL_POSITION_NED").msgid
+    assert [(m.param1, m.param2) for m in asked] == [(local, 50_000.0)]
+
+
 def test_garbage_and_unknown_messages_are_counted_and_it_carries_on() -> None:
     flight = Flight()
     flight.fly(3.0)

@@ -178,7 +178,7 @@ class Session:
         self.state = STATE_ACTIVE
         self.reader = frame.Reader(counting=False)
         self.clock = BootClock()
-        self.streams = Streams({dialect.type_named(n).msgid: hz for n, hz in (rates_hz or {}).items()})
+        self.streams = Streams(_by_id(rates_hz or {}))
         self._system = system
         self._wanted = autopilot_system
         self._autopilot: int | None = None  # its system id
@@ -221,6 +221,10 @@ class Session:
     def heed(self, system: int) -> None:
         """Take no other autopilot than that of `system`, unless one was heard before."""
         self._wanted = self._wanted or system
+
+    def want(self, rates_hz: Mapping[str, float], now_ns: int) -> None:
+        """Ask the autopilot for these rates (Hz, by message name) from now on."""
+        self.streams.want(_by_id(rates_hz), now_ns)
 
     def receive(self, data: bytes, now_ns: int) -> list[Event]:
         """Take bytes that arrived at `now_ns`; return what they mean, in order."""
@@ -377,3 +381,7 @@ class Session:
                 param2=1e6 / rate_hz,
             )
         )
+
+
+def _by_id(rates_hz: Mapping[str, float]) -> dict[int, float]:
+    return {dialect.type_named(name).msgid: hz for name, hz in rates_hz.items()}

@@ -35,13 +35,20 @@ class Streams:
     """The wanted rates (Hz) by message id. Idle until `start`."""
 
     def __init__(self, rates_hz: Mapping[int, float]) -> None:
+        self._streams: dict[int, Stream] = {}
+        self._running = False
+        self.want(rates_hz, 0)
+
+    def want(self, rates_hz: Mapping[int, float], now: int) -> None:
+        """Want these from now on: what is new is asked for at the next `due`. ValueError if impossible."""
+        before, self._streams = self._streams, {}
         for msgid, rate in rates_hz.items():
             if not 0 < rate <= 1000:
                 raise ValueError(f"a rate of {rate} Hz for message {msgid} is not between 0 and 1000 Hz")
-        self._streams = {
-            msgid: Stream(rate, max(WINDOW, int(3 * SECOND / rate))) for msgid, rate in rates_hz.items()
-        }
-        self._running = False
+            stream = before.get(msgid)
+            if stream is None or stream.rate_hz != rate:
+                stream = Stream(rate, max(WINDOW, int(3 * SECOND / rate)), since=now, check_at=now)
+            self._streams[msgid] = stream
 
     def start(self, now: int) -> None:
         """Ask for everything at the next `due`: the autopilot has come, come back or rebooted."""
