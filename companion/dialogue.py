@@ -50,10 +50,10 @@ class Dialogue:
         )
         self._parameters = Parameters(component, config, save=save)
         self._status = StatusText()
+        #: How often each message is to go out now; what is disabled is left out.
+        self.periods_ns = self._periods_ns()
 
-    @property
-    def periods_ns(self) -> dict[str, int]:
-        """How often each message is to go out now; what is disabled is left out."""
+    def _periods_ns(self) -> dict[str, int]:
         asked = self._commands.intervals_us.items()
         periods = {dialect.TYPES[msgid].name: us * NANO_PER_MICRO for msgid, us in asked if us > 0}
         if (hz := self._output.rates_hz[RESET]) > 0.0:
@@ -68,6 +68,7 @@ class Dialogue:
         if config is not None and config.output != self._output:
             self._output = config.output
             self._commands.pace(_by_id(config.output))
+        self.periods_ns = self._periods_ns()
         return replies, config
 
     def tell(self, event: Event, now_ns: int) -> None:
