@@ -9,15 +9,16 @@ from __future__ import annotations
 import asyncio
 import os
 import socket
-from collections import deque
 from collections.abc import Callable
+from functools import partial
+
+from companion.link.outbox import Outbox
 
 #: A link is drained by so many bytes, and so many datagrams, before others get their turn: noise made to be
 #: slow to read (0.3 MB/s) then holds nobody up for more than 0.05 s.
 AT_ONCE = 1 << 14
 BURST = 64
 INBOX_LIMIT = 1 << 20
-OUTBOX_LIMIT = 1 << 16
 
 
 class Stream:
@@ -29,22 +30,22 @@ class Stream:
         device: int | socket.socket,
         take: Callable[[], bytes | None],
         put: Callable[[bytes], int],
+        release: Callable[[], None] | None = None,
     ) -> None:
         """`take` returns bytes, None for an empty datagram, b"" at the end; `put` how much it took.
 
-        Both may raise OSError; BlockingIOError means that the line is empty or full.
+        Both may raise OSError; BlockingIOError means that the line is empty or full. `release` closes the
+        device, where more than that is to be done.
         """
         self.name = name
-        self.dropped = 0
         self._device = device
         self._fd = device if isinstance(device, int) else device.fileno()
-        self._take, self._put = take, put
+        self._take = take
+        self._release = release or (partial(os.close, device) if isinstance(device, int) else device.close)
         self._loop = asyncio.get_running_loop()
         self._inbox: list[bytes] = []
         self._held = 0
-        self._outbox: deque[bytes] = deque()
-        self._queued = 0
-        self._begun = False  # the first of the outbox is the rest of a frame half written
+        self._outbox = Outbox(put, self._loop.time)
         self._waiter: asyncio.Future[None] | None = None
         self._end: ConnectionError | None = None
         self._hand: Callable[[bytes], None] | None = None
@@ -87,25 +88,37 @@ class Stream:
         assert self._end is not None
         raise self._end
 
+    @property
+    def dropped(self) -> int:
+        """Frames that waited for the line too long."""
+        return self._outbox.dropped
+
     def write(self, frame: bytes) -> None:
         """Send a frame now or as soon as the line takes it. Without effect on a link that has ended."""
         if self._end is not None or not frame:
             return
-        self._outbox.append(frame)
-        self._queued += len(frame)
-        if len(self._outbox) == 1:
-            self._flush()
-            if self._outbox:
-                self._loop.add_writer(self._fd, self._on_writable)
-        while self._queued > OUTBOX_LIMIT and len(self._outbox) > 1 + self._begun:
-            oldest = self._outbox[int(self._begun)]
-            del self._outbox[int(self._begun)]
-            self._queued -= len(oldest)
-            self.dropped += 1
+        waited = bool(self._outbox)
+        try:
+            self._outbox.write(frame)
+        except OSError as error:
+            self.end(f"failed: {reason(error)}")
+        if self._outbox and not waited:
+            self._loop.add_writer(self._fd, self._on_writable)
 
     def close(self) -> None:
         """End the link; a waiting `read` raises ConnectionError."""
-        self._finish("was closed")
+        self.end("was closed")
+
+    def end(self, why: str) -> None:
+        """End the link; ConnectionError then says `why`. Without effect on one that has ended."""
+        if self._end is not None:
+            return
+        self._end = ConnectionError(f"{self.name} {why}")
+        self._loop.remove_reader(self._fd)
+        self._loop.remove_writer(self._fd)
+        self._outbox.clear()
+        self._release()
+        self._wake()
 
     def _all(self) -> bytes:
         data = b"".join(self._inbox)
@@ -125,11 +138,11 @@ class Stream:
             except BlockingIOError:
                 break
             except OSError as error:
-                return self._finish(f"failed: {reason(error)}")
+                return self.end(f"failed: {reason(error)}")
             if data is None:
                 continue
             if not data:
-                return self._finish("was closed by the other side")
+                return self.end("was closed by the other side")
             taken += len(data)
             if not self._deliver(data):
                 break
@@ -152,42 +165,29 @@ class Stream:
         return self._held < INBOX_LIMIT
 
     def _on_writable(self) -> None:
-        self._flush()
-        if not self._outbox and self._end is None:
-            self._loop.remove_writer(self._fd)
-
-    def _flush(self) -> None:
         try:
-            while self._outbox:
-                frame = self._outbox[0]
-                done = self._put(frame)
-                self._queued -= done
-                self._begun = done < len(frame)
-                if self._begun:
-                    self._outbox[0] = frame[done:]
-                    return
-                self._outbox.popleft()
-        except BlockingIOError:
-            pass
+            self._outbox.flush()
         except OSError as error:
-            self._finish(f"failed: {reason(error)}")
-
-    def _finish(self, why: str) -> None:
-        if self._end is not None:
-            return
-        self._end = ConnectionError(f"{self.name} {why}")
-        self._loop.remove_reader(self._fd)
-        self._loop.remove_writer(self._fd)
-        self._outbox.clear()
-        if isinstance(self._device, int):
-            os.close(self._device)
-        else:
-            self._device.close()
-        self._wake()
+            self.end(f"failed: {reason(error)}")
+        if not self._outbox:
+            self._loop.remove_writer(self._fd)
 
     def _wake(self) -> None:
         if self._waiter is not None and not self._waiter.done():
             self._waiter.set_result(None)
+
+
+def over_socket(name: str, sock: socket.socket) -> Stream:
+    """Stream over a connected socket of bytes."""
+    return Stream(name, sock, lambda: sock.recv(AT_ONCE), sock.send)
+
+
+def pair() -> tuple[Stream, Stream]:
+    """Return the two ends of a link in memory."""
+    one, other = socket.socketpair()
+    one.setblocking(False)
+    other.setblocking(False)
+    return over_socket("memory", one), over_socket("memory", other)
 
 
 def reason(error: OSError) -> str:
