@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import ipaddress
+import os
+import socket
 import termios
 from typing import NamedTuple
 
@@ -11,6 +14,8 @@ BAUD_RATES = {
     int(name[1:]): value for name, value in vars(termios).items() if name[0] == "B" and name[1:].isdigit()
 }
 LOOPBACK = "127.0.0.1"
+LISTENING = ("udpin", "tcpin")
+KINDS = ("serial", "udpout", "tcp", *LISTENING)
 
 
 class Address(NamedTuple):
@@ -25,10 +30,10 @@ class Address(NamedTuple):
         """Read a connection string. A link that listens without a host does so on the loopback only."""
         kind, _, rest = text.partition(":")
         place, colon, digits = rest.rpartition(":")
-        if not colon and kind in ("udpin", "tcpin"):
+        listens = kind in LISTENING
+        if not colon and listens:
             place = ""
-        listens = kind in ("udpin", "tcpin")
-        if kind not in ("serial", "udpin", "udpout", "tcp", "tcpin") or not digits.isdecimal():
+        if kind not in KINDS or not digits.isdecimal():
             raise ValueError(f"{text!r} is no connection string: give {FORMS}")
         number = int(digits)
         if kind == "serial":
@@ -40,8 +45,39 @@ class Address(NamedTuple):
             raise ValueError(f"{text!r}: {number} is not a port: give 1 to 65535")
         if not place and not listens:
             raise ValueError(f"{text!r} is no connection string, it names no host or device: give {FORMS}")
-        return cls(kind, place.strip("[]") or LOOPBACK, number)
+        place = place.strip("[]") or LOOPBACK
+        if kind == "serial" and not _is_device(place):
+            raise ValueError(f"{text!r}: {place!r} cannot be the name of a device")
+        if kind != "serial" and not _is_host(place):
+            raise ValueError(f"{text!r}: {place!r} can be neither an address nor the name of a host")
+        return cls(kind, place, number)
+
+    @property
+    def listens(self) -> bool:
+        """Whether others come to this address."""
+        return self.kind in LISTENING
 
     def __str__(self) -> str:
         place = f"[{self.place}]" if ":" in self.place else self.place
         return f"{self.kind}:{place}:{self.number}"
+
+
+def _is_device(place: str) -> bool:
+    try:
+        return b"\0" not in os.fsencode(place)
+    except UnicodeError:
+        return False
+
+
+def _is_host(place: str) -> bool:
+    """Whether a look-up may find it; what has only digits and dots is no name but an address."""
+    try:
+        if ":" in place:
+            ipaddress.IPv6Address(place)
+        elif place.replace(".", "").isdecimal():
+            socket.inet_aton(place)
+        else:
+            return b"\0" not in place.encode("idna")
+    except (OSError, ValueError):  # UnicodeError is a ValueError
+        return False
+    return True
