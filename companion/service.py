@@ -114,7 +114,9 @@ class Service:
         self._stopped.set()
 
     async def serve(self) -> None:
-        """Carry bytes until `stop`. Raises CannotListen where an address to listen on is not to be had."""
+        """Carry bytes until `stop`. Raises CannotListen where at the start an address is taken or forbidden;
+        one that is not there yet, or is taken later, is tried again for ever.
+        """
         try:
             async with asyncio.TaskGroup() as tasks:
                 carrying = [tasks.create_task(self._carry(name)) for name in self._addresses]
@@ -249,8 +251,8 @@ def command(file: Path | None, connect: tuple[str, ...], logs: str | None, pairs
     SIGTERM.
 
     Links are serial:DEVICE:BAUD, udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT and tcpin:HOST:PORT. Exit
-    codes: 0 stopped, 69 an address cannot be listened on, 73 the log folder cannot be written, 78 bad
-    configuration.
+    codes: 0 stopped, 69 an address to listen on is taken or forbidden at the start, 73 the log folder cannot
+    be written, 78 bad configuration.
     """
     flags = {"link.connect": connect or None, "log.folder": logs}
     config = load(file, flags, pairs=pairs)

@@ -18,8 +18,10 @@ from collections.abc import AsyncIterator, Callable, Iterator
 
 from companion.link.address import Address
 from companion.link.serial_line import open_serial
-from companion.link.sockets import CannotListen, open_socket, pair
-from companion.link.stream import Stream, reason
+from companion.link.sockets import CannotListen, open_socket
+from companion.link.stream import Stream, pair, reason
+from companion.link.tcp import Listener, over_tcp
+from companion.link.udp import to_all, to_one
 
 __all__ = ["Address", "CannotListen", "Stream", "back_off", "connect", "connections", "pair"]
 
@@ -29,8 +31,17 @@ GOOD_AFTER = 10.0
 
 
 async def connect(address: Address) -> Stream:
-    """Open the link once. OSError if it is not to be had, CannotListen if its own address is not."""
-    return open_serial(address) if address.kind == "serial" else await open_socket(address)
+    """Open the link once. OSError if it is not to be had, CannotListen if its own address never will be."""
+    if address.kind == "serial":
+        return open_serial(address)
+    if address.kind == "tcpin":
+        listener = await Listener.on(address)
+        try:
+            return await listener.accept()
+        finally:
+            listener.close()
+    over = {"udpin": to_all, "udpout": to_one, "tcp": over_tcp}[address.kind]
+    return over(str(address), await open_socket(address))
 
 
 async def connections(
@@ -39,30 +50,39 @@ async def connections(
     """Open the link, and again whenever the body of the `async for` comes back, for ever.
 
     `random` returns numbers in [0, 1), for the jitter of the pauses; `say` gets one line for each failure
-    that differs from the last. CannotListen ends it at once.
+    that differs from the last. CannotListen ends it, at its very first attempt alone: by then an operator is
+    there to settle it, later there may be none. A listening TCP link keeps listening between its clients.
     """
     loop = asyncio.get_running_loop()
     pauses = back_off(random)
-    said = ""
-    while True:
-        try:
-            stream = await connect(address)
-        except CannotListen:
-            raise
-        except OSError as error:
-            line = f"{address}: {reason(error)}; trying again"
-            if line != said:
-                say(line)
-            said = line
-        else:
-            said, opened = "", loop.time()
+    said, is_first = "", True
+    listener: Listener | None = None
+    try:
+        while True:
             try:
-                yield stream
-            finally:
-                stream.close()
-            if loop.time() - opened >= GOOD_AFTER:
-                pauses = back_off(random)
-        await asyncio.sleep(next(pauses))
+                if address.kind == "tcpin":
+                    listener = listener or await Listener.on(address)
+                stream = await (listener.accept() if listener else connect(address))
+            except OSError as error:
+                if is_first and isinstance(error, CannotListen):
+                    raise
+                line = f"{address}: {reason(error)}; trying again"
+                if line != said:
+                    say(line)
+                said = line
+            else:
+                said, opened = "", loop.time()
+                try:
+                    yield stream
+                finally:
+                    stream.close()
+                if loop.time() - opened >= GOOD_AFTER:
+                    pauses = back_off(random)
+            is_first = False
+            await asyncio.sleep(next(pauses))
+    finally:
+        if listener is not None:
+            listener.close()
 
 
 def back_off(random: Callable[[], float]) -> Iterator[float]:

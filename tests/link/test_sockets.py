@@ -1,8 +1,6 @@
 """Bytes through real sockets: several peers, bursts, losses and refusals."""
 
 import asyncio
-import errno
-import os
 import socket
 from collections.abc import Coroutine
 from typing import Any
@@ -12,7 +10,7 @@ import pytest
 from companion.link import stream
 from companion.link.address import Address
 from companion.link.stream import Stream
-from companion.link.transport import connect, connections
+from companion.link.transport import connect
 
 
 def run(test: Coroutine[Any, Any, None]) -> None:
@@ -80,26 +78,27 @@ def test_a_burst_of_datagrams_comes_in_few_reads_and_in_order() -> None:
     run(test())
 
 
-def test_tcp_both_ways_and_again_after_a_loss() -> None:
+def answering(monkeypatch: pytest.MonkeyPatch, *answers: tuple[socket.AddressFamily, str]) -> None:
+    async def getaddrinfo(_: str, port: int, *, type: socket.SocketKind) -> list[Any]:
+        return [(family, type, 0, "", (host, port)) for family, host in answers]
+
+    monkeypatch.setattr(asyncio.get_running_loop(), "getaddrinfo", getaddrinfo)
+
+
+def test_every_answer_to_a_name_is_tried(monkeypatch: pytest.MonkeyPatch) -> None:
     async def test() -> None:
-        port = free_port()
-        said: list[str] = []
-        client = connections(Address("tcp", "127.0.0.1", port), lambda: 1.0, said.append)
-        waiting = asyncio.ensure_future(anext(client))
-        await asyncio.sleep(0.05)  # nobody listens yet
-        for turn in (b"one", b"two"):
-            accepting = asyncio.ensure_future(connect(Address("tcpin", "127.0.0.1", port)))
-            near, far = await asyncio.gather(waiting, accepting)
-            near.write(turn)
-            far.write(turn[::-1])
-            assert (await far.read(), await near.read()) == (turn, turn[::-1])
-            far.close()
-            with pytest.raises(ConnectionError, match=f"tcp:127.0.0.1:{port} was closed by the other side"):
-                await near.read()
-            waiting = asyncio.ensure_future(anext(client))
-        waiting.cancel()
-        await asyncio.gather(waiting, return_exceptions=True)
-        await client.aclose()
-        assert said[0] == f"tcp:127.0.0.1:{port}: {os.strerror(errno.ECONNREFUSED)}; trying again"
+        with socket.create_server(("127.0.0.1", 0)) as server:
+            answering(monkeypatch, *((socket.AF_INET, f"127.0.0.{i}") for i in (3, 2, 1)))
+            link = await connect(Address("tcp", "localhost", server.getsockname()[1]))
+            link.close()
+
+    run(test())
+
+
+def test_where_no_answer_to_a_name_helps_the_first_failure_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def test() -> None:
+        answering(monkeypatch, (socket.AF_INET, "127.0.0.1"), (socket.AF_INET, "255.255.255.255"))
+        with pytest.raises(ConnectionRefusedError):
+            await connect(Address("tcp", "localhost", free_port()))
 
     run(test())

@@ -1,13 +1,16 @@
 """Links opened again for ever: when not, after which pauses, and what is said."""
 
 import asyncio
+import errno
+import os
 import random
 import socket
-from collections.abc import Coroutine
+from collections.abc import Callable, Coroutine
 from typing import Any
 
 import pytest
 
+from companion.link import transport
 from companion.link.address import Address
 from companion.link.transport import CannotListen, back_off, connections
 
@@ -30,6 +33,74 @@ def test_a_port_in_use_is_one_clear_sentence_and_no_retry(kind: str) -> None:
             address = Address(kind, "127.0.0.1", taken.getsockname()[1])
             with pytest.raises(CannotListen, match=f"cannot listen on {address}: .*choose another port"):
                 await anext(connections(address, random.random, print))
+
+    run(test())
+
+
+async def until(condition: Callable[[], bool]) -> None:
+    for _ in range(2000):
+        if condition():
+            return
+        await asyncio.sleep(0.005)
+    raise TimeoutError
+
+
+def binding(monkeypatch: pytest.MonkeyPatch, *errors: int) -> list[Any]:
+    """What `bind` was called with; it fails with these errors in turn, and passes at a 0 and after."""
+    real, called, waiting = socket.socket.bind, list[Any](), list(errors)
+
+    def bind(sock: socket.socket, where: Any) -> None:
+        called.append(where)
+        if waiting and (number := waiting.pop(0)):
+            raise OSError(number, os.strerror(number))
+        real(sock, where)
+
+    monkeypatch.setattr(socket.socket, "bind", bind)
+    monkeypatch.setattr(transport, "SHORTEST_PAUSE", 0.002)
+    return called
+
+
+@pytest.mark.parametrize("number", [errno.EACCES, errno.EINVAL])
+def test_an_address_that_never_will_be_had_ends_it(monkeypatch: pytest.MonkeyPatch, number: int) -> None:
+    async def test() -> None:
+        called = binding(monkeypatch, number)
+        with pytest.raises(CannotListen, match=rf"{os.strerror(number)}; choose another host or port"):
+            await anext(connections(Address("udpin", "127.0.0.1", 0), random.random, print))
+        assert len(called) == 1
+
+    run(test())
+
+
+@pytest.mark.parametrize("kind", ["udpin", "tcpin"])
+def test_an_address_that_is_not_there_yet_is_said_once_and_waited_for(
+    monkeypatch: pytest.MonkeyPatch, kind: str
+) -> None:
+    async def test() -> None:
+        said: list[str] = []
+        called = binding(monkeypatch, *[errno.EADDRNOTAVAIL] * 5)
+        address = Address(kind, "127.0.0.1", 0)
+        links = connections(address, random.random, said.append)
+        opening = asyncio.ensure_future(anext(links))
+        await until(lambda: len(called) == 6)
+        assert said == [f"{address}: this computer has no address 127.0.0.1 at present; trying again"]
+        opening.cancel()
+        await asyncio.gather(opening, return_exceptions=True)
+        await links.aclose()
+
+    run(test())
+
+
+@pytest.mark.parametrize("number", [errno.EADDRINUSE, errno.EACCES, errno.EADDRNOTAVAIL])
+def test_opening_again_never_ends_it(monkeypatch: pytest.MonkeyPatch, number: int) -> None:
+    async def test() -> None:
+        said: list[str] = []
+        called = binding(monkeypatch, 0, *[number] * 5)
+        links = connections(Address("udpin", "127.0.0.1", 0), random.random, said.append)
+        (await anext(links)).close()
+        (await anext(links)).close()
+        assert len(called) == 7
+        assert len(said) == 1 and said[0].endswith("; trying again")
+        await links.aclose()
 
     run(test())
 
