@@ -28,9 +28,8 @@ def open_serial(address: Address) -> Stream:
             raise OSError(TAKEN) from None
         raise
     try:
-        fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        _claim(fd)
         tty.setraw(fd)
-        fcntl.ioctl(fd, termios.TIOCEXCL)
         mode = termios.tcgetattr(fd)
         mode[2] = mode[2] & ~(termios.CRTSCTS | termios.CSTOPB) | termios.CLOCAL | termios.CREAD
         mode[4] = mode[5] = BAUD_RATES[address.number]
@@ -50,3 +49,15 @@ def open_serial(address: Address) -> Stream:
         os.close(fd)
 
     return Stream(str(address), fd, lambda: os.read(fd, AT_ONCE), lambda frame: os.write(fd, frame), release)
+
+
+def _claim(fd: int) -> None:
+    """Raises BlockingIOError where somebody holds the lock; a driver that knows neither way is used as is."""
+    try:
+        fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        raise
+    except OSError:
+        pass
+    with contextlib.suppress(OSError):
+        fcntl.ioctl(fd, termios.TIOCEXCL)
