@@ -29,6 +29,7 @@ import click
 from companion import __version__
 from companion.config import Config, ConfigError, Log, load
 from companion.kept import Kept
+from companion.link.shortfall import Shortfall
 from companion.link.signing import Signing, read_key, store, stored
 from companion.link.transport import Address, CannotListen, Stream, connections
 from companion.log.deferred import Deferred
@@ -106,6 +107,8 @@ class Service:
         self.onboard = Onboard(config, self._deferred, self._addresses, signing, self._kept.put)
         self._log, self._tell, self._now = log, tell, now
         self._streams: dict[str, Stream] = {}
+        self._dropped_before: dict[str, int] = {}  # by earlier streams of the link
+        self._shortfalls = {name: Shortfall(address) for name, address in self._addresses.items()}
         self._stopped = asyncio.Event()
         self._trouble: str | None = None
 
@@ -114,7 +117,9 @@ class Service:
         self._stopped.set()
 
     async def serve(self) -> None:
-        """Carry bytes until `stop`. Raises CannotListen where an address to listen on is not to be had."""
+        """Carry bytes until `stop`. Raises CannotListen where at the start an address is taken or forbidden;
+        one that is not there yet, or is taken later, is tried again for ever.
+        """
         try:
             async with asyncio.TaskGroup() as tasks:
                 carrying = [tasks.create_task(self._carry(name)) for name in self._addresses]
@@ -131,22 +136,22 @@ class Service:
     async def _carry(self, name: str) -> None:
         """One link, opened again for ever."""
         async for stream in connections(self._addresses[name], random.random, self.say):
-            self._streams[name] = stream
             link = self.onboard.links[name]
+            self._streams[name], self._dropped_before[name] = stream, link.dropped
             self._manager.ready()
             try:
-                await stream.hand_to(partial(self._receive, link, stream, link.dropped))
+                await stream.hand_to(partial(self._receive, link))
             except ConnectionError as error:
                 self.say(f"{name}: {error}; opening it again")
+            self._count_dropped()
             del self._streams[name]
 
-    def _receive(self, link: Link, stream: Stream, dropped_before: int, data: bytes) -> None:
+    def _receive(self, link: Link, data: bytes) -> None:
         self.onboard.receive(link.name, data, self._now())
         self._flush()
-        link.dropped = dropped_before + stream.dropped
 
     async def _keep_time(self) -> None:
-        """What is due, and whether the disk is well."""
+        """What is due, and whether the disk and the lines are well."""
         while True:
             now = self._now()
             self.onboard.poll(now)
@@ -155,6 +160,7 @@ class Service:
                 text = f"log: {self._trouble}; navigation goes on" if self._trouble else "log: writing again"
                 text += f"; {self._log.dropped} messages lost so far" if self._log.dropped else ""
                 self.onboard.note(4 if self._trouble else 6, text, now)
+            self._look_at_lines(now)
             self._flush()
             await asyncio.sleep(max(0.0, min(1e-9 * (self.onboard.deadline() - self._now()), LOG_CHECK_S)))
 
@@ -170,6 +176,18 @@ class Service:
             if trouble is not None and trouble != told:
                 self.onboard.note(4, f"parameters: {trouble}; none can be set until it is", self._now())
             told = trouble
+
+    def _count_dropped(self) -> None:
+        for name, stream in self._streams.items():
+            self.onboard.links[name].dropped = self._dropped_before[name] + stream.dropped
+
+    def _look_at_lines(self, now: int) -> None:
+        self._count_dropped()
+        for name in self._streams:
+            shortfall = self._shortfalls[name]
+            text = shortfall.look(self.onboard.links[name].dropped, 1e-9 * now)
+            if text is not None:
+                self.onboard.note(4 if shortfall.lasts else 6, text, now)
 
     def _flush(self) -> None:
         now = self._now()
@@ -249,8 +267,8 @@ def command(file: Path | None, connect: tuple[str, ...], logs: str | None, pairs
     SIGTERM.
 
     Links are serial:DEVICE:BAUD, udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT and tcpin:HOST:PORT. Exit
-    codes: 0 stopped, 69 an address cannot be listened on, 73 the log folder cannot be written, 78 bad
-    configuration.
+    codes: 0 stopped, 69 an address to listen on is taken or forbidden at the start, 73 the log folder cannot
+    be written, 78 bad configuration.
     """
     flags = {"link.connect": connect or None, "log.folder": logs}
     config = load(file, flags, pairs=pairs)

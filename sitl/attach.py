@@ -64,7 +64,7 @@ class Attached:
         self._news.set()
 
     async def run(self, seconds: float = math.inf) -> None:
-        """Until `stop`, or for so many seconds. Raises CannotListen where an address is not to be had."""
+        """Until `stop`, or for so many seconds. Raises CannotListen where an address is taken."""
         self.begun_ns = self._now()
         try:
             async with asyncio.TaskGroup() as tasks:

@@ -152,7 +152,7 @@ class Playing:
         self._news.set()
 
     async def play(self) -> None:
-        """Play to the end or until `stop`. Raises CannotListen where an address is not to be had."""
+        """Play to the end or until `stop`. Raises CannotListen where an address is taken."""
         try:
             async with asyncio.TaskGroup() as tasks:
                 carrying = tasks.create_task(self._carry())

@@ -124,7 +124,7 @@ class Flying:
         self._news.set()
 
     async def fly(self) -> None:
-        """Fly to the end or until `stop`. Raises CannotListen where an address is not to be had."""
+        """Fly to the end or until `stop`. Raises CannotListen where an address is taken."""
         self._begun = self._now()
         try:
             async with asyncio.TaskGroup() as tasks:

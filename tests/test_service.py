@@ -259,7 +259,8 @@ def test_a_consumer_that_does_not_read_costs_the_oldest_frames_and_they_are_coun
             await until(stuck, 20.0)
             await asyncio.sleep(1.2)  # a state of the link is logged every second
 
-    serve(tmp_path, (f"tcpin:{LOOPBACK}:{port}",), play)
+    told = serve(tmp_path, (f"tcpin:{LOOPBACK}:{port}",), play)
+    assert sum("does not carry what is sent" in event.text for event in told) == 1
     states = [
         e.value.dropped for e in file.read(tmp_path / "a.mcap") if type(e.value).__name__ == "LinkState"
     ]

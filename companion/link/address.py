@@ -1,0 +1,83 @@
+"""Connection strings: where a link leads, and what can be none."""
+
+from __future__ import annotations
+
+import ipaddress
+import os
+import socket
+import termios
+from typing import NamedTuple
+
+FORMS = "serial:DEVICE:BAUD, udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or tcpin:HOST:PORT"
+#: Rates that a terminal device of this system can be set to, by their number.
+BAUD_RATES = {
+    int(name[1:]): value for name, value in vars(termios).items() if name[0] == "B" and name[1:].isdigit()
+}
+LOOPBACK = "127.0.0.1"
+LISTENING = ("udpin", "tcpin")
+KINDS = ("serial", "udpout", "tcp", *LISTENING)
+
+
+class Address(NamedTuple):
+    """Where a link leads: `kind` serial, udpin, udpout, tcp or tcpin; `number` a port or a baud rate."""
+
+    kind: str
+    place: str
+    number: int
+
+    @classmethod
+    def parse(cls, text: str) -> Address:
+        """Read a connection string. A link that listens without a host does so on the loopback only."""
+        kind, _, rest = text.partition(":")
+        place, colon, digits = rest.rpartition(":")
+        listens = kind in LISTENING
+        if not colon and listens:
+            place = ""
+        if kind not in KINDS or not digits.isdecimal():
+            raise ValueError(f"{text!r} is no connection string: give {FORMS}")
+        number = int(digits)
+        if kind == "serial":
+            if number not in BAUD_RATES:
+                raise ValueError(
+                    f"{text!r}: {number} is not a baud rate of this system: give one like 57600 or 921600"
+                )
+        elif not (0 if listens else 1) <= number <= 65535:
+            raise ValueError(f"{text!r}: {number} is not a port: give 1 to 65535")
+        if not place and not listens:
+            raise ValueError(f"{text!r} is no connection string, it names no host or device: give {FORMS}")
+        place = place.strip("[]") or LOOPBACK
+        if kind == "serial" and not _is_device(place):
+            raise ValueError(f"{text!r}: {place!r} cannot be the name of a device")
+        if kind != "serial" and not _is_host(place):
+            raise ValueError(f"{text!r}: {place!r} can be neither an address nor the name of a host")
+        return cls(kind, place, number)
+
+    @property
+    def listens(self) -> bool:
+        """Whether others come to this address."""
+        return self.kind in LISTENING
+
+    def __str__(self) -> str:
+        place = f"[{self.place}]" if ":" in self.place else self.place
+        return f"{self.kind}:{place}:{self.number}"
+
+
+def _is_device(place: str) -> bool:
+    try:
+        return b"\0" not in os.fsencode(place)
+    except UnicodeError:
+        return False
+
+
+def _is_host(place: str) -> bool:
+    """Whether a look-up may find it; what has only digits and dots is no name but an address."""
+    try:
+        if ":" in place:
+            ipaddress.IPv6Address(place)
+        elif place.replace(".", "").isdecimal():
+            socket.inet_aton(place)
+        else:
+            return b"\0" not in place.encode("idna")
+    except (OSError, ValueError):  # UnicodeError is a ValueError
+        return False
+    return True
