@@ -22,14 +22,13 @@ import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Self
 
 import click
 
 from companion import __version__
 from companion.config import Config, ConfigError, Log, load
 from companion.kept import Kept
-from companion.link.signing import Signing, read_key, store, stored
+from companion.keys import Keys
 from companion.link.transport import Address, CannotListen, Stream, connections
 from companion.log.deferred import Deferred
 from companion.log.file import Writer
@@ -44,46 +43,7 @@ EX_UNAVAILABLE, EX_CANTCREAT = 69, 73  # sysexits.h
 LOG_CHECK_S = 1.0
 KEEP_EVERY_S = 1.0
 STOP_S = 5.0  # a disk is waited for at the end
-#: A system clock before 2024 was never set: boards without a battery begin in 1970.
-SET_AFTER_NS = 1_704_067_200_000_000_000
 OVERDUE_NS = 2_000_000_000
-
-
-class Keys:
-    """MAVLink 2 signing with its key and the timestamp that must outlive a restart."""
-
-    def __init__(self, signing: Signing, stamp: Path) -> None:
-        self.signing, self._stamp = signing, stamp
-        self.follow()
-
-    @classmethod
-    def of(cls, config: Config) -> Self | None:
-        """As the configuration says, None without a key. Raises ConfigError for an unusable key."""
-        settings = config.signing
-        if not settings.key_file:
-            return None
-        stamp = Path(settings.stamp_file)
-        try:
-            signing = Signing(
-                read_key(Path(settings.key_file)),
-                timestamp=stored(stamp),
-                refuse_unsigned=settings.refuse_unsigned,
-                always_accepted=settings.always_accepted,
-            )
-        except (OSError, ValueError) as error:
-            raise ConfigError(f"signing.key_file: {error}") from None
-        return cls(signing, stamp)
-
-    def follow(self) -> None:
-        """Take the system's time, which may be set at any moment; one that was never set is none."""
-        if (unix_ns := time.time_ns()) >= SET_AFTER_NS:
-            self.signing.follow(unix_ns, time.monotonic_ns())
-
-    def store(self) -> None:
-        """Keep the timestamp; a disk that refuses costs signed links a minute after the next start."""
-        if self.signing.wants_storing:
-            with contextlib.suppress(OSError):
-                store(self._stamp, self.signing.to_store())
 
 
 class Service:
