@@ -47,7 +47,9 @@ OVERDUE_NS = 2_000_000_000
 
 
 class Service:
-    """One run of the companion. `tell` is handed every change of state, `now` reads the one clock."""
+    """One run of the companion. `tell` is handed every change of state, `now` reads the one clock, `base` is
+    the operator's configuration without what ground stations set in it.
+    """
 
     def __init__(
         self,
@@ -56,6 +58,7 @@ class Service:
         tell: Callable[[Event], None],
         now: Callable[[], int] = time.monotonic_ns,
         manager: Manager | None = None,
+        base: Config | None = None,
     ) -> None:
         self._manager = manager or Manager({})
         self._addresses = {text: Address.parse(text) for text in config.link.connect}
@@ -63,7 +66,7 @@ class Service:
         signing = self._keys.signing if self._keys else None
         self._kept = Kept(Path(name) if (name := config.link.parameters_file) else None)
         self._deferred = Deferred(log)
-        self.onboard = Onboard(config, self._deferred, self._addresses, signing, self._kept.put)
+        self.onboard = Onboard(config, self._deferred, self._addresses, signing, self._kept.put, base)
         self._log, self._tell, self._now = log, tell, now
         self._streams: dict[str, Stream] = {}
         self._stopped = asyncio.Event()
@@ -159,8 +162,8 @@ class Service:
         self._deferred.settle()
 
 
-async def run(config: Config, tell: Callable[[Event], None]) -> None:
-    """Open the log, serve until SIGINT or SIGTERM, close the log."""
+async def run(config: Config, tell: Callable[[Event], None], base: Config | None = None) -> None:
+    """Open the log, serve until SIGINT or SIGTERM, close the log. `base`: see `Service`."""
     start_ns, start_unix_ns = time.monotonic_ns(), time.time_ns()
     settings = config.log
     log = open_log(
@@ -173,7 +176,7 @@ async def run(config: Config, tell: Callable[[Event], None]) -> None:
         chunk_bytes=settings.chunk_kib << 10,
     )
     try:
-        service = Service(config, log, tell, manager=Manager(os.environ))
+        service = Service(config, log, tell, manager=Manager(os.environ), base=base)
         loop = asyncio.get_running_loop()
         for number in (signal.SIGINT, signal.SIGTERM):
             loop.add_signal_handler(number, service.stop)
@@ -213,7 +216,7 @@ def command(file: Path | None, connect: tuple[str, ...], logs: str | None, pairs
     configuration.
     """
     flags = {"link.connect": connect or None, "log.folder": logs}
-    config = load(file, flags, pairs=pairs)
+    base = config = load(file, flags, pairs=pairs)
     if config.link.parameters_file and Path(config.link.parameters_file).exists():
         config = load(file, flags, pairs=pairs, tuned=Path(config.link.parameters_file))
     begun = time.monotonic_ns()
@@ -228,7 +231,7 @@ def command(file: Path | None, connect: tuple[str, ...], logs: str | None, pairs
     except ValueError as error:
         raise ConfigError(f"link.connect: {error}") from None
     try:
-        asyncio.run(run(config, tell))
+        asyncio.run(run(config, tell, base))
     except CannotListen as error:
         click.echo(f"companion: {error.strerror}", err=True)
         sys.exit(EX_UNAVAILABLE)

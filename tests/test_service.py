@@ -202,6 +202,43 @@ def test_a_signal_closes_the_log_whole(tmp_path: Path, number: signal.Signals) -
     assert any(isinstance(e.value, Event) and "heard" in e.value.text for e in file.read(log))
 
 
+def set_in_a_run(tmp_path: Path, name: str, value: float, awaited: str) -> None:
+    """One run of the service, in which a station sets a parameter until `awaited` is in the file."""
+    port, kept, config = free_port(), tmp_path / "set.toml", tmp_path / "companion.toml"
+    config.write_text(f'[link]\nparameters_file = "{kept}"\n[gnss]\nsigma_m = 2.0\n')
+    command = [*RUN, "--config", str(config), "--connect", f"udpin:{LOOPBACK}:{port}"]
+    wish = dialect.new(
+        "PARAM_SET",
+        param_id=name.encode(),
+        param_value=value,
+        param_type=9,
+        target_system=1,
+        target_component=191,
+    )
+    with (
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock,
+        subprocess.Popen(
+            [*command, "--logs", str(tmp_path / "logs")], stderr=subprocess.DEVNULL, env=ENVIRONMENT
+        ) as process,
+    ):
+        sock.connect((LOOPBACK, port))
+        deadline = time.monotonic() + 30.0
+        while not (kept.exists() and awaited in kept.read_text()) and time.monotonic() < deadline:
+            with contextlib.suppress(ConnectionRefusedError):
+                sock.send(HEARTBEAT)
+                sock.send(frame.encode(wish, 0, 255, 190))
+            time.sleep(0.05)
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(20) == 0
+
+
+def test_what_is_set_in_one_run_outlives_what_is_set_in_the_next(tmp_path: Path) -> None:
+    set_in_a_run(tmp_path, "GNSS_SIGMA_M", 7.0, "sigma_m")
+    set_in_a_run(tmp_path, "GNSS_TIMEOUT_S", 5.0, "timeout_s")
+    kept = load(tmp_path / "set.toml", {}, {}).gnss
+    assert (kept.sigma_m, kept.timeout_s) == (7.0, 5.0)
+
+
 def finished(*arguments: str) -> tuple[int, str]:
     done = subprocess.run([*RUN, *arguments], capture_output=True, text=True, timeout=30, env=ENVIRONMENT)
     return done.returncode, done.stderr
