@@ -2,7 +2,7 @@
 
 Everything that decides is below; here bytes are carried, the clock is read and the deadline slept for. A link
 that breaks is opened again for ever, a disk that refuses is reported, and neither stops navigation: whatever
-waits for a disk does so in a thread of its own.
+waits for a disk, or for who reads what is told, does so in a thread of its own.
 
 systemd is told "ready" when the log is begun and a link is open, and "alive" each time that bytes or a
 deadline went through the navigator to the end and nothing is overdue, nowhere else: a navigator that hangs
@@ -38,6 +38,7 @@ from companion.log.replay import metadata
 from companion.onboard import Link, Onboard
 from companion.records import Event
 from companion.systemd import Manager
+from companion.telling import Telling
 
 EX_UNAVAILABLE, EX_CANTCREAT = 69, 73  # sysexits.h
 LOG_CHECK_S = 1.0
@@ -219,22 +220,23 @@ def command(file: Path | None, connect: tuple[str, ...], logs: str | None, pairs
     base = config = load(file, flags, pairs=pairs)
     if config.link.parameters_file and Path(config.link.parameters_file).exists():
         config = load(file, flags, pairs=pairs, tuned=Path(config.link.parameters_file))
-    begun = time.monotonic_ns()
-
-    def tell(event: Event) -> None:
-        with contextlib.suppress(OSError):  # nobody reads it any more: no reason not to navigate
-            click.echo(f"{(event.rx_ns - begun) * 1e-9:9.3f} {event.text}", err=True)
-
     try:
         for text in config.link.connect:
             Address.parse(text)
     except ValueError as error:
         raise ConfigError(f"link.connect: {error}") from None
+    begun, telling = time.monotonic_ns(), Telling()
+
+    def tell(event: Event) -> None:
+        telling.tell(f"{(event.rx_ns - begun) * 1e-9:9.3f} {event.text}")
+
     try:
         asyncio.run(run(config, tell, base))
     except CannotListen as error:
-        click.echo(f"companion: {error.strerror}", err=True)
+        telling.tell(f"companion: {error.strerror}")
         sys.exit(EX_UNAVAILABLE)
     except LogError as error:
-        click.echo(f"companion: {error}", err=True)
+        telling.tell(f"companion: {error}")
         sys.exit(EX_CANTCREAT)
+    finally:
+        telling.close()
