@@ -26,6 +26,7 @@ from pathlib import Path
 import click
 
 from companion import __version__
+from companion.aside import aside
 from companion.config import Config, ConfigError, Log, load
 from companion.kept import Kept
 from companion.keys import Keys
@@ -66,6 +67,7 @@ class Service:
         self._keys = Keys.of(config)
         signing = self._keys.signing if self._keys else None
         self._kept = Kept(Path(name) if (name := config.link.parameters_file) else None)
+        self._keeping = threading.Lock()
         self._deferred = Deferred(log)
         self.onboard = Onboard(config, self._deferred, self._addresses, signing, self._kept.put, base)
         self._log, self._tell, self._now = log, tell, now
@@ -129,8 +131,7 @@ class Service:
             await asyncio.sleep(KEEP_EVERY_S)
             if self._keys is not None:
                 self._keys.follow()
-                await asyncio.to_thread(self._keys.store)
-            trouble = await asyncio.to_thread(self._kept.write)
+            trouble = await aside(self.keep)
             if trouble is not None and trouble != told:
                 self.onboard.note(4, f"parameters: {trouble}; none can be set until it is", self._now())
             told = trouble
@@ -151,11 +152,14 @@ class Service:
         self.onboard.settle()
         self._deferred.settle()
 
-    def keep(self) -> None:
-        """Put on disk what must outlive a restart; waits for the disk."""
-        if self._keys is not None:
-            self._keys.store()
-        self._kept.write()
+    def keep(self) -> str | None:
+        """Put on disk what must outlive a restart; waits for the disk, and for what is being put there. What
+        the disk said of the parameters.
+        """
+        with self._keeping:
+            if self._keys is not None:
+                self._keys.store()
+            return self._kept.write()
 
     def say(self, text: str) -> None:
         """Log and tell what happened to links and files."""
@@ -186,9 +190,9 @@ async def run(config: Config, tell: Callable[[Event], None], base: Config | None
         threading.Thread(target=recovering, name="recover", daemon=True).start()
         await service.serve()
         with contextlib.suppress(TimeoutError):
-            await asyncio.wait_for(asyncio.to_thread(service.keep), STOP_S)
+            await asyncio.wait_for(aside(service.keep), STOP_S)
     finally:
-        await asyncio.to_thread(log.close)
+        await aside(log.close)
         text = f"log: closed as {log.path}" if log.trouble is None else f"log: left torn, {log.trouble}"
         text += f"; {log.dropped} messages were lost" if log.dropped else ""
         tell(Event(time.monotonic_ns(), time.monotonic_ns(), 6, text))
