@@ -40,7 +40,14 @@ def _by_id(output: Output) -> dict[int, int]:
 class Dialogue:
     """One component's side of it: acknowledges commands, keeps the parameters, tells its events."""
 
-    def __init__(self, config: Config, sources: Mapping[str, Source], save: Callable[[str], None]) -> None:
+    def __init__(
+        self,
+        config: Config,
+        sources: Mapping[str, Source],
+        save: Callable[[str], None],
+        base: Config | None = None,
+    ) -> None:
+        """`save` and `base`: see `Parameters`."""
         component = config.link.component_id
         self._output = config.output
         self._commands = Commands(
@@ -48,7 +55,7 @@ class Dialogue:
             _by_id(config.output),
             {dialect.type_named(name).msgid: source for name, source in sources.items()},
         )
-        self._parameters = Parameters(component, config, save=save)
+        self._parameters = Parameters(component, config, base=base, save=save)
         self._status = StatusText()
         #: How often each message is to go out now; what is disabled is left out.
         self.periods_ns = self._periods_ns()

@@ -135,9 +135,10 @@ class Onboard:
         links: Iterable[str] = ("main",),
         signing: Signing | None = None,
         save: Callable[[str], None] = lambda text: None,
+        base: Config | None = None,
     ) -> None:
-        """`save` keeps the TOML of what ground stations set; it may raise OSError. Raises ConfigError for
-        what cannot be meant, such as feeding the autopilot its own position.
+        """`save` keeps the TOML of what ground stations set beyond `base`; it may raise OSError. Raises
+        ConfigError for what cannot be meant, such as feeding the autopilot its own position.
         """
         for *_, sentence in conflicts(config):
             raise ConfigError(sentence)
@@ -145,7 +146,7 @@ class Onboard:
         self._log = log
         self._navigator = Navigator(config)
         self.links = {name: Link(name, config, number, signing) for number, name in enumerate(links)}
-        self._dialogue = Dialogue(config, {STATUS: self._status}, save)
+        self._dialogue = Dialogue(config, {STATUS: self._status}, save, base)
         self._solution: Solution | None = None
         self._events: list[Event] = []
         self.rejected: Counter[str] = Counter()

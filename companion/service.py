@@ -2,7 +2,7 @@
 
 Everything that decides is below; here bytes are carried, the clock is read and the deadline slept for. A link
 that breaks is opened again for ever, a disk that refuses is reported, and neither stops navigation: whatever
-waits for a disk does so in a thread of its own.
+waits for a disk, or for who reads what is told, does so in a thread of its own.
 
 systemd is told "ready" when the log is begun and a link is open, and "alive" each time that bytes or a
 deadline went through the navigator to the end and nothing is overdue, nowhere else: a navigator that hangs
@@ -22,15 +22,15 @@ import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Self
 
 import click
 
 from companion import __version__
+from companion.aside import aside
 from companion.config import Config, ConfigError, Log, load
 from companion.kept import Kept
+from companion.keys import Keys
 from companion.link.shortfall import Shortfall
-from companion.link.signing import Signing, read_key, store, stored
 from companion.link.transport import Address, CannotListen, Stream, connections
 from companion.log.deferred import Deferred
 from companion.log.file import Writer
@@ -40,55 +40,19 @@ from companion.log.replay import metadata
 from companion.onboard import Link, Onboard
 from companion.records import Event
 from companion.systemd import Manager
+from companion.telling import Telling
 
 EX_UNAVAILABLE, EX_CANTCREAT = 69, 73  # sysexits.h
 LOG_CHECK_S = 1.0
 KEEP_EVERY_S = 1.0
 STOP_S = 5.0  # a disk is waited for at the end
-#: A system clock before 2024 was never set: boards without a battery begin in 1970.
-SET_AFTER_NS = 1_704_067_200_000_000_000
 OVERDUE_NS = 2_000_000_000
 
 
-class Keys:
-    """MAVLink 2 signing with its key and the timestamp that must outlive a restart."""
-
-    def __init__(self, signing: Signing, stamp: Path) -> None:
-        self.signing, self._stamp = signing, stamp
-        self.follow()
-
-    @classmethod
-    def of(cls, config: Config) -> Self | None:
-        """As the configuration says, None without a key. Raises ConfigError for an unusable key."""
-        settings = config.signing
-        if not settings.key_file:
-            return None
-        stamp = Path(settings.stamp_file)
-        try:
-            signing = Signing(
-                read_key(Path(settings.key_file)),
-                timestamp=stored(stamp),
-                refuse_unsigned=settings.refuse_unsigned,
-                always_accepted=settings.always_accepted,
-            )
-        except (OSError, ValueError) as error:
-            raise ConfigError(f"signing.key_file: {error}") from None
-        return cls(signing, stamp)
-
-    def follow(self) -> None:
-        """Take the system's time, which may be set at any moment; one that was never set is none."""
-        if (unix_ns := time.time_ns()) >= SET_AFTER_NS:
-            self.signing.follow(unix_ns, time.monotonic_ns())
-
-    def store(self) -> None:
-        """Keep the timestamp; a disk that refuses costs signed links a minute after the next start."""
-        if self.signing.wants_storing:
-            with contextlib.suppress(OSError):
-                store(self._stamp, self.signing.to_store())
-
-
 class Service:
-    """One run of the companion. `tell` is handed every change of state, `now` reads the one clock."""
+    """One run of the companion. `tell` is handed every change of state, `now` reads the one clock, `base` is
+    the operator's configuration without what ground stations set in it.
+    """
 
     def __init__(
         self,
@@ -97,14 +61,16 @@ class Service:
         tell: Callable[[Event], None],
         now: Callable[[], int] = time.monotonic_ns,
         manager: Manager | None = None,
+        base: Config | None = None,
     ) -> None:
         self._manager = manager or Manager({})
         self._addresses = {text: Address.parse(text) for text in config.link.connect}
         self._keys = Keys.of(config)
         signing = self._keys.signing if self._keys else None
         self._kept = Kept(Path(name) if (name := config.link.parameters_file) else None)
+        self._keeping = threading.Lock()
         self._deferred = Deferred(log)
-        self.onboard = Onboard(config, self._deferred, self._addresses, signing, self._kept.put)
+        self.onboard = Onboard(config, self._deferred, self._addresses, signing, self._kept.put, base)
         self._log, self._tell, self._now = log, tell, now
         self._streams: dict[str, Stream] = {}
         self._dropped_before: dict[str, int] = {}  # by earlier streams of the link
@@ -171,8 +137,7 @@ class Service:
             await asyncio.sleep(KEEP_EVERY_S)
             if self._keys is not None:
                 self._keys.follow()
-                await asyncio.to_thread(self._keys.store)
-            trouble = await asyncio.to_thread(self._kept.write)
+            trouble = await aside(self.keep)
             if trouble is not None and trouble != told:
                 self.onboard.note(4, f"parameters: {trouble}; none can be set until it is", self._now())
             told = trouble
@@ -205,11 +170,14 @@ class Service:
         self.onboard.settle()
         self._deferred.settle()
 
-    def keep(self) -> None:
-        """Put on disk what must outlive a restart; waits for the disk."""
-        if self._keys is not None:
-            self._keys.store()
-        self._kept.write()
+    def keep(self) -> str | None:
+        """Put on disk what must outlive a restart; waits for the disk, and for what is being put there. What
+        the disk said of the parameters.
+        """
+        with self._keeping:
+            if self._keys is not None:
+                self._keys.store()
+            return self._kept.write()
 
     def say(self, text: str) -> None:
         """Log and tell what happened to links and files."""
@@ -217,8 +185,8 @@ class Service:
         self._deferred.settle()
 
 
-async def run(config: Config, tell: Callable[[Event], None]) -> None:
-    """Open the log, serve until SIGINT or SIGTERM, close the log."""
+async def run(config: Config, tell: Callable[[Event], None], base: Config | None = None) -> None:
+    """Open the log, serve until SIGINT or SIGTERM, close the log. `base`: see `Service`."""
     start_ns, start_unix_ns = time.monotonic_ns(), time.time_ns()
     settings = config.log
     log = open_log(
@@ -231,7 +199,7 @@ async def run(config: Config, tell: Callable[[Event], None]) -> None:
         chunk_bytes=settings.chunk_kib << 10,
     )
     try:
-        service = Service(config, log, tell, manager=Manager(os.environ))
+        service = Service(config, log, tell, manager=Manager(os.environ), base=base)
         loop = asyncio.get_running_loop()
         for number in (signal.SIGINT, signal.SIGTERM):
             loop.add_signal_handler(number, service.stop)
@@ -240,9 +208,9 @@ async def run(config: Config, tell: Callable[[Event], None]) -> None:
         threading.Thread(target=recovering, name="recover", daemon=True).start()
         await service.serve()
         with contextlib.suppress(TimeoutError):
-            await asyncio.wait_for(asyncio.to_thread(service.keep), STOP_S)
+            await asyncio.wait_for(aside(service.keep), STOP_S)
     finally:
-        await asyncio.to_thread(log.close)
+        await aside(log.close)
         text = f"log: closed as {log.path}" if log.trouble is None else f"log: left torn, {log.trouble}"
         text += f"; {log.dropped} messages were lost" if log.dropped else ""
         tell(Event(time.monotonic_ns(), time.monotonic_ns(), 6, text))
@@ -271,25 +239,26 @@ def command(file: Path | None, connect: tuple[str, ...], logs: str | None, pairs
     be written, 78 bad configuration.
     """
     flags = {"link.connect": connect or None, "log.folder": logs}
-    config = load(file, flags, pairs=pairs)
+    base = config = load(file, flags, pairs=pairs)
     if config.link.parameters_file and Path(config.link.parameters_file).exists():
         config = load(file, flags, pairs=pairs, tuned=Path(config.link.parameters_file))
-    begun = time.monotonic_ns()
-
-    def tell(event: Event) -> None:
-        with contextlib.suppress(OSError):  # nobody reads it any more: no reason not to navigate
-            click.echo(f"{(event.rx_ns - begun) * 1e-9:9.3f} {event.text}", err=True)
-
     try:
         for text in config.link.connect:
             Address.parse(text)
     except ValueError as error:
         raise ConfigError(f"link.connect: {error}") from None
+    begun, telling = time.monotonic_ns(), Telling()
+
+    def tell(event: Event) -> None:
+        telling.tell(f"{(event.rx_ns - begun) * 1e-9:9.3f} {event.text}")
+
     try:
-        asyncio.run(run(config, tell))
+        asyncio.run(run(config, tell, base))
     except CannotListen as error:
-        click.echo(f"companion: {error.strerror}", err=True)
+        telling.tell(f"companion: {error.strerror}")
         sys.exit(EX_UNAVAILABLE)
     except LogError as error:
-        click.echo(f"companion: {error}", err=True)
+        telling.tell(f"companion: {error}")
         sys.exit(EX_CANTCREAT)
+    finally:
+        telling.close()

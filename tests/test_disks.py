@@ -170,6 +170,50 @@ def test_solutions_go_out_on_time_whatever_the_disk_does(tmp_path: Path, monkeyp
     assert max(b - a for a, b in pairwise(solutions)) < LATE_S * 1e9  # nothing was lost meanwhile
 
 
+#: The fault: the disk of the parameters never answers (or only after a while), and one is to be kept there.
+KEEPING = """
+import sys, threading, time
+from pathlib import Path
+from companion import kept, service
+from companion.__main__ import main
+whole, wait = kept.replace_text, {wait}
+def hang(path, text):
+    print("asked", flush=True)
+    wait()
+    whole(path, text)
+kept.replace_text = hang
+init = service.Service.__init__
+def wishing(self, *arguments, **named):
+    init(self, *arguments, **named)
+    self._kept.put("kept")
+service.Service.__init__ = wishing
+sys.argv[0] = "companion"
+main()
+"""
+
+
+@pytest.mark.parametrize(
+    ("wait", "kept_text"), [("threading.Event().wait", None), ("lambda: time.sleep(2.0)", "kept")]
+)
+def test_a_disk_that_answers_late_is_waited_for_at_the_end_and_one_that_never_does_is_not(
+    tmp_path: Path, wait: str, kept_text: str | None
+) -> None:
+    parameters, logs = tmp_path / "set.toml", tmp_path / "logs"
+    command = [sys.executable, "-c", KEEPING.format(wait=wait), "run", "--logs", str(logs)]
+    command += ["--connect", f"udpin:{LOOPBACK}:{free_port()}"]
+    command += ["--set", f"link.parameters_file={parameters}"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as process:
+        try:
+            assert process.stdout is not None and process.stdout.readline() == "asked\n"
+            process.send_signal(signal.SIGTERM)
+            assert process.wait(25) == 0
+        finally:
+            process.kill()
+    assert (parameters.read_text() if parameters.exists() else None) == kept_text
+    (log,) = logs.iterdir()
+    assert file.info(log).closed
+
+
 # -- whole processes on a disk of their own ------------------------------------------------------------------
 
 

@@ -3,11 +3,13 @@ lost."""
 
 import asyncio
 import contextlib
+import fcntl
 import os
 import signal
 import socket
 import subprocess
 import sys
+import termios
 import time
 from pathlib import Path
 
@@ -200,6 +202,88 @@ def test_a_signal_closes_the_log_whole(tmp_path: Path, number: signal.Signals) -
     info = file.info(log)
     assert info.closed and info.counts["/link/Event"] >= 2
     assert any(isinstance(e.value, Event) and "heard" in e.value.text for e in file.read(log))
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="a pipe's size is set and asked for as on Linux")
+def test_a_reader_who_never_reads_holds_nothing_up(tmp_path: Path) -> None:
+    """Events until the pipe behind stderr is full, and more: it answers, and ends when it is to."""
+    port = free_port()
+    command = [*RUN, "--connect", f"udpin:{LOOPBACK}:{port}", "--logs", str(tmp_path)]
+    with (
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock,
+        subprocess.Popen(command, stderr=subprocess.PIPE, env=ENVIRONMENT) as process,
+    ):
+        assert process.stderr is not None
+        size = fcntl.fcntl(process.stderr, fcntl.F_SETPIPE_SZ, 4096)
+        sock.connect((LOOPBACK, port))
+        sock.settimeout(0.05)
+        others = iter(range(2, 256))
+
+        def is_answered() -> bool:
+            with contextlib.suppress(ConnectionRefusedError, TimeoutError):
+                sock.send(HEARTBEAT)
+                return bool(sock.recv(65536))
+            return False
+
+        def unread() -> int:
+            return int.from_bytes(fcntl.ioctl(process.stderr, termios.FIONREAD, bytes(4)), sys.byteorder)
+
+        deadline = time.monotonic() + 30.0
+        while not is_answered() and time.monotonic() < deadline:
+            time.sleep(0.05)
+        for system in others:  # each is told: a second autopilot
+            sock.send(frame.encode(dialect.new("HEARTBEAT", type=1, autopilot=3), 0, system, 1))
+        while unread() < size - 100 and time.monotonic() < deadline:
+            time.sleep(0.05)
+        while is_answered():  # what was answered before it was full
+            pass
+        sock.settimeout(5.0)
+        try:
+            assert all(is_answered() for _ in range(3))
+            process.send_signal(signal.SIGTERM)
+            assert process.wait(20) == 0
+        finally:
+            process.kill()
+        assert b"a second autopilot, 2, is ignored" in process.stderr.read()
+    (log,) = tmp_path.glob("*.mcap")
+    assert file.info(log).closed
+
+
+def set_in_a_run(tmp_path: Path, name: str, value: float, awaited: str) -> None:
+    """One run of the service, in which a station sets a parameter until `awaited` is in the file."""
+    port, kept, config = free_port(), tmp_path / "set.toml", tmp_path / "companion.toml"
+    config.write_text(f'[link]\nparameters_file = "{kept}"\n[gnss]\nsigma_m = 2.0\n')
+    command = [*RUN, "--config", str(config), "--connect", f"udpin:{LOOPBACK}:{port}"]
+    wish = dialect.new(
+        "PARAM_SET",
+        param_id=name.encode(),
+        param_value=value,
+        param_type=9,
+        target_system=1,
+        target_component=191,
+    )
+    with (
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock,
+        subprocess.Popen(
+            [*command, "--logs", str(tmp_path / "logs")], stderr=subprocess.DEVNULL, env=ENVIRONMENT
+        ) as process,
+    ):
+        sock.connect((LOOPBACK, port))
+        deadline = time.monotonic() + 30.0
+        while not (kept.exists() and awaited in kept.read_text()) and time.monotonic() < deadline:
+            with contextlib.suppress(ConnectionRefusedError):
+                sock.send(HEARTBEAT)
+                sock.send(frame.encode(wish, 0, 255, 190))
+            time.sleep(0.05)
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(20) == 0
+
+
+def test_what_is_set_in_one_run_outlives_what_is_set_in_the_next(tmp_path: Path) -> None:
+    set_in_a_run(tmp_path, "GNSS_SIGMA_M", 7.0, "sigma_m")
+    set_in_a_run(tmp_path, "GNSS_TIMEOUT_S", 5.0, "timeout_s")
+    kept = load(tmp_path / "set.toml", {}, {}).gnss
+    assert (kept.sigma_m, kept.timeout_s) == (7.0, 5.0)
 
 
 def finished(*arguments: str) -> tuple[int, str]:

@@ -19,9 +19,10 @@ from companion.config import Config, ConfigError, load
 from companion.doctor.diagnosis import Diagnosis, Finding
 from companion.doctor.examination import Examination
 from companion.doctor.show import after, as_json, parameter_table, show
+from companion.keys import Keys
 from companion.link.transport import Address, CannotListen, Stream, connect
 from companion.profiles import PROFILES
-from companion.service import EX_UNAVAILABLE, Keys
+from companion.service import EX_UNAVAILABLE
 
 HEAR_S = 10.0
 #: However slow the line, the examination or the setting is over after that.

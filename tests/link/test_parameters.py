@@ -37,9 +37,11 @@ TABLE = table()
 class Station:
     """A ground station joined to the parameters of one component, on one clock."""
 
-    def __init__(self, base: Config | None = None, save: Callable[[str], None] | None = None) -> None:
+    def __init__(self, config: Config | None = None, save: Callable[[str], None] | None = None) -> None:
         self.saved: list[str] = []
-        self.parameters = Parameters(COMPONENT, base or Config(), save=save or self.saved.append)
+        self.parameters = Parameters(
+            COMPONENT, config or Config(), base=Config(), save=save or self.saved.append
+        )
         self.now = 0
         self.changes: list[ParameterChanged] = []
 
@@ -192,6 +194,17 @@ def test_what_was_set_is_read_back_by_the_loader_of_configurations(tmp_path: pat
     for name in ("GNSS_SIGMA_M", "GNSS_USE_VEL", "LOG_MAX_FILES", "EST_FALSE_REJ"):
         station.set(name, value(Config(), name))
     assert "=" not in station.saved[-1]  # nothing departs from the operator's own any more
+
+
+def test_what_an_earlier_run_was_set_to_is_kept_with_what_this_one_is() -> None:
+    earlier = Station()
+    earlier.set("GNSS_SIGMA_M", 7.0)
+    later = Station(config.parse(earlier.saved[-1], "kept"))
+    later.set("GNSS_TIMEOUT_S", 5.0)
+    kept = config.parse(later.saved[-1], "kept").gnss
+    assert (kept.sigma_m, kept.timeout_s) == (7.0, 5.0)
+    later.set("GNSS_SIGMA_M", Config().gnss.sigma_m)  # back to the operator's own
+    assert "sigma_m" not in later.saved[-1]
 
 
 def test_to_set_what_stands_is_no_change() -> None:
