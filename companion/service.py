@@ -198,6 +198,7 @@ async def run(config: Config, tell: Callable[[Event], None], base: Config | None
         min_free=settings.minimum_free_mib << 20,
         chunk_bytes=settings.chunk_kib << 10,
     )
+    flew = True
     try:
         service = Service(config, log, tell, manager=Manager(os.environ), base=base)
         loop = asyncio.get_running_loop()
@@ -209,11 +210,17 @@ async def run(config: Config, tell: Callable[[Event], None], base: Config | None
         await service.serve()
         with contextlib.suppress(TimeoutError):
             await asyncio.wait_for(aside(service.keep), STOP_S)
+    except (CannotListen, ConfigError):
+        flew = False  # nor will it: a log of nothing takes no flight's place
+        raise
     finally:
         await aside(log.close)
-        text = f"log: closed as {log.path}" if log.trouble is None else f"log: left torn, {log.trouble}"
-        text += f"; {log.dropped} messages were lost" if log.dropped else ""
-        tell(Event(time.monotonic_ns(), time.monotonic_ns(), 6, text))
+        if flew:
+            text = f"log: closed as {log.path}" if log.trouble is None else f"log: left torn, {log.trouble}"
+            text += f"; {log.dropped} messages were lost" if log.dropped else ""
+            tell(Event(time.monotonic_ns(), time.monotonic_ns(), 6, text))
+        else:
+            log.path.unlink(missing_ok=True)
 
 
 def _recover(settings: Log, service: Service, loop: asyncio.AbstractEventLoop) -> None:

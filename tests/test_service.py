@@ -300,6 +300,13 @@ def test_a_port_in_use_exits_69_with_one_line(tmp_path: Path) -> None:
     assert code == EX_UNAVAILABLE
     assert sum(line.startswith("companion: cannot listen") for line in said.splitlines()) == 1
     assert "Traceback" not in said
+    assert not list(tmp_path.iterdir())  # a start that never flew leaves no log to take a flight's place
+
+
+def test_a_key_that_is_not_there_exits_78_and_leaves_no_log(tmp_path: Path) -> None:
+    code, said = finished("--set", f"signing.key_file={tmp_path / 'none'}", "--logs", str(tmp_path))
+    assert code == 78 and "signing.key_file" in said
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_log_folder_that_cannot_be_written_exits_73_with_one_line(tmp_path: Path) -> None:
