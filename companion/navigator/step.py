@@ -49,7 +49,7 @@ from .solution import solve
 TOGETHER_NS = 1_000_000_000  # GNSS this close to a beacon's answer joins its fix
 PATIENCE_NS = 5_000_000_000  # how long the autopilot is waited for to tell what a channel begins with
 LEVEL_3D = 3  # GPS_FIX_TYPE_3D_FIX
-BRIDGED_S = 1.0  # a silence of the airspeed up to this long is nothing
+BRIDGED_S = 1.0  # a silence of the airspeed up to this long is nothing, and one of the position not told
 UNKNOWN_M_S = 15.0  # how fast the position is lost in a longer one
 UNKNOWN_M_S2 = 5.0  # and the velocity in one of the IMU,
 TURNED_M_S = 30.0  # until nothing is known of it
@@ -108,13 +108,30 @@ def _local_position(carry: Carry, record: LocalPosition, settings: Settings) -> 
     if before is not None and record.t_ns <= before.t_ns:
         return carry._replace(local=before), out
     new = inertial.point(record, origin)
-    jump = inertial.jump(carry.track[-1], new) if carry.track else None
-    if jump is not None:
-        carry = moved.shifted(carry, jump[0], jump[1])
-        length = math.hypot(jump[0], jump[1])
-        out.append(_channel(record, f"it jumped by {length:.1f} m"))
+    if carry.track:
+        carry, out = _stepped(carry, carry.track[-1], new, record, settings)
     carry = carry._replace(track=inertial.extend(carry.track, new))
     return _given(carry, record, out, settings)
+
+
+def _stepped(carry: Carry, last: Point, new: Point, record: LocalPosition, settings: Settings) -> Step:
+    """With what the channel did from `last` to `new` that its velocities do not explain.
+
+    From one record to the next that is a jump or nothing. Across a silence a turn explains hundreds of
+    metres: what is left may be a turn or a step, and nobody knows which.
+    """
+    out = list[Output]()
+    north, east, _ = inertial.beyond(last, new)
+    length, silent = math.hypot(north, east), (new.t_ns - last.t_ns) * 1e-9
+    most = inertial.unnoticed(silent)
+    if length > most:
+        carry = moved.shifted(carry, north, east)
+        out.append(_channel(record, f"it jumped by {length:.1f} m"))
+    if length > inertial.JUMP_M and silent > inertial.REACH_S:
+        carry = moved.blurred(carry, settings, min(length, most))
+        if silent > BRIDGED_S:
+            out.append(_channel(record, f"no local position for {silent:.1f} s"))
+    return carry, out
 
 
 def _sense(carry: Carry, record: Attitude | AirData | Pressure, settings: Settings) -> Step:

@@ -268,6 +268,49 @@ def test_a_jump_of_the_inertial_channel_is_no_jump_of_the_estimate() -> None:
     assert max(errors) < 15.0
 
 
+def silent(gnss_until: float, step_m: float) -> tuple[list[tuple[Moment, Solution]], list[Any]]:
+    """The solutions of a flight whose local position is silent from 45 s to 50 s and comes back `step_m`
+    further north, each with its moment, and what is begun anew or excluded from then on.
+    """
+    navigator, solutions, told = Navigator(CONFIG), [], []
+    navigator.handle(origin())
+    for moment in flight(90, gnss_until, 90.0):
+        for record in moment.records:
+            if isinstance(record, LocalPosition) and record.t_ns > 45 * NS:
+                if record.t_ns <= 50 * NS:
+                    continue
+                x, y, z = record.x_n
+                record = msgspec.structs.replace(record, x_n=(x + step_m, y, z))
+            for out in navigator.handle(record):
+                solutions += [(moment, out)] if isinstance(out, Solution) else []
+                excluded = isinstance(out, Rejection) and "excluded" in out.reason
+                told += [out] if isinstance(out, Reset) or excluded else []
+    return solutions, told
+
+
+@pytest.mark.parametrize("gnss_until", [90.0, 30.0], ids=["gnss", "a beacon"])
+def test_a_step_in_a_silence_is_undone_by_the_next_fix(gnss_until: float) -> None:
+    """A turn would explain 200 m in 5 s, so it is no jump; but neither is it held against who contradicts."""
+    solutions, told = silent(gnss_until, 200.0)
+    assert [(type(out), out.reason) for out in told] == [(Reset, "no local position for 5.1 s")]
+    after = [(m, s) for m, s in solutions if s.t_ns > 52 * NS]
+    first = next(s for _, s in solutions if s.t_ns > 50 * NS)
+    assert first.bound_n is None  # what was promised rests on what is no more
+    worst_m = 10.0 if gnss_until > 50.0 else 300.0  # what one answer of a beacon is good for
+    assert max(distance(s, m.truth) for m, s in after) < worst_m
+    assert all(distance(s, m.truth) < 4.0 * math.sqrt(s.covariance[0] + s.covariance[3]) for m, s in after)
+    if gnss_until > 50.0:
+        assert solutions[-1][1].bound_n is not None  # and something is promised again
+
+
+def test_a_silence_without_a_step_changes_nothing_that_was_known() -> None:
+    solutions, told = silent(90.0, 0.0)
+    assert told == []
+    after = [(m, s) for m, s in solutions if s.t_ns > 50 * NS]
+    assert max(distance(s, m.truth) for m, s in after) < 10.0
+    assert all(s.bound_n is not None for _, s in after)
+
+
 def test_a_gnss_jump_is_refused_and_counted() -> None:
     navigator, rejections, errors = Navigator(CONFIG), 0, []
     navigator.handle(origin())
