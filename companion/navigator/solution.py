@@ -83,7 +83,7 @@ def solve(carry: Carry, rx_ns: int, settings: Settings) -> Step:
         _disagreement(candidates),
         max(0.0, (rx_ns - t_ns) * 1e-9),
         carry.ahead,
-        math.sqrt(velocity_variance),
+        math.hypot(math.sqrt(velocity_variance), settings.unit.velocity_noise),  # gusts are no state
         protection,
         held.trust,
     )
