@@ -60,6 +60,8 @@ FOLDED = (
     Tuning,
 )
 
+ENDLESS = 1e8  # in SI: no metres, pascals or metres a second of ours come near it
+
 
 class _Past(NamedTuple):
     t_ns: int
@@ -93,6 +95,8 @@ class Navigator:
         if not self._chosen:
             self._chosen = True
             return [_choice(record, self._settings.config), *self.handle(record)]
+        if not _is_numbers(record):
+            return [Rejection(record.t_ns, record.rx_ns, type(record).__name__, "it has what is no number")]
         if isinstance(record, Gnss) and self._gnss_latency_ns:
             record = structs.replace(record, t_ns=record.t_ns - self._gnss_latency_ns)
         stale = self._freshness.judge(record)
@@ -241,6 +245,17 @@ def _guarded(
         outputs = [*outputs, Reset(record.t_ns, record.rx_ns, "integrity monitor", why)]
         after = after._replace(watch=None)
     return after, outputs
+
+
+def _is_numbers(record: Input) -> bool:
+    """Whether all that it says are numbers, and none that nothing in flight can say."""
+    for value in structs.astuple(record):
+        if isinstance(value, float):
+            if not abs(value) < ENDLESS:  # nor is NaN
+                return False
+        elif isinstance(value, tuple) and not all(abs(x) < ENDLESS for x in value):
+            return False
+    return True
 
 
 def _choice(record: Input, config: Config) -> Event:

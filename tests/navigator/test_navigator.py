@@ -386,6 +386,33 @@ def test_what_cannot_be_computed_is_refused_and_the_flight_goes_on(monkeypatch: 
     assert max(out.t_ns for out in outs if isinstance(out, Solution)) > 29 * NS
 
 
+def spoilt(record: Any, value: float) -> Iterator[Any]:
+    """The record with `value` in one number after the other."""
+    for field in record.__struct_fields__:
+        said = getattr(record, field)
+        if isinstance(said, float):
+            yield msgspec.structs.replace(record, **{field: value})
+        elif isinstance(said, tuple):
+            for k in range(len(said)):
+                yield msgspec.structs.replace(record, **{field: (*said[:k], value, *said[k + 1 :])})
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 1e300])
+def test_what_is_no_number_is_refused_and_changes_nothing(value: float) -> None:
+    clean, spoiled, refused, told = Navigator(CONFIG), Navigator(CONFIG), 0, 0
+    clean.handle(origin())
+    spoiled.handle(origin())
+    for k, moment in enumerate(flight(30, 30.0, 30.0)):
+        for record in moment.records:
+            if k >= 90 and k % 10 == 9:
+                for wrong in spoilt(record, value):
+                    refused += 1
+                    told += [type(out) for out in spoiled.handle(wrong)] == [Rejection]
+            assert spoiled.handle(record) == clean.handle(record)
+    assert refused > 200
+    assert told == refused
+
+
 def test_a_state_gone_wrong_is_begun_anew_and_said(monkeypatch: pytest.MonkeyPatch) -> None:
     absorb = errorstate.absorb_position
     navigator, outs = Navigator(CONFIG), []
