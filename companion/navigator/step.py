@@ -39,8 +39,8 @@ from companion.records import (
     Stamped,
 )
 
-from . import absorb, deadreckoning, errorstate, inertial, moved, radio, strapped, watch
-from .carry import Carry, Lesson, Level, Settings, Step, initial, level, state_at
+from . import absorb, deadreckoning, errorstate, height, inertial, moved, radio, strapped, watch
+from .carry import Carry, Lesson, Settings, Step, initial, level, state_at
 from .inertial import Point
 from .lesson import unheard
 from .sights import GNSS
@@ -243,7 +243,8 @@ def _gnss(carry: Carry, record: Gnss, settings: Settings) -> Step:
     if out:
         return carry, out
     heard = radio.from_gnss(record, ins, config)
-    learnt = _levelled(carry.level, record, ins, min(since, config.correlation_s) / config.correlation_s)
+    part = min(since, config.correlation_s) / config.correlation_s
+    learnt = height.learn(carry.level, record, ins, part, settings.gate[1])
     carry = carry._replace(gnss_ns=record.t_ns, gnss_heard=heard, level=learnt)
     if config.use_velocity and record.v_n is not None:
         carry = absorb.velocity(carry, record, record.v_n, ins, settings)
@@ -286,17 +287,6 @@ def _calibrated(
             kept.append(watch.calibrated(carry.watch, name, z, settings.config))
             told |= Source.AZIMUTH if isinstance(z, Azimuth) else Source.RANGE
     return radio.Heard(record.t_ns, tuple(kept), told)
-
-
-def _levelled(old: Level, record: Gnss, ins: Point, part: float) -> Level:
-    """The height error against GNSS, followed as a random walk of 5 cm a root second (a barometer drifts).
-
-    `part` is the share of one independent fix that this one is worth, its noise being correlated.
-    """
-    r = max(record.sigma_vertical or 0.0, 5.0) ** 2 / part
-    p = old.variance + 0.0025
-    k = p / (p + r)
-    return Level(old.error + k * (ins.position.alt - record.alt_msl - old.error), (1.0 - k) * p)
 
 
 _Uses = dict[type, Callable[[Carry, Any, Settings], Step]]
