@@ -279,9 +279,13 @@ def _rsbn(carry: Carry, record: RsbnFix, settings: Settings) -> Step:
 def _calibrated(
     carry: Carry, record: RsbnFix, said: tuple[Azimuth | Range, ...], settings: Settings
 ) -> radio.Heard:
-    """What is to be believed of a beacon's answer, less its learnt biases."""
-    kept, told = list[Observation](), Source(0)
+    """What is to be believed of a beacon's answer, less its learnt biases; right above it no azimuth."""
+    kept, told, state = list[Observation](), Source(0), carry.state
     for z in said:
+        if isinstance(z, Azimuth) and state is not None:
+            north, east = state.x[:2].tolist()
+            if radio.silent(z, (north, east), record.slant_range):
+                continue
         name = watch.named(record.beacon, z)
         if not watch.excluded(carry.watch, name):
             kept.append(watch.calibrated(carry.watch, name, z, settings.config))

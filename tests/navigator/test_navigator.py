@@ -32,6 +32,7 @@ from companion.records import (
     Reset,
     RsbnFix,
     Solution,
+    Source,
     Truth,
     Tuning,
 )
@@ -367,6 +368,30 @@ def test_an_azimuth_alone_corrects_across_and_is_no_fix() -> None:
     assert last.mode is Mode.FIXED
 
 
+@pytest.mark.parametrize("ranged", [True, False], ids=["with a range", "an azimuth alone"])
+def test_in_the_cone_of_silence_an_azimuth_is_no_fix(ranged: bool) -> None:
+    """The beacon stands where the aircraft is after 40 s, 1 km up: it crosses the cone in 38 s."""
+    moments, navigator, heard = flight(60, 15.0, 60.0), Navigator(CONFIG), {}
+    beacon = moments[400].truth._replace(alt=0.0)
+    navigator.handle(origin())
+    for moment in moments:
+        for record in moment.records:
+            if isinstance(record, RsbnFix):
+                seen = slant_range_azimuth(beacon, moment.truth)
+                record = RsbnFix(
+                    *(record.t_ns, record.rx_ns, 1, *beacon),
+                    seen.azimuth,
+                    seen.slant_range if ranged else None,
+                    record.sigma_azimuth,
+                    record.sigma_range,
+                )
+            for out in navigator.handle(record):
+                if isinstance(out, Solution):
+                    heard[round(out.t_ns / NS)] = Source(out.sources) & (Source.AZIMUTH | Source.RANGE)
+    assert Source.AZIMUTH in heard[15]
+    assert heard[40] == (Source.RANGE if ranged else Source(0))
+
+
 def test_what_cannot_be_computed_is_refused_and_the_flight_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
     def singular(*_: Any) -> None:
         raise np.linalg.LinAlgError("Singular matrix")
@@ -406,11 +431,12 @@ def test_what_is_no_number_is_refused_and_changes_nothing(value: float) -> None:
         for record in moment.records:
             if k >= 90 and k % 10 == 9:
                 for wrong in spoilt(record, value):
-                    refused += 1
-                    told += [type(out) for out in spoiled.handle(wrong)] == [Rejection]
+                    outs = spoiled.handle(wrong)
+                    assert {type(out) for out in outs} <= {Rejection}
+                    refused, told = refused + 1, told + len(outs)
             assert spoiled.handle(record) == clean.handle(record)
     assert refused > 200
-    assert told == refused
+    assert told == 3 * 20  # once a second of each kind
 
 
 def test_a_state_gone_wrong_is_begun_anew_and_said(monkeypatch: pytest.MonkeyPatch) -> None:
