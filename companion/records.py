@@ -248,7 +248,7 @@ class Solution(Stamped, frozen=True, gc=False, tag=True):
     `covariance` is of north, east, down position (m^2), upper triangle. `bound_n` is the guaranteed r.m.s.
     bound north and east (m), None where it cannot be given. `error_n` is the estimated error of the inertial
     channel (m), `velocity_error_n` that of its velocity (m/s); `sigma_velocity` is what is left of it on the
-    worse horizontal axis (m/s). `horizon_s` counts from the last accepted fix.
+    worse horizontal axis (m/s), gusts included. `horizon_s` counts from the last accepted fix.
     `disagreement` is the greatest distance between the estimators that run (m). `protection` is the
     horizontal protection level (m): with the configured risk the error is beyond it, whichever one source
     lies; `trust` says what else must be known of it.

@@ -95,6 +95,19 @@ def join(bank: Bank, source: str, bias_sigma: float | None = None, forks: int = 
     return bank._replace(rows=rows, x=x, P=wider, biases=(*bank.biases, source))
 
 
+def leave(bank: Bank, source: str) -> Bank:
+    """Without the rows and the bias of `source`, as if it had never joined; what it taught stays taught."""
+    kept = [i for i, row in enumerate(bank.rows) if i == 0 or row.without != source]
+    x, P = bank.x[kept], bank.P[kept]
+    if source in bank.biases:
+        i = x.shape[1] - len(bank.biases) + bank.biases.index(source)
+        x, P = np.delete(x, i, axis=1), np.delete(np.delete(P, i, axis=1), i, axis=2)
+    biases, excluded = (
+        tuple(name for name in names if name != source) for names in (bank.biases, bank.excluded)
+    )
+    return bank._replace(rows=tuple(bank.rows[i] for i in kept), x=x, P=P, biases=biases, excluded=excluded)
+
+
 def carry(bank: Bank, t_ns: int, Phi: Floats, Q: Floats, loose: Floats, bias_walk: Floats) -> Bank:
     """All rows at `t_ns` by Phi (k, k), Q (k, k) of the states before the biases.
 

@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 from scipy.special import chdtri
 
-from .filterbank import INERTIAL, Bank, Measurement, fork, readmit, refuse, take
+from .filterbank import INERTIAL, Bank, Measurement, fork, leave, readmit, refuse, take
 from .integrity import Separation, blame, exclude, separations, threshold
 
 BEYOND = "separation"
@@ -165,6 +165,17 @@ def offer(
         bank = readmit(monitor.bank, source)
         return monitor._replace(bank=bank, runs=runs, admitted=tuple(since.items())), True
     return monitor._replace(admitted=tuple(since.items())), False
+
+
+def forget(monitor: Monitor, source: str) -> Monitor:
+    """As if `source` had never been heard, but for what it taught the others."""
+    runs, refused, admitted = (
+        tuple(entry for entry in entries if entry[0] != source)
+        for entries in (monitor.runs, monitor.refused, monitor.admitted)
+    )
+    drifted = tuple(name for name in monitor.drifted if name != source)
+    bank = leave(monitor.bank, source)
+    return monitor._replace(bank=bank, runs=runs, refused=refused, admitted=admitted, drifted=drifted)
 
 
 def probation(monitor: Monitor, source: str, allotment: Allotment) -> float:

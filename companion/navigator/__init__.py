@@ -39,7 +39,7 @@ from companion.records import (
 
 from . import errorstate, guarantee, watch
 from .carry import FIXES, Carry, Settings, Step, initial, is_news
-from .freshness import Freshness
+from .freshness import TOLD_EVERY, Freshness
 from .lesson import learn
 from .solution import announce, solve
 from .step import step, uses
@@ -59,6 +59,8 @@ FOLDED = (
     Reboot,
     Tuning,
 )
+
+ENDLESS = 1e8  # in SI: no metres, pascals or metres a second of ours come near it
 
 
 class _Past(NamedTuple):
@@ -80,6 +82,7 @@ class Navigator:
         self._freshness = Freshness()
         self._rests_on = Mode.INITIALISING, Source(0)  # mode and fixes of the last solution, and its time
         self._given_ns = 0
+        self._refused_ns: dict[str, int] = {}  # when what is no number was last told, by kind
         self._told: watch.Watch | None = None
         self._chosen = False  # the inertial channel is told once, with the first record
 
@@ -93,6 +96,8 @@ class Navigator:
         if not self._chosen:
             self._chosen = True
             return [_choice(record, self._settings.config), *self.handle(record)]
+        if not _is_numbers(record):
+            return self._refused(record)
         if isinstance(record, Gnss) and self._gnss_latency_ns:
             record = structs.replace(record, t_ns=record.t_ns - self._gnss_latency_ns)
         stale = self._freshness.judge(record)
@@ -120,6 +125,14 @@ class Navigator:
         self._owed += self._learnt()[1]
         while self._past and self._past[0].t_ns < self._past[-1].t_ns - self._late_ns:
             self._past.popleft()
+
+    def _refused(self, record: Input) -> list[Output]:
+        """That it is not used, told once a second."""
+        name = type(record).__name__
+        if record.rx_ns - self._refused_ns.get(name, -TOLD_EVERY) < TOLD_EVERY:
+            return []
+        self._refused_ns[name] = record.rx_ns
+        return [Rejection(record.t_ns, record.rx_ns, name, "it has what is no number")]
 
     def _watched(self, record: Input) -> list[Output]:
         """What became of the sources since it was last told."""
@@ -241,6 +254,17 @@ def _guarded(
         outputs = [*outputs, Reset(record.t_ns, record.rx_ns, "integrity monitor", why)]
         after = after._replace(watch=None)
     return after, outputs
+
+
+def _is_numbers(record: Input) -> bool:
+    """Whether all that it says are numbers, and none that nothing in flight can say."""
+    for value in structs.astuple(record):
+        if isinstance(value, float):
+            if not abs(value) < ENDLESS:  # nor is NaN
+                return False
+        elif isinstance(value, tuple) and not all(abs(x) < ENDLESS for x in value):
+            return False
+    return True
 
 
 def _choice(record: Input, config: Config) -> Event:

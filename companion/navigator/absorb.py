@@ -34,9 +34,9 @@ def position(
     after, cost, _ = _fused(state, heard, H, settings)
     limit = settings.gate[radio.freedom(heard)]
     carry = carry._replace(innovation=cost if radio.freedom(heard) == 2 else None)
-    if cost > limit:
+    if not cost <= limit:  # nor is what is no number
         explained = _within_bound(carry, heard, settings) or _by_a_jump(carry, state, heard, H, settings)
-        if carry.state is not None and not explained:
+        if math.isnan(cost) or (carry.state is not None and not explained):
             carry = carry._replace(state=state)
             return carry, [_rejected(record, "innovation beyond its gate (chi-square)", cost, limit)]
         factor = cost / limit
@@ -138,7 +138,7 @@ def velocity(carry: Carry, record: Gnss, v_n: Vector3, ins: Point, settings: Set
     error = (ins.v_n[0] - v_n[0], ins.v_n[1] - v_n[1])
     H = settings.unit.velocity_rows(ins.v_n)
     after, nis = errorstate.absorb_velocity(carry.state, H, np.array(error), sigma)
-    if nis > settings.gate[2]:
+    if not nis <= settings.gate[2]:
         return carry
 
     def each(state: ErrorState) -> tuple[ErrorState, float]:

@@ -13,10 +13,11 @@ from companion.estimate.trust import Held
 from companion.nav.geometry import Geodetic
 from companion.records import Gnss, LocalOrigin, LocalPosition, Output, Prediction, RsbnFix, Source
 
-from . import errorstate, guarantee, inertial, radio, tilterror, watch, winderror
+from . import errorstate, guarantee, height, inertial, radio, tilterror, watch, winderror
 from .deadreckoning import Reckoner
 from .errorstate import ErrorModel, ErrorState
 from .guarantee import Guarantee
+from .height import Level
 from .inertial import Point, Track
 from .restricted import Restrictive
 from .strapped import Strap
@@ -53,13 +54,6 @@ class Settings(NamedTuple):
             if not config.inertial.independent:
                 watched = errorstate.overbound(ins, config.air_data.wind_jump_m_s)
         return cls(config, unit, gate, watch.allotment(config), watched, config.channel)
-
-
-class Level(NamedTuple):
-    """Height error of the inertial channel against GNSS (m) and its variance."""
-
-    error: float = 0.0
-    variance: float = 400.0
 
 
 class Lesson(NamedTuple):
@@ -128,7 +122,7 @@ def state_at(carry: Carry, ins: Point, settings: Settings) -> ErrorState:
 def level(ins: Point, carry: Carry) -> Point:
     """The inertial point at the height that GNSS has taught."""
     lat, lon, alt = ins.position
-    return Point(ins.t_ns, Geodetic(lat, lon, alt - carry.level.error), ins.v_n)
+    return Point(ins.t_ns, Geodetic(lat, lon, alt - height.at(carry.level, ins).error), ins.v_n)
 
 
 def sources(carry: Carry, t_ns: int, settings: Settings) -> Source:

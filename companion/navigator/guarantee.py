@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from companion.config import Config, Predictor
-from companion.estimate.predictor import Forecast, Quantity, Window, predict, predict_ahead
+from companion.estimate.predictor import MEASURED, Forecast, Quantity, Window, predict, predict_ahead
 from companion.estimate.predictor import Prediction as Channel
 from companion.records import Prediction, Vector2
 
@@ -159,13 +159,22 @@ def forget(g: Guarantee, since_ns: int) -> Guarantee:
 
 
 def _close(g: Guarantee) -> Guarantee:
-    """All bins pushed, oldest first: a window takes its fixes in the order of time."""
+    """All bins pushed, oldest first: a window takes its fixes in the order of time, one of a kind at a time.
+
+    Two fixes of one instant, too unlike for one bin, stand a nanosecond apart.
+    """
     north, east = g.north, g.east
     for t_ns, full in sorted((b.start_ns + round(1e9 * b.time / b.weight), b) for b in g.bins):
-        w = full.weight
+        w, t_ns = full.weight, max(t_ns, _free_ns(north, full.quantity))
         north = north.push(t_ns, full.quantity, full.value[0] / w, full.sigma[0] / w)
         east = east.push(t_ns, full.quantity, full.value[1] / w, full.sigma[1] / w)
     return Guarantee(north, east, (), g.held)
+
+
+def _free_ns(window: Window, quantity: Quantity) -> int:
+    """From when on the window takes another fix of this quantity."""
+    same = window.t_ns[window.velocity == MEASURED[quantity]]
+    return max(int(window.t_ns[-1]), int(same[-1]) + 1 if len(same) else 0) if len(window) else 0
 
 
 def _halves(g: Guarantee, t_ns: int, settings: Predictor) -> Guarantee:

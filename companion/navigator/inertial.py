@@ -73,18 +73,23 @@ def at(track: Track, t_ns: int) -> Point | None:
     return Point(t_ns, Geodetic(*mix), v_n)  # type: ignore[arg-type]
 
 
-def jump(before: Point, after: Point) -> Vector3 | None:
-    """How far the channel stepped (NED, m) beyond what its own velocities explain; None if it did not.
+def beyond(before: Point, after: Point) -> Vector3:
+    """How far the channel moved (NED, m) beyond what its own velocities explain.
 
     On the earth, not from the origin: an origin that moves, told before or after the local positions that are
     counted from it, is a step and its return, and moves nothing in the end.
     """
     dt = (after.t_ns - before.t_ns) * 1e-9
     moved = apart(after.position, before.position)
-    step = [s - 0.5 * (v + w) * dt for s, v, w in zip(moved, before.v_n, after.v_n, strict=True)]
-    if math.hypot(step[0], step[1]) <= JUMP_M + 0.5 * JUMP_ACCELERATION * dt * dt:
-        return None
-    return step[0], step[1], step[2]
+    north, east, down = (s - 0.5 * (v + w) * dt for s, v, w in zip(moved, before.v_n, after.v_n, strict=True))
+    return north, east, down
+
+
+def unnoticed(dt: float) -> float:
+    """How far (m) that may be after `dt` seconds without the channel having jumped: the aircraft may have
+    turned.
+    """
+    return JUMP_M + 0.5 * JUMP_ACCELERATION * dt * dt
 
 
 def acceleration(track: Track) -> Vector2:

@@ -33,13 +33,13 @@ def shifted(carry: Carry, north: float, east: float, v_n: Vector2 | None = None,
 
 
 def blurred(carry: Carry, settings: Settings, sigma: float, sigma_v: float = 0.0) -> Carry:
-    """After the channel was carried across a silence: what was promised of it is void."""
+    """After the channel moved unseen by nobody knows how much: what was promised of it is void."""
     state = carry.state and errorstate.blur(carry.state, sigma, sigma_v)
     promise = guarantee.begin(settings.config)
     w = carry.watch and watch.blur(carry.watch, sigma, sigma_v)
     jumps = windjumps.each(carry.jumps, lambda s: errorstate.blur(s, sigma, sigma_v))
     carry = carry._replace(state=state, jumps=jumps, guarantee=promise, restrictive=None, watch=w)
-    return carry._replace(track=carry.track[-1:])
+    return carry._replace(track=carry.track[-1:], gnss_heard=None)
 
 
 def kept_near(carry: Carry, settings: Settings, has_velocity: bool) -> Carry:

@@ -9,14 +9,22 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
 
 from companion.config import GnssSection, Rsbn
-from companion.estimate.fusion import Azimuth, Height, Observation, Position, Range, most_likely
+from companion.estimate.fusion import (
+    CONE_OF_SILENCE,
+    Azimuth,
+    Height,
+    Observation,
+    Position,
+    Range,
+    most_likely,
+)
 from companion.nav.geometry import Geodetic, Triple, apart, east_north_up, ecef, from_enu
-from companion.records import Gnss, RsbnFix, Source
+from companion.records import Gnss, RsbnFix, Source, Vector2
 
 from .errorstate import Belief
 from .inertial import Point
@@ -64,6 +72,17 @@ def from_rsbn(record: RsbnFix, ins: Point, settings: Rsbn) -> tuple[Azimuth | Ra
         floor = settings.sigma_range_m + 0.01 * settings.sigma_range_percent * record.slant_range
         observations.append(Range(place, record.slant_range, max(record.sigma_range, floor)))
     return tuple(observations)
+
+
+def silent(z: Azimuth, error_n: Vector2, distance: float | None) -> bool:
+    """Whether the aircraft is in the cone of silence of the azimuth's beacon, the INS being off by `error_n`
+    (m) and `distance` (m) measured, if it is: fusion takes nothing of an azimuth there.
+    """
+    x, y, z_b = cast(Triple, z.beacon)
+    axes = cast(tuple[Triple, Triple, Triple], z.axes)
+    east, north, up = _times(axes, (-error_n[1] - x, -error_n[0] - y, -z_b))
+    slant = math.hypot(east, north, up) if distance is None else distance
+    return abs(up) > math.sin(CONE_OF_SILENCE) * slant
 
 
 @lru_cache(maxsize=64)

@@ -11,7 +11,7 @@ from companion.estimate.filterbank import INERTIAL
 from companion.nav.geometry import displace
 from companion.records import Event, Mode, Solution, Source, Vector2, Vector3
 
-from . import errorstate, guarantee, restricted, watch
+from . import errorstate, guarantee, height, restricted, watch
 from .carry import FIXES, Carry, Settings, Step, level, sources, state_at
 from .errorstate import ErrorState, Floats
 from .guarantee import Bounded
@@ -73,7 +73,7 @@ def solve(carry: Carry, rx_ns: int, settings: Settings) -> Step:
         lon,
         alt,
         (north - velocity_error[0], east - velocity_error[1], down),
-        (var_n, cov, 0.0, var_e, 0.0, carry.level.variance),
+        (var_n, cov, 0.0, var_e, 0.0, height.at(carry.level, carry.track[-1]).covariance[0]),
         error,
         velocity_error,
         int(rests_on),
@@ -83,7 +83,7 @@ def solve(carry: Carry, rx_ns: int, settings: Settings) -> Step:
         _disagreement(candidates),
         max(0.0, (rx_ns - t_ns) * 1e-9),
         carry.ahead,
-        math.sqrt(velocity_variance),
+        math.hypot(math.sqrt(velocity_variance), settings.unit.velocity_noise),  # gusts are no state
         protection,
         held.trust,
     )

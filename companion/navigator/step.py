@@ -39,8 +39,8 @@ from companion.records import (
     Stamped,
 )
 
-from . import absorb, deadreckoning, errorstate, inertial, moved, radio, strapped, watch
-from .carry import Carry, Lesson, Level, Settings, Step, initial, level, state_at
+from . import absorb, deadreckoning, errorstate, height, inertial, moved, radio, strapped, watch
+from .carry import Carry, Lesson, Settings, Step, initial, level, state_at
 from .inertial import Point
 from .lesson import unheard
 from .sights import GNSS
@@ -49,7 +49,7 @@ from .solution import solve
 TOGETHER_NS = 1_000_000_000  # GNSS this close to a beacon's answer joins its fix
 PATIENCE_NS = 5_000_000_000  # how long the autopilot is waited for to tell what a channel begins with
 LEVEL_3D = 3  # GPS_FIX_TYPE_3D_FIX
-BRIDGED_S = 1.0  # a silence of the airspeed up to this long is nothing
+BRIDGED_S = 1.0  # a silence of the airspeed up to this long is nothing, and one of the position not told
 UNKNOWN_M_S = 15.0  # how fast the position is lost in a longer one
 UNKNOWN_M_S2 = 5.0  # and the velocity in one of the IMU,
 TURNED_M_S = 30.0  # until nothing is known of it
@@ -108,13 +108,30 @@ def _local_position(carry: Carry, record: LocalPosition, settings: Settings) -> 
     if before is not None and record.t_ns <= before.t_ns:
         return carry._replace(local=before), out
     new = inertial.point(record, origin)
-    jump = inertial.jump(carry.track[-1], new) if carry.track else None
-    if jump is not None:
-        carry = moved.shifted(carry, jump[0], jump[1])
-        length = math.hypot(jump[0], jump[1])
-        out.append(_channel(record, f"it jumped by {length:.1f} m"))
+    if carry.track:
+        carry, out = _stepped(carry, carry.track[-1], new, record, settings)
     carry = carry._replace(track=inertial.extend(carry.track, new))
     return _given(carry, record, out, settings)
+
+
+def _stepped(carry: Carry, last: Point, new: Point, record: LocalPosition, settings: Settings) -> Step:
+    """With what the channel did from `last` to `new` that its velocities do not explain.
+
+    From one record to the next that is a jump or nothing. Across a silence a turn explains hundreds of
+    metres: what is left may be a turn or a step, and nobody knows which.
+    """
+    out = list[Output]()
+    north, east, _ = inertial.beyond(last, new)
+    length, silent = math.hypot(north, east), (new.t_ns - last.t_ns) * 1e-9
+    most = inertial.unnoticed(silent)
+    if length > most:
+        carry = moved.shifted(carry, north, east)
+        out.append(_channel(record, f"it jumped by {length:.1f} m"))
+    if length > inertial.JUMP_M and silent > inertial.REACH_S:
+        carry = moved.blurred(carry, settings, min(length, most))
+        if silent > BRIDGED_S:
+            out.append(_channel(record, f"no local position for {silent:.1f} s"))
+    return carry, out
 
 
 def _sense(carry: Carry, record: Attitude | AirData | Pressure, settings: Settings) -> Step:
@@ -226,7 +243,8 @@ def _gnss(carry: Carry, record: Gnss, settings: Settings) -> Step:
     if out:
         return carry, out
     heard = radio.from_gnss(record, ins, config)
-    learnt = _levelled(carry.level, record, ins, min(since, config.correlation_s) / config.correlation_s)
+    part = min(since, config.correlation_s) / config.correlation_s
+    learnt = height.learn(carry.level, record, ins, part, settings.gate[1])
     carry = carry._replace(gnss_ns=record.t_ns, gnss_heard=heard, level=learnt)
     if config.use_velocity and record.v_n is not None:
         carry = absorb.velocity(carry, record, record.v_n, ins, settings)
@@ -241,7 +259,8 @@ def _rsbn(carry: Carry, record: RsbnFix, settings: Settings) -> Step:
         return carry, [*told, Rejection(record.t_ns, record.rx_ns, f"rsbn {record.beacon}", why)]
     ins = level(ins, carry)
     said = radio.from_rsbn(record, ins, settings.config.rsbn)
-    carry = carry._replace(lesson=Lesson(record, None, ins, said))
+    w = carry.watch and watch.met(carry.watch, record)
+    carry = carry._replace(lesson=Lesson(record, None, ins, said), watch=w)
     heard = _calibrated(carry, record, said, settings)
     if not heard.observations:
         return carry, []
@@ -261,25 +280,18 @@ def _rsbn(carry: Carry, record: RsbnFix, settings: Settings) -> Step:
 def _calibrated(
     carry: Carry, record: RsbnFix, said: tuple[Azimuth | Range, ...], settings: Settings
 ) -> radio.Heard:
-    """What is to be believed of a beacon's answer, less its learnt biases."""
-    kept, told = list[Observation](), Source(0)
+    """What is to be believed of a beacon's answer, less its learnt biases; right above it no azimuth."""
+    kept, told, state = list[Observation](), Source(0), carry.state
     for z in said:
+        if isinstance(z, Azimuth) and state is not None:
+            north, east = state.x[:2].tolist()
+            if radio.silent(z, (north, east), record.slant_range):
+                continue
         name = watch.named(record.beacon, z)
         if not watch.excluded(carry.watch, name):
             kept.append(watch.calibrated(carry.watch, name, z, settings.config))
             told |= Source.AZIMUTH if isinstance(z, Azimuth) else Source.RANGE
     return radio.Heard(record.t_ns, tuple(kept), told)
-
-
-def _levelled(old: Level, record: Gnss, ins: Point, part: float) -> Level:
-    """The height error against GNSS, followed as a random walk of 5 cm a root second (a barometer drifts).
-
-    `part` is the share of one independent fix that this one is worth, its noise being correlated.
-    """
-    r = max(record.sigma_vertical or 0.0, 5.0) ** 2 / part
-    p = old.variance + 0.0025
-    k = p / (p + r)
-    return Level(old.error + k * (ins.position.alt - record.alt_msl - old.error), (1.0 - k) * p)
 
 
 _Uses = dict[type, Callable[[Carry, Any, Settings], Step]]

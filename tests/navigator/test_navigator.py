@@ -32,6 +32,7 @@ from companion.records import (
     Reset,
     RsbnFix,
     Solution,
+    Source,
     Truth,
     Tuning,
 )
@@ -268,6 +269,49 @@ def test_a_jump_of_the_inertial_channel_is_no_jump_of_the_estimate() -> None:
     assert max(errors) < 15.0
 
 
+def silent(gnss_until: float, step_m: float) -> tuple[list[tuple[Moment, Solution]], list[Any]]:
+    """The solutions of a flight whose local position is silent from 45 s to 50 s and comes back `step_m`
+    further north, each with its moment, and what is begun anew or excluded from then on.
+    """
+    navigator, solutions, told = Navigator(CONFIG), [], []
+    navigator.handle(origin())
+    for moment in flight(90, gnss_until, 90.0):
+        for record in moment.records:
+            if isinstance(record, LocalPosition) and record.t_ns > 45 * NS:
+                if record.t_ns <= 50 * NS:
+                    continue
+                x, y, z = record.x_n
+                record = msgspec.structs.replace(record, x_n=(x + step_m, y, z))
+            for out in navigator.handle(record):
+                solutions += [(moment, out)] if isinstance(out, Solution) else []
+                excluded = isinstance(out, Rejection) and "excluded" in out.reason
+                told += [out] if isinstance(out, Reset) or excluded else []
+    return solutions, told
+
+
+@pytest.mark.parametrize("gnss_until", [90.0, 30.0], ids=["gnss", "a beacon"])
+def test_a_step_in_a_silence_is_undone_by_the_next_fix(gnss_until: float) -> None:
+    """A turn would explain 200 m in 5 s, so it is no jump; but neither is it held against who contradicts."""
+    solutions, told = silent(gnss_until, 200.0)
+    assert [(type(out), out.reason) for out in told] == [(Reset, "no local position for 5.1 s")]
+    after = [(m, s) for m, s in solutions if s.t_ns > 52 * NS]
+    first = next(s for _, s in solutions if s.t_ns > 50 * NS)
+    assert first.bound_n is None  # what was promised rests on what is no more
+    worst_m = 10.0 if gnss_until > 50.0 else 300.0  # what one answer of a beacon is good for
+    assert max(distance(s, m.truth) for m, s in after) < worst_m
+    assert all(distance(s, m.truth) < 4.0 * math.sqrt(s.covariance[0] + s.covariance[3]) for m, s in after)
+    if gnss_until > 50.0:
+        assert solutions[-1][1].bound_n is not None  # and something is promised again
+
+
+def test_a_silence_without_a_step_changes_nothing_that_was_known() -> None:
+    solutions, told = silent(90.0, 0.0)
+    assert told == []
+    after = [(m, s) for m, s in solutions if s.t_ns > 50 * NS]
+    assert max(distance(s, m.truth) for m, s in after) < 10.0
+    assert all(s.bound_n is not None for _, s in after)
+
+
 def test_a_gnss_jump_is_refused_and_counted() -> None:
     navigator, rejections, errors = Navigator(CONFIG), 0, []
     navigator.handle(origin())
@@ -324,6 +368,30 @@ def test_an_azimuth_alone_corrects_across_and_is_no_fix() -> None:
     assert last.mode is Mode.FIXED
 
 
+@pytest.mark.parametrize("ranged", [True, False], ids=["with a range", "an azimuth alone"])
+def test_in_the_cone_of_silence_an_azimuth_is_no_fix(ranged: bool) -> None:
+    """The beacon stands where the aircraft is after 40 s, 1 km up: it crosses the cone in 38 s."""
+    moments, navigator, heard = flight(60, 15.0, 60.0), Navigator(CONFIG), {}
+    beacon = moments[400].truth._replace(alt=0.0)
+    navigator.handle(origin())
+    for moment in moments:
+        for record in moment.records:
+            if isinstance(record, RsbnFix):
+                seen = slant_range_azimuth(beacon, moment.truth)
+                record = RsbnFix(
+                    *(record.t_ns, record.rx_ns, 1, *beacon),
+                    seen.azimuth,
+                    seen.slant_range if ranged else None,
+                    record.sigma_azimuth,
+                    record.sigma_range,
+                )
+            for out in navigator.handle(record):
+                if isinstance(out, Solution):
+                    heard[round(out.t_ns / NS)] = Source(out.sources) & (Source.AZIMUTH | Source.RANGE)
+    assert Source.AZIMUTH in heard[15]
+    assert heard[40] == (Source.RANGE if ranged else Source(0))
+
+
 def test_what_cannot_be_computed_is_refused_and_the_flight_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
     def singular(*_: Any) -> None:
         raise np.linalg.LinAlgError("Singular matrix")
@@ -341,6 +409,34 @@ def test_what_cannot_be_computed_is_refused_and_the_flight_goes_on(monkeypatch: 
     assert "it cannot be computed with: Singular matrix" in {out.reason for out in refused}
     assert isinstance(outs[-1], Solution | Fix)
     assert max(out.t_ns for out in outs if isinstance(out, Solution)) > 29 * NS
+
+
+def spoilt(record: Any, value: float) -> Iterator[Any]:
+    """The record with `value` in one number after the other."""
+    for field in record.__struct_fields__:
+        said = getattr(record, field)
+        if isinstance(said, float):
+            yield msgspec.structs.replace(record, **{field: value})
+        elif isinstance(said, tuple):
+            for k in range(len(said)):
+                yield msgspec.structs.replace(record, **{field: (*said[:k], value, *said[k + 1 :])})
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 1e300])
+def test_what_is_no_number_is_refused_and_changes_nothing(value: float) -> None:
+    clean, spoiled, refused, told = Navigator(CONFIG), Navigator(CONFIG), 0, 0
+    clean.handle(origin())
+    spoiled.handle(origin())
+    for k, moment in enumerate(flight(30, 30.0, 30.0)):
+        for record in moment.records:
+            if k >= 90 and k % 10 == 9:
+                for wrong in spoilt(record, value):
+                    outs = spoiled.handle(wrong)
+                    assert {type(out) for out in outs} <= {Rejection}
+                    refused, told = refused + 1, told + len(outs)
+            assert spoiled.handle(record) == clean.handle(record)
+    assert refused > 200
+    assert told == 3 * 20  # once a second of each kind
 
 
 def test_a_state_gone_wrong_is_begun_anew_and_said(monkeypatch: pytest.MonkeyPatch) -> None:
