@@ -352,6 +352,48 @@ def test_a_full_disk_is_said_and_waited_for_and_nothing_is_lost_that_there_is_ro
     assert [e.value for e in read(path)] == written
 
 
+@pytest.mark.parametrize("refusals", [1, 2, 5])
+def test_what_a_refusing_disk_took_and_would_not_give_back_is_written_over(tmp_path, refusals):
+    """A disk that drops out takes a part, refuses to cut it off, and is well again."""
+
+    class Flaky(Sick):
+        left = 0
+
+        def truncate(self, size):
+            if self.left > 0:
+                self.left -= 1
+                raise OSError(errno.EIO, "broken")
+            self.disk.truncate(size)
+
+    drops, disks = threading.Event(), []
+
+    def refuses():
+        if drops.is_set():
+            drops.clear()
+            disks[0].left = refusals
+            return OSError(errno.EIO, "broken")
+        return None
+
+    path = tmp_path / "x.mcap"
+    log = Writer(
+        path,
+        metadata={},
+        chunk_bytes=500,
+        fsync_s=0.05,
+        disk=lambda p: disks.append(Flaky(p, refuses)) or disks[0],
+        **START,
+    )
+    for i in range(200):
+        log.record(imu(i))
+        if i % 50 == 20:
+            drops.set()
+            wait_until(lambda: not drops.is_set() and log.trouble is None)
+    assert log.close() and log.dropped == 0
+    assert [e.value for e in read(path)] == [imu(i) for i in range(200)]
+    with path.open("rb") as stream:
+        assert sum(1 for _ in make_reader(stream, validate_crcs=True).iter_messages()) == 200
+
+
 def test_a_disk_that_stays_full_costs_the_oldest_and_they_are_counted(tmp_path):
     full = threading.Event()
     log = Writer(
