@@ -29,7 +29,8 @@ from .. import __version__
 from ..records import BY_NAME, INPUTS, LinkState, Stamped, Truth, encode
 from . import container, location
 from .container import Chunk, Damaged
-from .opened import ACTIVE, Channels, LogError, Recovered, opened, recover
+from .opened import ACTIVE, Channels, LogError, opened
+from .recovery import Recovered, recover
 from .store import Disk, DiskFile, Store, sync_folder
 
 __all__ = [

@@ -14,7 +14,8 @@ from functools import partial
 from pathlib import Path
 
 from .file import Writer
-from .opened import ACTIVE, LogError, Recovered, recover
+from .opened import ACTIVE, LogError
+from .recovery import Recovered, recover
 from .store import DiskFile
 
 _OURS = re.compile(r"\d{8}T\d{6}Z(-\d+)?(\.recovered)?\.mcap")
