@@ -279,9 +279,9 @@ class Writer:
             self._turn()
         written = self._drain()
         finished = written and self._try(self._file.finish) and self._try(self._file.sync)
-        self._file.close()
         if finished:
             self._try(self._name)
+        self._file.close()  # and with it the lock: no other start is to mend what only lacks its name
         with self._lock:
             self.dropped += sum(chunk.messages for chunk in self._waiting)
 

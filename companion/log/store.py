@@ -77,10 +77,12 @@ class DiskFile:
         reserve: int = 0,
         relieve: Callable[[int], object] = lambda wanted: None,
     ) -> None:
-        self._fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o644)
+        self._take(os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o644), reserve, relieve)
         fcntl.flock(self._fd, fcntl.LOCK_EX)  # tells a log being written from one left behind
         sync_folder(Path(path).parent)
-        self._reserve, self._relieve = reserve, relieve
+
+    def _take(self, fd: int, reserve: int, relieve: Callable[[int], object]) -> None:
+        self._fd, self._reserve, self._relieve = fd, reserve, relieve
         self._at = 0
 
     def write(self, data: bytes) -> None:
@@ -168,14 +170,23 @@ class Store:
         self._append(record(ATTACHMENT, content))
         self._attachments += 1
 
-    def chunk(self, chunk: Chunk, schemas: Mapping[int, bytes], channels: Mapping[int, bytes]) -> None:
-        """Add `chunk`; `schemas` and `channels` are the contents of the records it may refer to, by id."""
+    def chunk(
+        self,
+        chunk: Chunk,
+        schemas: Mapping[int, bytes],
+        channels: Mapping[int, bytes],
+        squeezed: bytes | None = None,
+    ) -> None:
+        """Add `chunk`; `schemas` and `channels` are the contents of the records it may refer to, by id.
+
+        `squeezed` is its data compressed by zstd, where that is known.
+        """
         new = [name for name in chunk.index if name not in self._channels]
         needed = {name: int.from_bytes(channels[name][2:4], "little") for name in new}
         new_schemas = {i: schemas[i] for i in needed.values() if i in schemas and i not in self._schemas}
         definitions = b"".join(record(SCHEMA, content) for content in new_schemas.values())
         definitions += b"".join(record(CHANNEL, channels[name]) for name in new)
-        body, indexes, first, last = pack(chunk, self._compress)
+        body, indexes, first, last = pack(chunk, squeezed or self._compress(bytes(chunk.data)))
         self._append(definitions + body + indexes)
 
         self._schemas |= new_schemas

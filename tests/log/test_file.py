@@ -13,6 +13,8 @@ import sys
 import tarfile
 import threading
 import time
+from contextlib import suppress
+from functools import partial
 from pathlib import Path
 
 import msgspec
@@ -209,11 +211,91 @@ def test_a_log_cut_at_any_byte_is_readable_up_to_its_last_whole_chunk_and_repair
         saved.path.unlink()
 
 
+class Killed(BaseException):
+    """The process ends here: nothing after it is done."""
+
+
+class Power:
+    """The calls by which a log is changed, allowed for so many steps; of the last write, so many bytes."""
+
+    def __init__(self, patch: pytest.MonkeyPatch, steps: int, part: float) -> None:
+        self.steps, self.part, self.written = steps, part, 0
+        for name in ("ftruncate", "pwrite", "fsync", "fdatasync", "replace"):
+            patch.setattr(os, name, partial(self.call, name, getattr(os, name)))
+
+    def call(self, name, real, *arguments):
+        self.steps -= 1
+        if self.steps < 0:
+            if name == "pwrite":
+                fd, data, at = arguments
+                real(fd, data[: int(len(data) * self.part)], at)
+            raise Killed
+        result = real(*arguments)
+        self.written += result if name == "pwrite" else 0
+        return result
+
+
+@settings(deadline=None, max_examples=300)
+@given(cut=st.integers(0, 900), steps=st.integers(0, 8), part=st.floats(0, 1))
+def test_a_kill_at_any_instant_of_a_repair_leaves_a_log_that_reads_as_before(
+    tmp_path_factory, small, cut, steps, part
+):
+    path = tmp_path_factory.mktemp("killed") / "x.mcap.active"
+    path.write_bytes(small[: len(small) - cut])
+    entries = list(read(path))
+    with pytest.MonkeyPatch.context() as patch:
+        Power(patch, steps, part)
+        with suppress(Killed):
+            recover(path)
+    left = path if path.exists() else path.with_suffix("")
+    assert list(read(left)) == entries
+    if left == path:
+        assert recover(path).messages == len(entries)
+    assert [one.name for one in path.parent.iterdir()] == ["x.mcap"]
+    assert list(read(path.with_suffix(""))) == entries and info(path.with_suffix("")).closed
+
+
+def test_what_stands_is_not_written_again(tmp_path, small):
+    """A log is mended by the bytes that it lacks, and one that is whole by its name alone."""
+    path = tmp_path / "x.mcap.active"
+    for cut in (0, 30, len(small) - small.rindex(container.record(container.DATA_END, bytes(4)))):
+        path.write_bytes(small[: len(small) - cut])
+        node = path.stat().st_ino
+        with pytest.MonkeyPatch.context() as patch:
+            power = Power(patch, 100, 0.0)
+            assert recover(path).messages == 24
+        assert power.written == cut
+        assert (tmp_path / "x.mcap").read_bytes() == small and (tmp_path / "x.mcap").stat().st_ino == node
+        (tmp_path / "x.mcap").unlink()
+
+
+def test_a_log_damaged_before_its_end_is_left_as_it_was_until_its_copy_is_whole(tmp_path, small):
+    path = tmp_path / "x.mcap.active"
+    for at in range(8, small.rindex(container.record(container.DATA_END, bytes(4))), 7):
+        damaged = bytearray(small[:-20])
+        damaged[at] ^= 0xFF
+        path.write_bytes(damaged)
+        kept = None
+        with suppress(LogError):
+            kept = list(read(path))
+        with pytest.MonkeyPatch.context() as patch, suppress(LogError, Killed):
+            Power(patch, 2, 0.5)
+            recover(path)
+        if kept is not None and path.exists():
+            assert list(read(path))[: len(kept)] == kept, at
+        with suppress(LogError):
+            recover(path)
+            assert info(tmp_path / "x.mcap").closed
+            assert info(tmp_path / "x.mcap").messages >= len(kept or ()), at
+        for one in tmp_path.iterdir():
+            one.unlink()
+
+
 def test_of_a_torn_chunk_that_is_stored_plain_the_whole_messages_are_saved(tmp_path):
     chunk = container.Chunk()
     for i in range(10):
         chunk.add(1, i, i, i, b"%d" % i)
-    body = container.pack(chunk, lambda data: data)[0].replace(container.text("zstd"), container.text(""))
+    body = container.pack(chunk, bytes(chunk.data))[0].replace(container.text("zstd"), container.text(""))
     definition = container.record(container.CHANNEL, bytes([1, 0, 0, 0]) + container.text("t") * 2 + bytes(4))
     head = container.MAGIC + container.record(container.HEADER, container.text("") * 2)
     path = tmp_path / "x.mcap"
