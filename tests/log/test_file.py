@@ -628,23 +628,7 @@ def test_a_killed_writer_loses_at_most_its_last_second(tmp_path, life_s):
     assert not lost or last_ns - lost[0] < 1_000_000_000
 
 
-# -- folder and command --------------------------------------------------------------------------------------
-
-
-def test_a_folder_keeps_the_newest_logs_and_touches_nothing_else(tmp_path):
-    (tmp_path / "mine.mcap").write_text("keep")
-    for second in range(5):
-        with folder.open_log(
-            tmp_path, metadata={}, start_unix_ns=second * 10**9, start_ns=0, max_files=3, min_free=0
-        ) as log:
-            log.record(imu(second))
-    names = [f"19700101T00000{second}Z.mcap" for second in (2, 3, 4)]
-    assert sorted(p.name for p in tmp_path.iterdir()) == [*names, "mine.mcap"]
-    with folder.open_log(tmp_path, metadata={}, start_unix_ns=4 * 10**9, start_ns=0, min_free=0) as log:
-        assert log.path.name == "19700101T000004Z-2.mcap"
-    with pytest.raises(LogError, match="would be left on the disk"):
-        folder.open_log(tmp_path, metadata={}, start_unix_ns=0, start_ns=0, min_free=1 << 60)
-    assert (tmp_path / "mine.mcap").read_text() == "keep"
+# -- command --------------------------------------------------------------------------------------
 
 
 def test_the_command_shows_repairs_and_fails_in_one_sentence(tmp_path, small):
