@@ -242,8 +242,8 @@ def command(file: Path | None, connect: tuple[str, ...], logs: str | None, pairs
     SIGTERM.
 
     Links are serial:DEVICE:BAUD, udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT and tcpin:HOST:PORT. Exit
-    codes: 0 stopped, 69 an address to listen on is taken or forbidden at the start, 73 the log folder cannot
-    be written, 78 bad configuration.
+    codes: 0 stopped, 69 an address to listen on is taken or forbidden at the start, 73 no log can be begun
+    (folder or room), 78 bad configuration.
     """
     flags = {"link.connect": connect or None, "log.folder": logs}
     base = config = load(file, flags, pairs=pairs)

@@ -234,6 +234,11 @@ def small_disk(tmp_path: Path):
     subprocess.run(["umount", "-l", str(place)], check=True)
 
 
+def free(folder: Path) -> int:
+    room = os.statvfs(folder)
+    return room.f_bavail * room.f_frsize
+
+
 def test_a_disk_that_fills_up_is_said_and_written_to_again_when_there_is_room(small_disk, tmp_path) -> None:
     port, said = free_port(), tmp_path / "said"
     ballast = small_disk / "ballast"
@@ -272,24 +277,47 @@ def test_room_is_made_while_a_log_is_written_by_the_age_of_the_others(small_disk
     for i in range(1000):
         log.record(Event(i, i, 6, random.randbytes(400).hex()))
         time.sleep(0.001)
-    room = os.statvfs(small_disk)
+    room = free(small_disk)
     assert log.close() and log.dropped == 0
-    assert room.f_bavail * room.f_frsize >= 300_000 - 4096
+    assert room >= 300_000 - 4096
     left = sorted(path.name for path in small_disk.iterdir())
-    assert left == ["20260102T000000Z.mcap", "20260103T000000Z.mcap", "20270115T080000Z.mcap", "mine.txt"]
+    new = "00001-20270115T080000Z.mcap"
+    assert left == [new, "20260102T000000Z.mcap", "20260103T000000Z.mcap", "mine.txt"]
+
+
+def torn_log(folder: Path) -> Path:
+    """A log of 1000 messages, half a mebibyte, that lacks its end."""
+    with file.Writer(folder / "x.mcap", metadata={}, start_unix_ns=10**18, start_ns=0) as log:
+        for i in range(1000):
+            log.record(Event(i, i, 6, random.randbytes(400).hex()))
+    torn = folder / "20260101T000000Z.mcap.active"
+    torn.write_bytes((folder / "x.mcap").read_bytes()[:-1000])
+    (folder / "x.mcap").unlink()
+    return torn
+
+
+def test_a_log_that_lacks_its_end_is_mended_on_a_disk_with_no_room_for_a_second_one(small_disk) -> None:
+    torn = torn_log(small_disk)
+    (small_disk / "ballast").write_bytes(bytes(free(small_disk) - 20_000))
+    size = torn.stat().st_size
+    with pytest.raises(file.LogError, match="cannot write the recovered log"):
+        file.recover(torn, reserve=20_000)
+    assert torn.stat().st_size <= size  # nothing of the end was begun
+    assert file.recover(torn, reserve=10_000).messages == 1000
+    assert {path.name for path in small_disk.iterdir()} == {"20260101T000000Z.mcap", "ballast"}
+    assert file.info(small_disk / "20260101T000000Z.mcap").closed
+    assert free(small_disk) >= 10_000
 
 
 def test_a_copy_that_finds_no_room_is_taken_back_and_the_reserve_is_left(small_disk) -> None:
-    with file.Writer(small_disk / "x.mcap", metadata={}, start_unix_ns=10**18, start_ns=0) as log:
-        for i in range(1000):
-            log.record(Event(i, i, 6, random.randbytes(400).hex()))
-    whole = (small_disk / "x.mcap").read_bytes()
-    (small_disk / "x.mcap").unlink()
-    torn = small_disk / "20260101T000000Z.mcap.active"
-    torn.write_bytes(whole[:-100])
+    torn = torn_log(small_disk)
+    content = bytearray(torn.read_bytes())
+    content[len(content) // 2] ^= 0xFF  # an end alone would not mend it
+    torn.write_bytes(content)
     (small_disk / "ballast").write_bytes(bytes(1_300_000))
     with pytest.raises(file.LogError, match="cannot write the recovered log"):
         file.recover(torn, reserve=200_000)
     assert {path.name for path in small_disk.iterdir()} == {torn.name, "ballast"}
+    assert torn.read_bytes() == content
     (small_disk / "ballast").unlink()
-    assert file.recover(torn, reserve=200_000).messages == 1000
+    assert 500 < file.recover(torn, reserve=200_000).messages < 1000

@@ -3,10 +3,10 @@
     for change in parameters.receive(message, frame, system, now_ns): ...   # change.config is the new whole
     for message in parameters.to_send(now_ns): ...                          # again at parameters.deadline()
 
-Numbers and switches are offered; texts and lists are not, nor what decides who may speak to us (sections
-LINK and SIGNING). A value must pass the same checks as in the file. One that does not is answered by the
-value that stands, and PARAM_ERROR. What is set is kept: `save` gets the text of a TOML file to be laid over
-the operator's own, and where it fails nothing is changed.
+Numbers and switches are offered; texts and lists are not, nor what decides who may speak to us (sections LINK
+and SIGNING) or what is kept of earlier flights (LOG). A value must pass the same checks as in the file. One
+that does not is answered by the value that stands, and PARAM_ERROR. What is set is kept: `save` gets the text
+of a TOML file to be laid over the operator's own, and where it fails nothing is changed.
 
 Every parameter is a REAL32 on the wire. Ground stations disagree how an integer stands in param_value (as
 PX4's bytes or as ArduPilot's cast): MAVProxy and MAVSDK go by the kind of the vehicle's autopilot,
@@ -41,7 +41,8 @@ VALUES_HZ, VALUES_BURST = 40.0, 10
 #: Changes a second, and at once; what comes faster is dropped, and a station tries again.
 CHANGES_HZ, CHANGES_BURST = 5.0, 20
 
-HIDDEN = frozenset({"link", "signing"})
+#: Of no ground station's concern; a limit of the logs that was set wrong would erase flights.
+HIDDEN = frozenset({"link", "log", "signing"})
 #: What a ground station must not claim for the aircraft.
 HIDDEN_KEYS = frozenset({("inertial", "independent")})
 _SECTIONS = {"RATES": "RATE", "INERTIAL": "INS", "PREDICTOR": "PRED", "ESTIMATOR": "EST", "OUTPUT": "OUT"}
@@ -63,8 +64,6 @@ _SHORT = {
     "EXTERNAL": "EXT",
     "HEADING": "HDG",
     "LOCAL": "LOC",
-    "MAXIMUM": "MAX",
-    "MINIMUM": "MIN",
     "PERCENT": "PCT",
     "POSITION": "POS",
     "RANGE": "RNG",

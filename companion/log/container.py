@@ -13,7 +13,7 @@ from __future__ import annotations
 import struct
 import zlib
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from typing import BinaryIO, NamedTuple
 
 import zstandard
@@ -139,6 +139,13 @@ class Fields:
         return values
 
 
+def library(content: bytes) -> str:
+    """What a header says it was written by."""
+    fields = Fields(content)
+    fields.text()
+    return fields.text()
+
+
 def metadata(content: bytes) -> tuple[str, dict[str, str]]:
     """Name and map of a metadata record."""
     fields = Fields(content)
@@ -182,15 +189,13 @@ class Chunk:
         return sum(map(len, self.index.values())) // 2
 
 
-def pack(chunk: Chunk, compress: Callable[[bytes], bytes]) -> tuple[bytes, bytes, int, int]:
-    """The chunk record and its message indexes; first and last log time."""
-    data = bytes(chunk.data)
-    squeezed = compress(data)
+def pack(chunk: Chunk, squeezed: bytes) -> tuple[bytes, bytes, int, int]:
+    """The chunk record, its data compressed to `squeezed`, and its message indexes; first, last log time."""
     first = min(min(entries[::2]) for entries in chunk.index.values())
     last = max(max(entries[::2]) for entries in chunk.index.values())
     body = record(
         CHUNK,
-        _CHUNK.pack(first, last, len(data), zlib.crc32(data)),
+        _CHUNK.pack(first, last, len(chunk.data), zlib.crc32(chunk.data)),
         text("zstd"),
         struct.pack("<Q", len(squeezed)),
         squeezed,
@@ -241,6 +246,13 @@ def unpack(content: bytes) -> bytes:
     if len(data) != size or (crc and zlib.crc32(data) != crc):
         raise Damaged("a chunk's checksum is wrong")
     return bytes(data)
+
+
+def squeezed(content: bytes) -> bytes | None:
+    """A chunk's records as they stand in it, compressed by zstd; None where by something else."""
+    fields = Fields(content)
+    fields.take(_CHUNK.size)
+    return fields.take(fields.number(8)) if fields.text() == "zstd" else None
 
 
 def unpack_torn(torn: bytes) -> bytes:

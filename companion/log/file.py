@@ -29,7 +29,8 @@ from .. import __version__
 from ..records import BY_NAME, INPUTS, LinkState, Stamped, Truth, encode
 from . import container, location
 from .container import Chunk, Damaged
-from .opened import ACTIVE, Channels, LogError, Recovered, opened, recover
+from .opened import ACTIVE, Channels, LogError, opened
+from .recovery import Recovered, recover
 from .store import Disk, DiskFile, Store, sync_folder
 
 __all__ = [
@@ -278,9 +279,9 @@ class Writer:
             self._turn()
         written = self._drain()
         finished = written and self._try(self._file.finish) and self._try(self._file.sync)
-        self._file.close()
         if finished:
             self._try(self._name)
+        self._file.close()  # and with it the lock: no other start is to mend what only lacks its name
         with self._lock:
             self.dropped += sum(chunk.messages for chunk in self._waiting)
 

@@ -15,6 +15,7 @@ import zlib
 from array import array
 from collections import defaultdict
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Protocol
 
@@ -54,8 +55,11 @@ class Disk(Protocol):
     def sync(self) -> None:
         """Return once what was written survives a loss of power."""
 
+    def rewind(self, size: int) -> None:
+        """Let the next write go to after `size` bytes; asks nothing of the disk."""
+
     def truncate(self, size: int) -> None:
-        """Cut off what stands after `size` bytes; the next write goes there."""
+        """Cut off what stands after `size` bytes."""
 
     def close(self) -> None:
         """Let go."""
@@ -73,10 +77,13 @@ class DiskFile:
         reserve: int = 0,
         relieve: Callable[[int], object] = lambda wanted: None,
     ) -> None:
-        self._fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o644)
+        self._take(os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o644), reserve, relieve)
         fcntl.flock(self._fd, fcntl.LOCK_EX)  # tells a log being written from one left behind
         sync_folder(Path(path).parent)
-        self._reserve, self._relieve = reserve, relieve
+
+    def _take(self, fd: int, reserve: int, relieve: Callable[[int], object]) -> None:
+        self._fd, self._reserve, self._relieve = fd, reserve, relieve
+        self._at = 0
 
     def write(self, data: bytes) -> None:
         """See `Disk`; refuses where it would eat into the reserve."""
@@ -87,7 +94,9 @@ class DiskFile:
                 raise OSError(errno.ENOSPC, f"less than {self._reserve} bytes would be left on the disk")
         view = memoryview(data)
         while view:
-            view = view[os.write(self._fd, view) :]
+            written = os.pwrite(self._fd, view, self._at)
+            self._at += written
+            view = view[written:]
 
     def _free(self) -> int:
         room = os.fstatvfs(self._fd)
@@ -104,10 +113,13 @@ class DiskFile:
         """See `Disk`."""
         os.fdatasync(self._fd)
 
+    def rewind(self, size: int) -> None:
+        """See `Disk`."""
+        self._at = size
+
     def truncate(self, size: int) -> None:
         """See `Disk`."""
         os.ftruncate(self._fd, size)
-        os.lseek(self._fd, size, os.SEEK_SET)
 
     def close(self) -> None:
         """See `Disk`."""
@@ -126,13 +138,15 @@ def sync_folder(folder: Path) -> None:
 class Store:
     """Lays an MCAP file down on `disk`. After every method that returned, the file is readable so far.
 
-    A method that raises OSError has been undone and may be called again. Of a chunk it remembers in 24 bytes
-    where it is: what the summary says of it (half a kilobyte; 40 MB after a day) is read from the disk again.
+    A method that raises OSError has been undone and may be called again; where the disk will not cut off what
+    it took, the next goes over it. Of a chunk it remembers in 24 bytes where it is: what the summary says of
+    it (half a kilobyte; 40 MB after a day) is read from the disk again.
     """
 
     def __init__(self, disk: Disk, library: str) -> None:
         self._disk = disk
         self._end = 0
+        self._uncut = False  # a part of what was refused stands after the end
         self._compress = zstandard.ZstdCompressor(level=1).compress
         self._schemas: dict[int, bytes] = {}
         self._channels: dict[int, bytes] = {}
@@ -156,14 +170,23 @@ class Store:
         self._append(record(ATTACHMENT, content))
         self._attachments += 1
 
-    def chunk(self, chunk: Chunk, schemas: Mapping[int, bytes], channels: Mapping[int, bytes]) -> None:
-        """Add `chunk`; `schemas` and `channels` are the contents of the records it may refer to, by id."""
+    def chunk(
+        self,
+        chunk: Chunk,
+        schemas: Mapping[int, bytes],
+        channels: Mapping[int, bytes],
+        squeezed: bytes | None = None,
+    ) -> None:
+        """Add `chunk`; `schemas` and `channels` are the contents of the records it may refer to, by id.
+
+        `squeezed` is its data compressed by zstd, where that is known.
+        """
         new = [name for name in chunk.index if name not in self._channels]
         needed = {name: int.from_bytes(channels[name][2:4], "little") for name in new}
         new_schemas = {i: schemas[i] for i in needed.values() if i in schemas and i not in self._schemas}
         definitions = b"".join(record(SCHEMA, content) for content in new_schemas.values())
         definitions += b"".join(record(CHANNEL, channels[name]) for name in new)
-        body, indexes, first, last = pack(chunk, self._compress)
+        body, indexes, first, last = pack(chunk, squeezed or self._compress(bytes(chunk.data)))
         self._append(definitions + body + indexes)
 
         self._schemas |= new_schemas
@@ -207,6 +230,7 @@ class Store:
                 offsets += record(SUMMARY_OFFSET, place)
                 summary += group
         tail = summary + offsets + struct.pack("<BQQQ", FOOTER, 20, start, start + len(summary))
+        self._cut()
         self._append(data_end + tail + struct.pack("<I", zlib.crc32(tail)) + MAGIC)
 
     def _chunk_index(self, start: int, at: int, end: int) -> bytes:
@@ -233,9 +257,21 @@ class Store:
         self._disk.close()
 
     def _append(self, data: bytes) -> None:
+        self._try_to_cut()
         try:
             self._disk.write(data)
         except OSError:
-            self._disk.truncate(self._end)
+            self._disk.rewind(self._end)
+            self._uncut = True
+            self._try_to_cut()
             raise
         self._end += len(data)
+
+    def _try_to_cut(self) -> None:
+        with suppress(OSError):
+            self._cut()
+
+    def _cut(self) -> None:
+        if self._uncut:
+            self._disk.truncate(self._end)
+            self._uncut = False

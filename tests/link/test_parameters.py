@@ -91,7 +91,6 @@ def test_names_are_few_characters_distinct_and_stable() -> None:
         ("predictor", "window_min"): "PRED_WINDOW_MIN",
         ("estimator", "false_rejection"): "EST_FALSE_REJ",
         ("output", "global_position_sensor_hz"): "OUT_GPSENS_HZ",
-        ("log", "minimum_free_mib"): "LOG_MIN_FREE_MIB",
     }
     assert {key: name_of(*key) for key in pinned} == pinned
 
@@ -107,6 +106,15 @@ def test_every_number_and_switch_is_offered_and_nothing_of_who_may_speak() -> No
         for key, content in msgspec.structs.asdict(getattr(Config(), section)).items():
             open_to_all = section not in HIDDEN and (section, key) not in HIDDEN_KEYS
             assert ((section, key) in offered) == (open_to_all and isinstance(content, int | float))
+
+
+def test_no_station_can_have_the_logs_erased() -> None:
+    """A limit of the disk that is out of reach, kept, would cost every flight at the next start."""
+    station = Station()
+    assert not any(parameter.section == "log" for parameter in TABLE)
+    (error,) = station.set(name_of("log", "minimum_free_mib"), 16777216.0)
+    assert error.error == DOES_NOT_EXIST
+    assert station.changes == [] and station.saved == []
 
 
 def test_the_list_comes_whole_at_its_rate() -> None:
@@ -186,12 +194,12 @@ def test_what_was_set_is_read_back_by_the_loader_of_configurations(tmp_path: pat
     station = Station()
     station.set("GNSS_SIGMA_M", 4.0)
     station.set("GNSS_USE_VEL", 0.0)
-    station.set("LOG_MAX_FILES", 7.0)
+    station.set("OUT_GPSENS_ID", 7.0)
     station.set("EST_FALSE_REJ", 1e-7)
     path = tmp_path / "set.toml"
     path.write_text(station.saved[-1])
     assert config.load(path, environment={}) == station.parameters.config
-    for name in ("GNSS_SIGMA_M", "GNSS_USE_VEL", "LOG_MAX_FILES", "EST_FALSE_REJ"):
+    for name in ("GNSS_SIGMA_M", "GNSS_USE_VEL", "OUT_GPSENS_ID", "EST_FALSE_REJ"):
         station.set(name, value(Config(), name))
     assert "=" not in station.saved[-1]  # nothing departs from the operator's own any more
 
@@ -227,7 +235,7 @@ def test_to_set_what_stands_is_no_change() -> None:
         ("OUT_GPSENS_ID", 256.0),
         ("OUT_GPSENS_ID", 1.5),
         ("OUT_GPSENS_ID", -1.0),
-        ("LOG_MIN_FREE_MIB", 3e9),
+        ("OUT_GPSENS_ID", 3e9),
         ("GNSS_USE_VEL", 2.0),
         ("GNSS_USE_VEL", 0.5),
     ],

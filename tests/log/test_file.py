@@ -13,6 +13,8 @@ import sys
 import tarfile
 import threading
 import time
+from contextlib import suppress
+from functools import partial
 from pathlib import Path
 
 import msgspec
@@ -209,11 +211,91 @@ def test_a_log_cut_at_any_byte_is_readable_up_to_its_last_whole_chunk_and_repair
         saved.path.unlink()
 
 
+class Killed(BaseException):
+    """The process ends here: nothing after it is done."""
+
+
+class Power:
+    """The calls by which a log is changed, allowed for so many steps; of the last write, so many bytes."""
+
+    def __init__(self, patch: pytest.MonkeyPatch, steps: int, part: float) -> None:
+        self.steps, self.part, self.written = steps, part, 0
+        for name in ("ftruncate", "pwrite", "fsync", "fdatasync", "replace"):
+            patch.setattr(os, name, partial(self.call, name, getattr(os, name)))
+
+    def call(self, name, real, *arguments):
+        self.steps -= 1
+        if self.steps < 0:
+            if name == "pwrite":
+                fd, data, at = arguments
+                real(fd, data[: int(len(data) * self.part)], at)
+            raise Killed
+        result = real(*arguments)
+        self.written += result if name == "pwrite" else 0
+        return result
+
+
+@settings(deadline=None, max_examples=300)
+@given(cut=st.integers(0, 900), steps=st.integers(0, 8), part=st.floats(0, 1))
+def test_a_kill_at_any_instant_of_a_repair_leaves_a_log_that_reads_as_before(
+    tmp_path_factory, small, cut, steps, part
+):
+    path = tmp_path_factory.mktemp("killed") / "x.mcap.active"
+    path.write_bytes(small[: len(small) - cut])
+    entries = list(read(path))
+    with pytest.MonkeyPatch.context() as patch:
+        Power(patch, steps, part)
+        with suppress(Killed):
+            recover(path)
+    left = path if path.exists() else path.with_suffix("")
+    assert list(read(left)) == entries
+    if left == path:
+        assert recover(path).messages == len(entries)
+    assert [one.name for one in path.parent.iterdir()] == ["x.mcap"]
+    assert list(read(path.with_suffix(""))) == entries and info(path.with_suffix("")).closed
+
+
+def test_what_stands_is_not_written_again(tmp_path, small):
+    """A log is mended by the bytes that it lacks, and one that is whole by its name alone."""
+    path = tmp_path / "x.mcap.active"
+    for cut in (0, 30, len(small) - small.rindex(container.record(container.DATA_END, bytes(4)))):
+        path.write_bytes(small[: len(small) - cut])
+        node = path.stat().st_ino
+        with pytest.MonkeyPatch.context() as patch:
+            power = Power(patch, 100, 0.0)
+            assert recover(path).messages == 24
+        assert power.written == cut
+        assert (tmp_path / "x.mcap").read_bytes() == small and (tmp_path / "x.mcap").stat().st_ino == node
+        (tmp_path / "x.mcap").unlink()
+
+
+def test_a_log_damaged_before_its_end_is_left_as_it_was_until_its_copy_is_whole(tmp_path, small):
+    path = tmp_path / "x.mcap.active"
+    for at in range(8, small.rindex(container.record(container.DATA_END, bytes(4))), 7):
+        damaged = bytearray(small[:-20])
+        damaged[at] ^= 0xFF
+        path.write_bytes(damaged)
+        kept = None
+        with suppress(LogError):
+            kept = list(read(path))
+        with pytest.MonkeyPatch.context() as patch, suppress(LogError, Killed):
+            Power(patch, 2, 0.5)
+            recover(path)
+        if kept is not None and path.exists():
+            assert list(read(path))[: len(kept)] == kept, at
+        with suppress(LogError):
+            recover(path)
+            assert info(tmp_path / "x.mcap").closed
+            assert info(tmp_path / "x.mcap").messages >= len(kept or ()), at
+        for one in tmp_path.iterdir():
+            one.unlink()
+
+
 def test_of_a_torn_chunk_that_is_stored_plain_the_whole_messages_are_saved(tmp_path):
     chunk = container.Chunk()
     for i in range(10):
         chunk.add(1, i, i, i, b"%d" % i)
-    body = container.pack(chunk, lambda data: data)[0].replace(container.text("zstd"), container.text(""))
+    body = container.pack(chunk, bytes(chunk.data))[0].replace(container.text("zstd"), container.text(""))
     definition = container.record(container.CHANNEL, bytes([1, 0, 0, 0]) + container.text("t") * 2 + bytes(4))
     head = container.MAGIC + container.record(container.HEADER, container.text("") * 2)
     path = tmp_path / "x.mcap"
@@ -350,6 +432,48 @@ def test_a_full_disk_is_said_and_waited_for_and_nothing_is_lost_that_there_is_ro
     wait_until(lambda: log.trouble is None)
     assert log.close() and log.dropped == 0
     assert [e.value for e in read(path)] == written
+
+
+@pytest.mark.parametrize("refusals", [1, 2, 5])
+def test_what_a_refusing_disk_took_and_would_not_give_back_is_written_over(tmp_path, refusals):
+    """A disk that drops out takes a part, refuses to cut it off, and is well again."""
+
+    class Flaky(Sick):
+        left = 0
+
+        def truncate(self, size):
+            if self.left > 0:
+                self.left -= 1
+                raise OSError(errno.EIO, "broken")
+            self.disk.truncate(size)
+
+    drops, disks = threading.Event(), []
+
+    def refuses():
+        if drops.is_set():
+            drops.clear()
+            disks[0].left = refusals
+            return OSError(errno.EIO, "broken")
+        return None
+
+    path = tmp_path / "x.mcap"
+    log = Writer(
+        path,
+        metadata={},
+        chunk_bytes=500,
+        fsync_s=0.05,
+        disk=lambda p: disks.append(Flaky(p, refuses)) or disks[0],
+        **START,
+    )
+    for i in range(200):
+        log.record(imu(i))
+        if i % 50 == 20:
+            drops.set()
+            wait_until(lambda: not drops.is_set() and log.trouble is None)
+    assert log.close() and log.dropped == 0
+    assert [e.value for e in read(path)] == [imu(i) for i in range(200)]
+    with path.open("rb") as stream:
+        assert sum(1 for _ in make_reader(stream, validate_crcs=True).iter_messages()) == 200
 
 
 def test_a_disk_that_stays_full_costs_the_oldest_and_they_are_counted(tmp_path):
@@ -504,23 +628,7 @@ def test_a_killed_writer_loses_at_most_its_last_second(tmp_path, life_s):
     assert not lost or last_ns - lost[0] < 1_000_000_000
 
 
-# -- folder and command --------------------------------------------------------------------------------------
-
-
-def test_a_folder_keeps_the_newest_logs_and_touches_nothing_else(tmp_path):
-    (tmp_path / "mine.mcap").write_text("keep")
-    for second in range(5):
-        with folder.open_log(
-            tmp_path, metadata={}, start_unix_ns=second * 10**9, start_ns=0, max_files=3, min_free=0
-        ) as log:
-            log.record(imu(second))
-    names = [f"19700101T00000{second}Z.mcap" for second in (2, 3, 4)]
-    assert sorted(p.name for p in tmp_path.iterdir()) == [*names, "mine.mcap"]
-    with folder.open_log(tmp_path, metadata={}, start_unix_ns=4 * 10**9, start_ns=0, min_free=0) as log:
-        assert log.path.name == "19700101T000004Z-2.mcap"
-    with pytest.raises(LogError, match="would be left on the disk"):
-        folder.open_log(tmp_path, metadata={}, start_unix_ns=0, start_ns=0, min_free=1 << 60)
-    assert (tmp_path / "mine.mcap").read_text() == "keep"
+# -- command --------------------------------------------------------------------------------------
 
 
 def test_the_command_shows_repairs_and_fails_in_one_sentence(tmp_path, small):
