@@ -42,7 +42,7 @@ from .carry import FIXES, Carry, Settings, Step, initial, is_news
 from .freshness import TOLD_EVERY, Freshness
 from .lesson import learn
 from .solution import announce, solve
-from .step import step, uses
+from .step import LEVEL_3D, step, uses
 
 __all__ = ["FOLDED", "Navigator", "learnt", "stepped", "tuned"]
 
@@ -164,12 +164,7 @@ class Navigator:
 
     def _handle_late(self, record: Input) -> list[Output]:
         if record.t_ns < self._past[0].t_ns:
-            age = (self._past[-1].t_ns - record.t_ns) * 1e-9
-            name = type(record).__name__
-            limit = self._late_ns * 1e-9
-            return [
-                Rejection(record.t_ns, record.rx_ns, name, "arrived too late to be folded in", age, limit)
-            ]
+            return self._too_late(record)
         place = bisect_right(self._past, record.t_ns, key=lambda past: past.t_ns)
         again = [record, *(past.record for past in list(self._past)[place:])]
         self._carry = self._rewound(self._past[place].before)
@@ -186,6 +181,16 @@ class Navigator:
                 given = [out for out in outputs if not isinstance(out, Solution) or out.t_ns > self._given_ns]
         self._learnt()
         return given
+
+    def _too_late(self, record: Input) -> list[Output]:
+        """That it is not used; in what a receiver without a fix says there is nothing to use."""
+        if isinstance(record, Gnss) and record.fix < LEVEL_3D:
+            return []
+        age, limit = (self._past[-1].t_ns - record.t_ns) * 1e-9, self._late_ns * 1e-9
+        name = type(record).__name__
+        if age <= limit:
+            return [Rejection(record.t_ns, record.rx_ns, name, "it is of a time before all that was heard")]
+        return [Rejection(record.t_ns, record.rx_ns, name, "arrived too late to be folded in", age, limit)]
 
     def _rewound(self, before: Carry) -> Carry:
         """An earlier carry, to fold forward from: what was forecast since is not forecast again."""
