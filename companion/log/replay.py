@@ -25,6 +25,7 @@ from companion import __version__
 from companion.config import Config, load, parse, to_toml
 from companion.log import file, latency, simulate
 from companion.log.opened import LogError, is_closed
+from companion.log.overwriting import refuse_own_input
 from companion.log.variant import changed, has_flown, is_own, sentences, with_radio
 from companion.navigator import Navigator
 from companion.records import INPUTS, OUTPUTS, Event, Reboot, Solution, Stamped
@@ -196,6 +197,8 @@ def command(
     counts: dict[str, int] = {}
     if own and not is_closed(log):
         notes.append("the log was not closed: what came last is missing")
+    if output is not None:
+        refuse_own_input(output, log, beacons, config_file)
     if has_flown(log) and not (changes or beacons or silent):
         found = _compare(log, output, config)
     else:

@@ -148,3 +148,13 @@ def test_the_glitch_of_the_real_quadrotor_is_an_event(tmp_path: pathlib.Path) ->
     assert told["outputs"]["Solution"] > 500
     (glitch,) = [event for event in values(written, r.Event) if "GNSS glitch" in event.text]
     assert 126.2 < glitch.t_ns * 1e-9 < 127.7
+
+
+def test_a_log_of_ours_needs_no_conversion(tmp_path: pathlib.Path) -> None:
+    log, again, foreign = tmp_path / "x.mcap", tmp_path / "y.mcap", tmp_path / "z.mcap"
+    run("log", "convert", FLIGHT, "-o", log)
+    foreign.write_bytes(b"what is this" * 20)
+    for source, said in ((log, f"{log} is an MCAP log already"), (foreign, "is not an MCAP log")):
+        result = CliRunner().invoke(cli, ["log", "convert", str(source), "-o", str(again)])
+        assert result.exit_code == 1 and said in result.output
+    assert not again.exists()
