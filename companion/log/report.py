@@ -12,6 +12,7 @@ from pathlib import Path
 import click
 
 from companion.config import load
+from companion.extras import lacking
 from companion.log.assess import assess
 from companion.log.draw import printed
 from companion.log.figures import figures
@@ -66,9 +67,7 @@ def command(
         output.write_text(page(" and ".join(_names(logs)), blocks), encoding="utf-8")
         written = [output, *(printed(_all_figures(blocks), pdf, png) if pdf or png else [])]
     except ModuleNotFoundError as error:
-        raise LogError(
-            f"a report needs {error.name}: install it by `pip install 'navigation-companion[report]'`"
-        ) from None
+        raise LogError(lacking("a report", error.name, "report")) from None
     except OSError as error:
         raise LogError(f"cannot write the report to {error.filename}: {error.strerror}") from None
     for block in blocks:

@@ -17,6 +17,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from companion import drawing
 from companion.estimate.exchange import Design, Infeasible
 from companion.estimate.schuler import ARCSECOND, DEG_PER_HOUR, MEAN_EARTH, Scale, schuler_row, transition
 
@@ -140,7 +141,7 @@ def _drift(context: click.Context, parameter: click.Parameter, text: str | None)
 )
 @click.option("--limit-m", type=float, help="Also tell how long the position bound stays below this [m].")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
-@click.option("--plot", type=click.Path(path_type=Path, dir_okay=False), help="Draw into this file.")
+@click.option("--plot", type=click.Path(path_type=Path), callback=drawing.file, help="Draw into this file.")
 def command(
     sigma_m: float,
     window_min: float,
@@ -196,10 +197,8 @@ def _print(table: Sequence[Ahead], title: str, drift_deg_h: float | None) -> Non
 
 
 def _plot(table: Sequence[Ahead], file: Path) -> None:
-    try:
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise click.UsageError("--plot needs matplotlib; install navigation-companion[plot]") from None
+    from matplotlib.figure import Figure
+
     figure = Figure(figsize=(8.0, 5.0), layout="constrained")
     axes = figure.add_subplot()
     minutes = [row.ahead_min for row in table]
