@@ -194,14 +194,13 @@ def _beacons(given: tuple[str, ...], file: Path | None) -> tuple[Beacon, ...]:
                 param_hint="--beacon",
             ) from None
         height = alt[0] if alt else 0.0
-        beacons.append(Beacon(number, lat, lon, height, ground_alt=min(height, 20.0)))
+        beacons.append(Beacon(number, lat, lon, height, ground_alt=simulate.GROUND))
     if file is not None:
         for listed in simulate.read_beacons(file):
             if not (listed.azimuth and listed.ranging):
                 continue  # neither a VOR nor a DME alone is one
             lat, lon = math.degrees(listed.lat), math.degrees(listed.lon)
-            low = min(listed.alt, 20.0)
-            beacons.append(Beacon(listed.number, lat, lon, listed.alt, low, listed.range_limit))
+            beacons.append(Beacon(listed.number, lat, lon, listed.alt, simulate.GROUND, listed.range_limit))
     return tuple(beacons)
 
 
