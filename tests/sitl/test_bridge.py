@@ -303,3 +303,13 @@ def test_beacons_of_the_bridge_and_of_a_replay_have_one_horizon(height: float, t
     listed.write_text(f"id,lat_deg,lon_deg,alt_m\n1,55.75,38.57,{height}\n")
     typed, read = attach._beacons((f"55.75,38.57,{height}",), listed)
     assert typed.ground_alt == read.ground_alt == simulate.GROUND
+
+
+def test_a_bridge_that_hears_no_autopilot_says_so() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+        free.bind((LOOPBACK, 0))
+        link = f"udpin:{LOOPBACK}:{free.getsockname()[1]}"
+    done = CliRunner().invoke(command, ["--connect", link, "--seconds", "1"])
+    assert done.exit_code == 69
+    assert f"companion: no autopilot heard on {link} in 1 s" in done.stderr
+    assert not done.stdout
