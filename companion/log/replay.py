@@ -257,8 +257,11 @@ def _fly(
         finally:
             sink.close()
     notes = [note] if note else []
-    if outages:
+    if outages and config.channel == "local_position" and not config.inertial.independent:
         notes.append("the log's local position is as the autopilot had it, its own GNSS included")
+    end_s = found.flights[-1].end_s if found.flights else 0.0
+    late = (outage for outage in outages if outage.start > end_s)
+    notes += [f"{outage} silenced nothing: the log ends at {end_s:.0f} s" for outage in late]
     return found, [*notes, *latency.sentences(seen)], opened.summary()
 
 

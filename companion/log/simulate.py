@@ -82,6 +82,9 @@ class Outage(NamedTuple):
     start: float
     end: float
 
+    def __str__(self) -> str:
+        return f"--outage {self.source}:{self.start:g}-{self.end:g}"
+
 
 def read_beacons(path: Path) -> list[Beacon]:
     """A beacon list as CSV (`.gz` too): columns id, lat_deg, lon_deg, alt_m, optionally range_m; or
