@@ -148,6 +148,19 @@ def test_the_errors_put_in_come_out(assessed):
         assert row.rms[score.CORRECTED] == pytest.approx(5.0, abs=1e-3)
 
 
+def test_answers_of_beacons_are_scored_whatever_else_is_heard_as_the_loopback_scores_them(assessed):
+    """The flight has GNSS but for two minutes; every answer of its beacon counts."""
+
+    def truth(t_ns):
+        return displace(LAT, LON, 100.0, 0.0, 20.0 * (t_ns - START) / S, 0.0)
+
+    there = score.errors([r for r in flight_records() if isinstance(r, RsbnFix)], truth)[score.RSBN]
+    found = assessed.errors[score.RSBN]
+    assert len(found.t_ns) == len(there.t_ns) == END // 5
+    assert np.allclose(found.error, there.error, rtol=1e-3, atol=0.1)
+    assert all(score.RSBN in row.rms for row in assessed.rows)
+
+
 def rebooted(at_s=200.0):
     """The same five minutes, in which the autopilot began anew."""
     at = START + round(at_s * S)
