@@ -112,6 +112,12 @@ def _minutes(context: click.Context, parameter: click.Parameter, text: str) -> l
     return given if len(given) > 1 else np.linspace(0.0, given[0], 13).tolist()
 
 
+def _positive(context: click.Context, parameter: click.Parameter, value: float | None) -> float | None:
+    if value is not None and not (math.isfinite(value) and value > 0.0):
+        raise click.BadParameter(f"{value:g} is no distance: give metres above 0")
+    return value
+
+
 def _drift(context: click.Context, parameter: click.Parameter, text: str | None) -> float | None:
     """Return deg/h from a grade or a number."""
     if text is None or text in GRADES_DEG_H:
@@ -126,7 +132,13 @@ def _drift(context: click.Context, parameter: click.Parameter, text: str | None)
 
 
 @click.command("horizon")
-@click.option("--sigma-m", default=30.0, show_default=True, help="R.m.s. of one position fix [m].")
+@click.option(
+    "--sigma-m",
+    default=30.0,
+    show_default=True,
+    callback=_positive,
+    help="R.m.s. of one position fix [m].",
+)
 @click.option("--window-min", default=15.0, show_default=True, help="Length of trusted fixes [min].")
 @click.option("--every-s", default=1.0, show_default=True, help="Interval of the fixes [s].")
 @click.option(
@@ -139,7 +151,12 @@ def _drift(context: click.Context, parameter: click.Parameter, text: str | None)
 @click.option(
     "--ins", "drift_deg_h", callback=_drift, help="Grade (navigation, tactical, industrial) or drift [deg/h]."
 )
-@click.option("--limit-m", type=float, help="Also tell how long the position bound stays below this [m].")
+@click.option(
+    "--limit-m",
+    type=float,
+    callback=_positive,
+    help="Also tell how long the position bound stays below this [m].",
+)
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 @click.option("--plot", type=click.Path(path_type=Path), callback=drawing.file, help="Draw into this file.")
 def command(
