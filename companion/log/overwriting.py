@@ -13,7 +13,7 @@ def refuse_own_input(output: Path, *read: Path | None) -> None:
     """LogError, one sentence, where `output` is one of the files that are `read`."""
     for path in read:
         if path is not None and path.exists() and output.exists() and output.samefile(path):
-            raise LogError(f"{output} is {path}, which is read: give another name")
+            raise LogError(f"{output} is read (as {path}) and not written over: give another name")
 
 
 def refuse_any_log(output: Path) -> None:

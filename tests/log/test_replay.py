@@ -107,7 +107,7 @@ def test_the_log_that_is_read_is_not_written_over(how: str, tmp_path: Path) -> N
         output.hardlink_to(log)
     done = CliRunner().invoke(replay.command, [str(log), "-o", str(output)])
     assert isinstance(done.exception, LogError)
-    assert str(done.exception) == f"{output} is {log}, which is read: give another name"
+    assert str(done.exception) == f"{output} is read (as {log}) and not written over: give another name"
     assert log.read_bytes() == CUT.read_bytes()
 
 
@@ -117,5 +117,5 @@ def test_a_log_of_ours_is_not_written_over_by_its_replay(tmp_path: Path) -> None
     before = log.read_bytes()
     for changes in ([], ["--with", "gnss.sigma_m=3"]):
         done = CliRunner().invoke(replay.command, [str(log), "-o", str(log), *changes])
-        assert isinstance(done.exception, LogError) and "which is read" in str(done.exception)
+        assert isinstance(done.exception, LogError) and "not written over" in str(done.exception)
     assert log.read_bytes() == before
