@@ -7,6 +7,7 @@ that nothing here imports it: an aircraft may fly without.
 from __future__ import annotations
 
 import importlib
+import os
 import sys
 from importlib.metadata import entry_points
 
@@ -16,7 +17,7 @@ from companion import __version__
 from companion.config import ConfigError
 from companion.log.opened import LogError
 
-EX_CONFIG = 78  # sysexits.h
+EX_IOERR, EX_CONFIG = 74, 78  # sysexits.h
 COMMANDS = {
     "run": "companion.service:command",
     "replay": "companion.log.replay:command",
@@ -77,6 +78,12 @@ def main() -> None:
     except LogError as error:
         click.echo(f"companion: {error}", err=True)
         sys.exit(1)
+    except OSError as error:
+        # what the output could not take is not tried again at the exit, which would add lines of its own
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        where = error.filename or "the output"
+        click.echo(f"companion: {where}: {error.strerror or error}", err=True)
+        sys.exit(EX_IOERR)
 
 
 if __name__ == "__main__":

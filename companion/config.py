@@ -13,7 +13,8 @@ import tomllib
 from collections.abc import Iterable, Mapping
 from functools import lru_cache
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeAlias
+from types import UnionType
+from typing import Annotated, Any, Literal, TypeAlias, Union, get_args, get_origin, get_type_hints
 
 import msgspec
 from msgspec import Meta
@@ -28,6 +29,9 @@ RateHz = Annotated[float, Meta(ge=0.0, le=400.0)]
 OutputHz = Annotated[float, Meta(ge=-1.0, le=50.0)]
 Channel: TypeAlias = Literal["local_position", "air_data", "strapdown"]
 NodeId = Annotated[int, Meta(ge=1, le=255)]
+
+
+PREFIX = "COMPANION_"  # of the environment variables that are ours, every one a key
 
 
 class ConfigError(ValueError):
@@ -320,8 +324,10 @@ def load(
                 tree.setdefault(section, {}).update(table)
                 origin |= {(section, key): str(source) for key in table}
     for name, text in (os.environ if environment is None else environment).items():
-        if name.startswith("COMPANION_") and "__" in name:
-            section, key = name.removeprefix("COMPANION_").lower().split("__", 1)
+        if name.startswith(PREFIX):
+            section, between, key = name.removeprefix(PREFIX).lower().partition("__")
+            if not between:
+                raise ConfigError(f"environment variable {name}: it names no key{_nearest_variable(name)}")
             _check_keys({section: {key: text}}, f"environment variable {name}")
             tree.setdefault(section, {})[key] = _parsed(text)
             origin[section, key] = f"environment variable {name}"
@@ -401,6 +407,13 @@ def _nearest(name: str, known: tuple[str, ...]) -> str:
     return f"; did you mean `{close[0]}`?" if close else f"; it has {', '.join(known)}"
 
 
+def _nearest_variable(name: str) -> str:
+    tables = {section: type(getattr(Config(), section)) for section in Config.__struct_fields__}
+    known = [f"{PREFIX}{s}__{key}".upper() for s, table in tables.items() for key in table.__struct_fields__]
+    close = difflib.get_close_matches(name, known, 1, 0.6)
+    return f"; did you mean `{close[0]}`?" if close else f"; write it as {PREFIX}SECTION__KEY"
+
+
 def _parsed(text: str) -> Any:
     """An environment variable's text as TOML would read it, else as a string."""
     try:
@@ -409,16 +422,38 @@ def _parsed(text: str) -> Any:
         return text
 
 
+def _listed(value: Any, kind: Any) -> Any:
+    """One value where a list is asked for is a list of one."""
+    return [value] if get_origin(kind) is tuple and not isinstance(value, list | tuple) else value
+
+
+def _choices(kind: Any) -> tuple[str, ...]:
+    """The words that a key takes, where it takes nothing else."""
+    if get_origin(kind) is Literal:
+        return get_args(kind)
+    if get_origin(kind) in (Union, UnionType):
+        return tuple(word for one in get_args(kind) for word in _choices(one))
+    return ()
+
+
 def _convert(tree: Mapping[str, Mapping[str, Any]], origin: Mapping[tuple[str, str], str]) -> Config:
     sections: dict[str, Any] = {}
     for section, table in tree.items():
         kind = type(getattr(Config(), section))
+        hints = get_type_hints(kind)
+        table = {key: _listed(value, hints[key]) for key, value in table.items()}
         for key, value in table.items():
             try:
                 msgspec.convert({key: value}, kind)
             except msgspec.ValidationError as error:
                 reason = str(error).split(" - at ")[0].replace("`", "")
                 where = origin[section, key]
+                if choices := _choices(hints[key]):
+                    close = difflib.get_close_matches(str(value), choices, 1, 0.4)
+                    nearest = f"; did you mean `{close[0]}`?" if close else ""
+                    raise ConfigError(
+                        f"{where}: {section}.{key}: {value!r} is none of {', '.join(choices)}{nearest}"
+                    ) from None
                 raise ConfigError(
                     f"{where}: {section}.{key} = {value!r} is impossible: {reason[0].lower()}{reason[1:]}"
                 ) from None

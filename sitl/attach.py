@@ -194,14 +194,13 @@ def _beacons(given: tuple[str, ...], file: Path | None) -> tuple[Beacon, ...]:
                 param_hint="--beacon",
             ) from None
         height = alt[0] if alt else 0.0
-        beacons.append(Beacon(number, lat, lon, height, ground_alt=min(height, 20.0)))
+        beacons.append(Beacon(number, lat, lon, height, ground_alt=simulate.GROUND))
     if file is not None:
         for listed in simulate.read_beacons(file):
             if not (listed.azimuth and listed.ranging):
                 continue  # neither a VOR nor a DME alone is one
             lat, lon = math.degrees(listed.lat), math.degrees(listed.lon)
-            low = min(listed.alt, 20.0)
-            beacons.append(Beacon(listed.number, lat, lon, listed.alt, low, listed.range_limit))
+            beacons.append(Beacon(listed.number, lat, lon, listed.alt, simulate.GROUND, listed.range_limit))
     return tuple(beacons)
 
 
@@ -247,7 +246,7 @@ def command(
 
     Relays between autopilot and companion. Seconds count from the autopilot's first word. Ends at SIGINT or
     SIGTERM with a table; GNSS is switched on again. Exit codes: 1 the beacons cannot be read, 69 an address
-    cannot be listened on, 73 the folder cannot be written.
+    cannot be listened on or no autopilot was heard, 73 the folder cannot be written.
     """
     autopilot = _address(connect, "--connect")
     other = _address(companion, "--companion") if companion else None
@@ -282,6 +281,10 @@ def command(
     finally:
         if record is not None:
             record.close()
+    if bridge.begun_ns is None:
+        seconds = (attached.now_ns - attached.begun_ns) * 1e-9
+        click.echo(f"companion: no autopilot heard on {connect} in {seconds:.0f} s", err=True)
+        sys.exit(EX_UNAVAILABLE)
     tables = found(bridge, attached.now_ns)
     if as_json:
         click.echo(json.dumps(_json(tables, record)))

@@ -26,6 +26,7 @@ from rich.console import Console
 from rich.progress import MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
+from companion.extras import lacking
 from sitl.trial import KINDS, SCENARIOS, Order, Result, attempt, by_records, matters
 
 RETRIES = 3  # workers that may die under one flight before it counts as failed
@@ -104,9 +105,8 @@ def run(todo: Sequence[Order], scheduler: str | None, workers: int) -> Iterator[
     try:
         from dask.distributed import Client, LocalCluster, as_completed
     except ImportError:
-        raise ValueError(
-            "Dask is not installed: install the extra `campaign`, or fly with --workers 0"
-        ) from None
+        without = "or fly with --workers 0"
+        raise ValueError(f"{lacking('a campaign by many workers', 'Dask', 'campaign')}, {without}") from None
     cluster = None
     if scheduler is None:
         cluster = LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address="127.0.0.1:0")

@@ -22,6 +22,7 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
+from companion import drawing
 from companion.config import Config, Output, load
 from companion.log import score
 from companion.log.deferred import Log
@@ -147,7 +148,12 @@ def _from_first_fix(phase: Phase, kept: Iterable[Stamped]) -> score.Phase:
 @click.option("--config", "file", type=click.Path(path_type=Path), help="TOML file; see check-config.")
 @click.option("--set", "pairs", multiple=True, metavar="SECTION.KEY=VALUE", help="Any key of the file.")
 @click.option("--logs", help="Folder for the log.")
-@click.option("--plot", type=click.Path(path_type=Path), help="Draw the errors and the bound into this file.")
+@click.option(
+    "--plot",
+    type=click.Path(path_type=Path),
+    callback=drawing.file,
+    help="Draw the errors and the bound into this file.",
+)
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 def command(
     scenario: str,

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import click
 import numpy as np
 
 from companion.log import score
@@ -18,12 +17,8 @@ SHADES = {"GNSS+RSBN": "#e5f5e0", "GNSS only": "#deebf7", "RSBN only": "#fee6ce"
 
 def draw(path: Path, found: dict[str, score.Errors], scenario: Scenario, start_ns: int) -> None:
     """Draw into `path`; its suffix is the format."""
-    try:
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise click.ClickException(
-            "drawing needs matplotlib: pip install 'navigation-companion[plot]'"
-        ) from None
+    from matplotlib.figure import Figure
+
     figure = Figure(figsize=(10.0, 5.2), layout="constrained")
     axes = figure.subplots()
     for phase in scenario.phases():

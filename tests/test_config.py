@@ -36,6 +36,14 @@ def test_flags_beat_environment_beat_file(tmp_path: Path) -> None:
         ("[gnss]\nsigma_m = -1", "gnss.sigma_m = -1 is impossible: expected float > 0.0"),
         ("[gnss]\nsigma_m = nan", "gnss.sigma_m = nan is impossible: expected float"),
         ("[gnss]\nsigma_m = 'two'", "gnss.sigma_m = 'two' is impossible: expected float, got str"),
+        (
+            "[output]\nprofile = 'px5'",
+            "output.profile: 'px5' is none of monitor, ardupilot, px4, custom; did you mean `px4`?",
+        ),
+        ("[output]\nvia = 'odometri'", "is none of auto, odometry, "),
+        ("[output]\nvia = 3", "output.via: 3 is none of auto, "),
+        ("[inertial]\nsource = 'ins'", "'ins' is none of auto, local_position, air_data, strapdown"),
+        ("[link]\nconnect = 3", "link.connect = [3] is impossible: expected str, got int"),
         ("link = 3", "`link` is a section: write [link] and its keys below it"),
         ("x = [", "is no TOML"),
     ],
@@ -54,6 +62,29 @@ def test_a_mistake_in_the_environment_names_the_variable() -> None:
         load(environment={"COMPANION_GNSS__SIGMA_M": "-3"})
     with pytest.raises(ConfigError, match="COMPANION_GNS__SIGMA_M"):
         load(environment={"COMPANION_GNS__SIGMA_M": "3"})
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("COMPANION_OUTPUT_PROFILE", "did you mean `COMPANION_OUTPUT__PROFILE`?"),
+        ("COMPANION_GNSS_SIGMA_M", "did you mean `COMPANION_GNSS__SIGMA_M`?"),
+        ("COMPANION_XYZZY", "write it as COMPANION_SECTION__KEY"),
+    ],
+)
+def test_a_variable_of_ours_that_is_no_key_is_not_ignored(name: str, said: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        load(environment={name: "px4", "COMPANIONS": "two"})
+    assert str(caught.value) == f"environment variable {name}: it names no key; {said}"
+
+
+def test_one_word_is_a_list_of_one(tmp_path: Path) -> None:
+    link = "udpin:127.0.0.1:14560"
+    path = written(tmp_path, f"[link]\nconnect = '{link}'\n[predictor]\nahead_min = 5.0\n")
+    config = load(path, environment={})
+    assert config.link.connect == (link,) and config.predictor.ahead_min == (5.0,)
+    assert load(environment={"COMPANION_LINK__CONNECT": link}).link.connect == (link,)
+    assert load(environment={"COMPANION_LINK__CONNECT": f'["{link}", "x"]'}).link.connect == (link, "x")
 
 
 def test_a_missing_file_says_how_to_begin(tmp_path: Path) -> None:

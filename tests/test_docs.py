@@ -2,6 +2,7 @@
 they are in force, bytes that add up."""
 
 import re
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -104,3 +105,12 @@ def test_what_the_page_says_of_the_unit_stands_in_it() -> None:
 def test_links_lead_somewhere(page: str) -> None:
     for target in re.findall(r"\]\(([^)#]+)\)", PAGES[page]):
         assert (ROOT / "docs" / target).exists(), target
+
+
+def test_every_extra_that_is_named_is_there() -> None:
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    named = set(re.findall(r"'\.\[(\w+)\]'", (ROOT / "README.md").read_text()))
+    assert {"report", "plot", "logs"} <= named <= set(extras)
+    for source in (*ROOT.glob("companion/**/*.py"), *ROOT.glob("sitl/*.py")):
+        assert set(re.findall(r"lacking\(.*\"(\w+)\"\)", source.read_text())) <= set(extras), source
+        assert "navigation-companion[" not in source.read_text(), source  # it is on no index

@@ -90,3 +90,16 @@ def test_a_log_that_is_not_there_gets_one_sentence(tmp_path: Path, name: str) ->
     assert done.returncode == 1
     assert len(done.stderr.splitlines()) == 1 and name in done.stderr
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is always full")
+@pytest.mark.parametrize(
+    "command", [["--help"], ["check-config"], ["study", "horizon", "--ahead-min", "1,2"]]
+)
+def test_an_output_that_takes_no_more_is_one_sentence(command: list[str]) -> None:
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(
+            [sys.executable, "-m", "companion", *command], stdout=full, stderr=subprocess.PIPE, text=True
+        )
+    assert done.returncode == 74
+    assert done.stderr == "companion: the output: No space left on device\n"

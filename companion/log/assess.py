@@ -17,10 +17,11 @@ from scipy.special import gammaincinv
 from companion.config import Config, parse
 from companion.log import happenings, score
 from companion.log.gather import Flight, Floats, Table, Told
-from companion.log.happenings import Group, Outage, Rate, is_radio, usable_gnss
+from companion.log.happenings import Group, Outage, Rate, usable_gnss
 from companion.log.replay import CONFIGURATION
 from companion.log.smooth import joined, smooth_flight
 from companion.nav.earth import radii
+from companion.nav.geometry import Geodetic
 
 REACH_S = 2.0  # a reference is not carried across a longer hole
 
@@ -28,12 +29,13 @@ TRUTH, SMOOTHED, GNSS = "the simulator's truth", "the smoothed track", "GNSS its
 
 
 class Reference(NamedTuple):
-    """What errors are counted from: `what` it is, and a track, t (s), lat, lon (rad), all (n,)."""
+    """What errors are counted from: `what` it is, and a track, t (s), lat, lon (rad), alt (m), all (n,)."""
 
     what: str
     t: Floats
     lat: Floats
     lon: Floats
+    alt: Floats
 
 
 class Misfit(NamedTuple):
@@ -124,15 +126,15 @@ def _reference(flight: Flight) -> Reference | None:
     """Truth where the log has it, else the track smoothed with all fixes, else GNSS, else nothing."""
     truth, gnss = flight.tables["Truth"], usable_gnss(flight)
     if len(truth["t"]) > 1:
-        return _ordered(TRUTH, truth["t"], truth["lat"], truth["lon"])
+        return _ordered(TRUTH, truth["t"], truth["lat"], truth["lon"], truth["alt"])
     try:
         runs = smooth_flight(flight.heard, configuration(flight))
     except ValueError:
         if len(gnss["t"]) > 1:
-            return _ordered(GNSS, gnss["t"], gnss["lat"], gnss["lon"])
+            return _ordered(GNSS, gnss["t"], gnss["lat"], gnss["lon"], gnss["alt"])
         return None
-    t_ns, lat, lon, _ = joined(runs)
-    return _ordered(SMOOTHED, 1e-9 * (t_ns - flight.zero_ns), lat, lon)
+    t_ns, lat, lon, alt = joined(runs)
+    return _ordered(SMOOTHED, 1e-9 * (t_ns - flight.zero_ns), lat, lon, alt)
 
 
 def configuration(flight: Flight) -> Config:
@@ -141,9 +143,9 @@ def configuration(flight: Flight) -> Config:
     return Config() if text is None else parse(text, f"{flight.name} (its own configuration)")
 
 
-def _ordered(what: str, t: npt.ArrayLike, lat: Floats, lon: Floats) -> Reference:
+def _ordered(what: str, t: npt.ArrayLike, lat: Floats, lon: Floats, alt: Floats) -> Reference:
     t, first = np.unique(np.asarray(t, dtype=np.float64), return_index=True)
-    return Reference(what, t, lat[first], np.unwrap(lon[first]))
+    return Reference(what, t, lat[first], np.unwrap(lon[first]), alt[first])
 
 
 def _at(reference: Reference, t: Floats) -> tuple[Floats, Floats]:
@@ -172,9 +174,11 @@ def _wrapped(angle: Floats) -> Floats:
 
 def _errors(flight: Flight, reference: Reference) -> dict[str, score.Errors]:
     solution, gnss = flight.tables["Solution"], usable_gnss(flight)
-    radio = {name: column[is_radio(flight)] for name, column in flight.tables["Fix"].items()}
     bound = np.hypot(solution["bound_north"], solution["bound_east"])
-    tracks: list[tuple[str, Table]] = [(score.CORRECTED, solution), (score.RSBN, radio)]
+    tracks: list[tuple[str, Table]] = [
+        (score.CORRECTED, solution),
+        (score.RSBN, _beacon_places(flight, reference)),
+    ]
     if reference.what != GNSS:
         tracks.append((score.GNSS, gnss))
     found = {}
@@ -185,6 +189,20 @@ def _errors(flight: Flight, reference: Reference) -> dict[str, score.Errors]:
             ins = np.hypot(north + table["error_north"], east + table["error_east"])
             found[score.INS] = _known(table["t"], ins, None)
     return {source: found[source] for source in score.SOURCES if source in found and len(found[source].t_ns)}
+
+
+def _beacon_places(flight: Flight, reference: Reference) -> Table:
+    """Where each answer of a beacon alone puts the aircraft, whatever else is heard: as `score.errors`."""
+    heard = flight.tables["RsbnFix"]
+    whole = np.isfinite(heard["azimuth"] + heard["slant"])
+    t, *columns = (heard[name][whole] for name in ("t", "lat", "lon", "alt", "azimuth", "slant"))
+    places = [
+        score.beacon_place(Geodetic(lat, lon, alt), azimuth, slant, true_alt)
+        for lat, lon, alt, azimuth, slant, true_alt in zip(
+            *(column.tolist() for column in columns), np.interp(t, reference.t, reference.alt).tolist()
+        )
+    ]
+    return {"t": t, "lat": np.array([p.lat for p in places]), "lon": np.array([p.lon for p in places])}
 
 
 def _known(t: Floats, error: Floats, bound: Floats | None) -> score.Errors:

@@ -5,10 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 from companion.log import sources
-from companion.log.opened import LogError
+from companion.log.opened import LogError, opened
 from companion.log.replay import writer
 from companion.log.sources import Summary
-from companion.log.variant import CONVERTED, sentences
+from companion.log.variant import CONVERTED, is_own, sentences
 from companion.records import OUTPUTS
 
 
@@ -18,16 +18,19 @@ def convert(source: Path, output: Path) -> Summary:
     What the source itself tells (events, refused messages) goes to topics under /link, as in a replay.
     """
     with sentences():
+        if is_own(source):
+            with opened(source):
+                raise LogError(f"{source} is an MCAP log already: there is nothing to convert")
         if output.resolve() == source.resolve() or output.exists():
             raise LogError(f"{output} is there already: give another name")
-        opened = sources.open_source(source)
+        records = sources.open_source(source)
         sink = writer(output, {CONVERTED: {"from": source.name}})
         try:
-            for record in opened:
+            for record in records:
                 told = isinstance(record, OUTPUTS)
                 sink.record(record, f"/link/{type(record).__name__}" if told else None)
         finally:
             sink.close()
         if sink.trouble:
             raise LogError(f"{output} is not whole: {sink.trouble}")
-    return opened.summary()
+    return records.summary()

@@ -121,7 +121,10 @@ COLUMNS: dict[type[Stamped], tuple[str, Callable[[Any], tuple[float, ...]]]] = {
         "receiver fix lat lon alt sigma",
         lambda r: (r.receiver, r.fix, r.lat, r.lon, r.alt_msl, _number(r.sigma_horizontal)),
     ),
-    RsbnFix: ("beacon lat lon", lambda r: (r.beacon, r.lat, r.lon)),
+    RsbnFix: (
+        "beacon lat lon alt azimuth slant",
+        lambda r: (r.beacon, r.lat, r.lon, r.alt, _number(r.azimuth), _number(r.slant_range)),
+    ),
     Truth: ("lat lon alt", lambda r: (r.lat, r.lon, r.alt)),
     FilterStatus: ("gnss_glitch", lambda r: (float(r.gnss_glitch),)),
 }

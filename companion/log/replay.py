@@ -25,6 +25,7 @@ from companion import __version__
 from companion.config import Config, load, parse, to_toml
 from companion.log import file, latency, simulate
 from companion.log.opened import LogError, is_closed
+from companion.log.overwriting import refuse_own_input
 from companion.log.variant import changed, has_flown, is_own, sentences, with_radio
 from companion.navigator import Navigator
 from companion.records import INPUTS, OUTPUTS, Event, Reboot, Solution, Stamped
@@ -196,6 +197,8 @@ def command(
     counts: dict[str, int] = {}
     if own and not is_closed(log):
         notes.append("the log was not closed: what came last is missing")
+    if output is not None:
+        refuse_own_input(output, log, beacons, config_file)
     if has_flown(log) and not (changes or beacons or silent):
         found = _compare(log, output, config)
     else:
@@ -254,8 +257,11 @@ def _fly(
         finally:
             sink.close()
     notes = [note] if note else []
-    if outages:
+    if outages and config.channel == "local_position" and not config.inertial.independent:
         notes.append("the log's local position is as the autopilot had it, its own GNSS included")
+    end_s = found.flights[-1].end_s if found.flights else 0.0
+    late = (outage for outage in outages if outage.start > end_s)
+    notes += [f"{outage} silenced nothing: the log ends at {end_s:.0f} s" for outage in late]
     return found, [*notes, *latency.sentences(seen)], opened.summary()
 
 

@@ -12,15 +12,17 @@ from pathlib import Path
 import click
 
 from companion.config import load
+from companion.extras import lacking
 from companion.log.assess import assess
 from companion.log.draw import printed
 from companion.log.figures import figures
 from companion.log.flights import open_flights
 from companion.log.gather import Flight
 from companion.log.opened import LogError
+from companion.log.overwriting import refuse_any_log, refuse_own_input
 from companion.log.page import Block, page
 from companion.log.plot import LETTERS, Figure
-from companion.log.variant import changed
+from companion.log.variant import changed, has_flown
 from companion.log.verdict import verdict
 
 
@@ -50,6 +52,12 @@ def command(
     """
     if len(logs) > 2:
         raise click.UsageError(f"{len(logs)} logs were given: a report is about one, or compares two")
+    for target in (output, pdf):
+        if target is not None:
+            refuse_own_input(target, *logs, config_file)
+            refuse_any_log(target)
+    if changes or config_file:
+        _refuse_flown(logs)
     config = load(config_file)
     if changes:
         config = changed(config, ",".join(changes))
@@ -59,15 +67,23 @@ def command(
         output.write_text(page(" and ".join(_names(logs)), blocks), encoding="utf-8")
         written = [output, *(printed(_all_figures(blocks), pdf, png) if pdf or png else [])]
     except ModuleNotFoundError as error:
-        raise LogError(
-            f"a report needs {error.name}: install it by `pip install 'navigation-companion[report]'`"
-        ) from None
+        raise LogError(lacking("a report", error.name, "report")) from None
     except OSError as error:
         raise LogError(f"cannot write the report to {error.filename}: {error.strerror}") from None
     for block in blocks:
         for flight in block.flights:
             click.echo(verdict(flight))
     click.echo(f"written: {', '.join(str(path) for path in written)}")
+
+
+def _refuse_flown(logs: Sequence[Path]) -> None:
+    """LogError where a log is of a flight with us: what flew it is in it, and nothing is flown anew here."""
+    for path in logs:
+        if has_flown(path):
+            raise LogError(
+                f"--with and --config change nothing of {path}, reported as it flew; replay it first:"
+                f" companion replay {path} --with KEY=VALUE, and report what that writes"
+            )
 
 
 def alone(flights: Sequence[Flight]) -> list[Block]:

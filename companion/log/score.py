@@ -22,6 +22,8 @@ TruthAt = Callable[[int], Geodetic | None]
 
 INS, GNSS, RSBN, CORRECTED = "INS alone", "GNSS fix", "RSBN fix", "corrected"
 SOURCES = (INS, GNSS, RSBN, CORRECTED)
+OPENING_NS = 1_000_000_000  # a fix opens a phase no later than this after the time it is valid for
+_KINDS = ((GNSS, "GNSS"), (RSBN, "RSBN"))  # as they stand in the names of phases
 
 
 class Phase(NamedTuple):
@@ -94,27 +96,40 @@ def beacon_fix(record: RsbnFix, alt: float) -> Geodetic | None:
     """The place that a beacon's azimuth and slant range alone give at height `alt` (m); None without both."""
     if record.azimuth is None or record.slant_range is None:
         return None
-    beacon, up = Geodetic(record.lat, record.lon, record.alt), alt - record.alt
-    distance = math.sqrt(max(record.slant_range**2 - up * up, 0.0))
+    beacon = Geodetic(record.lat, record.lon, record.alt)
+    return beacon_place(beacon, record.azimuth, record.slant_range, alt)
+
+
+def beacon_place(beacon: Geodetic, azimuth: float, slant_range: float, alt: float) -> Geodetic:
+    """The place at height `alt` (m) that is seen from `beacon` under `azimuth` at `slant_range`."""
+    up = alt - beacon.alt
+    distance = math.sqrt(max(slant_range**2 - up * up, 0.0))
     for _ in range(2):  # the height over the beacon's tangent plane, the earth falling away below it
-        place = from_enu(
-            np.array([distance * math.sin(record.azimuth), distance * math.cos(record.azimuth), up]), beacon
-        )
+        place = from_enu(np.array([distance * math.sin(azimuth), distance * math.cos(azimuth), up]), beacon)
         up += alt - place.alt
-        distance = math.sqrt(max(record.slant_range**2 - up * up, 0.0))
+        distance = math.sqrt(max(slant_range**2 - up * up, 0.0))
     return place
 
 
 def table(found: dict[str, Errors], phases: Sequence[Phase]) -> list[Row]:
-    """One row a phase."""
-    return [_row(found, phase) for phase in phases]
+    """One row a phase. The fix that opens a phase is valid a moment before it, and counts in none."""
+    rows = []
+    for phase, following in zip(phases, [*phases[1:], None]):
+        opening = {
+            source
+            for source, kind in _KINDS
+            if following and kind in following.name and kind not in phase.name
+        }
+        rows.append(_row(found, phase, opening))
+    return rows
 
 
-def _row(found: dict[str, Errors], phase: Phase) -> Row:
+def _row(found: dict[str, Errors], phase: Phase, opening: set[str]) -> Row:
     rms, p95 = {}, {}
     judged: tuple[float, float, bool, float, float] | tuple[None, ...] = (None,) * 5
     for source, e in found.items():
-        within = (e.t_ns >= phase.start_ns) & (e.t_ns < phase.end_ns)
+        end_ns = phase.end_ns - OPENING_NS * (source in opening)
+        within = (e.t_ns >= phase.start_ns) & (e.t_ns < end_ns)
         if not within.any():
             continue
         error = e.error[within]

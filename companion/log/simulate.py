@@ -5,9 +5,9 @@
 
 A beacon answers once a second while it is above the radio horizon and within its range, with white noise of
 the stated sigmas on azimuth and slant range; of those that could, a receiver follows the nearest few. The
-earth is smooth at the height of the beacon or of the lowest point flown, whichever is lower. No terrain, no
-multipath, no bias. Heights are taken as the list and the track state them, both above the same surface.
-Everything follows from the seed.
+earth is smooth at `GROUND`, the surface that the list and the track both count heights from: what a height
+above it stands on, a mast or a hill, is not known. No terrain, no multipath, no bias. Everything follows from
+the seed.
 """
 
 from __future__ import annotations
@@ -36,6 +36,7 @@ Floats = npt.NDArray[np.float64]
 PERIOD_NS = 1_000_000_000
 REACH_NS = 3 * PERIOD_NS  # a track with a longer gap is not interpolated over it
 FOLLOWED = 4
+GROUND = 0.0  # m; one that followed the beacon's height would hide a higher one
 RANGE_LIMIT_M = 370_000.0  # 200 nautical miles
 SILENCE = math.radians(45.0)  # no azimuth in the cone above a beacon
 SIGMA_AZIMUTH = math.radians(0.25)
@@ -80,6 +81,9 @@ class Outage(NamedTuple):
     source: str
     start: float
     end: float
+
+    def __str__(self) -> str:
+        return f"--outage {self.source}:{self.start:g}-{self.end:g}"
 
 
 def read_beacons(path: Path) -> list[Beacon]:
@@ -270,7 +274,6 @@ def _in_reach(beacon: Beacon, sight: _Sight, alt: Floats) -> npt.NDArray[np.bool
     near = sight.slant <= beacon.range_limit
     if not near.any():
         return near
-    ground = min(beacon.alt, float(alt.min()))
-    horizon = np.array([radio_horizon(beacon.alt - ground, height) for height in (alt - ground).tolist()])
+    horizon = np.array([radio_horizon(beacon.alt - GROUND, height) for height in (alt - GROUND).tolist()])
     reach: npt.NDArray[np.bool_] = near & (sight.slant <= horizon)
     return reach

@@ -172,6 +172,8 @@ _READERS: dict[str, Callable[[Path], Iterable[Stamped]]] = {
     ".mat": inertialnav.read_matlab,
     ".zip": inertialnav.read_tables,
 }
+KINDS = (".tlog", *_READERS)
+"""How the names of other recorders' logs end."""
 
 
 def open_source(path: Path, autopilot_system: int | None = None) -> TlogSource | OnboardSource:
@@ -179,13 +181,13 @@ def open_source(path: Path, autopilot_system: int | None = None) -> TlogSource |
 
     ValueError or LogError, one sentence, if there is none or it is of no kind that is read.
     """
-    kind = path.suffix.lower()
-    if kind != ".tlog" and kind not in _READERS and not path.is_dir():
-        raise ValueError(
-            f"{path} is of no kind that is read here: give .tlog, {', '.join(_READERS)} or a folder of topics"
-        )
     if not path.exists():
         raise LogError(f"{path}: no such log")
+    kind = path.suffix.lower()
+    if kind not in KINDS and not path.is_dir():
+        raise ValueError(
+            f"{path} is of no kind that is read here: give .mcap, {', '.join(KINDS)} or a folder of topics"
+        )
     if path.is_dir():
         return OnboardSource(
             inertialnav.read_tables(path) if inertialnav.is_tables(path) else uorb.read(path)

@@ -16,6 +16,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, TypeAlias
 
+from companion.extras import lacking
 from companion.log.opened import LogError
 from companion.records import (
     AirData,
@@ -79,7 +80,7 @@ def _parsed(path: Path) -> Any:
     try:
         from pyulog import ULog
     except ImportError:
-        raise LogError(f"{path} needs pyulog: pip install navigation-companion[logs]") from None
+        raise LogError(lacking(str(path), "pyulog", "logs")) from None
     try:
         with path.open("rb") as file, contextlib.redirect_stdout(io.StringIO()):
             return ULog(file, [*_TOPICS, *_TRUTHS])

@@ -17,6 +17,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from companion import drawing
 from companion.estimate.exchange import Design, Infeasible
 from companion.estimate.schuler import ARCSECOND, DEG_PER_HOUR, MEAN_EARTH, Scale, schuler_row, transition
 
@@ -111,6 +112,12 @@ def _minutes(context: click.Context, parameter: click.Parameter, text: str) -> l
     return given if len(given) > 1 else np.linspace(0.0, given[0], 13).tolist()
 
 
+def _positive(context: click.Context, parameter: click.Parameter, value: float | None) -> float | None:
+    if value is not None and not (math.isfinite(value) and value > 0.0):
+        raise click.BadParameter(f"{value:g} is no distance: give metres above 0")
+    return value
+
+
 def _drift(context: click.Context, parameter: click.Parameter, text: str | None) -> float | None:
     """Return deg/h from a grade or a number."""
     if text is None or text in GRADES_DEG_H:
@@ -125,7 +132,13 @@ def _drift(context: click.Context, parameter: click.Parameter, text: str | None)
 
 
 @click.command("horizon")
-@click.option("--sigma-m", default=30.0, show_default=True, help="R.m.s. of one position fix [m].")
+@click.option(
+    "--sigma-m",
+    default=30.0,
+    show_default=True,
+    callback=_positive,
+    help="R.m.s. of one position fix [m].",
+)
 @click.option("--window-min", default=15.0, show_default=True, help="Length of trusted fixes [min].")
 @click.option("--every-s", default=1.0, show_default=True, help="Interval of the fixes [s].")
 @click.option(
@@ -138,9 +151,14 @@ def _drift(context: click.Context, parameter: click.Parameter, text: str | None)
 @click.option(
     "--ins", "drift_deg_h", callback=_drift, help="Grade (navigation, tactical, industrial) or drift [deg/h]."
 )
-@click.option("--limit-m", type=float, help="Also tell how long the position bound stays below this [m].")
+@click.option(
+    "--limit-m",
+    type=float,
+    callback=_positive,
+    help="Also tell how long the position bound stays below this [m].",
+)
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
-@click.option("--plot", type=click.Path(path_type=Path, dir_okay=False), help="Draw into this file.")
+@click.option("--plot", type=click.Path(path_type=Path), callback=drawing.file, help="Draw into this file.")
 def command(
     sigma_m: float,
     window_min: float,
@@ -196,10 +214,8 @@ def _print(table: Sequence[Ahead], title: str, drift_deg_h: float | None) -> Non
 
 
 def _plot(table: Sequence[Ahead], file: Path) -> None:
-    try:
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise click.UsageError("--plot needs matplotlib; install navigation-companion[plot]") from None
+    from matplotlib.figure import Figure
+
     figure = Figure(figsize=(8.0, 5.0), layout="constrained")
     axes = figure.add_subplot()
     minutes = [row.ahead_min for row in table]

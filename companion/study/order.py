@@ -16,6 +16,7 @@ import numpy.typing as npt
 from rich.console import Console
 from rich.table import Table
 
+from companion import drawing
 from companion.estimate.polynomial import FAMILIES, Family, Order, select_order
 
 Array = npt.NDArray[np.float64]
@@ -109,7 +110,7 @@ def short_form(samples: Samples, found: Order) -> int:
 @click.option("--sigma", default=0.2, show_default=True, help="R.m.s. noise, where FILE has no third column.")
 @click.option("--seed", default=1, show_default=True, help="Of the noise.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
-@click.option("--plot", type=click.Path(path_type=Path, dir_okay=False), help="Draw into this file.")
+@click.option("--plot", type=click.Path(path_type=Path), callback=drawing.file, help="Draw into this file.")
 def command(
     file: Path | None,
     signal: str,
@@ -168,10 +169,8 @@ def _print(rows: Sequence[Row], title: str) -> None:
 
 
 def _plot(samples: Samples, rows: Sequence[Row], file: Path) -> None:
-    try:
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise click.UsageError("--plot needs matplotlib; install navigation-companion[plot]") from None
+    from matplotlib.figure import Figure
+
     figure = Figure(figsize=(11.0, 4.5), layout="constrained")
     left, right = figure.subplots(1, 2)
     left.plot(samples.t, samples.z, ".", color="0.7", label="samples")

@@ -16,6 +16,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from companion import drawing
 from companion.estimate import kalman, restrictive
 from companion.estimate.kalman import Array
 from companion.nav.error_model import Example, paper_example
@@ -190,7 +191,6 @@ def draw(
     """Figures in the order of the paper's 1-10, of the first run: measurements, inputs, estimates, errors."""
     from matplotlib.figure import Figure
 
-    folder.mkdir(parents=True, exist_ok=True)
     assert restricted.u is not None
     states = model.states
     groups = [range(i, min(i + 4, len(states))) for i in range(0, len(states), 4)]
@@ -225,7 +225,9 @@ def draw(
 @click.option("--truth", "names", multiple=True, type=click.Choice(list(TRUTHS)), help="rows; all by default")
 @click.option("--seed", default=1, show_default=True, help="of the random numbers")
 @click.option("--json", "as_json", is_flag=True, help="print plain data")
-@click.option("--plot", type=click.Path(file_okay=False, path_type=Path), help="folder for figures 1-10")
+@click.option(
+    "--plot", type=click.Path(path_type=Path), callback=drawing.folder, help="folder for figures 1-10"
+)
 def command(names: tuple[str, ...], runs: int, seed: int, as_json: bool, plot: Path | None) -> None:
     """Minimax Kalman filter against the restrictive filter, 16 states, six hours of unknown currents."""
     rows = []

@@ -16,6 +16,7 @@ inside, to judge it by. The "truth" is such a measurement too, so the shares are
 """
 
 import json
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -61,8 +62,21 @@ class Outcome(NamedTuple):
 
 
 def load(file: Path, every_s: float = 10.0) -> Recording:
-    """Read a recording and keep about one sample in every_s; a midnight passed in flight is unwrapped."""
-    table = np.loadtxt(file, delimiter=",", skiprows=3)
+    """Read a recording and keep about one sample in every_s; a midnight passed in flight is unwrapped.
+
+    ValueError, one sentence, where it is none.
+    """
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of a file without data, which is told below
+            table = np.loadtxt(file, delimiter=",", skiprows=3, ndmin=2)
+    except (ValueError, OSError) as error:  # no number, no text, no gzip
+        raise ValueError(f"{file} is no recording of velocity errors: {error}") from None
+    if len(table) < 2 or table.shape[1] < 3:
+        raise ValueError(
+            f"{file} is no recording of velocity errors: below three lines of heading it needs lines of"
+            " seconds, east, north"
+        )
     seconds = np.unwrap(table[:, 0], period=86_400.0)
     seconds -= seconds[0]
     _, first = np.unique(np.floor(seconds / every_s), return_index=True)

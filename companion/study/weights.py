@@ -6,6 +6,7 @@ in `companion.estimate.weights`.
 """
 
 import json
+from pathlib import Path
 from typing import Any
 
 import click
@@ -13,6 +14,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from companion import drawing
 from companion.estimate.weights import changed, per_axis, rms_ratio, rms_ratio_assuming
 
 DEVIATIONS = (0.05, 0.1, 0.2, 0.5)  # the law is even in them
@@ -78,12 +80,10 @@ def table(result: dict[str, Any]) -> Table:
     return sheet
 
 
-def plot(variances: list[float], names: list[str], file: str) -> None:
+def plot(variances: list[float], names: list[str], file: Path) -> None:
     """Two curves per sensor: rms ratio against its weight's deviation, and against its assumed variance."""
-    try:
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise ValueError("a plot needs matplotlib: install navigation-companion[plot]") from None
+    from matplotlib.figure import Figure
+
     best = per_axis(np.zeros(len(variances)), variances).weights
     figure = Figure(figsize=(10, 4), layout="constrained")
     left, right = figure.subplots(1, 2)
@@ -105,10 +105,14 @@ def plot(variances: list[float], names: list[str], file: str) -> None:
 @click.option("--names", default="INS,GNSS,RSBN", show_default=True, help="Names, comma separated.")
 @click.option("--distance", default=100.0, show_default=True, help="Coordinate at which the bias is counted.")
 @click.option(
-    "--plot", "plot_file", type=click.Path(dir_okay=False), help="Also draw the study to this file."
+    "--plot",
+    "plot_file",
+    type=click.Path(path_type=Path),
+    callback=drawing.file,
+    help="Also draw the study to this file.",
 )
 @click.option("--json", "as_json", is_flag=True, help="Print plain data instead of a table.")
-def command(variances: str, names: str, distance: float, plot_file: str | None, as_json: bool) -> None:
+def command(variances: str, names: str, distance: float, plot_file: Path | None, as_json: bool) -> None:
     """What is lost when the fusion weights depart from the best ones."""
     try:
         values, labels = [float(v) for v in variances.split(",")], names.split(",")
@@ -116,7 +120,7 @@ def command(variances: str, names: str, distance: float, plot_file: str | None, 
         if plot_file:
             plot(values, labels, plot_file)
     except ValueError as e:
-        raise click.ClickException(str(e)) from None
+        raise click.UsageError(str(e)) from None
     if as_json:
         click.echo(json.dumps(result, indent=1))
     else:

@@ -1,6 +1,7 @@
 """Foreign logs run through the navigator to their end, and come out as a log of ours."""
 
 import json
+import shutil
 from collections import Counter
 from pathlib import Path
 
@@ -92,3 +93,29 @@ def test_a_log_without_inputs_and_a_torn_one_are_told(tmp_path: Path) -> None:
     done = CliRunner().invoke(replay.command, [str(tmp_path / "torn.mcap")])
     assert "the log was not closed" in done.output
     assert "not closed" not in CliRunner().invoke(replay.command, [str(tmp_path / "out.mcap")]).output
+
+
+@pytest.mark.parametrize("how", ["itself", "symbolic link", "hard link"])
+def test_the_log_that_is_read_is_not_written_over(how: str, tmp_path: Path) -> None:
+    log, output = tmp_path / "flight.tlog", tmp_path / "other.mcap"
+    shutil.copy(CUT, log)
+    if how == "itself":
+        output = log
+    elif how == "symbolic link":
+        output.symlink_to(log)
+    else:
+        output.hardlink_to(log)
+    done = CliRunner().invoke(replay.command, [str(log), "-o", str(output)])
+    assert isinstance(done.exception, LogError)
+    assert str(done.exception) == f"{output} is read (as {log}) and not written over: give another name"
+    assert log.read_bytes() == CUT.read_bytes()
+
+
+def test_a_log_of_ours_is_not_written_over_by_its_replay(tmp_path: Path) -> None:
+    log = tmp_path / "out.mcap"
+    replayed(CUT, log)
+    before = log.read_bytes()
+    for changes in ([], ["--with", "gnss.sigma_m=3"]):
+        done = CliRunner().invoke(replay.command, [str(log), "-o", str(log), *changes])
+        assert isinstance(done.exception, LogError) and "not written over" in str(done.exception)
+    assert log.read_bytes() == before

@@ -148,6 +148,19 @@ def test_the_errors_put_in_come_out(assessed):
         assert row.rms[score.CORRECTED] == pytest.approx(5.0, abs=1e-3)
 
 
+def test_answers_of_beacons_are_scored_whatever_else_is_heard_as_the_loopback_scores_them(assessed):
+    """The flight has GNSS but for two minutes; every answer of its beacon counts."""
+
+    def truth(t_ns):
+        return displace(LAT, LON, 100.0, 0.0, 20.0 * (t_ns - START) / S, 0.0)
+
+    there = score.errors([r for r in flight_records() if isinstance(r, RsbnFix)], truth)[score.RSBN]
+    found = assessed.errors[score.RSBN]
+    assert len(found.t_ns) == len(there.t_ns) == END // 5
+    assert np.allclose(found.error, there.error, rtol=1e-3, atol=0.1)
+    assert all(score.RSBN in row.rms for row in assessed.rows)
+
+
 def rebooted(at_s=200.0):
     """The same five minutes, in which the autopilot began anew."""
     at = START + round(at_s * S)
@@ -381,6 +394,35 @@ def test_bad_input_is_one_sentence(name, content, tmp_path):
     assert str(path) in str(found.exception) or name in str(found.exception)
     assert "\n" not in str(found.exception)
     assert not (tmp_path / "r.html").exists()
+
+
+@pytest.mark.parametrize("option", ["-o", "--pdf"])
+def test_no_log_is_written_over(option, log, tmp_path):
+    other, link, before = tmp_path / "other.tlog", tmp_path / "page.html", log.read_bytes()
+    other.write_bytes(b"another flight")
+    link.symlink_to(log)
+    for output in (log, link, other):
+        found = CliRunner().invoke(command, [str(log), option, str(output)])
+        assert isinstance(found.exception, LogError) and "give another name" in str(found.exception)
+    assert log.read_bytes() == before and other.read_bytes() == b"another flight"
+
+
+def test_a_page_is_written_over_an_older_one(log, tmp_path):
+    pytest.importorskip("plotly")
+    page = tmp_path / "r.html"
+    page.write_text("an older one")
+    CliRunner().invoke(command, [str(log), "-o", str(page)], catch_exceptions=False)
+    assert "an older one" not in page.read_text("utf-8")
+
+
+def test_what_would_be_flown_with_is_refused_where_nothing_is_flown(log, tmp_path):
+    mine = tmp_path / "mine.toml"
+    mine.write_text("[gnss]\nsigma_m = 7.5\n")
+    for option in (["--with", "gnss.sigma_m=50"], ["--config", str(mine)]):
+        found = CliRunner().invoke(command, [str(log), "-o", str(tmp_path / "r.html"), *option])
+        assert isinstance(found.exception, LogError)
+        assert f"replay it first: companion replay {log} --with" in str(found.exception)
+        assert not (tmp_path / "r.html").exists()
 
 
 def test_a_report_is_of_one_log_or_two(log):

@@ -111,3 +111,13 @@ def test_half_an_answer_is_no_place() -> None:
     beacon = Geodetic(math.radians(60.05), math.radians(31.07), 80.0)
     assert score.beacon_fix(rsbn(beacon, PLACE, azimuth=None), 800.0) is None
     assert score.beacon_fix(rsbn(beacon, PLACE, slant_range=None), 800.0) is None
+
+
+def test_the_fix_that_opens_a_phase_is_not_the_one_before_its():
+    second = 1_000_000_000
+    t = np.arange(0, 20 * second, second // 2)
+    t = t[t > 9 * second]  # the first is valid half a second before the phase that it opens
+    fixes = score.Errors(t, np.ones(len(t)), np.full(len(t), np.nan))
+    phases = [score.Phase("neither", 0, 10 * second), score.Phase("GNSS only", 10 * second, 20 * second)]
+    before, after = score.table({score.GNSS: fixes}, phases)
+    assert score.GNSS not in before.rms and after.rms[score.GNSS] == 1.0

@@ -51,15 +51,25 @@ def test_the_seed_decides_and_a_beacon_has_its_own_noise() -> None:
 
 
 def test_only_beacons_above_the_horizon_and_within_range_answer() -> None:
-    low, beacon = track(alt=320.0), Geodetic(0.785, -1.632, 300.0)
+    low, beacon = track(alt=20.0), Geodetic(0.785, -1.632, 1.0)
     heard = {a.t_ns for a in simulate.answers([simulate.Beacon(1, *beacon)], low)}
-    told = {int(t) for t in low.t_ns[::2] if in_radio_sight(beacon, place(low, int(t)), 300.0)}
+    told = {int(t) for t in low.t_ns[::2] if in_radio_sight(beacon, place(low, int(t)))}
     assert heard == told and 0 < len(told) < 1000
     far = track(alt=300.0 + 9000.0)
     limit = 50_000.0
     close = simulate.answers([simulate.Beacon(1, *beacon, range_limit=limit)], far)
     assert 0 < len(close) < 1000
     assert all(slant_range_azimuth(beacon, place(far, a.t_ns)).slant_range <= limit for a in close)
+
+
+@pytest.mark.parametrize("alt", [20.0, 250.0])
+def test_a_higher_beacon_is_heard_wherever_a_lower_one_is(alt: float) -> None:
+    heard: set[int] = set()
+    for height in (-30.0, 0.0, 20.0, 50.0, 200.0, 260.0, 2000.0):
+        lower, beacon = heard, simulate.Beacon(1, 0.7855, -1.64, height)
+        heard = {answer.t_ns for answer in simulate.answers([beacon], track(alt=alt))}
+        assert heard >= lower
+    assert heard
 
 
 def test_no_azimuth_overhead_and_the_nearest_few_are_followed() -> None:

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from companion import records as r
 from companion.link import dialect, frame
 from companion.log import sources, tlog
+from companion.log.opened import LogError
 from companion.nav.geometry import Geodetic, geodetic_to_local
 
 DATA = pathlib.Path(__file__).parents[1] / "data"
@@ -164,12 +165,19 @@ def test_the_origin_is_inferred_where_no_message_tells_it() -> None:
 
 
 def test_what_is_no_tlog_is_refused_in_a_sentence(tmp_path: pathlib.Path) -> None:
-    empty, foreign = tmp_path / "empty.tlog", tmp_path / "foreign.tlog"
+    empty, foreign, other = tmp_path / "empty.tlog", tmp_path / "foreign.tlog", tmp_path / "x.pdf"
     empty.touch()
+    other.touch()
     foreign.write_bytes(bytes(range(256)) * 8)
-    for path, words in ((empty, "is empty"), (foreign, "is no tlog"), (tmp_path / "x.pdf", "no kind")):
+    for path, words in ((empty, "is empty"), (foreign, "is no tlog"), (other, r"no kind .* give \.mcap")):
         with pytest.raises(ValueError, match=words):
             sources.open_source(path)
+
+
+@pytest.mark.parametrize("name", ["nofile", "nofile.pdf", "nofile.tlog", "nofile.bin"])
+def test_what_is_not_there_is_said_so_whatever_its_name(name: str, tmp_path: pathlib.Path) -> None:
+    with pytest.raises(LogError, match=f"{name}: no such log"):
+        sources.open_source(tmp_path / name)
 
 
 REAL = {

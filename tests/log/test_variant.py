@@ -77,6 +77,21 @@ def test_an_outage_leaves_the_navigator_predicting_and_beacons_fix_it(
     assert any(s.sources & r.Source.RANGE for s in late)
 
 
+@pytest.mark.parametrize("keys", ["source=air_data", "independent=true"])
+def test_of_an_autopilot_whose_position_is_not_used_or_its_own_nothing_is_said(
+    tmp_path: pathlib.Path, keys: str
+) -> None:
+    told = report(FLIGHT, "-o", tmp_path / "x.mcap", "--outage", "GNSS:30-60", "--with", keys)
+    assert not any("as the autopilot had it" in note for note in told["notes"])
+
+
+def test_an_outage_after_the_log_s_end_is_said_to_be_none(tmp_path: pathlib.Path) -> None:
+    late = ("--outage", "GNSS:9000-9900", "--outage", "GNSS:30-60")
+    told = report(FLIGHT, "-o", tmp_path / "x.mcap", *late)
+    (note,) = [note for note in told["notes"] if "silenced nothing" in note]
+    assert note.startswith("--outage GNSS:9000-9900 silenced nothing: the log ends at ")
+
+
 def test_the_seed_decides_what_is_heard(tmp_path: pathlib.Path, beacons: pathlib.Path) -> None:
     one, same, other = (tmp_path / name for name in ("one.mcap", "same.mcap", "other.mcap"))
     report(FLIGHT, "-o", one, "--rsbn", beacons)
@@ -148,3 +163,13 @@ def test_the_glitch_of_the_real_quadrotor_is_an_event(tmp_path: pathlib.Path) ->
     assert told["outputs"]["Solution"] > 500
     (glitch,) = [event for event in values(written, r.Event) if "GNSS glitch" in event.text]
     assert 126.2 < glitch.t_ns * 1e-9 < 127.7
+
+
+def test_a_log_of_ours_needs_no_conversion(tmp_path: pathlib.Path) -> None:
+    log, again, foreign = tmp_path / "x.mcap", tmp_path / "y.mcap", tmp_path / "z.mcap"
+    run("log", "convert", FLIGHT, "-o", log)
+    foreign.write_bytes(b"what is this" * 20)
+    for source, said in ((log, f"{log} is an MCAP log already"), (foreign, "is not an MCAP log")):
+        result = CliRunner().invoke(cli, ["log", "convert", str(source), "-o", str(again)])
+        assert result.exit_code == 1 and said in result.output
+    assert not again.exists()

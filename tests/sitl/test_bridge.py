@@ -16,9 +16,10 @@ from click.testing import CliRunner
 
 from companion.config import Config, load
 from companion.link import dialect, frame
-from companion.log import file, tlog
+from companion.log import file, simulate, tlog
 from companion.onboard import Onboard
 from companion.records import Event, RsbnFix, Solution, Truth
+from sitl import attach
 from sitl.attach import command
 from sitl.beacon import Beacon
 from sitl.bridge import AUTOPILOT, COMPANION, RSBN, Bridge, Orders, Way
@@ -294,3 +295,21 @@ def test_a_list_of_beacons_that_is_none_ends_it(tmp_path: Path) -> None:
     path.write_text("a,b\n1,2\n")
     done = CliRunner().invoke(command, ["--beacons", str(path)])
     assert done.exit_code == 1 and "it needs the columns id, lat_deg" in done.output
+
+
+@pytest.mark.parametrize("height", [0.0, 20.0, 200.0, 900.0])
+def test_beacons_of_the_bridge_and_of_a_replay_have_one_horizon(height: float, tmp_path) -> None:
+    listed = tmp_path / "beacons.csv"
+    listed.write_text(f"id,lat_deg,lon_deg,alt_m\n1,55.75,38.57,{height}\n")
+    typed, read = attach._beacons((f"55.75,38.57,{height}",), listed)
+    assert typed.ground_alt == read.ground_alt == simulate.GROUND
+
+
+def test_a_bridge_that_hears_no_autopilot_says_so() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+        free.bind((LOOPBACK, 0))
+        link = f"udpin:{LOOPBACK}:{free.getsockname()[1]}"
+    done = CliRunner().invoke(command, ["--connect", link, "--seconds", "1"])
+    assert done.exit_code == 69
+    assert f"companion: no autopilot heard on {link} in 1 s" in done.stderr
+    assert not done.stdout

@@ -82,6 +82,27 @@ def test_command():
     assert "sigma -1.0" in CliRunner().invoke(command, [*arguments, "--sigma-mps", "-1"]).output
 
 
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("empty.csv", b""),
+        ("heading.csv", b"# a\n# b\nutc_s_of_day,ve,vn\n"),
+        ("one_line.csv", b"# a\n# b\n# c\n1.0,2.0,3.0\n"),
+        ("narrow.csv", b"# a\n# b\n# c\n1.0,2.0\n2.0,2.0\n"),
+        ("flight.tlog", bytes(range(256))),
+        ("mine.toml", b"[gnss]\nsigma_m = 3.0\n\nevery_s = 1\n"),
+        ("flight.csv.gz", b"no gzip"),
+    ],
+)
+def test_what_is_no_recording_is_one_sentence_with_its_name(name, content, tmp_path):
+    file = tmp_path / name
+    file.write_bytes(content)
+    done = CliRunner().invoke(command, [str(file)])
+    assert done.exit_code == 2
+    assert f"Error: {file} is no recording of velocity errors: " in done.stderr
+    assert len(done.stderr.splitlines()) == 4
+
+
 @pytest.mark.shared
 @pytest.mark.skipif(not ORIGINAL.exists(), reason="the full recording stands beside the repository")
 def test_the_cut_is_the_recording(recording):

@@ -48,5 +48,5 @@ def test_plot(tmp_path):
 )
 def test_bad_input_is_one_sentence(arguments, said):
     result = run(*arguments)
-    assert result.exit_code == 1
+    assert result.exit_code == 2
     assert said in result.output
