@@ -262,4 +262,5 @@ def _told(record: Event | Reset, zero_ns: int) -> Told:
 
 
 def _refused(r: Rejection, zero_ns: int) -> Refused:
-    return Refused((r.t_ns - zero_ns) * 1e-9, r.source, r.reason, _number(r.value), _number(r.limit))
+    t_ns = r.t_ns if r.t_ns >= zero_ns else r.rx_ns  # of a time before the flight: when it was heard
+    return Refused((t_ns - zero_ns) * 1e-9, r.source, r.reason, _number(r.value), _number(r.limit))

@@ -101,8 +101,8 @@ def _flown(a: Assessment) -> list[str]:
     lasts = f"The log holds {lasting(seconds)}" if n == 1 else f"Flight {k} of {n} lasts {lasting(seconds)}"
     if not len(a.flight.tables["Solution"]["t"]):
         return [
-            f"{lasts} but no estimate: there was no inertial channel (a local position with its origin, or "
-            "airspeed with attitude), or no fix that was believed."
+            f"{lasts}, without an estimate: there was no inertial channel (a local position with its origin, "
+            "or airspeed with attitude), or no fix that was believed."
         ]
     sentences = [f"{lasts}."]
     started = float(a.flight.tables["Solution"]["t"][0])
