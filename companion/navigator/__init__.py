@@ -189,7 +189,7 @@ class Navigator:
         age, limit = (self._past[-1].t_ns - record.t_ns) * 1e-9, self._late_ns * 1e-9
         name = type(record).__name__
         if age <= limit:
-            return [Rejection(record.t_ns, record.rx_ns, name, "it is of a time before all that was heard")]
+            return [Rejection(record.t_ns, record.rx_ns, name, "older than all that can be gone back to")]
         return [Rejection(record.t_ns, record.rx_ns, name, "arrived too late to be folded in", age, limit)]
 
     def _rewound(self, before: Carry) -> Carry:

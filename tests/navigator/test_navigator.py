@@ -233,6 +233,19 @@ def test_what_is_later_than_the_limit_is_rejected_aloud() -> None:
     assert out.value > 50.0
 
 
+def test_what_is_older_than_the_first_record_is_not_called_late_and_no_fix_is_no_refusal() -> None:
+    navigator = Navigator(CONFIG)
+    records = [r for m in flight(10, 10.0, 10.0) for r in m.records if r.t_ns > 5 * NS]
+    for record in (origin(), *records):
+        navigator.handle(msgspec.structs.replace(record, t_ns=max(record.t_ns, 5 * NS)))
+    answer = next(r for r in records if isinstance(r, RsbnFix))
+    old = msgspec.structs.replace(answer, t_ns=4 * NS, rx_ns=10 * NS)
+    (out,) = navigator.handle(old)
+    assert isinstance(out, Rejection) and out.value is None and "gone back to" in out.reason
+    fix = next(r for r in records if isinstance(r, Gnss))
+    assert navigator.handle(msgspec.structs.replace(fix, t_ns=NS, rx_ns=10 * NS, stamp_us=1, fix=1)) == []
+
+
 def test_what_is_too_late_is_so_after_parameters_were_set_too() -> None:
     navigator = Navigator(CONFIG)
     navigator.handle(origin())
