@@ -90,7 +90,7 @@ def _measured(
     if isinstance(record, Gnss):
         told = watch.of_gnss(record, lesson.ins, settings.watched, settings.config)
         return w._replace(sights=sights.noted(w.sights, w.monitor.bank.t_ns, told)), [(told, None)]
-    w, measurements = watch.met(w, record), list[tuple[Measurement, Azimuth | Range | None]]()
+    w, measurements = watch.met(w, record.beacon), list[tuple[Measurement, Azimuth | Range | None]]()
     for z in lesson.sights:
         assert isinstance(z, Azimuth | Range)
         w, measurement = watch.of_beacon(w, watch.named(record.beacon, z), z, settings.config)

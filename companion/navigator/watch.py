@@ -23,7 +23,7 @@ from companion.estimate.fusion import Azimuth, Range
 from companion.estimate.integrity import Protection
 from companion.estimate.monitor import Allotment, Exclusion, Monitor, Refusal
 from companion.nav.geometry import Geodetic, apart
-from companion.records import Event, Gnss, Output, Rejection, RsbnFix, Vector2, Vector3
+from companion.records import Event, Gnss, Output, Rejection, Vector2, Vector3
 
 from . import errorstate, radio, sights
 from .errorstate import POSITION, VELOCITY, ErrorModel, ErrorState
@@ -39,7 +39,6 @@ DECIDE_NS = 1_000_000_000
 BIAS_HOUR = 0.5  # a beacon's bias walks in an hour by this share of what it may be
 WARNING, NOTICE = 4, 5  # MAV_SEVERITY
 MOST_BEACONS = 8  # followed at once: the work grows with the cube of their number
-ELSEWHERE_M = 100.0  # the same identity this far off is another beacon
 CONTRADICT = "sources contradict one another"
 
 
@@ -52,7 +51,7 @@ class Watch(NamedTuple):
     due_ns: int = 0
     v_n: Vector3 | None = None  # of the channel, at the bank's time
     sights: Sights = Sights()
-    beacons: tuple[tuple[int, Geodetic], ...] = ()  # and where they stand; the last heard last
+    beacons: tuple[int, ...] = ()  # that are followed, the last heard last
 
 
 class Verdict(NamedTuple):
@@ -149,23 +148,21 @@ def of_gnss(record: Gnss, ins: Point, unit: ErrorModel, config: Config) -> Measu
     return Measurement(GNSS, np.array(z), H, np.diag(variance))
 
 
-def met(w: Watch, record: RsbnFix) -> Watch:
-    """Before an answer: of one that stands elsewhere than it did nothing is known, and of more than are
-    followed the one silent longest is forgotten, one left out only if all are.
+def met(w: Watch, beacon: int) -> Watch:
+    """Before an answer: of more beacons than are followed the one silent longest is forgotten, one that is
+    left out only if all are.
+
+    One that tells another place than it did goes on as the same: it is the likelier fault.
     """
-    place = Geodetic(record.lat, record.lon, record.alt)
-    if w.beacons and w.beacons[-1] == (record.beacon, place):
+    if w.beacons and w.beacons[-1] == beacon:
         return w
-    known = dict(w.beacons)
-    before = known.pop(record.beacon, None)
-    if before is not None and before != place and math.hypot(*apart(before, place)) > ELSEWHERE_M:
-        w, before = _forgotten(w, record.beacon), None
-    if before is None and len(known) >= MOST_BEACONS:
+    known = [other for other in w.beacons if other != beacon]
+    if len(known) >= MOST_BEACONS:
         excluded = {int(name.split()[1]) for name in w.monitor.bank.excluded if name.startswith("rsbn ")}
-        oldest = min(known, key=lambda beacon: beacon in excluded)
-        del known[oldest]
+        oldest = min(known, key=lambda other: other in excluded)
+        known.remove(oldest)
         w = _forgotten(w, oldest)
-    return w._replace(beacons=(*known.items(), (record.beacon, before or place)))
+    return w._replace(beacons=(*known, beacon))
 
 
 def _forgotten(w: Watch, beacon: int) -> Watch:

@@ -38,16 +38,15 @@ INS = Point(0, Geodetic(1.0, 0.5, 1000.0), (30.0, 0.0, 0.0))
 FAR = Geodetic(1.01, 0.5, 0.0)
 
 
-def heard(w: Watch, t: int, beacon: int, place: Geodetic, offset_m: float = 0.0) -> Watch:
-    """After GNSS and one answer, whose range is too long by `offset_m`."""
+def heard(w: Watch, t: int, beacon: int) -> Watch:
+    """After GNSS and one answer."""
     ins = INS._replace(t_ns=t * NS)
     w = watch.advance(w, ins, (0.0, 0.0), SETTINGS.unit, SETTINGS.config)
     fix = Gnss(ins.t_ns, ins.t_ns, 0, t, 3, 1.0, 0.5, 1000.0, 1.5, 3.0)
     w, _ = watch.hear(w, watch.of_gnss(fix, ins, SETTINGS.unit, SETTINGS.config), SETTINGS.allotment)
-    seen = slant_range_azimuth(place, ins.position)
-    slant = seen.slant_range + offset_m
-    answer = RsbnFix(ins.t_ns, ins.t_ns, beacon, *place, seen.azimuth, slant, 0.004, 100.0)
-    w = watch.met(w, answer)
+    seen = slant_range_azimuth(FAR, ins.position)
+    answer = RsbnFix(ins.t_ns, ins.t_ns, beacon, *FAR, seen.azimuth, seen.slant_range, 0.004, 100.0)
+    w = watch.met(w, beacon)
     for z in radio.from_rsbn(answer, ins, SETTINGS.config.rsbn):
         w, told = watch.of_beacon(w, watch.named(beacon, z), z, SETTINGS.config)
         assert told is not None
@@ -55,18 +54,11 @@ def heard(w: Watch, t: int, beacon: int, place: Geodetic, offset_m: float = 0.0)
     return w
 
 
-def bias(w: Watch) -> tuple[float, float]:
-    """Of beacon 1's range, m, and its sigma."""
-    bank = w.monitor.bank
-    i = bank.x.shape[1] - len(bank.biases) + bank.biases.index("rsbn 1 range")
-    return float(bank.x[0, i]), float(np.sqrt(bank.P[0, i, i]))
-
-
 def test_of_any_number_of_beacons_the_last_heard_are_followed() -> None:
     w = watch.begin(0, SETTINGS.unit)
     for t in range(1, 4 * MOST_BEACONS):
-        w = heard(w, t, t % (MOST_BEACONS + 5), FAR)
-        w = heard(w, t, 100, FAR)  # one that never falls silent
+        w = heard(w, t, t % (MOST_BEACONS + 5))
+        w = heard(w, t, 100)  # one that never falls silent
     bank = w.monitor.bank
     beacons = {name.split()[1] for name in bank.biases}
     assert len(beacons) == MOST_BEACONS
@@ -78,25 +70,11 @@ def test_of_any_number_of_beacons_the_last_heard_are_followed() -> None:
 def test_what_is_forgotten_leaves_what_the_others_know_as_it_is() -> None:
     w = watch.begin(0, SETTINGS.unit)
     for t in range(1, MOST_BEACONS + 1):
-        w = heard(w, t, t, FAR)
-    fewer = watch.met(w, RsbnFix(0, 0, 99, *FAR, 0.0, 1.0, 1.0, 1.0))
+        w = heard(w, t, t)
+    fewer = watch.met(w, 99)
     assert "rsbn 1 range" not in fewer.monitor.bank.biases
     keep = [i for i, row in enumerate(w.monitor.bank.rows) if not row.without.startswith("rsbn 1 ")]
     k = len(SETTINGS.unit.sigma0)
     states = [*range(k), *range(k + 2, w.monitor.bank.x.shape[1])]
     np.testing.assert_array_equal(fewer.monitor.bank.x, w.monitor.bank.x[np.ix_(keep, states)])
     np.testing.assert_array_equal(fewer.monitor.bank.P, w.monitor.bank.P[np.ix_(keep, states, states)])
-
-
-def test_another_beacon_of_the_same_identity_has_a_bias_of_its_own() -> None:
-    w = watch.begin(0, SETTINGS.unit)
-    for t in range(1, 100):
-        w = heard(w, t, 1, FAR, 90.0)
-    value, sigma = bias(w)
-    assert abs(value - 90.0) < 3.0 * sigma < 60.0
-    rounded = heard(w, 100, 1, FAR._replace(lat=FAR.lat + 1e-6), 90.0)  # 6 m further north
-    assert bias(rounded)[1] < 1.1 * sigma
-    elsewhere = heard(w, 100, 1, FAR._replace(lat=FAR.lat + 1e-3))
-    value, wide = bias(elsewhere)
-    assert abs(value) < 2.0 * wide
-    assert wide > 2.0 * sigma
