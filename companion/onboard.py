@@ -162,7 +162,10 @@ class Onboard:
     @property
     def leading(self) -> Link | None:
         """The link over which the autopilot is listened to and steered."""
-        return next((link for link in self.links.values() if link.session.is_up), None)
+        for link in self.links.values():  # asked for every message: cheaper than a generator
+            if link.session.is_up:
+                return link
+        return None
 
     def settle(self) -> None:
         """Do what no answer waits for, once the answers are out; left undone, the next record does it."""
