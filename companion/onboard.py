@@ -311,15 +311,10 @@ class Onboard:
         """The messages that are due, and on the news of a beacon's fix all that steer, to the autopilot."""
         self._solution = solution
         periods, t_ns = self._dialogue.periods_ns, solution.t_ns
-        due = [
-            name
-            for name, period in periods.items()
-            if (news and name not in (RESET, STATUS)) or t_ns >= self._paced.get(name, t_ns - period) + period
-        ]
+        next_ns = {name: self._paced.get(name, t_ns - period) + period for name, period in periods.items()}
+        due = [n for n in periods if (news and n not in (RESET, STATUS)) or t_ns >= next_ns[n]]
         for name in due:
-            period = periods[name]
-            next_ns = self._paced.get(name, t_ns - period) + period
-            self._paced[name] = max(next_ns, t_ns if name == RESET else t_ns - period)
+            self._paced[name] = max(next_ns[name], t_ns if name == RESET else t_ns - periods[name])
         feeding = [name for name in due if name != STATUS]
         if feeding and (leading := self.leading) is not None:
             for message in leading.feed.messages(solution, feeding, self._receiver(leading)):

@@ -198,7 +198,7 @@ async def run(config: Config, tell: Callable[[Event], None], base: Config | None
         min_free=settings.minimum_free_mib << 20,
         chunk_bytes=settings.chunk_kib << 10,
     )
-    flew = True
+    service, flew = None, True
     try:
         service = Service(config, log, tell, manager=Manager(os.environ), base=base)
         loop = asyncio.get_running_loop()
@@ -210,8 +210,8 @@ async def run(config: Config, tell: Callable[[Event], None], base: Config | None
         await service.serve()
         with contextlib.suppress(TimeoutError):
             await asyncio.wait_for(aside(service.keep), STOP_S)
-    except (CannotListen, ConfigError):
-        flew = False  # nor will it: a log of nothing takes no flight's place
+    except (CannotListen, ConfigError):  # a log of nothing takes no flight's place
+        flew = service is not None and any(link.received for link in service.onboard.links.values())
         raise
     finally:
         await aside(log.close)

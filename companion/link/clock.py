@@ -149,8 +149,10 @@ class BootClock:
 
     def _slept(self, boot: int, received: int) -> bool:
         """Whether this stamp, though no step back, is of one that booted in the silence before it."""
+        if boot > received - self._heard_at:
+            return False
         offset = self.offset(received)
-        return offset is not None and boot <= received - self._heard_at and received - boot - offset > LATEST
+        return offset is not None and received - boot - offset > LATEST
 
     def _possible(self, now: int) -> int:
         """The least offset that there can be: by TIMESYNC, without it by what has arrived."""

@@ -13,8 +13,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from .file import Info, LogError, info, read, recover
-from .opened import ACTIVE, is_closed
+from .file import Info, LogError, info, recover
 
 
 @click.group("log")
@@ -42,9 +41,6 @@ def info_command(log: Path, as_json: bool) -> None:
 @click.argument("log", type=click.Path(path_type=Path))
 def recover_command(log: Path) -> None:
     """Make a torn or damaged LOG whole (x.mcap.active becomes x.mcap, x.mcap gets x.recovered.mcap)."""
-    there = log.with_name(f"{log.name.split('.mcap')[0]}.recovered.mcap")
-    if there.exists() and _takes_a_copy(log):
-        _fail(LogError(f"{there} is there already: move it away first"))
     try:
         saved = recover(log)
     except LogError as error:
@@ -70,16 +66,6 @@ def convert_command(source: Path, output: Path) -> None:
     except LogError as error:
         _fail(error)
     click.echo(f"{output}: {written.records} records, {written.reboots} reboots")
-
-
-def _takes_a_copy(log: Path) -> bool:
-    """Whether `recover` writes beside `log`: it is torn or damaged, and its own name is taken."""
-    if log.suffix == ACTIVE and not log.with_suffix("").exists():
-        return False
-    try:
-        return log.exists() and not (is_closed(log) and all(True for _ in read(log)))
-    except LogError:
-        return True
 
 
 def _print(found: Info) -> None:

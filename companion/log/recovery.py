@@ -40,7 +40,8 @@ def recover(
     ".active". A whole log is left as it is. Killed at any instant it leaves a log that reads as before.
 
     `reserve` bytes of the disk are left free; `relieve` may make room for an end, as for a `DiskFile`, never
-    for a copy. Raises LogError where there is nothing to read or no room, and where a process still writes.
+    for a copy. Raises LogError where there is nothing to read or no room, where a process still writes, and
+    where what it would become is there already.
     """
     path = Path(path)
     with opened(path) as locked:
@@ -50,14 +51,17 @@ def recover(
             raise LogError(f"{path}: is still being written") from None
         target = _target(path)
         try:
-            saved = _whole(path) or _ended(path, reserve, relieve)
+            saved = _whole(path)
+            if saved is not None and path.suffix != ACTIVE:
+                return saved
+            if target.exists():
+                raise LogError(f"{target} is there already: move it away first")
+            saved = saved or _ended(path, reserve, relieve)
             if saved is None:
                 saved = _copied(path, target, reserve)
-            elif path.suffix == ACTIVE:
+            else:
                 os.replace(path, target)
                 sync_folder(target.parent)
-            else:
-                target = path
         except LogError:
             raise
         except OSError as error:

@@ -259,8 +259,7 @@ def _rsbn(carry: Carry, record: RsbnFix, settings: Settings) -> Step:
         return carry, [*told, Rejection(record.t_ns, record.rx_ns, f"rsbn {record.beacon}", why)]
     ins = level(ins, carry)
     said = radio.from_rsbn(record, ins, settings.config.rsbn)
-    w = carry.watch and watch.met(carry.watch, record.beacon)
-    carry = carry._replace(lesson=Lesson(record, None, ins, said), watch=w)
+    carry = carry._replace(lesson=Lesson(record, None, ins, said))
     heard = _calibrated(carry, record, said, settings)
     if not heard.observations:
         return carry, []
