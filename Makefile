@@ -32,7 +32,7 @@ lint: $(STAMP) ## ruff and mypy --strict
 	$(BIN)/mypy
 
 fuzz: $(VENV)/.fuzz ## hostile bytes for SECONDS at every door, guided by coverage (Linux)
-	$(BIN)/python -m sitl.fuzz --seconds $(SECONDS)
+	$(BIN)/python -m sitl.endurance.fuzz --seconds $(SECONDS)
 
 $(VENV)/.fuzz: $(STAMP)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check 'atheris>=3,<4'

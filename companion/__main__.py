@@ -15,16 +15,16 @@ import click
 
 from companion import __version__
 from companion.config import ConfigError
-from companion.log.opened import LogError
+from companion.storage.reader import LogError
 
 EX_IOERR, EX_CONFIG = 74, 78  # sysexits.h
 COMMANDS = {
-    "run": "companion.service:command",
-    "replay": "companion.log.replay:command",
-    "report": "companion.log.report:command",
-    "log": "companion.log.command:group",
+    "run": "companion.runtime.service:command",
+    "replay": "companion.analysis.replay:command",
+    "report": "companion.analysis.report:command",
+    "log": "companion.analysis.log_command:group",
     "doctor": "companion.doctor.command:command",
-    "check-config": "companion.check:command",
+    "check-config": "companion.config.check_config:command",
     "bench": "companion.bench.command:command",
 }
 STUDIES = {

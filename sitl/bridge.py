@@ -22,17 +22,17 @@ import math
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
+from companion.analysis.error_statistics import beacon_fix
 from companion.link import dialect, frame
 from companion.link.clock import SECOND, BootClock
+from companion.link.decode import MAKES, Sender, decode
 from companion.link.session import LinkLost, LinkUp, MessageReceived, Rebooted, Session
-from companion.log.score import beacon_fix
 from companion.nav.geometry import Geodetic, local_to_geodetic
 from companion.records import GlobalPosition, Gnss, LocalOrigin, LocalPosition, Truth
-from companion.wire.decode import MAKES, Sender, decode
-from sitl.answering import Answering
 from sitl.beacon import Beacon
 from sitl.comparison import AFTER_S, Comparison, nearest
 from sitl.gnss_switch import KNOBS, GnssSwitch
+from sitl.live_beacons import Answering
 from sitl.positions import CARRIERS, feeds, position_of
 
 COMPONENT, AUTOPILOT_COMPONENT = 193, 1

@@ -1,4 +1,4 @@
-"""Record -> message: what an autopilot would send. The mirror of `companion.wire.decode`.
+"""Record -> message: what an autopilot would send. The mirror of `companion.link.decode`.
 
 A table by the record's kind. `boot_ns` is the time, on the records' clock, at which the simulated autopilot
 was switched on; records before it cannot be told. What MAVLink rounds (milliseconds, 1e-7 degrees, cm/s)

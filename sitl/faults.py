@@ -24,9 +24,9 @@ from fastcrc import crc16
 from msgspec.structs import replace
 
 from companion.link import dialect
-from companion.log.store import DiskFile
 from companion.nav.geometry import displace
 from companion.records import AirData, Gnss, LocalPosition, RsbnFix, Stamped
+from companion.storage.mcap_file import DiskFile
 
 R = TypeVar("R", bound=Stamped)
 Generator = np.random.Generator

@@ -22,15 +22,15 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from companion import drawing
-from companion.config import Config, Output, load
-from companion.log import score
-from companion.log.deferred import Log
-from companion.log.folder import open_log
-from companion.log.replay import metadata
+from companion.analysis import error_statistics
+from companion.analysis.replay import metadata
+from companion.config import Config, OutputConfig, load
 from companion.nav.geometry import Geodetic
-from companion.onboard import Onboard
 from companion.records import Event, Gnss, Rejection, Reset, RsbnFix, Solution, Stamped
+from companion.runtime.core import Onboard
+from companion.storage.deferred_log import Log
+from companion.storage.retention import open_log
+from companion.study import plot_options
 from sitl.autopilot import UNIX_AT_START_NS, Autopilot
 from sitl.scenarios import SCENARIOS, Phase, Scenario, named
 
@@ -38,7 +38,7 @@ LINK = "sitl"
 SECOND = 1_000_000_000
 START_NS = 1000 * SECOND  # of the companion's clock at the flight's start: any instant but 0
 #: What the companion sends where [output] is left as it is.
-FED = Output(profile="custom", odometry_hz=5.0, global_position_sensor_hz=2.0)
+FED = OutputConfig(profile="custom", odometry_hz=5.0, global_position_sensor_hz=2.0)
 KEPT = (Solution, Gnss, RsbnFix, Rejection, Event, Reset)
 
 
@@ -75,7 +75,7 @@ def simulated(config: Config) -> Config:
     part of what it is sent, and it is sent positions where [output] is left as it is.
     """
     inertial = msgspec.structs.replace(config.inertial, independent=True)
-    output = FED if config.output == Output() else config.output
+    output = FED if config.output == OutputConfig() else config.output
     return msgspec.structs.replace(config, inertial=inertial, output=output)
 
 
@@ -109,7 +109,7 @@ def join(
         now = max(now + 1, min(autopilot.deadline(), due))
 
 
-def truth_of(autopilot: Autopilot) -> score.TruthAt:
+def truth_of(autopilot: Autopilot) -> error_statistics.TruthAt:
     """The exact truth at any time of the companion's clock, height above mean sea level."""
     times = np.arange(0.0, autopilot.scenario.duration_s, 0.05)
     flight = autopilot.world.truth_at(times)
@@ -122,14 +122,14 @@ def truth_of(autopilot: Autopilot) -> score.TruthAt:
     return truth
 
 
-def scored(flown: Flown) -> list[score.Row]:
+def scored(flown: Flown) -> list[error_statistics.Row]:
     """The error table. A phase with fixes begins with the first solution that can know of one."""
-    found = score.errors(flown.kept, truth_of(flown.autopilot))
+    found = error_statistics.errors(flown.kept, truth_of(flown.autopilot))
     phases = flown.autopilot.scenario.phases()
-    return score.table(found, [_from_first_fix(phase, flown.kept) for phase in phases])
+    return error_statistics.table(found, [_from_first_fix(phase, flown.kept) for phase in phases])
 
 
-def _from_first_fix(phase: Phase, kept: Iterable[Stamped]) -> score.Phase:
+def _from_first_fix(phase: Phase, kept: Iterable[Stamped]) -> error_statistics.Phase:
     start, end = (START_NS + round(s * SECOND) for s in (phase.start_s, phase.end_s))
     kinds = tuple(kind for name, kind in (("GNSS", Gnss), ("RSBN", RsbnFix)) if name in phase.name)
     if kinds:
@@ -139,7 +139,7 @@ def _from_first_fix(phase: Phase, kept: Iterable[Stamped]) -> score.Phase:
             None,
         )
         start = next((r.t_ns for r in records if isinstance(r, Solution)), start)
-    return score.Phase(phase.name, min(start, end), end)
+    return error_statistics.Phase(phase.name, min(start, end), end)
 
 
 @click.command("loopback")
@@ -151,7 +151,7 @@ def _from_first_fix(phase: Phase, kept: Iterable[Stamped]) -> score.Phase:
 @click.option(
     "--plot",
     type=click.Path(path_type=Path),
-    callback=drawing.file,
+    callback=plot_options.file,
     help="Draw the errors and the bound into this file.",
 )
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
@@ -190,9 +190,9 @@ def command(
     seconds = time.perf_counter() - begun
     rows = scored(flown)
     if plot is not None:
-        from sitl.plot import draw
+        from sitl.loopback_plot import draw
 
-        draw(plot, score.errors(flown.kept, truth_of(flown.autopilot)), chosen, START_NS)
+        draw(plot, error_statistics.errors(flown.kept, truth_of(flown.autopilot)), chosen, START_NS)
     if as_json:
         rate = chosen.duration_s / seconds
         summary = {"log": str(log.path), "seconds": seconds, "times_real_time": rate}
@@ -204,13 +204,15 @@ def command(
         raise SystemExit(f"companion: the log is not whole: {log.trouble}")
 
 
-def _print(flown: Flown, rows: list[score.Row], seconds: float) -> None:
+def _print(flown: Flown, rows: list[error_statistics.Row], seconds: float) -> None:
     scenario = flown.autopilot.scenario
     table = Table(title=f"{scenario.name}: horizontal error, r.m.s. / 95 % [m]")
-    for column in ("phase", "min", *score.SOURCES, "bound", "held"):
+    for column in ("phase", "min", *error_statistics.SOURCES, "bound", "held"):
         table.add_column(column, justify="left" if column == "phase" else "right")
     for row in rows:
-        cells = [f"{row.rms[s]:.1f} / {row.p95[s]:.1f}" if s in row.rms else "-" for s in score.SOURCES]
+        cells = [
+            f"{row.rms[s]:.1f} / {row.p95[s]:.1f}" if s in row.rms else "-" for s in error_statistics.SOURCES
+        ]
         bound = "-" if row.bound is None else f"{row.bound:.1f}"
         held = (
             "-"

@@ -11,11 +11,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from companion.config.profiles import MESSAGES
 from companion.link import dialect
 from companion.nav.geometry import Geodetic, local_to_geodetic
-from companion.profiles import MESSAGES
+from companion.output.encode import GPS_LAG_NS, MAV_CMD_EXTERNAL_POSITION_ESTIMATE
 from companion.records import LocalOrigin
-from companion.wire.encode import GPS_LAG_NS, MAV_CMD_EXTERNAL_POSITION_ESTIMATE
 
 CARRIERS = frozenset(dialect.type_named(name).msgid for name in MESSAGES.values())
 SET_SOURCE = 42007  # MAV_CMD_SET_EKF_SOURCE_SET

@@ -8,11 +8,12 @@ from pathlib import Path
 import pytest
 
 from companion.config import Config, load, parse
+from companion.config.profiles import PROFILES
+from companion.config.required_parameters import needed
 from companion.link.dialect import type_named
-from companion.onboard import SECOND, wanted
-from companion.profiles import PROFILES, needed
+from companion.output.gate import fault
 from companion.records import Mode, Solution, Trust
-from companion.wire.gate import fault
+from companion.runtime.core import SECOND, wanted
 
 ROOT = Path(__file__).parents[1]
 PAGES = {
@@ -93,7 +94,7 @@ def test_what_the_page_says_of_trust_is_what_the_gate_does(trust: Trust) -> None
 
 
 def test_what_the_page_says_of_the_unit_stands_in_it() -> None:
-    unit = (ROOT / "deploy" / "companion.service").read_text().splitlines()
+    unit = (ROOT / "deploy" / "companion.runtime.service").read_text().splitlines()
     settings = re.findall(r"`([A-Z][A-Za-z]+=[^`]+)`", PAGES["install"])
     assert len(settings) >= 6
     for setting in settings:

@@ -27,7 +27,7 @@ from typing import Any
 from companion.config import load
 from companion.link import dialect, frame
 from companion.nav.geometry import Geodetic, local_to_geodetic, slant_range_azimuth
-from companion.service import run
+from companion.runtime.service import run
 
 ROUNDS = 100
 WARM_UP = 20  # answers before it counts

@@ -12,8 +12,8 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType
 from mcap.writer import Writer as PackageWriter
 
-from companion.log.file import Writer, read
 from companion.records import Imu, encode
+from companion.storage.flight_log import Writer, read
 
 MESSAGES = 20_000
 READ = 1_000_000  # messages of the file that is read

@@ -16,13 +16,13 @@ import click
 from rich.console import Console
 
 from companion.config import Config, ConfigError, load
+from companion.config.profiles import PROFILES
 from companion.doctor.diagnosis import Diagnosis, Finding
 from companion.doctor.examination import Examination
-from companion.doctor.show import after, as_json, parameter_table, show
-from companion.keys import Keys
-from companion.link.transport import Address, CannotListen, Stream, connect
-from companion.profiles import PROFILES
-from companion.service import EX_UNAVAILABLE
+from companion.doctor.rendering import after, as_json, parameter_table, show
+from companion.runtime.service import EX_UNAVAILABLE
+from companion.runtime.signing_key import Keys
+from companion.transport.links import Address, CannotListen, Stream, connect
 
 HEAR_S = 10.0
 #: However slow the line, the examination or the setting is over after that.

@@ -9,11 +9,11 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 from companion.config import Config
+from companion.config.profiles import PROFILES, Needed
 from companion.link.dialect import TYPES
 from companion.link.parameter_client import Value, same
-from companion.link.streams import ENOUGH
+from companion.link.stream_rates import ENOUGH
 from companion.navigator.step import uses
-from companion.profiles import PROFILES, Needed
 from companion.records import AirData, Attitude, Gnss, Imu, LocalPosition, Pressure
 
 #: Messages that a make does not have; its other ones tell the same.

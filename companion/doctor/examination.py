@@ -15,9 +15,12 @@ from __future__ import annotations
 from typing import Any
 
 from companion.config import Config
+from companion.config.profiles import Needed
+from companion.config.required_parameters import needed
 from companion.doctor.diagnosis import Diagnosis, Finding, Identity, ParameterFinding, of_profile, of_streams
 from companion.link import dialect, frame
 from companion.link.clock import SECOND
+from companion.link.decode import MAKES
 from companion.link.parameter_client import Answer, ParameterClient, encoding_of, same
 from companion.link.session import (
     AUTOPILOT_COMPONENT,
@@ -28,9 +31,7 @@ from companion.link.session import (
     Session,
 )
 from companion.link.signing import Signing
-from companion.onboard import wanted
-from companion.profiles import Needed, needed
-from companion.wire import MAKES
+from companion.runtime.core import wanted
 
 HEARTBEAT, GPS_GLOBAL_ORIGIN, AUTOPILOT_VERSION = 0, 49, 148
 RSBN_MEASUREMENT = dialect.type_named("RSBN_MEASUREMENT").msgid

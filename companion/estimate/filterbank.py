@@ -16,8 +16,8 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from .fusion import CONE_OF_SILENCE
-from .observations import Azimuth, Model, Range
+from companion.estimate.fusion import CONE_OF_SILENCE
+from companion.estimate.observations import Azimuth, Model, Range
 
 Floats = npt.NDArray[np.float64]
 

@@ -21,7 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from companion.estimate import box, kalman
+from companion.estimate import bounded_lsq, kalman
 from companion.estimate.kalman import Array
 
 
@@ -61,7 +61,7 @@ class Exact(NamedTuple):
     x: Array
     P: Array
     u: Array
-    status: box.Status
+    status: bounded_lsq.Status
     l: Array
 
 
@@ -71,7 +71,7 @@ def exact(
     """Box-constrained maximum likelihood from Z (T, p), Z[t] measuring x[t+1], for constant matrices."""
     samples = [Sample(z, A, B, Q, H, R, C) for z in Z]
     record = condense(x0, P0, samples)
-    best = box.least_squares(record.D, record.r)
+    best = bounded_lsq.least_squares(record.D, record.r)
     u = best.v.reshape(len(samples), -1) * C
     x, l = trajectory(x0, P0, samples, u)
     P = record.P + record.G @ best.free_inverse @ record.G.T

@@ -35,8 +35,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import gammaincc
 
-from companion.estimate.crossing import converted, crossings, mean_position
-from companion.estimate.descent import Minimum, NoFix, descend, inverse
+from companion.estimate.initial_position import converted, crossings, mean_position
+from companion.estimate.levenberg_marquardt import Minimum, NoFix, descend, inverse
 from companion.estimate.observations import (
     Array,
     Azimuth,

@@ -35,7 +35,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import chdtri
 
-from .filterbank import INERTIAL, Bank, Floats, Row
+from companion.estimate.filterbank import INERTIAL, Bank, Floats, Row
 
 #: Least variance of a separation (m^2), above rounding and linearisation. It must be small: beside GNSS a
 #: beacon moves the full solution by centimetres, and by how many too many is what tells its bias.

@@ -28,7 +28,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from companion.estimate.exchange import (
+from companion.estimate.minimax_lp import (
     Design,
     Infeasible,
     LeastSquares,

@@ -16,8 +16,8 @@ from typing import NamedTuple
 
 from scipy.special import chdtri
 
-from .filterbank import INERTIAL, Bank, Measurement, fork, leave, readmit, refuse, take
-from .integrity import Separation, blame, exclude, separations, threshold
+from companion.estimate.filterbank import INERTIAL, Bank, Measurement, fork, leave, readmit, refuse, take
+from companion.estimate.integrity import Separation, blame, exclude, separations, threshold
 
 BEYOND = "separation"
 REFUSED = "refused by every solution"

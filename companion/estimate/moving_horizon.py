@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from companion.estimate import box, kalman
+from companion.estimate import bounded_lsq, kalman
 from companion.estimate.full_horizon import Sample, condense
 from companion.estimate.kalman import Array
 from companion.estimate.restrictive import Restricted
@@ -51,7 +51,7 @@ class MHE:
         """Take in one sample; from Window(x0, P0) on. The result is that of t given the data up to t."""
         samples = (*carry.samples, sample)
         record = condense(carry.x, carry.P, samples)
-        best = box.least_squares(record.D, record.r)
+        best = bounded_lsq.least_squares(record.D, record.r)
         m, p = len(sample.C), len(sample.z)
         left = np.linalg.cholesky(record.S) @ (record.r[-p:] - record.D[-p:] @ best.v)
         now = Restricted(
@@ -70,7 +70,7 @@ class MHE:
 
 
 def arrive(
-    x: Array, P: Array, sample: Sample, v: Array, status: box.Status, kappa: float = np.inf
+    x: Array, P: Array, sample: Sample, v: Array, status: bounded_lsq.Status, kappa: float = np.inf
 ) -> tuple[Array, Array]:
     """Move the arrival pair over one sample whose input is v = U* / C with the given status."""
     z, A, B, Q, H, R, C = sample
@@ -84,7 +84,7 @@ def arrive(
     spread = np.zeros((len(C), len(C)))
     if kappa > 0.0 and len(free):
         M = DC.T @ SD
-        weight = box.information(M, kappa)[np.ix_(free, free)]
+        weight = bounded_lsq.information(M, kappa)[np.ix_(free, free)]
         spread[np.ix_(free, free)] = np.linalg.inv(M[np.ix_(free, free)] + weight)
         if not np.isfinite(kappa):  # flat: U* is forgotten
             v = np.where(status == 0, 0.0, v)

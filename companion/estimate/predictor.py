@@ -21,7 +21,7 @@ from typing import Literal, NamedTuple, Self, cast
 import numpy as np
 import numpy.typing as npt
 
-from companion.estimate.exchange import Design, Infeasible
+from companion.estimate.minimax_lp import Design, Infeasible
 from companion.estimate.schuler import MEAN_EARTH, Scale, schuler_row, transition
 
 Floats = npt.NDArray[np.float64]

@@ -24,7 +24,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from companion.estimate import box, kalman
+from companion.estimate import bounded_lsq, kalman
 from companion.estimate.full_horizon import exact
 from companion.estimate.kalman import Array
 
@@ -41,7 +41,7 @@ class Restricted(NamedTuple):
     x: Array
     P: Array
     u: Array
-    status: box.Status
+    status: bounded_lsq.Status
     innovation: Array
     S: Array
     nis: Array
@@ -73,7 +73,7 @@ def step(
     DC = H @ BC  # inputs in units of their bounds
     SD = S_inverse @ DC
     M = DC.T @ SD
-    best = box.minimum(M + box.information(M, kappa), (SD.mT @ nu[..., None])[..., 0])
+    best = bounded_lsq.minimum(M + bounded_lsq.information(M, kappa), (SD.mT @ nu[..., None])[..., 0])
     left = nu - best.v @ DC.T
     W = BC - K @ DC
     rebuilt = kalman.joseph(Pb, K, H, R)

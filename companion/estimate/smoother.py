@@ -31,8 +31,8 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from companion.estimate import boundary, kalman
-from companion.estimate.stages import Gaps, Lists, Stage, stages_of
+from companion.estimate import kalman, two_point_bvp
+from companion.estimate.linear_system import Gaps, Lists, Stage, stages_of
 
 Array = npt.NDArray[np.float64]
 Measured = Callable[[int, Array], tuple[npt.ArrayLike, npt.ArrayLike]]
@@ -266,7 +266,7 @@ def _two_point(stages: list[Stage], m: Array, B: Array) -> tuple[Smoothed, Array
             HP = np.linalg.solve(stage.R, stage.H * scale).T
             diagonal[i + 1, n:, n:] = HP @ stage.H * scale
             right[i + 1, n:] = HP @ stage.z
-    y, inverse = boundary.solve(diagonal, lower, right)
+    y, inverse = two_point_bvp.solve(diagonal, lower, right)
     s, x = y[:, :n] / scale, y[:, n:] * scale
     P, L = inverse[:, n:, n:] * outer, -inverse[1:, :n, :n] / outer
     disturbances = [_disturbance(stage, a, b) for stage, a, b in zip(stages, s[1:], L, strict=True)]

@@ -19,9 +19,9 @@ from collections.abc import Callable, Mapping
 
 from companion import __version__
 from companion.link import dialect
-from companion.link.bucket import Bucket
 from companion.link.dialect import Message
 from companion.link.frame import Frame
+from companion.link.rate_limiter import Bucket
 
 COMMAND_INT, COMMAND_LONG = 75, 76
 AUTOPILOT_VERSION, MESSAGE_INTERVAL = 148, 244

@@ -5,7 +5,7 @@ The one importer of pymavlink. Of its dialects `all` is taken: it holds every me
 0.03 s from a compiled cache and 13 MB. pymavlink's own parser and signature check are not used, see
 `companion.link.frame`.
 
-Our messages live in rsbn.xml. `python -m companion.link.dialect` writes rsbn_dialect.py again from it, by the
+Our messages live in rsbn.xml. `python -m companion.link.dialect` regenerates generated/rsbn_dialect.py from it, by the
 mavgen of the installed wheel; `regenerate` does the same to another path.
 
 A message is built by its class (`RsbnMeasurement(time_usec=..., ...)`) or by `new("ODOMETRY", x=...)`, read
@@ -27,7 +27,7 @@ from typing import Any, NamedTuple, Protocol
 
 from pymavlink.dialects.v20 import all as _all
 
-from companion.link import rsbn_dialect as rsbn
+from companion.link.generated import rsbn_dialect as rsbn
 
 #: pymavlink's generated module, for its constants (`mavlink.MAV_TYPE_GCS`).
 mavlink: Any = _all
@@ -239,4 +239,4 @@ def regenerate(path: Path) -> None:
 
 
 if __name__ == "__main__":
-    regenerate(XML.with_name("rsbn_dialect.py"))
+    regenerate(XML.parent / "generated" / "rsbn_dialect.py")

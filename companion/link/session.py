@@ -23,12 +23,12 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 from companion.link import dialect, frame
-from companion.link.bucket import Bucket
 from companion.link.clock import JUMP, LATE, SECOND, BootClock, News
 from companion.link.dialect import Message
 from companion.link.frame import BadFrame, Frame, UnknownFrame
+from companion.link.rate_limiter import Bucket
 from companion.link.signing import Refusal, Signing
-from companion.link.streams import Streams
+from companion.link.stream_rates import Streams
 
 HEARTBEAT_EVERY = SECOND
 TIMESYNC_EVERY = SECOND

@@ -11,8 +11,8 @@ bytes goes out in chunks.
 from __future__ import annotations
 
 from companion.link import dialect
-from companion.link.bucket import SECOND, Bucket
 from companion.link.dialect import Message
+from companion.link.rate_limiter import SECOND, Bucket
 from companion.records import Event
 
 EVERY = 2 * SECOND

@@ -22,7 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from companion.nav import correctors, disturbances
-from companion.nav.discrete import discretise, euler
+from companion.nav.discretization import discretise, euler
 from companion.nav.disturbances import Disturbance, Model, compose
 from companion.nav.earth import SPHERE, SPHERE_KM_H, Sphere
 

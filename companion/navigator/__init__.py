@@ -15,6 +15,12 @@ from typing import Any, NamedTuple
 from msgspec import structs
 
 from companion.config import Config, parse
+from companion.navigator import error_state, integrity, minimax_bound
+from companion.navigator.deferred_update import learn
+from companion.navigator.solution import announce, solve
+from companion.navigator.stale_data import TOLD_EVERY, Freshness
+from companion.navigator.state import FIXES, Carry, Settings, Step, initial, is_news
+from companion.navigator.step import LEVEL_3D, step, uses
 from companion.records import (
     AirData,
     Attitude,
@@ -36,13 +42,6 @@ from companion.records import (
     Source,
     Tuning,
 )
-
-from . import errorstate, guarantee, watch
-from .carry import FIXES, Carry, Settings, Step, initial, is_news
-from .freshness import TOLD_EVERY, Freshness
-from .lesson import learn
-from .solution import announce, solve
-from .step import LEVEL_3D, step, uses
 
 __all__ = ["FOLDED", "Navigator", "learnt", "stepped", "tuned"]
 
@@ -83,7 +82,7 @@ class Navigator:
         self._rests_on = Mode.INITIALISING, Source(0)  # mode and fixes of the last solution, and its time
         self._given_ns = 0
         self._refused_ns: dict[str, int] = {}  # when what is no number was last told, by kind
-        self._told: watch.Watch | None = None
+        self._told: integrity.Watch | None = None
         self._chosen = False  # the inertial channel is told once, with the first record
 
     def handle(self, record: Input) -> list[Output]:
@@ -139,7 +138,7 @@ class Navigator:
         before, self._told = self._told, self._carry.watch
         if before is self._told or self._told is None:
             return []
-        return watch.tell(before, self._told, record.rx_ns)
+        return integrity.tell(before, self._told, record.rx_ns)
 
     def _learnt(self) -> tuple[Input | None, list[Output]]:
         """The lesson left over by the record before is learnt: whose it was, and what follows."""
@@ -237,7 +236,7 @@ def tuned(carry: Carry, before: Settings, config: Config) -> tuple[Settings, Car
     settings = Settings.of(config)
     if settings.channel != before.channel:
         return settings, initial(settings)._replace(next_ns=carry.next_ns)
-    return settings, carry._replace(guarantee=guarantee.tuned(carry.guarantee, config))
+    return settings, carry._replace(guarantee=minimax_bound.tuned(carry.guarantee, config))
 
 
 def _guarded(
@@ -252,10 +251,10 @@ def _guarded(
         why = f"it cannot be computed with: {error}"
         return carry, [Rejection(record.t_ns, record.rx_ns, type(record).__name__, why)]
     why = "its covariance was none any more"
-    if after.state is not carry.state and not errorstate.is_sound(after.state):
+    if after.state is not carry.state and not error_state.is_sound(after.state):
         outputs = [*outputs, Reset(record.t_ns, record.rx_ns, "error state", why)]
         after = after._replace(state=None, jumps=None)
-    if after.watch is not carry.watch and not watch.is_sound(after.watch):
+    if after.watch is not carry.watch and not integrity.is_sound(after.watch):
         outputs = [*outputs, Reset(record.t_ns, record.rx_ns, "integrity monitor", why)]
         after = after._replace(watch=None)
     return after, outputs

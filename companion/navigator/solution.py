@@ -9,14 +9,13 @@ from typing import NamedTuple
 from companion.estimate import trust
 from companion.estimate.filterbank import INERTIAL
 from companion.nav.geometry import displace
+from companion.navigator import error_state, height_error, integrity, minimax_bound, restrictive_filter
+from companion.navigator.error_state import ErrorState, Floats
+from companion.navigator.inertial_track import Point
+from companion.navigator.minimax_bound import Bounded
+from companion.navigator.state import FIXES, Carry, Settings, Step, level, sources, state_at
+from companion.navigator.wind_error_model import WindError
 from companion.records import Event, Mode, Solution, Source, Vector2, Vector3
-
-from . import errorstate, guarantee, height, restricted, watch
-from .carry import FIXES, Carry, Settings, Step, level, sources, state_at
-from .errorstate import ErrorState, Floats
-from .guarantee import Bounded
-from .inertial import Point
-from .winderror import WindError
 
 AHEAD_NS = 5_000_000_000  # how often the bounds ahead are worked out
 
@@ -40,11 +39,11 @@ def solve(carry: Carry, rx_ns: int, settings: Settings) -> Step:
     ins = level(carry.track[-1], carry)
     t_ns = ins.t_ns
     state, dt = carry.state, max(0.0, (t_ns - carry.state.t_ns) * 1e-9)
-    if dt > errorstate.NEAR_S:
+    if dt > error_state.NEAR_S:
         state, dt = state_at(carry, ins, settings), 0.0
-    promise, bounded = guarantee.bounded(carry.guarantee, t_ns, config.predictor)
+    promise, bounded = minimax_bound.bounded(carry.guarantee, t_ns, config.predictor)
     if t_ns >= carry.next_ahead_ns:
-        bounds = guarantee.ahead(promise, t_ns, config.predictor)
+        bounds = minimax_bound.ahead(promise, t_ns, config.predictor)
         carry = carry._replace(ahead=bounds, next_ahead_ns=t_ns + AHEAD_NS)
     rests_on = sources(carry, t_ns, settings)
     fixes = rests_on & FIXES
@@ -61,7 +60,7 @@ def solve(carry: Carry, rx_ns: int, settings: Settings) -> Step:
     protection = None
     if carry.watch is not None and watched is not None:
         # of the monitor's full solution; another one is off by no more than its distance from that besides
-        protection = watched.level + math.dist(error, watch.error_at(carry.watch, ins, settings.unit))
+        protection = watched.level + math.dist(error, integrity.error_at(carry.watch, ins, settings.unit))
     held = _trust(carry, bool(fixes), bounded, protection, t_ns, settings)
     last = max((t for t in (carry.gnss_ns, carry.rsbn_ns) if t is not None), default=t_ns)
     solution = Solution(
@@ -73,7 +72,7 @@ def solve(carry: Carry, rx_ns: int, settings: Settings) -> Step:
         lon,
         alt,
         (north - velocity_error[0], east - velocity_error[1], down),
-        (var_n, cov, 0.0, var_e, 0.0, height.at(carry.level, carry.track[-1]).covariance[0]),
+        (var_n, cov, 0.0, var_e, 0.0, height_error.at(carry.level, carry.track[-1]).covariance[0]),
         error,
         velocity_error,
         int(rests_on),
@@ -95,7 +94,7 @@ def _candidates(
 ) -> dict[str, _Estimate]:
     """What each estimator that runs says of the channel's error; the state is `dt` seconds old."""
     unit = settings.unit
-    place, motion = errorstate.ahead(state, dt, ins.v_n, unit)
+    place, motion = error_state.ahead(state, dt, ins.v_n, unit)
     variance = max(motion.covariance[0], motion.covariance[2], 0.0)
     found = {"kalman": _Estimate(place.error_n, motion.error_n, place.covariance, variance)}
     if bounded is not None:
@@ -103,7 +102,7 @@ def _candidates(
         variance = max(bounded.velocity_bound_n) ** 2
         found["minimax"] = _Estimate(bounded.error_n, bounded.velocity_error_n, variances, variance)
     if carry.restrictive is not None and isinstance(settings.unit, WindError):
-        x, P = restricted.at(carry.restrictive, ins.t_ns, settings.unit)
+        x, P = restrictive_filter.at(carry.restrictive, ins.t_ns, settings.unit)
         dx, dy, dv_n, dv_e = x.tolist()
         variance = float(max(P[2, 2], P[3, 3], 0.0))
         found["restrictive"] = _Estimate((dx, dy), (dv_n, dv_e), _triangle(P), variance)
@@ -140,7 +139,7 @@ def _trust(
     """How far the output can be trusted."""
     w = carry.watch
     suspicion = w is not None and (w.monitor.unresolved or bool(w.exclusions))
-    inertial = watch.excluded(w, INERTIAL)
+    inertial = integrity.excluded(w, INERTIAL)
     bound = None if bounded is None or inertial else math.hypot(*bounded.bound_n)
     evidence = trust.Evidence(fixes, suspicion, protection, bound)
     config = settings.config

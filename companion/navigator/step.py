@@ -19,6 +19,22 @@ from typing import Any
 from companion.config import Channel
 from companion.estimate.fusion import Azimuth, Observation, Range
 from companion.nav.geometry import displace
+from companion.navigator import (
+    air_data_channel,
+    channel_corrections,
+    error_state,
+    fix_observations,
+    height_error,
+    inertial_track,
+    integrity,
+    measurement_update,
+    strapdown_channel,
+)
+from companion.navigator.deferred_update import unheard
+from companion.navigator.gnss_beacon_check import GNSS
+from companion.navigator.inertial_track import Point
+from companion.navigator.solution import solve
+from companion.navigator.state import Carry, Lesson, Settings, Step, initial, level, state_at
 from companion.records import (
     AirData,
     Attitude,
@@ -38,13 +54,6 @@ from companion.records import (
     Source,
     Stamped,
 )
-
-from . import absorb, deadreckoning, errorstate, height, inertial, moved, radio, strapped, watch
-from .carry import Carry, Lesson, Settings, Step, initial, level, state_at
-from .inertial import Point
-from .lesson import unheard
-from .sights import GNSS
-from .solution import solve
 
 TOGETHER_NS = 1_000_000_000  # GNSS this close to a beacon's answer joins its fix
 PATIENCE_NS = 5_000_000_000  # how long the autopilot is waited for to tell what a channel begins with
@@ -79,8 +88,8 @@ def _reboot(carry: Carry, record: Reboot, settings: Settings) -> Step:
     """
     why = f"autopilot {record.system} rebooted"
     if settings.channel != "local_position":
-        strap = strapped.Strap(refused_ns=record.t_ns)  # that it is not heard goes without saying
-        carry = carry._replace(reckoner=deadreckoning.Reckoner(), strap=strap, gnss=None, gnss_heard=None)
+        strap = strapdown_channel.Strap(refused_ns=record.t_ns)  # that it is not heard goes without saying
+        carry = carry._replace(reckoner=air_data_channel.Reckoner(), strap=strap, gnss=None, gnss_heard=None)
         return carry, [Reset(record.t_ns, record.rx_ns, settings.channel.replace("_", " "), why)]
     out = Reset(record.t_ns, record.rx_ns, "navigator", why)
     return initial(settings)._replace(next_ns=carry.next_ns), [out]
@@ -107,10 +116,10 @@ def _local_position(carry: Carry, record: LocalPosition, settings: Settings) -> 
         return carry._replace(waiting_ns=carry.waiting_ns or record.t_ns), out
     if before is not None and record.t_ns <= before.t_ns:
         return carry._replace(local=before), out
-    new = inertial.point(record, origin)
+    new = inertial_track.point(record, origin)
     if carry.track:
         carry, out = _stepped(carry, carry.track[-1], new, record, settings)
-    carry = carry._replace(track=inertial.extend(carry.track, new))
+    carry = carry._replace(track=inertial_track.extend(carry.track, new))
     return _given(carry, record, out, settings)
 
 
@@ -121,21 +130,21 @@ def _stepped(carry: Carry, last: Point, new: Point, record: LocalPosition, setti
     metres: what is left may be a turn or a step, and nobody knows which.
     """
     out = list[Output]()
-    north, east, _ = inertial.beyond(last, new)
+    north, east, _ = inertial_track.beyond(last, new)
     length, silent = math.hypot(north, east), (new.t_ns - last.t_ns) * 1e-9
-    most = inertial.unnoticed(silent)
+    most = inertial_track.unnoticed(silent)
     if length > most:
-        carry = moved.shifted(carry, north, east)
+        carry = channel_corrections.shifted(carry, north, east)
         out.append(_channel(record, f"it jumped by {length:.1f} m"))
-    if length > inertial.JUMP_M and silent > inertial.REACH_S:
-        carry = moved.blurred(carry, settings, min(length, most))
+    if length > inertial_track.JUMP_M and silent > inertial_track.REACH_S:
+        carry = channel_corrections.blurred(carry, settings, min(length, most))
         if silent > BRIDGED_S:
             out.append(_channel(record, f"no local position for {silent:.1f} s"))
     return carry, out
 
 
 def _sense(carry: Carry, record: Attitude | AirData | Pressure, settings: Settings) -> Step:
-    return carry._replace(reckoner=deadreckoning.sense(carry.reckoner, record)), []
+    return carry._replace(reckoner=air_data_channel.sense(carry.reckoner, record)), []
 
 
 def _air_data(carry: Carry, record: AirData, settings: Settings) -> Step:
@@ -144,20 +153,20 @@ def _air_data(carry: Carry, record: AirData, settings: Settings) -> Step:
         return _sense(carry, record, settings)
     out = list[Output]()
     last = carry.track[-1]
-    found = deadreckoning.advance(carry.reckoner, last, record)
+    found = air_data_channel.advance(carry.reckoner, last, record)
     if found is None:
         return carry, out
     reckoner, new = found
     silent = (new.t_ns - last.t_ns) * 1e-9
     if silent > BRIDGED_S:
-        carry = moved.blurred(carry, settings, UNKNOWN_M_S * silent)
+        carry = channel_corrections.blurred(carry, settings, UNKNOWN_M_S * silent)
         out.append(_channel(record, f"no airspeed with attitude for {silent:.1f} s"))
-    carry = carry._replace(reckoner=reckoner, track=inertial.extend(carry.track, new))
-    return _given(moved.kept_near(carry, settings, has_velocity=False), record, out, settings)
+    carry = carry._replace(reckoner=reckoner, track=inertial_track.extend(carry.track, new))
+    return _given(channel_corrections.kept_near(carry, settings, has_velocity=False), record, out, settings)
 
 
 def _strap(carry: Carry, record: Attitude | Pressure, settings: Settings) -> Step:
-    return carry._replace(strap=strapped.sense(carry.strap, record)), []
+    return carry._replace(strap=strapdown_channel.sense(carry.strap, record)), []
 
 
 def _imu(carry: Carry, record: Imu, settings: Settings) -> Step:
@@ -165,7 +174,7 @@ def _imu(carry: Carry, record: Imu, settings: Settings) -> Step:
     if record.source != settings.config.strapdown.imu:
         return carry, []
     before, out = carry.strap, list[Output]()
-    strap = strapped.hear(before, record)
+    strap = strapdown_channel.hear(before, record)
     carry = carry._replace(strap=strap)
     if not carry.track:
         return carry, out
@@ -177,15 +186,15 @@ def _imu(carry: Carry, record: Imu, settings: Settings) -> Step:
     silent = (record.t_ns - last.t_ns) * 1e-9
     if silent <= 0.0:
         return carry, out
-    if silent > strapped.BRIDGED_S or before.imu is None:
-        new = strapped.coast(strap, last)
+    if silent > strapdown_channel.BRIDGED_S or before.imu is None:
+        new = strapdown_channel.coast(strap, last)
         faster = min(UNKNOWN_M_S2 * silent, TURNED_M_S)
-        carry = moved.blurred(carry, settings, faster * silent, faster)
+        carry = channel_corrections.blurred(carry, settings, faster * silent, faster)
         out.append(_channel(record, f"no IMU with attitude for {silent:.1f} s"))
     else:
-        strap, new = strapped.advance(before, strap, last)
-    carry = carry._replace(strap=strap, track=inertial.renew(carry.track, new))
-    return _given(moved.kept_near(carry, settings, has_velocity=True), record, out, settings)
+        strap, new = strapdown_channel.advance(before, strap, last)
+    carry = carry._replace(strap=strap, track=inertial_track.renew(carry.track, new))
+    return _given(channel_corrections.kept_near(carry, settings, has_velocity=True), record, out, settings)
 
 
 def _given(carry: Carry, record: Stamped, out: list[Output], settings: Settings) -> Step:
@@ -214,9 +223,9 @@ def _begun(carry: Carry, record: Gnss | RsbnFix, settings: Settings) -> Step:
     if carry.track or channel == "local_position":
         return carry, []
     if channel == "air_data":
-        first, why = deadreckoning.begin(carry.reckoner, record), "no airspeed with attitude is heard"
+        first, why = air_data_channel.begin(carry.reckoner, record), "no airspeed with attitude is heard"
     else:
-        first, why = strapped.begin(carry.strap, record), carry.strap.why
+        first, why = strapdown_channel.begin(carry.strap, record), carry.strap.why
     if first is not None:
         return carry._replace(track=(first,)), []
     since = carry.waiting_ns or record.t_ns
@@ -230,46 +239,50 @@ def _gnss(carry: Carry, record: Gnss, settings: Settings) -> Step:
     carry, told = _begun(carry, record, settings)
     config = settings.config.gnss
     carry = carry._replace(gnss=record)
-    ins = inertial.at(carry.track, record.t_ns)
+    ins = inertial_track.at(carry.track, record.t_ns)
     asked = math.inf if carry.asked_ns is None else (record.t_ns - carry.asked_ns) * 1e-9
     if record.fix < LEVEL_3D or ins is None or asked < config.every_s:
         return carry, told
     carry = carry._replace(asked_ns=record.t_ns, lesson=Lesson(record, None, ins))
-    if watch.excluded(carry.watch, GNSS):
+    if integrity.excluded(carry.watch, GNSS):
         return carry, []
     since = math.inf if carry.gnss_ns is None else (record.t_ns - carry.gnss_ns) * 1e-9
-    white = radio.from_gnss(record, ins, config, drifting=True)
-    carry, out = absorb.position(carry, white, errorstate.gnss_rows(settings.unit), ins, record, settings)
+    white = fix_observations.from_gnss(record, ins, config, drifting=True)
+    carry, out = measurement_update.position(
+        carry, white, error_state.gnss_rows(settings.unit), ins, record, settings
+    )
     if out:
         return carry, out
-    heard = radio.from_gnss(record, ins, config)
+    heard = fix_observations.from_gnss(record, ins, config)
     part = min(since, config.correlation_s) / config.correlation_s
-    learnt = height.learn(carry.level, record, ins, part, settings.gate[1])
+    learnt = height_error.learn(carry.level, record, ins, part, settings.gate[1])
     carry = carry._replace(gnss_ns=record.t_ns, gnss_heard=heard, level=learnt)
     if config.use_velocity and record.v_n is not None:
-        carry = absorb.velocity(carry, record, record.v_n, ins, settings)
+        carry = measurement_update.velocity(carry, record, record.v_n, ins, settings)
     return carry._replace(lesson=carry.lesson and carry.lesson._replace(heard=heard)), []
 
 
 def _rsbn(carry: Carry, record: RsbnFix, settings: Settings) -> Step:
     carry, told = _begun(carry, record, settings)
-    ins = inertial.at(carry.track, record.t_ns)
+    ins = inertial_track.at(carry.track, record.t_ns)
     if ins is None:
         why = "no inertial position at its time"
         return carry, [*told, Rejection(record.t_ns, record.rx_ns, f"rsbn {record.beacon}", why)]
     ins = level(ins, carry)
-    said = radio.from_rsbn(record, ins, settings.config.rsbn)
+    said = fix_observations.from_rsbn(record, ins, settings.config.rsbn)
     carry = carry._replace(lesson=Lesson(record, None, ins, said))
     heard = _calibrated(carry, record, said, settings)
     if not heard.observations:
         return carry, []
-    carry, out = absorb.position(carry, heard, errorstate.beacon_rows(settings.unit), ins, record, settings)
+    carry, out = measurement_update.position(
+        carry, heard, error_state.beacon_rows(settings.unit), ins, record, settings
+    )
     if out:
         return carry, out
     gnss, together = carry.gnss_heard, heard
     if gnss is not None and abs(record.t_ns - gnss.t_ns) <= TOGETHER_NS:
         # the correction INS minus GNSS of a moment ago is that of now: the error drifts by metres a minute
-        together = radio.Heard(
+        together = fix_observations.Heard(
             record.t_ns, heard.observations + gnss.observations, heard.sources | gnss.sources
         )
     lesson = carry.lesson and carry.lesson._replace(heard=together)
@@ -278,19 +291,19 @@ def _rsbn(carry: Carry, record: RsbnFix, settings: Settings) -> Step:
 
 def _calibrated(
     carry: Carry, record: RsbnFix, said: tuple[Azimuth | Range, ...], settings: Settings
-) -> radio.Heard:
+) -> fix_observations.Heard:
     """What is to be believed of a beacon's answer, less its learnt biases; right above it no azimuth."""
     kept, told, state = list[Observation](), Source(0), carry.state
     for z in said:
         if isinstance(z, Azimuth) and state is not None:
             north, east = state.x[:2].tolist()
-            if radio.silent(z, (north, east), record.slant_range):
+            if fix_observations.silent(z, (north, east), record.slant_range):
                 continue
-        name = watch.named(record.beacon, z)
-        if not watch.excluded(carry.watch, name):
-            kept.append(watch.calibrated(carry.watch, name, z, settings.config))
+        name = integrity.named(record.beacon, z)
+        if not integrity.excluded(carry.watch, name):
+            kept.append(integrity.calibrated(carry.watch, name, z, settings.config))
             told |= Source.AZIMUTH if isinstance(z, Azimuth) else Source.RANGE
-    return radio.Heard(record.t_ns, tuple(kept), told)
+    return fix_observations.Heard(record.t_ns, tuple(kept), told)
 
 
 _Uses = dict[type, Callable[[Carry, Any, Settings], Step]]

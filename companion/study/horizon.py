@@ -17,9 +17,9 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from companion import drawing
-from companion.estimate.exchange import Design, Infeasible
+from companion.estimate.minimax_lp import Design, Infeasible
 from companion.estimate.schuler import ARCSECOND, DEG_PER_HOUR, MEAN_EARTH, Scale, schuler_row, transition
+from companion.study import plot_options
 
 GRADES_DEG_H = {"navigation": 0.01, "tactical": 1.0, "industrial": 10.0}
 LONGEST_MIN = 24 * 60
@@ -158,7 +158,9 @@ def _drift(context: click.Context, parameter: click.Parameter, text: str | None)
     help="Also tell how long the position bound stays below this [m].",
 )
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
-@click.option("--plot", type=click.Path(path_type=Path), callback=drawing.file, help="Draw into this file.")
+@click.option(
+    "--plot", type=click.Path(path_type=Path), callback=plot_options.file, help="Draw into this file."
+)
 def command(
     sigma_m: float,
     window_min: float,

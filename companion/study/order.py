@@ -16,8 +16,8 @@ import numpy.typing as npt
 from rich.console import Console
 from rich.table import Table
 
-from companion import drawing
 from companion.estimate.polynomial import FAMILIES, Family, Order, select_order
+from companion.study import plot_options
 
 Array = npt.NDArray[np.float64]
 
@@ -110,7 +110,9 @@ def short_form(samples: Samples, found: Order) -> int:
 @click.option("--sigma", default=0.2, show_default=True, help="R.m.s. noise, where FILE has no third column.")
 @click.option("--seed", default=1, show_default=True, help="Of the noise.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
-@click.option("--plot", type=click.Path(path_type=Path), callback=drawing.file, help="Draw into this file.")
+@click.option(
+    "--plot", type=click.Path(path_type=Path), callback=plot_options.file, help="Draw into this file."
+)
 def command(
     file: Path | None,
     signal: str,

@@ -16,10 +16,10 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from companion import drawing
 from companion.estimate import kalman, restrictive
 from companion.estimate.kalman import Array
 from companion.nav.error_model import Example, paper_example
+from companion.study import plot_options
 
 SAMPLES = 600
 NEAR = 0.9  # an input this close to its bound counts as near it
@@ -226,7 +226,7 @@ def draw(
 @click.option("--seed", default=1, show_default=True, help="of the random numbers")
 @click.option("--json", "as_json", is_flag=True, help="print plain data")
 @click.option(
-    "--plot", type=click.Path(path_type=Path), callback=drawing.folder, help="folder for figures 1-10"
+    "--plot", type=click.Path(path_type=Path), callback=plot_options.folder, help="folder for figures 1-10"
 )
 def command(names: tuple[str, ...], runs: int, seed: int, as_json: bool, plot: Path | None) -> None:
     """Minimax Kalman filter against the restrictive filter, 16 states, six hours of unknown currents."""

@@ -14,8 +14,8 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from companion import drawing
 from companion.estimate.weights import changed, per_axis, rms_ratio, rms_ratio_assuming
+from companion.study import plot_options
 
 DEVIATIONS = (0.05, 0.1, 0.2, 0.5)  # the law is even in them
 FACTORS = (0.1, 0.5, 2.0, 10.0)
@@ -108,7 +108,7 @@ def plot(variances: list[float], names: list[str], file: Path) -> None:
     "--plot",
     "plot_file",
     type=click.Path(path_type=Path),
-    callback=drawing.file,
+    callback=plot_options.file,
     help="Also draw the study to this file.",
 )
 @click.option("--json", "as_json", is_flag=True, help="Print plain data instead of a table.")

@@ -21,7 +21,7 @@ import pytest
 from companion.config import Config
 from companion.link import dialect, frame
 from companion.link.commands import Commands, Result
-from companion.link.parameters import Parameters, table
+from companion.link.parameter_server import Parameters, table
 from companion.link.session import MessageReceived, Session
 from companion.link.signing import Refusal, Signing
 from companion.link.status_text import StatusText

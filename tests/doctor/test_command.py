@@ -17,12 +17,12 @@ from click.testing import CliRunner, Result
 from rich.console import Console
 
 from companion.config import load
-from companion.doctor import command, examination, show
+from companion.config.required_parameters import needed
+from companion.doctor import command, examination, rendering
 from companion.doctor.command import EX_UNAVAILABLE, machine
 from companion.doctor.diagnosis import Diagnosis, Finding, Identity, ParameterFinding
-from companion.link import streams
-from companion.link.transport import Address
-from companion.profiles import needed
+from companion.link import stream_rates
+from companion.transport.links import Address
 
 LOOPBACK = "127.0.0.1"
 SECOND = 1_000_000_000
@@ -36,7 +36,7 @@ def free_port() -> int:
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(streams, "WINDOW", SECOND)
+    monkeypatch.setattr(stream_rates, "WINDOW", SECOND)
     monkeypatch.setattr(examination, "WATCHED", 4 * SECOND)
     monkeypatch.setattr(examination, "WATCHED_LONGER", 4 * SECOND)
     monkeypatch.setattr(command, "HEAR_S", 8.0)
@@ -152,7 +152,9 @@ def test_a_tcp_listener_that_nobody_joins_ends(monkeypatch: pytest.MonkeyPatch) 
 def shown(diagnosis: Diagnosis) -> str:
     config = load(None, {"output.profile": "px4"}, {})
     text = io.StringIO()
-    show.show(Console(file=text, width=80), config, Address.parse("serial:/dev/ttyAMA0:921600"), diagnosis)
+    rendering.show(
+        Console(file=text, width=80), config, Address.parse("serial:/dev/ttyAMA0:921600"), diagnosis
+    )
     return text.getvalue()
 
 
@@ -187,8 +189,8 @@ def test_what_is_well_is_said_to_be() -> None:
 
 def test_a_reboot_is_asked_for_by_what_was_changed_only() -> None:
     before, new = diagnosis(), diagnosis(has=1)
-    assert "reboot the autopilot for EKF2_AGP0_ID" in show.after(new, new.changed_from(before))
-    assert "reboot" not in show.after(new, ())
+    assert "reboot the autopilot for EKF2_AGP0_ID" in rendering.after(new, new.changed_from(before))
+    assert "reboot" not in rendering.after(new, ())
 
 
 @pytest.mark.parametrize(("bits", "well"), [(32, False), (64, True)])

@@ -7,11 +7,11 @@ from typing import Any
 import pytest
 
 from companion.config import Config, load
+from companion.config.required_parameters import needed
 from companion.doctor.diagnosis import Diagnosis, Finding
 from companion.doctor.examination import WATCHED, WATCHED_LONGER, Examination
 from companion.link import dialect, frame
 from companion.link.parameter_client import ATTEMPTS, SILENCE
-from companion.profiles import needed
 from sitl.autopilot import Autopilot
 from sitl.scenarios import named
 from sitl.world import World

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from companion.estimate import box, kalman, restrictive
+from companion.estimate import bounded_lsq, kalman, restrictive
 from companion.estimate.full_horizon import Sample
 from companion.estimate.moving_horizon import MHE, Window
 from companion.nav.error_model import paper_example
@@ -168,7 +168,7 @@ def test_unseen_inputs_take_the_minimax_prior(C):
 def test_box_by_enumeration_and_by_bvls_agree(seed, m):
     rng = np.random.default_rng(seed)
     D, r = rng.normal(size=(m + 2, m)), 3 * rng.normal(size=m + 2)
-    small, large = box.minimum(D.T @ D, D.T @ r), box.least_squares(D, r)
+    small, large = bounded_lsq.minimum(D.T @ D, D.T @ r), bounded_lsq.least_squares(D, r)
     np.testing.assert_allclose(small.v, large.v, atol=1e-9)
     assert (small.status == large.status).all()
     np.testing.assert_allclose(small.free_inverse, large.free_inverse, rtol=1e-6, atol=1e-9)
@@ -179,7 +179,7 @@ def test_box_by_enumeration_and_by_bvls_agree(seed, m):
 def test_clipping_is_not_the_answer():
     M, g = np.array([[1.0, 0.9], [0.9, 1.0]]), np.array([2.0, 1.0])
     clipped = np.clip(np.linalg.solve(M, g), -1, 1)
-    best = box.minimum(M, g).v
+    best = bounded_lsq.minimum(M, g).v
     cost = [0.5 * v @ M @ v - g @ v for v in (best, clipped)]
     assert cost[0] < cost[1] - 0.1
 
@@ -191,7 +191,7 @@ def test_interior_point_solver_agrees():
     solver = piqp.DenseSolver()
     solver.setup(D.T @ D, -D.T @ r, x_l=-np.ones(40), x_u=np.ones(40))
     solver.solve()
-    np.testing.assert_allclose(box.least_squares(D, r).v, solver.result.x, atol=1e-5)
+    np.testing.assert_allclose(bounded_lsq.least_squares(D, r).v, solver.result.x, atol=1e-5)
 
 
 def test_batch_is_one_by_one():

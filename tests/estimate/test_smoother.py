@@ -13,8 +13,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from companion.estimate import boundary, smoother
-from companion.nav.discrete import discretise
+from companion.estimate import smoother, two_point_bvp
+from companion.nav.discretization import discretise
 from companion.nav.disturbances import accelerometer_slow, gyro_drift
 from companion.nav.error_model import aircraft
 
@@ -168,7 +168,7 @@ def test_block_elimination_solves_the_whole_system(seed: int, n: int, N: int) ->
         rows, columns = slice(2 * n * (i + 1), 2 * n * (i + 1) + n), slice(2 * n * i + n, 2 * n * (i + 1))
         whole[rows, columns], whole[columns, rows] = C[i], C[i].T
     b = rng.standard_normal((N + 1, 2 * n))
-    y, inverse = boundary.solve(M, C, b)
+    y, inverse = two_point_bvp.solve(M, C, b)
     np.testing.assert_allclose(y.ravel(), np.linalg.solve(whole, b.ravel()), atol=1e-10)
     dense = np.linalg.inv(whole)
     for i in range(N + 1):

@@ -7,8 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from companion.link import dialect, frame
-from companion.link.bucket import Bucket
 from companion.link.commands import BURST, CAPABILITIES, RATE_HZ, Commands, Result
+from companion.link.rate_limiter import Bucket
 from companion.link.session import MessageReceived, Session
 
 SECOND = 1_000_000_000

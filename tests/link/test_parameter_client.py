@@ -25,7 +25,7 @@ from companion.link.parameter_client import (
     to_value,
     to_wire,
 )
-from companion.link.parameters import Parameters, table
+from companion.link.parameter_server import Parameters, table
 
 ARDUPILOT, PX4 = 3, 12
 SYSTEM, COMPONENT = 7, 1

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from companion.nav import disturbances as dist
-from companion.nav.discrete import discretise
+from companion.nav.discretization import discretise
 from companion.nav.error_model import INS_STATES, aircraft
 
 

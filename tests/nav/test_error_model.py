@@ -15,14 +15,7 @@ from scipy.integrate import solve_ivp
 
 from companion.nav import disturbances as dist
 from companion.nav import error_model
-from companion.nav.correctors import (
-    absolute_log,
-    airspeed,
-    gnss_velocity,
-    paper_velocity,
-    relative_log,
-    rows,
-)
+from companion.nav.correctors import absolute_log, airspeed, gnss_velocity, paper_velocity, relative_log, rows
 from companion.nav.earth import SPHERE, SPHERE_KM_H
 from companion.nav.error_model import INS_STATES, aircraft, paper, paper_example, twin
 from companion.nav.strapdown import rates, rotation

@@ -11,8 +11,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from companion.config import Config, Inertial, load
-from companion.nav.discrete import discretise
+from companion.config import Config, InertialConfig, load
+from companion.nav.discretization import discretise
 from companion.nav.geometry import (
     Geodetic,
     displace,
@@ -21,7 +21,7 @@ from companion.nav.geometry import (
     separation,
     slant_range_azimuth,
 )
-from companion.navigator import Navigator, errorstate, radio
+from companion.navigator import Navigator, error_state, fix_observations
 from companion.records import (
     Fix,
     Gnss,
@@ -39,7 +39,7 @@ from companion.records import (
 
 ORIGIN = Geodetic(math.radians(60.0), math.radians(30.0), 0.0)
 BEACON = Geodetic(math.radians(60.4), math.radians(30.3), 100.0)
-CONFIG = Config(inertial=Inertial(independent=True))  # the channel that flies here is one
+CONFIG = Config(inertial=InertialConfig(independent=True))  # the channel that flies here is one
 NS = 1_000_000_000
 
 
@@ -54,7 +54,7 @@ class Moment:
 def flight(duration_s: int, gnss_until: float, rsbn_until: float, seed: int = 1) -> tuple[Moment, ...]:
     """A circling aircraft whose inertial channel errs as its equations say; GNSS 5 Hz, a beacon 1 Hz."""
     rng = np.random.default_rng(seed)
-    dt, unit = 0.1, errorstate.grade(CONFIG.inertial, CONFIG.gnss)
+    dt, unit = 0.1, error_state.grade(CONFIG.inertial, CONFIG.gnss)
     model = unit.system(ORIGIN.lat, (30.0, 0.0, 0.0), (0.0, 0.0))
     step = discretise(model.A, model.Q, np.zeros((len(unit.sigma0), 0)), dt)
     noise = np.linalg.cholesky(step.Q + 1e-30 * np.eye(len(unit.sigma0)))
@@ -415,7 +415,7 @@ def test_what_cannot_be_computed_is_refused_and_the_flight_goes_on(monkeypatch: 
     for k, moment in enumerate(moments):
         with monkeypatch.context() as patch:
             if 100 <= k < 120:
-                patch.setattr(radio, "innovation", singular)
+                patch.setattr(fix_observations, "innovation", singular)
             outs += [out for record in moment.records for out in navigator.handle(record)]
     refused = [out for out in outs if isinstance(out, Rejection)]
     assert refused
@@ -453,14 +453,14 @@ def test_what_is_no_number_is_refused_and_changes_nothing(value: float) -> None:
 
 
 def test_a_state_gone_wrong_is_begun_anew_and_said(monkeypatch: pytest.MonkeyPatch) -> None:
-    absorb = errorstate.absorb_position
+    absorb = error_state.absorb_position
     navigator, outs = Navigator(CONFIG), []
     navigator.handle(origin())
     for k, moment in enumerate(flight(60, 60.0, 60.0)):
         with monkeypatch.context() as patch:
             if 100 <= k < 112:
                 spoilt = lambda *given: absorb(*given)._replace(P=np.full((14, 14), np.nan))  # noqa: E731
-                patch.setattr(errorstate, "absorb_position", spoilt)
+                patch.setattr(error_state, "absorb_position", spoilt)
             outs += [(moment, out) for record in moment.records for out in navigator.handle(record)]
     resets = [out for _, out in outs if isinstance(out, Reset)]
     assert {out.what for out in resets} == {"error state"}

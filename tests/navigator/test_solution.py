@@ -8,8 +8,8 @@ import numpy as np
 
 from companion.config import load
 from companion.records import Solution
+from sitl.campaign.flight import fly_records
 from sitl.scenarios import named
-from sitl.trial import fly_records
 
 
 def test_the_velocity_by_air_data_is_as_good_as_claimed_in_gusts() -> None:

@@ -10,12 +10,12 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
-from companion.config import Config, Inertial
+from companion.config import Config, InertialConfig
 from companion.records import Event, Rejection, Solution, Source, Trust
 from sitl.beacon import Beacon
+from sitl.campaign.flight import SCENARIOS, fly_records, horizontal_errors
 from sitl.faults import Fault
 from sitl.flight import Leg, Plan, Wind
-from sitl.trial import SCENARIOS, fly_records, horizontal_errors
 
 NS = 1_000_000_000
 START, END = 300.0, 540.0
@@ -53,7 +53,7 @@ class Flown(NamedTuple):
 def flown(name: str, size: float | None = None, seed: int = 1, **changes: Any) -> Flown:
     faults = (Fault(name, START, END, size),) if name else ()
     scenario = dataclasses.replace(SCENARIOS["one-beacon"], faults=faults, seed=seed, **changes)
-    world, told = fly_records(scenario, Config(inertial=Inertial(independent=True)))
+    world, told = fly_records(scenario, Config(inertial=InertialConfig(independent=True)))
     solutions = [r for r in told if isinstance(r, Solution) and r.protection is not None]
     t = np.array([s.t_ns / NS for s in solutions])
     level = np.array([s.protection for s in solutions])

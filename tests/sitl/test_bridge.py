@@ -14,17 +14,19 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
+from companion.analysis import simulated_rsbn
 from companion.config import Config, load
+from companion.importers import tlog
 from companion.link import dialect, frame
-from companion.log import file, simulate, tlog
-from companion.onboard import Onboard
 from companion.records import Event, RsbnFix, Solution, Truth
-from sitl import attach
-from sitl.attach import command
+from companion.runtime.core import Onboard
+from companion.storage import flight_log
+from sitl import bridge_command
 from sitl.beacon import Beacon
 from sitl.bridge import AUTOPILOT, COMPANION, RSBN, Bridge, Orders, Way
+from sitl.bridge_command import command
 from sitl.comparison import table
-from sitl.play import NEVER, Player
+from sitl.tlog_player import NEVER, Player
 
 SECOND = 1_000_000_000
 START = 1000 * SECOND
@@ -261,7 +263,7 @@ def test_three_processes_over_tcp_and_udp(entries, tmp_path: Path) -> None:
     assert lines[0].startswith("t_s,source,north_m,east_m,error_m,sigma_m,bound_m,true_lat_deg")
     assert sum(COMPANION in line for line in lines) > 50
     (flown,) = logs.iterdir()
-    kinds = {type(entry.value) for entry in file.read(flown)}
+    kinds = {type(entry.value) for entry in flight_log.read(flown)}
     assert {Solution, RsbnFix, Truth} <= kinds
 
 
@@ -301,8 +303,8 @@ def test_a_list_of_beacons_that_is_none_ends_it(tmp_path: Path) -> None:
 def test_beacons_of_the_bridge_and_of_a_replay_have_one_horizon(height: float, tmp_path) -> None:
     listed = tmp_path / "beacons.csv"
     listed.write_text(f"id,lat_deg,lon_deg,alt_m\n1,55.75,38.57,{height}\n")
-    typed, read = attach._beacons((f"55.75,38.57,{height}",), listed)
-    assert typed.ground_alt == read.ground_alt == simulate.GROUND
+    typed, read = bridge_command._beacons((f"55.75,38.57,{height}",), listed)
+    assert typed.ground_alt == read.ground_alt == simulated_rsbn.GROUND
 
 
 def test_a_bridge_that_hears_no_autopilot_says_so() -> None:

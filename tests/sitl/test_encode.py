@@ -6,7 +6,7 @@ import pytest
 
 from companion import records as r
 from companion.link import dialect, frame
-from companion.wire import Autopilot, Sender, decode
+from companion.link.decode import Autopilot, Sender, decode
 from sitl.encode import Airframe, encode
 
 BOOT = 5_000_000_000

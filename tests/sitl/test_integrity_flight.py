@@ -6,9 +6,10 @@ import dataclasses
 
 import pytest
 
-from companion.config import Config, Inertial
-from sitl import loopback, trial
-from sitl.trial import SCENARIOS, Order, Result, attempt
+from companion.config import Config, InertialConfig
+from sitl import loopback
+from sitl.campaign import flight
+from sitl.campaign.flight import SCENARIOS, Order, Result, attempt
 
 HARMLESS_M = 300.0
 
@@ -42,7 +43,7 @@ def test_air_data_alone_do_not_outvote_gnss_and_a_beacon() -> None:
 
 def test_a_guarantee_does_not_rest_on_what_is_under_suspicion() -> None:
     """Everything falls silent while the spoofer is not yet excluded: the bound still holds."""
-    fault = trial.KINDS["gnss-spoof-5"].fault
+    fault = flight.KINDS["gnss-spoof-5"].fault
     assert fault is not None
     spoofed = dataclasses.replace(
         SCENARIOS["air-data"],
@@ -51,9 +52,9 @@ def test_a_guarantee_does_not_rest_on_what_is_under_suspicion() -> None:
         gnss_outages=((338.0, 420.0),),
         rsbn_outages=((338.0, 420.0),),
     )
-    config = loopback.simulated(Config(inertial=Inertial(source="air_data")))
-    world, told = trial.fly_records(spoofed, config)
-    result = trial.score(Order("air-data", "gnss-spoof-5", 1), world, told)
+    config = loopback.simulated(Config(inertial=InertialConfig(source="air_data")))
+    world, told = flight.fly_records(spoofed, config)
+    result = flight.score(Order("air-data", "gnss-spoof-5", 1), world, told)
     assert result.rms_error is not None and result.rms_bound is not None
     assert result.rms_error <= result.rms_bound
     assert result.misleading_s == 0.0

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
+from companion.analysis import replay
+from companion.analysis.error_statistics import CORRECTED, GNSS, RSBN
 from companion.config import Config
-from companion.log import replay
-from companion.log.score import CORRECTED, GNSS, RSBN
 from sitl.loopback import command, fly, scored, simulated
 from sitl.scenarios import named
 

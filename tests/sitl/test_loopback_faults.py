@@ -18,10 +18,10 @@ import numpy as np
 import pytest
 
 from companion.config import load
-from companion.log import file
-from companion.log.folder import open_log
 from companion.nav.geometry import Geodetic, displace, local_to_geodetic, separation
 from companion.records import Event, LinkState, Reboot, Reset, Solution
+from companion.storage import flight_log
+from companion.storage.retention import open_log
 from sitl.autopilot import UNIX_AT_START_NS
 from sitl.faults import Fault
 from sitl.flight import Leg, Plan, Wind
@@ -51,7 +51,7 @@ class Flown:
             flown = fly(scenario, config, log)
         assert log.trouble is None
         self.autopilot, self.truth = flown.autopilot, truth_of(flown.autopilot)
-        self.logged = [entry.value for entry in file.read(log.path)]
+        self.logged = [entry.value for entry in flight_log.read(log.path)]
         self.solutions = [value for value in self.logged if isinstance(value, Solution)]
 
     def told(self) -> list[str]:

@@ -6,9 +6,9 @@ import pytest
 
 from companion.link import dialect, frame
 from companion.nav.geometry import separation
+from companion.output.encode import ENCODERS, Receiver, encode
+from companion.output.gate import Position
 from companion.records import LocalOrigin
-from companion.wire.encode import ENCODERS, Receiver, encode
-from companion.wire.gate import Position
 from sitl.positions import CARRIERS, feeds, position_of
 
 NOW = 5_000_000_000_000

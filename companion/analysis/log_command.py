@@ -1,0 +1,94 @@
+"""`companion log`: what a log holds, and a torn one made whole. Words only; the work is in `file`."""
+
+from __future__ import annotations
+
+import sys
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import NoReturn
+
+import click
+import msgspec
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from companion.storage.flight_log import Info, LogError, info, recover
+
+
+@click.group("log")
+def group() -> None:
+    """Look into logs and repair them."""
+
+
+@group.command("info")
+@click.argument("log", type=click.Path(path_type=Path))
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
+def info_command(log: Path, as_json: bool) -> None:
+    """Say what LOG holds: messages by topic, times, metadata, whether it was closed."""
+    try:
+        found = info(log)
+    except LogError as error:
+        _fail(error)
+    if as_json:
+        values = found._asdict() | {"path": str(found.path), "duration_s": found.duration_s}
+        click.echo(msgspec.json.format(msgspec.json.encode(values), indent=2))
+    else:
+        _print(found)
+
+
+@group.command("recover")
+@click.argument("log", type=click.Path(path_type=Path))
+def recover_command(log: Path) -> None:
+    """Make a torn or damaged LOG whole (x.mcap.active becomes x.mcap, x.mcap gets x.recovered.mcap)."""
+    try:
+        saved = recover(log)
+    except LogError as error:
+        _fail(error)
+    if saved.path == log:
+        click.echo(f"{log} is whole: {saved.messages} messages in {saved.chunks} chunks")
+    else:
+        click.echo(
+            f"{saved.path}: {saved.messages} messages in {saved.chunks} chunks saved,"
+            f" {saved.bytes_lost} bytes lost"
+        )
+
+
+@group.command("convert")
+@click.argument("source", type=click.Path(path_type=Path))
+@click.option("-o", "--output", type=click.Path(path_type=Path), required=True, help="The MCAP to write.")
+def convert_command(source: Path, output: Path) -> None:
+    """Write the records of SOURCE, a log of another recorder, as MCAP: inputs and truth, nothing computed."""
+    from companion.analysis import convert
+
+    try:
+        written = convert.convert(source, output)
+    except LogError as error:
+        _fail(error)
+    click.echo(f"{output}: {written.records} records, {written.reboots} reboots")
+
+
+def _print(found: Info) -> None:
+    console = Console()
+    rate = 1.0 / found.duration_s if found.duration_s > 0 else 0.0
+    state = "closed" if found.closed else f"torn ({found.bytes_lost} bytes unreadable: companion log recover)"
+    console.print(f"[bold]{escape(str(found.path))}[/]  {found.bytes / 1e6:.3f} MB, {state}", soft_wrap=True)
+    if found.messages:
+        start = datetime.fromtimestamp(found.start_ns / 1e9, UTC).isoformat(timespec="milliseconds")
+        console.print(f"{start}, {found.duration_s:.1f} s, {found.messages} messages, {found.chunks} chunks")
+    table = Table("topic", box=None, pad_edge=False)
+    table.add_column("messages", justify="right")
+    table.add_column("Hz", justify="right")
+    for topic, count in sorted(found.counts.items()):
+        table.add_row(escape(topic), str(count), f"{count * rate:.2f}")
+    console.print(table)
+    for name, values in found.metadata.items():
+        for key, value in values.items():
+            head, *rest = value.splitlines() or [""]
+            more = f" ... ({len(rest)} more lines)" if rest else ""
+            console.print(escape(f"{name}.{key}: {head}{more}"), soft_wrap=True, highlight=False)
+
+
+def _fail(error: LogError) -> NoReturn:
+    click.echo(str(error), err=True)
+    sys.exit(1)

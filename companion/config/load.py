@@ -1,0 +1,187 @@
+"""Load a configuration: file, environment, flags; later ones win.
+
+The file is TOML, one table per section; the environment variable of a key is `COMPANION_SECTION__KEY`. A
+mistake is a `ConfigError`: one sentence that names where it stands, the key, and the nearest valid one. The
+service does not start on it (exit code 78, EX_CONFIG).
+"""
+
+from __future__ import annotations
+
+import difflib
+import os
+import tomllib
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from types import UnionType
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+
+import msgspec
+
+from companion.config.schema import Config
+from companion.config.validate import conflicts
+
+PREFIX = "COMPANION_"  # of the environment variables that are ours, every one a key
+
+
+class ConfigError(ValueError):
+    """A configuration that cannot be meant; the text says where and what to write instead."""
+
+
+def load(
+    path: Path | None = None,
+    flags: Mapping[str, Any] | None = None,
+    environment: Mapping[str, str] | None = None,
+    pairs: Iterable[str] = (),
+    tuned: Path | None = None,
+) -> Config:
+    """The configuration of file `path`, then environment, then `flags` (keys "section.key", None: unset),
+    then `pairs` ("section.key=value", as typed). `tuned`, what ground stations set, beats `path` and no more.
+
+    Raises `ConfigError` where a file cannot be read, a key is unknown or a value impossible.
+    """
+    tree: dict[str, dict[str, Any]] = {}
+    origin: dict[tuple[str, str], str] = {}
+    for source in (path, tuned):
+        if source is not None:
+            for section, table in _read(source).items():
+                tree.setdefault(section, {}).update(table)
+                origin |= {(section, key): str(source) for key in table}
+    for name, text in (os.environ if environment is None else environment).items():
+        if name.startswith(PREFIX):
+            section, between, key = name.removeprefix(PREFIX).lower().partition("__")
+            if not between:
+                raise ConfigError(f"environment variable {name}: it names no key{_nearest_variable(name)}")
+            _check_keys({section: {key: text}}, f"environment variable {name}")
+            tree.setdefault(section, {})[key] = _parsed(text)
+            origin[section, key] = f"environment variable {name}"
+    for name, value in (flags or {}).items():
+        if value is not None:
+            section, key = name.split(".")
+            tree.setdefault(section, {})[key] = value
+            origin[section, key] = "command line"
+    for pair in pairs:
+        name, _, text = pair.partition("=")
+        section, _, key = name.strip().partition(".")
+        if not key or not text:
+            raise ConfigError(f"--set {pair}: write it as SECTION.KEY=VALUE, for example gnss.sigma_m=3.0")
+        _check_keys({section: {key: text}}, f"--set {pair}")
+        tree.setdefault(section, {})[key] = _parsed(text.strip())
+        origin[section, key] = f"--set {pair}"
+    return _convert(tree, origin)
+
+
+def parse(text: str, where: str) -> Config:
+    """The configuration written in `text`; `where` names it in a `ConfigError`."""
+    tree = _tree(text, where)
+    _check_keys(tree, where)
+    return _convert(tree, {(section, key): where for section, table in tree.items() for key in table})
+
+
+def to_toml(config: Config) -> str:
+    """The whole configuration as the TOML that `load` reads back."""
+    lines = []
+    for section in config.__struct_fields__:
+        table = getattr(config, section)
+        lines.append(f"[{section}]")
+        # JSON's strings, numbers, booleans and lists are TOML's too
+        lines += [
+            f"{key} = {msgspec.json.encode(getattr(table, key)).decode()}" for key in table.__struct_fields__
+        ]
+        lines.append("")
+    return "\n".join(lines)
+
+
+def _read(path: Path) -> dict[str, dict[str, Any]]:
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise ConfigError(f"{path}: no such file; start from `companion check-config --defaults`") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: cannot be read ({error})") from None
+    tree = _tree(text, str(path))
+    _check_keys(tree, str(path))
+    return tree
+
+
+def _tree(text: str, where: str) -> dict[str, dict[str, Any]]:
+    try:
+        tree = tomllib.loads(text)
+    except (ValueError, RecursionError) as error:  # integers of thousands of digits are none of TOML's errors
+        raise ConfigError(f"{where}: is no TOML: {error}") from None
+    for section, table in tree.items():
+        if not isinstance(table, dict) and section in Config.__struct_fields__:
+            raise ConfigError(f"{where}: `{section}` is a section: write [{section}] and its keys below it")
+    return {name: table if isinstance(table, dict) else {"": table} for name, table in tree.items()}
+
+
+def _check_keys(tree: Mapping[str, Mapping[str, Any]], where: str) -> None:
+    sections = Config.__struct_fields__
+    for section, table in tree.items():
+        if section not in sections:
+            raise ConfigError(f"{where}: there is no section [{section}]{_nearest(section, sections)}")
+        keys = type(getattr(Config(), section)).__struct_fields__
+        for key in table:
+            if key not in keys:
+                raise ConfigError(f"{where}: section [{section}] has no key `{key}`{_nearest(key, keys)}")
+
+
+def _nearest(name: str, known: tuple[str, ...]) -> str:
+    close = difflib.get_close_matches(name, known, 1, 0.4)
+    return f"; did you mean `{close[0]}`?" if close else f"; it has {', '.join(known)}"
+
+
+def _nearest_variable(name: str) -> str:
+    tables = {section: type(getattr(Config(), section)) for section in Config.__struct_fields__}
+    known = [f"{PREFIX}{s}__{key}".upper() for s, table in tables.items() for key in table.__struct_fields__]
+    close = difflib.get_close_matches(name, known, 1, 0.6)
+    return f"; did you mean `{close[0]}`?" if close else f"; write it as {PREFIX}SECTION__KEY"
+
+
+def _parsed(text: str) -> Any:
+    """An environment variable's text as TOML would read it, else as a string."""
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except (ValueError, RecursionError):
+        return text
+
+
+def _listed(value: Any, kind: Any) -> Any:
+    """One value where a list is asked for is a list of one."""
+    return [value] if get_origin(kind) is tuple and not isinstance(value, list | tuple) else value
+
+
+def _choices(kind: Any) -> tuple[str, ...]:
+    """The words that a key takes, where it takes nothing else."""
+    if get_origin(kind) is Literal:
+        return get_args(kind)
+    if get_origin(kind) in (Union, UnionType):
+        return tuple(word for one in get_args(kind) for word in _choices(one))
+    return ()
+
+
+def _convert(tree: Mapping[str, Mapping[str, Any]], origin: Mapping[tuple[str, str], str]) -> Config:
+    sections: dict[str, Any] = {}
+    for section, table in tree.items():
+        kind = type(getattr(Config(), section))
+        hints = get_type_hints(kind)
+        table = {key: _listed(value, hints[key]) for key, value in table.items()}
+        for key, value in table.items():
+            try:
+                msgspec.convert({key: value}, kind)
+            except msgspec.ValidationError as error:
+                reason = str(error).split(" - at ")[0].replace("`", "")
+                where = origin[section, key]
+                if choices := _choices(hints[key]):
+                    close = difflib.get_close_matches(str(value), choices, 1, 0.4)
+                    nearest = f"; did you mean `{close[0]}`?" if close else ""
+                    raise ConfigError(
+                        f"{where}: {section}.{key}: {value!r} is none of {', '.join(choices)}{nearest}"
+                    ) from None
+                raise ConfigError(
+                    f"{where}: {section}.{key} = {value!r} is impossible: {reason[0].lower()}{reason[1:]}"
+                ) from None
+        sections[section] = msgspec.convert(table, kind)
+    config = Config(**sections)
+    for section, key, sentence in conflicts(config):
+        raise ConfigError(f"{origin.get((section, key), 'configuration')}: {sentence}")
+    return config

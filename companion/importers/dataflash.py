@@ -1,0 +1,280 @@
+"""ArduPilot's onboard log (DataFlash, `.bin` binary or `.log` text) -> records.
+
+    log = dataflash.read(path)
+    for record in log: ...              # in the order of the file
+
+pymavlink's DFReader splits the file into messages; `Messages` turns a message into records and knows nothing
+of files, so it serves whatever holds the same messages. The log was written on board: arrival and validity
+are the same instant, UNIX time where the log holds a GPS time, else time since boot. Of the filter's lanes
+only the primary one is told, EKF3 (XKF) before EKF2 (NKF). Names and units: the @LoggerMessage comments in
+ArduPilot's sources.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import math
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, TypeAlias
+
+from companion.link.decode import UERE
+from companion.nav.geometry import Geodetic, separation
+from companion.records import (
+    AirData,
+    Attitude,
+    Event,
+    FilterStatus,
+    GlobalPosition,
+    Gnss,
+    Imu,
+    LocalOrigin,
+    LocalPosition,
+    Pressure,
+    Reboot,
+    Stamped,
+    Truth,
+    Vector3,
+    Wind,
+)
+from companion.storage.reader import LogError
+
+Message: TypeAlias = Any  # attributes named as the log's columns
+
+_ZERO_CELSIUS = 273.15
+_WARNING, _INFO = 4, 6  # MAV_SEVERITY
+_EKF_ORIGIN = 0  # LogOriginType
+_STATUS, _GLITCHING = 0x3FF, 1 << 14  # nav_filter_status; its first ten bits are EKF_STATUS_FLAGS
+_EKF_GPS_GLITCHING = 32768  # of EKF_STATUS_FLAGS
+_WEEK_US = 604_800_000_000
+_BACK_US = 1_000_000  # a boot time that went back farther began anew
+
+
+class Messages:
+    """The records of one log's messages, given one by one; keeps what a record needs of earlier ones."""
+
+    def __init__(self) -> None:
+        self._lane = 0
+        self._filter = "NKF1"  # until an XKF1 is seen
+        self._accuracy: dict[int, tuple[float | None, float | None, float | None]] = {}
+        self._v_n: Vector3 | None = None
+        self._differential: float | None = None
+        self._true_v_n: Vector3 | None = None
+        self._true: Truth | None = None
+
+    def records(self, name: str, message: Message, t_ns: int) -> Iterator[Stamped]:
+        """The records in a message called `name`; AttributeError if it lacks a column it always had."""
+        make = _TABLE.get(name)
+        if make is not None:
+            yield from make(self, name, message, t_ns)
+
+    def _gps(self, name: str, m: Message, t: int) -> Iterator[Stamped]:
+        """GPA, the receiver's accuracy, follows its GPS: told is that of the fix before."""
+        receiver = getattr(m, "I", 0 if name == "GPS" else 1)
+        lat, lon = math.radians(m.Lat), math.radians(m.Lng)
+        fix = int(m.Status)
+        if not (abs(m.Lat) <= 90.0 and abs(m.Lng) <= 180.0) or (fix >= 2 and m.Lat == m.Lng == 0.0):
+            return
+        week, ms = getattr(m, "GWk", getattr(m, "Week", 0)), getattr(m, "GMS", getattr(m, "TimeMS", 0))
+        course = math.radians(m.GCrs)
+        hdop = m.HDop if 0.0 < m.HDop < 99.0 else None
+        horizontal, vertical, speed = self._accuracy.get(receiver, (None, None, None))
+        if horizontal is None and hdop is not None:
+            horizontal = hdop * UERE / math.sqrt(2.0)
+        moving = (m.Spd * math.cos(course), m.Spd * math.sin(course), _finite(getattr(m, "VZ", 0.0)) or 0.0)
+        yield Gnss(
+            t,
+            t,
+            receiver=receiver,
+            stamp_us=int(week) * _WEEK_US + int(ms) * 1000,
+            fix=fix,
+            lat=lat,
+            lon=lon,
+            alt_msl=m.Alt,
+            sigma_horizontal=horizontal,
+            sigma_vertical=vertical,
+            v_n=moving if fix >= 3 else None,
+            sigma_velocity=speed,
+            satellites=int(m.NSats),
+            hdop=hdop,
+        )
+
+    def _gps_accuracy(self, name: str, m: Message, t: int) -> Iterator[Stamped]:
+        receiver = getattr(m, "I", 0 if name == "GPA" else 1)
+        self._accuracy[receiver] = _positive(m.HAcc), _positive(m.VAcc), _positive(m.SAcc)
+        return iter(())
+
+    def _imu(self, name: str, m: Message, t: int) -> Iterator[Stamped]:
+        source = getattr(m, "I", {"IMU": 0, "IMU2": 1, "IMU3": 2}[name])
+        yield Imu(t, t, source, (m.AccX, m.AccY, m.AccZ), (m.GyrX, m.GyrY, m.GyrZ))
+
+    def _attitude(self, name: str, m: Message, t: int) -> Iterator[Stamped]:
+        heading = math.radians(m.Yaw) % math.tau
+        yield Attitude(t, t, math.radians(m.Roll), math.radians(m.Pitch), heading)
+
+    def _chosen(self, name: str, m: Message) -> bool:
+        """Whether a filter's message is the primary lane's of the filter told."""
+        if name.startswith("X"):
+            self._filter = "XKF1"
+        return name[0] == self._filter[0] and getattr(m, "C", 0) == self._lane
+
+    def _local(self, name: str, m: Message, t: int) -> Iterator[Stamped]:
+        if self._chosen(name, m):
+            self._v_n = m.VN, m.VE, m.VD
+            yield LocalPosition(t, t, (m.PN, m.PE, m.PD), self._v_n)
+
+    def _wind(self, name: str, m: Message, t: int) -> Iterator[Stamped]:
+        if self._chosen(name, m):
+            yield Wind(t, t, (m.VWN, m.VWE, 0.0))
+
+    def _status(self, name: str, m: Message, t: int) -> Iterator[Stamped]:
+        if (primary := getattr(m, "PI", -1)) >= 0 and name[0] in ("X", self._filter[0]):
+            self._lane = primary
+        if self._chosen(name, m):
+            glitch = bool(m.SS & _GLITCHING)
+            flags = (m.SS & _STATUS) | (_EKF_GPS_GLITCHING if glitch else 0)
+            yield FilterStatus(t, t, flags, glitch, _finite(m.SP) or 0.0)
+
+    def _origin(self, name: str, m: Message, t: int) -> Iterator[Stamped]:
+        if m.Type == _EKF_ORIGIN and (m.Lat or m.Lng):
+            yield LocalOrigin(t, t, math.radians(m.Lat), math.radians(m.Lng), m.Alt, "ardupilot")
+
+    def _global(self, name: str, m: Message, t: int) -> Iterator[Stamped]:
+        if self._v_n is not None:
+            lat, lon = math.radians(m.Lat), math.radians(m.Lng)
+            yield GlobalPosition(t, t, lat, lon, m.Alt, self._v_n, m.RelHomeAlt)
+
+    def _airspeed(self, name: str, m: Message, t: int) -> Iterator[Stamped]:
+        if getattr(m, "I", 0) == 0 and name == "ARSP" and math.isfinite(m.Airspeed):
+            self._differential = _finite(getattr(m, "DiffPress", math.nan))
+            yield AirData(t, t, m.Airspeed)
+
+    def _baro(self, name: str, m: Message, t: int) -> Iterator[Stamped]:
+        if getattr(m, "I", 0) == 0 and m.Press > 0.0:
+            yield Pressure(t, t, m.Press, self._differential, m.Temp + _ZERO_CELSIUS)
+
+    def _true_velocity(self, name: str, m: Message, t: int) -> Iterator[Stamped]:
+        self._true_v_n = m.VN, m.VE, m.VD
+        return iter(())
+
+    def _truth(self, name: str, m: Message, t: int) -> Iterator[Stamped]:
+        """SIM has no velocity: SIM2's, else that of the last two positions."""
+        lat, lon = math.radians(m.Lat), math.radians(m.Lng)
+        v_n = self._true_v_n
+        if v_n is None:
+            last = self._true
+            if last is None or t <= last.t_ns:
+                v_n = (0.0, 0.0, 0.0)
+            else:
+                moved = separation(Geodetic(lat, lon, m.Alt), Geodetic(last.lat, last.lon, last.alt))
+                north, east, down = (moved / ((t - last.t_ns) * 1e-9)).tolist()
+                v_n = north, east, down
+        attitude = math.radians(m.Roll), math.radians(m.Pitch), math.radians(m.Yaw) % math.tau
+        self._true = Truth(t, t, lat, lon, m.Alt, v_n, attitude)
+        yield self._true
+
+    def _text(self, name: str, m: Message, t: int) -> Iterator[Stamped]:
+        yield Event(t, t, _INFO, str(m.Message))
+
+    def _error(self, name: str, m: Message, t: int) -> Iterator[Stamped]:
+        yield Event(t, t, _WARNING, f"the autopilot logged error {m.ECode} of subsystem {m.Subsys}")
+
+
+_TABLE: dict[str, Callable[[Messages, str, Message, int], Iterator[Stamped]]] = {
+    **dict.fromkeys(("GPS", "GPS2"), Messages._gps),
+    **dict.fromkeys(("GPA", "GPA2"), Messages._gps_accuracy),
+    **dict.fromkeys(("IMU", "IMU2", "IMU3"), Messages._imu),
+    **dict.fromkeys(("XKF1", "NKF1"), Messages._local),
+    **dict.fromkeys(("XKF2", "NKF2"), Messages._wind),
+    **dict.fromkeys(("XKF4", "NKF4"), Messages._status),
+    "ATT": Messages._attitude,
+    "ORGN": Messages._origin,
+    "POS": Messages._global,
+    "ARSP": Messages._airspeed,
+    "BARO": Messages._baro,
+    "SIM2": Messages._true_velocity,
+    "SIM": Messages._truth,
+    "MSG": Messages._text,
+    "ERR": Messages._error,
+}
+NAMES = tuple(_TABLE)
+
+
+class Dataflash:
+    """A log opened, to be iterated once. `reboots` counts the boot times that went back."""
+
+    def __init__(self, path: Path, reader: Any) -> None:
+        self.path = path
+        self.messages = self.reboots = 0
+        self._reader = reader
+        self._epoch_us = round(getattr(reader.clock, "timebase", 0.0) * 1e6)
+
+    def __iter__(self) -> Iterator[Stamped]:
+        """Records in the order of the file. LogError at a message that lacks what it always had."""
+        messages, last_us, shift_us = Messages(), -1, self._epoch_us
+        with contextlib.redirect_stderr(io.StringIO()), contextlib.redirect_stdout(io.StringIO()):
+            while (m := self._reader.recv_match(type=list(NAMES), strict=True)) is not None:
+                name, boot_us = m.get_type(), boot_time_us(m)
+                if boot_us is None:
+                    boot_us = max(last_us, 0)
+                if boot_us < last_us - _BACK_US:
+                    shift_us += last_us - boot_us  # time goes on; how long it was off is not known
+                    self.reboots += 1
+                    messages = Messages()
+                    t_ns = (shift_us + boot_us) * 1000
+                    yield Reboot(t_ns, t_ns, 1)
+                last_us = boot_us
+                self.messages += 1
+                try:
+                    yield from messages.records(name, m, (shift_us + boot_us) * 1000)
+                except (AttributeError, TypeError) as error:
+                    raise LogError(f"{self.path}: its {name} has no column {error}: no ArduPilot's") from None
+
+
+def boot_time_us(m: Message) -> int | None:
+    """A message's time since boot in all its spellings; of an old GPS that is T, TimeMS the time of week."""
+    if (us := getattr(m, "TimeUS", None)) is not None:
+        return int(us)
+    ms = getattr(m, "T", None)
+    if ms is None and not hasattr(m, "Week"):
+        ms = getattr(m, "TimeMS", None)
+    return None if ms is None else int(ms) * 1000
+
+
+def read(path: Path) -> Dataflash:
+    """Open a `.bin` or a `.log`. LogError, one sentence, if it is empty, no such log or cannot be read."""
+    from pymavlink import DFReader
+
+    try:
+        with path.open("rb") as file:
+            head = file.read(65536)
+    except OSError as error:
+        raise LogError(f"{path} cannot be read: {error.strerror}") from None
+    if not head:
+        raise LogError(f"{path} is empty: nothing was recorded")
+    binary = b"\xa3\x95\x80" in head[:4096]
+    if not binary and b"FMT," not in head:
+        raise LogError(f"{path} is no DataFlash log: no message format stands at its beginning")
+    kind = DFReader.DFReader_binary if binary else DFReader.DFReader_text
+    reader = kind.__new__(kind)  # in hand also where __init__ fails, which leaves its file open
+    try:
+        with contextlib.redirect_stderr(io.StringIO()), contextlib.redirect_stdout(io.StringIO()):
+            reader.__init__(str(path))
+    except Exception as error:  # whatever a damaged file makes the reader trip over
+        raise LogError(f"{path} is damaged beyond reading: {error or type(error).__name__}") from None
+    finally:
+        reader.filehandle.close()  # it reads a memory map
+    if not set(NAMES) & set(reader.name_to_id):
+        raise LogError(
+            f"{path} is a DataFlash log without any message that is read here: needs GPS, XKF1, ..."
+        )
+    return Dataflash(path, reader)
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def _positive(value: float) -> float | None:
+    return value if 0.0 < value < 600.0 else None  # ArduPilot's "not known" is 655.35

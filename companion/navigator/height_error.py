@@ -1,0 +1,71 @@
+"""The height error of the inertial channel against GNSS: it drifts, and it grows with a climb.
+
+The height is a barometer's in the end. Weather moves it by 5 cm a root second, and on a day 20 K off the
+standard a metre of it is 8 % off: so the error is followed together with its share of a climb, which a few
+hundred metres of climb teach. A climb without GNSS then costs what is not known of that share, no more.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from companion.navigator.inertial_track import Point
+from companion.records import Gnss, Vector3
+
+DRIFT = 0.0025  # m^2/s
+SHARE = 0.08  # one sigma of the error of a climb, as its share
+SHARE_WALK = 1.3e-7  # 1/m: in 3 km of climb the share changes by 2 %
+LEAST_M = 5.0  # one sigma of a height of GNSS, at least
+PATIENCE_NS = 10_000_000_000  # what goes on contradicting for so long is believed
+
+
+class Level(NamedTuple):
+    """Height error (m) where the channel was at height `alt` (m) at `t_ns`, and its share of a climb; their
+    covariance (m^2, m, 1). `refused_ns` is since when fixes contradict it.
+    """
+
+    error: float = 0.0
+    share: float = 0.0
+    covariance: Vector3 = (400.0, 0.0, SHARE**2)
+    t_ns: int | None = None
+    alt: float = 0.0
+    refused_ns: int | None = None
+
+
+def at(level: Level, ins: Point) -> Level:
+    """The error at the time and height of `ins`; before the first fix it is what it is everywhere."""
+    if level.t_ns is None:
+        return level
+    climb, dt = ins.position.alt - level.alt, (ins.t_ns - level.t_ns) * 1e-9
+    variance, covariance, of_share = level.covariance
+    variance += climb * (2.0 * covariance + climb * of_share) + DRIFT * max(dt, 0.0)
+    covariance += climb * of_share
+    return level._replace(
+        error=level.error + climb * level.share,
+        covariance=(variance, covariance, of_share + SHARE_WALK * abs(climb)),
+        t_ns=ins.t_ns,
+        alt=ins.position.alt,
+    )
+
+
+def learn(level: Level, record: Gnss, ins: Point, part: float, gate: float) -> Level:
+    """With the height of one fix, refused if its squared innovation is beyond `gate` times its variance.
+
+    `part` is the share of one independent fix that this one is worth, its noise being correlated.
+    """
+    first = level.t_ns is None
+    now = at(level, ins)._replace(t_ns=ins.t_ns, alt=ins.position.alt)
+    variance, covariance, of_share = now.covariance
+    noise = max(record.sigma_vertical or 0.0, LEAST_M) ** 2
+    nu = ins.position.alt - record.alt_msl - now.error
+    if not first and not nu * nu <= gate * (variance + noise):
+        since = now.refused_ns or ins.t_ns
+        if ins.t_ns - since < PATIENCE_NS:
+            return now._replace(refused_ns=since)
+        variance += nu * nu  # the claim was wrong
+    k = variance / (variance + noise / part)
+    k_share = covariance / (variance + noise / part)
+    left = ((1.0 - k) * variance, (1.0 - k) * covariance, of_share - k_share * covariance)
+    return now._replace(
+        error=now.error + k * nu, share=now.share + k_share * nu, covariance=left, refused_ns=None
+    )

@@ -1,0 +1,189 @@
+"""Strapdown reckoning: accelerometers turned by the autopilot's attitude, an inertial channel of our own.
+
+Specific force is turned to the level frame, gravity and Coriolis are added, and it is integrated over the
+earth (`nav.strapdown`), from the first fix on. The attitude is the autopilot's; the gyros carry it from one
+sample to the next of the IMU. No position and no velocity of the autopilot's comes in. Heights are pressure
+altitudes, as with air data: the vertical channel is unstable alone. What the attitude's error makes of it is
+in `tilterror`.
+
+It needs the IMU at `IMU_HZ` and the attitude at `ATTITUDE_HZ` or more, and says what it does not get. A
+sample at the end of an accelerometer's or gyro's range is not used, and none is while the vertical force,
+averaged, is not gravity's: then units or orientation are wrong. What it cannot see: vibration folded down by
+sampling, which it takes for noise.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from companion.nav.geometry import displace
+from companion.nav.strapdown import Inertial, mechanise, rotation
+from companion.navigator import air_data_channel
+from companion.navigator.inertial_track import Point
+from companion.records import Attitude, Gnss, Imu, Pressure, RsbnFix, Vector3
+
+Matrix = npt.NDArray[np.float64]
+
+G = 9.80665  # [m/s^2]
+IMU_HZ, ATTITUDE_HZ = 10.0, 2.0  # wanted at least
+LEAST = 0.7  # of which so much must come: streams are asked for again below it
+FEW = 5  # samples that tell no rate yet
+SLOWEST_S = 2.0  # a longer interval is a silence and tells no rate either
+STALE_S = 1.0  # an attitude older than this is not carried on by gyros
+BRIDGED_S = 0.3  # a silence of the IMU up to this long is nothing
+F_MAX = 0.995 * 16.0 * G  # [m/s^2] the range of common accelerometers
+W_MAX = 0.995 * math.radians(2000.0)  # [rad/s] and gyros
+VERTICAL = 0.5  # of gravity, by which the vertical force may differ from it
+VERTICAL_S = 10.0  # averaged over so long: nobody climbs 50 m/s faster after it
+
+
+class Pace(NamedTuple):
+    """How fast a record comes: time of the last, how many, their mean interval (s)."""
+
+    t_ns: int = 0
+    heard: int = 0
+    interval: float = 0.0
+
+    def with_one(self, t_ns: int) -> Pace:
+        """With one more at `t_ns`; about the last twenty count."""
+        if not self.heard:
+            return Pace(t_ns, 1)
+        dt = min((t_ns - self.t_ns) * 1e-9, SLOWEST_S)
+        gain = max(1.0 / self.heard, 0.05)
+        return Pace(t_ns, self.heard + 1, self.interval + gain * (dt - self.interval))
+
+    @property
+    def hz(self) -> float:
+        """0 before it is known."""
+        return 1.0 / self.interval if self.heard > FEW and self.interval > 0.0 else 0.0
+
+
+class Strap(NamedTuple):
+    """What is needed to go on: last sample, attitude at its time, rates, vertical specific force averaged
+    (m/s^2, down), static pressure (Pa), climb (m/s); why the last sample is of no use, and when it last was.
+    """
+
+    imu: Imu | None = None
+    C_nb: Matrix | None = None
+    imu_pace: Pace = Pace()
+    attitude_pace: Pace = Pace()
+    down: float = -G
+    static: float | None = None
+    climb: float = 0.0
+    why: str = "no IMU is heard"
+    refused_ns: int | None = None
+
+
+def sense(s: Strap, record: Attitude | Pressure) -> Strap:
+    """With one more attitude or static pressure."""
+    if isinstance(record, Pressure):
+        return s._replace(static=record.static) if 1e3 < record.static < 2e5 else s
+    C_nb = attitude_matrix(record)
+    if s.imu is not None:
+        dt = (s.imu.t_ns - record.t_ns) * 1e-9
+        C_nb = C_nb @ rotation(np.array(s.imu.w_b) * max(-STALE_S, min(dt, STALE_S)))
+    return s._replace(C_nb=C_nb, attitude_pace=s.attitude_pace.with_one(record.t_ns))
+
+
+def hear(s: Strap, record: Imu) -> Strap:
+    """With one more sample; `why` is empty where it can be used, else a sentence."""
+    before = s.imu or record
+    dt = (record.t_ns - before.t_ns) * 1e-9
+    s = s._replace(imu_pace=s.imu_pace.with_one(record.t_ns))
+    if why := _senseless(record):
+        return s._replace(why=why)
+    if s.C_nb is None:
+        return s._replace(why="no attitude is heard")
+    C_nb = s.C_nb @ rotation(0.5 * (np.array(before.w_b) + record.w_b) * min(dt, STALE_S))
+    s = s._replace(imu=record, C_nb=C_nb)
+    gain = min(dt / VERTICAL_S, 0.1)
+    s = s._replace(down=s.down + gain * (float(C_nb[2] @ record.f_b) - s.down))
+    return s._replace(why=_unfit(s))
+
+
+def begin(s: Strap, fix: Gnss | RsbnFix) -> Point | None:
+    """Where the channel begins: the first position anybody tells once there are IMU and attitude; else None.
+
+    Its velocity is that of GNSS; where the fix has none, none.
+    """
+    at = air_data_channel.first_place(fix, s.static)
+    if at is None or s.why or s.imu is None or abs(fix.t_ns - s.imu.t_ns) * 1e-9 > STALE_S:
+        return None
+    v_n = (fix.v_n if isinstance(fix, Gnss) else None) or (0.0, 0.0, 0.0)
+    dt = (s.imu.t_ns - fix.t_ns) * 1e-9
+    return Point(s.imu.t_ns, displace(*at, v_n[0] * dt, v_n[1] * dt, 0.0), (v_n[0], v_n[1], 0.0))
+
+
+def advance(before: Strap, s: Strap, last: Point) -> tuple[Strap, Point]:
+    """The point at the time of the sample heard last, from that at the sample `before`."""
+    assert before.imu is not None
+    assert before.C_nb is not None
+    assert s.imu is not None
+    dt = (s.imu.t_ns - last.t_ns) * 1e-9
+    alt, climb = air_data_channel.followed(s.static, s.climb, last.position.alt, dt)
+    f_b = 0.5 * (np.array(before.imu.f_b) + s.imu.f_b)
+    w_b = 0.5 * (np.array(before.imu.w_b) + s.imu.w_b)
+    start = Inertial(*last.position, np.array(last.v_n), before.C_nb)
+    new = mechanise(start, f_b, w_b, dt)
+    v_n: Vector3 = (float(new.v_n[0]), float(new.v_n[1]), -climb)
+    position = last.position._replace(lat=new.lat, lon=new.lon, alt=alt)
+    return s._replace(climb=climb), Point(s.imu.t_ns, position, v_n)
+
+
+def coast(s: Strap, last: Point) -> Point:
+    """The point at the time of the sample heard last after a silence: straight on."""
+    assert s.imu is not None
+    dt = (s.imu.t_ns - last.t_ns) * 1e-9
+    north, east, _ = last.v_n
+    alt = air_data_channel.pressure_altitude(s.static) if s.static else last.position.alt
+    moved = displace(*last.position, north * dt, east * dt, 0.0)
+    return Point(s.imu.t_ns, moved._replace(alt=alt), last.v_n)
+
+
+def attitude_matrix(record: Attitude) -> Matrix:
+    """C_nb (3, 3) of roll, pitch and heading: Groves (2.22)."""
+    sr, sp, sh = math.sin(record.roll), math.sin(record.pitch), math.sin(record.heading)
+    cr, cp, ch = math.cos(record.roll), math.cos(record.pitch), math.cos(record.heading)
+    return np.array(
+        [
+            [cp * ch, sr * sp * ch - cr * sh, cr * sp * ch + sr * sh],
+            [cp * sh, sr * sp * sh + cr * ch, cr * sp * sh - sr * ch],
+            [-sp, sr * cp, cr * cp],
+        ]
+    )
+
+
+def _senseless(record: Imu) -> str:
+    force, rate = max(map(abs, record.f_b)), max(map(abs, record.w_b))
+    if not math.isfinite(sum(record.f_b) + sum(record.w_b)):
+        return "the IMU sends what is no number"
+    if force > F_MAX:
+        return f"a specific force of {force:.0f} m/s^2 is at the end of an accelerometer's range"
+    if rate > W_MAX:
+        return f"an angular rate of {rate:.1f} rad/s is at the end of a gyro's range"
+    return ""
+
+
+def _unfit(s: Strap) -> str:
+    """Why nothing can be made of the sample heard last, though it makes sense alone."""
+    assert s.imu is not None
+    if min(s.imu_pace.heard, s.attitude_pace.heard) <= FEW:
+        return "the rates of IMU and attitude are not known yet"
+    if s.imu_pace.hz < LEAST * IMU_HZ or s.attitude_pace.hz < LEAST * ATTITUDE_HZ:
+        return (
+            f"IMU at {s.imu_pace.hz:.1f} Hz and attitude at {s.attitude_pace.hz:.1f} Hz are too slow, "
+            f"it takes {IMU_HZ:.0f} and {ATTITUDE_HZ:.0f} Hz"
+        )
+    silent = (s.imu.t_ns - s.attitude_pace.t_ns) * 1e-9
+    if silent > STALE_S:
+        return f"no attitude for {silent:.1f} s"
+    if abs(s.down + G) > VERTICAL * G:
+        return (
+            f"the specific force upwards averages {-s.down:.1f} m/s^2 where gravity is 9.8: "
+            "units or orientation of the IMU are wrong"
+        )
+    return ""

@@ -1,0 +1,112 @@
+"""Positions as `foxglove.LocationFix`, so that common viewers show a log on a map.
+
+It turns a record into the JSON of that schema (degrees, east-north-up) and knows nothing of files. The map is
+for people: replay and report read the records themselves. An altitude is above mean sea level where the
+ellipsoid's is not known.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import msgspec
+
+from companion.nav import earth
+from companion.records import Gnss, Solution, Stamped, Truth
+
+SCHEMA_NAME = "foxglove.LocationFix"
+
+UNKNOWN, APPROXIMATED, DIAGONAL_KNOWN, KNOWN = range(4)
+
+_time = {
+    "type": "object",
+    "title": "time",
+    "properties": {
+        "sec": {"type": "integer", "minimum": 0},
+        "nsec": {"type": "integer", "minimum": 0, "maximum": 999_999_999},
+    },
+}
+SCHEMA: dict[str, Any] = {
+    "title": SCHEMA_NAME,
+    "description": "A navigation satellite fix for any Global Navigation Satellite System",
+    "type": "object",
+    "properties": {
+        "timestamp": _time,
+        "frame_id": {"type": "string"},
+        "latitude": {"type": "number", "description": "degrees"},
+        "longitude": {"type": "number", "description": "degrees"},
+        "altitude": {"type": "number", "description": "m"},
+        "position_covariance": {
+            "type": "array",
+            "items": {"type": "number"},
+            "minItems": 9,
+            "maxItems": 9,
+            "description": "m^2, row by row, east-north-up tangent to the reported position",
+        },
+        "position_covariance_type": {
+            "title": "foxglove.PositionCovarianceType",
+            "oneOf": [
+                {"title": "UNKNOWN", "const": UNKNOWN},
+                {"title": "APPROXIMATED", "const": APPROXIMATED},
+                {"title": "DIAGONAL_KNOWN", "const": DIAGONAL_KNOWN},
+                {"title": "KNOWN", "const": KNOWN},
+            ],
+        },
+    },
+}
+
+
+class LocationFix(msgspec.Struct, frozen=True, gc=False):
+    """One point of the map; field names and units are the schema's, not ours."""
+
+    timestamp: dict[str, int]
+    frame_id: str
+    latitude: float
+    longitude: float
+    altitude: float
+    position_covariance: tuple[float, ...] = (0.0,) * 9
+    position_covariance_type: int = UNKNOWN
+
+
+def fixes(record: Stamped, unix_ns: int) -> list[tuple[str, LocationFix]]:
+    """(topic, point) of every position `record` holds: a solution holds its own and the inertial one.
+
+    `unix_ns` is the wall-clock time of the record's validity.
+    """
+    stamp = dict(zip(("sec", "nsec"), divmod(max(unix_ns, 0), 1_000_000_000), strict=True))
+    match record:
+        case Truth():
+            return [("/map/truth", _fix(stamp, record.lat, record.lon, record.alt))]
+        case Gnss():
+            alt = record.alt_msl if record.alt is None else record.alt
+            h, v = record.sigma_horizontal, record.sigma_vertical
+            if h is None or v is None:
+                return [("/map/gnss", _fix(stamp, record.lat, record.lon, alt))]
+            covariance = (h * h, 0.0, 0.0, 0.0, h * h, 0.0, 0.0, 0.0, v * v)
+            return [("/map/gnss", _fix(stamp, record.lat, record.lon, alt, covariance, DIAGONAL_KNOWN))]
+        case Solution():
+            nn, ne, nd, ee, ed, dd = record.covariance
+            covariance = (ee, ne, -ed, ne, nn, -nd, -ed, -nd, dd)
+            # error = INS - truth, so the inertial channel stands at the corrected position plus the error
+            R_N, R_E = earth.radii(record.lat)
+            north, east = record.error_n
+            lat = record.lat + north / (R_N + record.alt_msl)
+            lon = record.lon + east / ((R_E + record.alt_msl) * max(math.cos(record.lat), 1e-9))
+            return [
+                ("/map/solution", _fix(stamp, record.lat, record.lon, record.alt_msl, covariance, KNOWN)),
+                ("/map/inertial", _fix(stamp, lat, lon, record.alt_msl)),
+            ]
+        case _:
+            return []
+
+
+def _fix(
+    stamp: dict[str, int],
+    lat: float,
+    lon: float,
+    alt: float,
+    covariance: tuple[float, ...] = (0.0,) * 9,
+    kind: int = UNKNOWN,
+) -> LocationFix:
+    return LocationFix(stamp, "", math.degrees(lat), math.degrees(lon), alt, covariance, kind)

@@ -1,0 +1,44 @@
+"""`companion log recover` writes over nothing that is there."""
+
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from companion.analysis.log_command import group
+from companion.records import Event
+from companion.storage.flight_log import Writer
+
+
+@pytest.fixture
+def whole(tmp_path: Path) -> bytes:
+    log = tmp_path / "written.mcap"
+    with Writer(log, metadata={}, start_unix_ns=10**18, start_ns=0, block=True) as writer:
+        for k in range(100):
+            writer.record(Event(k, k, 6, "hello"))
+    return log.read_bytes()
+
+
+@pytest.mark.parametrize("damage", ["torn", "changed"])
+def test_a_copy_that_is_there_is_not_written_over(damage: str, whole: bytes, tmp_path: Path) -> None:
+    log, copy = tmp_path / "flight.mcap", tmp_path / "flight.recovered.mcap"
+    at = whole.index(b"zstd") + 40  # within its chunk
+    log.write_bytes(whole[:at] if damage == "torn" else whole[:at] + bytes(20) + whole[at + 20 :])
+    copy.write_bytes(b"dear")
+    done = CliRunner().invoke(group, ["recover", str(log)])
+    assert (done.exit_code, done.stderr) == (1, f"{copy} is there already: move it away first\n")
+    assert copy.read_bytes() == b"dear"
+    copy.unlink()
+    assert CliRunner().invoke(group, ["recover", str(log)]).exit_code == 0
+    assert copy.exists()
+
+
+def test_a_log_that_needs_no_copy_minds_none(whole: bytes, tmp_path: Path) -> None:
+    log, copy = tmp_path / "flight.mcap", tmp_path / "flight.recovered.mcap"
+    copy.write_bytes(b"dear")
+    log.write_bytes(whole)
+    assert "is whole: 100 messages" in CliRunner().invoke(group, ["recover", str(log)]).stdout
+    log.unlink()
+    (tmp_path / "flight.mcap.active").write_bytes(whole[:-30])
+    assert CliRunner().invoke(group, ["recover", f"{log}.active"]).exit_code == 0
+    assert log.exists() and copy.read_bytes() == b"dear"

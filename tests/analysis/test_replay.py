@@ -1,0 +1,122 @@
+"""Foreign logs run through the navigator to their end, and come out as a log of ours."""
+
+import json
+import shutil
+from collections import Counter
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from companion.analysis import replay
+from companion.config import Config
+from companion.records import Event, Reboot, Reset
+from companion.storage import flight_log
+from companion.storage.reader import LogError
+
+DATA = Path(__file__).parents[1] / "data"
+SHARED = Path(__file__).parents[2].parent / "shared" / "data"
+CUT = DATA / "dronekit_copter_cut.tlog"
+
+# messages, corrupt, unknown, torn, reboots
+REAL = {
+    "dronekit_copter/flight.tlog": (75_477, 1_314, 0, 19, 1),
+    "autopilot_sitl/plane_gps_loss.tlog": (49_121, 0, 0, 0, 0),
+    "autopilot_sitl/plane_gps_input_aid.tlog": (52_175, 0, 0, 0, 0),
+    "autopilot_sitl/plane_wind_change.tlog": (88_209, 0, 0, 0, 0),
+    "autopilot_sitl/px4_global_position_sensor.tlog": (88_993, 0, 370, 0, 0),
+}
+
+
+def replayed(log: Path, output: Path) -> dict:
+    done = CliRunner().invoke(replay.command, [str(log), "-o", str(output), "--json"])
+    assert done.exit_code == 0, done.output
+    return json.loads(done.stdout)
+
+
+def test_a_damaged_log_with_a_reboot_is_read_to_the_end(tmp_path: Path) -> None:
+    found = replayed(CUT, tmp_path / "out.mcap")
+    assert [found[k] for k in ("messages", "corrupt", "unknown", "torn", "reboots")] == [841, 24, 0, 13, 1]
+    kinds = Counter(type(entry.value) for entry in flight_log.read(tmp_path / "out.mcap"))
+    assert kinds[Reboot] == 1
+    assert sum(kinds.values()) > 265  # every record that was read, and what came out
+    resets = [e for e in flight_log.read(tmp_path / "out.mcap") if isinstance(e.value, Reset)]
+    assert [(e.topic, e.value.what) for e in resets] == [
+        ("/link/Reset", "flight"),
+        ("/out/Reset", "navigator"),
+    ]
+
+
+def test_what_a_replay_wrote_replays_bit_for_bit(tmp_path: Path) -> None:
+    replayed(CUT, tmp_path / "out.mcap")
+    found = replay.replay_own(tmp_path / "out.mcap", replay.configuration(tmp_path / "out.mcap"))
+    assert found.different == 0 and found.compared
+
+
+def test_the_configuration_travels_with_the_log(tmp_path: Path) -> None:
+    config_file = tmp_path / "mine.toml"
+    config_file.write_text("[gnss]\nsigma_m = 7.5\n")
+    log = tmp_path / "out.mcap"
+    done = CliRunner().invoke(replay.command, [str(CUT), "-o", str(log), "--config", str(config_file)])
+    assert done.exit_code == 0, done.output
+    assert replay.configuration(log).gnss.sigma_m == 7.5
+    assert replay.configuration(log) != Config()
+
+
+def test_the_counts_are_printed(tmp_path: Path) -> None:
+    done = CliRunner().invoke(replay.command, [str(CUT), "-o", str(tmp_path / "out.mcap")])
+    assert "841 messages, 24 corrupt" in done.stdout and "1 reboots" in done.stdout
+    assert str(tmp_path / "out.mcap") in done.stdout
+
+
+@pytest.mark.shared
+@pytest.mark.parametrize("name", REAL)
+def test_whole_flights_give_solutions(name: str, tmp_path: Path) -> None:
+    log = SHARED / name
+    if not log.exists():
+        pytest.skip("the recordings do not stand beside the repository")
+    found = replayed(log, tmp_path / "out.mcap")
+    assert tuple(found[k] for k in ("messages", "corrupt", "unknown", "torn", "reboots")) == REAL[name]
+    assert found["outputs"]["Solution"] > 900  # at most 5 Hz: from three to ten minutes
+    info = flight_log.info(tmp_path / "out.mcap")
+    assert info.closed and info.counts["/out/Solution"] == found["outputs"]["Solution"]
+
+
+def test_a_log_without_inputs_and_a_torn_one_are_told(tmp_path: Path) -> None:
+    empty = tmp_path / "empty.mcap"
+    with flight_log.Writer(empty, metadata={}, start_unix_ns=10**18, start_ns=0, block=True) as log:
+        log.record(Event(1, 1, 6, "hello"))
+    done = CliRunner().invoke(replay.command, [str(empty)])
+    assert isinstance(done.exception, LogError) and "nothing to replay" in str(done.exception)
+    replayed(CUT, tmp_path / "out.mcap")
+    whole = (tmp_path / "out.mcap").read_bytes()
+    (tmp_path / "torn.mcap").write_bytes(whole[:-100])
+    done = CliRunner().invoke(replay.command, [str(tmp_path / "torn.mcap")])
+    assert "the log was not closed" in done.output
+    assert "not closed" not in CliRunner().invoke(replay.command, [str(tmp_path / "out.mcap")]).output
+
+
+@pytest.mark.parametrize("how", ["itself", "symbolic link", "hard link"])
+def test_the_log_that_is_read_is_not_written_over(how: str, tmp_path: Path) -> None:
+    log, output = tmp_path / "flight.tlog", tmp_path / "other.mcap"
+    shutil.copy(CUT, log)
+    if how == "itself":
+        output = log
+    elif how == "symbolic link":
+        output.symlink_to(log)
+    else:
+        output.hardlink_to(log)
+    done = CliRunner().invoke(replay.command, [str(log), "-o", str(output)])
+    assert isinstance(done.exception, LogError)
+    assert str(done.exception) == f"{output} is read (as {log}) and not written over: give another name"
+    assert log.read_bytes() == CUT.read_bytes()
+
+
+def test_a_log_of_ours_is_not_written_over_by_its_replay(tmp_path: Path) -> None:
+    log = tmp_path / "out.mcap"
+    replayed(CUT, log)
+    before = log.read_bytes()
+    for changes in ([], ["--with", "gnss.sigma_m=3"]):
+        done = CliRunner().invoke(replay.command, [str(log), "-o", str(log), *changes])
+        assert isinstance(done.exception, LogError) and "not written over" in str(done.exception)
+    assert log.read_bytes() == before

@@ -1,0 +1,132 @@
+"""The output profiles: what goes out by default, and what the autopilot must have for it."""
+
+from __future__ import annotations
+
+import itertools
+
+import msgspec
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from companion.config import Config, ConfigError, InertialConfig, OutputConfig, load
+from companion.config.profiles import MESSAGES, PROFILES
+from companion.config.required_parameters import needed
+from companion.config.validate import conflicts
+
+STATUS = {"NAVIGATION_STATUS": 1.0}
+
+
+def told(*pairs: str) -> Config:
+    return load(pairs=pairs, environment={})
+
+
+def sent(config: Config) -> dict[str, float]:
+    return {name: hz for name, hz in config.output.rates_hz.items() if hz > 0.0}
+
+
+@pytest.mark.parametrize(
+    ("pairs", "rates"),
+    [
+        ([], {}),
+        (["output.profile=monitor"], {}),
+        (["output.profile=custom"], {}),
+        (["output.profile=custom", "output.vision_hz=6"], {"VISION_POSITION_ESTIMATE": 6.0}),
+        (["output.profile=ardupilot"], {"ODOMETRY": 10.0}),
+        (["output.profile=ardupilot", "output.odometry_hz=4"], {"ODOMETRY": 4.0}),
+        (["output.profile=ardupilot", "output.odometry_hz=0"], {}),
+        (["output.profile=ardupilot", "output.via=vision"], {"VISION_POSITION_ESTIMATE": 10.0}),
+        (["output.profile=ardupilot", "output.via=gps_input"], {"GPS_INPUT": 10.0}),
+        (["output.profile=ardupilot", "output.via=external_position"], {"COMMAND_INT": 1.0}),
+        (["output.profile=px4"], {"GLOBAL_POSITION_SENSOR": 2.0}),
+        (["output.profile=px4", "output.via=odometry"], {"ODOMETRY": 10.0}),
+        (["output.profile=px4", "output.via=vision"], {"VISION_POSITION_ESTIMATE": 10.0}),
+        (["output.profile=px4", "output.via=external_position"], {"COMMAND_INT": 0.5}),
+    ],
+)
+def test_what_goes_out(pairs: list[str], rates: dict[str, float]) -> None:
+    config = told(*pairs)
+    assert sent(config) == STATUS | rates
+    assert config.output.feeds_estimator == bool(rates)
+    assert config.output.pace_hz == max(5.0, *rates.values(), 0.0)
+
+
+VISO = {"VISO_TYPE": 1, "EK3_SRC2_POSXY": 6, "EK3_SRC2_VELXY": 0, "EK3_SRC2_POSZ": 1, "EK3_SRC2_VELZ": 0}
+VISO["EK3_SRC2_YAW"] = 1
+
+
+@pytest.mark.parametrize(
+    ("pairs", "parameters", "reboot"),
+    [
+        ([], {}, set()),
+        (["output.profile=ardupilot"], VISO, {"VISO_TYPE"}),
+        (["output.profile=ardupilot", "output.via=vision"], VISO, {"VISO_TYPE"}),
+        (
+            ["output.profile=ardupilot", "output.via=gps_input"],
+            {"GPS2_TYPE": 14, "GPS_AUTO_SWITCH": 1, "EK3_GPS_CHECK": 23},
+            {"GPS2_TYPE"},
+        ),
+        (["output.profile=ardupilot", "output.via=external_position"], {}, set()),
+        (
+            ["output.profile=px4", "output.global_position_sensor_id=3"],
+            {"EKF2_AGP0_ID": 3, "EKF2_AGP0_CTRL": 1},
+            {"EKF2_AGP0_ID", "EKF2_AGP0_CTRL"},
+        ),
+        (["output.profile=px4", "output.via=odometry"], {"EKF2_EV_CTRL": 1}, set()),
+        (["output.profile=px4", "output.via=vision"], {"EKF2_EV_CTRL": 1}, set()),
+        (["output.profile=px4", "output.via=external_position"], {}, set()),
+    ],
+)
+def test_what_the_autopilot_must_have(
+    pairs: list[str], parameters: dict[str, float], reboot: set[str]
+) -> None:
+    found = needed(told(*pairs))
+    assert {p.name: p.value for p in found} == parameters
+    assert len(found) == len(parameters)
+    assert {p.name for p in found if p.reboot} == reboot
+
+
+def test_custom_needs_what_the_make_that_is_heard_needs() -> None:
+    config = told("output.profile=custom", "output.odometry_hz=5")
+    assert {p.name: p.value for p in needed(config, "ardupilot")} == VISO
+    assert {p.name: p.value for p in needed(config, "px4")} == {"EKF2_EV_CTRL": 1}
+    assert needed(config) == needed(config, "other") == ()
+
+
+outputs = st.builds(
+    OutputConfig,
+    profile=st.sampled_from(list(PROFILES)),
+    via=st.sampled_from(["auto", *MESSAGES]),
+    odometry_hz=st.sampled_from([-1.0, 0.0, 5.0]),
+    vision_hz=st.sampled_from([-1.0, 0.0, 5.0]),
+    gps_input_hz=st.sampled_from([-1.0, 0.0, 5.0]),
+    global_position_sensor_hz=st.sampled_from([-1.0, 0.0, 2.0]),
+    external_position_hz=st.sampled_from([-1.0, 0.0, 0.5]),
+)
+sources = st.sampled_from(["auto", "local_position", "air_data"])
+
+
+@settings(deadline=None, max_examples=300)
+@given(output=outputs, source=sources)
+def test_no_configuration_feeds_an_autopilot_its_own_position(output: OutputConfig, source: str) -> None:
+    config = Config(output=output, inertial=InertialConfig(source=source))
+    if not list(conflicts(config)) and output.feeds_estimator:
+        assert config.channel != "local_position"
+        assert output.profile != "monitor"
+
+
+@pytest.mark.parametrize("profile", ["ardupilot", "px4"])
+def test_only_the_operator_s_word_makes_the_local_position_independent(profile: str) -> None:
+    pairs = [f"output.profile={profile}", "inertial.source=local_position"]
+    with pytest.raises(ConfigError, match=r"inertial\.independent"):
+        told(*pairs)
+    assert told(*pairs, "inertial.independent=true").channel == "local_position"
+
+
+def test_every_profile_can_be_meant_with_each_of_its_ways() -> None:
+    for name, via in itertools.chain.from_iterable(
+        [(name, via) for via in profile.ways] for name, profile in PROFILES.items()
+    ):
+        config = msgspec.structs.replace(Config(), output=OutputConfig(profile=name, via=via))
+        assert not list(conflicts(config))
+        assert list(sent(config)) == [MESSAGES[via], "NAVIGATION_STATUS"]

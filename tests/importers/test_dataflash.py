@@ -1,0 +1,210 @@
+"""An ArduPilot's onboard log becomes records. The logs are written here byte by byte: none was recorded."""
+
+import math
+import pathlib
+import struct
+from collections.abc import Callable
+
+import pytest
+
+from companion import records as r
+from companion.importers import dataflash, sources
+from companion.storage.reader import LogError
+
+CODES = {"B": "B", "I": "I", "Q": "Q", "H": "H", "b": "b", "f": "f", "d": "d", "c": "h", "L": "i"}
+CODES |= {"C": "H", "e": "i", "n": "4s", "N": "16s", "Z": "64s"}
+SCALES = {"c": 100, "C": 100, "e": 100, "L": 1e7}
+#: Format and columns as ArduPilot 4.x writes them.
+FORMATS = {
+    "GPS": ("QBBIHBcLLeffffB", "TimeUS,I,Status,GMS,GWk,NSats,HDop,Lat,Lng,Alt,Spd,GCrs,VZ,Yaw,U"),
+    "GPA": ("QBCCCCfBIHfH", "TimeUS,I,VDop,HAcc,VAcc,SAcc,YAcc,VV,SMS,Delta,Und,RTCMFU"),
+    "IMU": ("QBffffff", "TimeUS,I,GyrX,GyrY,GyrZ,AccX,AccY,AccZ"),
+    "ATT": ("Qccccff", "TimeUS,DesRoll,Roll,DesPitch,Pitch,DesYaw,Yaw"),
+    "XKF1": ("QBccCfffffffccce", "TimeUS,C,Roll,Pitch,Yaw,VN,VE,VD,dPD,PN,PE,PD,GX,GY,GZ,OH"),
+    "XKF2": ("QBcc", "TimeUS,C,VWN,VWE"),
+    "XKF4": ("QBcIB", "TimeUS,C,SP,SS,PI"),
+    "ORGN": ("QBLLe", "TimeUS,Type,Lat,Lng,Alt"),
+    "POS": ("QLLfff", "TimeUS,Lat,Lng,Alt,RelHomeAlt,RelOriginAlt"),
+    "BARO": ("QBfc", "TimeUS,I,Press,Temp"),
+    "ARSP": ("QBffc", "TimeUS,I,Airspeed,DiffPress,Temp"),
+    "SIM": ("QccCfLL", "TimeUS,Roll,Pitch,Yaw,Alt,Lat,Lng"),
+    "SIM2": ("Qffffff", "TimeUS,PN,PE,PD,VN,VE,VD"),
+    "MSG": ("QZ", "TimeUS,Message"),
+}
+TYPES = {name: 130 + k for k, name in enumerate(FORMATS)}
+GWK, GMS = 2300, 100_000_000
+UNIX_S = 315964800 + GWK * 604800 + GMS / 1000 - 18  # as of leap seconds since 2017
+
+
+def packed(kind: int, layout: str, values: tuple[object, ...]) -> bytes:
+    raw = [
+        v.encode() if isinstance(v, str) else round(v * SCALES[c]) if c in SCALES else v  # type: ignore[operator]
+        for c, v in zip(layout, values, strict=True)
+    ]
+    return b"\xa3\x95" + bytes([kind]) + struct.pack("<" + "".join(CODES[c] for c in layout), *raw)
+
+
+def definitions() -> bytes:
+    fmt = [("FMT", 128, "BBnNZ", "Type,Length,Name,Format,Columns")]
+    fmt += [(name, TYPES[name], layout, columns) for name, (layout, columns) in FORMATS.items()]
+    out = b""
+    for name, kind, layout, columns in fmt:
+        size = 3 + struct.calcsize("<" + "".join(CODES[c] for c in layout))
+        out += packed(128, "BBnNZ", (kind, size, name, layout, columns))
+    return out
+
+
+def message(name: str, *values: object) -> bytes:
+    return packed(TYPES[name], FORMATS[name][0], values)
+
+
+def gps(us: int, ms: int, lat: float = 45.0, status: int = 3, receiver: int = 0) -> bytes:
+    return message(
+        *("GPS", us, receiver, status, ms, GWK, 10, 0.8, lat, 7.0, 300.0, 10.0, 90.0, -1.0, 0.0, 1)
+    )
+
+
+def local(us: int, north: float, lane: int = 0) -> bytes:
+    return message("XKF1", us, lane, 0, 0, 0, 1.0, 2.0, 3.0, 0.0, north, 20.0, -30.0, 0, 0, 0, 0)
+
+
+LOG = [
+    gps(1_000_000, GMS),
+    message("GPA", 1_000_000, 0, 1.2, 0.9, 1.5, 0.3, 0.0, 1, 0, 0, 0.0, 0),
+    message("ORGN", 1_010_000, 0, 45.0, 7.0, 290.0),
+    message("ORGN", 1_010_000, 1, 44.0, 6.0, 280.0),
+    message("IMU", 1_020_000, 1, 0.1, 0.2, 0.3, 0.4, 0.5, -9.8),
+    message("ATT", 1_030_000, 0, 10.0, 0, -5.0, 0.0, 350.0),
+    message("XKF4", 1_040_000, 0, 0.25, 0x3F | 1 << 14, 1),
+    local(1_050_000, 10.0, lane=1),
+    local(1_050_000, 99.0, lane=0),
+    message("XKF2", 1_050_000, 1, 3.0, -4.0),
+    message("POS", 1_060_000, 45.001, 7.001, 310.0, 10.0, 20.0),
+    message("ARSP", 1_070_000, 0, 21.0, 250.0, 15.0),
+    message("BARO", 1_080_000, 0, 97_000.0, 20.0),
+    message("SIM2", 1_090_000, 0.0, 0.0, 0.0, 11.0, 12.0, 13.0),
+    message("SIM", 1_090_000, 1.0, 2.0, 90.0, 305.0, 45.0, 7.0),
+    message("MSG", 1_100_000, "Throttle armed"),
+    gps(1_200_000, GMS + 200, 45.00001),
+]
+
+
+def write(tmp_path: pathlib.Path, *parts: bytes, name: str = "flight.bin") -> pathlib.Path:
+    path = tmp_path / name
+    path.write_bytes(b"".join(parts))
+    return path
+
+
+def test_every_message_becomes_its_record(tmp_path: pathlib.Path) -> None:
+    source = sources.open_source(write(tmp_path, definitions(), *LOG))
+    heard = list(source)
+    kinds = [type(record) for record in heard]
+    assert kinds == [
+        *(r.Gnss, r.LocalOrigin, r.Imu, r.Attitude, r.LocalPosition, r.Wind, r.GlobalPosition),
+        *(r.AirData, r.Pressure, r.Truth, r.Event, r.Gnss),
+    ]
+    by = {type(record): record for record in heard}
+    first, second = heard[0], heard[-1]
+    assert isinstance(first, r.Gnss) and isinstance(second, r.Gnss)
+    assert first.t_ns * 1e-9 == pytest.approx(UNIX_S, abs=1.0)
+    assert second.t_ns - first.t_ns == 200_000_000 and not second.repeats(first)
+    assert (first.lat, first.alt_msl, first.fix) == (pytest.approx(math.radians(45.0)), 300.0, 3)
+    assert first.v_n == pytest.approx((0.0, 10.0, -1.0), abs=1e-6)
+    assert (second.sigma_horizontal, second.sigma_vertical, second.sigma_velocity) == (0.9, 1.5, 0.3)
+    assert by[r.LocalOrigin].alt_msl == 290.0  # type: ignore[attr-defined]
+    assert by[r.LocalPosition].x_n == (10.0, 20.0, -30.0)  # type: ignore[attr-defined]
+    assert by[r.GlobalPosition].v_n == (1.0, 2.0, 3.0)  # type: ignore[attr-defined]
+    assert by[r.Attitude].heading == pytest.approx(math.radians(350.0))  # type: ignore[attr-defined]
+    assert by[r.Wind].v_n == (3.0, -4.0, 0.0)  # type: ignore[attr-defined]
+    assert (by[r.Pressure].static, by[r.Pressure].differential) == (97_000.0, 250.0)  # type: ignore[attr-defined]
+    assert by[r.Truth].v_n == (11.0, 12.0, 13.0)  # type: ignore[attr-defined]
+    assert by[r.Event].text == "Throttle armed"  # type: ignore[attr-defined]
+    assert source.summary().records == len(heard)
+
+
+def test_the_lane_told_is_the_primary_one(tmp_path: pathlib.Path) -> None:
+    """Before any XKF4 lane 0; then the one it names, whose status is told as MAVLink's flags."""
+    status = message("XKF4", 1_050_000, 1, 0.25, 0x3F | 1 << 14, 1)
+    parts = [
+        gps(1_000_000, GMS),
+        local(1_040_000, 1.0),
+        status,
+        local(1_060_000, 2.0, 1),
+        local(1_070_000, 3.0),
+    ]
+    heard = list(sources.open_source(write(tmp_path, definitions(), *parts)))
+    assert [h.x_n[0] for h in heard if isinstance(h, r.LocalPosition)] == [1.0, 2.0]
+    (found,) = [h for h in heard if isinstance(h, r.FilterStatus)]
+    assert (found.flags, found.gnss_glitch, found.position_ratio) == (0x3F | 32768, True, 0.25)
+
+
+def test_truth_without_velocity_gets_that_of_its_positions(tmp_path: pathlib.Path) -> None:
+    parts = [
+        message("SIM", us, 0.0, 0.0, 0.0, 100.0, lat, 7.0)
+        for us, lat in ((1_000_000, 45.0), (2_000_000, 45.0001))
+    ]
+    heard = [h for h in sources.open_source(write(tmp_path, definitions(), *parts)) if isinstance(h, r.Truth)]
+    assert heard[0].v_n == (0.0, 0.0, 0.0)
+    assert heard[1].v_n == pytest.approx((11.11, 0.0, 0.0), abs=0.02)
+
+
+def test_a_reboot_splits_the_log_and_time_goes_on(tmp_path: pathlib.Path) -> None:
+    parts = [*LOG, gps(900, GMS + 50_000), local(5_000_000, 1.0), gps(6_000_000, GMS + 56_000)]
+    source = sources.open_source(write(tmp_path, definitions(), *parts))
+    heard = list(source)
+    assert sum(isinstance(record, r.Reboot) for record in heard) == source.summary().reboots == 1
+    times = [record.t_ns for record in heard]
+    assert times == sorted(times)
+
+
+def test_a_torn_log_is_read_up_to_where_it_is_torn(tmp_path: pathlib.Path) -> None:
+    whole = definitions() + b"".join(LOG)
+    heard = list(sources.open_source(write(tmp_path, whole[:-20])))
+    assert len([h for h in heard if isinstance(h, r.Gnss)]) == 1
+    damaged = definitions() + LOG[0] + b"\x00" * 40 + b"".join(LOG[1:])
+    assert len([h for h in sources.open_source(write(tmp_path, damaged)) if isinstance(h, r.Gnss)]) == 2
+
+
+def test_the_text_form_says_the_same(tmp_path: pathlib.Path) -> None:
+    lines = ["FMT, 128, 89, FMT, BBnNZ, Type,Length,Name,Format,Columns"]
+    lines += [f"FMT, {TYPES[n]}, 50, {n}, {lay}, {col}" for n, (lay, col) in FORMATS.items()]
+    lines += ["GPS, 1000000, 0, 3, 100000000, 2300, 10, 0.80, 45.0, 7.0, 300.0, 10.0, 90.0, -1.0, 0.0, 1"]
+    lines += ["XKF1, 1050000, 0, 0, 0, 0, 1.0, 2.0, 3.0, 0, 10.0, 20.0, -30.0, 0, 0, 0, 0", ""]
+    text = list(sources.open_source(write(tmp_path, "\n".join(lines).encode(), name="flight.log")))
+    binary = list(
+        sources.open_source(write(tmp_path, definitions(), gps(1_000_000, GMS), local(1_050_000, 10.0)))
+    )
+    assert [type(record) for record in text] == [r.Gnss, r.LocalPosition]
+    assert text[1] == binary[1]
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"", "is empty"),
+        (bytes(range(200)) * 10, "no DataFlash log"),
+        (b"FMT, nonsense\n" * 5, "damaged beyond reading|without any message"),
+        (packed(128, "BBnNZ", (128, 89, "FMT", "BBnNZ", "Type,Length,Name,Format,Columns")), "without any"),
+    ],
+)
+def test_what_is_no_log_is_refused_in_a_sentence(
+    tmp_path: pathlib.Path, content: bytes, words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(LogError, match=words) as caught:
+        sources.open_source(write(tmp_path, content))
+    assert "\n" not in str(caught.value)
+    assert capsys.readouterr() == ("", "")
+
+
+def test_a_log_that_lacks_a_column_says_which(tmp_path: pathlib.Path) -> None:
+    wrong = packed(128, "BBnNZ", (140, 15, "XKF1", "Qf", "TimeUS,VN"))
+    log = wrong + b"\xa3\x95" + bytes([140]) + struct.pack("<Qf", 1_000_000, 1.0)
+    with pytest.raises(LogError, match="XKF1 has no column VE"):
+        list(dataflash.read(write(tmp_path, definitions()[:89], log)))
+
+
+def test_a_missing_log_is_said_to_be_missing(tmp_path: pathlib.Path) -> None:
+    readers: list[Callable[[pathlib.Path], object]] = [sources.open_source, dataflash.read]
+    for read in readers:
+        with pytest.raises(LogError, match=r"no such log|No such file"):
+            read(tmp_path / "none.bin")

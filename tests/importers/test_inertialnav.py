@@ -1,0 +1,112 @@
+"""The recordings of the InertialNav project: tables with names and without become records."""
+
+import io
+import math
+import pathlib
+import zipfile
+
+import numpy as np
+import pytest
+from scipy.io import savemat
+
+from companion import records as r
+from companion.importers import sources
+from companion.storage.reader import LogError
+
+SHARED = pathlib.Path(__file__).parents[2].parent / "shared" / "data" / "inertialnav"
+
+
+def labels(names: str) -> np.ndarray[tuple[int, ...], np.dtype[np.object_]]:
+    return np.array([[name] for name in names.split()], dtype=object)
+
+
+def test_tables_with_names_are_an_ardupilots_messages(tmp_path: pathlib.Path) -> None:
+    path = tmp_path / "log.mat"
+    gps = "LineNo Status TimeMS Week NSats HDop Lat Lng RelAlt Alt Spd GCrs VZ T"
+    tables = {
+        "GPS": [[1, 3, 5000, 1768, 7, 2.0, -37.9, 144.7, 0.0, 16.0, 2.0, 90.0, 0.5, 13_300.0]],
+        "IMU": [[2, 13_200.0, 0.1, 0.2, 0.3, 1.0, 2.0, -9.8], [3, 13_400.0, 0.1, 0.2, 0.3, 1.0, 2.0, -9.7]],
+    }
+    content = {name: np.array(rows, dtype=float) for name, rows in tables.items()}
+    named = {"GPS_label": labels(gps), "IMU_label": labels("LineNo TimeMS GyrX GyrY GyrZ AccX AccY AccZ")}
+    savemat(path, content | named)
+    first, fix, last = sources.open_source(path)
+    assert isinstance(first, r.Imu) and isinstance(fix, r.Gnss) and isinstance(last, r.Imu)
+    assert [record.t_ns for record in (first, fix, last)] == [13_200_000_000, 13_300_000_000, 13_400_000_000]
+    assert first.f_b == (1.0, 2.0, -9.8) and first.w_b == (0.1, 0.2, 0.3)
+    assert (fix.lat, fix.fix, fix.stamp_us) == (math.radians(-37.9), 3, 1768 * 604_800_000_000 + 5_000_000)
+    assert fix.v_n == pytest.approx((0.0, 2.0, 0.5), abs=1e-12)
+
+
+def tables(glitch: float = 0.0) -> dict[str, str]:
+    """Ten minutes of flight eastwards at 10 m/s, GNSS `glitch` metres aside for a second in it."""
+
+    def text(rows: list[list[float]]) -> str:
+        out = io.StringIO()
+        np.savetxt(out, rows)
+        return out.getvalue()
+
+    metre = 1.0 / (6_371_000.0 * math.cos(math.radians(40.0))) * 180.0 / math.pi
+    onboard, raw = [], []
+    for k in range(1200):
+        t = 50.0 * k
+        where = [40.0, -105.0 + 0.01 * t * metre, 1800.0, 0.0, 10.0, 0.0]
+        onboard.append([t, *where])
+        if k % 4 == 0:
+            off = glitch if 30_000 <= t < 31_000 else 0.0
+            raw.append([t, where[0] + off * metre, *where[1:]])
+    imu = [[50.0 * k, 50.0 * k, 0.0, 0.0, 0.0, 0.0, 0.0, -9.8] for k in range(1200)]
+    return {"GPOSonboard.txt": text(onboard), "GPSraw.txt": text(raw), "IMU.txt": text(imu)}
+
+
+def zipped(path: pathlib.Path, members: dict[str, str]) -> pathlib.Path:
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, content in members.items():
+            archive.writestr(name, content)
+    return path
+
+
+def test_tables_without_names_are_read_zipped_or_not(tmp_path: pathlib.Path) -> None:
+    heard = list(sources.open_source(zipped(tmp_path / "log.zip", tables())))
+    assert not any(isinstance(record, r.Event) for record in heard)
+    last = [record for record in heard if isinstance(record, r.LocalPosition)][-1]
+    assert last.x_n == pytest.approx((0.0, 599.5, 0.0), abs=2.0)
+    assert [record.t_ns for record in heard] == sorted(record.t_ns for record in heard)
+    for name, content in tables().items():
+        (tmp_path / name).write_text(content)
+    assert list(sources.open_source(tmp_path)) == heard
+
+
+def test_a_glitch_in_them_is_an_event(tmp_path: pathlib.Path) -> None:
+    heard = list(sources.open_source(zipped(tmp_path / "log.zip", tables(20.0))))
+    (event,) = [record for record in heard if isinstance(record, r.Event)]
+    assert event.t_ns == 30_000_000_000 and event.text.startswith("GNSS glitch of 0.8 s")
+
+
+def test_what_is_missing_or_damaged_is_said(tmp_path: pathlib.Path) -> None:
+    lacking = {name: text for name, text in tables().items() if name != "GPSraw.txt"}
+    narrow = tables() | {"IMU.txt": "1 2 3\n4 5 6\n"}
+    damaged = tables() | {"IMU.txt": "1 2 three\n"}
+    for members, words in (
+        (lacking, "holds no GPSraw.txt"),
+        (narrow, "has 3 columns"),
+        (damaged, "damaged at IMU"),
+    ):
+        with pytest.raises(LogError, match=words) as caught:
+            sources.open_source(zipped(tmp_path / "log.zip", members))
+        assert "\n" not in str(caught.value)
+    savemat(tmp_path / "other.mat", {"x": np.ones(3)})
+    with pytest.raises(LogError, match="holds no ArduPilot table"):
+        sources.open_source(tmp_path / "other.mat")
+
+
+@pytest.mark.shared
+def test_the_real_recordings_are_read() -> None:
+    if not SHARED.exists():
+        pytest.skip("the recordings do not stand beside the repository")
+    plane = list(sources.open_source(SHARED / "TestLog2.mat"))
+    assert sum(isinstance(record, r.Imu) for record in plane) == 30_650
+    assert sum(isinstance(record, r.Gnss) for record in plane) == 3050
+    quad = list(sources.open_source(SHARED / "f450_glitch_log.zip"))
+    (glitch,) = [record for record in quad if isinstance(record, r.Event)]
+    assert 126.2 < glitch.t_ns * 1e-9 < 127.7

@@ -1,0 +1,186 @@
+"""A PX4's onboard log becomes records. The logs are written here by the format's public specification, none
+was recorded; without pyulog the tests are skipped."""
+
+import math
+import pathlib
+import struct
+
+import pytest
+
+from companion import records as r
+from companion.importers import sources, ulog
+from companion.storage.reader import LogError
+
+pytest.importorskip("pyulog")
+
+CODES = {
+    "uint64_t": "Q",
+    "float": "f",
+    "double": "d",
+    "int32_t": "i",
+    "uint8_t": "B",
+    "bool": "?",
+    "uint32_t": "I",
+}
+HEADER = b"\x55\x4c\x6f\x67\x01\x12\x35\x01" + struct.pack("<Q", 1_000_000)
+UTC = 1_700_000_000_000_000
+
+GPS_NEW = (
+    "uint64_t timestamp;uint64_t time_utc_usec;double latitude_deg;double longitude_deg;"
+    "double altitude_msl_m;double altitude_ellipsoid_m;"
+    "float s_variance_m_s;float eph;float epv;float hdop;float vel_n_m_s;"
+    "float vel_e_m_s;float vel_d_m_s;uint8_t fix_type;bool vel_ned_valid;uint8_t satellites_used;"
+)
+GPS_OLD = (
+    "uint64_t timestamp;uint64_t time_utc_usec;int32_t lat;int32_t lon;int32_t alt;int32_t alt_ellipsoid;"
+    "float s_variance_m_s;float eph;float epv;float hdop;float vel_n_m_s;"
+    "float vel_e_m_s;float vel_d_m_s;uint8_t fix_type;bool vel_ned_valid;uint8_t satellites_used;"
+)
+LOCAL = (
+    "uint64_t timestamp;float x;float y;float z;float vx;float vy;float vz;double ref_lat;double ref_lon;"
+    "float ref_alt;bool xy_valid;bool z_valid;bool xy_global;uint8_t xy_reset_counter;"
+)
+TOPICS = {
+    "vehicle_local_position": LOCAL,
+    "vehicle_gps_position": GPS_NEW,
+    "sensor_gps": GPS_OLD,
+    "vehicle_attitude": "uint64_t timestamp;float[4] q;",
+    "sensor_combined": "uint64_t timestamp;float[3] gyro_rad;float[3] accelerometer_m_s2;",
+    "airspeed": "uint64_t timestamp;float true_airspeed_m_s;",
+    "wind": "uint64_t timestamp;float windspeed_north;float windspeed_east;"
+    "float variance_north;float variance_east;",
+    "vehicle_air_data": "uint64_t timestamp;float baro_pressure_pa;float baro_temp_celcius;",
+    "estimator_status": "uint64_t timestamp;float pos_test_ratio;float pos_horiz_accuracy;"
+    "uint32_t solution_status_flags;",
+    "vehicle_global_position_groundtruth": "uint64_t timestamp;double lat;double lon;float alt;",
+    "vehicle_local_position_groundtruth": "uint64_t timestamp;float vx;float vy;float vz;",
+}
+NUMBERS = {name: k for k, name in enumerate(TOPICS)}
+
+
+def message(kind: str, body: bytes) -> bytes:
+    return struct.pack("<HB", len(body), ord(kind)) + body
+
+
+def definitions(*names: str) -> bytes:
+    out = HEADER + message("B", bytes(40))
+    out += b"".join(message("F", f"{name}:{TOPICS[name]}".encode()) for name in names)
+    return out + b"".join(
+        message("A", struct.pack("<BH", 0, NUMBERS[name]) + name.encode()) for name in names
+    )
+
+
+def data(name: str, *values: float | int | bool) -> bytes:
+    layout = "<"
+    for field in TOPICS[name].split(";")[:-1]:
+        kind, _, size = field.split(" ")[0].partition("[")
+        layout += CODES[kind] * int(size.rstrip("]") or 1)
+    return message("D", struct.pack("<H", NUMBERS[name]) + struct.pack(layout, *values))
+
+
+def local(us: int, x: float, resets: int = 0) -> bytes:
+    origin = 47.0, 8.0, 488.0
+    return data("vehicle_local_position", us, x, 2.0, -3.0, 4.0, 5.0, 6.0, *origin, True, True, True, resets)
+
+
+def fix(us: int, lat: float) -> bytes:
+    return data(
+        *("vehicle_gps_position", us, UTC, lat, 8.0, 500.0, 547.0),
+        *(0.4, 1.3, 1.7, 0.8, 1.0, 2.0, 3.0, 3, True, 10),
+    )
+
+
+def write(tmp_path: pathlib.Path, content: bytes) -> pathlib.Path:
+    path = tmp_path / "flight.ulg"
+    path.write_bytes(content)
+    return path
+
+
+def flight() -> bytes:
+    names = [name for name in TOPICS if name != "sensor_gps"]
+    return definitions(*names) + b"".join(
+        [
+            fix(2_000_000, 47.0),
+            local(2_010_000, 1.0),
+            data("vehicle_attitude", 2_020_000, math.cos(0.25), 0.0, 0.0, math.sin(0.25)),
+            data("sensor_combined", 2_030_000, 0.1, 0.2, 0.3, 0.0, 0.0, -9.8),
+            data("airspeed", 2_040_000, 15.0),
+            data("airspeed", 2_045_000, math.nan),
+            data("wind", 2_050_000, 3.0, -4.0, 0.5, 0.5),
+            data("vehicle_air_data", 2_060_000, 95_000.0, 20.0),
+            data("estimator_status", 2_070_000, 0.2, 1.5, 0x33F),
+            data("vehicle_local_position_groundtruth", 2_075_000, 7.0, 8.0, 9.0),
+            data("vehicle_global_position_groundtruth", 2_080_000, 47.0, 8.0, 501.0),
+            message("L", b"4" + struct.pack("<Q", 2_090_000) + b"Failsafe enabled"),
+            message("O", struct.pack("<H", 120)),
+            local(2_110_000, 51.0, resets=1),
+            fix(2_200_000, 47.00001),
+        ]
+    )
+
+
+def test_every_topic_becomes_its_record(tmp_path: pathlib.Path) -> None:
+    heard = list(sources.open_source(write(tmp_path, flight())))
+    assert [type(record) for record in heard if not isinstance(record, r.Event)] == [
+        *(r.Gnss, r.LocalOrigin, r.LocalPosition, r.Attitude, r.Imu, r.AirData, r.Wind, r.Pressure),
+        *(r.FilterStatus, r.Truth, r.LocalPosition, r.Gnss),
+    ]
+    first, last = heard[0], heard[-1]
+    assert isinstance(first, r.Gnss) and isinstance(last, r.Gnss)
+    assert (first.t_ns, last.t_ns - first.t_ns) == (UTC * 1000, 200_000_000)
+    assert not last.repeats(first)  # though the receiver's own time stood still
+    assert (first.lat, first.alt_msl, first.alt) == (math.radians(47.0), 500.0, 547.0)
+    assert first.sigma_horizontal == pytest.approx(1.3)
+    by = {type(record): record for record in heard}
+    assert by[r.LocalPosition].v_n == (4.0, 5.0, 6.0)  # type: ignore[attr-defined]
+    assert (by[r.LocalOrigin].alt_msl, by[r.LocalOrigin].projection) == (488.0, "px4")  # type: ignore[attr-defined]
+    assert by[r.Attitude].heading == pytest.approx(0.5)  # type: ignore[attr-defined]
+    assert by[r.Imu].f_b == pytest.approx((0.0, 0.0, -9.8))  # type: ignore[attr-defined]
+    assert by[r.Wind].sigma == pytest.approx(math.sqrt(0.5))  # type: ignore[attr-defined]
+    assert by[r.FilterStatus].horizontal_accuracy == 1.5  # type: ignore[attr-defined]
+    assert by[r.Truth].v_n == (7.0, 8.0, 9.0)  # type: ignore[attr-defined]
+    said = {event.text: event.severity for event in heard if isinstance(event, r.Event)}
+    assert said["Failsafe enabled"] == 4
+    assert {"the logger dropped out for 120 ms", "the autopilot reset its horizontal position"} < set(said)
+    times = [record.t_ns for record in heard]
+    assert times == sorted(times)
+
+
+def test_the_old_names_of_gps_say_the_same(tmp_path: pathlib.Path) -> None:
+    old = data(
+        *("sensor_gps", 2_000_000, UTC, 470_000_000, 80_000_000, 500_000, 547_000),
+        *(0.4, 1.3, 1.7, 0.8, 1.0, 2.0, 3.0, 3, True, 10),
+    )
+    (before,) = sources.open_source(write(tmp_path, definitions("sensor_gps") + old))
+    (now,) = sources.open_source(write(tmp_path, definitions("vehicle_gps_position") + fix(2_000_000, 47.0)))
+    assert before == now
+
+
+def test_a_torn_log_is_read_up_to_where_it_is_torn(tmp_path: pathlib.Path) -> None:
+    heard = list(sources.open_source(write(tmp_path, flight()[:-30])))
+    assert sum(isinstance(record, r.Gnss) for record in heard) == 1
+    assert sum(isinstance(record, r.LocalPosition) for record in heard) == 2
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"", "is empty"),
+        (b"this is something else altogether", "is no ULog"),
+        (HEADER[:12], "damaged beyond reading|without any topic"),
+        (definitions("airspeed"), "without any topic"),
+    ],
+)
+def test_what_is_no_log_is_refused_in_a_sentence(tmp_path: pathlib.Path, content: bytes, words: str) -> None:
+    with pytest.raises(LogError, match=words) as caught:
+        ulog.read(write(tmp_path, content))
+    assert "\n" not in str(caught.value)
+
+
+def test_a_topic_that_lacks_a_field_says_which(tmp_path: pathlib.Path) -> None:
+    layout = "uint64_t timestamp;float speed;"
+    content = HEADER + message("B", bytes(40)) + message("F", f"airspeed:{layout}".encode())
+    content += message("A", struct.pack("<BH", 0, 0) + b"airspeed")
+    content += message("D", struct.pack("<HQf", 0, 1_000_000, 12.0))
+    with pytest.raises(LogError, match="airspeed has no field 'true_airspeed_m_s'"):
+        list(ulog.read(write(tmp_path, content)))

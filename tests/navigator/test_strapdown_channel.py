@@ -1,0 +1,651 @@
+"""Strapdown by the autopilot's attitude: it integrates, errs as its model says, and says when it cannot."""
+
+from __future__ import annotations
+
+import gzip
+import heapq
+import math
+from collections.abc import Iterable, Iterator
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+import pytest
+from scipy.signal import lfilter
+
+from companion.analysis.error_statistics import beacon_fix
+from companion.config import Config, ConfigError, load
+from companion.nav.geometry import Geodetic, from_enu, separation, slant_range_azimuth
+from companion.nav.strapdown import Inertial, mechanise
+from companion.navigator import (
+    Navigator,
+    air_data_channel,
+    channel_corrections,
+    error_state,
+    minimax_bound,
+    strapdown_channel,
+    tilt_error_model,
+)
+from companion.navigator.inertial_track import Point
+from companion.records import (
+    AirData,
+    Attitude,
+    Event,
+    GlobalPosition,
+    Gnss,
+    Imu,
+    LocalPosition,
+    Pressure,
+    Reset,
+    RsbnFix,
+    Solution,
+    Source,
+    Stamped,
+    Truth,
+    Wind,
+)
+from companion.runtime.core import wanted
+from sitl.flight import Flight, Leg, Plan, fly, rotation
+from sitl.flight import Wind as Blows
+
+Floats = npt.NDArray[np.float64]
+NS = 1_000_000_000
+G = 9.80665
+DATA = Path(__file__).parents[1] / "data"
+SIGMA_AZIMUTH, SIGMA_RANGE = math.radians(0.125), 100.0  # one sigma
+STRAPDOWN = load(flags={"inertial.source": "strapdown"}, environment={})
+UNIT = tilt_error_model.grade(STRAPDOWN.strapdown, STRAPDOWN.gnss)
+
+
+# ---------------------------------------------------------------------------------------------------------
+# Simulated flight: what is felt and what is true
+# ---------------------------------------------------------------------------------------------------------
+
+
+class Errors(NamedTuple):
+    """Of roll, pitch, heading (rad), of the accelerometers, and of gravity let in north and east (m/s^2)."""
+
+    attitude: Floats = np.zeros((1, 3))
+    f_b: Floats = np.zeros((1, 3))
+    tilt_n: Floats = np.zeros((1, 2))
+
+
+NONE = Errors()
+
+
+@lru_cache(maxsize=2)
+def circles(windy: bool = True) -> Flight:
+    """Turning all the time from 90 to 290 s."""
+    legs = (Leg(90.0, 0.0, 30.0, 100.0), *(Leg(50.0, 90.0 * k % 360.0, 30.0, 100.0) for k in (1, 2, 3, 4)))
+    return fly(Plan(legs, winds=(Blows(0.0, 4.0, -3.0, 20.0),) if windy else ()))
+
+
+def straight() -> Flight:
+    """Level and straight east, 90 s once at height."""
+    return fly(Plan((Leg(130.0, 90.0, 30.0, 100.0), Leg(100.0, 90.0, 30.0, 100.0))))
+
+
+def static_pressure(alt: float) -> float:
+    return float(
+        air_data_channel.P0 * (1.0 - alt * air_data_channel.LAPSE / air_data_channel.T0) ** (1.0 / 0.190263)
+    )
+
+
+def felt(
+    flight: Flight, start: float, errors: Errors = NONE, every: int = 1, attitude_every: int = 5
+) -> list[Any]:
+    """IMU (every so many of 50 Hz), attitude and pressure from `start` (s) on, all stamped alike."""
+    n = len(flight.t)
+    attitude = flight.attitude + np.broadcast_to(errors.attitude, (n, 3))
+    f_b = flight.f_b + np.broadcast_to(errors.f_b, (n, 3))
+    f_b[:, :2] += level_axes(flight, np.broadcast_to(errors.tilt_n, (n, 2)))
+    records: list[Any] = []
+    first = round(start * 50.0)
+    for k in range(first, n):
+        t_ns = round(flight.t[k] * 1e9)
+        if (k - first) % (every * attitude_every) == 0:
+            records.append(Attitude(t_ns, t_ns, *attitude[k].tolist()))
+        if (k - first) % every == 0:
+            records.append(Imu(t_ns, t_ns, 0, tuple(f_b[k].tolist()), tuple(flight.w_b[k].tolist())))
+        if (k - first) % 10 == 0:
+            records.append(Pressure(t_ns, t_ns, static_pressure(flight.alt[k])))
+    return records
+
+
+def level_axes(flight: Flight, a_n: Floats) -> Floats:
+    """What an error of acceleration north and east is ahead and to the right of the level body, (n, 2)."""
+    c, s = np.cos(flight.attitude[:, 2]), np.sin(flight.attitude[:, 2])
+    return np.stack([c * a_n[:, 0] + s * a_n[:, 1], -s * a_n[:, 0] + c * a_n[:, 1]], axis=1)
+
+
+def true_point(flight: Flight, t: float) -> Point:
+    """Everything here happens at the flight's own samples."""
+    k = round(t * 50.0)
+    assert abs(flight.t[k] - t) < 1e-6
+    at = Geodetic(float(flight.lat[k]), float(flight.lon[k]), float(flight.alt[k]))
+    return Point(round(t * 1e9), at, tuple(flight.v_n[k].tolist()))
+
+
+def reckoned(flight: Flight, records: Iterable[Any], start: float, lasting: float) -> tuple[Floats, Floats]:
+    """Errors of the channel alone from the true state at `start` on: position (n, 3) m and velocity."""
+    s, track = strapdown_channel.Strap(), [true_point(flight, start)]
+    for record in records:
+        if not isinstance(record, Imu):
+            s = strapdown_channel.sense(s, record)
+            continue
+        before, s = s, strapdown_channel.hear(s, record)
+        if start < record.t_ns * 1e-9 <= start + lasting:
+            assert not s.why
+            s, new = strapdown_channel.advance(before, s, track[-1])
+            track.append(new)
+    truth = [true_point(flight, p.t_ns * 1e-9) for p in track]
+    position = np.array([separation(p.position, q.position) for p, q in zip(track, truth, strict=True)])
+    return position, np.array([np.subtract(p.v_n, q.v_n) for p, q in zip(track, truth, strict=True)])
+
+
+@pytest.mark.parametrize(("every", "attitude_every"), [(1, 1), (1, 5), (1, 25), (2, 5), (5, 2)])
+def test_perfect_sensors_reproduce_a_minute_of_turning_flight(every: int, attitude_every: int) -> None:
+    flight = circles()
+    records = felt(flight, 100.0, NONE, every, attitude_every)
+    position, velocity = reckoned(flight, records, 110.0, 60.0)
+    a_few = {1: 1.0, 2: 2.0, 5: 5.0}[every]  # m; at 10 Hz the trapezoid shows
+    turned = np.ptp(np.unwrap(flight.at(np.linspace(110.0, 170.0, 100)).attitude[:, 2]))
+    assert turned > math.radians(80.0)
+    assert np.hypot(*position[-1, :2]) < a_few
+    assert np.hypot(*velocity[-1, :2]) < 0.05 * a_few
+    assert np.abs(position[:, 2]).max() < 1.0  # by the pressure
+
+
+def test_it_agrees_with_a_strapdown_that_keeps_its_own_attitude() -> None:
+    """With perfect gyros both integrate the same equations; only the vertical channel is held here."""
+    flight = circles()
+    first, n = round(110.0 * 50), 60 * 50
+    state = Inertial(
+        float(flight.lat[first]), float(flight.lon[first]), float(flight.alt[first]), flight.v_n[first],
+        rotation(flight.attitude[first : first + 1])[0],
+    )  # fmt: skip
+    for k in range(first, first + n):
+        f_b, w_b = 0.5 * (flight.f_b[k] + flight.f_b[k + 1]), 0.5 * (flight.w_b[k] + flight.w_b[k + 1])
+        state = mechanise(state, f_b, w_b, 0.02)
+    own = separation(Geodetic(state.lat, state.lon, state.alt), true_point(flight, 170.0).position)
+    position, _ = reckoned(flight, felt(flight, 100.0), 110.0, 60.0)
+    assert np.abs(position[-1, :2] - own[:2]).max() < 0.1
+
+
+@pytest.mark.parametrize("degrees", [0.5, -2.0])
+def test_a_tilt_is_half_g_theta_t_squared(degrees: float) -> None:
+    """Flying east: a pitch too great by theta takes gravity for an acceleration backwards, -g theta."""
+    flight, theta = straight(), math.radians(degrees)
+    records = felt(flight, 130.0, Errors(attitude=np.array([[0.0, theta, 0.0]])))
+    position, velocity = reckoned(flight, records, 135.0, 60.0)
+    one_percent = 0.01
+    assert position[-1, 1] == pytest.approx(-0.5 * G * math.sin(theta) * 60.0**2, rel=one_percent)
+    assert velocity[-1, 1] == pytest.approx(-G * math.sin(theta) * 60.0, rel=one_percent)
+    assert abs(position[-1, 0]) < one_percent * abs(position[-1, 1])
+
+
+def test_a_roll_error_and_a_bias_drift_sideways_by_the_same_law() -> None:
+    flight, bias, phi = straight(), 0.05, math.radians(0.5)
+    one_percent = 0.01
+    biased, _ = reckoned(flight, felt(flight, 130.0, Errors(f_b=np.array([[0.0, bias, 0.0]]))), 135.0, 60.0)
+    assert biased[-1, 0] == pytest.approx(-0.5 * bias * 60.0**2, rel=one_percent)  # right of east is south
+    rolled, _ = reckoned(flight, felt(flight, 130.0, Errors(np.array([[phi, 0.0, 0.0]]))), 135.0, 60.0)
+    assert rolled[-1, 0] == pytest.approx(-0.5 * G * phi * 60.0**2, rel=one_percent)
+
+
+@pytest.mark.parametrize(("state", "size"), [(4, 0.05), (5, 0.05), (6, 0.05), (7, -0.05), (8, 0.03)])
+def test_the_error_equations_are_those_of_the_integration(state: int, size: float) -> None:
+    """One error at a time through a minute of turns, integrated, and by `TiltError.system`.
+
+    Without wind: the equations take the course for the heading.
+    """
+    flight = circles(windy=False)
+    n = len(flight.t)
+    errors = {
+        4: Errors(tilt_n=np.broadcast_to([size, 0.0], (n, 2))),
+        5: Errors(tilt_n=np.broadcast_to([0.0, size], (n, 2))),
+        6: Errors(f_b=np.array([[size, 0.0, 0.0]])),
+        7: Errors(f_b=np.array([[0.0, size, 0.0]])),
+        8: Errors(attitude=np.array([[0.0, 0.0, size]])),
+    }[state]
+    position, velocity = reckoned(flight, felt(flight, 105.0, errors, every=2), 110.0, 60.0)
+    constant = UNIT._replace(decay=np.zeros(tilt_error_model.N))
+    x = np.zeros(tilt_error_model.N)
+    x[state] = size
+    for k in range(60):
+        a, b = true_point(flight, 110.0 + k), true_point(flight, 111.0 + k)
+        a_n = b.v_n[0] - a.v_n[0], b.v_n[1] - a.v_n[1]
+        held = error_state.ErrorState(a.t_ns, x, np.eye(tilt_error_model.N))
+        x = error_state.predict(held, b.t_ns, a.position.lat, a.v_n, a_n, constant).x
+    some_percent = 0.05  # banked axes are not level
+    assert math.dist(position[-1, :2], x[:2]) < some_percent * max(np.hypot(*x[:2]), 20.0)
+    assert math.dist(velocity[-1, :2], x[2:4]) < some_percent * max(np.hypot(*x[2:4]), 1.0)
+
+
+# ---------------------------------------------------------------------------------------------------------
+# In the navigator
+# ---------------------------------------------------------------------------------------------------------
+
+
+class Flown(NamedTuple):
+    """Of the solutions: time (s), error north and east (m), covariance (2, 2), bound (m, NaN without)."""
+
+    t: Floats
+    error_n: Floats
+    P: Floats
+    bound: Floats
+    others: list[Stamped]
+
+    @property
+    def error(self) -> Floats:
+        return np.hypot(*self.error_n.T)
+
+    @property
+    def sigma(self) -> Floats:
+        return np.sqrt(np.trace(self.P, axis1=1, axis2=2))
+
+
+def navigated(records: Iterable[Any], truth: Any, config: Config = STRAPDOWN) -> Flown:
+    """`truth`: the true Geodetic at a time in ns."""
+    navigator, rows, others = Navigator(config), list[Any](), list[Stamped]()
+    for record in records:
+        for out in navigator.handle(record):
+            if isinstance(out, Solution):
+                north, east, _ = separation(Geodetic(out.lat, out.lon, 0.0), truth(out.t_ns))
+                var_n, cov, _, var_e = out.covariance[:4]
+                bound = math.nan if out.bound_n is None else math.hypot(*out.bound_n)
+                rows.append((out.t_ns * 1e-9, north, east, var_n, cov, cov, var_e, bound))
+            else:
+                others.append(out)
+    a = np.array(rows).reshape(-1, 8)
+    return Flown(a[:, 0], a[:, 1:3], a[:, 3:7].reshape(-1, 2, 2), a[:, 7], others)
+
+
+def truth_of(flight: Flight) -> Any:
+    return lambda t_ns: true_point(flight, t_ns * 1e-9).position
+
+
+def gnss(flight: Flight, start: float, end: float, rng: np.random.Generator) -> Iterator[Gnss]:
+    """Fixes at 2 Hz with a drift and white noise as configured."""
+    settings = STRAPDOWN.gnss
+    drift = settings.sigma_m * rng.standard_normal(2)
+    kept = math.exp(-0.5 / settings.correlation_s)
+    for k in range(int(2.0 * start), int(2.0 * end)):
+        p = true_point(flight, 0.5 * k)
+        e = np.append(drift + settings.sigma_m / 3.0 * rng.standard_normal(2), 0.0)
+        drift = kept * drift + math.sqrt(1.0 - kept**2) * settings.sigma_m * rng.standard_normal(2)
+        lat, lon, alt = from_enu(e, p.position)
+        noise = math.hypot(settings.sigma_velocity_m_s, UNIT.velocity_noise)
+        v = np.array(p.v_n) + np.append(noise * rng.standard_normal(2), 0.0)
+        yield Gnss(p.t_ns, p.t_ns, 0, p.t_ns // 1000, 3, lat, lon, alt, 2.0, 3.0, tuple(v.tolist()), 0.1)
+
+
+def drawn(flight: Flight, rng: np.random.Generator) -> Errors:
+    """Errors as the model has them: Gauss-Markov tilt, white noise, constant bias and heading error."""
+    settings, dt = STRAPDOWN.strapdown, 0.02
+    n, kept = len(flight.t), math.exp(-dt / settings.tilt_s)
+    white = math.sqrt(1.0 - kept**2) * rng.standard_normal((n, 2))
+    white[0] = rng.standard_normal(2)
+    tilt = lfilter([1.0], [1.0, -kept], white, axis=0)
+    tilt *= G * math.radians(settings.tilt_deg)
+    tilt += settings.velocity_noise_m_s_sqrt_s / math.sqrt(dt) * rng.standard_normal((n, 2))
+    body = np.append(settings.accelerometer_m_s2 * rng.standard_normal(2), 0.0)
+    attitude = np.array([[0.0, 0.0, math.radians(settings.heading_deg) * rng.standard_normal()]])
+    return Errors(attitude, body[None, :], tilt)
+
+
+def test_the_covariance_is_honest() -> None:
+    """Normalised squared errors up to 20 s after GNSS is gone, in turns, over seeds: chi-square."""
+    flight, runs = circles(), 12
+    nees: dict[float, list[float]] = {155.0: [], 165.0: [], 175.0: []}
+    for seed in range(runs):
+        rng = np.random.default_rng(seed)
+        sensors = felt(flight, 90.0, drawn(flight, rng), attitude_every=10)
+        fixes = gnss(flight, 95.0, 155.0, rng)
+        records = heapq.merge((r for r in sensors if r.t_ns < 176 * NS), fixes, key=lambda r: r.t_ns)
+        found = navigated(records, truth_of(flight))
+        for t, values in nees.items():
+            k = int(np.searchsorted(found.t, t))
+            e = found.error_n[k]
+            values.append(float(e @ np.linalg.solve(found.P[k], e)))
+    for t, values in nees.items():
+        # 2 x 12 degrees of freedom: 9.9 to 45.6 with a probability of 0.995 each side
+        assert 9.9 < sum(values) < 45.6, (t, np.mean(values))
+
+
+def lost(flight: Flight, silent: tuple[float, float] = (0.0, 0.0)) -> list[Any]:
+    """GNSS to 120 s, then none; no IMU within `silent`."""
+    sensors = [
+        r
+        for r in felt(flight, 90.0)
+        if r.t_ns < 140 * NS and not (isinstance(r, Imu) and silent[0] < r.t_ns * 1e-9 <= silent[1])
+    ]
+    return list(
+        heapq.merge(sensors, gnss(flight, 95.0, 120.0, np.random.default_rng(1)), key=lambda r: r.t_ns)
+    )
+
+
+def changed(records: Iterable[Any], **how: Any) -> list[Any]:
+    """With the IMU's samples after 130 s replaced: `f` and `w` turn their specific force and rate."""
+
+    def spoilt(r: Any) -> Any:
+        if not isinstance(r, Imu) or r.t_ns < 130 * NS:
+            return r
+        f_b, w_b = how.get("f", tuple)(r.f_b), how.get("w", tuple)(r.w_b)
+        return msgspec.structs.replace(r, f_b=tuple(f_b), w_b=tuple(w_b))
+
+    return [spoilt(r) for r in records]
+
+
+def resets(found: Flown) -> list[str]:
+    return [out.reason for out in found.others if isinstance(out, Reset)]
+
+
+def test_a_silence_is_told_once_and_widens_the_claim() -> None:
+    flight = circles()
+    found = navigated(lost(flight, (125.0, 130.0)), truth_of(flight))
+    assert resets(found) == ["no IMU with attitude for 5.0 s"]
+    assert found.t[-1] > 139.0
+    assert found.sigma[-1] > 150.0
+    assert np.all(found.error[found.t > 120.0] <= 3.0 * found.sigma[found.t > 120.0])
+
+
+def test_a_lost_packet_is_nothing() -> None:
+    flight = circles()
+    whole = navigated(lost(flight), truth_of(flight))
+    found = navigated(lost(flight, (125.0, 125.2)), truth_of(flight))
+    assert resets(found) == []
+    assert abs(found.error[-1] - whole.error[-1]) < 1.0
+
+
+@pytest.mark.parametrize(
+    ("how", "word"),
+    [
+        ({"f": lambda f: (157.0, f[1], f[2])}, "accelerometer's range"),
+        ({"w": lambda w: (w[0], 35.0, w[2])}, "gyro's range"),
+        ({"f": lambda f: [100.0 * x for x in f]}, "accelerometer's range"),  # sensor units for m/s^2
+        ({"f": lambda f: [x / G for x in f]}, "averages 4.9 m/s^2 where gravity is 9.8"),  # g for m/s^2
+        ({"f": lambda f: [-x for x in f]}, "units or orientation of the IMU are wrong"),  # z upwards
+    ],
+)
+def test_what_makes_no_sense_is_refused_with_one_sentence(how: dict[str, Any], word: str) -> None:
+    flight = circles()
+    found = navigated(changed(lost(flight), **how), truth_of(flight))
+    assert len(resets(found)) == 1
+    assert word in resets(found)[0]
+    assert found.t[-1] < 139.0  # and nothing is given out of it
+    assert np.isfinite(found.error).all()
+
+
+def test_what_is_no_number_is_no_sense_either() -> None:
+    """The navigator lets none in; who folds its steps over a log may."""
+    assert (
+        "no number"
+        in strapdown_channel.hear(
+            strapdown_channel.Strap(), Imu(0, 0, 0, (0.0, math.nan, -G), (0.0,) * 3)
+        ).why
+    )
+
+
+def thinned(records: Iterable[Any], kind: type, every: int) -> Iterator[Any]:
+    count = 0
+    for record in records:
+        if isinstance(record, kind):
+            count += 1
+            if count % every:
+                continue
+        yield record
+
+
+@pytest.mark.parametrize(
+    ("kind", "every", "word"),
+    [
+        (Imu, 10, "IMU at 5.0 Hz and attitude at 10.0 Hz are too slow, it takes 10 and 2 Hz"),
+        (Attitude, 10, "IMU at 50.0 Hz and attitude at 1.0 Hz are too slow, it takes 10 and 2 Hz"),
+        (Attitude, 10**6, "no attitude is heard"),
+        (Imu, 10**6, "no IMU is heard"),
+    ],
+)
+def test_too_slow_it_does_not_begin_and_says_why(kind: type, every: int, word: str) -> None:
+    flight = circles()
+    found = navigated(thinned(lost(flight), kind, every), truth_of(flight))
+    told = [out.text for out in found.others if isinstance(out, Event)]
+    assert len(found.t) == 0
+    assert told[1:] == [f"inertial channel cannot begin: {word}"]
+
+
+def test_an_attitude_that_stops_is_told() -> None:
+    flight = circles()
+    records = [r for r in lost(flight) if not (isinstance(r, Attitude) and r.t_ns > 125 * NS)]
+    found = navigated(records, truth_of(flight))
+    assert len(resets(found)) == 1
+    assert resets(found)[0].startswith("not used: no attitude for 1.")
+    assert found.t[-1] < 127.0
+
+
+def test_only_the_imu_configured_is_heard() -> None:
+    flight = circles()
+    records = lost(flight)
+    wrong = [
+        msgspec.structs.replace(r, source=1, f_b=(50.0, 50.0, 50.0)) for r in records if isinstance(r, Imu)
+    ]
+    both = heapq.merge(records, wrong, key=lambda r: r.t_ns)
+    plain, mixed = navigated(records, truth_of(flight)), navigated(both, truth_of(flight))
+    np.testing.assert_array_equal(plain.error_n, mixed.error_n)
+
+
+def test_where_the_channel_is_kept_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A channel brought back in position and velocity gives what one left alone gives."""
+    flight = circles()
+    rng = np.random.default_rng(5)
+    errors = Errors(attitude=np.array([[0.0, math.radians(0.5), 0.0]]))
+    sensors = [r for r in felt(flight, 90.0, errors) if r.t_ns < 170 * NS]
+    records = list(heapq.merge(sensors, gnss(flight, 95.0, 150.0, rng), key=lambda r: r.t_ns))
+    monkeypatch.setattr(channel_corrections, "FAST_M_S", 0.5)
+    kept = navigated(records, truth_of(flight))
+    monkeypatch.setattr(channel_corrections, "FAST_M_S", 1e9)
+    monkeypatch.setattr(channel_corrections, "FAR_M", 1e9)
+    left = navigated(records, truth_of(flight))
+    early = kept.t < 150.0
+    assert np.abs(kept.error_n - left.error_n)[early].max() < 0.1
+    assert np.abs(kept.error_n - left.error_n).max() < 1.0
+    np.testing.assert_allclose(kept.sigma, left.sigma, rtol=0.01)
+
+
+def test_the_promise_moves_with_the_channel() -> None:
+    """A jump and a change of velocity of the channel are one of its error; what is promised stays."""
+    promise, rng, settings = minimax_bound.begin(STRAPDOWN), np.random.default_rng(4), STRAPDOWN.predictor
+    for k in range(300):
+        quantity: Any = "velocity" if k % 3 == 0 else "position"
+        value = tuple(rng.standard_normal(2).tolist())
+        promise = minimax_bound.learn(promise, k * NS // 5, quantity, value, (1.0, 2.0), settings)
+    at, v = 50 * NS, (0.7, -0.3)
+    still, moving = (
+        minimax_bound.bounded(g, 75 * NS, settings)[1]
+        for g in (promise, minimax_bound.shift(promise, 30.0, -40.0, v, at))
+    )
+    assert still is not None
+    assert moving is not None
+    error = (still.error_n[0] + 30.0 + 0.7 * 25.0, still.error_n[1] - 40.0 - 0.3 * 25.0)
+    velocity = (still.velocity_error_n[0] + 0.7, still.velocity_error_n[1] - 0.3)
+    np.testing.assert_allclose(moving.error_n, error, atol=1e-6)
+    np.testing.assert_allclose(moving.velocity_error_n, velocity, atol=1e-6)
+    np.testing.assert_allclose(moving.bound_n, still.bound_n, rtol=1e-9)
+
+
+def test_a_beacon_alone_begins_it_and_teaches_its_velocity() -> None:
+    flight, rng = circles(), np.random.default_rng(2)
+    beacon = from_enu(np.array([40e3, 30e3, 0.0]), true_point(flight, 150.0).position)._replace(alt=100.0)
+    sensors = felt(flight, 90.0)
+    answers = []
+    for t in range(95, 270):
+        sight = slant_range_azimuth(beacon, true_point(flight, t).position)
+        azimuth = sight.azimuth + SIGMA_AZIMUTH * rng.standard_normal()
+        distance = sight.slant_range + SIGMA_RANGE * rng.standard_normal()
+        answers.append(RsbnFix(t * NS, t * NS, 7, *beacon, azimuth, distance, SIGMA_AZIMUTH, SIGMA_RANGE))
+    found = navigated(heapq.merge(sensors, answers, key=lambda r: r.t_ns), truth_of(flight))
+    assert np.all(found.error <= 3.5 * found.sigma)
+    assert found.sigma[0] > 100.0
+    assert rms(found.error[found.t > 155.0]) < 80.0  # of fixes of 150 m
+
+
+# ---------------------------------------------------------------------------------------------------------
+# On a recorded flight
+# ---------------------------------------------------------------------------------------------------------
+
+CUT = Attitude | AirData | Pressure | Truth | Gnss | LocalPosition | GlobalPosition
+LOSS = 1000.0  # s
+
+
+@lru_cache(maxsize=1)
+def recorded() -> tuple[tuple[Any, ...], Any]:
+    """GNSS is lost as the wind turns by 7 m/s, in turbulence: records, the IMU at 20 Hz, and the truth."""
+    with gzip.open(DATA / "plane_wind_change_cut.jsonl.gz") as file:
+        records = [msgspec.json.decode(line, type=CUT) for line in file]
+    with gzip.open(DATA / "plane_wind_change_imu.csv.gz") as file:
+        rows = np.loadtxt(file, delimiter=",", skiprows=1, dtype=np.int64).tolist()
+    imu = [
+        Imu(
+            1_000_000 * t,
+            1_000_000 * rx,
+            0,
+            (1e-3 * G * fx, 1e-3 * G * fy, 1e-3 * G * fz),
+            (1e-3 * wx, 1e-3 * wy, 1e-3 * wz),
+        )
+        for t, rx, fx, fy, fz, wx, wy, wz in rows
+    ]
+    truths = [r for r in records if isinstance(r, Truth) and r.lat != 0.0]
+    t = np.array([r.t_ns for r in truths]) * 1e-9
+    place = np.array([(r.lat, r.lon, r.alt) for r in truths]).T
+
+    def truth(t_ns: int) -> Geodetic:
+        return Geodetic(*(float(np.interp(t_ns * 1e-9, t, column)) for column in place))
+
+    merged = heapq.merge((r for r in records if r.rx_ns >= imu[0].rx_ns), imu, key=lambda r: r.rx_ns)
+    return tuple(merged), truth
+
+
+def with_beacon(seed: int, gap: tuple[float, float] = (0.0, 0.0)) -> list[Any]:
+    """The flight with a beacon 60 km off, 1 Hz, silent within `gap` (s from the loss)."""
+    records, truth = recorded()
+    rng, bearing = np.random.default_rng(seed), math.radians(120.0 * seed)
+    away = 60e3 * np.array([math.sin(bearing), math.cos(bearing), 0.0])
+    beacon = from_enu(away, truth(round(LOSS * 1e9)))._replace(alt=100.0)
+    heard, next_ns = list[Any](), 0
+    for record in records:
+        heard.append(record)
+        if isinstance(record, Truth) and record.t_ns >= next_ns:
+            next_ns = record.t_ns + NS
+            a, d = rng.standard_normal(2)
+            sight = slant_range_azimuth(beacon, truth(record.t_ns))
+            if not gap[0] < record.t_ns * 1e-9 - LOSS <= gap[1]:
+                azimuth = float((sight.azimuth + SIGMA_AZIMUTH * a) % math.tau)
+                distance = float(sight.slant_range + SIGMA_RANGE * d)
+                at = record.t_ns, record.rx_ns
+                heard.append(RsbnFix(*at, 7, *beacon, azimuth, distance, SIGMA_AZIMUTH, SIGMA_RANGE))
+    return heard
+
+
+def rms(x: npt.ArrayLike) -> float:
+    return float(np.sqrt(np.mean(np.square(x))))
+
+
+def raw_rms(records: Iterable[Any], start: float) -> float:
+    """Of the beacon's fixes alone, m."""
+    _, truth = recorded()
+    errors = []
+    for r in records:
+        if isinstance(r, RsbnFix) and r.t_ns * 1e-9 >= start:
+            fix = beacon_fix(r, truth(r.t_ns).alt)
+            assert fix is not None
+            errors.append(math.hypot(*separation(fix, truth(r.t_ns))[:2]))
+    return rms(errors)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_recorded_with_a_beacon_the_error_is_at_most_half_the_fixes(seed: int) -> None:
+    records = with_beacon(seed)
+    found = navigated(records, recorded()[1])
+    late = found.t >= LOSS + 60.0
+    assert rms(found.error[late]) <= 0.5 * raw_rms(records, LOSS + 60.0)
+    after = found.t > LOSS + 5.0  # GNSS drift over
+    assert np.all(found.error[after] <= 3.0 * found.sigma[after])
+
+
+def test_recorded_alone_it_bridges_seconds_and_says_how_far_it_may_be_off() -> None:
+    """The autopilot's attitude errs by 2.5 degrees once its GNSS is gone in a wind that it does not know."""
+    records, truth = recorded()
+    found = navigated((r for r in records if r.t_ns * 1e-9 < LOSS + 121.0), truth)
+    after = found.t > LOSS
+    assert np.all(found.error[after] <= 3.0 * found.sigma[after])
+
+    def at(s: float) -> float:
+        return float(found.error[np.searchsorted(found.t, LOSS + s)])
+
+    assert at(5.0) < 20.0
+    assert at(10.0) < 40.0
+    assert 60.0 < at(20.0) < 200.0  # which is what it is good for: not for minutes
+    assert at(120.0) > 500.0
+    told = after & np.isfinite(found.bound)
+    assert np.mean(np.square(found.error[told])) <= np.mean(np.square(found.bound[told]))
+
+
+def test_nothing_of_the_autopilots_own_position_comes_back_to_it() -> None:
+    """Whatever it says of where it is, how fast and in what air, the outputs are the same bit for bit; so are
+    those of records that come from their own JSON, as a log has them.
+    """
+    records = [r for r in with_beacon(1) if LOSS - 30.0 < r.t_ns * 1e-9 < LOSS + 30.0]
+
+    def outputs(records: Iterable[Any]) -> list[Any]:
+        navigator = Navigator(STRAPDOWN)
+        return [out for r in records for out in navigator.handle(r)]
+
+    lies: list[Any] = []
+    for r in records:
+        if isinstance(r, (LocalPosition, GlobalPosition, AirData)):
+            at = r.t_ns, r.rx_ns
+            lies += [LocalPosition(*at, (1e4, -1e4, 5.0), (-30.0, 7.0, 1.0)), Wind(*at, (30.0, -30.0, 0.0))]
+            lies += [GlobalPosition(*at, 0.1, 0.2, 0.0, (9.0, 9.0, 9.0), 0.0), AirData(*at, 99.0)]
+        else:
+            lies.append(msgspec.json.decode(msgspec.json.encode(r), type=type(r)))
+    plain = outputs(records)
+    last = [out for out in plain if isinstance(out, Solution)][-1]
+    assert last.sources == Source.INERTIAL | Source.AZIMUTH | Source.RANGE
+    assert outputs(lies) == plain
+
+
+def test_late_answers_are_folded_in_at_their_own_time() -> None:
+    in_time = [r for r in with_beacon(1) if LOSS - 30.0 < r.t_ns * 1e-9 < LOSS + 60.0]
+    late = [
+        msgspec.structs.replace(r, rx_ns=r.rx_ns + 4 * NS) if isinstance(r, RsbnFix) else r for r in in_time
+    ]
+    late.sort(key=lambda r: r.rx_ns)
+    _, truth = recorded()
+    prompt, found = navigated(in_time, truth), navigated(late, truth)
+    assert found.error[-1] <= 3.0 * found.sigma[-1]
+    assert abs(found.sigma[-1] - prompt.sigma[-1]) < 20.0  # four seconds more without a fix
+
+
+# ---------------------------------------------------------------------------------------------------------
+# In the configuration
+# ---------------------------------------------------------------------------------------------------------
+
+
+def test_it_is_chosen_by_name_alone_and_told() -> None:
+    assert load(flags={"inertial.source": "auto"}, environment={}).channel != "strapdown"
+    assert (STRAPDOWN.channel, STRAPDOWN.leading) == ("strapdown", "kalman")
+    first = Gnss(NS, NS, 0, 1, 3, 1.0, 0.5, 100.0)
+    events = [out for out in Navigator(STRAPDOWN).handle(first) if isinstance(out, Event)]
+    assert events[0].text == "inertial channel: strapdown by the autopilot's attitude (configured)"
+    with pytest.raises(ConfigError, match="runs by air data only"):
+        load(flags={"inertial.source": "strapdown", "estimator.output": "restrictive"}, environment={})
+
+
+def test_the_rates_asked_for_are_enough() -> None:
+    asked = wanted(STRAPDOWN)
+    assert min(asked["RAW_IMU"], asked["HIGHRES_IMU"]) >= strapdown_channel.IMU_HZ
+    assert asked["ATTITUDE"] >= strapdown_channel.ATTITUDE_HZ
+    assert asked["SCALED_PRESSURE"] > 0.0

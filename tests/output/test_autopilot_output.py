@@ -1,0 +1,484 @@
+"""What an autopilot's estimator is fed: fit to steer by, of the right make, and never its own position."""
+
+import gzip
+import math
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from companion.config import Config, ConfigError, InertialConfig, OutputConfig, load
+from companion.link import dialect, frame
+from companion.nav.geometry import Geodetic, displace, local_to_geodetic, slant_range_azimuth
+from companion.navigator import Navigator
+from companion.output.autopilot_output import Feed
+from companion.output.encode import ENCODERS, Receiver
+from companion.records import (
+    AirData,
+    Attitude,
+    Event,
+    GlobalPosition,
+    Gnss,
+    LocalOrigin,
+    LocalPosition,
+    Mode,
+    Pressure,
+    RsbnFix,
+    Solution,
+    Source,
+    SystemTime,
+    Trust,
+    Truth,
+)
+from companion.runtime.core import Onboard, wanted
+
+SECOND, MS = 1_000_000_000, 1_000_000
+START = 5000 * SECOND
+ORIGIN = Geodetic(math.radians(60.0), math.radians(30.0), 50.0)
+BEACON = Geodetic(math.radians(60.05), math.radians(31.07), 80.0)
+SPEED, HEIGHT, WIND_EAST = 30.0, 800.0, 4.0
+UTC_S = 1_795_248_000
+Frame = tuple[str, bytes]
+
+
+def told(*pairs: str) -> Config:
+    return load(pairs=pairs, environment={})
+
+
+def deg_e7(angle: float) -> int:
+    return round(math.degrees(angle) * 1e7)
+
+
+class Silent:
+    def __init__(self) -> None:
+        self.events: list[Event] = []
+
+    def record(self, record: Any, channel: str | None = None) -> None:
+        if isinstance(record, Event):
+            self.events.append(record)
+
+    def frame(self, link: str, outgoing: bool, data: bytes, t_ns: int) -> None: ...
+
+
+class Flight:
+    """Nose to the north in a wind from the west; `lie` changes what the autopilot says of itself."""
+
+    def __init__(
+        self,
+        config: Config,
+        autopilot: int = 3,
+        lie: Callable[[str, dict[str, Any]], None] = lambda name, values: None,
+    ) -> None:
+        self.log = Silent()
+        self.onboard, self.lie, self.autopilot = Onboard(config, self.log), lie, autopilot
+        self.now, self.ticks = START, 0
+        self.gnss = self.rsbn = True
+        self.source_set, self.answers = 1, True
+        self.sent: list[tuple[float, Any]] = []
+        self.payloads: list[Frame] = []
+        self._sequence, self._reader = 0, frame.Reader()
+
+    def say(self, name: str, **values: Any) -> None:
+        self.lie(name, values)
+        self._sequence = self._sequence + 1 & 0xFF
+        data = frame.encode(dialect.new(name, **values), self._sequence, 1, 1)
+        self.onboard.receive("main", data, self.now)
+        self.collect()
+
+    def collect(self) -> None:
+        for data in self.onboard.to_send("main", self.now):
+            for found in self._reader.receive(data):
+                assert isinstance(found, frame.Frame)
+                message = dialect.decode(found)
+                self.sent.append((self.seconds, message))
+                self.payloads.append((message.get_type(), found.payload))
+                if message.get_type() == "COMMAND_LONG" and message.command == 42007 and self.answers:
+                    self.source_set = int(message.param1)
+                    self.say("COMMAND_ACK", command=42007, result=0, target_system=1, target_component=191)
+
+    @property
+    def seconds(self) -> float:
+        return (self.now - START) * 1e-9
+
+    def place(self) -> Geodetic:
+        x_n = np.array([SPEED * self.seconds, WIND_EAST * self.seconds, -HEIGHT])
+        return local_to_geodetic("ardupilot", ORIGIN, x_n)
+
+    def fly(self, seconds: float) -> None:
+        for _ in range(round(10 * seconds)):
+            self.now += 100 * MS
+            self.ticks += 1
+            self._tick(self.ticks)
+            self.onboard.poll(self.now)
+            self.collect()
+
+    def _tick(self, tick: int) -> None:
+        boot = {"time_boot_ms": (self.now - START) // MS + 30_000}
+        place = self.place()
+        here = {"lat": deg_e7(place.lat), "lon": deg_e7(place.lon)}
+        if tick % 10 == 1:
+            self.say("HEARTBEAT", type=1, autopilot=self.autopilot)
+            self.say("SYSTEM_TIME", time_unix_usec=(UTC_S * 10**9 + self.now - START) // 1000, **boot)
+        if tick % 50 == 2:
+            lat, lon = deg_e7(ORIGIN.lat), deg_e7(ORIGIN.lon)
+            self.say("GPS_GLOBAL_ORIGIN", latitude=lat, longitude=lon, altitude=round(ORIGIN.alt * 1e3))
+        tremor = 1e-5 * (tick % 7)  # what never changes is frozen
+        self.say("ATTITUDE", roll=tremor, pitch=0.0, yaw=0.0, **boot)
+        stamp = boot["time_boot_ms"] * 1000
+        if self.autopilot == 3:
+            self.say("RAW_IMU", time_usec=stamp, zacc=-1000)
+        else:
+            self.say("HIGHRES_IMU", time_usec=stamp, zacc=-9.80665, fields_updated=0x3F)
+        self.say("SCALED_PRESSURE", press_abs=915.0, temperature=1500, **boot)
+        indicated = SPEED * (915.0 / 1013.25) ** 0.404868 + tremor
+        self.say("VFR_HUD", airspeed=indicated, groundspeed=SPEED, alt=place.alt, climb=0.0, heading=0)
+        x, y = SPEED * self.seconds, WIND_EAST * self.seconds
+        self.say("LOCAL_POSITION_NED", x=x, y=y, z=-HEIGHT, vx=SPEED, vy=WIND_EAST, vz=0.0, **boot)
+        v = {"vx": round(100 * SPEED), "vy": round(100 * WIND_EAST)}
+        self.say("GLOBAL_POSITION_INT", alt=round(place.alt * 1e3), hdg=0, **here, **v, **boot)
+        self.say("WIND", direction=270.0, speed=WIND_EAST)
+        if tick % 2:
+            course = math.degrees(math.atan2(WIND_EAST, SPEED))
+            self.say(
+                "GPS_RAW_INT",
+                time_usec=boot["time_boot_ms"] * 1000,
+                fix_type=3 if self.gnss else 1,
+                **here,
+                alt=round(place.alt * 1e3),
+                vel=round(100 * math.hypot(SPEED, WIND_EAST)),
+                cog=round(100 * course),
+                satellites_visible=14,
+            )
+        if tick % 10 == 5 and self.rsbn:
+            sight = slant_range_azimuth(BEACON, place)
+            self.say(
+                "RSBN_MEASUREMENT",
+                time_usec=boot["time_boot_ms"] * 1000,
+                beacon_lat=deg_e7(BEACON.lat),
+                beacon_lon=deg_e7(BEACON.lon),
+                beacon_alt=BEACON.alt,
+                azimuth=sight.azimuth,
+                slant_range=sight.slant_range,
+                sigma_azimuth=0.002,
+                sigma_range=100.0,
+                beacon_id=1,
+                status=3,
+            )
+
+    def heard(self, name: str, after: float = 0.0) -> list[Any]:
+        return [m for at, m in self.sent if m.get_type() == name and at >= after]
+
+    def fed(self) -> list[Frame]:
+        return [each for each in self.payloads if each[0] in FED]
+
+    @property
+    def texts(self) -> list[str]:
+        return [event.text for event in self.log.events]
+
+
+FED = ("ODOMETRY", "VISION_POSITION_ESTIMATE", "GPS_INPUT", "GLOBAL_POSITION_SENSOR", "COMMAND_INT")
+WAYS = [
+    (3, "ardupilot", "odometry"),
+    (3, "ardupilot", "vision"),
+    (3, "ardupilot", "gps_input"),
+    (3, "ardupilot", "external_position"),
+    (12, "px4", "global_position_sensor"),
+    (12, "px4", "odometry"),
+    (12, "px4", "external_position"),
+]
+
+
+def lies(name: str, values: dict[str, Any]) -> None:
+    """All that the autopilot says of its own position, velocity, height and wind is false."""
+    match name:
+        case "LOCAL_POSITION_NED":
+            values |= {"x": 900.0, "y": -4000.0, "z": 30.0, "vx": -70.0, "vy": 55.0, "vz": 9.0}
+        case "GLOBAL_POSITION_INT":
+            # no further than a position that may be reset is believed to have drifted
+            values |= {"lat": values["lat"] + 3000, "alt": 90_000, "vx": -700, "vy": 550, "relative_alt": 7}
+        case "VFR_HUD":
+            values |= {"groundspeed": 90.0, "alt": 77.0, "climb": -6.0, "heading": 123}
+        case "WIND":
+            values |= {"direction": 12.0, "speed": 25.0, "speed_z": 3.0}
+
+
+@pytest.mark.parametrize("source", ["auto", "strapdown"])
+@pytest.mark.parametrize(("autopilot", "profile", "via"), WAYS)
+def test_nothing_that_the_autopilot_says_of_its_position_comes_back(
+    autopilot: int, profile: str, via: str, source: str
+) -> None:
+    """Bit for bit the same is fed to one that tells the truth and to one that lies."""
+    config = told(f"output.profile={profile}", f"output.via={via}", f"inertial.source={source}")
+    assert config.channel == {"auto": "air_data"}.get(source, source)
+    honest, lying = Flight(config, autopilot), Flight(config, autopilot, lies)
+    for flight in (honest, lying):
+        flight.fly(15.0)
+        flight.gnss = False
+        flight.fly(15.0)
+    assert len(honest.fed()) >= (6 if via == "external_position" else 50)
+    assert lying.fed() == honest.fed()
+
+
+def test_that_test_would_see_it() -> None:
+    """With an INS that the operator calls independent, the lies do go through."""
+    config = told("output.profile=ardupilot", "inertial.independent=true")
+    honest, lying = Flight(config), Flight(config, lie=lies)
+    for flight in (honest, lying):
+        flight.fly(15.0)
+    assert honest.fed() and lying.fed() != honest.fed()
+
+
+def test_an_onboard_that_would_feed_it_back_does_not_even_start() -> None:
+    config = Config(
+        output=OutputConfig(profile="ardupilot"), inertial=InertialConfig(source="local_position")
+    )
+    with pytest.raises(ConfigError, match="its own position back"):
+        Onboard(config, Silent())
+
+
+@pytest.mark.parametrize("msgid", [331, 102, 232, 296, 75])
+def test_nobody_can_ask_the_monitor_to_feed(msgid: int) -> None:
+    flight = Flight(told())
+    flight.fly(3.0)
+    flight.say(
+        "COMMAND_LONG", target_system=1, target_component=191, command=511, param1=msgid, param2=100_000
+    )
+    values = {"param_id": "OUT_ODOMETRY_HZ", "param_value": 5.0, "param_type": 9}
+    flight.say("PARAM_SET", target_system=1, target_component=191, **values)
+    denied = [m.result for m in flight.heard("COMMAND_ACK")]
+    flight.fly(5.0)
+    assert denied == [2]
+    assert [m.error for m in flight.heard("PARAM_ERROR")] == [2]  # out of range
+    assert flight.fed() == []
+    assert flight.heard("NAVIGATION_STATUS")
+
+
+def test_a_ground_station_may_slow_down_what_the_profile_feeds() -> None:
+    flight = Flight(told("output.profile=ardupilot"))
+    flight.fly(10.0)
+    values = {"param_id": "OUT_ODOMETRY_HZ", "param_value": 5.0, "param_type": 9}
+    flight.say("PARAM_SET", target_system=1, target_component=191, **values)
+    begun = flight.seconds
+    flight.fly(10.0)
+    assert len(flight.heard("ODOMETRY", begun)) == pytest.approx(50, abs=5)
+
+
+def test_the_wrong_make_is_fed_nothing_and_told_so() -> None:
+    flight = Flight(told("output.profile=px4"), autopilot=3)
+    flight.fly(10.0)
+    assert flight.fed() == []
+    assert sum("the autopilot heard is no px4" in text for text in flight.texts) == 1
+
+
+def test_ardupilot_gets_odometry_and_is_switched_when_gnss_goes_and_comes() -> None:
+    flight = Flight(told("output.profile=ardupilot"))
+    flight.fly(20.0)
+    assert flight.source_set == 1
+    rates = Counter(m.get_type() for _, m in flight.sent)
+    assert rates["ODOMETRY"] == pytest.approx(200, abs=25)
+    flight.gnss = False
+    lost = flight.seconds
+    flight.fly(30.0)
+    assert flight.source_set == 2
+    switched = [at for at, m in flight.sent if m.get_type() == "COMMAND_LONG" and m.command == 42007]
+    assert len(switched) == 2 and 4.0 < switched[1] - lost < 7.0  # 3 s until it is not used, 2 s lost
+    error = [
+        math.hypot(m.x - SPEED * at, m.y - WIND_EAST * at)
+        for at, m in flight.sent
+        if m.get_type() == "ODOMETRY"
+    ]
+    assert max(error[100:]) < 30.0
+    flight.gnss = True
+    flight.fly(20.0)
+    assert flight.source_set == 1
+    assert [t for t in flight.texts if "source set" in t] == [
+        "EKF source set 1: GNSS is trusted again",
+        "EKF source set 2: GNSS is lost, our position leads",
+        "EKF source set 1: GNSS is trusted again",
+    ]
+
+
+def test_switching_can_be_left_to_the_pilot() -> None:
+    flight = Flight(told("output.profile=ardupilot", "output.switch_sources=false"))
+    flight.fly(15.0)
+    flight.gnss = False
+    flight.fly(15.0)
+    assert not [m for m in flight.heard("COMMAND_LONG") if m.command == 42007]
+    assert flight.heard("ODOMETRY")
+
+
+def test_an_unanswered_switch_is_given_up_aloud() -> None:
+    flight = Flight(told("output.profile=ardupilot"))
+    flight.answers = False
+    flight.fly(35.0)
+    assert sum("switch it by hand" in text for text in flight.texts) == 1
+
+
+def test_the_position_of_an_autopilot_is_not_reset_while_it_has_gps() -> None:
+    flight = Flight(told("output.profile=ardupilot", "output.via=external_position"))
+    flight.fly(20.0)
+    assert flight.heard("COMMAND_INT") == []
+    flight.gnss = False
+    flight.fly(20.0)
+    sent = flight.heard("COMMAND_INT")
+    assert 15 <= len(sent) <= 19  # 1 Hz, and not at once on a beacon's answer
+    assert {m.command for m in sent} == {43003}
+    assert sum("external position withheld: the autopilot has GPS" in text for text in flight.texts) == 1
+
+
+def test_nobody_can_hurry_the_resets() -> None:
+    flight = Flight(told("output.profile=ardupilot", "output.via=external_position"))
+    flight.gnss = False
+    flight.fly(3.0)
+    flight.say("COMMAND_LONG", target_system=1, target_component=191, command=511, param1=75, param2=50_000)
+    flight.fly(10.0)
+    assert [m.result for m in flight.heard("COMMAND_ACK")] == [2]
+    at = [at for at, m in flight.sent if m.get_type() == "COMMAND_INT"]
+    assert len(at) > 8 and min(np.diff(at)) >= 0.99
+
+
+def test_gps_input_has_the_time_of_day_and_our_own_velocity() -> None:
+    flight = Flight(told("output.profile=ardupilot", "output.via=gps_input"))
+    flight.fly(30.0)
+    m = flight.heard("GPS_INPUT")[-1]
+    assert (m.gps_id, m.fix_type, m.time_week) == (1, 3, 2445)
+    assert m.time_week_ms == pytest.approx(547_218_000 + 1000 * flight.seconds, abs=2)
+    assert (m.vn, m.ve) == pytest.approx((SPEED, WIND_EAST), abs=0.5)
+    assert 0.05 < m.speed_accuracy < 1.0
+    behind = displace(*flight.place(), -0.2 * SPEED, -0.2 * WIND_EAST, 0.0)
+    assert (m.lat, m.lon) == pytest.approx((deg_e7(behind.lat), deg_e7(behind.lon)), abs=300)
+
+
+def test_the_streams_that_the_output_hangs_on_are_asked_for_fast_enough() -> None:
+    assert wanted(told("output.profile=ardupilot"))["VFR_HUD"] == 10.0
+    assert wanted(told("output.profile=px4"))["VFR_HUD"] == 5.0
+    own = told("output.profile=ardupilot", "output.odometry_hz=20", "inertial.independent=true")
+    assert wanted(own)["LOCAL_POSITION_NED"] == 20.0
+    assert "SYSTEM_TIME" in wanted(told("output.profile=ardupilot", "output.via=gps_input"))
+    assert "GLOBAL_POSITION_INT" in wanted(told("output.profile=px4", "output.via=external_position"))
+
+
+GOOD = Solution(
+    START,
+    START,
+    Mode.FIXED,
+    "kalman",
+    ORIGIN.lat,
+    ORIGIN.lon,
+    800.0,
+    (0.0, 0.0, 0.0),
+    (100.0, 0.0, 0.0, 100.0, 0.0, 25.0),
+    (0.0, 0.0),
+    (0.0, 0.0),
+    int(Source.INERTIAL | Source.AIR_DATA),
+    0.0,
+)
+
+
+def at(seconds: float, **changes: Any) -> Solution:
+    t_ns = START + round(seconds * SECOND)
+    return msgspec.structs.replace(GOOD, t_ns=t_ns, rx_ns=t_ns, **changes)
+
+
+def test_odometry_stops_where_its_accuracy_cannot_be_said_and_says_so() -> None:
+    """A sigma that grows from 80 to 120 m and is 20 m after the next fix."""
+    receiver = Receiver("ardupilot", 1, origin=LocalOrigin(START, START, *ORIGIN, "ardupilot"))
+    feed, sent, texts = Feed(told("output.profile=ardupilot", "output.switch_sources=false")), [], []
+    for k in range(600):
+        sigma = 80.0 + 0.1 * k if k < 400 else 20.0
+        solution = at(0.1 * k, covariance=(sigma**2, 0.0, 0.0, sigma**2, 0.0, 25.0))
+        sent += [k for _ in feed.messages(solution, ["ODOMETRY"], receiver)]
+        texts += [event.text for event in feed.take_events()]
+    assert sent == [*range(201), *range(400, 600)]
+    assert texts == [
+        "ODOMETRY goes out",
+        "ODOMETRY withheld: its accuracy is worse than the 100 m that ArduPilot can be told",
+        "ODOMETRY goes out, 199 withheld so far",
+    ]
+    assert sum(feed.withheld.values()) == 199
+
+
+RECORDED = Attitude | AirData | Pressure | Truth | Gnss | LocalPosition | GlobalPosition
+
+
+def recorded(name: str) -> list[Any]:
+    """A recorded flight of ArduPlane in which GNSS is lost, cut down to 5 Hz."""
+    with gzip.open(Path(__file__).parents[1] / "data" / f"{name}_cut.jsonl.gz") as file:
+        return [msgspec.json.decode(line, type=RECORDED) for line in file]
+
+
+@pytest.mark.parametrize("name", ["plane_gps_loss", "plane_wind_change"])
+def test_the_gate_is_not_in_the_way_of_a_real_flight(name: str) -> None:
+    """On the recordings, with a beacon 60 km away after the loss and none for a minute of it: everything
+    passes but what ArduPilot could not be told.
+    """
+    records = recorded(name)
+    truths = [r for r in records if isinstance(r, Truth) and r.lat]
+    loss = max(r.t_ns for r in records if isinstance(r, Gnss) and r.fix >= 3)
+    beacon = displace(truths[-1].lat, truths[-1].lon, 100.0, 45e3, -40e3, 0.0)
+    config, rng = told("output.profile=ardupilot", "output.switch_sources=false"), np.random.default_rng(3)
+    navigator, feed = Navigator(config), Feed(config)
+    receiver = Receiver("ardupilot", 1, origin=LocalOrigin(1, 1, *ORIGIN, "ardupilot"))
+    sent, next_ns = Counter[bool](), loss
+    for record in records:
+        given: list[Any] = []
+        if not isinstance(record, Truth):
+            given = navigator.handle(record)
+        elif record.t_ns >= next_ns and not 120.0 < (record.t_ns - loss) * 1e-9 < 180.0:
+            next_ns = record.t_ns + SECOND
+            sight = slant_range_azimuth(beacon, Geodetic(record.lat, record.lon, record.alt))
+            a, d = rng.standard_normal(2)
+            azimuth, away = sight.azimuth + 0.00218 * a, sight.slant_range + 100.0 * d
+            at = record.t_ns, record.rx_ns
+            given = navigator.handle(RsbnFix(*at, 7, *beacon, azimuth % math.tau, away, 0.00218, 100.0))
+        for solution in given:
+            if isinstance(solution, Solution):
+                sent[bool(feed.messages(solution, ["ODOMETRY"], receiver))] += 1
+    reasons = {reason for _, reason in feed.withheld}
+    assert reasons <= {"its accuracy is worse than the 100 m that ArduPilot can be told"}
+    assert sent[True] > 1800 and sent[False] < 70
+
+
+def test_px4_is_told_how_bad_it_is() -> None:
+    feed, receiver = Feed(told("output.profile=px4")), Receiver("px4", 1)
+    solution = at(0.0, covariance=(4e4, 0.0, 0.0, 4e4, 0.0, 25.0))
+    (m,) = feed.messages(solution, ["GLOBAL_POSITION_SENSOR"], receiver)
+    assert m.eph == 200.0
+
+
+@pytest.mark.parametrize("name", sorted(ENCODERS))
+@pytest.mark.parametrize("trust", list(Trust))
+def test_nothing_untrusted_is_fused_or_resets_anything(name: str, trust: Trust) -> None:
+    """The mode is "fixed" all the while, and the autopilot's GPS is gone."""
+    origin = LocalOrigin(1, 1, *ORIGIN, "ardupilot")
+    receiver = Receiver("ardupilot", 1, origin=origin, unix_ns=UTC_S * 10**9)
+    feed = Feed(told("output.profile=ardupilot", "output.switch_sources=false"))
+    feed.heard(Gnss(START, START, 0, 1, 1, *ORIGIN))
+    feed.heard(GlobalPosition(START, START, *ORIGIN, (0.0, 0.0, 0.0), HEIGHT))
+    sent = feed.messages(at(0.5, trust=trust, sigma_velocity=0.5), [name], receiver)
+    assert [m.get_type() for m in sent] == ([] if trust is Trust.UNTRUSTED else [name])
+
+
+def test_each_refusal_of_the_gate_is_counted_by_message_and_reason() -> None:
+    feed = Feed(told("output.profile=px4"))
+    for k in range(5):
+        assert feed.messages(at(0.1 * k, lat=math.nan), ["GLOBAL_POSITION_SENSOR"], Receiver("px4", 1)) == []
+    assert feed.withheld == {("GLOBAL_POSITION_SENSOR", "it is not finite"): 5}
+    assert [e.text for e in feed.take_events()] == ["GLOBAL_POSITION_SENSOR withheld: it is not finite"]
+
+
+def test_after_a_reboot_of_the_autopilot_gps_must_be_heard_again() -> None:
+    feed, receiver = (
+        Feed(told("output.profile=ardupilot", "output.via=external_position")),
+        Receiver("ardupilot", 1),
+    )
+    feed.heard(Gnss(START, START, 0, 1, 1, *ORIGIN))
+    feed.heard(SystemTime(START, START, 0, UTC_S * 10**9))
+    feed.rebooted()
+    assert feed.messages(at(10.0), ["COMMAND_INT"], receiver) == []
+    assert "never heard" in feed.take_events()[-1].text
+    assert feed.unix_ns == UTC_S * 10**9 - START  # the time of day goes on

@@ -1,0 +1,311 @@
+"""What each make of autopilot is told, as it reads it: decoded from the bytes by pymavlink's own parser,
+field by field, against numbers worked out by hand (flat earths of both makes, the ellipsoid, GPS time).
+"""
+
+import math
+from typing import Any
+
+import msgspec
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pymavlink.dialects.v20 import all as pymavlink
+
+from companion.link import dialect, frame
+from companion.link.decode import Autopilot
+from companion.output.encode import ENCODERS, Receiver, Unsent, encode, navigation_status
+from companion.output.gate import Position
+from companion.records import LocalOrigin, Mode, Prediction, Solution, Source
+
+T = 123_456_789_000
+NAN = math.nan
+POSITION = Position(
+    T,
+    math.radians(55.75),
+    math.radians(37.61),
+    250.0,
+    (20.0, -3.0, 0.5),
+    (16.0, 2.0, 25.0),
+    9.0,
+    fixed=False,
+    sigma_velocity=0.75,
+    resets=258,
+)
+SIGMA = 5.042264  # sqrt of the greater eigenvalue of ((16, 2), (2, 25))
+UNIX_NS = 1_795_248_000 * 10**9 - T  # at T it is 2026-11-21 08:00:00 UTC
+
+
+def receiver(autopilot: Autopilot) -> Receiver:
+    projection = "tangent" if autopilot == "other" else autopilot
+    origin = LocalOrigin(T, T, math.radians(55.7), math.radians(37.7), 150.0, projection)
+    return Receiver(autopilot, 1, origin=origin, geoid=14.5, sensor_id=3, unix_ns=UNIX_NS, rejected=70_000)
+
+
+def parsed(message: Any) -> Any:
+    """The message as it comes out at the other end, single precision and all."""
+    (found,) = pymavlink.MAVLink(None).parse_buffer(frame.encode(message, 0, 1, 191))
+    return found
+
+
+def told(name: str, autopilot: Autopilot = "ardupilot", **changes: Any) -> Any:
+    return parsed(encode(POSITION._replace(**changes), receiver(autopilot), name))
+
+
+ARDUPILOT_COVARIANCE = [6.536989, *[0] * 5, 6.536989, *[0] * 4, 6.536989, 0, 0, 0, 1.06066, 0, 0, 1.06066]
+ARDUPILOT_COVARIANCE += [0, 1.06066]
+TRUE_COVARIANCE = [16, 2, *[0] * 4, 25, *[0] * 4, 9, 0, 0, 0, *[NAN] * 6]
+
+NO_RATES = {name: NAN for name in ("vx", "vy", "vz", "rollspeed", "pitchspeed", "yawspeed")}
+AS_ARDUPILOT_COUNTS = {"x": 5565.942251, "y": -5642.184391, "z": -100.0}
+AS_PX4_COUNTS = {"x": 5563.401381, "y": -5632.293872, "z": -100.0}
+GLOBAL = {"lat": 557_500_000, "lon": 376_100_000, "alt": 250.0}
+
+TOLD: list[tuple[str, Autopilot, dict[str, Any]]] = [
+    (
+        "ODOMETRY",
+        "ardupilot",
+        {
+            "time_usec": 123_456_789,
+            "frame_id": 20,
+            "child_frame_id": 12,
+            **AS_ARDUPILOT_COUNTS,
+            "q": [1, 0, 0, 0],
+            **NO_RATES,
+            "pose_covariance": ARDUPILOT_COVARIANCE,
+            "velocity_covariance": [NAN, *[0] * 20],
+            "reset_counter": 2,
+            "estimator_type": 0,
+            "quality": 50,
+        },
+    ),
+    (
+        "ODOMETRY",
+        "px4",
+        {
+            "time_usec": 123_456_789,
+            "frame_id": 1,
+            "child_frame_id": 12,
+            **AS_PX4_COUNTS,
+            "q": [NAN] * 4,
+            **NO_RATES,
+            "pose_covariance": TRUE_COVARIANCE,
+            "velocity_covariance": [NAN, *[0] * 20],
+            "reset_counter": 2,
+            "estimator_type": 0,
+            "quality": 50,
+        },
+    ),
+    (
+        "VISION_POSITION_ESTIMATE",
+        "ardupilot",
+        {
+            "usec": 123_456_789,
+            **AS_ARDUPILOT_COUNTS,
+            **dict.fromkeys(("roll", "pitch", "yaw"), 0.0),
+            "covariance": ARDUPILOT_COVARIANCE,
+            "reset_counter": 2,
+        },
+    ),
+    (
+        "VISION_POSITION_ESTIMATE",
+        "px4",
+        {
+            "usec": 123_456_789,
+            **AS_PX4_COUNTS,
+            **dict.fromkeys(("roll", "pitch", "yaw"), NAN),
+            "covariance": TRUE_COVARIANCE,
+            "reset_counter": 2,
+        },
+    ),
+    (
+        "GPS_INPUT",
+        "ardupilot",
+        {
+            "time_usec": 123_456_789,
+            "gps_id": 1,
+            "ignore_flags": 16,  # the vertical velocity alone
+            "time_week": 2445,
+            "time_week_ms": 547_218_000,
+            "fix_type": 3,
+            # 0.2 s before: 4.0 m south and 0.6 m east
+            "lat": 557_499_641,
+            "lon": 376_100_096,
+            "alt": 250.1,
+            "hdop": 1.0,
+            "vdop": 1.0,
+            "vn": 20.0,
+            "ve": -3.0,
+            "vd": 0.0,
+            "speed_accuracy": 0.75,
+            "horiz_accuracy": SIGMA,
+            "vert_accuracy": 3.0,
+            "satellites_visible": 6,
+            "yaw": 0,
+        },
+    ),
+    (
+        "GLOBAL_POSITION_SENSOR",
+        "px4",
+        {
+            "target_system": 1,
+            "target_component": 1,
+            "id": 3,
+            "time_usec": 123_456_789,
+            "processing_time": 0,
+            "source": 6,
+            "flags": 0,
+            **GLOBAL,
+            "alt_ellipsoid": 264.5,
+            "eph": SIGMA,
+            "epv": 3.0,
+        },
+    ),
+    *(
+        (
+            "COMMAND_INT",
+            autopilot,
+            {
+                "target_system": 1,
+                "target_component": 1,
+                "frame": 5,
+                "command": 43003,
+                "current": 0,
+                "autocontinue": 0,
+                "param1": 123.456787109375,  # single precision, and not above 123.456789
+                "param2": 0.0,
+                "param3": SIGMA,
+                "param4": 0.0,
+                "x": 557_500_000,
+                "y": 376_100_000,
+                "z": NAN,
+            },
+        )
+        for autopilot in ("ardupilot", "px4")
+    ),
+]
+
+
+@pytest.mark.parametrize(("name", "autopilot", "fields"), TOLD, ids=lambda value: str(value)[:24])
+def test_field_by_field(name: str, autopilot: Autopilot, fields: dict[str, Any]) -> None:
+    m = told(name, autopilot)
+    assert m.get_msgId() == dialect.type_named(name).msgid
+    assert set(fields) == set(m.fieldnames)
+    for field, expected in fields.items():
+        assert getattr(m, field) == pytest.approx(expected, rel=2e-6, abs=1e-6, nan_ok=True), field
+
+
+@pytest.mark.parametrize("sigma", [0.5, 20.0, 99.9])
+@pytest.mark.parametrize("name", ["ODOMETRY", "VISION_POSITION_ESTIMATE"])
+def test_ardupilot_reads_the_accuracy_out_of_its_own_formula(name: str, sigma: float) -> None:
+    m = told(name, covariance=(sigma**2, 0.0, 0.25 * sigma**2))
+    c = m.pose_covariance if name == "ODOMETRY" else m.covariance
+    assert math.cbrt(c[0] ** 2 + c[6] ** 2 + c[11] ** 2) == pytest.approx(sigma)
+    assert math.cbrt(c[15] ** 2 + c[18] ** 2 + c[20] ** 2) == pytest.approx(1.5)
+    assert all(map(math.isfinite, c))
+
+
+@pytest.mark.parametrize("name", ["ODOMETRY", "VISION_POSITION_ESTIMATE", "GPS_INPUT", "COMMAND_INT"])
+def test_an_accuracy_that_ardupilot_would_cut_is_not_told(name: str) -> None:
+    told(name, covariance=(99.0**2, 0.0, 99.0**2))
+    with pytest.raises(Unsent, match="worse than"):
+        told(name, covariance=(80.0**2, 70.0**2, 80.0**2))  # 80 m each way, 106 m along the diagonal
+
+
+def test_px4_is_told_the_same_accuracy_as_it_is() -> None:
+    assert told("GLOBAL_POSITION_SENSOR", "px4", covariance=(4e4, 0.0, 1e4)).eph == 200.0
+    assert told("ODOMETRY", "px4", covariance=(4e4, 0.0, 1e4)).pose_covariance[0] == 4e4
+
+
+@pytest.mark.parametrize("name", ["ODOMETRY", "VISION_POSITION_ESTIMATE"])
+def test_without_an_origin_there_are_no_local_metres(name: str) -> None:
+    with pytest.raises(Unsent, match="origin"):
+        encode(POSITION, Receiver("ardupilot", 1), name)
+
+
+@pytest.mark.parametrize("unix_ns", [None, 0, -(10**18), 2**67])
+def test_without_the_time_of_day_there_is_no_gps_input(unix_ns: int | None) -> None:
+    with pytest.raises(Unsent, match="time of day"):
+        encode(POSITION, receiver("ardupilot")._replace(unix_ns=unix_ns), "GPS_INPUT")
+
+
+def test_gps_input_never_leaves_ardupilot_an_old_velocity() -> None:
+    with pytest.raises(Unsent, match="velocity"):
+        told("GPS_INPUT", sigma_velocity=None)
+
+
+@given(ns=st.integers(1, 10**16))
+@settings(deadline=None, max_examples=300)
+def test_the_command_s_clock_is_that_of_all_messages_and_never_ahead_of_it(ns: int) -> None:
+    """Ahead it would pull the clock that ArduPilot learns for the whole link."""
+    m, odometry = told("COMMAND_INT", t_ns=ns), told("ODOMETRY", t_ns=ns)
+    assert 0.0 <= ns * 1e-9 - m.param1 <= ns * 1e-9 * 2.0**-22
+    assert odometry.time_usec == ns // 1000
+
+
+def test_the_quality_is_lower_while_it_is_predicted() -> None:
+    assert (told("ODOMETRY", fixed=True).quality, told("ODOMETRY").quality) == (100, 50)
+
+
+def test_every_way_has_its_encoder() -> None:
+    from companion.config.profiles import MESSAGES
+
+    assert set(ENCODERS) == set(MESSAGES.values())
+
+
+SOLUTION = Solution(
+    t_ns=T,
+    rx_ns=T,
+    mode=Mode.PREDICTING,
+    estimator="minimax",
+    lat=POSITION.lat,
+    lon=POSITION.lon,
+    alt_msl=250.0,
+    v_n=(20.0, -3.0, 0.5),
+    covariance=(16.0, 2.0, 0.0, 25.0, 0.0, 9.0),
+    error_n=(30.0, -40.0),
+    velocity_error_n=(0.1, 0.2),
+    sources=int(Source.INERTIAL | Source.AZIMUTH),
+    horizon_s=60.0,
+    bound_n=(12.0, 5.0),
+    velocity_bound_n=(0.3, 0.4),
+    disagreement=7.5,
+    inertial_age_s=0.05,
+    ahead=(Prediction(60.0, (30.0, 40.0), (1.0, 1.0), (2.0, 2.0)),),
+)
+
+
+def status(**changes: Any) -> Any:
+    message = navigation_status(msgspec.structs.replace(SOLUTION, **changes), receiver("ardupilot"))
+    found = frame.examine(frame.encode(message, 0, 1, 191))
+    assert isinstance(found, frame.Frame)
+    return dialect.decode(found)
+
+
+def test_status_says_what_no_other_message_does() -> None:
+    m = status()
+    assert (m.mode, m.estimator, m.sources, m.rejected, m.age) == (2, 2, 1 | 8, 65535, 50)
+    assert (m.bound_north, m.bound_east, m.bound_horizontal) == (12.0, 5.0, 13.0)
+    assert (m.bound_velocity, m.disagreement, m.horizon) == pytest.approx((0.5, 7.5, 60.0))
+    assert m.sigma_horizontal == pytest.approx(math.sqrt(41.0))
+    assert (m.ahead, m.bound_ahead[0]) == ([60.0, 0.0, 0.0, 0.0], 50.0)
+    assert all(map(math.isnan, m.bound_ahead[1:]))
+
+
+def test_status_leaves_open_what_is_not_known() -> None:
+    m = status(bound_n=None, velocity_bound_n=None, disagreement=None, ahead=())
+    unknown = (m.bound_north, m.bound_east, m.bound_horizontal, m.bound_velocity, m.disagreement)
+    assert all(map(math.isnan, unknown))
+
+
+@pytest.mark.parametrize("mode", list(Mode))
+def test_every_mode_has_its_number(mode: Mode) -> None:
+    assert status(mode=mode).mode == list(Mode).index(mode)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{"lat": NAN}, {"covariance": (NAN,) * 6}, {"bound_n": (math.inf, 1.0)}, {"inertial_age_s": NAN}],
+    ids=str,
+)
+def test_status_goes_out_whatever_the_solution_is(changes: dict[str, Any]) -> None:
+    assert status(**changes).mode == 2

@@ -1,0 +1,287 @@
+"""The gate: whatever comes in, what goes out is finite, fresh, in range, and where the last lets it be."""
+
+import itertools
+import math
+from collections.abc import Iterator
+from typing import Any
+
+import msgspec
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from companion.link import dialect, frame
+from companion.nav.geometry import displace
+from companion.output.encode import ENCODERS, Receiver, Unsent, encode
+from companion.output.gate import TELL_EVERY, Gate, Position, Withheld, fault
+from companion.records import LocalOrigin, Mode, Solution, Source, Trust
+
+SECOND = 1_000_000_000
+NAN, INF = math.nan, math.inf
+GOOD = Solution(
+    t_ns=100 * SECOND,
+    rx_ns=100 * SECOND,
+    mode=Mode.FIXED,
+    estimator="kalman",
+    lat=1.0,
+    lon=0.5,
+    alt_msl=800.0,
+    v_n=(30.0, 5.0, 0.0),
+    covariance=(16.0, 2.0, 0.0, 25.0, 0.0, 9.0),
+    error_n=(0.0, 0.0),
+    velocity_error_n=(0.0, 0.0),
+    sources=int(Source.INERTIAL | Source.GNSS),
+    horizon_s=0.0,
+    sigma_velocity=0.5,
+)
+
+
+def changed(**changes: Any) -> Solution:
+    return msgspec.structs.replace(GOOD, **changes)
+
+
+def moved(seconds: float, north: float = 0.0, east: float = 0.0, **changes: Any) -> Solution:
+    """The good one `seconds` later along its velocity, and `north`, `east` metres beside it."""
+    t_ns = GOOD.t_ns + round(seconds * SECOND)
+    v_n, v_e, _ = GOOD.v_n
+    lat, lon, _ = displace(GOOD.lat, GOOD.lon, GOOD.alt_msl, v_n * seconds + north, v_e * seconds + east, 0.0)
+    return changed(**({"t_ns": t_ns, "rx_ns": t_ns, "lat": lat, "lon": lon} | changes))
+
+
+NEVER: list[tuple[dict[str, Any], str]] = [
+    ({"mode": Mode.INITIALISING}, "initialising"),
+    ({"mode": Mode.UNTRUSTED}, "untrusted"),
+    ({"mode": Mode.FIXED, "trust": Trust.UNTRUSTED}, "not trusted"),
+    ({"mode": Mode.PREDICTING, "trust": Trust.UNTRUSTED}, "not trusted"),
+    ({"lat": NAN}, "finite"),
+    ({"lon": INF}, "finite"),
+    ({"alt_msl": -INF}, "finite"),
+    ({"v_n": (NAN, 0.0, 0.0)}, "finite"),
+    ({"covariance": (NAN, 0.0, 0.0, 1.0, 0.0, 1.0)}, "finite"),
+    ({"inertial_age_s": NAN}, "finite"),
+    ({"rx_ns": GOOD.t_ns + SECOND + 1}, "old"),
+    ({"inertial_age_s": 1.1}, "old"),
+    ({"t_ns": 0}, "old"),
+    ({"rx_ns": GOOD.t_ns - 2 * SECOND}, "future"),
+    ({"lat": 2.0}, "earth"),
+    ({"lat": math.radians(89.5)}, "pole"),
+    ({"lon": 7.0}, "earth"),
+    ({"alt_msl": 40_000.0}, "high"),
+    ({"alt_msl": -600.0}, "low"),
+    ({"v_n": (300.0, 300.0, 0.0)}, "fast"),
+    ({"covariance": (0.0,) * 6}, "covariance"),
+    ({"covariance": (1.0, 0.0, 0.0, -1.0, 0.0, 1.0)}, "covariance"),
+    ({"covariance": (1.0, 2.0, 0.0, 1.0, 0.0, 1.0)}, "covariance"),
+    ({"covariance": (1.0, 0.0, 0.0, 1.0, 0.0, 0.0)}, "covariance"),
+    ({"covariance": (16.0, 0.0, 0.0, 25.0, 0.0, 7e-116)}, "covariance"),  # 0 in single precision
+    ({"sigma_velocity": 1e-60}, "velocity"),
+    ({"covariance": (1.1e6, 0.0, 0.0, 1.0, 0.0, 1.0)}, "1 km"),
+    ({"sigma_velocity": NAN}, "velocity"),
+    ({"sigma_velocity": 0.0}, "velocity"),
+]
+
+
+@pytest.mark.parametrize(("changes", "said"), NEVER, ids=str)
+def test_it_is_withheld_and_why(changes: dict[str, Any], said: str) -> None:
+    assert fault(GOOD) is None
+    refused = Gate().admit(changed(**changes))
+    assert isinstance(refused, str) and said in refused
+
+
+def test_what_passes_is_what_came_and_carried_to_its_sending() -> None:
+    plain = Gate().admit(GOOD)
+    assert plain == Position(
+        100 * SECOND, 1.0, 0.5, 800.0, GOOD.v_n, (16.0, 2.0, 25.0), 9.0, True, 0.5, resets=0
+    )
+    late = Gate().admit(changed(rx_ns=GOOD.t_ns + SECOND // 2))
+    assert isinstance(late, Position)
+    assert late.t_ns == GOOD.t_ns + SECOND // 2
+    north, east = (late.lat - 1.0) * 6.3781e6, (late.lon - 0.5) * 6.39e6 * math.cos(1.0)
+    assert (north, east) == pytest.approx((15.0, 2.5), rel=0.01)
+    # a turn of 10 m/s^2, unknown for half a second, is 1.25 m
+    assert late.covariance == pytest.approx((16.0 + 1.25**2, 2.0, 25.0 + 1.25**2))
+
+
+@pytest.mark.parametrize("trust", [Trust.NORMAL, Trust.DEGRADED, Trust.PREDICTING, None])
+def test_what_is_not_untrusted_passes_with_the_sigma_of_its_estimator(trust: Trust | None) -> None:
+    assert Gate().admit(changed(trust=trust, protection=400.0)) == Gate().admit(GOOD)
+
+
+def test_across_the_antimeridian() -> None:
+    gate, east = Gate(), {"v_n": (0.0, 50.0, 0.0)}
+    before = changed(lon=math.pi - 1e-9, rx_ns=GOOD.t_ns + SECOND // 10, **east)
+    first = gate.admit(before)
+    assert isinstance(first, Position) and -math.pi <= first.lon < -3.1
+    after = changed(lon=first.lon, t_ns=before.rx_ns, rx_ns=before.rx_ns, **east)
+    second = gate.admit(after)
+    assert isinstance(second, Position) and second.resets == 0
+
+
+@pytest.mark.parametrize("seconds", [0.1, 1.0, 10.0])
+def test_a_jump_beyond_both_accuracies_is_withheld_until_time_allows_it(seconds: float) -> None:
+    gate = Gate()
+    first = gate.admit(GOOD)
+    assert isinstance(first, Position)
+    room = 3.0 * 2.0 * first.sigma + 2.0 + 10.0 * seconds**2
+    assert isinstance(gate.admit(moved(seconds, east=1.01 * room)), str)
+    assert isinstance(gate.admit(moved(seconds, east=0.99 * room)), Position)
+
+
+def test_it_is_not_shut_out_for_ever() -> None:
+    gate = Gate()
+    gate.admit(GOOD)
+    passed = [k for k in range(1, 400) if isinstance(gate.admit(moved(0.1 * k, north=3000.0)), Position)]
+    first = 0.1 * passed[0]
+    assert 10.0 * first**2 == pytest.approx(3000.0, rel=0.02)
+    assert passed == list(range(passed[0], 400))
+
+
+def test_a_jump_that_the_old_accuracy_alone_justifies_is_a_reset_to_be_told() -> None:
+    """GNSS comes back after an outage: the prediction was 300 m off, and said so."""
+    gate, poor = Gate(), (2e4, 0.0, 0.0, 2e4, 0.0, 9.0)
+    assert isinstance(gate.admit(changed(covariance=poor, mode=Mode.PREDICTING)), Position)
+    back = gate.admit(moved(0.2, east=300.0))
+    assert isinstance(back, Position) and back.resets == 1
+    on = gate.admit(moved(0.4, east=300.0))
+    assert isinstance(on, Position) and on.resets == 1
+
+
+def test_noise_within_the_accuracy_resets_nothing() -> None:
+    gate = Gate()
+    for k in range(100):
+        found = gate.admit(moved(0.1 * k, north=4.0 * math.sin(k), east=4.0 * math.cos(3 * k)))
+        assert isinstance(found, Position) and found.resets == 0
+
+
+def test_time_does_not_go_back() -> None:
+    gate = Gate()
+    gate.admit(moved(1.0))
+    assert gate.admit(moved(0.9)) == "its time is before the last one's"
+    assert isinstance(gate.admit(moved(1.0)), Position)
+
+
+def test_what_was_withheld_is_no_reference() -> None:
+    gate = Gate()
+    gate.admit(GOOD)
+    for k in range(1, 5):
+        assert isinstance(gate.admit(moved(0.1 * k, north=1e5)), str)
+    assert isinstance(gate.admit(moved(0.5)), Position)
+
+
+wild = st.floats(allow_nan=True, allow_infinity=True)
+instants = st.integers(-(2**70), 2**70) | st.integers(1, 10**15)
+
+
+def _near(value: float) -> st.SearchStrategy[float]:
+    """Mostly the good value, so that the other fields are looked at too."""
+    return st.just(value) | st.just(value) | wild
+
+
+@st.composite
+def solutions(draw: st.DrawFn) -> Solution:
+    t_ns = draw(st.just(GOOD.t_ns) | instants)
+    values = {field: draw(_near(getattr(GOOD, field))) for field in ("lat", "lon", "alt_msl")}
+    return changed(
+        t_ns=t_ns,
+        rx_ns=draw(st.just(t_ns) | st.integers(t_ns - 2 * SECOND, t_ns + 2 * SECOND) | instants),
+        mode=draw(st.sampled_from(list(Mode))),
+        v_n=tuple(draw(_near(v)) for v in GOOD.v_n),
+        covariance=tuple(draw(_near(c)) for c in GOOD.covariance),
+        inertial_age_s=draw(_near(0.0)),
+        sigma_velocity=draw(st.none() | _near(0.5)),
+        **values,
+    )
+
+
+RECEIVERS = [
+    Receiver(
+        make,
+        1,
+        origin=LocalOrigin(1, 1, 0.99, 0.51, 100.0, "tangent" if make == "other" else make),
+        unix_ns=1_795_248_000 * 10**9,
+    )
+    for make in ("ardupilot", "px4", "other")
+]
+#: Fields that are NaN by the standard's own word for "not given".
+OPEN = {
+    "ODOMETRY": {"q", "vx", "vy", "vz", "rollspeed", "pitchspeed", "yawspeed", "velocity_covariance"},
+    "VISION_POSITION_ESTIMATE": {"roll", "pitch", "yaw"},
+    "GLOBAL_POSITION_SENSOR": {"alt_ellipsoid"},
+    "COMMAND_INT": {"z"},
+}
+
+
+def _numbers(message: Any) -> Iterator[tuple[str, float]]:
+    for name in message.fieldnames:
+        value = getattr(message, name)
+        for number in value if isinstance(value, list) else [value]:
+            yield name, number
+
+
+@settings(deadline=None, max_examples=400)
+@given(sent=st.lists(solutions(), min_size=1, max_size=4))
+def test_whatever_comes_in_what_goes_out_is_fit_to_steer_by(sent: list[Solution]) -> None:
+    gate = Gate()
+    for solution, receiver in itertools.product(sent, RECEIVERS):
+        position = gate.admit(solution)
+        if isinstance(position, str):
+            assert position
+            continue
+        assert position.t_ns == solution.rx_ns and abs(solution.rx_ns - solution.t_ns) <= SECOND
+        for name in ENCODERS:
+            try:
+                message = encode(position, receiver, name)
+            except Unsent:
+                continue
+            found = frame.examine(frame.encode(message, 0, 1, 191))
+            assert isinstance(found, frame.Frame)
+            m = dialect.decode(found)
+            for field, number in _numbers(m):
+                spared = field in OPEN.get(name, ()) or "covariance" in field
+                assert spared or math.isfinite(number), (name, field)
+            _in_range(name, m)
+
+
+def _in_range(name: str, m: Any) -> None:
+    if name in ("GPS_INPUT", "GLOBAL_POSITION_SENSOR", "COMMAND_INT"):
+        lat, lon = (m.x, m.y) if name == "COMMAND_INT" else (m.lat, m.lon)
+        assert abs(lat) < 90 * 10**7 and abs(lon) <= 180 * 10**7
+    else:
+        c = m.covariance if name == "VISION_POSITION_ESTIMATE" else m.pose_covariance
+        assert min(c[0], c[6], c[11]) > 0.0 and max(c[0], c[6], c[11]) < math.inf
+        assert max(abs(m.x), abs(m.y)) < 3e7
+    if name == "COMMAND_INT":
+        assert m.param1 >= 0.0 and m.param2 == 0.0 and 0.0 < m.param3 <= 100.001
+    if name == "GPS_INPUT":
+        assert math.hypot(m.vn, m.ve) < 401.0 and m.time_week > 0
+        assert 0.0 < m.horiz_accuracy <= 100.001 and m.vert_accuracy > 0.0 and m.speed_accuracy > 0.0
+    if name == "GLOBAL_POSITION_SENSOR":
+        assert 0.0 < m.eph < 1500.0 and 0.0 < m.epv < 1001.0
+
+
+def test_each_change_is_told_once_and_not_too_often() -> None:
+    withheld, now = Withheld(), 0
+    told = []
+
+    def say(reason: str | None, seconds: float) -> None:
+        nonlocal now
+        for _ in range(round(10 * seconds)):
+            now += SECOND // 10
+            if (event := withheld.note("ODOMETRY", reason, now)) is not None:
+                told.append((now * 1e-9, event.severity, event.text))
+
+    say(None, 10.0)
+    say("it is too old", 10.0)
+    say(None, 10.0)
+    assert [(severity, text) for _, severity, text in told] == [
+        (6, "ODOMETRY goes out"),
+        (4, "ODOMETRY withheld: it is too old"),
+        (6, "ODOMETRY goes out, 100 withheld so far"),
+    ]
+    assert withheld.counts == {("ODOMETRY", "it is too old"): 100}
+    for _ in range(100):
+        say("it is too old", 0.1)
+        say(None, 0.1)
+    times = [at for at, *_ in told]
+    assert len(told) <= 3 + 20 * SECOND // TELL_EVERY + 1
+    assert all(b - a >= TELL_EVERY / SECOND for a, b in itertools.pairwise(times))

@@ -1,0 +1,389 @@
+"""Bytes in, bytes out: who is believed, what is logged, what goes out when, and what breaks nothing."""
+
+import math
+from collections import Counter
+
+import numpy as np
+import pytest
+
+from companion.config import Config, InertialConfig, OutputConfig
+from companion.link import dialect, frame
+from companion.nav.geometry import Geodetic, local_to_geodetic, slant_range_azimuth
+from companion.navigator import Navigator
+from companion.records import (
+    Event,
+    Gnss,
+    LinkState,
+    LocalPosition,
+    Reboot,
+    Rejection,
+    Reset,
+    RsbnFix,
+    Solution,
+    Stamped,
+    Truth,
+)
+from companion.runtime.core import Onboard
+
+CONFIG = Config(
+    inertial=InertialConfig(independent=True),
+    output=OutputConfig(profile="custom", odometry_hz=5.0, global_position_sensor_hz=2.0),
+)
+SECOND, MS = 1_000_000_000, 1_000_000
+START = 5000 * SECOND
+BOOT = START - 30 * SECOND
+ORIGIN = Geodetic(math.radians(60.0), math.radians(30.0), 50.0)
+BEACON = Geodetic(math.radians(60.05), math.radians(31.07), 80.0)
+V_NORTH, HEIGHT = 40.0, 800.0
+
+
+def deg_e7(angle: float) -> int:
+    return round(math.degrees(angle) * 1e7)
+
+
+class Log:
+    def __init__(self) -> None:
+        self.records: list[tuple[str | None, Stamped]] = []
+        self.frames: Counter[bool] = Counter()
+
+    def record(self, record: Stamped, channel: str | None = None) -> None:
+        self.records.append((channel, record))
+
+    def frame(self, link: str, outgoing: bool, data: bytes, t_ns: int) -> None:
+        self.frames[outgoing] += 1
+
+    def of(self, *kinds: type[Stamped]) -> list:
+        return [record for _, record in self.records if isinstance(record, kinds)]
+
+
+class Flight:
+    """An autopilot that flies north, and the companion beside it, on a clock of the test's own."""
+
+    def __init__(self, *links: str) -> None:
+        self.log = Log()
+        self.onboard = Onboard(CONFIG, self.log, links or ("main",))
+        self.now, self.boot, self.tells_origin = START, BOOT, True
+        self.sent: list[tuple[int, dialect.Message]] = []
+        self._sequence = 0
+        self._reader = frame.Reader()
+
+    def frame(self, name: str, system: int = 1, component: int = 1, **values: object) -> bytes:
+        self._sequence = self._sequence + 1 & 0xFF
+        return frame.encode(dialect.new(name, **values), self._sequence, system, component)
+
+    def say(self, name: str, system: int = 1, component: int = 1, **values: object) -> None:
+        self.hear(self.frame(name, system, component, **values))
+
+    def hear(self, data: bytes) -> None:
+        self.onboard.receive("main", data, self.now)
+        self.collect()
+
+    def collect(self) -> None:
+        for data in self.onboard.to_send("main", self.now):
+            for found in self._reader.receive(data):
+                self.sent.append((self.now, dialect.decode(found)))
+
+    def place(self) -> Geodetic:
+        t = (self.now - START) * 1e-9
+        return local_to_geodetic("ardupilot", ORIGIN, np.array([V_NORTH * t, 0.0, -HEIGHT]))
+
+    def fly(self, seconds: float) -> None:
+        for _ in range(round(10 * seconds)):
+            self.now += 100 * MS
+            stamp = (self.now - self.boot) // MS
+            tick = (self.now - START) // (100 * MS)
+            if tick % 10 == 1:
+                self.say("HEARTBEAT", type=1, autopilot=3)
+            if tick % 50 == 2 and self.tells_origin:
+                self.tell_origin()
+            x = V_NORTH * (self.now - START) * 1e-9
+            self.say("LOCAL_POSITION_NED", time_boot_ms=stamp, x=x, z=-HEIGHT, vx=V_NORTH)
+            if tick % 2:
+                lat, lon, alt = self.place()
+                self.say(
+                    "GPS_RAW_INT",
+                    time_usec=stamp * 1000,
+                    fix_type=3,
+                    lat=deg_e7(lat),
+                    lon=deg_e7(lon),
+                    alt=round(alt * 1e3),
+                    vel=round(V_NORTH * 100),
+                    satellites_visible=14,
+                )
+            self.onboard.poll(self.now)
+            self.collect()
+
+    def tell_origin(self) -> None:
+        lat, lon = deg_e7(ORIGIN.lat), deg_e7(ORIGIN.lon)
+        self.say("GPS_GLOBAL_ORIGIN", latitude=lat, longitude=lon, altitude=round(ORIGIN.alt * 1e3))
+
+    def rsbn(self, component: int = 1, **changes: object) -> None:
+        sight = slant_range_azimuth(BEACON, self.place())
+        values = {
+            "time_usec": (self.now - self.boot) // 1000,
+            "beacon_lat": deg_e7(BEACON.lat),
+            "beacon_lon": deg_e7(BEACON.lon),
+            "beacon_alt": BEACON.alt,
+            "azimuth": sight.azimuth,
+            "slant_range": sight.slant_range,
+            "sigma_azimuth": 0.002,
+            "sigma_range": 100.0,
+            "beacon_id": 1,
+            "status": 3,
+        }
+        self.say("RSBN_MEASUREMENT", component=component, **(values | changes))
+
+    def heard(self, name: str) -> list[int]:
+        return [at for at, message in self.sent if message.get_type() == name]
+
+
+def test_truth_is_logged_and_never_reaches_the_navigator(monkeypatch: pytest.MonkeyPatch) -> None:
+    handed: list[type] = []
+    handle = Navigator.handle
+
+    def spy(self: Navigator, record: Stamped) -> list:
+        handed.append(type(record))
+        return handle(self, record)
+
+    monkeypatch.setattr(Navigator, "handle", spy)
+    flight = Flight()
+    flight.fly(2.0)
+    lat, lon, alt = flight.place()
+    flight.say("SIM_STATE", lat_int=deg_e7(lat), lon_int=deg_e7(lon), alt=alt, q1=1.0)
+    hil = {"lat": deg_e7(lat), "lon": deg_e7(lon), "alt": round(alt * 1e3)}
+    flight.say("HIL_STATE_QUATERNION", **hil, attitude_quaternion=[1.0, 0.0, 0.0, 0.0])
+    assert len(flight.log.of(Truth)) == 2
+    assert Truth not in handed
+    assert LocalPosition in handed and Gnss in handed
+
+
+def test_solutions_go_out_at_their_rates_and_at_once_on_a_beacon_s_answer() -> None:
+    flight = Flight()
+    flight.fly(13.0)
+    begin = flight.now - 10 * SECOND
+    for name, rate in (("ODOMETRY", 5), ("GLOBAL_POSITION_SENSOR", 2), ("NAVIGATION_STATUS", 1)):
+        times = [at for at in flight.heard(name) if at > begin]
+        assert len(times) == pytest.approx(10 * rate, abs=1), name
+    before = len(flight.sent)
+    flight.now += 10 * MS
+    flight.rsbn(component=42)  # a receiver that is a component of its own
+    assert {m.get_type() for _, m in flight.sent[before:]} >= {"ODOMETRY", "GLOBAL_POSITION_SENSOR"}
+    assert len(flight.log.of(RsbnFix)) == 1
+
+
+def test_the_origin_is_asked_for_until_it_is_told() -> None:
+    flight = Flight()
+    flight.tells_origin = False
+    flight.fly(10.0)
+
+    def asked() -> int:
+        return sum(
+            m.get_type() == "COMMAND_LONG" and m.command == 512 and m.param1 == 49 for _, m in flight.sent
+        )
+
+    assert 3 <= asked() <= 4
+    assert not flight.log.of(Solution)
+    flight.tell_origin()
+    count = asked()
+    flight.fly(7.0)
+    assert asked() == count
+    assert flight.log.of(Solution)
+
+
+def test_a_second_autopilot_is_told_once_and_changes_nothing() -> None:
+    alone, disturbed = Flight(), Flight()
+    alone.fly(6.0)
+    for _ in range(6):
+        disturbed.fly(1.0)
+        disturbed.say("HEARTBEAT", system=9, type=1, autopilot=3)
+        disturbed.say("LOCAL_POSITION_NED", system=9, time_boot_ms=1, x=9e4, y=9e4)
+    told = [e.text for e in disturbed.log.of(Event) if "second autopilot" in e.text]
+    assert len(told) == 1 and "9" in told[0]
+    assert disturbed.log.of(Solution) == alone.log.of(Solution)
+
+
+def decoded(frames: list[bytes]) -> list[dialect.Message]:
+    found = [found for data in frames for found in frame.Reader().receive(data)]
+    return [dialect.decode(each) for each in found if isinstance(each, frame.Frame)]
+
+
+def told(flight: Flight) -> list[str]:
+    return [event.text for event in flight.log.of(Event)]
+
+
+class TwoLinks(Flight):
+    """The same autopilot heard over a second link too, that is late; the first may be cut."""
+
+    def __init__(self, late: int) -> None:
+        super().__init__("main", "radio")
+        self.late, self.cut = late, False
+        self.steered: Counter[str] = Counter()
+        self._way: list[tuple[int, bytes]] = []
+
+    def hear(self, data: bytes) -> None:
+        if not self.cut:
+            super().hear(data)
+        self._way.append((self.now + self.late, data))
+        while self._way and self._way[0][0] <= self.now:
+            self.onboard.receive("radio", self._way.pop(0)[1], self.now)
+        for name in ("main", "radio"):
+            for message in decoded(self.onboard.to_send(name, self.now)):
+                self.steered[name] += message.get_type() == "ODOMETRY"
+
+    def collect(self) -> None:
+        pass
+
+
+@pytest.mark.parametrize("late", [0, 400 * MS, 2 * SECOND])
+def test_of_two_links_to_the_autopilot_one_leads(late: int) -> None:
+    alone, both = Flight(), TwoLinks(late)
+    alone.fly(20.0)
+    both.fly(20.0)
+    assert both.log.of(Solution) == alone.log.of(Solution)
+    assert both.steered["radio"] == 0 and both.steered["main"] == len(alone.heard("ODOMETRY"))
+    assert "radio: autopilot 1 heard (ardupilot); it is listened to over main" in told(both)
+
+
+def test_the_other_link_leads_while_the_first_is_silent() -> None:
+    flight = TwoLinks(20 * MS)
+    flight.fly(90.0)
+    flight.cut = True
+    flight.fly(20.0)
+    assert any(t.startswith("main: autopilot 1 silent") and t.endswith("over radio") for t in told(flight))
+    during = [s for s in flight.log.of(Solution) if s.rx_ns > flight.now - 14 * SECOND]
+    assert len(during) >= 65 and flight.steered["radio"] >= 65
+    assert max(math.hypot(*s.error_n) for s in during) < 3.0
+    flight.cut = False
+    before = flight.steered.copy()
+    flight.fly(10.0)
+    assert flight.steered["main"] - before["main"] >= 45
+    assert not flight.log.of(Reset)
+
+
+def test_another_aircraft_on_a_second_link_is_told_and_changes_nothing() -> None:
+    alone, disturbed = Flight(), Flight("main", "radio")
+    alone.fly(6.0)
+    for _ in range(6):
+        disturbed.fly(1.0)
+        for name, values in (
+            ("HEARTBEAT", {"type": 1, "autopilot": 3}),
+            ("LOCAL_POSITION_NED", {"time_boot_ms": 1000, "x": 9e4, "y": 9e4}),
+        ):
+            disturbed.onboard.receive("radio", disturbed.frame(name, system=9, **values), disturbed.now)
+    assert "radio: a second autopilot, 9, is ignored; we listen to 1" in told(disturbed)
+    assert disturbed.log.of(Solution) == alone.log.of(Solution)
+    names = [m.get_type() for m in decoded(disturbed.onboard.to_send("radio", disturbed.now))]
+    assert set(names) == {"HEARTBEAT"}
+
+
+def test_a_rate_that_was_slow_for_a_moment_is_not_slow_for_longer() -> None:
+    flight = Flight()
+    flight.fly(5.0)
+    odometry = dialect.type_named("ODOMETRY").msgid
+    for interval_us in (60e6, 0.0):  # once a minute, and by default again
+        flight.say(
+            "COMMAND_LONG",
+            system=255,
+            component=190,
+            target_system=1,
+            target_component=191,
+            command=511,
+            param1=odometry,
+            param2=interval_us,
+        )
+        flight.fly(2.0)
+    assert [m.result for _, m in flight.sent if m.get_type() == "COMMAND_ACK"] == [0, 0]
+    before = len(flight.heard("ODOMETRY"))
+    flight.fly(10.0)
+    assert len(flight.heard("ODOMETRY")) - before == pytest.approx(50, abs=1)
+
+
+def test_a_faster_output_set_in_flight_asks_for_a_faster_channel() -> None:
+    flight = Flight()
+    flight.fly(3.0)
+    before = len(flight.sent)
+    flight.say(
+        "PARAM_SET",
+        system=255,
+        component=190,
+        target_system=1,
+        target_component=191,
+        param_id=b"OUT_ODOMETRY_HZ",
+        param_value=20.0,
+        param_type=9,
+    )
+    flight.fly(1.0)
+    asked = [m for _, m in flight.sent[before:] if m.get_type() == "COMMAND_LONG" and m.command == 511]
+    local = dialect.type_named("LOCAL_POSITION_NED").msgid
+    assert [(m.param1, m.param2) for m in asked] == [(local, 50_000.0)]
+
+
+def test_garbage_and_unknown_messages_are_counted_and_it_carries_on() -> None:
+    flight = Flight()
+    flight.fly(3.0)
+    flight.hear(bytes(range(256)) * 4)
+    flight.hear(b"\xfd\x02\x00\x00\x00\x01\x01\xff\xff\x7fab\x12\x34")
+    solutions = len(flight.log.of(Solution))
+    flight.fly(3.0)
+    assert flight.log.of(LinkState)[-1].bad >= 2
+    assert len(flight.log.of(Solution)) >= solutions + 14
+
+
+@pytest.mark.parametrize("name", ["LOCAL_POSITION_NED", "RSBN_MEASUREMENT", "GPS_RAW_INT"])
+def test_fields_that_are_no_numbers_make_one_rejection(name: str) -> None:
+    flight = Flight()
+    flight.fly(3.0)
+    rejected = len(flight.log.of(Rejection))
+    if name == "RSBN_MEASUREMENT":
+        flight.rsbn(azimuth=math.nan, slant_range=math.nan)
+    elif name == "GPS_RAW_INT":
+        flight.say(name, time_usec=1, fix_type=3, lat=2_000_000_000, lon=0)
+    else:
+        flight.say(name, time_boot_ms=(flight.now - flight.boot) // MS, x=math.nan, z=-HEIGHT)
+    found = flight.log.of(Rejection)[rejected:]
+    assert [r.source for r in found] == [name]
+    solutions = len(flight.log.of(Solution))
+    flight.fly(2.0)
+    assert len(flight.log.of(Solution)) >= solutions + 9
+
+
+def test_after_a_reboot_everything_begins_anew_and_it_flies_on() -> None:
+    flight = Flight()
+    flight.fly(6.0)
+    flight.boot = flight.now - SECOND
+    flight.fly(6.0)
+    assert len(flight.log.of(Reboot)) == 1
+    assert [r.what for r in flight.log.of(Reset)] == ["navigator"]
+    assert sum("rebooted" in e.text for e in flight.log.of(Event)) == 1
+    assert flight.log.of(Solution)[-1].rx_ns > flight.now - SECOND
+    assert any(at > flight.now - SECOND for at in flight.heard("ODOMETRY"))
+
+
+def test_an_autopilot_that_falls_silent_and_comes_back_is_told_of() -> None:
+    flight = Flight()
+    flight.fly(2.0)
+    for _ in range(8):
+        flight.now += SECOND
+        flight.onboard.poll(flight.now)
+    flight.fly(2.0)
+    texts = [e.text for e in flight.onboard.take_events()]
+    assert sum("silent" in t for t in texts) == 1
+    assert sum("heard" in t for t in texts) == 2
+
+
+def test_every_frame_is_logged_both_ways() -> None:
+    flight = Flight()
+    flight.fly(3.0)
+    assert flight.log.frames[True] == len(flight.sent)
+    assert flight.log.frames[False] == flight.onboard.links["main"].received
+
+
+def test_it_is_polled_when_it_says() -> None:
+    flight = Flight()
+    flight.fly(1.0)
+    for _ in range(20):
+        deadline = flight.onboard.deadline()
+        assert deadline > flight.now
+        flight.now = deadline
+        flight.onboard.poll(flight.now)
+        flight.collect()

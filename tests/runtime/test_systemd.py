@@ -1,0 +1,220 @@
+"""What systemd hears, over a real socket of a real process: ready when it serves, alive only while the
+navigator works, stopping at its end; and a unit file that its own checker and our command line accept."""
+
+import configparser
+import contextlib
+import os
+import shlex
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from companion.__main__ import EX_CONFIG
+from companion.link import dialect, frame
+from companion.runtime.service import LOG_CHECK_S
+from companion.runtime.systemd import TIMES, Manager
+
+LOOPBACK = "127.0.0.1"
+TERM_S = 0.8
+RUN = "import sys; from companion.__main__ import main; sys.argv[0] = 'companion'; main()"
+#: The fault: a navigator that never returns from the first GNSS fix on.
+HANGING = f"""
+import time
+from companion.navigator import Navigator
+from companion.records import Gnss
+handle = Navigator.handle
+def hang(self, record):
+    while isinstance(record, Gnss):
+        time.sleep(0.1)
+    return handle(self, record)
+Navigator.handle = hang
+{RUN}
+"""
+#: The fault: nothing that is due is done any more, while bytes still come and go.
+IDLE = f"""
+from companion.onboard import Onboard
+poll, polls = Onboard.poll, []
+def twice(self, now):
+    polls.append(now)
+    if len(polls) < 3:
+        poll(self, now)
+Onboard.poll = twice
+{RUN}
+"""
+DATA = {
+    "heartbeat": dialect.new("HEARTBEAT", type=1, autopilot=3),
+    "gnss": dialect.new("GPS_RAW_INT", time_usec=1, fix_type=3, lat=600000000, lon=300000000, alt=100000),
+}
+
+
+def heard(sock: socket.socket) -> str:
+    """All that is there to be read."""
+    lines = []
+    with contextlib.suppress(BlockingIOError):
+        while True:
+            lines.append(sock.recv(4096).decode())
+    return "\n".join(lines)
+
+
+class Running:
+    """`companion run` below a service manager of ours, and an autopilot that says `DATA` at 20 Hz."""
+
+    def __init__(self, folder: Path, code: str = RUN, name: str = "") -> None:
+        self.folder = folder
+        self.manager = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self.manager.setblocking(False)
+        name = name or str(folder / "notify")
+        self.manager.bind("\0" + name[1:] if name.startswith("@") else name)
+        self.autopilot = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.autopilot.bind((LOOPBACK, 0))
+        self.autopilot.setblocking(False)
+        port = self.autopilot.getsockname()[1]
+        environment = {k: v for k, v in os.environ.items() if not k.startswith("COMPANION_")}
+        environment |= {"NOTIFY_SOCKET": name, "WATCHDOG_USEC": str(round(1e6 * TERM_S))}
+        arguments = ["run", "--connect", f"udpout:{LOOPBACK}:{port}", "--logs", str(folder / "logs")]
+        self.process = subprocess.Popen(
+            [sys.executable, "-c", code, *arguments], env=environment, stderr=subprocess.DEVNULL
+        )
+        self._peer = None
+        self.told = ""
+
+    def play(self, seconds: float, *names: str, until: str = "") -> str:
+        """Speak for so long, or until the manager was told `until`; what it was told meanwhile."""
+        told, end = "", time.monotonic() + seconds
+        while time.monotonic() < end and not (until and until in told):
+            with contextlib.suppress(BlockingIOError):
+                self._peer = self.autopilot.recvfrom(65536)[1]
+            for name in names:
+                if self._peer:
+                    with contextlib.suppress(ConnectionRefusedError):
+                        self.autopilot.sendto(frame.encode(DATA[name], 0, 1, 1), self._peer)
+            time.sleep(0.05)
+            told += heard(self.manager)
+        self.told += told
+        return told
+
+    def close(self) -> None:
+        self.process.kill()
+        self.process.wait()
+        self.manager.close()
+        self.autopilot.close()
+
+
+@pytest.fixture
+def running(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Running]:
+    run = Running(tmp_path, **getattr(request, "param", {}))
+    yield run
+    run.close()
+
+
+@pytest.mark.parametrize("running", [{}, {"name": f"@companion-test-{os.getpid()}"}], indirect=True)
+def test_it_is_ready_once_it_logs_and_alive_while_it_works_and_says_when_it_stops(running: Running) -> None:
+    running.play(30.0, "heartbeat", "gnss", until="READY=1")
+    assert "READY=1" in running.told
+    assert any((running.folder / "logs").iterdir())
+    assert "autopilot 1 heard" in running.play(5.0, "heartbeat", "gnss", until="autopilot 1 heard")
+    told = running.play(2 * TERM_S, "heartbeat", "gnss")
+    assert TIMES <= told.count("WATCHDOG=1") <= 2 * TIMES + 1
+    running.process.send_signal(signal.SIGTERM)
+    assert running.process.wait(20) == 0
+    told = heard(running.manager)
+    assert "STOPPING=1" in told and "READY" not in told
+    assert running.told.count("READY=1") == 1
+
+
+def test_it_is_alive_while_there_is_no_autopilot_yet(running: Running) -> None:
+    running.play(30.0, until="READY=1")
+    assert running.play(2.5).count("WATCHDOG=1") >= 2
+
+
+@pytest.mark.parametrize("running", [{"code": HANGING}], indirect=True)
+def test_a_navigator_that_hangs_starves_the_watchdog(running: Running) -> None:
+    running.play(30.0, "heartbeat", until="heard")
+    assert "WATCHDOG=1" in running.play(TERM_S, "heartbeat")
+    running.play(0.3, "heartbeat", "gnss")  # from here on it hangs
+    assert "WATCHDOG=1" not in running.play(2 * TERM_S, "heartbeat", "gnss")
+    assert running.process.poll() is None
+
+
+@pytest.mark.parametrize("running", [{"code": IDLE}], indirect=True)
+def test_bytes_alone_do_not_feed_the_watchdog(running: Running) -> None:
+    running.play(30.0, "heartbeat", "gnss", until="READY=1")
+    running.play(3.5, "heartbeat", "gnss")
+    assert "WATCHDOG=1" not in running.play(2 * TERM_S, "heartbeat", "gnss")
+    assert running.process.poll() is None
+
+
+# -- the notifier alone -------------------------------------------------------------------------------------
+
+
+def manager_at(path: Path, **environment: str) -> tuple[Manager, socket.socket]:
+    sock = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+    sock.bind(str(path))
+    sock.setblocking(False)
+    return Manager({"NOTIFY_SOCKET": str(path), **environment}), sock
+
+
+def test_without_a_manager_or_with_one_that_is_gone_nothing_happens(tmp_path: Path) -> None:
+    for environment in ({}, {"NOTIFY_SOCKET": str(tmp_path / "gone"), "WATCHDOG_USEC": "1000"}):
+        manager = Manager(environment)
+        manager.ready()
+        manager.alive(0)
+        manager.status("all is well")
+        manager.stopping()
+
+
+def test_the_watchdog_of_another_process_is_not_ours(tmp_path: Path) -> None:
+    for pid, fed in ((os.getpid(), True), (os.getpid() + 1, False)):
+        manager, sock = manager_at(tmp_path / str(pid), WATCHDOG_USEC="1000", WATCHDOG_PID=str(pid))
+        manager.alive(0)
+        assert ("WATCHDOG=1" in heard(sock)) is fed
+        sock.close()
+
+
+def test_a_status_is_one_line(tmp_path: Path) -> None:
+    manager, sock = manager_at(tmp_path / "notify")
+    manager.status("log: two\nlines")
+    assert heard(sock) == "STATUS=log: two lines"
+    sock.close()
+
+
+# -- the unit -----------------------------------------------------------------------------------------------
+
+UNIT = Path(__file__).parents[2] / "deploy" / "companion.runtime.service"
+
+
+def unit() -> configparser.ConfigParser:
+    read = configparser.ConfigParser(strict=False, interpolation=None, delimiters="=")
+    read.optionxform = str
+    read.read(UNIT)
+    return read
+
+
+def test_the_unit_means_what_the_service_does() -> None:
+    service = unit()["Service"]
+    assert service["Type"] == "notify"
+    assert float(service["WatchdogSec"]) > TIMES * LOG_CHECK_S  # with no autopilot it wakes once a second
+    assert str(EX_CONFIG) in service["RestartPreventExitStatus"].split()
+    _, command, *options = shlex.split(service["ExecStart"])
+    shown = subprocess.run(
+        [sys.executable, "-m", "companion", command, "--help"], capture_output=True, text=True, check=True
+    )
+    for option in options[::2]:
+        assert option in shown.stdout
+
+
+@pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="there is no systemd-analyze here")
+def test_systemd_accepts_the_unit(tmp_path: Path) -> None:
+    copy = tmp_path / "companion.runtime.service"
+    text = UNIT.read_text()
+    copy.write_text(text.replace(shlex.split(unit()["Service"]["ExecStart"])[0], sys.executable))
+    done = subprocess.run(["systemd-analyze", "verify", str(copy)], capture_output=True, text=True)
+    ours = [line for line in done.stderr.splitlines() if "companion" in line]
+    assert not ours and done.returncode == 0, done.stderr

@@ -1,0 +1,649 @@
+"""The log gives back what was put in, whatever the disk or the power did."""
+
+import dataclasses
+import errno
+import io
+import itertools
+import json
+import os
+import resource
+import signal
+import subprocess
+import sys
+import tarfile
+import threading
+import time
+from contextlib import suppress
+from functools import partial
+from pathlib import Path
+
+import msgspec
+import pytest
+from click.testing import CliRunner
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.reader import NonSeekingReader, make_reader
+from mcap.stream_reader import StreamReader
+
+from companion import records as r
+from companion.analysis.log_command import group
+from companion.storage import container, location_fix, retention
+from companion.storage.flight_log import LogError, Writer, info, metadata, read, recover
+from companion.storage.mcap_file import DiskFile
+
+SUITE = Path(__file__).parents[1] / "data" / "mcap_conformance.tar.xz"
+START = {"start_unix_ns": 1_700_000_000_000_000_000, "start_ns": 12_345_678_901}
+T = START["start_ns"]
+
+EVERY_KIND = [
+    r.Imu(T, T + 1, 0, (0.1, -0.2, -9.806649999999999), (1e-300, -0.0, 5e-324)),
+    r.Attitude(T + 2, T + 3, 0.1, -0.2, 3.141592653589793, (1.0, 2.0, 3.0)),
+    r.Gnss(T + 4, T + 5, 1, 123456, 3, 0.9, -2.1, 312.5, 1.5, 3.0, (1.0, 2.0, -3.0), 0.1, 12, 0.9, 330.1),
+    r.LocalPosition(T + 6, T + 7, (1.0, 2.0, 3.0), (4.0, 5.0, 6.0)),
+    r.LocalOrigin(T + 8, T + 9, 0.9, -2.1, 10.0),
+    r.HomePosition(T + 10, T + 11, 0.9, -2.1, 10.0),
+    r.GlobalPosition(T + 12, T + 13, 0.9, -2.1, 10.0, (1.0, 2.0, 3.0), 5.0),
+    r.AirData(T + 14, T + 15, 31.4),
+    r.Wind(T + 16, T + 17, (3.0, -4.0, 0.1)),
+    r.Pressure(T + 18, T + 19, 101325.0, None, 288.15),
+    r.FilterStatus(T + 20, T + 21, 831, False, 0.05),
+    r.SystemTime(T + 22, T + 23, 10**9),
+    r.RsbnFix(T + 24, T + 25, 7, 0.91, -2.0, 120.0, None, 81234.5, 0.0044, 200.0),
+    r.Fix(T + 26, T + 26, 0.9, -2.1, 3.0, (1.0, 2.0), (4.0, 0.5, 9.0), 6, 1.2, 2, 4),
+    r.Rejection(T + 27, T + 27, "gnss", "too far", 12.5, 9.21),
+    r.Reset(T + 28, T + 28, "filter", "the covariance lost its sign"),
+    r.Event(T + 29, T + 29, 4, "RSBN beacon 7 lost ✈"),
+    r.Solution(
+        T + 30, T + 30, r.Mode.PREDICTING, "minimax", 0.9, -2.1, 300.0, (30.0, 0.1, -1.0),
+        (16.0, 1.0, 2.0, 25.0, 3.0, 36.0), (637.0, -400.0), (0.5, -0.25), 5, 120.5, (700.0, 800.0),
+        ahead=(r.Prediction(60.0, (1.0, 2.0), (0.5, 0.6), (1.5, 2.5)),),
+    ),
+    r.LinkState(T + 31, T + 31, "udp", True, 1000, 3, 1, 0, -5, 900_000),
+    r.Reboot(T + 31, T + 31, 1),
+    r.Tuning(T + 32, T + 32, '[gnss]\nsigma_m = 3.0\n'),
+    r.Truth(T + 32, T + 32, 0.9, -2.1, 333.0, (1.0, 2.0, 3.0), (0.1, 0.2, 0.3)),
+]  # fmt: skip
+
+
+def imu(i: int) -> r.Imu:
+    return r.Imu(T + i * 10**7, T + i * 10**7 + 11, 0, (0.1 * i, 0.2, -9.81), (1e-3 / (i + 1), 2e-3, 0.0))
+
+
+def wait_until(condition, seconds: float = 10.0) -> None:
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "did not come true in time"
+        time.sleep(0.01)
+
+
+# -- what goes in comes out --------------------------------------------------------------------------------
+
+
+def test_every_kind_of_record_and_frame_comes_back_bit_for_bit(tmp_path):
+    assert {type(one) for one in EVERY_KIND} == set(r.BY_NAME.values())
+    path = tmp_path / "x.mcap"
+    with Writer(path, metadata={"configuration": {"toml": "a = 1\n"}}, **START) as log:
+        for one in EVERY_KIND:
+            log.record(one)
+        log.record(EVERY_KIND[0], "/replay/Imu")
+        log.frame("udp", False, b"\xfd\x00\xff", T + 40)
+        log.frame("udp", True, b"", T + 41)
+        assert log.path == path and not path.exists()
+    assert (log.dropped, log.trouble) == (0, None)
+    entries = list(read(path))
+    ours = [e for e in entries if not e.topic.startswith("/map/")]
+    assert [e.value for e in ours] == [*EVERY_KIND, EVERY_KIND[0], b"\xfd\x00\xff", b""]
+    assert [r.encode(e.value) for e in ours[: len(EVERY_KIND)]] == [r.encode(one) for one in EVERY_KIND]
+    shift = START["start_unix_ns"] - START["start_ns"]
+    assert [e.log_time - shift for e in ours[: len(EVERY_KIND)]] == [one.rx_ns for one in EVERY_KIND]
+    topics = [e.topic for e in ours]
+    assert {"/in/Gnss", "/out/Solution", "/truth/Truth", "/link/LinkState"} <= set(topics)
+    assert topics[-3:] == ["/replay/Imu", "/mavlink/udp/rx", "/mavlink/udp/tx"]
+    assert metadata(path) == info(path).metadata
+    assert metadata(path)["configuration"] == {"toml": "a = 1\n"}
+    assert metadata(path)["log"]["start_ns"] == str(START["start_ns"])
+
+
+def test_the_mcap_package_reads_the_same(tmp_path):
+    path = tmp_path / "x.mcap"
+    with Writer(path, metadata={"a": {"b": "c"}}, chunk_bytes=2000, **START) as log:
+        for one in itertools.islice(itertools.cycle(EVERY_KIND), 500):
+            log.record(one)
+    ours = [(e.topic, e.log_time, e.value) for e in read(path, raw=True)]
+    with path.open("rb") as stream:
+        reader = make_reader(stream, validate_crcs=True)
+        # its order is by time; the file's is that of the calls
+        theirs = [(c.topic, m.log_time, m.data) for _, c, m in reader.iter_messages()]
+        assert sorted(theirs) == sorted(ours)
+        assert {m.name: m.metadata for m in reader.iter_metadata()} == metadata(path)
+        summary = reader.get_summary()
+    found = info(path)
+    assert summary.statistics.message_count == found.messages == len(ours)
+    assert summary.statistics.chunk_count == found.chunks == len(summary.chunk_indexes) > 10
+    assert summary.statistics.message_start_time == found.start_ns
+    assert summary.statistics.message_end_time == found.end_ns
+    with path.open("rb") as stream:
+        stream_records = list(StreamReader(stream, validate_crcs=True).records)
+    assert [x.data for x in stream_records if type(x).__name__ == "Message"] == [x[2] for x in ours]
+
+
+def test_positions_stand_on_the_map_no_more_than_twice_a_second(tmp_path):
+    path = tmp_path / "x.mcap"
+    solution = next(one for one in EVERY_KIND if isinstance(one, r.Solution))
+
+    with Writer(path, metadata={}, **START) as log:
+        for i in range(101):
+            t_ns = T + i * 10**8
+            log.record(msgspec.structs.replace(solution, t_ns=t_ns, rx_ns=t_ns))
+    points = {"/map/solution": [], "/map/inertial": []}
+    for entry in read(path):
+        if entry.topic in points:
+            points[entry.topic].append(json.loads(entry.value))
+    assert [len(v) for v in points.values()] == [21, 21]
+    corrected, inertial = points["/map/solution"][0], points["/map/inertial"][0]
+    # 637 m north and 400 m west of it, by the radii of the ellipsoid at 51.6 degrees
+    assert (inertial["latitude"] - corrected["latitude"]) * 111_258 == pytest.approx(637.0, rel=1e-3)
+    assert (inertial["longitude"] - corrected["longitude"]) * 69_340 == pytest.approx(-400.0, rel=2e-3)
+    nn, ne, nd, ee, ed, dd = solution.covariance
+    assert corrected["position_covariance"] == [ee, ne, -ed, ne, nn, -nd, -ed, -nd, dd]
+    assert corrected["position_covariance_type"] == location_fix.KNOWN
+    assert set(corrected) == set(location_fix.SCHEMA["properties"])
+    start_s, _ = divmod(START["start_unix_ns"] + 30, 10**9)
+    assert corrected["timestamp"]["sec"] == start_s
+
+
+def test_a_mad_clock_harms_no_record(tmp_path):
+    mad = [r.Event(-(2**62), 2**63 - 1, 1, "a"), r.Event(2**63 - 1, -(2**62), 1, "b")]
+    with Writer(tmp_path / "x.mcap", metadata={}, start_unix_ns=0, start_ns=2**60) as log:
+        for one in mad:
+            log.record(one)
+    assert [e.value for e in read(tmp_path / "x.mcap")] == mad
+
+
+# -- torn logs -----------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory) -> bytes:
+    path = tmp_path_factory.mktemp("small") / "x.mcap"
+    with Writer(path, metadata={"c": {"k": "v"}}, chunk_bytes=300, **START) as log:
+        for i in range(12):
+            log.record(r.Event(T + i, T + i, 6, f"event {i}"))
+            log.frame("udp", i % 2 == 0, bytes(range(i)), T + i)
+    return path.read_bytes()
+
+
+def test_a_log_cut_at_any_byte_is_readable_up_to_its_last_whole_chunk_and_repaired(tmp_path, small):
+    whole, cut = tmp_path / "whole.mcap", tmp_path / "x.mcap.active"
+    whole.write_bytes(small)
+    entries = list(read(whole))
+    ends, have = [], 0  # (where a chunk ends, messages up to there)
+
+    for record in container.scan(io.BytesIO(small[8:]), len(small)):
+        if record.opcode == container.CHUNK:
+            have += sum(
+                m[0] == container.MESSAGE for m in container.messages(container.unpack(record.content))
+            )
+            ends.append((record.offset + 9 + len(record.content), have))
+    assert have == len(entries) == 24 and len(ends) >= 4
+    header_end = 8 + 9 + int.from_bytes(small[9:17], "little")
+    for size in range(len(small)):
+        cut.write_bytes(small[:size])
+        if size < header_end:
+            with pytest.raises(LogError):
+                list(read(cut))
+            with pytest.raises(LogError):
+                recover(cut)
+            continue
+        least = max((n for end, n in ends if end <= size), default=0)
+        got = list(read(cut))
+        assert got == entries[: len(got)] and len(got) >= least, size
+        found = info(cut)
+        assert not found.closed and found.messages == len(got)
+        if size % 9 and size not in {e for end, _ in ends for e in (end - 1, end, end + 1)}:
+            continue  # a repair syncs the disk several times
+        saved = recover(cut)
+        assert saved.path == tmp_path / "x.mcap" and not cut.exists()
+        assert saved.messages == len(got)
+        assert list(read(saved.path)) == got and info(saved.path).closed
+        with saved.path.open("rb") as stream:
+            assert sum(1 for _ in NonSeekingReader(stream, validate_crcs=True).iter_messages()) == len(got)
+        saved.path.unlink()
+
+
+class Killed(BaseException):
+    """The process ends here: nothing after it is done."""
+
+
+class Power:
+    """The calls by which a log is changed, allowed for so many steps; of the last write, so many bytes."""
+
+    def __init__(self, patch: pytest.MonkeyPatch, steps: int, part: float) -> None:
+        self.steps, self.part, self.written = steps, part, 0
+        for name in ("ftruncate", "pwrite", "fsync", "fdatasync", "replace"):
+            patch.setattr(os, name, partial(self.call, name, getattr(os, name)))
+
+    def call(self, name, real, *arguments):
+        self.steps -= 1
+        if self.steps < 0:
+            if name == "pwrite":
+                fd, data, at = arguments
+                real(fd, data[: int(len(data) * self.part)], at)
+            raise Killed
+        result = real(*arguments)
+        self.written += result if name == "pwrite" else 0
+        return result
+
+
+@settings(deadline=None, max_examples=300)
+@given(cut=st.integers(0, 900), steps=st.integers(0, 8), part=st.floats(0, 1))
+def test_a_kill_at_any_instant_of_a_repair_leaves_a_log_that_reads_as_before(
+    tmp_path_factory, small, cut, steps, part
+):
+    path = tmp_path_factory.mktemp("killed") / "x.mcap.active"
+    path.write_bytes(small[: len(small) - cut])
+    entries = list(read(path))
+    with pytest.MonkeyPatch.context() as patch:
+        Power(patch, steps, part)
+        with suppress(Killed):
+            recover(path)
+    left = path if path.exists() else path.with_suffix("")
+    assert list(read(left)) == entries
+    if left == path:
+        assert recover(path).messages == len(entries)
+    assert [one.name for one in path.parent.iterdir()] == ["x.mcap"]
+    assert list(read(path.with_suffix(""))) == entries and info(path.with_suffix("")).closed
+
+
+def test_what_stands_is_not_written_again(tmp_path, small):
+    """A log is mended by the bytes that it lacks, and one that is whole by its name alone."""
+    path = tmp_path / "x.mcap.active"
+    for cut in (0, 30, len(small) - small.rindex(container.record(container.DATA_END, bytes(4)))):
+        path.write_bytes(small[: len(small) - cut])
+        node = path.stat().st_ino
+        with pytest.MonkeyPatch.context() as patch:
+            power = Power(patch, 100, 0.0)
+            assert recover(path).messages == 24
+        assert power.written == cut
+        assert (tmp_path / "x.mcap").read_bytes() == small and (tmp_path / "x.mcap").stat().st_ino == node
+        (tmp_path / "x.mcap").unlink()
+
+
+def test_a_log_damaged_before_its_end_is_left_as_it_was_until_its_copy_is_whole(tmp_path, small):
+    path = tmp_path / "x.mcap.active"
+    for at in range(8, small.rindex(container.record(container.DATA_END, bytes(4))), 7):
+        damaged = bytearray(small[:-20])
+        damaged[at] ^= 0xFF
+        path.write_bytes(damaged)
+        kept = None
+        with suppress(LogError):
+            kept = list(read(path))
+        with pytest.MonkeyPatch.context() as patch, suppress(LogError, Killed):
+            Power(patch, 2, 0.5)
+            recover(path)
+        if kept is not None and path.exists():
+            assert list(read(path))[: len(kept)] == kept, at
+        with suppress(LogError):
+            recover(path)
+            assert info(tmp_path / "x.mcap").closed
+            assert info(tmp_path / "x.mcap").messages >= len(kept or ()), at
+        for one in tmp_path.iterdir():
+            one.unlink()
+
+
+def test_of_a_torn_chunk_that_is_stored_plain_the_whole_messages_are_saved(tmp_path):
+    chunk = container.Chunk()
+    for i in range(10):
+        chunk.add(1, i, i, i, b"%d" % i)
+    body = container.pack(chunk, bytes(chunk.data))[0].replace(container.text("zstd"), container.text(""))
+    definition = container.record(container.CHANNEL, bytes([1, 0, 0, 0]) + container.text("t") * 2 + bytes(4))
+    head = container.MAGIC + container.record(container.HEADER, container.text("") * 2)
+    path = tmp_path / "x.mcap"
+    path.write_bytes(head + definition + body[:-40])
+    assert [e.value for e in read(path)] == [b"%d" % i for i in range(8)]
+    saved = recover(path)
+    assert saved.messages == 8 and saved.path.name == "x.recovered.mcap" and path.exists()
+
+
+def test_a_damaged_byte_is_met_by_a_sentence_and_recover_saves_the_rest(tmp_path, small):
+    path = tmp_path / "x.mcap"
+    at = small.index(b"\x28\xb5\x2f\xfd") + 30  # inside the first compressed chunk
+    path.write_bytes(small[:at] + bytes([small[at] ^ 0xFF]) + small[at + 1 :])
+    with pytest.raises(LogError, match="damaged near byte"):
+        list(read(path))
+    with pytest.raises(LogError, match="damaged near byte"):
+        info(path)
+    saved = recover(path)
+    assert 0 < saved.messages < 24 and saved.bytes_lost > 0
+    assert info(saved.path).messages == saved.messages
+
+
+@settings(deadline=None, max_examples=1500)
+@given(data=st.data())
+def test_no_bytes_raise_anything_but_a_sentence(tmp_path_factory, small, data):
+    kind = data.draw(st.integers(0, 2))
+    if kind == 0:
+        junk = data.draw(st.binary(max_size=200))
+    elif kind == 1:
+        junk = container.MAGIC + data.draw(st.binary(max_size=200))
+    else:
+        edits = data.draw(
+            st.lists(st.tuples(st.integers(8, len(small) - 1), st.integers(0, 255)), max_size=8)
+        )
+        changed = bytearray(small)
+        for at, value in edits:
+            changed[at] = value
+        junk = bytes(changed)
+    path = tmp_path_factory.getbasetemp() / "junk.mcap"
+    path.write_bytes(junk)
+    for look in (lambda: list(read(path)), lambda: info(path), lambda: metadata(path), lambda: recover(path)):
+        try:
+            look()
+        except LogError as error:
+            assert "\n" not in str(error) and str(path.parent) in str(error)
+
+
+def test_what_is_no_log_gets_one_clear_sentence(tmp_path):
+    for name, content, words in (
+        ("empty", b"", "is empty"),
+        ("foreign", b"\x7fELF" * 20, "is not an MCAP log"),
+        ("short", container.MAGIC[:5], "cut off before its header"),
+        ("zeros", container.MAGIC + bytes(100), "cut off before its header"),
+    ):
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(LogError, match=words):
+            list(read(tmp_path / name))
+    with pytest.raises(LogError, match="cannot be read: No such file"):
+        info(tmp_path / "missing")
+    bomb = container.record(
+        container.CHUNK, bytes(16), (2**62).to_bytes(8, "little"), bytes(4), container.text("zstd"), bytes(8)
+    )
+    head = container.MAGIC + container.record(container.HEADER, container.text("") * 2)
+    foot = container.record(container.FOOTER, bytes(20)) + container.MAGIC
+    (tmp_path / "bomb").write_bytes(head + bomb + foot)
+    with pytest.raises(LogError, match="claims"):
+        list(read(tmp_path / "bomb"))
+
+
+# -- the conformance suite -----------------------------------------------------------------------------------
+
+
+def test_all_files_of_the_conformance_suite_are_read(tmp_path):
+    with tarfile.open(SUITE) as archive:
+        archive.extractall(tmp_path, filter="data")
+    logs = sorted(tmp_path.glob("*/*.mcap"))
+    assert len(logs) == 171
+    for path in logs:
+        stated = json.loads(path.with_suffix(".json").read_text())["records"]
+        stated = [(one["type"], dict(one["fields"])) for one in stated]
+        topics = {f["id"]: f["topic"] for kind, f in stated if kind == "Channel"}
+        expected = [
+            (topics[f["channel_id"]], int(f["log_time"]), bytes(map(int, f["data"])))
+            for kind, f in stated
+            if kind == "Message"
+        ]
+        assert list(read(path)) == expected, path.name
+        assert info(path).closed and info(path).messages == len(expected)
+        names = {f["name"]: f["metadata"] for kind, f in stated if kind == "Metadata"}
+        assert metadata(path) == names
+
+
+# -- disks and power -----------------------------------------------------------------------------------------
+
+
+@dataclasses.dataclass
+class Sick:
+    """A disk of which `refuses` says what it does before every write: nothing, wait, or raise."""
+
+    path: Path
+    refuses: object
+
+    def __post_init__(self):
+        self.disk = DiskFile(self.path)
+
+    def write(self, data):
+        error = self.refuses()
+        if error is not None:
+            self.disk.write(data[: len(data) // 2])  # a full disk takes a part
+            raise error
+        self.disk.write(data)
+
+    def __getattr__(self, name):
+        return getattr(self.disk, name)
+
+
+def test_a_full_disk_is_said_and_waited_for_and_nothing_is_lost_that_there_is_room_for(tmp_path):
+    full = threading.Event()
+
+    def refuses():
+        return OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)) if full.is_set() else None
+
+    path = tmp_path / "x.mcap"
+    log = Writer(path, metadata={}, chunk_bytes=500, fsync_s=0.05, disk=lambda p: Sick(p, refuses), **START)
+    written = []
+    for phase in range(3):
+        full.set() if phase == 1 else full.clear()
+        for i in range(100):
+            written.append(imu(100 * phase + i))
+            log.record(written[-1])
+        if phase == 1:
+            wait_until(lambda: log.trouble is not None)
+            assert "No space left on device" in log.trouble
+    wait_until(lambda: log.trouble is None)
+    assert log.close() and log.dropped == 0
+    assert [e.value for e in read(path)] == written
+
+
+@pytest.mark.parametrize("refusals", [1, 2, 5])
+def test_what_a_refusing_disk_took_and_would_not_give_back_is_written_over(tmp_path, refusals):
+    """A disk that drops out takes a part, refuses to cut it off, and is well again."""
+
+    class Flaky(Sick):
+        left = 0
+
+        def truncate(self, size):
+            if self.left > 0:
+                self.left -= 1
+                raise OSError(errno.EIO, "broken")
+            self.disk.truncate(size)
+
+    drops, disks = threading.Event(), []
+
+    def refuses():
+        if drops.is_set():
+            drops.clear()
+            disks[0].left = refusals
+            return OSError(errno.EIO, "broken")
+        return None
+
+    path = tmp_path / "x.mcap"
+    log = Writer(
+        path,
+        metadata={},
+        chunk_bytes=500,
+        fsync_s=0.05,
+        disk=lambda p: disks.append(Flaky(p, refuses)) or disks[0],
+        **START,
+    )
+    for i in range(200):
+        log.record(imu(i))
+        if i % 50 == 20:
+            drops.set()
+            wait_until(lambda: not drops.is_set() and log.trouble is None)
+    assert log.close() and log.dropped == 0
+    assert [e.value for e in read(path)] == [imu(i) for i in range(200)]
+    with path.open("rb") as stream:
+        assert sum(1 for _ in make_reader(stream, validate_crcs=True).iter_messages()) == 200
+
+
+def test_a_disk_that_stays_full_costs_the_oldest_and_they_are_counted(tmp_path):
+    full = threading.Event()
+    log = Writer(
+        tmp_path / "x.mcap",
+        metadata={},
+        chunk_bytes=500,
+        fsync_s=0.05,
+        depth=2000,
+        disk=lambda p: Sick(p, lambda: OSError(errno.EIO, "broken") if full.is_set() else None),
+        **START,
+    )
+    full.set()
+    for i in range(500):
+        log.record(imu(i))
+    wait_until(lambda: log.trouble is not None and log.dropped > 400)
+    full.clear()
+    assert log.close()
+    kept = [e.value for e in read(tmp_path / "x.mcap")]
+    assert kept == [imu(i) for i in range(500 - len(kept), 500)]
+    assert log.dropped + len(kept) == 500
+
+
+def test_a_disk_that_never_comes_back_leaves_a_log_to_recover(tmp_path):
+    full = threading.Event()
+    log = Writer(
+        tmp_path / "x.mcap",
+        metadata={},
+        fsync_s=0.05,
+        disk=lambda p: Sick(p, lambda: OSError(errno.ENOSPC, "full") if full.is_set() else None),
+        **START,
+    )
+    log.record(imu(0))
+    wait_until(lambda: info(tmp_path / "x.mcap.active").messages == 1)
+    full.set()
+    log.record(imu(1))
+    assert not log.close() and "full" in log.trouble and log.dropped == 1
+    log.record(imu(2))
+    assert log.dropped == 2
+    assert recover(tmp_path / "x.mcap.active").messages == 1
+
+
+def test_a_slow_disk_never_holds_the_caller(tmp_path):
+    """While the disk holds the writer nothing else waits: it is let go only after the last record."""
+    slow, holds, go = threading.Event(), threading.Event(), threading.Event()
+    patience = []
+
+    def wait():
+        if slow.is_set():
+            holds.set()
+            patience.append(go.wait(30.0))
+
+    log = Writer(
+        tmp_path / "x.mcap",
+        metadata={},
+        chunk_bytes=2000,
+        fsync_s=0.05,
+        disk=lambda p: Sick(p, wait),
+        **START,
+    )
+    slow.set()
+    log.record(imu(0))
+    wait_until(holds.is_set)
+    i = 1000
+    for k in range(1, i):
+        log.record(imu(k))
+    slow.clear()
+    go.set()
+    assert log.close() and log.dropped == 0 and all(patience)
+    assert sum(1 for _ in read(tmp_path / "x.mcap")) == i
+
+
+def test_with_block_the_caller_waits_and_nothing_is_dropped(tmp_path):
+    log = Writer(
+        tmp_path / "x.mcap", metadata={}, chunk_bytes=1000, depth=2000, block=True,
+        disk=lambda p: Sick(p, lambda: time.sleep(0.005)), **START,
+    )  # fmt: skip
+    for i in range(1000):
+        log.record(imu(i))
+    assert log.close() and log.dropped == 0
+    assert [e.value.t_ns for e in read(tmp_path / "x.mcap")] == [imu(i).t_ns for i in range(1000)]
+
+
+def test_the_kernels_own_limit_on_a_file_is_survived(tmp_path):
+    path = tmp_path / "x.mcap"
+    log = Writer(path, metadata={}, chunk_bytes=4000, fsync_s=0.05, **START)
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, before[1]))
+    try:
+        i = 0
+        while log.trouble is None:
+            log.record(imu(i))
+            i += 1
+        assert "File too large" in log.trouble
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert log.close() and log.dropped == 0
+    assert [e.value for e in read(path)] == [imu(k) for k in range(i)]
+
+
+def test_a_folder_that_cannot_be_written_gets_one_clear_sentence(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(LogError, match=r"cannot keep logs in .*: (Not a directory|File exists)"):
+        retention.open_log(tmp_path / "file", metadata={}, **START)
+    with pytest.raises(LogError, match=r"cannot write a log to .*: No such file"):
+        Writer(tmp_path / "missing" / "x.mcap", metadata={}, **START)
+    if os.geteuid() == 0:  # root writes everywhere but into the kernel's own folders
+        with pytest.raises(LogError, match="cannot write a log to"):
+            Writer("/proc/x.mcap", metadata={}, **START)
+        return
+    locked = tmp_path / "locked"
+    locked.mkdir(mode=0o555)
+    with pytest.raises(LogError, match="Permission denied"):
+        Writer(locked / "x.mcap", metadata={}, **START)
+
+
+KILLED = """
+import sys, time
+from companion.log.file import Writer
+from companion.records import Event
+log = Writer(sys.argv[1], metadata={}, start_unix_ns=10**18, start_ns=0)
+i = 0
+while True:
+    now = time.monotonic_ns()
+    log.record(Event(now, i, 6, "x"))
+    print(now, i, flush=True)
+    i += 1
+    time.sleep(0.002)
+"""
+
+
+@pytest.mark.parametrize("life_s", [0.3, 1.7])
+def test_a_killed_writer_loses_at_most_its_last_second(tmp_path, life_s):
+    path = tmp_path / "x.mcap"
+    with subprocess.Popen([sys.executable, "-c", KILLED, str(path)], stdout=subprocess.PIPE) as child:
+        assert child.stdout is not None
+        said = [child.stdout.readline()]
+        end = time.monotonic() + life_s
+        while time.monotonic() < end:
+            said.append(child.stdout.readline())
+        with pytest.raises(LogError, match="still being written"):
+            recover(f"{path}.active")
+        child.send_signal(signal.SIGKILL)
+        said += child.stdout.readlines()
+    last_ns = int(said[-1].split()[0])
+    (saved,) = retention.recover_left(tmp_path)
+    assert saved.path == path
+    kept = [e.value for e in read(path)]
+    assert [one.rx_ns for one in kept] == list(range(len(kept)))
+    lost = [int(line.split()[0]) for line in said if line.endswith(b"\n")][len(kept) :]
+    assert not lost or last_ns - lost[0] < 1_000_000_000
+
+
+# -- command --------------------------------------------------------------------------------------
+
+
+def test_the_command_shows_repairs_and_fails_in_one_sentence(tmp_path, small):
+    run = CliRunner()
+    (tmp_path / "x.mcap").write_bytes(small)
+    (tmp_path / "y.mcap.active").write_bytes(small[:-60])
+    shown = run.invoke(group, ["info", str(tmp_path / "x.mcap")])
+    assert shown.exit_code == 0 and "/out/Event" in shown.output and "closed" in shown.output
+    shown = run.invoke(group, ["info", "--json", str(tmp_path / "x.mcap")])
+    assert json.loads(shown.output)["counts"] == {
+        "/out/Event": 12, "/mavlink/udp/tx": 6, "/mavlink/udp/rx": 6
+    }  # fmt: skip
+    assert "torn" in run.invoke(group, ["info", str(tmp_path / "y.mcap.active")]).output
+    assert "24 messages" in run.invoke(group, ["recover", str(tmp_path / "y.mcap.active")]).output
+    assert "is whole" in run.invoke(group, ["recover", str(tmp_path / "y.mcap")]).output
+    for command in ("info", "recover"):
+        failed = run.invoke(group, [command, str(tmp_path / "none")])
+        assert failed.exit_code == 1 and failed.output.count("\n") == 1

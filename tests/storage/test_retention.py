@@ -1,0 +1,150 @@
+"""Which logs a folder keeps: the last ones begun, whatever the clock said, and none goes in vain."""
+
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from companion.records import Event
+from companion.storage import retention
+from companion.storage.flight_log import LogError, Writer, info
+
+MIB = 1 << 20
+NS = 10**9
+
+
+def fly(place: Path, unix_s: int = 0, *, max_files: int = 100, min_free: int = 0) -> str:
+    """One log of one record; its name."""
+    with retention.open_log(
+        place, metadata={}, start_unix_ns=unix_s * NS, start_ns=0, max_files=max_files, min_free=min_free
+    ) as log:
+        log.record(Event(1, 1, 6, "x"))
+    return log.path.name
+
+
+def tear(place: Path, name: str) -> Path:
+    """Make of a closed log one that lacks its end."""
+    torn = place / f"{name}.active"
+    torn.write_bytes((place / name).read_bytes()[:-60])
+    (place / name).unlink()
+    return torn
+
+
+def names(place: Path) -> list[str]:
+    return sorted(path.name for path in place.iterdir())
+
+
+class Room:
+    """A disk of so many bytes, of which the files of a folder take theirs and others `taken`."""
+
+    def __init__(self, patch: pytest.MonkeyPatch, place: Path, total: int, taken: int = 0) -> None:
+        self.place, self.total, self.taken = place, total, taken
+        patch.setattr(shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(total, 0, self.free))
+
+    @property
+    def free(self) -> int:
+        return self.total - self.taken - sum(one.stat().st_blocks * 512 for one in self.place.iterdir())
+
+
+def filled(place: Path, name: str, size: int = MIB) -> Path:
+    path = place / name
+    path.write_bytes(os.urandom(size))
+    return path
+
+
+@settings(deadline=None, max_examples=30)
+@given(clock=st.lists(st.integers(0, 3) | st.integers(0, 2_000_000_000), min_size=1, max_size=12))
+def test_the_last_logs_begun_are_kept_whatever_the_clock_said(tmp_path_factory, clock):
+    """A board without a battery begins in 1970 each time; many flights have one name but for the number."""
+    place = tmp_path_factory.mktemp("logs")
+    made = [fly(place, unix_s, max_files=3) for unix_s in clock]
+    assert names(place) == sorted(made[-3:]) == made[-3:]
+
+
+def test_names_of_earlier_versions_go_first_and_in_their_order(tmp_path):
+    """Of those within one second the tenth came after the second."""
+    old = ["19700101T000001Z.mcap", *(f"19700101T000001Z-{i}.mcap" for i in range(2, 12))]
+    old += ["20260101T000000Z.mcap", "20260101T000000Z.recovered.mcap"]
+    for name in old:
+        (tmp_path / name).write_bytes(b"")
+    (tmp_path / "mine.mcap").write_text("keep")
+    (tmp_path / "00007-mine.mcap").write_text("keep")
+    for left in range(len(old), 1, -1):
+        new = fly(tmp_path, max_files=left)
+        kept = {*old[len(old) - left + 1 :], new, "mine.mcap", "00007-mine.mcap"}
+        assert kept <= set(names(tmp_path)) and len(names(tmp_path)) == left + 2
+        (tmp_path / new).unlink()
+
+
+def test_a_number_follows_the_greatest_that_lies_there(tmp_path):
+    assert fly(tmp_path) == "00001-19700101T000000Z.mcap"
+    filled(tmp_path, "99999-20260101T000000Z.mcap", 0)  # copied from another aircraft
+    assert [fly(tmp_path, max_files=3) for _ in range(2)] == [
+        "100000-19700101T000000Z.mcap",
+        "100001-19700101T000000Z.mcap",
+    ]
+    assert "00001-19700101T000000Z.mcap" not in names(tmp_path)
+    assert tear(tmp_path, fly(tmp_path)).name == "100002-19700101T000000Z.mcap.active"
+    assert fly(tmp_path) == "100003-19700101T000000Z.mcap"
+
+
+def test_a_limit_that_no_deletion_reaches_deletes_nothing(tmp_path, monkeypatch):
+    made = [fly(tmp_path, i) for i in range(5)]
+    Room(monkeypatch, tmp_path, 100 * MIB, taken=90 * MIB)
+    for limit in (1 << 44, 11 * MIB):
+        with pytest.raises(LogError, match=r"with all of them deleted there would still not be \d+ MiB free"):
+            fly(tmp_path, 9, min_free=limit, max_files=2)
+        assert names(tmp_path) == made
+    assert not retention.make_room(tmp_path, 11 * MIB) and names(tmp_path) == made
+
+
+def test_no_more_goes_than_the_room_takes(tmp_path, monkeypatch):
+    for number in range(1, 9):
+        filled(tmp_path, f"{number:05d}-20260101T000000Z.mcap")
+    room = Room(monkeypatch, tmp_path, 10 * MIB)
+    assert retention.make_room(tmp_path, 2 * MIB) and len(names(tmp_path)) == 8
+    assert retention.make_room(tmp_path, 2 * MIB + 1) and room.free >= 2 * MIB + 1
+    assert names(tmp_path) == [f"{number:05d}-20260101T000000Z.mcap" for number in range(2, 9)]
+
+
+def test_torn_logs_go_by_their_age_as_others_do_but_none_that_is_written(tmp_path, monkeypatch):
+    filled(tmp_path, "00001-20260101T000000Z.mcap.active")
+    filled(tmp_path, "00002-20260101T000000Z.mcap")
+    filled(tmp_path, "00003-20260101T000000Z.mcap.active")
+    room = Room(monkeypatch, tmp_path, 10 * MIB)
+    with Writer(tmp_path / "00000-20260101T000000Z.mcap", metadata={}, start_unix_ns=0, start_ns=0) as other:
+        assert retention.make_room(tmp_path, room.free + MIB)
+        assert names(tmp_path)[1:] == ["00002-20260101T000000Z.mcap", "00003-20260101T000000Z.mcap.active"]
+        assert retention.make_room(tmp_path, 0, max_files=0)
+        assert names(tmp_path) == [f"{other.path.name}.active"]
+    assert info(other.path).closed
+
+
+def test_where_torn_logs_are_mended_the_oldest_makes_the_room_and_the_newest_stays(tmp_path, monkeypatch):
+    torn = [tear(tmp_path, fly(tmp_path, i)) for i in range(4)]
+    wanted = []
+
+    def make_room(place: Path, wanted_bytes: int) -> bool:
+        wanted.append(wanted_bytes)
+        return real(place, 0, max_files=3 if len(wanted) == 1 else None)
+
+    real = retention.make_room
+    monkeypatch.setattr(retention, "make_room", make_room)
+    saved = retention.recover_left(tmp_path, 1 << 60)  # each asks for room, and only the first finds some
+    assert saved == [] and names(tmp_path) == [one.name for one in torn[1:]] and len(wanted) == 3
+    assert [one.path.name for one in retention.recover_left(tmp_path)] == [
+        one.name.removesuffix(".active") for one in torn[:0:-1]
+    ]
+
+
+def test_a_log_that_is_whole_only_gets_its_name(tmp_path):
+    name = fly(tmp_path)
+    (tmp_path / name).rename(tmp_path / f"{name}.active")  # killed before it was closed
+    node = (tmp_path / f"{name}.active").stat().st_ino
+    (saved,) = retention.recover_left(tmp_path, 1 << 60)
+    assert (saved.path, saved.messages) == (tmp_path / name, 1)
+    assert saved.path.stat().st_ino == node and names(tmp_path) == [name]
+    assert retention.recover_left(tmp_path) == []

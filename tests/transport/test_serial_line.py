@@ -1,0 +1,129 @@
+"""Bytes through a pseudo-terminal, and what is no serial line."""
+
+import asyncio
+import errno
+import os
+import pty
+import tty
+from collections.abc import Callable, Coroutine
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from companion.transport.address import Address
+from companion.transport.connection import Stream
+from companion.transport.links import connect, connections
+
+
+def run(test: Coroutine[Any, Any, None]) -> None:
+    async def limited() -> None:
+        async with asyncio.timeout(20):
+            await test
+
+    asyncio.run(limited())
+
+
+async def until(condition: Callable[[], bool]) -> None:
+    for _ in range(2000):
+        if condition():
+            return
+        await asyncio.sleep(0.005)
+    raise TimeoutError
+
+
+async def read_exactly(stream: Stream, count: int) -> bytes:
+    data = b""
+    while len(data) < count:
+        data += await stream.read()
+    return data
+
+
+def test_a_missing_device_is_said_once_and_opened_when_it_is_there(tmp_path: Path) -> None:
+    async def test() -> None:
+        master, slave = pty.openpty()
+        tty.setraw(master)
+        device = tmp_path / "ttyFC"
+        said: list[str] = []
+        links = connections(Address.parse(f"serial:{device}:921600"), lambda: 1.0, said.append)
+        waiting = asyncio.ensure_future(anext(links))
+        await asyncio.sleep(0.5)
+        assert said == [f"serial:{device}:921600: {os.strerror(errno.ENOENT)}; trying again"]
+        device.symlink_to(os.ttyname(slave))
+        line = await waiting
+        every_byte = bytes(range(256))
+        os.write(master, every_byte)
+        assert await read_exactly(line, 256) == every_byte
+        line.write(every_byte)
+        await asyncio.sleep(0.01)
+        assert os.read(master, 1000) == every_byte
+        os.close(slave)
+        os.close(master)
+        with pytest.raises(ConnectionError, match="ttyFC"):
+            await line.read()
+        await links.aclose()
+
+    run(test())
+
+
+def test_a_file_that_is_no_serial_line_is_told(tmp_path: Path) -> None:
+    (tmp_path / "file").write_bytes(b"")
+
+    async def test() -> None:
+        with pytest.raises(OSError, match="not a serial line"):
+            await connect(Address("serial", str(tmp_path / "file"), 57600))
+
+    run(test())
+
+
+def test_a_line_belongs_to_one_and_to_the_next_when_it_is_let_go() -> None:
+    async def test() -> None:
+        master, slave = pty.openpty()  # somebody has had it open before, and keeps it
+        address = Address("serial", os.ttyname(slave), 57600)
+        line = await connect(address)
+        said: list[str] = []
+        links = connections(address, lambda: 1.0, said.append)
+        waiting = asyncio.ensure_future(anext(links))
+        await until(lambda: bool(said))
+        assert said == [f"{address}: another program has this line open: end it; trying again"]
+        os.write(master, b"all of it")
+        assert await read_exactly(line, 9) == b"all of it"
+        line.close()
+        second = await waiting
+        os.write(master, b"again")
+        assert await read_exactly(second, 5) == b"again"
+        await links.aclose()
+        os.close(slave)
+        os.close(master)
+
+    run(test())
+
+
+def test_a_device_that_refuses_because_it_is_taken_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    def taken(*_: object) -> int:
+        raise OSError(errno.EBUSY, os.strerror(errno.EBUSY))
+
+    async def test() -> None:
+        with pytest.raises(OSError, match="another program has this line open"):
+            await connect(Address("serial", "/dev/ttyFC", 57600))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "open", taken)
+        run(test())
+
+
+def test_a_line_that_does_not_drain_is_never_waited_for() -> None:
+    async def test() -> None:
+        master, slave = pty.openpty()
+        line = await connect(Address("serial", os.ttyname(slave), 57600))
+        line._outbox._now = lambda: 0.0
+        for _ in range(100):
+            line.write(b"before" * 100)
+        line._outbox._now = lambda: 1.0
+        line.write(b"after")
+        assert line.dropped > 10
+        line.close()
+        os.close(slave)
+        os.close(master)
+
+    run(test())

@@ -1,0 +1,104 @@
+"""Bytes through real sockets: several peers, bursts, losses and refusals."""
+
+import asyncio
+import socket
+from collections.abc import Coroutine
+from typing import Any
+
+import pytest
+
+from companion.transport import connection
+from companion.transport.address import Address
+from companion.transport.connection import Stream
+from companion.transport.links import connect
+
+
+def run(test: Coroutine[Any, Any, None]) -> None:
+    async def limited() -> None:
+        async with asyncio.timeout(20):
+            await test
+
+    asyncio.run(limited())
+
+
+def free_port() -> int:
+    with socket.socket() as sock:
+        sock.bind(("127.0.0.1", 0))
+        return int(sock.getsockname()[1])
+
+
+async def read_exactly(connection: Stream, count: int) -> bytes:
+    data = b""
+    while len(data) < count:
+        data += await connection.read()
+    return data
+
+
+def test_udp_answers_all_peers_heard_and_outlives_a_peer_that_is_not_there() -> None:
+    async def test() -> None:
+        early = await connect(Address("udpout", "127.0.0.1", free_port()))
+        for _ in range(3):
+            early.write(b"nobody hears")
+            await asyncio.sleep(0.01)
+        early.close()
+        server = await connect(Address.parse("udpin:0"))
+        server.write(b"nobody yet")
+        clients = [await connect(Address("udpout", "127.0.0.1", server.port)) for _ in range(3)]
+        for i, client in enumerate(clients):
+            client.write(b"from %d" % i)
+            assert await server.read() == b"from %d" % i
+        clients.pop().close()
+        for _ in range(3):
+            server.write(b"to all")
+        for client in clients:
+            assert await read_exactly(client, 18) == b"to all" * 3
+        for end in (server, *clients):
+            end.close()
+
+    run(test())
+
+
+def test_a_burst_of_datagrams_comes_in_few_reads_and_in_order() -> None:
+    async def test() -> None:
+        server = await connect(Address.parse("udpin:0"))
+        client = await connect(Address("udpout", "127.0.0.1", server.port))
+        sent = [b"%05d" % i for i in range(200)]
+        for data in sent:
+            client.write(data)
+        reads = 0
+        got = b""
+        while len(got) < 1000:
+            got += await server.read()
+            reads += 1
+        assert got == b"".join(sent)
+        assert reads <= 200 // connection.BURST + 2
+        server.close()
+        client.close()
+
+    run(test())
+
+
+def answering(monkeypatch: pytest.MonkeyPatch, *answers: tuple[socket.AddressFamily, str]) -> None:
+    async def getaddrinfo(_: str, port: int, *, type: socket.SocketKind) -> list[Any]:
+        return [(family, type, 0, "", (host, port)) for family, host in answers]
+
+    monkeypatch.setattr(asyncio.get_running_loop(), "getaddrinfo", getaddrinfo)
+
+
+def test_every_answer_to_a_name_is_tried(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def test() -> None:
+        with socket.create_server(("127.0.0.1", 0)) as server:
+            answering(monkeypatch, *((socket.AF_INET, f"127.0.0.{i}") for i in (3, 2, 1)))
+            link = await connect(Address("tcp", "localhost", server.getsockname()[1]))
+            link.close()
+
+    run(test())
+
+
+def test_where_no_answer_to_a_name_helps_the_first_failure_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def test() -> None:
+        answering(monkeypatch, (socket.AF_INET, "127.0.0.1"), (socket.AF_INET, "255.255.255.255"))
+        with pytest.raises(ConnectionRefusedError):
+            await connect(Address("tcp", "localhost", free_port()))
+
+    run(test())
