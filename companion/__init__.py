@@ -1,32 +1,37 @@
-"""Navigation companion: keeps an aircraft's position, and a guaranteed bound on it, when GNSS is gone.
+"""Navigation companion: position of an aircraft during GNSS outages, with a guaranteed error bound.
 
 Data
     A *record* (`companion.records`) is an immutable value in SI units and radians, stamped with the time
     it is valid for and the time it arrived. A *message* is MAVLink. A *frame* is a message's bytes.
-    An *error* is always computed minus true: `error = INS - truth`, so `corrected = INS - error`.
+    An *error* is computed minus true: `error = INS - truth`, so `corrected = INS - error`.
 
 Frames
     n   local level, north-east-down (NED), at the aircraft's own geodetic position
     b   body, forward-right-down
     e   earth-centred, earth-fixed (WGS84)
     i   inertial
-    Papers with x east, y north keep their order inside their own module and say so.
-    An azimuth is counted from true north clockwise, at the beacon, towards the aircraft.
+    A module after a paper with x east, y north keeps that order and states it.
+    An azimuth is measured at the beacon, clockwise from true north, towards the aircraft.
 
 Names
-    v_n     a vector in frame n            C_nb    rotation that takes b to n (v_n = C_nb v_b)
-    lat, lon, alt   geodetic radians and metres above the WGS84 ellipsoid unless a name says `msl`
-    sigma_x one standard deviation of x    *_deg   degrees: only on the wire, in configuration, in reports
-    t_ns    integer nanoseconds on the companion's one monotonic clock; durations are float seconds
+    v_n     a vector in frame n            C_nb    rotation from b to n (v_n = C_nb v_b)
+    lat, lon, alt   geodetic, radians and metres above the WGS84 ellipsoid; *_msl above mean sea level
+    sigma_x one standard deviation of x    *_deg   degrees: in messages, configuration and reports only
+    t_ns    integer nanoseconds on the companion's monotonic clock; durations are float seconds
 
-Map
-    records     every value that flows                      config    what the operator may set
-    link/       bytes <-> messages (no clock, no sockets but in `transport`)
-    wire        messages <-> records                        navigator records -> records (pure)
-    profiles    which message feeds which autopilot         feed      what of a solution goes to it
-    nav/        the physics: earth, strapdown, error model, beacons
-    estimate/   the mathematics: fusion, minimax, kalman, restrictive, schemes, smoother, polynomial
-    log/        MCAP files, replay                          service   the asyncio shell
+Packages
+    records     data types that flow between packages     units       units and constants
+    config/     configuration and output profiles         transport/  serial, UDP and TCP connections
+    link/       MAVLink: frames, sessions, decoding       nav/        earth, strapdown, INS error model
+    estimate/   Kalman, minimax, maximum likelihood       navigator/  records in, solutions out; no I/O
+    output/     gate and messages to the autopilot        runtime/    core without I/O, asyncio service
+    storage/    MCAP flight logs                          importers/  tlog, dataflash, ulog
+    analysis/   replay, assessment, report                doctor/     check of the autopilot's configuration
+    study/      numerical studies                         bench/      benchmarks
+    The package `sitl` beside this one has the simulator, the loopback and the campaigns.
+
+    bytes -> link -> records -> navigator -> solutions -> output -> link -> bytes. The log stores inputs and
+    outputs; a replay of the inputs gives the same outputs bit for bit.
 """
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"

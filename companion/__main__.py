@@ -1,7 +1,7 @@
-"""The command line: a table of commands, each loaded only when it is called.
+"""Command line: table of commands, each imported only when it is called.
 
-A command is a click command in the module that does its work. The simulator's come through entry points, so
-that nothing here imports it: an aircraft may fly without.
+A command is a click command in the module that does its work. The commands of the simulator come through
+entry points, so that nothing here imports it: on an aircraft it need not be installed.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ STUDIES = {
 }
 
 
-class Lazy(click.Group):
-    """A group whose commands are imported when named: `companion --help` stays quick."""
+class LazyGroup(click.Group):
+    """Command group whose commands are imported on use."""
 
     def __init__(self, table: dict[str, str], plugins: str | None = None, **settings: object) -> None:
         super().__init__(**settings)  # type: ignore[arg-type]
@@ -46,11 +46,11 @@ class Lazy(click.Group):
             self._table |= {entry.name: entry.value for entry in entry_points(group=plugins)}
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        """All names, in order."""
+        """Return all names, sorted."""
         return sorted({*self._table, *self.commands})
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        """The command of that name, imported now."""
+        """Import and return the command of that name."""
         if cmd_name not in self._table:
             return super().get_command(ctx, cmd_name)
         module, attribute = self._table[cmd_name].split(":")
@@ -58,18 +58,20 @@ class Lazy(click.Group):
         return command
 
 
-cli = Lazy(
+cli = LazyGroup(
     COMMANDS,
     "companion.commands",
     name="companion",
     help="Keeps an aircraft's position, and a guaranteed bound on it, when GNSS is gone.",
 )
 cli = click.version_option(__version__, prog_name="companion")(cli)
-cli.add_command(Lazy(STUDIES, "companion.studies", name="study", help="Numbers behind the estimators."))
+cli.add_command(
+    LazyGroup(STUDIES, "companion.studies", name="study", help="Numerical studies of the estimators.")
+)
 
 
 def main() -> None:
-    """Run the command line; whatever a person can mend ends in one sentence and an exit code."""
+    """Run the command line; an error that the user can fix ends with one sentence and an exit code."""
     try:
         cli(standalone_mode=True)
     except ConfigError as error:
@@ -79,7 +81,7 @@ def main() -> None:
         click.echo(f"companion: {error}", err=True)
         sys.exit(1)
     except OSError as error:
-        # what the output could not take is not tried again at the exit, which would add lines of its own
+        # prevent a second flush of stdout at exit, which would print its own error
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         where = error.filename or "the output"
         click.echo(f"companion: {where}: {error.strerror or error}", err=True)

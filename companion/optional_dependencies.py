@@ -1,8 +1,8 @@
-"""The optional packages: what a person is told where one is missing."""
+"""Error text for missing optional dependencies."""
 
 from __future__ import annotations
 
 
-def lacking(what: str, package: str | None, extra: str) -> str:
-    """A sentence: `what` needs `package`, and how to get it: the program itself is on no index."""
+def missing_package(what: str, package: str | None, extra: str) -> str:
+    """Return the sentence that `what` needs `package`, and how to install it from the checkout."""
     return f"{what} needs {package}: run `pip install '.[{extra}]'` in the program's checkout"

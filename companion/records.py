@@ -1,14 +1,14 @@
-"""Every value that flows: immutable records in SI units and radians.
+"""Records: the immutable data types exchanged between packages, in SI units and radians.
 
-A record knows nothing of MAVLink, files or estimators. Two times stand at its head:
+A record does not depend on MAVLink, files or estimators. Every record starts with two times:
 
-    t_ns     when the value was true, integer nanoseconds on the companion's monotonic clock
-    rx_ns    when it reached the companion, same clock (equal to t_ns for what the companion makes itself)
+    t_ns     time of validity, integer nanoseconds on the companion's monotonic clock
+    rx_ns    time of arrival, same clock (equal to t_ns for records made by the companion)
 
-Absent is `None`, never NaN, so that a record survives JSON bit for bit (`encode`, `decode`) and a log
-replays exactly. Vectors are tuples in the frame their name ends with. A covariance is the upper triangle,
-row by row. Positions are geodetic: latitude and longitude in radians, altitude in metres above the WGS84
-ellipsoid, or above mean sea level where the name says `msl` (the geoid is not known on board).
+A missing value is `None`, never NaN, so that JSON preserves a record bit for bit (`encode`, `decode`) and a
+log replays exactly. Vectors are tuples in the frame of their suffix. A covariance is the upper triangle, row
+by row. Positions are geodetic: latitude and longitude in radians, altitude in metres above the WGS84
+ellipsoid, or above mean sea level with `msl` in the name (the geoid is not known on board).
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ Vector3: TypeAlias = tuple[float, float, float]
 
 
 class Stamped(msgspec.Struct, frozen=True, gc=False, omit_defaults=True):
-    """What every record begins with: the time of validity and the time of arrival."""
+    """Base of all records: time of validity and time of arrival."""
 
     t_ns: int
     rx_ns: int
 
 
 # ---------------------------------------------------------------------------------------------------------
-# What sensors and the autopilot say
+# Inputs from sensors and the autopilot
 # ---------------------------------------------------------------------------------------------------------
 
 
@@ -43,7 +43,7 @@ class Imu(Stamped, frozen=True, gc=False, tag=True):
 
 
 class Attitude(Stamped, frozen=True, gc=False, tag=True):
-    """Roll, pitch, heading (true, rad) and body rates (rad/s) as the autopilot has them."""
+    """Roll, pitch, heading (true, rad) and body rates (rad/s) from the autopilot."""
 
     roll: float
     pitch: float
@@ -52,10 +52,10 @@ class Attitude(Stamped, frozen=True, gc=False, tag=True):
 
 
 class Gnss(Stamped, frozen=True, gc=False, tag=True):
-    """One GNSS fix. `fix` is MAVLink's GPS_FIX_TYPE (3 = 3D), `stamp_us` the receiver's own time as sent
-    (0 where the autopilot sends none), which tells a new fix from one repeated at the stream's rate.
+    """GNSS fix. `fix` is MAVLink's GPS_FIX_TYPE (3 = 3D). `stamp_us` is the receiver's time as sent (0 if the
+    autopilot sends none); it distinguishes a new fix from one repeated at the stream's rate.
 
-    Sigmas are per axis: `sigma_horizontal` of north and of east, both metres; velocities NED in m/s.
+    Sigmas are per axis: `sigma_horizontal` of north and of east, m; velocities NED, m/s.
     """
 
     receiver: int
@@ -72,8 +72,13 @@ class Gnss(Stamped, frozen=True, gc=False, tag=True):
     hdop: float | None = None
     alt: float | None = None
 
+    @property
+    def has_3d_fix(self) -> bool:
+        """Whether the fix is MAVLink's GPS_FIX_TYPE_3D_FIX or better."""
+        return self.fix >= 3
+
     def repeats(self, previous: Gnss) -> bool:
-        """Whether this is `previous` sent once more."""
+        """Return whether this is `previous` sent again."""
         if self.stamp_us or previous.stamp_us:
             return self.stamp_us == previous.stamp_us
         return (self.lat, self.lon, self.alt_msl, self.v_n) == (
@@ -85,14 +90,14 @@ class Gnss(Stamped, frozen=True, gc=False, tag=True):
 
 
 class LocalPosition(Stamped, frozen=True, gc=False, tag=True):
-    """The inertial channel: position north, east, down from the local origin (m) and velocity (m/s)."""
+    """Inertial channel: position north, east, down from the local origin (m) and velocity (m/s)."""
 
     x_n: Vector3
     v_n: Vector3
 
 
 class LocalOrigin(Stamped, frozen=True, gc=False, tag=True):
-    """Where the local position is counted from; `projection` is the autopilot's own flat-earth formula."""
+    """Origin of the local position; `projection` is the autopilot's local projection."""
 
     lat: float
     lon: float
@@ -109,7 +114,7 @@ class HomePosition(Stamped, frozen=True, gc=False, tag=True):
 
 
 class GlobalPosition(Stamped, frozen=True, gc=False, tag=True):
-    """The autopilot's own filtered position and NED velocity."""
+    """The autopilot's estimated position and NED velocity."""
 
     lat: float
     lon: float
@@ -120,7 +125,7 @@ class GlobalPosition(Stamped, frozen=True, gc=False, tag=True):
 
 
 class AirData(Stamped, frozen=True, gc=False, tag=True):
-    """Airspeed (m/s, true where `true`, else indicated or equivalent as the autopilot sends it) and climb."""
+    """Airspeed (m/s; true if `true`, else indicated or equivalent as sent by the autopilot), climb rate."""
 
     airspeed: float
     true: bool = False
@@ -131,7 +136,7 @@ class AirData(Stamped, frozen=True, gc=False, tag=True):
 
 
 class Wind(Stamped, frozen=True, gc=False, tag=True):
-    """The autopilot's own wind estimate: velocity of the air over ground, NED, m/s."""
+    """The autopilot's wind estimate: velocity of the air over ground, NED, m/s."""
 
     v_n: Vector3
     sigma: float | None = None
@@ -146,7 +151,7 @@ class Pressure(Stamped, frozen=True, gc=False, tag=True):
 
 
 class FilterStatus(Stamped, frozen=True, gc=False, tag=True):
-    """The autopilot's estimator flags; its `accuracy` in metres only where it is honest (PX4)."""
+    """The autopilot's estimator flags; `horizontal_accuracy` (m) only if it is meaningful (PX4)."""
 
     flags: int
     gnss_glitch: bool
@@ -155,16 +160,16 @@ class FilterStatus(Stamped, frozen=True, gc=False, tag=True):
 
 
 class SystemTime(Stamped, frozen=True, gc=False, tag=True):
-    """UNIX time of the autopilot at its boot time, both in nanoseconds; `unix_ns` None before GNSS time."""
+    """UNIX time of the autopilot at its boot time, both in ns; `unix_ns` is None before GNSS time."""
 
     boot_ns: int
     unix_ns: int | None = None
 
 
 class RsbnFix(Stamped, frozen=True, gc=False, tag=True):
-    """One answer of a beacon: azimuth at the beacon (rad, true north, clockwise) and slant range (m).
+    """Reply of a beacon: azimuth at the beacon (rad, clockwise from true north) and slant range (m).
 
-    Either may be absent. `lat`, `lon`, `alt` are the beacon's, `alt` above the ellipsoid.
+    Either may be None. `lat`, `lon`, `alt` are the beacon's position, `alt` above the ellipsoid.
     """
 
     beacon: int
@@ -178,19 +183,19 @@ class RsbnFix(Stamped, frozen=True, gc=False, tag=True):
 
 
 class Reboot(Stamped, frozen=True, gc=False, tag=True):
-    """The autopilot began anew: its origin, its clock and its inertial channel are others from here on."""
+    """The autopilot rebooted: its origin, clock and inertial channel change."""
 
     system: int
 
 
 class Tuning(Stamped, frozen=True, gc=False, tag=True):
-    """A ground station set parameters: the whole configuration from here on, as TOML."""
+    """A ground station set parameters: the whole new configuration, as TOML."""
 
     toml: str
 
 
 class Truth(Stamped, frozen=True, gc=False, tag=True):
-    """What only a simulator knows. It is logged and scored and never reaches the navigator."""
+    """True state from a simulator; logged and used for scoring, never passed to the navigator."""
 
     lat: float
     lon: float
@@ -200,30 +205,30 @@ class Truth(Stamped, frozen=True, gc=False, tag=True):
 
 
 # ---------------------------------------------------------------------------------------------------------
-# What the companion says
+# Outputs of the companion
 # ---------------------------------------------------------------------------------------------------------
 
 
 class Mode(StrEnum):
-    """What the position rests on."""
+    """Basis of the position."""
 
     INITIALISING = "initialising"  # no inertial channel or no fix yet
-    FIXED = "fixed"  # trusted fixes now
+    FIXED = "fixed"  # trusted fixes available
     PREDICTING = "predicting"  # no fixes: the inertial error is predicted
     UNTRUSTED = "untrusted"  # the prediction is infeasible, or its bound passed the stated limit
 
 
 class Trust(IntEnum):
-    """How far the position can be trusted, from best to worst."""
+    """Trust in the position, from best to worst."""
 
-    NORMAL = 0  # fixes that check each other, the protection level within its limit
-    DEGRADED = 1  # fixes, but a source is excluded or under suspicion, or too little checks them
+    NORMAL = 0  # fixes that confirm each other, protection level within its limit
+    DEGRADED = 1  # fixes, but a source is excluded or suspected, or nothing confirms them
     PREDICTING = 2  # no fixes: the inertial error is predicted within a guaranteed bound
-    UNTRUSTED = 3  # no bound, or one beyond its limit
+    UNTRUSTED = 3  # no bound, or a bound above its limit
 
 
 class Source(IntFlag):
-    """What a solution rests on, as bits."""
+    """Sources of a solution, as bits."""
 
     INERTIAL = 1
     GNSS = 2
@@ -233,8 +238,8 @@ class Source(IntFlag):
 
 
 class Prediction(msgspec.Struct, frozen=True, gc=False):
-    """The inertial error `ahead_s` from now, north and east (m): the guaranteed r.m.s. bound, and beside it
-    what least squares claims under white noise and what it would suffer under the worst correlation."""
+    """Predicted inertial error `ahead_s` from now, north and east (m): the guaranteed r.m.s. bound, and for
+    comparison the least-squares sigma under white noise and under the worst correlation."""
 
     ahead_s: float
     bound_n: Vector2
@@ -243,15 +248,14 @@ class Prediction(msgspec.Struct, frozen=True, gc=False):
 
 
 class Solution(Stamped, frozen=True, gc=False, tag=True):
-    """The corrected estimate.
+    """Corrected estimate.
 
     `covariance` is of north, east, down position (m^2), upper triangle. `bound_n` is the guaranteed r.m.s.
-    bound north and east (m), None where it cannot be given. `error_n` is the estimated error of the inertial
-    channel (m), `velocity_error_n` that of its velocity (m/s); `sigma_velocity` is what is left of it on the
-    worse horizontal axis (m/s), gusts included. `horizon_s` counts from the last accepted fix.
-    `disagreement` is the greatest distance between the estimators that run (m). `protection` is the
-    horizontal protection level (m): with the configured risk the error is beyond it, whichever one source
-    lies; `trust` says what else must be known of it.
+    bound north and east (m), None if there is none. `error_n` is the estimated error of the inertial channel
+    (m), `velocity_error_n` of its velocity (m/s); `sigma_velocity` is the remaining velocity sigma on the
+    worse horizontal axis (m/s), gusts included. `horizon_s` is the time since the last accepted fix.
+    `disagreement` is the greatest distance between the running estimators (m). `protection` is the horizontal
+    protection level (m): the error exceeds it with the configured risk, even if any one source is faulty.
     """
 
     mode: Mode
@@ -276,11 +280,11 @@ class Solution(Stamped, frozen=True, gc=False, tag=True):
 
 
 class Fix(Stamped, frozen=True, gc=False, tag=True):
-    """A maximum-likelihood radio fix, the INS left out: the correction vector INS minus fix, NED (m).
+    """Maximum-likelihood radio fix without the INS: correction vector, INS minus fix, north and east (m).
 
-    `covariance` is that of north, east (upper triangle); `cost` the chi-square of its residuals with
-    `freedom` degrees of freedom; `normalised` the squared innovation of azimuth and range, or of the GNSS
-    position, against the running estimate by its covariance: chi-square with 2 degrees of freedom.
+    `covariance` is of north, east (upper triangle); `cost` the chi-square of its residuals with
+    `degrees_of_freedom`; `normalised` the NIS of azimuth and range, or of the GNSS position, against the
+    current estimate: chi-square with 2 degrees of freedom.
     """
 
     lat: float
@@ -290,13 +294,13 @@ class Fix(Stamped, frozen=True, gc=False, tag=True):
     covariance: Vector3
     sources: int
     cost: float
-    freedom: int
+    degrees_of_freedom: int
     iterations: int
     normalised: float | None = None
 
 
 class Rejection(Stamped, frozen=True, gc=False, tag=True):
-    """A measurement not used: which, why, and the numbers behind it (value against limit)."""
+    """Measurement that was not used: source, reason, and the value with its limit."""
 
     source: str
     reason: str
@@ -305,21 +309,34 @@ class Rejection(Stamped, frozen=True, gc=False, tag=True):
 
 
 class Reset(Stamped, frozen=True, gc=False, tag=True):
-    """The navigator began anew, wholly or in part, and why."""
+    """Full or partial reset of the navigator, and its reason."""
 
     what: str
     reason: str
 
 
+class Severity(IntEnum):
+    """Severity of an event: MAVLink's MAV_SEVERITY, which are the levels of syslog."""
+
+    EMERGENCY = 0
+    ALERT = 1
+    CRITICAL = 2
+    ERROR = 3
+    WARNING = 4
+    NOTICE = 5
+    INFO = 6
+    DEBUG = 7
+
+
 class Event(Stamped, frozen=True, gc=False, tag=True):
-    """A change of state worth a line: severity is MAVLink's (0 emergency ... 6 info, 7 debug)."""
+    """Change of state reported to the user; `severity` is a `Severity`."""
 
     severity: int
     text: str
 
 
 class LinkState(Stamped, frozen=True, gc=False, tag=True):
-    """A link's health: counts since start, and the clock mapping to the autopilot."""
+    """State of a link: counts since the start, and the clock offset to the autopilot."""
 
     link: str
     connected: bool
@@ -362,10 +379,10 @@ _decoders: dict[str, msgspec.json.Decoder[Any]] = {
 
 
 def encode(record: Stamped) -> bytes:
-    """One record as JSON; doubles keep every bit."""
+    """Encode a record as JSON; doubles are preserved bit for bit."""
     return _encoder.encode(record)
 
 
 def decode(name: str, data: bytes) -> Any:
-    """The record of kind `name` from its JSON; mirror of `encode`."""
+    """Decode a record of type `name` from its JSON."""
     return _decoders[name].decode(data)

@@ -1,15 +1,15 @@
-"""An autopilot in flight, without its I/O: bytes and instants in, MAVLink frames out. No clock, no socket.
+"""Simulated autopilot without I/O: bytes and time in, MAVLink frames out. No clock, no socket.
 
-    autopilot.receive(data, now_ns)         # what the companion sent
+    autopilot.receive(data, now_ns)         # bytes from the companion
     for data in autopilot.poll(now_ns): ... # every frame due; call it no later than autopilot.deadline()
 
-It plays a `World` as ArduPlane (system 1, component 1) or PX4 would: streams of 1 Hz each until
-SET_MESSAGE_INTERVAL asks otherwise, the newest value repeated where a stream is faster than its sensor, its
-own time since boot, TIMESYNC, commands. Beside it speaks an RSBN receiver, a component of its own, which
-sends each answer once. Between the two sides lie the link's latency, jitter and faults.
+It sends the records of a `World` as ArduPlane (system 1, component 1) or PX4 would: streams at 1 Hz until
+SET_MESSAGE_INTERVAL requests another rate, the newest value repeated where a stream is faster than its
+sensor, time since boot, TIMESYNC, commands. An RSBN receiver, a component of its own, sends each answer once.
+Latency, jitter and faults of the link are applied between the two sides.
 
-`now_ns` is the companion's clock; the flight begins at `start_ns` on it. What the companion says to be
-used or looked at is kept in `outputs`. It knows no estimator and lets nothing it is told change the flight.
+`now_ns` is the companion's clock; the flight starts at `start_ns` on it. Position and status messages of the
+companion are recorded in `outputs`; they do not affect the flight.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from companion.link import dialect, frame
+from companion.link.dialect import mavlink
 from companion.nav.geometry import Geodetic, displace, geodetic_to_local, local_to_geodetic
 from companion.records import (
     AirData,
@@ -41,27 +42,36 @@ from companion.records import (
     SystemTime,
     Truth,
 )
-from sitl.encode import Airframe, encode
-from sitl.faults import AUTOPILOT_FAULTS, CONSUMER_FAULTS, LINK_FAULTS, Chunk, Fault, disturb, without_fix
-from sitl.parameters import CAPABILITIES, VERSIONS, Parameters
+from companion.units import SECOND_NS
+from sitl.encode import SimulatedSender, encode
+from sitl.faults import (
+    AUTOPILOT_FAULTS,
+    CONSUMER_FAULTS,
+    LINK_FAULTS,
+    Fault,
+    TimedBytes,
+    apply_link_faults,
+    without_fix,
+)
+from sitl.parameters import CAPABILITIES, VERSIONS, SimulatedParameters
 from sitl.scenarios import Scenario
 from sitl.world import World
 
-SECOND = 1_000_000_000
 NEVER = 2**63 - 1
-UNREAD = 1024  # frames that wait for a slow consumer at most
+MOST_UNREAD = 1024  # most frames that wait for a slow consumer
 SYSTEM, COMPONENT, RSBN_COMPONENT = 1, 1, 42
-UNIX_AT_START_NS = 1_767_225_600 * SECOND
+UNIX_AT_START_NS = 1_767_225_600 * SECOND_NS
 """The simulated date: 1 January 2026."""
 
-_SET_MESSAGE_INTERVAL, _REQUEST_MESSAGE, _SET_SOURCE, _EXTERNAL_POSITION = 511, 512, 42007, 43003
-_ACCEPTED, _DENIED, _UNSUPPORTED = 0, 2, 3
+_BASE_MODE = 0x1D  # MAV_MODE_FLAG of a plane in AUTO
 _FLAGS_AIDED, _FLAGS_ALONE = 831, 303  # EKF_STATUS_REPORT.flags as ArduPlane has them
-_ALONE_AFTER = 10 * SECOND
+_ALONE_AFTER = 10 * SECOND_NS
 _SLOW_HZ = 0.2
 
-#: What the companion says to be used: kept with the time it came.
-KEPT = frozenset({"ODOMETRY", "GLOBAL_POSITION_SENSOR", "NAVIGATION_STATUS", "VISION_POSITION_ESTIMATE"})
+#: Messages of the companion that are recorded with their arrival time.
+RECORDED_MESSAGES = frozenset(
+    {"ODOMETRY", "GLOBAL_POSITION_SENSOR", "NAVIGATION_STATUS", "VISION_POSITION_ESTIMATE"}
+)
 
 _SENSED: dict[str, type[Stamped]] = {
     "LOCAL_POSITION_NED": LocalPosition,
@@ -76,8 +86,8 @@ _BY_MAKE: dict[str, dict[str, type[Stamped]]] = {
 }
 
 
-class Autopilot:
-    """The aircraft's side of one link. `world` may be handed in to be shared; it must be the scenario's."""
+class SimulatedAutopilot:
+    """Aircraft side of one link. `world` may be passed to share it; it must be the scenario's."""
 
     def __init__(self, scenario: Scenario, start_ns: int = 0, world: World | None = None) -> None:
         self.scenario = scenario
@@ -88,16 +98,17 @@ class Autopilot:
         self._start_ns = start_ns
         self._rng = np.random.default_rng([scenario.seed, 1])
         self._link_faults = [f for f in scenario.faults if f.name in LINK_FAULTS]
-        self._losses = [f for f in self._link_faults if f.name == "link-loss"]
+        self._link_losses = [f for f in self._link_faults if f.name == "link-loss"]
         self._own_faults = sorted(
             (f for f in scenario.faults if f.name in AUTOPILOT_FAULTS), key=lambda f: -f.start_s
         )
         self._slow = [f for f in scenario.faults if f.name == "slow-consumer"]
-        self._unread: deque[bytes] = deque(maxlen=UNREAD)
+        self._unread: deque[bytes] = deque(maxlen=MOST_UNREAD)
         self._read_at = 0
         self._reader = frame.Reader()
-        self._deaf_until = 0  # while it boots
-        self._local_origin, self._origin_moved = self.world.origin, 0.0  # metres north, and as many east
+        self._booting_until = 0  # end of the boot after a reboot
+        self._local_origin = self.world.origin
+        self._origin_shift = 0.0  # to the north and to the east, m
         self._commands: dict[str, Callable[[Any, int], None]] = {
             "TIMESYNC": self._on_timesync,
             "COMMAND_LONG": self._on_command,
@@ -106,51 +117,54 @@ class Autopilot:
             "PARAM_SET": self._on_parameter,
         }
         sensed = {**_SENSED, **_BY_MAKE[scenario.autopilot]}
-        self._sensed = {_msgid(name): self.world.streams[kind] for name, kind in sensed.items()}
+        self._streams = {_msgid(name): self.world.streams[kind] for name, kind in sensed.items()}
         self._rsbn = self.world.streams[RsbnFix]
         self._rsbn_next = 0
-        self.parameters = Parameters(scenario.autopilot)
-        self._gnss_off_ns: int | None = None  # since when its parameter has switched it off
-        self._outbox: list[tuple[int, int, bytes]] = []  # due, order, frame
-        self._order = 0
-        self._released = 0
+        self.parameters = SimulatedParameters(scenario.autopilot)
+        self._gnss_off_ns: int | None = None  # time at which the parameter switched GNSS off
+        self._send_queue: list[tuple[int, int, bytes]] = []  # due, order, frame
+        self._frames_sent = 0
+        self._last_due = 0
         self._latency_ns = round(scenario.link.latency_s * 1e9)
-        self._made: dict[int, Callable[[int], Any]] = {
+        self._generators: dict[int, Callable[[int], Any]] = {
             _msgid("HEARTBEAT"): self._heartbeat,
             _msgid("SYSTEM_TIME"): self._system_time,
             _msgid("GLOBAL_POSITION_INT"): self._global_position,
             _msgid("GPS_GLOBAL_ORIGIN"): self._origin,
             _msgid("HOME_POSITION"): self._home,
             _msgid("AUTOPILOT_VERSION"): self._version,
-            _msgid("ESTIMATOR_STATUS" if scenario.autopilot == "px4" else "EKF_STATUS_REPORT"): self._status,
+            _msgid(
+                "ESTIMATOR_STATUS" if scenario.autopilot == "px4" else "EKF_STATUS_REPORT"
+            ): self._filter_status,
         }
         self._boot(-round(scenario.boot_before_s * 1e9), 0)
 
-    # -- the sans-IO face ---------------------------------------------------------------------------------
+    # -- sans-IO interface --------------------------------------------------------------------------------
 
     def receive(self, data: bytes, now_ns: int) -> None:
-        """Take what the companion sent at `now_ns`; a link that is lost is lost both ways."""
+        """Receive bytes that the companion sent at `now_ns`; a lost link loses both directions."""
         t = now_ns - self._start_ns
-        if t < self._deaf_until or (
-            self._losses and not disturb([Chunk(now_ns, data)], t, self._losses, self._rng)
+        if t < self._booting_until or (
+            self._link_losses
+            and not apply_link_faults([TimedBytes(now_ns, data)], t, self._link_losses, self._rng)
         ):
             return
-        for found in self._reader.receive(self._taken(data, t)):
+        for found in self._reader.receive(self._take_unread(data, t)):
             if isinstance(found, frame.Frame):
                 name = dialect.TYPES[found.msgid].name
-                if name in KEPT:
+                if name in RECORDED_MESSAGES:
                     self.outputs.append((now_ns, dialect.decode(found)))
                 elif name in self._commands:
                     message = dialect.decode(found)
                     if getattr(message, "target_system", 0) in (0, SYSTEM):
                         self._commands[name](message, t + self._latency())
 
-    def _taken(self, data: bytes, t: int) -> bytes:
-        """What of all that came is read now: a slow consumer lets it wait, and of too much the newest."""
+    def _take_unread(self, data: bytes, t: int) -> bytes:
+        """Return the bytes to read now: a slow consumer reads seldom, and old frames are dropped."""
         self._unread.append(data)
         for fault in self._slow:
             size = CONSUMER_FAULTS[fault.name] if fault.size is None else fault.size
-            if fault.covers(t) and t - self._read_at < size * SECOND:
+            if fault.covers(t) and t - self._read_at < size * SECOND_NS:
                 return b""
         self._read_at = t
         data = b"".join(self._unread)
@@ -158,35 +172,35 @@ class Autopilot:
         return data
 
     def poll(self, now_ns: int) -> list[bytes]:
-        """Return every frame that reaches the companion up to `now_ns`, in order."""
+        """Return every frame that arrives at the companion up to `now_ns`, in order."""
         t = min(now_ns, self.end_ns) - self._start_ns
         while (self._schedule and self._schedule[0][0] <= t) or self._rsbn_due() <= t:
             self._emit(min(self._schedule[0][0] if self._schedule else NEVER, self._rsbn_due()))
         due = []
-        while self._outbox and self._outbox[0][0] <= now_ns:
-            due.append(heapq.heappop(self._outbox)[2])
+        while self._send_queue and self._send_queue[0][0] <= now_ns:
+            due.append(heapq.heappop(self._send_queue)[2])
         return due
 
     def deadline(self) -> int:
-        """Return the instant of the next frame, `NEVER` once the flight is over."""
+        """Return the time of the next frame, `NEVER` after the flight."""
         t = min(self._schedule[0][0] if self._schedule else NEVER, self._rsbn_due())
         sending = t + self._start_ns if t + self._start_ns <= self.end_ns else NEVER
-        return min(sending, self._outbox[0][0] if self._outbox else NEVER)
+        return min(sending, self._send_queue[0][0] if self._send_queue else NEVER)
 
     def rates_hz(self) -> dict[str, float]:
-        """The rate of each stream now, by message name; streams that are off are left out."""
+        """Return the current rate of each active stream by message name."""
         return {dialect.TYPES[msgid].name: 1e9 / ns for msgid, ns in self._intervals.items() if ns}
 
     # -- streams ------------------------------------------------------------------------------------------
 
     def _boot(self, boot_ns: int, from_ns: int) -> None:
-        """Begin anew: time since boot from `boot_ns`, every stream at its own rate from `from_ns` on."""
-        self._airframe = Airframe(self.scenario.autopilot, boot_ns)
+        """Boot: time since boot starts at `boot_ns`, every stream at its default rate at `from_ns`."""
+        self._sender = SimulatedSender(self.scenario.autopilot, boot_ns)
         self._sequences = {COMPONENT: 0, RSBN_COMPONENT: 0}
         self._intervals: dict[int, int] = {}
         self._schedule: list[tuple[int, int]] = []
-        self._newest = dict.fromkeys(self._sensed, -1)
-        for msgid in (*self._made, *self._sensed):
+        self._newest = dict.fromkeys(self._streams, -1)
+        for msgid in (*self._generators, *self._streams):
             self._set_rate(msgid, _default_hz(msgid), from_ns)
 
     def _set_rate(self, msgid: int, rate_hz: float, t: int) -> None:
@@ -197,9 +211,9 @@ class Autopilot:
             heapq.heappush(self._schedule, (-(-t // interval) * interval, msgid))
 
     def _emit(self, t: int) -> None:
-        """Make all frames of the instant `t` and hand them to the link."""
+        """Send all frames due at `t` over the link."""
         while self._own_faults and self._own_faults[-1].start_s * 1e9 <= t:
-            self._undergo(self._own_faults.pop())
+            self._apply_own_fault(self._own_faults.pop())
             return
         frames = []
         while self._schedule and self._schedule[0][0] <= t:
@@ -209,7 +223,7 @@ class Autopilot:
             if message is not None:
                 frames.append(self._frame(message, COMPONENT))
         while self._rsbn_due() <= t:
-            message = encode(self._rsbn[self._rsbn_next], self._airframe)
+            message = encode(self._rsbn[self._rsbn_next], self._sender)
             frames.append(self._frame(message, RSBN_COMPONENT))
             self._rsbn_next += 1
         self._transmit(frames, t)
@@ -218,27 +232,27 @@ class Autopilot:
         return self._rsbn[self._rsbn_next].rx_ns if self._rsbn_next < len(self._rsbn) else NEVER
 
     def _message(self, msgid: int, t: int) -> Any:
-        """The message of a stream at the flight's time `t`, None where there is nothing to say yet."""
-        if msgid in self._made:
-            return self._made[msgid](t)
-        stream, index = self._sensed[msgid], self._newest[msgid]
+        """The message of a stream at flight time `t`, None before its first record."""
+        if msgid in self._generators:
+            return self._generators[msgid](t)
+        stream, index = self._streams[msgid], self._newest[msgid]
         while index + 1 < len(stream) and stream[index + 1].rx_ns <= t:
             index += 1
         self._newest[msgid] = index
         if index < 0:
             return None
         record = stream[index]
-        if record.t_ns < self._airframe.boot_ns:
+        if record.t_ns < self._sender.boot_ns:
             return None
         if isinstance(record, Gnss) and not self.parameters.gnss_is_on:
             record = without_fix(record)
         if isinstance(record, Gnss) and record.stamp_us:
-            moved = -round(self.scenario.boot_before_s * 1e6) - self._airframe.boot_ns // 1000
-            if moved:
-                record = replace(record, stamp_us=max(record.stamp_us + moved, 1))
+            boot_shift = -round(self.scenario.boot_before_s * 1e6) - self._sender.boot_ns // 1000
+            if boot_shift:
+                record = replace(record, stamp_us=max(record.stamp_us + boot_shift, 1))
         if isinstance(record, LocalPosition) and self._local_origin != self.world.origin:
             record = self._from_local_origin(record)
-        return encode(record, self._airframe)
+        return encode(record, self._sender)
 
     def _frame(self, message: Any, component: int) -> bytes:
         sequence = self._sequences[component]
@@ -249,40 +263,40 @@ class Autopilot:
         return self._latency_ns + int(self._rng.exponential(self.scenario.link.jitter_s) * 1e9)
 
     def _transmit(self, frames: list[bytes], t: int) -> None:
-        """Put frames sent at `t` on the link; it keeps their order unless a fault says otherwise."""
+        """Put frames sent at `t` on the link; their order is kept except under the fault "reordering"."""
         due = t + self._start_ns + self._latency()
-        chunks = [Chunk(due, data) for data in frames]
+        chunks = [TimedBytes(due, data) for data in frames]
         if self._link_faults:
-            chunks = disturb(chunks, t, self._link_faults, self._rng)
+            chunks = apply_link_faults(chunks, t, self._link_faults, self._rng)
         shuffled = any(f.name == "reordering" and f.covers(t) for f in self._link_faults)
         for due, data in chunks:
             if not shuffled:
-                self._released = due = max(self._released, due)
-            self._order += 1
-            heapq.heappush(self._outbox, (due, self._order, data))
+                self._last_due = due = max(self._last_due, due)
+            self._frames_sent += 1
+            heapq.heappush(self._send_queue, (due, self._frames_sent, data))
 
-    def _undergo(self, fault: Fault) -> None:
-        """A fault of the autopilot itself begins (or, for what leaps back, ends)."""
+    def _apply_own_fault(self, fault: Fault) -> None:
+        """Start a fault of the autopilot, or end it by applying the opposite jump."""
         start = round(fault.start_s * 1e9)
         size = AUTOPILOT_FAULTS[fault.name] if fault.size is None else fault.size
         size_ns = round(size * 1e9)
         if fault.name == "reboot":
-            self._deaf_until = start + size_ns
-            self._boot(start, self._deaf_until)
-            while self._rsbn_due() < self._deaf_until:
+            self._booting_until = start + size_ns
+            self._boot(start, self._booting_until)
+            while self._rsbn_due() < self._booting_until:
                 self._rsbn_next += 1
             return
         if fault.name == "clock-jump":
-            self._airframe = self._airframe._replace(boot_ns=self._airframe.boot_ns - size_ns)
+            self._sender = self._sender._replace(boot_ns=self._sender.boot_ns - size_ns)
         else:
-            self._origin_moved += size * math.sqrt(0.5)
-            self._local_origin = displace(*self.world.origin, self._origin_moved, self._origin_moved, 0.0)
+            self._origin_shift += size * math.sqrt(0.5)
+            self._local_origin = displace(*self.world.origin, self._origin_shift, self._origin_shift, 0.0)
         if math.isfinite(fault.end_s):
             back = Fault(fault.name, fault.end_s, math.inf, -size)
             self._own_faults = sorted([*self._own_faults, back], key=lambda f: -f.start_s)
 
     def _from_local_origin(self, record: LocalPosition) -> LocalPosition:
-        """The local position counted from where the origin is now; the world counts from its own."""
+        """Refer the local position to the current origin instead of the world's."""
         if not math.isfinite(record.x_n[0]):
             return record
         projection: Any = self.scenario.autopilot
@@ -290,33 +304,33 @@ class Autopilot:
         north, east, down = geodetic_to_local(projection, self._local_origin, place)
         return replace(record, x_n=(north, east, down))
 
-    # -- messages that no sensor makes ----------------------------------------------------------------------
+    # -- messages without a sensor --------------------------------------------------------------------------
 
     def _heartbeat(self, t: int) -> Any:
-        make = 12 if self.scenario.autopilot == "px4" else 3
+        px4 = self.scenario.autopilot == "px4"
         return dialect.new(
             "HEARTBEAT",
-            type=1,
-            autopilot=make,
-            base_mode=0x9D if self.is_armed else 0x1D,
+            type=mavlink.MAV_TYPE_FIXED_WING,
+            autopilot=mavlink.MAV_AUTOPILOT_PX4 if px4 else mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA,
+            base_mode=_BASE_MODE | (mavlink.MAV_MODE_FLAG_SAFETY_ARMED if self.is_armed else 0),
             custom_mode=10,
-            system_status=4,
+            system_status=mavlink.MAV_STATE_ACTIVE,
             mavlink_version=3,
         )
 
     def _system_time(self, t: int) -> Any:
-        moved = -self._airframe.boot_ns - round(self.scenario.boot_before_s * 1e9)
-        leapt = max(moved, 0)  # a leap forward of the clock moves UNIX time too, a reboot does not
-        record = SystemTime(t, t, boot_ns=t - self._airframe.boot_ns, unix_ns=UNIX_AT_START_NS + t + leapt)
-        return encode(record, self._airframe)
+        boot_shift = -self._sender.boot_ns - round(self.scenario.boot_before_s * 1e9)
+        jump = max(boot_shift, 0)  # a clock jump moves UNIX time too, a reboot does not
+        record = SystemTime(t, t, boot_ns=t - self._sender.boot_ns, unix_ns=UNIX_AT_START_NS + t + jump)
+        return encode(record, self._sender)
 
     def _origin(self, t: int) -> Any:
         lat, lon, alt = self._local_origin
-        return encode(LocalOrigin(t, t, lat, lon, alt - self.scenario.geoid_height), self._airframe)
+        return encode(LocalOrigin(t, t, lat, lon, alt - self.scenario.geoid_height), self._sender)
 
     def _home(self, t: int) -> Any:
         lat, lon, alt = self.world.origin
-        return encode(HomePosition(t, t, lat, lon, alt - self.scenario.geoid_height), self._airframe)
+        return encode(HomePosition(t, t, lat, lon, alt - self.scenario.geoid_height), self._sender)
 
     def _version(self, t: int) -> Any:
         make = self.scenario.autopilot
@@ -324,8 +338,8 @@ class Autopilot:
             "AUTOPILOT_VERSION", capabilities=CAPABILITIES[make], flight_sw_version=VERSIONS[make]
         )
 
-    def _last(self, kind: type[Stamped], t: int) -> Any:
-        """The sensor's newest record at `t`; its stream is nearly regular, so the guess is near."""
+    def _newest_record(self, kind: type[Stamped], t: int) -> Any:
+        """The newest record of the sensor at `t`, searched from the index of a regular stream."""
         stream = self.world.streams[kind]
         span = max(stream[-1].rx_ns, 1)
         index = min(len(stream) - 1, t * (len(stream) - 1) // span + 2)
@@ -334,33 +348,33 @@ class Autopilot:
         return stream[index]
 
     def _global_position(self, t: int) -> Any:
-        local = self._last(LocalPosition, t)
+        local = self._newest_record(LocalPosition, t)
         if not math.isfinite(local.x_n[0]):
             return None
         projection: Any = self.scenario.autopilot
         place: Geodetic = local_to_geodetic(projection, self.world.origin, local.x_n)
         above = place.alt - self.world.origin.alt
         msl = place.alt - self.scenario.geoid_height
-        heading = self._last(Attitude, t).heading
+        heading = self._newest_record(Attitude, t).heading
         record = GlobalPosition(t, t, place.lat, place.lon, msl, local.v_n, above, heading)
-        return encode(record, self._airframe)
+        return encode(record, self._sender)
 
-    def _status(self, t: int) -> Any:
-        # The filter gives its aid up only ten seconds after the receiver lost its fix.
-        fixes = (self._last(Gnss, max(t - ago, 0)).fix for ago in range(0, _ALONE_AFTER, SECOND))
+    def _filter_status(self, t: int) -> Any:
+        # the filter reports the loss of aiding ten seconds after the loss of the fix
+        fixes = (self._newest_record(Gnss, max(t - ago, 0)) for ago in range(0, _ALONE_AFTER, SECOND_NS))
         switched_off = self._gnss_off_ns is not None and t - self._gnss_off_ns >= _ALONE_AFTER
-        aided = not switched_off and any(fix >= 3 for fix in fixes)
+        aided = not switched_off and any(fix.has_3d_fix for fix in fixes)
         flags = _FLAGS_AIDED if aided else _FLAGS_ALONE
-        return encode(FilterStatus(t, t, flags, False, 0.05, 1.5 if aided else 50.0), self._airframe)
+        return encode(FilterStatus(t, t, flags, False, 0.05, 1.5 if aided else 50.0), self._sender)
 
-    # -- what the companion asks ----------------------------------------------------------------------------
+    # -- requests of the companion --------------------------------------------------------------------------
 
-    def _answer(self, name: str, t: int, **values: Any) -> None:
+    def _reply(self, name: str, t: int, **values: Any) -> None:
         self._transmit([self._frame(dialect.new(name, **values), COMPONENT)], t)
 
     def _on_timesync(self, message: Any, t: int) -> None:
         if message.tc1 == 0:
-            self._answer("TIMESYNC", t, tc1=t - self._airframe.boot_ns, ts1=message.ts1)
+            self._reply("TIMESYNC", t, tc1=t - self._sender.boot_ns, ts1=message.ts1)
 
     def _on_parameter(self, message: Any, t: int) -> None:
         parameters = self.parameters
@@ -371,25 +385,28 @@ class Autopilot:
             self._transmit([self._frame(answer, COMPONENT)], t)
 
     def _on_command(self, message: Any, t: int) -> None:
-        command, result = message.command, _UNSUPPORTED
-        if command == _SET_MESSAGE_INTERVAL:
+        command, result = message.command, mavlink.MAV_RESULT_UNSUPPORTED
+        if command == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL:
             msgid, interval_us = int(message.param1), float(message.param2)
             if msgid in self._intervals:
-                result = _ACCEPTED
+                result = mavlink.MAV_RESULT_ACCEPTED
                 rate = 0.0 if interval_us < 0.0 else 1e6 / interval_us if interval_us else _default_hz(msgid)
                 self._set_rate(msgid, rate, t)
-        elif command == _REQUEST_MESSAGE and int(message.param1) in self._intervals:
+        elif command == mavlink.MAV_CMD_REQUEST_MESSAGE and int(message.param1) in self._intervals:
             wanted = self._message(int(message.param1), t)
-            result = _DENIED if wanted is None else _ACCEPTED
+            result = mavlink.MAV_RESULT_DENIED if wanted is None else mavlink.MAV_RESULT_ACCEPTED
             if wanted is not None:
                 self._transmit([self._frame(wanted, COMPONENT)], t)
-        elif command == _SET_SOURCE:
-            result = _ACCEPTED
-        elif command == _EXTERNAL_POSITION and dialect.id_of(message) == _msgid("COMMAND_INT"):
+        elif command == mavlink.MAV_CMD_SET_EKF_SOURCE_SET:
+            result = mavlink.MAV_RESULT_ACCEPTED
+        elif (
+            command == mavlink.MAV_CMD_EXTERNAL_POSITION_ESTIMATE
+            and dialect.id_of(message) == mavlink.MAVLINK_MSG_ID_COMMAND_INT
+        ):
             self.outputs.append((t + self._start_ns, message))
-            result = _ACCEPTED
+            result = mavlink.MAV_RESULT_ACCEPTED
         who = {"target_system": message.get_srcSystem(), "target_component": message.get_srcComponent()}
-        self._answer("COMMAND_ACK", t, command=command, result=result, **who)
+        self._reply("COMMAND_ACK", t, command=command, result=result, **who)
 
 
 def _msgid(name: str) -> int:

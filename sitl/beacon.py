@@ -1,8 +1,8 @@
-"""RSBN beacons: when a beacon answers an aircraft, and what it says.
+"""RSBN beacon model: coverage and measurement errors.
 
-An answer is the azimuth of the aircraft at the beacon (true north, clockwise) and the slant range. Beyond
-the beacon's range or the radio horizon there is none; in the cone of silence overhead it has no azimuth.
-It knows nothing of the receiver's message, of time mapping or of faults (`sitl.faults`).
+An answer is the azimuth of the aircraft at the beacon (from true north, clockwise) and the slant range.
+Beyond the range limit or the radio horizon there is no answer; in the cone of silence there is no azimuth.
+Messages, time mapping and faults (`sitl.faults`) are not modelled here.
 """
 
 from __future__ import annotations
@@ -15,18 +15,19 @@ import numpy as np
 from companion.nav.earth import E2, A
 from companion.nav.geometry import enu_axes
 from companion.records import RsbnFix
-from sitl.flight import Array, Flight
+from companion.units import Floats
+from sitl.flight import Trajectory
 
 _RADIO_R = 4.0 / 3.0 * 6371000.0
 
 
 @dataclass(frozen=True, slots=True)
 class Beacon:
-    """A ground beacon and the errors of its channel.
+    """Ground beacon and the errors of its channel.
 
-    Sigmas are one sigma: RSBN's usual figures, 0.25 degrees and 200 m + 0.03 % of the range, are two.
-    `north_deg` is how far the beacon's north is turned: it is added to every azimuth. `alt` is above the
-    ellipsoid, `ground_alt` that of the smooth earth which the horizon is reckoned over.
+    Sigmas are one sigma (RSBN's published 0.25 degrees and 200 m + 0.03 % of the range are two sigma).
+    `north_deg` is the misalignment of the beacon's north, added to every azimuth. `alt` is above the
+    ellipsoid; `ground_alt` is the height of the smooth earth of the horizon computation.
     """
 
     number: int
@@ -47,10 +48,10 @@ class Beacon:
     latency_s: float = 0.15
 
 
-def sights(beacon: Beacon, flight: Flight) -> tuple[Array, Array, Array]:
-    """True azimuth in [0, 2 pi), slant range and elevation of the flight's positions at the beacon."""
+def azimuth_range_elevation(beacon: Beacon, flight: Trajectory) -> tuple[Floats, Floats, Floats]:
+    """Return azimuth in [0, 2 pi) rad, slant range (m) and elevation (rad) of the aircraft at the beacon."""
 
-    def ecef(lat: Array, lon: Array, alt: Array) -> Array:
+    def ecef(lat: Floats, lon: Floats, alt: Floats) -> Floats:
         R_E = A / np.sqrt(1.0 - E2 * np.sin(lat) ** 2)
         rho = (R_E + alt) * np.cos(lat)
         return np.stack(
@@ -64,9 +65,9 @@ def sights(beacon: Beacon, flight: Flight) -> tuple[Array, Array, Array]:
     return np.arctan2(east, north) % (2.0 * np.pi), np.hypot(level, up), np.arctan2(up, level)
 
 
-def in_reach(beacon: Beacon, flight: Flight) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
-    """Where the flight is within the beacon's range limit and above its radio horizon (4/3 earth)."""
-    _, slant, _ = sights(beacon, flight)
+def in_reach(beacon: Beacon, flight: Trajectory) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+    """Return a mask: within the beacon's range limit and above its radio horizon (4/3 earth)."""
+    _, slant, _ = azimuth_range_elevation(beacon, flight)
     mast = max(beacon.alt - beacon.ground_alt, 0.0)
     height = np.maximum(flight.alt - beacon.ground_alt, 0.0)
     horizon = math.sqrt(2.0 * _RADIO_R) * (np.sqrt(height) + math.sqrt(mast))
@@ -74,30 +75,30 @@ def in_reach(beacon: Beacon, flight: Flight) -> np.ndarray[tuple[int], np.dtype[
     return reached
 
 
-def answers(
+def simulate_answers(
     beacon: Beacon,
-    flight: Flight,
+    flight: Trajectory,
     rng: np.random.Generator,
     outages: tuple[tuple[float, float], ...] = (),
 ) -> list[RsbnFix]:
-    """The beacon's answers at the flight's times; `t_ns` is flight time, `rx_ns` that plus the latency."""
-    azimuth, slant, elevation = sights(beacon, flight)
+    """Simulate the answers at the trajectory's times; `t_ns` is flight time, `rx_ns` adds the latency."""
+    azimuth, slant, elevation = azimuth_range_elevation(beacon, flight)
     n = len(flight.t)
     sigma_azimuth = math.radians(beacon.sigma_azimuth_deg)
     sigma_range = beacon.sigma_range + beacon.sigma_range_share * slant
-    # Drawn for every moment, heard or not, so that an outage does not change the noise after it.
+    # drawn for every sample, received or not: an outage does not change the noise after it
     azimuth = azimuth + math.radians(beacon.north_deg) + sigma_azimuth * rng.standard_normal(n)
     slant = slant + beacon.bias_range + sigma_range * rng.standard_normal(n)
-    heard = in_reach(beacon, flight) & (rng.random(n) >= beacon.drop_out)
+    received = in_reach(beacon, flight) & (rng.random(n) >= beacon.drop_out)
     for start, end in outages:
-        heard &= (flight.t < start) | (flight.t >= end)
+        received &= (flight.t < start) | (flight.t >= end)
     step = math.radians(beacon.azimuth_step_deg)
     if step:
         azimuth = np.round(azimuth / step) * step
     if beacon.range_step:
         slant = np.round(slant / beacon.range_step) * beacon.range_step
     azimuth = np.mod(azimuth, 2.0 * np.pi)
-    silent = elevation > math.radians(beacon.silence_deg)
+    overhead = elevation > math.radians(beacon.silence_deg)
     lat, lon = math.radians(beacon.lat_deg), math.radians(beacon.lon_deg)
     return [
         RsbnFix(
@@ -107,18 +108,18 @@ def answers(
             lat=lat,
             lon=lon,
             alt=beacon.alt,
-            azimuth=None if quiet else a,
+            azimuth=None if no_azimuth else a,
             slant_range=max(d, 0.0),
             sigma_azimuth=sigma_azimuth,
             sigma_range=s,
         )
-        for t, a, d, s, quiet, on in zip(
+        for t, a, d, s, no_azimuth, is_received in zip(
             flight.t.tolist(),
             azimuth.tolist(),
             slant.tolist(),
             sigma_range.tolist(),
-            silent.tolist(),
-            heard.tolist(),
+            overhead.tolist(),
+            received.tolist(),
         )
-        if on
+        if is_received
     ]

@@ -1,4 +1,4 @@
-"""`companion sitl bridge`: a `Bridge` on real links and the wall's clock, its record and its table.
+"""`companion sitl bridge`: a `Bridge` on real links and the system clock, with error file and table.
 
     companion sitl bridge --connect tcp:127.0.0.1:5760 --companion udpout:127.0.0.1:14550 \\
         --beacon 55.75,38.57 --gnss-off-after 120 --seconds 330
@@ -25,10 +25,10 @@ from rich.table import Table
 
 from companion.analysis import simulated_rsbn
 from companion.storage.reader import LogError
-from companion.transport.links import Address, CannotListen, Stream, connections
+from companion.transport.reconnect import Address, CannotListen, Connection, connections
 from sitl.beacon import Beacon
-from sitl.bridge import AUTOPILOT, COMPANION, RSBN, Bridge, Orders, Way
-from sitl.comparison import AFTER_S, Row, Scored, table
+from sitl.bridge import AUTOPILOT, COMPANION, RSBN, Bridge, BridgeMode, GnssSchedule
+from sitl.comparison import AFTER_S, OutageErrors, PositionError, outage_table
 
 EX_UNAVAILABLE, EX_CANTCREAT = 69, 73  # sysexits.h
 LONGEST_SLEEP_S = 0.2
@@ -37,72 +37,72 @@ COLUMNS = ("t_s", "source", "north_m", "east_m", "error_m", "sigma_m", "bound_m"
 TRUTH_COLUMNS = ("true_lat_deg", "true_lon_deg", "true_alt_m")
 
 
-class Attached:
-    """One run: two links, or one where nothing is to be relayed. `keep` gets every new error."""
+class BridgeRunner:
+    """One run over two links, or over one without relaying. `store` receives every new error."""
 
     def __init__(
         self,
         bridge: Bridge,
         autopilot: Address,
         companion: Address | None,
-        tell: Callable[[float, str], None],
-        keep: Callable[[Sequence[Scored]], None],
+        report: Callable[[float, str], None],
+        store: Callable[[Sequence[PositionError]], None],
         now: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        self._bridge, self._tell, self._keep, self._now = bridge, tell, keep, now
+        self._bridge, self._report_line, self._store, self._now = bridge, report, store, now
         self._addresses = [autopilot, *([companion] if companion else [])]
         self._receive = bridge.from_autopilot, bridge.from_companion
-        self._streams: dict[int, Stream] = {}
-        self._news = asyncio.Event()
+        self._streams: dict[int, Connection] = {}
+        self._received = asyncio.Event()
         self._stopped = False
-        self._kept = 0
-        self.begun_ns = self.now_ns = now()
+        self._stored = 0
+        self.started_ns = self.now_ns = now()
 
     def stop(self) -> None:
-        """End `run` soon."""
+        """Make `run` return soon."""
         self._stopped = True
-        self._news.set()
+        self._received.set()
 
     async def run(self, seconds: float = math.inf) -> None:
-        """Until `stop`, or for so many seconds. Raises CannotListen where an address is taken."""
-        self.begun_ns = self._now()
+        """Run for `seconds` or until `stop`. Raises CannotListen if an address is in use."""
+        self.started_ns = self._now()
         try:
             async with asyncio.TaskGroup() as tasks:
-                carrying = [tasks.create_task(self._carry(side)) for side in range(len(self._addresses))]
+                serving = [tasks.create_task(self._serve(side)) for side in range(len(self._addresses))]
                 while not self._stopped and self._elapsed() < seconds:
                     self._bridge.poll(self._now())
                     self._flush()
                     left = min(1e-9 * (self._bridge.deadline() - self._now()), seconds - self._elapsed())
-                    await self._rest(min(left, LONGEST_SLEEP_S))
+                    await self._wait(min(left, LONGEST_SLEEP_S))
                 self._bridge.finish(self._now())
                 self._flush()
-                for task in carrying:
+                for task in serving:
                     task.cancel()
         except* CannotListen as group:
             raise group.exceptions[0] from None
 
     def _elapsed(self) -> float:
         self.now_ns = self._now()
-        return (self.now_ns - self.begun_ns) * 1e-9
+        return (self.now_ns - self.started_ns) * 1e-9
 
-    async def _rest(self, seconds: float) -> None:
-        """Sleep, but no longer than to the next bytes: what is relayed must not wait."""
+    async def _wait(self, seconds: float) -> None:
+        """Sleep until the time is over or bytes arrive: relayed frames must not wait."""
         try:
             async with asyncio.timeout(max(0.0, seconds)):
-                await self._news.wait()
+                await self._received.wait()
         except TimeoutError:
             pass
-        self._news.clear()
+        self._received.clear()
 
-    async def _carry(self, side: int) -> None:
-        async for stream in connections(self._addresses[side], random.random, self._say):
+    async def _serve(self, side: int) -> None:
+        async for stream in connections(self._addresses[side], random.random, self._report):
             self._streams[side] = stream
             try:
                 while True:
                     self._receive[side](await stream.read(), self._now())
-                    self._news.set()
+                    self._received.set()
             except ConnectionError as error:
-                self._say(f"{error}; opening it again")
+                self._report(f"{error}; reconnecting")
             del self._streams[side]
 
     def _flush(self) -> None:
@@ -110,19 +110,19 @@ class Attached:
             if (stream := self._streams.get(side)) is not None:
                 for data in frames:
                     stream.write(data)
-        for line in self._bridge.take_told():
-            self._say(line)
-        scored = self._bridge.comparison.scored
-        if len(scored) > self._kept:
-            self._keep(scored[self._kept :])
-            self._kept = len(scored)
+        for line in self._bridge.take_reports():
+            self._report(line)
+        scored = self._bridge.comparison.errors
+        if len(scored) > self._stored:
+            self._store(scored[self._stored :])
+            self._stored = len(scored)
 
-    def _say(self, text: str) -> None:
-        self._tell(self._elapsed(), text)
+    def _report(self, text: str) -> None:
+        self._report_line(self._elapsed(), text)
 
 
-class Record:
-    """Every error as a line of CSV in `folder`; times are seconds since `start_ns`. Raises OSError."""
+class ErrorFile:
+    """CSV file of all errors in `folder`; times are seconds since `start_ns`. Raises OSError."""
 
     def __init__(self, folder: Path, start_ns: int) -> None:
         folder.mkdir(parents=True, exist_ok=True)
@@ -132,8 +132,8 @@ class Record:
         self._lines = csv.writer(self._file)
         self._lines.writerow((*COLUMNS, *TRUTH_COLUMNS))
 
-    def keep(self, scored: Sequence[Scored]) -> None:
-        """Write them."""
+    def store(self, scored: Sequence[PositionError]) -> None:
+        """Append errors to the file."""
         for s in scored:
             metres = (s.north, s.east, s.error, s.sigma, s.bound)
             numbers = ("" if value is None else f"{value:.2f}" for value in metres)
@@ -142,30 +142,30 @@ class Record:
             self._lines.writerow((t_s, s.source, *numbers, *place, f"{s.true.alt:.1f}"))
 
     def close(self) -> None:
-        """It is whole."""
+        """Close the file."""
         self._file.close()
 
 
-def found(bridge: Bridge, end_ns: int) -> list[tuple[str, list[Row]]]:
-    """A title and a table for each loss of GNSS, or one for the whole flight if there was none."""
-    start_ns = bridge.begun_ns or end_ns
+def outage_tables(bridge: Bridge, end_ns: int) -> list[tuple[str, list[OutageErrors]]]:
+    """Return title and table of each GNSS outage, or of the whole flight if there was none."""
+    start_ns = bridge.connected_ns or end_ns
 
-    def rows(from_ns: int, to_ns: int) -> list[Row]:
-        found = table(bridge.comparison.scored, from_ns, to_ns)
+    def rows(from_ns: int, to_ns: int) -> list[OutageErrors]:
+        found = outage_table(bridge.comparison.errors, from_ns, to_ns)
         return sorted(found, key=lambda row: ORDER.index(row.source))
 
-    if not bridge.losses:
-        return [("GNSS was there all the time", rows(start_ns, end_ns))]
+    if not bridge.outages:
+        return [("GNSS available throughout", rows(start_ns, end_ns))]
     tables = []
-    for loss in bridge.losses:
-        back_ns = loss.back_ns or end_ns
+    for loss in bridge.outages:
+        back_ns = loss.regained_ns or end_ns
         title = f"GNSS lost at {(loss.lost_ns - start_ns) * 1e-9:.0f} s"
         title += f" for {(back_ns - loss.lost_ns) * 1e-9:.0f} s"
         tables.append((title, rows(loss.lost_ns, back_ns)))
     return tables
 
 
-def _print(tables: list[tuple[str, list[Row]]]) -> None:
+def _print(tables: list[tuple[str, list[OutageErrors]]]) -> None:
     def metres(value: float | None) -> str:
         return "" if value is None else f"{value:.0f}"
 
@@ -181,16 +181,16 @@ def _print(tables: list[tuple[str, list[Row]]]) -> None:
         Console(width=max(100, Console().width)).print(out)
 
 
-def _beacons(given: tuple[str, ...], file: Path | None) -> tuple[Beacon, ...]:
+def _parse_beacons(positions: tuple[str, ...], file: Path | None) -> tuple[Beacon, ...]:
     beacons = []
-    for number, text in enumerate(given, start=1):
+    for number, text in enumerate(positions, start=1):
         try:
             lat, lon, *alt = map(float, text.split(","))
             if len(alt) > 1 or abs(lat) > 90.0 or abs(lon) > 180.0 or not all(map(math.isfinite, alt)):
                 raise ValueError
         except ValueError:
             raise click.BadParameter(
-                f"{text!r} is no beacon: write it as LAT,LON or LAT,LON,ALT in degrees and metres",
+                f"invalid beacon {text!r}: write it as LAT,LON or LAT,LON,ALT in degrees and metres",
                 param_hint="--beacon",
             ) from None
         height = alt[0] if alt else 0.0
@@ -198,7 +198,7 @@ def _beacons(given: tuple[str, ...], file: Path | None) -> tuple[Beacon, ...]:
     if file is not None:
         for listed in simulated_rsbn.read_beacons(file):
             if not (listed.azimuth and listed.ranging):
-                continue  # neither a VOR nor a DME alone is one
+                continue  # a VOR or DME alone is not enough
             lat, lon = math.degrees(listed.lat), math.degrees(listed.lon)
             beacons.append(
                 Beacon(listed.number, lat, lon, listed.alt, simulated_rsbn.GROUND, listed.range_limit)
@@ -206,7 +206,7 @@ def _beacons(given: tuple[str, ...], file: Path | None) -> tuple[Beacon, ...]:
     return tuple(beacons)
 
 
-def _address(text: str, option: str) -> Address:
+def _parse_address(text: str, option: str) -> Address:
     try:
         return Address.parse(text)
     except ValueError as error:
@@ -215,25 +215,32 @@ def _address(text: str, option: str) -> Address:
 
 @click.command("bridge")
 @click.option("--connect", default="tcp:127.0.0.1:5760", show_default=True, help="Link to the autopilot.")
-@click.option("--companion", help="Link to the companion; without one, all are on the first (a router).")
+@click.option("--companion", help="Link to the companion; without it all share the first link (a router).")
 @click.option(
-    "--beacon", "given", multiple=True, metavar="LAT,LON[,ALT]", help="Simulate an RSBN beacon there."
+    "--beacon", "positions", multiple=True, metavar="LAT,LON[,ALT]", help="Simulate an RSBN beacon there."
 )
-@click.option("--beacons", "file", type=click.Path(path_type=Path), help="Simulate those of a CSV file.")
 @click.option(
-    "--gnss-off-after", type=click.FloatRange(0.0), metavar="S", help="Switch the simulated GNSS off."
+    "--beacons", "file", type=click.Path(path_type=Path), help="Simulate the beacons of a CSV file."
 )
-@click.option("--gnss-on-after", type=click.FloatRange(0.0), metavar="S", help="And on again.")
-@click.option("--seconds", type=click.FloatRange(1.0), default=math.inf, help="End after so long.")
-@click.option("--unaided", is_flag=True, help="Keep the companion's positions from the autopilot.")
-@click.option("--beacons-only", is_flag=True, help="Send the companion nothing but the beacons' answers.")
-@click.option("--seed", type=int, default=1, show_default=True, help="Of the beacons' noise.")
+@click.option(
+    "--gnss-off-after",
+    type=click.FloatRange(0.0),
+    metavar="S",
+    help="Switch the simulated GNSS off after S seconds.",
+)
+@click.option(
+    "--gnss-on-after", type=click.FloatRange(0.0), metavar="S", help="Switch it on again after S seconds."
+)
+@click.option("--seconds", type=click.FloatRange(1.0), default=math.inf, help="Duration of the run.")
+@click.option("--unaided", is_flag=True, help="Do not relay the companion's positions to the autopilot.")
+@click.option("--beacons-only", is_flag=True, help="Send the companion only the beacons' answers.")
+@click.option("--seed", type=int, default=1, show_default=True, help="Seed of the beacons' noise.")
 @click.option("--log", "folder", type=click.Path(path_type=Path), help="Folder for the errors, as CSV.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 def command(
     connect: str,
     companion: str | None,
-    given: tuple[str, ...],
+    positions: tuple[str, ...],
     file: Path | None,
     gnss_off_after: float | None,
     gnss_on_after: float | None,
@@ -244,50 +251,50 @@ def command(
     folder: Path | None,
     as_json: bool,
 ) -> None:
-    """Attach to an ArduPilot or PX4 SITL that runs: truth, beacons, loss of GNSS, and who was how far off.
+    """Connect to a running ArduPilot or PX4 SITL: truth, beacons, GNSS loss, and a table of position errors.
 
-    Relays between autopilot and companion. Seconds count from the autopilot's first word. Ends at SIGINT or
-    SIGTERM with a table; GNSS is switched on again. Exit codes: 1 the beacons cannot be read, 69 an address
-    cannot be listened on or no autopilot was heard, 73 the folder cannot be written.
+    Relays between autopilot and companion. Seconds count from the first message of the autopilot. Ends at
+    SIGINT or SIGTERM with a table; GNSS is switched on again. Exit codes: 1 the beacons cannot be read, 69
+    cannot listen on an address or no autopilot found, 73 the folder cannot be written.
     """
-    autopilot = _address(connect, "--connect")
-    other = _address(companion, "--companion") if companion else None
+    autopilot = _parse_address(connect, "--connect")
+    other = _parse_address(companion, "--companion") if companion else None
     if gnss_on_after is not None and (gnss_off_after is None or gnss_on_after <= gnss_off_after):
         raise click.BadParameter("give --gnss-off-after, and a later time here", param_hint="--gnss-on-after")
     if other is None and (beacons_only or unaided):
         raise click.UsageError("--beacons-only and --unaided need a link to the companion: give --companion")
-    way = Way.SAME if other is None else Way.BESIDE if beacons_only else Way.RELAY
+    mode = BridgeMode.SAME if other is None else BridgeMode.BESIDE if beacons_only else BridgeMode.RELAY
     try:
-        beacons = _beacons(given, file)
+        beacons = _parse_beacons(positions, file)
     except LogError as error:
         click.echo(f"companion: {error}", err=True)
         sys.exit(1)
-    bridge = Bridge(beacons, Orders(gnss_off_after, gnss_on_after), way, unaided, seed)
+    bridge = Bridge(beacons, GnssSchedule(gnss_off_after, gnss_on_after), mode, unaided, seed)
     try:
-        record = Record(folder, time.monotonic_ns()) if folder else None
+        record = ErrorFile(folder, time.monotonic_ns()) if folder else None
     except OSError as error:
         click.echo(f"companion: {folder} cannot be written: {error.strerror}", err=True)
         sys.exit(EX_CANTCREAT)
-    attached = Attached(
+    runner = BridgeRunner(
         bridge,
         autopilot,
         other,
         lambda t, text: click.echo(f"{t:8.1f} s  {text}", err=True),
-        record.keep if record else lambda scored: None,
+        record.store if record else lambda scored: None,
     )
     try:
-        asyncio.run(_until_stopped(attached, seconds))
+        asyncio.run(_until_stopped(runner, seconds))
     except CannotListen as error:
         click.echo(f"companion: {error.strerror}", err=True)
         sys.exit(EX_UNAVAILABLE)
     finally:
         if record is not None:
             record.close()
-    if bridge.begun_ns is None:
-        seconds = (attached.now_ns - attached.begun_ns) * 1e-9
-        click.echo(f"companion: no autopilot heard on {connect} in {seconds:.0f} s", err=True)
+    if bridge.connected_ns is None:
+        seconds = (runner.now_ns - runner.started_ns) * 1e-9
+        click.echo(f"companion: no autopilot on {connect} in {seconds:.0f} s", err=True)
         sys.exit(EX_UNAVAILABLE)
-    tables = found(bridge, attached.now_ns)
+    tables = outage_tables(bridge, runner.now_ns)
     if as_json:
         click.echo(json.dumps(_json(tables, record)))
         return
@@ -296,13 +303,13 @@ def command(
         click.echo(f"errors: {record.path}")
 
 
-def _json(tables: list[tuple[str, list[Row]]], record: Record | None) -> dict[str, Any]:
+def _json(tables: list[tuple[str, list[OutageErrors]]], record: ErrorFile | None) -> dict[str, Any]:
     losses = [{"title": title, "rows": [row._asdict() for row in rows]} for title, rows in tables]
     return {"tables": losses, "errors": str(record.path) if record else None}
 
 
-async def _until_stopped(attached: Attached, seconds: float) -> None:
+async def _until_stopped(runner: BridgeRunner, seconds: float) -> None:
     loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM):
-        loop.add_signal_handler(number, attached.stop)
-    await attached.run(seconds)
+        loop.add_signal_handler(number, runner.stop)
+    await runner.run(seconds)

@@ -1,7 +1,7 @@
-"""Estimates against the truth of a live simulator: errors as they come, and the table after a loss of GNSS.
+"""Position errors against the truth of a live simulator, and the error table of a GNSS outage.
 
-Truth comes in samples, estimates with times of their own, each a little before or after the other. An
-estimate waits until the truth is known on both sides of it. It knows no message and no link.
+Truth samples and estimates have different time stamps and arrive in any order. An estimate waits until truth
+samples on both sides of it are known. Messages and links are not handled here.
 """
 
 from __future__ import annotations
@@ -15,18 +15,20 @@ from typing import NamedTuple
 import numpy as np
 
 from companion.nav.geometry import Geodetic, separation
+from companion.units import SECOND_NS
 
-SECOND = 1_000_000_000
-REMEMBERED_NS = 20 * SECOND
-MOST_WAITING = 1000  # estimates: truth that comes no more is not waited for
-GAP_NS = 1 * SECOND  # nor is it drawn across a longer hole
-AFTER_S = (30, 60, 120, 180)  # at which the table tells the error
-NEAR_NS = 2 * SECOND
+TRUTH_HISTORY_NS = 20 * SECOND_NS
+MOST_WAITING = 1000  # estimates: bounds the queue when the truth stops
+GAP_NS = 1 * SECOND_NS  # truth is not interpolated across a longer gap
+AFTER_S = (30, 60, 120, 180)  # after the loss: the table lists the error at these times
+NEAR_NS = 2 * SECOND_NS
 
 
-class Scored(NamedTuple):
-    """The horizontal error of one estimate, m: estimate minus truth; the sigma and the guaranteed bound that
-    it stated, m, None where it did not; and the truth.
+class PositionError(NamedTuple):
+    """Horizontal error of one estimate, m: estimate minus truth.
+
+    `sigma` and `bound` are the stated sigma and guaranteed bound, m, None where not stated; `true` is the
+    truth.
     """
 
     t_ns: int
@@ -39,7 +41,7 @@ class Scored(NamedTuple):
 
     @property
     def error(self) -> float:
-        """Its length."""
+        """Horizontal distance, m."""
         return math.hypot(self.north, self.east)
 
 
@@ -51,9 +53,12 @@ class _Estimate(NamedTuple):
     bound: float | None
 
 
-class Row(NamedTuple):
-    """One source while GNSS was lost: errors (m) by seconds since the loss, None where there was none, their
-    r.m.s. and maximum, and the share within three stated sigmas."""
+class OutageErrors(NamedTuple):
+    """Errors of one source during a GNSS outage, m.
+
+    `at` maps seconds since the loss to the error (None: no estimate near); `within` is the share of errors
+    within three stated sigmas.
+    """
 
     source: str
     at: dict[int, float | None]
@@ -64,24 +69,24 @@ class Row(NamedTuple):
 
 
 class Comparison:
-    """One flight's truth and estimates; `scored` grows in order of time, nearly."""
+    """Truth and estimates of one flight. `errors` is appended nearly in order of time."""
 
     def __init__(self) -> None:
-        self.scored: list[Scored] = []
+        self.errors: list[PositionError] = []
         self._truth: deque[tuple[int, Geodetic]] = deque()
         self._waiting: deque[_Estimate] = deque(maxlen=MOST_WAITING)
 
-    def truth(self, t_ns: int, place: Geodetic) -> None:
-        """The aircraft was at `place`. What is not later than the last is not used."""
+    def add_truth(self, t_ns: int, place: Geodetic) -> None:
+        """Add a truth sample. A sample not later than the last one is ignored."""
         if self._truth and t_ns <= self._truth[-1][0]:
             return
         self._truth.append((t_ns, place))
-        while self._truth[0][0] < t_ns - REMEMBERED_NS:
+        while self._truth[0][0] < t_ns - TRUTH_HISTORY_NS:
             self._truth.popleft()
         for _ in range(len(self._waiting)):
             self._score(self._waiting.popleft())
 
-    def estimate(
+    def add_estimate(
         self,
         t_ns: int,
         source: str,
@@ -89,20 +94,24 @@ class Comparison:
         sigma: float | None = None,
         bound: float | None = None,
     ) -> None:
-        """`source` says that it was at `place`, to `sigma` metres and by `bound` metres r.m.s. at most."""
+        """Add an estimate of `source`, with its stated sigma (m) and guaranteed r.m.s. bound (m)."""
         self._score(_Estimate(t_ns, source, place, sigma, bound))
 
-    def _score(self, said: _Estimate) -> None:
-        if not self._truth or said.t_ns > self._truth[-1][0]:
-            self._waiting.append(said)
+    def _score(self, estimate: _Estimate) -> None:
+        if not self._truth or estimate.t_ns > self._truth[-1][0]:
+            self._waiting.append(estimate)
             return
-        true = self._truth_at(said.t_ns)
+        true = self._truth_at(estimate.t_ns)
         if true is not None:
-            north, east, _ = separation(said.place, true).tolist()
-            self.scored.append(Scored(said.t_ns, said.source, north, east, said.sigma, said.bound, true))
+            north, east, _ = separation(estimate.place, true).tolist()
+            self.errors.append(
+                PositionError(
+                    estimate.t_ns, estimate.source, north, east, estimate.sigma, estimate.bound, true
+                )
+            )
 
     def _truth_at(self, t_ns: int) -> Geodetic | None:
-        """Linear between two samples; None before the first, and in a hole."""
+        """Interpolate linearly between two samples; None before the first and in a gap."""
         k = bisect_left(self._truth, t_ns, key=lambda sample: sample[0])
         after_ns, after = self._truth[k]
         if after_ns == t_ns:
@@ -121,29 +130,29 @@ class Comparison:
         )
 
 
-def nearest(scored: Iterable[Scored], source: str, t_ns: int) -> Scored | None:
-    """What `source` said next to `t_ns`, None where nothing is near."""
-    near = [s for s in scored if s.source == source and abs(s.t_ns - t_ns) <= NEAR_NS]
+def nearest_error(errors: Iterable[PositionError], source: str, t_ns: int) -> PositionError | None:
+    """Return the error of `source` nearest to `t_ns`, None where none is within `NEAR_NS`."""
+    near = [s for s in errors if s.source == source and abs(s.t_ns - t_ns) <= NEAR_NS]
     return min(near, key=lambda s: abs(s.t_ns - t_ns), default=None)
 
 
-def table(scored: Sequence[Scored], start_ns: int, end_ns: int) -> list[Row]:
-    """A row for each source heard between two instants; seconds count from the first."""
+def outage_table(errors: Sequence[PositionError], start_ns: int, end_ns: int) -> list[OutageErrors]:
+    """Return one row per source with estimates between two instants; seconds count from the first."""
     rows = []
-    for source in dict.fromkeys(s.source for s in scored):
-        inside = [s for s in scored if s.source == source and start_ns <= s.t_ns < end_ns]
+    for source in dict.fromkeys(s.source for s in errors):
+        inside = [s for s in errors if s.source == source and start_ns <= s.t_ns < end_ns]
         if not inside:
             continue
-        errors = np.array([s.error for s in inside])
-        marks = {s: start_ns + s * SECOND for s in AFTER_S}
-        at = {s: nearest(inside, source, mark) for s, mark in marks.items() if mark < end_ns}
+        metres = np.array([s.error for s in inside])
+        marks = {s: start_ns + s * SECOND_NS for s in AFTER_S}
+        at = {s: nearest_error(inside, source, mark) for s, mark in marks.items() if mark < end_ns}
         stated = [s.error <= 3.0 * s.sigma for s in inside if s.sigma is not None]
         rows.append(
-            Row(
+            OutageErrors(
                 source,
                 {s: found.error if (found := at.get(s)) else None for s in AFTER_S},
-                float(np.sqrt(np.mean(errors**2))),
-                float(errors.max()),
+                float(np.sqrt(np.mean(metres**2))),
+                float(metres.max()),
                 len(inside),
                 sum(stated) / len(stated) if stated else None,
             )

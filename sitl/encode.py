@@ -1,9 +1,8 @@
-"""Record -> message: what an autopilot would send. The mirror of `companion.link.decode`.
+"""Encoder record -> MAVLink message of an autopilot. The inverse of `companion.link.decode`.
 
-A table by the record's kind. `boot_ns` is the time, on the records' clock, at which the simulated autopilot
-was switched on; records before it cannot be told. What MAVLink rounds (milliseconds, 1e-7 degrees, cm/s)
-is rounded, and what a message cannot say is left out in the message's own way. It knows nothing of rates,
-links or of how a record came about.
+A table by the record's kind. `boot_ns` is the boot time of the simulated autopilot on the records' clock;
+earlier records cannot be encoded. Values are rounded as MAVLink does (milliseconds, 1e-7 degrees, cm/s), and
+missing values are sent as the message's "unknown". Rates and links belong to `sitl.autopilot`.
 """
 
 from __future__ import annotations
@@ -13,6 +12,7 @@ from collections.abc import Callable
 from typing import Any, Literal, NamedTuple, TypeAlias
 
 from companion.link import dialect
+from companion.link.dialect import rsbn
 from companion.records import (
     AirData,
     Attitude,
@@ -31,36 +31,36 @@ from companion.records import (
     Vector3,
     Wind,
 )
+from companion.units import G0
 
 Message: TypeAlias = Any
 
-_MILLI_G = 9.80665e-3
+_MILLI_G = G0 / 1000
 _ZERO_CELSIUS = 273.15
-_RSBN_AZIMUTH, _RSBN_RANGE, _RSBN_SIMULATED = 1, 2, 16
-_INERTIAL_UPDATED = 0x3F
+_INERTIAL_UPDATED = 0x3F  # HIGHRES_IMU_UPDATED_XACC ... ZGYRO
 
 
-class Airframe(NamedTuple):
-    """The autopilot that is played: its make decides which message carries a record."""
+class SimulatedSender(NamedTuple):
+    """Simulated sender: make, which selects the message of a record, and boot time."""
 
     autopilot: Literal["ardupilot", "px4"] = "ardupilot"
     boot_ns: int = 0
 
     def ms(self, t_ns: int) -> int:
-        """Milliseconds since boot, as time_boot_ms has them."""
+        """Milliseconds since boot (time_boot_ms)."""
         return (t_ns - self.boot_ns) // 1_000_000
 
     def us(self, t_ns: int) -> int:
-        """Microseconds since boot, as time_usec has them."""
+        """Microseconds since boot (time_usec)."""
         return (t_ns - self.boot_ns) // 1000
 
 
-def encode(record: Stamped, airframe: Airframe) -> Message:
-    """The message that carries `record`. ValueError for a kind that no autopilot sends."""
+def encode(record: Stamped, sender: SimulatedSender) -> Message:
+    """Encode `record` as a message. Raises ValueError for a kind that no autopilot sends."""
     encoder = _ENCODERS.get(type(record))
     if encoder is None:
-        raise ValueError(f"no autopilot sends a {type(record).__name__}: encode what its sensors say")
-    return encoder(record, airframe)
+        raise ValueError(f"no autopilot sends a {type(record).__name__}: only sensor records can be encoded")
+    return encoder(record, sender)
 
 
 def _deg_e7(angle: float) -> int:
@@ -83,12 +83,12 @@ def _accuracy(sigma: float | None) -> int:
     return 0 if sigma is None else max(1, _mm(sigma))
 
 
-def _wrapped(heading: float) -> float:
+def _wrap_pi(heading: float) -> float:
     return math.remainder(heading, math.tau)
 
 
 def _quaternion(attitude: Vector3) -> list[float]:
-    """w, x, y, z of the rotation b -> n by roll, pitch, heading."""
+    """Quaternion w, x, y, z of the rotation b -> n by roll, pitch, heading."""
     (sr, cr), (sp, cp), (sh, ch) = ((math.sin(0.5 * a), math.cos(0.5 * a)) for a in attitude)
     return [
         cr * cp * ch + sr * sp * sh,
@@ -98,7 +98,7 @@ def _quaternion(attitude: Vector3) -> list[float]:
     ]
 
 
-def _imu(r: Imu, a: Airframe) -> Message:
+def _imu(r: Imu, a: SimulatedSender) -> Message:
     if a.autopilot == "px4":
         names = ("xacc", "yacc", "zacc", "xgyro", "ygyro", "zgyro")
         values = dict(zip(names, (*r.f_b, *r.w_b)))
@@ -114,21 +114,21 @@ def _imu(r: Imu, a: Airframe) -> Message:
     return dialect.new(f"SCALED_IMU{r.source + 1}", time_boot_ms=a.ms(r.t_ns), **fields)
 
 
-def _attitude(r: Attitude, a: Airframe) -> Message:
+def _attitude(r: Attitude, a: SimulatedSender) -> Message:
     p, q, s = r.w_b or (math.nan, math.nan, math.nan)
     return dialect.new(
         "ATTITUDE",
         time_boot_ms=a.ms(r.t_ns),
         roll=r.roll,
         pitch=r.pitch,
-        yaw=_wrapped(r.heading),
+        yaw=_wrap_pi(r.heading),
         rollspeed=p,
         pitchspeed=q,
         yawspeed=s,
     )
 
 
-def _gnss(r: Gnss, a: Airframe) -> Message:
+def _gnss(r: Gnss, a: SimulatedSender) -> Message:
     vel = cog = 0xFFFF
     if r.v_n is not None:
         vel = min(round(math.hypot(r.v_n[0], r.v_n[1]) * 100.0), 0xFFFE)
@@ -152,13 +152,13 @@ def _gnss(r: Gnss, a: Airframe) -> Message:
     )
 
 
-def _local_position(r: LocalPosition, a: Airframe) -> Message:
+def _local_position(r: LocalPosition, a: SimulatedSender) -> Message:
     (x, y, z), (vx, vy, vz) = r.x_n, r.v_n
     return dialect.new("LOCAL_POSITION_NED", time_boot_ms=a.ms(r.t_ns), x=x, y=y, z=z, vx=vx, vy=vy, vz=vz)
 
 
-def _place(name: str) -> Callable[[LocalOrigin | HomePosition, Airframe], Message]:
-    def encode_place(r: LocalOrigin | HomePosition, a: Airframe) -> Message:
+def _position_encoder(name: str) -> Callable[[LocalOrigin | HomePosition, SimulatedSender], Message]:
+    def encode_position(r: LocalOrigin | HomePosition, a: SimulatedSender) -> Message:
         return dialect.new(
             name,
             latitude=_deg_e7(r.lat),
@@ -167,10 +167,10 @@ def _place(name: str) -> Callable[[LocalOrigin | HomePosition, Airframe], Messag
             time_usec=a.us(r.t_ns),
         )
 
-    return encode_place
+    return encode_position
 
 
-def _global_position(r: GlobalPosition, a: Airframe) -> Message:
+def _global_position(r: GlobalPosition, a: SimulatedSender) -> Message:
     vx, vy, vz = (round(v * 100.0) for v in r.v_n)
     return dialect.new(
         "GLOBAL_POSITION_INT",
@@ -186,7 +186,7 @@ def _global_position(r: GlobalPosition, a: Airframe) -> Message:
     )
 
 
-def _air_data(r: AirData, a: Airframe) -> Message:
+def _air_data(r: AirData, a: SimulatedSender) -> Message:
     return dialect.new(
         "VFR_HUD",
         airspeed=r.airspeed,
@@ -197,7 +197,7 @@ def _air_data(r: AirData, a: Airframe) -> Message:
     )
 
 
-def _wind(r: Wind, a: Airframe) -> Message:
+def _wind(r: Wind, a: SimulatedSender) -> Message:
     north, east, down = r.v_n
     if a.autopilot == "px4":
         variance = 0.0 if r.sigma is None else 2.0 * r.sigma**2
@@ -208,7 +208,7 @@ def _wind(r: Wind, a: Airframe) -> Message:
     return dialect.new("WIND", direction=direction, speed=math.hypot(north, east, down), speed_z=down)
 
 
-def _pressure(r: Pressure, a: Airframe) -> Message:
+def _pressure(r: Pressure, a: SimulatedSender) -> Message:
     kelvin = 288.15 if r.temperature is None else r.temperature
     return dialect.new(
         "SCALED_PRESSURE",
@@ -219,7 +219,7 @@ def _pressure(r: Pressure, a: Airframe) -> Message:
     )
 
 
-def _filter_status(r: FilterStatus, a: Airframe) -> Message:
+def _filter_status(r: FilterStatus, a: SimulatedSender) -> Message:
     if a.autopilot == "px4":
         return dialect.new(
             "ESTIMATOR_STATUS",
@@ -231,12 +231,12 @@ def _filter_status(r: FilterStatus, a: Airframe) -> Message:
     return dialect.new("EKF_STATUS_REPORT", flags=r.flags, pos_horiz_variance=r.position_ratio)
 
 
-def _system_time(r: SystemTime, a: Airframe) -> Message:
+def _system_time(r: SystemTime, a: SimulatedSender) -> Message:
     unix_us = 0 if r.unix_ns is None else r.unix_ns // 1000
     return dialect.new("SYSTEM_TIME", time_unix_usec=unix_us, time_boot_ms=r.boot_ns // 1_000_000)
 
 
-def _truth(r: Truth, a: Airframe) -> Message:
+def _truth(r: Truth, a: SimulatedSender) -> Message:
     attitude = r.attitude or (0.0, 0.0, 0.0)
     lat, lon = _deg_e7(r.lat), _deg_e7(r.lon)
     if a.autopilot == "px4":
@@ -255,16 +255,16 @@ def _truth(r: Truth, a: Airframe) -> Message:
     roll, pitch, heading = attitude
     vn, ve, vd = r.v_n
     q = dict(zip(("q1", "q2", "q3", "q4"), _quaternion(attitude)))
-    # ArduPilot 4.7 puts 1e-7 degrees into the float fields, too coarse to be read.
+    # ArduPilot 4.7 puts 1e-7 degrees into the float fields: single precision, too coarse to use
     places = {"lat": float(lat), "lon": float(lon), "lat_int": lat, "lon_int": lon, "alt": r.alt}
-    angles = {"roll": roll, "pitch": pitch, "yaw": _wrapped(heading)}
+    angles = {"roll": roll, "pitch": pitch, "yaw": _wrap_pi(heading)}
     return dialect.new("SIM_STATE", vn=vn, ve=ve, vd=vd, **q, **angles, **places)
 
 
-def _rsbn(r: RsbnFix, a: Airframe) -> Message:
-    status = _RSBN_SIMULATED
-    status |= 0 if r.azimuth is None else _RSBN_AZIMUTH
-    status |= 0 if r.slant_range is None else _RSBN_RANGE
+def _rsbn(r: RsbnFix, a: SimulatedSender) -> Message:
+    status = rsbn.RSBN_STATUS_SIMULATED
+    status |= 0 if r.azimuth is None else rsbn.RSBN_STATUS_AZIMUTH_VALID
+    status |= 0 if r.slant_range is None else rsbn.RSBN_STATUS_RANGE_VALID
     return dialect.new(
         "RSBN_MEASUREMENT",
         time_usec=a.us(r.t_ns),
@@ -280,13 +280,13 @@ def _rsbn(r: RsbnFix, a: Airframe) -> Message:
     )
 
 
-_ENCODERS: dict[type[Stamped], Callable[[Any, Airframe], Message]] = {
+_ENCODERS: dict[type[Stamped], Callable[[Any, SimulatedSender], Message]] = {
     Imu: _imu,
     Attitude: _attitude,
     Gnss: _gnss,
     LocalPosition: _local_position,
-    LocalOrigin: _place("GPS_GLOBAL_ORIGIN"),
-    HomePosition: _place("HOME_POSITION"),
+    LocalOrigin: _position_encoder("GPS_GLOBAL_ORIGIN"),
+    HomePosition: _position_encoder("HOME_POSITION"),
     GlobalPosition: _global_position,
     AirData: _air_data,
     Wind: _wind,

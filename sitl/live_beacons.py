@@ -1,10 +1,10 @@
-"""RSBN beacons that answer along a live truth: `sitl.beacon` one moment at a time. Sans-IO.
+"""RSBN beacons along the truth of a live simulator: `sitl.beacon` sample by sample. Sans-IO.
 
-    for fix in answering.along(truth): ...              # with every sample of the truth
-    for data in answering.due(now_ns, boot_ns, 1): ...  # no later than answering.deadline()
+    for fix in beacons.answers_to(truth): ...               # with every sample of the truth
+    for data in beacons.take_due(now_ns, boot_ns, 1): ...   # no later than beacons.deadline()
 
-A receiver follows the few that are nearest to where it first was. `untimed` answers carry no time, for a link
-on which no autopilot's clock is heard; they count as of their arrival, so they have no latency.
+The receiver follows the beacons nearest to its first position. `untimed` answers carry no time, for a link
+without an autopilot's clock; they are valid at arrival, so they have no latency.
 """
 
 from __future__ import annotations
@@ -19,19 +19,19 @@ from msgspec.structs import replace
 from companion.link import frame
 from companion.nav.geometry import Geodetic, separation
 from companion.records import RsbnFix, Truth
-from sitl.beacon import Beacon, answers
-from sitl.encode import Airframe, encode
-from sitl.flight import Flight
+from companion.units import SECOND_NS
+from sitl.beacon import Beacon, simulate_answers
+from sitl.encode import SimulatedSender, encode
+from sitl.flight import Trajectory
 
-SECOND = 1_000_000_000
-EVERY = SECOND
+INTERVAL_NS = SECOND_NS
 NEAREST = 8
 COMPONENT = 42
 NEVER = 2**63 - 1
 
 
-class Answering:
-    """The beacons, and their answers on the way; the seed makes their noise."""
+class LiveBeacons:
+    """Beacons and their answers not yet delivered; the seed determines the noise."""
 
     def __init__(self, beacons: Sequence[Beacon], seed: int = 1, untimed: bool = False) -> None:
         self._beacons = list(beacons)
@@ -39,53 +39,54 @@ class Answering:
         self._untimed = untimed
         self._chosen = False
         self._next_at = 0
-        self._late: list[tuple[int, int, RsbnFix]] = []  # due, order, answer
-        self._made = 0
+        self._pending: list[tuple[int, int, RsbnFix]] = []  # due, order, answer
+        self._count = 0
 
-    def along(self, truth: Truth) -> list[RsbnFix]:
-        """The answers that are made where the aircraft is now: once a second."""
+    def answers_to(self, truth: Truth) -> list[RsbnFix]:
+        """Return the answers at this position, once per second; they are also queued for `take_due`."""
         if truth.t_ns < self._next_at:
             return []
-        regular = self._next_at + EVERY
-        self._next_at = regular if regular > truth.t_ns else truth.t_ns + EVERY
+        regular = self._next_at + INTERVAL_NS
+        self._next_at = regular if regular > truth.t_ns else truth.t_ns + INTERVAL_NS
         if not self._chosen:
             self._chosen = True
             self._beacons = sorted(self._beacons, key=lambda beacon: _distance(beacon, truth))[:NEAREST]
         t, three = np.zeros(1), np.zeros((1, 3))
         lat, lon, alt = (np.array([value]) for value in (truth.lat, truth.lon, truth.alt))
-        flight = Flight(t, lat, lon, alt, three, three, three, three, three, t)
-        made = []
+        flight = Trajectory(t, lat, lon, alt, three, three, three, three, three, t)
+        fixes = []
         for beacon in self._beacons:
-            for said in answers(beacon, flight, self._rng):
-                fix = replace(said, t_ns=truth.t_ns)
-                latency = 0 if self._untimed else said.rx_ns
-                heapq.heappush(self._late, (truth.t_ns + latency, self._made, fix))
-                self._made += 1
-                made.append(fix)
-        return made
+            for answer in simulate_answers(beacon, flight, self._rng):
+                fix = replace(answer, t_ns=truth.t_ns)
+                latency = 0 if self._untimed else answer.rx_ns
+                heapq.heappush(self._pending, (truth.t_ns + latency, self._count, fix))
+                self._count += 1
+                fixes.append(fix)
+        return fixes
 
-    def due(self, now_ns: int, boot_ns: int | None, system: int) -> list[bytes]:
-        """The frames of those that have arrived. `boot_ns`: the autopilot's boot on the same clock; as long
-        as that is not known, none is sent.
+    def take_due(self, now_ns: int, boot_ns: int | None, system: int) -> list[bytes]:
+        """Return the frames of the answers due at `now_ns`.
+
+        `boot_ns` is the autopilot's boot time on the same clock; while it is None, answers are dropped.
         """
         frames = []
-        while self._late and self._late[0][0] <= now_ns:
-            _, number, fix = heapq.heappop(self._late)
+        while self._pending and self._pending[0][0] <= now_ns:
+            _, number, fix = heapq.heappop(self._pending)
             if boot_ns is None:
                 continue
-            message = encode(fix, Airframe("ardupilot", boot_ns))
+            message = encode(fix, SimulatedSender("ardupilot", boot_ns))
             if self._untimed:
                 message.time_usec = 0
             frames.append(frame.encode(message, number & 0xFF, system, COMPONENT))
         return frames
 
     def deadline(self) -> int:
-        """When `due` next has something."""
-        return self._late[0][0] if self._late else NEVER
+        """Return the time of the next answer, `NEVER` without one."""
+        return self._pending[0][0] if self._pending else NEVER
 
 
 def _distance(beacon: Beacon, truth: Truth) -> float:
-    """Roughly, m."""
+    """Approximate horizontal distance, m."""
     there = Geodetic(math.radians(beacon.lat_deg), math.radians(beacon.lon_deg), truth.alt)
     north, east, _ = separation(Geodetic(truth.lat, truth.lon, truth.alt), there).tolist()
     return math.hypot(north, east)

@@ -1,9 +1,7 @@
-"""`companion loopback`: a whole flight in virtual time, the simulated autopilot and the companion joined in
-process.
+"""`companion loopback`: a flight in virtual time, simulated autopilot and companion in one process.
 
-Only the stream and the clock are replaced: the companion's side is the `Onboard` that flies. An hour takes
-seconds and is the same every time. The table at the end scores every source against the simulator's exact
-truth.
+Only the stream and the clock are replaced: the companion is the `CompanionCore` used in flight. An hour of
+flight takes seconds and is reproducible. The table at the end compares every source with the exact truth.
 """
 
 from __future__ import annotations
@@ -23,36 +21,36 @@ from rich.progress import Progress
 from rich.table import Table
 
 from companion.analysis import error_statistics
-from companion.analysis.replay import metadata
 from companion.config import Config, OutputConfig, load
 from companion.nav.geometry import Geodetic
 from companion.records import Event, Gnss, Rejection, Reset, RsbnFix, Solution, Stamped
-from companion.runtime.core import Onboard
+from companion.runtime.core import CompanionCore
 from companion.storage.deferred_log import Log
-from companion.storage.retention import open_log
+from companion.storage.retention import create_log
+from companion.storage.run_metadata import run_metadata
 from companion.study import plot_options
-from sitl.autopilot import UNIX_AT_START_NS, Autopilot
-from sitl.scenarios import SCENARIOS, Phase, Scenario, named
+from companion.units import SECOND_NS
+from sitl.autopilot import UNIX_AT_START_NS, SimulatedAutopilot
+from sitl.scenarios import SCENARIOS, Scenario, SchedulePhase, get_scenario
 
 LINK = "sitl"
-SECOND = 1_000_000_000
-START_NS = 1000 * SECOND  # of the companion's clock at the flight's start: any instant but 0
-#: What the companion sends where [output] is left as it is.
-FED = OutputConfig(profile="custom", odometry_hz=5.0, global_position_sensor_hz=2.0)
-KEPT = (Solution, Gnss, RsbnFix, Rejection, Event, Reset)
+START_NS = 1000 * SECOND_NS  # companion's clock at the start of the flight: any value but 0
+#: Output of the companion where [output] is the default.
+DEFAULT_OUTPUT = OutputConfig(profile="custom", odometry_hz=5.0, global_position_sensor_hz=2.0)
+COLLECTED = (Solution, Gnss, RsbnFix, Rejection, Event, Reset)
 
 
-class Tap:
-    """A log that also keeps in memory what is scored."""
+class CollectingLog:
+    """Log that also collects the records needed for scoring in memory."""
 
     def __init__(self, log: Log | None) -> None:
-        self.kept: list[Stamped] = []
+        self.records: list[Stamped] = []
         self._log = log
 
     def record(self, record: Stamped, channel: str | None = None) -> None:
-        """Write one record, and keep it if it is scored."""
-        if isinstance(record, KEPT):
-            self.kept.append(record)
+        """Write one record and collect it if its kind is in `COLLECTED`."""
+        if isinstance(record, COLLECTED):
+            self.records.append(record)
         if self._log is not None:
             self._log.record(record, channel)
 
@@ -62,55 +60,63 @@ class Tap:
             self._log.frame(link, outgoing, data, t_ns)
 
 
-class Flown(NamedTuple):
-    """A flight: the autopilot that flew it, what was kept of the log, and the companion at its end."""
+class LoopbackFlight(NamedTuple):
+    """Result of a flight: the simulated autopilot, the collected records, and the companion's final state."""
 
-    autopilot: Autopilot
-    kept: list[Stamped]
-    onboard: Onboard
+    autopilot: SimulatedAutopilot
+    records: list[Stamped]
+    core: CompanionCore
 
 
-def simulated(config: Config) -> Config:
-    """`config` for the simulated autopilot: its local position is that of an INS of its own, which takes no
-    part of what it is sent, and it is sent positions where [output] is left as it is.
+def simulator_config(config: Config) -> Config:
+    """Adapt `config` to the simulated autopilot.
+
+    Its local position comes from an independent INS, so `inertial.independent` is set. A default [output] is
+    replaced by `DEFAULT_OUTPUT`.
     """
     inertial = msgspec.structs.replace(config.inertial, independent=True)
-    output = FED if config.output == OutputConfig() else config.output
+    output = DEFAULT_OUTPUT if config.output == OutputConfig() else config.output
     return msgspec.structs.replace(config, inertial=inertial, output=output)
 
 
-def fly(
-    scenario: Scenario, config: Config, log: Log | None = None, tell: Callable[[float], None] | None = None
-) -> Flown:
-    """Fly `scenario` from start to end; `tell` is handed the seconds flown, once a second of flight."""
-    autopilot, tap = Autopilot(scenario, START_NS), Tap(log)
-    onboard = Onboard(config, tap, (LINK,))
-    join(autopilot, onboard, START_NS, tell)
-    return Flown(autopilot, tap.kept, onboard)
+def fly_scenario(
+    scenario: Scenario,
+    config: Config,
+    log: Log | None = None,
+    progress: Callable[[float], None] | None = None,
+) -> LoopbackFlight:
+    """Fly `scenario` from start to end; call `progress` with the seconds flown once per second of flight."""
+    autopilot, collected = SimulatedAutopilot(scenario, START_NS), CollectingLog(log)
+    core = CompanionCore(config, collected, (LINK,))
+    fly_connected(autopilot, core, START_NS, progress)
+    return LoopbackFlight(autopilot, collected.records, core)
 
 
-def join(
-    autopilot: Autopilot, onboard: Onboard, start_ns: int, tell: Callable[[float], None] | None = None
+def fly_connected(
+    autopilot: SimulatedAutopilot,
+    core: CompanionCore,
+    start_ns: int,
+    progress: Callable[[float], None] | None = None,
 ) -> None:
-    """Let the two speak with each other from `start_ns`, the flight's start, to the flight's end."""
-    now, told, due = start_ns, start_ns, start_ns
+    """Exchange bytes between autopilot and companion from `start_ns`, the start of the flight, to its end."""
+    now, reported, due = start_ns, start_ns, start_ns
     while now <= autopilot.end_ns:
         for data in autopilot.poll(now):
-            onboard.receive(LINK, data, now)
+            core.receive(LINK, data, now)
         if now >= due:
-            onboard.poll(now)
-        for data in onboard.to_send(LINK, now):
+            core.poll(now)
+        for data in core.to_send(LINK, now):
             autopilot.receive(data, now)
-        onboard.take_events()
-        if tell is not None and now >= told:
-            tell((now - start_ns) * 1e-9)
-            told = now + SECOND
-        due = onboard.deadline()
+        core.take_events()
+        if progress is not None and now >= reported:
+            progress((now - start_ns) * 1e-9)
+            reported = now + SECOND_NS
+        due = core.deadline()
         now = max(now + 1, min(autopilot.deadline(), due))
 
 
-def truth_of(autopilot: Autopilot) -> error_statistics.TruthAt:
-    """The exact truth at any time of the companion's clock, height above mean sea level."""
+def truth_function(autopilot: SimulatedAutopilot) -> error_statistics.TruthAt:
+    """Return a function: companion's clock (ns) -> true position, height above mean sea level."""
     times = np.arange(0.0, autopilot.scenario.duration_s, 0.05)
     flight = autopilot.world.truth_at(times)
     columns = flight.lat, flight.lon, flight.alt - autopilot.scenario.geoid_height
@@ -122,37 +128,43 @@ def truth_of(autopilot: Autopilot) -> error_statistics.TruthAt:
     return truth
 
 
-def scored(flown: Flown) -> list[error_statistics.Row]:
-    """The error table. A phase with fixes begins with the first solution that can know of one."""
-    found = error_statistics.errors(flown.kept, truth_of(flown.autopilot))
+def error_table(flown: LoopbackFlight) -> list[error_statistics.PhaseErrors]:
+    """Compute the error table. A phase with fixes starts at the first solution after its first fix."""
+    found = error_statistics.horizontal_errors(flown.records, truth_function(flown.autopilot))
     phases = flown.autopilot.scenario.phases()
-    return error_statistics.table(found, [_from_first_fix(phase, flown.kept) for phase in phases])
+    return error_statistics.summarize_phases(
+        found, [_from_first_fix(phase, flown.records) for phase in phases]
+    )
 
 
-def _from_first_fix(phase: Phase, kept: Iterable[Stamped]) -> error_statistics.Phase:
-    start, end = (START_NS + round(s * SECOND) for s in (phase.start_s, phase.end_s))
+def _from_first_fix(phase: SchedulePhase, records: Iterable[Stamped]) -> error_statistics.FlightPhase:
+    start, end = (START_NS + round(s * SECOND_NS) for s in (phase.start_s, phase.end_s))
     kinds = tuple(kind for name, kind in (("GNSS", Gnss), ("RSBN", RsbnFix)) if name in phase.name)
     if kinds:
-        records = iter(kept)
+        records = iter(records)
         next(
-            (r for r in records if isinstance(r, kinds) and r.t_ns >= start and getattr(r, "fix", 3) >= 3),
+            (
+                r
+                for r in records
+                if isinstance(r, kinds) and r.t_ns >= start and getattr(r, "has_3d_fix", True)
+            ),
             None,
         )
         start = next((r.t_ns for r in records if isinstance(r, Solution)), start)
-    return error_statistics.Phase(phase.name, min(start, end), end)
+    return error_statistics.FlightPhase(phase.name, min(start, end), end)
 
 
 @click.command("loopback")
 @click.option("--scenario", default="default", show_default=True, help=f"One of {', '.join(SCENARIOS)}.")
-@click.option("--seed", type=int, help="Another noise for the same flight.")
+@click.option("--seed", type=int, help="Seed of the noise.")
 @click.option("--config", "file", type=click.Path(path_type=Path), help="TOML file; see check-config.")
 @click.option("--set", "pairs", multiple=True, metavar="SECTION.KEY=VALUE", help="Any key of the file.")
 @click.option("--logs", help="Folder for the log.")
 @click.option(
     "--plot",
     type=click.Path(path_type=Path),
-    callback=plot_options.file,
-    help="Draw the errors and the bound into this file.",
+    callback=plot_options.check_plot_file,
+    help="Plot the errors and the bound to this file.",
 )
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 def command(
@@ -164,19 +176,19 @@ def command(
     plot: Path | None,
     as_json: bool,
 ) -> None:
-    """Fly a scenario in virtual time, write its log, and print how far off each source was in each phase."""
+    """Fly a scenario in virtual time, write its log, and print the error of each source in each phase."""
     try:
-        chosen = named(scenario, **({} if seed is None else {"seed": seed}))
+        chosen = get_scenario(scenario, **({} if seed is None else {"seed": seed}))
     except ValueError as error:
         raise click.BadParameter(str(error), param_hint="--scenario") from None
-    # the truth goes into the log, for reports
+    # log the truth: reports use it
     flags = {"log.folder": logs, "rates.truth_hz": 10.0, "inertial.independent": True}
-    config = simulated(load(file, flags, pairs=pairs))
-    begun = time.perf_counter()
+    config = simulator_config(load(file, flags, pairs=pairs))
+    started = time.perf_counter()
     settings = config.log
-    log = open_log(
+    log = create_log(
         settings.folder,
-        metadata=metadata(config) | {"scenario": {"name": chosen.name, "seed": str(chosen.seed)}},
+        metadata=run_metadata(config) | {"scenario": {"name": chosen.name, "seed": str(chosen.seed)}},
         start_unix_ns=UNIX_AT_START_NS,
         start_ns=START_NS,
         max_files=settings.maximum_files,
@@ -186,25 +198,30 @@ def command(
     )
     with log, Progress(console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task(f"flying {chosen.name}", total=chosen.duration_s)
-        flown = fly(chosen, config, log, lambda flown_s: progress.update(task, completed=flown_s))
-    seconds = time.perf_counter() - begun
-    rows = scored(flown)
+        flown = fly_scenario(chosen, config, log, lambda flown_s: progress.update(task, completed=flown_s))
+    seconds = time.perf_counter() - started
+    rows = error_table(flown)
     if plot is not None:
         from sitl.loopback_plot import draw
 
-        draw(plot, error_statistics.errors(flown.kept, truth_of(flown.autopilot)), chosen, START_NS)
+        draw(
+            plot,
+            error_statistics.horizontal_errors(flown.records, truth_function(flown.autopilot)),
+            chosen,
+            START_NS,
+        )
     if as_json:
         rate = chosen.duration_s / seconds
         summary = {"log": str(log.path), "seconds": seconds, "times_real_time": rate}
         click.echo(json.dumps({**summary, "phases": [row._asdict() for row in rows]}))
     else:
-        _print(flown, rows, seconds)
+        _print_table(flown, rows, seconds)
         click.echo(f"log: {log.path}")
     if log.trouble is not None:
-        raise SystemExit(f"companion: the log is not whole: {log.trouble}")
+        raise SystemExit(f"companion: the log is incomplete: {log.trouble}")
 
 
-def _print(flown: Flown, rows: list[error_statistics.Row], seconds: float) -> None:
+def _print_table(flown: LoopbackFlight, rows: list[error_statistics.PhaseErrors], seconds: float) -> None:
     scenario = flown.autopilot.scenario
     table = Table(title=f"{scenario.name}: horizontal error, r.m.s. / 95 % [m]")
     for column in ("phase", "min", *error_statistics.SOURCES, "bound", "held"):
@@ -222,20 +239,16 @@ def _print(flown: Flown, rows: list[error_statistics.Row], seconds: float) -> No
         table.add_row(row.phase, f"{row.seconds / 60.0:.1f}", *cells, bound, held)
     Console(width=max(110, Console().width)).print(table)
     click.echo(
-        "bound: r.m.s. over the phase of the guaranteed bound; held: the r.m.s. error is within it"
+        "bound: r.m.s. of the guaranteed bound over the phase; held: the r.m.s. error is within it"
         " (share of instants within it)"
     )
-    told = Counter(type(record).__name__ for record in flown.kept)
+    reported = Counter(type(record).__name__ for record in flown.records)
     rate = scenario.duration_s / seconds
     click.echo(
         f"{scenario.duration_s / 60.0:.1f} min flown in {seconds:.1f} s, {rate:.0f} times real time;"
-        f" {told['Solution']} solutions, {told['Rejection']} rejections, {told['Reset']} resets"
+        f" {reported['Solution']} solutions, {reported['Rejection']} rejections, {reported['Reset']} resets"
     )
-    for record in flown.kept:
+    for record in flown.records:
         if isinstance(record, Event | Reset):
             text = record.text if isinstance(record, Event) else f"{record.what}: {record.reason}"
             click.echo(f"  {(record.t_ns - START_NS) * 1e-9:8.1f} s  {text}")
-
-
-def _m(metres: float) -> str:
-    return f"{metres:.1f}" if metres < 99.95 else f"{metres:.0f}"

@@ -1,6 +1,4 @@
-"""The loopback's picture: errors of every source and the guaranteed bound over the flight, the phases behind
-them.
-"""
+"""Loopback plot: error of every source and the guaranteed bound over the flight, phases shaded."""
 
 from __future__ import annotations
 
@@ -20,8 +18,10 @@ COLOURS = {
 SHADES = {"GNSS+RSBN": "#e5f5e0", "GNSS only": "#deebf7", "RSBN only": "#fee6ce", "neither": "#fde0dd"}
 
 
-def draw(path: Path, found: dict[str, error_statistics.Errors], scenario: Scenario, start_ns: int) -> None:
-    """Draw into `path`; its suffix is the format."""
+def draw(
+    path: Path, found: dict[str, error_statistics.ErrorSeries], scenario: Scenario, start_ns: int
+) -> None:
+    """Write the plot to `path`; the suffix selects the format."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(10.0, 5.2), layout="constrained")

@@ -1,8 +1,7 @@
-"""The simulated autopilot's parameters: the few that decide whether it takes a position from outside, and the
-one by which its simulator switches GNSS.
+"""Parameters of the simulated autopilot: those for external positions, and the one that switches GNSS.
 
-It answers the parameter protocol as its make does, integers cast to a float (ArduPilot) or as their bytes
-(PX4), and of a parameter that it does not have says nothing. They change nothing in the flight.
+The parameter protocol follows the make: integers cast to float (ArduPilot) or sent bytewise (PX4). A request
+for an unknown parameter is not answered. Except for the GNSS switch, parameters do not affect the flight.
 """
 
 from __future__ import annotations
@@ -11,9 +10,9 @@ import struct
 from typing import Any
 
 from companion.link import dialect
+from companion.link.dialect import mavlink
 from companion.link.parameter_client import Encoding, Value, to_value, to_wire
 
-INT8, INT32 = 2, 6
 _ARDUPILOT: dict[str, Value] = {
     "VISO_TYPE": 0,
     "EK3_SRC2_POSXY": 0,
@@ -28,33 +27,37 @@ _ARDUPILOT: dict[str, Value] = {
 }
 _PX4: dict[str, Value] = {"EKF2_AGP0_ID": 0, "EKF2_AGP0_CTRL": 0, "EKF2_EV_CTRL": 0, "SIM_GPS_USED": 10}
 SATELLITES_OF_A_FIX = 4
-#: AUTOPILOT_VERSION.capabilities: COMMAND_INT, MAVLINK2 and the encoding of parameters.
-CAPABILITIES = {"ardupilot": 8 | 8192 | 131072, "px4": 8 | 8192 | 16}
+_COMMON = mavlink.MAV_PROTOCOL_CAPABILITY_COMMAND_INT | mavlink.MAV_PROTOCOL_CAPABILITY_MAVLINK2
+#: AUTOPILOT_VERSION.capabilities by make.
+CAPABILITIES = {
+    "ardupilot": _COMMON | mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_C_CAST,
+    "px4": _COMMON | mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE,
+}
 VERSIONS = {"ardupilot": 4 << 24 | 7 << 16, "px4": 1 << 24 | 17 << 16}
 
 
-class Parameters:
-    """The parameters of an autopilot of this make ("ardupilot" or "px4")."""
+class SimulatedParameters:
+    """Parameter values of an autopilot of this make ("ardupilot" or "px4")."""
 
     def __init__(self, make: str) -> None:
         self.values = dict(_PX4 if make == "px4" else _ARDUPILOT)
         self._encoding: Encoding = "bytewise" if make == "px4" else "cast"
-        self._kind = INT32 if make == "px4" else INT8
+        self._kind = mavlink.MAV_PARAM_TYPE_INT32 if make == "px4" else mavlink.MAV_PARAM_TYPE_INT8
 
     @property
     def gnss_is_on(self) -> bool:
-        """Whether the simulated receiver may have a fix."""
+        """Whether the parameters let the simulated receiver have a fix."""
         used = self.values.get("SIM_GPS_USED")
         return bool(self.values["SIM_GPS1_ENABLE"]) if used is None else used >= SATELLITES_OF_A_FIX
 
     def read(self, message: Any) -> Any:
-        """The answer to a PARAM_REQUEST_READ, None where there is none."""
+        """Answer a PARAM_REQUEST_READ; None for an unknown parameter."""
         names = list(self.values)
         name = names[message.param_index] if 0 <= message.param_index < len(names) else message.param_id
         return self._value(name) if name in self.values else None
 
     def set(self, message: Any) -> Any:
-        """The answer to a PARAM_SET, None where there is none."""
+        """Set a value by PARAM_SET and return the answer; None for an unknown parameter."""
         name = message.param_id
         if name not in self.values:
             return None

@@ -1,7 +1,7 @@
-"""The position that a companion's message means: `wire.encode` and `profiles` read backwards.
+"""Decoder of the companion's position messages: the inverse of `companion.output.encode`.
 
-By every message that carries a position into an estimator, with the accuracy that it states. It knows no
-link, and no time but the sender's.
+Covers every message that carries a position to an estimator, with its stated accuracy. Times are the
+sender's.
 """
 
 from __future__ import annotations
@@ -13,17 +13,19 @@ import numpy as np
 
 from companion.config.profiles import MESSAGES
 from companion.link import dialect
+from companion.link.dialect import mavlink
 from companion.nav.geometry import Geodetic, local_to_geodetic
-from companion.output.encode import GPS_LAG_NS, MAV_CMD_EXTERNAL_POSITION_ESTIMATE
+from companion.output.encode import GPS_LAG_NS
 from companion.records import LocalOrigin
 
-CARRIERS = frozenset(dialect.type_named(name).msgid for name in MESSAGES.values())
-SET_SOURCE = 42007  # MAV_CMD_SET_EKF_SOURCE_SET
+POSITION_MESSAGES = frozenset(dialect.type_named(name).msgid for name in MESSAGES.values())
 
 
-class Said(NamedTuple):
-    """A place, one sigma of it (m, None where none is stated), the sender's time of sending (ns, 0: not told)
-    and how much older the place is.
+class ReportedPosition(NamedTuple):
+    """Position decoded from a message.
+
+    `sigma` is one sigma, m (None: not stated); `stamp_ns` the sender's time of sending, ns (0: not given);
+    `age_ns` the age of the position at sending.
     """
 
     stamp_ns: int
@@ -32,10 +34,10 @@ class Said(NamedTuple):
     age_ns: int = 0
 
 
-def position_of(message: Any, origin: LocalOrigin | None, make: str) -> Said | None:
-    """What a message of `CARRIERS` says to an autopilot of this make, None where it says no position.
+def position_of(message: Any, origin: LocalOrigin | None, make: str) -> ReportedPosition | None:
+    """Decode a message of `POSITION_MESSAGES` as an autopilot of this make would; None without a position.
 
-    Local metres mean nothing before the autopilot's `origin` is known.
+    A local position needs the autopilot's `origin`.
     """
     name = message.get_type()
     if name in ("ODOMETRY", "VISION_POSITION_ESTIMATE"):
@@ -49,23 +51,30 @@ def position_of(message: Any, origin: LocalOrigin | None, make: str) -> Said | N
         odometry = name == "ODOMETRY"
         covariance = message.pose_covariance if odometry else message.covariance
         stamp = message.time_usec if odometry else message.usec
-        return Said(stamp * 1000, place, _sigma(covariance, make))
+        return ReportedPosition(stamp * 1000, place, _sigma(covariance, make))
     if name == "COMMAND_INT":
-        if message.command != MAV_CMD_EXTERNAL_POSITION_ESTIMATE:
+        if message.command != mavlink.MAV_CMD_EXTERNAL_POSITION_ESTIMATE:
             return None
-        # its time of sending is of single precision: its arrival tells more
-        return Said(0, _geodetic(message.x, message.y, 0.0), message.param3, round(message.param2 * 1e9))
+        # the time of sending is a single-precision float: the arrival time is more accurate
+        return ReportedPosition(
+            0, _geodetic(message.x, message.y, 0.0), message.param3, round(message.param2 * 1e9)
+        )
     if name == "GPS_INPUT":
         place = _geodetic(message.lat, message.lon, message.alt)
-        return Said(message.time_usec * 1000, place, message.horiz_accuracy, GPS_LAG_NS)
-    return Said(message.time_usec * 1000, _geodetic(message.lat, message.lon, message.alt), message.eph)
+        return ReportedPosition(message.time_usec * 1000, place, message.horiz_accuracy, GPS_LAG_NS)
+    return ReportedPosition(
+        message.time_usec * 1000, _geodetic(message.lat, message.lon, message.alt), message.eph
+    )
 
 
-def feeds(message: Any) -> bool:
-    """Whether a message would have an effect on an estimator, by its position or by its sources."""
+def affects_estimator(message: Any) -> bool:
+    """Whether a message affects the estimator, by a position or by selecting sources."""
     if message.get_type() in ("COMMAND_INT", "COMMAND_LONG"):
-        return message.command in (MAV_CMD_EXTERNAL_POSITION_ESTIMATE, SET_SOURCE)
-    return dialect.id_of(message) in CARRIERS
+        return message.command in (
+            mavlink.MAV_CMD_EXTERNAL_POSITION_ESTIMATE,
+            mavlink.MAV_CMD_SET_EKF_SOURCE_SET,
+        )
+    return dialect.id_of(message) in POSITION_MESSAGES
 
 
 def _geodetic(lat: int, lon: int, alt: float) -> Geodetic:
@@ -73,7 +82,7 @@ def _geodetic(lat: int, lon: int, alt: float) -> Geodetic:
 
 
 def _sigma(covariance: list[float], make: str) -> float | None:
-    """ArduPilot reads A = cbrt(c0^2 + c6^2 + c11^2) for all axes; others the variances."""
+    """Horizontal sigma, m. ArduPilot uses cbrt(c0^2 + c6^2 + c11^2) for all axes, others the variances."""
     c0, c6, c11 = covariance[0], covariance[6], covariance[11]
     if not all(map(math.isfinite, (c0, c6, c11))):
         return None

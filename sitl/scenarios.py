@@ -1,7 +1,7 @@
-"""Scenarios: what is flown, with which sensors, and what fails when. Values; `sitl.world` plays them.
+"""Simulation scenarios: flight plan, sensors, outages and faults. `sitl.world` simulates them.
 
-`named("default")` is one of the table; `named("default", seed=7)` the same flight with other noise. All
-times are seconds of flight.
+`get_scenario("default")` returns a scenario of the table, `get_scenario("default", seed=7)` the same flight
+with other noise. All times are seconds of flight.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ from typing import Any, Literal, NamedTuple
 
 from sitl.beacon import Beacon
 from sitl.faults import Fault
-from sitl.flight import Leg, Plan, Wind
+from sitl.flight import FlightPlan, Leg, WindChange
 from sitl.sensors import GRADES, AirDataModel, GnssModel
 
-Spans = tuple[tuple[float, float], ...]
+TimeSpans = tuple[tuple[float, float], ...]
 
 
-class Phase(NamedTuple):
-    """A stretch of the flight during which the same sources are on."""
+class SchedulePhase(NamedTuple):
+    """Part of the flight during which the same sources are available."""
 
     name: str
     start_s: float
@@ -30,8 +30,8 @@ class Phase(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Rates:
-    """How often each sensor gives a new value, Hz."""
+class SensorRates:
+    """Update rate of each sensor, Hz."""
 
     imu: float = 50.0
     local_position: float = 10.0
@@ -43,8 +43,8 @@ class Rates:
 
 
 @dataclass(frozen=True, slots=True)
-class Link:
-    """The way from autopilot to companion: latency and the exponential jitter's mean (s)."""
+class LinkDelay:
+    """Delay from autopilot to companion: latency and mean of the exponential jitter, s."""
 
     latency_s: float = 0.004
     jitter_s: float = 0.002
@@ -52,18 +52,18 @@ class Link:
 
 @dataclass(frozen=True, slots=True)
 class Scenario:
-    """One flight with all that happens in it; the seed makes every random number."""
+    """One flight: plan, sensors, outages, faults. The seed determines every random number."""
 
     name: str
-    plan: Plan
+    plan: FlightPlan
     grade: str = "navigation"
     beacons: tuple[Beacon, ...] = ()
-    gnss_outages: Spans = ()
-    rsbn_outages: Spans = ()
+    gnss_outages: TimeSpans = ()
+    rsbn_outages: TimeSpans = ()
     gnss: GnssModel = field(default_factory=GnssModel)
     air: AirDataModel = field(default_factory=AirDataModel)
-    rates: Rates = field(default_factory=Rates)
-    link: Link = field(default_factory=Link)
+    rates: SensorRates = field(default_factory=SensorRates)
+    link: LinkDelay = field(default_factory=LinkDelay)
     faults: tuple[Fault, ...] = ()
     seed: int = 1
     autopilot: Literal["ardupilot", "px4"] = "ardupilot"
@@ -72,30 +72,32 @@ class Scenario:
 
     def __post_init__(self) -> None:
         if self.grade not in GRADES:
-            raise ValueError(f"grade {self.grade!r} is unknown: choose one of {', '.join(GRADES)}")
+            raise ValueError(f"unknown grade {self.grade!r}: choose one of {', '.join(GRADES)}")
         for start, end in (*self.gnss_outages, *self.rsbn_outages):
             if not 0.0 <= start < end:
-                raise ValueError(f"an outage from {start:g} to {end:g} s: let it end after its start")
+                raise ValueError(
+                    f"outage from {start:g} to {end:g} s: it must start at 0 or later and end after its start"
+                )
         if min(dataclasses.astuple(self.rates)) <= 0.0:
-            raise ValueError("a sensor's rate is not positive: give hertz greater than 0")
+            raise ValueError("a sensor rate is not positive: give a rate above 0 Hz")
 
     @property
     def duration_s(self) -> float:
-        """How long the flight lasts, s."""
+        """Duration of the flight, s."""
         return self.plan.duration_s
 
-    def phases(self) -> list[Phase]:
-        """The stretches of the schedule, in order, by which sources are on; names as "GNSS+RSBN", "neither".
+    def phases(self) -> list[SchedulePhase]:
+        """Return the phases of the outage schedule in order, named "GNSS+RSBN", "GNSS only", ..., "neither".
 
-        Neither a beacon's reach nor faults are in it.
+        Beacon range and faults are not considered.
         """
 
-        def on(spans: Spans, t: float) -> bool:
+        def on(spans: TimeSpans, t: float) -> bool:
             return not any(start <= t < end for start, end in spans)
 
         ends = {edge for span in (*self.gnss_outages, *self.rsbn_outages) for edge in span}
         edges = sorted({0.0, self.duration_s} | {edge for edge in ends if edge < self.duration_s})
-        phases: list[Phase] = []
+        phases: list[SchedulePhase] = []
         for start, end in itertools.pairwise(edges):
             gnss, rsbn = on(self.gnss_outages, start), bool(self.beacons) and on(self.rsbn_outages, start)
             name = {(True, True): "GNSS+RSBN", (True, False): "GNSS only", (False, True): "RSBN only"}.get(
@@ -104,11 +106,11 @@ class Scenario:
             if phases and phases[-1].name == name:
                 phases[-1] = phases[-1]._replace(end_s=end)
             else:
-                phases.append(Phase(name, start, end))
+                phases.append(SchedulePhase(name, start, end))
         return phases
 
 
-# About 42 min out to 90 km and some of the way back, at 34 to 42 m/s.
+# about 42 min at 34 to 42 m/s: out to 90 km, then part of the way back
 _LEGS = (
     Leg(20, 40, 0, 0),
     Leg(60, 40, 38, 0),
@@ -119,37 +121,37 @@ _LEGS = (
     Leg(380, 70, 42, 1000),
     Leg(360, 250, 36, 600),
 )
-_BACK = (Leg(540, 215, 40, 800), Leg(540, 240, 40, 600))  # to make it an hour
-_SHORT = (
+_RETURN_LEGS = (Leg(540, 215, 40, 800), Leg(540, 240, 40, 600))  # extends the flight to an hour
+_SHORT_LEGS = (
     Leg(10, 40, 0, 0),
     Leg(50, 40, 38, 0),
     Leg(120, 40, 38, 120),
     Leg(60, 100, 36, 120),
     Leg(60, 30, 38, 120),
 )
-_WINDS = (Wind(0, 4, 5), Wind(1200, 1, 8, 240.0))
-#: 60 km from the start on the right hand, and further on at the left.
-_EAST = Beacon(1, 60.05, 31.07)
-_NORTH = Beacon(2, 60.75, 30.25)
-_PLAN = Plan(_LEGS, winds=_WINDS)
+_WINDS = (WindChange(0, 4, 5), WindChange(1200, 1, 8, 240.0))
+#: East: 60 km from the start, to the right of the path. North: farther on, to the left.
+_EAST_BEACON = Beacon(1, 60.05, 31.07)
+_NORTH_BEACON = Beacon(2, 60.75, 30.25)
+_PLAN = FlightPlan(_LEGS, winds=_WINDS)
 
 DEFAULT = Scenario(
     "default",
     _PLAN,
-    beacons=(_EAST,),
+    beacons=(_EAST_BEACON,),
     gnss_outages=((1500.0, 2220.0),),
     rsbn_outages=((900.0, 1500.0), (1920.0, 2220.0)),
 )
-_SHORT_SCENARIO = Scenario(
+_SHORT_FLIGHT = Scenario(
     "short",
-    Plan(_SHORT, winds=(Wind(0, 4, 5),)),
-    beacons=(_EAST,),
+    FlightPlan(_SHORT_LEGS, winds=(WindChange(0, 4, 5),)),
+    beacons=(_EAST_BEACON,),
     gnss_outages=((180.0, 270.0),),
     rsbn_outages=((120.0, 180.0), (225.0, 270.0)),
 )
 
 
-def _tabled(name: str, **changes: Any) -> Scenario:
+def _default_with(name: str, **changes: Any) -> Scenario:
     return dataclasses.replace(DEFAULT, name=name, **changes)
 
 
@@ -157,27 +159,29 @@ SCENARIOS: dict[str, Scenario] = {
     scenario.name: scenario
     for scenario in (
         DEFAULT,
-        _SHORT_SCENARIO,
-        _tabled("gnss-loss", gnss_outages=((900.0, math.inf),), rsbn_outages=((0.0, math.inf),)),
-        _tabled("hour", plan=dataclasses.replace(_PLAN, legs=(*_LEGS, *_BACK))),
-        _tabled("tactical", grade="tactical"),
-        _tabled("mems", grade="mems"),
-        _tabled("two-beacons", beacons=(_EAST, _NORTH)),
-        _tabled("no-beacon", beacons=(), rsbn_outages=()),
-        _tabled(
+        _SHORT_FLIGHT,
+        _default_with("gnss-loss", gnss_outages=((900.0, math.inf),), rsbn_outages=((0.0, math.inf),)),
+        _default_with("hour", plan=dataclasses.replace(_PLAN, legs=(*_LEGS, *_RETURN_LEGS))),
+        _default_with("tactical", grade="tactical"),
+        _default_with("mems", grade="mems"),
+        _default_with("two-beacons", beacons=(_EAST_BEACON, _NORTH_BEACON)),
+        _default_with("no-beacon", beacons=(), rsbn_outages=()),
+        _default_with(
             "wind-change",
-            # The wind turns by 90 degrees and grows twofold the moment GNSS is lost.
-            plan=dataclasses.replace(_PLAN, winds=(Wind(0, 5, 0), Wind(900, 0, 10, 20.0))),
+            # the wind turns by 90 degrees and doubles when GNSS is lost
+            plan=dataclasses.replace(_PLAN, winds=(WindChange(0, 5, 0), WindChange(900, 0, 10, 20.0))),
             gnss_outages=((900.0, 1500.0),),
             rsbn_outages=((900.0, 1500.0),),
         ),
-        _tabled(
+        _default_with(
             "ten-outages",
             gnss_outages=tuple((300.0 + 210.0 * i, 360.0 + 210.0 * i) for i in range(10)),
             rsbn_outages=tuple((330.0 + 210.0 * i, 360.0 + 210.0 * i) for i in range(10)),
         ),
-        _tabled("spoof", gnss_outages=(), rsbn_outages=(), faults=(Fault("gnss-spoof", 1200.0, 1800.0),)),
-        _tabled(
+        _default_with(
+            "spoof", gnss_outages=(), rsbn_outages=(), faults=(Fault("gnss-spoof", 1200.0, 1800.0),)
+        ),
+        _default_with(
             "hostile",
             faults=(
                 Fault("bit-errors", 300.0, 360.0),
@@ -191,11 +195,14 @@ SCENARIOS: dict[str, Scenario] = {
 }
 
 
-def named(name: str, **changes: Any) -> Scenario:
-    """The scenario of this name, with fields changed. ValueError for an unknown name, naming the nearest."""
+def get_scenario(name: str, **changes: Any) -> Scenario:
+    """Return the scenario of this name, with `changes` to its fields.
+
+    Raises ValueError for an unknown name; the message names the nearest one.
+    """
     scenario = SCENARIOS.get(name)
     if scenario is None:
         near = difflib.get_close_matches(name, SCENARIOS, 1)
         hint = f"did you mean {near[0]}?" if near else f"choose one of {', '.join(SCENARIOS)}"
-        raise ValueError(f"no scenario is called {name!r}: {hint}")
+        raise ValueError(f"unknown scenario {name!r}: {hint}")
     return dataclasses.replace(scenario, **changes)

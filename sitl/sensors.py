@@ -1,11 +1,11 @@
-"""What the sensors of a simulated flight say: INS, GNSS, air data and IMU, as arrays, by seed.
+"""Sensor models of a simulated flight: INS, GNSS, air data and IMU, as arrays.
 
-The INS is not integrated from the IMU: its error obeys the Schuler error equations along the flight, driven
-by gyro and accelerometer errors of its grade, and is added to the truth. Errors are INS minus true. The
-vertical channel is held by the barometer and only wanders.
+The INS is not integrated from the IMU: its error follows the Schuler error equations along the flight, driven
+by gyro and accelerometer errors of its grade, and is added to the truth. Errors are INS minus truth. The
+vertical channel is aided by the barometer and has a bounded random error.
 
-It knows nothing of records, messages, beacons (`sitl.beacon`) or faults. Every function takes the
-generator that makes its noise.
+Records, messages, beacons (`sitl.beacon`) and faults are not handled here. Every function takes the random
+generator of its noise.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ import numpy.typing as npt
 from scipy.signal import lfilter
 
 from companion.nav.earth import OMEGA
-from sitl.flight import Array, Flight, radii, rotation
+from companion.units import Floats
+from sitl.flight import Trajectory, radii, rotation
 
 Generator = np.random.Generator
 
@@ -29,15 +30,18 @@ DEG_H = math.radians(1.0) / 3600.0
 """1 deg/h in rad/s."""
 UG = 1e-6 * G
 """1 micro-g in m/s^2."""
-_STEP_S = 0.5  # the INS error is integrated at 2 Hz: a turn lasts 20 s and more
+_STEP_S = 0.5  # the INS error is integrated at 2 Hz: turns last at least 20 s
 RHO_0, P_0, T_0 = 1.225, 101325.0, 288.15
 """International standard atmosphere at sea level: kg/m^3, Pa, K."""
 
 
 @dataclass(frozen=True, slots=True)
-class Grade:
-    """An inertial grade, one sigma each. Biases are what is left after alignment and calibration in flight;
-    half of their variance is constant, half wanders with the correlation time."""
+class InertialGrade:
+    """Inertial grade, one sigma each.
+
+    Biases are the residuals after alignment and calibration in flight: half of the variance is constant, half
+    is a Gauss-Markov process with the correlation time.
+    """
 
     name: str
     gyro_bias_deg_h: float
@@ -50,41 +54,43 @@ class Grade:
     heading_deg: float
 
 
-# Figures within the classes of Groves (2013), tables 4.1 and section 4.4 (aviation, intermediate, tactical).
+# values within the classes of Groves (2013), table 4.1 and section 4.4 (aviation, intermediate, tactical)
 GRADES = {
-    # A ring laser gyro INS of 1 nautical mile an hour (0.01 deg/h, 50 micro-g).
-    "navigation": Grade("navigation", 0.01, 0.002, 50.0, 20.0, 3600.0, 0.1, 10.0, 0.05),
-    # A fibre-optic gyro unit of 1 deg/h, calibrated in flight to a tenth of that.
-    "tactical": Grade("tactical", 0.1, 0.07, 200.0, 100.0, 1800.0, 0.2, 40.0, 0.2),
-    # A good MEMS unit (bias instability 0.5 deg/h and 0.05 mg), calibrated in flight, temperature wandering.
-    "mems": Grade("mems", 1.0, 0.15, 500.0, 120.0, 600.0, 0.4, 120.0, 1.0),
+    # ring laser gyro INS, 1 nautical mile per hour (0.01 deg/h, 50 micro-g)
+    "navigation": InertialGrade("navigation", 0.01, 0.002, 50.0, 20.0, 3600.0, 0.1, 10.0, 0.05),
+    # fibre-optic gyro unit, 1 deg/h, calibrated in flight to 0.1 deg/h
+    "tactical": InertialGrade("tactical", 0.1, 0.07, 200.0, 100.0, 1800.0, 0.2, 40.0, 0.2),
+    # good MEMS unit (bias instability 0.5 deg/h and 0.05 mg), calibrated in flight, with temperature drift
+    "mems": InertialGrade("mems", 1.0, 0.15, 500.0, 120.0, 600.0, 0.4, 120.0, 1.0),
 }
 
 
 class InertialError(NamedTuple):
-    """INS minus true: position and velocity NED (n, 3) in m and m/s, misalignment `psi` (n, 3) in rad
-    (the P of the error equations: minus the rotation of the platform, so the heading error is +psi_z)."""
+    """INS minus truth: position and velocity NED (n, 3) in m and m/s, misalignment `psi` (n, 3) in rad.
 
-    t: Array
-    x_n: Array
-    v_n: Array
-    psi: Array
+    `psi` is P of the error equations: minus the rotation of the platform, so the heading error is +psi_z.
+    """
+
+    t: Floats
+    x_n: Floats
+    v_n: Floats
+    psi: Floats
 
 
 class GnssFixes(NamedTuple):
-    """Fixes: errors are inside; `usable` False where the receiver has none. Geodetic, ellipsoidal height."""
+    """GNSS fixes with errors; `usable` is False without a fix. Geodetic, ellipsoidal height."""
 
-    t: Array
-    lat: Array
-    lon: Array
-    alt: Array
-    v_n: Array
+    t: Floats
+    lat: Floats
+    lon: Floats
+    alt: Floats
+    v_n: Floats
     usable: npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True)
 class GnssModel:
-    """A receiver: correlated (first-order Gauss-Markov) and white error, one sigma per axis, m and m/s."""
+    """GNSS receiver: correlated (first-order Gauss-Markov) and white error, one sigma per axis, m and m/s."""
 
     correlated_m: float = 1.5
     correlation_s: float = 60.0
@@ -94,13 +100,13 @@ class GnssModel:
 
     @property
     def sigma_horizontal(self) -> float:
-        """One sigma of north and of east, as the receiver states it, m."""
+        """Stated one sigma per horizontal axis, m."""
         return math.hypot(self.correlated_m, self.white_m)
 
 
 @dataclass(frozen=True, slots=True)
 class AirDataModel:
-    """A pitot-static system: scale-factor and white error of airspeed, turbulence along the flight path."""
+    """Pitot-static system: scale-factor and white error of airspeed, turbulence along the flight path."""
 
     scale: float = 0.01
     noise_m_s: float = 0.15
@@ -111,31 +117,31 @@ class AirDataModel:
 
 
 class AirReadings(NamedTuple):
-    """True and equivalent airspeed as measured (m/s), static and impact pressure (Pa), temperature (K)."""
+    """Measured true and equivalent airspeed (m/s), static and impact pressure (Pa), temperature (K)."""
 
-    t: Array
-    true_airspeed: Array
-    equivalent_airspeed: Array
-    static: Array
-    impact: Array
-    temperature: Array
+    t: Floats
+    true_airspeed: Floats
+    equivalent_airspeed: Floats
+    static: Floats
+    impact: Floats
+    temperature: Floats
 
 
-def gauss_markov(n: int, dt: float, correlation_s: float, rng: Generator, columns: int = 1) -> Array:
-    """A stationary first-order Gauss-Markov process of unit variance, (n, columns)."""
+def gauss_markov(n: int, dt: float, correlation_s: float, rng: Generator, columns: int = 1) -> Floats:
+    """Sample a stationary first-order Gauss-Markov process of unit variance, (n, columns)."""
     phi = math.exp(-dt / correlation_s)
     white = rng.standard_normal((n, columns))
     white[1:] *= math.sqrt(1.0 - phi * phi)
-    out: Array = lfilter([1.0], [1.0, -phi], white, axis=0)
+    out: Floats = lfilter([1.0], [1.0, -phi], white, axis=0)
     return out
 
 
-def error_rates(flight: Flight) -> Array:
-    """A(t) (n, 7, 7) of dx, dy [m], dVN, dVE [m/s], PX, PY, PZ [rad] along the flight, continuous.
+def error_rates(flight: Trajectory) -> Floats:
+    """Return A(t) (n, 7, 7) of dx, dy [m], dVN, dVE [m/s], PX, PY, PZ [rad] along the flight.
 
-    The equations of Poddubny's INS error model, complete to first order for aircraft, with the manoeuvres'
-    own specific force; x north, y east, dx = R dphi, dy = R cos(phi) dlam. `companion.nav.error_model`
-    has them one moment at a time; the two are tested against each other.
+    Poddubny's INS error model, complete to first order for aircraft, with the specific force of manoeuvres;
+    x north, y east, dx = R dphi, dy = R cos(phi) dlam. `companion.nav.error_model` has the same equations for
+    one instant; the tests compare the two.
     """
     VN, VE, _ = flight.v_n.T
     s, c = np.sin(flight.lat), np.cos(flight.lat)
@@ -159,10 +165,10 @@ def error_rates(flight: Flight) -> Array:
     return a
 
 
-def propagate(flight: Flight, initial: Array, drive: Array) -> Array:
-    """The states (n, 7) of x' = A(t) x + drive(t) from `initial` (7,) on, at the flight's equal steps.
+def propagate(flight: Trajectory, initial: Floats, drive: Floats) -> Floats:
+    """Integrate x' = A(t) x + drive(t) from `initial` (7,) over the flight's equal steps; states (n, 7).
 
-    Second order by the midpoint: I + M + M^2/2 + M^3/6 with M the mean of A over a step.
+    Second order (midpoint): I + M + M^2/2 + M^3/6 with M the mean of A over a step.
     """
     dt = float(flight.t[1] - flight.t[0])
     a = error_rates(flight)
@@ -179,17 +185,17 @@ def propagate(flight: Flight, initial: Array, drive: Array) -> Array:
     return states
 
 
-def inertial_error(flight: Flight, grade: Grade, rng: Generator) -> InertialError:
-    """The error of an INS of this grade, strapped to the body, along the flight (at 2 Hz)."""
+def simulate_inertial_error(flight: Trajectory, grade: InertialGrade, rng: Generator) -> InertialError:
+    """Simulate the error of a strapdown INS of this grade along the flight, at 2 Hz."""
     coarse = flight.at(np.arange(flight.t[0], flight.t[-1] + 2.0 * _STEP_S, _STEP_S))
     n = len(coarse.t)
     C_nb = rotation(coarse.attitude)
 
-    def bias(sigma: float) -> Array:
+    def bias(sigma: float) -> Floats:
         wander = gauss_markov(n, _STEP_S, grade.correlation_s, rng, 3)
         constant = rng.standard_normal(3)
         body = sigma * math.sqrt(0.5) * (wander + constant)
-        out: Array = np.einsum("nij,nj->ni", C_nb, body)
+        out: Floats = np.einsum("nij,nj->ni", C_nb, body)
         return out
 
     gyro_n = bias(grade.gyro_bias_deg_h * DEG_H)
@@ -204,46 +210,46 @@ def inertial_error(flight: Flight, grade: Grade, rng: Generator) -> InertialErro
 
     initial = np.zeros(7)
     initial[2:4] = grade.velocity_m_s * rng.standard_normal(2)
-    # A levelled platform has the tilt that hides its accelerometer's bias, and a little more.
+    # levelling leaves the tilt that cancels the accelerometer bias, plus the stated tilt error
     level = np.array([-accelerometer_n[0, 1], accelerometer_n[0, 0]]) / G
     initial[4:6] = level + math.radians(grade.tilt_arcsec / 3600.0) * rng.standard_normal(2)
     initial[6] = math.radians(grade.heading_deg) * rng.standard_normal()
     states = propagate(coarse, initial, drive)
 
     down = 3.0 * gauss_markov(n, _STEP_S, 300.0, rng)[:, 0]
-    down = lfilter([0.05], [1.0, -0.95], down - down[0])  # smooth: its slope is the velocity error
+    down = lfilter([0.05], [1.0, -0.95], down - down[0])  # smoothed: its derivative is the velocity error
     x_n = np.stack([states[:, 0], states[:, 1], down], axis=1)
     v_n = np.stack([states[:, 2], states[:, 3], np.gradient(down, _STEP_S)], axis=1)
     return InertialError(coarse.t, x_n, v_n, states[:, 4:7])
 
 
-def error_at(error: InertialError, t: Array) -> InertialError:
-    """The error at times `t`, linear between its samples."""
+def interpolate_error(error: InertialError, t: Floats) -> InertialError:
+    """Interpolate the error linearly at times `t`."""
 
-    def columns(a: Array) -> Array:
+    def columns(a: Floats) -> Floats:
         return np.stack([np.interp(t, error.t, a[:, i]) for i in range(3)], axis=1)
 
     return InertialError(t, columns(error.x_n), columns(error.v_n), columns(error.psi))
 
 
-def displaced(flight: Flight, x_n: Array) -> tuple[Array, Array, Array]:
-    """Latitude, longitude, height of positions `x_n` (n, 3) NED metres away from the true ones."""
+def displace_positions(flight: Trajectory, x_n: Floats) -> tuple[Floats, Floats, Floats]:
+    """Return latitude, longitude, height of the true positions displaced by `x_n` (n, 3) m NED."""
     R_N, R_E = radii(flight.lat)
     lat = flight.lat + x_n[:, 0] / (R_N + flight.alt)
     lon = flight.lon + x_n[:, 1] / ((R_E + flight.alt) * np.cos(flight.lat))
     return lat, lon, flight.alt - x_n[:, 2]
 
 
-def gnss(
-    flight: Flight, model: GnssModel, outages: tuple[tuple[float, float], ...], rng: Generator
+def simulate_gnss(
+    flight: Trajectory, model: GnssModel, outages: tuple[tuple[float, float], ...], rng: Generator
 ) -> GnssFixes:
-    """Fixes at the times of `flight`, none inside the outages (start, end in s)."""
+    """Simulate fixes at the times of `flight`; unusable inside the outages (start, end in s)."""
     n = len(flight.t)
     dt = float(flight.t[1] - flight.t[0])
     error_n = model.correlated_m * gauss_markov(n, dt, model.correlation_s, rng, 3)
     error_n += model.white_m * rng.standard_normal((n, 3))
     error_n[:, 2] *= model.vertical_ratio
-    lat, lon, alt = displaced(flight, error_n)
+    lat, lon, alt = displace_positions(flight, error_n)
     usable = np.ones(n, dtype=np.bool_)
     for start, end in outages:
         usable &= (flight.t < start) | (flight.t >= end)
@@ -251,9 +257,11 @@ def gnss(
     return GnssFixes(flight.t, lat, lon, alt, v_n, usable)
 
 
-def air_data(flight: Flight, model: AirDataModel, rng: Generator) -> AirReadings:
-    """Airspeed with Dryden's longitudinal turbulence (MIL-F-8785C: first order, time V/L) and pressures
-    of the standard atmosphere."""
+def simulate_air_data(flight: Trajectory, model: AirDataModel, rng: Generator) -> AirReadings:
+    """Simulate airspeed with Dryden's longitudinal turbulence, and pressures of the standard atmosphere.
+
+    Turbulence after MIL-F-8785C: first order, correlation time L/V.
+    """
     n = len(flight.t)
     dt = float(flight.t[1] - flight.t[0])
     speed = float(np.mean(flight.airspeed)) or 1.0
@@ -270,8 +278,8 @@ def air_data(flight: Flight, model: AirDataModel, rng: Generator) -> AirReadings
     return AirReadings(flight.t, true_airspeed, equivalent, static + noise, impact, temperature)
 
 
-def imu(flight: Flight, grade: Grade, rng: Generator) -> tuple[Array, Array]:
-    """Specific force and angular rate (n, 3) with the grade's constant biases and white noise."""
+def simulate_imu(flight: Trajectory, grade: InertialGrade, rng: Generator) -> tuple[Floats, Floats]:
+    """Simulate specific force and angular rate (n, 3) with the grade's constant biases and white noise."""
     dt = float(flight.t[1] - flight.t[0])
     arw = math.radians(grade.angle_random_walk_deg_sqrt_h) / 60.0 / math.sqrt(dt)
     vrw = grade.velocity_random_walk_ug_sqrt_hz * UG / math.sqrt(dt)

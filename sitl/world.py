@@ -1,7 +1,7 @@
-"""A scenario played out: every record its sensors will ever say, in flight time, and the truth to score by.
+"""Simulated world of a scenario: the true trajectory and all sensor records, in flight time.
 
-`t_ns` is the flight's time, `rx_ns` when the record is there for the autopilot to send. It knows nothing of
-messages, rates asked for, links and the companion's clock: `sitl.autopilot` does.
+`t_ns` is the flight time, `rx_ns` the time at which the autopilot can send the record. Messages, requested
+rates, links and the companion's clock belong to `sitl.autopilot`.
 """
 
 from __future__ import annotations
@@ -13,29 +13,32 @@ import numpy as np
 
 from companion.nav.geometry import Geodetic, geodetic_to_local
 from companion.records import AirData, Attitude, Gnss, Imu, LocalPosition, Pressure, RsbnFix, Stamped, Truth
+from companion.units import Floats
 from sitl import beacon, sensors
-from sitl.faults import spoil
-from sitl.flight import Array, Flight, fly
+from sitl.faults import apply_record_faults
+from sitl.flight import Trajectory, fly_plan
 from sitl.scenarios import Scenario
 
 _TURN = 2.0 * np.pi
 
 
 class World:
-    """The flight of a scenario and the streams of its sensors, each in order of arrival.
+    """Trajectory of a scenario and the record streams of its sensors, each in order of arrival.
 
     `origin` is the autopilot's local origin: the start, geodetic.
     """
 
     def __init__(self, scenario: Scenario) -> None:
         self.scenario = scenario
-        self.flight = fly(scenario.plan)
+        self.flight = fly_plan(scenario.plan)
         start = self.flight
         self.origin = Geodetic(float(start.lat[0]), float(start.lon[0]), float(start.alt[0]))
-        # Each sensor has a generator of its own, so that none changes another's noise.
+        # one generator per sensor: no sensor changes the noise of another
         seeds = np.random.SeedSequence(scenario.seed).spawn(5 + len(scenario.beacons))
         ins, gnss, air, imu, faults, *beacons = (np.random.default_rng(seed) for seed in seeds)
-        self.error = sensors.inertial_error(self.flight, sensors.GRADES[scenario.grade], ins)
+        self.inertial_error = sensors.simulate_inertial_error(
+            self.flight, sensors.GRADES[scenario.grade], ins
+        )
         self.streams: dict[type[Stamped], Sequence[Stamped]] = {
             Imu: self._imu(imu),
             LocalPosition: self._local_position(),
@@ -47,7 +50,7 @@ class World:
                 (
                     fix
                     for ground, rng in zip(scenario.beacons, beacons)
-                    for fix in beacon.answers(
+                    for fix in beacon.simulate_answers(
                         ground, self._sampled(scenario.rates.rsbn), rng, scenario.rsbn_outages
                     )
                 ),
@@ -55,26 +58,26 @@ class World:
             ),
         }
         for kind, stream in self.streams.items():
-            self.streams[kind] = spoil(kind, stream, scenario.faults, faults)
+            self.streams[kind] = apply_record_faults(kind, stream, scenario.faults, faults)
 
-    def truth_at(self, t: Array) -> Flight:
-        """The truth at flight times `t` (s)."""
+    def truth_at(self, t: Floats) -> Trajectory:
+        """Return the truth at flight times `t` (s)."""
         return self.flight.at(t)
 
-    def _sampled(self, rate_hz: float) -> Flight:
+    def _sampled(self, rate_hz: float) -> Trajectory:
         count = int(self.scenario.duration_s * rate_hz * (1.0 + 1e-12)) + 1
         return self.flight.at(np.arange(count) / rate_hz)
 
     def _imu(self, rng: np.random.Generator) -> list[Imu]:
         flight = self._sampled(self.scenario.rates.imu)
-        f_b, w_b = sensors.imu(flight, sensors.GRADES[self.scenario.grade], rng)
+        f_b, w_b = sensors.simulate_imu(flight, sensors.GRADES[self.scenario.grade], rng)
         rows = zip(_ns(flight.t), f_b.tolist(), w_b.tolist())
         return [Imu(t, t, 0, tuple(f), tuple(w)) for t, f, w in rows]
 
     def _local_position(self) -> list[LocalPosition]:
         flight = self._sampled(self.scenario.rates.local_position)
-        error = sensors.error_at(self.error, flight.t)
-        places = np.stack(sensors.displaced(flight, error.x_n), axis=1).tolist()
+        error = sensors.interpolate_error(self.inertial_error, flight.t)
+        places = np.stack(sensors.displace_positions(flight, error.x_n), axis=1).tolist()
         projection: Literal["px4", "ardupilot"] = "px4" if self.scenario.autopilot == "px4" else "ardupilot"
         x_n = [geodetic_to_local(projection, self.origin, Geodetic(*place)) for place in places]
         v_n = (flight.v_n + error.v_n).tolist()
@@ -82,8 +85,8 @@ class World:
 
     def _attitude(self) -> list[Attitude]:
         flight = self._sampled(self.scenario.rates.attitude)
-        psi = sensors.error_at(self.error, flight.t).psi
-        # The platform is turned by -psi: its tilts along the hull are the errors of roll, pitch.
+        psi = sensors.interpolate_error(self.inertial_error, flight.t).psi
+        # the platform is rotated by -psi: its tilts along the body axes are the roll and pitch errors
         s, c = np.sin(flight.attitude[:, 2]), np.cos(flight.attitude[:, 2])
         along, across = c * psi[:, 0] + s * psi[:, 1], c * psi[:, 1] - s * psi[:, 0]
         attitude = flight.attitude + np.stack([along, across, psi[:, 2]], axis=1)
@@ -95,7 +98,7 @@ class World:
 
     def _gnss(self, rng: np.random.Generator) -> list[Gnss]:
         model, scenario = self.scenario.gnss, self.scenario
-        fixes = sensors.gnss(self._sampled(scenario.rates.gnss), model, scenario.gnss_outages, rng)
+        fixes = sensors.simulate_gnss(self._sampled(scenario.rates.gnss), model, scenario.gnss_outages, rng)
         stamp_offset = round(scenario.boot_before_s * 1e6)
         stream = []
         last = (self.origin.lat, self.origin.lon, self.origin.alt)
@@ -126,8 +129,8 @@ class World:
 
     def _air(self, rng: np.random.Generator) -> dict[type[Stamped], Sequence[Stamped]]:
         flight = self._sampled(self.scenario.rates.air)
-        air = sensors.air_data(flight, self.scenario.air, rng)
-        v_n = flight.v_n + sensors.error_at(self.error, flight.t).v_n
+        air = sensors.simulate_air_data(flight, self.scenario.air, rng)
+        v_n = flight.v_n + sensors.interpolate_error(self.inertial_error, flight.t).v_n
         speeds = np.stack(
             [air.equivalent_airspeed, np.hypot(v_n[:, 0], v_n[:, 1]), -v_n[:, 2]], axis=1
         ).tolist()
@@ -153,6 +156,6 @@ class World:
         ]
 
 
-def _ns(t: Array) -> list[int]:
+def _ns(t: Floats) -> list[int]:
     out: list[int] = np.rint(t * 1e9).astype(np.int64).tolist()
     return out

@@ -1,4 +1,4 @@
-"""The command line as a person or a program meets it: what it lists, what it prints, how it ends."""
+"""Command line: help, output and exit codes."""
 
 import json
 import subprocess
@@ -28,18 +28,18 @@ def test_help_lists_every_command() -> None:
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_every_command_explains_itself(name: str) -> None:
+def test_every_command_has_help(name: str) -> None:
     done = CliRunner().invoke(cli, [name, "--help"])
     assert done.exit_code == 0
     assert len(done.output) > 100
 
 
-def test_the_version_is_told() -> None:
+def test_version_is_printed() -> None:
     assert __version__ in CliRunner().invoke(cli, ["--version"]).output
 
 
 @pytest.mark.parametrize(
-    ("text", "words"),
+    ("text", "expected"),
     [
         ("[predictor]\nwindow_mn = 3\n", ("window_mn", "window_min")),
         ("[predicter]\n", ("predicter", "predictor")),
@@ -48,8 +48,8 @@ def test_the_version_is_told() -> None:
     ],
 )
 @pytest.mark.parametrize("command", [["check-config"], ["run", "--config"], ["loopback", "--config"]])
-def test_a_mistake_in_the_configuration_exits_78_with_one_sentence(
-    tmp_path: Path, command: list[str], text: str, words: tuple[str, ...]
+def test_configuration_mistake_exits_78_with_one_sentence(
+    tmp_path: Path, command: list[str], text: str, expected: tuple[str, ...]
 ) -> None:
     file = tmp_path / "mine.toml"
     file.write_text(text)
@@ -58,11 +58,11 @@ def test_a_mistake_in_the_configuration_exits_78_with_one_sentence(
     done = companion(*command, file)
     assert done.returncode == 78
     assert len(done.stderr.splitlines()) == 1
-    for word in (str(file), *words):
+    for word in (str(file), *expected):
         assert word in done.stderr
 
 
-def test_json_is_json(tmp_path: Path) -> None:
+def test_json_output_is_valid(tmp_path: Path) -> None:
     config = CliRunner().invoke(cli, ["check-config", "--json"])
     assert json.loads(config.stdout)["gnss"]
     replay = CliRunner().invoke(cli, ["replay", str(CUT), "-o", str(tmp_path / "out.mcap"), "--json"])
@@ -71,21 +71,21 @@ def test_json_is_json(tmp_path: Path) -> None:
     assert json.loads(info.stdout)
 
 
-def test_the_defaults_printed_are_a_configuration(tmp_path: Path) -> None:
+def test_printed_defaults_are_a_valid_configuration(tmp_path: Path) -> None:
     file = tmp_path / "defaults.toml"
     file.write_text(CliRunner().invoke(cli, ["check-config", "--defaults"]).stdout)
     assert CliRunner().invoke(cli, ["check-config", str(file)]).exit_code == 0
 
 
 @pytest.mark.parametrize("command", ["sitl", "loopback"])
-def test_an_unknown_scenario_names_the_nearest(command: str) -> None:
+def test_unknown_scenario_suggests_the_nearest(command: str) -> None:
     done = CliRunner().invoke(cli, [command, "--scenario", "defualt"])
     assert done.exit_code == 2
     assert "did you mean default?" in done.output
 
 
 @pytest.mark.parametrize("name", ["nothing.mcap", "nothing.tlog", "nothing.pdf"])
-def test_a_log_that_is_not_there_gets_one_sentence(tmp_path: Path, name: str) -> None:
+def test_missing_log_is_reported_in_one_sentence(tmp_path: Path, name: str) -> None:
     done = companion("replay", tmp_path / name)
     assert done.returncode == 1
     assert len(done.stderr.splitlines()) == 1 and name in done.stderr
@@ -96,7 +96,7 @@ def test_a_log_that_is_not_there_gets_one_sentence(tmp_path: Path, name: str) ->
 @pytest.mark.parametrize(
     "command", [["--help"], ["check-config"], ["study", "horizon", "--ahead-min", "1,2"]]
 )
-def test_an_output_that_takes_no_more_is_one_sentence(command: list[str]) -> None:
+def test_full_output_device_is_reported_in_one_sentence(command: list[str]) -> None:
     with open("/dev/full", "w") as full:
         done = subprocess.run(
             [sys.executable, "-m", "companion", *command], stdout=full, stderr=subprocess.PIPE, text=True

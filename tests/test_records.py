@@ -1,4 +1,4 @@
-"""Records survive JSON bit for bit: what replay rests on."""
+"""Records: JSON preserves them bit for bit, as replay requires."""
 
 from __future__ import annotations
 
@@ -11,23 +11,23 @@ from companion import records
 
 @given(st.floats(allow_nan=False, allow_infinity=False), st.integers(0, 2**62))
 @settings(deadline=None)
-def test_every_double_and_time_comes_back_the_same(value: float, t_ns: int) -> None:
+def test_doubles_and_times_survive_json(value: float, t_ns: int) -> None:
     record = records.RsbnFix(t_ns, t_ns + 1, 7, value, -value, value, None, value, value, value)
     assert records.decode("RsbnFix", records.encode(record)) == record
 
 
-def test_every_kind_is_known_by_name_and_immutable() -> None:
+def test_every_record_type_is_registered_and_frozen() -> None:
     for name, kind in records.BY_NAME.items():
         assert kind.__struct_config__.frozen, name
         assert kind.__struct_config__.tag == name
 
 
-def test_truth_is_no_input() -> None:
+def test_truth_is_not_an_input() -> None:
     assert records.Truth not in records.INPUTS
     assert not issubclass(records.Truth, records.INPUTS)
 
 
-def test_a_record_of_another_kind_is_refused() -> None:
+def test_record_of_another_type_is_rejected() -> None:
     data = records.encode(records.Event(1, 1, 6, "hello"))
     try:
         records.decode("Reset", data)

@@ -1,7 +1,6 @@
-"""What became of a flight in numbers: errors against the best track there is, and whether they fit sigmas.
+"""Assessment of a flight: errors against the best available reference, and their consistency with sigmas.
 
-Arrays in (`gather`), arrays and rows out; the words are `verdict`'s and the pictures `figures`'. Errors are
-estimate minus reference, horizontal, metres.
+Errors are estimate minus reference, horizontal, metres.
 """
 
 from __future__ import annotations
@@ -15,21 +14,22 @@ import numpy.typing as npt
 from scipy.special import gammaincinv
 
 from companion.analysis import error_statistics, flight_events
-from companion.analysis.flight_arrays import Flight, Floats, Table, Told
-from companion.analysis.flight_events import Group, Outage, Rate, usable_gnss
-from companion.analysis.replay import CONFIGURATION
-from companion.analysis.smoothing import joined, smooth_flight
+from companion.analysis.flight_arrays import Flight, Table, TimelineEntry
+from companion.analysis.flight_events import MessageRate, OutageInterval, RejectionGroup, usable_gnss
+from companion.analysis.smoothing import join_runs, smooth_flight
 from companion.config import Config, parse
 from companion.nav.earth import radii
 from companion.nav.geometry import Geodetic
+from companion.storage.run_metadata import CONFIGURATION
+from companion.units import Floats
 
-REACH_S = 2.0  # a reference is not carried across a longer hole
+REACH_S = 2.0  # no interpolation of the reference across a longer gap
 
 TRUTH, SMOOTHED, GNSS = "the simulator's truth", "the smoothed track", "GNSS itself"
 
 
-class Reference(NamedTuple):
-    """What errors are counted from: `what` it is, and a track, t (s), lat, lon (rad), alt (m), all (n,)."""
+class ReferenceTrack(NamedTuple):
+    """Track that errors are measured against: its name `what`, t (s), lat, lon (rad), alt (m), all (n,)."""
 
     what: str
     t: Floats
@@ -38,77 +38,77 @@ class Reference(NamedTuple):
     alt: Floats
 
 
-class Misfit(NamedTuple):
-    """Squared errors by their covariance: times (s), values (n,), degrees of freedom (n,) and what it is."""
+class NormalizedErrors(NamedTuple):
+    """Squared errors normalized by their covariance: name, times (s), values, degrees of freedom, (n,)."""
 
     what: str
     t: Floats
     value: Floats
-    freedom: Floats
+    degrees_of_freedom: Floats
 
     @property
     def inside(self) -> float:
-        """The share below the 95 % quantile of chi-square."""
-        return float(np.mean(self.value <= chi2_95(self.freedom)))
+        """Share of the values below the 95 % quantile of chi-square."""
+        return float(np.mean(self.value <= chi2_95(self.degrees_of_freedom)))
 
     @property
     def mean(self) -> float:
-        """Of the values over their degrees of freedom: about 1 where sigmas are right."""
-        return float(np.mean(self.value / self.freedom))
+        """Mean of value / degrees of freedom: about 1 if the sigmas are correct."""
+        return float(np.mean(self.value / self.degrees_of_freedom))
 
 
-def chi2_95(freedom: Floats) -> Floats:
-    """The 95 % quantile of chi-square."""
-    return np.asarray(2.0 * gammaincinv(0.5 * freedom, 0.95), dtype=np.float64)
+def chi2_95(degrees_of_freedom: Floats) -> Floats:
+    """Return the 95 % quantile of chi-square."""
+    return np.asarray(2.0 * gammaincinv(0.5 * degrees_of_freedom, 0.95), dtype=np.float64)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Assessment:
-    """All numbers of a report on one flight; `errors` by source as in `score`, times there ns since t = 0."""
+    """All numbers of a report on one flight; `errors` by source, times in ns since t = 0."""
 
     flight: Flight
     origin: tuple[float, float]
-    reference: Reference | None
-    phases: list[error_statistics.Phase]
-    rows: list[error_statistics.Row]
-    errors: dict[str, error_statistics.Errors]
+    reference: ReferenceTrack | None
+    phases: list[error_statistics.FlightPhase]
+    rows: list[error_statistics.PhaseErrors]
+    errors: dict[str, error_statistics.ErrorSeries]
     ins_error: dict[str, Floats]
-    misfits: list[Misfit]
-    groups: list[Group]
-    outages: list[Outage]
-    rates: list[Rate]
-    timeline: list[Told]
+    normalized_errors: list[NormalizedErrors]
+    groups: list[RejectionGroup]
+    outages: list[OutageInterval]
+    rates: list[MessageRate]
+    timeline: list[TimelineEntry]
 
     def north_east(self, lat: Floats, lon: Floats) -> tuple[Floats, Floats]:
-        """A local plane at the flight's first position, m; for maps."""
+        """Convert to a local plane at the first position of the flight, m; for maps."""
         R_N, R_E = radii(self.origin[0])
         lat_0, lon_0 = self.origin
-        return (lat - lat_0) * R_N, _wrapped(lon - lon_0) * R_E * math.cos(lat_0)
+        return (lat - lat_0) * R_N, _wrap(lon - lon_0) * R_E * math.cos(lat_0)
 
 
-def assess(flight: Flight) -> Assessment:
-    """Everything there is to say of `flight` in numbers."""
-    reference = _reference(flight)
-    phases = flight_events.phases(flight.tables["Solution"], flight.seconds)
-    errors = {} if reference is None else _errors(flight, reference)
-    groups = flight_events.groups(flight)
-    outages = flight_events.outages(flight)
+def assess_flight(flight: Flight) -> Assessment:
+    """Compute all numbers of the report on `flight`."""
+    reference = _select_reference(flight)
+    phases = flight_events.split_phases(flight.tables["Solution"], flight.seconds)
+    errors = {} if reference is None else _source_errors(flight, reference)
+    groups = flight_events.group_rejections(flight)
+    outages = flight_events.find_gnss_outages(flight)
     return Assessment(
         flight=flight,
         origin=_origin(flight),
         reference=reference,
         phases=phases,
-        rows=error_statistics.table(errors, phases),
+        rows=error_statistics.summarize_phases(errors, phases),
         errors=errors,
         ins_error=_ins_error(flight, reference),
-        misfits=_misfits(flight, reference),
+        normalized_errors=_normalized_errors(flight, reference),
         groups=groups,
         outages=outages,
         rates=[
-            flight_events.rate(topic, stream, flight_events.latency(flight, topic)[1])
+            flight_events.message_rate(topic, stream, flight_events.message_latency(flight, topic)[1])
             for topic, stream in flight.streams.items()
         ],
-        timeline=flight_events.timeline(flight, groups, outages),
+        timeline=flight_events.build_timeline(flight, groups, outages),
     )
 
 
@@ -119,75 +119,75 @@ def _origin(flight: Flight) -> tuple[float, float]:
     return 0.0, 0.0
 
 
-# -- against what ----------------------------------------------------------------------------------------
+# -- reference and errors --------------------------------------------------------------------------------
 
 
-def _reference(flight: Flight) -> Reference | None:
-    """Truth where the log has it, else the track smoothed with all fixes, else GNSS, else nothing."""
+def _select_reference(flight: Flight) -> ReferenceTrack | None:
+    """Return the truth if logged, else the track smoothed with all fixes, else GNSS, else None."""
     truth, gnss = flight.tables["Truth"], usable_gnss(flight)
     if len(truth["t"]) > 1:
-        return _ordered(TRUTH, truth["t"], truth["lat"], truth["lon"], truth["alt"])
+        return _track_from(TRUTH, truth["t"], truth["lat"], truth["lon"], truth["alt"])
     try:
-        runs = smooth_flight(flight.heard, configuration(flight))
+        runs = smooth_flight(flight.smoother_inputs, configuration(flight))
     except ValueError:
         if len(gnss["t"]) > 1:
-            return _ordered(GNSS, gnss["t"], gnss["lat"], gnss["lon"], gnss["alt"])
+            return _track_from(GNSS, gnss["t"], gnss["lat"], gnss["lon"], gnss["alt"])
         return None
-    t_ns, lat, lon, alt = joined(runs)
-    return _ordered(SMOOTHED, 1e-9 * (t_ns - flight.zero_ns), lat, lon, alt)
+    t_ns, lat, lon, alt = join_runs(runs)
+    return _track_from(SMOOTHED, 1e-9 * (t_ns - flight.zero_ns), lat, lon, alt)
 
 
 def configuration(flight: Flight) -> Config:
-    """What flew, the defaults where the log does not say."""
+    """Return the configuration stored in the log; the defaults if none is stored."""
     text = flight.metadata.get(CONFIGURATION, {}).get("toml")
     return Config() if text is None else parse(text, f"{flight.name} (its own configuration)")
 
 
-def _ordered(what: str, t: npt.ArrayLike, lat: Floats, lon: Floats, alt: Floats) -> Reference:
+def _track_from(what: str, t: npt.ArrayLike, lat: Floats, lon: Floats, alt: Floats) -> ReferenceTrack:
     t, first = np.unique(np.asarray(t, dtype=np.float64), return_index=True)
-    return Reference(what, t, lat[first], np.unwrap(lon[first]), alt[first])
+    return ReferenceTrack(what, t, lat[first], np.unwrap(lon[first]), alt[first])
 
 
-def _at(reference: Reference, t: Floats) -> tuple[Floats, Floats]:
-    """Latitude and longitude of the reference at times `t`, NaN beyond its ends and in its holes."""
+def _interpolate(reference: ReferenceTrack, t: Floats) -> tuple[Floats, Floats]:
+    """Return latitude and longitude of the reference at times `t`, NaN beyond its ends and in its gaps."""
     k = np.clip(np.searchsorted(reference.t, t), 1, len(reference.t) - 1)
     known = (t >= reference.t[0]) & (t <= reference.t[-1]) & (reference.t[k] - reference.t[k - 1] <= REACH_S)
     lat = np.where(known, np.interp(t, reference.t, reference.lat), np.nan)
     return lat, np.where(known, np.interp(t, reference.t, reference.lon), np.nan)
 
 
-def _off(reference: Reference, t: Floats, lat: Floats, lon: Floats) -> tuple[Floats, Floats]:
-    """North and east of a track from the reference, m."""
-    lat_0, lon_0 = _at(reference, t)
+def _offset_from(reference: ReferenceTrack, t: Floats, lat: Floats, lon: Floats) -> tuple[Floats, Floats]:
+    """Return the offset of a track from the reference, north and east, m."""
+    lat_0, lon_0 = _interpolate(reference, t)
     if not np.isfinite(lat_0).any():
         return lat_0, lon_0
     R_N, R_E = radii(float(np.nanmean(lat_0)))
     north: Floats = (lat - lat_0) * R_N
-    east: Floats = _wrapped(lon - lon_0) * R_E * np.cos(lat_0)
+    east: Floats = _wrap(lon - lon_0) * R_E * np.cos(lat_0)
     return north, east
 
 
-def _wrapped(angle: Floats) -> Floats:
+def _wrap(angle: Floats) -> Floats:
     wrapped: Floats = (angle + math.pi) % math.tau - math.pi
     return wrapped
 
 
-def _errors(flight: Flight, reference: Reference) -> dict[str, error_statistics.Errors]:
+def _source_errors(flight: Flight, reference: ReferenceTrack) -> dict[str, error_statistics.ErrorSeries]:
     solution, gnss = flight.tables["Solution"], usable_gnss(flight)
     bound = np.hypot(solution["bound_north"], solution["bound_east"])
     tracks: list[tuple[str, Table]] = [
         (error_statistics.CORRECTED, solution),
-        (error_statistics.RSBN, _beacon_places(flight, reference)),
+        (error_statistics.RSBN, _beacon_positions(flight, reference)),
     ]
     if reference.what != GNSS:
         tracks.append((error_statistics.GNSS, gnss))
     found = {}
     for source, table in tracks:
-        north, east = _off(reference, table["t"], table["lat"], table["lon"])
-        found[source] = _known(table["t"], np.hypot(north, east), bound if table is solution else None)
+        north, east = _offset_from(reference, table["t"], table["lat"], table["lon"])
+        found[source] = _error_series(table["t"], np.hypot(north, east), bound if table is solution else None)
         if table is solution:
             ins = np.hypot(north + table["error_north"], east + table["error_east"])
-            found[error_statistics.INS] = _known(table["t"], ins, None)
+            found[error_statistics.INS] = _error_series(table["t"], ins, None)
     return {
         source: found[source]
         for source in error_statistics.SOURCES
@@ -195,32 +195,32 @@ def _errors(flight: Flight, reference: Reference) -> dict[str, error_statistics.
     }
 
 
-def _beacon_places(flight: Flight, reference: Reference) -> Table:
-    """Where each answer of a beacon alone puts the aircraft, whatever else is heard: as `score.errors`."""
-    heard = flight.tables["RsbnFix"]
-    whole = np.isfinite(heard["azimuth"] + heard["slant"])
-    t, *columns = (heard[name][whole] for name in ("t", "lat", "lon", "alt", "azimuth", "slant"))
-    places = [
-        error_statistics.beacon_place(Geodetic(lat, lon, alt), azimuth, slant, true_alt)
+def _beacon_positions(flight: Flight, reference: ReferenceTrack) -> Table:
+    """Return the position that each beacon measurement alone gives, as in `error_statistics`."""
+    fixes = flight.tables["RsbnFix"]
+    complete = np.isfinite(fixes["azimuth"] + fixes["slant"])
+    t, *columns = (fixes[name][complete] for name in ("t", "lat", "lon", "alt", "azimuth", "slant"))
+    positions = [
+        error_statistics.intersect_azimuth_range(Geodetic(lat, lon, alt), azimuth, slant, true_alt)
         for lat, lon, alt, azimuth, slant, true_alt in zip(
             *(column.tolist() for column in columns), np.interp(t, reference.t, reference.alt).tolist()
         )
     ]
-    return {"t": t, "lat": np.array([p.lat for p in places]), "lon": np.array([p.lon for p in places])}
+    return {"t": t, "lat": np.array([p.lat for p in positions]), "lon": np.array([p.lon for p in positions])}
 
 
-def _known(t: Floats, error: Floats, bound: Floats | None) -> error_statistics.Errors:
+def _error_series(t: Floats, error: Floats, bound: Floats | None) -> error_statistics.ErrorSeries:
     known = np.isfinite(error)
     bound = np.full(len(t), np.nan) if bound is None else bound
-    return error_statistics.Errors(np.round(t[known] * 1e9).astype(np.int64), error[known], bound[known])
+    return error_statistics.ErrorSeries(np.round(t[known] * 1e9).astype(np.int64), error[known], bound[known])
 
 
-def _ins_error(flight: Flight, reference: Reference | None) -> dict[str, Floats]:
-    """The error of the inertial channel against the reference, beside what `Solution` says of it."""
+def _ins_error(flight: Flight, reference: ReferenceTrack | None) -> dict[str, Floats]:
+    """Return the error of the inertial channel against the reference, at the times of `Solution`."""
     solution = flight.tables["Solution"]
     if reference is None or not len(solution["t"]):
         return {}
-    north, east = _off(reference, solution["t"], solution["lat"], solution["lon"])
+    north, east = _offset_from(reference, solution["t"], solution["lat"], solution["lon"])
     return {
         "t": solution["t"],
         "north": north + solution["error_north"],
@@ -231,25 +231,36 @@ def _ins_error(flight: Flight, reference: Reference | None) -> dict[str, Floats]
 # -- consistency -----------------------------------------------------------------------------------------
 
 
-def _misfits(flight: Flight, reference: Reference | None) -> list[Misfit]:
+def _normalized_errors(flight: Flight, reference: ReferenceTrack | None) -> list[NormalizedErrors]:
     fix, solution = flight.tables["Fix"], flight.tables["Solution"]
     found = []
     if len(fix["t"]):
-        told = np.isfinite(fix["normalised"])
-        found.append(Misfit("NIS", fix["t"][told], fix["normalised"][told], np.full(int(told.sum()), 2.0)))
-        many = fix["freedom"] > 0
-        if many.any() and fix["cost"][many].max() > 1e-9:  # one GNSS position and a height have no residual
-            found.append(Misfit("fix residuals", fix["t"][many], fix["cost"][many], fix["freedom"][many]))
+        known = np.isfinite(fix["normalised"])
+        found.append(
+            NormalizedErrors("NIS", fix["t"][known], fix["normalised"][known], np.full(int(known.sum()), 2.0))
+        )
+        redundant = fix["degrees_of_freedom"] > 0
+        if (
+            redundant.any() and fix["cost"][redundant].max() > 1e-9
+        ):  # a single GNSS position with a height has no residual
+            found.append(
+                NormalizedErrors(
+                    "fix residuals",
+                    fix["t"][redundant],
+                    fix["cost"][redundant],
+                    fix["degrees_of_freedom"][redundant],
+                )
+            )
     if reference is not None and reference.what == TRUTH and len(solution["t"]):
-        north, east = _off(reference, solution["t"], solution["lat"], solution["lon"])
-        value = _squared(north, east, solution["nn"], solution["ne"], solution["ee"])
+        north, east = _offset_from(reference, solution["t"], solution["lat"], solution["lon"])
+        value = _mahalanobis_squared(north, east, solution["nn"], solution["ne"], solution["ee"])
         known = np.isfinite(value)
         if known.any():
             two = np.full(int(known.sum()), 2.0)
-            found.append(Misfit("NEES", solution["t"][known], value[known], two))
-    return [misfit for misfit in found if len(misfit.t)]
+            found.append(NormalizedErrors("NEES", solution["t"][known], value[known], two))
+    return [series for series in found if len(series.t)]
 
 
-def _squared(north: Floats, east: Floats, nn: Floats, ne: Floats, ee: Floats) -> Floats:
+def _mahalanobis_squared(north: Floats, east: Floats, nn: Floats, ne: Floats, ee: Floats) -> Floats:
     value: Floats = (ee * north**2 - 2.0 * ne * north * east + nn * east**2) / (nn * ee - ne**2)
     return value

@@ -1,36 +1,36 @@
-"""A log of another recorder as an MCAP of ours: its records, and nothing computed from them."""
+"""Conversion of another recorder's log to MCAP: its records only, nothing computed."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from companion.analysis.replay import writer
-from companion.analysis.replay_inputs import CONVERTED, is_own, sentences
+from companion.analysis.replay import create_replay_log
+from companion.analysis.replay_inputs import CONVERTED, input_errors_as_log_errors, is_own_log
 from companion.importers import sources
-from companion.importers.sources import Summary
+from companion.importers.sources import ImportSummary
 from companion.records import OUTPUTS
-from companion.storage.reader import LogError, opened
+from companion.storage.reader import LogError, open_log
 
 
-def convert(source: Path, output: Path) -> Summary:
-    """Write the records of `source` to `output`. LogError, one sentence, where it cannot be read or written.
+def convert_log(source: Path, output: Path) -> ImportSummary:
+    """Write the records of `source` to `output`. Raises LogError if it cannot be read or written.
 
-    What the source itself tells (events, refused messages) goes to topics under /link, as in a replay.
+    Events and rejections of the importer go to topics under /link, as in a replay.
     """
-    with sentences():
-        if is_own(source):
-            with opened(source):
-                raise LogError(f"{source} is an MCAP log already: there is nothing to convert")
+    with input_errors_as_log_errors():
+        if is_own_log(source):
+            with open_log(source):
+                raise LogError(f"{source} is already an MCAP log: nothing to convert")
         if output.resolve() == source.resolve() or output.exists():
-            raise LogError(f"{output} is there already: give another name")
+            raise LogError(f"{output} already exists: give another name")
         records = sources.open_source(source)
-        sink = writer(output, {CONVERTED: {"from": source.name}})
+        sink = create_replay_log(output, {CONVERTED: {"from": source.name}})
         try:
             for record in records:
-                told = isinstance(record, OUTPUTS)
-                sink.record(record, f"/link/{type(record).__name__}" if told else None)
+                from_importer = isinstance(record, OUTPUTS)
+                sink.record(record, f"/link/{type(record).__name__}" if from_importer else None)
         finally:
             sink.close()
         if sink.trouble:
-            raise LogError(f"{output} is not whole: {sink.trouble}")
+            raise LogError(f"{output} is incomplete: {sink.trouble}")
     return records.summary()

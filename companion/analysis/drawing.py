@@ -1,4 +1,4 @@
-"""Figures made visible: `interactive` for a page (plotly), `printed` for paper (matplotlib), side by side."""
+"""Drawing of figures: `to_plotly` for the HTML page, `write_figures` for PDF and PNG (matplotlib)."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from typing import Any
 
 import numpy as np
 
-from companion.analysis.flight_arrays import Floats
 from companion.analysis.plot_data import Figure, Line
+from companion.units import Floats
 
 INK, GRID, SHADE = "#374151", "#e5e7eb", "#fee2e2"
 _FONT = "system-ui, -apple-system, 'Segoe UI', Roboto, sans-serif"
 
 
-def interactive(figure: Figure) -> dict[str, Any]:
-    """The figure as plotly's JSON: `data`, `layout`. Its width is the page's."""
+def to_plotly(figure: Figure) -> dict[str, Any]:
+    """Convert a figure to plotly's JSON, `data` and `layout`; its width follows the page."""
     x: dict[str, Any] = {"title": {"text": figure.x}, "zeroline": False, "gridcolor": GRID}
     y: dict[str, Any] = {
         "title": {"text": figure.y},
@@ -75,15 +75,14 @@ def _trace(line: Line) -> dict[str, Any]:
 
 
 def _plain(a: Floats) -> list[float | None]:
-    """Six digits are more than a screen has; NaN lifts the pen."""
+    """Return the values with six digits, NaN as None (a gap in the line)."""
     return [float(f"{v:.6g}") if math.isfinite(v) else None for v in a.tolist()]
 
 
-def printed(figures: Sequence[Figure], pdf: Path | None, png: Path | None) -> list[Path]:
-    """Write the figures into one `pdf`, a page each, and into the folder `png`, a file each.
+def write_figures(figures: Sequence[Figure], pdf: Path | None, png: Path | None) -> list[Path]:
+    """Write the figures to one `pdf`, a page each, and to the folder `png`, a file each. Return the paths.
 
-    Returns what was written.
-    ModuleNotFoundError where matplotlib is missing.
+    Raises ModuleNotFoundError if matplotlib is missing.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.backends.backend_pdf import PdfPages
@@ -110,7 +109,7 @@ def printed(figures: Sequence[Figure], pdf: Path | None, png: Path | None) -> li
 
 
 def _paint(figure: Figure, axes: Any) -> None:
-    """One figure into matplotlib's axes; mirror of `interactive`."""
+    """Draw one figure in matplotlib axes, like `to_plotly`."""
     axes.set_title(figure.title, loc="left", fontsize=10)
     axes.set_xlabel(figure.x)
     axes.set_ylabel("" if figure.rows else figure.y)

@@ -1,7 +1,6 @@
-"""How far off everything was: the INS alone, each fix and the corrected estimate against the truth, by phase.
+"""Error statistics: INS, fixes and corrected estimate against the truth, by phase of the flight.
 
-Records in, a table of numbers out. The truth is a function of time, so that a simulator's exact one, a logged
-one and a smoothed track serve alike. It knows nothing of files and of where the phases come from.
+The truth is a function of time, so that a simulator, a log or a smoothed track can provide it.
 """
 
 from __future__ import annotations
@@ -16,31 +15,31 @@ import numpy.typing as npt
 
 from companion.nav.geometry import Geodetic, displace, from_enu, separation
 from companion.records import Gnss, RsbnFix, Solution, Stamped
+from companion.units import Floats
 
-Floats = npt.NDArray[np.float64]
 TruthAt = Callable[[int], Geodetic | None]
 
 INS, GNSS, RSBN, CORRECTED = "INS alone", "GNSS fix", "RSBN fix", "corrected"
 SOURCES = (INS, GNSS, RSBN, CORRECTED)
-OPENING_NS = 1_000_000_000  # a fix opens a phase no later than this after the time it is valid for
-_KINDS = ((GNSS, "GNSS"), (RSBN, "RSBN"))  # as they stand in the names of phases
+PHASE_START_DELAY_NS = 1_000_000_000  # maximum delay from the validity of a fix to the phase it starts
+_KINDS = ((GNSS, "GNSS"), (RSBN, "RSBN"))  # source, its word in the names of phases
 
 
-class Phase(NamedTuple):
-    """A stretch of the flight."""
+class FlightPhase(NamedTuple):
+    """A named interval of the flight."""
 
     name: str
     start_ns: int
     end_ns: int
 
 
-class Row(NamedTuple):
+class PhaseErrors(NamedTuple):
     """Horizontal errors (m) of one phase: r.m.s. and 95th percentile by source, and the guaranteed bound.
 
-    The bound is on the r.m.s. error, so it is judged by r.m.s.: `bound` is its own over the phase, `share`
-    the corrected estimate's as a part of it, `held` whether that is at most 1. For information, `inside` and
-    `inside_twice` are the shares of instants within the bound, and within twice the bound, of their own
-    moment; twice a bound that holds is passed in a quarter of cases at most (Chebyshev). None without bound.
+    The bound limits the r.m.s. error, so r.m.s. values are compared: `bound` is that of the phase, `share`
+    the error of the corrected estimate divided by it, `held` whether `share` is at most 1. `inside` and
+    `inside_twice` are the shares of instants with an error within the bound, and within twice the bound, of
+    that instant; twice a valid bound is exceeded in at most a quarter of cases (Chebyshev). None: no bound.
     """
 
     phase: str
@@ -54,16 +53,16 @@ class Row(NamedTuple):
     inside_twice: float | None
 
 
-class Errors(NamedTuple):
-    """Horizontal errors over a flight: times (ns), metres, and the bound where there is one, else NaN."""
+class ErrorSeries(NamedTuple):
+    """Horizontal errors over a flight: times (ns), errors (m), and the bound (m), NaN if there is none."""
 
     t_ns: npt.NDArray[np.int64]
     error: Floats
     bound: Floats
 
 
-def errors(records: Iterable[Stamped], truth: TruthAt) -> dict[str, Errors]:
-    """The horizontal error of every source against `truth`, which is None where it is not known."""
+def horizontal_errors(records: Iterable[Stamped], truth: TruthAt) -> dict[str, ErrorSeries]:
+    """Return the horizontal error of every source against `truth`, which returns None where unknown."""
     found: dict[str, list[tuple[int, float, float]]] = defaultdict(list)
 
     def add(source: str, t_ns: int, place: Geodetic, bound: float = math.nan) -> None:
@@ -79,56 +78,58 @@ def errors(records: Iterable[Stamped], truth: TruthAt) -> dict[str, Errors]:
             corrected = Geodetic(record.lat, record.lon, record.alt_msl)
             add(CORRECTED, record.t_ns, corrected, bound)
             add(INS, record.t_ns, displace(*corrected, *record.error_n, 0.0))
-        elif isinstance(record, Gnss) and record.fix >= 3 and (last is None or not record.repeats(last)):
+        elif isinstance(record, Gnss) and record.has_3d_fix and (last is None or not record.repeats(last)):
             last = record
             add(GNSS, record.t_ns, Geodetic(record.lat, record.lon, record.alt_msl))
         elif isinstance(record, RsbnFix):
             true = truth(record.t_ns)
-            if true is not None and (place := beacon_fix(record, true.alt)) is not None:
+            if true is not None and (place := position_from_beacon(record, true.alt)) is not None:
                 add(RSBN, record.t_ns, place)
     return {
-        source: Errors(*(np.array(column) for column in zip(*rows, strict=True)))
+        source: ErrorSeries(*(np.array(column) for column in zip(*rows, strict=True)))
         for source, rows in found.items()
     }
 
 
-def beacon_fix(record: RsbnFix, alt: float) -> Geodetic | None:
-    """The place that a beacon's azimuth and slant range alone give at height `alt` (m); None without both."""
+def position_from_beacon(record: RsbnFix, alt: float) -> Geodetic | None:
+    """Return the position from azimuth and slant range at height `alt` (m); None if either is missing."""
     if record.azimuth is None or record.slant_range is None:
         return None
     beacon = Geodetic(record.lat, record.lon, record.alt)
-    return beacon_place(beacon, record.azimuth, record.slant_range, alt)
+    return intersect_azimuth_range(beacon, record.azimuth, record.slant_range, alt)
 
 
-def beacon_place(beacon: Geodetic, azimuth: float, slant_range: float, alt: float) -> Geodetic:
-    """The place at height `alt` (m) that is seen from `beacon` under `azimuth` at `slant_range`."""
+def intersect_azimuth_range(beacon: Geodetic, azimuth: float, slant_range: float, alt: float) -> Geodetic:
+    """Return the position at height `alt` (m), at `azimuth` and `slant_range` from `beacon`."""
     up = alt - beacon.alt
     distance = math.sqrt(max(slant_range**2 - up * up, 0.0))
-    for _ in range(2):  # the height over the beacon's tangent plane, the earth falling away below it
+    for _ in range(2):  # iterate the height above the tangent plane of the beacon: the earth is curved
         place = from_enu(np.array([distance * math.sin(azimuth), distance * math.cos(azimuth), up]), beacon)
         up += alt - place.alt
         distance = math.sqrt(max(slant_range**2 - up * up, 0.0))
     return place
 
 
-def table(found: dict[str, Errors], phases: Sequence[Phase]) -> list[Row]:
-    """One row a phase. The fix that opens a phase is valid a moment before it, and counts in none."""
+def summarize_phases(found: dict[str, ErrorSeries], phases: Sequence[FlightPhase]) -> list[PhaseErrors]:
+    """Return one row per phase. The fix that starts a phase is valid just before it and is not counted."""
     rows = []
     for phase, following in zip(phases, [*phases[1:], None]):
-        opening = {
+        starting_sources = {
             source
             for source, kind in _KINDS
             if following and kind in following.name and kind not in phase.name
         }
-        rows.append(_row(found, phase, opening))
+        rows.append(_summarize_phase(found, phase, starting_sources))
     return rows
 
 
-def _row(found: dict[str, Errors], phase: Phase, opening: set[str]) -> Row:
+def _summarize_phase(
+    found: dict[str, ErrorSeries], phase: FlightPhase, starting_sources: set[str]
+) -> PhaseErrors:
     rms, p95 = {}, {}
-    judged: tuple[float, float, bool, float, float] | tuple[None, ...] = (None,) * 5
+    compared: tuple[float, float, bool, float, float] | tuple[None, ...] = (None,) * 5
     for source, e in found.items():
-        end_ns = phase.end_ns - OPENING_NS * (source in opening)
+        end_ns = phase.end_ns - PHASE_START_DELAY_NS * (source in starting_sources)
         within = (e.t_ns >= phase.start_ns) & (e.t_ns < end_ns)
         if not within.any():
             continue
@@ -136,15 +137,15 @@ def _row(found: dict[str, Errors], phase: Phase, opening: set[str]) -> Row:
         rms[source] = float(np.sqrt(np.mean(error**2)))
         p95[source] = float(np.percentile(error, 95.0))
         if np.isfinite(e.bound[within]).any():
-            judged = _judged(error, e.bound[within])
-    return Row(phase.name, (phase.end_ns - phase.start_ns) * 1e-9, rms, p95, *judged)
+            compared = _compare_with_bound(error, e.bound[within])
+    return PhaseErrors(phase.name, (phase.end_ns - phase.start_ns) * 1e-9, rms, p95, *compared)
 
 
-def _judged(error: Floats, bound: Floats) -> tuple[float, float, bool, float, float]:
-    """Bound, share, held, inside and inside_twice of `Row`, where there is a bound."""
+def _compare_with_bound(error: Floats, bound: Floats) -> tuple[float, float, bool, float, float]:
+    """Return bound, share, held, inside and inside_twice of `PhaseErrors`."""
     known = np.isfinite(bound)
     error, bound = error[known], bound[known]
-    promised = float(np.sqrt(np.mean(bound**2)))
-    share = float(np.sqrt(np.mean(error**2))) / promised
+    bound_rms = float(np.sqrt(np.mean(bound**2)))
+    share = float(np.sqrt(np.mean(error**2))) / bound_rms
     inside, twice = (float(np.mean(error <= k * bound)) for k in (1.0, 2.0))
-    return promised, share, share <= 1.0, inside, twice
+    return bound_rms, share, share <= 1.0, inside, twice

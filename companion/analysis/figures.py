@@ -1,6 +1,6 @@
-"""What a report draws: the plots of one flight, or of two in the same axes, over time and the map (`track`).
+"""Figures of the report: plots of one flight, or of two in the same axes.
 
-Times are minutes since the flight's start, lengths metres.
+Times are minutes since the start of the flight, lengths metres.
 """
 
 from __future__ import annotations
@@ -12,29 +12,30 @@ import numpy.typing as npt
 
 from companion.analysis import error_statistics, flight_events
 from companion.analysis.assessment import Assessment, chi2_95
-from companion.analysis.flight_arrays import AHEAD, Floats
-from companion.analysis.map_figure import track
-from companion.analysis.plot_data import COLOURS, LETTERS, TIME, Figure, Line, Style, strided, thinned
+from companion.analysis.flight_arrays import AHEAD
+from companion.analysis.map_figure import build_map
+from companion.analysis.plot_data import COLOURS, LETTERS, TIME, Figure, Line, Style, subsample, thin_line
+from companion.units import Floats
 
 
-def figures(flights: Sequence[Assessment]) -> list[Figure]:
-    """Every plot there is something to draw in, for one flight or two, which the legends call A and B."""
+def build_figures(flights: Sequence[Assessment]) -> list[Figure]:
+    """Build every figure that has data, for one flight or two (A and B in the legends)."""
     prefixes = [f"{letter} " for letter in LETTERS] if len(flights) > 1 else [""]
     found = (build(flights, prefixes) for build in _BUILDERS)
     return [figure for figure in found if any(len(line.x) for line in figure.lines)]
 
 
 def _line(name: str, role: str, which: int, t: Floats, y: Floats, **more: object) -> Line:
-    x, y = thinned(np.asarray(t / 60.0, dtype=np.float64), y)
+    x, y = thin_line(np.asarray(t / 60.0, dtype=np.float64), y)
     return Line(name, x, y, COLOURS[role][which], **more)  # type: ignore[arg-type]
 
 
-def _seconds(e: error_statistics.Errors) -> Floats:
+def _seconds(e: error_statistics.ErrorSeries) -> Floats:
     return np.asarray(e.t_ns * 1e-9, dtype=np.float64)
 
 
 def _spans(flights: Sequence[Assessment]) -> tuple[tuple[float, float, str], ...]:
-    """The phases without fixes, of one flight alone: two would hide each other."""
+    """Return the phases without fixes as shaded spans; none for two flights, which would overlap."""
     if len(flights) > 1:
         return ()
     return tuple(
@@ -71,7 +72,7 @@ def _error(flights: Sequence[Assessment], prefixes: Sequence[str]) -> Figure:
         TIME,
         "error, m",
         lines,
-        "Logarithmic. Shaded: no fixes. The estimate's error must stay, r.m.s., under the dashed bound.",
+        "Logarithmic. Shaded: no fixes. The r.m.s. error of the estimate must stay below the dashed bound.",
         log=True,
         spans=_spans(flights),
     )
@@ -90,8 +91,8 @@ def _ratio(flights: Sequence[Assessment], prefixes: Sequence[str]) -> Figure:
         TIME,
         "error / bound",
         lines,
-        "Above 1 the error was beyond the bound. The bound is on the r.m.s.: a moment above it is allowed, "
-        "a phase is not.",
+        "Above 1 the error exceeded the bound. The bound limits the r.m.s. error of a phase: single moments "
+        "above 1 are allowed.",
         log=True,
         spans=_spans(flights),
         level=1.0,
@@ -102,19 +103,19 @@ def _misfit(flights: Sequence[Assessment], prefixes: Sequence[str]) -> Figure:
     roles = {"NEES": error_statistics.CORRECTED, "fix residuals": error_statistics.RSBN}
     lines = []
     for which, (a, prefix) in enumerate(zip(flights, prefixes, strict=True)):
-        for misfit in a.misfits:
-            role = roles.get(misfit.what, error_statistics.GNSS)
-            style: Style = "line" if misfit.what == "NEES" else "dots"
-            value = np.maximum(misfit.value / chi2_95(misfit.freedom), 1e-4)
-            lines.append(_line(prefix + misfit.what, role, which, misfit.t, value, style=style))
+        for series in a.normalized_errors:
+            role = roles.get(series.what, error_statistics.GNSS)
+            style: Style = "line" if series.what == "NEES" else "dots"
+            value = np.maximum(series.value / chi2_95(series.degrees_of_freedom), 1e-4)
+            lines.append(_line(prefix + series.what, role, which, series.t, value, style=style))
     return Figure(
         "consistency",
         "Do errors fit their covariances?",
         TIME,
         "value / 95 % limit",
         lines,
-        "Squares of errors by their covariance, over the 95 % quantile of chi-square: in a sound filter "
-        "one in twenty is above 1, not many more and not none at all.",
+        "Squared errors normalized by their covariance, divided by the 95 % quantile of chi-square. In a "
+        "consistent filter about 5 % of the values are above 1; if none are, the sigmas are too large.",
         log=True,
         spans=_spans(flights),
         level=1.0,
@@ -130,9 +131,9 @@ def _inertial(axis: str) -> Callable[[Sequence[Assessment], Sequence[str]], Figu
         for which, (a, prefix) in enumerate(zip(flights, prefixes, strict=True)):
             s = a.flight.tables["Solution"]
             estimated, bound = s[f"error_{axis}"], s[f"bound_{axis}"]
-            lone = s["sources"].astype(int) <= 1
+            without_fixes = s["sources"].astype(int) <= 1
             for sign, name in ((1.0, f"{prefix}estimate ± bound"), (-1.0, "")):
-                edge = np.where(lone, estimated + sign * bound, np.nan)
+                edge = np.where(without_fixes, estimated + sign * bound, np.nan)
                 if np.isfinite(edge).any():
                     lines.append(_line(name, "bound", which, s["t"], edge, dash=True, width=1.0))
             if a.ins_error:
@@ -146,7 +147,7 @@ def _inertial(axis: str) -> Callable[[Sequence[Assessment], Sequence[str]], Figu
             TIME,
             "error, m",
             lines,
-            "What is taken off the inertial channel, beside what it was; the bound while it is predicted.",
+            "The estimated error, which is subtracted; the actual error; the bound in phases without fixes.",
             spans=_spans(flights),
             view=_near([line for line in lines if not line.dash]),
         )
@@ -155,7 +156,7 @@ def _inertial(axis: str) -> Callable[[Sequence[Assessment], Sequence[str]], Figu
 
 
 def _near(lines: Sequence[Line]) -> tuple[float, float, float, float] | None:
-    """A view of these lines with half as much again above and below, whatever else there is."""
+    """Return a view that covers these lines with a margin of half their range."""
     known = [line for line in lines if np.isfinite(line.y).any()]
     if not known:
         return None
@@ -181,12 +182,12 @@ def _ahead(flights: Sequence[Assessment], prefixes: Sequence[str]) -> Figure:
                     lines.append(_line(name, roles[i], which, s["t"][known], y, dash=dash))
     return Figure(
         "ahead",
-        "The error ahead, as told in flight",
+        "Predicted error, as reported in flight",
         TIME,
         "r.m.s., m",
         lines,
-        "What the inertial error may be some minutes from each moment: guaranteed, and (dashed) as least "
-        "squares claims it under white noise.",
+        "The inertial error some minutes after each moment: guaranteed bound, and (dashed) the value that "
+        "least squares claims under white noise.",
         log=True,
         spans=_spans(flights),
     )
@@ -196,7 +197,7 @@ def _ahead(flights: Sequence[Assessment], prefixes: Sequence[str]) -> Figure:
 
 
 def _sources(flights: Sequence[Assessment], prefixes: Sequence[str]) -> Figure:
-    """A row a source and log: when it was used, and each refusal."""
+    """Build one row per source and log: intervals of use, and each rejection."""
     lines: list[Line] = []
     rows: list[str] = []
     for which, (a, prefix) in enumerate(zip(flights, prefixes, strict=True)):
@@ -211,17 +212,17 @@ def _sources(flights: Sequence[Assessment], prefixes: Sequence[str]) -> Figure:
                 rows.append(prefix + name)
                 y = np.where(on, float(len(rows)), np.nan)
                 lines.append(_runs(rows[-1], role, which, s["t"], y))
-        for source in dict.fromkeys(r.source for r in a.flight.refused):
-            rows.append(f"{prefix}refused: {source}")
-            t = strided(np.array([r.t for r in a.flight.refused if r.source == source])) / 60.0
+        for source in dict.fromkeys(r.source for r in a.flight.rejections):
+            rows.append(f"{prefix}rejected: {source}")
+            t = subsample(np.array([r.t for r in a.flight.rejections if r.source == source])) / 60.0
             y = np.full(len(t), float(len(rows)))
-            lines.append(Line(rows[-1], t, y, COLOURS["refused"][which], "dots"))
-    note = "A row for each source: bars where it was used, dots where it was refused."
-    return Figure("sources", "Sources used and refused", TIME, "", lines, note, rows=tuple(rows))
+            lines.append(Line(rows[-1], t, y, COLOURS["rejected"][which], "dots"))
+    note = "One row per source: bars where it was used, dots where it was rejected."
+    return Figure("sources", "Sources used and rejected", TIME, "", lines, note, rows=tuple(rows))
 
 
 def _runs(name: str, role: str, which: int, t: Floats, on: Floats) -> Line:
-    """A bar: only where it begins and ends needs points."""
+    """Build a bar; points are needed only at its ends."""
     change = np.flatnonzero(np.diff(np.isfinite(on), prepend=False))
     ends = np.concatenate([[0, len(t) - 1], change - 1, change])
     keep: npt.NDArray[np.int64] = np.unique(np.clip(ends, 0, len(t) - 1))
@@ -238,8 +239,8 @@ def _latency(flights: Sequence[Assessment], prefixes: Sequence[str]) -> Figure:
     for which, (a, prefix) in enumerate(zip(flights, prefixes, strict=True)):
         for topic, role in topics:
             if topic in a.flight.streams:
-                rx, late = flight_events.latency(a.flight, topic)
-                if not late.any():  # its recorder kept one time
+                rx, late = flight_events.message_latency(a.flight, topic)
+                if not late.any():  # the recorder stored only one time
                     continue
                 name = f"{prefix}{topic.removeprefix('/in/')}"
                 lines.append(_line(name, role, which, rx, 1e3 * late, style="dots"))
@@ -261,7 +262,13 @@ def _pace(flights: Sequence[Assessment], prefixes: Sequence[str]) -> Figure:
                 name = f"{prefix}{topic.split('/')[-1]}"
                 lines.append(_line(name, role, which, np.asarray(edges[:-1], dtype=np.float64), hz))
     return Figure(
-        "rates", "Message rates", TIME, "Hz", lines, "Messages a second, over a few seconds each.", zero=True
+        "rates",
+        "Message rates",
+        TIME,
+        "Hz",
+        lines,
+        "Messages per second, averaged over a few seconds.",
+        zero=True,
     )
 
 
@@ -284,7 +291,7 @@ def _clock(flights: Sequence[Assessment], prefixes: Sequence[str]) -> Figure:
 
 
 _BUILDERS = (
-    track,
+    build_map,
     _error,
     _ratio,
     _misfit,

@@ -1,7 +1,6 @@
-"""Flights as arrays: one pass over the records of a log, columns of numbers by kind, times by topic.
+"""Flights as arrays: one pass over the records of a log gives columns by record type and times by topic.
 
-Times become seconds since the flight's first arrival, angles stay radians, absent stays NaN. It knows what a
-record holds and judges nothing; `assess` does.
+Times become seconds since the first arrival of the flight, angles stay in radians, missing values are NaN.
 """
 
 from __future__ import annotations
@@ -14,10 +13,9 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
-from companion.analysis import gnss_latency
-from companion.analysis.gnss_latency import Latency
+from companion.importers import gnss_latency
+from companion.importers.gnss_latency import Latency
 from companion.navigator import FOLDED
 from companion.records import (
     Event,
@@ -35,23 +33,23 @@ from companion.records import (
     Truth,
 )
 from companion.storage import flight_log
+from companion.units import Floats
 
-Floats = npt.NDArray[np.float64]
 Table = dict[str, Floats]
 MODES = tuple(Mode)
 TRUTH = flight_log.topic_of(Truth)
-AHEAD = 4  # predictions kept of each solution
+AHEAD = 4  # predictions stored per solution
 
 
 class Stream(NamedTuple):
-    """When the messages of one topic were valid and when they arrived, both seconds (n,)."""
+    """Times of validity and of arrival of the messages of one topic, both in seconds (n,)."""
 
     t: Floats
     rx: Floats
 
 
-class Told(NamedTuple):
-    """A line of the log's own: when (s), of what kind, how grave (MAVLink's 0..7), and the text."""
+class TimelineEntry(NamedTuple):
+    """A line of the timeline: time (s), kind, severity (MAVLink's 0..7) and text."""
 
     t: float
     kind: str
@@ -59,8 +57,8 @@ class Told(NamedTuple):
     text: str
 
 
-class Refused(NamedTuple):
-    """One measurement not used."""
+class RejectedMeasurement(NamedTuple):
+    """A measurement that was not used."""
 
     t: float
     source: str
@@ -71,11 +69,11 @@ class Refused(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Flight:
-    """All that a report needs of one flight, `part` k of n of the log `name`.
+    """All data that a report needs of one flight, `part` k of n of the log `name`.
 
-    `tables` holds columns (n,) by kind of record, "t" and "rx" (s) among them; a kind that never came has
-    columns of length 0. `unix_ns` is the wall-clock time of t = 0. `latencies` are of GNSS behind the
-    local position. `heard` are the records themselves that a smoother wants, kept where there is no truth.
+    `tables` has columns (n,) by record type, including "t" and "rx" (s); the columns of an absent type have
+    length 0. `unix_ns` is the wall-clock time of t = 0. `latencies` are those of GNSS relative to the local
+    position. `smoother_inputs` are the records for the smoother, stored only if there is no truth.
     """
 
     name: str
@@ -86,15 +84,15 @@ class Flight:
     tables: dict[str, Table]
     streams: dict[str, Stream]
     links: dict[str, Table]
-    told: list[Told]
-    refused: list[Refused]
+    log_entries: list[TimelineEntry]
+    rejections: list[RejectedMeasurement]
     latencies: list[Latency]
-    heard: list[Stamped]
+    smoother_inputs: list[Stamped]
     metadata: dict[str, dict[str, str]]
     remarks: tuple[str, ...]
 
 
-def _number(value: float | None) -> float:
+def _or_nan(value: float | None) -> float:
     return math.nan if value is None else value
 
 
@@ -115,16 +113,16 @@ COLUMNS: dict[type[Stamped], tuple[str, Callable[[Any], tuple[float, ...]]]] = {
         _solution,
     ),
     Fix: (
-        "lat lon sources cost freedom normalised",
-        lambda r: (r.lat, r.lon, r.sources, r.cost, r.freedom, _number(r.normalised)),
+        "lat lon sources cost degrees_of_freedom normalised",
+        lambda r: (r.lat, r.lon, r.sources, r.cost, r.degrees_of_freedom, _or_nan(r.normalised)),
     ),
     Gnss: (
         "receiver fix lat lon alt sigma",
-        lambda r: (r.receiver, r.fix, r.lat, r.lon, r.alt_msl, _number(r.sigma_horizontal)),
+        lambda r: (r.receiver, r.fix, r.lat, r.lon, r.alt_msl, _or_nan(r.sigma_horizontal)),
     ),
     RsbnFix: (
         "beacon lat lon alt azimuth slant",
-        lambda r: (r.beacon, r.lat, r.lon, r.alt, _number(r.azimuth), _number(r.slant_range)),
+        lambda r: (r.beacon, r.lat, r.lon, r.alt, _or_nan(r.azimuth), _or_nan(r.slant_range)),
     ),
     Truth: ("lat lon alt", lambda r: (r.lat, r.lon, r.alt)),
     FilterStatus: ("gnss_glitch", lambda r: (float(r.gnss_glitch),)),
@@ -139,7 +137,7 @@ def _link(r: LinkState) -> tuple[float, ...]:
 
 
 class _Columns:
-    """Rows come in, columns go out."""
+    """Table builder: rows in, columns out."""
 
     def __init__(self, names: str) -> None:
         self._names, self._times, self._rows = names.split(), array("q"), array("d")
@@ -156,12 +154,12 @@ class _Columns:
 
 
 def _seconds(times: array[int], zero_ns: int) -> Floats:
-    """Pairs of t_ns, rx_ns as seconds (n, 2); the difference first, 1970's nanoseconds fit no double."""
+    """Convert pairs of t_ns, rx_ns to seconds (n, 2). UNIX ns exceed double precision: subtract integers."""
     pairs = np.array(times, dtype=np.int64).reshape(-1, 2) - zero_ns
     return np.asarray(pairs * 1e-9, dtype=np.float64)
 
 
-def gather(
+def collect_flights(
     records: Iterable[tuple[str, Stamped]],
     name: str,
     *,
@@ -169,18 +167,19 @@ def gather(
     metadata: dict[str, dict[str, str]] | None = None,
     remarks: tuple[str, ...] = (),
 ) -> list[Flight]:
-    """The flights of `records`, each with its topic, in order of arrival: a reboot of the autopilot begins a
-    new one. `unix_ns` is the wall-clock time of the first record (its own stamp where not told).
+    """Collect the flights in `records` (topic, record), in order of arrival. A reboot starts a new flight.
 
-    ValueError where there are none.
+    `unix_ns` is the wall-clock time of the first record; by default its own time stamp.
+
+    Raises ValueError if there are no records.
     """
-    parts = [_Gathered()]
+    parts = [_FlightCollector()]
     for topic, record in records:
-        if isinstance(record, Reboot) and parts[-1].began:
-            parts.append(_Gathered())
-        parts[-1].see(topic, record)
-    if not parts[0].began:
-        raise ValueError(f"{name} holds no record: there is nothing to report")
+        if isinstance(record, Reboot) and parts[-1].started:
+            parts.append(_FlightCollector())
+        parts[-1].add(topic, record)
+    if not parts[0].started:
+        raise ValueError(f"{name} contains no records: nothing to report")
     shift = 0 if unix_ns is None else unix_ns - parts[0].zero_ns
     about = metadata or {}
     return [
@@ -188,24 +187,24 @@ def gather(
     ]
 
 
-class _Gathered:
-    """What was seen so far of one flight."""
+class _FlightCollector:
+    """The data of one flight collected so far."""
 
     def __init__(self) -> None:
-        self.began = False
+        self.started = False
         self.zero_ns = self._end_ns = 0
         self._columns = {kind: _Columns(names) for kind, (names, _) in COLUMNS.items()}
         self._links: dict[str, _Columns] = defaultdict(lambda: _Columns(_LINK))
         self._times: dict[str, array[int]] = defaultdict(lambda: array("q"))
-        self._told: list[Stamped] = []
-        self._heard: list[Stamped] = []
+        self._messages: list[Stamped] = []
+        self._smoother_inputs: list[Stamped] = []
         self._last: dict[int, Gnss] = {}
-        self._watch = gnss_latency.Watch()
+        self._latency_tracks = gnss_latency.TrackCollector()
 
-    def see(self, topic: str, record: Stamped) -> None:
-        """Take one record. A fix repeated at the stream's rate counts for the rate alone."""
-        if not self.began:
-            self.began, self.zero_ns = True, record.rx_ns
+    def add(self, topic: str, record: Stamped) -> None:
+        """Add one record. A repeated fix counts only for the message rate."""
+        if not self.started:
+            self.started, self.zero_ns = True, record.rx_ns
         self._end_ns = max(self._end_ns, record.rx_ns)
         self._times[topic].extend((record.t_ns, record.rx_ns))
         if isinstance(record, Gnss):
@@ -214,14 +213,14 @@ class _Gathered:
                 return
         kind = type(record)
         if kind in FOLDED:
-            self._heard.append(record)
-            self._watch.see(record)
+            self._smoother_inputs.append(record)
+            self._latency_tracks.add(record)
         if kind in COLUMNS:
             self._columns[kind].add(record, COLUMNS[kind][1](record))
         elif isinstance(record, LinkState):
             self._links[record.link].add(record, _link(record))
         elif kind in (Event, Reset, Rejection):
-            self._told.append(record)
+            self._messages.append(record)
 
     def flight(
         self,
@@ -231,12 +230,15 @@ class _Gathered:
         metadata: dict[str, dict[str, str]],
         remarks: tuple[str, ...],
     ) -> Flight:
-        """All of it as arrays. What was heard is let go where the truth is known."""
+        """Return the flight as arrays."""
         pairs = {topic: _seconds(both, self.zero_ns) for topic, both in sorted(self._times.items())}
-        seen = [gnss_latency.look(track) for track in self._watch.tracks()]
-        lines = [_told(r, self.zero_ns) for r in self._told if isinstance(r, Event | Reset)]
-        glitches = [_told(event, self.zero_ns)._replace(kind="glitch") for event in gnss_latency.events(seen)]
-        found = {(line.t, line.text) for line in glitches}  # a replay has told them already
+        analyses = [gnss_latency.analyze_track(track) for track in self._latency_tracks.tracks()]
+        lines = [_timeline_entry(r, self.zero_ns) for r in self._messages if isinstance(r, Event | Reset)]
+        glitches = [
+            _timeline_entry(event, self.zero_ns)._replace(kind="glitch")
+            for event in gnss_latency.glitch_events(analyses)
+        ]
+        found = {(line.t, line.text) for line in glitches}  # a replay has logged them already
         return Flight(
             name=name,
             part=part,
@@ -246,22 +248,26 @@ class _Gathered:
             tables={kind.__name__: column.table(self.zero_ns) for kind, column in self._columns.items()},
             streams={topic: Stream(pair[:, 0], pair[:, 1]) for topic, pair in pairs.items()},
             links={link: column.table(self.zero_ns) for link, column in sorted(self._links.items())},
-            told=[*glitches, *(line for line in lines if (line.t, line.text) not in found)],
-            refused=[_refused(r, self.zero_ns) for r in self._told if isinstance(r, Rejection)],
-            latencies=[one.latency for one in seen if one.latency is not None],
-            heard=[] if TRUTH in self._times else self._heard,
+            log_entries=[*glitches, *(line for line in lines if (line.t, line.text) not in found)],
+            rejections=[
+                _rejected_measurement(r, self.zero_ns) for r in self._messages if isinstance(r, Rejection)
+            ],
+            latencies=[one.latency for one in analyses if one.latency is not None],
+            smoother_inputs=[] if TRUTH in self._times else self._smoother_inputs,
             metadata=metadata,
             remarks=remarks,
         )
 
 
-def _told(record: Event | Reset, zero_ns: int) -> Told:
+def _timeline_entry(record: Event | Reset, zero_ns: int) -> TimelineEntry:
     t = (record.t_ns - zero_ns) * 1e-9
     if isinstance(record, Event):
-        return Told(t, "event", record.severity, record.text)
-    return Told(t, "reset", 4, f"{record.what} began anew: {record.reason}")
+        return TimelineEntry(t, "event", record.severity, record.text)
+    return TimelineEntry(t, "reset", 4, f"{record.what} reset: {record.reason}")
 
 
-def _refused(r: Rejection, zero_ns: int) -> Refused:
-    t_ns = r.t_ns if r.t_ns >= zero_ns else r.rx_ns  # of a time before the flight: when it was heard
-    return Refused((t_ns - zero_ns) * 1e-9, r.source, r.reason, _number(r.value), _number(r.limit))
+def _rejected_measurement(r: Rejection, zero_ns: int) -> RejectedMeasurement:
+    t_ns = r.t_ns if r.t_ns >= zero_ns else r.rx_ns  # stamped before the flight: use the arrival
+    return RejectedMeasurement(
+        (t_ns - zero_ns) * 1e-9, r.source, r.reason, _or_nan(r.value), _or_nan(r.limit)
+    )

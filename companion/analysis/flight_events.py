@@ -1,7 +1,4 @@
-"""What happened on a flight: the phases it falls into, outages, refusals in a row, the pace of messages.
-
-Arrays in (`gather`), rows out. It knows nothing of errors and of what is true.
-"""
+"""Events of a flight: phases, GNSS outages, grouped rejections, message rates, timeline."""
 
 from __future__ import annotations
 
@@ -13,18 +10,19 @@ import numpy as np
 import numpy.typing as npt
 
 from companion.analysis import error_statistics
-from companion.analysis.flight_arrays import MODES, Flight, Floats, Refused, Stream, Table, Told
+from companion.analysis.flight_arrays import MODES, Flight, RejectedMeasurement, Stream, Table, TimelineEntry
 from companion.nav.earth import radii
 from companion.records import Mode, Source
+from companion.units import Floats
 
-SHORT_S = 5.0  # a phase shorter than this belongs to the one before it, the first to the next
-TOGETHER_S = 3.0  # refusals of one source closer than this are one event
-LOST_S = 5.0  # without GNSS for longer than this is an outage
-RADIO = Source.AZIMUTH | Source.RANGE
+PHASE_MIN_S = 5.0  # a shorter phase is merged into the previous one, the first into the next
+GROUP_GAP_S = 3.0  # rejections of one source closer than this form one group
+OUTAGE_MIN_S = 5.0  # a longer time without GNSS is an outage
+BEACON = Source.AZIMUTH | Source.RANGE
 
 
-class Group(NamedTuple):
-    """Refusals of one source in a row: from, to (s), how many, the worst value against its limit."""
+class RejectionGroup(NamedTuple):
+    """Consecutive rejections of one source: start, end (s), count, worst value and its limit."""
 
     start: float
     end: float
@@ -33,18 +31,18 @@ class Group(NamedTuple):
     number: int
     value: float
     limit: float
-    metres: float  # how far the farthest of them was off the estimate; NaN where it is not known
+    metres: float  # greatest distance from the estimate; NaN if unknown
 
 
-class Outage(NamedTuple):
-    """No GNSS fix from `start` to `end` (s)."""
+class OutageInterval(NamedTuple):
+    """Interval without a GNSS fix, `start` to `end` (s)."""
 
     start: float
     end: float
 
 
-class Rate(NamedTuple):
-    """One topic: messages, mean rate (Hz), longest gap (s) and its start, latency (s) median and 95 %."""
+class MessageRate(NamedTuple):
+    """Statistics of a topic: count, mean rate (Hz), longest gap and its start (s), latency (s)."""
 
     topic: str
     number: int
@@ -56,29 +54,29 @@ class Rate(NamedTuple):
 
 
 def usable_gnss(flight: Flight) -> Table:
-    """The columns of 3D fixes alone."""
+    """Return the GNSS columns restricted to 3D fixes."""
     gnss = flight.tables["Gnss"]
     return {name: column[gnss["fix"] >= 3] for name, column in gnss.items()}
 
 
-def latency(flight: Flight, topic: str) -> tuple[Floats, Floats]:
-    """When each message of `topic` arrived and how late it was, s; of GNSS the new fixes alone."""
+def message_latency(flight: Flight, topic: str) -> tuple[Floats, Floats]:
+    """Return arrival and latency of each message of `topic`, s; for GNSS of new fixes only."""
     of_gnss = topic == "/in/Gnss"
     t, rx = (usable_gnss(flight)[name] for name in ("t", "rx")) if of_gnss else flight.streams[topic]
     return rx, rx - t
 
 
-def is_radio(flight: Flight) -> npt.NDArray[np.bool_]:
-    """Which rows of "Fix" rest on beacons and not on GNSS."""
+def rests_on_beacons(flight: Flight) -> npt.NDArray[np.bool_]:
+    """Return which rows of "Fix" use beacons and not GNSS."""
     sources = flight.tables["Fix"]["sources"].astype(int)
-    found: npt.NDArray[np.bool_] = ((sources & int(RADIO)) != 0) & ((sources & int(Source.GNSS)) == 0)
+    found: npt.NDArray[np.bool_] = ((sources & int(BEACON)) != 0) & ((sources & int(Source.GNSS)) == 0)
     return found
 
 
-def phases(solution: Table, seconds: float) -> list[error_statistics.Phase]:
-    """Stretches of one footing: which fixes, or none and predicted, or not even that."""
+def split_phases(solution: Table, seconds: float) -> list[error_statistics.FlightPhase]:
+    """Split the flight into phases by the sources of the position: which fixes, prediction, or untrusted."""
     names = [
-        _footing(MODES[int(mode)], int(sources))
+        _phase_name(MODES[int(mode)], int(sources))
         for mode, sources in zip(solution["mode"], solution["sources"], strict=True)
     ]
     runs: list[tuple[str, float]] = []
@@ -86,48 +84,48 @@ def phases(solution: Table, seconds: float) -> list[error_statistics.Phase]:
     for name, group in groupby(names):
         count = len(list(group))
         end = k + count
-        lasts = (solution["t"][end] if end < len(names) else seconds) - solution["t"][k]
-        if not runs or (lasts >= SHORT_S and runs[-1][0] != name):
+        duration = (solution["t"][end] if end < len(names) else seconds) - solution["t"][k]
+        if not runs or (duration >= PHASE_MIN_S and runs[-1][0] != name):
             runs.append((name, float(solution["t"][k])))
         k = end
-    if len(runs) > 1 and runs[1][1] - runs[0][1] < SHORT_S:
+    if len(runs) > 1 and runs[1][1] - runs[0][1] < PHASE_MIN_S:
         runs[:2] = [(runs[1][0], runs[0][1])]
     starts = [round(start * 1e9) for _, start in runs] + [round(seconds * 1e9)]
-    return [error_statistics.Phase(name, starts[i], starts[i + 1]) for i, (name, _) in enumerate(runs)]
+    return [error_statistics.FlightPhase(name, starts[i], starts[i + 1]) for i, (name, _) in enumerate(runs)]
 
 
-def _footing(mode: Mode, sources: int) -> str:
+def _phase_name(mode: Mode, sources: int) -> str:
     if mode is not Mode.FIXED:
         return {Mode.PREDICTING: "prediction", Mode.UNTRUSTED: "untrusted"}.get(mode, str(mode))
-    names = [name for bits, name in ((Source.GNSS, "GNSS"), (RADIO, "RSBN")) if sources & int(bits)]
+    names = [name for bits, name in ((Source.GNSS, "GNSS"), (BEACON, "RSBN")) if sources & int(bits)]
     return " + ".join(names) or "fixes"
 
 
-def outages(flight: Flight) -> list[Outage]:
-    """Holes between the arrivals of usable GNSS fixes, and the end without any, once there was one."""
+def find_gnss_outages(flight: Flight) -> list[OutageInterval]:
+    """Find gaps between arrivals of usable GNSS fixes, and a final gap, after the first fix."""
     t = np.sort(usable_gnss(flight)["rx"])
     if not len(t):
         return []
     t = np.append(t, max(flight.seconds, t[-1]))
-    return [Outage(float(t[k]), float(t[k + 1])) for k in np.flatnonzero(np.diff(t) > LOST_S)]
+    return [OutageInterval(float(t[k]), float(t[k + 1])) for k in np.flatnonzero(np.diff(t) > OUTAGE_MIN_S)]
 
 
-def groups(flight: Flight) -> list[Group]:
-    """Refusals of one source for one reason, in a row, are one event."""
-    rows: list[list[Refused]] = []
-    for refused in sorted(flight.refused, key=lambda r: (r.source, r.reason, r.t)):
+def group_rejections(flight: Flight) -> list[RejectionGroup]:
+    """Group consecutive rejections of one source for one reason."""
+    rows: list[list[RejectedMeasurement]] = []
+    for rejected in sorted(flight.rejections, key=lambda r: (r.source, r.reason, r.t)):
         last = rows[-1][-1] if rows else None
-        if last is not None and last[1:3] == refused[1:3] and refused.t - last.t <= TOGETHER_S:
-            rows[-1].append(refused)
+        if last is not None and last[1:3] == rejected[1:3] and rejected.t - last.t <= GROUP_GAP_S:
+            rows[-1].append(rejected)
         else:
-            rows.append([refused])
-    return sorted(_group(flight, row) for row in rows)
+            rows.append([rejected])
+    return sorted(_summarize_group(flight, row) for row in rows)
 
 
-def _group(flight: Flight, row: list[Refused]) -> Group:
+def _summarize_group(flight: Flight, row: list[RejectedMeasurement]) -> RejectionGroup:
     values = [r.value for r in row if math.isfinite(r.value)]
     limits = [r.limit for r in row if math.isfinite(r.limit)]
-    return Group(
+    return RejectionGroup(
         row[0].t,
         row[-1].t,
         row[0].source,
@@ -135,31 +133,31 @@ def _group(flight: Flight, row: list[Refused]) -> Group:
         len(row),
         max(values, default=math.nan),
         min(limits, default=math.nan),
-        _farthest(flight, row) if row[0].source.startswith("gnss") else math.nan,
+        _max_distance(flight, row) if row[0].source.startswith("gnss") else math.nan,
     )
 
 
-def _farthest(flight: Flight, row: list[Refused]) -> float:
-    """How far the GNSS fixes refused in `row` were off the estimate at most, m."""
+def _max_distance(flight: Flight, row: list[RejectedMeasurement]) -> float:
+    """Return the greatest distance of the rejected GNSS fixes from the estimate, m."""
     gnss, solution = usable_gnss(flight), flight.tables["Solution"]
-    within = (gnss["t"] >= row[0].t - 1e-3) & (gnss["t"] <= row[-1].t + 1e-3)
-    if not within.any() or len(solution["t"]) < 2:
+    in_group = (gnss["t"] >= row[0].t - 1e-3) & (gnss["t"] <= row[-1].t + 1e-3)
+    if not in_group.any() or len(solution["t"]) < 2:
         return math.nan
     order = np.argsort(solution["t"], kind="stable")
     t, lat, lon = (solution[name][order] for name in ("t", "lat", "lon"))
-    north = gnss["lat"][within] - np.interp(gnss["t"][within], t, lat)
-    east = gnss["lon"][within] - np.interp(gnss["t"][within], t, lon)
+    north = gnss["lat"][in_group] - np.interp(gnss["t"][in_group], t, lat)
+    east = gnss["lon"][in_group] - np.interp(gnss["t"][in_group], t, lon)
     R_N, R_E = radii(float(lat[0]))
     return float(np.max(np.hypot(north * R_N, east * R_E * math.cos(lat[0]))))
 
 
-def rate(topic: str, stream: Stream, latency: Floats) -> Rate:
-    """The pace of one topic; `latency` (s) of what was new in it."""
+def message_rate(topic: str, stream: Stream, latency: Floats) -> MessageRate:
+    """Compute the statistics of one topic; `latency` (s) is that of its new messages."""
     rx = stream.rx
     gaps = np.diff(rx)
     worst = int(np.argmax(gaps)) if len(gaps) else 0
     span = float(rx[-1] - rx[0])
-    return Rate(
+    return MessageRate(
         topic,
         len(rx),
         (len(rx) - 1) / span if span > 0.0 else math.nan,
@@ -170,32 +168,36 @@ def rate(topic: str, stream: Stream, latency: Floats) -> Rate:
     )
 
 
-def timeline(flight: Flight, groups: list[Group], outages: list[Outage]) -> list[Told]:
-    """The log's own lines, and what was found: refusals by groups, outages, what the autopilot flagged."""
-    lines = list(flight.told)
-    lines += [Told(group.start, "refused", 4, refusal(group)) for group in groups]
+def build_timeline(
+    flight: Flight, groups: list[RejectionGroup], outages: list[OutageInterval]
+) -> list[TimelineEntry]:
+    """Merge the entries of the log with grouped rejections, outages and glitch flags of the autopilot."""
+    lines = list(flight.log_entries)
+    lines += [TimelineEntry(group.start, "rejected", 4, describe_rejections(group)) for group in groups]
     lines += [
-        Told(hole.start, "outage", 4, f"no GNSS fix for {hole.end - hole.start:.1f} s from here")
-        for hole in outages
+        TimelineEntry(
+            outage.start, "outage", 4, f"no GNSS fix for the next {outage.end - outage.start:.1f} s"
+        )
+        for outage in outages
     ]
     status = flight.tables["FilterStatus"]
     rises = np.flatnonzero(np.diff(status["gnss_glitch"], prepend=0.0) > 0.0)
-    said = "the autopilot's estimator reports a GNSS glitch"
-    lines += [Told(float(status["t"][k]), "glitch", 4, said) for k in rises]
+    text = "the autopilot's estimator reports a GNSS glitch"
+    lines += [TimelineEntry(float(status["t"][k]), "glitch", 4, text) for k in rises]
     return sorted(lines)
 
 
-def refusal(group: Group) -> str:
-    """A group of refusals in words."""
+def describe_rejections(group: RejectionGroup) -> str:
+    """Describe a group of rejections in one line."""
     name = group.source.upper() if group.source.lower().startswith(("gnss", "rsbn")) else group.source
     if group.number == 1:
-        text = f"{name} refused once: {group.reason}"
+        text = f"{name} rejected once: {group.reason}"
     else:
-        lasts = group.end - group.start
-        text = f"{name} refused for {lasts:.1f} s, {group.number} in a row: {group.reason}"
+        duration = group.end - group.start
+        text = f"{name} rejected for {duration:.1f} s, {group.number} in a row: {group.reason}"
     if math.isfinite(group.metres):
-        text += f", up to {group.metres:.1f} m off the estimate"
+        text += f", up to {group.metres:.1f} m from the estimate"
     if math.isfinite(group.value):
-        limit = f" against {group.limit:.3g}" if math.isfinite(group.limit) else ""
+        limit = f", limit {group.limit:.3g}" if math.isfinite(group.limit) else ""
         text += f" (value {group.value:.3g}{limit})"
     return text

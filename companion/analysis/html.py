@@ -1,7 +1,4 @@
-"""The page: everything a report says of one flight or two, in a single HTML file that opens offline.
-
-Words and figures come in; what they mean is settled elsewhere. Plotly's script stands inside the file.
-"""
+"""HTML report of one flight or two, in a single file that opens offline (plotly is embedded)."""
 
 from __future__ import annotations
 
@@ -15,13 +12,19 @@ from typing import NamedTuple
 from companion import __version__
 from companion.analysis import error_statistics
 from companion.analysis.assessment import Assessment
-from companion.analysis.drawing import interactive
-from companion.analysis.gnss_latency import sentence
+from companion.analysis.drawing import to_plotly
 from companion.analysis.plot_data import Figure
-from companion.analysis.replay import CONFIGURATION
-from companion.analysis.summary import clock, comparison, lasting, metres, verdict
+from companion.analysis.summary import (
+    compare_flights,
+    format_duration,
+    format_length,
+    format_time,
+    summarize_flight,
+)
+from companion.importers.gnss_latency import describe_latency
+from companion.storage.run_metadata import CONFIGURATION
 
-#: The chapters in order: title, and the figures that stand in it.
+#: Chapters in order: title and its figures.
 CHAPTERS = (
     ("Track", ("track",)),
     ("Errors", ("error",)),
@@ -33,32 +36,32 @@ CHAPTERS = (
     ("Events", ()),
     ("Configuration", ()),
 )
-BOOTED_NS = 10**18  # a clock before 2001 counts from power-up
-EVENTS = 400  # lines shown of a log's events
+BOOTED_NS = 10**18  # earlier than 2001: the clock counts from power-up
+EVENTS = 400  # maximum number of events shown
 
 
-class Block(NamedTuple):
-    """What stands together: one flight, or two to be compared, their names and their figures."""
+class ReportBlock(NamedTuple):
+    """A section of the report: one flight, or two compared flights, with names and figures."""
 
     names: Sequence[str]
     flights: Sequence[Assessment]
     figures: Sequence[Figure]
 
 
-def page(title: str, blocks: Sequence[Block]) -> str:
-    """The whole HTML: all verdicts first, then the chapters of each block.
+def render_report(title: str, blocks: Sequence[ReportBlock]) -> str:
+    """Return the HTML: first the summaries, then the chapters of each block.
 
-    ModuleNotFoundError where plotly is missing.
+    Raises ModuleNotFoundError if plotly is missing.
     """
     from plotly.offline import get_plotlyjs
 
     here = files("companion.analysis")
     keys = [f"flight{k}_" for k in range(1, len(blocks) + 1)] if len(blocks) > 1 else [""]
     drawn = {
-        key + figure.key: interactive(figure) for key, block in zip(keys, blocks) for figure in block.figures
+        key + figure.key: to_plotly(figure) for key, block in zip(keys, blocks) for figure in block.figures
     }
     data = json.dumps(drawn, separators=(",", ":"))
-    data = data.replace("</", r"<\/")  # no name in a log may end the script
+    data = data.replace("</", r"<\/")  # text from the log must not close the script element
     return "".join(
         (
             "<!doctype html>\n<html lang='en'><head><meta charset='utf-8'>",
@@ -76,20 +79,20 @@ def page(title: str, blocks: Sequence[Block]) -> str:
     )
 
 
-def _head(title: str, blocks: Sequence[Block]) -> str:
+def _head(title: str, blocks: Sequence[ReportBlock]) -> str:
     parts = [f"<header><p class='kind'>Flight report</p><h1>{escape(title)}</h1>"]
     if len(blocks) > 1:
         parts.append(
-            f"<p class='when'>The autopilot began anew {_times(len(blocks) - 1)}: the log holds "
-            f"{len(blocks)} flights, each with chapters of its own.</p>"
+            f"<p class='when'>The autopilot rebooted {_times(len(blocks) - 1)}. The log contains "
+            f"{len(blocks)} flights; each has its own chapters.</p>"
         )
     for block in blocks:
         if len(block.flights) == 2:
-            parts.append(f"<p class='verdict'>{escape(comparison(*block.flights))}</p>")
+            parts.append(f"<p class='summary'>{escape(compare_flights(*block.flights))}</p>")
         for a, name in zip(block.flights, block.names, strict=True):
             named = f"<b class='log'>{escape(name)}</b>" if len(blocks) + len(block.flights) > 2 else ""
             parts.append(_summary(a, named))
-    parts.append("<p class='when'>Drag across a plot to zoom, double-click to see all of it again.</p>")
+    parts.append("<p class='when'>Drag across a plot to zoom; double-click to reset the view.</p>")
     return "".join(parts) + "</header>"
 
 
@@ -98,7 +101,7 @@ def _times(n: int) -> str:
 
 
 def _summary(a: Assessment, named: str) -> str:
-    """Verdict, tiles and date of one flight."""
+    """Return the summary, tiles and date of one flight."""
     when = "Date unknown"
     if a.flight.unix_ns > BOOTED_NS:
         when = datetime.fromtimestamp(a.flight.unix_ns * 1e-9, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
@@ -106,18 +109,18 @@ def _summary(a: Assessment, named: str) -> str:
     flown = f", navigator of companion {escape(version)}" if version else ""
     warn = " bad" if any(row.held is False for row in a.rows) else ""
     return (
-        f"<p class='verdict{warn}'>{named}{escape(verdict(a))}</p>{_tiles(a)}"
-        f"<p class='when'>{when}{flown}; times count from its first message.</p>"
+        f"<p class='summary{warn}'>{named}{escape(summarize_flight(a))}</p>{_tiles(a)}"
+        f"<p class='when'>{when}{flown}; times are relative to its first message.</p>"
     )
 
 
-def _block(key: str, block: Block, headed: bool) -> str:
-    """The chapters of one block; `key` begins the ids of its parts."""
+def _block(key: str, block: ReportBlock, headed: bool) -> str:
+    """Return the chapters of one block; `key` is the prefix of its element ids."""
     drawn = {figure.key: figure for figure in block.figures}
     tables = {
         "Errors": _phases,
         "Consistency": _consistency,
-        "Sources": _refusals,
+        "Sources": _rejections,
         "Messages and clock": _messages,
         "Events": _events,
         "Configuration": _configuration,
@@ -126,7 +129,7 @@ def _block(key: str, block: Block, headed: bool) -> str:
     for title, keys in CHAPTERS:
         inner = "".join(_figure(key, drawn[k]) for k in keys if k in drawn)
         if title in tables:
-            inner += _beside(block, tables[title])
+            inner += _tables_of(block, tables[title])
         if title == "Configuration" and len(block.flights) == 2:
             inner = _differences(block.flights, block.names) + inner
         if inner:
@@ -148,13 +151,13 @@ def _block(key: str, block: Block, headed: bool) -> str:
 
 def _tiles(a: Assessment) -> str:
     corrected = a.errors.get(error_statistics.CORRECTED)
-    worst = max((hole.end - hole.start for hole in a.outages), default=0.0)
+    worst = max((outage.end - outage.start for outage in a.outages), default=0.0)
     held = [row.held for row in a.rows if row.held is not None]
     tiles = [
-        ("duration", lasting(a.flight.seconds)),
-        ("longest without GNSS", lasting(worst) if worst else "–"),
+        ("duration", format_duration(a.flight.seconds)),
+        ("longest without GNSS", format_duration(worst) if worst else "–"),
     ]
-    tiles.append(("largest error", "–" if corrected is None else metres(float(corrected.error.max()))))
+    tiles.append(("largest error", "–" if corrected is None else format_length(float(corrected.error.max()))))
     tiles.append(("bound held in phases", f"{sum(held)} of {len(held)}" if held else "–"))
     inner = "".join(f"<div><dt>{name}</dt><dd>{value}</dd></div>" for name, value in tiles)
     return f"<dl class='tiles'>{inner}</dl>"
@@ -167,8 +170,8 @@ def _figure(key: str, figure: Figure) -> str:
     return f"<figure>{caption}<div class='{kind}' id='plot-{key}{figure.key}'></div>{note}</figure>"
 
 
-def _beside(block: Block, table: Callable[[Assessment], str]) -> str:
-    """A table of each flight, under its name where there are two."""
+def _tables_of(block: ReportBlock, table: Callable[[Assessment], str]) -> str:
+    """Return a table for each flight, headed by its name if there are two."""
     inner = [(name, table(a)) for a, name in zip(block.flights, block.names, strict=True)]
     if len(inner) == 1:
         return inner[0][1]
@@ -176,7 +179,7 @@ def _beside(block: Block, table: Callable[[Assessment], str]) -> str:
 
 
 def _table(head: Sequence[str], rows: Iterable[Sequence[str]], kind: str = "") -> str:
-    """A table; on a narrow screen those of kind "cards" fall apart into a card a row."""
+    """Return a table; on narrow screens tables of kind "cards" show each row as a card."""
     labels = [escape(name) for name in head]
     body = ""
     for row in rows:
@@ -195,53 +198,58 @@ def _table(head: Sequence[str], rows: Iterable[Sequence[str]], kind: str = "") -
 
 def _phases(a: Assessment) -> str:
     if not a.rows or not a.errors:
-        return "<p class='note'>No error can be told: there is no truth and no track to smooth.</p>"
+        return (
+            "<p class='note'>No errors are available: the log has neither a truth nor a track to smooth.</p>"
+        )
     sources = [source for source in error_statistics.SOURCES if source in a.errors]
     head = ["phase", "from", "lasts", *sources, "bound, r.m.s.", "error / bound", "held", "within", "twice"]
     rows: list[list[str]] = []
     for row, phase in zip(a.rows, a.phases, strict=True):
-        cells = [row.phase, clock(phase.start_ns * 1e-9), lasting(row.seconds)]
+        cells = [row.phase, format_time(phase.start_ns * 1e-9), format_duration(row.seconds)]
         for source in sources:
             known = source in row.rms
             cells.append(_both(row.rms[source], row.p95[source]) if known else "–")
-        cells.append("–" if row.bound is None else metres(row.bound))
+        cells.append("–" if row.bound is None else format_length(row.bound))
         cells.append("–" if row.share is None else f"{row.share:.2f}")
         cells.append("–" if row.held is None else "yes" if row.held else "NO")
         cells += ["–" if k is None else f"{100.0 * k:.0f} %" for k in (row.inside, row.inside_twice)]
         rows.append(cells)
-    said = (
-        "" if a.reference is None else f"Horizontal, against {a.reference.what}: r.m.s. / 95th percentile. "
+    about = (
+        ""
+        if a.reference is None
+        else f"Horizontal errors against {a.reference.what}: r.m.s. / 95th percentile. "
     )
     note = (
-        f"{said}The bound is on the r.m.s. error: it held where error / bound, both r.m.s. over the phase, "
-        "is at most 1. Within, twice: the share of moments inside the bound and inside twice the bound."
+        f"{about}The bound limits the r.m.s. error: it held if error / bound (r.m.s. of the phase) is "
+        "at most 1. Within, twice: share of moments with an error within the bound and twice the bound."
     )
     return _table(head, rows, "cards") + f"<p class='note'>{escape(note)}</p>"
 
 
 def _both(rms: float, p95: float) -> str:
-    """Two lengths, the unit once where it is the same."""
-    first, second = metres(rms), metres(p95)
+    """Format two lengths; the unit is written once if both have the same."""
+    first, second = format_length(rms), format_length(p95)
     same = first.split()[-1] == second.split()[-1]
     return f"{first.split()[0] if same else first} / {second}"
 
 
 def _consistency(a: Assessment) -> str:
-    if not a.misfits:
-        return "<p class='note'>The log holds nothing to compare with covariances.</p>"
-    rows = [(m.what, f"{len(m.t)}", f"{m.mean:.2f}", f"{100.0 * m.inside:.1f} %") for m in a.misfits]
-    table = _table(("what", "number", "mean / freedom", "within 95 %"), rows)
+    if not a.normalized_errors:
+        return "<p class='note'>The log has no data to compare with covariances.</p>"
+    rows = [
+        (m.what, f"{len(m.t)}", f"{m.mean:.2f}", f"{100.0 * m.inside:.1f} %") for m in a.normalized_errors
+    ]
+    table = _table(("what", "number", "mean / degrees of freedom", "within 95 %"), rows)
     note = (
-        "NEES: the estimate's error against the truth; NIS: each fix against the estimate before it; "
-        "residuals of a fix from several lines of position. "
-        "A sound filter has a mean of about 1 and 95 % within."
+        "NEES: error of the estimate against the truth. NIS: innovation of each fix. Fix residuals: those "
+        "of a fix from several lines of position. A consistent filter has a mean of about 1 and 95 % within."
     )
     return f"{table}<p class='note'>{note}</p>"
 
 
-def _refusals(a: Assessment) -> str:
+def _rejections(a: Assessment) -> str:
     if not a.groups:
-        return "<p class='note'>Nothing was refused.</p>"
+        return "<p class='note'>No measurement was rejected.</p>"
     counts: dict[tuple[str, str], list[float]] = {}
     for group in a.groups:
         known = counts.setdefault((group.source, group.reason), [0, 0, group.start, group.end])
@@ -249,10 +257,10 @@ def _refusals(a: Assessment) -> str:
         known[1] += 1
         known[3] = group.end
     rows = [
-        (source, reason, f"{n:.0f}", f"{events:.0f}", clock(first), clock(last))
+        (source, reason, f"{n:.0f}", f"{events:.0f}", format_time(first), format_time(last))
         for (source, reason), (n, events, first, last) in counts.items()
     ]
-    return _table(("refused", "why", "number", "events", "first", "last"), rows, "cards")
+    return _table(("rejected", "reason", "number", "events", "first", "last"), rows, "cards")
 
 
 def _messages(a: Assessment) -> str:
@@ -262,7 +270,7 @@ def _messages(a: Assessment) -> str:
             f"{r.number}",
             f"{r.hz:.2f}" if r.number > 1 else "–",
             f"{r.gap:.2f}" if r.number > 1 else "–",
-            clock(r.gap_at),
+            format_time(r.gap_at),
             f"{1e3 * r.latency:.0f} / {1e3 * r.latency_95:.0f}" if r.latency == r.latency else "–",
         )
         for r in a.rates
@@ -277,15 +285,17 @@ def _messages(a: Assessment) -> str:
     ]
     if links:
         table += _table(("link", "received", "lost", "bad", "dropped"), links, "small")
-    told = [sentence(found) + "." for found in a.flight.latencies]
-    note = " ".join(["Gap: the longest between two arrivals. Latency: median / 95th percentile.", *told])
+    latencies = [describe_latency(found) + "." for found in a.flight.latencies]
+    note = " ".join(
+        ["Gap: the longest time between two arrivals. Latency: median / 95th percentile.", *latencies]
+    )
     return f"{table}<p class='note'>{escape(note)}</p>"
 
 
 def _events(a: Assessment) -> str:
-    rows = [(clock(line.t), line.kind, line.text) for line in a.timeline[:EVENTS]]
+    rows = [(format_time(line.t), line.kind, line.text) for line in a.timeline[:EVENTS]]
     more = len(a.timeline) - len(rows)
-    note = f"<p class='note'>{more} more are in the log.</p>" if more else ""
+    note = f"<p class='note'>{more} more events are in the log.</p>" if more else ""
     return f"<div class='long'>{_table(('at', 'what', 'text'), rows, 'events')}</div>{note}"
 
 
@@ -295,16 +305,16 @@ def _configuration(a: Assessment) -> str:
         text = values.get("toml") if name == CONFIGURATION else None
         text = "\n".join(f"{key} = {value}" for key, value in values.items()) if text is None else text
         parts.append(f"<details><summary>{escape(name)}</summary><pre>{escape(text)}</pre></details>")
-    return "".join(parts) or "<p class='note'>The log does not tell its configuration.</p>"
+    return "".join(parts) or "<p class='note'>The log does not contain its configuration.</p>"
 
 
 def _differences(flights: Sequence[Assessment], names: Sequence[str]) -> str:
-    """The lines in which two configurations differ."""
+    """Return a table of the keys in which two configurations differ."""
     texts = [a.flight.metadata.get(CONFIGURATION, {}).get("toml", "") for a in flights]
     settings = [_settings(text) for text in texts]
     keys = [key for key in {**settings[0], **settings[1]} if settings[0].get(key) != settings[1].get(key)]
     if not keys:
-        return "<p class='note'>Both flew with the same configuration.</p>"
+        return "<p class='note'>Both flights had the same configuration.</p>"
     return _table(("key", *names), [(key, *(s.get(key, "–") for s in settings)) for key in keys])
 
 

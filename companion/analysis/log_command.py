@@ -1,4 +1,4 @@
-"""`companion log`: what a log holds, and a torn one made whole. Words only; the work is in `file`."""
+"""`companion log`: show the contents of a log, recover a torn log, convert a log of another recorder."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from companion.storage.flight_log import Info, LogError, info, recover
 
 @click.group("log")
 def group() -> None:
-    """Look into logs and repair them."""
+    """Inspect, recover and convert logs."""
 
 
 @group.command("info")
 @click.argument("log", type=click.Path(path_type=Path))
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
 def info_command(log: Path, as_json: bool) -> None:
-    """Say what LOG holds: messages by topic, times, metadata, whether it was closed."""
+    """Show the contents of LOG: messages by topic, times, metadata, and whether it was closed."""
     try:
         found = info(log)
     except LogError as error:
@@ -40,13 +40,13 @@ def info_command(log: Path, as_json: bool) -> None:
 @group.command("recover")
 @click.argument("log", type=click.Path(path_type=Path))
 def recover_command(log: Path) -> None:
-    """Make a torn or damaged LOG whole (x.mcap.active becomes x.mcap, x.mcap gets x.recovered.mcap)."""
+    """Recover a torn or damaged LOG (x.mcap.active becomes x.mcap; x.mcap is copied to x.recovered.mcap)."""
     try:
         saved = recover(log)
     except LogError as error:
         _fail(error)
     if saved.path == log:
-        click.echo(f"{log} is whole: {saved.messages} messages in {saved.chunks} chunks")
+        click.echo(f"{log} is complete: {saved.messages} messages in {saved.chunks} chunks")
     else:
         click.echo(
             f"{saved.path}: {saved.messages} messages in {saved.chunks} chunks saved,"
@@ -56,13 +56,13 @@ def recover_command(log: Path) -> None:
 
 @group.command("convert")
 @click.argument("source", type=click.Path(path_type=Path))
-@click.option("-o", "--output", type=click.Path(path_type=Path), required=True, help="The MCAP to write.")
+@click.option("-o", "--output", type=click.Path(path_type=Path), required=True, help="MCAP file to write.")
 def convert_command(source: Path, output: Path) -> None:
-    """Write the records of SOURCE, a log of another recorder, as MCAP: inputs and truth, nothing computed."""
+    """Convert SOURCE, a log of another recorder, to MCAP: inputs and truth only, nothing computed."""
     from companion.analysis import convert
 
     try:
-        written = convert.convert(source, output)
+        written = convert.convert_log(source, output)
     except LogError as error:
         _fail(error)
     click.echo(f"{output}: {written.records} records, {written.reboots} reboots")
@@ -71,7 +71,9 @@ def convert_command(source: Path, output: Path) -> None:
 def _print(found: Info) -> None:
     console = Console()
     rate = 1.0 / found.duration_s if found.duration_s > 0 else 0.0
-    state = "closed" if found.closed else f"torn ({found.bytes_lost} bytes unreadable: companion log recover)"
+    state = (
+        "closed" if found.closed else f"torn ({found.bytes_lost} bytes unreadable; run companion log recover)"
+    )
     console.print(f"[bold]{escape(str(found.path))}[/]  {found.bytes / 1e6:.3f} MB, {state}", soft_wrap=True)
     if found.messages:
         start = datetime.fromtimestamp(found.start_ns / 1e9, UTC).isoformat(timespec="milliseconds")

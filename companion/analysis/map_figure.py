@@ -1,6 +1,6 @@
-"""The map of a flight: fixes, the estimate, the reference and the guaranteed bound, in a local plane.
+"""Map of a flight: fixes, estimate, reference and guaranteed bound, in metres north and east.
 
-Metres north and east of the first position; no tiles, so that it needs no network.
+It has no map tiles and needs no network.
 """
 
 from __future__ import annotations
@@ -12,23 +12,23 @@ import numpy as np
 
 from companion.analysis import error_statistics, flight_events
 from companion.analysis.assessment import Assessment
-from companion.analysis.flight_arrays import Floats
-from companion.analysis.plot_data import COLOURS, Figure, Line, strided
+from companion.analysis.plot_data import COLOURS, Figure, Line, subsample
+from companion.units import Floats
 
-CIRCLES = 9
+ELLIPSES = 9
 BOUND = "guaranteed bound"
 
 
-def track(flights: Sequence[Assessment], prefixes: Sequence[str]) -> Figure:
-    """The map of one flight or two; seen at first is where the aircraft was, not all of the bound."""
+def build_map(flights: Sequence[Assessment], prefixes: Sequence[str]) -> Figure:
+    """Build the map of one flight or two. The initial view covers the tracks, not the whole bound."""
     plane = flights[0]
     lines: list[Line] = []
     frame: list[Line] = []
     for which, (a, prefix) in enumerate(zip(flights, prefixes, strict=True)):
-        framed = list(_tracks(plane, a, prefix, which))
+        framed = list(_track_lines(plane, a, prefix, which))
         frame += framed
         lines += framed
-        lines += _far(plane, a, prefix, which)
+        lines += _far_lines(plane, a, prefix, which)
     bounded = any(line.name.endswith(BOUND) and len(line.x) for line in lines)
     return Figure(
         "track",
@@ -36,14 +36,14 @@ def track(flights: Sequence[Assessment], prefixes: Sequence[str]) -> Figure:
         "east, m",
         "north, m",
         [line for line in lines if len(line.x)],
-        "Ellipses: the guaranteed r.m.s. bound where there were no fixes." if bounded else "",
+        "Ellipses: the guaranteed r.m.s. bound in phases without fixes." if bounded else "",
         equal=True,
         view=_view([line for line in frame if np.isfinite(line.x).any()]),
     )
 
 
-def _tracks(plane: Assessment, a: Assessment, prefix: str, which: int) -> Iterator[Line]:
-    """Where the aircraft was, by all accounts."""
+def _track_lines(plane: Assessment, a: Assessment, prefix: str, which: int) -> Iterator[Line]:
+    """Yield the lines that the initial view covers: GNSS, reference, estimate."""
     gnss, solution = flight_events.usable_gnss(a.flight), a.flight.tables["Solution"]
     yield _line(
         plane, f"{prefix}GNSS fixes", error_statistics.GNSS, which, gnss["lat"], gnss["lon"], dots=True
@@ -55,30 +55,36 @@ def _tracks(plane: Assessment, a: Assessment, prefix: str, which: int) -> Iterat
     )
 
 
-def _far(plane: Assessment, a: Assessment, prefix: str, which: int) -> Iterator[Line]:
-    """What may lie far from it: fixes of beacons, the bound, the beacons."""
-    fix, radio, rsbn = a.flight.tables["Fix"], flight_events.is_radio(a.flight), a.flight.tables["RsbnFix"]
+def _far_lines(plane: Assessment, a: Assessment, prefix: str, which: int) -> Iterator[Line]:
+    """Yield the lines that may be far away: beacon fixes, bound, beacons."""
+    fix, radio, rsbn = (
+        a.flight.tables["Fix"],
+        flight_events.rests_on_beacons(a.flight),
+        a.flight.tables["RsbnFix"],
+    )
     lat, lon = fix["lat"][radio], fix["lon"][radio]
     yield _line(plane, f"{prefix}RSBN fixes", error_statistics.RSBN, which, lat, lon, dots=True)
     yield _ellipses(plane, a, prefix, which)
     first = np.unique(rsbn["beacon"], return_index=True)[1]
     yield _line(
-        plane, f"{prefix}beacons", "refused", which, rsbn["lat"][first], rsbn["lon"][first], dots=True
+        plane, f"{prefix}beacons", "rejected", which, rsbn["lat"][first], rsbn["lon"][first], dots=True
     )
 
 
 def _line(
     plane: Assessment, name: str, role: str, which: int, lat: Floats, lon: Floats, dots: bool = False
 ) -> Line:
-    north, east = plane.north_east(strided(lat), strided(lon))
+    north, east = plane.north_east(subsample(lat), subsample(lon))
     return Line(name, east, north, COLOURS[role][which], "dots" if dots else "line")
 
 
 def _ellipses(plane: Assessment, a: Assessment, prefix: str, which: int) -> Line:
-    """The guaranteed bound, evenly in time over the stretches without fixes."""
+    """Draw the guaranteed bound at instants evenly spaced over the phases without fixes."""
     solution = a.flight.tables["Solution"]
-    lone = np.flatnonzero(np.isfinite(solution["bound_north"]) & (solution["sources"] <= 1))
-    chosen = lone[np.linspace(0, len(lone) - 1, min(CIRCLES, len(lone))).astype(int)]
+    without_fixes = np.flatnonzero(np.isfinite(solution["bound_north"]) & (solution["sources"] <= 1))
+    chosen = without_fixes[
+        np.linspace(0, len(without_fixes) - 1, min(ELLIPSES, len(without_fixes))).astype(int)
+    ]
     angle = np.append(np.linspace(0.0, math.tau, 49), math.nan)
     north, east = plane.north_east(solution["lat"][chosen], solution["lon"][chosen])
     x = (east[:, None] + solution["bound_east"][chosen, None] * np.sin(angle)).ravel()

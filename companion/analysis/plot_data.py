@@ -1,7 +1,4 @@
-"""What a plot is, before it is drawn: lines and dots with names, as data, thinned so that every peak stays.
-
-`draw` makes it visible, on a page or on paper. It knows nothing of flights.
-"""
+"""Plot data: named lines and dots, thinned without losing extremes; `drawing` renders them."""
 
 from __future__ import annotations
 
@@ -11,12 +8,12 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from companion.analysis import error_statistics
-from companion.analysis.flight_arrays import Floats
+from companion.units import Floats
 
-MOST = 3000  # points of a line: about the pixels of a screen, twice
+MAX_POINTS = 3000  # per line: about twice the pixels of a screen
 Style = Literal["line", "dots"]
 
-#: A colour for each role, for the first log and for the second. Chosen to be told apart by colour-blind eyes.
+#: Colours by role, for the first and the second log; distinguishable for colour-blind readers.
 COLOURS = {
     "reference": ("#374151", "#9ca3af"),
     error_statistics.CORRECTED: ("#2563eb", "#db2777"),
@@ -24,13 +21,13 @@ COLOURS = {
     error_statistics.GNSS: ("#f59e0b", "#a16207"),
     error_statistics.RSBN: ("#10b981", "#065f46"),
     "bound": ("#dc2626", "#7c2d12"),
-    "refused": ("#111827", "#6b7280"),
+    "rejected": ("#111827", "#6b7280"),
     "second": ("#0891b2", "#155e75"),
 }
 
 
 class Line(NamedTuple):
-    """Points (x, y), joined or not; NaN lifts the pen."""
+    """Points (x, y), joined or not; NaN is a gap."""
 
     name: str
     x: Floats
@@ -42,11 +39,11 @@ class Line(NamedTuple):
 
 
 class Figure(NamedTuple):
-    """A plot: `key` names it in the page and as a file, `note` says how to read it.
+    """A plot; `key` is its name in the page and its file name, `note` explains how to read it.
 
-    `spans` are shaded stretches of x with a name. `equal` asks for the same scale on both axes, `zero` for y
-    from 0; `view` is what is seen at first: x from, to, y from, to. `level` is a y to compare with; `rows`
-    name y = 1, 2 ...
+    `spans`: shaded intervals of x with a name. `equal`: same scale on both axes. `zero`: y starts at 0.
+    `view`: initial view, x from, to, y from, to. `level`: horizontal reference line. `rows`: names of
+    y = 1, 2, ...
     """
 
     key: str
@@ -65,25 +62,25 @@ class Figure(NamedTuple):
 
 
 TIME = "time, min"
-LETTERS = "AB"  # what two flights compared are called
+LETTERS = "AB"  # names of two compared flights
 
 
-def thinned(x: Floats, y: Floats, most: int = MOST) -> tuple[Floats, Floats]:
-    """The line with at most about `most` points: of each stretch of it the lowest and the highest stay."""
+def thin_line(x: Floats, y: Floats, most: int = MAX_POINTS) -> tuple[Floats, Floats]:
+    """Thin a line to about `most` points, keeping the minimum and the maximum of each interval."""
     n = len(x)
     if n <= most:
         return x, y
     width = math.ceil(2 * n / most)
     whole = n // width * width
-    stretches = y[:whole].reshape(-1, width)
-    empty = ~np.isfinite(stretches)
-    low = np.where(empty, np.inf, stretches).argmin(axis=1)
-    high = np.where(empty, -np.inf, stretches).argmax(axis=1)
+    intervals = y[:whole].reshape(-1, width)
+    empty = ~np.isfinite(intervals)
+    low = np.where(empty, np.inf, intervals).argmin(axis=1)
+    high = np.where(empty, -np.inf, intervals).argmax(axis=1)
     start = np.arange(0, whole, width)
     keep = np.unique(np.concatenate([start + low, start + high, [0, n - 1]]))
     return x[keep], y[keep]
 
 
-def strided(a: Floats, most: int = MOST) -> Floats:
-    """At most `most` of them, evenly."""
+def subsample(a: Floats, most: int = MAX_POINTS) -> Floats:
+    """Return at most `most` values, evenly spaced."""
     return a[:: max(1, math.ceil(len(a) / most))]

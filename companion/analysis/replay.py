@@ -1,10 +1,9 @@
-"""`companion replay`: the navigator that flew, over any log; our own logs must give the same outputs bit for
-bit.
+"""`companion replay`: run the navigator over a log; outputs for our own logs must equal those of the flight.
 
-An MCAP log of ours holds what went into the navigator, what came out and the configuration: its inputs are
-handed in again and every output is compared. Any other log has inputs only (`log.sources`); what comes out is
-written. So it is where the replay is to differ from the flight: another configuration (--with), beacons that
-were not heard (--rsbn), fixes that did not come (--outage).
+Our own MCAP log contains inputs, outputs and configuration: the inputs are replayed and every output is
+compared (see `comparison`). The log of another recorder contains inputs only (see `importers.sources`): the
+outputs are written. The same applies to a replay with changes: another configuration (--with), simulated
+beacons (--rsbn), simulated outages (--outage).
 """
 
 from __future__ import annotations
@@ -13,7 +12,6 @@ import json
 import time
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from itertools import zip_longest
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,21 +19,27 @@ import click
 from rich.console import Console
 from rich.progress import Progress
 
-from companion import __version__
-from companion.analysis import gnss_latency, simulated_rsbn
-from companion.analysis.output_guard import refuse_own_input
-from companion.analysis.replay_inputs import changed, has_flown, is_own, sentences, with_radio
-from companion.config import Config, load, parse, to_toml
+from companion.analysis import simulated_rsbn
+from companion.analysis.comparison import TOLERANCE, OutputComparison
+from companion.analysis.output_guard import reject_own_input
+from companion.analysis.replay_inputs import (
+    apply_changes,
+    has_navigator_outputs,
+    input_errors_as_log_errors,
+    is_own_log,
+    with_beacons_and_outages,
+)
+from companion.config import Config, load
+from companion.importers import gnss_latency
 from companion.navigator import Navigator
 from companion.records import INPUTS, OUTPUTS, Event, Reboot, Solution, Stamped
 from companion.storage import flight_log
 from companion.storage.reader import LogError, is_closed
+from companion.storage.run_metadata import PLATFORM, logged_configuration, numerical_platform, run_metadata
 
-CONFIGURATION = "configuration"  # the metadata record, and its key `toml`
 
-
-class Part(NamedTuple):
-    """A flight of the log: from, to (s since the log's first input), inputs and solutions."""
+class FlightPart(NamedTuple):
+    """A flight in the log: start and end (s since the first input), counts of inputs and solutions."""
 
     start_s: float
     end_s: float
@@ -43,23 +47,28 @@ class Part(NamedTuple):
     solutions: int
 
 
-class Replayed(NamedTuple):
-    """What a replay saw; a reboot begins a flight. Of `compared` outputs `different` are not as in flight."""
+class ReplayResult(NamedTuple):
+    """Counts of a replay; a reboot starts a new flight. `different` of the `compared` outputs differ from the
+    flight: not bit for bit if the log was written on this platform (`exact`), beyond the tolerance otherwise.
+    `apart_m` is the greatest distance between a solution in flight and the same one now (m).
+    """
 
     inputs: int
     outputs: dict[str, int]
-    flights: list[Part]
-    compared: int | None
-    different: int
-    first_difference: str | None
+    flights: list[FlightPart]
+    compared: int | None = None
+    different: int = 0
+    first_difference: str | None = None
+    exact: bool = True
+    apart_m: float = 0.0
 
 
-class _Count:
-    """Counts what goes into a navigator and what comes out, by flight."""
+class _ReplayCounter:
+    """Counts the inputs and outputs of a navigator, by flight."""
 
     def __init__(self) -> None:
         self.outputs = Counter[str]()
-        self._parts: list[list[int]] = []  # of each flight: first and last arrival (ns), inputs, solutions
+        self._parts: list[list[int]] = []  # per flight: first and last arrival (ns), inputs, solutions
 
     def input(self, record: Stamped) -> None:
         """Count one input."""
@@ -74,46 +83,32 @@ class _Count:
         self.outputs[type(record).__name__] += 1
         self._parts[-1][3] += isinstance(record, Solution)
 
-    def found(self, compared: int | None, different: int = 0, first: str | None = None) -> Replayed:
-        """Everything counted."""
+    def result(self, comparison: OutputComparison | None = None) -> ReplayResult:
+        """Return everything counted."""
         zero_ns = self._parts[0][0] if self._parts else 0
-        parts = [Part((a - zero_ns) * 1e-9, (b - zero_ns) * 1e-9, *n) for a, b, *n in self._parts]
-        inputs = sum(part.inputs for part in parts)
-        return Replayed(inputs, dict(self.outputs), parts, compared, different, first)
+        parts = [FlightPart((a - zero_ns) * 1e-9, (b - zero_ns) * 1e-9, *n) for a, b, *n in self._parts]
+        counted = ReplayResult(sum(part.inputs for part in parts), dict(self.outputs), parts)
+        if comparison is None:
+            return counted
+        return counted._replace(
+            compared=comparison.compared,
+            different=comparison.different,
+            first_difference=comparison.first,
+            exact=comparison.exact,
+            apart_m=comparison.apart_m,
+        )
 
 
-def metadata(config: Config) -> dict[str, dict[str, str]]:
-    """What every log of ours says of itself."""
-    return {CONFIGURATION: {"toml": to_toml(config)}, "companion": {"version": __version__}}
-
-
-def configuration(path: Path) -> Config:
-    """The configuration that flew with the log at `path`, the default one where none is told."""
-    text = flight_log.metadata(path).get(CONFIGURATION, {}).get("toml")
-    return Config() if text is None else parse(text, f"{path} (its own configuration)")
-
-
-def replay_own(path: Path, config: Config, sink: Any = None) -> Replayed:
-    """Hand the log's inputs to a navigator and compare what comes out with what came out in flight."""
-    navigator, count = Navigator(config), _Count()
-    compared = different = 0
-    first: str | None = None
+def replay_own(path: Path, config: Config, sink: Any = None) -> ReplayResult:
+    """Replay the inputs of our own log and compare the outputs with those of the flight."""
+    navigator, count = Navigator(config), _ReplayCounter()
+    comparison = OutputComparison(flight_log.metadata(path).get(PLATFORM) == numerical_platform())
     ours: list[Stamped] = []
     flown: list[Stamped] = []
 
-    def settle() -> None:
-        nonlocal compared, different, first
-        for then, now in zip_longest(flown, ours):
-            compared += 1
-            if then != now:
-                different += 1
-                first = first or f"in flight {then}, now {now}"
-        flown.clear()
-        ours.clear()
-
     for entry in flight_log.read(path):
         if entry.topic.startswith("/in/") and isinstance(entry.value, Stamped):
-            settle()
+            comparison.add(flown, ours)
             count.input(entry.value)
             if sink is not None:
                 sink.record(entry.value)
@@ -124,28 +119,28 @@ def replay_own(path: Path, config: Config, sink: Any = None) -> Replayed:
                     sink.record(output)
         elif entry.topic.startswith("/out/") and isinstance(entry.value, Stamped):
             flown.append(entry.value)
-    settle()
-    return count.found(compared, different, first)
+    comparison.add(flown, ours)
+    return count.result(comparison)
 
 
-def replay_foreign(records: Iterable[Stamped], config: Config, sink: Any) -> Replayed:
-    """Hand the records of a foreign log to a navigator, and write everything to `sink`."""
-    navigator, count = Navigator(config), _Count()
+def replay_foreign(records: Iterable[Stamped], config: Config, sink: Any) -> ReplayResult:
+    """Replay the records of another recorder's log and write inputs and outputs to `sink`."""
+    navigator, count = Navigator(config), _ReplayCounter()
     for record in records:
-        told = isinstance(record, OUTPUTS)  # by the source, not by the navigator
-        sink.record(record, f"/link/{type(record).__name__}" if told else None)
+        from_importer = isinstance(record, OUTPUTS)
+        sink.record(record, f"/link/{type(record).__name__}" if from_importer else None)
         if isinstance(record, INPUTS):
             count.input(record)
             for output in navigator.handle(record):  # type: ignore[arg-type]
                 count.output(output)
                 sink.record(output)
-    return count.found(None)
+    return count.result()
 
 
-def writer(
+def create_replay_log(
     path: Path, described: Mapping[str, Mapping[str, str]], start_ns: int = 0, start_unix_ns: int = 0
 ) -> flight_log.Writer:
-    """A log for a replay: it waits for the disk, since nobody flies by it."""
+    """Create a log for a replay, which waits for the disk instead of dropping messages."""
     return flight_log.Writer(
         path, metadata=described, start_unix_ns=start_unix_ns, start_ns=start_ns, block=True
     )
@@ -153,22 +148,20 @@ def writer(
 
 @click.command("replay")
 @click.argument("log", type=click.Path(path_type=Path))
+@click.option("-o", "--output", type=click.Path(path_type=Path), help="MCAP file to write.")
+@click.option("--config", "config_file", type=click.Path(path_type=Path), help="Use this configuration.")
 @click.option(
-    "-o", "--output", type=click.Path(path_type=Path), help="Where to write the MCAP of this replay."
+    "--with", "changes", multiple=True, metavar="KEY=VALUE,...", help="Change these configuration keys."
 )
-@click.option("--config", "config_file", type=click.Path(path_type=Path), help="Fly with this configuration.")
-@click.option(
-    "--with", "changes", multiple=True, metavar="KEY=VALUE,...", help="Fly with these keys changed."
-)
-@click.option("--rsbn", "beacons", type=click.Path(path_type=Path), help="Hear the beacons of this CSV.")
+@click.option("--rsbn", "beacons", type=click.Path(path_type=Path), help="Simulate the beacons of this CSV.")
 @click.option(
     "--outage",
     "outages",
     multiple=True,
     metavar="GNSS:FROM-TO",
-    help="Be deaf to GNSS or RSBN, s of the log.",
+    help="Remove GNSS or RSBN in this interval, s of the log.",
 )
-@click.option("--seed", type=click.IntRange(min=0), default=0, help="Of the simulated beacons' noise.")
+@click.option("--seed", type=click.IntRange(min=0), default=0, help="Seed of the noise of simulated beacons.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 def command(
     log: Path,
@@ -180,36 +173,36 @@ def command(
     seed: int,
     as_json: bool,
 ) -> None:
-    """Run the navigator over LOG: an MCAP of ours (outputs compared bit for bit), or another recorder's.
+    """Run the navigator over LOG: our own MCAP (outputs are compared with the flight), or another recorder's.
 
-    Read are MAVLink .tlog, ArduPilot .bin and .log, PX4 .ulg and folders of topics as CSV, InertialNav's .mat
-    and .zip. What differs from a flight of ours is written to OUTPUT (by default beside you, as
-    NAME.replay.mcap). The CSV of beacons has columns id, lat_deg, lon_deg, alt_m and, if you like, range_m;
-    OurAirports' navaids.csv is read too.
+    Supported logs: MAVLink .tlog, ArduPilot .bin and .log, PX4 .ulg and folders of topics as CSV,
+    InertialNav .mat and .zip. A replay of another recorder's log, or with changes, is written to OUTPUT (by
+    default NAME.replay.mcap in the current folder). The CSV of beacons has the columns id, lat_deg, lon_deg,
+    alt_m and optionally range_m; OurAirports' navaids.csv is also accepted.
     """
-    begun = time.perf_counter()
+    start = time.perf_counter()
     try:
-        silent = [simulated_rsbn.parse_outage(text) for text in outages]
+        simulated_outages = [simulated_rsbn.parse_outage(text) for text in outages]
     except ValueError as error:
         raise click.UsageError(str(error)) from None
-    own = is_own(log)
-    config = load(config_file) if config_file or not own else configuration(log)
+    own = is_own_log(log)
+    config = load(config_file) if config_file or not own else logged_configuration(log)
     if changes:
-        config = changed(config, ",".join(changes))
+        config = apply_changes(config, ",".join(changes))
     notes: list[str] = []
     counts: dict[str, int] = {}
     if own and not is_closed(log):
-        notes.append("the log was not closed: what came last is missing")
+        notes.append("the log was not closed: its last messages may be missing")
     if output is not None:
-        refuse_own_input(output, log, beacons, config_file)
-    if has_flown(log) and not (changes or beacons or silent):
-        found = _compare(log, output, config)
+        reject_own_input(output, log, beacons, config_file)
+    if has_navigator_outputs(log) and not (changes or beacons or simulated_outages):
+        found = _replay_as_flown(log, output, config)
     else:
         output = output or Path(f"{log.name.split('.mcap')[0] if own else log.stem}.replay.mcap")
-        with sentences():
-            found, more, counts = _fly(log, output, config, beacons, silent, seed)
+        with input_errors_as_log_errors():
+            found, more, counts = _replay_changed(log, output, config, beacons, simulated_outages, seed)
         notes += more
-    seconds = time.perf_counter() - begun
+    seconds = time.perf_counter() - start
     if as_json:
         report = {"log": str(log), **counts, **found._asdict(), "notes": notes, "seconds": round(seconds, 3)}
         report["flights"] = [part._asdict() for part in found.flights]
@@ -222,69 +215,79 @@ def command(
         raise SystemExit(1)
 
 
-def _compare(log: Path, output: Path | None, config: Config) -> Replayed:
-    """A log of ours as it flew."""
+def _replay_as_flown(log: Path, output: Path | None, config: Config) -> ReplayResult:
+    """Replay our own log unchanged."""
     first = next(iter(flight_log.read(log)), None)
     if first is None:
-        raise LogError(f"{log} holds no message: there is nothing to replay")
+        raise LogError(f"{log} contains no messages: nothing to replay")
     sink = None
     if output is not None:
-        sink = writer(output, metadata(config), getattr(first.value, "rx_ns", 0), first.log_time)
+        sink = create_replay_log(
+            output, run_metadata(config), getattr(first.value, "rx_ns", 0), first.log_time
+        )
     found = replay_own(log, config, sink)
     if sink is not None:
         sink.close()
     if not found.inputs:
-        raise LogError(f"{log} holds nothing that a navigator was given: there is nothing to replay")
+        raise LogError(f"{log} contains no inputs of a navigator: nothing to replay")
     return found
 
 
-def _fly(
+def _replay_changed(
     log: Path,
     output: Path,
     config: Config,
     beacons: Path | None,
-    outages: Sequence[simulated_rsbn.Outage],
+    outages: Sequence[simulated_rsbn.SimulatedOutage],
     seed: int,
-) -> tuple[Replayed, list[str], dict[str, int]]:
-    """Any log, otherwise than it flew, written to `output`: what came out, notes for the reader, counts."""
-    opened, note = with_radio(log, beacons, outages, seed, config)
-    watch, told = gnss_latency.Watch(), set[Stamped]()
+) -> tuple[ReplayResult, list[str], dict[str, int]]:
+    """Replay any log, with changes, and write it to `output`. Return result, notes, counts."""
+    log_inputs, note = with_beacons_and_outages(log, beacons, outages, seed, config)
+    tracks, logged = gnss_latency.TrackCollector(), set[Stamped]()
     with Progress(console=Console(stderr=True), transient=True) as progress:
-        records = progress.track(_watched(opened.records, watch, told), description=f"replay {log.name}")
-        sink = writer(output, metadata(config), *_start(log))
+        records = progress.track(
+            _observe(log_inputs.records, tracks, logged), description=f"replay {log.name}"
+        )
+        sink = create_replay_log(output, run_metadata(config), *_start_times(log))
         try:
             found = replay_foreign(records, config, sink)
-            seen = [gnss_latency.look(track) for track in watch.tracks()]
-            for event in set(gnss_latency.events(seen)) - told:
+            analyses = [gnss_latency.analyze_track(track) for track in tracks.tracks()]
+            for event in set(gnss_latency.glitch_events(analyses)) - logged:
                 sink.record(event, "/link/Event")
         finally:
             sink.close()
     notes = [note] if note else []
     if outages and config.channel == "local_position" and not config.inertial.independent:
-        notes.append("the log's local position is as the autopilot had it, its own GNSS included")
+        notes.append(
+            "the local position in the log includes the effect of the autopilot's own GNSS during the outage"
+        )
     end_s = found.flights[-1].end_s if found.flights else 0.0
     late = (outage for outage in outages if outage.start > end_s)
-    notes += [f"{outage} silenced nothing: the log ends at {end_s:.0f} s" for outage in late]
-    return found, [*notes, *gnss_latency.sentences(seen)], opened.summary()
+    notes += [f"{outage} has no effect: the log ends at {end_s:.0f} s" for outage in late]
+    return found, [*notes, *gnss_latency.describe_analyses(analyses)], log_inputs.summary()
 
 
-def _start(log: Path) -> tuple[int, int]:
-    """A record's time and the wall clock's at it: a foreign log's times are UNIX already, or since boot."""
-    if not is_own(log):
+def _start_times(log: Path) -> tuple[int, int]:
+    """Return time and wall-clock time of the first record; (0, 0) for the log of another recorder."""
+    if not is_own_log(log):
         return 0, 0
     first = next(iter(flight_log.read(log)), None)
     return (0, 0) if first is None else (getattr(first.value, "rx_ns", 0), first.log_time)
 
 
-def _watched(records: Iterable[Stamped], watch: gnss_latency.Watch, told: set[Stamped]) -> Iterator[Stamped]:
+def _observe(
+    records: Iterable[Stamped], tracks: gnss_latency.TrackCollector, logged: set[Stamped]
+) -> Iterator[Stamped]:
     for record in records:
-        watch.see(record)
+        tracks.add(record)
         if isinstance(record, Event):
-            told.add(record)
+            logged.add(record)
         yield record
 
 
-def _print(log: Path, output: Path | None, counts: dict[str, int], found: Replayed, seconds: float) -> None:
+def _print(
+    log: Path, output: Path | None, counts: dict[str, int], found: ReplayResult, seconds: float
+) -> None:
     click.echo(f"{log}: {found.inputs} inputs in {seconds:.1f} s")
     if counts:
         click.echo("  " + ", ".join(f"{value} {name}" for name, value in counts.items()))
@@ -292,16 +295,26 @@ def _print(log: Path, output: Path | None, counts: dict[str, int], found: Replay
         "  out: " + (", ".join(f"{n} {name}" for name, n in sorted(found.outputs.items())) or "nothing")
     )
     if len(found.flights) > 1:
-        click.echo(f"  {len(found.flights)} flights, the autopilot having begun anew in between:")
+        click.echo(f"  {len(found.flights)} flights, separated by reboots of the autopilot:")
         for k, part in enumerate(found.flights, start=1):
             span = f"{part.start_s:.1f} to {part.end_s:.1f} s"
             click.echo(f"    {k}: {span}, {part.inputs} inputs, {part.solutions} solutions")
     if not found.outputs.get(Solution.__name__):
-        click.echo("  no solution: the log has no local position with an origin, or no fix that was believed")
+        click.echo("  no solution: the log has no local position with an origin, or no fix was accepted")
     if found.compared is not None:
-        same = "all the same, bit for bit" if not found.different else f"{found.different} DIFFERENT"
-        click.echo(f"  compared with the flight: {found.compared} outputs, {same}")
+        click.echo(f"  compared with the flight: {found.compared} outputs, {_comparison(found)}")
         if found.first_difference:
             click.echo(f"  first difference: {found.first_difference}")
     if output is not None:
         click.echo(f"  written to {output}")
+
+
+def _comparison(found: ReplayResult) -> str:
+    distance = f"greatest distance {found.apart_m:.2g} m"
+    if found.exact:
+        same, where = "all the same bit for bit", "computed on this platform"
+    else:
+        same, where = f"all the same within {TOLERANCE}", "computed on another platform"
+    if not found.different:
+        return f"{same} ({where}{'' if found.exact else f': {distance}'})"
+    return f"{found.different} DIFFERENT ({where}; {distance})"

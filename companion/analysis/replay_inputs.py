@@ -1,7 +1,6 @@
-"""A log to be flown otherwise than it was: its inputs with beacons heard, outages had; a configuration with
-keys changed.
+"""Inputs for a replay with changes: simulated beacons, simulated outages, changed configuration keys.
 
-It opens any log, ours or a foreign one, for its inputs alone; `replay` flies them.
+Opens any log, ours or another recorder's, for its inputs only; `replay` runs the navigator over them.
 """
 
 from __future__ import annotations
@@ -24,13 +23,14 @@ from companion.records import Stamped
 from companion.storage import flight_log
 from companion.storage.reader import ACTIVE, LogError
 
-CONVERTED = "converted"  # the metadata record of a log that never flew with us, and its key `from`
+CONVERTED = "converted"  # metadata record of a converted log; its key is `from`
 
 
-def changed(config: Config, text: str) -> Config:
-    """`config` with KEY=VALUE,... as typed: SECTION.KEY, or KEY alone where one section has it, or
-    `estimator` for estimator.output. ConfigError, one sentence, where there is no such key or value, or where
-    they do not go together.
+def apply_changes(config: Config, text: str) -> Config:
+    """Return `config` with the changes KEY=VALUE,... applied.
+
+    KEY is SECTION.KEY, or KEY alone if only one section has it, or `estimator` for estimator.output. Raises
+    ConfigError, one sentence, if a key or value is invalid, or the result is inconsistent.
     """
     pairs = [
         f"{section}.{key}={msgspec.json.encode(value).decode()}"
@@ -51,40 +51,40 @@ def _full_name(name: str) -> str:
         return name
     if name == "estimator":
         return "estimator.output"
-    having = [section for section in Config.__struct_fields__ if hasattr(getattr(Config(), section), name)]
-    if len(having) == 1:
-        return f"{having[0]}.{name}"
-    why = f"sections {', '.join(having)} have one each" if having else "no section has it"
+    sections = [section for section in Config.__struct_fields__ if hasattr(getattr(Config(), section), name)]
+    if len(sections) == 1:
+        return f"{sections[0]}.{name}"
+    why = f"sections {', '.join(sections)} all have this key" if sections else "no section has this key"
     raise ConfigError(f"--with {name}: {why}; write it as SECTION.KEY=VALUE, for example gnss.sigma_m=3.0")
 
 
-class Opened(NamedTuple):
-    """The inputs of any log, and what it was given for its times: `summary` counts once they are read."""
+class LogInputs(NamedTuple):
+    """The inputs of a log; `summary` returns the importer's counts after they are read."""
 
     records: Iterable[Stamped]
     summary: Callable[[], dict[str, int]]
 
 
-def inputs(log: Path) -> Opened:
-    """What went into a navigator in `log`, ours or a foreign one, with the truth where it has any.
+def open_inputs(log: Path) -> LogInputs:
+    """Open the inputs of a log, ours or another recorder's, with the truth if it has one.
 
-    LogError, one sentence, where it cannot be read.
+    Raises LogError, one sentence, if it cannot be read.
     """
-    if is_own(log):
-        return Opened(_own_inputs(log), dict)
-    with sentences():
+    if is_own_log(log):
+        return LogInputs(_own_inputs(log), dict)
+    with input_errors_as_log_errors():
         source = sources.open_source(log)
-    return Opened(source, lambda: source.summary()._asdict())
+    return LogInputs(source, lambda: source.summary()._asdict())
 
 
-def is_own(log: Path) -> bool:
-    """Whether the name is that of a log of ours."""
+def is_own_log(log: Path) -> bool:
+    """Return whether the file name is that of our own log (MCAP)."""
     return log.suffix == ".mcap" or log.name.endswith(f".mcap{ACTIVE}")
 
 
-def has_flown(log: Path) -> bool:
-    """Whether a log is of ours and holds what a navigator gave out: it is no other recorder's, converted."""
-    return is_own(log) and CONVERTED not in flight_log.metadata(log)
+def has_navigator_outputs(log: Path) -> bool:
+    """Return whether a log is our own and has navigator outputs, that is, was not converted."""
+    return is_own_log(log) and CONVERTED not in flight_log.metadata(log)
 
 
 def _own_inputs(log: Path) -> Iterator[Stamped]:
@@ -94,8 +94,8 @@ def _own_inputs(log: Path) -> Iterator[Stamped]:
 
 
 @contextmanager
-def sentences() -> Iterator[None]:
-    """What a foreign log's reader says in a ValueError is for the person who gave the log."""
+def input_errors_as_log_errors() -> Iterator[None]:
+    """Convert ValueError and OSError of the importers to LogError, which is shown to the user."""
     try:
         yield
     except ConfigError:
@@ -108,30 +108,34 @@ def sentences() -> Iterator[None]:
         raise LogError(f"{error.filename} cannot be read: {error.strerror}") from None
 
 
-def with_radio(
-    log: Path, beacons: Path | None, outages: Sequence[simulated_rsbn.Outage], seed: int, config: Config
-) -> tuple[Opened, str]:
-    """The inputs of `log` with beacons heard and outages had, and a sentence about the beacons.
+def with_beacons_and_outages(
+    log: Path,
+    beacons: Path | None,
+    outages: Sequence[simulated_rsbn.SimulatedOutage],
+    seed: int,
+    config: Config,
+) -> tuple[LogInputs, str]:
+    """Open the inputs of `log` with simulated beacons and outages. Return them and a note on the beacons.
 
-    The log is read twice where there are beacons: once for its track.
+    With beacons the log is read twice: first for its track.
     """
-    opened = inputs(log)
+    log_inputs = open_inputs(log)
     if beacons is None and not outages:
-        return opened, ""
-    records = iter(opened.records)
+        return log_inputs, ""
+    records = iter(log_inputs.records)
     first = next(records, None)
     if first is None:
-        raise LogError(f"{log} holds no message: there is nothing to replay")
+        raise LogError(f"{log} contains no messages: nothing to replay")
     merged, note = chain([first], records), ""
     if beacons is not None:
-        track = simulated_rsbn.track_of(inputs(log).records, config)
-        heard = simulated_rsbn.answers(simulated_rsbn.read_beacons(beacons), track, seed)
-        numbers = sorted({answer.beacon for answer in heard})
+        track = simulated_rsbn.extract_track(open_inputs(log).records, config)
+        measurements = simulated_rsbn.simulate_measurements(simulated_rsbn.read_beacons(beacons), track, seed)
+        numbers = sorted({answer.beacon for answer in measurements})
         note = (
-            f"{len(heard)} RSBN answers of {len(numbers)} beacons ({', '.join(map(str, numbers))}) simulated"
-            f" along {track.origin}, seed {seed}"
-            if heard
-            else f"no beacon of {beacons} is in radio sight along {track.origin}"
+            f"{len(measurements)} RSBN measurements of {len(numbers)} beacons"
+            f" ({', '.join(map(str, numbers))}) simulated along {track.origin}, seed {seed}"
+            if measurements
+            else f"no beacon of {beacons} is above the radio horizon along {track.origin}"
         )
-        merged = heapq.merge(merged, heard, key=lambda record: record.rx_ns)  # type: ignore[assignment]
-    return Opened(simulated_rsbn.without(merged, outages, first.rx_ns), opened.summary), note
+        merged = heapq.merge(merged, measurements, key=lambda record: record.rx_ns)  # type: ignore[assignment]
+    return LogInputs(simulated_rsbn.apply_outages(merged, outages, first.rx_ns), log_inputs.summary), note

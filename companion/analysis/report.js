@@ -1,10 +1,10 @@
 "use strict";
-// Draws every figure of the page once; `data-drawn` on <html> then says how many, `data-failed` how many not.
+// Draws every figure of the page once; then `data-drawn` on <html> is the number drawn, `data-failed` of failures.
 (() => {
   const figures = JSON.parse(document.getElementById("figures").textContent);
   const narrow = window.innerWidth < 700;
   const config = { responsive: true, displayModeBar: false };
-  const said = document.documentElement.dataset;
+  const status = document.documentElement.dataset;
   const draw = ([key, figure]) => {
     if (narrow) {
       figure.layout.font.size = 10.5;
@@ -18,8 +18,8 @@
   };
   Promise.allSettled(Object.entries(figures).map((entry) => Promise.resolve(entry).then(draw))).then((ends) => {
     for (const end of ends) if (end.status === "rejected") console.error(end.reason);
-    said.failed = ends.filter((end) => end.status === "rejected").length;
-    said.drawn = document.querySelectorAll(".plot .main-svg").length ? ends.length - said.failed : 0;
-    said.overflow = document.documentElement.scrollWidth - document.documentElement.clientWidth;
+    status.failed = ends.filter((end) => end.status === "rejected").length;
+    status.drawn = document.querySelectorAll(".plot .main-svg").length ? ends.length - status.failed : 0;
+    status.overflow = document.documentElement.scrollWidth - document.documentElement.clientWidth;
   });
 })();

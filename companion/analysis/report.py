@@ -1,7 +1,7 @@
-"""`companion report LOG [LOG2] -o report.html`: a flight on one page, or two beside each other.
+"""`companion report LOG [LOG2] -o report.html`: report on one flight, or comparison of two, in one HTML file.
 
-The page needs no network and no server. A log that is not ours is flown through the navigator first, in
-memory. Errors are counted from the log's own truth, or else from the track smoothed with all fixes.
+The file needs no network and no server. The navigator is first run, in memory, over the log of another
+recorder. Errors are relative to the truth of the log, or else to the track smoothed with all fixes.
 """
 
 from __future__ import annotations
@@ -11,18 +11,18 @@ from pathlib import Path
 
 import click
 
-from companion.analysis.assessment import assess
-from companion.analysis.drawing import printed
-from companion.analysis.figures import figures
+from companion.analysis.assessment import assess_flight
+from companion.analysis.drawing import write_figures
+from companion.analysis.figures import build_figures
 from companion.analysis.flight_arrays import Flight
 from companion.analysis.flights import open_flights
-from companion.analysis.html import Block, page
-from companion.analysis.output_guard import refuse_any_log, refuse_own_input
+from companion.analysis.html import ReportBlock, render_report
+from companion.analysis.output_guard import reject_any_log, reject_own_input
 from companion.analysis.plot_data import LETTERS, Figure
-from companion.analysis.replay_inputs import changed, has_flown
-from companion.analysis.summary import verdict
+from companion.analysis.replay_inputs import apply_changes, has_navigator_outputs
+from companion.analysis.summary import summarize_flight
 from companion.config import load
-from companion.optional_dependencies import lacking
+from companion.optional_dependencies import missing_package
 from companion.storage.reader import LogError
 
 
@@ -31,12 +31,15 @@ from companion.storage.reader import LogError
 @click.option(
     "-o", "--output", type=click.Path(path_type=Path), default=Path("report.html"), show_default=True
 )
-@click.option("--pdf", type=click.Path(path_type=Path), help="Write the figures into this PDF too.")
-@click.option("--png", type=click.Path(path_type=Path), help="Write each figure into this folder too.")
-@click.option("--config", "config_file", type=click.Path(path_type=Path), help="For a log that is not ours.")
+@click.option("--pdf", type=click.Path(path_type=Path), help="Also write the figures to this PDF.")
+@click.option("--png", type=click.Path(path_type=Path), help="Also write each figure to this folder.")
 @click.option(
-    "--with", "changes", multiple=True, metavar="KEY=VALUE,...", help="Of that, these keys changed."
+    "--config",
+    "config_file",
+    type=click.Path(path_type=Path),
+    help="Configuration for the log of another recorder.",
 )
+@click.option("--with", "changes", multiple=True, metavar="KEY=VALUE,...", help="Change these keys of it.")
 def command(
     logs: tuple[Path, ...],
     output: Path,
@@ -45,74 +48,74 @@ def command(
     config_file: Path | None,
     changes: tuple[str, ...],
 ) -> None:
-    """Write a page about LOG, or about two logs compared: our MCAP, or any other that `replay` reads.
+    """Write a report on LOG, or a comparison of two logs: our MCAP, or any log that `replay` supports.
 
-    Where the autopilot began anew, a log holds several flights: each has its chapters, and of two logs the
+    A reboot of the autopilot starts a new flight in a log: each flight has its own chapters; of two logs the
     longest flights are compared.
     """
     if len(logs) > 2:
-        raise click.UsageError(f"{len(logs)} logs were given: a report is about one, or compares two")
+        raise click.UsageError(f"{len(logs)} logs given; give one log, or two to compare")
     for target in (output, pdf):
         if target is not None:
-            refuse_own_input(target, *logs, config_file)
-            refuse_any_log(target)
+            reject_own_input(target, *logs, config_file)
+            reject_any_log(target)
     if changes or config_file:
-        _refuse_flown(logs)
+        _reject_flown(logs)
     config = load(config_file)
     if changes:
-        config = changed(config, ",".join(changes))
+        config = apply_changes(config, ",".join(changes))
     found = [open_flights(path, config) for path in logs]
-    blocks = compared(found, _names(logs)) if len(logs) == 2 else alone(found[0])
+    blocks = comparison_block(found, _names(logs)) if len(logs) == 2 else blocks_of_log(found[0])
     try:
-        output.write_text(page(" and ".join(_names(logs)), blocks), encoding="utf-8")
-        written = [output, *(printed(_all_figures(blocks), pdf, png) if pdf or png else [])]
+        output.write_text(render_report(" and ".join(_names(logs)), blocks), encoding="utf-8")
+        written = [output, *(write_figures(_all_figures(blocks), pdf, png) if pdf or png else [])]
     except ModuleNotFoundError as error:
-        raise LogError(lacking("a report", error.name, "report")) from None
+        raise LogError(missing_package("a report", error.name, "report")) from None
     except OSError as error:
         raise LogError(f"cannot write the report to {error.filename}: {error.strerror}") from None
     for block in blocks:
         for flight in block.flights:
-            click.echo(verdict(flight))
+            click.echo(summarize_flight(flight))
     click.echo(f"written: {', '.join(str(path) for path in written)}")
 
 
-def _refuse_flown(logs: Sequence[Path]) -> None:
-    """LogError where a log is of a flight with us: what flew it is in it, and nothing is flown anew here."""
+def _reject_flown(logs: Sequence[Path]) -> None:
+    """Raise LogError if a log has navigator outputs, as configuration options would have no effect on it."""
     for path in logs:
-        if has_flown(path):
+        if has_navigator_outputs(path):
             raise LogError(
-                f"--with and --config change nothing of {path}, reported as it flew; replay it first:"
-                f" companion replay {path} --with KEY=VALUE, and report what that writes"
+                f"--with and --config have no effect on {path}, which is reported as flown; replay it first:"
+                f" companion replay {path} --with KEY=VALUE, then report the replay"
             )
 
 
-def alone(flights: Sequence[Flight]) -> list[Block]:
-    """A block for each flight of one log."""
+def blocks_of_log(flights: Sequence[Flight]) -> list[ReportBlock]:
+    """Build a block for each flight of one log."""
     blocks = []
     for flight in flights:
-        a = assess(flight)
-        blocks.append(Block([_called(flight, flight.name)], [a], figures([a])))
+        a = assess_flight(flight)
+        blocks.append(ReportBlock([_flight_title(flight, flight.name)], [a], build_figures([a])))
     return blocks
 
 
-def compared(logs: Sequence[Sequence[Flight]], names: Sequence[str]) -> list[Block]:
-    """One block with the longest flight of each of two logs."""
+def comparison_block(logs: Sequence[Sequence[Flight]], names: Sequence[str]) -> list[ReportBlock]:
+    """Build one block with the longest flight of each of two logs."""
     chosen = [max(flights, key=lambda flight: flight.seconds) for flights in logs]
-    called = [
-        f"{letter}: {_called(flight, name)}"
+    names_of_flights = [
+        f"{letter}: {_flight_title(flight, name)}"
         for letter, flight, name in zip(LETTERS, chosen, names, strict=True)
     ]
-    both = [assess(flight) for flight in chosen]
-    return [Block(called, both, figures(both))]
+    both = [assess_flight(flight) for flight in chosen]
+    return [ReportBlock(names_of_flights, both, build_figures(both))]
 
 
-def _called(flight: Flight, name: str) -> str:
+def _flight_title(flight: Flight, name: str) -> str:
     k, n = flight.part
     return name if n == 1 else f"{name}, flight {k} of {n}"
 
 
-def _all_figures(blocks: Sequence[Block]) -> list[Figure]:
-    """Those of all blocks for paper, told apart by the flight."""
+def _all_figures(blocks: Sequence[ReportBlock]) -> list[Figure]:
+    """Return the figures of all blocks, with the flight number in keys and titles if there are several."""
     if len(blocks) == 1:
         return list(blocks[0].figures)
     return [
@@ -123,6 +126,6 @@ def _all_figures(blocks: Sequence[Block]) -> list[Figure]:
 
 
 def _names(logs: tuple[Path, ...]) -> list[str]:
-    """What the page calls its logs; a folder more where two have one name."""
+    """Return the names of the logs, with their folder if two names are equal."""
     same = len({path.name for path in logs}) < len(logs)
     return [f"{path.resolve().parent.name}/{path.name}" if same else path.name for path in logs]

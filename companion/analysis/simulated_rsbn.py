@@ -1,13 +1,12 @@
-"""Beacons that a log did not hear, and outages it did not have: for replay only.
+"""Simulated RSBN measurements and outages for replays.
 
-    track = track_of(records, config)           # the truth where the log has it, else its own track
-    heard = answers(beacons, track, seed=0)     # RSBN answers along it, in order of time
+    track = extract_track(records, config)                   # the truth if logged, else the smoothed track
+    fixes = simulate_measurements(beacons, track, seed=0)    # by time
 
-A beacon answers once a second while it is above the radio horizon and within its range, with white noise of
-the stated sigmas on azimuth and slant range; of those that could, a receiver follows the nearest few. The
-earth is smooth at `GROUND`, the surface that the list and the track both count heights from: what a height
-above it stands on, a mast or a hill, is not known. No terrain, no multipath, no bias. Everything follows from
-the seed.
+A beacon gives a measurement once a second while it is above the radio horizon and within its range, with
+white noise of the stated sigmas on azimuth and slant range; the receiver follows the nearest `CHANNELS` of
+them. The earth is smooth with its surface at `GROUND`, the reference of the heights of beacons and track:
+there is no terrain, no multipath, no bias. The result depends only on the inputs and the seed.
 """
 
 from __future__ import annotations
@@ -23,26 +22,25 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from companion.analysis.smoothing import joined, smooth_flight
+from companion.analysis.smoothing import join_runs, smooth_flight
 from companion.config import Config
 from companion.nav.earth import E2, A
 from companion.nav.geometry import enu_axes, radio_horizon
 from companion.navigator import FOLDED
 from companion.records import Gnss, RsbnFix, Stamped, Truth
 from companion.storage.reader import LogError
-
-Floats = npt.NDArray[np.float64]
+from companion.units import Floats
 
 PERIOD_NS = 1_000_000_000
-REACH_NS = 3 * PERIOD_NS  # a track with a longer gap is not interpolated over it
-FOLLOWED = 4
-GROUND = 0.0  # m; one that followed the beacon's height would hide a higher one
+MAX_GAP_NS = 3 * PERIOD_NS  # no interpolation of the track across a longer gap
+CHANNELS = 4
+GROUND = 0.0  # m; not the height of the beacon, so that a higher beacon is never hidden
 RANGE_LIMIT_M = 370_000.0  # 200 nautical miles
-SILENCE = math.radians(45.0)  # no azimuth in the cone above a beacon
+CONE_OF_SILENCE = math.radians(45.0)  # no azimuth in the cone above a beacon
 SIGMA_AZIMUTH = math.radians(0.25)
 SIGMA_RANGE, SIGMA_RANGE_SHARE = 200.0, 3e-4
 _FEET = 0.3048
-#: OurAirports' kinds of aid: whether they give an azimuth, whether a range. An NDB gives neither.
+#: OurAirports' types of navaid: whether they give azimuth, and range. An NDB gives neither.
 _KINDS = {
     "VOR-DME": (True, True),
     "VORTAC": (True, True),
@@ -53,8 +51,8 @@ _KINDS = {
 _OUTAGE = re.compile(r"(GNSS|RSBN):(\d+(?:\.\d+)?)-(\d+(?:\.\d+)?)", re.IGNORECASE)
 
 
-class Beacon(NamedTuple):
-    """A beacon: position rad, m; range limit m; which of azimuth and range it gives."""
+class ListedBeacon(NamedTuple):
+    """A beacon of a list: position (rad, m), range limit (m), and whether it gives azimuth and range."""
 
     number: int
     lat: float
@@ -65,8 +63,8 @@ class Beacon(NamedTuple):
     ranging: bool = True
 
 
-class Track(NamedTuple):
-    """Where the aircraft was (n,): times, rad, rad, m; `origin` is a phrase for the reader: whence."""
+class AircraftTrack(NamedTuple):
+    """Track of the aircraft, each (n,): times, rad, rad, m; `origin` describes its source for the user."""
 
     t_ns: npt.NDArray[np.int64]
     lat: Floats
@@ -75,8 +73,8 @@ class Track(NamedTuple):
     origin: str
 
 
-class Outage(NamedTuple):
-    """What is silent, "GNSS" or "RSBN", from `start` to before `end`, seconds of the log."""
+class SimulatedOutage(NamedTuple):
+    """Outage of `source`, "GNSS" or "RSBN", from `start` to before `end`, seconds of the log."""
 
     source: str
     start: float
@@ -86,75 +84,78 @@ class Outage(NamedTuple):
         return f"--outage {self.source}:{self.start:g}-{self.end:g}"
 
 
-def read_beacons(path: Path) -> list[Beacon]:
-    """A beacon list as CSV (`.gz` too): columns id, lat_deg, lon_deg, alt_m, optionally range_m; or
-    OurAirports' navaids, of which those with an azimuth or a range are taken.
+def read_beacons(path: Path) -> list[ListedBeacon]:
+    """Read a beacon list from CSV (or `.gz`): columns id, lat_deg, lon_deg, alt_m, optionally range_m.
 
-    LogError, one sentence, where it cannot be read or a line is wrong.
+    OurAirports' navaids.csv is also accepted; navaids without azimuth and range are skipped. Raises LogError,
+    one sentence, if the file cannot be read or a line is invalid.
     """
     try:
         with gzip.open(path, "rt", newline="") if path.suffix == ".gz" else path.open(newline="") as file:
             reader = csv.DictReader(file)
             columns = set(reader.fieldnames or ())
             if {"id", "lat_deg", "lon_deg", "alt_m"} <= columns:
-                read = _own
+                read = _parse_row
             elif {"id", "type", "latitude_deg", "longitude_deg", "elevation_ft"} <= columns:
-                read = _airports
+                read = _parse_ourairports_row
             else:
-                raise LogError(f"{path} is no beacon list: it needs the columns id, lat_deg, lon_deg, alt_m")
+                raise LogError(
+                    f"{path} is not a beacon list: it needs the columns id, lat_deg, lon_deg, alt_m"
+                )
             found = []
             for row in reader:
                 try:
                     found += read(row)
                 except (TypeError, ValueError) as error:
-                    raise LogError(f"{path}, line {reader.line_num} is no beacon: {error}") from None
+                    raise LogError(f"{path}, line {reader.line_num} is not a valid beacon: {error}") from None
     except (OSError, EOFError, UnicodeDecodeError) as error:
         if isinstance(error, LogError):
             raise
         raise LogError(f"{path} cannot be read: {getattr(error, 'strerror', None) or error}") from None
     if not found:
-        raise LogError(f"{path} lists no beacon")
+        raise LogError(f"{path} contains no beacons")
     return found
 
 
-def _own(row: dict[str, str]) -> list[Beacon]:
+def _parse_row(row: dict[str, str]) -> list[ListedBeacon]:
     limit = float(row["range_m"]) if row.get("range_m") else RANGE_LIMIT_M
-    lat, lon = _degrees(row["lat_deg"], 90.0), _degrees(row["lon_deg"], 180.0)
+    lat, lon = _parse_degrees(row["lat_deg"], 90.0), _parse_degrees(row["lon_deg"], 180.0)
     alt = float(row["alt_m"])
     if not (math.isfinite(alt) and 0.0 < limit < math.inf):
-        raise ValueError("alt_m and range_m must be finite, range_m positive")
-    return [Beacon(int(row["id"]), lat, lon, alt, limit)]
+        raise ValueError("alt_m and range_m must be finite and range_m positive")
+    return [ListedBeacon(int(row["id"]), lat, lon, alt, limit)]
 
 
-def _airports(row: dict[str, str]) -> list[Beacon]:
-    """Where an elevation is missing, the sea's: the height tells little at the ranges flown."""
+def _parse_ourairports_row(row: dict[str, str]) -> list[ListedBeacon]:
+    """Parse a row; a missing elevation counts as sea level, which matters little at usual ranges."""
     if row["type"] not in _KINDS:
         return []
     azimuth, ranging = _KINDS[row["type"]]
-    lat, lon = _degrees(row["latitude_deg"], 90.0), _degrees(row["longitude_deg"], 180.0)
+    lat, lon = _parse_degrees(row["latitude_deg"], 90.0), _parse_degrees(row["longitude_deg"], 180.0)
     alt = float(row["elevation_ft"] or 0.0) * _FEET
-    return [Beacon(int(row["id"]), lat, lon, alt, RANGE_LIMIT_M, azimuth, ranging)]
+    return [ListedBeacon(int(row["id"]), lat, lon, alt, RANGE_LIMIT_M, azimuth, ranging)]
 
 
-def _degrees(text: str, limit: float) -> float:
+def _parse_degrees(text: str, limit: float) -> float:
     value = float(text)
     if not abs(value) <= limit:
-        raise ValueError(f"{value} deg is outside +-{limit:g}")
+        raise ValueError(f"{value} deg is outside +-{limit:g} deg")
     return math.radians(value)
 
 
-def parse_outage(text: str) -> Outage:
-    """GNSS:600-900 as typed. ValueError, one sentence, if it is not that."""
+def parse_outage(text: str) -> SimulatedOutage:
+    """Parse an outage such as GNSS:600-900. Raises ValueError, one sentence, if it is invalid."""
     match = _OUTAGE.fullmatch(text.strip())
     if match is None or float(match[2]) >= float(match[3]):
-        raise ValueError(f"--outage {text}: write it as GNSS:600-900 or RSBN:600-900, seconds of the log")
-    return Outage(match[1].upper(), float(match[2]), float(match[3]))
+        raise ValueError(f"--outage {text}: write it as GNSS:600-900 or RSBN:600-900, in seconds of the log")
+    return SimulatedOutage(match[1].upper(), float(match[2]), float(match[3]))
 
 
-def without(records: Iterable[Stamped], outages: Sequence[Outage], start_ns: int) -> Iterator[Stamped]:
-    """The records but for those that fall into an outage by their time of arrival; time counts from
-    `start_ns`."""
-    silent: dict[type[Stamped], list[tuple[int, int]]] = {
+def apply_outages(
+    records: Iterable[Stamped], outages: Sequence[SimulatedOutage], start_ns: int
+) -> Iterator[Stamped]:
+    """Yield the records that do not arrive during an outage; times count from `start_ns`."""
+    intervals: dict[type[Stamped], list[tuple[int, int]]] = {
         kind: [
             (start_ns + round(o.start * 1e9), start_ns + round(o.end * 1e9))
             for o in outages
@@ -163,15 +164,15 @@ def without(records: Iterable[Stamped], outages: Sequence[Outage], start_ns: int
         for name, kind in (("GNSS", Gnss), ("RSBN", RsbnFix))
     }
     for record in records:
-        spans = silent.get(type(record), ())
+        spans = intervals.get(type(record), ())
         if not any(begin <= record.rx_ns < end for begin, end in spans):
             yield record
 
 
-def track_of(records: Iterable[Stamped], config: Config) -> Track:
-    """The truth in `records` where there is any, else the flight smoothed with all of its fixes.
+def extract_track(records: Iterable[Stamped], config: Config) -> AircraftTrack:
+    """Return the truth in `records` if there is one, else the flight smoothed with all of its fixes.
 
-    LogError where there is neither.
+    Raises LogError if there is neither.
     """
     truths: list[tuple[int, float, float, float]] = []
     folded: list[Stamped] = []
@@ -184,52 +185,58 @@ def track_of(records: Iterable[Stamped], config: Config) -> Track:
             folded.append(record)
     if truths:
         t, lat, lon, alt = zip(*truths, strict=True)
-        return Track(
+        return AircraftTrack(
             np.array(t, dtype=np.int64), np.array(lat), np.array(lon), np.array(alt), "the log's truth"
         )
     try:
         runs = smooth_flight(folded, config)
     except ValueError as error:
-        raise LogError(f"there is no track to hear beacons along: {error}") from None
-    return Track(*joined(runs), "the log's own smoothed track, not a truth")
+        raise LogError(f"there is no track to simulate beacons along: {error}") from None
+    return AircraftTrack(*join_runs(runs), "the log's own smoothed track, not a truth")
 
 
-def answers(beacons: Sequence[Beacon], track: Track, seed: int = 0) -> list[RsbnFix]:
-    """What a receiver on the track hears of the beacons, by time; the same for the same seed."""
-    t_ns, lat, lon, alt = _sampled(track)
+def simulate_measurements(
+    beacons: Sequence[ListedBeacon], track: AircraftTrack, seed: int = 0
+) -> list[RsbnFix]:
+    """Simulate the measurements of a receiver on the track, by time; reproducible by the seed."""
+    t_ns, lat, lon, alt = _sample_track(track)
     if not t_ns.size:
         return []
     place = _ecef(lat, lon, alt)
-    heard = []
+    visible = []
     for beacon in beacons:
-        sight = _sight(beacon, place)
-        if (reach := _in_reach(beacon, sight, alt)).any():
-            heard.append((beacon, sight, reach))
-    if not heard:
+        geometry = _beacon_geometry(beacon, place)
+        if (reach := _in_reach(beacon, geometry, alt)).any():
+            visible.append((beacon, geometry, reach))
+    if not visible:
         return []
-    slants = np.array([np.where(reach, sight.slant, np.inf) for _, sight, reach in heard])
+    slants = np.array([np.where(reach, geometry.slant, np.inf) for _, geometry, reach in visible])
     rank = np.argsort(np.argsort(slants, axis=0, kind="stable"), axis=0)
     found: list[RsbnFix] = []
-    for (beacon, sight, reach), order in zip(heard, rank, strict=True):
-        found += _answers(beacon, sight, t_ns, reach & (order < FOLLOWED), seed)
+    for (beacon, geometry, reach), order in zip(visible, rank, strict=True):
+        found += _simulate_beacon(beacon, geometry, t_ns, reach & (order < CHANNELS), seed)
     return sorted(found, key=lambda answer: (answer.rx_ns, answer.beacon))
 
 
-class _Sight(NamedTuple):
+class _Geometry(NamedTuple):
     azimuth: Floats
     slant: Floats
     elevation: Floats
 
 
-def _answers(
-    beacon: Beacon, sight: _Sight, t_ns: npt.NDArray[np.int64], heard: npt.NDArray[np.bool_], seed: int
+def _simulate_beacon(
+    beacon: ListedBeacon,
+    geometry: _Geometry,
+    t_ns: npt.NDArray[np.int64],
+    visible: npt.NDArray[np.bool_],
+    seed: int,
 ) -> Iterator[RsbnFix]:
-    rng = np.random.default_rng([seed, beacon.number])  # its own noise, whatever else is in the list
-    sigma = SIGMA_RANGE + SIGMA_RANGE_SHARE * sight.slant
-    azimuth = (sight.azimuth + SIGMA_AZIMUTH * rng.standard_normal(t_ns.size)) % math.tau
-    slant = np.maximum(sight.slant + sigma * rng.standard_normal(t_ns.size), 1.0)
-    told = beacon.azimuth & (sight.elevation < SILENCE)
-    for k in np.flatnonzero(heard & (told | beacon.ranging)).tolist():
+    rng = np.random.default_rng([seed, beacon.number])  # noise independent of the other beacons in the list
+    sigma = SIGMA_RANGE + SIGMA_RANGE_SHARE * geometry.slant
+    azimuth = (geometry.azimuth + SIGMA_AZIMUTH * rng.standard_normal(t_ns.size)) % math.tau
+    slant = np.maximum(geometry.slant + sigma * rng.standard_normal(t_ns.size), 1.0)
+    has_azimuth = beacon.azimuth & (geometry.elevation < CONE_OF_SILENCE)
+    for k in np.flatnonzero(visible & (has_azimuth | beacon.ranging)).tolist():
         yield RsbnFix(
             int(t_ns[k]),
             int(t_ns[k]),
@@ -237,43 +244,43 @@ def _answers(
             beacon.lat,
             beacon.lon,
             beacon.alt,
-            float(azimuth[k]) if told[k] else None,
+            float(azimuth[k]) if has_azimuth[k] else None,
             float(slant[k]) if beacon.ranging else None,
             SIGMA_AZIMUTH,
             float(sigma[k]),
         )
 
 
-def _sampled(track: Track) -> tuple[npt.NDArray[np.int64], Floats, Floats, Floats]:
-    """The track every `PERIOD_NS`, but for its gaps."""
+def _sample_track(track: AircraftTrack) -> tuple[npt.NDArray[np.int64], Floats, Floats, Floats]:
+    """Interpolate the track at every `PERIOD_NS`, except in its gaps."""
     t_ns = np.arange(track.t_ns[0], track.t_ns[-1] + 1, PERIOD_NS)
     k = np.clip(np.searchsorted(track.t_ns, t_ns), 1, max(track.t_ns.size - 1, 1))
     if track.t_ns.size > 1:
-        t_ns = t_ns[track.t_ns[k] - track.t_ns[k - 1] <= REACH_NS]
+        t_ns = t_ns[track.t_ns[k] - track.t_ns[k - 1] <= MAX_GAP_NS]
     at, known = ((ns - track.t_ns[0]) * 1e-9 for ns in (t_ns, track.t_ns))
     lat, alt = (np.interp(at, known, values) for values in (track.lat, track.alt))
     return t_ns, lat, np.interp(at, known, np.unwrap(track.lon)), alt
 
 
 def _ecef(lat: Floats, lon: Floats, alt: Floats) -> Floats:
-    """(n, 3), m."""
+    """Convert to earth-centred coordinates (n, 3), m."""
     N = A / np.sqrt(1.0 - E2 * np.sin(lat) ** 2)
     level = (N + alt) * np.cos(lat)
     return np.stack([level * np.cos(lon), level * np.sin(lon), (N * (1.0 - E2) + alt) * np.sin(lat)], axis=1)
 
 
-def _sight(beacon: Beacon, place: Floats) -> _Sight:
-    """`nav.geometry.slant_range_azimuth` of many places (n, 3) at once."""
+def _beacon_geometry(beacon: ListedBeacon, place: Floats) -> _Geometry:
+    """Compute `nav.geometry.slant_range_azimuth` for many positions (n, 3), with elevations."""
     lat, lon, alt = (np.array([value]) for value in (beacon.lat, beacon.lon, beacon.alt))
     east, north, up = enu_axes(beacon.lat, beacon.lon) @ (place - _ecef(lat, lon, alt)).T
     level = np.hypot(east, north)
-    return _Sight(np.arctan2(east, north) % math.tau, np.hypot(level, up), np.arctan2(up, level))
+    return _Geometry(np.arctan2(east, north) % math.tau, np.hypot(level, up), np.arctan2(up, level))
 
 
-def _in_reach(beacon: Beacon, sight: _Sight, alt: Floats) -> npt.NDArray[np.bool_]:
-    near = sight.slant <= beacon.range_limit
+def _in_reach(beacon: ListedBeacon, geometry: _Geometry, alt: Floats) -> npt.NDArray[np.bool_]:
+    near = geometry.slant <= beacon.range_limit
     if not near.any():
         return near
     horizon = np.array([radio_horizon(beacon.alt - GROUND, height) for height in (alt - GROUND).tolist()])
-    reach: npt.NDArray[np.bool_] = near & (sight.slant <= horizon)
+    reach: npt.NDArray[np.bool_] = near & (geometry.slant <= horizon)
     return reach

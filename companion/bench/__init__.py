@@ -1,1 +1,1 @@
-"""Benchmarks: each module yields the cases that are worth timing."""
+"""Benchmarks: each module yields cases to be timed."""

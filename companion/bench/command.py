@@ -1,7 +1,7 @@
-"""`companion bench`: what things cost, side by side in one run, so that ratios can be trusted.
+"""`companion bench`: timing of the costly parts, interleaved in one run so that ratios are reliable.
 
-Every case of a module is called in turn, round after round, so that a machine that slows down slows all of
-them; the median of the rounds is quoted.
+In each round every case of a module is called in turn, so that a slowdown of the machine affects all of them;
+the median of the rounds is reported.
 """
 
 from __future__ import annotations
@@ -18,50 +18,50 @@ from rich.table import Table
 
 MODULES = ("fusion", "minimax", "kalman", "frame", "log")
 ROUNDS = 15
-ROUND_S = 0.02  # a round of one case lasts at least this long
+ROUND_S = 0.02  # minimum duration of one case in a round
 
 
 def measure(
     cases: Iterator[tuple[str, Callable[[], object]]], rounds: int = ROUNDS
 ) -> dict[str, list[float]]:
-    """Seconds a call for each case and round, the cases interleaved."""
+    """Measure the seconds per call of each case in each round, with the cases interleaved."""
     calls: dict[str, tuple[Callable[[], object], int]] = {}
     for name, call in cases:
         call()
-        begun = time.perf_counter()
+        start = time.perf_counter()
         call()
-        calls[name] = call, max(1, round(ROUND_S / max(time.perf_counter() - begun, 1e-9)))
+        calls[name] = call, max(1, round(ROUND_S / max(time.perf_counter() - start, 1e-9)))
     times: dict[str, list[float]] = {name: [] for name in calls}
     for _ in range(rounds):
         for name, (call, repeat) in calls.items():
-            begun = time.perf_counter()
+            start = time.perf_counter()
             for _ in range(repeat):
                 call()
-            times[name].append((time.perf_counter() - begun) / repeat)
+            times[name].append((time.perf_counter() - start) / repeat)
     return times
 
 
 def table(title: str, times: dict[str, list[float]]) -> Table:
-    """Median, least and greatest per call, and each median against the dearest case's."""
+    """Build a table of median, minimum and maximum per call, and the slowest median over each median."""
     shown = Table(title=title)
-    for column in ("case", "median us", "min", "max", "dearest / this"):
+    for column in ("case", "median us", "min", "max", "slowest / this"):
         shown.add_column(column, justify="left" if column == "case" else "right")
     medians = {name: statistics.median(values) for name, values in times.items()}
-    dearest = max(medians.values())
+    slowest = max(medians.values())
     for name, values in times.items():
         numbers = (medians[name], min(values), max(values))
-        shown.add_row(name, *(f"{1e6 * x:.1f}" for x in numbers), f"{dearest / medians[name]:.1f}")
+        shown.add_row(name, *(f"{1e6 * x:.1f}" for x in numbers), f"{slowest / medians[name]:.1f}")
     return shown
 
 
 @click.command("bench")
 @click.argument("names", nargs=-1, type=click.Choice([*MODULES, "latency"]))
-@click.option("--json", "as_json", is_flag=True, help="Print JSON: seconds a call, every round.")
+@click.option("--json", "as_json", is_flag=True, help="Print JSON: seconds per call, every round.")
 def command(names: tuple[str, ...], as_json: bool) -> None:
-    """Time the parts NAMES (all but latency where none is named), interleaved in one run.
+    """Time the parts NAMES (default: all except latency), interleaved in one run.
 
-    `latency` sends beacon answers over UDP on loopback to a whole service and waits for the corrected
-    estimate, beside a bare asyncio UDP echo.
+    `latency` sends beacon measurements by UDP on the loopback interface to a complete service and waits for
+    the corrected estimate; a plain asyncio UDP echo is measured for comparison.
     """
     found = {}
     for name in names or MODULES:

@@ -1,4 +1,4 @@
-"""Reading a busy link: the companion's frame reader beside pymavlink's parser, over the same bytes."""
+"""Benchmark of frame parsing: the companion's frame reader and pymavlink's parser on the same bytes."""
 
 from collections.abc import Callable, Iterator
 
@@ -8,7 +8,7 @@ MESSAGES = 200
 
 
 def stream(messages: int = MESSAGES) -> bytes:
-    """Return that many frames, of the kinds that a companion hears most."""
+    """Return the bytes of `messages` frames of the most frequent types."""
     kinds = ("ATTITUDE", "LOCAL_POSITION_NED", "HIGHRES_IMU", "GPS_RAW_INT", "GLOBAL_POSITION_INT", "VFR_HUD")
     values = {kind: {field.name: 7 for field in dialect.type_named(kind).fields} for kind in kinds}
     sent = []

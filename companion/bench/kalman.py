@@ -1,7 +1,7 @@
-"""Filters worth timing: the 16-state example one flight at a time and 200 flights in one call.
+"""Benchmark of filters: the 16-state example, one flight at a time and 200 flights in one call.
 
-The last two cases are the same Monte Carlo, the first samples of flights of `companion study restrictive`:
-their quotient is what a stack of flights saves.
+The last two cases are the same Monte Carlo run, the first samples of `companion study restrictive`; their
+ratio is the gain of processing flights as a stack.
 """
 
 from collections.abc import Callable, Iterator
@@ -9,32 +9,28 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from companion.estimate import kalman, restrictive
-from companion.estimate.full_horizon import Sample
-from companion.estimate.moving_horizon import MHE, Window
 from companion.nav.error_model import paper_example
-from companion.study.restrictive import TRUTHS, fly
+from companion.study.restrictive import TRUTHS, simulate_flights
+from companion.units import Floats
 
 FLIGHTS = 200
 SAMPLES = 10
 
 
 def cases() -> Iterator[tuple[str, Callable[[], object]]]:
-    """Names and callables; one call is one predict and correct of one flight or all, or as many as named."""
+    """Yield (name, callable): one call is a step of one flight or of all, or the samples in the name."""
     model = paper_example()
     _, A, B, Q, _, H, R, C, x0, P0, *_ = model
-    z = fly(model, TRUTHS["constant"], FLIGHTS, np.random.default_rng(0)).z
+    z = simulate_flights(model, TRUTHS["constant"], FLIGHTS, np.random.default_rng(0)).z
     many0, Ps0 = np.tile(x0, (FLIGHTS, 1)), np.tile(P0, (FLIGHTS, 1, 1))
 
-    def follow(x: kalman.Array, P: kalman.Array, z: kalman.Array) -> tuple[kalman.Array, kalman.Array]:
+    def follow(x: Floats, P: Floats, z: Floats) -> tuple[Floats, Floats]:
         for z_t in z:
             x, P, *_ = restrictive.step(x, P, z_t, A, B, Q, H, R, C)
         return x, P
 
-    many, Ps = follow(many0, Ps0, z[:100])  # to covariances and a window as in flight
+    many, Ps = follow(many0, Ps0, z[:100])  # to covariances as in flight
     x, P, z_t = many[0], Ps[0], z[100]
-    window, mhe = Window(x0, P0), MHE(10)
-    for t in range(20):
-        window, _ = mhe.step(window, Sample(z[t, 0], A, B, Q, H, R, C))
     yield "kalman step, 16 states", lambda: kalman.step(x, P, z_t[0], A, Q, H, R)
     yield f"kalman step, {FLIGHTS} flights at once", lambda: kalman.step(many, P, z_t, A, Q, H, R)
     yield "restrictive step, 16 states", lambda: restrictive.step(x, P, z_t[0], A, B, Q, H, R, C)
@@ -42,7 +38,6 @@ def cases() -> Iterator[tuple[str, Callable[[], object]]]:
         f"restrictive step, {FLIGHTS} flights at once",
         lambda: restrictive.step(many, Ps, z_t, A, B, Q, H, R, C),
     )
-    yield "moving horizon of 10, 16 states", lambda: mhe.step(window, Sample(z_t[0], A, B, Q, H, R, C))
     yield (
         f"restrictive, {SAMPLES} samples, {FLIGHTS} flights at once",
         lambda: follow(many0, Ps0, z[:SAMPLES]),

@@ -1,14 +1,14 @@
-"""Latency: a beacon's answer in by UDP, the corrected estimate out, beside a bare asyncio echo.
+"""Benchmark of latency: from a beacon measurement received by UDP to the corrected estimate sent.
 
-A whole `companion run` (log on, real sockets) and an echo of the same datagram stand in processes of their
-own. A tiny autopilot here flies north at 40 m/s, with GNSS, until the navigator has its fix, and then sends
-beacon answers one by one; each is timed until the ODOMETRY that it causes is here. Both peers are asked in
-turn, after the same rest, and waited for in the same way, so the ratio of the medians holds whatever the
-machine does.
+A complete `companion run` (log on, real sockets) and an asyncio echo of the same datagram run in processes of
+their own. A minimal autopilot here flies north at 40 m/s with GNSS until the navigator has a fix, then sends
+beacon measurements one by one; each is timed until the resulting ODOMETRY arrives. Both peers are queried
+alternately, after the same pause and with the same wait, so that the ratio of the medians is independent of
+the machine's load.
 
-Who asks has a processor of its own, as an autopilot has. Left to itself the kernel runs a peer as small as
-the echo on the processor that has just asked, and saves it the waking of another one; a message from outside
-is never spared that.
+The sending process has a processor of its own, like an autopilot. Otherwise the kernel would run a peer as
+small as the echo on the processor that has just sent, without the wake-up of another processor that a message
+from outside always needs.
 """
 
 from __future__ import annotations
@@ -26,14 +26,15 @@ from typing import Any
 
 from companion.config import load
 from companion.link import dialect, frame
+from companion.link.dialect import mavlink, rsbn
 from companion.nav.geometry import Geodetic, local_to_geodetic, slant_range_azimuth
 from companion.runtime.service import run
 
 ROUNDS = 100
-WARM_UP = 20  # answers before it counts
-PATIENCE_S = 60.0
+WARM_UP = 20  # measurements before timing starts
+FIX_TIMEOUT_S = 60.0
 ROUND_S = 0.1  # local position at 10 Hz
-REST_S = 0.35 * ROUND_S  # before each question: whoever asks comes straight from sleep, and all is at rest
+REST_S = 0.35 * ROUND_S  # before each measurement, so that everything is idle
 TIMEOUT_S = 5.0
 LOOPBACK = "127.0.0.1"
 ORIGIN = Geodetic(math.radians(60.0), math.radians(30.0), 50.0)
@@ -43,59 +44,63 @@ COMPANION, ECHO = "companion: RSBN in to corrected estimate out", "bare asyncio 
 
 
 def measure() -> dict[str, list[float]]:
-    """Seconds from a beacon's answer sent to the estimate received, and the echo's round trip, round by
-    round.
-    """
+    """Measure by round the seconds from measurement sent to estimate received, and those of the echo."""
     with (
         tempfile.TemporaryDirectory() as logs,
-        _apart() as others,
+        _separate_processors() as others,
         _peer(others, _companion, logs) as there,
         _peer(others, _echo) as back,
     ):
         autopilot = _Autopilot(there)
-        begun, answered = time.perf_counter(), 0
+        start, answered = time.perf_counter(), 0
         while answered < WARM_UP:
-            if time.perf_counter() - begun > PATIENCE_S:
-                raise TimeoutError(f"the companion has no fix after {PATIENCE_S:g} s of flight")
+            if time.perf_counter() - start > FIX_TIMEOUT_S:
+                raise TimeoutError(f"the companion has no fix after {FIX_TIMEOUT_S:g} s of flight")
             autopilot.fly()
-            answered += math.isfinite(autopilot.rsbn(autopilot.rsbn_frame(), ROUND_S / 4))
+            answered += math.isfinite(autopilot.time_response(autopilot.rsbn_frame(), ROUND_S / 4))
         times: dict[str, list[float]] = {COMPANION: [], ECHO: []}
         for _ in range(ROUNDS):
             autopilot.fly()
             answer = autopilot.rsbn_frame()
             time.sleep(REST_S)
-            times[COMPANION].append(autopilot.rsbn(answer, TIMEOUT_S))
+            times[COMPANION].append(autopilot.time_response(answer, TIMEOUT_S))
             time.sleep(REST_S)
             times[ECHO].append(_round_trip(back, answer))
         if not all(map(math.isfinite, times[COMPANION])):
-            raise TimeoutError(f"the companion gave no corrected estimate within {TIMEOUT_S:g} s")
+            raise TimeoutError(f"the companion sent no corrected estimate within {TIMEOUT_S:g} s")
     return times
 
 
 class _Autopilot:
-    """As little of one as the navigator needs."""
+    """A minimal autopilot: only the messages that the navigator needs."""
 
     def __init__(self, sock: socket.socket) -> None:
         self._sock = sock
-        self._begun = time.perf_counter()
+        self._start = time.perf_counter()
         self._next = 0.0
         self._sequence = 0
 
     def fly(self) -> None:
-        """Wait for the next tenth of a second, say all that is due, and hear out what it causes."""
+        """Wait for the next tenth of a second, send the messages that are due, discard the replies."""
         self._next += ROUND_S
-        time.sleep(max(0.0, self._begun + self._next - time.perf_counter()))
+        time.sleep(max(0.0, self._start + self._next - time.perf_counter()))
         t, place = self._where()
         ms = round(t * 1e3)
         here = [round(math.degrees(x) * 1e7) for x in place[:2]]
         lat, lon = (round(math.degrees(x) * 1e7) for x in ORIGIN[:2])
-        self._say("HEARTBEAT", type=1, autopilot=3, system_status=4, mavlink_version=3)
-        self._say("GPS_GLOBAL_ORIGIN", latitude=lat, longitude=lon, altitude=round(ORIGIN.alt * 1e3))
-        self._say("LOCAL_POSITION_NED", time_boot_ms=ms, x=V_NORTH * t, z=-HEIGHT, vx=V_NORTH)
-        self._say(
+        self._send(
+            "HEARTBEAT",
+            type=mavlink.MAV_TYPE_FIXED_WING,
+            autopilot=mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA,
+            system_status=mavlink.MAV_STATE_ACTIVE,
+            mavlink_version=3,
+        )
+        self._send("GPS_GLOBAL_ORIGIN", latitude=lat, longitude=lon, altitude=round(ORIGIN.alt * 1e3))
+        self._send("LOCAL_POSITION_NED", time_boot_ms=ms, x=V_NORTH * t, z=-HEIGHT, vx=V_NORTH)
+        self._send(
             "GPS_RAW_INT",
             time_usec=ms * 1000,
-            fix_type=3,
+            fix_type=mavlink.GPS_FIX_TYPE_3D_FIX,
             lat=here[0],
             lon=here[1],
             alt=round(place.alt * 1e3),
@@ -109,46 +114,49 @@ class _Autopilot:
         self._drain()
 
     def rsbn_frame(self) -> bytes:
-        """A beacon's true answer now."""
+        """Return the frame of a beacon measurement without errors, valid now."""
         t, place = self._where()
-        sight = slant_range_azimuth(BEACON, place)
+        geometry = slant_range_azimuth(BEACON, place)
         return self._frame(
             "RSBN_MEASUREMENT",
             time_usec=round(t * 1e6),
             beacon_lat=round(math.degrees(BEACON.lat) * 1e7),
             beacon_lon=round(math.degrees(BEACON.lon) * 1e7),
             beacon_alt=BEACON.alt,
-            azimuth=sight.azimuth % math.tau,
-            slant_range=sight.slant_range,
+            azimuth=geometry.azimuth % math.tau,
+            slant_range=geometry.slant_range,
             sigma_azimuth=math.radians(0.125),
             sigma_range=100.0,
             beacon_id=1,
-            status=3,
+            status=rsbn.RSBN_STATUS_AZIMUTH_VALID | rsbn.RSBN_STATUS_RANGE_VALID,
         )
 
-    def rsbn(self, answer: bytes, patience_s: float) -> float:
-        """Send a beacon's answer; seconds until the corrected estimate is here, NaN if none comes."""
-        begun = time.perf_counter()
+    def time_response(self, answer: bytes, timeout_s: float) -> float:
+        """Send a beacon measurement.
+
+        Return the seconds until the corrected estimate arrives, NaN if none does.
+        """
+        start = time.perf_counter()
         self._sock.send(answer)
-        while time.perf_counter() - begun < patience_s:
+        while time.perf_counter() - start < timeout_s:
             try:
                 data = self._sock.recv(65536)
             except (BlockingIOError, TimeoutError, ConnectionRefusedError):
                 continue
-            here = time.perf_counter()  # what it is, is found out afterwards
+            here = time.perf_counter()  # take the time before parsing
             if _is_odometry(data):
-                return here - begun
+                return here - start
         return math.nan
 
     def _where(self) -> tuple[float, Geodetic]:
-        t = 10.0 + time.perf_counter() - self._begun
+        t = 10.0 + time.perf_counter() - self._start
         return t, local_to_geodetic("ardupilot", ORIGIN, (V_NORTH * t, 0.0, -HEIGHT))
 
     def _frame(self, name: str, **values: Any) -> bytes:
         self._sequence = self._sequence + 1 & 0xFF
         return frame.encode(dialect.new(name, **values), self._sequence, 1, 1)
 
-    def _say(self, name: str, **values: Any) -> None:
+    def _send(self, name: str, **values: Any) -> None:
         with suppress(ConnectionRefusedError):  # not there yet
             self._sock.send(self._frame(name, **values))
 
@@ -173,16 +181,17 @@ def _is_odometry(data: bytes) -> bool:
 
 
 def _round_trip(sock: socket.socket, data: bytes) -> float:
-    begun = time.perf_counter()
+    start = time.perf_counter()
     sock.send(data)
     sock.recv(65536)
-    return time.perf_counter() - begun
+    return time.perf_counter() - start
 
 
 @contextmanager
-def _apart() -> Iterator[set[int]]:
-    """This process on one processor; the others, for its peers. Where there is one, or the system (not Linux)
-    leaves no choice, all share.
+def _separate_processors() -> Iterator[set[int]]:
+    """Pin this process to one processor and yield the others, for its peers.
+
+    With a single processor all processes share it; without `sched_setaffinity` (not Linux) nothing is pinned.
     """
     if not hasattr(os, "sched_setaffinity"):
         yield set()
@@ -198,8 +207,9 @@ def _apart() -> Iterator[set[int]]:
 
 @contextmanager
 def _peer(processors: set[int], serve: Any, *arguments: Any) -> Iterator[socket.socket]:
-    """A process on `processors` (any, if empty) that runs `serve(port, *arguments)`, and a socket connected
-    to its port; ended by SIGTERM.
+    """Run `serve(port, *arguments)` in a process on `processors` (any if empty); yield a connected socket.
+
+    The process is terminated by SIGTERM.
     """
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:

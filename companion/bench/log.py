@@ -1,4 +1,4 @@
-"""The log written and read, beside the mcap package on the same records and the same file."""
+"""Benchmark of the flight log: writing and reading, compared with the mcap package on the same data."""
 
 import atexit
 import itertools
@@ -16,18 +16,18 @@ from companion.records import Imu, encode
 from companion.storage.flight_log import Writer, read
 
 MESSAGES = 20_000
-READ = 1_000_000  # messages of the file that is read
+READ = 1_000_000  # messages in the file that is read
 ROUNDS = 3
 
 
 def imu(i: int) -> Imu:
-    """Return the i-th of records that differ as a sensor's do."""
+    """Return the i-th of a series of differing records."""
     t_ns = i * 20_000_000
     return Imu(t_ns, t_ns + 1_000_017, 0, (0.1 * i, 0.2, -9.81), (1e-3 / (i + 1), 2e-3, 0.0))
 
 
 def write(path: Path, messages: int) -> None:
-    """Write one closed log of that many records."""
+    """Write a closed log of `messages` records."""
     with Writer(path, metadata={}, start_unix_ns=10**18, start_ns=0, block=True) as log:
         for i in range(messages):
             log.record(imu(i))

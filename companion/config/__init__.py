@@ -1,4 +1,12 @@
-"""Configuration: schema, loading, validation, output profiles."""
+"""Configuration: schema, loading, validation and output profiles.
+
+schema      one frozen structure per section of the TOML file, the unit in every key
+load        file, environment and command line merged; `ConfigError` for every mistake
+validate    combinations of keys that are invalid
+profiles    table of output profiles: messages, rates and autopilot parameters per make of autopilot
+required_parameters     autopilot parameters that a configuration requires
+check_config            the command `companion check-config`
+"""
 
 from companion.config.load import PREFIX, ConfigError, load, parse, to_toml
 from companion.config.schema import (

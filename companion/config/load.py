@@ -1,8 +1,8 @@
-"""Load a configuration: file, environment, flags; later ones win.
+"""Configuration loader: file, environment variables and command line, each overriding the one before.
 
 The file is TOML, one table per section; the environment variable of a key is `COMPANION_SECTION__KEY`. A
-mistake is a `ConfigError`: one sentence that names where it stands, the key, and the nearest valid one. The
-service does not start on it (exit code 78, EX_CONFIG).
+mistake raises `ConfigError`: one sentence with the place, the key and the nearest valid one. The service then
+does not start (exit code 78, EX_CONFIG).
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 import msgspec
 
 from companion.config.schema import Config
-from companion.config.validate import conflicts
+from companion.config.validate import find_conflicts
 
-PREFIX = "COMPANION_"  # of the environment variables that are ours, every one a key
+PREFIX = "COMPANION_"  # every environment variable with this prefix must name a key
 
 
 class ConfigError(ValueError):
-    """A configuration that cannot be meant; the text says where and what to write instead."""
+    """Invalid configuration; the text states where the mistake is and what to write instead."""
 
 
 def load(
@@ -34,10 +34,25 @@ def load(
     pairs: Iterable[str] = (),
     tuned: Path | None = None,
 ) -> Config:
-    """The configuration of file `path`, then environment, then `flags` (keys "section.key", None: unset),
-    then `pairs` ("section.key=value", as typed). `tuned`, what ground stations set, beats `path` and no more.
+    """Load the configuration; each source overrides the ones before.
 
-    Raises `ConfigError` where a file cannot be read, a key is unknown or a value impossible.
+    Parameters
+    ----------
+    path
+        TOML file.
+    tuned
+        TOML file of the values that ground stations set; overrides `path` only.
+    environment
+        Variables `COMPANION_SECTION__KEY`, those of the process by default.
+    flags
+        Values by "section.key"; None is unset.
+    pairs
+        Texts "section.key=value" as typed.
+
+    Raises
+    ------
+    ConfigError
+        If a file cannot be read, a key is unknown or a value is invalid.
     """
     tree: dict[str, dict[str, Any]] = {}
     origin: dict[tuple[str, str], str] = {}
@@ -50,9 +65,9 @@ def load(
         if name.startswith(PREFIX):
             section, between, key = name.removeprefix(PREFIX).lower().partition("__")
             if not between:
-                raise ConfigError(f"environment variable {name}: it names no key{_nearest_variable(name)}")
+                raise ConfigError(f"environment variable {name}: no such key{_nearest_variable(name)}")
             _check_keys({section: {key: text}}, f"environment variable {name}")
-            tree.setdefault(section, {})[key] = _parsed(text)
+            tree.setdefault(section, {})[key] = _parse_value(text)
             origin[section, key] = f"environment variable {name}"
     for name, value in (flags or {}).items():
         if value is not None:
@@ -65,25 +80,25 @@ def load(
         if not key or not text:
             raise ConfigError(f"--set {pair}: write it as SECTION.KEY=VALUE, for example gnss.sigma_m=3.0")
         _check_keys({section: {key: text}}, f"--set {pair}")
-        tree.setdefault(section, {})[key] = _parsed(text.strip())
+        tree.setdefault(section, {})[key] = _parse_value(text.strip())
         origin[section, key] = f"--set {pair}"
     return _convert(tree, origin)
 
 
 def parse(text: str, where: str) -> Config:
-    """The configuration written in `text`; `where` names it in a `ConfigError`."""
+    """Parse the configuration in `text`; `where` names its source in a `ConfigError`."""
     tree = _tree(text, where)
     _check_keys(tree, where)
     return _convert(tree, {(section, key): where for section, table in tree.items() for key in table})
 
 
 def to_toml(config: Config) -> str:
-    """The whole configuration as the TOML that `load` reads back."""
+    """Format the whole configuration as TOML that `load` reads back."""
     lines = []
     for section in config.__struct_fields__:
         table = getattr(config, section)
         lines.append(f"[{section}]")
-        # JSON's strings, numbers, booleans and lists are TOML's too
+        # JSON strings, numbers, booleans and lists are valid TOML
         lines += [
             f"{key} = {msgspec.json.encode(getattr(table, key)).decode()}" for key in table.__struct_fields__
         ]
@@ -106,8 +121,8 @@ def _read(path: Path) -> dict[str, dict[str, Any]]:
 def _tree(text: str, where: str) -> dict[str, dict[str, Any]]:
     try:
         tree = tomllib.loads(text)
-    except (ValueError, RecursionError) as error:  # integers of thousands of digits are none of TOML's errors
-        raise ConfigError(f"{where}: is no TOML: {error}") from None
+    except (ValueError, RecursionError) as error:  # an integer of thousands of digits is no TOMLDecodeError
+        raise ConfigError(f"{where}: not valid TOML: {error}") from None
     for section, table in tree.items():
         if not isinstance(table, dict) and section in Config.__struct_fields__:
             raise ConfigError(f"{where}: `{section}` is a section: write [{section}] and its keys below it")
@@ -137,21 +152,21 @@ def _nearest_variable(name: str) -> str:
     return f"; did you mean `{close[0]}`?" if close else f"; write it as {PREFIX}SECTION__KEY"
 
 
-def _parsed(text: str) -> Any:
-    """An environment variable's text as TOML would read it, else as a string."""
+def _parse_value(text: str) -> Any:
+    """Parse a value as TOML; a text that is not TOML is a string."""
     try:
         return tomllib.loads(f"value = {text}")["value"]
     except (ValueError, RecursionError):
         return text
 
 
-def _listed(value: Any, kind: Any) -> Any:
-    """One value where a list is asked for is a list of one."""
+def _as_list(value: Any, kind: Any) -> Any:
+    """Wrap a single value in a list where the key takes a list."""
     return [value] if get_origin(kind) is tuple and not isinstance(value, list | tuple) else value
 
 
 def _choices(kind: Any) -> tuple[str, ...]:
-    """The words that a key takes, where it takes nothing else."""
+    """Return the texts that a key accepts; empty if it accepts other values too."""
     if get_origin(kind) is Literal:
         return get_args(kind)
     if get_origin(kind) in (Union, UnionType):
@@ -164,7 +179,7 @@ def _convert(tree: Mapping[str, Mapping[str, Any]], origin: Mapping[tuple[str, s
     for section, table in tree.items():
         kind = type(getattr(Config(), section))
         hints = get_type_hints(kind)
-        table = {key: _listed(value, hints[key]) for key, value in table.items()}
+        table = {key: _as_list(value, hints[key]) for key, value in table.items()}
         for key, value in table.items():
             try:
                 msgspec.convert({key: value}, kind)
@@ -175,13 +190,13 @@ def _convert(tree: Mapping[str, Mapping[str, Any]], origin: Mapping[tuple[str, s
                     close = difflib.get_close_matches(str(value), choices, 1, 0.4)
                     nearest = f"; did you mean `{close[0]}`?" if close else ""
                     raise ConfigError(
-                        f"{where}: {section}.{key}: {value!r} is none of {', '.join(choices)}{nearest}"
+                        f"{where}: {section}.{key}: {value!r} is not one of {', '.join(choices)}{nearest}"
                     ) from None
                 raise ConfigError(
-                    f"{where}: {section}.{key} = {value!r} is impossible: {reason[0].lower()}{reason[1:]}"
+                    f"{where}: {section}.{key} = {value!r} is invalid: {reason[0].lower()}{reason[1:]}"
                 ) from None
         sections[section] = msgspec.convert(table, kind)
     config = Config(**sections)
-    for section, key, sentence in conflicts(config):
+    for section, key, sentence in find_conflicts(config):
         raise ConfigError(f"{origin.get((section, key), 'configuration')}: {sentence}")
     return config

@@ -1,5 +1,7 @@
-"""What an autopilot lacks for the configured output profile: looked at, told and, after a yes, set.
+"""Doctor: what an autopilot lacks for the configured output profile; sets parameters after confirmation.
 
-diagnosis    what is found, as values      examination   one link watched and asked, sans-IO
-show         tables and JSON               command       `companion doctor`: socket, clock, terminal
+diagnosis      findings as values
+examination    one link observed, parameters read and set; no I/O
+rendering      tables and JSON
+command        the command `companion doctor`: connection, clock and terminal
 """

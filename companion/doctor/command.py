@@ -1,6 +1,6 @@
-"""`companion doctor`: one link, the clock and the terminal round an `Examination`.
+"""Command `companion doctor`: connection, clock and terminal around an `Examination`.
 
-Nothing is set without a yes, nor while the vehicle is armed.
+Nothing is set without confirmation, or while the vehicle is armed.
 """
 
 from __future__ import annotations
@@ -19,35 +19,36 @@ from companion.config import Config, ConfigError, load
 from companion.config.profiles import PROFILES
 from companion.doctor.diagnosis import Diagnosis, Finding
 from companion.doctor.examination import Examination
-from companion.doctor.rendering import after, as_json, parameter_table, show
+from companion.doctor.rendering import as_json, change_summary, parameter_table, print_diagnosis
 from companion.runtime.service import EX_UNAVAILABLE
-from companion.runtime.signing_key import Keys
-from companion.transport.links import Address, CannotListen, Stream, connect
+from companion.runtime.signing_key import SigningKey
+from companion.transport.reconnect import Address, CannotListen, Connection, connect
 
-HEAR_S = 10.0
-#: However slow the line, the examination or the setting is over after that.
-LONGEST_S = 40.0
-LONGEST_SLEEP_S = 0.2
-#: Long enough for one heartbeat.
+CONNECT_TIMEOUT_S = 10.0
+#: Limit on the examination and on setting parameters, however slow the line is.
+EXAMINATION_TIMEOUT_S = 40.0
+MAX_SLEEP_S = 0.2
+#: Enough to receive one heartbeat.
 HEARTBEAT_S = 1.5
-ARMED = "it is armed, and nothing is set in flight"
+ARMED = "the vehicle is armed; parameters are set only while disarmed"
 
 
 class NoAutopilot(Exception):
-    """None was heard; the text says what was, and what to look at."""
+    """No autopilot found; the text states what was received instead and what to check."""
 
 
-class Patient:
-    """The link to one autopilot and what is seen of it."""
+class AutopilotConnection:
+    """Connection to one autopilot and its examination."""
 
-    def __init__(self, stream: Stream, examination: Examination) -> None:
+    def __init__(self, stream: Connection, examination: Examination) -> None:
         self._stream, self.examination = stream, examination
         self.bytes = 0
-        self._begun = time.monotonic()
+        self._start = time.monotonic()
 
     async def until(self, done: Callable[[int], bool], seconds: float) -> bool:
-        """Carry bytes until `done(now_ns)`, False where it was not after so long. ConnectionError at the
-        link's end.
+        """Transfer bytes until `done(now_ns)`; return False after `seconds`.
+
+        Raises ConnectionError if the link ends.
         """
         examination, end = self.examination, time.monotonic() + seconds
         while not done(now := time.monotonic_ns()):
@@ -56,7 +57,7 @@ class Patient:
             examination.poll(now)
             for data in examination.to_send():
                 self._stream.write(data)
-            wait = min(1e-9 * (examination.deadline() - time.monotonic_ns()), LONGEST_SLEEP_S)
+            wait = min(1e-9 * (examination.deadline() - time.monotonic_ns()), MAX_SLEEP_S)
             try:
                 async with asyncio.timeout(max(wait, 0.001)):
                     data = await self._stream.read()
@@ -67,137 +68,135 @@ class Patient:
         return True
 
     def close(self) -> None:
-        """Leave the link."""
+        """Close the connection."""
         self._stream.close()
 
-    def count_anew(self) -> None:
-        """Count bytes from now on: the streams that were asked for come."""
-        self.bytes, self._begun = 0, time.monotonic()
+    def reset_byte_count(self) -> None:
+        """Restart the byte count, once the requested streams arrive."""
+        self.bytes, self._start = 0, time.monotonic()
 
-    def line_use(self, address: Address) -> list[Finding]:
-        """How full a serial line is in our direction: ten bits a byte."""
+    def check_line_use(self, address: Address) -> list[Finding]:
+        """Report the use of a serial line in our direction, at ten bits per byte."""
         if address.kind != "serial":
             return []
-        use = 10.0 * self.bytes / (time.monotonic() - self._begun) / address.number
+        use = 10.0 * self.bytes / (time.monotonic() - self._start) / address.number
         advice = "raise the baud rate on both sides, or lower the rates"
         return [Finding("line in use", f"{use:.0%}", "at most 80%", use <= 0.8, advice)]
 
 
-async def meet(config: Config, address: Address) -> Patient:
-    """Open the link. OSError where it is not to be had."""
-    keys = Keys.of(config)
-    async with asyncio.timeout(HEAR_S):
+async def open_connection(config: Config, address: Address) -> AutopilotConnection:
+    """Open the link. Raises OSError or TimeoutError."""
+    key = SigningKey.from_config(config)
+    async with asyncio.timeout(CONNECT_TIMEOUT_S):
         stream = await connect(address)
-    return Patient(stream, Examination(config, keys.signing if keys else None))
+    return AutopilotConnection(stream, Examination(config, key.signing if key else None))
 
 
-async def examine(patient: Patient, address: Address) -> Diagnosis:
-    """Hear the autopilot, look at it. Raises NoAutopilot, and ConnectionError where the link ends."""
-    examination = patient.examination
-    if not await patient.until(lambda now: examination.is_heard, HEAR_S):
-        raise NoAutopilot(f"no autopilot heard on {address} in {HEAR_S:.0f} s: {_what_came(patient)}")
-    patient.count_anew()
-    await patient.until(examination.is_done, LONGEST_S)
+async def run_examination(connection: AutopilotConnection, address: Address) -> Diagnosis:
+    """Find the autopilot and examine it. Raises NoAutopilot, or ConnectionError if the link ends."""
+    examination = connection.examination
+    if not await connection.until(lambda now: examination.is_connected, CONNECT_TIMEOUT_S):
+        raise NoAutopilot(
+            f"no autopilot found on {address} in {CONNECT_TIMEOUT_S:.0f} s: {_describe_traffic(connection)}"
+        )
+    connection.reset_byte_count()
+    await connection.until(examination.is_done, EXAMINATION_TIMEOUT_S)
     diagnosis = examination.diagnosis(time.monotonic_ns())
-    more = (*patient.line_use(address), machine(struct.calcsize("P") * 8))
+    more = (*connection.check_line_use(address), check_machine(struct.calcsize("P") * 8))
     return diagnosis._replace(findings=(*diagnosis.findings, *more))
 
 
-async def change(patient: Patient, before: Diagnosis) -> Diagnosis | None:
-    """Set what is not as needed and read it again; the rest of the diagnosis stands as it was.
+async def set_parameters(connection: AutopilotConnection, before: Diagnosis) -> Diagnosis | None:
+    """Set the wrong parameters and read them back; return `before` with the new parameters.
 
-    None where the vehicle was armed while the question stood, so that nothing is set.
+    Return None, with nothing set, if the vehicle was armed in the meantime.
     """
-    examination = patient.examination
-    await patient.until(lambda now: False, HEARTBEAT_S)
+    examination = connection.examination
+    await connection.until(lambda now: False, HEARTBEAT_S)
     if examination.diagnosis(time.monotonic_ns()).identity.is_armed:
         return None
-    examination.change()
-    await patient.until(lambda now: examination.is_read, LONGEST_S)
+    examination.set_parameters()
+    await connection.until(lambda now: examination.has_all_parameters, EXAMINATION_TIMEOUT_S)
     return before._replace(parameters=examination.diagnosis(time.monotonic_ns()).parameters)
 
 
-def machine(bits: int) -> Finding:
-    """Whether this computer is one that the numerical libraries are made for."""
+def check_machine(bits: int) -> Finding:
+    """Check that the numerical libraries are available for this computer."""
     return Finding("this machine", f"{bits}-bit", "64-bit", bits == 64, "install a 64-bit system")
 
 
-def _what_came(patient: Patient) -> str:
-    examination = patient.examination
+def _describe_traffic(connection: AutopilotConnection) -> str:
+    examination = connection.examination
     senders = [f"{system}/{component}" for system, component in examination.session.reader.counts]
-    if refused := examination.session.refused:
+    if refused := examination.session.rejected:
         reasons = ", ".join(reason.name.lower() for reason in refused)
-        return f"frames were refused ({reasons}); have it sign with the key of signing.key_file"
+        return f"frames rejected ({reasons}); let it sign with the key of signing.key_file"
     if senders:
-        return (
-            f"only {', '.join(senders)} spoke; is the autopilot connected there, is link.system_id its own?"
-        )
-    if patient.bytes:
-        return (
-            f"{patient.bytes} bytes came and no MAVLink among them; is the baud rate the same on both sides?"
-        )
-    return "not a byte came; look at the address, the wiring (TX to RX) and the port's MAVLink protocol"
+        return f"received only {', '.join(senders)}; check the autopilot's connection and link.system_id"
+    if connection.bytes:
+        return f"{connection.bytes} bytes received, no MAVLink; check that both sides use the same baud rate"
+    return "no data received; check the address, the wiring (TX to RX) and the port's MAVLink protocol"
 
 
-def may_change(diagnosis: Diagnosis, yes: bool) -> str:
-    """Ask; empty for a yes, else why nothing is set."""
-    sets = [f"{f.need.name} = {f.need.value:g}" for f in diagnosis.wrong if f.has is not None]
+def confirm_change(diagnosis: Diagnosis, yes: bool) -> str:
+    """Ask for confirmation; return "" if confirmed, else why nothing is set."""
+    sets = [f"{f.need.name} = {f.need.value:g}" for f in diagnosis.wrong_parameters if f.has is not None]
     if not sets:
         return "there is nothing to set"
     if diagnosis.identity.is_armed:
         return ARMED
     if yes:
         return ""
-    if not _is_somebody_here():
-        return "nobody is here to say yes: give --yes"
+    if not _is_interactive():
+        return "not run in a terminal: give --yes to confirm"
     question = f"Set {', '.join(sets)} on system {diagnosis.identity.system}?"
-    return "" if click.confirm(question, err=True) else "you said no"
+    return "" if click.confirm(question, err=True) else "not confirmed"
 
 
-def look(config: Config, address: Address, apply: bool, yes: bool, as_json_: bool) -> bool:
-    """Examine, show, change after a yes, show again; whether all is well at the end."""
-    console, said = Console(quiet=as_json_), Console(stderr=True)
-    with asyncio.Runner() as runner, said.status(f"listening on {address}") as status:
-        patient = runner.run(meet(config, address))
+def examine(config: Config, address: Address, apply: bool, yes: bool, as_json_: bool) -> bool:
+    """Examine the autopilot, print the diagnosis, set parameters if confirmed; return whether all is well."""
+    console, stderr = Console(quiet=as_json_), Console(stderr=True)
+    with asyncio.Runner() as runner, stderr.status(f"listening on {address}") as status:
+        connection = runner.run(open_connection(config, address))
         try:
-            diagnosis = first = runner.run(examine(patient, address))
+            diagnosis = first = runner.run(run_examination(connection, address))
             status.stop()
-            show(console, config, address, diagnosis)
+            print_diagnosis(console, config, address, diagnosis)
             if apply:
-                why = may_change(diagnosis, yes)
-                new = None if why else runner.run(change(patient, diagnosis))
+                why = confirm_change(diagnosis, yes)
+                new = None if why else runner.run(set_parameters(connection, diagnosis))
                 if new is None:
-                    said.print(f"Nothing was set: {why or ARMED}.", highlight=False)
+                    stderr.print(f"Nothing was set: {why or ARMED}.", highlight=False)
                 else:
                     diagnosis = new
                     console.print(parameter_table(diagnosis))
-                    console.print(after(diagnosis, diagnosis.changed_from(first)), highlight=False)
+                    console.print(change_summary(diagnosis, diagnosis.changed_from(first)), highlight=False)
         finally:
-            patient.close()
+            connection.close()
     if as_json_:
         click.echo(as_json(config, address, diagnosis, diagnosis.changed_from(first)))
     return diagnosis.is_well
 
 
-def _is_somebody_here() -> bool:
+def _is_interactive() -> bool:
     return sys.stdin.isatty()
 
 
 def _advice(error: OSError) -> str:
     if isinstance(error, PermissionError):
-        return "; a serial line belongs to a group, most often dialout: add this user to it and log in again"
+        return "; add this user to the group of the serial port (usually dialout) and log in again"
     return "; is `companion run` still running?" if isinstance(error, CannotListen) else ""
 
 
 @click.command("doctor")
 @click.option("--config", "file", type=click.Path(path_type=Path), help="TOML file; see check-config.")
-@click.option("--connect", help="Link to the autopilot; without it the configuration's first.")
+@click.option("--connect", help="Link to the autopilot; default: the first of the configuration.")
 @click.option(
-    "--profile", type=click.Choice(list(PROFILES)), help="Output profile in the configuration's place."
+    "--profile", type=click.Choice(list(PROFILES)), help="Output profile; overrides the configuration."
 )
 @click.option("--set", "pairs", multiple=True, metavar="SECTION.KEY=VALUE", help="Any other key of the file.")
-@click.option("--apply", is_flag=True, help="Set the parameters that are not as needed, after a yes.")
-@click.option("--yes", is_flag=True, help="Say yes to --apply beforehand.")
+@click.option("--apply", is_flag=True, help="Set the wrong parameters, after confirmation.")
+@click.option("--yes", is_flag=True, help="Confirm --apply without asking.")
 @click.option("--json", "as_json_", is_flag=True, help="Print the findings as JSON.")
 def command(
     file: Path | None,
@@ -208,11 +207,11 @@ def command(
     yes: bool,
     as_json_: bool,
 ) -> None:
-    """Look at the autopilot: has it what the output profile needs, and does the link carry it?
+    """Check the autopilot's parameters and the link against the output profile.
 
-    Reads parameters and watches the link for 6 to 14 seconds. Nothing is set without --apply and a yes, nor
-    while it is armed. Exit codes: 0 all is well, 1 something is missing, 69 no autopilot was heard, 78 bad
-    configuration.
+    Reads parameters and observes the link for 6 to 14 seconds. Nothing is set without --apply and
+    confirmation, or while the vehicle is armed. Exit codes: 0 all is well, 1 something is missing, 69 no
+    autopilot found, 78 invalid configuration.
     """
     config = load(file, {"output.profile": profile}, pairs=pairs)
     try:
@@ -220,12 +219,12 @@ def command(
     except (ValueError, IndexError) as error:
         raise ConfigError(f"--connect: {error}") from None
     try:
-        well = look(config, address, apply, yes, as_json_)
+        well = examine(config, address, apply, yes, as_json_)
     except NoAutopilot as error:
         click.echo(f"companion: {error}", err=True)
         sys.exit(EX_UNAVAILABLE)
     except TimeoutError:
-        click.echo(f"companion: {address}: nobody answers", err=True)
+        click.echo(f"companion: {address}: no peer connected within {CONNECT_TIMEOUT_S:g} s", err=True)
         sys.exit(EX_UNAVAILABLE)
     except OSError as error:
         click.echo(f"companion: {address}: {error.strerror or error}{_advice(error)}", err=True)

@@ -1,6 +1,6 @@
-"""What `companion doctor` finds, as values: who the autopilot is, its parameters, the link and the machine.
+"""Diagnosis: the findings of `companion doctor` on the autopilot, its parameters, the link and the machine.
 
-It knows neither how anything is observed (`examination`) nor how it is shown (`doctor`).
+Values only: `examination` observes, `rendering` shows.
 """
 
 from __future__ import annotations
@@ -9,20 +9,20 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 from companion.config import Config
-from companion.config.profiles import PROFILES, Needed
+from companion.config.profiles import PROFILES, RequiredParameter
 from companion.link.dialect import TYPES
-from companion.link.parameter_client import Value, same
+from companion.link.parameter_client import Value, equal_real32
 from companion.link.stream_rates import ENOUGH
 from companion.navigator.step import uses
 from companion.records import AirData, Attitude, Gnss, Imu, LocalPosition, Pressure
 
-#: Messages that a make does not have; its other ones tell the same.
-LACKING = {
+#: Messages that a make does not send; it has others with the same content.
+MISSING_MESSAGES = {
     "ardupilot": frozenset({"HIGHRES_IMU"}),
     "px4": frozenset({"RAW_IMU", "EKF_STATUS_REPORT", "SIM_STATE"}),
 }
-#: What the navigator makes of which stream: one that its inertial channel does not use may be missing.
-READ_AS: Mapping[str, type] = {
+#: Record type of each stream: one that the inertial channel does not use may be missing.
+RECORD_TYPES: Mapping[str, type] = {
     "RAW_IMU": Imu,
     "HIGHRES_IMU": Imu,
     "LOCAL_POSITION_NED": LocalPosition,
@@ -35,20 +35,20 @@ LOGGED = frozenset({"EKF_STATUS_REPORT", "SIM_STATE"})
 
 
 class ParameterFinding(NamedTuple):
-    """A parameter that the profile needs, and what the autopilot has: None, and `trouble` says why."""
+    """Required parameter and the autopilot's value; None if not read, with the reason in `trouble`."""
 
-    need: Needed
+    need: RequiredParameter
     has: Value | None
     trouble: str
 
     @property
     def is_well(self) -> bool:
-        """Whether it has what it needs."""
-        return same(self.has, self.need.value)
+        """Whether the autopilot has the required value."""
+        return equal_real32(self.has, self.need.value)
 
 
 class Finding(NamedTuple):
-    """One line about the link or the machine; `is_well` None is for information."""
+    """Finding about the link or the machine; with `is_well` None for information only."""
 
     what: str
     found: str
@@ -58,7 +58,7 @@ class Finding(NamedTuple):
 
 
 class Identity(NamedTuple):
-    """Who the autopilot is; `make` as profiles are called ("other": neither), empty where not told."""
+    """Identity of the autopilot; `make` is the name of a profile or "other", `version` empty if unknown."""
 
     system: int
     make: str
@@ -68,35 +68,35 @@ class Identity(NamedTuple):
 
 
 class Diagnosis(NamedTuple):
-    """All that was found."""
+    """All findings of one examination."""
 
     identity: Identity
     parameters: tuple[ParameterFinding, ...]
     findings: tuple[Finding, ...]
 
     @property
-    def wrong(self) -> tuple[ParameterFinding, ...]:
-        """The parameters that are not as needed."""
+    def wrong_parameters(self) -> tuple[ParameterFinding, ...]:
+        """The parameters without the required value."""
         return tuple(p for p in self.parameters if not p.is_well)
 
     @property
-    def amiss(self) -> tuple[Finding, ...]:
-        """What else is not as needed."""
+    def problems(self) -> tuple[Finding, ...]:
+        """The other findings that are not well."""
         return tuple(f for f in self.findings if f.is_well is False)
 
     @property
     def is_well(self) -> bool:
-        """Whether nothing is missing."""
-        return not self.wrong and not self.amiss
+        """Whether all requirements are met."""
+        return not self.wrong_parameters and not self.problems
 
     def changed_from(self, before: Diagnosis) -> tuple[str, ...]:
-        """The parameters that are not what they were."""
+        """Return the names of the parameters whose value changed since `before`."""
         pairs = zip(before.parameters, self.parameters)
         return tuple(new.need.name for old, new in pairs if old.has != new.has)
 
 
-def of_profile(config: Config, make: str) -> list[Finding]:
-    """What there is to say of a profile that is for another make."""
+def check_profile(config: Config, make: str) -> list[Finding]:
+    """Report an output profile of another make of autopilot."""
     profile = config.output.profile
     if profile in ("monitor", "custom", make):
         return []
@@ -104,16 +104,21 @@ def of_profile(config: Config, make: str) -> list[Finding]:
     return [Finding("output profile", profile, make, False, advice)]
 
 
-def of_streams(config: Config, make: str, rates: Mapping[int, tuple[float, float | None]]) -> list[Finding]:
-    """What comes of what was asked for: `rates` are asked and measured (None: not yet), Hz, by message id."""
+def check_streams(
+    config: Config, make: str, rates: Mapping[int, tuple[float, float | None]]
+) -> list[Finding]:
+    """Compare requested and measured stream rates.
+
+    `rates` has both by message id, Hz; measured None is not known yet.
+    """
     found, used = [], uses(config.channel)
     for msgid, (asked, measured) in rates.items():
         name = TYPES[msgid].name
-        if name in LACKING.get(make, ()):
+        if name in MISSING_MESSAGES.get(make, ()):
             continue
         comes = (measured or 0.0) >= ENOUGH * asked
-        idle = name in LOGGED or (name in READ_AS and READ_AS[name] not in used)
+        idle = name in LOGGED or (name in RECORD_TYPES and RECORD_TYPES[name] not in used)
         is_well = comes or (None if idle else False)
-        advice = "" if comes else "too slow a line, or a ground station that sets other rates"
+        advice = "" if comes else "the line is too slow, or a ground station sets other rates"
         found.append(Finding(name, f"{measured or 0.0:.1f} Hz", f"{asked:g} Hz", is_well, advice))
     return found

@@ -1,13 +1,13 @@
-"""What an autopilot and the way to it lack for the configured output profile. No clock, no I/O.
+"""Examination of one link: autopilot, parameters and stream rates against the output profile. No I/O.
 
     examination.receive(data, now_ns)               # bytes of the link
     examination.poll(now_ns)                        # no later than examination.deadline()
     for data in examination.to_send(): ...          # after either
-    examination.diagnosis(now_ns)                   # once is_done(now_ns): what was found
+    examination.diagnosis(now_ns)                   # once is_done(now_ns): the findings
 
-It speaks with the ids and rates that `companion run` would, asks for what makes the autopilot known and for
-the parameters that the profile needs, and watches for WATCHED what comes. Nothing is changed on the autopilot
-but its message rates, unless `change` is called.
+It uses the ids and rates of `companion run`, requests the autopilot's version and the required parameters,
+and observes the link for `OBSERVE`. Only message rates are changed on the autopilot, unless `set_parameters`
+is called.
 """
 
 from __future__ import annotations
@@ -15,15 +15,21 @@ from __future__ import annotations
 from typing import Any
 
 from companion.config import Config
-from companion.config.profiles import Needed
-from companion.config.required_parameters import needed
-from companion.doctor.diagnosis import Diagnosis, Finding, Identity, ParameterFinding, of_profile, of_streams
+from companion.config.profiles import RequiredParameter
+from companion.config.required_parameters import required_parameters
+from companion.doctor.diagnosis import (
+    Diagnosis,
+    Finding,
+    Identity,
+    ParameterFinding,
+    check_profile,
+    check_streams,
+)
 from companion.link import dialect, frame
-from companion.link.clock import SECOND
 from companion.link.decode import MAKES
-from companion.link.parameter_client import Answer, ParameterClient, encoding_of, same
+from companion.link.dialect import mavlink, rsbn
+from companion.link.parameter_client import Answer, ParameterClient, encoding_of, equal_real32
 from companion.link.session import (
-    AUTOPILOT_COMPONENT,
     LinkUp,
     MessageReceived,
     NotUnderstood,
@@ -31,38 +37,41 @@ from companion.link.session import (
     Session,
 )
 from companion.link.signing import Signing
-from companion.runtime.core import wanted
+from companion.runtime.core import requested_rates
+from companion.units import SECOND_NS
 
-HEARTBEAT, GPS_GLOBAL_ORIGIN, AUTOPILOT_VERSION = 0, 49, 148
-RSBN_MEASUREMENT = dialect.type_named("RSBN_MEASUREMENT").msgid
-REQUEST_MESSAGE = 512  # MAV_CMD
-ARMED = 128  # MAV_MODE_FLAG_SAFETY_ARMED
-ASK_EVERY = 1 * SECOND
-#: So long the autopilot may take to tell its version before its make alone is believed.
-PATIENCE = 3 * SECOND
-#: What comes is watched for so long, and where something is amiss for so long.
-WATCHED, WATCHED_LONGER = 6 * SECOND, 14 * SECOND
-GREATEST_LOSS = 0.05
-STAGES = {0: "-dev", 64: "-alpha", 128: "-beta", 192: "-rc", 255: ""}  # FIRMWARE_VERSION_TYPE
+REQUEST_INTERVAL = 1 * SECOND_NS
+#: Wait for the autopilot's version; after that its make alone is used.
+VERSION_TIMEOUT = 3 * SECOND_NS
+#: Observation time, and observation time if something is not well.
+OBSERVE, OBSERVE_LONGER = 6 * SECOND_NS, 14 * SECOND_NS
+MAX_LOSS = 0.05
+STAGES = {
+    mavlink.FIRMWARE_VERSION_TYPE_DEV: "-dev",
+    mavlink.FIRMWARE_VERSION_TYPE_ALPHA: "-alpha",
+    mavlink.FIRMWARE_VERSION_TYPE_BETA: "-beta",
+    mavlink.FIRMWARE_VERSION_TYPE_RC: "-rc",
+    mavlink.FIRMWARE_VERSION_TYPE_OFFICIAL: "",
+}
 
 
 class Examination:
-    """One look at the autopilot of one link."""
+    """One examination of the autopilot on one link."""
 
     def __init__(self, config: Config, signing: Signing | None = None) -> None:
         self._config = config
         self.session = Session(
             component=config.link.component_id,
             autopilot_system=config.link.system_id or None,
-            rates_hz=wanted(config),
+            rates_hz=requested_rates(config),
             signing=signing,
         )
-        self.bad = 0  # chunks of bytes that are no frame
-        self._reader = frame.Reader()  # for frames in our own name, which the session does not show
+        self.bad = 0  # chunks of bytes that are not frames
+        self._reader = frame.Reader()  # for frames with our own id, which the session drops
         self._sent: set[bytes] = set()
-        self._doubles = 0
-        self._begun: int | None = None  # when the autopilot was first heard
-        self._asked_at = 0
+        self._id_conflicts = 0
+        self._start: int | None = None  # time of the first heartbeat
+        self._next_request_ns = 0
         self._make_id = 0
         self._heartbeat = dialect.new("HEARTBEAT")
         self._version: Any = None
@@ -70,30 +79,30 @@ class Examination:
         self._others: set[int] = set()
         self._beacons: set[int] = set()
         self._client: ParameterClient | None = None
-        self._needed: tuple[Needed, ...] = ()
+        self._needed: tuple[RequiredParameter, ...] = ()
         self._answers: dict[str, Answer] = {}
 
     @property
-    def is_heard(self) -> bool:
-        """Whether the autopilot was heard."""
-        return self._begun is not None
+    def is_connected(self) -> bool:
+        """Whether an autopilot was found."""
+        return self._start is not None
 
     @property
     def make(self) -> str:
-        """The autopilot's make, as profiles are called."""
+        """The autopilot's make, as in the names of profiles."""
         return MAKES.get(self._make_id, "other")
 
     def receive(self, data: bytes, now_ns: int) -> None:
-        """Take bytes that came at `now_ns`."""
+        """Process bytes received at `now_ns`."""
         for found in self._reader.receive(data):
             if isinstance(found, frame.Frame):
                 ours = (found.system, found.component) == (self.session.system, self.session.component)
-                self._doubles += ours and found.raw not in self._sent
+                self._id_conflicts += ours and found.raw not in self._sent
         for event in self.session.receive(data, now_ns):
             if isinstance(event, MessageReceived):
                 self._on_message(event)
             elif isinstance(event, LinkUp):
-                self._begun = self._begun or now_ns
+                self._start = self._start or now_ns
                 self._make_id = event.autopilot
             elif isinstance(event, NotUnderstood):
                 self.bad += 1
@@ -101,17 +110,17 @@ class Examination:
                 self._others.add(event.system)
 
     def poll(self, now_ns: int) -> None:
-        """Do what is due."""
+        """Make the requests that are due."""
         self.session.poll(now_ns)
-        if self._begun is None:
+        if self._start is None:
             return
-        if now_ns >= self._asked_at:
-            self._asked_at = now_ns + ASK_EVERY
+        if now_ns >= self._next_request_ns:
+            self._next_request_ns = now_ns + REQUEST_INTERVAL
             if self._version is None:
-                self._ask_for(AUTOPILOT_VERSION)
+                self._request_message(mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION)
             if self._origin is None:
-                self._ask_for(GPS_GLOBAL_ORIGIN)
-        if self._client is None and (self._version is not None or now_ns - self._begun >= PATIENCE):
+                self._request_message(mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN)
+        if self._client is None and (self._version is not None or now_ns - self._start >= VERSION_TIMEOUT):
             self._begin_reading()
         if self._client is not None:
             self._answers |= {answer.name: answer for answer in self._client.poll(now_ns)}
@@ -119,56 +128,55 @@ class Examination:
                 self.session.send(message)
 
     def to_send(self) -> list[bytes]:
-        """The frames to be written now."""
+        """Return the frames to write now."""
         frames = self.session.to_send()
         self._sent.update(frames)
         return frames
 
     def deadline(self) -> int:
-        """When `poll` must be called at the latest."""
+        """Return the latest time of the next `poll`, ns."""
         due = [self.session.deadline()]
-        if self._begun is not None:
-            due.append(self._asked_at)
+        if self._start is not None:
+            due.append(self._next_request_ns)
         if self._client is not None and (asking := self._client.deadline()) is not None:
             due.append(asking)
         return min(due)
 
     def is_done(self, now_ns: int) -> bool:
-        """Whether everything was seen that there is to be seen."""
-        if self._begun is None or not self.is_read:
+        """Whether all parameters are read and the observation time is over."""
+        if self._start is None or not self.has_all_parameters:
             return False
-        watched = now_ns - self._begun
-        return watched >= (WATCHED if self.diagnosis(now_ns).is_well else WATCHED_LONGER)
+        return now_ns - self._start >= (OBSERVE if self.diagnosis(now_ns).is_well else OBSERVE_LONGER)
 
     @property
-    def is_read(self) -> bool:
-        """Whether every parameter asked for, or changed, was answered or given up."""
+    def has_all_parameters(self) -> bool:
+        """Whether every parameter read or set was answered, or its retries are used up."""
         return self._client is not None and self._client.is_idle
 
-    def change(self) -> None:
-        """Set what is not as needed, as far as it is there; `is_done` tells when it is proved or refused."""
+    def set_parameters(self) -> None:
+        """Set the wrong parameters that exist; `has_all_parameters` is true once they are read back."""
         assert self._client is not None
         for need in self._needed:
             answer = self._answers[need.name]
-            if answer.value is not None and not same(answer.value, need.value):
+            if answer.value is not None and not equal_real32(answer.value, need.value):
                 self._client.set(need.name, need.value)
 
     def diagnosis(self, now_ns: int) -> Diagnosis:
-        """What was found up to now."""
+        """Return the findings up to now."""
         return Diagnosis(self._identity(), self._parameters(), tuple(self._findings(now_ns)))
 
-    # -- what is heard --------------------------------------------------------------------------------------
+    # -- input ----------------------------------------------------------------------------------------------
 
     def _on_message(self, event: MessageReceived) -> None:
-        if event.frame.msgid == RSBN_MEASUREMENT:
+        if event.frame.msgid == rsbn.MAVLINK_MSG_ID_RSBN_MEASUREMENT:
             self._beacons.add(event.message.beacon_id)
         if not event.from_autopilot:
             return
-        if event.frame.msgid == HEARTBEAT:
+        if event.frame.msgid == mavlink.MAVLINK_MSG_ID_HEARTBEAT:
             self._heartbeat = event.message
-        elif event.frame.msgid == AUTOPILOT_VERSION:
+        elif event.frame.msgid == mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION:
             self._version = event.message
-        elif event.frame.msgid == GPS_GLOBAL_ORIGIN:
+        elif event.frame.msgid == mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN:
             self._origin = event.message
         if self._client is not None:
             answers = self._client.receive(event.message, event.frame)
@@ -177,37 +185,37 @@ class Examination:
     def _begin_reading(self) -> None:
         capabilities = None if self._version is None else self._version.capabilities
         encoding = encoding_of(capabilities, self._heartbeat.autopilot)
-        self._client = ParameterClient(self.session.autopilot or 0, AUTOPILOT_COMPONENT, encoding)
-        if self._is_its_profile:
-            self._needed = needed(self._config, self.make)
+        self._client = ParameterClient(self.session.autopilot or 0, mavlink.MAV_COMP_ID_AUTOPILOT1, encoding)
+        if self._is_profile_applicable:
+            self._needed = required_parameters(self._config, self.make)
             self._client.read(need.name for need in self._needed)
 
-    def _ask_for(self, msgid: int) -> None:
+    def _request_message(self, msgid: int) -> None:
         self.session.send(
             dialect.new(
                 "COMMAND_LONG",
                 target_system=self.session.autopilot or 0,
-                target_component=AUTOPILOT_COMPONENT,
-                command=REQUEST_MESSAGE,
+                target_component=mavlink.MAV_COMP_ID_AUTOPILOT1,
+                command=mavlink.MAV_CMD_REQUEST_MESSAGE,
                 param1=msgid,
             )
         )
 
-    # -- what it means --------------------------------------------------------------------------------------
+    # -- findings -------------------------------------------------------------------------------------------
 
     @property
-    def _is_its_profile(self) -> bool:
-        return not of_profile(self._config, self.make)
+    def _is_profile_applicable(self) -> bool:
+        return not check_profile(self._config, self.make)
 
     def _identity(self) -> Identity:
-        kind = dialect.mavlink.enums["MAV_TYPE"].get(self._heartbeat.type)
+        kind = mavlink.enums["MAV_TYPE"].get(self._heartbeat.type)
         vehicle = kind.name.removeprefix("MAV_TYPE_").replace("_", " ").lower() if kind else "vehicle"
         version = ""
         if self._version is not None:
             stated = self._version.flight_sw_version
             major, minor, patch, stage = (stated >> shift & 255 for shift in (24, 16, 8, 0))
             version = f"{major}.{minor}.{patch}{STAGES.get(stage, '')}"
-        armed = bool(self._heartbeat.base_mode & ARMED)
+        armed = bool(self._heartbeat.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
         return Identity(self.session.autopilot or 0, self.make, vehicle, version, armed)
 
     def _parameters(self) -> tuple[ParameterFinding, ...]:
@@ -218,58 +226,62 @@ class Examination:
         return tuple(found)
 
     def _findings(self, now: int) -> list[Finding]:
-        heard = ", ".join(map(str, sorted(self._beacons)))
+        beacons = ", ".join(map(str, sorted(self._beacons)))
         return [
-            *of_profile(self._config, self.make),
-            *of_streams(self._config, self.make, self.session.streams.rates()),
-            *self._of_link(now),
-            Finding("RSBN beacons", heard or "none", "", None),
+            *check_profile(self._config, self.make),
+            *check_streams(self._config, self.make, self.session.stream_rates.rates()),
+            *self._check_link(now),
+            Finding("RSBN beacons", beacons or "none", "", None),
         ]
 
-    def _of_link(self, now: int) -> list[Finding]:
+    def _check_link(self, now: int) -> list[Finding]:
         session, found = self.session, list[Finding]()
-        counts = session.reader.counts.get((session.autopilot or 0, AUTOPILOT_COMPONENT), frame.Counts(0, 0))
+        counts = session.reader.counts.get(
+            (session.autopilot or 0, mavlink.MAV_COMP_ID_AUTOPILOT1), frame.Counts(0, 0)
+        )
         loss = counts.lost / max(counts.lost + counts.received, 1)
-        advice = "too slow or too long a line, or no common ground"
+        advice = "check line speed, cable length and common ground"
         found.append(
-            Finding(
-                "frames lost", f"{loss:.1%}", f"at most {GREATEST_LOSS:.0%}", loss <= GREATEST_LOSS, advice
-            )
+            Finding("frames lost", f"{loss:.1%}", f"at most {MAX_LOSS:.0%}", loss <= MAX_LOSS, advice)
         )
         half = session.clock.uncertainty(now)
         found.append(
             Finding(
                 "TIMESYNC",
-                "no answer" if half is None else f"{2e-6 * half:.1f} ms there and back",
+                "no answer" if half is None else f"{2e-6 * half:.1f} ms round trip",
                 "answers",
                 half is not None,
-                "without it times are those of arrival; let it through the router",
+                "let TIMESYNC through the router; without it arrival times are used",
             )
         )
         place = "not known"
         if self._origin is not None:
             place = f"{self._origin.latitude * 1e-7:.5f}, {self._origin.longitude * 1e-7:.5f}"
-        advice = "it comes with the first 3D fix; wait under an open sky"
+        advice = "wait under an open sky for the first 3D fix"
         found.append(Finding("GPS_GLOBAL_ORIGIN", place, "known", self._origin is not None, advice))
         who = f"{session.system}/{session.component}"
-        advice = "another speaks in our name; set link.component_id, unless it is `companion run`"
+        advice = "another component uses our id; stop `companion run` or set link.component_id"
         found.append(
             Finding(
-                "our id", f"{who} {'twice' if self._doubles else 'free'}", "free", not self._doubles, advice
+                "our id",
+                f"{who} {'used twice' if self._id_conflicts else 'free'}",
+                "free",
+                not self._id_conflicts,
+                advice,
             )
         )
         if self._others:
             others = ", ".join(map(str, sorted({*self._others, session.autopilot or 0})))
-            advice = "set link.system_id to the one that is meant"
+            advice = "set link.system_id to the intended one"
             found.append(Finding("autopilots", others, "one", bool(self._config.link.system_id), advice))
-        if refused := session.refused.total():
+        if refused := session.rejected.total():
             found.append(
                 Finding(
-                    "frames refused",
+                    "frames rejected",
                     str(refused),
                     "0",
                     False,
-                    "have all sign with the key of signing.key_file",
+                    "let all senders sign with the key of signing.key_file",
                 )
             )
         return found

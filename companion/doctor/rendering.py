@@ -1,4 +1,4 @@
-"""A diagnosis as a person reads it on 80 columns, and as a program does."""
+"""Rendering of a diagnosis: tables for a terminal of 80 columns, JSON for programs."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from rich.table import Table
 from companion.config import Config
 from companion.doctor.diagnosis import Diagnosis
 from companion.link.parameter_client import Value
-from companion.transport.links import Address
+from companion.transport.reconnect import Address
 
 NAMES = {"ardupilot": "ArduPilot", "px4": "PX4", "other": "an autopilot of another make"}
 _GOOD, _BAD, _NOTE = "[green]ok[/]", "[bold red]{}[/]", "[dim]-[/]"
 
 
-def _shown(value: Value | None) -> str:
+def _format_value(value: Value | None) -> str:
     return "-" if value is None else f"{value:.7g}"
 
 
-def show(console: Console, config: Config, address: Address, diagnosis: Diagnosis) -> None:
-    """Print all of it."""
+def print_diagnosis(console: Console, config: Config, address: Address, diagnosis: Diagnosis) -> None:
+    """Print a diagnosis."""
     console.print(heading(config, address, diagnosis), highlight=False)
     if diagnosis.parameters:
         console.print(parameter_table(diagnosis))
@@ -31,22 +31,22 @@ def show(console: Console, config: Config, address: Address, diagnosis: Diagnosi
 
 
 def parameter_table(diagnosis: Diagnosis) -> Table:
-    """The parameters: has, needs, why."""
+    """Return the table of parameters."""
     table = Table(title="parameters of the autopilot", title_justify="left")
     for column in ("", "parameter", "has", "needs", "why"):
         numeric = column in ("has", "needs")
         table.add_column(column, justify="right" if numeric else "left", no_wrap=column in ("", "parameter"))
     for found in diagnosis.parameters:
         state = _GOOD if found.is_well else _BAD.format("absent" if found.has is None else "wrong")
-        why = found.need.why + (" (counts after a reboot)" if found.need.reboot else "")
+        why = found.need.why + (" (after a reboot)" if found.need.reboot else "")
         if found.trouble:
             why = f"[red]{found.trouble}[/]; {why}"
-        table.add_row(state, found.need.name, _shown(found.has), _shown(found.need.value), why)
+        table.add_row(state, found.need.name, _format_value(found.has), _format_value(found.need.value), why)
     return table
 
 
 def finding_table(diagnosis: Diagnosis) -> Table:
-    """The link and the machine."""
+    """Return the table of the link and the machine."""
     table = Table(title="link and machine", title_justify="left")
     for column in ("", "what", "found", "needs"):
         table.add_column(column, no_wrap=column in ("", "what"))
@@ -57,13 +57,13 @@ def finding_table(diagnosis: Diagnosis) -> Table:
 
 
 def heading(config: Config, address: Address, diagnosis: Diagnosis) -> str:
-    """Who was heard, and what for it is looked at."""
+    """Return the autopilot's identity and the output profile, two lines."""
     who = diagnosis.identity
     name = " ".join(part for part in (NAMES[who.make], who.version) if part)
     armed = "[bold red]armed[/]" if who.is_armed else "disarmed"
     output = config.output
     sent = [name for name, hz in output.rates_hz.items() if hz > 0.0 and name != "NAVIGATION_STATUS"]
-    fed = " and ".join(sent) if sent else "nothing is fed to it"
+    fed = " and ".join(sent) if sent else "no position is sent to it"
     return (
         f"{name} ({who.vehicle}), system {who.system}, {armed}, over {address}\n"
         f"output profile {output.profile}: {fed}"
@@ -71,18 +71,22 @@ def heading(config: Config, address: Address, diagnosis: Diagnosis) -> str:
 
 
 def summary(config: Config, diagnosis: Diagnosis) -> str:
-    """What is missing, a line each."""
-    said = []
-    if there := sum(found.has is not None for found in diagnosis.wrong):
-        said.append(f"{_number(there, 'parameter')} not as needed: --apply sets what is there, after a yes.")
-    if absent := len(diagnosis.wrong) - there:
-        said.append(f"{_number(absent, 'parameter')} absent: is the firmware old, or built without?")
-    said += [f"{found.what}: {found.advice}." for found in diagnosis.amiss]
-    if not said:
-        said.append("All is well.")
+    """Return what is not well, one line each."""
+    lines = []
+    if there := sum(found.has is not None for found in diagnosis.wrong_parameters):
+        lines.append(f"{_number(there, 'parameter')} wrong: --apply sets them, after confirmation.")
+    if absent := len(diagnosis.wrong_parameters) - there:
+        lines.append(
+            f"{_number(absent, 'parameter')} absent: update the firmware, or use a build with this feature."
+        )
+    lines += [f"{found.what}: {found.advice}." for found in diagnosis.problems]
+    if not lines:
+        lines.append("All is well.")
     if config.output.profile == "monitor":
-        said.append("Profile monitor feeds nothing; --profile ardupilot or px4 shows what feeding takes.")
-    return "\n".join(said)
+        lines.append(
+            "Profile monitor sends no position; --profile ardupilot or px4 shows what that requires."
+        )
+    return "\n".join(lines)
 
 
 def _number(count: int, noun: str) -> str:
@@ -90,7 +94,7 @@ def _number(count: int, noun: str) -> str:
 
 
 def as_json(config: Config, address: Address, diagnosis: Diagnosis, changed: tuple[str, ...]) -> str:
-    """The diagnosis for a program."""
+    """Return the diagnosis as JSON."""
     tree: dict[str, Any] = {
         "link": str(address),
         "profile": config.output.profile,
@@ -117,14 +121,14 @@ def as_json(config: Config, address: Address, diagnosis: Diagnosis, changed: tup
     return json.dumps(tree, indent=2)
 
 
-def after(diagnosis: Diagnosis, changed: tuple[str, ...]) -> str:
-    """What a change came to, and what counts only after a reboot."""
+def change_summary(diagnosis: Diagnosis, changed: tuple[str, ...]) -> str:
+    """Return the result of setting parameters, and which ones need a reboot."""
     reboot = [
         found.need.name for found in diagnosis.parameters if found.need.reboot and found.need.name in changed
     ]
-    said = f"{_number(len(changed), 'parameter')} set and read back"
+    text = f"{_number(len(changed), 'parameter')} set and read back"
     if reboot:
-        said += f"; reboot the autopilot for {', '.join(reboot)}, and look again"
-    if diagnosis.wrong:
-        said += f"; {', '.join(found.need.name for found in diagnosis.wrong)} could not be"
-    return said + "."
+        text += f"; reboot the autopilot for {', '.join(reboot)}, and run the doctor again"
+    if diagnosis.wrong_parameters:
+        text += f"; {', '.join(found.need.name for found in diagnosis.wrong_parameters)} could not be set"
+    return text + "."

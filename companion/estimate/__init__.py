@@ -1,0 +1,133 @@
+"""Estimation: filters, smoothers, maximum-likelihood fixes, minimax prediction, and fault monitoring.
+
+Linear filtering
+    kalman               predict, update, consistency tests; the one implementation of the update
+    schemes              feedforward and feedback correction of an INS
+    linear_system        a linear Gaussian system as a list of stages
+    smoother             Rauch-Tung-Striebel, two-point and Gauss-Newton smoothing
+    two_point_bvp        block-tridiagonal solver of the two-point boundary value problem
+Bounded disturbances
+    restrictive          filter with bounded inputs, one step at a time
+    full_horizon         the exact solution over a record
+    bounded_lsq          least squares in a box
+Positions from beacons
+    observations         positions, azimuths, ranges and heights as whitened equations
+    initial_position     intersections of lines of position
+    levenberg_marquardt  minimisation in two or three unknowns
+    fusion               maximum-likelihood position and its covariance
+    weights              the per-axis estimator of the paper, and the cost of wrong weights
+Guaranteed prediction
+    schuler              dynamics of one horizontal INS error
+    minimax_lp           guaranteed linear estimation by exchange
+    minimax              closed form on the Schuler channel
+    predictor            rolling window of fixes and its prediction
+Curves
+    polynomial           approximation of an unknown function, and its order
+Faults and trust
+    filterbank, integrity, monitor, gnss_beacon_conflict, trust
+
+SI and radians, unless a name ends in `_tau` (radians of Schuler phase). numpy and scipy only, no I/O; where a
+function takes a time, it is in ns. `step`, `predict`, `update` and `solve` exist in several modules and are
+reached through them, for example `kalman.update`. The modules of the last group are not exported here.
+"""
+
+from companion.estimate import (
+    bounded_lsq,
+    kalman,
+    minimax_lp,
+    predictor,
+    restrictive,
+    schemes,
+    smoother,
+    two_point_bvp,
+    weights,
+)
+from companion.estimate.full_horizon import FullHorizonEstimate, solve_full_horizon
+from companion.estimate.fusion import (
+    Ambiguous,
+    Azimuth,
+    Fix,
+    Fix3D,
+    Height,
+    NoFix,
+    Observation,
+    Position,
+    Range,
+    Unobservable,
+    convert_to_position,
+    cramer_rao_bound,
+    fisher_information,
+    maximum_likelihood,
+    maximum_likelihood_3d,
+)
+from companion.estimate.minimax import ClosedForm, Continuous, closed_form, closed_form_tau, continuous_tau
+from companion.estimate.minimax_lp import Design, Infeasible, LeastSquares, Minimax
+from companion.estimate.polynomial import Order, Track, select_order, smooth_track
+from companion.estimate.predictor import Forecast, Prediction, Window, predict_ahead
+from companion.estimate.schuler import MEAN_EARTH, Scale, schuler_row, transition
+from companion.estimate.smoother import (
+    Smoothed,
+    Trajectory,
+    forward_filter,
+    gauss_newton,
+    rts,
+    rts_backward,
+    two_point,
+)
+
+__all__ = [
+    "MEAN_EARTH",
+    "Ambiguous",
+    "Azimuth",
+    "ClosedForm",
+    "Continuous",
+    "Design",
+    "Fix",
+    "Fix3D",
+    "Forecast",
+    "FullHorizonEstimate",
+    "Height",
+    "Infeasible",
+    "LeastSquares",
+    "Minimax",
+    "NoFix",
+    "Observation",
+    "Order",
+    "Position",
+    "Prediction",
+    "Range",
+    "Scale",
+    "Smoothed",
+    "Track",
+    "Trajectory",
+    "Unobservable",
+    "Window",
+    "bounded_lsq",
+    "closed_form",
+    "closed_form_tau",
+    "continuous_tau",
+    "convert_to_position",
+    "cramer_rao_bound",
+    "fisher_information",
+    "forward_filter",
+    "gauss_newton",
+    "kalman",
+    "maximum_likelihood",
+    "maximum_likelihood_3d",
+    "minimax_lp",
+    "predict_ahead",
+    "predictor",
+    "restrictive",
+    "rts",
+    "rts_backward",
+    "schemes",
+    "schuler_row",
+    "select_order",
+    "smooth_track",
+    "smoother",
+    "solve_full_horizon",
+    "transition",
+    "two_point",
+    "two_point_bvp",
+    "weights",
+]

@@ -1,10 +1,9 @@
-"""Least squares within a box, the inner problem of the restrictive filters: small by enumeration, large by
-BVLS.
+"""Least squares with bounded unknowns: the inner problem of the restrictive filters.
 
-Inputs are counted in units of their bounds, v_i = u_i / C_i, so the box is always |v_i| <= 1 and C_i = 0
-simply takes an input away. A box problem has a unique answer only where the data see every input;
-`information` says what to assume elsewhere. Both solvers answer with the active set, because the filters'
-covariance hangs on it.
+Inputs are scaled by their bounds, v_i = u_i / C_i, so that the box is always |v_i| <= 1 and C_i = 0 removes
+an input. Small problems are solved by enumeration of active sets, large ones by bounded-variable least
+squares (BVLS). Both return the active set, because the filters' covariance depends on it. The solution is
+unique only where the data determine every input; `prior_information` gives the prior assumed elsewhere.
 
 It does not know what the inputs are.
 """
@@ -15,28 +14,50 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from scipy.optimize import lsq_linear
 
-Array = npt.NDArray[np.float64]
+from companion.units import Floats
+
 Status = npt.NDArray[np.int8]
 
-BLIND = 1e-10
-"""Least eigenvalue of the inputs' correlation in the data below which they cannot be told apart."""
+INDISTINGUISHABLE = 1e-10
+"""Least eigenvalue of the inputs' correlation in the data; below it they cannot be distinguished."""
 
 
-class Box(NamedTuple):
-    """Minimum v in |v_i| <= 1, its status -1, 0 (free) or +1, M_ff^-1 of the free ones padded with zeros."""
+class BoxMinimum(NamedTuple):
+    """Minimum of a quadratic function in the box |v_i| <= 1.
 
-    v: Array
+    Attributes
+    ----------
+    v : (..., m)
+        Minimiser.
+    status : (..., m)
+        -1 or +1 on a bound, 0 inside (free).
+    free_inverse : (..., m, m)
+        Inverse of the free block of M, padded with zeros.
+    """
+
+    v: Floats
     status: Status
-    free_inverse: Array
+    free_inverse: Floats
 
 
-def information(M: Array, kappa: float = np.inf) -> Array:
-    """The weight (..., m, m) to add to M: I / kappa for a prior N(0, kappa C^2), nothing for kappa = inf.
+def prior_information(M: Floats, kappa: float = np.inf) -> Floats:
+    """Choose the prior information to add to M.
 
-    Even then an input that the data do not show at all takes the weight 1, kappa = 1, and all of them do
-    where M is singular (fewer measurements than inputs): the step is then the minimax filter's.
+    An input that the data do not determine takes the weight 1 (kappa = 1) even for kappa = inf, and all
+    inputs do where M is singular (fewer measurements than inputs): the step is then the minimax filter's.
+
+    Parameters
+    ----------
+    M : (..., m, m)
+        Information of the data on v.
+    kappa : float
+        Prior variance of each input over its squared bound; inf for no prior.
+
+    Returns
+    -------
+    (..., m, m)
+        I / kappa for finite kappa, otherwise zero except as above.
     """
     identity = np.eye(M.shape[-1])
     if np.isfinite(kappa):
@@ -45,15 +66,25 @@ def information(M: Array, kappa: float = np.inf) -> Array:
     unseen = (size <= 0.0)[..., None] * identity
     scale = np.sqrt(size + (size <= 0.0))
     rho = M / (scale[..., :, None] * scale[..., None, :]) + unseen
-    if (np.abs(rho).sum(-1) < 2.0 - BLIND).all():  # Gershgorin: no eigenvalue can be small
+    if (np.abs(rho).sum(-1) < 2.0 - INDISTINGUISHABLE).all():  # Gershgorin: no eigenvalue can be small
         return np.asarray(unseen)
-    blind = np.linalg.eigvalsh(rho)[..., :1, None] < BLIND
-    weight: Array = np.where(blind, identity, unseen)
+    indistinct = np.linalg.eigvalsh(rho)[..., :1, None] < INDISTINGUISHABLE
+    weight: Floats = np.where(indistinct, identity, unseen)
     return weight
 
 
 class ActiveSets(NamedTuple):
-    """All 3^m statuses, free ones first; their free components as 1; the row of `inverses` of each."""
+    """All 3^m active sets of m inputs.
+
+    Attributes
+    ----------
+    status : (3^m, m)
+        -1, 0 or +1 for each input; sets with more free inputs first.
+    free : (3^m, m)
+        1 where the input is free, otherwise 0.
+    row : (3^m,)
+        Index of the set of free inputs in the result of `free_set_inverses`.
+    """
 
     status: Status
     free: Status
@@ -62,17 +93,38 @@ class ActiveSets(NamedTuple):
 
 @lru_cache(maxsize=8)
 def active_sets(m: int) -> ActiveSets:
-    """The candidates of a box of m inputs; there are only 2^m different sets of free ones."""
+    """List the active sets of a box.
+
+    Parameters
+    ----------
+    m : int
+        Number of inputs.
+
+    Returns
+    -------
+    ActiveSets
+        All 3^m candidates; there are only 2^m different sets of free inputs.
+    """
     statuses = sorted(product((0, -1, 1), repeat=m), key=lambda s: sum(map(abs, s)))
     status = np.array(statuses, np.int8).reshape(-1, m)
     free = status == 0
     return ActiveSets(status, free.astype(np.int8), free @ (1 << np.arange(m)))
 
 
-def inverses(M: Array) -> Array:
-    """M_ff^-1 (2^m, m, m, ...) padded with zeros, of M (m, m, ...); bit k of the row says that k is free.
+def free_set_inverses(M: Floats) -> Floats:
+    """Invert M restricted to every set of free inputs.
 
-    By bordering, one component after another set free: w' M w is what is left of M_kk (Schur).
+    By bordering, one component after another is set free: w' M w is the Schur complement of M_kk.
+
+    Parameters
+    ----------
+    M : (m, m, ...)
+        Positive definite matrices.
+
+    Returns
+    -------
+    (2^m, m, m, ...)
+        Inverses padded with zeros; bit k of the row index means that input k is free.
     """
     inverse = np.zeros((1 << len(M), *M.shape))
     for k in range(len(M)):
@@ -84,40 +136,70 @@ def inverses(M: Array) -> Array:
     return inverse
 
 
-def minimum(M: Array, g: Array) -> Box:
-    """Minimise 1/2 v' M v - g' v over |v_i| <= 1 for M (..., m, m) positive definite, g (..., m), m up to 4.
+def minimize_quadratic(M: Floats, g: Floats) -> BoxMinimum:
+    """Minimise 1/2 v' M v - g' v over |v_i| <= 1 by enumeration.
 
-    Every active set gives one candidate and the Kuhn-Tucker conditions accept one of them; the least
-    violation is taken, so rounding cannot leave us without an answer.
+    Every active set gives one candidate, and the Kuhn-Tucker conditions accept one. The candidate with the
+    least violation is taken, so that rounding cannot leave the problem without an answer.
+
+    Parameters
+    ----------
+    M : (..., m, m)
+        Positive definite, m up to 4.
+    g : (..., m)
+        Linear term.
+
+    Returns
+    -------
+    BoxMinimum
+        Minimiser, active set and inverse of the free block.
     """
     m = g.shape[-1]
     sets = active_sets(m)
-    g = g.T.copy()  # flights last: the loops over them are long, those over components short
+    g = g.T.copy()  # flights last: numpy loops over the long axis
     each = np.empty((m, *g.shape))
     each.T[...] = M
-    inverse = inverses(each)
+    inverse = free_set_inverses(each)
     shape = (-1, m) + (1,) * (g.ndim - 1)
     status, free = sets.status.reshape(shape), sets.free.reshape(shape)
-    pushed = g - np.add.reduce(status[:, None] * each, 2)
-    v = status + np.add.reduce(inverse[sets.row] * pushed[:, None], 2)
-    slope = g - np.add.reduce(v[:, None] * each, 2)  # points out of the box where v is on its side
+    pull = g - np.add.reduce(status[:, None] * each, 2)
+    v = status + np.add.reduce(inverse[sets.row] * pull[:, None], 2)
+    slope = g - np.add.reduce(v[:, None] * each, 2)  # gradient: points out of the box at an active bound
     best = np.maximum.reduce(free * (np.abs(v) - 1.0) - status * slope, 1).argmin(0).T
     flights, whole = tuple(np.indices(best.shape, sparse=True)), slice(None)
-    return Box(
+    return BoxMinimum(
         v.T[(*flights, whole, best)], sets.status[best], inverse.T[(*flights, whole, whole, sets.row[best])]
     )
 
 
-def least_squares(D: Array, r: Array) -> Box:
-    """Minimise 1/2 |r - D v|^2 over |v_i| <= 1 for D (q, m) of any size, by bounded-variable least squares.
+def least_squares(D: Floats, r: Floats) -> BoxMinimum:
+    """Minimise 1/2 |r - D v|^2 over |v_i| <= 1 by BVLS.
 
-    scipy's BVLS (Stark and Parker) ends on an active set, so it is as exact as the linear algebra: on 600
-    samples of two inputs it needs about two seconds where an interior-point solver needs 0.2 s and stops 1e-8
-    short.
+    The method of Stark and Parker ends on an active set, so that it is as exact as the linear algebra. 600
+    samples of two inputs take about two seconds; an interior-point solver takes 0.2 s and stops 1e-8 short.
+
+    Parameters
+    ----------
+    D : (q, m)
+        Jacobian, of any size.
+    r : (q,)
+        Residuals at v = 0.
+
+    Returns
+    -------
+    BoxMinimum
+        Minimiser, active set and inverse of the free block of D'D (plus prior information).
+
+    Raises
+    ------
+    ValueError
+        If the solver does not converge.
     """
+    from scipy.optimize import lsq_linear
+
     m = D.shape[1]
     M = D.T @ D
-    weight = information(M)
+    weight = prior_information(M)
     if weight.any():
         D, r, M = np.vstack([D, weight]), np.concatenate([r, np.zeros(m)]), M + weight
     found = lsq_linear(D, r, (-np.ones(m), np.ones(m)), method="bvls", tol=1e-15, max_iter=10 * m + 100)
@@ -127,4 +209,4 @@ def least_squares(D: Array, r: Array) -> Box:
     free = status == 0
     inverse = np.zeros((m, m))
     inverse[np.ix_(free, free)] = np.linalg.inv(M[np.ix_(free, free)])
-    return Box(np.where(free, found.x, status), status, inverse)
+    return BoxMinimum(np.where(free, found.x, status), status, inverse)

@@ -1,12 +1,12 @@
-"""A bank of Kalman filters side by side: one hears every source, each other all but one.
+"""Bank of parallel Kalman filters: one with all sources, and each other with all but one.
 
-All are over the same state, x = INS minus truth with the position errors north and east (m) first. The first
-row is the full solution, which hears every source; beside it a *row* a source hears all but that one. A row
-may also be *forked* from the full solution and hear all but its source from then on. The row "inertial" hears
-everything and has process noise added. What the differences of the rows tell is `integrity`'s.
+All have the same state, x = INS minus truth with the position errors north and east (m) first. The first
+row is the full solution, which uses every source; each source has a *row* that uses all but that one. A row
+may also be *forked* from the full solution and use all but its source from then on. The row "inertial" uses
+everything and has process noise added. `integrity` interprets the differences of the rows.
 
-A beacon's bias is one more state, a constant that walks slowly: learnt from all others while they are heard
-and used when they are not. The bank knows no clock, no records, and not what the other states mean.
+A beacon's bias is one more state, a constant that walks slowly: estimated with the help of all other sources
+and used when they are missing. The bank knows no clock, no records, and not what the other states mean.
 """
 
 from __future__ import annotations
@@ -14,29 +14,27 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from companion.estimate.fusion import CONE_OF_SILENCE
 from companion.estimate.observations import Azimuth, Model, Range
-
-Floats = npt.NDArray[np.float64]
+from companion.units import Floats
 
 INERTIAL = "inertial"
 
 
 class Row(NamedTuple):
-    """One solution: which source it has not heard since when; "" is the full one, which hears all."""
+    """One solution: the source that it does not use, and since when; "" is the full one."""
 
     without: str
     since_ns: int
-    never: bool = True  # it has not heard its source before `since_ns` either
+    never: bool = True  # it has not used its source before `since_ns` either
 
 
 class Bank(NamedTuple):
-    """The solutions side by side: m rows of means x (m, n) and covariances P (m, n, n), the full one first.
+    """Parallel solutions: m rows of means x (m, n) and covariances P (m, n, n), the full one first.
 
     The last len(biases) states are constant errors of the sources named there, in their measurements' unit.
-    Nothing takes what an `excluded` source says.
+    No row uses measurements of an `excluded` source.
     """
 
     t_ns: int
@@ -48,12 +46,12 @@ class Bank(NamedTuple):
 
     @property
     def sources(self) -> tuple[str, ...]:
-        """Every source that has a row, in the order they joined."""
+        """Return every source that has a row, in the order they were added."""
         return tuple(dict.fromkeys(row.without for row in self.rows[1:]))
 
 
 class Measurement(NamedTuple):
-    """What `source` says of the states before the biases: z (p,) = H (p, k) x + unit (p,) bias + N(0, R)."""
+    """Measurement by `source`: z (p,) = H (p, k) x + unit (p,) bias + N(0, R)."""
 
     source: str
     z: Floats
@@ -63,7 +61,7 @@ class Measurement(NamedTuple):
 
 
 class Taken(NamedTuple):
-    """The bank after a measurement; normalised innovation squared in the row that it fits best."""
+    """Bank after a measurement; normalised innovation squared in the row that it fits best."""
 
     bank: Bank
     accepted: bool
@@ -71,16 +69,16 @@ class Taken(NamedTuple):
 
 
 def begin(t_ns: int, x: Floats, P: Floats) -> Bank:
-    """The full solution x (n,), P (n, n) alone, north and east position errors (m) first."""
+    """Start with the full solution x (n,), P (n, n) alone, north and east position errors (m) first."""
     if x.ndim != 1 or len(x) < 2 or P.shape != (len(x), len(x)):
         raise ValueError(f"x has shape {x.shape} and P {P.shape}: give (n,) and (n, n), position first")
     return Bank(t_ns, (Row("", t_ns),), x[None].copy(), P[None].copy())
 
 
 def join(bank: Bank, source: str, bias_sigma: float | None = None, forks: int = 0) -> Bank:
-    """With a new source: the row that never hears it, `forks` rows for `fork`, and its bias as a state."""
+    """Add a source: the row that never uses it, `forks` rows for `fork`, and its bias as a state."""
     if not source or source in bank.sources:
-        raise ValueError(f"source {source!r} cannot join: give each source one name of its own")
+        raise ValueError(f"source {source!r} cannot be added: give each source a unique name")
     row = Row(source, bank.t_ns)
     rows = (*bank.rows, row, *(row._replace(never=False) for _ in range(forks)))
     x = np.concatenate((bank.x, np.repeat(bank.x[:1], 1 + forks, axis=0)))
@@ -96,7 +94,7 @@ def join(bank: Bank, source: str, bias_sigma: float | None = None, forks: int = 
 
 
 def leave(bank: Bank, source: str) -> Bank:
-    """Without the rows and the bias of `source`, as if it had never joined; what it taught stays taught."""
+    """Remove the rows and the bias of `source`; what it contributed to the states remains."""
     kept = [i for i, row in enumerate(bank.rows) if i == 0 or row.without != source]
     x, P = bank.x[kept], bank.P[kept]
     if source in bank.biases:
@@ -109,7 +107,7 @@ def leave(bank: Bank, source: str) -> Bank:
 
 
 def carry(bank: Bank, t_ns: int, Phi: Floats, Q: Floats, loose: Floats, bias_walk: Floats) -> Bank:
-    """All rows at `t_ns` by Phi (k, k), Q (k, k) of the states before the biases.
+    """Propagate all rows to `t_ns` by Phi (k, k), Q (k, k) of the states before the biases.
 
     `loose` (k,) are the variances added to the row "inertial", and to all while the inertial channel is
     excluded; `bias_walk` (len(biases),) those added to every bias.
@@ -126,9 +124,9 @@ def carry(bank: Bank, t_ns: int, Phi: Floats, Q: Floats, loose: Floats, bias_wal
 
 
 def take(bank: Bank, measurement: Measurement, limit: float) -> Taken:
-    """Every row but the source's own with the measurement; none, if its NIS is beyond `limit` in all.
+    """Update every row but the source's own with the measurement; none, if its NIS exceeds `limit` in all.
 
-    One refused by the full solution alone is taken: it may be the full solution that was drawn off.
+    One rejected by the full solution alone is used: the full solution may be the one that is wrong.
     """
     wide, HP, S, nu, nis_of_rows = _innovations(bank, measurement)
     hears = np.array([row.without != measurement.source for row in bank.rows])
@@ -144,17 +142,17 @@ def take(bank: Bank, measurement: Measurement, limit: float) -> Taken:
 
 
 def surprise(bank: Bank, measurement: Measurement) -> float:
-    """Normalised innovation squared in the full solution, whether the source is excluded or not."""
+    """Compute the NIS in the full solution, whether the source is excluded or not."""
     return float(_innovations(bank, measurement)[4][0])
 
 
 def sighted(source: str, z: Azimuth | Range, x: Floats, k: int) -> Measurement | None:
-    """An azimuth or a range in the plane tangent at the INS (x east, y north), linearised where `x` has the
-    aircraft, whitened; None inside the beacon's cone of silence.
+    """Linearise an azimuth or a range in the plane tangent at the INS (x east, y north) at the position
+    given by `x`, whitened; None inside the beacon's cone of silence.
     """
     place = (-float(x[1]), -float(x[0]), 0.0)
     model = Model((z,), 3)
-    if model.above(place, CONE_OF_SILENCE):
+    if model.azimuths_above(place, CONE_OF_SILENCE):
         return None
     at = model.at(place)
     H = np.zeros((1, k))
@@ -163,9 +161,9 @@ def sighted(source: str, z: Azimuth | Range, x: Floats, k: int) -> Measurement |
 
 
 def fork(bank: Bank, index: int) -> Bank:
-    """Row `index`, one of a source's forks, begun again from the full solution."""
+    """Restart row `index`, one of a source's forks, from the full solution."""
     if bank.rows[index].never:
-        raise ValueError(f"row {index} never hears {bank.rows[index].without!r}: fork another")
+        raise ValueError(f"row {index} never uses {bank.rows[index].without!r}: fork another")
     x, P = bank.x.copy(), bank.P.copy()
     x[index], P[index] = x[0], P[0]
     rows = list(bank.rows)
@@ -174,12 +172,12 @@ def fork(bank: Bank, index: int) -> Bank:
 
 
 def refuse(bank: Bank, source: str) -> Bank:
-    """Without `source` from now on: nothing was taken of it since it went wrong, so nothing is undone."""
+    """Exclude `source` from now on; nothing was used of it since its fault, so nothing is undone."""
     return bank._replace(excluded=(*bank.excluded, source))
 
 
 def readmit(bank: Bank, source: str) -> Bank:
-    """With `source` heard again; its rows part from the full solution now."""
+    """Re-admit `source`; its rows separate from the full solution from now on."""
     if source not in bank.excluded:
         raise ValueError(f"{source!r} is not excluded")
     rows, x, P = list(bank.rows), bank.x.copy(), bank.P.copy()
@@ -191,18 +189,18 @@ def readmit(bank: Bank, source: str) -> Bank:
 
 
 def widen(bank: Bank, factor: float) -> Bank:
-    """With every covariance multiplied: what the solutions claimed was proved wrong."""
+    """Multiply every covariance: the claimed accuracy was proved wrong."""
     return bank._replace(P=bank.P * factor)
 
 
 def is_sound(bank: Bank) -> bool:
-    """Whether the numbers are numbers and no variance is negative."""
+    """Return whether all numbers are finite and no variance is negative."""
     variances = np.diagonal(bank.P, axis1=1, axis2=2)
     return bool(np.isfinite(bank.x).all() and np.isfinite(bank.P).all() and (variances >= 0.0).all())
 
 
 def _innovations(bank: Bank, measurement: Measurement) -> tuple[Floats, Floats, Floats, Floats, Floats]:
-    """H of all states (p, n); of each row H P (m, p, n), S (m, p, p), innovation (m, p) and its NIS (m,)."""
+    """Compute H of all states (p, n); of each row H P (m, p, n), S (m, p, p), innovation (m, p), NIS (m,)."""
     source, z, H, R, unit = measurement
     n, p = bank.x.shape[1], len(z)
     k = n - len(bank.biases)

@@ -8,20 +8,21 @@ is linear and works axis by axis; `weights` keeps it in that form. An azimuth an
 nor independent by axes, so here (5) is iterated on the joint problem: with whitened residuals r and
 their Jacobian J at the last position,
 
-    minimise r^T r,   F = J^T J,   step (F + mu I)^-1 J^T r   (Gauss-Newton; `descent`)
+    minimise r^T r,   F = J^T J,   step (F + mu I)^-1 J^T r   (`levenberg_marquardt`)
 
 and F at the end is the information, F^-1 the Cramer-Rao bound there. DEPARTS FROM (6): the inverse on the
 second R is restored. DEPARTS FROM (7): one row per observation, azimuth and range with their own partials.
 
-What degenerates, and what is done
-    A direction that nothing measures: `Unobservable`, with the direction and what to add, never a number.
+Degenerate cases
+    A direction that no observation measures: `Unobservable`, with the direction and what to add.
     Two places that explain the same ranges (two beacons: two crossings, mirrored in the line between them):
         a position among the observations, or `start`, chooses; without either `Ambiguous`, with both places.
-    Over a beacon: an azimuth whose beacon sees the fix higher than `cone` is left out and listed as `silent`.
-        The plane has no elevations: there the caller leaves out azimuths of a beacon too near.
-    A start in the wrong valley: a misfit that noise does not explain is tried again from the crossings.
+    Over a beacon: an azimuth whose beacon sees the fix higher than `cone` is left out and listed in
+        `in_cone_of_silence`. The plane has no elevations: there the caller leaves out azimuths of a beacon
+        too near.
+    A start near a wrong local minimum: a misfit that noise does not explain is retried from the crossings.
     Rays that do not meet: the cost falls all the way to infinity; `NoFix`.
-    A wild measurement is NOT rejected here: the residuals and their shares of the cost tell which one it is.
+    A wild measurement is NOT rejected here: the residuals and their shares of the cost identify it.
 
 Frame and observations: see `observations`. It knows no time and no motion.
 """
@@ -33,12 +34,10 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import gammaincc
 
-from companion.estimate.initial_position import converted, crossings, mean_position
-from companion.estimate.levenberg_marquardt import Minimum, NoFix, descend, inverse
+from companion.estimate.initial_position import convert_to_position, find_crossings, mean_position
+from companion.estimate.levenberg_marquardt import Minimum, NoFix, invert_information, minimize_cost
 from companion.estimate.observations import (
-    Array,
     Azimuth,
     Height,
     Linearised,
@@ -48,79 +47,120 @@ from companion.estimate.observations import (
     Position,
     Range,
 )
+from companion.units import Floats
 
 __all__ = [
     "Ambiguous",
     "Azimuth",
     "Fix",
+    "Fix3D",
     "Height",
     "NoFix",
     "Observation",
-    "Peak",
     "Position",
     "Range",
     "Unobservable",
-    "converted",
-    "cramer_rao",
-    "information",
+    "convert_to_position",
+    "cramer_rao_bound",
+    "fisher_information",
     "maximum_likelihood",
-    "most_likely",
+    "maximum_likelihood_3d",
 ]
 
 CONE_OF_SILENCE = math.radians(60.0)
-"""Elevation above which an azimuth is not believed, rad. The signal fades there, and towards the
+"""Elevation above which an azimuth is left out, rad. The signal fades there, and towards the
 zenith the linearised azimuth claims an accuracy that it does not have."""
 
 _OBSERVABLE = 1e-12  # least ratio of the information's eigenvalues: standard deviations a million times apart
-_TRIALS = 8  # crossings followed down, the cheapest first
-_LIKELIHOOD_GAP = 9.0  # difference of costs by which one place is preferred to another: three sigma
-_PLAUSIBLE = 5.0  # a cost this many of its own standard deviations above its mean may be a wrong valley
+_TRIALS = 8  # crossings tried, in the order of their cost
+_LIKELIHOOD_GAP = 9.0  # least difference of costs to prefer one place to another: three sigma
+_PLAUSIBLE = 5.0  # a cost more of its standard deviations above its mean may be a wrong minimum
 
 
 class Unobservable(NoFix):
-    """Some direction is measured by nothing. `directions` (k, n) are orthogonal unit vectors."""
+    """Some direction is not measured.
 
-    def __init__(self, message: str, directions: Array) -> None:
+    Attributes
+    ----------
+    directions : (k, n)
+        Orthogonal unit vectors of the unobservable directions.
+    """
+
+    def __init__(self, message: str, directions: Floats) -> None:
         super().__init__(message)
         self.directions = directions
 
 
 class Ambiguous(NoFix):
-    """Several places explain the observations. `positions` (k, n) m, the likeliest first."""
+    """Several places explain the observations.
 
-    def __init__(self, message: str, positions: Array) -> None:
+    Attributes
+    ----------
+    positions : (k, n)
+        The places, m, the most likely first.
+    """
+
+    def __init__(self, message: str, positions: Floats) -> None:
         super().__init__(message)
         self.positions = positions
 
 
 class Fix(NamedTuple):
-    """The most likely position and how well the observations agree on it.
+    """Maximum-likelihood position with the residuals of its observations.
 
-    `cost` is the sum of squared residuals in standard deviations, chi-square with `degrees_of_freedom` if the
-    errors are as stated. Per observation, in the order given: `residuals` are observed minus computed, (k,)
-    metres or radians; `chi_squares` their shares of the cost. `silent` are the indices of the azimuths left
-    out, in the cone of silence.
+    Attributes
+    ----------
+    position : (n,)
+        East, north[, up], m.
+    covariance : (n, n)
+        Its covariance, m^2.
+    cost : float
+        Sum of squared residuals in standard deviations; chi-square if the errors are as stated.
+    iterations : int
+        Steps of the last descent.
+    degrees_of_freedom : int
+        Of the cost.
+    residuals : tuple of arrays
+        Observed minus computed for each observation in the order given, m or rad.
+    chi_squares : tuple of float
+        Share of each observation in the cost.
+    in_cone_of_silence : tuple of int
+        Indices of the azimuths left out.
     """
 
-    position: Array
-    covariance: Array
+    position: Floats
+    covariance: Floats
     cost: float
     iterations: int
     degrees_of_freedom: int
-    residuals: tuple[Array, ...]
+    residuals: tuple[Floats, ...]
     chi_squares: tuple[float, ...]
-    silent: tuple[int, ...]
+    in_cone_of_silence: tuple[int, ...]
 
     @property
     def p_value(self) -> float:
-        """Probability of a cost at least this large if the stated errors are right; 1 without redundancy."""
+        """Return the probability of a cost at least this large under the stated errors.
+
+        1 without redundancy."""
+        from scipy.special import gammaincc
+
         if self.degrees_of_freedom == 0:
             return 1.0
         return float(gammaincc(self.degrees_of_freedom / 2.0, self.cost / 2.0))
 
 
-class Peak(NamedTuple):
-    """The most likely position (m), the rows of its covariance (m^2) and the cost, as in `Fix`."""
+class Fix3D(NamedTuple):
+    """Maximum-likelihood position in plain numbers.
+
+    Attributes
+    ----------
+    position : Point
+        East, north, up, m.
+    covariance : tuple of rows
+        Its covariance, m^2.
+    cost : float
+        Sum of squared residuals in standard deviations.
+    """
 
     position: Point
     covariance: tuple[tuple[float, ...], ...]
@@ -130,20 +170,41 @@ class Peak(NamedTuple):
 def maximum_likelihood(
     observations: Sequence[Observation], start: npt.ArrayLike | None = None, cone: float = CONE_OF_SILENCE
 ) -> Fix:
-    """The position (n,) that makes the observations most likely, and its covariance (n, n), m and m^2.
+    """Compute the most likely position and its covariance.
 
-    `start` (n,) m is where to look first: needed only where two places are equally likely and nothing among
-    the observations chooses. It is no observation and carries no weight. An azimuth whose beacon sees the fix
-    higher than `cone` rad is left out. Raises ValueError naming a bad observation, and NoFix, Unobservable or
-    Ambiguous where good observations do not give a position.
+    Parameters
+    ----------
+    observations : sequence of Observation
+        In one Cartesian frame, see `observations`.
+    start : (n,), optional
+        First point of the search, m. Needed only where two places are equally likely and no observation
+        chooses; it is not an observation and has no weight.
+    cone : float
+        Elevation above which an azimuth is left out, rad.
+
+    Returns
+    -------
+    Fix
+        Position, covariance and residuals.
+
+    Raises
+    ------
+    ValueError
+        Names a bad observation.
+    NoFix, Unobservable, Ambiguous
+        If good observations do not give a position.
+
+    References
+    ----------
+    Lukinova, Podgorna, Rogozhin (5)-(7).
     """
-    x0 = None if start is None else _start(start)
+    x0 = None if start is None else _check_start(start)
     model = Model(observations, 2 if x0 is None else len(x0))
     if x0 is None:
         x0 = mean_position(model)
     if x0 is not None and len(x0) != model.n:
         raise ValueError(f"start has {len(x0)} coordinates, the observations {model.n}: give as many")
-    model, found = _heard_fix(model, None if x0 is None else model.point(x0), cone)
+    model, found = _fix_outside_cone(model, None if x0 is None else model.point(x0), cone)
     covariance = np.array(_invert(model, found.at))
     residuals, shares = model.residuals(found.p)
     return Fix(
@@ -154,106 +215,159 @@ def maximum_likelihood(
         len(found.at.rows) - model.n,
         residuals,
         shares,
-        tuple(sorted(model.silent)),
+        tuple(sorted(model.in_cone)),
     )
 
 
-def most_likely(observations: Sequence[Observation], start: Point, cone: float = CONE_OF_SILENCE) -> Peak:
-    """The same in space and in plain numbers, for who asks in flight and for no residuals."""
-    model, found = _heard_fix(Model(observations, 3), start, cone)
-    return Peak(found.p, _invert(model, found.at), found.at.cost)
+def maximum_likelihood_3d(
+    observations: Sequence[Observation], start: Point, cone: float = CONE_OF_SILENCE
+) -> Fix3D:
+    """Compute the most likely position in space in plain numbers, without residuals.
 
+    Parameters
+    ----------
+    observations : sequence of Observation
+        In one Cartesian frame, see `observations`.
+    start : Point
+        First point of the search, m.
+    cone : float
+        Elevation above which an azimuth is left out, rad.
 
-def information(
-    observations: Sequence[Observation], position: npt.ArrayLike, cone: float = CONE_OF_SILENCE
-) -> Array:
-    """Fisher information F = J^T J (n, n), 1/m^2, of the observations for an aircraft at `position` (n,).
+    Returns
+    -------
+    Fix3D
+        Position, covariance and cost.
 
-    The measured values do not enter, only where the beacons are and how large the errors. An azimuth in its
-    beacon's cone of silence has none.
+    Raises
+    ------
+    ValueError, NoFix, Unobservable, Ambiguous
+        As in `maximum_likelihood`.
     """
-    J = _heard(observations, position, cone)[1].J
+    model, found = _fix_outside_cone(Model(observations, 3), start, cone)
+    return Fix3D(found.p, _invert(model, found.at), found.at.cost)
+
+
+def fisher_information(
+    observations: Sequence[Observation], position: npt.ArrayLike, cone: float = CONE_OF_SILENCE
+) -> Floats:
+    """Compute the Fisher information F = J^T J for an aircraft at a position.
+
+    Only the places of the beacons and the sizes of the errors enter, not the measured values. An azimuth in
+    its beacon's cone of silence has no information.
+
+    Parameters
+    ----------
+    observations : sequence of Observation
+        In one Cartesian frame.
+    position : (n,)
+        Position of the aircraft, m.
+    cone : float
+        Elevation above which an azimuth is left out, rad.
+
+    Returns
+    -------
+    (n, n)
+        Information, 1/m^2.
+    """
+    J = _equations_outside_cone(observations, position, cone)[1].J
     return J.T @ J
 
 
-def cramer_rao(
+def cramer_rao_bound(
     observations: Sequence[Observation], position: npt.ArrayLike, cone: float = CONE_OF_SILENCE
-) -> Array:
-    """Cramer-Rao bound F^-1 (n, n), m^2: no unbiased estimator has a smaller covariance at `position` (n,).
+) -> Floats:
+    """Compute the Cramer-Rao bound F^-1: no unbiased estimator has a smaller covariance.
 
-    Raises Unobservable where a direction is not measured.
+    Parameters
+    ----------
+    observations : sequence of Observation
+        In one Cartesian frame.
+    position : (n,)
+        Position of the aircraft, m.
+    cone : float
+        Elevation above which an azimuth is left out, rad.
+
+    Returns
+    -------
+    (n, n)
+        Covariance, m^2.
+
+    Raises
+    ------
+    Unobservable
+        If a direction is not measured.
     """
-    return np.array(_invert(*_heard(observations, position, cone)))
+    return np.array(_invert(*_equations_outside_cone(observations, position, cone)))
 
 
-def _heard(
+def _equations_outside_cone(
     observations: Sequence[Observation], position: npt.ArrayLike, cone: float
 ) -> tuple[Model, Linearised]:
-    x = _start(position)
+    x = _check_start(position)
     model = Model(observations, len(x))
     p = model.point(x)
     if model.n == 3:
-        model = model.without(model.above(p, cone))
+        model = model.without(model.azimuths_above(p, cone))
     return model, model.at(p)
 
 
-def _start(start: npt.ArrayLike) -> Array:
+def _check_start(start: npt.ArrayLike) -> Floats:
     x = np.array(start, dtype=float)
     if x.shape not in ((2,), (3,)) or not np.isfinite(x).all():
         raise ValueError(f"start is {start!r}: give 2 or 3 finite coordinates")
     return x
 
 
-def _heard_fix(model: Model, p0: Point | None, cone: float) -> tuple[Model, Minimum]:
-    """The fix and the model without the azimuths that cannot be heard there; the plane has no cone."""
-    if model.n == 3 and p0 is not None and (silent := model.above(p0, cone)):
-        # near its beacon an azimuth pulls the fix into the singular point, so the others are asked first
-        quiet = model.without(silent)
+def _fix_outside_cone(model: Model, p0: Point | None, cone: float) -> tuple[Model, Minimum]:
+    """Compute the fix and the model without the azimuths in the cone of silence; a plane has no cone."""
+    if model.n == 3 and p0 is not None and (in_cone := model.azimuths_above(p0, cone)):
+        # near its beacon an azimuth pulls the fix into the singular point: try without it first
+        reduced = model.without(in_cone)
         with contextlib.suppress(NoFix):
-            found = _descend_from(quiet, p0)
-            if silent <= quiet.above(found.p, cone):
-                model, p0 = quiet, found.p
+            found = _descend_from(reduced, p0)
+            if in_cone <= reduced.azimuths_above(found.p, cone):
+                model, p0 = reduced, found.p
     while True:
         found = _descend_from(model, p0)
-        # what the cone takes away stays away, so that this ends
-        silent = model.above(found.p, cone) - model.silent if model.n == 3 else frozenset[int]()
-        if not silent:
+        # an azimuth once left out stays out: the loop ends
+        in_cone = model.azimuths_above(found.p, cone) - model.in_cone if model.n == 3 else frozenset[int]()
+        if not in_cone:
             return model, found
-        model, p0 = model.without(silent), found.p
+        model, p0 = model.without(in_cone), found.p
 
 
 def _descend_from(model: Model, p0: Point | None) -> Minimum:
-    """The minimum reached from p0; from the crossings where p0 is missing or ends in a misfit."""
+    """Find the minimum from p0; from the crossings where p0 is missing or ends in a misfit."""
     if p0 is not None:
         try:
-            found = descend(model, p0)
+            found = minimize_cost(model, p0)
         except NoFix:
-            return _likeliest(model)
-        if _plausible(found.at, model.n):
+            return _best_from_crossings(model)
+        if _is_plausible(found.at, model.n):
             return found
         try:
-            other = _likeliest(model)
+            other = _best_from_crossings(model)
         except NoFix:
             return found
         return other if other.at.cost < found.at.cost - _LIKELIHOOD_GAP else found
-    return _likeliest(model)
+    return _best_from_crossings(model)
 
 
-def _plausible(at: Linearised, n: int) -> bool:
+def _is_plausible(at: Linearised, n: int) -> bool:
     k = max(len(at.rows) - n, 0)
     return at.cost <= k + _PLAUSIBLE * math.sqrt(2.0 * k) + 1e-6
 
 
-def _likeliest(model: Model) -> Minimum:
-    """The best minimum reachable from the crossings; Ambiguous if another place is nearly as good."""
-    points = crossings(model) or [(0.0, 0.0, 0.0)]
+def _best_from_crossings(model: Model) -> Minimum:
+    """Find the best minimum reachable from the crossings; Ambiguous if another place is nearly as good."""
+    points = find_crossings(model) or [(0.0, 0.0, 0.0)]
     points.sort(key=lambda p: model.at(p).cost)
     minima: list[Minimum] = []
     failure: NoFix | None = None
     for p in points[:_TRIALS]:
         try:
-            if all(_apart(p, m) for m in minima):
-                minima.append(descend(model, p))
+            if all(_differs(p, m) for m in minima):
+                minima.append(minimize_cost(model, p))
         except NoFix as e:
             failure = e
     if not minima:
@@ -261,8 +375,8 @@ def _likeliest(model: Model) -> Minimum:
         raise failure
     minima.sort(key=lambda m: m.at.cost)
     best = minima[0]
-    _invert(model, best.at)  # what is not measured at all is said first
-    rivals = [m for m in minima if m.at.cost - best.at.cost < _LIKELIHOOD_GAP and _apart(m.p, best)]
+    _invert(model, best.at)  # report an unobservable direction first
+    rivals = [m for m in minima if m.at.cost - best.at.cost < _LIKELIHOOD_GAP and _differs(m.p, best)]
     if rivals:
         places = [model.place(best.p), model.place(rivals[0].p)]
         raise Ambiguous(
@@ -274,44 +388,44 @@ def _likeliest(model: Model) -> Minimum:
     return best
 
 
-def _apart(p: Point, m: Minimum) -> bool:
-    """Whether p is another place than the minimum: more than three standard deviations from it."""
+def _differs(p: Point, m: Minimum) -> bool:
+    """Return whether p is more than three standard deviations from the minimum."""
     x, y, z = p[0] - m.p[0], p[1] - m.p[1], p[2] - m.p[2]
     return sum([(a * x + b * y + c * z) ** 2 for _, a, b, c in m.at.rows]) > 9.0
 
 
 def _invert(model: Model, at: Linearised) -> tuple[tuple[float, ...], ...]:
-    """Rows of the covariance F^-1; Unobservable where an eigenvalue of F vanishes against the largest."""
-    if (found := inverse(at)) is not None:
+    """Compute the rows of F^-1; Unobservable where an eigenvalue of F vanishes against the largest."""
+    if (found := invert_information(at)) is not None:
         return found
     eigenvalues, V = np.linalg.eigh(at.J.T @ at.J)
-    blind = eigenvalues <= _OBSERVABLE * eigenvalues[-1]
-    if blind.any():
-        raise _unobservable(model, V[:, blind])
+    unobservable = eigenvalues <= _OBSERVABLE * eigenvalues[-1]
+    if unobservable.any():
+        raise _unobservable(model, V[:, unobservable])
     return tuple(map(tuple, ((V / eigenvalues) @ V.T).tolist()))
 
 
-def _unobservable(model: Model, N: Array) -> Unobservable:
-    """The exception that names the directions spanned by the columns of N (n, k)."""
-    lost = ""
-    if model.silent:
-        lost = f" (the azimuths {sorted(model.silent)} are silent: their beacons see the fix too high)"
+def _unobservable(model: Model, N: Floats) -> Unobservable:
+    """Build the exception that names the directions spanned by the columns of N (n, k)."""
+    left_out = ""
+    if model.in_cone:
+        left_out = f" (the azimuths {sorted(model.in_cone)} are left out: cone of silence of their beacons)"
     if model.n == 3:
-        # of all bases of the blind directions, the one that has the most vertical member first
+        # choose the basis of the unobservable directions with the most vertical vector first
         vertical = N @ N[2]
         if np.linalg.norm(vertical) > 0.5:
             N = np.linalg.qr(np.column_stack((vertical, N)))[0][:, : N.shape[1]]
-    named = " and ".join(_name(v) for v in N.T)
+    named = " and ".join(_direction_name(v) for v in N.T)
     advice = (
         "a Position, a Range to a beacon that lies along it, or an Azimuth from a beacon that lies across it"
     )
     if model.n == 3 and abs(N[2, 0]) > 0.5:
         advice = "a Height or a Position of three coordinates" + (f", and {advice}" if N.shape[1] > 1 else "")
-    return Unobservable(f"nothing measures the position along {named}{lost}: add {advice}", N.T)
+    return Unobservable(f"nothing measures the position along {named}{left_out}: add {advice}", N.T)
 
 
-def _name(v: Array) -> str:
-    """A direction for people: the vertical, or an azimuth in [0, 180) deg, with its slope if it has one."""
+def _direction_name(v: Floats) -> str:
+    """Describe a direction: the vertical, or an azimuth in [0, 180) deg, with its slope if it has one."""
     horizontal = math.hypot(v[0], v[1])
     up = float(v[2]) if len(v) == 3 else 0.0
     if horizontal < 0.02 * abs(up):

@@ -1,27 +1,27 @@
-"""GNSS and a beacon contradict each other and nothing outvotes them: which of both lies, by the shape of it.
+"""GNSS against beacon: decide which of two contradicting sources is faulty, by the shape of their difference.
 
-Their difference is kept as *sights*: what a beacon measured less what GNSS's position predicts, whoever is
-believed. A beacon goes wrong at an instant and by a constant: its delay, its place, its north. GNSS is pulled
-off: its position runs away at a rate that passes for a change of the wind. Over all instants at which it may
-have begun, each of both is weighed as a Gaussian model with its own prior,
+It is used where no third source decides. The difference is kept as *sights*: a beacon's measurement minus the
+value predicted from GNSS's position, whichever source is in use. A beacon fails at an instant and by a
+constant: its delay, its place, its north. A spoofed GNSS is pulled off: its position drifts at a rate that
+resembles a change of the wind. Over all instants at which it may have started, each hypothesis is weighed as
+a Gaussian model with its own prior,
 
     residual = unit bias + H velocity (t - tau)+          GNSS pulled off
     residual = unit bias + unit step [t >= tau]           the beacon's error stepped
 
-by its evidence: 2 ln p(residuals | model) - 2 ln p(residuals | neither). Eight ninths of a ramp's chi-square
-are a step's too, so that by shape alone it takes a minute to tell; but a pull shows in the wind as well, as
-GNSS has it. Its velocity is the change of that since tau, give or take `CALM_M_S`, or a jump of the wind if
-one came in between. Where GNSS knows of no change it cannot have been pulled off.
+by its evidence: 2 ln p(residuals | model) - 2 ln p(residuals | no fault). Eight ninths of a ramp's chi-square
+are a step's too, so that the shape alone needs a minute to decide; but a pull also appears in the wind
+derived from GNSS. Its velocity is the change of that wind since tau, within `CALM_M_S`, or a jump of the wind
+if one came in between. Where GNSS shows no change it cannot have been pulled off.
 
 A step is N(0, (STEP bias)^2).
 
-The two mistakes do not cost the same. A step that passes for a pull is a small one; he who hears a spoofer is
-led as far as the spoofer likes. So a step of less than `SMALL_M` is not held against a beacon, and while a
-greater one is the likelier explanation GNSS is heard, but no longer than `PATIENCE_S`. And GNSS is attacked
-where a beacon of one's own only fails: `ODDS`. A beacon that has just said what nothing can explain is the
-other way about.
+The two wrong decisions have different costs. A step that is taken for a pull is small; following a spoofer
+has no limit. So a step of less than `SMALL_M` does not count against a beacon, and while a larger one is the
+more likely explanation GNSS remains in use, but no longer than `PATIENCE_S`. GNSS is attacked, one's own
+beacon only fails: `ODDS`. For a beacon whose last measurement no solution explains the odds are reversed.
 
-It knows no clock, no filter and not who is believed. Source: Bayesian model comparison as in MacKay,
+It knows no clock, no filter and not which source is in use. Source: Bayesian model comparison as in MacKay,
 Information Theory, Inference, and Learning Algorithms (2003), chapter 28.
 """
 
@@ -35,25 +35,24 @@ import numpy as np
 import numpy.typing as npt
 
 from companion.estimate.integrity import threshold
-
-Floats = npt.NDArray[np.float64]
+from companion.units import Floats
 
 WINDOW_NS = 600_000_000_000
-STEP = 20.0  # times what a beacon's constant error may be: 1 km, 2 degrees
-ODDS = 100.0  # by which GNSS is sooner pulled off than a beacon's error steps
+STEP = 20.0  # times the sigma of a beacon's constant error: 1 km, 2 degrees
+ODDS = 100.0  # prior odds of a pull of GNSS against a step of a beacon
 SMALL_M = 100.0  # of position
-SURE = 1e-3  # an accusation must be likelier than that nobody lies by one over this
-INSTANTS = 80  # tried, the denser the later: what lasts long has grown slowly
-PATIENCE_S = 60.0  # how long GNSS is still heard while the beacon is the likelier liar, if not by `ODDS`
-SHORTEST_S = 10.0  # a record shorter than this says nothing
-CALM_M_S = 1.0  # by which the mean wind and the errors of air data change between jumps
-BEFORE_S = 60.0  # over which the wind is averaged before an instant
+SURE = 1e-3  # inverse of the least likelihood ratio of a fault to no fault
+INSTANTS = 80  # instants tried, denser towards the end
+PATIENCE_S = 60.0  # how long GNSS stays in use while a fault of the beacon is more likely, but not by `ODDS`
+SHORTEST_S = 10.0  # a shorter record is not weighed
+CALM_M_S = 1.0  # change of mean wind and air-data errors between jumps
+BEFORE_S = 60.0  # averaging time of the wind before an instant
 
 
 class Sight(NamedTuple):
-    """A beacon's measurement less what GNSS's position predicts, one sigma being 1: `residual` is
-    H (2,) (GNSS's error north and east, m) + `unit` (the source's constant error) + N(0, 1). `drift` is the
-    velocity of the channel's error as GNSS has it, north and east (m/s): minus the wind.
+    """Beacon measurement minus its prediction from GNSS, whitened: `residual` is H (2,) (GNSS's error north
+    and east, m) + `unit` (the source's constant error) + N(0, 1). `drift` is the velocity of the channel's
+    error relative to GNSS, north and east (m/s): minus the wind.
     """
 
     t_ns: int
@@ -65,15 +64,15 @@ class Sight(NamedTuple):
 
 
 class Wind(NamedTuple):
-    """How it changes: sigma of a jump in each axis (m/s), and how many come in a second."""
+    """Change of the wind: sigma of a jump in each axis (m/s), and jumps per second."""
 
     jump: float
     rate: float
 
 
 class Evidence(NamedTuple):
-    """For GNSS pulled off and for the step of the beacon's `source` that explains most: twice the logarithm
-    of the likelihood ratio to nobody lying. That step would move a position by `moved` m.
+    """Evidence for GNSS pulled off, and for the step of the beacon's `source` that explains most: twice the
+    logarithm of the likelihood ratio to no fault. That step would move a position by `moved` m.
     """
 
     pulled: float
@@ -82,8 +81,9 @@ class Evidence(NamedTuple):
     moved: float
 
     def liar(self, suspect: bool, for_s: float) -> str | None:
-        """ "" for GNSS, or the beacon's source; None while it is not sure that either lies, or which, they
-        having contradicted each other `for_s`. `suspect` if that beacon has said what nothing explains.
+        """Decide which source is faulty: "" for GNSS, or the beacon's source; None while it is not certain
+        whether or which, the two having contradicted each other for `for_s`. `suspect` if no solution
+        explains that beacon.
         """
         lead = self.stepped - self.pulled
         if not suspect and self.moved < SMALL_M:
@@ -96,15 +96,15 @@ class Evidence(NamedTuple):
 
 
 def keep(sights: tuple[Sight, ...], new: Sight) -> tuple[Sight, ...]:
-    """With one more, without those that are too old."""
+    """Append a sight and drop those that are too old."""
     if sights and sights[0].t_ns < new.t_ns - WINDOW_NS:
         sights = tuple(s for s in sights if s.t_ns >= new.t_ns - WINDOW_NS)
     return (*sights, new)
 
 
 def weigh(sights: tuple[Sight, ...], bias: Mapping[str, float], wind: Wind) -> Evidence:
-    """Who lies, by sights in the order of time. `bias` is one sigma of each source's constant error in its
-    unit. After a few seconds of sights nobody does.
+    """Weigh the hypotheses by sights in the order of time. `bias` is one sigma of each source's constant
+    error in its unit. The first seconds of sights give no evidence.
     """
     t, y, H, units = _columns(sights, tuple(bias))
     constant = units * np.array(list(bias.values()))
@@ -119,10 +119,12 @@ def weigh(sights: tuple[Sight, ...], bias: Mapping[str, float], wind: Wind) -> E
         on = int(t.searchsorted(tau, "right"))
         ramp, after, told = (t[on:] - tau)[:, None] * H[on:], constant[on:], y[on:]
         before = t[:on] > t[on - 1] - BEFORE_S
-        pull = drift[:on][before].mean(axis=0) - drift[on:].mean(axis=0)  # as GNSS has the wind
+        pull = drift[:on][before].mean(axis=0) - drift[on:].mean(
+            axis=0
+        )  # change of the wind derived from GNSS
         jumped = -math.expm1(wind.rate * tau)
         RR, CR, Ry = ramp.T @ ramp, after.T @ ramp, ramp.T @ told
-        left = Cy - CR @ pull, Ry - RR @ pull  # when so much of a pull is taken off
+        left = Cy - CR @ pull, Ry - RR @ pull  # with the mean pull removed
         either = [
             2.0 * math.log(share) + _joint(CC, sigma * CR, sigma**2 * RR, left[0], sigma * left[1])
             for share, sigma in ((1.0 - jumped, CALM_M_S), (jumped, wind.jump))
@@ -141,12 +143,12 @@ def weigh(sights: tuple[Sight, ...], bias: Mapping[str, float], wind: Wind) -> E
 
 
 def apart(sights: tuple[Sight, ...], x: Floats, P: Floats, names: tuple[str, ...]) -> float:
-    """Chi-square of two of a constant error of GNSS in all these sights, the constant errors of the sources
-    `names` being known to be x (m,) with covariance P (m, m).
+    """Compute the chi-square of two of a constant error of GNSS in all these sights, the constant errors of
+    the sources `names` being x (m,) with covariance P (m, m).
     """
     _, y, H, units = _columns(sights, names)
     y = y - units @ x
-    # against noise and what is not known of the constants: S^-1 = I - U (P^-1 + U'U)^-1 U'
+    # covariance of noise and constants: S^-1 = I - U (P^-1 + U'U)^-1 U'
     inner = P @ np.linalg.inv(np.eye(len(x)) + units.T @ units @ P)
     weighted = np.column_stack((H, y))
     weighted = weighted - units @ (inner @ (units.T @ weighted))
@@ -155,7 +157,7 @@ def apart(sights: tuple[Sight, ...], x: Floats, P: Floats, names: tuple[str, ...
 
 
 def _columns(sights: tuple[Sight, ...], names: tuple[str, ...]) -> tuple[Floats, Floats, Floats, Floats]:
-    """Seconds before the last (n,), residuals (n,), H (n, 2), units (n, m) each in its source's column."""
+    """Build times from the last (n,), s, residuals (n,), H (n, 2), units (n, m) by source."""
     t = np.array([(s.t_ns - sights[-1].t_ns) * 1e-9 for s in sights])
     units = np.zeros((len(sights), len(names)))
     for row, s in zip(units, sights, strict=True):
@@ -164,12 +166,12 @@ def _columns(sights: tuple[Sight, ...], names: tuple[str, ...]) -> tuple[Floats,
 
 
 def _joint(AA: Floats, AB: Floats, BB: Floats, Ay: Floats, By: Floats) -> float:
-    """`_evidence` of the columns of A and B side by side."""
+    """Compute `_evidence` of the columns of A and B side by side."""
     return _evidence(np.block([[AA, AB], [AB.T, BB]]), np.concatenate((Ay, By)))
 
 
 def _evidence(AA: Floats, Ay: Floats) -> float:
-    """2 ln p(y | A) - 2 ln p(y | nothing), y (n,) = A (n, p) N(0, I) + N(0, I), by A'A and A'y."""
+    """Compute 2 ln p(y | A) - 2 ln p(y | nothing), y (n,) = A (n, p) N(0, I) + N(0, I), by A'A and A'y."""
     information = np.eye(len(AA)) + AA
     return float(Ay @ np.linalg.solve(information, Ay) - np.linalg.slogdet(information)[1])
 
@@ -177,7 +179,7 @@ def _evidence(AA: Floats, Ay: Floats) -> float:
 def _moved(
     constant: Floats, after: npt.NDArray[np.bool_], H: Floats, units: Floats, y: Floats, source: int
 ) -> float:
-    """By how much (m) the likeliest step of a source would move a position."""
+    """Compute the displacement (m) of a position by the most likely step of a source."""
     A = np.column_stack((constant, STEP * constant[:, source] * after))
     step = np.linalg.solve(np.eye(A.shape[1]) + A.T @ A, A.T @ y)[-1] * A[:, -1]
     mine = units[:, source] * after != 0.0
@@ -185,7 +187,7 @@ def _moved(
 
 
 def _averaged(evidence: Floats) -> Floats:
-    """Over the instants, the first axis."""
+    """Average the likelihood over the instants, the first axis."""
     best = evidence.max(axis=0)
     out: Floats = best + 2.0 * np.log(np.exp(0.5 * (evidence - best)).mean(axis=0))
     return out

@@ -1,9 +1,9 @@
-"""Where lines of position cross: points to start the iteration of `fusion` from, and quick answers.
+"""Initial positions: intersections of lines of position, from which the iteration of `fusion` starts.
 
 An azimuth is a ray from its beacon, a range a circle round it, seen from above at a height taken as known.
-Two of them cross in no, one or two points; where they miss each other by the measurements' errors, a point
-near both is taken. Nothing here weighs errors except `converted`, and no crossing is an estimate: the
-directions of a distant beacon are turned to this frame, its tilt is left out.
+Two of them intersect in no, one or two points; where they miss each other by the measurements' errors, a
+point near both is taken. Errors are weighed only in `convert_to_position`, and no intersection is an
+estimate: the directions of a distant beacon are turned to this frame, its tilt is left out.
 """
 
 import math
@@ -13,21 +13,40 @@ from itertools import combinations
 
 import numpy as np
 
-from companion.estimate.observations import Array, Azimuth, Height, Model, Point, Position, Range
+from companion.estimate.observations import Azimuth, Height, Model, Point, Position, Range
+from companion.units import Floats
 
 _ABOVE_BEACONS = 1000.0
 """Height above the highest beacon where nothing is known of the height, m."""
 
 
-def converted(azimuth: Azimuth, range_: Range, up: float = 0.0) -> Position:
-    """Position (2,) of the aircraft from one beacon's azimuth and range, with its correlated covariance.
+def convert_to_position(azimuth: Azimuth, range_: Range, up: float = 0.0) -> Position:
+    """Convert one beacon's azimuth and range to a position with its correlated covariance.
 
         x_P = x_b + d sin A,  y_P = y_b + d cos A,  d = sqrt(D^2 - up^2)
         covariance = [[s_d^2 s^2 + d^2 s_A^2 c^2, (s_d^2 - d^2 s_A^2) s c], [., s_d^2 c^2 + d^2 s_A^2 s^2]]
 
     DEPARTS FROM Lukinova, Podgorna, Rogozhin, "the channels x and y are independent": for these two they are
-    not. The aircraft is `up` metres above the beacon, taken as exact. The azimuth's `axes` are not used.
-    ValueError where the range is shorter than `up`.
+    not. The azimuth's `axes` are not used.
+
+    Parameters
+    ----------
+    azimuth : Azimuth
+        Azimuth from the beacon.
+    range_ : Range
+        Slant range from the same beacon.
+    up : float
+        Height of the aircraft above the beacon, m, taken as exact.
+
+    Returns
+    -------
+    Position
+        Position (2,) of the aircraft, m.
+
+    Raises
+    ------
+    ValueError
+        If the range is not longer than `up`.
     """
     if not range_.value > abs(up):
         raise ValueError(f"range {range_.value} m is not longer than the height {up} m over the beacon")
@@ -60,16 +79,38 @@ class _Circle:
 _Line = _Ray | _Circle
 
 
-def crossings(model: Model) -> list[Point]:
-    """Points where the model's lines of position cross two by two; some point of a lone line."""
+def find_crossings(model: Model) -> list[Point]:
+    """Find the points where the model's lines of position cross two by two; some point of a single line.
+
+    Parameters
+    ----------
+    model : Model
+        Observations.
+
+    Returns
+    -------
+    list of Point
+        Candidates, m; empty if there is no line of position.
+    """
     z = _height(model)
     lines = list(_lines(model, z))
     points = [q for a, b in combinations(lines, 2) for q in _cross(a, b)] or [a.foot() for a in lines[:1]]
     return [(q.real, q.imag, z) for q in points]
 
 
-def mean_position(model: Model) -> Array | None:
-    """Weighted mean (n,) of the positions and heights alone, None where there is no position."""
+def mean_position(model: Model) -> Floats | None:
+    """Average the positions and heights alone, by their weights.
+
+    Parameters
+    ----------
+    model : Model
+        Observations.
+
+    Returns
+    -------
+    (n,) or None
+        Mean, m; None if there is no position among the observations.
+    """
     if not any(isinstance(z, Position) for z in model.observations):
         return None
     known = model.linear
@@ -90,15 +131,15 @@ def _height(model: Model) -> float:
     ]
     if heights:
         return heights[0]
-    return max((s.beacon[2] for s in model.sights if s is not None), default=0.0) + _ABOVE_BEACONS
+    return max((s.beacon[2] for s in model.beacon_equations if s is not None), default=0.0) + _ABOVE_BEACONS
 
 
 def _lines(model: Model, z: float) -> Iterator[_Line]:
     for i, o in enumerate(model.observations):
-        sight = model.sights[i]
-        if sight is None or i in model.silent:
+        equation = model.beacon_equations[i]
+        if equation is None or i in model.in_cone:
             continue
-        x_b, y_b, z_b = sight.beacon
+        x_b, y_b, z_b = equation.beacon
         if isinstance(o, Azimuth):
             d = np.array([math.sin(o.value), math.cos(o.value), 0.0])
             if o.axes is not None:
@@ -130,7 +171,7 @@ def _ray_ray(a: _Ray, b: _Ray) -> list[complex]:
 
 
 def _ray_circle(a: _Ray, b: _Circle) -> list[complex]:
-    # seen from the ray: the circle's centre lies `along` it and `across` it
+    # centre of the circle in the axes of the ray
     centre = a.direction.conjugate() * (b.beacon - a.beacon)
     along, across = centre.real, centre.imag
     half = math.sqrt(max(b.radius**2 - across**2, 0.0))

@@ -1,17 +1,16 @@
-"""Solution separation: which source lies, and how far off its lie can have drawn the position.
+"""Solution separation: detect the faulty source and bound its effect on the position.
 
-Beside the filter that hears every source a row of `filterbank` hears all but one. If the models are right the
+Beside the filter that uses every source a row of `filterbank` uses all but one. If the models are right the
 full solution is optimal, its error is orthogonal to any difference of solutions, and so the separation
 
     d = x_full - x_sub   has the covariance   S = P_sub - P_full                        (Brown, McBurney 1988)
 
-whatever they heard together. d' S^-1 d over all states is by how much the source's absence makes the data
-more likely, whatever its lie: so the row that stands apart most names it, once the freedom of S is taken
-off. A lie in position shows in the velocities and tilts that it taught long before it shows in position. Of a
-row forked from the full solution the same holds: its separation accumulates over minutes what a slow drift
-adds, with an INS and beacons that were calibrated up to the fork. A fault older than the fork is in the
-forked row too; the row that never heard its source has none of it, and on that one the protection level
-rests.
+whatever they used in common. d' S^-1 d over all states is the gain in likelihood by leaving the source out,
+whatever its fault: so the row with the largest separation, less its degrees of freedom, names it. A fault in
+position shows in the velocities and tilts that it contributed to long before it shows in position. The same
+holds of a row forked from the full solution: its separation accumulates a slow drift over minutes, with an
+INS and beacons that were calibrated up to the fork. A fault older than the fork is in the forked row too; the
+row that never used its source has none of it, and the protection level rests on that one.
 
 The process noise added to the row "inertial" makes its claimed P larger than its errors are, so that S errs
 on the side of fewer alarms.
@@ -21,9 +20,9 @@ Horizontal protection level, for one faulty source at a time:
     |e_full| <= |d| + |e_sub| <= K_fa sigma(S) + K_md sigma(P_sub),  sigma(C) = sqrt(greatest eigenvalue),
 
 with K = sqrt(-2 ln p), as a normal error in the plane leaves the circle K sigma with probability at most p.
-While |d| is beyond its limit and nobody is accused yet, |d| itself stands in the place of the limit.
-The second of two faults that overlap is seen only from the first's exclusion on: that one's row, which all
-begin from again, may have heard the second.
+While |d| exceeds its limit and no source is excluded yet, |d| itself replaces the limit. The second of two
+faults that overlap is detected only after the exclusion of the first: the row of the first, from which all
+restart, may have used the second.
 """
 
 from __future__ import annotations
@@ -35,17 +34,18 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import chdtri
 
-from companion.estimate.filterbank import INERTIAL, Bank, Floats, Row
+from companion.estimate.filterbank import INERTIAL, Bank, Row
+from companion.units import Floats
 
 #: Least variance of a separation (m^2), above rounding and linearisation. It must be small: beside GNSS a
-#: beacon moves the full solution by centimetres, and by how many too many is what tells its bias.
+#: beacon moves the full solution by centimetres, and the excess of that shows its bias.
 FLOOR = 1e-6
-ROUNDING = 1e-6  # of a row's variance: a difference of covariances below this is none
+ROUNDING = 1e-6  # of a row's variance: a smaller difference of covariances is zero
 
 
 class Separation(NamedTuple):
-    """Full minus row, north and east (m), its covariance (m^2); d' S^-1 d of the position alone, chi-square
-    of two, and of all states, chi-square of `freedom`.
+    """Full solution minus row, north and east (m), its covariance (m^2); d' S^-1 d of the position alone,
+    chi-square of two, and of all states, chi-square of `freedom`.
     """
 
     row: Row
@@ -56,25 +56,25 @@ class Separation(NamedTuple):
     freedom: int
 
     def limit(self, probability: float) -> float:
-        """Of `statistic`, passed with `probability` where nothing is wrong."""
+        """Return the limit of `statistic`, exceeded with `probability` without a fault."""
         return float(chdtri(max(self.freedom, 1), probability))
 
     def beyond(self, probability: float) -> bool:
-        """Whether one of both tests fails, half of `probability` each."""
+        """Return whether one of both tests fails, half of `probability` each."""
         half = 0.5 * probability
         return self.position > threshold(half) or self.statistic > self.limit(half)
 
 
 class Blame(NamedTuple):
-    """The source that stands apart most, the limit of its statistic, and by how much less the next does:
-    clear once `margin` is large.
+    """Source with the largest separation, the limit of its statistic, and its distance to the next: certain
+    once `margin` is large.
     """
 
     source: str
     statistic: float
     limit: float
     margin: float
-    lead: float  # over the next of those that measure, as a share of its own
+    lead: float  # over the next measuring source, as a share of its own
 
 
 class Protection(NamedTuple):
@@ -87,23 +87,22 @@ class Protection(NamedTuple):
 
 
 def separations(bank: Bank) -> tuple[Separation, ...]:
-    """Every row's separation in position from the full solution."""
+    """Compute every row's separation in position from the full solution."""
     return _separated(bank, 0, range(1, len(bank.rows)))
 
 
 def threshold(probability: float) -> float:
-    """Limit of a separation's statistic, passed with `probability` where nothing is wrong."""
+    """Compute the limit of a separation's statistic, exceeded with `probability` without a fault."""
     if not 0.0 < probability < 1.0:
         raise ValueError(f"probability {probability} of a false alarm: give one between 0 and 1")
     return -2.0 * math.log(probability)
 
 
 def blame(found: tuple[Separation, ...], probability: float) -> Blame | None:
-    """The source whose row stands apart most, if any is beyond its limit of this `probability`.
+    """Find the source with the largest separation, if any exceeds its limit of this `probability`.
 
     `margin` is twice the logarithm of the likelihood by which it explains the data better than the next
-    source does, each less its freedom: ask for `threshold(p)` of it to accuse the wrong one with
-    probability p.
+    source does, each less its freedom: require `threshold(p)` of it to name the wrong one with probability p.
     """
     if not any(s.beyond(probability) for s in found):
         return None
@@ -121,15 +120,15 @@ def blame(found: tuple[Separation, ...], probability: float) -> Blame | None:
 
 
 def exclude(bank: Bank, source: str, probability: float) -> Bank:
-    """Without `source` from now on, and without what it has done.
+    """Exclude `source` from now on, and undo its effect.
 
-    The full solution is taken from the source's oldest fork if that agrees with the row that never heard it
-    (it is taken for disagreeing with this `probability` though it does not), else from this one; all others,
-    which heard it, begin again from there.
+    The full solution is replaced by the source's oldest fork if that agrees with the row that never used it
+    (agreement is wrongly denied with this `probability`), else by this row; all others, which used it,
+    restart from there.
     """
     mine = [i for i, row in enumerate(bank.rows) if row.without == source]
     if not mine:
-        raise ValueError(f"no row is without {source!r}: there are {', '.join(bank.sources)}")
+        raise ValueError(f"no row leaves out {source!r}: there are {', '.join(bank.sources)}")
     clean = next(i for i in mine if bank.rows[i].never)
     forks = sorted((i for i in mine if not bank.rows[i].never), key=lambda i: bank.rows[i].since_ns)
     chosen = clean
@@ -146,10 +145,10 @@ def exclude(bank: Bank, source: str, probability: float) -> Bank:
 
 
 def protection(bank: Bank, false_alarm: float, integrity_risk: float) -> Protection:
-    """The horizontal protection level with separations tested at `false_alarm` each.
+    """Compute the horizontal protection level with separations tested at `false_alarm` each.
 
-    The risk is shared equally by the sources and the case without a fault; that a fault is there counts as
-    certain. An excluded source's row is the full solution's equal, unless what it said before was kept.
+    The risk is shared equally by the sources and the case without a fault; the probability of a fault is
+    taken as 1. An excluded source's row equals the full solution, unless its earlier measurements were kept.
     """
     rows = [(i, r) for i, r in enumerate(bank.rows) if i and r.never]
     K_md = math.sqrt(threshold(integrity_risk / (1 + len(rows))))
@@ -169,12 +168,12 @@ def protection(bank: Bank, false_alarm: float, integrity_risk: float) -> Protect
 def admits(
     offset: Sequence[float], bound: Sequence[float], sigma: Sequence[float], refusal: float
 ) -> tuple[float, float]:
-    """How far a fix's `offset` from the guaranteed prediction goes beyond what is guaranteed, and the limit.
+    """Compute the excess of a fix's `offset` from the guaranteed prediction, and its limit.
 
     `bound` are guaranteed r.m.s. bounds, `sigma` the fix's own, one number a component (m, m/s). Of second
-    moments alone nothing more than Markov's inequality is known: the sum of offset^2 / (bound^2 + sigma^2)
-    over n components has a mean of n at most and is beyond n / refusal with probability `refusal` at most,
-    however the errors are distributed.
+    moments alone only Markov's inequality is known: the sum of offset^2 / (bound^2 + sigma^2) over n
+    components has a mean of n at most and exceeds n / refusal with probability `refusal` at most, whatever
+    the distribution of the errors.
     """
     found = sum(o * o / (b * b + s * s) for o, b, s in zip(offset, bound, sigma, strict=True))
     return found, len(offset) / refusal
@@ -182,13 +181,13 @@ def admits(
 
 def _separated(bank: Bank, full: int, subs: Sequence[int]) -> tuple[Separation, ...]:
     d, S = bank.x[full] - bank.x[subs], bank.P[subs] - bank.P[full]
-    # what rounding or a refused measurement has made negative in position is lifted to the floor
+    # lift position eigenvalues made negative by rounding or a rejected measurement to the floor
     eigenvalues, V = np.linalg.eigh(0.5 * (S + S.mT)[:, :2, :2])
     eigenvalues = np.maximum(eigenvalues, 0.0) + FLOOR
     along = (V.mT @ d[:, :2, None])[..., 0]
     position = (along**2 / eigenvalues).sum(axis=1)
     S2 = (V * eigenvalues[:, None, :]) @ V.mT
-    # metres and microradians: only what the row knows less by more than rounding counts
+    # states may be metres and microradians: count only differences above rounding
     scale = np.sqrt(np.maximum(np.diagonal(bank.P[subs], axis1=1, axis2=2), np.finfo(float).tiny))
     eigenvalues, V = np.linalg.eigh(0.5 * (S + S.mT) / (scale[:, :, None] * scale[:, None, :]))
     counts = eigenvalues > ROUNDING
@@ -200,7 +199,7 @@ def _separated(bank: Bank, full: int, subs: Sequence[int]) -> tuple[Separation, 
 
 
 def _sigma(C: Floats) -> Floats:
-    """Square root of the greatest eigenvalue of C (..., 2, 2)."""
+    """Compute the square root of the greatest eigenvalue of C (..., 2, 2)."""
     a, b, c = C[..., 0, 0], C[..., 0, 1], C[..., 1, 1]
     out: Floats = np.sqrt(np.maximum(0.5 * (a + c) + np.hypot(0.5 * (a - c), b), 0.0))
     return out

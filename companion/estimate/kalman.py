@@ -1,13 +1,14 @@
-"""The Kalman filter, its consistency tests, and its minimax (coarsened) form.
+"""Kalman filter: predict, update, consistency tests, and the minimax (coarsened) noise.
 
     x(t+1) = A x(t) + W(t),   z(t) = H x(t) + N(t),   W ~ (0, Q), N ~ (0, R)                (2.1), (2.3)
 
-Equation numbers are Poddubny's paper on restrictive filtering. All functions broadcast over leading axes:
-`x` of shape (..., n) with one shared `P` of shape (n, n) is a Monte Carlo of many flights in one call,
+Equation numbers are those of Poddubny's paper on restrictive filtering. All functions broadcast over leading
+axes: `x` of shape (..., n) with one shared `P` of shape (n, n) is a Monte Carlo of many flights in one call,
 because the gain does not depend on the data; with `P` of shape (..., n, n) every flight has its own.
 
-It does not know what the states mean, what time is, nor what to do with a rejected measurement: the `_flaw`
-functions say why something is not believable, the caller decides.
+This is the one implementation of the measurement update in `companion.estimate`: `restrictive`,
+`full_horizon`, `smoother` and `schemes` call it. It does not know what the states mean, and it rejects
+nothing: the `find_*_flaw` functions describe what is wrong with a number, the caller decides.
 """
 
 from dataclasses import dataclass
@@ -15,50 +16,123 @@ from functools import lru_cache
 from typing import NamedTuple, cast
 
 import numpy as np
-import numpy.typing as npt
-from scipy.stats import chi2
 
-Array = npt.NDArray[np.float64]
+from companion.units import Floats
 
 
 class Prediction(NamedTuple):
-    """Mean (..., n) and covariance (..., n, n) before the measurement."""
+    """State before the measurement.
 
-    x: Array
-    P: Array
+    Attributes
+    ----------
+    x : (..., n)
+        Mean.
+    P : (..., n, n)
+        Covariance.
+    """
+
+    x: Floats
+    P: Floats
 
 
 class Estimate(NamedTuple):
-    """Mean and covariance after the measurement; the innovation (..., p), its covariance S, nu' S^-1 nu."""
+    """State after the measurement.
 
-    x: Array
-    P: Array
-    innovation: Array
-    S: Array
-    nis: Array
+    Attributes
+    ----------
+    x : (..., n)
+        Mean.
+    P : (..., n, n)
+        Covariance.
+    innovation : (..., p)
+        nu = z - H x before the update.
+    S : (..., p, p)
+        Covariance of the innovation.
+    nis : (...,)
+        Normalised innovation squared, nu' S^-1 nu.
+    """
+
+    x: Floats
+    P: Floats
+    innovation: Floats
+    S: Floats
+    nis: Floats
 
 
 class Gain(NamedTuple):
-    """Innovation covariance S = H P H' + R, its inverse, and K = P H' S^-1."""
+    """Kalman gain with the innovation covariance it is made of.
 
-    S: Array
-    S_inverse: Array
-    K: Array
+    Attributes
+    ----------
+    S : (..., p, p)
+        Innovation covariance H P H' + R.
+    S_inverse : (..., p, p)
+        Its inverse.
+    K : (..., n, p)
+        Gain P H' S^-1.
+    """
+
+    S: Floats
+    S_inverse: Floats
+    K: Floats
 
 
-def predict(x: Array, P: Array, A: Array, Q: Array) -> Prediction:
-    """Carry x (..., n) and P one step forward by the transition A and the noise covariance Q of the step."""
+def predict(x: Floats, P: Floats, A: Floats, Q: Floats) -> Prediction:
+    """Propagate mean and covariance over one step.
+
+    Parameters
+    ----------
+    x : (..., n)
+        Mean.
+    P : (n, n) or (..., n, n)
+        Covariance.
+    A : (n, n)
+        Transition of the step.
+    Q : (n, n)
+        Covariance of the noise added in the step.
+
+    Returns
+    -------
+    Prediction
+        A x and A P A' + Q.
+
+    References
+    ----------
+    Poddubny (2.4).
+    """
     Pb = A @ P @ A.mT
     Pb += Q
     return Prediction(x @ A.mT, Pb)
 
 
-def correct(x: Array, P: Array, z: Array, H: Array, R: Array) -> Estimate:
-    """Take in z (..., p) = H x + N(0, R).
+def update(x: Floats, P: Floats, z: Floats, H: Floats, R: Floats) -> Estimate:
+    """Update mean and covariance by the measurement z = H x + N(0, R).
 
     DEPARTS FROM (2.5): the paper inverts the predicted covariance, which does not exist after exact alignment
-    (P0 = 0). The gain form needs S = H P H' + R invertible only; Joseph's form keeps P symmetric and
+    (P0 = 0). The gain form needs only an invertible S = H P H' + R; Joseph's form keeps P symmetric and
     non-negative whatever the rounding of K.
+
+    Parameters
+    ----------
+    x : (..., n)
+        Predicted mean.
+    P : (n, n) or (..., n, n)
+        Predicted covariance.
+    z : (..., p)
+        Measurement.
+    H : (p, n)
+        Measurement matrix.
+    R : (p, p)
+        Measurement noise covariance, positive definite.
+
+    Returns
+    -------
+    Estimate
+        Updated state with innovation, S and NIS.
+
+    References
+    ----------
+    Poddubny (2.5).
     """
     S, S_inverse, K = gain(P, H, R)
     nu = z - x @ H.mT
@@ -66,95 +140,240 @@ def correct(x: Array, P: Array, z: Array, H: Array, R: Array) -> Estimate:
     return Estimate(x + (K @ nu[..., None])[..., 0], joseph(P, K, H, R), nu, S, nis)
 
 
-def step(x: Array, P: Array, z: Array, A: Array, Q: Array, H: Array, R: Array) -> Estimate:
-    """One predict and correct, (2.4)-(2.5): from X(t|t), P(t|t) and z(t+1) to X(t+1|t+1), P(t+1|t+1)."""
+def step(x: Floats, P: Floats, z: Floats, A: Floats, Q: Floats, H: Floats, R: Floats) -> Estimate:
+    """Predict over one step and update by its measurement.
+
+    Parameters
+    ----------
+    x, P : (..., n), (..., n, n)
+        X(t|t) and P(t|t).
+    z : (..., p)
+        Measurement z(t+1).
+    A, Q, H, R
+        As in `predict` and `update`.
+
+    Returns
+    -------
+    Estimate
+        X(t+1|t+1), P(t+1|t+1), with innovation, S and NIS.
+
+    References
+    ----------
+    Poddubny (2.4), (2.5).
+    """
     x, P = predict(x, P, A, Q)
-    return correct(x, P, z, H, R)
+    return update(x, P, z, H, R)
 
 
-def gain(P: Array, H: Array, R: Array) -> Gain:
-    """Of a predicted covariance P (..., n, n), measured through H (p, n) with noise R."""
+def gain(P: Floats, H: Floats, R: Floats) -> Gain:
+    """Compute the Kalman gain of a predicted covariance.
+
+    Parameters
+    ----------
+    P : (..., n, n)
+        Predicted covariance.
+    H : (p, n)
+        Measurement matrix.
+    R : (p, p)
+        Measurement noise covariance.
+
+    Returns
+    -------
+    Gain
+        S, its inverse, and K.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        If S is singular.
+    """
     HP = H @ P
     S = HP @ H.mT + R
-    S_inverse = cast("Array", np.linalg.inv(S))
+    S_inverse = cast("Floats", np.linalg.inv(S))
     return Gain(S, S_inverse, HP.mT @ S_inverse)
 
 
-def joseph(P: Array, K: Array, H: Array, R: Array) -> Array:
-    """M P M' + K R K', M = I - K H, exactly symmetric, and non-negative whatever the rounding of K.
+def joseph(P: Floats, K: Floats, H: Floats, R: Floats) -> Floats:
+    """Update a covariance for any gain: M P M' + K R K', M = I - K H.
 
-    M is applied, never formed, first from the left and then from the right: every product then has but the
-    rank of the measurement. Multiplying all out into four terms of the size of P would be as cheap, but it
+    M is applied, never formed, first from the left and then from the right: every product then has only the
+    rank of the measurement. Multiplying out into four terms of the size of P would be as cheap, but it
     cancels: with R far below H P H' the sign of P is lost.
+
+    Parameters
+    ----------
+    P : (..., n, n)
+        Predicted covariance.
+    K : (..., n, p)
+        Gain, optimal or not.
+    H : (p, n)
+        Measurement matrix.
+    R : (p, p)
+        Measurement noise covariance.
+
+    Returns
+    -------
+    (..., n, n)
+        Updated covariance, exactly symmetric, and non-negative whatever the rounding of K.
     """
     MP = K @ (H @ P)
-    np.subtract(P, MP, out=MP)  # a stack of flights is large: work in the same memory
+    np.subtract(P, MP, out=MP)  # in place: a stack of flights is large
     J = (K @ R - MP @ H.mT) @ K.mT
     J += MP
-    symmetric: Array = np.add(J, J.mT, out=MP)
+    symmetric: Floats = np.add(J, J.mT, out=MP)
     symmetric *= 0.5
     return symmetric
 
 
-def minimax_noise(B: Array, C: Array, Q: Array) -> Array:
-    """Q + B diag(C_i^2) B', the noise of the minimax filter for X(t+1) = A X + B U + W, |U_i| <= C_i.
+def minimax_noise(B: Floats, C: Floats, Q: Floats) -> Floats:
+    """Compute the noise of the minimax filter for X(t+1) = A X + B U + W with bounded inputs |U_i| <= C_i.
 
-    Of all laws of a white U within its bounds, +-C_i with equal chances has the greatest variance: section 2.
+    Of all distributions of a white U within its bounds, +-C_i with equal chances has the largest variance.
+
+    Parameters
+    ----------
+    B : (n, m)
+        Influence of the inputs.
+    C : (m,)
+        Bounds, in the unit of the inputs.
+    Q : (n, n)
+        Covariance of W.
+
+    Returns
+    -------
+    (n, n)
+        Q + B diag(C_i^2) B'.
+
+    References
+    ----------
+    Poddubny, section 2.
     """
     return Q + (B * np.square(C)) @ B.T
 
 
-# Consistency: is the spread what P and S promise?
+# Consistency: does the spread match P and S?
 
 
 @lru_cache(maxsize=64)
-def gate(dof: int, false_alarm: float = 1e-3) -> float:
-    """Limit that the NIS of an honest measurement of `dof` components exceeds with chance `false_alarm`."""
-    return float(chi2.isf(false_alarm, dof))
+def nis_gate(dof: int, false_alarm: float = 1e-3) -> float:
+    """Compute the chi-square gate for the NIS.
+
+    Parameters
+    ----------
+    dof : int
+        Number of components of the measurement.
+    false_alarm : float
+        Probability that a measurement with the stated errors exceeds the gate.
+
+    Returns
+    -------
+    float
+        Upper chi-square quantile, dimensionless.
+    """
+    from scipy.special import chdtri
+
+    return float(chdtri(dof, false_alarm))
 
 
 @lru_cache(maxsize=64)
-def band(dof: int, samples: int, false_alarm: float = 1e-3) -> tuple[float, float]:
-    """Two-sided limits of the mean of `samples` independent NIS or NEES values, each of `dof` components."""
-    low, high = chi2.interval(1.0 - false_alarm, dof * samples)
+def consistency_band(dof: int, samples: int, false_alarm: float = 1e-3) -> tuple[float, float]:
+    """Compute two-sided limits for the mean of independent NIS or NEES values.
+
+    Parameters
+    ----------
+    dof : int
+        Components of each value.
+    samples : int
+        Number of values averaged.
+    false_alarm : float
+        Probability that a consistent filter falls outside.
+
+    Returns
+    -------
+    tuple of float
+        Lower and upper limit, dimensionless.
+    """
+    from scipy.special import gammaincinv
+
+    freedom = dof * samples
+    low, high = (2.0 * gammaincinv(0.5 * freedom, p) for p in (0.5 * false_alarm, 1.0 - 0.5 * false_alarm))
     return float(low) / samples, float(high) / samples
 
 
-def nees(error: Array, P: Array) -> Array:
-    """error' P^+ error (...,), whose mean is the rank of P (..., n, n) where the filter is consistent.
+def nees(error: Floats, P: Floats) -> Floats:
+    """Compute the normalised estimation error squared; its mean is the rank of P if the filter is consistent.
 
-    The inverse is taken on the correlation matrix, so that kilometres and microradians weigh alike;
-    directions in which P promises exactness (P0 = 0) are left out.
+    The inverse is taken on the correlation matrix, so that kilometres and microradians weigh alike.
+    Directions of zero variance (P0 = 0) are left out.
+
+    Parameters
+    ----------
+    error : (..., n)
+        Estimate minus truth.
+    P : (..., n, n)
+        Covariance.
+
+    Returns
+    -------
+    (...,)
+        error' P^+ error.
     """
     sigma = np.sqrt(np.einsum("...ii->...i", P))
     scale = np.where(sigma > 0.0, sigma, 1.0)
     rho = P / (scale[..., :, None] * scale[..., None, :])
     e = error / scale
-    inverse: Array = np.linalg.pinv(rho, rcond=1e-12, hermitian=True)
-    weight: Array = (e * (inverse @ e[..., None])[..., 0]).sum(-1)
+    inverse: Floats = np.linalg.pinv(rho, rcond=1e-12, hermitian=True)
+    weight: Floats = (e * (inverse @ e[..., None])[..., 0]).sum(-1)
     return weight
 
 
-# What can be wrong with the numbers
+# Checks of the numbers
 
 
 @dataclass(frozen=True, slots=True)
-class Start:
-    """A validated beginning of a filter: time, mean (n,), covariance (n, n). ValueError names the flaw."""
+class InitialState:
+    """Validated initial state of a filter; ValueError names the flaw.
+
+    Attributes
+    ----------
+    t_ns : int
+        Time, ns.
+    x : (n,)
+        Mean.
+    P : (n, n)
+        Covariance; zero variances are allowed.
+    """
 
     t_ns: int
-    x: Array
-    P: Array
+    x: Floats
+    P: Floats
 
     def __post_init__(self) -> None:
         if not np.isfinite(self.x).all():
             raise ValueError("the initial state x is not finite: give every state a finite starting value")
-        if reason := covariance_flaw("P0", self.P, len(self.x)):
+        if reason := find_covariance_flaw("P0", self.P, len(self.x)):
             raise ValueError(reason)
 
 
-def covariance_flaw(name: str, P: Array, n: int, *, definite: bool = False) -> str | None:
-    """Why P cannot be the covariance of n numbers, or None. `definite` also forbids a zero eigenvalue."""
+def find_covariance_flaw(name: str, P: Floats, n: int, *, definite: bool = False) -> str | None:
+    """Describe why P cannot be a covariance.
+
+    Parameters
+    ----------
+    name : str
+        Name of the matrix in the text.
+    P : array
+        Candidate, should be (n, n).
+    n : int
+        Number of variables.
+    definite : bool
+        Also forbid a zero eigenvalue.
+
+    Returns
+    -------
+    str or None
+        The reason, None if P is a covariance.
+    """
     if P.shape != (n, n):
         return f"covariance {name} has shape {P.shape}, it must be ({n}, {n})"
     if not np.isfinite(P).all():
@@ -174,11 +393,28 @@ def covariance_flaw(name: str, P: Array, n: int, *, definite: bool = False) -> s
     return None
 
 
-def measurement_flaw(t_ns: int, z: Array, R: Array, last_t_ns: int) -> str | None:
-    """Why the measurement z (p,) with covariance R (p, p) cannot be used after time `last_t_ns`, or None."""
+def find_measurement_flaw(t_ns: int, z: Floats, R: Floats, last_t_ns: int) -> str | None:
+    """Describe why a measurement cannot be used.
+
+    Parameters
+    ----------
+    t_ns : int
+        Time of the measurement, ns.
+    z : (p,)
+        Measurement.
+    R : (p, p)
+        Its covariance.
+    last_t_ns : int
+        Time of the filter's state, ns.
+
+    Returns
+    -------
+    str or None
+        The reason, None if it can be used.
+    """
     if t_ns < last_t_ns:
         late = (last_t_ns - t_ns) / 1e9
         return f"time runs backwards by {late:.3f} s: go back to an older state and forward again"
     if not np.isfinite(z).all():
         return "the measurement is not finite: check its source"
-    return covariance_flaw("R", R, len(z), definite=True)
+    return find_covariance_flaw("R", R, len(z), definite=True)

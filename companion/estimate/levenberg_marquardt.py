@@ -1,10 +1,10 @@
-"""Gauss-Newton with Levenberg's damping, in two or three unknowns and plain numbers.
+"""Levenberg-Marquardt minimisation in two or three unknowns, in plain numbers.
 
 With whitened residuals r and their Jacobian J at the last position,
 
     minimise r^T r,   F = J^T J,   step (F + mu I)^-1 J^T r,   mu rises until the cost falls
 
-It goes down from one point; which one, and what the minimum is worth, is `fusion`'s.
+It descends from one point; `fusion` chooses that point and assesses the minimum.
 """
 
 import math
@@ -12,33 +12,61 @@ from typing import NamedTuple
 
 from companion.estimate.observations import Linearised, Model, Point
 
-_CLEARLY = 1e-9  # pivots whose product over that of the trace is more hide no small eigenvalue
-_DAMPING = 1e-14  # least mu, in traces of F: keeps a step finite along a direction that nothing measures
+_CLEARLY = 1e-9  # least product of pivots over trace^3 that excludes a small eigenvalue
+_DAMPING = 1e-14  # least mu, in traces of F: keeps a step finite along an unobservable direction
 _STEPS = 100
-_CONVERGED = 1e-9  # a step this long, in standard deviations, is not worth taking
-_LEVEL = 1e-11  # a rise of the cost by less, relative to 1 + cost, is rounding
-_STALLED = 1e-4  # and one this long if rounding no longer lets the cost fall
+_CONVERGED = 1e-9  # length of the last step, in standard deviations
+_LEVEL = 1e-11  # rise of the cost, relative to 1 + cost, that is rounding
+_STALLED = 1e-4  # length of the last step where the cost no longer falls, by rounding
 
 
 class NoFix(ValueError):
-    """The observations, each fit for use, do not give a position."""
+    """The observations, each usable, do not determine a position."""
 
 
 class Minimum(NamedTuple):
-    """Where the cost is least, the equations there, and the steps it took."""
+    """Minimum of the cost.
+
+    Attributes
+    ----------
+    p : Point
+        Position, m.
+    at : Linearised
+        Equations there.
+    iterations : int
+        Steps taken.
+    """
 
     p: Point
     at: Linearised
     iterations: int
 
 
-def descend(model: Model, p: Point) -> Minimum:
-    """The minimum of the cost that is reached from p; NoFix where there is none."""
+def minimize_cost(model: Model, p: Point) -> Minimum:
+    """Minimise the cost from a starting point.
+
+    Parameters
+    ----------
+    model : Model
+        Equations.
+    p : Point
+        Start, m.
+
+    Returns
+    -------
+    Minimum
+        Minimum reached.
+
+    Raises
+    ------
+    NoFix
+        If there is none within the limit of steps.
+    """
     at = model.at(p)
     floor, mu = _DAMPING, _DAMPING
     for iteration in range(1, _STEPS + 1):
         step, length = _step(at, mu)
-        # while damped, a step is short for another reason
+        # a damped step is short without convergence
         if length < _CONVERGED and mu == floor:
             return Minimum(p, at, iteration)
         q = (p[0] + step[0], p[1] + step[1], p[2] + step[2])
@@ -55,8 +83,19 @@ def descend(model: Model, p: Point) -> Minimum:
     )
 
 
-def inverse(at: Linearised) -> tuple[tuple[float, ...], ...] | None:
-    """The n rows of F^-1, m^2; None where some direction may be measured by nothing."""
+def invert_information(at: Linearised) -> tuple[tuple[float, ...], ...] | None:
+    """Invert the information F = J^T J.
+
+    Parameters
+    ----------
+    at : Linearised
+        Equations at a point.
+
+    Returns
+    -------
+    tuple or None
+        n rows of F^-1, m^2; None where some direction may be unobservable.
+    """
     F = _information(at)
     if at.n == 2:
         F = F._replace(zz=max(F.xx, F.yy))
@@ -72,9 +111,9 @@ def inverse(at: Linearised) -> tuple[tuple[float, ...], ...] | None:
 
 
 def _step(at: Linearised, mu: float) -> tuple[Point, float]:
-    """Levenberg's step (F + mu trace(F) I)^-1 J^T r and its length in standard deviations.
+    """Compute Levenberg's step (F + mu trace(F) I)^-1 J^T r and its length in standard deviations.
 
-    In the plane nothing measures z, and the step has none.
+    In the plane z is not measured, and the step has none.
     """
     F = _information(at)
     least = mu * (F.xx + F.yy + F.zz)
@@ -118,7 +157,7 @@ def _information(at: Linearised) -> _Information:
 
 
 def _factors(F: _Information, least: float) -> _Factors:
-    """Of F + `least` I, which no pivot can fall below."""
+    """Factor F + `least` I; no pivot falls below `least`."""
     dx = F.xx + least
     yx, zx = F.xy / dx, F.xz / dx
     dy = max(F.yy + least - yx * F.xy, least)

@@ -1,8 +1,8 @@
-"""A linear Gaussian problem as a list of steps: what it takes, and what can be wrong with it.
+"""Linear Gaussian system as a list of stages, with validation.
 
     x_{i+1} = Phi_i x_i + Gamma_i theta_i,   z_{i+1} = H_{i+1} x_{i+1} + N(0, R_{i+1}),   theta_i ~ N(0, D_i)
 
-It does not know how to solve it: see `smoother`.
+It does not solve anything: see `smoother`.
 """
 
 from __future__ import annotations
@@ -14,41 +14,84 @@ import numpy as np
 import numpy.typing as npt
 
 from companion.estimate import kalman
+from companion.units import Floats
 
-Array = npt.NDArray[np.float64]
-Lists = Sequence[npt.ArrayLike]
-Gaps = Sequence[npt.ArrayLike | None]
+Arrays = Sequence[npt.ArrayLike]
+OptionalArrays = Sequence[npt.ArrayLike | None]
 
 
 class Stage(NamedTuple):
-    """From x_i to x_{i+1}, and what is measured there; z (p,), H (p, n), R (p, p), p = 0 for nothing."""
+    """One stage: the transition from x_i to x_{i+1} and the measurement of x_{i+1}.
 
-    Phi: Array
-    Gamma: Array
-    D: Array
-    H: Array
-    R: Array
-    z: Array
+    Attributes
+    ----------
+    Phi : (n, n)
+        Transition.
+    Gamma : (n, q)
+        Influence of the disturbance.
+    D : (q, q)
+        Covariance of the disturbance.
+    H : (p, n)
+        Measurement matrix; p = 0 for no measurement.
+    R : (p, p)
+        Measurement noise covariance.
+    z : (p,)
+        Measurement.
+    """
+
+    Phi: Floats
+    Gamma: Floats
+    D: Floats
+    H: Floats
+    R: Floats
+    z: Floats
 
     @property
-    def Q(self) -> Array:
-        """Gamma D Gamma', what the disturbance adds to the covariance."""
+    def Q(self) -> Floats:
+        """Return Gamma D Gamma' (n, n), the covariance added by the disturbance."""
         return self.Gamma @ self.D @ self.Gamma.T
 
 
-def stages_of(
-    Phi: Lists, Gamma: Lists, D: Lists, H: Gaps, R: Gaps, z: Gaps, m: npt.ArrayLike, B: npt.ArrayLike
-) -> tuple[list[Stage], Array, Array]:
-    """The lists as stages. ValueError names the entry that does not fit."""
+def make_stages(
+    Phi: Arrays,
+    Gamma: Arrays,
+    D: Arrays,
+    H: OptionalArrays,
+    R: OptionalArrays,
+    z: OptionalArrays,
+    m: npt.ArrayLike,
+    B: npt.ArrayLike,
+) -> tuple[list[Stage], Floats, Floats]:
+    """Convert lists of matrices to stages and validate them.
+
+    Parameters
+    ----------
+    Phi, Gamma, D : sequences of N arrays
+        Transition (n, n), influence (n, q_i) and covariance (q_i, q_i) of each stage.
+    H, R, z : sequences of N arrays or None
+        Measurement of x_{i+1}: (p_i, n), (p_i, p_i), (p_i,); None or no rows for no measurement.
+    m, B : (n,), (n, n)
+        Mean and covariance of x_0.
+
+    Returns
+    -------
+    tuple
+        Stages, m and B as float arrays.
+
+    Raises
+    ------
+    ValueError
+        Names the entry that does not fit.
+    """
     lengths = [len(each) for each in (Phi, Gamma, D, H, R, z)]
     if len(set(lengths)) > 1 or not lengths[0]:
         raise ValueError(f"Phi, Gamma, D, H, R, z have {lengths} entries: give one of each for every step")
-    start = kalman.Start(0, np.atleast_1d(np.asarray(m, float)), np.atleast_2d(np.asarray(B, float)))
+    start = kalman.InitialState(0, np.atleast_1d(np.asarray(m, float)), np.atleast_2d(np.asarray(B, float)))
     n = len(start.x)
     stages = []
     for i, parts in enumerate(zip(Phi, Gamma, D, H, R, z, strict=True)):
         stage = _stage(n, *parts)
-        flaw = _flaw(stage, n)
+        flaw = _find_flaw(stage, n)
         if flaw:
             raise ValueError(f"entry {i}: {flaw}")
         stages.append(stage)
@@ -70,18 +113,18 @@ def _stage(
     noise = np.atleast_2d(np.asarray(D, float))
     if z is None or H is None or R is None or np.size(H) == 0:
         return Stage(transition, influence, noise, np.zeros((0, n)), np.zeros((0, 0)), np.zeros(0))
-    seen = np.atleast_2d(np.asarray(H, float))
-    accuracy, value = np.atleast_2d(np.asarray(R, float)), np.atleast_1d(np.asarray(z, float))
-    return Stage(transition, influence, noise, seen, accuracy, value)
+    matrix = np.atleast_2d(np.asarray(H, float))
+    covariance, value = np.atleast_2d(np.asarray(R, float)), np.atleast_1d(np.asarray(z, float))
+    return Stage(transition, influence, noise, matrix, covariance, value)
 
 
-def _flaw(stage: Stage, n: int) -> str | None:
+def _find_flaw(stage: Stage, n: int) -> str | None:
     q, p = stage.Gamma.shape[-1], len(stage.z)
     if stage.Phi.shape != (n, n) or stage.Gamma.shape != (n, q):
         return f"Phi {stage.Phi.shape} and Gamma {stage.Gamma.shape} do not fit {n} states"
     if stage.H.shape != (p, n):
         return f"H {stage.H.shape} does not fit z of {p} numbers and {n} states"
     if not all(np.isfinite(each).all() for each in stage):
-        return "a number is not finite: leave the measurement out (z None) or mend the model"
-    noise = kalman.covariance_flaw("D", stage.D, q)
-    return noise or (kalman.covariance_flaw("R", stage.R, p, definite=True) if p else None)
+        return "a number is not finite: leave the measurement out (z None) or correct the model"
+    noise = kalman.find_covariance_flaw("D", stage.D, q)
+    return noise or (kalman.find_covariance_flaw("R", stage.R, p, definite=True) if p else None)

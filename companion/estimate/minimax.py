@@ -1,4 +1,4 @@
-"""Minimax prediction on the Schuler channel: the closed form, and the general solver for everything else.
+"""Minimax prediction on the Schuler channel: the closed form, and the continuous problem in general.
 
 Position gamma is measured on all of [0, T] with errors of r.m.s. at most sigma and any correlation; the
 state is wanted at T + alpha. Matasov, Martirosyan: the optimal estimate uses four instants, 0, chi, T - chi,
@@ -11,15 +11,18 @@ With h = T / 2, t1 = h - chi, c = h + alpha the four bounds are sigma / D times
     gamma  c cos t1 - sin c      phi  |sin c|      mu  cos t1 - cos c      vartheta  cos t1,     D = h cos t1
     - sin h
 
-written below with u(x) = x - sin x and half angles, since as printed they lose everything to cancellation in
-a short window. Where they hold: all four stand on one dual polynomial, A x - B sin x in x = tau - h, which
-levels at +-1 with alternating signs on the four instants and nowhere exceeds 1 while h + t1 < 2 pi; so a
-target is served exactly when its four weights alternate in sign too. The paper's T <= pi/2, alpha <= pi - T
+written below with u(x) = x - sin x and half angles, since as printed they cancel in a short window. Where
+they hold: all four have one dual polynomial, A x - B sin x in x = tau - h, which levels at +-1 with
+alternating signs on the four instants and nowhere exceeds 1 while h + t1 < 2 pi; so the closed form holds
+for a target exactly when its four weights alternate in sign too. The paper's T <= pi/2, alpha <= pi - T
 is sufficient for gamma, mu and vartheta, but not for phi, whose optimum has three instants near h + alpha =
-0 and pi: there `continuous` takes over.
+0 and pi: there `continuous_tau` takes over.
 
 The bound is on the r.m.s. error, and attained by rho = +-sigma sign Phi. It bounds |error| itself only where
 |rho| <= sigma for certain: of a fully correlated Gaussian error 31.7 % of realisations exceed it.
+
+Units: `closed_form` takes seconds and metres. The functions named `_tau` take dimensionless time, radians of
+Schuler phase (one second is 1.2387e-3), and dimensionless errors; `schuler.Scale` converts.
 """
 
 import math
@@ -28,72 +31,137 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from companion.estimate.minimax_lp import (
-    Design,
-    Infeasible,
-    LeastSquares,
-    Minimax,
-    least_squares,
-    solve,
-    white,
-    worst_case,
-)
-from companion.estimate.schuler import STATE, schuler_row, transition
-from companion.estimate.schuler import sine_excess_at as u
-
-__all__ = [
-    "ClosedForm",
-    "Continuous",
-    "Design",
-    "Infeasible",
-    "LeastSquares",
-    "Minimax",
-    "closed_form",
-    "continuous",
-    "least_squares",
-    "schuler_row",
-    "solve",
-    "white",
-    "worst_case",
-]
-
-Floats = npt.NDArray[np.float64]
+from companion.estimate.minimax_lp import solve
+from companion.estimate.schuler import MEAN_EARTH, STATE, Scale, schuler_row, transition
+from companion.estimate.schuler import sine_excess_scalar as u
+from companion.units import Floats
 
 REMEZ_TOLERANCE = 1e-11  # how far the dual polynomial may exceed sigma between grid points, relative
 REMEZ_ROUNDS = 30  # three to five are usual, fifteen where two instants merge
 
 
 class ClosedForm(NamedTuple):
-    """Minimax estimates of gamma, phi, mu, vartheta, in this order, at T + alpha; dimensionless.
+    """Minimax estimates of gamma, phi, mu, vartheta, in this order, at the end of the window plus `ahead`.
 
-    Estimate k is weights[k] . z(instants[k]). `instants[k]` is `times` but for the targets named in
-    `fallback`, where the paper's form is not optimal and the general solver found (at most four) instants of
-    its own.
+    Estimate k is weights[k] . z(instants[k]). `closed_form` gives SI (s, m, rad, m/s, rad/s),
+    `closed_form_tau` dimensionless numbers.
+
+    Attributes
+    ----------
+    times : (4,)
+        Instants 0, chi, T - chi, T of the paper's form.
+    weights : (4, 4)
+        One row per target, one column per instant.
+    bounds : (4,)
+        Worst r.m.s. errors, sigma sum |weights|.
+    instants : (4, 4)
+        Instants of each target: `times`, except for the targets in `fallback`.
+    fallback : tuple of str
+        Targets for which the paper's form is not optimal; the general solver found at most four instants.
     """
 
-    times: Floats  # (4,) 0, chi, T - chi, T
-    weights: Floats  # (4 targets, 4 instants)
-    bounds: Floats  # (4,) sigma sum |weights|
-    instants: Floats  # (4 targets, 4 instants)
+    times: Floats
+    weights: Floats
+    bounds: Floats
+    instants: Floats
     fallback: tuple[str, ...]
 
 
 class Continuous(NamedTuple):
-    """The minimax estimate of one target from gamma measured on all of [0, T]: weights . z(times)."""
+    """Minimax estimate weights . z(times) of one target from gamma measured on all of [0, T]; dimensionless.
 
-    times: Floats  # (k,), k <= 4
-    weights: Floats  # (k,)
+    Attributes
+    ----------
+    times : (k,)
+        Instants, k <= 4.
+    weights : (k,)
+        Weights of the measurements there.
+    bound : float
+        Worst r.m.s. error.
+    dual : (4,)
+        Dual vector on the state at T + alpha, feasible.
+    gap : float
+        Relative duality gap.
+    """
+
+    times: Floats
+    weights: Floats
     bound: float
-    dual: Floats  # (4,)
+    dual: Floats
     gap: float
 
 
-def closed_form(T: float, alpha: float, sigma: float = 1.0) -> ClosedForm:
-    """Return the minimax estimates at T + alpha from gamma on [0, T]; alpha < 0 is inside the window.
+def closed_form(window_s: float, ahead_s: float, sigma_m: float, scale: Scale = MEAN_EARTH) -> ClosedForm:
+    """Compute the minimax estimates of the INS errors ahead of a window of positions, in SI units.
 
-    Everything is dimensionless, `schuler.Scale` has the units. ValueError unless T, sigma > 0 and finite.
+    `closed_form(900, 600, 30).bounds[0]` is 1217 m: 15 minutes of 30 m positions, ten minutes ahead.
+
+    Parameters
+    ----------
+    window_s : float
+        Length of the window on which the position error is measured, s.
+    ahead_s : float
+        Time ahead of the end of the window, s; negative inside the window.
+    sigma_m : float
+        R.m.s. error of the measured positions, m, of any correlation.
+    scale : Scale
+        Earth radius and Schuler rate.
+
+    Returns
+    -------
+    ClosedForm
+        Instants in s; rows of weights and bounds for position (m), tilt (rad), velocity (m/s), drift (rad/s).
+
+    Raises
+    ------
+    ValueError
+        If the window or sigma is not positive, or a number is not finite.
+
+    References
+    ----------
+    Matasov, Martirosyan (2.5), (2.6).
     """
-    _check(T, alpha, sigma)
+    _check(window_s=window_s, sigma_m=sigma_m)
+    _check(positive=False, ahead_s=ahead_s)
+    found = closed_form_tau(window_s * scale.rate, ahead_s * scale.rate, sigma_m / scale.radius)
+    units = np.array(scale.units)
+    return ClosedForm(
+        found.times / scale.rate,
+        found.weights * (units / scale.radius)[:, None],
+        found.bounds * units,
+        found.instants / scale.rate,
+        found.fallback,
+    )
+
+
+def closed_form_tau(T: float, alpha: float, sigma: float = 1.0) -> ClosedForm:
+    """Compute the minimax estimates at T + alpha from gamma on [0, T], dimensionless.
+
+    Parameters
+    ----------
+    T : float
+        Window, radians of Schuler phase (seconds times `Scale.rate`).
+    alpha : float
+        Time ahead of the end of the window, radians of Schuler phase; negative inside the window.
+    sigma : float
+        R.m.s. error of gamma, dimensionless (metres over `Scale.radius`).
+
+    Returns
+    -------
+    ClosedForm
+        Dimensionless times, weights and bounds.
+
+    Raises
+    ------
+    ValueError
+        If T or sigma is not positive, or a number is not finite.
+
+    References
+    ----------
+    Matasov, Martirosyan (2.5), (2.6).
+    """
+    _check(T=T, sigma=sigma)
+    _check(positive=False, alpha=alpha)
     h, c = 0.5 * T, 0.5 * T + alpha
     t1 = _inner_instant(h)
     times = np.array([0.0, h - t1, h + t1, T])
@@ -107,19 +175,43 @@ def closed_form(T: float, alpha: float, sigma: float = 1.0) -> ClosedForm:
     holds = (alternating.min(axis=1) >= -1e-14 * np.abs(weights).sum(axis=1)) & (h + t1 < 2.0 * math.pi)
     instants = np.tile(times, (4, 1))
     for k in np.flatnonzero(~holds):
-        optimum = continuous(T, alpha, np.eye(4)[k], sigma)
+        optimum = continuous_tau(T, alpha, np.eye(4)[k], sigma)
         used = len(optimum.times)
-        instants[k], weights[k] = optimum.times[-1], 0.0  # fewer than four: the rest stand by with no weight
+        instants[k], weights[k] = optimum.times[-1], 0.0  # fewer than four: the rest have zero weight
         instants[k, :used], weights[k, :used], bounds[k] = optimum.times, optimum.weights, optimum.bound
     return ClosedForm(times, weights, bounds, instants, tuple(STATE[k] for k in np.flatnonzero(~holds)))
 
 
-def continuous(T: float, alpha: float, target: npt.ArrayLike, sigma: float = 1.0) -> Continuous:
-    """Return the minimax estimate of target (4,) . state(T + alpha) from gamma on [0, T].
+def continuous_tau(T: float, alpha: float, target: npt.ArrayLike, sigma: float = 1.0) -> Continuous:
+    """Compute the minimax estimate of any target from gamma on [0, T], dimensionless.
 
     The exchange over a grid, then over the extrema of its dual polynomial, until none exceeds sigma (Remez).
+
+    Parameters
+    ----------
+    T, alpha : float
+        Window and time ahead of its end, radians of Schuler phase.
+    target : (4,)
+        Coefficients of gamma, phi, mu, vartheta at T + alpha.
+    sigma : float
+        R.m.s. error of gamma, dimensionless.
+
+    Returns
+    -------
+    Continuous
+        Instants, weights, bound and its certificate.
+
+    Raises
+    ------
+    ValueError
+        If T or sigma is not positive, a number is not finite, or the target is not (4,).
+
+    References
+    ----------
+    Matasov, Martirosyan (1.9), (1.10).
     """
-    _check(T, alpha, sigma)
+    _check(T=T, sigma=sigma)
+    _check(positive=False, alpha=alpha)
     a = np.asarray(target, dtype=np.float64)
     if a.shape != (4,):
         raise ValueError(f"target has shape {a.shape}; give (4,): gamma, phi, mu, vartheta")
@@ -129,7 +221,7 @@ def continuous(T: float, alpha: float, target: npt.ArrayLike, sigma: float = 1.0
         return Continuous(np.empty(0), np.empty(0), 0.0, np.zeros(4), 0.0)
     x = h * np.sin(np.linspace(-0.5 * np.pi, 0.5 * np.pi, 16 * (4 + math.ceil(T))))
     if -T <= alpha <= 0.0:
-        x = np.union1d(x, h + alpha)  # inside the window a fix at the very instant may be the whole answer
+        x = np.union1d(x, h + alpha)  # inside the window a fix at that instant may be the optimum
     for _ in range(REMEZ_ROUNDS):
         best = solve(schuler_row("gamma", -x), a_mid, sigma)
         used = np.flatnonzero(np.abs(best.weights) > 1e-12 * np.abs(best.weights).sum())
@@ -144,7 +236,7 @@ def continuous(T: float, alpha: float, target: npt.ArrayLike, sigma: float = 1.0
 
 
 def _extrema(x: Floats, dual: Floats, h: float) -> Floats:
-    """Return the local extrema of the dual polynomial from the grid x (n,), by Newton on its slope."""
+    """Find the local extrema of the dual polynomial from the grid x (n,), by Newton on its slope."""
     value = np.abs(schuler_row("gamma", -x) @ dual)
     inner = np.flatnonzero((value[1:-1] >= value[:-2]) & (value[1:-1] >= value[2:])) + 1
     peak = x[inner]
@@ -158,10 +250,10 @@ def _extrema(x: Floats, dual: Floats, h: float) -> Floats:
 
 
 def _inner_instant(h: float) -> float:
-    """Return t1 = h - chi of sin(chi - h) + (T - chi) cos(chi - h) - sin h = 0.
+    """Solve sin(chi - h) + (T - chi) cos(chi - h) - sin h = 0 for t1 = h - chi.
 
     As u(h) + u(t1) = 2 (h + t1) sin^2(t1 / 2), whose difference falls and is concave on (0, pi/2): Newton
-    from the right comes down monotonically and stops where rounding stops it.
+    from the right descends monotonically until rounding stops it.
     """
     t1 = min(h, 0.5 * math.pi)
     u_h = u(h)
@@ -174,7 +266,7 @@ def _inner_instant(h: float) -> float:
 
 
 def _weights(h: float, t1: float, c: float) -> Floats:
-    """Return N^-1 of (2.5) (4 targets, 4 instants), as even and odd pairs about the middle of the window."""
+    """Compute N^-1 of (2.5) (4 targets, 4 instants), as even and odd pairs about the middle of the window."""
     u_h, u_1, u_c = u(h), u(t1), u(c)
     versine = 2.0 * math.sin(0.5 * c) ** 2
     sin, cos = math.sin(c), math.cos(c)
@@ -187,11 +279,11 @@ def _weights(h: float, t1: float, c: float) -> Floats:
 
 
 def _cos_difference(x: float, y: float) -> float:
-    """Return cos x - cos y without cancellation."""
+    """Compute cos x - cos y without cancellation."""
     return -2.0 * math.sin(0.5 * (x + y)) * math.sin(0.5 * (x - y))
 
 
-def _check(T: float, alpha: float, sigma: float) -> None:
-    for name, value, positive in (("T", T, True), ("alpha", alpha, False), ("sigma", sigma, True)):
+def _check(positive: bool = True, **numbers: float) -> None:
+    for name, value in numbers.items():
         if not math.isfinite(value) or (positive and value <= 0.0):
             raise ValueError(f"{name} is {value}; give a {'positive' if positive else 'finite'} number")

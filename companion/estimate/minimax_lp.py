@@ -1,4 +1,4 @@
-"""Guaranteed linear estimation from sampled measurements of any kind, by exchange.
+"""Guaranteed linear estimation from sampled measurements: linear programme solved by exchange.
 
 Measurements z_j = H_j x + rho_j, E rho_j = 0, E rho_j^2 <= sigma_j^2, with ANY correlation between the rho.
 Of all linear unbiased estimates of a . x the one whose worst r.m.s. error is least solves (Matasov,
@@ -9,17 +9,16 @@ Martirosyan (1.9)-(1.10))
 
 A basis of r independent rows, r the rank (4 on the Schuler channel), gives weights by one small solve and is
 feasible whatever their signs, so there is no first phase. Its dual vector is a generalised polynomial H .
-lambda that levels at +-sigma on the basis; the row where it sticks out most enters, and the line search of
-the entering weight tells which leaves: the simplex method, or Remez's exchange. It ends with both values
+lambda that levels at +-sigma on the basis. The row with the largest excess enters, and a line search over
+its weight chooses the row that leaves: the simplex method, or Remez's exchange. At the end both values are
 equal, and that equality is the proof.
 
-All work is done on orthonormal coordinates, H / sigma = Q S, found once for many targets: there the levelled
-polynomial is known to a few units of the last place however short the window, and least squares costs one
-product, because the same problem with |w|_2 for |w|_1 is solved by w = Q a.
+All work is done on orthonormal coordinates, H / sigma = Q S, computed once for many targets: there the
+levelled polynomial is accurate to a few units of the last place however short the window, and least squares
+costs one product, because the same problem with |w|_2 for |w|_1 is solved by w = Q a.
 
-It knows neither time nor navigation: rows are rows. Degenerate targets (weights that vanish) are handled by
-Bland's rule after a stall; unobservable ones raise `Infeasible`. The optimum need not be unique, its value
-is.
+It knows neither time nor navigation. Degenerate targets (weights that vanish) are handled by Bland's rule
+after a stall; unobservable ones raise `Infeasible`. The optimum need not be unique, its value is.
 """
 
 from collections.abc import Sequence
@@ -28,9 +27,10 @@ from typing import NamedTuple, Self
 
 import numpy as np
 import numpy.typing as npt
-import scipy.linalg
+from scipy.linalg import qr
 
-Floats = npt.NDArray[np.float64]
+from companion.units import Floats
+
 Indices = npt.NDArray[np.intp]
 
 LEVEL_TOLERANCE = 1e-12  # how far |H lambda| may exceed sigma, relative: also the duality gap left
@@ -39,67 +39,195 @@ EXCHANGES_MAX = 1000  # a handful to thirty are usual
 
 
 class Infeasible(ValueError):
-    """The rows do not see the target: no unbiased estimate exists."""
+    """The rows do not determine the target: no unbiased estimate exists."""
 
 
 class Minimax(NamedTuple):
-    """The minimax estimate w . z and its certificate: a . dual <= least worst error <= bound."""
+    """Minimax estimate w . z and its certificate: a . dual <= least worst error <= bound.
 
-    weights: Floats  # (n,)
-    bound: float  # sum sigma |w|, the worst r.m.s. error
-    dual: Floats  # (m,) lambda, feasible
-    gap: float  # (bound - a . dual) / bound
-    active: tuple[int, ...]  # rows of the last basis: start the next, similar problem from them
+    Attributes
+    ----------
+    weights : (n,)
+        Weights w.
+    bound : float
+        Worst r.m.s. error, sum sigma |w|.
+    dual : (m,)
+        Feasible dual vector lambda.
+    gap : float
+        Relative duality gap, (bound - a . dual) / bound.
+    active : tuple of int
+        Rows of the last basis; a start for the next, similar problem.
+    """
+
+    weights: Floats
+    bound: float
+    dual: Floats
+    gap: float
+    active: tuple[int, ...]
 
 
 class LeastSquares(NamedTuple):
-    """The least-squares estimate w . z, with what it claims and what it may suffer."""
+    """Least-squares estimate w . z with its claimed and its worst error.
 
-    weights: Floats  # (n,)
-    claimed: float  # one sigma if the errors were uncorrelated
-    worst: float  # sum sigma |w|: under the worst correlation
+    Attributes
+    ----------
+    weights : (n,)
+        Weights w.
+    claimed : float
+        One sigma if the errors are uncorrelated.
+    worst : float
+        R.m.s. error under the worst correlation, sum sigma |w|.
+    """
+
+    weights: Floats
+    claimed: float
+    worst: float
 
 
-def worst_case(weights: npt.ArrayLike, sigmas: npt.ArrayLike) -> float:
-    """Return sum sigma |w|: the r.m.s. error of w . z under the worst correlation, rho = +-sigma sign w."""
+def worst_case_rms(weights: npt.ArrayLike, sigmas: npt.ArrayLike) -> float:
+    """Compute the r.m.s. error of w . z under the worst correlation, rho = +-sigma sign w.
+
+    Parameters
+    ----------
+    weights : (n,)
+        Weights w.
+    sigmas : (n,) or float
+        R.m.s. errors of the measurements.
+
+    Returns
+    -------
+    float
+        sum sigma |w|.
+    """
     return float(np.sum(np.abs(np.asarray(weights) * np.asarray(sigmas))))
 
 
-def white(weights: npt.ArrayLike, sigmas: npt.ArrayLike) -> float:
-    """Return sqrt(sum sigma^2 w^2): the r.m.s. error of w . z under uncorrelated errors."""
+def white_noise_rms(weights: npt.ArrayLike, sigmas: npt.ArrayLike) -> float:
+    """Compute the r.m.s. error of w . z under uncorrelated errors.
+
+    Parameters
+    ----------
+    weights : (n,)
+        Weights w.
+    sigmas : (n,) or float
+        R.m.s. errors of the measurements.
+
+    Returns
+    -------
+    float
+        sqrt(sum sigma^2 w^2).
+    """
     return float(np.linalg.norm(np.asarray(weights) * np.asarray(sigmas)))
 
 
 def solve(
     rows: npt.ArrayLike, target: npt.ArrayLike, sigmas: npt.ArrayLike, start: Sequence[int] | None = None
 ) -> Minimax:
-    """Return the minimax estimate of target . x; rows (n, m), target (m,), sigmas (n,) or one for all.
+    """Compute the minimax estimate of one target.
 
-    `start` is the `active` of a similar problem. Raises Infeasible where the rows do not determine the
-    target, and ValueError on shapes, NaN or sigmas that are not positive.
+    Parameters
+    ----------
+    rows : (n, m)
+        Measurement rows.
+    target : (m,)
+        Coefficients of the wanted combination of unknowns.
+    sigmas : (n,) or float
+        R.m.s. errors, one a row or one for all.
+    start : sequence of int, optional
+        `active` of a similar problem.
+
+    Returns
+    -------
+    Minimax
+        Weights, bound and certificate.
+
+    Raises
+    ------
+    Infeasible
+        If the rows do not determine the target.
+    ValueError
+        On wrong shapes, numbers that are not finite, or sigmas that are not positive.
+
+    References
+    ----------
+    Matasov, Martirosyan (1.9), (1.10).
     """
     return Design.of(rows, sigmas).minimax(target, start)
 
 
 def least_squares(rows: npt.ArrayLike, target: npt.ArrayLike, sigmas: npt.ArrayLike) -> LeastSquares:
-    """Return the weighted least-squares estimate of target . x; arguments and errors as in `solve`."""
+    """Compute the weighted least-squares estimate of one target.
+
+    Parameters
+    ----------
+    rows : (n, m)
+        Measurement rows.
+    target : (m,)
+        Coefficients of the wanted combination of unknowns.
+    sigmas : (n,) or float
+        R.m.s. errors, one a row or one for all.
+
+    Returns
+    -------
+    LeastSquares
+        Weights, claimed and worst error.
+
+    Raises
+    ------
+    Infeasible, ValueError
+        As in `solve`.
+    """
     return Design.of(rows, sigmas).least_squares(target)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Design:
-    """Rows and sigmas, checked and factored once, ready for any number of targets."""
+    """Rows and sigmas, checked and factored once, for any number of targets.
 
-    sigmas: Floats  # (n,)
-    whitened: Floats  # (m, n) H / sigma, by columns: numpy is fastest along the long axis
-    q: Floats  # (r, n) the rows in orthonormal coordinates: q q^T = 1
-    coordinates: Floats  # (m, r): q = coordinates^T @ whitened
-    unseen: Floats  # (m, m) projector, in scaled columns, on what no row sees
-    columns: Floats  # (m,) scale of each column
+    Attributes
+    ----------
+    sigmas : (n,)
+        R.m.s. errors.
+    whitened : (m, n)
+        H / sigma, by columns: numpy is fastest along the long axis.
+    q : (r, n)
+        Rows in orthonormal coordinates, q q^T = I.
+    coordinates : (m, r)
+        q = coordinates^T @ whitened.
+    unobservable : (m, m)
+        Projector, in scaled columns, on the directions that no row measures.
+    columns : (m,)
+        Scale of each column.
+    """
+
+    sigmas: Floats
+    whitened: Floats
+    q: Floats
+    coordinates: Floats
+    unobservable: Floats
+    columns: Floats
 
     @classmethod
     def of(cls, rows: npt.ArrayLike, sigmas: npt.ArrayLike) -> Self:
-        """Check rows (n, m) and sigmas (n,) or scalar, and factor them."""
+        """Check and factor rows and sigmas.
+
+        Parameters
+        ----------
+        rows : (n, m)
+            Measurement rows.
+        sigmas : (n,) or float
+            R.m.s. errors, one a row or one for all.
+
+        Returns
+        -------
+        Design
+            Factored rows.
+
+        Raises
+        ------
+        ValueError
+            On wrong shapes, numbers that are not finite, or sigmas that are not positive.
+        """
         rows = np.asarray(rows, dtype=np.float64)
         if rows.ndim != 2 or rows.shape[0] == 0 or rows.shape[1] == 0:
             raise ValueError(f"rows has shape {rows.shape}; give (n, m) with one measurement or more")
@@ -107,7 +235,9 @@ class Design:
         if sigmas.ndim == 0:
             sigmas = np.full(len(rows), sigmas)
         if sigmas.shape != (len(rows),):
-            raise ValueError(f"sigmas has shape {sigmas.shape}, rows {rows.shape}; give one sigma a row")
+            raise ValueError(
+                f"sigmas has shape {sigmas.shape}, rows {rows.shape}; give one sigma for each row"
+            )
         if not np.isfinite(rows).all():
             i = int(np.argmin(np.isfinite(rows).all(axis=1)))
             raise ValueError(f"rows[{i}] is not finite; leave a missing measurement out")
@@ -120,33 +250,64 @@ class Design:
         triangle = np.linalg.qr((whitened / columns[:, None]).T, mode="r")
         _, singular, v_t = np.linalg.svd(triangle)
         rank = int(np.count_nonzero(singular > RANK_TOLERANCE * max(singular[0], np.finfo(float).tiny)))
-        seen = v_t[:rank]
-        coordinates = (seen.T / singular[:rank]) / columns[:, None]
-        unseen = np.eye(len(columns)) - seen.T @ seen
-        return cls(sigmas, whitened, coordinates.T @ whitened, coordinates, unseen, columns)
+        observable = v_t[:rank]
+        coordinates = (observable.T / singular[:rank]) / columns[:, None]
+        unobservable = np.eye(len(columns)) - observable.T @ observable
+        return cls(sigmas, whitened, coordinates.T @ whitened, coordinates, unobservable, columns)
 
     def in_coordinates(self, target: npt.ArrayLike) -> tuple[Floats, Floats]:
-        """Return target (m,) as floats and in the orthonormal coordinates (r,), or raise Infeasible."""
+        """Transform a target to the orthonormal coordinates.
+
+        Parameters
+        ----------
+        target : (m,)
+            Coefficients of the wanted combination of unknowns.
+
+        Returns
+        -------
+        tuple
+            Target (m,) as floats, and in the coordinates (r,).
+
+        Raises
+        ------
+        Infeasible
+            If the rows do not determine it.
+        ValueError
+            On a wrong shape or a number that is not finite.
+        """
         a = np.asarray(target, dtype=np.float64)
         m = len(self.columns)
         if a.shape != (m,):
-            raise ValueError(f"target has shape {a.shape}; give ({m},), one number an unknown")
+            raise ValueError(f"target has shape {a.shape}; give ({m},), one number for each unknown")
         if not np.isfinite(a).all():
             raise ValueError(f"target[{int(np.argmin(np.isfinite(a)))}] is not finite; give numbers")
         scaled = a / self.columns
-        missed = np.abs(self.unseen @ scaled)
+        component = np.abs(self.unobservable @ scaled)
         size = float(np.linalg.norm(scaled))
-        if missed.max() > 1e-9 * size:
-            blamed = ", ".join(str(i) for i in np.flatnonzero((missed > 1e-9 * size) & (a != 0.0)))
+        if component.max() > 1e-9 * size:
+            indices = ", ".join(str(i) for i in np.flatnonzero((component > 1e-9 * size) & (a != 0.0)))
             rank, n = self.q.shape
             raise Infeasible(
-                f"target is not observable in component {blamed}: {n} rows have rank {rank} of {m}; "
+                f"target is not observable in component {indices}: {n} rows have rank {rank} of {m}; "
                 "add measurements at other times or of another quantity"
             )
         return a, a @ self.coordinates
 
     def minimax(self, target: npt.ArrayLike, start: Sequence[int] | None = None) -> Minimax:
-        """Solve for one target (m,) by exchange, from the rows `start` if they are a basis."""
+        """Compute the minimax estimate of one target by exchange.
+
+        Parameters
+        ----------
+        target : (m,)
+            Coefficients of the wanted combination of unknowns.
+        start : sequence of int, optional
+            Rows to start from, if they are a basis.
+
+        Returns
+        -------
+        Minimax
+            Weights, bound and certificate.
+        """
         a, a_q = self.in_coordinates(target)
         weights = np.zeros(len(self.sigmas))
         if not a_q.any():
@@ -161,7 +322,18 @@ class Design:
         )
 
     def least_squares(self, target: npt.ArrayLike) -> LeastSquares:
-        """Solve for one target (m,) in the least-squares sense."""
+        """Compute the least-squares estimate of one target.
+
+        Parameters
+        ----------
+        target : (m,)
+            Coefficients of the wanted combination of unknowns.
+
+        Returns
+        -------
+        LeastSquares
+            Weights, claimed and worst error.
+        """
         _, a_q = self.in_coordinates(target)
         whitened_weights = a_q @ self.q
         return LeastSquares(
@@ -169,7 +341,7 @@ class Design:
         )
 
     def _basis(self, start: Sequence[int] | None) -> Indices:
-        """Return r independent rows: `start`, else the extremal nodes of a window, else by pivoting."""
+        """Choose r independent rows: `start`, else the extremal nodes of a window, else by pivoting."""
         rank, n = self.q.shape
         nodes = 0.5 * (1.0 - np.cos(np.pi * np.arange(rank) / max(rank - 1, 1)))
         for rows in (start, np.round(nodes * (n - 1))):
@@ -178,18 +350,18 @@ class Design:
             basis = np.asarray(rows, dtype=np.intp)
             if basis.min() >= 0 and basis.max() < n and np.linalg.cond(self.q[:, basis]) < 1e6:
                 return basis
-        return np.asarray(scipy.linalg.qr(self.q, mode="r", pivoting=True)[-1][:rank], dtype=np.intp)
+        return np.asarray(qr(self.q, mode="r", pivoting=True)[-1][:rank], dtype=np.intp)
 
 
 def _exchange(q: Floats, a: Floats, basis: Indices) -> tuple[Indices, Floats, Floats]:
-    """Return the optimal basis, its whitened weights and the dual vector, from any independent basis.
+    """Find the optimal basis, its whitened weights and the dual vector, from any independent basis.
 
     q (r, n), a (r,). The sign of a weight is kept as part of the basis, so that a weight of zero has one too.
     """
     basis = basis.copy()
     sign = np.where(np.linalg.solve(q[:, basis], a) < 0.0, -1.0, 1.0)
     cost, stalled = np.inf, 0
-    held: tuple[Indices, Floats, Floats] | None = None
+    best: tuple[Indices, Floats, Floats] | None = None
     for _ in range(EXCHANGES_MAX):
         b = q[:, basis]
         inverse = np.linalg.inv(b)
@@ -200,33 +372,31 @@ def _exchange(q: Floats, a: Floats, basis: Indices) -> tuple[Indices, Floats, Fl
         sign[wrong], size[wrong] = -sign[wrong], -size[wrong]
         now = float(size.sum())
         biased = np.abs(b @ w - a).max() > 1e-10 * max(np.abs(a).max(), 1e-3 * now * np.abs(b).max())
-        if held is not None and (biased or now > cost * (1.0 + 1e-9)):
-            break  # two rows all but equal: the basis before was optimal to within rounding
+        if best is not None and (biased or now > cost * (1.0 + 1e-9)):
+            break  # two nearly equal rows: the basis before was optimal within rounding
         dual = sign @ inverse
-        held = (basis.copy(), w, dual)
+        best = (basis.copy(), w, dual)
         level = dual @ q
         excess = np.abs(level)
         stalled = 0 if now < cost * (1.0 - 1e-14) else stalled + 1
         cost = now
-        careful = stalled > 3 * len(a)
-        enter = int(np.argmax(excess > 1.0 + LEVEL_TOLERANCE)) if careful else int(excess.argmax())
+        bland = stalled > 3 * len(a)
+        enter = int(np.argmax(excess > 1.0 + LEVEL_TOLERANCE)) if bland else int(excess.argmax())
         if excess[enter] <= 1.0 + LEVEL_TOLERANCE:
             break
         side = 1.0 if level[enter] > 0.0 else -1.0
         rate = sign * (inverse @ q[:, enter]) * side  # how fast each |w| of the basis falls
-        leave = (
-            _first_to_vanish(size, rate, basis) if careful else _long_step(size, rate, sign, excess[enter])
-        )
+        leave = _first_to_vanish(size, rate, basis) if bland else _long_step(size, rate, sign, excess[enter])
         basis[leave], sign[leave] = enter, side
-    assert held is not None
-    return held
+    assert best is not None
+    return best
 
 
 def _long_step(size: Floats, rate: Floats, sign: Floats, excess: float) -> int:
-    """Return which weight leaves, changing `sign` of those passed on the way.
+    """Choose the weight that leaves, changing `sign` of those passed on the way.
 
     The cost is convex in the entering weight and its slope, 1 - excess at first, grows by twice the rate of
-    each weight that vanishes; while it stays negative that weight had better change sign than leave.
+    each weight that vanishes; while the slope is negative that weight changes sign instead of leaving.
     """
     falling = np.flatnonzero(rate > 1e-11 * np.abs(rate).max())
     slope = 1.0 - excess
@@ -239,7 +409,7 @@ def _long_step(size: Floats, rate: Floats, sign: Floats, excess: float) -> int:
 
 
 def _first_to_vanish(size: Floats, rate: Floats, basis: Indices) -> int:
-    """Return the weight that vanishes first, of several the lowest row: Bland's rule."""
+    """Choose the weight that vanishes first, of several the lowest row: Bland's rule."""
     falling = np.flatnonzero(rate > 1e-11 * np.abs(rate).max())
     when = np.maximum(size[falling], 0.0) / rate[falling]
     first = falling[when <= when.min() * (1.0 + 1e-12) + 1e-300]

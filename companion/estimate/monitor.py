@@ -1,12 +1,12 @@
-"""The watch over the sources: solution separation as a fold over measurements, with exclusions as data.
+"""Source monitor: solution separation as a fold over measurements, with exclusions as data.
 
     monitor, refused = hear(monitor, measurement, allotment)     # every measurement, in the order of time
     monitor, exclusions = watch(monitor, allotment)              # once a second
 
-`integrity` has the mathematics; here stands when it is asked. A source falls by its separation, clear of
-every other's; by a run of measurements that no solution can explain; or by the word of an arbiter, where
-there is one. The forks of a source are renewed in turn, so that the older is between one and two `fork_s`
-old, and never while something stands apart.
+`integrity` has the mathematics; this module decides when to test. A source is excluded by its separation, if
+it is larger than every other's; by a run of measurements that no solution explains; or by the decision of an
+arbiter, where there is one. The forks of a source are renewed in turn, so that the older is between one and
+two `fork_s` old, but not while a separation exceeds its limit.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ from companion.estimate.integrity import Separation, blame, exclude, separations
 BEYOND = "separation"
 REFUSED = "refused by every solution"
 CONTRADICTED = "contradiction"
-LEAD = 0.5  # by which one must stand apart from others that measure: a model's errors grow with the lie
+LEAD = 0.5  # least lead over the other measuring sources: a model's errors grow with the fault
 
 
 class Allotment(NamedTuple):
-    """What may go wrong, as probabilities.
+    """Allocation of risk, as probabilities, and the times of the decisions.
 
-    `alarms_per_hour`: false alarms of the separations, all rows together. They are tested once a second,
-    but one test says little new within `independent_s`. `rejection`: a good measurement refused. `wrong`:
-    the wrong source accused. `run`: refusals in a row that exclude. `settle_s`: how long an excluded source
-    must be admitted without a break before it is heard again, and `slow_s` one that drifted: it may pass
-    for good that long. `hold_s`: how long the inertial channel must stand accused; a jump of a source looks
-    like one of the channel until beacons have averaged enough, and sources jump.
+    `alarms_per_hour`: false alarms of the separations, all rows together. They are tested once a second;
+    tests within `independent_s` count as one. `rejection`: a good measurement rejected. `wrong`: the wrong
+    source excluded. `run`: rejections in a row that exclude. `settle_s`: time for which an excluded source
+    must pass the gate without a break before it is re-admitted, `slow_s` the same for one that drifted: a
+    drift can pass the gate that long. `hold_s`: time for which the inertial channel must be the suspect; a
+    jump of a source looks like one of the channel until beacons have averaged enough, and sources jump.
     """
 
     alarms_per_hour: float = 1e-3
@@ -47,13 +47,13 @@ class Allotment(NamedTuple):
     hold_s: float = 60.0
 
     def false_alarm(self, rows: int) -> float:
-        """Of one test of one of `rows` separations."""
+        """Return the false-alarm probability of one test of one of `rows` separations."""
         return self.alarms_per_hour * self.independent_s / 3600.0 / max(rows, 1)
 
 
 class Exclusion(NamedTuple):
-    """A source left out: why, the number that told and its limit. What it said after `since_ns` is undone,
-    which moved the position by `moved` m.
+    """Exclusion of a source: reason, test statistic and limit. Its measurements after `since_ns` are undone,
+    which moves the position by `moved` m.
     """
 
     t_ns: int
@@ -66,7 +66,7 @@ class Exclusion(NamedTuple):
 
 
 class Refusal(NamedTuple):
-    """A measurement not taken: NIS in the solution that it fits best, and the limit."""
+    """Rejected measurement: NIS in the solution that it fits best, and the limit."""
 
     source: str
     value: float
@@ -74,7 +74,7 @@ class Refusal(NamedTuple):
 
 
 class Judgement(NamedTuple):
-    """Who lies, None while that is not sure; the number that told and its limit."""
+    """Decision of an arbiter: the faulty source, None while not certain; the statistic and its limit."""
 
     source: str | None
     value: float
@@ -82,24 +82,24 @@ class Judgement(NamedTuple):
 
 
 class Monitor(NamedTuple):
-    """The bank, the run of refusals of each source, since when something stands apart and is not clear."""
+    """Bank, run of rejections of each source, and the start of an unresolved separation."""
 
     bank: Bank
     runs: tuple[tuple[str, int], ...] = ()
-    refused: tuple[tuple[str, int], ...] = ()  # when a measurement of each source was last refused
+    refused: tuple[tuple[str, int], ...] = ()  # time of the last rejection of each source
     unresolved_ns: int | None = None
-    admitted: tuple[tuple[str, int], ...] = ()  # excluded sources, and since when they have been admitted
+    admitted: tuple[tuple[str, int], ...] = ()  # excluded sources, and since when they pass the gate
     drifted: tuple[str, ...] = ()  # sources excluded by separation
-    accused_ns: int | None = None  # since when the inertial channel stands accused
+    accused_ns: int | None = None  # since when the inertial channel is the suspect
 
     @property
     def unresolved(self) -> bool:
-        """Whether something stands apart and is not yet clear."""
+        """Return whether a separation exceeds its limit without a clear suspect."""
         return self.unresolved_ns is not None
 
 
 def hear(monitor: Monitor, measurement: Measurement, allotment: Allotment) -> tuple[Monitor, Refusal | None]:
-    """One more measurement, at the bank's time."""
+    """Update with one measurement at the bank's time."""
     limit = float(chdtri(len(measurement.z), allotment.rejection))
     taken = take(monitor.bank, measurement, limit)
     runs = dict(monitor.runs)
@@ -116,7 +116,8 @@ def watch(
 ) -> tuple[Monitor, list[Exclusion]]:
     """Test every separation, exclude at most one source, renew the forks.
 
-    An `arbiter` is asked who lies where the separations cannot tell, the channel itself being no witness.
+    An `arbiter` decides which source is faulty where the separations cannot, the channel itself not being an
+    independent reference.
     """
     bank = monitor.bank
     found = separations(bank)
@@ -153,8 +154,8 @@ def _unresolved(monitor: Monitor, now: bool) -> Monitor:
 def offer(
     monitor: Monitor, t_ns: int, source: str, admitted: bool, allotment: Allotment
 ) -> tuple[Monitor, bool]:
-    """What an excluded source says, which the gate (`integrity.admits`) has or has not `admitted`; whether it
-    is heard again from now on.
+    """Try to re-admit an excluded source, given whether its measurement was `admitted` by the gate
+    (`integrity.admits`); return whether it is used from now on.
     """
     since = dict(monitor.admitted)
     if not admitted:
@@ -168,7 +169,7 @@ def offer(
 
 
 def forget(monitor: Monitor, source: str) -> Monitor:
-    """As if `source` had never been heard, but for what it taught the others."""
+    """Remove `source` with its rows and history; what it contributed to the states remains."""
     runs, refused, admitted = (
         tuple(entry for entry in entries if entry[0] != source)
         for entries in (monitor.runs, monitor.refused, monitor.admitted)
@@ -179,12 +180,12 @@ def forget(monitor: Monitor, source: str) -> Monitor:
 
 
 def probation(monitor: Monitor, source: str, allotment: Allotment) -> float:
-    """How long (s) an excluded source must be admitted without a break."""
+    """Return the time (s) for which an excluded source must pass the gate without a break."""
     return allotment.slow_s if source in monitor.drifted else allotment.settle_s
 
 
 def trusted(monitor: Monitor, source: str) -> bool:
-    """Whether the source is heard: neither excluded nor in a run of refusals."""
+    """Return whether the source is used: neither excluded nor in a run of rejections."""
     return source not in monitor.bank.excluded and dict(monitor.runs).get(source, 0) == 0
 
 
@@ -201,7 +202,7 @@ def _excluded(
 
 
 def _renewed(bank: Bank, found: tuple[Separation, ...], every_ns: int) -> Bank:
-    """Each source's oldest fork begun again once its youngest is `every_ns` old."""
+    """Restart each source's oldest fork once its youngest is `every_ns` old."""
     forks: dict[str, list[int]] = {}
     for i, s in enumerate(found, 1):
         if not s.row.never and s.row.without not in bank.excluded:

@@ -1,7 +1,7 @@
-"""What may be said about a position: a position, an azimuth, a slant range, a height, each with its errors.
+"""Observations of a position: positions, azimuths, slant ranges and heights, each with its errors.
 
-Four values, and `Model`, which turns a list of them into whitened equations. It knows nothing of how the
-equations are solved (`fusion`), of where the errors' sizes come from, nor of the earth: the caller brings
+Four values, and `Model`, which turns a list of them into whitened equations. It does not know how the
+equations are solved (`fusion`), where the sizes of the errors come from, or the earth: the caller transforms
 everything into one Cartesian frame first. The equations are plain numbers: there are two or three unknowns,
 and an array of three costs ten times its arithmetic.
 
@@ -11,13 +11,13 @@ position, beacon or start has three components or a height is given; a position 
 the third free.
 
 North at the beacon is not north here: seen in a tangent plane at the aircraft, the true north of a beacon 400
-km to the east is turned by 3.6 deg tan(latitude). So `Azimuth.axes` takes this frame's axes to the beacon's
-own east, north, up; with the beacon's coordinates brought through ECEF nothing is then approximated. A
-slant range needs no such thing: a length is the same in all frames.
+km to the east is turned by 3.6 deg tan(latitude). So `Azimuth.axes` rotates this frame's axes to the beacon's
+own east, north, up; with the beacon's coordinates transformed through ECEF nothing is then approximated. A
+slant range needs no such rotation: a length is the same in all frames.
 
 Above a beacon there is no azimuth: the antenna has its cone of silence, and the geometry itself breaks down
 where the azimuth's share of the error, sigma_A times the horizontal distance, tends to zero and claims an
-accuracy that is not there. `Model.above` finds such azimuths and `Model.without` leaves them out.
+accuracy that is not there. `Model.azimuths_above` finds such azimuths and `Model.without` leaves them out.
 """
 
 import copy
@@ -28,7 +28,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-Array = npt.NDArray[np.float64]
+from companion.units import Floats
+
 Point = tuple[float, float, float]
 Row = tuple[float, float, float, float]
 """One whitened equation at a point: residual, observed minus computed, and the gradient of the computed."""
@@ -36,7 +37,15 @@ Row = tuple[float, float, float, float]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Position:
-    """A measured position, `value` (2,) or (3,) m, with the full `covariance` (2, 2) or (3, 3) m^2."""
+    """Measured position.
+
+    Attributes
+    ----------
+    value : (2,) or (3,)
+        East, north[, up], m.
+    covariance : (2, 2) or (3, 3)
+        Full covariance, m^2.
+    """
 
     value: npt.ArrayLike
     covariance: npt.ArrayLike
@@ -44,9 +53,18 @@ class Position:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Azimuth:
-    """Azimuth of the aircraft from `beacon` (2,) or (3,) m: `value`, `sigma` rad, clockwise from its north.
+    """Azimuth of the aircraft from a beacon.
 
-    `axes` (3, 3) rotates this frame's axes to the beacon's own east, north, up; None where they are the same.
+    Attributes
+    ----------
+    beacon : (2,) or (3,)
+        Beacon position, m.
+    value : float
+        Azimuth, rad, clockwise from the beacon's north.
+    sigma : float
+        Its error, rad.
+    axes : (3, 3), optional
+        Rotation from this frame's axes to the beacon's own east, north, up; None where they are the same.
     """
 
     beacon: npt.ArrayLike
@@ -57,7 +75,17 @@ class Azimuth:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Range:
-    """Slant range of the aircraft from `beacon` (2,) or (3,) m: `value` and `sigma` m."""
+    """Slant range of the aircraft from a beacon.
+
+    Attributes
+    ----------
+    beacon : (2,) or (3,)
+        Beacon position, m.
+    value : float
+        Range, m.
+    sigma : float
+        Its error, m.
+    """
 
     beacon: npt.ArrayLike
     value: float
@@ -66,7 +94,15 @@ class Range:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Height:
-    """Height, the z of this frame: `value` and `sigma` m."""
+    """Height, the z of this frame.
+
+    Attributes
+    ----------
+    value : float
+        Height, m.
+    sigma : float
+        Its error, m.
+    """
 
     value: float
     sigma: float
@@ -75,8 +111,8 @@ class Height:
 Observation = Position | Azimuth | Range | Height
 
 
-class _Bearing:
-    """An azimuth ready for use: its whitened residual and gradient at a point."""
+class _AzimuthEquation:
+    """Azimuth prepared for evaluation: whitened residual and gradient at a point."""
 
     __slots__ = ("A", "axes", "beacon", "sigma")
 
@@ -86,7 +122,7 @@ class _Bearing:
         self.beacon, self.A, self.sigma, self.axes = beacon, A, sigma, axes
 
     def local(self, p: Point) -> Point:
-        """East, north, up of point p as the beacon sees it."""
+        """Resolve point p in the beacon's east, north, up."""
         x0, y0, z0 = self.beacon
         x, y, z = p[0] - x0, p[1] - y0, p[2] - z0
         if self.axes is None:
@@ -106,7 +142,7 @@ class _Bearing:
         x, y, _ = self.local(p)
         residual = math.remainder(self.A - math.atan2(x, y), math.tau) / self.sigma
         d2 = (x * x + y * y) * self.sigma
-        if d2 == 0.0:  # exactly above the beacon every azimuth is as good as any other
+        if d2 == 0.0:  # exactly above the beacon the gradient is undefined: none
             return (residual, 0.0, 0.0, 0.0)
         de, dn = y / d2, -x / d2
         if self.axes is None:
@@ -120,8 +156,8 @@ class _Bearing:
         )
 
 
-class _Slant:
-    """A range ready for use: its whitened residual and gradient at a point."""
+class _RangeEquation:
+    """Range prepared for evaluation: whitened residual and gradient at a point."""
 
     __slots__ = ("D", "beacon", "sigma")
 
@@ -132,17 +168,27 @@ class _Slant:
         x0, y0, z0 = self.beacon
         x, y, z = p[0] - x0, p[1] - y0, p[2] - z0
         d = math.sqrt(x * x + y * y + z * z)
-        if d == 0.0:  # at the beacon any way out is as good as any other: north
+        if d == 0.0:  # at the beacon the gradient is undefined: north
             return (self.D / self.sigma, 0.0, 1.0 / self.sigma, 0.0)
         s = d * self.sigma
         return ((self.D - d) / self.sigma, x / s, y / s, z / s)
 
 
-Sight = _Bearing | _Slant
+BeaconEquation = _AzimuthEquation | _RangeEquation
 
 
 class Linearised:
-    """The whitened equations at one point and their cost, the sum of squared residuals."""
+    """Whitened equations at one point.
+
+    Attributes
+    ----------
+    rows : list
+        Residual and gradient of each equation.
+    n : int
+        Number of unknowns.
+    cost : float
+        Sum of squared residuals.
+    """
 
     __slots__ = ("cost", "n", "rows")
 
@@ -151,102 +197,192 @@ class Linearised:
         self.cost = sum([row[0] * row[0] for row in rows])
 
     @property
-    def r(self) -> Array:
-        """Residuals (m,)."""
+    def r(self) -> Floats:
+        """Return the residuals (m,)."""
         return np.array([row[0] for row in self.rows])
 
     @property
-    def J(self) -> Array:
-        """Jacobian (m, n) of the computed values."""
+    def J(self) -> Floats:
+        """Return the Jacobian (m, n) of the computed values."""
         return np.array([row[1 : 1 + self.n] for row in self.rows])
 
 
 class Model:
-    """Observations as whitened equations in `n` (2 or 3) unknowns; ValueError names a bad observation.
+    """Observations as whitened equations in 2 or 3 unknowns.
 
-    Linear observations (positions, heights) are rows of W x = w for good; azimuths and ranges (`sights`) are
-    linearised anew at each point.
+    Linear observations (positions, heights) are rows of W x = w, computed once; azimuths and ranges
+    (`beacon_equations`) are linearised at each point.
+
+    Parameters
+    ----------
+    observations : sequence of Observation
+        At least one.
+    start : int
+        Number of coordinates of the start.
+
+    Attributes
+    ----------
+    n : int
+        Number of unknowns.
+    beacon_equations : list
+        Equation of each azimuth and range, None for other observations.
+    in_cone : frozenset of int
+        Azimuths left out, in the cone of silence of their beacon.
+
+    Raises
+    ------
+    ValueError
+        Names a bad observation.
     """
 
-    __slots__ = ("_linear", "n", "observations", "sights", "silent")
+    __slots__ = ("_linear", "beacon_equations", "in_cone", "n", "observations")
 
     def __init__(self, observations: Sequence[Observation], start: int = 2) -> None:
-        """`start`: of how many coordinates the first place to look at is."""
         if not observations:
             raise ValueError("no observations: give at least a Position, or an Azimuth and a Range")
         self.observations = observations
         where = [_where(i, z) for i, z in enumerate(observations)]
         self.n = max(start, max([3 if place is None else len(place) for place in where]))
-        self.sights: list[Sight | None] = []
-        self.silent: frozenset[int] = frozenset()
-        self._linear: list[tuple[int, Row]] = []  # of which observation, and w where the residual will stand
+        self.beacon_equations: list[BeaconEquation | None] = []
+        self.in_cone: frozenset[int] = frozenset()
+        self._linear: list[tuple[int, Row]] = []  # index of the observation; w in place of the residual
         for i, (z, place) in enumerate(zip(observations, where, strict=True)):
-            sight: Sight | None = None
+            equation: BeaconEquation | None = None
             if isinstance(z, Height):
                 _check(i, z)
                 self._linear.append((i, (z.value / z.sigma, 0.0, 0.0, 1.0 / z.sigma)))
             elif isinstance(z, Position):
                 self._linear += [(i, row) for row in _whitened(i, z, place or ())]
             else:
-                sight = _sight(i, z, place or (), self.n)
-            self.sights.append(sight)
+                equation = _beacon_equation(i, z, place or (), self.n)
+            self.beacon_equations.append(equation)
 
     @property
     def linear(self) -> Linearised:
-        """The positions and heights alone, at the origin."""
+        """Return the positions and heights alone, linearised at the origin."""
         return Linearised([row for _, row in self._linear], self.n)
 
-    def point(self, x: Array) -> Point:
-        """Position x (n,) as three numbers, z = 0 in the plane."""
+    def point(self, x: Floats) -> Point:
+        """Convert a position to plain numbers.
+
+        Parameters
+        ----------
+        x : (n,)
+            Position, m.
+
+        Returns
+        -------
+        Point
+            Three numbers, z = 0 in the plane.
+        """
         p = x.tolist()
         return (p[0], p[1], p[2] if self.n == 3 else 0.0)
 
-    def place(self, p: Point) -> Array:
-        """Point p as a position (n,)."""
+    def place(self, p: Point) -> Floats:
+        """Convert a point to an array.
+
+        Parameters
+        ----------
+        p : Point
+            Three numbers, m.
+
+        Returns
+        -------
+        (n,)
+            Position, m.
+        """
         return np.array(p[: self.n])
 
     def at(self, p: Point) -> Linearised:
-        """The whitened equations at point p, positions and heights first."""
+        """Linearise the equations.
+
+        Parameters
+        ----------
+        p : Point
+            Where, m.
+
+        Returns
+        -------
+        Linearised
+            Whitened equations, positions and heights first.
+        """
         x, y, z = p
         rows = [(w - a * x - b * y - c * z, a, b, c) for _, (w, a, b, c) in self._linear]
-        rows += [s.row(p) for i, s in enumerate(self.sights) if s is not None and i not in self.silent]
+        rows += [
+            s.row(p) for i, s in enumerate(self.beacon_equations) if s is not None and i not in self.in_cone
+        ]
         return Linearised(rows, self.n)
 
-    def above(self, p: Point, elevation: float) -> frozenset[int]:
-        """Indices of the azimuths whose beacon sees point p higher than `elevation` rad."""
+    def azimuths_above(self, p: Point, elevation: float) -> frozenset[int]:
+        """Find the azimuths whose beacon sees a point above an elevation.
+
+        Parameters
+        ----------
+        p : Point
+            Position of the aircraft, m.
+        elevation : float
+            Limit, rad.
+
+        Returns
+        -------
+        frozenset of int
+            Indices of the observations.
+        """
         return frozenset(
-            i for i, s in enumerate(self.sights) if isinstance(s, _Bearing) and s.elevation(p) > elevation
+            i
+            for i, s in enumerate(self.beacon_equations)
+            if isinstance(s, _AzimuthEquation) and s.elevation(p) > elevation
         )
 
-    def without(self, silent: frozenset[int]) -> "Model":
-        """The same model with those azimuths left out."""
+    def without(self, in_cone: frozenset[int]) -> "Model":
+        """Leave out azimuths.
+
+        Parameters
+        ----------
+        in_cone : frozenset of int
+            Indices of the observations.
+
+        Returns
+        -------
+        Model
+            A copy without them.
+        """
         other = copy.copy(self)
-        other.silent = self.silent | silent
+        other.in_cone = self.in_cone | in_cone
         return other
 
-    def residuals(self, p: Point) -> tuple[tuple[Array, ...], tuple[float, ...]]:
-        """Per observation at point p: observed minus computed in its own unit, and its share of the cost.
+    def residuals(self, p: Point) -> tuple[tuple[Floats, ...], tuple[float, ...]]:
+        """Compute the residual of each observation and its share of the cost.
 
-        A silent azimuth has an empty residual and no share.
+        Parameters
+        ----------
+        p : Point
+            Position of the aircraft, m.
+
+        Returns
+        -------
+        tuple
+            Residuals, observed minus computed in the observation's unit, and shares of the cost. An azimuth
+            left out has an empty residual and share 0.
         """
         residuals = [np.zeros(0)] * len(self.observations)
         shares = [0.0] * len(self.observations)
         for i, (w, a, b, c) in self._linear:
             shares[i] += (w - a * p[0] - b * p[1] - c * p[2]) ** 2
-        for i, (o, sight) in enumerate(zip(self.observations, self.sights, strict=True)):
+        for i, (o, equation) in enumerate(zip(self.observations, self.beacon_equations, strict=True)):
             if isinstance(o, Position):
                 value = np.asarray(o.value, dtype=float)
                 residuals[i] = value - p[: len(value)]
             elif isinstance(o, Height):
                 residuals[i] = np.array([o.value - p[2]])
-            elif i not in self.silent and sight is not None:
-                r = sight.row(p)[0]
-                residuals[i], shares[i] = np.array([r * sight.sigma]), r * r
+            elif i not in self.in_cone and equation is not None:
+                r = equation.row(p)[0]
+                residuals[i], shares[i] = np.array([r * equation.sigma]), r * r
         return tuple(residuals), tuple(shares)
 
 
 def _where(i: int, z: Observation) -> tuple[float, ...] | None:
-    """Coordinates of the position or of the beacon; None of a height."""
+    """Return the coordinates of the position or of the beacon; None for a height."""
     if isinstance(z, Height):
         return None
     if isinstance(z, Position):
@@ -257,7 +393,7 @@ def _where(i: int, z: Observation) -> tuple[float, ...] | None:
 
 
 def _vector(x: npt.ArrayLike) -> tuple[float, ...]:
-    """Plain numbers as they are, anything else made to them; what is no vector has no coordinates."""
+    """Convert to plain numbers; empty if it is not a vector."""
     if isinstance(x, tuple):
         return x
     array = np.asarray(x, dtype=float)
@@ -265,7 +401,7 @@ def _vector(x: npt.ArrayLike) -> tuple[float, ...]:
 
 
 def _matrix(x: npt.ArrayLike) -> tuple[tuple[float, ...], ...]:
-    """The same of a matrix, row by row."""
+    """Convert to rows of plain numbers; empty if it is not a matrix."""
     if isinstance(x, tuple):
         return x
     array = np.asarray(x, dtype=float)
@@ -284,7 +420,7 @@ def _check(i: int, z: Azimuth | Range | Height) -> None:
 
 
 def _whitened(i: int, z: Position, x: tuple[float, ...]) -> list[Row]:
-    """The rows of W x = W value, W^T W = covariance^-1."""
+    """Compute the rows of W x = W value, W^T W = covariance^-1."""
     n, C = len(x), _matrix(z.covariance)
     if n not in (2, 3) or [len(row) for row in C] != [n] * n:
         raise ValueError(
@@ -309,9 +445,7 @@ def _whitened(i: int, z: Position, x: tuple[float, ...]) -> list[Row]:
 
 
 def _whitener(C: tuple[tuple[float, ...], ...]) -> list[tuple[float, ...]] | None:
-    """W with W C W^T = I, the unit vectors made orthonormal under C one after the other; None if it cannot be
-    done.
-    """
+    """Compute W with W C W^T = I by orthonormalising the unit vectors under C; None if C is not definite."""
     xx, xy, yy = C[0][0], C[0][1], C[1][1]
     if not xx > 0.0:
         return None
@@ -333,7 +467,7 @@ def _whitener(C: tuple[tuple[float, ...], ...]) -> list[tuple[float, ...]] | Non
     return [(u, 0.0, 0.0), (-v * yx, v, 0.0), (-w * zx, -w * zy, w)]
 
 
-def _sight(i: int, z: Azimuth | Range, beacon: tuple[float, ...], n: int) -> Sight:
+def _beacon_equation(i: int, z: Azimuth | Range, beacon: tuple[float, ...], n: int) -> BeaconEquation:
     _check(i, z)
     if len(beacon) != n or n > 3:
         raise ValueError(
@@ -346,20 +480,20 @@ def _sight(i: int, z: Azimuth | Range, beacon: tuple[float, ...], n: int) -> Sig
     if isinstance(z, Range):
         if z.value < 0.0:
             raise ValueError(f"{_name(i, z)}: value is {z.value} m; a range is not negative")
-        return _Slant(place, z.value, z.sigma)
+        return _RangeEquation(place, z.value, z.sigma)
     if z.axes is None:
-        return _Bearing(place, z.value, z.sigma, None)
+        return _AzimuthEquation(place, z.value, z.sigma, None)
     C = _matrix(z.axes)
     if n != 3 or [len(row) for row in C] != [3] * 3 or not _orthonormal(*C):
         raise ValueError(
             f"{_name(i, z)}: axes must be a (3, 3) rotation, and the problem of three dimensions"
         )
     (xe, ye, ze), (xn, yn, zn), (xu, yu, zu) = C
-    return _Bearing(place, z.value, z.sigma, ((xe, ye, ze), (xn, yn, zn), (xu, yu, zu)))
+    return _AzimuthEquation(place, z.value, z.sigma, ((xe, ye, ze), (xn, yn, zn), (xu, yu, zu)))
 
 
 def _orthonormal(e: tuple[float, ...], n: tuple[float, ...], u: tuple[float, ...]) -> bool:
-    """Whether the rows are unit vectors at right angles; NaN are not."""
+    """Return whether the rows are unit vectors at right angles; False for NaN."""
     return (
         abs(e[0] * e[0] + e[1] * e[1] + e[2] * e[2] - 1.0) <= 1e-6
         and abs(n[0] * n[0] + n[1] * n[1] + n[2] * n[2] - 1.0) <= 1e-6

@@ -1,11 +1,12 @@
-"""A function of which nothing is known, from noisy samples: a sum of basis functions, and how many of them.
+"""Approximation of an unknown function by basis functions, and the choice of their number.
 
     z_i = x(t_i) + N(0, sigma_i^2),   x(t) = sum_j a_j psi_j(t)                         (6.5.1), (6.5.5)
 
 After Brandin et al., section 6.5. The psi_j are a power, Legendre or trigonometric family made orthonormal
 with the weight p(t) = 1 / sigma(t)^2 on the span of the samples (6.5.6); a_r = C_r^-1 Psi_r' P z is least
-squares with the first r of them (6.5.8). More terms fit better and are known worse; the best r minimises the
-weighted integral of the squared error (6.5.7). The source breaks off before its estimate, completed here:
+squares with the first r of them (6.5.8). More terms fit better and have larger variances; the best r
+minimises the weighted integral of the squared error (6.5.7). The source breaks off before its estimate,
+completed here:
 
     Jhat(r) = |beta - E_r a_r|^2 - tr C^-1 + 2 tr C_r^-1
 
@@ -13,8 +14,8 @@ beta being a_r for r = r_max, C = Psi' P Psi with C_r its leading block, and E_r
 unbiased if x lies in the span of r_max functions. DEPARTS FROM the short form that takes C for I/dt, which
 leaves out the trace and the coupling of the terms: it chooses order 9 for a cubic, instead of 4.
 
-What lies outside the span of all r_max functions Jhat cannot see, the residuals can: RSS / (N - r_max) is
-about 1 where the span is wide enough, and `spans` says whether it is. The noise is taken for independent.
+Jhat does not include what lies outside the span of all r_max functions, the residuals do: RSS / (N - r_max)
+is about 1 where the span is wide enough; `Order.spans` tests it. The noise is assumed independent.
 """
 
 from __future__ import annotations
@@ -23,74 +24,155 @@ from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import chdtri
 
-Array = npt.NDArray[np.float64]
+from companion.estimate.kalman import nis_gate
+from companion.units import Floats
+
 Family = Literal["power", "legendre", "sine", "fourier"]
 FAMILIES: tuple[str, ...] = get_args(Family)
 
-FALSE_ALARM = 1e-3  # chance that `spans` is False though the span is wide enough
-_GAUSS = np.polynomial.legendre.leggauss(8)  # per interval between samples
+FALSE_ALARM = 1e-3  # probability that `spans` is False although the span is wide enough
+_GAUSS = np.polynomial.legendre.leggauss(8)  # nodes for each interval between samples
 
 
 class Curve(NamedTuple):
-    """Values of the fitted function and their standard deviations, the noise's part of the error alone."""
+    """Fitted function at given times.
 
-    x: Array
-    sigma: Array
+    Attributes
+    ----------
+    x : (N,)
+        Values.
+    sigma : (N,)
+        Standard deviations due to the noise alone.
+    """
+
+    x: Floats
+    sigma: Floats
 
 
 class Basis(NamedTuple):
-    """Functions psi_j (6.5.6): a family on [start, start + span], times `mix` (r, r), upper triangular.
+    """Orthonormal functions psi_j (6.5.6): a family on [start, start + span], times `mix`.
 
     On u = (t - start) / span: power (2u - 1)^m and Legendre P_m(2u - 1), m = 0, 1, ..; sine sin(pi m u) as
-    the source prints it, less its m = 0, which is zero (it vanishes at both ends); fourier 1, sin 2 pi u,
+    the source prints it, without its m = 0, which is zero (it vanishes at both ends); fourier 1, sin 2 pi u,
     cos 2 pi u, sin 4 pi u, ..
+
+    Attributes
+    ----------
+    family : str
+        One of `FAMILIES`.
+    start, span : float
+        Interval, s.
+    mix : (r, r)
+        Upper triangular matrix from the family to the orthonormal functions.
     """
 
     family: Family
     start: float
     span: float
-    mix: Array
+    mix: Floats
 
-    def __call__(self, t: npt.ArrayLike) -> Array:
-        """Psi (N, r) at the times t (N,)."""
+    def __call__(self, t: npt.ArrayLike) -> Floats:
+        """Evaluate the functions.
+
+        Parameters
+        ----------
+        t : (N,)
+            Times, s.
+
+        Returns
+        -------
+        (N, r)
+            Psi.
+        """
         u = (np.atleast_1d(np.asarray(t, float)) - self.start) / self.span
         return _raw(self.family, u, len(self.mix)) @ self.mix
 
 
 class Order(NamedTuple):
-    """What `select_order` found.
+    """Result of `select_order`.
 
-    `order` r of the least `criterion` (r_max,); `coefficients` a_r (r,) in the orthonormal basis and their
-    `covariance` (r, r); `cp` (r_max,) Mallows' criterion, the discrete twin; `consistency` RSS/(N - r_max).
+    Attributes
+    ----------
+    order : int
+        r of the smallest criterion.
+    criterion : (r_max,)
+        Jhat(r).
+    coefficients : (r,)
+        a_r in the orthonormal basis.
+    covariance : (r, r)
+        Their covariance.
+    cp : (r_max,)
+        Mallows' criterion, the discrete equivalent.
+    consistency : float
+        RSS / (N - r_max).
+    degrees_of_freedom : int
+        N - r_max.
+    basis : Basis
+        The orthonormal functions.
     """
 
     order: int
-    criterion: Array
-    coefficients: Array
-    covariance: Array
-    cp: Array
+    criterion: Floats
+    coefficients: Floats
+    covariance: Floats
+    cp: Floats
     consistency: float
-    freedom: int
+    degrees_of_freedom: int
     basis: Basis
 
     @property
     def spans(self) -> bool:
-        """Whether r_max functions explain the samples to within their noise; if not, nothing here holds."""
-        return self.consistency * self.freedom <= float(chdtri(self.freedom, FALSE_ALARM))
+        """Return whether r_max functions explain the samples within the noise; otherwise discard it."""
+        return self.consistency * self.degrees_of_freedom <= nis_gate(self.degrees_of_freedom, FALSE_ALARM)
 
     def at(self, t: npt.ArrayLike) -> Curve:
-        """The function at the times t (N,), which should be among those of the samples."""
+        """Evaluate the function.
+
+        Parameters
+        ----------
+        t : (N,)
+            Times, s, within those of the samples.
+
+        Returns
+        -------
+        Curve
+            Values and standard deviations.
+        """
         Psi = self.basis(t)[:, : self.order]
         return Curve(Psi @ self.coefficients, np.sqrt(((Psi @ self.covariance) * Psi).sum(1)))
 
 
-def orthonormal(t: Array, sigma: Array, family: Family, r: int) -> Basis:
-    """The first r functions of the family, orthonormal with the weight 1/sigma(t)^2 from t[0] to t[-1].
+def orthonormal_basis(t: Floats, sigma: Floats, family: Family, r: int) -> Basis:
+    """Orthonormalise the first r functions of a family with the weight 1/sigma(t)^2 from t[0] to t[-1].
 
-    Between samples sigma runs straight. The integral is Gauss' in each interval, the rest a QR
-    decomposition, and R's diagonal is made positive: each function begins as its family's does.
+    Between samples sigma is linear. The integral is Gauss' in each interval, the rest a QR decomposition, and
+    R's diagonal is made positive: each function keeps the sign of its family's.
+
+    Parameters
+    ----------
+    t : (N,)
+        Times of the samples, s, increasing.
+    sigma : (N,)
+        Their errors.
+    family : {"power", "legendre", "sine", "fourier"}
+        Family of functions.
+    r : int
+        Number of functions.
+
+    Returns
+    -------
+    Basis
+        Orthonormal functions.
+
+    Raises
+    ------
+    ValueError
+        If the functions are nearly dependent.
+
+    References
+    ----------
+    Brandin et al. (6.5.6).
     """
     half = 0.5 * np.diff(t)[:, None]
     nodes = (0.5 * (t[1:] + t[:-1])[:, None] + half * _GAUSS[0]).ravel()
@@ -98,45 +180,79 @@ def orthonormal(t: Array, sigma: Array, family: Family, r: int) -> Basis:
     start, span = float(t[0]), float(t[-1] - t[0])
     R = np.linalg.qr(root[:, None] * _raw(family, (nodes - start) / span, r), mode="r")
     if np.linalg.cond(R) > 1e12:
-        raise ValueError(f"{r} functions of the {family} basis are as good as dependent: take fewer")
+        raise ValueError(f"{r} functions of the {family} basis are nearly dependent: take fewer")
     return Basis(family, start, span, np.linalg.inv(R * np.sign(np.diag(R))[:, None]))
 
 
 def select_order(
     t: npt.ArrayLike, z: npt.ArrayLike, sigma: npt.ArrayLike, basis: Family, r_max: int
 ) -> Order:
-    """The number of functions that estimates x(t) best, and the estimate.
+    """Choose the number of functions that estimates x(t) best, and estimate it.
 
-    t (N,) s rising, z (N,), sigma (N,) or one for all, in the unit of z. ValueError where the samples are not
-    fit for use, or too few or too unevenly spread to tell r_max functions apart.
+    Parameters
+    ----------
+    t : (N,)
+        Times, s, increasing.
+    z : (N,)
+        Samples.
+    sigma : (N,) or float
+        Their errors, in the unit of z.
+    basis : {"power", "legendre", "sine", "fourier"}
+        Family of functions.
+    r_max : int
+        Largest number of functions.
+
+    Returns
+    -------
+    Order
+        Order, estimate and criteria.
+
+    Raises
+    ------
+    ValueError
+        If the samples are not usable, or too few or too unevenly spread to distinguish r_max functions.
+
+    References
+    ----------
+    Brandin et al. (6.5.5)-(6.5.8).
     """
     t, z, sigma = _samples(t, z, sigma, basis, r_max)
-    functions = orthonormal(t, sigma, basis, r_max)
+    functions = orthonormal_basis(t, sigma, basis, r_max)
     Q, R = np.linalg.qr(functions(t) / sigma[:, None])  # C_r = R_r' R_r, never formed
     if np.linalg.cond(R) > 1e8:
-        raise ValueError(f"the samples do not tell {r_max} functions of the {basis} basis apart: take fewer")
+        raise ValueError(f"the samples do not distinguish {r_max} functions of the {basis} basis: take fewer")
     y = z / sigma
     b = Q.T @ y
-    inverse = np.linalg.inv(R)  # that of a leading block is the leading block of this
+    inverse = np.linalg.inv(R)  # inverse of a leading block is the leading block
     fits = np.triu(np.cumsum(inverse * b, axis=1))  # column r - 1 is a_r, padded with zeros
     beta = fits[:, -1]
     traces = np.cumsum((inverse**2).sum(0))  # tr C_r^-1, r = 1..r_max
     criterion = ((beta[:, None] - fits) ** 2).sum(0) - traces[-1] + 2.0 * traces
     residual = y - Q @ b
     rss, N, r = float(residual @ residual), len(z), int(criterion.argmin()) + 1
-    beyond = np.append(np.cumsum(b[:0:-1] ** 2)[::-1], 0.0)  # what the later functions explain
+    beyond = np.append(np.cumsum(b[:0:-1] ** 2)[::-1], 0.0)  # cost explained by the later functions
     cp = rss + beyond - N + 2.0 * np.arange(1, r_max + 1)
     V = inverse[:r, :r] @ inverse[:r, :r].T
     return Order(r, criterion, fits[:r, r - 1], V, cp, rss / (N - r_max), N - r_max, functions)
 
 
 class Track(NamedTuple):
-    """A smoothed track: x and sigma (N, k) at the times of the samples, the windows it took, and
-    RSS/(N - r_max) over them, which is about 1 if they were short enough.
+    """Smoothed track.
+
+    Attributes
+    ----------
+    x : (N, k)
+        Values at the times of the samples.
+    sigma : (N, k)
+        Upper bounds of their standard deviations.
+    windows : int
+        Number of windows side by side.
+    consistency : float
+        RSS / (N - r_max) over them, about 1 if they were short enough.
     """
 
-    x: Array
-    sigma: Array
+    x: Floats
+    sigma: Floats
     windows: int
     consistency: float
 
@@ -144,11 +260,34 @@ class Track(NamedTuple):
 def smooth_track(
     t: npt.ArrayLike, z: npt.ArrayLike, sigma: npt.ArrayLike, basis: Family = "legendre", r_max: int = 8
 ) -> Track:
-    """A track of which nothing is known: z (N, k), each component estimated on its own; sigma (N,) or one.
+    """Smooth a track of unknown shape, each component on its own.
 
     Its span is cut into 1, 2, 4, .. windows until r_max functions explain each to within the noise, or one
     would hold fewer than 2 r_max samples. Windows overlap by half and are blended by cos^2, so that the track
-    has no joints; its sigma is theirs blended alike, an upper bound.
+    has no joints; their sigmas are blended in the same way, an upper bound.
+
+    Parameters
+    ----------
+    t : (N,)
+        Times, s, increasing.
+    z : (N, k)
+        Samples.
+    sigma : (N,) or float
+        Their errors, in the unit of z.
+    basis : {"power", "legendre", "sine", "fourier"}
+        Family of functions.
+    r_max : int
+        Largest number of functions in a window.
+
+    Returns
+    -------
+    Track
+        Track with errors.
+
+    Raises
+    ------
+    ValueError
+        If the samples are not usable.
     """
     t, z = np.asarray(t, float), np.asarray(z, float)
     if z.ndim != 2 or len(z) != t.size:
@@ -163,18 +302,20 @@ def smooth_track(
             return found
 
 
-def _windows(t: Array, count: int) -> list[slice]:
-    """The samples of `count` windows side by side and of those that straddle two of them, in their order."""
+def _windows(t: Floats, count: int) -> list[slice]:
+    """List the samples of `count` windows side by side and of those that straddle two of them, in order."""
     edges = np.linspace(t[0], t[-1], 2 * count + 1)
     first = np.searchsorted(t, edges[:-2], side="left")
     last = np.searchsorted(t, edges[2:], side="right")
     return [slice(a, b) for a, b in zip(first, last, strict=True)]
 
 
-def _windowed(t: Array, z: Array, sigma: Array, basis: Family, r_max: int, count: int) -> tuple[Track, bool]:
+def _windowed(
+    t: Floats, z: Floats, sigma: Floats, basis: Family, r_max: int, count: int
+) -> tuple[Track, bool]:
     x, deviation = np.zeros_like(z), np.zeros_like(z)
     half = (t[-1] - t[0]) / (2 * count)
-    rss, freedom = 0.0, 0
+    rss, degrees_of_freedom = 0.0, 0
     windows = _windows(t, count)
     for j, inside in enumerate(windows):
         u = (t[inside] - t[0]) / half - j  # 0 .. 2, the middle at 1
@@ -188,21 +329,26 @@ def _windowed(t: Array, z: Array, sigma: Array, basis: Family, r_max: int, count
             curve = order.at(t[inside])
             x[inside, k] += weight * curve.x
             deviation[inside, k] += weight * curve.sigma
-            if j % 2 == 0:  # those side by side share no samples
-                rss, freedom = rss + order.consistency * order.freedom, freedom + order.freedom
-    return Track(x, deviation, count, rss / freedom), rss <= float(chdtri(freedom, FALSE_ALARM))
+            if j % 2 == 0:  # windows side by side share no samples
+                rss, degrees_of_freedom = (
+                    rss + order.consistency * order.degrees_of_freedom,
+                    degrees_of_freedom + order.degrees_of_freedom,
+                )
+    return Track(x, deviation, count, rss / degrees_of_freedom), rss <= nis_gate(
+        degrees_of_freedom, FALSE_ALARM
+    )
 
 
 class _Samples(NamedTuple):
-    t: Array
-    z: Array
-    sigma: Array
+    t: Floats
+    z: Floats
+    sigma: Floats
 
 
 def _samples(t: npt.ArrayLike, z: npt.ArrayLike, sigma: npt.ArrayLike, basis: str, r_max: int) -> _Samples:
     t, z = np.asarray(t, float), np.asarray(z, float)
     if basis not in FAMILIES:
-        raise ValueError(f"there is no basis {basis!r}: choose one of {', '.join(FAMILIES)}")
+        raise ValueError(f"unknown basis {basis!r}: choose one of {', '.join(FAMILIES)}")
     if t.ndim != 1 or z.shape != t.shape or np.shape(sigma) not in ((), t.shape):
         shapes = f"t {t.shape}, z {z.shape}, sigma {np.shape(sigma)}"
         raise ValueError(f"{shapes} do not fit: give N times, N values, and one sigma or N")
@@ -214,16 +360,16 @@ def _samples(t: npt.ArrayLike, z: npt.ArrayLike, sigma: npt.ArrayLike, basis: st
     if (sigma <= 0.0).any():
         raise ValueError(f"sigma is {sigma.min():g} somewhere: it must be positive")
     if (np.diff(t) < 0.0).any() or t[-1] <= t[0]:
-        raise ValueError("the times do not rise: sort the samples by time")
+        raise ValueError("the times are not increasing: sort the samples by time")
     return _Samples(t, z, sigma)
 
 
-def _raw(family: Family, u: Array, r: int) -> Array:
-    """The first r functions of the family (N, r) on u = 0 .. 1."""
+def _raw(family: Family, u: Floats, r: int) -> Floats:
+    """Evaluate the first r functions of the family (N, r) on u = 0 .. 1."""
     if family == "power":
         return np.vander(2.0 * u - 1.0, r, increasing=True)
     if family == "legendre":
-        values: Array = np.polynomial.legendre.legvander(2.0 * u - 1.0, r - 1).astype(float)
+        values: Floats = np.polynomial.legendre.legvander(2.0 * u - 1.0, r - 1).astype(float)
         return values
     if family == "sine":
         return np.sin(np.pi * np.outer(u, np.arange(1, r + 1)))

@@ -1,21 +1,20 @@
-"""The restrictive filter R1: some inputs are not random, only bounded.
+"""Restrictive filter R1: some inputs are not random but bounded.
 
     X(t+1) = A X(t) + B U(t) + W(t),   |U_i| <= C_i,   Z = H X + N                             (2.7)-(2.9)
 
-Maximum likelihood of X(0), W, N under the bounds gives a two-point problem with saturations; invariant
-imbedding with a linear approximation step by step turns it into a Kalman filter whose covariance is rebuilt
-by the data at every step (Poddubny, section 2). One step: find the best input within the bounds
+Maximum likelihood of X(0), W, N under the bounds gives a two-point problem with saturations. Invariant
+imbedding with a linear approximation at every step turns it into a Kalman filter whose covariance depends on
+the data (Poddubny, section 2). One step finds the best input within the bounds
 
     U* = argmin 1/2 |nu - D u|^2_{S^-1},   |u_i| <= C_i,   D = H B,
 
-then the inputs on a bound are known numbers, and those inside (f) unknown ones:
+and then treats the inputs on a bound as known numbers, those inside (f) as unknown:
 
     X+ = A X + B U* + K (nu - D U*),   P+ = P1 + (B_f - K D_f) (D_f' S^-1 D_f)^-1 (B_f - K D_f)'.
 
-The box is solved exactly: clipping the free solution component by component is wrong as soon as D' S^-1 D is
-not diagonal. For C -> 0 and C -> inf the filter is exact; between them P is conditional on the active sets
-and overconfident: never a guarantee. `moving_horizon` has windows longer than one step, `full_horizon` the
-exact solution by which both are judged.
+The box problem is solved exactly: clipping the free solution component by component is wrong as soon as D'
+S^-1 D is not diagonal. For C -> 0 and C -> inf the filter is exact. Between them P is conditional on the
+active sets and overconfident: it is not a guarantee. `full_horizon` has the exact solution for comparison.
 
 It does not know what U is. The bounds are those of one step: a finer step with the same C is another problem.
 """
@@ -25,46 +24,85 @@ from typing import NamedTuple
 import numpy as np
 
 from companion.estimate import bounded_lsq, kalman
-from companion.estimate.full_horizon import exact
-from companion.estimate.kalman import Array
-
-__all__ = ["Restricted", "exact", "step"]
+from companion.units import Floats
 
 
-class Restricted(NamedTuple):
-    """Mean (..., n), covariance, bounded inputs (..., m) and where they lie: -1 and +1 on a bound, 0 inside.
+class RestrictiveEstimate(NamedTuple):
+    """State after one step.
 
-    The innovation (..., p) is nu - D U*, what no input can explain, with the S and NIS of the known-input
-    filter.
+    Attributes
+    ----------
+    x : (..., n)
+        Mean.
+    P : (..., n, n)
+        Covariance, conditional on the active set.
+    u : (..., m)
+        Inputs of the step, in their own unit.
+    status : (..., m)
+        -1 or +1 on a bound, 0 inside.
+    innovation : (..., p)
+        nu - D U*, the part that no input can explain.
+    S : (..., p, p)
+        Innovation covariance of the filter with known inputs.
+    nis : (...,)
+        Normalised square of `innovation` by S.
     """
 
-    x: Array
-    P: Array
-    u: Array
+    x: Floats
+    P: Floats
+    u: Floats
     status: bounded_lsq.Status
-    innovation: Array
-    S: Array
-    nis: Array
+    innovation: Floats
+    S: Floats
+    nis: Floats
 
 
 def step(
-    x: Array,
-    P: Array,
-    z: Array,
-    A: Array,
-    B: Array,
-    Q: Array,
-    H: Array,
-    R: Array,
-    C: Array,
+    x: Floats,
+    P: Floats,
+    z: Floats,
+    A: Floats,
+    B: Floats,
+    Q: Floats,
+    H: Floats,
+    R: Floats,
+    C: Floats,
     kappa: float = np.inf,
-) -> Restricted:
-    """One step from X(t|t), P(t|t) and z(t+1) (..., p); B is (n, m), C (m,) the bounds; leading axes are
-    flights.
+) -> RestrictiveEstimate:
+    """Predict over one step with bounded inputs and update by its measurement.
 
-    `kappa` = inf knows nothing of U but its bounds, a finite one adds the prior N(0, kappa C^2). An input
-    that this one measurement does not show takes the prior with kappa = 1, the minimax filter's
-    (`box.information`).
+    An input that this measurement does not determine takes the prior kappa = 1, the minimax filter's (see
+    `bounded_lsq.prior_information`).
+
+    Parameters
+    ----------
+    x, P : (..., n), (..., n, n)
+        X(t|t) and P(t|t); leading axes are flights.
+    z : (..., p)
+        Measurement z(t+1).
+    A : (n, n)
+        Transition.
+    B : (n, m)
+        Influence of the inputs.
+    Q : (n, n)
+        Process noise covariance.
+    H : (p, n)
+        Measurement matrix.
+    R : (p, p)
+        Measurement noise covariance.
+    C : (m,)
+        Bounds of the inputs in one step.
+    kappa : float
+        Prior variance of an input over its squared bound; inf for bounds only.
+
+    Returns
+    -------
+    RestrictiveEstimate
+        X(t+1|t+1), P(t+1|t+1), and the inputs found.
+
+    References
+    ----------
+    Poddubny (2.7)-(2.9) and section 2.
     """
     Ax, Pb = kalman.predict(x, P, A, Q)
     S, S_inverse, K = kalman.gain(Pb, H, R)
@@ -73,12 +111,14 @@ def step(
     DC = H @ BC  # inputs in units of their bounds
     SD = S_inverse @ DC
     M = DC.T @ SD
-    best = bounded_lsq.minimum(M + bounded_lsq.information(M, kappa), (SD.mT @ nu[..., None])[..., 0])
+    best = bounded_lsq.minimize_quadratic(
+        M + bounded_lsq.prior_information(M, kappa), (SD.mT @ nu[..., None])[..., 0]
+    )
     left = nu - best.v @ DC.T
     W = BC - K @ DC
     rebuilt = kalman.joseph(Pb, K, H, R)
     rebuilt += W @ best.free_inverse @ W.mT
-    return Restricted(
+    return RestrictiveEstimate(
         x=Ax + best.v @ BC.T + (K @ left[..., None])[..., 0],
         P=rebuilt,
         u=best.v * C,

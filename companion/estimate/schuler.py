@@ -1,4 +1,4 @@
-"""The Schuler channel: how one horizontal INS error moves, and what its four numbers are in SI units.
+"""Schuler channel: the dynamics of one horizontal INS error, and its scale in SI units.
 
 Matasov, Martirosyan (2.1), in dimensionless time tau = omega0 t, omega0 = sqrt(g / R):
 
@@ -10,7 +10,7 @@ Matasov, Martirosyan (2.1), in dimensionless time tau = omega0 t, omega0 = sqrt(
     vartheta   constant gyro drift / omega0                  [rad/s]
 
 One channel is one horizontal axis, north or east, along or across the great circle: (2.1) is the same.
-Errors are INS minus truth. What phi and vartheta are in NED, with (P_N, P_E) MINUS the rotation of the
+Errors are INS minus truth. Meaning of phi and vartheta in NED, with (P_N, P_E) MINUS the rotation of the
 platform about north and east, (E_N, E_E) minus its physical drift and (A_N, A_E) the accelerometer errors:
 
     north   dV_N' = -g P_E + A_N,   P_E' =  dV_N / R + E_E    so   phi =  P_E - A_N / g,   drift = -E_E
@@ -19,7 +19,7 @@ platform about north and east, (E_N, E_E) minus its physical drift and (A_N, A_E
 Another axis at azimuth psi (along the course, say) mixes them like any horizontal vector: cos psi of north
 plus sin psi of east for all four numbers.
 
-It does not know the Earth's rotation, the coupling of the two axes nor the heading error: over an hour or
+It does not know the Earth's rotation, the coupling of the two axes or the heading error: over an hour or
 two in level flight that is an error of a few per cent; `nav.error_model` has the whole matrix.
 """
 
@@ -29,10 +29,11 @@ from typing import Literal, NamedTuple, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-Floats = npt.NDArray[np.float64]
+from companion.units import Floats
+
 Number = TypeVar("Number", float, Floats)
 
-EARTH_RADIUS = 6_371_000.0  # [m] the sphere of (2.1)
+EARTH_RADIUS = 6_371_000.0  # [m] sphere of (2.1)
 SCHULER_RATE = 1.2387e-3  # [rad/s] sqrt(g / R); 84.5 min; g = 9.81 m/s^2 would give 1.2409e-3
 ARCSECOND = math.pi / 648_000  # [rad]
 DEG_PER_HOUR = math.pi / 648_000  # [rad/s]; the same number: 3600 s, 3600 arcseconds
@@ -41,14 +42,22 @@ STATE = ("gamma", "phi", "mu", "vartheta")
 
 
 class Scale(NamedTuple):
-    """What one unit of dimensionless time and state is in SI: the only place where it meets metres."""
+    """Conversion between dimensionless time and state and SI; the only place where they meet.
+
+    Attributes
+    ----------
+    radius : float
+        Earth radius, m.
+    rate : float
+        Schuler rate omega0, rad/s.
+    """
 
     radius: float = EARTH_RADIUS
     rate: float = SCHULER_RATE
 
     @property
     def units(self) -> tuple[float, float, float, float]:
-        """Multipliers of gamma, phi, mu, vartheta to m, rad, m/s, rad/s."""
+        """Return the multipliers of gamma, phi, mu, vartheta to m, rad, m/s, rad/s."""
         return (self.radius, 1.0, self.radius * self.rate, self.rate)
 
 
@@ -56,12 +65,34 @@ MEAN_EARTH = Scale()
 
 
 def sine_excess(x: Floats) -> Floats:
-    """Return u(x) = x - sin x to full relative precision, where the difference itself cancels near zero."""
+    """Compute x - sin x to full relative precision; the difference itself cancels near zero.
+
+    Parameters
+    ----------
+    x : array
+        Angle, rad.
+
+    Returns
+    -------
+    array
+        x - sin x, of the same shape.
+    """
     return np.where(np.abs(x) < 0.5, x * x * x * _excess_series(x * x), x - np.sin(x))
 
 
-def sine_excess_at(x: float) -> float:
-    """Return `sine_excess` of one number, fifty times faster."""
+def sine_excess_scalar(x: float) -> float:
+    """Compute `sine_excess` of one number, fifty times faster.
+
+    Parameters
+    ----------
+    x : float
+        Angle, rad.
+
+    Returns
+    -------
+    float
+        x - sin x.
+    """
     return x * x * x * _excess_series(x * x) if abs(x) < 0.5 else x - math.sin(x)
 
 
@@ -74,10 +105,30 @@ def _excess_series(square: Number) -> Number:
 
 
 def schuler_row(quantity: Literal["gamma", "mu"], s: npt.ArrayLike) -> Floats:
-    """Return H with H . state = the quantity, measured a dimensionless time s before that state.
+    """Build the measurement row of a fix: H with H . state = the quantity a time s before that state.
 
-    s scalar gives (4,), s (n,) gives (n, 4); s may be negative (measured after). Equation (2.1) solved
-    backwards.
+    Equation (2.1) solved backwards.
+
+    Parameters
+    ----------
+    quantity : {"gamma", "mu"}
+        Measured quantity: position or velocity.
+    s : float or (n,)
+        Dimensionless time (rad of Schuler phase) from the fix to the state; negative for a fix after it.
+
+    Returns
+    -------
+    (4,) or (n, 4)
+        Rows on gamma, phi, mu, vartheta.
+
+    Raises
+    ------
+    ValueError
+        For another quantity.
+
+    References
+    ----------
+    Matasov, Martirosyan (2.1).
     """
     s = np.asarray(s, dtype=np.float64)
     row = np.empty((*s.shape, 4))
@@ -98,11 +149,22 @@ def schuler_row(quantity: Literal["gamma", "mu"], s: npt.ArrayLike) -> Floats:
 
 
 def transition(alpha: float) -> Floats:
-    """Return the (4, 4) matrix that takes the state a dimensionless time alpha ahead: (2.1) forwards."""
+    """Build the transition matrix over a dimensionless time: (2.1) solved forwards.
+
+    Parameters
+    ----------
+    alpha : float
+        Dimensionless time ahead, rad of Schuler phase.
+
+    Returns
+    -------
+    (4, 4)
+        Transition of gamma, phi, mu, vartheta.
+    """
     sin, cos, versine = math.sin(alpha), math.cos(alpha), 2.0 * math.sin(0.5 * alpha) ** 2
     return np.array(
         [
-            [1.0, -versine, sin, sine_excess_at(alpha)],
+            [1.0, -versine, sin, sine_excess_scalar(alpha)],
             [0.0, cos, sin, -sin],
             [0.0, -sin, cos, versine],
             [0.0, 0.0, 0.0, 1.0],

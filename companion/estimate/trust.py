@@ -1,6 +1,6 @@
-"""How far a position can be trusted, as a state with hysteresis: worse at once, better only after a while.
+"""Trust in the position as a state with hysteresis: worse immediately, better only after a settling time.
 
-A pure fold over evidence. It knows no sources by name and no estimator.
+A pure fold over evidence. It does not know sources by name or any estimator.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from companion.records import Trust
 
 
 class Evidence(NamedTuple):
-    """What is known at one instant; lengths in m, None where there is none."""
+    """Evidence at one instant; lengths in m, None where there is none."""
 
     fixes: bool  # a trusted radio fix not older than its timeout
     suspicion: bool  # a source excluded, or a separation beyond its limit that names none clearly
@@ -20,7 +20,7 @@ class Evidence(NamedTuple):
 
 
 class Limits(NamedTuple):
-    """Alert limits (m), the share of them below which a state is left for a better one, and for how long."""
+    """Alert limits (m), the share of them required for a better state, and the settling time (s)."""
 
     protection: float = 500.0
     bound: float = 5000.0
@@ -29,7 +29,7 @@ class Limits(NamedTuple):
 
 
 class Held(NamedTuple):
-    """The state, since when, and since when the evidence has been for a better one."""
+    """Trust state, its start, and the start of uninterrupted evidence for a better one."""
 
     trust: Trust
     since_ns: int
@@ -37,7 +37,7 @@ class Held(NamedTuple):
 
 
 def judge(evidence: Evidence, limits: Limits, share: float = 1.0) -> Trust:
-    """What the evidence of one instant alone says, both limits multiplied by `share`."""
+    """Judge the evidence of one instant alone, with both limits multiplied by `share`."""
     if evidence.fixes:
         safe = evidence.protection is not None and evidence.protection <= share * limits.protection
         return Trust.NORMAL if safe and not evidence.suspicion else Trust.DEGRADED
@@ -47,8 +47,8 @@ def judge(evidence: Evidence, limits: Limits, share: float = 1.0) -> Trust:
 
 
 def turn(held: Held, t_ns: int, evidence: Evidence, limits: Limits) -> Held:
-    """The state at `t_ns`: a worse one at once; a better one after `settle_s` without a break of evidence
-    that clears the limits by their share.
+    """Update the state to `t_ns`: a worse one immediately; a better one after `settle_s` of uninterrupted
+    evidence within the limits times their share.
     """
     now = judge(evidence, limits)
     if now > held.trust:

@@ -1,13 +1,13 @@
-"""ArduPilot's onboard log (DataFlash, `.bin` binary or `.log` text) -> records.
+"""ArduPilot onboard logs (DataFlash, `.bin` binary or `.log` text) -> records.
 
     log = dataflash.read(path)
     for record in log: ...              # in the order of the file
 
-pymavlink's DFReader splits the file into messages; `Messages` turns a message into records and knows nothing
-of files, so it serves whatever holds the same messages. The log was written on board: arrival and validity
-are the same instant, UNIX time where the log holds a GPS time, else time since boot. Of the filter's lanes
-only the primary one is told, EKF3 (XKF) before EKF2 (NKF). Names and units: the @LoggerMessage comments in
-ArduPilot's sources.
+pymavlink's DFReader splits the file into messages; `MessageConverter` turns messages into records and does no
+I/O, so that other formats with the same messages can use it. Arrival and validity are the same instant, as
+the log is written on board: UNIX time if the log has a GPS time, else time since boot. Only the primary lane
+of the filter is converted, EKF3 (XKF) before EKF2 (NKF). Names and units are those of the @LoggerMessage
+comments in ArduPilot's sources.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from companion.link.decode import UERE
+from companion.link.dialect import mavlink
 from companion.nav.geometry import Geodetic, separation
 from companion.records import (
     AirData,
@@ -33,6 +34,7 @@ from companion.records import (
     LocalPosition,
     Pressure,
     Reboot,
+    Severity,
     Stamped,
     Truth,
     Vector3,
@@ -40,19 +42,20 @@ from companion.records import (
 )
 from companion.storage.reader import LogError
 
-Message: TypeAlias = Any  # attributes named as the log's columns
+Message: TypeAlias = Any  # its attributes are the columns of the log
 
 _ZERO_CELSIUS = 273.15
-_WARNING, _INFO = 4, 6  # MAV_SEVERITY
 _EKF_ORIGIN = 0  # LogOriginType
 _STATUS, _GLITCHING = 0x3FF, 1 << 14  # nav_filter_status; its first ten bits are EKF_STATUS_FLAGS
-_EKF_GPS_GLITCHING = 32768  # of EKF_STATUS_FLAGS
 _WEEK_US = 604_800_000_000
-_BACK_US = 1_000_000  # a boot time that went back farther began anew
+_BACK_US = 1_000_000  # a larger decrease of the boot time is a reboot
 
 
-class Messages:
-    """The records of one log's messages, given one by one; keeps what a record needs of earlier ones."""
+class MessageConverter:
+    """Converts the messages of one log to records, one by one.
+
+    Keeps the earlier values that a record needs.
+    """
 
     def __init__(self) -> None:
         self._lane = 0
@@ -64,17 +67,22 @@ class Messages:
         self._true: Truth | None = None
 
     def records(self, name: str, message: Message, t_ns: int) -> Iterator[Stamped]:
-        """The records in a message called `name`; AttributeError if it lacks a column it always had."""
+        """Yield the records of a message of type `name`.
+
+        Raises AttributeError if a required column is missing.
+        """
         make = _TABLE.get(name)
         if make is not None:
             yield from make(self, name, message, t_ns)
 
     def _gps(self, name: str, m: Message, t: int) -> Iterator[Stamped]:
-        """GPA, the receiver's accuracy, follows its GPS: told is that of the fix before."""
+        """Convert a fix; its accuracy is that of the fix before, because GPA is logged after GPS."""
         receiver = getattr(m, "I", 0 if name == "GPS" else 1)
         lat, lon = math.radians(m.Lat), math.radians(m.Lng)
         fix = int(m.Status)
-        if not (abs(m.Lat) <= 90.0 and abs(m.Lng) <= 180.0) or (fix >= 2 and m.Lat == m.Lng == 0.0):
+        if not (abs(m.Lat) <= 90.0 and abs(m.Lng) <= 180.0) or (
+            fix >= mavlink.GPS_FIX_TYPE_2D_FIX and m.Lat == m.Lng == 0.0
+        ):
             return
         week, ms = getattr(m, "GWk", getattr(m, "Week", 0)), getattr(m, "GMS", getattr(m, "TimeMS", 0))
         course = math.radians(m.GCrs)
@@ -94,7 +102,7 @@ class Messages:
             alt_msl=m.Alt,
             sigma_horizontal=horizontal,
             sigma_vertical=vertical,
-            v_n=moving if fix >= 3 else None,
+            v_n=moving if fix >= mavlink.GPS_FIX_TYPE_3D_FIX else None,
             sigma_velocity=speed,
             satellites=int(m.NSats),
             hdop=hdop,
@@ -113,27 +121,27 @@ class Messages:
         heading = math.radians(m.Yaw) % math.tau
         yield Attitude(t, t, math.radians(m.Roll), math.radians(m.Pitch), heading)
 
-    def _chosen(self, name: str, m: Message) -> bool:
-        """Whether a filter's message is the primary lane's of the filter told."""
+    def _is_primary_lane(self, name: str, m: Message) -> bool:
+        """Return whether the message is of the primary lane of the filter in use."""
         if name.startswith("X"):
             self._filter = "XKF1"
         return name[0] == self._filter[0] and getattr(m, "C", 0) == self._lane
 
     def _local(self, name: str, m: Message, t: int) -> Iterator[Stamped]:
-        if self._chosen(name, m):
+        if self._is_primary_lane(name, m):
             self._v_n = m.VN, m.VE, m.VD
             yield LocalPosition(t, t, (m.PN, m.PE, m.PD), self._v_n)
 
     def _wind(self, name: str, m: Message, t: int) -> Iterator[Stamped]:
-        if self._chosen(name, m):
+        if self._is_primary_lane(name, m):
             yield Wind(t, t, (m.VWN, m.VWE, 0.0))
 
     def _status(self, name: str, m: Message, t: int) -> Iterator[Stamped]:
         if (primary := getattr(m, "PI", -1)) >= 0 and name[0] in ("X", self._filter[0]):
             self._lane = primary
-        if self._chosen(name, m):
+        if self._is_primary_lane(name, m):
             glitch = bool(m.SS & _GLITCHING)
-            flags = (m.SS & _STATUS) | (_EKF_GPS_GLITCHING if glitch else 0)
+            flags = (m.SS & _STATUS) | (mavlink.EKF_GPS_GLITCHING if glitch else 0)
             yield FilterStatus(t, t, flags, glitch, _finite(m.SP) or 0.0)
 
     def _origin(self, name: str, m: Message, t: int) -> Iterator[Stamped]:
@@ -159,7 +167,7 @@ class Messages:
         return iter(())
 
     def _truth(self, name: str, m: Message, t: int) -> Iterator[Stamped]:
-        """SIM has no velocity: SIM2's, else that of the last two positions."""
+        """Convert SIM; its velocity is that of SIM2, else the difference of the last two positions."""
         lat, lon = math.radians(m.Lat), math.radians(m.Lng)
         v_n = self._true_v_n
         if v_n is None:
@@ -175,34 +183,34 @@ class Messages:
         yield self._true
 
     def _text(self, name: str, m: Message, t: int) -> Iterator[Stamped]:
-        yield Event(t, t, _INFO, str(m.Message))
+        yield Event(t, t, Severity.INFO, str(m.Message))
 
     def _error(self, name: str, m: Message, t: int) -> Iterator[Stamped]:
-        yield Event(t, t, _WARNING, f"the autopilot logged error {m.ECode} of subsystem {m.Subsys}")
+        yield Event(t, t, Severity.WARNING, f"the autopilot logged error {m.ECode} of subsystem {m.Subsys}")
 
 
-_TABLE: dict[str, Callable[[Messages, str, Message, int], Iterator[Stamped]]] = {
-    **dict.fromkeys(("GPS", "GPS2"), Messages._gps),
-    **dict.fromkeys(("GPA", "GPA2"), Messages._gps_accuracy),
-    **dict.fromkeys(("IMU", "IMU2", "IMU3"), Messages._imu),
-    **dict.fromkeys(("XKF1", "NKF1"), Messages._local),
-    **dict.fromkeys(("XKF2", "NKF2"), Messages._wind),
-    **dict.fromkeys(("XKF4", "NKF4"), Messages._status),
-    "ATT": Messages._attitude,
-    "ORGN": Messages._origin,
-    "POS": Messages._global,
-    "ARSP": Messages._airspeed,
-    "BARO": Messages._baro,
-    "SIM2": Messages._true_velocity,
-    "SIM": Messages._truth,
-    "MSG": Messages._text,
-    "ERR": Messages._error,
+_TABLE: dict[str, Callable[[MessageConverter, str, Message, int], Iterator[Stamped]]] = {
+    **dict.fromkeys(("GPS", "GPS2"), MessageConverter._gps),
+    **dict.fromkeys(("GPA", "GPA2"), MessageConverter._gps_accuracy),
+    **dict.fromkeys(("IMU", "IMU2", "IMU3"), MessageConverter._imu),
+    **dict.fromkeys(("XKF1", "NKF1"), MessageConverter._local),
+    **dict.fromkeys(("XKF2", "NKF2"), MessageConverter._wind),
+    **dict.fromkeys(("XKF4", "NKF4"), MessageConverter._status),
+    "ATT": MessageConverter._attitude,
+    "ORGN": MessageConverter._origin,
+    "POS": MessageConverter._global,
+    "ARSP": MessageConverter._airspeed,
+    "BARO": MessageConverter._baro,
+    "SIM2": MessageConverter._true_velocity,
+    "SIM": MessageConverter._truth,
+    "MSG": MessageConverter._text,
+    "ERR": MessageConverter._error,
 }
 NAMES = tuple(_TABLE)
 
 
-class Dataflash:
-    """A log opened, to be iterated once. `reboots` counts the boot times that went back."""
+class DataflashLog:
+    """An opened log, to be iterated once. `reboots` counts decreases of the boot time."""
 
     def __init__(self, path: Path, reader: Any) -> None:
         self.path = path
@@ -211,17 +219,17 @@ class Dataflash:
         self._epoch_us = round(getattr(reader.clock, "timebase", 0.0) * 1e6)
 
     def __iter__(self) -> Iterator[Stamped]:
-        """Records in the order of the file. LogError at a message that lacks what it always had."""
-        messages, last_us, shift_us = Messages(), -1, self._epoch_us
+        """Yield records in the order of the file. Raises LogError if a message lacks a required column."""
+        messages, last_us, shift_us = MessageConverter(), -1, self._epoch_us
         with contextlib.redirect_stderr(io.StringIO()), contextlib.redirect_stdout(io.StringIO()):
             while (m := self._reader.recv_match(type=list(NAMES), strict=True)) is not None:
                 name, boot_us = m.get_type(), boot_time_us(m)
                 if boot_us is None:
                     boot_us = max(last_us, 0)
                 if boot_us < last_us - _BACK_US:
-                    shift_us += last_us - boot_us  # time goes on; how long it was off is not known
+                    shift_us += last_us - boot_us  # continue the time; the duration of the reboot is unknown
                     self.reboots += 1
-                    messages = Messages()
+                    messages = MessageConverter()
                     t_ns = (shift_us + boot_us) * 1000
                     yield Reboot(t_ns, t_ns, 1)
                 last_us = boot_us
@@ -229,11 +237,13 @@ class Dataflash:
                 try:
                     yield from messages.records(name, m, (shift_us + boot_us) * 1000)
                 except (AttributeError, TypeError) as error:
-                    raise LogError(f"{self.path}: its {name} has no column {error}: no ArduPilot's") from None
+                    raise LogError(
+                        f"{self.path}: message {name} has no column {error}: not an ArduPilot log"
+                    ) from None
 
 
 def boot_time_us(m: Message) -> int | None:
-    """A message's time since boot in all its spellings; of an old GPS that is T, TimeMS the time of week."""
+    """Return the time since boot (TimeUS, TimeMS or T; in an old GPS message TimeMS is the time of week)."""
     if (us := getattr(m, "TimeUS", None)) is not None:
         return int(us)
     ms = getattr(m, "T", None)
@@ -242,8 +252,8 @@ def boot_time_us(m: Message) -> int | None:
     return None if ms is None else int(ms) * 1000
 
 
-def read(path: Path) -> Dataflash:
-    """Open a `.bin` or a `.log`. LogError, one sentence, if it is empty, no such log or cannot be read."""
+def read(path: Path) -> DataflashLog:
+    """Open a `.bin` or `.log` file. Raises LogError if it is empty, not a DataFlash log, or unreadable."""
     from pymavlink import DFReader
 
     try:
@@ -255,21 +265,19 @@ def read(path: Path) -> Dataflash:
         raise LogError(f"{path} is empty: nothing was recorded")
     binary = b"\xa3\x95\x80" in head[:4096]
     if not binary and b"FMT," not in head:
-        raise LogError(f"{path} is no DataFlash log: no message format stands at its beginning")
+        raise LogError(f"{path} is not a DataFlash log: no message format at its beginning")
     kind = DFReader.DFReader_binary if binary else DFReader.DFReader_text
-    reader = kind.__new__(kind)  # in hand also where __init__ fails, which leaves its file open
+    reader = kind.__new__(kind)  # separate from __init__, which leaves its file open if it fails
     try:
         with contextlib.redirect_stderr(io.StringIO()), contextlib.redirect_stdout(io.StringIO()):
             reader.__init__(str(path))
-    except Exception as error:  # whatever a damaged file makes the reader trip over
-        raise LogError(f"{path} is damaged beyond reading: {error or type(error).__name__}") from None
+    except Exception as error:  # a damaged file raises various exceptions in the reader
+        raise LogError(f"{path} is damaged and cannot be read: {error or type(error).__name__}") from None
     finally:
-        reader.filehandle.close()  # it reads a memory map
+        reader.filehandle.close()  # the reader uses its memory map
     if not set(NAMES) & set(reader.name_to_id):
-        raise LogError(
-            f"{path} is a DataFlash log without any message that is read here: needs GPS, XKF1, ..."
-        )
-    return Dataflash(path, reader)
+        raise LogError(f"{path} is a DataFlash log without any supported message: it needs GPS, XKF1, ...")
+    return DataflashLog(path, reader)
 
 
 def _finite(value: float) -> float | None:

@@ -1,8 +1,8 @@
-"""A folder of PX4 topics as CSV files (`vehicle_gps_position.csv.gz`, ...: ulog2csv's names) -> records.
+"""PX4 topics as CSV files in a folder (`vehicle_gps_position.csv.gz`, ..., as named by ulog2csv) -> records.
 
-Each file is one uORB topic, `timestamp` in microseconds since boot. The rows of all topics come out in one
-order of time; the log was written on board, so arrival and validity are the same instant. No raw inertial
-data is looked for. What a topic does not hold stays absent.
+Each file is one uORB topic, `timestamp` in microseconds since boot. The rows of all topics are merged by
+time; arrival and validity are the same instant, as the log is written on board. Raw inertial data is not
+read. Fields that a topic lacks remain None.
 """
 
 from __future__ import annotations
@@ -16,18 +16,27 @@ from pathlib import Path
 from typing import TypeAlias
 
 from companion.link.fields import euler
-from companion.records import AirData, Attitude, Event, Gnss, LocalOrigin, LocalPosition, Stamped, Wind
+from companion.records import (
+    AirData,
+    Attitude,
+    Event,
+    Gnss,
+    LocalOrigin,
+    LocalPosition,
+    Severity,
+    Stamped,
+    Wind,
+)
 
 Row: TypeAlias = dict[str, str]
-_WARNING = 4  # MAV_SEVERITY
 
 
 def read(folder: Path) -> Iterator[Stamped]:
-    """The records of the topics in `folder`, by time. ValueError if it holds none that is known."""
+    """Return the records of the topics in `folder` by time. Raises ValueError if no known topic is found."""
     found = {path.name.split(".")[0]: path for path in sorted(folder.glob("*.csv*"))}
     known = [(found[topic], make) for topic, make in _TOPICS.items() if topic in found]
     if not known:
-        raise ValueError(f"{folder} holds no topic that is read here: it needs {', '.join(_TOPICS)} as CSV")
+        raise ValueError(f"{folder} has no supported topic: it needs {', '.join(_TOPICS)} as CSV")
     return heapq.merge(*(_records(path, make()) for path, make in known), key=lambda record: record.t_ns)
 
 
@@ -37,7 +46,7 @@ def _records(path: Path, topic: Callable[[Row, int], Iterator[Stamped]]) -> Iter
             try:
                 yield from topic(row, int(row["timestamp"]) * 1000)
             except (KeyError, TypeError, ValueError) as error:
-                raise ValueError(f"{path.name}, line {number} is no row of its topic: {error}") from None
+                raise ValueError(f"{path.name}, line {number}: not a row of its topic: {error}") from None
 
 
 def _number(row: Row, name: str) -> float | None:
@@ -52,7 +61,7 @@ def _gnss(row: Row, t: int) -> Iterator[Stamped]:
         t,
         t,
         receiver=0,
-        stamp_us=t // 1000,  # a row is a fix; the receiver's time_utc_usec may step once a second only
+        stamp_us=t // 1000,  # each row is a fix; time_utc_usec of the receiver may change only once a second
         fix=int(row["fix_type"]),
         lat=math.radians(int(row["lat"]) / 1e7),
         lon=math.radians(int(row["lon"]) / 1e7),
@@ -84,7 +93,7 @@ def _wind(row: Row, t: int) -> Iterator[Stamped]:
 
 
 def _local_positions() -> Callable[[Row, int], Iterator[Stamped]]:
-    """The inertial channel; its origin when it is first told or moved, a warning where PX4 made it jump."""
+    """Convert the inertial channel, with its origin when stated or changed, and an event at each reset."""
     last: tuple[str, ...] = ()
     resets = ""
 
@@ -98,7 +107,7 @@ def _local_positions() -> Callable[[Row, int], Iterator[Stamped]]:
             lat, lon, alt_msl = map(float, origin)
             yield LocalOrigin(t, t, math.radians(lat), math.radians(lon), alt_msl, "px4")
         if resets and row["xy_reset_counter"] != resets:
-            yield Event(t, t, _WARNING, "the autopilot reset its horizontal position")
+            yield Event(t, t, Severity.WARNING, "the autopilot reset its horizontal position")
         resets = row["xy_reset_counter"]
         x_n = float(row["x"]), float(row["y"]), float(row["z"])
         yield LocalPosition(t, t, x_n, (float(row["vx"]), float(row["vy"]), float(row["vz"])))

@@ -1,9 +1,9 @@
-"""PX4's onboard log (ULog, `.ulg`) through pyulog -> records, topics by time.
+"""PX4 onboard logs (ULog, `.ulg`), read with pyulog -> records, merged by time.
 
-PX4 renamed fields over the years; each is looked for under all of its names, and what a topic does not hold
-stays absent. Instance 0 of each topic is told. The log was written on board: arrival and validity are the
-same instant, UNIX time where a GPS told it, else time since boot. What the logger itself says (its texts, its
-drop-outs, a damaged end) becomes events.
+PX4 has renamed fields over the years: each is looked up under all of its names, and missing fields remain
+None. Only instance 0 of each topic is read. Arrival and validity are the same instant, as the log is written
+on board: UNIX time if a GPS provides it, else time since boot. Messages of the logger (texts, dropouts, a
+damaged end) become events.
 """
 
 from __future__ import annotations
@@ -16,8 +16,9 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, TypeAlias
 
+from companion.link.dialect import mavlink
 from companion.link.fields import euler
-from companion.optional_dependencies import lacking
+from companion.optional_dependencies import missing_package
 from companion.records import (
     AirData,
     Attitude,
@@ -28,6 +29,7 @@ from companion.records import (
     LocalOrigin,
     LocalPosition,
     Pressure,
+    Severity,
     Stamped,
     Truth,
     Vector3,
@@ -39,35 +41,33 @@ Row: TypeAlias = dict[str, Any]
 Topic: TypeAlias = Callable[[Row, int], Iterator[Stamped]]
 
 _MAGIC = b"\x55\x4c\x6f\x67\x01\x12\x35"
-_WARNING = 4  # MAV_SEVERITY
-_ESTIMATOR_GPS_GLITCH = 1024  # of ESTIMATOR_STATUS_FLAGS
 _ZERO_CELSIUS = 273.15
 _UNIX_AFTER_US = 10**15
 
 
 def read(path: Path) -> Iterator[Stamped]:
-    """The records of a `.ulg` by time. LogError, one sentence, if it is none, empty, or pyulog is missing."""
-    log = _parsed(path)
+    """Return the records of a `.ulg` by time. Raises LogError if it is not a ULog, or pyulog is missing."""
+    log = _open_ulog(path)
     columns: dict[str, dict[str, list[Any]]] = {}
     for data in log.data_list:
         if data.multi_id == 0 and len(data.data.get("timestamp", ())):
             columns[data.name] = {name: values.tolist() for name, values in data.data.items()}
     if not columns:
-        raise LogError(f"{path} is a ULog without any topic that is read here: {', '.join(_TOPICS)}")
+        raise LogError(f"{path} is a ULog without any supported topic: it needs {', '.join(_TOPICS)}")
     epoch_us = _epoch_us(columns)
     if "vehicle_gps_position" in columns:
-        columns.pop("sensor_gps", None)  # the same fixes
+        columns.pop("sensor_gps", None)  # duplicates of vehicle_gps_position
     if "airspeed_validated" in columns:
         columns.pop("airspeed", None)
     topics = {name: make() for name, make in _TOPICS.items() if name in columns}
     if "vehicle_global_position_groundtruth" in columns:
-        topics["vehicle_global_position_groundtruth"] = _truths(columns)
+        topics["vehicle_global_position_groundtruth"] = _truth_topic(columns)
     streams = [_records(path, name, columns[name], topic, epoch_us) for name, topic in topics.items()]
-    said = sorted(_said(log, epoch_us), key=lambda event: event.t_ns)
-    return heapq.merge(*streams, said, key=lambda record: record.t_ns)
+    events = sorted(_logger_events(log, epoch_us), key=lambda event: event.t_ns)
+    return heapq.merge(*streams, events, key=lambda record: record.t_ns)
 
 
-def _parsed(path: Path) -> Any:
+def _open_ulog(path: Path) -> Any:
     try:
         with path.open("rb") as file:
             head = file.read(len(_MAGIC))
@@ -76,20 +76,20 @@ def _parsed(path: Path) -> Any:
     if not head:
         raise LogError(f"{path} is empty: nothing was recorded")
     if head != _MAGIC:
-        raise LogError(f"{path} is no ULog: it does not begin as one")
+        raise LogError(f"{path} is not a ULog: wrong magic bytes at its beginning")
     try:
         from pyulog import ULog
     except ImportError:
-        raise LogError(lacking(str(path), "pyulog", "logs")) from None
+        raise LogError(missing_package(str(path), "pyulog", "logs")) from None
     try:
         with path.open("rb") as file, contextlib.redirect_stdout(io.StringIO()):
             return ULog(file, [*_TOPICS, *_TRUTHS])
-    except Exception as error:  # whatever a damaged file makes the reader trip over
-        raise LogError(f"{path} is damaged beyond reading: {error or type(error).__name__}") from None
+    except Exception as error:  # a damaged file raises various exceptions in pyulog
+        raise LogError(f"{path} is damaged and cannot be read: {error or type(error).__name__}") from None
 
 
 def _epoch_us(columns: dict[str, dict[str, list[Any]]]) -> int:
-    """What to add to the time since boot to have UNIX time, 0 where no GPS told it."""
+    """Return the offset from time since boot to UNIX time; 0 if no GPS provides it."""
     for name in ("vehicle_gps_position", "sensor_gps"):
         found = columns.get(name, {})
         for boot, utc in zip(found.get("timestamp", ()), found.get("time_utc_usec", ()), strict=False):
@@ -107,10 +107,10 @@ def _records(
         try:
             yield from topic(row, (row["timestamp"] + epoch_us) * 1000)
         except KeyError as error:
-            raise LogError(f"{path}: its {name} has no field {error}: no PX4 known here wrote it") from None
+            raise LogError(f"{path}: topic {name} has no field {error}: unsupported PX4 version") from None
 
 
-def _said(log: Any, epoch_us: int) -> Iterator[Event]:
+def _logger_events(log: Any, epoch_us: int) -> Iterator[Event]:
     def event(us: int, severity: int, text: str) -> Event:
         t = (us + epoch_us) * 1000
         return Event(t, t, severity, text)
@@ -119,24 +119,24 @@ def _said(log: Any, epoch_us: int) -> Iterator[Event]:
         severity = min(max(int(line.log_level) - ord("0"), 0), 7)
         yield event(line.timestamp, severity, line.message)
     for gap in log.dropouts:
-        yield event(gap.timestamp, _WARNING, f"the logger dropped out for {gap.duration} ms")
+        yield event(gap.timestamp, Severity.WARNING, f"logger dropout of {gap.duration} ms")
     if log.file_corruption:
-        yield event(log.last_timestamp, _WARNING, "the log is damaged: parts of it are missing")
+        yield event(log.last_timestamp, Severity.WARNING, "the log is damaged: some data is missing")
 
 
 def _finite(value: float | None) -> float | None:
     return value if value is not None and math.isfinite(value) else None
 
 
-def _first(row: Row, *names: str) -> Any:
-    """The field under the first of its names that is there; KeyError if under none."""
+def _first_field(row: Row, *names: str) -> Any:
+    """Return the field under the first of `names` that exists. Raises KeyError if none does."""
     for name in names:
         if name in row:
             return row[name]
     raise KeyError(names[0])
 
 
-def _three(row: Row, name: str) -> Vector3:
+def _vector(row: Row, name: str) -> Vector3:
     return row[f"{name}[0]"], row[f"{name}[1]"], row[f"{name}[2]"]
 
 
@@ -146,13 +146,13 @@ def _gnss(row: Row, t: int) -> Iterator[Stamped]:
     alt_msl = row["altitude_msl_m"] if new else row["alt"] * 1e-3
     alt = row["altitude_ellipsoid_m"] if new else row["alt_ellipsoid"] * 1e-3
     fix = int(row["fix_type"])
-    if fix >= 2 and lat == lon == 0.0:
+    if fix >= mavlink.GPS_FIX_TYPE_2D_FIX and lat == lon == 0.0:
         return
     yield Gnss(
         t,
         t,
         receiver=0,
-        stamp_us=t // 1000,  # a row is a fix; the receiver's time_utc_usec may step once a second only
+        stamp_us=t // 1000,  # each row is a fix; time_utc_usec of the receiver may change only once a second
         fix=fix,
         lat=math.radians(lat),
         lon=math.radians(lon),
@@ -168,14 +168,14 @@ def _gnss(row: Row, t: int) -> Iterator[Stamped]:
 
 
 def _attitude(row: Row, t: int) -> Iterator[Stamped]:
-    q = *_three(row, "q"), row["q[3]"]
+    q = *_vector(row, "q"), row["q[3]"]
     rates = (row["rollspeed"], row["pitchspeed"], row["yawspeed"]) if "rollspeed" in row else None
     if math.isfinite(sum(q)):
         yield Attitude(t, t, *euler(q), rates)
 
 
 def _imu(row: Row, t: int) -> Iterator[Stamped]:
-    yield Imu(t, t, 0, _three(row, "accelerometer_m_s2"), _three(row, "gyro_rad"))
+    yield Imu(t, t, 0, _vector(row, "accelerometer_m_s2"), _vector(row, "gyro_rad"))
 
 
 def _air_data(row: Row, t: int) -> Iterator[Stamped]:
@@ -184,8 +184,8 @@ def _air_data(row: Row, t: int) -> Iterator[Stamped]:
 
 
 def _wind(row: Row, t: int) -> Iterator[Stamped]:
-    north = _first(row, "variance_north", "covariance_north")
-    variance = 0.5 * (north + _first(row, "variance_east", "covariance_east"))
+    north = _first_field(row, "variance_north", "covariance_north")
+    variance = 0.5 * (north + _first_field(row, "variance_east", "covariance_east"))
     v_n = row["windspeed_north"], row["windspeed_east"], 0.0
     if math.isfinite(v_n[0] + v_n[1]):
         yield Wind(t, t, v_n, math.sqrt(variance) if variance > 0.0 else None)
@@ -199,13 +199,13 @@ def _pressure(row: Row, t: int) -> Iterator[Stamped]:
 
 def _status(row: Row, t: int) -> Iterator[Stamped]:
     flags = int(row["solution_status_flags"])
-    glitch = bool(flags & _ESTIMATOR_GPS_GLITCH)
+    glitch = bool(flags & mavlink.ESTIMATOR_GPS_GLITCH)
     ratio, accuracy = _finite(row["pos_test_ratio"]) or 0.0, _finite(row["pos_horiz_accuracy"])
     yield FilterStatus(t, t, flags, glitch, ratio, accuracy)
 
 
 def _local_positions() -> Topic:
-    """The inertial channel; its origin when it is first told or moved, a warning where PX4 made it jump."""
+    """Convert the inertial channel, with its origin when stated or changed, and an event at each reset."""
     last: tuple[float, ...] = ()
     resets: int | None = None
 
@@ -218,7 +218,7 @@ def _local_positions() -> Topic:
             yield LocalOrigin(t, t, math.radians(origin[0]), math.radians(origin[1]), origin[2], "px4")
         counter = row.get("xy_reset_counter", 0)
         if resets is not None and counter != resets:
-            yield Event(t, t, _WARNING, "the autopilot reset its horizontal position")
+            yield Event(t, t, Severity.WARNING, "the autopilot reset its horizontal position")
         resets = counter
         yield LocalPosition(t, t, (row["x"], row["y"], row["z"]), (row["vx"], row["vy"], row["vz"]))
 
@@ -231,8 +231,8 @@ _TRUTHS = (
 )
 
 
-def _truths(columns: dict[str, dict[str, list[Any]]]) -> Topic:
-    """A simulator's: positions with the velocity of the local truth at or before them."""
+def _truth_topic(columns: dict[str, dict[str, list[Any]]]) -> Topic:
+    """Convert a simulator's truth: positions, each with the latest velocity of the local truth."""
     local = columns.get(_TRUTHS[1], {"timestamp": []})
     velocities = list(zip(*(local.get(name, ()) for name in ("timestamp", "vx", "vy", "vz")), strict=True))
     steps = iter(velocities)
@@ -249,20 +249,20 @@ def _truths(columns: dict[str, dict[str, list[Any]]]) -> Topic:
     return topic
 
 
-def _same(topic: Topic) -> Callable[[], Topic]:
+def _stateless(topic: Topic) -> Callable[[], Topic]:
     return lambda: topic
 
 
 _TOPICS: dict[str, Callable[[], Topic]] = {
     "vehicle_local_position": _local_positions,
-    "vehicle_gps_position": _same(_gnss),
-    "sensor_gps": _same(_gnss),
-    "vehicle_attitude": _same(_attitude),
-    "sensor_combined": _same(_imu),
-    "airspeed_validated": _same(_air_data),
-    "airspeed": _same(_air_data),
-    "wind": _same(_wind),
-    "wind_estimate": _same(_wind),
-    "vehicle_air_data": _same(_pressure),
-    "estimator_status": _same(_status),
+    "vehicle_gps_position": _stateless(_gnss),
+    "sensor_gps": _stateless(_gnss),
+    "vehicle_attitude": _stateless(_attitude),
+    "sensor_combined": _stateless(_imu),
+    "airspeed_validated": _stateless(_air_data),
+    "airspeed": _stateless(_air_data),
+    "wind": _stateless(_wind),
+    "wind_estimate": _stateless(_wind),
+    "vehicle_air_data": _stateless(_pressure),
+    "estimator_status": _stateless(_status),
 }

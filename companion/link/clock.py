@@ -1,33 +1,32 @@
-"""The autopilot's time on the companion's clock. Pure: every instant is handed in.
+"""Mapping of an autopilot's boot time to the companion's clock. Pure: the caller supplies every time.
 
-MAVLink stamps its measurements with the time since the autopilot's boot, or with UNIX time. Two ways lead
-from there to the companion's clock, local = boot + offset:
+MAVLink stamps measurements with the time since the autopilot's boot, or with UNIX time. Two methods estimate
+the offset to the companion's clock, local = boot + offset:
 
-  arrival   Every stamped message gives arrival - stamp = offset + delay with delay >= 0, so the offset lies
-            on the lower envelope of what arrives. The envelope may rise slowly (DRIFT), as fast as two
-            crystals may part. It is there from the first message, needs no answer, and errs by the least
-            delay (late).
-  TIMESYNC  The autopilot's clock read between two readings of ours: asked - reading <= offset <= answered -
-            reading. Among recent answers the one of least round trip is believed, a little less with every
-            second of its age, and its middle taken. Preferred while it is fresh and agrees with the
-            arrivals. One whose round trip is longer than ROUGH waited somewhere, most likely on one way of
-            the two (a link that is late, an autopilot that reads seldom), and its middle may be off by
-            seconds: it does not take the place of a better one, and alone it only bounds what the arrivals
-            tell.
+  arrival   Every stamped message gives arrival - stamp = offset + delay with delay >= 0, so the offset is the
+            lower envelope of these differences. The envelope may rise slowly (DRIFT), as fast as two crystals
+            may drift apart. It is available from the first message, needs no answer, and is late by the least
+            delay.
+  TIMESYNC  The autopilot's clock is read between two readings of ours: requested - reading <= offset <=
+            received - reading. Of the recent answers the one with the shortest round trip is used (with a
+            penalty for its age), and its midpoint is taken. Preferred while it is recent and agrees with the
+            arrivals. An answer whose round trip is longer than MAX_ROUND_TRIP was delayed, most likely in one
+            direction only (a late link, an autopilot that reads seldom), and its midpoint may be wrong by
+            seconds. It does not replace a better answer; alone, it only bounds the estimate from arrivals.
 
-All that arrives late from one moment on is a link that is late, or a clock that stood still or was set back.
-A late link leaves the lower bound of TIMESYNC where it was, for its round trips are as long as it is late;
-a clock set back moves it at once. So while TIMESYNC is answered nothing but that bound lifts the envelope,
-and measurements that come late are placed when they were made. Where it is not answered there is no telling
-the two apart, and the envelope follows the least delay of the last WINDOW, but no faster than SLIP: a
-simulator's clock may run slow by a hundredth.
+If all messages arrive late from one moment on, either the link is late, or the autopilot's clock stopped or
+was set back. A late link leaves the lower bound of TIMESYNC unchanged, because its round trips grow by the
+same delay; a clock set back moves that bound at once. So while TIMESYNC is answered, only that bound raises
+the envelope, and late measurements are placed at the time they were made. Without TIMESYNC the two cases
+cannot be distinguished, and the envelope follows the least delay of the last WINDOW, but no faster than SLIP:
+a simulator's clock may run slow by one per cent.
 
-A stamp that arrives before even TIMESYNC's lower bound lets it (before the envelope, without one) is of a
-clock that was set forward. Stamps that go back by seconds are of a reboot, if the autopilot can be so young:
-everything is forgotten and begun again. (So is the wrap of a 32-bit millisecond stamp after 49.7 days.) If
-not, its clock was set back and only the mapping is begun again. After a silence in which the autopilot may
-have booted its stamps need not go back: that they are behind by more than any link is late tells as much. One
-alone may be a straggler or a false one: it is believed when the next agrees with it.
+A stamp that arrives earlier than TIMESYNC's lower bound (without TIMESYNC: the envelope) allows means that
+the clock was set forward. Stamps that go back by seconds mean a reboot, if the autopilot can be that young:
+the whole state is reset. (The wrap of a 32-bit millisecond stamp after 49.7 days does the same.) If it
+cannot, its clock was set back, and only the mapping is reset. After a silence in which the autopilot may have
+booted, its stamps need not go back: stamps behind by more than any link delay mean a reboot too. A single
+such stamp may be delayed or false: it is accepted when the next one agrees with it.
 """
 
 from __future__ import annotations
@@ -36,209 +35,216 @@ from collections import deque
 from enum import Enum
 from typing import NamedTuple
 
-SECOND = 1_000_000_000
-#: How fast two clocks may part: crystals at the ends of the temperature range.
+from companion.units import SECOND_NS
+
+#: Relative drift of two clocks: crystals at the ends of the temperature range.
 DRIFT = 100e-6
-#: Two stamps this much older than the newest one mean a reboot.
-BACK = 3 * SECOND
-#: Without TIMESYNC the envelope follows the least delay heard in so long,
-WINDOW = 20 * SECOND
+#: Two stamps older than the newest one by this much mean a reboot.
+BACK = 3 * SECOND_NS
+#: Without TIMESYNC the envelope follows the least delay of this window,
+WINDOW = 20 * SECOND_NS
 #: but rises no faster than a simulator's clock may run slow.
 SLIP = 0.012
-#: Arrivals that fall below what is possible by more tell that the autopilot's clock was set.
-JUMP = 1 * SECOND
-#: A TIMESYNC reading that makes the last arrival early, or later than any link is, is of another clock.
-LATEST = 10 * SECOND
-#: What comes later than this is told as late, and what is not stamped is taken for as late as what is.
-LATE = 1 * SECOND
-#: A round trip beyond this is no measure of the way.
-ROUGH = SECOND // 4
-#: For so long an answer of TIMESYNC is believed.
-FRESH = 60 * SECOND
-#: Stamps from here on (September 2001) are UNIX time; no autopilot is up for 31 years.
-UNIX_EPOCH_FROM = 10**9 * SECOND
+#: Arrivals earlier than possible by more than this mean that the autopilot's clock was set.
+JUMP = 1 * SECOND_NS
+#: A TIMESYNC reading by which the last arrival is later than this belongs to another clock.
+MAX_LATENESS = 10 * SECOND_NS
+#: A message later than this is reported as late, and messages without a stamp are taken to be as late.
+LATE = 1 * SECOND_NS
+#: A longer round trip does not measure the offset.
+MAX_ROUND_TRIP = SECOND_NS // 4
+#: How long a TIMESYNC answer is used.
+FRESH = 60 * SECOND_NS
+#: Stamps from here on (September 2001) are UNIX time; no autopilot runs for 31 years.
+UNIX_EPOCH_FROM = 10**9 * SECOND_NS
 
 
-class News(Enum):
-    """What a stamp may tell of the autopilot's clock."""
+class ClockChange(Enum):
+    """Change of the autopilot's clock detected from a stamp."""
 
     REBOOTED = "rebooted"
     SET = "set"
 
 
-class Answer(NamedTuple):
-    """One TIMESYNC answer: when it was asked and came, and the reading in between, all in ns."""
+class TimesyncSample(NamedTuple):
+    """One TIMESYNC answer: times of request and reception, and the reading in between, all in ns."""
 
-    asked: int
+    requested: int
     reading: int
-    at: int
+    received: int
 
     @property
     def round_trip(self) -> int:
-        """From question to answer."""
-        return self.at - self.asked
+        """Time from request to answer."""
+        return self.received - self.requested
 
     @property
-    def least(self) -> int:
-        """No offset is less: the reading was taken after the question."""
-        return self.asked - self.reading
+    def min_offset(self) -> int:
+        """Lower bound of the offset: the reading was taken after the request."""
+        return self.requested - self.reading
 
     @property
-    def most(self) -> int:
-        """Nor greater: it was taken before the answer came."""
-        return self.at - self.reading
+    def max_offset(self) -> int:
+        """Upper bound of the offset: the reading was taken before the answer arrived."""
+        return self.received - self.reading
 
     @property
     def offset(self) -> int:
-        """The middle, in error by half the round trip at most."""
-        return (self.asked + self.at) // 2 - self.reading
+        """Midpoint of the bounds, in error by half the round trip at most."""
+        return (self.requested + self.received) // 2 - self.reading
 
 
 class BootClock:
     """Maps one autopilot's stamps to the companion's clock. All times are integer nanoseconds."""
 
     def __init__(self) -> None:
-        self._asked: deque[int] = deque(maxlen=64)
+        self._requests: deque[int] = deque(maxlen=64)
         self.outlier: int | None = None
         self._reset()
 
     def _reset(self) -> None:
-        self._newest = -1
-        self._heard_at = 0  # arrival of the newest
+        self._newest = -1  # newest stamp
+        self._newest_received = 0
         self._envelope: int | None = None
         self._envelope_at = 0
-        self._seen = 0  # the last arrival - stamp
-        # Of the last WINDOW, (arrival, arrival - stamp), increasing in both: the first is the least.
+        self._last_difference = 0  # arrival - stamp of the last message
+        # (arrival, arrival - stamp) of the last WINDOW, increasing in both: the first is the least
         self._least: deque[tuple[int, int]] = deque()
-        self._back: tuple[int, int] | None = None  # a stamp gone back, and its arrival - stamp
-        self._answers: deque[Answer] = deque(maxlen=8)
-        self._best: Answer | None = None
+        self._back: tuple[int, int] | None = None  # a stamp that went back, and its arrival - stamp
+        self._samples: deque[TimesyncSample] = deque(maxlen=8)
+        self._best: TimesyncSample | None = None
         self._unix_minus_boot: int | None = None
-        self._asked.clear()
+        self._requests.clear()
 
-    def heard(self, boot: int, received: int) -> News | None:
-        """Take the stamp of a message that was stamped when sent. Returns what it tells of the clock."""
-        seen, news = received - boot, None
-        if boot < self._newest - BACK or self._slept(boot, received):
-            doubted, self._back = self._back, (boot, seen)
-            if doubted is None or boot < doubted[0] or abs(seen - doubted[1]) > BACK:
+    def update(self, boot: int, received: int) -> ClockChange | None:
+        """Process the stamp of a message that was stamped when sent; return a detected clock change."""
+        difference, change = received - boot, None
+        if boot < self._newest - BACK or self._booted_in_silence(boot, received):
+            before, self._back = self._back, (boot, difference)
+            if before is None or boot < before[0] or abs(difference - before[1]) > BACK:
                 return None
-            is_young = boot <= received - self._heard_at + LATEST
-            news = News.REBOOTED if is_young else News.SET
+            is_young = boot <= received - self._newest_received + MAX_LATENESS
+            change = ClockChange.REBOOTED if is_young else ClockChange.SET
             self._reset()
         self._back = None
         if boot > self._newest:
-            self._newest, self._heard_at = boot, received
-        self._seen = seen
+            self._newest, self._newest_received = boot, received
+        self._last_difference = difference
         least = self._least
-        while least and least[-1][1] >= seen:
+        while least and least[-1][1] >= difference:
             least.pop()
-        least.append((received, seen))
+        least.append((received, difference))
         while least[0][0] < received - WINDOW:
             least.popleft()
         if self._envelope is None:
-            self._envelope = seen
+            self._envelope = difference
         else:
-            if seen < self._possible(received) - JUMP:
-                self._answers.clear()
+            if difference < self._min_offset(received) - JUMP:
+                self._samples.clear()
                 self._best = None
-                news = News.SET
-            self._envelope = self._followed(self._envelope, seen, received)
+                change = ClockChange.SET
+            self._envelope = self._next_envelope(self._envelope, difference, received)
         self._envelope_at = received
-        return news
+        return change
 
-    def _slept(self, boot: int, received: int) -> bool:
-        """Whether this stamp, though no step back, is of one that booted in the silence before it."""
-        if boot > received - self._heard_at:
+    def _booted_in_silence(self, boot: int, received: int) -> bool:
+        """Return whether the sender of this stamp booted in the silence before it."""
+        if boot > received - self._newest_received:
             return False
         offset = self.offset(received)
-        return offset is not None and received - boot - offset > LATEST
+        return offset is not None and received - boot - offset > MAX_LATENESS
 
-    def _possible(self, now: int) -> int:
-        """The least offset that there can be: by TIMESYNC, without it by what has arrived."""
+    def _min_offset(self, now: int) -> int:
+        """Return the lower bound of the offset: by TIMESYNC, without it by the arrivals."""
         if self._is_answered(now):
-            return max(answer.least - int(DRIFT * (now - answer.at)) for answer in self._answers)
+            return max(s.min_offset - int(DRIFT * (now - s.received)) for s in self._samples)
         assert self._envelope is not None
         return self._envelope
 
-    def _followed(self, envelope: int, seen: int, now: int) -> int:
-        """The envelope once something has arrived."""
-        passed = now - self._envelope_at
-        followed = min(envelope + int(DRIFT * passed), seen)
+    def _next_envelope(self, envelope: int, difference: int, now: int) -> int:
+        """Return the envelope after an arrival."""
+        elapsed = now - self._envelope_at
+        followed = min(envelope + int(DRIFT * elapsed), difference)
         if self._is_answered(now):
             return followed
-        return max(followed, min(self._least[0][1], envelope + int(SLIP * passed)))
+        return max(followed, min(self._least[0][1], envelope + int(SLIP * elapsed)))
 
     def _is_answered(self, now: int) -> bool:
-        return bool(self._answers) and now - self._answers[-1].at < FRESH
+        return bool(self._samples) and now - self._samples[-1].received < FRESH
 
-    def heard_unix(self, unix: int, boot: int) -> None:
-        """Take a pair of the autopilot's two times, valid at one instant (SYSTEM_TIME). UNIX 0 is not set."""
+    def update_unix(self, unix: int, boot: int) -> None:
+        """Process the autopilot's two times of one instant (SYSTEM_TIME). UNIX time 0 is "not set"."""
         if unix >= UNIX_EPOCH_FROM:
             self._unix_minus_boot = unix - boot
 
-    def ask(self, now: int) -> int:
+    def request(self, now: int) -> int:
         """Return the stamp to send in a TIMESYNC request."""
-        self._asked.append(now)
+        self._requests.append(now)
         return now
 
-    def answered(self, asked: int, reading: int, now: int) -> bool:
-        """Take a TIMESYNC answer; False if it is not to a question of ours, means another clock, or
-        nothing stamped was heard yet.
+    def update_timesync(self, requested: int, reading: int, now: int) -> bool:
+        """Process a TIMESYNC answer; return whether it is used.
 
-        `outlier` then says by how much (ns) it would have the last message arrive early (below 0) or late.
+        It is not used if it answers no request of ours, belongs to another clock, or no stamped message was
+        received yet. If it belongs to another clock, `outlier` is the age (ns) that the last message would
+        have by it, negative if it would be early; otherwise `outlier` is None.
         """
         self.outlier = None
-        if asked not in self._asked:
+        if requested not in self._requests:
             return False
-        self._asked.remove(asked)
+        self._requests.remove(requested)
         if self._envelope is None:
-            return False  # nothing was heard that it could be judged by
-        answer = Answer(asked, reading, now)
-        if self._seen - answer.least < -JUMP or self._seen - answer.most > LATEST:
-            self.outlier = self._seen - answer.offset
+            return False  # no stamp to check it against
+        sample = TimesyncSample(requested, reading, now)
+        age = self._last_difference
+        if age - sample.min_offset < -JUMP or age - sample.max_offset > MAX_LATENESS:
+            self.outlier = age - sample.offset
             return False
-        self._envelope = max(self._envelope, answer.least)
-        # One clock has no two answers that exclude one another: it was set, or slips faster than a crystal.
-        self._answers = deque((a for a in self._answers if self._agree(a, answer)), self._answers.maxlen)
-        self._answers.append(answer)
-        best = min(self._answers, key=lambda a: a.round_trip + 2 * DRIFT * (now - a.at))
-        held = self._best
-        if held is not None and held.round_trip <= ROUGH < best.round_trip and self._agree(held, answer):
-            best = held if now - held.at < FRESH else best
+        self._envelope = max(self._envelope, sample.min_offset)
+        # samples that contradict the newest: the clock was set, or drifts faster than a crystal
+        self._samples = deque((s for s in self._samples if self._agree(s, sample)), self._samples.maxlen)
+        self._samples.append(sample)
+        best = min(self._samples, key=lambda s: s.round_trip + 2 * DRIFT * (now - s.received))
+        last = self._best
+        if (
+            last is not None
+            and last.round_trip <= MAX_ROUND_TRIP < best.round_trip
+            and self._agree(last, sample)
+        ):
+            best = last if now - last.received < FRESH else best
         self._best = best
         return True
 
     @staticmethod
-    def _agree(before: Answer, after: Answer) -> bool:
-        drift = int(DRIFT * (after.at - before.at))
-        return before.least - drift <= after.most and after.least <= before.most + drift
+    def _agree(before: TimesyncSample, after: TimesyncSample) -> bool:
+        drift = int(DRIFT * (after.received - before.received))
+        return before.min_offset - drift <= after.max_offset and after.min_offset <= before.max_offset + drift
 
     def offset(self, now: int) -> int | None:
-        """Return local minus boot time, None before anything was heard."""
+        """Return local minus boot time, None before the first stamp."""
         best, envelope = self._best, self._envelope
-        if best is None or now - best.at >= FRESH:
+        if best is None or now - best.received >= FRESH:
             return envelope
-        if best.round_trip <= ROUGH or envelope is None:
+        if best.round_trip <= MAX_ROUND_TRIP or envelope is None:
             return best.offset
-        return min(max(envelope, best.least), best.most)
+        return min(max(envelope, best.min_offset), best.max_offset)
 
     def uncertainty(self, now: int) -> int | None:
-        """Return half the round trip, plus drift, that the offset rests on; None if on arrivals alone."""
-        if self._best is None or now - self._best.at >= FRESH:
+        """Return half the round trip, plus drift, behind the offset; None if it rests on arrivals alone."""
+        if self._best is None or now - self._best.received >= FRESH:
             return None
-        return self._best.round_trip // 2 + int(DRIFT * (now - self._best.at))
+        return self._best.round_trip // 2 + int(DRIFT * (now - self._best.received))
 
     def lateness(self, now: int) -> int:
-        """By how much (ns) the last stamped message came after its time; 0 before one was heard."""
+        """Return the delay (ns) of the last stamped message; 0 before the first."""
         offset = self.offset(now)
-        return 0 if offset is None or self._envelope is None else max(self._seen - offset, 0)
+        return 0 if offset is None or self._envelope is None else max(self._last_difference - offset, 0)
 
     def local(self, stamp: int, received: int) -> int:
-        """Return when a message stamped `stamp` (since boot, or UNIX) was valid, on the companion's clock.
+        """Return the local time for which a message stamped `stamp` (since boot, or UNIX) is valid.
 
-        Never later than its arrival. The arrival itself where the stamp cannot be mapped yet; where it is 0
-        (unknown) the arrival too, less the lateness of what is stamped if that is late.
+        Never later than its arrival. The arrival itself if the stamp cannot be mapped yet. For stamp 0
+        (unknown) the arrival too, less the delay of stamped messages if the link is late.
         """
         offset = self.offset(received)
         if stamp <= 0:

@@ -1,13 +1,13 @@
-"""Answers to COMMAND_LONG and COMMAND_INT: every command addressed to us is acknowledged. No clock, no link.
+"""COMMAND_LONG and COMMAND_INT server: every command addressed to us is acknowledged. No clock, no link.
 
-    replies = commands.receive(message, frame, system, now_ns)   # to be sent where it came from
+    replies = commands.receive(message, frame, system, now_ns)   # to be sent on the link it came from
 
-We serve what describes us and paces us: messages on request, their intervals, our version. Everything else is
-UNSUPPORTED, a bad parameter DENIED, and what comes faster than it may TEMPORARILY_REJECTED.
+Supported commands: request a message, get and set message intervals, request our version. All others get
+UNSUPPORTED, an invalid parameter gets DENIED, and commands above the rate limit get TEMPORARILY_REJECTED.
 
-A command to all components (component 0) is answered only if it is one of ours: an UNSUPPORTED of ours beside
-the autopilot's ACCEPTED is what a ground station may take for the autopilot's answer. A command to another
-system, or to all systems, is not answered at all.
+A command to all components (component 0) is answered only if we support it: a ground station may take our
+UNSUPPORTED, sent beside the autopilot's ACCEPTED, for the autopilot's answer. A command to another system, or
+to all systems, is not answered.
 """
 
 from __future__ import annotations
@@ -19,39 +19,40 @@ from collections.abc import Callable, Mapping
 
 from companion import __version__
 from companion.link import dialect
-from companion.link.dialect import Message
+from companion.link.dialect import Message, mavlink
 from companion.link.frame import Frame
-from companion.link.rate_limiter import Bucket
+from companion.link.rate_limiter import RateLimiter
 
-COMMAND_INT, COMMAND_LONG = 75, 76
-AUTOPILOT_VERSION, MESSAGE_INTERVAL = 148, 244
-#: Commands a second, and at once, before they are rejected.
+#: Commands per second, and at once, before they are rejected.
 RATE_HZ, BURST = 10.0, 20
-#: Nobody gets a message faster.
-SHORTEST_US = 20_000
+#: Shortest message interval that may be requested.
+MIN_INTERVAL_US = 20_000
 DISABLED = -1
 
-#: MAV_PROTOCOL_CAPABILITY: COMMAND_INT, MAVLINK2, and PARAM_ENCODE_BYTEWISE (one encoding is to be named; our
-#: parameters are all REAL32, which are the same bytes in either).
-CAPABILITIES = 8 | 8192 | 16
+#: Parameters are all REAL32, which both encodings store alike; AUTOPILOT_VERSION must name one of them.
+CAPABILITIES = (
+    mavlink.MAV_PROTOCOL_CAPABILITY_COMMAND_INT
+    | mavlink.MAV_PROTOCOL_CAPABILITY_MAVLINK2
+    | mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE
+)
 
 
 class Result(enum.IntEnum):
-    """MAV_RESULT, as far as we use it."""
+    """The values of MAV_RESULT that are sent."""
 
-    ACCEPTED = 0
-    TEMPORARILY_REJECTED = 1
-    DENIED = 2
-    UNSUPPORTED = 3
-    FAILED = 4
+    ACCEPTED = mavlink.MAV_RESULT_ACCEPTED
+    TEMPORARILY_REJECTED = mavlink.MAV_RESULT_TEMPORARILY_REJECTED
+    DENIED = mavlink.MAV_RESULT_DENIED
+    UNSUPPORTED = mavlink.MAV_RESULT_UNSUPPORTED
+    FAILED = mavlink.MAV_RESULT_FAILED
 
 
-#: Makes a message that is asked for, or None while there is nothing to tell.
+#: Makes a message on request, or None while there is nothing to send.
 Source = Callable[[], Message | None]
 
 
 def autopilot_version() -> Message:
-    """Who we are, in the message that MAVLink has for it."""
+    """Return AUTOPILOT_VERSION with the version and capabilities of the companion."""
     major, minor, patch = (int(part) for part in re.findall(r"\d+", __version__)[:3])
     return dialect.new(
         "AUTOPILOT_VERSION",
@@ -60,45 +61,55 @@ def autopilot_version() -> Message:
     )
 
 
-class Commands:
-    """What we can be told to do, and the message intervals that we were told."""
+class CommandServer:
+    """Executes and acknowledges commands; holds the message intervals that were set."""
 
     def __init__(
         self, component: int, intervals_us: Mapping[int, int], sources: Mapping[int, Source]
     ) -> None:
-        """`intervals_us`: default interval of every message that we stream, -1 for one that begins disabled.
+        """Create a server for our component id.
 
-        `sources`: what makes each message that may be asked for; AUTOPILOT_VERSION is added.
+        Parameters
+        ----------
+        component
+            Our component id.
+        intervals_us
+            Default interval of every streamed message by message id, -1 if disabled by default.
+        sources
+            Function that makes each message that may be requested; AUTOPILOT_VERSION is added.
         """
         self._component = component
         self._defaults = dict(intervals_us)
-        self._sources: dict[int, Source] = {AUTOPILOT_VERSION: autopilot_version} | dict(sources)
-        self._bucket = Bucket(RATE_HZ, BURST)
-        self._table: dict[int, Callable[[float, float], tuple[Result, list[Message]]]] = {
-            510: self._get_message_interval,
-            511: self._set_message_interval,
-            512: self._request_message,
-            520: self._request_autopilot_capabilities,
+        self._sources: dict[int, Source] = {
+            mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION: autopilot_version,
+            **sources,
         }
-        #: The interval of each streamed message now, us; -1: not sent.
+        self._limiter = RateLimiter(RATE_HZ, BURST)
+        self._table: dict[int, Callable[[float, float], tuple[Result, list[Message]]]] = {
+            mavlink.MAV_CMD_GET_MESSAGE_INTERVAL: self._get_message_interval,
+            mavlink.MAV_CMD_SET_MESSAGE_INTERVAL: self._set_message_interval,
+            mavlink.MAV_CMD_REQUEST_MESSAGE: self._request_message,
+            mavlink.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES: self._request_autopilot_capabilities,
+        }
+        #: The present interval of each streamed message, us; -1: disabled.
         self.intervals_us = dict(intervals_us)
 
-    def pace(self, intervals_us: Mapping[int, int]) -> None:
-        """Other default intervals; what was asked before is forgotten."""
+    def set_default_intervals(self, intervals_us: Mapping[int, int]) -> None:
+        """Replace the default intervals and discard those that were set by command."""
         self._defaults, self.intervals_us = dict(intervals_us), dict(intervals_us)
 
     def receive(self, message: Message, frame: Frame, system: int, now_ns: int) -> list[Message]:
-        """Do what a command says and return the answers; nothing for other messages and other addressees.
+        """Execute a command and return the replies; empty for other messages and other addressees.
 
         `system` is our own id.
         """
-        if frame.msgid not in (COMMAND_INT, COMMAND_LONG) or message.target_system != system:
+        if frame.msgid not in _COMMANDS or message.target_system != system:
             return []
         execute = self._table.get(message.command)
         if message.target_component != self._component and (message.target_component or execute is None):
             return []
         replies: list[Message] = []
-        if not self._bucket.take(now_ns):
+        if not self._limiter.take(now_ns):
             result = Result.TEMPORARILY_REJECTED
         elif execute is None:
             result = Result.UNSUPPORTED
@@ -114,38 +125,43 @@ class Commands:
         return [ack, *replies]
 
     def _request_message(self, param1: float, param2: float) -> tuple[Result, list[Message]]:
-        source = self._sources.get(_whole(param1))
+        source = self._sources.get(_to_message_id(param1))
         if source is None:
             return Result.DENIED, []
         message = source()
         return (Result.FAILED, []) if message is None else (Result.ACCEPTED, [message])
 
     def _set_message_interval(self, param1: float, param2: float) -> tuple[Result, list[Message]]:
-        msgid, wanted = _whole(param1), param2
+        msgid, interval = _to_message_id(param1), param2
         if msgid not in self._defaults:
             return Result.DENIED, []
-        if wanted == 0:
+        if interval == 0:
             self.intervals_us[msgid] = self._defaults[msgid]
-        elif wanted == DISABLED:
+        elif interval == DISABLED:
             self.intervals_us[msgid] = DISABLED
-        elif SHORTEST_US <= wanted < 2**31:
-            self.intervals_us[msgid] = round(wanted)
+        elif MIN_INTERVAL_US <= interval < 2**31:
+            self.intervals_us[msgid] = round(interval)
         else:
             return Result.DENIED, []
         return Result.ACCEPTED, []
 
     def _get_message_interval(self, param1: float, param2: float) -> tuple[Result, list[Message]]:
-        msgid = _whole(param1)
-        if not 0 <= msgid < 1 << 16:  # MESSAGE_INTERVAL cannot name it
+        msgid = _to_message_id(param1)
+        if not 0 <= msgid < 1 << 16:  # the range of MESSAGE_INTERVAL.message_id
             return Result.DENIED, []
-        # 0 tells that the message is not to be had, after MESSAGE_INTERVAL's own description
+        # 0: message not available, by the description of MESSAGE_INTERVAL
         interval = self.intervals_us.get(msgid, DISABLED if msgid in self._sources else 0)
         return Result.ACCEPTED, [dialect.new("MESSAGE_INTERVAL", message_id=msgid, interval_us=interval)]
 
     def _request_autopilot_capabilities(self, param1: float, param2: float) -> tuple[Result, list[Message]]:
-        return self._request_message(AUTOPILOT_VERSION, 0.0) if param1 == 1 else (Result.DENIED, [])
+        if param1 != 1:
+            return Result.DENIED, []
+        return self._request_message(mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION, 0.0)
 
 
-def _whole(value: float) -> int:
-    """A parameter that means an id, -1 where it can mean none."""
+_COMMANDS = frozenset({mavlink.MAVLINK_MSG_ID_COMMAND_INT, mavlink.MAVLINK_MSG_ID_COMMAND_LONG})
+
+
+def _to_message_id(value: float) -> int:
+    """Return the message id in a command parameter, -1 if it is not an integer."""
     return int(value) if math.isfinite(value) and value == int(value) else -1

@@ -1,12 +1,12 @@
-"""Message -> records. Never raises on what a foreign sender put into a message.
+"""Decoding of MAVLink messages to records. Never raises on the content of a message.
 
-Absence has many spellings on the wire: NaN, all ones, zero time, zero accuracy. Each becomes `None` where
-the record allows it; where the record needs the number, the message becomes a `Rejection` that says why.
-A message that carries no measurement by its own word (no airspeed sensor, a compass without an
-accelerometer) becomes nothing at all.
+An absent value has several encodings on the wire: NaN, all ones, zero time, zero accuracy. Each becomes
+`None` where the record allows it; where the record needs the number, the message becomes a `Rejection` with
+the reason. A message that states that it carries no measurement (no airspeed sensor, a compass without an
+accelerometer) gives no record.
 
-Headings come out in [0, 2 pi). Times go through the sender's `Clock`; what is sent without a time is stamped
-with its arrival, less what the link is late by.
+Headings are in [0, 2 pi). Times are mapped by the sender's `Clock`; a message without a time is stamped with
+its arrival, less the delay of the link.
 """
 
 from __future__ import annotations
@@ -16,19 +16,20 @@ from collections.abc import Callable
 from typing import Literal, NamedTuple, Protocol, TypeAlias
 
 from companion.link import dialect
+from companion.link.dialect import mavlink, rsbn
 from companion.link.fields import (
+    InvalidField,
     Message,
-    Refused,
     accuracy,
     dilution,
     euler,
     known_position,
-    maybe,
-    maybe_vector,
     number,
+    optional_number,
+    optional_vector,
     position,
     vector,
-    wrapped,
+    wrap_heading,
 )
 from companion.records import (
     AirData,
@@ -48,40 +49,49 @@ from companion.records import (
     Truth,
     Wind,
 )
+from companion.units import G0
 
 Autopilot: TypeAlias = Literal["ardupilot", "px4", "other"]
-MAKES: dict[int, Autopilot] = {3: "ardupilot", 12: "px4"}  # MAV_AUTOPILOT
+#: Autopilot by MAV_AUTOPILOT.
+MAKES: dict[int, Autopilot] = {
+    mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA: "ardupilot",
+    mavlink.MAV_AUTOPILOT_PX4: "px4",
+}
 
 UERE = 4.0
-"""User range error, one sigma, m, that turns a dilution of precision into metres where a receiver gives no
-accuracy of its own: 7.8 m at 95 % (GPS SPS Performance Standard, 4th edition 2008, table 3.4-1)."""
-G = 9.80665
-"""Standard gravity, m/s^2: MAVLink's mG are thousandths of it."""
+"""User range error, one sigma, m: converts a dilution of precision to metres where a receiver gives no
+accuracy; 7.8 m at 95 % (GPS SPS Performance Standard, 4th edition 2008, table 3.4-1)."""
 _ZERO_CELSIUS = 273.15
 FARTHEST, FASTEST, HIGHEST = 2.1e7, 3e3, 1e5
-"""Beyond these no number is a measurement: half the earth's girth (m), 3 km/s, 100 km. Filters that square
-them would still give numbers, but none that mean anything."""
-_UNIX_AFTER_US = 10**15  # 2001; a smaller number of microseconds is no date
+"""Limits of a measurement: half the earth's circumference (m), 3 km/s, 100 km."""
+_UNIX_AFTER_US = 10**15  # 2001; fewer microseconds are not a date
 
-_RSBN_AZIMUTH, _RSBN_RANGE, _RSBN_TEST, _RSBN_MEMORY = 1, 2, 4, 8
-_AIRSPEED_UNHEALTHY = 1
-_HIGHRES_INERTIAL, _HIGHRES_PRESSURE, _HIGHRES_DIFFERENTIAL, _HIGHRES_TEMPERATURE = 0x3F, 0x200, 0x400, 0x1000
-_EKF_GPS_GLITCHING = 32768  # of EKF_STATUS_FLAGS
-_ESTIMATOR_GPS_GLITCH = 1024  # of ESTIMATOR_STATUS_FLAGS; there 1024 is EKF_UNINITIALIZED
+_INERTIAL_UPDATED = (
+    mavlink.HIGHRES_IMU_UPDATED_XACC
+    | mavlink.HIGHRES_IMU_UPDATED_YACC
+    | mavlink.HIGHRES_IMU_UPDATED_ZACC
+    | mavlink.HIGHRES_IMU_UPDATED_XGYRO
+    | mavlink.HIGHRES_IMU_UPDATED_YGYRO
+    | mavlink.HIGHRES_IMU_UPDATED_ZGYRO
+)
+_SPEED_UNKNOWN, _COURSE_UNKNOWN, _SATELLITES_UNKNOWN = 0xFFFF, 0xFFFF, 0xFF
 
 
 class Clock(Protocol):
-    """How a sender's times map onto the companion's one clock (`link.clock.BootClock` is one)."""
+    """Mapping of a sender's times to the companion's clock (`link.clock.BootClock` is one)."""
 
     def local(self, stamp: int, received: int, /) -> int:
-        """When `stamp` was, all in nanoseconds: time since boot or since 1970, told apart by magnitude; 0 is
-        "unknown" and gives `received`, less what the link is late by."""
+        """Map `stamp` to local time, all in nanoseconds.
+
+        `stamp` is the time since boot or since 1970, distinguished by magnitude; 0 is "unknown" and gives
+        `received`, less the delay of the link.
+        """
 
 
 class Sender(NamedTuple):
-    """Whose messages these are: the clock they are stamped by, and the habits that differ by make.
+    """Sender of messages: its clock, its autopilot type, and default sigmas.
 
-    `sigma_azimuth` (rad) and `sigma_range` (m) stand in where an RSBN_MEASUREMENT leaves them open.
+    `sigma_azimuth` (rad) and `sigma_range` (m) are used where an RSBN_MEASUREMENT gives none.
     """
 
     clock: Clock
@@ -95,29 +105,29 @@ _DECODERS: dict[int, _Decoder] = {}
 
 
 def decode(message: Message, rx_ns: int, sender: Sender) -> tuple[Stamped, ...]:
-    """The records in `message`, received at `rx_ns` from `sender`; empty where it carries none.
+    """Decode `message`, received at `rx_ns` from `sender`; empty if it carries no record.
 
-    Never raises on a message's content: what cannot be used becomes a `Rejection` stamped `rx_ns`.
+    Never raises on a message's content: an unusable message becomes a `Rejection` stamped `rx_ns`.
     """
     decoder = _DECODERS.get(dialect.id_of(message))
     if decoder is None:
         return ()
     try:
         return decoder(message, rx_ns, sender)
-    except Refused as refused:
+    except InvalidField as error:
         name = dialect.TYPES[dialect.id_of(message)].name
-        return (Rejection(rx_ns, rx_ns, name, str(refused), refused.value, refused.limit),)
+        return (Rejection(rx_ns, rx_ns, name, str(error), error.value, error.limit),)
 
 
 def _of(*names: str) -> Callable[[_Decoder], _Decoder]:
-    """Enter a function into the table under the messages' names."""
+    """Register a function as the decoder of the named messages."""
 
-    def enter(decoder: _Decoder) -> _Decoder:
+    def register(decoder: _Decoder) -> _Decoder:
         for name in names:
             _DECODERS[dialect.type_named(name).msgid] = decoder
         return decoder
 
-    return enter
+    return register
 
 
 def _booted(message: Message, rx: int, sender: Sender) -> int:
@@ -139,27 +149,28 @@ def _unstamped(rx: int, sender: Sender) -> int:
 
 @_of("GPS_RAW_INT", "GPS2_RAW")
 def _gnss(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
-    """A fix; without one (`fix` below 2) too, so that its loss is seen.
+    """Decode a fix; also without a position (`fix` below 2), so that its loss is seen.
 
-    The receiver's `h_acc` is taken as the sigma of each axis, as both autopilots' filters do. Neither message
-    has a vertical velocity: `v_n` is horizontal, its third component 0.
+    The receiver's `h_acc` is the sigma of each axis, as in both autopilots' filters. Neither message has a
+    vertical velocity: the third component of `v_n` is 0.
     """
-    lat, lon = known_position(m) if m.fix_type >= 2 else position(m.lat, m.lon)
+    has_position = m.fix_type >= mavlink.GPS_FIX_TYPE_2D_FIX
+    lat, lon = known_position(m) if has_position else position(m.lat, m.lon)
     hdop, vdop = dilution(m.eph), dilution(m.epv)
     sigma_horizontal, sigma_vertical = accuracy(m.h_acc), accuracy(m.v_acc)
     if sigma_horizontal is None and hdop:
-        sigma_horizontal = UERE * hdop / math.sqrt(2.0)  # HDOP is of both axes together
+        sigma_horizontal = UERE * hdop / math.sqrt(2.0)  # HDOP covers both axes
     if sigma_vertical is None and vdop:
         sigma_vertical = UERE * vdop
     v_n = None
-    if m.fix_type >= 2 and m.vel != 0xFFFF and m.cog <= 36000:
+    if has_position and m.vel != _SPEED_UNKNOWN and m.cog <= 36000:
         speed, course = m.vel * 0.01, math.radians(m.cog * 0.01)
         v_n = (speed * math.cos(course), speed * math.sin(course), 0.0)
     return (
         Gnss(
             t_ns=_stamped(m, rx, sender),
             rx_ns=rx,
-            receiver=0 if dialect.id_of(m) == 24 else 1,
+            receiver=0 if dialect.id_of(m) == mavlink.MAVLINK_MSG_ID_GPS_RAW_INT else 1,
             stamp_us=m.time_usec,
             fix=m.fix_type,
             lat=lat,
@@ -169,7 +180,7 @@ def _gnss(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
             sigma_vertical=sigma_vertical,
             v_n=v_n,
             sigma_velocity=accuracy(m.vel_acc),
-            satellites=None if m.satellites_visible == 0xFF else m.satellites_visible,
+            satellites=None if m.satellites_visible == _SATELLITES_UNKNOWN else m.satellites_visible,
             hdop=hdop,
             alt=m.alt_ellipsoid * 1e-3 if m.alt_ellipsoid else None,
         ),
@@ -177,7 +188,7 @@ def _gnss(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
 
 
 # ---------------------------------------------------------------------------------------------------------
-# What the autopilot estimates
+# Estimates of the autopilot
 # ---------------------------------------------------------------------------------------------------------
 
 
@@ -205,7 +216,7 @@ def _home_position(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
 def _global_position(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
     lat, lon = known_position(m)
     v_n = vector(m, "vx vy vz", 0.01)
-    heading = None if m.hdg == 0xFFFF else wrapped(math.radians(m.hdg * 0.01))
+    heading = None if m.hdg == _COURSE_UNKNOWN else wrap_heading(math.radians(m.hdg * 0.01))
     t_ns = _booted(m, rx, sender)
     return (GlobalPosition(t_ns, rx, lat, lon, m.alt * 1e-3, v_n, m.relative_alt * 1e-3, heading),)
 
@@ -213,31 +224,33 @@ def _global_position(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]
 @_of("ATTITUDE")
 def _attitude(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
     roll, pitch, yaw = vector(m, "roll pitch yaw")
-    w_b = maybe_vector(m, "rollspeed pitchspeed yawspeed")
-    return (Attitude(_booted(m, rx, sender), rx, roll, pitch, wrapped(yaw), w_b),)
+    w_b = optional_vector(m, "rollspeed pitchspeed yawspeed")
+    return (Attitude(_booted(m, rx, sender), rx, roll, pitch, wrap_heading(yaw), w_b),)
 
 
 @_of("ATTITUDE_QUATERNION")
 def _attitude_quaternion(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
     q = number(m, "q1"), number(m, "q2"), number(m, "q3"), number(m, "q4")
     return (
-        Attitude(_booted(m, rx, sender), rx, *euler(q), maybe_vector(m, "rollspeed pitchspeed yawspeed")),
+        Attitude(_booted(m, rx, sender), rx, *euler(q), optional_vector(m, "rollspeed pitchspeed yawspeed")),
     )
 
 
 @_of("EKF_STATUS_REPORT")
 def _ekf_status(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
-    """ArduPilot's `pos_horiz_variance` is an innovation test ratio; it says nothing of accuracy."""
+    """Decode ArduPilot's filter status; `pos_horiz_variance` is an innovation test ratio, not an accuracy."""
     ratio = number(m, "pos_horiz_variance")
-    return (FilterStatus(_unstamped(rx, sender), rx, m.flags, bool(m.flags & _EKF_GPS_GLITCHING), ratio),)
+    return (
+        FilterStatus(_unstamped(rx, sender), rx, m.flags, bool(m.flags & mavlink.EKF_GPS_GLITCHING), ratio),
+    )
 
 
 @_of("ESTIMATOR_STATUS")
 def _estimator_status(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
-    """PX4 sends NaN for the ratio while no position is tested: 0, as ArduPilot says then."""
-    accuracy = maybe(m, "pos_horiz_accuracy") if sender.autopilot == "px4" else None
-    ratio = maybe(m, "pos_horiz_ratio") or 0.0
-    glitch = bool(m.flags & _ESTIMATOR_GPS_GLITCH)
+    """Decode PX4's filter status; its ratio is NaN while no position is tested, where ArduPilot sends 0."""
+    accuracy = optional_number(m, "pos_horiz_accuracy") if sender.autopilot == "px4" else None
+    ratio = optional_number(m, "pos_horiz_ratio") or 0.0
+    glitch = bool(m.flags & mavlink.ESTIMATOR_GPS_GLITCH)  # this bit is EKF_UNINITIALIZED in EKF_STATUS_FLAGS
     return (FilterStatus(_stamped(m, rx, sender), rx, m.flags, glitch, ratio, accuracy),)
 
 
@@ -257,66 +270,76 @@ def _highres_imu(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
     t_ns = _stamped(m, rx, sender)
     updated = m.fields_updated
     records: tuple[Stamped, ...] = ()
-    if updated & _HIGHRES_INERTIAL == _HIGHRES_INERTIAL:
+    if updated & _INERTIAL_UPDATED == _INERTIAL_UPDATED:
         records += (Imu(t_ns, rx, m.id, vector(m, "xacc yacc zacc"), vector(m, "xgyro ygyro zgyro")),)
-    if updated & _HIGHRES_PRESSURE:
+    if updated & mavlink.HIGHRES_IMU_UPDATED_ABS_PRESSURE:
         static = number(m, "abs_pressure", 100.0)
-        differential = maybe(m, "diff_pressure", 100.0) if updated & _HIGHRES_DIFFERENTIAL else None
-        celsius = maybe(m, "temperature") if updated & _HIGHRES_TEMPERATURE else None
+        differential = celsius = None
+        if updated & mavlink.HIGHRES_IMU_UPDATED_DIFF_PRESSURE:
+            differential = optional_number(m, "diff_pressure", 100.0)
+        if updated & mavlink.HIGHRES_IMU_UPDATED_TEMPERATURE:
+            celsius = optional_number(m, "temperature")
         kelvin = None if celsius is None else celsius + _ZERO_CELSIUS
         records += (Pressure(t_ns, rx, static, differential, kelvin),)
     return records
 
 
 def _scaled_imu(m: Message, t_ns: int, rx: int, source: int) -> tuple[Stamped, ...]:
-    f_b = vector(m, "xacc yacc zacc", 1e-3 * G)
+    f_b = vector(m, "xacc yacc zacc", 1e-3 * G0)
     if f_b == (0.0, 0.0, 0.0):
-        return ()  # a compass without an accelerometer: exactly 0 in all three is no specific force
+        return ()  # a compass without an accelerometer: a specific force is never exactly 0 in all axes
     return (Imu(t_ns, rx, source, f_b, vector(m, "xgyro ygyro zgyro", 1e-3)),)
 
 
 @_of("RAW_IMU")
 def _raw_imu(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
-    """By the standard in units of the sensor's own; ArduPilot sends mG and mrad/s, so of it alone."""
+    """Decode RAW_IMU of ArduPilot only, which sends mG and mrad/s; the standard leaves the units open."""
     if sender.autopilot != "ardupilot":
         return ()
     return _scaled_imu(m, _stamped(m, rx, sender), rx, m.id)
 
 
+_IMU_NUMBERS = {
+    mavlink.MAVLINK_MSG_ID_SCALED_IMU: 0,
+    mavlink.MAVLINK_MSG_ID_SCALED_IMU2: 1,
+    mavlink.MAVLINK_MSG_ID_SCALED_IMU3: 2,
+}
+
+
 @_of("SCALED_IMU", "SCALED_IMU2", "SCALED_IMU3")
 def _numbered_imu(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
-    return _scaled_imu(m, _booted(m, rx, sender), rx, {26: 0, 116: 1, 129: 2}[dialect.id_of(m)])
+    return _scaled_imu(m, _booted(m, rx, sender), rx, _IMU_NUMBERS[dialect.id_of(m)])
 
 
 @_of("VFR_HUD")
 def _vfr_hud(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
-    if maybe(m, "airspeed") is None:
-        return ()  # PX4's word for "no airspeed"
+    if optional_number(m, "airspeed") is None:
+        return ()  # PX4 sends NaN without an airspeed sensor
     airspeed = number(m, "airspeed", limit=FASTEST)
-    heading = wrapped(math.radians(m.heading)) if 0 <= m.heading <= 360 else None
+    heading = wrap_heading(math.radians(m.heading)) if 0 <= m.heading <= 360 else None
     return (
         AirData(
             _unstamped(rx, sender),
             rx,
             airspeed,
-            groundspeed=maybe(m, "groundspeed"),
-            climb=maybe(m, "climb"),
+            groundspeed=optional_number(m, "groundspeed"),
+            climb=optional_number(m, "climb"),
             heading=heading,
-            alt_msl=maybe(m, "alt"),
+            alt_msl=optional_number(m, "alt"),
         ),
     )
 
 
 @_of("AIRSPEED")
 def _airspeed(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
-    if m.flags & _AIRSPEED_UNHEALTHY:
-        raise Refused("the airspeed sensor calls itself unhealthy", float(m.airspeed))
+    if m.flags & mavlink.AIRSPEED_SENSOR_UNHEALTHY:
+        raise InvalidField("the airspeed sensor reports itself unhealthy", float(m.airspeed))
     return (AirData(_unstamped(rx, sender), rx, number(m, "airspeed", limit=FASTEST)),)
 
 
 @_of("WIND")
 def _wind(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
-    """ArduPilot's: the direction it blows from, the length of the whole vector, its down component."""
+    """Decode ArduPilot's wind: direction it blows from, length of the 3D vector, down component."""
     direction, speed, down = number(m, "direction"), number(m, "speed"), number(m, "speed_z")
     horizontal = math.sqrt(max(0.0, speed * speed - down * down))
     towards = math.radians(direction) + math.pi
@@ -329,8 +352,11 @@ def _wind(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
 
 @_of("WIND_COV")
 def _wind_cov(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
-    """PX4 leaves `horiz_accuracy` 0 and sends in `var_horiz` the sum of both axes' variances."""
-    sigma = maybe(m, "horiz_accuracy") or None
+    """Decode a wind with covariance.
+
+    PX4 sends `horiz_accuracy` 0, and in `var_horiz` the sum of the variances of both axes.
+    """
+    sigma = optional_number(m, "horiz_accuracy") or None
     if sigma is None and sender.autopilot == "px4" and 0.0 < m.var_horiz < math.inf:
         sigma = math.sqrt(0.5 * m.var_horiz)
     t_ns = _stamped(m, rx, sender)
@@ -339,40 +365,44 @@ def _wind_cov(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
 
 @_of("SCALED_PRESSURE")
 def _scaled_pressure(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
-    differential = maybe(m, "press_diff", 100.0)
+    differential = optional_number(m, "press_diff", 100.0)
     kelvin = m.temperature * 0.01 + _ZERO_CELSIUS
     return (Pressure(_booted(m, rx, sender), rx, number(m, "press_abs", 100.0), differential, kelvin),)
 
 
 def _sigma(message: Message, field: str, measured: float | None, configured: float) -> float:
-    """A sigma as sent, or as configured where it is left open."""
-    sigma = maybe(message, field)
+    """Return the sigma as sent, or as configured if the message gives none."""
+    sigma = optional_number(message, field)
     if sigma is None or (sigma <= 0.0 and measured is None):
         return configured
     if sigma <= 0.0:
-        raise Refused(f"{field} {sigma:g} is not positive", sigma, 0.0)
+        raise InvalidField(f"{field} {sigma:g} is not positive", sigma, 0.0)
     if sigma > FARTHEST:
-        raise Refused(f"{field} {sigma:g} tells nothing", sigma, FARTHEST)
+        raise InvalidField(f"{field} {sigma:g} is beyond the limit {FARTHEST:g}", sigma, FARTHEST)
     return sigma
 
 
 @_of("RSBN_MEASUREMENT")
 def _rsbn(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
-    if m.status & _RSBN_TEST:
-        raise Refused(f"beacon {m.beacon_id} sends a test signal")
-    if m.status & _RSBN_MEMORY:
-        raise Refused(f"beacon {m.beacon_id} is not heard: the receiver repeats its last answer")
+    if m.status & rsbn.RSBN_STATUS_TEST:
+        raise InvalidField(f"beacon {m.beacon_id} sends a test signal")
+    if m.status & rsbn.RSBN_STATUS_MEMORY:
+        raise InvalidField(f"beacon {m.beacon_id} is not received: the receiver repeats its last answer")
     lat, lon = position(m.beacon_lat, m.beacon_lon, ("beacon_lat", "beacon_lon"))
-    azimuth = maybe(m, "azimuth") if m.status & _RSBN_AZIMUTH else None
-    slant_range = maybe(m, "slant_range") if m.status & _RSBN_RANGE else None
+    azimuth = optional_number(m, "azimuth") if m.status & rsbn.RSBN_STATUS_AZIMUTH_VALID else None
+    slant_range = optional_number(m, "slant_range") if m.status & rsbn.RSBN_STATUS_RANGE_VALID else None
     if azimuth is None and slant_range is None:
-        raise Refused(f"beacon {m.beacon_id} gives neither azimuth nor range")
+        raise InvalidField(f"beacon {m.beacon_id} gives neither azimuth nor range")
     if azimuth is not None and abs(azimuth) > math.tau:
-        raise Refused(f"azimuth {azimuth:g} rad is no angle in radians", azimuth, math.tau)
+        raise InvalidField(
+            f"azimuth {azimuth:g} rad is not an angle in radians (limit 2 pi)", azimuth, math.tau
+        )
     if slant_range is not None and slant_range <= 0.0:
-        raise Refused(f"slant range {slant_range:g} m is not positive", slant_range, 0.0)
+        raise InvalidField(f"slant range {slant_range:g} m is not positive", slant_range, 0.0)
     if slant_range is not None and slant_range > FARTHEST:
-        raise Refused(f"slant range {slant_range:g} m is beyond the earth", slant_range, FARTHEST)
+        raise InvalidField(
+            f"slant range {slant_range:g} m is beyond the limit {FARTHEST:g} m", slant_range, FARTHEST
+        )
     return (
         RsbnFix(
             t_ns=_stamped(m, rx, sender),
@@ -381,7 +411,7 @@ def _rsbn(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
             lat=lat,
             lon=lon,
             alt=number(m, "beacon_alt", limit=HIGHEST),
-            azimuth=None if azimuth is None else wrapped(azimuth),
+            azimuth=None if azimuth is None else wrap_heading(azimuth),
             slant_range=slant_range,
             sigma_azimuth=_sigma(m, "sigma_azimuth", azimuth, sender.sigma_azimuth),
             sigma_range=_sigma(m, "sigma_range", slant_range, sender.sigma_range),
@@ -390,23 +420,28 @@ def _rsbn(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
 
 
 # ---------------------------------------------------------------------------------------------------------
-# What only a simulator knows
+# True state, sent by simulators only
 # ---------------------------------------------------------------------------------------------------------
 
 
 @_of("SIM_STATE")
 def _sim_state(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
-    """ArduPilot's. Without a time: up to one period late. Its altitude is above mean sea level; its simulated
-    earth has no geoid, so it is passed on as it is. The float `lat`, `lon` (degE7 in fact) are too coarse."""
+    """Decode the true state of ArduPilot's simulator.
+
+    The message has no time: its stamp is up to one period late. Its altitude is above mean sea level; the
+    simulated earth has no geoid, so it is used unchanged. The float fields `lat`, `lon` are too coarse.
+    """
     lat, lon = known_position(m, "lat_int", "lon_int")
     roll, pitch, yaw = vector(m, "roll pitch yaw")
     v_n = vector(m, "vn ve vd")
-    return (Truth(_unstamped(rx, sender), rx, lat, lon, number(m, "alt"), v_n, (roll, pitch, wrapped(yaw))),)
+    return (
+        Truth(_unstamped(rx, sender), rx, lat, lon, number(m, "alt"), v_n, (roll, pitch, wrap_heading(yaw))),
+    )
 
 
 @_of("HIL_STATE_QUATERNION")
 def _hil_state(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
-    """PX4's; its altitude as that of SIM_STATE."""
+    """Decode the true state of PX4's simulator; altitude as in SIM_STATE."""
     lat, lon = known_position(m)
     w, x, y, z = (float(c) for c in m.attitude_quaternion)
     t_ns = _stamped(m, rx, sender)

@@ -1,15 +1,15 @@
-"""The MAVLink messages the companion knows: pymavlink's generated classes and our own two. No parser, no I/O.
+"""MAVLink messages and constants: pymavlink's generated dialect and our own two messages. No parser, no I/O.
 
-The one importer of pymavlink. Of its dialects `all` is taken: it holds every message of `ardupilotmega` and
-`development` (PX4) with the same check bytes and 50 more, for the same price: importing it costs about
-0.03 s from a compiled cache and 13 MB. pymavlink's own parser and signature check are not used, see
+The only importer of pymavlink. Its dialect `all` is used: it holds every message of `ardupilotmega` and
+`development` (PX4) with the same CRC_EXTRA bytes and 50 more, at the same cost: 0.03 s to import from a
+compiled cache, and 13 MB. pymavlink's own parser and signature check are not used, see
 `companion.link.frame`.
 
-Our messages live in rsbn.xml. `python -m companion.link.dialect` regenerates generated/rsbn_dialect.py from it, by the
-mavgen of the installed wheel; `regenerate` does the same to another path.
+Our messages are defined in rsbn.xml. `python -m companion.link.dialect` regenerates generated/rsbn_dialect.py
+from it with the mavgen of the installed wheel; `regenerate` writes it to another path.
 
-A message is built by its class (`RsbnMeasurement(time_usec=..., ...)`) or by `new("ODOMETRY", x=...)`, read
-by its attributes, and told by `id_of(message)`. Do not read `.id`, `.name`, `.type`: payload fields shadow
+Create a message by its class (`RsbnMeasurement(time_usec=..., ...)`) or by `new("ODOMETRY", x=...)`, read its
+attributes, and get its id by `id_of(message)`. Do not read `.id`, `.name`, `.type`: payload fields shadow
 them in 41 messages.
 """
 
@@ -27,10 +27,12 @@ from typing import Any, NamedTuple, Protocol
 
 from pymavlink.dialects.v20 import all as _all
 
-from companion.link.generated import rsbn_dialect as rsbn
+from companion.link.generated import rsbn_dialect as _rsbn
 
-#: pymavlink's generated module, for its constants (`mavlink.MAV_TYPE_GCS`).
+#: The generated dialects, for their constants: `mavlink.MAV_TYPE_GCS`, `mavlink.MAVLINK_MSG_ID_HEARTBEAT`,
+#: `rsbn.RSBN_STATUS_TEST`. Import MAVLink ids and enum values from here.
 mavlink: Any = _all
+rsbn: Any = _rsbn
 
 #: A MAVLink message: an instance of one of pymavlink's generated classes, which carry no types.
 Message = Any
@@ -42,7 +44,7 @@ XML = Path(__file__).with_name("rsbn.xml")
 
 
 class Framed(Protocol):
-    """What `decode` reads of a frame; `companion.link.frame.Frame` is one."""
+    """Frame as read by `decode`; `companion.link.frame.Frame` is one."""
 
     @property
     def msgid(self) -> int: ...  # noqa: D102
@@ -57,7 +59,7 @@ class Framed(Protocol):
 
 
 class Field(NamedTuple):
-    """Where a field lies among the values that the message's struct unpacks."""
+    """Position of a field among the values unpacked by the message's struct."""
 
     name: str
     first: int
@@ -66,23 +68,23 @@ class Field(NamedTuple):
 
 
 class MessageType(NamedTuple):
-    """What the frame layer needs of a message: its name, layout and check byte."""
+    """Name, layout and CRC_EXTRA byte of a message."""
 
     msgid: int
     name: str
     layout: struct.Struct
     crc_extra: int
-    #: Bytes of payload without the extension fields: what MAVLink 1, which trims nothing, sends at least.
+    #: Payload size without the extension fields: the least that MAVLink 1, which trims nothing, sends.
     base_size: int
-    #: Names in the order of the wire if every field is one number, else empty.
+    #: Names in wire order if every field is one number, else empty.
     scalars: tuple[str, ...]
-    #: Fields in the order of the wire.
+    #: Fields in wire order.
     fields: tuple[Field, ...]
     cls: Any
-    #: What every field is if it is not given; and which are text.
+    #: Default value of every field, and the names of the text fields.
     zeros: dict[str, Any]
     texts: tuple[str, ...]
-    #: Attributes that pymavlink's base class gives every message, to be shared by all of this type.
+    #: Attributes set by pymavlink's base class, shared by all messages of the type.
     base: dict[str, Any]
 
 
@@ -93,7 +95,7 @@ def _describe(msgid: int, cls: Any) -> MessageType:
     for name, length in zip(cls.ordered_fieldnames, cls.lengths):
         fields.append(Field(name, first, length, types[name] == "char"))
         first += length
-    # mavgen gives default values to the extension fields and to no others; they lie last on the wire.
+    # mavgen gives default values to the extension fields only; they are last on the wire
     extensions = len(cls.__init__.__defaults__ or ())
     formats = re.findall(r"\d*[a-zA-Z]", cls.unpacker.format)
     base_size = struct.calcsize("<" + "".join(formats[: len(formats) - extensions]))
@@ -104,7 +106,7 @@ def _describe(msgid: int, cls: Any) -> MessageType:
     base |= {"_fieldnames": cls.fieldnames, "_instance_field": cls.instance_field}
     base["_instance_offset"] = cls.instance_offset
     scalars = tuple(cls.ordered_fieldnames) if plain else ()
-    # arrays are tuples here: all messages of the type share them
+    # arrays are tuples: all messages of the type share them
     zeros = {f.name: b"" if f.text else 0 if f.length == 1 else (0,) * f.length for f in fields}
     texts = tuple(f.name for f in fields if f.text)
     return MessageType(
@@ -122,7 +124,7 @@ def _describe(msgid: int, cls: Any) -> MessageType:
     )
 
 
-#: Every message known, by its id.
+#: Every known message by its id.
 TYPES: Mapping[int, MessageType] = {
     msgid: _describe(msgid, cls) for msgid, cls in (_all.mavlink_map | rsbn.mavlink_map).items()
 }
@@ -130,12 +132,12 @@ _BY_NAME: Mapping[str, MessageType] = {kind.name: kind for kind in TYPES.values(
 
 
 def id_of(message: Message) -> int:
-    """Return the message's id on the wire."""
+    """Return the message id."""
     return int(message._header.msgId)
 
 
 def type_named(name: str) -> MessageType:
-    """Return the type of the message called `name` (as in the XML, "GPS_RAW_INT")."""
+    """Return the type of the message `name` (as in the XML, "GPS_RAW_INT"). ValueError if unknown."""
     try:
         return _BY_NAME[name]
     except KeyError:
@@ -145,15 +147,15 @@ def type_named(name: str) -> MessageType:
 
 
 def new(name: str, /, **values: Any) -> Message:
-    """Build a message by its name, fields not given being 0 (text: empty, arrays: all 0).
+    """Create a message by its name; fields not given are 0 (text: empty, arrays: all 0).
 
-    Units are those of the wire, named in the message's XML.
+    Units are those of the wire, given in the message's XML. ValueError for an unknown message or field.
     """
     kind = type_named(name)
     if unknown := values.keys() - kind.zeros.keys():
         names = ", ".join(kind.zeros)
         raise ValueError(f"{name} has no field {sorted(unknown)[0]!r}; it has {names}")
-    message = _made(kind, 0, 0, 0, 0)
+    message = _blank_message(kind, 0, 0, 0, 0)
     for field in kind.texts:
         value = values.get(field, b"")
         raw = value.encode() if isinstance(value, str) else value
@@ -163,9 +165,9 @@ def new(name: str, /, **values: Any) -> Message:
 
 
 def decode(frame: Framed) -> Message:
-    """Return the message that a frame carries; a payload shorter than the message has its zeros put back.
+    """Decode the message of a frame; a payload shorter than the message is padded with zeros.
 
-    KeyError if the id is unknown. The payload is believed: the checksum is the reader's business.
+    KeyError if the id is unknown. The checksum was verified by the frame reader.
     """
     msgid, payload = frame.msgid, frame.payload
     kind = TYPES[msgid]
@@ -173,7 +175,7 @@ def decode(frame: Framed) -> Message:
     if len(payload) != size:
         payload = payload[:size].ljust(size, b"\0")
     values = kind.layout.unpack(payload)
-    message = _made(kind, len(payload), frame.sequence, frame.system, frame.component)
+    message = _blank_message(kind, len(payload), frame.sequence, frame.system, frame.component)
     attributes = message.__dict__
     if kind.scalars:
         attributes.update(zip(kind.scalars, values))
@@ -188,8 +190,8 @@ def decode(frame: Framed) -> Message:
     return message
 
 
-def _made(kind: MessageType, size: int, sequence: int, system: int, component: int) -> Message:
-    """A message without its fields, made without the constructors that cost more than all else of it."""
+def _blank_message(kind: MessageType, size: int, sequence: int, system: int, component: int) -> Message:
+    """Return a message without its fields, bypassing the constructors, which dominate the cost."""
     message = object.__new__(kind.cls)
     header = object.__new__(_all.MAVLink_header)
     header.__dict__ = {
@@ -206,7 +208,7 @@ def _made(kind: MessageType, size: int, sequence: int, system: int, component: i
 
 
 def payload(message: Message) -> bytes:
-    """Return the message's payload in full, zeros not trimmed: the mirror of `decode`.
+    """Encode the full payload of a message, zeros not trimmed; inverse of `decode`.
 
     ValueError if a field does not fit its wire type.
     """
@@ -227,15 +229,15 @@ def payload(message: Message) -> bytes:
 
 
 def regenerate(path: Path) -> None:
-    """Write the Python module of rsbn.xml to `path`, by the installed wheel's mavgen (wire protocol 2.0)."""
-    from pymavlink.generator import mavgen  # heavy, and needed by nobody who flies
+    """Generate the Python module of rsbn.xml at `path` with the installed mavgen (wire protocol 2.0)."""
+    from pymavlink.generator import mavgen  # slow to import, not needed in flight
 
     options = mavgen.Opts(os.fspath(path), wire_protocol="2.0", language="Python", validate=True)
-    said = io.StringIO()
-    with contextlib.redirect_stdout(said):
+    output = io.StringIO()
+    with contextlib.redirect_stdout(output):
         done = mavgen.mavgen(options, [os.fspath(XML)])
     if not done:
-        raise ValueError(f"mavgen refused {XML.name}: {said.getvalue().strip()}")
+        raise ValueError(f"mavgen rejected {XML.name}: {output.getvalue().strip()}")
 
 
 if __name__ == "__main__":

@@ -1,20 +1,20 @@
-"""MAVLink frames out of bytes and into bytes. Knows no clock, no socket, no key, and no meaning of a message.
+"""MAVLink frame reader and writer. Knows no clock, no socket, no key, and no meaning of a message.
 
     reader = Reader()
     for event in reader.receive(data):     # any split of the stream gives the same events
         ...                                # Frame | UnknownFrame | BadFrame
-    reader.close()                         # at the end of a file: what the buffer still holds
+    reader.close()                         # at the end of a file: events of the bytes still buffered
 
-A frame (MAVLink 1 or 2) is accepted when its checksum, which covers header, payload and the check byte of the
-message's layout, is right. After a rejection the search goes on at the very next byte, so a byte lost or
-damaged costs the frame it hit and not the ones that a false length would swallow.
+A frame (MAVLink 1 or 2) is accepted if its checksum over header, payload and the message's CRC_EXTRA byte is
+correct. After a rejection the search continues at the next byte, so a lost or damaged byte costs only the
+frame it hit, and not the frames that a wrong length would cover.
 
-The checksum of an unknown message id cannot be verified. Such a frame is skipped as a whole only if where it
-ends the next one visibly begins (a magic byte, and legal flags if MAVLink 2); otherwise it is taken for noise
-and its inside is searched as well. It is reported, without its payload, and never counted in the sequence.
+The checksum of an unknown message id cannot be verified. Such a frame is skipped as a whole only if another
+frame starts where it ends (a magic byte, and legal flags for MAVLink 2); otherwise it is treated as noise and
+its bytes are searched too. It is reported without its payload, and not counted in the sequence.
 
-At most one longest frame and the next one's head wait in the buffer. Nothing here raises on any bytes.
-A signature is kept with its frame and not judged.
+The buffer holds at most one frame of maximum size and the header of the next. No input raises. A signature is
+kept with its frame and not verified.
 """
 
 from __future__ import annotations
@@ -32,37 +32,37 @@ MAGIC_V1, MAGIC_V2 = 0xFE, 0xFD
 SIGNED = 0x01
 SIGNATURE_SIZE = 13
 #: Header, longest payload, checksum, signature.
-LONGEST = 10 + 255 + 2 + SIGNATURE_SIZE
-#: Most bytes that wait: a longest frame of unknown id whose successor's flags are not yet here.
-MOST_WAITING = LONGEST + 2
-#: Senders whose sequence numbers are followed; a line that makes up more of them is counted as a whole.
-MOST_SENDERS = 256
+MAX_FRAME_SIZE = 10 + 255 + 2 + SIGNATURE_SIZE
+#: Maximum of buffered bytes: a frame of unknown id whose successor's flags are not received yet.
+MAX_WAITING = MAX_FRAME_SIZE + 2
+#: Senders with sequence counters of their own; frames of further senders count in the total only.
+MAX_SENDERS = 256
 #: A run of rejected bytes is reported at this length at the latest.
-LONGEST_RUN = 1024
+MAX_RUN = 1024
 
 _MAGIC = re.compile(b"[\xfd\xfe]")
-#: What the checksum takes in after the payload, by message id.
+#: CRC_EXTRA by message id.
 _CHECK_BYTE = {msgid: bytes([kind.crc_extra]) for msgid, kind in dialect.TYPES.items()}
 _BASE_SIZE = {msgid: kind.base_size for msgid, kind in dialect.TYPES.items()}
 _crc = crc16.mcrf4xx
 
 
 class Frame(NamedTuple):
-    """A frame with a right checksum. `payload` is as sent: MAVLink 2 trims trailing zeros."""
+    """A frame with a correct checksum. `payload` is as sent: MAVLink 2 trims trailing zeros."""
 
     msgid: int
     payload: bytes
     sequence: int
     system: int
     component: int
-    #: 13 bytes: link id, timestamp, hash; not verified here.
+    #: 13 bytes: link id, timestamp, hash; not verified.
     signature: bytes | None
-    #: The whole frame as it came, signature included.
+    #: The whole frame as received, signature included.
     raw: bytes
 
 
 class UnknownFrame(NamedTuple):
-    """What looks like a frame of a message that no dialect here knows; nothing in it is verified."""
+    """An apparent frame of a message unknown to the dialects; its contents are not verified."""
 
     msgid: int
     system: int
@@ -73,11 +73,11 @@ class UnknownFrame(NamedTuple):
 class Reason(enum.Enum):
     """Why bytes were rejected."""
 
-    JUNK = "no frame begins here"
+    JUNK = "no frame starts here"
     CHECKSUM = "wrong checksum"
     LENGTH = "a MAVLink 1 payload shorter than its message"
-    FLAGS = "incompatibility flags that are not understood"
-    UNKNOWN = "unknown message id, and no frame follows where it would end"
+    FLAGS = "unknown incompatibility flags"
+    UNKNOWN = "unknown message id, not followed by another frame"
     TORN = "the input ended inside a frame"
 
 
@@ -89,7 +89,7 @@ class BadFrame(NamedTuple):
 
 
 class Counts(NamedTuple):
-    """Frames of one sender: those that came, and those missing by the sequence numbers."""
+    """Frames of one sender: received, and lost by the sequence numbers."""
 
     received: int
     lost: int
@@ -98,10 +98,11 @@ class Counts(NamedTuple):
 Event = Frame | UnknownFrame | BadFrame
 
 
-def examine(buffer: bytes, at: int = 0) -> Frame | UnknownFrame | Reason | None:
-    """Judge the bytes from `at` on: a frame, the reason why none begins there, or None if more are needed.
+def parse(buffer: bytes, at: int = 0) -> Frame | UnknownFrame | Reason | None:
+    """Parse the frame at `at`: a frame, the reason why there is none, or None if more bytes are needed.
 
-    The step of `Reader`, also good by itself where another container tells the places of frames (tlog).
+    `Reader` calls it at every position; a container that knows where its frames start (tlog) can call it
+    alone.
     """
     left = len(buffer) - at
     if left < 8:
@@ -130,7 +131,7 @@ def examine(buffer: bytes, at: int = 0) -> Frame | UnknownFrame | Reason | None:
         return Reason.JUNK
     check_byte = _CHECK_BYTE.get(msgid)
     if check_byte is None:
-        follows = _begins(buffer, at + size)
+        follows = _starts_frame(buffer, at + size)
         if follows is None:
             return None
         return UnknownFrame(msgid, system, component, size) if follows else Reason.UNKNOWN
@@ -143,8 +144,8 @@ def examine(buffer: bytes, at: int = 0) -> Frame | UnknownFrame | Reason | None:
     return Frame(msgid, buffer[head:end], sequence, system, component, signature, raw)
 
 
-def _begins(buffer: bytes, at: int) -> bool | None:
-    """Tell whether a frame seems to begin at `at`; None if that is not yet seen."""
+def _starts_frame(buffer: bytes, at: int) -> bool | None:
+    """Return whether a frame seems to start at `at`; None if more bytes are needed."""
     head = buffer[at : at + 3]
     if not head or (head[0] == MAGIC_V2 and len(head) < 3):
         return None
@@ -152,10 +153,10 @@ def _begins(buffer: bytes, at: int) -> bool | None:
 
 
 class Reader:
-    """Frames of one stream, found however the stream is cut, and counted by sender."""
+    """Frame reader of one byte stream, which may be split anywhere; counts frames by sender."""
 
     def __init__(self, counting: bool = True) -> None:
-        """`counting`: count every frame; else whoever judges them is to call `count` for the genuine ones."""
+        """`counting`: count every frame; if False, the caller calls `count` for each accepted frame."""
         self._counting = counting
         self._waiting = b""
         self._run = 0
@@ -164,36 +165,36 @@ class Reader:
         self.received = self.lost = 0  # of all senders
 
     def receive(self, data: bytes) -> list[Event]:
-        """Take the next bytes of the stream and return what they complete, in order."""
+        """Process the next bytes of the stream; return the completed events in order."""
         return self._scan(self._waiting + data if self._waiting else bytes(data), ended=False)
 
     def close(self) -> list[Event]:
-        """Return what the buffer still holds now that nothing follows. The reader may be used again."""
+        """Return the events of the buffered bytes at the end of the stream. The reader may be used again."""
         events = self._scan(self._waiting, ended=True)
         self._end_run(events)
         return events
 
     @property
     def waiting(self) -> int:
-        """Bytes that wait for the rest of their frame, at most MOST_WAITING."""
+        """Number of bytes that wait for the rest of their frame, at most MAX_WAITING."""
         return len(self._waiting)
 
     @property
     def counts(self) -> dict[tuple[int, int], Counts]:
         """Frames received and lost by (system, component).
 
-        A step back of the sequence (a reordered or repeated frame, a reboot) counts as no loss; neither can
-        gaps of 128 frames or more be told from one.
+        A step back of the sequence (a reordered or repeated frame, a reboot) does not count as a loss. A gap
+        of 128 frames or more cannot be distinguished from a step back.
         """
         return {sender: Counts(received, lost) for sender, (_, received, lost) in self._senders.items()}
 
     def count(self, frame: Frame) -> None:
-        """Count a frame for its sender, and the ones that are missing before it."""
+        """Count a frame of its sender, and the frames lost before it."""
         sequence = frame.sequence
         self.received += 1
         sender = self._senders.get((frame.system, frame.component))
         if sender is None:
-            if len(self._senders) < MOST_SENDERS:
+            if len(self._senders) < MAX_SENDERS:
                 self._senders[frame.system, frame.component] = [sequence + 1 & 0xFF, 1, 0]
             return
         gap = sequence - sender[0] & 0xFF
@@ -207,7 +208,7 @@ class Reader:
         events: list[Event] = []
         at, end = 0, len(buffer)
         while at < end:
-            found = examine(buffer, at)
+            found = parse(buffer, at)
             if isinstance(found, Frame):
                 if self._run:
                     self._end_run(events)
@@ -233,9 +234,9 @@ class Reader:
         if not self._run:
             self._run_reason = reason
         self._run += size
-        while self._run >= LONGEST_RUN:
-            events.append(BadFrame(self._run_reason, LONGEST_RUN))
-            self._run -= LONGEST_RUN
+        while self._run >= MAX_RUN:
+            events.append(BadFrame(self._run_reason, MAX_RUN))
+            self._run -= MAX_RUN
             self._run_reason = Reason.JUNK
 
     def _end_run(self, events: list[Event]) -> None:
@@ -251,9 +252,9 @@ def encode(
     component: int,
     sign: Callable[[bytes], bytes] | None = None,
 ) -> bytes:
-    """Return `message` as a MAVLink 2 frame. ValueError if a field does not fit its wire type.
+    """Encode `message` as a MAVLink 2 frame. ValueError if a field does not fit its wire type.
 
-    `sign` gives the 13 bytes of a signature for the frame before them.
+    `sign` returns the 13 bytes of the signature for the frame that precedes them.
     """
     msgid = dialect.id_of(message)
     payload = dialect.payload(message).rstrip(b"\0") or b"\0"

@@ -1,17 +1,17 @@
-"""The configuration as MAVLink parameters: listed, read and set from a ground station. No clock, no link.
+"""Parameter protocol server: a ground station lists, reads and sets the configuration. No clock, no link.
 
-    for change in parameters.receive(message, frame, system, now_ns): ...   # change.config is the new whole
+    for change in parameters.receive(message, frame, system, now_ns): ...   # change.config is the new one
     for message in parameters.to_send(now_ns): ...                          # again at parameters.deadline()
 
-Numbers and switches are offered; texts and lists are not, nor what decides who may speak to us (sections LINK
-and SIGNING) or what is kept of earlier flights (LOG). A value must pass the same checks as in the file. One
-that does not is answered by the value that stands, and PARAM_ERROR. What is set is kept: `save` gets the text
-of a TOML file to be laid over the operator's own, and where it fails nothing is changed.
+Numbers and switches are parameters. Texts and lists are not, nor are the sections that decide who may connect
+(LINK and SIGNING) and which earlier flights are kept (LOG). A value must pass the same checks as in the file.
+If it does not, the answer is PARAM_ERROR and the value in effect. Set values are persistent: `save` receives
+the text of a TOML file to merge over the operator's file; if it fails, nothing is changed.
 
-Every parameter is a REAL32 on the wire. Ground stations disagree how an integer stands in param_value (as
-PX4's bytes or as ArduPilot's cast): MAVProxy and MAVSDK go by the kind of the vehicle's autopilot,
-QGroundControl by the component, and we fly under either autopilot. A REAL32 is the same in both and holds
-integers up to 2^24 exactly; greater ones cannot be set.
+Every parameter is a REAL32 on the wire. Ground stations disagree how an integer is stored in param_value
+(bytewise as PX4, or cast as ArduPilot): MAVProxy and MAVSDK choose by the vehicle's autopilot, QGroundControl
+by the component, and the companion runs with either autopilot. A REAL32 is the same in both encodings and
+holds integers up to 2^24 exactly; larger ones cannot be set.
 """
 
 from __future__ import annotations
@@ -24,29 +24,30 @@ from typing import Any, NamedTuple
 import msgspec
 
 from companion.config import Config
-from companion.config.validate import conflicts
+from companion.config.validate import find_conflicts
 from companion.link import dialect
-from companion.link.dialect import Message
+from companion.link.dialect import Message, mavlink
 from companion.link.frame import Frame
-from companion.link.rate_limiter import Bucket
+from companion.link.rate_limiter import RateLimiter
 
-PARAM_REQUEST_READ, PARAM_REQUEST_LIST, PARAM_SET = 20, 21, 23
-REAL32 = 9
-#: MAV_PARAM_ERROR.
-DOES_NOT_EXIST, OUT_OF_RANGE, PERMISSION_DENIED = 1, 2, 3
-LONGEST_NAME = 16
-EXACT = 1 << 24
-#: PARAM_VALUE a second, and at once: 37 bytes each.
+REAL32: int = mavlink.MAV_PARAM_TYPE_REAL32
+DOES_NOT_EXIST: int = mavlink.MAV_PARAM_ERROR_DOES_NOT_EXIST
+OUT_OF_RANGE: int = mavlink.MAV_PARAM_ERROR_VALUE_OUT_OF_RANGE
+PERMISSION_DENIED: int = mavlink.MAV_PARAM_ERROR_PERMISSION_DENIED
+MAX_NAME_LENGTH = 16
+#: Largest integer that a REAL32 holds exactly.
+MAX_INTEGER = 1 << 24
+#: PARAM_VALUE per second, and at once: 37 bytes each.
 VALUES_HZ, VALUES_BURST = 40.0, 10
-#: Changes a second, and at once; what comes faster is dropped, and a station tries again.
+#: Changes per second, and at once; faster ones are dropped, and a station tries again.
 CHANGES_HZ, CHANGES_BURST = 5.0, 20
 
-#: Of no ground station's concern; a limit of the logs that was set wrong would erase flights.
+#: Sections without parameters; a wrong limit of the logs would erase flights.
 HIDDEN = frozenset({"link", "log", "signing"})
-#: What a ground station must not claim for the aircraft.
+#: Statement about the aircraft, not to be changed by a ground station.
 HIDDEN_KEYS = frozenset({("inertial", "independent")})
 _SECTIONS = {"RATES": "RATE", "INERTIAL": "INS", "PREDICTOR": "PRED", "ESTIMATOR": "EST", "OUTPUT": "OUT"}
-#: Applied in this order to names that are too long.
+#: Abbreviations, applied in this order to names that are too long.
 _SHORT = {
     "GLOBAL_POSITION_SENSOR": "GPSENS",
     "ANGLE_RANDOM_WALK": "ARW",
@@ -71,25 +72,32 @@ _SHORT = {
     "SIGMA": "SIG",
     "VELOCITY": "VEL",
 }
+_REQUESTS = frozenset(
+    {
+        mavlink.MAVLINK_MSG_ID_PARAM_REQUEST_READ,
+        mavlink.MAVLINK_MSG_ID_PARAM_REQUEST_LIST,
+        mavlink.MAVLINK_MSG_ID_PARAM_SET,
+    }
+)
 
 Value = float | int | bool
 
 
 class Parameter(NamedTuple):
-    """A key of the configuration that is a parameter; `kind` is float, int or bool (0 and 1 on the wire)."""
+    """A configuration key offered as a parameter; `kind` is float, int or bool (0 and 1 on the wire)."""
 
     name: str
     section: str
     key: str
     kind: type
 
-    def of(self, config: Config) -> Any:
-        """Its value in `config`."""
+    def value_in(self, config: Config) -> Any:
+        """Return its value in `config`."""
         return getattr(getattr(config, self.section), self.key)
 
 
 class ParameterChanged(NamedTuple):
-    """A parameter was set: the configuration with it, to be applied."""
+    """A parameter was set: the new configuration, to be applied."""
 
     config: Config
     parameter: Parameter
@@ -97,24 +105,24 @@ class ParameterChanged(NamedTuple):
     new: Value
 
 
-def name_of(section: str, key: str) -> str:
-    """The parameter's name: SECTION_KEY, shortened to 16 characters by a rule that looks at nothing else."""
+def parameter_name(section: str, key: str) -> str:
+    """Return the name SECTION_KEY, shortened to 16 characters; it depends on section and key only."""
     prefix = section.upper()
     name = f"{_SECTIONS.get(prefix, prefix)}_{key.upper()}"
-    if len(name) > LONGEST_NAME:
+    if len(name) > MAX_NAME_LENGTH:
         name = f"_{name}_"
         for word, short in _SHORT.items():
             name = name.replace(f"_{word}_", f"_{short}_")
         name = name.strip("_")
     words = name.split("_")
-    while len("_".join(words)) > LONGEST_NAME:  # keys that _SHORT does not know: the longest words are cut
+    while len("_".join(words)) > MAX_NAME_LENGTH:  # keys not in _SHORT: cut the longest words
         longest = max(range(len(words)), key=lambda i: len(words[i]))
         words[longest] = words[longest][:-1]
     return "_".join(words)
 
 
-def table() -> tuple[Parameter, ...]:
-    """All parameters, in the order of the configuration. ValueError if two would have one name."""
+def parameter_table() -> tuple[Parameter, ...]:
+    """Return all parameters in the order of the configuration. ValueError if two have the same name."""
     found: dict[str, Parameter] = {}
     for parameter in _keys():
         if (other := found.setdefault(parameter.name, parameter)) is not parameter:
@@ -132,11 +140,11 @@ def _keys() -> Iterator[Parameter]:
         for field in msgspec.structs.fields(type(getattr(Config(), section))):
             kind = type(field.default)
             if kind in (float, int, bool) and (section, field.name) not in HIDDEN_KEYS:
-                yield Parameter(name_of(section, field.name), section, field.name, kind)
+                yield Parameter(parameter_name(section, field.name), section, field.name, kind)
 
 
-class Parameters:
-    """The configuration that stands, and what of it is still to be told."""
+class ParameterServer:
+    """The configuration in effect, and the parameter values that remain to be sent."""
 
     def __init__(
         self,
@@ -146,86 +154,95 @@ class Parameters:
         base: Config | None = None,
         save: Callable[[str], None] = lambda text: None,
     ) -> None:
-        """`base`: the operator's configuration without what was set here before; `config` is with it.
+        """Create a server for our component id.
 
-        `save` may raise OSError.
+        Parameters
+        ----------
+        component
+            Our component id.
+        config
+            The configuration in effect.
+        base
+            The operator's configuration, without the parameters set before; by default `config`.
+        save
+            Stores the TOML text of all set parameters; may raise OSError.
         """
         self.config = config
         self._component = component
         self._base = base or config
         self._save = save
-        self._table = table()
+        self._table = parameter_table()
         self._index = {parameter.name: index for index, parameter in enumerate(self._table)}
-        self._pending: dict[int, None] = {}  # indices to be told, in this order
+        self._pending: dict[int, None] = {}  # indices to send, in this order
         self._errors: list[Message] = []
-        self._values = Bucket(VALUES_HZ, VALUES_BURST)
-        self._changes = Bucket(CHANGES_HZ, CHANGES_BURST)
+        self._value_limiter = RateLimiter(VALUES_HZ, VALUES_BURST)
+        self._change_limiter = RateLimiter(CHANGES_HZ, CHANGES_BURST)
         self._deadline: int | None = None
 
     def receive(self, message: Message, frame: Frame, system: int, now_ns: int) -> list[ParameterChanged]:
-        """Take a message of the parameter protocol that is meant for us; others mean nothing.
+        """Process a parameter message addressed to us; return the changes. Other messages are ignored.
 
         `system` is our own id.
         """
-        if frame.msgid not in (PARAM_REQUEST_READ, PARAM_REQUEST_LIST, PARAM_SET):
+        if frame.msgid not in _REQUESTS:
             return []
         if message.target_system not in (0, system) or message.target_component not in (0, self._component):
             return []
-        if frame.msgid == PARAM_REQUEST_LIST:
+        if frame.msgid == mavlink.MAVLINK_MSG_ID_PARAM_REQUEST_LIST:
             self._pending |= dict.fromkeys(range(len(self._table)))
             return []
-        if frame.msgid == PARAM_REQUEST_READ and message.param_index >= 0:
+        if frame.msgid == mavlink.MAVLINK_MSG_ID_PARAM_REQUEST_READ and message.param_index >= 0:
             index = message.param_index if message.param_index < len(self._table) else None
         else:
             index = self._index.get(message.param_id)
         if index is None:
-            # a broadcast is for whom it concerns
-            if message.target_component and self._changes.take(now_ns):
-                self._refuse(message, frame, DOES_NOT_EXIST)
+            # a broadcast of an unknown name is meant for another component
+            if message.target_component and self._change_limiter.take(now_ns):
+                self._send_error(message, frame, DOES_NOT_EXIST)
             return []
-        if frame.msgid == PARAM_REQUEST_READ:
-            self._tell_first(index)
+        if frame.msgid == mavlink.MAVLINK_MSG_ID_PARAM_REQUEST_READ:
+            self._send_first(index)
             return []
-        return self._set(index, message, frame) if self._changes.take(now_ns) else []
+        return self._set_parameter(index, message, frame) if self._change_limiter.take(now_ns) else []
 
     def to_send(self, now_ns: int) -> list[Message]:
-        """The messages to be sent now, on every link: a value is news for all stations."""
+        """Return the messages to send now, on every link: all stations need a changed value."""
         messages, self._errors = self._errors, []
-        while self._pending and self._values.take(now_ns):
+        while self._pending and self._value_limiter.take(now_ns):
             index = next(iter(self._pending))
             del self._pending[index]
             messages.append(self._value(index))
-        self._deadline = self._values.ready_at(now_ns) if self._pending else None
+        self._deadline = self._value_limiter.ready_at(now_ns) if self._pending else None
         return messages
 
     def deadline(self) -> int | None:
-        """When `to_send` is next worth calling without news; None: not before there are any."""
+        """Return when `to_send` has something to send without a new message; None if nothing is pending."""
         return self._deadline
 
-    def _set(self, index: int, message: Message, frame: Frame) -> list[ParameterChanged]:
-        self._tell_first(index)
+    def _set_parameter(self, index: int, message: Message, frame: Frame) -> list[ParameterChanged]:
+        self._send_first(index)
         parameter = self._table[index]
-        old = parameter.of(self.config)
+        old = parameter.value_in(self.config)
         if message.param_type != REAL32:
-            self._refuse(message, frame, OUT_OF_RANGE)
+            self._send_error(message, frame, OUT_OF_RANGE)
             return []
         if _real32(message.param_value) == _real32(old):
             return []
         try:
-            new = _meant(parameter, message.param_value)
-            config = _with(self.config, parameter, new)
+            new = _to_value(parameter, message.param_value)
+            config = _replace_value(self.config, parameter, new)
         except (ValueError, msgspec.ValidationError):
-            self._refuse(message, frame, OUT_OF_RANGE)
+            self._send_error(message, frame, OUT_OF_RANGE)
             return []
         try:
             self._save(self._overrides(config))
         except OSError:
-            self._refuse(message, frame, PERMISSION_DENIED)
+            self._send_error(message, frame, PERMISSION_DENIED)
             return []
         self.config = config
         return [ParameterChanged(config, parameter, old, new)]
 
-    def _tell_first(self, index: int) -> None:
+    def _send_first(self, index: int) -> None:
         self._pending = {index: None} | self._pending
 
     def _value(self, index: int) -> Message:
@@ -233,30 +250,30 @@ class Parameters:
         return dialect.new(
             "PARAM_VALUE",
             param_id=parameter.name,
-            param_value=_real32(parameter.of(self.config)),
+            param_value=_real32(parameter.value_in(self.config)),
             param_type=REAL32,
             param_count=len(self._table),
             param_index=index,
         )
 
-    def _refuse(self, message: Message, frame: Frame, error: int) -> None:
+    def _send_error(self, message: Message, frame: Frame, error: int) -> None:
         self._errors.append(
             dialect.new(
                 "PARAM_ERROR",
                 target_system=frame.system,
                 target_component=frame.component,
-                param_id=message.param_id.encode()[:LONGEST_NAME],
+                param_id=message.param_id.encode()[:MAX_NAME_LENGTH],
                 param_index=getattr(message, "param_index", -1),
                 error=error,
             )
         )
 
     def _overrides(self, config: Config) -> str:
-        lines = ["# Set over MAVLink, and written anew at every change; laid over the configuration file."]
+        lines = ["# Set over MAVLink, rewritten at every change, merged over the configuration file."]
         section = None
         for parameter in self._table:
-            value = parameter.of(config)
-            if value == parameter.of(self._base):
+            value = parameter.value_in(config)
+            if value == parameter.value_in(self._base):
                 continue
             if parameter.section != section:
                 section = parameter.section
@@ -265,25 +282,25 @@ class Parameters:
         return "\n".join(lines) + "\n"
 
 
-def _meant(parameter: Parameter, wire: float) -> Value:
-    """The value that a station means by a REAL32. ValueError if it can mean none."""
+def _to_value(parameter: Parameter, wire: float) -> Value:
+    """Convert a REAL32 to the parameter's type. ValueError if it is invalid."""
     if not math.isfinite(wire):
-        raise ValueError(f"{parameter.name} = {wire} is no number")
+        raise ValueError(f"{parameter.name} = {wire} is not a number")
     if parameter.kind is float:
         return _shortest(wire)
-    if wire != int(wire) or abs(wire) > EXACT or (parameter.kind is bool and wire not in (0.0, 1.0)):
-        raise ValueError(f"{parameter.name} = {wire} is no {parameter.kind.__name__}")
+    if wire != int(wire) or abs(wire) > MAX_INTEGER or (parameter.kind is bool and wire not in (0.0, 1.0)):
+        raise ValueError(f"{parameter.name} = {wire} is not a {parameter.kind.__name__}")
     value: Value = parameter.kind(wire)
     return value
 
 
-def _with(config: Config, parameter: Parameter, value: Value) -> Config:
-    """`config` with one value changed, checked as a file is. ValueError if it is impossible."""
+def _replace_value(config: Config, parameter: Parameter, value: Value) -> Config:
+    """Return `config` with one value replaced, checked like a file. ValueError if it is invalid."""
     section = getattr(config, parameter.section)
     changed = msgspec.structs.replace(section, **{parameter.key: value})
     checked = msgspec.convert(msgspec.to_builtins(changed), type(section))
     whole = msgspec.structs.replace(config, **{parameter.section: checked})
-    for *_, sentence in conflicts(whole):
+    for *_, sentence in find_conflicts(whole):
         raise ValueError(sentence)
     return whole
 
@@ -297,7 +314,7 @@ def _real32(value: float) -> float:
 
 
 def _shortest(wire: float) -> float:
-    """The decimal of fewest digits that this REAL32 stands for: 0.2, not 0.20000000298023224."""
+    """Return the shortest decimal that rounds to this REAL32: 0.2, not 0.20000000298023224."""
     for digits in range(1, 9):
         if _real32(short := float(f"{wire:.{digits}g}")) == wire:
             return short

@@ -1,19 +1,19 @@
-"""One MAVLink link, without its I/O: bytes and instants in, events and bytes out. No clock, no socket.
+"""State of one MAVLink link without its I/O: bytes and times in, events and bytes out. No clock, no socket.
 
-    events = session.receive(data, now_ns)      # whenever bytes came
+    events = session.receive(data, now_ns)      # whenever bytes arrived
     events = session.poll(now_ns)               # no later than session.deadline()
     for data in session.to_send(): ...          # after either, and after session.send(message)
 
-It says HEARTBEAT, finds the one autopilot and takes its system id, tells when it comes, goes silent or
-reboots, keeps its time on the companion's clock, answers TIMESYNC (so often and no more) and asks for the
-wanted message rates until they come. All else a peer says is handed up as MessageReceived. What messages mean
-is the business of `wire`.
+A session sends HEARTBEAT, finds the autopilot and adopts its system id, reports when it appears, is lost or
+reboots, maps its time to the companion's clock, answers TIMESYNC (rate-limited) and requests the configured
+message rates until they arrive. Every other message is passed up as MessageReceived; `companion.link.decode`
+interprets it.
 
-A vehicle has one autopilot: component 1 of a system, with a HEARTBEAT of a real autopilot and not of a
-ground station. The first one heard is kept; another is told once, then ignored altogether. Nothing a peer
-sends raises.
+A vehicle has one autopilot: component 1 of a system, with a HEARTBEAT of a real autopilot and not of a ground
+station. The first one received is kept; any other is reported once, then ignored. No input of a peer raises.
 
-With a `Signing` all that goes out is signed and what it refuses is told as Refused and goes no further.
+With a `Signing`, every sent frame is signed; received frames that it rejects are reported as FrameRejected
+and not processed.
 """
 
 from __future__ import annotations
@@ -23,36 +23,60 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 from companion.link import dialect, frame
-from companion.link.clock import JUMP, LATE, SECOND, BootClock, News
-from companion.link.dialect import Message
+from companion.link.clock import JUMP, LATE, BootClock, ClockChange
+from companion.link.dialect import Message, mavlink
 from companion.link.frame import BadFrame, Frame, UnknownFrame
-from companion.link.rate_limiter import Bucket
-from companion.link.signing import Refusal, Signing
-from companion.link.stream_rates import Streams
+from companion.link.rate_limiter import RateLimiter
+from companion.link.signing import SignatureFault, Signing
+from companion.link.stream_rates import StreamRates
+from companion.units import SECOND_NS
 
-HEARTBEAT_EVERY = SECOND
-TIMESYNC_EVERY = SECOND
-#: Answers to TIMESYNC a second, and at once: whoever asks faster is no clock.
+HEARTBEAT_INTERVAL = SECOND_NS
+TIMESYNC_INTERVAL = SECOND_NS
+#: TIMESYNC answers per second, and at once.
 ANSWERS_HZ, ANSWERS_BURST = 20.0, 10
-#: The autopilot is lost when nothing of it came for so long.
-LOST_AFTER = 5 * SECOND
-
-HEARTBEAT, SYSTEM_TIME, TIMESYNC = 0, 2, 111
-SET_MESSAGE_INTERVAL = 511
-AUTOPILOT_COMPONENT = 1
-TYPE_ONBOARD_CONTROLLER = 18
-AUTOPILOT_INVALID = 8
-STATE_ACTIVE = 4
-#: A link is late, or prompt again, once it was for so long: TIMESYNC has had its say by then.
-LATE_FOR = 2 * SECOND
-#: HEARTBEAT types that come from no autopilot, whatever their autopilot field says.
-NOT_VEHICLES = frozenset({5, 6, 18, 26, 27, 30, 31, 32, 33, 34, 36, 37, 38, 39, 40, 41, 42})
-#: Messages whose time_boot_ms is new in each: SYSTEM_TIME, ATTITUDE(_QUATERNION), LOCAL_ and GLOBAL_POSITION.
-CLOCKED = frozenset({2, 30, 31, 32, 33})
+#: The autopilot is lost when nothing was received from it for this time.
+LOST_AFTER = 5 * SECOND_NS
+#: A link is reported late, or prompt again, after this time: TIMESYNC has been answered by then.
+LATE_FOR = 2 * SECOND_NS
+#: HEARTBEAT types of peripherals and ground stations, whatever their autopilot field holds.
+NOT_VEHICLES = frozenset(
+    {
+        mavlink.MAV_TYPE_ANTENNA_TRACKER,
+        mavlink.MAV_TYPE_GCS,
+        mavlink.MAV_TYPE_ONBOARD_CONTROLLER,
+        mavlink.MAV_TYPE_GIMBAL,
+        mavlink.MAV_TYPE_ADSB,
+        mavlink.MAV_TYPE_CAMERA,
+        mavlink.MAV_TYPE_CHARGING_STATION,
+        mavlink.MAV_TYPE_FLARM,
+        mavlink.MAV_TYPE_SERVO,
+        mavlink.MAV_TYPE_ODID,
+        mavlink.MAV_TYPE_BATTERY,
+        mavlink.MAV_TYPE_PARACHUTE,
+        mavlink.MAV_TYPE_LOG,
+        mavlink.MAV_TYPE_OSD,
+        mavlink.MAV_TYPE_IMU,
+        mavlink.MAV_TYPE_GPS,
+        mavlink.MAV_TYPE_WINCH,
+    }
+)
+#: Messages stamped with time_boot_ms when they are sent.
+STAMPED_WHEN_SENT = frozenset(
+    {
+        mavlink.MAVLINK_MSG_ID_SYSTEM_TIME,
+        mavlink.MAVLINK_MSG_ID_ATTITUDE,
+        mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION,
+        mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED,
+        mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT,
+    }
+)
+_AUTOPILOT_COMPONENT: int = mavlink.MAV_COMP_ID_AUTOPILOT1
+_SYSTEM_TIME: int = mavlink.MAVLINK_MSG_ID_SYSTEM_TIME
 
 
 class LinkUp(NamedTuple):
-    """The autopilot is heard, first or again; `autopilot` is MAV_AUTOPILOT (3 ArduPilot, 12 PX4)."""
+    """The autopilot was received, for the first time or again; `autopilot` is MAV_AUTOPILOT."""
 
     at_ns: int
     system: int
@@ -60,22 +84,22 @@ class LinkUp(NamedTuple):
 
 
 class LinkLost(NamedTuple):
-    """Nothing of the autopilot came since `heard_ns`."""
+    """Nothing was received from the autopilot since `last_received_ns`."""
 
     at_ns: int
     system: int
-    heard_ns: int
+    last_received_ns: int
 
 
 class Rebooted(NamedTuple):
-    """The autopilot's boot time went back: its clock, origin and streams begin anew."""
+    """The autopilot's boot time went back: its clock, origin and streams are reset."""
 
     at_ns: int
     system: int
 
 
-class ClockLeapt(NamedTuple):
-    """The autopilot's clock was set: its times are mapped anew from here on, `by_ns` later than before."""
+class ClockJump(NamedTuple):
+    """The autopilot's clock was set: its times now map `by_ns` later than before."""
 
     at_ns: int
     system: int
@@ -83,23 +107,23 @@ class ClockLeapt(NamedTuple):
 
 
 class LinkLate(NamedTuple):
-    """All that comes has come late for a while, `by_ns` now; 0: the link is prompt again."""
+    """Messages have arrived late for LATE_FOR, by `by_ns` now; 0: the link is prompt again."""
 
     at_ns: int
     system: int
     by_ns: int
 
 
-class FalseTime(NamedTuple):
-    """A TIMESYNC answer that is of another clock, and was not believed: `off_ns` from what arrivals tell."""
+class TimesyncOutlier(NamedTuple):
+    """A TIMESYNC answer of another clock, not used: `error_ns` from the time estimated by arrivals."""
 
     at_ns: int
     system: int
-    off_ns: int
+    error_ns: int
 
 
 class SecondAutopilot(NamedTuple):
-    """Another autopilot is on the link and will be ignored; told once for each."""
+    """Another autopilot is on the link and is ignored; reported once for each."""
 
     at_ns: int
     system: int
@@ -107,7 +131,7 @@ class SecondAutopilot(NamedTuple):
 
 
 class MessageReceived(NamedTuple):
-    """A message, the frame it came in, and whether the vehicle's autopilot sent it."""
+    """A message, its frame, and whether the vehicle's autopilot sent it."""
 
     received_ns: int
     message: Message
@@ -116,32 +140,32 @@ class MessageReceived(NamedTuple):
 
 
 class NotUnderstood(NamedTuple):
-    """Bytes that are no frame, or a frame of an unknown message."""
+    """Bytes that are not a frame, or a frame of an unknown message."""
 
     received_ns: int
     what: BadFrame | UnknownFrame
 
 
-class Refused(NamedTuple):
-    """A frame that was not let in, being unsigned, forged or not of this time; its sender is a mere claim."""
+class FrameRejected(NamedTuple):
+    """A frame rejected by `Signing`; its sender ids are not verified."""
 
     received_ns: int
     system: int
     component: int
-    reason: Refusal
+    reason: SignatureFault
 
 
 Event = (
     LinkUp
     | LinkLost
     | Rebooted
-    | ClockLeapt
+    | ClockJump
     | LinkLate
-    | FalseTime
+    | TimesyncOutlier
     | SecondAutopilot
     | MessageReceived
     | NotUnderstood
-    | Refused
+    | FrameRejected
 )
 
 
@@ -151,18 +175,34 @@ class Session:
     def __init__(
         self,
         *,
-        component: int = 191,
+        component: int = mavlink.MAV_COMP_ID_ONBOARD_COMPUTER,
         system: int | None = None,
         autopilot_system: int | None = None,
         rates_hz: Mapping[str, float] | None = None,
         signing: Signing | None = None,
         link_id: int = 0,
     ) -> None:
-        """`system`: our own id, if None the autopilot's (1 until it is heard).
+        """Create a session.
 
-        `autopilot_system`: heed no other. `rates_hz`: rates wanted of the autopilot by message name.
-        `signing`: one for all links of a key, on which each signs with its own `link_id` (0-255).
-        ValueError on ids outside 1-255, unknown names and impossible rates.
+        Parameters
+        ----------
+        component
+            Our component id.
+        system
+            Our system id; if None, the autopilot's (1 until it is received).
+        autopilot_system
+            If given, any other autopilot is ignored.
+        rates_hz
+            Rates to request from the autopilot, by message name.
+        signing
+            One object for all links that share a key.
+        link_id
+            Link id (0-255) in the signatures of this link.
+
+        Raises
+        ------
+        ValueError
+            For ids outside 1-255, unknown message names and rates out of range.
         """
         for name, value in (
             ("component", component),
@@ -174,29 +214,32 @@ class Session:
         if not 0 <= link_id <= 255:
             raise ValueError(f"link_id {link_id} does not fit a signature: give 0 to 255")
         self.component = component
-        self.refused: Counter[Refusal] = Counter()
-        self.state = STATE_ACTIVE
+        self.rejected: Counter[SignatureFault] = Counter()
+        self.state: int = mavlink.MAV_STATE_ACTIVE  # for our heartbeat
         self.reader = frame.Reader(counting=False)
         self.clock = BootClock()
-        self.streams = Streams(_by_id(rates_hz or {}))
+        self.stream_rates = StreamRates(_by_id(rates_hz or {}))
         self._system = system
-        self._wanted = autopilot_system
+        self._required_system = autopilot_system
         self._autopilot: int | None = None  # its system id
-        self._kind = AUTOPILOT_INVALID
-        self._heard = 0
+        self._autopilot_type: int = mavlink.MAV_AUTOPILOT_INVALID
+        self._last_received = 0  # from the autopilot
         self._up = False
-        self._late_told = False
-        self._turned_at: int | None = None  # since when the link is not as late, or as prompt, as was told
+        self._reported_late = False
+        self._changed_at: int | None = None  # since when the lateness differs from the reported one
         self._ignored: set[int] = set()
         self._sequence = 0
-        self._outbox: list[bytes] = []
+        self._send_queue: list[bytes] = []
         self._signing = signing
         self._link_id = link_id
-        self._now = 0  # the last instant handed in
+        self._now = 0  # the last time supplied
         self._heartbeat_at = 0
         self._timesync_at = 0
-        self._answers = Bucket(ANSWERS_HZ, ANSWERS_BURST)
-        self._handlers = {HEARTBEAT: self._on_heartbeat, TIMESYNC: self._on_timesync}
+        self._answer_limiter = RateLimiter(ANSWERS_HZ, ANSWERS_BURST)
+        self._handlers = {
+            mavlink.MAVLINK_MSG_ID_HEARTBEAT: self._on_heartbeat,
+            mavlink.MAVLINK_MSG_ID_TIMESYNC: self._on_timesync,
+        }
 
     @property
     def system(self) -> int:
@@ -205,29 +248,29 @@ class Session:
 
     @property
     def autopilot(self) -> int | None:
-        """The autopilot's system id, None before it was heard."""
+        """The autopilot's system id, None before it was received."""
         return self._autopilot
 
     @property
-    def kind(self) -> int:
-        """The autopilot's MAV_AUTOPILOT, 8 (none) before it was heard."""
-        return self._kind
+    def autopilot_type(self) -> int:
+        """The autopilot's MAV_AUTOPILOT, MAV_AUTOPILOT_INVALID before it was received."""
+        return self._autopilot_type
 
     @property
     def is_up(self) -> bool:
-        """Whether the autopilot is heard."""
+        """Whether the autopilot is received."""
         return self._up
 
-    def heed(self, system: int) -> None:
-        """Take no other autopilot than that of `system`, unless one was heard before."""
-        self._wanted = self._wanted or system
+    def lock_to_system(self, system: int) -> None:
+        """Accept no autopilot but that of `system`, unless one was set or received before."""
+        self._required_system = self._required_system or system
 
-    def want(self, rates_hz: Mapping[str, float], now_ns: int) -> None:
-        """Ask the autopilot for these rates (Hz, by message name) from now on."""
-        self.streams.want(_by_id(rates_hz), now_ns)
+    def set_rates(self, rates_hz: Mapping[str, float], now_ns: int) -> None:
+        """Request these rates (Hz, by message name) from the autopilot from now on."""
+        self.stream_rates.set_rates(_by_id(rates_hz), now_ns)
 
     def receive(self, data: bytes, now_ns: int) -> list[Event]:
-        """Take bytes that arrived at `now_ns`; return what they mean, in order."""
+        """Process bytes that arrived at `now_ns`; return the events in order."""
         self._now = now_ns
         events: list[Event] = []
         for found in self.reader.receive(data):
@@ -238,55 +281,55 @@ class Session:
         return events
 
     def poll(self, now_ns: int) -> list[Event]:
-        """Do what is due at `now_ns`; return what the passing of time means."""
+        """Do what is due at `now_ns`; return the events caused by the elapsed time."""
         self._now = now_ns
         events: list[Event] = []
-        if self._up and now_ns - self._heard >= LOST_AFTER:
+        if self._up and now_ns - self._last_received >= LOST_AFTER:
             self._up = False
-            self.streams.stop()
-            events.append(LinkLost(now_ns, self._autopilot or 0, self._heard))
+            self.stream_rates.stop()
+            events.append(LinkLost(now_ns, self._autopilot or 0, self._last_received))
         if now_ns >= self._heartbeat_at:
-            self._heartbeat_at = now_ns + HEARTBEAT_EVERY
+            self._heartbeat_at = now_ns + HEARTBEAT_INTERVAL
             self.send(
                 dialect.new(
                     "HEARTBEAT",
-                    type=TYPE_ONBOARD_CONTROLLER,
-                    autopilot=AUTOPILOT_INVALID,
+                    type=mavlink.MAV_TYPE_ONBOARD_CONTROLLER,
+                    autopilot=mavlink.MAV_AUTOPILOT_INVALID,
                     system_status=self.state,
                     mavlink_version=3,
                 )
             )
         if self._up and now_ns >= self._timesync_at:
-            self._timesync_at = now_ns + TIMESYNC_EVERY
-            self.send(dialect.new("TIMESYNC", ts1=self.clock.ask(now_ns)))
-        for msgid, rate_hz in self.streams.due(now_ns):
-            self._ask_for(msgid, rate_hz)
+            self._timesync_at = now_ns + TIMESYNC_INTERVAL
+            self.send(dialect.new("TIMESYNC", ts1=self.clock.request(now_ns)))
+        for msgid, rate_hz in self.stream_rates.due(now_ns):
+            self._request_rate(msgid, rate_hz)
         return events
 
     def deadline(self) -> int:
-        """Return the instant at which `poll` must be called at the latest."""
+        """Return when `poll` must be called at the latest."""
         due = [self._heartbeat_at]
         if self._up:
-            due += [self._timesync_at, self._heard + LOST_AFTER]
-        if (check := self.streams.deadline()) is not None:
+            due += [self._timesync_at, self._last_received + LOST_AFTER]
+        if (check := self.stream_rates.deadline()) is not None:
             due.append(check)
         return min(due)
 
     def send(self, message: Message) -> None:
         """Queue a message for `to_send`. ValueError if a field does not fit its wire type."""
         sign = self._sign if self._signing else None
-        self._outbox.append(frame.encode(message, self._sequence, self.system, self.component, sign))
+        self._send_queue.append(frame.encode(message, self._sequence, self.system, self.component, sign))
         self._sequence = self._sequence + 1 & 0xFF
 
     def to_send(self) -> list[bytes]:
-        """Return the frames to be written now, oldest first, and forget them."""
-        sent, self._outbox = self._outbox, []
+        """Return and clear the queued frames, oldest first."""
+        sent, self._send_queue = self._send_queue, []
         return sent
 
     def to_local_ns(self, time_usec: int, received_ns: int) -> int:
-        """Return the local time for which a message stamped `time_usec` (since boot, or UNIX) was valid.
+        """Return the local time for which a message stamped `time_usec` (since boot, or UNIX) is valid.
 
-        The arrival where the stamp is 0 or not to be mapped yet; for a time_boot_ms give 1000 times it.
+        The arrival if the stamp is 0 or cannot be mapped yet. For a time_boot_ms give 1000 times it.
         """
         return self.clock.local(time_usec * 1000, received_ns)
 
@@ -295,88 +338,88 @@ class Session:
         return self._signing.sign(data, self._link_id, self._now)
 
     def _on_frame(self, found: Frame, now: int, events: list[Event]) -> None:
-        if self._signing is not None and (reason := self._signing.judge(found, now)) is not None:
-            self.refused[reason] += 1
-            events.append(Refused(now, found.system, found.component, reason))
+        if self._signing is not None and (reason := self._signing.verify(found, now)) is not None:
+            self.rejected[reason] += 1
+            events.append(FrameRejected(now, found.system, found.component, reason))
             return
         self.reader.count(found)
         if found.system in self._ignored:
             return
         if found.component == self.component and found.system == self.system:
-            return  # our own, sent back by a router
+            return  # our own frame, sent back by a router
         message = dialect.decode(found)
         if (handler := self._handlers.get(found.msgid)) is not None:
             handler(message, found, now, events)
             if found.system in self._ignored:
                 return
-        ours = found.system == self._autopilot and found.component == AUTOPILOT_COMPONENT
-        if ours:
+        from_autopilot = found.system == self._autopilot and found.component == _AUTOPILOT_COMPONENT
+        if from_autopilot:
             self._on_autopilot(message, found, now, events)
-        events.append(MessageReceived(now, message, found, ours))
+        events.append(MessageReceived(now, message, found, from_autopilot))
 
     def _on_autopilot(self, message: Message, found: Frame, now: int, events: list[Event]) -> None:
-        self._heard = now
+        self._last_received = now
         if not self._up:
             self._up = True
             self._timesync_at = now
-            self.streams.start(now)
-            events.append(LinkUp(now, found.system, self._kind))
-        self.streams.heard(found.msgid)
-        if found.msgid in CLOCKED and message.time_boot_ms:
+            self.stream_rates.start(now)
+            events.append(LinkUp(now, found.system, self._autopilot_type))
+        self.stream_rates.count(found.msgid)
+        if found.msgid in STAMPED_WHEN_SENT and message.time_boot_ms:
             boot = message.time_boot_ms * 1_000_000
             before = self.clock.offset(now)
-            news = self.clock.heard(boot, now)
-            if news is News.REBOOTED:
-                self.streams.start(now)
+            change = self.clock.update(boot, now)
+            if change is ClockChange.REBOOTED:
+                self.stream_rates.start(now)
                 events.append(Rebooted(now, found.system))
-            elif news is News.SET:
-                events.append(ClockLeapt(now, found.system, (before or 0) - (self.clock.offset(now) or 0)))
-            if found.msgid == SYSTEM_TIME:
-                self.clock.heard_unix(message.time_unix_usec * 1000, boot)
-            self._tell_lateness(now, found.system, events)
+            elif change is ClockChange.SET:
+                events.append(ClockJump(now, found.system, (before or 0) - (self.clock.offset(now) or 0)))
+            if found.msgid == _SYSTEM_TIME:
+                self.clock.update_unix(message.time_unix_usec * 1000, boot)
+            self._report_lateness(now, found.system, events)
 
-    def _tell_lateness(self, now: int, system: int, events: list[Event]) -> None:
+    def _report_lateness(self, now: int, system: int, events: list[Event]) -> None:
         late = self.clock.lateness(now)
-        if (late > LATE) == self._late_told:
-            self._turned_at = None
-        elif self._turned_at is None:
-            self._turned_at = now
-        elif now - self._turned_at >= LATE_FOR:
-            self._late_told, self._turned_at = not self._late_told, None
-            events.append(LinkLate(now, system, late if self._late_told else 0))
+        if (late > LATE) == self._reported_late:
+            self._changed_at = None
+        elif self._changed_at is None:
+            self._changed_at = now
+        elif now - self._changed_at >= LATE_FOR:
+            self._reported_late, self._changed_at = not self._reported_late, None
+            events.append(LinkLate(now, system, late if self._reported_late else 0))
 
     def _on_heartbeat(self, message: Message, found: Frame, now: int, events: list[Event]) -> None:
-        if found.component != AUTOPILOT_COMPONENT or message.autopilot == AUTOPILOT_INVALID:
+        if found.component != _AUTOPILOT_COMPONENT or message.autopilot == mavlink.MAV_AUTOPILOT_INVALID:
             return
         if message.type in NOT_VEHICLES:
             return
-        if self._autopilot is None and self._wanted in (None, found.system):
+        if self._autopilot is None and self._required_system in (None, found.system):
             self._autopilot = found.system
         if found.system == self._autopilot:
-            self._kind = message.autopilot
+            self._autopilot_type = message.autopilot
         else:
             self._ignored.add(found.system)
-            events.append(SecondAutopilot(now, found.system, self._autopilot or self._wanted or 0))
+            events.append(SecondAutopilot(now, found.system, self._autopilot or self._required_system or 0))
 
     def _on_timesync(self, message: Message, found: Frame, now: int, events: list[Event]) -> None:
         if message.tc1 == 0:
-            if self._answers.take(now):
+            if self._answer_limiter.take(now):
                 self.send(dialect.new("TIMESYNC", tc1=max(now, 1), ts1=message.ts1))
-        elif found.system == self._autopilot and found.component == AUTOPILOT_COMPONENT:
+        elif found.system == self._autopilot and found.component == _AUTOPILOT_COMPONENT:
             before = self.clock.offset(now)
-            self.clock.answered(message.ts1, message.tc1, now)
-            if (off := self.clock.outlier) is not None:
-                events.append(FalseTime(now, found.system, off))
+            self.clock.update_timesync(message.ts1, message.tc1, now)
+            if (error := self.clock.outlier) is not None:
+                events.append(TimesyncOutlier(now, found.system, error))
             elif before is not None and (by := before - (self.clock.offset(now) or 0)) < -JUMP:
-                events.append(ClockLeapt(now, found.system, by))  # it stood still, or was set back
+                events.append(ClockJump(now, found.system, by))  # the clock stopped, or was set back
 
-    def _ask_for(self, msgid: int, rate_hz: float) -> None:
+    def _request_rate(self, msgid: int, rate_hz: float) -> None:
         self.send(
             dialect.new(
                 "COMMAND_LONG",
                 target_system=self._autopilot or 0,
-                target_component=AUTOPILOT_COMPONENT,
-                command=SET_MESSAGE_INTERVAL,
+                target_component=_AUTOPILOT_COMPONENT,
+                command=mavlink.MAV_CMD_SET_MESSAGE_INTERVAL,
                 param1=msgid,
                 param2=1e6 / rate_hz,
             )

@@ -1,0 +1,107 @@
+"""Navigation: the earth, positions, strapdown integration, and linear error models.
+
+    earth            WGS84 radii, gravity, angular rates; the sphere of the error equations
+    geometry         geodetic, ECEF and local positions, lines of sight, the autopilots' flat earths
+    strapdown        integration of inertial measurements, and its inverse
+    error_model      error equations of an INS, the paper's and the complete ones
+    disturbances     slow disturbances, stochastic or bounded, that extend the error state
+    correctors       measurement rows of airspeed, logs, GNSS, radio navigation, stars
+    discretization   continuous system to one step, exact or Euler
+
+Geodetic positions are radians and metres above WGS84. `_n` is NED, `_b` the body, `_e` ECEF; `C_nb` rotates
+from b to n. Errors are computed minus true. numpy and scipy only, no I/O and no time. Functions of the same
+name in `disturbances` and `correctors` (a wind as a state and as a row) are reached through their modules.
+"""
+
+from companion.nav import correctors, disturbances, earth
+from companion.nav.correctors import observation_matrix
+from companion.nav.discretization import Discrete, discretise, euler
+from companion.nav.disturbances import Disturbance, Model, compose
+from companion.nav.earth import SPHERE, Radii, RateN, Sphere, earth_rate, gravity, radii, transport_rate
+from companion.nav.error_model import (
+    INS_STATES,
+    Example,
+    aircraft_matrix,
+    aircraft_model,
+    combine_systems,
+    paper_example,
+    paper_model,
+)
+from companion.nav.geometry import (
+    Geodetic,
+    LineOfSight,
+    Projection,
+    displace,
+    enu_axes,
+    from_ecef,
+    from_enu,
+    geodetic_to_local,
+    in_radio_sight,
+    local_to_geodetic,
+    radio_horizon,
+    separation,
+    slant_range_azimuth,
+    to_ecef,
+    to_enu,
+    wrap_angle,
+)
+from companion.nav.strapdown import (
+    InertialState,
+    StepMeans,
+    combine_two_samples,
+    mechanise,
+    rotation_matrix,
+    rotation_vector,
+    synthesise,
+)
+
+__all__ = [
+    "INS_STATES",
+    "SPHERE",
+    "Discrete",
+    "Disturbance",
+    "Example",
+    "Geodetic",
+    "InertialState",
+    "LineOfSight",
+    "Model",
+    "Projection",
+    "Radii",
+    "RateN",
+    "Sphere",
+    "StepMeans",
+    "aircraft_matrix",
+    "aircraft_model",
+    "combine_systems",
+    "combine_two_samples",
+    "compose",
+    "correctors",
+    "discretise",
+    "displace",
+    "disturbances",
+    "earth",
+    "earth_rate",
+    "enu_axes",
+    "euler",
+    "from_ecef",
+    "from_enu",
+    "geodetic_to_local",
+    "gravity",
+    "in_radio_sight",
+    "local_to_geodetic",
+    "mechanise",
+    "observation_matrix",
+    "paper_example",
+    "paper_model",
+    "radii",
+    "radio_horizon",
+    "rotation_matrix",
+    "rotation_vector",
+    "separation",
+    "slant_range_azimuth",
+    "synthesise",
+    "to_ecef",
+    "to_enu",
+    "transport_rate",
+    "wrap_angle",
+]

@@ -1,9 +1,9 @@
-"""What each corrector sees of the INS errors: rows of H in Z = INS - corrector = H X + N.
+"""Measurement rows of the correctors: H in Z = INS - corrector = H X + N.
 
 Poddubny (1.19)-(1.23), with x north, y east, z down. A row is a mapping from state name to coefficient;
-`rows` puts rows on the states of a model. Knows nothing of noise covariances, gating or time.
+`observation_matrix` puts rows on the states of a model. It does not know noise covariances, gating or time.
 
-The error of the ground velocity is written apart, since the two models mean different things by dVE:
+The error of the ground velocity is a separate argument, since the two models define dVE differently:
 `TRUE_VELOCITY` for the aircraft's (dVN, dVE are errors of the velocity itself), `paper_velocity` for the
 paper's (its dVE is the rate of dy). All velocity correctors are built on one of them.
 """
@@ -13,16 +13,21 @@ from math import cos, sin, tan
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from companion.nav.earth import SPHERE, Sphere
+from companion.units import Floats
 
-Matrix = npt.NDArray[np.float64]
 Row = dict[str, float]
 
 
 class VelocityError(NamedTuple):
-    """North and east error of the computed ground velocity, as rows."""
+    """Error of the computed ground velocity as rows.
+
+    Attributes
+    ----------
+    north, east : Row
+        Coefficients of the states in its components.
+    """
 
     north: Row
     east: Row
@@ -32,38 +37,129 @@ TRUE_VELOCITY = VelocityError({"dVN": 1.0}, {"dVE": 1.0})
 
 
 def paper_velocity(lat: float, v_north: float, v_east: float, sphere: Sphere = SPHERE) -> VelocityError:
-    """True velocity error in the paper's states: dVE + phi' tan(phi) dy - lam' sin(phi) dx, as in (1.19)."""
+    """Express the true velocity error in the paper's states: dVE + phi' tan(phi) dy - lam' sin(phi) dx.
+
+    Parameters
+    ----------
+    lat : float
+        Latitude, rad.
+    v_north, v_east : float
+        Ground velocity, in the unit of `sphere`.
+    sphere : Sphere
+        Spherical earth.
+
+    Returns
+    -------
+    VelocityError
+        Rows of north and east error.
+
+    References
+    ----------
+    Poddubny (1.19).
+    """
     lat_rate, lon_rate = v_north / sphere.R, v_east / (sphere.R * cos(lat))
     return VelocityError({"dVN": 1.0}, {"dVE": 1.0, "dx": -lon_rate * sin(lat), "dy": lat_rate * tan(lat)})
 
 
-def rows(states: Sequence[str], *row: Row) -> Matrix:
-    """H (k, n): the given rows on the `states` of a model. ValueError for a state the model has not."""
+def observation_matrix(states: Sequence[str], *row: Row) -> Floats:
+    """Put rows on the states of a model.
+
+    Parameters
+    ----------
+    states : sequence of str
+        The n states of the model, in order.
+    *row : Row
+        k rows.
+
+    Returns
+    -------
+    (k, n)
+        H.
+
+    Raises
+    ------
+    ValueError
+        For a state that the model does not have.
+    """
     index = {s: i for i, s in enumerate(states)}
     H = np.zeros((len(row), len(index)))
     for i, r in enumerate(row):
         for name, coefficient in r.items():
             if name not in index:
-                raise ValueError(f"a corrector sees {name}, which the model has not: add its disturbance")
+                raise ValueError(
+                    f"a corrector measures {name}, not a state of the model: add its disturbance"
+                )
             H[i, index[name]] = coefficient
     return H
 
 
 def airspeed(K: float, V_air: float, velocity: VelocityError = TRUE_VELOCITY) -> tuple[Row, Row]:
-    """Air velocity along and across the hull (INS minus air data), wind with its physical sign.
+    """Build the rows of the air velocity along and across the hull, INS minus air data, physical wind sign.
 
-    K heading, V_air true airspeed. The across row needs a sideslip vane or the assumption of none.
+    The across row needs a sideslip vane or the assumption of zero sideslip.
+
+    Parameters
+    ----------
+    K : float
+        Heading, rad.
+    V_air : float
+        True airspeed.
+    velocity : VelocityError
+        Error of the ground velocity in the model's states.
+
+    Returns
+    -------
+    tuple of Row
+        Along and across.
     """
     return _log(K, V_air, velocity, {"wN": 1.0}, {"wE": 1.0})
 
 
 def relative_log(K: float, V: float, velocity: VelocityError = TRUE_VELOCITY) -> tuple[Row, Row]:
-    """A log against the water, (1.19), (1.20), at speed V through it; the current enters with minus."""
+    """Build the rows of a log against the water; the current enters with minus.
+
+    Parameters
+    ----------
+    K : float
+        Heading, rad.
+    V : float
+        Speed through the water.
+    velocity : VelocityError
+        Error of the ground velocity in the model's states.
+
+    Returns
+    -------
+    tuple of Row
+        Along and across.
+
+    References
+    ----------
+    Poddubny (1.19), (1.20).
+    """
     return _log(K, V, velocity, {"VcX": -1.0}, {"VcY": -1.0})
 
 
 def absolute_log(K: float, V: float, velocity: VelocityError = TRUE_VELOCITY) -> tuple[Row, Row]:
-    """A log against the ground, Doppler radar, optical flow: (1.19) without current; V over ground."""
+    """Build the rows of a log against the ground, Doppler radar or optical flow.
+
+    Parameters
+    ----------
+    K : float
+        Heading, rad.
+    V : float
+        Speed over ground.
+    velocity : VelocityError
+        Error of the ground velocity in the model's states.
+
+    Returns
+    -------
+    tuple of Row
+        Along and across.
+
+    References
+    ----------
+    Poddubny (1.19) without current.
+    """
     return _log(K, V, velocity, {}, {})
 
 
@@ -75,42 +171,129 @@ def _log(K: float, V: float, velocity: VelocityError, flow_n: Row, flow_e: Row) 
 
 
 def gnss_position() -> tuple[Row, Row]:
-    """North and east, INS minus GNSS in metres (`geometry.separation`)."""
+    """Build the rows of a GNSS position, INS minus GNSS in metres (`geometry.separation`).
+
+    Returns
+    -------
+    tuple of Row
+        North and east.
+    """
     return {"dx": 1.0}, {"dy": 1.0}
 
 
 def gnss_velocity(velocity: VelocityError = TRUE_VELOCITY) -> tuple[Row, Row]:
-    """North and east, INS minus GNSS."""
+    """Build the rows of a GNSS velocity, INS minus GNSS.
+
+    Parameters
+    ----------
+    velocity : VelocityError
+        Error of the ground velocity in the model's states.
+
+    Returns
+    -------
+    tuple of Row
+        North and east.
+    """
     return velocity.north, velocity.east
 
 
 def line_of_position(N: float, M: float, drift: str | None = None) -> Row:
-    """A radio line of position (1.23): N dx + M dy + its slow drift, if that is a state."""
+    """Build the row of a radio line of position, N dx + M dy + its slow drift.
+
+    Parameters
+    ----------
+    N, M : float
+        Gradient of the measurement, north and east.
+    drift : str, optional
+        Name of the drift state, if there is one.
+
+    Returns
+    -------
+    Row
+        The row.
+
+    References
+    ----------
+    Poddubny (1.23).
+    """
     return {"dx": N, "dy": M} | ({drift: 1.0} if drift else {})
 
 
 def rsbn_range(bearing: float, elevation: float, drift: str | None = None) -> Row:
-    """Slant range to a beacon, computed minus measured.
+    """Build the row of a slant range to a beacon, computed minus measured.
 
-    `bearing` of the line from the beacon on, at the aircraft (the azimuth at the beacon plus the
-    convergence of the meridians, rad); `elevation` of the aircraft above the beacon's horizontal, rad.
+    Parameters
+    ----------
+    bearing : float
+        Direction of the line from the beacon, at the aircraft, rad (the azimuth at the beacon plus the
+        convergence of the meridians).
+    elevation : float
+        Elevation of the aircraft above the beacon's horizontal, rad.
+    drift : str, optional
+        Name of the drift state, if there is one.
+
+    Returns
+    -------
+    Row
+        The row.
     """
     return line_of_position(cos(bearing) * cos(elevation), sin(bearing) * cos(elevation), drift)
 
 
 def rsbn_azimuth(bearing: float, distance: float, drift: str | None = None) -> Row:
-    """Azimuth at a beacon, computed minus measured, rad; `bearing` as above, horizontal `distance`."""
+    """Build the row of an azimuth at a beacon, computed minus measured, rad.
+
+    Parameters
+    ----------
+    bearing : float
+        As in `rsbn_range`, rad.
+    distance : float
+        Horizontal distance to the beacon.
+    drift : str, optional
+        Name of the drift state, if there is one.
+
+    Returns
+    -------
+    Row
+        The row.
+
+    Raises
+    ------
+    ValueError
+        If the distance is not positive.
+    """
     if not distance > 0.0:
         raise ValueError(
-            f"horizontal distance to the beacon is {distance}: overhead an azimuth tells nothing"
+            f"horizontal distance to the beacon is {distance}: give a positive one, "
+            "overhead the azimuth is undefined"
         )
     return line_of_position(-sin(bearing) / distance, cos(bearing) / distance, drift)
 
 
 def star(h: float, q: float, lat: float, sphere: Sphere = SPHERE) -> tuple[Row, Row]:
-    """Altitude h and azimuth q (from north clockwise) of a star against the platform, (1.22).
+    """Build the rows of a star's altitude and azimuth against the platform.
 
     DEPARTS FROM (1.22): azimuth contains -PZ - tan(h) (cos(q) PX + sin(q) PY), there + PZ alone.
+
+    Parameters
+    ----------
+    h : float
+        Altitude of the star, rad.
+    q : float
+        Azimuth, from north clockwise, rad.
+    lat : float
+        Latitude, rad.
+    sphere : Sphere
+        Spherical earth.
+
+    Returns
+    -------
+    tuple of Row
+        Altitude and azimuth.
+
+    References
+    ----------
+    Poddubny (1.22).
     """
     R = sphere.R
     altitude = {"dx": cos(q) / R, "dy": sin(q) / R, "PX": sin(q), "PY": -cos(q)}
@@ -125,9 +308,27 @@ def star(h: float, q: float, lat: float, sphere: Sphere = SPHERE) -> tuple[Row, 
 
 
 def free_gyro(h: float, q: float, P: float, lat: float, sphere: Sphere = SPHERE) -> tuple[Row, Row]:
-    """A star whose place has errors of its own: dg along the parallel westward, dd in declination (1.22).
+    """Build the rows of a free gyro: a star with errors dg westward along the parallel, dd in declination.
 
-    P is the parallactic angle: at the star, from the pole to the zenith, counted westward.
+    Parameters
+    ----------
+    h, q : float
+        Altitude and azimuth, rad, as in `star`.
+    P : float
+        Parallactic angle, rad: at the star, from the pole to the zenith, counted westward.
+    lat : float
+        Latitude, rad.
+    sphere : Sphere
+        Spherical earth.
+
+    Returns
+    -------
+    tuple of Row
+        Altitude and azimuth.
+
+    References
+    ----------
+    Poddubny (1.21), (1.22).
     """
     altitude, azimuth = star(h, q, lat, sphere)
     return (
@@ -137,10 +338,23 @@ def free_gyro(h: float, q: float, P: float, lat: float, sphere: Sphere = SPHERE)
 
 
 def second_ins(
-    suffix: str = "2", seen: Sequence[str] = ("dx", "dy", "dVN", "dVE", "PX", "PY", "PZ")
+    suffix: str = "2", compared: Sequence[str] = ("dx", "dy", "dVN", "dVE", "PX", "PY", "PZ")
 ) -> list[Row]:
-    """First INS minus second: differences of like outputs, and angles between like axes of the platforms."""
-    return [{s: 1.0, s + suffix: -1.0} for s in seen]
+    """Build the rows of a second INS: first minus second, outputs and platform angles.
+
+    Parameters
+    ----------
+    suffix : str
+        Suffix of the second system's states.
+    compared : sequence of str
+        States that are compared.
+
+    Returns
+    -------
+    list of Row
+        One row for each state.
+    """
+    return [{s: 1.0, s + suffix: -1.0} for s in compared]
 
 
 def _scale(k: float, row: Row) -> Row:

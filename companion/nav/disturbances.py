@@ -1,12 +1,12 @@
-"""What disturbs an inertial system and its correctors, one declaration per kind: Poddubny (1.24)-(1.33).
+"""Disturbances of an inertial system and its correctors, one declaration per kind: Poddubny (1.24)-(1.33).
 
-Every slow disturbance d obeys d' = -a d + w. What drives it is declared either
+Every slow disturbance d obeys d' = -a d + w. Its driving noise is declared either
 
 - stochastic: w white of spectral density 2 a sigma^2, so that sigma is the steady deviation (1.25)-(1.32);
 - bounded ("restrictive"): w = u, unknown but |u| <= c (1.33), (1.36); it becomes a column of B.
 
-A constant has a = 0 and is unknown at the start only. The units are those of the INS equations it is put
-together with (`error_model`); the builders here only name states and say what they feed.
+A constant has a = 0 and is unknown at the start only. The units are those of the INS equations it is
+combined with (`error_model`); the builders here only name states and the states that they drive.
 """
 
 from collections.abc import Sequence
@@ -15,24 +15,35 @@ from math import cos, inf, isfinite, sin
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
-Matrix = npt.NDArray[np.float64]
+from companion.units import Floats
+
 Feed = tuple[str, str, float]
-"""(the state fed, the state feeding it, gain): fed' = ... + gain * feeding."""
+"""(driven state, driving state, gain): driven' = ... + gain * driving."""
 
 
 @dataclass(frozen=True, slots=True)
 class Disturbance:
-    """A group of states alike: independent, of equal decay, of equal deviation or bound."""
+    """Group of similar states: independent, of equal decay, of equal deviation or bound.
+
+    Attributes
+    ----------
+    states : tuple of str
+        Names.
+    decay : float
+        a, per unit of time; 0 for a constant.
+    sigma : float
+        Steady (for a constant: initial) standard deviation, if stochastic.
+    bound : float or None
+        c of |u| <= c, unit of the state per unit of time, if bounded.
+    feeds : tuple of Feed
+        States driven by the disturbance.
+    """
 
     states: tuple[str, ...]
     decay: float
-    """a, per unit of time; 0 for a constant."""
     sigma: float = 0.0
-    """Steady (for a constant: initial) standard deviation, if stochastic."""
     bound: float | None = None
-    """c of |u| <= c, unit of the state per unit of time, if bounded."""
     feeds: tuple[Feed, ...] = ()
 
     def __post_init__(self) -> None:
@@ -46,31 +57,62 @@ class Disturbance:
 
 
 class Model(NamedTuple):
-    """X' = A X + B u + w, |u| <= C, w of spectral density Q: the general model (1.35), (1.36)."""
+    """General model X' = A X + B u + w, |u| <= C, w of spectral density Q: (1.35), (1.36).
 
-    A: Matrix
-    """(n, n)."""
+    Attributes
+    ----------
+    A : (n, n)
+        Dynamics.
+    states : tuple of str
+        n names, in order.
+    Q : (n, n)
+        Spectral densities.
+    B : (n, m)
+        Influence of the bounded inputs, 0 or 1.
+    C : (m,)
+        Bounds of u.
+    sigma : (n,)
+        Steady deviations of the stochastic disturbances, 0 elsewhere: a prior for them.
+    """
+
+    A: Floats
     states: tuple[str, ...]
-    """n names, in order."""
-    Q: Matrix
-    """(n, n) spectral densities."""
-    B: Matrix
-    """(n, m), boolean."""
-    C: Matrix
-    """(m,) bounds of u."""
-    sigma: Matrix
-    """(n,) steady deviations of the stochastic disturbances, 0 elsewhere: a prior for them."""
+    Q: Floats
+    B: Floats
+    C: Floats
+    sigma: Floats
 
 
-def compose(A_ins: Matrix, ins_states: Sequence[str], disturbances: Sequence[Disturbance] = ()) -> Model:
-    """The general state (1.34): the INS block first, then the disturbances in the order given.
+def compose(A_ins: Floats, ins_states: Sequence[str], disturbances: Sequence[Disturbance] = ()) -> Model:
+    """Combine an INS block and disturbances to one model: the INS first, then the disturbances in order.
 
-    ValueError for a name used twice, or a feed from or into a state that is not there.
+    Parameters
+    ----------
+    A_ins : (k, k)
+        Dynamics of the INS errors.
+    ins_states : sequence of str
+        Their names.
+    disturbances : sequence of Disturbance
+        Extensions of the state.
+
+    Returns
+    -------
+    Model
+        The general model.
+
+    Raises
+    ------
+    ValueError
+        For a name used twice, or a feed from or into an unknown state.
+
+    References
+    ----------
+    Poddubny (1.34)-(1.36).
     """
     states = (*ins_states, *(s for d in disturbances for s in d.states))
     if len(set(states)) != len(states):
-        twice = sorted({s for s in states if states.count(s) > 1})
-        raise ValueError(f"states named twice: {', '.join(twice)}; give each disturbance names of its own")
+        repeated = sorted({s for s in states if states.count(s) > 1})
+        raise ValueError(f"states named twice: {', '.join(repeated)}; give each disturbance unique names")
     index = {s: i for i, s in enumerate(states)}
     n, n_ins = len(states), len(ins_states)
     A, Q, sigma = np.zeros((n, n)), np.zeros((n, n)), np.zeros(n)
@@ -95,31 +137,114 @@ def compose(A_ins: Matrix, ins_states: Sequence[str], disturbances: Sequence[Dis
 
 
 def gyro_constant(sigma: float) -> Disturbance:
-    """Constant part of the drift, E0 of (1.27), (1.28); minus the physical one, as P is."""
+    """Declare the constant part of the gyro drift, minus the physical one, as P is.
+
+    Parameters
+    ----------
+    sigma : float
+        Initial standard deviation, rad per unit of time.
+
+    Returns
+    -------
+    Disturbance
+        E0X, E0Y, E0Z.
+
+    References
+    ----------
+    Poddubny (1.27), (1.28).
+    """
     states = ("E0X", "E0Y", "E0Z")
     return Disturbance(states, 0.0, sigma, feeds=_pairs(("PX", "PY", "PZ"), states))
 
 
 def gyro_drift(decay: float, sigma: float = 0.0, bound: float | None = None) -> Disturbance:
-    """Slowly changing part of the drift, (1.29)."""
+    """Declare the slowly changing part of the gyro drift.
+
+    Parameters
+    ----------
+    decay : float
+        Decay rate, per unit of time.
+    sigma : float
+        Steady deviation, if stochastic.
+    bound : float, optional
+        Bound of its rate of change, if bounded.
+
+    Returns
+    -------
+    Disturbance
+        EX, EY, EZ.
+
+    References
+    ----------
+    Poddubny (1.29).
+    """
     states = ("EX", "EY", "EZ")
     return Disturbance(states, decay, sigma, bound, _pairs(("PX", "PY", "PZ"), states))
 
 
 def accelerometer_fast(decay: float, sigma: float = 0.0, bound: float | None = None) -> Disturbance:
-    """Fast part of the accelerometer errors, (1.24), (1.25); the only one of section 3."""
+    """Declare the fast part of the accelerometer errors; the only one of section 3.
+
+    Parameters
+    ----------
+    decay, sigma, bound
+        As in `gyro_drift`.
+
+    Returns
+    -------
+    Disturbance
+        AX, AY.
+
+    References
+    ----------
+    Poddubny (1.24), (1.25).
+    """
     states = ("AX", "AY")
     return Disturbance(states, decay, sigma, bound, _pairs(("dVN", "dVE"), states))
 
 
 def accelerometer_slow(decay: float, sigma: float = 0.0, bound: float | None = None) -> Disturbance:
-    """Slow part of the accelerometer errors, (1.24), (1.25)."""
+    """Declare the slow part of the accelerometer errors.
+
+    Parameters
+    ----------
+    decay, sigma, bound
+        As in `gyro_drift`.
+
+    Returns
+    -------
+    Disturbance
+        AsX, AsY.
+
+    References
+    ----------
+    Poddubny (1.24), (1.25).
+    """
     states = ("AsX", "AsY")
     return Disturbance(states, decay, sigma, bound, _pairs(("dVN", "dVE"), states))
 
 
 def gravity(speed: float, R_G: float, sigma: float = 0.0, bound: float | None = None) -> Disturbance:
-    """Gravity anomalies, stationary in space with correlation radius R_G: decay V/R_G, (1.26)."""
+    """Declare gravity anomalies, stationary in space: decay V/R_G.
+
+    Parameters
+    ----------
+    speed : float
+        Speed of the vehicle.
+    R_G : float
+        Correlation radius.
+    sigma, bound
+        As in `gyro_drift`.
+
+    Returns
+    -------
+    Disturbance
+        GX, GY.
+
+    References
+    ----------
+    Poddubny (1.26).
+    """
     states = ("GX", "GY")
     return Disturbance(states, speed / R_G, sigma, bound, _pairs(("dVN", "dVE"), states))
 
@@ -127,28 +252,104 @@ def gravity(speed: float, R_G: float, sigma: float = 0.0, bound: float | None = 
 def current(
     speed: float, decay: float, R_c: float, sigma: float = 0.0, bound: float | None = None
 ) -> Disturbance:
-    """Current as the paper counts it, minus the physical one: decay a_c + V/R_c, (1.30)."""
+    """Declare the current with the paper's sign, minus the physical one: decay a_c + V/R_c.
+
+    Parameters
+    ----------
+    speed : float
+        Speed of the vehicle.
+    decay : float
+        Decay rate in time, per unit of time.
+    R_c : float
+        Correlation radius.
+    sigma, bound
+        As in `gyro_drift`.
+
+    Returns
+    -------
+    Disturbance
+        VcX, VcY.
+
+    References
+    ----------
+    Poddubny (1.30).
+    """
     return Disturbance(("VcX", "VcY"), decay + speed / R_c, sigma, bound)
 
 
 def wind(
     speed: float, decay: float, R_w: float, sigma: float = 0.0, bound: float | None = None
 ) -> Disturbance:
-    """Wind from its physical side, north and east velocity of the air: in the role of (1.30)."""
+    """Declare the wind with its physical sign, north and east velocity of the air.
+
+    Parameters
+    ----------
+    speed : float
+        Speed of the vehicle.
+    decay : float
+        Decay rate in time, per unit of time.
+    R_w : float
+        Correlation radius.
+    sigma, bound
+        As in `gyro_drift`.
+
+    Returns
+    -------
+    Disturbance
+        wN, wE.
+
+    References
+    ----------
+    Poddubny (1.30), for the wind instead of the current.
+    """
     return Disturbance(("wN", "wE"), decay + speed / R_w, sigma, bound)
 
 
 def radio_drift(
     names: Sequence[str], decay: float, sigma: float = 0.0, bound: float | None = None
 ) -> Disturbance:
-    """Slow drift of radio lines of position, one state per line (1.32), named for the correctors."""
+    """Declare the slow drift of radio lines of position, one state per line.
+
+    Parameters
+    ----------
+    names : sequence of str
+        Names of the states, as given to the correctors.
+    decay, sigma, bound
+        As in `gyro_drift`.
+
+    Returns
+    -------
+    Disturbance
+        One state for each name.
+
+    References
+    ----------
+    Poddubny (1.32).
+    """
     return Disturbance(tuple(names), decay, sigma, bound)
 
 
 def free_gyro(
     P: float, decay: float, sigma: float = 0.0, bound: float | None = None
 ) -> tuple[Disturbance, Disturbance]:
-    """A free gyro ("artificial star") of parallactic angle P: axis (1.21) and drift b1, b2 (1.31)."""
+    """Declare a free gyro ("artificial star"): axis errors dg, dd and drift b1, b2.
+
+    Parameters
+    ----------
+    P : float
+        Parallactic angle, rad.
+    decay, sigma, bound
+        Of the drift, as in `gyro_drift`.
+
+    Returns
+    -------
+    tuple of Disturbance
+        Axis and drift.
+
+    References
+    ----------
+    Poddubny (1.21), (1.31).
+    """
     axis = Disturbance(("dg", "dd"), 0.0)
     feeds = (("dg", "b1", -cos(P)), ("dg", "b2", sin(P)), ("dd", "b1", sin(P)), ("dd", "b2", cos(P)))
     return axis, Disturbance(("b1", "b2"), decay, sigma, bound, feeds)

@@ -1,4 +1,4 @@
-"""The WGS84 earth as navigation sees it: radii of curvature, normal gravity, rates of rotation.
+"""WGS84 earth: radii of curvature, normal gravity, angular rates.
 
 Scalars in, scalars out, by `math`: these are called once a message. It knows neither positions in
 space (`geometry`) nor motion (`strapdown`). Rates are angular rates resolved in n (NED).
@@ -32,16 +32,28 @@ _M = OMEGA**2 * A**2 * B / GM
 
 
 class Radii(NamedTuple):
-    """Radii of curvature of the ellipsoid, m (named by the direction of motion, as Groves does)."""
+    """Radii of curvature of the ellipsoid, named by the direction of motion, as Groves does.
+
+    Attributes
+    ----------
+    R_N : float
+        In the meridian (north-south motion), m.
+    R_E : float
+        In the prime vertical (east-west motion), m.
+    """
 
     R_N: float
-    """In the meridian (north-south motion)."""
     R_E: float
-    """In the prime vertical (east-west motion)."""
 
 
 class RateN(NamedTuple):
-    """An angular rate resolved in n, rad/s."""
+    """Angular rate resolved in n.
+
+    Attributes
+    ----------
+    north, east, down : float
+        Components, rad/s.
+    """
 
     north: float
     east: float
@@ -49,35 +61,78 @@ class RateN(NamedTuple):
 
 
 class Sphere(NamedTuple):
-    """The spherical, uniformly heavy earth of the INS error equations, in any units that agree.
+    """Spherical earth of the INS error equations, in any consistent units.
 
-    Stands where an `Earth` (see `strapdown`) is wanted.
+    It can be used wherever an `Earth` (see `strapdown`) is expected.
+
+    Attributes
+    ----------
+    R : float
+        Radius.
+    G : float
+        Acceleration of gravity.
+    OMEGA : float
+        Rate of rotation.
     """
 
     R: float
-    """Radius."""
     G: float
-    """Acceleration of gravity."""
     OMEGA: float
-    """Rate of rotation."""
 
     def radii(self, lat: float) -> Radii:
-        """The same at every latitude."""
+        """Return the radius, the same at every latitude.
+
+        Parameters
+        ----------
+        lat : float
+            Latitude, rad; not used.
+
+        Returns
+        -------
+        Radii
+            R twice.
+        """
         return Radii(self.R, self.R)
 
     def gravity(self, lat: float, alt: float = 0.0) -> float:
-        """The same everywhere."""
+        """Return the acceleration of gravity, the same everywhere.
+
+        Parameters
+        ----------
+        lat, alt : float
+            Latitude, rad, and height; not used.
+
+        Returns
+        -------
+        float
+            G.
+        """
         return self.G
 
 
 SPHERE = Sphere(6371e3, 9.81, OMEGA)
-"""SI."""
+"""Sphere in SI units."""
 SPHERE_KM_H = Sphere(6371.0, 9.81 * 3.6e3**2 / 1e3, OMEGA * 3.6e3)
-"""Kilometres and hours, as Poddubny writes his example."""
+"""Sphere in kilometres and hours, the units of Poddubny's example."""
 
 
 def radii(lat: float) -> Radii:
-    """Radii of curvature at geodetic latitude `lat` (rad): Groves (2.105), (2.106)."""
+    """Compute the radii of curvature.
+
+    Parameters
+    ----------
+    lat : float
+        Geodetic latitude, rad.
+
+    Returns
+    -------
+    Radii
+        Meridian and prime vertical, m.
+
+    References
+    ----------
+    Groves (2.105), (2.106).
+    """
     sin_lat = math.sin(lat)
     w2 = 1.0 - E2 * sin_lat * sin_lat
     R_E = A / math.sqrt(w2)
@@ -85,10 +140,26 @@ def radii(lat: float) -> Radii:
 
 
 def gravity(lat: float, alt: float = 0.0) -> float:
-    """Magnitude of normal gravity, m/s^2, at `lat` (rad) and `alt` (m above the ellipsoid).
+    """Compute the magnitude of normal gravity.
 
-    Somigliana's closed form on the ellipsoid (TR8350.2 (4-1)), second order in height above it (4-3);
-    good to 1e-6 m/s^2 up to 20 km.
+    Somigliana's closed form on the ellipsoid, second order in height above it; accurate to 1e-6 m/s^2 up to
+    20 km.
+
+    Parameters
+    ----------
+    lat : float
+        Geodetic latitude, rad.
+    alt : float
+        Height above the ellipsoid, m.
+
+    Returns
+    -------
+    float
+        Gravity, m/s^2.
+
+    References
+    ----------
+    NIMA TR8350.2 (4-1), (4-3).
     """
     s2 = math.sin(lat) ** 2
     g_0 = G_EQUATOR * (1.0 + _SOMIGLIANA_K * s2) / math.sqrt(1.0 - E2 * s2)
@@ -97,14 +168,47 @@ def gravity(lat: float, alt: float = 0.0) -> float:
 
 
 def earth_rate(lat: float) -> RateN:
-    """Rate of the earth w_ie_n: Groves (2.123)."""
+    """Compute the rate of the earth w_ie_n.
+
+    Parameters
+    ----------
+    lat : float
+        Geodetic latitude, rad.
+
+    Returns
+    -------
+    RateN
+        Rate in n, rad/s.
+
+    References
+    ----------
+    Groves (2.123).
+    """
     return RateN(OMEGA * math.cos(lat), 0.0, -OMEGA * math.sin(lat))
 
 
 def transport_rate(lat: float, alt: float, v_north: float, v_east: float) -> RateN:
-    """Rate of n over the earth w_en_n at velocity (m/s): Groves (5.44).
+    """Compute the rate of n over the earth w_en_n.
 
-    Grows without limit towards the poles, where north has no meaning: the caller keeps away from them.
+    It grows without limit towards the poles, where north is not defined: the caller avoids them.
+
+    Parameters
+    ----------
+    lat : float
+        Geodetic latitude, rad.
+    alt : float
+        Height above the ellipsoid, m.
+    v_north, v_east : float
+        Ground velocity, m/s.
+
+    Returns
+    -------
+    RateN
+        Rate in n, rad/s.
+
+    References
+    ----------
+    Groves (5.44).
     """
     R_N, R_E = radii(lat)
     lon_rate_cos = v_east / (R_E + alt)

@@ -3,13 +3,13 @@
 The seven states of the INS, in this order, x north, y east, z down:
 
     dx, dy      position error: R dphi, R cos(phi) dlam
-    dVN, dVE    velocity error; in `paper` dVE is the rate of dy, in `aircraft` that of the velocity itself
-    PX, PY, PZ  minus the rotation of the platform (the computed n): C~_nb = (I + [P x]) C_nb,
+    dVN, dVE    velocity error; in `paper_model` dVE is the rate of dy, in `aircraft_model` that of the
+    velocity PX, PY, PZ  minus the rotation of the platform (the computed n): C~_nb = (I + [P x]) C_nb,
                 so the error of a computed heading is +PZ; a gyro drift E is likewise minus the physical one
 
 Mixing the two senses of rotation turns Schuler's oscillation into a growing exponent, +-4.47 1/h.
-`disturbances` extend the state, `correctors` observe it, `discrete` makes a step of it.
-The equations hold on a sphere and in any consistent units: a `Sphere` brings them in.
+`disturbances` extend the state, `correctors` observe it, `discretization` makes a step of it.
+The equations hold on a sphere and in any consistent units: a `Sphere` defines them.
 
 Source: V. Poddubny, a stochastic-restrictive model of navigation systems, (1.18) and section 3.
 """
@@ -19,24 +19,42 @@ from math import cos, pi, sin, tan
 from typing import Literal, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from companion.nav import correctors, disturbances
 from companion.nav.discretization import discretise, euler
 from companion.nav.disturbances import Disturbance, Model, compose
 from companion.nav.earth import SPHERE, SPHERE_KM_H, Sphere
-
-Matrix = npt.NDArray[np.float64]
+from companion.units import Floats
 
 INS_STATES = ("dx", "dy", "dVN", "dVE", "PX", "PY", "PZ")
 
 
-def paper(
+def paper_model(
     lat: float, v_north: float, v_east: float, *, added: Sequence[Disturbance] = (), sphere: Sphere = SPHERE
 ) -> Model:
-    """The paper's model (1.18) at a latitude (rad) and a velocity: simple, for ships and slow aircraft.
+    """Build the paper's model at a latitude and a velocity: simple, for ships and slow aircraft.
 
     DEPARTS FROM (1.18): restores the lost equation PY' = dVN/R - wZ PX + wX PZ + EY.
+
+    Parameters
+    ----------
+    lat : float
+        Latitude, rad.
+    v_north, v_east : float
+        Ground velocity, in the unit of `sphere`.
+    added : sequence of Disturbance
+        Extensions of the state.
+    sphere : Sphere
+        Spherical earth; defines the units.
+
+    Returns
+    -------
+    Model
+        INS states and disturbances.
+
+    References
+    ----------
+    Poddubny (1.18).
     """
     R, G, Om = sphere
     t = tan(lat)
@@ -56,7 +74,7 @@ def paper(
     return compose(A, INS_STATES, added)
 
 
-def aircraft(
+def aircraft_model(
     lat: float,
     v_north: float,
     v_east: float,
@@ -65,23 +83,51 @@ def aircraft(
     added: Sequence[Disturbance] = (),
     sphere: Sphere = SPHERE,
 ) -> Model:
-    """The model complete to first order, for any speed: the one that flies. Its own states are
-    `aircraft_errors`.
+    """Build the model complete to first order, for any speed: the one used in flight.
+
+    Parameters
+    ----------
+    lat, v_north, v_east, acceleration_n
+        As in `aircraft_matrix`.
+    added : sequence of Disturbance
+        Extensions of the state.
+    sphere : Sphere
+        Spherical earth; defines the units.
+
+    Returns
+    -------
+    Model
+        INS states and disturbances.
     """
-    return compose(aircraft_errors(lat, v_north, v_east, acceleration_n, sphere), INS_STATES, added)
+    return compose(aircraft_matrix(lat, v_north, v_east, acceleration_n, sphere), INS_STATES, added)
 
 
-def aircraft_errors(
+def aircraft_matrix(
     lat: float,
     v_north: float,
     v_east: float,
     acceleration_n: tuple[float, float, float] = (0.0, 0.0, 0.0),
     sphere: Sphere = SPHERE,
-) -> Matrix:
-    """A (7, 7) of `INS_STATES` alone, complete to first order.
+) -> Floats:
+    """Build the dynamics of `INS_STATES` alone, complete to first order.
 
-    `acceleration_n` is the rate of change of the velocity, NED: in a turn it couples PZ into the velocity.
-    Vertical errors are not in it: the height channel is aided by the barometer.
+    Vertical errors are not included: the height channel is aided by the barometer.
+
+    Parameters
+    ----------
+    lat : float
+        Latitude, rad.
+    v_north, v_east : float
+        Ground velocity, in the unit of `sphere`.
+    acceleration_n : (3,)
+        Rate of change of the velocity, NED; in a turn it couples PZ into the velocity.
+    sphere : Sphere
+        Spherical earth; defines the units.
+
+    Returns
+    -------
+    (7, 7)
+        A.
     """
     R, G, Om = sphere
     s, c, t = sin(lat), cos(lat), tan(lat)
@@ -105,60 +151,117 @@ def aircraft_errors(
     )
 
 
-def twin(first: Model, second: Model, suffix: str = "2", common: Sequence[Disturbance] = ()) -> Model:
-    """Two inertial systems side by side, the second's states marked by `suffix`.
+def combine_systems(
+    first: Model, second: Model, suffix: str = "2", common: Sequence[Disturbance] = ()
+) -> Model:
+    """Combine two inertial systems to one model.
 
-    Disturbances of each are its own; `common` ones (gravity) are declared here and feed both by name.
+    Parameters
+    ----------
+    first, second : Model
+        The systems; disturbances of each are its own.
+    suffix : str
+        Suffix of the second's states.
+    common : sequence of Disturbance
+        Disturbances of both (gravity); they feed states of both by name.
+
+    Returns
+    -------
+    Model
+        Both systems, then the common disturbances.
     """
     n = len(first.states)
     states = (*first.states, *(s + suffix for s in second.states))
-    bare = compose(np.zeros((len(states), len(states))), states, common)
-    A, Q, sigma = bare.A, bare.Q, bare.sigma
+    frame = compose(np.zeros((len(states), len(states))), states, common)
+    A, Q, sigma = frame.A, frame.Q, frame.sigma
     m = n + len(second.states)
     A[:n, :n], A[n:m, n:m] = first.A, second.A
     Q[:n, :n], Q[n:m, n:m] = first.Q, second.Q
     sigma[:n], sigma[n:m] = first.sigma, second.sigma
-    B = np.zeros((len(bare.states), first.B.shape[1] + second.B.shape[1]))
+    B = np.zeros((len(frame.states), first.B.shape[1] + second.B.shape[1]))
     B[:n, : first.B.shape[1]], B[n:m, first.B.shape[1] :] = first.B, second.B
-    C = np.concatenate([first.C, second.C, bare.C])
-    return Model(A, bare.states, Q, np.hstack([B, bare.B]), C, sigma)
+    C = np.concatenate([first.C, second.C, frame.C])
+    return Model(A, frame.states, Q, np.hstack([B, frame.B]), C, sigma)
 
 
 class Example(NamedTuple):
-    """One step of the paper's section 3, ready for the filters."""
+    """One step of the paper's section 3, in the form the filters take.
+
+    Attributes
+    ----------
+    states : tuple of str
+        16 names.
+    A : (16, 16)
+        Transition.
+    B : (16, 2)
+        Influence of the current's increments in a step, 0 or 1.
+    Q : (16, 16)
+        Process noise where the current is driven by the bounded input alone.
+    Q_markov : (16, 16)
+        Process noise where the current is Markov's (1.30) and no input is bounded: for the plain Kalman
+        filter.
+    H : (2, 16)
+        The log, along and across.
+    R : (2, 2)
+        Its noise covariance.
+    C : (2,)
+        Bounds of the increments of a step.
+    x0 : (16,)
+        Zero.
+    P0 : (16, 16)
+        Zero: exact alignment.
+    dt : float
+        Step.
+    A_continuous : (16, 16)
+        Continuous dynamics.
+    units : (16,)
+        One unit of km-h-rad in the units chosen, state by state.
+    """
 
     states: tuple[str, ...]
-    A: Matrix
-    """(16, 16)."""
-    B: Matrix
-    """(16, 2), boolean: the current's increments of a step."""
-    Q: Matrix
-    """(16, 16), the current being driven by the bounded input alone."""
-    Q_markov: Matrix
-    """(16, 16), the current being Markov's (1.30) and nothing bounded: the plain Kalman filter's."""
-    H: Matrix
-    """(2, 16): the log along and across."""
-    R: Matrix
-    """(2, 2)."""
-    C: Matrix
-    """(2,): bounds of the increments of a step."""
-    x0: Matrix
-    """(16,) zero."""
-    P0: Matrix
-    """(16, 16) zero: exact alignment."""
+    A: Floats
+    B: Floats
+    Q: Floats
+    Q_markov: Floats
+    H: Floats
+    R: Floats
+    C: Floats
+    x0: Floats
+    P0: Floats
     dt: float
-    A_continuous: Matrix
-    units: Matrix
-    """(16,): what one unit of km-h-rad is in the units chosen, state by state."""
+    A_continuous: Floats
+    units: Floats
 
 
 def paper_example(
     units: Literal["km-h", "SI"] = "km-h", *, exact: bool = True, sigma_E: float = 1e-5, C: float = 0.3
 ) -> Example:
-    """Section 3: a ship at 60 degrees north going east at 30 km/h, a log in unknown currents, 0.01 h a step.
+    """Build section 3: a ship at 60 degrees north, east at 30 km/h, a log in unknown currents, 0.01 h a step.
 
-    `sigma_E` in rad/h and `C` in km/h a step whatever the units (the text lost both; these fit its figures).
-    `exact` takes Van Loan's step, otherwise the paper's Euler.
+    Parameters
+    ----------
+    units : {"km-h", "SI"}
+        Units of the result.
+    exact : bool
+        Van Loan's step, otherwise the paper's Euler.
+    sigma_E : float
+        Gyro drift, rad/h whatever the units (lost in the text; this value fits its figures).
+    C : float
+        Bound of the current, km/h a step whatever the units (lost in the text as well).
+
+    Returns
+    -------
+    Example
+        Matrices of a step.
+
+    Raises
+    ------
+    ValueError
+        For other units.
+
+    References
+    ----------
+    Poddubny, section 3.
     """
     if units not in ("km-h", "SI"):
         raise ValueError(f"units {units!r}: choose km-h or SI")
@@ -174,7 +277,7 @@ def paper_example(
     )
 
     def at_sea(current: Disturbance) -> Model:
-        return paper(lat, 0.0, V, added=(drift, current, *others), sphere=sphere)
+        return paper_model(lat, 0.0, V, added=(drift, current, *others), sphere=sphere)
 
     bounded = at_sea(disturbances.current(V, a_c, R_c, bound=C * km / h / dt))
     markov = at_sea(disturbances.current(V, a_c, R_c, sigma=0.3 * km / h))
@@ -185,10 +288,10 @@ def paper_example(
     return Example(
         states=bounded.states,
         A=step.A,
-        B=bounded.B,  # as the paper has it on either step: the increment falls at the step's end
+        B=bounded.B,  # as in the paper for either step: the increment acts at the end of the step
         Q=step.Q,
         Q_markov=step_markov.Q,
-        H=correctors.rows(bounded.states, *correctors.relative_log(K, V, velocity)),
+        H=correctors.observation_matrix(bounded.states, *correctors.relative_log(K, V, velocity)),
         R=np.eye(2) * (0.05 * km / h) ** 2,
         C=bounded.C * dt,
         x0=np.zeros(n),

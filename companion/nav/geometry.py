@@ -1,8 +1,9 @@
-"""Where things are: geodetic, ECEF and local positions, lines of sight, the autopilots' flat earths.
+"""Positions and lines of sight: geodetic, ECEF and local frames, and the autopilots' flat earths.
 
-Knows the ellipsoid and nothing of motion, time, sensors or errors. A geodetic position is
-`Geodetic(lat, lon, alt)`, radians and metres above WGS84; longitudes that come out lie in [-pi, pi).
-Local vectors are numpy arrays of shape (3,), metres.
+It knows the ellipsoid, not motion, time, sensors or errors. A geodetic position is
+`Geodetic(lat, lon, alt)`, radians and metres above WGS84; resulting longitudes are in [-pi, pi).
+Local vectors are numpy arrays of shape (3,), metres; functions named `_tuple` return plain numbers instead,
+ten times faster.
 """
 
 import math
@@ -10,12 +11,10 @@ from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from companion.nav.earth import E2, A, radii
+from companion.units import Floats
 
-Vector = npt.NDArray[np.float64]
-Matrix = npt.NDArray[np.float64]
 Triple = tuple[float, float, float]
 Projection = Literal["ardupilot", "px4", "tangent"]
 
@@ -28,45 +27,116 @@ _RADIO_R = 4.0 / 3.0 * 6371000.0
 
 
 class Geodetic(NamedTuple):
-    """A position on WGS84: geodetic latitude and longitude, rad; height above the ellipsoid, m."""
+    """Position on WGS84.
+
+    Attributes
+    ----------
+    lat, lon : float
+        Geodetic latitude and longitude, rad.
+    alt : float
+        Height above the ellipsoid, m.
+    """
 
     lat: float
     lon: float
     alt: float
 
 
-class Sight(NamedTuple):
-    """A line of sight, at its origin: azimuth from true north clockwise in [0, 2 pi), rad; slant range, m;
-    elevation above the local horizontal, rad."""
+class LineOfSight(NamedTuple):
+    """Line of sight at its origin.
+
+    Attributes
+    ----------
+    azimuth : float
+        From true north clockwise, [0, 2 pi), rad.
+    slant_range : float
+        Distance, m.
+    elevation : float
+        Above the local horizontal, rad.
+    """
 
     azimuth: float
     slant_range: float
     elevation: float
 
 
-def wrap(angle: float) -> float:
-    """The same angle in [-pi, pi)."""
+def wrap_angle(angle: float) -> float:
+    """Wrap an angle to [-pi, pi).
+
+    Parameters
+    ----------
+    angle : float
+        Angle, rad.
+
+    Returns
+    -------
+    float
+        The same angle in [-pi, pi).
+    """
     wrapped = math.remainder(angle, math.tau)
     return -math.pi if wrapped == math.pi else wrapped
 
 
-def to_ecef(point: Geodetic) -> Vector:
-    """Geodetic to ECEF, m: Groves (2.112)."""
-    return np.array(ecef(point))
+def to_ecef(point: Geodetic) -> Floats:
+    """Convert geodetic to ECEF coordinates.
+
+    Parameters
+    ----------
+    point : Geodetic
+        Position.
+
+    Returns
+    -------
+    (3,)
+        X, Y, Z, m.
+
+    References
+    ----------
+    Groves (2.112).
+    """
+    return np.array(ecef_tuple(point))
 
 
-def ecef(point: Geodetic) -> Triple:
-    """The same in plain numbers."""
+def ecef_tuple(point: Geodetic) -> Triple:
+    """Convert geodetic to ECEF coordinates in plain numbers.
+
+    Parameters
+    ----------
+    point : Geodetic
+        Position.
+
+    Returns
+    -------
+    tuple of float
+        X, Y, Z, m.
+    """
     lat, lon, alt = point
     R_E = radii(lat).R_E
     rho = (R_E + alt) * math.cos(lat)
     return rho * math.cos(lon), rho * math.sin(lon), ((1.0 - E2) * R_E + alt) * math.sin(lat)
 
 
-def from_ecef(r_e: Vector) -> Geodetic:
-    """ECEF to geodetic in closed form: Vermeille, Journal of Geodesy 76 (2002) 451-454, symbols as there.
+def from_ecef(r_e: Floats) -> Geodetic:
+    """Convert ECEF to geodetic coordinates in closed form.
 
-    ValueError within about 43 km of the earth's centre, where the form does not hold.
+    Parameters
+    ----------
+    r_e : (3,)
+        X, Y, Z, m.
+
+    Returns
+    -------
+    Geodetic
+        Position.
+
+    Raises
+    ------
+    ValueError
+        Within about 43 km of the earth's centre, where the form does not hold.
+
+    References
+    ----------
+    Vermeille, Journal of Geodesy 76 (2002) 451-454, symbols as there.
     """
     X, Y, Z = (float(c) for c in r_e)
     e4 = E2 * E2
@@ -86,84 +156,199 @@ def from_ecef(r_e: Vector) -> Geodetic:
     k = math.sqrt(u + v + w * w) - w
     D = k * rho / (k + E2)
     hypot = math.hypot(D, Z)
-    return Geodetic(2.0 * math.atan2(Z, D + hypot), wrap(math.atan2(Y, X)), (k + E2 - 1.0) / k * hypot)
+    return Geodetic(2.0 * math.atan2(Z, D + hypot), wrap_angle(math.atan2(Y, X)), (k + E2 - 1.0) / k * hypot)
 
 
-def enu_axes(lat: float, lon: float) -> Matrix:
-    """C_e^enu (3, 3): its rows are the east, north and up axes at (lat, lon) in ECEF."""
-    return np.array(east_north_up(lat, lon))
+def enu_axes(lat: float, lon: float) -> Floats:
+    """Compute the east, north and up axes in ECEF.
+
+    Parameters
+    ----------
+    lat, lon : float
+        Geodetic latitude and longitude, rad.
+
+    Returns
+    -------
+    (3, 3)
+        C_e^enu; its rows are the axes.
+    """
+    return np.array(enu_axes_tuple(lat, lon))
 
 
-def east_north_up(lat: float, lon: float) -> tuple[Triple, Triple, Triple]:
-    """The same in plain numbers."""
+def enu_axes_tuple(lat: float, lon: float) -> tuple[Triple, Triple, Triple]:
+    """Compute the east, north and up axes in ECEF in plain numbers.
+
+    Parameters
+    ----------
+    lat, lon : float
+        Geodetic latitude and longitude, rad.
+
+    Returns
+    -------
+    tuple
+        East, north and up axis.
+    """
     sl, cl, so, co = math.sin(lat), math.cos(lat), math.sin(lon), math.cos(lon)
     return (-so, co, 0.0), (-sl * co, -sl * so, cl), (cl * co, cl * so, sl)
 
 
-def to_enu(point: Geodetic, origin: Geodetic) -> Vector:
-    """East, north, up of `point` in the plane tangent at `origin`, m; exact at any distance."""
-    axes: Matrix = enu_axes(origin.lat, origin.lon)
+def to_enu(point: Geodetic, origin: Geodetic) -> Floats:
+    """Convert a position to the plane tangent at an origin; exact at any distance.
+
+    Parameters
+    ----------
+    point, origin : Geodetic
+        Position and origin.
+
+    Returns
+    -------
+    (3,)
+        East, north, up, m.
+    """
+    axes: Floats = enu_axes(origin.lat, origin.lon)
     return axes @ (to_ecef(point) - to_ecef(origin))
 
 
-def from_enu(x_enu: Vector, origin: Geodetic) -> Geodetic:
-    """The inverse of `to_enu`."""
+def from_enu(x_enu: Floats, origin: Geodetic) -> Geodetic:
+    """Convert east, north, up of an origin to a position: the inverse of `to_enu`.
+
+    Parameters
+    ----------
+    x_enu : (3,)
+        East, north, up, m.
+    origin : Geodetic
+        Origin.
+
+    Returns
+    -------
+    Geodetic
+        Position.
+    """
     return from_ecef(to_ecef(origin) + enu_axes(origin.lat, origin.lon).T @ x_enu)
 
 
 def displace(lat: float, lon: float, alt: float, north: float, east: float, down: float) -> Geodetic:
-    """The position a few metres away, through the radii of curvature at (lat, alt).
+    """Displace a position by a short vector, through the radii of curvature at (lat, alt).
 
     First order: wrong by about d^2 tan(lat) / 2R (1 m at 2.7 km and 60 degrees; use `from_enu` beyond).
-    Never to be used at a pole, where east has no meaning.
+    Not usable at a pole, where east is not defined.
+
+    Parameters
+    ----------
+    lat, lon : float
+        Geodetic latitude and longitude, rad.
+    alt : float
+        Height above the ellipsoid, m.
+    north, east, down : float
+        Displacement, m.
+
+    Returns
+    -------
+    Geodetic
+        Displaced position.
     """
     R_N, R_E = radii(lat)
-    return Geodetic(lat + north / (R_N + alt), wrap(lon + east / ((R_E + alt) * math.cos(lat))), alt - down)
+    return Geodetic(
+        lat + north / (R_N + alt), wrap_angle(lon + east / ((R_E + alt) * math.cos(lat))), alt - down
+    )
 
 
-def separation(point: Geodetic, reference: Geodetic) -> Vector:
-    """`point` minus `reference` in NED metres: the inverse of `displace` from `reference`.
+def separation(point: Geodetic, reference: Geodetic) -> Floats:
+    """Compute `point` minus `reference` in NED: the inverse of `displace` from `reference`.
 
     An error is computed minus true, so the error of the INS against a fix is `separation(ins, fix)`.
+
+    Parameters
+    ----------
+    point, reference : Geodetic
+        Positions.
+
+    Returns
+    -------
+    (3,)
+        North, east, down, m.
     """
-    return np.array(apart(point, reference))
+    return np.array(separation_tuple(point, reference))
 
 
-def apart(point: Geodetic, reference: Geodetic) -> Triple:
-    """The same in plain numbers."""
+def separation_tuple(point: Geodetic, reference: Geodetic) -> Triple:
+    """Compute `separation` in plain numbers.
+
+    Parameters
+    ----------
+    point, reference : Geodetic
+        Positions.
+
+    Returns
+    -------
+    tuple of float
+        North, east, down, m.
+    """
     R_N, R_E = radii(reference.lat)
     north = (point.lat - reference.lat) * (R_N + reference.alt)
-    east = wrap(point.lon - reference.lon) * (R_E + reference.alt) * math.cos(reference.lat)
+    east = wrap_angle(point.lon - reference.lon) * (R_E + reference.alt) * math.cos(reference.lat)
     return north, east, reference.alt - point.alt
 
 
-def slant_range_azimuth(beacon: Geodetic, aircraft: Geodetic) -> Sight:
-    """What a perfect RSBN, VOR/DME or TACAN ground beacon would tell of the aircraft."""
+def slant_range_azimuth(beacon: Geodetic, aircraft: Geodetic) -> LineOfSight:
+    """Compute the measurement of an ideal RSBN, VOR/DME or TACAN ground beacon.
+
+    Parameters
+    ----------
+    beacon, aircraft : Geodetic
+        Positions.
+
+    Returns
+    -------
+    LineOfSight
+        From the beacon to the aircraft.
+    """
     east, north, up = (float(c) for c in to_enu(aircraft, beacon))
     horizontal = math.hypot(east, north)
     azimuth = math.atan2(east, north) % math.tau
-    # A tiny negative angle rounds up to 2 pi, which is not in the range promised.
-    return Sight(
+    # a tiny negative angle rounds up to 2 pi, outside [0, 2 pi)
+    return LineOfSight(
         0.0 if azimuth == math.tau else azimuth, math.hypot(horizontal, up), math.atan2(up, horizontal)
     )
 
 
 def radio_horizon(height_a: float, height_b: float) -> float:
-    """Greatest distance of direct radio sight between two antennas, m, over a smooth earth of 4/3 radius.
+    """Compute the range of direct radio sight between two antennas, over a smooth earth of 4/3 radius.
 
-    Heights, m, above that smooth earth; below it counts as on it.
+    Parameters
+    ----------
+    height_a, height_b : float
+        Heights above that smooth earth, m; below it counts as on it.
+
+    Returns
+    -------
+    float
+        Distance, m.
     """
     return math.sqrt(2.0 * _RADIO_R) * (math.sqrt(max(height_a, 0.0)) + math.sqrt(max(height_b, 0.0)))
 
 
 def in_radio_sight(beacon: Geodetic, aircraft: Geodetic, ground_alt: float = 0.0) -> bool:
-    """Whether the aircraft is above the beacon's radio horizon over a smooth earth at `ground_alt`, m."""
+    """Decide whether the aircraft is above the beacon's radio horizon over a smooth earth.
+
+    Parameters
+    ----------
+    beacon, aircraft : Geodetic
+        Positions.
+    ground_alt : float
+        Height of the smooth earth above the ellipsoid, m.
+
+    Returns
+    -------
+    bool
+        True above the horizon.
+    """
     horizon = radio_horizon(beacon.alt - ground_alt, aircraft.alt - ground_alt)
     return slant_range_azimuth(beacon, aircraft).slant_range <= horizon
 
 
-def local_to_geodetic(projection: Projection, origin: Geodetic, x_n: Sequence[float] | Vector) -> Geodetic:
-    """The geodetic position an autopilot means by the local NED position `x_n` from its `origin`.
+def local_to_geodetic(projection: Projection, origin: Geodetic, x_n: Sequence[float] | Floats) -> Geodetic:
+    """Convert an autopilot's local NED position to a geodetic position.
 
     Each autopilot has a flat earth of its own; reading its local position through another one is off by
     0.1-0.5 % of the distance (different radii) and more.
@@ -171,13 +356,32 @@ def local_to_geodetic(projection: Projection, origin: Geodetic, x_n: Sequence[fl
     - "ardupilot": Location::offset, a sphere of 6378.1 km, longitudes scaled at the mean latitude;
     - "px4": MapProjection::reproject, azimuthal equidistant on a sphere of 6371 km;
     - "tangent": the plane tangent to the ellipsoid, exact.
+
+    Parameters
+    ----------
+    projection : {"ardupilot", "px4", "tangent"}
+        Flat earth.
+    origin : Geodetic
+        Origin of the local frame.
+    x_n : (3,)
+        North, east, down, m.
+
+    Returns
+    -------
+    Geodetic
+        Position.
+
+    Raises
+    ------
+    ValueError
+        For an unknown projection.
     """
     north, east, down = (float(c) for c in x_n)
     lat_0, lon_0, alt_0 = origin
     if projection == "ardupilot":
         dlat = north / _ARDUPILOT_R
         dlon = east / (_ARDUPILOT_R * _longitude_scale(lat_0 + 0.5 * dlat))
-        return Geodetic(lat_0 + dlat, wrap(lon_0 + dlon), alt_0 - down)
+        return Geodetic(lat_0 + dlat, wrap_angle(lon_0 + dlon), alt_0 - down)
     if projection == "px4":
         c = math.hypot(north, east) / _PX4_R
         if c == 0.0:
@@ -185,17 +389,39 @@ def local_to_geodetic(projection: Projection, origin: Geodetic, x_n: Sequence[fl
         x, y = north / _PX4_R * math.sin(c) / c, east / _PX4_R * math.sin(c) / c
         lat = math.asin(math.cos(c) * math.sin(lat_0) + x * math.cos(lat_0))
         dlon = math.atan2(y, math.cos(lat_0) * math.cos(c) - x * math.sin(lat_0))
-        return Geodetic(lat, wrap(lon_0 + dlon), alt_0 - down)
+        return Geodetic(lat, wrap_angle(lon_0 + dlon), alt_0 - down)
     if projection == "tangent":
         return from_enu(np.array([east, north, -down]), origin)
     raise _unknown(projection)
 
 
 def geodetic_to_local(projection: Projection, origin: Geodetic, point: Geodetic) -> Triple:
-    """The inverse of `local_to_geodetic`: Location::get_distance_NED, MapProjection::project, `to_enu`."""
+    """Convert a geodetic position to an autopilot's local NED position: the inverse of `local_to_geodetic`.
+
+    The counterparts are Location::get_distance_NED, MapProjection::project and `to_enu`.
+
+    Parameters
+    ----------
+    projection : {"ardupilot", "px4", "tangent"}
+        Flat earth.
+    origin : Geodetic
+        Origin of the local frame.
+    point : Geodetic
+        Position.
+
+    Returns
+    -------
+    tuple of float
+        North, east, down, m.
+
+    Raises
+    ------
+    ValueError
+        For an unknown projection.
+    """
     lat_0, lon_0, alt_0 = origin
     lat, lon, alt = point
-    dlon = wrap(lon - lon_0)
+    dlon = wrap_angle(lon - lon_0)
     if projection == "ardupilot":
         scale = _longitude_scale(0.5 * (lat + lat_0))
         return (lat - lat_0) * _ARDUPILOT_R, dlon * _ARDUPILOT_R * scale, alt_0 - alt
@@ -215,7 +441,7 @@ def geodetic_to_local(projection: Projection, origin: Geodetic, point: Geodetic)
 
 
 def _longitude_scale(lat: float) -> float:
-    return max(math.cos(lat), 0.01)  # ArduPilot's floor, so that nothing divides by zero at a pole
+    return max(math.cos(lat), 0.01)  # ArduPilot's floor: no division by zero at a pole
 
 
 def _unknown(projection: str) -> ValueError:

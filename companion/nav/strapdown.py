@@ -1,10 +1,10 @@
-"""Strapdown navigation in the local-level frame, and its mirror: the inertial measurements of a trajectory.
+"""Strapdown navigation in the local-level frame, and its inverse: the inertial measurements of a trajectory.
 
 `mechanise` integrates specific force f_b and angular rate w_b (means over a step, of the body against the
-inertial frame) into position, ground velocity and attitude; `synthesise` takes two states and gives back the
+inertial frame) into position, ground velocity and attitude; `synthesise` takes two states and returns the
 f_b and w_b between them. Each is second order in dt with the body's rotation integrated exactly; at 50-200 Hz
-their disagreement is far below any sensor's noise. Knows nothing of sensor errors, filters or the barometer:
-the vertical channel is unstable alone, as every INS's is, and is the caller's to hold.
+their disagreement is far below any sensor's noise. It does not know sensor errors, filters or the barometer:
+the vertical channel alone is unstable, as in every INS, and the caller stabilises it.
 
 Source: Groves (2013), 5.4 (local-navigation-frame equations) and 5.5; Savage's exact rotation of a step.
 """
@@ -13,75 +13,143 @@ import math
 from typing import NamedTuple, Protocol
 
 import numpy as np
-import numpy.typing as npt
 
 import companion.nav.earth as wgs84
 from companion.nav.earth import Radii
-from companion.nav.geometry import wrap
-
-Vector = npt.NDArray[np.float64]
-Matrix = npt.NDArray[np.float64]
-
+from companion.nav.geometry import wrap_angle
+from companion.units import Floats
 
 _ZERO = np.zeros(3)
 
 
 class Earth(Protocol):
-    """What the equations ask of the earth: the module `earth` (WGS84), or an `earth.Sphere`."""
+    """Model of the earth in the equations: the module `earth` (WGS84), or an `earth.Sphere`."""
 
     @property
     def OMEGA(self) -> float:
-        """Rate of rotation."""
+        """Return the rate of rotation, rad/s."""
 
     def radii(self, lat: float) -> Radii:
-        """Radii of curvature."""
+        """Compute the radii of curvature.
+
+        Parameters
+        ----------
+        lat : float
+            Geodetic latitude, rad.
+
+        Returns
+        -------
+        Radii
+            Meridian and prime vertical, m.
+        """
 
     def gravity(self, lat: float, alt: float = ...) -> float:
-        """Acceleration of gravity, downwards."""
+        """Compute the acceleration of gravity.
+
+        Parameters
+        ----------
+        lat : float
+            Geodetic latitude, rad.
+        alt : float
+            Height, m.
+
+        Returns
+        -------
+        float
+            Downwards, m/s^2.
+        """
 
 
-class Inertial(NamedTuple):
-    """Where a body is, how it moves and how it is turned."""
+class InertialState(NamedTuple):
+    """Position, velocity and attitude of a body.
+
+    Attributes
+    ----------
+    lat, lon : float
+        Geodetic latitude and longitude, rad; longitude in [-pi, pi).
+    alt : float
+        Height above the ellipsoid, m.
+    v_n : (3,)
+        Ground velocity, NED, m/s.
+    C_nb : (3, 3)
+        Attitude, v_n = C_nb v_b.
+    """
 
     lat: float
-    """rad."""
     lon: float
-    """rad, [-pi, pi)."""
     alt: float
-    """m above the ellipsoid."""
-    v_n: Vector
-    """(3,) ground velocity, NED, m/s."""
-    C_nb: Matrix
-    """(3, 3), v_n = C_nb v_b."""
+    v_n: Floats
+    C_nb: Floats
 
 
-class Increment(NamedTuple):
-    """What ideal inertial sensors tell of a step, as means over it."""
+class StepMeans(NamedTuple):
+    """Readings of ideal inertial sensors, as means over a step.
 
-    f_b: Vector
-    """(3,) specific force, m/s^2."""
-    w_b: Vector
-    """(3,) angular rate against the inertial frame, rad/s."""
+    Attributes
+    ----------
+    f_b : (3,)
+        Specific force in the body, m/s^2.
+    w_b : (3,)
+        Angular rate of the body against the inertial frame, rad/s.
+    """
+
+    f_b: Floats
+    w_b: Floats
 
 
 class Rates(NamedTuple):
-    """How position, velocity and the frame n itself change at a moment."""
+    """Rates of change of position, velocity and frame n.
+
+    Attributes
+    ----------
+    lat, lon : float
+        rad/s.
+    alt : float
+        m/s.
+    v_n : (3,)
+        Rate of the ground velocity, NED, m/s^2.
+    w_in_n : (3,)
+        Angular rate of n against the inertial frame, in n, rad/s.
+    """
 
     lat: float
     lon: float
     alt: float
-    v_n: Vector
-    w_in_n: Vector
+    v_n: Floats
+    w_in_n: Floats
 
 
-def rates(lat: float, alt: float, v_n: Vector, f_n: Vector, earth: Earth = wgs84) -> Rates:
-    """The navigation equations in continuous time: Groves (5.54), (5.56), and w_in_n = w_ie_n + w_en_n."""
+def navigation_rates(lat: float, alt: float, v_n: Floats, f_n: Floats, earth: Earth = wgs84) -> Rates:
+    """Evaluate the navigation equations in continuous time, with w_in_n = w_ie_n + w_en_n.
+
+    Parameters
+    ----------
+    lat : float
+        Geodetic latitude, rad.
+    alt : float
+        Height above the ellipsoid, m.
+    v_n : (3,)
+        Ground velocity, NED, m/s.
+    f_n : (3,)
+        Specific force, NED, m/s^2.
+    earth : Earth
+        Model of the earth.
+
+    Returns
+    -------
+    Rates
+        Rates of change.
+
+    References
+    ----------
+    Groves (5.54), (5.56).
+    """
     vN, vE, vD = v_n.tolist()
     fN, fE, fD = f_n.tolist()
     R_N, R_E = earth.radii(lat)
     s, c = math.sin(lat), math.cos(lat)
     lat_rate, lon_rate = vN / (R_N + alt), vE / ((R_E + alt) * c)
-    # w_in + w_ie, resolved in n: what Coriolis takes.
+    # w_in + w_ie in n, for Coriolis
     x, y, z = (2.0 * earth.OMEGA + lon_rate) * c, -lat_rate, -(2.0 * earth.OMEGA + lon_rate) * s
     g = earth.gravity(lat, alt)
     a_n = np.array([fN - y * vD + z * vE, fE - z * vN + x * vD, fD + g - x * vE + y * vN])
@@ -89,75 +157,162 @@ def rates(lat: float, alt: float, v_n: Vector, f_n: Vector, earth: Earth = wgs84
     return Rates(lat_rate, lon_rate, -vD, a_n, w_in)
 
 
-def mechanise(state: Inertial, f_b: Vector, w_b: Vector, dt: float, earth: Earth = wgs84) -> Inertial:
-    """One step of strapdown integration; f_b (3,) m/s^2 and w_b (3,) rad/s are means over dt (s)."""
+def mechanise(
+    state: InertialState, f_b: Floats, w_b: Floats, dt: float, earth: Earth = wgs84
+) -> InertialState:
+    """Integrate one step of strapdown navigation.
+
+    Parameters
+    ----------
+    state : InertialState
+        State before the step.
+    f_b : (3,)
+        Mean specific force over the step, m/s^2.
+    w_b : (3,)
+        Mean angular rate over the step, rad/s.
+    dt : float
+        Step, s.
+    earth : Earth
+        Model of the earth.
+
+    Returns
+    -------
+    InertialState
+        State after the step.
+
+    References
+    ----------
+    Groves (2013), 5.4, 5.5.
+    """
     lat, lon, alt, v_n, C_nb = state
-    start = rates(lat, alt, v_n, C_nb @ f_b, earth)
+    start = navigation_rates(lat, alt, v_n, C_nb @ f_b, earth)
     v_mid = v_n + 0.5 * dt * start.v_n
     lat_mid, alt_mid = lat + 0.5 * dt * start.lat, alt + 0.5 * dt * start.alt
-    free = rates(lat_mid, alt_mid, v_mid, _ZERO, earth)
-    turn = free.w_in_n * dt
-    f_b_mean = _mean_rotation(w_b * dt) @ f_b  # f_b turned with the body, resolved in b at the step's start
-    f_n = rotation(-0.5 * turn) @ (C_nb @ f_b_mean)
-    v_new = v_n + dt * (f_n + free.v_n)
-    mean = rates(lat_mid, alt_mid, 0.5 * (v_n + v_new), f_n, earth)
-    C_new = rotation(-turn) @ C_nb @ rotation(w_b * dt)
-    return Inertial(lat + dt * mean.lat, wrap(lon + dt * mean.lon), alt + dt * mean.alt, v_new, C_new)
+    unforced = navigation_rates(lat_mid, alt_mid, v_mid, _ZERO, earth)
+    turn = unforced.w_in_n * dt
+    f_b_mean = _mean_rotation(w_b * dt) @ f_b  # mean of f_b in b at the start of the step
+    f_n = rotation_matrix(-0.5 * turn) @ (C_nb @ f_b_mean)
+    v_new = v_n + dt * (f_n + unforced.v_n)
+    mean = navigation_rates(lat_mid, alt_mid, 0.5 * (v_n + v_new), f_n, earth)
+    C_new = rotation_matrix(-turn) @ C_nb @ rotation_matrix(w_b * dt)
+    return InertialState(
+        lat + dt * mean.lat, wrap_angle(lon + dt * mean.lon), alt + dt * mean.alt, v_new, C_new
+    )
 
 
-def synthesise(state: Inertial, after: Inertial, dt: float, earth: Earth = wgs84) -> Increment:
-    """The mean f_b and w_b that lead from `state` to `after` in dt: the inverse of `mechanise`.
+def synthesise(state: InertialState, after: InertialState, dt: float, earth: Earth = wgs84) -> StepMeans:
+    """Compute the mean f_b and w_b that lead from one state to another: the inverse of `mechanise`.
 
-    Position is taken at the two ends as given; that it moves with the velocity is the trajectory's affair.
+    The positions are taken as given at the two ends; the trajectory must make them consistent with the
+    velocity.
+
+    Parameters
+    ----------
+    state, after : InertialState
+        States at the two ends of the step.
+    dt : float
+        Step, s.
+    earth : Earth
+        Model of the earth.
+
+    Returns
+    -------
+    StepMeans
+        Mean specific force and angular rate.
     """
     lat_mid, alt_mid = 0.5 * (state.lat + after.lat), 0.5 * (state.alt + after.alt)
-    free = rates(lat_mid, alt_mid, 0.5 * (state.v_n + after.v_n), _ZERO, earth)
-    turn = free.w_in_n * dt
-    w_b_dt = rotation_vector(state.C_nb.T @ rotation(turn) @ after.C_nb)
-    f_n = (after.v_n - state.v_n) / dt - free.v_n
-    f_b_mean = state.C_nb.T @ (rotation(0.5 * turn) @ f_n)
+    unforced = navigation_rates(lat_mid, alt_mid, 0.5 * (state.v_n + after.v_n), _ZERO, earth)
+    turn = unforced.w_in_n * dt
+    w_b_dt = rotation_vector(state.C_nb.T @ rotation_matrix(turn) @ after.C_nb)
+    f_n = (after.v_n - state.v_n) / dt - unforced.v_n
+    f_b_mean = state.C_nb.T @ (rotation_matrix(0.5 * turn) @ f_n)
     f_b = np.asarray(np.linalg.solve(_mean_rotation(w_b_dt), f_b_mean), dtype=np.float64)
-    return Increment(f_b, w_b_dt / dt)
+    return StepMeans(f_b, w_b_dt / dt)
 
 
-def two_samples(f_1: Vector, w_1: Vector, f_2: Vector, w_2: Vector, dt: float) -> Increment:
-    """Two successive samples of dt made one of 2 dt for `mechanise`, coning and sculling compensated.
+def combine_two_samples(f_1: Floats, w_1: Floats, f_2: Floats, w_2: Floats, dt: float) -> StepMeans:
+    """Combine two samples of dt into one of 2 dt for `mechanise`, with coning and sculling compensation.
 
-    Savage's two-sample algorithms: 2/3 a_1 x a_2 for the rotation, and for the velocity
-    2/3 (a_1 x u_2 + u_1 x a_2); the rotation term 1/2 a x u is `mechanise`'s own.
+    2/3 a_1 x a_2 for the rotation, and for the velocity 2/3 (a_1 x u_2 + u_1 x a_2); the rotation term
+    1/2 a x u is `mechanise`'s own.
+
+    Parameters
+    ----------
+    f_1, w_1, f_2, w_2 : (3,)
+        Mean specific forces, m/s^2, and angular rates, rad/s, of the two samples.
+    dt : float
+        Duration of each, s.
+
+    Returns
+    -------
+    StepMeans
+        Means over 2 dt.
+
+    References
+    ----------
+    Savage's two-sample algorithms.
     """
     a_1, a_2, u_1, u_2 = w_1 * dt, w_2 * dt, f_1 * dt, f_2 * dt
     angle = a_1 + a_2 + 2.0 / 3.0 * np.cross(a_1, a_2)
     velocity = u_1 + u_2 + 2.0 / 3.0 * (np.cross(a_1, u_2) + np.cross(u_1, a_2))
-    return Increment(velocity / (2.0 * dt), angle / (2.0 * dt))
+    return StepMeans(velocity / (2.0 * dt), angle / (2.0 * dt))
 
 
-def rotation(vector: Vector) -> Matrix:
-    """exp([vector x]) (3, 3): turns by |vector| rad about it (Rodrigues)."""
+def rotation_matrix(vector: Floats) -> Floats:
+    """Compute exp([vector x]): the rotation by |vector| rad about it (Rodrigues).
+
+    Parameters
+    ----------
+    vector : (3,)
+        Rotation vector, rad.
+
+    Returns
+    -------
+    (3, 3)
+        Rotation matrix.
+    """
     x, y, z = vector.tolist()
     angle2 = x * x + y * y + z * z
     return _polynomial(x, y, z, *_rodrigues(angle2)[:2])
 
 
-def rotation_vector(C: Matrix) -> Vector:
-    """The inverse of `rotation`, for turns below pi."""
+def rotation_vector(C: Floats) -> Floats:
+    """Compute the rotation vector of a matrix: the inverse of `rotation_matrix`, for rotations below pi.
+
+    Parameters
+    ----------
+    C : (3, 3)
+        Rotation matrix.
+
+    Returns
+    -------
+    (3,)
+        Rotation vector, rad.
+
+    Raises
+    ------
+    ValueError
+        Near pi, where the axis is not defined.
+    """
     axis = 0.5 * np.array([C[2, 1] - C[1, 2], C[0, 2] - C[2, 0], C[1, 0] - C[0, 1]])
     s = math.sqrt(axis @ axis)
     angle = math.atan2(s, 0.5 * (float(C[0, 0] + C[1, 1] + C[2, 2]) - 1.0))
     if angle > 3.1:
-        raise ValueError(f"a step turns by {angle:.3f} rad: sample faster, near pi its axis is not defined")
+        raise ValueError(
+            f"a step rotates by {angle:.3f} rad (limit 3.1): sample faster, near pi the axis is not defined"
+        )
     return np.asarray(axis * (angle / s) if s > 1e-12 else axis)
 
 
-def _mean_rotation(vector: Vector) -> Matrix:
-    """Mean of exp([s vector x]) over s in (0, 1): exact for a constant rate."""
+def _mean_rotation(vector: Floats) -> Floats:
+    """Average exp([s vector x]) over s in (0, 1): exact for a constant rate."""
     x, y, z = vector.tolist()
     angle2 = x * x + y * y + z * z
     return _polynomial(x, y, z, *_rodrigues(angle2)[1:])
 
 
 def _rodrigues(angle2: float) -> tuple[float, float, float]:
-    """sin(a)/a, (1 - cos(a))/a^2 and (a - sin(a))/a^3."""
+    """Compute sin(a)/a, (1 - cos(a))/a^2 and (a - sin(a))/a^3."""
     if angle2 < 1e-4:  # the series are exact to rounding here, the closed forms are not
         return (
             1.0 - angle2 / 6.0 * (1.0 - angle2 / 20.0 * (1.0 - angle2 / 42.0)),
@@ -168,8 +323,8 @@ def _rodrigues(angle2: float) -> tuple[float, float, float]:
     return math.sin(a) / a, (1.0 - math.cos(a)) / angle2, (a - math.sin(a)) / (a * angle2)
 
 
-def _polynomial(x: float, y: float, z: float, p: float, q: float) -> Matrix:
-    """I + p [v x] + q [v x]^2 of v = (x, y, z)."""
+def _polynomial(x: float, y: float, z: float, p: float, q: float) -> Floats:
+    """Compute I + p [v x] + q [v x]^2 of v = (x, y, z)."""
     return np.array(
         [
             [1.0 - q * (y * y + z * z), q * x * y - p * z, q * x * z + p * y],

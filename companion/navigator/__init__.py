@@ -20,7 +20,7 @@ from companion.navigator.deferred_update import learn
 from companion.navigator.solution import announce, solve
 from companion.navigator.stale_data import TOLD_EVERY, Freshness
 from companion.navigator.state import FIXES, Carry, Settings, Step, initial, is_news
-from companion.navigator.step import LEVEL_3D, step, uses
+from companion.navigator.step import step, uses
 from companion.records import (
     AirData,
     Attitude,
@@ -38,6 +38,7 @@ from companion.records import (
     Rejection,
     Reset,
     RsbnFix,
+    Severity,
     Solution,
     Source,
     Tuning,
@@ -183,7 +184,7 @@ class Navigator:
 
     def _too_late(self, record: Input) -> list[Output]:
         """That it is not used; in what a receiver without a fix says there is nothing to use."""
-        if isinstance(record, Gnss) and record.fix < LEVEL_3D:
+        if isinstance(record, Gnss) and not record.has_3d_fix:
             return []
         age, limit = (self._past[-1].t_ns - record.t_ns) * 1e-9, self._late_ns * 1e-9
         name = type(record).__name__
@@ -287,4 +288,4 @@ def _choice(record: Input, config: Config) -> Event:
         "local_position": f"the autopilot's local position ({why}); airspeed not used: "
         "it makes a good INS worse",
     }
-    return Event(record.t_ns, record.rx_ns, 6, f"inertial channel: {name[config.channel]}")
+    return Event(record.t_ns, record.rx_ns, Severity.INFO, f"inertial channel: {name[config.channel]}")

@@ -75,7 +75,7 @@ def first_place(fix: Gnss | RsbnFix, static: float | None) -> Geodetic | None:
     if isinstance(fix, RsbnFix):
         return place(fix, pressure_altitude(static) if static else fix.alt)
     alt = pressure_altitude(static) if static else fix.alt_msl
-    return Geodetic(fix.lat, fix.lon, alt) if fix.fix >= 3 else None
+    return Geodetic(fix.lat, fix.lon, alt) if fix.has_3d_fix else None
 
 
 def followed(static: float | None, climb: float, alt: float, dt: float) -> Vector2:

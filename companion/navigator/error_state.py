@@ -19,14 +19,12 @@ from functools import cache
 from typing import NamedTuple, Protocol
 
 import numpy as np
-import numpy.typing as npt
 
 from companion.config import GnssConfig, InertialConfig
 from companion.nav.disturbances import Disturbance, accelerometer_slow, compose, gyro_drift
-from companion.nav.error_model import INS_STATES, aircraft_errors
+from companion.nav.error_model import INS_STATES, aircraft_matrix
 from companion.records import Vector2, Vector3
-
-Floats = npt.NDArray[np.float64]
+from companion.units import G0, Floats
 
 N = 14
 POSITION = slice(0, 2)
@@ -36,7 +34,6 @@ INS = slice(0, 7)
 GYRO, ACCELEROMETER = (7, 8), (10, 11)  # north and east
 TURNING_M_S = 5.0  # slower, the course says nothing of the heading
 FRONT_S = 30.0  # how long a jump of the wind takes at most
-G0 = 9.80665  # [m/s^2] of what is quoted in micro-g
 NEAR_S = 0.5  # the noise that comes in meanwhile is nothing, and an error moves straight on
 STEP_S = 2.0  # the transition is a power series: its fifth term is below 1e-12 of the first here
 
@@ -109,7 +106,7 @@ class Grade(NamedTuple):
     def system(self, lat: float, v_n: Vector3, a_n: Vector2) -> System:
         """The INS error equations at this latitude, velocity and acceleration."""
         A = self.composed.copy()
-        A[INS, INS] = aircraft_errors(lat, v_n[0], v_n[1], (*a_n, 0.0))
+        A[INS, INS] = aircraft_matrix(lat, v_n[0], v_n[1], (*a_n, 0.0))
         # a strapped-down sensor's error turns with the aircraft: b_n' = (course rate) down x b_n
         speed2 = v_n[0] ** 2 + v_n[1] ** 2
         if self.body_fixed and speed2 > TURNING_M_S**2:

@@ -21,9 +21,9 @@ from companion.estimate.fusion import (
     Observation,
     Position,
     Range,
-    most_likely,
+    maximum_likelihood_3d,
 )
-from companion.nav.geometry import Geodetic, Triple, apart, east_north_up, ecef, from_enu
+from companion.nav.geometry import Geodetic, Triple, ecef_tuple, enu_axes_tuple, from_enu, separation_tuple
 from companion.navigator.error_state import Belief
 from companion.navigator.inertial_track import Point
 from companion.records import Gnss, RsbnFix, Source, Vector2
@@ -40,7 +40,7 @@ class Heard(NamedTuple):
 def from_gnss(record: Gnss, ins: Point, settings: GnssConfig, drifting: bool = False) -> Heard:
     """A GNSS fix as a horizontal position at the INS; if `drifting`, with its white noise alone."""
     sigma = white_sigma(record, settings) if drifting else _stated(record, settings)
-    north, east, _ = apart(Geodetic(record.lat, record.lon, record.alt_msl), ins.position)
+    north, east, _ = separation_tuple(Geodetic(record.lat, record.lon, record.alt_msl), ins.position)
     place = Position((east, north), ((sigma**2, 0.0), (0.0, sigma**2)))
     return Heard(record.t_ns, (place,), Source.GNSS)
 
@@ -59,8 +59,8 @@ def from_rsbn(record: RsbnFix, ins: Point, settings: RsbnConfig) -> tuple[Azimut
     """A beacon's azimuth and slant range, whichever are there, with the floors of the configuration."""
     here = ins.position
     (x, y, z), axes_beacon = _on_earth(record.lat, record.lon, record.alt)
-    x_0, y_0, z_0 = ecef(here)
-    axes = east_north_up(here.lat, here.lon)
+    x_0, y_0, z_0 = ecef_tuple(here)
+    axes = enu_axes_tuple(here.lat, here.lon)
     place = _times(axes, (x - x_0, y - y_0, z - z_0))
     observations: list[Azimuth | Range] = []
     if record.azimuth is not None:
@@ -87,7 +87,7 @@ def silent(z: Azimuth, error_n: Vector2, distance: float | None) -> bool:
 @lru_cache(maxsize=64)
 def _on_earth(lat: float, lon: float, alt: float) -> tuple[Triple, tuple[Triple, Triple, Triple]]:
     """Of a beacon, which stays where it is: ECEF position and axes east, north, up."""
-    return ecef(Geodetic(lat, lon, alt)), east_north_up(lat, lon)
+    return ecef_tuple(Geodetic(lat, lon, alt)), enu_axes_tuple(lat, lon)
 
 
 def _times(C: tuple[Triple, Triple, Triple], v: Triple) -> Triple:
@@ -119,7 +119,9 @@ def innovation(heard: Heard, prior: Belief, height_sigma: float) -> tuple[Belief
     (north, east), (nn, ne, ee) = prior
     # the place in the plane is minus the error; x east, y north
     before = Position((-east, -north), ((ee, ne), (ne, nn)))
-    found = most_likely((before, Height(0.0, height_sigma), *heard.observations), (-east, -north, 0.0))
+    found = maximum_likelihood_3d(
+        (before, Height(0.0, height_sigma), *heard.observations), (-east, -north, 0.0)
+    )
     x, y, _ = found.position
     (ee, ne, _), (_, nn, _), _ = found.covariance
     return Belief((-y, -x), (nn, ne, ee)), found.cost

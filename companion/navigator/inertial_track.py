@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from companion.nav.geometry import Geodetic, Projection, apart, displace, local_to_geodetic
+from companion.nav.geometry import Geodetic, Projection, displace, local_to_geodetic, separation_tuple
 from companion.records import LocalOrigin, LocalPosition, Vector2, Vector3
 
 KEEP = 128  # points: 12 s at 10 Hz, more than a beacon's answer may be late
@@ -80,7 +80,7 @@ def beyond(before: Point, after: Point) -> Vector3:
     counted from it, is a step and its return, and moves nothing in the end.
     """
     dt = (after.t_ns - before.t_ns) * 1e-9
-    moved = apart(after.position, before.position)
+    moved = separation_tuple(after.position, before.position)
     north, east, down = (s - 0.5 * (v + w) * dt for s, v, w in zip(moved, before.v_n, after.v_n, strict=True))
     return north, east, down
 

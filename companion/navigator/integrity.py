@@ -21,13 +21,13 @@ from companion.estimate.filterbank import INERTIAL, Measurement
 from companion.estimate.fusion import Azimuth, Range
 from companion.estimate.integrity import Protection
 from companion.estimate.monitor import Allotment, Exclusion, Monitor, Refusal
-from companion.nav.geometry import Geodetic, apart
+from companion.nav.geometry import Geodetic, separation_tuple
 from companion.navigator import error_state, fix_observations, gnss_beacon_check
 from companion.navigator.error_state import POSITION, VELOCITY, ErrorModel, ErrorState
 from companion.navigator.gnss_beacon_check import GNSS, PLAUSIBLE, Sights
 from companion.navigator.inertial_track import Point
 from companion.navigator.minimax_bound import Bounded
-from companion.records import Event, Gnss, Output, Rejection, Vector2, Vector3
+from companion.records import Event, Gnss, Output, Rejection, Severity, Vector2, Vector3
 
 FORKS = 2
 LOOSE_M_S = 0.05  # a root second: an inertial channel that is not believed beyond a minute
@@ -35,7 +35,6 @@ LOOSER = 8.0  # times the model's own noise, for a channel whose velocity is noi
 MOST_STEPS = 64  # across a silence: two minutes in the error state's own steps, a longer one in longer
 DECIDE_NS = 1_000_000_000
 BIAS_HOUR = 0.5  # a beacon's bias walks in an hour by this share of what it may be
-WARNING, NOTICE = 4, 5  # MAV_SEVERITY
 MOST_BEACONS = 8  # followed at once: the work grows with the cube of their number
 CONTRADICT = "sources contradict one another"
 
@@ -139,7 +138,7 @@ def of_gnss(record: Gnss, ins: Point, unit: ErrorModel, config: Config) -> Measu
     """Position and, where it is told and used, velocity; the receiver's slow drift is a state."""
     sigma = fix_observations.white_sigma(record, config.gnss)
     H, variance = error_state.gnss_rows(unit), [sigma**2] * 2
-    z = [*apart(ins.position, Geodetic(record.lat, record.lon, record.alt_msl))[:2]]
+    z = [*separation_tuple(ins.position, Geodetic(record.lat, record.lon, record.alt_msl))[:2]]
     if config.gnss.use_velocity and record.v_n is not None:
         told = max(record.sigma_velocity or 0.0, config.gnss.sigma_velocity_m_s)
         z += [ins.v_n[0] - record.v_n[0], ins.v_n[1] - record.v_n[1]]
@@ -242,7 +241,7 @@ def tell(before: Watch | None, after: Watch, rx_ns: int) -> list[Output]:
     t_ns = after.monitor.bank.t_ns
     told = list[Output]()
     if after.monitor.unresolved and not (before and before.monitor.unresolved):
-        told.append(Event(t_ns, rx_ns, WARNING, f"{CONTRADICT}, none clearly wrong"))
+        told.append(Event(t_ns, rx_ns, Severity.WARNING, f"{CONTRADICT}, none clearly wrong"))
     for e in after.exclusions:
         if e not in known:
             age = (e.t_ns - e.since_ns) * 1e-9
@@ -250,12 +249,12 @@ def tell(before: Watch | None, after: Watch, rx_ns: int) -> list[Output]:
             text += f"without its last {age:.0f} s the position moves by {e.moved:.0f} m"
             told += [
                 Rejection(e.t_ns, rx_ns, e.source, f"excluded: {e.reason}", e.value, e.limit),
-                Event(t_ns, rx_ns, WARNING, text),
+                Event(t_ns, rx_ns, Severity.WARNING, text),
             ]
     for e in known:
         if e.source not in after.monitor.bank.excluded:
             out = (t_ns - e.t_ns) * 1e-9
-            told.append(Event(t_ns, rx_ns, NOTICE, f"{e.source} heard again after {out:.0f} s"))
+            told.append(Event(t_ns, rx_ns, Severity.NOTICE, f"{e.source} heard again after {out:.0f} s"))
     return told
 
 

@@ -12,11 +12,12 @@ from collections.abc import Callable
 import numpy as np
 
 from companion.navigator import error_state, fix_observations, inertial_track, minimax_bound, wind_mixture
-from companion.navigator.error_state import Belief, ErrorState, Floats
+from companion.navigator.error_state import Belief, ErrorState
 from companion.navigator.inertial_track import Point
 from companion.navigator.state import FIXES, Carry, Settings, Step, sources, state_at
 from companion.navigator.wind_error_model import WindError
 from companion.records import Gnss, Rejection, RsbnFix, Vector3
+from companion.units import Floats
 
 BOUND_GATE = 3.0  # a fix within this many guaranteed r.m.s. of the prediction is believed after an outage
 

@@ -19,8 +19,8 @@ from companion.config import Config, PredictorConfig
 from companion.estimate.predictor import MEASURED, Forecast, Quantity, Window, predict, predict_ahead
 from companion.estimate.predictor import Prediction as Channel
 from companion.navigator import tilt_error_model
-from companion.navigator.error_state import G0
 from companion.records import Prediction, Vector2
+from companion.units import G0
 
 REFRESH_NS = 1_000_000_000
 HOPELESS_M = 1e6  # a bound beyond this is as good as none: the window is too short for so far ahead

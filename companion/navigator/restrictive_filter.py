@@ -22,8 +22,9 @@ from typing import NamedTuple
 import numpy as np
 
 from companion.estimate import kalman, restrictive
-from companion.navigator.error_state import ErrorModel, ErrorState, Floats, beacon_rows
+from companion.navigator.error_state import ErrorModel, ErrorState, beacon_rows
 from companion.navigator.wind_error_model import WIND, WindError
+from companion.units import Floats
 
 INTERVAL_NS = 10_000_000_000
 EVEN = 1.0 / 3.0  # variance of a change even within its bounds, in units of the bound's square

@@ -10,12 +10,13 @@ from companion.estimate import trust
 from companion.estimate.filterbank import INERTIAL
 from companion.nav.geometry import displace
 from companion.navigator import error_state, height_error, integrity, minimax_bound, restrictive_filter
-from companion.navigator.error_state import ErrorState, Floats
+from companion.navigator.error_state import ErrorState
 from companion.navigator.inertial_track import Point
 from companion.navigator.minimax_bound import Bounded
 from companion.navigator.state import FIXES, Carry, Settings, Step, level, sources, state_at
 from companion.navigator.wind_error_model import WindError
-from companion.records import Event, Mode, Solution, Source, Vector2, Vector3
+from companion.records import Event, Mode, Severity, Solution, Source, Vector2, Vector3
+from companion.units import Floats
 
 AHEAD_NS = 5_000_000_000  # how often the bounds ahead are worked out
 
@@ -49,7 +50,7 @@ def solve(carry: Carry, rx_ns: int, settings: Settings) -> Step:
     fixes = rests_on & FIXES
     candidates = _candidates(carry, state, dt, bounded, ins, settings)
     watched = carry.watch and carry.watch.protection
-    leads = settings.config.leading
+    leads = settings.config.leading_estimator
     if leads == "minimax" and watched and bounded and math.hypot(*bounded.bound_n) > watched.level:
         leads = "kalman"  # little is left to predict from: what was learnt of an excluded source is gone
     if (rests_on & Source.GNSS if leads == "restrictive" else fixes) or leads not in candidates:
@@ -160,5 +161,5 @@ def announce(solution: Solution) -> Event:
         why = "no fixes, and too few before for a guaranteed prediction"
     else:
         why = f"no fixes; the guaranteed bound is {math.hypot(*solution.bound_n):.0f} m"
-    severity = 4 if solution.mode is Mode.UNTRUSTED else 5
+    severity = Severity.WARNING if solution.mode is Mode.UNTRUSTED else Severity.NOTICE
     return Event(solution.t_ns, solution.rx_ns, severity, f"navigation {solution.mode}: {why}")

@@ -30,8 +30,8 @@ from companion.records import (
     RsbnFix,
     Stamped,
 )
+from companion.units import SECOND_NS
 
-SECOND = 1_000_000_000
 MOVING_M_S = 1.0
 FLYING_M_S = 5.0
 #: So long an old time may be repeated before it is told: streams are faster than their sensors.
@@ -42,7 +42,7 @@ ANSWERS, HALF_ANSWERS = 3, 5
 #: Two answers alike and this near are one that came twice, and so are two of anything else: what maps the
 #: autopilot's times is adjusted in between.
 SAME_ANSWER_NS, SAME_NS = 50_000_000, 5_000_000
-TOLD_EVERY = SECOND
+TOLD_EVERY = SECOND_NS
 
 
 class Run(NamedTuple):
@@ -84,7 +84,7 @@ LAWS: dict[type[Stamped], Law] = {
     Gnss: Law(
         lambda r: f"gnss {r.receiver}",
         lambda r: (r.lat, r.lon, r.alt_msl, r.v_n, r.fix),
-        lambda r, times, lasted_s: r.fix >= 3 and _moves(r.v_n),
+        lambda r, times, lasted_s: r.has_3d_fix and _moves(r.v_n),
     ),
     Attitude: Law(
         lambda r: "attitude",
@@ -124,7 +124,7 @@ class Freshness:
             return None
         lasted_s = (record.rx_ns - run.since_ns) * 1e-9
         if abs(stamp - run.stamp) <= same:  # no news; but a sensor that is well would have some by now
-            claimed = not isinstance(record, Gnss) or record.fix >= 3
+            claimed = not isinstance(record, Gnss) or record.has_3d_fix
             if claimed and lasted_s > PATIENCE_S:
                 return self._told(record, source, run, lasted_s, "its time stands still")
             return None

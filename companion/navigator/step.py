@@ -18,7 +18,6 @@ from typing import Any
 
 from companion.config import Channel
 from companion.estimate.fusion import Azimuth, Observation, Range
-from companion.nav.geometry import displace
 from companion.navigator import (
     air_data_channel,
     channel_corrections,
@@ -33,6 +32,7 @@ from companion.navigator import (
 from companion.navigator.deferred_update import unheard
 from companion.navigator.gnss_beacon_check import GNSS
 from companion.navigator.inertial_track import Point
+from companion.navigator.local_origin import LIVE_WINDOW_NS, infer_origin
 from companion.navigator.solution import solve
 from companion.navigator.state import Carry, Lesson, Settings, Step, initial, level, state_at
 from companion.records import (
@@ -51,13 +51,13 @@ from companion.records import (
     Rejection,
     Reset,
     RsbnFix,
+    Severity,
     Source,
     Stamped,
 )
 
 TOGETHER_NS = 1_000_000_000  # GNSS this close to a beacon's answer joins its fix
 PATIENCE_NS = 5_000_000_000  # how long the autopilot is waited for to tell what a channel begins with
-LEVEL_3D = 3  # GPS_FIX_TYPE_3D_FIX
 BRIDGED_S = 1.0  # a silence of the airspeed up to this long is nothing, and one of the position not told
 UNKNOWN_M_S = 15.0  # how fast the position is lost in a longer one
 UNKNOWN_M_S2 = 5.0  # and the velocity in one of the IMU,
@@ -78,7 +78,7 @@ def _origin(carry: Carry, record: LocalOrigin, settings: Settings) -> Step:
         return carry, []
     text = "local origin known" if old is None else "local origin changed"
     carry = carry._replace(origin=record)
-    return carry, [Event(record.t_ns, record.rx_ns, 6 if old is None else 4, text)]
+    return carry, [Event(record.t_ns, record.rx_ns, Severity.INFO if old is None else Severity.WARNING, text)]
 
 
 def _reboot(carry: Carry, record: Reboot, settings: Settings) -> Step:
@@ -98,15 +98,10 @@ def _reboot(carry: Carry, record: Reboot, settings: Settings) -> Step:
 def _global_position(carry: Carry, record: GlobalPosition, settings: Settings) -> Step:
     """Without a stated origin, the same position said twice, locally and globally, tells where it is."""
     local, since = carry.local, carry.waiting_ns
-    if carry.origin is not None or local is None or abs(record.t_ns - local.t_ns) > 50_000_000:
-        return carry, []
-    if since is None or record.t_ns - since < PATIENCE_NS:
-        return carry, []  # it was asked for, and the autopilot's own word is better
-    dt = (record.t_ns - local.t_ns) * 1e-9
-    north, east, down = (x + v * dt for x, v in zip(local.x_n, local.v_n, strict=True))
-    lat, lon, alt = displace(record.lat, record.lon, record.alt_msl, -north, -east, -down)
-    origin = LocalOrigin(record.t_ns, record.rx_ns, lat, lon, alt, "ardupilot")
-    return _origin(carry, origin, settings)
+    if carry.origin is not None or local is None or since is None or record.t_ns - since < PATIENCE_NS:
+        return carry, []  # wait for the origin that was requested: the autopilot's own is more accurate
+    origin = infer_origin(local, record, "ardupilot", LIVE_WINDOW_NS)
+    return (carry, []) if origin is None else _origin(carry, origin, settings)
 
 
 def _local_position(carry: Carry, record: LocalPosition, settings: Settings) -> Step:
@@ -229,10 +224,12 @@ def _begun(carry: Carry, record: Gnss | RsbnFix, settings: Settings) -> Step:
     if first is not None:
         return carry._replace(track=(first,)), []
     since = carry.waiting_ns or record.t_ns
-    if record.t_ns - since < PATIENCE_NS or (isinstance(record, Gnss) and record.fix < LEVEL_3D):
+    if record.t_ns - since < PATIENCE_NS or (isinstance(record, Gnss) and not record.has_3d_fix):
         return carry._replace(waiting_ns=since), []
     carry = carry._replace(waiting_ns=record.t_ns + AGAIN_NS)
-    return carry, [Event(record.t_ns, record.rx_ns, 4, f"inertial channel cannot begin: {why}")]
+    return carry, [
+        Event(record.t_ns, record.rx_ns, Severity.WARNING, f"inertial channel cannot begin: {why}")
+    ]
 
 
 def _gnss(carry: Carry, record: Gnss, settings: Settings) -> Step:
@@ -241,7 +238,7 @@ def _gnss(carry: Carry, record: Gnss, settings: Settings) -> Step:
     carry = carry._replace(gnss=record)
     ins = inertial_track.at(carry.track, record.t_ns)
     asked = math.inf if carry.asked_ns is None else (record.t_ns - carry.asked_ns) * 1e-9
-    if record.fix < LEVEL_3D or ins is None or asked < config.every_s:
+    if not record.has_3d_fix or ins is None or asked < config.every_s:
         return carry, told
     carry = carry._replace(asked_ns=record.t_ns, lesson=Lesson(record, None, ins))
     if integrity.excluded(carry.watch, GNSS):

@@ -18,24 +18,21 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from companion.nav.geometry import displace
-from companion.nav.strapdown import Inertial, mechanise, rotation
+from companion.nav.strapdown import InertialState, mechanise, rotation_matrix
 from companion.navigator import air_data_channel
 from companion.navigator.inertial_track import Point
 from companion.records import Attitude, Gnss, Imu, Pressure, RsbnFix, Vector3
+from companion.units import G0, Floats
 
-Matrix = npt.NDArray[np.float64]
-
-G = 9.80665  # [m/s^2]
 IMU_HZ, ATTITUDE_HZ = 10.0, 2.0  # wanted at least
 LEAST = 0.7  # of which so much must come: streams are asked for again below it
 FEW = 5  # samples that tell no rate yet
 SLOWEST_S = 2.0  # a longer interval is a silence and tells no rate either
 STALE_S = 1.0  # an attitude older than this is not carried on by gyros
 BRIDGED_S = 0.3  # a silence of the IMU up to this long is nothing
-F_MAX = 0.995 * 16.0 * G  # [m/s^2] the range of common accelerometers
+F_MAX = 0.995 * 16.0 * G0  # [m/s^2] the range of common accelerometers
 W_MAX = 0.995 * math.radians(2000.0)  # [rad/s] and gyros
 VERTICAL = 0.5  # of gravity, by which the vertical force may differ from it
 VERTICAL_S = 10.0  # averaged over so long: nobody climbs 50 m/s faster after it
@@ -68,10 +65,10 @@ class Strap(NamedTuple):
     """
 
     imu: Imu | None = None
-    C_nb: Matrix | None = None
+    C_nb: Floats | None = None
     imu_pace: Pace = Pace()
     attitude_pace: Pace = Pace()
-    down: float = -G
+    down: float = -G0
     static: float | None = None
     climb: float = 0.0
     why: str = "no IMU is heard"
@@ -85,7 +82,7 @@ def sense(s: Strap, record: Attitude | Pressure) -> Strap:
     C_nb = attitude_matrix(record)
     if s.imu is not None:
         dt = (s.imu.t_ns - record.t_ns) * 1e-9
-        C_nb = C_nb @ rotation(np.array(s.imu.w_b) * max(-STALE_S, min(dt, STALE_S)))
+        C_nb = C_nb @ rotation_matrix(np.array(s.imu.w_b) * max(-STALE_S, min(dt, STALE_S)))
     return s._replace(C_nb=C_nb, attitude_pace=s.attitude_pace.with_one(record.t_ns))
 
 
@@ -98,7 +95,7 @@ def hear(s: Strap, record: Imu) -> Strap:
         return s._replace(why=why)
     if s.C_nb is None:
         return s._replace(why="no attitude is heard")
-    C_nb = s.C_nb @ rotation(0.5 * (np.array(before.w_b) + record.w_b) * min(dt, STALE_S))
+    C_nb = s.C_nb @ rotation_matrix(0.5 * (np.array(before.w_b) + record.w_b) * min(dt, STALE_S))
     s = s._replace(imu=record, C_nb=C_nb)
     gain = min(dt / VERTICAL_S, 0.1)
     s = s._replace(down=s.down + gain * (float(C_nb[2] @ record.f_b) - s.down))
@@ -127,7 +124,7 @@ def advance(before: Strap, s: Strap, last: Point) -> tuple[Strap, Point]:
     alt, climb = air_data_channel.followed(s.static, s.climb, last.position.alt, dt)
     f_b = 0.5 * (np.array(before.imu.f_b) + s.imu.f_b)
     w_b = 0.5 * (np.array(before.imu.w_b) + s.imu.w_b)
-    start = Inertial(*last.position, np.array(last.v_n), before.C_nb)
+    start = InertialState(*last.position, np.array(last.v_n), before.C_nb)
     new = mechanise(start, f_b, w_b, dt)
     v_n: Vector3 = (float(new.v_n[0]), float(new.v_n[1]), -climb)
     position = last.position._replace(lat=new.lat, lon=new.lon, alt=alt)
@@ -144,7 +141,7 @@ def coast(s: Strap, last: Point) -> Point:
     return Point(s.imu.t_ns, moved._replace(alt=alt), last.v_n)
 
 
-def attitude_matrix(record: Attitude) -> Matrix:
+def attitude_matrix(record: Attitude) -> Floats:
     """C_nb (3, 3) of roll, pitch and heading: Groves (2.22)."""
     sr, sp, sh = math.sin(record.roll), math.sin(record.pitch), math.sin(record.heading)
     cr, cp, ch = math.cos(record.roll), math.cos(record.pitch), math.cos(record.heading)
@@ -181,7 +178,7 @@ def _unfit(s: Strap) -> str:
     silent = (s.imu.t_ns - s.attitude_pace.t_ns) * 1e-9
     if silent > STALE_S:
         return f"no attitude for {silent:.1f} s"
-    if abs(s.down + G) > VERTICAL * G:
+    if abs(s.down + G0) > VERTICAL * G0:
         return (
             f"the specific force upwards averages {-s.down:.1f} m/s^2 where gravity is 9.8: "
             "units or orientation of the IMU are wrong"

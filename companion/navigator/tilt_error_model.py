@@ -21,8 +21,9 @@ from typing import NamedTuple
 import numpy as np
 
 from companion.config import GnssConfig, StrapdownConfig
-from companion.navigator.error_state import G0, VELOCITY, Floats, System
+from companion.navigator.error_state import VELOCITY, System
 from companion.records import Vector2, Vector3
+from companion.units import G0, Floats
 
 N = 11
 TILT, BODY, HEADING, DRIFT = slice(4, 6), slice(6, 8), 8, slice(9, 11)

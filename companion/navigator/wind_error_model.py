@@ -18,8 +18,9 @@ from typing import NamedTuple
 import numpy as np
 
 from companion.config import AirDataConfig, GnssConfig
-from companion.navigator.error_state import FRONT_S, Floats, System
+from companion.navigator.error_state import FRONT_S, System
 from companion.records import Vector2, Vector3
+from companion.units import Floats
 
 N = 8
 WIND, SCALE, HEADING, DRIFT = slice(2, 4), 4, 5, slice(6, 8)

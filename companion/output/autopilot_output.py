@@ -1,7 +1,7 @@
-"""What goes into an autopilot's estimator, and what is kept from it. Sans-IO: solutions in, messages out.
+"""Autopilot output of one link: solutions in, messages to its estimator out. No I/O.
 
-Here the gate, the two commands with rules of their own (`resetting`, `switching`) and the encoders meet. What
-the autopilot says is heard for what it is asked, and never for a position: that comes from solutions alone.
+Joins the gate, the encoders and the two commands with rules of their own (`position_reset`, `source_switch`).
+Records from the autopilot are used for these rules only, never for a position: positions come from solutions.
 """
 
 from __future__ import annotations
@@ -11,78 +11,82 @@ from collections.abc import Collection
 
 from companion.config import Config
 from companion.config.profiles import MESSAGES, RESET
-from companion.link.dialect import Message
-from companion.output.encode import MAV_CMD_EXTERNAL_POSITION_ESTIMATE, Receiver, Unsent, encode
-from companion.output.gate import Gate, Position, Withheld
-from companion.output.position_reset import Resetting
-from companion.output.source_switch import Switching
+from companion.link.dialect import Message, mavlink
+from companion.output.encode import CannotEncode, Receiver, encode
+from companion.output.gate import Gate, Position, WithholdingMonitor
+from companion.output.position_reset import PositionReset
+from companion.output.source_switch import SourceSwitch
 from companion.records import Event, FilterStatus, GlobalPosition, Gnss, Solution, Source, Stamped, SystemTime
 
-CALLED = {RESET: "external position"}
+DISPLAY_NAMES = {RESET: "external position"}
 ON_SOURCE_SET_2 = frozenset({MESSAGES["odometry"], MESSAGES["vision"]})
 
 
-class Feed:
-    """That of one link's autopilot: what it was sent last, and what it said of its GPS and its time."""
+class AutopilotOutput:
+    """Messages to one link's autopilot, by the last ones sent and by the state of its GPS and its time."""
 
     def __init__(self, config: Config) -> None:
         self.config = config
         self.unix_ns: int | None = None
-        self._gate, self._withheld = Gate(), Withheld()
-        self._resetting, self._switching = Resetting(), Switching()
+        self._gate, self._monitor = Gate(), WithholdingMonitor()
+        self._position_reset, self._source_switch = PositionReset(), SourceSwitch()
         self._events: list[Event] = []
 
     @property
     def withheld(self) -> Counter[tuple[str, str]]:
-        """How often each message was withheld, by its name and the reason."""
-        return self._withheld.counts
+        """How often each message was withheld, by name and reason."""
+        return self._monitor.counts
 
-    def heard(self, record: Stamped) -> None:
-        """A record of the autopilot's."""
+    def receive(self, record: Stamped) -> None:
+        """Process a record from the autopilot."""
         if isinstance(record, SystemTime):
             if record.unix_ns is not None:
                 self.unix_ns = record.unix_ns - record.t_ns
         elif isinstance(record, Gnss | GlobalPosition | FilterStatus):
-            self._resetting.heard(record)
+            self._position_reset.receive(record)
 
-    def rebooted(self) -> None:
-        """The autopilot began anew."""
-        self._resetting, self._switching = Resetting(), Switching()
+    def handle_reboot(self) -> None:
+        """Reset what was known of the autopilot; it has rebooted."""
+        self._position_reset, self._source_switch = PositionReset(), SourceSwitch()
 
-    def acknowledged(self, command: int, result: int, now_ns: int) -> None:
-        """The autopilot's answer to a command of ours."""
-        self._switching.acknowledged(command, result, now_ns)
-        if command == MAV_CMD_EXTERNAL_POSITION_ESTIMATE:
-            self._tell(self._resetting.acknowledged(result, now_ns))
+    def handle_acknowledgement(self, command: int, result: int, now_ns: int) -> None:
+        """Process the autopilot's COMMAND_ACK of one of our commands."""
+        self._source_switch.handle_acknowledgement(command, result, now_ns)
+        if command == mavlink.MAV_CMD_EXTERNAL_POSITION_ESTIMATE:
+            self._add_event(self._position_reset.handle_acknowledgement(result, now_ns))
 
     def messages(self, solution: Solution, names: Collection[str], receiver: Receiver) -> list[Message]:
-        """What it is to be sent for `solution`, of the messages `names`, and what it is to be told to do."""
+        """Return the messages among `names` that may be sent for `solution`, and the commands due."""
         now = solution.rx_ns
-        position, made = self._gate.admit(solution), dict[str, Message]()
+        position, encoded = self._gate.admit(solution), dict[str, Message]()
         for name in names:
-            reason = position if isinstance(position, str) else self._forbids(position, name, receiver)
+            reason = (
+                position if isinstance(position, str) else self._withholding_reason(position, name, receiver)
+            )
             if isinstance(position, Position) and reason is None:
                 try:
-                    made[name] = encode(position, receiver, name)
-                except Unsent as unsent:
-                    reason = str(unsent)
-            self._tell(self._withheld.note(CALLED.get(name, name), reason, now))
+                    encoded[name] = encode(position, receiver, name)
+                except CannotEncode as error:
+                    reason = str(error)
+            self._add_event(self._monitor.update(DISPLAY_NAMES.get(name, name), reason, now))
         if self.config.output.switches_sources and (by_set := ON_SOURCE_SET_2.intersection(names)):
-            self._switching.update(bool(solution.sources & Source.GNSS), not by_set.isdisjoint(made), now)
-            return [*made.values(), *self._switching.to_send(receiver.system, now)]
-        return list(made.values())
+            self._source_switch.update(
+                bool(solution.sources & Source.GNSS), not by_set.isdisjoint(encoded), now
+            )
+            return [*encoded.values(), *self._source_switch.to_send(receiver.system, now)]
+        return list(encoded.values())
 
     def take_events(self) -> list[Event]:
-        """What is to be told since this was last asked."""
-        taken, self._events = [*self._events, *self._switching.take_events()], []
+        """Return the events since the last call."""
+        taken, self._events = [*self._events, *self._source_switch.take_events()], []
         return taken
 
-    def _forbids(self, position: Position, name: str, receiver: Receiver) -> str | None:
+    def _withholding_reason(self, position: Position, name: str, receiver: Receiver) -> str | None:
         profile = self.config.output.profile
         if profile not in ("custom", receiver.autopilot):
-            return f"the autopilot heard is no {profile}: set output.profile"
-        return self._resetting.forbids(position) if name == RESET else None
+            return f"the autopilot is not {profile}: set output.profile"
+        return self._position_reset.withholding_reason(position) if name == RESET else None
 
-    def _tell(self, event: Event | None) -> None:
+    def _add_event(self, event: Event | None) -> None:
         if event is not None:
             self._events.append(event)

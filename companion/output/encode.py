@@ -1,12 +1,12 @@
-"""A position, or a solution -> messages, as the autopilot at the other end takes them.
+"""Message encoders: positions and solutions as MAVLink messages, as each make of autopilot reads them.
 
-Each make reads a standard message in its own way (measured on ArduPlane/ArduCopter 4.7 EKF3 and PX4 EKF2);
-those ways are written down here and nowhere else. What feeds an estimator is made of a `gate.Position` only,
-so that nothing implausible can leave; NAVIGATION_STATUS is made of any solution, for it says just that.
+Each make interprets a standard message in its own way (measured on ArduPlane/ArduCopter 4.7 EKF3 and PX4
+EKF2); these differences are handled here only. A message for an estimator is made from a `gate.Position`, so
+no unchecked value can be sent. NAVIGATION_STATUS is made from any solution and reports its state.
 
-Every time sent is that of the companion's monotonic clock: ArduPilot learns the offset of one steady clock a
-link, for all messages together, and PX4 maps it by the TIMESYNC that the session answers with the same clock.
-A position is sent as of the instant of sending, so none has an age.
+Every timestamp is on the companion's monotonic clock: ArduPilot estimates the offset of one clock per link
+for all messages, and PX4 maps it by the TIMESYNC messages, which the session answers from the same clock. A
+position is valid at the time of sending, so none has an age.
 """
 
 from __future__ import annotations
@@ -18,54 +18,51 @@ from typing import Any, NamedTuple, TypeAlias
 
 from companion.link import dialect
 from companion.link.decode import Autopilot
+from companion.link.dialect import mavlink, rsbn
 from companion.nav.geometry import Geodetic, Projection, geodetic_to_local
 from companion.output.gate import Position
 from companion.records import LocalOrigin, Mode, Solution, Source
 
 Message: TypeAlias = Any
 
-GREATEST_ERROR_M = 100.0
-"""ArduPilot's filter cuts every position error off here: to say more is not possible, and to say less is
-not true."""
+ARDUPILOT_MAX_SIGMA_M = 100.0
+"""ArduPilot's filter limits every position sigma to this value, so a greater one cannot be stated."""
+_TOO_INACCURATE = f"accuracy worse than ArduPilot's limit of {ARDUPILOT_MAX_SIGMA_M:g} m"
 GPS_LAG_NS = 200_000_000
-"""ArduPilot takes a GPS_INPUT for so much older than its arrival."""
-MAV_CMD_EXTERNAL_POSITION_ESTIMATE = 43003
+"""Age that ArduPilot assumes for a GPS_INPUT on arrival."""
 
-_GLOBAL_INT, _LOCAL_NED, _BODY_FRD, _LOCAL_FRD = 5, 1, 12, 20  # MAV_FRAME
-_ESTIMATOR_UNKNOWN = 0  # PX4 refuses GPS, GPS_INS, LIDAR and AUTOPILOT, and drops the variances of NAIVE
-_POSITION_SRC_ESTIMATOR = 6
-_YAW_ERROR = 1.5  # rad, the greatest ArduPilot counts with; the attitude sent means nothing
+# PX4 rejects GPS, GPS_INS, LIDAR and AUTOPILOT, and ignores the variances of NAIVE
+_ESTIMATOR_UNKNOWN = mavlink.MAV_ESTIMATOR_TYPE_UNKNOWN
+_YAW_ERROR = 1.5  # rad, the greatest that ArduPilot uses; the attitude sent is meaningless
 _FIXED, _PREDICTED = 100, 50  # quality, per cent; -1 is "failed" and dropped, 0 "unknown"
 
 _SECOND_RECEIVER = 1  # gps_id: the first is the autopilot's own
-_FIX_3D = 3
-_IGNORE_VERTICAL_VELOCITY = 16  # GPS_INPUT_IGNORE_FLAGS
 _SATELLITES, _DOP = 6, 1.0
-"""There are none: ArduPilot checks for 6 and 2.5. The least, lest it prefer us to a receiver with a fix."""
-_GPS_EPOCH_S, _LEAP_S = 315_964_800, 18  # of UNIX time; GPS time is UTC and 18 s since 2017
+"""Placeholders: the minimum of ArduPilot's check (6, 2.5), so that a receiver with a fix is preferred."""
+_GPS_EPOCH_S, _LEAP_S = 315_964_800, 18  # UNIX time; GPS time is 18 s ahead of UTC since 2017
 _WEEK_MS, _WEEKS = 604_800_000, 1 << 16
 
-_MODES = {Mode.INITIALISING: 0, Mode.FIXED: 1, Mode.PREDICTING: 2, Mode.UNTRUSTED: 3}  # NAVIGATION_MODE
+_MODES = {mode: getattr(rsbn, f"NAVIGATION_MODE_{mode.name}") for mode in Mode}
 _ESTIMATORS = ("none", "fusion", "minimax", "kalman", "restrictive", "smoother", "polynomial")
-_SOURCES = {  # NAVIGATION_SOURCE
-    Source.INERTIAL: 1,
-    Source.GNSS: 2,
-    Source.AZIMUTH: 8,
-    Source.RANGE: 16,
-    Source.AIR_DATA: 32,
+_SOURCES = {
+    Source.INERTIAL: rsbn.NAVIGATION_SOURCE_INS,
+    Source.GNSS: rsbn.NAVIGATION_SOURCE_GNSS,
+    Source.AZIMUTH: rsbn.NAVIGATION_SOURCE_RSBN_AZIMUTH,
+    Source.RANGE: rsbn.NAVIGATION_SOURCE_RSBN_RANGE,
+    Source.AIR_DATA: rsbn.NAVIGATION_SOURCE_AIR_DATA,
 }
 
 
-class Unsent(Exception):
-    """A message that cannot be made honestly, and why."""
+class CannotEncode(Exception):
+    """The receiver cannot be given this position correctly; the text states why."""
 
 
 class Receiver(NamedTuple):
-    """Who is told, and what only the link and the service know.
+    """The autopilot that receives a message, and the values that only its link knows.
 
-    `origin` is the autopilot's last local origin, `geoid` the height of mean sea level above the ellipsoid
-    here (m) where a receiver tells it, `sensor_id` PX4's EKF2_AGP0_ID, `unix_ns` UTC less our clock (ns)
-    where it is known, `rejected` the count of measurements not used.
+    `origin` is the autopilot's local origin, `geoid` the height of mean sea level above the ellipsoid (m) if
+    a receiver reports it, `sensor_id` PX4's EKF2_AGP0_ID, `unix_ns` UTC minus our clock (ns) if known,
+    `rejected` the number of rejected measurements.
     """
 
     autopilot: Autopilot
@@ -79,14 +76,14 @@ class Receiver(NamedTuple):
 
 
 def encode(position: Position, receiver: Receiver, name: str) -> Message:
-    """The message called `name` (a key of `ENCODERS`). `Unsent` where it would not be honest."""
+    """Encode the message `name` (a key of `ENCODERS`). Raises `CannotEncode` if it would be incorrect."""
     return ENCODERS[name](position, receiver)
 
 
 def odometry(position: Position, receiver: Receiver) -> Message:
-    """ODOMETRY: the position alone, counted from the autopilot's origin by the autopilot's own projection.
+    """Encode ODOMETRY: position only, from the autopilot's local origin in the autopilot's own projection.
 
-    Velocity and rates are NaN, so that they are not used.
+    Velocity and rates are NaN: not given.
     """
     x, y, z = _local(position, receiver)
     ardupilot = receiver.autopilot == "ardupilot"
@@ -94,12 +91,12 @@ def odometry(position: Position, receiver: Receiver) -> Message:
     return dialect.new(
         "ODOMETRY",
         time_usec=position.t_ns // 1000,
-        frame_id=_LOCAL_FRD if ardupilot else _LOCAL_NED,
-        child_frame_id=_BODY_FRD,
+        frame_id=mavlink.MAV_FRAME_LOCAL_FRD if ardupilot else mavlink.MAV_FRAME_LOCAL_NED,
+        child_frame_id=mavlink.MAV_FRAME_BODY_FRD,
         x=x,
         y=y,
         z=z,
-        # PX4 leaves out an attitude of NaN. ArduPilot converts it to angles first: "none" is no rotation.
+        # PX4 ignores an attitude of NaN; ArduPilot converts it to angles, so it receives no rotation
         q=[1.0, 0.0, 0.0, 0.0] if ardupilot else [nan] * 4,
         vx=nan,
         vy=nan,
@@ -116,7 +113,7 @@ def odometry(position: Position, receiver: Receiver) -> Message:
 
 
 def vision_position_estimate(position: Position, receiver: Receiver) -> Message:
-    """VISION_POSITION_ESTIMATE: the same local metres and covariance, north, east, down for both makes."""
+    """Encode VISION_POSITION_ESTIMATE: position and covariance as in ODOMETRY; NED for both makes."""
     x, y, z = _local(position, receiver)
     ardupilot = receiver.autopilot == "ardupilot"
     angle = 0.0 if ardupilot else math.nan
@@ -135,12 +132,12 @@ def vision_position_estimate(position: Position, receiver: Receiver) -> Message:
 
 
 def _local(position: Position, receiver: Receiver) -> tuple[float, float, float]:
-    """North, east, down from the autopilot's origin, m."""
+    """Return north, east, down from the autopilot's local origin, m."""
     origin = receiver.origin
     if origin is None:
-        raise Unsent("the autopilot's local origin is not known")
-    if receiver.autopilot == "ardupilot" and position.sigma > GREATEST_ERROR_M:
-        raise Unsent(f"its accuracy is worse than the {GREATEST_ERROR_M:g} m that ArduPilot can be told")
+        raise CannotEncode("the autopilot's local origin is unknown")
+    if receiver.autopilot == "ardupilot" and position.sigma > ARDUPILOT_MAX_SIGMA_M:
+        raise CannotEncode(_TOO_INACCURATE)
     point = Geodetic(position.lat, position.lon, position.alt_msl)
     start = Geodetic(origin.lat, origin.lon, origin.alt_msl)
     return geodetic_to_local(_projection(origin), start, point)
@@ -154,11 +151,11 @@ def _projection(origin: LocalOrigin) -> Projection:
 
 
 def _covariance(position: Position, ardupilot: bool) -> list[float]:
-    """Upper triangle of 6 x 6, row by row.
+    """Return the upper triangle of the 6 x 6 covariance, row by row.
 
-    For ArduPilot the horizontal accuracy: it reads one number for all axes, A = cbrt(c0^2 + c6^2 + c11^2), so
-    A metres are said by c0 = c6 = c11 = sqrt(A^3 / 3), and so for the angles. For others the true variances
-    of the position, and none of the attitude.
+    ArduPilot reads one accuracy for all axes, A = cbrt(c0^2 + c6^2 + c11^2), so the horizontal accuracy A is
+    encoded as c0 = c6 = c11 = sqrt(A^3 / 3), and the angles likewise. Others receive the position variances,
+    and NaN for the attitude.
     """
     covariance = [0.0] * 21
     if ardupilot:
@@ -172,31 +169,31 @@ def _covariance(position: Position, ardupilot: bool) -> list[float]:
 
 
 def gps_input(position: Position, receiver: Receiver) -> Message:
-    """GPS_INPUT as ArduPilot's second receiver, as of `GPS_LAG_NS` before it arrives.
+    """Encode GPS_INPUT as ArduPilot's second receiver, valid `GPS_LAG_NS` before it arrives.
 
-    With our velocity, always: a message with the ignore flags leaves ArduPilot the velocity of the last one
-    without them, and one that never has any is taken for standing still (51 m r.m.s. where a true velocity
-    gave 4.4 m). It is ours to give: no channel that takes part of the autopilot's may feed it.
+    The velocity is always included. With the ignore flags ArduPilot keeps the velocity of the last message
+    without them, and without any velocity it assumes zero (51 m r.m.s. position error instead of 4.4 m). The
+    velocity is independent of the autopilot's, because no channel that uses its position may feed it.
     """
     if receiver.unix_ns is None:
-        raise Unsent("the time of day is not known")
-    if position.sigma > GREATEST_ERROR_M:
-        raise Unsent(f"its accuracy is worse than the {GREATEST_ERROR_M:g} m that ArduPilot can be told")
+        raise CannotEncode("the time of day is unknown")
+    if position.sigma > ARDUPILOT_MAX_SIGMA_M:
+        raise CannotEncode(_TOO_INACCURATE)
     if position.sigma_velocity is None:
-        raise Unsent("the accuracy of its velocity is not known")
+        raise CannotEncode("velocity accuracy is unknown")
     then = position.at(position.t_ns - GPS_LAG_NS)
     gps_ms = (position.t_ns + receiver.unix_ns) // 1_000_000 + (_LEAP_S - _GPS_EPOCH_S) * 1000
     if not _WEEK_MS <= gps_ms < _WEEKS * _WEEK_MS:
-        raise Unsent("the time of day is not known")
+        raise CannotEncode("the time of day is unknown")
     north, east, _ = position.v_n
     return dialect.new(
         "GPS_INPUT",
         time_usec=position.t_ns // 1000,
         gps_id=_SECOND_RECEIVER,
-        ignore_flags=_IGNORE_VERTICAL_VELOCITY,
+        ignore_flags=mavlink.GPS_INPUT_IGNORE_FLAG_VEL_VERT,
         time_week_ms=gps_ms % _WEEK_MS,
         time_week=gps_ms // _WEEK_MS,
-        fix_type=_FIX_3D,
+        fix_type=mavlink.GPS_FIX_TYPE_3D_FIX,
         lat=_deg_e7(then.lat),
         lon=_deg_e7(then.lon),
         alt=then.alt_msl,
@@ -214,14 +211,14 @@ def gps_input(position: Position, receiver: Receiver) -> Message:
 
 
 def global_position_sensor(position: Position, receiver: Receiver) -> Message:
-    """GLOBAL_POSITION_SENSOR, `eph` and `epv` honest."""
+    """Encode GLOBAL_POSITION_SENSOR; `eph` and `epv` are the standard deviations."""
     return dialect.new(
         "GLOBAL_POSITION_SENSOR",
         target_system=receiver.system,
         target_component=receiver.component,
         id=receiver.sensor_id,
         time_usec=position.t_ns // 1000,
-        source=_POSITION_SRC_ESTIMATOR,
+        source=mavlink.GLOBAL_POSITION_SRC_ESTIMATOR,
         lat=_deg_e7(position.lat),
         lon=_deg_e7(position.lon),
         alt_ellipsoid=math.nan if receiver.geoid is None else position.alt_msl + receiver.geoid,
@@ -232,20 +229,20 @@ def global_position_sensor(position: Position, receiver: Receiver) -> Message:
 
 
 def external_position_estimate(position: Position, receiver: Receiver) -> Message:
-    """MAV_CMD_EXTERNAL_POSITION_ESTIMATE, in COMMAND_INT, which alone takes it.
+    """Encode MAV_CMD_EXTERNAL_POSITION_ESTIMATE, which is accepted in COMMAND_INT only.
 
-    Both makes take frame 5 (PX4 no other), and a height of NaN (ArduPilot no other). A `param1` of NaN kills
-    ArduPilot; it is rounded down to the single precision of the wire, because a stamp that is late would
-    move the clock that all messages of the link share.
+    Both makes accept frame 5 (PX4 no other) and a height of NaN (ArduPilot no other). A `param1` of NaN
+    crashes ArduPilot. It is rounded down to single precision, because a timestamp in the future would shift
+    the clock offset that all messages of the link share.
     """
-    if position.sigma > GREATEST_ERROR_M:
-        raise Unsent(f"its accuracy is worse than {GREATEST_ERROR_M:g} m, and it would be taken for true")
+    if position.sigma > ARDUPILOT_MAX_SIGMA_M:
+        raise CannotEncode(f"accuracy worse than {ARDUPILOT_MAX_SIGMA_M:g} m, the limit of a position reset")
     return dialect.new(
         "COMMAND_INT",
         target_system=receiver.system,
         target_component=receiver.component,
-        frame=_GLOBAL_INT,
-        command=MAV_CMD_EXTERNAL_POSITION_ESTIMATE,
+        frame=mavlink.MAV_FRAME_GLOBAL_INT,
+        command=mavlink.MAV_CMD_EXTERNAL_POSITION_ESTIMATE,
         param1=_single_below(position.t_ns * 1e-9),
         param2=0.0,
         param3=position.sigma,
@@ -257,7 +254,7 @@ def external_position_estimate(position: Position, receiver: Receiver) -> Messag
 
 
 def _single_below(value: float) -> float:
-    """The greatest number of single precision that is not above a positive `value`."""
+    """Return the greatest single-precision number that is not above a positive `value`."""
     packed = struct.pack("<f", value)
     single: float = struct.unpack("<f", packed)[0]
     if single > value:
@@ -267,7 +264,7 @@ def _single_below(value: float) -> float:
 
 
 def navigation_status(solution: Solution, receiver: Receiver) -> Message:
-    """NAVIGATION_STATUS, for every solution; unknown is NaN."""
+    """Encode NAVIGATION_STATUS, for any solution; unknown values are NaN."""
     s = solution
     ahead = s.ahead[:4]
     unused = 4 - len(ahead)
@@ -292,7 +289,7 @@ def navigation_status(solution: Solution, receiver: Receiver) -> Message:
         mode=_MODES[s.mode],
         estimator=_ESTIMATORS.index(s.estimator) if s.estimator in _ESTIMATORS else 0,
         protection=math.nan if s.protection is None else s.protection,
-        trust=0 if s.trust is None else s.trust + 1,  # NAVIGATION_TRUST: 0 is "not told"
+        trust=0 if s.trust is None else s.trust + 1,  # NAVIGATION_TRUST: 0 is "unknown"
     )
 
 
@@ -307,4 +304,4 @@ ENCODERS: Mapping[str, Callable[[Position, Receiver], Message]] = {
     "GLOBAL_POSITION_SENSOR": global_position_sensor,
     "COMMAND_INT": external_position_estimate,
 }
-"""Every message that a position can be told by; of COMMAND_INT, MAV_CMD_EXTERNAL_POSITION_ESTIMATE."""
+"""Encoders of the position messages; COMMAND_INT carries MAV_CMD_EXTERNAL_POSITION_ESTIMATE."""

@@ -1,72 +1,83 @@
-"""When the autopilot's position may be set by MAV_CMD_EXTERNAL_POSITION_ESTIMATE. Sans-IO.
+"""Position reset: when MAV_CMD_EXTERNAL_POSITION_ESTIMATE may reset the autopilot's position. No I/O.
 
-For ArduPilot that command is a hard reset without a gate (it was seen to accept 500 km, and to fly there), so
-the gate is here. It opens only while the autopilot has no GPS of its own, and only as far as it may have
-drifted: since it last had GPS, or took a position of ours, it reckons by airspeed and a wind that it holds
-for known, so it is wrong by no more than that wind may be wrong, times the time. A reset beyond that and
-our own three sigmas is a fault of ours, and is withheld.
+ArduPilot executes this command as a hard reset without a gate (it accepted 500 km, and flew there), so the
+gate is here. A reset is allowed only while the autopilot has no GPS of its own, and only within its possible
+drift. Since its last GPS fix or accepted reset it dead-reckons by airspeed and a constant wind, so its error
+is at most the error of that wind times the elapsed time. A distance beyond that drift plus three of our
+sigmas indicates a fault of ours: the reset is withheld.
 """
 
 from __future__ import annotations
 
+from companion.link.dialect import mavlink
 from companion.nav.geometry import displace
-from companion.output.gate import FREE_M, SIGMAS, Position, distance
-from companion.records import Event, FilterStatus, GlobalPosition, Gnss, Stamped
+from companion.output.gate import JUMP_MARGIN_M, SIGMAS, Position, distance
+from companion.records import Event, FilterStatus, GlobalPosition, Gnss, Severity, Stamped
+from companion.units import SECOND_NS
 
-SECOND = 1_000_000_000
-GONE_NS = 2 * SECOND  # ArduPilot refuses while GPS passed under a second ago
-FRESH_NS = 2 * SECOND
-WIND_ERROR = 20.0  # [m/s], of a wind held for known: more than was ever seen (7 m/s after a change)
-ACCEPTED = 0
-RESULTS = ("accepted", "temporarily rejected", "denied", "unsupported", "failed")  # MAV_RESULT
+GPS_TIMEOUT_NS = 2 * SECOND_NS  # ArduPilot rejects the command for 1 s after a GPS fix
+POSITION_TIMEOUT_NS = 2 * SECOND_NS
+WIND_ERROR = 20.0  # [m/s], greatest error of its wind (7 m/s observed after a change)
+RESULTS = {
+    mavlink.MAV_RESULT_ACCEPTED: "accepted",
+    mavlink.MAV_RESULT_TEMPORARILY_REJECTED: "temporarily rejected",
+    mavlink.MAV_RESULT_DENIED: "denied",
+    mavlink.MAV_RESULT_UNSUPPORTED: "unsupported",
+    mavlink.MAV_RESULT_FAILED: "failed",
+}
 
 
-class Resetting:
-    """What is known of the autopilot's own position."""
+class PositionReset:
+    """State of the autopilot's own GPS and position."""
 
     def __init__(self) -> None:
         self._has_receiver = self._glitching = False
         self._fixed_ns: int | None = None  # when it last had GPS
-        self._sure_ns: int | None = None  # when its position was last known to be right
-        self._own: GlobalPosition | None = None
+        self._correct_ns: int | None = None  # when its position was last known to be correct
+        self._autopilot_position: GlobalPosition | None = None
         self._answer: int | None = None
 
-    def heard(self, record: Stamped) -> None:
-        """A record of the autopilot's."""
+    def receive(self, record: Stamped) -> None:
+        """Process a record from the autopilot."""
         if isinstance(record, FilterStatus):
             self._glitching = record.gnss_glitch
         elif isinstance(record, Gnss) and record.receiver == 0:
             self._has_receiver = True
-            if record.fix >= 3 and not self._glitching:
-                self._fixed_ns = self._sure_ns = record.rx_ns
+            if record.has_3d_fix and not self._glitching:
+                self._fixed_ns = self._correct_ns = record.rx_ns
         elif isinstance(record, GlobalPosition):
-            self._own = record
-            if self._sure_ns is None:
-                self._sure_ns = record.rx_ns
+            self._autopilot_position = record
+            if self._correct_ns is None:
+                self._correct_ns = record.rx_ns
 
-    def forbids(self, position: Position) -> str | None:
-        """Why `position` must not be sent now; None if it may."""
-        now, own = position.t_ns, self._own
+    def withholding_reason(self, position: Position) -> str | None:
+        """Return why `position` must not be sent now; None if it may be sent."""
+        now, own = position.t_ns, self._autopilot_position
         if not self._has_receiver:
-            return "the autopilot's GPS was never heard, so it may have a fix"
-        if self._fixed_ns is not None and now - self._fixed_ns < GONE_NS:
+            return "no GPS message received yet, so the autopilot may have a fix"
+        if self._fixed_ns is not None and now - self._fixed_ns < GPS_TIMEOUT_NS:
             return "the autopilot has GPS"
-        if own is None or self._sure_ns is None or now - own.rx_ns > FRESH_NS:
-            return "the autopilot's own position is not heard"
+        if own is None or self._correct_ns is None or now - own.rx_ns > POSITION_TIMEOUT_NS:
+            return "no recent position received from the autopilot"
         dt = (now - own.t_ns) * 1e-9
         there = displace(own.lat, own.lon, own.alt_msl, own.v_n[0] * dt, own.v_n[1] * dt, 0.0)
-        drift = WIND_ERROR * (now - self._sure_ns) * 1e-9
+        drift = WIND_ERROR * (now - self._correct_ns) * 1e-9
         away = distance(there[:2], (position.lat, position.lon))
-        if away > SIGMAS * position.sigma + drift + FREE_M:
-            return "it is further from the autopilot's than that can have drifted"
+        if away > SIGMAS * position.sigma + drift + JUMP_MARGIN_M:
+            return "further from the autopilot's position than its possible drift"
         return None
 
-    def acknowledged(self, result: int, now_ns: int) -> Event | None:
-        """The autopilot's answer; what is to be told, if it is another than before."""
-        if result == ACCEPTED:
-            self._sure_ns = now_ns
+    def handle_acknowledgement(self, result: int, now_ns: int) -> Event | None:
+        """Process the result of a reset; return an event if it differs from the previous result."""
+        if result == mavlink.MAV_RESULT_ACCEPTED:
+            self._correct_ns = now_ns
         news, self._answer = result != self._answer, result
         if not news:
             return None
-        name = RESULTS[result] if result < len(RESULTS) else f"MAV_RESULT {result}"
-        return Event(now_ns, now_ns, 6 if result == ACCEPTED else 4, f"external position {name}")
+        name = RESULTS.get(result, f"MAV_RESULT {result}")
+        return Event(
+            now_ns,
+            now_ns,
+            Severity.INFO if result == mavlink.MAV_RESULT_ACCEPTED else Severity.WARNING,
+            f"external position {name}",
+        )

@@ -1,9 +1,9 @@
-"""Work that may hang, done in a thread that nobody has to wait for.
+"""Daemon thread for blocking work whose completion the process does not wait for.
 
-    trouble = await aside(write)
+    trouble = await run_in_daemon_thread(write)
 
-`asyncio.to_thread` does it in a pool whose threads are waited for at the end of the process: with a disk that
-never answers there would be none.
+`asyncio.to_thread` uses a pool that is joined when the process exits; with a disk that never responds the
+process would not exit.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from typing import TypeVar
 T = TypeVar("T")
 
 
-def aside(work: Callable[[], T]) -> asyncio.Future[T]:
-    """Begin `work` in a thread of its own; what it returns or raises. Cancelled, it goes on unheard."""
+def run_in_daemon_thread(work: Callable[[], T]) -> asyncio.Future[T]:
+    """Run `work` in a daemon thread; return a future of its result. Cancelling does not stop the thread."""
     done: Future[T] = Future()
     done.set_running_or_notify_cancel()
 
@@ -28,5 +28,5 @@ def aside(work: Callable[[], T]) -> asyncio.Future[T]:
         except BaseException as error:
             done.set_exception(error)
 
-    threading.Thread(target=do, name="aside", daemon=True).start()
+    threading.Thread(target=do, name="daemon-work", daemon=True).start()
     return asyncio.wrap_future(done)

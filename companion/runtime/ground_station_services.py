@@ -1,6 +1,6 @@
-"""What others on the link may ask of us: commands, parameters, and the texts we tell. Sans-IO.
+"""Ground station services: commands, parameters and STATUSTEXT. No I/O.
 
-Every message heard goes through `receive`; what `to_send` gives is for every link that has a vehicle.
+`receive` takes every message received; the messages from `to_send` go to every link with a vehicle.
 """
 
 from __future__ import annotations
@@ -11,20 +11,21 @@ from typing import Any
 from companion.config import Config, OutputConfig
 from companion.config.profiles import RESET
 from companion.link import dialect
-from companion.link.commands import Commands, Source
-from companion.link.parameter_server import Parameters
+from companion.link.commands import CommandServer, Source
+from companion.link.parameter_server import ParameterServer
 from companion.link.session import MessageReceived
 from companion.link.status_text import StatusText
 from companion.records import Event
 
 NANO_PER_MICRO = 1000
-#: MAVLink's interval of a message that is not sent.
+#: Interval of a disabled message.
 DISABLED_US = -1
 
 
 def intervals_us(output: OutputConfig) -> dict[str, int]:
-    """The interval of each message that may be asked for, microseconds: not what the profile does not send,
-    nor the command that resets a position, which goes out at our pace alone.
+    """Return the interval of each message that may be requested, microseconds.
+
+    Excluded are messages that the profile does not send, and the position reset, whose rate is fixed.
     """
     return {
         name: round(1e6 / hz) if hz > 0.0 else DISABLED_US
@@ -37,8 +38,8 @@ def _by_id(output: OutputConfig) -> dict[int, int]:
     return {dialect.type_named(name).msgid: us for name, us in intervals_us(output).items()}
 
 
-class Dialogue:
-    """One component's side of it: acknowledges commands, keeps the parameters, tells its events."""
+class GroundStationServices:
+    """Command acknowledgement, parameter server and event reports of one component."""
 
     def __init__(
         self,
@@ -47,17 +48,17 @@ class Dialogue:
         save: Callable[[str], None],
         base: Config | None = None,
     ) -> None:
-        """`save` and `base`: see `Parameters`."""
+        """`save` and `base`: see `ParameterServer`."""
         component = config.link.component_id
         self._output = config.output
-        self._commands = Commands(
+        self._commands = CommandServer(
             component,
             _by_id(config.output),
             {dialect.type_named(name).msgid: source for name, source in sources.items()},
         )
-        self._parameters = Parameters(component, config, base=base, save=save)
+        self._parameters = ParameterServer(component, config, base=base, save=save)
         self._status = StatusText()
-        #: How often each message is to go out now; what is disabled is left out.
+        #: Period of each enabled message, ns.
         self.periods_ns = self._periods_ns()
 
     def _periods_ns(self) -> dict[str, int]:
@@ -68,25 +69,25 @@ class Dialogue:
         return periods
 
     def receive(self, event: MessageReceived, system: int) -> tuple[list[Any], Config | None]:
-        """Replies for the link it came on, and the configuration where a parameter changed it."""
+        """Process a message; return replies for its link, and the configuration if a parameter changed it."""
         replies = self._commands.receive(event.message, event.frame, system, event.received_ns)
         changes = self._parameters.receive(event.message, event.frame, system, event.received_ns)
         config = changes[-1].config if changes else None
         if config is not None and config.output != self._output:
             self._output = config.output
-            self._commands.pace(_by_id(config.output))
+            self._commands.set_default_intervals(_by_id(config.output))
         self.periods_ns = self._periods_ns()
         return replies, config
 
-    def tell(self, event: Event, now_ns: int) -> None:
-        """Have a change of state told as STATUSTEXT, as often as may be."""
-        self._status.tell(event, now_ns)
+    def report(self, event: Event, now_ns: int) -> None:
+        """Queue an event for STATUSTEXT, subject to its rate limit."""
+        self._status.add(event, now_ns)
 
     def to_send(self, now_ns: int) -> list[Any]:
-        """Messages for every link."""
+        """Return the messages that are due, for every link."""
         return [*self._parameters.to_send(now_ns), *self._status.to_send(now_ns)]
 
     def deadline(self) -> int | None:
-        """When `to_send` is next worth calling without news."""
+        """Return when `to_send` must be called next, None if only after new input."""
         due = [at for at in (self._parameters.deadline(), self._status.deadline()) if at is not None]
         return min(due, default=None)

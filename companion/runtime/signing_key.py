@@ -1,18 +1,18 @@
-"""The key of signed links through the life of a process: read once, its time followed, its stamp kept.
+"""Signing key of the links: read at the start, its time kept synchronized, its last timestamp stored.
 
-    keys = Keys.of(config)      # None: nothing is signed
-    keys.follow()               # every second
-    keys.store()                # in a thread: waits for a disk
+    key = SigningKey.from_config(config)    # None: no signing
+    key.follow_system_time()                # every second
+    key.save_timestamp()                    # in a thread: blocks on the disk
 
-By a clock that is behind, every frame of an autopilot on GPS time would be of the future, and ours of the
-past there. That a system clock shows a time of these years says nothing: a board without a battery begins
-where it was last shut down (fake-hwclock) or when its systemd was built. So on Linux the system's time is
-taken only while there is a file that systemd-timesyncd makes once a server has told it the time, and that the
-next boot begins without. Till then time is what genuine frames say; a time once taken runs on by itself.
+With a system clock that is behind, every frame of an autopilot on GPS time would be from the future, and ours
+from the past. A plausible date is no proof of a correct clock: a board without a battery starts with the time
+of its last shutdown (fake-hwclock) or of the build of systemd. So on Linux the system time is used only while
+the file exists that systemd-timesyncd creates after it has synchronized with a server, and that is absent
+after a boot. Until then the time is taken from genuine frames; once set, it runs on the monotonic clock.
 
-With chrony or ntpd nobody makes that file, and genuine frames tell the time always: signed links live, and
-miss only the refusal of what is stamped ahead. The kernel knows of all three (adjtimex), but units that
-protect the clock, ours too, end a process that asks it.
+chrony and ntpd do not create that file, so the time always comes from genuine frames: signed links work, only
+frames from the future are not rejected. The kernel knows the state of all three (adjtimex), but units that
+protect the clock, like ours, kill a process that makes this call.
 """
 
 from __future__ import annotations
@@ -26,34 +26,34 @@ from pathlib import Path
 from typing import Self
 
 from companion.config import Config, ConfigError
-from companion.link.signing import Signing, read_key, store, stored
+from companion.link.signing import Signing, load_timestamp, read_key, save_timestamp
 
-#: Made by systemd-timesyncd (239 and later) when the clock has been set after a server's.
+#: Created by systemd-timesyncd (239 and later) after the clock was synchronized with a server.
 SYNCHRONIZED = "/run/systemd/timesync/synchronized"
-#: Elsewhere than on Linux, a system clock before 2024 was never set.
+#: On other systems than Linux, a system clock before 2024 was never set.
 SET_AFTER_NS = 1_704_067_200_000_000_000
 
 
 def synchronized_time(platform: str = sys.platform, synchronized: str = SYNCHRONIZED) -> int | None:
-    """The system's time, UNIX nanoseconds; None where nobody vouches for it."""
+    """Return the system time, UNIX ns; None if it is not known to be synchronized."""
     unix_ns = time.time_ns()
-    vouched = os.path.exists(synchronized) if platform == "linux" else unix_ns >= SET_AFTER_NS
-    return unix_ns if vouched else None
+    synchronized_now = os.path.exists(synchronized) if platform == "linux" else unix_ns >= SET_AFTER_NS
+    return unix_ns if synchronized_now else None
 
 
-class Keys:
-    """MAVLink 2 signing with its key and the timestamp that must outlive a restart."""
+class SigningKey:
+    """MAVLink 2 signing with its key and the timestamp that outlives a restart."""
 
     def __init__(
         self, signing: Signing, stamp: Path, system_time: Callable[[], int | None] = synchronized_time
     ) -> None:
-        """`system_time`: UNIX nanoseconds, None while nobody vouches for them."""
+        """`stamp`: file of the timestamp; `system_time`: UNIX ns, None while not synchronized."""
         self.signing, self._stamp, self._system_time = signing, stamp, system_time
-        self.follow()
+        self.follow_system_time()
 
     @classmethod
-    def of(cls, config: Config) -> Self | None:
-        """As the configuration says, None without a key. Raises ConfigError for an unusable key."""
+    def from_config(cls, config: Config) -> Self | None:
+        """Create from the configuration; None without a key. Raises ConfigError for an unusable key."""
         settings = config.signing
         if not settings.key_file:
             return None
@@ -61,7 +61,7 @@ class Keys:
         try:
             signing = Signing(
                 read_key(Path(settings.key_file)),
-                timestamp=stored(stamp),
+                timestamp=load_timestamp(stamp),
                 refuse_unsigned=settings.refuse_unsigned,
                 always_accepted=settings.always_accepted,
             )
@@ -69,13 +69,13 @@ class Keys:
             raise ConfigError(f"signing.key_file: {error}") from None
         return cls(signing, stamp)
 
-    def follow(self) -> None:
-        """Take the system's time, which may be set at any moment, if there is one."""
+    def follow_system_time(self) -> None:
+        """Use the system time, which may be set at any moment, if it is synchronized."""
         if (unix_ns := self._system_time()) is not None:
-            self.signing.follow(unix_ns, time.monotonic_ns())
+            self.signing.set_time(unix_ns, time.monotonic_ns())
 
-    def store(self) -> None:
-        """Keep the timestamp; a disk that refuses costs signed links a minute after the next start."""
-        if self.signing.wants_storing:
+    def save_timestamp(self) -> None:
+        """Store the timestamp; if the disk fails, signed links start a minute late after the next start."""
+        if self.signing.needs_saving:
             with contextlib.suppress(OSError):
-                store(self._stamp, self.signing.to_store())
+                save_timestamp(self._stamp, self.signing.timestamp_to_save())

@@ -1,10 +1,10 @@
-"""A small text that must outlive a restart: kept whole on a disk that may be slow, full or gone.
+"""State file: a small text that outlives a restart, written atomically to a disk that may be slow or full.
 
-    kept = Kept(path)
-    kept.put(text)              # at once; OSError while the disk refuses
-    trouble = kept.write()      # in a thread: puts on disk what was put last, says what the disk said
+    file = StateFile(path)
+    file.put(text)              # returns at once; OSError while the disk fails
+    trouble = file.write()      # in a thread: writes the last text, returns the error of the disk
 
-It knows nothing of what the text says, starts no thread and asks no clock.
+It does not interpret the text, starts no thread and reads no clock.
 """
 
 from __future__ import annotations
@@ -15,33 +15,33 @@ import threading
 from pathlib import Path
 
 
-class Kept:
-    """The text of one file; `path` None: nothing is kept."""
+class StateFile:
+    """Text of one file; with `path` None nothing is stored."""
 
     def __init__(self, path: Path | None) -> None:
         self._path = path
         self._lock = threading.Lock()
-        self._waiting: str | None = None
+        self._pending: str | None = None
         self.trouble: str | None = None
 
     def put(self, text: str) -> None:
-        """Have `text` kept soon. OSError while what was put before it cannot be."""
+        """Set the text for the next `write`. Raises OSError while the previous text cannot be stored."""
         with self._lock:
             if self.trouble is not None:
                 raise OSError(errno.EIO, self.trouble)
-            self._waiting = text
+            self._pending = text
 
     def write(self) -> str | None:
-        """Put on disk what waits; what the disk said if it refused (then it is tried again), else None."""
+        """Store the pending text; return the error if the disk failed (the next call retries), else None."""
         with self._lock:
-            text, self._waiting = self._waiting, None
+            text, self._pending = self._pending, None
         if text is None or self._path is None:
             return self.trouble
         try:
             replace_text(self._path, text)
         except OSError as error:
             with self._lock:
-                self._waiting = text if self._waiting is None else self._waiting
+                self._pending = text if self._pending is None else self._pending
                 self.trouble = f"cannot write {self._path}: {error.strerror or error}"
         else:
             self.trouble = None
@@ -49,10 +49,10 @@ class Kept:
 
 
 def replace_text(path: Path, text: str) -> None:
-    """Write a file so that a loss of power leaves the old one or the new one, never half. OSError if not."""
-    beside = path.with_name(path.name + ".new")
-    with beside.open("w", encoding="utf-8") as file:
+    """Replace a file atomically: a power loss leaves the old text or the new one. Raises OSError."""
+    temporary = path.with_name(path.name + ".new")
+    with temporary.open("w", encoding="utf-8") as file:
         file.write(text)
         file.flush()
         os.fsync(file.fileno())
-    os.replace(beside, path)
+    os.replace(temporary, path)

@@ -1,10 +1,10 @@
-"""What the service manager is told of us: ready, alive, stopping. Silent where there is none.
+"""systemd notification: ready, watchdog, status and stopping; does nothing without a service manager.
 
-The protocol of sd_notify(3) is a datagram of NAME=VALUE lines to the socket that NOTIFY_SOCKET names; a name
-that begins with @ is in the abstract namespace. The watchdog's term is WATCHDOG_USEC. The packages for it
-are bindings to libsystemd (a compiler and headers on every board) or unmaintained, for less than is here.
+The protocol of sd_notify(3) is a datagram of NAME=VALUE lines to the socket in NOTIFY_SOCKET; a name that
+starts with @ is in the abstract namespace. The watchdog timeout is WATCHDOG_USEC. The existing packages are
+bindings to libsystemd (which need a compiler and headers on the board) or unmaintained.
 
-It has no thread and no timer: `alive` is told by whom it is to vouch for.
+There is no thread and no timer: `alive` is called by the work that it confirms.
 """
 
 from __future__ import annotations
@@ -14,44 +14,46 @@ import os
 import socket
 from collections.abc import Mapping
 
-#: How often within its term the watchdog is fed.
-TIMES = 4
+#: Watchdog notifications per timeout.
+FEEDS_PER_TIMEOUT = 4
 
 
-class Manager:
-    """The service manager at the other end, as `environment` (of the process) names it."""
+class SystemdNotifier:
+    """Connection to the service manager that the process `environment` names."""
 
     def __init__(self, environment: Mapping[str, str]) -> None:
         name = environment.get("NOTIFY_SOCKET", "")
-        self._place = "\0" + name[1:] if name.startswith("@") else name
-        meant = environment.get("WATCHDOG_PID", "") in ("", str(os.getpid()))
-        term_us = environment.get("WATCHDOG_USEC", "")
-        self._every_ns = 1000 * int(term_us) // TIMES if meant and term_us.isdecimal() else 0
+        self._address = "\0" + name[1:] if name.startswith("@") else name
+        applies = environment.get("WATCHDOG_PID", "") in ("", str(os.getpid()))
+        timeout_us = environment.get("WATCHDOG_USEC", "")
+        self._interval_ns = (
+            1000 * int(timeout_us) // FEEDS_PER_TIMEOUT if applies and timeout_us.isdecimal() else 0
+        )
         self._fed_ns: int | None = None
         self._is_ready = False
 
     def ready(self) -> None:
-        """It serves; told once."""
+        """Notify that the service is ready; sent once."""
         if not self._is_ready:
             self._is_ready = True
-            self._tell("READY=1")
+            self._notify("READY=1")
 
     def alive(self, now_ns: int) -> None:
-        """Work was done at `now_ns`: feed the watchdog, if there is one and it is time."""
-        if self._every_ns and (self._fed_ns is None or now_ns - self._fed_ns >= self._every_ns):
+        """Feed the watchdog, if enabled and due, for work completed at `now_ns`."""
+        if self._interval_ns and (self._fed_ns is None or now_ns - self._fed_ns >= self._interval_ns):
             self._fed_ns = now_ns
-            self._tell("WATCHDOG=1")
+            self._notify("WATCHDOG=1")
 
     def status(self, text: str) -> None:
-        """One line for `systemctl status`."""
-        self._tell("STATUS=" + text.replace("\n", " "))
+        """Set the line shown by `systemctl status`."""
+        self._notify("STATUS=" + text.replace("\n", " "))
 
     def stopping(self) -> None:
-        """The end has begun."""
-        self._tell("STOPPING=1")
+        """Notify that the service is stopping."""
+        self._notify("STOPPING=1")
 
-    def _tell(self, line: str) -> None:
-        if self._place[:1] in ("/", "\0"):
-            # a manager that does not listen is no reason not to navigate
+    def _notify(self, line: str) -> None:
+        if self._address[:1] in ("/", "\0"):
+            # keep navigating without a listening manager
             with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sock:
-                sock.sendto(line.encode(), socket.MSG_DONTWAIT, self._place)
+                sock.sendto(line.encode(), socket.MSG_DONTWAIT, self._address)

@@ -1,11 +1,11 @@
-"""The MCAP container, byte for byte: records <-> bytes, messages <-> chunk.
+"""MCAP container codec: records <-> bytes, messages <-> chunk (https://mcap.dev/spec, version 0).
 
-It knows the layout (https://mcap.dev/spec, version 0) and nothing of disks, clocks or what a message means.
-Parsing trusts no length it is given: what contradicts itself raises Damaged, what is torn off ends the walk.
+Pure: no disks, no clocks, no meaning of messages. The parser trusts no length field: inconsistent data raises
+DamagedError, a truncated end stops the iteration.
 
-Why not the mcap package, which the tests read every log with: its Writer (1.6) offers no way to close a chunk
-each second nor to take back one that the disk refused, and its readers stop at a torn end, where a flight's
-last chunks are. By `companion bench log` it also costs 3 times as much to write and 5 times as much to read.
+The mcap package is used in the tests only: its Writer (1.6) can neither close a chunk every second nor undo
+a chunk that the disk rejected, and its readers stop at a torn end, where the last chunks of a flight are. By
+`companion bench log` it is also 3 times slower to write and 5 times slower to read.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ import zstandard
 
 try:
     import lz4.frame as lz4  # type: ignore[import-untyped]
-except ImportError:  # our own logs are zstd; foreign ones may need it
+except ImportError:  # needed only for logs of other recorders; ours are zstd
     lz4 = None
 
 MAGIC = b"\x89MCAP0\r\n"
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX = range(1, 9)
 ATTACHMENT, ATTACHMENT_INDEX, STATISTICS, METADATA, METADATA_INDEX, SUMMARY_OFFSET, DATA_END = range(9, 16)
 
-MOST_UNCOMPRESSED = 1 << 28
-"""A chunk that claims more bytes than this is not opened: a few hostile bytes must not take the memory."""
+MAX_UNCOMPRESSED = 1 << 28
+"""Larger chunks are rejected, so that a forged size field cannot exhaust the memory."""
 
 _HEAD = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log time, publish time
@@ -37,20 +37,20 @@ _INDEX = struct.Struct("<BQH")  # opcode, length, channel
 CHUNK_HEAD_SIZE = _HEAD.size + _CHUNK.size + 4 + len("zstd") + 8
 
 
-class Damaged(ValueError):
-    """Bytes that contradict themselves: a bad checksum, a length that runs out of its record."""
+class DamagedError(ValueError):
+    """Inconsistent bytes, such as a wrong checksum or a length beyond the end of its record."""
 
 
 class Channel(NamedTuple):
-    """What a channel's messages are: `schema` is the schema's name, empty where there is none."""
+    """Topic, encoding and schema name of a channel; `schema` is empty if the channel has none."""
 
     topic: str
     encoding: str
     schema: str
 
 
-class Whole(NamedTuple):
-    """One whole record as it stands in a file: where it begins, its opcode and its content."""
+class RawRecord(NamedTuple):
+    """A complete record of a file: its offset, opcode and content."""
 
     offset: int
     opcode: int
@@ -62,27 +62,30 @@ class Whole(NamedTuple):
 # ---------------------------------------------------------------------------------------------------------
 
 
-def record(opcode: int, *parts: bytes) -> bytes:
-    """One record: opcode, length, content."""
+def encode_record(opcode: int, *parts: bytes) -> bytes:
+    """Encode one record: opcode, length, content."""
     content = b"".join(parts)
     return _HEAD.pack(opcode, len(content)) + content
 
 
-def scan(file: BinaryIO, size: int) -> Iterator[Whole]:
-    """Every whole record of `file` (positioned after its magic, `size` bytes in all) up to its footer."""
+def scan_records(file: BinaryIO, size: int) -> Iterator[RawRecord]:
+    """Yield every complete record up to the footer.
+
+    `file` is positioned after its magic, `size` is in bytes.
+    """
     offset = len(MAGIC)
     while offset + _HEAD.size <= size:
         opcode, length = _HEAD.unpack(file.read(_HEAD.size))
         if opcode == 0 or offset + _HEAD.size + length > size:
             return
-        yield Whole(offset, opcode, file.read(length))
+        yield RawRecord(offset, opcode, file.read(length))
         offset += _HEAD.size + length
         if opcode == FOOTER:
             return
 
 
 def is_closed(file: BinaryIO, size: int) -> bool:
-    """Whether a file ends the way a closed one does: a footer and the magic."""
+    """Return whether the file ends with a footer and the magic, as a closed log does."""
     if size < len(MAGIC) + 29 + len(MAGIC):
         return False
     file.seek(size - 37)
@@ -91,77 +94,77 @@ def is_closed(file: BinaryIO, size: int) -> bool:
     return tail[:9] == _HEAD.pack(FOOTER, 20) and tail[-8:] == MAGIC
 
 
-def text(value: str) -> bytes:
-    """A string behind its length."""
+def encode_string(value: str) -> bytes:
+    """Encode a string with a length prefix."""
     data = value.encode()
     return struct.pack("<I", len(data)) + data
 
 
-def texts(values: Mapping[str, str]) -> bytes:
-    """A map of strings behind its length in bytes."""
-    data = b"".join(text(key) + text(value) for key, value in values.items())
+def encode_string_map(values: Mapping[str, str]) -> bytes:
+    """Encode a map of strings with its length in bytes as a prefix."""
+    data = b"".join(encode_string(key) + encode_string(value) for key, value in values.items())
     return struct.pack("<I", len(data)) + data
 
 
-class Fields:
-    """Reads the fields of one record's content in order; raises Damaged where they run out of it."""
+class FieldReader:
+    """Sequential reader of the fields of a record; raises DamagedError beyond the end of the content."""
 
     def __init__(self, content: bytes) -> None:
         self._content = content
         self.at = 0
 
-    def take(self, size: int) -> bytes:
-        """The next `size` bytes."""
+    def read_bytes(self, size: int) -> bytes:
+        """Read the next `size` bytes."""
         data = self._content[self.at : self.at + size]
         if len(data) != size:
-            raise Damaged("a field runs out of its record")
+            raise DamagedError("a field extends beyond its record")
         self.at += size
         return data
 
-    def number(self, size: int) -> int:
-        """The next unsigned integer of `size` bytes."""
-        return int.from_bytes(self.take(size), "little")
+    def read_uint(self, size: int) -> int:
+        """Read an unsigned integer of `size` bytes."""
+        return int.from_bytes(self.read_bytes(size), "little")
 
-    def text(self) -> str:
-        """Mirror of `text`."""
+    def read_string(self) -> str:
+        """Read a string; inverse of `encode_string`."""
         try:
-            return self.take(self.number(4)).decode()
+            return self.read_bytes(self.read_uint(4)).decode()
         except UnicodeDecodeError:
-            raise Damaged("a string is not UTF-8") from None
+            raise DamagedError("a string is not UTF-8") from None
 
-    def texts(self) -> dict[str, str]:
-        """Mirror of `texts`."""
-        end = self.number(4) + self.at
+    def read_string_map(self) -> dict[str, str]:
+        """Read a map of strings; inverse of `encode_string_map`."""
+        end = self.read_uint(4) + self.at
         values = {}
         while self.at < end:
-            key = self.text()
-            values[key] = self.text()
+            key = self.read_string()
+            values[key] = self.read_string()
         return values
 
 
-def library(content: bytes) -> str:
-    """What a header says it was written by."""
-    fields = Fields(content)
-    fields.text()
-    return fields.text()
+def parse_library(content: bytes) -> str:
+    """Return the library field of a header record."""
+    fields = FieldReader(content)
+    fields.read_string()
+    return fields.read_string()
 
 
-def metadata(content: bytes) -> tuple[str, dict[str, str]]:
-    """Name and map of a metadata record."""
-    fields = Fields(content)
-    return fields.text(), fields.texts()
+def parse_metadata(content: bytes) -> tuple[str, dict[str, str]]:
+    """Return the name and the map of a metadata record."""
+    fields = FieldReader(content)
+    return fields.read_string(), fields.read_string_map()
 
 
-def schema(content: bytes) -> tuple[int, str]:
-    """Id and name of a schema record."""
-    fields = Fields(content)
-    return fields.number(2), fields.text()
+def parse_schema(content: bytes) -> tuple[int, str]:
+    """Return the id and the name of a schema record."""
+    fields = FieldReader(content)
+    return fields.read_uint(2), fields.read_string()
 
 
-def channel(content: bytes) -> tuple[int, int, str, str]:
-    """Id, id of its schema (0 for none), topic and encoding of a channel record."""
-    fields = Fields(content)
-    return fields.number(2), fields.number(2), fields.text(), fields.text()
+def parse_channel(content: bytes) -> tuple[int, int, str, str]:
+    """Return id, schema id (0 for none), topic and encoding of a channel record."""
+    fields = FieldReader(content)
+    return fields.read_uint(2), fields.read_uint(2), fields.read_string(), fields.read_string()
 
 
 # ---------------------------------------------------------------------------------------------------------
@@ -170,7 +173,7 @@ def channel(content: bytes) -> tuple[int, int, str, str]:
 
 
 class Chunk:
-    """Messages in the order they came, and per channel where each stands: [log time, offset, ...]."""
+    """Messages in order of arrival, and an index by channel: [log time, offset, ...]."""
 
     __slots__ = ("data", "index")
 
@@ -179,42 +182,42 @@ class Chunk:
         self.index: defaultdict[int, list[int]] = defaultdict(list)
 
     def add(self, channel: int, sequence: int, log_ns: int, publish_ns: int, data: bytes) -> None:
-        """Append one message. This is the only code that runs once per message."""
+        """Append one message (hot path: runs once per message)."""
         self.index[channel] += (log_ns, len(self.data))
         self.data += _MESSAGE.pack(MESSAGE, 22 + len(data), channel, sequence, log_ns, publish_ns) + data
 
     @property
     def messages(self) -> int:
-        """How many messages it holds."""
+        """Number of messages in the chunk."""
         return sum(map(len, self.index.values())) // 2
 
 
-def pack(chunk: Chunk, squeezed: bytes) -> tuple[bytes, bytes, int, int]:
-    """The chunk record, its data compressed to `squeezed`, and its message indexes; first, last log time."""
+def encode_chunk(chunk: Chunk, compressed: bytes) -> tuple[bytes, bytes, int, int]:
+    """Encode a chunk whose data is `compressed`: chunk record, message indexes, first and last log time."""
     first = min(min(entries[::2]) for entries in chunk.index.values())
     last = max(max(entries[::2]) for entries in chunk.index.values())
-    body = record(
+    body = encode_record(
         CHUNK,
         _CHUNK.pack(first, last, len(chunk.data), zlib.crc32(chunk.data)),
-        text("zstd"),
-        struct.pack("<Q", len(squeezed)),
-        squeezed,
+        encode_string("zstd"),
+        struct.pack("<Q", len(compressed)),
+        compressed,
     )
     indexes = b"".join(
-        record(MESSAGE_INDEX, struct.pack(f"<HI{len(entries)}Q", of, 8 * len(entries), *entries))
+        encode_record(MESSAGE_INDEX, struct.pack(f"<HI{len(entries)}Q", of, 8 * len(entries), *entries))
         for of, entries in chunk.index.items()
     )
     return body, indexes, first, last
 
 
-def chunk_head(head: bytes) -> tuple[int, int, int, int]:
-    """Of the CHUNK_HEAD_SIZE first bytes that `pack` made: first and last log time, size, size squeezed."""
+def parse_chunk_head(head: bytes) -> tuple[int, int, int, int]:
+    """Return first and last log time, size and compressed size from the first CHUNK_HEAD_SIZE bytes."""
     first, last, size, _ = _CHUNK.unpack_from(head, _HEAD.size)
     return first, last, size, int.from_bytes(head[-8:], "little")
 
 
-def indexed_channels(indexes: bytes) -> Iterator[tuple[int, int]]:
-    """Of message indexes in a row: where each begins, and its channel."""
+def iter_message_indexes(indexes: bytes) -> Iterator[tuple[int, int]]:
+    """Yield (offset, channel) of each message index in `indexes`."""
     at = 0
     while at < len(indexes):
         _, length, of = _INDEX.unpack_from(indexes, at)
@@ -222,73 +225,73 @@ def indexed_channels(indexes: bytes) -> Iterator[tuple[int, int]]:
         at += _HEAD.size + length
 
 
-def unpack(content: bytes) -> bytes:
-    """The uncompressed records of a chunk; raises Damaged where they are not what was written."""
-    fields = Fields(content)
-    _, _, size, crc = _CHUNK.unpack(fields.take(_CHUNK.size))
-    compression = fields.text()
-    data = fields.take(fields.number(8))
-    if size > MOST_UNCOMPRESSED:
-        raise Damaged(f"a chunk claims {size} bytes")
+def decompress_chunk(content: bytes) -> bytes:
+    """Return the uncompressed records of a chunk. Raises DamagedError if size or checksum do not match."""
+    fields = FieldReader(content)
+    _, _, size, crc = _CHUNK.unpack(fields.read_bytes(_CHUNK.size))
+    compression = fields.read_string()
+    data = fields.read_bytes(fields.read_uint(8))
+    if size > MAX_UNCOMPRESSED:
+        raise DamagedError(f"a chunk states {size} bytes (limit {MAX_UNCOMPRESSED})")
     try:
         if compression == "zstd":
             if size and zstandard.get_frame_parameters(data).content_size not in (size, -1, 2**64 - 1):
-                raise Damaged("a chunk's size is not the stated one")
+                raise DamagedError("a chunk's size differs from the stated one")
             data = zstandard.ZstdDecompressor().decompress(data, max_output_size=size) if size else b""
         elif compression == "lz4":
             if lz4 is None:
-                raise Damaged("a chunk is compressed by lz4, which is not installed")
+                raise DamagedError("a chunk is compressed with lz4, which is not installed (pip install lz4)")
             data = lz4.LZ4FrameDecompressor().decompress(data, max_length=size)
         elif compression:
-            raise Damaged(f"a chunk is compressed by {compression[:20]!r}, which is not known")
+            raise DamagedError(f"a chunk has the unsupported compression {compression[:20]!r}")
     except (zstandard.ZstdError, RuntimeError, EOFError) as error:
-        raise Damaged(f"a chunk does not decompress ({error})") from None
+        raise DamagedError(f"a chunk cannot be decompressed ({error})") from None
     if len(data) != size or (crc and zlib.crc32(data) != crc):
-        raise Damaged("a chunk's checksum is wrong")
+        raise DamagedError("a chunk's checksum is wrong")
     return bytes(data)
 
 
-def squeezed(content: bytes) -> bytes | None:
-    """A chunk's records as they stand in it, compressed by zstd; None where by something else."""
-    fields = Fields(content)
-    fields.take(_CHUNK.size)
-    return fields.take(fields.number(8)) if fields.text() == "zstd" else None
+def compressed_data(content: bytes) -> bytes | None:
+    """Return the zstd-compressed records of a chunk; None if another compression is used."""
+    fields = FieldReader(content)
+    fields.read_bytes(_CHUNK.size)
+    return fields.read_bytes(fields.read_uint(8)) if fields.read_string() == "zstd" else None
 
 
-def unpack_torn(torn: bytes) -> bytes:
-    """What can still be had of a chunk record (opcode and length first) whose end is missing.
+def salvage_torn_chunk(torn: bytes) -> bytes:
+    """Return the readable part of a truncated chunk record (opcode and length first). Never raises.
 
-    A compressor's block is whole or nothing, so short chunks give nothing; never raises.
+    Compression blocks decompress completely or not at all, so a short chunk gives nothing.
     """
     if torn[:1] != bytes([CHUNK]):
         return b""
     try:
-        fields = Fields(torn[_HEAD.size :])
-        size = _CHUNK.unpack(fields.take(_CHUNK.size))[2]
-        compression = fields.text()
-        fields.number(8)
+        fields = FieldReader(torn[_HEAD.size :])
+        size = _CHUNK.unpack(fields.read_bytes(_CHUNK.size))[2]
+        compression = fields.read_string()
+        fields.read_uint(8)
         rest = torn[_HEAD.size + fields.at :]
-        if compression == "zstd" and 0 < size <= MOST_UNCOMPRESSED:
-            return _as_far_as_it_goes(rest, size)
+        if compression == "zstd" and 0 < size <= MAX_UNCOMPRESSED:
+            return _decompress_whole_blocks(rest, size)
         return rest if compression == "" else b""
-    except (Damaged, zstandard.ZstdError):
+    except (DamagedError, zstandard.ZstdError):
         return b""
 
 
-def _as_far_as_it_goes(torn: bytes, size: int) -> bytes:
-    """The whole blocks of a zstd frame, `size` bytes at most: a few bytes of one may stand for gigabytes."""
+def _decompress_whole_blocks(torn: bytes, size: int) -> bytes:
+    """Decompress the complete blocks of a zstd frame, up to `size` bytes: it may expand to gigabytes."""
     blocks = []
-    with zstandard.ZstdDecompressor(max_window_size=MOST_UNCOMPRESSED).stream_reader(torn) as reader:
+    with zstandard.ZstdDecompressor(max_window_size=MAX_UNCOMPRESSED).stream_reader(torn) as reader:
         while size > 0 and (block := reader.read(min(size, 1 << 17))):
             blocks.append(block)
             size -= len(block)
     return b"".join(blocks)
 
 
-def messages(data: bytes) -> Iterator[tuple[int, int, int, int, int, bytes]]:
-    """Every whole record among a chunk's: (opcode, channel, sequence, log time, publish time, data).
+def iter_messages(data: bytes) -> Iterator[tuple[int, int, int, int, int, bytes]]:
+    """Yield (opcode, channel, sequence, log time, publish time, data) of every complete record of a chunk.
 
-    For what is not a message the four numbers are 0 and `data` is the record's content.
+    For records other than messages the four numbers are 0 and `data` is the content of the record.
     """
     at, end = 0, len(data)
     parse, size = _MESSAGE.unpack_from, _MESSAGE.size
@@ -302,7 +305,7 @@ def messages(data: bytes) -> Iterator[tuple[int, int, int, int, int, bytes]]:
         else:
             yield opcode, 0, 0, 0, 0, data[at + 9 : stop]
         at = stop
-    while at + 9 <= end:  # a short record at the end: a schema or a channel
+    while at + 9 <= end:  # a schema or channel record shorter than a message header
         opcode, length = _HEAD.unpack_from(data, at)
         if at + 9 + length > end:
             return

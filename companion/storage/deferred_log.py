@@ -1,9 +1,9 @@
-"""A log that is written to once the answer is out: what is told of meanwhile is kept and handed on in order.
+"""Deferred log: buffers records and frames while a solution is computed, writes them afterwards in order.
 
-    deferred.record(record); deferred.frame(...)     # costs next to nothing
-    deferred.settle()                                # the log has it all
+    deferred.record(record); deferred.frame(...)    # append to a list
+    deferred.flush()                                # encode and write everything
 
-Packing and encoding take a tenth of the time between a beacon's answer and the estimate that it causes.
+Encoding for the log would take a tenth of the latency from a beacon measurement to the corrected estimate.
 """
 
 from __future__ import annotations
@@ -16,32 +16,32 @@ from companion.records import Stamped
 
 
 class Log(Protocol):
-    """Where records and raw frames go; `companion.storage.flight_log.Writer` is one."""
+    """Sink of records and raw frames, such as `companion.storage.flight_log.Writer`."""
 
     def record(self, record: Stamped, channel: str | None = None) -> None:
-        """Write one record, to the channel of its kind if no other is named."""
+        """Write one record, to the topic of its type unless `channel` is given."""
 
     def frame(self, link: str, outgoing: bool, data: bytes, t_ns: int) -> None:
         """Write one frame."""
 
 
-class Deferred:
-    """A `Log` before another."""
+class DeferredLog:
+    """A `Log` that buffers in front of another one."""
 
     def __init__(self, log: Log) -> None:
         self._log = log
-        self._kept: list[Callable[[], None]] = []
+        self._pending: list[Callable[[], None]] = []
 
     def record(self, record: Stamped, channel: str | None = None) -> None:
-        """Keep one record."""
-        self._kept.append(partial(self._log.record, record, channel))
+        """Buffer one record."""
+        self._pending.append(partial(self._log.record, record, channel))
 
     def frame(self, link: str, outgoing: bool, data: bytes, t_ns: int) -> None:
-        """Keep one frame."""
-        self._kept.append(partial(self._log.frame, link, outgoing, data, t_ns))
+        """Buffer one frame."""
+        self._pending.append(partial(self._log.frame, link, outgoing, data, t_ns))
 
-    def settle(self) -> None:
-        """Hand all that is kept to the log."""
-        kept, self._kept = self._kept, []
-        for write in kept:
+    def flush(self) -> None:
+        """Write everything buffered to the log."""
+        pending, self._pending = self._pending, []
+        for write in pending:
             write()

@@ -1,13 +1,11 @@
-"""A flight's log: every record and every raw frame in one MCAP file, written and read as mirror images.
+"""Flight log: every record and every raw frame in one MCAP file; writer and reader.
 
-`Writer` takes records from the service and puts them on a disk from a thread of its own, so that no disk,
-full, slow or gone, ever holds navigation up. What is at risk is the last second: the open chunk is closed and
-synced that often. `read` gives the same records back in the order they were written, from a log closed or
-torn.
+`Writer` accepts records without blocking and writes them in a thread of its own, so that a full, slow or
+failing disk never delays navigation. The open chunk is closed and synced once a second: at most the last
+second is lost. `read` returns the same records in the order written, from closed and torn logs.
 
-It knows what a record is and where a position stands in it; it does not know what any of them mean. Times in
-the container are wall-clock (`log_time` of arrival, `publish_time` of validity), for other tools; the exact
-monotonic ones are inside the records.
+Times in the container are wall-clock for other tools: `log_time` of arrival, `publish_time` of validity. The
+exact monotonic times are inside the records.
 """
 
 from __future__ import annotations
@@ -28,9 +26,9 @@ import msgspec
 from companion import __version__
 from companion.records import BY_NAME, INPUTS, LinkState, Stamped, Truth, encode
 from companion.storage import container, location_fix
-from companion.storage.container import Chunk, Damaged
-from companion.storage.mcap_file import Disk, DiskFile, Store, sync_folder
-from companion.storage.reader import ACTIVE, Channels, LogError, opened
+from companion.storage.container import Chunk, DamagedError
+from companion.storage.mcap_file import Disk, DiskFile, McapFile, sync_folder
+from companion.storage.reader import ACTIVE, ChannelTable, LogError, open_log
 from companion.storage.recovery import Recovered, recover
 
 __all__ = [
@@ -47,13 +45,13 @@ __all__ = [
 ]
 
 MAP_PERIOD_NS = 500_000_000
-"""Positions go to the map's topics no more often than this."""
+"""Minimum interval of positions on the /map topics."""
 
-_MOST = 2**64 - 1
+_MAX_UINT64 = 2**64 - 1
 
 
 class Entry(NamedTuple):
-    """One message: its topic, its wall-clock time of arrival (ns) and its record, or bytes if it is none."""
+    """One message: topic, wall-clock time of arrival (ns), and the record, or bytes if it is not a record."""
 
     topic: str
     log_time: int
@@ -61,7 +59,7 @@ class Entry(NamedTuple):
 
 
 class Info(NamedTuple):
-    """What a log holds. Times are wall-clock ns (0 where it holds no message); `counts` is by topic."""
+    """Summary of a log. Times are wall-clock ns (0 if it has no messages); `counts` is by topic."""
 
     path: Path
     closed: bool
@@ -76,21 +74,26 @@ class Info(NamedTuple):
 
     @property
     def duration_s(self) -> float:
-        """From the first message to the last."""
+        """Time from the first message to the last, s."""
         return (self.end_ns - self.start_ns) * 1e-9
 
 
 class Writer:
-    """A log being written to `path` + ".active"; `close` gives it its name.
+    """Non-blocking log writer. Writes to `path` + ".active"; `close` renames the file to `path`.
 
-    `start_unix_ns` is the wall-clock time at `start_ns` of the companion's clock. `metadata` is kept as
-    given, beside a record "log" of version and start times. A chunk holds `chunk_bytes` or what came in
-    `fsync_s` seconds of real time. At most `depth` bytes wait for the disk: beyond, the oldest are dropped
-    and counted, or with `block` (a simulation that runs faster than any disk) the caller waits for a disk
-    that is slow, never for one that refuses. `disk` opens the file.
+    Parameters
+    ----------
+    metadata : metadata records by name; a record "log" with version and start times is added.
+    start_unix_ns, start_ns : wall-clock time and time of the companion's clock at the same instant.
+    chunk_bytes, fsync_s : a chunk is closed at this size, or after this real time.
+    depth : limit of bytes queued for the disk. Beyond it the oldest chunks are dropped and counted in
+        `dropped`.
+    block : wait for a slow disk instead of dropping (for simulations faster than any disk); a failing disk
+        is never waited for.
+    disk : opens the file.
 
-    Raises LogError where the file cannot be begun, and never afterwards: `trouble` says what the disk said
-    last, None while all is well, and what waits is tried again for as long as there is room.
+    Raises LogError if the file cannot be created, and never afterwards: `trouble` is the last error of the
+    disk, None while writing works. Queued chunks are retried.
     """
 
     def __init__(
@@ -111,14 +114,14 @@ class Writer:
         self.trouble: str | None = None
         self._shift = start_unix_ns - start_ns
         self._chunk_bytes, self._depth, self._block = chunk_bytes, depth, block
-        # The disk takes its own time to sync, a busy machine to let us: half of the second is left to them.
+        # half of `fsync_s` is left for the sync itself and for a busy machine
         self._period_s = 0.5 * fsync_s
 
         self._lock = threading.Lock()
-        self._room = threading.Condition(self._lock)
+        self._space_available = threading.Condition(self._lock)
         self._open = Chunk()
-        self._waiting: deque[Chunk] = deque()
-        self._waiting_bytes = 0
+        self._queued: deque[Chunk] = deque()
+        self._queued_bytes = 0
         self._wake = threading.Event()
         self._closing = False
 
@@ -126,50 +129,50 @@ class Writer:
         self._sequences: list[int] = [0]
         self._schemas: dict[int, bytes] = {}
         self._channels: dict[int, bytes] = {}
-        self._map_due = {kind: -_MOST for kind in BY_NAME.values() if kind.__name__ in _MAPPED}
+        self._map_due = {kind: -_MAX_UINT64 for kind in BY_NAME.values() if kind.__name__ in _MAP_RECORDS}
 
-        self._file = self._begin(disk, metadata, start_unix_ns, start_ns)
-        self._thread = threading.Thread(target=self._run, name="log", daemon=True)
+        self._file = self._create_file(disk, metadata, start_unix_ns, start_ns)
+        self._thread = threading.Thread(target=self._write_loop, name="log", daemon=True)
         self._thread.start()
 
     def record(self, record: Stamped, channel: str | None = None) -> None:
-        """Write one record, to the topic of its kind or to `channel`. Never waits for the disk."""
+        """Write one record, to the topic of its type or to `channel`. Never waits for the disk."""
         kind = type(record)
         key = kind if channel is None else (channel, kind)
         number = self._ids.get(key) or self._channel_of_record(key, kind, channel)
-        self._put(number, record.rx_ns, record.t_ns, encode(record))
+        self._append(number, record.rx_ns, record.t_ns, encode(record))
         due = self._map_due.get(kind)
         if due is not None and not due - MAP_PERIOD_NS <= record.t_ns < due:
             self._map_due[kind] = record.t_ns + MAP_PERIOD_NS
-            for topic, fix in location_fix.fixes(record, record.t_ns + self._shift):
+            for topic, fix in location_fix.to_location_fixes(record, record.t_ns + self._shift):
                 number = self._ids.get(topic) or self._channel_of_map(topic)
-                self._put(number, record.rx_ns, record.t_ns, msgspec.json.encode(fix))
+                self._append(number, record.rx_ns, record.t_ns, msgspec.json.encode(fix))
 
     def frame(self, link: str, outgoing: bool, data: bytes, t_ns: int) -> None:
-        """Write one frame as it was on the wire of `link`. Never waits for the disk."""
+        """Write one frame as transmitted on `link`. Never waits for the disk."""
         key = (link, outgoing)
         number = self._ids.get(key)
         if number is None:
             topic = f"/mavlink/{link.strip('/')}/{'tx' if outgoing else 'rx'}"
-            number = self._define(key, topic, "mavlink", "", None)
-        self._put(number, t_ns, t_ns, data)
+            number = self._define_channel(key, topic, "mavlink", "", None)
+        self._append(number, t_ns, t_ns, data)
 
     @property
     def waiting(self) -> int:
-        """Bytes that wait for the disk."""
-        return self._waiting_bytes
+        """Bytes queued for the disk."""
+        return self._queued_bytes
 
     def close(self, timeout_s: float = 30.0) -> bool:
-        """Write all that waits, close the file and give it its name; whether that was done.
+        """Write everything queued, close the file and rename it. Return whether this succeeded.
 
-        Where the disk refuses or takes longer than `timeout_s` the log stays ".active", to be recovered.
+        If the disk fails or takes longer than `timeout_s`, the log stays ".active" and can be recovered.
         """
         with self._lock:
             self._closing = True
         self._wake.set()
         self._thread.join(timeout_s)
         if self._thread.is_alive():
-            self.trouble = f"cannot close the log {self.path}: no answer from the disk in {timeout_s:g} s"
+            self.trouble = f"cannot close the log {self.path}: no response from the disk in {timeout_s:g} s"
         return self.trouble is None
 
     def __enter__(self) -> Writer:
@@ -182,12 +185,12 @@ class Writer:
 
     # -- in the caller's thread ------------------------------------------------------------------------
 
-    def _put(self, number: int, rx_ns: int, t_ns: int, data: bytes) -> None:
+    def _append(self, number: int, rx_ns: int, t_ns: int, data: bytes) -> None:
         log_ns, publish_ns = rx_ns + self._shift, t_ns + self._shift
         if not (
-            0 <= log_ns <= _MOST and 0 <= publish_ns <= _MOST
-        ):  # a clock gone mad; the record has it exact
-            log_ns, publish_ns = min(max(log_ns, 0), _MOST), min(max(publish_ns, 0), _MOST)
+            0 <= log_ns <= _MAX_UINT64 and 0 <= publish_ns <= _MAX_UINT64
+        ):  # implausible clock: clamp here, the record keeps the exact times
+            log_ns, publish_ns = min(max(log_ns, 0), _MAX_UINT64), min(max(publish_ns, 0), _MAX_UINT64)
         with self._lock:
             if self._closing:
                 self.dropped += 1
@@ -197,34 +200,34 @@ class Writer:
             chunk = self._open
             chunk.add(number, sequence, log_ns, publish_ns, data)
             if len(chunk.data) >= self._chunk_bytes:
-                self._turn()
+                self._queue_open_chunk()
                 self._wake.set()
-                while self._block and self._waiting_bytes > self._depth and self.trouble is None:
-                    self._room.wait(1.0)
+                while self._block and self._queued_bytes > self._depth and self.trouble is None:
+                    self._space_available.wait(1.0)
 
-    def _turn(self) -> None:
-        """Close the open chunk and let it wait for the disk (under the lock)."""
+    def _queue_open_chunk(self) -> None:
+        """Close the open chunk and queue it for the disk (lock held)."""
         if not self._open.data:
             return
-        self._waiting.append(self._open)
-        self._waiting_bytes += len(self._open.data)
+        self._queued.append(self._open)
+        self._queued_bytes += len(self._open.data)
         self._open = Chunk()
         if not self._block or self.trouble is not None:
-            while self._waiting_bytes > self._depth and self._waiting:
-                oldest = self._waiting.popleft()
-                self._waiting_bytes -= len(oldest.data)
+            while self._queued_bytes > self._depth and self._queued:
+                oldest = self._queued.popleft()
+                self._queued_bytes -= len(oldest.data)
                 self.dropped += oldest.messages
 
     def _channel_of_record(self, key: Any, kind: type[Stamped], channel: str | None) -> int:
         schema = msgspec.json.encode(msgspec.json.schema(kind))
-        return self._define(key, channel or topic_of(kind), "json", kind.__name__, schema)
+        return self._define_channel(key, channel or topic_of(kind), "json", kind.__name__, schema)
 
     def _channel_of_map(self, topic: str) -> int:
-        return self._define(
+        return self._define_channel(
             topic, topic, "json", location_fix.SCHEMA_NAME, msgspec.json.encode(location_fix.SCHEMA)
         )
 
-    def _define(self, key: Any, topic: str, encoding: str, name: str, schema: bytes | None) -> int:
+    def _define_channel(self, key: Any, topic: str, encoding: str, name: str, schema: bytes | None) -> int:
         with self._lock:
             number = len(self._channels) + 1
             of_schema = 0
@@ -232,14 +235,17 @@ class Writer:
                 of_schema = number
                 self._schemas[of_schema] = (
                     struct.pack("<H", of_schema)
-                    + container.text(name)
-                    + container.text("jsonschema")
+                    + container.encode_string(name)
+                    + container.encode_string("jsonschema")
                     + struct.pack("<I", len(schema))
                     + schema
                 )
             head = struct.pack("<HH", number, of_schema)
             self._channels[number] = (
-                head + container.text(topic) + container.text(encoding) + container.texts({})
+                head
+                + container.encode_string(topic)
+                + container.encode_string(encoding)
+                + container.encode_string_map({})
             )
             self._sequences.append(0)
             self._ids[key] = number
@@ -247,17 +253,17 @@ class Writer:
 
     # -- in the writer's thread ------------------------------------------------------------------------
 
-    def _begin(
+    def _create_file(
         self,
         disk: Callable[[Path], Disk],
         metadata: Mapping[str, Mapping[str, str]],
         start_unix_ns: int,
         start_ns: int,
-    ) -> Store:
+    ) -> McapFile:
         active = self.path.with_name(self.path.name + ACTIVE)
         log = {"version": __version__, "start_unix_ns": str(start_unix_ns), "start_ns": str(start_ns)}
         try:
-            file = Store(disk(active), f"companion {__version__}")
+            file = McapFile(disk(active), f"companion {__version__}")
             for name, values in {"log": log, **metadata}.items():
                 file.metadata(name, values)
             file.sync()
@@ -265,7 +271,7 @@ class Writer:
             raise LogError(f"cannot write a log to {active}: {error.strerror or error}") from None
         return file
 
-    def _run(self) -> None:
+    def _write_loop(self) -> None:
         due = time.monotonic() + self._period_s
         while not self._closing:
             self._wake.wait(max(0.0, due - time.monotonic()))
@@ -273,40 +279,40 @@ class Writer:
             tick = time.monotonic() >= due
             if tick:
                 with self._lock:
-                    self._turn()
+                    self._queue_open_chunk()
                 due = time.monotonic() + self._period_s
-            if self._drain() and tick:
-                self._try(self._file.sync)
+            if self._write_queued() and tick:
+                self._attempt(self._file.sync)
         with self._lock:
-            self._turn()
-        written = self._drain()
-        finished = written and self._try(self._file.finish) and self._try(self._file.sync)
+            self._queue_open_chunk()
+        written = self._write_queued()
+        finished = written and self._attempt(self._file.finish) and self._attempt(self._file.sync)
         if finished:
-            self._try(self._name)
-        self._file.close()  # and with it the lock: no other start is to mend what only lacks its name
+            self._attempt(self._rename)
+        self._file.close()  # last: releases the lock that keeps others from recovering the log
         with self._lock:
-            self.dropped += sum(chunk.messages for chunk in self._waiting)
+            self.dropped += sum(chunk.messages for chunk in self._queued)
 
-    def _name(self) -> None:
+    def _rename(self) -> None:
         os.replace(self.path.with_name(self.path.name + ACTIVE), self.path)
         sync_folder(self.path.parent)
 
-    def _drain(self) -> bool:
-        """Write every chunk that waits; False at the first the disk refuses, which then waits on."""
+    def _write_queued(self) -> bool:
+        """Write all queued chunks. On the first failure re-queue that chunk and return False."""
         while True:
             with self._lock:
-                if not self._waiting:
+                if not self._queued:
                     return True
-                chunk = self._waiting.popleft()
-                self._waiting_bytes -= len(chunk.data)
-                self._room.notify_all()
-            if not self._try(partial(self._file.chunk, chunk, self._schemas, self._channels)):
+                chunk = self._queued.popleft()
+                self._queued_bytes -= len(chunk.data)
+                self._space_available.notify_all()
+            if not self._attempt(partial(self._file.chunk, chunk, self._schemas, self._channels)):
                 with self._lock:
-                    self._waiting.appendleft(chunk)
-                    self._waiting_bytes += len(chunk.data)
+                    self._queued.appendleft(chunk)
+                    self._queued_bytes += len(chunk.data)
                 return False
 
-    def _try(self, act: Callable[[], None]) -> bool:
+    def _attempt(self, act: Callable[[], None]) -> bool:
         try:
             act()
         except OSError as error:
@@ -316,11 +322,11 @@ class Writer:
         return True
 
 
-_MAPPED = ("Gnss", "Solution", "Truth")
+_MAP_RECORDS = ("Gnss", "Solution", "Truth")
 
 
 def topic_of(kind: type[Stamped]) -> str:
-    """The topic of a kind of record."""
+    """Return the topic of a record type."""
     if kind is Truth:
         return "/truth/Truth"
     if kind is LinkState:
@@ -334,39 +340,39 @@ def topic_of(kind: type[Stamped]) -> str:
 
 
 def read(path: str | os.PathLike[str], *, raw: bool = False) -> Iterator[Entry]:
-    """Every message of a log in the order written; with `raw`, records stay the bytes they are in the file.
+    """Yield every message of a log in the order written; with `raw`, records are not decoded.
 
-    A torn log is read up to its first damage. Raises LogError where the file is no MCAP log, and where a
-    closed one is damaged.
+    A torn log is read up to the first damage. Raises LogError if the file is not an MCAP log, or is a closed
+    log that is damaged.
     """
-    with opened(path) as source:
-        channels = Channels()
+    with open_log(path) as source:
+        channels = ChannelTable()
         decoders: dict[int, tuple[str, Callable[[bytes], Any] | None]] = {}
         try:
-            for data in source.stretches():
-                for opcode, number, _, log_ns, _, content in container.messages(data):
+            for data in source.message_blocks():
+                for opcode, number, _, log_ns, _, content in container.iter_messages(data):
                     if opcode == container.MESSAGE:
                         topic, decode = decoders[number]
                         yield Entry(topic, log_ns, content if decode is None else decode(content))
                     elif (defined := channels.define(opcode, content)) is not None:
                         decoders[defined] = _decoder(channels[defined], raw)
-        except (Damaged, KeyError) as error:
+        except (DamagedError, KeyError) as error:
             if source.closed:
-                raise source.damaged(error) from None
+                raise source.damage_error(error) from None
         except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
-            raise LogError(f"{path}: a record is not of this version's kind ({error})") from None
+            raise LogError(f"{path}: a record does not match the format of this version ({error})") from None
 
 
 def info(path: str | os.PathLike[str]) -> Info:
-    """Counts, times and metadata of a log, closed or torn. Raises LogError as `read` does."""
-    with opened(path) as source:
+    """Return counts, times and metadata of a log, closed or torn. Raises LogError as `read` does."""
+    with open_log(path) as source:
         counts: Counter[int] = Counter()
         by_topic: Counter[str] = Counter()
-        channels = Channels()
-        first, last = _MOST, 0
+        channels = ChannelTable()
+        first, last = _MAX_UINT64, 0
         try:
-            for data in source.stretches():
-                for opcode, number, _, log_ns, _, content in container.messages(data):
+            for data in source.message_blocks():
+                for opcode, number, _, log_ns, _, content in container.iter_messages(data):
                     if opcode == container.MESSAGE:
                         counts[number] += 1
                         first = log_ns if log_ns < first else first
@@ -375,9 +381,9 @@ def info(path: str | os.PathLike[str]) -> Info:
                         channels.define(opcode, content)
             for number, count in counts.items():
                 by_topic[channels[number].topic] += count
-        except (Damaged, KeyError) as error:
+        except (DamagedError, KeyError) as error:
             if source.closed:
-                raise source.damaged(error) from None
+                raise source.damage_error(error) from None
         total = sum(by_topic.values())
         return Info(
             path=source.path,
@@ -394,23 +400,23 @@ def info(path: str | os.PathLike[str]) -> Info:
 
 
 def metadata(path: str | os.PathLike[str]) -> dict[str, dict[str, str]]:
-    """The metadata at the head of a log (before its first message), by name."""
-    with opened(path) as source:
+    """Return the metadata records before the first message of a log, by name."""
+    with open_log(path) as source:
         found = {}
         for _, opcode, content in source.records():
             if opcode in (container.CHUNK, container.MESSAGE):
                 break
             if opcode == container.METADATA:
                 try:
-                    name, values = container.metadata(content)
-                except Damaged as error:
-                    raise source.damaged(error) from None
+                    name, values = container.parse_metadata(content)
+                except DamagedError as error:
+                    raise source.damage_error(error) from None
                 found[name] = values
         return found
 
 
 def _decoder(channel: container.Channel, raw: bool) -> tuple[str, Callable[[bytes], Any] | None]:
-    """Topic of a channel, and how its messages become records (None: they stay bytes)."""
+    """Return the topic of a channel and the decoder of its messages (None: not decoded)."""
     kind = BY_NAME.get(channel.schema)
     if raw or kind is None or channel.encoding != "json":
         return channel.topic, None

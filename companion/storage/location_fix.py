@@ -1,8 +1,7 @@
-"""Positions as `foxglove.LocationFix`, so that common viewers show a log on a map.
+"""Positions as `foxglove.LocationFix` messages (degrees, east-north-up), shown on a map by log viewers.
 
-It turns a record into the JSON of that schema (degrees, east-north-up) and knows nothing of files. The map is
-for people: replay and report read the records themselves. An altitude is above mean sea level where the
-ellipsoid's is not known.
+Replay and report do not read them; they use the records. The altitude is above mean sea level if the
+altitude above the ellipsoid is not known.
 """
 
 from __future__ import annotations
@@ -58,7 +57,7 @@ SCHEMA: dict[str, Any] = {
 
 
 class LocationFix(msgspec.Struct, frozen=True, gc=False):
-    """One point of the map; field names and units are the schema's, not ours."""
+    """One point of the map, with the field names and units of the schema."""
 
     timestamp: dict[str, int]
     frame_id: str
@@ -69,10 +68,10 @@ class LocationFix(msgspec.Struct, frozen=True, gc=False):
     position_covariance_type: int = UNKNOWN
 
 
-def fixes(record: Stamped, unix_ns: int) -> list[tuple[str, LocationFix]]:
-    """(topic, point) of every position `record` holds: a solution holds its own and the inertial one.
+def to_location_fixes(record: Stamped, unix_ns: int) -> list[tuple[str, LocationFix]]:
+    """Return (topic, point) of every position in `record`: two for a solution, corrected and inertial.
 
-    `unix_ns` is the wall-clock time of the record's validity.
+    `unix_ns` is the wall-clock time of validity.
     """
     stamp = dict(zip(("sec", "nsec"), divmod(max(unix_ns, 0), 1_000_000_000), strict=True))
     match record:
@@ -88,7 +87,7 @@ def fixes(record: Stamped, unix_ns: int) -> list[tuple[str, LocationFix]]:
         case Solution():
             nn, ne, nd, ee, ed, dd = record.covariance
             covariance = (ee, ne, -ed, ne, nn, -nd, -ed, -nd, dd)
-            # error = INS - truth, so the inertial channel stands at the corrected position plus the error
+            # error = INS - truth: the inertial position is the corrected one plus the error
             R_N, R_E = earth.radii(record.lat)
             north, east = record.error_n
             lat = record.lat + north / (R_N + record.alt_msl)

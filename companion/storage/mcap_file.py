@@ -1,8 +1,7 @@
-"""Lays an MCAP file down on a disk, chunk by chunk, so that it can be cut off after any of its writes.
+"""MCAP file writer: chunk by chunk, readable if truncated after any write. No threads, no clock.
 
-It knows where the bytes go and what the summary at the end must say; it starts no thread and asks no clock.
-Schemas and channels stand before the chunk that first uses them, not inside it: a chunk lost to a full disk
-then takes no definition with it.
+Schemas and channels are written before the chunk that first uses them, not inside it, so that a chunk lost to
+a full disk takes no definition with it.
 """
 
 from __future__ import annotations
@@ -36,39 +35,40 @@ from companion.storage.container import (
     STATISTICS,
     SUMMARY_OFFSET,
     Chunk,
-    pack,
-    record,
-    text,
-    texts,
+    encode_chunk,
+    encode_record,
+    encode_string,
+    encode_string_map,
 )
 
 
 class Disk(Protocol):
-    """Where a file's bytes go; every method may raise OSError."""
+    """Storage of one file; every method may raise OSError."""
 
     def write(self, data: bytes) -> None:
         """Append all of `data`."""
 
     def read(self, at: int, size: int) -> bytes:
-        """Return `size` bytes of what was written, from `at` on."""
+        """Return `size` written bytes from offset `at`."""
 
     def sync(self) -> None:
-        """Return once what was written survives a loss of power."""
+        """Return once everything written survives a power loss."""
 
     def rewind(self, size: int) -> None:
-        """Let the next write go to after `size` bytes; asks nothing of the disk."""
+        """Set the position of the next write to `size`, without disk access."""
 
     def truncate(self, size: int) -> None:
-        """Cut off what stands after `size` bytes."""
+        """Cut the file to `size` bytes."""
 
     def close(self) -> None:
-        """Let go."""
+        """Close the file."""
 
 
 class DiskFile:
-    """A file that is written once from front to back; `reserve` bytes of its disk are left to others.
+    """A file written sequentially, which leaves `reserve` bytes of the disk free.
 
-    `relieve` is called where the room is gone, with the bytes that must be free, and may make some.
+    If the space is insufficient, `relieve` is called with the number of bytes that must be free, and may
+    free some.
     """
 
     def __init__(
@@ -77,21 +77,21 @@ class DiskFile:
         reserve: int = 0,
         relieve: Callable[[int], object] = lambda wanted: None,
     ) -> None:
-        self._take(os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o644), reserve, relieve)
-        fcntl.flock(self._fd, fcntl.LOCK_EX)  # tells a log being written from one left behind
+        self._attach(os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o644), reserve, relieve)
+        fcntl.flock(self._fd, fcntl.LOCK_EX)  # marks the log as being written
         sync_folder(Path(path).parent)
 
-    def _take(self, fd: int, reserve: int, relieve: Callable[[int], object]) -> None:
+    def _attach(self, fd: int, reserve: int, relieve: Callable[[int], object]) -> None:
         self._fd, self._reserve, self._relieve = fd, reserve, relieve
         self._at = 0
 
     def write(self, data: bytes) -> None:
-        """See `Disk`; refuses where it would eat into the reserve."""
+        """See `Disk`; raises ENOSPC rather than use the reserve."""
         wanted = self._reserve + len(data)
         if self._free() < wanted:
             self._relieve(wanted)
             if self._reserve and self._free() < wanted:
-                raise OSError(errno.ENOSPC, f"less than {self._reserve} bytes would be left on the disk")
+                raise OSError(errno.ENOSPC, f"less than {self._reserve} bytes would remain free on the disk")
         view = memoryview(data)
         while view:
             written = os.pwrite(self._fd, view, self._at)
@@ -106,7 +106,7 @@ class DiskFile:
         """See `Disk`."""
         data = os.pread(self._fd, size, at)
         if len(data) != size:
-            raise OSError(errno.EIO, "what was written cannot be read")
+            raise OSError(errno.EIO, "written data cannot be read back")
         return data
 
     def sync(self) -> None:
@@ -127,7 +127,7 @@ class DiskFile:
 
 
 def sync_folder(folder: Path) -> None:
-    """Put a name just made or changed in `folder` where a loss of power does not reach it."""
+    """Make a file name created or changed in `folder` survive a power loss."""
     fd = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         os.fsync(fd)
@@ -135,39 +135,39 @@ def sync_folder(folder: Path) -> None:
         os.close(fd)
 
 
-class Store:
-    """Lays an MCAP file down on `disk`. After every method that returned, the file is readable so far.
+class McapFile:
+    """Writer of an MCAP file. The file is readable up to the last method that returned.
 
-    A method that raises OSError has been undone and may be called again; where the disk will not cut off what
-    it took, the next goes over it. Of a chunk it remembers in 24 bytes where it is: what the summary says of
-    it (half a kilobyte; 40 MB after a day) is read from the disk again.
+    A method that raises OSError is undone and may be called again; if the disk cannot truncate the partial
+    write, the next write overwrites it. Only 24 bytes per chunk are kept in memory; the summary of a chunk
+    (half a kilobyte, 40 MB after a day) is read back from the disk by `finish`.
     """
 
     def __init__(self, disk: Disk, library: str) -> None:
         self._disk = disk
         self._end = 0
-        self._uncut = False  # a part of what was refused stands after the end
+        self._partial_write = False  # a failed write left bytes after the end
         self._compress = zstandard.ZstdCompressor(level=1).compress
         self._schemas: dict[int, bytes] = {}
         self._channels: dict[int, bytes] = {}
         self._counts: defaultdict[int, int] = defaultdict(int)
-        self._chunks = array("Q")  # of each: where it begins, where its message indexes do, and their end
+        self._chunks = array("Q")  # per chunk: offset, offset of its message indexes, end
         self._metadata_indexes: list[bytes] = []
         self._attachments = 0
         self._first: int | None = None
         self._last = 0
-        self._append(MAGIC + record(HEADER, text(""), text(library)))
+        self._append(MAGIC + encode_record(HEADER, encode_string(""), encode_string(library)))
 
     def metadata(self, name: str, values: Mapping[str, str]) -> None:
         """Add one metadata record."""
-        body = record(METADATA, text(name), texts(values))
+        body = encode_record(METADATA, encode_string(name), encode_string_map(values))
         self._append(body)
         place = struct.pack("<QQ", self._end - len(body), len(body))
-        self._metadata_indexes.append(record(METADATA_INDEX, place, text(name)))
+        self._metadata_indexes.append(encode_record(METADATA_INDEX, place, encode_string(name)))
 
     def attachment(self, content: bytes) -> None:
-        """Add one attachment record as it stood in another file."""
-        self._append(record(ATTACHMENT, content))
+        """Add one attachment record, copied from another file."""
+        self._append(encode_record(ATTACHMENT, content))
         self._attachments += 1
 
     def chunk(
@@ -175,18 +175,18 @@ class Store:
         chunk: Chunk,
         schemas: Mapping[int, bytes],
         channels: Mapping[int, bytes],
-        squeezed: bytes | None = None,
+        compressed: bytes | None = None,
     ) -> None:
-        """Add `chunk`; `schemas` and `channels` are the contents of the records it may refer to, by id.
+        """Add `chunk`; `schemas` and `channels` are the record contents it may refer to, by id.
 
-        `squeezed` is its data compressed by zstd, where that is known.
+        `compressed` is its zstd-compressed data, if already known.
         """
         new = [name for name in chunk.index if name not in self._channels]
         needed = {name: int.from_bytes(channels[name][2:4], "little") for name in new}
         new_schemas = {i: schemas[i] for i in needed.values() if i in schemas and i not in self._schemas}
-        definitions = b"".join(record(SCHEMA, content) for content in new_schemas.values())
-        definitions += b"".join(record(CHANNEL, channels[name]) for name in new)
-        body, indexes, first, last = pack(chunk, squeezed or self._compress(bytes(chunk.data)))
+        definitions = b"".join(encode_record(SCHEMA, content) for content in new_schemas.values())
+        definitions += b"".join(encode_record(CHANNEL, channels[name]) for name in new)
+        body, indexes, first, last = encode_chunk(chunk, compressed or self._compress(bytes(chunk.data)))
         self._append(definitions + body + indexes)
 
         self._schemas |= new_schemas
@@ -214,64 +214,66 @@ class Store:
             len(counts),
         )
         groups = (
-            (SCHEMA, [record(SCHEMA, content) for content in self._schemas.values()]),
-            (CHANNEL, [record(CHANNEL, content) for content in self._channels.values()]),
-            (STATISTICS, [record(STATISTICS, statistics, counts)]),
+            (SCHEMA, [encode_record(SCHEMA, content) for content in self._schemas.values()]),
+            (CHANNEL, [encode_record(CHANNEL, content) for content in self._channels.values()]),
+            (STATISTICS, [encode_record(STATISTICS, statistics, counts)]),
             (CHUNK_INDEX, map(self._chunk_index, *(self._chunks[i::3] for i in range(3)))),
             (METADATA_INDEX, self._metadata_indexes),
         )
-        data_end = record(DATA_END, struct.pack("<I", 0))
+        data_end = encode_record(DATA_END, struct.pack("<I", 0))
         start = self._end + len(data_end)
         summary, offsets = b"", b""
         for opcode, members in groups:
             group = b"".join(members)
             if group:
                 place = struct.pack("<BQQ", opcode, start + len(summary), len(group))
-                offsets += record(SUMMARY_OFFSET, place)
+                offsets += encode_record(SUMMARY_OFFSET, place)
                 summary += group
         tail = summary + offsets + struct.pack("<BQQQ", FOOTER, 20, start, start + len(summary))
-        self._cut()
+        self._truncate()
         self._append(data_end + tail + struct.pack("<I", zlib.crc32(tail)) + MAGIC)
 
     def _chunk_index(self, start: int, at: int, end: int) -> bytes:
-        """The summary's record of the chunk at `start`, whose message indexes lie from `at` to `end`."""
-        first, last, size, squeezed = container.chunk_head(self._disk.read(start, container.CHUNK_HEAD_SIZE))
+        """Return the index record of the chunk at `start`, whose message indexes are from `at` to `end`."""
+        first, last, size, compressed = container.parse_chunk_head(
+            self._disk.read(start, container.CHUNK_HEAD_SIZE)
+        )
         places = b"".join(
             struct.pack("<HQ", of, at + offset)
-            for offset, of in container.indexed_channels(self._disk.read(at, end - at))
+            for offset, of in container.iter_message_indexes(self._disk.read(at, end - at))
         )
-        return record(
+        return encode_record(
             CHUNK_INDEX,
             struct.pack("<QQQQ", first, last, start, at - start),
             struct.pack("<I", len(places)) + places,
-            struct.pack("<Q", end - at) + text("zstd"),
-            struct.pack("<QQ", squeezed, size),
+            struct.pack("<Q", end - at) + encode_string("zstd"),
+            struct.pack("<QQ", compressed, size),
         )
 
     def sync(self) -> None:
-        """Put what was written where a loss of power does not reach it."""
+        """Make everything written survive a power loss."""
         self._disk.sync()
 
     def close(self) -> None:
-        """Let the disk go; without `finish` before it the file stays open-ended."""
+        """Close the disk; without `finish` the log stays unclosed."""
         self._disk.close()
 
     def _append(self, data: bytes) -> None:
-        self._try_to_cut()
+        self._try_truncate()
         try:
             self._disk.write(data)
         except OSError:
             self._disk.rewind(self._end)
-            self._uncut = True
-            self._try_to_cut()
+            self._partial_write = True
+            self._try_truncate()
             raise
         self._end += len(data)
 
-    def _try_to_cut(self) -> None:
+    def _try_truncate(self) -> None:
         with suppress(OSError):
-            self._cut()
+            self._truncate()
 
-    def _cut(self) -> None:
-        if self._uncut:
+    def _truncate(self) -> None:
+        if self._partial_write:
             self._disk.truncate(self._end)
-            self._uncut = False
+            self._partial_write = False

@@ -1,7 +1,6 @@
-"""An MCAP file opened for reading, whole or torn, ours or foreign.
+"""MCAP log reader: blocks of message records from a closed or torn file, ours or another recorder's.
 
-It gives the stretches of bytes that hold messages, up to where the file ends or is damaged, and says whether
-the file was closed. It does not know what the messages are.
+It does not decode messages.
 """
 
 from __future__ import annotations
@@ -13,19 +12,20 @@ from pathlib import Path
 from typing import BinaryIO
 
 from companion.storage import container
-from companion.storage.container import Damaged
+from companion.storage.container import DamagedError
 
 ACTIVE = ".active"
-"""Stands after the name of a log that is not closed."""
+"""Suffix of a log that is not closed."""
 
 
 class LogError(OSError):
-    """A log that cannot be written or read; its text is one sentence for a person."""
+    """A log that cannot be written or read; the text is one sentence for the user."""
 
 
-class Opened:
-    """A log open for reading. `closed` tells a whole file from a torn one; the rest grows as it is read:
-    `end` is where the last whole record ends, `metadata` is by name.
+class LogReader:
+    """A log opened for reading; `closed` is False for a torn one.
+
+    Updated while reading: `end`, where the last complete record ends; `chunks`; `metadata` by name.
     """
 
     def __init__(self, path: Path, file: BinaryIO, size: int) -> None:
@@ -35,53 +35,53 @@ class Opened:
         self.chunks = 0
         self.metadata: dict[str, dict[str, str]] = {}
 
-    def records(self) -> Iterator[container.Whole]:
-        """Every whole record up to the footer, or up to where the file is torn."""
-        for whole in container.scan(self.file, self.size):
+    def records(self) -> Iterator[container.RawRecord]:
+        """Yield every complete record up to the footer, or up to where the file is torn."""
+        for whole in container.scan_records(self.file, self.size):
             self.end = whole.offset + 9 + len(whole.content)
             yield whole
             if whole.opcode == container.FOOTER and self.closed:
                 self.end = self.size
 
-    def stretches(self) -> Iterator[bytes]:
-        """Runs of schema, channel and message records: each chunk opened, and what stands between chunks.
+    def message_blocks(self) -> Iterator[bytes]:
+        """Yield blocks of schema, channel and message records: uncompressed chunks, and records between them.
 
-        A chunk torn off gives the messages that can still be had. Raises Damaged at a chunk that is whole in
-        length and wrong inside.
+        A truncated chunk gives the messages that can still be read. Raises DamagedError at a chunk of
+        complete length with wrong content.
         """
         data_ended = False
         for _, opcode, content in self.records():
             if opcode == container.CHUNK:
-                data = container.unpack(content)
+                data = container.decompress_chunk(content)
                 self.chunks += 1
                 yield data
             elif opcode == container.METADATA:
-                name, values = container.metadata(content)
+                name, values = container.parse_metadata(content)
                 self.metadata[name] = values
             elif opcode == container.DATA_END:
                 data_ended = True
             elif opcode in (container.SCHEMA, container.CHANNEL, container.MESSAGE) and not data_ended:
-                yield container.record(opcode, content)
+                yield container.encode_record(opcode, content)
         if not self.closed and not data_ended:
-            yield container.unpack_torn(self.tail())
+            yield container.salvage_torn_chunk(self.read_tail())
 
-    def tail(self) -> bytes:
-        """What stands after the last whole record."""
+    def read_tail(self) -> bytes:
+        """Return the bytes after the last complete record."""
         self.file.seek(self.end)
-        return self.file.read(min(self.size - self.end, container.MOST_UNCOMPRESSED))
+        return self.file.read(min(self.size - self.end, container.MAX_UNCOMPRESSED))
 
-    def damaged(self, error: Exception) -> LogError:
-        """`error`, met in a stretch, as a sentence."""
+    def damage_error(self, error: Exception) -> LogError:
+        """Convert an error found while reading into a LogError for the user."""
         if isinstance(error, KeyError):
-            error = Damaged(f"a message is on channel {error}, which is not defined")
+            error = DamagedError(f"a message is on channel {error}, which is not defined")
         return LogError(
             f"{self.path}: damaged near byte {self.end}: {error}; `companion log recover` saves the rest"
         )
 
 
 @contextmanager
-def opened(path: str | os.PathLike[str]) -> Iterator[Opened]:
-    """Open the log at `path`; LogError where it is missing, empty, foreign, or cut before its header."""
+def open_log(path: str | os.PathLike[str]) -> Iterator[LogReader]:
+    """Open the log at `path`. Raises LogError if it is missing, empty, not MCAP, or cut before its header."""
     path = Path(path)
     try:
         file = path.open("rb")
@@ -94,10 +94,10 @@ def opened(path: str | os.PathLike[str]) -> Iterator[Opened]:
             raise LogError(f"{path}: is empty")
         if not container.MAGIC.startswith(magic):
             raise LogError(f"{path}: is not an MCAP log (it does not begin with MCAP's magic)")
-        source = Opened(path, file, size)
-        first = next(container.scan(file, size), None)
+        source = LogReader(path, file, size)
+        first = next(container.scan_records(file, size), None)
         if first is None:
-            raise LogError(f"{path}: was cut off before its header ended; there is nothing in it to read")
+            raise LogError(f"{path}: is truncated within its header and contains no messages")
         if first.opcode != container.HEADER:
             raise LogError(f"{path}: is not an MCAP log (its first record is not a header)")
         file.seek(len(container.MAGIC))
@@ -105,35 +105,35 @@ def opened(path: str | os.PathLike[str]) -> Iterator[Opened]:
 
 
 def is_closed(path: str | os.PathLike[str]) -> bool:
-    """Whether the log at `path` is whole. Raises LogError as `opened` does."""
-    with opened(path) as source:
+    """Return whether the log at `path` was closed. Raises LogError as `open_log` does."""
+    with open_log(path) as source:
         return source.closed
 
 
-class Channels:
-    """The schemas and channels a file has defined so far: contents of their records, by id."""
+class ChannelTable:
+    """Schemas and channels defined so far in a file: record contents by id."""
 
     def __init__(self) -> None:
         self.schemas: dict[int, bytes] = {}
         self.channels: dict[int, bytes] = {}
 
     def define(self, opcode: int, content: bytes) -> int | None:
-        """Take in one record; the id if it was a channel. Raises Damaged where it cannot be parsed."""
+        """Add one record and return its id if it is a channel. Raises DamagedError if it cannot be parsed."""
         if opcode == container.SCHEMA:
-            self.schemas[container.schema(content)[0]] = content
+            self.schemas[container.parse_schema(content)[0]] = content
         elif opcode == container.CHANNEL:
-            number = container.channel(content)[0]
+            number = container.parse_channel(content)[0]
             self.channels[number] = content
             return number
         return None
 
     def __contains__(self, number: int) -> bool:
-        """Whether channel `number` and its schema are defined."""
-        of_schema = container.channel(self.channels[number])[1] if number in self.channels else -1
+        """Return whether channel `number` and its schema are defined."""
+        of_schema = container.parse_channel(self.channels[number])[1] if number in self.channels else -1
         return of_schema == 0 or of_schema in self.schemas
 
     def __getitem__(self, number: int) -> container.Channel:
-        """The channel `number`; raises KeyError where it or its schema is not defined."""
-        _, of_schema, topic, encoding = container.channel(self.channels[number])
-        name = container.schema(self.schemas[of_schema])[1] if of_schema else ""
+        """Return channel `number`. Raises KeyError if it or its schema is not defined."""
+        _, of_schema, topic, encoding = container.parse_channel(self.channels[number])
+        name = container.parse_schema(self.schemas[of_schema])[1] if of_schema else ""
         return container.Channel(topic, encoding, name)

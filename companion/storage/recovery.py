@@ -1,7 +1,4 @@
-"""A torn or damaged log made whole again.
-
-It knows how a log is laid down and read; which logs are left torn, and when to mend them, is not its concern.
-"""
+"""Recovery of a torn or damaged log. Which logs to recover, and when, is decided by the caller."""
 
 from __future__ import annotations
 
@@ -13,13 +10,13 @@ from pathlib import Path
 from typing import NamedTuple
 
 from companion.storage import container
-from companion.storage.container import Chunk, Damaged
-from companion.storage.mcap_file import DiskFile, Store, sync_folder
-from companion.storage.reader import ACTIVE, Channels, LogError, Opened, opened
+from companion.storage.container import Chunk, DamagedError
+from companion.storage.mcap_file import DiskFile, McapFile, sync_folder
+from companion.storage.reader import ACTIVE, ChannelTable, LogError, LogReader, open_log
 
 
 class Recovered(NamedTuple):
-    """What `recover` saved, and where it put it; `bytes_lost` are those of the torn log not carried over."""
+    """Result of `recover`; `bytes_lost` counts the bytes of the torn log that were not saved."""
 
     messages: int
     chunks: int
@@ -32,33 +29,37 @@ def recover(
     reserve: int = 0,
     relieve: Callable[[int], object] = lambda wanted: None,
 ) -> Recovered:
-    """Make a torn or damaged log whole: every whole chunk, and the whole messages of one torn off.
+    """Recover a torn or damaged log: every complete chunk, and the complete messages of a truncated one.
 
-    `x.mcap.active` becomes `x.mcap`: where it stands if only its end is missing, which takes the room of that
-    end, and by a copy if it is damaged or a torn chunk gives messages. Of a torn `x.mcap` a copy
-    `x.recovered.mcap` is made. A torn log goes only after its copy is safely on the disk, and only if it is
-    ".active". A whole log is left as it is. Killed at any instant it leaves a log that reads as before.
+    `x.mcap.active` becomes `x.mcap`: in place if only its end is missing, which needs space for the end only,
+    and by a copy if it is damaged or a truncated chunk gives messages. A torn `x.mcap` is copied to
+    `x.recovered.mcap`. The torn log is removed only after its copy is synced to the disk, and only if it is
+    ".active". A closed log is left unchanged. A kill at any instant leaves a log that reads as before.
 
-    `reserve` bytes of the disk are left free; `relieve` may make room for an end, as for a `DiskFile`, never
-    for a copy. Raises LogError where there is nothing to read or no room, where a process still writes, and
-    where what it would become is there already.
+    Parameters
+    ----------
+    reserve : bytes of the disk to leave free.
+    relieve : frees space for the end of a log, as for `DiskFile`; never called for a copy.
+
+    Raises LogError if there is nothing to read or no space, if a process still writes the log, or if the
+    target exists.
     """
     path = Path(path)
-    with opened(path) as locked:
+    with open_log(path) as locked:
         try:
             fcntl.flock(locked.file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
             raise LogError(f"{path}: is still being written") from None
-        target = _target(path)
+        target = _target_path(path)
         try:
-            saved = _whole(path)
+            saved = _check_complete(path)
             if saved is not None and path.suffix != ACTIVE:
                 return saved
             if target.exists():
-                raise LogError(f"{target} is there already: move it away first")
-            saved = saved or _ended(path, reserve, relieve)
+                raise LogError(f"{target} already exists: move it away first")
+            saved = saved or _complete_in_place(path, reserve, relieve)
             if saved is None:
-                saved = _copied(path, target, reserve)
+                saved = _recover_by_copy(path, target, reserve)
             else:
                 os.replace(path, target)
                 sync_folder(target.parent)
@@ -69,30 +70,30 @@ def recover(
     return saved._replace(path=target)
 
 
-def _whole(path: Path) -> Recovered | None:
-    """What the log at `path` holds if it is whole, and then safely on the disk; None if it is not."""
-    with opened(path) as source:
+def _check_complete(path: Path) -> Recovered | None:
+    """Return the contents of the log at `path` if it is complete, after a sync; None if it is not."""
+    with open_log(path) as source:
         try:
-            count = sum(_messages(data) for data in source.stretches()) if source.closed else 0
-        except Damaged:
+            count = sum(_count_messages(data) for data in source.message_blocks()) if source.closed else 0
+        except DamagedError:
             return None
         if not source.closed or source.end < source.size:
             return None
-        os.fsync(source.file.fileno())  # killed after its last write it may not have been
+        os.fsync(source.file.fileno())  # the writer may have been killed before its sync
         return Recovered(count, source.chunks, 0, path)
 
 
-class Differs(Exception):
-    """A log is not what its copy would be."""
+class CopyMismatch(Exception):
+    """The log differs from what its copy would be."""
 
 
-class Standing(DiskFile):
-    """A file that stands already, to be written again from its front. What is the same is left alone, at the
-    first difference the file is cut off, and never before `kept` bytes: a difference there raises Differs.
+class InPlaceFile(DiskFile):
+    """An existing file rewritten from its start. Equal bytes are not written again; the file is truncated at
+    the first difference. A difference within the first `kept` bytes raises CopyMismatch.
     """
 
     def __init__(self, path: Path, kept: int, reserve: int, relieve: Callable[[int], object]) -> None:
-        self._take(os.open(path, os.O_RDWR), reserve, relieve)
+        self._attach(os.open(path, os.O_RDWR), reserve, relieve)
         self._kept, self._same = kept, True
 
     def write(self, data: bytes) -> None:
@@ -104,7 +105,7 @@ class Standing(DiskFile):
                 return
             same = next((i for i, (a, b) in enumerate(zip(there, data)) if a != b), len(there))
             if self._at + same < self._kept:
-                raise Differs
+                raise CopyMismatch
             self._at += same
             self.truncate(self._at)
             data = data[same:]
@@ -117,76 +118,76 @@ class Standing(DiskFile):
         super().sync()
 
     def truncate(self, size: int) -> None:
-        """See `Disk`; what is kept stays even where a write is taken back."""
+        """See `Disk`; never truncates below the kept bytes."""
         self._same = False
         super().truncate(max(size, self._kept))
 
 
-def _ended(path: Path, reserve: int, relieve: Callable[[int], object]) -> Recovered | None:
-    """Put its end to the log at `path`; None where that is not all it lacks, and then it is as it was.
+def _complete_in_place(path: Path, reserve: int, relieve: Callable[[int], object]) -> Recovered | None:
+    """Write the missing end of the log at `path`. If more than the end is missing, return None unchanged.
 
-    It is copied onto itself: so the end is what the copy's would be, and all before it was compared.
+    The log is copied onto itself: its end becomes that of a copy, and everything before is compared.
     """
     if path.suffix != ACTIVE:
         return None
-    with opened(path) as source:
+    with open_log(path) as source:
         kept, library = 0, ""
         for _, opcode, content in source.records():
             if opcode == container.DATA_END:
                 break
             if opcode == container.HEADER:
-                with suppress(Damaged):
-                    library = container.library(content)
+                with suppress(DamagedError):
+                    library = container.parse_library(content)
             if opcode not in (container.SCHEMA, container.CHANNEL, container.MESSAGE_INDEX):
                 kept = source.end
         else:
-            if any(container.messages(container.unpack_torn(source.tail()))):
-                return None  # killed between the cut and the write they would be lost
-    disk = Standing(path, kept, reserve, relieve)
+            if any(container.iter_messages(container.salvage_torn_chunk(source.read_tail()))):
+                return None  # a kill between truncate and write would lose them
+    disk = InPlaceFile(path, kept, reserve, relieve)
     try:
-        with opened(path) as source:
-            return _copy(source, Store(disk, library))
-    except Differs:
+        with open_log(path) as source:
+            return _copy_records(source, McapFile(disk, library))
+    except CopyMismatch:
         return None
     finally:
         disk.close()
 
 
-def _copied(path: Path, target: Path, reserve: int) -> Recovered:
-    """Save what can be read of the log at `path` to `target`, and remove it if it is ".active"."""
+def _recover_by_copy(path: Path, target: Path, reserve: int) -> Recovered:
+    """Copy everything readable from `path` to `target`, and remove `path` if it is ".active"."""
     part = target.with_name(target.name + ".part")
     part.unlink(missing_ok=True)
     disk = DiskFile(part, reserve)
     try:
-        with opened(path) as source:
-            saved = _copy(source, Store(disk, "companion recover"))
+        with open_log(path) as source:
+            saved = _copy_records(source, McapFile(disk, "companion recover"))
         os.replace(part, target)
     finally:
         disk.close()
-        part.unlink(missing_ok=True)  # half a copy only takes the room that a flight needs
+        part.unlink(missing_ok=True)  # a partial copy would only take disk space
     sync_folder(target.parent)
     if path.suffix == ACTIVE:
         path.unlink(missing_ok=True)
     return saved
 
 
-def _target(path: Path) -> Path:
+def _target_path(path: Path) -> Path:
     stem = path.with_suffix("") if path.suffix == ACTIVE else path
     if path.suffix == ACTIVE and not stem.exists():
         return stem
     return stem.with_name(f"{stem.stem}.recovered.mcap")
 
 
-def _copy(source: Opened, target: Store) -> Recovered:
-    """Everything that can be read of `source` into `target`, chunk by chunk."""
-    known = Channels()
+def _copy_records(source: LogReader, target: McapFile) -> Recovered:
+    """Copy everything readable from `source` to `target`, chunk by chunk."""
+    known = ChannelTable()
     messages = chunks = lost = 0
-    loose = Chunk()
+    between = Chunk()
 
-    def keep(chunk: Chunk, squeezed: bytes | None = None) -> None:
+    def keep(chunk: Chunk, compressed: bytes | None = None) -> None:
         nonlocal messages, chunks
         if chunk.index:
-            target.chunk(chunk, known.schemas, known.channels, squeezed)
+            target.chunk(chunk, known.schemas, known.channels, compressed)
             messages += chunk.messages
             chunks += 1
 
@@ -195,33 +196,33 @@ def _copy(source: Opened, target: Store) -> Recovered:
             break
         try:
             if opcode == container.METADATA:
-                target.metadata(*container.metadata(content))
+                target.metadata(*container.parse_metadata(content))
             elif opcode == container.ATTACHMENT:
                 target.attachment(content)
             elif opcode == container.CHUNK:
-                data = container.unpack(content)
-                keep(loose)
-                loose = Chunk()
-                chunk = _rebuild(data, known, Chunk())
-                keep(chunk, container.squeezed(content) if chunk.data == data else None)
+                data = container.decompress_chunk(content)
+                keep(between)
+                between = Chunk()
+                chunk = _collect_messages(data, known, Chunk())
+                keep(chunk, container.compressed_data(content) if chunk.data == data else None)
             elif opcode in (container.SCHEMA, container.CHANNEL, container.MESSAGE):
-                _rebuild(container.record(opcode, content), known, loose)
-        except Damaged:
+                _collect_messages(container.encode_record(opcode, content), known, between)
+        except DamagedError:
             lost += 9 + len(content)
     else:
         if not source.closed:
             lost += source.size - source.end
-            with suppress(Damaged):  # torn and damaged: what stood before the damage is kept
-                _rebuild(container.unpack_torn(source.tail()), known, loose)
-    keep(loose)
+            with suppress(DamagedError):  # torn and damaged: keep the messages before the damage
+                _collect_messages(container.salvage_torn_chunk(source.read_tail()), known, between)
+    keep(between)
     target.finish()
     target.sync()
     return Recovered(messages, chunks, lost, source.path)
 
 
-def _rebuild(data: bytes, known: Channels, chunk: Chunk) -> Chunk:
-    """Add the messages among `data` to `chunk`; those of channels never defined cannot be kept."""
-    for opcode, number, sequence, log_ns, publish_ns, content in container.messages(data):
+def _collect_messages(data: bytes, known: ChannelTable, chunk: Chunk) -> Chunk:
+    """Add the messages in `data` to `chunk`; messages of undefined channels are dropped."""
+    for opcode, number, sequence, log_ns, publish_ns, content in container.iter_messages(data):
         if opcode != container.MESSAGE:
             known.define(opcode, content)
         elif number in known:
@@ -229,5 +230,5 @@ def _rebuild(data: bytes, known: Channels, chunk: Chunk) -> Chunk:
     return chunk
 
 
-def _messages(data: bytes) -> int:
-    return sum(inner[0] == container.MESSAGE for inner in container.messages(data))
+def _count_messages(data: bytes) -> int:
+    return sum(inner[0] == container.MESSAGE for inner in container.iter_messages(data))

@@ -1,10 +1,10 @@
-"""The folder logs live in: names by number and UTC time, room made by age, logs left torn made whole.
+"""Log folder: file names, deletion of the oldest logs, recovery of logs left unclosed.
 
-Age is the order in which logs were begun, whatever the clock said: each has the number after the greatest
-that lies there. Names without a number, of earlier versions, are older than all others and go by their time.
+Logs are ordered by the number in their name, not by the clock: a new log gets the greatest number plus one.
+Names without a number (earlier versions) count as older and are ordered by their time.
 
-It deletes nothing it did not name itself, never a log that is being written or mended, and nothing at all
-where that would not make room enough.
+Only files with names of this format are deleted, never a log that is being written or recovered, and none
+at all if deleting them could not free enough space.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ from companion.storage.mcap_file import DiskFile
 from companion.storage.reader import ACTIVE, LogError
 from companion.storage.recovery import Recovered, recover
 
-_OURS = re.compile(r"(?:(\d{5,})-)?(\d{8}T\d{6}Z)(?:-(\d+))?(?:\.recovered)?\.mcap(?:\.active)?")
+_LOG_NAME = re.compile(r"(?:(\d{5,})-)?(\d{8}T\d{6}Z)(?:-(\d+))?(?:\.recovered)?\.mcap(?:\.active)?")
 
 
-def open_log(
+def create_log(
     folder: str | os.PathLike[str],
     *,
     metadata: Mapping[str, Mapping[str, str]],
@@ -39,23 +39,23 @@ def open_log(
     depth: int = 1 << 25,
     block: bool = False,
 ) -> Writer:
-    """Begin a log in `folder`, named by its number and its start in UTC (00042-20260131T235959Z.mcap).
+    """Create a log in `folder`, named by number and start time in UTC (00042-20260131T235959Z.mcap).
 
-    At most `max_files` logs of ours are kept, this one included, and of the disk `min_free` bytes are left
-    free: the oldest logs go first, now and for room also while this one is written. Raises LogError where the
-    folder cannot be made or written to, and where without any log there would not be that room.
+    At most `max_files` logs are kept, this one included, and `min_free` bytes of the disk are left free: the
+    oldest logs are deleted first, at the start and, for space, while this log is written. Raises LogError if
+    the folder cannot be created or written, or if deleting all logs would not free enough space.
     """
     folder = Path(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        roomy = make_room(folder, min_free, max_files - 1)
-        path = _next_name(folder, start_unix_ns)
+        has_space = make_room(folder, min_free, max_files - 1)
+        path = _next_path(folder, start_unix_ns)
     except OSError as error:
         raise LogError(f"cannot keep logs in {folder}: {error.strerror or error}") from None
-    if not roomy:
+    if not has_space:
         raise LogError(
-            f"cannot keep logs in {folder}: with all of them deleted there would still not be "
-            f"{min_free >> 20} MiB free on the disk (log.minimum_free_mib), so none was"
+            f"cannot keep logs in {folder}: deleting all of them would not leave {min_free >> 20} MiB free; "
+            "none was deleted. Free space on the disk, or lower log.minimum_free_mib"
         )
     return Writer(
         path,
@@ -70,26 +70,27 @@ def open_log(
     )
 
 
-def recover_left(folder: str | os.PathLike[str], min_free: int = 0) -> list[Recovered]:
-    """Make whole every log in `folder` that was left ".active" and that no process is writing any more.
+def recover_unclosed(folder: str | os.PathLike[str], min_free: int = 0) -> list[Recovered]:
+    """Recover every ".active" log in `folder` that no process is writing.
 
-    One that holds nothing to read is left as it is, and so is one where `min_free` bytes of disk would not
-    stay free. The newest comes first: where room must be made, it is the oldest that goes.
+    A log with nothing to read is left unchanged, and so is one that would leave less than `min_free` bytes
+    of the disk free. The newest is recovered first: if space must be freed, the oldest is deleted.
     """
     saved: list[Recovered] = []
-    for path in sorted(Path(folder).glob(f"*.mcap{ACTIVE}"), key=_begun, reverse=True):
+    for path in sorted(Path(folder).glob(f"*.mcap{ACTIVE}"), key=_age_key, reverse=True):
         try:
             saved.append(recover(path, min_free, partial(make_room, Path(folder))))
-        except LogError:  # being written, or nothing in it, or no room: it waits for the next start
+        except LogError:  # being written, empty, or no space: retried at the next start
             continue
     return saved
 
 
 def make_room(folder: Path, min_free: int, max_files: int | None = None) -> bool:
-    """Delete the oldest logs of ours, closed or torn, until no more than `max_files` are left and `min_free`
-    bytes of the disk are free; whether they are. Where they would not be, nothing is deleted.
+    """Delete the oldest logs, closed or torn, until at most `max_files` remain and `min_free` bytes are free.
+
+    Return whether the space is free. If it cannot be reached, nothing is deleted.
     """
-    logs = _logs(folder)
+    logs = _find_logs(folder)
     spare = 0 if max_files is None else len(logs) - max_files
     missing = min_free - shutil.disk_usage(folder).free
     chosen: list[Path] = []
@@ -97,10 +98,10 @@ def make_room(folder: Path, min_free: int, max_files: int | None = None) -> bool
         if missing <= 0 and len(chosen) >= spare:
             break
         try:
-            if _held(log):
+            if _is_locked(log):
                 continue
             missing -= log.stat().st_blocks * 512
-        except FileNotFoundError:  # another companion makes room, or gave it its name
+        except FileNotFoundError:  # deleted or renamed by another process
             continue
         chosen.append(log)
     if missing > 0:
@@ -110,8 +111,8 @@ def make_room(folder: Path, min_free: int, max_files: int | None = None) -> bool
     return True
 
 
-def _held(log: Path) -> bool:
-    """Whether a process, this one or another, writes or mends `log`."""
+def _is_locked(log: Path) -> bool:
+    """Return whether a process is writing or recovering `log`."""
     if log.suffix != ACTIVE:
         return False
     with log.open("rb") as file:
@@ -122,18 +123,18 @@ def _held(log: Path) -> bool:
     return False
 
 
-def _logs(folder: Path) -> list[Path]:
-    """The logs of ours, oldest first."""
-    return sorted((log for log in folder.iterdir() if _OURS.fullmatch(log.name)), key=_begun)
+def _find_logs(folder: Path) -> list[Path]:
+    """Return the logs with names of this format, oldest first."""
+    return sorted((log for log in folder.iterdir() if _LOG_NAME.fullmatch(log.name)), key=_age_key)
 
 
-def _begun(log: Path) -> tuple[int, str, int]:
-    """What logs are ordered by; a file that is none of ours goes before them."""
-    found = _OURS.fullmatch(log.name)
+def _age_key(log: Path) -> tuple[int, str, int]:
+    """Return the sort key of a log: number, start time, suffix. Other files sort first."""
+    found = _LOG_NAME.fullmatch(log.name)
     return (int(found[1] or 0), found[2], int(found[3] or 1)) if found else (0, "", 0)
 
 
-def _next_name(folder: Path, start_unix_ns: int) -> Path:
-    number = max((_begun(log)[0] for log in folder.iterdir()), default=0) + 1
+def _next_path(folder: Path, start_unix_ns: int) -> Path:
+    number = max((_age_key(log)[0] for log in folder.iterdir()), default=0) + 1
     start = datetime.fromtimestamp(start_unix_ns // 1_000_000_000, UTC)
     return folder / f"{number:05d}-{start:%Y%m%dT%H%M%SZ}.mcap"

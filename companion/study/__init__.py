@@ -1,1 +1,1 @@
-"""Studies: questions an operator or an analyst asks of the mathematics, answered as tables and plots."""
+"""Studies: commands that evaluate the estimation methods and print tables and plots."""

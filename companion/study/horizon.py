@@ -1,9 +1,8 @@
-"""`companion study horizon`: how long one may fly without fixes.
+"""`companion study horizon`: permissible flight time without fixes.
 
-For position fixes of a given sigma over a given window, the guaranteed r.m.s. bound of the INS errors
-against the time since the last fix, with what least squares would claim and might suffer. It knows the
-Schuler channel only (see `estimate.schuler`) and no real flight: no fix is missing and the INS keeps its
-drift.
+For position fixes of a given sigma over a given window: the guaranteed r.m.s. bound of the INS errors as a
+function of the time since the last fix, with the claimed and the worst-case error of least squares. The model
+is the Schuler channel (see `estimate.schuler`); no fix is missing and the drift of the INS is constant.
 """
 
 import json
@@ -26,7 +25,7 @@ LONGEST_MIN = 24 * 60
 
 
 class Ahead(NamedTuple):
-    """Bounds at one time since the last fix, in the units of a report."""
+    """Bounds at one time since the last fix, in the units of the output."""
 
     ahead_min: float
     position_m: float
@@ -38,7 +37,7 @@ class Ahead(NamedTuple):
 
 
 class Horizon:
-    """The bounds ahead of one window of position fixes; `drift` [rad/s] is what the INS keeps, r.m.s."""
+    """Bounds after a window of position fixes; `drift` [rad/s] is the constant drift of the INS, r.m.s."""
 
     def __init__(
         self,
@@ -50,22 +49,22 @@ class Horizon:
     ) -> None:
         if not (window > 0.0 and every > 0.0 and math.isfinite(window / every)):
             raise ValueError(
-                f"a window of {window} s with a fix every {every} s holds none; give positive seconds"
+                f"a window of {window} s with a fix every {every} s contains none; give positive seconds"
             )
         count = round(window / every) + 1
         tau = np.linspace(-0.5, 0.5, count) * (window * scale.rate)
         rows, sigmas = schuler_row("gamma", -tau), np.full(count, sigma / scale.radius)
-        if drift is not None:  # a constant known to be zero +- drift is one more measurement of it
+        if drift is not None:  # prior knowledge of the constant, 0 +- drift, is one more measurement
             rows, sigmas = np.vstack([rows, [0.0, 0.0, 0.0, 1.0]]), np.append(sigmas, drift / scale.rate)
         self._design, self._scale, self._half = Design.of(rows, sigmas), scale, 0.5 * window
         self._starts: list[tuple[int, ...]] = [()] * 4
 
     def position(self, ahead: float) -> float:
-        """Return the bound of position [m] a time ahead [s] of the last fix."""
+        """Return the bound of the position [m] at a time ahead [s] after the last fix."""
         return self._bound(0, ahead)
 
     def at(self, ahead: float) -> Ahead:
-        """Return all bounds a time ahead [s] of the last fix."""
+        """Return all bounds at a time ahead [s] after the last fix."""
         position, tilt, velocity, drift = (self._bound(k, ahead) for k in range(4))
         ls = self._design.least_squares(self._target(0, ahead))
         radius = self._scale.radius
@@ -80,7 +79,7 @@ class Horizon:
         )
 
     def longest(self, limit: float) -> float:
-        """Return how long [s] the bound of position stays below limit [m], to a second; inf past a day."""
+        """Return the time [s] for which the position bound stays within limit [m]; inf beyond a day."""
         for minute in range(LONGEST_MIN + 1):
             if self.position(60.0 * minute) > limit:
                 break
@@ -106,20 +105,20 @@ def _minutes(context: click.Context, parameter: click.Parameter, text: str) -> l
     try:
         given = [float(word) for word in text.split(",")]
     except ValueError:
-        raise click.BadParameter(f"{text!r} is not a number nor a list like 5,10,20") from None
+        raise click.BadParameter(f"{text!r} is neither a number nor a list like 5,10,20") from None
     if not all(math.isfinite(minute) and minute >= 0.0 for minute in given):
-        raise click.BadParameter(f"{text!r}: give minutes from 0 up")
+        raise click.BadParameter(f"{text!r}: give minutes of 0 or more")
     return given if len(given) > 1 else np.linspace(0.0, given[0], 13).tolist()
 
 
 def _positive(context: click.Context, parameter: click.Parameter, value: float | None) -> float | None:
     if value is not None and not (math.isfinite(value) and value > 0.0):
-        raise click.BadParameter(f"{value:g} is no distance: give metres above 0")
+        raise click.BadParameter(f"{value:g} is not a valid distance: give metres above 0")
     return value
 
 
 def _drift(context: click.Context, parameter: click.Parameter, text: str | None) -> float | None:
-    """Return deg/h from a grade or a number."""
+    """Return the drift in deg/h from a grade or a number."""
     if text is None or text in GRADES_DEG_H:
         return GRADES_DEG_H[text] if text else None
     try:
@@ -127,7 +126,9 @@ def _drift(context: click.Context, parameter: click.Parameter, text: str | None)
     except ValueError:
         drift = math.nan
     if not (math.isfinite(drift) and drift > 0.0):
-        raise click.BadParameter(f"{text!r} is no grade ({', '.join(GRADES_DEG_H)}) and no drift in deg/h")
+        raise click.BadParameter(
+            f"{text!r} is neither a grade ({', '.join(GRADES_DEG_H)}) nor a drift in deg/h above 0"
+        )
     return drift
 
 
@@ -139,14 +140,14 @@ def _drift(context: click.Context, parameter: click.Parameter, text: str | None)
     callback=_positive,
     help="R.m.s. of one position fix [m].",
 )
-@click.option("--window-min", default=15.0, show_default=True, help="Length of trusted fixes [min].")
+@click.option("--window-min", default=15.0, show_default=True, help="Duration of the window of fixes [min].")
 @click.option("--every-s", default=1.0, show_default=True, help="Interval of the fixes [s].")
 @click.option(
     "--ahead-min",
     default="60",
     show_default=True,
     callback=_minutes,
-    help="Minutes: a list 5,10,20 or the farthest.",
+    help="Times after the last fix [min]: a list 5,10,20, or the last one.",
 )
 @click.option(
     "--ins", "drift_deg_h", callback=_drift, help="Grade (navigation, tactical, industrial) or drift [deg/h]."
@@ -155,11 +156,14 @@ def _drift(context: click.Context, parameter: click.Parameter, text: str | None)
     "--limit-m",
     type=float,
     callback=_positive,
-    help="Also tell how long the position bound stays below this [m].",
+    help="Also print how long the position bound stays below this [m].",
 )
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 @click.option(
-    "--plot", type=click.Path(path_type=Path), callback=plot_options.file, help="Draw into this file."
+    "--plot",
+    type=click.Path(path_type=Path),
+    callback=plot_options.check_plot_file,
+    help="Also write a plot to this file.",
 )
 def command(
     sigma_m: float,
@@ -171,7 +175,7 @@ def command(
     as_json: bool,
     plot: Path | None,
 ) -> None:
-    """Guaranteed bounds against time since the last fix: how long may I fly without fixes?"""
+    """Print the guaranteed bounds as a function of the time since the last fix."""
     try:
         drift = None if drift_deg_h is None else drift_deg_h * DEG_PER_HOUR
         horizon = Horizon(sigma_m, 60.0 * window_min, every_s, drift)
@@ -194,8 +198,8 @@ def command(
     else:
         _print(table, f"{sigma_m:g} m fixes every {every_s:g} s for {window_min:g} min", drift_deg_h)
         if longest is not None:
-            told = f"{longest / 60.0:.1f} min" if math.isfinite(longest) else "more than a day"
-            click.echo(f"The position bound stays below {limit_m:g} m for {told} without fixes.")
+            duration = f"{longest / 60.0:.1f} min" if math.isfinite(longest) else "more than a day"
+            click.echo(f"The position bound stays below {limit_m:g} m for {duration} without fixes.")
     if plot is not None:
         _plot(table, plot)
 

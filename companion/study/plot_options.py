@@ -1,4 +1,4 @@
-"""What a command draws into, as callbacks of its option: looked at before any work is done."""
+"""Callbacks of the plot options: the output path is checked before any work is done."""
 
 from __future__ import annotations
 
@@ -7,40 +7,40 @@ from pathlib import Path
 
 import click
 
-from companion.optional_dependencies import lacking
+from companion.optional_dependencies import missing_package
 
 
-def file(context: click.Context, parameter: click.Parameter, path: Path | None) -> Path | None:
-    """A file whose suffix is a format of matplotlib's, in a folder that is there."""
+def check_plot_file(context: click.Context, parameter: click.Parameter, path: Path | None) -> Path | None:
+    """Check that the path is a writable file with a suffix known to matplotlib."""
     if path is None:
         return None
-    formats = _formats()
+    formats = _supported_formats()
     if path.suffix[1:].lower() not in formats:
-        raise click.BadParameter(f"{path} has no suffix of a drawing: give one of {', '.join(formats)}")
+        raise click.BadParameter(f"{path} has no image suffix: use one of {', '.join(formats)}")
     if not path.parent.is_dir():
-        raise click.BadParameter(f"{path} cannot be drawn: there is no folder {path.parent}")
+        raise click.BadParameter(f"{path} cannot be written: no folder {path.parent}")
     if path.is_dir() or not os.access(path if path.exists() else path.parent, os.W_OK):
         raise click.BadParameter(f"{path} cannot be written")
     return path
 
 
-def folder(context: click.Context, parameter: click.Parameter, path: Path | None) -> Path | None:
-    """A folder, made where it is not there."""
+def make_plot_folder(context: click.Context, parameter: click.Parameter, path: Path | None) -> Path | None:
+    """Create the folder if it does not exist."""
     if path is None:
         return None
-    _formats()
+    _supported_formats()
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise click.BadParameter(f"{path} cannot be drawn into: {error.strerror}") from None
+        raise click.BadParameter(f"{path} cannot be created: {error.strerror}") from None
     return path
 
 
-def _formats() -> dict[str, str]:
-    """What can be drawn, by suffix."""
+def _supported_formats() -> dict[str, str]:
+    """Return the image formats of matplotlib by suffix."""
     try:
         from matplotlib.backend_bases import FigureCanvasBase
     except ImportError:
-        raise click.UsageError(lacking("drawing", "matplotlib", "plot")) from None
+        raise click.UsageError(missing_package("plotting", "matplotlib", "plot")) from None
     formats: dict[str, str] = FigureCanvasBase.get_supported_filetypes()
     return formats

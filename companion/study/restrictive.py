@@ -1,9 +1,9 @@
 """`companion study restrictive`: the minimax Kalman filter and the restrictive filter R1 on the same flights.
 
 The experiment of Poddubny, section 3: a ship's INS with a log in unknown currents, 16 states, 600 samples in
-six hours, perfect alignment. What drives the currents is the truth of the run; everything else is drawn from
-the model both filters use. The paper's own truth lies on the bounds all the time; the others show what that
-is worth.
+six hours, perfect alignment. The truth of a run is the input that drives the currents; everything else is
+drawn from the model that both filters use. In the paper the input is always on the bounds; the other truths
+show how the result depends on that.
 """
 
 import json
@@ -17,33 +17,33 @@ from rich.console import Console
 from rich.table import Table
 
 from companion.estimate import kalman, restrictive
-from companion.estimate.kalman import Array
 from companion.nav.error_model import Example, paper_example
 from companion.study import plot_options
+from companion.units import Floats
 
 SAMPLES = 600
-NEAR = 0.9  # an input this close to its bound counts as near it
+NEAR = 0.9  # inputs above this share of the bound count as near it
 Generator = np.random.Generator
 
 
-def constant(rng: Generator, runs: int, C: Array, dt: float) -> Array:
-    """On the upper bound for the whole run, both currents.
+def constant(rng: Generator, runs: int, C: Floats, dt: float) -> Floats:
+    """Return both currents on the upper bound for the whole run.
 
-    The paper does not say which bounds. With both signs alike velocity north gains more than east (1.8 and
-    1.5 times), with opposite signs the two change places.
+    The paper does not state which bounds. With equal signs the gain is greater in velocity north than east
+    (1.8 and 1.5 times); with opposite signs it is the reverse.
     """
     return np.broadcast_to(C, (runs, SAMPLES, len(C)))
 
 
-def telegraph(rng: Generator, runs: int, C: Array, dt: float) -> Array:
-    """From bound to bound, on average one switch an hour."""
+def telegraph(rng: Generator, runs: int, C: Floats, dt: float) -> Floats:
+    """Return inputs that switch between the bounds, once an hour on average."""
     switches = rng.random((runs, SAMPLES, len(C))) < dt
     switches[:, 0] = rng.random((runs, len(C))) < 0.5
     return C * np.where(np.cumsum(switches, 1) % 2, 1.0, -1.0)
 
 
-def slow(rng: Generator, runs: int, C: Array, dt: float) -> Array:
-    """A sine of 2 to 6 h that reaches a fifth to three fifths of the bound, phase by lot."""
+def slow(rng: Generator, runs: int, C: Floats, dt: float) -> Floats:
+    """Return sines of period 2 to 6 h, amplitude 0.2 to 0.6 of the bound, random phase."""
     shape = (runs, 1, len(C))
     period, height = rng.uniform(2, 6, shape), rng.uniform(0.2, 0.6, shape)
     phase = rng.uniform(0, 1, shape)
@@ -51,39 +51,39 @@ def slow(rng: Generator, runs: int, C: Array, dt: float) -> Array:
     return C * height * np.sin(2 * np.pi * (hours / period + phase))
 
 
-def white(rng: Generator, runs: int, C: Array, dt: float) -> Array:
-    """Gaussian and white with variance C^2, the law for which the minimax filter is optimal."""
+def white(rng: Generator, runs: int, C: Floats, dt: float) -> Floats:
+    """Return Gaussian white noise of variance C^2, for which the minimax filter is optimal."""
     return C * rng.standard_normal((runs, SAMPLES, len(C)))
 
 
-class Truth(NamedTuple):
-    """A row of the table: what drives the currents, and the model of all the rest."""
+class TruthModel(NamedTuple):
+    """A row of the table: the inputs that drive the currents, and the model variant."""
 
     title: str
-    inputs: Callable[[Generator, int, Array, float], Array]
+    inputs: Callable[[Generator, int, Floats, float], Floats]
     exact: bool = True
     sigma_E: float = 1e-5
 
 
 TRUTHS = {
-    "constant": Truth("constant on the bound", constant),
-    "telegraph": Truth("telegraph, one switch an hour", telegraph),
-    "slow": Truth("slow, inside the bounds", slow),
-    "white": Truth("Gaussian white, variance C^2", white),
-    "euler": Truth("constant, Euler's step, sigma_E 3e-6", constant, exact=False, sigma_E=3e-6),
+    "constant": TruthModel("constant on the bound", constant),
+    "telegraph": TruthModel("telegraph, one switch an hour", telegraph),
+    "slow": TruthModel("slow, inside the bounds", slow),
+    "white": TruthModel("Gaussian white, variance C^2", white),
+    "euler": TruthModel("constant, Euler's step, sigma_E 3e-6", constant, exact=False, sigma_E=3e-6),
 }
 
 
 class Flights(NamedTuple):
-    """Truth x (T, runs, n), inputs u (T, runs, m), measurements z (T, runs, p): time comes first."""
+    """Truth x (T, runs, n), inputs u (T, runs, m), measurements z (T, runs, p); the first axis is time."""
 
-    x: Array
-    u: Array
-    z: Array
+    x: Floats
+    u: Floats
+    z: Floats
 
 
-def fly(model: Example, truth: Truth, runs: int, rng: Generator) -> Flights:
-    """Draw the flights: W and N from the model, U from the truth."""
+def simulate_flights(model: Example, truth: TruthModel, runs: int, rng: Generator) -> Flights:
+    """Simulate the flights: W and N from the model, U from the truth."""
     u = np.moveaxis(truth.inputs(rng, runs, model.C, model.dt), 1, 0)
     noise = rng.multivariate_normal(np.zeros(len(model.x0)), model.Q, (SAMPLES, runs), method="eigh")
     x = np.broadcast_to(model.x0, (runs, len(model.x0)))
@@ -94,17 +94,17 @@ def fly(model: Example, truth: Truth, runs: int, rng: Generator) -> Flights:
     return Flights(states, u, states @ model.H.T + sigma * rng.standard_normal((SAMPLES, runs, len(sigma))))
 
 
-class Passed(NamedTuple):
-    """A filter over the flights: estimates (T, runs, n), inputs (T, runs, m) or None, NEES by state (n,)."""
+class FilterResult(NamedTuple):
+    """Result of a filter: estimates (T, runs, n), inputs (T, runs, m) or None, NEES by state (n,)."""
 
-    x: Array
-    u: Array | None
-    nees: Array
+    x: Floats
+    u: Floats | None
+    nees: Floats
     nees_all: float
 
 
-def minimax(model: Example, flights: Flights) -> Passed:
-    """The Kalman filter whose noise is the greatest within the bounds."""
+def minimax(model: Example, flights: Flights) -> FilterResult:
+    """Run the Kalman filter with the greatest noise within the bounds."""
     Q = kalman.minimax_noise(model.B, model.C, model.Q)
     x, P = np.broadcast_to(model.x0, flights.x.shape[1:]), model.P0
     steps = []
@@ -112,26 +112,26 @@ def minimax(model: Example, flights: Flights) -> Passed:
         now = kalman.step(x, P, z, model.A, Q, model.H, model.R)
         x, P = now.x, now.P
         steps.append((x, None, P))
-    return _passed(flights, steps)
+    return _collect_result(flights, steps)
 
 
-def r1(model: Example, flights: Flights) -> Passed:
-    """The restrictive filter; every flight has its own covariance."""
+def r1(model: Example, flights: Flights) -> FilterResult:
+    """Run the restrictive filter; every flight has its own covariance."""
     runs, n = flights.x.shape[1:]
     x, P = np.broadcast_to(model.x0, (runs, n)), np.broadcast_to(model.P0, (runs, n, n))
 
-    def steps() -> Iterator[tuple[Array, Array | None, Array]]:
+    def steps() -> Iterator[tuple[Floats, Floats | None, Floats]]:
         nonlocal x, P
         for z in flights.z:
             now = restrictive.step(x, P, z, model.A, model.B, model.Q, model.H, model.R, model.C)
             x, P = now.x, now.P
             yield x, now.u, P
 
-    return _passed(flights, steps())
+    return _collect_result(flights, steps())
 
 
-def _passed(flights: Flights, steps: Any) -> Passed:
-    """Gather the estimates; the NEES by state after the first hour, when every variance has grown."""
+def _collect_result(flights: Flights, steps: Any) -> FilterResult:
+    """Collect the estimates, and the NEES by state after the first hour, when all variances have grown."""
     settled = SAMPLES // 6
     x, u, by_state, whole = [], [], [], []
     for t, (x_t, u_t, P_t) in enumerate(steps):
@@ -142,19 +142,23 @@ def _passed(flights: Flights, steps: Any) -> Passed:
             by_state.append((error**2 / np.diagonal(P_t, axis1=-2, axis2=-1)).mean(0))
             whole.append(kalman.nees(error, P_t).mean() / error.shape[-1])
     inputs = None if u[0] is None else np.array(u)
-    return Passed(np.array(x), inputs, np.mean(by_state, 0), float(np.mean(whole)))
+    return FilterResult(np.array(x), inputs, np.mean(by_state, 0), float(np.mean(whole)))
 
 
-def study(name: str, runs: int, seed: int) -> tuple[dict[str, Any], Flights, Passed, Passed, Example]:
-    """One row: rms errors over all runs and six hours, their ratio, inputs on the bound, consistency."""
+def study(
+    name: str, runs: int, seed: int
+) -> tuple[dict[str, Any], Flights, FilterResult, FilterResult, Example]:
+    """Compute one row: rms errors over all runs and six hours, ratio, inputs on the bound, consistency."""
     truth = TRUTHS[name]
     model = paper_example(exact=truth.exact, sigma_E=truth.sigma_E)
     rng = np.random.default_rng([seed, list(TRUTHS).index(name)])
-    flights = fly(model, truth, runs, rng)
-    coarse, restricted = minimax(model, flights), r1(model, flights)
-    rms = [np.sqrt(np.mean((f.x - flights.x) ** 2, axis=(0, 1))) for f in (coarse, restricted)]
-    assert restricted.u is not None
-    share = np.abs(restricted.u) / model.C
+    flights = simulate_flights(model, truth, runs, rng)
+    minimax_result, restrictive_result = minimax(model, flights), r1(model, flights)
+    rms = [
+        np.sqrt(np.mean((f.x - flights.x) ** 2, axis=(0, 1))) for f in (minimax_result, restrictive_result)
+    ]
+    assert restrictive_result.u is not None
+    share = np.abs(restrictive_result.u) / model.C
     row = {
         "truth": name,
         "title": truth.title,
@@ -166,16 +170,16 @@ def study(name: str, runs: int, seed: int) -> tuple[dict[str, Any], Flights, Pas
         "rms_free": np.sqrt(np.mean(flights.x**2, axis=(0, 1))).tolist(),
         "on_bound": float((share >= 1.0).mean()),
         "near_bound": float((share >= NEAR).mean()),
-        "nees_minimax": coarse.nees.tolist(),
-        "nees_restrictive": restricted.nees.tolist(),
-        "nees_minimax_per_dimension": coarse.nees_all,
-        "nees_restrictive_per_dimension": restricted.nees_all,
+        "nees_minimax": minimax_result.nees.tolist(),
+        "nees_restrictive": restrictive_result.nees.tolist(),
+        "nees_minimax_per_dimension": minimax_result.nees_all,
+        "nees_restrictive_per_dimension": restrictive_result.nees_all,
     }
-    return row, flights, coarse, restricted, model
+    return row, flights, minimax_result, restrictive_result, model
 
 
-def sheet(rows: list[dict[str, Any]], key: str, title: str, number: str) -> Table:
-    """One table, a row per state and a column per truth: it fits a terminal of 80 columns."""
+def build_table(rows: list[dict[str, Any]], key: str, title: str, number: str) -> Table:
+    """Build a table with a row per state and a column per truth; it fits 80 columns."""
     table = Table(title=title)
     table.add_column("state")
     for row in rows:
@@ -186,16 +190,21 @@ def sheet(rows: list[dict[str, Any]], key: str, title: str, number: str) -> Tabl
 
 
 def draw(
-    folder: Path, name: str, flights: Flights, coarse: Passed, restricted: Passed, model: Example
+    folder: Path,
+    name: str,
+    flights: Flights,
+    minimax_result: FilterResult,
+    restrictive_result: FilterResult,
+    model: Example,
 ) -> None:
-    """Figures in the order of the paper's 1-10, of the first run: measurements, inputs, estimates, errors."""
+    """Draw figures 1-10 of the paper for the first run: measurements, inputs, estimates, errors."""
     from matplotlib.figure import Figure
 
-    assert restricted.u is not None
+    assert restrictive_result.u is not None
     states = model.states
     groups = [range(i, min(i + 4, len(states))) for i in range(0, len(states), 4)]
 
-    def save(number: int, panels: list[tuple[str, dict[str, Array]]]) -> None:
+    def save(number: int, panels: list[tuple[str, dict[str, Floats]]]) -> None:
         figure = Figure(figsize=(8, 2 * len(panels)), layout="constrained")
         for axes, (label, curves) in zip(np.atleast_1d(figure.subplots(len(panels), 1)), panels, strict=True):
             for legend, values in curves.items():
@@ -208,11 +217,11 @@ def draw(
     save(
         2,
         [
-            (f"U{i + 1}", {"true": flights.u[:, 0, i], "restrictive": restricted.u[:, 0, i]})
+            (f"U{i + 1}", {"true": flights.u[:, 0, i], "restrictive": restrictive_result.u[:, 0, i]})
             for i in range(flights.u.shape[-1])
         ],
     )
-    x, k, r = (f[:, 0] for f in (flights.x, coarse.x, restricted.x))
+    x, k, r = (f[:, 0] for f in (flights.x, minimax_result.x, restrictive_result.x))
     for number, group in enumerate(groups):
         curves = [(states[i], {"true": x[:, i], "restrictive": r[:, i], "minimax": k[:, i]}) for i in group]
         errors = [(states[i], {"restrictive": abs(r - x)[:, i], "minimax": abs(k - x)[:, i]}) for i in group]
@@ -221,33 +230,47 @@ def draw(
 
 
 @click.command("restrictive")
-@click.option("--runs", default=200, show_default=True, type=click.IntRange(2), help="flights per truth")
-@click.option("--truth", "names", multiple=True, type=click.Choice(list(TRUTHS)), help="rows; all by default")
-@click.option("--seed", default=1, show_default=True, help="of the random numbers")
-@click.option("--json", "as_json", is_flag=True, help="print plain data")
+@click.option("--runs", default=200, show_default=True, type=click.IntRange(2), help="Flights per truth.")
 @click.option(
-    "--plot", type=click.Path(path_type=Path), callback=plot_options.folder, help="folder for figures 1-10"
+    "--truth",
+    "names",
+    multiple=True,
+    type=click.Choice(list(TRUTHS)),
+    help="Truth, may be repeated; default: all.",
+)
+@click.option("--seed", default=1, show_default=True, help="Seed of the random numbers.")
+@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+@click.option(
+    "--plot",
+    type=click.Path(path_type=Path),
+    callback=plot_options.make_plot_folder,
+    help="Folder for figures 1-10.",
 )
 def command(names: tuple[str, ...], runs: int, seed: int, as_json: bool, plot: Path | None) -> None:
-    """Minimax Kalman filter against the restrictive filter, 16 states, six hours of unknown currents."""
+    """Compare the minimax Kalman filter and the restrictive filter.
+
+    The simulated flights have 16 states and last six hours, in unknown currents.
+    """
     rows = []
     for name in names or tuple(TRUTHS):
-        row, flights, coarse, restricted, model = study(name, runs, seed)
+        row, flights, minimax_result, restrictive_result, model = study(name, runs, seed)
         rows.append(row)
         if plot:
-            draw(plot, name, flights, coarse, restricted, model)
+            draw(plot, name, flights, minimax_result, restrictive_result, model)
     if as_json:
         click.echo(json.dumps(rows))
         return
     console = Console()
     console.print(
-        sheet(rows, "ratio", "rms error, minimax / restrictive (above 1: restrictive better)", ".2f")
+        build_table(rows, "ratio", "rms error, minimax / restrictive (above 1: restrictive better)", ".2f")
     )
-    console.print(sheet(rows, "rms_minimax", "rms error of the minimax filter, km, h, rad", ".2e"))
-    console.print(sheet(rows, "rms_restrictive", "rms error of the restrictive filter", ".2e"))
-    console.print(sheet(rows, "rms_free", "rms error of the INS without correction", ".2e"))
-    console.print(sheet(rows, "nees_minimax", "mean error^2 / variance, minimax (1: consistent)", ".1f"))
-    console.print(sheet(rows, "nees_restrictive", "mean error^2 / variance, restrictive", ".1f"))
+    console.print(build_table(rows, "rms_minimax", "rms error of the minimax filter, km, h, rad", ".2e"))
+    console.print(build_table(rows, "rms_restrictive", "rms error of the restrictive filter", ".2e"))
+    console.print(build_table(rows, "rms_free", "rms error of the INS without correction", ".2e"))
+    console.print(
+        build_table(rows, "nees_minimax", "mean error^2 / variance, minimax (1: consistent)", ".1f")
+    )
+    console.print(build_table(rows, "nees_restrictive", "mean error^2 / variance, restrictive", ".1f"))
     for row in rows:
         console.print(
             f"{row['title']}: U on the bound in {row['on_bound']:.0%} of steps, "

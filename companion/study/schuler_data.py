@@ -1,18 +1,18 @@
-"""`companion study schuler`: prediction on recorded velocity errors of a real INS, and its bound tried out.
+"""`companion study schuler`: prediction of recorded velocity errors of a real INS, and test of its bound.
 
 Input is a CSV with columns utc_s_of_day, ins_minus_gps_ve_mps, ins_minus_gps_vn_mps (comment lines with #,
 may be .gz), such as the five Schuler periods of a navigation-grade Honeywell Laseref on the NSF/NCAR
-Gulfstream V (DEEPWAVE, W. Cooper, UCAR). On each window the velocity error is learnt, then predicted;
-windows slide over the flight. Beside the minimax stand least squares on the same model, a straight line, and
-holding the last error.
+Gulfstream V (DEEPWAVE, W. Cooper, UCAR). In sliding windows over the flight the velocity error is estimated,
+then predicted. The minimax prediction is compared with least squares on the same model, a straight line, and
+the last error held constant.
 
-The stated sigma. What departs from (2.1) here is less noise than model: manoeuvres, drift that turns with
-the heading and, first, the Earth's rotation, which turns a Schuler oscillation of amplitude A between the
-channels at Omega sin(lat), and which one channel alone cannot know. So the default is stated beforehand, for
-any such INS: 0.12 m/s, the r.m.s. residual about the model over the first hour of this flight (its worse
-channel, east), and A Omega sin(lat) t = 0.28 m/s with A = 2 m/s, lat = 45 deg, t = 45 min, the middle of an
-hour and a half of window and horizon; together 0.30 m/s. `sigma_68` is the sigma that would have put 68 %
-inside, to judge it by. The "truth" is such a measurement too, so the shares are on the strict side.
+The stated sigma. The departures from (2.1) are mostly model errors: manoeuvres, drift that rotates with the
+heading and, above all, the Earth's rotation, which rotates a Schuler oscillation of amplitude A between the
+channels at Omega sin(lat) and is not observable in a single channel. The default is therefore fixed in
+advance for any such INS: 0.12 m/s, the r.m.s. residual of the model over the first hour of this flight (its
+worse channel, east), and A Omega sin(lat) t = 0.28 m/s with A = 2 m/s, lat = 45 deg, t = 45 min, the middle
+of one and a half hours of window and horizon; together 0.30 m/s. `sigma_68` is the sigma for which 68 % of
+the errors are inside, for comparison. As the "truth" is such a measurement too, the shares are conservative.
 """
 
 import json
@@ -28,12 +28,11 @@ from rich.console import Console
 from rich.table import Table
 
 from companion.estimate.predictor import Window, predict_ahead
+from companion.units import SECOND_NS, Floats
 
-Floats = npt.NDArray[np.float64]
-NANO = 1_000_000_000
 STATED_SIGMA = 0.30  # [m/s]
-STEP_S = 300.0  # windows start this far apart
-SLACK_S = 5.0  # a prediction is compared only with a measurement this near
+STEP_S = 300.0  # interval between the starts of windows
+SLACK_S = 5.0  # maximum time between a prediction and the measurement it is compared with
 
 
 class Recording(NamedTuple):
@@ -44,7 +43,7 @@ class Recording(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """How one channel was predicted for one window and horizon; m/s but for n and shares."""
+    """Result for one channel, window and horizon; m/s except n and shares."""
 
     channel: str
     window_min: float
@@ -53,41 +52,41 @@ class Outcome(NamedTuple):
     sigma: float
     bound: float  # mean
     inside: float  # share of |error| <= bound
-    sigma_68: float  # the sigma that would have put 68 % inside
+    sigma_68: float  # sigma for which 68 % are inside
     minimax_rms: float
     ls_rms: float
-    ls_inside: float  # share inside the one sigma that least squares claims
+    ls_inside: float  # share within one sigma as claimed by least squares
     line_rms: float
     hold_rms: float
 
 
 def load(file: Path, every_s: float = 10.0) -> Recording:
-    """Read a recording and keep about one sample in every_s; a midnight passed in flight is unwrapped.
+    """Read a recording and keep about one sample per every_s; times are unwrapped at midnight.
 
-    ValueError, one sentence, where it is none.
+    Raises ValueError, one sentence, if the file is not a recording.
     """
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of a file without data, which is told below
+            warnings.simplefilter("ignore")  # empty files are reported below
             table = np.loadtxt(file, delimiter=",", skiprows=3, ndmin=2)
-    except (ValueError, OSError) as error:  # no number, no text, no gzip
-        raise ValueError(f"{file} is no recording of velocity errors: {error}") from None
+    except (ValueError, OSError) as error:  # not a number, not text, not gzip
+        raise ValueError(f"{file} is not a recording of velocity errors: {error}") from None
     if len(table) < 2 or table.shape[1] < 3:
         raise ValueError(
-            f"{file} is no recording of velocity errors: below three lines of heading it needs lines of"
+            f"{file} is not a recording of velocity errors: after three header lines it needs lines of"
             " seconds, east, north"
         )
     seconds = np.unwrap(table[:, 0], period=86_400.0)
     seconds -= seconds[0]
     _, first = np.unique(np.floor(seconds / every_s), return_index=True)
-    t_ns = np.round(seconds[first] * NANO).astype(np.int64)
+    t_ns = np.round(seconds[first] * SECOND_NS).astype(np.int64)
     return Recording(t_ns, {"east": table[first, 1], "north": table[first, 2]})
 
 
 def run(
     recording: Recording, channel: str, window_s: float, ahead_s: list[float], sigma: float
 ) -> list[Outcome]:
-    """Predict one channel ahead of every window of window_s [s] for each horizon in ahead_s [s]."""
+    """Predict one channel after every window of window_s [s] for each horizon in ahead_s [s]."""
     return [
         Outcome(
             channel,
@@ -112,35 +111,35 @@ def run(
 def _errors(
     recording: Recording, channel: str, window_s: float, ahead_s: list[float], sigma: float
 ) -> dict[float, list[tuple[float, ...]]]:
-    """Return by horizon: errors of minimax, least squares, line, hold; bound and claim."""
+    """Return by horizon: errors of minimax, least squares, line and hold; bound; claimed sigma."""
     errors: dict[float, list[tuple[float, ...]]] = {ahead: [] for ahead in ahead_s}
     t_ns, velocity = recording.t_ns, recording.channels[channel]
-    for learn in _windows(t_ns, window_s):
+    for span in _windows(t_ns, window_s):
         window = Window.of(
-            t_ns[learn], "velocity", velocity[learn], sigma, span=window_s + 1.0, capacity=10_000
+            t_ns[span], "velocity", velocity[span], sigma, span=window_s + 1.0, capacity=10_000
         )
         last = int(window.t_ns[-1])
-        seconds = (window.t_ns - last) / NANO
+        seconds = (window.t_ns - last) / SECOND_NS
         slope, level = np.polyfit(seconds, window.value, 1)
         reached = {}
         for ahead in ahead_s:
-            k = int(np.abs(t_ns - (last + round(ahead * NANO))).argmin())
-            if abs((t_ns[k] - last) / NANO - ahead) <= SLACK_S:
+            k = int(np.abs(t_ns - (last + round(ahead * SECOND_NS))).argmin())
+            if abs((t_ns[k] - last) / SECOND_NS - ahead) <= SLACK_S:
                 reached[ahead] = k
         predictions = predict_ahead(window, [int(t_ns[k]) for k in reached.values()], ("velocity",))
         for (ahead, k), prediction in zip(reached.items(), predictions, strict=True):
             forecast = prediction.velocity
             if forecast is None or not forecast.feasible:
                 continue
-            line = level + slope * (int(t_ns[k]) - last) / NANO
+            line = level + slope * (int(t_ns[k]) - last) / SECOND_NS
             guesses = np.array([forecast.estimate, forecast.ls_estimate, line, window.value[-1]])
             errors[ahead].append((*(guesses - velocity[k]).tolist(), forecast.bound, forecast.ls_claimed))
     return errors
 
 
 def _windows(t_ns: npt.NDArray[np.int64], window_s: float) -> Iterator[slice]:
-    for start in np.arange(0.0, t_ns[-1] / NANO - window_s, STEP_S):
-        first, end = t_ns.searchsorted(np.array([start, start + window_s]) * NANO)
+    for start in np.arange(0.0, t_ns[-1] / SECOND_NS - window_s, STEP_S):
+        first, end = t_ns.searchsorted(np.array([start, start + window_s]) * SECOND_NS)
         if end - first >= 4:
             yield slice(int(first), int(end))
 
@@ -151,12 +150,14 @@ def _rms(errors: Floats) -> float:
 
 @click.command("schuler")
 @click.argument("file", type=click.Path(exists=True, dir_okay=False, path_type=Path))
-@click.option("--window-min", default="30,60,90,120", show_default=True, help="Windows to learn on [min].")
+@click.option(
+    "--window-min", default="30,60,90,120", show_default=True, help="Windows of the estimation [min]."
+)
 @click.option("--ahead-min", default="5,10,20,40,60", show_default=True, help="Horizons [min].")
 @click.option("--sigma-mps", default=STATED_SIGMA, show_default=True, help="Stated sigma [m/s].")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 def command(file: Path, window_min: str, ahead_min: str, sigma_mps: float, as_json: bool) -> None:
-    """Predict recorded INS velocity errors and compare with their bound and with simpler ways."""
+    """Predict recorded INS velocity errors; compare them with their bound and with simpler predictions."""
     try:
         recording = load(file)
         windows = [60.0 * float(word) for word in window_min.split(",")]
@@ -173,7 +174,7 @@ def command(file: Path, window_min: str, ahead_min: str, sigma_mps: float, as_js
         click.echo(json.dumps([outcome._asdict() for outcome in outcomes]))
         return
     shown = Table(
-        title=f"{file.name}: velocity error predicted, m/s", caption="share: of |error| inside the bound"
+        title=f"{file.name}: velocity error predicted, m/s", caption="share: errors within the bound"
     )
     for head in (
         "channel",

@@ -1,4 +1,4 @@
-"""Connection strings: where a link leads, and what can be none."""
+"""Connection strings: parsing and validation."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import termios
 from typing import NamedTuple
 
 FORMS = "serial:DEVICE:BAUD, udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or tcpin:HOST:PORT"
-#: Rates that a terminal device of this system can be set to, by their number.
+#: Baud rates of this system: termios constant by number.
 BAUD_RATES = {
     int(name[1:]): value for name, value in vars(termios).items() if name[0] == "B" and name[1:].isdigit()
 }
@@ -19,7 +19,7 @@ KINDS = ("serial", "udpout", "tcp", *LISTENING)
 
 
 class Address(NamedTuple):
-    """Where a link leads: `kind` serial, udpin, udpout, tcp or tcpin; `number` a port or a baud rate."""
+    """Address of a link: `kind` serial, udpin, udpout, tcp or tcpin; `number` a port or a baud rate."""
 
     kind: str
     place: str
@@ -27,14 +27,16 @@ class Address(NamedTuple):
 
     @classmethod
     def parse(cls, text: str) -> Address:
-        """Read a connection string. A link that listens without a host does so on the loopback only."""
+        """Parse a connection string; ValueError if it is invalid. The default host of a listening link is the
+        loopback address.
+        """
         kind, _, rest = text.partition(":")
         place, colon, digits = rest.rpartition(":")
         listens = kind in LISTENING
         if not colon and listens:
             place = ""
         if kind not in KINDS or not digits.isdecimal():
-            raise ValueError(f"{text!r} is no connection string: give {FORMS}")
+            raise ValueError(f"{text!r} is not a connection string: give {FORMS}")
         number = int(digits)
         if kind == "serial":
             if number not in BAUD_RATES:
@@ -44,17 +46,19 @@ class Address(NamedTuple):
         elif not (0 if listens else 1) <= number <= 65535:
             raise ValueError(f"{text!r}: {number} is not a port: give 1 to 65535")
         if not place and not listens:
-            raise ValueError(f"{text!r} is no connection string, it names no host or device: give {FORMS}")
+            raise ValueError(
+                f"{text!r} is not a connection string, the host or device is missing: give {FORMS}"
+            )
         place = place.strip("[]") or LOOPBACK
         if kind == "serial" and not _is_device(place):
-            raise ValueError(f"{text!r}: {place!r} cannot be the name of a device")
+            raise ValueError(f"{text!r}: {place!r} is not a device name")
         if kind != "serial" and not _is_host(place):
-            raise ValueError(f"{text!r}: {place!r} can be neither an address nor the name of a host")
+            raise ValueError(f"{text!r}: {place!r} is neither an address nor a host name")
         return cls(kind, place, number)
 
     @property
     def listens(self) -> bool:
-        """Whether others come to this address."""
+        """Whether peers connect to this address."""
         return self.kind in LISTENING
 
     def __str__(self) -> str:
@@ -70,7 +74,7 @@ def _is_device(place: str) -> bool:
 
 
 def _is_host(place: str) -> bool:
-    """Whether a look-up may find it; what has only digits and dots is no name but an address."""
+    """Return whether `place` is a possible host; digits and dots alone are an address, not a name."""
     try:
         if ":" in place:
             ipaddress.IPv6Address(place)

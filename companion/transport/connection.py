@@ -1,7 +1,7 @@
-"""An open link of any kind: a file descriptor that the event loop watches, and two closures.
+"""An open connection of any kind: a file descriptor watched by the event loop, and two closures.
 
-One takes what is there, one puts what fits. (Draining a socket by `add_reader` costs a tenth of asyncio's
-datagram transport.)
+`receive` reads what is available, `send` writes what fits. (Reading a socket by `add_reader` costs a tenth of
+asyncio's datagram transport.)
 """
 
 from __future__ import annotations
@@ -12,48 +12,59 @@ import socket
 from collections.abc import Callable
 from functools import partial
 
-from companion.transport.send_queue import Outbox
+from companion.transport.send_queue import SendQueue
 
-#: A link is drained by so many bytes, and so many datagrams, before others get their turn: noise made to be
-#: slow to read (0.3 MB/s) then holds nobody up for more than 0.05 s.
-AT_ONCE = 1 << 14
+#: A connection is read up to this number of bytes and of datagrams before others have their turn: input made
+#: to be slow to parse (0.3 MB/s) then delays the others by 0.05 s at most.
+READ_SIZE = 1 << 14
 BURST = 64
 INBOX_LIMIT = 1 << 20
 
 
-class Stream:
-    """An open link. Not for threads; belongs to the running loop."""
+class Connection:
+    """An open connection. Not thread-safe; belongs to the running loop."""
 
     def __init__(
         self,
         name: str,
         device: int | socket.socket,
-        take: Callable[[], bytes | None],
-        put: Callable[[bytes], int],
+        receive: Callable[[], bytes | None],
+        send: Callable[[bytes], int],
         release: Callable[[], None] | None = None,
     ) -> None:
-        """`take` returns bytes, None for an empty datagram, b"" at the end; `put` how much it took.
+        """Watch an open device.
 
-        Both may raise OSError; BlockingIOError means that the line is empty or full. `release` closes the
-        device, where more than that is to be done.
+        Parameters
+        ----------
+        name
+            Name of the connection in error messages.
+        device
+            File descriptor or socket, in non-blocking mode.
+        receive
+            Returns the available bytes, None for an empty datagram, b"" at the end. May raise OSError;
+            BlockingIOError means that nothing is available.
+        send
+            Returns how many bytes were accepted. May raise OSError; BlockingIOError: the line is full.
+        release
+            Closes the device; by default, it is only closed.
         """
         self.name = name
         self._device = device
         self._fd = device if isinstance(device, int) else device.fileno()
-        self._take = take
+        self._receive = receive
         self._release = release or (partial(os.close, device) if isinstance(device, int) else device.close)
         self._loop = asyncio.get_running_loop()
         self._inbox: list[bytes] = []
-        self._held = 0
-        self._outbox = Outbox(put, self._loop.time)
+        self._inbox_size = 0
+        self._send_queue = SendQueue(send, self._loop.time)
         self._waiter: asyncio.Future[None] | None = None
         self._end: ConnectionError | None = None
-        self._hand: Callable[[bytes], None] | None = None
+        self._handler: Callable[[bytes], None] | None = None
         self._loop.add_reader(self._fd, self._on_readable)
 
     @property
     def port(self) -> int:
-        """The local port, 0 where the link has none."""
+        """The local port, 0 if the connection has none."""
         if isinstance(self._device, socket.socket) and self._device.family in (
             socket.AF_INET,
             socket.AF_INET6,
@@ -62,7 +73,7 @@ class Stream:
         return 0
 
     async def read(self) -> bytes:
-        """Wait for bytes and return all that came. ConnectionError when the link has ended."""
+        """Wait for bytes and return all that arrived. ConnectionError when the connection has ended."""
         while not self._inbox:
             if self._end is not None:
                 raise self._end
@@ -71,70 +82,71 @@ class Stream:
                 await self._waiter
             finally:
                 self._waiter = None
-        return self._all()
+        return self._take_inbox()
 
-    async def hand_to(self, receive: Callable[[bytes], None]) -> None:
-        """Call `receive` with each piece as soon as it is here, until the link ends: ConnectionError, or what
-        `receive` raised.
+    async def deliver_to(self, handler: Callable[[bytes], None]) -> None:
+        """Call `handler` with each piece as soon as it arrives, until the connection ends.
+
+        Raises ConnectionError at the end, or what `handler` raised.
         """
-        self._waiter, self._hand = self._loop.create_future(), receive
+        self._waiter, self._handler = self._loop.create_future(), handler
         try:
             if self._inbox:
-                receive(self._all())
+                handler(self._take_inbox())
             if self._end is None:
                 await self._waiter
         finally:
-            self._waiter = self._hand = None
+            self._waiter = self._handler = None
         assert self._end is not None
         raise self._end
 
     @property
     def dropped(self) -> int:
-        """Frames that waited for the line too long."""
-        return self._outbox.dropped
+        """Number of frames dropped because the line was too slow."""
+        return self._send_queue.dropped
 
     def write(self, frame: bytes) -> None:
-        """Send a frame now or as soon as the line takes it. Without effect on a link that has ended."""
+        """Send a frame now or as soon as the line accepts it. No effect after the end."""
         if self._end is not None or not frame:
             return
-        waited = bool(self._outbox)
+        was_waiting = bool(self._send_queue)
         try:
-            self._outbox.write(frame)
+            self._send_queue.write(frame)
         except OSError as error:
             self.end(f"failed: {reason(error)}")
-        if self._outbox and not waited:
+        if self._send_queue and not was_waiting:
             self._loop.add_writer(self._fd, self._on_writable)
 
     def close(self) -> None:
-        """End the link; a waiting `read` raises ConnectionError."""
+        """End the connection; a waiting `read` raises ConnectionError."""
         self.end("was closed")
 
     def end(self, why: str) -> None:
-        """End the link; ConnectionError then says `why`. Without effect on one that has ended."""
+        """End the connection with `why` as the text of its ConnectionError. No effect after the end."""
         if self._end is not None:
             return
         self._end = ConnectionError(f"{self.name} {why}")
         self._loop.remove_reader(self._fd)
         self._loop.remove_writer(self._fd)
-        self._outbox.clear()
+        self._send_queue.clear()
         self._release()
         self._wake()
 
-    def _all(self) -> bytes:
+    def _take_inbox(self) -> bytes:
         data = b"".join(self._inbox)
         self._inbox.clear()
-        if self._held >= INBOX_LIMIT and self._end is None:
+        if self._inbox_size >= INBOX_LIMIT and self._end is None:
             self._loop.add_reader(self._fd, self._on_readable)
-        self._held = 0
+        self._inbox_size = 0
         return data
 
     def _on_readable(self) -> None:
-        taken = 0
+        size = 0
         for _ in range(BURST):
-            if taken >= AT_ONCE:
+            if size >= READ_SIZE:
                 break
             try:
-                data = self._take()
+                data = self._receive()
             except BlockingIOError:
                 break
             except OSError as error:
@@ -143,33 +155,33 @@ class Stream:
                 continue
             if not data:
                 return self.end("was closed by the other side")
-            taken += len(data)
+            size += len(data)
             if not self._deliver(data):
                 break
         return self._wake() if self._inbox else None
 
     def _deliver(self, data: bytes) -> bool:
-        """Whether there may be more."""
-        if self._hand is not None and self._waiter is not None:
+        """Pass `data` on; return whether reading may continue."""
+        if self._handler is not None and self._waiter is not None:
             try:
-                self._hand(data)
+                self._handler(data)
             except Exception as error:
                 if not self._waiter.done():
                     self._waiter.set_exception(error)
                 return False
             return self._end is None
         self._inbox.append(data)
-        self._held += len(data)
-        if self._held >= INBOX_LIMIT:
+        self._inbox_size += len(data)
+        if self._inbox_size >= INBOX_LIMIT:
             self._loop.remove_reader(self._fd)
-        return self._held < INBOX_LIMIT
+        return self._inbox_size < INBOX_LIMIT
 
     def _on_writable(self) -> None:
         try:
-            self._outbox.flush()
+            self._send_queue.flush()
         except OSError as error:
             self.end(f"failed: {reason(error)}")
-        if not self._outbox:
+        if not self._send_queue:
             self._loop.remove_writer(self._fd)
 
     def _wake(self) -> None:
@@ -177,21 +189,21 @@ class Stream:
             self._waiter.set_result(None)
 
 
-def over_socket(name: str, sock: socket.socket) -> Stream:
-    """Stream over a connected socket of bytes."""
-    return Stream(name, sock, lambda: sock.recv(AT_ONCE), sock.send)
+def socket_connection(name: str, sock: socket.socket) -> Connection:
+    """Return a connection over a connected stream socket."""
+    return Connection(name, sock, lambda: sock.recv(READ_SIZE), sock.send)
 
 
-def pair() -> tuple[Stream, Stream]:
-    """Return the two ends of a link in memory."""
+def pair() -> tuple[Connection, Connection]:
+    """Return the two ends of a connection in memory."""
     one, other = socket.socketpair()
     one.setblocking(False)
     other.setblocking(False)
-    return over_socket("memory", one), over_socket("memory", other)
+    return socket_connection("memory", one), socket_connection("memory", other)
 
 
 def reason(error: OSError) -> str:
-    """What failed, in the system's words; one without a number is a sentence of ours."""
+    """Return the system's text of an error; an error without a number already has a text of ours."""
     if isinstance(error, TimeoutError) and not error.errno:
         return "no answer"
     return os.strerror(error.errno) if error.errno and error.errno > 0 else error.strerror or str(error)

@@ -1,4 +1,4 @@
-"""A serial line: opened raw, and for nobody else."""
+"""Serial lines, opened in raw mode for exclusive use."""
 
 from __future__ import annotations
 
@@ -10,25 +10,26 @@ import termios
 import tty
 
 from companion.transport.address import BAUD_RATES, Address
-from companion.transport.connection import AT_ONCE, Stream
+from companion.transport.connection import READ_SIZE, Connection
 
-TAKEN = "another program has this line open: end it"
+IN_USE = "another program has this line open: end it"
 
 
-def open_serial(address: Address) -> Stream:
-    """Open the device raw, without flow control, at its rate. OSError, in words where it is somebody else's.
+def open_serial(address: Address) -> Connection:
+    """Open the device in raw mode, without flow control, at its baud rate. OSError if it fails or is in use.
 
-    Two readers would share its bytes out among them. TIOCEXCL keeps all but root from opening it while we
-    have it; the lock keeps out who asks for it, root too: a companion, and what is made with pySerial.
+    Two readers would each get a part of the bytes. TIOCEXCL keeps all users but root from opening the device
+    while it is open here; the lock keeps out every program that requests it, run by root too: another
+    companion, and programs that use pySerial.
     """
     try:
         fd = os.open(address.place, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
     except OSError as error:
         if error.errno == errno.EBUSY:
-            raise OSError(TAKEN) from None
+            raise OSError(IN_USE) from None
         raise
     try:
-        _claim(fd)
+        _lock(fd)
         tty.setraw(fd)
         mode = termios.tcgetattr(fd)
         mode[2] = mode[2] & ~(termios.CRTSCTS | termios.CSTOPB) | termios.CLOCAL | termios.CREAD
@@ -38,21 +39,23 @@ def open_serial(address: Address) -> Stream:
     except BaseException as error:
         os.close(fd)
         if isinstance(error, BlockingIOError):
-            raise OSError(TAKEN) from None
+            raise OSError(IN_USE) from None
         if isinstance(error, termios.error):
             raise OSError(f"not a serial line: {error.args[1]}") from None
         raise
 
     def release() -> None:
-        with contextlib.suppress(OSError):  # a device that was pulled out
-            fcntl.ioctl(fd, termios.TIOCNXCL)  # would outlive us where somebody had it open before
+        with contextlib.suppress(OSError):  # a device that was unplugged
+            fcntl.ioctl(fd, termios.TIOCNXCL)  # it would persist if another process keeps the device open
         os.close(fd)
 
-    return Stream(str(address), fd, lambda: os.read(fd, AT_ONCE), lambda frame: os.write(fd, frame), release)
+    return Connection(
+        str(address), fd, lambda: os.read(fd, READ_SIZE), lambda frame: os.write(fd, frame), release
+    )
 
 
-def _claim(fd: int) -> None:
-    """Raises BlockingIOError where somebody holds the lock; a driver that knows neither way is used as is."""
+def _lock(fd: int) -> None:
+    """Lock the device, if its driver supports locks; BlockingIOError if another process holds the lock."""
     try:
         fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:

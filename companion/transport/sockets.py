@@ -1,4 +1,4 @@
-"""Sockets bound where an address listens, connected where it does not; every answer to a name is tried."""
+"""Opening of sockets: bound for listening addresses, connected for others; tries every resolved address."""
 
 from __future__ import annotations
 
@@ -11,26 +11,27 @@ from companion.transport.address import Address
 from companion.transport.connection import reason
 
 CONNECT_TIMEOUT = 10.0
-#: Clients of a listening TCP link that may wait while another is served.
+#: Clients of a listening TCP link that may wait while another is connected.
 BACKLOG = 4
-#: What no waiting mends: taken by somebody, forbidden, no address at all.
-REFUSALS = (errno.EADDRINUSE, errno.EACCES, errno.EINVAL)
+#: Errors of `bind` that do not go away: address in use, forbidden, invalid.
+PERMANENT_ERRORS = (errno.EADDRINUSE, errno.EACCES, errno.EINVAL)
 
 
 class CannotListen(OSError):
-    """Somebody has the address to listen on, or it is forbidden: for the operator to settle."""
+    """The address to listen on is in use or forbidden; the operator must correct it."""
 
 
 async def open_socket(address: Address) -> socket.socket:
-    """Bind where the address listens, else connect, within CONNECT_TIMEOUT s for each answer to its name.
+    """Open a non-blocking socket: bound if the address listens, else connected.
 
-    The socket does not block. CannotListen where its own address is not to be had, any other OSError where
-    trying again may help: a computer at its start, or in the air, has not all of its addresses.
+    Each resolved address has CONNECT_TIMEOUT s to connect. Raises CannotListen if our own address cannot be
+    used, another OSError if a later attempt may succeed: a computer that starts, or is in flight, may lack
+    some of its addresses.
     """
     kind = socket.SOCK_DGRAM if address.kind.startswith("udp") else socket.SOCK_STREAM
     found = await asyncio.get_running_loop().getaddrinfo(address.place, address.number, type=kind)
     failed: list[OSError] = []
-    # What speaks MAVLink does so over IPv4: of `localhost`, 127.0.0.1 before ::1.
+    # MAVLink programs use IPv4: of `localhost`, try 127.0.0.1 before ::1
     for family, _, _, _, where in sorted(found, key=lambda answer: answer[0] != socket.AF_INET):
         try:
             return await _open(address, family, kind, where)
@@ -66,7 +67,7 @@ def _bind(address: Address, sock: socket.socket, where: Any) -> None:
     except OSError as error:
         if error.errno == errno.EADDRNOTAVAIL:
             raise OSError(f"this computer has no address {address.place} at present") from None
-        if error.errno not in REFUSALS:
+        if error.errno not in PERMANENT_ERRORS:
             raise
         in_use = error.errno == errno.EADDRINUSE
         advice = "end the other program or choose another port" if in_use else "choose another host or port"

@@ -1,8 +1,8 @@
-"""TCP connections that end soon after their peer is gone, and a listener whose newest client is the link.
+"""TCP connections with fast detection of lost peers, and a listener that serves the newest client.
 
-A peer that vanished without a word (a roaming ground station, a hotspot gone) is noticed after GONE_AFTER_S:
-silence is probed, and data that nobody confirms, or a peer that reads nothing, ends the connection. A client
-that comes back sooner, from a new address, is let in at once in place of what it was.
+A peer that disappeared without closing (a roaming ground station, a lost hotspot) is detected after
+PEER_TIMEOUT_S: an idle connection is probed, and unacknowledged data, or a peer that does not read, ends the
+connection. A client that reconnects sooner, from a new address, replaces its old connection at once.
 """
 
 from __future__ import annotations
@@ -12,29 +12,29 @@ import contextlib
 import socket
 
 from companion.transport.address import Address
-from companion.transport.connection import Stream, over_socket
+from companion.transport.connection import Connection, socket_connection
 from companion.transport.sockets import open_socket
 
-#: A peer that answers nothing for so long (s) is gone.
-GONE_AFTER_S = 10
-#: Bytes that the system may hold unsent: they cannot be called back, and grow old there.
-UNSENT = 2048
-#: By system; where one is not known, the others do what they can.
+#: A peer that does not answer for this time (s) is lost.
+PEER_TIMEOUT_S = 10
+#: Unsent bytes that the system may buffer: they cannot be recalled when they are too old.
+MAX_UNSENT = 2048
+#: Socket options; those unknown to the system are left out.
 OPTIONS = {
     "TCP_NODELAY": 1,
-    "TCP_USER_TIMEOUT": 1000 * GONE_AFTER_S,
-    "TCP_KEEPIDLE": GONE_AFTER_S // 2,
-    "TCP_KEEPALIVE": GONE_AFTER_S // 2,  # as macOS calls the line before
+    "TCP_USER_TIMEOUT": 1000 * PEER_TIMEOUT_S,
+    "TCP_KEEPIDLE": PEER_TIMEOUT_S // 2,
+    "TCP_KEEPALIVE": PEER_TIMEOUT_S // 2,  # the name of TCP_KEEPIDLE on macOS
     "TCP_KEEPINTVL": 2,
     "TCP_KEEPCNT": 3,
-    "TCP_NOTSENT_LOWAT": UNSENT,
+    "TCP_NOTSENT_LOWAT": MAX_UNSENT,
 }
 #: Bytes sent and not yet acknowledged, about: more than 50 kB/s at a round trip of 0.2 s.
 SEND_BUFFER = 1 << 14
 
 
-def over_tcp(name: str, sock: socket.socket) -> Stream:
-    """Stream over a connected socket."""
+def tcp_connection(name: str, sock: socket.socket) -> Connection:
+    """Connection over a connected socket."""
     settings = [
         (socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1),
         (socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER),
@@ -45,13 +45,13 @@ def over_tcp(name: str, sock: socket.socket) -> Stream:
         if hasattr(socket, option)
     ]
     for level, option, value in settings:
-        with contextlib.suppress(OSError):  # known to Python, not to this kernel; or the peer has left
+        with contextlib.suppress(OSError):  # unknown to this kernel, or the peer has left
             sock.setsockopt(level, option, value)
-    return over_socket(name, sock)
+    return socket_connection(name, sock)
 
 
 class Listener:
-    """A TCP address that is listened on for as long as this is open, with a client or without."""
+    """Listening TCP socket, open with or without a client."""
 
     def __init__(self, address: Address, sock: socket.socket) -> None:
         self._name = str(address)
@@ -59,29 +59,29 @@ class Listener:
         self._loop = asyncio.get_running_loop()
 
     @classmethod
-    async def on(cls, address: Address) -> Listener:
-        """Listen. OSError, CannotListen as `open_socket`."""
+    async def open(cls, address: Address) -> Listener:
+        """Start to listen. Raises as `open_socket`."""
         return cls(address, await open_socket(address))
 
-    async def accept(self) -> Stream:
-        """Wait for a client, of several take the newest; its link ends when a newer one comes. OSError."""
+    async def accept(self) -> Connection:
+        """Wait for a client; accept the newest of several. Its connection ends when a newer one arrives."""
         self._loop.remove_reader(self._sock)
         client, _ = await self._loop.sock_accept(self._sock)
-        with contextlib.suppress(OSError):  # BlockingIOError: there are no more
+        with contextlib.suppress(OSError):  # BlockingIOError: no further client
             while True:
                 newer, _ = self._sock.accept()
                 client.close()
                 client = newer
         client.setblocking(False)
-        stream = over_tcp(self._name, client)
-        self._loop.add_reader(self._sock, self._give_way, stream)
-        return stream
+        connection = tcp_connection(self._name, client)
+        self._loop.add_reader(self._sock, self._end_for_newer, connection)
+        return connection
 
-    def _give_way(self, stream: Stream) -> None:
+    def _end_for_newer(self, connection: Connection) -> None:
         self._loop.remove_reader(self._sock)
-        stream.end("gives way to a newer client")
+        connection.end("was replaced by a newer client")
 
     def close(self) -> None:
-        """Listen no more. A client that was accepted stays."""
+        """Stop listening. An accepted client stays connected."""
         self._loop.remove_reader(self._sock)
         self._sock.close()

@@ -1,4 +1,4 @@
-"""Datagrams: to one place, or to all who were heard lately."""
+"""UDP connections: to one peer, or to the peers received most recently."""
 
 from __future__ import annotations
 
@@ -6,47 +6,47 @@ import contextlib
 import socket
 from typing import Any
 
-from companion.transport.connection import Stream
+from companion.transport.connection import Connection
 
-LONGEST_DATAGRAM = 65536
-#: Peers that a listening link answers to: the last ones heard.
-PEERS = 8
+MAX_DATAGRAM = 65536
+#: Number of most recent peers that a listening link sends to.
+MAX_PEERS = 8
 
 
-def to_one(name: str, sock: socket.socket) -> Stream:
-    """Stream over a connected socket; a datagram that nobody took is no end."""
+def connected_udp(name: str, sock: socket.socket) -> Connection:
+    """Return a connection over a connected socket; a refused datagram does not end it."""
 
-    def take() -> bytes | None:
+    def receive() -> bytes | None:
         try:
-            return sock.recv(LONGEST_DATAGRAM) or None
+            return sock.recv(MAX_DATAGRAM) or None
         except ConnectionRefusedError:
             return None
 
-    def put(frame: bytes) -> int:
+    def send(frame: bytes) -> int:
         try:
             return sock.send(frame)
         except ConnectionRefusedError:
             return len(frame)
 
-    return Stream(name, sock, take, put)
+    return Connection(name, sock, receive, send)
 
 
-def to_all(name: str, sock: socket.socket) -> Stream:
-    """Stream over a bound socket, to the last PEERS who spoke."""
-    peers: dict[Any, None] = {}  # in the order of their last word
+def listening_udp(name: str, sock: socket.socket) -> Connection:
+    """Return a connection over a bound socket that sends to the last MAX_PEERS peers."""
+    peers: dict[Any, None] = {}  # in order of their last datagram
 
-    def take() -> bytes | None:
-        data, peer = sock.recvfrom(LONGEST_DATAGRAM)
+    def receive() -> bytes | None:
+        data, peer = sock.recvfrom(MAX_DATAGRAM)
         peers.pop(peer, None)
         peers[peer] = None
-        if len(peers) > PEERS:
+        if len(peers) > MAX_PEERS:
             del peers[next(iter(peers))]
         return data or None
 
-    def put(frame: bytes) -> int:
+    def send(frame: bytes) -> int:
         for peer in peers:
-            with contextlib.suppress(OSError):  # a peer that is gone, or a full line: one datagram lost
+            with contextlib.suppress(OSError):  # the peer has left, or the line is full: one datagram lost
                 sock.sendto(frame, peer)
         return len(frame)
 
-    return Stream(name, sock, take, put)
+    return Connection(name, sock, receive, send)

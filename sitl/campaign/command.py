@@ -1,14 +1,14 @@
-"""`companion campaign`: scenarios x faults x seeds, flown by many workers, in one table with pass or fail.
+"""`companion campaign`: scenarios x faults x seeds, flown in parallel, in one table with pass or fail.
 
     companion campaign --seeds 10                                  # a Dask cluster of this machine's cores
-    companion campaign --scheduler tcp://...:8786 --seeds 1000     # one that is there already
+    companion campaign --scheduler tcp://...:8786 --seeds 1000     # an existing cluster
     companion campaign --workers 0 --fault gnss-spoof-2            # in this process, without Dask
     companion campaign --seeds 40 --report tests/reports/campaign.md
 
-Each flight is one line of `flights.jsonl` in the results folder, written by this process as it comes in. What
-is there is not flown again, so that a campaign cut short goes on where it was; a flight whose worker died is
-flown by another one, and where one after the other died under it, by the next campaign. It knows nothing of
-what a flight is: `sitl.campaign.flight` does.
+This process appends one line per finished flight to `flights.jsonl` in the results folder. Stored flights are
+not repeated, so an interrupted campaign continues. A flight whose worker died is retried by another worker,
+and after `RETRIES` failures by the next campaign. The flights themselves are defined in
+`sitl.campaign.flight`.
 """
 
 from __future__ import annotations
@@ -26,11 +26,19 @@ from rich.console import Console
 from rich.progress import MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from companion.optional_dependencies import lacking
-from sitl.campaign.flight import KINDS, SCENARIOS, Order, Result, attempt, by_records, matters
+from companion.optional_dependencies import missing_package
+from sitl.campaign.flight import (
+    FAULT_CASES,
+    SCENARIOS,
+    FlightOrder,
+    FlightResult,
+    fly_order,
+    is_applicable,
+    is_sensor_fault,
+)
 
-RETRIES = 3  # workers that may die under one flight before it counts as failed
-LOST = "worker lost"
+RETRIES = 3  # worker losses per flight before it counts as failed
+WORKER_LOST = "worker lost"
 EX_FAILED = 1
 HEADS = (
     *("fault", "flights", "detected", "median", "slowest", "excluded", "largest before", "largest"),
@@ -38,16 +46,16 @@ HEADS = (
 )
 
 
-class Limits(NamedTuple):
-    """What a campaign must keep to pass."""
+class CampaignLimits(NamedTuple):
+    """Limits that a fault has to meet to pass."""
 
-    harmless_m: float = 300.0  # a fault not detected may do no more than this
+    harmless_m: float = 300.0  # largest error under an undetected fault
     misleading: float = 1e-5  # share of flights with an error beyond the protection level, unflagged
     alarms_per_hour: float = 0.1
 
 
-class Line(NamedTuple):
-    """All flights of one kind of fault. Times s, errors m; None where nothing was detected or predicted."""
+class FaultSummary(NamedTuple):
+    """Summary of all flights with one fault. Times s, errors m; None: nothing detected or predicted."""
 
     fault: str
     flights: int
@@ -67,24 +75,24 @@ class Line(NamedTuple):
     passed: bool
 
 
-def orders(scenarios: Iterable[str], faults: Iterable[str], seeds: int) -> list[Order]:
-    """Every flight, the seeds outermost: a campaign cut short has seen a little of everything.
+def list_orders(scenarios: Iterable[str], faults: Iterable[str], seeds: int) -> list[FlightOrder]:
+    """List the flights, seeds outermost: an interrupted campaign has covered all cases.
 
-    A fault of the link or of the autopilot, and lateness, care for no grade and no beacon: they are flown in
-    the first scenario only; and none is flown where there is nothing that it concerns.
+    Faults of the link and of the autopilot and delays do not depend on grade and beacons: they are flown in
+    the first scenario only. A fault is not flown in a scenario without the sensor that it concerns.
     """
     names, kinds = list(scenarios), list(faults)
     every = itertools.product(range(1, seeds + 1), names, kinds)
-    once = {f for f in kinds if not by_records(f) or f.endswith("-late")}
+    once = {f for f in kinds if not is_sensor_fault(f) or f.endswith("-late")}
     return [
-        Order(s, f, seed)
+        FlightOrder(s, f, seed)
         for seed, s, f in every
-        if (s == names[0] or f not in once) and (matters(s, f) or len(names) == 1)
+        if (s == names[0] or f not in once) and (is_applicable(s, f) or len(names) == 1)
     ]
 
 
-def stored(path: Path) -> list[Result]:
-    """The results in a file; a last line that was torn off is cut away, so that what follows is whole."""
+def read_results(path: Path) -> list[FlightResult]:
+    """Read the results of a file; an incomplete last line is removed, so that lines can be appended."""
     if not path.exists():
         return []
     data = path.read_bytes()
@@ -92,46 +100,55 @@ def stored(path: Path) -> list[Result]:
     if len(whole) < len(data):
         os.truncate(path, len(whole))
     try:
-        return [Result(**json.loads(line)) for line in whole.splitlines()]
+        return [FlightResult(**json.loads(line)) for line in whole.splitlines()]
     except (ValueError, TypeError) as error:
-        raise ValueError(f"{path}: a line is no result of a flight ({error}); name another folder") from None
+        raise ValueError(
+            f"{path}: invalid flight result ({error}); choose another folder with --results"
+        ) from None
 
 
-def run(todo: Sequence[Order], scheduler: str | None, workers: int) -> Iterator[Result]:
-    """Every flight's result as it comes: in this process if `workers` is 0 and there is no scheduler."""
+def fly_orders(todo: Sequence[FlightOrder], scheduler: str | None, workers: int) -> Iterator[FlightResult]:
+    """Fly and yield each result when it is finished; in this process with 0 workers and no scheduler."""
     if scheduler is None and workers == 0:
-        yield from map(attempt, todo)
+        yield from map(fly_order, todo)
         return
     try:
         from dask.distributed import Client, LocalCluster, as_completed
     except ImportError:
         without = "or fly with --workers 0"
-        raise ValueError(f"{lacking('a campaign by many workers', 'Dask', 'campaign')}, {without}") from None
+        raise ValueError(
+            f"{missing_package('a campaign by many workers', 'Dask', 'campaign')}, {without}"
+        ) from None
     cluster = None
     if scheduler is None:
         cluster = LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address="127.0.0.1:0")
     with Client(scheduler or cluster) as client:
         flown = {
-            client.submit(attempt, order, key=order.key, retries=RETRIES, pure=False): order for order in todo
+            client.submit(fly_order, order, key=order.key, retries=RETRIES, pure=False): order
+            for order in todo
         }
         for future in as_completed(flown):
             if future.status == "finished":
                 yield future.result()
             else:
-                raised = f"{LOST}: {future.exception()}"
-                yield Result(flown[future].key, *flown[future], 0.0, 0.0, raised=raised)
+                raised = f"{WORKER_LOST}: {future.exception()}"
+                yield FlightResult(flown[future].key, *flown[future], 0.0, 0.0, raised=raised)
             future.release()
     if cluster is not None:
         cluster.close()
 
 
-def campaign(
-    wanted: Sequence[Order], folder: Path, scheduler: str | None = None, workers: int = 0, quiet: bool = False
-) -> list[Result]:
-    """Fly what `folder` does not have yet, and return the results of all wanted flights."""
+def run_campaign(
+    wanted: Sequence[FlightOrder],
+    folder: Path,
+    scheduler: str | None = None,
+    workers: int = 0,
+    quiet: bool = False,
+) -> list[FlightResult]:
+    """Fly the flights without a result in `folder`; return the results of all wanted flights."""
     folder.mkdir(parents=True, exist_ok=True)
     path, keys = folder / "flights.jsonl", {order.key for order in wanted}
-    known = {result.key: result for result in stored(path) if result.key in keys}
+    known = {result.key: result for result in read_results(path) if result.key in keys}
     todo = [order for order in wanted if order.key not in known]
     columns = TextColumn("{task.description}"), MofNCompleteColumn(), TimeRemainingColumn()
     with (
@@ -139,8 +156,8 @@ def campaign(
         Progress(*columns, console=Console(stderr=True), transient=True, disable=quiet) as progress,
     ):
         task = progress.add_task("flights", total=len(wanted), completed=len(known))
-        for result in run(todo, scheduler, workers):
-            if not (result.raised or "").startswith(LOST):
+        for result in fly_orders(todo, scheduler, workers):
+            if not (result.raised or "").startswith(WORKER_LOST):
                 file.write(json.dumps(result._asdict()).encode() + b"\n")
                 file.flush()
                 os.fsync(file.fileno())
@@ -149,13 +166,13 @@ def campaign(
     return [known[order.key] for order in wanted]
 
 
-def table(results: Sequence[Result], limits: Limits) -> list[Line]:
-    """One line a fault, in the order in which they first come."""
+def summarise(results: Sequence[FlightResult], limits: CampaignLimits) -> list[FaultSummary]:
+    """Summarise the results by fault, in order of first appearance."""
     faults = dict.fromkeys(result.fault for result in results)
-    return [_line(fault, [r for r in results if r.fault == fault], limits) for fault in faults]
+    return [_summarise_fault(fault, [r for r in results if r.fault == fault], limits) for fault in faults]
 
 
-def _line(fault: str, flights: list[Result], limits: Limits) -> Line:
+def _summarise_fault(fault: str, flights: list[FlightResult], limits: CampaignLimits) -> FaultSummary:
     times = [r.detected_s for r in flights if r.detected_s is not None]
     misleading = sum(r.misleading_s >= 1.0 for r in flights)
     raised = sum(r.raised is not None for r in flights)
@@ -173,7 +190,7 @@ def _line(fault: str, flights: list[Result], limits: Limits) -> Line:
         and misleading <= limits.misleading * len(flights)
         and alarms <= limits.alarms_per_hour
     )
-    return Line(
+    return FaultSummary(
         fault,
         len(flights),
         len(times),
@@ -193,7 +210,7 @@ def _line(fault: str, flights: list[Result], limits: Limits) -> Line:
     )
 
 
-def show(lines: Sequence[Line], limits: Limits, console: Console) -> None:
+def print_table(lines: Sequence[FaultSummary], limits: CampaignLimits, console: Console) -> None:
     """Print the table."""
     flights, failed = sum(line.flights for line in lines), sum(not line.passed for line in lines)
     grid = Table(title=f"{flights} flights; horizontal errors in m, times to detect in s")
@@ -202,26 +219,26 @@ def show(lines: Sequence[Line], limits: Limits, console: Console) -> None:
     for line in lines:
         grid.add_row(*(_cell(value) for value in line))
     console.print(grid)
-    console.print(f"{_meaning(limits)} {len(lines) - failed} of {len(lines)} did.", soft_wrap=True)
+    console.print(f"{_explain_limits(limits)} {len(lines) - failed} of {len(lines)} passed.", soft_wrap=True)
 
 
-def report(results: Sequence[Result], limits: Limits, made_by: str) -> str:
-    """The tables of all scenarios as Markdown; `made_by` is the command that makes them again."""
+def markdown_report(results: Sequence[FlightResult], limits: CampaignLimits, made_by: str) -> str:
+    """Return the tables of all scenarios as Markdown; `made_by` is the command that reproduces them."""
     scenarios = dict.fromkeys(result.scenario for result in results)
     quiet = sum(r.quiet_s for r in results) / 3600.0
     text = [
         "# Campaign",
         "",
-        f"{len(results)} flights of {min(r.flown_s for r in results) / 60.0:.0f} minutes or longer, by",
+        f"{len(results)} flights of at least {min(r.flown_s for r in results) / 60.0:.0f} minutes, by",
         "",
         f"    {made_by}",
         "",
-        "Horizontal errors in m, times to detect in s. " + _meaning(limits),
+        "Horizontal errors in m, times to detect in s. " + _explain_limits(limits),
         f"{sum(r.alarms for r in results)} false alarms in {quiet:.1f} h of flight before the faults;"
-        f" {sum(r.misleading_s >= 1.0 for r in results)} flights misled.",
+        f" {sum(r.misleading_s >= 1.0 for r in results)} flights with misleading information.",
     ]
     for scenario in scenarios:
-        lines = table([r for r in results if r.scenario == scenario], limits)
+        lines = summarise([r for r in results if r.scenario == scenario], limits)
         rows = [
             HEADS,
             ("-" * 3,) + ("--:",) * (len(HEADS) - 1),
@@ -231,12 +248,13 @@ def report(results: Sequence[Result], limits: Limits, made_by: str) -> str:
     return "\n".join(text) + "\n"
 
 
-def _meaning(limits: Limits) -> str:
+def _explain_limits(limits: CampaignLimits) -> str:
     return (
-        f"passed: no exception; an undetected fault never more than {limits.harmless_m:g} m off, nor a"
-        " detected one while trust is normal; misleading (beyond the protection level, unflagged) in at most"
-        f" {limits.misleading:g} of the flights; at most {limits.alarms_per_hour:g} false alarms an hour."
-        " beyond: flights beyond the protection level though flagged; wrong: another source was excluded too."
+        f"passed: no exception; error at most {limits.harmless_m:g} m while the fault is undetected or trust"
+        " is normal; misleading (error above the protection level, not flagged) in at most"
+        f" {limits.misleading:g} of the flights; at most {limits.alarms_per_hour:g} false alarms per hour."
+        " beyond: flights with an error above the protection level, flagged; wrong: flights in which another"
+        " source was excluded."
     )
 
 
@@ -250,16 +268,23 @@ def _cell(value: Any) -> str:
 
 @click.command("campaign")
 @click.option(
-    "--scenario", "scenarios", multiple=True, type=click.Choice(list(SCENARIOS)), help="All without it."
+    "--scenario", "scenarios", multiple=True, type=click.Choice(list(SCENARIOS)), help="Default: all."
 )
-@click.option("--fault", "faults", multiple=True, type=click.Choice(list(KINDS)), help="All without it.")
-@click.option("--seeds", type=click.IntRange(1), default=1, show_default=True, help="Noises for each.")
+@click.option("--fault", "faults", multiple=True, type=click.Choice(list(FAULT_CASES)), help="Default: all.")
+@click.option(
+    "--seeds", type=click.IntRange(1), default=1, show_default=True, help="Seeds per scenario and fault."
+)
 @click.option("--results", type=click.Path(path_type=Path, file_okay=False), default=Path("logs/campaign"))
-@click.option("--scheduler", help="Address of a Dask scheduler; a cluster of this machine without it.")
-@click.option("--workers", type=click.IntRange(0), default=os.cpu_count() or 1, help="0: in this process.")
-@click.option("--harmless-m", type=float, default=Limits().harmless_m, show_default=True)
-@click.option("--misleading", type=float, default=Limits().misleading, show_default=True)
-@click.option("--alarms-per-hour", type=float, default=Limits().alarms_per_hour, show_default=True)
+@click.option("--scheduler", help="Address of a Dask scheduler; default: a local cluster.")
+@click.option(
+    "--workers",
+    type=click.IntRange(0),
+    default=os.cpu_count() or 1,
+    help="Worker processes; 0: fly in this process.",
+)
+@click.option("--harmless-m", type=float, default=CampaignLimits().harmless_m, show_default=True)
+@click.option("--misleading", type=float, default=CampaignLimits().misleading, show_default=True)
+@click.option("--alarms-per-hour", type=float, default=CampaignLimits().alarms_per_hour, show_default=True)
 @click.option("--report", "page", type=click.Path(path_type=Path), help="Write the tables to this .md file.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 def command(
@@ -275,29 +300,29 @@ def command(
     page: Path | None,
     as_json: bool,
 ) -> None:
-    """Fly every scenario with every fault and many seeds, and say what was detected, and how far off it led.
+    """Fly every scenario with every fault and many seeds; tabulate detection times and position errors.
 
-    Ends with 1 where a limit was passed.
+    Exit code 1 if a limit is exceeded.
     """
-    limits = Limits(harmless_m, misleading, alarms_per_hour)
-    wanted = orders(scenarios or SCENARIOS, faults or KINDS, seeds)
+    limits = CampaignLimits(harmless_m, misleading, alarms_per_hour)
+    wanted = list_orders(scenarios or SCENARIOS, faults or FAULT_CASES, seeds)
     try:
-        flown = campaign(wanted, results, scheduler, workers)
+        flown = run_campaign(wanted, results, scheduler, workers)
         if page is not None:
-            asked = [
+            options = [
                 f"--{name} {value}"
                 for name, many in (("scenario", scenarios), ("fault", faults))
                 for value in many
             ]
-            made_by = " ".join(["companion campaign", *asked, f"--seeds {seeds} --report {page}"])
+            made_by = " ".join(["companion campaign", *options, f"--seeds {seeds} --report {page}"])
             page.parent.mkdir(parents=True, exist_ok=True)
-            page.write_text(report(flown, limits, made_by))
+            page.write_text(markdown_report(flown, limits, made_by))
     except (ValueError, OSError) as error:
         raise SystemExit(f"companion: {error}") from None
-    lines = table(flown, limits)
+    lines = summarise(flown, limits)
     if as_json:
         click.echo(json.dumps([line._asdict() for line in lines]))
     else:
-        show(lines, limits, Console(width=max(150, Console().width)))
+        print_table(lines, limits, Console(width=max(150, Console().width)))
     if not all(line.passed for line in lines):
         raise SystemExit(EX_FAILED)

@@ -1,15 +1,13 @@
-"""`companion kills`: the service is killed at random moments in flight; its logs against what it was sent.
+"""`companion kills`: kill test of the service in flight; its logs are compared with the frames sent to it.
 
     companion kills --times 200 --seed 1
 
-Each life is a `companion run` of its own, fed a simulated flight over UDP and ended by SIGKILL at a moment
-after it has heard the autopilot, which it shows by asking for its time: navigating, or still recovering the
-log of the life before. One in ten is ended at a moment after its start instead, and does not count among
-`--times` unless it had heard the autopilot by then. What must hold: the log left behind can be read as it
-lies, holds every frame that came up to its last one, and of what was sent no more is missing than the last
-second; and a start later every log is closed, with all that could be read of it torn.
-
-It looks at the log from outside and knows nothing of chunks.
+Each run is a `companion run` process that receives a simulated flight over UDP and is killed by SIGKILL at a
+random time after its first TIMESYNC request, which shows that it is connected to the autopilot; it may still
+be recovering the log of the run before. One run in ten is killed at a random time after the start of the
+process instead, and counts among `--times` only if it was connected by then. Requirements: the log can be
+read as it is, holds every frame up to its last one, and only frames of the last second are missing; after one
+more start every log is closed and holds at least the messages that were readable before.
 """
 
 from __future__ import annotations
@@ -33,85 +31,95 @@ import click
 from companion.link import dialect, frame
 from companion.storage import flight_log
 from companion.storage.reader import ACTIVE, LogError
-from sitl.autopilot import Autopilot
-from sitl.scenarios import Rates, Scenario, named
+from sitl.autopilot import SimulatedAutopilot
+from sitl.scenarios import Scenario, SensorRates, get_scenario
 from sitl.world import World
 
 LOOPBACK = "127.0.0.1"
-AT_RISK_S = 1.0  # of what was sent, no more may be lost
-SHORTEST_S, LONGEST_S = 0.1, 4.0  # of a life
-STILLBORN = 0.1  # share of lives that are counted from the start of the process
+AT_RISK_S = 1.0  # only frames of the last second may be missing
+SHORTEST_S, LONGEST_S = 0.1, 4.0  # of a run
+EARLY_SHARE = 0.1  # share of runs timed from the start of the process
 STEP_S = 0.01
 START_S = 60.0
 TIMESYNC = dialect.type_named("TIMESYNC").msgid
 
 
-class Life(NamedTuple):
-    """One run up to its kill: frames sent once it listened, frames found in its log, and what is missing.
+class KilledRun(NamedTuple):
+    """One run up to its kill: number of frames sent while it listened, and of frames in its log.
 
-    `heard_s` is for how long it had heard the autopilot at the kill, None if it had not. `lost_s` is the age,
-    at the kill, of the oldest frame that is not in the log; `holes` are frames missing before the last one
-    found.
+    `connected_s` is the time from connection to kill, None if not connected. `lost_s` is the age, at the
+    kill, of the oldest frame missing at the end of the log; `holes` counts frames missing before the last
+    logged one.
     """
 
-    heard_s: float | None
+    connected_s: float | None
     sent: int
-    kept: int
+    logged: int
     lost_s: float
     holes: int
 
 
-def kills(times: int, seed: int, folder: Path, at_once: int = 2) -> list[Life]:
-    """Live and be killed until `times` lives had heard the autopilot, `at_once` side by side, then start once
-    more in each folder. Those that had not are among what is returned, with `heard_s` None.
+def run_kills(times: int, seed: int, folder: Path, at_once: int = 2) -> list[KilledRun]:
+    """Run and kill the service until `times` runs were connected, `at_once` in parallel; recover all logs.
 
-    ValueError, one sentence, where a log cannot be read or is not whole in the end.
+    Runs that were not connected are returned too, with `connected_s` None. Raises ValueError if a log cannot
+    be read or is not recovered completely.
     """
-    scenario = replace(named("short"), rates=Rates(imu=1.0, truth=1.0))
+    scenario = replace(get_scenario("short"), rates=SensorRates(imu=1.0, truth=1.0))
     world = World(scenario)
     shares = [times // at_once + (i < times % at_once) for i in range(at_once)]
     with ThreadPoolExecutor(at_once) as pool:
-        runs = [
-            pool.submit(_lives, share, random.Random(f"{seed} {i}"), folder / str(i), scenario, world)
+        futures = [
+            pool.submit(
+                _kill_repeatedly, share, random.Random(f"{seed} {i}"), folder / str(i), scenario, world
+            )
             for i, share in enumerate(shares)
             if share
         ]
-        return [life for run in runs for life in run.result()]
+        return [run for future in futures for run in future.result()]
 
 
-def _lives(times: int, rng: random.Random, folder: Path, scenario: Scenario, world: World) -> list[Life]:
+def _kill_repeatedly(
+    times: int, rng: random.Random, folder: Path, scenario: Scenario, world: World
+) -> list[KilledRun]:
     folder.mkdir(parents=True)
-    readable: dict[str, int] = {}  # messages that each torn log gave, by its name
-    lives = list[Life]()
-    while sum(life.heard_s is not None for life in lives) < times:
+    readable: dict[str, int] = {}  # number of readable messages of each torn log, by name
+    runs = list[KilledRun]()
+    while sum(run.connected_s is not None for run in runs) < times:
         before = set(folder.iterdir())
-        stillborn = rng.random() < STILLBORN
+        early = rng.random() < EARLY_SHARE
         seconds = rng.uniform(SHORTEST_S, LONGEST_S)
-        heard_s, sent = _live(folder, seconds, Autopilot(scenario, 0, world), stillborn)
-        if heard_s is None and not stillborn:
+        connected_s, sent = _run_and_kill(folder, seconds, SimulatedAutopilot(scenario, 0, world), early)
+        if connected_s is None and not early:
             raise ValueError(
-                f"{folder}: a service did not hear the autopilot for {START_S:g} s after its start"
+                f"{folder}: a service did not connect to the autopilot within {START_S:g} s after its start"
             )
-        left = {path for path in folder.glob(f"*{ACTIVE}") if path not in before}
-        lives.append(_compared(heard_s, sent, [data for path in left for data in _heard(path)]))
-        for path in left:
+        torn = {path for path in folder.glob(f"*{ACTIVE}") if path not in before}
+        runs.append(
+            _compare_with_log(connected_s, sent, [data for path in torn for data in _received_frames(path)])
+        )
+        for path in torn:
             with contextlib.suppress(LogError):  # killed before its first byte
                 readable[path.name.removesuffix(ACTIVE)] = flight_log.info(path).messages
-    _live(folder, START_S, Autopilot(scenario, 0, world), until_recovered=True)
+    _run_and_kill(folder, START_S, SimulatedAutopilot(scenario, 0, world), until_recovered=True)
     for name, messages in readable.items():
         found = flight_log.info(folder / name)
         if not found.closed or found.messages < messages:
-            raise ValueError(f"{found.path}: held {messages} messages torn and holds {found.messages} now")
-    return lives
+            raise ValueError(f"{found.path}: {messages} messages before recovery, {found.messages} after it")
+    return runs
 
 
-def _live(
-    folder: Path, seconds: float, autopilot: Autopilot, stillborn: bool = False, until_recovered: bool = False
+def _run_and_kill(
+    folder: Path,
+    seconds: float,
+    autopilot: SimulatedAutopilot,
+    early: bool = False,
+    until_recovered: bool = False,
 ) -> tuple[float | None, list[tuple[float, bytes]]]:
-    """Run the service for `seconds` after it first asks for the autopilot's time (`stillborn`: after its
-    start) and kill it; for how long it had heard the autopilot, and what was sent, with its age at the kill.
+    """Kill the service `seconds` after its first TIMESYNC request (`early`: after its start).
 
-    `until_recovered`: end it in good order as soon as no log is torn any more.
+    Returns the time from connection to kill (None if not connected) and the frames sent, with their age at
+    the kill. `until_recovered`: terminate it by SIGTERM when no torn log is left.
     """
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as chosen:
         chosen.bind((LOOPBACK, 0))
@@ -119,29 +127,31 @@ def _live(
     command = [sys.executable, "-m", "companion", "run", "--connect", f"udpin:{LOOPBACK}:{port}"]
     command += ["--logs", str(folder), "--set", "log.minimum_free_mib=0", "--set", "log.maximum_files=100000"]
     sent: list[tuple[float, bytes]] = []
-    heard, reader = list[float](), frame.Reader()
-    torn, begun = list(folder.glob(f"*{ACTIVE}")), time.monotonic()
+    connected, reader = list[float](), frame.Reader()
+    torn, started = list(folder.glob(f"*{ACTIVE}")), time.monotonic()
     with (
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock,
         subprocess.Popen(command, stderr=subprocess.DEVNULL) as process,
     ):
         sock.connect((LOOPBACK, port))
         sock.setblocking(False)
-        end = begun + (seconds if stillborn or until_recovered else START_S)
+        end = started + (seconds if early or until_recovered else START_S)
         while (now := time.monotonic()) < end:
-            for data in autopilot.poll(int((now - begun) * 1e9)):
+            for data in autopilot.poll(int((now - started) * 1e9)):
                 try:
                     sock.send(data)
                     sent.append((now, data))
-                except ConnectionRefusedError:  # of an earlier one: nobody listened yet
+                except ConnectionRefusedError:  # report of an earlier datagram: no listener yet
                     sent.clear()
             with contextlib.suppress(BlockingIOError, ConnectionRefusedError):
                 while True:
                     data = sock.recv(65536)
-                    autopilot.receive(data, int((now - begun) * 1e9))
-                    if not heard and any(getattr(f, "msgid", None) == TIMESYNC for f in reader.receive(data)):
-                        heard.append(now)
-                        end = end if stillborn or until_recovered else now + seconds
+                    autopilot.receive(data, int((now - started) * 1e9))
+                    if not connected and any(
+                        getattr(f, "msgid", None) == TIMESYNC for f in reader.receive(data)
+                    ):
+                        connected.append(now)
+                        end = end if early or until_recovered else now + seconds
             if until_recovered and not any(path.exists() for path in torn):
                 process.send_signal(signal.SIGTERM)
                 process.wait(START_S)
@@ -150,12 +160,12 @@ def _live(
         killed = time.monotonic()
         process.kill()
     if until_recovered:
-        raise ValueError(f"{folder}: logs are still torn {seconds:g} s after a start")
-    return killed - heard[0] if heard else None, [(killed - at, data) for at, data in sent]
+        raise ValueError(f"{folder}: torn logs remain {seconds:g} s after a start")
+    return killed - connected[0] if connected else None, [(killed - at, data) for at, data in sent]
 
 
-def _heard(path: Path) -> list[bytes]:
-    """The frames in a torn log as they came; none where there is no header yet."""
+def _received_frames(path: Path) -> list[bytes]:
+    """Received frames in a torn log, in order; empty if the log has no header yet."""
     try:
         return [
             e.value
@@ -166,18 +176,22 @@ def _heard(path: Path) -> list[bytes]:
         return []
 
 
-def _compared(heard_s: float | None, sent: list[tuple[float, bytes]], kept: list[bytes]) -> Life:
-    """`sent` with ages at the kill. What was sent before the first frame that is in the log met no ear, nor,
-    where there is none, did what was sent before the autopilot was heard.
+def _compare_with_log(
+    connected_s: float | None, sent: list[tuple[float, bytes]], logged: list[bytes]
+) -> KilledRun:
+    """Compare the log with `sent` (age at the kill, frame).
+
+    Frames sent before the first logged one, or before the connection if none is logged, are not counted as
+    lost: the service was not listening yet.
     """
     datas = [data for _, data in sent]
-    if not kept:
-        return Life(heard_s, len(sent), 0, heard_s or 0.0, 0)
-    first = datas.index(kept[0]) if kept[0] in datas else 0
-    last = len(datas) - 1 - datas[::-1].index(kept[-1]) if kept[-1] in datas else len(datas) - 1
-    holes = len(set(datas[first : last + 1]) - set(kept))
+    if not logged:
+        return KilledRun(connected_s, len(sent), 0, connected_s or 0.0, 0)
+    first = datas.index(logged[0]) if logged[0] in datas else 0
+    last = len(datas) - 1 - datas[::-1].index(logged[-1]) if logged[-1] in datas else len(datas) - 1
+    holes = len(set(datas[first : last + 1]) - set(logged))
     missing = sent[last + 1 :]
-    return Life(heard_s, len(datas) - first, len(kept), missing[0][0] if missing else 0.0, holes)
+    return KilledRun(connected_s, len(datas) - first, len(logged), missing[0][0] if missing else 0.0, holes)
 
 
 @click.command("kills")
@@ -185,25 +199,24 @@ def _compared(heard_s: float | None, sent: list[tuple[float, bytes]], kept: list
 @click.option("--seed", type=int, default=1, show_default=True)
 @click.option("--at-once", type=click.IntRange(1), default=2, show_default=True)
 def command(times: int, seed: int, at_once: int) -> None:
-    """Kill a flying service at random moments and see that its log lost no more than the last second.
+    """Kill the service in flight at random times and check that its log lost at most the last second.
 
-    Ends with 1 where it did.
+    Exit code 1 if it lost more.
     """
     with tempfile.TemporaryDirectory() as folder:
         try:
-            lives = kills(times, seed, Path(folder), at_once)
+            runs = run_kills(times, seed, Path(folder), at_once)
         except ValueError as error:
             raise SystemExit(f"companion: {error}") from None
-    flown = [life for life in lives if life.heard_s is not None]
-    lost = [life.lost_s for life in flown]
+    flown = [run for run in runs if run.connected_s is not None]
+    lost = [run.lost_s for run in flown]
     worst = max(lost, default=0.0)
-    holes = sum(life.holes for life in lives)
+    holes = sum(run.holes for run in runs)
     click.echo(
-        f"{len(flown)} kills of a service that had heard the autopilot, and {len(lives) - len(flown)} of one "
-        "that had not yet; "
-        f"{sum(life.kept for life in lives)} frames in the logs, {holes} missing among them; "
-        f"lost at the end: {statistics.median(lost):.2f} s in the median, {worst:.2f} s at most; "
-        "every torn log was read as it lay and closed by a later start"
+        f"{len(flown)} kills of a connected service, {len(runs) - len(flown)} before the connection; "
+        f"{sum(run.logged for run in runs)} frames in the logs, {holes} missing between them; "
+        f"lost at the end: median {statistics.median(lost):.2f} s, maximum {worst:.2f} s; "
+        "every torn log was readable and was closed by a later start"
     )
     if worst > AT_RISK_S or holes:
         raise SystemExit(1)

@@ -1,18 +1,17 @@
-"""`companion soak`: one companion that is never restarted, a day of flight, faults scattered by seed.
+"""`companion soak`: soak test of one companion over a day of flight with random faults.
 
     companion soak --hours 24 --seed 1
 
-An hour is four sorties: the autopilot is switched on, flies a quarter of an hour, and is switched off; the
-companion goes on. In every sortie faults whose kinds and times are drawn by the seed last half a minute or so
-and stand two minutes apart, some 14 in an hour. A line an hour says what the process holds and how often
-things happen. What must not grow:
+An hour consists of four sorties: the autopilot is switched on, flies a quarter of an hour, and is switched
+off; the companion is never restarted. In every sortie random faults last about half a minute and are two
+minutes apart, about 14 per hour. Each hour yields one line with memory, queues and rates. Limits:
 
-    memory     of the process (resident) and the objects that can be reached from the companion: no more than
-               5 % above those at the end of the first hour
-    queues     the longest container in the companion, and what waits for the log's disk: bounded
-    rates      of solutions and messages in the quiet time between faults: within 1 % of the first hour's
+    memory     resident memory of the process, and number of objects reachable from the companion: at most 5 %
+               above the end of the first hour
+    queues     the longest container in the companion, and the bytes that wait for the log's disk: bounded
+    rates      of solutions and messages in the quiet time between faults: within 1 % of the first hour
 
-Virtual time: a day takes some ten minutes.
+Virtual time: a day takes about ten minutes.
 """
 
 from __future__ import annotations
@@ -37,31 +36,32 @@ import click
 from rich.console import Console
 from rich.table import Table
 
-from companion.analysis.replay import metadata
 from companion.config import Config
 from companion.records import Stamped
-from companion.runtime.core import Onboard
+from companion.runtime.core import CompanionCore
 from companion.storage.flight_log import Writer
-from sitl.autopilot import UNIX_AT_START_NS, Autopilot
+from companion.storage.run_metadata import run_metadata
+from companion.units import SECOND_NS
+from sitl.autopilot import UNIX_AT_START_NS, SimulatedAutopilot
 from sitl.beacon import Beacon
 from sitl.faults import AUTOPILOT_FAULTS, LINK_FAULTS, RECORD_FAULTS, Fault
-from sitl.flight import Leg, Plan, Wind
-from sitl.loopback import LINK, SECOND, START_NS, join, simulated
-from sitl.scenarios import Rates, Scenario
+from sitl.flight import FlightPlan, Leg, WindChange
+from sitl.loopback import LINK, START_NS, fly_connected, simulator_config
+from sitl.scenarios import Scenario, SensorRates
 
 SORTIE_S, SORTIES = 900.0, 4  # of an hour
-QUIET_S = 120.0  # at the start of a sortie, and after a fault, before anything is counted as quiet
+QUIET_S = 120.0  # not counted as quiet: start of a sortie, and after a fault
 FAULT_S = (20.0, 60.0)
-APART_NS = 60 * SECOND  # between two sorties
+APART_NS = 60 * SECOND_NS  # between two sorties
 MEMORY_GROWTH, RATE_DRIFT = 0.05, 0.01
 LONGEST = 4096  # of a container
-NAMES = (*RECORD_FAULTS, *LINK_FAULTS, *AUTOPILOT_FAULTS, "slow-consumer")
+SOAK_FAULTS = (*RECORD_FAULTS, *LINK_FAULTS, *AUTOPILOT_FAULTS, "slow-consumer")
 _CONTAINERS = (list, tuple, dict, set, frozenset, deque)
 _OUTSIDE = (types.ModuleType, type, types.FunctionType, types.BuiltinFunctionType, types.CodeType)
 
 
-class Hour(NamedTuple):
-    """What was measured at the end of an hour, or over it. Rates in Hz over its quiet time."""
+class HourStatistics(NamedTuple):
+    """Measurements at the end of an hour or over it. Rates in Hz over its quiet time."""
 
     hour: int
     resident_mib: float
@@ -79,16 +79,16 @@ class Hour(NamedTuple):
     times_real_time: float
 
 
-class Held(NamedTuple):
-    """What can be reached from an object: how many objects, and the length of the longest container."""
+class ReachableObjects(NamedTuple):
+    """Number of objects reachable from an object, and the length of the longest container."""
 
     objects: int
     longest: int
 
 
-def held(root: object, but: tuple[object, ...] = ()) -> Held:
-    """Walk everything that `root` holds, but for `but`; code and modules are nobody's."""
-    seen, longest = {id(each) for each in but}, 0
+def count_reachable(root: object, exclude: tuple[object, ...] = ()) -> ReachableObjects:
+    """Count the objects reachable from `root`, except `exclude`, code and modules."""
+    seen, longest = {id(each) for each in exclude}, 0
     waiting = [root]
     while waiting:
         each = waiting.pop()
@@ -98,31 +98,31 @@ def held(root: object, but: tuple[object, ...] = ()) -> Held:
         if isinstance(each, _CONTAINERS):
             longest = max(longest, len(each))
         waiting += gc.get_referents(each)
-    return Held(len(seen), longest)
+    return ReachableObjects(len(seen), longest)
 
 
-class Tally:
-    """A log that counts on its way to another, and the rates of a quiet time."""
+class CountingLog:
+    """Log that counts records and frames before it passes them on, with rates over quiet time."""
 
     def __init__(self, log: Writer) -> None:
         self._log = log
-        self.begin()
+        self.reset()
 
-    def begin(self) -> None:
-        """Count anew."""
+    def reset(self) -> None:
+        """Reset all counts."""
         self.counts: Counter[str] = Counter()
         self._rates: Counter[str] = Counter()
         self._quiet = False
         self.quiet_s = self.waiting = 0
 
-    def listen(self, loud: Sequence[tuple[float, float]], t: float) -> None:
-        """Called at each second `t` of a flight: whether the one that begins is quiet, in none of `loud`."""
-        self._quiet = not any(since <= t + 1.0 and t < until for since, until in loud)
+    def start_second(self, disturbed: Sequence[tuple[float, float]], t: float) -> None:
+        """Start second `t` of a flight: it is quiet if it overlaps none of the intervals `disturbed`."""
+        self._quiet = not any(since <= t + 1.0 and t < until for since, until in disturbed)
         self.quiet_s += self._quiet
         self.waiting = max(self.waiting, self._log.waiting)
 
     def rate(self, name: str) -> float:
-        """How many of `name` there were in a quiet second."""
+        """Return the mean count of `name` per quiet second."""
         return round(self._rates[name] / max(self.quiet_s, 1), 3)
 
     def record(self, record: Stamped, channel: str | None = None) -> None:
@@ -138,26 +138,26 @@ class Tally:
         self._log.frame(link, outgoing, data, t_ns)
 
 
-def sortie(number: int, seed: int, duration_s: float = SORTIE_S) -> Scenario:
-    """A flight round and round within reach of two beacons, faults all along."""
+def make_sortie(number: int, seed: int, duration_s: float = SORTIE_S) -> Scenario:
+    """Make a flight of turns within reach of two beacons, with random faults."""
     rng = random.Random(f"{seed} {number}")
     sides = math.ceil((duration_s - 60.0) / 240.0)
     legs = [Leg(10, 40, 0, 0), Leg(50, 40, 38, 0)]
     legs += [Leg((duration_s - 60.0) / sides, (40 + 70 * i) % 360, 38, 100) for i in range(sides)]
     return Scenario(
         f"sortie {number}",
-        Plan(tuple(legs), winds=(Wind(0, 4, 5),)),
+        FlightPlan(tuple(legs), winds=(WindChange(0, 4, 5),)),
         beacons=(Beacon(1, 60.05, 31.07), Beacon(2, 60.45, 30.0)),
-        rates=Rates(imu=1.0, truth=1.0),
-        faults=tuple(_scattered(rng, duration_s)),
+        rates=SensorRates(imu=1.0, truth=1.0),
+        faults=tuple(_scatter_faults(rng, duration_s)),
         seed=rng.randrange(1 << 31),
     )
 
 
-def _scattered(rng: random.Random, duration_s: float) -> Iterator[Fault]:
-    """As many kinds as find room, each once, in any order; a quiet time before each."""
+def _scatter_faults(rng: random.Random, duration_s: float) -> Iterator[Fault]:
+    """Distinct faults in random order, as many as fit, with a quiet time before each."""
     start = QUIET_S
-    for name in rng.sample(NAMES, len(NAMES)):
+    for name in rng.sample(SOAK_FAULTS, len(SOAK_FAULTS)):
         start += rng.uniform(0.0, 20.0)
         end = start + rng.uniform(*FAULT_S)
         if end > duration_s - QUIET_S:
@@ -166,58 +166,62 @@ def _scattered(rng: random.Random, duration_s: float) -> Iterator[Fault]:
         start = end + QUIET_S + 20.0
 
 
-def soak(hours: int, seed: int, folder: Path, sortie_s: float = SORTIE_S) -> Iterator[Hour]:
-    """Fly, and yield a line after each hour."""
-    config = simulated(Config())
+def run_soak(hours: int, seed: int, folder: Path, sortie_s: float = SORTIE_S) -> Iterator[HourStatistics]:
+    """Fly, and yield the statistics of each hour."""
+    config = simulator_config(Config())
     log = Writer(
         folder / "soak.mcap",
-        metadata=metadata(config),
+        metadata=run_metadata(config),
         start_unix_ns=UNIX_AT_START_NS,
         start_ns=START_NS,
         block=True,
     )
     with log:
-        tally = Tally(log)
-        onboard = Onboard(config, tally, (LINK,))
+        counter = CountingLog(log)
+        core = CompanionCore(config, counter, (LINK,))
         start = START_NS
         for hour in range(1, hours + 1):
-            tally.begin()
-            begun, flown_s = time.perf_counter(), 0.0
+            counter.reset()
+            started, flown_s = time.perf_counter(), 0.0
             for number in range(SORTIES):
-                scenario = sortie(SORTIES * (hour - 1) + number, seed, sortie_s)
-                loud = [
+                scenario = make_sortie(SORTIES * (hour - 1) + number, seed, sortie_s)
+                disturbed = [
                     (0.0, QUIET_S),
                     *((fault.start_s, fault.end_s + QUIET_S) for fault in scenario.faults),
                 ]
-                join(Autopilot(scenario, start), onboard, start, partial(tally.listen, loud))
+                fly_connected(
+                    SimulatedAutopilot(scenario, start), core, start, partial(counter.start_second, disturbed)
+                )
                 flown_s += scenario.duration_s
-                start += round(scenario.duration_s * SECOND) + APART_NS
-            yield _line(hour, onboard, tally, log, flown_s / (time.perf_counter() - begun))
+                start += round(scenario.duration_s * SECOND_NS) + APART_NS
+            yield _measure_hour(hour, core, counter, log, flown_s / (time.perf_counter() - started))
 
 
-def _line(hour: int, onboard: Onboard, tally: Tally, log: Writer, times_real_time: float) -> Hour:
-    _give_back()  # the simulator's memory is not the companion's
-    objects, longest = held(onboard, but=(tally,))
-    return Hour(
+def _measure_hour(
+    hour: int, core: CompanionCore, counter: CountingLog, log: Writer, times_real_time: float
+) -> HourStatistics:
+    _trim_memory()  # exclude memory freed by the simulator
+    objects, longest = count_reachable(core, exclude=(counter,))
+    return HourStatistics(
         hour,
         round(_resident_mib(), 1),
         objects,
         longest,
-        round(tally.waiting / 1024.0, 1),
+        round(counter.waiting / 1024.0, 1),
         log.dropped,
-        tally.rate("Solution"),
-        tally.rate("tx"),
-        tally.rate("rx"),
-        tally.quiet_s,
-        tally.counts["Rejection"],
-        tally.counts["Reset"],
-        tally.counts["Event"],
+        counter.rate("Solution"),
+        counter.rate("tx"),
+        counter.rate("rx"),
+        counter.quiet_s,
+        counter.counts["Rejection"],
+        counter.counts["Reset"],
+        counter.counts["Event"],
         round(times_real_time, 1),
     )
 
 
-def _give_back() -> None:
-    """Have free memory returned to the system where the C library can, so that what is resident is in use."""
+def _trim_memory() -> None:
+    """Return free memory to the system where the C library can: resident memory is then in use."""
     gc.collect()
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
     if trim is not None:
@@ -225,7 +229,7 @@ def _give_back() -> None:
 
 
 def _resident_mib() -> float:
-    """Of this process now; where the system does not say, at its greatest."""
+    """Resident memory of this process; its maximum where /proc is not available."""
     try:
         pages = int(Path("/proc/self/statm").read_text().split()[1])
     except OSError:
@@ -233,8 +237,8 @@ def _resident_mib() -> float:
     return pages * os.sysconf("SC_PAGE_SIZE") / (1 << 20)
 
 
-def failures(hours: list[Hour], depth: int = 1 << 25) -> list[str]:
-    """What a soak did not keep, one sentence each."""
+def find_failures(hours: list[HourStatistics], depth: int = 1 << 25) -> list[str]:
+    """Return one sentence for each limit that was exceeded."""
     first, found = hours[0], []
     for hour in hours:
         for name in ("resident_mib", "objects"):
@@ -246,7 +250,7 @@ def failures(hours: list[Hour], depth: int = 1 << 25) -> list[str]:
             if abs(now - before) > before * RATE_DRIFT:
                 found.append(f"hour {hour.hour}: {name} went from {before:g} to {now:g}")
         if hour.longest > LONGEST:
-            found.append(f"hour {hour.hour}: a container holds {hour.longest}")
+            found.append(f"hour {hour.hour}: a container has {hour.longest} elements (limit {LONGEST})")
         if hour.waiting_kib > depth / 1024 or hour.dropped:
             found.append(
                 f"hour {hour.hour}: {hour.waiting_kib:g} KiB waited for the log, {hour.dropped} dropped"
@@ -257,28 +261,28 @@ def failures(hours: list[Hour], depth: int = 1 << 25) -> list[str]:
 @click.command("soak")
 @click.option("--hours", type=click.IntRange(1), default=24, show_default=True)
 @click.option("--seed", type=int, default=1, show_default=True)
-@click.option("--json", "as_json", is_flag=True, help="Print JSON, a line an hour.")
+@click.option("--json", "as_json", is_flag=True, help="Print JSON, one line per hour.")
 def command(hours: int, seed: int, as_json: bool) -> None:
-    """Fly for hours with every fault scattered over each, and say what grew. Ends with 1 where any did."""
-    flown: list[Hour] = []
+    """Fly for hours with random faults; report memory, queues and rates. Exit code 1 above a limit."""
+    flown: list[HourStatistics] = []
     with tempfile.TemporaryDirectory() as folder:
-        for hour in soak(hours, seed, Path(folder)):
+        for hour in run_soak(hours, seed, Path(folder)):
             flown.append(hour)
             if as_json:
                 click.echo(json.dumps(hour._asdict()))
             else:
                 click.echo(f"hour {hour.hour} of {hours}: {hour.resident_mib:g} MiB", err=True)
     if not as_json:
-        _show(flown)
-    for sentence in failures(flown):
+        _print_table(flown)
+    for sentence in find_failures(flown):
         click.echo(sentence, err=True)
-    if failures(flown):
+    if find_failures(flown):
         raise SystemExit(1)
 
 
-def _show(hours: list[Hour]) -> None:
+def _print_table(hours: list[HourStatistics]) -> None:
     table = Table(title="memory and queues at the end of each hour, rates in its quiet time")
-    for name in Hour._fields:
+    for name in HourStatistics._fields:
         table.add_column(name.replace("_", " "), justify="right")
     for hour in hours:
         table.add_row(*(f"{value:g}" if isinstance(value, float) else str(value) for value in hour))

@@ -1,4 +1,4 @@
-"""Errors against a truth that is known: what is displaced by so much is off by so much."""
+"""Error statistics against a known truth."""
 
 import math
 
@@ -53,15 +53,15 @@ def rsbn(beacon: Geodetic, place: Geodetic, **changes) -> RsbnFix:
     return RsbnFix(0, 0, 1, *beacon, **values, sigma_azimuth=1e-3, sigma_range=1.0)
 
 
-def test_what_is_displaced_by_so_much_is_off_by_so_much() -> None:
-    found = error_statistics.errors([solution(1.0, 3.0, 4.0), gnss(2.0, 7.0)], truth)
+def test_errors_equal_the_displacements() -> None:
+    found = error_statistics.horizontal_errors([solution(1.0, 3.0, 4.0), gnss(2.0, 7.0)], truth)
     assert found[error_statistics.CORRECTED].error == pytest.approx([5.0], rel=1e-6)
     assert found[error_statistics.INS].error == pytest.approx([math.hypot(33.0, -36.0)], rel=1e-4)
     assert found[error_statistics.GNSS].error == pytest.approx([7.0], rel=1e-6)
     assert np.isnan(found[error_statistics.CORRECTED].bound).all()
 
 
-def test_without_truth_a_fix_or_news_nothing_is_scored() -> None:
+def test_records_without_truth_or_fix_and_repeats_are_not_counted() -> None:
     records = [
         gnss(1.0, 7.0),
         gnss(1.0, 7.0),
@@ -69,18 +69,20 @@ def test_without_truth_a_fix_or_news_nothing_is_scored() -> None:
         gnss(101.0, 7.0),
         solution(101.0, 1.0, 1.0),
     ]
-    found = error_statistics.errors(records, truth)
+    found = error_statistics.horizontal_errors(records, truth)
     assert list(found) == [error_statistics.GNSS]
     assert found[error_statistics.GNSS].t_ns.tolist() == [SECOND]
 
 
-def test_a_phase_is_summed_by_its_own_instants() -> None:
+def test_phase_uses_its_own_instants() -> None:
     records = [solution(t, 0.0, float(t), bound_n=(0.0, 10.5)) for t in range(20)]
     phases = [
-        error_statistics.Phase("first", 0, 10 * SECOND),
-        error_statistics.Phase("last", 10 * SECOND, 20 * SECOND),
+        error_statistics.FlightPhase("first", 0, 10 * SECOND),
+        error_statistics.FlightPhase("last", 10 * SECOND, 20 * SECOND),
     ]
-    first, last = error_statistics.table(error_statistics.errors(records, truth), phases)
+    first, last = error_statistics.summarize_phases(
+        error_statistics.horizontal_errors(records, truth), phases
+    )
     assert first.rms[error_statistics.CORRECTED] == pytest.approx(
         math.sqrt(sum(t * t for t in range(10)) / 10), rel=1e-5
     )
@@ -91,9 +93,10 @@ def test_a_phase_is_summed_by_its_own_instants() -> None:
     assert last.seconds == 10.0
 
 
-def test_a_phase_without_records_has_no_numbers() -> None:
-    (row,) = error_statistics.table(
-        error_statistics.errors([solution(1.0, 1.0, 0.0)], truth), [error_statistics.Phase("late", 50, 60)]
+def test_phase_without_records_has_no_numbers() -> None:
+    (row,) = error_statistics.summarize_phases(
+        error_statistics.horizontal_errors([solution(1.0, 1.0, 0.0)], truth),
+        [error_statistics.FlightPhase("late", 50, 60)],
     )
     assert (
         row.rms == {} and row.bound is None and row.share is None and row.held is None and row.inside is None
@@ -102,30 +105,32 @@ def test_a_phase_without_records_has_no_numbers() -> None:
 
 @settings(deadline=None, max_examples=50)
 @given(st.floats(-math.pi, math.pi), st.floats(2e3, 250e3), st.floats(100.0, 9000.0))
-def test_a_beacon_s_true_answer_leads_to_the_true_place(azimuth: float, distance: float, alt: float) -> None:
+def test_exact_beacon_measurement_gives_the_true_position(
+    azimuth: float, distance: float, alt: float
+) -> None:
     beacon = Geodetic(math.radians(60.05), math.radians(31.07), 80.0)
     away = displace(*beacon, distance * math.cos(azimuth), distance * math.sin(azimuth), 0.0)
     place = away._replace(alt=alt)
-    found = error_statistics.beacon_fix(rsbn(beacon, place), alt)
+    found = error_statistics.position_from_beacon(rsbn(beacon, place), alt)
     assert found is not None
     north, east, _ = separation(found, place)
-    assert math.hypot(north, east) < 2.0  # the height over the tangent plane is found in two turns
+    assert math.hypot(north, east) < 2.0  # two iterations of the height above the tangent plane
 
 
-def test_half_an_answer_is_no_place() -> None:
+def test_incomplete_beacon_measurement_gives_no_position() -> None:
     beacon = Geodetic(math.radians(60.05), math.radians(31.07), 80.0)
-    assert error_statistics.beacon_fix(rsbn(beacon, PLACE, azimuth=None), 800.0) is None
-    assert error_statistics.beacon_fix(rsbn(beacon, PLACE, slant_range=None), 800.0) is None
+    assert error_statistics.position_from_beacon(rsbn(beacon, PLACE, azimuth=None), 800.0) is None
+    assert error_statistics.position_from_beacon(rsbn(beacon, PLACE, slant_range=None), 800.0) is None
 
 
-def test_the_fix_that_opens_a_phase_is_not_the_one_before_its():
+def test_fix_that_starts_a_phase_is_not_counted_in_the_previous_one():
     second = 1_000_000_000
     t = np.arange(0, 20 * second, second // 2)
-    t = t[t > 9 * second]  # the first is valid half a second before the phase that it opens
-    fixes = error_statistics.Errors(t, np.ones(len(t)), np.full(len(t), np.nan))
+    t = t[t > 9 * second]  # the first is valid half a second before the phase that it starts
+    fixes = error_statistics.ErrorSeries(t, np.ones(len(t)), np.full(len(t), np.nan))
     phases = [
-        error_statistics.Phase("neither", 0, 10 * second),
-        error_statistics.Phase("GNSS only", 10 * second, 20 * second),
+        error_statistics.FlightPhase("neither", 0, 10 * second),
+        error_statistics.FlightPhase("GNSS only", 10 * second, 20 * second),
     ]
-    before, after = error_statistics.table({error_statistics.GNSS: fixes}, phases)
+    before, after = error_statistics.summarize_phases({error_statistics.GNSS: fixes}, phases)
     assert error_statistics.GNSS not in before.rms and after.rms[error_statistics.GNSS] == 1.0

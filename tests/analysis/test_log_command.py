@@ -1,4 +1,4 @@
-"""`companion log recover` writes over nothing that is there."""
+"""`companion log recover` does not overwrite existing files."""
 
 from pathlib import Path
 
@@ -20,25 +20,25 @@ def whole(tmp_path: Path) -> bytes:
 
 
 @pytest.mark.parametrize("damage", ["torn", "changed"])
-def test_a_copy_that_is_there_is_not_written_over(damage: str, whole: bytes, tmp_path: Path) -> None:
+def test_existing_copy_is_not_overwritten(damage: str, whole: bytes, tmp_path: Path) -> None:
     log, copy = tmp_path / "flight.mcap", tmp_path / "flight.recovered.mcap"
     at = whole.index(b"zstd") + 40  # within its chunk
     log.write_bytes(whole[:at] if damage == "torn" else whole[:at] + bytes(20) + whole[at + 20 :])
-    copy.write_bytes(b"dear")
+    copy.write_bytes(b"existing")
     done = CliRunner().invoke(group, ["recover", str(log)])
-    assert (done.exit_code, done.stderr) == (1, f"{copy} is there already: move it away first\n")
-    assert copy.read_bytes() == b"dear"
+    assert (done.exit_code, done.stderr) == (1, f"{copy} already exists: move it away first\n")
+    assert copy.read_bytes() == b"existing"
     copy.unlink()
     assert CliRunner().invoke(group, ["recover", str(log)]).exit_code == 0
     assert copy.exists()
 
 
-def test_a_log_that_needs_no_copy_minds_none(whole: bytes, tmp_path: Path) -> None:
+def test_recovery_without_copy_ignores_an_existing_copy(whole: bytes, tmp_path: Path) -> None:
     log, copy = tmp_path / "flight.mcap", tmp_path / "flight.recovered.mcap"
-    copy.write_bytes(b"dear")
+    copy.write_bytes(b"existing")
     log.write_bytes(whole)
-    assert "is whole: 100 messages" in CliRunner().invoke(group, ["recover", str(log)]).stdout
+    assert "is complete: 100 messages" in CliRunner().invoke(group, ["recover", str(log)]).stdout
     log.unlink()
     (tmp_path / "flight.mcap.active").write_bytes(whole[:-30])
     assert CliRunner().invoke(group, ["recover", f"{log}.active"]).exit_code == 0
-    assert log.exists() and copy.read_bytes() == b"dear"
+    assert log.exists() and copy.read_bytes() == b"existing"

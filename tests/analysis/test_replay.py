@@ -1,4 +1,4 @@
-"""Foreign logs run through the navigator to their end, and come out as a log of ours."""
+"""Logs of other recorders are replayed to the end and written as our own logs."""
 
 import json
 import shutil
@@ -13,6 +13,7 @@ from companion.config import Config
 from companion.records import Event, Reboot, Reset
 from companion.storage import flight_log
 from companion.storage.reader import LogError
+from companion.storage.run_metadata import logged_configuration
 
 DATA = Path(__file__).parents[1] / "data"
 SHARED = Path(__file__).parents[2].parent / "shared" / "data"
@@ -34,12 +35,12 @@ def replayed(log: Path, output: Path) -> dict:
     return json.loads(done.stdout)
 
 
-def test_a_damaged_log_with_a_reboot_is_read_to_the_end(tmp_path: Path) -> None:
+def test_damaged_log_with_reboot_is_read_to_the_end(tmp_path: Path) -> None:
     found = replayed(CUT, tmp_path / "out.mcap")
     assert [found[k] for k in ("messages", "corrupt", "unknown", "torn", "reboots")] == [841, 24, 0, 13, 1]
     kinds = Counter(type(entry.value) for entry in flight_log.read(tmp_path / "out.mcap"))
     assert kinds[Reboot] == 1
-    assert sum(kinds.values()) > 265  # every record that was read, and what came out
+    assert sum(kinds.values()) > 265  # all inputs and outputs
     resets = [e for e in flight_log.read(tmp_path / "out.mcap") if isinstance(e.value, Reset)]
     assert [(e.topic, e.value.what) for e in resets] == [
         ("/link/Reset", "flight"),
@@ -47,23 +48,23 @@ def test_a_damaged_log_with_a_reboot_is_read_to_the_end(tmp_path: Path) -> None:
     ]
 
 
-def test_what_a_replay_wrote_replays_bit_for_bit(tmp_path: Path) -> None:
+def test_output_of_a_replay_replays_bit_for_bit(tmp_path: Path) -> None:
     replayed(CUT, tmp_path / "out.mcap")
-    found = replay.replay_own(tmp_path / "out.mcap", replay.configuration(tmp_path / "out.mcap"))
+    found = replay.replay_own(tmp_path / "out.mcap", logged_configuration(tmp_path / "out.mcap"))
     assert found.different == 0 and found.compared
 
 
-def test_the_configuration_travels_with_the_log(tmp_path: Path) -> None:
+def test_configuration_is_stored_in_the_log(tmp_path: Path) -> None:
     config_file = tmp_path / "mine.toml"
     config_file.write_text("[gnss]\nsigma_m = 7.5\n")
     log = tmp_path / "out.mcap"
     done = CliRunner().invoke(replay.command, [str(CUT), "-o", str(log), "--config", str(config_file)])
     assert done.exit_code == 0, done.output
-    assert replay.configuration(log).gnss.sigma_m == 7.5
-    assert replay.configuration(log) != Config()
+    assert logged_configuration(log).gnss.sigma_m == 7.5
+    assert logged_configuration(log) != Config()
 
 
-def test_the_counts_are_printed(tmp_path: Path) -> None:
+def test_counts_are_printed(tmp_path: Path) -> None:
     done = CliRunner().invoke(replay.command, [str(CUT), "-o", str(tmp_path / "out.mcap")])
     assert "841 messages, 24 corrupt" in done.stdout and "1 reboots" in done.stdout
     assert str(tmp_path / "out.mcap") in done.stdout
@@ -71,10 +72,10 @@ def test_the_counts_are_printed(tmp_path: Path) -> None:
 
 @pytest.mark.shared
 @pytest.mark.parametrize("name", REAL)
-def test_whole_flights_give_solutions(name: str, tmp_path: Path) -> None:
+def test_recordings_give_solutions(name: str, tmp_path: Path) -> None:
     log = SHARED / name
     if not log.exists():
-        pytest.skip("the recordings do not stand beside the repository")
+        pytest.skip("the recordings are not available")
     found = replayed(log, tmp_path / "out.mcap")
     assert tuple(found[k] for k in ("messages", "corrupt", "unknown", "torn", "reboots")) == REAL[name]
     assert found["outputs"]["Solution"] > 900  # at most 5 Hz: from three to ten minutes
@@ -82,7 +83,7 @@ def test_whole_flights_give_solutions(name: str, tmp_path: Path) -> None:
     assert info.closed and info.counts["/out/Solution"] == found["outputs"]["Solution"]
 
 
-def test_a_log_without_inputs_and_a_torn_one_are_told(tmp_path: Path) -> None:
+def test_empty_and_torn_logs_are_reported(tmp_path: Path) -> None:
     empty = tmp_path / "empty.mcap"
     with flight_log.Writer(empty, metadata={}, start_unix_ns=10**18, start_ns=0, block=True) as log:
         log.record(Event(1, 1, 6, "hello"))
@@ -97,7 +98,7 @@ def test_a_log_without_inputs_and_a_torn_one_are_told(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("how", ["itself", "symbolic link", "hard link"])
-def test_the_log_that_is_read_is_not_written_over(how: str, tmp_path: Path) -> None:
+def test_input_log_is_not_overwritten(how: str, tmp_path: Path) -> None:
     log, output = tmp_path / "flight.tlog", tmp_path / "other.mcap"
     shutil.copy(CUT, log)
     if how == "itself":
@@ -108,15 +109,15 @@ def test_the_log_that_is_read_is_not_written_over(how: str, tmp_path: Path) -> N
         output.hardlink_to(log)
     done = CliRunner().invoke(replay.command, [str(log), "-o", str(output)])
     assert isinstance(done.exception, LogError)
-    assert str(done.exception) == f"{output} is read (as {log}) and not written over: give another name"
+    assert str(done.exception) == f"{output} is an input (as {log}) and is not overwritten: give another name"
     assert log.read_bytes() == CUT.read_bytes()
 
 
-def test_a_log_of_ours_is_not_written_over_by_its_replay(tmp_path: Path) -> None:
+def test_own_log_is_not_overwritten_by_its_replay(tmp_path: Path) -> None:
     log = tmp_path / "out.mcap"
     replayed(CUT, log)
     before = log.read_bytes()
     for changes in ([], ["--with", "gnss.sigma_m=3"]):
         done = CliRunner().invoke(replay.command, [str(log), "-o", str(log), *changes])
-        assert isinstance(done.exception, LogError) and "not written over" in str(done.exception)
+        assert isinstance(done.exception, LogError) and "not overwritten" in str(done.exception)
     assert log.read_bytes() == before

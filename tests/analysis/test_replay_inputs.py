@@ -1,4 +1,4 @@
-"""A log is flown again with other keys, beacons and outages; a foreign one as MCAP flies the same."""
+"""Replay with changed keys, simulated beacons and outages; converted logs replay like the originals."""
 
 import json
 import pathlib
@@ -9,10 +9,11 @@ from click.testing import CliRunner, Result
 
 from companion import records as r
 from companion.__main__ import cli
-from companion.analysis import replay, replay_inputs
+from companion.analysis import replay_inputs
 from companion.config import Config, ConfigError
 from companion.storage import flight_log
 from companion.storage.reader import LogError
+from companion.storage.run_metadata import logged_configuration
 
 TESTS = pathlib.Path(__file__).parents[1]
 SHARED = TESTS.parent.parent / "shared" / "data"
@@ -44,7 +45,7 @@ def beacons(tmp_path: pathlib.Path) -> pathlib.Path:
     return path
 
 
-def test_a_converted_log_replays_as_the_log_itself(tmp_path: pathlib.Path) -> None:
+def test_converted_log_replays_as_the_original(tmp_path: pathlib.Path) -> None:
     converted = tmp_path / "flight.mcap"
     assert "879 records" in run("log", "convert", FLIGHT, "-o", converted).output
     once, twice = tmp_path / "once.mcap", tmp_path / "twice.mcap"
@@ -52,48 +53,48 @@ def test_a_converted_log_replays_as_the_log_itself(tmp_path: pathlib.Path) -> No
     assert first["inputs"] == second["inputs"] > 800
     assert first["outputs"] == second["outputs"] and first["outputs"]["Solution"] > 200
     assert values(once, r.Solution) == values(twice, r.Solution)
-    again = report(twice)  # and what was written is a flight of ours, the same bit for bit
+    again = report(twice)  # the output is an own log and replays bit for bit
     assert again["compared"] > 0 and again["different"] == 0
 
 
-def test_the_delay_of_gnss_is_reported(tmp_path: pathlib.Path) -> None:
-    told = run("replay", FLIGHT, "-o", tmp_path / "x.mcap").output
-    assert "GNSS is 0.18 s (sigma 0.01) behind the local position: median distance 3.15 m, 0.31 m" in told
+def test_gnss_delay_is_reported(tmp_path: pathlib.Path) -> None:
+    result = run("replay", FLIGHT, "-o", tmp_path / "x.mcap").output
+    assert "GNSS is 0.18 s (sigma 0.01) behind the local position: median distance 3.15 m, 0.31 m" in result
 
 
-def test_an_outage_leaves_the_navigator_predicting_and_beacons_fix_it(
+def test_navigator_predicts_in_an_outage_and_uses_simulated_beacons(
     tmp_path: pathlib.Path, beacons: pathlib.Path
 ) -> None:
-    deaf, aided = tmp_path / "deaf.mcap", tmp_path / "aided.mcap"
-    told = report(FLIGHT, "-o", deaf, "--outage", "GNSS:30-60")
-    start = min(values(deaf, r.LocalPosition), key=lambda x: x.rx_ns).rx_ns
-    assert max(fix.rx_ns for fix in values(deaf, r.Gnss)) < start + 31 * 10**9
-    assert {s.mode for s in values(deaf, r.Solution)[-20:]} <= {r.Mode.PREDICTING, r.Mode.UNTRUSTED}
-    assert any("as the autopilot had it" in note for note in told["notes"])
-    told = report(FLIGHT, "-o", aided, "--outage", "GNSS:30-60", "--rsbn", beacons)
+    without_gnss, aided = tmp_path / "without_gnss.mcap", tmp_path / "aided.mcap"
+    result = report(FLIGHT, "-o", without_gnss, "--outage", "GNSS:30-60")
+    start = min(values(without_gnss, r.LocalPosition), key=lambda x: x.rx_ns).rx_ns
+    assert max(fix.rx_ns for fix in values(without_gnss, r.Gnss)) < start + 31 * 10**9
+    assert {s.mode for s in values(without_gnss, r.Solution)[-20:]} <= {r.Mode.PREDICTING, r.Mode.UNTRUSTED}
+    assert any("autopilot's own GNSS" in note for note in result["notes"])
+    result = report(FLIGHT, "-o", aided, "--outage", "GNSS:30-60", "--rsbn", beacons)
     assert any(
-        "of 2 beacons (11, 12) simulated along the log's own smoothed track" in n for n in told["notes"]
+        "of 2 beacons (11, 12) simulated along the log's own smoothed track" in n for n in result["notes"]
     )
     late = [s for s in values(aided, r.Solution) if s.t_ns > start + 50 * 10**9]
     assert any(s.sources & r.Source.RANGE for s in late)
 
 
 @pytest.mark.parametrize("keys", ["source=air_data", "independent=true"])
-def test_of_an_autopilot_whose_position_is_not_used_or_its_own_nothing_is_said(
+def test_no_note_if_the_autopilot_position_is_unused_or_independent(
     tmp_path: pathlib.Path, keys: str
 ) -> None:
-    told = report(FLIGHT, "-o", tmp_path / "x.mcap", "--outage", "GNSS:30-60", "--with", keys)
-    assert not any("as the autopilot had it" in note for note in told["notes"])
+    result = report(FLIGHT, "-o", tmp_path / "x.mcap", "--outage", "GNSS:30-60", "--with", keys)
+    assert not any("autopilot's own GNSS" in note for note in result["notes"])
 
 
-def test_an_outage_after_the_log_s_end_is_said_to_be_none(tmp_path: pathlib.Path) -> None:
+def test_outage_after_the_end_is_reported(tmp_path: pathlib.Path) -> None:
     late = ("--outage", "GNSS:9000-9900", "--outage", "GNSS:30-60")
-    told = report(FLIGHT, "-o", tmp_path / "x.mcap", *late)
-    (note,) = [note for note in told["notes"] if "silenced nothing" in note]
-    assert note.startswith("--outage GNSS:9000-9900 silenced nothing: the log ends at ")
+    result = report(FLIGHT, "-o", tmp_path / "x.mcap", *late)
+    (note,) = [note for note in result["notes"] if "has no effect" in note]
+    assert note.startswith("--outage GNSS:9000-9900 has no effect: the log ends at ")
 
 
-def test_the_seed_decides_what_is_heard(tmp_path: pathlib.Path, beacons: pathlib.Path) -> None:
+def test_simulated_measurements_depend_on_the_seed(tmp_path: pathlib.Path, beacons: pathlib.Path) -> None:
     one, same, other = (tmp_path / name for name in ("one.mcap", "same.mcap", "other.mcap"))
     report(FLIGHT, "-o", one, "--rsbn", beacons)
     report(FLIGHT, "-o", same, "--rsbn", beacons, "--seed", 0)
@@ -102,77 +103,77 @@ def test_the_seed_decides_what_is_heard(tmp_path: pathlib.Path, beacons: pathlib
     assert values(one, r.Solution) == values(same, r.Solution)
 
 
-def test_a_log_of_ours_flies_with_other_keys(tmp_path: pathlib.Path) -> None:
+def test_own_log_is_replayed_with_changed_keys(tmp_path: pathlib.Path) -> None:
     flown, other = tmp_path / "flown.mcap", tmp_path / "other.mcap"
     report(FLIGHT, "-o", flown, "--with", "sigma_m=3.5")
-    assert replay.configuration(flown).gnss.sigma_m == 3.5
-    told = report(flown, "--with", "estimator=kalman", "-o", other)
-    assert told["compared"] is None
-    config = replay.configuration(other)
+    assert logged_configuration(flown).gnss.sigma_m == 3.5
+    result = report(flown, "--with", "estimator=kalman", "-o", other)
+    assert result["compared"] is None
+    config = logged_configuration(other)
     assert (config.estimator.output, config.gnss.sigma_m) == ("kalman", 3.5)
     assert values(other, r.Gnss) == values(flown, r.Gnss)
 
 
-def test_keys_are_told_short_and_long() -> None:
-    config = replay_inputs.changed(
+def test_keys_with_and_without_section() -> None:
+    config = replay_inputs.apply_changes(
         Config(), "estimator=kalman,gnss.sigma_m=3,ahead_min=[1.0,2.0],window_min=10"
     )
     assert config.estimator.output == "kalman" and config.gnss.sigma_m == 3.0
     assert config.predictor.ahead_min == (1.0, 2.0) and config.predictor.window_min == 10.0
     for text, words in (
         ("estimator=foo", "--with estimator.output=foo"),
-        ("timeout_s=3", "sections gnss, rsbn have one each"),
-        ("beta=3", "no section has it"),
+        ("timeout_s=3", "sections gnss, rsbn all have this key"),
+        ("beta=3", "no section has this key"),
         ("gnss.sigma=3", "did you mean `sigma_m`"),
         ("estimator", "write it as SECTION.KEY=VALUE"),
         ("estimator=kalman,scheme=feedback", "set inertial.source = 'air_data' or 'strapdown'"),
     ):
         with pytest.raises(ConfigError, match=words) as caught:
-            replay_inputs.changed(Config(), text)
+            replay_inputs.apply_changes(Config(), text)
         assert "--set" not in str(caught.value)
 
 
 @pytest.mark.parametrize("name", ["a.tlog", "a.bin", "a.log", "a.ulg", "a.mat", "a.zip", "a.mcap"])
 @pytest.mark.parametrize("content", [None, b"", b"something else " * 400])
-def test_what_cannot_be_read_ends_in_a_sentence(
+def test_unreadable_log_is_reported_in_one_sentence(
     tmp_path: pathlib.Path, name: str, content: bytes | None
 ) -> None:
     path = tmp_path / name
     if content is not None:
         path.write_bytes(content)
-    told = str(run("replay", path, "-o", tmp_path / "x.mcap", fails=LogError).exception)
-    assert name in told and "\n" not in told
+    result = str(run("replay", path, "-o", tmp_path / "x.mcap", fails=LogError).exception)
+    assert name in result and "\n" not in result
     if path.suffix != ".mcap":
         result = CliRunner().invoke(cli, ["log", "convert", str(path), "-o", str(tmp_path / "y.mcap")])
         assert result.exit_code == 1 and result.output.count("\n") == 1
-    assert not list(tmp_path.glob("[xy].mcap*"))  # nothing begun is left behind
+    assert not list(tmp_path.glob("[xy].mcap*"))  # no partial files remain
 
 
-def test_convert_overwrites_nothing(tmp_path: pathlib.Path) -> None:
+def test_convert_does_not_overwrite(tmp_path: pathlib.Path) -> None:
     there = tmp_path / "there.mcap"
-    there.write_bytes(b"dear")
+    there.write_bytes(b"existing")
     result = CliRunner().invoke(cli, ["log", "convert", str(FLIGHT), "-o", str(there)])
-    assert result.exit_code == 1 and "is there already" in result.output
-    assert there.read_bytes() == b"dear"
+    assert result.exit_code == 1 and "already exists" in result.output
+    assert there.read_bytes() == b"existing"
 
 
 @pytest.mark.shared
-def test_the_glitch_of_the_real_quadrotor_is_an_event(tmp_path: pathlib.Path) -> None:
+def test_recorded_quadrotor_glitch_is_an_event(tmp_path: pathlib.Path) -> None:
     path = SHARED / "inertialnav" / "f450_glitch_log.zip"
     if not path.exists():
-        pytest.skip("the recordings do not stand beside the repository")
+        pytest.skip("the recordings are not available")
     written = tmp_path / "f450.mcap"
-    told = report(path, "-o", written)
-    assert told["outputs"]["Solution"] > 500
+    result = report(path, "-o", written)
+    assert result["outputs"]["Solution"] > 500
     (glitch,) = [event for event in values(written, r.Event) if "GNSS glitch" in event.text]
     assert 126.2 < glitch.t_ns * 1e-9 < 127.7
 
 
-def test_a_log_of_ours_needs_no_conversion(tmp_path: pathlib.Path) -> None:
+def test_conversion_of_an_own_log_is_rejected(tmp_path: pathlib.Path) -> None:
     log, again, foreign = tmp_path / "x.mcap", tmp_path / "y.mcap", tmp_path / "z.mcap"
     run("log", "convert", FLIGHT, "-o", log)
     foreign.write_bytes(b"what is this" * 20)
-    for source, said in ((log, f"{log} is an MCAP log already"), (foreign, "is not an MCAP log")):
+    for source, message in ((log, f"{log} is already an MCAP log"), (foreign, "is not an MCAP log")):
         result = CliRunner().invoke(cli, ["log", "convert", str(source), "-o", str(again)])
-        assert result.exit_code == 1 and said in result.output
+        assert result.exit_code == 1 and message in result.output
     assert not again.exists()

@@ -1,5 +1,6 @@
-"""A report says what is in its log: errors put in come out, refusals in a row are one event, a broken bound
-is told, the page stands alone and draws itself in a real browser (skipped where there is no chromium).
+"""Reports: simulated errors, grouped rejections and violated bounds are stated; the page is self-contained.
+
+The page is opened in a real browser (skipped without chromium).
 """
 
 import html
@@ -18,17 +19,16 @@ from hypothesis import strategies as st
 
 from companion.analysis import assessment as assessing
 from companion.analysis import error_statistics
-from companion.analysis.assessment import assess
-from companion.analysis.convert import convert
-from companion.analysis.figures import figures
-from companion.analysis.flight_arrays import gather
-from companion.analysis.flight_events import refusal
+from companion.analysis.assessment import assess_flight
+from companion.analysis.convert import convert_log
+from companion.analysis.figures import build_figures
+from companion.analysis.flight_arrays import collect_flights
+from companion.analysis.flight_events import describe_rejections
 from companion.analysis.flights import open_flights
-from companion.analysis.plot_data import thinned
+from companion.analysis.plot_data import thin_line
 from companion.analysis.replay import command as replay_command
-from companion.analysis.replay import metadata
 from companion.analysis.report import command
-from companion.analysis.summary import clock, comparison, lasting, verdict
+from companion.analysis.summary import compare_flights, format_duration, format_time, summarize_flight
 from companion.config import Config
 from companion.nav.geometry import displace
 from companion.records import (
@@ -48,6 +48,7 @@ from companion.records import (
 )
 from companion.storage import flight_log
 from companion.storage.reader import LogError
+from companion.storage.run_metadata import run_metadata
 
 S = 1_000_000_000
 START = 5_000 * S
@@ -59,7 +60,7 @@ needs_chromium = pytest.mark.skipif(CHROMIUM is None, reason="no chromium to ope
 
 
 def flight_records(error=(3.0, 4.0), bound=(30.0, 40.0), ins=(60.0, 80.0), truth=True):
-    """Five minutes eastwards at 20 m/s; GNSS lost from LOST to FOUND, refused for 2 s at 60 s."""
+    """Five minutes eastwards at 20 m/s; GNSS lost from LOST to FOUND, rejected for 2 s at 60 s."""
     rows = []
     for k in range(END * 5):
         t = START + k * S // 5
@@ -104,21 +105,23 @@ def flight_records(error=(3.0, 4.0), bound=(30.0, 40.0), ins=(60.0, 80.0), truth
 
 
 def flight(**kind):
-    (found,) = gather(((flight_log.topic_of(type(r)), r) for r in flight_records(**kind)), "made.mcap")
+    (found,) = collect_flights(
+        ((flight_log.topic_of(type(r)), r) for r in flight_records(**kind)), "made.mcap"
+    )
     return found
 
 
 @pytest.fixture(scope="module")
 def assessed():
-    return assess(flight())
+    return assess_flight(flight())
 
 
 @pytest.fixture(scope="module")
 def log(tmp_path_factory):
-    """A log in the file system whose name tries to end the page's script."""
+    """A log whose name contains a script element."""
     path = tmp_path_factory.mktemp("logs") / "a <script> & b.mcap"
     with flight_log.Writer(
-        path, metadata=metadata(Config()), start_unix_ns=1_700_000_000 * S, start_ns=START, block=True
+        path, metadata=run_metadata(Config()), start_unix_ns=1_700_000_000 * S, start_ns=START, block=True
     ) as out:
         for record in flight_records():
             out.record(record)
@@ -138,7 +141,7 @@ def page(log, tmp_path_factory):
 # -- numbers ---------------------------------------------------------------------------------------------
 
 
-def test_the_errors_put_in_come_out(assessed):
+def test_simulated_errors_are_reported(assessed):
     assert assessed.reference.what == assessing.TRUTH
     assert np.allclose(assessed.errors[error_statistics.CORRECTED].error, 5.0, atol=1e-3)
     assert np.allclose(assessed.errors[error_statistics.INS].error, 100.0, atol=1e-2)
@@ -149,46 +152,48 @@ def test_the_errors_put_in_come_out(assessed):
         assert row.rms[error_statistics.CORRECTED] == pytest.approx(5.0, abs=1e-3)
 
 
-def test_answers_of_beacons_are_scored_whatever_else_is_heard_as_the_loopback_scores_them(assessed):
-    """The flight has GNSS but for two minutes; every answer of its beacon counts."""
+def test_beacon_errors_equal_those_of_the_loopback(assessed):
+    """GNSS is available except for two minutes; every beacon measurement is counted."""
 
     def truth(t_ns):
         return displace(LAT, LON, 100.0, 0.0, 20.0 * (t_ns - START) / S, 0.0)
 
-    there = error_statistics.errors([r for r in flight_records() if isinstance(r, RsbnFix)], truth)[
-        error_statistics.RSBN
-    ]
+    expected = error_statistics.horizontal_errors(
+        [r for r in flight_records() if isinstance(r, RsbnFix)], truth
+    )[error_statistics.RSBN]
     found = assessed.errors[error_statistics.RSBN]
-    assert len(found.t_ns) == len(there.t_ns) == END // 5
-    assert np.allclose(found.error, there.error, rtol=1e-3, atol=0.1)
+    assert len(found.t_ns) == len(expected.t_ns) == END // 5
+    assert np.allclose(found.error, expected.error, rtol=1e-3, atol=0.1)
     assert all(error_statistics.RSBN in row.rms for row in assessed.rows)
 
 
 def rebooted(at_s=200.0):
-    """The same five minutes, in which the autopilot began anew."""
+    """The same five minutes, with a reboot of the autopilot."""
     at = START + round(at_s * S)
     rows = flight_records()
     k = next(k for k, r in enumerate(rows) if r.rx_ns >= at)
     return [*rows[:k], Reboot(at, at, 1), *rows[k:]]
 
 
-def test_a_reboot_parts_a_log_into_flights():
+def test_reboot_splits_a_log_into_flights():
     records = [(flight_log.topic_of(type(r)), r) for r in rebooted()]
-    first, second = gather(records, "made.mcap", unix_ns=10**18)
+    first, second = collect_flights(records, "made.mcap", unix_ns=10**18)
     assert (first.part, second.part) == ((1, 2), (2, 2))
     assert (second.unix_ns - first.unix_ns, second.zero_ns - first.zero_ns) == (200 * S, 200 * S)
     assert sum(len(s.t) for f in (first, second) for s in f.streams.values()) == len(records)
     assert "/in/Reboot" in second.streams and "/in/Reboot" not in first.streams
-    said = verdict(assess(second))
-    assert "Flight 2 of 2 lasts 1 min 40 s." in said
-    assert "GNSS was lost once" not in said  # it was lost in the first: here it comes at 0:40
+    text_of_summary = summarize_flight(assess_flight(second))
+    assert "Flight 2 of 2 lasts 1 min 40 s." in text_of_summary
+    assert (
+        "GNSS was lost once" not in text_of_summary
+    )  # the outage is in the first flight: here GNSS starts at 0:40
 
 
-def test_every_flight_of_a_log_has_its_chapters(tmp_path):
+def test_every_flight_has_its_own_chapters(tmp_path):
     pytest.importorskip("plotly")
     log, out = tmp_path / "two.mcap", tmp_path / "r.html"
     with flight_log.Writer(
-        log, metadata=metadata(Config()), start_unix_ns=1_700_000_000 * S, start_ns=START, block=True
+        log, metadata=run_metadata(Config()), start_unix_ns=1_700_000_000 * S, start_ns=START, block=True
     ) as writer:
         for record in rebooted():
             writer.record(record)
@@ -202,94 +207,97 @@ def test_every_flight_of_a_log_has_its_chapters(tmp_path):
     assert set(json.loads(re.search(r"id='figures'>(.*?)</script>", text, re.S)[1])) == set(ids)
     assert (tmp_path / "flight2_track.png").exists()
     replayed = CliRunner().invoke(replay_command, [str(log), "-o", str(tmp_path / "x.mcap")])
-    assert "2 flights, the autopilot having begun anew" in replayed.output
+    assert "2 flights, separated by reboots of the autopilot" in replayed.output
 
 
-def test_phases_are_what_the_position_rests_on(assessed):
+def test_phases_follow_the_sources_of_the_position(assessed):
     assert [phase.name for phase in assessed.phases] == ["GNSS", "prediction", "GNSS"]
     assert [round(phase.start_ns / S) for phase in assessed.phases] == [0, LOST, FOUND]
     assert [(round(h.start), round(h.end)) for h in assessed.outages] == [(LOST, FOUND)]
 
 
-def test_refusals_in_a_row_are_one_event(assessed):
+def test_consecutive_rejections_are_grouped(assessed):
     (group,) = assessed.groups
     assert (group.source, group.number) == ("gnss 0", 10)
     assert (group.start, group.end) == pytest.approx((60.0, 61.8))
     assert group.metres == pytest.approx(500.0, abs=5.0)
     assert group.value == 99.0 + 309
-    assert "10 in a row" in refusal(group)
-    assert [line.text for line in assessed.timeline if line.kind == "refused"] == [refusal(group)]
+    assert "10 in a row" in describe_rejections(group)
+    assert [line.text for line in assessed.timeline if line.kind == "rejected"] == [
+        describe_rejections(group)
+    ]
 
 
-def test_nees_is_the_squared_error_by_its_covariance(assessed):
-    (nees,) = (misfit for misfit in assessed.misfits if misfit.what == "NEES")
+def test_nees_is_the_normalized_squared_error(assessed):
+    (nees,) = (series for series in assessed.normalized_errors if series.what == "NEES")
     assert np.allclose(nees.value, 1.0, atol=1e-3)
     assert nees.inside == 1.0
-    (nis,) = (misfit for misfit in assessed.misfits if misfit.what == "NIS")
+    (nis,) = (series for series in assessed.normalized_errors if series.what == "NIS")
     assert np.allclose(nis.value, 0.5)
 
 
-def test_chi_square_limits_are_those_of_the_tables():
+def test_chi_square_quantiles_match_tables():
     found = assessing.chi2_95(np.array([1.0, 2.0, 3.0]))
     assert np.allclose(found, [3.841, 5.991, 7.815], atol=1e-3)
 
 
 @pytest.mark.parametrize(("size", "held"), [(4.9, False), (5.1, True)])
-def test_a_bound_that_does_not_hold_is_told(size, held):
+def test_violated_bound_is_reported(size, held):
     side = size / math.sqrt(2.0)
-    a = assess(flight(bound=(side, side)))
+    a = assess_flight(flight(bound=(side, side)))
     assert all(row.held is held for row in a.rows)
-    assert ("DID NOT HOLD in 3 of 3 phases" in verdict(a)) is not held
-    assert ("held in every phase" in verdict(a)) is held
+    assert ("DID NOT HOLD in 3 of 3 phases" in summarize_flight(a)) is not held
+    assert ("held in every phase" in summarize_flight(a)) is held
 
 
-def test_the_verdict_tells_what_happened(assessed):
-    said = verdict(assessed)
+def test_summary_describes_the_flight(assessed):
+    text_of_summary = summarize_flight(assessed)
     for words in (
-        "The log holds 5 min.",
+        "The log covers 5 min.",
         "GNSS was lost once, for 2 min (from 2:00 to 4:00).",
-        "off by 5.0 m with fixes and 5.0 m without (r.m.s.), 5.0 m at most; the inertial channel alone 100 m",
-        "10 fixes were refused, from 1:00 to 1:02",
+        "error of the estimate was 5.0 m with fixes and 5.0 m without (r.m.s.), 5.0 m at most; "
+        "the inertial channel alone 100 m",
+        "10 fixes were rejected, from 1:00 to 1:02",
         "1 reset, the first at 0:10",
     ):
-        assert words in said
+        assert words in text_of_summary
 
 
-def test_an_estimate_worse_than_the_inertial_channel_is_odd():
-    assert "worse than the inertial channel alone" in verdict(
-        assess(flight(error=(30.0, 40.0), ins=(3.0, 4.0)))
+def test_estimate_worse_than_the_inertial_channel_is_an_anomaly():
+    assert "worse than the inertial channel alone" in summarize_flight(
+        assess_flight(flight(error=(30.0, 40.0), ins=(3.0, 4.0)))
     )
 
 
-def test_without_truth_the_reference_is_said_so():
-    a = assess(flight(truth=False))  # no origin: nothing to smooth
+def test_reference_without_truth_is_named():
+    a = assess_flight(flight(truth=False))  # no origin: nothing to smooth
     assert a.reference.what == assessing.GNSS
-    assert "GNSS is no truth" in verdict(a)
-    assert error_statistics.GNSS not in a.errors  # it would be compared with itself
+    assert "GNSS is not a truth" in summarize_flight(a)
+    assert error_statistics.GNSS not in a.errors  # GNSS is the reference itself
 
 
-def test_two_flights_are_compared_phase_by_phase(assessed):
-    worse = assess(flight(error=(6.0, 8.0)))
-    said = comparison(assessed, worse)
-    assert "Without fixes A was nearer: 5.0 m r.m.s. against 10.0 m of B." in said
-    for figure in figures([assessed, worse]):
+def test_two_flights_are_compared(assessed):
+    worse = assess_flight(flight(error=(6.0, 8.0)))
+    text_of_summary = compare_flights(assessed, worse)
+    assert "Without fixes A had the smaller error: 5.0 m r.m.s., and 10.0 m for B." in text_of_summary
+    for figure in build_figures([assessed, worse]):
         assert all(line.name[:2] in ("A ", "B ", "") for line in figure.lines)
 
 
-def test_durations_read_as_people_say_them():
-    assert [lasting(s) for s in (3.24, 42.0, 60.0, 187.0, 3600.0, 3725.0)] == [
+def test_durations_and_times_are_formatted():
+    assert [format_duration(s) for s in (3.24, 42.0, 60.0, 187.0, 3600.0, 3725.0)] == [
         *("3.2 s", "42 s", "1 min", "3 min 7 s", "1 h", "1 h 2 min 5 s"),
     ]
-    assert [clock(s) for s in (0.0, 187.4, -26.0, 7200.0)] == ["0:00", "3:07", "-0:26", "120:00"]
+    assert [format_time(s) for s in (0.0, 187.4, -26.0, 7200.0)] == ["0:00", "3:07", "-0:26", "120:00"]
 
 
 @settings(deadline=None, max_examples=60)
 @given(st.integers(1, 5000), st.integers(20, 400), st.integers(0, 2**32 - 1))
-def test_thinning_keeps_every_extreme_and_the_ends(n, most, seed):
+def test_thinning_keeps_extremes_and_ends(n, most, seed):
     rng = np.random.default_rng(seed)
     x, y = np.arange(float(n)), rng.normal(size=n)
     y[rng.random(n) < 0.1] = np.nan
-    kept_x, kept_y = thinned(x, y, most)
+    kept_x, kept_y = thin_line(x, y, most)
     assert len(kept_x) <= max(n if n <= most else 0, 1.5 * most + 4)
     assert (np.diff(kept_x) > 0.0).all()
     assert (kept_x[0], kept_x[-1]) == (x[0], x[-1])
@@ -299,15 +307,15 @@ def test_thinning_keeps_every_extreme_and_the_ends(n, most, seed):
         assert np.nanmin(kept_y) <= np.nanmin(whole)
 
 
-# -- the page --------------------------------------------------------------------------------------------
+# -- page ------------------------------------------------------------------------------------------------
 
 
-def test_the_page_stands_alone(page):
+def test_page_is_self_contained(page):
     text = page.read_text("utf-8")
     own = text[: text.index("<script>")] + text[text.index("<script type='application/json'") :]
     assert not re.findall(r"(?:src|href)\s*=\s*['\"]?\s*(?:https?:)?//", own)
     assert "@import" not in own
-    assert "a <script> & b" not in own  # a log's name is words, not HTML
+    assert "a <script> & b" not in own  # the name of a log is escaped
     assert html.escape("a <script> & b.mcap") in own
     assert "&lt;b&gt;no&lt;/b&gt; fixes" in own
     data = json.loads(re.search(r"id='figures'>(.*?)</script>", own, re.S)[1])
@@ -319,15 +327,15 @@ def test_the_page_stands_alone(page):
     assert page.stat().st_size < 12e6
 
 
-def opened(page, width, folder):
-    """What the page says of itself in a browser `width` wide, and what its console said."""
-    # no window is narrower than 500: a frame is
+def open_in_browser(page, width, folder):
+    """Return the status attributes of the page in a browser `width` wide, and its console output."""
+    # a browser window is at least 500 wide, a frame is not
     frame = folder / f"frame{width}.html"
     frame.write_text(
         f"<!doctype html><iframe src='{page.as_uri()}' style='border:0;width:{width}px;height:3000px'>"
         "</iframe>"
         "<script>setInterval(() => { const d = document.querySelector('iframe').contentDocument;"
-        "if (d) document.documentElement.dataset.said = JSON.stringify(d.documentElement.dataset); }, 100)"
+        "if (d) document.documentElement.dataset.status = JSON.stringify(d.documentElement.dataset); }, 100)"
         "</script>"
     )
     found = subprocess.run(
@@ -347,22 +355,22 @@ def opened(page, width, folder):
         text=True,
         timeout=180,
     )
-    said = re.search(r'data-said="([^"]*)"', found.stdout)
-    assert said, found.stderr[-2000:]
+    status = re.search(r'data-status="([^"]*)"', found.stdout)
+    assert status, found.stderr[-2000:]
     console = [line for line in found.stderr.splitlines() if "CONSOLE" in line]
-    return json.loads(html.unescape(said[1])), console
+    return json.loads(html.unescape(status[1])), console
 
 
 @needs_chromium
 @pytest.mark.parametrize("width", [1280, 390])
-def test_a_browser_draws_every_plot_without_a_word(page, width, tmp_path):
-    said, console = opened(page, width, tmp_path)
+def test_browser_draws_every_plot_without_console_output(page, width, tmp_path):
+    status, console = open_in_browser(page, width, tmp_path)
     plots = len(re.findall(r"id='plot-\w+'", page.read_text("utf-8")))
-    assert said == {"drawn": str(plots), "failed": "0", "overflow": "0"}
+    assert status == {"drawn": str(plots), "failed": "0", "overflow": "0"}
     assert console == []
 
 
-def test_figures_go_to_paper(log, tmp_path):
+def test_figures_are_written_to_pdf_and_png(log, tmp_path):
     pytest.importorskip("matplotlib")
     pytest.importorskip("plotly")
     out, pdf, png = tmp_path / "r.html", tmp_path / "r.pdf", tmp_path / "png"
@@ -388,7 +396,7 @@ def test_figures_go_to_paper(log, tmp_path):
         ("picture.png", b"\x89PNG"),
     ],
 )
-def test_bad_input_is_one_sentence(name, content, tmp_path):
+def test_invalid_input_is_reported_in_one_sentence(name, content, tmp_path):
     path = tmp_path / name
     if content is not None:
         path.write_bytes(content)
@@ -400,7 +408,7 @@ def test_bad_input_is_one_sentence(name, content, tmp_path):
 
 
 @pytest.mark.parametrize("option", ["-o", "--pdf"])
-def test_no_log_is_written_over(option, log, tmp_path):
+def test_logs_are_not_overwritten(option, log, tmp_path):
     other, link, before = tmp_path / "other.tlog", tmp_path / "page.html", log.read_bytes()
     other.write_bytes(b"another flight")
     link.symlink_to(log)
@@ -410,7 +418,7 @@ def test_no_log_is_written_over(option, log, tmp_path):
     assert log.read_bytes() == before and other.read_bytes() == b"another flight"
 
 
-def test_a_page_is_written_over_an_older_one(log, tmp_path):
+def test_older_page_is_overwritten(log, tmp_path):
     pytest.importorskip("plotly")
     page = tmp_path / "r.html"
     page.write_text("an older one")
@@ -418,7 +426,7 @@ def test_a_page_is_written_over_an_older_one(log, tmp_path):
     assert "an older one" not in page.read_text("utf-8")
 
 
-def test_what_would_be_flown_with_is_refused_where_nothing_is_flown(log, tmp_path):
+def test_configuration_options_are_rejected_for_flown_logs(log, tmp_path):
     mine = tmp_path / "mine.toml"
     mine.write_text("[gnss]\nsigma_m = 7.5\n")
     for option in (["--with", "gnss.sigma_m=50"], ["--config", str(mine)]):
@@ -428,20 +436,20 @@ def test_what_would_be_flown_with_is_refused_where_nothing_is_flown(log, tmp_pat
         assert not (tmp_path / "r.html").exists()
 
 
-def test_a_report_is_of_one_log_or_two(log):
+def test_report_accepts_one_or_two_logs(log):
     assert CliRunner().invoke(command, [str(log)] * 3).exit_code == 2
 
 
-def test_a_page_that_cannot_be_written_is_said(log, tmp_path):
+def test_unwritable_page_is_reported(log, tmp_path):
     pytest.importorskip("plotly")
     found = CliRunner().invoke(command, [str(log), "-o", str(tmp_path / "no" / "r.html")])
     assert isinstance(found.exception, LogError)
     assert "cannot write the report" in str(found.exception)
 
 
-def test_a_converted_log_is_flown_like_what_it_was_made_of(tmp_path):
+def test_converted_log_is_reported_as_the_original(tmp_path):
     folder, log = Path(__file__).parents[1] / "data" / "umn_fixed_wing_cut", tmp_path / "umn.mcap"
-    convert(folder, log)
+    convert_log(folder, log)
     (direct,), (converted,) = open_flights(folder, Config()), open_flights(log, Config())
     for name, table in direct.tables.items():
         for column in table:
@@ -449,18 +457,20 @@ def test_a_converted_log_is_flown_like_what_it_was_made_of(tmp_path):
     assert len(converted.tables["Solution"]["t"]) > 10
     (delay,) = converted.latencies
     assert delay.seconds == pytest.approx(0.2, abs=0.05)
-    assert "behind the local position" in verdict(assess(converted))
+    assert "behind the local position" in summarize_flight(assess_flight(converted))
 
 
 @pytest.mark.shared
-@pytest.mark.skipif(not DATA.exists(), reason="the recordings are not here")
-def test_the_glitch_of_the_f450_is_an_event():
+@pytest.mark.skipif(not DATA.exists(), reason="the recordings are not available")
+def test_f450_glitch_is_an_event():
     (flight,) = open_flights(DATA / "inertialnav" / "f450_glitch_log.zip", Config())
-    a = assess(flight)
-    (group,) = (group for group in a.groups if group.source == "gnss 0")  # excluded, as it drifts off before
+    a = assess_flight(flight)
+    (group,) = (
+        group for group in a.groups if group.source == "gnss 0"
+    )  # excluded already during the preceding drift
     assert 124.0 < group.start < 126.7
     assert group.end > 128.0
     assert 10.0 < group.metres < 20.0
     (line,) = (line for line in a.timeline if line.kind == "glitch")
     assert 126.2 < line.t < 127.7
-    assert line.text in verdict(a)
+    assert line.text in summarize_flight(a)

@@ -1,4 +1,4 @@
-"""Simulated beacons answer what geometry says, with the noise they state; outages silence what they name."""
+"""Simulated beacon measurements follow geometry and stated noise; outages remove the named source."""
 
 import math
 import pathlib
@@ -15,101 +15,109 @@ from companion.storage.reader import LogError
 
 TESTS = pathlib.Path(__file__).parents[1]
 SHARED = TESTS.parent.parent / "shared" / "data"
-NEAR = simulated_rsbn.Beacon(7, 0.79, -1.62, 300.0)
+NEAR = simulated_rsbn.ListedBeacon(7, 0.79, -1.62, 300.0)
 
 
-def track(n: int = 2000, alt: float = 3000.0) -> simulated_rsbn.Track:
-    """East at about 100 m/s, a position every half second."""
+def track(n: int = 2000, alt: float = 3000.0) -> simulated_rsbn.AircraftTrack:
+    """Return a track eastwards at about 100 m/s, a position every half second."""
     t = 500_000_000 * np.arange(n)
     lat = np.full(n, 0.785)
-    return simulated_rsbn.Track(t, lat, -1.63 + 1.1e-5 * np.arange(n), np.full(n, alt), "a straight line")
+    return simulated_rsbn.AircraftTrack(
+        t, lat, -1.63 + 1.1e-5 * np.arange(n), np.full(n, alt), "a straight line"
+    )
 
 
-def place(flown: simulated_rsbn.Track, t_ns: int) -> Geodetic:
-    return Geodetic(*(float(np.interp(t_ns, flown.t_ns, x)) for x in (flown.lat, flown.lon, flown.alt)))
+def place(aircraft: simulated_rsbn.AircraftTrack, t_ns: int) -> Geodetic:
+    return Geodetic(
+        *(float(np.interp(t_ns, aircraft.t_ns, x)) for x in (aircraft.lat, aircraft.lon, aircraft.alt))
+    )
 
 
-def test_answers_are_the_sights_with_the_noise_they_state() -> None:
-    flown = track()
-    heard = simulated_rsbn.answers([NEAR], flown)
-    assert len(heard) == 1000
-    sights = [slant_range_azimuth(Geodetic(*NEAR[1:4]), place(flown, a.t_ns)) for a in heard]
-    azimuth = [(a.azimuth - s.azimuth) / a.sigma_azimuth for a, s in zip(heard, sights)]  # type: ignore[operator]
-    slant = [(a.slant_range - s.slant_range) / a.sigma_range for a, s in zip(heard, sights)]  # type: ignore[operator]
+def test_measurements_have_the_stated_noise() -> None:
+    aircraft = track()
+    fixes = simulated_rsbn.simulate_measurements([NEAR], aircraft)
+    assert len(fixes) == 1000
+    geometries = [slant_range_azimuth(Geodetic(*NEAR[1:4]), place(aircraft, a.t_ns)) for a in fixes]
+    azimuth = [(a.azimuth - s.azimuth) / a.sigma_azimuth for a, s in zip(fixes, geometries)]  # type: ignore[operator]
+    slant = [(a.slant_range - s.slant_range) / a.sigma_range for a, s in zip(fixes, geometries)]  # type: ignore[operator]
     for standard in (azimuth, slant):
         assert abs(np.mean(standard)) < 4.0 / math.sqrt(1000)
         assert np.std(standard) == pytest.approx(1.0, abs=0.1)
-    assert heard[0].sigma_range == pytest.approx(200.0 + 3e-4 * sights[0].slant_range)
+    assert fixes[0].sigma_range == pytest.approx(200.0 + 3e-4 * geometries[0].slant_range)
 
 
-def test_the_seed_decides_and_a_beacon_has_its_own_noise() -> None:
+def test_noise_depends_on_seed_and_beacon() -> None:
     other = NEAR._replace(number=8, lat=0.78)
-    alone, again = (simulated_rsbn.answers([NEAR], track(), seed=3) for _ in "ab")
-    assert alone == again != simulated_rsbn.answers([NEAR], track(), seed=4)
-    both = simulated_rsbn.answers([other, NEAR], track(), seed=3)
+    alone, again = (simulated_rsbn.simulate_measurements([NEAR], track(), seed=3) for _ in "ab")
+    assert alone == again != simulated_rsbn.simulate_measurements([NEAR], track(), seed=4)
+    both = simulated_rsbn.simulate_measurements([other, NEAR], track(), seed=3)
     assert [answer for answer in both if answer.beacon == 7] == alone
     assert [answer.rx_ns for answer in both] == sorted(answer.rx_ns for answer in both)
 
 
-def test_only_beacons_above_the_horizon_and_within_range_answer() -> None:
+def test_only_beacons_above_the_horizon_and_within_range_are_received() -> None:
     low, beacon = track(alt=20.0), Geodetic(0.785, -1.632, 1.0)
-    heard = {a.t_ns for a in simulated_rsbn.answers([simulated_rsbn.Beacon(1, *beacon)], low)}
-    told = {int(t) for t in low.t_ns[::2] if in_radio_sight(beacon, place(low, int(t)))}
-    assert heard == told and 0 < len(told) < 1000
+    fixes = {
+        a.t_ns for a in simulated_rsbn.simulate_measurements([simulated_rsbn.ListedBeacon(1, *beacon)], low)
+    }
+    records = {int(t) for t in low.t_ns[::2] if in_radio_sight(beacon, place(low, int(t)))}
+    assert fixes == records and 0 < len(records) < 1000
     far = track(alt=300.0 + 9000.0)
     limit = 50_000.0
-    close = simulated_rsbn.answers([simulated_rsbn.Beacon(1, *beacon, range_limit=limit)], far)
+    close = simulated_rsbn.simulate_measurements(
+        [simulated_rsbn.ListedBeacon(1, *beacon, range_limit=limit)], far
+    )
     assert 0 < len(close) < 1000
     assert all(slant_range_azimuth(beacon, place(far, a.t_ns)).slant_range <= limit for a in close)
 
 
 @pytest.mark.parametrize("alt", [20.0, 250.0])
-def test_a_higher_beacon_is_heard_wherever_a_lower_one_is(alt: float) -> None:
-    heard: set[int] = set()
+def test_higher_beacon_is_received_wherever_a_lower_one_is(alt: float) -> None:
+    fixes: set[int] = set()
     for height in (-30.0, 0.0, 20.0, 50.0, 200.0, 260.0, 2000.0):
-        lower, beacon = heard, simulated_rsbn.Beacon(1, 0.7855, -1.64, height)
-        heard = {answer.t_ns for answer in simulated_rsbn.answers([beacon], track(alt=alt))}
-        assert heard >= lower
-    assert heard
+        lower, beacon = fixes, simulated_rsbn.ListedBeacon(1, 0.7855, -1.64, height)
+        fixes = {answer.t_ns for answer in simulated_rsbn.simulate_measurements([beacon], track(alt=alt))}
+        assert fixes >= lower
+    assert fixes
 
 
-def test_no_azimuth_overhead_and_the_nearest_few_are_followed() -> None:
-    flown = track(n=200, alt=9000.0)
-    below = simulated_rsbn.Beacon(1, float(flown.lat[100]), float(flown.lon[100]), 0.0)
-    quiet = {a.azimuth is None for a in simulated_rsbn.answers([below], flown)}
-    assert quiet == {True}  # never more than 9 km aside
-    ring = [simulated_rsbn.Beacon(k, 0.785 + 0.002 * k, -1.63, 0.0) for k in range(1, 8)]
-    assert {a.beacon for a in simulated_rsbn.answers(ring, flown)} == {1, 2, 3, 4}
+def test_no_azimuth_in_the_cone_of_silence_and_nearest_beacons_are_followed() -> None:
+    aircraft = track(n=200, alt=9000.0)
+    below = simulated_rsbn.ListedBeacon(1, float(aircraft.lat[100]), float(aircraft.lon[100]), 0.0)
+    quiet = {a.azimuth is None for a in simulated_rsbn.simulate_measurements([below], aircraft)}
+    assert quiet == {True}  # always within 9 km horizontally
+    ring = [simulated_rsbn.ListedBeacon(k, 0.785 + 0.002 * k, -1.63, 0.0) for k in range(1, 8)]
+    assert {a.beacon for a in simulated_rsbn.simulate_measurements(ring, aircraft)} == {1, 2, 3, 4}
 
 
-def test_a_gap_of_the_track_is_silent() -> None:
+def test_no_measurements_in_gaps_of_the_track() -> None:
     whole = track()
     kept = np.r_[0:400, 800:2000]
-    cut = simulated_rsbn.Track(*(column[kept] for column in whole[:4]), whole.origin)
-    times = [a.t_ns * 1e-9 for a in simulated_rsbn.answers([NEAR], cut)]
+    cut = simulated_rsbn.AircraftTrack(*(column[kept] for column in whole[:4]), whole.origin)
+    times = [a.t_ns * 1e-9 for a in simulated_rsbn.simulate_measurements([NEAR], cut)]
     assert not any(200.0 <= t < 400.0 for t in times) and len(times) == pytest.approx(800, abs=2)
 
 
-def test_the_track_is_the_truth_where_there_is_any() -> None:
-    told = [r.Truth(k, k, 0.1 * k, 0.2, 3.0, (0.0, 0.0, 0.0)) for k in (1, 2, 2, 3)]
-    found = simulated_rsbn.track_of(told, Config())
+def test_track_is_the_truth_if_logged() -> None:
+    records = [r.Truth(k, k, 0.1 * k, 0.2, 3.0, (0.0, 0.0, 0.0)) for k in (1, 2, 2, 3)]
+    found = simulated_rsbn.extract_track(records, Config())
     assert found.origin == "the log's truth"
     assert found.t_ns.tolist() == [1, 2, 3] and found.lat[2] == pytest.approx(0.3)
 
 
-def test_without_truth_the_track_is_the_smoothed_flight() -> None:
+def test_track_without_truth_is_the_smoothed_flight() -> None:
     folder = TESTS / "data" / "umn_fixed_wing_cut"
-    found = simulated_rsbn.track_of(sources.open_source(folder), Config())
+    found = simulated_rsbn.extract_track(sources.open_source(folder), Config())
     assert "not a truth" in found.origin
     for record in sources.open_source(folder):
         if isinstance(record, r.Gnss) and found.t_ns[5] < record.t_ns < found.t_ns[-1]:
             at = place(found, record.t_ns)
-            assert abs(at.lat - record.lat) * 6.4e6 < 15.0  # 25 m/s a fifth of a second late, and noise
+            assert abs(at.lat - record.lat) * 6.4e6 < 15.0  # 0.2 s delay at 25 m/s, and noise
     with pytest.raises(LogError, match="no track"):
-        simulated_rsbn.track_of([], Config())
+        simulated_rsbn.extract_track([], Config())
 
 
-def test_an_outage_silences_what_it_names() -> None:
+def test_outage_removes_the_named_source() -> None:
     def fix(second: int) -> r.Gnss:
         return r.Gnss(10**9 * second, 10**9 * second, 0, second, 3, 0.1, 0.2, 3.0)
 
@@ -117,21 +125,23 @@ def test_an_outage_silences_what_it_names() -> None:
         t = 10**9 * second
         return r.RsbnFix(t, t, 1, 0.1, 0.2, 3.0, 0.4, 5.0, 0.1, 1.0)
 
-    told: list[r.Stamped] = [make(s) for s in range(100, 110) for make in (fix, answer)]
-    left = list(simulated_rsbn.without(told, [simulated_rsbn.parse_outage("gnss:2-5")], 100 * 10**9))
+    records: list[r.Stamped] = [make(s) for s in range(100, 110) for make in (fix, answer)]
+    left = list(simulated_rsbn.apply_outages(records, [simulated_rsbn.parse_outage("gnss:2-5")], 100 * 10**9))
     assert [x.stamp_us for x in left if isinstance(x, r.Gnss)] == [100, 101, 105, 106, 107, 108, 109]
     assert sum(isinstance(x, r.RsbnFix) for x in left) == 10
-    left = list(simulated_rsbn.without(told, [simulated_rsbn.parse_outage("RSBN:0-9.5")], 100 * 10**9))
+    left = list(
+        simulated_rsbn.apply_outages(records, [simulated_rsbn.parse_outage("RSBN:0-9.5")], 100 * 10**9)
+    )
     assert sum(isinstance(x, r.RsbnFix) for x in left) == 0
 
 
 @pytest.mark.parametrize("text", ["GNSS", "GNSS:5-2", "GPS:1-2", "GNSS:1", "GNSS:1-2-3", "GNSS:-1-2"])
-def test_an_outage_that_is_none_is_refused(text: str) -> None:
+def test_invalid_outage_is_rejected(text: str) -> None:
     with pytest.raises(ValueError, match="write it as GNSS:600-900"):
         simulated_rsbn.parse_outage(text)
 
 
-def test_both_kinds_of_beacon_lists_are_read(tmp_path: pathlib.Path) -> None:
+def test_both_beacon_list_formats_are_read(tmp_path: pathlib.Path) -> None:
     own, airports = tmp_path / "own.csv", tmp_path / "navaids.csv"
     own.write_text("id,lat_deg,lon_deg,alt_m,range_m\n1,45,-93,300,\n2,46,-94,310.5,50000\n")
     first, second = simulated_rsbn.read_beacons(own)
@@ -156,23 +166,28 @@ def test_both_kinds_of_beacon_lists_are_read(tmp_path: pathlib.Path) -> None:
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("", "no beacon list"),
-        ("a,b\n1,2\n", "no beacon list: it needs the columns id, lat_deg"),
-        ("id,lat_deg,lon_deg,alt_m\n", "lists no beacon"),
-        ("id,lat_deg,lon_deg,alt_m\n1,45,-93,3\n1,95,-93,3\n", "line 3 is no beacon: 95.0 deg is outside"),
-        ("id,lat_deg,lon_deg,alt_m\none,45,-93,3\n", "line 2 is no beacon"),
-        ("id,lat_deg,lon_deg,alt_m\n1,45\n", "line 2 is no beacon"),
-        ("id,lat_deg,lon_deg,alt_m\n1,45,-93,nan\n", "line 2 is no beacon: alt_m and range_m"),
+        ("", "is not a beacon list"),
+        ("a,b\n1,2\n", "is not a beacon list: it needs the columns id, lat_deg"),
+        ("id,lat_deg,lon_deg,alt_m\n", "contains no beacons"),
+        (
+            "id,lat_deg,lon_deg,alt_m\n1,45,-93,3\n1,95,-93,3\n",
+            "line 3 is not a valid beacon: 95.0 deg is outside",
+        ),
+        ("id,lat_deg,lon_deg,alt_m\none,45,-93,3\n", "line 2 is not a valid beacon"),
+        ("id,lat_deg,lon_deg,alt_m\n1,45\n", "line 2 is not a valid beacon"),
+        ("id,lat_deg,lon_deg,alt_m\n1,45,-93,nan\n", "line 2 is not a valid beacon: alt_m and range_m"),
     ],
 )
-def test_a_bad_beacon_list_is_refused_in_a_sentence(tmp_path: pathlib.Path, text: str, words: str) -> None:
+def test_invalid_beacon_list_is_reported_in_one_sentence(
+    tmp_path: pathlib.Path, text: str, words: str
+) -> None:
     path = tmp_path / "beacons.csv"
     path.write_text(text)
     with pytest.raises(LogError, match=words):
         simulated_rsbn.read_beacons(path)
 
 
-def test_what_cannot_be_read_as_a_list_is_said(tmp_path: pathlib.Path) -> None:
+def test_unreadable_beacon_list_is_reported(tmp_path: pathlib.Path) -> None:
     foreign = tmp_path / "beacons.csv.gz"
     foreign.write_bytes(b"not gzip")
     for path in (foreign, tmp_path / "none.csv"):
@@ -181,10 +196,10 @@ def test_what_cannot_be_read_as_a_list_is_said(tmp_path: pathlib.Path) -> None:
 
 
 @pytest.mark.shared
-def test_the_worlds_radio_aids_are_read() -> None:
+def test_worldwide_navaids_are_read() -> None:
     path = SHARED / "navaids" / "ourairports_navaids.csv.gz"
     if not path.exists():
-        pytest.skip("the list does not stand beside the repository")
+        pytest.skip("the list is not available")
     found = simulated_rsbn.read_beacons(path)
     assert 3000 < len(found) < 11_008
     assert len({beacon.number for beacon in found}) == len(found)

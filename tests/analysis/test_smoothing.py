@@ -1,4 +1,4 @@
-"""A flight smoothed: better than in flight where fixes came later, the same at the end, honest about both."""
+"""Smoothing: more accurate than the filter before later fixes, equal at the end, consistent."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from companion.analysis.smoothing import Run, smooth_flight
+from companion.analysis.smoothing import SmoothedRun, smooth_flight
 from companion.config import Config
 from companion.nav.discretization import discretise
 from companion.nav.geometry import (
@@ -30,8 +30,8 @@ CONFIG = Config()
 NS = 1_000_000_000
 
 
-class Flown(NamedTuple):
-    """The records, and what only the simulator knows: truth and INS error by time, ns."""
+class SimulatedFlight(NamedTuple):
+    """Records of a simulated flight, with truth and INS error by time, ns."""
 
     records: tuple[Any, ...]
     truth: dict[int, Geodetic]
@@ -39,9 +39,11 @@ class Flown(NamedTuple):
 
 
 @lru_cache(maxsize=8)
-def flight(duration_s: int, silent: tuple[int, int], seed: int = 1) -> Flown:
-    """A circling aircraft whose inertial channel errs as its equations say; GNSS 1 Hz with the drift of its
-    model, a beacon every 5 s; nothing but the INS in `silent`."""
+def flight(duration_s: int, outage_s: tuple[int, int], seed: int = 1) -> SimulatedFlight:
+    """Simulate a circling aircraft with INS errors of the model, GNSS at 1 Hz with drift, a beacon every 5 s.
+
+    There are no fixes in the interval `outage_s`.
+    """
     rng = np.random.default_rng(seed)
     dt, unit = 0.2, error_state.grade(CONFIG.inertial, CONFIG.gnss)
     model = unit.system(ORIGIN.lat, (30.0, 0.0, 0.0), (0.0, 0.0))
@@ -60,7 +62,7 @@ def flight(duration_s: int, silent: tuple[int, int], seed: int = 1) -> Flown:
         ins = displace(*place, x[0], x[1], 0.0)
         x_n = tuple(float(c) for c in geodetic_to_local("tangent", ORIGIN, ins))
         records.append(LocalPosition(t_ns, t_ns, x_n, (v_n[0] + float(x[2]), v_n[1] + float(x[3]), 0.0)))
-        if silent[0] < t < silent[1]:
+        if outage_s[0] < t < outage_s[1]:
             continue
         if k % 5 == 0:
             e = x[12:14] + CONFIG.gnss.sigma_m / 3.0 * rng.standard_normal(2)
@@ -72,11 +74,11 @@ def flight(duration_s: int, silent: tuple[int, int], seed: int = 1) -> Flown:
             sight, (a, d) = slant_range_azimuth(BEACON, place), rng.standard_normal(2)
             azimuth, distance = sight.azimuth + math.radians(0.125) * a, sight.slant_range + 100.0 * d
             records.append(RsbnFix(t_ns, t_ns, 7, *BEACON, azimuth, distance, math.radians(0.125), 100.0))
-    return Flown(tuple(records), truth, error)
+    return SimulatedFlight(tuple(records), truth, error)
 
 
-def errors(found: Run, flown: Flown) -> tuple[Any, Any]:
-    """Errors (N, n) of the smoothed and of the filtered states."""
+def errors(found: SmoothedRun, flown: SimulatedFlight) -> tuple[Any, Any]:
+    """Return the errors (N, n) of the smoothed and of the filtered states."""
     true = np.array([flown.error[int(t)] for t in found.t_ns])
     return found.x - true, found.x_filter - true
 
@@ -85,7 +87,7 @@ def rms(e: Any) -> float:
     return float(np.sqrt(np.mean(np.square(e))))
 
 
-def test_smoothed_beats_filtered() -> None:
+def test_smoothed_errors_are_below_filtered_errors() -> None:
     everywhere, outage = [], []
     for seed in range(1, 7):
         flown = flight(600, (200, 400), seed)
@@ -93,7 +95,7 @@ def test_smoothed_beats_filtered() -> None:
         both = np.stack(errors(found, flown))
         everywhere.append(both)
         outage.append(both[:, (found.t_ns > 220 * NS) & (found.t_ns < 400 * NS)])
-    # the drift of GNSS takes but a few independent values a flight: only several flights tell
+    # GNSS drift has only few independent values per flight: several flights are needed
     for state in (slice(0, 2), slice(2, 4), slice(4, 6), slice(12, 14)):
         smoothed, filtered = np.concatenate(everywhere, axis=1)[:, :, state]
         assert rms(smoothed) < rms(filtered)
@@ -101,7 +103,7 @@ def test_smoothed_beats_filtered() -> None:
     assert rms(smoothed) < 0.7 * rms(filtered)
 
 
-def test_the_last_epoch_is_the_filter_in_flight() -> None:
+def test_last_epoch_equals_the_filter() -> None:
     flown = flight(600, (200, 400))
     (found,) = smooth_flight(flown.records, CONFIG)
     np.testing.assert_array_equal(found.x[-1], found.x_filter[-1])
@@ -113,14 +115,14 @@ def test_the_last_epoch_is_the_filter_in_flight() -> None:
                 last = out
     assert last is not None
     assert found.t_ns[-1] == last.t_ns
-    # solutions fall at other instants than stops, and with them the steps of the error equations
+    # solutions and smoother epochs are at different instants, with different propagation steps
     one_centimetre = 1e-2
     assert math.dist(found.x[-1, :2], last.error_n) < one_centimetre
     assert math.dist(found.x[-1, 2:4], last.velocity_error_n) < 1e-3
     np.testing.assert_allclose(found.P[-1, 0, 0], last.covariance[0], rtol=1e-3)
 
 
-def test_the_innovations_told_are_chi_square() -> None:
+def test_normalized_innovations_are_chi_square() -> None:
     found: list[float] = []
     for seed in range(1, 5):
         navigator = Navigator(CONFIG)
@@ -133,7 +135,7 @@ def test_the_innovations_told_are_chi_square() -> None:
     assert 0.92 < np.mean(np.array(found) < 5.99) < 0.98
 
 
-def test_no_variance_grows_and_the_claims_are_honest() -> None:
+def test_smoothing_reduces_variances_and_is_consistent() -> None:
     nees = []
     for seed in range(1, 9):
         flown = flight(300, (100, 200), seed)
@@ -146,7 +148,7 @@ def test_no_variance_grows_and_the_claims_are_honest() -> None:
     assert 2.0 < np.mean(nees) < 7.0
 
 
-def test_the_track_is_where_the_aircraft_was() -> None:
+def test_smoothed_track_matches_the_truth() -> None:
     flown = flight(600, (200, 400))
     (found,) = smooth_flight(flown.records, CONFIG)
     off = []
@@ -158,7 +160,7 @@ def test_the_track_is_where_the_aircraft_was() -> None:
     assert rms(off) < 2.0 * rms(sigma)
 
 
-def test_a_jump_of_the_channel_is_no_jump_of_the_smoothed_track() -> None:
+def test_channel_jump_does_not_affect_the_smoothed_track() -> None:
     flown = flight(300, (0, 0))
     records = []
     for record in flown.records:
@@ -170,12 +172,12 @@ def test_a_jump_of_the_channel_is_no_jump_of_the_smoothed_track() -> None:
     np.testing.assert_array_equal(plain.t_ns, jumped.t_ns)
     late = plain.t_ns > 150 * NS
     shift = jumped.x[:, :2] - plain.x[:, :2] - np.where(late[:, None], [97.0, -40.0], 0.0)
-    assert abs(shift).max() < 1.0  # the step of the channel is noticed but for a decimetre
+    assert abs(shift).max() < 1.0  # the jump is detected to about a decimetre
 
 
-def test_where_the_filter_had_claimed_too_much_the_smoother_knows_it() -> None:
-    """In the outage the channel runs away by 2 m/s, as no model of it allows; the navigator widens its
-    covariance at the first fix after, and what it knew before must not bind the smoother."""
+def test_smoother_accounts_for_covariance_inflation() -> None:
+    """In the outage the channel drifts at 2 m/s, far beyond its model. The navigator inflates its covariance
+    at the next fix, and the smoother must apply the inflation to the time before."""
     flown = flight(600, (200, 400))
     records, run = [], {}
     for record in flown.records:
@@ -195,7 +197,7 @@ def test_where_the_filter_had_claimed_too_much_the_smoother_knows_it() -> None:
     assert rms(found.x[found.t_ns < 190 * NS][:, :2] - found.x_filter[found.t_ns < 190 * NS][:, :2]) < 10.0
 
 
-def test_a_reboot_parts_the_flight() -> None:
+def test_reboot_starts_a_new_run() -> None:
     flown = flight(300, (0, 0))
     cut = 150 * NS + 1
     records = [*flown.records, Reboot(cut, cut, 1), msgspec.structs.replace(flown.records[0], t_ns=cut + 1)]
@@ -204,6 +206,6 @@ def test_a_reboot_parts_the_flight() -> None:
     np.testing.assert_array_equal(found[0].x, first.x)
 
 
-def test_nothing_to_smooth_is_one_sentence() -> None:
+def test_nothing_to_smooth_is_reported_in_one_sentence() -> None:
     with pytest.raises(ValueError, match="nothing to smooth: the records need"):
         smooth_flight([r for r in flight(20, (0, 20)).records], CONFIG)

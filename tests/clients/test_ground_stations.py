@@ -1,6 +1,6 @@
-"""Real ground stations over loopback UDP, on a vehicle that has an autopilot's heartbeat and our component.
+"""Real ground stations over loopback UDP, with a vehicle of an autopilot's heartbeat and our component.
 
-They see the component, read and set its parameters and get their commands acknowledged, under either
+They find the component, read and set its parameters and get their commands acknowledged, with either
 autopilot, with and without signatures. Each needs its package (extra `clients`) and is skipped without it.
 """
 
@@ -20,27 +20,27 @@ import pytest
 
 from companion.config import Config
 from companion.link import dialect, frame
-from companion.link.commands import Commands, Result
-from companion.link.parameter_server import Parameters, table
+from companion.link.commands import CommandServer, Result
+from companion.link.parameter_server import ParameterServer, parameter_table
 from companion.link.session import MessageReceived, Session
-from companion.link.signing import Refusal, Signing
+from companion.link.signing import SignatureFault, Signing
 from companion.link.status_text import StatusText
 from companion.records import Event
 
 SYSTEM, COMPONENT, ARDUPILOT, PX4 = 1, 191, 3, 12
-PASSPHRASE = "chickpea"  # a station makes the key from it by SHA-256
+PASSPHRASE = "chickpea"  # a station derives the key from it by SHA-256
 
 
 class Vehicle(threading.Thread):
-    """What a vehicle with the companion says and answers on one UDP port, until stopped."""
+    """A vehicle with the companion on one UDP port, until stopped."""
 
     def __init__(self, autopilot: int, signing: Signing | None = None) -> None:
         super().__init__(daemon=True)
         self.session = Session(system=SYSTEM, component=COMPONENT, signing=signing)
-        self.commands = Commands(COMPONENT, {331: 200_000}, {})
-        self.parameters = Parameters(COMPONENT, Config())
-        self.speaker = StatusText()
-        self.heard: list[str] = []
+        self.commands = CommandServer(COMPONENT, {331: 200_000}, {})
+        self.parameters = ParameterServer(COMPONENT, Config())
+        self.status_text = StatusText()
+        self.received: list[str] = []
         self.acknowledged: list[int] = []
         self._autopilot = autopilot
         self._signing = signing
@@ -53,13 +53,13 @@ class Vehicle(threading.Thread):
         heartbeat_at = 0
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as link:
             link.settimeout(0.005)
-            link.connect(("127.0.0.1", self.port))  # where the station listens
+            link.connect(("127.0.0.1", self.port))  # the port of the station
             while not self._ended.is_set():
                 now = time.monotonic_ns()
                 with contextlib.suppress(TimeoutError, ConnectionRefusedError):
-                    self._hear(self.session.receive(link.recv(65536), now), now)
+                    self._process(self.session.receive(link.recv(65536), now), now)
                 self.session.poll(now)
-                for message in [*self.parameters.to_send(now), *self.speaker.to_send(now)]:
+                for message in [*self.parameters.to_send(now), *self.status_text.to_send(now)]:
                     self.session.send(message)
                 out = self.session.to_send()
                 if now >= heartbeat_at:
@@ -79,18 +79,18 @@ class Vehicle(threading.Thread):
         assert self._signing is not None
         return self._signing.sign(data, 0, time.monotonic_ns())
 
-    def _hear(self, events: list[object], now: int) -> None:
+    def _process(self, events: list[object], now: int) -> None:
         for event in events:
             if not isinstance(event, MessageReceived):
                 continue
-            self.heard.append(event.message.get_type())
+            self.received.append(event.message.get_type())
             for reply in self.commands.receive(event.message, event.frame, SYSTEM, now):
                 self.session.send(reply)
                 if reply.get_type() == "COMMAND_ACK":
                     self.acknowledged.append(reply.command)
             for change in self.parameters.receive(event.message, event.frame, SYSTEM, now):
                 text = f"{change.parameter.name} is {change.new}"
-                self.speaker.tell(Event(now, now, 5, text), now)
+                self.status_text.add(Event(now, now, 5, text), now)
 
 
 @pytest.fixture
@@ -122,10 +122,10 @@ def test_mavsdk(vehicle: Vehicle) -> None:
         assert until(lambda: COMPONENT in system.component_ids())
 
         parameters = param.Param(system)
-        with contextlib.suppress(param.ParamError):  # 4.1 selects it, and says UNKNOWN
+        with contextlib.suppress(param.ParamError):  # 4.1 selects it, but raises UNKNOWN
             parameters.select_component(COMPONENT, param.ProtocolVersion.V1)
         listed = {p.name: p.value for p in parameters.get_all_params().float_params}
-        assert set(listed) == {p.name for p in table()}
+        assert set(listed) == {p.name for p in parameter_table()}
         assert parameters.get_param_float("GNSS_SIGMA_M") == Config().gnss.sigma_m
         parameters.set_param_float("GNSS_SIGMA_M", 4.0)
         assert parameters.get_param_float("GNSS_SIGMA_M") == 4.0
@@ -134,15 +134,15 @@ def test_mavsdk(vehicle: Vehicle) -> None:
             parameters.set_param_float("GNSS_SIGMA_M", -1.0)
         assert vehicle.parameters.config.gnss.sigma_m == 4.0
 
-        said: list[dict[str, object]] = []
+        received: list[dict[str, object]] = []
         station = direct.MavlinkDirect(system)
-        station.subscribe_message("COMMAND_ACK", lambda m, *_: said.append(json.loads(m.fields_json)))
+        station.subscribe_message("COMMAND_ACK", lambda m, *_: received.append(json.loads(m.fields_json)))
         for command in (512, 400):
             fields = {"target_system": SYSTEM, "target_component": COMPONENT, "command": command}
             fields |= {f"param{i}": 148 if i == 1 else 0 for i in range(1, 8)} | {"confirmation": 0}
             station.send_message(direct.MavlinkMessage("COMMAND_LONG", 0, 0, 0, 0, json.dumps(fields)))
         results = {512: Result.ACCEPTED, 400: Result.UNSUPPORTED}
-        assert until(lambda: results.items() <= {m["command"]: m["result"] for m in said}.items())
+        assert until(lambda: results.items() <= {m["command"]: m["result"] for m in received}.items())
     finally:
         sdk.destroy()
 
@@ -153,24 +153,24 @@ def test_mavproxy(vehicle: Vehicle, tmp_path: pathlib.Path) -> None:
     if program is None:
         pytest.skip("mavproxy.py is not on the path")
     with Proxy(program, vehicle, tmp_path) as proxy:
-        assert until(lambda: "HEARTBEAT" in vehicle.heard)
+        assert until(lambda: "HEARTBEAT" in vehicle.received)
         proxy.type("param fetch")
-        assert proxy.says(f"Received {len(table())} parameters")
+        assert proxy.prints(f"Received {len(parameter_table())} parameters")
         proxy.type("param show GNSS_SIGMA_M")
-        assert proxy.says(f"GNSS_SIGMA_M     {Config().gnss.sigma_m:.1f}")
+        assert proxy.prints(f"GNSS_SIGMA_M     {Config().gnss.sigma_m:.1f}")
         proxy.type("param set GNSS_SIGMA_M 4")
         assert until(lambda: vehicle.parameters.config.gnss.sigma_m == 4.0)
-        assert proxy.says("GNSS_SIGMA_M is 4.0")  # our STATUSTEXT
+        assert proxy.prints("GNSS_SIGMA_M is 4.0")  # our STATUSTEXT
         proxy.type("param set OUT_GPSENS_ID 5")
         assert until(lambda: vehicle.parameters.config.output.global_position_sensor_id == 5)
         proxy.type("long 512 148 0 0 0 0 0 0")
         assert until(lambda: 512 in vehicle.acknowledged)
         proxy.type("long 400 1 0 0 0 0 0 0")
-        assert proxy.says("COMPONENT_ARM_DISARM: UNSUPPORTED")
+        assert proxy.prints("COMPONENT_ARM_DISARM: UNSUPPORTED")
 
 
 SIGNING = Signing(hashlib.sha256(PASSPHRASE.encode()).digest())
-SIGNING.follow(time.time_ns(), time.monotonic_ns())
+SIGNING.set_time(time.time_ns(), time.monotonic_ns())
 
 
 @pytest.mark.parametrize("vehicle", [(ARDUPILOT, SIGNING)], indirect=True)
@@ -178,24 +178,24 @@ def test_mavproxy_signed(vehicle: Vehicle, tmp_path: pathlib.Path) -> None:
     program = shutil.which("mavproxy.py")
     if program is None:
         pytest.skip("mavproxy.py is not on the path")
-    refused = vehicle.session.refused
+    rejected = vehicle.session.rejected
     with Proxy(program, vehicle, tmp_path) as proxy:
-        assert until(lambda: refused[Refusal.UNSIGNED] > 0)
+        assert until(lambda: rejected[SignatureFault.UNSIGNED] > 0)
         proxy.type("signing key wrong")
-        assert until(lambda: refused[Refusal.FORGED] > 0)
-        assert vehicle.heard == []
+        assert until(lambda: rejected[SignatureFault.FORGED] > 0)
+        assert vehicle.received == []
         proxy.type(f"signing key {PASSPHRASE}")
-        assert until(lambda: "HEARTBEAT" in vehicle.heard)
+        assert until(lambda: "HEARTBEAT" in vehicle.received)
         proxy.type("param fetch")
-        assert proxy.says(f"Received {len(table())} parameters")
+        assert proxy.prints(f"Received {len(parameter_table())} parameters")
         proxy.type("param set GNSS_SIGMA_M 4")
-        assert proxy.says("GNSS_SIGMA_M is 4.0")
+        assert proxy.prints("GNSS_SIGMA_M is 4.0")
     assert vehicle.parameters.config.gnss.sigma_m == 4.0
-    assert not {Refusal.REPLAYED, Refusal.OLD, Refusal.FUTURE} & set(refused)
+    assert not {SignatureFault.REPLAYED, SignatureFault.OLD, SignatureFault.FUTURE} & set(rejected)
 
 
 class Proxy:
-    """MAVProxy at a prompt that is a pipe."""
+    """MAVProxy controlled through a pipe."""
 
     def __init__(self, program: str, vehicle: Vehicle, folder: pathlib.Path) -> None:
         self._process = subprocess.Popen(
@@ -216,7 +216,7 @@ class Proxy:
             text=True,
             env=os.environ | {"HOME": str(folder), "PYTHONUNBUFFERED": "1"},
         )
-        self._said = ""
+        self._output = ""
         self._reader = threading.Thread(target=self._read, daemon=True)
 
     def __enter__(self) -> "Proxy":
@@ -231,17 +231,17 @@ class Proxy:
         self._process.stdin.close()
         self._process.stdout.close()
         if error[0] is not None:
-            print(self._said)
+            print(self._output)
 
     def type(self, line: str) -> None:
         assert self._process.stdin is not None
         self._process.stdin.write(line + "\n")
         self._process.stdin.flush()
 
-    def says(self, text: str) -> bool:
-        return until(lambda: text in self._said)
+    def prints(self, text: str) -> bool:
+        return until(lambda: text in self._output)
 
     def _read(self) -> None:
         assert self._process.stdout is not None
-        while said := self._process.stdout.read(1):
-            self._said += said
+        while received := self._process.stdout.read(1):
+            self._output += received

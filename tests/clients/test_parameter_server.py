@@ -1,4 +1,4 @@
-"""Our parameter client against somebody else's server: MAVSDK as an autopilot, over UDP.
+"""Parameter client against a foreign server: MAVSDK as an autopilot, over UDP.
 
 It needs its package (extra `clients`) and is skipped without it.
 """
@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from companion.link import dialect
-from companion.link.parameter_client import Answer, ParameterClient, encoding_of, same
+from companion.link.parameter_client import Answer, ParameterClient, encoding_of, equal_real32
 from companion.link.session import MessageReceived, Session
 
 AUTOPILOT_VERSION, REQUEST_MESSAGE = 148, 512
@@ -20,7 +20,7 @@ HAS = {"EKF2_AGP0_ID": 0, "EKF2_EV_CTRL": -2, "CAL_BARO0_ID": 6620172, "EKF2_AGP
 
 @pytest.fixture
 def server() -> Iterator[int]:
-    """An autopilot of MAVSDK's with the parameters `HAS`; the port it sends to."""
+    """Run MAVSDK as an autopilot with the parameters `HAS`; yield the port it sends to."""
     mavsdk = pytest.importorskip("mavsdk.mavsdk")
     component = pytest.importorskip("mavsdk.component_type").ComponentType.AUTOPILOT
     parameters = pytest.importorskip("mavsdk.plugins.param_server.param_server")
@@ -38,8 +38,8 @@ def server() -> Iterator[int]:
         sdk.destroy()
 
 
-class Asking:
-    """A session and, once the server is heard, a client on one socket."""
+class Station:
+    """A session and, once the server is received, a client on one socket."""
 
     def __init__(self, port: int) -> None:
         self.link = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -57,7 +57,7 @@ class Asking:
             data, peer = self.link.recvfrom(65536)
             for event in self.session.receive(data, time.monotonic_ns()):
                 if isinstance(event, MessageReceived):
-                    self.hear(event)
+                    self.receive(event)
         self.session.poll(time.monotonic_ns())
         if self.client is not None:
             self.answers |= {a.name: a for a in self.client.poll(time.monotonic_ns())}
@@ -67,7 +67,7 @@ class Asking:
             for out in self.session.to_send():
                 self.link.sendto(out, peer)
 
-    def hear(self, event: MessageReceived) -> None:
+    def receive(self, event: MessageReceived) -> None:
         if event.message.get_type() == "HEARTBEAT" and event.frame.component == 1:
             if self.make is None:
                 self.session.send(
@@ -92,23 +92,23 @@ class Asking:
         assert done()
 
 
-def test_mavsdk_is_read_and_set_as_it_states(server: int) -> None:
-    asking = Asking(server)
+def test_mavsdk_parameters_are_read_and_set_with_its_stated_encoding(server: int) -> None:
+    station = Station(server)
     try:
-        asking.until(lambda: asking.capabilities is not None)
-        encoding = encoding_of(asking.capabilities, asking.make or 0)
-        assert encoding == "bytewise"  # what MAVSDK does, and states
-        client = asking.client = ParameterClient(1, 1, encoding)
+        station.until(lambda: station.capabilities is not None)
+        encoding = encoding_of(station.capabilities, station.make or 0)
+        assert encoding == "bytewise"  # as MAVSDK states and does
+        client = station.client = ParameterClient(1, 1, encoding)
         client.read([*HAS, "NOT_THERE"])
-        asking.until(lambda: client.is_idle)
+        station.until(lambda: client.is_idle)
         for name, value in HAS.items():
-            assert same(asking.answers[name].value, value), asking.answers[name]
-        assert asking.answers["NOT_THERE"] == ("NOT_THERE", None, "does not exist")
+            assert equal_real32(station.answers[name].value, value), station.answers[name]
+        assert station.answers["NOT_THERE"] == ("NOT_THERE", None, "does not exist")
 
         client.set("EKF2_AGP0_ID", 1)
         client.set("EKF2_AGP0_NOISE", 2.5)
-        asking.until(lambda: client.is_idle)
-        assert asking.answers["EKF2_AGP0_ID"] == ("EKF2_AGP0_ID", 1, "")
-        assert asking.answers["EKF2_AGP0_NOISE"] == ("EKF2_AGP0_NOISE", 2.5, "")
+        station.until(lambda: client.is_idle)
+        assert station.answers["EKF2_AGP0_ID"] == ("EKF2_AGP0_ID", 1, "")
+        assert station.answers["EKF2_AGP0_NOISE"] == ("EKF2_AGP0_NOISE", 2.5, "")
     finally:
-        asking.link.close()
+        station.link.close()

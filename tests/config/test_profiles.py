@@ -1,4 +1,4 @@
-"""The output profiles: what goes out by default, and what the autopilot must have for it."""
+"""Output profiles: default messages and rates, and the required autopilot parameters."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from hypothesis import strategies as st
 
 from companion.config import Config, ConfigError, InertialConfig, OutputConfig, load
 from companion.config.profiles import MESSAGES, PROFILES
-from companion.config.required_parameters import needed
-from companion.config.validate import conflicts
+from companion.config.required_parameters import required_parameters
+from companion.config.validate import find_conflicts
 
 STATUS = {"NAVIGATION_STATUS": 1.0}
 
 
-def told(*pairs: str) -> Config:
+def configured(*pairs: str) -> Config:
     return load(pairs=pairs, environment={})
 
 
@@ -44,8 +44,8 @@ def sent(config: Config) -> dict[str, float]:
         (["output.profile=px4", "output.via=external_position"], {"COMMAND_INT": 0.5}),
     ],
 )
-def test_what_goes_out(pairs: list[str], rates: dict[str, float]) -> None:
-    config = told(*pairs)
+def test_output_rates(pairs: list[str], rates: dict[str, float]) -> None:
+    config = configured(*pairs)
     assert sent(config) == STATUS | rates
     assert config.output.feeds_estimator == bool(rates)
     assert config.output.pace_hz == max(5.0, *rates.values(), 0.0)
@@ -77,20 +77,18 @@ VISO["EK3_SRC2_YAW"] = 1
         (["output.profile=px4", "output.via=external_position"], {}, set()),
     ],
 )
-def test_what_the_autopilot_must_have(
-    pairs: list[str], parameters: dict[str, float], reboot: set[str]
-) -> None:
-    found = needed(told(*pairs))
+def test_required_parameters(pairs: list[str], parameters: dict[str, float], reboot: set[str]) -> None:
+    found = required_parameters(configured(*pairs))
     assert {p.name: p.value for p in found} == parameters
     assert len(found) == len(parameters)
     assert {p.name for p in found if p.reboot} == reboot
 
 
-def test_custom_needs_what_the_make_that_is_heard_needs() -> None:
-    config = told("output.profile=custom", "output.odometry_hz=5")
-    assert {p.name: p.value for p in needed(config, "ardupilot")} == VISO
-    assert {p.name: p.value for p in needed(config, "px4")} == {"EKF2_EV_CTRL": 1}
-    assert needed(config) == needed(config, "other") == ()
+def test_profile_custom_requires_the_parameters_of_the_connected_make() -> None:
+    config = configured("output.profile=custom", "output.odometry_hz=5")
+    assert {p.name: p.value for p in required_parameters(config, "ardupilot")} == VISO
+    assert {p.name: p.value for p in required_parameters(config, "px4")} == {"EKF2_EV_CTRL": 1}
+    assert required_parameters(config) == required_parameters(config, "other") == ()
 
 
 outputs = st.builds(
@@ -110,23 +108,23 @@ sources = st.sampled_from(["auto", "local_position", "air_data"])
 @given(output=outputs, source=sources)
 def test_no_configuration_feeds_an_autopilot_its_own_position(output: OutputConfig, source: str) -> None:
     config = Config(output=output, inertial=InertialConfig(source=source))
-    if not list(conflicts(config)) and output.feeds_estimator:
+    if not list(find_conflicts(config)) and output.feeds_estimator:
         assert config.channel != "local_position"
         assert output.profile != "monitor"
 
 
 @pytest.mark.parametrize("profile", ["ardupilot", "px4"])
-def test_only_the_operator_s_word_makes_the_local_position_independent(profile: str) -> None:
+def test_local_position_is_independent_only_if_configured(profile: str) -> None:
     pairs = [f"output.profile={profile}", "inertial.source=local_position"]
     with pytest.raises(ConfigError, match=r"inertial\.independent"):
-        told(*pairs)
-    assert told(*pairs, "inertial.independent=true").channel == "local_position"
+        configured(*pairs)
+    assert configured(*pairs, "inertial.independent=true").channel == "local_position"
 
 
-def test_every_profile_can_be_meant_with_each_of_its_ways() -> None:
+def test_every_output_method_of_every_profile_is_valid() -> None:
     for name, via in itertools.chain.from_iterable(
-        [(name, via) for via in profile.ways] for name, profile in PROFILES.items()
+        [(name, via) for via in profile.methods] for name, profile in PROFILES.items()
     ):
         config = msgspec.structs.replace(Config(), output=OutputConfig(profile=name, via=via))
-        assert not list(conflicts(config))
+        assert not list(find_conflicts(config))
         assert list(sent(config)) == [MESSAGES[via], "NAVIGATION_STATUS"]

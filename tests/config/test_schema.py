@@ -1,4 +1,4 @@
-"""Configuration: flags beat environment beat file, and a mistake is named where it stands."""
+"""Configuration: flags override the environment, which overrides the file; mistakes are located."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ def written(tmp_path: Path, text: str) -> Path:
     return path
 
 
-def test_what_is_written_is_read_back(tmp_path: Path) -> None:
+def test_formatted_configuration_is_read_back(tmp_path: Path) -> None:
     assert load(written(tmp_path, to_toml(Config())), environment={}) == Config()
 
 
-def test_flags_beat_environment_beat_file(tmp_path: Path) -> None:
+def test_flags_override_environment_overrides_file(tmp_path: Path) -> None:
     path = written(tmp_path, "[gnss]\nsigma_m = 4.0\ntimeout_s = 5.0\n[rsbn]\ntimeout_s = 20.0\n")
     environment = {"COMPANION_GNSS__SIGMA_M": "3.5", "COMPANION_RSBN__TIMEOUT_S": "30", "HOME": "/"}
     config = load(path, {"rsbn.timeout_s": 40.0, "gnss.every_s": None}, environment)
@@ -28,36 +28,36 @@ def test_flags_beat_environment_beat_file(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "expected"),
     [
         ("[lnk]\nx = 1", "there is no section [lnk]; did you mean `link`?"),
         ("[link]\ncomponent = 1", "section [link] has no key `component`; did you mean `component_id`?"),
-        ("[link]\ncomponent_id = 1000", "link.component_id = 1000 is impossible: expected int <= 255"),
-        ("[gnss]\nsigma_m = -1", "gnss.sigma_m = -1 is impossible: expected float > 0.0"),
-        ("[gnss]\nsigma_m = nan", "gnss.sigma_m = nan is impossible: expected float"),
-        ("[gnss]\nsigma_m = 'two'", "gnss.sigma_m = 'two' is impossible: expected float, got str"),
+        ("[link]\ncomponent_id = 1000", "link.component_id = 1000 is invalid: expected int <= 255"),
+        ("[gnss]\nsigma_m = -1", "gnss.sigma_m = -1 is invalid: expected float > 0.0"),
+        ("[gnss]\nsigma_m = nan", "gnss.sigma_m = nan is invalid: expected float"),
+        ("[gnss]\nsigma_m = 'two'", "gnss.sigma_m = 'two' is invalid: expected float, got str"),
         (
             "[output]\nprofile = 'px5'",
-            "output.profile: 'px5' is none of monitor, ardupilot, px4, custom; did you mean `px4`?",
+            "output.profile: 'px5' is not one of monitor, ardupilot, px4, custom; did you mean `px4`?",
         ),
-        ("[output]\nvia = 'odometri'", "is none of auto, odometry, "),
-        ("[output]\nvia = 3", "output.via: 3 is none of auto, "),
-        ("[inertial]\nsource = 'ins'", "'ins' is none of auto, local_position, air_data, strapdown"),
-        ("[link]\nconnect = 3", "link.connect = [3] is impossible: expected str, got int"),
+        ("[output]\nvia = 'odometri'", "is not one of auto, odometry, "),
+        ("[output]\nvia = 3", "output.via: 3 is not one of auto, "),
+        ("[inertial]\nsource = 'ins'", "'ins' is not one of auto, local_position, air_data, strapdown"),
+        ("[link]\nconnect = 3", "link.connect = [3] is invalid: expected str, got int"),
         ("link = 3", "`link` is a section: write [link] and its keys below it"),
-        ("x = [", "is no TOML"),
+        ("x = [", "not valid TOML"),
     ],
 )
-def test_a_mistake_is_one_sentence_that_names_it(tmp_path: Path, text: str, said: str) -> None:
+def test_mistake_is_reported_in_one_sentence(tmp_path: Path, text: str, expected: str) -> None:
     path = written(tmp_path, text)
     with pytest.raises(ConfigError) as caught:
         load(path, environment={})
-    assert said in str(caught.value)
+    assert expected in str(caught.value)
     assert str(path) in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
-def test_a_mistake_in_the_environment_names_the_variable() -> None:
+def test_mistake_in_the_environment_names_the_variable() -> None:
     with pytest.raises(ConfigError, match="COMPANION_GNSS__SIGMA_M"):
         load(environment={"COMPANION_GNSS__SIGMA_M": "-3"})
     with pytest.raises(ConfigError, match="COMPANION_GNS__SIGMA_M"):
@@ -65,20 +65,20 @@ def test_a_mistake_in_the_environment_names_the_variable() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "said"),
+    ("name", "expected"),
     [
         ("COMPANION_OUTPUT_PROFILE", "did you mean `COMPANION_OUTPUT__PROFILE`?"),
         ("COMPANION_GNSS_SIGMA_M", "did you mean `COMPANION_GNSS__SIGMA_M`?"),
         ("COMPANION_XYZZY", "write it as COMPANION_SECTION__KEY"),
     ],
 )
-def test_a_variable_of_ours_that_is_no_key_is_not_ignored(name: str, said: str) -> None:
+def test_unknown_environment_variable_is_reported(name: str, expected: str) -> None:
     with pytest.raises(ConfigError) as caught:
         load(environment={name: "px4", "COMPANIONS": "two"})
-    assert str(caught.value) == f"environment variable {name}: it names no key; {said}"
+    assert str(caught.value) == f"environment variable {name}: no such key; {expected}"
 
 
-def test_one_word_is_a_list_of_one(tmp_path: Path) -> None:
+def test_single_value_is_a_list_of_one(tmp_path: Path) -> None:
     link = "udpin:127.0.0.1:14560"
     path = written(tmp_path, f"[link]\nconnect = '{link}'\n[predictor]\nahead_min = 5.0\n")
     config = load(path, environment={})
@@ -87,34 +87,43 @@ def test_one_word_is_a_list_of_one(tmp_path: Path) -> None:
     assert load(environment={"COMPANION_LINK__CONNECT": f'["{link}", "x"]'}).link.connect == (link, "x")
 
 
-def test_a_missing_file_says_how_to_begin(tmp_path: Path) -> None:
+def test_missing_file_error_suggests_defaults(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="check-config --defaults"):
         load(tmp_path / "none.toml", environment={})
 
 
-def test_the_restrictive_estimator_needs_its_channel() -> None:
+def test_restrictive_estimator_requires_air_data() -> None:
     with pytest.raises(ConfigError, match=r"air data only: set inertial\.source"):
         load(pairs=["estimator.output=restrictive"], environment={})
     both = ["estimator.output=restrictive", "inertial.source=air_data"]
-    assert load(pairs=both, environment={}).leading == "restrictive"
+    assert load(pairs=both, environment={}).leading_estimator == "restrictive"
 
 
 @pytest.mark.parametrize(
-    ("pairs", "said"),
+    ("pairs", "expected"),
     [
         (
             ["inertial.source=local_position", "output.profile=px4"],
             "feed the autopilot its own position back",
         ),
         (["output.odometry_hz=5"], "profile 'monitor' never feeds an autopilot: set output.profile"),
-        (["output.profile=px4", "output.gps_input_hz=5"], "its autopilot takes global_position_sensor, odom"),
-        (["output.profile=px4", "output.via=gps_input"], "is no way of profile 'px4': choose global_pos"),
-        (["output.profile=custom", "output.via=odometry"], "is no way of profile 'custom': leave it out"),
+        (
+            ["output.profile=px4", "output.gps_input_hz=5"],
+            "its autopilot accepts global_position_sensor, odom",
+        ),
+        (
+            ["output.profile=px4", "output.via=gps_input"],
+            "is not available in profile 'px4': choose global_pos",
+        ),
+        (
+            ["output.profile=custom", "output.via=odometry"],
+            "is not available in profile 'custom': remove this key",
+        ),
         (["output.profile=ardupilot", "output.via=gps_input", "gnss.receiver=1"], "set gnss.receiver = 0"),
     ],
 )
-def test_what_cannot_be_meant_together_is_refused_in_one_sentence(pairs: list[str], said: str) -> None:
+def test_invalid_combination_is_reported_in_one_sentence(pairs: list[str], expected: str) -> None:
     with pytest.raises(ConfigError) as caught:
         load(pairs=pairs, environment={})
-    assert said in str(caught.value)
+    assert expected in str(caught.value)
     assert "\n" not in str(caught.value)

@@ -1,5 +1,5 @@
-"""`companion doctor` over UDP against the simulated autopilot as a process of its own: what is printed,
-asked, set and returned. The times of watching are cut to let it be quick; nothing else is."""
+"""`companion doctor` over UDP with the simulated autopilot in its own process: output, questions, parameters
+and exit codes. Only the observation times are shortened."""
 
 import contextlib
 import io
@@ -17,12 +17,12 @@ from click.testing import CliRunner, Result
 from rich.console import Console
 
 from companion.config import load
-from companion.config.required_parameters import needed
+from companion.config.required_parameters import required_parameters
 from companion.doctor import command, examination, rendering
-from companion.doctor.command import EX_UNAVAILABLE, machine
+from companion.doctor.command import EX_UNAVAILABLE, check_machine
 from companion.doctor.diagnosis import Diagnosis, Finding, Identity, ParameterFinding
 from companion.link import stream_rates
-from companion.transport.links import Address
+from companion.transport.reconnect import Address
 
 LOOPBACK = "127.0.0.1"
 SECOND = 1_000_000_000
@@ -37,9 +37,9 @@ def free_port() -> int:
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(stream_rates, "WINDOW", SECOND)
-    monkeypatch.setattr(examination, "WATCHED", 4 * SECOND)
-    monkeypatch.setattr(examination, "WATCHED_LONGER", 4 * SECOND)
-    monkeypatch.setattr(command, "HEAR_S", 8.0)
+    monkeypatch.setattr(examination, "OBSERVE", 4 * SECOND)
+    monkeypatch.setattr(examination, "OBSERVE_LONGER", 4 * SECOND)
+    monkeypatch.setattr(command, "CONNECT_TIMEOUT_S", 8.0)
     for name in list(os.environ):
         if name.startswith("COMPANION_"):
             monkeypatch.delenv(name)
@@ -47,11 +47,11 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @contextlib.contextmanager
 def flying(*options: str) -> Iterator[str]:
-    """A simulated autopilot; where the doctor is to listen."""
+    """Run a simulated autopilot; yield the address for the doctor."""
     port = free_port()
-    said = [sys.executable, "-m", "companion", "sitl", "--scenario", "short"]
+    data_sent = [sys.executable, "-m", "companion", "sitl", "--scenario", "short"]
     with subprocess.Popen(
-        [*said, "--connect", f"udpout:{LOOPBACK}:{port}", *options], stderr=subprocess.DEVNULL
+        [*data_sent, "--connect", f"udpout:{LOOPBACK}:{port}", *options], stderr=subprocess.DEVNULL
     ) as process:
         try:
             yield f"udpin:{LOOPBACK}:{port}"
@@ -67,24 +67,24 @@ def has(result: Result) -> dict[str, float]:
     return {found["name"]: found["has"] for found in json.loads(result.stdout)["parameters"]}
 
 
-def test_looking_asking_and_setting(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(command, "_is_somebody_here", lambda: True)
+def test_examine_confirm_and_set(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(command, "_is_interactive", lambda: True)
     with flying("--disarmed") as place:
         ask = ("--connect", place, "--profile", "ardupilot", "--apply")
         no = doctor(*ask, answer="n\n")
-        assert no.exit_code == 1 and "you said no" in no.stderr
-        assert "Set VISO_TYPE = 1, EK3_SRC2_POSXY = 6" in no.stderr  # what is asked names the values
-        assert "VISO_TYPE" in no.stdout and "not as needed" in no.stdout
+        assert no.exit_code == 1 and "not confirmed" in no.stderr
+        assert "Set VISO_TYPE = 1, EK3_SRC2_POSXY = 6" in no.stderr  # the question contains the values
+        assert "VISO_TYPE" in no.stdout and "wrong" in no.stdout
         assert max(map(len, no.stdout.splitlines())) <= 80
 
         yes = doctor(*ask, "--json", answer="y\n")
         assert yes.exit_code == 0, yes.output
-        needs = needed(load(None, {"output.profile": "ardupilot"}))
+        needs = required_parameters(load(None, {"output.profile": "ardupilot"}))
         assert has(yes) == {need.name: need.value for need in needs}
         assert json.loads(yes.stdout)["changed"] == ["VISO_TYPE", "EK3_SRC2_POSXY", "EK3_SRC2_YAW"]
 
 
-def test_nothing_is_set_while_it_is_armed() -> None:
+def test_nothing_is_set_while_armed() -> None:
     with flying() as place:
         done = doctor("--connect", place, "--profile", "ardupilot", "--apply", "--yes", "--json")
     assert done.exit_code == 1
@@ -101,49 +101,49 @@ def line(result: Result) -> str:
     return only
 
 
-def test_silence_exits_69_and_says_where_to_look(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(command, "HEAR_S", 0.5)
-    assert "not a byte came" in line(doctor("--connect", f"udpin:{LOOPBACK}:{free_port()}"))
+def test_no_data_exits_69_with_advice(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(command, "CONNECT_TIMEOUT_S", 0.5)
+    assert "no data received" in line(doctor("--connect", f"udpin:{LOOPBACK}:{free_port()}"))
 
 
 @pytest.mark.parametrize(
-    ("said", "words"),
-    [pytest.param(b"\x00\x80\xf8" * 30, "baud rate", id="noise"), (None, "only 255/190 spoke")],
+    ("data_sent", "expected"),
+    [pytest.param(b"\x00\x80\xf8" * 30, "baud rate", id="noise"), (None, "received only 255/190")],
 )
-def test_noise_and_others_are_told_from_silence(
-    monkeypatch: pytest.MonkeyPatch, said: bytes | None, words: str
+def test_noise_and_other_senders_are_described(
+    monkeypatch: pytest.MonkeyPatch, data_sent: bytes | None, expected: str
 ) -> None:
     from companion.link import dialect, frame
 
-    monkeypatch.setattr(command, "HEAR_S", 1.0)
-    data = said or frame.encode(dialect.new("HEARTBEAT", type=6, autopilot=8), 0, 255, 190)
+    monkeypatch.setattr(command, "CONNECT_TIMEOUT_S", 1.0)
+    data = data_sent or frame.encode(dialect.new("HEARTBEAT", type=6, autopilot=8), 0, 255, 190)
     port = free_port()
     code = (
         "import socket, time\ns = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)\n"
         f"for _ in range(60): s.sendto({data!r}, ('{LOOPBACK}', {port})); time.sleep(0.05)"
     )
     with subprocess.Popen([sys.executable, "-c", code]) as process:
-        assert words in line(doctor("--connect", f"udpin:{LOOPBACK}:{port}"))
+        assert expected in line(doctor("--connect", f"udpin:{LOOPBACK}:{port}"))
         process.terminate()
 
 
-def test_a_port_in_use_names_the_companion_that_may_hold_it() -> None:
+def test_port_in_use_suggests_a_running_companion() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
         taken.bind((LOOPBACK, 0))
-        said = line(doctor("--connect", f"udpin:{LOOPBACK}:{taken.getsockname()[1]}"))
-    assert "companion run" in said
+        data_sent = line(doctor("--connect", f"udpin:{LOOPBACK}:{taken.getsockname()[1]}"))
+    assert "companion run" in data_sent
 
 
-def test_a_device_that_is_missing_or_forbidden_is_a_sentence() -> None:
+def test_missing_or_forbidden_device_is_one_sentence() -> None:
     assert "No such file" in line(doctor("--connect", "serial:/dev/ttyNONE:57600"))
     assert "dialout" in command._advice(PermissionError(13, "Permission denied"))
 
 
-def test_a_tcp_listener_that_nobody_joins_ends(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(command, "HEAR_S", 0.3)
-    begun = time.monotonic()
-    assert "nobody" in line(doctor("--connect", f"tcpin:{LOOPBACK}:0"))
-    assert time.monotonic() - begun < 5.0
+def test_tcp_listener_without_a_peer_times_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(command, "CONNECT_TIMEOUT_S", 0.3)
+    start = time.monotonic()
+    assert "no peer" in line(doctor("--connect", f"tcpin:{LOOPBACK}:0"))
+    assert time.monotonic() - start < 5.0
 
 
 # -- what is shown -------------------------------------------------------------------------------------------
@@ -152,7 +152,7 @@ def test_a_tcp_listener_that_nobody_joins_ends(monkeypatch: pytest.MonkeyPatch) 
 def shown(diagnosis: Diagnosis) -> str:
     config = load(None, {"output.profile": "px4"}, {})
     text = io.StringIO()
-    rendering.show(
+    rendering.print_diagnosis(
         Console(file=text, width=80), config, Address.parse("serial:/dev/ttyAMA0:921600"), diagnosis
     )
     return text.getvalue()
@@ -160,11 +160,11 @@ def shown(diagnosis: Diagnosis) -> str:
 
 def diagnosis(*findings: Finding, has: float | None = 0, trouble: str = "") -> Diagnosis:
     config = load(None, {"output.profile": "px4"}, {})
-    parameters = tuple(ParameterFinding(need, has, trouble) for need in needed(config))
+    parameters = tuple(ParameterFinding(need, has, trouble) for need in required_parameters(config))
     return Diagnosis(Identity(1, "px4", "fixed wing", "1.17.0", False), parameters, findings)
 
 
-def test_every_finding_has_its_word_its_numbers_and_its_advice() -> None:
+def test_every_finding_has_state_numbers_and_advice() -> None:
     bad = Finding("ATTITUDE", "2.0 Hz", "10 Hz", False, "is the line fast enough")
     text = shown(diagnosis(bad, has=None, trouble="no answer"))
     assert "absent" in text and "no answer" in text and "EKF2_AGP0_CTRL" in text
@@ -173,37 +173,37 @@ def test_every_finding_has_its_word_its_numbers_and_its_advice() -> None:
     assert max(map(len, text.splitlines())) <= 80
 
 
-def test_without_a_terminal_and_a_yes_nothing_may_be_changed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(command, "_is_somebody_here", lambda: False)
-    assert "--yes" in command.may_change(diagnosis(), yes=False)
-    assert command.may_change(diagnosis(), yes=True) == ""
-    assert "nothing to set" in command.may_change(diagnosis(has=None), yes=True)
-    assert "nothing to set" in command.may_change(diagnosis(has=1), yes=True)
+def test_change_requires_confirmation(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(command, "_is_interactive", lambda: False)
+    assert "--yes" in command.confirm_change(diagnosis(), yes=False)
+    assert command.confirm_change(diagnosis(), yes=True) == ""
+    assert "nothing to set" in command.confirm_change(diagnosis(has=None), yes=True)
+    assert "nothing to set" in command.confirm_change(diagnosis(has=1), yes=True)
     armed = Identity(1, "px4", "fixed wing", "", is_armed=True)
-    assert "armed" in command.may_change(diagnosis()._replace(identity=armed), yes=True)
+    assert "armed" in command.confirm_change(diagnosis()._replace(identity=armed), yes=True)
 
 
-def test_what_is_well_is_said_to_be() -> None:
+def test_well_diagnosis_is_stated() -> None:
     assert "All is well." in shown(diagnosis(has=1))
 
 
-def test_a_reboot_is_asked_for_by_what_was_changed_only() -> None:
+def test_reboot_is_advised_only_for_changed_parameters() -> None:
     before, new = diagnosis(), diagnosis(has=1)
-    assert "reboot the autopilot for EKF2_AGP0_ID" in rendering.after(new, new.changed_from(before))
-    assert "reboot" not in rendering.after(new, ())
+    assert "reboot the autopilot for EKF2_AGP0_ID" in rendering.change_summary(new, new.changed_from(before))
+    assert "reboot" not in rendering.change_summary(new, ())
 
 
 @pytest.mark.parametrize(("bits", "well"), [(32, False), (64, True)])
-def test_a_32_bit_machine_is_not_well(bits: int, well: bool) -> None:
-    assert machine(bits).is_well is well
-    assert machine(struct.calcsize("P") * 8).is_well
+def test_32_bit_machine_is_not_well(bits: int, well: bool) -> None:
+    assert check_machine(bits).is_well is well
+    assert check_machine(struct.calcsize("P") * 8).is_well
 
 
-def test_a_full_serial_line_is_not_well(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_full_serial_line_is_not_well(monkeypatch: pytest.MonkeyPatch) -> None:
     for share, well in ((0.5, True), (0.95, False)):
-        patient = object.__new__(command.Patient)
-        patient.bytes = round(share * 57600 / 10 * 2.0)
-        patient._begun = time.monotonic() - 2.0
-        (finding,) = patient.line_use(Address.parse("serial:/dev/ttyS0:57600"))
+        connection = object.__new__(command.AutopilotConnection)
+        connection.bytes = round(share * 57600 / 10 * 2.0)
+        connection._start = time.monotonic() - 2.0
+        (finding,) = connection.check_line_use(Address.parse("serial:/dev/ttyS0:57600"))
         assert finding.is_well is well
-        assert patient.line_use(Address.parse("udpin:127.0.0.1:14550")) == []
+        assert connection.check_line_use(Address.parse("udpin:127.0.0.1:14550")) == []

@@ -1,4 +1,4 @@
-"""The joint estimator against foreign numbers, scipy, its own statistics, and where it must refuse."""
+"""Joint estimator against independent reference values, scipy and its own statistics; degenerate cases."""
 
 import itertools
 import json
@@ -21,9 +21,9 @@ from companion.estimate.fusion import (
     Position,
     Range,
     Unobservable,
-    converted,
-    cramer_rao,
-    information,
+    convert_to_position,
+    cramer_rao_bound,
+    fisher_information,
     maximum_likelihood,
 )
 
@@ -32,7 +32,7 @@ SIGMA_A = math.radians(0.25)
 
 
 def observations(case):
-    """The reference case's observations, its RSBN pair last."""
+    """Observations of the reference case, its RSBN pair last."""
     given_ = case["input"]
     found = []
     for name in ("ins", "gnss"):
@@ -51,7 +51,7 @@ def observations(case):
 
 
 def seen(beacon, x, axes=None):
-    """Azimuth and range of x as the beacon sees it, without error."""
+    """Azimuth and range of x at the beacon, without error."""
     d = np.asarray(x, dtype=float) - beacon
     e = d if axes is None else axes @ d
     return math.atan2(e[0], e[1]), float(np.linalg.norm(d))
@@ -67,7 +67,7 @@ def rotation(angle, axis):
 
 
 @pytest.mark.parametrize("case", REFERENCE, ids=lambda c: c["name"])
-class TestForeignNumbers:
+class TestReferenceValues:
     def test_the_most_likely_position(self, case):
         fix = maximum_likelihood(observations(case))
         np.testing.assert_allclose(fix.position, case["ML"], rtol=1e-9)
@@ -85,7 +85,7 @@ class TestForeignNumbers:
         if case["input"]["dim"] == 3:
             pytest.skip("the reference converts in the plane only")
         *positions, azimuth, range_ = observations(case)
-        P = converted(azimuth, range_)
+        P = convert_to_position(azimuth, range_)
         np.testing.assert_allclose(P.value, case["conv_xy"], rtol=1e-9)
         size = np.abs(case["conv_cov"]).max()
         np.testing.assert_allclose(P.covariance, case["conv_cov"], rtol=1e-9, atol=1e-12 * size)
@@ -100,7 +100,7 @@ class TestForeignNumbers:
         np.testing.assert_allclose(diagonal, case["WLS_diag_only"], rtol=1e-9)
 
 
-def test_the_scalar_form_claims_three_metres_where_the_joint_one_says_98():
+def test_scalar_form_is_overconfident_beside_the_joint_form():
     A, D = math.radians(1.0), 140e3
     x = D * np.array([math.sin(A), math.cos(A)])
     pair = [Azimuth([0, 0], A, SIGMA_A), Range([0, 0], D, 200.0)]
@@ -186,7 +186,7 @@ def test_agrees_with_scipy_from_poor_starts(n, x, beacons, ins, start, seed):
         np.testing.assert_allclose(sum(fix.chi_squares), fix.cost, rtol=1e-9, atol=1e-12)
 
 
-def test_errors_and_cost_are_as_large_as_claimed():
+def test_errors_and_cost_match_their_distribution():
     # NEES of 3000 fixes: mean n, and the share inside the 95 % ellipse; cost: chi-square with m - n
     rng = np.random.default_rng(3)
     x = np.array([30e3, -20e3, 9000.0])
@@ -226,14 +226,14 @@ def test_one_more_observation_never_raises_the_bound(A, D, seed):
         Range(other, 1.0, 200.0),
         Height(9000.0, 30.0),
     ]
-    bounds = [cramer_rao(obs[:k], x) for k in range(1, 7)]
+    bounds = [cramer_rao_bound(obs[:k], x) for k in range(1, 7)]
     for before, after in itertools.pairwise(bounds):
         assert np.linalg.eigvalsh(before - after).min() >= -1e-9 * before.max()
-    parts = sum(information([o], x) for o in obs)
-    np.testing.assert_allclose(information(obs, x), parts, rtol=1e-9, atol=1e-12 * parts.max())
+    parts = sum(fisher_information([o], x) for o in obs)
+    np.testing.assert_allclose(fisher_information(obs, x), parts, rtol=1e-9, atol=1e-12 * parts.max())
 
 
-def test_the_jacobian_is_the_derivative_of_what_the_beacon_sees():
+def test_jacobian_is_the_derivative_of_the_measurement():
     axes = rotation(0.04, 0) @ rotation(0.05, 2)
     b, x = np.array([300e3, -150e3, -9000.0]), np.array([200.0, 300.0, 500.0])
 
@@ -241,7 +241,7 @@ def test_the_jacobian_is_the_derivative_of_what_the_beacon_sees():
         return np.array(seen(b, p, axes)) / [SIGMA_A, 200.0]
 
     J = np.column_stack([(h(x + e) - h(x - e)) / 20.0 for e in 10.0 * np.eye(3)])
-    F = information([Azimuth(b, 0.0, SIGMA_A, axes), Range(b, 1.0, 200.0)], x)
+    F = fisher_information([Azimuth(b, 0.0, SIGMA_A, axes), Range(b, 1.0, 200.0)], x)
     np.testing.assert_allclose(F, J.T @ J, rtol=1e-6, atol=1e-6 * F.max())
 
 
@@ -275,7 +275,7 @@ class TestWithoutAPosition:
         fix = maximum_likelihood([Range(s, seen(s, self.x)[1], 200.0) for s in (self.a, self.b, self.c)])
         np.testing.assert_allclose(fix.position, self.x, atol=1e-4)
 
-    def test_two_ranges_have_two_crossings_and_a_start_or_a_position_chooses(self):
+    def test_two_ranges_are_ambiguous_without_a_start_or_a_position(self):
         two = [Range(s, seen(s, self.x)[1], 200.0) for s in (self.a, self.b)]
         with pytest.raises(Ambiguous, match=r"two places .* give a start") as e:
             maximum_likelihood(two)
@@ -317,7 +317,7 @@ class TestUnobservable:
 
     def test_two_beacons_in_one_line_with_the_aircraft(self):
         with pytest.raises(Unobservable, match=r"azimuth 0\.00 deg"):
-            cramer_rao([Range([0, 0], 1.0, 200.0), Range([9e4, 0], 1.0, 200.0)], [4e4, 0.0])
+            cramer_rao_bound([Range([0, 0], 1.0, 200.0), Range([9e4, 0], 1.0, 200.0)], [4e4, 0.0])
 
     def test_only_a_height(self):
         with pytest.raises(Unobservable, match=r"azimuth .* and azimuth"):
@@ -325,26 +325,26 @@ class TestUnobservable:
 
 
 class TestOverhead:
-    def test_an_azimuth_in_the_cone_of_silence_is_left_out_and_said_so(self):
+    def test_azimuth_in_the_cone_of_silence_is_left_out_and_listed(self):
         x = np.array([300.0, -200.0, 9000.0])
         gnss = Position(x, np.eye(3) * 100.0)
         pair = [Azimuth([0, 0, 0], 0.4, SIGMA_A), Range([0, 0, 0], float(np.linalg.norm(x)) + 100.0, 200.0)]
         fix = maximum_likelihood([gnss, *pair])
-        assert fix.silent == (1,)
+        assert fix.in_cone_of_silence == (1,)
         assert (fix.residuals[1].size, fix.chi_squares[1]) == (0, 0.0)
         without = maximum_likelihood([gnss, pair[1]])
         np.testing.assert_allclose(fix.position, without.position, atol=1e-6)
         assert fix.degrees_of_freedom == without.degrees_of_freedom == 1
-        np.testing.assert_array_equal(information([pair[0]], x), np.zeros((3, 3)))
+        np.testing.assert_array_equal(fisher_information([pair[0]], x), np.zeros((3, 3)))
 
     def test_exactly_over_the_beacon(self):
         fix = maximum_likelihood([Position([0, 0, 5e3], np.eye(3)), Azimuth([0, 0, 0], 1.0, SIGMA_A)])
         np.testing.assert_allclose(fix.position, [0, 0, 5e3], atol=1e-9)
-        assert fix.silent == (1,)
+        assert fix.in_cone_of_silence == (1,)
 
     def test_the_cone_can_take_observability_away(self):
         pair = [Azimuth([0, 0, 0], 0.4, SIGMA_A), Range([0, 0, 0], 9050.0, 200.0), Height(9000.0, 20.0)]
-        with pytest.raises(Unobservable, match=r"azimuths \[0\] are silent"):
+        with pytest.raises(Unobservable, match=r"azimuths \[0\] are left out"):
             maximum_likelihood(pair)
 
     def test_a_start_at_the_beacon_itself(self):
@@ -353,7 +353,7 @@ class TestOverhead:
         np.testing.assert_allclose(fix.position, 9e4 * np.array([math.sin(2), math.cos(2)]), atol=1e-3)
 
 
-def test_residuals_point_at_the_wild_measurement():
+def test_residuals_identify_the_wild_measurement():
     x = np.array([40e3, 30e3])
     A, D = seen([0, 0], x)
     fix = maximum_likelihood(
@@ -368,7 +368,7 @@ GOOD = Position([0.0, 0.0], np.eye(2))
 
 
 @pytest.mark.parametrize(
-    ("bad", "said"),
+    ("bad", "message"),
     [
         (Range([0, 0], 1e3, 0.0), r"observation 1 \(Range\): sigma is 0.0"),
         (Azimuth([0, 0], 1.0, -1.0), r"observation 1 \(Azimuth\): sigma"),
@@ -385,13 +385,13 @@ GOOD = Position([0.0, 0.0], np.eye(2))
         ("nonsense", "observation 1 is a str"),
     ],
 )
-def test_a_bad_observation_is_named(bad, said):
-    with pytest.raises(ValueError, match=said) as e:
+def test_bad_observation_is_reported(bad, message):
+    with pytest.raises(ValueError, match=message) as e:
         maximum_likelihood([GOOD, bad])
     assert not isinstance(e.value, NoFix)
 
 
-def test_bad_calls_are_refused():
+def test_bad_calls_are_rejected():
     with pytest.raises(ValueError, match="no observations"):
         maximum_likelihood([])
     with pytest.raises(ValueError, match="start is"):
@@ -401,7 +401,7 @@ def test_bad_calls_are_refused():
     with pytest.raises(ValueError, match=r"beacon has shape \(2,\)"):
         maximum_likelihood([Height(1.0, 1.0), Range([0, 0], 1.0, 1.0)])
     with pytest.raises(ValueError, match="not longer than the height"):
-        converted(Azimuth([0, 0], 0.0, 1.0), Range([0, 0], 10.0, 1.0), up=11.0)
+        convert_to_position(Azimuth([0, 0], 0.0, 1.0), Range([0, 0], 10.0, 1.0), up=11.0)
 
 
 def test_the_benchmarks_run():

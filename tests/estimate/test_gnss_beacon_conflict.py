@@ -1,4 +1,4 @@
-"""GNSS against a beacon: the shape of their difference, and the wind, tell which of both lies."""
+"""GNSS against a beacon: the shape of their difference, and the wind, identify the faulty source."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def weighed(until_s: int, seed: int, **lie: float) -> Evidence:
 
 
 @pytest.mark.parametrize("pull, after_s", [(0.5, 240), (2.0, 90), (5.0, 50)])
-def test_a_pull_of_gnss_is_told_from_a_step_of_the_beacon(pull: float, after_s: int) -> None:
+def test_pull_of_gnss_is_distinguished_from_a_step_of_the_beacon(pull: float, after_s: int) -> None:
     for seed in range(8):
         found = weighed(START_S + after_s, seed, pull=pull)
         assert found.liar(False, 0.0) in ("", None)
@@ -47,7 +47,9 @@ def test_a_pull_of_gnss_is_told_from_a_step_of_the_beacon(pull: float, after_s: 
 
 
 @pytest.mark.parametrize("step, after_s", [(500.0, 5), (300.0, 14), (200.0, 40)])
-def test_a_step_of_the_beacon_is_told_from_a_pull_though_the_wind_jumps(step: float, after_s: int) -> None:
+def test_step_of_the_beacon_is_distinguished_from_a_pull_despite_a_wind_jump(
+    step: float, after_s: int
+) -> None:
     for seed in range(8):
         for blow in (0.0, 6.0):
             found = weighed(START_S + after_s, seed, step=step, blow=blow)
@@ -57,14 +59,14 @@ def test_a_step_of_the_beacon_is_told_from_a_pull_though_the_wind_jumps(step: fl
     assert weighed(START_S + 3 * after_s, 1, step=step).liar(False, 0.0) == "range"
 
 
-def test_where_nobody_lies_nobody_is_accused_whatever_the_wind_does() -> None:
+def test_no_source_is_blamed_without_a_fault_in_any_wind() -> None:
     for seed in range(12):
         for blow in (0.0, 8.0):
             assert weighed(START_S + 30 + 20 * seed, seed, blow=blow).liar(False, 1e9) is None
 
 
-def test_a_small_step_is_not_held_against_a_beacon_and_doubt_does_not_last() -> None:
-    """Hearing a beacon costs no more than its step; hearing a spoofer costs what he likes."""
+def test_small_step_does_not_exclude_a_beacon_and_doubt_is_limited() -> None:
+    """The error by a stepped beacon is limited, that by a spoofer is not."""
     assert Evidence(20.0, 40.0, "range", 80.0).liar(False, 0.0) == ""
     assert Evidence(20.0, 40.0, "range", 80.0).liar(True, 0.0) == "range"
     doubt = Evidence(30.0, 35.0, "range", 200.0)
@@ -73,21 +75,21 @@ def test_a_small_step_is_not_held_against_a_beacon_and_doubt_does_not_last() -> 
     assert Evidence(35.0, 30.0, "range", 200.0).liar(True, 0.0) == "range"
 
 
-def test_a_gap_and_a_short_record_are_no_obstacle() -> None:
+def test_gap_and_short_record_are_handled() -> None:
     whole = sights(START_S + 50, 3, pull=5.0)
     gap = tuple(s for s in whole if not 60 <= s.t_ns // SECOND < START_S - 10)
     assert weigh(gap, BIAS, WIND).liar(False, 0.0) == ""
     assert weigh(tuple(whole[:4]), BIAS, WIND).liar(False, 0.0) is None
 
 
-def test_what_is_too_old_is_forgotten() -> None:
+def test_old_sights_are_dropped() -> None:
     kept: tuple[Sight, ...] = ()
     for s in sights(700, 1):
         kept = keep(kept, s)
     assert (kept[-1].t_ns - kept[0].t_ns) == gnss_beacon_conflict.WINDOW_NS
 
 
-def test_an_excluded_gnss_that_stands_apart_is_seen_to_and_one_that_does_not_is_not() -> None:
+def test_difference_of_an_excluded_gnss_is_measured() -> None:
     x, P, names = np.array([20.0, 20.0]), np.diag([8.0**2, 8.0**2]), tuple(BIAS)
     limit = threshold(1e-3)
     honest = [apart(tuple(sights(60, seed)), x, P, names) for seed in range(200)]

@@ -1,4 +1,4 @@
-"""Solution separation: its covariance is what it says, a liar is named, the level is not passed too often."""
+"""Solution separation: covariance, identification of the faulty source, protection level."""
 
 from __future__ import annotations
 
@@ -40,9 +40,9 @@ def carried(bank: Bank) -> Bank:
     return filterbank.carry(bank, bank.t_ns + NS, PHI, Q, LOOSE, np.zeros(0))
 
 
-def measured(source: str, x: np.ndarray, rng: np.random.Generator, lie: float = 0.0) -> Measurement:
+def measured(source: str, x: np.ndarray, rng: np.random.Generator, fault: float = 0.0) -> Measurement:
     H, sigma = ROWS[source], SIGMA[source]
-    z = H @ x + sigma * rng.standard_normal(len(H)) + lie
+    z = H @ x + sigma * rng.standard_normal(len(H)) + fault
     return Measurement(source, z, H, sigma**2 * np.eye(len(H)))
 
 
@@ -51,8 +51,8 @@ class Flight(NamedTuple):
     x: np.ndarray
 
 
-def fly(seed: int, seconds: int, liar: str = "", slope: float = 0.0, start: int = 0) -> Flight:
-    """A flight by the filters' own model; from `start` on, `liar` is drawn off at `slope` m/s."""
+def fly(seed: int, seconds: int, faulty: str = "", slope: float = 0.0, start: int = 0) -> Flight:
+    """A flight by the filters' own model; from `start` on, `faulty` drifts at `slope` m/s."""
     rng, bank = np.random.default_rng(seed), begun()
     x = np.sqrt(np.diag(P0)) * rng.standard_normal(4)
     noise = np.linalg.cholesky(Q)
@@ -60,8 +60,8 @@ def fly(seed: int, seconds: int, liar: str = "", slope: float = 0.0, start: int 
         x = PHI @ x + noise @ rng.standard_normal(4)
         bank = carried(bank)
         for source in SIGMA:
-            lie = slope * max(t - start, 0) if source == liar else 0.0
-            bank = filterbank.take(bank, measured(source, x, rng, lie), FREE).bank
+            fault = slope * max(t - start, 0) if source == faulty else 0.0
+            bank = filterbank.take(bank, measured(source, x, rng, fault), FREE).bank
     return Flight(bank, x)
 
 
@@ -85,7 +85,7 @@ def test_the_separation_has_the_covariance_of_the_difference() -> None:
     assert {tuple(s.freedom for s in f) for f in found} == {(4, 2, 2)}
 
 
-def test_false_alarms_come_as_often_as_allotted() -> None:
+def test_false_alarm_rate_matches_its_allocation() -> None:
     limit, found = integrity.threshold(0.1), [integrity.separations(f.bank) for f in honest()]
     gnss = [s[0].position > limit for s in found]
     assert abs(np.mean(gnss) - 0.1) < 4.0 * math.sqrt(0.1 * 0.9 / len(gnss))
@@ -98,7 +98,7 @@ def test_false_alarms_come_as_often_as_allotted() -> None:
 
 
 @pytest.mark.parametrize("slope", [0.0, 0.5, 2.0, 10.0])
-def test_the_protection_level_is_passed_unseen_no_more_often_than_it_says(slope: float) -> None:
+def test_protection_level_is_exceeded_undetected_within_its_risk(slope: float) -> None:
     """Whatever the drift: misleading is an error beyond the level and no separation beyond its limit."""
     false_alarm, risk = 0.01, 0.05
     flights = honest() if slope == 0.0 else [fly(s, 25, "gnss", slope, 10) for s in range(150)]
@@ -112,15 +112,15 @@ def test_the_protection_level_is_passed_unseen_no_more_often_than_it_says(slope:
 
 @settings(deadline=None, max_examples=20)
 @given(st.sampled_from(sorted(SIGMA)), st.integers(0, 10_000))
-def test_the_one_that_jumps_is_the_one_named(liar: str, seed: int) -> None:
-    bank = fly(seed, 40, liar, 40.0 * SIGMA[liar] / 25.0, 15).bank
+def test_source_that_jumps_is_blamed(faulty: str, seed: int) -> None:
+    bank = fly(seed, 40, faulty, 40.0 * SIGMA[faulty] / 25.0, 15).bank
     found = integrity.blame(integrity.separations(bank), 1e-6)
     assert found is not None
-    assert found.source == liar
+    assert found.source == faulty
 
 
-def test_what_is_excluded_leaves_no_trace() -> None:
-    """After an exclusion the full solution is that of a filter which never met the liar."""
+def test_exclusion_removes_all_effects_of_the_source() -> None:
+    """After an exclusion the full solution equals that of a filter which never used the faulty source."""
     rng, bank, alone = np.random.default_rng(3), begun(), begun()
     for t in range(60):
         bank, alone = carried(bank), carried(alone)
@@ -139,7 +139,7 @@ def test_what_is_excluded_leaves_no_trace() -> None:
     assert filterbank.take(bank, measured("gnss", np.zeros(4), rng), FREE).accepted
 
 
-def test_a_forked_row_sees_a_drift_that_came_after_it_sooner() -> None:
+def test_forked_row_detects_a_later_drift_sooner() -> None:
     bank, rng = begun(forks=1), np.random.default_rng(4)
     fork = next(i for i, row in enumerate(bank.rows) if not row.never)
     for t in range(120):
@@ -147,13 +147,13 @@ def test_a_forked_row_sees_a_drift_that_came_after_it_sooner() -> None:
             bank = filterbank.fork(bank, fork)
         bank = carried(bank)
         for source in SIGMA:
-            lie = 1.0 * max(t - 60, 0) if source == "gnss" else 0.0
-            bank = filterbank.take(bank, measured(source, np.zeros(4), rng, lie), FREE).bank
+            fault = 1.0 * max(t - 60, 0) if source == "gnss" else 0.0
+            bank = filterbank.take(bank, measured(source, np.zeros(4), rng, fault), FREE).bank
     statistic = {s.row.never: s.statistic for s in integrity.separations(bank) if s.row.without == "gnss"}
     assert statistic[False] > 2.0 * statistic[True] > 0.0
 
 
-def test_a_beacons_bias_is_learnt_from_the_others_and_used_without_them() -> None:
+def test_beacon_bias_is_estimated_with_the_others_and_used_without_them() -> None:
     rng, bias = np.random.default_rng(5), 80.0
     bank = filterbank.join(begun(), "beacon", 100.0)
     without_state = begun()
@@ -195,24 +195,24 @@ def test_a_row_agrees_with_the_maximum_likelihood_fix() -> None:
     np.testing.assert_allclose(bank.P[0, :2, :2], fix.covariance[1::-1, 1::-1], rtol=1e-3)
 
 
-def test_above_the_beacon_an_azimuth_says_nothing() -> None:
+def test_azimuth_above_the_beacon_is_not_used() -> None:
     overhead = Azimuth(np.array([0.0, 10.0, -3000.0]), 1.0, 0.002)
     assert filterbank.sighted("azimuth", overhead, np.zeros(4), 4) is None
 
 
-def test_the_monitor_excludes_a_slow_drift_and_says_so_in_numbers() -> None:
+def test_monitor_excludes_a_slow_drift_and_reports_numbers() -> None:
     allotment = monitor.Allotment()
     watch = monitor.Monitor(begun(forks=2))
-    rng, told = np.random.default_rng(6), []
+    rng, excluded = np.random.default_rng(6), []
     for t in range(400):
         watch = watch._replace(bank=carried(watch.bank))
         for source in SIGMA:
-            lie = 2.0 * max(t - 250, 0) if source == "gnss" else 0.0
-            watch, _ = monitor.hear(watch, measured(source, np.zeros(4), rng, lie), allotment)
+            fault = 2.0 * max(t - 250, 0) if source == "gnss" else 0.0
+            watch, _ = monitor.hear(watch, measured(source, np.zeros(4), rng, fault), allotment)
         watch, exclusions = monitor.watch(watch, allotment)
-        told += [(t, e) for e in exclusions]
-    assert [e.source for _, e in told] == ["gnss"]
-    t, exclusion = told[0]
+        excluded += [(t, e) for e in exclusions]
+    assert [e.source for _, e in excluded] == ["gnss"]
+    t, exclusion = excluded[0]
     assert 250 < t < 300
     assert exclusion.value > exclusion.limit or exclusion.reason == monitor.REFUSED
     assert exclusion.since_ns < 250 * NS
@@ -223,7 +223,7 @@ def test_the_monitor_excludes_a_slow_drift_and_says_so_in_numbers() -> None:
 
 def test_a_run_of_wild_measurements_excludes_and_single_ones_do_not() -> None:
     allotment, rng = monitor.Allotment(run=5), np.random.default_rng(7)
-    watch, refused, told = monitor.Monitor(begun(forks=2)), 0, []
+    watch, refused, excluded = monitor.Monitor(begun(forks=2)), 0, []
     for t in range(80):
         watch = watch._replace(bank=carried(watch.bank))
         for source in SIGMA:
@@ -232,12 +232,12 @@ def test_a_run_of_wild_measurements_excludes_and_single_ones_do_not() -> None:
             watch, refusal = monitor.hear(watch, z, allotment)
             refused += refusal is not None
         watch, exclusions = monitor.watch(watch, allotment)
-        told += [(t, e.source, e.reason) for e in exclusions]
-    assert told == [(64, "north", monitor.REFUSED)]
+        excluded += [(t, e.source, e.reason) for e in exclusions]
+    assert excluded == [(64, "north", monitor.REFUSED)]
     assert refused == 3 + 20
 
 
-def test_an_excluded_source_comes_back_only_after_a_settled_while_within_the_bound() -> None:
+def test_excluded_source_is_readmitted_after_settling_within_the_bound() -> None:
     allotment = monitor.Allotment(settle_s=10.0)
     watch = monitor.Monitor(integrity.exclude(fly(8, 30).bank, "gnss", 0.5))
     for t in range(100):
@@ -253,7 +253,7 @@ def test_an_excluded_source_comes_back_only_after_a_settled_while_within_the_bou
     assert monitor.trusted(watch, "gnss")
 
 
-def test_what_claims_less_protects_less() -> None:
+def test_smaller_covariance_gives_smaller_protection_level() -> None:
     bank = fly(9, 30).bank
     wide = filterbank.widen(bank, 4.0)
     assert integrity.protection(wide, 1e-6, 1e-5).level > 1.9 * integrity.protection(bank, 1e-6, 1e-5).level
@@ -264,7 +264,7 @@ def test_what_claims_less_protects_less() -> None:
     st.lists(st.tuples(st.floats(-1e3, 1e3), st.floats(-1e3, 1e3)), min_size=1, max_size=30),
     st.floats(0.001, 0.5),
 )
-def test_the_gate_of_the_bound_refuses_no_more_than_its_share(
+def test_gate_of_the_bound_rejects_within_its_probability(
     offsets: list[tuple[float, float]], refusal: float
 ) -> None:
     """Of any errors whatever that obey their r.m.s. bounds."""
@@ -273,16 +273,16 @@ def test_the_gate_of_the_bound_refuses_no_more_than_its_share(
     assert np.mean([value > limit for value, limit in found]) <= refusal + 1e-12
 
 
-def test_bad_input_is_named() -> None:
+def test_bad_input_is_reported() -> None:
     bank = begun()
     with pytest.raises(ValueError, match=r"position first"):
         filterbank.begin(0, np.zeros(3), np.eye(2))
-    with pytest.raises(ValueError, match=r"one name of its own"):
+    with pytest.raises(ValueError, match=r"a unique name"):
         filterbank.join(bank, "gnss")
     with pytest.raises(ValueError, match=r"gnss: H has shape"):
         filterbank.take(bank, Measurement("gnss", np.zeros(2), np.eye(2), np.eye(2)), FREE)
     with pytest.raises(ValueError, match=r"there are gnss, north, east"):
-        integrity.exclude(bank, "nobody", 0.5)
+        integrity.exclude(bank, "unknown", 0.5)
     with pytest.raises(ValueError, match=r"not excluded"):
         filterbank.readmit(bank, "gnss")
     with pytest.raises(ValueError, match=r"between 0 and 1"):
@@ -303,7 +303,7 @@ evidence = st.builds(
 
 @settings(deadline=None, max_examples=200)
 @given(st.lists(evidence, min_size=1, max_size=60))
-def test_trust_falls_at_once_and_rises_only_after_a_settled_while(course: list[Evidence]) -> None:
+def test_trust_falls_at_once_and_rises_after_settling(course: list[Evidence]) -> None:
     limits = Limits(settle_s=5.0)
     held = Held(Trust.UNTRUSTED, 0)
     for t, now in enumerate(course, 1):
@@ -315,7 +315,7 @@ def test_trust_falls_at_once_and_rises_only_after_a_settled_while(course: list[E
             assert all(trust.judge(e, limits, limits.clear) < before.trust for e in better)
 
 
-def test_trust_does_not_flutter_at_its_limit() -> None:
+def test_trust_has_hysteresis_at_its_limit() -> None:
     limits, held = Limits(protection=100.0), Held(Trust.NORMAL, 0)
     changes = 0
     for t in range(1, 400):

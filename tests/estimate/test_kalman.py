@@ -1,3 +1,5 @@
+"""Kalman filter: reference values, agreement with dense least squares, consistency, validation."""
+
 import json
 from pathlib import Path
 
@@ -8,7 +10,6 @@ from hypothesis import strategies as st
 from scipy.linalg import block_diag
 
 from companion.estimate import full_horizon, kalman, restrictive
-from companion.estimate.moving_horizon import MHE, Window
 from companion.nav.error_model import paper_example
 
 REFERENCE = json.loads((Path(__file__).parents[1] / "data/restrictive.json").read_text())
@@ -19,7 +20,7 @@ def problem(case):
     return [np.array(case[k], float) for k in ("A", "B", "Q", "H", "R", "C", "x0", "P0", "Z")]
 
 
-def follow(x, P, Z, A, Q, H, R):
+def run_filter(x, P, Z, A, Q, H, R):
     X = [x]
     for z in Z:
         now = kalman.step(x, P, z, A, Q, H, R)
@@ -39,7 +40,7 @@ def random_problem(rng, n=4, p=2, m=1, T=15):
 def test_reference_without_inputs_and_minimax(case):
     A, B, Q, H, R, C, x0, P0, Z = problem(case)
     for name, noise in (("kf_noU", Q), ("minimax_kf", kalman.minimax_noise(B, C, Q))):
-        X, P = follow(x0, P0, Z, A, noise, H, R)
+        X, P = run_filter(x0, P0, Z, A, noise, H, R)
         np.testing.assert_allclose(X, case[name]["X"], atol=1e-12)
         np.testing.assert_allclose(P, case[name]["P_last"], atol=1e-12)
 
@@ -48,7 +49,7 @@ def test_reference_of_sixteen_states():
     s = REFERENCE["sixteen_states_euler"]
     e = paper_example(exact=False)
     for name, Q in (("minimax_kf", kalman.minimax_noise(e.B, e.C, e.Q)), ("plain_kf", e.Q_markov)):
-        X, P = follow(e.x0, e.P0, s["Z"], e.A, Q, e.H, e.R)
+        X, P = run_filter(e.x0, e.P0, s["Z"], e.A, Q, e.H, e.R)
         np.testing.assert_allclose(X[s["steps"]], s[name], atol=1e-9)
         if name == "minimax_kf":
             np.testing.assert_allclose(np.diag(P), s["minimax_P60_diag"], atol=1e-9)
@@ -64,7 +65,7 @@ def test_minimax_is_the_markov_filter_for_one_bound():
 @settings(deadline=None, max_examples=20)
 @given(st.integers(0, 2**32 - 1))
 def test_all_filters_are_dense_least_squares(seed):
-    """Linear and Gaussian: KF, R1 and MHE with no room for U, the exact record and one big system agree."""
+    """Kalman filter, R1 with zero bounds, full horizon and dense least squares agree."""
     rng = np.random.default_rng(seed)
     A, B, Q, H, R, Z = random_problem(rng)
     n, T = len(A), len(Z)
@@ -74,24 +75,22 @@ def test_all_filters_are_dense_least_squares(seed):
     dynamics[: n * (T + 1), : n * (T + 1)] = np.eye(n * (T + 1))
     for t in range(T):
         dynamics[n * (t + 1) : n * (t + 2), n * t : n * (t + 1)] = -A
-    sight = np.hstack([np.zeros((len(R) * T, n)), block_diag(*[H] * T)])
+    measurements = np.hstack([np.zeros((len(R) * T, n)), block_diag(*[H] * T)])
     weight = np.linalg.inv(np.linalg.cholesky(block_diag(P0, *[Q] * T, *[R] * T)))
-    rows = weight @ np.vstack([dynamics, sight])
+    rows = weight @ np.vstack([dynamics, measurements])
     right = weight @ np.concatenate([x0, np.zeros(n * T), Z.ravel()])
     dense = np.linalg.lstsq(rows, right)[0].reshape(T + 1, n)
 
-    X, P = follow(x0, P0, Z, A, Q, H, R)
+    X, P = run_filter(x0, P0, Z, A, Q, H, R)
     np.testing.assert_allclose(X[-1], dense[-1], atol=1e-10)
     none = np.zeros(1)
-    record = full_horizon.exact(x0, P0, Z, A, B, Q, H, R, none)
+    record = full_horizon.solve_full_horizon(x0, P0, Z, A, B, Q, H, R, none)
     np.testing.assert_allclose(record.x, dense, atol=1e-10)
     np.testing.assert_allclose(record.P, P, atol=1e-10)
-    x, P1, window = x0, P0, Window(x0, P0)
+    x, P1 = x0, P0
     for t, z in enumerate(Z):
         x, P1, *_ = restrictive.step(x, P1, z, A, B, Q, H, R, none)
-        window, mhe = MHE(4).step(window, full_horizon.Sample(z, A, B, Q, H, R, none))
         np.testing.assert_allclose(x, X[t + 1], atol=1e-10)
-        np.testing.assert_allclose(mhe.x, X[t + 1], atol=1e-10)
 
 
 def test_joseph_keeps_covariance_for_a_wrong_gain():
@@ -105,7 +104,7 @@ def test_joseph_keeps_covariance_for_a_wrong_gain():
     assert np.linalg.eigvalsh(wrong - best)[0] > -1e-9 * np.abs(wrong).max()
 
 
-def test_batch_is_one_by_one():
+def test_batch_equals_one_by_one():
     rng = np.random.default_rng(1)
     A, _, Q, H, R, Z = random_problem(rng, T=7)
     x = rng.normal(size=(7, 4))
@@ -118,8 +117,8 @@ def test_batch_is_one_by_one():
         np.testing.assert_allclose(own.P[i], alone.P, atol=1e-13)
 
 
-def test_honest_filter_is_consistent():
-    """NIS and NEES of a filter that knows the truth's law stay within their chi-square limits."""
+def test_filter_with_the_true_model_is_consistent():
+    """NIS and NEES of a filter with the true model stay within their chi-square limits."""
     rng = np.random.default_rng(2)
     A, _, Q, H, R, _ = random_problem(rng)
     runs, n, p = 400, 4, 2
@@ -131,22 +130,22 @@ def test_honest_filter_is_consistent():
         z = truth @ H.T + rng.multivariate_normal(np.zeros(p), R, runs)
         x, P, _, _, nis = kalman.step(x, P, z, A, Q, H, R)
     for value, dof in ((nis, p), (kalman.nees(x - truth, P), n)):
-        low, high = kalman.band(dof, runs)
+        low, high = kalman.consistency_band(dof, runs)
         assert low < value.mean() < high
-    assert (nis > kalman.gate(p)).mean() < 0.01
+    assert (nis > kalman.nis_gate(p)).mean() < 0.01
 
 
-def test_nees_counts_only_what_p_leaves_open():
+def test_nees_leaves_out_directions_of_zero_variance():
     P = np.diag([1e6, 1e-12, 0.0])
     assert kalman.nees(np.array([1e3, 1e-6, 0.0]), P) == pytest.approx(2.0)
 
 
 def test_gate_is_chi_square():
-    assert kalman.gate(2, 0.05) == pytest.approx(5.991, abs=1e-3)
+    assert kalman.nis_gate(2, 0.05) == pytest.approx(5.991, abs=1e-3)
 
 
 @pytest.mark.parametrize(
-    ("P", "says"),
+    ("P", "message"),
     [
         (np.diag([1.0, -1.0]), "variance -1"),
         (np.array([[1.0, 2.0], [2.0, 1.0]]), "semidefinite"),
@@ -155,20 +154,20 @@ def test_gate_is_chi_square():
         (np.eye(3), "shape"),
     ],
 )
-def test_start_names_what_is_wrong_with_p0(P, says):
-    with pytest.raises(ValueError, match=says):
-        kalman.Start(0, np.zeros(2), P)
+def test_initial_state_names_the_flaw_of_p0(P, message):
+    with pytest.raises(ValueError, match=message):
+        kalman.InitialState(0, np.zeros(2), P)
 
 
-def test_start_accepts_exact_alignment_and_refuses_nan():
-    assert kalman.Start(0, np.zeros(2), np.zeros((2, 2))).t_ns == 0
+def test_initial_state_accepts_exact_alignment_and_rejects_nan():
+    assert kalman.InitialState(0, np.zeros(2), np.zeros((2, 2))).t_ns == 0
     with pytest.raises(ValueError, match="not finite"):
-        kalman.Start(0, np.array([0.0, np.nan]), np.eye(2))
+        kalman.InitialState(0, np.array([0.0, np.nan]), np.eye(2))
 
 
-def test_in_flight_a_flaw_is_a_reason_not_an_exception():
+def test_measurement_flaw_is_returned_not_raised():
     z, R = np.zeros(2), np.eye(2)
-    assert kalman.measurement_flaw(5, z, R, 5) is None
-    assert "backwards" in str(kalman.measurement_flaw(4, z, R, 5))
-    assert "not finite" in str(kalman.measurement_flaw(6, z + np.inf, R, 5))
-    assert "must be positive" in str(kalman.measurement_flaw(6, z, 0 * R, 5))
+    assert kalman.find_measurement_flaw(5, z, R, 5) is None
+    assert "backwards" in str(kalman.find_measurement_flaw(4, z, R, 5))
+    assert "not finite" in str(kalman.find_measurement_flaw(6, z + np.inf, R, 5))
+    assert "must be positive" in str(kalman.find_measurement_flaw(6, z, 0 * R, 5))

@@ -13,17 +13,17 @@ from hypothesis.extra import numpy as hnp
 from scipy.linalg import expm
 from scipy.optimize import linprog
 
-from companion.estimate.minimax import (
-    Infeasible,
-    closed_form,
-    continuous,
-    least_squares,
+from companion.estimate.minimax import closed_form, closed_form_tau, continuous_tau
+from companion.estimate.minimax_lp import Infeasible, least_squares, solve, white_noise_rms, worst_case_rms
+from companion.estimate.schuler import (
+    ARCSECOND,
+    DEG_PER_HOUR,
+    STATE,
+    Scale,
     schuler_row,
-    solve,
-    white,
-    worst_case,
+    sine_excess,
+    transition,
 )
-from companion.estimate.schuler import ARCSECOND, DEG_PER_HOUR, STATE, Scale, sine_excess, transition
 
 REFERENCE = json.loads((Path(__file__).parents[1] / "data" / "minimax.json").read_text())
 REFERENCE_DIGITS = 1e-12
@@ -36,7 +36,7 @@ def sampled(case):
 
 
 def highs(rows, target, sigmas):
-    """The primal programme, solved by somebody else."""
+    """Solve the primal programme by HiGHS."""
     sigmas = np.broadcast_to(sigmas, len(rows))
     unit = np.abs(rows).max(axis=0)  # coefficients below 1e-9 it takes for zero, whatever they are worth
     unit[unit == 0.0] = 1.0
@@ -51,11 +51,11 @@ def highs(rows, target, sigmas):
 
 
 def proved(result, rows, target, sigmas, gap=1e-9):
-    """A solution carries its own proof: unbiased weights, a feasible dual, equal values."""
+    """Check the certificate: unbiased weights, a feasible dual, equal values."""
     size = (np.abs(rows.T) @ np.abs(result.weights)).max()
     assert np.abs(rows.T @ result.weights - target).max() <= 1e-11 * size
     assert (np.abs(rows @ result.dual) <= sigmas * (1.0 + 1e-9)).all()
-    assert worst_case(result.weights, sigmas) == pytest.approx(result.bound, rel=1e-12)
+    assert worst_case_rms(result.weights, sigmas) == pytest.approx(result.bound, rel=1e-12)
     assert abs(result.gap) < gap
     assert abs(result.bound - target @ result.dual) <= gap * result.bound
 
@@ -86,7 +86,7 @@ def test_sine_excess_keeps_its_digits_near_zero():
 
 @pytest.mark.parametrize("case", REFERENCE["chi"], ids=lambda case: f"T={case['T']:.3g}")
 def test_chi_delta_and_determinant(case):
-    result = closed_form(case["T"], 0.1)
+    result = closed_form_tau(case["T"], 0.1)
     t1 = 0.5 * case["T"] - result.times[1]
     N = schuler_row("gamma", 0.5 * case["T"] - result.times)  # det N is the same for every alpha
     assert result.times[1] == pytest.approx(case["chi"], rel=REFERENCE_DIGITS)
@@ -98,7 +98,7 @@ def test_chi_delta_and_determinant(case):
     "case", REFERENCE["closed_form"], ids=lambda c: f"T={c['T']:.3g} alpha={c['alpha']:.3g}"
 )
 def test_closed_form_reference(case):
-    result = closed_form(case["T"], case["alpha"])
+    result = closed_form_tau(case["T"], case["alpha"])
     assert result.fallback == ()
     for k, name in enumerate(STATE):
         assert result.bounds[k] == pytest.approx(case["d"][name], rel=REFERENCE_DIGITS)
@@ -107,36 +107,38 @@ def test_closed_form_reference(case):
 
 
 @pytest.mark.parametrize("case", REFERENCE["phi_window"], ids=lambda case: f"T={case['T']:.3g}")
-def test_tilt_leaves_the_closed_form_exactly_where_it_fails(case):
+def test_tilt_falls_back_exactly_where_the_closed_form_fails(case):
     T, edges = case["T"], (case["alpha_max"], case["valid_again_from"])
-    inside = [closed_form(T, edges[0] - 1e-7), closed_form(T, edges[1] + 1e-7)]
-    beyond = [closed_form(T, edges[0] + 1e-7), closed_form(T, edges[1] - 1e-7)]
+    inside = [closed_form_tau(T, edges[0] - 1e-7), closed_form_tau(T, edges[1] + 1e-7)]
+    beyond = [closed_form_tau(T, edges[0] + 1e-7), closed_form_tau(T, edges[1] - 1e-7)]
     assert [r.fallback for r in inside] == [(), ()]
     assert [r.fallback for r in beyond] == [("phi",), ("phi",)]
     for r, other in zip(inside, beyond, strict=True):
         assert r.bounds[1] == pytest.approx(other.bounds[1], rel=1e-5)  # the bound itself has no jump
     h = 0.5 * T
-    assert closed_form(T, math.pi - h).bounds[1] > 1.0  # where the printed sigma |sin c| / D is zero
+    assert closed_form_tau(T, math.pi - h).bounds[1] > 1.0  # where the printed sigma |sin c| / D is zero
 
 
 @pytest.mark.parametrize("T", [0.05, 0.7, 2.0, 4.7, 7.0, 12.0])
 @pytest.mark.parametrize("alpha", [-0.02, 0.0, 0.4, 2.3, 3.0, 5.5])
 def test_closed_form_equals_the_general_solver_everywhere(T, alpha):
-    result = closed_form(T, alpha, sigma=2.0)
+    result = closed_form_tau(T, alpha, sigma=2.0)
     for k in range(4):
         rows = schuler_row("gamma", T + alpha - result.instants[k])
         size = np.abs(result.weights[k]).sum()
         assert (result.instants[k] >= 0.0).all() and (result.instants[k] <= T).all()
         assert rows.T @ result.weights[k] == pytest.approx(UNITS[k], abs=1e-12 * size)
         assert result.bounds[k] == pytest.approx(2.0 * size, rel=REFERENCE_DIGITS)
-        assert result.bounds[k] == pytest.approx(continuous(T, alpha, UNITS[k], sigma=2.0).bound, rel=1e-9)
+        assert result.bounds[k] == pytest.approx(
+            continuous_tau(T, alpha, UNITS[k], sigma=2.0).bound, rel=1e-9
+        )
         if STATE[k] not in result.fallback:
             assert (result.instants[k] == result.times).all()
 
 
-def test_closed_form_keeps_its_digits_in_a_window_of_hundredths_of_a_second():
+def test_closed_form_is_accurate_in_a_very_short_window():
     """h -> 0: chi -> T/4 and the bounds go as powers of T: the channel becomes a cubic."""
-    short, shorter = closed_form(1e-5, 0.0), closed_form(5e-6, 0.0)
+    short, shorter = closed_form_tau(1e-5, 0.0), closed_form_tau(5e-6, 0.0)
     assert short.times[1] / 1e-5 == pytest.approx(0.25, rel=1e-10)
     assert shorter.bounds / short.bounds == pytest.approx([1.0, 4.0, 2.0, 8.0], rel=1e-9)
 
@@ -144,27 +146,33 @@ def test_closed_form_keeps_its_digits_in_a_window_of_hundredths_of_a_second():
 def test_prediction_in_metres():
     """Matasov, Martirosyan's channel at 1.2387e-3 rad/s: 15 min of 30 m positions."""
     scale = Scale(6_371_000.0, 1.2387e-3)
-    units = np.array(scale.units) * (1.0, 1 / ARCSECOND, 1.0, 1 / DEG_PER_HOUR)
+    units = np.array([1.0, 1 / ARCSECOND, 1.0, 1 / DEG_PER_HOUR])
 
     def bounds(minutes):
-        return closed_form(900 * scale.rate, 60 * minutes * scale.rate, 30.0 / scale.radius).bounds * units
+        return closed_form(900.0, 60.0 * minutes, 30.0, scale).bounds * units
 
+    assert closed_form(900, 600, 30).bounds[0] == pytest.approx(1216.97846, rel=1e-8)
+    found, tau = closed_form(900.0, 300.0, 30.0), closed_form_tau(900.0 * scale.rate, 300.0 * scale.rate)
+    assert found.times == pytest.approx(tau.times / scale.rate, rel=1e-14)
+    assert 30.0 * np.abs(found.weights).sum(axis=1) == pytest.approx(found.bounds, rel=1e-12)
     assert bounds(5) == pytest.approx([391.731747, 109.928437, 1.90645543, 0.163481305], rel=1e-8)
     assert bounds(10)[0] == pytest.approx(1216.97846, rel=1e-8)
     assert bounds(20)[[0, 2, 3]] == pytest.approx([4558.45109, 7.44174283, 0.163481305], rel=1e-8)
 
 
-def test_least_squares_claims_much_and_guarantees_little():
+def test_least_squares_is_overconfident():
     """15 min of 30 m positions a second apart, ten minutes ahead."""
     scale = Scale(6_371_000.0, 1.2387e-3)
     rows = schuler_row("gamma", scale.rate * (1500.0 - np.arange(901)))
     ls, minimax = (f(rows, UNITS[0], 30.0) for f in (least_squares, solve))
     assert (ls.claimed, ls.worst) == pytest.approx((70.7, 1786.5), abs=0.05)
     assert minimax.bound == pytest.approx(1216.97846, rel=4.03 / 900**2)
-    assert white(closed_form(900 * scale.rate, 600 * scale.rate).weights[0], 30.0) == pytest.approx(
+    assert white_noise_rms(closed_form(900.0, 600.0, 30.0, scale).weights[0], 30.0) == pytest.approx(
         651, abs=0.5
     )
-    assert (ls.claimed, ls.worst) == pytest.approx((white(ls.weights, 30.0), worst_case(ls.weights, 30.0)))
+    assert (ls.claimed, ls.worst) == pytest.approx(
+        (white_noise_rms(ls.weights, 30.0), worst_case_rms(ls.weights, 30.0))
+    )
 
 
 # The general solver
@@ -180,7 +188,7 @@ def test_sampled_reference(case):
 
 @pytest.mark.parametrize("case", REFERENCE["arbitrary_target"], ids=lambda c: f"T={c['T']} {c['a']}")
 def test_arbitrary_target_reference(case):
-    result = continuous(case["T"], case["alpha"], case["a"])
+    result = continuous_tau(case["T"], case["alpha"], case["a"])
     rows = schuler_row("gamma", case["T"] + case["alpha"] - result.times)
     assert result.bound == pytest.approx(1.0 if case["d"] is None else case["d"], rel=1e-9)
     assert rows.T @ result.weights == pytest.approx(case["a"], abs=1e-11 * result.bound)
@@ -242,7 +250,7 @@ def test_exchange_equals_a_linear_programme_on_the_channel(T, alpha, seed, k):
     sigmas = np.r_[np.full(60, 1.0), rng.uniform(0.5, 20.0, 30)]
     result = solve(rows, UNITS[k], sigmas)
     proved(result, rows, UNITS[k], sigmas)
-    assert result.bound == pytest.approx(highs(rows, UNITS[k], sigmas).fun, rel=1e-8)
+    assert result.bound == pytest.approx(highs(rows, UNITS[k], sigmas).fun, rel=1e-7)  # HiGHS's own tolerance
 
 
 @pytest.mark.parametrize("T", [1e-3, 1e-2, 0.1])
@@ -252,7 +260,7 @@ def test_short_windows_are_solved_in_the_middle_of_the_window(T):
     target = transition(0.5 * T + alpha)[0]
     result = solve(schuler_row("gamma", -x), target, 1.0)
     assert result.bound == pytest.approx(
-        closed_form(T, alpha).bounds[0], rel=3e-7
+        closed_form_tau(T, alpha).bounds[0], rel=3e-7
     )  # the grid's 4.03 / (n - 1)^2
     assert abs(result.gap) < 1e-9
 
@@ -264,7 +272,7 @@ def test_short_windows_are_solved_in_the_middle_of_the_window(T):
     seed=st.integers(0, 2**32 - 1),
     k=st.integers(0, 3),
 )
-def test_every_window_carries_its_proof(exponent, ahead, seed, k):
+def test_every_window_has_a_certificate(exponent, ahead, seed, k):
     """From a tenth of a second to three Schuler periods, with velocities of any quality."""
     rng, T = np.random.default_rng(seed), 10.0**exponent
     x = np.sort(rng.uniform(-0.5, 0.5, rng.integers(6, 300))) * T
@@ -280,7 +288,7 @@ def test_every_window_carries_its_proof(exponent, ahead, seed, k):
     assert abs(result.gap) < 1e-9
 
 
-def test_a_bad_start_does_no_harm():
+def test_bad_start_does_not_change_the_result():
     rows = schuler_row("gamma", 1.5 - np.linspace(0, 1, 101))
     good = solve(rows, UNITS[0], 1.0)
     for start in ([], [0, 0, 0, 0], [0, 1, 2, 3], [-1, 5, 7, 9], [5, 50, 99, 101], [1, 2, 3]):
@@ -309,8 +317,8 @@ def test_bound_is_attained_and_never_exceeded(data):
     variance = w @ (correlation * np.outer(sigmas, sigmas)) @ w
     assert variance <= bound**2 * (1.0 + 1e-9)
     for other in (least_squares(rows, UNITS[0], sigmas).weights, w):
-        assert worst_case(other, sigmas) >= bound * (1.0 - rounding)
-        assert white(other, sigmas) <= worst_case(other, sigmas)
+        assert worst_case_rms(other, sigmas) >= bound * (1.0 - rounding)
+        assert white_noise_rms(other, sigmas) <= worst_case_rms(other, sigmas)
 
 
 @settings(max_examples=100, deadline=None)
@@ -342,8 +350,8 @@ def test_scaling(seed, factor):
     )
 
 
-def test_bounds_of_parts_seen_by_different_sensors_add():
-    """Two sensors, each alone sees its own part of the target: the bounds add, not their squares."""
+def test_bounds_of_parts_measured_by_different_sensors_add():
+    """Two sensors, each measuring its own part of the target: the bounds add, not their squares."""
     rng = np.random.default_rng(5)
     first, second = rng.normal(size=(9, 2)), rng.normal(size=(7, 2))
     rows = np.block([[first, np.zeros((9, 2))], [np.zeros((7, 2)), second]])
@@ -353,8 +361,8 @@ def test_bounds_of_parts_seen_by_different_sensors_add():
     assert whole.bound == pytest.approx(sum(parts), rel=1e-12)
 
 
-def test_a_denser_grid_comes_down_to_the_continuous_optimum():
-    exact = closed_form(1.0, 0.5).bounds[0]
+def test_denser_grid_converges_to_the_continuous_optimum():
+    exact = closed_form_tau(1.0, 0.5).bounds[0]
     excess = [
         solve(schuler_row("gamma", 1.5 - np.linspace(0, 1, n)), UNITS[0], 1.0).bound / exact - 1.0
         for n in (26, 51, 101, 401, 1601)
@@ -367,7 +375,7 @@ def test_a_denser_grid_comes_down_to_the_continuous_optimum():
 
 
 @pytest.mark.parametrize(
-    ("rows", "target", "sigmas", "told"),
+    ("rows", "target", "sigmas", "message"),
     [
         (np.eye(2), [1, 0], [1.0, -2.0], r"sigmas\[1\] is -2.0"),
         (np.eye(2), [1, 0], [0.0, 1.0], r"sigmas\[0\] is 0.0"),
@@ -388,14 +396,27 @@ def test_a_denser_grid_comes_down_to_the_continuous_optimum():
         (np.zeros((3, 2)), [1, 0], 1.0, "rank 0 of 2"),
     ],
 )
-def test_bad_problems_are_told(rows, target, sigmas, told):
+def test_bad_problems_are_reported(rows, target, sigmas, message):
     for solver in (solve, least_squares):
-        with pytest.raises(ValueError, match=told):
+        with pytest.raises(ValueError, match=message):
             solver(rows, target, sigmas)
 
 
 @pytest.mark.parametrize(
-    ("arguments", "told"),
+    ("arguments", "message"),
+    [
+        ((0.0, 600.0, 30.0), "window_s is 0.0"),
+        ((900.0, math.nan, 30.0), "ahead_s is nan"),
+        ((900.0, 600.0, 0.0), "sigma_m is 0.0"),
+    ],
+)
+def test_bad_dimensional_arguments_are_reported(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        closed_form(*arguments)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
     [
         ((0.0, 0.1), "T is 0.0"),
         ((-1.0, 0.1), "T is -1.0"),
@@ -404,8 +425,8 @@ def test_bad_problems_are_told(rows, target, sigmas, told):
         ((1.0, 0.1, -1.0), "sigma is -1.0"),
     ],
 )
-def test_bad_arguments_of_the_closed_form_are_told(arguments, told):
-    with pytest.raises(ValueError, match=told):
-        closed_form(*arguments)
+def test_bad_arguments_of_the_closed_form_are_reported(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        closed_form_tau(*arguments)
     with pytest.raises(ValueError, match=r"'gamma' \(position\) or 'mu'"):
         schuler_row("phi", 0.0)

@@ -1,4 +1,4 @@
-"""Order selection: foreign numbers, unbiasedness, and a smoothed track of which nothing was known."""
+"""Order selection: reference values, unbiasedness, and smoothing of an unknown track."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from companion.estimate.polynomial import FAMILIES, orthonormal, select_order, smooth_track
+from companion.estimate.polynomial import FAMILIES, orthonormal_basis, select_order, smooth_track
 
 DATA = json.loads((pathlib.Path(__file__).parents[1] / "data/map_and_order.json").read_text())["order"]
 T = np.linspace(0.0, 10.0, 101)
@@ -21,7 +21,7 @@ SIGMA = 0.2 * (1.0 + 0.05 * T)
 
 @pytest.mark.parametrize("signal", ["cubic", "osc"])
 @pytest.mark.parametrize("basis", FAMILIES)
-def test_foreign_numbers(signal: str, basis: Any) -> None:
+def test_reference_values(signal: str, basis: Any) -> None:
     reference = DATA["results"][signal][basis]
     found = select_order(T, DATA["z"][signal], SIGMA, basis, 12)
     assert found.order == reference["r_J"]
@@ -40,7 +40,7 @@ def test_a_cubic_has_four_terms_and_not_nine() -> None:
     assert found.spans
 
 
-def test_what_the_basis_does_not_span_shows_in_the_residuals_alone() -> None:
+def test_signal_outside_the_span_shows_in_the_residuals() -> None:
     # a wave between the functions of the basis: the criterion is content, the residuals are not
     z = np.sin(10.0 * T) * 3.0 * SIGMA + DATA["z"]["cubic"]
     found = select_order(T, z, SIGMA, "legendre", 8)
@@ -51,7 +51,7 @@ def test_what_the_basis_does_not_span_shows_in_the_residuals_alone() -> None:
 
 @pytest.mark.parametrize("basis", FAMILIES)
 def test_the_basis_is_orthonormal_with_the_weight(basis: Any) -> None:
-    functions = orthonormal(T, SIGMA, basis, 9)
+    functions = orthonormal_basis(T, SIGMA, basis, 9)
     fine = np.linspace(0.0, 10.0, 200_001)
     Psi = functions(fine) / np.interp(fine, T, SIGMA)[:, None]
     inner = np.trapezoid(Psi[:, :, None] * Psi[:, None, :], fine, axis=0)
@@ -60,7 +60,9 @@ def test_the_basis_is_orthonormal_with_the_weight(basis: Any) -> None:
 
 @settings(max_examples=40, deadline=None)
 @given(st.integers(0, 10**6), st.integers(13, 200), st.floats(1e-3, 1e3), st.floats(-1e6, 1e6))
-def test_neither_units_nor_origins_matter(seed: int, count: int, unit: float, origin: float) -> None:
+def test_result_is_independent_of_units_and_origins(
+    seed: int, count: int, unit: float, origin: float
+) -> None:
     rng = np.random.default_rng(seed)
     t = np.linspace(0.0, 1.0, count) + rng.uniform(0.0, 0.3 / count, count)
     z = np.polynomial.polynomial.polyval(t, rng.standard_normal(3)) + 0.1 * rng.standard_normal(count)
@@ -136,18 +138,18 @@ def test_a_simple_track_takes_one_window() -> None:
 
 
 @pytest.mark.parametrize(
-    ("t", "z", "sigma", "basis", "r_max", "said"),
+    ("t", "z", "sigma", "basis", "r_max", "message"),
     [
-        ([0, 1, 2], [1, 2, 3], 1.0, "spline", 2, "there is no basis 'spline'"),
+        ([0, 1, 2], [1, 2, 3], 1.0, "spline", 2, "unknown basis 'spline'"),
         ([0, 1, 2], [1, 2], 1.0, "power", 2, "do not fit"),
         ([0, 1, 2], [1, 2, 3], 1.0, "power", 3, "r_max is 3 for 3 samples"),
-        ([0, 2, 1], [1, 2, 3], 1.0, "power", 2, "the times do not rise"),
+        ([0, 2, 1], [1, 2, 3], 1.0, "power", 2, "the times are not increasing"),
         ([0, 1, 2], [1, 2, math.nan], 1.0, "power", 2, "not finite"),
         ([0, 1, 2], [1, 2, 3], 0.0, "power", 2, "must be positive"),
         (np.arange(50.0), np.arange(50.0), 1.0, "power", 45, "take fewer"),
-        ([0, 1e-5, 2e-5, 3e-5, 10], [1, 2, 3, 4, 5], 1.0, "legendre", 4, "do not tell 4 functions"),
+        ([0, 1e-5, 2e-5, 3e-5, 10], [1, 2, 3, 4, 5], 1.0, "legendre", 4, "do not distinguish 4 functions"),
     ],
 )
-def test_bad_input_is_one_sentence(t: Any, z: Any, sigma: Any, basis: Any, r_max: int, said: str) -> None:
-    with pytest.raises(ValueError, match=said):
+def test_bad_input_is_reported(t: Any, z: Any, sigma: Any, basis: Any, r_max: int, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
         select_order(t, z, sigma, basis, r_max)

@@ -1,4 +1,4 @@
-"""The rolling window is an immutable value, and its promises in metres are those of the mathematics."""
+"""Rolling window: an immutable value whose bounds in metres are those of the theory."""
 
 import math
 
@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from companion.estimate.minimax import closed_form, solve
+from companion.estimate.minimax import closed_form
+from companion.estimate.minimax_lp import solve
 from companion.estimate.predictor import TARGETS, Window, predict, predict_ahead
 from companion.estimate.schuler import ARCSECOND, DEG_PER_HOUR, Scale, schuler_row, transition
 
@@ -38,7 +39,7 @@ def test_bounds_in_metres_and_arcseconds(minutes, position, velocity, tilt):
     assert all(abs(f.gap) < 1e-9 for f in (p.position, p.velocity, p.tilt, p.drift))
 
 
-def test_least_squares_stands_beside():
+def test_least_squares_is_reported_for_comparison():
     forecast = predict(FIFTEEN_MINUTES, START + 1500 * SECOND, scale=SCALE).position
     assert forecast.ls_claimed == pytest.approx(70.7, abs=0.05)
     assert forecast.ls_worst == pytest.approx(1786.5, abs=0.05)
@@ -71,7 +72,7 @@ def test_a_channel_without_noise_is_predicted_exactly(seed, ahead, mix):
 
 @settings(max_examples=100, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), ahead=st.floats(0.0, 3600.0))
-def test_errors_within_sigma_never_leave_the_bound(seed, ahead):
+def test_errors_within_sigma_stay_within_the_bound(seed, ahead):
     """Where |rho| <= sigma for certain, |error| <= bound for certain."""
     rng = np.random.default_rng(seed)
     t = np.arange(0, 900, 15) * SECOND
@@ -83,9 +84,9 @@ def test_errors_within_sigma_never_leave_the_bound(seed, ahead):
     assert abs(forecast.estimate - motion(then / SECOND, start)[0, 0]) <= forecast.bound * (1.0 + 1e-9)
 
 
-def test_the_fixes_named_are_those_the_bound_stands_on():
+def test_active_fixes_determine_the_bound():
     forecast = predict(FIFTEEN_MINUTES, START + 1500 * SECOND, scale=SCALE).position
-    chi = closed_form(900 * SCALE.rate, 600 * SCALE.rate).times / SCALE.rate
+    chi = closed_form(900.0, 600.0, 30.0, SCALE).times
     seconds = np.array([t - START for t, _ in forecast.active]) / SECOND
     assert np.abs(seconds - chi).max() <= 1.0
     rows = schuler_row("gamma", (1500.0 - seconds) * SCALE.rate)
@@ -104,7 +105,7 @@ def test_horizons_in_a_row_equal_horizons_one_by_one():
     assert predict_ahead(FIFTEEN_MINUTES, []) == []
 
 
-def test_a_start_from_another_window_changes_nothing():
+def test_start_from_another_window_does_not_change_the_result():
     velocities = Window.of(START + np.arange(500) * SECOND, "velocity", np.zeros(500), 0.1)
     other = predict(velocities, START + 600 * SECOND, ("velocity",))
     then = START + 1200 * SECOND
@@ -115,7 +116,7 @@ def test_a_start_from_another_window_changes_nothing():
 # Flagged, not raised
 
 
-def test_too_few_fixes_are_a_state():
+def test_too_few_fixes_are_not_feasible():
     empty = predict(Window(), START, TARGETS)
     assert not empty.feasible and empty.reason == "no fixes in the window"
     window = Window()
@@ -127,7 +128,7 @@ def test_too_few_fixes_are_a_state():
     assert predict(window, START + 100 * SECOND).feasible
 
 
-def test_velocity_alone_tells_all_but_position():
+def test_velocities_determine_all_but_position():
     window = Window.of(START + np.arange(600) * SECOND, "velocity", np.zeros(600), 0.3)
     p = predict(window, START + 900 * SECOND, TARGETS)
     assert not p.feasible
@@ -139,7 +140,7 @@ def test_velocity_alone_tells_all_but_position():
 # The window
 
 
-def test_pushing_leaves_the_old_window_alone():
+def test_push_does_not_change_the_old_window():
     old = Window().push(START, "position", 5.0, 30.0)
     new = old.push(START + SECOND, "velocity", 0.1, 0.3)
     assert (len(old), len(new)) == (1, 2)
@@ -169,7 +170,7 @@ def test_window_keeps_the_longest_stretch_and_its_ends(seed, capacity, velocity_
     assert holes.max() <= 4.0 * max(np.median(holes), 2.0)
 
 
-def test_thinning_costs_little():
+def test_thinning_hardly_changes_the_bound():
     """1 h of fixes a second apart, thinned to 300: the bound hardly moves."""
     full = Window.of(np.arange(3600) * SECOND, "position", np.zeros(3600), 30.0, capacity=3600)
     thin = Window.of(np.arange(3600) * SECOND, "position", np.zeros(3600), 30.0, capacity=300)
@@ -179,7 +180,7 @@ def test_thinning_costs_little():
 
 
 @pytest.mark.parametrize(
-    ("fix", "told"),
+    ("fix", "message"),
     [
         ((START - 1, "position", 0.0, 30.0), r"fix 1 is at .* before the last"),
         ((START, "position", 0.0, 30.0), "fix 1 repeats the position"),
@@ -189,12 +190,12 @@ def test_thinning_costs_little():
         ((START + 1, "height", 0.0, 30.0), "'height'; give 'position' or 'velocity'"),
     ],
 )
-def test_bad_fixes_are_told(fix, told):
-    with pytest.raises(ValueError, match=told):
+def test_bad_fixes_are_reported(fix, message):
+    with pytest.raises(ValueError, match=message):
         Window().push(START, "position", 0.0, 30.0).push(*fix)
 
 
-def test_bad_windows_are_told():
+def test_bad_windows_are_reported():
     with pytest.raises(ValueError, match=r"t_ns\[2\] does not follow t_ns\[1\]"):
         Window.of([0, 5, 5, 7], "position", np.zeros(4), 1.0)
     with pytest.raises(ValueError, match=r"t_ns\[1\] does not follow"):

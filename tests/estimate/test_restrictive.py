@@ -1,5 +1,6 @@
+"""Restrictive filter R1 and the full-horizon solution: reference values, optimality, limits, box solvers."""
+
 import json
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -7,9 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from companion.estimate import bounded_lsq, kalman, restrictive
-from companion.estimate.full_horizon import Sample
-from companion.estimate.moving_horizon import MHE, Window
+from companion.estimate import bounded_lsq, full_horizon, kalman, restrictive
 from companion.nav.error_model import paper_example
 
 REFERENCE = json.loads((Path(__file__).parents[1] / "data/restrictive.json").read_text())
@@ -29,19 +28,11 @@ def ship():
     return e.x0, e.P0, np.array(SHIP["Z"]), (e.A, e.B, e.Q, e.H, e.R, e.C)
 
 
-def r1(x, P, Z, model, kappa=np.inf):
+def run_r1(x, P, Z, model, kappa=np.inf):
     steps = []
     for z in Z:
         steps.append(restrictive.step(x, P, z, *model, kappa))
         x, P = steps[-1].x, steps[-1].P
-    return steps
-
-
-def mhe(x, P, Z, model, length, kappa=np.inf):
-    carry, steps = Window(x, P), []
-    for z in Z:
-        carry, now = MHE(length, kappa).step(carry, Sample(z, *model))
-        steps.append(now)
     return steps
 
 
@@ -53,7 +44,7 @@ def gather(steps, name):
 def test_r1_small(case):
     x0, P0, Z, model = problem(case)
     for name, kappa in (("restrictive_R1", np.inf), ("restrictive_R1_prior_C2", 1.0)):
-        steps, want = r1(x0, P0, Z, model, kappa), case[name]
+        steps, want = run_r1(x0, P0, Z, model, kappa), case[name]
         np.testing.assert_allclose(gather(steps, "x"), want["X"][1:], atol=1e-12)
         np.testing.assert_allclose(gather(steps, "u"), want["U"], atol=1e-12)
         assert (gather(steps, "status") == want["status"]).all()
@@ -62,11 +53,11 @@ def test_r1_small(case):
 
 
 @pytest.mark.parametrize("case", SMALL)
-def test_exact_small(case):
+def test_full_horizon_small(case):
     x0, P0, Z, model = problem(case)
     want = case["exact_restrictive"]
     for t in range(1, len(Z) + 1):
-        record = restrictive.exact(x0, P0, Z[:t], *model)
+        record = full_horizon.solve_full_horizon(x0, P0, Z[:t], *model)
         np.testing.assert_allclose(record.x[-1], want["X_filter"][t - 1], atol=1e-12)
         np.testing.assert_allclose(record.u[-1], want["U_last"][t - 1], atol=1e-12)
     np.testing.assert_allclose(record.u.ravel(), want["U_smooth_T"], atol=1e-12)
@@ -75,50 +66,25 @@ def test_exact_small(case):
     assert (record.status == 0).sum() == want["free_count_T"]
 
 
-@pytest.mark.parametrize("case", SMALL)
-@pytest.mark.parametrize("length", [1, 3, 5])
-@pytest.mark.parametrize(("name", "kappa"), [("flat", np.inf), ("fix", 0.0)])
-def test_mhe_small(case, length, name, kappa):
-    x0, P0, Z, model = problem(case)
-    steps, want = mhe(x0, P0, Z, model, length, kappa), case[f"mhe_{name}_L{length}"]
-    np.testing.assert_allclose(gather(steps, "x"), want["X"][1:], atol=1e-12)
-    np.testing.assert_allclose(gather(steps, "u"), want["U"], atol=1e-12)
-
-
 def test_sixteen_states():
     x0, P0, Z, model = ship()
     shown = np.array(SHIP["steps"]) - 1
-    steps = r1(x0, P0, Z, model)
+    steps = run_r1(x0, P0, Z, model)
     np.testing.assert_allclose(gather(steps, "x")[shown], SHIP["restrictive_R1"], atol=1e-9)
     np.testing.assert_allclose(gather(steps, "u"), SHIP["restrictive_R1_U"], atol=1e-9)
     assert (gather(steps, "status") == SHIP["restrictive_R1_status"]).all()
     np.testing.assert_allclose(np.diag(steps[-1].P), SHIP["restrictive_R1_P60_diag"], atol=1e-9)
-    ten = mhe(x0, P0, Z, model, 10)
-    np.testing.assert_allclose(gather(ten, "x")[shown], SHIP["mhe_flat_L10"], atol=1e-9)
     for t, want in zip(SHIP["steps"], SHIP["exact_restrictive"], strict=True):
-        record = restrictive.exact(x0, P0, Z[:t], *model)
+        record = full_horizon.solve_full_horizon(x0, P0, Z[:t], *model)
         np.testing.assert_allclose(record.x[-1], want, atol=1e-9)
     np.testing.assert_allclose(record.u, SHIP["exact_U_smooth_60"], atol=1e-9)
 
 
 @pytest.mark.parametrize("data", [*(problem(p.values[0]) for p in SMALL), ship()], ids=["1", "2", "16"])
-def test_mhe_between_r1_and_exact(data):
-    x0, P0, Z, model = data
-    for one, other in zip(mhe(x0, P0, Z, model, 1), r1(x0, P0, Z, model), strict=True):
-        np.testing.assert_allclose(one.x, other.x, atol=1e-10)
-        np.testing.assert_allclose(one.P, other.P, atol=1e-10)
-        assert (one.status == other.status).all()
-    full = mhe(x0, P0, Z, model, len(Z))[-1]
-    record = restrictive.exact(x0, P0, Z, *model)
-    np.testing.assert_allclose(full.x, record.x[-1], atol=1e-10)
-    np.testing.assert_allclose(full.P, record.P, atol=1e-10)
-
-
-@pytest.mark.parametrize("data", [*(problem(p.values[0]) for p in SMALL), ship()], ids=["1", "2", "16"])
-def test_two_point_problem(data):
-    """The record solves the conditions of the optimum, none of which was used to find it."""
+def test_full_horizon_solves_the_two_point_problem(data):
+    """The estimate satisfies the conditions of the optimum, none of which was used to find it."""
     x0, P0, Z, (A, B, Q, H, R, C) = data
-    x, _, u, status, l = restrictive.exact(x0, P0, Z, A, B, Q, H, R, C)
+    x, _, u, status, l = full_horizon.solve_full_horizon(x0, P0, Z, A, B, Q, H, R, C)
     # adjoint variables in units in which they multiply states of order one
     size = 1.0 + np.abs(l).max(axis=0)
     assert np.abs(x[0] - x0 - P0 @ l[0]).max() < 1e-9
@@ -134,33 +100,33 @@ def test_two_point_problem(data):
 
 
 def test_limits_of_the_bound():
-    """No room: the filter without inputs. All room: unknown inputs, and both R1 and the record agree."""
+    """Zero bounds: the filter without inputs. Wide bounds: unknown inputs, R1 and the full horizon agree."""
     x0, P0, Z, (A, B, Q, H, R, C) = ship()
-    tight = r1(x0, P0, Z, (A, B, Q, H, R, 0 * C))[-1]
+    tight = run_r1(x0, P0, Z, (A, B, Q, H, R, 0 * C))[-1]
     x, P = x0, P0
     for z in Z:
         x, P, *_ = kalman.step(x, P, z, A, Q, H, R)
     np.testing.assert_allclose(tight.x, x, atol=1e-10)
     np.testing.assert_allclose(tight.P, P, atol=1e-10)
     wide = (A, B, Q, H, R, 1e6 * C)
-    loose = r1(x0, P0, Z, wide)[-1]
+    loose = run_r1(x0, P0, Z, wide)[-1]
     assert not loose.status.any()
-    np.testing.assert_allclose(loose.x, restrictive.exact(x0, P0, Z, *wide).x[-1], atol=1e-8)
+    np.testing.assert_allclose(loose.x, full_horizon.solve_full_horizon(x0, P0, Z, *wide).x[-1], atol=1e-8)
 
 
 @pytest.mark.parametrize("C", [[0.0, 0.3], [0.3, 0.3]])
-def test_unseen_inputs_take_the_minimax_prior(C):
-    """One row cannot tell two inputs apart; no measurement at all is the minimax prediction."""
+def test_undetermined_inputs_take_the_minimax_prior(C):
+    """One row cannot distinguish two inputs; no measurement at all is the minimax prediction."""
     e = paper_example()
     C = np.array(C)
-    blind = restrictive.step(
+    unmeasured = restrictive.step(
         e.x0, 1e-4 * e.Q, np.zeros(0), e.A, e.B, e.Q, np.zeros((0, 16)), np.zeros((0, 0)), C
     )
-    assert not blind.u.any()
+    assert not unmeasured.u.any()
     Q = kalman.minimax_noise(e.B, C, e.Q)
-    np.testing.assert_allclose(blind.P, kalman.predict(e.x0, 1e-4 * e.Q, e.A, Q).P, atol=1e-12)
-    seen = restrictive.step(e.x0, e.Q, np.array([0.1]), e.A, e.B, e.Q, np.ones((1, 16)), np.eye(1), C)
-    assert np.isfinite(seen.P).all() and np.linalg.eigvalsh(seen.P)[0] > -1e-9
+    np.testing.assert_allclose(unmeasured.P, kalman.predict(e.x0, 1e-4 * e.Q, e.A, Q).P, atol=1e-12)
+    partly = restrictive.step(e.x0, e.Q, np.array([0.1]), e.A, e.B, e.Q, np.ones((1, 16)), np.eye(1), C)
+    assert np.isfinite(partly.P).all() and np.linalg.eigvalsh(partly.P)[0] > -1e-9
 
 
 @settings(deadline=None, max_examples=60)
@@ -168,7 +134,7 @@ def test_unseen_inputs_take_the_minimax_prior(C):
 def test_box_by_enumeration_and_by_bvls_agree(seed, m):
     rng = np.random.default_rng(seed)
     D, r = rng.normal(size=(m + 2, m)), 3 * rng.normal(size=m + 2)
-    small, large = bounded_lsq.minimum(D.T @ D, D.T @ r), bounded_lsq.least_squares(D, r)
+    small, large = bounded_lsq.minimize_quadratic(D.T @ D, D.T @ r), bounded_lsq.least_squares(D, r)
     np.testing.assert_allclose(small.v, large.v, atol=1e-9)
     assert (small.status == large.status).all()
     np.testing.assert_allclose(small.free_inverse, large.free_inverse, rtol=1e-6, atol=1e-9)
@@ -176,10 +142,10 @@ def test_box_by_enumeration_and_by_bvls_agree(seed, m):
     assert (np.sum((r - v @ D.T) ** 2, 1) >= np.sum((r - D @ small.v) ** 2) - 1e-12).all()
 
 
-def test_clipping_is_not_the_answer():
+def test_clipping_is_not_optimal():
     M, g = np.array([[1.0, 0.9], [0.9, 1.0]]), np.array([2.0, 1.0])
     clipped = np.clip(np.linalg.solve(M, g), -1, 1)
-    best = bounded_lsq.minimum(M, g).v
+    best = bounded_lsq.minimize_quadratic(M, g).v
     cost = [0.5 * v @ M @ v - g @ v for v in (best, clipped)]
     assert cost[0] < cost[1] - 0.1
 
@@ -194,7 +160,7 @@ def test_interior_point_solver_agrees():
     np.testing.assert_allclose(bounded_lsq.least_squares(D, r).v, solver.result.x, atol=1e-5)
 
 
-def test_batch_is_one_by_one():
+def test_batch_equals_one_by_one():
     e = paper_example()
     z = 0.5 * np.random.default_rng(4).standard_normal((8, 30, 2))
     x, P = np.tile(e.x0, (8, 1)), np.tile(e.P0, (8, 1, 1))
@@ -203,28 +169,8 @@ def test_batch_is_one_by_one():
         together.append(restrictive.step(x, P, z[:, t], e.A, e.B, e.Q, e.H, e.R, e.C))
         x, P = together[-1].x, together[-1].P
     for i in range(8):
-        alone = r1(e.x0, e.P0, z[i], (e.A, e.B, e.Q, e.H, e.R, e.C))
+        alone = run_r1(e.x0, e.P0, z[i], (e.A, e.B, e.Q, e.H, e.R, e.C))
         for many, one in zip(together, alone, strict=True):
             np.testing.assert_allclose(many.x[i], one.x, atol=1e-9)
             assert (many.status[i] == one.status).all()
         np.testing.assert_allclose(together[-1].P[i], one.P, atol=1e-9)
-
-
-def test_carry_is_a_value():
-    """Going back to an older carry and forward again gives the same."""
-    x0, P0, Z, model = ship()
-    filter_, carry, old = MHE(5), Window(x0, P0), []
-    for z in Z[:20]:
-        old.append(carry)
-        carry, now = filter_.step(carry, Sample(z, *model))
-    again = old[8]
-    for z in Z[8:20]:
-        again, redone = filter_.step(again, Sample(z, *model))
-    assert (redone.x == now.x).all() and (redone.P == now.P).all()
-    assert all(len(a.samples) <= len(b.samples) for a, b in pairwise(old))
-
-
-@pytest.mark.parametrize(("length", "kappa"), [(0, np.inf), (3, -1.0), (3, np.nan)])
-def test_horizon_is_validated(length, kappa):
-    with pytest.raises(ValueError, match=r"horizon|kappa"):
-        MHE(length, kappa)

@@ -1,3 +1,5 @@
+"""Correction schemes: reference values, equivalence of all mixtures, nonlinear feedback."""
+
 import json
 from pathlib import Path
 
@@ -6,7 +8,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from companion.estimate.schemes import FEEDBACK, FEEDFORWARD, Carry, Feed, Plant, feed_back, step
+from companion.estimate.schemes import (
+    FEEDBACK,
+    FEEDFORWARD,
+    FeedbackFractions,
+    Plant,
+    SchemeState,
+    feed_back,
+    step,
+)
 
 LINEAR = json.loads((Path(__file__).parents[1] / "data/schemes.json").read_text())["linear"]
 F, G, A, Q, H, R, P0, X0, READ, Z, TRUTH = (
@@ -17,10 +27,10 @@ PLANT = Plant(lambda X, u: F @ X + G @ u, lambda X, u: A, lambda X: X[:1], lambd
 
 def linear(feed):
     """Columns p, v, k1, k2 as estimated, for all steps."""
-    carry, rows = Carry(X0, np.zeros(4), P0, np.zeros(1)), []
+    state, rows = SchemeState(X0, np.zeros(4), P0, np.zeros(1)), []
     for f, z in zip(READ, Z, strict=True):
-        carry = step(carry, np.array([f]), np.array([z]), PLANT, feed)
-        rows.append([*carry.corrected, *carry.x[2:]])
+        state = step(state, np.array([f]), np.array([z]), PLANT, feed)
+        rows.append([*state.corrected, *state.x[2:]])
     return np.array(rows)
 
 
@@ -37,30 +47,32 @@ def test_linear_reference(name, feed):
 @settings(deadline=None, max_examples=25)
 @given(st.floats(0, 1), st.floats(0, 1))
 def test_every_mixture_is_informationally_equivalent(state, readings):
-    np.testing.assert_allclose(linear(Feed(state, readings)), linear(FEEDFORWARD), rtol=1e-12, atol=1e-10)
+    np.testing.assert_allclose(
+        linear(FeedbackFractions(state, readings)), linear(FEEDFORWARD), rtol=1e-12, atol=1e-10
+    )
 
 
-def test_forgetting_to_reduce_the_estimate_is_silent():
+def test_estimate_must_be_reduced_with_the_ins():
     """The INS is corrected but the estimate keeps the part taken out: no alarm, 3.24 m instead of 3.05."""
-    carry, wrong = Carry(X0, np.zeros(4), P0, np.zeros(1)), []
+    state, wrong = SchemeState(X0, np.zeros(4), P0, np.zeros(1)), []
     for f, z in zip(READ, Z, strict=True):
-        carry = step(carry, np.array([f]), np.array([z]), PLANT)
-        carry = carry._replace(X=carry.X - carry.x[:2])  # and x untouched
-        wrong.append(carry.X[0])
+        state = step(state, np.array([f]), np.array([z]), PLANT)
+        state = state._replace(X=state.X - state.x[:2])  # and x untouched
+        wrong.append(state.X[0])
     assert rms(linear(FEEDBACK)[:, 0]) == pytest.approx(3.05, abs=0.005)
     assert rms(np.array(wrong)) == pytest.approx(3.24, abs=0.005)
 
 
-def test_feed_back_moves_numbers_and_loses_none():
-    carry = Carry(np.array([5.0, 6.0]), np.array([1.0, 2.0, 3.0, 4.0]), P0, np.zeros(1))
-    after = feed_back(carry, Feed(0.25, 0.5))
-    np.testing.assert_array_equal(after.corrected, carry.corrected)
-    assert after.beta == 1.5 and after.P is carry.P
+def test_feed_back_keeps_the_solution():
+    state = SchemeState(np.array([5.0, 6.0]), np.array([1.0, 2.0, 3.0, 4.0]), P0, np.zeros(1))
+    after = feed_back(state, FeedbackFractions(0.25, 0.5))
+    np.testing.assert_array_equal(after.corrected, state.corrected)
+    assert after.beta == 1.5 and after.P is state.P
 
 
-def test_feed_is_a_fraction():
-    with pytest.raises(ValueError, match=r"feed\.readings"):
-        Feed(0.5, 1.5)
+def test_fractions_outside_0_to_1_are_rejected():
+    with pytest.raises(ValueError, match="readings"):
+        FeedbackFractions(0.5, 1.5)
 
 
 # A planar INS: position, velocity, heading; a gyro and two accelerometers with biases.
@@ -100,7 +112,7 @@ def planar(gyro, accelerometer, feed, seed, scale=1.0):
     biases = np.array([gyro, accelerometer, accelerometer])
     sigma = scale * np.concatenate([[2, 2, 0.2, 0.2, 0.02], biases])
     X = np.array([0, 0, SPEED, 0, 0.0])
-    carry = Carry(X + sigma[:5] * rng.standard_normal(5), np.zeros(8), np.diag(sigma**2), np.zeros(3))
+    state = SchemeState(X + sigma[:5] * rng.standard_normal(5), np.zeros(8), np.diag(sigma**2), np.zeros(3))
     biases = scale * biases * rng.choice([-1, 1], 3)
     errors = []
     for k in range(1, 3001):
@@ -108,9 +120,9 @@ def planar(gyro, accelerometer, feed, seed, scale=1.0):
         u = np.array([w, 0.5 * np.sin(2 * np.pi * k * DT / 30), SPEED * w])
         X = mechanise(X, u)
         fix = X[:2] + 2 * scale * rng.standard_normal(2) if k % 10 == 0 else None
-        carry = step(carry, u + biases + noise * rng.standard_normal(3), fix, plant, feed)
+        state = step(state, u + biases + noise * rng.standard_normal(3), fix, plant, feed)
         if fix is not None:
-            errors.append(carry.corrected[:2] - X[:2])
+            errors.append(state.corrected[:2] - X[:2])
     return np.array(errors)
 
 
@@ -124,7 +136,7 @@ def test_jacobian_is_that_of_the_mechanisation():
 
 
 def test_coarse_sensors_need_feedback():
-    """A MEMS gyro: with feedback the error does not notice the biases, without it the linearisation fails."""
+    """A MEMS gyro: with feedback the biases have no effect, without it the linearisation fails."""
 
     def error(gyro_deg, accelerometer, feed):
         square = [np.sum(planar(np.radians(gyro_deg), accelerometer, feed, s) ** 2, 1).mean() for s in (0, 1)]
@@ -136,7 +148,7 @@ def test_coarse_sensors_need_feedback():
     assert fine[0] > 2 * fine[1] and coarse[0] > 40 * coarse[1]
 
 
-def test_schemes_part_as_the_square_of_the_errors():
+def test_schemes_differ_by_the_square_of_the_errors():
     apart = [
         np.abs(
             planar(np.radians(0.1), 0.05, FEEDFORWARD, 1, s) - planar(np.radians(0.1), 0.05, FEEDBACK, 1, s)

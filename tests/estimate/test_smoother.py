@@ -1,4 +1,4 @@
-"""The smoother: three ways to one trajectory, foreign numbers, and what smoothing must do to an error."""
+"""Smoother: three algorithms for one trajectory, reference values, consistency of the errors."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from companion.estimate import smoother, two_point_bvp
 from companion.nav.discretization import discretise
 from companion.nav.disturbances import accelerometer_slow, gyro_drift
-from companion.nav.error_model import aircraft
+from companion.nav.error_model import aircraft_model
 
 DATA = json.loads((pathlib.Path(__file__).parents[1] / "data/map_and_order.json").read_text())["two_state"]
 AGREE = 1e-9
@@ -37,13 +37,13 @@ def example() -> tuple[Any, ...]:
 
 
 @pytest.mark.parametrize("solve", [smoother.rts, smoother.two_point])
-def test_foreign_numbers(solve: Any) -> None:
+def test_reference_values(solve: Any) -> None:
     found = solve(*example())
     np.testing.assert_allclose(found.x, DATA["x_smooth"], atol=1e-13)
     np.testing.assert_allclose(found.s, DATA["s"], atol=1e-13)
     np.testing.assert_allclose(found.P[0], DATA["P_smooth_0"], atol=1e-14)
     np.testing.assert_allclose(found.x[0], [0.141426184774452, 0.975138510178567], atol=1e-14)
-    forward = smoother.filtered(*example())
+    forward = smoother.forward_filter(*example())
     np.testing.assert_allclose(forward.x, DATA["x_filter"], atol=1e-13)
     np.testing.assert_allclose(found.x[-1], forward.x[-1], atol=1e-13)
     np.testing.assert_allclose(found.P[-1], DATA["P_filter_last"], atol=1e-14)
@@ -84,7 +84,7 @@ def random_problem(seed: int, n: int, N: int, singular: bool) -> tuple[Any, ...]
 
 
 def conditioned(problem: tuple[Any, ...]) -> tuple[Any, Any, Any, Any]:
-    """The same by the textbook: everything is linear in (x_0, theta), which are conditioned on all of z."""
+    """Dense conditioning: everything is linear in (x_0, theta), which are conditioned on all of z."""
     Phi, Gamma, D, H, R, z, m, B = problem
     n, N = len(m), len(z)
     starts = np.cumsum([n, *(len(d) for d in D)])
@@ -118,7 +118,7 @@ def conditioned(problem: tuple[Any, ...]) -> tuple[Any, Any, Any, Any]:
 
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 10**6), st.integers(1, 5), st.integers(1, 12), st.booleans())
-def test_all_ways_agree(seed: int, n: int, N: int, singular: bool) -> None:
+def test_all_algorithms_agree(seed: int, n: int, N: int, singular: bool) -> None:
     problem = random_problem(seed, n, N, singular)
     x, P, theta, theta_P = conditioned(problem)
     H, z = problem[3], problem[5]
@@ -139,10 +139,10 @@ def test_all_ways_agree(seed: int, n: int, N: int, singular: bool) -> None:
 
 @settings(max_examples=30, deadline=None)
 @given(st.integers(0, 10**6), st.integers(1, 4), st.integers(2, 10))
-def test_it_is_the_recursion_of_rauch_tung_and_striebel(seed: int, n: int, N: int) -> None:
+def test_rts_equals_the_recursion_of_rauch_tung_and_striebel(seed: int, n: int, N: int) -> None:
     problem = random_problem(seed, n, N, singular=False)
     Phi, Gamma, D = problem[:3]
-    forward, found = smoother.filtered(*problem), smoother.rts(*problem)
+    forward, found = smoother.forward_filter(*problem), smoother.rts(*problem)
     x, P = forward.x[-1], forward.P[-1]
     for i in range(N - 1, -1, -1):
         ahead = Phi[i] @ forward.P[i] @ Phi[i].T + Gamma[i] @ D[i] @ Gamma[i].T
@@ -153,6 +153,11 @@ def test_it_is_the_recursion_of_rauch_tung_and_striebel(seed: int, n: int, N: in
         P = forward.P[i] + C @ (P - ahead) @ C.T
         np.testing.assert_allclose(found.x[i], x, rtol=1e-7, atol=1e-8)
         np.testing.assert_allclose(found.P[i], P, rtol=1e-7, atol=1e-8)
+    Q = [g @ d @ g.T for g, d in zip(Gamma, D, strict=True)]
+    predicted = [Phi[i] @ forward.x[i] for i in range(N)]
+    backward = smoother.rts_backward(forward.x, forward.P, predicted, Phi, Q)
+    np.testing.assert_allclose(backward.x, found.x, rtol=1e-7, atol=1e-8)
+    np.testing.assert_allclose(backward.P, found.P, rtol=1e-7, atol=1e-8)
 
 
 @settings(max_examples=30, deadline=None)
@@ -231,7 +236,7 @@ def test_beacon_only_the_nonlinear_problem_is_solved(seed: int) -> None:
         assert (abs(x[i + 1] - Phi[i] @ x[i] - Q @ s_i) < 1e-7 * sigma[i + 1]).all()
 
 
-def test_beacon_only_nothing_near_costs_less() -> None:
+def test_beacon_only_the_result_is_a_minimum() -> None:
     problem, _, h = flight(7)
     Phi, Gamma, D, _, R, z, m, B = problem
     found = smoother.gauss_newton(*problem)
@@ -256,7 +261,7 @@ def test_beacon_only_nothing_near_costs_less() -> None:
             assert criterion(start, theta + 0.1 * size * rng.standard_normal(theta.shape)) > least
 
 
-def test_beacon_only_errors_are_as_large_as_promised() -> None:
+def test_beacon_only_errors_match_their_covariance() -> None:
     states, disturbances = [], []
     for seed in range(20):
         problem, truth, _ = flight(seed, N=100)
@@ -274,7 +279,7 @@ def test_beacon_only_errors_are_as_large_as_promised() -> None:
 
 def test_smoothing_makes_every_variance_smaller() -> None:
     problem = random_problem(3, 4, 40, singular=False)
-    forward, found = smoother.filtered(*problem), smoother.rts(*problem)
+    forward, found = smoother.forward_filter(*problem), smoother.rts(*problem)
     for k in range(41):
         assert np.linalg.eigvalsh(forward.P[k] - found.P[k]).min() > -1e-12
     np.testing.assert_allclose(found.x[-1], forward.x[-1], atol=1e-12)
@@ -283,7 +288,7 @@ def test_smoothing_makes_every_variance_smaller() -> None:
 def test_the_error_model_of_an_ins_for_a_flight() -> None:
     """Metres, microradians and radians per second in one state, an outage in the middle."""
     drift, bias = gyro_drift(1.0 / 18000.0, 5e-8), accelerometer_slow(1.0 / 3600.0, 5e-4)
-    model = aircraft(math.radians(60.0), 150.0, 100.0, added=(drift, bias))
+    model = aircraft_model(math.radians(60.0), 150.0, 100.0, added=(drift, bias))
     step = discretise(model.A, model.Q + np.diag([0.0, 0.0, 1e-5, 1e-5] + [0.0] * 8), model.B, 2.0)
     N, H = 900, np.eye(2, 12)
     B = np.diag([20.0, 20.0, 0.5, 0.5, 1e-4, 1e-4, 1e-3, 5e-8, 5e-8, 5e-8, 5e-4, 5e-4]) ** 2
@@ -297,8 +302,8 @@ def test_the_error_model_of_an_ins_for_a_flight() -> None:
 
 
 @pytest.mark.parametrize("solve", [smoother.rts, smoother.two_point])
-def test_a_prior_that_knows_nothing(solve: Any) -> None:
-    """Least squares without a prior; nothing negative comes of taking great covariances from each other."""
+def test_uninformative_prior(solve: Any) -> None:
+    """Least squares without a prior; no negative variance by differences of large covariances."""
     N = 30
     rng = np.random.default_rng(0)
     z = list(rng.standard_normal((N, 1)))
@@ -325,7 +330,7 @@ def test_memory_grows_as_the_length(solve: Any) -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         ({5: [1.0, 2.0]}, "entries: give one of each"),
         ({0: [np.eye(3)] * 10}, r"entry 0: Phi \(3, 3\)"),
@@ -336,16 +341,16 @@ def test_memory_grows_as_the_length(solve: Any) -> None:
         ({7: [[1.0, 2.0], [2.0, 1.0]]}, "P0 is not positive semidefinite"),
     ],
 )
-def test_bad_input_is_one_sentence(change: dict[int, Any], said: str) -> None:
+def test_bad_input_is_reported(change: dict[int, Any], message: str) -> None:
     problem = list(example())
     for k, value in change.items():
         problem[k] = value
     for solve in (smoother.rts, smoother.two_point):
-        with pytest.raises(ValueError, match=said):
+        with pytest.raises(ValueError, match=message):
             solve(*problem)
 
 
-def test_a_wrong_jacobian_is_said() -> None:
+def test_wrong_jacobian_is_reported() -> None:
     problem = list(flight(1)[0])
     right = problem[3]
     problem[3] = lambda i, x: (right(i, x)[0], -right(i, x)[1])

@@ -1,4 +1,4 @@
-"""An ArduPilot's onboard log becomes records. The logs are written here byte by byte: none was recorded."""
+"""ArduPilot onboard logs are converted to records. The logs are written here byte by byte, not recorded."""
 
 import math
 import pathlib
@@ -95,16 +95,16 @@ def write(tmp_path: pathlib.Path, *parts: bytes, name: str = "flight.bin") -> pa
     return path
 
 
-def test_every_message_becomes_its_record(tmp_path: pathlib.Path) -> None:
+def test_every_message_is_converted(tmp_path: pathlib.Path) -> None:
     source = sources.open_source(write(tmp_path, definitions(), *LOG))
-    heard = list(source)
-    kinds = [type(record) for record in heard]
+    records = list(source)
+    kinds = [type(record) for record in records]
     assert kinds == [
         *(r.Gnss, r.LocalOrigin, r.Imu, r.Attitude, r.LocalPosition, r.Wind, r.GlobalPosition),
         *(r.AirData, r.Pressure, r.Truth, r.Event, r.Gnss),
     ]
-    by = {type(record): record for record in heard}
-    first, second = heard[0], heard[-1]
+    by = {type(record): record for record in records}
+    first, second = records[0], records[-1]
     assert isinstance(first, r.Gnss) and isinstance(second, r.Gnss)
     assert first.t_ns * 1e-9 == pytest.approx(UNIX_S, abs=1.0)
     assert second.t_ns - first.t_ns == 200_000_000 and not second.repeats(first)
@@ -119,11 +119,11 @@ def test_every_message_becomes_its_record(tmp_path: pathlib.Path) -> None:
     assert (by[r.Pressure].static, by[r.Pressure].differential) == (97_000.0, 250.0)  # type: ignore[attr-defined]
     assert by[r.Truth].v_n == (11.0, 12.0, 13.0)  # type: ignore[attr-defined]
     assert by[r.Event].text == "Throttle armed"  # type: ignore[attr-defined]
-    assert source.summary().records == len(heard)
+    assert source.summary().records == len(records)
 
 
-def test_the_lane_told_is_the_primary_one(tmp_path: pathlib.Path) -> None:
-    """Before any XKF4 lane 0; then the one it names, whose status is told as MAVLink's flags."""
+def test_primary_lane_is_converted(tmp_path: pathlib.Path) -> None:
+    """Lane 0 before any XKF4, then the lane that it names; its status is converted to MAVLink flags."""
     status = message("XKF4", 1_050_000, 1, 0.25, 0x3F | 1 << 14, 1)
     parts = [
         gps(1_000_000, GMS),
@@ -132,40 +132,42 @@ def test_the_lane_told_is_the_primary_one(tmp_path: pathlib.Path) -> None:
         local(1_060_000, 2.0, 1),
         local(1_070_000, 3.0),
     ]
-    heard = list(sources.open_source(write(tmp_path, definitions(), *parts)))
-    assert [h.x_n[0] for h in heard if isinstance(h, r.LocalPosition)] == [1.0, 2.0]
-    (found,) = [h for h in heard if isinstance(h, r.FilterStatus)]
+    records = list(sources.open_source(write(tmp_path, definitions(), *parts)))
+    assert [h.x_n[0] for h in records if isinstance(h, r.LocalPosition)] == [1.0, 2.0]
+    (found,) = [h for h in records if isinstance(h, r.FilterStatus)]
     assert (found.flags, found.gnss_glitch, found.position_ratio) == (0x3F | 32768, True, 0.25)
 
 
-def test_truth_without_velocity_gets_that_of_its_positions(tmp_path: pathlib.Path) -> None:
+def test_truth_velocity_is_derived_from_positions(tmp_path: pathlib.Path) -> None:
     parts = [
         message("SIM", us, 0.0, 0.0, 0.0, 100.0, lat, 7.0)
         for us, lat in ((1_000_000, 45.0), (2_000_000, 45.0001))
     ]
-    heard = [h for h in sources.open_source(write(tmp_path, definitions(), *parts)) if isinstance(h, r.Truth)]
-    assert heard[0].v_n == (0.0, 0.0, 0.0)
-    assert heard[1].v_n == pytest.approx((11.11, 0.0, 0.0), abs=0.02)
+    records = [
+        h for h in sources.open_source(write(tmp_path, definitions(), *parts)) if isinstance(h, r.Truth)
+    ]
+    assert records[0].v_n == (0.0, 0.0, 0.0)
+    assert records[1].v_n == pytest.approx((11.11, 0.0, 0.0), abs=0.02)
 
 
-def test_a_reboot_splits_the_log_and_time_goes_on(tmp_path: pathlib.Path) -> None:
+def test_reboot_is_reported_and_time_continues(tmp_path: pathlib.Path) -> None:
     parts = [*LOG, gps(900, GMS + 50_000), local(5_000_000, 1.0), gps(6_000_000, GMS + 56_000)]
     source = sources.open_source(write(tmp_path, definitions(), *parts))
-    heard = list(source)
-    assert sum(isinstance(record, r.Reboot) for record in heard) == source.summary().reboots == 1
-    times = [record.t_ns for record in heard]
+    records = list(source)
+    assert sum(isinstance(record, r.Reboot) for record in records) == source.summary().reboots == 1
+    times = [record.t_ns for record in records]
     assert times == sorted(times)
 
 
-def test_a_torn_log_is_read_up_to_where_it_is_torn(tmp_path: pathlib.Path) -> None:
+def test_torn_log_is_read_up_to_the_damage(tmp_path: pathlib.Path) -> None:
     whole = definitions() + b"".join(LOG)
-    heard = list(sources.open_source(write(tmp_path, whole[:-20])))
-    assert len([h for h in heard if isinstance(h, r.Gnss)]) == 1
+    records = list(sources.open_source(write(tmp_path, whole[:-20])))
+    assert len([h for h in records if isinstance(h, r.Gnss)]) == 1
     damaged = definitions() + LOG[0] + b"\x00" * 40 + b"".join(LOG[1:])
     assert len([h for h in sources.open_source(write(tmp_path, damaged)) if isinstance(h, r.Gnss)]) == 2
 
 
-def test_the_text_form_says_the_same(tmp_path: pathlib.Path) -> None:
+def test_text_and_binary_logs_agree(tmp_path: pathlib.Path) -> None:
     lines = ["FMT, 128, 89, FMT, BBnNZ, Type,Length,Name,Format,Columns"]
     lines += [f"FMT, {TYPES[n]}, 50, {n}, {lay}, {col}" for n, (lay, col) in FORMATS.items()]
     lines += ["GPS, 1000000, 0, 3, 100000000, 2300, 10, 0.80, 45.0, 7.0, 300.0, 10.0, 90.0, -1.0, 0.0, 1"]
@@ -182,12 +184,12 @@ def test_the_text_form_says_the_same(tmp_path: pathlib.Path) -> None:
     ("content", "words"),
     [
         (b"", "is empty"),
-        (bytes(range(200)) * 10, "no DataFlash log"),
-        (b"FMT, nonsense\n" * 5, "damaged beyond reading|without any message"),
+        (bytes(range(200)) * 10, "is not a DataFlash log"),
+        (b"FMT, nonsense\n" * 5, "damaged and cannot be read|without any supported message"),
         (packed(128, "BBnNZ", (128, 89, "FMT", "BBnNZ", "Type,Length,Name,Format,Columns")), "without any"),
     ],
 )
-def test_what_is_no_log_is_refused_in_a_sentence(
+def test_invalid_log_is_reported_in_one_sentence(
     tmp_path: pathlib.Path, content: bytes, words: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(LogError, match=words) as caught:
@@ -196,14 +198,14 @@ def test_what_is_no_log_is_refused_in_a_sentence(
     assert capsys.readouterr() == ("", "")
 
 
-def test_a_log_that_lacks_a_column_says_which(tmp_path: pathlib.Path) -> None:
+def test_missing_column_is_named(tmp_path: pathlib.Path) -> None:
     wrong = packed(128, "BBnNZ", (140, 15, "XKF1", "Qf", "TimeUS,VN"))
     log = wrong + b"\xa3\x95" + bytes([140]) + struct.pack("<Qf", 1_000_000, 1.0)
     with pytest.raises(LogError, match="XKF1 has no column VE"):
         list(dataflash.read(write(tmp_path, definitions()[:89], log)))
 
 
-def test_a_missing_log_is_said_to_be_missing(tmp_path: pathlib.Path) -> None:
+def test_missing_log_is_reported(tmp_path: pathlib.Path) -> None:
     readers: list[Callable[[pathlib.Path], object]] = [sources.open_source, dataflash.read]
     for read in readers:
         with pytest.raises(LogError, match=r"no such log|No such file"):

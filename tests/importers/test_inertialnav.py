@@ -1,4 +1,4 @@
-"""The recordings of the InertialNav project: tables with names and without become records."""
+"""Recordings of the InertialNav project, with and without column names, are converted to records."""
 
 import io
 import math
@@ -20,7 +20,7 @@ def labels(names: str) -> np.ndarray[tuple[int, ...], np.dtype[np.object_]]:
     return np.array([[name] for name in names.split()], dtype=object)
 
 
-def test_tables_with_names_are_an_ardupilots_messages(tmp_path: pathlib.Path) -> None:
+def test_matlab_tables_are_converted_as_ardupilot_messages(tmp_path: pathlib.Path) -> None:
     path = tmp_path / "log.mat"
     gps = "LineNo Status TimeMS Week NSats HDop Lat Lng RelAlt Alt Spd GCrs VZ T"
     tables = {
@@ -39,7 +39,7 @@ def test_tables_with_names_are_an_ardupilots_messages(tmp_path: pathlib.Path) ->
 
 
 def tables(glitch: float = 0.0) -> dict[str, str]:
-    """Ten minutes of flight eastwards at 10 m/s, GNSS `glitch` metres aside for a second in it."""
+    """One minute of flight eastwards at 10 m/s, with a GNSS error of `glitch` metres for one second."""
 
     def text(rows: list[list[float]]) -> str:
         out = io.StringIO()
@@ -66,44 +66,44 @@ def zipped(path: pathlib.Path, members: dict[str, str]) -> pathlib.Path:
     return path
 
 
-def test_tables_without_names_are_read_zipped_or_not(tmp_path: pathlib.Path) -> None:
-    heard = list(sources.open_source(zipped(tmp_path / "log.zip", tables())))
-    assert not any(isinstance(record, r.Event) for record in heard)
-    last = [record for record in heard if isinstance(record, r.LocalPosition)][-1]
+def test_text_tables_are_read_from_zip_and_folder(tmp_path: pathlib.Path) -> None:
+    records = list(sources.open_source(zipped(tmp_path / "log.zip", tables())))
+    assert not any(isinstance(record, r.Event) for record in records)
+    last = [record for record in records if isinstance(record, r.LocalPosition)][-1]
     assert last.x_n == pytest.approx((0.0, 599.5, 0.0), abs=2.0)
-    assert [record.t_ns for record in heard] == sorted(record.t_ns for record in heard)
+    assert [record.t_ns for record in records] == sorted(record.t_ns for record in records)
     for name, content in tables().items():
         (tmp_path / name).write_text(content)
-    assert list(sources.open_source(tmp_path)) == heard
+    assert list(sources.open_source(tmp_path)) == records
 
 
-def test_a_glitch_in_them_is_an_event(tmp_path: pathlib.Path) -> None:
-    heard = list(sources.open_source(zipped(tmp_path / "log.zip", tables(20.0))))
-    (event,) = [record for record in heard if isinstance(record, r.Event)]
+def test_glitch_is_an_event(tmp_path: pathlib.Path) -> None:
+    records = list(sources.open_source(zipped(tmp_path / "log.zip", tables(20.0))))
+    (event,) = [record for record in records if isinstance(record, r.Event)]
     assert event.t_ns == 30_000_000_000 and event.text.startswith("GNSS glitch of 0.8 s")
 
 
-def test_what_is_missing_or_damaged_is_said(tmp_path: pathlib.Path) -> None:
+def test_missing_and_damaged_tables_are_reported(tmp_path: pathlib.Path) -> None:
     lacking = {name: text for name, text in tables().items() if name != "GPSraw.txt"}
     narrow = tables() | {"IMU.txt": "1 2 3\n4 5 6\n"}
     damaged = tables() | {"IMU.txt": "1 2 three\n"}
     for members, words in (
-        (lacking, "holds no GPSraw.txt"),
-        (narrow, "has 3 columns"),
-        (damaged, "damaged at IMU"),
+        (lacking, "has no GPSraw.txt"),
+        (narrow, "has 2 rows of 3 columns"),
+        (damaged, "damaged in IMU"),
     ):
         with pytest.raises(LogError, match=words) as caught:
             sources.open_source(zipped(tmp_path / "log.zip", members))
         assert "\n" not in str(caught.value)
     savemat(tmp_path / "other.mat", {"x": np.ones(3)})
-    with pytest.raises(LogError, match="holds no ArduPilot table"):
+    with pytest.raises(LogError, match="has no ArduPilot table"):
         sources.open_source(tmp_path / "other.mat")
 
 
 @pytest.mark.shared
-def test_the_real_recordings_are_read() -> None:
+def test_recordings_are_read() -> None:
     if not SHARED.exists():
-        pytest.skip("the recordings do not stand beside the repository")
+        pytest.skip("the recordings are not available")
     plane = list(sources.open_source(SHARED / "TestLog2.mat"))
     assert sum(isinstance(record, r.Imu) for record in plane) == 30_650
     assert sum(isinstance(record, r.Gnss) for record in plane) == 3050

@@ -1,4 +1,4 @@
-"""A telemetry log is read to its end whatever the radio did to it, and becomes the records of the flight."""
+"""Telemetry logs are read to the end despite radio damage, and converted to records."""
 
 import math
 import pathlib
@@ -36,12 +36,12 @@ def heartbeat(autopilot: int = 3) -> bytes:
 CLEAN = [entry(i, attitude(i)) for i in range(20)]
 
 
-def read(data: bytes) -> tuple[list[tlog.Entry], tlog.Tlog]:
+def read(data: bytes) -> tuple[list[tlog.TlogEntry], tlog.Tlog]:
     log = tlog.Tlog(data)
     return list(log), log
 
 
-def test_every_entry_comes_with_its_own_time() -> None:
+def test_entries_have_their_own_times() -> None:
     entries, log = read(b"".join(CLEAN))
     assert [e.rx_ns for e in entries] == [(START_US + 10_000 * i) * 1000 for i in range(20)]
     assert [e.frame.sequence for e in entries] == list(range(20))
@@ -63,26 +63,26 @@ DAMAGE = {
 
 
 @pytest.mark.parametrize("name", DAMAGE)
-def test_one_damage_costs_one_entry_at_most_and_counts_once(name: str) -> None:
+def test_one_damage_loses_at_most_one_entry_and_is_counted_once(name: str) -> None:
     entries, log = read(b"".join([*CLEAN[:7], DAMAGE[name], *CLEAN[8:]]))
     assert {e.frame.sequence for e in entries} >= set(range(20)) - {7}
     assert log.corrupt == 1
     assert log.torn == 0
 
 
-def test_two_damaged_neighbours_are_two() -> None:
+def test_adjacent_damaged_entries_are_counted_separately() -> None:
     damaged = [flipped(CLEAN[i], 20) for i in (7, 8)]
     _, log = read(b"".join([*CLEAN[:7], *damaged, *CLEAN[9:]]))
     assert (log.messages, log.corrupt) == (18, 2)
 
 
-def test_a_frame_of_an_unknown_message_is_told_from_a_damaged_one() -> None:
+def test_unknown_message_is_not_counted_as_damaged() -> None:
     unknown = b"\xfd\x02\x00\x00\x00\x01\x01\xff\xff\x7fab\x12\x34"
     _, log = read(b"".join([*CLEAN[:7], entry(7, unknown), *CLEAN[8:]]))
     assert (log.messages, log.corrupt, log.unknown) == (19, 0, 1)
 
 
-def test_a_torn_end_is_told() -> None:
+def test_torn_end_is_counted() -> None:
     data = b"".join(CLEAN)
     for lost in range(1, len(CLEAN[-1])):
         _, log = read(data[:-lost])
@@ -90,7 +90,7 @@ def test_a_torn_end_is_told() -> None:
         assert log.torn == len(CLEAN[-1]) - lost
 
 
-def test_time_never_goes_back_though_the_writer_s_clock_did() -> None:
+def test_times_never_decrease() -> None:
     entries, _ = read(b"".join([*CLEAN[10:], *CLEAN[:10]]))
     times = [e.rx_ns for e in entries]
     assert len(times) == 20 and times == sorted(times)
@@ -98,43 +98,43 @@ def test_time_never_goes_back_though_the_writer_s_clock_did() -> None:
 
 @settings(deadline=None, max_examples=100)
 @given(st.binary(max_size=60), st.integers(0, len(b"".join(CLEAN))))
-def test_nothing_inserted_anywhere_raises_or_loses_more_than_it_hit(junk: bytes, at: int) -> None:
+def test_inserted_bytes_lose_at_most_one_entry(junk: bytes, at: int) -> None:
     data = b"".join(CLEAN)
     entries, log = read(data[:at] + junk + data[at:])
     assert log.messages == len(entries) >= 19
 
 
-def test_a_cut_of_a_real_flight_has_its_damage_counted_and_its_reboot_found() -> None:
+def test_recorded_flight_has_damage_counted_and_reboot_detected() -> None:
     source = sources.TlogSource(tlog.Tlog(CUT))
-    heard = list(source)
+    records = list(source)
     summary = source.summary()
-    assert summary == sources.Summary(
-        messages=841, corrupt=24, unknown=0, torn=13, reboots=1, records=len(heard)
+    assert summary == sources.ImportSummary(
+        messages=841, corrupt=24, unknown=0, torn=13, reboots=1, records=len(records)
     )
-    resets = [record for record in heard if isinstance(record, r.Reset)]
-    assert [record.system for record in heard if isinstance(record, r.Reboot)] == [1]
+    resets = [record for record in records if isinstance(record, r.Reset)]
+    assert [record.system for record in records if isinstance(record, r.Reboot)] == [1]
     assert [reset.what for reset in resets] == ["flight"]
-    assert [record.rx_ns for record in heard] == sorted(record.rx_ns for record in heard)
-    assert all(record.t_ns <= record.rx_ns for record in heard)
+    assert [record.rx_ns for record in records] == sorted(record.rx_ns for record in records)
+    assert all(record.t_ns <= record.rx_ns for record in records)
 
 
-def test_the_clock_begins_anew_at_the_reboot() -> None:
-    """Each boot is mapped by itself: stamps that keep pace with their arrival are valid at it, in both."""
+def test_clock_is_reset_at_a_reboot() -> None:
+    """Each boot has its own time mapping: stamps in step with their arrival are valid at the arrival."""
     log = b"".join(
         [entry(0, heartbeat())]
         + [entry(i, attitude(i, 500_000 + 10 * i)) for i in range(1, 50)]
         + [entry(i, attitude(i, 10 * i)) for i in range(50, 100)]
     )
-    heard = list(sources.TlogSource(tlog.Tlog(log)))
-    assert sum(isinstance(record, r.Reset) for record in heard) == 1
-    attitudes = [record for record in heard if isinstance(record, r.Attitude)]
+    records = list(sources.TlogSource(tlog.Tlog(log)))
+    assert sum(isinstance(record, r.Reset) for record in records) == 1
+    attitudes = [record for record in records if isinstance(record, r.Attitude)]
     assert len(attitudes) == 99
-    first = attitudes.pop(49)  # after the reboot: alone it may be a straggler, as far as anyone can tell
+    first = attitudes.pop(49)  # after the reboot: a single message may be a late one
     assert first.t_ns < first.rx_ns
     assert all(record.t_ns == record.rx_ns for record in attitudes)
 
 
-def test_a_beacon_receiver_beside_the_autopilot_is_heard() -> None:
+def test_messages_of_a_beacon_receiver_are_accepted() -> None:
     message = dialect.new(
         "RSBN_MEASUREMENT",
         beacon_lat=600_000_000,
@@ -149,8 +149,8 @@ def test_a_beacon_receiver_beside_the_autopilot_is_heard() -> None:
     assert [fix.beacon for fix in fixes] == [7]
 
 
-def test_the_origin_is_inferred_where_no_message_tells_it() -> None:
-    """The point it gives is the one from which the local position leads to the global one."""
+def test_unstated_origin_is_inferred() -> None:
+    """The local position relative to the inferred origin is the global position."""
     lat, lon, x, y, z = -353_623_294, 1_491_657_228, 1200.0, -800.0, -50.0
     local = dialect.new("LOCAL_POSITION_NED", time_boot_ms=5000, x=x, y=y, z=z)
     known = dialect.new("GLOBAL_POSITION_INT", time_boot_ms=5000, lat=lat, lon=lon, alt=600_000)
@@ -164,18 +164,22 @@ def test_the_origin_is_inferred_where_no_message_tells_it() -> None:
     assert geodetic_to_local("ardupilot", origin, point) == pytest.approx([x, y, z], abs=1e-6)
 
 
-def test_what_is_no_tlog_is_refused_in_a_sentence(tmp_path: pathlib.Path) -> None:
+def test_invalid_tlog_is_reported_in_one_sentence(tmp_path: pathlib.Path) -> None:
     empty, foreign, other = tmp_path / "empty.tlog", tmp_path / "foreign.tlog", tmp_path / "x.pdf"
     empty.touch()
     other.touch()
     foreign.write_bytes(bytes(range(256)) * 8)
-    for path, words in ((empty, "is empty"), (foreign, "is no tlog"), (other, r"no kind .* give \.mcap")):
+    for path, words in (
+        (empty, "is empty"),
+        (foreign, "is not a tlog"),
+        (other, r"unknown file type; give \.mcap"),
+    ):
         with pytest.raises(ValueError, match=words):
             sources.open_source(path)
 
 
 @pytest.mark.parametrize("name", ["nofile", "nofile.pdf", "nofile.tlog", "nofile.bin"])
-def test_what_is_not_there_is_said_so_whatever_its_name(name: str, tmp_path: pathlib.Path) -> None:
+def test_missing_log_of_any_type_is_reported(name: str, tmp_path: pathlib.Path) -> None:
     with pytest.raises(LogError, match=f"{name}: no such log"):
         sources.open_source(tmp_path / name)
 
@@ -191,10 +195,10 @@ REAL = {
 
 @pytest.mark.shared
 @pytest.mark.parametrize("name", REAL)
-def test_whole_flights_are_read_to_the_end(name: str) -> None:
+def test_recordings_are_read_to_the_end(name: str) -> None:
     path = SHARED / name
     if not path.exists():
-        pytest.skip("the recordings do not stand beside the repository")
+        pytest.skip("the recordings are not available")
     source = sources.TlogSource(tlog.read(path))
     kinds = Counter(type(record) for record in source)
     assert source.summary()[:5] == REAL[name]
@@ -203,39 +207,39 @@ def test_whole_flights_are_read_to_the_end(name: str) -> None:
     assert source.log.torn == REAL[name][3]
 
 
-def test_topics_as_csv_come_in_one_order_of_time(tmp_path: pathlib.Path) -> None:
+def test_csv_topics_are_merged_by_time(tmp_path: pathlib.Path) -> None:
     local = "timestamp,ref_lat,ref_lon,ref_alt,x,y,z,vx,vy,vz,xy_valid,z_valid,xy_global,xy_reset_counter"
     rows = ["1000,45.0,-93.0,275.9,1,2,-3,4,5,6,1,1,1,1", "3000,45.0,-93.0,275.9,99,2,-3,4,5,6,1,1,1,2"]
     (tmp_path / "vehicle_local_position.csv").write_text("\n".join([local, *rows]))
     wind = "timestamp,windspeed_north,windspeed_east,covariance_north,covariance_east"
     (tmp_path / "wind_estimate.csv").write_text(f"{wind}\n2000,3,-4,0.5,0.5")
-    heard = list(sources.open_source(tmp_path))
-    assert [type(record) for record in heard] == [
+    records = list(sources.open_source(tmp_path))
+    assert [type(record) for record in records] == [
         r.LocalOrigin,
         r.LocalPosition,
         r.Wind,
         r.Event,
         r.LocalPosition,
     ]
-    assert heard[1] == r.LocalPosition(1_000_000, 1_000_000, (1.0, 2.0, -3.0), (4.0, 5.0, 6.0))
+    assert records[1] == r.LocalPosition(1_000_000, 1_000_000, (1.0, 2.0, -3.0), (4.0, 5.0, 6.0))
     (tmp_path / "wind_estimate.csv").write_text(f"{wind}\n2000,north,-4,0.5,0.5")
     with pytest.raises(ValueError, match=r"wind_estimate.csv, line 2"):
         list(sources.open_source(tmp_path))
 
 
-def test_an_empty_folder_is_refused_in_a_sentence(tmp_path: pathlib.Path) -> None:
-    with pytest.raises(ValueError, match="holds no topic"):
+def test_empty_folder_is_reported(tmp_path: pathlib.Path) -> None:
+    with pytest.raises(ValueError, match="has no supported topic"):
         sources.open_source(tmp_path)
 
 
 @pytest.mark.shared
-def test_a_real_fixed_wing_is_read_from_its_topics() -> None:
+def test_recorded_csv_topics_are_read() -> None:
     folder = SHARED / "umn_fixed_wing"
     if not folder.exists():
-        pytest.skip("the recordings do not stand beside the repository")
-    heard = list(sources.open_source(folder))
-    kinds = Counter(type(record) for record in heard)
-    times = [record.t_ns for record in heard]
+        pytest.skip("the recordings are not available")
+    records = list(sources.open_source(folder))
+    kinds = Counter(type(record) for record in records)
+    times = [record.t_ns for record in records]
     assert times == sorted(times)
     assert kinds[r.Gnss] > 2000 and kinds[r.LocalPosition] > 4000 and kinds[r.Attitude] > 40_000
     assert (kinds[r.LocalOrigin], kinds[r.Event]) == (1, 2)

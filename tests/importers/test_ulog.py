@@ -1,5 +1,7 @@
-"""A PX4's onboard log becomes records. The logs are written here by the format's public specification, none
-was recorded; without pyulog the tests are skipped."""
+"""PX4 onboard logs are converted to records.
+
+The logs are written here by the public format specification, not recorded. Skipped without pyulog.
+"""
 
 import math
 import pathlib
@@ -119,19 +121,19 @@ def flight() -> bytes:
     )
 
 
-def test_every_topic_becomes_its_record(tmp_path: pathlib.Path) -> None:
-    heard = list(sources.open_source(write(tmp_path, flight())))
-    assert [type(record) for record in heard if not isinstance(record, r.Event)] == [
+def test_every_topic_is_converted(tmp_path: pathlib.Path) -> None:
+    records = list(sources.open_source(write(tmp_path, flight())))
+    assert [type(record) for record in records if not isinstance(record, r.Event)] == [
         *(r.Gnss, r.LocalOrigin, r.LocalPosition, r.Attitude, r.Imu, r.AirData, r.Wind, r.Pressure),
         *(r.FilterStatus, r.Truth, r.LocalPosition, r.Gnss),
     ]
-    first, last = heard[0], heard[-1]
+    first, last = records[0], records[-1]
     assert isinstance(first, r.Gnss) and isinstance(last, r.Gnss)
     assert (first.t_ns, last.t_ns - first.t_ns) == (UTC * 1000, 200_000_000)
-    assert not last.repeats(first)  # though the receiver's own time stood still
+    assert not last.repeats(first)  # although the time of the receiver did not change
     assert (first.lat, first.alt_msl, first.alt) == (math.radians(47.0), 500.0, 547.0)
     assert first.sigma_horizontal == pytest.approx(1.3)
-    by = {type(record): record for record in heard}
+    by = {type(record): record for record in records}
     assert by[r.LocalPosition].v_n == (4.0, 5.0, 6.0)  # type: ignore[attr-defined]
     assert (by[r.LocalOrigin].alt_msl, by[r.LocalOrigin].projection) == (488.0, "px4")  # type: ignore[attr-defined]
     assert by[r.Attitude].heading == pytest.approx(0.5)  # type: ignore[attr-defined]
@@ -139,14 +141,14 @@ def test_every_topic_becomes_its_record(tmp_path: pathlib.Path) -> None:
     assert by[r.Wind].sigma == pytest.approx(math.sqrt(0.5))  # type: ignore[attr-defined]
     assert by[r.FilterStatus].horizontal_accuracy == 1.5  # type: ignore[attr-defined]
     assert by[r.Truth].v_n == (7.0, 8.0, 9.0)  # type: ignore[attr-defined]
-    said = {event.text: event.severity for event in heard if isinstance(event, r.Event)}
-    assert said["Failsafe enabled"] == 4
-    assert {"the logger dropped out for 120 ms", "the autopilot reset its horizontal position"} < set(said)
-    times = [record.t_ns for record in heard]
+    events = {event.text: event.severity for event in records if isinstance(event, r.Event)}
+    assert events["Failsafe enabled"] == 4
+    assert {"logger dropout of 120 ms", "the autopilot reset its horizontal position"} < set(events)
+    times = [record.t_ns for record in records]
     assert times == sorted(times)
 
 
-def test_the_old_names_of_gps_say_the_same(tmp_path: pathlib.Path) -> None:
+def test_old_and_new_gps_fields_agree(tmp_path: pathlib.Path) -> None:
     old = data(
         *("sensor_gps", 2_000_000, UTC, 470_000_000, 80_000_000, 500_000, 547_000),
         *(0.4, 1.3, 1.7, 0.8, 1.0, 2.0, 3.0, 3, True, 10),
@@ -156,28 +158,28 @@ def test_the_old_names_of_gps_say_the_same(tmp_path: pathlib.Path) -> None:
     assert before == now
 
 
-def test_a_torn_log_is_read_up_to_where_it_is_torn(tmp_path: pathlib.Path) -> None:
-    heard = list(sources.open_source(write(tmp_path, flight()[:-30])))
-    assert sum(isinstance(record, r.Gnss) for record in heard) == 1
-    assert sum(isinstance(record, r.LocalPosition) for record in heard) == 2
+def test_torn_log_is_read_up_to_the_damage(tmp_path: pathlib.Path) -> None:
+    records = list(sources.open_source(write(tmp_path, flight()[:-30])))
+    assert sum(isinstance(record, r.Gnss) for record in records) == 1
+    assert sum(isinstance(record, r.LocalPosition) for record in records) == 2
 
 
 @pytest.mark.parametrize(
     ("content", "words"),
     [
         (b"", "is empty"),
-        (b"this is something else altogether", "is no ULog"),
-        (HEADER[:12], "damaged beyond reading|without any topic"),
-        (definitions("airspeed"), "without any topic"),
+        (b"this is something else altogether", "is not a ULog"),
+        (HEADER[:12], "damaged and cannot be read|without any supported topic"),
+        (definitions("airspeed"), "without any supported topic"),
     ],
 )
-def test_what_is_no_log_is_refused_in_a_sentence(tmp_path: pathlib.Path, content: bytes, words: str) -> None:
+def test_invalid_log_is_reported_in_one_sentence(tmp_path: pathlib.Path, content: bytes, words: str) -> None:
     with pytest.raises(LogError, match=words) as caught:
         ulog.read(write(tmp_path, content))
     assert "\n" not in str(caught.value)
 
 
-def test_a_topic_that_lacks_a_field_says_which(tmp_path: pathlib.Path) -> None:
+def test_missing_field_is_named(tmp_path: pathlib.Path) -> None:
     layout = "uint64_t timestamp;float speed;"
     content = HEADER + message("B", bytes(40)) + message("F", f"airspeed:{layout}".encode())
     content += message("A", struct.pack("<BH", 0, 0) + b"airspeed")

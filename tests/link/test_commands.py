@@ -1,4 +1,4 @@
-"""Every command that is addressed to us is answered by the right result; two sessions joined in memory."""
+"""Command server: results, addressing, intervals and rate limit; two sessions joined in memory."""
 
 import math
 
@@ -7,8 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from companion.link import dialect, frame
-from companion.link.commands import BURST, CAPABILITIES, RATE_HZ, Commands, Result
-from companion.link.rate_limiter import Bucket
+from companion.link.commands import BURST, CAPABILITIES, RATE_HZ, CommandServer, Result
+from companion.link.rate_limiter import RateLimiter
 from companion.link.session import MessageReceived, Session
 
 SECOND = 1_000_000_000
@@ -17,8 +17,8 @@ GET_INTERVAL, SET_INTERVAL, REQUEST, CAPABILITIES_OF, ARM = 510, 511, 512, 520, 
 SYSTEM, COMPONENT = 7, 191
 
 
-def commands() -> Commands:
-    return Commands(
+def commands() -> CommandServer:
+    return CommandServer(
         COMPONENT,
         {ODOMETRY: 200_000, NAVIGATION_STATUS: 1_000_000},
         {STATUSTEXT: lambda: dialect.new("STATUSTEXT", text="here"), HOME: lambda: None},
@@ -26,7 +26,7 @@ def commands() -> Commands:
 
 
 def ask(
-    to: Commands,
+    to: CommandServer,
     command: int,
     *params: float,
     now: int = 0,
@@ -36,11 +36,11 @@ def ask(
 ) -> list[dialect.Message]:
     values = {f"param{i}": value for i, value in enumerate(params, 1)}
     message = dialect.new(kind, command=command, target_system=system, target_component=component, **values)
-    found = frame.examine(frame.encode(message, 0, 255, 190))
+    found = frame.parse(frame.encode(message, 0, 255, 190))
     assert isinstance(found, frame.Frame)
     replies = to.receive(dialect.decode(found), found, SYSTEM, now)
     for reply in replies:
-        frame.encode(reply, 0, SYSTEM, COMPONENT)  # whatever we say can be sent
+        frame.encode(reply, 0, SYSTEM, COMPONENT)  # every reply can be encoded
     return replies
 
 
@@ -92,35 +92,35 @@ def test_only_what_is_addressed_to_us_is_answered() -> None:
         assert bool(ask(here, REQUEST, 148, system=system, component=component)) == answered
 
 
-def test_a_command_to_all_components_that_is_not_ours_is_left_to_whom_it_concerns() -> None:
+def test_unsupported_broadcast_command_is_not_answered() -> None:
     assert ask(commands(), ARM, 1, component=0) == []
     assert ask(commands(), ARM, 1)[0].result == Result.UNSUPPORTED
 
 
-def test_intervals_are_set_read_disabled_and_put_back() -> None:
+def test_intervals_are_set_read_disabled_and_restored() -> None:
     here = commands()
 
-    def told(msgid: int) -> int:
+    def interval_us_of(msgid: int) -> int:
         return int(ask(here, GET_INTERVAL, msgid)[1].interval_us)
 
-    assert (told(ODOMETRY), told(STATUSTEXT), told(30)) == (200_000, -1, 0)
+    assert (interval_us_of(ODOMETRY), interval_us_of(STATUSTEXT), interval_us_of(30)) == (200_000, -1, 0)
     ask(here, SET_INTERVAL, ODOMETRY, 50_000)
-    assert told(ODOMETRY) == here.intervals_us[ODOMETRY] == 50_000
+    assert interval_us_of(ODOMETRY) == here.intervals_us[ODOMETRY] == 50_000
     ask(here, SET_INTERVAL, ODOMETRY, -1)
-    assert told(ODOMETRY) == here.intervals_us[ODOMETRY] == -1
+    assert interval_us_of(ODOMETRY) == here.intervals_us[ODOMETRY] == -1
     ask(here, SET_INTERVAL, ODOMETRY, 0)
-    assert told(ODOMETRY) == 200_000
+    assert interval_us_of(ODOMETRY) == 200_000
     ask(here, SET_INTERVAL, NAVIGATION_STATUS, 500_000)
     assert here.intervals_us[NAVIGATION_STATUS] == 500_000
 
 
-def test_our_version_says_what_we_can_do() -> None:
+def test_version_states_our_capabilities() -> None:
     version = ask(commands(), REQUEST, 148)[1]
     assert version.capabilities == CAPABILITIES
     assert version.flight_sw_version >> 8 & 0xFFFFFF > 0
 
 
-def test_what_comes_too_fast_is_rejected_and_the_rate_holds() -> None:
+def test_commands_above_the_rate_limit_are_rejected() -> None:
     here = commands()
     results = [ask(here, REQUEST, 148, now=step * SECOND // 100)[0].result for step in range(1000)]
     accepted = results.count(Result.ACCEPTED)
@@ -142,14 +142,14 @@ def test_any_command_has_one_acknowledgement(command: int, params: list[float]) 
 def test_two_sessions_joined_in_memory() -> None:
     station, companion = Session(system=255, component=190), Session(system=SYSTEM, component=COMPONENT)
     here = commands()
-    wish = {"command": REQUEST, "param1": 148, "target_system": SYSTEM, "target_component": COMPONENT}
-    station.send(dialect.new("COMMAND_LONG", **wish))
+    request = {"command": REQUEST, "param1": 148, "target_system": SYSTEM, "target_component": COMPONENT}
+    station.send(dialect.new("COMMAND_LONG", **request))
     for event in companion.receive(b"".join(station.to_send()), 0):
         assert isinstance(event, MessageReceived)
         for reply in here.receive(event.message, event.frame, companion.system, event.received_ns):
             companion.send(reply)
-    heard = station.receive(b"".join(companion.to_send()), 0)
-    assert [e.message.get_type() for e in heard if isinstance(e, MessageReceived)] == [
+    received = station.receive(b"".join(companion.to_send()), 0)
+    assert [e.message.get_type() for e in received if isinstance(e, MessageReceived)] == [
         "COMMAND_ACK",
         "AUTOPILOT_VERSION",
     ]
@@ -161,14 +161,14 @@ def test_two_sessions_joined_in_memory() -> None:
     rate_hz=st.sampled_from([0.5, 3.0, 10.0]),
     burst=st.integers(1, 5),
 )
-def test_a_bucket_gives_its_burst_and_its_rate_and_says_when(
+def test_rate_limiter_grants_burst_and_rate_and_states_the_next_time(
     waits: list[int], rate_hz: float, burst: int
 ) -> None:
-    bucket, now, taken = Bucket(rate_hz, burst), 0, []
+    limiter, now, taken = RateLimiter(rate_hz, burst), 0, []
     for wait in waits:
         now += wait
-        ready = bucket.ready_at(now)
-        assert bucket.take(now) == (ready == now)
+        ready = limiter.ready_at(now)
+        assert limiter.take(now) == (ready == now)
         if ready == now:
             taken.append(now)
     for i, start in enumerate(taken):

@@ -1,4 +1,4 @@
-"""What each message means, field by field, and what it does not: sentinels, NaN, positions off the earth."""
+"""Decoding of each message: fields, units, sentinels, NaN and invalid positions."""
 
 import math
 import pathlib
@@ -12,7 +12,8 @@ from companion import records as r
 from companion.importers import tlog
 from companion.link import dialect, frame
 from companion.link.clock import BootClock
-from companion.link.decode import UERE, Autopilot, G, Sender, decode
+from companion.link.decode import UERE, Autopilot, Sender, decode
+from companion.units import G0
 
 CUT = (pathlib.Path(__file__).parents[1] / "data" / "dronekit_copter_cut.tlog").read_bytes()
 RX = 1_000_000_000_000
@@ -26,14 +27,14 @@ class BootedAt:
         return BOOT + stamp if stamp else received
 
 
-def heard(name: str, autopilot: Autopilot = "ardupilot", **fields: Any) -> tuple[r.Stamped, ...]:
-    found = frame.examine(frame.encode(dialect.new(name, **fields), 0, 1, 1))
+def decoded(name: str, autopilot: Autopilot = "ardupilot", **fields: Any) -> tuple[r.Stamped, ...]:
+    found = frame.parse(frame.encode(dialect.new(name, **fields), 0, 1, 1))
     assert isinstance(found, frame.Frame)
     return decode(dialect.decode(found), RX, Sender(BootedAt(), autopilot))
 
 
 def one(name: str, autopilot: Autopilot = "ardupilot", **fields: Any) -> Any:
-    (record,) = heard(name, autopilot, **fields)
+    (record,) = decoded(name, autopilot, **fields)
     return record
 
 
@@ -63,12 +64,12 @@ def test_a_full_fix() -> None:
     assert fix.v_n == pytest.approx((0.0, 17.29, 0.0), abs=1e-12)
 
 
-def test_a_second_receiver_is_told_from_the_first() -> None:
+def test_second_receiver_has_its_own_number() -> None:
     assert one("GPS2_RAW", **FIX).receiver == 1
 
 
-def test_dilution_stands_in_where_no_accuracy_is_given() -> None:
-    """HDOP is of both axes together: two equal axes at UERE x HDOP / sqrt 2 make it up again."""
+def test_dilution_is_used_where_no_accuracy_is_given() -> None:
+    """HDOP covers both axes: two equal axes of UERE x HDOP / sqrt 2 add up to it."""
     fix = one("GPS_RAW_INT", **FIX, eph=200, epv=300, vel=0xFFFF, h_acc=0xFFFFFFFF)
     assert math.hypot(fix.sigma_horizontal, fix.sigma_horizontal) == pytest.approx(2.0 * UERE)
     assert fix.sigma_vertical == pytest.approx(3.0 * UERE)
@@ -88,11 +89,11 @@ def test_dilution_stands_in_where_no_accuracy_is_given() -> None:
         ({"alt_ellipsoid": 0}, "alt"),
     ],
 )
-def test_what_a_receiver_does_not_know_is_absent(fields: dict[str, int], absent: str) -> None:
+def test_unknown_values_of_a_receiver_are_absent(fields: dict[str, int], absent: str) -> None:
     assert getattr(one("GPS_RAW_INT", **FIX, **fields), absent) is None
 
 
-def test_a_lost_fix_is_seen_though_its_position_is_none() -> None:
+def test_lost_fix_is_decoded_without_a_position() -> None:
     fix = one("GPS_RAW_INT", fix_type=1, eph=9999, epv=0xFFFF)
     assert (fix.fix, fix.lat, fix.lon, fix.v_n) == (1, 0.0, 0.0, None)
     assert fix.t_ns == RX  # time 0 is "unknown"
@@ -122,7 +123,7 @@ REJECTED: list[tuple[str, dict[str, Any], str]] = [
     ("RSBN_MEASUREMENT", {"status": 3 | 4, "azimuth": 1.0}, "test signal"),
     ("RSBN_MEASUREMENT", {"status": 3 | 8, "azimuth": 1.0}, "repeats its last answer"),
     ("RSBN_MEASUREMENT", {"status": 0, "azimuth": 1.0, "slant_range": 1.0}, "neither azimuth nor range"),
-    ("RSBN_MEASUREMENT", {"status": 1, "azimuth": 57.3}, "no angle in radians"),
+    ("RSBN_MEASUREMENT", {"status": 1, "azimuth": 57.3}, "not an angle in radians"),
     ("RSBN_MEASUREMENT", {"status": 2, "slant_range": -5.0}, "not positive"),
     ("RSBN_MEASUREMENT", {"status": 2, "slant_range": 5e3, "sigma_range": -1.0}, "sigma_range -1"),
     ("RSBN_MEASUREMENT", {"status": 1, "azimuth": 1.0, "beacon_lat": 10**9}, "beacon_lat 100 deg"),
@@ -130,7 +131,7 @@ REJECTED: list[tuple[str, dict[str, Any], str]] = [
 
 
 @pytest.mark.parametrize(("name", "fields", "reason"), REJECTED)
-def test_what_cannot_be_used_is_rejected_by_name_and_reason(
+def test_unusable_message_is_rejected_with_name_and_reason(
     name: str, fields: dict[str, Any], reason: str
 ) -> None:
     rejection = one(name, **fields)
@@ -155,7 +156,7 @@ def test_positions_and_velocities() -> None:
 @pytest.mark.parametrize(
     ("autopilot", "projection"), [("ardupilot", "ardupilot"), ("px4", "px4"), ("other", "tangent")]
 )
-def test_an_origin_carries_its_autopilot_s_projection(autopilot: Autopilot, projection: str) -> None:
+def test_origin_has_the_projection_of_its_autopilot(autopilot: Autopilot, projection: str) -> None:
     origin = one("GPS_GLOBAL_ORIGIN", autopilot, latitude=LAT, longitude=LON, altitude=150_100)
     assert (origin.projection, origin.alt_msl) == (projection, pytest.approx(150.1))
 
@@ -180,34 +181,34 @@ def test_both_attitudes_agree() -> None:
     assert one("ATTITUDE", rollspeed=NAN).w_b is None
 
 
-def test_highres_imu_gives_what_it_updated() -> None:
+def test_highres_imu_gives_the_updated_fields_only() -> None:
     fields = {"zacc": -9.75, "xgyro": 0.5, "abs_pressure": 995.0, "diff_pressure": 1.5, "temperature": 15.0}
-    imu, pressure = heard("HIGHRES_IMU", "px4", time_usec=5000, id=2, fields_updated=6719 | 0x400, **fields)
+    imu, pressure = decoded("HIGHRES_IMU", "px4", time_usec=5000, id=2, fields_updated=6719 | 0x400, **fields)
     assert imu == r.Imu(BOOT + 5_000_000, RX, 2, (0.0, 0.0, -9.75), (0.5, 0.0, 0.0))
     assert pressure == r.Pressure(BOOT + 5_000_000, RX, 99_500.0, 150.0, 288.15)
-    assert heard("HIGHRES_IMU", fields_updated=0x1C0) == ()
-    assert [type(x) for x in heard("HIGHRES_IMU", fields_updated=63)] == [r.Imu]
-    assert heard("HIGHRES_IMU", fields_updated=6719)[1].differential is None  # type: ignore[attr-defined]
+    assert decoded("HIGHRES_IMU", fields_updated=0x1C0) == ()
+    assert [type(x) for x in decoded("HIGHRES_IMU", fields_updated=63)] == [r.Imu]
+    assert decoded("HIGHRES_IMU", fields_updated=6719)[1].differential is None  # type: ignore[attr-defined]
 
 
 def test_scaled_units_are_thousandths() -> None:
     for source, name in enumerate(("SCALED_IMU", "SCALED_IMU2", "SCALED_IMU3")):
         imu = one(name, zacc=-1000, ygyro=250)
         assert imu.source == source
-        assert imu.f_b == pytest.approx((0.0, 0.0, -G))
+        assert imu.f_b == pytest.approx((0.0, 0.0, -G0))
         assert imu.w_b == pytest.approx((0.0, 0.25, 0.0))
-    assert heard("SCALED_IMU3", xmag=34) == ()
+    assert decoded("SCALED_IMU3", xmag=34) == ()
 
 
-def test_raw_units_are_read_of_ardupilot_alone() -> None:
-    assert one("RAW_IMU", "ardupilot", zacc=-1000).f_b == pytest.approx((0.0, 0.0, -G))
-    assert heard("RAW_IMU", "px4", zacc=-1000) == heard("RAW_IMU", "other", zacc=-1000) == ()
+def test_raw_imu_is_decoded_for_ardupilot_only() -> None:
+    assert one("RAW_IMU", "ardupilot", zacc=-1000).f_b == pytest.approx((0.0, 0.0, -G0))
+    assert decoded("RAW_IMU", "px4", zacc=-1000) == decoded("RAW_IMU", "other", zacc=-1000) == ()
 
 
 def test_air_and_wind() -> None:
     air = one("VFR_HUD", airspeed=25.0, groundspeed=NAN, heading=90, climb=-1.5, alt=600.0)
     assert air == r.AirData(RX, RX, 25.0, False, None, -1.5, math.radians(90), 600.0)
-    assert heard("VFR_HUD", airspeed=NAN) == ()
+    assert decoded("VFR_HUD", airspeed=NAN) == ()
     assert one("AIRSPEED", airspeed=25.0, flags=2) == r.AirData(RX, RX, 25.0)
     # From the north-east at 13, rising at 5: 12 level, towards the south-west.
     blown = one("WIND", direction=45.0, speed=13.0, speed_z=-5.0)
@@ -217,7 +218,7 @@ def test_air_and_wind() -> None:
     assert one("WIND_COV", "other", horiz_accuracy=0.75).sigma == 0.75
 
 
-def test_the_filters_say_glitch_in_bits_of_their_own() -> None:
+def test_gps_glitch_has_a_different_bit_for_each_filter() -> None:
     assert one("EKF_STATUS_REPORT", flags=831 | 32768).gnss_glitch
     assert not one("EKF_STATUS_REPORT", flags=1024).gnss_glitch
     status = one("ESTIMATOR_STATUS", "px4", flags=1024, pos_horiz_ratio=NAN, pos_horiz_accuracy=30.5)
@@ -231,7 +232,7 @@ def test_system_time_before_a_fix_is_boot_time_alone() -> None:
     assert (unix.boot_ns, unix.unix_ns) == (5_000_000, 1_436_056_227_521_000_000)
 
 
-def test_rsbn_takes_what_the_receiver_vouches_for() -> None:
+def test_rsbn_uses_the_values_flagged_as_valid() -> None:
     fields = {"time_usec": 1000, "beacon_id": 7, "beacon_lat": LAT, "beacon_lon": LON, "beacon_alt": 600.0}
     values = {"azimuth": 1.25, "slant_range": 5e4, "sigma_azimuth": 0.0078125, "sigma_range": 150.0}
     both = one("RSBN_MEASUREMENT", status=3, **fields, **values)
@@ -244,7 +245,7 @@ def test_rsbn_takes_what_the_receiver_vouches_for() -> None:
     assert configured.sigma_range == Sender(BootedAt()).sigma_range
 
 
-def test_truth_comes_of_the_exact_position() -> None:
+def test_truth_uses_the_integer_position() -> None:
     state = one("SIM_STATE", lat=557500032.0, lat_int=557_500_000, lon_int=376_099_976, yaw=-1.0, vd=-2.0)
     assert math.degrees(state.lat) == pytest.approx(55.75, abs=1e-12)
     assert state.attitude == pytest.approx((0.0, 0.0, math.tau - 1.0))
@@ -252,8 +253,8 @@ def test_truth_comes_of_the_exact_position() -> None:
     assert (turned.v_n, turned.attitude) == ((-0.5, 0.0, 0.0), (0.0, 0.0, 0.0))
 
 
-def test_what_means_nothing_here_gives_nothing() -> None:
-    assert heard("STATUSTEXT", text="hello") == heard("HEARTBEAT") == ()
+def test_other_messages_give_no_record() -> None:
+    assert decoded("STATUSTEXT", text="hello") == decoded("HEARTBEAT") == ()
 
 
 READ = sorted({name for name, _, _ in REJECTED} | {"RAW_IMU", "SCALED_IMU", "VFR_HUD", "ESTIMATOR_STATUS"})
@@ -270,22 +271,22 @@ def test_no_payload_raises_and_every_record_survives_the_log(
         assert r.decode(type(record).__name__, r.encode(record)) == record
 
 
-def test_a_real_flight_decodes_to_what_it_was() -> None:
+def test_real_flight_decodes_to_its_known_values() -> None:
     """A copter on the ground near Canberra: gravity in the accelerometers, the right place and pressure."""
     clock = BootClock()
-    heard: dict[type[r.Stamped], list[Any]] = {}
+    records: dict[type[r.Stamped], list[Any]] = {}
     for rx_ns, found in tlog.Tlog(CUT):
         message = dialect.decode(found)
         if found.msgid == 30:
-            clock.heard(message.time_boot_ms * 1_000_000, rx_ns)
+            clock.update(message.time_boot_ms * 1_000_000, rx_ns)
         for record in decode(message, rx_ns, Sender(clock, "ardupilot")):
-            heard.setdefault(type(record), []).append(record)
-    for imu in heard[r.Imu]:
-        assert math.hypot(*imu.f_b) == pytest.approx(G, rel=0.05)
-    fixes = [fix for fix in heard[r.Gnss] if fix.fix >= 3]
+            records.setdefault(type(record), []).append(record)
+    for imu in records[r.Imu]:
+        assert math.hypot(*imu.f_b) == pytest.approx(G0, rel=0.05)
+    fixes = [fix for fix in records[r.Gnss] if fix.has_3d_fix]
     assert fixes
     for fix in fixes:
         assert math.degrees(fix.lat) == pytest.approx(-35.3623, abs=1e-3)
         assert math.degrees(fix.lon) == pytest.approx(149.1657, abs=1e-3)
         assert 1.0 < fix.sigma_horizontal < 20.0
-    assert all(95_000 < pressure.static < 96_000 for pressure in heard[r.Pressure])
+    assert all(95_000 < pressure.static < 96_000 for pressure in records[r.Pressure])

@@ -1,4 +1,4 @@
-"""The committed dialect is the XML's, and decode, payload and pymavlink agree on every message."""
+"""The committed dialect matches the XML; decode, payload and pymavlink agree on every message."""
 
 import ast
 import random
@@ -9,19 +9,20 @@ import pytest
 
 from companion.link import dialect
 from companion.link.frame import Frame
+from companion.records import Gnss, Severity
 
 
 def frame_of(msgid: int, payload: bytes) -> Frame:
     return Frame(msgid, payload, 7, 3, 9, None, b"")
 
 
-def test_committed_module_is_what_mavgen_makes_of_the_xml(tmp_path: Path) -> None:
+def test_committed_module_matches_the_xml(tmp_path: Path) -> None:
     dialect.regenerate(tmp_path / "rsbn_dialect.py")
     made = (tmp_path / "rsbn_dialect.py").read_text()
     assert ast.dump(ast.parse(made)) == ast.dump(ast.parse(Path(dialect.rsbn.__file__).read_text()))
 
 
-def test_own_messages_fit_the_private_range_and_clash_with_none() -> None:
+def test_own_messages_use_the_private_range_and_do_not_collide() -> None:
     assert set(dialect.rsbn.mavlink_map) == {180000, 180001}
     assert not set(dialect.rsbn.mavlink_map) & set(dialect.mavlink.mavlink_map)
 
@@ -50,7 +51,7 @@ def test_decode_agrees_with_the_generated_constructor_on_random_payloads(msgid: 
     assert bytes(sane.get_payload()) == (dialect.payload(sane).rstrip(b"\0") or b"\0")
 
 
-def test_a_trimmed_payload_reads_as_zeros_and_a_longer_one_is_cut() -> None:
+def test_trimmed_payload_is_padded_and_a_longer_one_is_cut() -> None:
     message = dialect.decode(frame_of(32, b""))
     assert (message.time_boot_ms, message.x) == (0, 0.0)
     whole = dialect.payload(dialect.new("LOCAL_POSITION_NED", x=4.0))
@@ -71,7 +72,7 @@ def test_rsbn_measurement_keeps_its_precision() -> None:
     assert got.azimuth == pytest.approx(6.1, abs=2.5e-7)  # 6 cm at 250 km
 
 
-def test_wrong_names_and_values_are_named() -> None:
+def test_invalid_names_and_values_are_reported() -> None:
     with pytest.raises(ValueError, match="'GPS_RAW_IN'; did you mean GPS_RAW_INT"):
         dialect.new("GPS_RAW_IN")
     with pytest.raises(ValueError, match="HEARTBEAT has no field 'kind'"):
@@ -80,7 +81,7 @@ def test_wrong_names_and_values_are_named() -> None:
         dialect.payload(dialect.new("HEARTBEAT", type=300))
 
 
-def test_any_value_with_a_frame_s_names_can_be_decoded() -> None:
+def test_any_object_with_the_fields_of_a_frame_can_be_decoded() -> None:
     class Replayed(NamedTuple):
         msgid: int
         payload: bytes
@@ -89,3 +90,11 @@ def test_any_value_with_a_frame_s_names_can_be_decoded() -> None:
         component: int
 
     assert dialect.decode(Replayed(253, b"\x06hello", 0, 1, 1)).text == "hello"
+
+
+def test_records_agree_with_the_enums_of_the_dialect() -> None:
+    for severity in Severity:
+        assert severity == getattr(dialect.mavlink, f"MAV_SEVERITY_{severity.name}")
+    for fix, entry in dialect.mavlink.enums["GPS_FIX_TYPE"].items():
+        is_3d = fix >= dialect.mavlink.GPS_FIX_TYPE_3D_FIX
+        assert Gnss(0, 0, 0, 0, fix, 0.0, 0.0, 0.0).has_3d_fix == is_3d, entry.name

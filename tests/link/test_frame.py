@@ -1,4 +1,4 @@
-"""One table of streams, fed whole, byte by byte and with junk around; then noise, loss and any bytes."""
+"""Frame reader: known frames whole, byte by byte and with junk around them; noise, loss and random bytes."""
 
 import json
 import random
@@ -41,7 +41,7 @@ def read(data: bytes, step: int | None = None) -> tuple[Reader, list[frame.Event
     events: list[frame.Event] = []
     for i in range(0, len(data), step or len(data) or 1):
         events += reader.receive(data[i : i + (step or len(data))])
-        assert reader.waiting <= frame.MOST_WAITING
+        assert reader.waiting <= frame.MAX_WAITING
     return reader, events + reader.close()
 
 
@@ -53,7 +53,7 @@ def frames(events: list[frame.Event]) -> list[Frame]:
 @pytest.mark.parametrize("step", [None, 1, 3])
 @pytest.mark.parametrize("before", [b"", b"\x00\x55junk", b"\xfd", b"\xfe\x09", b"\xfd\x09\x00\x00"])
 @pytest.mark.parametrize("after", [b"", b"\x00junk", b"\xfd"])
-def test_foreign_frames_are_found_in_any_company(
+def test_foreign_frames_are_found_between_other_bytes(
     vector: dict, step: int | None, before: bytes, after: bytes
 ) -> None:
     raw = bytes.fromhex(vector["hex"])
@@ -63,7 +63,7 @@ def test_foreign_frames_are_found_in_any_company(
     assert (frames(events)[0].signature is not None) == ("signed" in vector["name"])
 
 
-def test_foreign_frames_hold_what_their_authors_say() -> None:
+def test_foreign_frames_decode_to_their_stated_values() -> None:
     by_name = {v["name"]: dialect.decode(frames(read(bytes.fromhex(v["hex"]))[1])[0]) for v in GOOD}
     heartbeat = by_name["v2 HEARTBEAT signed"]
     assert (heartbeat.type, heartbeat.autopilot, heartbeat.base_mode) == (1, 2, 3)
@@ -79,7 +79,7 @@ def test_foreign_frames_hold_what_their_authors_say() -> None:
 
 
 @pytest.mark.parametrize("vector", NOT_FRAMES, ids=lambda v: v["name"])
-def test_what_is_no_frame_is_not_accepted(vector: dict) -> None:
+def test_invalid_frames_are_not_accepted(vector: dict) -> None:
     raw = bytes.fromhex(vector["hex"])
     for step in (None, 1):
         _, events = read(raw, step)
@@ -128,23 +128,23 @@ def unknown(payload: bytes, msgid: int = 190_000) -> bytes:
 
 
 @pytest.mark.parametrize("step", [None, 1])
-def test_an_unknown_message_is_skipped_whole_and_told(step: int | None) -> None:
+def test_unknown_message_is_skipped_whole_and_reported(step: int | None) -> None:
     first, second = stream(2, 4)
-    inside = encode(dialect.new("COMMAND_LONG", command=400), 0, 255, 190)  # must not be heard
+    inside = encode(dialect.new("COMMAND_LONG", command=400), 0, 255, 190)  # must not be decoded
     strange = unknown(inside)
     _, events = read(first + strange + second, step)
     assert [type(e) for e in events] == [Frame, UnknownFrame, Frame]
     assert events[1] == UnknownFrame(190_000, 1, 1, len(strange))
 
 
-def test_an_unknown_id_made_by_noise_does_not_swallow_the_frames_behind_it() -> None:
+def test_unknown_id_in_noise_does_not_hide_the_next_frames() -> None:
     first, second, third = stream(3, 5)
     false_head = b"\xfd\xff\x00\x00\x00\x01\x01" + (190_000).to_bytes(3, "little")
     _, events = read(false_head + first + second + third + bytes(300))
     assert [f.raw for f in frames(events)] == [first, second, third]
 
 
-def test_loss_is_counted_by_sender_and_a_repeat_is_none() -> None:
+def test_loss_is_counted_by_sender_and_a_repeated_frame_is_not_a_loss() -> None:
     sent = [encode(dialect.new("HEARTBEAT"), i & 0xFF, 1, 1) for i in range(600)]
     other = [encode(dialect.new("HEARTBEAT"), i & 0xFF, 1, 191) for i in range(10)]
     del sent[250:260]
@@ -153,13 +153,13 @@ def test_loss_is_counted_by_sender_and_a_repeat_is_none() -> None:
     assert reader.counts == {(1, 1): frame.Counts(591, 10), (1, 191): frame.Counts(10, 0)}
 
 
-def test_senders_without_end_cost_no_memory_and_are_counted_together() -> None:
+def test_number_of_sender_counters_is_bounded() -> None:
     reader, _ = read(b"".join(encode(dialect.new("HEARTBEAT"), 0, i >> 8, i & 0xFF) for i in range(5000)))
-    assert len(reader.counts) == frame.MOST_SENDERS
+    assert len(reader.counts) == frame.MAX_SENDERS
     assert (reader.received, reader.lost) == (5000, 0)
 
 
-def test_more_frames_outlive_dropped_bytes_than_with_pymavlink() -> None:
+def test_dropped_bytes_cost_fewer_frames_than_with_pymavlink() -> None:
     rng = random.Random(2024)
     sent = stream(20_000, 6)
     data = bytes(b for b in b"".join(sent) if rng.random() >= 1e-3)
@@ -182,7 +182,7 @@ def test_a_run_of_junk_is_reported_without_waiting_for_its_end() -> None:
     assert reader.close() == [BadFrame(Reason.JUNK, 3000 - 2048)]
 
 
-def test_a_frame_behind_a_false_head_at_the_end_is_found_on_close() -> None:
+def test_frame_after_a_false_header_at_the_end_is_found_on_close() -> None:
     (first,) = stream(1, 7)
     reader = Reader()
     assert reader.receive(b"\xfd\xff\x00" + first) == []
@@ -201,7 +201,7 @@ pieces = st.one_of(
 
 @settings(deadline=None, max_examples=300)
 @given(st.lists(pieces, max_size=12).map(b"".join), st.lists(st.integers(1, 400), max_size=12))
-def test_any_bytes_cut_anywhere_give_the_same_events(data: bytes, cuts: list[int]) -> None:
+def test_events_do_not_depend_on_the_split_of_the_stream(data: bytes, cuts: list[int]) -> None:
     _, whole = read(data)
     reader = Reader()
     events: list[frame.Event] = []
@@ -209,7 +209,7 @@ def test_any_bytes_cut_anywhere_give_the_same_events(data: bytes, cuts: list[int
     for cut in cuts:
         events += reader.receive(rest[:cut])
         rest = rest[cut:]
-        assert reader.waiting <= frame.MOST_WAITING
+        assert reader.waiting <= frame.MAX_WAITING
     events += reader.receive(rest) + reader.close()
     assert events == whole
     assert sum(len(e.raw) if isinstance(e, Frame) else e.size for e in whole) == len(data)

@@ -1,5 +1,6 @@
-"""The client of the parameter protocol: joined to our own server, to a small autopilot of either make, and to
-what real ones said. Whatever the line loses, a request ends, and in what stands."""
+"""Parameter protocol client, joined to our own server, to a simulated autopilot of either encoding, and to
+recorded values of real ones. Every request ends, with the value in effect, however many messages are lost.
+"""
 
 import struct
 from collections.abc import Callable
@@ -21,11 +22,11 @@ from companion.link.parameter_client import (
     Encoding,
     ParameterClient,
     encoding_of,
-    same,
+    equal_real32,
     to_value,
     to_wire,
 )
-from companion.link.parameter_server import Parameters, table
+from companion.link.parameter_server import ParameterServer, parameter_table
 
 ARDUPILOT, PX4 = 3, 12
 SYSTEM, COMPONENT = 7, 1
@@ -34,24 +35,24 @@ REQUEST_READ, SET = 20, 23
 
 
 def on_wire(message: dialect.Message, system: int = SYSTEM, component: int = COMPONENT) -> frame.Frame:
-    found = frame.examine(frame.encode(message, 0, system, component))
+    found = frame.parse(frame.encode(message, 0, system, component))
     assert isinstance(found, frame.Frame)
     return found
 
 
 class Vehicle:
-    """An autopilot's parameters: `stubborn` ones are echoed as set and stay as they were."""
+    """Parameters of an autopilot; `stubborn` ones are echoed as set but keep their value."""
 
     def __init__(
         self, encoding: Encoding, values: dict[str, tuple[float, int]], errors: bool = False
     ) -> None:
         self.encoding, self.values, self.errors = encoding, dict(values), errors
         self.stubborn: set[str] = set()
-        self.heard: list[int] = []
+        self.received: list[int] = []
 
     def receive(self, found: frame.Frame) -> list[frame.Frame]:
         message = dialect.decode(found)
-        self.heard.append(found.msgid)
+        self.received.append(found.msgid)
         name = message.param_id
         if name not in self.values:
             if self.errors:
@@ -63,12 +64,12 @@ class Vehicle:
             value = to_value(found.payload[:4].ljust(4, b"\0"), kind, self.encoding)
             if name not in self.stubborn:
                 self.values[name] = value, kind
-        said = to_wire(value, kind, self.encoding)
+        sent = to_wire(value, kind, self.encoding)
         count = len(self.values)
         return [
             on_wire(
                 dialect.new(
-                    "PARAM_VALUE", param_id=name, param_value=said, param_type=kind, param_count=count
+                    "PARAM_VALUE", param_id=name, param_value=sent, param_type=kind, param_count=count
                 )
             )
         ]
@@ -79,13 +80,13 @@ def play(
     vehicle: Callable[[frame.Frame], list[frame.Frame]],
     lost: Callable[[], bool] = lambda: False,
 ) -> tuple[dict[str, Answer], int]:
-    """Carry everything until the client is idle; the answers and how long it took, ns."""
+    """Exchange messages until the client is idle; return the answers and the duration, ns."""
     answers: list[Answer] = []
     now = 0
     while not client.is_idle:
         answers += client.poll(now)
-        said = [on_wire(message, 255, 190) for message in client.to_send() if not lost()]
-        for request in said:
+        sent = [on_wire(message, 255, 190) for message in client.to_send() if not lost()]
+        for request in sent:
             for reply in vehicle(request):
                 if not lost():
                     answers += client.receive(dialect.decode(reply), reply)
@@ -108,7 +109,7 @@ VALUES = {
 
 
 @pytest.mark.parametrize("encoding", ["cast", "bytewise"])
-def test_what_stands_is_read_whatever_the_encoding(encoding: Encoding) -> None:
+def test_values_are_read_with_either_encoding(encoding: Encoding) -> None:
     client = ParameterClient(SYSTEM, COMPONENT, encoding)
     vehicle = Vehicle(encoding, VALUES)
     client.read(VALUES)
@@ -118,16 +119,16 @@ def test_what_stands_is_read_whatever_the_encoding(encoding: Encoding) -> None:
         for name, (value, kind) in VALUES.items()
     }
     assert not any(answer.trouble for answer in answers.values())
-    assert took == 0 and len(vehicle.heard) == len(VALUES)
+    assert took == 0 and len(vehicle.received) == len(VALUES)
 
 
 @pytest.mark.parametrize("encoding", ["cast", "bytewise"])
-def test_a_change_is_proved_by_reading_it_again(encoding: Encoding) -> None:
+def test_change_is_verified_by_reading_it_again(encoding: Encoding) -> None:
     client = ParameterClient(SYSTEM, COMPONENT, encoding)
     vehicle = Vehicle(encoding, VALUES)
     client.read(VALUES)
     play(client, vehicle.receive)
-    vehicle.heard.clear()
+    vehicle.received.clear()
     vehicle.stubborn.add("EKF2_EV_CTRL")
     client.set("VISO_TYPE", 1)
     client.set("EKF2_AGP0_NOISE", 2.5)
@@ -138,16 +139,16 @@ def test_a_change_is_proved_by_reading_it_again(encoding: Encoding) -> None:
     assert answers["EKF2_EV_CTRL"] == (
         "EKF2_EV_CTRL",
         15,
-        "not taken",
-    )  # echoed as taken, and not: only the reading shows it
-    assert vehicle.heard.count(SET) == vehicle.heard.count(REQUEST_READ) == 3
+        "not accepted",
+    )  # echoed as set, but unchanged: only the reading shows it
+    assert vehicle.received.count(SET) == vehicle.received.count(REQUEST_READ) == 3
 
 
-def test_a_refused_change_ends_and_says_what_stands() -> None:
+def test_rejected_change_ends_with_the_value_in_effect() -> None:
     client = ParameterClient(SYSTEM, COMPONENT, "cast")
     vehicle = Vehicle("cast", VALUES)
 
-    def refusing(request: frame.Frame) -> list[frame.Frame]:
+    def reject_set(request: frame.Frame) -> list[frame.Frame]:
         if request.msgid == SET:
             message = dialect.decode(request)
             request = on_wire(dialect.new("PARAM_REQUEST_READ", param_id=message.param_id, param_index=-1))
@@ -156,19 +157,19 @@ def test_a_refused_change_ends_and_says_what_stands() -> None:
     client.read(["VISO_TYPE"])
     play(client, vehicle.receive)
     client.set("VISO_TYPE", 1)
-    answers, took = play(client, refusing)
-    assert answers["VISO_TYPE"] == ("VISO_TYPE", 0, "not taken")
+    answers, took = play(client, reject_set)
+    assert answers["VISO_TYPE"] == ("VISO_TYPE", 0, "not accepted")
     assert took == ATTEMPTS * TIMEOUT
 
 
 @pytest.mark.parametrize(
-    ("errors", "said", "took"), [(True, "does not exist", 0), (False, SILENCE, ATTEMPTS)]
+    ("errors", "sent", "took"), [(True, "does not exist", 0), (False, SILENCE, ATTEMPTS)]
 )
-def test_what_is_not_there_is_said_to_be_so(errors: bool, said: str, took: int) -> None:
+def test_missing_parameter_is_reported(errors: bool, sent: str, took: int) -> None:
     client = ParameterClient(SYSTEM, COMPONENT, "cast")
     client.read(["EK3_SRC9_POSXY", "VISO_TYPE"])
     answers, ended = play(client, Vehicle("cast", VALUES, errors).receive)
-    assert answers["EK3_SRC9_POSXY"] == ("EK3_SRC9_POSXY", None, said)
+    assert answers["EK3_SRC9_POSXY"] == ("EK3_SRC9_POSXY", None, sent)
     assert answers["VISO_TYPE"].value == 0
     assert ended == took * TIMEOUT
 
@@ -188,14 +189,16 @@ def test_a_slow_line_is_not_flooded() -> None:
 
 @given(st.randoms(use_true_random=False), st.sampled_from(["cast", "bytewise"]))
 @settings(deadline=None, max_examples=60)
-def test_whatever_is_lost_an_answer_is_right_or_says_that_there_is_none(random, encoding: Encoding) -> None:
+def test_with_losses_an_answer_is_right_or_absent(random, encoding: Encoding) -> None:
     client = ParameterClient(SYSTEM, COMPONENT, encoding)
     vehicle = Vehicle(encoding, VALUES)
     client.read(VALUES)
     answers, _ = play(client, vehicle.receive, lambda: random.random() < 0.3)
     assert set(answers) == set(VALUES)
     for name, answer in answers.items():
-        assert answer.trouble == SILENCE if answer.value is None else same(answer.value, VALUES[name][0])
+        assert (
+            answer.trouble == SILENCE if answer.value is None else equal_real32(answer.value, VALUES[name][0])
+        )
     known = [name for name, answer in answers.items() if answer.value is not None]
     for name in known:
         client.set(name, 7)
@@ -205,7 +208,7 @@ def test_whatever_is_lost_an_answer_is_right_or_says_that_there_is_none(random, 
             assert vehicle.values[name][0] == answers[name].value == 7
 
 
-def test_others_and_the_unasked_are_not_heard() -> None:
+def test_other_components_and_unrequested_parameters_are_ignored() -> None:
     client = ParameterClient(SYSTEM, COMPONENT, "cast")
     client.read(["VISO_TYPE"])
     client.poll(0)
@@ -219,7 +222,7 @@ def test_others_and_the_unasked_are_not_heard() -> None:
     assert client.receive(dialect.decode(ours), ours) == [("VISO_TYPE", 5, "")]
 
 
-def test_a_parameter_never_read_or_a_value_it_cannot_hold_is_refused_here() -> None:
+def test_set_of_an_unread_parameter_or_an_invalid_value_is_an_error() -> None:
     client = ParameterClient(SYSTEM, COMPONENT, "cast")
     with pytest.raises(ValueError, match="read before"):
         client.set("VISO_TYPE", 1)
@@ -231,10 +234,10 @@ def test_a_parameter_never_read_or_a_value_it_cannot_hold_is_refused_here() -> N
     assert client.is_idle
 
 
-def test_it_reads_and_sets_our_own_server() -> None:
-    server = Parameters(191, Config())
+def test_client_reads_and_sets_our_own_server() -> None:
+    server = ParameterServer(191, Config())
     client = ParameterClient(SYSTEM, 191, "bytewise")
-    names = [parameter.name for parameter in table()]
+    names = [parameter.name for parameter in parameter_table()]
 
     def serve(request: frame.Frame) -> list[frame.Frame]:
         nonlocal now
@@ -245,8 +248,8 @@ def test_it_reads_and_sets_our_own_server() -> None:
     now = 0
     client.read(names)
     answers, _ = play(client, serve)
-    for parameter in table():
-        assert same(answers[parameter.name].value, float(parameter.of(Config())))
+    for parameter in parameter_table():
+        assert equal_real32(answers[parameter.name].value, float(parameter.value_in(Config())))
     client.set("GNSS_SIGMA_M", 3.5)
     answers, _ = play(client, serve)
     assert answers["GNSS_SIGMA_M"].value == 3.5 and server.config.gnss.sigma_m == 3.5
@@ -256,7 +259,7 @@ def test_it_reads_and_sets_our_own_server() -> None:
 
 
 @pytest.mark.parametrize(
-    ("param_value", "kind", "encoding", "meant"),
+    ("param_value", "kind", "encoding", "expected"),
     [  # PARAM_VALUEs of ArduPlane 4.7-dev and PX4 main of 2026-03 in flight
         (3.0, INT8, "cast", 3),  # EK3_SRC1_POSXY: GPS
         (100.0, INT16, "cast", 100),  # TKOFF_ALT, echoed with its own type though set as a REAL32
@@ -267,14 +270,16 @@ def test_it_reads_and_sets_our_own_server() -> None:
         (60.0, REAL32, "bytewise", 60.0),  # COM_OBC_LOSS_T
     ],
 )
-def test_what_real_autopilots_said(param_value: float, kind: int, encoding: Encoding, meant: float) -> None:
-    assert to_value(struct.pack("<f", param_value), kind, encoding) == meant
-    assert to_wire(meant, kind, encoding) == param_value
+def test_values_recorded_from_real_autopilots(
+    param_value: float, kind: int, encoding: Encoding, expected: float
+) -> None:
+    assert to_value(struct.pack("<f", param_value), kind, encoding) == expected
+    assert to_wire(expected, kind, encoding) == param_value
 
 
 @given(st.sampled_from(sorted(LAYOUTS)), st.sampled_from(["cast", "bytewise"]), st.data())
 @settings(deadline=None, max_examples=200)
-def test_the_mirror_holds(kind: int, encoding: Encoding, data: st.DataObject) -> None:
+def test_encoding_and_decoding_are_inverse(kind: int, encoding: Encoding, data: st.DataObject) -> None:
     if kind == REAL32:
         value: float = data.draw(st.floats(width=32, allow_nan=False))
     else:
@@ -288,23 +293,23 @@ def test_the_mirror_holds(kind: int, encoding: Encoding, data: st.DataObject) ->
     [
         (None, ARDUPILOT, "cast"),
         (None, PX4, "bytewise"),
-        (16, ARDUPILOT, "bytewise"),  # what it states goes before what it is
+        (16, ARDUPILOT, "bytewise"),  # the stated encoding has priority
         (131072, PX4, "cast"),
         (2, PX4, "cast"),
         (16 | 2, PX4, "bytewise"),
         (8192, ARDUPILOT, "cast"),
     ],
 )
-def test_the_encoding_is_the_stated_one_or_the_make_s(
+def test_encoding_is_the_stated_one_or_that_of_the_autopilot_type(
     capabilities: int | None, make: int, encoding: Encoding
 ) -> None:
     assert encoding_of(capabilities, make) == encoding
 
 
-def test_a_type_that_four_bytes_cannot_hold_is_an_answer_too() -> None:
+def test_type_that_does_not_fit_four_bytes_is_reported() -> None:
     client = ParameterClient(SYSTEM, COMPONENT, "bytewise")
     client.read(["BIG"])
     client.poll(0)
-    said = on_wire(dialect.new("PARAM_VALUE", param_id="BIG", param_type=8))
-    (answer,) = client.receive(dialect.decode(said), said)
+    sent = on_wire(dialect.new("PARAM_VALUE", param_id="BIG", param_type=8))
+    (answer,) = client.receive(dialect.decode(sent), sent)
     assert answer.value is None and "type 8" in answer.trouble and client.is_idle

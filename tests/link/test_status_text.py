@@ -1,22 +1,22 @@
-"""What people are told: whole texts, few of them, the gravest first; chunks joined as a station does."""
+"""STATUSTEXT: complete texts, rate limit, severity order; chunks are joined as in a ground station."""
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from companion.link import dialect, frame
-from companion.link.status_text import BURST, EVERY, LONGEST, StatusText
+from companion.link.status_text import BURST, INTERVAL, MAX_LENGTH, StatusText
 from companion.records import Event
 
 SECOND = 1_000_000_000
 
 
-def told(messages: list[dialect.Message]) -> list[tuple[int, str]]:
-    """Severity and text of each, chunks joined after the message's description."""
+def joined(messages: list[dialect.Message]) -> list[tuple[int, str]]:
+    """Return severity and text of each, chunks joined as the message's description requires."""
     texts: list[tuple[int, str]] = []
     parts: dict[int, bytes] = {}
     for message in messages:
-        found = frame.examine(frame.encode(message, 0, 1, 191))
+        found = frame.parse(frame.encode(message, 0, 1, 191))
         assert isinstance(found, frame.Frame)
         chunk = dialect.decode(found)
         raw = chunk._text_raw
@@ -31,60 +31,60 @@ def told(messages: list[dialect.Message]) -> list[tuple[int, str]]:
     return texts
 
 
-def say(*events: tuple[int, str]) -> list[tuple[int, str]]:
-    speaker = StatusText()
+def texts_of(*events: tuple[int, str]) -> list[tuple[int, str]]:
+    status_text = StatusText()
     for severity, text in events:
-        speaker.tell(Event(0, 0, severity, text), 0)
-    return told(speaker.to_send(0))
+        status_text.add(Event(0, 0, severity, text), 0)
+    return joined(status_text.to_send(0))
 
 
-@pytest.mark.parametrize("size", [0, 1, 49, 50, 51, 99, 100, 101, 150, LONGEST - 1, LONGEST])
+@pytest.mark.parametrize("size", [0, 1, 49, 50, 51, 99, 100, 101, 150, MAX_LENGTH - 1, MAX_LENGTH])
 def test_a_text_arrives_whole_at_any_length(size: int) -> None:
     text = ("GNSS lost; beacon 7 " * 20)[:size]
-    assert say((4, text)) == [(4, text)]
+    assert texts_of((4, text)) == [(4, text)]
 
 
 @settings(deadline=None, max_examples=100)
 @given(texts=st.lists(st.text(max_size=300), max_size=BURST))
 def test_any_text_arrives_as_far_as_it_fits(texts: list[str]) -> None:
-    heard = say(*[(6, text) for text in texts])
-    assert len(heard) == len(texts)
-    for (_, there), here in zip(heard, texts):
+    received = texts_of(*[(6, text) for text in texts])
+    assert len(received) == len(texts)
+    for (_, there), here in zip(received, texts):
         here = here.replace("\0", " ").encode(errors="replace").decode()
-        assert here.startswith(there) and (here == there or len(there.encode()) > LONGEST - 4)
+        assert here.startswith(there) and (here == there or len(there.encode()) > MAX_LENGTH - 4)
 
 
-def test_long_texts_of_one_voice_are_told_apart() -> None:
+def test_chunks_of_two_long_texts_have_different_ids() -> None:
     texts = [(4, "a" * 120), (4, "b" * 120)]
-    speaker = StatusText()
+    status_text = StatusText()
     for severity, text in texts:
-        speaker.tell(Event(0, 0, severity, text), 0)
-    messages = speaker.to_send(0)
-    assert told(messages) == texts and {m.id for m in messages} == {1, 2}
+        status_text.add(Event(0, 0, severity, text), 0)
+    messages = status_text.to_send(0)
+    assert joined(messages) == texts and {m.id for m in messages} == {1, 2}
 
 
-def test_what_is_only_for_the_log_is_not_told() -> None:
-    assert say((7, "debug"), (6, "info")) == [(6, "info")]
+def test_debug_events_are_not_sent() -> None:
+    assert texts_of((7, "debug"), (6, "info")) == [(6, "info")]
 
 
-def test_the_gravest_of_too_many_is_told_with_the_number_of_the_others() -> None:
-    speaker = StatusText()
+def test_most_severe_of_too_many_events_is_sent_with_the_number_of_the_others() -> None:
+    status_text = StatusText()
     for i in range(20):
-        speaker.tell(Event(0, 0, 2 if i == 12 else 5, f"event {i}"), 0)
-    assert told(speaker.to_send(0)) == [(5, f"event {i}") for i in range(BURST)]
-    assert speaker.deadline() == EVERY
-    assert speaker.to_send(EVERY - 1) == []
-    assert told(speaker.to_send(EVERY)) == [(2, "event 12 (and 14 more)")]
-    assert speaker.deadline() is None and speaker.to_send(10 * EVERY) == []
+        status_text.add(Event(0, 0, 2 if i == 12 else 5, f"event {i}"), 0)
+    assert joined(status_text.to_send(0)) == [(5, f"event {i}") for i in range(BURST)]
+    assert status_text.deadline() == INTERVAL
+    assert status_text.to_send(INTERVAL - 1) == []
+    assert joined(status_text.to_send(INTERVAL)) == [(2, "event 12 (and 14 more)")]
+    assert status_text.deadline() is None and status_text.to_send(10 * INTERVAL) == []
 
 
-def test_a_flood_is_held_to_the_rate_and_nothing_is_uncounted() -> None:
-    speaker, heard = StatusText(), []
+def test_flood_is_rate_limited_and_every_event_is_counted() -> None:
+    status_text, received = StatusText(), []
     for step in range(6000):
         now = step * SECOND // 100
-        speaker.tell(Event(now, now, 4, "no fix"), now)
-        heard += told(speaker.to_send(now))
-    heard += told(speaker.to_send(10**12))
-    assert len(heard) <= BURST + 60 * SECOND // EVERY + 1
-    more = [int(text.split()[-2]) for _, text in heard if "more" in text]
-    assert len(heard) + sum(more) == 6000
+        status_text.add(Event(now, now, 4, "no fix"), now)
+        received += joined(status_text.to_send(now))
+    received += joined(status_text.to_send(10**12))
+    assert len(received) <= BURST + 60 * SECOND // INTERVAL + 1
+    more = [int(text.split()[-2]) for _, text in received if "more" in text]
+    assert len(received) + sum(more) == 6000

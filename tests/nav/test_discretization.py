@@ -1,5 +1,6 @@
+"""Discretization: Van Loan against the integral, Euler as its first order."""
+
 import numpy as np
-import numpy.typing as npt
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -7,11 +8,10 @@ from scipy.integrate import quad_vec
 from scipy.linalg import expm
 
 from companion.nav.discretization import discretise, euler
+from companion.units import Floats
 
-Matrix = npt.NDArray[np.float64]
 
-
-def system(seed: int, n: int = 5, m: int = 2) -> tuple[Matrix, Matrix, Matrix]:
+def system(seed: int, n: int = 5, m: int = 2) -> tuple[Floats, Floats, Floats]:
     rng = np.random.default_rng(seed)
     G = rng.normal(size=(n, n - 1))
     return rng.normal(size=(n, n)), G @ G.T, rng.normal(size=(n, m))
@@ -56,8 +56,8 @@ def test_euler_is_the_first_order_of_the_exact_step() -> None:
 
 
 @pytest.mark.parametrize("step", [discretise, euler])
-def test_what_does_not_fit_is_refused(step: type) -> None:
+def test_wrong_shapes_are_rejected(step: type) -> None:
     with pytest.raises(ValueError, match="do not fit"):
         step(np.eye(3), np.eye(2), np.zeros((3, 0)), 1.0)
-    with pytest.raises(ValueError, match="must be positive"):
+    with pytest.raises(ValueError, match="positive step"):
         step(np.eye(3), np.eye(3), np.zeros((3, 0)), 0.0)

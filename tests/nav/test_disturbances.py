@@ -1,3 +1,5 @@
+"""Disturbances: order of the general state, stochastic and bounded ones, their feeds."""
+
 import math
 
 import numpy as np
@@ -5,7 +7,7 @@ import pytest
 
 from companion.nav import disturbances as dist
 from companion.nav.discretization import discretise
-from companion.nav.error_model import INS_STATES, aircraft
+from companion.nav.error_model import INS_STATES, aircraft_model
 
 
 def everything() -> tuple[dist.Disturbance, ...]:
@@ -23,7 +25,7 @@ def everything() -> tuple[dist.Disturbance, ...]:
 
 
 def test_the_general_state_in_its_order() -> None:
-    model = aircraft(1.0, 20.0, 20.0, added=everything())
+    model = aircraft_model(1.0, 20.0, 20.0, added=everything())
     assert model.states == (
         *INS_STATES,
         *("E0X", "E0Y", "E0Z", "EX", "EY", "EZ"),
@@ -37,7 +39,7 @@ def test_the_general_state_in_its_order() -> None:
 
 def test_a_bounded_disturbance_has_a_column_and_no_noise() -> None:
     """(1.35), (1.37): what is in B u is not in W, and the other way round."""
-    model = aircraft(1.0, 20.0, 20.0, added=everything())
+    model = aircraft_model(1.0, 20.0, 20.0, added=everything())
     driven = model.B.any(axis=1)
     assert [s for s, d in zip(model.states, driven, strict=True) if d] == ["wN", "wE", "GX", "GY"]
     assert not np.diag(model.Q)[driven].any()
@@ -46,7 +48,7 @@ def test_a_bounded_disturbance_has_a_column_and_no_noise() -> None:
 
 
 def test_a_stochastic_disturbance_is_stationary_at_its_sigma() -> None:
-    model = aircraft(1.0, 20.0, 20.0, added=everything())
+    model = aircraft_model(1.0, 20.0, 20.0, added=everything())
     step = discretise(model.A, model.Q, model.B, 10.0)
     for name in ("EX", "AX", "AsY", "b1", "O2"):
         i = model.states.index(name)
@@ -58,7 +60,7 @@ def test_a_stochastic_disturbance_is_stationary_at_its_sigma() -> None:
 
 
 def test_each_feeds_its_channel() -> None:
-    model = aircraft(1.0, 20.0, 20.0, added=everything())
+    model = aircraft_model(1.0, 20.0, 20.0, added=everything())
     index = {s: i for i, s in enumerate(model.states)}
     for fed, feeding in (
         *(("PX", "EX"), ("PY", "EY"), ("PZ", "EZ"), ("PX", "E0X"), ("PZ", "E0Z")),
@@ -72,7 +74,7 @@ def test_each_feeds_its_channel() -> None:
 
 def test_a_free_gyro_turns_by_its_drift() -> None:
     """(1.21) is a rotation by the parallactic angle: the axis moves as far as the drift turns it."""
-    model = aircraft(1.0, 0.0, 0.0, added=dist.free_gyro(0.4, 1e-5, 1e-8))
+    model = aircraft_model(1.0, 0.0, 0.0, added=dist.free_gyro(0.4, 1e-5, 1e-8))
     block = model.A[7:9, 9:11]
     np.testing.assert_allclose(block @ block.T, np.eye(2), atol=1e-15)
     np.testing.assert_allclose(block[0], [-math.cos(0.4), math.sin(0.4)], atol=1e-15)
@@ -81,14 +83,14 @@ def test_a_free_gyro_turns_by_its_drift() -> None:
 @pytest.mark.parametrize(
     ("decay", "sigma", "bound"), [(-1.0, 0.0, None), (1.0, math.nan, None), (1.0, 0.5, 0.1), (1.0, 0.0, -1.0)]
 )
-def test_nonsense_is_refused_by_name(decay: float, sigma: float, bound: float | None) -> None:
+def test_bad_disturbance_is_reported_by_name(decay: float, sigma: float, bound: float | None) -> None:
     with pytest.raises(ValueError, match="EX/EY/EZ"):
         dist.gyro_drift(decay, sigma, bound)
 
 
-def test_a_name_used_twice_or_unknown_is_refused() -> None:
+def test_repeated_or_unknown_name_is_rejected() -> None:
     with pytest.raises(ValueError, match="EX, EY, EZ"):
-        aircraft(1.0, 0.0, 0.0, added=(dist.gyro_drift(1.0, 1.0), dist.gyro_drift(2.0, 1.0)))
+        aircraft_model(1.0, 0.0, 0.0, added=(dist.gyro_drift(1.0, 1.0), dist.gyro_drift(2.0, 1.0)))
     with pytest.raises(ValueError, match="cannot feed nowhere"):
         lost = dist.Disturbance(("x",), 1.0, feeds=(("nowhere", "x", 1.0),))
-        aircraft(1.0, 0.0, 0.0, added=(lost,))
+        aircraft_model(1.0, 0.0, 0.0, added=(lost,))

@@ -9,24 +9,30 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 from scipy.integrate import solve_ivp
 
 from companion.nav import disturbances as dist
 from companion.nav import error_model
-from companion.nav.correctors import absolute_log, airspeed, gnss_velocity, paper_velocity, relative_log, rows
+from companion.nav.correctors import (
+    absolute_log,
+    airspeed,
+    gnss_velocity,
+    observation_matrix,
+    paper_velocity,
+    relative_log,
+)
 from companion.nav.earth import SPHERE, SPHERE_KM_H
-from companion.nav.error_model import INS_STATES, aircraft, paper, paper_example, twin
-from companion.nav.strapdown import rates, rotation
+from companion.nav.error_model import INS_STATES, aircraft_model, combine_systems, paper_example, paper_model
+from companion.nav.strapdown import navigation_rates, rotation_matrix
+from companion.units import Floats
 
-Matrix = npt.NDArray[np.float64]
 GOLDEN: dict[str, Any] = json.loads((Path(__file__).parents[1] / "data" / "error_model.json").read_text())
 speeds = [8.0, 30.0, 250.0]
 headings = [0.0, 90.0, 180.0, 225.0]
 
 
-def frequencies(A: Matrix) -> Matrix:
+def frequencies(A: Floats) -> Floats:
     """Imaginary parts of a spectrum that must be imaginary, from the greatest down."""
     eigenvalues = np.linalg.eigvals(A)
     np.testing.assert_allclose(eigenvalues.real, 0.0, atol=1e-9 * np.abs(eigenvalues).max())
@@ -37,7 +43,7 @@ def frequencies(A: Matrix) -> Matrix:
 
 
 @pytest.mark.parametrize(("V", "lat"), [(30.0, math.pi / 4), (250.0, math.pi / 3)])
-@pytest.mark.parametrize(("name", "model"), [("A7_full", aircraft), ("A7_paper", paper)])
+@pytest.mark.parametrize(("name", "model"), [("A7_full", aircraft_model), ("A7_paper", paper_model)])
 def test_golden_matrices(name: str, model: Any, V: float, lat: float) -> None:
     golden = np.array(GOLDEN["matrices"][f"{name} V={V:.0f} K=1.570796 phi={lat:.6f}"])
     np.testing.assert_allclose(model(lat, 0.0, V).A, golden, rtol=1e-14, atol=0.0)
@@ -59,10 +65,10 @@ def test_golden_sixteen_states() -> None:
 
 @pytest.mark.parametrize("V", [30.0, 250.0])
 def test_golden_airspeed_rows(V: float) -> None:
-    model = aircraft(
+    model = aircraft_model(
         1.0, 0.0, V, added=(dist.gyro_drift(1.0), dist.wind(V, 1e-3, 1e4), *_gravity_and_sensors())
     )
-    H = rows(model.states, *airspeed(math.pi / 2, V))
+    H = observation_matrix(model.states, *airspeed(math.pi / 2, V))
     np.testing.assert_allclose(H, GOLDEN["matrices"][f"H_full V={V:.0f} K=1.570796"], atol=1e-15)
 
 
@@ -76,10 +82,10 @@ def _gravity_and_sensors() -> tuple[dist.Disturbance, ...]:
 @pytest.mark.parametrize(
     ("golden", "model", "V"),
     [
-        ("paper V=0", paper, 0.0),
-        ("paper V=30 E", paper, 30.0),
-        ("full V=0 E", aircraft, 0.0),
-        ("full V=30 E", aircraft, 30.0),
+        ("paper V=0", paper_model, 0.0),
+        ("paper V=30 E", paper_model, 30.0),
+        ("full V=0 E", aircraft_model, 0.0),
+        ("full V=30 E", aircraft_model, 30.0),
     ],
 )
 def test_golden_spectra(golden: str, model: Any, V: float) -> None:
@@ -94,7 +100,7 @@ def test_golden_spectra(golden: str, model: Any, V: float) -> None:
 def test_the_laws_of_the_schuler_pair() -> None:
     """Product of the two frequencies G/R, difference 2 Om sin(phi); then the earth's rate, and a zero."""
     for lat in (0.1, 0.8, math.pi / 3, 1.3):
-        fast, slow, diurnal, zero = frequencies(paper(lat, 0.0, 0.0, sphere=SPHERE_KM_H).A)[:4]
+        fast, slow, diurnal, zero = frequencies(paper_model(lat, 0.0, 0.0, sphere=SPHERE_KM_H).A)[:4]
         assert fast * slow == pytest.approx(SPHERE_KM_H.G / SPHERE_KM_H.R, rel=1e-9)
         assert fast - slow == pytest.approx(2.0 * SPHERE_KM_H.OMEGA * math.sin(lat), rel=1e-8)
         assert diurnal == pytest.approx(SPHERE_KM_H.OMEGA, rel=1e-8)
@@ -105,7 +111,7 @@ def test_the_schuler_period() -> None:
     assert 2.0 * math.pi * math.sqrt(SPHERE.R / SPHERE.G) / 60.0 == pytest.approx(84.3913, abs=5e-5)
 
 
-@pytest.mark.parametrize("model", [paper, aircraft])
+@pytest.mark.parametrize("model", [paper_model, aircraft_model])
 @pytest.mark.parametrize("heading", headings)
 @pytest.mark.parametrize("V", speeds)
 def test_no_error_grows_faster_than_the_flight_goes(model: Any, V: float, heading: float) -> None:
@@ -115,9 +121,9 @@ def test_no_error_grows_faster_than_the_flight_goes(model: Any, V: float, headin
     assert np.abs(np.linalg.eigvals(A).real).max() < 3.0 * V / SPHERE.R
 
 
-def test_mixed_senses_of_rotation_would_be_seen() -> None:
+def test_mixed_senses_of_rotation_are_unstable() -> None:
     """P as minus the rotation in the tilts but plus in the velocities: Schuler turns into +-4.47 1/h."""
-    mixed = paper(math.pi / 3, 0.0, 0.0, sphere=SPHERE_KM_H).A.copy()
+    mixed = paper_model(math.pi / 3, 0.0, 0.0, sphere=SPHERE_KM_H).A.copy()
     mixed[2:4, 4:7] *= -1.0
     real = np.sort(np.linalg.eigvals(mixed).real)
     schuler = math.sqrt(SPHERE_KM_H.G / SPHERE_KM_H.R)
@@ -143,10 +149,10 @@ class Flight:
     def heading(self, t: float) -> float:
         return self.K_0 + self.turn_rate * t
 
-    def v_n(self, t: float) -> Matrix:
+    def v_n(self, t: float) -> Floats:
         return np.array([self.V * math.cos(self.heading(t)), self.V * math.sin(self.heading(t)), 0.0])
 
-    def a_n(self, t: float) -> Matrix:
+    def a_n(self, t: float) -> Floats:
         return np.array([-self.turn_rate * self.v_n(t)[1], self.turn_rate * self.v_n(t)[0], 0.0])
 
     def lat(self, t: float) -> float:
@@ -155,28 +161,28 @@ class Flight:
             north = self.V * (math.sin(self.heading(t)) - math.sin(self.K_0)) / self.turn_rate
         return self.lat_0 + north / SPHERE.R
 
-    def C_nb(self, t: float) -> Matrix:
-        banked: Matrix = rotation(np.array([0.0, 0.0, self.heading(t)])) @ rotation(
+    def C_nb(self, t: float) -> Floats:
+        banked: Floats = rotation_matrix(np.array([0.0, 0.0, self.heading(t)])) @ rotation_matrix(
             np.array([0.1, -0.05, 0.0])
         )
         return banked
 
-    def sensors(self, t: float) -> tuple[Matrix, Matrix]:
+    def sensors(self, t: float) -> tuple[Floats, Floats]:
         """Specific force balances gravity and Coriolis and gives a_n; the body turns with n and more."""
-        free = rates(self.lat(t), 0.0, self.v_n(t), np.zeros(3), SPHERE)
+        free = navigation_rates(self.lat(t), 0.0, self.v_n(t), np.zeros(3), SPHERE)
         C_bn, yaw = self.C_nb(t).T, np.array([0.0, 0.0, self.turn_rate])
         return C_bn @ (self.a_n(t) - free.v_n), C_bn @ (free.w_in_n + yaw)
 
-    def ins(self, x_0: Matrix) -> Matrix:
+    def ins(self, x_0: Floats) -> Floats:
         """Fly the INS from initial errors x_0 (7,): its errors at the end, dy but for a constant."""
         start = [self.lat_0 + x_0[0] / SPHERE.R, x_0[1] / (SPHERE.R * math.cos(self.lat_0))]
-        C_0 = rotation(x_0[4:7]) @ self.C_nb(0.0)
+        C_0 = rotation_matrix(x_0[4:7]) @ self.C_nb(0.0)
         y_0 = np.concatenate([start, self.v_n(0.0)[:2] + x_0[2:4], C_0.ravel()])
 
-        def slope(t: float, y: Matrix) -> Matrix:
+        def slope(t: float, y: Floats) -> Floats:
             f_b, w_b = self.sensors(t)
             C = y[4:].reshape(3, 3)
-            r = rates(float(y[0]), 0.0, np.array([y[2], y[3], 0.0]), C @ f_b, SPHERE)
+            r = navigation_rates(float(y[0]), 0.0, np.array([y[2], y[3], 0.0]), C @ f_b, SPHERE)
             C_rate = C @ _cross(w_b) - _cross(r.w_in_n) @ C
             return np.concatenate([[r.lat, r.lon], r.v_n[:2], C_rate.ravel()])
 
@@ -187,10 +193,10 @@ class Flight:
         P = 0.5 * np.array([tilt[2, 1] - tilt[1, 2], tilt[0, 2] - tilt[2, 0], tilt[1, 0] - tilt[0, 1]])
         return np.concatenate([position, y[2:4] - self.v_n(self.seconds)[:2], P])
 
-    def linear(self, model: Any) -> Matrix:
+    def linear(self, model: Any) -> Floats:
         """The transition matrix (7, 7) of the error equations over the same flight."""
 
-        def slope(t: float, Phi: Matrix) -> Matrix:
+        def slope(t: float, Phi: Floats) -> Floats:
             turning = (tuple(self.a_n(t)),) if self.turn_rate else ()
             A = model(self.lat(t), *self.v_n(t)[:2].tolist(), *turning).A
             return np.asarray(A @ Phi.reshape(7, 7)).ravel()
@@ -201,7 +207,7 @@ class Flight:
         return np.asarray(end.y[:, -1].reshape(7, 7))
 
 
-def _cross(v: Matrix) -> Matrix:
+def _cross(v: Floats) -> Floats:
     x, y, z = v
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
@@ -214,10 +220,10 @@ def _cross(v: Matrix) -> Matrix:
 def test_aircraft_is_the_jacobian_of_a_nonlinear_inertial_system(
     V: float, heading: float, turn_rate: float
 ) -> None:
-    """An hour of flight, every initial error perturbed both ways: 1e-6 of the error scale (met: 1e-8)."""
+    """An hour of flight, every initial error perturbed both ways: 1e-6 of the error scale (is 1e-8)."""
     flight = Flight(V, heading, turn_rate)
     scale = np.array([1e3, 1e3, 1.0, 1.0, 2e-4, 2e-4, 2e-4])  # comparable errors of a Schuler cycle
-    Phi = flight.linear(aircraft)
+    Phi = flight.linear(aircraft_model)
     rng = np.random.default_rng(7)
     for _ in range(2):
         x_0 = 0.02 * scale * rng.uniform(0.5, 1.0, 7) * rng.choice([-1.0, 1.0], 7)
@@ -232,9 +238,9 @@ def test_paper_is_only_approximate_at_aircraft_speed() -> None:
 
     def discrepancy(V: float) -> float:
         flight = Flight(V, 90.0)
-        Phi, Psi = flight.linear(aircraft), flight.linear(paper)
+        Phi, Psi = flight.linear(aircraft_model), flight.linear(paper_model)
         # the paper's dVE is the rate of dy: its true velocity error is a row, not a state
-        H = rows(INS_STATES, *gnss_velocity(paper_velocity(flight.lat_0, 0.0, V)))
+        H = observation_matrix(INS_STATES, *gnss_velocity(paper_velocity(flight.lat_0, 0.0, V)))
         to_true = np.eye(7)
         to_true[2:4] = H
         Psi = to_true @ Psi @ np.linalg.inv(to_true)
@@ -247,7 +253,7 @@ def test_paper_is_only_approximate_at_aircraft_speed() -> None:
 # -- units, composition --------------------------------------------------------------------------------
 
 
-def _kalman(example: error_model.Example, Q: Matrix, Z: Matrix) -> Matrix:
+def _kalman(example: error_model.Example, Q: Floats, Z: Floats) -> Floats:
     """A plain Joseph filter, so that this file proves the model without the package's filters."""
     x, P, out = example.x0, example.P0, []
     for z in Z:
@@ -278,7 +284,7 @@ def test_the_example_in_kilometre_hours_and_in_si_gives_the_same_estimates(exact
         assert (np.abs(x_km - x_si) / np.abs(x_si).max(axis=0)).max() < 1e-11
 
 
-def _minimax(example: error_model.Example) -> Matrix:
+def _minimax(example: error_model.Example) -> Floats:
     return np.asarray(example.Q + example.B @ np.diag(example.C**2) @ example.B.T)
 
 
@@ -300,17 +306,17 @@ def test_euler_magnifies_schuler_and_the_exact_step_does_not() -> None:
     assert growth[1] == pytest.approx(1.94, abs=0.01)
 
 
-def test_unknown_units_are_named() -> None:
+def test_unknown_units_are_reported() -> None:
     with pytest.raises(ValueError, match="km-h or SI"):
         paper_example("miles")  # type: ignore[arg-type]
 
 
 def test_two_systems_share_gravity_and_nothing_else() -> None:
-    one = aircraft(1.0, 10.0, 20.0, added=(dist.gyro_drift(1e-5, 1e-8),))
-    two = aircraft(1.0, 10.0, 20.0, added=(dist.gyro_drift(2e-5, bound=1e-12),))
+    one = aircraft_model(1.0, 10.0, 20.0, added=(dist.gyro_drift(1e-5, 1e-8),))
+    two = aircraft_model(1.0, 10.0, 20.0, added=(dist.gyro_drift(2e-5, bound=1e-12),))
     feeds = tuple((f"{v}{s}", g, 1.0) for s in ("", "2") for v, g in (("dVN", "GX"), ("dVE", "GY")))
     gravity = dist.Disturbance(("GX", "GY"), 1e-3, 1e-4, feeds=feeds)
-    both = twin(one, two, common=(gravity,))
+    both = combine_systems(one, two, common=(gravity,))
     assert both.states == (*one.states, *(s + "2" for s in two.states), "GX", "GY")
     n = len(one.states)
     np.testing.assert_array_equal(both.A[:n, :n], one.A)
@@ -331,9 +337,11 @@ def test_logs_with_the_paper_velocity_are_the_printed_rows() -> None:
     along = [-lon_rate * s * sK, lat_rate * t * sK, cK, sK, 0, 0, 0, -cK, -sK]
     across = [-lon_rate * s * cK, lat_rate * t * cK, -sK, cK, 0, 0, -V, sK, -cK]
     velocity = paper_velocity(lat, vN, vE)
-    np.testing.assert_allclose(rows(states, *relative_log(K, V, velocity)), [along, across], atol=1e-18)
     np.testing.assert_allclose(
-        rows(INS_STATES, *absolute_log(K, V, velocity)), [along[:7], across[:7]], atol=1e-18
+        observation_matrix(states, *relative_log(K, V, velocity)), [along, across], atol=1e-18
+    )
+    np.testing.assert_allclose(
+        observation_matrix(INS_STATES, *absolute_log(K, V, velocity)), [along[:7], across[:7]], atol=1e-18
     )
 
 

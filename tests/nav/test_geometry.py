@@ -1,3 +1,5 @@
+"""Geometry: golden values, inverses, flat earths of the autopilots, lines of sight."""
+
 import math
 
 import numpy as np
@@ -21,7 +23,7 @@ from companion.nav.geometry import (
     slant_range_azimuth,
     to_ecef,
     to_enu,
-    wrap,
+    wrap_angle,
 )
 
 micrometre = 1e-6
@@ -56,7 +58,7 @@ def test_ecef_golden_values(point: Geodetic, xyz: tuple[float, float, float], to
     assert back.lat == pytest.approx(point.lat, abs=1e-12)
     assert back.alt == pytest.approx(point.alt, abs=tolerance)
     if abs(point.lat) < 1.5:
-        assert wrap(back.lon - point.lon) == pytest.approx(0.0, abs=1e-12)
+        assert wrap_angle(back.lon - point.lon) == pytest.approx(0.0, abs=1e-12)
 
 
 @given(points)
@@ -68,7 +70,7 @@ def test_ecef_there_and_back_within_a_micrometre(point: Geodetic) -> None:
     assert back.alt == pytest.approx(point.alt, abs=micrometre)
 
 
-def test_the_centre_of_the_earth_is_refused() -> None:
+def test_centre_of_the_earth_is_rejected() -> None:
     with pytest.raises(ValueError, match="centre of the earth"):
         from_ecef(np.array([100.0, 0.0, 0.0]))
 
@@ -89,7 +91,7 @@ def test_axes_at_the_cardinal_places(
     np.testing.assert_allclose(axes, [east, north, up], atol=1e-15)
 
 
-def test_a_sight_of_pymap3d() -> None:
+def test_line_of_sight_of_pymap3d() -> None:
     """aer (33, 70, 1000) from (42, -82, 200): pymap3d's tests (test_aer.py, test_enu.py), BSD-2-Clause."""
     origin = degrees(42, -82, 200)
     point = from_enu(np.array([186.277521, 286.842228, 939.692621]), origin)
@@ -190,13 +192,13 @@ def test_px4_at_its_origin() -> None:
 
 
 def test_the_flat_earths_disagree_by_more_than_a_beacon_error() -> None:
-    """Why the projection is asked for: 100 km north of the origin they are hundreds of metres apart."""
+    """Why the projection is an input: 100 km north of the origin they are hundreds of metres apart."""
     origin, x_n = degrees(50.0, 10.0, 0.0), np.array([100e3, 0.0, 0.0])
     lats = [local_to_geodetic(p, origin, x_n).lat * earth.A for p in projections]
     assert max(lats) - min(lats) > 100.0
 
 
-def test_unknown_projection_is_named() -> None:
+def test_unknown_projection_is_reported() -> None:
     with pytest.raises(ValueError, match=r"'betaflight'.*ardupilot, px4 or tangent"):
         local_to_geodetic("betaflight", degrees(0, 0, 0), np.zeros(3))  # type: ignore[arg-type]
 
@@ -230,5 +232,5 @@ def test_radio_horizon_is_the_tangent_line_over_the_four_thirds_earth() -> None:
 @given(st.floats(-1e3, 1e3))
 @settings(deadline=None)
 def test_wrap(angle: float) -> None:
-    assert -math.pi <= wrap(angle) < math.pi
-    assert math.remainder(wrap(angle) - angle, math.tau) == pytest.approx(0.0, abs=1e-12)
+    assert -math.pi <= wrap_angle(angle) < math.pi
+    assert math.remainder(wrap_angle(angle) - angle, math.tau) == pytest.approx(0.0, abs=1e-12)

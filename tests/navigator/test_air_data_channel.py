@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from companion.analysis.error_statistics import beacon_fix
+from companion.analysis.error_statistics import position_from_beacon
 from companion.config import Config, load, to_toml
 from companion.importers import sources
 from companion.nav.geometry import Geodetic, displace, from_enu, separation, slant_range_azimuth
@@ -38,8 +38,8 @@ from companion.records import (
     Tuning,
     Wind,
 )
+from companion.units import Floats
 
-Floats = npt.NDArray[np.float64]
 NS = 1_000_000_000
 DATA = Path(__file__).parents[1] / "data"
 SHARED = Path(__file__).parents[2].parent / "shared" / "data" / "autopilot_sitl"
@@ -65,7 +65,7 @@ class Recorded(NamedTuple):
 
 def recorded(records: Iterable[Any]) -> Recorded:
     kept = tuple(r for r in records if isinstance(r, (*INPUTS, Truth)))
-    loss = max(r.t_ns for r in kept if isinstance(r, Gnss) and r.fix >= 3)
+    loss = max(r.t_ns for r in kept if isinstance(r, Gnss) and r.has_3d_fix)
     truths = [r for r in kept if isinstance(r, Truth) and r.lat != 0.0]
     t = np.array([(r.t_ns - loss) * 1e-9 for r in truths])
     new = np.concatenate([[True], np.diff(t) > 0.0])
@@ -136,7 +136,7 @@ def raw_rms(flown: Recorded, records: Iterable[Any], start: float, end: float) -
     for r in records:
         if isinstance(r, RsbnFix) and start <= flown.since(r) < end:
             true = flown.truth(r.t_ns)
-            fix = beacon_fix(r, true.alt)
+            fix = position_from_beacon(r, true.alt)
             assert fix is not None
             errors.append(math.hypot(*separation(fix, true)[:2]))
     return rms(errors)
@@ -260,7 +260,7 @@ FED, UNFED = (load(flags={"output.profile": profile}, environment={}) for profil
 def test_the_channel_is_chosen_by_what_is_fed_and_told() -> None:
     own = load(flags={"output.profile": "ardupilot", "inertial.independent": True}, environment={})
     assert (FED.channel, UNFED.channel, own.channel) == ("air_data", "local_position", "local_position")
-    assert (FED.leading, UNFED.leading) == ("kalman", "minimax")
+    assert (FED.leading_estimator, UNFED.leading_estimator) == ("kalman", "minimax")
     first = Gnss(NS, NS, 0, 1, 3, 1.0, 0.5, 100.0)
     events = [out for out in Navigator(FED).handle(first) if isinstance(out, Event)]
     assert events[0].text.startswith("inertial channel: air-data dead reckoning")

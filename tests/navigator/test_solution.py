@@ -9,12 +9,14 @@ import numpy as np
 from companion.config import load
 from companion.records import Solution
 from sitl.campaign.flight import fly_records
-from sitl.scenarios import named
+from sitl.scenarios import get_scenario
 
 
 def test_the_velocity_by_air_data_is_as_good_as_claimed_in_gusts() -> None:
     """A gust is no state: airspeed and heading follow it at once, the wind does not."""
-    scenario = dataclasses.replace(named("short"), gnss_outages=(), rsbn_outages=(), beacons=(), seed=2)
+    scenario = dataclasses.replace(
+        get_scenario("short"), gnss_outages=(), rsbn_outages=(), beacons=(), seed=2
+    )
     config = load(flags={"inertial.source": "air_data"}, environment={})
     world, told = fly_records(scenario, config)
     solutions = [out for out in told if isinstance(out, Solution) and out.t_ns > 80e9]

@@ -16,10 +16,10 @@ import numpy.typing as npt
 import pytest
 from scipy.signal import lfilter
 
-from companion.analysis.error_statistics import beacon_fix
+from companion.analysis.error_statistics import position_from_beacon
 from companion.config import Config, ConfigError, load
 from companion.nav.geometry import Geodetic, from_enu, separation, slant_range_azimuth
-from companion.nav.strapdown import Inertial, mechanise
+from companion.nav.strapdown import InertialState, mechanise
 from companion.navigator import (
     Navigator,
     air_data_channel,
@@ -47,11 +47,10 @@ from companion.records import (
     Truth,
     Wind,
 )
-from companion.runtime.core import wanted
-from sitl.flight import Flight, Leg, Plan, fly, rotation
-from sitl.flight import Wind as Blows
+from companion.runtime.core import requested_rates
+from companion.units import Floats
+from sitl.flight import FlightPlan, Leg, Trajectory, WindChange, fly_plan, rotation
 
-Floats = npt.NDArray[np.float64]
 NS = 1_000_000_000
 G = 9.80665
 DATA = Path(__file__).parents[1] / "data"
@@ -77,15 +76,15 @@ NONE = Errors()
 
 
 @lru_cache(maxsize=2)
-def circles(windy: bool = True) -> Flight:
+def circles(windy: bool = True) -> Trajectory:
     """Turning all the time from 90 to 290 s."""
     legs = (Leg(90.0, 0.0, 30.0, 100.0), *(Leg(50.0, 90.0 * k % 360.0, 30.0, 100.0) for k in (1, 2, 3, 4)))
-    return fly(Plan(legs, winds=(Blows(0.0, 4.0, -3.0, 20.0),) if windy else ()))
+    return fly_plan(FlightPlan(legs, winds=(WindChange(0.0, 4.0, -3.0, 20.0),) if windy else ()))
 
 
-def straight() -> Flight:
+def straight() -> Trajectory:
     """Level and straight east, 90 s once at height."""
-    return fly(Plan((Leg(130.0, 90.0, 30.0, 100.0), Leg(100.0, 90.0, 30.0, 100.0))))
+    return fly_plan(FlightPlan((Leg(130.0, 90.0, 30.0, 100.0), Leg(100.0, 90.0, 30.0, 100.0))))
 
 
 def static_pressure(alt: float) -> float:
@@ -95,7 +94,7 @@ def static_pressure(alt: float) -> float:
 
 
 def felt(
-    flight: Flight, start: float, errors: Errors = NONE, every: int = 1, attitude_every: int = 5
+    flight: Trajectory, start: float, errors: Errors = NONE, every: int = 1, attitude_every: int = 5
 ) -> list[Any]:
     """IMU (every so many of 50 Hz), attitude and pressure from `start` (s) on, all stamped alike."""
     n = len(flight.t)
@@ -115,13 +114,13 @@ def felt(
     return records
 
 
-def level_axes(flight: Flight, a_n: Floats) -> Floats:
+def level_axes(flight: Trajectory, a_n: Floats) -> Floats:
     """What an error of acceleration north and east is ahead and to the right of the level body, (n, 2)."""
     c, s = np.cos(flight.attitude[:, 2]), np.sin(flight.attitude[:, 2])
     return np.stack([c * a_n[:, 0] + s * a_n[:, 1], -s * a_n[:, 0] + c * a_n[:, 1]], axis=1)
 
 
-def true_point(flight: Flight, t: float) -> Point:
+def true_point(flight: Trajectory, t: float) -> Point:
     """Everything here happens at the flight's own samples."""
     k = round(t * 50.0)
     assert abs(flight.t[k] - t) < 1e-6
@@ -129,7 +128,9 @@ def true_point(flight: Flight, t: float) -> Point:
     return Point(round(t * 1e9), at, tuple(flight.v_n[k].tolist()))
 
 
-def reckoned(flight: Flight, records: Iterable[Any], start: float, lasting: float) -> tuple[Floats, Floats]:
+def reckoned(
+    flight: Trajectory, records: Iterable[Any], start: float, lasting: float
+) -> tuple[Floats, Floats]:
     """Errors of the channel alone from the true state at `start` on: position (n, 3) m and velocity."""
     s, track = strapdown_channel.Strap(), [true_point(flight, start)]
     for record in records:
@@ -163,7 +164,7 @@ def test_it_agrees_with_a_strapdown_that_keeps_its_own_attitude() -> None:
     """With perfect gyros both integrate the same equations; only the vertical channel is held here."""
     flight = circles()
     first, n = round(110.0 * 50), 60 * 50
-    state = Inertial(
+    state = InertialState(
         float(flight.lat[first]), float(flight.lon[first]), float(flight.alt[first]), flight.v_n[first],
         rotation(flight.attitude[first : first + 1])[0],
     )  # fmt: skip
@@ -264,11 +265,11 @@ def navigated(records: Iterable[Any], truth: Any, config: Config = STRAPDOWN) ->
     return Flown(a[:, 0], a[:, 1:3], a[:, 3:7].reshape(-1, 2, 2), a[:, 7], others)
 
 
-def truth_of(flight: Flight) -> Any:
+def truth_of(flight: Trajectory) -> Any:
     return lambda t_ns: true_point(flight, t_ns * 1e-9).position
 
 
-def gnss(flight: Flight, start: float, end: float, rng: np.random.Generator) -> Iterator[Gnss]:
+def gnss(flight: Trajectory, start: float, end: float, rng: np.random.Generator) -> Iterator[Gnss]:
     """Fixes at 2 Hz with a drift and white noise as configured."""
     settings = STRAPDOWN.gnss
     drift = settings.sigma_m * rng.standard_normal(2)
@@ -283,7 +284,7 @@ def gnss(flight: Flight, start: float, end: float, rng: np.random.Generator) -> 
         yield Gnss(p.t_ns, p.t_ns, 0, p.t_ns // 1000, 3, lat, lon, alt, 2.0, 3.0, tuple(v.tolist()), 0.1)
 
 
-def drawn(flight: Flight, rng: np.random.Generator) -> Errors:
+def drawn(flight: Trajectory, rng: np.random.Generator) -> Errors:
     """Errors as the model has them: Gauss-Markov tilt, white noise, constant bias and heading error."""
     settings, dt = STRAPDOWN.strapdown, 0.02
     n, kept = len(flight.t), math.exp(-dt / settings.tilt_s)
@@ -316,7 +317,7 @@ def test_the_covariance_is_honest() -> None:
         assert 9.9 < sum(values) < 45.6, (t, np.mean(values))
 
 
-def lost(flight: Flight, silent: tuple[float, float] = (0.0, 0.0)) -> list[Any]:
+def lost(flight: Trajectory, silent: tuple[float, float] = (0.0, 0.0)) -> list[Any]:
     """GNSS to 120 s, then none; no IMU within `silent`."""
     sensors = [
         r
@@ -559,7 +560,7 @@ def raw_rms(records: Iterable[Any], start: float) -> float:
     errors = []
     for r in records:
         if isinstance(r, RsbnFix) and r.t_ns * 1e-9 >= start:
-            fix = beacon_fix(r, truth(r.t_ns).alt)
+            fix = position_from_beacon(r, truth(r.t_ns).alt)
             assert fix is not None
             errors.append(math.hypot(*separation(fix, truth(r.t_ns))[:2]))
     return rms(errors)
@@ -636,16 +637,16 @@ def test_late_answers_are_folded_in_at_their_own_time() -> None:
 
 def test_it_is_chosen_by_name_alone_and_told() -> None:
     assert load(flags={"inertial.source": "auto"}, environment={}).channel != "strapdown"
-    assert (STRAPDOWN.channel, STRAPDOWN.leading) == ("strapdown", "kalman")
+    assert (STRAPDOWN.channel, STRAPDOWN.leading_estimator) == ("strapdown", "kalman")
     first = Gnss(NS, NS, 0, 1, 3, 1.0, 0.5, 100.0)
     events = [out for out in Navigator(STRAPDOWN).handle(first) if isinstance(out, Event)]
     assert events[0].text == "inertial channel: strapdown by the autopilot's attitude (configured)"
-    with pytest.raises(ConfigError, match="runs by air data only"):
+    with pytest.raises(ConfigError, match="runs on air data only"):
         load(flags={"inertial.source": "strapdown", "estimator.output": "restrictive"}, environment={})
 
 
 def test_the_rates_asked_for_are_enough() -> None:
-    asked = wanted(STRAPDOWN)
+    asked = requested_rates(STRAPDOWN)
     assert min(asked["RAW_IMU"], asked["HIGHRES_IMU"]) >= strapdown_channel.IMU_HZ
     assert asked["ATTITUDE"] >= strapdown_channel.ATTITUDE_HZ
     assert asked["SCALED_PRESSURE"] > 0.0

@@ -15,7 +15,7 @@ from companion.records import Event, Rejection, Solution, Source, Trust
 from sitl.beacon import Beacon
 from sitl.campaign.flight import SCENARIOS, fly_records, horizontal_errors
 from sitl.faults import Fault
-from sitl.flight import Leg, Plan, Wind
+from sitl.flight import FlightPlan, Leg, WindChange
 
 NS = 1_000_000_000
 START, END = 300.0, 540.0
@@ -62,7 +62,7 @@ def flown(name: str, size: float | None = None, seed: int = 1, **changes: Any) -
 
 def test_an_hour_without_a_fault_raises_no_alarm_and_trust_stays_normal() -> None:
     legs = [Leg(10, 40, 0, 0), Leg(50, 40, 38, 0), *(Leg(590, 40 + 180 * (k % 2), 38, 400) for k in range(6))]
-    hour = flown("", plan=Plan(tuple(legs), winds=(Wind(0, 4, 5),)))
+    hour = flown("", plan=FlightPlan(tuple(legs), winds=(WindChange(0, 4, 5),)))
     assert hour.t[-1] >= 3590.0
     assert hour.exclusions() == []
     assert [r for r in hour.told if isinstance(r, Rejection)] == []
@@ -128,7 +128,7 @@ def test_a_beacons_bias_and_north_are_learnt_while_gnss_is_trusted_and_used_afte
     good = SCENARIOS["one-beacon"].beacons[0]
     crooked: Beacon = dataclasses.replace(good, bias_range=120.0, north_deg=0.15)
     legs = (Leg(10, 40, 0, 0), Leg(50, 40, 38, 0), Leg(1140, 40, 38, 400))
-    flight = flown("", plan=Plan(legs), beacons=(crooked,), gnss_outages=((600.0, 1e9),))
+    flight = flown("", plan=FlightPlan(legs), beacons=(crooked,), gnss_outages=((600.0, 1e9),))
     assert {found for _, found in flight.exclusions()} <= {"rsbn 1 azimuth"}
     assert flight.worst(620.0) < 60.0
     assert flight.beyond() == 0

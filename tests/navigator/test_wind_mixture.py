@@ -7,7 +7,6 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 
 from companion.config import AirDataConfig, GnssConfig
@@ -16,8 +15,8 @@ from companion.navigator import error_state, wind_error_model, wind_mixture
 from companion.navigator.error_state import ErrorState
 from companion.navigator.inertial_track import Point
 from companion.navigator.wind_mixture import Jumps
+from companion.units import Floats
 
-Floats = npt.NDArray[np.float64]
 NS = 1_000_000_000
 UNIT = wind_error_model.grade(AirDataConfig(), GnssConfig())
 H = error_state.beacon_rows(UNIT)

@@ -1,4 +1,4 @@
-"""What an autopilot's estimator is fed: fit to steer by, of the right make, and never its own position."""
+"""Autopilot output: checked positions, for the right make, and never the autopilot's own position."""
 
 import gzip
 import math
@@ -15,7 +15,7 @@ from companion.config import Config, ConfigError, InertialConfig, OutputConfig, 
 from companion.link import dialect, frame
 from companion.nav.geometry import Geodetic, displace, local_to_geodetic, slant_range_azimuth
 from companion.navigator import Navigator
-from companion.output.autopilot_output import Feed
+from companion.output.autopilot_output import AutopilotOutput
 from companion.output.encode import ENCODERS, Receiver
 from companion.records import (
     AirData,
@@ -34,7 +34,7 @@ from companion.records import (
     Trust,
     Truth,
 )
-from companion.runtime.core import Onboard, wanted
+from companion.runtime.core import CompanionCore, requested_rates
 
 SECOND, MS = 1_000_000_000, 1_000_000
 START = 5000 * SECOND
@@ -45,7 +45,7 @@ UTC_S = 1_795_248_000
 Frame = tuple[str, bytes]
 
 
-def told(*pairs: str) -> Config:
+def configured(*pairs: str) -> Config:
     return load(pairs=pairs, environment={})
 
 
@@ -53,7 +53,7 @@ def deg_e7(angle: float) -> int:
     return round(math.degrees(angle) * 1e7)
 
 
-class Silent:
+class EventLog:
     def __init__(self) -> None:
         self.events: list[Event] = []
 
@@ -65,16 +65,16 @@ class Silent:
 
 
 class Flight:
-    """Nose to the north in a wind from the west; `lie` changes what the autopilot says of itself."""
+    """Flight with heading north in a west wind; `falsify` changes the messages of the autopilot."""
 
     def __init__(
         self,
         config: Config,
         autopilot: int = 3,
-        lie: Callable[[str, dict[str, Any]], None] = lambda name, values: None,
+        falsify: Callable[[str, dict[str, Any]], None] = lambda name, values: None,
     ) -> None:
-        self.log = Silent()
-        self.onboard, self.lie, self.autopilot = Onboard(config, self.log), lie, autopilot
+        self.log = EventLog()
+        self.core, self.falsify, self.autopilot = CompanionCore(config, self.log), falsify, autopilot
         self.now, self.ticks = START, 0
         self.gnss = self.rsbn = True
         self.source_set, self.answers = 1, True
@@ -82,15 +82,15 @@ class Flight:
         self.payloads: list[Frame] = []
         self._sequence, self._reader = 0, frame.Reader()
 
-    def say(self, name: str, **values: Any) -> None:
-        self.lie(name, values)
+    def send(self, name: str, **values: Any) -> None:
+        self.falsify(name, values)
         self._sequence = self._sequence + 1 & 0xFF
         data = frame.encode(dialect.new(name, **values), self._sequence, 1, 1)
-        self.onboard.receive("main", data, self.now)
+        self.core.receive("main", data, self.now)
         self.collect()
 
     def collect(self) -> None:
-        for data in self.onboard.to_send("main", self.now):
+        for data in self.core.to_send("main", self.now):
             for found in self._reader.receive(data):
                 assert isinstance(found, frame.Frame)
                 message = dialect.decode(found)
@@ -98,7 +98,7 @@ class Flight:
                 self.payloads.append((message.get_type(), found.payload))
                 if message.get_type() == "COMMAND_LONG" and message.command == 42007 and self.answers:
                     self.source_set = int(message.param1)
-                    self.say("COMMAND_ACK", command=42007, result=0, target_system=1, target_component=191)
+                    self.send("COMMAND_ACK", command=42007, result=0, target_system=1, target_component=191)
 
     @property
     def seconds(self) -> float:
@@ -113,7 +113,7 @@ class Flight:
             self.now += 100 * MS
             self.ticks += 1
             self._tick(self.ticks)
-            self.onboard.poll(self.now)
+            self.core.poll(self.now)
             self.collect()
 
     def _tick(self, tick: int) -> None:
@@ -121,29 +121,29 @@ class Flight:
         place = self.place()
         here = {"lat": deg_e7(place.lat), "lon": deg_e7(place.lon)}
         if tick % 10 == 1:
-            self.say("HEARTBEAT", type=1, autopilot=self.autopilot)
-            self.say("SYSTEM_TIME", time_unix_usec=(UTC_S * 10**9 + self.now - START) // 1000, **boot)
+            self.send("HEARTBEAT", type=1, autopilot=self.autopilot)
+            self.send("SYSTEM_TIME", time_unix_usec=(UTC_S * 10**9 + self.now - START) // 1000, **boot)
         if tick % 50 == 2:
             lat, lon = deg_e7(ORIGIN.lat), deg_e7(ORIGIN.lon)
-            self.say("GPS_GLOBAL_ORIGIN", latitude=lat, longitude=lon, altitude=round(ORIGIN.alt * 1e3))
-        tremor = 1e-5 * (tick % 7)  # what never changes is frozen
-        self.say("ATTITUDE", roll=tremor, pitch=0.0, yaw=0.0, **boot)
+            self.send("GPS_GLOBAL_ORIGIN", latitude=lat, longitude=lon, altitude=round(ORIGIN.alt * 1e3))
+        tremor = 1e-5 * (tick % 7)  # a constant attitude would be rejected as frozen
+        self.send("ATTITUDE", roll=tremor, pitch=0.0, yaw=0.0, **boot)
         stamp = boot["time_boot_ms"] * 1000
         if self.autopilot == 3:
-            self.say("RAW_IMU", time_usec=stamp, zacc=-1000)
+            self.send("RAW_IMU", time_usec=stamp, zacc=-1000)
         else:
-            self.say("HIGHRES_IMU", time_usec=stamp, zacc=-9.80665, fields_updated=0x3F)
-        self.say("SCALED_PRESSURE", press_abs=915.0, temperature=1500, **boot)
+            self.send("HIGHRES_IMU", time_usec=stamp, zacc=-9.80665, fields_updated=0x3F)
+        self.send("SCALED_PRESSURE", press_abs=915.0, temperature=1500, **boot)
         indicated = SPEED * (915.0 / 1013.25) ** 0.404868 + tremor
-        self.say("VFR_HUD", airspeed=indicated, groundspeed=SPEED, alt=place.alt, climb=0.0, heading=0)
+        self.send("VFR_HUD", airspeed=indicated, groundspeed=SPEED, alt=place.alt, climb=0.0, heading=0)
         x, y = SPEED * self.seconds, WIND_EAST * self.seconds
-        self.say("LOCAL_POSITION_NED", x=x, y=y, z=-HEIGHT, vx=SPEED, vy=WIND_EAST, vz=0.0, **boot)
+        self.send("LOCAL_POSITION_NED", x=x, y=y, z=-HEIGHT, vx=SPEED, vy=WIND_EAST, vz=0.0, **boot)
         v = {"vx": round(100 * SPEED), "vy": round(100 * WIND_EAST)}
-        self.say("GLOBAL_POSITION_INT", alt=round(place.alt * 1e3), hdg=0, **here, **v, **boot)
-        self.say("WIND", direction=270.0, speed=WIND_EAST)
+        self.send("GLOBAL_POSITION_INT", alt=round(place.alt * 1e3), hdg=0, **here, **v, **boot)
+        self.send("WIND", direction=270.0, speed=WIND_EAST)
         if tick % 2:
             course = math.degrees(math.atan2(WIND_EAST, SPEED))
-            self.say(
+            self.send(
                 "GPS_RAW_INT",
                 time_usec=boot["time_boot_ms"] * 1000,
                 fix_type=3 if self.gnss else 1,
@@ -154,34 +154,40 @@ class Flight:
                 satellites_visible=14,
             )
         if tick % 10 == 5 and self.rsbn:
-            sight = slant_range_azimuth(BEACON, place)
-            self.say(
+            true = slant_range_azimuth(BEACON, place)
+            self.send(
                 "RSBN_MEASUREMENT",
                 time_usec=boot["time_boot_ms"] * 1000,
                 beacon_lat=deg_e7(BEACON.lat),
                 beacon_lon=deg_e7(BEACON.lon),
                 beacon_alt=BEACON.alt,
-                azimuth=sight.azimuth,
-                slant_range=sight.slant_range,
+                azimuth=true.azimuth,
+                slant_range=true.slant_range,
                 sigma_azimuth=0.002,
                 sigma_range=100.0,
                 beacon_id=1,
                 status=3,
             )
 
-    def heard(self, name: str, after: float = 0.0) -> list[Any]:
+    def sent_messages(self, name: str, after: float = 0.0) -> list[Any]:
         return [m for at, m in self.sent if m.get_type() == name and at >= after]
 
-    def fed(self) -> list[Frame]:
-        return [each for each in self.payloads if each[0] in FED]
+    def position_payloads(self) -> list[Frame]:
+        return [each for each in self.payloads if each[0] in POSITION_MESSAGES]
 
     @property
     def texts(self) -> list[str]:
         return [event.text for event in self.log.events]
 
 
-FED = ("ODOMETRY", "VISION_POSITION_ESTIMATE", "GPS_INPUT", "GLOBAL_POSITION_SENSOR", "COMMAND_INT")
-WAYS = [
+POSITION_MESSAGES = (
+    "ODOMETRY",
+    "VISION_POSITION_ESTIMATE",
+    "GPS_INPUT",
+    "GLOBAL_POSITION_SENSOR",
+    "COMMAND_INT",
+)
+METHODS = [
     (3, "ardupilot", "odometry"),
     (3, "ardupilot", "vision"),
     (3, "ardupilot", "gps_input"),
@@ -192,13 +198,13 @@ WAYS = [
 ]
 
 
-def lies(name: str, values: dict[str, Any]) -> None:
-    """All that the autopilot says of its own position, velocity, height and wind is false."""
+def falsify_position(name: str, values: dict[str, Any]) -> None:
+    """Falsify the autopilot's own position, velocity, height and wind."""
     match name:
         case "LOCAL_POSITION_NED":
             values |= {"x": 900.0, "y": -4000.0, "z": 30.0, "vx": -70.0, "vy": 55.0, "vz": 9.0}
         case "GLOBAL_POSITION_INT":
-            # no further than a position that may be reset is believed to have drifted
+            # within the drift limit of a position reset
             values |= {"lat": values["lat"] + 3000, "alt": 90_000, "vx": -700, "vy": 550, "relative_alt": 7}
         case "VFR_HUD":
             values |= {"groundspeed": 90.0, "alt": 77.0, "climb": -6.0, "heading": 123}
@@ -207,75 +213,75 @@ def lies(name: str, values: dict[str, Any]) -> None:
 
 
 @pytest.mark.parametrize("source", ["auto", "strapdown"])
-@pytest.mark.parametrize(("autopilot", "profile", "via"), WAYS)
-def test_nothing_that_the_autopilot_says_of_its_position_comes_back(
+@pytest.mark.parametrize(("autopilot", "profile", "via"), METHODS)
+def test_autopilot_position_never_reaches_the_output(
     autopilot: int, profile: str, via: str, source: str
 ) -> None:
-    """Bit for bit the same is fed to one that tells the truth and to one that lies."""
-    config = told(f"output.profile={profile}", f"output.via={via}", f"inertial.source={source}")
+    """A correct and a falsified autopilot receive the same bytes."""
+    config = configured(f"output.profile={profile}", f"output.via={via}", f"inertial.source={source}")
     assert config.channel == {"auto": "air_data"}.get(source, source)
-    honest, lying = Flight(config, autopilot), Flight(config, autopilot, lies)
-    for flight in (honest, lying):
+    honest, falsified = Flight(config, autopilot), Flight(config, autopilot, falsify_position)
+    for flight in (honest, falsified):
         flight.fly(15.0)
         flight.gnss = False
         flight.fly(15.0)
-    assert len(honest.fed()) >= (6 if via == "external_position" else 50)
-    assert lying.fed() == honest.fed()
+    assert len(honest.position_payloads()) >= (6 if via == "external_position" else 50)
+    assert falsified.position_payloads() == honest.position_payloads()
 
 
-def test_that_test_would_see_it() -> None:
-    """With an INS that the operator calls independent, the lies do go through."""
-    config = told("output.profile=ardupilot", "inertial.independent=true")
-    honest, lying = Flight(config), Flight(config, lie=lies)
-    for flight in (honest, lying):
+def test_falsified_position_reaches_the_output_of_an_independent_ins() -> None:
+    """The test above can fail: with `inertial.independent` the output differs."""
+    config = configured("output.profile=ardupilot", "inertial.independent=true")
+    honest, falsified = Flight(config), Flight(config, falsify=falsify_position)
+    for flight in (honest, falsified):
         flight.fly(15.0)
-    assert honest.fed() and lying.fed() != honest.fed()
+    assert honest.position_payloads() and falsified.position_payloads() != honest.position_payloads()
 
 
-def test_an_onboard_that_would_feed_it_back_does_not_even_start() -> None:
+def test_core_rejects_a_configuration_with_feedback() -> None:
     config = Config(
         output=OutputConfig(profile="ardupilot"), inertial=InertialConfig(source="local_position")
     )
     with pytest.raises(ConfigError, match="its own position back"):
-        Onboard(config, Silent())
+        CompanionCore(config, EventLog())
 
 
 @pytest.mark.parametrize("msgid", [331, 102, 232, 296, 75])
-def test_nobody_can_ask_the_monitor_to_feed(msgid: int) -> None:
-    flight = Flight(told())
+def test_profile_monitor_rejects_requests_for_position_messages(msgid: int) -> None:
+    flight = Flight(configured())
     flight.fly(3.0)
-    flight.say(
+    flight.send(
         "COMMAND_LONG", target_system=1, target_component=191, command=511, param1=msgid, param2=100_000
     )
     values = {"param_id": "OUT_ODOMETRY_HZ", "param_value": 5.0, "param_type": 9}
-    flight.say("PARAM_SET", target_system=1, target_component=191, **values)
-    denied = [m.result for m in flight.heard("COMMAND_ACK")]
+    flight.send("PARAM_SET", target_system=1, target_component=191, **values)
+    denied = [m.result for m in flight.sent_messages("COMMAND_ACK")]
     flight.fly(5.0)
     assert denied == [2]
-    assert [m.error for m in flight.heard("PARAM_ERROR")] == [2]  # out of range
-    assert flight.fed() == []
-    assert flight.heard("NAVIGATION_STATUS")
+    assert [m.error for m in flight.sent_messages("PARAM_ERROR")] == [2]  # out of range
+    assert flight.position_payloads() == []
+    assert flight.sent_messages("NAVIGATION_STATUS")
 
 
-def test_a_ground_station_may_slow_down_what_the_profile_feeds() -> None:
-    flight = Flight(told("output.profile=ardupilot"))
+def test_ground_station_can_lower_the_output_rate() -> None:
+    flight = Flight(configured("output.profile=ardupilot"))
     flight.fly(10.0)
     values = {"param_id": "OUT_ODOMETRY_HZ", "param_value": 5.0, "param_type": 9}
-    flight.say("PARAM_SET", target_system=1, target_component=191, **values)
-    begun = flight.seconds
+    flight.send("PARAM_SET", target_system=1, target_component=191, **values)
+    start = flight.seconds
     flight.fly(10.0)
-    assert len(flight.heard("ODOMETRY", begun)) == pytest.approx(50, abs=5)
+    assert len(flight.sent_messages("ODOMETRY", start)) == pytest.approx(50, abs=5)
 
 
-def test_the_wrong_make_is_fed_nothing_and_told_so() -> None:
-    flight = Flight(told("output.profile=px4"), autopilot=3)
+def test_autopilot_of_another_make_receives_no_position() -> None:
+    flight = Flight(configured("output.profile=px4"), autopilot=3)
     flight.fly(10.0)
-    assert flight.fed() == []
-    assert sum("the autopilot heard is no px4" in text for text in flight.texts) == 1
+    assert flight.position_payloads() == []
+    assert sum("the autopilot is not px4" in text for text in flight.texts) == 1
 
 
-def test_ardupilot_gets_odometry_and_is_switched_when_gnss_goes_and_comes() -> None:
-    flight = Flight(told("output.profile=ardupilot"))
+def test_ardupilot_source_set_follows_gnss() -> None:
+    flight = Flight(configured("output.profile=ardupilot"))
     flight.fly(20.0)
     assert flight.source_set == 1
     rates = Counter(m.get_type() for _, m in flight.sent)
@@ -285,7 +291,7 @@ def test_ardupilot_gets_odometry_and_is_switched_when_gnss_goes_and_comes() -> N
     flight.fly(30.0)
     assert flight.source_set == 2
     switched = [at for at, m in flight.sent if m.get_type() == "COMMAND_LONG" and m.command == 42007]
-    assert len(switched) == 2 and 4.0 < switched[1] - lost < 7.0  # 3 s until it is not used, 2 s lost
+    assert len(switched) == 2 and 4.0 < switched[1] - lost < 7.0  # 3 s timeout, 2 s unused
     error = [
         math.hypot(m.x - SPEED * at, m.y - WIND_EAST * at)
         for at, m in flight.sent
@@ -297,54 +303,54 @@ def test_ardupilot_gets_odometry_and_is_switched_when_gnss_goes_and_comes() -> N
     assert flight.source_set == 1
     assert [t for t in flight.texts if "source set" in t] == [
         "EKF source set 1: GNSS is trusted again",
-        "EKF source set 2: GNSS is lost, our position leads",
+        "EKF source set 2: GNSS is lost, using companion",
         "EKF source set 1: GNSS is trusted again",
     ]
 
 
-def test_switching_can_be_left_to_the_pilot() -> None:
-    flight = Flight(told("output.profile=ardupilot", "output.switch_sources=false"))
+def test_source_switch_can_be_disabled() -> None:
+    flight = Flight(configured("output.profile=ardupilot", "output.switch_sources=false"))
     flight.fly(15.0)
     flight.gnss = False
     flight.fly(15.0)
-    assert not [m for m in flight.heard("COMMAND_LONG") if m.command == 42007]
-    assert flight.heard("ODOMETRY")
+    assert not [m for m in flight.sent_messages("COMMAND_LONG") if m.command == 42007]
+    assert flight.sent_messages("ODOMETRY")
 
 
-def test_an_unanswered_switch_is_given_up_aloud() -> None:
-    flight = Flight(told("output.profile=ardupilot"))
+def test_unanswered_source_switch_is_reported() -> None:
+    flight = Flight(configured("output.profile=ardupilot"))
     flight.answers = False
     flight.fly(35.0)
     assert sum("switch it by hand" in text for text in flight.texts) == 1
 
 
-def test_the_position_of_an_autopilot_is_not_reset_while_it_has_gps() -> None:
-    flight = Flight(told("output.profile=ardupilot", "output.via=external_position"))
+def test_no_position_reset_while_the_autopilot_has_gps() -> None:
+    flight = Flight(configured("output.profile=ardupilot", "output.via=external_position"))
     flight.fly(20.0)
-    assert flight.heard("COMMAND_INT") == []
+    assert flight.sent_messages("COMMAND_INT") == []
     flight.gnss = False
     flight.fly(20.0)
-    sent = flight.heard("COMMAND_INT")
-    assert 15 <= len(sent) <= 19  # 1 Hz, and not at once on a beacon's answer
+    sent = flight.sent_messages("COMMAND_INT")
+    assert 15 <= len(sent) <= 19  # 1 Hz, also after a beacon fix
     assert {m.command for m in sent} == {43003}
     assert sum("external position withheld: the autopilot has GPS" in text for text in flight.texts) == 1
 
 
-def test_nobody_can_hurry_the_resets() -> None:
-    flight = Flight(told("output.profile=ardupilot", "output.via=external_position"))
+def test_rate_of_position_resets_cannot_be_changed() -> None:
+    flight = Flight(configured("output.profile=ardupilot", "output.via=external_position"))
     flight.gnss = False
     flight.fly(3.0)
-    flight.say("COMMAND_LONG", target_system=1, target_component=191, command=511, param1=75, param2=50_000)
+    flight.send("COMMAND_LONG", target_system=1, target_component=191, command=511, param1=75, param2=50_000)
     flight.fly(10.0)
-    assert [m.result for m in flight.heard("COMMAND_ACK")] == [2]
+    assert [m.result for m in flight.sent_messages("COMMAND_ACK")] == [2]
     at = [at for at, m in flight.sent if m.get_type() == "COMMAND_INT"]
     assert len(at) > 8 and min(np.diff(at)) >= 0.99
 
 
-def test_gps_input_has_the_time_of_day_and_our_own_velocity() -> None:
-    flight = Flight(told("output.profile=ardupilot", "output.via=gps_input"))
+def test_gps_input_has_gps_time_and_velocity() -> None:
+    flight = Flight(configured("output.profile=ardupilot", "output.via=gps_input"))
     flight.fly(30.0)
-    m = flight.heard("GPS_INPUT")[-1]
+    m = flight.sent_messages("GPS_INPUT")[-1]
     assert (m.gps_id, m.fix_type, m.time_week) == (1, 3, 2445)
     assert m.time_week_ms == pytest.approx(547_218_000 + 1000 * flight.seconds, abs=2)
     assert (m.vn, m.ve) == pytest.approx((SPEED, WIND_EAST), abs=0.5)
@@ -353,13 +359,15 @@ def test_gps_input_has_the_time_of_day_and_our_own_velocity() -> None:
     assert (m.lat, m.lon) == pytest.approx((deg_e7(behind.lat), deg_e7(behind.lon)), abs=300)
 
 
-def test_the_streams_that_the_output_hangs_on_are_asked_for_fast_enough() -> None:
-    assert wanted(told("output.profile=ardupilot"))["VFR_HUD"] == 10.0
-    assert wanted(told("output.profile=px4"))["VFR_HUD"] == 5.0
-    own = told("output.profile=ardupilot", "output.odometry_hz=20", "inertial.independent=true")
-    assert wanted(own)["LOCAL_POSITION_NED"] == 20.0
-    assert "SYSTEM_TIME" in wanted(told("output.profile=ardupilot", "output.via=gps_input"))
-    assert "GLOBAL_POSITION_INT" in wanted(told("output.profile=px4", "output.via=external_position"))
+def test_streams_are_requested_at_the_output_rate() -> None:
+    assert requested_rates(configured("output.profile=ardupilot"))["VFR_HUD"] == 10.0
+    assert requested_rates(configured("output.profile=px4"))["VFR_HUD"] == 5.0
+    own = configured("output.profile=ardupilot", "output.odometry_hz=20", "inertial.independent=true")
+    assert requested_rates(own)["LOCAL_POSITION_NED"] == 20.0
+    assert "SYSTEM_TIME" in requested_rates(configured("output.profile=ardupilot", "output.via=gps_input"))
+    assert "GLOBAL_POSITION_INT" in requested_rates(
+        configured("output.profile=px4", "output.via=external_position")
+    )
 
 
 GOOD = Solution(
@@ -384,44 +392,46 @@ def at(seconds: float, **changes: Any) -> Solution:
     return msgspec.structs.replace(GOOD, t_ns=t_ns, rx_ns=t_ns, **changes)
 
 
-def test_odometry_stops_where_its_accuracy_cannot_be_said_and_says_so() -> None:
-    """A sigma that grows from 80 to 120 m and is 20 m after the next fix."""
+def test_odometry_beyond_ardupilots_accuracy_limit_is_withheld_and_reported() -> None:
+    """Sigma grows from 80 to 120 m and is 20 m after the next fix."""
     receiver = Receiver("ardupilot", 1, origin=LocalOrigin(START, START, *ORIGIN, "ardupilot"))
-    feed, sent, texts = Feed(told("output.profile=ardupilot", "output.switch_sources=false")), [], []
+    output = AutopilotOutput(configured("output.profile=ardupilot", "output.switch_sources=false"))
+    sent, texts = [], []
     for k in range(600):
         sigma = 80.0 + 0.1 * k if k < 400 else 20.0
         solution = at(0.1 * k, covariance=(sigma**2, 0.0, 0.0, sigma**2, 0.0, 25.0))
-        sent += [k for _ in feed.messages(solution, ["ODOMETRY"], receiver)]
-        texts += [event.text for event in feed.take_events()]
+        sent += [k for _ in output.messages(solution, ["ODOMETRY"], receiver)]
+        texts += [event.text for event in output.take_events()]
     assert sent == [*range(201), *range(400, 600)]
     assert texts == [
-        "ODOMETRY goes out",
-        "ODOMETRY withheld: its accuracy is worse than the 100 m that ArduPilot can be told",
-        "ODOMETRY goes out, 199 withheld so far",
+        "sending ODOMETRY",
+        "ODOMETRY withheld: accuracy worse than ArduPilot's limit of 100 m",
+        "sending ODOMETRY, 199 withheld so far",
     ]
-    assert sum(feed.withheld.values()) == 199
+    assert sum(output.withheld.values()) == 199
 
 
 RECORDED = Attitude | AirData | Pressure | Truth | Gnss | LocalPosition | GlobalPosition
 
 
 def recorded(name: str) -> list[Any]:
-    """A recorded flight of ArduPlane in which GNSS is lost, cut down to 5 Hz."""
+    """Read a recorded ArduPlane flight with a GNSS loss, reduced to 5 Hz."""
     with gzip.open(Path(__file__).parents[1] / "data" / f"{name}_cut.jsonl.gz") as file:
         return [msgspec.json.decode(line, type=RECORDED) for line in file]
 
 
 @pytest.mark.parametrize("name", ["plane_gps_loss", "plane_wind_change"])
-def test_the_gate_is_not_in_the_way_of_a_real_flight(name: str) -> None:
-    """On the recordings, with a beacon 60 km away after the loss and none for a minute of it: everything
-    passes but what ArduPilot could not be told.
+def test_gate_passes_recorded_flights(name: str) -> None:
+    """Recordings with a simulated beacon 60 km away after the GNSS loss, and none for one minute of it: only
+    positions beyond ArduPilot's accuracy limit are withheld.
     """
     records = recorded(name)
     truths = [r for r in records if isinstance(r, Truth) and r.lat]
-    loss = max(r.t_ns for r in records if isinstance(r, Gnss) and r.fix >= 3)
+    loss = max(r.t_ns for r in records if isinstance(r, Gnss) and r.has_3d_fix)
     beacon = displace(truths[-1].lat, truths[-1].lon, 100.0, 45e3, -40e3, 0.0)
-    config, rng = told("output.profile=ardupilot", "output.switch_sources=false"), np.random.default_rng(3)
-    navigator, feed = Navigator(config), Feed(config)
+    config = configured("output.profile=ardupilot", "output.switch_sources=false")
+    rng = np.random.default_rng(3)
+    navigator, output = Navigator(config), AutopilotOutput(config)
     receiver = Receiver("ardupilot", 1, origin=LocalOrigin(1, 1, *ORIGIN, "ardupilot"))
     sent, next_ns = Counter[bool](), loss
     for record in records:
@@ -430,55 +440,59 @@ def test_the_gate_is_not_in_the_way_of_a_real_flight(name: str) -> None:
             given = navigator.handle(record)
         elif record.t_ns >= next_ns and not 120.0 < (record.t_ns - loss) * 1e-9 < 180.0:
             next_ns = record.t_ns + SECOND
-            sight = slant_range_azimuth(beacon, Geodetic(record.lat, record.lon, record.alt))
+            true = slant_range_azimuth(beacon, Geodetic(record.lat, record.lon, record.alt))
             a, d = rng.standard_normal(2)
-            azimuth, away = sight.azimuth + 0.00218 * a, sight.slant_range + 100.0 * d
+            azimuth, away = true.azimuth + 0.00218 * a, true.slant_range + 100.0 * d
             at = record.t_ns, record.rx_ns
             given = navigator.handle(RsbnFix(*at, 7, *beacon, azimuth % math.tau, away, 0.00218, 100.0))
         for solution in given:
             if isinstance(solution, Solution):
-                sent[bool(feed.messages(solution, ["ODOMETRY"], receiver))] += 1
-    reasons = {reason for _, reason in feed.withheld}
-    assert reasons <= {"its accuracy is worse than the 100 m that ArduPilot can be told"}
+                sent[bool(output.messages(solution, ["ODOMETRY"], receiver))] += 1
+    reasons = {reason for _, reason in output.withheld}
+    assert reasons <= {"accuracy worse than ArduPilot's limit of 100 m"}
     assert sent[True] > 1800 and sent[False] < 70
 
 
-def test_px4_is_told_how_bad_it_is() -> None:
-    feed, receiver = Feed(told("output.profile=px4")), Receiver("px4", 1)
+def test_px4_receives_the_true_accuracy() -> None:
+    output, receiver = AutopilotOutput(configured("output.profile=px4")), Receiver("px4", 1)
     solution = at(0.0, covariance=(4e4, 0.0, 0.0, 4e4, 0.0, 25.0))
-    (m,) = feed.messages(solution, ["GLOBAL_POSITION_SENSOR"], receiver)
+    (m,) = output.messages(solution, ["GLOBAL_POSITION_SENSOR"], receiver)
     assert m.eph == 200.0
 
 
 @pytest.mark.parametrize("name", sorted(ENCODERS))
 @pytest.mark.parametrize("trust", list(Trust))
-def test_nothing_untrusted_is_fused_or_resets_anything(name: str, trust: Trust) -> None:
-    """The mode is "fixed" all the while, and the autopilot's GPS is gone."""
+def test_untrusted_positions_are_never_sent(name: str, trust: Trust) -> None:
+    """The mode is "fixed" throughout, and the autopilot has no GPS."""
     origin = LocalOrigin(1, 1, *ORIGIN, "ardupilot")
     receiver = Receiver("ardupilot", 1, origin=origin, unix_ns=UTC_S * 10**9)
-    feed = Feed(told("output.profile=ardupilot", "output.switch_sources=false"))
-    feed.heard(Gnss(START, START, 0, 1, 1, *ORIGIN))
-    feed.heard(GlobalPosition(START, START, *ORIGIN, (0.0, 0.0, 0.0), HEIGHT))
-    sent = feed.messages(at(0.5, trust=trust, sigma_velocity=0.5), [name], receiver)
+    output = AutopilotOutput(configured("output.profile=ardupilot", "output.switch_sources=false"))
+    output.receive(Gnss(START, START, 0, 1, 1, *ORIGIN))
+    output.receive(GlobalPosition(START, START, *ORIGIN, (0.0, 0.0, 0.0), HEIGHT))
+    sent = output.messages(at(0.5, trust=trust, sigma_velocity=0.5), [name], receiver)
     assert [m.get_type() for m in sent] == ([] if trust is Trust.UNTRUSTED else [name])
 
 
-def test_each_refusal_of_the_gate_is_counted_by_message_and_reason() -> None:
-    feed = Feed(told("output.profile=px4"))
+def test_withheld_messages_are_counted_by_reason() -> None:
+    output = AutopilotOutput(configured("output.profile=px4"))
     for k in range(5):
-        assert feed.messages(at(0.1 * k, lat=math.nan), ["GLOBAL_POSITION_SENSOR"], Receiver("px4", 1)) == []
-    assert feed.withheld == {("GLOBAL_POSITION_SENSOR", "it is not finite"): 5}
-    assert [e.text for e in feed.take_events()] == ["GLOBAL_POSITION_SENSOR withheld: it is not finite"]
+        assert (
+            output.messages(at(0.1 * k, lat=math.nan), ["GLOBAL_POSITION_SENSOR"], Receiver("px4", 1)) == []
+        )
+    assert output.withheld == {("GLOBAL_POSITION_SENSOR", "position is not finite"): 5}
+    assert [e.text for e in output.take_events()] == [
+        "GLOBAL_POSITION_SENSOR withheld: position is not finite"
+    ]
 
 
-def test_after_a_reboot_of_the_autopilot_gps_must_be_heard_again() -> None:
-    feed, receiver = (
-        Feed(told("output.profile=ardupilot", "output.via=external_position")),
+def test_reset_after_a_reboot_requires_a_new_gps_message() -> None:
+    output, receiver = (
+        AutopilotOutput(configured("output.profile=ardupilot", "output.via=external_position")),
         Receiver("ardupilot", 1),
     )
-    feed.heard(Gnss(START, START, 0, 1, 1, *ORIGIN))
-    feed.heard(SystemTime(START, START, 0, UTC_S * 10**9))
-    feed.rebooted()
-    assert feed.messages(at(10.0), ["COMMAND_INT"], receiver) == []
-    assert "never heard" in feed.take_events()[-1].text
-    assert feed.unix_ns == UTC_S * 10**9 - START  # the time of day goes on
+    output.receive(Gnss(START, START, 0, 1, 1, *ORIGIN))
+    output.receive(SystemTime(START, START, 0, UTC_S * 10**9))
+    output.handle_reboot()
+    assert output.messages(at(10.0), ["COMMAND_INT"], receiver) == []
+    assert "no GPS message" in output.take_events()[-1].text
+    assert output.unix_ns == UTC_S * 10**9 - START  # the time of day remains valid

@@ -1,5 +1,5 @@
-"""What each make of autopilot is told, as it reads it: decoded from the bytes by pymavlink's own parser,
-field by field, against numbers worked out by hand (flat earths of both makes, the ellipsoid, GPS time).
+"""Encoders: every field of every message as decoded by pymavlink's parser, against values computed by hand
+(local projections of both makes, the ellipsoid, GPS time).
 """
 
 import math
@@ -13,7 +13,7 @@ from pymavlink.dialects.v20 import all as pymavlink
 
 from companion.link import dialect, frame
 from companion.link.decode import Autopilot
-from companion.output.encode import ENCODERS, Receiver, Unsent, encode, navigation_status
+from companion.output.encode import ENCODERS, CannotEncode, Receiver, encode, navigation_status
 from companion.output.gate import Position
 from companion.records import LocalOrigin, Mode, Prediction, Solution, Source
 
@@ -42,12 +42,12 @@ def receiver(autopilot: Autopilot) -> Receiver:
 
 
 def parsed(message: Any) -> Any:
-    """The message as it comes out at the other end, single precision and all."""
+    """Return the message as received, in single precision."""
     (found,) = pymavlink.MAVLink(None).parse_buffer(frame.encode(message, 0, 1, 191))
     return found
 
 
-def told(name: str, autopilot: Autopilot = "ardupilot", **changes: Any) -> Any:
+def encoded(name: str, autopilot: Autopilot = "ardupilot", **changes: Any) -> Any:
     return parsed(encode(POSITION._replace(**changes), receiver(autopilot), name))
 
 
@@ -60,7 +60,7 @@ AS_ARDUPILOT_COUNTS = {"x": 5565.942251, "y": -5642.184391, "z": -100.0}
 AS_PX4_COUNTS = {"x": 5563.401381, "y": -5632.293872, "z": -100.0}
 GLOBAL = {"lat": 557_500_000, "lon": 376_100_000, "alt": 250.0}
 
-TOLD: list[tuple[str, Autopilot, dict[str, Any]]] = [
+CASES: list[tuple[str, Autopilot, dict[str, Any]]] = [
     (
         "ODOMETRY",
         "ardupilot",
@@ -185,9 +185,9 @@ TOLD: list[tuple[str, Autopilot, dict[str, Any]]] = [
 ]
 
 
-@pytest.mark.parametrize(("name", "autopilot", "fields"), TOLD, ids=lambda value: str(value)[:24])
-def test_field_by_field(name: str, autopilot: Autopilot, fields: dict[str, Any]) -> None:
-    m = told(name, autopilot)
+@pytest.mark.parametrize(("name", "autopilot", "fields"), CASES, ids=lambda value: str(value)[:24])
+def test_every_field_of_every_message(name: str, autopilot: Autopilot, fields: dict[str, Any]) -> None:
+    m = encoded(name, autopilot)
     assert m.get_msgId() == dialect.type_named(name).msgid
     assert set(fields) == set(m.fieldnames)
     for field, expected in fields.items():
@@ -196,8 +196,8 @@ def test_field_by_field(name: str, autopilot: Autopilot, fields: dict[str, Any])
 
 @pytest.mark.parametrize("sigma", [0.5, 20.0, 99.9])
 @pytest.mark.parametrize("name", ["ODOMETRY", "VISION_POSITION_ESTIMATE"])
-def test_ardupilot_reads_the_accuracy_out_of_its_own_formula(name: str, sigma: float) -> None:
-    m = told(name, covariance=(sigma**2, 0.0, 0.25 * sigma**2))
+def test_ardupilot_formula_returns_the_accuracy(name: str, sigma: float) -> None:
+    m = encoded(name, covariance=(sigma**2, 0.0, 0.25 * sigma**2))
     c = m.pose_covariance if name == "ODOMETRY" else m.covariance
     assert math.cbrt(c[0] ** 2 + c[6] ** 2 + c[11] ** 2) == pytest.approx(sigma)
     assert math.cbrt(c[15] ** 2 + c[18] ** 2 + c[20] ** 2) == pytest.approx(1.5)
@@ -205,48 +205,48 @@ def test_ardupilot_reads_the_accuracy_out_of_its_own_formula(name: str, sigma: f
 
 
 @pytest.mark.parametrize("name", ["ODOMETRY", "VISION_POSITION_ESTIMATE", "GPS_INPUT", "COMMAND_INT"])
-def test_an_accuracy_that_ardupilot_would_cut_is_not_told(name: str) -> None:
-    told(name, covariance=(99.0**2, 0.0, 99.0**2))
-    with pytest.raises(Unsent, match="worse than"):
-        told(name, covariance=(80.0**2, 70.0**2, 80.0**2))  # 80 m each way, 106 m along the diagonal
+def test_accuracy_beyond_ardupilots_limit_is_not_encoded(name: str) -> None:
+    encoded(name, covariance=(99.0**2, 0.0, 99.0**2))
+    with pytest.raises(CannotEncode, match="worse than"):
+        encoded(name, covariance=(80.0**2, 70.0**2, 80.0**2))  # 80 m each way, 106 m along the diagonal
 
 
-def test_px4_is_told_the_same_accuracy_as_it_is() -> None:
-    assert told("GLOBAL_POSITION_SENSOR", "px4", covariance=(4e4, 0.0, 1e4)).eph == 200.0
-    assert told("ODOMETRY", "px4", covariance=(4e4, 0.0, 1e4)).pose_covariance[0] == 4e4
+def test_px4_receives_the_true_accuracy() -> None:
+    assert encoded("GLOBAL_POSITION_SENSOR", "px4", covariance=(4e4, 0.0, 1e4)).eph == 200.0
+    assert encoded("ODOMETRY", "px4", covariance=(4e4, 0.0, 1e4)).pose_covariance[0] == 4e4
 
 
 @pytest.mark.parametrize("name", ["ODOMETRY", "VISION_POSITION_ESTIMATE"])
-def test_without_an_origin_there_are_no_local_metres(name: str) -> None:
-    with pytest.raises(Unsent, match="origin"):
+def test_local_position_requires_an_origin(name: str) -> None:
+    with pytest.raises(CannotEncode, match="origin"):
         encode(POSITION, Receiver("ardupilot", 1), name)
 
 
 @pytest.mark.parametrize("unix_ns", [None, 0, -(10**18), 2**67])
-def test_without_the_time_of_day_there_is_no_gps_input(unix_ns: int | None) -> None:
-    with pytest.raises(Unsent, match="time of day"):
+def test_gps_input_requires_the_time_of_day(unix_ns: int | None) -> None:
+    with pytest.raises(CannotEncode, match="time of day"):
         encode(POSITION, receiver("ardupilot")._replace(unix_ns=unix_ns), "GPS_INPUT")
 
 
-def test_gps_input_never_leaves_ardupilot_an_old_velocity() -> None:
-    with pytest.raises(Unsent, match="velocity"):
-        told("GPS_INPUT", sigma_velocity=None)
+def test_gps_input_requires_a_velocity() -> None:
+    with pytest.raises(CannotEncode, match="velocity"):
+        encoded("GPS_INPUT", sigma_velocity=None)
 
 
 @given(ns=st.integers(1, 10**16))
 @settings(deadline=None, max_examples=300)
-def test_the_command_s_clock_is_that_of_all_messages_and_never_ahead_of_it(ns: int) -> None:
-    """Ahead it would pull the clock that ArduPilot learns for the whole link."""
-    m, odometry = told("COMMAND_INT", t_ns=ns), told("ODOMETRY", t_ns=ns)
+def test_command_timestamp_is_never_ahead_of_the_clock(ns: int) -> None:
+    """A timestamp ahead of the clock would shift ArduPilot's clock offset of the whole link."""
+    m, odometry = encoded("COMMAND_INT", t_ns=ns), encoded("ODOMETRY", t_ns=ns)
     assert 0.0 <= ns * 1e-9 - m.param1 <= ns * 1e-9 * 2.0**-22
     assert odometry.time_usec == ns // 1000
 
 
-def test_the_quality_is_lower_while_it_is_predicted() -> None:
-    assert (told("ODOMETRY", fixed=True).quality, told("ODOMETRY").quality) == (100, 50)
+def test_quality_is_lower_during_prediction() -> None:
+    assert (encoded("ODOMETRY", fixed=True).quality, encoded("ODOMETRY").quality) == (100, 50)
 
 
-def test_every_way_has_its_encoder() -> None:
+def test_every_output_method_has_an_encoder() -> None:
     from companion.config.profiles import MESSAGES
 
     assert set(ENCODERS) == set(MESSAGES.values())
@@ -276,12 +276,12 @@ SOLUTION = Solution(
 
 def status(**changes: Any) -> Any:
     message = navigation_status(msgspec.structs.replace(SOLUTION, **changes), receiver("ardupilot"))
-    found = frame.examine(frame.encode(message, 0, 1, 191))
+    found = frame.parse(frame.encode(message, 0, 1, 191))
     assert isinstance(found, frame.Frame)
     return dialect.decode(found)
 
 
-def test_status_says_what_no_other_message_does() -> None:
+def test_status_fields() -> None:
     m = status()
     assert (m.mode, m.estimator, m.sources, m.rejected, m.age) == (2, 2, 1 | 8, 65535, 50)
     assert (m.bound_north, m.bound_east, m.bound_horizontal) == (12.0, 5.0, 13.0)
@@ -291,7 +291,7 @@ def test_status_says_what_no_other_message_does() -> None:
     assert all(map(math.isnan, m.bound_ahead[1:]))
 
 
-def test_status_leaves_open_what_is_not_known() -> None:
+def test_unknown_status_fields_are_nan() -> None:
     m = status(bound_n=None, velocity_bound_n=None, disagreement=None, ahead=())
     unknown = (m.bound_north, m.bound_east, m.bound_horizontal, m.bound_velocity, m.disagreement)
     assert all(map(math.isnan, unknown))
@@ -307,5 +307,5 @@ def test_every_mode_has_its_number(mode: Mode) -> None:
     [{"lat": NAN}, {"covariance": (NAN,) * 6}, {"bound_n": (math.inf, 1.0)}, {"inertial_age_s": NAN}],
     ids=str,
 )
-def test_status_goes_out_whatever_the_solution_is(changes: dict[str, Any]) -> None:
+def test_status_is_encoded_for_any_solution(changes: dict[str, Any]) -> None:
     assert status(**changes).mode == 2

@@ -1,4 +1,4 @@
-"""The gate: whatever comes in, what goes out is finite, fresh, in range, and where the last lets it be."""
+"""Output gate: every position that passes is finite, recent, in range and consistent with the last one."""
 
 import itertools
 import math
@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 from companion.link import dialect, frame
 from companion.nav.geometry import displace
-from companion.output.encode import ENCODERS, Receiver, Unsent, encode
-from companion.output.gate import TELL_EVERY, Gate, Position, Withheld, fault
+from companion.output.encode import ENCODERS, CannotEncode, Receiver, encode
+from companion.output.gate import REPORT_INTERVAL_NS, Gate, Position, WithholdingMonitor, withholding_reason
 from companion.records import LocalOrigin, Mode, Solution, Source, Trust
 
 SECOND = 1_000_000_000
@@ -41,18 +41,18 @@ def changed(**changes: Any) -> Solution:
 
 
 def moved(seconds: float, north: float = 0.0, east: float = 0.0, **changes: Any) -> Solution:
-    """The good one `seconds` later along its velocity, and `north`, `east` metres beside it."""
+    """Return `GOOD` propagated by `seconds` along its velocity, displaced by `north`, `east` metres."""
     t_ns = GOOD.t_ns + round(seconds * SECOND)
     v_n, v_e, _ = GOOD.v_n
     lat, lon, _ = displace(GOOD.lat, GOOD.lon, GOOD.alt_msl, v_n * seconds + north, v_e * seconds + east, 0.0)
     return changed(**({"t_ns": t_ns, "rx_ns": t_ns, "lat": lat, "lon": lon} | changes))
 
 
-NEVER: list[tuple[dict[str, Any], str]] = [
+INVALID: list[tuple[dict[str, Any], str]] = [
     ({"mode": Mode.INITIALISING}, "initialising"),
     ({"mode": Mode.UNTRUSTED}, "untrusted"),
-    ({"mode": Mode.FIXED, "trust": Trust.UNTRUSTED}, "not trusted"),
-    ({"mode": Mode.PREDICTING, "trust": Trust.UNTRUSTED}, "not trusted"),
+    ({"mode": Mode.FIXED, "trust": Trust.UNTRUSTED}, "untrusted"),
+    ({"mode": Mode.PREDICTING, "trust": Trust.UNTRUSTED}, "untrusted"),
     ({"lat": NAN}, "finite"),
     ({"lon": INF}, "finite"),
     ({"alt_msl": -INF}, "finite"),
@@ -63,32 +63,32 @@ NEVER: list[tuple[dict[str, Any], str]] = [
     ({"inertial_age_s": 1.1}, "old"),
     ({"t_ns": 0}, "old"),
     ({"rx_ns": GOOD.t_ns - 2 * SECOND}, "future"),
-    ({"lat": 2.0}, "earth"),
-    ({"lat": math.radians(89.5)}, "pole"),
-    ({"lon": 7.0}, "earth"),
-    ({"alt_msl": 40_000.0}, "high"),
-    ({"alt_msl": -600.0}, "low"),
-    ({"v_n": (300.0, 300.0, 0.0)}, "fast"),
+    ({"lat": 2.0}, "latitude"),
+    ({"lat": math.radians(89.5)}, "latitude"),
+    ({"lon": 7.0}, "longitude"),
+    ({"alt_msl": 40_000.0}, "altitude"),
+    ({"alt_msl": -600.0}, "altitude"),
+    ({"v_n": (300.0, 300.0, 0.0)}, "speed"),
     ({"covariance": (0.0,) * 6}, "covariance"),
     ({"covariance": (1.0, 0.0, 0.0, -1.0, 0.0, 1.0)}, "covariance"),
     ({"covariance": (1.0, 2.0, 0.0, 1.0, 0.0, 1.0)}, "covariance"),
     ({"covariance": (1.0, 0.0, 0.0, 1.0, 0.0, 0.0)}, "covariance"),
     ({"covariance": (16.0, 0.0, 0.0, 25.0, 0.0, 7e-116)}, "covariance"),  # 0 in single precision
     ({"sigma_velocity": 1e-60}, "velocity"),
-    ({"covariance": (1.1e6, 0.0, 0.0, 1.0, 0.0, 1.0)}, "1 km"),
+    ({"covariance": (1.1e6, 0.0, 0.0, 1.0, 0.0, 1.0)}, "sigma above"),
     ({"sigma_velocity": NAN}, "velocity"),
     ({"sigma_velocity": 0.0}, "velocity"),
 ]
 
 
-@pytest.mark.parametrize(("changes", "said"), NEVER, ids=str)
-def test_it_is_withheld_and_why(changes: dict[str, Any], said: str) -> None:
-    assert fault(GOOD) is None
+@pytest.mark.parametrize(("changes", "expected"), INVALID, ids=str)
+def test_invalid_solutions_are_withheld_with_a_reason(changes: dict[str, Any], expected: str) -> None:
+    assert withholding_reason(GOOD) is None
     refused = Gate().admit(changed(**changes))
-    assert isinstance(refused, str) and said in refused
+    assert isinstance(refused, str) and expected in refused
 
 
-def test_what_passes_is_what_came_and_carried_to_its_sending() -> None:
+def test_position_is_propagated_to_the_time_of_sending() -> None:
     plain = Gate().admit(GOOD)
     assert plain == Position(
         100 * SECOND, 1.0, 0.5, 800.0, GOOD.v_n, (16.0, 2.0, 25.0), 9.0, True, 0.5, resets=0
@@ -98,16 +98,16 @@ def test_what_passes_is_what_came_and_carried_to_its_sending() -> None:
     assert late.t_ns == GOOD.t_ns + SECOND // 2
     north, east = (late.lat - 1.0) * 6.3781e6, (late.lon - 0.5) * 6.39e6 * math.cos(1.0)
     assert (north, east) == pytest.approx((15.0, 2.5), rel=0.01)
-    # a turn of 10 m/s^2, unknown for half a second, is 1.25 m
+    # an unknown turn of 10 m/s^2 for half a second adds 1.25 m
     assert late.covariance == pytest.approx((16.0 + 1.25**2, 2.0, 25.0 + 1.25**2))
 
 
 @pytest.mark.parametrize("trust", [Trust.NORMAL, Trust.DEGRADED, Trust.PREDICTING, None])
-def test_what_is_not_untrusted_passes_with_the_sigma_of_its_estimator(trust: Trust | None) -> None:
+def test_trust_does_not_change_the_sigma(trust: Trust | None) -> None:
     assert Gate().admit(changed(trust=trust, protection=400.0)) == Gate().admit(GOOD)
 
 
-def test_across_the_antimeridian() -> None:
+def test_positions_across_the_antimeridian() -> None:
     gate, east = Gate(), {"v_n": (0.0, 50.0, 0.0)}
     before = changed(lon=math.pi - 1e-9, rx_ns=GOOD.t_ns + SECOND // 10, **east)
     first = gate.admit(before)
@@ -118,7 +118,7 @@ def test_across_the_antimeridian() -> None:
 
 
 @pytest.mark.parametrize("seconds", [0.1, 1.0, 10.0])
-def test_a_jump_beyond_both_accuracies_is_withheld_until_time_allows_it(seconds: float) -> None:
+def test_jump_beyond_both_accuracies_is_withheld(seconds: float) -> None:
     gate = Gate()
     first = gate.admit(GOOD)
     assert isinstance(first, Position)
@@ -127,7 +127,7 @@ def test_a_jump_beyond_both_accuracies_is_withheld_until_time_allows_it(seconds:
     assert isinstance(gate.admit(moved(seconds, east=0.99 * room)), Position)
 
 
-def test_it_is_not_shut_out_for_ever() -> None:
+def test_withheld_position_passes_later() -> None:
     gate = Gate()
     gate.admit(GOOD)
     passed = [k for k in range(1, 400) if isinstance(gate.admit(moved(0.1 * k, north=3000.0)), Position)]
@@ -136,8 +136,8 @@ def test_it_is_not_shut_out_for_ever() -> None:
     assert passed == list(range(passed[0], 400))
 
 
-def test_a_jump_that_the_old_accuracy_alone_justifies_is_a_reset_to_be_told() -> None:
-    """GNSS comes back after an outage: the prediction was 300 m off, and said so."""
+def test_jump_within_the_old_accuracy_counts_as_a_reset() -> None:
+    """GNSS returns after an outage; the prediction was off by 300 m, within its sigma."""
     gate, poor = Gate(), (2e4, 0.0, 0.0, 2e4, 0.0, 9.0)
     assert isinstance(gate.admit(changed(covariance=poor, mode=Mode.PREDICTING)), Position)
     back = gate.admit(moved(0.2, east=300.0))
@@ -146,21 +146,21 @@ def test_a_jump_that_the_old_accuracy_alone_justifies_is_a_reset_to_be_told() ->
     assert isinstance(on, Position) and on.resets == 1
 
 
-def test_noise_within_the_accuracy_resets_nothing() -> None:
+def test_noise_within_the_accuracy_is_no_reset() -> None:
     gate = Gate()
     for k in range(100):
         found = gate.admit(moved(0.1 * k, north=4.0 * math.sin(k), east=4.0 * math.cos(3 * k)))
         assert isinstance(found, Position) and found.resets == 0
 
 
-def test_time_does_not_go_back() -> None:
+def test_earlier_timestamp_is_withheld() -> None:
     gate = Gate()
     gate.admit(moved(1.0))
-    assert gate.admit(moved(0.9)) == "its time is before the last one's"
+    assert gate.admit(moved(0.9)) == "timestamp before the previous position"
     assert isinstance(gate.admit(moved(1.0)), Position)
 
 
-def test_what_was_withheld_is_no_reference() -> None:
+def test_withheld_position_is_not_the_reference() -> None:
     gate = Gate()
     gate.admit(GOOD)
     for k in range(1, 5):
@@ -173,7 +173,7 @@ instants = st.integers(-(2**70), 2**70) | st.integers(1, 10**15)
 
 
 def _near(value: float) -> st.SearchStrategy[float]:
-    """Mostly the good value, so that the other fields are looked at too."""
+    """Mostly the valid value, so that other fields are tested too."""
     return st.just(value) | st.just(value) | wild
 
 
@@ -202,8 +202,8 @@ RECEIVERS = [
     )
     for make in ("ardupilot", "px4", "other")
 ]
-#: Fields that are NaN by the standard's own word for "not given".
-OPEN = {
+#: Fields for which MAVLink defines NaN as "not given".
+NAN_FIELDS = {
     "ODOMETRY": {"q", "vx", "vy", "vz", "rollspeed", "pitchspeed", "yawspeed", "velocity_covariance"},
     "VISION_POSITION_ESTIMATE": {"roll", "pitch", "yaw"},
     "GLOBAL_POSITION_SENSOR": {"alt_ellipsoid"},
@@ -220,7 +220,7 @@ def _numbers(message: Any) -> Iterator[tuple[str, float]]:
 
 @settings(deadline=None, max_examples=400)
 @given(sent=st.lists(solutions(), min_size=1, max_size=4))
-def test_whatever_comes_in_what_goes_out_is_fit_to_steer_by(sent: list[Solution]) -> None:
+def test_every_encoded_message_is_finite_and_in_range(sent: list[Solution]) -> None:
     gate = Gate()
     for solution, receiver in itertools.product(sent, RECEIVERS):
         position = gate.admit(solution)
@@ -231,13 +231,13 @@ def test_whatever_comes_in_what_goes_out_is_fit_to_steer_by(sent: list[Solution]
         for name in ENCODERS:
             try:
                 message = encode(position, receiver, name)
-            except Unsent:
+            except CannotEncode:
                 continue
-            found = frame.examine(frame.encode(message, 0, 1, 191))
+            found = frame.parse(frame.encode(message, 0, 1, 191))
             assert isinstance(found, frame.Frame)
             m = dialect.decode(found)
             for field, number in _numbers(m):
-                spared = field in OPEN.get(name, ()) or "covariance" in field
+                spared = field in NAN_FIELDS.get(name, ()) or "covariance" in field
                 assert spared or math.isfinite(number), (name, field)
             _in_range(name, m)
 
@@ -259,29 +259,29 @@ def _in_range(name: str, m: Any) -> None:
         assert 0.0 < m.eph < 1500.0 and 0.0 < m.epv < 1001.0
 
 
-def test_each_change_is_told_once_and_not_too_often() -> None:
-    withheld, now = Withheld(), 0
-    told = []
+def test_each_change_is_reported_once_and_rate_limited() -> None:
+    withheld, now = WithholdingMonitor(), 0
+    events = []
 
-    def say(reason: str | None, seconds: float) -> None:
+    def update(reason: str | None, seconds: float) -> None:
         nonlocal now
         for _ in range(round(10 * seconds)):
             now += SECOND // 10
-            if (event := withheld.note("ODOMETRY", reason, now)) is not None:
-                told.append((now * 1e-9, event.severity, event.text))
+            if (event := withheld.update("ODOMETRY", reason, now)) is not None:
+                events.append((now * 1e-9, event.severity, event.text))
 
-    say(None, 10.0)
-    say("it is too old", 10.0)
-    say(None, 10.0)
-    assert [(severity, text) for _, severity, text in told] == [
-        (6, "ODOMETRY goes out"),
-        (4, "ODOMETRY withheld: it is too old"),
-        (6, "ODOMETRY goes out, 100 withheld so far"),
+    update(None, 10.0)
+    update("too old", 10.0)
+    update(None, 10.0)
+    assert [(severity, text) for _, severity, text in events] == [
+        (6, "sending ODOMETRY"),
+        (4, "ODOMETRY withheld: too old"),
+        (6, "sending ODOMETRY, 100 withheld so far"),
     ]
-    assert withheld.counts == {("ODOMETRY", "it is too old"): 100}
+    assert withheld.counts == {("ODOMETRY", "too old"): 100}
     for _ in range(100):
-        say("it is too old", 0.1)
-        say(None, 0.1)
-    times = [at for at, *_ in told]
-    assert len(told) <= 3 + 20 * SECOND // TELL_EVERY + 1
-    assert all(b - a >= TELL_EVERY / SECOND for a, b in itertools.pairwise(times))
+        update("too old", 0.1)
+        update(None, 0.1)
+    times = [at for at, *_ in events]
+    assert len(events) <= 3 + 20 * SECOND // REPORT_INTERVAL_NS + 1
+    assert all(b - a >= REPORT_INTERVAL_NS / SECOND for a, b in itertools.pairwise(times))

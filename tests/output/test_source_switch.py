@@ -1,57 +1,64 @@
-"""Source sets: asked for when GNSS is lost and we are good, taken back when it is trusted; none too soon."""
+"""Source switch: set 2 when GNSS is lost and our output is steady, set 1 when GNSS is trusted again."""
 
 import itertools
 
-from companion.output.source_switch import GOOD_NS, LOST_NS, RETURNED_NS, SECOND, TRIES, Switching
+from companion.output.source_switch import (
+    GNSS_LOST_NS,
+    GNSS_TRUSTED_NS,
+    MAX_TRIES,
+    OUTPUT_STEADY_NS,
+    SourceSwitch,
+)
+from companion.units import SECOND_NS
 
-TENTH = SECOND // 10
+TENTH = SECOND_NS // 10
 ACCEPTED, TEMPORARILY_REJECTED, DENIED, UNSUPPORTED, FAILED = range(5)
 
 
 class Flight:
-    """An autopilot that answers `answer` (None: nothing), and our navigation, ten times a second."""
+    """An autopilot that answers with `answer` (None: no answer), and our solutions at 10 Hz."""
 
     def __init__(self, answer: int | None = ACCEPTED) -> None:
-        self.switching, self.now, self.answer = Switching(), 10**12, answer
-        self.asked: list[tuple[float, int, int]] = []
-        self.told: list[tuple[float, str]] = []
+        self.switch, self.now, self.answer = SourceSwitch(), 10**12, answer
+        self.requests: list[tuple[float, int, int]] = []
+        self.reports: list[tuple[float, str]] = []
 
     def fly(self, seconds: float, gnss: bool, sent: bool = True) -> float:
-        """Fly on; the time at its end, s."""
+        """Simulate `seconds`; return the time at the end, s."""
         for _ in range(round(10 * seconds)):
             self.now += TENTH
-            self.switching.update(gnss, sent, self.now)
-            for m in self.switching.to_send(7, self.now):
+            self.switch.update(gnss, sent, self.now)
+            for m in self.switch.to_send(7, self.now):
                 assert (m.target_system, m.target_component, m.command) == (7, 1, 42007)
-                self.asked.append((self.now * 1e-9, m.param1, m.confirmation))
+                self.requests.append((self.now * 1e-9, m.param1, m.confirmation))
                 if self.answer is not None:
-                    self.switching.acknowledged(42007, self.answer, self.now + TENTH // 2)
-            self.told += [(e.rx_ns * 1e-9, e.text) for e in self.switching.take_events()]
+                    self.switch.handle_acknowledgement(42007, self.answer, self.now + TENTH // 2)
+            self.reports += [(e.rx_ns * 1e-9, e.text) for e in self.switch.take_events()]
         return self.now * 1e-9
 
     @property
     def sets(self) -> list[int]:
-        return [source_set for _, source_set, _ in self.asked]
+        return [source_set for _, source_set, _ in self.requests]
 
 
-def test_set_2_when_gnss_is_lost_and_1_when_it_is_trusted_again() -> None:
+def test_set_2_on_gnss_loss_and_set_1_on_its_return() -> None:
     flight = Flight()
     flight.fly(30.0, gnss=True)
-    assert flight.sets == [1]  # whatever set it had before we came
+    assert flight.sets == [1]  # the initial set is unknown
     lost = flight.fly(0.1, gnss=False)
     back = flight.fly(60.0, gnss=False)
     flight.fly(60.0, gnss=True)
     assert flight.sets == [1, 2, 1]
-    assert flight.asked[1][0] - lost == LOST_NS / SECOND
-    assert abs(flight.asked[2][0] - back - RETURNED_NS / SECOND) <= 0.11
-    assert [text for _, text in flight.told] == [
+    assert flight.requests[1][0] - lost == GNSS_LOST_NS / SECOND_NS
+    assert abs(flight.requests[2][0] - back - GNSS_TRUSTED_NS / SECOND_NS) <= 0.11
+    assert [text for _, text in flight.reports] == [
         "EKF source set 1: GNSS is trusted again",
-        "EKF source set 2: GNSS is lost, our position leads",
+        "EKF source set 2: GNSS is lost, using companion",
         "EKF source set 1: GNSS is trusted again",
     ]
 
 
-def test_set_2_is_not_asked_for_before_our_own_position_goes_out() -> None:
+def test_set_2_requires_our_position_to_be_sent() -> None:
     flight = Flight()
     flight.fly(30.0, gnss=True, sent=False)
     flight.fly(60.0, gnss=False, sent=False)
@@ -59,10 +66,10 @@ def test_set_2_is_not_asked_for_before_our_own_position_goes_out() -> None:
     good = flight.fly(0.1, gnss=False, sent=True)
     flight.fly(10.0, gnss=False, sent=True)
     assert flight.sets == [1, 2]
-    assert flight.asked[1][0] - good == GOOD_NS / SECOND
+    assert flight.requests[1][0] - good == OUTPUT_STEADY_NS / SECOND_NS
 
 
-def test_a_position_that_comes_and_goes_is_not_good() -> None:
+def test_intermittent_output_is_not_steady() -> None:
     flight = Flight()
     flight.fly(30.0, gnss=True, sent=False)
     for _ in range(20):
@@ -71,7 +78,7 @@ def test_a_position_that_comes_and_goes_is_not_good() -> None:
     assert flight.sets == [1]
 
 
-def test_a_receiver_that_flickers_switches_nothing() -> None:
+def test_intermittent_gnss_switches_nothing() -> None:
     flight = Flight()
     flight.fly(30.0, gnss=True)
     for _ in range(50):
@@ -85,16 +92,16 @@ def test_a_receiver_that_flickers_switches_nothing() -> None:
     assert flight.sets == [1, 2]
 
 
-def test_a_silence_of_the_navigator_is_no_sign_of_good() -> None:
+def test_gap_in_solutions_restarts_the_timers() -> None:
     flight = Flight()
     flight.fly(30.0, gnss=True)
     flight.fly(1.0, gnss=False)
-    flight.now += 60 * SECOND
+    flight.now += 60 * SECOND_NS
     flight.fly(1.0, gnss=False)
     assert flight.sets == [1]
 
 
-def test_it_is_repeated_until_it_is_acknowledged() -> None:
+def test_command_is_repeated_until_acknowledged() -> None:
     flight = Flight()
     flight.fly(30.0, gnss=True)
     flight.answer = None
@@ -103,46 +110,46 @@ def test_it_is_repeated_until_it_is_acknowledged() -> None:
     flight.fly(2.0, gnss=False)
     flight.answer = ACCEPTED
     flight.fly(20.0, gnss=False)
-    asked = flight.asked[1:]
-    assert [confirmation for *_, confirmation in asked] == list(range(len(asked)))
-    assert 4 <= len(asked) <= 6
-    assert all(round(b[0] - a[0], 6) == 1.0 for a, b in itertools.pairwise(asked))
-    assert flight.told[-1][1].startswith("EKF source set 2")
+    requests = flight.requests[1:]
+    assert [confirmation for *_, confirmation in requests] == list(range(len(requests)))
+    assert 4 <= len(requests) <= 6
+    assert all(round(b[0] - a[0], 6) == 1.0 for a, b in itertools.pairwise(requests))
+    assert flight.reports[-1][1].startswith("EKF source set 2")
 
 
-def test_it_is_given_up_with_one_event() -> None:
-    for answer, said in ((None, "10 tries"), (FAILED, "10 tries"), (DENIED, "2"), (UNSUPPORTED, "3")):
+def test_rejected_command_is_reported_once() -> None:
+    for answer, expected in ((None, "10 tries"), (FAILED, "10 tries"), (DENIED, "2"), (UNSUPPORTED, "3")):
         flight = Flight(answer)
         flight.fly(100.0, gnss=False)
-        assert len(flight.asked) == (TRIES if "tries" in said else 1)
-        ((_, text),) = flight.told
-        assert said in text and "source set 2" in text and "by hand" in text
+        assert len(flight.requests) == (MAX_TRIES if "tries" in expected else 1)
+        ((_, text),) = flight.reports
+        assert expected in text and "source set 2" in text and "by hand" in text
         flight.answer = ACCEPTED
         flight.fly(30.0, gnss=True)
-        assert flight.sets[-1] == 1  # the next wish is asked for again
+        assert flight.sets[-1] == 1  # the next set is requested
 
 
-def test_the_answer_to_another_command_is_none() -> None:
+def test_acknowledgement_of_another_command_is_ignored() -> None:
     flight = Flight(None)
     flight.fly(6.0, gnss=False)
-    flight.switching.acknowledged(511, ACCEPTED, flight.now)
-    count = len(flight.asked)
+    flight.switch.handle_acknowledgement(511, ACCEPTED, flight.now)
+    count = len(flight.requests)
     flight.fly(5.0, gnss=False)
-    assert len(flight.asked) > count
+    assert len(flight.requests) > count
 
 
-def test_an_answer_that_comes_unasked_is_none() -> None:
+def test_unrequested_acknowledgement_is_ignored() -> None:
     flight = Flight()
-    flight.switching.acknowledged(42007, ACCEPTED, flight.now)
+    flight.switch.handle_acknowledgement(42007, ACCEPTED, flight.now)
     flight.fly(10.0, gnss=False)
     assert flight.sets == [2]
-    flight.switching.acknowledged(42007, DENIED, flight.now)
-    assert not flight.switching.take_events()
+    flight.switch.handle_acknowledgement(42007, DENIED, flight.now)
+    assert not flight.switch.take_events()
 
 
-def test_after_a_reboot_it_is_asked_for_anew() -> None:
+def test_after_a_reboot_the_source_set_is_requested_again() -> None:
     flight = Flight()
     flight.fly(10.0, gnss=False)
-    flight.switching.rebooted()
+    flight.switch = SourceSwitch()  # as AutopilotOutput.handle_reboot does
     flight.fly(10.0, gnss=False)
     assert flight.sets == [2, 2]

@@ -1,4 +1,4 @@
-"""What is done aside gives its result or its error, holds nothing else up, and may never end."""
+"""Daemon thread: result and exception arrive; blocked work blocks neither the loop nor the exit."""
 
 import asyncio
 import subprocess
@@ -7,29 +7,29 @@ import threading
 
 import pytest
 
-from companion.runtime.daemon_thread import aside
+from companion.runtime.daemon_thread import run_in_daemon_thread
 
 
-def test_its_result_comes_while_the_loop_goes_on() -> None:
+def test_result_arrives_while_the_loop_runs() -> None:
     gate = threading.Event()
 
     async def both() -> str:
-        doing = aside(lambda: "done" if gate.wait(30.0) else "late")
-        gate.set()  # the loop is free to
+        doing = run_in_daemon_thread(lambda: "done" if gate.wait(30.0) else "late")
+        gate.set()  # only possible if the loop is not blocked
         return await doing
 
     assert asyncio.run(both()) == "done"
 
 
-def test_its_error_is_the_caller_s() -> None:
+def test_exception_is_raised_in_the_caller() -> None:
     async def fail() -> None:
-        await aside(lambda: 1 // 0)
+        await run_in_daemon_thread(lambda: 1 // 0)
 
     with pytest.raises(ZeroDivisionError):
         asyncio.run(fail())
 
 
-def test_what_is_given_up_ends_unheard() -> None:
+def test_cancelled_work_still_completes() -> None:
     gate, ended = threading.Event(), threading.Event()
 
     def work() -> None:
@@ -38,20 +38,20 @@ def test_what_is_given_up_ends_unheard() -> None:
 
     async def give_up() -> None:
         with pytest.raises(TimeoutError):
-            await asyncio.wait_for(aside(work), 0.01)
+            await asyncio.wait_for(run_in_daemon_thread(work), 0.01)
 
     asyncio.run(give_up())
     gate.set()
     assert ended.wait(30.0)
 
 
-def test_what_never_ends_does_not_keep_the_process() -> None:
+def test_endless_work_does_not_block_process_exit() -> None:
     code = """
 import asyncio, contextlib, threading
-from companion.aside import aside
+from companion.runtime.daemon_thread import run_in_daemon_thread
 async def main():
     with contextlib.suppress(TimeoutError):
-        await asyncio.wait_for(aside(threading.Event().wait), 0.01)
+        await asyncio.wait_for(run_in_daemon_thread(threading.Event().wait), 0.01)
 asyncio.run(main())
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=30)

@@ -1,26 +1,25 @@
-"""The look at the autopilot's parameters at the start of a flight: one line where something is wrong, and
-never a change."""
+"""Parameter check: one event if the autopilot's parameters are wrong, and never a change."""
 
 import pytest
 
 from companion.config import load
-from companion.config.required_parameters import needed
+from companion.config.required_parameters import required_parameters
 from companion.link import frame
 from companion.records import Stamped
-from companion.runtime.core import Onboard
-from sitl.autopilot import Autopilot
+from companion.runtime.core import CompanionCore
+from sitl.autopilot import SimulatedAutopilot
 from sitl.faults import Fault
-from sitl.scenarios import named
+from sitl.scenarios import get_scenario
 from sitl.world import World
 
 SECOND = 1_000_000_000
 STEP = SECOND // 50
 REQUEST_READ, SET = 20, 23
-WORLDS = {make: World(named("short", autopilot=make)) for make in ("ardupilot", "px4")}
+WORLDS = {make: World(get_scenario("short", autopilot=make)) for make in ("ardupilot", "px4")}
 
 
-class Kept:
-    """A log of nothing."""
+class NullLog:
+    """Log that discards everything."""
 
     def record(self, record: Stamped, channel: str | None = None) -> None:
         pass
@@ -30,55 +29,57 @@ class Kept:
 
 
 class Flight:
-    """An autopilot and the companion joined for some seconds; what was asked, and what was told of it."""
+    """An autopilot and a companion connected for some seconds; the requests and the reports."""
 
     def __init__(self, make: str, *pairs: str, right: bool = False, seconds: float = 8.0, **scenario) -> None:
         world = WORLDS[make] if not scenario else None
-        autopilot = Autopilot(named("short", autopilot=make, **scenario), world=world)
+        autopilot = SimulatedAutopilot(get_scenario("short", autopilot=make, **scenario), world=world)
         config = load(None, None, {}, pairs)
         if right:
-            autopilot.parameters.values |= {need.name: need.value for need in needed(config, make)}
+            autopilot.parameters.values |= {
+                need.name: need.value for need in required_parameters(config, make)
+            }
         before = dict(autopilot.parameters.values)
-        onboard = Onboard(config, Kept())
-        self.asked: list[int] = []
+        core = CompanionCore(config, NullLog())
+        self.requests: list[int] = []
         for now in range(STEP, round(seconds * SECOND), STEP):
             for data in autopilot.poll(now):
-                onboard.receive("main", data, now)
-            onboard.poll(now)
-            for data in onboard.to_send("main", now):
+                core.receive("main", data, now)
+            core.poll(now)
+            for data in core.to_send("main", now):
                 autopilot.receive(data, now)
-                seen = frame.examine(data)
-                assert isinstance(seen, frame.Frame)
-                self.asked += [seen.msgid] if seen.msgid in (REQUEST_READ, SET) else []
-        self.told = [event.text for event in onboard.take_events() if "doctor" in event.text]
-        assert autopilot.parameters.values == before and SET not in self.asked
+                found = frame.parse(data)
+                assert isinstance(found, frame.Frame)
+                self.requests += [found.msgid] if found.msgid in (REQUEST_READ, SET) else []
+        self.reports = [event.text for event in core.take_events() if "doctor" in event.text]
+        assert autopilot.parameters.values == before and SET not in self.requests
 
 
 @pytest.mark.parametrize(
     ("make", "line"),
     [
-        ("ardupilot", "main: VISO_TYPE is 0, needs 1 and 2 more: see companion doctor"),
-        ("px4", "main: EKF2_AGP0_ID is 0, needs 1 and 1 more: see companion doctor"),
+        ("ardupilot", "main: VISO_TYPE is 0, needs 1 and 2 more: run companion doctor"),
+        ("px4", "main: EKF2_AGP0_ID is 0, needs 1 and 1 more: run companion doctor"),
     ],
 )
 @pytest.mark.parametrize("custom", [False, True])
-def test_what_is_wrong_is_told_in_one_line(make: str, line: str, custom: bool) -> None:
+def test_wrong_parameters_are_reported_in_one_event(make: str, line: str, custom: bool) -> None:
     rate = "odometry_hz=10" if make == "ardupilot" else "global_position_sensor_hz=2"
     pairs = ("output.profile=custom", f"output.{rate}") if custom else (f"output.profile={make}",)
-    assert Flight(make, *pairs).told == [line]
+    assert Flight(make, *pairs).reports == [line]
 
 
-def test_what_is_right_is_not_worth_a_line() -> None:
+def test_correct_parameters_are_not_reported() -> None:
     flight = Flight("ardupilot", "output.profile=ardupilot", right=True)
-    assert flight.told == [] and len(flight.asked) == 6
+    assert flight.reports == [] and len(flight.requests) == 6
 
 
-@pytest.mark.parametrize("profile", ["monitor", "px4"])  # of the latter another line tells
-def test_nobody_is_asked_where_nothing_is_fed(profile: str) -> None:
+@pytest.mark.parametrize("profile", ["monitor", "px4"])  # px4: reported by the output as the wrong make
+def test_no_parameter_is_read_without_output(profile: str) -> None:
     flight = Flight("ardupilot", f"output.profile={profile}")
-    assert flight.told == [] and flight.asked == []
+    assert flight.reports == [] and flight.requests == []
 
 
-def test_after_a_reboot_it_is_looked_at_again() -> None:
+def test_parameters_are_checked_again_after_a_reboot() -> None:
     flight = Flight("ardupilot", "output.profile=ardupilot", seconds=20.0, faults=(Fault("reboot", 10.0),))
-    assert len(flight.told) == 2 and len(flight.asked) == 12
+    assert len(flight.reports) == 2 and len(flight.requests) == 12

@@ -1,5 +1,5 @@
-"""The shell over real sockets, disks and signals: what is wrong gets one line and a code, nothing logged is
-lost."""
+"""Service with real sockets, disks and signals: errors end with one line and an exit code, the log is
+complete."""
 
 import asyncio
 import contextlib
@@ -20,7 +20,7 @@ from companion.link import dialect, frame
 from companion.records import Event
 from companion.runtime.service import EX_CANTCREAT, EX_UNAVAILABLE, Service
 from companion.storage import flight_log
-from companion.transport.links import Address, CannotListen
+from companion.transport.reconnect import Address, CannotListen
 
 LOOPBACK = "127.0.0.1"
 HEARTBEAT = frame.encode(dialect.new("HEARTBEAT", type=1, autopilot=3), 0, 1, 1)
@@ -47,33 +47,33 @@ async def until(condition, seconds: float = 10.0) -> None:
 
 
 def serve(tmp_path: Path, connect: tuple[str, ...], play) -> list[Event]:
-    """Run a Service while `play(service, told)` lasts; what it told."""
-    told: list[Event] = []
+    """Run a Service during `play(service, events)`; return its events."""
+    events: list[Event] = []
 
     async def both() -> None:
         with log_in(tmp_path) as log:
-            service = Service(load(None, {"link.connect": connect}, {}), log, told.append)
+            service = Service(load(None, {"link.connect": connect}, {}), log, events.append)
             serving = asyncio.create_task(service.serve())
             try:
-                await play(service, told)
+                await play(service, events)
             finally:
                 service.stop()
                 await serving
 
     asyncio.run(both())
-    return told
+    return events
 
 
-def test_an_autopilot_on_udp_is_heard_answered_and_logged(tmp_path: Path) -> None:
+def test_udp_autopilot_is_answered_and_logged(tmp_path: Path) -> None:
     port = free_port()
     replies: list[bytes] = []
 
-    async def play(service: Service, told: list[Event]) -> None:
+    async def play(service: Service, events: list[Event]) -> None:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
             sock.setblocking(False)
             sock.connect((LOOPBACK, port))
 
-            def heard() -> bool:
+            def has_replies() -> bool:
                 try:
                     sock.send(HEARTBEAT)
                     replies.append(sock.recv(65536))
@@ -81,10 +81,10 @@ def test_an_autopilot_on_udp_is_heard_answered_and_logged(tmp_path: Path) -> Non
                     pass
                 return len(replies) >= 3
 
-            await until(heard)
+            await until(has_replies)
 
-    told = serve(tmp_path, (f"udpin:{LOOPBACK}:{port}",), play)
-    assert any("autopilot 1 heard (ardupilot)" in event.text for event in told)
+    events = serve(tmp_path, (f"udpin:{LOOPBACK}:{port}",), play)
+    assert any("autopilot 1 connected (ardupilot)" in event.text for event in events)
     names = {
         dialect.TYPES[found.msgid].name
         for data in replies
@@ -97,7 +97,7 @@ def test_an_autopilot_on_udp_is_heard_answered_and_logged(tmp_path: Path) -> Non
 
 
 def listening() -> set[str]:
-    """The local addresses of this process's sockets that anybody may speak to."""
+    """Return the local addresses on which this process listens."""
     found = set()
     for link in Path("/proc/self/fd").iterdir():
         with contextlib.suppress(OSError):
@@ -115,35 +115,35 @@ def listening() -> set[str]:
 
 @pytest.mark.skipif(not os.path.isdir("/proc/self/fd"), reason="sockets are looked up in /proc")
 @pytest.mark.parametrize(
-    ("connect", "heard_at"),
+    ("connect", "expected"),
     [
         ("udpin:{port}", LOOPBACK),
         ("tcpin:{port}", LOOPBACK),
         ("udpin::{port}", LOOPBACK),
-        ("udpin:0.0.0.0:{port}", "0.0.0.0"),  # asked for in so many words
+        ("udpin:0.0.0.0:{port}", "0.0.0.0"),  # configured explicitly
     ],
 )
-def test_nothing_listens_beyond_the_loopback_unless_configured(
-    tmp_path: Path, connect: str, heard_at: str
+def test_only_loopback_addresses_listen_unless_configured(
+    tmp_path: Path, connect: str, expected: str
 ) -> None:
     seen = set[str]()
     assert Address.parse(load(None, {}, {}).link.connect[0]).place == LOOPBACK
 
-    async def play(service: Service, told: list[Event]) -> None:
+    async def play(service: Service, events: list[Event]) -> None:
         await until(lambda: listening() - before)
         seen.update(listening() - before)
 
     before = listening()
     serve(tmp_path, (connect.format(port=free_port()),), play)
-    assert seen == {heard_at}
+    assert seen == {expected}
 
 
-def test_an_address_in_use_ends_it_with_a_sentence(tmp_path: Path) -> None:
+def test_address_in_use_raises_cannot_listen(tmp_path: Path) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
         taken.bind((LOOPBACK, 0))
         connect = f"udpin:{LOOPBACK}:{taken.getsockname()[1]}"
 
-        async def play(service: Service, told: list[Event]) -> None:
+        async def play(service: Service, events: list[Event]) -> None:
             await asyncio.sleep(0.2)
 
         with pytest.raises(CannotListen, match="choose another port"):
@@ -151,25 +151,25 @@ def test_an_address_in_use_ends_it_with_a_sentence(tmp_path: Path) -> None:
     assert flight_log.info(tmp_path / "a.mcap").closed
 
 
-def test_a_missing_serial_device_is_said_once_and_the_other_link_lives(tmp_path: Path) -> None:
+def test_missing_serial_device_is_reported_once_and_the_other_link_works(tmp_path: Path) -> None:
     port = free_port()
     missing = f"serial:{tmp_path}/ttyNONE:57600"
 
-    async def play(service: Service, told: list[Event]) -> None:
+    async def play(service: Service, events: list[Event]) -> None:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
             sock.connect((LOOPBACK, port))
 
-            def heard() -> bool:
+            def has_replies() -> bool:
                 with contextlib.suppress(ConnectionRefusedError):
                     sock.send(HEARTBEAT)
-                return any("heard" in event.text for event in told)
+                return any("connected" in event.text for event in events)
 
-            await until(heard)
+            await until(has_replies)
             await asyncio.sleep(1.0)  # several attempts
 
-    told = serve(tmp_path, (missing, f"udpin:{LOOPBACK}:{port}"), play)
-    assert sum("ttyNONE" in event.text for event in told) == 1
-    assert any("No such file" in event.text for event in told)
+    events = serve(tmp_path, (missing, f"udpin:{LOOPBACK}:{port}"), play)
+    assert sum("ttyNONE" in event.text for event in events) == 1
+    assert any("No such file" in event.text for event in events)
 
 
 # -- whole processes ----------------------------------------------------------------------------------------
@@ -180,33 +180,33 @@ RUN = [sys.executable, "-m", "companion", "run"]
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_a_signal_closes_the_log_whole(tmp_path: Path, number: signal.Signals) -> None:
-    port, logs, said = free_port(), tmp_path / "logs", tmp_path / "said"
+def test_signal_closes_the_log(tmp_path: Path, number: signal.Signals) -> None:
+    port, logs, output = free_port(), tmp_path / "logs", tmp_path / "stderr"
     command = [*RUN, "--connect", f"udpin:{LOOPBACK}:{port}", "--logs", str(logs)]
     with (
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock,
-        said.open("w") as stderr,
+        output.open("w") as stderr,
         subprocess.Popen(command, stderr=stderr, env=ENVIRONMENT) as process,
     ):
         sock.connect((LOOPBACK, port))
         deadline = time.monotonic() + 30.0
-        while "heard" not in said.read_text() and time.monotonic() < deadline:
+        while "connected" not in output.read_text() and time.monotonic() < deadline:
             with contextlib.suppress(ConnectionRefusedError):
                 sock.send(HEARTBEAT)
             time.sleep(0.05)
         process.send_signal(number)
         assert process.wait(20) == 0
-    assert "log: closed as" in said.read_text()
+    assert "log: closed as" in output.read_text()
     (log,) = logs.iterdir()
     assert log.suffix == ".mcap"
     info = flight_log.info(log)
     assert info.closed and info.counts["/link/Event"] >= 2
-    assert any(isinstance(e.value, Event) and "heard" in e.value.text for e in flight_log.read(log))
+    assert any(isinstance(e.value, Event) and "connected" in e.value.text for e in flight_log.read(log))
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="a pipe's size is set and asked for as on Linux")
-def test_a_reader_who_never_reads_holds_nothing_up(tmp_path: Path) -> None:
-    """Events until the pipe behind stderr is full, and more: it answers, and ends when it is to."""
+def test_stalled_stderr_reader_does_not_block_the_service(tmp_path: Path) -> None:
+    """With more events than the pipe of stderr holds, the service still answers and stops on request."""
     port = free_port()
     command = [*RUN, "--connect", f"udpin:{LOOPBACK}:{port}", "--logs", str(tmp_path)]
     with (
@@ -231,11 +231,11 @@ def test_a_reader_who_never_reads_holds_nothing_up(tmp_path: Path) -> None:
         deadline = time.monotonic() + 30.0
         while not is_answered() and time.monotonic() < deadline:
             time.sleep(0.05)
-        for system in others:  # each is told: a second autopilot
+        for system in others:  # each one is reported as a second autopilot
             sock.send(frame.encode(dialect.new("HEARTBEAT", type=1, autopilot=3), 0, system, 1))
         while unread() < size - 100 and time.monotonic() < deadline:
             time.sleep(0.05)
-        while is_answered():  # what was answered before it was full
+        while is_answered():  # drain the replies from before the pipe was full
             pass
         sock.settimeout(5.0)
         try:
@@ -244,17 +244,17 @@ def test_a_reader_who_never_reads_holds_nothing_up(tmp_path: Path) -> None:
             assert process.wait(20) == 0
         finally:
             process.kill()
-        assert b"a second autopilot, 2, is ignored" in process.stderr.read()
+        assert b"second autopilot 2 ignored" in process.stderr.read()
     (log,) = tmp_path.glob("*.mcap")
     assert flight_log.info(log).closed
 
 
 def set_in_a_run(tmp_path: Path, name: str, value: float, awaited: str) -> None:
-    """One run of the service, in which a station sets a parameter until `awaited` is in the file."""
-    port, kept, config = free_port(), tmp_path / "set.toml", tmp_path / "companion.toml"
-    config.write_text(f'[link]\nparameters_file = "{kept}"\n[gnss]\nsigma_m = 2.0\n')
+    """Run the service and set a parameter until `awaited` is in the parameters file."""
+    port, saved, config = free_port(), tmp_path / "set.toml", tmp_path / "companion.toml"
+    config.write_text(f'[link]\nparameters_file = "{saved}"\n[gnss]\nsigma_m = 2.0\n')
     command = [*RUN, "--config", str(config), "--connect", f"udpin:{LOOPBACK}:{port}"]
-    wish = dialect.new(
+    request = dialect.new(
         "PARAM_SET",
         param_id=name.encode(),
         param_value=value,
@@ -270,20 +270,20 @@ def set_in_a_run(tmp_path: Path, name: str, value: float, awaited: str) -> None:
     ):
         sock.connect((LOOPBACK, port))
         deadline = time.monotonic() + 30.0
-        while not (kept.exists() and awaited in kept.read_text()) and time.monotonic() < deadline:
+        while not (saved.exists() and awaited in saved.read_text()) and time.monotonic() < deadline:
             with contextlib.suppress(ConnectionRefusedError):
                 sock.send(HEARTBEAT)
-                sock.send(frame.encode(wish, 0, 255, 190))
+                sock.send(frame.encode(request, 0, 255, 190))
             time.sleep(0.05)
         process.send_signal(signal.SIGTERM)
         assert process.wait(20) == 0
 
 
-def test_what_is_set_in_one_run_outlives_what_is_set_in_the_next(tmp_path: Path) -> None:
+def test_parameters_of_two_runs_are_both_saved(tmp_path: Path) -> None:
     set_in_a_run(tmp_path, "GNSS_SIGMA_M", 7.0, "sigma_m")
     set_in_a_run(tmp_path, "GNSS_TIMEOUT_S", 5.0, "timeout_s")
-    kept = load(tmp_path / "set.toml", {}, {}).gnss
-    assert (kept.sigma_m, kept.timeout_s) == (7.0, 5.0)
+    saved = load(tmp_path / "set.toml", {}, {}).gnss
+    assert (saved.sigma_m, saved.timeout_s) == (7.0, 5.0)
 
 
 def finished(*arguments: str) -> tuple[int, str]:
@@ -291,67 +291,65 @@ def finished(*arguments: str) -> tuple[int, str]:
     return done.returncode, done.stderr
 
 
-def test_a_port_in_use_exits_69_with_one_line(tmp_path: Path) -> None:
+def test_port_in_use_exits_69_with_one_line(tmp_path: Path) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
         taken.bind((LOOPBACK, 0))
-        code, said = finished(
+        code, stderr = finished(
             "--connect", f"udpin:{LOOPBACK}:{taken.getsockname()[1]}", "--logs", str(tmp_path)
         )
     assert code == EX_UNAVAILABLE
-    assert sum(line.startswith("companion: cannot listen") for line in said.splitlines()) == 1
-    assert "Traceback" not in said
-    assert not list(tmp_path.iterdir())  # a start that never flew leaves no log to take a flight's place
+    assert sum(line.startswith("companion: cannot listen") for line in stderr.splitlines()) == 1
+    assert "Traceback" not in stderr
+    assert not list(tmp_path.iterdir())  # a failed start leaves no empty log
 
 
-def test_a_key_that_is_not_there_exits_78_and_leaves_no_log(tmp_path: Path) -> None:
-    code, said = finished("--set", f"signing.key_file={tmp_path / 'none'}", "--logs", str(tmp_path))
-    assert code == 78 and "signing.key_file" in said
+def test_missing_key_exits_78_and_leaves_no_log(tmp_path: Path) -> None:
+    code, stderr = finished("--set", f"signing.key_file={tmp_path / 'none'}", "--logs", str(tmp_path))
+    assert code == 78 and "signing.key_file" in stderr
     assert not list(tmp_path.iterdir())
 
 
-def test_a_log_folder_that_cannot_be_written_exits_73_with_one_line(tmp_path: Path) -> None:
+def test_unwritable_log_folder_exits_73_with_one_line(tmp_path: Path) -> None:
     folder = tmp_path / "logs"
-    if os.geteuid() == 0:  # root may write everywhere but into a file
+    if os.geteuid() == 0:  # root may write to any folder, but not into a file
         folder.write_text("no folder")
     else:
         folder.mkdir(mode=0o555)
-    code, said = finished("--logs", str(folder))
+    code, stderr = finished("--logs", str(folder))
     assert code == EX_CANTCREAT
-    assert len(said.splitlines()) == 1 and str(folder) in said
+    assert len(stderr.splitlines()) == 1 and str(folder) in stderr
 
 
-def test_a_bad_link_exits_78_with_one_line(tmp_path: Path) -> None:
-    code, said = finished("--connect", "udp:1.2.3.4", "--logs", str(tmp_path))
+def test_invalid_link_exits_78_with_one_line(tmp_path: Path) -> None:
+    code, stderr = finished("--connect", "udp:1.2.3.4", "--logs", str(tmp_path))
     assert code == 78
-    assert len(said.splitlines()) == 1 and "link.connect" in said
+    assert len(stderr.splitlines()) == 1 and "link.connect" in stderr
 
 
-def test_a_consumer_that_does_not_read_costs_the_oldest_frames_and_they_are_counted(tmp_path: Path) -> None:
-    """A TCP peer that sends and never reads: the newest words wait for it, the log says how many did not; if
-    it were waited for, this would not end.
-    """
+def test_stalled_tcp_peer_drops_the_oldest_frames_and_they_are_counted(tmp_path: Path) -> None:
+    """A TCP peer sends and never reads: the newest frames are queued, the log counts the dropped ones."""
     port = free_port()
 
-    async def play(service: Service, told: list[Event]) -> None:
+    async def play(service: Service, events: list[Event]) -> None:
         with socket.socket() as sock:
             sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2048)
             await until(lambda: sock.connect_ex((LOOPBACK, port)) == 0)
             sock.setblocking(False)
-            (link,) = service.onboard.links.values()
+            (link,) = service.core.links.values()
 
             def stuck() -> bool:
                 with contextlib.suppress(BlockingIOError):
                     sock.send(HEARTBEAT)
-                for _ in range(500):  # far more than any ground station is told
+                for _ in range(500):  # far more than any ground station receives
                     link.session.send(dialect.new("ATTITUDE"))
                 service._flush()
                 return link.dropped > 1000
 
             await until(stuck, 20.0)
-            await asyncio.sleep(1.2)  # a state of the link is logged every second
+            await asyncio.sleep(1.2)  # the link state is logged every second
 
-    told = serve(tmp_path, (f"tcpin:{LOOPBACK}:{port}",), play)
-    assert sum("does not carry what is sent" in event.text for event in told) == 1
+    events = serve(tmp_path, (f"tcpin:{LOOPBACK}:{port}",), play)
+    assert sum("the line is too slow" in event.text for event in events) == 1
     states = [
         e.value.dropped for e in flight_log.read(tmp_path / "a.mcap") if type(e.value).__name__ == "LinkState"
     ]

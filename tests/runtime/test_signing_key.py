@@ -1,4 +1,4 @@
-"""Signed links live whatever the system's clock shows: it is followed only while somebody vouches for it."""
+"""Signing key: signed links work with any system clock, which is used only while it is synchronized."""
 
 import time
 from pathlib import Path
@@ -6,65 +6,63 @@ from pathlib import Path
 import pytest
 
 from companion.link import dialect, frame
-from companion.link.signing import Refusal, Signing
-from companion.runtime.signing_key import SET_AFTER_NS, Keys, synchronized_time
+from companion.link.signing import SignatureFault, Signing
+from companion.runtime.signing_key import SET_AFTER_NS, SigningKey, synchronized_time
 
 SECOND, DAY = 10**9, 86_400 * 10**9
-#: What the autopilot's GPS says, UNIX nanoseconds.
+#: GPS time of the autopilot, UNIX nanoseconds.
 TRUE_NS = SET_AFTER_NS + 800 * DAY
 KEY = bytes(32)
 
 
-def said(signing: Signing, system: int, now_ns: int) -> frame.Frame:
-    """A heartbeat signed at `now_ns`, as it is heard."""
+def signed_heartbeat(signing: Signing, system: int, now_ns: int) -> frame.Frame:
+    """Return a heartbeat signed at `now_ns`, as received."""
     message = dialect.new("HEARTBEAT", type=1, autopilot=3)
-    (heard,) = frame.Reader().receive(
+    (found,) = frame.Reader().receive(
         frame.encode(message, 0, system, 1, lambda data: signing.sign(data, 0, now_ns))
     )
-    assert isinstance(heard, frame.Frame)
-    return heard
+    assert isinstance(found, frame.Frame)
+    return found
 
 
 @pytest.mark.parametrize("behind_ns", [TRUE_NS, 500 * DAY, DAY, -DAY])
-def test_a_clock_that_is_not_synchronised_refuses_nobody_and_is_heard(
+def test_unsynchronized_clock_neither_rejects_nor_is_rejected(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, behind_ns: int
 ) -> None:
-    """Of 1970, of the day systemd was built, of the last shutdown, set by hand to tomorrow."""
+    """Clock at 1970, at the build of systemd, at the last shutdown, and set to tomorrow by hand."""
     autopilot = Signing(KEY)
-    autopilot.follow(TRUE_NS, 0)
+    autopilot.set_time(TRUE_NS, 0)
     monkeypatch.setattr(time, "time_ns", lambda: TRUE_NS - behind_ns)
     absent = str(tmp_path / "synchronized")
-    keys = Keys(Signing(KEY), tmp_path / "stamp", lambda: synchronized_time("linux", absent))
+    key = SigningKey(Signing(KEY), tmp_path / "stamp", lambda: synchronized_time("linux", absent))
     for now_ns in range(SECOND, 600 * SECOND, SECOND):
-        keys.follow()
-        assert keys.signing.judge(said(autopilot, 1, now_ns), now_ns) is None
-        assert autopilot.judge(said(keys.signing, 2, now_ns), now_ns) is None
+        key.follow_system_time()
+        assert key.signing.verify(signed_heartbeat(autopilot, 1, now_ns), now_ns) is None
+        assert autopilot.verify(signed_heartbeat(key.signing, 2, now_ns), now_ns) is None
 
 
-def test_a_clock_that_is_synchronised_in_flight_is_followed_and_runs_on_when_it_is_lost(
+def test_clock_synchronized_in_flight_is_used_and_runs_on_after_loss(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     synchronized = tmp_path / "synchronized"
     monkeypatch.setattr(time, "time_ns", lambda: TRUE_NS)
     monkeypatch.setattr(time, "monotonic_ns", lambda: 0)
-    keys = Keys(Signing(KEY), tmp_path / "stamp", lambda: synchronized_time("linux", str(synchronized)))
-    assert keys.signing.time(0) == 0
+    key = SigningKey(Signing(KEY), tmp_path / "stamp", lambda: synchronized_time("linux", str(synchronized)))
+    assert key.signing.time(0) == 0
     synchronized.touch()
-    keys.follow()
+    key.follow_system_time()
     followed = Signing(KEY)
-    followed.follow(TRUE_NS, 0)
-    assert keys.signing.time(0) == followed.time(0) > 0
+    followed.set_time(TRUE_NS, 0)
+    assert key.signing.time(0) == followed.time(0) > 0
     synchronized.unlink()
-    keys.follow()
-    assert keys.signing.time(DAY) == followed.time(DAY)
-    future = Signing(KEY)  # a recording of a station whose clock once stood wrong
-    future.follow(TRUE_NS + DAY, 0)
-    assert keys.signing.judge(said(future, 1, 0), 0) is Refusal.FUTURE
+    key.follow_system_time()
+    assert key.signing.time(DAY) == followed.time(DAY)
+    future = Signing(KEY)  # recorded from a station whose clock was wrong
+    future.set_time(TRUE_NS + DAY, 0)
+    assert key.signing.verify(signed_heartbeat(future, 1, 0), 0) is SignatureFault.FUTURE
 
 
-def test_where_nobody_can_vouch_a_clock_that_was_never_set_is_none(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_clock_that_was_never_set_is_not_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(time, "time_ns", lambda: 3600 * SECOND)
     assert synchronized_time("darwin", str(tmp_path)) is None
     monkeypatch.setattr(time, "time_ns", lambda: TRUE_NS)

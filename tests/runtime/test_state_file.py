@@ -1,45 +1,45 @@
-"""What must outlive a restart is kept whole, soon, and waited for by nobody who navigates."""
+"""State file: atomic writes, errors returned and retried, `put` without disk access."""
 
 import pytest
 
 from companion.runtime import state_file
-from companion.runtime.state_file import Kept
+from companion.runtime.state_file import StateFile
 
 
-def test_the_last_put_is_what_is_written(tmp_path) -> None:
+def test_last_text_is_written(tmp_path) -> None:
     path = tmp_path / "a.toml"
-    text = Kept(path)
-    assert text.write() is None and not path.exists()
-    text.put("one")
-    text.put("two")
+    file = StateFile(path)
+    assert file.write() is None and not path.exists()
+    file.put("one")
+    file.put("two")
     assert not path.exists()  # `put` touches no disk
-    assert text.write() is None
+    assert file.write() is None
     assert path.read_text() == "two"
     assert [p.name for p in tmp_path.iterdir()] == ["a.toml"]
 
 
-def test_without_a_place_nothing_is_kept_and_nothing_refused() -> None:
-    text = Kept(None)
-    text.put("one")
-    assert text.write() is None
+def test_without_a_path_nothing_is_stored() -> None:
+    file = StateFile(None)
+    file.put("one")
+    assert file.write() is None
 
 
-def test_a_disk_that_refuses_is_said_and_tried_again(tmp_path) -> None:
+def test_disk_error_is_returned_and_retried(tmp_path) -> None:
     folder = tmp_path / "not yet there"
-    text = Kept(folder / "a.toml")
-    text.put("one")
-    assert "cannot write" in (text.write() or "")
+    file = StateFile(folder / "a.toml")
+    file.put("one")
+    assert "cannot write" in (file.write() or "")
     with pytest.raises(OSError, match="No such file"):
-        text.put("two")
+        file.put("two")
     folder.mkdir()
-    assert text.write() is None
+    assert file.write() is None
     assert (folder / "a.toml").read_text() == "one"
-    text.put("three")
-    assert text.write() is None
+    file.put("three")
+    assert file.write() is None
 
 
-def test_a_cut_at_any_step_leaves_the_old_text_or_the_new(tmp_path, monkeypatch) -> None:
-    """Power goes before the sync, before the new name, after it: what stands under the name is whole."""
+def test_interrupted_write_leaves_the_old_text_or_the_new(tmp_path, monkeypatch) -> None:
+    """Power loss before the sync, before the rename and after it: the file is complete."""
     path = tmp_path / "a.toml"
     state_file.replace_text(path, "old")
 

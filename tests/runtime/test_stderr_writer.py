@@ -1,64 +1,64 @@
-"""Whoever reads, and however slowly: telling never waits, and what is missing is counted where it stood."""
+"""Stderr writer: never blocks, keeps the order, and reports the number of dropped lines."""
 
 import threading
 
-from companion.runtime.stderr_writer import Telling
+from companion.runtime.stderr_writer import StderrWriter
 
 
 class Reader:
-    """It reads nothing until `reads`, then everything."""
+    """Reader that is stalled until `reads` is set."""
 
     def __init__(self) -> None:
         self.lines: list[str] = []
-        self.asked, self.reads = threading.Event(), threading.Event()
+        self.called, self.reads = threading.Event(), threading.Event()
 
     def write(self, line: str) -> None:
-        self.asked.set()
+        self.called.set()
         self.reads.wait()
         self.lines.append(line)
 
 
-def test_lines_come_in_order_and_all_of_them_before_the_end() -> None:
+def test_all_lines_are_written_in_order() -> None:
     reader = Reader()
-    telling = Telling(reader.write)
+    writer = StderrWriter(reader.write)
     lines = [str(i) for i in range(500)]
     for line in lines:
-        telling.tell(line)
+        writer.write_line(line)
     reader.reads.set()
-    telling.close(30.0)
+    writer.close(30.0)
     assert reader.lines == lines
 
 
-def test_of_too_many_the_oldest_are_dropped_and_counted_where_they_stood() -> None:
+def test_full_queue_drops_the_oldest_lines_and_reports_their_number() -> None:
     reader = Reader()
-    telling = Telling(reader.write, most=3)
-    telling.tell("first")
-    assert reader.asked.wait(30.0)  # it is in the reader's hands, who does not take it
+    writer = StderrWriter(reader.write, max_lines=3)
+    writer.write_line("first")
+    assert reader.called.wait(30.0)  # the first line is being written
     for i in range(10):
-        telling.tell(str(i))
+        writer.write_line(str(i))
     reader.reads.set()
-    telling.close(30.0)
-    assert reader.lines == ["first", "... 7 lines that nobody read in time", "7", "8", "9"]
+    writer.close(30.0)
+    assert reader.lines == ["first", "... 7 lines dropped: stderr was not read in time", "7", "8", "9"]
 
 
-def test_a_reader_who_never_reads_is_not_waited_for_at_the_end() -> None:
+def test_close_does_not_wait_for_a_stalled_reader() -> None:
     reader = Reader()
-    telling = Telling(reader.write)
-    telling.tell("first")
-    telling.close(0.01)
+    writer = StderrWriter(reader.write)
+    writer.write_line("first")
+    writer.close(0.01)
     assert reader.lines == []
     reader.reads.set()
 
 
-def test_a_reader_who_is_gone_ends_nothing() -> None:
-    told: list[str] = []
+def test_closed_reader_does_not_stop_the_writer() -> None:
+    written: list[str] = []
 
     def write(line: str) -> None:
-        told.append(line)
+        written.append(line)
         raise BrokenPipeError
 
-    telling = Telling(write)
-    telling.tell("first")
-    telling.tell("second")
-    telling.close(30.0)
-    assert told == ["first", "second"]
+    writer = StderrWriter(write)
+    writer.write_line("first")
+    writer.write_line("second")
+    writer.close(30.0)
+    assert written == ["first", "second"]

@@ -1,5 +1,5 @@
-"""What systemd hears, over a real socket of a real process: ready when it serves, alive only while the
-navigator works, stopping at its end; and a unit file that its own checker and our command line accept."""
+"""systemd notification of a real process: ready, watchdog only while the navigator works, stopping; and the
+unit file, checked by systemd-analyze and against our command line."""
 
 import configparser
 import contextlib
@@ -19,12 +19,12 @@ import pytest
 from companion.__main__ import EX_CONFIG
 from companion.link import dialect, frame
 from companion.runtime.service import LOG_CHECK_S
-from companion.runtime.systemd import TIMES, Manager
+from companion.runtime.systemd import FEEDS_PER_TIMEOUT, SystemdNotifier
 
 LOOPBACK = "127.0.0.1"
 TERM_S = 0.8
 RUN = "import sys; from companion.__main__ import main; sys.argv[0] = 'companion'; main()"
-#: The fault: a navigator that never returns from the first GNSS fix on.
+#: Fault: a navigator that never returns after the first GNSS fix.
 HANGING = f"""
 import time
 from companion.navigator import Navigator
@@ -37,15 +37,15 @@ def hang(self, record):
 Navigator.handle = hang
 {RUN}
 """
-#: The fault: nothing that is due is done any more, while bytes still come and go.
+#: Fault: periodic work stops while bytes are still transferred.
 IDLE = f"""
-from companion.onboard import Onboard
-poll, polls = Onboard.poll, []
+from companion.runtime.core import CompanionCore
+poll, polls = CompanionCore.poll, []
 def twice(self, now):
     polls.append(now)
     if len(polls) < 3:
         poll(self, now)
-Onboard.poll = twice
+CompanionCore.poll = twice
 {RUN}
 """
 DATA = {
@@ -54,8 +54,8 @@ DATA = {
 }
 
 
-def heard(sock: socket.socket) -> str:
-    """All that is there to be read."""
+def read_all(sock: socket.socket) -> str:
+    """Read all pending datagrams."""
     lines = []
     with contextlib.suppress(BlockingIOError):
         while True:
@@ -64,7 +64,7 @@ def heard(sock: socket.socket) -> str:
 
 
 class Running:
-    """`companion run` below a service manager of ours, and an autopilot that says `DATA` at 20 Hz."""
+    """`companion run` with a simulated service manager, and an autopilot that sends `DATA` at 20 Hz."""
 
     def __init__(self, folder: Path, code: str = RUN, name: str = "") -> None:
         self.folder = folder
@@ -83,12 +83,12 @@ class Running:
             [sys.executable, "-c", code, *arguments], env=environment, stderr=subprocess.DEVNULL
         )
         self._peer = None
-        self.told = ""
+        self.received = ""
 
     def play(self, seconds: float, *names: str, until: str = "") -> str:
-        """Speak for so long, or until the manager was told `until`; what it was told meanwhile."""
-        told, end = "", time.monotonic() + seconds
-        while time.monotonic() < end and not (until and until in told):
+        """Send `names` for some seconds or until the manager received `until`; return what it received."""
+        received, end = "", time.monotonic() + seconds
+        while time.monotonic() < end and not (until and until in received):
             with contextlib.suppress(BlockingIOError):
                 self._peer = self.autopilot.recvfrom(65536)[1]
             for name in names:
@@ -96,9 +96,9 @@ class Running:
                     with contextlib.suppress(ConnectionRefusedError):
                         self.autopilot.sendto(frame.encode(DATA[name], 0, 1, 1), self._peer)
             time.sleep(0.05)
-            told += heard(self.manager)
-        self.told += told
-        return told
+            received += read_all(self.manager)
+        self.received += received
+        return received
 
     def close(self) -> None:
         self.process.kill()
@@ -115,36 +115,36 @@ def running(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Running]
 
 
 @pytest.mark.parametrize("running", [{}, {"name": f"@companion-test-{os.getpid()}"}], indirect=True)
-def test_it_is_ready_once_it_logs_and_alive_while_it_works_and_says_when_it_stops(running: Running) -> None:
+def test_ready_watchdog_and_stopping_are_notified(running: Running) -> None:
     running.play(30.0, "heartbeat", "gnss", until="READY=1")
-    assert "READY=1" in running.told
+    assert "READY=1" in running.received
     assert any((running.folder / "logs").iterdir())
-    assert "autopilot 1 heard" in running.play(5.0, "heartbeat", "gnss", until="autopilot 1 heard")
-    told = running.play(2 * TERM_S, "heartbeat", "gnss")
-    assert TIMES <= told.count("WATCHDOG=1") <= 2 * TIMES + 1
+    assert "autopilot 1 connected" in running.play(5.0, "heartbeat", "gnss", until="autopilot 1 connected")
+    received = running.play(2 * TERM_S, "heartbeat", "gnss")
+    assert FEEDS_PER_TIMEOUT <= received.count("WATCHDOG=1") <= 2 * FEEDS_PER_TIMEOUT + 1
     running.process.send_signal(signal.SIGTERM)
     assert running.process.wait(20) == 0
-    told = heard(running.manager)
-    assert "STOPPING=1" in told and "READY" not in told
-    assert running.told.count("READY=1") == 1
+    received = read_all(running.manager)
+    assert "STOPPING=1" in received and "READY" not in received
+    assert running.received.count("READY=1") == 1
 
 
-def test_it_is_alive_while_there_is_no_autopilot_yet(running: Running) -> None:
+def test_watchdog_is_fed_without_an_autopilot(running: Running) -> None:
     running.play(30.0, until="READY=1")
     assert running.play(2.5).count("WATCHDOG=1") >= 2
 
 
 @pytest.mark.parametrize("running", [{"code": HANGING}], indirect=True)
-def test_a_navigator_that_hangs_starves_the_watchdog(running: Running) -> None:
-    running.play(30.0, "heartbeat", until="heard")
+def test_hanging_navigator_stops_the_watchdog(running: Running) -> None:
+    running.play(30.0, "heartbeat", until="connected")
     assert "WATCHDOG=1" in running.play(TERM_S, "heartbeat")
-    running.play(0.3, "heartbeat", "gnss")  # from here on it hangs
+    running.play(0.3, "heartbeat", "gnss")  # the navigator hangs from here on
     assert "WATCHDOG=1" not in running.play(2 * TERM_S, "heartbeat", "gnss")
     assert running.process.poll() is None
 
 
 @pytest.mark.parametrize("running", [{"code": IDLE}], indirect=True)
-def test_bytes_alone_do_not_feed_the_watchdog(running: Running) -> None:
+def test_received_bytes_alone_do_not_feed_the_watchdog(running: Running) -> None:
     running.play(30.0, "heartbeat", "gnss", until="READY=1")
     running.play(3.5, "heartbeat", "gnss")
     assert "WATCHDOG=1" not in running.play(2 * TERM_S, "heartbeat", "gnss")
@@ -154,40 +154,40 @@ def test_bytes_alone_do_not_feed_the_watchdog(running: Running) -> None:
 # -- the notifier alone -------------------------------------------------------------------------------------
 
 
-def manager_at(path: Path, **environment: str) -> tuple[Manager, socket.socket]:
+def manager_at(path: Path, **environment: str) -> tuple[SystemdNotifier, socket.socket]:
     sock = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
     sock.bind(str(path))
     sock.setblocking(False)
-    return Manager({"NOTIFY_SOCKET": str(path), **environment}), sock
+    return SystemdNotifier({"NOTIFY_SOCKET": str(path), **environment}), sock
 
 
-def test_without_a_manager_or_with_one_that_is_gone_nothing_happens(tmp_path: Path) -> None:
+def test_missing_service_manager_is_ignored(tmp_path: Path) -> None:
     for environment in ({}, {"NOTIFY_SOCKET": str(tmp_path / "gone"), "WATCHDOG_USEC": "1000"}):
-        manager = Manager(environment)
+        manager = SystemdNotifier(environment)
         manager.ready()
         manager.alive(0)
         manager.status("all is well")
         manager.stopping()
 
 
-def test_the_watchdog_of_another_process_is_not_ours(tmp_path: Path) -> None:
+def test_watchdog_of_another_process_is_not_fed(tmp_path: Path) -> None:
     for pid, fed in ((os.getpid(), True), (os.getpid() + 1, False)):
         manager, sock = manager_at(tmp_path / str(pid), WATCHDOG_USEC="1000", WATCHDOG_PID=str(pid))
         manager.alive(0)
-        assert ("WATCHDOG=1" in heard(sock)) is fed
+        assert ("WATCHDOG=1" in read_all(sock)) is fed
         sock.close()
 
 
-def test_a_status_is_one_line(tmp_path: Path) -> None:
+def test_status_is_one_line(tmp_path: Path) -> None:
     manager, sock = manager_at(tmp_path / "notify")
     manager.status("log: two\nlines")
-    assert heard(sock) == "STATUS=log: two lines"
+    assert read_all(sock) == "STATUS=log: two lines"
     sock.close()
 
 
 # -- the unit -----------------------------------------------------------------------------------------------
 
-UNIT = Path(__file__).parents[2] / "deploy" / "companion.runtime.service"
+UNIT = Path(__file__).parents[2] / "deploy" / "companion.service"
 
 
 def unit() -> configparser.ConfigParser:
@@ -197,10 +197,11 @@ def unit() -> configparser.ConfigParser:
     return read
 
 
-def test_the_unit_means_what_the_service_does() -> None:
+def test_unit_matches_the_service() -> None:
     service = unit()["Service"]
     assert service["Type"] == "notify"
-    assert float(service["WatchdogSec"]) > TIMES * LOG_CHECK_S  # with no autopilot it wakes once a second
+    # without an autopilot it wakes once a second
+    assert float(service["WatchdogSec"]) > FEEDS_PER_TIMEOUT * LOG_CHECK_S
     assert str(EX_CONFIG) in service["RestartPreventExitStatus"].split()
     _, command, *options = shlex.split(service["ExecStart"])
     shown = subprocess.run(
@@ -212,7 +213,7 @@ def test_the_unit_means_what_the_service_does() -> None:
 
 @pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="there is no systemd-analyze here")
 def test_systemd_accepts_the_unit(tmp_path: Path) -> None:
-    copy = tmp_path / "companion.runtime.service"
+    copy = tmp_path / "companion.service"
     text = UNIT.read_text()
     copy.write_text(text.replace(shlex.split(unit()["Service"]["ExecStart"])[0], sys.executable))
     done = subprocess.run(["systemd-analyze", "verify", str(copy)], capture_output=True, text=True)

@@ -1,4 +1,4 @@
-"""What a flight costs afterwards is measured: each command in a process of its own, time and memory told."""
+"""Study of time and memory after a flight: each command is measured in its own process."""
 
 import subprocess
 
@@ -8,7 +8,7 @@ from click.testing import CliRunner
 from sitl import after_flight_study
 
 
-def test_a_short_flight_is_within_the_budget_of_an_hour():
+def test_short_flight_is_within_the_budget():
     pytest.importorskip("plotly")
     found = CliRunner().invoke(after_flight_study.command, ["--scenario", "short"])
     assert found.exit_code == 0, found.output
@@ -21,15 +21,15 @@ def test_a_short_flight_is_within_the_budget_of_an_hour():
         assert what in found.output
 
 
-def test_cost_is_the_childs_own():
+def test_cost_excludes_the_parent_process():
     ballast = b"x" * (600 << 20)
-    held = after_flight_study.run("nothing", ["--version"])
+    cost = after_flight_study.measure_command("nothing", ["--version"])
     assert len(ballast) > 500 << 20
-    assert 5.0 < held.peak_mib < 500.0
-    assert 0.0 < held.cpu_s < 10.0 * held.wall_s
+    assert 5.0 < cost.peak_mib < 500.0
+    assert 0.0 < cost.cpu_s < 10.0 * cost.wall_s
     with pytest.raises(subprocess.CalledProcessError):
-        after_flight_study.run("nonsense", ["replay", "no-such.mcap"])
+        after_flight_study.measure_command("nonsense", ["replay", "no-such.mcap"])
 
 
-def test_an_unknown_scenario_is_refused():
+def test_unknown_scenario_is_rejected():
     assert CliRunner().invoke(after_flight_study.command, ["--scenario", "none"]).exit_code == 2

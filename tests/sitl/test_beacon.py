@@ -5,39 +5,39 @@ import numpy as np
 import pytest
 
 from companion.nav.geometry import Geodetic, in_radio_sight, slant_range_azimuth
-from sitl.beacon import Beacon, answers, in_reach, sights
-from sitl.flight import fly
-from sitl.scenarios import named
+from sitl.beacon import Beacon, azimuth_range_elevation, in_reach, simulate_answers
+from sitl.flight import fly_plan
+from sitl.scenarios import get_scenario
 
 BEACON = Beacon(1, 60.05, 31.07, azimuth_step_deg=0.0, range_step=0.0, drop_out=0.0)
 
 
 @pytest.fixture(scope="module")
 def flight():
-    return fly(named("default").plan).at(np.arange(0.0, 2520.0, 1.0))
+    return fly_plan(get_scenario("default").plan).at(np.arange(0.0, 2520.0, 1.0))
 
 
 def at_distance(flight, beacon, lon_deg, alt):
-    """The flight's first rows, put at a place."""
+    """First rows of the flight, moved to other longitudes at the beacon's latitude."""
     n = len(lon_deg)
     values = {name: getattr(flight, name)[:n] for name in flight._fields}
     values |= {"lat": np.full(n, math.radians(beacon.lat_deg)), "lon": np.radians(lon_deg)}
     return type(flight)(**(values | {"alt": np.full(n, alt)}))
 
 
-def test_sights_are_the_geometrys(flight):
+def test_azimuth_range_elevation_agree_with_nav_geometry(flight):
     ground = Geodetic(math.radians(BEACON.lat_deg), math.radians(BEACON.lon_deg), BEACON.alt)
-    azimuth, slant, elevation = sights(BEACON, flight)
+    azimuth, slant, elevation = azimuth_range_elevation(BEACON, flight)
     for k in range(0, len(flight.t), 250):
-        sight = slant_range_azimuth(ground, Geodetic(flight.lat[k], flight.lon[k], flight.alt[k]))
-        assert (azimuth[k], slant[k], elevation[k]) == pytest.approx(sight, rel=1e-9)
+        expected = slant_range_azimuth(ground, Geodetic(flight.lat[k], flight.lon[k], flight.alt[k]))
+        assert (azimuth[k], slant[k], elevation[k]) == pytest.approx(expected, rel=1e-9)
 
 
-def test_errors_are_the_stated_sigmas(flight):
-    azimuth, slant, _ = sights(BEACON, flight)
+def test_errors_have_the_stated_sigmas(flight):
+    azimuth, slant, _ = azimuth_range_elevation(BEACON, flight)
     a, d, s = [], [], []
     for seed in range(10):
-        for fix in answers(BEACON, flight, np.random.default_rng(seed)):
+        for fix in simulate_answers(BEACON, flight, np.random.default_rng(seed)):
             k = round(fix.t_ns * 1e-9)
             a.append(math.remainder(fix.azimuth - azimuth[k], math.tau))
             d.append((fix.slant_range - slant[k]) / fix.sigma_range)
@@ -49,14 +49,14 @@ def test_errors_are_the_stated_sigmas(flight):
     assert np.abs(s).max() < 1e-9
 
 
-def test_bias_north_and_quantisation(flight):
-    plain = answers(BEACON, flight, np.random.default_rng(1))
+def test_range_bias_north_offset_and_quantisation(flight):
+    plain = simulate_answers(BEACON, flight, np.random.default_rng(1))
     wrong = dataclasses.replace(BEACON, bias_range=300.0, north_deg=1.0)
-    for a, b in zip(plain, answers(wrong, flight, np.random.default_rng(1))):
+    for a, b in zip(plain, simulate_answers(wrong, flight, np.random.default_rng(1))):
         assert b.slant_range - a.slant_range == pytest.approx(300.0)
         assert math.remainder(b.azimuth - a.azimuth, math.tau) == pytest.approx(math.radians(1.0))
     coarse = dataclasses.replace(BEACON, azimuth_step_deg=0.1, range_step=50.0)
-    for fix in answers(coarse, flight, np.random.default_rng(1)):
+    for fix in simulate_answers(coarse, flight, np.random.default_rng(1)):
         assert fix.slant_range % 50.0 == 0.0
         assert abs(math.remainder(math.degrees(fix.azimuth), 0.1)) < 1e-9
 
@@ -73,19 +73,23 @@ def test_no_answer_beyond_horizon_or_limit(flight):
     assert 0 < sum(expected) < len(expected)
     near = dataclasses.replace(BEACON, range_limit=50e3)
     reached = in_reach(near, there)
-    assert sights(near, there)[1][reached].max() <= 50e3 < sights(near, there)[1][~reached].min()
+    assert (
+        azimuth_range_elevation(near, there)[1][reached].max()
+        <= 50e3
+        < azimuth_range_elevation(near, there)[1][~reached].min()
+    )
 
 
-def test_overhead_there_is_range_but_no_azimuth(flight):
+def test_cone_of_silence_has_range_but_no_azimuth(flight):
     overhead = at_distance(flight, BEACON, BEACON.lon_deg + np.array([0.001, 0.005, 0.05]), 1000.0)
-    fixes = answers(BEACON, overhead, np.random.default_rng(1))
+    fixes = simulate_answers(BEACON, overhead, np.random.default_rng(1))
     assert [fix.azimuth is None for fix in fixes] == [True, True, False]
     assert all(fix.slant_range is not None for fix in fixes)
 
 
-def test_drop_out_and_outages_leave_the_other_answers_as_they_were(flight):
-    whole = {fix.t_ns: fix for fix in answers(BEACON, flight, np.random.default_rng(1))}
-    fewer = answers(
+def test_drop_out_and_outages_do_not_change_other_answers(flight):
+    whole = {fix.t_ns: fix for fix in simulate_answers(BEACON, flight, np.random.default_rng(1))}
+    fewer = simulate_answers(
         dataclasses.replace(BEACON, drop_out=0.2), flight, np.random.default_rng(1), ((1000.0, 1100.0),)
     )
     assert all(whole[fix.t_ns] == fix for fix in fewer)

@@ -1,4 +1,4 @@
-"""What the simulated autopilot says is what the companion hears, to the rounding of the wire."""
+"""Encoding by the simulated autopilot and decoding by the companion agree to the rounding of the messages."""
 
 import math
 
@@ -7,7 +7,7 @@ import pytest
 from companion import records as r
 from companion.link import dialect, frame
 from companion.link.decode import Autopilot, Sender, decode
-from sitl.encode import Airframe, encode
+from sitl.encode import SimulatedSender, encode
 
 BOOT = 5_000_000_000
 T = BOOT + 123_456_000_000
@@ -20,8 +20,8 @@ class BootedAt:
         return BOOT + stamp if stamp else received
 
 
-def over_the_wire(record: r.Stamped, autopilot: Autopilot) -> tuple[r.Stamped, ...]:
-    found = frame.examine(frame.encode(encode(record, Airframe(autopilot, BOOT)), 0, 1, 1))
+def encode_and_decode(record: r.Stamped, autopilot: Autopilot) -> tuple[r.Stamped, ...]:
+    found = frame.parse(frame.encode(encode(record, SimulatedSender(autopilot, BOOT)), 0, 1, 1))
     assert isinstance(found, frame.Frame)
     return decode(dialect.decode(found), RX, Sender(BootedAt(), autopilot))
 
@@ -59,53 +59,53 @@ PX4_RECORDS = {
 }
 
 
-#: Half the wire's step where a message sends integers (mG, mrad/s, mm, cm/s, cdeg); floats are single.
+#: Half the resolution of integer fields (mG, mrad/s, mm, cm/s, cdeg); floats have single precision.
 HALF_STEP = {r.Imu: 5e-3, r.Gnss: 5.1e-3, r.GlobalPosition: 5.1e-3, r.Pressure: 5.1e-3}
 
 
-def assert_close(heard: object, said: object, half_step: float) -> None:
-    if isinstance(said, tuple):
-        for one, other in zip(heard, said, strict=True):  # type: ignore[call-overload]
+def assert_close(decoded: object, record: object, half_step: float) -> None:
+    if isinstance(record, tuple):
+        for one, other in zip(decoded, record, strict=True):  # type: ignore[call-overload]
             assert_close(one, other, half_step)
-    elif isinstance(said, float):
-        assert heard == pytest.approx(said, rel=1e-6, abs=half_step)
+    elif isinstance(record, float):
+        assert decoded == pytest.approx(record, rel=1e-6, abs=half_step)
     else:
-        assert heard == said
+        assert decoded == record
 
 
-def check(said: r.Stamped, autopilot: Autopilot) -> None:
-    (heard,) = over_the_wire(said, autopilot)
-    assert type(heard) is type(said)
-    half_step = HALF_STEP.get(type(said), 1e-6)
-    for name in said.__struct_fields__:
-        assert_close(getattr(heard, name), getattr(said, name), half_step)
+def check(record: r.Stamped, autopilot: Autopilot) -> None:
+    (decoded,) = encode_and_decode(record, autopilot)
+    assert type(decoded) is type(record)
+    half_step = HALF_STEP.get(type(record), 1e-6)
+    for name in record.__struct_fields__:
+        assert_close(getattr(decoded, name), getattr(record, name), half_step)
     for name in ("lat", "lon"):
-        if hasattr(said, name):
-            assert getattr(heard, name) == pytest.approx(getattr(said, name), abs=math.radians(0.51e-7))
+        if hasattr(record, name):
+            assert getattr(decoded, name) == pytest.approx(getattr(record, name), abs=math.radians(0.51e-7))
 
 
 @pytest.mark.parametrize("name", RECORDS)
-def test_ardupilot_is_heard_as_it_speaks(name: str) -> None:
+def test_ardupilot_records_survive_encoding(name: str) -> None:
     check(RECORDS[name], "ardupilot")
 
 
 @pytest.mark.parametrize("name", PX4_RECORDS)
-def test_px4_is_heard_as_it_speaks(name: str) -> None:
+def test_px4_records_survive_encoding(name: str) -> None:
     check(PX4_RECORDS[name], "px4")
 
 
 @pytest.mark.parametrize("autopilot", ["ardupilot", "px4"])
-def test_the_origin_carries_the_projection_of_its_make(autopilot: Autopilot) -> None:
+def test_origin_has_the_projection_of_its_make(autopilot: Autopilot) -> None:
     check(r.LocalOrigin(T, RX, LAT, LON, 588.59, autopilot), autopilot)
 
 
-def test_a_repeated_fix_is_recognised_over_the_wire() -> None:
-    (first,) = over_the_wire(RECORDS["gnss"], "ardupilot")
-    (again,) = over_the_wire(RECORDS["gnss"], "ardupilot")
+def test_repeated_fix_is_recognised_after_decoding() -> None:
+    (first,) = encode_and_decode(RECORDS["gnss"], "ardupilot")
+    (again,) = encode_and_decode(RECORDS["gnss"], "ardupilot")
     assert isinstance(first, r.Gnss) and isinstance(again, r.Gnss)
     assert again.repeats(first)
 
 
-def test_what_the_companion_makes_itself_is_no_autopilot_s_message() -> None:
+def test_companion_record_cannot_be_encoded() -> None:
     with pytest.raises(ValueError, match="no autopilot sends a Rejection"):
-        encode(r.Rejection(T, T, "gnss", "test"), Airframe())
+        encode(r.Rejection(T, T, "gnss", "test"), SimulatedSender())

@@ -12,10 +12,10 @@ from sitl.faults import (
     LINK_FAULTS,
     NAMES,
     RECORD_FAULTS,
-    Chunk,
     Fault,
-    disturb,
-    spoil,
+    TimedBytes,
+    apply_link_faults,
+    apply_record_faults,
 )
 
 S = 1_000_000_000
@@ -37,10 +37,10 @@ def stream_of(kind, count=60):
     return [one(k) for k in range(count)]
 
 
-def spoiled(name, size=None, **order):
+def apply_fault(name, size=None, **order):
     kind = RECORD_FAULTS[name].kind
     before = stream_of(kind)
-    after = spoil(kind, before, (Fault(name, 20.0, 40.0, size, **order),), RNG(1))
+    after = apply_record_faults(kind, before, (Fault(name, 20.0, 40.0, size, **order),), RNG(1))
     return before, after
 
 
@@ -49,138 +49,138 @@ def east_of(fix, origin):
 
 
 @pytest.mark.parametrize("name", RECORD_FAULTS)
-def test_a_fault_touches_its_window_only_and_is_the_same_each_time(name):
-    before, after = spoiled(name)
+def test_fault_changes_only_its_window_reproducibly(name):
+    before, after = apply_fault(name)
     outside = [r for r in before if not 20 * S <= r.t_ns < 40 * S]
     assert [r for r in after if not 20 * S <= r.t_ns < 40 * S] == outside
     assert [r for r in after if 20 * S <= r.t_ns < 40 * S] != before[20:40]
-    assert repr(spoiled(name)[1]) == repr(after)
+    assert repr(apply_fault(name)[1]) == repr(after)
 
 
-def test_gnss_jumps_and_is_drawn_off():
-    before, after = spoiled("gnss-jump", 500.0)
+def test_gnss_jump_and_spoof():
+    before, after = apply_fault("gnss-jump", 500.0)
     assert math.hypot((after[30].lat - 1.0) * 6.37e6, east_of(after[30], before[30])) == pytest.approx(
         500, rel=5e-3
     )
-    before, after = spoiled("gnss-spoof", 2.0)
+    before, after = apply_fault("gnss-spoof", 2.0)
     assert [east_of(after[k], before[k]) for k in (20, 25, 39)] == pytest.approx([0.0, 10.0, 38.0], rel=5e-3)
     assert after[30].v_n == (0.0, 32.0, 0.0)
 
 
-def test_gnss_jammed_has_no_fix_and_frozen_repeats():
-    _, after = spoiled("gnss-jam")
+def test_gnss_jam_and_frozen_fix():
+    _, after = apply_fault("gnss-jam")
     assert {r.fix for r in after[20:40]} == {1}
-    _, after = spoiled("gnss-frozen")
+    _, after = apply_fault("gnss-frozen")
     assert all(r.repeats(after[19]) for r in after[20:40])
     assert not after[40].repeats(after[19])
-    _, after = spoiled("gnss-stale")
+    _, after = apply_fault("gnss-stale")
     assert {r.alt_msl for r in after[20:40]} == {after[19].alt_msl}
-    assert not any(b.repeats(a) for a, b in pairwise(after))  # the stamps go on
+    assert not any(b.repeats(a) for a, b in pairwise(after))  # the stamps advance
 
 
-def test_beacons_lie_in_range_azimuth_and_place():
-    _, after = spoiled("beacon-bias", 700.0, beacon=1)
+def test_beacon_bias_north_and_position_faults():
+    _, after = apply_fault("beacon-bias", 700.0, beacon=1)
     assert {(r.beacon, r.slant_range) for r in after[20:40]} == {(0, 50e3), (1, 50.7e3)}
-    _, after = spoiled("beacon-north", 0.05)
+    _, after = apply_fault("beacon-north", 0.05)
     assert after[25].azimuth == pytest.approx(3.05)
-    _, after = spoiled("beacon-position", 3000.0)
+    _, after = apply_fault("beacon-position", 3000.0)
     assert (after[25].lat - 1.0) * 6.385e6 == pytest.approx(3000.0, rel=5e-3)
 
 
-def test_multipath_is_a_detour_now_and_then():
-    _, after = spoiled("beacon-multipath", 1500.0)
+def test_multipath_lengthens_some_ranges():
+    _, after = apply_fault("beacon-multipath", 1500.0)
     ranges = np.array([r.slant_range for r in after[20:40]])
     assert ranges.min() == 50e3 < ranges.max()
     assert 1 <= np.count_nonzero(ranges > 50e3) <= 15
 
 
-def test_drop_out_and_lateness():
-    _, after = spoiled("beacon-drop-out", 1.0)
+def test_drop_out_and_delay():
+    _, after = apply_fault("beacon-drop-out", 1.0)
     assert len(after) == 40
     for name in ("gnss-late", "beacon-late"):
-        _, after = spoiled(name, 5.0)
+        _, after = apply_fault(name, 5.0)
         assert {r.rx_ns - r.t_ns for r in after if 20 * S <= r.t_ns < 40 * S} == {5 * S}
         assert [r.rx_ns for r in after] == sorted(r.rx_ns for r in after)
 
 
-def test_ins_leaps_and_says_nan():
-    before, after = spoiled("ins-reset", 200.0)
+def test_ins_reset_and_nan():
+    before, after = apply_fault("ins-reset", 200.0)
     assert math.dist(before[30].x_n, after[30].x_n) == pytest.approx(200.0)
-    _, after = spoiled("ins-nan")
+    _, after = apply_fault("ins-nan")
     assert all(map(math.isnan, after[30].x_n + after[30].v_n))
 
 
-def test_airspeed_ices_freezes_and_shears():
-    before, after = spoiled("airspeed-icing", 0.6)
+def test_airspeed_icing_freezing_and_wind_shear():
+    before, after = apply_fault("airspeed-icing", 0.6)
     assert after[30].airspeed == pytest.approx(before[30].airspeed * 0.9)
-    _, after = spoiled("airspeed-frozen")
+    _, after = apply_fault("airspeed-frozen")
     assert {r.airspeed for r in after[20:40]} == {after[19].airspeed}
     assert after[30].t_ns == 30 * S
-    before, after = spoiled("wind-shear", 8.0)
+    before, after = apply_fault("wind-shear", 8.0)
     assert after[30].airspeed == before[30].airspeed + 8.0
 
 
 def frames(count=400):
     messages = (dialect.new("ATTITUDE", time_boot_ms=k, roll=0.1, yaw=1.0) for k in range(1, count + 1))
-    return [Chunk(k * 20_000_000, frame.encode(m, k & 0xFF, 1, 1)) for k, m in enumerate(messages)]
+    return [TimedBytes(k * 20_000_000, frame.encode(m, k & 0xFF, 1, 1)) for k, m in enumerate(messages)]
 
 
-def passed(name, size=None):
+def apply_link_fault(name, size=None):
     out = []
     rng = RNG(5)
     for chunk in frames():
-        out += disturb([chunk], chunk.due_ns, (Fault(name, 0.0, 1e9, size),), rng)
+        out += apply_link_faults([chunk], chunk.due_ns, (Fault(name, 0.0, 1e9, size),), rng)
     return sorted(out, key=lambda chunk: chunk.due_ns)
 
 
-def heard(chunks):
+def parse_frames(chunks):
     reader = frame.Reader()
     events = [event for chunk in chunks for event in reader.receive(chunk.data)] + reader.close()
     return [event for event in events if isinstance(event, frame.Frame)], events
 
 
 @pytest.mark.parametrize("name", LINK_FAULTS)
-def test_link_faults_keep_to_their_window_and_repeat(name):
+def test_link_faults_change_only_their_window_reproducibly(name):
     quiet = (Fault(name, 5.0, 6.0),)
-    assert disturb(frames(2), 4 * S, quiet, RNG(1)) == frames(2)
-    assert passed(name) == passed(name)
+    assert apply_link_faults(frames(2), 4 * S, quiet, RNG(1)) == frames(2)
+    assert apply_link_fault(name) == apply_link_fault(name)
 
 
-def test_links_lose_double_delay_and_shuffle():
-    assert passed("link-loss") == []
-    assert len(passed("link-loss", 0.25)) == pytest.approx(300, abs=30)
-    assert len(passed("duplicates", 0.1)) == pytest.approx(440, abs=25)
-    assert [c.due_ns for c in passed("link-late", 5.0)] == [c.due_ns + 5 * S for c in frames()]
-    shuffled = [chunk.data for chunk in passed("reordering", 0.2)]
+def test_link_loss_duplicates_delay_and_reordering():
+    assert apply_link_fault("link-loss") == []
+    assert len(apply_link_fault("link-loss", 0.25)) == pytest.approx(300, abs=30)
+    assert len(apply_link_fault("duplicates", 0.1)) == pytest.approx(440, abs=25)
+    assert [c.due_ns for c in apply_link_fault("link-late", 5.0)] == [c.due_ns + 5 * S for c in frames()]
+    shuffled = [chunk.data for chunk in apply_link_fault("reordering", 0.2)]
     assert shuffled != [c.data for c in frames()]
     assert sorted(shuffled) == sorted(c.data for c in frames())
 
 
-def test_bit_errors_have_their_rate():
+def test_bit_error_rate():
     before = np.frombuffer(b"".join(c.data for c in frames()), np.uint8)
-    after = np.frombuffer(b"".join(c.data for c in passed("bit-errors", 1e-3)), np.uint8)
+    after = np.frombuffer(b"".join(c.data for c in apply_link_fault("bit-errors", 1e-3)), np.uint8)
     wrong = np.unpackbits(before ^ after)
     assert np.mean(wrong) == pytest.approx(1e-3, rel=0.3)
 
 
-def test_garbage_costs_bytes_and_cuts_cost_frames():
-    found, events = heard(passed("garbage", 20.0))
+def test_garbage_and_truncation():
+    found, events = parse_frames(apply_link_fault("garbage", 20.0))
     assert len(found) >= 395 and len(events) > len(found)
-    found, _ = heard(passed("cut", 0.1))
+    found, _ = parse_frames(apply_link_fault("cut", 0.1))
     assert len(found) == pytest.approx(360, abs=25)
 
 
-def test_a_second_autopilot_says_the_same_with_right_checksums():
-    found, events = heard(passed("second-autopilot"))
+def test_second_autopilot_repeats_frames_with_correct_checksums():
+    found, events = parse_frames(apply_link_fault("second-autopilot"))
     assert len(found) == len(events) == 800
     assert {f.system for f in found} == {1, 2}
 
 
-def test_every_fault_has_one_name_and_wrong_orders_are_refused():
+def test_fault_names_are_unique_and_invalid_faults_are_rejected():
     assert len(set(NAMES)) == len(RECORD_FAULTS) + len(LINK_FAULTS) + len(AUTOPILOT_FAULTS) + len(
         CONSUMER_FAULTS
     )
-    with pytest.raises(ValueError, match="no fault is called 'gnss-leap'"):
+    with pytest.raises(ValueError, match="unknown fault 'gnss-leap'"):
         Fault("gnss-leap", 0.0)
     with pytest.raises(ValueError, match="end after its start"):
         Fault("gnss-jump", 10.0, 5.0)

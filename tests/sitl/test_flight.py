@@ -5,29 +5,39 @@ import pytest
 
 from companion.nav import earth
 from companion.nav.geometry import Geodetic, separation
-from companion.nav.strapdown import Inertial, mechanise
-from sitl.flight import CLIMB_RATE, Leg, Plan, Wind, fly, gravity, radii, rotation, step
-from sitl.scenarios import named
+from companion.nav.strapdown import InertialState, mechanise
+from sitl.flight import (
+    CLIMB_RATE,
+    FlightPlan,
+    Leg,
+    WindChange,
+    fly_plan,
+    gravity,
+    radii,
+    rotation,
+    smooth_step,
+)
+from sitl.scenarios import get_scenario
 
-PLAN = Plan(
+PLAN = FlightPlan(
     (
         Leg(5, 40, 0, 0),
         Leg(40, 40, 38, 0),
         Leg(80, 120, 36, 100),
         Leg(80, 350, 40, 60),
     ),
-    winds=(Wind(0, 4, 5), Wind(120, -3, 8)),
+    winds=(WindChange(0, 4, 5), WindChange(120, -3, 8)),
 )
 
 
 @pytest.fixture(scope="module")
 def flight():
-    return fly(PLAN)
+    return fly_plan(PLAN)
 
 
-def test_imu_integrates_back_to_the_flight(flight):
-    # The strapdown takes means over a step: those of a smooth signal are its values half way, by Simpson.
-    state = Inertial(
+def test_integrated_imu_reproduces_the_flight(flight):
+    # mechanise() takes means over a step: Simpson's rule
+    state = InertialState(
         flight.lat[0], flight.lon[0], flight.alt[0], flight.v_n[0], rotation(flight.attitude[:1])[0]
     )
     for k in range(0, len(flight.t) - 2, 2):
@@ -44,8 +54,8 @@ def test_imu_integrates_back_to_the_flight(flight):
 
 def test_turns_are_coordinated(flight):
     assert np.abs(flight.f_b[:, 1]).max() < 1e-9
-    # And the bank is that of the textbook in still air: tan(roll) = V psi'/g.
-    still = fly(Plan((Leg(5, 0, 0, 0), Leg(40, 0, 38, 0), Leg(80, 120, 38, 0))))
+    # bank of a coordinated turn in still air: tan(roll) = V psi'/g
+    still = fly_plan(FlightPlan((Leg(5, 0, 0, 0), Leg(40, 0, 38, 0), Leg(80, 120, 38, 0))))
     turn_rate = np.gradient(still.attitude[:, 2], 0.02)
     middle = (still.t > 60.0) & (still.t < 80.0)
     bank = np.arctan(38.0 * turn_rate[middle] / 9.82)
@@ -69,7 +79,7 @@ def test_position_is_the_integral_of_velocity(flight):
     assert np.abs(flight.v_n[:, 2]).max() <= CLIMB_RATE + 1e-6
 
 
-def test_between_samples_the_flight_is_straight_and_headings_wrap(flight):
+def test_interpolation_is_linear_and_headings_wrap(flight):
     t = np.array([0.0, 61.237, 100.011, 205.0])
     at = flight.at(t)
     assert at.lat == pytest.approx(np.interp(t, flight.t, flight.lat), abs=1e-15)
@@ -78,7 +88,7 @@ def test_between_samples_the_flight_is_straight_and_headings_wrap(flight):
     assert exact.attitude == pytest.approx(flight.attitude[[0, 17, -1]], abs=1e-12)
 
 
-def test_earth_on_arrays_is_the_earth():
+def test_array_earth_model_agrees_with_nav_earth():
     lats, alts = np.radians([0.0, 30.0, 59.3, -75.0]), np.array([0.0, 100.0, 1200.0, 9000.0])
     assert gravity(lats, alts) == pytest.approx([earth.gravity(*p) for p in zip(lats, alts)], rel=1e-14)
     assert np.stack(radii(lats), axis=1) == pytest.approx(
@@ -87,15 +97,15 @@ def test_earth_on_arrays_is_the_earth():
 
 
 def test_step_is_smooth_and_monotone():
-    y = step(np.linspace(-1.0, 3.0, 401), 0.0, 2.0)
+    y = smooth_step(np.linspace(-1.0, 3.0, 401), 0.0, 2.0)
     assert (y[0], y[-1]) == (0.0, 1.0)
     assert np.all(np.diff(y) >= 0.0)
     assert np.diff(y).max() * 100.0 == pytest.approx(2.1875 / 2.0, rel=1e-3)
 
 
-def test_the_default_flight_is_long_fast_far_and_cheap():
+def test_default_flight_duration_speed_range_and_cost():
     start = time.process_time()
-    flight = fly(named("default").plan)
+    flight = fly_plan(get_scenario("default").plan)
     assert time.process_time() - start < 1.0
     assert flight.t[-1] >= 40 * 60
     cruise = flight.airspeed[flight.t > 120.0]
@@ -109,13 +119,13 @@ def test_the_default_flight_is_long_fast_far_and_cheap():
 
 
 @pytest.mark.parametrize(
-    ("legs", "says"),
+    ("legs", "message"),
     [
         ((), "no legs"),
         ((Leg(0, 0, 30, 0),), "duration"),
         ((Leg(10, 0, 0, 0), Leg(10, 180, 0, 0)), "too short"),
     ],
 )
-def test_impossible_plans_are_refused(legs, says):
-    with pytest.raises(ValueError, match=says):
-        fly(Plan(legs))
+def test_invalid_plans_are_rejected(legs, message):
+    with pytest.raises(ValueError, match=message):
+        fly_plan(FlightPlan(legs))

@@ -1,49 +1,49 @@
-"""GNSS of a simulated autopilot that obeys, off and on by its own parameter, whichever that is."""
+"""GNSS switch by the simulation parameter of each make and version."""
 
 import pytest
 
 from companion.link import dialect, frame
 from companion.link.parameter_client import to_wire
-from sitl.autopilot import Autopilot
-from sitl.bridge import Bridge, Orders
-from sitl.gnss_switch import KNOBS, GnssSwitch
-from sitl.scenarios import named
+from sitl.autopilot import SimulatedAutopilot
+from sitl.bridge import Bridge, GnssSchedule
+from sitl.gnss_switch import GNSS_PARAMETERS, GnssSwitch
+from sitl.scenarios import get_scenario
 
 SECOND = 1_000_000_000
 
 
-def flown(
-    make: str, orders: Orders, until_s: float
-) -> tuple[Autopilot, Bridge, list[tuple[float, str]], int]:
-    pilot = Autopilot(named("short", autopilot=make, gnss_outages=()))
-    bridge, told, now = Bridge(orders=orders), [], 0
+def fly_bridge(
+    make: str, schedule: GnssSchedule, until_s: float
+) -> tuple[SimulatedAutopilot, Bridge, list[tuple[float, str]], int]:
+    pilot = SimulatedAutopilot(get_scenario("short", autopilot=make, gnss_outages=()))
+    bridge, lines, now = Bridge(schedule=schedule), [], 0
     while now < until_s * SECOND:
         for data in pilot.poll(now):
             bridge.from_autopilot(data, now)
         bridge.poll(now)
         for data in bridge.to_autopilot():
             pilot.receive(data, now)
-        told += [(now / SECOND, line) for line in bridge.take_told()]
+        lines += [(now / SECOND, line) for line in bridge.take_reports()]
         now = max(now + 1, min(pilot.deadline(), bridge.deadline()))
-    return pilot, bridge, told, now
+    return pilot, bridge, lines, now
 
 
 @pytest.mark.parametrize(
     ("make", "name", "off", "on"), [("ardupilot", "SIM_GPS1_ENABLE", 0, 1), ("px4", "SIM_GPS_USED", 0, 10)]
 )
-def test_it_is_lost_and_comes_back_as_ordered(make: str, name: str, off: int, on: int) -> None:
-    pilot, bridge, told, _ = flown(make, Orders(20.0, 40.0), 60.0)
-    (loss,) = bridge.losses
+def test_gnss_is_switched_off_and_on_at_the_scheduled_times(make: str, name: str, off: int, on: int) -> None:
+    pilot, bridge, lines, _ = fly_bridge(make, GnssSchedule(20.0, 40.0), 60.0)
+    (loss,) = bridge.outages
     assert loss.lost_ns / SECOND == pytest.approx(20.0, abs=1.5)
-    assert loss.back_ns / SECOND == pytest.approx(40.0, abs=1.5)
-    lines = [line for _, line in told]
+    assert loss.regained_ns / SECOND == pytest.approx(40.0, abs=1.5)
+    lines = [line for _, line in lines]
     assert f"GNSS switched off: {name} = {off}" in lines and f"GNSS switched on: {name} = {on}" in lines
     assert pilot.parameters.values[name] == on
 
 
 @pytest.mark.parametrize("make", ["ardupilot", "px4"])
-def test_it_is_left_as_it_was_found(make: str) -> None:
-    pilot, bridge, _, now = flown(make, Orders(20.0), 30.0)
+def test_gnss_is_restored_at_the_end(make: str) -> None:
+    pilot, bridge, _, now = fly_bridge(make, GnssSchedule(20.0), 30.0)
     assert not pilot.parameters.gnss_is_on
     bridge.finish(now)
     for data in bridge.to_autopilot():
@@ -51,16 +51,16 @@ def test_it_is_left_as_it_was_found(make: str) -> None:
     assert pilot.parameters.gnss_is_on
 
 
-def test_it_is_not_touched_where_nothing_was_ordered() -> None:
-    _, bridge, told, now = flown("ardupilot", Orders(), 30.0)
+def test_gnss_parameter_is_not_accessed_without_a_schedule() -> None:
+    _, bridge, lines, now = fly_bridge("ardupilot", GnssSchedule(), 30.0)
     bridge.finish(now)
     sent = [f for data in bridge.to_autopilot() for f in frame.Reader().receive(data)]
     assert not [f for f in sent if dialect.TYPES[f.msgid].name.startswith("PARAM")]
-    assert bridge.losses == [] and not any("switch" in line for _, line in told)
+    assert bridge.outages == [] and not any("switch" in line for _, line in lines)
 
 
-class Fake:
-    """An autopilot with one parameter, which may refuse to be set."""
+class FakeAutopilot:
+    """Autopilot with one parameter, which may reject PARAM_SET."""
 
     def __init__(self, name: str, value: int, obeys: bool = True) -> None:
         self.name, self.value, self.obeys = name, value, obeys
@@ -76,40 +76,40 @@ class Fake:
         return message, found
 
 
-def settle(switch: GnssSwitch, fake: Fake, seconds: int = 12) -> list[str]:
-    told = []
+def exchange(switch: GnssSwitch, autopilot: FakeAutopilot, seconds: int = 12) -> list[str]:
+    lines = []
     for tenth in range(10 * seconds):
-        told += switch.poll(tenth * SECOND // 10)
+        lines += switch.poll(tenth * SECOND // 10)
         for message in switch.to_send():
-            if (answer := fake.answer(message)) is not None:
-                told += switch.receive(*answer)
-    return told
+            if (answer := autopilot.answer(message)) is not None:
+                lines += switch.receive(*answer)
+    return lines
 
 
-def test_an_older_ardupilot_has_the_opposite_parameter() -> None:
-    fake, switch = Fake("SIM_GPS_DISABLE", 0), GnssSwitch("ardupilot", 1)
-    switch.order(on=False)
-    assert settle(switch, fake) == ["GNSS switched off: SIM_GPS_DISABLE = 1"]
-    assert fake.value == 1 and switch.is_off
-    switch.order(on=True)
-    assert settle(switch, fake) == ["GNSS switched on: SIM_GPS_DISABLE = 0"]
+def test_older_ardupilot_has_the_inverse_parameter() -> None:
+    autopilot, switch = FakeAutopilot("SIM_GPS_DISABLE", 0), GnssSwitch("ardupilot", 1)
+    switch.request(on=False)
+    assert exchange(switch, autopilot) == ["GNSS switched off: SIM_GPS_DISABLE = 1"]
+    assert autopilot.value == 1 and switch.is_off
+    switch.request(on=True)
+    assert exchange(switch, autopilot) == ["GNSS switched on: SIM_GPS_DISABLE = 0"]
 
 
-def test_one_that_was_left_off_is_switched_on_all_the_same() -> None:
-    fake, switch = Fake("SIM_GPS1_ENABLE", 0), GnssSwitch("ardupilot", 1)
-    switch.order(on=True)
-    settle(switch, fake)
-    assert fake.value == 1
+def test_gnss_found_off_is_switched_on() -> None:
+    autopilot, switch = FakeAutopilot("SIM_GPS1_ENABLE", 0), GnssSwitch("ardupilot", 1)
+    switch.request(on=True)
+    exchange(switch, autopilot)
+    assert autopilot.value == 1
 
 
-def test_what_is_refused_is_told() -> None:
-    fake, switch = Fake("SIM_GPS1_ENABLE", 1, obeys=False), GnssSwitch("ardupilot", 1)
-    switch.order(on=False)
-    (line,) = settle(switch, fake)
-    assert "SIM_GPS1_ENABLE was not set" in line and "GNSS stays as it is" in line
+def test_rejected_parameter_is_reported() -> None:
+    autopilot, switch = FakeAutopilot("SIM_GPS1_ENABLE", 1, obeys=False), GnssSwitch("ardupilot", 1)
+    switch.request(on=False)
+    (line,) = exchange(switch, autopilot)
+    assert "SIM_GPS1_ENABLE was not set" in line and "GNSS is unchanged" in line
 
 
-@pytest.mark.parametrize("make", sorted(KNOBS))
-def test_where_there_is_none_that_is_told_once(make: str) -> None:
-    (line,) = settle(GnssSwitch(make, 1), Fake("OTHER", 1))
+@pytest.mark.parametrize("make", sorted(GNSS_PARAMETERS))
+def test_missing_parameter_is_reported_once(make: str) -> None:
+    (line,) = exchange(GnssSwitch(make, 1), FakeAutopilot("OTHER", 1))
     assert "GNSS cannot be switched" in line

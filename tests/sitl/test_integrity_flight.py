@@ -1,4 +1,4 @@
-"""Flights without an INS, one beacon: whoever of GNSS and the beacon lies, the aircraft is not led astray."""
+"""Integrity on flights without an INS, one beacon: a fault of GNSS or beacon does no harm."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ import pytest
 from companion.config import Config, InertialConfig
 from sitl import loopback
 from sitl.campaign import flight
-from sitl.campaign.flight import SCENARIOS, Order, Result, attempt
+from sitl.campaign.flight import SCENARIOS, FlightOrder, FlightResult, fly_order
 
 HARMLESS_M = 300.0
 
 
-def flown(fault: str, seed: int = 1) -> Result:
-    result = attempt(Order("air-data", fault, seed))
+def flown(fault: str, seed: int = 1) -> FlightResult:
+    result = fly_order(FlightOrder("air-data", fault, seed))
     assert result.raised is None
     assert (result.alarms, result.wrong, result.misleading_s) == (0, 0, 0.0)
     return result
 
 
 @pytest.mark.parametrize("fault", ["gnss-spoof-0.5", "gnss-spoof-5"])
-def test_a_spoofer_is_excluded_and_taken_back_when_he_has_left(fault: str) -> None:
+def test_spoofed_gnss_is_excluded_and_readmitted(fault: str) -> None:
     result = flown(fault)
     assert result.excluded_s is not None
     assert result.largest_m < HARMLESS_M
@@ -31,19 +31,19 @@ def test_a_spoofer_is_excluded_and_taken_back_when_he_has_left(fault: str) -> No
 
 
 @pytest.mark.parametrize("fault", ["beacon-bias-300", "beacon-multipath"])
-def test_a_beacon_that_goes_wrong_does_not_cost_gnss(fault: str) -> None:
+def test_faulty_beacon_does_not_exclude_gnss(fault: str) -> None:
     result = flown(fault, 3)
     assert result.detected_s is not None and result.detected_s < 15.0
     assert result.largest_m < 10.0
 
 
-def test_air_data_alone_do_not_outvote_gnss_and_a_beacon() -> None:
+def test_air_data_alone_do_not_exclude_gnss_and_beacon() -> None:
     assert flown("airspeed-icing").largest_m < HARMLESS_M
 
 
-def test_a_guarantee_does_not_rest_on_what_is_under_suspicion() -> None:
-    """Everything falls silent while the spoofer is not yet excluded: the bound still holds."""
-    fault = flight.KINDS["gnss-spoof-5"].fault
+def test_guaranteed_bound_does_not_use_suspected_sources() -> None:
+    """All fixes stop before the spoofed GNSS is excluded: the bound still holds."""
+    fault = flight.FAULT_CASES["gnss-spoof-5"].fault
     assert fault is not None
     spoofed = dataclasses.replace(
         SCENARIOS["air-data"],
@@ -52,9 +52,9 @@ def test_a_guarantee_does_not_rest_on_what_is_under_suspicion() -> None:
         gnss_outages=((338.0, 420.0),),
         rsbn_outages=((338.0, 420.0),),
     )
-    config = loopback.simulated(Config(inertial=InertialConfig(source="air_data")))
-    world, told = flight.fly_records(spoofed, config)
-    result = flight.score(Order("air-data", "gnss-spoof-5", 1), world, told)
+    config = loopback.simulator_config(Config(inertial=InertialConfig(source="air_data")))
+    world, outputs = flight.fly_records(spoofed, config)
+    result = flight.score_flight(FlightOrder("air-data", "gnss-spoof-5", 1), world, outputs)
     assert result.rms_error is not None and result.rms_bound is not None
     assert result.rms_error <= result.rms_bound
     assert result.misleading_s == 0.0

@@ -1,4 +1,4 @@
-"""A whole flight in virtual time: the same every time, better than any source, within its promise."""
+"""Loopback flights in virtual time: reproducible, better than any source, within the guaranteed bound."""
 
 import hashlib
 import json
@@ -11,14 +11,14 @@ from click.testing import CliRunner
 from companion.analysis import replay
 from companion.analysis.error_statistics import CORRECTED, GNSS, RSBN
 from companion.config import Config
-from sitl.loopback import command, fly, scored, simulated
-from sitl.scenarios import named
+from sitl.loopback import command, error_table, fly_scenario, simulator_config
+from sitl.scenarios import get_scenario
 
-CONFIG = simulated(Config())
+CONFIG = simulator_config(Config())
 
 
-class Memory:
-    """A log in memory: a digest of all that was sent and said."""
+class DigestLog:
+    """Log that computes a digest of all records and sent frames."""
 
     def __init__(self) -> None:
         self.digest = hashlib.sha256()
@@ -36,24 +36,24 @@ SEEDS = (1, 2, 3, 4)
 
 @pytest.fixture(scope="module")
 def flights():
-    """The table of each of four flights that differ in noise alone."""
-    return [scored(fly(named("short", seed=seed), CONFIG)) for seed in SEEDS]
+    """Error tables of four flights that differ in noise only."""
+    return [error_table(fly_scenario(get_scenario("short", seed=seed), CONFIG)) for seed in SEEDS]
 
 
-def flown_again(seed: int) -> str:
-    log = Memory()
-    fly(named("short", seed=seed), CONFIG, log)
+def flight_digest(seed: int) -> str:
+    log = DigestLog()
+    fly_scenario(get_scenario("short", seed=seed), CONFIG, log)
     return log.digest.hexdigest()
 
 
-def test_the_same_seed_gives_the_same_bytes_and_another_seed_others() -> None:
-    first = flown_again(1)
-    assert first == flown_again(1)
-    assert first != flown_again(2)
+def test_output_bytes_depend_on_the_seed_only() -> None:
+    first = flight_digest(1)
+    assert first == flight_digest(1)
+    assert first != flight_digest(2)
 
 
-def test_with_fixes_the_corrected_estimate_beats_the_best_of_them(flights) -> None:
-    """Over the flights together: what GNSS drifts in one correlation time nobody can tell in one flight."""
+def test_corrected_estimate_is_better_than_the_best_fix_source(flights) -> None:
+    """Pooled over flights: the GNSS drift within one correlation time is unobservable in one flight."""
     for rows in zip(*flights, strict=True):
         phase = rows[0].phase
         if phase == "neither":
@@ -67,36 +67,36 @@ def test_with_fixes_the_corrected_estimate_beats_the_best_of_them(flights) -> No
     assert {row.phase for row in flights[0]} == {"GNSS+RSBN", "GNSS only", "RSBN only", "neither"}
 
 
-def test_the_bound_holds_in_every_phase_and_without_fixes_at_every_instant(flights) -> None:
+def test_bound_holds_in_every_phase_and_always_without_fixes(flights) -> None:
     for rows in flights:
         assert all(row.held for row in rows)
         assert [row.inside for row in rows if row.phase == "neither"] == [1.0]
 
 
-def test_the_command_s_log_replays_bit_for_bit(tmp_path: Path) -> None:
+def test_log_of_the_command_replays_bit_for_bit(tmp_path: Path) -> None:
     done = CliRunner().invoke(command, ["--scenario", "short", "--logs", str(tmp_path), "--json"])
     assert done.exit_code == 0, done.output
     summary = json.loads(done.stdout)
     assert {row["phase"] for row in summary["phases"]} >= {"GNSS+RSBN", "neither"}
     assert summary["times_real_time"] > 10.0  # 100 on a quiet machine; see the benchmark
     log = Path(summary["log"])
-    again = CliRunner().invoke(replay.command, [str(log), "--json"])
-    assert again.exit_code == 0, again.output
-    found = json.loads(again.stdout)
+    replayed = CliRunner().invoke(replay.command, [str(log), "--json"])
+    assert replayed.exit_code == 0, replayed.output
+    found = json.loads(replayed.stdout)
     assert found["different"] == 0 and found["compared"] > 1000
     assert found["outputs"]["Solution"] > 1000
 
 
-def test_a_log_replayed_with_another_configuration_is_different_and_says_where(tmp_path: Path) -> None:
+def test_replay_with_another_configuration_reports_the_first_difference(tmp_path: Path) -> None:
     done = CliRunner().invoke(command, ["--scenario", "short", "--logs", str(tmp_path), "--json"])
     other = tmp_path / "other.toml"
     other.write_text("[gnss]\nsigma_m = 4.0\n")
-    again = CliRunner().invoke(replay.command, [json.loads(done.stdout)["log"], "--config", str(other)])
-    assert again.exit_code == 1
-    assert "DIFFERENT" in again.stdout and "first difference" in again.stdout
+    replayed = CliRunner().invoke(replay.command, [json.loads(done.stdout)["log"], "--config", str(other)])
+    assert replayed.exit_code == 1
+    assert "DIFFERENT" in replayed.stdout and "first difference" in replayed.stdout
 
 
-def test_an_unknown_scenario_names_the_nearest(tmp_path: Path) -> None:
+def test_unknown_scenario_suggests_the_nearest(tmp_path: Path) -> None:
     done = CliRunner().invoke(command, ["--scenario", "shrt", "--logs", str(tmp_path)])
     assert done.exit_code == 2
     assert "did you mean short?" in done.output

@@ -5,58 +5,60 @@ import time
 import numpy as np
 import pytest
 
-from companion.nav.error_model import aircraft
-from sitl.flight import Leg, Plan, Wind, fly
-from sitl.scenarios import named
+from companion.nav.error_model import aircraft_model
+from sitl.flight import FlightPlan, Leg, WindChange, fly_plan
+from sitl.scenarios import get_scenario
 from sitl.sensors import (
     DEG_H,
     GRADES,
     AirDataModel,
     GnssModel,
-    air_data,
-    error_at,
     error_rates,
     gauss_markov,
-    gnss,
-    imu,
-    inertial_error,
+    interpolate_error,
     propagate,
+    simulate_air_data,
+    simulate_gnss,
+    simulate_imu,
+    simulate_inertial_error,
 )
 
 
 @pytest.fixture(scope="module")
 def flight():
-    return fly(named("default").plan)
+    return fly_plan(get_scenario("default").plan)
 
 
 @pytest.fixture(scope="module")
 def cruise():
-    """Seven hours due north at 8 m/s from 2 degrees north on, a sample in ten seconds."""
-    whole = fly(Plan((Leg(60, 0, 8, 0), Leg(25140, 0, 8, 0)), lat_deg=2.0))
+    """Seven hours northwards at 8 m/s from latitude 2 degrees, sampled every ten seconds."""
+    whole = fly_plan(FlightPlan((Leg(60, 0, 8, 0), Leg(25140, 0, 8, 0)), lat_deg=2.0))
     return whole.at(np.arange(0.0, 25200.0, 10.0))
 
 
-def test_error_rates_are_those_of_the_error_model():
-    plan = Plan((Leg(5, 40, 0, 0), Leg(60, 40, 38, 0), Leg(80, 150, 36, 50)), winds=(Wind(0, 4, 5),))
-    flight = fly(plan)
+def test_error_rates_agree_with_the_error_model():
+    plan = FlightPlan(
+        (Leg(5, 40, 0, 0), Leg(60, 40, 38, 0), Leg(80, 150, 36, 50)), winds=(WindChange(0, 4, 5),)
+    )
+    flight = fly_plan(plan)
     acceleration = np.gradient(flight.v_n, 0.02, axis=0)
     rates = error_rates(flight)
     for k in (100, 2000, 4000, 5000):
-        model = aircraft(flight.lat[k], *flight.v_n[k, :2], tuple(acceleration[k]))
+        model = aircraft_model(flight.lat[k], *flight.v_n[k, :2], tuple(acceleration[k]))
         scale = np.maximum(np.abs(model.A), 1e-12)
-        # Real gravity and curvature against the sphere's 9.81 m/s^2: a third of a percent of what is felt.
-        felt = [(2, 5), (2, 6), (3, 4), (3, 6)]
-        for i, j in felt:
+        # real gravity and curvature against the sphere's 9.81 m/s^2: 0.3 % of the specific force
+        force_terms = [(2, 5), (2, 6), (3, 4), (3, 6)]
+        for i, j in force_terms:
             assert rates[k, i, j] == pytest.approx(model.A[i, j], abs=0.02)
             rates[k, i, j] = model.A[i, j]
         assert np.abs((rates[k] - model.A) / scale).max() < 1e-6
 
 
-def test_constant_gyro_bias_swings_with_schulers_period(cruise):
+def test_constant_gyro_bias_oscillates_with_the_schuler_period(cruise):
     drive = np.zeros((len(cruise.t), 7))
     drive[:, 5] = 0.01 * DEG_H
     states = propagate(cruise, np.zeros(7), drive)
-    # The line of the spectrum, on the slow swing of a day (here a parabola), found by least squares.
+    # spectral line by least squares, with a parabola for the slow daily oscillation
     t = cruise.t
     periods = np.arange(75.0, 95.0, 0.05) * 60.0
     left = []
@@ -64,36 +66,38 @@ def test_constant_gyro_bias_swings_with_schulers_period(cruise):
         wave = 2.0 * np.pi * t / period
         basis = np.stack([np.ones_like(t), t, t**2, np.sin(wave), np.cos(wave)], axis=1)
         left.append(np.linalg.lstsq(basis, states[:, 2])[1][0])
-    # 84.4 min; the vertical component of the earth's rate splits it by a percent at a few degrees north.
+    # 84.4 min; the vertical component of the earth's rate splits it by 1 % at a few degrees of latitude
     assert periods[np.argmin(left)] / 60.0 == pytest.approx(84.4, abs=1.0)
     assert min(left) < 1e-2 * np.sum(np.square(states[:, 2] - np.mean(states[:, 2])))
-    # Velocity: R eps (1 - cos w t), R eps in the mean of the first swing, before the earth has turned far.
+    # velocity R eps (1 - cos w t): mean R eps over the first period, before the earth has rotated far
     assert abs(np.mean(states[t < 5063.0, 2])) == pytest.approx(6371e3 * 0.01 * DEG_H, rel=0.1)
 
 
-def test_accelerometer_bias_hidden_by_tilt_moves_nothing(cruise):
+def test_accelerometer_bias_cancelled_by_tilt_has_no_effect(cruise):
     bias = 1e-3
     drive = np.zeros((len(cruise.t), 7))
     drive[:, 2] = bias
     level = np.zeros(7)
-    level[5] = bias / 9.78  # as inertial_error starts: fD PY + AX = 0
+    level[5] = bias / 9.78  # initial condition of simulate_inertial_error: fD PY + AX = 0
     free = propagate(cruise, np.zeros(7), drive)
-    held = propagate(cruise, level, drive)
+    aided = propagate(cruise, level, drive)
     quarter = cruise.t < 1200.0
-    assert np.abs(held[quarter, 0]).max() < 0.05 * np.abs(free[quarter, 0]).max()
+    assert np.abs(aided[quarter, 0]).max() < 0.05 * np.abs(free[quarter, 0]).max()
 
 
-def test_the_step_does_not_matter(flight):
+def test_result_does_not_depend_on_the_step(flight):
     fine, coarse = flight.at(np.arange(0, 1200, 0.25)), flight.at(np.arange(0, 1200, 0.5))
     start = np.array([0, 0, 0.1, -0.1, 1e-4, -1e-4, 1e-3])
     ends = [propagate(f, start, np.zeros((len(f.t), 7)))[-1 if f is coarse else -2] for f in (fine, coarse)]
     assert ends[0][:2] == pytest.approx(ends[1][:2], abs=0.5)
 
 
-def test_grades_are_ordered_and_navigation_is_a_mile_an_hour(flight):
+def test_grades_are_ordered_and_navigation_grade_is_a_mile_per_hour(flight):
     start = time.process_time()
     ends = {
-        name: [inertial_error(flight, grade, np.random.default_rng(s)).x_n[-1, :2] for s in range(30)]
+        name: [
+            simulate_inertial_error(flight, grade, np.random.default_rng(s)).x_n[-1, :2] for s in range(30)
+        ]
         for name, grade in GRADES.items()
     }
     assert (time.process_time() - start) / 90 < 0.3
@@ -104,25 +108,25 @@ def test_grades_are_ordered_and_navigation_is_a_mile_an_hour(flight):
     assert 3.0 < rms["mems"] / rms["tactical"] < 30.0
 
 
-def test_velocity_error_is_the_rate_of_the_position_error(flight):
-    error = inertial_error(flight, GRADES["tactical"], np.random.default_rng(3))
+def test_velocity_error_is_the_derivative_of_the_position_error(flight):
+    error = simulate_inertial_error(flight, GRADES["tactical"], np.random.default_rng(3))
     assert np.gradient(error.x_n[:, 0], 0.5)[1:-1] == pytest.approx(error.v_n[1:-1, 0], abs=0.02)
-    at = error_at(error, np.array([10.25]))
+    at = interpolate_error(error, np.array([10.25]))
     assert at.x_n[0] == pytest.approx((error.x_n[20] + error.x_n[21]) / 2.0)
 
 
-def test_gauss_markov_has_unit_variance_and_its_correlation():
+def test_gauss_markov_has_unit_variance_and_correlation_time():
     x = gauss_markov(400_000, 1.0, 20.0, np.random.default_rng(1))[:, 0]
     assert np.std(x) == pytest.approx(1.0, abs=0.03)
     assert np.mean(x[20:] * x[:-20]) == pytest.approx(math.exp(-1.0), abs=0.04)
 
 
-def test_gnss_errs_as_it_states_and_is_silent_in_outages(flight):
+def test_gnss_errors_match_stated_sigmas_and_outages_have_no_fix(flight):
     model = GnssModel()
     at = flight.at(np.arange(0.0, 2520.0, 0.2))
     north, east, white = [], [], []
     for seed in range(20):
-        fixes = gnss(at, model, ((100.0, 160.0),), np.random.default_rng(seed))
+        fixes = simulate_gnss(at, model, ((100.0, 160.0),), np.random.default_rng(seed))
         n = (fixes.lat - at.lat) * 6.39e6
         north.append(n)
         east.append((fixes.lon - at.lon) * 6.39e6 * np.cos(at.lat))
@@ -139,16 +143,16 @@ def test_gnss_errs_as_it_states_and_is_silent_in_outages(flight):
 def test_airspeed_has_turbulence_noise_and_one_scale_factor(flight):
     at = flight.at(np.arange(200.0, 2500.0, 0.1))
     model = AirDataModel(scale=0.0)
-    air = air_data(at, model, np.random.default_rng(2))
+    air = simulate_air_data(at, model, np.random.default_rng(2))
     assert np.std(air.true_airspeed - at.airspeed) == pytest.approx(
         math.hypot(model.turbulence_m_s, model.noise_m_s), rel=0.1
     )
-    wrong = air_data(at, dataclasses.replace(model, scale=0.05), np.random.default_rng(2))
+    wrong = simulate_air_data(at, dataclasses.replace(model, scale=0.05), np.random.default_rng(2))
     ratio = wrong.true_airspeed / air.true_airspeed
     assert np.std(ratio) < 0.01 < abs(np.mean(ratio) - 1.0)
-    # Equivalent airspeed is the less the thinner the air: 1000 m of the standard atmosphere is 0.9529.
+    # ratio of equivalent to true airspeed at 1000 m of the standard atmosphere: 0.9529
     high = flight.at(at.t[at.alt > 1000.0])
-    air = air_data(
+    air = simulate_air_data(
         high, AirDataModel(pressure_noise_pa=0.0, pressure_wander_pa=0.0), np.random.default_rng(2)
     )
     nearest = np.argmin(np.abs(high.alt - 1000.0))
@@ -156,9 +160,9 @@ def test_airspeed_has_turbulence_noise_and_one_scale_factor(flight):
     assert air.equivalent_airspeed[nearest] / air.true_airspeed[nearest] == pytest.approx(expected, abs=2e-3)
 
 
-def test_imu_noise_is_the_grades(flight):
+def test_imu_noise_matches_the_grade(flight):
     at = flight.at(np.arange(100.0, 1100.0, 0.02))
-    f_b, w_b = imu(at, GRADES["tactical"], np.random.default_rng(4))
+    f_b, w_b = simulate_imu(at, GRADES["tactical"], np.random.default_rng(4))
     arw = math.radians(0.07) / 60.0 / math.sqrt(0.02)
     assert np.std(w_b - at.w_b, axis=0) == pytest.approx(arw, rel=0.03)
     assert np.std(f_b - at.f_b, axis=0) == pytest.approx(100e-6 * 9.81 / math.sqrt(0.02), rel=0.03)

@@ -1,4 +1,4 @@
-"""Smoothing on flights of the simulator: nearer to the truth on both channels, and honest about how near."""
+"""Smoothing of simulated flights: nearer to the truth than the filter, with consistent covariance."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from companion.config import Config, EstimatorConfig, InertialConfig, to_toml
 from companion.navigator import Navigator
 from companion.records import AirData, Solution, Tuning
 from sitl import smoothing_study
-from sitl.scenarios import Scenario, named
+from sitl.scenarios import Scenario, get_scenario
 from sitl.world import World
 
 AIR = Config(inertial=InertialConfig(source="air_data"))
 NS = 1_000_000_000
 
 
-def heard(scenario: Scenario) -> list:
-    return list(smoothing_study.records(World(scenario)))
+def received(scenario: Scenario) -> list:
+    return list(smoothing_study.flight_records(World(scenario)))
 
 
 @pytest.mark.parametrize(
@@ -35,35 +35,38 @@ def heard(scenario: Scenario) -> list:
         ("short", "strapdown"),
     ],
 )
-def test_the_smoothed_track_is_nearer_and_honest(name: str, channel: str) -> None:
-    found = smoothing_study.compare(named(name), channel)
+def test_smoothed_track_is_nearer_and_consistent(name: str, channel: str) -> None:
+    found = smoothing_study.compare_flight(get_scenario(name), channel)
     assert math.sqrt(found.smoothed / found.filtered) < 0.8
-    assert found.misfit_smoothed / found.stops < 1.5
+    assert found.misfit_smoothed / found.epochs < 1.5
 
 
-def test_flights_are_pooled_where_gnss_never_fails_long() -> None:
-    parts = [smoothing_study.compare(named("short", seed=seed), "local_position") for seed in range(1, 7)]
-    found = smoothing_study.pooled(parts)
-    assert found.stops == sum(part.stops for part in parts)
+def test_pooled_flights_with_short_outages() -> None:
+    parts = [
+        smoothing_study.compare_flight(get_scenario("short", seed=seed), "local_position")
+        for seed in range(1, 7)
+    ]
+    found = smoothing_study.pool(parts)
+    assert found.epochs == sum(part.epochs for part in parts)
     assert found.better
-    assert found.misfit_smoothed / found.stops < 1.5
+    assert found.misfit_smoothed / found.epochs < 1.5
 
 
-def test_what_a_silent_channel_loses_is_noise_of_the_smoother_too() -> None:
-    """Where no fix came, P is Phi P Phi' + Q from stop to stop, also across a silence of the airspeed."""
-    records = heard(named("short"))
-    lull = [r for r in records if not (isinstance(r, AirData) and 240 * NS < r.t_ns < 244 * NS)]
-    stops = smoothing._forward(lull, AIR)
-    free = [(a, b) for a, b in itertools.pairwise(stops) if not b.fixed]
+def test_process_noise_covers_a_gap_in_the_channel() -> None:
+    """Between fixes P is Phi P Phi' + Q from epoch to epoch, also across a gap of the airspeed."""
+    records = received(get_scenario("short"))
+    gap = [r for r in records if not (isinstance(r, AirData) and 240 * NS < r.t_ns < 244 * NS)]
+    epochs = smoothing._forward_pass(gap, AIR)
+    free = [(a, b) for a, b in itertools.pairwise(epochs) if not b.fixed]
     for before, stop in free:
         np.testing.assert_allclose(stop.Phi @ before.state.P @ stop.Phi.T + stop.Q, stop.state.P, rtol=1e-6)
     assert len(free) > 30
     lost = max(np.trace(stop.Q[:2, :2]) for _, stop in free)
-    assert lost > 2 * (15.0 * 3.0) ** 2  # by 15 m/s for more than 3 s
+    assert lost > 2 * (15.0 * 3.0) ** 2  # 15 m/s for more than 3 s
 
 
-def test_a_channel_chosen_in_flight_parts_it_and_another_sigma_does_not() -> None:
-    records, at = heard(named("short")), 100 * NS
+def test_channel_change_in_flight_splits_the_track_and_sigma_change_does_not() -> None:
+    records, at = received(get_scenario("short")), 100 * NS
     (one,) = smoothing.smooth_flight([*records, Tuning(at, at, to_toml(Config()))], Config())
     (same,) = smoothing.smooth_flight(records, Config())
     np.testing.assert_array_equal(one.x, same.x)
@@ -72,33 +75,33 @@ def test_a_channel_chosen_in_flight_parts_it_and_another_sigma_does_not() -> Non
     assert first.t_ns[-1] <= at < second.t_ns[0] < at + 2 * NS
 
 
-def test_feedback_and_feedforward_are_one_estimate() -> None:
-    """What is taken off the channel is taken off every estimate of its error: on a linear model, which that
-    of dead reckoning nearly is, both schemes give the same position, and the smoother the same track.
+def test_feedback_and_feedforward_agree() -> None:
+    """A correction of the channel is subtracted from the estimate of its error: on a linear model (dead
+    reckoning nearly is one) both schemes give the same position, and the smoother the same track.
     """
-    records = heard(named("short"))
-    ahead, back = (
+    records = received(get_scenario("short"))
+    feedforward, feedback = (
         structs.replace(AIR, estimator=EstimatorConfig(output="kalman", scheme=s))
         for s in ("feedforward", "feedback")
     )
-    told = []
-    for config in (ahead, back):
+    solutions = []
+    for config in (feedforward, feedback):
         navigator = Navigator(config)
         outputs = [out for record in records for out in navigator.handle(record)]
-        told.append([out for out in outputs if isinstance(out, Solution)])
-    assert [s.t_ns for s in told[0]] == [s.t_ns for s in told[1]]
-    late = [(a, b) for a, b in zip(*told, strict=True) if a.t_ns > 30 * NS]
+        solutions.append([out for out in outputs if isinstance(out, Solution)])
+    assert [s.t_ns for s in solutions[0]] == [s.t_ns for s in solutions[1]]
+    late = [(a, b) for a, b in zip(*solutions, strict=True) if a.t_ns > 30 * NS]
     apart = [math.hypot(a.lat - b.lat, (a.lon - b.lon) * 0.5) * 6.4e6 for a, b in late]
-    assert max(apart) < 1.0  # the turn of the meridians over the channel's own error
-    # with fixes the channel that is fed back stays near, the other strays
+    assert max(apart) < 1.0  # meridian convergence over the error of the channel
+    # with feedback the channel error stays small, without it grows
     assert np.median([math.hypot(*b.error_n) for _, b in late]) < 5.0
     assert np.median([math.hypot(*a.error_n) for a, _ in late]) > 50.0
-    (one,), (other,) = (smoothing.smooth_flight(records, config) for config in (ahead, back))
+    (one,), (other,) = (smoothing.smooth_flight(records, config) for config in (feedforward, feedback))
     north = np.interp(one.t_ns, other.t_ns, other.lat) - one.lat
     assert np.abs(north[one.t_ns > 30 * NS]).max() * 6.4e6 < 1.0
 
 
-def test_the_command_prints_a_line_for_each_case() -> None:
+def test_command_prints_a_line_for_each_case() -> None:
     found = CliRunner().invoke(smoothing_study.command, ["--scenario", "short"])
     assert found.exit_code == 0
     assert found.output.count("1 of 1") == 3

@@ -1,9 +1,9 @@
-"""What is kept for later reaches the log whole and in order, and nothing is held twice."""
+"""Deferred log: buffered records reach the log complete and in order."""
 
 from __future__ import annotations
 
 from companion.records import Event, Stamped
-from companion.storage.deferred_log import Deferred
+from companion.storage.deferred_log import DeferredLog
 
 
 class _Log:
@@ -17,17 +17,17 @@ class _Log:
         self.written.append((link, outgoing, data, t_ns))
 
 
-def test_the_log_has_all_in_order_once_settled() -> None:
+def test_flush_writes_everything_in_order_once() -> None:
     log = _Log()
-    deferred = Deferred(log)
+    deferred = DeferredLog(log)
     events = [Event(k, k, 6, str(k)) for k in range(3)]
     deferred.record(events[0])
     deferred.frame("main", True, b"x", 1)
     deferred.record(events[1], "/link/Event")
     assert log.written == []
-    deferred.settle()
+    deferred.flush()
     assert log.written == [(events[0], None), ("main", True, b"x", 1), (events[1], "/link/Event")]
     deferred.record(events[2])
-    deferred.settle()
-    deferred.settle()
+    deferred.flush()
+    deferred.flush()
     assert log.written[3:] == [(events[2], None)]

@@ -1,4 +1,4 @@
-"""The log gives back what was put in, whatever the disk or the power did."""
+"""Flight log: records round trip despite failing disks, truncation and kills."""
 
 import dataclasses
 import errno
@@ -72,14 +72,14 @@ def imu(i: int) -> r.Imu:
 def wait_until(condition, seconds: float = 10.0) -> None:
     end = time.monotonic() + seconds
     while not condition():
-        assert time.monotonic() < end, "did not come true in time"
+        assert time.monotonic() < end, "condition not met in time"
         time.sleep(0.01)
 
 
-# -- what goes in comes out --------------------------------------------------------------------------------
+# -- round trip ----------------------------------------------------------------------------------------------
 
 
-def test_every_kind_of_record_and_frame_comes_back_bit_for_bit(tmp_path):
+def test_records_and_frames_round_trip_bit_for_bit(tmp_path):
     assert {type(one) for one in EVERY_KIND} == set(r.BY_NAME.values())
     path = tmp_path / "x.mcap"
     with Writer(path, metadata={"configuration": {"toml": "a = 1\n"}}, **START) as log:
@@ -104,7 +104,7 @@ def test_every_kind_of_record_and_frame_comes_back_bit_for_bit(tmp_path):
     assert metadata(path)["log"]["start_ns"] == str(START["start_ns"])
 
 
-def test_the_mcap_package_reads_the_same(tmp_path):
+def test_mcap_package_reads_the_same_messages(tmp_path):
     path = tmp_path / "x.mcap"
     with Writer(path, metadata={"a": {"b": "c"}}, chunk_bytes=2000, **START) as log:
         for one in itertools.islice(itertools.cycle(EVERY_KIND), 500):
@@ -112,7 +112,7 @@ def test_the_mcap_package_reads_the_same(tmp_path):
     ours = [(e.topic, e.log_time, e.value) for e in read(path, raw=True)]
     with path.open("rb") as stream:
         reader = make_reader(stream, validate_crcs=True)
-        # its order is by time; the file's is that of the calls
+        # its order is by time; that of the file is the order of writing
         theirs = [(c.topic, m.log_time, m.data) for _, c, m in reader.iter_messages()]
         assert sorted(theirs) == sorted(ours)
         assert {m.name: m.metadata for m in reader.iter_metadata()} == metadata(path)
@@ -127,7 +127,7 @@ def test_the_mcap_package_reads_the_same(tmp_path):
     assert [x.data for x in stream_records if type(x).__name__ == "Message"] == [x[2] for x in ours]
 
 
-def test_positions_stand_on_the_map_no_more_than_twice_a_second(tmp_path):
+def test_map_positions_are_limited_to_two_per_second(tmp_path):
     path = tmp_path / "x.mcap"
     solution = next(one for one in EVERY_KIND if isinstance(one, r.Solution))
 
@@ -152,7 +152,7 @@ def test_positions_stand_on_the_map_no_more_than_twice_a_second(tmp_path):
     assert corrected["timestamp"]["sec"] == start_s
 
 
-def test_a_mad_clock_harms_no_record(tmp_path):
+def test_implausible_times_round_trip(tmp_path):
     mad = [r.Event(-(2**62), 2**63 - 1, 1, "a"), r.Event(2**63 - 1, -(2**62), 1, "b")]
     with Writer(tmp_path / "x.mcap", metadata={}, start_unix_ns=0, start_ns=2**60) as log:
         for one in mad:
@@ -173,16 +173,17 @@ def small(tmp_path_factory) -> bytes:
     return path.read_bytes()
 
 
-def test_a_log_cut_at_any_byte_is_readable_up_to_its_last_whole_chunk_and_repaired(tmp_path, small):
+def test_log_truncated_at_any_byte_is_readable_and_recoverable(tmp_path, small):
     whole, cut = tmp_path / "whole.mcap", tmp_path / "x.mcap.active"
     whole.write_bytes(small)
     entries = list(read(whole))
     ends, have = [], 0  # (where a chunk ends, messages up to there)
 
-    for record in container.scan(io.BytesIO(small[8:]), len(small)):
+    for record in container.scan_records(io.BytesIO(small[8:]), len(small)):
         if record.opcode == container.CHUNK:
             have += sum(
-                m[0] == container.MESSAGE for m in container.messages(container.unpack(record.content))
+                m[0] == container.MESSAGE
+                for m in container.iter_messages(container.decompress_chunk(record.content))
             )
             ends.append((record.offset + 9 + len(record.content), have))
     assert have == len(entries) == 24 and len(ends) >= 4
@@ -201,7 +202,7 @@ def test_a_log_cut_at_any_byte_is_readable_up_to_its_last_whole_chunk_and_repair
         found = info(cut)
         assert not found.closed and found.messages == len(got)
         if size % 9 and size not in {e for end, _ in ends for e in (end - 1, end, end + 1)}:
-            continue  # a repair syncs the disk several times
+            continue  # sample the sizes: a recovery syncs the disk several times
         saved = recover(cut)
         assert saved.path == tmp_path / "x.mcap" and not cut.exists()
         assert saved.messages == len(got)
@@ -211,12 +212,12 @@ def test_a_log_cut_at_any_byte_is_readable_up_to_its_last_whole_chunk_and_repair
         saved.path.unlink()
 
 
-class Killed(BaseException):
-    """The process ends here: nothing after it is done."""
+class KilledError(BaseException):
+    """Simulated end of the process."""
 
 
-class Power:
-    """The calls by which a log is changed, allowed for so many steps; of the last write, so many bytes."""
+class LimitedCalls:
+    """Allows a number of system calls that change a log and a part of the next write, then raises."""
 
     def __init__(self, patch: pytest.MonkeyPatch, steps: int, part: float) -> None:
         self.steps, self.part, self.written = steps, part, 0
@@ -229,7 +230,7 @@ class Power:
             if name == "pwrite":
                 fd, data, at = arguments
                 real(fd, data[: int(len(data) * self.part)], at)
-            raise Killed
+            raise KilledError
         result = real(*arguments)
         self.written += result if name == "pwrite" else 0
         return result
@@ -237,15 +238,13 @@ class Power:
 
 @settings(deadline=None, max_examples=300)
 @given(cut=st.integers(0, 900), steps=st.integers(0, 8), part=st.floats(0, 1))
-def test_a_kill_at_any_instant_of_a_repair_leaves_a_log_that_reads_as_before(
-    tmp_path_factory, small, cut, steps, part
-):
+def test_kill_during_recovery_leaves_a_log_that_reads_as_before(tmp_path_factory, small, cut, steps, part):
     path = tmp_path_factory.mktemp("killed") / "x.mcap.active"
     path.write_bytes(small[: len(small) - cut])
     entries = list(read(path))
     with pytest.MonkeyPatch.context() as patch:
-        Power(patch, steps, part)
-        with suppress(Killed):
+        LimitedCalls(patch, steps, part)
+        with suppress(KilledError):
             recover(path)
     left = path if path.exists() else path.with_suffix("")
     assert list(read(left)) == entries
@@ -255,31 +254,31 @@ def test_a_kill_at_any_instant_of_a_repair_leaves_a_log_that_reads_as_before(
     assert list(read(path.with_suffix(""))) == entries and info(path.with_suffix("")).closed
 
 
-def test_what_stands_is_not_written_again(tmp_path, small):
-    """A log is mended by the bytes that it lacks, and one that is whole by its name alone."""
+def test_recovery_writes_only_the_missing_bytes(tmp_path, small):
+    """Recovery appends the missing bytes only; a complete log is only renamed."""
     path = tmp_path / "x.mcap.active"
-    for cut in (0, 30, len(small) - small.rindex(container.record(container.DATA_END, bytes(4)))):
+    for cut in (0, 30, len(small) - small.rindex(container.encode_record(container.DATA_END, bytes(4)))):
         path.write_bytes(small[: len(small) - cut])
         node = path.stat().st_ino
         with pytest.MonkeyPatch.context() as patch:
-            power = Power(patch, 100, 0.0)
+            power = LimitedCalls(patch, 100, 0.0)
             assert recover(path).messages == 24
         assert power.written == cut
         assert (tmp_path / "x.mcap").read_bytes() == small and (tmp_path / "x.mcap").stat().st_ino == node
         (tmp_path / "x.mcap").unlink()
 
 
-def test_a_log_damaged_before_its_end_is_left_as_it_was_until_its_copy_is_whole(tmp_path, small):
+def test_damaged_log_is_unchanged_until_its_copy_is_complete(tmp_path, small):
     path = tmp_path / "x.mcap.active"
-    for at in range(8, small.rindex(container.record(container.DATA_END, bytes(4))), 7):
+    for at in range(8, small.rindex(container.encode_record(container.DATA_END, bytes(4))), 7):
         damaged = bytearray(small[:-20])
         damaged[at] ^= 0xFF
         path.write_bytes(damaged)
         kept = None
         with suppress(LogError):
             kept = list(read(path))
-        with pytest.MonkeyPatch.context() as patch, suppress(LogError, Killed):
-            Power(patch, 2, 0.5)
+        with pytest.MonkeyPatch.context() as patch, suppress(LogError, KilledError):
+            LimitedCalls(patch, 2, 0.5)
             recover(path)
         if kept is not None and path.exists():
             assert list(read(path))[: len(kept)] == kept, at
@@ -291,13 +290,17 @@ def test_a_log_damaged_before_its_end_is_left_as_it_was_until_its_copy_is_whole(
             one.unlink()
 
 
-def test_of_a_torn_chunk_that_is_stored_plain_the_whole_messages_are_saved(tmp_path):
+def test_complete_messages_of_a_truncated_uncompressed_chunk_are_saved(tmp_path):
     chunk = container.Chunk()
     for i in range(10):
         chunk.add(1, i, i, i, b"%d" % i)
-    body = container.pack(chunk, bytes(chunk.data))[0].replace(container.text("zstd"), container.text(""))
-    definition = container.record(container.CHANNEL, bytes([1, 0, 0, 0]) + container.text("t") * 2 + bytes(4))
-    head = container.MAGIC + container.record(container.HEADER, container.text("") * 2)
+    body = container.encode_chunk(chunk, bytes(chunk.data))[0].replace(
+        container.encode_string("zstd"), container.encode_string("")
+    )
+    definition = container.encode_record(
+        container.CHANNEL, bytes([1, 0, 0, 0]) + container.encode_string("t") * 2 + bytes(4)
+    )
+    head = container.MAGIC + container.encode_record(container.HEADER, container.encode_string("") * 2)
     path = tmp_path / "x.mcap"
     path.write_bytes(head + definition + body[:-40])
     assert [e.value for e in read(path)] == [b"%d" % i for i in range(8)]
@@ -305,7 +308,7 @@ def test_of_a_torn_chunk_that_is_stored_plain_the_whole_messages_are_saved(tmp_p
     assert saved.messages == 8 and saved.path.name == "x.recovered.mcap" and path.exists()
 
 
-def test_a_damaged_byte_is_met_by_a_sentence_and_recover_saves_the_rest(tmp_path, small):
+def test_damaged_byte_is_reported_and_the_rest_is_recovered(tmp_path, small):
     path = tmp_path / "x.mcap"
     at = small.index(b"\x28\xb5\x2f\xfd") + 30  # inside the first compressed chunk
     path.write_bytes(small[:at] + bytes([small[at] ^ 0xFF]) + small[at + 1 :])
@@ -320,7 +323,7 @@ def test_a_damaged_byte_is_met_by_a_sentence_and_recover_saves_the_rest(tmp_path
 
 @settings(deadline=None, max_examples=1500)
 @given(data=st.data())
-def test_no_bytes_raise_anything_but_a_sentence(tmp_path_factory, small, data):
+def test_arbitrary_bytes_raise_only_log_error(tmp_path_factory, small, data):
     kind = data.draw(st.integers(0, 2))
     if kind == 0:
         junk = data.draw(st.binary(max_size=200))
@@ -343,32 +346,37 @@ def test_no_bytes_raise_anything_but_a_sentence(tmp_path_factory, small, data):
             assert "\n" not in str(error) and str(path.parent) in str(error)
 
 
-def test_what_is_no_log_gets_one_clear_sentence(tmp_path):
+def test_invalid_log_is_reported_in_one_sentence(tmp_path):
     for name, content, words in (
         ("empty", b"", "is empty"),
         ("foreign", b"\x7fELF" * 20, "is not an MCAP log"),
-        ("short", container.MAGIC[:5], "cut off before its header"),
-        ("zeros", container.MAGIC + bytes(100), "cut off before its header"),
+        ("short", container.MAGIC[:5], "is truncated within its header"),
+        ("zeros", container.MAGIC + bytes(100), "is truncated within its header"),
     ):
         (tmp_path / name).write_bytes(content)
         with pytest.raises(LogError, match=words):
             list(read(tmp_path / name))
     with pytest.raises(LogError, match="cannot be read: No such file"):
         info(tmp_path / "missing")
-    bomb = container.record(
-        container.CHUNK, bytes(16), (2**62).to_bytes(8, "little"), bytes(4), container.text("zstd"), bytes(8)
+    bomb = container.encode_record(
+        container.CHUNK,
+        bytes(16),
+        (2**62).to_bytes(8, "little"),
+        bytes(4),
+        container.encode_string("zstd"),
+        bytes(8),
     )
-    head = container.MAGIC + container.record(container.HEADER, container.text("") * 2)
-    foot = container.record(container.FOOTER, bytes(20)) + container.MAGIC
+    head = container.MAGIC + container.encode_record(container.HEADER, container.encode_string("") * 2)
+    foot = container.encode_record(container.FOOTER, bytes(20)) + container.MAGIC
     (tmp_path / "bomb").write_bytes(head + bomb + foot)
-    with pytest.raises(LogError, match="claims"):
+    with pytest.raises(LogError, match="states"):
         list(read(tmp_path / "bomb"))
 
 
-# -- the conformance suite -----------------------------------------------------------------------------------
+# -- conformance suite ---------------------------------------------------------------------------------------
 
 
-def test_all_files_of_the_conformance_suite_are_read(tmp_path):
+def test_conformance_suite_is_read(tmp_path):
     with tarfile.open(SUITE) as archive:
         archive.extractall(tmp_path, filter="data")
     logs = sorted(tmp_path.glob("*/*.mcap"))
@@ -388,23 +396,23 @@ def test_all_files_of_the_conformance_suite_are_read(tmp_path):
         assert metadata(path) == names
 
 
-# -- disks and power -----------------------------------------------------------------------------------------
+# -- disk faults and kills -----------------------------------------------------------------------------------
 
 
 @dataclasses.dataclass
-class Sick:
-    """A disk of which `refuses` says what it does before every write: nothing, wait, or raise."""
+class FaultyDisk:
+    """A disk that calls `fault` before every write, which may wait, or return an error to raise."""
 
     path: Path
-    refuses: object
+    fault: object
 
     def __post_init__(self):
         self.disk = DiskFile(self.path)
 
     def write(self, data):
-        error = self.refuses()
+        error = self.fault()
         if error is not None:
-            self.disk.write(data[: len(data) // 2])  # a full disk takes a part
+            self.disk.write(data[: len(data) // 2])  # a full disk writes a part
             raise error
         self.disk.write(data)
 
@@ -412,14 +420,16 @@ class Sick:
         return getattr(self.disk, name)
 
 
-def test_a_full_disk_is_said_and_waited_for_and_nothing_is_lost_that_there_is_room_for(tmp_path):
+def test_full_disk_is_reported_and_queued_records_are_not_lost(tmp_path):
     full = threading.Event()
 
-    def refuses():
+    def fault():
         return OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)) if full.is_set() else None
 
     path = tmp_path / "x.mcap"
-    log = Writer(path, metadata={}, chunk_bytes=500, fsync_s=0.05, disk=lambda p: Sick(p, refuses), **START)
+    log = Writer(
+        path, metadata={}, chunk_bytes=500, fsync_s=0.05, disk=lambda p: FaultyDisk(p, fault), **START
+    )
     written = []
     for phase in range(3):
         full.set() if phase == 1 else full.clear()
@@ -434,11 +444,11 @@ def test_a_full_disk_is_said_and_waited_for_and_nothing_is_lost_that_there_is_ro
     assert [e.value for e in read(path)] == written
 
 
-@pytest.mark.parametrize("refusals", [1, 2, 5])
-def test_what_a_refusing_disk_took_and_would_not_give_back_is_written_over(tmp_path, refusals):
-    """A disk that drops out takes a part, refuses to cut it off, and is well again."""
+@pytest.mark.parametrize("failures", [1, 2, 5])
+def test_partial_write_that_cannot_be_truncated_is_overwritten(tmp_path, failures):
+    """The disk writes a part, fails to truncate it, then works again."""
 
-    class Flaky(Sick):
+    class Flaky(FaultyDisk):
         left = 0
 
         def truncate(self, size):
@@ -449,10 +459,10 @@ def test_what_a_refusing_disk_took_and_would_not_give_back_is_written_over(tmp_p
 
     drops, disks = threading.Event(), []
 
-    def refuses():
+    def fault():
         if drops.is_set():
             drops.clear()
-            disks[0].left = refusals
+            disks[0].left = failures
             return OSError(errno.EIO, "broken")
         return None
 
@@ -462,7 +472,7 @@ def test_what_a_refusing_disk_took_and_would_not_give_back_is_written_over(tmp_p
         metadata={},
         chunk_bytes=500,
         fsync_s=0.05,
-        disk=lambda p: disks.append(Flaky(p, refuses)) or disks[0],
+        disk=lambda p: disks.append(Flaky(p, fault)) or disks[0],
         **START,
     )
     for i in range(200):
@@ -476,7 +486,7 @@ def test_what_a_refusing_disk_took_and_would_not_give_back_is_written_over(tmp_p
         assert sum(1 for _ in make_reader(stream, validate_crcs=True).iter_messages()) == 200
 
 
-def test_a_disk_that_stays_full_costs_the_oldest_and_they_are_counted(tmp_path):
+def test_permanently_full_disk_drops_the_oldest_and_counts_them(tmp_path):
     full = threading.Event()
     log = Writer(
         tmp_path / "x.mcap",
@@ -484,7 +494,7 @@ def test_a_disk_that_stays_full_costs_the_oldest_and_they_are_counted(tmp_path):
         chunk_bytes=500,
         fsync_s=0.05,
         depth=2000,
-        disk=lambda p: Sick(p, lambda: OSError(errno.EIO, "broken") if full.is_set() else None),
+        disk=lambda p: FaultyDisk(p, lambda: OSError(errno.EIO, "broken") if full.is_set() else None),
         **START,
     )
     full.set()
@@ -498,13 +508,13 @@ def test_a_disk_that_stays_full_costs_the_oldest_and_they_are_counted(tmp_path):
     assert log.dropped + len(kept) == 500
 
 
-def test_a_disk_that_never_comes_back_leaves_a_log_to_recover(tmp_path):
+def test_failed_disk_leaves_a_recoverable_log(tmp_path):
     full = threading.Event()
     log = Writer(
         tmp_path / "x.mcap",
         metadata={},
         fsync_s=0.05,
-        disk=lambda p: Sick(p, lambda: OSError(errno.ENOSPC, "full") if full.is_set() else None),
+        disk=lambda p: FaultyDisk(p, lambda: OSError(errno.ENOSPC, "full") if full.is_set() else None),
         **START,
     )
     log.record(imu(0))
@@ -517,22 +527,22 @@ def test_a_disk_that_never_comes_back_leaves_a_log_to_recover(tmp_path):
     assert recover(tmp_path / "x.mcap.active").messages == 1
 
 
-def test_a_slow_disk_never_holds_the_caller(tmp_path):
-    """While the disk holds the writer nothing else waits: it is let go only after the last record."""
+def test_slow_disk_does_not_block_the_caller(tmp_path):
+    """The disk is blocked until after the last record; no call of the writer waits for it."""
     slow, holds, go = threading.Event(), threading.Event(), threading.Event()
-    patience = []
+    released = []
 
     def wait():
         if slow.is_set():
             holds.set()
-            patience.append(go.wait(30.0))
+            released.append(go.wait(30.0))
 
     log = Writer(
         tmp_path / "x.mcap",
         metadata={},
         chunk_bytes=2000,
         fsync_s=0.05,
-        disk=lambda p: Sick(p, wait),
+        disk=lambda p: FaultyDisk(p, wait),
         **START,
     )
     slow.set()
@@ -543,14 +553,14 @@ def test_a_slow_disk_never_holds_the_caller(tmp_path):
         log.record(imu(k))
     slow.clear()
     go.set()
-    assert log.close() and log.dropped == 0 and all(patience)
+    assert log.close() and log.dropped == 0 and all(released)
     assert sum(1 for _ in read(tmp_path / "x.mcap")) == i
 
 
-def test_with_block_the_caller_waits_and_nothing_is_dropped(tmp_path):
+def test_blocking_writer_drops_nothing(tmp_path):
     log = Writer(
         tmp_path / "x.mcap", metadata={}, chunk_bytes=1000, depth=2000, block=True,
-        disk=lambda p: Sick(p, lambda: time.sleep(0.005)), **START,
+        disk=lambda p: FaultyDisk(p, lambda: time.sleep(0.005)), **START,
     )  # fmt: skip
     for i in range(1000):
         log.record(imu(i))
@@ -558,7 +568,7 @@ def test_with_block_the_caller_waits_and_nothing_is_dropped(tmp_path):
     assert [e.value.t_ns for e in read(tmp_path / "x.mcap")] == [imu(i).t_ns for i in range(1000)]
 
 
-def test_the_kernels_own_limit_on_a_file_is_survived(tmp_path):
+def test_file_size_limit_of_the_kernel_is_survived(tmp_path):
     path = tmp_path / "x.mcap"
     log = Writer(path, metadata={}, chunk_bytes=4000, fsync_s=0.05, **START)
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -575,13 +585,13 @@ def test_the_kernels_own_limit_on_a_file_is_survived(tmp_path):
     assert [e.value for e in read(path)] == [imu(k) for k in range(i)]
 
 
-def test_a_folder_that_cannot_be_written_gets_one_clear_sentence(tmp_path):
+def test_unwritable_folder_is_reported_in_one_sentence(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(LogError, match=r"cannot keep logs in .*: (Not a directory|File exists)"):
-        retention.open_log(tmp_path / "file", metadata={}, **START)
+        retention.create_log(tmp_path / "file", metadata={}, **START)
     with pytest.raises(LogError, match=r"cannot write a log to .*: No such file"):
         Writer(tmp_path / "missing" / "x.mcap", metadata={}, **START)
-    if os.geteuid() == 0:  # root writes everywhere but into the kernel's own folders
+    if os.geteuid() == 0:  # root can write everywhere except in kernel folders
         with pytest.raises(LogError, match="cannot write a log to"):
             Writer("/proc/x.mcap", metadata={}, **START)
         return
@@ -593,7 +603,7 @@ def test_a_folder_that_cannot_be_written_gets_one_clear_sentence(tmp_path):
 
 KILLED = """
 import sys, time
-from companion.log.file import Writer
+from companion.storage.flight_log import Writer
 from companion.records import Event
 log = Writer(sys.argv[1], metadata={}, start_unix_ns=10**18, start_ns=0)
 i = 0
@@ -607,31 +617,31 @@ while True:
 
 
 @pytest.mark.parametrize("life_s", [0.3, 1.7])
-def test_a_killed_writer_loses_at_most_its_last_second(tmp_path, life_s):
+def test_killed_writer_loses_at_most_the_last_second(tmp_path, life_s):
     path = tmp_path / "x.mcap"
     with subprocess.Popen([sys.executable, "-c", KILLED, str(path)], stdout=subprocess.PIPE) as child:
         assert child.stdout is not None
-        said = [child.stdout.readline()]
+        printed = [child.stdout.readline()]
         end = time.monotonic() + life_s
         while time.monotonic() < end:
-            said.append(child.stdout.readline())
+            printed.append(child.stdout.readline())
         with pytest.raises(LogError, match="still being written"):
             recover(f"{path}.active")
         child.send_signal(signal.SIGKILL)
-        said += child.stdout.readlines()
-    last_ns = int(said[-1].split()[0])
-    (saved,) = retention.recover_left(tmp_path)
+        printed += child.stdout.readlines()
+    last_ns = int(printed[-1].split()[0])
+    (saved,) = retention.recover_unclosed(tmp_path)
     assert saved.path == path
     kept = [e.value for e in read(path)]
     assert [one.rx_ns for one in kept] == list(range(len(kept)))
-    lost = [int(line.split()[0]) for line in said if line.endswith(b"\n")][len(kept) :]
+    lost = [int(line.split()[0]) for line in printed if line.endswith(b"\n")][len(kept) :]
     assert not lost or last_ns - lost[0] < 1_000_000_000
 
 
 # -- command --------------------------------------------------------------------------------------
 
 
-def test_the_command_shows_repairs_and_fails_in_one_sentence(tmp_path, small):
+def test_log_command_shows_recovers_and_reports_errors(tmp_path, small):
     run = CliRunner()
     (tmp_path / "x.mcap").write_bytes(small)
     (tmp_path / "y.mcap.active").write_bytes(small[:-60])
@@ -643,7 +653,7 @@ def test_the_command_shows_repairs_and_fails_in_one_sentence(tmp_path, small):
     }  # fmt: skip
     assert "torn" in run.invoke(group, ["info", str(tmp_path / "y.mcap.active")]).output
     assert "24 messages" in run.invoke(group, ["recover", str(tmp_path / "y.mcap.active")]).output
-    assert "is whole" in run.invoke(group, ["recover", str(tmp_path / "y.mcap")]).output
+    assert "is complete" in run.invoke(group, ["recover", str(tmp_path / "y.mcap")]).output
     for command in ("info", "recover"):
         failed = run.invoke(group, [command, str(tmp_path / "none")])
         assert failed.exit_code == 1 and failed.output.count("\n") == 1

@@ -1,4 +1,4 @@
-"""Which logs a folder keeps: the last ones begun, whatever the clock said, and none goes in vain."""
+"""Log retention: the newest logs are kept independently of the clock; nothing is deleted in vain."""
 
 import os
 import shutil
@@ -16,17 +16,17 @@ MIB = 1 << 20
 NS = 10**9
 
 
-def fly(place: Path, unix_s: int = 0, *, max_files: int = 100, min_free: int = 0) -> str:
-    """One log of one record; its name."""
-    with retention.open_log(
+def write_log(place: Path, unix_s: int = 0, *, max_files: int = 100, min_free: int = 0) -> str:
+    """Write a log of one record and return its name."""
+    with retention.create_log(
         place, metadata={}, start_unix_ns=unix_s * NS, start_ns=0, max_files=max_files, min_free=min_free
     ) as log:
         log.record(Event(1, 1, 6, "x"))
     return log.path.name
 
 
-def tear(place: Path, name: str) -> Path:
-    """Make of a closed log one that lacks its end."""
+def truncate_log(place: Path, name: str) -> Path:
+    """Remove the end of a closed log."""
     torn = place / f"{name}.active"
     torn.write_bytes((place / name).read_bytes()[:-60])
     (place / name).unlink()
@@ -37,8 +37,8 @@ def names(place: Path) -> list[str]:
     return sorted(path.name for path in place.iterdir())
 
 
-class Room:
-    """A disk of so many bytes, of which the files of a folder take theirs and others `taken`."""
+class SimulatedDisk:
+    """A simulated disk of `total` bytes, used by the files of a folder and by `taken` bytes of others."""
 
     def __init__(self, patch: pytest.MonkeyPatch, place: Path, total: int, taken: int = 0) -> None:
         self.place, self.total, self.taken = place, total, taken
@@ -57,15 +57,15 @@ def filled(place: Path, name: str, size: int = MIB) -> Path:
 
 @settings(deadline=None, max_examples=30)
 @given(clock=st.lists(st.integers(0, 3) | st.integers(0, 2_000_000_000), min_size=1, max_size=12))
-def test_the_last_logs_begun_are_kept_whatever_the_clock_said(tmp_path_factory, clock):
-    """A board without a battery begins in 1970 each time; many flights have one name but for the number."""
+def test_newest_logs_are_kept_independently_of_the_clock(tmp_path_factory, clock):
+    """A board without a clock battery starts in 1970 each time: names differ only in the number."""
     place = tmp_path_factory.mktemp("logs")
-    made = [fly(place, unix_s, max_files=3) for unix_s in clock]
+    made = [write_log(place, unix_s, max_files=3) for unix_s in clock]
     assert names(place) == sorted(made[-3:]) == made[-3:]
 
 
-def test_names_of_earlier_versions_go_first_and_in_their_order(tmp_path):
-    """Of those within one second the tenth came after the second."""
+def test_logs_of_earlier_versions_are_deleted_first(tmp_path):
+    """Within one second the suffix -10 is later than -2."""
     old = ["19700101T000001Z.mcap", *(f"19700101T000001Z-{i}.mcap" for i in range(2, 12))]
     old += ["20260101T000000Z.mcap", "20260101T000000Z.recovered.mcap"]
     for name in old:
@@ -73,58 +73,58 @@ def test_names_of_earlier_versions_go_first_and_in_their_order(tmp_path):
     (tmp_path / "mine.mcap").write_text("keep")
     (tmp_path / "00007-mine.mcap").write_text("keep")
     for left in range(len(old), 1, -1):
-        new = fly(tmp_path, max_files=left)
+        new = write_log(tmp_path, max_files=left)
         kept = {*old[len(old) - left + 1 :], new, "mine.mcap", "00007-mine.mcap"}
         assert kept <= set(names(tmp_path)) and len(names(tmp_path)) == left + 2
         (tmp_path / new).unlink()
 
 
-def test_a_number_follows_the_greatest_that_lies_there(tmp_path):
-    assert fly(tmp_path) == "00001-19700101T000000Z.mcap"
+def test_new_log_number_follows_the_greatest(tmp_path):
+    assert write_log(tmp_path) == "00001-19700101T000000Z.mcap"
     filled(tmp_path, "99999-20260101T000000Z.mcap", 0)  # copied from another aircraft
-    assert [fly(tmp_path, max_files=3) for _ in range(2)] == [
+    assert [write_log(tmp_path, max_files=3) for _ in range(2)] == [
         "100000-19700101T000000Z.mcap",
         "100001-19700101T000000Z.mcap",
     ]
     assert "00001-19700101T000000Z.mcap" not in names(tmp_path)
-    assert tear(tmp_path, fly(tmp_path)).name == "100002-19700101T000000Z.mcap.active"
-    assert fly(tmp_path) == "100003-19700101T000000Z.mcap"
+    assert truncate_log(tmp_path, write_log(tmp_path)).name == "100002-19700101T000000Z.mcap.active"
+    assert write_log(tmp_path) == "100003-19700101T000000Z.mcap"
 
 
-def test_a_limit_that_no_deletion_reaches_deletes_nothing(tmp_path, monkeypatch):
-    made = [fly(tmp_path, i) for i in range(5)]
-    Room(monkeypatch, tmp_path, 100 * MIB, taken=90 * MIB)
+def test_unreachable_limit_deletes_nothing(tmp_path, monkeypatch):
+    made = [write_log(tmp_path, i) for i in range(5)]
+    SimulatedDisk(monkeypatch, tmp_path, 100 * MIB, taken=90 * MIB)
     for limit in (1 << 44, 11 * MIB):
-        with pytest.raises(LogError, match=r"with all of them deleted there would still not be \d+ MiB free"):
-            fly(tmp_path, 9, min_free=limit, max_files=2)
+        with pytest.raises(LogError, match=r"deleting all of them would not leave \d+ MiB free"):
+            write_log(tmp_path, 9, min_free=limit, max_files=2)
         assert names(tmp_path) == made
     assert not retention.make_room(tmp_path, 11 * MIB) and names(tmp_path) == made
 
 
-def test_no_more_goes_than_the_room_takes(tmp_path, monkeypatch):
+def test_no_more_logs_are_deleted_than_needed(tmp_path, monkeypatch):
     for number in range(1, 9):
         filled(tmp_path, f"{number:05d}-20260101T000000Z.mcap")
-    room = Room(monkeypatch, tmp_path, 10 * MIB)
+    disk = SimulatedDisk(monkeypatch, tmp_path, 10 * MIB)
     assert retention.make_room(tmp_path, 2 * MIB) and len(names(tmp_path)) == 8
-    assert retention.make_room(tmp_path, 2 * MIB + 1) and room.free >= 2 * MIB + 1
+    assert retention.make_room(tmp_path, 2 * MIB + 1) and disk.free >= 2 * MIB + 1
     assert names(tmp_path) == [f"{number:05d}-20260101T000000Z.mcap" for number in range(2, 9)]
 
 
-def test_torn_logs_go_by_their_age_as_others_do_but_none_that_is_written(tmp_path, monkeypatch):
+def test_torn_logs_are_deleted_by_age_but_not_a_log_being_written(tmp_path, monkeypatch):
     filled(tmp_path, "00001-20260101T000000Z.mcap.active")
     filled(tmp_path, "00002-20260101T000000Z.mcap")
     filled(tmp_path, "00003-20260101T000000Z.mcap.active")
-    room = Room(monkeypatch, tmp_path, 10 * MIB)
+    disk = SimulatedDisk(monkeypatch, tmp_path, 10 * MIB)
     with Writer(tmp_path / "00000-20260101T000000Z.mcap", metadata={}, start_unix_ns=0, start_ns=0) as other:
-        assert retention.make_room(tmp_path, room.free + MIB)
+        assert retention.make_room(tmp_path, disk.free + MIB)
         assert names(tmp_path)[1:] == ["00002-20260101T000000Z.mcap", "00003-20260101T000000Z.mcap.active"]
         assert retention.make_room(tmp_path, 0, max_files=0)
         assert names(tmp_path) == [f"{other.path.name}.active"]
     assert info(other.path).closed
 
 
-def test_where_torn_logs_are_mended_the_oldest_makes_the_room_and_the_newest_stays(tmp_path, monkeypatch):
-    torn = [tear(tmp_path, fly(tmp_path, i)) for i in range(4)]
+def test_recovery_deletes_the_oldest_and_keeps_the_newest(tmp_path, monkeypatch):
+    torn = [truncate_log(tmp_path, write_log(tmp_path, i)) for i in range(4)]
     wanted = []
 
     def make_room(place: Path, wanted_bytes: int) -> bool:
@@ -133,18 +133,18 @@ def test_where_torn_logs_are_mended_the_oldest_makes_the_room_and_the_newest_sta
 
     real = retention.make_room
     monkeypatch.setattr(retention, "make_room", make_room)
-    saved = retention.recover_left(tmp_path, 1 << 60)  # each asks for room, and only the first finds some
+    saved = retention.recover_unclosed(tmp_path, 1 << 60)  # each needs space, and only the first gets some
     assert saved == [] and names(tmp_path) == [one.name for one in torn[1:]] and len(wanted) == 3
-    assert [one.path.name for one in retention.recover_left(tmp_path)] == [
+    assert [one.path.name for one in retention.recover_unclosed(tmp_path)] == [
         one.name.removesuffix(".active") for one in torn[:0:-1]
     ]
 
 
-def test_a_log_that_is_whole_only_gets_its_name(tmp_path):
-    name = fly(tmp_path)
-    (tmp_path / name).rename(tmp_path / f"{name}.active")  # killed before it was closed
+def test_complete_log_is_only_renamed(tmp_path):
+    name = write_log(tmp_path)
+    (tmp_path / name).rename(tmp_path / f"{name}.active")  # killed before the rename
     node = (tmp_path / f"{name}.active").stat().st_ino
-    (saved,) = retention.recover_left(tmp_path, 1 << 60)
+    (saved,) = retention.recover_unclosed(tmp_path, 1 << 60)
     assert (saved.path, saved.messages) == (tmp_path / name, 1)
     assert saved.path.stat().st_ino == node and names(tmp_path) == [name]
-    assert retention.recover_left(tmp_path) == []
+    assert retention.recover_unclosed(tmp_path) == []

@@ -1,4 +1,4 @@
-"""`companion study horizon` answers in the numbers of the closed form."""
+"""`companion study horizon` agrees with the closed form."""
 
 import json
 import math
@@ -8,7 +8,7 @@ import pytest
 from click.testing import CliRunner
 
 from companion.estimate.minimax import closed_form
-from companion.estimate.schuler import DEG_PER_HOUR, MEAN_EARTH
+from companion.estimate.schuler import DEG_PER_HOUR
 from companion.study.horizon import Horizon, command
 
 
@@ -16,7 +16,7 @@ def run(*arguments):
     return CliRunner().invoke(command, arguments)
 
 
-def test_numbers_of_the_closed_form():
+def test_bounds_match_the_closed_form():
     answer = json.loads(
         run("--sigma-m", "30", "--window-min", "15", "--ahead-min", "5,10,20", "--json").stdout
     )
@@ -32,20 +32,17 @@ def test_numbers_of_the_closed_form():
     assert answer["table"][1]["ls_worst_m"] == pytest.approx(1786.5, abs=0.05)
 
 
-def test_how_long_without_fixes():
+def test_longest_time_without_fixes():
     horizon = Horizon(30.0, 900.0)
     longest = horizon.longest(1000.0)
     assert horizon.position(longest) <= 1000.0 < horizon.position(longest + 1.0)
-    ahead = [
-        closed_form(900 * MEAN_EARTH.rate, t * MEAN_EARTH.rate).bounds[0] * 30.0
-        for t in (longest, longest + 1)
-    ]
+    ahead = [closed_form(900.0, t, 30.0).bounds[0] for t in (longest, longest + 1)]
     assert ahead[0] <= 1000.0 < ahead[1]
-    assert horizon.longest(1.0) == 0.0  # not even now
+    assert horizon.longest(1.0) == 0.0  # already exceeded at the last fix
     assert f"below 1000 m for {longest / 60:.1f} min" in run("--limit-m", "1000").stdout
 
 
-def test_a_trusted_drift_buys_time_and_never_costs():
+def test_known_drift_never_increases_the_bound():
     free = Horizon(30.0, 900.0)
     kept = [Horizon(30.0, 900.0, drift=grade * DEG_PER_HOUR) for grade in (0.01, 0.1, 10.0)]
     for minutes in (0, 10, 40, 120):
@@ -64,19 +61,19 @@ def test_table_grade_and_plot(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "told"),
+    ("arguments", "message"),
     [
-        (("--ahead-min", "ten"), "not a number nor a list"),
-        (("--ahead-min", "-5,3"), "give minutes from 0 up"),
-        (("--ins", "best"), "no grade"),
-        (("--sigma-m", "-3"), "'--sigma-m': -3 is no distance: give metres above 0"),
-        (("--sigma-m", "nan"), "nan is no distance"),
-        (("--limit-m", "-5"), "'--limit-m': -5 is no distance: give metres above 0"),
+        (("--ahead-min", "ten"), "neither a number nor a list"),
+        (("--ahead-min", "-5,3"), "give minutes of 0 or more"),
+        (("--ins", "best"), "neither a grade"),
+        (("--sigma-m", "-3"), "'--sigma-m': -3 is not a valid distance: give metres above 0"),
+        (("--sigma-m", "nan"), "nan is not a valid distance"),
+        (("--limit-m", "-5"), "'--limit-m': -5 is not a valid distance: give metres above 0"),
         (("--window-min", "0"), "give positive seconds"),
         (("--window-min", "1", "--every-s", "60"), "too few fixes"),
     ],
 )
-def test_bad_options_are_told(arguments, told):
+def test_invalid_options_are_reported(arguments, message):
     result = run(*arguments)
     assert result.exit_code == 2
-    assert told in " ".join(result.output.replace("│", " ").split())
+    assert message in " ".join(result.output.replace("│", " ").split())

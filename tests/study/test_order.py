@@ -1,4 +1,4 @@
-"""`companion study order` tells the order, whether the basis spans the signal, and what a mistake was."""
+"""`companion study order` selects the order, detects whether the basis spans the signal, reports errors."""
 
 import json
 import pathlib
@@ -33,7 +33,7 @@ def test_table():
     assert "RSS/(N - r_max)" in output
 
 
-def test_a_file_of_samples(tmp_path):
+def test_samples_from_a_file(tmp_path):
     file, t = tmp_path / "samples.csv", np.linspace(5.0, 9.0, 80)
     z = 3.0 * t + 0.01 * np.random.default_rng(0).standard_normal(80)
     np.savetxt(file, np.column_stack((t, z)), delimiter=",")
@@ -51,23 +51,23 @@ def test_plot(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("text", "options", "said"),
+    ("text", "options", "message"),
     [
-        ("t,z\n1,2\n", (), "is no table of numbers"),
+        ("t,z\n1,2\n", (), "is not a table of numbers"),
         ("1,2,3,4\n", (), "has 4 columns"),
-        ("1,2\n0,3\n4,5\n", ("--r-max", 2), "the times do not rise"),
+        ("1,2\n0,3\n4,5\n", ("--r-max", 2), "the times are not increasing"),
         ("0,2\n1,3\n", (), "r_max is 12 for 2 samples"),
     ],
 )
-def test_bad_input_is_one_sentence(tmp_path, text, options, said):
+def test_invalid_input_is_reported_in_one_sentence(tmp_path, text, options, message):
     file = tmp_path / "samples.csv"
     file.write_text(text)
     result = run(file, *options)
     assert result.exit_code == 2
-    assert said in " ".join(result.output.split())
+    assert message in " ".join(result.output.split())
 
 
-def test_the_short_form_takes_nine_terms_for_a_cubic():
+def test_short_form_selects_nine_terms_for_a_cubic():
     data = json.loads((pathlib.Path(__file__).parents[1] / "data/map_and_order.json").read_text())["order"]
     t = np.linspace(0.0, 10.0, 101)
     samples = Samples(t, np.array(data["z"]["cubic"]), 0.2 * (1.0 + 0.05 * t))

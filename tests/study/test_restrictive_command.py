@@ -7,7 +7,7 @@ from click.testing import CliRunner
 from companion.study.restrictive import TRUTHS, command
 
 COLUMNS = ["dx", "dy", "dVN", "dVE", "PX", "PY", "PZ", "VcX", "VcY", "GX", "GY", "AX"]
-# rms error of the minimax filter over that of R1, found by an independent program over 200 runs
+# rms error of the minimax filter divided by that of R1, from an independent program, 200 runs
 RATIOS = {
     "constant": [0.59, 0.58, 1.79, 1.51, 1.21, 1.09, 0.58, 1.73, 1.49, 0.64, 0.69, 1.00],
     "telegraph": [0.89, 0.90, 2.00, 2.02, 1.67, 1.63, 0.90, 1.98, 2.00, 0.74, 0.75, 1.00],
@@ -29,7 +29,7 @@ def test_ratios(rows, truth):
     np.testing.assert_allclose([row[c] for c in COLUMNS], RATIOS[truth], rtol=0.1)
 
 
-def test_absolute_errors_of_the_first_row(rows):
+def test_rms_errors_of_the_first_row(rows):
     row = rows["constant"]
     for name, coarse, restrictive in (
         ("dx", 0.497, 0.848),
@@ -44,7 +44,7 @@ def test_absolute_errors_of_the_first_row(rows):
 
 
 def test_consistency(rows):
-    """Minimax is honest where U is Gaussian; on the bound both promise too much, R1 much more."""
+    """Minimax is consistent for Gaussian U; on the bound both variances are too small, R1 much more so."""
     assert rows["white"]["nees_minimax_per_dimension"] == pytest.approx(1.0, abs=0.05)
     bound = rows["constant"]
     assert 0.54 <= bound["on_bound"] <= 0.62 and 0.70 <= bound["near_bound"] <= 0.80

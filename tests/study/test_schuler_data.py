@@ -1,4 +1,4 @@
-"""Five real Schuler periods: what the prediction and its bound are worth on a flight nobody simulated."""
+"""Five recorded Schuler periods: accuracy of the prediction and validity of its bound on a real flight."""
 
 import json
 from pathlib import Path
@@ -30,8 +30,8 @@ def outcomes(recording):
     ]
 
 
-def test_the_recording_oscillates_at_schulers_rate(recording):
-    """Least squares over the rate itself, on five periods."""
+def test_recording_oscillates_at_the_schuler_rate(recording):
+    """Fit the rate by least squares over five periods."""
     seconds, east = recording.t_ns * 1e-9, recording.channels["east"]
     assert 5.0 < seconds[-1] / 3600.0 < 5.1
 
@@ -43,15 +43,15 @@ def test_the_recording_oscillates_at_schulers_rate(recording):
     assert rates[np.argmin([misfit(rate) for rate in rates])] == pytest.approx(SCHULER_RATE, rel=0.03)
 
 
-def test_prediction_beats_the_line_always_and_the_last_error_beyond_ten_minutes(outcomes):
+def test_prediction_is_better_than_line_and_hold(outcomes):
     assert len(outcomes) == 30 and all(o.n >= 30 for o in outcomes)
     assert all(o.minimax_rms < 0.75 * o.line_rms for o in outcomes)
     assert all(o.minimax_rms < 0.91 * o.hold_rms for o in outcomes if o.ahead_min >= 10)
     assert all(o.minimax_rms < 0.75 * o.hold_rms for o in outcomes if o.channel == "east")
 
 
-def test_stated_bound_holds_where_least_squares_claim_does_not(outcomes):
-    """What is compared with is measured too, and bounds add: r.m.s. differences are within bound + sigma."""
+def test_bound_holds_and_least_squares_claim_does_not(outcomes):
+    """The comparison values are measured too: r.m.s. differences are within bound + sigma."""
     assert all(o.minimax_rms <= o.bound + o.sigma for o in outcomes)
     assert all(o.inside > 0.65 for o in outcomes)
     total = sum(o.n for o in outcomes)
@@ -60,7 +60,7 @@ def test_stated_bound_holds_where_least_squares_claim_does_not(outcomes):
     assert all(o.sigma_68 < 1.0 * STATED_SIGMA for o in outcomes)
 
 
-def test_the_bound_scales_with_what_is_stated_and_the_estimate_does_not(recording):
+def test_bound_scales_with_the_stated_sigma(recording):
     once, twice = (run(recording, "north", 3600.0, [600.0], sigma)[0] for sigma in (0.1, 0.2))
     assert twice.bound == pytest.approx(2.0 * once.bound, rel=1e-9)
     assert twice.minimax_rms == pytest.approx(once.minimax_rms, rel=1e-6)
@@ -94,18 +94,18 @@ def test_command():
         ("flight.csv.gz", b"no gzip"),
     ],
 )
-def test_what_is_no_recording_is_one_sentence_with_its_name(name, content, tmp_path):
+def test_invalid_recording_is_reported_with_its_name(name, content, tmp_path):
     file = tmp_path / name
     file.write_bytes(content)
     done = CliRunner().invoke(command, [str(file)])
     assert done.exit_code == 2
-    assert f"Error: {file} is no recording of velocity errors: " in done.stderr
+    assert f"Error: {file} is not a recording of velocity errors: " in done.stderr
     assert len(done.stderr.splitlines()) == 4
 
 
 @pytest.mark.shared
 @pytest.mark.skipif(not ORIGINAL.exists(), reason="the full recording stands beside the repository")
-def test_the_cut_is_the_recording(recording):
+def test_sampled_data_equal_the_full_recording(recording):
     whole = load(ORIGINAL)
     assert (whole.t_ns == recording.t_ns).all()
     assert (whole.channels["east"] == recording.channels["east"]).all()

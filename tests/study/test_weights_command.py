@@ -1,4 +1,4 @@
-"""`companion study weights` prints the laws' numbers, as a table, as data, as a plot."""
+"""`companion study weights` prints table, data and plot."""
 
 import json
 
@@ -39,14 +39,14 @@ def test_plot(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "message"),
     [
         (("--variances", "1,2"), "3 names for 2 variances"),
         (("--variances", "1,-2,3"), "positive"),
         (("--variances", "1", "--names", "GNSS"), "two variances"),
     ],
 )
-def test_bad_input_is_one_sentence(arguments, said):
+def test_invalid_input_is_reported_in_one_sentence(arguments, message):
     result = run(*arguments)
     assert result.exit_code == 2
-    assert said in result.output
+    assert message in result.output

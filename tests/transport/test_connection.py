@@ -1,4 +1,4 @@
-"""Bytes through an open link: both ways, its end, full lines and slow readers."""
+"""Open connections: both directions, their end, full lines and slow readers."""
 
 import asyncio
 from collections.abc import Coroutine
@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from companion.transport import connection
-from companion.transport.connection import Stream, pair
+from companion.transport.connection import Connection, pair
 
 
 def run(test: Coroutine[Any, Any, None]) -> None:
@@ -18,14 +18,14 @@ def run(test: Coroutine[Any, Any, None]) -> None:
     asyncio.run(limited())
 
 
-async def read_exactly(connection: Stream, count: int) -> bytes:
+async def read_exactly(connection: Connection, count: int) -> bytes:
     data = b""
     while len(data) < count:
         data += await connection.read()
     return data
 
 
-def test_memory_carries_both_ways_and_tells_its_end() -> None:
+def test_memory_pair_carries_both_ways_and_reports_its_end() -> None:
     async def test() -> None:
         one, other = pair()
         one.write(b"ping")
@@ -41,22 +41,22 @@ def test_memory_carries_both_ways_and_tells_its_end() -> None:
     run(test())
 
 
-async def read_to(connection: Stream, end: bytes) -> bytes:
+async def read_to(connection: Connection, end: bytes) -> bytes:
     data = b""
     while not data.endswith(end):
         data += await connection.read()
     return data
 
 
-def untimed(connection: Stream) -> None:
-    """Nothing grows old in it, however long the machine lets this wait."""
-    connection._outbox._now = lambda: 0.0
+def stop_clock(connection: Connection) -> None:
+    """Stop the clock of its send queue, so that no frame is dropped on a slow machine."""
+    connection._send_queue._now = lambda: 0.0
 
 
-def test_a_full_line_never_waits_drops_whole_frames_and_counts_them() -> None:
+def test_full_line_drops_whole_frames_and_counts_them() -> None:
     async def test() -> None:
         one, other = pair()
-        untimed(one)
+        stop_clock(one)
         frames = [i.to_bytes(4, "big") * 64 for i in range(4000)]
         for data in frames:
             one.write(data)
@@ -71,14 +71,14 @@ def test_a_full_line_never_waits_drops_whole_frames_and_counts_them() -> None:
     run(test())
 
 
-def test_what_waited_too_long_for_a_reader_is_not_sent_to_it() -> None:
+def test_frames_that_waited_too_long_are_not_sent() -> None:
     async def test() -> None:
         one, other = pair()
-        untimed(one)
-        while not one._outbox:  # the system's own buffer takes what it takes
+        stop_clock(one)
+        while not one._send_queue:  # the system's own buffer takes what it takes
             one.write(b"before" * 100)
         one.write(b"stale")
-        one._outbox._now = lambda: 0.6
+        one._send_queue._now = lambda: 0.6
         one.write(b"fresh")
         assert one.dropped >= 1
         got = await read_to(other, b"fresh")
@@ -90,16 +90,16 @@ def test_what_waited_too_long_for_a_reader_is_not_sent_to_it() -> None:
     run(test())
 
 
-def test_a_slow_reader_holds_a_bounded_inbox_and_loses_no_more_than_is_counted() -> None:
+def test_inbox_of_a_slow_reader_is_bounded_and_losses_are_counted() -> None:
     async def test() -> None:
         one, other = pair()
-        untimed(one)
+        stop_clock(one)
         count = 0
         while count < 768 and not one.dropped:
             count += 1
             one.write(count.to_bytes(4, "big") * 1024)
             await asyncio.sleep(0)
-            assert other._held < connection.INBOX_LIMIT + connection.AT_ONCE
+            assert other._inbox_size < connection.INBOX_LIMIT + connection.READ_SIZE
         got = await read_to(other, count.to_bytes(4, "big") * 1024)
         assert len(got) == (count - one.dropped) * 4096
         one.close()

@@ -1,12 +1,12 @@
-"""What waits for a line: in order, whole, and never old. The line and the clock are made here."""
+"""Send queue with a simulated line and clock: order, whole frames, maximum wait."""
 
 import pytest
 
-from companion.transport.send_queue import LIMIT, LONGEST_WAIT_S, Outbox
+from companion.transport.send_queue import LIMIT, MAX_WAIT_S, SendQueue
 
 
 class Line:
-    """Takes `room` bytes, then no more; and the clock beside it."""
+    """Line that accepts `room` bytes, and its clock."""
 
     def __init__(self, room: int) -> None:
         self.room, self.now = room, 100.0
@@ -20,97 +20,97 @@ class Line:
         self.carried += taken
         return len(taken)
 
-    def outbox(self) -> Outbox:
-        return Outbox(self.put, lambda: self.now)
+    def queue(self) -> SendQueue:
+        return SendQueue(self.put, lambda: self.now)
 
 
-def test_what_the_line_takes_never_waits() -> None:
+def test_accepted_frames_do_not_wait() -> None:
     line = Line(8)
-    outbox = line.outbox()
-    outbox.write(b"1111")
-    assert not outbox
-    outbox.write(b"2222")
-    outbox.write(b"3333")
-    assert outbox and (line.carried, outbox.dropped) == (b"11112222", 0)
+    queue = line.queue()
+    queue.write(b"1111")
+    assert not queue
+    queue.write(b"2222")
+    queue.write(b"3333")
+    assert queue and (line.carried, queue.dropped) == (b"11112222", 0)
 
 
-def test_what_waited_goes_out_in_order_and_whole_however_the_line_cuts_it() -> None:
+def test_waiting_frames_are_sent_whole_and_in_order() -> None:
     line = Line(0)
-    outbox = line.outbox()
+    queue = line.queue()
     frames = [bytes([65 + i]) * 10 for i in range(8)]
     for frame in frames:
-        outbox.write(frame)
-    while outbox:
+        queue.write(frame)
+    while queue:
         line.room = 3
-        outbox.flush()
+        queue.flush()
     assert line.carried == b"".join(frames)
-    assert outbox.dropped == 0
+    assert queue.dropped == 0
 
 
-def test_a_frame_older_than_the_limit_is_dropped_and_counted_but_not_what_came_after() -> None:
+def test_frame_older_than_the_limit_is_dropped_and_counted() -> None:
     line = Line(0)
-    outbox = line.outbox()
-    outbox.write(b"old.")
-    line.now += LONGEST_WAIT_S
-    outbox.write(b"new.")
-    assert outbox.dropped == 0
+    queue = line.queue()
+    queue.write(b"old.")
+    line.now += MAX_WAIT_S
+    queue.write(b"new.")
+    assert queue.dropped == 0
     line.now += 0.01
     line.room = 100
-    outbox.flush()
-    assert (line.carried, outbox.dropped) == (b"new.", 1)
-    assert not outbox
+    queue.flush()
+    assert (line.carried, queue.dropped) == (b"new.", 1)
+    assert not queue
 
 
-def test_the_rest_of_a_half_written_frame_goes_out_however_old() -> None:
+def test_rest_of_a_partly_written_frame_is_always_sent() -> None:
     line = Line(2)
-    outbox = line.outbox()
-    outbox.write(b"half")
-    outbox.write(b"gone")
+    queue = line.queue()
+    queue.write(b"half")
+    queue.write(b"gone")
     line.now += 100.0
-    outbox.write(b"last")
-    assert outbox.dropped == 1
+    queue.write(b"last")
+    assert queue.dropped == 1
     line.room = 100
-    outbox.flush()
+    queue.flush()
     assert line.carried == b"halflast"
 
 
 @pytest.mark.parametrize("rate", [960, 5760, 92160])  # bytes/s
-def test_a_line_at_half_of_what_is_sent_carries_as_much_as_it_can_and_nothing_old(rate: int) -> None:
+def test_line_too_slow_by_half_is_fully_used_and_carries_no_old_frame(rate: int) -> None:
     line = Line(0)
-    outbox = line.outbox()
+    queue = line.queue()
     size, steps = rate // 50, 1000  # a frame each hundredth of a second: twice what the line takes
     due = 0.0
     for step in range(steps):
         line.now = 100.0 + 0.01 * step
-        outbox.write(step.to_bytes(size, "big"))
+        queue.write(step.to_bytes(size, "big"))
         due += 0.01 * rate
         line.room, due = int(due), due % 1
         sent = len(line.carried)
-        outbox.flush()
+        queue.flush()
         for begin in range(-(-sent // size) * size, len(line.carried) - size + 1, size):
             made = int.from_bytes(line.carried[begin : begin + size], "big")
-            assert 0.01 * (step - made) <= LONGEST_WAIT_S + 0.03  # which it takes to go through
+            assert 0.01 * (step - made) <= MAX_WAIT_S + 0.03  # the time to pass the line
     carried = len(line.carried) // size
     assert len(line.carried) > 0.99 * 0.01 * rate * steps
-    assert outbox.dropped + carried == pytest.approx(steps, abs=0.02 * steps + 60)
+    assert queue.dropped + carried == pytest.approx(steps, abs=0.02 * steps + 60)
 
 
-def test_a_flood_faster_than_time_passes_is_bounded_and_loses_the_oldest() -> None:
+def test_flood_is_bounded_and_drops_the_oldest() -> None:
     line = Line(0)
-    outbox = line.outbox()
+    queue = line.queue()
     frames = [i.to_bytes(4, "big") * 64 for i in range(1000)]
     for frame in frames:
-        outbox.write(frame)
+        queue.write(frame)
     line.room = 1 << 20
-    outbox.flush()
+    queue.flush()
     kept = LIMIT // 256
     assert line.carried == b"".join(frames[-kept:])
-    assert outbox.dropped == 1000 - kept
+    assert queue.dropped == 1000 - kept
 
 
-def test_what_the_line_raises_is_raised() -> None:
+def test_error_of_the_line_is_raised() -> None:
     def broken(data: bytes) -> int:
         raise BrokenPipeError
 
     with pytest.raises(BrokenPipeError):
-        Outbox(broken, lambda: 0.0).write(b"frame")
+        SendQueue(broken, lambda: 0.0).write(b"frame")

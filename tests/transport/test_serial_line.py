@@ -1,4 +1,4 @@
-"""Bytes through a pseudo-terminal, and what is no serial line."""
+"""Serial lines over a pseudo-terminal, and devices that are not serial lines."""
 
 import asyncio
 import errno
@@ -12,8 +12,8 @@ from typing import Any
 import pytest
 
 from companion.transport.address import Address
-from companion.transport.connection import Stream
-from companion.transport.links import connect, connections
+from companion.transport.connection import Connection
+from companion.transport.reconnect import connect, connections
 
 
 def run(test: Coroutine[Any, Any, None]) -> None:
@@ -32,23 +32,23 @@ async def until(condition: Callable[[], bool]) -> None:
     raise TimeoutError
 
 
-async def read_exactly(stream: Stream, count: int) -> bytes:
+async def read_exactly(connection: Connection, count: int) -> bytes:
     data = b""
     while len(data) < count:
-        data += await stream.read()
+        data += await connection.read()
     return data
 
 
-def test_a_missing_device_is_said_once_and_opened_when_it_is_there(tmp_path: Path) -> None:
+def test_missing_device_is_reported_once_and_opened_when_present(tmp_path: Path) -> None:
     async def test() -> None:
         master, slave = pty.openpty()
         tty.setraw(master)
         device = tmp_path / "ttyFC"
-        said: list[str] = []
-        links = connections(Address.parse(f"serial:{device}:921600"), lambda: 1.0, said.append)
+        reports: list[str] = []
+        links = connections(Address.parse(f"serial:{device}:921600"), lambda: 1.0, reports.append)
         waiting = asyncio.ensure_future(anext(links))
         await asyncio.sleep(0.5)
-        assert said == [f"serial:{device}:921600: {os.strerror(errno.ENOENT)}; trying again"]
+        assert reports == [f"serial:{device}:921600: {os.strerror(errno.ENOENT)}; trying again"]
         device.symlink_to(os.ttyname(slave))
         line = await waiting
         every_byte = bytes(range(256))
@@ -66,7 +66,7 @@ def test_a_missing_device_is_said_once_and_opened_when_it_is_there(tmp_path: Pat
     run(test())
 
 
-def test_a_file_that_is_no_serial_line_is_told(tmp_path: Path) -> None:
+def test_file_that_is_not_a_serial_line_is_reported(tmp_path: Path) -> None:
     (tmp_path / "file").write_bytes(b"")
 
     async def test() -> None:
@@ -76,16 +76,16 @@ def test_a_file_that_is_no_serial_line_is_told(tmp_path: Path) -> None:
     run(test())
 
 
-def test_a_line_belongs_to_one_and_to_the_next_when_it_is_let_go() -> None:
+def test_line_is_exclusive_until_it_is_closed() -> None:
     async def test() -> None:
-        master, slave = pty.openpty()  # somebody has had it open before, and keeps it
+        master, slave = pty.openpty()  # another process keeps it open
         address = Address("serial", os.ttyname(slave), 57600)
         line = await connect(address)
-        said: list[str] = []
-        links = connections(address, lambda: 1.0, said.append)
+        reports: list[str] = []
+        links = connections(address, lambda: 1.0, reports.append)
         waiting = asyncio.ensure_future(anext(links))
-        await until(lambda: bool(said))
-        assert said == [f"{address}: another program has this line open: end it; trying again"]
+        await until(lambda: bool(reports))
+        assert reports == [f"{address}: another program has this line open: end it; trying again"]
         os.write(master, b"all of it")
         assert await read_exactly(line, 9) == b"all of it"
         line.close()
@@ -99,7 +99,7 @@ def test_a_line_belongs_to_one_and_to_the_next_when_it_is_let_go() -> None:
     run(test())
 
 
-def test_a_device_that_refuses_because_it_is_taken_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_busy_device_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     def taken(*_: object) -> int:
         raise OSError(errno.EBUSY, os.strerror(errno.EBUSY))
 
@@ -112,14 +112,14 @@ def test_a_device_that_refuses_because_it_is_taken_says_so(monkeypatch: pytest.M
         run(test())
 
 
-def test_a_line_that_does_not_drain_is_never_waited_for() -> None:
+def test_full_line_does_not_block() -> None:
     async def test() -> None:
         master, slave = pty.openpty()
         line = await connect(Address("serial", os.ttyname(slave), 57600))
-        line._outbox._now = lambda: 0.0
+        line._send_queue._now = lambda: 0.0
         for _ in range(100):
             line.write(b"before" * 100)
-        line._outbox._now = lambda: 1.0
+        line._send_queue._now = lambda: 1.0
         line.write(b"after")
         assert line.dropped > 10
         line.close()

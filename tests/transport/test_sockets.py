@@ -1,4 +1,4 @@
-"""Bytes through real sockets: several peers, bursts, losses and refusals."""
+"""Connections over real sockets: several peers, bursts, losses and refusals."""
 
 import asyncio
 import socket
@@ -9,8 +9,8 @@ import pytest
 
 from companion.transport import connection
 from companion.transport.address import Address
-from companion.transport.connection import Stream
-from companion.transport.links import connect
+from companion.transport.connection import Connection
+from companion.transport.reconnect import connect
 
 
 def run(test: Coroutine[Any, Any, None]) -> None:
@@ -27,22 +27,22 @@ def free_port() -> int:
         return int(sock.getsockname()[1])
 
 
-async def read_exactly(connection: Stream, count: int) -> bytes:
+async def read_exactly(connection: Connection, count: int) -> bytes:
     data = b""
     while len(data) < count:
         data += await connection.read()
     return data
 
 
-def test_udp_answers_all_peers_heard_and_outlives_a_peer_that_is_not_there() -> None:
+def test_udp_sends_to_all_peers_and_survives_an_absent_one() -> None:
     async def test() -> None:
         early = await connect(Address("udpout", "127.0.0.1", free_port()))
         for _ in range(3):
-            early.write(b"nobody hears")
+            early.write(b"no peer")
             await asyncio.sleep(0.01)
         early.close()
         server = await connect(Address.parse("udpin:0"))
-        server.write(b"nobody yet")
+        server.write(b"no peer yet")
         clients = [await connect(Address("udpout", "127.0.0.1", server.port)) for _ in range(3)]
         for i, client in enumerate(clients):
             client.write(b"from %d" % i)
@@ -58,7 +58,7 @@ def test_udp_answers_all_peers_heard_and_outlives_a_peer_that_is_not_there() -> 
     run(test())
 
 
-def test_a_burst_of_datagrams_comes_in_few_reads_and_in_order() -> None:
+def test_burst_of_datagrams_is_read_in_order_with_few_reads() -> None:
     async def test() -> None:
         server = await connect(Address.parse("udpin:0"))
         client = await connect(Address("udpout", "127.0.0.1", server.port))
@@ -85,7 +85,7 @@ def answering(monkeypatch: pytest.MonkeyPatch, *answers: tuple[socket.AddressFam
     monkeypatch.setattr(asyncio.get_running_loop(), "getaddrinfo", getaddrinfo)
 
 
-def test_every_answer_to_a_name_is_tried(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_resolved_address_is_tried(monkeypatch: pytest.MonkeyPatch) -> None:
     async def test() -> None:
         with socket.create_server(("127.0.0.1", 0)) as server:
             answering(monkeypatch, *((socket.AF_INET, f"127.0.0.{i}") for i in (3, 2, 1)))
@@ -95,7 +95,7 @@ def test_every_answer_to_a_name_is_tried(monkeypatch: pytest.MonkeyPatch) -> Non
     run(test())
 
 
-def test_where_no_answer_to_a_name_helps_the_first_failure_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_first_failure_is_raised_if_no_resolved_address_works(monkeypatch: pytest.MonkeyPatch) -> None:
     async def test() -> None:
         answering(monkeypatch, (socket.AF_INET, "127.0.0.1"), (socket.AF_INET, "255.255.255.255"))
         with pytest.raises(ConnectionRefusedError):

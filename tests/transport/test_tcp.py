@@ -1,4 +1,4 @@
-"""TCP links: both ways, after a loss, with a peer that vanished, and of two clients the newer."""
+"""TCP connections: both directions, reconnecting, lost peers, and replacement by a newer client."""
 
 import asyncio
 import errno
@@ -10,9 +10,9 @@ from typing import Any
 import pytest
 
 from companion.transport.address import Address
-from companion.transport.connection import Stream
-from companion.transport.links import connect, connections
-from companion.transport.tcp import GONE_AFTER_S
+from companion.transport.connection import Connection
+from companion.transport.reconnect import connect, connections
+from companion.transport.tcp import PEER_TIMEOUT_S
 
 
 def run(test: Coroutine[Any, Any, None]) -> None:
@@ -32,10 +32,10 @@ def free_port() -> int:
 def test_tcp_both_ways_and_again_after_a_loss() -> None:
     async def test() -> None:
         port = free_port()
-        said: list[str] = []
-        client = connections(Address("tcp", "127.0.0.1", port), lambda: 1.0, said.append)
+        reports: list[str] = []
+        client = connections(Address("tcp", "127.0.0.1", port), lambda: 1.0, reports.append)
         waiting = asyncio.ensure_future(anext(client))
-        await asyncio.sleep(0.05)  # nobody listens yet
+        await asyncio.sleep(0.05)  # no listener yet
         for turn in (b"one", b"two"):
             accepting = asyncio.ensure_future(connect(Address("tcpin", "127.0.0.1", port)))
             near, far = await asyncio.gather(waiting, accepting)
@@ -49,20 +49,20 @@ def test_tcp_both_ways_and_again_after_a_loss() -> None:
         waiting.cancel()
         await asyncio.gather(waiting, return_exceptions=True)
         await client.aclose()
-        assert said[0] == f"tcp:127.0.0.1:{port}: {os.strerror(errno.ECONNREFUSED)}; trying again"
+        assert reports[0] == f"tcp:127.0.0.1:{port}: {os.strerror(errno.ECONNREFUSED)}; trying again"
 
     run(test())
 
 
-def option(stream: Stream, name: str) -> int:
-    device = stream._device
+def option(connection: Connection, name: str) -> int:
+    device = connection._device
     assert isinstance(device, socket.socket)
     return device.getsockopt(socket.IPPROTO_TCP, getattr(socket, name))
 
 
 @pytest.mark.skipif(not hasattr(socket, "TCP_USER_TIMEOUT"), reason="as Linux has it")
-def test_a_peer_that_vanished_is_noticed_on_both_ends() -> None:
-    """What the system does with it takes ten seconds and a network to break: asked for it is here."""
+def test_lost_peer_detection_is_enabled_on_both_ends() -> None:
+    """A real loss takes ten seconds and a broken network: only the socket options are checked."""
 
     async def test() -> None:
         port = free_port()
@@ -75,8 +75,8 @@ def test_a_peer_that_vanished_is_noticed_on_both_ends() -> None:
                 continue
             await accepting
         for end in (near, accepting.result()):
-            assert option(end, "TCP_USER_TIMEOUT") == 1000 * GONE_AFTER_S
-            assert option(end, "TCP_KEEPIDLE") + 3 * option(end, "TCP_KEEPINTVL") <= GONE_AFTER_S + 2
+            assert option(end, "TCP_USER_TIMEOUT") == 1000 * PEER_TIMEOUT_S
+            assert option(end, "TCP_KEEPIDLE") + 3 * option(end, "TCP_KEEPINTVL") <= PEER_TIMEOUT_S + 2
             assert isinstance(end._device, socket.socket)
             assert end._device.getsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE)
             end.close()
@@ -84,7 +84,7 @@ def test_a_peer_that_vanished_is_noticed_on_both_ends() -> None:
     run(test())
 
 
-def test_the_system_holds_little_for_a_peer_that_does_not_read() -> None:
+def test_system_buffers_little_for_a_peer_that_does_not_read() -> None:
     async def test() -> None:
         with socket.create_server(("127.0.0.1", 0)) as server:
             server.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
@@ -95,15 +95,15 @@ def test_the_system_holds_little_for_a_peer_that_does_not_read() -> None:
                     near.write(bytes(256))
                     await asyncio.sleep(0)
                 near.close()
-                held = 0
+                buffered = 0
                 while data := far.recv(65536):
-                    held += len(data)
-        assert held < 50_000
+                    buffered += len(data)
+        assert buffered < 50_000
 
     run(test())
 
 
-def test_the_newer_client_replaces_the_older_and_is_told() -> None:
+def test_newer_client_replaces_the_older() -> None:
     async def test() -> None:
         port = free_port()
         address = Address("tcpin", "127.0.0.1", port)
@@ -115,13 +115,13 @@ def test_the_newer_client_replaces_the_older_and_is_told() -> None:
         away.write(b"old")
         assert await link.read() == b"old"
         back = await connect(Address("tcp", "127.0.0.1", port))
-        with pytest.raises(ConnectionError, match=f"{address} gives way to a newer client"):
+        with pytest.raises(ConnectionError, match=f"{address} was replaced by a newer client"):
             await link.read()
         back.write(b"new")
         link = await anext(links)
         assert await link.read() == b"new"
-        link.write(b"heard")
-        assert await back.read() == b"heard"
+        link.write(b"reply")
+        assert await back.read() == b"reply"
         with pytest.raises(ConnectionError, match="closed by the other side"):
             await away.read()
         back.close()
@@ -131,7 +131,7 @@ def test_the_newer_client_replaces_the_older_and_is_told() -> None:
     run(test())
 
 
-def test_of_clients_that_came_while_none_was_served_the_newest_is_taken() -> None:
+def test_newest_of_the_waiting_clients_is_accepted() -> None:
     async def test() -> None:
         links = connections(Address("tcpin", "127.0.0.1", port := free_port()), lambda: 1.0, print)
         opening = asyncio.ensure_future(anext(links))

@@ -362,9 +362,9 @@ enums: Dict[str, Enum] = {}
 enums["RSBN_STATUS"] = Enum()
 enums["RSBN_STATUS"].bitmask = True
 RSBN_STATUS_AZIMUTH_VALID = 1
-enums["RSBN_STATUS"][1] = EnumEntry("RSBN_STATUS_AZIMUTH_VALID", """The receiver vouches for the azimuth.""")
+enums["RSBN_STATUS"][1] = EnumEntry("RSBN_STATUS_AZIMUTH_VALID", """The receiver reports the azimuth as valid.""")
 RSBN_STATUS_RANGE_VALID = 2
-enums["RSBN_STATUS"][2] = EnumEntry("RSBN_STATUS_RANGE_VALID", """The receiver vouches for the slant range.""")
+enums["RSBN_STATUS"][2] = EnumEntry("RSBN_STATUS_RANGE_VALID", """The receiver reports the slant range as valid.""")
 RSBN_STATUS_TEST = 4
 enums["RSBN_STATUS"][4] = EnumEntry("RSBN_STATUS_TEST", """A test signal: never to be used for navigation.""")
 RSBN_STATUS_MEMORY = 8
@@ -386,7 +386,7 @@ enums["NAVIGATION_MODE"][2] = EnumEntry("NAVIGATION_MODE_PREDICTING", """No trus
 NAVIGATION_MODE_UNTRUSTED = 3
 enums["NAVIGATION_MODE"][3] = EnumEntry("NAVIGATION_MODE_UNTRUSTED", """An estimate exists, but its bound is not guaranteed.""")
 NAVIGATION_MODE_LOST = 4
-enums["NAVIGATION_MODE"][4] = EnumEntry("NAVIGATION_MODE_LOST", """The autopilot's inertial channel is not heard.""")
+enums["NAVIGATION_MODE"][4] = EnumEntry("NAVIGATION_MODE_LOST", """The autopilot's inertial channel is not received.""")
 NAVIGATION_MODE_ENUM_END = 5
 enums["NAVIGATION_MODE"][5] = EnumEntry("NAVIGATION_MODE_ENUM_END", """""")
 
@@ -394,11 +394,11 @@ enums["NAVIGATION_MODE"][5] = EnumEntry("NAVIGATION_MODE_ENUM_END", """""")
 enums["NAVIGATION_TRUST"] = Enum()
 enums["NAVIGATION_TRUST"].bitmask = False
 NAVIGATION_TRUST_UNKNOWN = 0
-enums["NAVIGATION_TRUST"][0] = EnumEntry("NAVIGATION_TRUST_UNKNOWN", """Not told.""")
+enums["NAVIGATION_TRUST"][0] = EnumEntry("NAVIGATION_TRUST_UNKNOWN", """Unknown.""")
 NAVIGATION_TRUST_NORMAL = 1
-enums["NAVIGATION_TRUST"][1] = EnumEntry("NAVIGATION_TRUST_NORMAL", """Fixes that check each other, the protection level within its limit.""")
+enums["NAVIGATION_TRUST"][1] = EnumEntry("NAVIGATION_TRUST_NORMAL", """Fixes that check each other, and a protection level within its limit.""")
 NAVIGATION_TRUST_DEGRADED = 2
-enums["NAVIGATION_TRUST"][2] = EnumEntry("NAVIGATION_TRUST_DEGRADED", """Fixes, but a source is excluded or suspected, or too little checks them.""")
+enums["NAVIGATION_TRUST"][2] = EnumEntry("NAVIGATION_TRUST_DEGRADED", """Fixes, but a source is excluded or suspected, or they are not sufficiently cross-checked.""")
 NAVIGATION_TRUST_PREDICTING = 3
 enums["NAVIGATION_TRUST"][3] = EnumEntry("NAVIGATION_TRUST_PREDICTING", """No trusted fix: the inertial error is predicted, inside the guaranteed bound.""")
 NAVIGATION_TRUST_UNTRUSTED = 4
@@ -504,9 +504,9 @@ setattr(MAVLink_rsbn_measurement_message, "name", mavlink_msg_deprecated_name_pr
 
 class MAVLink_navigation_status_message(MAVLink_message):
     """
-    What no standard message carries of the companion's estimate: what
-    it rests on, its guaranteed bounds now and in the minutes ahead,
-    and how far the estimators disagree. NaN: unknown.
+    State of the companion's estimate beyond the standard messages:
+    mode, sources, guaranteed bounds now and in the minutes ahead, and
+    disagreement of the estimators. NaN: unknown.
     """
 
     id = MAVLINK_MSG_ID_NAVIGATION_STATUS
@@ -964,7 +964,7 @@ class MAVLink(object):
         aircraft and slant range between them. Either may be absent
         (NaN).
 
-        time_usec                 : Time for which the measurement is valid (UNIX epoch time or time since the autopilot's boot; told apart by the magnitude). 0: unknown, take the time of arrival. [us] (type:uint64_t)
+        time_usec                 : Time for which the measurement is valid (UNIX epoch time or time since the autopilot's boot, distinguished by magnitude). 0: unknown, use the time of arrival. [us] (type:uint64_t)
         beacon_lat                : Latitude of the beacon, WGS84. [degE7] (type:int32_t)
         beacon_lon                : Longitude of the beacon, WGS84. [degE7] (type:int32_t)
         beacon_alt                : Altitude of the beacon above the WGS84 ellipsoid. [m] (type:float)
@@ -985,7 +985,7 @@ class MAVLink(object):
         aircraft and slant range between them. Either may be absent
         (NaN).
 
-        time_usec                 : Time for which the measurement is valid (UNIX epoch time or time since the autopilot's boot; told apart by the magnitude). 0: unknown, take the time of arrival. [us] (type:uint64_t)
+        time_usec                 : Time for which the measurement is valid (UNIX epoch time or time since the autopilot's boot, distinguished by magnitude). 0: unknown, use the time of arrival. [us] (type:uint64_t)
         beacon_lat                : Latitude of the beacon, WGS84. [degE7] (type:int32_t)
         beacon_lon                : Longitude of the beacon, WGS84. [degE7] (type:int32_t)
         beacon_alt                : Altitude of the beacon above the WGS84 ellipsoid. [m] (type:float)
@@ -1001,26 +1001,26 @@ class MAVLink(object):
 
     def navigation_status_encode(self, time_usec: int, bound_north: float, bound_east: float, bound_horizontal: float, bound_velocity: float, sigma_horizontal: float, horizon: float, disagreement: float, ahead: Sequence[float], bound_ahead: Sequence[float], sources: int, rejected: int, age: int, mode: int, estimator: int, protection: float = 0, trust: int = 0) -> MAVLink_navigation_status_message:
         """
-        What no standard message carries of the companion's estimate: what it
-        rests on, its guaranteed bounds now and in the minutes ahead,
-        and how far the estimators disagree. NaN: unknown.
+        State of the companion's estimate beyond the standard messages: mode,
+        sources, guaranteed bounds now and in the minutes ahead, and
+        disagreement of the estimators. NaN: unknown.
 
-        time_usec                 : Time for which the estimate is valid (UNIX epoch time or time since boot; told apart by the magnitude). [us] (type:uint64_t)
+        time_usec                 : Time for which the estimate is valid (UNIX epoch time or time since boot, distinguished by magnitude). [us] (type:uint64_t)
         bound_north               : Guaranteed r.m.s. bound of the north error. [m] (type:float)
         bound_east                : Guaranteed r.m.s. bound of the east error. [m] (type:float)
         bound_horizontal          : Guaranteed r.m.s. bound of the horizontal error. [m] (type:float)
         bound_velocity            : Guaranteed r.m.s. bound of the horizontal velocity error. [m/s] (type:float)
         sigma_horizontal          : Horizontal standard deviation claimed by the estimator in use. [m] (type:float)
         horizon                   : Time since the last trusted fix. [s] (type:float)
-        disagreement              : Greatest horizontal distance between the estimators. [m] (type:float)
+        disagreement              : Largest horizontal distance between the estimators. [m] (type:float)
         ahead                     : Horizons from now for which bound_ahead is given. 0: not used. [s] (type:float)
         bound_ahead               : Guaranteed r.m.s. bound of the horizontal error after each horizon in ahead, if no fix comes. [m] (type:float)
         sources                   : Sources used in the estimate. (type:uint16_t, values:NAVIGATION_SOURCE)
         rejected                  : Measurements rejected since start (stays at 65535). (type:uint16_t)
         age                       : Age of the newest inertial data in the estimate when it was sent (65535: that or more). [ms] (type:uint16_t)
-        mode                      : What the estimate rests on. (type:uint8_t, values:NAVIGATION_MODE)
+        mode                      : Basis of the estimate. (type:uint8_t, values:NAVIGATION_MODE)
         estimator                 : The estimator in use. (type:uint8_t, values:NAVIGATION_ESTIMATOR)
-        protection                : Horizontal protection level: with the configured risk the error is beyond it, whichever one source lies. 0: not told. [m] (type:float)
+        protection                : Horizontal protection level: the error exceeds it with the configured risk at most, even if any one source is faulty. 0: unknown. [m] (type:float)
         trust                     : How far the estimate can be trusted. (type:uint8_t, values:NAVIGATION_TRUST)
 
         """
@@ -1028,26 +1028,26 @@ class MAVLink(object):
 
     def navigation_status_send(self, time_usec: int, bound_north: float, bound_east: float, bound_horizontal: float, bound_velocity: float, sigma_horizontal: float, horizon: float, disagreement: float, ahead: Sequence[float], bound_ahead: Sequence[float], sources: int, rejected: int, age: int, mode: int, estimator: int, protection: float = 0, trust: int = 0, force_mavlink1: bool = False) -> None:
         """
-        What no standard message carries of the companion's estimate: what it
-        rests on, its guaranteed bounds now and in the minutes ahead,
-        and how far the estimators disagree. NaN: unknown.
+        State of the companion's estimate beyond the standard messages: mode,
+        sources, guaranteed bounds now and in the minutes ahead, and
+        disagreement of the estimators. NaN: unknown.
 
-        time_usec                 : Time for which the estimate is valid (UNIX epoch time or time since boot; told apart by the magnitude). [us] (type:uint64_t)
+        time_usec                 : Time for which the estimate is valid (UNIX epoch time or time since boot, distinguished by magnitude). [us] (type:uint64_t)
         bound_north               : Guaranteed r.m.s. bound of the north error. [m] (type:float)
         bound_east                : Guaranteed r.m.s. bound of the east error. [m] (type:float)
         bound_horizontal          : Guaranteed r.m.s. bound of the horizontal error. [m] (type:float)
         bound_velocity            : Guaranteed r.m.s. bound of the horizontal velocity error. [m/s] (type:float)
         sigma_horizontal          : Horizontal standard deviation claimed by the estimator in use. [m] (type:float)
         horizon                   : Time since the last trusted fix. [s] (type:float)
-        disagreement              : Greatest horizontal distance between the estimators. [m] (type:float)
+        disagreement              : Largest horizontal distance between the estimators. [m] (type:float)
         ahead                     : Horizons from now for which bound_ahead is given. 0: not used. [s] (type:float)
         bound_ahead               : Guaranteed r.m.s. bound of the horizontal error after each horizon in ahead, if no fix comes. [m] (type:float)
         sources                   : Sources used in the estimate. (type:uint16_t, values:NAVIGATION_SOURCE)
         rejected                  : Measurements rejected since start (stays at 65535). (type:uint16_t)
         age                       : Age of the newest inertial data in the estimate when it was sent (65535: that or more). [ms] (type:uint16_t)
-        mode                      : What the estimate rests on. (type:uint8_t, values:NAVIGATION_MODE)
+        mode                      : Basis of the estimate. (type:uint8_t, values:NAVIGATION_MODE)
         estimator                 : The estimator in use. (type:uint8_t, values:NAVIGATION_ESTIMATOR)
-        protection                : Horizontal protection level: with the configured risk the error is beyond it, whichever one source lies. 0: not told. [m] (type:float)
+        protection                : Horizontal protection level: the error exceeds it with the configured risk at most, even if any one source is faulty. 0: unknown. [m] (type:float)
         trust                     : How far the estimate can be trusted. (type:uint8_t, values:NAVIGATION_TRUST)
 
         """

@@ -1,4 +1,4 @@
-"""A campaign: what was flown is kept, what is kept is not flown again, and the table says what happened."""
+"""Campaign: results are stored, stored flights are not repeated, and the table summarises them."""
 
 from __future__ import annotations
 
@@ -15,34 +15,36 @@ from companion.config import Config
 from companion.records import Event, Solution
 from sitl import loopback
 from sitl.campaign import command, flight
-from sitl.campaign.command import Limits
-from sitl.campaign.flight import KINDS, SCENARIOS, Order, Result, attempt
+from sitl.campaign.command import CampaignLimits
+from sitl.campaign.flight import FAULT_CASES, SCENARIOS, FlightOrder, FlightResult, fly_order
 from sitl.faults import NAMES, Fault
-from sitl.scenarios import Rates, named
+from sitl.scenarios import SensorRates, get_scenario
 
 
-def result(fault: str, seed: int, **changes: object) -> Result:
-    order = Order("one-beacon", fault, seed)
-    return Result(order.key, *order, 720.0, 2.0)._replace(**{"solutions": 3600, "quiet_s": 240.0, **changes})
+def result(fault: str, seed: int, **changes: object) -> FlightResult:
+    order = FlightOrder("one-beacon", fault, seed)
+    return FlightResult(order.key, *order, 720.0, 2.0)._replace(
+        **{"solutions": 3600, "quiet_s": 240.0, **changes}
+    )
 
 
 @pytest.fixture(scope="module")
-def flown(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Result]]:
-    """Six flights, in this process."""
+def flown(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[FlightResult]]:
+    """Six flights in this process."""
     folder = tmp_path_factory.mktemp("campaign")
     faults = ("none", "gnss-jump", "gnss-spoof-5", "gnss-jam", "beacon-bias", "ins-reset")
-    wanted = command.orders(("one-beacon",), faults, 1)
-    return folder, command.campaign(wanted, folder, quiet=True)
+    wanted = command.list_orders(("one-beacon",), faults, 1)
+    return folder, command.run_campaign(wanted, folder, quiet=True)
 
 
-def test_a_flight_without_faults_is_quiet_and_near(flown: tuple[Path, list[Result]]) -> None:
+def test_flight_without_faults_has_no_alarms_and_small_errors(flown: tuple[Path, list[FlightResult]]) -> None:
     quiet = flown[1][0]
     assert quiet.raised is None
     assert quiet.largest_m < 15.0
     assert (quiet.detected_s, quiet.excluded_s, quiet.alarms, quiet.misleading_s) == (None, None, 0, 0.0)
 
 
-def test_gross_faults_are_seen_at_once_and_do_no_harm(flown: tuple[Path, list[Result]]) -> None:
+def test_gross_faults_are_detected_at_once(flown: tuple[Path, list[FlightResult]]) -> None:
     for r in flown[1][1:]:
         assert r.raised is None
         assert r.detected_s is not None, r.key
@@ -50,41 +52,41 @@ def test_gross_faults_are_seen_at_once_and_do_no_harm(flown: tuple[Path, list[Re
         assert r.before_m < 100.0, r.key
 
 
-def test_the_same_order_gives_the_same_numbers(flown: tuple[Path, list[Result]]) -> None:
-    again = attempt(Order("one-beacon", "gnss-jump", 1))
-    assert again._replace(took_s=0.0) == flown[1][1]._replace(took_s=0.0)
+def test_same_order_gives_the_same_result(flown: tuple[Path, list[FlightResult]]) -> None:
+    repeated = fly_order(FlightOrder("one-beacon", "gnss-jump", 1))
+    assert repeated._replace(took_s=0.0) == flown[1][1]._replace(took_s=0.0)
 
 
-def test_what_is_stored_is_not_flown_again(
-    flown: tuple[Path, list[Result]], monkeypatch: pytest.MonkeyPatch
+def test_stored_flights_are_not_repeated(
+    flown: tuple[Path, list[FlightResult]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A campaign cut short, its last line torn: only that flight and the missing ones are flown."""
+    """After an interruption with an incomplete last line, that flight and the missing ones are flown."""
     folder, results = flown
     path = folder / "flights.jsonl"
     lines = path.read_bytes().splitlines(keepends=True)
     assert len(lines) == len(results) == 6
     path.write_bytes(b"".join(lines[:4]) + lines[4][:25])
-    asked: list[Order] = []
+    requested: list[FlightOrder] = []
 
-    def remembered(order: Order) -> Result:
-        asked.append(order)
+    def remembered(order: FlightOrder) -> FlightResult:
+        requested.append(order)
         return next(r for r in results if r.key == order.key)
 
-    monkeypatch.setattr(command, "attempt", remembered)
-    wanted = [Order(r.scenario, r.fault, r.seed) for r in results]
-    assert command.campaign(wanted, folder, quiet=True) == results
-    assert asked == wanted[4:]
+    monkeypatch.setattr(command, "fly_order", remembered)
+    wanted = [FlightOrder(r.scenario, r.fault, r.seed) for r in results]
+    assert command.run_campaign(wanted, folder, quiet=True) == results
+    assert requested == wanted[4:]
     assert [json.loads(line)["key"] for line in path.read_bytes().splitlines()] == [r.key for r in results]
 
 
-def test_a_flight_that_raises_is_a_result() -> None:
-    lost = attempt(Order("nowhere", "none", 1))
+def test_exception_in_a_flight_is_a_result() -> None:
+    lost = fly_order(FlightOrder("nowhere", "none", 1))
     assert lost.raised is not None
     assert "scenarios are one-beacon" in lost.raised
-    assert not command.table([lost], Limits())[0].passed
+    assert not command.summarise([lost], CampaignLimits())[0].passed
 
 
-def test_the_table_counts_by_the_stated_limits() -> None:
+def test_table_applies_the_limits() -> None:
     results = [
         result("gnss-jump", 1, detected_s=1.0, excluded_s=3.0, before_m=20.0, largest_m=50.0),
         result("gnss-jump", 2, detected_s=5.0, excluded_s=6.0, before_m=40.0, largest_m=400.0),
@@ -92,7 +94,7 @@ def test_the_table_counts_by_the_stated_limits() -> None:
         result("gnss-jam", 1, detected_s=3.0, rms_error=30.0, rms_bound=40.0),
         result("gnss-jam", 2, detected_s=3.0, rms_error=60.0, rms_bound=40.0),
     ]
-    jump, bias, jam = command.table(results, Limits())
+    jump, bias, jam = command.summarise(results, CampaignLimits())
     assert (jump.flights, jump.detected, jump.median_s, jump.slowest_s) == (2, 2, 3.0, 5.0)
     assert (jump.before_m, jump.largest_m, jump.harmful, jump.passed) == (40.0, 400.0, 0, True)
     assert (bias.detected, bias.harmful, bias.misleading, bias.alarms_per_hour) == (0, 1, 1, 15.0)
@@ -100,9 +102,9 @@ def test_the_table_counts_by_the_stated_limits() -> None:
     assert jam.bound_held is False
 
 
-def test_a_slow_consumer_does_not_move_the_clock() -> None:
-    """An autopilot that reads every ten seconds once moved it by half a second, and GNSS was blamed."""
-    flown = attempt(Order("one-beacon", "slow-consumer", 1))
+def test_slow_consumer_does_not_shift_the_clock() -> None:
+    """Regression: reading every ten seconds shifted the clock by half a second, and GNSS was excluded."""
+    flown = fly_order(FlightOrder("one-beacon", "slow-consumer", 1))
     assert flown.raised is None
     assert (flown.excluded_s, flown.wrong, flown.alarms) == (None, 0, 0)
     assert flown.largest_m < 15.0
@@ -117,13 +119,11 @@ def test_a_slow_consumer_does_not_move_the_clock() -> None:
         ("one-beacon", "reboot-turning"),
     ],
 )
-def test_a_link_that_is_late_and_a_clock_that_leaps_are_told_and_move_nothing(
-    scenario: str, name: str
-) -> None:
-    """Once a late link moved the clock, and a clock set back was a reboot: 220 m, and GNSS was blamed. So it
-    was where the channel begun anew was a hundred metres off, five times what it claims.
+def test_late_link_and_clock_jump_are_reported_without_position_error(scenario: str, name: str) -> None:
+    """Regression: a late link shifted the clock, and a clock set back counted as a reboot: 220 m of error,
+    GNSS excluded. The same happened where the error of the restarted channel was five times its sigma.
     """
-    flown = attempt(Order(scenario, name, 1))
+    flown = fly_order(FlightOrder(scenario, name, 1))
     assert flown.raised is None
     assert (flown.excluded_s, flown.wrong, flown.alarms, flown.misleading_s) == (None, 0, 0, 0.0)
     assert flown.detected_s is not None and flown.detected_s < 10.0
@@ -131,80 +131,85 @@ def test_a_link_that_is_late_and_a_clock_that_leaps_are_told_and_move_nothing(
 
 
 @pytest.mark.parametrize("name", ["gnss-stale", "beacon-frozen", "ins-frozen"])
-def test_old_numbers_under_new_times_are_told_at_once_and_do_no_harm(name: str) -> None:
-    flown = attempt(Order("one-beacon", name, 1))
+def test_stale_data_with_new_stamps_is_detected_at_once(name: str) -> None:
+    flown = fly_order(FlightOrder("one-beacon", name, 1))
     assert flown.raised is None
     assert flown.detected_s is not None and flown.detected_s < 3.0
     assert flown.largest_m < 100.0
 
 
-def test_when_solutions_cease_it_is_told_and_when_they_come_again() -> None:
-    """The position freezes while the attitude goes on: over the link, as the pilot hears it."""
+def test_stop_and_resumption_of_solutions_are_reported() -> None:
+    """The position freezes while the attitude continues; events as sent over the link."""
     fault = Fault("ins-frozen", 60.0, 75.0)
-    scenario = dataclasses.replace(named("short"), faults=(fault,), rates=Rates(imu=1.0, truth=1.0))
-    kept = loopback.fly(scenario, loopback.simulated(Config())).kept
-    told = [(r.rx_ns * 1e-9 - 1000.0, r.text) for r in kept if isinstance(r, Event)]
-    (ceased,) = [t for t, text in told if "the inertial channel gives nothing" in text]
-    (again,) = [t for t, text in told if text == "solutions again"]
-    assert 60.0 < ceased < 65.0 and 75.0 < again < 78.0
-    assert not [r for r in kept if isinstance(r, Solution) and 61.0 < r.rx_ns * 1e-9 - 1000.0 < 75.0]
+    scenario = dataclasses.replace(
+        get_scenario("short"), faults=(fault,), rates=SensorRates(imu=1.0, truth=1.0)
+    )
+    records = loopback.fly_scenario(scenario, loopback.simulator_config(Config())).records
+    events = [(r.rx_ns * 1e-9 - 1000.0, r.text) for r in records if isinstance(r, Event)]
+    (stopped,) = [t for t, text in events if "no data from the inertial channel" in text]
+    (resumed,) = [t for t, text in events if text == "solutions resumed"]
+    assert 60.0 < stopped < 65.0 and 75.0 < resumed < 78.0
+    assert not [r for r in records if isinstance(r, Solution) and 61.0 < r.rx_ns * 1e-9 - 1000.0 < 75.0]
 
 
-def test_every_fault_of_the_simulator_is_flown() -> None:
-    flown = {kind.fault.name for kind in KINDS.values() if kind.fault}
-    assert set(NAMES) - flown <= {"cut"}  # of the stream, tried elsewhere
+def test_campaign_covers_every_simulator_fault() -> None:
+    flown = {kind.fault.name for kind in FAULT_CASES.values() if kind.fault}
+    assert set(NAMES) - flown <= {"cut"}  # a byte fault, covered by the tests of the frame reader
     for name in SCENARIOS:
-        for fault in KINDS:
-            assert flight.ordered(Order(name, fault, 1)).duration_s >= 600.0
+        for fault in FAULT_CASES:
+            assert flight.scenario_of(FlightOrder(name, fault, 1)).duration_s >= 600.0
 
 
-def test_the_command_prints_and_ends_by_the_limits(flown: tuple[Path, list[Result]]) -> None:
+def test_exit_code_follows_the_limits(flown: tuple[Path, list[FlightResult]]) -> None:
     folder = str(flown[0])
     options = ["--fault", "none", "--fault", "gnss-jump", "--workers", "0", "--results", folder, "--json"]
-    told = CliRunner().invoke(command.command, options)
-    assert told.exit_code == 0, told.output
-    assert [line["fault"] for line in json.loads(told.stdout)] == ["none", "gnss-jump"]
+    events = CliRunner().invoke(command.command, options)
+    assert events.exit_code == 0, events.output
+    assert [line["fault"] for line in json.loads(events.stdout)] == ["none", "gnss-jump"]
     strict = CliRunner().invoke(command.command, [*options[:-1], "--harmless-m", "0.001"])
     assert strict.exit_code == 1
     assert "gnss-jump" in strict.output
 
 
-def test_dask_brings_back_every_flight(tmp_path: Path) -> None:
-    """One worker process; the flights end at once for want of their scenario, which is all that is asked."""
+def test_dask_returns_every_flight(tmp_path: Path) -> None:
+    """One worker process; the flights end at once because their scenario is unknown."""
     pytest.importorskip("distributed", reason="the extra `campaign` is not installed")
-    wanted = [Order("nowhere", "none", seed) for seed in range(8)]
-    results = command.campaign(wanted, tmp_path, workers=1, quiet=True)
+    wanted = [FlightOrder("nowhere", "none", seed) for seed in range(8)]
+    results = command.run_campaign(wanted, tmp_path, workers=1, quiet=True)
     assert [r.key for r in results] == [order.key for order in wanted]
     assert all(r.raised and "scenarios are" in r.raised for r in results)
-    assert sorted(command.stored(tmp_path / "flights.jsonl")) == sorted(results)
+    assert sorted(command.read_results(tmp_path / "flights.jsonl")) == sorted(results)
 
 
-def test_a_worker_killed_in_flight_loses_no_flight(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """SIGKILL under the third of six flights; the nanny starts another worker, and it is flown there."""
+def test_flight_of_a_killed_worker_is_repeated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """SIGKILL during the third of six flights; the nanny starts another worker, which repeats it."""
     pytest.importorskip("distributed", reason="the extra `campaign` is not installed")
     killed = tmp_path / "killed"
 
-    def fly(order: Order) -> Result:
+    def fly(order: FlightOrder) -> FlightResult:
         if order.seed == 3 and not killed.exists():
             killed.touch()
             os.kill(os.getpid(), signal.SIGKILL)
-        return Result(order.key, *order, 720.0, 2.0)
+        return FlightResult(order.key, *order, 720.0, 2.0)
 
-    monkeypatch.setattr(command, "attempt", fly)
-    wanted = [Order("one-beacon", "none", seed) for seed in range(1, 7)]
-    results = command.campaign(wanted, tmp_path, workers=1, quiet=True)
+    monkeypatch.setattr(command, "fly_order", fly)
+    wanted = [FlightOrder("one-beacon", "none", seed) for seed in range(1, 7)]
+    results = command.run_campaign(wanted, tmp_path, workers=1, quiet=True)
     assert killed.exists()
-    assert results == [Result(order.key, *order, 720.0, 2.0) for order in wanted]
+    assert results == [FlightResult(order.key, *order, 720.0, 2.0) for order in wanted]
     lines = (tmp_path / "flights.jsonl").read_bytes().splitlines()
     assert sorted(json.loads(line)["seed"] for line in lines) == [1, 2, 3, 4, 5, 6]
 
 
-def test_a_flight_that_no_worker_survived_is_flown_again(
+def test_lost_flight_is_repeated_by_the_next_campaign(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (order,) = wanted = [Order("one-beacon", "none", 1)]
-    lost, flown = Result(order.key, *order, 0.0, 0.0, raised=f"{command.LOST}: it died"), result("none", 1)
-    for came in (lost, flown):
-        monkeypatch.setattr(command, "run", lambda *_, came=came: iter([came]))
-        assert command.campaign(wanted, tmp_path, quiet=True) == [came]
-    assert command.stored(tmp_path / "flights.jsonl") == [flown]
+    (order,) = wanted = [FlightOrder("one-beacon", "none", 1)]
+    lost, flown = (
+        FlightResult(order.key, *order, 0.0, 0.0, raised=f"{command.WORKER_LOST}: it died"),
+        result("none", 1),
+    )
+    for returned in (lost, flown):
+        monkeypatch.setattr(command, "fly_orders", lambda *_, returned=returned: iter([returned]))
+        assert command.run_campaign(wanted, tmp_path, quiet=True) == [returned]
+    assert command.read_results(tmp_path / "flights.jsonl") == [flown]

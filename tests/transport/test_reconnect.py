@@ -1,4 +1,4 @@
-"""Links opened again for ever: when not, after which pauses, and what is said."""
+"""Reconnecting: retries, pauses and reports."""
 
 import asyncio
 import errno
@@ -10,9 +10,9 @@ from typing import Any
 
 import pytest
 
-from companion.transport import links
+from companion.transport import reconnect
 from companion.transport.address import Address
-from companion.transport.links import CannotListen, back_off, connections
+from companion.transport.reconnect import CannotListen, back_off, connections
 
 
 def run(test: Coroutine[Any, Any, None]) -> None:
@@ -24,7 +24,7 @@ def run(test: Coroutine[Any, Any, None]) -> None:
 
 
 @pytest.mark.parametrize("kind", ["udpin", "tcpin"])
-def test_a_port_in_use_is_one_clear_sentence_and_no_retry(kind: str) -> None:
+def test_port_in_use_is_one_error_without_retry(kind: str) -> None:
     async def test() -> None:
         with socket.socket(type=socket.SOCK_DGRAM if kind == "udpin" else socket.SOCK_STREAM) as taken:
             taken.bind(("127.0.0.1", 0))
@@ -46,7 +46,7 @@ async def until(condition: Callable[[], bool]) -> None:
 
 
 def binding(monkeypatch: pytest.MonkeyPatch, *errors: int) -> list[Any]:
-    """What `bind` was called with; it fails with these errors in turn, and passes at a 0 and after."""
+    """Make `bind` fail with these errors in turn (0: succeed); return the list of its arguments."""
     real, called, waiting = socket.socket.bind, list[Any](), list(errors)
 
     def bind(sock: socket.socket, where: Any) -> None:
@@ -56,12 +56,12 @@ def binding(monkeypatch: pytest.MonkeyPatch, *errors: int) -> list[Any]:
         real(sock, where)
 
     monkeypatch.setattr(socket.socket, "bind", bind)
-    monkeypatch.setattr(links, "SHORTEST_PAUSE", 0.002)
+    monkeypatch.setattr(reconnect, "MIN_PAUSE", 0.002)
     return called
 
 
 @pytest.mark.parametrize("number", [errno.EACCES, errno.EINVAL])
-def test_an_address_that_never_will_be_had_ends_it(monkeypatch: pytest.MonkeyPatch, number: int) -> None:
+def test_permanently_unusable_address_is_an_error(monkeypatch: pytest.MonkeyPatch, number: int) -> None:
     async def test() -> None:
         called = binding(monkeypatch, number)
         with pytest.raises(CannotListen, match=rf"{os.strerror(number)}; choose another host or port"):
@@ -72,17 +72,17 @@ def test_an_address_that_never_will_be_had_ends_it(monkeypatch: pytest.MonkeyPat
 
 
 @pytest.mark.parametrize("kind", ["udpin", "tcpin"])
-def test_an_address_that_is_not_there_yet_is_said_once_and_waited_for(
+def test_address_not_available_yet_is_reported_once_and_retried(
     monkeypatch: pytest.MonkeyPatch, kind: str
 ) -> None:
     async def test() -> None:
-        said: list[str] = []
+        reports: list[str] = []
         called = binding(monkeypatch, *[errno.EADDRNOTAVAIL] * 5)
         address = Address(kind, "127.0.0.1", 0)
-        links = connections(address, random.random, said.append)
+        links = connections(address, random.random, reports.append)
         opening = asyncio.ensure_future(anext(links))
         await until(lambda: len(called) == 6)
-        assert said == [f"{address}: this computer has no address 127.0.0.1 at present; trying again"]
+        assert reports == [f"{address}: this computer has no address 127.0.0.1 at present; trying again"]
         opening.cancel()
         await asyncio.gather(opening, return_exceptions=True)
         await links.aclose()
@@ -91,40 +91,40 @@ def test_an_address_that_is_not_there_yet_is_said_once_and_waited_for(
 
 
 @pytest.mark.parametrize("number", [errno.EADDRINUSE, errno.EACCES, errno.EADDRNOTAVAIL])
-def test_opening_again_never_ends_it(monkeypatch: pytest.MonkeyPatch, number: int) -> None:
+def test_failure_to_reopen_is_always_retried(monkeypatch: pytest.MonkeyPatch, number: int) -> None:
     async def test() -> None:
-        said: list[str] = []
+        reports: list[str] = []
         called = binding(monkeypatch, 0, *[number] * 5)
-        links = connections(Address("udpin", "127.0.0.1", 0), random.random, said.append)
+        links = connections(Address("udpin", "127.0.0.1", 0), random.random, reports.append)
         (await anext(links)).close()
         (await anext(links)).close()
         assert len(called) == 7
-        assert len(said) == 1 and said[0].endswith("; trying again")
+        assert len(reports) == 1 and reports[0].endswith("; trying again")
         await links.aclose()
 
     run(test())
 
 
-def test_pauses_double_to_their_limit_and_are_jittered_down_to_a_half() -> None:
+def test_pauses_double_up_to_their_limit_with_jitter_down_to_a_half() -> None:
     whole, half = back_off(lambda: 0.0), back_off(lambda: 1.0)
     longest = [next(whole) for _ in range(8)]
     assert longest == [0.25, 0.5, 1, 2, 4, 8, 10, 10]
     assert [next(half) for _ in range(8)] == [p / 2 for p in longest]
 
 
-def test_a_name_that_is_not_known_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unknown_host_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     async def test() -> None:
         async def unknown(*_: object, **__: object) -> None:
             raise socket.gaierror(socket.EAI_NONAME, "Name or service not known")
 
         monkeypatch.setattr(asyncio.get_running_loop(), "getaddrinfo", unknown)
-        said: list[str] = []
+        reports: list[str] = []
         waiting = asyncio.ensure_future(
-            anext(connections(Address("tcp", "no.such", 1), lambda: 1.0, said.append))
+            anext(connections(Address("tcp", "no.such", 1), lambda: 1.0, reports.append))
         )
         await asyncio.sleep(0.5)
         waiting.cancel()
         await asyncio.gather(waiting, return_exceptions=True)
-        assert said == ["tcp:no.such:1: Name or service not known; trying again"]
+        assert reports == ["tcp:no.such:1: Name or service not known; trying again"]
 
     run(test())

@@ -1,0 +1,101 @@
+"""Reconnecting transport: byte streams over serial lines, UDP and TCP, opened again after each failure.
+
+async for connection in connections(Address.parse("udpin:127.0.0.1:14550"), random.random, print):
+    try:
+        while True:
+            data = await connection.read()      # all that is available; ConnectionError at the end
+            connection.write(answer)            # never waits
+        # or, if the answer must not wait for a turn of the event loop:
+        await connection.deliver_to(receive)    # each piece as it arrives, until the connection ends
+    except ConnectionError as error:
+        ...                                     # the next iteration opens it again, after a pause
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Callable, Iterator
+
+from companion.transport.address import Address
+from companion.transport.connection import Connection, pair, reason
+from companion.transport.serial_line import open_serial
+from companion.transport.sockets import CannotListen, open_socket
+from companion.transport.tcp import Listener, tcp_connection
+from companion.transport.udp import connected_udp, listening_udp
+
+__all__ = ["Address", "CannotListen", "Connection", "back_off", "connect", "connections", "pair"]
+
+MIN_PAUSE, MAX_PAUSE = 0.25, 10.0
+#: After a connection that lasted this long (s), the pauses start again from the shortest.
+GOOD_AFTER = 10.0
+
+
+async def connect(address: Address) -> Connection:
+    """Open a connection once. OSError if it fails, CannotListen if our own address cannot be used."""
+    if address.kind == "serial":
+        return open_serial(address)
+    if address.kind == "tcpin":
+        listener = await Listener.open(address)
+        try:
+            return await listener.accept()
+        finally:
+            listener.close()
+    over = {"udpin": listening_udp, "udpout": connected_udp, "tcp": tcp_connection}[address.kind]
+    return over(str(address), await open_socket(address))
+
+
+async def connections(
+    address: Address, random: Callable[[], float], report: Callable[[str], None]
+) -> AsyncIterator[Connection]:
+    """Open a connection, and open it again at every iteration of the `async for`, until stopped.
+
+    CannotListen is raised by the first attempt only: then an operator is present to correct the address,
+    later there may be none. A listening TCP link keeps listening between its clients.
+
+    Parameters
+    ----------
+    address
+        Address of the link.
+    random
+        Returns numbers in [0, 1), for the jitter of the pauses.
+    report
+        Receives one line for each failure that differs from the last.
+    """
+    loop = asyncio.get_running_loop()
+    pauses = back_off(random)
+    last_report, is_first = "", True
+    listener: Listener | None = None
+    try:
+        while True:
+            try:
+                if address.kind == "tcpin":
+                    listener = listener or await Listener.open(address)
+                connection = await (listener.accept() if listener else connect(address))
+            except OSError as error:
+                if is_first and isinstance(error, CannotListen):
+                    raise
+                line = f"{address}: {reason(error)}; trying again"
+                if line != last_report:
+                    report(line)
+                last_report = line
+            else:
+                last_report, opened = "", loop.time()
+                try:
+                    yield connection
+                finally:
+                    connection.close()
+                if loop.time() - opened >= GOOD_AFTER:
+                    pauses = back_off(random)
+            is_first = False
+            await asyncio.sleep(next(pauses))
+    finally:
+        if listener is not None:
+            listener.close()
+
+
+def back_off(random: Callable[[], float]) -> Iterator[float]:
+    """Yield pauses in seconds that double up to MAX_PAUSE, each shortened by up to a half at random."""
+    longest = MIN_PAUSE
+    while True:
+        yield longest * (1 - random() / 2)
+        longest = min(2 * longest, MAX_PAUSE)

@@ -1,0 +1,23 @@
+"""Read a log: print the error of the estimate against the truth once a minute of flight.
+
+python examples/read_log.py LOG.mcap
+"""
+
+import math
+import sys
+
+from companion.nav import Geodetic, separation
+from companion.records import Solution, Truth
+from companion.storage import flight_log
+
+truth = None
+next_ns = 0
+for entry in flight_log.read(sys.argv[1]):
+    record = entry.value
+    if isinstance(record, Truth):
+        truth = Geodetic(record.lat, record.lon, record.alt)
+    elif isinstance(record, Solution) and truth is not None and record.t_ns >= next_ns:
+        next_ns = record.t_ns + 60_000_000_000
+        north, east, _ = separation(Geodetic(record.lat, record.lon, truth.alt), truth)
+        sigma = math.sqrt(record.covariance[0] + record.covariance[3])
+        print(f"{record.t_ns / 60e9:6.1f} min {record.mode:11} error {math.hypot(north, east):7.1f} m, sigma {sigma:.1f} m")

@@ -1,0 +1,37 @@
+"""Replay a recording with another configuration and compare the two tracks.
+
+python examples/replay_with_another_estimator.py FLIGHT.tlog
+"""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from companion.analysis.replay_inputs import apply_changes, open_inputs
+from companion.config import Config
+from companion.nav import Geodetic, separation
+from companion.navigator import Navigator
+from companion.records import INPUTS, Solution
+
+
+def solutions(path: Path, config: Config) -> dict[int, Solution]:
+    """Run a navigator over the recording: its solutions by time."""
+    navigator, found = Navigator(config), {}
+    for record in open_inputs(path).records:
+        if isinstance(record, INPUTS):
+            for output in navigator.handle(record):
+                if isinstance(output, Solution):
+                    found[output.t_ns // 1_000_000_000] = output
+    return found
+
+
+path = Path(sys.argv[1])
+default = solutions(path, Config())
+other = solutions(path, apply_changes(Config(), "gnss.sigma_m=4"))
+apart = [
+    np.hypot(*separation(Geodetic(a.lat, a.lon, 0.0), Geodetic(b.lat, b.lon, 0.0))[:2])
+    for t, a in default.items()
+    if (b := other.get(t)) is not None
+]
+print(f"{len(default)} and {len(other)} solutions; distance {np.median(apart):.2f} m in the median, {max(apart):.2f} m at most")

@@ -1,0 +1,68 @@
+"""Replayed outputs compared with the flight's: exactly on the same platform, within a tolerance elsewhere."""
+
+from __future__ import annotations
+
+import math
+
+from msgspec import structs
+
+from companion.analysis.comparison import POSITION_M, OutputComparison
+from companion.records import Event, Mode, Rejection, Solution
+
+SOLUTION = Solution(
+    t_ns=1,
+    rx_ns=2,
+    mode=Mode.FIXED,
+    estimator="kalman",
+    lat=1.0,
+    lon=0.5,
+    alt_msl=100.0,
+    v_n=(20.0, -3.0, 0.1),
+    covariance=(4.0, 0.0, 0.0, 4.0, 0.0, 9.0),
+    error_n=(1.0, 2.0),
+    velocity_error_n=(0.1, 0.2),
+    sources=3,
+    horizon_s=0.2,
+)
+METRE = 1.0 / 6.4e6
+
+
+def compare(exact: bool, now: object, then: object = SOLUTION) -> OutputComparison:
+    comparison = OutputComparison(exact)
+    comparison.add([then], [now])  # type: ignore[list-item]
+    return comparison
+
+
+def test_the_last_bit_counts_on_the_same_platform_only() -> None:
+    nearly = structs.replace(SOLUTION, lat=math.nextafter(1.0, 2.0), error_n=(math.nextafter(1.0, 2.0), 2.0))
+    assert compare(True, nearly).different == 1
+    assert compare(False, nearly).different == 0
+    assert compare(True, SOLUTION).different == 0
+
+
+def test_the_distance_is_in_metres_and_limited() -> None:
+    away = structs.replace(SOLUTION, lat=1.0 + 5.0 * METRE)
+    found = compare(False, away)
+    assert found.different == 1
+    assert abs(found.apart_m - 5.0) < 0.05
+    assert compare(False, structs.replace(SOLUTION, lat=1.0 + 0.5 * POSITION_M * METRE)).different == 0
+
+
+def test_other_kinds_missing_outputs_and_numbers_differ_elsewhere_too() -> None:
+    assert compare(False, Event(1, 2, 6, "x")).different == 1
+    assert compare(False, structs.replace(SOLUTION, v_n=(20.1, -3.0, 0.1))).different == 1
+    missing = OutputComparison(False)
+    missing.add([SOLUTION], [])
+    assert (missing.compared, missing.different) == (1, 1)
+
+
+def test_a_text_may_round_its_number_differently_but_say_nothing_else() -> None:
+    then = Rejection(1, 2, "Gnss", "too far: 163 m")
+    assert compare(False, Rejection(1, 2, "Gnss", "too far: 164 m"), then).different == 0
+    assert compare(False, Rejection(1, 2, "Gnss", "too late: 163 m"), then).different == 1
+
+
+def test_the_first_difference_is_shortened() -> None:
+    found = compare(True, structs.replace(SOLUTION, lat=1.1))
+    assert found.first is not None
+    assert len(found.first) < 320
