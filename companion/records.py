@@ -133,6 +133,7 @@ class AirData(Stamped, frozen=True, gc=False, tag=True):
     climb: float | None = None
     heading: float | None = None
     alt_msl: float | None = None
+    sensed: bool | None = None
 
 
 class Wind(Stamped, frozen=True, gc=False, tag=True):
@@ -148,6 +149,25 @@ class Pressure(Stamped, frozen=True, gc=False, tag=True):
     static: float
     differential: float | None = None
     temperature: float | None = None
+
+
+class AirspeedSensor(Stamped, frozen=True, gc=False, tag=True):
+    """Whether the autopilot has an airspeed sensor that is present, enabled and healthy."""
+
+    healthy: bool
+
+
+class GnssIntegrity(Stamped, frozen=True, gc=False, tag=True):
+    """Jamming and spoofing as the receiver reports them (GNSS_INTEGRITY)."""
+
+    receiver: int
+    jamming: int
+    spoofing: int
+
+    @property
+    def threatened(self) -> bool:
+        """Whether jamming or spoofing is indicated, mitigated or not."""
+        return self.jamming >= 2 or self.spoofing >= 2
 
 
 class FilterStatus(Stamped, frozen=True, gc=False, tag=True):
@@ -277,6 +297,8 @@ class Solution(Stamped, frozen=True, gc=False, tag=True):
     sigma_velocity: float | None = None
     protection: float | None = None
     trust: Trust | None = None
+    gnss_false: float | None = None
+    witness: bool = False
 
 
 class Fix(Stamped, frozen=True, gc=False, tag=True):
@@ -357,6 +379,8 @@ Input: TypeAlias = (
     | HomePosition
     | GlobalPosition
     | AirData
+    | AirspeedSensor
+    | GnssIntegrity
     | Wind
     | Pressure
     | FilterStatus

@@ -25,5 +25,6 @@ error = np.asarray(fix.position) - aircraft
 sigma = np.sqrt(np.diag(fix.covariance))
 print(f"position  {np.round(fix.position, 1)} m, {fix.iterations} iterations")
 print(f"sigma     {np.round(sigma, 1)} m")
-print(f"error     {np.round(error, 1)} m, chi-square {fix.cost:.1f} with {fix.degrees_of_freedom} degrees of freedom")
+print(f"error     {np.round(error, 1)} m")
+print(f"residuals chi-square {fix.cost:.1f} with {fix.degrees_of_freedom} degrees of freedom")
 assert np.all(np.abs(error) < 5.0 * sigma)

@@ -1,6 +1,6 @@
 """Guaranteed prediction of an INS on the Schuler channel: how far off can it be after GNSS is lost?
 
-The bound is the worst r.m.s. error over every correlation of the fixes' errors (Matasov and Martirosyan, 1997).
+The bound is the worst r.m.s. error over every correlation of the fixes' errors (Matasov, Martirosyan, 1997).
 """
 
 from companion.estimate import closed_form

@@ -20,4 +20,5 @@ for entry in flight_log.read(sys.argv[1]):
         next_ns = record.t_ns + 60_000_000_000
         north, east, _ = separation(Geodetic(record.lat, record.lon, truth.alt), truth)
         sigma = math.sqrt(record.covariance[0] + record.covariance[3])
-        print(f"{record.t_ns / 60e9:6.1f} min {record.mode:11} error {math.hypot(north, east):7.1f} m, sigma {sigma:.1f} m")
+        error = math.hypot(north, east)
+        print(f"{record.t_ns / 60e9:6.1f} min {record.mode:11} error {error:7.1f} m, sigma {sigma:.1f} m")

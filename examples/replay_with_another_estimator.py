@@ -1,6 +1,6 @@
 """Replay a recording with another configuration and compare the two tracks.
 
-python examples/replay_with_another_estimator.py FLIGHT.tlog
+python examples/replay_with_another_estimator.py FLIGHT.tlog [KEY=VALUE,...]
 """
 
 import sys
@@ -28,10 +28,12 @@ def solutions(path: Path, config: Config) -> dict[int, Solution]:
 
 path = Path(sys.argv[1])
 default = solutions(path, Config())
-other = solutions(path, apply_changes(Config(), "gnss.sigma_m=4"))
+changes = sys.argv[2] if len(sys.argv) > 2 else "inertial.source=air_data,estimator.scheme=feedback"
+other = solutions(path, apply_changes(Config(), changes))
 apart = [
     np.hypot(*separation(Geodetic(a.lat, a.lon, 0.0), Geodetic(b.lat, b.lon, 0.0))[:2])
     for t, a in default.items()
     if (b := other.get(t)) is not None
 ]
-print(f"{len(default)} and {len(other)} solutions; distance {np.median(apart):.2f} m in the median, {max(apart):.2f} m at most")
+print(f"solutions: {len(default)} by default, {len(other)} with {changes}")
+print(f"distance: {np.median(apart):.2f} m in the median, {max(apart):.2f} m at most")

@@ -28,6 +28,7 @@ from companion.link.dialect import mavlink
 from companion.nav.geometry import Geodetic, displace, geodetic_to_local, local_to_geodetic
 from companion.records import (
     AirData,
+    AirspeedSensor,
     Attitude,
     FilterStatus,
     GlobalPosition,
@@ -128,6 +129,7 @@ class SimulatedAutopilot:
         self._latency_ns = round(scenario.link.latency_s * 1e9)
         self._generators: dict[int, Callable[[int], Any]] = {
             _msgid("HEARTBEAT"): self._heartbeat,
+            _msgid("SYS_STATUS"): self._system_status,
             _msgid("SYSTEM_TIME"): self._system_time,
             _msgid("GLOBAL_POSITION_INT"): self._global_position,
             _msgid("GPS_GLOBAL_ORIGIN"): self._origin,
@@ -317,6 +319,9 @@ class SimulatedAutopilot:
             system_status=mavlink.MAV_STATE_ACTIVE,
             mavlink_version=3,
         )
+
+    def _system_status(self, t: int) -> Any:
+        return encode(AirspeedSensor(t, t, self.scenario.airspeed_sensor), self._sender)
 
     def _system_time(self, t: int) -> Any:
         boot_shift = -self._sender.boot_ns - round(self.scenario.boot_before_s * 1e9)

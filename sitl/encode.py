@@ -12,9 +12,10 @@ from collections.abc import Callable
 from typing import Any, Literal, NamedTuple, TypeAlias
 
 from companion.link import dialect
-from companion.link.dialect import rsbn
+from companion.link.dialect import mavlink, rsbn
 from companion.records import (
     AirData,
+    AirspeedSensor,
     Attitude,
     FilterStatus,
     GlobalPosition,
@@ -37,6 +38,13 @@ Message: TypeAlias = Any
 
 _MILLI_G = G0 / 1000
 _ZERO_CELSIUS = 273.15
+_ALWAYS_PRESENT = (
+    mavlink.MAV_SYS_STATUS_SENSOR_3D_GYRO
+    | mavlink.MAV_SYS_STATUS_SENSOR_3D_ACCEL
+    | mavlink.MAV_SYS_STATUS_SENSOR_3D_MAG
+    | mavlink.MAV_SYS_STATUS_SENSOR_ABSOLUTE_PRESSURE
+    | mavlink.MAV_SYS_STATUS_SENSOR_GPS
+)
 _INERTIAL_UPDATED = 0x3F  # HIGHRES_IMU_UPDATED_XACC ... ZGYRO
 
 
@@ -197,6 +205,16 @@ def _air_data(r: AirData, a: SimulatedSender) -> Message:
     )
 
 
+def _airspeed_sensor(r: AirspeedSensor, a: SimulatedSender) -> Message:
+    sensors = _ALWAYS_PRESENT | (mavlink.MAV_SYS_STATUS_SENSOR_DIFFERENTIAL_PRESSURE if r.healthy else 0)
+    return dialect.new(
+        "SYS_STATUS",
+        onboard_control_sensors_present=sensors,
+        onboard_control_sensors_enabled=sensors,
+        onboard_control_sensors_health=sensors,
+    )
+
+
 def _wind(r: Wind, a: SimulatedSender) -> Message:
     north, east, down = r.v_n
     if a.autopilot == "px4":
@@ -289,6 +307,7 @@ _ENCODERS: dict[type[Stamped], Callable[[Any, SimulatedSender], Message]] = {
     HomePosition: _position_encoder("HOME_POSITION"),
     GlobalPosition: _global_position,
     AirData: _air_data,
+    AirspeedSensor: _airspeed_sensor,
     Wind: _wind,
     Pressure: _pressure,
     FilterStatus: _filter_status,

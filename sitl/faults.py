@@ -24,11 +24,13 @@ from msgspec.structs import replace
 
 from companion.link import dialect
 from companion.nav.geometry import displace
-from companion.records import AirData, Gnss, LocalPosition, RsbnFix, Stamped
+from companion.records import AirData, Attitude, Gnss, LocalPosition, RsbnFix, Stamped
 from companion.storage.mcap_file import DiskFile
 
 R = TypeVar("R", bound=Stamped)
 Generator = np.random.Generator
+
+OUTAGE_S = 60.0  # without a fix, before the fix of "gnss-return"
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,6 +90,19 @@ def gnss_spoof(fix: Gnss, fault: Fault, size: float, rng: Generator) -> Gnss:
     return replace(_displace_fix(fix, 0.0, size * (fix.t_ns * 1e-9 - fault.start_s)), v_n=v_n)
 
 
+def gnss_accelerate(fix: Gnss, fault: Fault, size: float, rng: Generator) -> Gnss:
+    """Drift the fix eastwards with an acceleration of `size` m/s^2, with a consistent velocity."""
+    t = fix.t_ns * 1e-9 - fault.start_s
+    v_n = fix.v_n and (fix.v_n[0], fix.v_n[1] + size * t, fix.v_n[2])
+    return replace(_displace_fix(fix, 0.0, 0.5 * size * t * t), v_n=v_n)
+
+
+def gnss_return(fix: Gnss, fault: Fault, size: float, rng: Generator) -> Gnss:
+    """Remove the fix for `OUTAGE_S`; after it the fix is displaced `size` metres to the north-east."""
+    in_outage = fix.t_ns * 1e-9 - fault.start_s < OUTAGE_S
+    return without_fix(fix) if in_outage else gnss_jump(fix, fault, size, rng)
+
+
 def gnss_jam(fix: Gnss, fault: Fault, size: float, rng: Generator) -> Gnss:
     """Remove the fix."""
     return without_fix(fix)
@@ -132,6 +147,13 @@ def ins_reset(local: LocalPosition, fault: Fault, size: float, rng: Generator) -
     return replace(local, x_n=(north - leg, east - leg, down))
 
 
+def ins_drift(local: LocalPosition, fault: Fault, size: float, rng: Generator) -> LocalPosition:
+    """Drift the local position to the south at `size` m/s, with a consistent velocity."""
+    (north, east, down), (v_north, v_east, v_down) = local.x_n, local.v_n
+    gone = size * (local.t_ns * 1e-9 - fault.start_s)
+    return replace(local, x_n=(north - gone, east, down), v_n=(v_north - size, v_east, v_down))
+
+
 def nan_fields(local: LocalPosition, fault: Fault, size: float, rng: Generator) -> LocalPosition:
     """Set position and velocity to NaN."""
     return replace(local, x_n=(math.nan,) * 3, v_n=(math.nan,) * 3)
@@ -141,6 +163,21 @@ def icing(air: AirData, fault: Fault, size: float, rng: Generator) -> AirData:
     """Ice the pitot tube: airspeed decreases by the fraction `size` within a minute and stays low."""
     grown = min((air.t_ns * 1e-9 - fault.start_s) / 60.0, 1.0)
     return replace(air, airspeed=air.airspeed * (1.0 - size * grown))
+
+
+def pitot_stuck(air: AirData, fault: Fault, size: float, rng: Generator) -> AirData:
+    """Hold the airspeed at `size` m/s."""
+    return replace(air, airspeed=size)
+
+
+def pitot_scale(air: AirData, fault: Fault, size: float, rng: Generator) -> AirData:
+    """Multiply the airspeed by `size`."""
+    return replace(air, airspeed=air.airspeed * size)
+
+
+def heading_off(attitude: Attitude, fault: Fault, size: float, rng: Generator) -> Attitude:
+    """Add `size` radians to the heading."""
+    return replace(attitude, heading=(attitude.heading + size) % math.tau)
 
 
 def wind_shear(air: AirData, fault: Fault, size: float, rng: Generator) -> AirData:
@@ -210,6 +247,14 @@ def delayed(stream: Sequence[R], fault: Fault, size: float, rng: Generator) -> l
     return sorted(moved, key=lambda r: r.rx_ns)
 
 
+def stamped_late(stream: Sequence[R], fault: Fault, size: float, rng: Generator) -> list[R]:
+    """Delay records by `size` seconds and stamp them at their arrival, as a receiver without a stamp does."""
+    delay = round(size * 1e9)
+    return [
+        replace(r, t_ns=r.t_ns + delay, rx_ns=r.rx_ns + delay) if fault.covers(r.t_ns) else r for r in stream
+    ]
+
+
 class RecordFault(NamedTuple):
     """Record fault: kind of record, default size, function."""
 
@@ -221,6 +266,9 @@ class RecordFault(NamedTuple):
 RECORD_FAULTS: dict[str, RecordFault] = {
     "gnss-jump": RecordFault(Gnss, 500.0, per_record(gnss_jump)),
     "gnss-spoof": RecordFault(Gnss, 2.0, per_record(gnss_spoof)),
+    "gnss-accelerate": RecordFault(Gnss, 0.003, per_record(gnss_accelerate)),
+    "gnss-return": RecordFault(Gnss, 450.0, per_record(gnss_return)),
+    "gnss-latency": RecordFault(Gnss, 0.2, stamped_late),
     "gnss-jam": RecordFault(Gnss, 0.0, per_record(gnss_jam)),
     "gnss-frozen": RecordFault(Gnss, 0.0, repeat_last),
     "gnss-stale": RecordFault(Gnss, 0.0, repeat_last_with_new_stamp),
@@ -233,10 +281,14 @@ RECORD_FAULTS: dict[str, RecordFault] = {
     "beacon-frozen": RecordFault(RsbnFix, 0.0, repeat_last),
     "beacon-late": RecordFault(RsbnFix, 5.0, delayed),
     "ins-reset": RecordFault(LocalPosition, 200.0, per_record(ins_reset)),
+    "ins-drift": RecordFault(LocalPosition, 1.0, per_record(ins_drift)),
     "ins-frozen": RecordFault(LocalPosition, 0.0, repeat_last),
     "ins-nan": RecordFault(LocalPosition, 0.0, per_record(nan_fields)),
     "airspeed-icing": RecordFault(AirData, 0.5, per_record(icing)),
     "airspeed-frozen": RecordFault(AirData, 0.0, repeat_last),
+    "pitot-stuck": RecordFault(AirData, 8.0, per_record(pitot_stuck)),
+    "pitot-scale": RecordFault(AirData, 1.5, per_record(pitot_scale)),
+    "heading-off": RecordFault(Attitude, math.radians(5.0), per_record(heading_off)),
     "wind-shear": RecordFault(AirData, 8.0, per_record(wind_shear)),
 }
 

@@ -7,22 +7,24 @@ flight takes seconds and is reproducible. The table at the end compares every so
 from __future__ import annotations
 
 import json
+import math
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import click
 import msgspec
 import numpy as np
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
 from companion.analysis import error_statistics
 from companion.config import Config, OutputConfig, load
-from companion.nav.geometry import Geodetic
+from companion.nav.geometry import Geodetic, separation
 from companion.records import Event, Gnss, Rejection, Reset, RsbnFix, Solution, Stamped
 from companion.runtime.core import CompanionCore
 from companion.storage.deferred_log import Log
@@ -68,13 +70,13 @@ class LoopbackFlight(NamedTuple):
     core: CompanionCore
 
 
-def simulator_config(config: Config) -> Config:
+def simulator_config(config: Config, own_ins: bool = True) -> Config:
     """Adapt `config` to the simulated autopilot.
 
-    Its local position comes from an independent INS, so `inertial.independent` is set. A default [output] is
-    replaced by `DEFAULT_OUTPUT`.
+    Its local position comes from an INS of its own, so `inertial.independent` is set; without `own_ins` it is
+    treated as that of a stock autopilot. A default [output] is replaced by `DEFAULT_OUTPUT`.
     """
-    inertial = msgspec.structs.replace(config.inertial, independent=True)
+    inertial = msgspec.structs.replace(config.inertial, independent=own_ins)
     output = DEFAULT_OUTPUT if config.output == OutputConfig() else config.output
     return msgspec.structs.replace(config, inertial=inertial, output=output)
 
@@ -97,8 +99,12 @@ def fly_connected(
     core: CompanionCore,
     start_ns: int,
     progress: Callable[[float], None] | None = None,
+    stalls: Sequence[tuple[int, int]] = (),
 ) -> None:
-    """Exchange bytes between autopilot and companion from `start_ns`, the start of the flight, to its end."""
+    """Exchange bytes between autopilot and companion from `start_ns`, the start of the flight, to its end.
+
+    During `stalls`, from one time to another (ns), the companion's computer does nothing.
+    """
     now, reported, due = start_ns, start_ns, start_ns
     while now <= autopilot.end_ns:
         for data in autopilot.poll(now):
@@ -113,6 +119,7 @@ def fly_connected(
             reported = now + SECOND_NS
         due = core.deadline()
         now = max(now + 1, min(autopilot.deadline(), due))
+        now = max((end for begin, end in stalls if begin <= now < end), default=now)
 
 
 def truth_function(autopilot: SimulatedAutopilot) -> error_statistics.TruthAt:
@@ -135,6 +142,40 @@ def error_table(flown: LoopbackFlight) -> list[error_statistics.PhaseErrors]:
     return error_statistics.summarize_phases(
         found, [_from_first_fix(phase, flown.records) for phase in phases]
     )
+
+
+class PhaseProtection(NamedTuple):
+    """Protection level in one phase: median (m), and the share of solutions with the error within it."""
+
+    level: float
+    inside: float
+
+    @property
+    def held(self) -> bool:
+        """Whether no error was beyond it."""
+        return self.inside == 1.0
+
+
+def protection_table(
+    flown: LoopbackFlight, rows: Sequence[error_statistics.PhaseErrors]
+) -> list[PhaseProtection | None]:
+    """Compute the protection level of each phase of `rows`; None where there is no solution."""
+    truth = truth_function(flown.autopilot)
+    phases = [_from_first_fix(phase, flown.records) for phase in flown.autopilot.scenario.phases()]
+    solutions = [r for r in flown.records if isinstance(r, Solution) and r.protection is not None]
+    t_ns = np.array([r.t_ns for r in solutions], dtype=np.int64)
+    levels = np.array([r.protection for r in solutions], dtype=np.float64)
+    places = (Geodetic(r.lat, r.lon, r.alt_msl) for r in solutions)
+    apart = (separation(place, true) for place, r in zip(places, solutions) if (true := truth(r.t_ns)))
+    errors = np.array([math.hypot(north, east) for north, east, _ in apart], dtype=np.float64)
+    found: list[PhaseProtection | None] = []
+    for phase, _ in zip(phases, rows, strict=True):
+        within = (t_ns >= phase.start_ns) & (t_ns < phase.end_ns)
+        inside = errors[within] <= levels[within]
+        found.append(
+            PhaseProtection(float(np.median(levels[within])), float(inside.mean())) if len(inside) else None
+        )
+    return found
 
 
 def _from_first_fix(phase: SchedulePhase, records: Iterable[Stamped]) -> error_statistics.FlightPhase:
@@ -183,7 +224,8 @@ def command(
         raise click.BadParameter(str(error), param_hint="--scenario") from None
     # log the truth: reports use it
     flags = {"log.folder": logs, "rates.truth_hz": 10.0, "inertial.independent": True}
-    config = simulator_config(load(file, flags, pairs=pairs))
+    loaded = load(file, flags, pairs=pairs)
+    config = simulator_config(loaded, own_ins=loaded.inertial.independent)
     started = time.perf_counter()
     settings = config.log
     log = create_log(
@@ -213,7 +255,11 @@ def command(
     if as_json:
         rate = chosen.duration_s / seconds
         summary = {"log": str(log.path), "seconds": seconds, "times_real_time": rate}
-        click.echo(json.dumps({**summary, "phases": [row._asdict() for row in rows]}))
+        phases = [
+            row._asdict() | {"protection": level._asdict() | {"held": level.held} if level else None}
+            for row, level in zip(rows, protection_table(flown, rows), strict=True)
+        ]
+        click.echo(json.dumps({**summary, "phases": phases}))
     else:
         _print_table(flown, rows, seconds)
         click.echo(f"log: {log.path}")
@@ -221,26 +267,36 @@ def command(
         raise SystemExit(f"companion: the log is incomplete: {log.trouble}")
 
 
+def _metres(value: float | None) -> str:
+    if value is None:
+        return "-"
+    return f"{value:.1f}" if abs(value) < 100.0 else f"{value:.0f}"
+
+
+def _unless_held(held: bool) -> str:
+    return "" if held else " NO"
+
+
 def _print_table(flown: LoopbackFlight, rows: list[error_statistics.PhaseErrors], seconds: float) -> None:
     scenario = flown.autopilot.scenario
-    table = Table(title=f"{scenario.name}: horizontal error, r.m.s. / 95 % [m]")
-    for column in ("phase", "min", *error_statistics.SOURCES, "bound", "held"):
-        table.add_column(column, justify="left" if column == "phase" else "right")
-    for row in rows:
-        cells = [
-            f"{row.rms[s]:.1f} / {row.p95[s]:.1f}" if s in row.rms else "-" for s in error_statistics.SOURCES
-        ]
-        bound = "-" if row.bound is None else f"{row.bound:.1f}"
-        held = (
-            "-"
-            if row.held is None or row.inside is None
-            else f"{'yes' if row.held else 'NO'} ({row.inside:.0%})"
-        )
-        table.add_row(row.phase, f"{row.seconds / 60.0:.1f}", *cells, bound, held)
-    Console(width=max(110, Console().width)).print(table)
+    console = Console(width=max(80, Console().width))
+    table = Table(
+        title=f"{scenario.name}: horizontal error, r.m.s. [m]", box=SIMPLE_HEAD, padding=(0, 1, 0, 0)
+    )
+    sources = (source.replace(" ", "\n") for source in error_statistics.SOURCES)
+    for column in ("phase", "min", *sources, "95 %", "protected", "bound"):
+        table.add_column(column, justify="left" if column == "phase" else "right", no_wrap=True)
+    for row, level in zip(rows, protection_table(flown, rows), strict=True):
+        cells = [_metres(row.rms.get(source)) for source in error_statistics.SOURCES]
+        percentile = _metres(row.p95.get(error_statistics.CORRECTED))
+        protected = "-" if level is None else _metres(level.level) + _unless_held(level.held)
+        bound = _metres(row.bound) + _unless_held(row.held is not False)
+        table.add_row(row.phase, f"{row.seconds / 60.0:.1f}", *cells, percentile, protected, bound)
+    console.print(table)
     click.echo(
-        "bound: r.m.s. of the guaranteed bound over the phase; held: the r.m.s. error is within it"
-        " (share of instants within it)"
+        "95 %: percentile of the corrected error; protected: median protection level, NO if\n"
+        "an error was beyond it; bound: r.m.s. of the guaranteed bound, NO if the r.m.s. error\n"
+        "was beyond it"
     )
     reported = Counter(type(record).__name__ for record in flown.records)
     rate = scenario.duration_s / seconds

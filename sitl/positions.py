@@ -82,10 +82,10 @@ def _geodetic(lat: int, lon: int, alt: float) -> Geodetic:
 
 
 def _sigma(covariance: list[float], make: str) -> float | None:
-    """Horizontal sigma, m. ArduPilot uses cbrt(c0^2 + c6^2 + c11^2) for all axes, others the variances."""
+    """Horizontal sigma, m. ArduPilot uses sqrt(c0 + c6 + c11) for all axes, others the variances."""
     c0, c6, c11 = covariance[0], covariance[6], covariance[11]
     if not all(map(math.isfinite, (c0, c6, c11))):
         return None
     if make == "ardupilot":
-        return math.cbrt(c0 * c0 + c6 * c6 + c11 * c11)
+        return math.sqrt(c0 + c6 + c11)
     return math.sqrt(max(c0, c6, 0.0))

@@ -52,7 +52,10 @@ class LinkDelay:
 
 @dataclass(frozen=True, slots=True)
 class Scenario:
-    """One flight: plan, sensors, outages, faults. The seed determines every random number."""
+    """One flight: plan, sensors, outages, faults. The seed determines every random number.
+
+    Without `airspeed_sensor` the autopilot sends its own synthetic airspeed.
+    """
 
     name: str
     plan: FlightPlan
@@ -64,6 +67,7 @@ class Scenario:
     air: AirDataModel = field(default_factory=AirDataModel)
     rates: SensorRates = field(default_factory=SensorRates)
     link: LinkDelay = field(default_factory=LinkDelay)
+    airspeed_sensor: bool = True
     faults: tuple[Fault, ...] = ()
     seed: int = 1
     autopilot: Literal["ardupilot", "px4"] = "ardupilot"

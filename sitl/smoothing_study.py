@@ -27,7 +27,7 @@ from rich.progress import track
 from rich.table import Table
 
 from companion.analysis.smoothing import SmoothedRun, smooth_flight
-from companion.config import Config
+from companion.config import Config, InertialConfig
 from companion.records import (
     AirData,
     Attitude,
@@ -46,7 +46,8 @@ from sitl.scenarios import SCENARIOS, Scenario, get_scenario
 from sitl.world import World
 
 SENSORS = (LocalPosition, Attitude, Gnss, AirData, Pressure, RsbnFix)
-CHANNELS = {"local_position": SENSORS, "air_data": SENSORS, "strapdown": (Imu, *SENSORS)}
+#: An INS of its own; the companion's own channel by airspeed alone; the same by all that it gets.
+CHANNELS = {"ins": SENSORS, "air_data": SENSORS, "own": (Imu, *SENSORS)}
 
 
 class SmoothingComparison(NamedTuple):
@@ -81,8 +82,11 @@ def flight_records(world: World, sensors: Sequence[type[Stamped]] = SENSORS) -> 
 def compare_flight(scenario: Scenario, channel: str) -> SmoothingComparison:
     """Compare filter and smoother with the truth on one flight."""
     world = World(scenario)
-    unit = UNITS[scenario.grade] if channel == "local_position" else Config().inertial
-    config = Config(inertial=structs.replace(unit, source=channel, independent=True))
+    if channel == "ins":
+        inertial = structs.replace(UNITS[scenario.grade], independent=True)
+    else:
+        inertial = InertialConfig(source="air_data" if channel == "air_data" else "auto")
+    config = Config(inertial=inertial)
     parts = [
         _against_truth(run, world) for run in smooth_flight(flight_records(world, CHANNELS[channel]), config)
     ]

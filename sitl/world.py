@@ -135,11 +135,15 @@ class World:
             [air.equivalent_airspeed, np.hypot(v_n[:, 0], v_n[:, 1]), -v_n[:, 2]], axis=1
         ).tolist()
         headings, heights = flight.attitude[:, 2].tolist(), (flight.alt - self.scenario.geoid_height).tolist()
-        pressures = np.stack([air.static, air.impact, air.temperature], axis=1).tolist()
+        sensed = self.scenario.airspeed_sensor
+        if not sensed:  # what VFR_HUD then carries: the ground speed of an estimator that knows of no wind
+            speeds = [[ground, ground, climb] for _, ground, climb in speeds]
+        impact = air.impact if sensed else np.zeros_like(air.impact)
+        pressures = np.stack([air.static, impact, air.temperature], axis=1).tolist()
         t_ns = _ns(flight.t)
         return {
             AirData: [
-                AirData(t, t, airspeed, False, ground, climb, heading, height)
+                AirData(t, t, airspeed, False, ground, climb, heading, height, sensed=sensed)
                 for t, (airspeed, ground, climb), heading, height in zip(t_ns, speeds, headings, heights)
             ],
             Pressure: [Pressure(t, t, *values) for t, values in zip(t_ns, pressures)],

@@ -16,7 +16,7 @@ import numpy as np
 
 from companion.importers import gnss_latency
 from companion.importers.gnss_latency import Latency
-from companion.navigator import FOLDED
+from companion.navigator import INPUTS_USED
 from companion.records import (
     Event,
     FilterStatus,
@@ -212,7 +212,7 @@ class _FlightCollector:
             if before is not None and record.repeats(before):
                 return
         kind = type(record)
-        if kind in FOLDED:
+        if kind in INPUTS_USED:
             self._smoother_inputs.append(record)
             self._latency_tracks.add(record)
         if kind in COLUMNS:

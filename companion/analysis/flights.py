@@ -23,10 +23,11 @@ from companion.storage import flight_log
 from companion.storage.reader import LogError
 from companion.storage.run_metadata import run_metadata
 
-CHANNELS = {
-    "local_position": "the autopilot's local position, which may depend on that GNSS (see inertial.source)",
-    "air_data": "air-data dead reckoning",
-    "strapdown": "strapdown navigation from its IMU",
+OWN_INS = "local position of an INS of its own"
+SENSORS = {
+    "imu": "its IMU",
+    "air_data": "its airspeed",
+    "local_position": "its velocity, which may depend on that GNSS (see inertial.source)",
 }
 
 
@@ -55,7 +56,7 @@ def open_flights(path: Path, config: Config) -> list[Flight]:
                 )
         remarks.append(
             "This is the log of another recorder: the navigator was run over it for this report. The "
-            f"inertial channel is {CHANNELS[config.channel]}."
+            f"inertial channel is {_channel(config)}."
         )
         return collect_flights(
             _run_navigator(open_inputs(path).records, config),
@@ -64,6 +65,14 @@ def open_flights(path: Path, config: Config) -> list[Flight]:
             metadata=run_metadata(config),
             remarks=tuple(remarks),
         )
+
+
+def _channel(config: Config) -> str:
+    """Say what the inertial channel may rest on."""
+    if config.has_own_ins:
+        return OWN_INS
+    used = [SENSORS[name] for name in ("imu", "air_data", "local_position") if config.uses(name)]
+    return f"the companion's own, by the autopilot's attitude and {', '.join(used)}"
 
 
 def _read_outputs(path: Path) -> Iterator[tuple[str, Stamped]]:

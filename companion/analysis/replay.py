@@ -257,9 +257,10 @@ def _replay_changed(
         finally:
             sink.close()
     notes = [note] if note else []
-    if outages and config.channel == "local_position" and not config.inertial.independent:
+    if outages and config.uses("local_position") and not config.has_own_ins:
         notes.append(
-            "the local position in the log includes the effect of the autopilot's own GNSS during the outage"
+            "the velocity in the log's local position includes the effect of the autopilot's own GNSS during "
+            "the outage"
         )
     end_s = found.flights[-1].end_s if found.flights else 0.0
     late = (outage for outage in outages if outage.start > end_s)

@@ -26,7 +26,7 @@ from companion.analysis.smoothing import join_runs, smooth_flight
 from companion.config import Config
 from companion.nav.earth import E2, A
 from companion.nav.geometry import enu_axes, radio_horizon
-from companion.navigator import FOLDED
+from companion.navigator import INPUTS_USED
 from companion.records import Gnss, RsbnFix, Stamped, Truth
 from companion.storage.reader import LogError
 from companion.units import Floats
@@ -181,7 +181,7 @@ def extract_track(records: Iterable[Stamped], config: Config) -> AircraftTrack:
             if not truths or record.t_ns > truths[-1][0]:
                 truths.append((record.t_ns, record.lat, record.lon, record.alt))
             folded.clear()
-        elif not truths and isinstance(record, FOLDED):
+        elif not truths and isinstance(record, INPUTS_USED):
             folded.append(record)
     if truths:
         t, lat, lon, alt = zip(*truths, strict=True)

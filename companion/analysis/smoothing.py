@@ -1,15 +1,22 @@
-"""Fixed-interval smoothing of a flight: error of the inertial channel at every epoch, given all fixes.
+"""Fixed-interval smoothing of a flight: error of the nominal trajectory at every epoch, given all fixes.
 
-Forward pass: the navigator's own step, gates and jump corrections included, with the error model of the
-inertial channel in use; epochs at every second and at every fix. Backward pass: the recursion of Rauch, Tung
-and Striebel (1965), which does not need the (nonlinear) measurements. With Phi, Q from one epoch to the next,
-x_{k+1|k} the prediction before the fix, P_{k+1|k} = Phi P_k Phi' + Q and C = P_k Phi' P_{k+1|k}^-1,
+A smoother needs one Gaussian path, so the flight is filtered twice by the navigator's own step. The first
+pass is the flight: the bank of hypotheses tells which sources were false, from their onset on, when the wind
+jumped, and which grade of noise was right. The second pass runs a plain Kalman filter with that grade: it
+leaves out what was false, widens the wind where it jumped, and takes for all other jumps a random walk of
+their variance. Every step of it is an epoch: at a measurement, or half a second after
+the last.
+
+Backward pass: the recursion of Rauch, Tung and Striebel (1965), which does not need the (nonlinear)
+measurements. With Phi, Q from one epoch to the next, x_{k+1|k} the prediction before the measurement,
+P_{k+1|k} = Phi P_k Phi' + Q and C = P_k Phi' P_{k+1|k}^-1,
 
     x_{k|N} = x_k + C (x_{k+1|N} - x_{k+1|k})
     P_{k|N} = (I - C Phi) P_k (I - C Phi)' + C (P_{k+1|N} + Q) C'
 
-The last epoch equals the filter. The track is the inertial channel minus its smoothed error; heights are
-those of the filter. Memory grows linearly with the duration of the flight.
+The last epoch equals the filter. The track is the nominal trajectory minus its smoothed error; heights are
+those of the filter. Memory grows linearly with the duration of the flight. The covariance is that of the
+plain path alone: it knows nothing of the chance that the first pass decided wrongly.
 """
 
 from __future__ import annotations
@@ -19,22 +26,24 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import eigh
+from msgspec import structs
 
 from companion.config import Config, parse
-from companion.estimate.filterbank import INERTIAL
+from companion.estimate import bank as banks
+from companion.estimate.bank import Bank
 from companion.estimate.smoother import rts_backward
 from companion.nav.geometry import displace
-from companion.navigator import FOLDED, inertial_track, integrity, learnt, stepped, tuned
-from companion.navigator.error_state import ErrorState
+from companion.navigator import INPUTS_USED, Navigator, guarded, tuned
+from companion.navigator.channel import Nominal, Transition
+from companion.navigator.hypotheses import MOST_BEACONS, Hypotheses, Model
 from companion.navigator.inertial_track import Point
-from companion.navigator.state import Carry, Settings, initial, is_news, level, state_at
-from companion.records import Gnss, Rejection, RsbnFix, Stamped, Tuning
-from companion.units import Floats
+from companion.navigator.state import Beacon, Settings, State, hypotheses, initial, levelled
+from companion.navigator.step import source_name, step
+from companion.records import AirData, Gnss, Input, LocalPosition, Output, Reset, RsbnFix, Stamped, Tuning
+from companion.units import SECOND_NS, Floats
 
-EVERY_NS = 1_000_000_000
 NEVER_NS = 2**63 - 1
-MIN_INFLATION = 1.0 + 1e-3  # smaller factors are rounding
+APART_NS = 5 * SECOND_NS  # hypotheses of one wind jump differ by less
 
 
 class SmoothedRun(NamedTuple):
@@ -54,34 +63,14 @@ class SmoothedRun(NamedTuple):
     P_filter: Floats
 
 
-class _Epoch(NamedTuple):
-    """Inertial position and filter state at an epoch, with the transition from the previous epoch.
-
-    `predicted` is x before the fix, if there was one; Phi is None at the start of a run.
-    """
-
-    ins: Point
-    state: ErrorState
-    predicted: Floats
-    Phi: Floats | None
-    Q: Floats
-    fixed: bool = False
-    inflation: float = 1.0  # factor on P before a fix that contradicted the covariance
-
-
 def smooth_flight(records: Iterable[Stamped], config: Config) -> list[SmoothedRun]:
     """Smooth a flight. `records` may be of any types; they are sorted by time of validity.
 
-    A run ends where the inertial channel changes (reboot of the autopilot, change by the operator), and where
-    a source is excluded together with its earlier contribution.
+    A run ends where the bank begins again: reboot of an INS, change of the error model by the operator.
 
-    Raises ValueError if the navigator never had an estimate: no inertial channel, or no fix.
+    Raises ValueError if the navigator never had an estimate: no nominal trajectory, or no fix.
     """
-    runs: list[list[_Epoch]] = []
-    for epoch in _forward_pass(records, config):
-        if epoch.Phi is None:
-            runs.append([])
-        runs[-1].append(epoch)
+    runs = [run for run in _forward_pass(records, config) if run]
     if not runs:
         raise ValueError(
             "nothing to smooth: the records need a local position and its origin, or airspeed and attitude, "
@@ -96,146 +85,367 @@ def join_runs(runs: Iterable[SmoothedRun]) -> tuple[npt.NDArray[np.int64], Float
     return np.concatenate(t_ns), np.concatenate(lat), np.concatenate(lon), np.concatenate(alt)
 
 
+# ---------------------------------------------------------------------------------------------------------
+# First pass: what was false
+# ---------------------------------------------------------------------------------------------------------
+
+
+class _Jump(NamedTuple):
+    """Base states that jumped at a time, and one sigma of each."""
+
+    t_ns: int
+    states: tuple[int, ...]
+    sigma: tuple[float, ...]
+
+
+class _Folded(NamedTuple):
+    """A record that the navigator took up, at its own time, and of which run."""
+
+    t_ns: int
+    record: Input
+    run: int
+
+
+class _Witness(Navigator):
+    """A navigator that notes what its bank decided."""
+
+    def __init__(self, config: Config) -> None:
+        super().__init__(config)
+        self.folded: list[_Folded] = []
+        self.spans: dict[str, list[tuple[int, int]]] = {}  # when each source was false, by name
+        self.jumps: list[_Jump] = []
+        self.beacons: dict[int, Beacon] = {}
+        self._last: list[tuple[Bank, Hypotheses] | None] = [None]  # of each run
+        self._open: dict[str, int] = {}
+
+    def handle(self, record: Input) -> list[Output]:
+        """Return the outputs of one more record."""
+        outputs = super().handle(record)
+        if isinstance(record, Tuning):
+            self._note(record)
+        return outputs
+
+    def _step(self, record: Input) -> list[Output]:
+        while self.folded and self.folded[-1].t_ns > record.t_ns:
+            self.folded.pop()  # folded again, behind a late record
+        outputs = super()._step(record)
+        self._note(record)
+        return outputs
+
+    def _note(self, record: Input) -> None:
+        state, t_ns = self.state, record.t_ns
+        if state.bank is None and self._last[-1] is not None:
+            self._last.append(None)
+        self.folded.append(_Folded(t_ns, record, len(self._last) - 1))
+        if state.bank is None:
+            self._close(t_ns)
+            return
+        known = hypotheses(state, self.settings)
+        self._last[-1] = state.bank, known
+        for beacon in state.beacons:
+            self.beacons.setdefault(beacon.identity, beacon)
+        self._note_false(state, state.bank, known, t_ns)
+        self._note_jump(state.bank, known, t_ns)
+
+    def _note_false(self, state: State, bank: Bank, known: Hypotheses, t_ns: int) -> None:
+        for i, p in enumerate(state.false):
+            name = source_name(i, state)
+            false = bool(bank.excluded[i]) or p > known.settings.suspect
+            if false and name not in self._open:
+                self._open[name] = t_ns - _age_ns(bank, known, i)
+            elif not false and name in self._open:
+                self.spans.setdefault(name, []).append((self._open.pop(name), t_ns))
+
+    def _note_jump(self, bank: Bank, known: Hypotheses, t_ns: int) -> None:
+        """Note the jump that the heaviest row holds, if that is what happened to it last."""
+        best, layout = int(np.argmax(bank.L)), known.layout
+        j = int(bank.event[best]) - 1 - 2 * len(layout.faults)
+        if j < 0:
+            return
+        at = t_ns - round((bank.t - float(bank.since[best])) * 1e9)
+        if all(abs(at - jump.t_ns) > APART_NS for jump in self.jumps):
+            self.jumps.append(_Jump(at, layout.jumps[j].states, layout.jumps[j].sigma))
+
+    def _close(self, t_ns: int) -> None:
+        for name, since in self._open.items():
+            self.spans.setdefault(name, []).append((since, t_ns))
+        self._open.clear()
+
+    def end(self) -> None:
+        """Close what is still open."""
+        self._close(NEVER_NS)
+
+    def was_false(self, name: str, t_ns: int) -> bool:
+        """Whether a source was false at a time, as known in the end."""
+        return any(since <= t_ns < until for since, until in self.spans.get(name, ()))
+
+    def grade(self, run: int) -> int:
+        """The grade that won in a run."""
+        last = self._last[run]
+        if last is None:
+            return 0
+        bank, known = last
+        return int(np.argmax(banks.grade_probability(bank, known.layout)))
+
+
+def _age_ns(bank: Bank, known: Hypotheses, source: int) -> int:
+    """How long ago a source became false, by the heaviest row whose last event that was; else 0."""
+    faults = np.flatnonzero(known.layout.concerns[:-1, source])
+    rows = np.flatnonzero(np.isin(bank.event - 1, faults))
+    if not len(rows):
+        return 0
+    best = rows[np.argmax(bank.L[rows])]
+    return round((bank.t - float(bank.since[best])) * 1e9)
+
+
+# ---------------------------------------------------------------------------------------------------------
+# Second pass: one Gaussian path
+# ---------------------------------------------------------------------------------------------------------
+
+
+class _PlainModel(Model):
+    """One grade and no faults; keeps the transitions that were asked for."""
+
+    def __init__(self, config: Config, grade: int, beacons: int) -> None:
+        super().__init__(config, plain=grade)
+        self.beacons = beacons
+        self.asked: list[tuple[Transition, Point]] = []
+
+    def begin(self, t_s: float) -> Bank:
+        """The bank before the first fix, with the biases of all beacons of the flight."""
+        bank = super().begin(t_s)
+        for k in range(self.beacons):
+            bank = self.with_beacon(bank, k)
+        return bank
+
+    def transition(self, nominal: Nominal, beacons: int) -> Transition:
+        """Phi and Q, noted."""
+        found = super().transition(nominal, beacons)
+        self.asked.append((found, nominal.point))
+        return found
+
+
+class _Epoch(NamedTuple):
+    """Nominal point and filter state at an epoch; `predicted` is x before the measurement, if there was one.
+    Phi and Q lead here from the previous epoch.
+    """
+
+    point: Point
+    x: Floats
+    P: Floats
+    predicted: Floats
+    Phi: Floats
+    Q: Floats
+    fixed: bool = False
+
+
+def _forward_pass(records: Iterable[Stamped], config: Config) -> list[list[_Epoch]]:
+    """Filter the records by one plain path; the epochs of each run."""
+    witness = _Witness(config)
+    for record in sorted((r for r in records if isinstance(r, INPUTS_USED)), key=lambda r: r.t_ns):
+        witness.handle(record)  # type: ignore[arg-type]
+    witness.end()
+    return _plain_pass(witness, config)
+
+
+def _plain_pass(witness: _Witness, config: Config) -> list[list[_Epoch]]:
+    path, run = _Path(config, witness), -1
+    for t_ns, record, number in witness.folded:
+        if number != run:
+            run = number
+            path.begin(run)
+        path.jump(t_ns)
+        kept = _believed(record, witness)
+        if kept is not None:
+            path.follow(kept)
+    path.end()
+    return path.runs
+
+
+def _believed(record: Input, witness: _Witness) -> Input | None:
+    """The record without what was false; None if nothing is left."""
+    if isinstance(record, Gnss):
+        return None if witness.was_false("gnss", record.t_ns) else record
+    if not isinstance(record, RsbnFix):
+        return record
+    if witness.was_false(f"rsbn {record.beacon} azimuth", record.t_ns):
+        record = structs.replace(record, azimuth=None)
+    if witness.was_false(f"rsbn {record.beacon} range", record.t_ns):
+        record = structs.replace(record, slant_range=None)
+    return None if record.azimuth is None and record.slant_range is None else record
+
+
+class _Path:
+    """The plain filter as it goes along, and its epochs.
+
+    `_Phi`, `_Q`: from the last epoch to where the bank stands now.
+    """
+
+    def __init__(self, config: Config, witness: _Witness) -> None:
+        self.runs: list[list[_Epoch]] = []
+        self._witness = witness
+        self._beacons = tuple(witness.beacons.values())[:MOST_BEACONS]
+        self._jumps = sorted(witness.jumps)
+        self._model = _PlainModel(config, 0, len(self._beacons))
+        self._settings = Settings(config, self._model)
+        self._state = self._with_beacons(initial(self._settings))
+        self._Phi, self._Q = np.eye(0), np.eye(0)
+
+    def begin(self, run: int) -> None:
+        """Go on with the grade of another run."""
+        self._model = _PlainModel(self._settings.config, self._witness.grade(run), len(self._beacons))
+        self._settings = self._settings._replace(model=self._model)
+
+    def jump(self, t_ns: int) -> None:
+        """Widen the states that jumped up to `t_ns`."""
+        while self._jumps and self._jumps[0].t_ns <= t_ns:
+            jump = self._jumps.pop(0)
+            bank = self._state.bank
+            if bank is None:
+                continue
+            P, at = bank.P.copy(), list(jump.states)
+            P[:, at, at] += np.square(jump.sigma)
+            self._state = self._state._replace(bank=bank._replace(P=P))
+            self._Q[at, at] += np.square(jump.sigma)
+
+    def follow(self, record: Input) -> None:
+        """Take one more record."""
+        if isinstance(record, Tuning):
+            self._tune(record)
+            return
+        before = self._state._replace(next_ns=NEVER_NS, pending=None)
+        self._model.asked.clear()
+        after, outputs = guarded(before, record, self._settings, step, record)
+        self._state = after if after.bank is not None else self._with_beacons(after)
+        if after.bank is None or after.nominal is None:
+            self._close()
+        elif before.bank is None or before.nominal is None:
+            self._open()
+        elif after.bank is not before.bank:
+            self._account(before, record, outputs)
+
+    def end(self) -> None:
+        """Carry the filter to the end of the nominal trajectory."""
+        state = self._state
+        if not self.runs or not self.runs[-1] or state.bank is None or state.nominal is None:
+            return
+        nominal = state.nominal
+        if nominal.pending_s > 0.0:
+            n = len(self._Q)
+            Phi, Q = self._model.transition(nominal, len(state.beacons))
+            Phi, Q = Phi[:n, :n], Q[int(state.bank.grade[0]), :n, :n]
+            x, P = state.bank.x[0, :n], state.bank.P[0, :n, :n]
+            self._Phi, self._Q = Phi @ self._Phi, Phi @ self._Q @ Phi.T + Q
+            self._append(nominal.point, Phi @ x, Phi @ P @ Phi.T + Q, Phi @ x)
+
+    def _tune(self, record: Tuning) -> None:
+        before = self._settings
+        self._settings, state = tuned(self._state, before, parse(record.toml, "parameters in the log"))
+        if self._settings.model is not before.model:  # another error model: the next run brings its grade
+            self.end()
+            self._close()
+            self._model = _PlainModel(self._settings.config, 0, len(self._beacons))
+            self._settings = self._settings._replace(model=self._model)
+        self._state = state if state.bank is not None else self._with_beacons(state)
+
+    def _with_beacons(self, state: State) -> State:
+        """With the beacons of the whole flight, as long as there is no bank."""
+        return state._replace(beacons=self._beacons)
+
+    def _close(self) -> None:
+        if self.runs and self.runs[-1]:
+            self.runs.append([])
+
+    def _open(self) -> None:
+        """The first fix: a run begins behind it."""
+        assert self._state.bank is not None
+        assert self._state.nominal is not None
+        n = hypotheses(self._state, self._settings).layout.n_base
+        self._Phi, self._Q = np.eye(n), np.zeros((n, n))
+        x, P = self._state.bank.x[0, :n], self._state.bank.P[0, :n, :n]
+        first = _Epoch(levelled(self._state.nominal.point, self._state), x, P, x, self._Phi, self._Q, True)
+        self.runs.append([first])
+
+    def _account(self, before: State, record: Input, outputs: list[Output]) -> None:
+        """Keep Phi and Q up to the bank's time; and an epoch wherever it was carried."""
+        state, n = self._state, len(self._Q)
+        assert before.bank is not None
+        assert before.nominal is not None
+        assert state.bank is not None
+        assert state.nominal is not None
+        x, P = state.bank.x[0, :n], state.bank.P[0, :n, :n]
+        Phi, Q, point = np.eye(n), np.zeros((n, n)), before.nominal.point
+        for (A, B), reached in self._model.asked:
+            A, B = A[:n, :n], B[int(state.bank.grade[0]), :n, :n]
+            Phi, Q, point = A @ Phi, A @ Q @ A.T + B, reached
+        predicted, measured = Phi @ before.bank.x[0, :n], True
+        if isinstance(record, Gnss | RsbnFix):
+            if isinstance(record, RsbnFix):
+                forget = self._renewed(before, n)
+                if forget is not None:
+                    keep, variance = forget
+                    predicted, Phi, Q = keep * predicted, keep[:, None] * Phi, Q * np.outer(keep, keep)
+                    Q = Q + np.diag(variance)
+            # the fix may have moved the nominal trajectory, and its error with it
+            predicted = predicted + np.pad(_moved(point, state.nominal.point), (0, n - 4))
+        elif self._settings.config.has_own_ins or not isinstance(record, AirData | LocalPosition):
+            measured, predicted = False, x
+            if any(isinstance(output, Reset) for output in outputs):  # the INS jumped: widened, perhaps
+                P_before = before.bank.P[0, :n, :n]
+                Q = P - Phi @ P_before @ Phi.T
+        self._Phi, self._Q = Phi @ self._Phi, Phi @ self._Q @ Phi.T + Q
+        if measured or self._model.asked:
+            self._append(state.nominal.point, x, P, predicted, isinstance(record, Gnss | RsbnFix))
+
+    def _renewed(self, before: State, n: int) -> tuple[Floats, Floats] | None:
+        """Zeros (n,) for states forgotten by a beacon that moved or took the place of another, and ones;
+        and new variances (n,).
+        """
+        keep, variance = np.ones(n), np.zeros(n)
+        biases = hypotheses(self._state, self._settings).biases
+        for k, (a, b) in enumerate(zip(before.beacons, self._state.beacons, strict=True)):
+            if (a.identity, a.place) != (b.identity, b.place):
+                at = slice(n - len(biases) + 2 * k, n - len(biases) + 2 * k + 2)
+                keep[at], variance[at] = 0.0, np.square(biases[2 * k : 2 * k + 2])
+        return None if keep.all() else (keep, variance)
+
+    def _append(self, point: Point, x: Floats, P: Floats, predicted: Floats, fixed: bool = False) -> None:
+        """Append an epoch, or merge it into the last one: a second measurement at the same instant."""
+        epochs, n = self.runs[-1], len(x)
+        unmoved = not self._Q.any() and (self._Phi == np.eye(n)).all()
+        at_once = unmoved and point.t_ns <= epochs[-1].point.t_ns
+        point = levelled(point, self._state)
+        if at_once:
+            last = epochs.pop()
+            moved = predicted - last.x  # by feedback
+            epochs.append(_Epoch(point, x, P, last.predicted + moved, last.Phi, last.Q, fixed or last.fixed))
+        else:
+            epochs.append(_Epoch(point, x, P, predicted, self._Phi, self._Q, fixed))
+        self._Phi, self._Q = np.eye(n), np.zeros((n, n))
+
+
+def _moved(before: Point, after: Point) -> Floats:
+    """How far the nominal trajectory was moved at once: north, east (m), velocity north, east (m/s)."""
+    a, b = before.position, after.position
+    one = displace(*a, 1e3, 1e3, 0.0)  # `displace` is linear
+    north, east = 1e3 * (b.lat - a.lat) / (one.lat - a.lat), 1e3 * (b.lon - a.lon) / (one.lon - a.lon)
+    return np.array((north, east, after.v_n[0] - before.v_n[0], after.v_n[1] - before.v_n[1]))
+
+
+# ---------------------------------------------------------------------------------------------------------
+# Backward
+# ---------------------------------------------------------------------------------------------------------
+
+
 def _rts_smooth(epochs: list[_Epoch]) -> SmoothedRun:
     """Run the backward pass over one run."""
-    x = np.array([epoch.state.x for epoch in epochs])
-    P = np.array([epoch.state.P for epoch in epochs])
-    x_filter, P_filter = x, P.copy()
-    _spread_inflation(epochs, P)
+    x_filter = np.array([epoch.x for epoch in epochs])
+    P_filter = np.array([epoch.P for epoch in epochs])
     later = epochs[1:]
-    Phi = [epoch.Phi for epoch in later if epoch.Phi is not None]  # only the first epoch has none
-    x, P = rts_backward(x, P, [e.predicted for e in later], Phi, [e.Q for e in later])
-    places = [displace(*s.ins.position, -e[0], -e[1], 0.0) for s, e in zip(epochs, x.tolist(), strict=True)]
+    x, P = rts_backward(
+        x_filter, P_filter, [e.predicted for e in later], [e.Phi for e in later], [e.Q for e in later]
+    )
+    places = [displace(*p.point.position, -e[0], -e[1], 0.0) for p, e in zip(epochs, x.tolist(), strict=True)]
     lat, lon, alt = np.array(places).T
-    t_ns = np.array([epoch.ins.t_ns for epoch in epochs], dtype=np.int64)
+    t_ns = np.array([epoch.point.t_ns for epoch in epochs], dtype=np.int64)
     return SmoothedRun(t_ns, lat, lon, alt, x, P, x_filter, P_filter)
-
-
-def _forward_pass(records: Iterable[Stamped], config: Config) -> list[_Epoch]:
-    """Run the navigator over the records; an epoch at every fix that changes the state, and every second.
-
-    `since` is the change made by the channel itself since the last epoch: x by jumps, P by inflation.
-    `restarted`: since then the state was replaced by one without the contribution of an excluded source.
-    """
-    settings = Settings.of(config)
-    carry, epochs = initial(settings), list[_Epoch]()
-    since, restarted = ErrorState(0, np.zeros(0), np.zeros((0, 0))), False
-    for record in sorted((r for r in records if isinstance(r, FOLDED)), key=lambda r: r.t_ns):
-        if isinstance(record, Gnss) and not is_news(record, carry, settings):
-            continue
-        # no solutions and no bounds ahead: solutions would propagate to times of their own
-        carry = carry._replace(next_ns=NEVER_NS, next_ahead_ns=NEVER_NS)
-        before = carry.state
-        carry, _ = learnt(carry, settings)
-        if carry.state is not before and carry.watch is not None:
-            restarted = restarted or not integrity.excluded(carry.watch, INERTIAL)
-        if epochs and before is not None and carry.state is not None and carry.state is not before:
-            last = epochs.pop()  # a source was excluded, together with its contribution before that fix
-            renewed = _with_update(last, carry.state)
-            epochs.append(renewed._replace(inflation=last.inflation * renewed.inflation))
-        if isinstance(record, Tuning):
-            settings, carry = tuned(carry, settings, parse(record.toml, "parameters in the log"))
-            continue
-        if isinstance(record, Gnss | RsbnFix):
-            after, epoch = _update_with_fix(carry, record, since, settings)
-        else:
-            after, epoch = stepped(carry, record, settings)[0], None
-            if after.state is not None and after.track:
-                if carry.state is not None and after.state is not carry.state:
-                    jump, inflated = after.state.x - carry.state.x, after.state.P - carry.state.P
-                    since = since._replace(x=since.x + jump, P=since.P + inflated)
-                if not epochs or after.track[-1].t_ns >= epochs[-1].ins.t_ns + EVERY_NS:
-                    epoch = _propagate_to(after, after.track[-1], since, settings)
-                    after = after._replace(state=epoch.state)
-        if epoch is not None:
-            epoch = epoch._replace(ins=level(epoch.ins, after), Phi=None if restarted else epoch.Phi)
-            _append_epoch(epochs, epoch, since)
-            restarted = False
-            since = ErrorState(epoch.ins.t_ns, np.zeros_like(epoch.state.x), np.zeros_like(epoch.state.P))
-        carry = after
-    if epochs and carry.state is not None and carry.track and carry.track[-1].t_ns > epochs[-1].ins.t_ns:
-        end = _propagate_to(carry, carry.track[-1], since, settings)
-        epochs.append(end._replace(ins=level(end.ins, carry)))
-    return epochs
-
-
-def _update_with_fix(
-    carry: Carry, record: Gnss | RsbnFix, since: ErrorState, settings: Settings
-) -> tuple[Carry, _Epoch | None]:
-    """Propagate to the fix and update with it; no epoch if the fix is not used."""
-    ins = inertial_track.at(carry.track, record.t_ns)
-    if ins is None or carry.state is None:
-        after, _ = stepped(carry, record, settings)
-        ins = inertial_track.at(after.track, record.t_ns)
-        if ins is None or after.state is None:
-            return after, None
-        return after, _with_update(
-            _propagate_to(carry._replace(track=after.track), ins, since, settings), after.state
-        )
-    epoch = _propagate_to(carry, ins, since, settings)
-    after, outputs = stepped(carry._replace(state=epoch.state), record, settings)
-    if after.state is not epoch.state and after.state is not None:
-        return after, _with_update(epoch, after.state)
-    if any(isinstance(output, Rejection) for output in outputs):
-        return after, epoch
-    return after._replace(state=carry.state), None
-
-
-def _spread_inflation(epochs: list[_Epoch], P: Floats) -> None:
-    """Where a fix contradicted the covariance, spread its inflation over the time since the previous fix.
-
-    P is multiplied by g, which rises linearly from 1 at the previous fix to the navigator's factor. The
-    equivalent process noise, (g_j - g_{j-1}) Phi P Phi' + g_j Q, is a covariance; the means do not change.
-    """
-    for k, epoch in enumerate(epochs):
-        if k == 0 or epoch.inflation == 1.0:
-            continue
-        first = k - 1
-        while first > 0 and not epochs[first].fixed:
-            first -= 1
-        start, span = epochs[first].ins.t_ns, epoch.ins.t_ns - epochs[first].ins.t_ns
-        before, claimed = 1.0, P[first]
-        for j in range(first + 1, k + 1):
-            g = 1.0 + (epoch.inflation - 1.0) * (epochs[j].ins.t_ns - start) / span
-            Phi = epochs[j].Phi
-            assert Phi is not None
-            Q = (g - before) * Phi @ claimed @ Phi.T + g * epochs[j].Q
-            epochs[j] = epochs[j]._replace(Q=Q)
-            before, claimed = g, P[j].copy()
-            if j < k:
-                P[j] *= g
-
-
-def _append_epoch(epochs: list[_Epoch], epoch: _Epoch, since: ErrorState) -> None:
-    """Append an epoch, or merge it into the last one if it is a second fix at the same instant."""
-    if epochs and epoch.Phi is not None and epoch.ins.t_ns <= epochs[-1].ins.t_ns:
-        last = epochs.pop()
-        epoch = last._replace(
-            ins=epoch.ins,
-            state=epoch.state,
-            predicted=last.predicted + since.x,
-            fixed=last.fixed or epoch.fixed,
-            inflation=last.inflation * epoch.inflation,
-        )
-    epochs.append(epoch)
-
-
-def _propagate_to(carry: Carry, ins: Point, since: ErrorState, settings: Settings) -> _Epoch:
-    """The state carried to `ins`; and, the prediction being linear, its Phi and Q by what it does to the unit
-    matrix and to no covariance but that which the channel lost at its beginning.
-    """
-    state = state_at(carry, ins, settings)
-    if carry.state is None:
-        return _Epoch(ins, state, state.x, None, state.P)
-    unit = ErrorState(carry.state.t_ns, np.eye(len(state.x)), since.P)
-    one = state_at(carry._replace(state=unit), ins, settings)
-    return _Epoch(ins, state, state.x, one.x, one.P)
-
-
-def _with_update(epoch: _Epoch, state: ErrorState) -> _Epoch:
-    """Return the epoch with the state after a fix; find the inflation of P before it, if any."""
-    scale = np.sqrt(np.diag(epoch.state.P))
-    outer = np.outer(scale, scale)
-    # a fix never increases the variance of a state combination: a factor above 1 is inflation
-    factor = float(eigh(state.P / outer, epoch.state.P / outer, eigvals_only=True)[-1])
-    return epoch._replace(state=state, fixed=True, inflation=factor if factor > MIN_INFLATION else 1.0)

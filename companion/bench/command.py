@@ -16,7 +16,7 @@ import click
 from rich.console import Console
 from rich.table import Table
 
-MODULES = ("fusion", "minimax", "kalman", "frame", "log")
+MODULES = ("bank", "fusion", "minimax", "kalman", "frame", "log")
 ROUNDS = 15
 ROUND_S = 0.02  # minimum duration of one case in a round
 

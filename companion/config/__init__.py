@@ -11,7 +11,6 @@ check_config            the command `companion check-config`
 from companion.config.load import PREFIX, ConfigError, load, parse, to_toml
 from companion.config.schema import (
     AirDataConfig,
-    Channel,
     Config,
     EstimatorConfig,
     GnssConfig,
@@ -23,6 +22,7 @@ from companion.config.schema import (
     PredictorConfig,
     RatesConfig,
     RsbnConfig,
+    Sensor,
     SigningConfig,
     StrapdownConfig,
 )
@@ -30,7 +30,6 @@ from companion.config.schema import (
 __all__ = [
     "PREFIX",
     "AirDataConfig",
-    "Channel",
     "Config",
     "ConfigError",
     "EstimatorConfig",
@@ -43,6 +42,7 @@ __all__ = [
     "PredictorConfig",
     "RatesConfig",
     "RsbnConfig",
+    "Sensor",
     "SigningConfig",
     "StrapdownConfig",
     "load",

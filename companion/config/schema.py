@@ -16,7 +16,7 @@ NotNegative = Annotated[float, Meta(ge=0.0, lt=1e9)]
 Probability = Annotated[float, Meta(gt=0.0, lt=1.0)]
 RateHz = Annotated[float, Meta(ge=0.0, le=400.0)]
 OutputHz = Annotated[float, Meta(ge=-1.0, le=50.0)]
-Channel: TypeAlias = Literal["local_position", "air_data", "strapdown"]
+Sensor: TypeAlias = Literal["local_position", "air_data", "imu"]
 NodeId = Annotated[int, Meta(ge=1, le=255)]
 
 
@@ -39,23 +39,23 @@ class RatesConfig(Section, frozen=True):
     local_position_hz: RateHz = 10.0
     gnss_hz: RateHz = 5.0
     attitude_hz: RateHz = 10.0
-    imu_hz: RateHz = 50.0
+    imu_hz: RateHz = 20.0  # ArduPilot denies more than 0.8 of SCHED_LOOP_RATE, which is 50 on planes
     air_data_hz: RateHz = 5.0
     status_hz: RateHz = 1.0
     truth_hz: RateHz = 0.0
 
 
 class InertialConfig(Section, frozen=True):
-    """The inertial channel that is corrected, and the INS error model (one standard deviation each).
+    """The sensors that may be used, and the error model of an INS of its own (one standard deviation each).
 
-    `source` "local_position" is LOCAL_POSITION_NED; "air_data" is dead reckoning in the companion from
-    airspeed and attitude; "strapdown" from IMU and attitude; "auto" is air data if a position is sent back to
-    the autopilot, else local position. With such an output, local position is rejected unless `independent`:
-    it then comes from a separate INS that does not use our output. The defaults of the error model are those
-    of a navigation-grade unit (0.01 deg/h, 50 ug).
+    `source` "auto" allows all: "imu" (with the autopilot's attitude), "air_data" (airspeed and attitude) and
+    "local_position" (the velocity of LOCAL_POSITION_NED); any of these alone allows only that one. If a
+    position is sent to the autopilot, local position is not used. With `independent`, LOCAL_POSITION_NED
+    comes from an INS of its own that does not use our output, and that INS is corrected. The defaults of its
+    error model are those of a navigation-grade unit (0.01 deg/h, 50 ug).
     """
 
-    source: Literal["auto", "local_position", "air_data", "strapdown"] = "auto"
+    source: Literal["auto", "local_position", "air_data", "imu"] = "auto"
     independent: bool = False
     gyro_drift_deg_h: Positive = 0.01
     gyro_correlation_h: Positive = 5.0
@@ -72,39 +72,38 @@ class InertialConfig(Section, frozen=True):
 
 
 class AirDataConfig(Section, frozen=True):
-    """The error model of air-data dead reckoning: one standard deviation each.
+    """The error model of airspeed, heading and wind: one standard deviation each.
 
-    The wind is a random walk of `wind_change_m_s_sqrt_s`: 1.5 m/s in one minute, 3 m/s in four.
+    The wind is a random walk of `wind_change_m_s_sqrt_s`, and now and then it jumps. `crab_deg` is the error
+    of the heading, or the sideslip, that lasts seconds. The defaults are supported by recorded flights.
     """
 
-    wind_m_s: Positive = 10.0
-    wind_change_m_s_sqrt_s: Positive = 0.2
+    wind_m_s: Positive = 8.0
+    wind_change_m_s_sqrt_s: Positive = 0.05
     wind_jump_m_s: Positive = 4.0  # of wind jumps, north and east
-    gust_m_s: Positive = 0.6
-    gust_s: Positive = 0.5
-    airspeed_percent: Positive = 2.0
+    wind_jumps_per_hour: Positive = 1.0
+    gust_m_s: Positive = 1.2
+    gust_s: Positive = 0.7
+    airspeed_percent: Positive = 3.0
     heading_deg: Positive = 1.5
     correlation_min: Positive = 10.0  # of airspeed and heading errors
+    crab_deg: Positive = 2.0
+    crab_s: Positive = 20.0
     wind_rate_m_s_min: Positive = 1.0  # r.m.s., for the guaranteed prediction
 
 
 class StrapdownConfig(Section, frozen=True):
-    """The error model of strapdown with the autopilot's attitude: one standard deviation each.
+    """The error model of the IMU turned by the autopilot's attitude: one standard deviation each.
 
-    `tilt_deg` is the attitude error, correlated over `tilt_s`; an unmodelled wind makes the tilt wrong by
-    degrees. Undersampled vibration adds `vibration_m_s` to each velocity and
-    `velocity_noise_m_s_sqrt_s` as a random walk.
+    `tilt_deg` is the attitude error, correlated over `tilt_s`; in an unmodelled wind the autopilot's tilt is
+    off by degrees. What vibration and sampling leave is `velocity_noise_m_s_sqrt_s`.
     """
 
     imu: Annotated[int, Meta(ge=0, le=2)] = 0  # index of the IMU
-    tilt_deg: Positive = 1.5
+    tilt_deg: Positive = 1.2
     tilt_s: Positive = 30.0
     accelerometer_m_s2: Positive = 0.1  # including misalignment
-    heading_deg: Positive = 2.0
-    correlation_min: Positive = 10.0  # of accelerometer and heading errors
-    vibration_m_s: Positive = 0.3
     velocity_noise_m_s_sqrt_s: Positive = 0.25
-    velocity_m_s: Positive = 30.0  # at the first fix, if it has no velocity
 
 
 class GnssConfig(Section, frozen=True):
@@ -151,34 +150,33 @@ class PredictorConfig(Section, frozen=True):
 
 
 class EstimatorConfig(Section, frozen=True):
-    """The estimator of the output, and the innovation gate of fixes.
+    """The estimator of the output.
 
-    While fixes arrive the error state ("kalman") is used. Without them `output` names the estimator:
-    "minimax" without fixes of any source, "restrictive" without GNSS fixes. `scheme` "feedback" corrects the
-    companion's own inertial channel at every fix, "feedforward" only when its error is large; the autopilot's
-    local position cannot be corrected.
+    The bank of hypotheses ("kalman", "auto") is used while fixes arrive. Without them `output` names the
+    estimator: "minimax" without fixes of any source, "restrictive" without GNSS fixes. `scheme` "feedback"
+    corrects the companion's own channel at every fix, "feedforward" only when its error is large; an INS of
+    its own cannot be corrected.
     """
 
     output: Literal["auto", "minimax", "kalman", "restrictive"] = "auto"
     scheme: Literal["feedforward", "feedback"] = "feedforward"
-    false_rejection: Probability = 1e-6
     late_s: Annotated[float, Meta(ge=0.0, le=30.0)] = 6.0
+
+    @property
+    def feedback(self) -> float:
+        """Share of the estimated error that every fix takes off the companion's own channel."""
+        return 1.0 if self.scheme == "feedback" else 0.0
 
 
 class IntegrityConfig(Section, frozen=True):
     """Integrity risk.
 
-    `risk` is the probability that the horizontal protection level is exceeded without a flag,
-    `alarms_per_hour` the rate at which a good source is excluded, and `refusal` the probability that an
-    excluded source is not re-admitted although its error is within the guaranteed prediction.
-
-    Trust is normal while the protection level is below `alert_m`. It improves, and an excluded source is
-    re-admitted, after `settle_s` without interruption.
+    `risk` is the probability that the horizontal protection level is exceeded. Trust is normal while it is
+    below `alert_m` and no source is suspect; it improves after `settle_s` without interruption.
     """
 
-    risk: Probability = 1e-5
-    alarms_per_hour: Positive = 1e-3
-    refusal: Probability = 0.1
+    rows: Annotated[int, Meta(ge=0, le=192)] = 0  # hypotheses followed at once; 0: 72 on an INS, else 96
+    risk: Probability = 1e-7
     alert_m: Positive = 500.0
     settle_s: NotNegative = 10.0
 
@@ -280,18 +278,15 @@ class Config(Section, frozen=True):
     signing: SigningConfig = SigningConfig()
 
     @property
-    def channel(self) -> Channel:
-        """The inertial channel that `inertial.source` selects; "auto" depends on the output."""
-        if self.inertial.source != "auto":
-            return self.inertial.source
-        fed = self.output.feeds_estimator and not self.inertial.independent
-        return "air_data" if fed else "local_position"
+    def has_own_ins(self) -> bool:
+        """Whether LOCAL_POSITION_NED is that of an INS of its own, which takes no part of what we send."""
+        return self.inertial.independent and self.inertial.source in ("auto", "local_position")
+
+    def uses(self, sensor: Sensor) -> bool:
+        """Whether the own channel may use a sensor: `inertial.source` allows all or one."""
+        return self.inertial.source in ("auto", sensor)
 
     @property
     def leading_estimator(self) -> Literal["minimax", "kalman", "restrictive"]:
-        """The estimator that `estimator.output` selects; "auto" depends on the channel. The restrictive one
-        runs on air data only and models neither wind jumps nor turns.
-        """
-        if self.estimator.output == "auto":
-            return "minimax" if self.channel == "local_position" else "kalman"
-        return self.estimator.output
+        """The estimator that leads when fixes stop; "auto" is the bank's."""
+        return "kalman" if self.estimator.output == "auto" else self.estimator.output

@@ -34,7 +34,11 @@ def find_conflicts(config: Config) -> Iterator[tuple[str, str, str]]:
                 else f"does not support it: its autopilot accepts {', '.join(methods)}"
             )
             yield "output", key, f"output.{key} = {rates[message]:g}, but profile '{output.profile}' {why}"
-    if config.channel == "local_position" and output.feeds_estimator and not config.inertial.independent:
+    if (
+        config.inertial.source == "local_position"
+        and output.feeds_estimator
+        and not config.inertial.independent
+    ):
         yield (
             "inertial",
             "source",
@@ -49,14 +53,14 @@ def find_conflicts(config: Config) -> Iterator[tuple[str, str, str]]:
             "gnss.receiver = 1 is the receiver that GPS_INPUT feeds, so our own position would come back as "
             "a fix: set gnss.receiver = 0",
         )
-    if config.estimator.scheme == "feedback" and config.channel == "local_position":
+    if config.estimator.scheme == "feedback" and config.has_own_ins:
         yield (
             "estimator",
             "scheme",
             "estimator.scheme = 'feedback' needs an inertial channel computed by the companion: "
-            "set inertial.source = 'air_data' or 'strapdown'",
+            "set inertial.source = 'air_data' or 'imu'",
         )
-    if config.leading_estimator == "restrictive" and config.channel != "air_data":
+    if config.leading_estimator == "restrictive" and config.inertial.source != "air_data":
         yield (
             "estimator",
             "output",

@@ -8,13 +8,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import NamedTuple
 
-from companion.config import Config
+from companion.config import Config, Sensor
 from companion.config.profiles import PROFILES, RequiredParameter
 from companion.link.dialect import TYPES
 from companion.link.parameter_client import Value, equal_real32
 from companion.link.stream_rates import ENOUGH
+from companion.navigator.state import Settings
 from companion.navigator.step import uses
-from companion.records import AirData, Attitude, Gnss, Imu, LocalPosition, Pressure
+from companion.records import AirData, AirspeedSensor, Attitude, Gnss, Imu, LocalPosition, Pressure
 
 #: Messages that a make does not send; it has others with the same content.
 MISSING_MESSAGES = {
@@ -30,7 +31,10 @@ RECORD_TYPES: Mapping[str, type] = {
     "ATTITUDE": Attitude,
     "VFR_HUD": AirData,
     "SCALED_PRESSURE": Pressure,
+    "SYS_STATUS": AirspeedSensor,
 }
+#: Sensor of `inertial.source` that a record belongs to; the others are always used.
+SENSORS: Mapping[type, Sensor] = {Imu: "imu", AirData: "air_data", AirspeedSensor: "air_data"}
 LOGGED = frozenset({"EKF_STATUS_REPORT", "SIM_STATE"})
 
 
@@ -104,6 +108,28 @@ def check_profile(config: Config, make: str) -> list[Finding]:
     return [Finding("output profile", profile, make, False, advice)]
 
 
+def _used_records(config: Config) -> set[type]:
+    kinds = uses(Settings.of(config))
+    return {kind for kind in kinds if kind not in SENSORS or config.uses(SENSORS[kind])}
+
+
+def check_airspeed(config: Config, healthy: bool | None) -> list[Finding]:
+    """Report whether airspeed is measured; `healthy` None where the autopilot did not tell."""
+    if config.has_own_ins or not config.uses("air_data"):
+        return []
+    others = [sensor for sensor in ("IMU",) if config.uses("imu")]
+    if config.uses("local_position") and not config.output.feeds_estimator:
+        others.append("local position")
+    if healthy is None:
+        text = "not reported: not used"
+    elif healthy:
+        text = "healthy"
+    else:
+        text = f"none: reckoning by {' and '.join(others) or 'the last velocity'} only"
+    advice = "" if healthy else "without GNSS the wind cannot be separated from the error: add a sensor"
+    return [Finding("airspeed sensor", text, "", None, advice)]
+
+
 def check_streams(
     config: Config, make: str, rates: Mapping[int, tuple[float, float | None]]
 ) -> list[Finding]:
@@ -111,7 +137,7 @@ def check_streams(
 
     `rates` has both by message id, Hz; measured None is not known yet.
     """
-    found, used = [], uses(config.channel)
+    found, used = [], _used_records(config)
     for msgid, (asked, measured) in rates.items():
         name = TYPES[msgid].name
         if name in MISSING_MESSAGES.get(make, ()):

@@ -22,11 +22,12 @@ from companion.doctor.diagnosis import (
     Finding,
     Identity,
     ParameterFinding,
+    check_airspeed,
     check_profile,
     check_streams,
 )
 from companion.link import dialect, frame
-from companion.link.decode import MAKES
+from companion.link.decode import MAKES, has_airspeed_sensor
 from companion.link.dialect import mavlink, rsbn
 from companion.link.parameter_client import Answer, ParameterClient, encoding_of, equal_real32
 from companion.link.session import (
@@ -76,6 +77,7 @@ class Examination:
         self._heartbeat = dialect.new("HEARTBEAT")
         self._version: Any = None
         self._origin: Any = None
+        self._airspeed: bool | None = None  # whether the airspeed sensor is healthy
         self._others: set[int] = set()
         self._beacons: set[int] = set()
         self._client: ParameterClient | None = None
@@ -178,6 +180,8 @@ class Examination:
             self._version = event.message
         elif event.frame.msgid == mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN:
             self._origin = event.message
+        elif event.frame.msgid == mavlink.MAVLINK_MSG_ID_SYS_STATUS:
+            self._airspeed = has_airspeed_sensor(event.message)
         if self._client is not None:
             answers = self._client.receive(event.message, event.frame)
             self._answers |= {answer.name: answer for answer in answers}
@@ -230,6 +234,7 @@ class Examination:
         return [
             *check_profile(self._config, self.make),
             *check_streams(self._config, self.make, self.session.stream_rates.rates()),
+            *check_airspeed(self._config, self._airspeed),
             *self._check_link(now),
             Finding("RSBN beacons", beacons or "none", "", None),
         ]

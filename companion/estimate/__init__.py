@@ -23,15 +23,16 @@ Guaranteed prediction
     predictor            rolling window of fixes and its prediction
 Curves
     polynomial           approximation of an unknown function, and its order
-Faults and trust
-    filterbank, integrity, monitor, gnss_beacon_conflict, trust
+Faults
+    bank                 bank of hypotheses: which source is false, and the protection level
 
 SI and radians, unless a name ends in `_tau` (radians of Schuler phase). numpy and scipy only, no I/O; where a
 function takes a time, it is in ns. `step`, `predict`, `update` and `solve` exist in several modules and are
-reached through them, for example `kalman.update`. The modules of the last group are not exported here.
+reached through them, for example `kalman.update`.
 """
 
 from companion.estimate import (
+    bank,
     bounded_lsq,
     kalman,
     minimax_lp,
@@ -102,6 +103,7 @@ __all__ = [
     "Trajectory",
     "Unobservable",
     "Window",
+    "bank",
     "bounded_lsq",
     "closed_form",
     "closed_form_tau",

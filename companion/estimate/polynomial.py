@@ -11,10 +11,10 @@ completed here:
     Jhat(r) = |beta - E_r a_r|^2 - tr C^-1 + 2 tr C_r^-1
 
 beta being a_r for r = r_max, C = Psi' P Psi with C_r its leading block, and E_r padding with zeros. It is
-unbiased if x lies in the span of r_max functions. DEPARTS FROM the short form that takes C for I/dt, which
+unbiased if x is in the span of r_max functions. DEPARTS FROM the short form that takes C for I/dt, which
 leaves out the trace and the coupling of the terms: it chooses order 9 for a cubic, instead of 4.
 
-Jhat does not include what lies outside the span of all r_max functions, the residuals do: RSS / (N - r_max)
+Jhat does not include what is outside the span of all r_max functions, the residuals do: RSS / (N - r_max)
 is about 1 where the span is wide enough; `Order.spans` tests it. The noise is assumed independent.
 """
 

@@ -63,6 +63,7 @@ class MessageConverter:
         self._accuracy: dict[int, tuple[float | None, float | None, float | None]] = {}
         self._v_n: Vector3 | None = None
         self._differential: float | None = None
+        self._has_airspeed = False  # the log has ARSP
         self._true_v_n: Vector3 | None = None
         self._true: Truth | None = None
 
@@ -156,7 +157,14 @@ class MessageConverter:
     def _airspeed(self, name: str, m: Message, t: int) -> Iterator[Stamped]:
         if getattr(m, "I", 0) == 0 and name == "ARSP" and math.isfinite(m.Airspeed):
             self._differential = _finite(getattr(m, "DiffPress", math.nan))
-            yield AirData(t, t, m.Airspeed)
+            self._has_airspeed = True
+            yield AirData(t, t, m.Airspeed, sensed=True)
+
+    def _navigation_tuning(self, name: str, m: Message, t: int) -> Iterator[Stamped]:
+        """Convert the sensor's airspeed of a plane's NTUN up to 3.x; without a sensor it is 0."""
+        airspeed = _finite(getattr(m, "Arspd", math.nan))
+        if airspeed and not self._has_airspeed:
+            yield AirData(t, t, airspeed, sensed=True)
 
     def _baro(self, name: str, m: Message, t: int) -> Iterator[Stamped]:
         if getattr(m, "I", 0) == 0 and m.Press > 0.0:
@@ -200,6 +208,7 @@ _TABLE: dict[str, Callable[[MessageConverter, str, Message, int], Iterator[Stamp
     "ORGN": MessageConverter._origin,
     "POS": MessageConverter._global,
     "ARSP": MessageConverter._airspeed,
+    "NTUN": MessageConverter._navigation_tuning,
     "BARO": MessageConverter._baro,
     "SIM2": MessageConverter._true_velocity,
     "SIM": MessageConverter._truth,

@@ -83,7 +83,7 @@ def _attitude(row: Row, t: int) -> Iterator[Stamped]:
 
 
 def _air_data(row: Row, t: int) -> Iterator[Stamped]:
-    yield AirData(t, t, float(row["true_airspeed_m_s"]), True)
+    yield AirData(t, t, float(row["true_airspeed_m_s"]), True, sensed=True)
 
 
 def _wind(row: Row, t: int) -> Iterator[Stamped]:

@@ -180,7 +180,7 @@ def _imu(row: Row, t: int) -> Iterator[Stamped]:
 
 def _air_data(row: Row, t: int) -> Iterator[Stamped]:
     if (speed := _finite(row["true_airspeed_m_s"])) is not None:
-        yield AirData(t, t, speed, True)
+        yield AirData(t, t, speed, True, sensed=True)
 
 
 def _wind(row: Row, t: int) -> Iterator[Stamped]:

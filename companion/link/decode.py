@@ -33,10 +33,12 @@ from companion.link.fields import (
 )
 from companion.records import (
     AirData,
+    AirspeedSensor,
     Attitude,
     FilterStatus,
     GlobalPosition,
     Gnss,
+    GnssIntegrity,
     HomePosition,
     Imu,
     LocalOrigin,
@@ -332,9 +334,32 @@ def _vfr_hud(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
 
 @_of("AIRSPEED")
 def _airspeed(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
-    if m.flags & mavlink.AIRSPEED_SENSOR_UNHEALTHY:
-        raise InvalidField("the airspeed sensor reports itself unhealthy", float(m.airspeed))
-    return (AirData(_unstamped(rx, sender), rx, number(m, "airspeed", limit=FASTEST)),)
+    """Sent only where there is a sensor; so is the word that it fails."""
+    t_ns, healthy = _unstamped(rx, sender), not m.flags & mavlink.AIRSPEED_SENSOR_UNHEALTHY
+    state = AirspeedSensor(t_ns, rx, healthy)
+    if not healthy:
+        return (state,)
+    return state, AirData(t_ns, rx, number(m, "airspeed", limit=FASTEST), sensed=True)
+
+
+def has_airspeed_sensor(m: Message) -> bool:
+    """Whether SYS_STATUS calls the sensor of differential pressure present, enabled and healthy."""
+    bits = (
+        m.onboard_control_sensors_present
+        & m.onboard_control_sensors_enabled
+        & m.onboard_control_sensors_health
+    )
+    return bool(bits & mavlink.MAV_SYS_STATUS_SENSOR_DIFFERENTIAL_PRESSURE)
+
+
+@_of("SYS_STATUS")
+def _sys_status(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
+    return (AirspeedSensor(_unstamped(rx, sender), rx, has_airspeed_sensor(m)),)
+
+
+@_of("GNSS_INTEGRITY")
+def _gnss_integrity(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
+    return (GnssIntegrity(_unstamped(rx, sender), rx, m.id, m.jamming_state, m.spoofing_state),)
 
 
 @_of("WIND")

@@ -1,8 +1,8 @@
-"""The navigator: records in, records out, no clock and no I/O.
+"""Navigator: records in, records out; no clock and no input or output.
 
-`Navigator` folds `step` over what arrives. Measurements that come late are folded in at their own time: it
-keeps the carries of the last seconds, goes back to the one before, and folds forward again. What was given
-out stays given out; a late measurement shows in the next solution.
+`Navigator` folds `step` over the records. A measurement that arrives late is applied at its own time: the
+states of the last seconds are kept, the navigator goes back to the one before it and folds forward again.
+Solutions that were already returned stay; a late measurement shows in the next one.
 """
 
 from __future__ import annotations
@@ -15,26 +15,19 @@ from typing import Any, NamedTuple
 from msgspec import structs
 
 from companion.config import Config, parse
-from companion.navigator import error_state, integrity, minimax_bound
-from companion.navigator.deferred_update import learn
-from companion.navigator.solution import announce, solve
-from companion.navigator.stale_data import TOLD_EVERY, Freshness
-from companion.navigator.state import FIXES, Carry, Settings, Step, initial, is_news
-from companion.navigator.step import step, uses
+from companion.estimate import bank as banks
+from companion.navigator import minimax_bound
+from companion.navigator.own_channel import OwnChannel
+from companion.navigator.solution import announce, resolve_pending, solve
+from companion.navigator.stale_data import REPORT_EVERY, StaleDataDetector
+from companion.navigator.state import FIXES, Settings, State, Step, initial, is_new_fix
+from companion.navigator.step import INPUTS_USED, step, uses
 from companion.records import (
-    AirData,
-    Attitude,
     Event,
-    GlobalPosition,
     Gnss,
-    Imu,
     Input,
-    LocalOrigin,
-    LocalPosition,
     Mode,
     Output,
-    Pressure,
-    Reboot,
     Rejection,
     Reset,
     RsbnFix,
@@ -44,29 +37,15 @@ from companion.records import (
     Tuning,
 )
 
-__all__ = ["FOLDED", "Navigator", "learnt", "stepped", "tuned"]
+__all__ = ["INPUTS_USED", "Navigator"]
 
-FOLDED = (
-    LocalPosition,
-    LocalOrigin,
-    GlobalPosition,
-    Attitude,
-    AirData,
-    Pressure,
-    Imu,
-    Gnss,
-    RsbnFix,
-    Reboot,
-    Tuning,
-)
-
-ENDLESS = 1e8  # in SI: no metres, pascals or metres a second of ours come near it
+PLAUSIBLE = 1e8  # in SI: no metres, pascals or metres a second of ours come near it
 
 
 class _Past(NamedTuple):
     t_ns: int
     record: Input
-    before: Carry
+    before: State
 
 
 class Navigator:
@@ -74,92 +53,100 @@ class Navigator:
 
     def __init__(self, config: Config) -> None:
         self._settings = Settings.of(config)
-        self._carry = initial(self._settings)
+        self._state = initial(self._settings)
         self._past: deque[_Past] = deque()
-        self._owed: list[Output] = []  # learnt since the last record was handled
+        self._deferred: list[Output] = []  # outputs of deferred updates, for the next `handle`
         self._late_ns = round(1e9 * config.estimator.late_s)
         self._gnss_latency_ns = round(1e9 * config.gnss.latency_s)
-        self._freshness = Freshness()
-        self._rests_on = Mode.INITIALISING, Source(0)  # mode and fixes of the last solution, and its time
-        self._given_ns = 0
-        self._refused_ns: dict[str, int] = {}  # when what is no number was last told, by kind
-        self._told: integrity.Watch | None = None
-        self._chosen = False  # the inertial channel is told once, with the first record
+        self._stale_data = StaleDataDetector()
+        self._last_mode = Mode.INITIALISING, Source(0)  # mode and fixes of the last solution, and its time
+        self._last_solution_ns = 0
+        self._rejected_ns: dict[str, int] = {}  # when a non-finite record was last reported, by kind
+        self._channel_reported = False
+
+    @property
+    def state(self) -> State:
+        """The state after the last record."""
+        return self._state
+
+    @property
+    def settings(self) -> Settings:
+        """The settings in force."""
+        return self._settings
 
     def handle(self, record: Input) -> list[Output]:
-        """What follows from one more record."""
+        """Return the outputs of one more record."""
         if isinstance(record, Tuning):
             self._tune(parse(record.toml, "parameters"))
             return []
-        if type(record) not in uses(self._settings.channel):
+        if type(record) not in uses(self._settings):
             return []
-        if not self._chosen:
-            self._chosen = True
-            return [_choice(record, self._settings.config), *self.handle(record)]
-        if not _is_numbers(record):
-            return self._refused(record)
+        if not self._channel_reported:
+            self._channel_reported = True
+            return [_channel_event(record, self._settings), *self.handle(record)]
+        if not _is_plausible(record):
+            return self._reject_implausible(record)
         if isinstance(record, Gnss) and self._gnss_latency_ns:
             record = structs.replace(record, t_ns=record.t_ns - self._gnss_latency_ns)
-        stale = self._freshness.judge(record)
+        stale = self._stale_data.judge(record)
         if stale is not None:
             return stale
-        if isinstance(record, Gnss) and not is_news(record, self._carry, self._settings):
+        if isinstance(record, Gnss) and not is_new_fix(record, self._state, self._settings):
             return []
         self.settle()
-        outputs, self._owed = self._owed, []
+        outputs, self._deferred = self._deferred, []
         if self._past and record.t_ns < self._past[-1].t_ns:
             outputs += self._handle_late(record)
         else:
-            self._past.append(_Past(record.t_ns, record, self._carry))
-            outputs += self._stepped(record)
-        if isinstance(record, RsbnFix) and self._carry.rsbn_ns == record.t_ns:  # believed: tell at once
-            self._carry, solution = _guarded(self._carry, record, self._settings, _solved, record)
+            self._past.append(_Past(record.t_ns, record, self._state))
+            outputs += self._step(record)
+        if (
+            isinstance(record, RsbnFix) and self._state.rsbn_ns == record.t_ns
+        ):  # a beacon's fix goes out at once
+            self._state, solution = guarded(self._state, record, self._settings, _solve, record)
             outputs += solution
-        return [*self._announced(outputs), *self._watched(record)]
+        return self._with_mode_events(outputs)
 
     def settle(self) -> None:
-        """Learn what the last record taught and let go of what is too old: work that nothing waits for.
+        """Do the deferred update of the last record and drop old states: no answer waits for this.
 
-        `handle` does it first if it was not done in between; what follows from it is told there all the same.
+        `handle` does it first if it was not done in between; its outputs come with the next `handle`.
         """
-        self._owed += self._learnt()[1]
+        self._deferred += self._resolve()[1]
         while self._past and self._past[0].t_ns < self._past[-1].t_ns - self._late_ns:
             self._past.popleft()
 
-    def _refused(self, record: Input) -> list[Output]:
-        """That it is not used, told once a second."""
+    def _reject_implausible(self, record: Input) -> list[Output]:
+        """Report it once a second."""
         name = type(record).__name__
-        if record.rx_ns - self._refused_ns.get(name, -TOLD_EVERY) < TOLD_EVERY:
+        if record.rx_ns - self._rejected_ns.get(name, -REPORT_EVERY) < REPORT_EVERY:
             return []
-        self._refused_ns[name] = record.rx_ns
-        return [Rejection(record.t_ns, record.rx_ns, name, "it has what is no number")]
+        self._rejected_ns[name] = record.rx_ns
+        return [Rejection(record.t_ns, record.rx_ns, name, "a value is not finite or beyond 1e8")]
 
-    def _watched(self, record: Input) -> list[Output]:
-        """What became of the sources since it was last told."""
-        before, self._told = self._told, self._carry.watch
-        if before is self._told or self._told is None:
-            return []
-        return integrity.tell(before, self._told, record.rx_ns)
+    def _resolve(self) -> tuple[Input | None, list[Output]]:
+        """Do the deferred update left by the last record: whose it was, and its outputs."""
+        pending = self._state.pending
+        if pending is None:
+            return None, []
+        state = self._state._replace(pending=None)
+        self._state, outputs = guarded(state, pending.record, self._settings, resolve_pending, pending)
+        return pending.record, outputs
 
-    def _learnt(self) -> tuple[Input | None, list[Output]]:
-        """The lesson left over by the record before is learnt: whose it was, and what follows."""
-        lesson = self._carry.lesson
-        self._carry, outputs = learnt(self._carry, self._settings)
-        return lesson and lesson.record, outputs
-
-    def _stepped(self, record: Input) -> list[Output]:
-        self._carry, outputs = stepped(self._carry, record, self._settings)
+    def _step(self, record: Input) -> list[Output]:
+        self._state, outputs = guarded(self._state, record, self._settings, step, record)
         return outputs
 
     def _tune(self, config: Config) -> None:
-        """Go on with another configuration; late measurements are no longer folded in from before it."""
+        """Go on with another configuration; late measurements are no longer applied from before it."""
         self.settle()
-        before = self._settings.channel
-        self._settings, self._carry = tuned(self._carry, self._settings, config)
+        before = self._settings
+        self._settings, self._state = tuned(self._state, before, config)
         self._late_ns = round(1e9 * config.estimator.late_s)
         self._gnss_latency_ns = round(1e9 * config.gnss.latency_s)
-        self._chosen = self._chosen and config.channel == before
-        while len(self._past) > 1:  # the last one stays, for what is too late
+        same = config.has_own_ins == before.config.has_own_ins
+        self._channel_reported = self._channel_reported and same
+        while len(self._past) > 1:  # the last one stays: it dates what is too late
             self._past.popleft()
 
     def _handle_late(self, record: Input) -> list[Output]:
@@ -167,125 +154,117 @@ class Navigator:
             return self._too_late(record)
         place = bisect_right(self._past, record.t_ns, key=lambda past: past.t_ns)
         again = [record, *(past.record for past in list(self._past)[place:])]
-        self._carry = self._rewound(self._past[place].before)
+        self._state = self._rewound(self._past[place].before)
         while len(self._past) > place:
             self._past.pop()
         given: list[Output] = []
         for each in again:
-            learner, learnt = self._learnt()
-            self._past.append(_Past(each.t_ns, each, self._carry))
-            outputs = self._stepped(each)
-            if learner is record:  # all other lessons were told when they were learnt first
-                given += learnt
+            whose, resolved = self._resolve()
+            self._past.append(_Past(each.t_ns, each, self._state))
+            outputs = self._step(each)
+            if whose is record:  # the others were returned when they were resolved first
+                given += resolved
             if each is record:
-                given = [out for out in outputs if not isinstance(out, Solution) or out.t_ns > self._given_ns]
-        self._learnt()
+                last = self._last_solution_ns
+                given = [out for out in outputs if not isinstance(out, Solution) or out.t_ns > last]
+        self._resolve()
         return given
 
     def _too_late(self, record: Input) -> list[Output]:
-        """That it is not used; in what a receiver without a fix says there is nothing to use."""
+        """Reject it; a receiver without a fix has nothing to use."""
         if isinstance(record, Gnss) and not record.has_3d_fix:
             return []
         age, limit = (self._past[-1].t_ns - record.t_ns) * 1e-9, self._late_ns * 1e-9
         name = type(record).__name__
-        if age <= limit:
-            return [Rejection(record.t_ns, record.rx_ns, name, "older than all that can be gone back to")]
-        return [Rejection(record.t_ns, record.rx_ns, name, "arrived too late to be folded in", age, limit)]
+        why = "late: not used" if age > limit else "older than the oldest kept state: not used"
+        return [Rejection(record.t_ns, record.rx_ns, name, why, age, limit)]
 
-    def _rewound(self, before: Carry) -> Carry:
-        """An earlier carry, to fold forward from: what was forecast since is not forecast again."""
-        now = self._carry
+    def _rewound(self, before: State) -> State:
+        """An earlier state to fold forward from, keeping the latest forecast of the predictor."""
+        now = self._state
         promise = before.guarantee._replace(held=now.guarantee.held)
         return before._replace(guarantee=promise, ahead=now.ahead, next_ahead_ns=now.next_ahead_ns)
 
-    def _announced(self, outputs: list[Output]) -> list[Output]:
-        """With an event wherever the mode of what is given out, or what fixes it rests on, changes."""
-        announced: list[Output] = []
+    def _with_mode_events(self, outputs: list[Output]) -> list[Output]:
+        """Add an event wherever the mode, or the fixes that the solution rests on, change."""
+        found: list[Output] = []
         for output in outputs:
-            announced.append(output)
+            found.append(output)
             if isinstance(output, Solution):
-                self._given_ns = output.t_ns
-                rests_on = output.mode, output.sources & FIXES
-                if rests_on != self._rests_on:
-                    self._rests_on = rests_on
-                    announced.append(announce(output))
-        return announced
+                self._last_solution_ns = output.t_ns
+                mode = output.mode, output.sources & FIXES
+                if mode != self._last_mode:
+                    self._last_mode = mode
+                    found.append(announce(output))
+        return found
 
 
-def _solved(carry: Carry, record: Input, settings: Settings) -> Step:
-    return solve(carry, record.rx_ns, settings)
+def _solve(state: State, record: Input, settings: Settings) -> Step:
+    return solve(state, record.rx_ns, settings)
 
 
-def stepped(carry: Carry, record: Input, settings: Settings) -> Step:
-    """One step, guarded."""
-    return _guarded(carry, record, settings, step, record)
+def tuned(state: State, before: Settings, config: Config) -> tuple[Settings, State]:
+    """Return the settings of another configuration, and the state to go on with.
 
-
-def learnt(carry: Carry, settings: Settings) -> Step:
-    """The lesson left over by the record before, if there is one, is learnt, guarded."""
-    lesson = carry.lesson
-    if lesson is None:
-        return carry, []
-    return _guarded(carry._replace(lesson=None), lesson.record, settings, learn, lesson)
-
-
-def tuned(carry: Carry, before: Settings, config: Config) -> tuple[Settings, Carry]:
-    """The settings of another configuration, and the carry to go on with under them.
-
-    Where it means another inertial channel, all that was learnt was of the old one's error.
+    The bank is begun again where the error model changed: its states mean something else.
     """
     settings = Settings.of(config)
-    if settings.channel != before.channel:
-        return settings, initial(settings)._replace(next_ns=carry.next_ns)
-    return settings, carry._replace(guarantee=minimax_bound.tuned(carry.guarantee, config))
+    same = all(
+        getattr(config, section) == getattr(before.config, section)
+        for section in ("inertial", "air_data", "strapdown", "gnss", "rsbn", "integrity")
+    )
+    if same:
+        settings = settings._replace(model=before.model)
+        return settings, state._replace(guarantee=minimax_bound.tuned(state.guarantee, config))
+    return settings, initial(settings)._replace(
+        next_ns=state.next_ns, origin=state.origin, sensors=state.sensors, level=state.level
+    )
 
 
-def _guarded(
-    carry: Carry, record: Input, settings: Settings, follow: Callable[[Carry, Any, Settings], Step], x: Any
+def guarded(
+    state: State, record: Input, settings: Settings, follow: Callable[[State, Any, Settings], Step], x: Any
 ) -> Step:
-    """What follows from x; what cannot be computed with is refused aloud and changes nothing, and a state
-    gone wrong by it is begun anew.
-    """
+    """Return what follows from x; a numerical error rejects the record, a broken bank is reset."""
     try:
-        after, outputs = follow(carry, x, settings)
+        after, outputs = follow(state, x, settings)
     except (ArithmeticError, ValueError) as error:  # a singular matrix is a ValueError too
-        why = f"it cannot be computed with: {error}"
-        return carry, [Rejection(record.t_ns, record.rx_ns, type(record).__name__, why)]
-    why = "its covariance was none any more"
-    if after.state is not carry.state and not error_state.is_sound(after.state):
-        outputs = [*outputs, Reset(record.t_ns, record.rx_ns, "error state", why)]
-        after = after._replace(state=None, jumps=None)
-    if after.watch is not carry.watch and not integrity.is_sound(after.watch):
-        outputs = [*outputs, Reset(record.t_ns, record.rx_ns, "integrity monitor", why)]
-        after = after._replace(watch=None)
+        why = f"cannot be computed with: {error}"
+        return state, [Rejection(record.t_ns, record.rx_ns, type(record).__name__, why)]
+    if after.bank is not None and after.bank is not state.bank and not banks.is_sound(after.bank):
+        why = "covariance not positive definite: error state reset"
+        outputs = [*outputs, Reset(record.t_ns, record.rx_ns, "bank", why)]
+        after = after._replace(
+            bank=None,
+            nominal=None,
+            beacons=(),
+            false=(),
+            reported=(),
+            certain_ns=(),
+            restrictive=None,
+            fixed=False,
+        )
     return after, outputs
 
 
-def _is_numbers(record: Input) -> bool:
-    """Whether all that it says are numbers, and none that nothing in flight can say."""
+def _is_plausible(record: Input) -> bool:
+    """Whether all its numbers are finite and none is beyond anything in flight."""
     for value in structs.astuple(record):
         if isinstance(value, float):
-            if not abs(value) < ENDLESS:  # nor is NaN
+            if not abs(value) < PLAUSIBLE:  # false for NaN too
                 return False
-        elif isinstance(value, tuple) and not all(abs(x) < ENDLESS for x in value):
+        elif isinstance(value, tuple) and not all(abs(x) < PLAUSIBLE for x in value):
             return False
     return True
 
 
-def _choice(record: Input, config: Config) -> Event:
-    """The line that tells which inertial channel is corrected, and why."""
-    if config.inertial.source != "auto":
-        why = "configured"
-    elif config.inertial.independent:
-        why = "an INS of its own"
-    elif config.output.feeds_estimator:
-        why = "the autopilot is fed, so its own position is not independent"
+def _channel_event(record: Input, settings: Settings) -> Event:
+    """Report which inertial channel is corrected."""
+    if isinstance(settings.model.channel, OwnChannel):
+        config = settings.config
+        allowed = [name for name in ("imu", "air_data", "local_position") if config.uses(name)]
+        if config.output.feeds_estimator and "local_position" in allowed:
+            allowed.remove("local_position")
+        text = f"inertial channel: own, by {', '.join(a.replace('_', ' ') for a in allowed)}"
     else:
-        why = "the autopilot is not fed"
-    name = {
-        "air_data": f"air-data dead reckoning ({why})",
-        "strapdown": f"strapdown by the autopilot's attitude ({why})",
-        "local_position": f"the autopilot's local position ({why}); airspeed not used: "
-        "it makes a good INS worse",
-    }
-    return Event(record.t_ns, record.rx_ns, Severity.INFO, f"inertial channel: {name[config.channel]}")
+        text = "inertial channel: local position of an INS of its own"
+    return Event(record.t_ns, record.rx_ns, Severity.INFO, text)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
-from typing import NamedTuple, cast
+from typing import cast
 
 import numpy as np
 
@@ -17,32 +17,24 @@ from companion.config import GnssConfig, RsbnConfig
 from companion.estimate.fusion import (
     CONE_OF_SILENCE,
     Azimuth,
-    Height,
     Observation,
     Position,
     Range,
-    maximum_likelihood_3d,
 )
 from companion.nav.geometry import Geodetic, Triple, ecef_tuple, enu_axes_tuple, from_enu, separation_tuple
-from companion.navigator.error_state import Belief
 from companion.navigator.inertial_track import Point
 from companion.records import Gnss, RsbnFix, Source, Vector2
+from companion.units import Floats
 
 
-class Heard(NamedTuple):
-    """Observations of one instant in the tangent plane at the INS, and the sources they come from."""
-
-    t_ns: int
-    observations: tuple[Observation, ...]
-    sources: Source
-
-
-def from_gnss(record: Gnss, ins: Point, settings: GnssConfig, drifting: bool = False) -> Heard:
-    """A GNSS fix as a horizontal position at the INS; if `drifting`, with its white noise alone."""
-    sigma = white_sigma(record, settings) if drifting else _stated(record, settings)
-    north, east, _ = separation_tuple(Geodetic(record.lat, record.lon, record.alt_msl), ins.position)
-    place = Position((east, north), ((sigma**2, 0.0), (0.0, sigma**2)))
-    return Heard(record.t_ns, (place,), Source.GNSS)
+def from_gnss(
+    record: Gnss, nominal: Point, settings: GnssConfig, centre: Vector2 = (0.0, 0.0)
+) -> tuple[Observation, ...]:
+    """A GNSS fix as a position about the nominal point less the error `centre` (north, east, m)."""
+    sigma = _stated(record, settings)
+    north, east, _ = separation_tuple(Geodetic(record.lat, record.lon, record.alt_msl), nominal.position)
+    place = (east + centre[1], north + centre[0])
+    return (Position(place, ((sigma**2, 0.0), (0.0, sigma**2))),)
 
 
 def white_sigma(record: Gnss, settings: GnssConfig) -> float:
@@ -73,13 +65,13 @@ def from_rsbn(record: RsbnFix, ins: Point, settings: RsbnConfig) -> tuple[Azimut
     return tuple(observations)
 
 
-def silent(z: Azimuth, error_n: Vector2, distance: float | None) -> bool:
-    """Whether the aircraft is in the cone of silence of the azimuth's beacon, the INS being off by `error_n`
-    (m) and `distance` (m) measured, if it is: fusion takes nothing of an azimuth there.
+def in_cone_of_silence(z: Azimuth, distance: float | None) -> bool:
+    """Whether the origin of the plane is in the cone of silence of the azimuth's beacon, at a measured
+    `distance` (m) where there is one: no azimuth is used there.
     """
     x, y, z_b = cast(Triple, z.beacon)
     axes = cast(tuple[Triple, Triple, Triple], z.axes)
-    east, north, up = _times(axes, (-error_n[1] - x, -error_n[0] - y, -z_b))
+    east, north, up = _times(axes, (-x, -y, -z_b))
     slant = math.hypot(east, north, up) if distance is None else distance
     return abs(up) > math.sin(CONE_OF_SILENCE) * slant
 
@@ -96,9 +88,38 @@ def _times(C: tuple[Triple, Triple, Triple], v: Triple) -> Triple:
     return a * x + b * y + c * z, d * x + e * y + f * z, g * x + h * y + i * z
 
 
-def bias_sigma(name: str, settings: RsbnConfig) -> float:
-    """One sigma of the constant error of a beacon's measurement, called as the monitor does: rad or m."""
-    return math.radians(settings.bias_azimuth_deg) if name.endswith("azimuth") else settings.bias_range_m
+def source_of(z: Observation) -> Source:
+    """The source that an observation of a beacon comes from."""
+    return Source.AZIMUTH if isinstance(z, Azimuth) else Source.RANGE
+
+
+def predict_sight(z: Azimuth | Range, at: Floats) -> tuple[Floats, Floats, Floats]:
+    """Predict an azimuth (rad) or a slant range (m) at positions `at` (R, 3), east, north, up of the nominal.
+
+    Returns
+    -------
+    value, east, north : (R,) the prediction and its derivatives by position.
+    """
+    d = at - np.asarray(z.beacon)
+    if isinstance(z, Range):
+        value = np.sqrt((d * d).sum(axis=1))
+        far = np.maximum(value, 1.0)  # a position may be the beacon's own
+        return value, d[:, 0] / far, d[:, 1] / far
+    axes = np.eye(3) if z.axes is None else np.asarray(z.axes)
+    b = d @ axes.T
+    e, n = b[:, 0], b[:, 1]
+    rho2 = np.maximum(e * e + n * n, 1.0)
+    g = (n / rho2)[:, None] * axes[0] - (e / rho2)[:, None] * axes[1]
+    return np.arctan2(e, n), g[:, 0], g[:, 1]
+
+
+def sight_variance(z: Azimuth | Range, height_sigma: float) -> float:
+    """Variance of an azimuth (rad^2) or a range (m^2), the unknown height of the aircraft included."""
+    if isinstance(z, Azimuth):
+        return z.sigma**2
+    x, y, up = cast(Triple, z.beacon)
+    slope = up / max(math.hypot(x, y, up), 1.0)
+    return z.sigma**2 + (slope * height_sigma) ** 2
 
 
 def place(record: RsbnFix, alt: float) -> Geodetic | None:
@@ -110,23 +131,3 @@ def place(record: RsbnFix, alt: float) -> Geodetic | None:
     east, north = distance * math.sin(record.azimuth), distance * math.cos(record.azimuth)
     beacon = Geodetic(record.lat, record.lon, record.alt)
     return from_enu(np.array([east, north, up]), beacon)._replace(alt=alt)
-
-
-def innovation(heard: Heard, prior: Belief, height_sigma: float) -> tuple[Belief, float]:
-    """The most likely error with what is believed of it as one more observation, and the gate's chi-square:
-    the cost. The height is the INS's, within its sigma.
-    """
-    (north, east), (nn, ne, ee) = prior
-    # the place in the plane is minus the error; x east, y north
-    before = Position((-east, -north), ((ee, ne), (ne, nn)))
-    found = maximum_likelihood_3d(
-        (before, Height(0.0, height_sigma), *heard.observations), (-east, -north, 0.0)
-    )
-    x, y, _ = found.position
-    (ee, ne, _), (_, nn, _), _ = found.covariance
-    return Belief((-y, -x), (nn, ne, ee)), found.cost
-
-
-def freedom(heard: Heard) -> int:
-    """How many scalar measurements there are."""
-    return sum(2 if isinstance(z, Position) else 1 for z in heard.observations)

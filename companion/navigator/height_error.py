@@ -1,8 +1,9 @@
 """The height error of the inertial channel against GNSS: it drifts, and it grows with a climb.
 
 The height is a barometer's in the end. Weather moves it by 5 cm a root second, and on a day 20 K off the
-standard a metre of it is 8 % off: so the error is followed together with its share of a climb, which a few
-hundred metres of climb teach. A climb without GNSS then costs what is not known of that share, no more.
+standard a metre of it is 8 % off: so the error is followed together with its share of a climb, which is
+estimated within a few hundred metres of climb. A climb without GNSS then costs what is not known of that
+share, no more.
 """
 
 from __future__ import annotations
@@ -48,7 +49,7 @@ def at(level: Level, ins: Point) -> Level:
     )
 
 
-def learn(level: Level, record: Gnss, ins: Point, part: float, gate: float) -> Level:
+def update(level: Level, record: Gnss, ins: Point, part: float, gate: float) -> Level:
     """With the height of one fix, refused if its squared innovation is beyond `gate` times its variance.
 
     `part` is the share of one independent fix that this one is worth, its noise being correlated.

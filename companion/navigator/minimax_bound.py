@@ -18,7 +18,6 @@ import numpy as np
 from companion.config import Config, PredictorConfig
 from companion.estimate.predictor import MEASURED, Forecast, Quantity, Window, predict, predict_ahead
 from companion.estimate.predictor import Prediction as Channel
-from companion.navigator import tilt_error_model
 from companion.records import Prediction, Vector2
 from companion.units import G0
 
@@ -58,29 +57,29 @@ class Guarantee(NamedTuple):
 
 
 def begin(config: Config) -> Guarantee:
-    """Nothing learnt yet. The error of dead reckoning drifts with a wind that changes at a bounded rate, that
+    """Start without fixes. The error of dead reckoning drifts with a wind of bounded rate of change, that
     of strapdown with an unknown acceleration.
     """
     span = 60.0 * config.predictor.window_min
-    if config.channel == "air_data":
-        window = Window(span, disturbance=config.air_data.wind_rate_m_s_min / 60.0, drifting=True)
-    elif config.channel == "strapdown":
-        window = Window(
-            span, disturbance=tilt_error_model.unknown_acceleration(config.strapdown), drifting=True
-        )
-    else:
+    if config.has_own_ins:
         window = Window(span, disturbance=config.predictor.disturbance_ug * 1e-6 * G0)
+    elif config.inertial.source == "imu":
+        strapdown = config.strapdown
+        acceleration = math.hypot(G0 * math.radians(strapdown.tilt_deg), strapdown.accelerometer_m_s2)
+        window = Window(span, disturbance=acceleration, drifting=True)
+    else:
+        window = Window(span, disturbance=config.air_data.wind_rate_m_s_min / 60.0, drifting=True)
     return Guarantee(window, window)
 
 
 def tuned(g: Guarantee, config: Config) -> Guarantee:
-    """What was learnt, under other settings."""
+    """Return the same windows of fixes under other settings."""
     fresh = begin(config).north
     north, east = (replace(w, span=fresh.span, disturbance=fresh.disturbance) for w in (g.north, g.east))
     return Guarantee(north, east, g.bins)
 
 
-def learn(
+def add_fix(
     g: Guarantee, t_ns: int, quantity: Quantity, value: Vector2, sigma: Vector2, settings: PredictorConfig
 ) -> Guarantee:
     """With one more correction `value` of INS position (m) or velocity (m/s), north and east."""
@@ -155,7 +154,7 @@ def shift(g: Guarantee, north: float, east: float, v_n: Vector2 = (0.0, 0.0), t_
 
 
 def forget(g: Guarantee, since_ns: int) -> Guarantee:
-    """Without what was learnt after `since_ns`: it was a lie."""
+    """Drop the fixes after `since_ns`: their source was false."""
     return Guarantee(_until(g.north, since_ns), _until(g.east, since_ns))
 
 

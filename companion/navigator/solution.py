@@ -1,4 +1,8 @@
-"""The corrected estimate: the inertial channel less its estimated error, by the estimator that leads now."""
+"""Corrected estimate: the nominal trajectory less its error, by the estimator that leads, with its trust.
+
+The bank's leading family always leads, unless `estimator.output` names another estimator for the time without
+fixes. The minimax predictor runs beside it; its guaranteed radius is stated about the position that is sent.
+"""
 
 from __future__ import annotations
 
@@ -6,25 +10,38 @@ import math
 from itertools import combinations
 from typing import NamedTuple
 
-from companion.estimate import trust
-from companion.estimate.filterbank import INERTIAL
-from companion.nav.geometry import displace
-from companion.navigator import error_state, height_error, integrity, minimax_bound, restrictive_filter
-from companion.navigator.error_state import ErrorState
-from companion.navigator.inertial_track import Point
-from companion.navigator.minimax_bound import Bounded
-from companion.navigator.state import FIXES, Carry, Settings, Step, level, sources, state_at
-from companion.navigator.wind_error_model import WindError
-from companion.records import Event, Mode, Severity, Solution, Source, Vector2, Vector3
-from companion.units import Floats
+import numpy as np
 
-AHEAD_NS = 5_000_000_000  # how often the bounds ahead are worked out
+from companion.estimate import bank as banks
+from companion.estimate.fusion import Height, NoFix, maximum_likelihood
+from companion.nav.geometry import displace
+from companion.navigator import fix_observations, height_error, minimax_bound, restrictive_filter, trust
+from companion.navigator.hypotheses import GNSS
+from companion.navigator.minimax_bound import Bounded
+from companion.navigator.own_channel import OwnChannel
+from companion.navigator.state import (
+    EXCLUDED,
+    FIXES,
+    Pending,
+    Settings,
+    State,
+    Step,
+    estimate,
+    hypotheses,
+    levelled,
+    sources,
+)
+from companion.records import Event, Fix, Gnss, Mode, Severity, Solution, Source, Vector2, Vector3
+from companion.units import SECOND_NS, Floats
+
+UNCONFIRMED = 0.99  # greatest probability stated of a source that is not excluded
+PROTECTION_NS = SECOND_NS  # how often the protection level is computed
+AHEAD_NS = 5 * SECOND_NS  # how often the bounds ahead are computed
+TOGETHER_NS = SECOND_NS  # a fix of GNSS this near joins a beacon's answer
 
 
 class _Estimate(NamedTuple):
-    """The error of the inertial channel by one estimator: m, m/s, and m^2 of north, north-east, east; the
-    variance left of the velocity on its worse axis, m^2/s^2.
-    """
+    """Error of the channel by one estimator (m, m/s), covariance (nn, ne, ee) and velocity variance."""
 
     error_n: Vector2
     velocity_error_n: Vector2
@@ -32,87 +49,140 @@ class _Estimate(NamedTuple):
     velocity_variance: float
 
 
-def solve(carry: Carry, rx_ns: int, settings: Settings) -> Step:
-    """The corrected estimate at the newest inertial point; nothing before the first fix."""
-    if carry.state is None or not carry.track:
-        return carry, []
-    config = settings.config
-    ins = level(carry.track[-1], carry)
-    t_ns = ins.t_ns
-    state, dt = carry.state, max(0.0, (t_ns - carry.state.t_ns) * 1e-9)
-    if dt > error_state.NEAR_S:
-        state, dt = state_at(carry, ins, settings), 0.0
-    promise, bounded = minimax_bound.bounded(carry.guarantee, t_ns, config.predictor)
-    if t_ns >= carry.next_ahead_ns:
+def solve(state: State, rx_ns: int, settings: Settings) -> Step:
+    """Return the corrected estimate at the nominal point; nothing before the first fix."""
+    nominal, bank = state.nominal, state.bank
+    if nominal is None or bank is None or not state.fixed:
+        return state, []
+    config, known = settings.config, hypotheses(state, settings)
+    point = levelled(nominal.point, state)
+    t_ns = point.t_ns
+    promise, bounded = minimax_bound.bounded(state.guarantee, t_ns, config.predictor)
+    if t_ns >= state.next_ahead_ns:
         bounds = minimax_bound.ahead(promise, t_ns, config.predictor)
-        carry = carry._replace(ahead=bounds, next_ahead_ns=t_ns + AHEAD_NS)
-    rests_on = sources(carry, t_ns, settings)
+        state = state._replace(ahead=bounds, next_ahead_ns=t_ns + AHEAD_NS)
+    rests_on = sources(state, t_ns, settings)
     fixes = rests_on & FIXES
-    candidates = _candidates(carry, state, dt, bounded, ins, settings)
-    watched = carry.watch and carry.watch.protection
-    leads = settings.config.leading_estimator
-    if leads == "minimax" and watched and bounded and math.hypot(*bounded.bound_n) > watched.level:
-        leads = "kalman"  # little is left to predict from: what was learnt of an excluded source is gone
+    leading = estimate(state)
+    state = state._replace(leading=(bank, leading))
+    candidates = _candidates(state, leading.x, leading.P, nominal.pending_s, bounded, settings)
+    leads = config.leading_estimator
     if (rests_on & Source.GNSS if leads == "restrictive" else fixes) or leads not in candidates:
         leads = "kalman"
     error, velocity_error, (var_n, cov, var_e), velocity_variance = candidates[leads]
-    north, east, down = ins.v_n
-    lat, lon, alt = displace(*ins.position, -error[0], -error[1], 0.0)
-    protection = None
-    if carry.watch is not None and watched is not None:
-        # of the monitor's full solution; another one is off by no more than its distance from that besides
-        protection = watched.level + math.dist(error, integrity.error_at(carry.watch, ins, settings.unit))
-    held = _trust(carry, bool(fixes), bounded, protection, t_ns, settings)
-    last = max((t for t in (carry.gnss_ns, carry.rsbn_ns) if t is not None), default=t_ns)
+    position = np.array(error) - nominal.pending_s * np.array(candidates["kalman"].velocity_error_n)
+    if state.protection is None or t_ns - state.protection[0] >= PROTECTION_NS:
+        radius = banks.protection_level(bank, known.layout, config.integrity.risk, position)
+        state = state._replace(protection=(t_ns, radius, *error))
+    assert state.protection is not None
+    # in between the estimate moves: by the triangle inequality the level holds about its new place
+    protection = state.protection[1] + math.dist(error, state.protection[2:])
+    bound_n, velocity_bound_n = _about(error, velocity_error, bounded)
+    witness = bool(rests_on & (Source.AZIMUTH | Source.RANGE))
+    suspicion = any(state.reported)
+    held = _trust(state, bool(fixes), suspicion, bound_n, protection, t_ns, settings)
+    north, east, down = point.v_n
+    lat, lon, alt = displace(*point.position, -error[0], -error[1], 0.0)
+    last = max((t for t in (state.gnss_ns, state.rsbn_ns) if t is not None), default=t_ns)
     solution = Solution(
-        t_ns,
-        rx_ns,
-        _mode(bool(fixes), bounded, settings),
-        leads,
-        lat,
-        lon,
-        alt,
-        (north - velocity_error[0], east - velocity_error[1], down),
-        (var_n, cov, 0.0, var_e, 0.0, height_error.at(carry.level, carry.track[-1]).covariance[0]),
-        error,
-        velocity_error,
-        int(rests_on),
-        max(0.0, (t_ns - last) * 1e-9),
-        bounded and bounded.bound_n,
-        bounded and bounded.velocity_bound_n,
-        _disagreement(candidates),
-        max(0.0, (rx_ns - t_ns) * 1e-9),
-        carry.ahead,
-        math.hypot(math.sqrt(velocity_variance), settings.unit.velocity_noise),  # gusts are no state
-        protection,
-        held.trust,
+        t_ns=t_ns,
+        rx_ns=rx_ns,
+        mode=_mode(bool(fixes), bound_n, protection, settings),
+        estimator=leads,
+        lat=lat,
+        lon=lon,
+        alt_msl=alt,
+        v_n=(north - velocity_error[0], east - velocity_error[1], down),
+        covariance=(
+            var_n,
+            cov,
+            0.0,
+            var_e,
+            0.0,
+            height_error.at(state.level, nominal.point).covariance[0],
+        ),
+        error_n=error,
+        velocity_error_n=velocity_error,
+        sources=int(rests_on),
+        horizon_s=max(0.0, (t_ns - last) * 1e-9),
+        bound_n=bound_n,
+        velocity_bound_n=velocity_bound_n,
+        disagreement=_disagreement(candidates),
+        inertial_age_s=max(0.0, (rx_ns - t_ns) * 1e-9),
+        ahead=state.ahead,
+        sigma_velocity=math.hypot(math.sqrt(velocity_variance), settings.model.channel.velocity_noise),
+        protection=protection,
+        trust=held.trust,
+        gnss_false=_gnss_false(state),
+        witness=witness,
     )
-    return carry._replace(state=state, guarantee=promise, held=held), [solution]
+    return state._replace(guarantee=promise, held=held), [solution]
 
 
 def _candidates(
-    carry: Carry, state: ErrorState, dt: float, bounded: Bounded | None, ins: Point, settings: Settings
+    state: State, x: Floats, P: Floats, dt: float, bounded: Bounded | None, settings: Settings
 ) -> dict[str, _Estimate]:
-    """What each estimator that runs says of the channel's error; the state is `dt` seconds old."""
-    unit = settings.unit
-    place, motion = error_state.ahead(state, dt, ins.v_n, unit)
-    variance = max(motion.covariance[0], motion.covariance[2], 0.0)
-    found = {"kalman": _Estimate(place.error_n, motion.error_n, place.covariance, variance)}
+    """Error of the channel by each estimator that runs; the bank is `dt` seconds older than the nominal."""
+    n, e, vn, ve = x[:4].tolist()
+    C = P[:4, :4]
+    (nn, ne, n_vn, n_ve), (_, ee, e_vn, e_ve), (_, _, vnn, vne), (*_, vee) = C.tolist()
+    place = (
+        nn + dt * (2.0 * n_vn + dt * vnn),
+        ne + dt * (n_ve + e_vn + dt * vne),
+        ee + dt * (2.0 * e_ve + dt * vee),
+    )
+    variance = max(vnn, vee, 0.0) + _velocity_growth(state, dt, settings)
+    found = {"kalman": _Estimate((n + dt * vn, e + dt * ve), (vn, ve), place, variance)}
     if bounded is not None:
         variances = (bounded.bound_n[0] ** 2, 0.0, bounded.bound_n[1] ** 2)
         variance = max(bounded.velocity_bound_n) ** 2
         found["minimax"] = _Estimate(bounded.error_n, bounded.velocity_error_n, variances, variance)
-    if carry.restrictive is not None and isinstance(settings.unit, WindError):
-        x, P = restrictive_filter.at(carry.restrictive, ins.t_ns, settings.unit)
-        dx, dy, dv_n, dv_e = x.tolist()
-        variance = float(max(P[2, 2], P[3, 3], 0.0))
-        found["restrictive"] = _Estimate((dx, dy), (dv_n, dv_e), _triangle(P), variance)
+    if state.restrictive is not None and state.nominal is not None:
+        x4, P4 = restrictive_filter.at(state.restrictive, state.nominal.t_ns, settings.config.air_data)
+        dx, dy, dv_n, dv_e = x4.tolist()
+        (var_n, cov), (_, var_e) = P4[:2, :2].tolist()
+        variance = float(max(P4[2, 2], P4[3, 3], 0.0))
+        found["restrictive"] = _Estimate((dx, dy), (dv_n, dv_e), (var_n, cov, var_e), variance)
     return found
 
 
-def _triangle(P: Floats) -> Vector3:
-    (var_n, cov), (_, var_e) = P[:2, :2].tolist()
-    return var_n, cov, var_e
+def _velocity_growth(state: State, dt: float, settings: Settings) -> float:
+    """Variance (m^2/s^2) that the samples of the last `dt` seconds, since the bank, added to the velocity.
+
+    A velocity through the air follows each gust, a foreign one its own noise; a held one grows stale.
+    """
+    channel, nominal = settings.model.channel, state.nominal
+    if nominal is None or nominal.interval is None or dt <= 0.0 or not isinstance(channel, OwnChannel):
+        return 0.0
+    model = channel.settings
+    if nominal.interval.by == "air":
+        return -(model.gust_along_m_s**2) * math.expm1(-2.0 * dt / model.gust_s)
+    if nominal.interval.by == "foreign":
+        return model.foreign_noise_m_s**2
+    return model.hold_m_s_sqrt_s**2 * dt if nominal.interval.by == "hold" else 0.0
+
+
+def _about(
+    error: Vector2, velocity_error: Vector2, bounded: Bounded | None
+) -> tuple[Vector2 | None, Vector2 | None]:
+    """Guaranteed r.m.s. bounds about what is sent: those of the minimax estimate and the distance to it."""
+    if bounded is None:
+        return None, None
+
+    def added(bound: Vector2, ours: Vector2, its: Vector2) -> Vector2:
+        return bound[0] + abs(ours[0] - its[0]), bound[1] + abs(ours[1] - its[1])
+
+    return (
+        added(bounded.bound_n, error, bounded.error_n),
+        added(bounded.velocity_bound_n, velocity_error, bounded.velocity_error_n),
+    )
+
+
+def _gnss_false(state: State) -> float | None:
+    """Probability that GNSS is false; no certainty before it is confirmed."""
+    if not state.false:
+        return None
+    return state.false[GNSS] if state.reported[GNSS] == EXCLUDED else min(state.false[GNSS], UNCONFIRMED)
 
 
 def _disagreement(candidates: dict[str, _Estimate]) -> float | None:
@@ -121,45 +191,106 @@ def _disagreement(candidates: dict[str, _Estimate]) -> float | None:
     return max((math.dist(a, b) for a, b in pairs), default=None)
 
 
-def _mode(fixes: bool, bounded: Bounded | None, settings: Settings) -> Mode:
+def _mode(fixes: bool, bound_n: Vector2 | None, protection: float, settings: Settings) -> Mode:
     if fixes:
         return Mode.FIXED
-    if bounded is None or math.hypot(*bounded.bound_n) > settings.config.predictor.limit_m:
-        return Mode.UNTRUSTED
-    return Mode.PREDICTING
+    limit = settings.config.predictor.limit_m
+    bounded = bound_n is not None and math.hypot(*bound_n) <= limit
+    return Mode.PREDICTING if bounded or protection <= limit else Mode.UNTRUSTED
 
 
 def _trust(
-    carry: Carry,
+    state: State,
     fixes: bool,
-    bounded: Bounded | None,
-    protection: float | None,
+    suspicion: bool,
+    bound_n: Vector2 | None,
+    protection: float,
     t_ns: int,
     settings: Settings,
 ) -> trust.Held:
     """How far the output can be trusted."""
-    w = carry.watch
-    suspicion = w is not None and (w.monitor.unresolved or bool(w.exclusions))
-    inertial = integrity.excluded(w, INERTIAL)
-    bound = None if bounded is None or inertial else math.hypot(*bounded.bound_n)
-    evidence = trust.Evidence(fixes, suspicion, protection, bound)
     config = settings.config
+    evidence = trust.Evidence(fixes, suspicion, protection)
     limits = trust.Limits(
         config.integrity.alert_m, config.predictor.limit_m, settle_s=config.integrity.settle_s
     )
-    if carry.held is None:
+    if state.held is None:
         return trust.Held(trust.judge(evidence, limits), t_ns)
-    return trust.turn(carry.held, t_ns, evidence, limits)
+    return trust.turn(state.held, t_ns, evidence, limits)
 
 
 def announce(solution: Solution) -> Event:
-    """The line that tells of a change to this solution's mode, or to the fixes it rests on."""
+    """Report a change of mode, or of the fixes that the solution rests on."""
     fixes = [s.name.lower() for s in Source if s.name and s & FIXES & solution.sources]
     if solution.mode is Mode.FIXED:
         why = " and ".join(fixes) + " fixes"
-    elif solution.bound_n is None:
-        why = "no fixes, and too few before for a guaranteed prediction"
+    elif solution.protection is not None:
+        why = f"no fixes; protection level {solution.protection:.0f} m"
     else:
-        why = f"no fixes; the guaranteed bound is {math.hypot(*solution.bound_n):.0f} m"
+        why = "no fixes"
     severity = Severity.WARNING if solution.mode is Mode.UNTRUSTED else Severity.NOTICE
     return Event(solution.t_ns, solution.rx_ns, severity, f"navigation {solution.mode}: {why}")
+
+
+def resolve_pending(state: State, pending: Pending, settings: Settings) -> Step:
+    """Deferred update: make the radio-only fix after the solution is out, for the guaranteed predictor."""
+    config, record, point = settings.config, pending.record, pending.point
+    used = pending.used
+    observations: tuple[object, ...]
+    if isinstance(record, Gnss):
+        observations = fix_observations.from_gnss(record, point, config.gnss)
+    else:
+        observations = tuple(
+            z
+            for z in fix_observations.from_rsbn(record, point, config.rsbn)
+            if used & fix_observations.source_of(z)
+        )
+        if state.gnss_fix is not None and abs(state.gnss_fix[0].t_ns - record.t_ns) <= TOGETHER_NS:
+            # the correction nominal minus GNSS of a moment ago holds now: the error drifts by metres a minute
+            fix_of_gnss, nominal = state.gnss_fix
+            observations += fix_observations.from_gnss(fix_of_gnss, nominal, config.gnss, pending.centre)
+            used |= Source.GNSS
+    height = Height(0.0, config.inertial.height_sigma_m)
+    try:
+        fix = maximum_likelihood((*observations, height), start=np.zeros(3))  # type: ignore[arg-type]
+    except NoFix:
+        return state, []  # an azimuth or a range alone is no fix
+    east, north, up = (float(c) for c in fix.position)
+    correction = (pending.centre[0] - north, pending.centre[1] - east)
+    (var_e, cov), var_n = fix.covariance[0, :2].tolist(), float(fix.covariance[1, 1])
+    sigma = (math.sqrt(var_n), math.sqrt(var_e))
+    g = minimax_bound.add_fix(state.guarantee, record.t_ns, "position", correction, sigma, config.predictor)
+    lat, lon, alt = displace(*point.position, north, east, -up)
+    out = Fix(
+        t_ns=record.t_ns,
+        rx_ns=record.rx_ns,
+        lat=lat,
+        lon=lon,
+        alt_msl=alt,
+        correction_n=correction,
+        covariance=(var_n, cov, var_e),
+        sources=int(used),
+        cost=fix.cost,
+        degrees_of_freedom=fix.degrees_of_freedom,
+        iterations=fix.iterations,
+    )
+    return _restrict(state._replace(guarantee=g), out, used, settings), [out]
+
+
+def _restrict(state: State, fix: Fix, used: Source, settings: Settings) -> State:
+    """The same fix for the restrictive filter, which runs on air data only."""
+    nominal = state.nominal
+    if settings.config.leading_estimator != "restrictive" or nominal is None or state.bank is None:
+        return state
+    air = settings.config.air_data
+    if state.restrictive is None:
+        found = estimate(state)
+        begun = restrictive_filter.begin(nominal.t_ns, found.x[:4], found.P[:4, :4])
+        return state._replace(restrictive=begun)
+    var_n, cov, var_e = fix.covariance
+    covariance = np.array([[var_n, cov], [cov, var_e]])
+    white = not used & Source.GNSS
+    updated = restrictive_filter.update(
+        state.restrictive, fix.t_ns, np.array(fix.correction_n), covariance, white, air
+    )
+    return state._replace(restrictive=updated)

@@ -1,10 +1,10 @@
-"""Whether a record is a measurement made anew, or an old one told again.
+"""Detection of stale data: repeated records, and old values under new times.
 
-    told = freshness.judge(record)      # None: use it; else drop it and tell what is in the list
+    outputs = detector.judge(record)      # None: use the record; else drop it and return these outputs
 
 Streams repeat: an autopilot sends its last fix at the stream's rate, a router sends every frame twice, a
-receiver that hangs goes on with its last numbers under new times. A repeat with the old time is no news and
-nothing is said of it, unless it lasts. The same numbers under a new time are another matter. No two readings
+receiver that hangs goes on with its last numbers under new times. A repeat with the old time is dropped,
+and reported only if it lasts. The same numbers under a new time are another matter. No two readings
 of a noisy sensor are alike to the last bit, and what moves is not where it was: a position that stands still
 at a speed is false at once, an attitude or an airspeed after seconds, a beacon's answer (rounded to 10 m and
 0.01 degrees: two running are alike once in 1500) at the third of a kind.
@@ -34,7 +34,7 @@ from companion.units import SECOND_NS
 
 MOVING_M_S = 1.0
 FLYING_M_S = 5.0
-#: So long an old time may be repeated before it is told: streams are faster than their sensors.
+#: An old time may be repeated for so long before it is reported: streams are faster than their sensors.
 PATIENCE_S = 3.0
 AIRSPEED_S, ATTITUDE_S = 10.0, 2.0
 #: Answers of a beacon alike under new times: with azimuth and range, with one of them.
@@ -42,17 +42,17 @@ ANSWERS, HALF_ANSWERS = 3, 5
 #: Two answers alike and this near are one that came twice, and so are two of anything else: what maps the
 #: autopilot's times is adjusted in between.
 SAME_ANSWER_NS, SAME_NS = 50_000_000, 5_000_000
-TOLD_EVERY = SECOND_NS
+REPORT_EVERY = SECOND_NS
 
 
 class Run(NamedTuple):
-    """Records alike of one source: what they say, the first and the last time, and how often it changed."""
+    """Equal records of one source: their content, first and last time, and how often the time changed."""
 
     content: tuple[Any, ...]
     stamp: int
     since_ns: int  # arrival of the first
     times: int = 1  # under times of their own
-    told_ns: int | None = None
+    reported_ns: int | None = None
 
 
 class Law(NamedTuple):
@@ -100,7 +100,7 @@ LAWS: dict[type[Stamped], Law] = {
 }
 
 
-class Freshness:
+class StaleDataDetector:
     """The last run of every source; `judge` all records in the order of arrival."""
 
     def __init__(self) -> None:
@@ -108,7 +108,7 @@ class Freshness:
         self._answers: dict[str, deque[tuple[int, tuple[Any, ...]]]] = {}
 
     def judge(self, record: Stamped) -> list[Output] | None:
-        """None if `record` may be used, else what is to be told of it, often nothing."""
+        """Return None if `record` may be used, else the outputs that report it (often none)."""
         law = LAWS.get(type(record))
         if law is None:
             if isinstance(record, Reboot):
@@ -126,11 +126,13 @@ class Freshness:
         if abs(stamp - run.stamp) <= same:  # no news; but a sensor that is well would have some by now
             claimed = not isinstance(record, Gnss) or record.has_3d_fix
             if claimed and lasted_s > PATIENCE_S:
-                return self._told(record, source, run, lasted_s, "its time stands still")
+                return self._rejection(record, source, run, lasted_s, "its time stands still")
             return None
         run = self._runs[source] = run._replace(stamp=stamp, times=run.times + 1)
         if law.stale(record, run.times, lasted_s):
-            return self._told(record, source, run, lasted_s, "it is frozen: old numbers under a new time")
+            return self._rejection(
+                record, source, run, lasted_s, "it is frozen: old numbers under a new time"
+            )
         return None
 
     def _came(self, source: str, t_ns: int, content: tuple[Any, ...]) -> bool:
@@ -141,8 +143,8 @@ class Freshness:
         known.append((t_ns, content))
         return False
 
-    def _told(self, record: Stamped, source: str, run: Run, lasted_s: float, why: str) -> list[Output]:
-        if run.told_ns is not None and record.rx_ns - run.told_ns < TOLD_EVERY:
+    def _rejection(self, record: Stamped, source: str, run: Run, lasted_s: float, why: str) -> list[Output]:
+        if run.reported_ns is not None and record.rx_ns - run.reported_ns < REPORT_EVERY:
             return []
-        self._runs[source] = run._replace(told_ns=record.rx_ns)
+        self._runs[source] = run._replace(reported_ns=record.rx_ns)
         return [Rejection(record.t_ns, record.rx_ns, source, why, lasted_s)]

@@ -1,145 +1,156 @@
-"""What the navigator remembers between two records, immutable, and what follows from it at an instant."""
+"""Navigator state between two records, immutable, and the settings derived once from the configuration."""
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
-from scipy.special import chdtri
-
-from companion.config import Channel, Config
-from companion.estimate.fusion import Observation
-from companion.estimate.monitor import Allotment
-from companion.estimate.trust import Held
-from companion.nav.geometry import Geodetic
-from companion.navigator import (
-    error_state,
-    fix_observations,
-    height_error,
-    inertial_track,
-    integrity,
-    minimax_bound,
-    tilt_error_model,
-    wind_error_model,
-)
-from companion.navigator.air_data_channel import Reckoner
-from companion.navigator.error_state import ErrorModel, ErrorState
+from companion.config import Config
+from companion.estimate import bank as banks
+from companion.estimate.bank import Bank, Estimate
+from companion.nav.geometry import Geodetic, displace
+from companion.navigator import height_error, minimax_bound
+from companion.navigator.channel import Nominal
 from companion.navigator.height_error import Level
-from companion.navigator.inertial_track import Point, Track
-from companion.navigator.integrity import Watch
+from companion.navigator.hypotheses import Hypotheses, Model
+from companion.navigator.inertial_track import Point
 from companion.navigator.minimax_bound import Guarantee
+from companion.navigator.own_channel import Sensors
 from companion.navigator.restrictive_filter import Restrictive
-from companion.navigator.strapdown_channel import Strap
-from companion.navigator.wind_mixture import Jumps
-from companion.records import Gnss, LocalOrigin, LocalPosition, Output, Prediction, RsbnFix, Source
+from companion.navigator.trust import Held
+from companion.records import Gnss, LocalOrigin, LocalPosition, Output, Prediction, RsbnFix, Source, Vector2
+from companion.units import SECOND_NS
 
 FIXES = Source.GNSS | Source.AZIMUTH | Source.RANGE
+JAMMED_NS = 10 * SECOND_NS  # the receiver's word lasts so long
+SUSPECT, EXCLUDED = 1, 2
+NEAR_S = 0.5  # the bank is at most so far behind: in between the error moves by its velocity
 
 
 class Settings(NamedTuple):
     """The configuration with what follows from it."""
 
     config: Config
-    unit: ErrorModel
-    gate: tuple[float, ...]  # chi-square limits for 0, 1, 2, 3 degrees of freedom
-    allotment: Allotment
-    watched: ErrorModel  # what the integrity monitor takes the channel for
-    channel: Channel
+    model: Model
 
     @classmethod
     def of(cls, config: Config) -> Settings:
-        """Everything derived once."""
-        alarm = config.estimator.false_rejection
-        gate = (0.0, *(float(chdtri(k, alarm)) for k in (1, 2, 3)))
-        unit: ErrorModel
-        watched: ErrorModel
-        if config.channel == "air_data":
-            unit = wind = wind_error_model.grade(config.air_data, config.gnss)
-            watched = wind_error_model.overbound(wind)
-        elif config.channel == "strapdown":
-            unit = watched = tilt_error_model.grade(config.strapdown, config.gnss)
-        else:
-            unit = watched = ins = error_state.grade(config.inertial, config.gnss)
-            if not config.inertial.independent:
-                watched = error_state.overbound(ins, config.air_data.wind_jump_m_s)
-        return cls(config, unit, gate, integrity.allotment(config), watched, config.channel)
+        """Derive everything once."""
+        return cls(config, Model(config))
 
 
-class Lesson(NamedTuple):
-    """A fix that has still to teach: what was believed of it, for the guaranteed predictor; the inertial
-    point of its time; and a beacon's measurements as they were said, for the integrity monitor. It is `proof`
-    if the guaranteed prediction allows it while the Gaussian state does not: the state's claim was wrong.
-    """
+class Beacon(NamedTuple):
+    """A beacon that is followed: its identity and place, and when it last answered."""
+
+    identity: int
+    place: tuple[float, float, float]
+    last_ns: int
+
+
+class Pending(NamedTuple):
+    """A fix whose radio-only solution has still to be made: it teaches the guaranteed predictor."""
 
     record: Gnss | RsbnFix
-    heard: fix_observations.Heard | None
-    ins: Point
-    sights: tuple[Observation, ...] = ()
-    proof: bool = False
+    point: Point  # origin of the observations' plane
+    centre: Vector2  # error of the nominal trajectory that was taken off there (m)
+    used: Source
 
 
-class Carry(NamedTuple):
+class State(NamedTuple):
     """All that the navigator remembers."""
 
     guarantee: Guarantee
     origin: LocalOrigin | None = None
     local: LocalPosition | None = None
-    waiting_ns: int | None = None  # since when positions come that a channel cannot begin with
-    reckoner: Reckoner = Reckoner()
-    strap: Strap = Strap()
-    track: Track = ()
-    state: ErrorState | None = None
-    jumps: Jumps | None = None  # of air-data dead reckoning: what `state` is the sum of
-    restrictive: Restrictive | None = None  # of the same
+    waiting_ns: int | None = None  # since when a channel cannot begin
+    sensors: Sensors = Sensors()
+    nominal: Nominal | None = None
+    ins: Point | None = None  # the last sample of an INS; the nominal point may be carried on beyond it
+    bank: Bank | None = None
+    leading: tuple[Bank, Estimate] | None = None  # moments of the leading family, and of which bank
+    protection: tuple[int, float, float, float] | None = None  # when computed; radius, position error (m)
+    fixed: bool = False  # whether a fix was ever used
+    beacons: tuple[Beacon, ...] = ()
+    jammed_ns: int | None = None  # when the receiver last reported jamming or spoofing
+    false: tuple[float, ...] = ()  # probability that each source is false
+    certain_ns: tuple[int, ...] = ()  # since when each is false beyond doubt, 0 where it is not
+    reported: tuple[int, ...] = ()  # what was last reported of each source: 0 used, 1 suspect, 2 excluded
     level: Level = Level()
+    restrictive: Restrictive | None = None
     gnss: Gnss | None = None  # the last new one, used or not
-    gnss_heard: fix_observations.Heard | None = None  # the last one believed
-    innovation: float | None = None  # of the last fix, squared, by its covariance; None if of one number
-    lesson: Lesson | None = None  # not yet learnt: a solution must not wait for it
-    asked_ns: int | None = None  # when GNSS was last used or refused
+    gnss_used_ns: int | None = None  # when a fix was last taken up, used or not
+    gnss_fix: tuple[Gnss, Point] | None = None  # the last one believed
+    pending: Pending | None = None
     gnss_ns: int | None = None  # when fixes were last believed
     rsbn_ns: int | None = None
-    rsbn_told: Source = Source(0)  # which of azimuth and range were, then
-    watch: Watch | None = None  # over the sources; its full solution is `state`
-    held: Held | None = None  # trust, and since when
+    rsbn_used: Source = Source(0)  # which of azimuth and range were, then
+    held: Held | None = None
     next_ns: int = 0
     next_ahead_ns: int = 0
     ahead: tuple[Prediction, ...] = ()
 
 
-Step = tuple[Carry, list[Output]]
+Step = tuple[State, list[Output]]
 
 
-def initial(settings: Settings) -> Carry:
-    """The carry before anything was heard."""
-    return Carry(minimax_bound.begin(settings.config))
+def initial(settings: Settings) -> State:
+    """The state before anything was received."""
+    return State(minimax_bound.begin(settings.config))
 
 
-def is_news(record: Gnss, carry: Carry, settings: Settings) -> bool:
-    """A new fix of the receiver believed in: an autopilot repeats its last one for ever."""
-    believed = record.receiver == settings.config.gnss.receiver
-    return believed and (carry.gnss is None or not record.repeats(carry.gnss))
+def is_new_fix(record: Gnss, state: State, settings: Settings) -> bool:
+    """Whether this is a new fix of the receiver in use: an autopilot repeats its last one."""
+    selected = record.receiver == settings.config.gnss.receiver
+    return selected and (state.gnss is None or not record.repeats(state.gnss))
 
 
-def state_at(carry: Carry, ins: Point, settings: Settings) -> ErrorState:
-    """The error state carried to the time of `ins`; from the grade of the unit before the first fix."""
-    state = carry.state or error_state.start(ins.t_ns, settings.unit)
-    acceleration = inertial_track.acceleration(carry.track)
-    return error_state.predict(state, ins.t_ns, ins.position.lat, ins.v_n, acceleration, settings.unit)
+def hypotheses(state: State, settings: Settings) -> Hypotheses:
+    """The hypotheses with the beacons that are followed, for what moves the nominal trajectory now."""
+    interval = state.nominal.interval if state.nominal else None
+    by_air = interval is not None and interval.by == "air"
+    return settings.model.hypotheses(len(state.beacons), by_air, has_witness(state, settings))
 
 
-def level(ins: Point, carry: Carry) -> Point:
-    """The inertial point at the height that GNSS has taught."""
-    lat, lon, alt = ins.position
-    return Point(ins.t_ns, Geodetic(lat, lon, alt - height_error.at(carry.level, ins).error), ins.v_n)
+def has_witness(state: State, settings: Settings) -> bool:
+    """Whether a beacon was received within its timeout, or the receiver reports jamming or spoofing."""
+    if state.bank is None:
+        return False
+    now = state.nominal.t_ns if state.nominal else 0
+    if state.jammed_ns is not None and now - state.jammed_ns < JAMMED_NS:
+        return True
+    timeout = round(1e9 * settings.config.rsbn.timeout_s)
+    return any(now - beacon.last_ns < timeout for beacon in state.beacons)
 
 
-def sources(carry: Carry, t_ns: int, settings: Settings) -> Source:
-    """What the position rests on now: fixes younger than their timeouts, over the inertial channel."""
-    config, sources = settings.config, Source.INERTIAL
-    if settings.channel == "air_data":
-        sources |= Source.AIR_DATA
-    if carry.gnss_ns is not None and (t_ns - carry.gnss_ns) * 1e-9 <= config.gnss.timeout_s:
-        sources |= Source.GNSS
-    if carry.rsbn_ns is not None and (t_ns - carry.rsbn_ns) * 1e-9 <= config.rsbn.timeout_s:
-        sources |= carry.rsbn_told
-    return sources
+def levelled(point: Point, state: State) -> Point:
+    """The nominal point at the height corrected by GNSS."""
+    lat, lon, alt = point.position
+    return Point(point.t_ns, Geodetic(lat, lon, alt - height_error.at(state.level, point).error), point.v_n)
+
+
+def corrected(point: Point, state: State) -> tuple[Point, Vector2]:
+    """The nominal point less its estimated error, and that error, north and east (m)."""
+    north, east = estimate(state).x[:2].tolist()
+    point = levelled(point, state)
+    place = displace(*point.position, -north, -east, 0.0)
+    return point._replace(position=place._replace(alt=point.position.alt)), (north, east)
+
+
+def estimate(state: State) -> Estimate:
+    """Moments of the leading family."""
+    assert state.bank is not None
+    if state.leading is not None and state.leading[0] is state.bank:
+        return state.leading[1]
+    return banks.estimate(state.bank)
+
+
+def sources(state: State, t_ns: int, settings: Settings) -> Source:
+    """What the position rests on now: fixes younger than their timeouts, over the channel."""
+    config, found = settings.config, Source.INERTIAL
+    interval = state.nominal.interval if state.nominal else None
+    if interval is not None and (interval.by == "air" or t_ns - state.sensors.measured_ns < 2_000_000_000):
+        found |= Source.AIR_DATA
+    if state.gnss_ns is not None and (t_ns - state.gnss_ns) * 1e-9 <= config.gnss.timeout_s:
+        found |= Source.GNSS
+    if state.rsbn_ns is not None and (t_ns - state.rsbn_ns) * 1e-9 <= config.rsbn.timeout_s:
+        found |= state.rsbn_used
+    return found

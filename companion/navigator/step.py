@@ -1,13 +1,9 @@
-"""One step of the navigator: `carry, outputs = step(carry, record, settings)`, the carry immutable.
+"""One step of the navigator: `state, outputs = step(state, record, settings)`, the state immutable.
 
-What a fix teaches the guaranteed predictor is not needed for the solution that it causes. It is left in the
-carry as a lesson, and `learn` makes up for it before the next step, when the solution is out.
-
-Online, replay and late measurements all go through this one function. Errors are INS minus truth, so what is
-given out is the inertial channel less the estimated error. Two estimators run on one stream: the Gaussian
-error state (the "kalman" of the configuration: maximum-likelihood fusion with memory) and, beside it, the
-minimax prediction with its guaranteed bound. While trusted fixes come the first is the output; when they
-stop, the one the configuration names.
+Online flight, replay and late measurements all go through this one function. A record either moves the
+nominal trajectory (a channel's sample), is remembered (attitude, pressure, flags), or is a measurement of
+the bank of hypotheses. The bank is propagated only at measurements, or after half a second without one. The
+solution is the nominal trajectory less its estimated error.
 """
 
 from __future__ import annotations
@@ -16,31 +12,53 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-from companion.config import Channel
-from companion.estimate.fusion import Azimuth, Observation, Range
+import numpy as np
+
+from companion.estimate import bank as banks
+from companion.estimate.fusion import Azimuth
+from companion.nav.geometry import displace
 from companion.navigator import (
     air_data_channel,
-    channel_corrections,
-    error_state,
     fix_observations,
     height_error,
     inertial_track,
-    integrity,
-    measurement_update,
+    measurements,
+    minimax_bound,
+    own_channel,
+    own_error_model,
+    restrictive_filter,
     strapdown_channel,
 )
-from companion.navigator.deferred_update import unheard
-from companion.navigator.gnss_beacon_check import GNSS
+from companion.navigator.channel import Nominal, moved
+from companion.navigator.hypotheses import AIRSPEED, GNSS, JAMMED, MOST_BEACONS
 from companion.navigator.inertial_track import Point
 from companion.navigator.local_origin import LIVE_WINDOW_NS, infer_origin
+from companion.navigator.own_channel import AirspeedSums, OwnChannel, Sensors
+from companion.navigator.own_error_model import By
 from companion.navigator.solution import solve
-from companion.navigator.state import Carry, Lesson, Settings, Step, initial, level, state_at
+from companion.navigator.state import (
+    EXCLUDED,
+    JAMMED_NS,
+    NEAR_S,
+    SUSPECT,
+    Beacon,
+    Pending,
+    Settings,
+    State,
+    Step,
+    corrected,
+    estimate,
+    hypotheses,
+    initial,
+)
 from companion.records import (
     AirData,
+    AirspeedSensor,
     Attitude,
     Event,
     GlobalPosition,
     Gnss,
+    GnssIntegrity,
     Imu,
     Input,
     LocalOrigin,
@@ -54,269 +72,633 @@ from companion.records import (
     Severity,
     Source,
     Stamped,
+    Tuning,
+    Vector2,
 )
+from companion.units import SECOND_NS
 
-TOGETHER_NS = 1_000_000_000  # GNSS this close to a beacon's answer joins its fix
-PATIENCE_NS = 5_000_000_000  # how long the autopilot is waited for to tell what a channel begins with
-BRIDGED_S = 1.0  # a silence of the airspeed up to this long is nothing, and one of the position not told
-UNKNOWN_M_S = 15.0  # how fast the position is lost in a longer one
-UNKNOWN_M_S2 = 5.0  # and the velocity in one of the IMU,
-TURNED_M_S = 30.0  # until nothing is known of it
-QUIET_NS = 10_000_000_000  # what goes on being refused is told once, and again after so long without
-AGAIN_NS = 60_000_000_000  # how often it is told that nothing can begin
-
-
-def step(carry: Carry, record: Input, settings: Settings) -> Step:
-    """The carry and the outputs after one more record; records it has no use for change nothing."""
-    use = uses(settings.channel).get(type(record))
-    return (carry, []) if use is None else use(carry, record, settings)
+PATIENCE_NS = 5 * SECOND_NS  # wait for the autopilot's own origin
+CONFIRM_NS = SECOND_NS  # one fix in disagreement is an outlier: a source is excluded once it lasts
+JUMP_SPREAD_S = 0.5  # across a longer silence a turn explains a step as well as a jump does
+FAR_M, FAST_M_S = 500.0, 5.0  # the nominal trajectory is brought back from this far off
+AIRSPEED_EVERY_NS = 500_000_000  # gusts are correlated: more often tells no more
+FOREIGN_EVERY_NS = SECOND_NS
+BLOCKED_M_S = 5.0  # slower, in flight, a pitot is blocked
+GATE_SIGMA = 5.0
 
 
-def _origin(carry: Carry, record: LocalOrigin, settings: Settings) -> Step:
-    old = carry.origin
+def step(state: State, record: Input, settings: Settings) -> Step:
+    """Return the state and the outputs after one more record."""
+    use = uses(settings).get(type(record))
+    return (state, []) if use is None else use(state, record, settings)
+
+
+# ---------------------------------------------------------------------------------------------------------
+# Origin, reboot, what is only remembered
+# ---------------------------------------------------------------------------------------------------------
+
+
+def _origin(state: State, record: LocalOrigin, settings: Settings) -> Step:
+    old = state.origin
     if old is not None and (old.lat, old.lon, old.alt_msl) == (record.lat, record.lon, record.alt_msl):
-        return carry, []
+        return state, []
     text = "local origin known" if old is None else "local origin changed"
-    carry = carry._replace(origin=record)
-    return carry, [Event(record.t_ns, record.rx_ns, Severity.INFO if old is None else Severity.WARNING, text)]
+    severity = Severity.INFO if old is None else Severity.WARNING
+    return state._replace(origin=record), [Event(record.t_ns, record.rx_ns, severity, text)]
 
 
-def _reboot(carry: Carry, record: Reboot, settings: Settings) -> Step:
-    """Another inertial channel: what was learnt of the old one's error says nothing of it.
-
-    Dead reckoning and strapdown are our own: to them a reboot is a silence, and the wind is what it was.
-    """
-    why = f"autopilot {record.system} rebooted"
-    if settings.channel != "local_position":
-        strap = strapdown_channel.Strap(refused_ns=record.t_ns)  # that it is not heard goes without saying
-        carry = carry._replace(reckoner=air_data_channel.Reckoner(), strap=strap, gnss=None, gnss_heard=None)
-        return carry, [Reset(record.t_ns, record.rx_ns, settings.channel.replace("_", " "), why)]
-    out = Reset(record.t_ns, record.rx_ns, "navigator", why)
-    return initial(settings)._replace(next_ns=carry.next_ns), [out]
-
-
-def _global_position(carry: Carry, record: GlobalPosition, settings: Settings) -> Step:
-    """Without a stated origin, the same position said twice, locally and globally, tells where it is."""
-    local, since = carry.local, carry.waiting_ns
-    if carry.origin is not None or local is None or since is None or record.t_ns - since < PATIENCE_NS:
-        return carry, []  # wait for the origin that was requested: the autopilot's own is more accurate
+def _global_position(state: State, record: GlobalPosition, settings: Settings) -> Step:
+    """Infer the origin where the autopilot does not send it."""
+    local, since = state.local, state.waiting_ns
+    if state.origin is not None or local is None or since is None or record.t_ns - since < PATIENCE_NS:
+        return state, []
     origin = infer_origin(local, record, "ardupilot", LIVE_WINDOW_NS)
-    return (carry, []) if origin is None else _origin(carry, origin, settings)
+    return (state, []) if origin is None else _origin(state, origin, settings)
 
 
-def _local_position(carry: Carry, record: LocalPosition, settings: Settings) -> Step:
-    before, origin, out = carry.local, carry.origin, list[Output]()
-    carry = carry._replace(local=record)
-    if origin is None:
-        return carry._replace(waiting_ns=carry.waiting_ns or record.t_ns), out
-    if before is not None and record.t_ns <= before.t_ns:
-        return carry._replace(local=before), out
-    new = inertial_track.point(record, origin)
-    if carry.track:
-        carry, out = _stepped(carry, carry.track[-1], new, record, settings)
-    carry = carry._replace(track=inertial_track.extend(carry.track, new))
-    return _given(carry, record, out, settings)
+def _reboot(state: State, record: Reboot, settings: Settings) -> Step:
+    """Begin again with an INS, whose errors are others now; to the own channel a reboot is a silence."""
+    why = f"autopilot {record.system} rebooted"
+    restarted = state.nominal is not None and record.t_ns < state.nominal.t_ns - SECOND_NS  # a log's clock
+    if isinstance(settings.model.channel, OwnChannel) and not restarted:
+        state = state._replace(sensors=Sensors(), gnss=None, gnss_fix=None, local=None)
+        return state, [Reset(record.t_ns, record.rx_ns, "sensors", why)]
+    return initial(settings)._replace(next_ns=state.next_ns), [
+        Reset(record.t_ns, record.rx_ns, "navigator", why)
+    ]
 
 
-def _stepped(carry: Carry, last: Point, new: Point, record: LocalPosition, settings: Settings) -> Step:
-    """With what the channel did from `last` to `new` that its velocities do not explain.
+def _airspeed_sensor(state: State, record: AirspeedSensor, settings: Settings) -> Step:
+    seen = record.t_ns if record.healthy else None
+    return state._replace(sensors=state.sensors._replace(sensor_ns=seen)), []
 
-    From one record to the next that is a jump or nothing. Across a silence a turn explains hundreds of
-    metres: what is left may be a turn or a step, and nobody knows which.
+
+def _gnss_integrity(state: State, record: GnssIntegrity, settings: Settings) -> Step:
+    return (state._replace(jammed_ns=record.t_ns) if record.threatened else state), []
+
+
+def _attitude(state: State, record: Attitude, settings: Settings) -> Step:
+    s = state.sensors
+    s = s._replace(strap=strapdown_channel.sense(s.strap, record), air=air_data_channel.sense(s.air, record))
+    state = state._replace(sensors=s)
+    if state.nominal is None or not s.leads("hold", record.t_ns):
+        return state, []
+    return _driven(state, record, "hold", None, settings)
+
+
+def _pressure(state: State, record: Pressure, settings: Settings) -> Step:
+    s = state.sensors
+    s = s._replace(strap=strapdown_channel.sense(s.strap, record), air=air_data_channel.sense(s.air, record))
+    return state._replace(sensors=s), []
+
+
+# ---------------------------------------------------------------------------------------------------------
+# Samples of the own channel
+# ---------------------------------------------------------------------------------------------------------
+
+
+def _imu(state: State, record: Imu, settings: Settings) -> Step:
+    config = settings.config
+    if record.source != config.strapdown.imu or not config.uses("imu"):
+        return state, []
+    s = state.sensors
+    strap = strapdown_channel.receive(s.strap, record)
+    s = s._replace(strap=strap)
+    if strap.why or strap.C_nb is None:
+        return state._replace(sensors=s), []
+    a_n = strapdown_channel.level_acceleration(strap)
+    mean = (0.5 * (a_n[0] + s.acceleration[0]), 0.5 * (a_n[1] + s.acceleration[1]))
+    fresh = record.t_ns - s.imu_ns <= own_channel.SILENT_NS["imu"]
+    s = s._replace(imu_ns=record.t_ns, acceleration=a_n)
+    state = state._replace(sensors=s)
+    return _driven(state, record, "imu", mean if fresh else a_n, settings)
+
+
+def _air_data(state: State, record: AirData, settings: Settings) -> Step:
+    s = state.sensors
+    state = state._replace(sensors=s._replace(air=air_data_channel.sense(s.air, record)))
+    nominal = state.nominal
+    if nominal is None or not settings.config.uses("air_data"):
+        return state, []
+    if not own_channel.airspeed_is_sensed(s, record):
+        return state, []
+    V = own_channel.air_velocity(s, record, nominal.point.position.alt)
+    if V is None:
+        return state, []
+    speed = math.hypot(*_velocity(state))
+    if s.ground.flying and math.hypot(*V) < BLOCKED_M_S < 0.5 * speed:
+        return state, _blocked_pitot(s, record)
+    height = nominal.point.position.alt
+    ground = own_error_model.ground_phase(s.ground, record.t_ns * 1e-9, math.hypot(*V), speed, height)
+    s = state.sensors._replace(ground=ground, air_ns=record.t_ns if ground.flying else s.air_ns)
+    state = state._replace(sensors=s)
+    if not ground.flying:
+        return _driven(state, record, "hold", None, settings) if s.leads("hold", record.t_ns) else (state, [])
+    if s.leads("air", record.t_ns):
+        return _driven(state, record, "air", V, settings)
+    if not _by(state, "imu"):
+        return state, []
+    state = _carried(state, record.t_ns)
+    assert state.nominal is not None
+    v_n = state.nominal.point.v_n
+    sums = s.sums or AirspeedSums(record.t_ns, 0, (0.0, 0.0), (0.0, 0.0))
+    sums = AirspeedSums(
+        sums.start_ns,
+        sums.samples + 1,
+        (sums.velocity[0] + v_n[0], sums.velocity[1] + v_n[1]),
+        (sums.air[0] + V[0], sums.air[1] + V[1]),
+    )
+    if record.t_ns - sums.start_ns < AIRSPEED_EVERY_NS:
+        return state._replace(sensors=s._replace(sums=sums)), []
+    state = _propagated(state, settings)
+    assert state.bank is not None
+    n, seconds = sums.samples, (record.t_ns - sums.start_ns) * 1e-9
+    taken = measurements.airspeed(
+        state.bank,
+        hypotheses(state, settings),
+        _own(settings),
+        (sums.air[0] / n, sums.air[1] / n),
+        (sums.velocity[0] / n, sums.velocity[1] / n),
+        seconds,
+    )
+    sums = AirspeedSums(record.t_ns, 0, (0.0, 0.0), (0.0, 0.0))
+    sensors = state.sensors._replace(measured_ns=record.t_ns, sums=sums)
+    return _decided(state._replace(bank=taken.bank, sensors=sensors), record, settings)
+
+
+def _blocked_pitot(before: Sensors, record: AirData) -> list[Output]:
+    """Reject an airspeed at which nothing flies, once a second: without a direction it cannot be modelled."""
+    last = before.air.air
+    if last is not None and last.t_ns // SECOND_NS == record.t_ns // SECOND_NS:
+        return []
+    why = "airspeed too low for the speed over ground: not used"
+    return [Rejection(record.t_ns, record.rx_ns, "airspeed", why, record.airspeed, BLOCKED_M_S)]
+
+
+def _foreign_position(state: State, record: LocalPosition, settings: Settings) -> Step:
+    """Use the velocity of the autopilot's estimator, as driver or as measurement, where we do not feed it."""
+    s, config = state.sensors, settings.config
+    state = state._replace(local=record)
+    if state.origin is None and state.waiting_ns is None:
+        state = state._replace(waiting_ns=record.t_ns)
+    if not config.uses("local_position") or config.output.feeds_estimator:
+        return state, []
+    before = s.foreign
+    s = s._replace(foreign=record, foreign_ns=record.t_ns)
+    state = state._replace(sensors=s)
+    if state.nominal is None:
+        return state, []
+    velocity = (record.v_n[0], record.v_n[1])
+    if s.leads("foreign", record.t_ns):
+        return _driven(state, record, "foreign", velocity, settings)
+    if before is not None and record.t_ns // FOREIGN_EVERY_NS == before.t_ns // FOREIGN_EVERY_NS:
+        return state, []
+    state = _propagated(_carried(state, record.t_ns), settings)
+    assert state.bank is not None
+    assert state.nominal is not None
+    v_n = state.nominal.point.v_n
+    apart = (v_n[0] - velocity[0], v_n[1] - velocity[1])
+    taken = measurements.foreign_velocity(state.bank, hypotheses(state, settings), _own(settings), apart)
+    return _decided(state._replace(bank=taken.bank), record, settings)
+
+
+def _driven(state: State, record: Stamped, by: By, sample: Vector2 | None, settings: Settings) -> Step:
+    """Move the nominal trajectory to the time of a sample of its driver, and solve if that is due.
+
+    `sample` is the mean acceleration (imu) or the velocity (air, foreign); None goes straight on.
     """
+    nominal, s = state.nominal, state.sensors
+    if nominal is None or record.t_ns <= nominal.t_ns:
+        return state, []
+    assert nominal.interval is not None
+    if nominal.interval.by != by:
+        s = s._replace(sums=None)
+        state = _propagated(_carried(state, record.t_ns), settings)._replace(sensors=s)
+        assert state.nominal is not None
+        velocity = sample if by in ("air", "foreign") and sample else state.nominal.point.v_n[:2]
+        nominal = own_channel.restart(state.nominal, by, velocity)
+        if by == "imu" and sample:
+            nominal = nominal._replace(a_n=sample)
+    elif by == "imu" and sample:
+        heading = s.heading() or 0.0
+        nominal = own_channel.by_imu(nominal, sample, heading, record.t_ns)._replace(a_n=s.acceleration)
+    else:
+        nominal = own_channel.by_velocity(nominal, sample or (0.0, 0.0), record.t_ns)
+    state = state._replace(nominal=_at_height(nominal, s, state))
+    if nominal.pending_s >= NEAR_S:
+        state, out = _decided(_propagated(state, settings), record, settings)
+    else:
+        out = []
+    state, more = _solved_if_due(state, record, settings)
+    return state, [*out, *more]
+
+
+def _at_height(nominal: Nominal, s: Sensors, state: State) -> Nominal:
+    """With the height of the pressure, and its rate as the climb."""
+    if s.air.static is None:
+        return nominal
+    point = nominal.point
+    dt = (point.t_ns - nominal.since.t_ns) * 1e-9
+    alt = air_data_channel.pressure_altitude(s.air.static)
+    climb = -point.v_n[2]
+    if dt > 0.0:
+        climb += min(dt / air_data_channel.CLIMB_S, 0.2) * ((alt - nominal.since.position.alt) / dt - climb)
+    v_n = (point.v_n[0], point.v_n[1], -climb)
+    return nominal._replace(point=point._replace(position=point.position._replace(alt=alt), v_n=v_n))
+
+
+# ---------------------------------------------------------------------------------------------------------
+# Samples of an INS
+# ---------------------------------------------------------------------------------------------------------
+
+
+def _ins_position(state: State, record: LocalPosition, settings: Settings) -> Step:
+    """Move the nominal trajectory to the position of the INS; a step beyond its velocity is a jump."""
+    state = state._replace(local=record)
+    if state.origin is None:
+        waiting = state.waiting_ns or record.t_ns
+        return state._replace(waiting_ns=waiting), []
+    new = inertial_track.point(record, state.origin)
+    nominal, out = state.nominal, list[Output]()
+    if nominal is None:
+        state = state._replace(nominal=Nominal(new, (0.0, 0.0), new), ins=new)
+        return _solved_if_due(state, record, settings)
+    last = state.ins or nominal.point
+    dt = (new.t_ns - last.t_ns) * 1e-9
+    if dt <= 0.0 or new.t_ns < nominal.t_ns:
+        return state, []
+    state, out = _jump_removed(state, last, new, record, settings)
+    a_n = ((new.v_n[0] - last.v_n[0]) / dt, (new.v_n[1] - last.v_n[1]) / dt)
+    assert state.nominal is not None
+    nominal = state.nominal._replace(point=new, a_n=a_n)
+    state = state._replace(nominal=nominal, ins=new)
+    if nominal.pending_s >= NEAR_S and state.bank is not None:
+        state, more = _decided(_propagated(state, settings), record, settings)
+        out += more
+    state, more = _solved_if_due(state, record, settings)
+    return state, [*out, *more]
+
+
+def _jump_removed(state: State, last: Point, new: Point, record: LocalPosition, settings: Settings) -> Step:
+    """Move the errors with a jump of the channel; across a silence what is left may be a turn or a step."""
     out = list[Output]()
     north, east, _ = inertial_track.beyond(last, new)
     length, silent = math.hypot(north, east), (new.t_ns - last.t_ns) * 1e-9
     most = inertial_track.unnoticed(silent)
     if length > most:
-        carry = channel_corrections.shifted(carry, north, east)
-        out.append(_channel(record, f"it jumped by {length:.1f} m"))
-    if length > inertial_track.JUMP_M and silent > inertial_track.REACH_S:
-        carry = channel_corrections.blurred(carry, settings, min(length, most))
-        if silent > BRIDGED_S:
-            out.append(_channel(record, f"no local position for {silent:.1f} s"))
-    return carry, out
+        state = shifted(state, north, east)
+        out.append(_channel(record, f"jumped by {length:.1f} m"))
+    if length > inertial_track.JUMP_M and silent > JUMP_SPREAD_S and state.bank is not None:
+        sigma = min(length, most)
+        state = state._replace(
+            bank=banks.inflate(state.bank, (0, 1), sigma), guarantee=minimax_bound.begin(settings.config)
+        )
+        out.append(_channel(record, f"no local position for {silent:.1f} s"))
+    return state, out
 
 
-def _sense(carry: Carry, record: Attitude | AirData | Pressure, settings: Settings) -> Step:
-    return carry._replace(reckoner=air_data_channel.sense(carry.reckoner, record)), []
+def shifted(state: State, north: float, east: float, v_n: Vector2 = (0.0, 0.0), t_ns: int = 0) -> State:
+    """Move the errors with the nominal trajectory: by (north, east) m and `v_n` (m/s), at `t_ns`."""
+    bank = state.bank
+    if bank is not None:
+        bank = banks.shift(bank, np.array((north, east, *v_n)))
+    protection = state.protection
+    if protection is not None:
+        protection = (*protection[:2], protection[2] + north, protection[3] + east)
+    promise = minimax_bound.shift(state.guarantee, north, east, v_n, t_ns)
+    bounded = state.restrictive and restrictive_filter.shift(state.restrictive, north, east)
+    return state._replace(
+        bank=bank, protection=protection, guarantee=promise, restrictive=bounded, gnss_fix=None
+    )
 
 
-def _air_data(carry: Carry, record: AirData, settings: Settings) -> Step:
-    """Dead reckoning goes on by one airspeed. The first fix told it where to begin."""
-    if not carry.track:
-        return _sense(carry, record, settings)
-    out = list[Output]()
-    last = carry.track[-1]
-    found = air_data_channel.advance(carry.reckoner, last, record)
-    if found is None:
-        return carry, out
-    reckoner, new = found
-    silent = (new.t_ns - last.t_ns) * 1e-9
-    if silent > BRIDGED_S:
-        carry = channel_corrections.blurred(carry, settings, UNKNOWN_M_S * silent)
-        out.append(_channel(record, f"no airspeed with attitude for {silent:.1f} s"))
-    carry = carry._replace(reckoner=reckoner, track=inertial_track.extend(carry.track, new))
-    return _given(channel_corrections.kept_near(carry, settings, has_velocity=False), record, out, settings)
+# ---------------------------------------------------------------------------------------------------------
+# Fixes
+# ---------------------------------------------------------------------------------------------------------
 
 
-def _strap(carry: Carry, record: Attitude | Pressure, settings: Settings) -> Step:
-    return carry._replace(strap=strapdown_channel.sense(carry.strap, record)), []
+def _begun(state: State, record: Gnss | RsbnFix, settings: Settings) -> State:
+    """With a nominal trajectory and a bank, if this fix is the first to tell a place."""
+    nominal = state.nominal
+    if nominal is None and isinstance(settings.model.channel, OwnChannel):
+        nominal = own_channel.begin(state.sensors, record)
+    if nominal is None or state.bank is not None:
+        return state
+    if nominal.interval is not None:
+        nominal = own_channel.restart(nominal, nominal.interval.by, nominal.point.v_n[:2])
+    return state._replace(nominal=nominal._replace(since=nominal.point), bank=settings.model.begin(0.0))
 
 
-def _imu(carry: Carry, record: Imu, settings: Settings) -> Step:
-    """Strapdown goes on by one sample, and across a silence straight on."""
-    if record.source != settings.config.strapdown.imu:
-        return carry, []
-    before, out = carry.strap, list[Output]()
-    strap = strapdown_channel.hear(before, record)
-    carry = carry._replace(strap=strap)
-    if not carry.track:
-        return carry, out
-    if strap.why:
-        if strap.refused_ns is None or record.t_ns - strap.refused_ns > QUIET_NS:
-            out.append(_channel(record, f"not used: {strap.why}"))
-        return carry._replace(strap=strap._replace(refused_ns=record.t_ns)), out
-    last = carry.track[-1]
-    silent = (record.t_ns - last.t_ns) * 1e-9
-    if silent <= 0.0:
-        return carry, out
-    if silent > strapdown_channel.BRIDGED_S or before.imu is None:
-        new = strapdown_channel.coast(strap, last)
-        faster = min(UNKNOWN_M_S2 * silent, TURNED_M_S)
-        carry = channel_corrections.blurred(carry, settings, faster * silent, faster)
-        out.append(_channel(record, f"no IMU with attitude for {silent:.1f} s"))
-    else:
-        strap, new = strapdown_channel.advance(before, strap, last)
-    carry = carry._replace(strap=strap, track=inertial_track.renew(carry.track, new))
-    return _given(channel_corrections.kept_near(carry, settings, has_velocity=True), record, out, settings)
+def _gnss(state: State, record: Gnss, settings: Settings) -> Step:
+    config = settings.config.gnss
+    state = state._replace(gnss=record)
+    used = math.inf if state.gnss_used_ns is None else (record.t_ns - state.gnss_used_ns) * 1e-9
+    if not record.has_3d_fix or used < config.every_s:
+        return state, []
+    state = _begun(state, record, settings)
+    if state.nominal is None or state.bank is None or _silent(state, record.t_ns):
+        return state, []
+    state = _propagated(_carried(state, record.t_ns), settings)
+    known, channel, nominal = hypotheses(state, settings), settings.model.channel, state.nominal
+    assert state.bank is not None
+    assert nominal is not None
+    taken = measurements.gnss_position(
+        state.bank, known, channel, record, nominal.point, _velocity(state), settings.config
+    )
+    bank, accepted = taken.bank, taken.accepted
+    if config.use_velocity and record.v_n is not None:
+        a_n = nominal.a_n
+        bank = measurements.gnss_velocity(
+            bank, known, channel, record, nominal.point, a_n, settings.config
+        ).bank
+    state = state._replace(bank=bank, gnss_used_ns=record.t_ns, fixed=True)
+    state, out = _decided(state, record, settings)
+    assert state.bank is not None
+    if state.reported[GNSS] == EXCLUDED or not accepted:
+        return _nearer(state, settings), [*out, _rejected(state, record, "gnss", GNSS, taken)]
+    since = math.inf if state.gnss_ns is None else (record.t_ns - state.gnss_ns) * 1e-9
+    part = min(since, config.correlation_s) / config.correlation_s
+    level = height_error.update(state.level, record, nominal.point, part, GATE_SIGMA**2)
+    pending = None
+    if state.false[GNSS] < known.settings.suspect:
+        pending = Pending(record, nominal.point, (0.0, 0.0), Source.GNSS)
+    state = state._replace(
+        gnss_ns=record.t_ns, gnss_fix=(record, nominal.point), level=level, pending=pending
+    )
+    return _nearer(state, settings), out
 
 
-def _given(carry: Carry, record: Stamped, out: list[Output], settings: Settings) -> Step:
-    """With a solution once one is due."""
-    if record.t_ns < carry.next_ns:
-        return carry, out
-    carry, ins = unheard(carry, settings), carry.track[-1]
-    if carry.state is not None:  # so that a beacon's answer finds it near
-        carry = carry._replace(state=state_at(carry, ins, settings))
-    carry, solution = solve(carry, record.rx_ns, settings)
+def _rsbn(state: State, record: RsbnFix, settings: Settings) -> Step:
+    state = _begun(state, record, settings)
+    name = f"rsbn {record.beacon}"
+    if state.nominal is None or state.bank is None or _silent(state, record.t_ns):
+        return state, [Rejection(record.t_ns, record.rx_ns, name, "no channel at its time")]
+    state = _propagated(_carried(state, record.t_ns), settings)
+    state, k, out = _beacon(state, record, settings)
+    nominal = state.nominal
+    assert nominal is not None
+    assert state.bank is not None
+    point, centre = corrected(nominal.point, state)
+    known, believed = hypotheses(state, settings), Source(0)
+    height = settings.config.inertial.height_sigma_m
+    for z in fix_observations.from_rsbn(record, point, settings.config.rsbn):
+        if isinstance(z, Azimuth) and fix_observations.in_cone_of_silence(z, record.slant_range):
+            continue
+        source = known.azimuth(k) if isinstance(z, Azimuth) else known.range(k)
+        taken = measurements.sight(state.bank, known, z, k, height, centre)
+        state, more = _decided(state._replace(bank=taken.bank), record, settings)
+        out += more
+        assert state.bank is not None
+        part = Source.AZIMUTH if isinstance(z, Azimuth) else Source.RANGE
+        if state.reported[source] == EXCLUDED or not taken.accepted:
+            label = f"{name} {'azimuth' if isinstance(z, Azimuth) else 'range'}"
+            out.append(_rejected(state, record, label, source, taken))
+        elif state.false[source] < known.settings.suspect:
+            believed |= part
+    state = state._replace(fixed=True)
+    if believed:
+        pending = Pending(record, point, centre, believed)
+        state = state._replace(rsbn_ns=record.t_ns, rsbn_used=believed, pending=pending)
+    return _nearer(state, settings), out
+
+
+def _beacon(state: State, record: RsbnFix, settings: Settings) -> tuple[State, int, list[Output]]:
+    """The number of the beacon that answered; a new one takes a new place, or the most silent one's."""
+    assert state.bank is not None
+    bank = state.bank
+    place, t_ns = (record.lat, record.lon, record.alt), record.t_ns
+    for k, beacon in enumerate(state.beacons):
+        if beacon.identity == record.beacon:
+            beacons = list(state.beacons)
+            beacons[k] = Beacon(record.beacon, place, t_ns)
+            out: list[Output] = []
+            if place != beacon.place:
+                known = hypotheses(state, settings)
+                first = known.layout.n_base - len(known.biases) + 2 * k
+                sigma = known.biases[2 * k : 2 * k + 2]
+                state = state._replace(bank=banks.renew(bank, (first, first + 1), sigma))
+                text = f"beacon {record.beacon} states another position"
+                out = [Event(record.t_ns, record.rx_ns, Severity.NOTICE, text)]
+            return state._replace(beacons=tuple(beacons)), k, out
+    new = Beacon(record.beacon, place, t_ns)
+    if len(state.beacons) < MOST_BEACONS:
+        larger = settings.model.with_beacon(bank, len(state.beacons))
+        state = state._replace(bank=larger, beacons=(*state.beacons, new))
+        state = state._replace(false=(*state.false, 0.0, 0.0), reported=(*state.reported, 0, 0))
+        return state, len(state.beacons) - 1, []
+    k = min(range(len(state.beacons)), key=lambda i: state.beacons[i].last_ns)
+    known = hypotheses(state, settings)
+    first = known.layout.n_base - len(known.biases) + 2 * k
+    renewed = banks.renew(bank, (first, first + 1), known.biases[2 * k : 2 * k + 2])
+    beacons = list(state.beacons)
+    beacons[k] = new
+    return state._replace(bank=renewed, beacons=tuple(beacons)), k, []
+
+
+# ---------------------------------------------------------------------------------------------------------
+# The bank in time
+# ---------------------------------------------------------------------------------------------------------
+
+
+def _silent(state: State, t_ns: int) -> bool:
+    """Whether an INS has given nothing for too long to carry it on."""
+    assert state.nominal is not None
+    last_ns = state.ins.t_ns if state.ins else state.nominal.t_ns
+    return state.nominal.interval is None and (t_ns - last_ns) * 1e-9 > 1.5
+
+
+def _carried(state: State, t_ns: int) -> State:
+    """With the nominal trajectory carried on to `t_ns`."""
+    nominal = state.nominal
+    assert nominal is not None
+    dt = (t_ns - nominal.t_ns) * 1e-9
+    if dt <= 0.0:
+        return state
+    if nominal.interval is not None:
+        return state._replace(nominal=own_channel.carry_on(nominal, state.sensors, t_ns))
+    v, a = nominal.point.v_n, nominal.a_n
+    point = moved(nominal.point, (v[0] + a[0] * dt, v[1] + a[1] * dt), t_ns)
+    return state._replace(nominal=nominal._replace(point=point))
+
+
+def _propagated(state: State, settings: Settings) -> State:
+    """With the bank at the time of the nominal point, and births if they are due."""
+    nominal, bank = state.nominal, state.bank
+    assert nominal is not None
+    if bank is None or nominal.pending_s <= 0.0:
+        return state
+    known = hypotheses(state, settings)
+    Phi, Q = settings.model.transition(nominal, len(state.beacons))
+    bank = banks.propagate(bank, known.layout, nominal.pending_s, Phi, Q)
+    if nominal.interval is not None and nominal.interval.by == "air":
+        seen = bank.seen.copy()
+        seen[AIRSPEED] = bank.t
+        bank = bank._replace(seen=seen)
+    if banks.births_due(bank, known.settings):
+        jammed = state.jammed_ns is not None and nominal.t_ns - state.jammed_ns < JAMMED_NS
+        bank = banks.births(bank, known.layout, known.settings, {0: JAMMED, 1: JAMMED} if jammed else None)
+    if nominal.interval is None:
+        return state._replace(bank=bank, nominal=nominal._replace(since=nominal.point))
+    velocity = nominal.point.v_n[:2]
+    nominal = own_channel.restart(nominal, nominal.interval.by, velocity)
+    return state._replace(bank=bank, nominal=nominal)
+
+
+def _decided(state: State, record: Stamped, settings: Settings) -> Step:
+    """With the decisions read off the bank, and an event for each source that they change."""
+    assert state.bank is not None
+    known = hypotheses(state, settings)
+    bank = banks.decide(state.bank, known.layout, known.settings)
+    false = tuple(banks.false_probability(bank, known.layout).tolist())
+    n = len(false)  # more than before if a beacon joined
+    before, certain = (*state.reported, *(0,) * n)[:n], (*state.certain_ns, *(0,) * n)[:n]
+    reported, since = list(before), list(certain)
+    out: list[Output] = []
+    for i, p in enumerate(false):
+        since[i] = (certain[i] or record.t_ns) if bank.excluded[i] else 0
+        if bank.excluded[i] and record.t_ns - since[i] >= CONFIRM_NS:
+            reported[i] = EXCLUDED
+        elif bank.excluded[i] or p > known.settings.suspect:
+            reported[i] = SUSPECT
+        elif p < known.settings.believed:
+            reported[i] = 0
+        if reported[i] != before[i]:
+            text = {
+                0: "is used again",
+                SUSPECT: f"is suspect: false with probability {p:.2f}",
+                EXCLUDED: f"is excluded: false with probability {p:.4f}",
+            }[reported[i]]
+            severity = Severity.WARNING if reported[i] else Severity.NOTICE
+            out.append(Event(record.t_ns, record.rx_ns, severity, f"{source_name(i, state)} {text}"))
+    leading = (bank, banks.estimate(bank))
+    state = state._replace(
+        bank=bank, leading=leading, false=false, reported=tuple(reported), certain_ns=tuple(since)
+    )
+    return state, out
+
+
+def source_name(i: int, state: State) -> str:
+    """Name of source number `i`, with the beacon's identity."""
+    if i < 2:
+        return ("gnss", "airspeed")[i]
+    beacon = state.beacons[(i - 2) // 2].identity
+    return f"rsbn {beacon} {'azimuth' if i % 2 == 0 else 'range'}"
+
+
+def _rejected(
+    state: State, record: Gnss | RsbnFix, name: str, source: int, taken: measurements.Taken
+) -> Rejection:
+    assert state.bank is not None
+    label = f"gnss {record.receiver}" if isinstance(record, Gnss) else name
+    if state.reported[source] == EXCLUDED:
+        return Rejection(
+            record.t_ns, record.rx_ns, label, "excluded: false with probability", state.false[source], 0.999
+        )
+    return Rejection(record.t_ns, record.rx_ns, label, "outlier: normalised squared innovation", taken.nis)
+
+
+def _nearer(state: State, settings: Settings) -> State:
+    """With the nominal trajectory moved by the estimated error where it is far off, or as the scheme says."""
+    nominal = state.nominal
+    assert nominal is not None
+    if nominal.interval is None:
+        return state  # an INS of its own cannot be corrected
+    x = estimate(state).x
+    n, e, vn, ve = (float(c) for c in x[:4])
+    share = settings.config.estimator.feedback
+    if math.hypot(n, e) > FAR_M or (math.hypot(vn, ve) > FAST_M_S and nominal.interval.by == "imu"):
+        share = 1.0
+    if share == 0.0:
+        return state
+    n, e, vn, ve = -share * n, -share * e, -share * vn, -share * ve
+    if nominal.interval.by in ("air", "foreign"):
+        vn = ve = 0.0  # the velocity is the sensor's, and its error follows from other states
+    state = shifted(state, n, e, (vn, ve), nominal.t_ns)
+    sums = state.sensors.sums
+    if sums is not None:  # the samples of airspeed so far are moved with the nominal velocity, not dropped
+        mean_sum = (sums.velocity[0] + sums.samples * vn, sums.velocity[1] + sums.samples * ve)
+        state = state._replace(sensors=state.sensors._replace(sums=sums._replace(velocity=mean_sum)))
+    place = displace(*nominal.point.position, n, e, 0.0)
+    v = nominal.point.v_n
+    velocity = (v[0] + vn, v[1] + ve)
+    point = Point(nominal.t_ns, place._replace(alt=nominal.point.position.alt), (*velocity, v[2]))
+    nominal = nominal._replace(point=point, since=point)
+    return state._replace(nominal=own_channel.restart(nominal, _driver(nominal), velocity))
+
+
+def _driver(nominal: Nominal) -> By:
+    assert nominal.interval is not None
+    return nominal.interval.by
+
+
+def _by(state: State, by: By) -> bool:
+    return (
+        state.nominal is not None and state.nominal.interval is not None and state.nominal.interval.by == by
+    )
+
+
+def _own(settings: Settings) -> OwnChannel:
+    assert isinstance(settings.model.channel, OwnChannel)
+    return settings.model.channel
+
+
+def _velocity(state: State) -> Vector2:
+    """Estimated velocity over ground, north and east, m/s."""
+    assert state.nominal is not None
+    v_n = state.nominal.point.v_n
+    if state.bank is None:
+        return v_n[0], v_n[1]
+    x = state.bank.x[int(state.bank.L.argmax())]
+    return v_n[0] - float(x[2]), v_n[1] - float(x[3])
+
+
+def _solved_if_due(state: State, record: Stamped, settings: Settings) -> Step:
+    if record.t_ns < state.next_ns or not state.fixed or state.nominal is None:
+        return state, []
+    state, solution = solve(state, record.rx_ns, settings)
     if solution:
-        next_ns = max(carry.next_ns + round(1e9 / settings.config.output.pace_hz), ins.t_ns)
-        carry = carry._replace(next_ns=next_ns)
-    return carry, out + solution
+        period = round(1e9 / settings.config.output.pace_hz)
+        state = state._replace(
+            next_ns=max(state.next_ns + period, state.nominal.t_ns if state.nominal else 0)
+        )
+    return state, solution
 
 
 def _channel(record: Stamped, why: str) -> Reset:
     return Reset(record.t_ns, record.rx_ns, "inertial channel", why)
 
 
-def _begun(carry: Carry, record: Gnss | RsbnFix, settings: Settings) -> Step:
-    """With the first point of a channel of our own, if this fix is the first to tell a place; where it cannot
-    begin, that is told.
-    """
-    channel = settings.channel
-    if carry.track or channel == "local_position":
-        return carry, []
-    if channel == "air_data":
-        first, why = air_data_channel.begin(carry.reckoner, record), "no airspeed with attitude is heard"
-    else:
-        first, why = strapdown_channel.begin(carry.strap, record), carry.strap.why
-    if first is not None:
-        return carry._replace(track=(first,)), []
-    since = carry.waiting_ns or record.t_ns
-    if record.t_ns - since < PATIENCE_NS or (isinstance(record, Gnss) and not record.has_3d_fix):
-        return carry._replace(waiting_ns=since), []
-    carry = carry._replace(waiting_ns=record.t_ns + AGAIN_NS)
-    return carry, [
-        Event(record.t_ns, record.rx_ns, Severity.WARNING, f"inertial channel cannot begin: {why}")
-    ]
-
-
-def _gnss(carry: Carry, record: Gnss, settings: Settings) -> Step:
-    carry, told = _begun(carry, record, settings)
-    config = settings.config.gnss
-    carry = carry._replace(gnss=record)
-    ins = inertial_track.at(carry.track, record.t_ns)
-    asked = math.inf if carry.asked_ns is None else (record.t_ns - carry.asked_ns) * 1e-9
-    if not record.has_3d_fix or ins is None or asked < config.every_s:
-        return carry, told
-    carry = carry._replace(asked_ns=record.t_ns, lesson=Lesson(record, None, ins))
-    if integrity.excluded(carry.watch, GNSS):
-        return carry, []
-    since = math.inf if carry.gnss_ns is None else (record.t_ns - carry.gnss_ns) * 1e-9
-    white = fix_observations.from_gnss(record, ins, config, drifting=True)
-    carry, out = measurement_update.position(
-        carry, white, error_state.gnss_rows(settings.unit), ins, record, settings
-    )
-    if out:
-        return carry, out
-    heard = fix_observations.from_gnss(record, ins, config)
-    part = min(since, config.correlation_s) / config.correlation_s
-    learnt = height_error.learn(carry.level, record, ins, part, settings.gate[1])
-    carry = carry._replace(gnss_ns=record.t_ns, gnss_heard=heard, level=learnt)
-    if config.use_velocity and record.v_n is not None:
-        carry = measurement_update.velocity(carry, record, record.v_n, ins, settings)
-    return carry._replace(lesson=carry.lesson and carry.lesson._replace(heard=heard)), []
-
-
-def _rsbn(carry: Carry, record: RsbnFix, settings: Settings) -> Step:
-    carry, told = _begun(carry, record, settings)
-    ins = inertial_track.at(carry.track, record.t_ns)
-    if ins is None:
-        why = "no inertial position at its time"
-        return carry, [*told, Rejection(record.t_ns, record.rx_ns, f"rsbn {record.beacon}", why)]
-    ins = level(ins, carry)
-    said = fix_observations.from_rsbn(record, ins, settings.config.rsbn)
-    carry = carry._replace(lesson=Lesson(record, None, ins, said))
-    heard = _calibrated(carry, record, said, settings)
-    if not heard.observations:
-        return carry, []
-    carry, out = measurement_update.position(
-        carry, heard, error_state.beacon_rows(settings.unit), ins, record, settings
-    )
-    if out:
-        return carry, out
-    gnss, together = carry.gnss_heard, heard
-    if gnss is not None and abs(record.t_ns - gnss.t_ns) <= TOGETHER_NS:
-        # the correction INS minus GNSS of a moment ago is that of now: the error drifts by metres a minute
-        together = fix_observations.Heard(
-            record.t_ns, heard.observations + gnss.observations, heard.sources | gnss.sources
-        )
-    lesson = carry.lesson and carry.lesson._replace(heard=together)
-    return carry._replace(rsbn_ns=record.t_ns, rsbn_told=heard.sources, lesson=lesson), []
-
-
-def _calibrated(
-    carry: Carry, record: RsbnFix, said: tuple[Azimuth | Range, ...], settings: Settings
-) -> fix_observations.Heard:
-    """What is to be believed of a beacon's answer, less its learnt biases; right above it no azimuth."""
-    kept, told, state = list[Observation](), Source(0), carry.state
-    for z in said:
-        if isinstance(z, Azimuth) and state is not None:
-            north, east = state.x[:2].tolist()
-            if fix_observations.silent(z, (north, east), record.slant_range):
-                continue
-        name = integrity.named(record.beacon, z)
-        if not integrity.excluded(carry.watch, name):
-            kept.append(integrity.calibrated(carry.watch, name, z, settings.config))
-            told |= Source.AZIMUTH if isinstance(z, Azimuth) else Source.RANGE
-    return fix_observations.Heard(record.t_ns, tuple(kept), told)
-
-
-_Uses = dict[type, Callable[[Carry, Any, Settings], Step]]
-_FIXES: _Uses = {Gnss: _gnss, RsbnFix: _rsbn, Reboot: _reboot}
-_OF_LOCAL_POSITION: _Uses = {
+_Uses = dict[type, Callable[[State, Any, Settings], Step]]
+_COMMON: _Uses = {
     LocalOrigin: _origin,
     GlobalPosition: _global_position,
-    LocalPosition: _local_position,
-    **_FIXES,
+    Gnss: _gnss,
+    GnssIntegrity: _gnss_integrity,
+    RsbnFix: _rsbn,
+    Reboot: _reboot,
 }
-#: No position and no velocity of the autopilot's is among these two, so none can be fed back to it.
-_OF_AIR_DATA: _Uses = {Attitude: _sense, Pressure: _sense, AirData: _air_data, **_FIXES}
-_OF_STRAPDOWN: _Uses = {Attitude: _strap, Pressure: _strap, Imu: _imu, **_FIXES}
-_USES = {"local_position": _OF_LOCAL_POSITION, "air_data": _OF_AIR_DATA, "strapdown": _OF_STRAPDOWN}
+_INS: _Uses = {**_COMMON, LocalPosition: _ins_position}
+_OWN: _Uses = {
+    **_COMMON,
+    LocalPosition: _foreign_position,
+    Attitude: _attitude,
+    Pressure: _pressure,
+    AirData: _air_data,
+    AirspeedSensor: _airspeed_sensor,
+    Imu: _imu,
+}
 
 
-def uses(channel: Channel) -> _Uses:
-    """What each kind of record is good for, by the inertial channel."""
-    return _USES[channel]
+_ABOUT_LOCAL = (LocalPosition, GlobalPosition, LocalOrigin)
+_OWN_FED: _Uses = {kind: use for kind, use in _OWN.items() if kind not in _ABOUT_LOCAL}
+INPUTS_USED = tuple({*_INS, *_OWN, Tuning})
+"""Kinds of records that a navigator may use."""
+
+
+def uses(settings: Settings) -> _Uses:
+    """What each kind of record is good for, by the channel; a local position that we feed is ignored."""
+    config = settings.config
+    if not isinstance(settings.model.channel, OwnChannel):
+        return _INS
+    fed = config.output.feeds_estimator or not config.uses("local_position")
+    return _OWN_FED if fed else _OWN

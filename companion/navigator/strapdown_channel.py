@@ -19,14 +19,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from companion.nav.geometry import displace
-from companion.nav.strapdown import InertialState, mechanise, rotation_matrix
-from companion.navigator import air_data_channel
-from companion.navigator.inertial_track import Point
-from companion.records import Attitude, Gnss, Imu, Pressure, RsbnFix, Vector3
+from companion.nav.strapdown import rotation_matrix
+from companion.records import Attitude, Imu, Pressure, Vector2
 from companion.units import G0, Floats
 
-IMU_HZ, ATTITUDE_HZ = 10.0, 2.0  # wanted at least
+IMU_HZ, ATTITUDE_HZ = 5.0, 2.0  # wanted at least
 LEAST = 0.7  # of which so much must come: streams are asked for again below it
 FEW = 5  # samples that tell no rate yet
 SLOWEST_S = 2.0  # a longer interval is a silence and tells no rate either
@@ -86,7 +83,7 @@ def sense(s: Strap, record: Attitude | Pressure) -> Strap:
     return s._replace(C_nb=C_nb, attitude_pace=s.attitude_pace.with_one(record.t_ns))
 
 
-def hear(s: Strap, record: Imu) -> Strap:
+def receive(s: Strap, record: Imu) -> Strap:
     """With one more sample; `why` is empty where it can be used, else a sentence."""
     before = s.imu or record
     dt = (record.t_ns - before.t_ns) * 1e-9
@@ -102,43 +99,12 @@ def hear(s: Strap, record: Imu) -> Strap:
     return s._replace(why=_unfit(s))
 
 
-def begin(s: Strap, fix: Gnss | RsbnFix) -> Point | None:
-    """Where the channel begins: the first position anybody tells once there are IMU and attitude; else None.
-
-    Its velocity is that of GNSS; where the fix has none, none.
-    """
-    at = air_data_channel.first_place(fix, s.static)
-    if at is None or s.why or s.imu is None or abs(fix.t_ns - s.imu.t_ns) * 1e-9 > STALE_S:
-        return None
-    v_n = (fix.v_n if isinstance(fix, Gnss) else None) or (0.0, 0.0, 0.0)
-    dt = (s.imu.t_ns - fix.t_ns) * 1e-9
-    return Point(s.imu.t_ns, displace(*at, v_n[0] * dt, v_n[1] * dt, 0.0), (v_n[0], v_n[1], 0.0))
-
-
-def advance(before: Strap, s: Strap, last: Point) -> tuple[Strap, Point]:
-    """The point at the time of the sample heard last, from that at the sample `before`."""
-    assert before.imu is not None
-    assert before.C_nb is not None
+def level_acceleration(s: Strap) -> Vector2:
+    """Horizontal acceleration over ground, north and east (m/s^2), of the last sample; Coriolis left out."""
     assert s.imu is not None
-    dt = (s.imu.t_ns - last.t_ns) * 1e-9
-    alt, climb = air_data_channel.followed(s.static, s.climb, last.position.alt, dt)
-    f_b = 0.5 * (np.array(before.imu.f_b) + s.imu.f_b)
-    w_b = 0.5 * (np.array(before.imu.w_b) + s.imu.w_b)
-    start = InertialState(*last.position, np.array(last.v_n), before.C_nb)
-    new = mechanise(start, f_b, w_b, dt)
-    v_n: Vector3 = (float(new.v_n[0]), float(new.v_n[1]), -climb)
-    position = last.position._replace(lat=new.lat, lon=new.lon, alt=alt)
-    return s._replace(climb=climb), Point(s.imu.t_ns, position, v_n)
-
-
-def coast(s: Strap, last: Point) -> Point:
-    """The point at the time of the sample heard last after a silence: straight on."""
-    assert s.imu is not None
-    dt = (s.imu.t_ns - last.t_ns) * 1e-9
-    north, east, _ = last.v_n
-    alt = air_data_channel.pressure_altitude(s.static) if s.static else last.position.alt
-    moved = displace(*last.position, north * dt, east * dt, 0.0)
-    return Point(s.imu.t_ns, moved._replace(alt=alt), last.v_n)
+    assert s.C_nb is not None
+    f_n = s.C_nb @ s.imu.f_b
+    return float(f_n[0]), float(f_n[1])
 
 
 def attitude_matrix(record: Attitude) -> Floats:

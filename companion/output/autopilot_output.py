@@ -16,7 +16,7 @@ from companion.output.encode import CannotEncode, Receiver, encode
 from companion.output.gate import Gate, Position, WithholdingMonitor
 from companion.output.position_reset import PositionReset
 from companion.output.source_switch import SourceSwitch
-from companion.records import Event, FilterStatus, GlobalPosition, Gnss, Solution, Source, Stamped, SystemTime
+from companion.records import Event, FilterStatus, GlobalPosition, Gnss, Solution, Stamped, SystemTime
 
 DISPLAY_NAMES = {RESET: "external position"}
 ON_SOURCE_SET_2 = frozenset({MESSAGES["odometry"], MESSAGES["vision"]})
@@ -44,6 +44,8 @@ class AutopilotOutput:
                 self.unix_ns = record.unix_ns - record.t_ns
         elif isinstance(record, Gnss | GlobalPosition | FilterStatus):
             self._position_reset.receive(record)
+            if isinstance(record, Gnss) and record.receiver == 0:
+                self._source_switch.receive(record)
 
     def handle_reboot(self) -> None:
         """Reset what was known of the autopilot; it has rebooted."""
@@ -69,12 +71,16 @@ class AutopilotOutput:
                 except CannotEncode as error:
                     reason = str(error)
             self._add_event(self._monitor.update(DISPLAY_NAMES.get(name, name), reason, now))
-        if self.config.output.switches_sources and (by_set := ON_SOURCE_SET_2.intersection(names)):
-            self._source_switch.update(
-                bool(solution.sources & Source.GNSS), not by_set.isdisjoint(encoded), now
-            )
-            return [*encoded.values(), *self._source_switch.to_send(receiver.system, now)]
+        if by_set := ON_SOURCE_SET_2.intersection(names):
+            self._source_switch.note_output(solution, not by_set.isdisjoint(encoded), now)
         return list(encoded.values())
+
+    def poll(self, system: int, now_ns: int) -> list[Message]:
+        """Return the commands that are due; call it once a second and after every solution."""
+        if not self.config.output.switches_sources:
+            return []
+        self._source_switch.update(now_ns)
+        return self._source_switch.to_send(system, now_ns)
 
     def take_events(self) -> list[Event]:
         """Return the events since the last call."""

@@ -153,14 +153,15 @@ def _projection(origin: LocalOrigin) -> Projection:
 def _covariance(position: Position, ardupilot: bool) -> list[float]:
     """Return the upper triangle of the 6 x 6 covariance, row by row.
 
-    ArduPilot reads one accuracy for all axes, A = cbrt(c0^2 + c6^2 + c11^2), so the horizontal accuracy A is
-    encoded as c0 = c6 = c11 = sqrt(A^3 / 3), and the angles likewise. Others receive the position variances,
-    and NaN for the attitude.
+    ArduPilot reads one accuracy for all axes, A = sqrt(c0 + c6 + c11), so the horizontal accuracy A is
+    encoded as c0 = c6 = c11 = A^2 / 3, and the angles likewise. Trees before February 2026 read
+    cbrt(c0^2 + c6^2 + c11^2): they take it for more than A, never for less, from 3 m up. Others receive the
+    position variances, and NaN for the attitude.
     """
     covariance = [0.0] * 21
     if ardupilot:
-        covariance[0] = covariance[6] = covariance[11] = math.sqrt(position.sigma**3 / 3.0)
-        covariance[15] = covariance[18] = covariance[20] = math.sqrt(_YAW_ERROR**3 / 3.0)
+        covariance[0] = covariance[6] = covariance[11] = position.sigma**2 / 3.0
+        covariance[15] = covariance[18] = covariance[20] = _YAW_ERROR**2 / 3.0
         return covariance
     covariance[0], covariance[1], covariance[6] = position.covariance
     covariance[11] = position.variance_down

@@ -1,23 +1,29 @@
-"""Source switch: ArduPilot's EKF source set, by MAV_CMD_SET_EKF_SOURCE_SET. No I/O.
+"""EKF source set of ArduPilot: which set may lead, as one table of named predicates. No I/O.
 
-Set 1 is the autopilot's GPS, set 2 the companion's position. ArduPilot accepts a source set that has no data,
-and then has no position. So set 2 is requested only after our position has been sent without interruption for
-`OUTPUT_STEADY_NS`, and set 1 only after GNSS has been trusted for `GNSS_TRUSTED_NS`, so that an intermittent
-receiver switches nothing. The command is repeated until it is acknowledged. The quality of a position is
-checked elsewhere (`gate`).
+ArduPilot accepts a source set that has no data, and is then lost; and a companion that takes an aircraft
+off a healthy GNSS does harm. So set 2 (our position) is requested only while our position goes out, and
+only if the receiver itself has no fix, or GNSS is false by the posterior with a beacon as witness: never
+because innovations were rejected. Set 1 (GNSS) is requested whenever the receiver has a fix that is not
+held false, also when there is no solution. The command is repeated until it is acknowledged.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import NamedTuple
+
 from companion.link import dialect
 from companion.link.dialect import Message, mavlink
-from companion.records import Event, Severity
+from companion.records import Event, Gnss, Severity, Solution
 from companion.units import SECOND_NS
 
 GNSS_SET, COMPANION_SET = 1, 2
-GNSS_LOST_NS = 2 * SECOND_NS  # GNSS unused for this long is lost
-OUTPUT_STEADY_NS = 3 * SECOND_NS  # our position was sent for this long
-GNSS_TRUSTED_NS = 10 * SECOND_NS  # GNSS was trusted again for this long
+NO_FIX_S, SILENT_S = 2.0, 3.0  # the receiver reports no fix, or nothing, for so long
+STEADY_S = 3.0  # our position has gone out without a gap for so long
+FIX_S = 5.0  # the receiver has had a fix for so long
+STOPPED_S = 2.0  # our position has not gone out for so long
+FALSE, BELIEVED = 0.999, 0.1  # probability that GNSS is false
+FRESH_S = 60.0  # a solution older than this says nothing about GNSS
 MAX_GAP_NS = SECOND_NS  # a longer gap interrupts
 RETRY_NS = SECOND_NS
 MAX_TRIES = 10
@@ -27,7 +33,64 @@ RETRIED = (
     mavlink.MAV_RESULT_FAILED,
     mavlink.MAV_RESULT_IN_PROGRESS,
 )
-REASONS = {GNSS_SET: "GNSS is trusted again", COMPANION_SET: "GNSS is lost, using companion"}
+
+
+class Situation(NamedTuple):
+    """Facts that decide the source set; durations in s, -1 where the condition does not hold."""
+
+    fix_s: float  # the receiver has had a fix
+    no_fix_s: float  # the receiver has reported no fix
+    silent_s: float  # nothing was received from a receiver that was received before
+    gnss_false: float | None  # probability, None without a recent solution
+    witness: bool  # a beacon is received and believed
+    sent_s: float  # our position has gone out
+    stopped_s: float  # our position has not gone out, after it did
+
+
+class Predicate(NamedTuple):
+    """A condition with its name and the reason that it gives."""
+
+    name: str
+    holds: Callable[[Situation], bool]
+    reason: str
+
+
+def _held_false(s: Situation) -> bool:
+    return s.gnss_false is not None and s.gnss_false > FALSE and s.witness
+
+
+#: Set 2 needs our position and one of these.
+TO_COMPANION = (
+    Predicate("no fix", lambda s: s.no_fix_s >= NO_FIX_S, "GNSS is lost, using companion"),
+    Predicate("receiver silent", lambda s: s.silent_s >= SILENT_S, "GNSS receiver silent, using companion"),
+    Predicate("GNSS false", _held_false, "GNSS is false, using companion"),
+)
+#: Set 1 needs a fix and one of these.
+TO_GNSS = (
+    Predicate(
+        "GNSS believed",
+        lambda s: s.fix_s >= FIX_S and (s.gnss_false is None or s.gnss_false < BELIEVED),
+        "GNSS has a fix",
+    ),
+    Predicate(
+        "companion stopped",
+        lambda s: s.stopped_s >= STOPPED_S and not _held_false(s),
+        "no companion position",
+    ),
+)
+
+
+def required_set(s: Situation) -> tuple[int, str] | None:
+    """Return the source set that must lead and the reason; None where the present one stays."""
+    if s.sent_s >= STEADY_S:
+        for predicate in TO_COMPANION:
+            if predicate.holds(s):
+                return COMPANION_SET, predicate.reason
+    if s.fix_s >= 0.0:
+        for predicate in TO_GNSS:
+            if predicate.holds(s):
+                return GNSS_SET, predicate.reason
+    return None
 
 
 class ConditionTimer:
@@ -37,36 +100,70 @@ class ConditionTimer:
         self._since: int | None = None
         self._last = 0
 
-    def update(self, holds: bool, now_ns: int) -> int:
-        """Return how long the condition has held at `now_ns`, ns; -1 if it does not hold."""
+    def update(self, holds: bool, now_ns: int, gap_ns: int = MAX_GAP_NS) -> None:
+        """Note whether the condition holds at `now_ns`; a gap longer than `gap_ns` interrupts it."""
         if not holds:
             self._since = None
-            return -1
-        if self._since is None or now_ns - self._last > MAX_GAP_NS:
+        elif self._since is None or now_ns - self._last > gap_ns:
             self._since = now_ns
         self._last = now_ns
-        return now_ns - self._since
+
+    def held_s(self, now_ns: int, gap_ns: int = MAX_GAP_NS) -> float:
+        """Return how long it has held, s; -1 if it does not, or was not noted for longer than `gap_ns`."""
+        if self._since is None or now_ns - self._last > gap_ns:
+            return -1.0
+        return (now_ns - self._since) * 1e-9
 
 
 class SourceSwitch:
     """The required EKF source set, requested until acknowledged; unknown at the start."""
 
     def __init__(self) -> None:
-        self._lost, self._sending, self._returned = ConditionTimer(), ConditionTimer(), ConditionTimer()
+        self._fix, self._no_fix, self._sent = ConditionTimer(), ConditionTimer(), ConditionTimer()
+        self._receiver_ns: int | None = None
+        self._sent_ns: int | None = None
+        self._solution: Solution | None = None
         self._wanted: int | None = None
+        self._reason = ""
         self._tries = 0
         self._next_ns: int | None = None  # None: nothing to request
         self._events: list[Event] = []
 
-    def update(self, gnss: bool, sent: bool, now_ns: int) -> None:
-        """Update the required set: whether the solution uses GNSS, and whether our position was sent."""
-        lost = self._lost.update(not gnss, now_ns)
-        sending = self._sending.update(sent, now_ns)
-        returned = self._returned.update(gnss, now_ns)
-        if lost >= GNSS_LOST_NS and sending >= OUTPUT_STEADY_NS:
-            self._request(COMPANION_SET, now_ns)
-        elif returned >= GNSS_TRUSTED_NS:
-            self._request(GNSS_SET, now_ns)
+    def receive(self, record: Gnss) -> None:
+        """Note what the autopilot's receiver reports; a repeated fix counts: the receiver still reports."""
+        now = record.rx_ns
+        self._receiver_ns = now
+        self._fix.update(record.has_3d_fix, now, 3 * SECOND_NS)
+        self._no_fix.update(not record.has_3d_fix, now, 3 * SECOND_NS)
+
+    def note_output(self, solution: Solution, sent: bool, now_ns: int) -> None:
+        """Note a solution and whether its position went out."""
+        self._solution = solution
+        self._sent.update(sent, now_ns)
+        if sent:
+            self._sent_ns = now_ns
+
+    def situation(self, now_ns: int) -> Situation:
+        """Return the facts at `now_ns`."""
+        solution, patience = self._solution, 3 * SECOND_NS
+        fresh = solution is not None and (now_ns - solution.rx_ns) * 1e-9 <= FRESH_S
+        silent = -1.0 if self._receiver_ns is None else (now_ns - self._receiver_ns) * 1e-9
+        return Situation(
+            fix_s=self._fix.held_s(now_ns, patience),
+            no_fix_s=self._no_fix.held_s(now_ns, patience),
+            silent_s=silent,
+            gnss_false=solution.gnss_false if fresh and solution is not None else None,
+            witness=fresh and solution is not None and solution.witness,
+            sent_s=self._sent.held_s(now_ns),
+            stopped_s=-1.0 if self._sent_ns is None else (now_ns - self._sent_ns) * 1e-9,
+        )
+
+    def update(self, now_ns: int) -> None:
+        """Decide by the table; call it at least once a second, with or without solutions."""
+        decision = required_set(self.situation(now_ns))
+        if decision is not None and decision[0] != self._wanted:
+            self._wanted, self._reason = decision
+            self._tries, self._next_ns = 0, now_ns
 
     def handle_acknowledgement(self, command: int, result: int, now_ns: int) -> None:
         """Process the autopilot's COMMAND_ACK of one of our commands."""
@@ -74,9 +171,7 @@ class SourceSwitch:
             return
         if result == mavlink.MAV_RESULT_ACCEPTED:
             self._next_ns = None
-            self._add_event(
-                Severity.NOTICE, f"EKF source set {self._wanted}: {REASONS[self._wanted or GNSS_SET]}", now_ns
-            )
+            self._add_event(Severity.NOTICE, f"EKF source set {self._wanted}: {self._reason}", now_ns)
         elif result not in RETRIED:
             self._give_up(f"it answered MAV_RESULT {result}", now_ns)
 
@@ -104,10 +199,6 @@ class SourceSwitch:
         """Return the events since the last call."""
         taken, self._events = self._events, []
         return taken
-
-    def _request(self, source_set: int, now_ns: int) -> None:
-        if source_set != self._wanted:
-            self._wanted, self._tries, self._next_ns = source_set, 0, now_ns
 
     def _give_up(self, why: str, now_ns: int) -> None:
         self._next_ns = None

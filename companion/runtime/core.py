@@ -114,19 +114,19 @@ def requested_rates(config: Config) -> dict[str, float]:
         "LOCAL_POSITION_NED": rates.local_position_hz,
         "GPS_RAW_INT": rates.gnss_hz,
         "ATTITUDE": rates.attitude_hz,
-        "RAW_IMU": rates.imu_hz,
-        "HIGHRES_IMU": rates.imu_hz,
+        "RAW_IMU": rates.imu_hz * (config.output.profile != "px4"),
+        "HIGHRES_IMU": rates.imu_hz * (config.output.profile != "ardupilot"),
         "VFR_HUD": rates.air_data_hz,
-        "SCALED_PRESSURE": 0.0 if config.channel == "local_position" else rates.air_data_hz,
+        "SCALED_PRESSURE": 0.0 if config.has_own_ins else rates.air_data_hz,
         "EKF_STATUS_REPORT": rates.status_hz,
+        "SYS_STATUS": 0.0 if config.has_own_ins else rates.status_hz,
         "SYSTEM_TIME": float(config.output.rates_hz["GPS_INPUT"] > 0.0),
         "GLOBAL_POSITION_INT": 2.0 * (config.output.rates_hz[RESET] > 0.0),
         "SIM_STATE": rates.truth_hz,
     }
-    channel_messages = {"air_data": ["VFR_HUD"], "strapdown": ["RAW_IMU", "HIGHRES_IMU"]}
-    for name in channel_messages.get(config.channel, ["LOCAL_POSITION_NED"]):
-        if 0.0 < rates_hz[name] < config.output.pace_hz:  # one solution per message of the channel
-            rates_hz[name] = config.output.pace_hz
+    paced = "LOCAL_POSITION_NED" if config.has_own_ins else "ATTITUDE"
+    if 0.0 < rates_hz[paced] < config.output.pace_hz:  # one solution per message of the channel
+        rates_hz[paced] = config.output.pace_hz
     return {name: hz for name, hz in rates_hz.items() if hz > 0.0}
 
 
@@ -191,6 +191,8 @@ class CompanionCore:
         if now_ns >= self._next_state_ns:
             self._next_state_ns = now_ns + SECOND_NS
             self._report_staleness(now_ns)
+            if (leading := self.leading_link) is not None:
+                self._steer(leading, now_ns)
             for link in self.links.values():
                 link.session.state = self._system_state(now_ns)
                 self._log.record(self._link_state(link, now_ns))
@@ -333,10 +335,16 @@ class CompanionCore:
         if feeding and (leading := self.leading_link) is not None:
             for message in leading.output.messages(solution, feeding, self._receiver(leading)):
                 leading.session.send(message)
-            self._emit_output_events(leading)
+            self._steer(leading, solution.rx_ns)
         for link in self.links.values() if STATUS in due else ():
             if link.session.is_up:
                 link.session.send(navigation_status(solution, self._receiver(link)))
+
+    def _steer(self, link: Link, now_ns: int) -> None:
+        """Request the EKF source set that must lead, with or without a solution."""
+        for message in link.output.poll(link.session.autopilot or 0, now_ns):
+            link.session.send(message)
+        self._emit_output_events(link)
 
     def _emit_output_events(self, link: Link) -> None:
         """Log and report the events of the autopilot output."""

@@ -8,10 +8,10 @@ recovery.
 Workers, files and tables belong to `sitl.campaign.command`. A fault counts as
 
     detected    before its end a measurement of an affected source was rejected, a reset was recorded, an
-    event
-                reported conflicting sources, a late link or a clock jump, the solutions stopped using the
-                source, or trust decreased;
-    excluded    the solutions stopped using the source (also because it sends nothing);
+                event reported the source as suspect or excluded, a late link or a clock jump, the solutions
+                stopped using the source, or trust decreased;
+    excluded    the source was reported as excluded, or the solutions stopped using it (also because it sends
+                nothing);
     misleading  the error exceeded the protection level for at least a second without a flag: trust neither
                 "degraded" nor "untrusted".
 """
@@ -33,12 +33,12 @@ import numpy.typing as npt
 
 from companion.config import Config, InertialConfig
 from companion.navigator import Navigator
-from companion.navigator.integrity import CONTRADICT
 from companion.records import (
     AirData,
     Attitude,
     Event,
     Gnss,
+    Imu,
     LocalOrigin,
     LocalPosition,
     Mode,
@@ -63,12 +63,9 @@ from sitl.world import World
 
 FAULT_S, OVER_S = 300.0, 540.0
 TURN_S = 430.0
-FAULT_EVENTS = (
-    CONTRADICT,
-    "the link is late",
-    "the clock of autopilot",
-)  # events that report a fault contain one of these
-EXCLUSION = "excluded:"  # start of the reason of a rejection by exclusion
+FAULT_EVENTS = ("the link is late", "the clock of autopilot")  # events that report a fault contain one
+SUSPICION, EXCLUSION = " is suspect:", " is excluded:"  # after the name of the source, in events
+SENSORS: tuple[type[Stamped], ...] = (LocalPosition, Attitude, Gnss, AirData, Pressure, RsbnFix)
 SETTLED_S = 60.0  # alarms count from here on
 _LEGS = (
     Leg(10, 40, 0, 0),
@@ -80,6 +77,7 @@ _LEGS = (
 _PLAN = FlightPlan(_LEGS, winds=(WindChange(0, 4, 5),))
 _EAST_BEACON, _NORTH_BEACON = Beacon(1, 60.05, 31.07), Beacon(2, 60.45, 30.0)
 _RATES = SensorRates(imu=1.0, truth=1.0)
+_STOCK_RATES = SensorRates(imu=10.0, truth=1.0)
 _BEACON = Source.AZIMUTH | Source.RANGE
 
 SCENARIOS: dict[str, Scenario] = {
@@ -90,13 +88,19 @@ SCENARIOS: dict[str, Scenario] = {
         Scenario("no-beacon", _PLAN, rates=_RATES),
         Scenario("tactical", _PLAN, grade="tactical", beacons=(_EAST_BEACON,), rates=_RATES),
         Scenario("mems", _PLAN, grade="mems", beacons=(_EAST_BEACON,), rates=_RATES),
-        Scenario(
-            "air-data", _PLAN, beacons=(_EAST_BEACON,), rates=_RATES
-        ),  # without INS: airspeed, attitude and fixes
+        # without an INS of its own: airspeed, attitude and fixes
+        Scenario("air-data", _PLAN, beacons=(_EAST_BEACON,), rates=_RATES),
+        # a stock autopilot: all of its sensors
+        Scenario("stock", _PLAN, grade="mems", beacons=(_EAST_BEACON,), rates=_STOCK_RATES),
     )
 }
+OWN_CHANNEL = {
+    "air-data": InertialConfig(source="air_data"),
+    "stock": InertialConfig(),
+}
+"""Configuration of scenarios without an INS of their own; the others fly by default."""
 
-#: Configuration of the simulated grades: residuals after calibration, tilt after levelling.
+#: Stated errors of the simulated grades: residuals after calibration, tilt after levelling.
 UNITS: dict[str, InertialConfig] = {
     "navigation": InertialConfig(),
     "tactical": InertialConfig(
@@ -129,15 +133,17 @@ class FaultCase(NamedTuple):
     bits: Source = Source(0)
 
 
-def _case(name: str, size: float | None = None, end_s: float = OVER_S) -> FaultCase:
+def _case(name: str, size: float | None = None, end_s: float = OVER_S, start_s: float = FAULT_S) -> FaultCase:
     concerns, bits = {
         "gnss": ("gnss", Source.GNSS),
         "beacon": ("rsbn", _BEACON),
         "airspeed": ("air", Source.AIR_DATA),
+        "pitot": ("air", Source.AIR_DATA),
+        "heading": ("air", Source.AIR_DATA),
         "wind": ("air", Source.AIR_DATA),
         "ins": ("inertial", Source(0)),
     }.get(name.split("-")[0], ("", Source.GNSS))
-    return FaultCase(Fault(name, FAULT_S, end_s, size), concerns, bits)
+    return FaultCase(Fault(name, start_s, end_s, size), concerns, bits)
 
 
 FAULT_CASES: dict[str, FaultCase] = {
@@ -147,21 +153,38 @@ FAULT_CASES: dict[str, FaultCase] = {
     "gnss-spoof-0.5": _case("gnss-spoof", 0.5),
     "gnss-spoof-2": _case("gnss-spoof", 2.0),
     "gnss-spoof-5": _case("gnss-spoof", 5.0),
+    "gnss-accelerate": _case("gnss-accelerate"),
+    "gnss-first-450": _case("gnss-jump", 450.0, start_s=0.0),
+    "gnss-return-450": _case("gnss-return", 450.0),
+    "gnss-latency-0.1": _case("gnss-latency", 0.1, math.inf, 0.0),
+    "gnss-latency-0.2": _case("gnss-latency", 0.2, math.inf, 0.0),
+    "gnss-latency-0.3": _case("gnss-latency", 0.3, math.inf, 0.0),
     "gnss-jam": _case("gnss-jam"),
     "gnss-frozen": _case("gnss-frozen"),
     "gnss-stale": _case("gnss-stale"),
     "gnss-late": _case("gnss-late"),
     "beacon-bias": _case("beacon-bias"),
+    "beacon-bias-50": _case("beacon-bias", 50.0),
+    "beacon-bias-200": _case("beacon-bias", 200.0),
     "beacon-bias-300": _case("beacon-bias", 300.0),
     "beacon-position": _case("beacon-position"),
+    "beacon-place": _case("beacon-position", 3000.0, math.inf, 0.0),
     "beacon-north": _case("beacon-north"),
+    "beacon-north-1": _case("beacon-north", math.radians(1.0)),
+    "beacon-north-5": _case("beacon-north", math.radians(5.0)),
     "beacon-multipath": _case("beacon-multipath"),
     "beacon-drop-out": _case("beacon-drop-out"),
     "beacon-late": _case("beacon-late"),
     "beacon-frozen": _case("beacon-frozen"),
     "ins-frozen": _case("ins-frozen", end_s=FAULT_S + 60.0),
     "ins-reset": _case("ins-reset"),
+    "ins-drift": _case("ins-drift"),
     "airspeed-icing": _case("airspeed-icing"),
+    "pitot-low": _case("pitot-stuck", 8.0),
+    "pitot-high": _case("pitot-stuck", 60.0),
+    "pitot-zero": _case("pitot-stuck", 0.0),
+    "pitot-scale": _case("pitot-scale", 1.5),
+    "heading-off": _case("heading-off"),
     "airspeed-frozen": _case("airspeed-frozen"),
     "wind-shear": _case("wind-shear"),
     "ins-nan": _case("ins-nan", end_s=FAULT_S + 10.0),
@@ -237,6 +260,14 @@ def scenario_of(order: FlightOrder) -> Scenario:
     return dataclasses.replace(base, faults=(fault,) if fault else (), seed=order.seed)
 
 
+def config_of(scenario: str) -> Config:
+    """Return the configuration that a scenario is flown with."""
+    inertial = OWN_CHANNEL.get(scenario)
+    if inertial is None:
+        return loopback.simulator_config(Config())
+    return loopback.simulator_config(Config(inertial=inertial), own_ins=False)
+
+
 def is_sensor_fault(kind: str) -> bool:
     """Whether a fault is a sensor fault, flown without messages."""
     fault = FAULT_CASES[kind].fault
@@ -248,9 +279,9 @@ def is_applicable(scenario: str, kind: str) -> bool:
     concerned = kind.split("-")[0]
     if concerned == "beacon":
         return bool(SCENARIOS[scenario].beacons)
-    if concerned in ("airspeed", "wind"):
-        return scenario == "air-data"
-    return concerned != "ins" or scenario != "air-data"
+    if concerned in ("airspeed", "pitot", "heading", "wind"):
+        return scenario in OWN_CHANNEL
+    return concerned != "ins" or scenario not in OWN_CHANNEL
 
 
 def fly_order(order: FlightOrder) -> FlightResult:
@@ -258,16 +289,21 @@ def fly_order(order: FlightOrder) -> FlightResult:
     started = time.perf_counter()
     try:
         scenario = scenario_of(order)
-        inertial = (
-            InertialConfig(source="air_data") if order.scenario == "air-data" else UNITS[scenario.grade]
-        )
-        config = loopback.simulator_config(Config(inertial=inertial))
+        config = config_of(order.scenario)
         fly = fly_records if is_sensor_fault(order.fault) else fly_bytes
         world, outputs = fly(scenario, config)
         result = score_flight(order, world, outputs)
     except Exception as error:  # the campaign continues and lists it
         result = FlightResult(order.key, *order, 0.0, 0.0, raised=f"{type(error).__name__}: {error}")
     return result._replace(took_s=round(time.perf_counter() - started, 3))
+
+
+def sensors_of(config: Config) -> tuple[type[Stamped], ...]:
+    """Return the kinds of records that the configuration uses.
+
+    The IMU is first: it moves the trajectory to an instant before the others are compared with it.
+    """
+    return SENSORS if config.has_own_ins or not config.uses("imu") else (Imu, *SENSORS)
 
 
 def fly_records(scenario: Scenario, config: Config) -> tuple[World, list[Stamped]]:
@@ -277,9 +313,9 @@ def fly_records(scenario: Scenario, config: Config) -> tuple[World, list[Stamped
     height = origin.alt - scenario.geoid_height
     outputs: list[Stamped] = []
     outputs += navigator.handle(LocalOrigin(0, 0, origin.lat, origin.lon, height, scenario.autopilot))
-    kinds = LocalPosition, Attitude, Gnss, AirData, Pressure, RsbnFix
-    for record in heapq.merge(*(world.streams[kind] for kind in kinds), key=attrgetter("rx_ns")):
+    for record in heapq.merge(*(world.streams[kind] for kind in sensors_of(config)), key=attrgetter("rx_ns")):
         outputs += navigator.handle(record)  # type: ignore[arg-type]
+        navigator.settle()
     return world, outputs
 
 
@@ -342,13 +378,14 @@ def score_flight(order: FlightOrder, world: World, outputs: Sequence[Stamped]) -
     start = kind.fault.start_s if kind.fault else math.inf
     end = kind.fault.end_s if kind.fault else math.inf
     on = (t >= start) & (t < end)
-    dropped = [x for x in _losses_of(solutions, t, kind.bits) if start <= x < end]
-    excluded = dropped[0] if dropped else None
+    exclusions = [r for r in outputs if isinstance(r, Event) and EXCLUSION in r.text]
+    ours = [r.t_ns * 1e-9 for r in exclusions if _concerns(r, kind.concerns)]
+    dropped = [x for x in (*ours, *_losses_of(solutions, t, kind.bits)) if start <= x < end]
+    excluded = min(dropped, default=None)
     reported = [r.t_ns * 1e-9 for r in outputs if _reports_fault(r, kind.concerns)]
     worse = t[on & (trust > trust[max(int(on.argmax()) - 1, 0)])].tolist() if on.any() else []
     detected = min((x for x in (*reported, *dropped, *worse) if start <= x < end), default=None)
-    exclusions = [r for r in outputs if isinstance(r, Rejection) and r.reason.startswith(EXCLUSION)]
-    wrong = [r for r in exclusions if not (kind.concerns and r.source.startswith(kind.concerns))]
+    wrong = [r for r in exclusions if not _concerns(r, kind.concerns)]
     before = (t >= start) & (t <= (end if excluded is None else excluded))
     settled, beyond = t >= SETTLED_S, error > levels
     flagged = (trust == Trust.DEGRADED) | (trust == Trust.UNTRUSTED)
@@ -403,12 +440,17 @@ def _losses_of(solutions: Sequence[Solution], t: Floats, bits: Source) -> Iterat
         before = solution.sources
 
 
+def _concerns(event: Event, concerns: str) -> bool:
+    return bool(concerns) and event.text.startswith(concerns)
+
+
 def _reports_fault(record: Any, concerns: str) -> bool:
     if isinstance(record, Rejection):
         return bool(concerns) and record.source.startswith(concerns)
-    return isinstance(record, Reset) or (
-        isinstance(record, Event) and any(t in record.text for t in FAULT_EVENTS)
-    )
+    if isinstance(record, Event):
+        names = any(word in record.text for word in (SUSPICION, EXCLUSION)) and _concerns(record, concerns)
+        return names or any(text in record.text for text in FAULT_EVENTS)
+    return isinstance(record, Reset)
 
 
 def _rms(values: Floats) -> float | None:

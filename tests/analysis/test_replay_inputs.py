@@ -126,7 +126,7 @@ def test_keys_with_and_without_section() -> None:
         ("beta=3", "no section has this key"),
         ("gnss.sigma=3", "did you mean `sigma_m`"),
         ("estimator", "write it as SECTION.KEY=VALUE"),
-        ("estimator=kalman,scheme=feedback", "set inertial.source = 'air_data' or 'strapdown'"),
+        ("independent=true,scheme=feedback", "set inertial.source = 'air_data' or 'imu'"),
     ):
         with pytest.raises(ConfigError, match=words) as caught:
             replay_inputs.apply_changes(Config(), text)

@@ -101,7 +101,7 @@ outputs = st.builds(
     global_position_sensor_hz=st.sampled_from([-1.0, 0.0, 2.0]),
     external_position_hz=st.sampled_from([-1.0, 0.0, 0.5]),
 )
-sources = st.sampled_from(["auto", "local_position", "air_data"])
+sources = st.sampled_from(["auto", "local_position", "air_data", "imu"])
 
 
 @settings(deadline=None, max_examples=300)
@@ -109,7 +109,8 @@ sources = st.sampled_from(["auto", "local_position", "air_data"])
 def test_no_configuration_feeds_an_autopilot_its_own_position(output: OutputConfig, source: str) -> None:
     config = Config(output=output, inertial=InertialConfig(source=source))
     if not list(find_conflicts(config)) and output.feeds_estimator:
-        assert config.channel != "local_position"
+        assert not config.has_own_ins
+        assert config.inertial.source != "local_position"
         assert output.profile != "monitor"
 
 
@@ -118,7 +119,23 @@ def test_local_position_is_independent_only_if_configured(profile: str) -> None:
     pairs = [f"output.profile={profile}", "inertial.source=local_position"]
     with pytest.raises(ConfigError, match=r"inertial\.independent"):
         configured(*pairs)
-    assert configured(*pairs, "inertial.independent=true").channel == "local_position"
+    assert configured(*pairs, "inertial.independent=true").has_own_ins
+
+
+@pytest.mark.parametrize(
+    ("source", "sensors", "own_ins"),
+    [
+        ("auto", {"local_position", "air_data", "imu"}, True),
+        ("local_position", {"local_position"}, True),
+        ("air_data", {"air_data"}, False),
+        ("imu", {"imu"}, False),
+    ],
+)
+def test_inertial_source_is_what_may_be_used(source: str, sensors: set[str], own_ins: bool) -> None:
+    config = configured(f"inertial.source={source}")
+    assert {name for name in ("local_position", "air_data", "imu") if config.uses(name)} == sensors  # type: ignore[arg-type]
+    assert not config.has_own_ins
+    assert configured(f"inertial.source={source}", "inertial.independent=true").has_own_ins is own_ins
 
 
 def test_every_output_method_of_every_profile_is_valid() -> None:

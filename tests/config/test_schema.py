@@ -42,7 +42,7 @@ def test_flags_override_environment_overrides_file(tmp_path: Path) -> None:
         ),
         ("[output]\nvia = 'odometri'", "is not one of auto, odometry, "),
         ("[output]\nvia = 3", "output.via: 3 is not one of auto, "),
-        ("[inertial]\nsource = 'ins'", "'ins' is not one of auto, local_position, air_data, strapdown"),
+        ("[inertial]\nsource = 'ins'", "'ins' is not one of auto, local_position, air_data, imu"),
         ("[link]\nconnect = 3", "link.connect = [3] is invalid: expected str, got int"),
         ("link = 3", "`link` is a section: write [link] and its keys below it"),
         ("x = [", "not valid TOML"),

@@ -8,7 +8,7 @@ import pytest
 
 from companion.config import Config, load
 from companion.config.required_parameters import required_parameters
-from companion.doctor.diagnosis import Diagnosis, Finding
+from companion.doctor.diagnosis import Diagnosis, Finding, check_airspeed
 from companion.doctor.examination import OBSERVE, OBSERVE_LONGER, Examination
 from companion.link import dialect, frame
 from companion.link.parameter_client import ATTEMPTS, SILENCE
@@ -170,12 +170,39 @@ def test_missing_message_is_found(dropped: str, what: str) -> None:
     assert bench.now >= OBSERVE_LONGER  # it waited longer
 
 
-@pytest.mark.parametrize(("channel", "well"), [("air_data", None), ("strapdown", False)])
-def test_unused_stream_may_be_missing(channel: str, well: bool | None) -> None:
-    bench = Bench("ardupilot", profile("ardupilot", f"inertial.source={channel}"))
-    bench.to_us = without("RAW_IMU")
-    imu = found(bench.look(), "RAW_IMU")
-    assert imu.is_well is well and imu.found == "0.0 Hz"
+@pytest.mark.parametrize(
+    ("source", "imu", "airspeed"),
+    [("auto", False, False), ("air_data", None, False), ("imu", False, None)],
+)
+def test_unused_stream_may_be_missing(source: str, imu: bool | None, airspeed: bool | None) -> None:
+    bench = Bench("ardupilot", profile("ardupilot", f"inertial.source={source}"))
+    bench.to_us = without("RAW_IMU", "SYS_STATUS", "VFR_HUD")
+    diagnosis = bench.look()
+    wells = {"RAW_IMU": imu, "SYS_STATUS": airspeed, "VFR_HUD": airspeed}
+    assert {name: found(diagnosis, name).is_well for name in wells} == wells
+    assert all(found(diagnosis, name).found == "0.0 Hz" for name in wells)
+
+
+@pytest.mark.parametrize(
+    ("healthy", "pairs", "text"),
+    [
+        (True, ["output.profile=ardupilot"], "healthy"),
+        (False, ["output.profile=ardupilot"], "none: reckoning by IMU only"),
+        (False, ["output.profile=monitor"], "none: reckoning by IMU and local position only"),
+        (None, ["output.profile=ardupilot"], "not reported: not used"),
+    ],
+)
+def test_missing_airspeed_sensor_is_reported_and_no_problem(
+    healthy: bool | None, pairs: list[str], text: str
+) -> None:
+    (airspeed,) = check_airspeed(load(None, {}, {}, pairs), healthy)
+    assert (airspeed.found, airspeed.is_well) == (text, None)
+    assert bool(airspeed.advice) == (not healthy)
+    assert not check_airspeed(load(None, {}, {}, [*pairs, "inertial.independent=true"]), healthy)
+
+
+def test_airspeed_sensor_of_the_autopilot_is_found() -> None:
+    assert found(Bench("ardupilot").look(), "airspeed sensor").found == "healthy"
 
 
 def test_unanswered_timesync_is_found() -> None:

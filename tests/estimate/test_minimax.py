@@ -367,8 +367,11 @@ def test_denser_grid_converges_to_the_continuous_optimum():
         solve(schuler_row("gamma", 1.5 - np.linspace(0, 1, n)), UNITS[0], 1.0).bound / exact - 1.0
         for n in (26, 51, 101, 401, 1601)
     ]
-    assert all(0.0 <= e <= 4.1 / (n - 1) ** 2 for e, n in zip(excess, (26, 51, 101, 401, 1601), strict=True))
-    assert all(fine <= coarse for coarse, fine in pairwise(excess))
+    rounding = 1e-13  # two optima that are equal differ by the order of additions of the BLAS kernel
+    assert all(
+        -rounding <= e <= 4.1 / (n - 1) ** 2 for e, n in zip(excess, (26, 51, 101, 401, 1601), strict=True)
+    )
+    assert all(fine <= coarse + rounding for coarse, fine in pairwise(excess))
 
 
 # Bad input

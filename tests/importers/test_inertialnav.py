@@ -38,6 +38,14 @@ def test_matlab_tables_are_converted_as_ardupilot_messages(tmp_path: pathlib.Pat
     assert fix.v_n == pytest.approx((0.0, 2.0, 0.5), abs=1e-12)
 
 
+def test_airspeed_of_an_old_log_is_a_sensor(tmp_path: pathlib.Path) -> None:
+    """Planes up to 3.x logged it in NTUN only; without a sensor it is 0 there."""
+    rows = np.array([[1, 13_100.0, 17.5], [2, 13_300.0, 0.0], [3, 13_500.0, 18.0]])
+    savemat(tmp_path / "log.mat", {"NTUN": rows, "NTUN_label": labels("LineNo TimeMS Arspd")})
+    seen = [record for record in sources.open_source(tmp_path / "log.mat") if isinstance(record, r.AirData)]
+    assert [(record.airspeed, record.sensed) for record in seen] == [(17.5, True), (18.0, True)]
+
+
 def tables(glitch: float = 0.0) -> dict[str, str]:
     """One minute of flight eastwards at 10 m/s, with a GNSS error of `glitch` metres for one second."""
 

@@ -112,7 +112,6 @@ REJECTED: list[tuple[str, dict[str, Any], str]] = [
     ("ATTITUDE_QUATERNION", {}, "length 0"),
     ("ATTITUDE_QUATERNION", {"q1": NAN}, "q1 is nan"),
     ("HIGHRES_IMU", {"fields_updated": 63, "zgyro": NAN}, "zgyro is nan"),
-    ("AIRSPEED", {"airspeed": 63.5, "flags": 1}, "unhealthy"),
     ("AIRSPEED", {"airspeed": NAN}, "airspeed is nan"),
     ("WIND", {"direction": NAN}, "direction is nan"),
     ("WIND_COV", {"wind_x": NAN}, "wind_x is nan"),
@@ -209,13 +208,49 @@ def test_air_and_wind() -> None:
     air = one("VFR_HUD", airspeed=25.0, groundspeed=NAN, heading=90, climb=-1.5, alt=600.0)
     assert air == r.AirData(RX, RX, 25.0, False, None, -1.5, math.radians(90), 600.0)
     assert decoded("VFR_HUD", airspeed=NAN) == ()
-    assert one("AIRSPEED", airspeed=25.0, flags=2) == r.AirData(RX, RX, 25.0)
     # From the north-east at 13, rising at 5: 12 level, towards the south-west.
     blown = one("WIND", direction=45.0, speed=13.0, speed_z=-5.0)
     assert blown.v_n == pytest.approx((-12 / math.sqrt(2), -12 / math.sqrt(2), -5.0))
     assert one("WIND_COV", "px4", wind_y=3.0, var_horiz=0.5).sigma == pytest.approx(0.5)
     assert one("WIND_COV", "other", wind_y=3.0, var_horiz=0.5).sigma is None
     assert one("WIND_COV", "other", horiz_accuracy=0.75).sigma == 0.75
+
+
+def test_airspeed_message_is_of_a_sensor_and_tells_its_health() -> None:
+    sensor, air = decoded("AIRSPEED", airspeed=25.0, flags=2)
+    assert sensor == r.AirspeedSensor(RX, RX, True)
+    assert air == r.AirData(RX, RX, 25.0, sensed=True)
+    assert decoded("AIRSPEED", airspeed=63.5, flags=1) == (r.AirspeedSensor(RX, RX, False),)
+    assert one("VFR_HUD", airspeed=25.0).sensed is None  # it may be the estimator's own number
+
+
+@pytest.mark.parametrize(
+    ("present", "enabled", "health", "healthy"),
+    [
+        (16, 16, 16, True),
+        (0xFFFF, 0x3F, 0x1F, True),
+        (16, 16, 0, False),
+        (16, 0, 16, False),
+        (0, 16, 16, False),
+    ],
+)
+def test_airspeed_sensor_is_healthy_only_if_present_enabled_and_healthy(
+    present: int, enabled: int, health: int, healthy: bool
+) -> None:
+    bits = {"present": present, "enabled": enabled, "health": health}
+    status = one("SYS_STATUS", **{f"onboard_control_sensors_{name}": value for name, value in bits.items()})
+    assert status == r.AirspeedSensor(RX, RX, healthy)
+
+
+@pytest.mark.parametrize(
+    ("jamming", "spoofing", "threatened"),
+    [(0, 0, False), (1, 1, False), (2, 1, True), (3, 0, True), (1, 2, True), (0, 3, True)],
+)
+def test_receivers_own_integrity(jamming: int, spoofing: int, threatened: bool) -> None:
+    """Of both states 0 is unknown, 1 none, 2 mitigated, 3 detected."""
+    state = one("GNSS_INTEGRITY", id=1, jamming_state=jamming, spoofing_state=spoofing)
+    assert state == r.GnssIntegrity(RX, RX, 1, jamming, spoofing)
+    assert state.threatened is threatened
 
 
 def test_gps_glitch_has_a_different_bit_for_each_filter() -> None:

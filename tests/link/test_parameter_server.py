@@ -197,11 +197,11 @@ def test_saved_parameters_are_loaded_as_configuration(tmp_path: pathlib.Path) ->
     station.set("GNSS_SIGMA_M", 4.0)
     station.set("GNSS_USE_VEL", 0.0)
     station.set("OUT_GPSENS_ID", 7.0)
-    station.set("EST_FALSE_REJ", 1e-7)
+    station.set("INTEGRITY_RISK", 1e-6)
     path = tmp_path / "set.toml"
     path.write_text(station.saved[-1])
     assert load(path, environment={}) == station.parameters.config
-    for name in ("GNSS_SIGMA_M", "GNSS_USE_VEL", "OUT_GPSENS_ID", "EST_FALSE_REJ"):
+    for name in ("GNSS_SIGMA_M", "GNSS_USE_VEL", "OUT_GPSENS_ID", "INTEGRITY_RISK"):
         station.set(name, value(Config(), name))
     assert "=" not in station.saved[-1]  # no value differs from the operator's configuration
 
@@ -233,7 +233,8 @@ def test_setting_the_value_in_effect_is_no_change() -> None:
         ("GNSS_SIGMA_M", math.nan),
         ("GNSS_SIGMA_M", math.inf),
         ("GNSS_SIGMA_M", 3e38),
-        ("EST_FALSE_REJ", 1.0),
+        ("INTEGRITY_RISK", 1.0),
+        ("INTEGRITY_ROWS", 193.0),
         ("OUT_GPSENS_ID", 256.0),
         ("OUT_GPSENS_ID", 1.5),
         ("OUT_GPSENS_ID", -1.0),

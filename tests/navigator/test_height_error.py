@@ -44,7 +44,7 @@ def climbed(
         if t < until:
             part = min(t - last, CORRELATION_S) / CORRELATION_S
             told = true + drift + (wrong or {}).get(k, 0.0)
-            level, last = height_error.learn(level, fix(t, told), ins, part, GATE), t
+            level, last = height_error.update(level, fix(t, told), ins, part, GATE), t
         now = height_error.at(level, ins)
         if k % round(hz) == 0:
             found.append((ins.position.alt - now.error - true, math.sqrt(now.covariance[0])))

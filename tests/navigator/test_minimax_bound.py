@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from companion.config import Config, InertialConfig
@@ -18,9 +20,10 @@ def test_two_fixes_of_one_instant_too_unlike_for_one_bin_both_count() -> None:
     for k in range(120):
         for sigma in (20.0, 200.0):
             value = tuple((sigma * rng.uniform(-1.0, 1.0, 2)).tolist())
-            both = minimax_bound.learn(both, k * NS, "position", value, (sigma, sigma), CONFIG.predictor)
+            fix: Any = (k * NS, "position", value, (sigma, sigma), CONFIG.predictor)
+            both = minimax_bound.add_fix(both, *fix)
             if sigma < 100.0:
-                near = minimax_bound.learn(near, k * NS, "position", value, (sigma, sigma), CONFIG.predictor)
+                near = minimax_bound.add_fix(near, *fix)
     assert len(both.north) + len(both.bins) == 240
     assert np.all(np.diff(both.north.t_ns) > 0)
     _, wide = minimax_bound.bounded(near, 130 * NS, CONFIG.predictor)

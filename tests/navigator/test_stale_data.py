@@ -13,7 +13,7 @@ from companion.navigator.stale_data import (
     ATTITUDE_S,
     HALF_ANSWERS,
     PATIENCE_S,
-    Freshness,
+    StaleDataDetector,
 )
 from companion.records import (
     AirData,
@@ -49,9 +49,9 @@ def rsbn(
 
 def verdicts(records) -> list[str]:
     """Of each record: "used", or what was told of it ("" where nothing was)."""
-    freshness, found = Freshness(), []
+    detector, found = StaleDataDetector(), []
     for record in records:
-        told = freshness.judge(record)
+        told = detector.judge(record)
         found.append("used" if told is None else " ".join(out.reason for out in told))
     return found
 
@@ -142,15 +142,15 @@ def test_a_sensor_without_noise_has_stopped(make, limit_s: float) -> None:
 
 
 def test_a_reboot_begins_anew() -> None:
-    freshness = Freshness()
-    freshness.judge(local(1.0, 4.0))
-    assert freshness.judge(Reboot(2 * NS, 2 * NS, 1)) is None
-    assert freshness.judge(local(1.1, 4.0)) is None
+    detector = StaleDataDetector()
+    detector.judge(local(1.0, 4.0))
+    assert detector.judge(Reboot(2 * NS, 2 * NS, 1)) is None
+    assert detector.judge(local(1.1, 4.0)) is None
 
 
 def test_the_navigator_takes_nothing_of_a_channel_that_froze() -> None:
     """Frozen at 40 m/s and believed, the channel would be off by 400 m after ten seconds."""
-    navigator = Navigator(Config(inertial=InertialConfig(source="local_position")))
+    navigator = Navigator(Config(inertial=InertialConfig(independent=True)))
     navigator.handle(LocalOrigin(0, 0, 1.0, 0.5, 0.0, "tangent"))
     told, after = [], []
     for i in range(1, 200):

@@ -199,8 +199,10 @@ def test_every_field_of_every_message(name: str, autopilot: Autopilot, fields: d
 def test_ardupilot_formula_returns_the_accuracy(name: str, sigma: float) -> None:
     m = encoded(name, covariance=(sigma**2, 0.0, 0.25 * sigma**2))
     c = m.pose_covariance if name == "ODOMETRY" else m.covariance
-    assert math.cbrt(c[0] ** 2 + c[6] ** 2 + c[11] ** 2) == pytest.approx(sigma)
-    assert math.cbrt(c[15] ** 2 + c[18] ** 2 + c[20] ** 2) == pytest.approx(1.5)
+    assert math.sqrt(c[0] + c[6] + c[11]) == pytest.approx(sigma)
+    assert math.sqrt(c[15] + c[18] + c[20]) == pytest.approx(1.5)
+    if sigma >= 3.0:  # older trees take it for less accurate, never for more
+        assert math.cbrt(c[0] ** 2 + c[6] ** 2 + c[11] ** 2) >= sigma
     assert all(map(math.isfinite, c))
 
 

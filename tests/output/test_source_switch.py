@@ -1,33 +1,171 @@
-"""Source switch: set 2 when GNSS is lost and our output is steady, set 1 when GNSS is trusted again."""
+"""Source switch: the table of predicates row by row, and the command that is repeated until acknowledged.
+
+First, do no harm: set 2 only where the receiver itself has no fix or GNSS is false with a witness, and set 1
+as soon as there is a fix that is not held false, whether or not the companion has a solution.
+"""
 
 import itertools
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from companion.output.source_switch import (
-    GNSS_LOST_NS,
-    GNSS_TRUSTED_NS,
+    BELIEVED,
+    FALSE,
+    FIX_S,
+    FRESH_S,
     MAX_TRIES,
-    OUTPUT_STEADY_NS,
+    NO_FIX_S,
+    SILENT_S,
+    STEADY_S,
+    STOPPED_S,
+    TO_COMPANION,
+    TO_GNSS,
+    Situation,
     SourceSwitch,
+    required_set,
 )
+from companion.records import Gnss, Mode, Solution
 from companion.units import SECOND_NS
 
 TENTH = SECOND_NS // 10
 ACCEPTED, TEMPORARILY_REJECTED, DENIED, UNSUPPORTED, FAILED = range(5)
+LONG = 1000.0
+
+#: GNSS and companion both well; each row of the table changes what it needs.
+WELL = Situation(
+    fix_s=LONG, no_fix_s=-1.0, silent_s=0.1, gnss_false=1e-6, witness=True, sent_s=LONG, stopped_s=0.0
+)
+NO_FIX: dict[str, Any] = {"fix_s": -1.0, "no_fix_s": NO_FIX_S}
+SILENT: dict[str, Any] = {"fix_s": -1.0, "silent_s": SILENT_S}
+LIE: dict[str, Any] = {"gnss_false": 0.9999, "witness": True}
+MUTE: dict[str, Any] = {"sent_s": -1.0, "stopped_s": STOPPED_S}
+BLIND: dict[str, Any] = {**MUTE, "gnss_false": None, "witness": False}
+
+TABLE: list[tuple[str, dict[str, Any], int | None]] = [
+    ("all well", {}, 1),
+    ("no fix", NO_FIX, 2),
+    ("no fix, not yet for long", {**NO_FIX, "no_fix_s": NO_FIX_S - 0.1}, None),
+    ("no fix, our position not yet steady", {**NO_FIX, "sent_s": STEADY_S - 0.1}, None),
+    ("no fix, our position does not go out", {**NO_FIX, **MUTE}, None),
+    ("no fix, no witness", {**NO_FIX, "witness": False}, 2),
+    ("no fix, and GNSS was believed false", {**NO_FIX, **LIE}, 2),
+    ("receiver silent", SILENT, 2),
+    ("receiver silent, not yet for long", {**SILENT, "silent_s": SILENT_S - 0.1}, None),
+    ("receiver silent, our position does not go out", {**SILENT, **MUTE}, None),
+    ("never received, a companion alone", {**SILENT, "silent_s": -1.0}, None),
+    ("GNSS false with a witness", LIE, 2),
+    ("GNSS false without a witness", {**LIE, "witness": False}, None),
+    ("GNSS probably false", {**LIE, "gnss_false": FALSE}, None),
+    ("GNSS false, our position does not go out", {**LIE, **MUTE}, None),
+    ("GNSS suspect", {"gnss_false": 0.5}, None),
+    ("GNSS suspect, our position does not go out", {**MUTE, "gnss_false": 0.5}, 1),
+    ("GNSS false without a witness, nothing goes out", {**LIE, **MUTE, "witness": False}, 1),
+    ("GNSS believed, the fix is new", {"fix_s": FIX_S - 0.1}, None),
+    ("GNSS nearly believed", {"gnss_false": BELIEVED}, None),
+    ("no solution", BLIND, 1),
+    ("no solution, the fix is new, nothing goes out", {**BLIND, "fix_s": 0.0}, 1),
+    ("no solution ever", {**BLIND, "stopped_s": -1.0}, 1),
+    ("no solution ever, the fix is new", {**BLIND, "stopped_s": -1.0, "fix_s": FIX_S - 0.1}, None),
+    ("our position has just stopped, the fix is new", {**MUTE, "fix_s": 0.0, "stopped_s": 1.9}, None),
+    ("no solution, no fix", {**BLIND, **NO_FIX}, None),
+]
+
+
+@pytest.mark.parametrize(("changes", "expected"), [row[1:] for row in TABLE], ids=[row[0] for row in TABLE])
+def test_table(changes: dict[str, Any], expected: int | None) -> None:
+    decision = required_set(WELL._replace(**changes))
+    assert (decision and decision[0]) == expected
+
+
+def test_every_predicate_decides_a_row_and_gives_its_reason() -> None:
+    decisions = [required_set(WELL._replace(**changes)) for _, changes, _ in TABLE]
+    reasons = {decision[1] for decision in decisions if decision is not None}
+    assert reasons == {predicate.reason for predicate in (*TO_COMPANION, *TO_GNSS)}
+
+
+seconds = st.one_of(st.just(-1.0), st.floats(0.0, 100.0))
+situations = st.builds(
+    Situation,
+    fix_s=seconds,
+    no_fix_s=seconds,
+    silent_s=seconds,
+    gnss_false=st.one_of(st.none(), st.floats(0.0, 1.0)),
+    witness=st.booleans(),
+    sent_s=seconds,
+    stopped_s=seconds,
+)
+
+
+@given(situations)
+def test_set_2_needs_our_position_and_a_reason_of_the_receiver_or_of_a_witness(s: Situation) -> None:
+    if (decision := required_set(s)) and decision[0] == 2:
+        held_false = s.witness and s.gnss_false is not None and s.gnss_false > FALSE
+        assert s.sent_s >= STEADY_S
+        assert s.no_fix_s >= NO_FIX_S or s.silent_s >= SILENT_S or held_false
+
+
+@given(situations)
+def test_set_1_needs_a_fix_that_is_not_held_false(s: Situation) -> None:
+    if (decision := required_set(s)) and decision[0] == 1:
+        assert s.fix_s >= 0.0
+        assert not (s.witness and s.gnss_false is not None and s.gnss_false > FALSE)
+
+
+# ---------------------------------------------------------------------------------------------------------
+# In flight
+# ---------------------------------------------------------------------------------------------------------
+
+
+def solution(now: int, gnss_false: float | None, witness: bool) -> Solution:
+    return Solution(
+        now,
+        now,
+        Mode.FIXED,
+        "kalman",
+        1.0,
+        0.5,
+        800.0,
+        (0.0, 0.0, 0.0),
+        (100.0, 0.0, 0.0, 100.0, 0.0, 25.0),
+        (0.0, 0.0),
+        (0.0, 0.0),
+        0,
+        0.0,
+        gnss_false=gnss_false,
+        witness=witness,
+    )
 
 
 class Flight:
-    """An autopilot that answers with `answer` (None: no answer), and our solutions at 10 Hz."""
+    """An autopilot that answers with `answer` (None: no answer); its receiver and our solutions at 5 Hz."""
 
     def __init__(self, answer: int | None = ACCEPTED) -> None:
         self.switch, self.now, self.answer = SourceSwitch(), 10**12, answer
         self.requests: list[tuple[float, int, int]] = []
         self.reports: list[tuple[float, str]] = []
 
-    def fly(self, seconds: float, gnss: bool, sent: bool = True) -> float:
-        """Simulate `seconds`; return the time at the end, s."""
-        for _ in range(round(10 * seconds)):
+    def fly(
+        self,
+        seconds: float,
+        fix: bool | None = True,
+        sent: bool = True,
+        solved: bool = True,
+        false: float = 1e-6,
+        witness: bool = True,
+    ) -> float:
+        """Simulate `seconds`, `fix` None is a silent receiver; return the time at the end, s."""
+        for k in range(round(10 * seconds)):
             self.now += TENTH
-            self.switch.update(gnss, sent, self.now)
+            if fix is not None and k % 2:
+                kind = 3 if fix else 1
+                self.switch.receive(Gnss(self.now, self.now, 0, self.now // 1000, kind, 1.0, 0.5, 100.0))
+            if solved:
+                self.switch.note_output(solution(self.now, false, witness), sent, self.now)
+            if solved or k % 10 == 0:
+                self.switch.update(self.now)
             for m in self.switch.to_send(7, self.now):
                 assert (m.target_system, m.target_component, m.command) == (7, 1, 42007)
                 self.requests.append((self.now * 1e-9, m.param1, m.confirmation))
@@ -43,76 +181,139 @@ class Flight:
 
 def test_set_2_on_gnss_loss_and_set_1_on_its_return() -> None:
     flight = Flight()
-    flight.fly(30.0, gnss=True)
+    lost = flight.fly(30.0)
     assert flight.sets == [1]  # the initial set is unknown
-    lost = flight.fly(0.1, gnss=False)
-    back = flight.fly(60.0, gnss=False)
-    flight.fly(60.0, gnss=True)
+    back = flight.fly(60.0, fix=False)
+    flight.fly(60.0)
     assert flight.sets == [1, 2, 1]
-    assert flight.requests[1][0] - lost == GNSS_LOST_NS / SECOND_NS
-    assert abs(flight.requests[2][0] - back - GNSS_TRUSTED_NS / SECOND_NS) <= 0.11
+    assert flight.requests[1][0] - lost == pytest.approx(NO_FIX_S, abs=0.31)
+    assert flight.requests[2][0] - back == pytest.approx(FIX_S, abs=0.31)
     assert [text for _, text in flight.reports] == [
-        "EKF source set 1: GNSS is trusted again",
+        "EKF source set 1: GNSS has a fix",
         "EKF source set 2: GNSS is lost, using companion",
-        "EKF source set 1: GNSS is trusted again",
+        "EKF source set 1: GNSS has a fix",
     ]
+
+
+def test_silent_receiver() -> None:
+    flight = Flight()
+    silent = flight.fly(30.0)
+    flight.fly(30.0, fix=None)
+    flight.fly(30.0)
+    assert flight.sets == [1, 2, 1]
+    assert flight.requests[1][0] - silent == pytest.approx(SILENT_S, abs=0.31)
+    assert flight.reports[1][1] == "EKF source set 2: GNSS receiver silent, using companion"
+
+
+def test_rejected_innovations_never_switch() -> None:
+    """A navigator that trusts no fix, without a witness or short of certainty, leaves the autopilot alone."""
+    flight = Flight()
+    flight.fly(30.0)
+    flight.fly(600.0, false=1.0, witness=False)
+    flight.fly(600.0, false=0.998, witness=True)
+    assert flight.sets == [1]
+
+
+def test_false_gnss_with_a_witness() -> None:
+    flight = Flight()
+    flight.fly(30.0)
+    flight.fly(30.0, false=0.9999)
+    assert flight.sets == [1, 2]
+    assert flight.reports[-1][1] == "EKF source set 2: GNSS is false, using companion"
+    flight.fly(60.0, false=0.5)  # not believed again: stays
+    assert flight.sets == [1, 2]
+    flight.fly(60.0, false=0.01)
+    assert flight.sets == [1, 2, 1]
+
+
+def test_lost_witness_leaves_the_aircraft_on_our_position_while_it_goes_out() -> None:
+    """A fix that was held false is not fit to lead because the beacon is silent for a while."""
+    flight = Flight()
+    flight.fly(30.0)
+    flight.fly(30.0, false=1.0)
+    flight.fly(60.0, false=1.0, witness=False)
+    assert flight.sets == [1, 2]
+    flight.fly(5.0, false=1.0, witness=False, sent=False)
+    assert flight.sets == [1, 2, 1]  # nothing goes out: ArduPilot would be lost on set 2
+
+
+@pytest.mark.parametrize("solved", [True, False])
+def test_silence_of_our_output_returns_to_set_1(solved: bool) -> None:
+    """GNSS returns in the dark moment when our output stops: withheld, or no solutions at all."""
+    flight = Flight()
+    flight.fly(30.0)
+    flight.fly(30.0, fix=False)
+    stopped = flight.fly(1.0, fix=True)
+    flight.fly(10.0, sent=False, solved=solved)
+    assert flight.sets == [1, 2, 1]
+    assert STOPPED_S <= flight.requests[2][0] - stopped <= STOPPED_S + 1.1
+    assert flight.reports[-1][1] == "EKF source set 1: no companion position"
+
+
+def test_solutions_that_end_return_to_set_1_after_a_false_gnss() -> None:
+    """A lie held with a witness is not forgotten at once; a solution of a minute ago says nothing more."""
+    flight = Flight()
+    flight.fly(30.0)
+    ended = flight.fly(30.0, false=1.0)
+    flight.fly(120.0, solved=False)
+    assert flight.sets == [1, 2, 1]
+    assert flight.requests[2][0] - ended == pytest.approx(FRESH_S, abs=1.1)
 
 
 def test_set_2_requires_our_position_to_be_sent() -> None:
     flight = Flight()
-    flight.fly(30.0, gnss=True, sent=False)
-    flight.fly(60.0, gnss=False, sent=False)
+    flight.fly(30.0, sent=False)
+    good = flight.fly(60.0, fix=False, sent=False)
     assert flight.sets == [1]
-    good = flight.fly(0.1, gnss=False, sent=True)
-    flight.fly(10.0, gnss=False, sent=True)
+    flight.fly(10.0, fix=False)
     assert flight.sets == [1, 2]
-    assert flight.requests[1][0] - good == OUTPUT_STEADY_NS / SECOND_NS
+    assert flight.requests[1][0] - good == pytest.approx(STEADY_S, abs=0.11)
 
 
 def test_intermittent_output_is_not_steady() -> None:
     flight = Flight()
-    flight.fly(30.0, gnss=True, sent=False)
+    flight.fly(30.0, sent=False)
     for _ in range(20):
-        flight.fly(2.5, gnss=False, sent=True)
-        flight.fly(0.1, gnss=False, sent=False)
+        flight.fly(2.5, fix=False)
+        flight.fly(0.1, fix=False, sent=False)
     assert flight.sets == [1]
 
 
-def test_intermittent_gnss_switches_nothing() -> None:
+def test_flickering_receiver_switches_nothing() -> None:
     flight = Flight()
-    flight.fly(30.0, gnss=True)
+    flight.fly(30.0)
     for _ in range(50):
-        flight.fly(1.5, gnss=False)
-        flight.fly(1.5, gnss=True)
+        flight.fly(1.5, fix=False)
+        flight.fly(1.5, fix=True)
     assert flight.sets == [1]
-    flight.fly(10.0, gnss=False)
+    flight.fly(10.0, fix=False)
     for _ in range(50):
-        flight.fly(9.0, gnss=True)
-        flight.fly(1.0, gnss=False)
+        flight.fly(4.0, fix=True)
+        flight.fly(1.0, fix=False)
     assert flight.sets == [1, 2]
 
 
-def test_gap_in_solutions_restarts_the_timers() -> None:
+def test_restart_in_the_dark() -> None:
+    """A companion that restarts while the autopilot is on set 2 takes it back to set 1 when GNSS returns."""
     flight = Flight()
-    flight.fly(30.0, gnss=True)
-    flight.fly(1.0, gnss=False)
-    flight.now += 60 * SECOND_NS
-    flight.fly(1.0, gnss=False)
+    flight.fly(20.0, fix=False, sent=False)  # nothing to send yet
+    assert flight.sets == []
+    flight.fly(20.0, fix=True, solved=False)  # and no solution: set 1 all the same
     assert flight.sets == [1]
 
 
 def test_command_is_repeated_until_acknowledged() -> None:
     flight = Flight()
-    flight.fly(30.0, gnss=True)
+    flight.fly(30.0)
     flight.answer = None
-    flight.fly(5.0, gnss=False)
+    flight.fly(5.0, fix=False)
     flight.answer = TEMPORARILY_REJECTED
-    flight.fly(2.0, gnss=False)
+    flight.fly(2.0, fix=False)
     flight.answer = ACCEPTED
-    flight.fly(20.0, gnss=False)
+    flight.fly(20.0, fix=False)
     requests = flight.requests[1:]
     assert [confirmation for *_, confirmation in requests] == list(range(len(requests)))
-    assert 4 <= len(requests) <= 6
+    assert 5 <= len(requests) <= 7
     assert all(round(b[0] - a[0], 6) == 1.0 for a, b in itertools.pairwise(requests))
     assert flight.reports[-1][1].startswith("EKF source set 2")
 
@@ -120,28 +321,28 @@ def test_command_is_repeated_until_acknowledged() -> None:
 def test_rejected_command_is_reported_once() -> None:
     for answer, expected in ((None, "10 tries"), (FAILED, "10 tries"), (DENIED, "2"), (UNSUPPORTED, "3")):
         flight = Flight(answer)
-        flight.fly(100.0, gnss=False)
+        flight.fly(100.0, fix=False)
         assert len(flight.requests) == (MAX_TRIES if "tries" in expected else 1)
         ((_, text),) = flight.reports
         assert expected in text and "source set 2" in text and "by hand" in text
         flight.answer = ACCEPTED
-        flight.fly(30.0, gnss=True)
+        flight.fly(30.0)
         assert flight.sets[-1] == 1  # the next set is requested
 
 
 def test_acknowledgement_of_another_command_is_ignored() -> None:
     flight = Flight(None)
-    flight.fly(6.0, gnss=False)
+    flight.fly(6.0, fix=False)
     flight.switch.handle_acknowledgement(511, ACCEPTED, flight.now)
     count = len(flight.requests)
-    flight.fly(5.0, gnss=False)
+    flight.fly(5.0, fix=False)
     assert len(flight.requests) > count
 
 
 def test_unrequested_acknowledgement_is_ignored() -> None:
     flight = Flight()
     flight.switch.handle_acknowledgement(42007, ACCEPTED, flight.now)
-    flight.fly(10.0, gnss=False)
+    flight.fly(10.0, fix=False)
     assert flight.sets == [2]
     flight.switch.handle_acknowledgement(42007, DENIED, flight.now)
     assert not flight.switch.take_events()
@@ -149,7 +350,7 @@ def test_unrequested_acknowledgement_is_ignored() -> None:
 
 def test_after_a_reboot_the_source_set_is_requested_again() -> None:
     flight = Flight()
-    flight.fly(10.0, gnss=False)
+    flight.fly(10.0, fix=False)
     flight.switch = SourceSwitch()  # as AutopilotOutput.handle_reboot does
-    flight.fly(10.0, gnss=False)
+    flight.fly(10.0, fix=False)
     assert flight.sets == [2, 2]

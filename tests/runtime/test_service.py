@@ -46,6 +46,22 @@ async def until(condition, seconds: float = 10.0) -> None:
     raise TimeoutError
 
 
+def test_flight_loads_only_what_it_needs() -> None:
+    """The companion starts in flight after a power failure: reports, importers and studies stay unloaded."""
+    code = "import sys, companion.runtime.service; print(*sys.modules)"
+    loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    ashore = ("analysis", "importers", "study", "bench", "doctor")
+    unneeded = (
+        *(f"companion.{name}" for name in ashore),
+        "rich",
+        "matplotlib",
+        "scipy.optimize",
+        "scipy.stats",
+    )
+    assert "companion.navigator" in loaded.split()
+    assert [m for m in loaded.split() if any(f"{m}.".startswith(f"{name}.") for name in unneeded)] == []
+
+
 def serve(tmp_path: Path, connect: tuple[str, ...], play) -> list[Event]:
     """Run a Service during `play(service, events)`; return its events."""
     events: list[Event] = []

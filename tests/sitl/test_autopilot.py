@@ -57,6 +57,7 @@ def test_default_message_rate_is_one_hertz():
         "ATTITUDE",
         "VFR_HUD",
         "SYSTEM_TIME",
+        "SYS_STATUS",
     ):
         assert len(grouped[name]) == 60, name
     assert "SIM_STATE" not in grouped

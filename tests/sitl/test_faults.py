@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from companion.link import dialect, frame
-from companion.records import AirData, Gnss, LocalPosition, RsbnFix
+from companion.records import AirData, Attitude, Gnss, LocalPosition, RsbnFix
 from sitl.faults import (
     AUTOPILOT_FAULTS,
     CONSUMER_FAULTS,
@@ -32,6 +32,8 @@ def stream_of(kind, count=60):
             return RsbnFix(t, t, k % 2, 1.0, 0.5, 60.0 + 1e-3 * k, 3.0, 50e3, 0.002, 107.5)
         if kind is LocalPosition:
             return LocalPosition(t, t, (10.0 * k, 0.0, -100.0), (10.0, 0.0, 0.0))
+        if kind is Attitude:
+            return Attitude(t, t, 0.0, 0.0, 6.25)
         return AirData(t, t, 38.0 + 0.1 * k)
 
     return [one(k) for k in range(count)]
@@ -108,6 +110,38 @@ def test_ins_reset_and_nan():
     assert math.dist(before[30].x_n, after[30].x_n) == pytest.approx(200.0)
     _, after = apply_fault("ins-nan")
     assert all(map(math.isnan, after[30].x_n + after[30].v_n))
+
+
+def test_accelerating_spoofer_and_false_fix_after_an_outage():
+    before, after = apply_fault("gnss-accelerate", 0.1)
+    assert east_of(after[30], before[30]) == pytest.approx(0.5 * 0.1 * 10.0**2, rel=1e-3)
+    assert after[30].v_n[1] == pytest.approx(before[30].v_n[1] + 1.0)
+    before = stream_of(Gnss, 200)
+    after = apply_record_faults(Gnss, before, (Fault("gnss-return", 20.0, size=450.0),), RNG(1))
+    assert not any(fix.has_3d_fix for fix in after[20:80])
+    assert all(fix.has_3d_fix for fix in after[80:])
+    assert east_of(after[80], before[80]) == pytest.approx(450.0 * math.sqrt(0.5), rel=1e-3)
+
+
+def test_latency_moves_stamp_and_arrival():
+    before, after = apply_fault("gnss-latency", 0.3)
+    assert {a.t_ns - b.t_ns for a, b in zip(after[20:39], before[20:39])} == {3 * S // 10}
+    assert all(a.rx_ns == a.t_ns and a.lat == b.lat for a, b in zip(after, before, strict=True))
+
+
+def test_pitot_and_heading():
+    before, after = apply_fault("pitot-stuck", 8.0)
+    assert {air.airspeed for air in after[20:40]} == {8.0}
+    before, after = apply_fault("pitot-scale", 1.5)
+    assert after[30].airspeed == pytest.approx(1.5 * before[30].airspeed)
+    before, after = apply_fault("heading-off", 0.1)
+    assert after[30].heading == pytest.approx(before[30].heading + 0.1 - math.tau)
+
+
+def test_ins_drift_has_a_consistent_velocity():
+    before, after = apply_fault("ins-drift", 2.0)
+    assert before[30].x_n[0] - after[30].x_n[0] == pytest.approx(20.0)
+    assert before[30].v_n[0] - after[30].v_n[0] == pytest.approx(2.0)
 
 
 def test_airspeed_icing_freezing_and_wind_shear():

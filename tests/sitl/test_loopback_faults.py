@@ -108,7 +108,7 @@ def test_ten_gnss_outages(tmp_path: Path, channel: str, beacons) -> None:
     flown = LoggedFlight(tmp_path, channel, gnss_outages=outages, beacons=beacons)
     flown.assert_accuracy()
     flown.assert_no_jump()
-    lost = r"fixed: azimuth and range fixes" if beacons else r"predicting: no fixes; the guaranteed bound is"
+    lost = r"fixed: azimuth and range fixes" if beacons else r"predicting: no fixes; protection level"
     back = r"fixed: gnss and azimuth and range fixes" if beacons else r"fixed: gnss fixes"
     flown.assert_events(*itertools.chain.from_iterable([lost, back] for _ in outages))
     assert sum(bool(re.search(lost, line)) for line in flown.event_lines()) == len(outages)
@@ -135,7 +135,7 @@ def test_autopilot_reboot_during_gnss_outage(tmp_path: Path, channel: str) -> No
     )
     flown.assert_accuracy()
     flown.assert_no_jump(longest_gap_s=8.0 + 2.0)  # until the first beacon answer
-    reset = "navigator" if channel == "local_position" else "air data"
+    reset = "navigator" if channel == "local_position" else "sensors"
     flown.assert_events(
         "silent for 5 s", "autopilot 1 connected", "1 rebooted", f"{reset}: autopilot 1 rebooted"
     )
@@ -160,7 +160,7 @@ def test_estimated_wind_survives_a_reboot(tmp_path: Path) -> None:
     )
     flown.assert_accuracy()
     flown.assert_no_jump(longest_gap_s=8.0 + 1.0)
-    flown.assert_events("air data: autopilot 1 rebooted", "no airspeed with attitude for 8")
+    flown.assert_events("sensors: autopilot 1 rebooted")
     last = flown.solutions[-1]
     north, east, _ = separation(place(last), flown.truth(last.t_ns))
     assert math.hypot(north, east) < 0.5 * 6.4 * 140.0  # half of the error without a wind estimate
@@ -173,8 +173,6 @@ def test_link_loss_of_thirty_seconds(tmp_path: Path, channel: str, outages) -> N
     flown.assert_accuracy()
     flown.assert_no_jump(longest_gap_s=31.0)
     flown.assert_events("silent for 5 s", r"14[56]\.\d sitl: autopilot 1 connected")
-    if channel == "air_data":
-        flown.assert_events("no airspeed with attitude for 30")
     down = [s for s in flown.logged if isinstance(s, LinkState) and not s.connected]
     assert 20 <= len(down) <= 30  # one per second after the link counts as lost
 
@@ -214,9 +212,7 @@ def test_autopilot_filter_reset_of_forty_metres(tmp_path: Path, outages) -> None
     )
     flown.assert_accuracy()
     flown.assert_no_jump()
-    flown.assert_events(
-        r"120\.\d inertial channel: it jumped by 40", r"180\.\d inertial channel: it jumped by 40"
-    )
+    flown.assert_events(r"120\.\d inertial channel: jumped by 40", r"180\.\d inertial channel: jumped by 40")
 
 
 def test_air_data_channel_ignores_local_position_resets(tmp_path: Path) -> None:

@@ -124,6 +124,7 @@ def test_solutions_are_on_time_with_a_failing_or_blocked_disk(tmp_path: Path, mo
     monkeypatch.setattr(state_file, "replace_text", replace_slowly)
     parameters = tmp_path / "set.toml"
     flags = {"output.status_hz": 1.0 / EVERY_S, "link.parameters_file": str(parameters)}
+    flags["inertial.independent"] = True  # its positions alone move the channel
     wish = dialect.new(
         "PARAM_SET",
         param_id=b"GNSS_SIGMA_M",

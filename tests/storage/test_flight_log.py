@@ -47,6 +47,8 @@ EVERY_KIND = [
     r.Wind(T + 16, T + 17, (3.0, -4.0, 0.1)),
     r.Pressure(T + 18, T + 19, 101325.0, None, 288.15),
     r.FilterStatus(T + 20, T + 21, 831, False, 0.05),
+    r.AirspeedSensor(T + 20, T + 21, True),
+    r.GnssIntegrity(T + 20, T + 21, 0, 1, 2),
     r.SystemTime(T + 22, T + 23, 10**9),
     r.RsbnFix(T + 24, T + 25, 7, 0.91, -2.0, 120.0, None, 81234.5, 0.0044, 200.0),
     r.Fix(T + 26, T + 26, 0.9, -2.1, 3.0, (1.0, 2.0), (4.0, 0.5, 9.0), 6, 1.2, 2, 4),

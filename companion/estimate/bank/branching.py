@@ -1,0 +1,232 @@
+"""Births and deaths: children of the rows, each with one event more than its parent, at the prior rate.
+
+A child is born when a fault may have started, changed or ended, when base states may have jumped, when the
+amplitude of the noise may be another, and when a source returns after silence.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from companion.estimate.bank.layout import NEVER, NONE, Layout, Lie
+from companion.estimate.bank.readout import level_rows
+from companion.estimate.bank.reduction import reduce
+from companion.estimate.bank.settings import DEFAULT, Settings
+from companion.estimate.bank.state import Bank, families, normalised
+
+HOUR_S = 3600.0
+
+
+class _Child(NamedTuple):
+    """A row to be born: parent, log of the prior, what changes."""
+
+    parent: int
+    log_prior: float
+    fault: int = NONE
+    lie: Lie | None = None
+    scale: int = 0
+    ends: bool = False
+    jump: int = NONE
+    grade: int = NONE
+
+
+def births_due(bank: Bank, settings: Settings = DEFAULT) -> bool:
+    """Report whether `births` is due.
+
+    Parameters
+    ----------
+    bank : at the present time.
+    settings : interval of births.
+
+    Returns
+    -------
+    bool : whether the interval has passed since the last births.
+    """
+    return bank.t - bank.born_t >= settings.birth_s
+
+
+def births(
+    bank: Bank,
+    layout: Layout,
+    settings: Settings = DEFAULT,
+    rate_factor: dict[int, float] | None = None,
+) -> Bank:
+    """Bear children for what may have started or ended since the last births, and reduce the rows.
+
+    Faults of a silent source are frozen: they neither begin nor end.
+
+    Parameters
+    ----------
+    bank, layout, settings : the bank.
+    rate_factor : factor on the prior rate by fault, e.g. 100 while the receiver itself reports jamming.
+
+    Returns
+    -------
+    Bank : with at most `settings.rows` rows.
+    """
+    hours = (bank.t - bank.born_t) / HOUR_S
+    if hours <= 0.0:
+        return bank
+    factor = rate_factor or {}
+    parents = _parents(bank, layout, settings)
+    heard = heard_sources(bank, layout)
+    children: list[_Child] = []
+    for p in parents:
+        for f, fault in enumerate(layout.faults):
+            if not all(heard[s] for s in fault.sources):
+                continue
+            now = bank.fault[p, layout.fault_group(f)]
+            if now == NONE:
+                rate = fault.rate_h * factor.get(f, 1.0)
+                children += _lie_children(int(p), f, fault.lies, rate * hours)
+            elif now == f:
+                children.append(_Child(int(p), _log(min(fault.death_h * hours, 0.5)), f, ends=True))
+                children += _lie_children(int(p), f, fault.lies, fault.change_h * hours)
+        for j, jump in enumerate(layout.jumps):
+            children.append(_Child(int(p), _log(jump.rate_h * hours), jump=j))
+    children += _grade_children(bank, layout, settings, hours)
+    grown = _with_children(bank, layout, [c for c in children if c.log_prior > NEVER])
+    return reduce(grown._replace(born_t=bank.t), layout, settings)
+
+
+def returns(bank: Bank, layout: Layout, source: int, settings: Settings) -> tuple[Bank, bool]:
+    """Bear "captured" children at the first measurement of a source after silence; report whether any.
+
+    A row that held the source to be false before keeps it so, and gets children whose lie is redrawn.
+
+    Parameters
+    ----------
+    bank, layout, settings : the bank before the measurement.
+    source : index of the source that was silent.
+
+    Returns
+    -------
+    Bank, bool : the bank to be updated, and whether children were born.
+    """
+    heard = heard_sources(bank, layout)
+    heard[source] = True
+    children: list[_Child] = []
+    order = np.argsort(-bank.L)
+    for p in order[: max(settings.parents, len(layout.grades))] if settings.parents else order:
+        for f, fault in enumerate(layout.faults):
+            if source not in fault.sources or not all(heard[s] for s in fault.sources):
+                continue
+            now = bank.fault[p, layout.fault_group(f)]
+            if now == NONE:
+                children += _lie_children(int(p), f, fault.first_lies, fault.first)
+            elif now == f:
+                children += _lie_children(int(p), f, fault.first_lies, 0.3)
+    grown = _with_children(bank, layout, [c for c in children if c.log_prior > NEVER])
+    if len(grown.L) == len(bank.L):
+        return bank, False
+    return reduce(grown, layout, settings), True
+
+
+def _lie_children(parent: int, fault: int, lies: tuple[Lie, ...], prior: float) -> list[_Child]:
+    """Children of one parent for one fault, one for each scale of the lie."""
+    total = sum(lie.share for lie in lies)
+    return [_Child(parent, _log(prior * lie.share / total), fault, lie, i) for i, lie in enumerate(lies)]
+
+
+def _grade_children(bank: Bank, layout: Layout, settings: Settings, hours: float) -> list[_Child]:
+    """The heaviest row with another grade, where no row of that grade is as heavy as a switch's prior."""
+    if settings.switch_h <= 0.0 or len(layout.grades) < 2:
+        return []
+    best = int(np.argmax(bank.L))
+    prior = _log(settings.switch_h * hours / (len(layout.grades) - 1))
+    out = []
+    for g in range(len(layout.grades)):
+        rows = bank.grade == g
+        if g != bank.grade[best] and (not rows.any() or bank.L[rows].max() < bank.L[best] + prior):
+            out.append(_Child(best, prior, grade=g))
+    return out
+
+
+def _parents(bank: Bank, layout: Layout, settings: Settings) -> list[int]:
+    """Rows that bear: the heaviest, those of the level, and the heaviest of each family and grade."""
+    order = np.lexsort((bank.since, bank.scale, bank.event, np.round(-bank.L, 9)))
+    if settings.parents == 0:
+        return [int(i) for i in order]
+    chosen = [int(i) for i in order[: settings.parents]]
+    chosen += [int(i) for i in level_rows(bank, layout, settings.level_parents, settings.risk)]
+    met: set[tuple[int, int]] = set()
+    for i, code, grade in zip(order, families(bank)[order].tolist(), bank.grade[order].tolist()):
+        if bank.L[i] < settings.parent_floor:
+            break
+        if (code, grade) not in met:
+            met.add((code, grade))
+            chosen.append(int(i))
+    return list(dict.fromkeys(chosen))
+
+
+def heard_sources(bank: Bank, layout: Layout) -> list[bool]:
+    """Return which sources are not silent.
+
+    Parameters
+    ----------
+    bank, layout : the bank.
+
+    Returns
+    -------
+    One boolean per source.
+    """
+    return [bank.t - bank.seen[i] <= s.silence_s for i, s in enumerate(layout.sources)]
+
+
+def _log(p: float) -> float:
+    return math.log(p) if p > 0.0 else NEVER
+
+
+def _with_children(bank: Bank, layout: Layout, children: list[_Child]) -> Bank:
+    """The bank with children appended; each parent keeps the weight it did not give away."""
+    if not children:
+        return bank
+    rows, k = len(bank.L), len(children)
+    at = np.concatenate((np.arange(rows), [c.parent for c in children]))
+    prior = np.array([c.log_prior for c in children])
+    given = np.zeros(rows)
+    np.add.at(given, [c.parent for c in children], np.exp(prior))
+    L = np.concatenate((bank.L + np.log1p(-np.minimum(given, 0.9)), bank.L[at[rows:]] + prior))
+    x, P, noise = bank.x[at], bank.P[at], bank.noise[at]
+    grade, fault, event, scale = bank.grade[at], bank.fault[at], bank.event[at], bank.scale[at]
+    since = bank.since[at]
+    F = len(layout.faults)
+    for i, c in zip(range(rows, rows + k), children):
+        since[i] = bank.t
+        if c.ends:
+            g = layout.fault_group(c.fault)
+            index = layout.starts[g] + np.arange(layout.sizes[g])
+            x[i, index] = 0.0
+            P[i, index, :] = 0.0
+            P[i, :, index] = 0.0
+            a = sum(layout.groups[:g])
+            noise[i, a : a + layout.groups[g]] = 0.0
+            fault[i, g], event[i], scale[i] = NONE, 1 + F + c.fault, 0
+        elif c.lie is not None:
+            index, variance, places, density = layout.lie_prior(c.fault, c.lie)
+            for state, sigma in layout.faults[c.fault].shock:
+                P[i, state, state] += sigma**2
+            P[i, index, index] += variance
+            noise[i, places] = density
+            fault[i, layout.fault_group(c.fault)], event[i], scale[i] = c.fault, 1 + c.fault, c.scale
+        elif c.jump != NONE:
+            j = layout.jumps[c.jump]
+            P[i, list(j.states), list(j.states)] += np.square(j.sigma)
+            event[i] = 1 + 2 * F + c.jump
+        else:
+            grade[i] = c.grade
+            since[i], event[i] = bank.since[c.parent], bank.event[c.parent]
+    return bank._replace(
+        L=normalised(L),
+        x=x,
+        P=P,
+        grade=grade,
+        fault=fault,
+        event=event,
+        since=since,
+        scale=scale,
+        noise=noise,
+    )

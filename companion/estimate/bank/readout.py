@@ -1,0 +1,204 @@
+"""Read-offs: estimate, probabilities, decisions with hysteresis, and the protection level."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from companion.estimate.bank.layout import Bools, Ints, Layout
+from companion.estimate.bank.protection import exceedance, level
+from companion.estimate.bank.settings import DEFAULT, Settings
+from companion.estimate.bank.state import Bank, false_rows, families
+from companion.units import Floats
+
+
+class Estimate(NamedTuple):
+    """Moments of the leading family.
+
+    Attributes
+    ----------
+    x : (n,) mean.
+    P : (n, n) covariance, spread of the rows' means included.
+    family : code of the family, see `families`.
+    weight : its weight; 0 if it has no rows left, then `x` and `P` are those of the heaviest row.
+    """
+
+    x: Floats
+    P: Floats
+    family: int
+    weight: float
+
+
+def decide(bank: Bank, layout: Layout, settings: Settings = DEFAULT) -> Bank:
+    """Advance the decisions that have hysteresis: leading family and excluded sources. Call after updates.
+
+    Parameters
+    ----------
+    bank, layout : the bank.
+    settings : thresholds and hysteresis.
+
+    Returns
+    -------
+    Bank : with `family` and `excluded` renewed.
+    """
+    w, code = bank.weights, families(bank)
+    totals: dict[int, float] = {}
+    for c, v in zip(code.tolist(), w.tolist()):
+        totals[c] = totals.get(c, 0.0) + v
+    best = max(totals, key=lambda c: totals[c])
+    leading = bank.family
+    if totals[best] > settings.hysteresis * totals.get(leading, 0.0):
+        leading = best
+    p = false_probability(bank, layout)
+    excluded = np.where(bank.excluded, p >= settings.believed, p > settings.excluded)
+    return bank._replace(family=leading, excluded=excluded)
+
+
+def estimate(bank: Bank) -> Estimate:
+    """Return the moments of the leading family (see `decide`).
+
+    Parameters
+    ----------
+    bank : the bank.
+
+    Returns
+    -------
+    Estimate
+    """
+    w = np.where(families(bank) == bank.family, bank.weights, 0.0)
+    total = float(w.sum())
+    if total == 0.0:
+        i = int(np.argmax(bank.L))
+        return Estimate(bank.x[i], bank.P[i], bank.family, 0.0)
+    w = w / total
+    at = w > 1e-9
+    w, x = w[at] / w[at].sum(), bank.x[at]
+    mean = w @ x
+    d = (x - mean) * np.sqrt(w)[:, None]
+    n = len(mean)
+    P = (w @ bank.P[at].reshape(len(w), -1)).reshape(n, n) + d.T @ d
+    return Estimate(mean, P, bank.family, total)
+
+
+def false_probability(bank: Bank, layout: Layout) -> Floats:
+    """Return the probability that each source is false now.
+
+    Parameters
+    ----------
+    bank, layout : the bank.
+
+    Returns
+    -------
+    (sources,) probabilities.
+    """
+    w = bank.weights
+    out = np.zeros(len(layout.sources))
+    for s in range(len(out)):
+        out[s] = float(w[false_rows(bank, layout, s)].sum())
+    return out
+
+
+def fault_probability(bank: Bank, layout: Layout) -> Floats:
+    """Return the probability that each fault is active now.
+
+    Parameters
+    ----------
+    bank, layout : the bank.
+
+    Returns
+    -------
+    (faults,) probabilities.
+    """
+    w = bank.weights
+    return np.array([float(w[(bank.fault == f).any(axis=1)].sum()) for f in range(len(layout.faults))])
+
+
+def grade_probability(bank: Bank, layout: Layout) -> Floats:
+    """Return the probability of each grade.
+
+    Parameters
+    ----------
+    bank, layout : the bank.
+
+    Returns
+    -------
+    (grades,) probabilities.
+    """
+    out: Floats = np.bincount(bank.grade, bank.weights, len(layout.grades)).astype(np.float64)
+    return out
+
+
+def suspects(bank: Bank, layout: Layout, settings: Settings = DEFAULT) -> Bools:
+    """Return which sources are suspected.
+
+    Parameters
+    ----------
+    bank, layout : the bank.
+    settings : threshold of the probability.
+
+    Returns
+    -------
+    (sources,) booleans.
+    """
+    out: Bools = false_probability(bank, layout) > settings.suspect
+    return out
+
+
+def protection_level(
+    bank: Bank, layout: Layout, risk: float | None = None, about: Floats | None = None
+) -> float:
+    """Return the radius that the position error exceeds with probability `risk` at most.
+
+    The least r with sum_i w_i P(|x_i - x_hat + e_i| > r) <= risk, e_i of covariance P_i.
+
+    Parameters
+    ----------
+    bank, layout : the bank.
+    risk : probability, 1e-7 by default.
+    about : (2,) the position that is sent; the estimate of the leading family by default.
+
+    Returns
+    -------
+    float : radius, in the unit of the position states.
+    """
+    d, C = about_estimate(bank, layout, about)
+    return level(bank.weights, d, C, DEFAULT.risk if risk is None else risk)
+
+
+def about_estimate(bank: Bank, layout: Layout, about: Floats | None = None) -> tuple[Floats, Floats]:
+    """Return the rows' positions relative to the estimate.
+
+    Parameters
+    ----------
+    bank, layout : the bank.
+    about : (2,) another centre.
+
+    Returns
+    -------
+    (R, 2) means and (R, 2, 2) covariances.
+    """
+    at = list(layout.position)
+    centre = estimate(bank).x[at] if about is None else about
+    return bank.x[:, at] - centre, bank.P[:, at][:, :, at]
+
+
+def level_rows(bank: Bank, layout: Layout, count: int, risk: float) -> Ints:
+    """Return the rows that contribute most to the risk at the protection level.
+
+    Parameters
+    ----------
+    bank, layout : the bank.
+    count : number of rows.
+    risk : probability.
+
+    Returns
+    -------
+    (count,) indices of rows.
+    """
+    if count == 0:
+        return np.zeros(0, dtype=np.int64)
+    d, C = about_estimate(bank, layout)
+    w = bank.weights
+    r = level(w, d, C, risk)
+    return np.argsort(-w * exceedance(r, d, C))[:count]

@@ -1,0 +1,246 @@
+"""Recursion of a bank: all rows are propagated and updated as one batch of Kalman filters.
+
+The weight of a row is multiplied by the likelihood of its innovation. A row that holds the source to be false
+sees the source's lie in the measurement: its columns of H are filled in here.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from companion.estimate.bank.branching import births, returns
+from companion.estimate.bank.layout import NEVER, Bools, Layout
+from companion.estimate.bank.settings import DEFAULT, Settings
+from companion.estimate.bank.state import Bank, false_rows, normalised
+from companion.units import Floats
+
+LOG_2PI = math.log(2.0 * math.pi)
+
+Measurement = tuple[Floats, Floats]
+"""z (R, m) and H (R, m, k), linearised for each row."""
+
+
+class Innovation(NamedTuple):
+    """Innovations of an update, per row of the bank that was updated.
+
+    Attributes
+    ----------
+    nu : (R, m) innovations.
+    S : (R, m, m) their covariances.
+    nis : (R,) normalised squared innovations.
+    born : whether births took place before the update.
+    refused : (R,) whether the row took the measurement for an outlier.
+    """
+
+    nu: Floats
+    S: Floats
+    nis: Floats
+    born: bool
+    refused: Bools
+
+
+def propagate(bank: Bank, layout: Layout, dt: float, Phi: Floats, Q: Floats, u: Floats | None = None) -> Bank:
+    """Propagate all rows by dt seconds: x = Phi x + u, P = Phi P Phi' + Q, offsets += rates dt.
+
+    Parameters
+    ----------
+    bank, layout : the bank.
+    dt : s.
+    Phi : transition, (k, k) for all rows or (R, k, k) per row; k is n_base or n. With n the caller may let
+        a lie feed base states; the motion of the lies themselves is filled in here.
+    Q : process noise, (k, k) for all or (grades, k, k) by grade.
+    u : (k,) known increment of the base states, or None.
+
+    Returns
+    -------
+    Bank : at t + dt.
+    """
+    R, n = bank.x.shape
+    F = _padded(layout, Phi, dt)
+    if F.ndim == 2:
+        FT = np.ascontiguousarray(F.T)
+        x = bank.x @ FT
+        # two flat products: P is symmetric, so (P F')' = F P, and one transposed copy stands in for F @ (.)
+        half = (bank.P.reshape(-1, n) @ FT).reshape(R, n, n)
+        P = (np.ascontiguousarray(half.transpose(0, 2, 1)).reshape(-1, n) @ FT).reshape(R, n, n)
+    else:
+        x = (F @ bank.x[:, :, None])[:, :, 0]
+        P = F @ bank.P @ F.transpose(0, 2, 1)
+    if u is not None:
+        x[:, : len(u)] += u
+    k = Q.shape[-1]
+    P[:, :k, :k] += Q[bank.grade] if Q.ndim == 3 else Q
+    if len(layout.rates):
+        diagonal = P.reshape(R, -1)[:, :: n + 1]
+        diagonal[:, layout.rates] += bank.noise * dt
+    return bank._replace(t=bank.t + dt, x=x, P=P)
+
+
+def _padded(layout: Layout, Phi: Floats, dt: float) -> Floats:
+    """Phi over all states, the lies moving on by their rates."""
+    k, n = Phi.shape[-1], layout.n
+    F = np.zeros((*Phi.shape[:-2], n, n))
+    F[..., :k, :k] = Phi
+    lies = np.arange(layout.n_base, n)
+    F[..., lies, lies] = 1.0
+    F[..., layout.offsets, layout.rates] = dt
+    if layout.accelerations[0].size:
+        offsets, rates, accelerations = layout.accelerations
+        F[..., offsets, accelerations] = 0.5 * dt * dt
+        F[..., rates, accelerations] = dt
+    return F
+
+
+def update(
+    bank: Bank,
+    layout: Layout,
+    z: Floats | Callable[[Bank], Measurement],
+    H: Floats | None,
+    R: Floats,
+    source: int | None,
+    settings: Settings = DEFAULT,
+    outlier: float = NEVER,
+    derivative: bool = False,
+    bears: bool = False,
+) -> tuple[Bank, Innovation]:
+    """Update all rows by one measurement z = H x + lie + white noise, and reweight them.
+
+    The first measurement of a source after silence bears "captured" children first; a measurement far from
+    the leading row bears children at once. Births in flight are `births`, on the caller's clock. A row for
+    which the measurement is less likely than an outlier does not use it and pays the price of one.
+
+    Parameters
+    ----------
+    bank, layout : the bank, propagated to the time of the measurement.
+    z : (m,) for all rows, or a function of the bank that returns z (R, m) and H (R, m, k): a measurement that
+        is nonlinear, or that depends on the hypothesis.
+    H : (m, k) for all or (R, m, k) per row; k is n_base or n. The lie's columns are filled in here. None
+        where z is a function.
+    R : (m, m) covariance of the white noise.
+    source : index of the source, None for a measurement that cannot be false.
+    settings : births on return and on surprise.
+    outlier : log density of a measurement that has nothing to do with its quantity, prior included.
+    derivative : the measurement is a velocity of the source, so it sees the rate of the lie, not the offset.
+    bears : a surprise bears children although the measurement itself cannot be false.
+
+    Returns
+    -------
+    Bank, Innovation
+
+    Raises
+    ------
+    ValueError : a covariance is not positive definite, or z is no number.
+    """
+    fixed = H is not None and H.ndim == 3  # rows must stay as they are
+    born = False
+
+    def innovations(bank: Bank) -> _Step:
+        z_rows, H_rows = z(bank) if callable(z) else (z, H)
+        assert H_rows is not None
+        if not np.isfinite(z_rows).all():
+            raise ValueError("measurement is not a number")
+        return _innovations(bank, layout, z_rows, H_rows, R, source, derivative)
+
+    if source is not None and not fixed and bank.t - bank.seen[source] > layout.sources[source].silence_s:
+        bank, born = returns(bank, layout, source, settings)
+    step = innovations(bank)
+    if (
+        (source is not None or bears)
+        and not fixed
+        and not born
+        and settings.surprise < math.inf
+        and bank.t - bank.born_t >= settings.surprise_gap_s
+        and step.nis[int(np.argmax(bank.L))] > settings.surprise * step.nu.shape[-1]
+    ):
+        bank = births(bank, layout, settings)
+        born = True
+        step = innovations(bank)
+    refused = step.log_likelihood < outlier
+    G, white = step.G, step.white
+    if refused.any():
+        taken = np.where(refused, 0.0, 1.0)
+        G, white = G * taken[:, None, None], white * taken[:, None]
+    P = bank.P - G @ G.transpose(0, 2, 1)
+    x = bank.x + (G @ white[:, :, None])[:, :, 0]
+    L = normalised(bank.L + np.maximum(step.log_likelihood, outlier))
+    seen = bank.seen
+    if source is not None:
+        seen = seen.copy()
+        seen[source] = bank.t
+    return bank._replace(L=L, x=x, P=P, seen=seen), Innovation(step.nu, step.S, step.nis, born, refused)
+
+
+class _Step(NamedTuple):
+    """Of an update: innovation, its covariance, S^-1/2 nu, P H' S^-T/2, NIS, log likelihood; per row."""
+
+    nu: Floats
+    S: Floats
+    white: Floats
+    G: Floats
+    nis: Floats
+    log_likelihood: Floats
+
+
+def _innovations(
+    bank: Bank, layout: Layout, z: Floats, H: Floats, R: Floats, source: int | None, derivative: bool
+) -> _Step:
+    """Innovations and square-root gains of all rows; P - G G' is the posterior covariance."""
+    rows, n = bank.x.shape
+    m, k = H.shape[-2:]
+    if H.ndim == 2:
+        HT = np.zeros((n, m))
+        HT[:k] = H.T
+        PHt = (bank.P.reshape(-1, n) @ HT).reshape(rows, n, m)
+        nu = z - bank.x @ HT
+    else:
+        HT = np.zeros((rows, n, m))
+        HT[:, :k] = H.transpose(0, 2, 1)
+        PHt = bank.P @ HT
+        nu = z - (bank.x[:, None, :] @ HT)[:, 0]
+    lie, false = None, None
+    if source is not None:
+        false = false_rows(bank, layout, source)
+        if false.any():
+            lie = layout.lie_states(source) + derivative * layout.groups[layout.sources[source].group]
+            a, b = int(lie[0]), int(lie[-1]) + 1
+            mask = false.astype(np.float64)
+            PHt = PHt + mask[:, None, None] * bank.P[:, :, a:b]
+            nu = nu - mask[:, None] * bank.x[:, a:b]
+    PHt_T = PHt.transpose(0, 2, 1)
+    S = PHt_T @ HT
+    if lie is not None:
+        S += mask[:, None, None] * PHt_T[:, :, a:b]
+    S += R
+    # lower triangular root of S, in closed form for one and two components
+    if m <= 2:
+        s00 = S[:, 0, 0]
+        if not s00.min() > 0.0:
+            raise ValueError("covariance not positive definite")
+        r0 = np.sqrt(s00)
+        white, G = np.empty((rows, m)), np.empty((rows, n, m))
+        white[:, 0] = nu[:, 0] / r0
+        np.divide(PHt[:, :, 0], r0[:, None], out=G[:, :, 0])
+        log_root = np.log(r0)
+        if m == 2:
+            c = S[:, 1, 0] / r0
+            s11 = S[:, 1, 1] - c * c
+            if not s11.min() > 0.0:
+                raise ValueError("covariance not positive definite")
+            r1 = np.sqrt(s11)
+            white[:, 1] = (nu[:, 1] - c * white[:, 0]) / r1
+            G[:, :, 1] = (PHt[:, :, 1] - c[:, None] * G[:, :, 0]) / r1[:, None]
+            log_root = log_root + np.log(r1)
+    else:
+        try:
+            root = np.linalg.cholesky(S)
+        except np.linalg.LinAlgError:
+            raise ValueError("covariance not positive definite") from None
+        white = np.linalg.solve(root, nu[:, :, None])[:, :, 0]
+        G = np.linalg.solve(root, PHt_T).transpose(0, 2, 1)
+        log_root = np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)
+    nis = (white * white).sum(axis=1)
+    return _Step(nu, S, white, G, nis, -0.5 * (nis + m * LOG_2PI) - log_root)

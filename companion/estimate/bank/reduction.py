@@ -1,0 +1,182 @@
+"""Reduction: which rows are kept, and where the weight of the others goes."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from companion.estimate.bank.layout import NONE, Ints, Layout
+from companion.estimate.bank.readout import level_rows
+from companion.estimate.bank.settings import Settings
+from companion.estimate.bank.state import Bank, families, normalised
+from companion.units import Floats
+
+
+def reduce(bank: Bank, layout: Layout, settings: Settings) -> Bank:
+    """Reduce the bank to `settings.rows` rows.
+
+    Within a class (family, last event, whether the lie's rate changes, bin of age) the heaviest and the
+    oldest row are kept first, and in the young bins the heaviest of each scale. Protected are the rows that
+    carry the weight, the heaviest of each fault and of each grade, and those that set the protection level.
+    A dropped row merges by moments with a row of its label if their weights are alike; else its weight goes
+    to the heaviest of its class.
+
+    Parameters
+    ----------
+    bank, layout : the bank after births.
+    settings : number of rows, bins of age, limits of a merge.
+
+    Returns
+    -------
+    Bank : with at most `settings.rows` rows; covariances made symmetric.
+    """
+    rows = len(bank.L)
+    bank = bank._replace(P=0.5 * (bank.P + bank.P.transpose(0, 2, 1)))
+    if rows <= settings.rows:
+        return bank
+    L, family = bank.L, families(bank)
+    bins = np.floor(
+        np.log(np.maximum((bank.t - bank.since) / settings.age_s, 0.1)) / math.log(settings.age_ratio) + 1.0
+    ).clip(0.0)
+    # ties (children of one parent) in an order that does not depend on where the rows stand
+    ties = (bank.since, bank.scale, bank.event, family, np.round(-L, 9))
+    order = np.lexsort(ties).tolist()
+    place = np.argsort(order).tolist()
+    # lies that may change their rate are a class of their own: they pay more, and must outlive what they beat
+    bends = bank.noise.any(axis=1)
+    if layout.accelerations[2].size:
+        bends |= (bank.P[:, layout.accelerations[2], layout.accelerations[2]] > 0.0).any(axis=1)
+    label = 2 * bank.event + bends
+    keys = list(zip(family.tolist(), label.tolist(), bins.astype(int).tolist()))
+    # rank of a row: 0 protected, 1 heaviest of its class, 2 oldest of its class, 3 and 4 others
+    rank = [4] * rows
+    heaviest: dict[tuple[int, int, int], int] = {}
+    oldest: dict[tuple[int, int, int], int] = {}
+    by_fault: set[int] = set()
+    by_scale: set[tuple[int, ...]] = set()
+    grades: set[int] = set()
+    for i in order:
+        key = keys[i]
+        if key not in heaviest:
+            heaviest[key] = i
+            rank[i] = 1
+        j = oldest.get(key)
+        if j is None or bank.since[i] < bank.since[j]:
+            oldest[key] = i
+        scale = (*key, int(bank.scale[i]))
+        if key[2] <= 1 and scale not in by_scale:
+            by_scale.add(scale)
+            rank[i] = min(rank[i], 2)
+        if key[0] not in by_fault and _single(bank.fault[i]):
+            by_fault.add(key[0])
+            rank[i] = 0
+        if key[0] == 0 and int(bank.grade[i]) not in grades:
+            grades.add(int(bank.grade[i]))
+            rank[i] = 0
+    for i in oldest.values():
+        rank[i] = min(rank[i], 2)
+    for i in range(rows):
+        if L[i] < settings.class_floor:
+            rank[i] = max(rank[i], 3) if rank[i] else 0
+    for i in level_rows(bank, layout, 3, settings.risk).tolist():
+        rank[i] = 0
+    # the rows that carry the weight, up to half of the room
+    mass = np.cumsum(np.exp(L[order[: settings.rows // 2]]))
+    for i, before in zip(order, (0.0, *mass.tolist())):
+        if before < 1.0 - settings.dropped:
+            rank[i] = 0
+    # quotas: the rows of a family beyond its quota rank behind all others
+    used: dict[int, int] = {}
+    score = []
+    for i in sorted(range(rows), key=lambda i: (rank[i], place[i])):
+        f = keys[i][0]
+        used[f] = used.get(f, 0) + 1
+        over = rank[i] > 0 and used[f] > _quota(layout, bank.fault[i], int(bank.event[i]))
+        score.append((rank[i] + (3 if over else 0), place[i], i))
+    score.sort()
+    keep = sorted(i for _, _, i in score[: settings.rows])
+    dropped = sorted((i for _, _, i in score[settings.rows :]), key=lambda i: place[i])
+    return _merged(bank, keep, dropped, keys, settings)
+
+
+def _single(fault: Ints) -> bool:
+    return int((fault != NONE).sum()) <= 1
+
+
+def _quota(layout: Layout, fault: Ints, event: int) -> int:
+    """Rows that the family of a row may hold before others come first."""
+    active = [int(f) for f in fault if f != NONE]
+    if len(active) > 1:
+        return 3
+    if active:
+        return layout.faults[active[0]].quota
+    return len(layout.grades) + sum(j.quota for j in layout.jumps) + 2
+
+
+def _merged(
+    bank: Bank, keep: list[int], dropped: list[int], keys: list[tuple[int, int, int]], settings: Settings
+) -> Bank:
+    """The rows `keep`; the weights of `dropped`, in this order, go where `reduce` states."""
+    L = bank.L.copy()
+    x, P, since = bank.x.copy(), bank.P.copy(), bank.since.copy()
+    by_key: dict[tuple[int, int, int], list[int]] = {}
+    for i in keep:
+        by_key.setdefault(keys[i], []).append(i)
+    log_ratio = math.log(settings.merge_ratio)
+    for i in dropped:
+        if keys[i] not in by_key:
+            continue
+        near = by_key[keys[i]]
+        alike = [
+            j
+            for j in near
+            if abs(L[i] - L[j]) < log_ratio
+            and bank.grade[i] == bank.grade[j]
+            and np.array_equal(bank.noise[i], bank.noise[j])
+        ]
+        j = max(alike or near, key=lambda j: L[j])
+        if alike and _distance(x[i] - x[j], P[j]) < settings.merge_distance:
+            L[j], x[j], P[j] = merge_moments(L[i], x[i], P[i], L[j], x[j], P[j])
+        elif L[i] < L[j] + log_ratio:
+            L[j] = np.logaddexp(L[i], L[j])
+    at = np.array(keep)
+    return bank._replace(
+        L=normalised(L[at]),
+        x=x[at],
+        P=P[at],
+        grade=bank.grade[at],
+        fault=bank.fault[at],
+        event=bank.event[at],
+        since=since[at],
+        scale=bank.scale[at],
+        noise=bank.noise[at],
+    )
+
+
+def _distance(d: Floats, P: Floats) -> float:
+    """Largest deviation of d in units of the marginal sigmas."""
+    variance = P.diagonal()
+    used = variance > 0.0
+    return math.sqrt(float((d[used] ** 2 / variance[used]).max())) if used.any() else 0.0
+
+
+def merge_moments(
+    La: float, xa: Floats, Pa: Floats, Lb: float, xb: Floats, Pb: Floats
+) -> tuple[float, Floats, Floats]:
+    """Merge two weighted Gaussians into one of the same weight, mean and covariance.
+
+    Parameters
+    ----------
+    La, Lb : log weights.
+    xa, xb : (n,) means.
+    Pa, Pb : (n, n) covariances.
+
+    Returns
+    -------
+    L, x, P : log weight, (n,) mean, (n, n) covariance.
+    """
+    L = float(np.logaddexp(La, Lb))
+    a, b = math.exp(La - L), math.exp(Lb - L)
+    d = xa - xb
+    return L, a * xa + b * xb, a * Pa + b * Pb + (a * b) * np.outer(d, d)

@@ -1,0 +1,220 @@
+"""What may be wrong: the layout of the navigator's bank, its priors, and beacons as they appear.
+
+Base states are those of the channel, then the biases of azimuth and range of each beacon, by identity. GNSS,
+beacons and airspeed have a group of lie states each, so that one source of each kind may be false at once.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from msgspec import structs
+
+from companion.config import AirDataConfig, Config
+from companion.estimate.bank import (
+    Bank,
+    Fault,
+    Jump,
+    Layout,
+    Lie,
+    Settings,
+    Source,
+    enlarge,
+    start,
+)
+from companion.navigator.channel import Channel, Nominal, Transition
+from companion.navigator.ins_channel import ins_channel
+from companion.navigator.own_channel import OwnChannel
+
+GNSS, AIRSPEED = 0, 1  # sources; those of beacon k are `azimuth(k)` and `range(k)`
+CONSISTENT, POSITION_ONLY = 0, 1  # faults of GNSS: its velocity is false too, or true
+GNSS_GROUP, BEACON_GROUP, AIRSPEED_GROUP = 0, 1, 2
+GROUPS = (2, 2, 1)
+CHANNEL_JUMPS_H = 1e-3
+BEACON_H = 2e-4  # a beacon steps, or is elsewhere, so often in an hour; it does not drift
+ORDERS = (3, 2, 2)  # GNSS may be drawn off with an acceleration
+SILENCE_S = 5.0  # airspeed that is not used for longer is not judged
+MOST_BEACONS = 8  # followed at once: the work grows with their number
+BIAS_HOUR = 0.5  # a beacon's bias walks in an hour by this share of what it may be
+
+#: Offsets (m) and rates (m/s) of a false GNSS: several scales, or a wide prior makes a small lie improbable.
+GNSS_LIES = (
+    Lie(3.0, 0.3),
+    Lie(3.0, 0.3, noise=0.01),
+    Lie(3.0, 0.1, acceleration=0.01, share=0.3),
+    Lie(3.0, 1.0),
+    Lie(3.0, 5.0, noise=0.01),
+    Lie(30.0, 5.0, noise=0.03),
+    Lie(300.0, 1.0, noise=0.01),
+)
+GNSS_FIRST = (Lie(60.0, 0.3), Lie(300.0, 0.3), Lie(2000.0, 0.3))
+AIRSPEED_LIES = (Lie(3.0, 0.03), Lie(15.0, 0.3))  # m/s, m/s^2
+SHOCK = ((0, 15.0), (1, 15.0), (2, 15.0), (3, 15.0))  # of a false airspeed that moves the nominal: m, m/s
+HYSTERESIS = 999.0  # a source leads the estimate until it is false beyond doubt
+JAMMED = 100.0  # times likelier while the receiver itself reports jamming or spoofing
+
+
+def beacon_lies(reach: tuple[float, ...], slow: tuple[float, ...], scales: int) -> tuple[Lie, ...]:
+    """Scales of a beacon's lie: offsets of 3 and 30 sigma, by components."""
+    return tuple(
+        Lie(tuple(x * 10.0**k for x in reach), tuple(x * 10.0**k for x in slow)) for k in range(scales)
+    )
+
+
+class Hypotheses(NamedTuple):
+    """The layout with so many beacons, and the settings of the bank."""
+
+    layout: Layout
+    settings: Settings
+    biases: tuple[float, ...]  # one sigma of each bias state: azimuth (rad), range (m), by beacon
+
+    def azimuth(self, k: int) -> int:
+        """Source of beacon k's azimuth."""
+        return 2 + 2 * k
+
+    def range(self, k: int) -> int:
+        """Source of beacon k's range."""
+        return 3 + 2 * k
+
+
+class Model:
+    """Channel and hypotheses of one configuration.
+
+    `plain` is a grade: then there is that grade alone, nothing is ever false and nothing jumps. The bank is a
+    Kalman filter, and the wind a random walk of the variance that random walk and jumps have together.
+    """
+
+    def __init__(self, config: Config, plain: int | None = None) -> None:
+        if plain is not None:
+            config = structs.replace(config, air_data=without_jumps(config.air_data))
+        self.config, self.plain = config, plain
+        self.channel: Channel = ins_channel(config) if config.has_own_ins else OwnChannel(config)
+        self._known: dict[tuple[int, bool, bool], Hypotheses] = {}
+
+    def hypotheses(self, beacons: int, by_air: bool = False, witness: bool = True) -> Hypotheses:
+        """The hypotheses with so many beacons; `by_air` where airspeed moves the nominal trajectory,
+        `witness` while a source of position other than GNSS is received.
+        """
+        key = (beacons, by_air, witness)
+        if key not in self._known:
+            found = _hypotheses(self.config, self.channel, *key)
+            if self.plain is not None:
+                layout = replace(found.layout, faults=(), jumps=())
+                found = found._replace(layout=layout, settings=replace(found.settings, switch_h=0.0))
+            self._known[key] = found
+        return self._known[key]
+
+    def begin(self, t_s: float) -> Bank:
+        """The bank before the first fix."""
+        layout = self.hypotheses(0).layout
+        P = self.channel.prior()
+        bank = start(layout, t_s, np.zeros(layout.n_base), P, self.channel.grades)
+        return bank if self.plain is None else only(bank, self.plain)
+
+    def with_beacon(self, bank: Bank, beacons: int) -> Bank:
+        """The bank with one beacon more than `beacons`, its biases unknown."""
+        old, new = self.hypotheses(beacons), self.hypotheses(beacons + 1)
+        return enlarge(bank, old.layout, new.layout, np.square(new.biases[-2:]))
+
+    def transition(self, nominal: Nominal, beacons: int) -> Transition:
+        """Phi (n, n) and Q (grades, n_base, n_base) over all states, the lies' motion left to the bank."""
+        found, known = self.channel.transition(nominal), self.hypotheses(beacons)
+        ours, n, dt = self.channel.n, known.layout.n_base, nominal.pending_s
+        Q = np.zeros((len(found.Q), n, n))
+        Q[:, :ours, :ours] = found.Q
+        biases = np.arange(ours, n)
+        Q[:, biases, biases] = np.square(known.biases) * (BIAS_HOUR**2 / 3600.0 * dt)
+        interval = nominal.interval
+        if interval is None or interval.by != "air":
+            Phi = np.eye(n)
+            Phi[:ours, :ours] = found.Phi
+            return Transition(Phi, Q)
+        # a false airspeed moves the nominal trajectory itself, along the nose
+        Phi = np.eye(known.layout.n)
+        Phi[:ours, :ours] = found.Phi
+        lie = known.layout.lie_states(AIRSPEED)[0]
+        speed = math.hypot(*interval.V)
+        if speed > 1.0:
+            nose = np.array(interval.V) / speed
+            Phi[0:2, lie], Phi[2:4, lie] = nose * dt, nose
+        return Transition(Phi, Q)
+
+
+def only(bank: Bank, row: int) -> Bank:
+    """The bank with one of its rows, which has all the weight."""
+    at = slice(row, row + 1)
+    return bank._replace(
+        L=np.zeros(1),
+        x=bank.x[at],
+        P=bank.P[at],
+        grade=bank.grade[at],
+        fault=bank.fault[at],
+        event=bank.event[at],
+        since=bank.since[at],
+        scale=bank.scale[at],
+        noise=bank.noise[at],
+    )
+
+
+def without_jumps(air: AirDataConfig) -> AirDataConfig:
+    """With a random walk of the wind that has the variance of random walk and jumps together."""
+    density = air.wind_change_m_s_sqrt_s**2 + air.wind_jump_m_s**2 * air.wind_jumps_per_hour / 3600.0
+    return structs.replace(air, wind_change_m_s_sqrt_s=math.sqrt(density))
+
+
+def _hypotheses(config: Config, channel: Channel, beacons: int, by_air: bool, witness: bool) -> Hypotheses:
+    azimuth_bias, range_bias = math.radians(config.rsbn.bias_azimuth_deg), config.rsbn.bias_range_m
+    sigma_a, sigma_r = math.radians(config.rsbn.sigma_azimuth_deg), config.rsbn.sigma_range_m
+    # an air-data or IMU channel alone is no witness against GNSS: its own model may be what is wrong
+    doubt = 1.0 if witness or not channel.wind else 0.0
+    sources = [
+        Source("gnss", 2, GNSS_GROUP),
+        Source("airspeed", 1, AIRSPEED_GROUP, silence_s=SILENCE_S),
+    ]
+    faults = [
+        Fault("gnss", (GNSS,), 7e-4 * doubt, GNSS_LIES, 7e-4 * doubt, GNSS_FIRST, quota=20),
+        Fault("gnss position", (GNSS,), 3e-4 * doubt, GNSS_LIES, 3e-4 * doubt, GNSS_FIRST, quota=10),
+        Fault("airspeed", (AIRSPEED,), 1e-2, AIRSPEED_LIES, shock=SHOCK if by_air else (), quota=6),
+    ]
+    for k in range(beacons):
+        a, r = len(sources), len(sources) + 1
+        sources += [Source(f"azimuth {k}", 1, BEACON_GROUP, 0), Source(f"range {k}", 1, BEACON_GROUP, 1)]
+        for name, which, reach in (
+            ("azimuth", (a,), (3.0 * sigma_a,)),
+            ("range", (r,), (3.0 * sigma_r,)),
+            ("beacon", (a, r), (3.0 * sigma_a, 3.0 * sigma_r)),
+        ):
+            # one measurement steps; a beacon at another place seems to move as the aircraft does
+            slow = tuple(x * (3e-3 if name == "beacon" else 1e-4) for x in reach)
+            lies = beacon_lies(reach, slow, 2)
+            faults.append(Fault(f"{name} {k}", which, BEACON_H, lies, 1e-3, lies, change_h=BEACON_H, quota=4))
+    jumps = []
+    if channel.wind:
+        jump = config.air_data.wind_jump_m_s
+        rate_h = config.air_data.wind_jumps_per_hour
+        # by air data the velocity over ground jumps with the wind; it is noticed up to a second later
+        states, sigmas = (channel.wind, 1) if not by_air else ((*channel.wind, 2, 3, 0, 1), 3)
+        jumps.append(Jump("wind", states, (jump, jump) * sigmas, rate_h, quota=24))
+    if channel.wind:
+        # whatever the model does not know: GNSS is believed again after a second or two
+        jumps.append(Jump("channel", (0, 1, 2, 3), (100.0, 100.0, 20.0, 20.0), CHANNEL_JUMPS_H, quota=4))
+    else:
+        jumps.append(Jump("channel", (0, 1), (100.0, 100.0), 0.01, quota=2))
+    layout = Layout(
+        channel.n + 2 * beacons,
+        GROUPS,
+        tuple(sources),
+        tuple(faults),
+        jumps=tuple(jumps),
+        grades=tuple(range(len(channel.grades))),
+        orders=ORDERS,
+    )
+    settings = Settings(
+        hysteresis=HYSTERESIS,
+        rows=config.integrity.rows or (72 if config.has_own_ins else 96),
+        risk=config.integrity.risk,
+    )
+    return Hypotheses(layout, settings, (azimuth_bias, range_bias) * beacons)

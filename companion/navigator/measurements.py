@@ -1,0 +1,179 @@
+"""Measurements of the bank: GNSS position and velocity, azimuth and range of a beacon, airspeed.
+
+Each says what a record measures of the error states, for all rows at once. A measurement goes to every row,
+those that hold its source to be false included: they estimate its error. It counts as used where its source
+is not excluded and the leading hypothesis could take it.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from companion.config import Config
+from companion.estimate import bank as banks
+from companion.estimate.bank import Bank, Innovation
+from companion.estimate.fusion import Azimuth, Range
+from companion.nav.geometry import Geodetic, separation_tuple
+from companion.navigator import fix_observations, own_error_model
+from companion.navigator.channel import Channel
+from companion.navigator.hypotheses import AIRSPEED, AIRSPEED_GROUP, CONSISTENT, GNSS, GNSS_GROUP, Hypotheses
+from companion.navigator.inertial_track import Point
+from companion.navigator.own_channel import OwnChannel
+from companion.records import Gnss, Vector2
+from companion.units import Floats
+
+#: Log density of a measurement that has nothing to do with its quantity: one in ten thousand, anywhere within
+#: 2 km, 0.1 rad, 5 km, 20 m/s.
+OUTLIER = {
+    "position": math.log(1e-4 / 2000.0**2),
+    "velocity": math.log(1e-4 / 20.0**2),
+    "azimuth": math.log(1e-4 / 0.1),
+    "range": math.log(1e-4 / 5000.0),
+}
+
+
+class Taken(NamedTuple):
+    """The bank after a measurement; its normalised squared innovation by the leading row, its degrees of
+    freedom, and whether the leading row took it.
+    """
+
+    bank: Bank
+    nis: float
+    freedom: int
+    accepted: bool
+
+
+def gnss_position(
+    bank: Bank,
+    known: Hypotheses,
+    channel: Channel,
+    record: Gnss,
+    nominal: Point,
+    v_n: Vector2,
+    config: Config,
+) -> Taken:
+    """Take the position of a fix: nominal minus GNSS is the error less drift, plus latency times velocity."""
+    north, east, _ = separation_tuple(Geodetic(record.lat, record.lon, record.alt_msl), nominal.position)
+    H = np.zeros((2, known.layout.n_base))
+    H[0, 0] = H[1, 1] = 1.0
+    H[:, channel.drift] = -np.eye(2)
+    H[:, channel.latency] = v_n
+    sigma = fix_observations.white_sigma(record, config.gnss)
+    after, seen = banks.update(
+        bank,
+        known.layout,
+        np.array((-north, -east)),
+        H,
+        sigma**2 * np.eye(2),
+        GNSS,
+        known.settings,
+        outlier=OUTLIER["position"],
+    )
+    return _taken(after, seen, 2)
+
+
+def gnss_velocity(
+    bank: Bank,
+    known: Hypotheses,
+    channel: Channel,
+    record: Gnss,
+    nominal: Point,
+    a_n: Vector2,
+    config: Config,
+) -> Taken:
+    """Take the velocity of a fix; rows that hold GNSS and its velocity false see the rate of its error."""
+    assert record.v_n is not None
+    layout = known.layout
+    z = np.array((nominal.v_n[0] - record.v_n[0], nominal.v_n[1] - record.v_n[1]))
+    rate = layout.starts[GNSS_GROUP] + layout.groups[GNSS_GROUP]
+
+    def seen_by(bank: Bank) -> tuple[Floats, Floats]:
+        H = np.zeros((len(bank.L), 2, layout.n))
+        H[:, 0, 2] = H[:, 1, 3] = 1.0
+        H[:, :, channel.latency] = a_n
+        lying = (bank.fault[:, GNSS_GROUP] == CONSISTENT).astype(np.float64)
+        H[:, 0, rate] = H[:, 1, rate + 1] = lying
+        return np.broadcast_to(z, (len(bank.L), 2)), H
+
+    stated = max(record.sigma_velocity or 0.0, config.gnss.sigma_velocity_m_s)
+    R = (stated**2 + channel.velocity_noise**2) * np.eye(2)
+    after, seen = banks.update(
+        bank, layout, seen_by, None, R, None, known.settings, outlier=OUTLIER["velocity"], bears=True
+    )
+    return _taken(after, seen, 2)
+
+
+def airspeed(
+    bank: Bank, known: Hypotheses, channel: OwnChannel, V: Vector2, velocity: Vector2, seconds: float
+) -> Taken:
+    """Take airspeed and heading as a velocity through the air; a false airspeed is wrong along the nose.
+
+    `V` and the nominal `velocity` (m/s) are means over the same samples of the last `seconds`.
+    """
+    layout = known.layout
+    row = channel.propagator.airspeed_row(velocity, V, seconds)
+    H = np.zeros((len(bank.L), 2, layout.n))
+    H[:, :, : channel.n] = row.H
+    speed = max(math.hypot(*V), 1.0)
+    false = (bank.fault[:, AIRSPEED_GROUP] != banks.NONE).astype(np.float64)
+    lie = layout.lie_states(AIRSPEED)[0]
+    H[:, 0, lie], H[:, 1, lie] = -false * V[0] / speed, -false * V[1] / speed
+    R = row.R[bank.grade]
+    after, seen = banks.update(bank, layout, row.y, H, R, None, known.settings, outlier=OUTLIER["velocity"])
+    heard = after.seen.copy()
+    heard[AIRSPEED] = after.t
+    return _taken(after._replace(seen=heard), seen, 2)
+
+
+def foreign_velocity(bank: Bank, known: Hypotheses, channel: OwnChannel, apart: Vector2) -> Taken:
+    """Take the velocity of the autopilot's own estimator; `apart` is nominal minus foreign (m/s)."""
+    row = own_error_model.foreign_row(channel.settings, channel.layout, apart)
+    H = np.zeros((2, known.layout.n_base))
+    H[:, : channel.n] = row.H
+    after, seen = banks.update(
+        bank, known.layout, row.y, H, row.R, None, known.settings, outlier=OUTLIER["velocity"]
+    )
+    return _taken(after, seen, 2)
+
+
+def sight(
+    bank: Bank, known: Hypotheses, z: Azimuth | Range, beacon: int, height_sigma: float, centre: Vector2
+) -> Taken:
+    """Take an azimuth or a range of beacon number `beacon`, linearised for each row about its own position.
+
+    `z` is in the plane tangent at the nominal point less the error `centre` (north, east, m): a nominal
+    trajectory kilometres off would otherwise cost tens of metres.
+    """
+    layout = known.layout
+    n = layout.n_base
+    source = known.azimuth(beacon) if isinstance(z, Azimuth) else known.range(beacon)
+    bias = n - len(known.biases) + 2 * beacon + (0 if isinstance(z, Azimuth) else 1)
+
+    def linearised(bank: Bank) -> tuple[Floats, Floats]:
+        x = bank.x
+        at = np.zeros((len(x), 3))
+        at[:, 0], at[:, 1] = centre[1] - x[:, 1], centre[0] - x[:, 0]  # east, north of the plane's origin
+        predicted, east, north = fix_observations.predict_sight(z, at)
+        H = np.zeros((len(x), 1, n))
+        H[:, 0, 0], H[:, 0, 1] = -north, -east
+        H[:, 0, bias] = 1.0
+        innovation = z.value - predicted
+        if isinstance(z, Azimuth):
+            innovation = np.remainder(innovation + math.pi, 2.0 * math.pi) - math.pi
+        lin = H[:, 0, 0] * x[:, 0] + H[:, 0, 1] * x[:, 1]
+        return (innovation + lin)[:, None], H
+
+    R = np.array(((fix_observations.sight_variance(z, height_sigma),),))
+    kind = "azimuth" if isinstance(z, Azimuth) else "range"
+    after, seen = banks.update(
+        bank, layout, linearised, None, R, source, known.settings, outlier=OUTLIER[kind]
+    )
+    return _taken(after, seen, 1)
+
+
+def _taken(bank: Bank, seen: Innovation, freedom: int) -> Taken:
+    best = int(np.argmax(bank.L))
+    return Taken(bank, float(seen.nis[best]), freedom, not bool(seen.refused[best]))

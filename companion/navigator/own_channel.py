@@ -1,0 +1,172 @@
+"""Own channel: dead reckoning by whatever the autopilot's sensors allow, best first.
+
+    imu      specific force turned by the autopilot's attitude, from 4 Hz up
+    air      airspeed along the nose, where there is a sensor and the aircraft flies
+    foreign  velocity of the autopilot's estimator, where it is not fed by us
+    hold     the last velocity
+
+Airspeed beside the IMU, and the foreign velocity beside either, are measurements (see `own_error_model`). No
+position of the autopilot's is used, and no velocity of an estimator that we feed.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+from companion.config import Config
+from companion.navigator import air_data_channel, own_error_model
+from companion.navigator.air_data_channel import Reckoner
+from companion.navigator.channel import Nominal, Transition, moved
+from companion.navigator.inertial_track import Point
+from companion.navigator.own_error_model import By, Ground, Layout, Propagator
+from companion.navigator.strapdown_channel import Strap
+from companion.records import AirData, Gnss, LocalPosition, RsbnFix, Vector2
+from companion.units import G0, Floats
+
+#: A driver that is silent for longer hands over to the next.
+SILENT_NS: dict[By, int] = {"imu": 600_000_000, "air": 1_500_000_000, "foreign": 2_500_000_000, "hold": 0}
+ORDER: tuple[By, ...] = ("imu", "air", "foreign", "hold")
+FRESH_NS = 1_000_000_000  # an attitude older than this turns no airspeed into a velocity
+HOLD_M_S_SQRT_S = 4.0  # a turn of 30 degrees of bank changes the velocity by 5.7 m/s in a second
+SENSOR_NS = 10_000_000_000  # the word of the autopilot that its airspeed sensor is healthy lasts so long
+WEIGHTS = (1.0, 0.5, 0.25)  # of `own_error_model.GRADES`
+
+
+class AirspeedSums(NamedTuple):
+    """Sums over the samples of airspeed since `start_ns`: of nominal velocity and of air velocity (m/s)."""
+
+    start_ns: int
+    samples: int
+    velocity: Vector2
+    air: Vector2
+
+
+class Sensors(NamedTuple):
+    """Last readings: IMU and attitude, air data, the foreign velocity, and when each was last of use."""
+
+    strap: Strap = Strap()
+    air: Reckoner = Reckoner()
+    ground: Ground = Ground()
+    sensor_ns: int | None = None  # when the autopilot last called its airspeed sensor healthy
+    foreign: LocalPosition | None = None
+    imu_ns: int = -SENSOR_NS
+    air_ns: int = -SENSOR_NS
+    foreign_ns: int = -SENSOR_NS
+    acceleration: Vector2 = (0.0, 0.0)
+    sums: AirspeedSums | None = None  # since airspeed was last a measurement
+    measured_ns: int = -SENSOR_NS
+
+    def last_ns(self, by: By) -> int:
+        """When a driver last gave a sample."""
+        return {"imu": self.imu_ns, "air": self.air_ns, "foreign": self.foreign_ns, "hold": 0}[by]
+
+    def leads(self, by: By, t_ns: int) -> bool:
+        """Whether no better driver than `by` gives samples now."""
+        better = ORDER[: ORDER.index(by)]
+        return all(t_ns - self.last_ns(b) > SILENT_NS[b] for b in better)
+
+    def heading(self) -> float | None:
+        """Heading of the last attitude, rad."""
+        return None if self.air.attitude is None else self.air.attitude.heading
+
+
+class OwnChannel:
+    """Error model of the own channel with the constants of one configuration."""
+
+    grades = WEIGHTS
+    drift = own_error_model.DRIFT
+    velocity_noise = 0.0
+    wind = (4, 5)
+
+    def __init__(self, config: Config) -> None:
+        air, strapdown, gnss = config.air_data, config.strapdown, config.gnss
+        self.settings = own_error_model.Settings(
+            wind_m_s=air.wind_m_s,
+            wind_change_m_s_sqrt_s=air.wind_change_m_s_sqrt_s,
+            wind_jump_m_s=air.wind_jump_m_s,
+            scale=0.01 * air.airspeed_percent,
+            heading=math.radians(air.heading_deg),
+            slow_s=60.0 * air.correlation_min,
+            crab=math.radians(air.crab_deg),
+            crab_s=air.crab_s,
+            gust_along_m_s=air.gust_m_s,
+            gust_across_m_s=air.gust_m_s / 1.2,
+            gust_s=air.gust_s,
+            accelerometer_m_s2=strapdown.accelerometer_m_s2,
+            tilt=G0 * math.radians(strapdown.tilt_deg),
+            tilt_s=strapdown.tilt_s,
+            velocity_noise_m_s_sqrt_s=strapdown.velocity_noise_m_s_sqrt_s,
+            drift_m=gnss.sigma_m,
+            drift_s=gnss.correlation_s,
+            hold_m_s_sqrt_s=HOLD_M_S_SQRT_S,
+        )
+        self.layout = Layout(foreign=True, latency=True)
+        self.propagator = Propagator(self.settings, self.layout)
+        self.n, self.latency = self.layout.n, self.layout.latency_at
+
+    def prior(self) -> Floats:
+        """First covariances (grades, n, n)."""
+        return own_error_model.prior(self.settings, self.layout, self.propagator.grades)
+
+    def transition(self, nominal: Nominal) -> Transition:
+        """Phi and Q of the interval."""
+        assert nominal.interval is not None
+        return Transition(*self.propagator.transition(nominal.interval))
+
+
+def airspeed_is_sensed(s: Sensors, record: AirData) -> bool:
+    """Whether the airspeed is a sensor's: without one VFR_HUD carries the estimator's own number."""
+    if record.sensed is not None:
+        return record.sensed
+    return s.sensor_ns is not None and record.t_ns - s.sensor_ns <= SENSOR_NS
+
+
+def air_velocity(s: Sensors, record: AirData, alt: float) -> Vector2 | None:
+    """Velocity through the air, north and east (m/s); None without a fresh attitude."""
+    attitude = s.air.attitude
+    if attitude is None or abs(record.t_ns - attitude.t_ns) > FRESH_NS:
+        return None
+    speed = air_data_channel.true_airspeed(record, s.air.static, alt)
+    return own_error_model.air_velocity(speed, attitude.pitch, attitude.heading)
+
+
+def begin(s: Sensors, fix: Gnss | RsbnFix) -> Nominal | None:
+    """Begin the nominal trajectory at the first position, with the velocity of GNSS or none."""
+    place = air_data_channel.first_place(fix, s.air.static)
+    if place is None:
+        return None
+    v = (fix.v_n if isinstance(fix, Gnss) else None) or (0.0, 0.0, 0.0)
+    point = Point(fix.t_ns, place, (v[0], v[1], 0.0))
+    return Nominal(point, (0.0, 0.0), point, own_error_model.begin("hold", (v[0], v[1])))
+
+
+def restart(nominal: Nominal, by: By, velocity: Vector2) -> Nominal:
+    """Begin the next interval at the nominal point, driven `by` a sensor, at a nominal `velocity` (m/s)."""
+    point = nominal.point._replace(v_n=(*velocity, nominal.point.v_n[2]))
+    return Nominal(point, nominal.a_n, point, own_error_model.begin(by, velocity))
+
+
+def carry_on(nominal: Nominal, s: Sensors, t_ns: int) -> Nominal:
+    """Carry the nominal trajectory on to `t_ns` by the last sample of its driver."""
+    assert nominal.interval is not None
+    if nominal.interval.by == "imu":
+        return by_imu(nominal, nominal.a_n, s.heading() or 0.0, t_ns)
+    return by_velocity(nominal, nominal.interval.velocity, t_ns)
+
+
+def by_imu(nominal: Nominal, a_n: Vector2, heading: float, t_ns: int) -> Nominal:
+    """Go on to `t_ns` by the mean acceleration `a_n` (m/s^2) at a mean heading (rad)."""
+    assert nominal.interval is not None
+    dt = (t_ns - nominal.t_ns) * 1e-9
+    interval = own_error_model.add_imu(nominal.interval, dt, a_n, heading)
+    return nominal._replace(point=moved(nominal.point, interval.velocity, t_ns), interval=interval)
+
+
+def by_velocity(nominal: Nominal, velocity: Vector2, t_ns: int) -> Nominal:
+    """Go on to `t_ns` by an air or foreign velocity (m/s), or straight on."""
+    i = nominal.interval
+    assert i is not None
+    dt = (t_ns - nominal.t_ns) * 1e-9
+    add = own_error_model.add_hold(i, dt) if i.by == "hold" else own_error_model.add_velocity(i, dt, velocity)
+    return nominal._replace(point=moved(nominal.point, add.velocity, t_ns), interval=add)

@@ -1,0 +1,517 @@
+"""Own channel: error model of airspeed, attitude, IMU and a foreign velocity in one linear state.
+
+The nominal trajectory is integrated from what the autopilot streams, the best source first:
+
+    imu      specific force turned to the level frame by the autopilot's attitude (from `IMU_HZ` up)
+    air      the velocity through the air: airspeed along the nose
+    foreign  the velocity of another estimator (LOCAL_POSITION_NED not fed by us)
+    hold     the last velocity
+
+Errors are nominal minus truth, north and east. The wind is the wind itself, not an error.
+
+    dp' = dv
+    dv' = tilt + R(heading) accelerometer + heading J a + white           (imu)
+    dv  = -wind + (scale + (heading + crab) J) V + gust                   (air; not integrated, substituted)
+    dv  = foreign + white                                                 (foreign; substituted)
+    dv' = white                                                           (hold)
+
+V (2,) is the velocity through the air, a (2,) the acceleration, J = [[0, -1], [1, 0]]. In the substituted
+cases the velocity error is no memory of its own: it follows from the other states at each moment, so the
+sensor is used once. In the IMU case airspeed is a measurement (`airspeed_row`), and a change of wind does
+not move the aircraft: it shows in the difference of accelerometers and airspeed.
+
+`heading` is what is wrong with the heading for minutes, `crab` for seconds (bank-dependent compass error,
+sideslip); only `crab` is not shared with the IMU. `tilt` (m/s^2) is gravity seen through the tilt of the
+attitude. A `Grade` states how many times coarser wind and attitude are than the settings say; one Phi serves
+all grades and Q has one layer for each.
+
+An `Interval` sums what Phi needs over many samples (a dozen numbers), so that Phi and Q are made once per
+measurement. Not modelled: Schuler loop, vertical channel (heights are pressure altitudes), Coriolis (it is
+0.003 m/s^2 at 25 m/s; put it into `a_n` for fast aircraft).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from companion.units import Floats
+
+Vector2 = tuple[float, float]
+Vector3 = tuple[float, float, float]
+By = Literal["imu", "air", "foreign", "hold"]
+
+IMU_HZ = 4.0  # slower samples are not integrated
+LONGEST_S = 1.0  # close an interval at this length even without a measurement: Q is of low order in it
+
+POSITION, VELOCITY, WIND = slice(0, 2), slice(2, 4), slice(4, 6)
+SCALE, HEADING, CRAB = 6, 7, 8
+TILT, ACCELEROMETER, DRIFT = slice(9, 11), slice(11, 13), slice(13, 15)
+N_BASE = 15
+
+
+class Layout(NamedTuple):
+    """Which optional states follow the 15 basic ones."""
+
+    foreign: bool = False
+    latency: bool = False
+
+    @property
+    def n(self) -> int:
+        """Number of states."""
+        return N_BASE + 2 * self.foreign + self.latency
+
+    @property
+    def foreign_at(self) -> slice:
+        """Where the foreign velocity error is."""
+        return slice(N_BASE, N_BASE + 2)
+
+    @property
+    def latency_at(self) -> int:
+        """Where the GNSS latency is."""
+        return N_BASE + 2 * self.foreign
+
+
+class Settings(NamedTuple):
+    """Standard deviations and correlation times of the error model; SI and radians."""
+
+    position_m: float = 2000.0
+    velocity_m_s: float = 30.0
+    wind_m_s: float = 8.0
+    wind_change_m_s_sqrt_s: float = 0.05
+    wind_jump_m_s: float = 4.0
+    wind_jumps_per_h: float = 1.0
+    scale: float = 0.03
+    heading: float = math.radians(1.5)
+    slow_s: float = 600.0  # correlation of scale and heading
+    crab: float = math.radians(2.0)
+    crab_s: float = 20.0
+    tilt: float = 0.2  # m/s^2
+    tilt_s: float = 30.0
+    accelerometer_m_s2: float = 0.1
+    accelerometer_s: float = 600.0
+    velocity_noise_m_s_sqrt_s: float = 0.25
+    manoeuvre_sqrt_s: float = 0.05  # velocity noise per horizontal acceleration
+    hold_m_s_sqrt_s: float = 2.0
+    gust_along_m_s: float = 1.2
+    gust_across_m_s: float = 1.0
+    gust_s: float = 0.7
+    drift_m: float = 1.5
+    drift_s: float = 300.0
+    foreign_m_s: float = 0.3
+    foreign_change_m_s_sqrt_s: float = 0.05
+    foreign_jump_m_s: float = 5.0
+    foreign_noise_m_s: float = 0.5
+    latency_s: float = 0.15  # sigma about the configured latency
+    latency_change_s_sqrt_s: float = 1e-4
+
+
+class Grade(NamedTuple):
+    """How many times coarser than the settings: wind change and gusts; crab, tilt and velocity noise."""
+
+    wind: float = 1.0
+    attitude: float = 1.0
+
+
+GRADES = (Grade(1.0, 1.0), Grade(1.0, 4.0), Grade(1.0, 8.0))
+
+
+class Interval(NamedTuple):
+    """Sums over the samples since the last measurement.
+
+    `velocity` (m/s) is the nominal one now; `moved` (m) how far the nominal went. c1, s1 are the integrals of
+    cosine and sine of the heading, c2, s2 those of c1, s1; n1, e1 of the acceleration, n2, e2 of n1, e1. For
+    `air`, n1 and e1 are the way through the air (m) and `V` is the air velocity at the end. aa is the
+    integral of the squared acceleration.
+    """
+
+    by: By
+    velocity: Vector2
+    moved: Vector2 = (0.0, 0.0)
+    seconds: float = 0.0
+    c1: float = 0.0
+    s1: float = 0.0
+    c2: float = 0.0
+    s2: float = 0.0
+    n1: float = 0.0
+    e1: float = 0.0
+    n2: float = 0.0
+    e2: float = 0.0
+    V: Vector2 = (0.0, 0.0)
+    aa: float = 0.0
+
+
+class Transition(NamedTuple):
+    """x <- Phi x, P <- Phi P Phi' + Q[grade]; Phi (n, n), Q (grades, n, n)."""
+
+    Phi: Floats
+    Q: Floats
+
+
+class Row(NamedTuple):
+    """y (m,) = H (m, n) x + noise of covariance R (m, m), or (grades, m, m); the innovation is y - H x."""
+
+    y: Floats
+    H: Floats
+    R: Floats
+
+
+# ---------------------------------------------------------------------------------------------------------
+# Nominal trajectory
+# ---------------------------------------------------------------------------------------------------------
+
+
+def level_acceleration(f_b: Vector3, roll: float, pitch: float, heading: float) -> Vector2:
+    """Turn specific force to the level frame: north and east acceleration, m/s^2."""
+    x, y, z = f_b
+    sr, cr, sp, cp = math.sin(roll), math.cos(roll), math.sin(pitch), math.cos(pitch)
+    u = cr * z + sr * y
+    forward, right = cp * x + sp * u, cr * y - sr * z
+    sh, ch = math.sin(heading), math.cos(heading)
+    return ch * forward - sh * right, sh * forward + ch * right
+
+
+def air_velocity(true_airspeed: float, pitch: float, heading: float) -> Vector2:
+    """Velocity through the air along the nose, north and east, m/s."""
+    level = true_airspeed * math.cos(pitch)
+    return level * math.cos(heading), level * math.sin(heading)
+
+
+def begin(by: By, velocity: Vector2) -> Interval:
+    """Begin an interval at a nominal velocity (m/s).
+
+    For `air` the nominal velocity is the velocity through the air, for `foreign` the foreign one: pass it.
+    """
+    return Interval(by, velocity, V=velocity)
+
+
+def add_imu(i: Interval, dt: float, a_n: Vector2, heading: float) -> Interval:
+    """Add one IMU step: `a_n` (m/s^2) and `heading` (rad) are means over `dt` (s)."""
+    c, s = math.cos(heading) * dt, math.sin(heading) * dt
+    vn, ve = a_n[0] * dt, a_n[1] * dt
+    v, m = i.velocity, i.moved
+    return Interval(
+        "imu",
+        (v[0] + vn, v[1] + ve),
+        (m[0] + (v[0] + 0.5 * vn) * dt, m[1] + (v[1] + 0.5 * ve) * dt),
+        i.seconds + dt,
+        i.c1 + c,
+        i.s1 + s,
+        i.c2 + (i.c1 + 0.5 * c) * dt,
+        i.s2 + (i.s1 + 0.5 * s) * dt,
+        i.n1 + vn,
+        i.e1 + ve,
+        i.n2 + (i.n1 + 0.5 * vn) * dt,
+        i.e2 + (i.e1 + 0.5 * ve) * dt,
+        i.V,
+        i.aa + vn * a_n[0] + ve * a_n[1],
+    )
+
+
+def add_velocity(i: Interval, dt: float, velocity: Vector2) -> Interval:
+    """Add one sample of the air velocity or of the foreign velocity (m/s), `dt` (s) after the last."""
+    n, e = 0.5 * (i.velocity[0] + velocity[0]) * dt, 0.5 * (i.velocity[1] + velocity[1]) * dt
+    moved = (i.moved[0] + n, i.moved[1] + e)
+    return Interval(i.by, velocity, moved, i.seconds + dt, n1=i.n1 + n, e1=i.e1 + e, V=velocity)
+
+
+def add_hold(i: Interval, dt: float) -> Interval:
+    """Go straight on for `dt` (s)."""
+    return i._replace(
+        moved=(i.moved[0] + i.velocity[0] * dt, i.moved[1] + i.velocity[1] * dt), seconds=i.seconds + dt
+    )
+
+
+# ---------------------------------------------------------------------------------------------------------
+# Propagation
+# ---------------------------------------------------------------------------------------------------------
+
+
+def prior(settings: Settings, layout: Layout, grades: tuple[Grade, ...]) -> Floats:
+    """Return the first covariances (grades, n, n); the estimate is zero."""
+    s = settings
+    sigma = np.empty((len(grades), layout.n))
+    sigma[:, POSITION], sigma[:, VELOCITY], sigma[:, WIND] = s.position_m, s.velocity_m_s, s.wind_m_s
+    sigma[:, SCALE], sigma[:, HEADING], sigma[:, CRAB] = s.scale, s.heading, s.crab
+    sigma[:, TILT], sigma[:, ACCELEROMETER], sigma[:, DRIFT] = s.tilt, s.accelerometer_m_s2, s.drift_m
+    coarser = np.array([g.attitude for g in grades])
+    sigma[:, CRAB] *= coarser
+    sigma[:, TILT] *= coarser[:, None]
+    if layout.foreign:
+        sigma[:, layout.foreign_at] = s.foreign_m_s
+    if layout.latency:
+        sigma[:, layout.latency_at] = s.latency_s
+    return np.asarray(np.square(sigma)[:, :, None] * np.eye(layout.n), dtype=np.float64)
+
+
+class Propagator:
+    """Makes Phi and Q of intervals; holds the constants of one configuration, no state.
+
+    Parameters
+    ----------
+    settings, layout, grades
+        The error model, its optional states, and the ladder.
+    """
+
+    def __init__(self, settings: Settings, layout: Layout, grades: tuple[Grade, ...] = GRADES) -> None:
+        self.settings, self.layout, self.grades = settings, layout, grades
+        s, n = settings, layout.n
+        rate, density = np.zeros(n), np.zeros((len(grades), n))
+        wind = np.array([g.wind for g in grades])
+        coarser = np.array([g.attitude for g in grades])
+        for where, sigma, tau, scaled in (
+            (SCALE, s.scale, s.slow_s, False),
+            (HEADING, s.heading, s.slow_s, False),
+            (CRAB, s.crab, s.crab_s, True),
+            (TILT, s.tilt, s.tilt_s, True),
+            (ACCELEROMETER, s.accelerometer_m_s2, s.accelerometer_s, False),
+            (DRIFT, s.drift_m, s.drift_s, False),
+        ):
+            rate[where] = 1.0 / tau
+            amplitude = sigma * (coarser if scaled else np.ones_like(coarser))
+            density[:, where] = ((2.0 / tau) * amplitude**2).reshape(-1, *([1] * isinstance(where, slice)))
+        density[:, WIND] = np.square(s.wind_change_m_s_sqrt_s * wind)[:, None]
+        if layout.foreign:
+            density[:, layout.foreign_at] = s.foreign_change_m_s_sqrt_s**2
+        if layout.latency:
+            density[:, layout.latency_at] = s.latency_change_s_sqrt_s**2
+        self._rate, self._density = rate, density
+        self._imu = np.square(s.velocity_noise_m_s_sqrt_s * coarser)  # velocity noise density by grade
+        self._diagonal = np.arange(n)
+        self._wind_seen = np.zeros((len(grades), n, n))
+        for k in (0, 1):
+            self._wind_seen[:, 2 + k, 2 + k] = density[:, 4]
+            self._wind_seen[:, 2 + k, 4 + k] = self._wind_seen[:, 4 + k, 2 + k] = -density[:, 4]
+        self._gust2 = np.square(wind)[:, None, None]
+
+    def transition(self, i: Interval) -> Transition:
+        """Return Phi (n, n) and Q (grades, n, n) of an interval of at most `LONGEST_S`."""
+        T = i.seconds
+        decay = np.exp(-T * self._rate)
+        Phi = np.zeros((self.layout.n, self.layout.n))
+        Phi[self._diagonal, self._diagonal] = decay
+        Q = np.zeros((len(self.grades), self.layout.n, self.layout.n))
+        Q[:, self._diagonal, self._diagonal] = self._density * (0.5 * T * (1.0 + decay * decay))
+        if i.by == "imu":
+            self._inertial(i, T, Phi, Q)
+        elif i.by == "air":
+            self._air(i, T, Phi, Q)
+        elif i.by == "foreign":
+            self._foreign(T, Phi, Q)
+        else:
+            _velocity_noise(Phi, Q, T, self.settings.hold_m_s_sqrt_s**2)
+        return Transition(Phi, Q)
+
+    def _inertial(self, i: Interval, T: float, Phi: Floats, Q: Floats) -> None:
+        half, tilt = 0.5 * T * T, self._density[:, 9]
+        manoeuvre = self.settings.manoeuvre_sqrt_s**2 * i.aa / T if T > 0.0 else 0.0
+        _velocity_noise(Phi, Q, T, self._imu + manoeuvre)
+        Phi[0, 9] = Phi[1, 10] = half
+        Phi[2, 9] = Phi[3, 10] = T
+        Phi[0:4, 11] = i.c2, i.s2, i.c1, i.s1
+        Phi[0:4, 12] = -i.s2, i.c2, -i.s1, i.c1
+        Phi[0:4, HEADING] = -i.e2, i.n2, -i.e1, i.n1
+        to_velocity, to_position = tilt * half, tilt * (T * half / 3.0)
+        for k in (0, 1):  # the tilt that comes up within the interval
+            Q[:, 9 + k, 2 + k] = Q[:, 2 + k, 9 + k] = to_velocity
+            Q[:, 9 + k, k] = Q[:, k, 9 + k] = to_position
+
+    def _air(self, i: Interval, T: float, Phi: Floats, Q: Floats) -> None:
+        s = self.settings
+        n, e = i.V
+        Phi[2, 2] = Phi[3, 3] = 0.0
+        Phi[0, 4] = Phi[1, 5] = -T
+        Phi[2, 4] = Phi[3, 5] = -1.0
+        Phi[0:4, SCALE] = i.n1, i.e1, n, e
+        Phi[0:4, HEADING] = Phi[0:4, CRAB] = -i.e1, i.n1, -e, n
+        gust = self._gust2 * nose_covariance(i.V, s.gust_along_m_s, s.gust_across_m_s)
+        both = gust * (
+            -s.gust_s * math.expm1(-T / s.gust_s)
+        )  # integral of the gust times the gust at the end
+        crab = self._density[:, CRAB] * T
+        Q += T * self._wind_seen  # wind and crab that come up within the interval: the velocity follows
+        Q[:, 0:2, 0:2] += (2.0 * s.gust_s * T) * gust
+        Q[:, 0:2, 2:4] += both
+        Q[:, 2:4, 0:2] += both
+        Q[:, 2:4, 2:4] += gust + crab[:, None, None] * np.array(((e * e, -n * e), (-n * e, n * n)))
+        Q[:, 2, CRAB] = Q[:, CRAB, 2] = -e * crab
+        Q[:, 3, CRAB] = Q[:, CRAB, 3] = n * crab
+
+    def _foreign(self, T: float, Phi: Floats, Q: Floats) -> None:
+        at = self.layout.foreign_at.start
+        noise = self.settings.foreign_noise_m_s**2
+        change = self.settings.foreign_change_m_s_sqrt_s**2 * T
+        for k in (0, 1):
+            Phi[2 + k, 2 + k] = 0.0
+            Phi[k, at + k], Phi[2 + k, at + k] = T, 1.0
+            Q[:, k, k] += noise * T
+            Q[:, 2 + k, 2 + k] += noise + change
+            Q[:, 2 + k, at + k] += change
+            Q[:, at + k, 2 + k] += change
+
+    def airspeed_row(self, velocity: Vector2, V: Vector2, seconds: float) -> Row:
+        """Return the row of airspeed and heading as a velocity vector; not in `air` intervals, <= 2 Hz.
+
+        Parameters
+        ----------
+        velocity
+            Nominal velocity over ground (m/s), mean over the samples since the last such row.
+        V
+            Measured velocity through the air (m/s), `air_velocity`, mean over the same samples.
+        seconds
+            Time since the last such row: gusts last `gust_s`, so that frequent rows tell less each.
+        """
+        s = self.settings
+        H = np.zeros((2, self.layout.n))
+        H[0, 2] = H[1, 3] = H[0, 4] = H[1, 5] = 1.0
+        H[:, SCALE] = -V[0], -V[1]
+        H[:, HEADING] = H[:, CRAB] = V[1], -V[0]
+        y = np.array((velocity[0] - V[0], velocity[1] - V[1]))
+        often = max(2.0 * s.gust_s / max(seconds, 0.05), 1.0)
+        return Row(y, H, often * self._gust2 * nose_covariance(V, s.gust_along_m_s, s.gust_across_m_s))
+
+    def airspeed_along_row(self, velocity: Vector2, V: Vector2, seconds: float) -> Row:
+        """Return the scalar row of airspeed along the nose, where sideslip is unknown (copter)."""
+        full = self.airspeed_row(velocity, V, seconds)
+        speed = max(math.hypot(*V), 1e-6)
+        nose = np.array(((V[0] / speed, V[1] / speed),))
+        return Row(nose @ full.y, nose @ full.H, nose @ full.R @ nose.T)
+
+
+def _velocity_noise(Phi: Floats, Q: Floats, T: float, density: float | Floats) -> None:
+    square, cube = density * (0.5 * T * T), density * (T * T * T / 3.0)
+    for k in (0, 1):
+        Phi[k, 2 + k] = T
+        Q[:, k, k] = cube
+        Q[:, k, 2 + k] = Q[:, 2 + k, k] = square
+        Q[:, 2 + k, 2 + k] = density * T
+
+
+def nose_covariance(V: Vector2, along: float, across: float) -> Floats:
+    """Return the covariance (2, 2), north and east, of sigmas along and across the air velocity `V`."""
+    n, e = V
+    speed2 = n * n + e * e
+    a, b = along * along, across * across
+    if speed2 < 1.0:
+        return np.diag((max(a, b), max(a, b)))
+    nn, ne, ee = n * n / speed2, n * e / speed2, e * e / speed2
+    return np.array(((a * nn + b * ee, (a - b) * ne), ((a - b) * ne, a * ee + b * nn)))
+
+
+# ---------------------------------------------------------------------------------------------------------
+# Measurements
+# ---------------------------------------------------------------------------------------------------------
+
+
+def position_row(
+    layout: Layout, apart: Vector2, R: Floats, velocity: Vector2 = (0.0, 0.0), drifts: bool = True
+) -> Row:
+    """Return the row of a position: `apart` is nominal minus measured (m), `velocity` the corrected one.
+
+    `drifts` is True for GNSS: the shared drift is subtracted, and the latency seen through `velocity`.
+    """
+    H = np.zeros((2, layout.n))
+    H[0, 0] = H[1, 1] = 1.0
+    if drifts:
+        H[0, 13] = H[1, 14] = -1.0
+        if layout.latency:
+            H[:, layout.latency_at] = velocity
+    return Row(np.array(apart), H, R)
+
+
+def velocity_row(layout: Layout, apart: Vector2, sigma: float, acceleration: Vector2 = (0.0, 0.0)) -> Row:
+    """Return the row of a GNSS velocity: nominal minus measured (m/s), latency through the acceleration."""
+    H = np.zeros((2, layout.n))
+    H[0, 2] = H[1, 3] = 1.0
+    if layout.latency:
+        H[:, layout.latency_at] = acceleration
+    return Row(np.array(apart), H, np.diag((sigma * sigma, sigma * sigma)))
+
+
+def foreign_row(settings: Settings, layout: Layout, apart: Vector2) -> Row:
+    """Return the row of a foreign velocity: nominal minus foreign (m/s); not in intervals by `foreign`."""
+    H = np.zeros((2, layout.n))
+    at = layout.foreign_at.start
+    H[0, 2] = H[1, 3] = 1.0
+    H[0, at] = H[1, at + 1] = -1.0
+    return Row(np.array(apart), H, np.eye(2) * settings.foreign_noise_m_s**2)
+
+
+def standing_row(layout: Layout, velocity: Vector2, sigma: float = 0.1) -> Row:
+    """Return the row of a parked aircraft: its velocity over ground is zero."""
+    return velocity_row(Layout(layout.foreign, layout.latency), velocity, sigma)
+
+
+# ---------------------------------------------------------------------------------------------------------
+# Jumps
+# ---------------------------------------------------------------------------------------------------------
+
+
+def wind_jump(settings: Settings, layout: Layout, by: By) -> Floats:
+    """Return the covariance (n, n) that a jump of the wind adds.
+
+    By the IMU the aircraft's velocity over ground does not jump with the wind; by air data it does, because
+    the channel's velocity error is minus the wind.
+    """
+    B = np.zeros((layout.n, 2))
+    B[4, 0] = B[5, 1] = settings.wind_jump_m_s
+    if by == "air":
+        B[2, 0] = B[3, 1] = -settings.wind_jump_m_s
+    return B @ B.T
+
+
+def foreign_jump(settings: Settings, layout: Layout, by: By) -> Floats:
+    """Return the covariance (n, n) that a jump of the foreign velocity error adds."""
+    B = np.zeros((layout.n, 2))
+    at = layout.foreign_at.start
+    B[at, 0] = B[at + 1, 1] = settings.foreign_jump_m_s
+    if by == "foreign":
+        B[2, 0] = B[3, 1] = settings.foreign_jump_m_s
+    return B @ B.T
+
+
+# ---------------------------------------------------------------------------------------------------------
+# Ground
+# ---------------------------------------------------------------------------------------------------------
+
+FLYING_M_S = 8.0  # [m/s] airspeed from which a fixed wing may fly
+PARKED_M_S = 4.0  # [m/s] below it, slow over ground, it may be parked
+PARKED_S = 10.0  # [s] of it
+CLEAR_M = 5.0  # [m] above the last parked height: the wheels are off the ground
+
+
+class Ground(NamedTuple):
+    """Flying or not, since when slow (s, None if not slow), the height (m) where it was last parked."""
+
+    flying: bool = False
+    slow_since: float | None = None
+    parked_height: float | None = None
+
+
+def ground_phase(g: Ground, t: float, airspeed: float, speed: float, height: float) -> Ground:
+    """Follow parking, ground roll and flight.
+
+    Airspeed is used only in flight: parked it measures nothing, and in the ground roll the wheels, not the
+    air, hold the course, so that crosswind would be taken for none. After lift-off the wind is as open as
+    before. In the air at the start (no parked height) airspeed alone decides. A flight ends after `PARKED_S`
+    of slowness, for a light aircraft may stall or hang in the wind (UMN: airspeed 4 m/s, 1.4 m/s over ground
+    at 71 m).
+
+    Parameters
+    ----------
+    t
+        Time (s).
+    airspeed, speed
+        True airspeed and speed over ground (m/s).
+    height
+        Pressure altitude (m).
+    """
+    if airspeed < PARKED_M_S and speed < PARKED_M_S:
+        since = t if g.slow_since is None else g.slow_since
+        if g.flying and t - since < PARKED_S:
+            return Ground(True, since, g.parked_height)
+        return Ground(False, since, height)
+    clear = g.parked_height is None or height > g.parked_height + CLEAR_M
+    return Ground(g.flying or (airspeed > FLYING_M_S and clear), None, g.parked_height)

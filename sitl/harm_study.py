@@ -1,0 +1,425 @@
+"""`companion study harm`: does the companion do harm while GNSS is healthy?
+
+    companion study harm --quick
+    companion study harm --seeds 3 --minutes 10 --data ../shared/data
+
+Simulated flights with a healthy GNSS and one thing wrong, on every inertial channel that it concerns; then
+the recordings, where they are there (`sitl.harm_recordings`). A flight passes if GNSS is never excluded, EKF
+source set 2 is never requested, and the corrected error is at no time more than 1.2 times as far off as GNSS
+itself, r.m.s. over 10 s, plus 3 m. Stalls and reboots are flown over the
+simulated link, all others record by record.
+"""
+
+from __future__ import annotations
+
+import heapq
+import json
+import math
+import re
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from itertools import chain, repeat
+from operator import attrgetter
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import click
+import numpy as np
+from msgspec.structs import replace
+from rich.console import Console
+from rich.table import Table
+from threadpoolctl import threadpool_limits
+
+from companion.config import Config, InertialConfig, OutputConfig
+from companion.navigator import Navigator
+from companion.output.source_switch import SourceSwitch
+from companion.records import Event, Gnss, LocalOrigin, Solution
+from companion.runtime.core import CompanionCore
+from companion.units import SECOND_NS, Floats
+from sitl import loopback
+from sitl.autopilot import SimulatedAutopilot
+from sitl.beacon import Beacon
+from sitl.campaign.flight import UNITS, horizontal_errors, sensors_of
+from sitl.faults import Fault
+from sitl.flight import FlightPlan, Leg, WindChange, radii
+from sitl.harm_recordings import RecordingResult, fly_named, list_recordings, set_2_requests
+from sitl.scenarios import Scenario, SensorRates
+from sitl.world import World
+
+START_S = 120.0  # something goes wrong from here on, unless it is wrong from the start
+WINDOW_S, MOST_RATIO, FREE_M = 10.0, 1.2, 3.0
+INS = ("INS navigation", "INS MEMS")
+OWN = ("air data", "stock")
+CHANNELS = (*INS, *OWN)
+QUICK_MINUTES = 5.0
+_SUSPECTED = re.compile("(.*) is (?:suspect|excluded):")
+_EXCLUDED, _SET_2 = "gnss is excluded", "EKF source set 2"
+
+
+class Wrong(NamedTuple):
+    """One thing that is wrong: a fault, a change of scenario or configuration, a stall (s)."""
+
+    channels: tuple[str, ...] = CHANNELS
+    fault: Fault | None = None
+    airspeed_sensor: bool = True
+    stated: float = 1.0  # stated errors of the INS, as a multiple of the true ones
+    rate_hz: float | None = None
+    feeds: bool = True  # a position is sent to the autopilot
+    stall_s: float = 0.0
+    over_link: bool = False
+
+
+def _fault(name: str, size: float | None = None, start_s: float = START_S) -> Fault:
+    return Fault(name, start_s, math.inf, size)
+
+
+def _beacon(name: str, size: float, start_s: float = START_S) -> Wrong:
+    return Wrong(fault=_fault(name, size, start_s))
+
+
+WRONG: dict[str, Wrong] = {
+    "nothing": Wrong(),
+    "no airspeed sensor": Wrong(OWN, airspeed_sensor=False),
+    "pitot stuck at 8 m/s": Wrong(OWN, _fault("pitot-stuck", 8.0)),
+    "pitot stuck at 60 m/s": Wrong(OWN, _fault("pitot-stuck", 60.0)),
+    "pitot at zero": Wrong(OWN, _fault("pitot-stuck", 0.0)),
+    "pitot reads 1.5x": Wrong(OWN, _fault("pitot-scale", 1.5)),
+    "heading off by 5 deg": Wrong(OWN, _fault("heading-off", math.radians(5.0))),
+    "INS 100x too fine": Wrong(INS, stated=0.01),
+    "INS 10x too fine": Wrong(INS, stated=0.1),
+    "INS 10x too coarse": Wrong(INS, stated=10.0),
+    "INS 100x too coarse": Wrong(INS, stated=100.0),
+    # of a foreign position the stock channel uses the velocity only: a jump changes nothing there
+    "position jumps 100 m": Wrong(INS, _fault("ins-reset", 100.0), feeds=False),
+    "position drifts 1 m/s": Wrong((*INS, "stock"), _fault("ins-drift", 1.0), feeds=False),
+    "beacon range +50 m": _beacon("beacon-bias", 50.0),
+    "beacon range +200 m": _beacon("beacon-bias", 200.0),
+    "beacon range +1000 m": _beacon("beacon-bias", 1000.0),
+    "beacon azimuth +1 deg": _beacon("beacon-north", math.radians(1.0)),
+    "beacon azimuth +5 deg": _beacon("beacon-north", math.radians(5.0)),
+    "beacon 3 km away": _beacon("beacon-position", 3000.0, 0.0),
+    "GNSS 0.1 s late": _beacon("gnss-latency", 0.1, 0.0),
+    "GNSS 0.2 s late": _beacon("gnss-latency", 0.2, 0.0),
+    "GNSS 0.3 s late": _beacon("gnss-latency", 0.3, 0.0),
+    "stall of 0.3 s": Wrong(stall_s=0.3, over_link=True),
+    "stall of 1 s": Wrong(stall_s=1.0, over_link=True),
+    "stall of 5 s": Wrong(stall_s=5.0, over_link=True),
+    "reboot in the air": Wrong(fault=_fault("reboot"), over_link=True),
+    "streams at 1 Hz": Wrong(rate_hz=1.0),
+    "streams at 0.5 Hz": Wrong(rate_hz=0.5),
+}
+
+
+class HarmOrder(NamedTuple):
+    """One flight."""
+
+    wrong: str
+    channel: str
+    seed: int
+    minutes: float
+
+
+class HarmResult(NamedTuple):
+    """What was seen on one flight; `ratio` as in `worst_ratio`, None without solutions.
+
+    `since` is the same from `START_S` on: a start-up that is worse hides it in `ratio`. `suspected` are the
+    sources that were reported as suspect or excluded.
+    """
+
+    wrong: str
+    channel: str
+    seed: int
+    excluded: bool
+    set_2: bool
+    ratio: float | None
+    since: float | None = None
+    suspected: tuple[str, ...] = ()
+    raised: str | None = None
+
+    @property
+    def passed(self) -> bool:
+        """Whether no harm was done."""
+        harmed = self.excluded or self.set_2 or self.raised is not None
+        return not harmed and self.ratio is not None and self.ratio <= MOST_RATIO
+
+
+def scenario_of(order: HarmOrder) -> Scenario:
+    """Return the scenario: a minute's run-up, then a turn every 75 s, in wind."""
+    wrong = WRONG[order.wrong]
+    left, headings = 60.0 * order.minutes - 60.0, (40.0, 110.0, 40.0, 340.0, 70.0)
+    count = round(left / 75.0)
+    turns = (Leg(left / count, headings[k % len(headings)], 38.0, 60.0) for k in range(count))
+    own = order.channel in OWN
+    rates = SensorRates(imu=10.0 if order.channel == "stock" else 1.0, truth=1.0)
+    if wrong.rate_hz is not None:
+        hz = wrong.rate_hz
+        rates = SensorRates(hz, local_position=hz, attitude=hz, gnss=hz, air=hz, truth=1.0)
+    return Scenario(
+        order.wrong,
+        FlightPlan((Leg(10, 40, 0, 0), Leg(50, 40, 38, 0), *turns), winds=(WindChange(0, 4, 5),)),
+        grade="mems" if own or order.channel == "INS MEMS" else "navigation",
+        beacons=(Beacon(1, 60.05, 31.07),),
+        rates=rates,
+        airspeed_sensor=wrong.airspeed_sensor,
+        faults=() if wrong.fault is None else (wrong.fault,),
+        seed=order.seed,
+    )
+
+
+def config_of(order: HarmOrder) -> Config:
+    """Return the default configuration of the channel, with what is stated wrongly."""
+    wrong, output = WRONG[order.wrong], OutputConfig(profile="ardupilot")
+    inertial = InertialConfig(
+        source="air_data" if order.channel == "air data" else "auto", independent=order.channel in INS
+    )
+    if wrong.stated != 1.0:
+        true = UNITS["mems" if order.channel == "INS MEMS" else "navigation"]
+        scaled = (
+            "gyro_drift_deg_h",
+            "angle_random_walk_deg_sqrt_h",
+            "accelerometer_bias_ug",
+            "tilt_arcsec",
+            "heading_arcmin",
+        )
+        stated = {name: wrong.stated * getattr(true, name) for name in scaled}
+        inertial = replace(inertial, **stated)
+    return Config(inertial=inertial, output=output if wrong.feeds else OutputConfig())
+
+
+def fly(order: HarmOrder) -> HarmResult:
+    """Fly one flight; an exception is returned as a result."""
+    try:
+        with threadpool_limits(1):
+            flown = _fly_link if WRONG[order.wrong].over_link else _fly_records
+            world, solutions, events, set_2 = flown(scenario_of(order), order)
+        excluded = any(event.text.startswith(_EXCLUDED) for event in events)
+        ours, its = _errors(world, solutions), _gnss_errors(world)
+        suspected = sorted({found[1] for event in events if (found := _SUSPECTED.match(event.text))})
+        return HarmResult(
+            *order[:3],
+            excluded,
+            set_2,
+            ratio=worst_ratio(*_from(0.0, ours, its)),
+            since=worst_ratio(*_from(START_S, ours, its)),
+            suspected=tuple(suspected),
+        )
+    except Exception as error:  # the study goes on and lists it
+        return HarmResult(*order[:3], False, False, None, raised=f"{type(error).__name__}: {error}")
+
+
+_Flown = tuple[World, list[Solution], list[Event], bool]
+
+
+def _fly_records(scenario: Scenario, order: HarmOrder) -> _Flown:
+    config, world, switch = config_of(order), World(scenario), SourceSwitch()
+    navigator, origin = Navigator(config), world.origin
+    start = LocalOrigin(0, 0, origin.lat, origin.lon, origin.alt - scenario.geoid_height, scenario.autopilot)
+    streams = (world.streams[kind] for kind in sensors_of(config))
+    solutions, events, set_2, next_ns = list[Solution](), list[Event](), False, 0
+    for record in chain([start], heapq.merge(*streams, key=attrgetter("rx_ns"))):
+        if isinstance(record, Gnss):
+            switch.receive(record)
+        for output in navigator.handle(record):  # type: ignore[arg-type]
+            if isinstance(output, Solution):
+                solutions.append(output)
+                switch.note_output(output, True, output.rx_ns)
+            elif isinstance(output, Event):
+                events.append(output)
+        navigator.settle()
+        if record.rx_ns >= next_ns:
+            next_ns = record.rx_ns + SECOND_NS
+            set_2 = bool(set_2_requests(switch, record.rx_ns)) or set_2
+    return world, solutions, events, set_2
+
+
+def _fly_link(scenario: Scenario, order: HarmOrder) -> _Flown:
+    start = loopback.START_NS
+    autopilot, log = SimulatedAutopilot(scenario, start), loopback.CollectingLog(None)
+    core = CompanionCore(config_of(order), log, (loopback.LINK,))
+    stall_ns = round(WRONG[order.wrong].stall_s * SECOND_NS)
+    begin = start + round((START_S + 7.3) * SECOND_NS)
+    loopback.fly_connected(autopilot, core, start, stalls=((begin, begin + stall_ns),) if stall_ns else ())
+    solutions = [replace(r, t_ns=r.t_ns - start) for r in log.records if isinstance(r, Solution)]
+    events = [r for r in log.records if isinstance(r, Event)]
+    return autopilot.world, solutions, events, any(_SET_2 in event.text for event in events)
+
+
+def _errors(world: World, solutions: list[Solution]) -> tuple[Floats, Floats]:
+    t = np.array([s.t_ns for s in solutions]) * 1e-9
+    return t, horizontal_errors(world, solutions, t) if len(t) else t
+
+
+def _gnss_errors(world: World) -> tuple[Floats, Floats]:
+    fixes = [r for r in world.streams[Gnss] if isinstance(r, Gnss) and r.has_3d_fix]
+    t = np.array([r.t_ns for r in fixes]) * 1e-9
+    truth = world.truth_at(t)
+    R_N, R_E = radii(truth.lat)
+    north = (np.array([r.lat for r in fixes]) - truth.lat) * (R_N + truth.alt)
+    east = (np.array([r.lon for r in fixes]) - truth.lon) * (R_E + truth.alt) * np.cos(truth.lat)
+    return t, np.hypot(north, east)
+
+
+def _from(start_s: float, ours: tuple[Floats, Floats], its: tuple[Floats, Floats]) -> tuple[Floats, ...]:
+    """Cut both series to the time from `start_s` on and after the first fix: GNSS has no error before it."""
+    (t, error), (t_gnss, error_gnss) = ours, its
+    first = float(t_gnss[0]) if len(t_gnss) else math.inf
+    now, its_now = (t >= start_s) & (t > first), t_gnss >= start_s
+    return t[now], error[now], t_gnss[its_now], error_gnss[its_now]
+
+
+def worst_ratio(t: Floats, error: Floats, t_gnss: Floats, error_gnss: Floats) -> float | None:
+    """Return the greatest ratio of the corrected error less 3 m to GNSS's own, r.m.s. over 10 s.
+
+    Parameters: times (n,) s and horizontal errors (n,) m of the solutions, and the same of GNSS (m,). Windows
+    begin every second; None if no window has both.
+    """
+    if not len(t) or not len(t_gnss):
+        return None
+    begins = np.arange(math.floor(t[0]), t[-1] - WINDOW_S + 1.0)
+    ours, its = (_window_rms(*series, begins) for series in ((t, error), (t_gnss, error_gnss)))
+    ratios = (ours - FREE_M) / np.maximum(its, 1e-3)
+    known = ratios[np.isfinite(ratios)]
+    return max(0.0, float(known.max())) if len(known) else None
+
+
+def _window_rms(t: Floats, error: Floats, begins: Floats) -> Floats:
+    order = np.argsort(t, kind="stable")
+    sums = np.concatenate(([0.0], np.cumsum(error[order] ** 2)))
+    a, b = (np.searchsorted(t[order], begins + shift) for shift in (0.0, WINDOW_S))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        out: Floats = np.sqrt((sums[b] - sums[a]) / (b - a))
+    return out
+
+
+def list_orders(names: Iterable[str], channels: Iterable[str], seeds: int, minutes: float) -> list[HarmOrder]:
+    """List the flights: every wrong thing on every channel that it concerns."""
+    wanted = list(channels)
+    return [
+        HarmOrder(name, channel, seed, minutes)
+        for name in names
+        for channel in wanted
+        if channel in WRONG[name].channels
+        for seed in range(1, seeds + 1)
+    ]
+
+
+def _mapped(function: Callable[..., Any], workers: int, *columns: Iterable[Any]) -> Iterator[Any]:
+    """Map in `workers` processes, in this one with 0."""
+    if workers == 0:
+        yield from map(function, *columns)
+        return
+    with ProcessPoolExecutor(workers) as pool:
+        yield from pool.map(function, *columns)
+
+
+def fly_one_recording(data: Path, name: str) -> RecordingResult:
+    """Fly one recording in a worker."""
+    with threadpool_limits(1):
+        return fly_named(data, name)
+
+
+@click.command("harm")
+@click.option("--seeds", type=click.IntRange(1), default=3, show_default=True, help="Flights per case.")
+@click.option("--minutes", type=click.FloatRange(4.0), default=10.0, show_default=True, help="Of each.")
+@click.option("--quick", is_flag=True, help="One seed, five minutes.")
+@click.option("--case", "names", multiple=True, type=click.Choice(list(WRONG)), help="Default: all.")
+@click.option("--channel", "channels", multiple=True, type=click.Choice(CHANNELS), help="Default: all.")
+@click.option(
+    "--data",
+    type=click.Path(path_type=Path, file_okay=False),
+    default=Path("../shared/data"),
+    show_default=True,
+    help="Folder of the recordings; skipped where it is missing.",
+)
+@click.option(
+    "--workers", type=click.IntRange(0), default=2, show_default=True, help="Processes; 0: this one only."
+)
+@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+def command(
+    seeds: int,
+    minutes: float,
+    quick: bool,
+    names: tuple[str, ...],
+    channels: tuple[str, ...],
+    data: Path,
+    workers: int,
+    as_json: bool,
+) -> None:
+    """Fly with a healthy GNSS and one thing wrong, and every recording. Exit code 1 if harm is done."""
+    if quick:
+        seeds, minutes = 1, QUICK_MINUTES
+    orders = list_orders(names or WRONG, channels or CHANNELS, seeds, minutes)
+    flights: list[HarmResult] = list(_mapped(fly, workers, orders))
+    there = list_recordings(data) if data.is_dir() else []
+    recordings: list[RecordingResult] = list(_mapped(fly_one_recording, workers, repeat(data), there))
+    if as_json:
+        rows = [result._asdict() | {"passed": result.passed} for result in flights]
+        click.echo(json.dumps({"flights": rows, "recordings": [r._asdict() for r in recordings]}))
+    else:
+        console = Console(width=max(110, Console().width))
+        _print_flights(flights, console)
+        if recordings:
+            _print_recordings(recordings, console)
+        else:
+            click.echo(f"{data}: no recordings")
+    if not (all(flight.passed for flight in flights) and all(r.passed for r in recordings)):
+        raise SystemExit(1)
+
+
+def _print_flights(flights: list[HarmResult], console: Console) -> None:
+    table = Table(title="GNSS healthy, one thing wrong")
+    for head in ("wrong", "channel", "excluded", "set 2", "ratio", "since", "suspected", "passed"):
+        table.add_column(head, justify="left" if head in ("wrong", "channel", "suspected") else "right")
+    cases: dict[tuple[str, str], list[HarmResult]] = {}
+    for result in flights:
+        cases.setdefault((result.wrong, result.channel), []).append(result)
+    for (wrong, channel), same in cases.items():
+        ratios = [r.ratio for r in same if r.ratio is not None]
+        since = [r.since for r in same if r.since is not None]
+        suspected = sorted({name for r in same for name in r.suspected})
+        passed = sum(r.passed for r in same)
+        table.add_row(
+            wrong,
+            channel,
+            _count(r.excluded for r in same),
+            _count(r.set_2 for r in same),
+            f"{max(ratios):.2f}" if ratios else "-",
+            f"{max(since):.2f}" if since else "-",
+            ", ".join(suspected) or "-",
+            "yes" if passed == len(same) else f"NO ({passed} of {len(same)})",
+        )
+    console.print(table)
+    for result in flights:
+        if result.raised is not None:
+            click.echo(f"{result.wrong}, {result.channel}, seed {result.seed}: {result.raised}")
+    passed = sum(result.passed for result in flights)
+    click.echo(
+        f"{passed} of {len(flights)} flights passed. ratio: greatest (corrected error - 3 m) / error of GNSS,"
+        f" r.m.s. over 10 s; at most {MOST_RATIO}. since: the same from {START_S:g} s on, when faults begin"
+    )
+
+
+def _print_recordings(recordings: list[RecordingResult], console: Console) -> None:
+    table = Table(title="recordings; medians against GNSS in m, times in s")
+    heads = ("recording", "fixes", "refused", "corrected", "autopilot", "truth", "set 2", "passed")
+    for head in heads:
+        table.add_column(head, justify="left" if head == "recording" else "right", overflow="fold")
+    for r in recordings:
+        table.add_row(
+            r.name.rsplit("/", 1)[-1].split(".")[0],
+            str(r.fixes),
+            f"{r.refused_s:.1f}",
+            *("-" if x is None else f"{x:.2f}" for x in (r.corrected_m, r.autopilot_m, r.truth_m)),
+            "-" if r.set_2_s is None else f"{r.set_2_s:.0f}{' HARM' if r.harmful else ''}",
+            "yes" if r.passed else "NO",
+        )
+    console.print(table)
+    click.echo(
+        "refused: longest time without a healthy fix used; truth: median of corrected against the truth;"
+        " set 2: when first requested"
+    )
+
+
+def _count(values: Iterable[bool]) -> str:
+    many = list(values)
+    return f"{sum(many)} of {len(many)}" if any(many) else "-"

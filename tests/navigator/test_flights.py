@@ -1,0 +1,322 @@
+"""Whole simulated flights: a healthy GNSS is never excluded, a false one is, and the claims are honest."""
+
+from __future__ import annotations
+
+import heapq
+import math
+from collections.abc import Callable
+from operator import attrgetter
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+from msgspec.structs import replace
+
+from companion.config import Config, load
+from companion.navigator import Navigator
+from companion.records import (
+    AirData,
+    Attitude,
+    Event,
+    Gnss,
+    Imu,
+    LocalOrigin,
+    LocalPosition,
+    Pressure,
+    RsbnFix,
+    Solution,
+    Source,
+)
+from companion.units import Floats
+from sitl.beacon import Beacon
+from sitl.flight import FlightPlan, Leg, WindChange
+from sitl.scenarios import Scenario, SensorRates
+from sitl.world import World
+
+NS = 1_000_000_000
+FIVE_MINUTES = (
+    Leg(5, 40, 0, 0),
+    Leg(55, 40, 38, 40),
+    Leg(60, 40, 38, 40),
+    Leg(60, 130, 34, 40),
+    Leg(60, 220, 38, 40),
+    Leg(60, 310, 38, 40),
+)
+SENSORS = (LocalPosition, Attitude, Gnss, AirData, Pressure, RsbnFix)
+INS = load(flags={"inertial.independent": True}, environment={})
+OWN = load(flags={"output.profile": "ardupilot"}, environment={})
+CHANNELS: dict[str, tuple[Config, tuple[type, ...]]] = {
+    "ins": (INS, SENSORS),
+    "imu": (OWN, (*SENSORS, Imu)),
+    "air": (OWN, SENSORS),
+}
+SETTLED_S = 60.0
+Change = Callable[[Any], Any]
+
+
+class Flown(NamedTuple):
+    """Solutions with their times (s), errors north and east (m), and events."""
+
+    solutions: list[Solution]
+    t: Floats
+    error_n: Floats
+    velocity_error_n: Floats
+    events: list[Event]
+
+    @property
+    def error(self) -> Floats:
+        return np.hypot(*self.error_n.T)
+
+    @property
+    def protection(self) -> Floats:
+        return np.array([s.protection for s in self.solutions])
+
+    def of(self, name: str, start: float = 0.0, end: float = math.inf) -> Floats:
+        """Field of the solutions between two times."""
+        rows = [getattr(s, name) for s, t in zip(self.solutions, self.t, strict=True) if start <= t < end]
+        return np.array(rows)
+
+    def nees(self, at: float) -> float:
+        """Normalised squared error of the position at a time."""
+        k = int(np.searchsorted(self.t, at))
+        var_n, cov, _, var_e = self.solutions[k].covariance[:4]
+        e = self.error_n[k]
+        return float(e @ np.linalg.solve([[var_n, cov], [cov, var_e]], e))
+
+
+def fly(
+    channel: str,
+    change: Change = lambda record: record,
+    legs: tuple[Leg, ...] = FIVE_MINUTES,
+    config: Config | None = None,
+    gnss_until: float = math.inf,
+    rsbn: tuple[tuple[float, float], ...] = (),
+    seed: int = 1,
+    winds: tuple[WindChange, ...] = (WindChange(0, 4, 5),),
+    **scenario: Any,
+) -> Flown:
+    """Fly a scenario with every record changed, or dropped where None comes back."""
+    chosen, kinds = CHANNELS[channel]
+    outages = ((gnss_until, 1e9),) if gnss_until < math.inf else ()
+    world = World(
+        Scenario(
+            "test",
+            FlightPlan(legs, winds=winds),
+            beacons=(Beacon(1, 60.05, 31.07),),
+            rates=SensorRates(imu=20.0, truth=1.0, gnss=2.0),
+            gnss_outages=outages,
+            rsbn_outages=rsbn,
+            seed=seed,
+            **scenario,
+        )
+    )
+    start, outputs = world.origin, list[Any]()
+    navigator = Navigator(config or chosen)
+    navigator.handle(LocalOrigin(0, 0, start.lat, start.lon, start.alt - 16.0, "ardupilot"))
+    for record in heapq.merge(*(world.streams[kind] for kind in kinds), key=attrgetter("rx_ns")):
+        changed = change(record)
+        outputs += [] if changed is None else navigator.handle(changed)
+    solutions = [out for out in outputs if isinstance(out, Solution)]
+    t = np.array([s.t_ns for s in solutions]) / NS
+    truth = world.truth_at(t)
+    place = np.array([(s.lat, s.lon) for s in solutions])
+    radius = 6.378e6
+    north, east = (place[:, 0] - truth.lat) * radius, (place[:, 1] - truth.lon) * radius * np.cos(truth.lat)
+    velocity = np.array([s.v_n for s in solutions])[:, :2] - truth.v_n[:, :2]
+    events = [out for out in outputs if isinstance(out, Event)]
+    return Flown(solutions, t, np.stack([north, east], axis=1), velocity, events)
+
+
+def after(start: float, kind: type, **fields: Callable[[Any], Any]) -> Change:
+    """Change the fields of one kind of record from `start` (s) on."""
+
+    def change(record: Any) -> Any:
+        if not isinstance(record, kind) or record.t_ns < start * NS:
+            return record
+        return replace(record, **{name: of(getattr(record, name)) for name, of in fields.items()})
+
+    return change
+
+
+# ---------------------------------------------------------------------------------------------------------
+# First, do no harm
+# ---------------------------------------------------------------------------------------------------------
+
+
+def noisy(speed: float) -> Callable[[float], float]:
+    """A sensor that is stuck still has noise in its last digits."""
+    count = iter(range(10**9))
+    return lambda _: speed + 0.01 * (next(count) % 7)
+
+
+def late(seconds: float) -> Change:
+    """GNSS that is older than its time of validity says."""
+
+    def change(record: Any) -> Any:
+        if not isinstance(record, Gnss):
+            return record
+        shifted = record.t_ns + round(seconds * NS)
+        return replace(record, t_ns=shifted, rx_ns=shifted)
+
+    return change
+
+
+FINE = load(
+    flags={
+        "inertial.independent": True,
+        **{
+            f"inertial.{name}": value / 10.0
+            for name, value in (
+                ("gyro_drift_deg_h", INS.inertial.gyro_drift_deg_h),
+                ("accelerometer_bias_ug", INS.inertial.accelerometer_bias_ug),
+                ("angle_random_walk_deg_sqrt_h", INS.inertial.angle_random_walk_deg_sqrt_h),
+                ("velocity_noise_m_s_sqrt_s", INS.inertial.velocity_noise_m_s_sqrt_s),
+                ("tilt_arcsec", INS.inertial.tilt_arcsec),
+                ("heading_arcmin", INS.inertial.heading_arcmin),
+            )
+        },
+    },
+    environment={},
+)
+ONE_WRONG: dict[str, Callable[[], Change]] = {
+    "nothing": lambda: lambda record: record,
+    "pitot low": lambda: after(120.0, AirData, airspeed=noisy(20.0)),
+    "pitot high": lambda: after(120.0, AirData, airspeed=noisy(60.0)),
+    "pitot zero": lambda: after(120.0, AirData, airspeed=noisy(0.0)),
+    "range": lambda: after(120.0, RsbnFix, slant_range=lambda d: d + 200.0),
+    "azimuth": lambda: after(120.0, RsbnFix, azimuth=lambda a: (a + math.radians(1.0)) % math.tau),
+    "late 0.1 s": lambda: late(0.1),
+    "late 0.3 s": lambda: late(0.3),
+    "stated too fine": lambda: lambda record: record,
+}
+CASES = [
+    *((c, f) for c in ("imu", "air") for f in ("pitot low", "pitot high", "pitot zero")),
+    *((c, f) for c in ("ins", "imu") for f in ("nothing", "range", "azimuth", "late 0.1 s", "late 0.3 s")),
+    ("ins", "stated too fine"),
+]
+
+
+@pytest.mark.parametrize(("channel", "wrong"), CASES)
+def test_a_healthy_gnss_is_never_excluded(channel: str, wrong: str) -> None:
+    flown = fly(channel, ONE_WRONG[wrong](), config=FINE if wrong == "stated too fine" else None)
+    used = flown.of("sources", 30.0) & Source.GNSS
+    assert used.all()
+    assert flown.of("gnss_false", 30.0).max() < 0.5
+    assert not any("gnss is" in event.text for event in flown.events)
+    late_m = 38.0 * {"late 0.1 s": 0.1, "late 0.3 s": 0.3}.get(wrong, 0.0)
+    if channel != "air":  # there a false airspeed moves the nominal trajectory until the next fix
+        assert flown.error[flown.t > SETTLED_S].max() < 10.0 + late_m
+    assert np.all(flown.error <= flown.protection)
+
+
+@pytest.mark.parametrize("channel", ["ins", "imu"])
+def test_a_spoofed_gnss_is_excluded_with_a_beacon_and_comes_back(channel: str) -> None:
+    """Drawn off by 2 m/s from 120 s to 210 s, velocity alike."""
+    begin, end = 120.0, 210.0
+
+    def spoofed(record: Any) -> Any:
+        since = record.t_ns / NS - begin
+        if not isinstance(record, Gnss) or not 0.0 <= since < end - begin:
+            return record
+        assert record.v_n is not None
+        lon = record.lon + 2.0 * since / (6.378e6 * math.cos(record.lat))
+        return replace(record, lon=lon, v_n=(record.v_n[0], record.v_n[1] + 2.0, record.v_n[2]))
+
+    legs = (*FIVE_MINUTES, Leg(120, 310, 38, 40))
+    flown = fly(channel, spoofed, legs)
+    told = [(e.t_ns / NS, e.text) for e in flown.events if e.text.startswith("gnss is")]
+    excluded = next(t for t, text in told if "excluded" in text)
+    back = next(t for t, text in told if "used again" in text and t > excluded)
+    assert begin < excluded < end
+    assert end <= back < end + 120.0
+    held = flown.of("sources", excluded + 6.0, end) & Source.GNSS
+    assert not held.any()
+    assert (flown.of("sources", back + 5.0) & Source.GNSS).all()
+    assert flown.of("witness", begin, end).all()
+    assert np.all(flown.error <= flown.protection)
+    assert flown.error[flown.t > SETTLED_S].max() < 2.0 * (end - begin) / 2.0
+    assert flown.error[flown.t > back + 20.0].max() < 10.0
+
+
+@pytest.mark.parametrize("channel", ["ins", "imu", "air"])
+def test_a_gnss_that_stops_is_no_step_of_the_output(channel: str) -> None:
+    """What the output moves beyond its velocity, from one solution to the next, is no more than before."""
+    stop = 150.0
+    flown = fly(channel, gnss_until=stop, rsbn=((0.0, 1e9),), legs=FIVE_MINUTES[:4])
+    step = np.hypot(*np.diff(flown.error_n, axis=0).T)
+    with_gnss = step[(flown.t[1:] > SETTLED_S) & (flown.t[1:] < stop)]
+    at_loss = step[(flown.t[1:] >= stop) & (flown.t[1:] < stop + 5.0)]
+    assert at_loss.max() <= max(1.5 * with_gnss.max(), 0.5)
+    assert flown.of("protection", stop, stop + 1.0)[0] < 3.0 * flown.of("protection", stop - 5.0, stop).max()
+    assert np.all(flown.error <= flown.protection)
+
+
+# ---------------------------------------------------------------------------------------------------------
+# Honest claims
+# ---------------------------------------------------------------------------------------------------------
+
+SHORT = (Leg(5, 40, 0, 0), Leg(55, 40, 38, 40), Leg(30, 40, 38, 40), Leg(60, 130, 34, 40))
+
+
+@pytest.mark.parametrize("channel", ["ins", "imu", "air"])
+def test_the_claims_are_consistent(channel: str) -> None:
+    """Normalised squared errors over seeds, with GNSS and 20 s after its loss without any fix."""
+    seeds, at = range(8), (100.0, 135.0)
+    values: dict[float, list[float]] = {t: [] for t in at}
+    for seed in seeds:
+        flown = fly(channel, legs=SHORT, gnss_until=115.0, rsbn=((0.0, 1e9),), seed=seed)
+        for t in at:
+            values[t].append(flown.nees(t))
+        assert np.all(flown.error <= flown.protection)
+    for t in at:
+        # 16 degrees of freedom: more than 34.3 with a probability of 0.005 each
+        assert sum(values[t]) < 34.3, (t, values[t])
+
+
+# ---------------------------------------------------------------------------------------------------------
+# What must not matter
+# ---------------------------------------------------------------------------------------------------------
+
+
+def test_without_an_airspeed_sensor_the_number_of_vfr_hud_moves_nothing() -> None:
+    """It is the autopilot's own estimate then."""
+    wild = np.random.default_rng(1)
+
+    def unsensed(record: Any) -> Any:
+        return replace(record, sensed=False) if isinstance(record, AirData) else record
+
+    def lying(record: Any) -> Any:
+        if isinstance(record, AirData):
+            return replace(record, sensed=False, airspeed=float(wild.uniform(0.0, 99.0)))
+        return record
+
+    plain = fly("imu", unsensed, legs=SHORT, gnss_until=100.0)
+    other = fly("imu", lying, legs=SHORT, gnss_until=100.0)
+    assert len(plain.solutions) > 100
+    assert plain.solutions == other.solutions
+
+
+def test_feedback_and_feedforward_give_equal_positions() -> None:
+    """In the same flight the corrected positions agree whether the nominal is brought back or not."""
+    feedback, feedforward = (
+        load(flags={"output.profile": "ardupilot", "estimator.scheme": scheme}, environment={})
+        for scheme in ("feedback", "feedforward")
+    )
+    a, b = (fly("imu", legs=SHORT, config=c, gnss_until=120.0) for c in (feedback, feedforward))
+    np.testing.assert_array_equal(a.t, b.t)
+    apart = np.hypot(*(a.error_n - b.error_n).T)
+    two_centimetres = 0.02  # the rows are linearised about nominal trajectories that are metres apart
+    assert apart.max() < two_centimetres
+
+
+def test_the_velocity_by_air_data_is_as_good_as_claimed_in_gusts() -> None:
+    """With the gusts of the simulator stated: the defaults are those of recorded flights, and larger."""
+    gusts = {"inertial.source": "air_data", "air_data.gust_m_s": 0.6, "air_data.gust_s": 0.5}
+    config = load(flags=gusts, environment={})
+    flown = fly("air", seed=2, rsbn=((0.0, 1e9),), legs=FIVE_MINUTES[:4], config=config)
+    late = flown.t > 80.0
+    claimed = flown.of("sigma_velocity")[late]
+    error = np.abs(flown.velocity_error_n[late]).max(axis=1)
+    assert len(error) > 100
+    assert np.mean(error > 3.0 * claimed) < 0.01
+    assert np.median(claimed) < 2.0 * np.sqrt(np.mean(error**2))  # nor is too much claimed

@@ -1,0 +1,115 @@
+"""Harm study: the measure of harm, the flights, and the judgement of recordings."""
+
+import json
+import math
+from itertools import product
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from companion.records import Event, GlobalPosition, Gnss, Rejection, Solution
+from sitl import harm_study
+from sitl.harm_recordings import LOGS, RecordingLog, Track, judge_recording, longest_refusal
+from sitl.harm_study import CHANNELS, WRONG, HarmOrder, HarmResult, config_of, fly, scenario_of, worst_ratio
+
+S = 1_000_000_000
+
+
+def fix(t_s: float, **changes) -> Gnss:
+    t = round(t_s * S)
+    return Gnss(t, t, 0, t // 1000, **{"fix": 3, "lat": 1.0, "lon": 0.5, "alt_msl": 0.0, **changes})
+
+
+def solution(t_s: float, north: float = 0.0) -> Solution:
+    t = round(t_s * S)
+    return Solution(
+        t_ns=t, rx_ns=t, mode="fixed", estimator="kalman", lat=1.0 + north / 6.37e6, lon=0.5, alt_msl=0.0,
+        v_n=(0.0, 0.0, 0.0), covariance=(1.0, 0.0, 0.0, 1.0, 0.0, 1.0), error_n=(0.0, 0.0),
+        velocity_error_n=(0.0, 0.0), sources=1, horizon_s=0.0,
+    )  # fmt: skip
+
+
+def test_ratio_is_that_of_the_worst_ten_seconds_less_three_metres():
+    t = np.arange(0.0, 60.0, 0.2)
+    gnss = np.full(len(t), 2.0)
+    assert worst_ratio(t, np.full(len(t), 3.0), t, gnss) == pytest.approx(0.0)
+    error = np.where((t >= 30.0) & (t < 40.0), 9.0, 1.0)
+    assert worst_ratio(t, error, t, gnss) == pytest.approx(3.0)
+    assert worst_ratio(t[:0], error[:0], t, gnss) is None
+
+
+def test_a_flight_passes_only_without_exclusion_set_2_or_exception():
+    good = HarmResult("nothing", "stock", 1, False, False, 1.2)
+    assert good.passed
+    for changes in ({"excluded": True}, {"set_2": True}, {"ratio": 1.21}, {"ratio": None}, {"raised": "no"}):
+        assert not good._replace(**changes).passed
+
+
+@pytest.mark.parametrize(("name", "minutes"), list(product(WRONG, (5.0, 10.0))))
+def test_every_case_has_a_scenario_and_a_configuration(name, minutes):
+    for channel in WRONG[name].channels:
+        order = HarmOrder(name, channel, 1, minutes)
+        assert scenario_of(order).duration_s == pytest.approx(60.0 * minutes)
+        assert config_of(order).has_own_ins == channel.startswith("INS")
+
+
+@pytest.mark.parametrize("channel", ["INS navigation", "air data"])
+def test_flight_with_nothing_wrong_passes(channel):
+    result = fly(HarmOrder("nothing", channel, 1, 4.0))
+    assert result.passed, result
+
+
+def test_exception_in_a_flight_is_a_result(monkeypatch):
+    monkeypatch.setattr(harm_study, "scenario_of", lambda order: 1 / 0)
+    result = fly(HarmOrder("nothing", "stock", 1, 5.0))
+    assert "ZeroDivisionError" in str(result.raised) and not result.passed
+
+
+def test_longest_refusal_lasts_until_a_fix_is_used():
+    fixes = [(fix(k), k != 12) for k in range(20)]
+    assert longest_refusal(fixes, set()) == 0.0
+    assert longest_refusal(fixes, {3 * S, 4 * S}) == 2.0
+    assert longest_refusal(fixes, {10 * S, 11 * S, 12 * S, 13 * S}) == 1.0  # the fix at 12 s is not healthy
+
+
+def test_recording_is_judged_by_what_was_done_to_healthy_fixes():
+    log = RecordingLog()
+    for k in range(60):
+        log.record(solution(k, 2.0))
+        log.record(fix(k))
+        log.record(GlobalPosition(k * S, k * S, 1.0 + 0.5 / 6.37e6, 0.5, 0.0, (0.0, 0.0, 0.0), 0.0))
+    found = judge_recording("a", log, ())
+    assert found.corrected_m == pytest.approx(2.0) and found.autopilot_m == pytest.approx(0.5)
+    assert not found.passed  # worse than the autopilot by more than a metre
+    better = RecordingLog()
+    better.records = [r for r in log.records if not isinstance(r, GlobalPosition)]
+    assert judge_recording("a", better, ()).passed
+    better.set_2_ns = [30 * S]
+    assert judge_recording("a", better, ()).harmful
+    assert not judge_recording("a", better, ((25.0, math.inf),)).harmful
+    better.set_2_ns = []
+    for k in (30, 31, 32):
+        better.record(Rejection(k * S, k * S, "gnss 0", "excluded: false with probability", 1.0))
+    better.record(Event(30 * S, 30 * S, 4, "gnss is excluded: false with probability 1.0000"))
+    found = judge_recording("a", better, ())
+    assert found.refused_s == pytest.approx(3.0) and found.excluded and not found.passed
+
+
+def test_distance_is_unknown_beside_a_gap():
+    track = Track.of([(0.0, 1.0, 0.5), (1.0, 1.0, 0.5), (10.0, 1.0, 0.5)])
+    apart = track.distance(Track.of([(0.5, 1.0 + 10.0 / 6.37e6, 0.5), (5.0, 1.0, 0.5), (11.0, 1.0, 0.5)]))
+    assert apart[0] == pytest.approx(10.0) and np.isnan(apart[1:]).all()
+
+
+def test_command_prints_json_and_its_exit_code_tells_harm(tmp_path, monkeypatch):
+    options = ["--quick", "--case", "nothing", "--workers", "0", "--data", str(tmp_path), "--json"]
+    for ratio, code in ((0.5, 0), (2.0, 1)):
+        monkeypatch.setattr(harm_study, "fly", lambda o, r=ratio: HarmResult(*o[:3], False, False, r))
+        done = CliRunner().invoke(harm_study.command, options)
+        assert done.exit_code == code, done.output
+        found = json.loads(done.stdout)
+        assert [row["channel"] for row in found["flights"]] == list(CHANNELS)
+        assert found["recordings"] == [] and LOGS
+    done = CliRunner().invoke(harm_study.command, options[:-1])
+    assert "one thing wrong" in done.output and "NO (0 of 1)" in done.output

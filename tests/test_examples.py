@@ -1,0 +1,99 @@
+"""Every script of examples/ runs, and prints a result that is right."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from sitl.loopback import command
+
+ROOT = Path(__file__).parents[1]
+SCRIPTS = sorted(path.name for path in (ROOT / "examples").glob("*.py"))
+RECORDING = ROOT / "tests" / "data" / "dronekit_copter_cut.tlog"
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A log of a short loopback."""
+    folder = tmp_path_factory.mktemp("examples")
+    done = CliRunner().invoke(command, ["--scenario", "short", "--logs", str(folder)])
+    assert done.exit_code == 0, done.output
+    (path,) = folder.glob("*.mcap")
+    return path
+
+
+def run(script: str, *arguments: object) -> str:
+    done = subprocess.run(
+        [sys.executable, ROOT / "examples" / script, *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        timeout=300,
+        cwd=ROOT,
+        env=os.environ | {"PYTHONWARNINGS": "error"},
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def numbers(text: str) -> list[float]:
+    return [float(x) for x in re.findall(r"-?\d+\.?\d*", text)]
+
+
+def test_at_least_six_examples_of_at_most_40_lines_and_each_in_the_readme() -> None:
+    assert len(SCRIPTS) >= 6
+    page = (ROOT / "examples" / "README.md").read_text()
+    for name in SCRIPTS:
+        assert len((ROOT / "examples" / name).read_text().splitlines()) <= 40, name
+        assert f"({name})" in page
+
+
+def test_read_log(flight: Path) -> None:
+    lines = run("read_log.py", flight).splitlines()
+    assert len(lines) >= 5  # one a minute
+    assert all(float(re.search(r"error +([\d.]+) m", line)[1]) < 50.0 for line in lines)  # type: ignore[index]
+
+
+def test_fuse_two_beacons() -> None:
+    sigma, error = (
+        numbers(line)
+        for line in run("fuse_two_beacons.py").splitlines()
+        if line.startswith(("sigma", "error"))
+    )
+    assert all(abs(e) < 5.0 * s for e, s in zip(error, sigma, strict=True))
+
+
+def test_predict_bound_prints_1217_m_ten_minutes_ahead() -> None:
+    (row,) = (
+        numbers(line) for line in run("predict_bound.py").splitlines() if line.lstrip().startswith("10 ")
+    )
+    assert row[:2] == [10.0, 1217.0]
+
+
+def test_fly_loopback() -> None:
+    rows = run("fly_loopback.py").splitlines()[1:]
+    assert {"GNSS+RSBN", "GNSS only", "RSBN only", "neither"} == {row[:12].strip() for row in rows}
+    assert all(numbers(row[12:])[0] < 50.0 for row in rows)
+
+
+@pytest.mark.parametrize("source", ["tlog", "log"])
+def test_replay_with_another_estimator(source: str, flight: Path) -> None:
+    shown = run("replay_with_another_estimator.py", RECORDING if source == "tlog" else flight)
+    default, other = re.search(r"(\d+) by default, (\d+) with", shown).groups()  # type: ignore[union-attr]
+    assert int(default) > 5
+    assert int(other) > 5
+
+
+def test_write_a_custom_channel() -> None:
+    true_n, true_e, north, east, sigma = numbers(run("write_a_custom_channel.py"))
+    assert abs(north - true_n) < 5.0 * sigma
+    assert abs(east - true_e) < 5.0 * sigma
+
+
+def test_every_example_has_a_test() -> None:
+    tests = {name.removeprefix("test_") for name in globals() if name.startswith("test_")}
+    for script in SCRIPTS:
+        assert any(name.startswith(script.removesuffix(".py")) for name in tests), script
