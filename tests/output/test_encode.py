@@ -51,8 +51,8 @@ def encoded(name: str, autopilot: Autopilot = "ardupilot", **changes: Any) -> An
     return parsed(encode(POSITION._replace(**changes), receiver(autopilot), name))
 
 
-ARDUPILOT_COVARIANCE = [6.536989, *[0] * 5, 6.536989, *[0] * 4, 6.536989, 0, 0, 0, 1.06066, 0, 0, 1.06066]
-ARDUPILOT_COVARIANCE += [0, 1.06066]
+ARDUPILOT_COVARIANCE = [8.474810, *[0] * 5, 8.474810, *[0] * 4, 8.474810, 0, 0, 0, 0.75, 0, 0, 0.75]
+ARDUPILOT_COVARIANCE += [0, 0.75]
 TRUE_COVARIANCE = [16, 2, *[0] * 4, 25, *[0] * 4, 9, 0, 0, 0, *[NAN] * 6]
 
 NO_RATES = {name: NAN for name in ("vx", "vy", "vz", "rollspeed", "pitchspeed", "yawspeed")}
