@@ -66,6 +66,14 @@ def message_latency(flight: Flight, topic: str) -> tuple[Floats, Floats]:
     return rx, rx - t
 
 
+def beacon_places(flight: Flight) -> list[tuple[int, float, float, float]]:
+    """Return identity, latitude, longitude and altitude of each beacon, where it first answered from."""
+    fixes = flight.tables["RsbnFix"]
+    first = np.unique(fixes["beacon"], return_index=True)[1]
+    columns = (fixes[name][first].tolist() for name in ("beacon", "lat", "lon", "alt"))
+    return [(int(identity), lat, lon, alt) for identity, lat, lon, alt in zip(*columns, strict=True)]
+
+
 def rests_on_beacons(flight: Flight) -> npt.NDArray[np.bool_]:
     """Return which rows of "Fix" use beacons and not GNSS."""
     sources = flight.tables["Fix"]["sources"].astype(int)

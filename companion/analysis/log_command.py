@@ -1,4 +1,4 @@
-"""`companion log`: show the contents of a log, recover a torn log, convert a log of another recorder."""
+"""`companion log`: contents of a log, recovery, conversion of another recorder's log, export of a map."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from companion.storage.flight_log import Info, LogError, info, recover
 
 @click.group("log")
 def group() -> None:
-    """Inspect, recover and convert logs."""
+    """Inspect, recover, convert and export logs."""
 
 
 @group.command("info")
@@ -66,6 +66,49 @@ def convert_command(source: Path, output: Path) -> None:
     except LogError as error:
         _fail(error)
     click.echo(f"{output}: {written.records} records, {written.reboots} reboots")
+
+
+@group.command("export")
+@click.argument("log", type=click.Path(path_type=Path))
+@click.option(
+    "-o", "--output", type=click.Path(path_type=Path), required=True, help="File to write: .geojson or .kml."
+)
+@click.option(
+    "--every",
+    "every_s",
+    type=click.FloatRange(min=0.01),
+    default=1.0,
+    show_default=True,
+    help="Seconds between points.",
+)
+@click.option(
+    "--config",
+    "config_file",
+    type=click.Path(path_type=Path),
+    help="Configuration for the log of another recorder.",
+)
+def export_command(log: Path, output: Path, every_s: float, config_file: Path | None) -> None:
+    """Export the map of LOG: the estimate by legs with and without fixes, GNSS, truth, beacons."""
+    from companion.analysis import export
+    from companion.analysis.flights import open_flights
+    from companion.analysis.output_guard import reject_any_log, reject_own_input
+    from companion.config import load
+
+    try:
+        export.check_suffix(output)
+        reject_own_input(output, log, config_file)
+        reject_any_log(output)
+        tracks, places = list[export.Track](), list[export.Place]()
+        for flight in open_flights(log, load(config_file)):
+            lines, places = export.flight_map(flight, every_s)
+            k, n = flight.part
+            tracks += [
+                line._replace(name=f"flight {k}: {line.name}" if n > 1 else line.name) for line in lines
+            ]
+        export.write_map(output, log.name, tracks, places)
+    except LogError as error:
+        _fail(error)
+    click.echo(f"{output}: {len(tracks)} tracks, {len(places)} beacons")
 
 
 def _print(found: Info) -> None:
