@@ -8,8 +8,11 @@ from __future__ import annotations
 
 import importlib
 import os
+import re
 import sys
 from importlib.metadata import entry_points
+from importlib.util import find_spec
+from pathlib import Path
 
 import click
 
@@ -56,6 +59,27 @@ class LazyGroup(click.Group):
         module, attribute = self._table[cmd_name].split(":")
         command: click.Command = getattr(importlib.import_module(module), attribute)
         return command
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the list of commands; a command of the table is not imported for its first sentence."""
+        limit = formatter.width - 6 - max(map(len, self.list_commands(ctx)))
+        rows = []
+        for name in self.list_commands(ctx):
+            doc = _docstring(*self._table[name].split(":")) if name in self._table else None
+            shown = click.Command(name, help=doc) if doc else self.get_command(ctx, name)
+            rows.append((name, shown.get_short_help_str(limit) if shown else ""))
+        with formatter.section("Commands"):
+            formatter.write_dl(rows)
+
+
+def _docstring(module: str, function: str) -> str | None:
+    """Return the docstring of a function of a module, read from the source without importing it."""
+    spec = find_spec(module)
+    if spec is None or spec.origin is None:
+        return None
+    source = Path(spec.origin).read_text(encoding="utf-8")
+    found = re.search(rf'^def {function}\([^"]*?:\n    """(.*?)"""', source, re.MULTILINE | re.DOTALL)
+    return found and found[1]
 
 
 cli = LazyGroup(

@@ -27,6 +27,19 @@ def test_help_lists_every_command() -> None:
     assert listed >= set(COMMANDS)
 
 
+@pytest.mark.parametrize(
+    ("code", "absent"),
+    [
+        ("from companion.__main__ import cli; cli(['--help'], standalone_mode=False)", ("numpy", "asyncio")),
+        ("import companion.runtime.service", ("scipy", "companion.analysis", "sitl")),
+    ],
+)
+def test_start_imports_only_what_it_needs(code: str, absent: tuple[str, ...]) -> None:
+    code += f"; import sys; sys.exit([name for name in {absent} if name in sys.modules] or None)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
 @pytest.mark.parametrize("name", COMMANDS)
 def test_every_command_has_help(name: str) -> None:
     done = CliRunner().invoke(cli, [name, "--help"])

@@ -27,7 +27,6 @@ from typing import NamedTuple, Self
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import qr
 
 from companion.units import Floats
 
@@ -350,6 +349,8 @@ class Design:
             basis = np.asarray(rows, dtype=np.intp)
             if basis.min() >= 0 and basis.max() < n and np.linalg.cond(self.q[:, basis]) < 1e6:
                 return basis
+        from scipy.linalg import qr  # 0.2 s: not before the first frame is received
+
         return np.asarray(qr(self.q, mode="r", pivoting=True)[-1][:rank], dtype=np.intp)
 
 

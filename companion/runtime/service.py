@@ -21,6 +21,7 @@ import threading
 import time
 from collections.abc import Callable
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 
 import click
@@ -46,6 +47,7 @@ EX_UNAVAILABLE, EX_CANTCREAT = 69, 73  # sysexits.h
 LOG_CHECK_S = 1.0
 SAVE_INTERVAL_S = 1.0
 STOP_TIMEOUT_S = 5.0  # limit on waiting for a disk at the end
+IMPORT_AFTER_S = 0.5
 OVERDUE_NS = 2_000_000_000
 
 
@@ -223,6 +225,9 @@ async def run(config: Config, on_event: Callable[[Event], None], base: Config | 
         service.core.report(Severity.INFO, f"companion {__version__}: log {log.path}", time.monotonic_ns())
         recover = partial(_recover_logs, settings, service, asyncio.get_running_loop())
         threading.Thread(target=recover, name="recover", daemon=True).start()
+        # needed by the first solution with a protection level; not before the first frame is received
+        load = threading.Thread(target=import_module, args=("scipy.special",), name="import", daemon=True)
+        loop.call_later(IMPORT_AFTER_S, load.start)
         await service.serve()
         with contextlib.suppress(TimeoutError):
             await asyncio.wait_for(run_in_daemon_thread(service.save_state), STOP_TIMEOUT_S)

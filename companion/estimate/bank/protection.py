@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from scipy.special import erfc
 
 from companion.units import Floats
 
@@ -51,6 +50,8 @@ def _principal(d: Floats, C: Floats) -> tuple[Floats, Floats, Floats, Floats]:
 
 
 def _tail(r: float, a: Floats, b: Floats, ma: Floats, mb: Floats) -> Floats:
+    from scipy.special import erfc  # 0.2 s: not before the first frame is received
+
     v = mb[:, None] + b[:, None] * NODES
     h = np.sqrt(np.maximum(r * r - v * v, 0.0))
     scale = 1.0 / (a * math.sqrt(2.0))
