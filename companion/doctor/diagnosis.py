@@ -130,6 +130,14 @@ def check_airspeed(config: Config, healthy: bool | None) -> list[Finding]:
     return [Finding("airspeed sensor", text, "", None, advice)]
 
 
+def check_script(config: Config, make: str, runs: bool) -> list[Finding]:
+    """Report whether the autopilot's script can select source set 1 if the companion fails."""
+    if make != "ardupilot" or not config.output.switches_sources:
+        return []
+    absent = "does not run: if the companion fails, the pilot must select set 1 (deploy/ardupilot)"
+    return [Finding("source set script", "runs" if runs else absent, "", None)]
+
+
 def check_streams(
     config: Config, make: str, rates: Mapping[int, tuple[float, float | None]]
 ) -> list[Finding]:

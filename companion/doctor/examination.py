@@ -24,6 +24,7 @@ from companion.doctor.diagnosis import (
     ParameterFinding,
     check_airspeed,
     check_profile,
+    check_script,
     check_streams,
 )
 from companion.link import dialect, frame
@@ -38,6 +39,7 @@ from companion.link.session import (
     Session,
 )
 from companion.link.signing import Signing
+from companion.output.source_switch import selected
 from companion.runtime.core import requested_rates
 from companion.units import SECOND_NS
 
@@ -78,6 +80,7 @@ class Examination:
         self._version: Any = None
         self._origin: Any = None
         self._airspeed: bool | None = None  # whether the airspeed sensor is healthy
+        self._has_script = False  # the source set script of deploy/ardupilot reports
         self._others: set[int] = set()
         self._beacons: set[int] = set()
         self._client: ParameterClient | None = None
@@ -182,6 +185,8 @@ class Examination:
             self._origin = event.message
         elif event.frame.msgid == mavlink.MAVLINK_MSG_ID_SYS_STATUS:
             self._airspeed = has_airspeed_sensor(event.message)
+        elif (by := selected(event.message, event.from_autopilot)) is not None and by.is_report:
+            self._has_script = True
         if self._client is not None:
             answers = self._client.receive(event.message, event.frame)
             self._answers |= {answer.name: answer for answer in answers}
@@ -235,6 +240,7 @@ class Examination:
             *check_profile(self._config, self.make),
             *check_streams(self._config, self.make, self.session.stream_rates.rates()),
             *check_airspeed(self._config, self._airspeed),
+            *check_script(self._config, self.make, self._has_script),
             *self._check_link(now),
             Finding("RSBN beacons", beacons or "none", "", None),
         ]

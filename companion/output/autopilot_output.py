@@ -15,7 +15,7 @@ from companion.link.dialect import Message, mavlink
 from companion.output.encode import CannotEncode, Receiver, encode
 from companion.output.gate import Gate, Position, WithholdingMonitor
 from companion.output.position_reset import PositionReset
-from companion.output.source_switch import SourceSwitch
+from companion.output.source_switch import SourceSwitch, selected
 from companion.records import Event, FilterStatus, GlobalPosition, Gnss, Solution, Stamped, SystemTime
 
 DISPLAY_NAMES = {RESET: "external position"}
@@ -56,6 +56,11 @@ class AutopilotOutput:
         self._source_switch.handle_acknowledgement(command, result, now_ns)
         if command == mavlink.MAV_CMD_EXTERNAL_POSITION_ESTIMATE:
             self._add_event(self._position_reset.handle_acknowledgement(result, now_ns))
+
+    def handle_message(self, message: Message, from_autopilot: bool, now_ns: int) -> None:
+        """Process a message of another sender that may concern the source set."""
+        if (by := selected(message, from_autopilot)) is not None:
+            self._source_switch.handle_selected(by, now_ns)
 
     def messages(self, solution: Solution, names: Collection[str], receiver: Receiver) -> list[Message]:
         """Return the messages among `names` that may be sent for `solution`, and the commands due."""

@@ -5,10 +5,14 @@ off a healthy GNSS does harm. So set 2 (our position) is requested only while ou
 only if the receiver itself has no fix, or GNSS is false by the posterior with a beacon as witness: never
 because innovations were rejected. Set 1 (GNSS) is requested whenever the receiver has a fix that is not
 held false, also when there is no solution. The command is repeated until it is acknowledged.
+
+A set that somebody else selected (the pilot's switch, a ground station) is left as it is: no set is requested
+until a person selects the one that the table requires at that time, or the autopilot reboots.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -27,12 +31,50 @@ FRESH_S = 60.0  # a solution older than this says nothing about GNSS
 MAX_GAP_NS = SECOND_NS  # a longer gap interrupts
 RETRY_NS = SECOND_NS
 MAX_TRIES = 10
+REPORTS = 2
+"""Equal reports of the script in a row that count: one may have been made just before our command."""
+_SWITCH_TEXT = re.compile(r"Using EKF Source Set ([123])")  # ArduPilot, RCx_OPTION 90
+SCRIPT_REPORT = "EKFSRC"
+"""NAMED_VALUE_FLOAT of deploy/ardupilot/companion_source_set.lua: the set, negative if the script chose it."""
+_SETS = (1, 2, 3)
 #: Results after which the command is repeated.
 RETRIED = (
     mavlink.MAV_RESULT_TEMPORARILY_REJECTED,
     mavlink.MAV_RESULT_FAILED,
     mavlink.MAV_RESULT_IN_PROGRESS,
 )
+
+
+class Selected(NamedTuple):
+    """A source set that somebody else selected, or a report of the leading one.
+
+    `by_script`: the script on the autopilot selected it, because our position had stopped. `is_report`: the
+    script repeats it once a second, whoever selected it.
+    """
+
+    number: int
+    by_script: bool = False
+    is_report: bool = False
+
+
+def selected(message: Message, from_autopilot: bool) -> Selected | None:
+    """Return what `message`, not sent by us, states about the source set; None if nothing.
+
+    MAV_CMD_SET_EKF_SOURCE_SET of another sender, ArduPilot's text on a switch by RCx_OPTION 90, and the
+    script's report.
+    """
+    name = message.get_type()
+    if not from_autopilot:
+        if name not in ("COMMAND_LONG", "COMMAND_INT"):
+            return None
+        is_switch = message.command == mavlink.MAV_CMD_SET_EKF_SOURCE_SET and message.param1 in _SETS
+        return Selected(int(message.param1)) if is_switch else None
+    if name == "STATUSTEXT":
+        found = _SWITCH_TEXT.match(message.text)
+        return Selected(int(found[1])) if found else None
+    if name == "NAMED_VALUE_FLOAT" and message.name == SCRIPT_REPORT and abs(message.value) in _SETS:
+        return Selected(int(abs(message.value)), message.value < 0.0, is_report=True)
+    return None
 
 
 class Situation(NamedTuple):
@@ -116,14 +158,21 @@ class ConditionTimer:
 
 
 class SourceSwitch:
-    """The required EKF source set, requested until acknowledged; unknown at the start."""
+    """The required EKF source set, requested until acknowledged; unknown at the start.
+
+    `_required` is the decision of the table, `_wanted` the set that was requested last or that somebody else
+    selected, `_held` the one that a person selected against the table.
+    """
 
     def __init__(self) -> None:
         self._fix, self._no_fix, self._sent = ConditionTimer(), ConditionTimer(), ConditionTimer()
         self._receiver_ns: int | None = None
         self._sent_ns: int | None = None
         self._solution: Solution | None = None
+        self._required: int | None = None
         self._wanted: int | None = None
+        self._held: int | None = None
+        self._reported, self._reports = Selected(0), 0  # the last report of the script, how often in a row
         self._reason = ""
         self._tries = 0
         self._next_ns: int | None = None  # None: nothing to request
@@ -161,9 +210,37 @@ class SourceSwitch:
     def update(self, now_ns: int) -> None:
         """Decide by the table; call it at least once a second, with or without solutions."""
         decision = required_set(self.situation(now_ns))
-        if decision is not None and decision[0] != self._wanted:
-            self._wanted, self._reason = decision
+        if decision is None:
+            return
+        is_new = decision[0] != self._required
+        self._required, self._reason = decision
+        if self._held is not None:
+            if is_new and self._required != self._held:
+                need = f"EKF source set {self._required} needed ({self._reason})"
+                self._add_event(Severity.WARNING, f"{need}, but set {self._held} selected by hand", now_ns)
+        elif self._required != self._wanted:
+            self._wanted = self._required
             self._tries, self._next_ns = 0, now_ns
+
+    def handle_selected(self, by: Selected, now_ns: int) -> None:
+        """Process a source set that somebody else selected, or the script's report."""
+        if by.is_report:
+            self._reports = self._reports + 1 if by == self._reported else 1
+            self._reported = by
+            is_old = self._reports < REPORTS or self._next_ns is not None or self._wanted is None
+            if is_old or by.number == self._wanted:
+                return
+        self._wanted, self._next_ns = by.number, None
+        if by.by_script:
+            return  # the table decides again once our position goes out
+        before, self._held = self._held, None if by.number == (self._required or GNSS_SET) else by.number
+        if self._held == before:
+            return
+        if self._held is not None:
+            text = f"EKF source set {by.number} selected by hand: the companion does not switch"
+            self._add_event(Severity.NOTICE, text, now_ns)
+        else:
+            self._add_event(Severity.NOTICE, "the companion switches the EKF source set again", now_ns)
 
     def handle_acknowledgement(self, command: int, result: int, now_ns: int) -> None:
         """Process the autopilot's COMMAND_ACK of one of our commands."""

@@ -75,6 +75,15 @@ REQUESTS = frozenset(
         mavlink.MAVLINK_MSG_ID_PARAM_SET,
     }
 )
+#: Messages that may report that somebody else selected an EKF source set.
+ABOUT_SOURCE_SET = frozenset(
+    {
+        mavlink.MAVLINK_MSG_ID_COMMAND_INT,
+        mavlink.MAVLINK_MSG_ID_COMMAND_LONG,
+        mavlink.MAVLINK_MSG_ID_STATUSTEXT,
+        mavlink.MAVLINK_MSG_ID_NAMED_VALUE_FLOAT,
+    }
+)
 
 
 class Link:
@@ -285,6 +294,9 @@ class CompanionCore:
                     each.output.config = config
                     each.session.set_rates(requested_rates(config), event.received_ns)
                 self._on_record(Tuning(event.received_ns, event.received_ns, to_toml(config)))
+        if event.frame.msgid in ABOUT_SOURCE_SET:
+            link.output.handle_message(event.message, event.from_autopilot, event.received_ns)
+            self._emit_output_events(link)
         if not (event.from_autopilot or event.frame.msgid == rsbn.MAVLINK_MSG_ID_RSBN_MEASUREMENT):
             return
         ours = (0, self._config.link.component_id)  # 0: the sender states no target

@@ -5,12 +5,14 @@ as soon as there is a fix that is not held false, whether or not the companion h
 """
 
 import itertools
+import math
 from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from companion.link import dialect
 from companion.output.source_switch import (
     BELIEVED,
     FALSE,
@@ -23,9 +25,11 @@ from companion.output.source_switch import (
     STOPPED_S,
     TO_COMPANION,
     TO_GNSS,
+    Selected,
     Situation,
     SourceSwitch,
     required_set,
+    selected,
 )
 from companion.records import Gnss, Mode, Solution
 from companion.units import SECOND_NS
@@ -354,3 +358,95 @@ def test_after_a_reboot_the_source_set_is_requested_again() -> None:
     flight.switch = SourceSwitch()  # as AutopilotOutput.handle_reboot does
     flight.fly(10.0, fix=False)
     assert flight.sets == [2, 2]
+
+
+# ---------------------------------------------------------------------------------------------------------
+# Somebody else selects
+# ---------------------------------------------------------------------------------------------------------
+
+#: How a person's choice reaches the companion.
+BY_PERSON = [
+    lambda n: (dialect.new("COMMAND_LONG", command=42007, param1=n), False),
+    lambda n: (dialect.new("COMMAND_INT", command=42007, param1=n), False),
+    lambda n: (dialect.new("STATUSTEXT", text=b"Using EKF Source Set %d" % n), True),
+    lambda n: (dialect.new("NAMED_VALUE_FLOAT", name=b"EKFSRC", value=n), True),
+]
+
+
+def by_others(flight: Flight, message: Any, from_autopilot: bool) -> None:
+    by = selected(message, from_autopilot)
+    assert by is not None
+    for _ in range(2):
+        flight.switch.handle_selected(by, flight.now)
+
+
+@pytest.mark.parametrize("how", BY_PERSON)
+def test_a_persons_choice_is_respected_until_he_hands_back(how: Any) -> None:
+    flight = Flight()
+    flight.fly(30.0)
+    flight.fly(30.0, fix=False)
+    assert flight.sets == [1, 2]
+    by_others(flight, *how(1))  # in the dark the pilot prefers the autopilot's own reckoning
+    flight.fly(30.0, fix=False)
+    flight.fly(30.0)
+    flight.fly(30.0, fix=False)
+    assert flight.sets == [1, 2]
+    assert [text for _, text in flight.reports[2:]] == [
+        "EKF source set 1 selected by hand: the companion does not switch",
+        "EKF source set 2 needed (GNSS is lost, using companion), but set 1 selected by hand",
+    ]
+    by_others(flight, *how(2))
+    flight.fly(10.0, fix=False)
+    flight.fly(10.0)
+    assert flight.sets == [1, 2, 1]
+
+
+def test_a_choice_that_agrees_changes_nothing() -> None:
+    flight = Flight()
+    by_others(flight, *BY_PERSON[0](1))  # before the companion has anything to decide
+    flight.fly(30.0)
+    by_others(flight, *BY_PERSON[2](1))
+    flight.fly(30.0, fix=False)
+    assert flight.sets == [2]
+    assert len(flight.reports) == 1
+
+
+def test_the_scripts_own_choice_is_no_persons() -> None:
+    """The companion stalls while GNSS is held false: the script selects set 1; then our position returns."""
+    flight = Flight()
+    flight.fly(30.0)
+    flight.fly(30.0, false=1.0)
+    flight.now += 5 * SECOND_NS  # stalled
+    script = dialect.new("NAMED_VALUE_FLOAT", name=b"EKFSRC", value=-1.0), True
+    by_others(flight, *script)
+    flight.fly(10.0, false=1.0)
+    assert flight.sets == [1, 2, 2]
+
+
+def test_one_report_made_before_our_command_is_ignored() -> None:
+    flight = Flight()
+    flight.fly(30.0)
+    flight.fly(10.0, fix=False)
+    flight.switch.handle_selected(Selected(1, is_report=True), flight.now)
+    flight.switch.handle_selected(Selected(2, is_report=True), flight.now)
+    flight.switch.handle_selected(Selected(1, is_report=True), flight.now)
+    flight.fly(10.0)
+    assert flight.sets == [1, 2, 1]
+
+
+@pytest.mark.parametrize(
+    ("name", "fields", "from_autopilot"),
+    [
+        ("COMMAND_LONG", {"command": 42007, "param1": 0.0}, False),
+        ("COMMAND_LONG", {"command": 42007, "param1": math.nan}, False),
+        ("COMMAND_LONG", {"command": 42007, "param1": 1.5}, False),
+        ("COMMAND_LONG", {"command": 400, "param1": 1.0}, False),
+        ("STATUSTEXT", {"text": b"Using EKF Source Set 2"}, False),
+        ("STATUSTEXT", {"text": b"Using EKF Source Set 4"}, True),
+        ("NAMED_VALUE_FLOAT", {"name": b"EKFSRC", "value": 0.0}, True),
+        ("NAMED_VALUE_FLOAT", {"name": b"EKFSRC", "value": math.inf}, True),
+        ("NAMED_VALUE_FLOAT", {"name": b"OTHER", "value": 1.0}, True),
+    ],
+)
+def test_other_messages_select_nothing(name: str, fields: dict[str, Any], from_autopilot: bool) -> None:
+    assert selected(dialect.new(name, **fields), from_autopilot) is None
