@@ -35,7 +35,7 @@ REPORTS = 2
 """Equal reports of the script in a row that count: one may have been made just before our command."""
 _SWITCH_TEXT = re.compile(r"Using EKF Source Set ([123])")  # ArduPilot, RCx_OPTION 90
 SCRIPT_REPORT = "EKFSRC"
-"""NAMED_VALUE_FLOAT of deploy/ardupilot/companion_source_set.lua: the set, negative if the script chose it."""
+"""NAMED_VALUE_FLOAT of the script in deploy/ardupilot: the leading set, negative if the script chose it."""
 _SETS = (1, 2, 3)
 #: Results after which the command is repeated.
 RETRIED = (
