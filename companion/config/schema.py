@@ -1,4 +1,9 @@
-"""Configuration schema: one frozen structure per section of the file, with the unit in every key."""
+"""Configuration schema: one frozen structure per section of the file, with the unit in every key.
+
+Every number has a physical minimum and maximum, because ground stations may set it: whatever passes can be
+computed with for hours of flight, and fits the messages that carry it. `validate` adds the limits that a
+single interval cannot express.
+"""
 
 from __future__ import annotations
 
@@ -11,9 +16,6 @@ from msgspec import Meta
 
 from companion.config.profiles import MESSAGES, PROFILES, Name, Via
 
-Positive = Annotated[float, Meta(gt=0.0, lt=1e9)]
-NotNegative = Annotated[float, Meta(ge=0.0, lt=1e9)]
-Probability = Annotated[float, Meta(gt=0.0, lt=1.0)]
 RateHz = Annotated[float, Meta(ge=0.0, le=400.0)]
 OutputHz = Annotated[float, Meta(ge=-1.0, le=50.0)]
 Sensor: TypeAlias = Literal["local_position", "air_data", "imu"]
@@ -57,17 +59,17 @@ class InertialConfig(Section, frozen=True):
 
     source: Literal["auto", "local_position", "air_data", "imu"] = "auto"
     independent: bool = False
-    gyro_drift_deg_h: Positive = 0.01
-    gyro_correlation_h: Positive = 5.0
-    angle_random_walk_deg_sqrt_h: NotNegative = 0.002
-    accelerometer_bias_ug: Positive = 50.0
-    accelerometer_correlation_h: Positive = 1.0
-    position_m: Positive = 20.0
-    velocity_m_s: Positive = 0.5
-    tilt_arcsec: Positive = 20.0
-    heading_arcmin: Positive = 3.0
-    velocity_noise_m_s_sqrt_s: Positive = 0.001
-    height_sigma_m: Positive = 20.0
+    gyro_drift_deg_h: Annotated[float, Meta(ge=1e-05, le=1000.0)] = 0.01
+    gyro_correlation_h: Annotated[float, Meta(ge=0.01, le=1000.0)] = 5.0
+    angle_random_walk_deg_sqrt_h: Annotated[float, Meta(ge=0.0, le=10.0)] = 0.002
+    accelerometer_bias_ug: Annotated[float, Meta(ge=0.01, le=100000.0)] = 50.0
+    accelerometer_correlation_h: Annotated[float, Meta(ge=0.01, le=1000.0)] = 1.0
+    position_m: Annotated[float, Meta(ge=0.1, le=100000.0)] = 20.0
+    velocity_m_s: Annotated[float, Meta(ge=0.001, le=100.0)] = 0.5
+    tilt_arcsec: Annotated[float, Meta(ge=0.1, le=36000.0)] = 20.0
+    heading_arcmin: Annotated[float, Meta(ge=0.01, le=10800.0)] = 3.0
+    velocity_noise_m_s_sqrt_s: Annotated[float, Meta(ge=1e-6, le=10.0)] = 0.001
+    height_sigma_m: Annotated[float, Meta(ge=0.1, le=10000.0)] = 20.0
     strapped_down: bool = True  # the sensors turn with the aircraft; false: gimballed platform
 
 
@@ -78,18 +80,20 @@ class AirDataConfig(Section, frozen=True):
     of the heading, or the sideslip, that lasts seconds. The defaults are supported by recorded flights.
     """
 
-    wind_m_s: Positive = 8.0
-    wind_change_m_s_sqrt_s: Positive = 0.05
-    wind_jump_m_s: Positive = 4.0  # of wind jumps, north and east
-    wind_jumps_per_hour: Positive = 1.0
-    gust_m_s: Positive = 1.2
-    gust_s: Positive = 0.7
-    airspeed_percent: Positive = 3.0
-    heading_deg: Positive = 1.5
-    correlation_min: Positive = 10.0  # of airspeed and heading errors
-    crab_deg: Positive = 2.0
-    crab_s: Positive = 20.0
-    wind_rate_m_s_min: Positive = 1.0  # r.m.s., for the guaranteed prediction
+    wind_m_s: Annotated[float, Meta(ge=0.1, le=100.0)] = 8.0
+    wind_change_m_s_sqrt_s: Annotated[float, Meta(ge=0.0001, le=10.0)] = 0.05
+    wind_jump_m_s: Annotated[float, Meta(ge=0.1, le=100.0)] = 4.0  # of wind jumps, north and east
+    wind_jumps_per_hour: Annotated[float, Meta(ge=0.001, le=60.0)] = 1.0
+    gust_m_s: Annotated[float, Meta(ge=0.01, le=50.0)] = 1.2
+    gust_s: Annotated[float, Meta(ge=0.01, le=60.0)] = 0.7
+    airspeed_percent: Annotated[float, Meta(ge=0.1, le=50.0)] = 3.0
+    heading_deg: Annotated[float, Meta(ge=0.05, le=45.0)] = 1.5
+    correlation_min: Annotated[float, Meta(ge=0.1, le=1000.0)] = 10.0  # of airspeed and heading errors
+    crab_deg: Annotated[float, Meta(ge=0.05, le=45.0)] = 2.0
+    crab_s: Annotated[float, Meta(ge=0.5, le=600.0)] = 20.0
+    wind_rate_m_s_min: Annotated[float, Meta(ge=0.001, le=100.0)] = (
+        1.0  # r.m.s., for the guaranteed prediction
+    )
 
 
 class StrapdownConfig(Section, frozen=True):
@@ -100,10 +104,10 @@ class StrapdownConfig(Section, frozen=True):
     """
 
     imu: Annotated[int, Meta(ge=0, le=2)] = 0  # index of the IMU
-    tilt_deg: Positive = 1.2
-    tilt_s: Positive = 30.0
-    accelerometer_m_s2: Positive = 0.1  # including misalignment
-    velocity_noise_m_s_sqrt_s: Positive = 0.25
+    tilt_deg: Annotated[float, Meta(ge=0.01, le=30.0)] = 1.2
+    tilt_s: Annotated[float, Meta(ge=1.0, le=3600.0)] = 30.0
+    accelerometer_m_s2: Annotated[float, Meta(ge=0.0001, le=10.0)] = 0.1  # including misalignment
+    velocity_noise_m_s_sqrt_s: Annotated[float, Meta(ge=1e-6, le=10.0)] = 0.25
 
 
 class GnssConfig(Section, frozen=True):
@@ -116,37 +120,43 @@ class GnssConfig(Section, frozen=True):
     receiver: Annotated[int, Meta(ge=0, le=1)] = (
         0  # GPS_RAW_INT is 0, GPS2_RAW is 1; the receiver that GPS_INPUT feeds is not allowed
     )
-    sigma_m: Positive = 2.0
-    sigma_velocity_m_s: Positive = 0.1
-    correlation_s: Positive = 60.0
-    every_s: NotNegative = 0.5  # minimum interval between fixes that are used
+    sigma_m: Annotated[float, Meta(ge=0.01, le=1000.0)] = 2.0
+    sigma_velocity_m_s: Annotated[float, Meta(ge=0.001, le=100.0)] = 0.1
+    correlation_s: Annotated[float, Meta(ge=1.0, le=10000.0)] = 60.0
+    every_s: Annotated[float, Meta(ge=0.0, le=60.0)] = 0.5  # minimum interval between fixes that are used
     use_velocity: bool = True
     latency_s: Annotated[float, Meta(ge=0.0, le=2.0)] = (
         0.0  # age of a fix at its timestamp; `companion report` estimates it
     )
-    timeout_s: Positive = 3.0
+    timeout_s: Annotated[float, Meta(ge=0.5, le=600.0)] = 3.0
 
 
 class RsbnConfig(Section, frozen=True):
     """RSBN beacon error model: the greater of the stated sigma and these minimums."""
 
-    sigma_azimuth_deg: Positive = 0.125
-    sigma_range_m: Positive = 100.0
-    sigma_range_percent: NotNegative = 0.015
-    bias_azimuth_deg: Positive = 0.1  # constant errors, estimated while other sources are available
-    bias_range_m: Positive = 50.0
-    timeout_s: Positive = 10.0
+    sigma_azimuth_deg: Annotated[float, Meta(ge=0.001, le=20.0)] = 0.125
+    sigma_range_m: Annotated[float, Meta(ge=0.1, le=10000.0)] = 100.0
+    sigma_range_percent: Annotated[float, Meta(ge=0.0, le=10.0)] = 0.015
+    bias_azimuth_deg: Annotated[float, Meta(ge=0.001, le=20.0)] = (
+        0.1  # constant errors, estimated while other sources are available
+    )
+    bias_range_m: Annotated[float, Meta(ge=0.1, le=10000.0)] = 50.0
+    timeout_s: Annotated[float, Meta(ge=0.5, le=600.0)] = 10.0
 
 
 class PredictorConfig(Section, frozen=True):
     """The window of trusted fixes that the guaranteed prediction is fitted to, and its limit."""
 
-    window_min: Annotated[float, Meta(gt=0.5, le=80.0)] = 25.0
+    window_min: Annotated[float, Meta(ge=1.0, le=80.0)] = 25.0
     bin_s: Annotated[float, Meta(ge=0.1, le=60.0)] = 10.0
     learn_velocity: bool = False
-    disturbance_ug: NotNegative = 20.0  # r.m.s. specific force that the Schuler channel does not model
-    ahead_min: tuple[Annotated[float, Meta(gt=0.0, le=120.0)], ...] = (1.0, 5.0, 10.0, 20.0)
-    limit_m: Positive = 5000.0  # with a greater guaranteed bound the position is untrusted
+    disturbance_ug: Annotated[float, Meta(ge=0.0, le=100000.0)] = (
+        20.0  # r.m.s. specific force that the Schuler channel does not model
+    )
+    ahead_min: tuple[Annotated[float, Meta(ge=0.1, le=120.0)], ...] = (1.0, 5.0, 10.0, 20.0)
+    limit_m: Annotated[float, Meta(ge=1.0, le=1000000.0)] = (
+        5000.0  # with a greater guaranteed bound the position is untrusted
+    )
 
 
 class EstimatorConfig(Section, frozen=True):
@@ -176,9 +186,9 @@ class IntegrityConfig(Section, frozen=True):
     """
 
     rows: Annotated[int, Meta(ge=0, le=192)] = 0  # hypotheses followed at once; 0: 72 on an INS, else 96
-    risk: Probability = 1e-7
-    alert_m: Positive = 500.0
-    settle_s: NotNegative = 10.0
+    risk: Annotated[float, Meta(ge=1e-12, le=0.5)] = 1e-7
+    alert_m: Annotated[float, Meta(ge=1.0, le=100000.0)] = 500.0
+    settle_s: Annotated[float, Meta(ge=0.0, le=600.0)] = 10.0
 
 
 class OutputConfig(Section, frozen=True):
@@ -191,7 +201,7 @@ class OutputConfig(Section, frozen=True):
     profile: Name = "monitor"
     via: Literal["auto"] | Via = "auto"
     switch_sources: bool = True  # profile ardupilot: EKF source set 2 while GNSS is lost, otherwise 1
-    solution_hz: Annotated[float, Meta(gt=0.0, le=50.0)] = (
+    solution_hz: Annotated[float, Meta(ge=0.1, le=50.0)] = (
         5.0  # minimum; at least the rate of the fastest message
     )
     odometry_hz: OutputHz = -1.0

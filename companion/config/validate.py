@@ -13,6 +13,11 @@ from collections.abc import Iterator
 from companion.config.profiles import MESSAGES, PROFILES
 from companion.config.schema import Config
 
+#: Lowest rate of a message that is sent or requested: its interval fits 31 bits of microseconds.
+MIN_RATE_HZ = 0.01
+#: Most bins of the predictor's window: a greater linear program delays the solutions.
+MAX_BINS = 600
+
 
 def find_conflicts(config: Config) -> Iterator[tuple[str, str, str]]:
     """Yield the section and key of each invalid combination, and a sentence that states how to fix it."""
@@ -66,3 +71,20 @@ def find_conflicts(config: Config) -> Iterator[tuple[str, str, str]]:
             "output",
             "estimator.output = 'restrictive' runs on air data only: set inertial.source = 'air_data'",
         )
+    yield from _too_slow_rates(config)
+    bins = 60.0 * config.predictor.window_min / config.predictor.bin_s
+    if bins > MAX_BINS:
+        yield (
+            "predictor",
+            "bin_s",
+            f"predictor.window_min and predictor.bin_s make {bins:.0f} bins (limit {MAX_BINS}): "
+            f"set predictor.bin_s = {60.0 * config.predictor.window_min / MAX_BINS:.3g} or more",
+        )
+
+
+def _too_slow_rates(config: Config) -> Iterator[tuple[str, str, str]]:
+    for section in ("rates", "output"):
+        table = getattr(config, section)
+        for key in table.__struct_fields__:
+            if key.endswith("_hz") and 0.0 < (hz := getattr(table, key)) < MIN_RATE_HZ:
+                yield section, key, f"{section}.{key} = {hz:g}: set 0, or at least {MIN_RATE_HZ:g} Hz"

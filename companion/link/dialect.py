@@ -224,7 +224,7 @@ def payload(message: Message) -> bytes:
                 values.extend(value)
     try:
         return kind.layout.pack(*values)
-    except (struct.error, TypeError) as error:
+    except (struct.error, TypeError, OverflowError) as error:
         raise ValueError(f"{kind.name} cannot be packed: {error}; a field is out of its range") from None
 
 

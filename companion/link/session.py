@@ -155,6 +155,13 @@ class FrameRejected(NamedTuple):
     reason: SignatureFault
 
 
+class NotSent(NamedTuple):
+    """A message of ours that does not fit its wire format and was not sent; `why` names the field's type."""
+
+    at_ns: int
+    why: str
+
+
 Event = (
     LinkUp
     | LinkLost
@@ -166,6 +173,7 @@ Event = (
     | MessageReceived
     | NotUnderstood
     | FrameRejected
+    | NotSent
 )
 
 
@@ -230,6 +238,7 @@ class Session:
         self._ignored: set[int] = set()
         self._sequence = 0
         self._send_queue: list[bytes] = []
+        self._not_sent: list[Event] = []
         self._signing = signing
         self._link_id = link_id
         self._now = 0  # the last time supplied
@@ -272,7 +281,7 @@ class Session:
     def receive(self, data: bytes, now_ns: int) -> list[Event]:
         """Process bytes that arrived at `now_ns`; return the events in order."""
         self._now = now_ns
-        events: list[Event] = []
+        events, self._not_sent = self._not_sent, []
         for found in self.reader.receive(data):
             if isinstance(found, Frame):
                 self._on_frame(found, now_ns, events)
@@ -283,7 +292,7 @@ class Session:
     def poll(self, now_ns: int) -> list[Event]:
         """Do what is due at `now_ns`; return the events caused by the elapsed time."""
         self._now = now_ns
-        events: list[Event] = []
+        events, self._not_sent = self._not_sent, []
         if self._up and now_ns - self._last_received >= LOST_AFTER:
             self._up = False
             self.stream_rates.stop()
@@ -316,9 +325,14 @@ class Session:
         return min(due)
 
     def send(self, message: Message) -> None:
-        """Queue a message for `to_send`. ValueError if a field does not fit its wire type."""
+        """Queue a message for `to_send`; if a field does not fit its wire type, report NotSent instead."""
         sign = self._sign if self._signing else None
-        self._send_queue.append(frame.encode(message, self._sequence, self.system, self.component, sign))
+        try:
+            data = frame.encode(message, self._sequence, self.system, self.component, sign)
+        except ValueError as error:
+            self._not_sent.append(NotSent(self._now, str(error)))
+            return
+        self._send_queue.append(data)
         self._sequence = self._sequence + 1 & 0xFF
 
     def to_send(self) -> list[bytes]:

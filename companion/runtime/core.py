@@ -30,6 +30,7 @@ from companion.link.session import (
     LinkLost,
     LinkUp,
     MessageReceived,
+    NotSent,
     NotUnderstood,
     Rebooted,
     SecondAutopilot,
@@ -102,6 +103,7 @@ class Link:
         self.output = AutopilotOutput(config)
         self.parameter_check = ParameterCheck()
         self.bad = 0
+        self.not_sent: Counter[str] = Counter()  # messages that did not fit their wire format, by reason
         self.dropped = 0  # frames not sent because the line was too slow; set by the service
         self.origin_request_ns = 0  # when the local origin is requested next
 
@@ -181,6 +183,16 @@ class CompanionCore:
             if link.session.is_up:
                 return link
         return None
+
+    @property
+    def config(self) -> Config:
+        """The configuration in effect, with the values set by ground stations."""
+        return self._config
+
+    @property
+    def has_solution(self) -> bool:
+        """Whether a solution was computed within the last seconds."""
+        return self._solution is not None and not self._stale
 
     def settle(self) -> None:
         """Run deferred work after the output has been sent; otherwise the next record runs it."""
@@ -278,6 +290,10 @@ class CompanionCore:
                 self._on_record(Rejection(now_ns, now_ns, "timesync", why, event.error_ns / SECOND_NS))
             elif isinstance(event, FrameRejected):
                 self.rejected[f"{link.name}: {event.reason.name.lower()} frame"] += 1
+            elif isinstance(event, NotSent):
+                link.not_sent[event.why] += 1
+                if link.not_sent[event.why] == 1:
+                    self.report(Severity.ERROR, f"{link.name}: not sent: {event.why}", now_ns)
             elif isinstance(event, SecondAutopilot):
                 text = f"{link.name}: second autopilot {event.system} ignored; connected to {event.kept}"
                 self.report(Severity.WARNING, text, now_ns)

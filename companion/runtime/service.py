@@ -19,7 +19,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import partial
 from importlib import import_module
 from pathlib import Path
@@ -31,6 +31,7 @@ from companion.config import Config, ConfigError, LogConfig, load
 from companion.records import Event, Severity
 from companion.runtime.core import CompanionCore, Link
 from companion.runtime.daemon_thread import run_in_daemon_thread
+from companion.runtime.kept_parameters import KeptParameters
 from companion.runtime.signing_key import SigningKey
 from companion.runtime.state_file import StateFile
 from companion.runtime.stderr_writer import StderrWriter
@@ -49,13 +50,14 @@ SAVE_INTERVAL_S = 1.0
 STOP_TIMEOUT_S = 5.0  # limit on waiting for a disk at the end
 IMPORT_AFTER_S = 0.5
 OVERDUE_NS = 2_000_000_000
+CONFIRM_AFTER_S = 60.0  # of solutions with parameters set by ground stations
 
 
 class Service:
     """One run of the companion.
 
     `on_event` is called for every event, `now` reads the monotonic clock, `base` is the operator's
-    configuration without the values that ground stations set.
+    configuration without the values that ground stations set, `kept` the file of those.
     """
 
     def __init__(
@@ -66,7 +68,9 @@ class Service:
         now: Callable[[], int] = time.monotonic_ns,
         notifier: SystemdNotifier | None = None,
         base: Config | None = None,
+        kept: KeptParameters | None = None,
     ) -> None:
+        self._kept = kept
         self._notifier = notifier or SystemdNotifier({})
         self._addresses = {text: Address.parse(text) for text in config.link.connect}
         self._signing_key = SigningKey.from_config(config)
@@ -146,8 +150,13 @@ class Service:
     async def _save_state_periodically(self) -> None:
         """Save the state that outlives a restart; only this task waits for its disk."""
         last_reported: str | None = None
+        solved_s = 0.0
         while True:
             await asyncio.sleep(SAVE_INTERVAL_S)
+            if self.core.has_solution and solved_s < CONFIRM_AFTER_S:
+                solved_s += SAVE_INTERVAL_S
+                if solved_s >= CONFIRM_AFTER_S:
+                    await run_in_daemon_thread(self.confirm_parameters)
             if self._signing_key is not None:
                 self._signing_key.follow_system_time()
             trouble = await run_in_daemon_thread(self.save_state)
@@ -197,14 +206,25 @@ class Service:
                 self._signing_key.save_timestamp()
             return self._parameters_file.write()
 
+    def confirm_parameters(self) -> None:
+        """Accept the parameters set by ground stations: the service works with them. Blocks on the disk."""
+        if self._kept is not None:
+            self._kept.confirm()
+
     def report(self, text: str) -> None:
         """Log and report a change of links and files."""
         self.core.report(Severity.NOTICE, text, self._now())
         self._deferred.flush()
 
 
-async def run(config: Config, on_event: Callable[[Event], None], base: Config | None = None) -> None:
-    """Open the log, serve until SIGINT or SIGTERM, close the log. `on_event`, `base`: see `Service`."""
+async def run(
+    config: Config,
+    on_event: Callable[[Event], None],
+    base: Config | None = None,
+    kept: KeptParameters | None = None,
+    notes: Iterable[str] = (),
+) -> None:
+    """Open the log, report `notes`, serve until SIGINT or SIGTERM, close the log. Others: see `Service`."""
     start_ns, start_unix_ns = time.monotonic_ns(), time.time_ns()
     settings = config.log
     log = create_log(
@@ -218,11 +238,13 @@ async def run(config: Config, on_event: Callable[[Event], None], base: Config | 
     )
     service, has_data = None, True
     try:
-        service = Service(config, log, on_event, notifier=SystemdNotifier(os.environ), base=base)
+        service = Service(config, log, on_event, notifier=SystemdNotifier(os.environ), base=base, kept=kept)
         loop = asyncio.get_running_loop()
         for number in (signal.SIGINT, signal.SIGTERM):
             loop.add_signal_handler(number, service.stop)
         service.core.report(Severity.INFO, f"companion {__version__}: log {log.path}", time.monotonic_ns())
+        for note in notes:
+            service.core.report(Severity.WARNING, note, time.monotonic_ns())
         recover = partial(_recover_logs, settings, service, asyncio.get_running_loop())
         threading.Thread(target=recover, name="recover", daemon=True).start()
         # needed by the first solution with a protection level; not before the first frame is received
@@ -231,6 +253,7 @@ async def run(config: Config, on_event: Callable[[Event], None], base: Config | 
         await service.serve()
         with contextlib.suppress(TimeoutError):
             await asyncio.wait_for(run_in_daemon_thread(service.save_state), STOP_TIMEOUT_S)
+            await asyncio.wait_for(run_in_daemon_thread(service.confirm_parameters), STOP_TIMEOUT_S)
     except (CannotListen, ConfigError):  # an empty log would count in log.maximum_files
         has_data = service is not None and any(link.received for link in service.core.links.values())
         raise
@@ -271,8 +294,10 @@ def command(file: Path | None, connect: tuple[str, ...], logs: str | None, pairs
     """
     flags = {"link.connect": connect or None, "log.folder": logs}
     base = config = load(file, flags, pairs=pairs)
-    if config.link.parameters_file and Path(config.link.parameters_file).exists():
-        config = load(file, flags, pairs=pairs, tuned=Path(config.link.parameters_file))
+    kept, notes = None, list[str]()
+    if base.link.parameters_file:
+        kept = KeptParameters(Path(base.link.parameters_file))
+        config, notes = kept.load(base, lambda: load(file, flags, pairs=pairs, tuned=kept.path))
     try:
         for text in config.link.connect:
             Address.parse(text)
@@ -284,7 +309,7 @@ def command(file: Path | None, connect: tuple[str, ...], logs: str | None, pairs
         writer.write_line(f"{(event.rx_ns - start_ns) * 1e-9:9.3f} {event.text}")
 
     try:
-        asyncio.run(run(config, write_event, base))
+        asyncio.run(run(config, write_event, base, kept, notes))
     except CannotListen as error:
         writer.write_line(f"companion: {error.strerror}")
         sys.exit(EX_UNAVAILABLE)

@@ -33,7 +33,7 @@ def test_flags_override_environment_overrides_file(tmp_path: Path) -> None:
         ("[lnk]\nx = 1", "there is no section [lnk]; did you mean `link`?"),
         ("[link]\ncomponent = 1", "section [link] has no key `component`; did you mean `component_id`?"),
         ("[link]\ncomponent_id = 1000", "link.component_id = 1000 is invalid: expected int <= 255"),
-        ("[gnss]\nsigma_m = -1", "gnss.sigma_m = -1 is invalid: expected float > 0.0"),
+        ("[gnss]\nsigma_m = -1", "gnss.sigma_m = -1 is invalid: expected float >= 0.01"),
         ("[gnss]\nsigma_m = nan", "gnss.sigma_m = nan is invalid: expected float"),
         ("[gnss]\nsigma_m = 'two'", "gnss.sigma_m = 'two' is invalid: expected float, got str"),
         (

@@ -1,0 +1,77 @@
+"""Kept parameters: values set by ground stations, loaded at the start unless they may have ended two starts.
+
+    config, notes = kept.load(base, lambda: load(..., tuned=kept.path))     # counts this start
+    kept.confirm()                # the values have flown for a minute, or the service ended as requested
+
+A start is counted in a file beside the parameters and confirmed later. After two starts of the same boot that
+were not confirmed, or if the values do not pass the checks, the parameters are set aside and the operator's
+configuration is used. A power cut changes the boot, so it does not count. A disk that cannot be written
+disables the count, not the service.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+from companion.config import Config, ConfigError
+from companion.runtime.state_file import replace_text
+
+MAX_FAILED_STARTS = 2
+BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
+
+
+class KeptParameters:
+    """The parameters file of one service and the count of its unconfirmed starts."""
+
+    def __init__(self, path: Path, boot_id: Path = BOOT_ID) -> None:
+        self.path = path
+        self._count_path = path.with_name(path.name + ".starts")
+        self._boot_id = boot_id
+
+    def load(self, base: Config, load: Callable[[], Config]) -> tuple[Config, list[str]]:
+        """Return the configuration to start with, and what must be reported.
+
+        `base` is the configuration without the kept values, `load` returns the one with them.
+        """
+        if not self.path.exists():
+            return base, []
+        boot, failed = self._count()
+        if failed >= MAX_FAILED_STARTS:
+            return base, [self._set_aside(f"the last {failed} starts with them failed")]
+        try:
+            config = load()
+        except ConfigError as error:
+            return base, [self._set_aside(str(error))]
+        with contextlib.suppress(OSError):
+            replace_text(self._count_path, f"{boot} {failed + 1}\n")
+        return config, []
+
+    def confirm(self) -> None:
+        """Forget the failed starts."""
+        with contextlib.suppress(OSError):
+            self._count_path.unlink(missing_ok=True)
+
+    def _count(self) -> tuple[str, int]:
+        """Return the id of this boot and its number of unconfirmed starts."""
+        try:
+            boot = self._boot_id.read_text("ascii").strip()
+        except (OSError, ValueError):
+            boot = "unknown"
+        try:
+            before, number = self._count_path.read_text("ascii").split()
+            return boot, int(number) if before == boot else 0
+        except (OSError, ValueError):
+            return boot, 0
+
+    def _set_aside(self, why: str) -> str:
+        aside = self.path.with_name(self.path.name + ".rejected")
+        self.confirm()
+        try:
+            os.replace(self.path, aside)
+            where = f"kept in {aside}"
+        except OSError as error:
+            where = f"{self.path} cannot be renamed ({error.strerror})"
+        return f"parameters set by ground stations are not used: {why}; {where}"

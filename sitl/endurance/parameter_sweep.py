@@ -1,0 +1,152 @@
+"""`python -m sitl.endurance.parameter_sweep`: every parameter set to its limits and beyond, in flight.
+
+A ground station may set any parameter to any number. Each flight sets one parameter (or several) by PARAM_SET
+while the companion navigates with GNSS and a beacon, then loses GNSS. Requirements: no exception, only finite
+outputs, every message sent fits its wire format, and a value outside the limits changes nothing.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import random
+from collections.abc import Iterable, Iterator
+from functools import lru_cache
+from typing import NamedTuple
+
+import click
+import msgspec
+
+from companion.config import AirDataConfig, Config, InertialConfig, OutputConfig
+from companion.link import dialect, frame
+from companion.link.dialect import mavlink
+from companion.link.parameter_server import REAL32, Parameter, parameter_table
+from companion.runtime.core import CompanionCore
+from companion.units import SECOND_NS
+from sitl.autopilot import SimulatedAutopilot
+from sitl.endurance.fuzz_targets import ALL_OUTPUTS, ValidatingLog
+from sitl.loopback import LINK, START_NS
+from sitl.scenarios import get_scenario
+
+FLIGHT_S, SET_AT_S, OUTAGE_S = 50.0, 15.0, 30.0
+#: Beyond the limits of every parameter, or awkward to compute with.
+EXTREMES = (math.nan, math.inf, -math.inf, 3.4e38, -3.4e38, 1e-40, -1e-40, 1e-30, 1e-6, 4e-4, 0.0, -1.0, 1e9)
+#: Channels and outputs that are swept: an own INS, the own channel by all sensors, and by air data alone.
+CONFIGS = (
+    Config(inertial=InertialConfig(independent=True), output=ALL_OUTPUTS),
+    Config(output=OutputConfig(profile="ardupilot")),
+    Config(inertial=InertialConfig(source="air_data"), air_data=AirDataConfig(), output=ALL_OUTPUTS),
+)
+
+
+class Setting(NamedTuple):
+    """One PARAM_SET: the parameter's name and the value on the wire."""
+
+    name: str
+    value: float
+
+
+def limits(parameter: Parameter) -> tuple[float, ...]:
+    """Return the least and the greatest value that a parameter accepts by itself."""
+    if parameter.kind is bool:
+        return 0.0, 1.0
+    info = msgspec.inspect.type_info(type(getattr(Config(), parameter.section)))
+    assert isinstance(info, msgspec.inspect.StructType)
+    (kind,) = [field.type for field in info.fields if field.name == parameter.key]
+    assert isinstance(kind, msgspec.inspect.FloatType | msgspec.inspect.IntType), parameter
+    if kind.ge is None or kind.le is None:
+        raise ValueError(f"{parameter.section}.{parameter.key} has no minimum or no maximum")
+    return float(kind.ge), float(kind.le)
+
+
+def settings() -> Iterator[Setting]:
+    """Yield every parameter at both limits and at all extremes."""
+    for parameter in parameter_table():
+        for value in (*limits(parameter), *EXTREMES):
+            yield Setting(parameter.name, value)
+
+
+@lru_cache
+def recorded_flight(own_ins: bool, duration_s: float = FLIGHT_S) -> tuple[tuple[int, bytes], ...]:
+    """Fly once and return the autopilot's frames with their arrival times, the GNSS lost at OUTAGE_S."""
+    scenario = dataclasses.replace(
+        get_scenario("short"), gnss_outages=((OUTAGE_S, 10 * duration_s),), rsbn_outages=()
+    )
+    autopilot = SimulatedAutopilot(scenario, START_NS)
+    core = CompanionCore(CONFIGS[0 if own_ins else 1], ValidatingLog(), (LINK,))
+    frames, now = list[tuple[int, bytes]](), START_NS
+    while now <= START_NS + round(duration_s * 1e9):
+        for data in autopilot.poll(now):
+            frames.append((now, data))
+            core.receive(LINK, data, now)
+        core.poll(now)
+        for data in core.to_send(LINK, now):
+            autopilot.receive(data, now)
+        now = max(now + 1, min(autopilot.deadline(), core.deadline()))
+    return tuple(frames)
+
+
+def fly_with(config: Config, chosen: Iterable[Setting]) -> int:
+    """Fly and set the parameters one after another, a second apart; return how many were changed."""
+    core = CompanionCore(config, ValidatingLog(), (LINK,))
+    pending = list(chosen)
+    before, changed, due = config, 0, START_NS + round(SET_AT_S * 1e9)
+    for number, (now, data) in enumerate(recorded_flight(config.inertial.independent)):
+        core.receive(LINK, data, now)
+        if core.deadline() <= now:
+            core.poll(now)
+        core.to_send(LINK, now)
+        core.take_events()
+        if pending and now >= due:
+            setting = pending.pop(0)
+            due = now + SECOND_NS
+            core.receive(LINK, _param_set(setting, number), now)
+            after = core.config
+            changed += after != before
+            before = after
+    if core.links[LINK].not_sent:
+        raise ValueError(f"not sent: {dict(core.links[LINK].not_sent)}")
+    return changed
+
+
+def _param_set(setting: Setting, sequence: int) -> bytes:
+    message = dialect.new(
+        "PARAM_SET",
+        target_system=1,
+        target_component=191,
+        param_id=setting.name,
+        param_value=setting.value,
+        param_type=REAL32,
+    )
+    return frame.encode(message, sequence & 0xFF, 255, mavlink.MAV_COMP_ID_MISSIONPLANNER)
+
+
+@click.command()
+@click.option("--several", type=click.IntRange(0), default=100, show_default=True, help="Flights with ten.")
+@click.option("--seed", type=int, default=1, show_default=True)
+def main(several: int, seed: int) -> None:
+    """Set every parameter to its limits and beyond in flight. Exit code 1 if a flight failed."""
+    everything, rng = list(settings()), random.Random(seed)
+    flights: list[tuple[Config, list[Setting]]] = []
+    for config in CONFIGS:
+        flights += [(config, [setting]) for setting in everything if setting.value not in EXTREMES]
+        # what is out of the limits changes nothing, so many are set in one flight
+        beyond = [s for s in everything if s.value in EXTREMES or math.isnan(s.value)]
+        flights += [(config, beyond[at : at + 30]) for at in range(0, len(beyond), 30)]
+    flights += [(rng.choice(CONFIGS), rng.sample(everything, 10)) for _ in range(several)]
+    changed, failed = 0, list[str]()
+    for number, (config, chosen) in enumerate(flights):
+        try:
+            changed += fly_with(config, chosen)
+        except Exception as error:  # the defect that is looked for
+            failed.append(f"{chosen}: {type(error).__name__}: {error}")
+            click.echo(failed[-1])
+        if number % 50 == 0:
+            click.echo(f"{number} of {len(flights)} flights")
+    click.echo(f"{len(flights)} flights, {changed} changes accepted, {len(failed)} failed")
+    if failed:
+        raise SystemExit(1)
+
+
+if __name__ == "__main__":
+    main()
