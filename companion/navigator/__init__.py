@@ -17,6 +17,7 @@ from msgspec import structs
 from companion.config import Config, parse
 from companion.estimate import bank as banks
 from companion.navigator import minimax_bound
+from companion.navigator.hypotheses import Model
 from companion.navigator.own_channel import OwnChannel
 from companion.navigator.solution import announce, resolve_pending, solve
 from companion.navigator.stale_data import REPORT_EVERY, StaleDataDetector
@@ -49,10 +50,13 @@ class _Past(NamedTuple):
 
 
 class Navigator:
-    """One aircraft's navigator: `handle` every record in the order of arrival."""
+    """One aircraft's navigator: `handle` every record in the order of arrival.
 
-    def __init__(self, config: Config) -> None:
-        self._settings = Settings.of(config)
+    `model` replaces the hypotheses that follow from the configuration, for studies.
+    """
+
+    def __init__(self, config: Config, model: Model | None = None) -> None:
+        self._settings = Settings(config, model or Model(config))
         self._state = initial(self._settings)
         self._past: deque[_Past] = deque()
         self._deferred: list[Output] = []  # outputs of deferred updates, for the next `handle`

@@ -1,4 +1,4 @@
-"""`companion study weights` prints table, data and plot."""
+"""`companion study weights` prints tables, data and plot; its numbers are the reference's."""
 
 import json
 
@@ -7,28 +7,79 @@ from click.testing import CliRunner
 
 from companion.study.weights import command
 
+AXIS = (
+    "--reading=INS.x=105,22.360679775",
+    "--reading=GNSS.x=101,3.16227766",
+    "--reading=RSBN.x=98.994949,14.142135624",
+)
+NEAR_NORTH = (
+    *("--reading=INS.x=2400,1500", "--reading=INS.y=139500,1500", "--reading=GNSS.x=2440,100"),
+    *("--reading=GNSS.y=139970,100", "--reading=RSBN.azimuth=1,0.25", "--reading=RSBN.range=140000,200"),
+)
+
 
 def run(*arguments):
     return CliRunner().invoke(command, arguments)
 
 
-def test_data():
-    result = json.loads(run("--json").output)
-    sensors = {s["name"]: s for s in result["sensors"]}
-    by_factor = {
-        name: dict(zip(result["factors"], s["rms_ratio_variance_assumed"], strict=True))
-        for name, s in sensors.items()
-    }
-    assert result["variance"] == pytest.approx(9.34579439252336)
-    assert by_factor["GNSS"][10.0] == pytest.approx(1.72103, abs=5e-6)
-    assert by_factor["RSBN"][0.1] == pytest.approx(1.66973, abs=5e-6)
-    assert sensors["GNSS"]["bias_one_per_cent"] == pytest.approx(0.934579439)
+def data(*arguments):
+    return json.loads(run("--json", *arguments).output)
 
 
-def test_table():
-    output = run("--variances", "500,10,200").output
-    assert "1.72103" in output
-    assert "1.66973" in output
+def test_worked_example():
+    result = data()
+    x, y = result["axes"]
+    assert (x["value"], y["value"]) == pytest.approx((100.981072400285825, 100.476399503089563), rel=1e-12)
+    assert x["variance"] == pytest.approx(9.34579439252336)
+    assert list(x["weights"].values()) == pytest.approx(
+        [0.0186915887850467, 0.934579439252336, 0.0467289719626168]
+    )
+    # reference/ml_fusion.json, case 1: computed with multi-precision arithmetic
+    assert result["joint"]["position"] == pytest.approx([100.98128612192838, 100.4762138564679], rel=1e-11)
+    assert result["joint"]["covariance"][0] == pytest.approx(
+        [9.35322256131724, -0.00746550859697283], rel=1e-8
+    )
+    output = run().output
+    for number in ("101.139", "101.138939", "100.981072", "100.892406", "100.981286"):
+        assert number in output
+
+
+def test_wrong_sigmas_of_one_coordinate():
+    result = data(*AXIS)
+    assert result["joint"] is None
+    at = {source: [c["actual"] for c in costs] for source, costs in result["sigma_assumed"].items()}
+    by_variance = dict(
+        zip((0.1, 10.0), (result["factors"].index(0.1**0.5), result["factors"].index(10.0**0.5)), strict=True)
+    )
+    assert at["GNSS"][by_variance[10.0]] == pytest.approx(1.72103, abs=5e-6)
+    assert at["RSBN"][by_variance[0.1]] == pytest.approx(1.66973, abs=5e-6)
+
+
+def test_row_of_the_paper_near_north_claims_what_it_has_not():
+    output = run(*NEAR_NORTH).output
+    assert "3.4883" in output and "610.03" in output  # MATH: claims 3.5 m where the true error is 610 m
+    assert data(*NEAR_NORTH)["joint"]["covariance"][0][0] ** 0.5 == pytest.approx(98.5, abs=0.05)
+
+
+def test_correlated_readings_count_less():
+    # two readings of equal error: variance s^2 (1 + rho) / 2, and the mean whatever rho
+    pair = ("--reading=A.x=10,2", "--reading=B.x=12,2")
+    for rho in (-0.5, 0.0, 0.5):
+        (axis,) = data(*pair, f"--correlation=A.x,B.x={rho}")["axes"]
+        assert axis["value"] == pytest.approx(11.0)
+        assert axis["variance"] == pytest.approx(2.0 * (1.0 + rho))
+
+
+def test_ignored_correlation_of_unequal_readings():
+    # two readings, sigma 1 and s: weights by variance, exact law of the mean
+    rho, s = 0.9, 3.0
+    (axis,) = data("--reading=A.x=0,1", "--reading=B.x=0,3")["axes"]
+    found = next(e["cost"] for e in axis["correlation_ignored"] if e["rho"] == rho)
+    w = s**2 / (1 + s**2)
+    actual = w**2 + (1 - w) ** 2 * s**2 + 2 * w * (1 - w) * rho * s
+    best = s**2 * (1 - rho**2) / (1 + s**2 - 2 * rho * s)
+    assert found["actual"] == pytest.approx((actual / best) ** 0.5)
+    assert found["claimed"] == pytest.approx((s**2 / (1 + s**2) / actual) ** 0.5)
 
 
 def test_plot(tmp_path):
@@ -41,12 +92,19 @@ def test_plot(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("--variances", "1,2"), "3 names for 2 variances"),
-        (("--variances", "1,-2,3"), "positive"),
-        (("--variances", "1", "--names", "GNSS"), "two variances"),
+        (("--reading=GNSS.x=1",), "two numbers"),
+        (("--reading=GNSS.z=1,2",), "kind of x, y, azimuth, range"),
+        (("--reading=GNSS.x=1,2",), "at least two"),
+        (("--reading=GNSS.x=1,2", "--reading=INS.x=1,-2"), "positive sigma"),
+        (("--reading=GNSS.x=1,2", "--reading=GNSS.x=1,2"), "same name"),
+        (("--correlation=INS.x,GNSS.x=1.5",), "(-1, 1)"),
+        (("--correlation=INS.x,VOR.x=0.5",), "no reading 'VOR.x'"),
+        (("--correlation=INS.x=0.5",), "no reading ''"),
+        (("--reading=A.x=1,2", "--reading=B.azimuth=0,1"), "azimuths that do not meet"),
+        (("--beacon=VOR=1,2",), "no reading of beacon VOR"),
     ],
 )
 def test_invalid_input_is_reported_in_one_sentence(arguments, message):
     result = run(*arguments)
     assert result.exit_code == 2
-    assert message in result.output
+    assert message in result.output.replace("\n", " ")

@@ -1,0 +1,130 @@
+"""`companion study weights-flown`: the error of a flight when one source's stated sigma is wrong.
+
+The records of one scenario are processed with the sigma of one source stated as 0.1 to 10 times the true
+one, by the bank of hypotheses and by a single Kalman filter (one grade, nothing ever false). The INS is
+an INS of its own, stated sigmas of it are those of its error model. Messages and links are not simulated.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
+
+import click
+import numpy as np
+from msgspec import structs
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+
+from companion.config import Config, InertialConfig, OutputConfig
+from companion.navigator import Navigator
+from companion.navigator.hypotheses import Model
+from companion.records import Gnss, RsbnFix, Solution, Stamped
+from sitl.campaign.flight import UNITS
+from sitl.flight import radii
+from sitl.scenarios import Scenario, get_scenario
+from sitl.smoothing_study import flight_records
+from sitl.world import World
+
+SOURCES = ("INS", "GNSS", "RSBN")
+FACTORS = (0.1, 0.3, 1.0, 3.0, 10.0)
+#: Stated amplitudes of an INS that are scaled together.
+INS_SIGMAS = tuple(
+    name
+    for name, value in structs.asdict(InertialConfig()).items()
+    if type(value) is float and name != "height_sigma_m"
+)
+
+
+class FlownError(NamedTuple):
+    """Horizontal r.m.s. error (m) of one flight: in each phase of its schedule, and overall."""
+
+    phases: tuple[float, ...]
+    overall: float
+
+
+def stated(config: Config, source: str, factor: float) -> Config:
+    """Return the configuration with the sigmas of one source stated `factor` times as large."""
+    if source == "INS":
+        scaled = {name: factor * getattr(config.inertial, name) for name in INS_SIGMAS}
+        return structs.replace(config, inertial=structs.replace(config.inertial, **scaled))
+    if source == "GNSS":
+        gnss = structs.replace(
+            config.gnss,
+            sigma_m=factor * config.gnss.sigma_m,
+            sigma_velocity_m_s=factor * config.gnss.sigma_velocity_m_s,
+        )
+        return structs.replace(config, gnss=gnss)
+    rsbn = structs.replace(
+        config.rsbn,
+        sigma_azimuth_deg=factor * config.rsbn.sigma_azimuth_deg,
+        sigma_range_m=factor * config.rsbn.sigma_range_m,
+        sigma_range_percent=factor * config.rsbn.sigma_range_percent,
+    )
+    return structs.replace(config, rsbn=rsbn)
+
+
+def restated(records: Iterable[Stamped], source: str, factor: float) -> Iterable[Stamped]:
+    """Yield the records with the sigmas that the source itself states scaled alike."""
+    for record in records:
+        if source == "GNSS" and isinstance(record, Gnss) and record.has_3d_fix:
+            yield structs.replace(
+                record,
+                sigma_horizontal=factor * (record.sigma_horizontal or 0.0),
+                sigma_velocity=factor * (record.sigma_velocity or 0.0),
+            )
+        elif source == "RSBN" and isinstance(record, RsbnFix):
+            yield structs.replace(
+                record, sigma_azimuth=factor * record.sigma_azimuth, sigma_range=factor * record.sigma_range
+            )
+        else:
+            yield record
+
+
+def fly(world: World, source: str, factor: float, bank: bool) -> FlownError:
+    """Navigate the records of a world with one source's sigma misstated; solutions once a second."""
+    scenario = world.scenario
+    inertial = structs.replace(UNITS[scenario.grade], independent=True)
+    config = stated(Config(inertial=inertial, output=OutputConfig(solution_hz=1.0)), source, factor)
+    navigator = Navigator(config, None if bank else Model(config, plain=0))
+    found = [
+        (output.t_ns * 1e-9, output.lat, output.lon)
+        for record in restated(flight_records(world), source, factor)
+        for output in navigator.handle(record)  # type: ignore[arg-type]
+        if isinstance(output, Solution)
+    ]
+    t, lat, lon = np.array(found).T
+    truth = world.truth_at(t)
+    R_N, R_E = radii(truth.lat)
+    squares = ((lat - truth.lat) * R_N) ** 2 + ((lon - truth.lon) * R_E * np.cos(truth.lat)) ** 2
+    phases = [squares[(t >= phase.start_s) & (t < phase.end_s)] for phase in scenario.phases()]
+    return FlownError(
+        tuple(math.sqrt(float(each.mean())) if len(each) else math.nan for each in phases),
+        math.sqrt(float(squares.mean())),
+    )
+
+
+@click.command("weights-flown")
+@click.option("--scenario", default="default", show_default=True, help="A loopback scenario.")
+@click.option("--source", "sources", multiple=True, type=click.Choice(SOURCES), help="Default: each.")
+@click.option("--seed", default=1, show_default=True, help="Seed of the flight.")
+def command(scenario: str, sources: Sequence[str], seed: int) -> None:
+    """Fly with the sigma of one source stated wrong, with the bank of hypotheses and without."""
+    try:
+        flight: Scenario = get_scenario(scenario, seed=seed)
+    except ValueError as error:
+        raise click.BadParameter(str(error), param_hint="--scenario") from None
+    world = World(flight)
+    table = Table(title=f"{scenario}, seed {seed}: horizontal error, m r.m.s.: bank / one Kalman filter")
+    for column in ("source", "stated / true sigma", *(phase.name for phase in flight.phases()), "overall"):
+        table.add_column(column, justify="left" if column == "source" else "right")
+    console = Console(stderr=True)
+    cases = [(source, factor) for source in sources or SOURCES for factor in FACTORS]
+    for source, factor in track(cases, "flying", console=console, transient=True):
+        bank, plain = (fly(world, source, factor, on) for on in (True, False))
+        cells = zip((*bank.phases, bank.overall), (*plain.phases, plain.overall), strict=True)
+        end = factor == FACTORS[-1]
+        table.add_row(source, f"{factor:g}", *(f"{a:.1f} / {b:.1f}" for a, b in cells), end_section=end)
+    Console(width=max(130, Console().width)).print(table)
