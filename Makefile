@@ -45,6 +45,9 @@ kills: $(STAMP) ## kill test: 200 kills of the service in flight
 soak: $(STAMP) ## soak test: a day of flight in virtual time with all faults
 	$(BIN)/companion soak
 
+docs/configuration.md: $(STAMP) companion/config/*.py
+	$(BIN)/python -m companion.config.reference > $@
+
 lock: ## regenerate requirements.lock from pyproject.toml (needs uv)
 	uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-emit-index-url \
 	  --no-annotate --no-header $(foreach e,dev plot report logs campaign,--extra $(e)) \

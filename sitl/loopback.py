@@ -24,6 +24,7 @@ from rich.table import Table
 
 from companion.analysis import error_statistics
 from companion.config import Config, OutputConfig, load
+from companion.config.options import configuration_options
 from companion.nav.geometry import Geodetic, separation
 from companion.records import Event, Gnss, Rejection, Reset, RsbnFix, Solution, Stamped
 from companion.runtime.core import CompanionCore
@@ -198,8 +199,7 @@ def _from_first_fix(phase: SchedulePhase, records: Iterable[Stamped]) -> error_s
 @click.command("loopback")
 @click.option("--scenario", default="default", show_default=True, help=f"One of {', '.join(SCENARIOS)}.")
 @click.option("--seed", type=int, help="Seed of the noise.")
-@click.option("--config", "file", type=click.Path(path_type=Path), help="TOML file; see check-config.")
-@click.option("--set", "pairs", multiple=True, metavar="SECTION.KEY=VALUE", help="Any key of the file.")
+@configuration_options
 @click.option("--logs", help="Folder for the log.")
 @click.option(
     "--plot",
@@ -212,6 +212,7 @@ def command(
     scenario: str,
     seed: int | None,
     file: Path | None,
+    preset: str | None,
     pairs: tuple[str, ...],
     logs: str | None,
     plot: Path | None,
@@ -223,8 +224,12 @@ def command(
     except ValueError as error:
         raise click.BadParameter(str(error), param_hint="--scenario") from None
     # log the truth: reports use it
-    flags = {"log.folder": logs, "rates.truth_hz": 10.0, "inertial.independent": True}
-    loaded = load(file, flags, pairs=pairs)
+    flags = {
+        "log.folder": logs,
+        "rates.truth_hz": 10.0,
+        "inertial.independent": True if preset is None else None,
+    }
+    loaded = load(file, flags, pairs=pairs, preset=preset)
     config = simulator_config(loaded, own_ins=loaded.inertial.independent)
     started = time.perf_counter()
     settings = config.log

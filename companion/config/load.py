@@ -17,6 +17,7 @@ from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import msgspec
 
+from companion.config.presets import PRESETS
 from companion.config.schema import Config
 from companion.config.validate import find_conflicts
 
@@ -33,6 +34,7 @@ def load(
     environment: Mapping[str, str] | None = None,
     pairs: Iterable[str] = (),
     tuned: Path | None = None,
+    preset: str | None = None,
 ) -> Config:
     """Load the configuration; each source overrides the ones before.
 
@@ -48,6 +50,8 @@ def load(
         Values by "section.key"; None is unset.
     pairs
         Texts "section.key=value" as typed.
+    preset
+        Name in `PRESETS`; every other source overrides it.
 
     Raises
     ------
@@ -56,6 +60,10 @@ def load(
     """
     tree: dict[str, dict[str, Any]] = {}
     origin: dict[tuple[str, str], str] = {}
+    for name, value in _preset(preset).items():
+        section, _, key = name.partition(".")
+        tree.setdefault(section, {})[key] = value
+        origin[section, key] = f"preset {preset}"
     for source in (path, tuned):
         if source is not None:
             for section, table in _read(source).items():
@@ -104,6 +112,16 @@ def to_toml(config: Config) -> str:
         ]
         lines.append("")
     return "\n".join(lines)
+
+
+def _preset(name: str | None) -> Mapping[str, Any]:
+    if name is None:
+        return {}
+    if name not in PRESETS:
+        close = difflib.get_close_matches(name, PRESETS, 1, 0.4)
+        nearest = f"; did you mean `{close[0]}`?" if close else ""
+        raise ConfigError(f"--preset {name}: not one of {', '.join(PRESETS)}{nearest}")
+    return PRESETS[name].values
 
 
 def _read(path: Path) -> dict[str, dict[str, Any]]:

@@ -149,7 +149,6 @@ class PredictorConfig(Section, frozen=True):
 
     window_min: Annotated[float, Meta(ge=1.0, le=80.0)] = 25.0
     bin_s: Annotated[float, Meta(ge=0.1, le=60.0)] = 10.0
-    learn_velocity: bool = False
     disturbance_ug: Annotated[float, Meta(ge=0.0, le=100000.0)] = (
         20.0  # r.m.s. specific force that the Schuler channel does not model
     )

@@ -16,6 +16,7 @@ import click
 from rich.console import Console
 
 from companion.config import Config, ConfigError, load
+from companion.config.options import configuration_options
 from companion.config.profiles import PROFILES
 from companion.doctor.diagnosis import Diagnosis, Finding
 from companion.doctor.examination import Examination
@@ -189,20 +190,20 @@ def _advice(error: OSError) -> str:
 
 
 @click.command("doctor")
-@click.option("--config", "file", type=click.Path(path_type=Path), help="TOML file; see check-config.")
+@configuration_options
 @click.option("--connect", help="Link to the autopilot; default: the first of the configuration.")
 @click.option(
     "--profile", type=click.Choice(list(PROFILES)), help="Output profile; overrides the configuration."
 )
-@click.option("--set", "pairs", multiple=True, metavar="SECTION.KEY=VALUE", help="Any other key of the file.")
 @click.option("--apply", is_flag=True, help="Set the wrong parameters, after confirmation.")
 @click.option("--yes", is_flag=True, help="Confirm --apply without asking.")
 @click.option("--json", "as_json_", is_flag=True, help="Print the findings as JSON.")
 def command(
     file: Path | None,
+    preset: str | None,
+    pairs: tuple[str, ...],
     connect: str | None,
     profile: str | None,
-    pairs: tuple[str, ...],
     apply: bool,
     yes: bool,
     as_json_: bool,
@@ -213,7 +214,7 @@ def command(
     confirmation, or while the vehicle is armed. Exit codes: 0 all is well, 1 something is missing, 69 no
     autopilot found, 78 invalid configuration.
     """
-    config = load(file, {"output.profile": profile}, pairs=pairs)
+    config = load(file, {"output.profile": profile}, pairs=pairs, preset=preset)
     try:
         address = Address.parse(connect or config.link.connect[0])
     except (ValueError, IndexError) as error:

@@ -9,6 +9,7 @@ from rich.console import Console
 from rich.table import Table
 
 from companion.config import Config
+from companion.config.presets import recommend_preset
 from companion.doctor.diagnosis import Diagnosis
 from companion.link.parameter_client import Value
 from companion.transport.reconnect import Address
@@ -86,6 +87,11 @@ def summary(config: Config, diagnosis: Diagnosis) -> str:
         lines.append(
             "Profile monitor sends no position; --profile ardupilot or px4 shows what that requires."
         )
+        if (preset := recommend_preset(diagnosis.identity.make)) is not None and not config.has_own_ins:
+            lines.append(
+                f"Recommended: --preset {preset}. Only if LOCAL_POSITION_NED comes from an INS of its own: "
+                "navigation-ins, tactical-ins or mems, by its data sheet."
+            )
     return "\n".join(lines)
 
 
@@ -99,6 +105,7 @@ def as_json(config: Config, address: Address, diagnosis: Diagnosis, changed: tup
         "link": str(address),
         "profile": config.output.profile,
         "autopilot": diagnosis.identity._asdict(),
+        "recommended_preset": recommend_preset(diagnosis.identity.make),
         "parameters": [
             {
                 "name": found.need.name,

@@ -28,6 +28,7 @@ import click
 
 from companion import __version__
 from companion.config import Config, ConfigError, LogConfig, load
+from companion.config.options import configuration_options
 from companion.records import Event, Severity
 from companion.runtime.core import CompanionCore, Link
 from companion.runtime.daemon_thread import run_in_daemon_thread
@@ -280,11 +281,12 @@ def _recover_logs(settings: LogConfig, service: Service, loop: asyncio.AbstractE
 
 
 @click.command("run")
-@click.option("--config", "file", type=click.Path(path_type=Path), help="TOML file; see check-config.")
+@configuration_options
 @click.option("--connect", multiple=True, help="Link (may be repeated): udpin:HOST:PORT, tcp:HOST:PORT, ...")
 @click.option("--logs", help="Folder for the flight's log.")
-@click.option("--set", "pairs", multiple=True, metavar="SECTION.KEY=VALUE", help="Any other key of the file.")
-def command(file: Path | None, connect: tuple[str, ...], logs: str | None, pairs: tuple[str, ...]) -> None:
+def command(
+    file: Path | None, preset: str | None, pairs: tuple[str, ...], connect: tuple[str, ...], logs: str | None
+) -> None:
     """Navigate: receive from the autopilot, send it corrected estimates and log everything, until SIGINT or
     SIGTERM.
 
@@ -293,11 +295,13 @@ def command(file: Path | None, connect: tuple[str, ...], logs: str | None, pairs
     (folder or free space), 78 invalid configuration.
     """
     flags = {"link.connect": connect or None, "log.folder": logs}
-    base = config = load(file, flags, pairs=pairs)
+    base = config = load(file, flags, pairs=pairs, preset=preset)
     kept, notes = None, list[str]()
     if base.link.parameters_file:
         kept = KeptParameters(Path(base.link.parameters_file))
-        config, notes = kept.load(base, lambda: load(file, flags, pairs=pairs, tuned=kept.path))
+        config, notes = kept.load(
+            base, lambda: load(file, flags, pairs=pairs, tuned=kept.path, preset=preset)
+        )
     try:
         for text in config.link.connect:
             Address.parse(text)
