@@ -399,12 +399,12 @@ class FullDisk(DiskFile):
 
     full = False
 
-    def write(self, data: bytes) -> None:
-        """Append `data`; while `full`, write half of it and raise ENOSPC, as a full disk does."""
+    def write(self, at: int, data: bytes) -> None:
+        """Write `data`; while `full`, write half of it and raise ENOSPC, as a full disk does."""
         if self.full:
-            super().write(data[: len(data) // 2])
+            super().write(at, data[: len(data) // 2])
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        super().write(data)
+        super().write(at, data)
 
 
 def apply_link_faults(

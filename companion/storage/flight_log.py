@@ -11,7 +11,6 @@ exact monotonic times are inside the records.
 from __future__ import annotations
 
 import os
-import struct
 import threading
 import time
 from collections import Counter, deque
@@ -22,13 +21,14 @@ from types import TracebackType
 from typing import Any, NamedTuple
 
 import msgspec
+from mcap.opcode import Opcode
+from mcap.records import Channel, Message, Schema
 
 from companion import __version__
 from companion.records import BY_NAME, INPUTS, LinkState, Stamped, Truth, encode
-from companion.storage import container, location_fix
-from companion.storage.container import Chunk, DamagedError
+from companion.storage import location_fix
 from companion.storage.mcap_file import Disk, DiskFile, McapFile, sync_folder
-from companion.storage.reader import ACTIVE, ChannelTable, LogError, open_log
+from companion.storage.reader import ACTIVE, DamagedError, LogError, LogReader, open_log
 from companion.storage.recovery import Recovered, recover
 
 __all__ = [
@@ -48,6 +48,7 @@ MAP_PERIOD_NS = 500_000_000
 """Minimum interval of positions on the /map topics."""
 
 _MAX_UINT64 = 2**64 - 1
+_MESSAGE_HEAD = 31  # bytes of a message record before its data
 
 
 class Entry(NamedTuple):
@@ -119,16 +120,16 @@ class Writer:
 
         self._lock = threading.Lock()
         self._space_available = threading.Condition(self._lock)
-        self._open = Chunk()
-        self._queued: deque[Chunk] = deque()
+        self._open = _Batch()
+        self._queued: deque[_Batch] = deque()
         self._queued_bytes = 0
         self._wake = threading.Event()
         self._closing = False
 
         self._ids: dict[Any, int] = {}
         self._sequences: list[int] = [0]
-        self._schemas: dict[int, bytes] = {}
-        self._channels: dict[int, bytes] = {}
+        self._schemas: dict[int, Schema] = {}
+        self._channels: dict[int, Channel] = {}
         self._map_due = {kind: -_MAX_UINT64 for kind in BY_NAME.values() if kind.__name__ in _MAP_RECORDS}
 
         self._file = self._create_file(disk, metadata, start_unix_ns, start_ns)
@@ -197,9 +198,10 @@ class Writer:
                 return
             sequence = self._sequences[number]
             self._sequences[number] = (sequence + 1) & 0xFFFFFFFF
-            chunk = self._open
-            chunk.add(number, sequence, log_ns, publish_ns, data)
-            if len(chunk.data) >= self._chunk_bytes:
+            batch = self._open
+            batch.messages.append(Message(number, log_ns, data, publish_ns, sequence))
+            batch.size += _MESSAGE_HEAD + len(data)
+            if batch.size >= self._chunk_bytes:
                 self._queue_open_chunk()
                 self._wake.set()
                 while self._block and self._queued_bytes > self._depth and self.trouble is None:
@@ -207,16 +209,16 @@ class Writer:
 
     def _queue_open_chunk(self) -> None:
         """Close the open chunk and queue it for the disk (lock held)."""
-        if not self._open.data:
+        if not self._open.messages:
             return
         self._queued.append(self._open)
-        self._queued_bytes += len(self._open.data)
-        self._open = Chunk()
+        self._queued_bytes += self._open.size
+        self._open = _Batch()
         if not self._block or self.trouble is not None:
             while self._queued_bytes > self._depth and self._queued:
                 oldest = self._queued.popleft()
-                self._queued_bytes -= len(oldest.data)
-                self.dropped += oldest.messages
+                self._queued_bytes -= oldest.size
+                self.dropped += len(oldest.messages)
 
     def _channel_of_record(self, key: Any, kind: type[Stamped], channel: str | None) -> int:
         schema = msgspec.json.encode(msgspec.json.schema(kind))
@@ -230,22 +232,14 @@ class Writer:
     def _define_channel(self, key: Any, topic: str, encoding: str, name: str, schema: bytes | None) -> int:
         with self._lock:
             number = len(self._channels) + 1
-            of_schema = 0
             if schema is not None:
-                of_schema = number
-                self._schemas[of_schema] = (
-                    struct.pack("<H", of_schema)
-                    + container.encode_string(name)
-                    + container.encode_string("jsonschema")
-                    + struct.pack("<I", len(schema))
-                    + schema
-                )
-            head = struct.pack("<HH", number, of_schema)
-            self._channels[number] = (
-                head
-                + container.encode_string(topic)
-                + container.encode_string(encoding)
-                + container.encode_string_map({})
+                self._schemas[number] = Schema(id=number, data=schema, encoding="jsonschema", name=name)
+            self._channels[number] = Channel(
+                id=number,
+                topic=topic,
+                message_encoding=encoding,
+                metadata={},
+                schema_id=0 if schema is None else number,
             )
             self._sequences.append(0)
             self._ids[key] = number
@@ -263,7 +257,8 @@ class Writer:
         active = self.path.with_name(self.path.name + ACTIVE)
         log = {"version": __version__, "start_unix_ns": str(start_unix_ns), "start_ns": str(start_ns)}
         try:
-            file = McapFile(disk(active), f"companion {__version__}")
+            file = McapFile(disk(active))
+            file.begin(f"companion {__version__}")
             for name, values in {"log": log, **metadata}.items():
                 file.metadata(name, values)
             file.sync()
@@ -291,7 +286,7 @@ class Writer:
             self._attempt(self._rename)
         self._file.close()  # last: releases the lock that keeps others from recovering the log
         with self._lock:
-            self.dropped += sum(chunk.messages for chunk in self._queued)
+            self.dropped += sum(len(batch.messages) for batch in self._queued)
 
     def _rename(self) -> None:
         os.replace(self.path.with_name(self.path.name + ACTIVE), self.path)
@@ -303,13 +298,13 @@ class Writer:
             with self._lock:
                 if not self._queued:
                     return True
-                chunk = self._queued.popleft()
-                self._queued_bytes -= len(chunk.data)
+                batch = self._queued.popleft()
+                self._queued_bytes -= batch.size
                 self._space_available.notify_all()
-            if not self._attempt(partial(self._file.chunk, chunk, self._schemas, self._channels)):
+            if not self._attempt(partial(self._file.chunk, batch.messages, self._schemas, self._channels)):
                 with self._lock:
-                    self._queued.appendleft(chunk)
-                    self._queued_bytes += len(chunk.data)
+                    self._queued.appendleft(batch)
+                    self._queued_bytes += batch.size
                 return False
 
     def _attempt(self, act: Callable[[], None]) -> bool:
@@ -320,6 +315,16 @@ class Writer:
             return False
         self.trouble = None
         return True
+
+
+class _Batch:
+    """Messages of a chunk that is not written yet, and its uncompressed size."""
+
+    __slots__ = ("messages", "size")
+
+    def __init__(self) -> None:
+        self.messages: list[Message] = []
+        self.size = 0
 
 
 _MAP_RECORDS = ("Gnss", "Solution", "Truth")
@@ -346,17 +351,15 @@ def read(path: str | os.PathLike[str], *, raw: bool = False) -> Iterator[Entry]:
     log that is damaged.
     """
     with open_log(path) as source:
-        channels = ChannelTable()
         decoders: dict[int, tuple[str, Callable[[bytes], Any] | None]] = {}
         try:
-            for data in source.message_blocks():
-                for opcode, number, _, log_ns, _, content in container.iter_messages(data):
-                    if opcode == container.MESSAGE:
-                        topic, decode = decoders[number]
-                        yield Entry(topic, log_ns, content if decode is None else decode(content))
-                    elif (defined := channels.define(opcode, content)) is not None:
-                        decoders[defined] = _decoder(channels[defined], raw)
-        except (DamagedError, KeyError) as error:
+            for message in source.messages():
+                decoder = decoders.get(message.channel_id)
+                if decoder is None:
+                    decoder = decoders[message.channel_id] = _decoder(source, message.channel_id, raw)
+                topic, decode = decoder
+                yield Entry(topic, message.log_time, message.data if decode is None else decode(message.data))
+        except DamagedError as error:
             if source.closed:
                 raise source.damage_error(error) from None
         except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
@@ -366,33 +369,28 @@ def read(path: str | os.PathLike[str], *, raw: bool = False) -> Iterator[Entry]:
 def info(path: str | os.PathLike[str]) -> Info:
     """Return counts, times and metadata of a log, closed or torn. Raises LogError as `read` does."""
     with open_log(path) as source:
-        counts: Counter[int] = Counter()
-        by_topic: Counter[str] = Counter()
-        channels = ChannelTable()
+        counts: Counter[str] = Counter()
+        topics: dict[int, str] = {}
         first, last = _MAX_UINT64, 0
         try:
-            for data in source.message_blocks():
-                for opcode, number, _, log_ns, _, content in container.iter_messages(data):
-                    if opcode == container.MESSAGE:
-                        counts[number] += 1
-                        first = log_ns if log_ns < first else first
-                        last = log_ns if log_ns > last else last
-                    else:
-                        channels.define(opcode, content)
-            for number, count in counts.items():
-                by_topic[channels[number].topic] += count
-        except (DamagedError, KeyError) as error:
+            for message in source.messages():
+                topic = topics.get(message.channel_id)
+                if topic is None:
+                    topic, _ = _decoder(source, message.channel_id, raw=True)
+                    topics[message.channel_id] = topic
+                counts[topic] += 1
+                first, last = min(first, message.log_time), max(last, message.log_time)
+        except DamagedError as error:
             if source.closed:
                 raise source.damage_error(error) from None
-        total = sum(by_topic.values())
         return Info(
             path=source.path,
             closed=source.closed,
-            start_ns=first if total else 0,
+            start_ns=first if counts else 0,
             end_ns=last,
-            messages=total,
+            messages=counts.total(),
             chunks=source.chunks,
-            counts=dict(by_topic),
+            counts=dict(counts),
             metadata=source.metadata,
             bytes=source.size,
             bytes_lost=source.size - source.end,
@@ -402,22 +400,24 @@ def info(path: str | os.PathLike[str]) -> Info:
 def metadata(path: str | os.PathLike[str]) -> dict[str, dict[str, str]]:
     """Return the metadata records before the first message of a log, by name."""
     with open_log(path) as source:
-        found = {}
-        for _, opcode, content in source.records():
-            if opcode in (container.CHUNK, container.MESSAGE):
+        for raw in source.records():
+            if raw.opcode in (Opcode.CHUNK, Opcode.MESSAGE):
                 break
-            if opcode == container.METADATA:
+            if raw.opcode == Opcode.METADATA:
                 try:
-                    name, values = container.parse_metadata(content)
+                    source.keep_metadata(raw)
                 except DamagedError as error:
                     raise source.damage_error(error) from None
-                found[name] = values
-        return found
+        return source.metadata
 
 
-def _decoder(channel: container.Channel, raw: bool) -> tuple[str, Callable[[bytes], Any] | None]:
+def _decoder(source: LogReader, number: int, raw: bool) -> tuple[str, Callable[[bytes], Any] | None]:
     """Return the topic of a channel and the decoder of its messages (None: not decoded)."""
-    kind = BY_NAME.get(channel.schema)
-    if raw or kind is None or channel.encoding != "json":
+    if not source.is_defined(number):
+        raise DamagedError(f"a message is on channel {number}, which is not defined")
+    channel = source.channels[number]
+    schema = source.schemas[channel.schema_id].name if channel.schema_id else ""
+    kind = BY_NAME.get(schema)
+    if raw or kind is None or channel.message_encoding != "json":
         return channel.topic, None
     return channel.topic, msgspec.json.Decoder(kind).decode

@@ -1,7 +1,8 @@
 """MCAP file writer: chunk by chunk, readable if truncated after any write. No threads, no clock.
 
-Schemas and channels are written before the chunk that first uses them, not inside it, so that a chunk lost to
-a full disk takes no definition with it.
+The records are those of the mcap package. Its Writer is not used: it keeps every chunk index as objects
+(16 MB an hour at two chunks a second) and cannot repeat a chunk that the disk rejected. Schemas and channels
+are written before the chunk that first uses them, not inside it: a lost chunk takes no definition with it.
 """
 
 from __future__ import annotations
@@ -9,53 +10,46 @@ from __future__ import annotations
 import errno
 import fcntl
 import os
-import struct
 import zlib
-from array import array
-from collections import defaultdict
-from collections.abc import Callable, Mapping
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Protocol
 
 import zstandard
-
-from companion.storage import container
-from companion.storage.container import (
-    ATTACHMENT,
-    CHANNEL,
-    CHUNK_INDEX,
-    DATA_END,
-    FOOTER,
-    HEADER,
-    MAGIC,
-    METADATA,
-    METADATA_INDEX,
-    SCHEMA,
-    STATISTICS,
-    SUMMARY_OFFSET,
+from mcap.data_stream import RecordBuilder
+from mcap.opcode import Opcode
+from mcap.records import (
+    Attachment,
+    AttachmentIndex,
+    Channel,
     Chunk,
-    encode_chunk,
-    encode_record,
-    encode_string,
-    encode_string_map,
+    ChunkIndex,
+    DataEnd,
+    Footer,
+    Header,
+    McapRecord,
+    Message,
+    MessageIndex,
+    Metadata,
+    MetadataIndex,
+    Schema,
+    Statistics,
+    SummaryOffset,
 )
+
+MAGIC = b"\x89MCAP0\r\n"
 
 
 class Disk(Protocol):
     """Storage of one file; every method may raise OSError."""
 
-    def write(self, data: bytes) -> None:
-        """Append all of `data`."""
-
-    def read(self, at: int, size: int) -> bytes:
-        """Return `size` written bytes from offset `at`."""
+    def write(self, at: int, data: bytes) -> None:
+        """Write all of `data` at offset `at`."""
 
     def sync(self) -> None:
         """Return once everything written survives a power loss."""
-
-    def rewind(self, size: int) -> None:
-        """Set the position of the next write to `size`, without disk access."""
 
     def truncate(self, size: int) -> None:
         """Cut the file to `size` bytes."""
@@ -65,7 +59,7 @@ class Disk(Protocol):
 
 
 class DiskFile:
-    """A file written sequentially, which leaves `reserve` bytes of the disk free.
+    """A file that leaves `reserve` bytes of the disk free; `new`, or an existing one.
 
     If the space is insufficient, `relieve` is called with the number of bytes that must be free, and may
     free some.
@@ -76,16 +70,15 @@ class DiskFile:
         path: str | os.PathLike[str],
         reserve: int = 0,
         relieve: Callable[[int], object] = lambda wanted: None,
+        new: bool = True,
     ) -> None:
-        self._attach(os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o644), reserve, relieve)
-        fcntl.flock(self._fd, fcntl.LOCK_EX)  # marks the log as being written
-        sync_folder(Path(path).parent)
+        self._fd = os.open(path, os.O_RDWR | (os.O_CREAT | os.O_EXCL if new else 0), 0o644)
+        self._reserve, self._relieve = reserve, relieve
+        if new:
+            fcntl.flock(self._fd, fcntl.LOCK_EX)  # marks the log as being written
+            sync_folder(Path(path).parent)
 
-    def _attach(self, fd: int, reserve: int, relieve: Callable[[int], object]) -> None:
-        self._fd, self._reserve, self._relieve = fd, reserve, relieve
-        self._at = 0
-
-    def write(self, data: bytes) -> None:
+    def write(self, at: int, data: bytes) -> None:
         """See `Disk`; raises ENOSPC rather than use the reserve."""
         wanted = self._reserve + len(data)
         if self._free() < wanted:
@@ -94,28 +87,16 @@ class DiskFile:
                 raise OSError(errno.ENOSPC, f"less than {self._reserve} bytes would remain free on the disk")
         view = memoryview(data)
         while view:
-            written = os.pwrite(self._fd, view, self._at)
-            self._at += written
-            view = view[written:]
+            written = os.pwrite(self._fd, view, at)
+            at, view = at + written, view[written:]
 
     def _free(self) -> int:
         room = os.fstatvfs(self._fd)
         return room.f_bavail * room.f_frsize
 
-    def read(self, at: int, size: int) -> bytes:
-        """See `Disk`."""
-        data = os.pread(self._fd, size, at)
-        if len(data) != size:
-            raise OSError(errno.EIO, "written data cannot be read back")
-        return data
-
     def sync(self) -> None:
         """See `Disk`."""
         os.fdatasync(self._fd)
-
-    def rewind(self, size: int) -> None:
-        """See `Disk`."""
-        self._at = size
 
     def truncate(self, size: int) -> None:
         """See `Disk`."""
@@ -135,120 +116,161 @@ def sync_folder(folder: Path) -> None:
         os.close(fd)
 
 
+def encode_records(records: Iterable[McapRecord]) -> bytes:
+    """Encode `records` one after another."""
+    builder = RecordBuilder()
+    for record in records:
+        record.write(builder)
+    encoded: bytes = builder.end()
+    return encoded
+
+
+def encode_chunk(messages: Sequence[Message], level: int = 1) -> tuple[Chunk, list[MessageIndex]]:
+    """Return the compressed chunk of `messages` (one at least) and its indexes, one for each channel."""
+    builder = RecordBuilder()
+    entries: defaultdict[int, list[tuple[int, int]]] = defaultdict(list)
+    for message in messages:
+        entries[message.channel_id].append((message.log_time, builder.count))
+        message.write(builder)
+    data = builder.end()
+    chunk = Chunk(
+        compression="zstd",
+        data=zstandard.ZstdCompressor(level=level).compress(data),
+        message_start_time=min(message.log_time for message in messages),
+        message_end_time=max(message.log_time for message in messages),
+        uncompressed_crc=zlib.crc32(data),
+        uncompressed_size=len(data),
+    )
+    return chunk, [MessageIndex(channel_id, records) for channel_id, records in entries.items()]
+
+
 class McapFile:
     """Writer of an MCAP file. The file is readable up to the last method that returned.
 
-    A method that raises OSError is undone and may be called again; if the disk cannot truncate the partial
-    write, the next write overwrites it. Only 24 bytes per chunk are kept in memory; the summary of a chunk
-    (half a kilobyte, 40 MB after a day) is read back from the disk by `finish`.
+    A method that raises OSError has changed nothing and may be called again; if the disk cannot cut a partial
+    write off, the next write tries again and covers it. The summary is kept compressed: 10 MB after a day.
     """
 
-    def __init__(self, disk: Disk, library: str) -> None:
+    def __init__(self, disk: Disk) -> None:
         self._disk = disk
-        self._end = 0
-        self._partial_write = False  # a failed write left bytes after the end
-        self._compress = zstandard.ZstdCompressor(level=1).compress
-        self._schemas: dict[int, bytes] = {}
-        self._channels: dict[int, bytes] = {}
-        self._counts: defaultdict[int, int] = defaultdict(int)
-        self._chunks = array("Q")  # per chunk: offset, offset of its message indexes, end
-        self._metadata_indexes: list[bytes] = []
-        self._attachments = 0
-        self._first: int | None = None
-        self._last = 0
-        self._append(MAGIC + encode_record(HEADER, encode_string(""), encode_string(library)))
+        self.end = 0
+        self._has_partial_write = False  # bytes after the end
+        self._schemas: dict[int, Schema] = {}
+        self._channels: dict[int, Channel] = {}
+        self._indexes: list[AttachmentIndex | MetadataIndex] = []
+        self._chunk_index: ChunkIndex | None = None  # of the last chunk
+        self._chunk_indexes, self._compressor = bytearray(), zlib.compressobj()  # of all before it
+        self._counts: Counter[int] = Counter()
+        self.chunks = 0
+        self._first, self._last = 2**64 - 1, 0
+
+    @property
+    def messages(self) -> int:
+        """Number of messages in the chunks."""
+        return self._counts.total()
+
+    def begin(self, library: str) -> None:
+        """Write the magic and the header."""
+        head = MAGIC + encode_records([Header(profile="", library=library)])
+        self._append(head)
+        self.end = len(head)
 
     def metadata(self, name: str, values: Mapping[str, str]) -> None:
         """Add one metadata record."""
-        body = encode_record(METADATA, encode_string(name), encode_string_map(values))
-        self._append(body)
-        place = struct.pack("<QQ", self._end - len(body), len(body))
-        self._metadata_indexes.append(encode_record(METADATA_INDEX, place, encode_string(name)))
-
-    def attachment(self, content: bytes) -> None:
-        """Add one attachment record, copied from another file."""
-        self._append(encode_record(ATTACHMENT, content))
-        self._attachments += 1
+        self.write([Metadata(name=name, metadata=dict(values))])
 
     def chunk(
-        self,
-        chunk: Chunk,
-        schemas: Mapping[int, bytes],
-        channels: Mapping[int, bytes],
-        compressed: bytes | None = None,
+        self, messages: Sequence[Message], schemas: Mapping[int, Schema], channels: Mapping[int, Channel]
     ) -> None:
-        """Add `chunk`; `schemas` and `channels` are the record contents it may refer to, by id.
+        """Add a chunk of `messages` and the definitions that it is the first to need."""
+        new = [channels[number] for number in dict.fromkeys(message.channel_id for message in messages)]
+        new = [channel for channel in new if channel.id not in self._channels]
+        needed = dict.fromkeys(channel.schema_id for channel in new if channel.schema_id)
+        chunk, indexes = encode_chunk(messages)
+        self.write([*(schemas[i] for i in needed if i not in self._schemas), *new, chunk, *indexes])
 
-        `compressed` is its zstd-compressed data, if already known.
-        """
-        new = [name for name in chunk.index if name not in self._channels]
-        needed = {name: int.from_bytes(channels[name][2:4], "little") for name in new}
-        new_schemas = {i: schemas[i] for i in needed.values() if i in schemas and i not in self._schemas}
-        definitions = b"".join(encode_record(SCHEMA, content) for content in new_schemas.values())
-        definitions += b"".join(encode_record(CHANNEL, channels[name]) for name in new)
-        body, indexes, first, last = encode_chunk(chunk, compressed or self._compress(bytes(chunk.data)))
-        self._append(definitions + body + indexes)
+    def write(self, records: Sequence[McapRecord]) -> None:
+        """Append `records`, all or none of them. The indexes of a chunk follow it."""
+        parts = [encode_records([record]) for record in records]
+        self._append(b"".join(parts))
+        for record, part in zip(records, parts, strict=True):
+            self.enter(record, self.end, self.end + len(part))
 
-        self._schemas |= new_schemas
-        self._channels |= {name: channels[name] for name in new}
-        for of, entries in chunk.index.items():
-            self._counts[of] += len(entries) // 2
-        at = self._end - len(indexes)
-        self._chunks.extend((at - len(body), at, self._end))
-        self._first = first if self._first is None else min(first, self._first)
-        self._last = max(last, self._last)
+    def enter(self, record: McapRecord, start: int, end: int) -> None:
+        """Enter into the summary a record that is in the file from `start` to `end`."""
+        self.end = end
+        match record:
+            case Schema():
+                self._schemas[record.id] = record
+            case Channel():
+                self._channels[record.id] = record
+            case Metadata():
+                self._indexes.append(MetadataIndex(start, end - start, record.name))
+            case Attachment(create_time=created, log_time=logged, name=name, media_type=media):
+                size = len(record.data)
+                self._indexes.append(AttachmentIndex(start, end - start, logged, created, size, name, media))
+            case Chunk():
+                self._pack_chunk_index()
+                self.chunks += 1
+                self._first = min(self._first, record.message_start_time)
+                self._last = max(self._last, record.message_end_time)
+                self._chunk_index = ChunkIndex(
+                    chunk_start_offset=start,
+                    chunk_length=end - start,
+                    compression=record.compression,
+                    compressed_size=len(record.data),
+                    uncompressed_size=record.uncompressed_size,
+                    message_start_time=record.message_start_time,
+                    message_end_time=record.message_end_time,
+                    message_index_length=0,
+                    message_index_offsets={},
+                )
+            case MessageIndex() if self._chunk_index is not None:
+                self._chunk_index.message_index_offsets[record.channel_id] = start
+                self._chunk_index.message_index_length += end - start
+                self._counts[record.channel_id] += len(record.records)
 
     def finish(self) -> None:
         """Write the summary, the footer and the closing magic."""
-        counts = b"".join(struct.pack("<HQ", of, count) for of, count in self._counts.items())
-        statistics = struct.pack(
-            "<QHIIIIQQI",
-            sum(self._counts.values()),
-            len(self._schemas),
-            len(self._channels),
-            self._attachments,
-            len(self._metadata_indexes),
-            len(self._chunks) // 3,
-            self._first or 0,
-            self._last,
-            len(counts),
+        self._pack_chunk_index()
+        packed = bytes(self._chunk_indexes) + self._compressor.copy().flush()
+        statistics = Statistics(
+            message_count=self.messages,
+            schema_count=len(self._schemas),
+            channel_count=len(self._channels),
+            attachment_count=sum(isinstance(one, AttachmentIndex) for one in self._indexes),
+            metadata_count=sum(isinstance(one, MetadataIndex) for one in self._indexes),
+            chunk_count=self.chunks,
+            message_start_time=self._first if self.messages else 0,
+            message_end_time=self._last,
+            channel_message_counts=dict(self._counts),
         )
-        groups = (
-            (SCHEMA, [encode_record(SCHEMA, content) for content in self._schemas.values()]),
-            (CHANNEL, [encode_record(CHANNEL, content) for content in self._channels.values()]),
-            (STATISTICS, [encode_record(STATISTICS, statistics, counts)]),
-            (CHUNK_INDEX, map(self._chunk_index, *(self._chunks[i::3] for i in range(3)))),
-            (METADATA_INDEX, self._metadata_indexes),
-        )
-        data_end = encode_record(DATA_END, struct.pack("<I", 0))
-        start = self._end + len(data_end)
-        summary, offsets = b"", b""
-        for opcode, members in groups:
-            group = b"".join(members)
+        data_end = encode_records([DataEnd(data_section_crc=0)])
+        start = at = self.end + len(data_end)
+        summary, offsets = b"", []
+        for opcode, group in (
+            (Opcode.SCHEMA, encode_records(self._schemas.values())),
+            (Opcode.CHANNEL, encode_records(self._channels.values())),
+            (Opcode.STATISTICS, encode_records([statistics])),
+            (Opcode.CHUNK_INDEX, zlib.decompress(packed)),
+            (
+                Opcode.ATTACHMENT_INDEX,
+                encode_records(i for i in self._indexes if isinstance(i, AttachmentIndex)),
+            ),
+            (Opcode.METADATA_INDEX, encode_records(i for i in self._indexes if isinstance(i, MetadataIndex))),
+        ):
             if group:
-                place = struct.pack("<BQQ", opcode, start + len(summary), len(group))
-                offsets += encode_record(SUMMARY_OFFSET, place)
-                summary += group
-        tail = summary + offsets + struct.pack("<BQQQ", FOOTER, 20, start, start + len(summary))
-        self._truncate()
-        self._append(data_end + tail + struct.pack("<I", zlib.crc32(tail)) + MAGIC)
+                offsets.append(SummaryOffset(group_opcode=opcode, group_start=at, group_length=len(group)))
+                summary, at = summary + group, at + len(group)
+        summary += encode_records(offsets)
+        crc = zlib.crc32(summary + encode_records([Footer(start, at, 0)])[:-4])
+        self._disk.truncate(self.end)
+        self._append(data_end + summary + encode_records([Footer(start, at, crc)]) + MAGIC)
 
-    def _chunk_index(self, start: int, at: int, end: int) -> bytes:
-        """Return the index record of the chunk at `start`, whose message indexes are from `at` to `end`."""
-        first, last, size, compressed = container.parse_chunk_head(
-            self._disk.read(start, container.CHUNK_HEAD_SIZE)
-        )
-        places = b"".join(
-            struct.pack("<HQ", of, at + offset)
-            for offset, of in container.iter_message_indexes(self._disk.read(at, end - at))
-        )
-        return encode_record(
-            CHUNK_INDEX,
-            struct.pack("<QQQQ", first, last, start, at - start),
-            struct.pack("<I", len(places)) + places,
-            struct.pack("<Q", end - at) + encode_string("zstd"),
-            struct.pack("<QQ", compressed, size),
-        )
+    def _pack_chunk_index(self) -> None:
+        if self._chunk_index is not None:
+            self._chunk_indexes += self._compressor.compress(encode_records([self._chunk_index]))
+            self._chunk_index = None
 
     def sync(self) -> None:
         """Make everything written survive a power loss."""
@@ -259,21 +281,16 @@ class McapFile:
         self._disk.close()
 
     def _append(self, data: bytes) -> None:
-        self._try_truncate()
+        self._cut_partial_write()
         try:
-            self._disk.write(data)
+            self._disk.write(self.end, data)
         except OSError:
-            self._disk.rewind(self._end)
-            self._partial_write = True
-            self._try_truncate()
+            self._has_partial_write = True
+            self._cut_partial_write()
             raise
-        self._end += len(data)
 
-    def _try_truncate(self) -> None:
-        with suppress(OSError):
-            self._truncate()
-
-    def _truncate(self) -> None:
-        if self._partial_write:
-            self._disk.truncate(self._end)
-            self._partial_write = False
+    def _cut_partial_write(self) -> None:
+        if self._has_partial_write:
+            with suppress(OSError):
+                self._disk.truncate(self.end)
+                self._has_partial_write = False

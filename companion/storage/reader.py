@@ -1,82 +1,161 @@
-"""MCAP log reader: blocks of message records from a closed or torn file, ours or another recorder's.
+"""MCAP log reader: records, messages and definitions of a closed or torn file, ours or another recorder's.
 
+The mcap package parses the records and the chunks. Its readers stop at a torn end and trust every length, so
+the records are found here: one of incomplete length ends a log, one of wrong content raises DamagedError.
 It does not decode messages.
 """
 
 from __future__ import annotations
 
 import os
+import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
+from io import BytesIO
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, NamedTuple
 
-from companion.storage import container
-from companion.storage.container import DamagedError
+import zstandard
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import Channel, Chunk, McapRecord, Message, Metadata, Schema
+from mcap.stream_reader import StreamReader, breakup_chunk
+
+from companion.storage.mcap_file import MAGIC
 
 ACTIVE = ".active"
 """Suffix of a log that is not closed."""
+
+MAX_UNCOMPRESSED = 1 << 28
+"""Larger chunks are rejected, so that a forged size field cannot exhaust the memory."""
+
+_HEAD = struct.Struct("<BQ")  # opcode, length
 
 
 class LogError(OSError):
     """A log that cannot be written or read; the text is one sentence for the user."""
 
 
+class DamagedError(ValueError):
+    """Inconsistent bytes, such as a wrong checksum or a length beyond the end of its record."""
+
+
+class RawRecord(NamedTuple):
+    """A complete record of a file: its offset, and its bytes with opcode and length."""
+
+    start: int
+    data: bytes
+
+    @property
+    def opcode(self) -> int:
+        """Opcode of the record."""
+        return self.data[0]
+
+    @property
+    def end(self) -> int:
+        """Offset of the next record."""
+        return self.start + len(self.data)
+
+    def parse(self) -> McapRecord:
+        """Parse the record, of a known opcode. Raises DamagedError if its content is inconsistent."""
+        try:
+            stream = StreamReader(BytesIO(self.data), skip_magic=True, emit_chunks=True)
+            return next(stream.records)
+        except (McapError, struct.error, UnicodeDecodeError, OverflowError) as error:
+            raise DamagedError(f"a record cannot be parsed ({error or type(error).__name__})") from None
+
+
 class LogReader:
     """A log opened for reading; `closed` is False for a torn one.
 
-    Updated while reading: `end`, where the last complete record ends; `chunks`; `metadata` by name.
+    Updated while reading: `end`, where the last complete record ends; `chunks`; `metadata` by name; `schemas`
+    and `channels` by id.
     """
 
     def __init__(self, path: Path, file: BinaryIO, size: int) -> None:
         self.path, self.file, self.size = path, file, size
-        self.closed = container.is_closed(file, size)
-        self.end = len(container.MAGIC)
+        file.seek(max(0, size - 37))
+        tail = file.read(37)
+        self.closed = tail[:9] == _HEAD.pack(Opcode.FOOTER, 20) and tail[29:] == MAGIC
+        self.end = len(MAGIC)
         self.chunks = 0
         self.metadata: dict[str, dict[str, str]] = {}
+        self.schemas: dict[int, Schema] = {}
+        self.channels: dict[int, Channel] = {}
 
-    def records(self) -> Iterator[container.RawRecord]:
-        """Yield every complete record up to the footer, or up to where the file is torn."""
-        for whole in container.scan_records(self.file, self.size):
-            self.end = whole.offset + 9 + len(whole.content)
-            yield whole
-            if whole.opcode == container.FOOTER and self.closed:
-                self.end = self.size
-
-    def message_blocks(self) -> Iterator[bytes]:
-        """Yield blocks of schema, channel and message records: uncompressed chunks, and records between them.
-
-        A truncated chunk gives the messages that can still be read. Raises DamagedError at a chunk of
-        complete length with wrong content.
-        """
-        data_ended = False
-        for _, opcode, content in self.records():
-            if opcode == container.CHUNK:
-                data = container.decompress_chunk(content)
-                self.chunks += 1
-                yield data
-            elif opcode == container.METADATA:
-                name, values = container.parse_metadata(content)
-                self.metadata[name] = values
-            elif opcode == container.DATA_END:
-                data_ended = True
-            elif opcode in (container.SCHEMA, container.CHANNEL, container.MESSAGE) and not data_ended:
-                yield container.encode_record(opcode, content)
-        if not self.closed and not data_ended:
-            yield container.salvage_torn_chunk(self.read_tail())
-
-    def read_tail(self) -> bytes:
-        """Return the bytes after the last complete record."""
+    def records(self) -> Iterator[RawRecord]:
+        """Yield every complete record of the data, up to where its end is stated or the file is torn."""
         self.file.seek(self.end)
-        return self.file.read(min(self.size - self.end, container.MAX_UNCOMPRESSED))
+        has_data = True
+        while len(head := self.file.read(_HEAD.size)) == _HEAD.size:
+            opcode, length = _HEAD.unpack(head)
+            if opcode == 0 or self.end + len(head) + length > self.size:
+                return
+            raw = RawRecord(self.end, head + self.file.read(length))
+            self.end = raw.end
+            has_data = has_data and opcode not in (Opcode.DATA_END, Opcode.FOOTER)
+            if has_data and opcode < Opcode.DATA_END:  # others are private or of a later format
+                yield raw
+            elif opcode == Opcode.FOOTER:
+                self.end = self.size if self.closed else self.end
+                return
+
+    def messages(self) -> Iterator[Message]:
+        """Yield the messages in the order written. Raises DamagedError at a record of wrong content."""
+        for raw in self.records():
+            if raw.opcode in (Opcode.CHUNK, Opcode.MESSAGE, Opcode.SCHEMA, Opcode.CHANNEL):
+                yield from self.unpack(raw.parse())
+            elif raw.opcode == Opcode.METADATA:
+                self.keep_metadata(raw)
+
+    def unpack(self, record: McapRecord) -> list[Message]:
+        """Return the messages of a chunk or message record; keep the definitions."""
+        inner: list[McapRecord] = [record]
+        if isinstance(record, Chunk):
+            inner = _break_up(record)
+            self.chunks += 1
+        messages = []
+        for one in inner:
+            if isinstance(one, Message):
+                messages.append(one)
+            elif isinstance(one, Schema):
+                self.schemas[one.id] = one
+            elif isinstance(one, Channel):
+                self.channels[one.id] = one
+        return messages
+
+    def keep_metadata(self, raw: RawRecord) -> None:
+        """Parse a metadata record and keep it in `metadata`."""
+        record = raw.parse()
+        assert isinstance(record, Metadata)
+        self.metadata[record.name] = record.metadata
+
+    def is_defined(self, channel_id: int) -> bool:
+        """Return whether a channel and its schema are defined."""
+        channel = self.channels.get(channel_id)
+        return channel is not None and (channel.schema_id == 0 or channel.schema_id in self.schemas)
 
     def damage_error(self, error: Exception) -> LogError:
         """Convert an error found while reading into a LogError for the user."""
-        if isinstance(error, KeyError):
-            error = DamagedError(f"a message is on channel {error}, which is not defined")
         return LogError(
             f"{self.path}: damaged near byte {self.end}: {error}; `companion log recover` saves the rest"
         )
+
+
+def _break_up(chunk: Chunk) -> list[McapRecord]:
+    """Return the records of a chunk. Raises DamagedError if size, checksum or content are wrong."""
+    if chunk.uncompressed_size > MAX_UNCOMPRESSED:
+        raise DamagedError(f"a chunk states {chunk.uncompressed_size} bytes (limit {MAX_UNCOMPRESSED})")
+    try:
+        if not chunk.uncompressed_size:
+            return []
+        if chunk.compression == "zstd":
+            content_size = zstandard.frame_content_size(chunk.data)  # -1: not stated
+            if content_size not in (-1, chunk.uncompressed_size):
+                raise DamagedError("a chunk's size differs from the stated one")
+        return list(breakup_chunk(chunk, validate_crc=True))
+    except (McapError, zstandard.ZstdError, struct.error, ValueError, OverflowError, RuntimeError) as error:
+        raise DamagedError(f"a chunk cannot be read ({error or type(error).__name__})") from None
 
 
 @contextmanager
@@ -89,51 +168,20 @@ def open_log(path: str | os.PathLike[str]) -> Iterator[LogReader]:
         raise LogError(f"{path}: cannot be read: {error.strerror or error}") from None
     with file:
         size = os.fstat(file.fileno()).st_size
-        magic = file.read(len(container.MAGIC))
+        magic = file.read(len(MAGIC))
         if not magic:
             raise LogError(f"{path}: is empty")
-        if not container.MAGIC.startswith(magic):
+        if not MAGIC.startswith(magic):
             raise LogError(f"{path}: is not an MCAP log (it does not begin with MCAP's magic)")
-        source = LogReader(path, file, size)
-        first = next(container.scan_records(file, size), None)
+        first = next(LogReader(path, file, size).records(), None)
         if first is None:
             raise LogError(f"{path}: is truncated within its header and contains no messages")
-        if first.opcode != container.HEADER:
+        if first.opcode != Opcode.HEADER:
             raise LogError(f"{path}: is not an MCAP log (its first record is not a header)")
-        file.seek(len(container.MAGIC))
-        yield source
+        yield LogReader(path, file, size)
 
 
 def is_closed(path: str | os.PathLike[str]) -> bool:
     """Return whether the log at `path` was closed. Raises LogError as `open_log` does."""
     with open_log(path) as source:
         return source.closed
-
-
-class ChannelTable:
-    """Schemas and channels defined so far in a file: record contents by id."""
-
-    def __init__(self) -> None:
-        self.schemas: dict[int, bytes] = {}
-        self.channels: dict[int, bytes] = {}
-
-    def define(self, opcode: int, content: bytes) -> int | None:
-        """Add one record and return its id if it is a channel. Raises DamagedError if it cannot be parsed."""
-        if opcode == container.SCHEMA:
-            self.schemas[container.parse_schema(content)[0]] = content
-        elif opcode == container.CHANNEL:
-            number = container.parse_channel(content)[0]
-            self.channels[number] = content
-            return number
-        return None
-
-    def __contains__(self, number: int) -> bool:
-        """Return whether channel `number` and its schema are defined."""
-        of_schema = container.parse_channel(self.channels[number])[1] if number in self.channels else -1
-        return of_schema == 0 or of_schema in self.schemas
-
-    def __getitem__(self, number: int) -> container.Channel:
-        """Return channel `number`. Raises KeyError if it or its schema is not defined."""
-        _, of_schema, topic, encoding = container.parse_channel(self.channels[number])
-        name = container.parse_schema(self.schemas[of_schema])[1] if of_schema else ""
-        return container.Channel(topic, encoding, name)

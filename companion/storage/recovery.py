@@ -5,14 +5,14 @@ from __future__ import annotations
 import fcntl
 import os
 from collections.abc import Callable
-from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
-from companion.storage import container
-from companion.storage.container import Chunk, DamagedError
-from companion.storage.mcap_file import DiskFile, McapFile, sync_folder
-from companion.storage.reader import ACTIVE, ChannelTable, LogError, LogReader, open_log
+from mcap.opcode import Opcode
+from mcap.records import Chunk, Message, MessageIndex
+
+from companion.storage.mcap_file import DiskFile, McapFile, encode_chunk, sync_folder
+from companion.storage.reader import ACTIVE, DamagedError, LogError, LogReader, open_log
 
 
 class Recovered(NamedTuple):
@@ -29,12 +29,12 @@ def recover(
     reserve: int = 0,
     relieve: Callable[[int], object] = lambda wanted: None,
 ) -> Recovered:
-    """Recover a torn or damaged log: every complete chunk, and the complete messages of a truncated one.
+    """Recover every complete chunk of a torn or damaged log.
 
     `x.mcap.active` becomes `x.mcap`: in place if only its end is missing, which needs space for the end only,
-    and by a copy if it is damaged or a truncated chunk gives messages. A torn `x.mcap` is copied to
-    `x.recovered.mcap`. The torn log is removed only after its copy is synced to the disk, and only if it is
-    ".active". A closed log is left unchanged. A kill at any instant leaves a log that reads as before.
+    and by a copy if it is damaged. A torn or damaged `x.mcap` is copied to `x.recovered.mcap`. The torn log
+    is removed only after its copy is synced to the disk, and only if it is ".active". A closed log is left
+    unchanged. A kill at any instant leaves a log that reads as before.
 
     Parameters
     ----------
@@ -52,12 +52,13 @@ def recover(
             raise LogError(f"{path}: is still being written") from None
         target = _target_path(path)
         try:
-            saved = _check_complete(path)
-            if saved is not None and path.suffix != ACTIVE:
-                return saved
+            if locked.closed and path.suffix != ACTIVE:
+                saved = _finish_in_place(path, reserve, relieve)
+                if saved is not None:
+                    return saved
             if target.exists():
                 raise LogError(f"{target} already exists: move it away first")
-            saved = saved or _complete_in_place(path, reserve, relieve)
+            saved = _finish_in_place(path, reserve, relieve) if path.suffix == ACTIVE else None
             if saved is None:
                 saved = _recover_by_copy(path, target, reserve)
             else:
@@ -70,107 +71,6 @@ def recover(
     return saved._replace(path=target)
 
 
-def _check_complete(path: Path) -> Recovered | None:
-    """Return the contents of the log at `path` if it is complete, after a sync; None if it is not."""
-    with open_log(path) as source:
-        try:
-            count = sum(_count_messages(data) for data in source.message_blocks()) if source.closed else 0
-        except DamagedError:
-            return None
-        if not source.closed or source.end < source.size:
-            return None
-        os.fsync(source.file.fileno())  # the writer may have been killed before its sync
-        return Recovered(count, source.chunks, 0, path)
-
-
-class CopyMismatch(Exception):
-    """The log differs from what its copy would be."""
-
-
-class InPlaceFile(DiskFile):
-    """An existing file rewritten from its start. Equal bytes are not written again; the file is truncated at
-    the first difference. A difference within the first `kept` bytes raises CopyMismatch.
-    """
-
-    def __init__(self, path: Path, kept: int, reserve: int, relieve: Callable[[int], object]) -> None:
-        self._attach(os.open(path, os.O_RDWR), reserve, relieve)
-        self._kept, self._same = kept, True
-
-    def write(self, data: bytes) -> None:
-        """See `Disk`."""
-        if self._same:
-            there = os.pread(self._fd, len(data), self._at)
-            if there == data:
-                self._at += len(data)
-                return
-            same = next((i for i, (a, b) in enumerate(zip(there, data)) if a != b), len(there))
-            if self._at + same < self._kept:
-                raise CopyMismatch
-            self._at += same
-            self.truncate(self._at)
-            data = data[same:]
-        super().write(data)
-
-    def sync(self) -> None:
-        """See `Disk`."""
-        if self._same:
-            self.truncate(self._at)
-        super().sync()
-
-    def truncate(self, size: int) -> None:
-        """See `Disk`; never truncates below the kept bytes."""
-        self._same = False
-        super().truncate(max(size, self._kept))
-
-
-def _complete_in_place(path: Path, reserve: int, relieve: Callable[[int], object]) -> Recovered | None:
-    """Write the missing end of the log at `path`. If more than the end is missing, return None unchanged.
-
-    The log is copied onto itself: its end becomes that of a copy, and everything before is compared.
-    """
-    if path.suffix != ACTIVE:
-        return None
-    with open_log(path) as source:
-        kept, library = 0, ""
-        for _, opcode, content in source.records():
-            if opcode == container.DATA_END:
-                break
-            if opcode == container.HEADER:
-                with suppress(DamagedError):
-                    library = container.parse_library(content)
-            if opcode not in (container.SCHEMA, container.CHANNEL, container.MESSAGE_INDEX):
-                kept = source.end
-        else:
-            if any(container.iter_messages(container.salvage_torn_chunk(source.read_tail()))):
-                return None  # a kill between truncate and write would lose them
-    disk = InPlaceFile(path, kept, reserve, relieve)
-    try:
-        with open_log(path) as source:
-            return _copy_records(source, McapFile(disk, library))
-    except CopyMismatch:
-        return None
-    finally:
-        disk.close()
-
-
-def _recover_by_copy(path: Path, target: Path, reserve: int) -> Recovered:
-    """Copy everything readable from `path` to `target`, and remove `path` if it is ".active"."""
-    part = target.with_name(target.name + ".part")
-    part.unlink(missing_ok=True)
-    disk = DiskFile(part, reserve)
-    try:
-        with open_log(path) as source:
-            saved = _copy_records(source, McapFile(disk, "companion recover"))
-        os.replace(part, target)
-    finally:
-        disk.close()
-        part.unlink(missing_ok=True)  # a partial copy would only take disk space
-    sync_folder(target.parent)
-    if path.suffix == ACTIVE:
-        path.unlink(missing_ok=True)
-    return saved
-
-
 def _target_path(path: Path) -> Path:
     stem = path.with_suffix("") if path.suffix == ACTIVE else path
     if path.suffix == ACTIVE and not stem.exists():
@@ -178,57 +78,90 @@ def _target_path(path: Path) -> Path:
     return stem.with_name(f"{stem.stem}.recovered.mcap")
 
 
-def _copy_records(source: LogReader, target: McapFile) -> Recovered:
-    """Copy everything readable from `source` to `target`, chunk by chunk."""
-    known = ChannelTable()
-    messages = chunks = lost = 0
-    between = Chunk()
+def _finish_in_place(path: Path, reserve: int, relieve: Callable[[int], object]) -> Recovered | None:
+    """Write what is missing after the last complete chunk at `path`; None, unchanged, if it is damaged."""
+    file = McapFile(DiskFile(path, reserve, relieve, new=False))
+    try:
+        with open_log(path) as source:
+            try:
+                messages, last = _enter_all(source, file)
+            except DamagedError:
+                return None
+            if not source.closed:
+                if messages != file.messages + len(last):
+                    return None  # some are outside chunks
+                if last:
+                    file.write(encode_chunk(last)[1])
+                file.finish()
+            file.sync()  # of a closed log too: its writer may have been killed before
+            return Recovered(messages, source.chunks, source.size - source.end, path)
+    finally:
+        file.close()
 
-    def keep(chunk: Chunk, compressed: bytes | None = None) -> None:
-        nonlocal messages, chunks
-        if chunk.index:
-            target.chunk(chunk, known.schemas, known.channels, compressed)
-            messages += chunk.messages
-            chunks += 1
 
-    for _, opcode, content in source.records():
-        if opcode == container.DATA_END:
-            break
+def _enter_all(source: LogReader, file: McapFile) -> tuple[int, list[Message]]:
+    """Enter the records of `source` into `file`, without the indexes of a chunk at a torn end.
+
+    Returns the number of messages, and the messages of that chunk: its indexes may be incomplete.
+    """
+    count = 0
+    last: list[Message] = []
+    indexes: list[tuple[MessageIndex, int, int]] = []  # of the last chunk
+    for raw in source.records():
+        record = raw.parse()
+        if isinstance(record, MessageIndex):
+            indexes.append((record, raw.start, raw.end))
+            continue
+        for index in indexes:
+            file.enter(*index)
+        messages = source.unpack(record)
+        if not all(source.is_defined(message.channel_id) for message in messages):
+            raise DamagedError("a message is on a channel that is not defined")
+        count, indexes = count + len(messages), []
+        last = messages if isinstance(record, Chunk) else []
+        file.enter(record, raw.start, raw.end)
+    for definition in (*source.schemas.values(), *source.channels.values()):
+        file.enter(definition, file.end, file.end)  # of another recorder: inside a chunk
+    return count, last
+
+
+def _recover_by_copy(path: Path, target: Path, reserve: int) -> Recovered:
+    """Copy everything readable from `path` to `target`, and remove `path` if it is ".active"."""
+    part = target.with_name(target.name + ".part")
+    part.unlink(missing_ok=True)
+    file = McapFile(DiskFile(part, reserve))
+    try:
+        file.begin("companion recover")
+        with open_log(path) as source:
+            lost = _copy_records(source, file)
+        file.finish()
+        file.sync()
+        os.replace(part, target)
+    finally:
+        file.close()
+        part.unlink(missing_ok=True)  # a partial copy would only take disk space
+    sync_folder(target.parent)
+    if path.suffix == ACTIVE:
+        path.unlink(missing_ok=True)
+    return Recovered(file.messages, file.chunks, lost, target)
+
+
+def _copy_records(source: LogReader, file: McapFile) -> int:
+    """Copy everything readable; return the number of bytes lost. Messages of undefined channels are lost."""
+    lost = 0
+    between: list[Message] = []  # messages outside chunks
+    for raw in source.records():
         try:
-            if opcode == container.METADATA:
-                target.metadata(*container.parse_metadata(content))
-            elif opcode == container.ATTACHMENT:
-                target.attachment(content)
-            elif opcode == container.CHUNK:
-                data = container.decompress_chunk(content)
-                keep(between)
-                between = Chunk()
-                chunk = _collect_messages(data, known, Chunk())
-                keep(chunk, container.compressed_data(content) if chunk.data == data else None)
-            elif opcode in (container.SCHEMA, container.CHANNEL, container.MESSAGE):
-                _collect_messages(container.encode_record(opcode, content), known, between)
+            if raw.opcode in (Opcode.METADATA, Opcode.ATTACHMENT):
+                file.write([raw.parse()])
+            elif raw.opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE, Opcode.CHUNK):
+                messages = [m for m in source.unpack(raw.parse()) if source.is_defined(m.channel_id)]
+                between += messages
+                if raw.opcode == Opcode.CHUNK and between:
+                    file.chunk(between, source.schemas, source.channels)
+                    between = []
         except DamagedError:
-            lost += 9 + len(content)
-    else:
-        if not source.closed:
-            lost += source.size - source.end
-            with suppress(DamagedError):  # torn and damaged: keep the messages before the damage
-                _collect_messages(container.salvage_torn_chunk(source.read_tail()), known, between)
-    keep(between)
-    target.finish()
-    target.sync()
-    return Recovered(messages, chunks, lost, source.path)
-
-
-def _collect_messages(data: bytes, known: ChannelTable, chunk: Chunk) -> Chunk:
-    """Add the messages in `data` to `chunk`; messages of undefined channels are dropped."""
-    for opcode, number, sequence, log_ns, publish_ns, content in container.iter_messages(data):
-        if opcode != container.MESSAGE:
-            known.define(opcode, content)
-        elif number in known:
-            chunk.add(number, sequence, log_ns, publish_ns, content)
-    return chunk
-
-
-def _count_messages(data: bytes) -> int:
-    return sum(inner[0] == container.MESSAGE for inner in container.iter_messages(data))
+            lost += len(raw.data)
+    if between:
+        file.chunk(between, source.schemas, source.channels)
+    return lost + (0 if source.closed else source.size - source.end)

@@ -14,13 +14,13 @@ from __future__ import annotations
 
 import contextlib
 import math
-import struct
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 from fastcrc import crc16
+from mcap.records import Channel, Chunk, Header, McapRecord, Message, Metadata, Schema
 
 from companion import records
 from companion.config import Config, ConfigError, InertialConfig, OutputConfig, load, parse, to_toml
@@ -32,7 +32,8 @@ from companion.link.session import MessageReceived, Session
 from companion.link.signing import Signing
 from companion.records import Mode, Solution, Stamped
 from companion.runtime.core import CompanionCore
-from companion.storage import container, flight_log
+from companion.storage import flight_log
+from companion.storage.mcap_file import MAGIC, encode_records
 from companion.storage.reader import LogError
 
 MILLI = 1_000_000
@@ -356,17 +357,15 @@ def small_log(content: bytes | None = None, chunked: bool = False) -> bytes:
     """Build a torn log of one message, `content`, without checksums, which would stop a fuzzer."""
     if content is None:
         content = records.encode(records.Event(5, 5, 6, "text"))
-    text, record = container.encode_string, container.encode_record
-    schema = struct.pack("<H", 1) + text("Event") + text("jsonschema") + text("{}")
-    channel = struct.pack("<HH", 1, 1) + text("/out/Event") + text("json") + container.encode_string_map({})
-    inner = record(container.SCHEMA, schema) + record(container.CHANNEL, channel)
-    inner += record(container.MESSAGE, struct.pack("<HIQQ", 1, 0, 5, 5), content)
-    head = container.MAGIC + record(container.HEADER, text(""), text("x"))
-    head += record(container.METADATA, text("log"), container.encode_string_map({"a": "b"}))
-    if not chunked:
-        return head + inner
-    sizes = struct.pack("<QQQI", 5, 5, len(inner), 0), struct.pack("<Q", len(inner))
-    return head + record(container.CHUNK, sizes[0], text(""), sizes[1], inner)
+    inner: list[McapRecord] = [
+        Schema(id=1, data=b"{}", encoding="jsonschema", name="Event"),
+        Channel(id=1, topic="/out/Event", message_encoding="json", metadata={}, schema_id=1),
+        Message(channel_id=1, log_time=5, data=content, publish_time=5, sequence=0),
+    ]
+    if chunked:
+        data = encode_records(inner)
+        inner = [Chunk("", data, 5, 5, uncompressed_crc=0, uncompressed_size=len(data))]
+    return MAGIC + encode_records([Header("", "x"), Metadata("log", {"a": "b"}), *inner])
 
 
 def check_config(data: bytes) -> None:

@@ -57,11 +57,11 @@ class FaultyDisk:
         self.working = threading.Event()
         self.working.set()
 
-    def write(self, data: bytes) -> None:
+    def write(self, at: int, data: bytes) -> None:
         self.working.wait(30.0)
         if self.error is not None:
             raise OSError(self.error, os.strerror(self.error))
-        self.disk.write(data)
+        self.disk.write(at, data)
 
     def sync(self) -> None:
         self.working.wait(30.0)

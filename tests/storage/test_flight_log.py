@@ -22,14 +22,17 @@ import pytest
 from click.testing import CliRunner
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mcap.opcode import Opcode
 from mcap.reader import NonSeekingReader, make_reader
+from mcap.records import Channel, Chunk, DataEnd, Footer, Header, Message
 from mcap.stream_reader import StreamReader
 
 from companion import records as r
 from companion.analysis.log_command import group
-from companion.storage import container, location_fix, retention
+from companion.storage import location_fix, retention
 from companion.storage.flight_log import LogError, Writer, info, metadata, read, recover
-from companion.storage.mcap_file import DiskFile
+from companion.storage.mcap_file import MAGIC, DiskFile, encode_records
+from companion.storage.reader import open_log
 
 SUITE = Path(__file__).parents[1] / "data" / "mcap_conformance.tar.xz"
 START = {"start_unix_ns": 1_700_000_000_000_000_000, "start_ns": 12_345_678_901}
@@ -181,13 +184,11 @@ def test_log_truncated_at_any_byte_is_readable_and_recoverable(tmp_path, small):
     entries = list(read(whole))
     ends, have = [], 0  # (where a chunk ends, messages up to there)
 
-    for record in container.scan_records(io.BytesIO(small[8:]), len(small)):
-        if record.opcode == container.CHUNK:
-            have += sum(
-                m[0] == container.MESSAGE
-                for m in container.iter_messages(container.decompress_chunk(record.content))
-            )
-            ends.append((record.offset + 9 + len(record.content), have))
+    with open_log(whole) as source:
+        for record in source.records():
+            if record.opcode == Opcode.CHUNK:
+                have += len(source.unpack(record.parse()))
+                ends.append((record.end, have))
     assert have == len(entries) == 24 and len(ends) >= 4
     header_end = 8 + 9 + int.from_bytes(small[9:17], "little")
     for size in range(len(small)):
@@ -256,23 +257,26 @@ def test_kill_during_recovery_leaves_a_log_that_reads_as_before(tmp_path_factory
     assert list(read(path.with_suffix(""))) == entries and info(path.with_suffix("")).closed
 
 
-def test_recovery_writes_only_the_missing_bytes(tmp_path, small):
-    """Recovery appends the missing bytes only; a complete log is only renamed."""
+def test_recovery_writes_only_after_the_last_chunk(tmp_path, small):
+    """The recovered log is the same file and has the same bytes; a complete log is only renamed."""
     path = tmp_path / "x.mcap.active"
-    for cut in (0, 30, len(small) - small.rindex(container.encode_record(container.DATA_END, bytes(4)))):
+    with io.BytesIO(small) as stream:
+        summary = make_reader(stream).get_summary()
+    last = max(index.chunk_start_offset + index.chunk_length for index in summary.chunk_indexes)
+    for cut in (0, 30, len(small) - small.rindex(encode_records([DataEnd(0)])), len(small) - last):
         path.write_bytes(small[: len(small) - cut])
         node = path.stat().st_ino
         with pytest.MonkeyPatch.context() as patch:
             power = LimitedCalls(patch, 100, 0.0)
             assert recover(path).messages == 24
-        assert power.written == cut
+        assert power.written <= (len(small) - last if cut else 0)
         assert (tmp_path / "x.mcap").read_bytes() == small and (tmp_path / "x.mcap").stat().st_ino == node
         (tmp_path / "x.mcap").unlink()
 
 
 def test_damaged_log_is_unchanged_until_its_copy_is_complete(tmp_path, small):
     path = tmp_path / "x.mcap.active"
-    for at in range(8, small.rindex(container.encode_record(container.DATA_END, bytes(4))), 7):
+    for at in range(8, small.rindex(encode_records([DataEnd(0)])), 7):
         damaged = bytearray(small[:-20])
         damaged[at] ^= 0xFF
         path.write_bytes(damaged)
@@ -292,22 +296,18 @@ def test_damaged_log_is_unchanged_until_its_copy_is_complete(tmp_path, small):
             one.unlink()
 
 
-def test_complete_messages_of_a_truncated_uncompressed_chunk_are_saved(tmp_path):
-    chunk = container.Chunk()
-    for i in range(10):
-        chunk.add(1, i, i, i, b"%d" % i)
-    body = container.encode_chunk(chunk, bytes(chunk.data))[0].replace(
-        container.encode_string("zstd"), container.encode_string("")
-    )
-    definition = container.encode_record(
-        container.CHANNEL, bytes([1, 0, 0, 0]) + container.encode_string("t") * 2 + bytes(4)
-    )
-    head = container.MAGIC + container.encode_record(container.HEADER, container.encode_string("") * 2)
-    path = tmp_path / "x.mcap"
-    path.write_bytes(head + definition + body[:-40])
-    assert [e.value for e in read(path)] == [b"%d" % i for i in range(8)]
-    saved = recover(path)
-    assert saved.messages == 8 and saved.path.name == "x.recovered.mcap" and path.exists()
+def test_messages_outside_chunks_are_recovered_into_one(tmp_path):
+    channel = Channel(id=1, topic="t", message_encoding="t", metadata={}, schema_id=0)
+    loose = [Message(1, i, b"%d" % i, i, i) for i in range(10)]
+    for name in ("x.mcap", "y.mcap.active"):
+        path = tmp_path / name
+        path.write_bytes(MAGIC + encode_records([Header("", ""), channel, *loose])[:-10])
+        assert [e.value for e in read(path)] == [b"%d" % i for i in range(9)]
+        saved = recover(path)
+        assert saved.messages == 9 and path.exists() == (name == "x.mcap")
+        with saved.path.open("rb") as stream:
+            assert len(list(make_reader(stream).iter_messages())) == 9
+    assert {one.name for one in tmp_path.iterdir()} == {"x.mcap", "x.recovered.mcap", "y.mcap"}
 
 
 def test_damaged_byte_is_reported_and_the_rest_is_recovered(tmp_path, small):
@@ -330,7 +330,7 @@ def test_arbitrary_bytes_raise_only_log_error(tmp_path_factory, small, data):
     if kind == 0:
         junk = data.draw(st.binary(max_size=200))
     elif kind == 1:
-        junk = container.MAGIC + data.draw(st.binary(max_size=200))
+        junk = MAGIC + data.draw(st.binary(max_size=200))
     else:
         edits = data.draw(
             st.lists(st.tuples(st.integers(8, len(small) - 1), st.integers(0, 255)), max_size=8)
@@ -352,25 +352,17 @@ def test_invalid_log_is_reported_in_one_sentence(tmp_path):
     for name, content, words in (
         ("empty", b"", "is empty"),
         ("foreign", b"\x7fELF" * 20, "is not an MCAP log"),
-        ("short", container.MAGIC[:5], "is truncated within its header"),
-        ("zeros", container.MAGIC + bytes(100), "is truncated within its header"),
+        ("short", MAGIC[:5], "is truncated within its header"),
+        ("zeros", MAGIC + bytes(100), "is truncated within its header"),
     ):
         (tmp_path / name).write_bytes(content)
         with pytest.raises(LogError, match=words):
             list(read(tmp_path / name))
     with pytest.raises(LogError, match="cannot be read: No such file"):
         info(tmp_path / "missing")
-    bomb = container.encode_record(
-        container.CHUNK,
-        bytes(16),
-        (2**62).to_bytes(8, "little"),
-        bytes(4),
-        container.encode_string("zstd"),
-        bytes(8),
-    )
-    head = container.MAGIC + container.encode_record(container.HEADER, container.encode_string("") * 2)
-    foot = container.encode_record(container.FOOTER, bytes(20)) + container.MAGIC
-    (tmp_path / "bomb").write_bytes(head + bomb + foot)
+    bomb = Chunk("zstd", b"", 0, 0, uncompressed_crc=0, uncompressed_size=2**62)
+    log = MAGIC + encode_records([Header("", ""), bomb, Footer(0, 0, 0)]) + MAGIC
+    (tmp_path / "bomb").write_bytes(log)
     with pytest.raises(LogError, match="states"):
         list(read(tmp_path / "bomb"))
 
@@ -411,12 +403,12 @@ class FaultyDisk:
     def __post_init__(self):
         self.disk = DiskFile(self.path)
 
-    def write(self, data):
+    def write(self, at, data):
         error = self.fault()
         if error is not None:
-            self.disk.write(data[: len(data) // 2])  # a full disk writes a part
+            self.disk.write(at, data[: len(data) // 2])  # a full disk writes a part
             raise error
-        self.disk.write(data)
+        self.disk.write(at, data)
 
     def __getattr__(self, name):
         return getattr(self.disk, name)

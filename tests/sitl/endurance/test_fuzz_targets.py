@@ -7,12 +7,15 @@ import pytest
 import zstandard
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mcap.opcode import Opcode
+from mcap.records import Chunk, Header, McapRecord
 
 from companion.config import ConfigError, parse
 from companion.link import dialect, frame
 from companion.navigator.air_data_channel import true_airspeed
 from companion.records import AirData
-from companion.storage import container, flight_log
+from companion.storage import flight_log
+from companion.storage.mcap_file import MAGIC, encode_records
 from companion.storage.reader import LogError
 from sitl.endurance import fuzz_targets
 from sitl.endurance.fuzz import TARGET_NAMES
@@ -107,41 +110,26 @@ def test_oversized_configuration_is_a_short_error(text: str) -> None:
     assert len(str(caught.value)) < 300
 
 
-def torn(tail: bytes) -> bytes:
-    """A log that ends inside a chunk record of `tail`."""
-    head = container.MAGIC + container.encode_record(
-        container.HEADER, container.encode_string(""), container.encode_string("x")
-    )
-    return head + struct.pack("<BQ", container.CHUNK, len(tail) + 1000) + tail
+def torn(*records: McapRecord) -> bytes:
+    """A log that ends after `records`."""
+    return MAGIC + encode_records([Header("", "x"), *records])
 
 
-def test_torn_chunk_is_recovered_up_to_a_damaged_schema(tmp_path) -> None:
-    bad = container.encode_record(container.SCHEMA, struct.pack("<HI", 1, 1 << 30))
-    chunk = (
-        struct.pack("<QQQI", 0, 0, len(bad), 0)
-        + container.encode_string("")
-        + struct.pack("<Q", len(bad))
-        + bad
-    )
+def test_torn_log_is_recovered_up_to_a_damaged_schema(tmp_path) -> None:
+    bad = struct.pack("<BQHI", Opcode.SCHEMA, 6, 1, 1 << 30)
     path = tmp_path / "x.mcap.active"
-    path.write_bytes(torn(chunk))
+    path.write_bytes(torn(Chunk("", bad, 0, 0, uncompressed_crc=0, uncompressed_size=len(bad))))
     assert flight_log.recover(path).messages == 0
     assert flight_log.info(tmp_path / "x.mcap").closed
 
 
-def test_torn_compression_bomb_is_limited_to_its_stated_size(tmp_path) -> None:
+def test_compression_bomb_is_limited_to_its_stated_size(tmp_path) -> None:
     """Half a gigabyte of zeros in 50 KiB, with a stated size of 100 bytes."""
     bomb = zstandard.ZstdCompressor(level=1, write_content_size=False).compressobj()
-    squeezed = b"".join(bomb.compress(bytes(16 * MIB)) for _ in range(32))
+    squeezed = b"".join(bomb.compress(bytes(16 * MIB)) for _ in range(32)) + bomb.flush()
     assert len(squeezed) < MIB
-    chunk = (
-        struct.pack("<QQQI", 0, 0, 100, 0)
-        + container.encode_string("zstd")
-        + struct.pack("<Q", MIB)
-        + squeezed
-    )
     path = tmp_path / "x.mcap"
-    path.write_bytes(torn(chunk))
+    path.write_bytes(torn(Chunk("zstd", squeezed, 0, 0, uncompressed_crc=0, uncompressed_size=100)))
     tracemalloc.start()
     try:
         assert list(flight_log.read(path)) == []
