@@ -18,8 +18,10 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
+from companion.analysis import error_statistics
 from companion.analysis.flight_arrays import Flight, Table
-from companion.analysis.flight_events import beacon_places, split_phases, usable_gnss
+from companion.analysis.flight_events import WITHOUT_FIXES, beacon_places, split_phases, usable_gnss
+from companion.analysis.plot_data import COLOURS
 from companion.storage.reader import LogError
 from companion.units import Floats
 
@@ -157,19 +159,19 @@ def flight_map(flight: Flight, every_s: float = 1.0) -> tuple[list[Track], list[
             name: column[(solution["t"] >= start) & (solution["t"] < end)]
             for name, column in solution.items()
         }
-        lost = phase.name in ("prediction", "untrusted")
+        lost = phase.name in WITHOUT_FIXES
         what = "no fixes" if lost else phase.name
-        colour = "#d1242f" if lost else "#0969da"
+        colour = COLOURS["bound" if lost else error_statistics.CORRECTED][0]
         about = {"leg": what, "from_s": round(start, 1), "to_s": round(end, 1)}
         tracks.append(_track(flight, f"estimate, {what}", leg, colour, every_s, about))
     for name, table, colour in (
-        ("GNSS", usable_gnss(flight), "#bc4c00"),
-        ("truth", flight.tables["Truth"], "#57606a"),
+        ("GNSS", usable_gnss(flight), COLOURS[error_statistics.GNSS][0]),
+        ("truth", flight.tables["Truth"], COLOURS["reference"][0]),
     ):
         about = {"altitude": "above the ellipsoid"} if name == "truth" else {}
         tracks.append(_track(flight, name, table, colour, every_s, about))
     places = [
-        Place(f"beacon {identity}", lat, lon, "#1a7f37", {"alt_m": round(alt, 1)})
+        Place(f"beacon {identity}", lat, lon, COLOURS[error_statistics.RSBN][0], {"alt_m": round(alt, 1)})
         for identity, lat, lon, alt in beacon_places(flight)
     ]
     return [track for track in tracks if len(track.lat)], places

@@ -103,13 +103,28 @@ def _solution(r: Solution) -> tuple[float, ...]:
     flat = (number for one in ahead for number in one)
     c = r.covariance
     mode = float(MODES.index(r.mode))
-    return (mode, r.lat, r.lon, r.alt_msl, c[0], c[1], c[3], *r.error_n, float(r.sources), *bound, *flat)
+    level = _or_nan(r.protection)
+    return (
+        mode,
+        r.lat,
+        r.lon,
+        r.alt_msl,
+        c[0],
+        c[1],
+        c[3],
+        *r.error_n,
+        float(r.sources),
+        *bound,
+        level,
+        *flat,
+    )
 
 
 _AHEAD = " ".join(f"ahead_{i} ahead_bound_{i} ahead_claimed_{i}" for i in range(AHEAD))
 COLUMNS: dict[type[Stamped], tuple[str, Callable[[Any], tuple[float, ...]]]] = {
     Solution: (
-        "mode lat lon alt nn ne ee error_north error_east sources bound_north bound_east " + _AHEAD,
+        "mode lat lon alt nn ne ee error_north error_east sources bound_north bound_east protection "
+        + _AHEAD,
         _solution,
     ),
     Fix: (

@@ -18,6 +18,7 @@ from companion.units import Floats
 PHASE_MIN_S = 5.0  # a shorter phase is merged into the previous one, the first into the next
 GROUP_GAP_S = 3.0  # rejections of one source closer than this form one group
 OUTAGE_MIN_S = 5.0  # a longer time without GNSS is an outage
+WITHOUT_FIXES = ("prediction", "untrusted")  # phases in which no fix was used
 BEACON = Source.AZIMUTH | Source.RANGE
 
 
@@ -109,6 +110,20 @@ def _phase_name(mode: Mode, sources: int) -> str:
     return " + ".join(names) or "fixes"
 
 
+def phase_title(name: str) -> str:
+    """Return the name of a phase for the user."""
+    return {"prediction": "no fixes", "untrusted": "no fixes, not to be trusted"}.get(name, name).replace(
+        "RSBN", "beacons"
+    )
+
+
+def source_title(source: str) -> str:
+    """Return the name of a source of measurements for the user: GNSS 0, beacon 7 azimuth, airspeed."""
+    kind, _, rest = source.partition(" ")
+    name = {"gnss": "GNSS", "rsbn": "beacon"}.get(kind.lower(), _NAMES.get(kind, kind))
+    return f"{name} {rest}".strip()
+
+
 def find_gnss_outages(flight: Flight) -> list[OutageInterval]:
     """Find gaps between arrivals of usable GNSS fixes, and a final gap, after the first fix."""
     t = np.sort(usable_gnss(flight)["rx"])
@@ -159,6 +174,33 @@ def _max_distance(flight: Flight, row: list[RejectedMeasurement]) -> float:
     return float(np.max(np.hypot(north * R_N, east * R_E * math.cos(lat[0]))))
 
 
+_NAMES = {
+    "LocalPosition": "local position",
+    "Gnss": "GNSS",
+    "RsbnFix": "beacon replies",
+    "Solution": "estimate",
+    "AirData": "airspeed",
+    "Imu": "IMU",
+    "Attitude": "attitude",
+    "Pressure": "pressure",
+    "Wind": "wind of the autopilot",
+    "GlobalPosition": "position of the autopilot",
+    "LocalOrigin": "local origin",
+    "HomePosition": "home",
+    "FilterStatus": "autopilot's estimator flags",
+    "SystemTime": "system time",
+    "Rejection": "rejections",
+    "Fix": "radio-only fixes",
+    "LinkState": "link state",
+}
+
+
+def topic_name(topic: str) -> str:
+    """Return the name of a topic for the user."""
+    kind = topic.rsplit("/", 1)[-1]
+    return _NAMES.get(kind, kind) if topic.startswith(("/in/", "/out/", "/link/")) else topic.lstrip("/")
+
+
 def message_rate(topic: str, stream: Stream, latency: Floats) -> MessageRate:
     """Compute the statistics of one topic; `latency` (s) is that of its new messages."""
     rx = stream.rx
@@ -197,7 +239,7 @@ def build_timeline(
 
 def describe_rejections(group: RejectionGroup) -> str:
     """Describe a group of rejections in one line."""
-    name = group.source.upper() if group.source.lower().startswith(("gnss", "rsbn")) else group.source
+    name = source_title(group.source)
     if group.number == 1:
         text = f"{name} rejected once: {group.reason}"
     else:

@@ -1,4 +1,4 @@
-"""Map of a flight: fixes, estimate, reference and guaranteed bound, in metres north and east.
+"""Map of flights: estimate by legs, fixes, reference, beacons by name, bound; metres east and north.
 
 It has no map tiles and needs no network.
 """
@@ -12,73 +12,86 @@ import numpy as np
 
 from companion.analysis import error_statistics, flight_events
 from companion.analysis.assessment import Assessment
-from companion.analysis.plot_data import COLOURS, Figure, Line, subsample
+from companion.analysis.flight_arrays import Table
+from companion.analysis.plot_data import COLOURS, LOGS, Figure, Line, PlacedName, subsample
 from companion.units import Floats
 
 ELLIPSES = 9
 BOUND = "guaranteed bound"
+LOST = "estimate without fixes"
 
 
 def build_map(flights: Sequence[Assessment], prefixes: Sequence[str]) -> Figure:
-    """Build the map of one flight or two. The initial view covers the tracks, not the whole bound."""
+    """Build the map of one flight or several. The initial view covers the tracks, not the whole bound."""
     plane = flights[0]
     lines: list[Line] = []
-    frame: list[Line] = []
+    places: dict[str, PlacedName] = {}
     for which, (a, prefix) in enumerate(zip(flights, prefixes, strict=True)):
-        framed = list(_track_lines(plane, a, prefix, which))
-        frame += framed
-        lines += framed
-        lines += _far_lines(plane, a, prefix, which)
-    bounded = any(line.name.endswith(BOUND) and len(line.x) for line in lines)
+        alone = len(flights) == 1
+        if alone:
+            lines += _context(plane, a)
+        lines += _estimate(plane, a, prefix, None if alone else LOGS[which % len(LOGS)])
+        for identity, lat, lon, _ in flight_events.beacon_places(a.flight):
+            north, east = plane.north_east(np.array(lat), np.array(lon))
+            places[f"beacon {identity}"] = PlacedName(f"beacon {identity}", float(east), float(north))
+    lines = [line for line in lines if np.isfinite(line.x).any()]
+    framed = [line for line in lines if line.name not in (BOUND, "beacon positions")]
     return Figure(
-        "track",
-        "North and east of the first position",
-        "east, m",
-        "north, m",
-        [line for line in lines if len(line.x)],
-        "Ellipses: the guaranteed r.m.s. bound in phases without fixes." if bounded else "",
-        equal=True,
-        view=_view([line for line in frame if np.isfinite(line.x).any()]),
+        "map",
+        "Map",
+        "m",
+        lines,
+        "Dashed ellipses: the guaranteed r.m.s. bound where there were no fixes."
+        if any(line.name == BOUND for line in lines)
+        else "",
+        origin=(math.degrees(plane.origin[0]), math.degrees(plane.origin[1])),
+        frame=_frame(framed),
+        places=tuple(places.values()),
     )
 
 
-def _track_lines(plane: Assessment, a: Assessment, prefix: str, which: int) -> Iterator[Line]:
-    """Yield the lines that the initial view covers: GNSS, reference, estimate."""
-    gnss, solution = flight_events.usable_gnss(a.flight), a.flight.tables["Solution"]
-    yield _line(
-        plane, f"{prefix}GNSS fixes", error_statistics.GNSS, which, gnss["lat"], gnss["lon"], dots=True
-    )
+def _context(plane: Assessment, a: Assessment) -> Iterator[Line]:
+    """Yield what is drawn below the estimate of a single flight."""
+    fix, radio = a.flight.tables["Fix"], flight_events.rests_on_beacons(a.flight)
+    at_beacons = {name: fix[name][radio] for name in ("t", "lat", "lon")}
+    yield _line(plane, "beacon positions", error_statistics.RSBN, at_beacons, dots=True)
+    yield _ellipses(plane, a)
+    yield _line(plane, "GNSS", error_statistics.GNSS, flight_events.usable_gnss(a.flight), dots=True)
     if a.reference is not None:
-        yield _line(plane, prefix + a.reference.what, "reference", which, a.reference.lat, a.reference.lon)
-    yield _line(
-        plane, f"{prefix}estimate", error_statistics.CORRECTED, which, solution["lat"], solution["lon"]
-    )
+        table = {"t": a.reference.t, "lat": a.reference.lat, "lon": a.reference.lon}
+        yield _line(plane, a.reference.what, "reference", table)
 
 
-def _far_lines(plane: Assessment, a: Assessment, prefix: str, which: int) -> Iterator[Line]:
-    """Yield the lines that may be far away: beacon fixes, bound, beacons."""
-    fix, radio, rsbn = (
-        a.flight.tables["Fix"],
-        flight_events.rests_on_beacons(a.flight),
-        a.flight.tables["RsbnFix"],
-    )
-    lat, lon = fix["lat"][radio], fix["lon"][radio]
-    yield _line(plane, f"{prefix}RSBN fixes", error_statistics.RSBN, which, lat, lon, dots=True)
-    yield _ellipses(plane, a, prefix, which)
-    first = np.unique(rsbn["beacon"], return_index=True)[1]
-    yield _line(
-        plane, f"{prefix}beacons", "rejected", which, rsbn["lat"][first], rsbn["lon"][first], dots=True
-    )
+def _estimate(
+    plane: Assessment, a: Assessment, prefix: str, colour: tuple[str, str] | None
+) -> Iterator[Line]:
+    """Yield the estimate: legs with fixes, and on top of them those without."""
+    solution = a.flight.tables["Solution"]
+    t = solution["t"]
+    lost = np.zeros(len(t), dtype=np.bool_)
+    for phase in a.phases:
+        if phase.name in flight_events.WITHOUT_FIXES:
+            lost |= (t >= phase.start_ns * 1e-9) & (t < phase.end_ns * 1e-9)
+    for name, hidden, role, width in (
+        ("estimate", lost, error_statistics.CORRECTED, 2.0),
+        (LOST, ~lost, "bound", 3.0),
+    ):
+        if len(t) and not hidden.all():
+            leg = {"t": t, "lat": np.where(hidden, np.nan, solution["lat"]), "lon": solution["lon"]}
+            line = _line(plane, prefix + name, role, leg, width=width)
+            yield line if colour is None else line._replace(colour=colour, dash=name == LOST)
 
 
 def _line(
-    plane: Assessment, name: str, role: str, which: int, lat: Floats, lon: Floats, dots: bool = False
+    plane: Assessment, name: str, role: str, table: Table, dots: bool = False, width: float = 1.6
 ) -> Line:
-    north, east = plane.north_east(subsample(lat), subsample(lon))
-    return Line(name, east, north, COLOURS[role][which], "dots" if dots else "line")
+    north, east = plane.north_east(subsample(table["lat"]), subsample(table["lon"]))
+    east = np.where(np.isfinite(north), east, np.nan)
+    style = "dots" if dots else "line"
+    return Line(name, east, north, COLOURS[role], style, width=width, t=subsample(table["t"]))  # type: ignore[arg-type]
 
 
-def _ellipses(plane: Assessment, a: Assessment, prefix: str, which: int) -> Line:
+def _ellipses(plane: Assessment, a: Assessment) -> Line:
     """Draw the guaranteed bound at instants evenly spaced over the phases without fixes."""
     solution = a.flight.tables["Solution"]
     without_fixes = np.flatnonzero(np.isfinite(solution["bound_north"]) & (solution["sources"] <= 1))
@@ -89,16 +102,17 @@ def _ellipses(plane: Assessment, a: Assessment, prefix: str, which: int) -> Line
     north, east = plane.north_east(solution["lat"][chosen], solution["lon"][chosen])
     x = (east[:, None] + solution["bound_east"][chosen, None] * np.sin(angle)).ravel()
     y = (north[:, None] + solution["bound_north"][chosen, None] * np.cos(angle)).ravel()
-    return Line(prefix + BOUND, x, y, COLOURS["bound"][which], width=1.0)
+    return Line(BOUND, x, y, COLOURS["bound"], dash=True, width=1.0)
 
 
-def _view(frame: Sequence[Line]) -> tuple[float, float, float, float] | None:
-    if not frame:
+def _frame(lines: Sequence[Line]) -> tuple[float, float, float, float] | None:
+    if not lines:
         return None
-    view = []
+    frame = []
     for axis in ("x", "y"):
-        low = min(float(np.nanmin(getattr(line, axis))) for line in frame)
-        high = max(float(np.nanmax(getattr(line, axis))) for line in frame)
+        columns: list[Floats] = [getattr(line, axis) for line in lines]
+        low = min(float(np.nanmin(column)) for column in columns)
+        high = max(float(np.nanmax(column)) for column in columns)
         half = max(0.55 * (high - low), 5.0)
-        view += [(low + high) / 2.0 - half, (low + high) / 2.0 + half]
-    return view[0], view[1], view[2], view[3]
+        frame += [(low + high) / 2.0 - half, (low + high) / 2.0 + half]
+    return frame[0], frame[1], frame[2], frame[3]

@@ -1,4 +1,8 @@
-"""Plot data: named lines and dots, thinned without losing extremes; `drawing` renders them."""
+"""Plot data: named lines, dots and places, thinned without losing extremes.
+
+`drawing` renders them for the pages (report and live view) and for PDF and PNG. Times are seconds since the
+start of the flight; lengths are metres.
+"""
 
 from __future__ import annotations
 
@@ -10,59 +14,90 @@ import numpy as np
 from companion.analysis import error_statistics
 from companion.units import Floats
 
-MAX_POINTS = 3000  # per line: about twice the pixels of a screen
+MAX_POINTS = 1600  # per line: more than the pixels of a screen that a plot covers
 Style = Literal["line", "dots"]
 
-#: Colours by role, for the first and the second log; distinguishable for colour-blind readers.
-COLOURS = {
-    "reference": ("#374151", "#9ca3af"),
-    error_statistics.CORRECTED: ("#2563eb", "#db2777"),
-    error_statistics.INS: ("#9333ea", "#c084fc"),
-    error_statistics.GNSS: ("#f59e0b", "#a16207"),
-    error_statistics.RSBN: ("#10b981", "#065f46"),
-    "bound": ("#dc2626", "#7c2d12"),
-    "rejected": ("#111827", "#6b7280"),
-    "second": ("#0891b2", "#155e75"),
+#: Colours by role, on light and on dark paper; distinguishable for colour-blind readers.
+COLOURS: dict[str, tuple[str, str]] = {
+    "reference": ("#57606a", "#9aa4af"),
+    error_statistics.CORRECTED: ("#0969da", "#58a6ff"),
+    error_statistics.INS: ("#8250df", "#bc8cff"),
+    error_statistics.GNSS: ("#bc4c00", "#f0883e"),
+    error_statistics.RSBN: ("#1a7f37", "#3fb950"),
+    "bound": ("#d1242f", "#ff7b72"),
+    "rejected": ("#24292f", "#d0d7de"),
+    "second": ("#1b7c83", "#39c5cf"),
 }
+#: Colours of the logs where several are compared.
+LOGS: tuple[tuple[str, str], ...] = (
+    ("#0969da", "#58a6ff"),
+    ("#bc4c00", "#f0883e"),
+    ("#1a7f37", "#3fb950"),
+    ("#bf3989", "#f778ba"),
+    ("#8250df", "#bc8cff"),
+    ("#1b7c83", "#39c5cf"),
+    ("#953800", "#ffa657"),
+    ("#57606a", "#9aa4af"),
+)
 
 
 class Line(NamedTuple):
-    """Points (x, y), joined or not; NaN is a gap."""
+    """Points (x, y), joined or not; NaN is a gap. `t` (s) are their times where x is no time."""
 
     name: str
     x: Floats
     y: Floats
-    colour: str
+    colour: tuple[str, str]
     style: Style = "line"
     dash: bool = False
     width: float = 1.6
+    t: Floats | None = None
+
+
+class Mark(NamedTuple):
+    """An event on a time axis: time (s), text, and whether it is a warning."""
+
+    t: float
+    text: str
+    warning: bool
+
+
+class PlacedName(NamedTuple):
+    """A named point of a map, metres east and north."""
+
+    name: str
+    x: float
+    y: float
 
 
 class Figure(NamedTuple):
     """A plot; `key` is its name in the page and its file name, `note` explains how to read it.
 
-    `spans`: shaded intervals of x with a name. `equal`: same scale on both axes. `zero`: y starts at 0.
-    `view`: initial view, x from, to, y from, to. `level`: horizontal reference line. `rows`: names of
-    y = 1, 2, ...
+    `unit`: of y, shown at the axis and in every reading. `spans`: shaded intervals of time with a name.
+    `marks`: events. `zero`: y starts at 0. `view`: initial view of y, from and to. `level`: horizontal
+    reference line. `rows`: names of y = 1, 2, ...
+    A map has x east and y north in the same scale: `origin` is latitude and longitude of (0, 0) in degrees,
+    `frame` its initial view, x from, to, y from, to, and `places` are named points.
     """
 
     key: str
     title: str
-    x: str
-    y: str
+    unit: str
     lines: list[Line]
     note: str = ""
     log: bool = False
-    equal: bool = False
     zero: bool = False
     spans: tuple[tuple[float, float, str], ...] = ()
-    view: tuple[float, float, float, float] | None = None
+    marks: tuple[Mark, ...] = ()
+    view: tuple[float, float] | None = None
     level: float | None = None
     rows: tuple[str, ...] = ()
+    origin: tuple[float, float] | None = None
+    frame: tuple[float, float, float, float] | None = None
+    places: tuple[PlacedName, ...] = ()
 
 
-TIME = "time, min"
-LETTERS = "AB"  # names of two compared flights
+LETTERS = "ABCDEFGHIJKLMNOPQRSTUVWXYZ"  # names of compared flights
 
 
 def thin_line(x: Floats, y: Floats, most: int = MAX_POINTS) -> tuple[Floats, Floats]:

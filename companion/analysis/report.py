@@ -1,4 +1,4 @@
-"""`companion report LOG [LOG2] -o report.html`: report on one flight, or comparison of two, in one HTML file.
+"""`companion report LOG... -o report.html`: report on one flight, or comparison of several, in one HTML file.
 
 The file needs no network and no server. The navigator is first run, in memory, over the log of another
 recorder. Errors are relative to the truth of the log, or else to the track smoothed with all fixes.
@@ -21,13 +21,14 @@ from companion.analysis.output_guard import reject_any_log, reject_own_input
 from companion.analysis.plot_data import LETTERS, Figure
 from companion.analysis.replay_inputs import apply_changes, has_navigator_outputs
 from companion.analysis.summary import summarize_flight
+from companion.analysis.verdict import judge_flight
 from companion.config import load
 from companion.optional_dependencies import missing_package
 from companion.storage.reader import LogError
 
 
 @click.command("report")
-@click.argument("logs", type=click.Path(path_type=Path), nargs=-1, required=True, metavar="LOG [LOG2]")
+@click.argument("logs", type=click.Path(path_type=Path), nargs=-1, required=True, metavar="LOG...")
 @click.option(
     "-o", "--output", type=click.Path(path_type=Path), default=Path("report.html"), show_default=True
 )
@@ -48,13 +49,13 @@ def command(
     config_file: Path | None,
     changes: tuple[str, ...],
 ) -> None:
-    """Write a report on LOG, or a comparison of two logs: our MCAP, or any log that `replay` supports.
+    """Write a report on LOG, or a comparison of several: our MCAP, or any log that `replay` supports.
 
-    A reboot of the autopilot starts a new flight in a log: each flight has its own chapters; of two logs the
-    longest flights are compared.
+    A reboot of the autopilot starts a new flight in a log: each flight has its own chapters; of several logs
+    the longest flights are compared.
     """
-    if len(logs) > 2:
-        raise click.UsageError(f"{len(logs)} logs given; give one log, or two to compare")
+    if len(logs) > len(LETTERS):
+        raise click.UsageError(f"{len(logs)} logs given; at most {len(LETTERS)} can be compared")
     for target in (output, pdf):
         if target is not None:
             reject_own_input(target, *logs, config_file)
@@ -65,9 +66,9 @@ def command(
     if changes:
         config = apply_changes(config, ",".join(changes))
     found = [open_flights(path, config) for path in logs]
-    blocks = comparison_block(found, _names(logs)) if len(logs) == 2 else blocks_of_log(found[0])
+    blocks = comparison_block(found, _names(logs)) if len(logs) > 1 else blocks_of_log(found[0])
     try:
-        output.write_text(render_report(" and ".join(_names(logs)), blocks), encoding="utf-8")
+        output.write_text(render_report(_title(_names(logs)), blocks), encoding="utf-8")
         written = [output, *(write_figures(_all_figures(blocks), pdf, png) if pdf or png else [])]
     except ModuleNotFoundError as error:
         raise LogError(missing_package("a report", error.name, "report")) from None
@@ -75,7 +76,9 @@ def command(
         raise LogError(f"cannot write the report to {error.filename}: {error.strerror}") from None
     for block in blocks:
         for flight in block.flights:
-            click.echo(summarize_flight(flight))
+            verdict = judge_flight(flight)
+            click.echo(f"{verdict.word}: {verdict.reason} {verdict.number} {verdict.what}.")
+            click.echo(" ".join(summarize_flight(flight)))
     click.echo(f"written: {', '.join(str(path) for path in written)}")
 
 
@@ -99,14 +102,17 @@ def blocks_of_log(flights: Sequence[Flight]) -> list[ReportBlock]:
 
 
 def comparison_block(logs: Sequence[Sequence[Flight]], names: Sequence[str]) -> list[ReportBlock]:
-    """Build one block with the longest flight of each of two logs."""
+    """Build one block with the longest flight of each log."""
     chosen = [max(flights, key=lambda flight: flight.seconds) for flights in logs]
     names_of_flights = [
-        f"{letter}: {_flight_title(flight, name)}"
-        for letter, flight, name in zip(LETTERS, chosen, names, strict=True)
+        f"{letter}: {_flight_title(flight, name)}" for letter, flight, name in zip(LETTERS, chosen, names)
     ]
-    both = [assess_flight(flight) for flight in chosen]
-    return [ReportBlock(names_of_flights, both, build_figures(both))]
+    assessed = [assess_flight(flight) for flight in chosen]
+    return [ReportBlock(names_of_flights, assessed, build_figures(assessed))]
+
+
+def _title(names: Sequence[str]) -> str:
+    return " and ".join(names) if len(names) <= 2 else f"{names[0]} and {len(names) - 1} other logs"
 
 
 def _flight_title(flight: Flight, name: str) -> str:

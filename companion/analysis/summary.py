@@ -1,22 +1,23 @@
-"""Summary of a flight in one paragraph: duration, outages, errors, bound, rejections, anomalies."""
+"""Summary of a flight in sentences: duration, outages, errors, bound, rejections, anomalies."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
 from companion.analysis import error_statistics
-from companion.analysis.assessment import GNSS, SMOOTHED, Assessment
-from companion.analysis.plot_data import LETTERS
+from companion.analysis.assessment import GNSS, SMOOTHED, TRUTH, Assessment
+from companion.analysis.flight_events import WITHOUT_FIXES, phase_title, source_title
 from companion.units import Floats
 
-WITHOUT_FIXES = ("prediction", "untrusted")
 FAR_M = 30.0  # a greater median distance between GNSS and the smoothed track is a contradiction
-SHORT_S = 30.0  # shorter phases and differences are not mentioned
+SHORT_S = 30.0  # shorter phases are not mentioned
 CHEBYSHEV = 0.75  # least share of moments within twice a valid r.m.s. bound
 LATE_S = 0.1  # smaller GNSS delays are usual
+CONSISTENT = 0.85  # least share of normalized errors within their 95 % limit
 FLAT_M = 1.0  # smaller differences of two errors are ignored
 
 
@@ -45,45 +46,48 @@ def format_length(value: float) -> str:
     return f"{value:.0f} m" if value >= 100.0 else f"{value:.1f} m" if value >= 1.0 else f"{value:.2f} m"
 
 
-def summarize_flight(a: Assessment) -> str:
-    """Return the paragraph."""
-    sentences = [
+class Worst(NamedTuple):
+    """The greatest horizontal distances of a flight, m: of the estimate from the reference, of GNSS from the
+    estimate or the reference. NaN if unknown."""
+
+    estimate: float
+    gnss: float
+
+
+def worst_of(a: Assessment) -> Worst:
+    """Return the greatest distances; nothing in the sentences is greater."""
+    corrected, gnss = a.errors.get(error_statistics.CORRECTED), a.errors.get(error_statistics.GNSS)
+    far = [group.metres for group in a.groups if group.source.lower().startswith("gnss")]
+    far += [float(gnss.error.max())] if gnss is not None else []
+    return Worst(
+        math.nan if corrected is None else float(corrected.error.max()),
+        max((d for d in far if math.isfinite(d)), default=math.nan),
+    )
+
+
+def describe_worst(a: Assessment) -> str:
+    """Name the greatest distance of the estimate: an error only against a truth."""
+    if a.reference is None or a.reference.what == TRUTH:
+        return "greatest error"
+    return f"greatest distance from {a.reference.what}"
+
+
+def summarize_flight(a: Assessment) -> list[str]:
+    """Return the sentences."""
+    return [
         *_flight_sentences(a),
         *_error_sentences(a),
         *_bound_sentences(a),
         *_rejection_sentences(a),
         *_anomalies(a),
+        *a.flight.remarks,
     ]
-    return " ".join([*sentences, *a.flight.remarks])
 
 
-def compare_flights(a: Assessment, b: Assessment) -> str:
-    """Describe which of two flights, A or B, had the smaller errors, with fixes and without."""
-    if a.reference is None or b.reference is None:
-        return "The errors cannot be compared: there is no reference."
-    parts = [_split_errors(a), _split_errors(b)]
-    sentences = []
-    for what, k in (("With fixes", 0), ("Without fixes", 1)):
-        pair = parts[0][k], parts[1][k]
-        if not all(len(error) for error in pair):
-            if any(len(error) for error in pair):
-                letter = LETTERS[0] if len(pair[0]) else LETTERS[1]
-                sentences.append(f"Only {letter} has a phase {what.lower()}.")
-            continue
-        rms = _rms(pair[0]), _rms(pair[1])
-        if abs(rms[0] - rms[1]) < 0.02 * max(rms):
-            sentences.append(f"{what} the errors are equal: {format_length(rms[0])} r.m.s.")
-        else:
-            (less, better), (more, worse) = sorted(zip(rms, LETTERS, strict=True))
-            values = f"{format_length(less)} r.m.s., and {format_length(more)} for {worse}"
-            sentences.append(f"{what} {better} had the smaller error: {values}.")
-    seconds = [_seconds_without_fixes(flight) for flight in (a, b)]
-    if any(seconds) and abs(seconds[0] - seconds[1]) > SHORT_S:
-        spans = [format_duration(span) if span else "never" for span in seconds]
-        sentences.append(f"A was without for {spans[0]}, B for {spans[1]}.".replace("for never", "never"))
-    if a.reference.what != b.reference.what:
-        sentences.append("The errors are relative to different references; compare them with care.")
-    return " ".join(sentences) or "The errors cannot be compared: one flight has none."
+def rms_by_fixes(a: Assessment) -> tuple[float, float]:
+    """Return the r.m.s. distance from the reference with fixes and without, m; NaN if there is none."""
+    with_fixes, without = (_rms(error) if len(error) else math.nan for error in _split_errors(a))
+    return with_fixes, without
 
 
 def _split_errors(a: Assessment) -> tuple[Floats, Floats]:
@@ -108,10 +112,7 @@ def _flight_sentences(a: Assessment) -> list[str]:
         else f"Flight {k} of {n} lasts {format_duration(seconds)}"
     )
     if not len(a.flight.tables["Solution"]["t"]):
-        return [
-            f"{duration}, without an estimate: there was no inertial channel (a local position with its "
-            "origin, or airspeed with attitude), or no fix was accepted."
-        ]
+        return [f"{duration}, without an estimate."]
     sentences = [f"{duration}."]
     started = float(a.flight.tables["Solution"]["t"][0])
     outages = [outage for outage in a.outages if outage.end > started]
@@ -145,23 +146,41 @@ def _error_sentences(a: Assessment) -> list[str]:
     parts = [f"{format_length(_rms(error))} {how}" for error, how in found if len(error)]
     ins = a.errors.get(error_statistics.INS)
     beside = f"; the inertial channel alone {format_length(_rms(ins.error))}" if ins is not None else ""
+    true = a.reference.what == TRUTH
+    subject = "The error of the estimate" if true else f"The distance of the estimate from {a.reference.what}"
     sentences = [
-        f"Against {a.reference.what} the error of the estimate was {' and '.join(parts)} (r.m.s.), "
-        f"{format_length(float(corrected.error.max()))} at most{beside}."
+        f"{subject} was {' and '.join(parts)} (r.m.s.), {format_length(worst_of(a).estimate)} at most"
+        f"{beside}."
     ]
     if a.reference.what == SMOOTHED:
         sentences.append(
             "The smoothed track uses the same fixes and error model; errors common to both are not visible."
         )
-        gnss = a.errors.get(error_statistics.GNSS)
-        if gnss is not None and (apart := float(np.median(gnss.error))) > FAR_M:
+        if (apart := gnss_contradiction(a)) is not None:
             sentences.append(
-                f"GNSS AND THE SMOOTHED TRACK DIFFER by {format_length(apart)} (median), "
-                "because GNSS was rejected: one of them is wrong, and the stated errors cannot be trusted."
+                f"GNSS and the smoothed track differ by {format_length(apart)} (median), because GNSS was "
+                "rejected: one of them is wrong, and the stated distances cannot be trusted."
             )
     elif a.reference.what == GNSS:
         sentences.append("GNSS is not a truth: its own error is included in these numbers.")
     return sentences
+
+
+def gnss_contradiction(a: Assessment) -> float | None:
+    """Return the median distance of GNSS from the smoothed track (m) if one of them must be wrong."""
+    gnss = a.errors.get(error_statistics.GNSS)
+    if gnss is None or a.reference is None or a.reference.what != SMOOTHED:
+        return None
+    apart = float(np.median(gnss.error))
+    return apart if apart > FAR_M else None
+
+
+def is_worse_than_inertial(row: error_statistics.PhaseErrors) -> bool:
+    """Return whether in a phase worth mentioning the estimate was worse than the inertial channel alone."""
+    ins, corrected = row.rms.get(error_statistics.INS), row.rms.get(error_statistics.CORRECTED)
+    if row.seconds < SHORT_S or ins is None or corrected is None:
+        return False
+    return corrected > 1.2 * ins + FLAT_M
 
 
 def _bound_sentences(a: Assessment) -> list[str]:
@@ -184,9 +203,9 @@ def _bound_sentences(a: Assessment) -> list[str]:
     worst = max(broken, key=lambda row: row.share or 0.0)
     judged = sum(row.held is not None for row in a.rows)
     return [
-        f"The guaranteed bound{reached} DID NOT HOLD in {len(broken)} of {judged} phases: in the phase "
-        f"“{worst.phase}” the error was {worst.share:.2f} times the bound, r.m.s. The error was within the "
-        f"bound {_percent(inside)} of the time."
+        f"The guaranteed bound{reached} did not hold in {len(broken)} of {judged} phases: in the phase "
+        f"“{phase_title(worst.phase)}” the error was {worst.share:.2f} times the bound, r.m.s. The error was "
+        f"within the bound {_percent(inside)} of the time."
     ]
 
 
@@ -207,7 +226,7 @@ def _rejection_sentences(a: Assessment) -> list[str]:
         return [f"{rejected}, {when}: {largest.reason}{far}."]
     return [
         f"{rejected} in {len(fixes)} events; the largest, {when}, has {largest.number} from "
-        f"{largest.source}{far}: {largest.reason}."
+        f"{source_title(largest.source)}{far}: {largest.reason}."
     ]
 
 
@@ -217,18 +236,18 @@ def _anomalies(a: Assessment) -> list[str]:
         ins, corrected = row.rms.get(error_statistics.INS), row.rms.get(error_statistics.CORRECTED)
         if row.seconds < SHORT_S or ins is None or corrected is None:
             continue
-        if corrected > 1.2 * ins + FLAT_M:
+        if is_worse_than_inertial(row):
             found.append(
-                f"in the phase “{row.phase}” the corrected estimate ({format_length(corrected)}) was worse "
-                f"than the inertial channel alone ({format_length(ins)})"
+                f"in the phase “{phase_title(row.phase)}” the estimate ({format_length(corrected)}) was "
+                f"worse than the inertial channel alone ({format_length(ins)})"
             )
         if row.inside_twice is not None and row.inside_twice < CHEBYSHEV:
             found.append(
-                f"in the phase “{row.phase}” the error was within twice the bound of its moment only "
-                f"{_percent(row.inside_twice)} of the time, where at least 75 % are expected"
+                f"in the phase “{phase_title(row.phase)}” the error was within twice the bound of its moment "
+                f"only {_percent(row.inside_twice)} of the time, where at least 75 % are expected"
             )
     for series in a.normalized_errors:
-        if series.inside < 0.85:
+        if series.inside < CONSISTENT:
             share = _percent(series.inside)
             found.append(f"only {share} of {series.what} is within its 95 % limit: the sigmas are too small")
     resets = [line for line in a.timeline if line.kind == "reset"]

@@ -9,7 +9,7 @@ from sitl import after_flight_study
 
 
 def test_short_flight_is_within_the_budget():
-    pytest.importorskip("plotly")
+    pytest.importorskip("jinja2")
     found = CliRunner().invoke(after_flight_study.command, ["--scenario", "short"])
     assert found.exit_code == 0, found.output
     for what in (

@@ -1,0 +1,234 @@
+"""Verdict on a flight: good, caution or fault, the reason in one sentence, and the number that decides.
+
+Against a truth a promise that was not kept is a fault; against a smoothed track or GNSS, which may be wrong
+themselves, it is a reason for caution. The first rule that applies decides.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from companion.analysis import error_statistics, flight_events
+from companion.analysis.assessment import GNSS, TRUTH, Assessment
+from companion.analysis.flight_arrays import Flight
+from companion.analysis.summary import (
+    CONSISTENT,
+    describe_worst,
+    format_duration,
+    format_length,
+    format_time,
+    gnss_contradiction,
+    is_worse_than_inertial,
+    worst_of,
+)
+
+REJECTED_S = 10.0  # fixes rejected for longer are worth a look
+
+Level = Literal["good", "caution", "fault"]
+WORDS: dict[Level, str] = {"good": "Good", "caution": "Caution", "fault": "Fault"}
+
+
+class Verdict(NamedTuple):
+    """Level, reason (one sentence), the number that decides and what it is."""
+
+    level: Level
+    reason: str
+    number: str
+    what: str
+
+    @property
+    def word(self) -> str:
+        """The level as the user reads it."""
+        return WORDS[self.level]
+
+
+def judge_flight(a: Assessment) -> Verdict:
+    """Return the verdict: that of the first rule that applies."""
+    found = (rule(a) for rule in _RULES)
+    return next((verdict for verdict in found if verdict is not None), _kept(a))
+
+
+def _promise(a: Assessment) -> Level:
+    """The level of a promise that was not kept."""
+    return "fault" if a.reference is not None and a.reference.what == TRUTH else "caution"
+
+
+def _no_estimate(a: Assessment) -> Verdict | None:
+    if len(a.flight.tables["Solution"]["t"]):
+        return None
+    return Verdict("fault", f"There is no estimate. {missing_input(a.flight)}", "none", "positions estimated")
+
+
+def _bound_broken(a: Assessment) -> Verdict | None:
+    broken = [row for row in a.rows if row.held is False]
+    if not broken:
+        return None
+    worst = max(broken, key=lambda row: row.share or 0.0)
+    return Verdict(
+        _promise(a),
+        f"The guaranteed bound did not hold in the phase “{flight_events.phase_title(worst.phase)}”.",
+        f"{worst.share:.2f} ×",
+        "the bound (r.m.s. error; limit 1)",
+    )
+
+
+def _protection_broken(a: Assessment) -> Verdict | None:
+    """The error exceeded the protection level; stated against a truth only."""
+    corrected = a.errors.get(error_statistics.CORRECTED)
+    if corrected is None or _promise(a) != "fault":
+        return None
+    solution, t = a.flight.tables["Solution"], corrected.t_ns * 1e-9
+    level = solution["protection"][
+        np.clip(np.searchsorted(solution["t"], t - 1e-6), 0, len(solution["t"]) - 1)
+    ]
+    beyond = np.flatnonzero(corrected.error > level)  # False where there is no level
+    if not len(beyond):
+        return None
+    k = beyond[np.argmax(corrected.error[beyond] / level[beyond])]
+    return Verdict(
+        "fault",
+        f"The error exceeded the protection level at {format_time(t[k])}: "
+        f"{format_length(corrected.error[k])} against {format_length(level[k])}.",
+        f"{corrected.error[k] / level[k]:.2f} ×",
+        "the protection level (limit 1)",
+    )
+
+
+def _worse_than_inertial(a: Assessment) -> Verdict | None:
+    worse = [row for row in a.rows if is_worse_than_inertial(row)]
+    if not worse or a.reference is None or a.reference.what == GNSS:
+        return None
+    row = max(worse, key=lambda row: row.rms[error_statistics.CORRECTED])
+    ins, ours = row.rms[error_statistics.INS], row.rms[error_statistics.CORRECTED]
+    return Verdict(
+        _promise(a),
+        f"In the phase “{flight_events.phase_title(row.phase)}” the estimate was worse than the inertial "
+        f"channel alone, which had {format_length(ins)}.",
+        format_length(ours),
+        "r.m.s. error of the estimate",
+    )
+
+
+def _contradiction(a: Assessment) -> Verdict | None:
+    apart = gnss_contradiction(a)
+    if apart is None:
+        return None
+    return Verdict(
+        "caution",
+        "GNSS and the smoothed track contradict each other: one of them is wrong.",
+        format_length(apart),
+        "between them (median)",
+    )
+
+
+def _untrusted(a: Assessment) -> Verdict | None:
+    seconds = sum((p.end_ns - p.start_ns) * 1e-9 for p in a.phases if p.name == "untrusted")
+    if not seconds:
+        return None
+    return Verdict(
+        "caution",
+        "For a part of the flight the position was marked as not to be trusted: fly by other means then.",
+        format_duration(seconds),
+        "not to be trusted",
+    )
+
+
+def _inconsistent(a: Assessment) -> Verdict | None:
+    small = [series for series in a.normalized_errors if series.inside < CONSISTENT]
+    if not small:
+        return None
+    worst = min(small, key=lambda series: series.inside)
+    return Verdict(
+        "caution",
+        f"The stated sigmas are too small for the errors found ({worst.what}).",
+        f"{100.0 * worst.inside:.0f} %",
+        "within the 95 % limit",
+    )
+
+
+def _rejections(a: Assessment) -> Verdict | None:
+    fixes = [g for g in a.groups if g.source.lower().startswith(("gnss", "rsbn"))]
+    longest = max(fixes, key=lambda g: g.end - g.start, default=None)
+    if longest is None or longest.end - longest.start < REJECTED_S or _promise(a) == "fault":
+        return None
+    return Verdict(
+        "caution",
+        f"Fixes of {flight_events.source_title(longest.source)} were rejected from "
+        f"{format_time(longest.start)}; without a truth it cannot be confirmed that this was right.",
+        format_duration(longest.end - longest.start),
+        "of fixes rejected",
+    )
+
+
+def _torn_or_reset(a: Assessment) -> Verdict | None:
+    resets = [line for line in a.timeline if line.kind == "reset"]
+    if resets:
+        return Verdict(
+            "caution",
+            f"The estimate was reset, first at {format_time(resets[0].t)}: {resets[0].text}.",
+            str(len(resets)),
+            "resets" if len(resets) > 1 else "reset",
+        )
+    return None
+
+
+def _no_reference(a: Assessment) -> Verdict | None:
+    if a.reference is not None and error_statistics.CORRECTED in a.errors:
+        return None
+    return Verdict("caution", "There is nothing to compare the estimate with.", "unknown", "error")
+
+
+def _kept(a: Assessment) -> Verdict:
+    worst = worst_of(a).estimate
+    judged = [row for row in a.rows if row.held is not None]
+    held = f"the guaranteed bound held in all {len(judged)} phases" if judged else "no bound was stated"
+    longest = max((outage.end - outage.start for outage in a.outages), default=0.0)
+    gnss = (
+        f"GNSS was lost for up to {format_duration(longest)}" if longest else "GNSS was available throughout"
+    )
+    return Verdict("good", f"{gnss}, and {held}.", format_length(worst), describe_worst(a))
+
+
+_RULES: tuple[Callable[[Assessment], Verdict | None], ...] = (
+    _no_estimate,
+    _bound_broken,
+    _protection_broken,
+    _worse_than_inertial,
+    _contradiction,
+    _untrusted,
+    _no_reference,
+    _inconsistent,
+    _rejections,
+    _torn_or_reset,
+)
+
+
+def missing_input(flight: Flight) -> str:
+    """Say what is missing for an estimate, and which message would give it."""
+    has = {
+        name: f"/in/{name}" in flight.streams
+        for name in ("Gnss", "RsbnFix", "LocalPosition", "LocalOrigin", "Attitude", "AirData", "Imu")
+    }
+    received = [flight_events.topic_name(f"/in/{name}") for name, known in has.items() if known]
+    logged = f"Logged are {', '.join(received)}. " if received else "No input was logged. "
+    if not has["RsbnFix"] and not len(flight_events.usable_gnss(flight)["t"]):
+        state = "GNSS never had a 3D fix" if has["Gnss"] else "no position was received"
+        return (
+            f"{logged}A fix is missing, for {state}: it needs GPS_RAW_INT with a fix, or a beacon's replies."
+        )
+    if (has["Attitude"] and (has["AirData"] or has["Imu"])) or (has["LocalPosition"] and has["LocalOrigin"]):
+        return f"{logged}A channel is there, but no fix was accepted: see the rejections below."
+    beside = "" if has["Attitude"] else "ATTITUDE with "
+    wanted = f"{beside}airspeed (VFR_HUD) or an IMU (RAW_IMU, HIGHRES_IMU)"
+    origin = (
+        "the message GPS_GLOBAL_ORIGIN"
+        if has["LocalPosition"]
+        else "LOCAL_POSITION_NED with GPS_GLOBAL_ORIGIN"
+    )
+    return (
+        f"{logged}What carries the position between fixes is missing: it needs {wanted}, or, with an INS of "
+        f"its own, {origin}."
+    )

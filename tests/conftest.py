@@ -1,0 +1,109 @@
+"""What tests share: a real browser, headless Chromium driven through its DevTools protocol."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import subprocess
+import time
+import urllib.request
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+
+
+class Browser:
+    """One page; `console` holds its messages, warnings and exceptions, `requests` every URL that it loads."""
+
+    def __init__(self, profile: Path) -> None:
+        from websockets.sync.client import connect
+
+        assert CHROMIUM is not None
+        self._process = subprocess.Popen(
+            [
+                *(CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", "--no-first-run"),
+                *("--disable-background-networking", "--disable-component-update", "--disable-sync"),
+                *("--remote-debugging-port=0", f"--user-data-dir={profile}", "about:blank"),
+            ],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        assert self._process.stderr is not None
+        found = next(m for line in self._process.stderr if (m := re.search(r"ws://([^/]+)/", line)))
+        with urllib.request.urlopen(f"http://{found[1]}/json") as answer:
+            page = next(tab for tab in json.load(answer) if tab["type"] == "page")
+        self._open = connect(page["webSocketDebuggerUrl"], max_size=None)
+        self._socket = self._open.__enter__()
+        self._count = 0
+        self.console: list[str] = []
+        self.requests: list[str] = []
+        for domain in ("Page", "Runtime", "Log", "Network"):
+            self.call(f"{domain}.enable")
+
+    def __enter__(self) -> Browser:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._open.__exit__(None, None, None)
+        self._process.kill()
+        self._process.wait()
+        assert self._process.stderr is not None
+        self._process.stderr.close()
+
+    def call(self, method: str, **parameters: object) -> dict[str, Any]:
+        """Call a method of the protocol; events that come meanwhile are collected."""
+        self._count += 1
+        self._socket.send(json.dumps({"id": self._count, "method": method, "params": parameters}))
+        while True:
+            answer = json.loads(self._socket.recv(timeout=60))
+            if answer.get("id") == self._count:
+                assert "error" not in answer, answer
+                return answer["result"]  # type: ignore[no-any-return]
+            if answer.get("method") in (
+                "Runtime.exceptionThrown",
+                "Log.entryAdded",
+                "Runtime.consoleAPICalled",
+            ):
+                self.console.append(json.dumps(answer["params"]))
+            elif answer.get("method") == "Network.requestWillBeSent":
+                self.requests.append(answer["params"]["request"]["url"])
+
+    def open(self, url: str, width: int = 1280, dark: bool = False) -> None:
+        """Open a page in a window `width` wide."""
+        mobile = width < 600
+        self.call(
+            "Emulation.setDeviceMetricsOverride", width=width, height=900, deviceScaleFactor=1, mobile=mobile
+        )
+        scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
+        self.call("Emulation.setEmulatedMedia", features=[scheme])
+        self.call("Page.navigate", url=url)
+
+    def evaluate(self, script: str) -> Any:
+        """Return the value of an expression in the page."""
+        found = self.call("Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True)
+        assert "exceptionDetails" not in found, found
+        return found["result"].get("value")
+
+    def wait_for(self, script: str, timeout_s: float = 20.0) -> Any:
+        """Return the first true value of an expression."""
+        end = time.monotonic() + timeout_s
+        while not (value := self.evaluate(script)):
+            assert time.monotonic() < end, f"{script} is still {value!r}; console: {self.console}"
+            time.sleep(0.05)
+        return value
+
+
+@pytest.fixture
+def browser(tmp_path: Path) -> Iterator[Browser]:
+    """A browser; skipped where there is none."""
+    pytest.importorskip("websockets")
+    if CHROMIUM is None:
+        pytest.skip("no chromium to open the page in")
+    with Browser(tmp_path / "browser") as found:
+        yield found
