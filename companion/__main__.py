@@ -25,6 +25,7 @@ COMMANDS = {
     "run": "companion.runtime.service:command",
     "replay": "companion.analysis.replay:command",
     "report": "companion.analysis.report:command",
+    "live": "companion.analysis.live.server:command",
     "log": "companion.analysis.log_command:group",
     "doctor": "companion.doctor.command:command",
     "check-config": "companion.config.check_config:command",

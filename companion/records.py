@@ -276,6 +276,7 @@ class Solution(Stamped, frozen=True, gc=False, tag=True):
     worse horizontal axis (m/s), gusts included. `horizon_s` is the time since the last accepted fix.
     `disagreement` is the greatest distance between the running estimators (m). `protection` is the horizontal
     protection level (m): the error exceeds it with the configured risk, even if any one source is faulty.
+    `false_sources`: once a second, the probability that each source is false, by name.
     """
 
     mode: Mode
@@ -299,6 +300,7 @@ class Solution(Stamped, frozen=True, gc=False, tag=True):
     trust: Trust | None = None
     gnss_false: float | None = None
     witness: bool = False
+    false_sources: tuple[tuple[str, float], ...] = ()
 
 
 class Fix(Stamped, frozen=True, gc=False, tag=True):

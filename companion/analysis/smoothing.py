@@ -37,8 +37,8 @@ from companion.navigator import INPUTS_USED, Navigator, guarded, tuned
 from companion.navigator.channel import Nominal, Transition
 from companion.navigator.hypotheses import MOST_BEACONS, Hypotheses, Model
 from companion.navigator.inertial_track import Point
-from companion.navigator.state import Beacon, Settings, State, hypotheses, initial, levelled
-from companion.navigator.step import source_name, step
+from companion.navigator.state import Beacon, Settings, State, hypotheses, initial, levelled, source_name
+from companion.navigator.step import step
 from companion.records import AirData, Gnss, Input, LocalPosition, Output, Reset, RsbnFix, Stamped, Tuning
 from companion.units import SECOND_NS, Floats
 

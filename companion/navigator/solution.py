@@ -29,6 +29,7 @@ from companion.navigator.state import (
     estimate,
     hypotheses,
     levelled,
+    source_name,
     sources,
 )
 from companion.records import Event, Fix, Gnss, Mode, Severity, Solution, Source, Vector2, Vector3
@@ -71,7 +72,9 @@ def solve(state: State, rx_ns: int, settings: Settings) -> Step:
         leads = "kalman"
     error, velocity_error, (var_n, cov, var_e), velocity_variance = candidates[leads]
     position = np.array(error) - nominal.pending_s * np.array(candidates["kalman"].velocity_error_n)
+    false_sources: tuple[tuple[str, float], ...] = ()
     if state.protection is None or t_ns - state.protection[0] >= PROTECTION_NS:
+        false_sources = tuple((source_name(i, state), p) for i, p in enumerate(state.false))
         radius = banks.protection_level(bank, known.layout, config.integrity.risk, position)
         state = state._replace(protection=(t_ns, radius, *error))
     assert state.protection is not None
@@ -115,6 +118,7 @@ def solve(state: State, rx_ns: int, settings: Settings) -> Step:
         trust=held.trust,
         gnss_false=_gnss_false(state),
         witness=witness,
+        false_sources=false_sources,
     )
     return state._replace(guarantee=promise, held=held), [solution]
 

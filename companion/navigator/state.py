@@ -143,6 +143,14 @@ def estimate(state: State) -> Estimate:
     return banks.estimate(state.bank)
 
 
+def source_name(i: int, state: State) -> str:
+    """Name of source number `i`, with the beacon's identity."""
+    if i < 2:
+        return ("gnss", "airspeed")[i]
+    beacon = state.beacons[(i - 2) // 2].identity
+    return f"rsbn {beacon} {'azimuth' if i % 2 == 0 else 'range'}"
+
+
 def sources(state: State, t_ns: int, settings: Settings) -> Source:
     """What the position rests on now: fixes younger than their timeouts, over the channel."""
     config, found = settings.config, Source.INERTIAL

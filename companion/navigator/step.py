@@ -50,6 +50,7 @@ from companion.navigator.state import (
     estimate,
     hypotheses,
     initial,
+    source_name,
 )
 from companion.records import (
     AirData,
@@ -575,14 +576,6 @@ def _decided(state: State, record: Stamped, settings: Settings) -> Step:
         bank=bank, leading=leading, false=false, reported=tuple(reported), certain_ns=tuple(since)
     )
     return state, out
-
-
-def source_name(i: int, state: State) -> str:
-    """Name of source number `i`, with the beacon's identity."""
-    if i < 2:
-        return ("gnss", "airspeed")[i]
-    beacon = state.beacons[(i - 2) // 2].identity
-    return f"rsbn {beacon} {'azimuth' if i % 2 == 0 else 'range'}"
 
 
 def _rejected(

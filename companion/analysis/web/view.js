@@ -273,7 +273,7 @@ class Chart {
 /** Map in metres east and north. Drag to move, wheel with Ctrl (or after a click) to zoom, two fingers on a screen. */
 class Plan {
   constructor(box, figure, group, height) {
-    Object.assign(this, { box, group, figure, hidden: new Set(), time: null, free: false });
+    Object.assign(this, { box, group, figure, hidden: new Set(), time: null, free: false, near: false });
     box.classList.add("map");
     box.style.height = height || `${Math.round(Math.min(620, Math.max(320, box.clientWidth * 0.62)))}px`;
     this.canvas = element("canvas", { tabindex: "0", role: "img", "aria-label": "map of the flight" });
@@ -281,7 +281,8 @@ class Plan {
     const button = (text, title, act) => element("button", { type: "button", title, "aria-label": title, on: { click: act } }, text);
     box.append(this.canvas, this.hover, element("div", { class: "buttons" },
       button("+", "zoom in", () => this.scale(1.6)), button("−", "zoom out", () => this.scale(1 / 1.6)),
-      button("⤢", "show all tracks", () => { this.free = false; this.fit(); this.paint(); })));
+      button("⤢", "show all tracks", () => this.show(false)),
+      ...(figure.near === undefined ? [] : [button("◎", "follow the aircraft", () => this.show(true))])));
     this.legendOf();
     group.maps.push(this);
     this.listen();
@@ -308,11 +309,14 @@ class Plan {
     this.paint();
   }
 
+  /** Show all tracks, or what is near the aircraft, and keep doing so. */
+  show(near) { this.free = false; this.near = near; this.fit(); this.paint(); }
+
   get width() { return this.canvas.clientWidth || 300; }
   get height() { return this.canvas.clientHeight || 300; }
 
   fit() {
-    const [x0, x1, y0, y1] = this.figure.frame || [-100, 100, -100, 100];
+    const [x0, x1, y0, y1] = (this.near && this.figure.near) || this.figure.frame || [-100, 100, -100, 100];
     this.view = { x: (x0 + x1) / 2, y: (y0 + y1) / 2, k: Math.min(this.width / (x1 - x0), this.height / (y1 - y0)) };
   }
 

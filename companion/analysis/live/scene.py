@@ -1,0 +1,449 @@
+"""Scene of the live view: messages in, one page of bounded size out.
+
+Tracks are thinned as they grow and strip charts cover the last minutes, so that an hour takes no more memory,
+and no more bytes a second, than a few minutes. Every frame is complete: a page that connects late, or again,
+needs nothing of before.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import msgspec
+import numpy as np
+
+from companion.analysis import error_statistics
+from companion.analysis.drawing import to_page
+from companion.analysis.flight_events import source_title
+from companion.analysis.live.follow import Message
+from companion.analysis.plot_data import COLOURS, Figure, Line, Mark, PlacedName
+from companion.nav.geometry import Geodetic, displace, separation
+from companion.records import Event, Gnss, Mode, Rejection, Reset, RsbnFix, Solution, Source, Stamped, Trust
+from companion.units import Floats
+
+TRACK_POINTS = 2400
+STRIP_S, STRIP_STEP_S = 600.0, 0.5
+EVENTS = 200
+SILENT_S = 5.0  # a source is silent after this time
+STALE_S = 3.0  # no solution for so long: the view says so
+CHI2_95_2 = 5.991
+NAMED = {
+    Trust.NORMAL: ("good", "Trusted"),
+    Trust.DEGRADED: ("caution", "Degraded"),
+    Trust.PREDICTING: ("caution", "Predicting"),
+    Trust.UNTRUSTED: ("fault", "Do not trust"),
+}
+_SHOWN: tuple[type[Stamped], ...] = (Solution, Gnss, RsbnFix, Event, Reset, Rejection)
+_decoders = {kind.__name__: msgspec.json.Decoder(kind) for kind in _SHOWN}
+
+
+class Track:
+    """Points of a track, metres east and north of an origin; every second one is dropped when it is full."""
+
+    def __init__(self) -> None:
+        self._rows: list[tuple[float, float, float]] = []
+        self._step_s = 0.5
+
+    def add(self, t: float, east: float, north: float) -> None:
+        """Append a point, NaN for a gap, unless the last one is too recent."""
+        if self._rows and t - self._rows[-1][0] < self._step_s:
+            return
+        self._rows.append((t, east, north))
+        if len(self._rows) > TRACK_POINTS:
+            self._rows = self._rows[::2]
+            self._step_s *= 2.0
+
+    def line(self, name: str, colour: tuple[str, str], **more: Any) -> Line:
+        """Return the track as a line of the map."""
+        t, x, y = np.array(self._rows, dtype=np.float64).reshape(-1, 3).T
+        return Line(name, x, y, colour, t=t, **more)
+
+
+class Strip:
+    """Values of the last minutes, at most two a second."""
+
+    def __init__(self) -> None:
+        self._rows: deque[tuple[float, float]] = deque(maxlen=round(STRIP_S / STRIP_STEP_S))
+
+    def add(self, t: float, value: float | None) -> None:
+        """Append a value, None for a gap."""
+        if not self._rows or t - self._rows[-1][0] >= STRIP_STEP_S:
+            self._rows.append((t, math.nan if value is None else value))
+
+    def line(self, name: str, colour: tuple[str, str], **more: Any) -> Line:
+        """Return the strip as a line over time."""
+        t, y = np.array(self._rows, dtype=np.float64).reshape(-1, 2).T
+        return Line(name, t, y, colour, **more)
+
+
+class Beacon(NamedTuple):
+    """The last reply of a beacon and when it came (s)."""
+
+    reply: RsbnFix
+    t: float
+
+
+class Scene:
+    """Everything that the page shows of one log."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.t = 0.0
+        self.log_ns = 0
+        self._first_ns: int | None = None
+        self._origin: Geodetic | None = None
+        self._solution: tuple[Solution, float] | None = None
+        self._gnss: tuple[Gnss, float] | None = None
+        self._beacons: dict[int, Beacon] = {}
+        self._rejected: dict[str, tuple[str, float]] = {}
+        self._false: dict[str, float] = {}
+        self._fixed, self._lost, self._received, self._ins = Track(), Track(), Track(), Track()
+        self._strips: dict[str, Strip] = {}
+        self._events: deque[tuple[float, int, str]] = deque(maxlen=EVENTS)
+
+    def add(self, message: Message) -> None:
+        """Take one message into the scene."""
+        if self._first_ns is None:
+            self._first_ns = message.log_ns
+        self.log_ns = max(self.log_ns, message.log_ns)
+        self.t = (self.log_ns - self._first_ns) * 1e-9
+        decoder = _decoders.get(message.channel.schema)
+        if decoder is None or not message.channel.topic.startswith(("/in/", "/out/", "/link/")):
+            return
+        try:
+            record = decoder.decode(message.content)
+        except msgspec.MsgspecError:
+            return  # of another version: not shown
+        match record:
+            case Solution():
+                self._add_solution(record)
+            case Gnss():
+                self._add_gnss(record)
+            case RsbnFix():
+                self._beacons[record.beacon] = Beacon(record, self.t)
+                self._place(record.lat, record.lon)
+            case Event():
+                self._events.append((self.t, record.severity, record.text))
+            case Reset():
+                self._events.append((self.t, 4, f"{record.what} reset: {record.reason}"))
+            case Rejection():
+                self._rejected[record.source] = (record.reason, self.t)
+
+    def _place(self, lat: float, lon: float) -> tuple[float, float]:
+        """Return metres east and north of the first position."""
+        if self._origin is None:
+            self._origin = Geodetic(lat, lon, 0.0)
+        north, east, _ = separation(Geodetic(lat, lon, 0.0), self._origin)
+        return float(east), float(north)
+
+    def _add_solution(self, s: Solution) -> None:
+        east, north = self._place(s.lat, s.lon)
+        lost = s.mode in (Mode.PREDICTING, Mode.UNTRUSTED)
+        gap = math.nan
+        self._fixed.add(self.t, gap if lost else east, north)
+        self._lost.add(self.t, east if lost else gap, north)
+        self._ins.add(self.t, east + s.error_n[1], north + s.error_n[0])
+        self._solution = s, self.t
+        if s.false_sources:
+            self._false = dict(s.false_sources)
+            for name, p in s.false_sources:
+                self._strip(f"false {name}").add(self.t, 100.0 * p)
+        self._strip("protection").add(self.t, s.protection)
+        self._strip("bound").add(self.t, None if s.bound_n is None else math.hypot(*s.bound_n))
+        self._strip("sigma").add(self.t, math.sqrt(CHI2_95_2 * _largest_variance(s)))
+        self._strip("error north").add(self.t, s.error_n[0])
+        self._strip("error east").add(self.t, s.error_n[1])
+
+    def _add_gnss(self, record: Gnss) -> None:
+        if self._gnss is not None and record.repeats(self._gnss[0]):
+            return
+        if not record.has_3d_fix:
+            self._strip("gnss").add(self.t, None)
+            return
+        self._gnss = record, self.t
+        east, north = self._place(record.lat, record.lon)
+        self._received.add(self.t, east, north)
+        if self._solution is not None:
+            s = self._solution[0]
+            d_north, d_east, _ = separation(
+                Geodetic(record.lat, record.lon, 0.0), Geodetic(s.lat, s.lon, 0.0)
+            )
+            self._strip("gnss").add(self.t, math.hypot(d_north, d_east))
+
+    def _strip(self, name: str) -> Strip:
+        return self._strips.setdefault(name, Strip())
+
+    # -- the page ------------------------------------------------------------------------------------------
+
+    def frame(self, behind_s: float | None, ended: bool) -> dict[str, Any]:
+        """Return the whole page. `behind_s`: real time since the newest message (None: playback)."""
+        return {
+            "log": self.name,
+            "t": round(self.t, 2),
+            "behind": None if behind_s is None else round(behind_s, 2),
+            "ended": ended,
+            "trust": self._trust(behind_s, ended),
+            "numbers": self._numbers(),
+            "sources": [row._asdict() for row in self._sources()],
+            "events": [[round(t, 1), severity, text] for t, severity, text in reversed(self._events)],
+            "map": self._map(),
+            "charts": [to_page(figure) | {"title": figure.title} for figure in self._charts()],
+        }
+
+    def _trust(self, behind_s: float | None, ended: bool) -> dict[str, str]:
+        if self._solution is None:
+            return {"level": "caution", "word": "No position yet", "why": self._waiting()}
+        s, t = self._solution
+        age = self.t - t + (behind_s or 0.0)
+        if age > STALE_S and not ended:
+            return {"level": "fault", "word": "No data", "why": f"The last position is {age:.0f} s old."}
+        level, word = NAMED[s.trust] if s.trust is not None else ("caution", str(s.mode).capitalize())
+        parts = []
+        if s.mode is not Mode.FIXED:
+            parts.append(f"No fix for {s.horizon_s:.0f} s.")
+        else:
+            used = [
+                name
+                for bits, name in ((Source.GNSS, "GNSS"), (Source.AZIMUTH | Source.RANGE, "beacons"))
+                if s.sources & bits
+            ]
+            parts.append(f"Position by {' and '.join(used) or 'fixes'}.")
+        false = [source_title(name) for name, p in self._false.items() if p > 0.5]
+        if false:
+            parts.append(f"Probably false: {', '.join(false)}.")
+        if s.protection is not None:
+            parts.append(f"The error is below {_metres(s.protection)}, whatever single source is false.")
+        return {"level": level, "word": word, "why": " ".join(parts)}
+
+    def _waiting(self) -> str:
+        """Say what was received so far."""
+        has = [
+            name for name, known in (("GNSS fixes", self._gnss), ("beacon replies", self._beacons)) if known
+        ]
+        return f"Received: {', '.join(has)}." if has else "No fix was received yet."
+
+    def _numbers(self) -> list[tuple[str, str]]:
+        if self._solution is None:
+            return []
+        s = self._solution[0]
+        bound = None if s.bound_n is None else math.hypot(*s.bound_n)
+        return [
+            ("protection level", _metres(s.protection)),
+            ("guaranteed bound", _metres(bound)),
+            ("95 % radius", _metres(math.sqrt(CHI2_95_2 * _largest_variance(s)))),
+            ("without fix", f"{s.horizon_s:.0f} s"),
+            ("speed", f"{math.hypot(s.v_n[0], s.v_n[1]):.1f} m/s"),
+            ("altitude (MSL)", f"{s.alt_msl:.0f} m"),
+            ("latitude", f"{math.degrees(s.lat):.5f}°"),
+            ("longitude", f"{math.degrees(s.lon):.5f}°"),
+        ]
+
+    def _sources(self) -> Iterator[SourceRow]:
+        s = self._solution[0] if self._solution else None
+        used = Source(s.sources) if s else Source(0)
+        if self._gnss is not None or "gnss" in self._false:
+            t = self._gnss[1] if self._gnss else None
+            yield self._row("GNSS", "gnss", t, bool(used & Source.GNSS))
+        for number, beacon in sorted(self._beacons.items()):
+            for kind, value, bit in (
+                ("azimuth", beacon.reply.azimuth, Source.AZIMUTH),
+                ("range", beacon.reply.slant_range, Source.RANGE),
+            ):
+                if value is not None:
+                    key = f"rsbn {number} {kind}"
+                    yield self._row(f"beacon {number} {kind}", key, beacon.t, bool(used & bit))
+        if "airspeed" in self._false:
+            yield self._row("airspeed", "airspeed", self.t, bool(used & Source.AIR_DATA))
+
+    def _row(self, name: str, key: str, t: float | None, used: bool) -> SourceRow:
+        p = self._false.get(key)
+        age = None if t is None else self.t - t
+        state, level = ("used", "good") if used else ("not used", "")
+        if age is None or age > SILENT_S:
+            state, level = "silent", "caution"
+        elif p is not None and p > 0.999:
+            state, level = "excluded", "fault"
+        elif p is not None and p > 0.5:
+            state, level = "suspect", "caution"
+        return SourceRow(
+            name,
+            state,
+            level,
+            None if p is None else round(100.0 * p, 1),
+            None if age is None else round(age, 1),
+        )
+
+    def _map(self) -> dict[str, Any]:
+        lines = [
+            self._ins.line("inertial channel alone", COLOURS[error_statistics.INS], width=1.0, dash=True),
+            self._received.line("GNSS", COLOURS[error_statistics.GNSS], style="dots"),
+            self._fixed.line("estimate", COLOURS[error_statistics.CORRECTED], width=2.0),
+            self._lost.line("estimate without fixes", COLOURS["bound"], width=3.0),
+            self._lines_of_position(),
+            *self._regions(),
+        ]
+        places = [
+            PlacedName(f"beacon {number}", *self._place(b.reply.lat, b.reply.lon))
+            for number, b in sorted(self._beacons.items())
+        ]
+        frame, near, aircraft = None, None, None
+        if self._solution is not None:
+            s = self._solution[0]
+            aircraft = (*self._place(s.lat, s.lon), math.atan2(s.v_n[1], s.v_n[0]))
+            frame = _frame([line for line in lines[1:4] if len(line.x)], *aircraft[:2])
+            r = max(200.0, 1.5 * (s.protection or 0.0))
+            near = (aircraft[0] - r, aircraft[0] + r, aircraft[1] - r, aircraft[1] + r)
+        origin = self._origin or Geodetic(0.0, 0.0, 0.0)
+        figure = Figure(
+            "map", "Map", "m", lines,
+            origin=(math.degrees(origin.lat), math.degrees(origin.lon)), frame=frame, places=tuple(places),
+        )  # fmt: skip
+        return to_page(figure) | {"aircraft": aircraft, "near": near}
+
+    def _lines_of_position(self) -> Line:
+        """Return azimuth and range of the beacons that answered lately."""
+        xs: list[float] = []
+        ys: list[float] = []
+        for beacon in self._beacons.values():
+            reply = beacon.reply
+            if self.t - beacon.t > SILENT_S:
+                continue
+            x, y = self._place(reply.lat, reply.lon)
+            reach = reply.slant_range
+            if reach is None and self._solution is not None:
+                reach = math.dist((x, y), self._place(self._solution[0].lat, self._solution[0].lon))
+            if reply.azimuth is not None and reach:
+                place = displace(
+                    reply.lat,
+                    reply.lon,
+                    0.0,
+                    reach * math.cos(reply.azimuth),
+                    reach * math.sin(reply.azimuth),
+                    0.0,
+                )
+                end = self._place(place.lat, place.lon)
+                xs += [x, end[0], math.nan]
+                ys += [y, end[1], math.nan]
+            if reply.slant_range is not None:
+                centre = reply.azimuth
+                if centre is None and self._solution is not None:
+                    here = self._place(self._solution[0].lat, self._solution[0].lon)
+                    centre = math.atan2(here[0] - x, here[1] - y)
+                arc = (centre or 0.0) + np.linspace(-0.15, 0.15, 25)
+                xs += [*(x + reply.slant_range * np.sin(arc)).tolist(), math.nan]
+                ys += [*(y + reply.slant_range * np.cos(arc)).tolist(), math.nan]
+        return Line(
+            "lines of position", np.array(xs), np.array(ys), COLOURS[error_statistics.RSBN], width=1.2
+        )
+
+    def _regions(self) -> Iterator[Line]:
+        """Yield the 95 % ellipse of the covariance, and the guaranteed and the protection circle."""
+        if self._solution is None:
+            return
+        s = self._solution[0]
+        x, y = self._place(s.lat, s.lon)
+        angle = np.linspace(0.0, math.tau, 73)
+        nn, ne, _, ee, _, _ = s.covariance
+        values, vectors = np.linalg.eigh(np.array([[ee, ne], [ne, nn]]))
+        circle = np.stack([np.cos(angle), np.sin(angle)])
+        ellipse: Floats = vectors @ (np.sqrt(CHI2_95_2 * np.maximum(values, 0.0))[:, None] * circle)
+        yield Line(
+            "95 % ellipse", x + ellipse[0], y + ellipse[1], COLOURS[error_statistics.CORRECTED], width=1.4
+        )
+        if s.bound_n is not None:
+            r = math.hypot(*s.bound_n)
+            yield Line("guaranteed circle", x + r * circle[0], y + r * circle[1], COLOURS["bound"], dash=True)
+        if s.protection is not None:
+            r = s.protection
+            yield Line(
+                "protection level",
+                x + r * circle[0],
+                y + r * circle[1],
+                COLOURS["second"],
+                dash=True,
+                width=1.1,
+            )
+
+    def _charts(self) -> Iterator[Figure]:
+        marks = tuple(
+            Mark(t, text, severity <= 4) for t, severity, text in self._events if t >= self.t - STRIP_S
+        )
+        yield Figure(
+            "size", "How far the position may be off", "m",
+            [
+                self._strip("protection").line("protection level", COLOURS["second"], dash=True),
+                self._strip("bound").line("guaranteed bound", COLOURS["bound"], dash=True),
+                self._strip("sigma").line("95 % radius", COLOURS[error_statistics.CORRECTED]),
+            ],
+            log=True, marks=marks,
+        )  # fmt: skip
+        yield Figure(
+            "gnss", "Distance of GNSS from the estimate", "m",
+            [self._strip("gnss").line("GNSS", COLOURS[error_statistics.GNSS])],
+            zero=True, marks=marks,
+        )  # fmt: skip
+        yield Figure(
+            "false",
+            "Probability that a source is false",
+            "%",
+            list(self._false_lines()),
+            zero=True,
+            marks=marks,
+        )
+        yield Figure(
+            "inertial", "Estimated error of the inertial channel", "m",
+            [
+                self._strip("error north").line("north", COLOURS[error_statistics.INS]),
+                self._strip("error east").line("east", COLOURS[error_statistics.INS], dash=True),
+            ],
+            marks=marks,
+        )  # fmt: skip
+
+    def _false_lines(self) -> Iterator[Line]:
+        roles = {"gnss": error_statistics.GNSS, "airspeed": "second"}
+        for key, strip in self._strips.items():
+            kind, _, name = key.partition(" ")
+            if kind == "false":
+                colour = COLOURS[roles.get(name, error_statistics.RSBN)]
+                yield strip.line(source_title(name), colour, dash=name.endswith("range"))
+
+
+class SourceRow(NamedTuple):
+    """A row of the source table: name, state and its level, probability that it is false (%), age (s)."""
+
+    name: str
+    state: str
+    level: str
+    false: float | None
+    age: float | None
+
+
+def _largest_variance(s: Solution) -> float:
+    nn, ne, _, ee, _, _ = s.covariance
+    return max(0.0, 0.5 * (nn + ee) + math.hypot(0.5 * (nn - ee), ne))
+
+
+def _metres(value: float | None) -> str:
+    if value is None or not math.isfinite(value):
+        return "–"
+    return (
+        f"{value / 1000.0:.1f} km"
+        if value >= 10_000.0
+        else f"{value:.0f} m"
+        if value >= 10.0
+        else f"{value:.1f} m"
+    )
+
+
+def _frame(lines: list[Line], x: float, y: float) -> tuple[float, float, float, float]:
+    """Return a view that covers the tracks and at least 200 m around the aircraft."""
+    xs = np.concatenate([[x - 200.0, x + 200.0], *(line.x for line in lines)])
+    ys = np.concatenate(
+        [[y - 200.0, y + 200.0], *(np.where(np.isfinite(line.x), line.y, np.nan) for line in lines)]
+    )
+    low_x, high_x, low_y, high_y = (float(f(a)) for a in (xs, ys) for f in (np.nanmin, np.nanmax))
+    dx, dy = 0.06 * (high_x - low_x), 0.06 * (high_y - low_y)
+    return low_x - dx, high_x + dx, low_y - dy, high_y + dy

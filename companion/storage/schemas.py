@@ -1,0 +1,195 @@
+"""Schemas of a log for other programs: records with units, MAVLink frames, events as foxglove.Log, dialect.
+
+A record keeps radians, as it is replayed bit for bit; its fields are `lat` and `lon`, and each description
+states the unit. Where a schema has `latitude` it is in degrees: `location_fix`. Altitudes are above mean sea
+level in a field with `msl` in its name, else above the WGS84 ellipsoid.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from importlib.resources import files
+from typing import Any
+
+import msgspec
+from mcap.records import Attachment
+
+from companion.records import Event, Severity, Stamped
+
+#: Unit and meaning of fields by name, or by "Record.field" where one name has two meanings.
+FIELDS = {
+    "t_ns": "ns, time of validity on the companion's monotonic clock",
+    "rx_ns": "ns, time of arrival on the companion's monotonic clock",
+    "ahead": "bounds of the inertial error some time ahead",
+    "ahead_s": "s, time ahead of the solution",
+    "airspeed": "m/s",
+    "alt": "m above the WGS84 ellipsoid",
+    "alt_msl": "m above mean sea level",
+    "attitude": "rad: roll, pitch, heading",
+    "azimuth": "rad clockwise from true north, measured at the beacon",
+    "bad": "count of frames with a wrong checksum or signature",
+    "beacon": "identity of the beacon",
+    "boot_ns": "ns since the autopilot's boot",
+    "bound_n": "m: north, east; guaranteed r.m.s. bound",
+    "claimed_n": "m: north, east; sigma that least squares claims",
+    "climb": "m/s, up",
+    "connected": "whether the link is open",
+    "correction_n": "m: north, east; inertial position minus fix",
+    "cost": "chi-square of the residuals (no unit)",
+    "covariance": "m^2: north-north, north-east, north-down, east-east, east-down, down-down",
+    "Fix.covariance": "m^2: north-north, north-east, east-east",
+    "degrees_of_freedom": "of the cost",
+    "differential": "Pa",
+    "disagreement": "m, greatest distance between the running estimators",
+    "dropped": "count of frames that were not sent",
+    "error_n": "m: north, east; estimated error of the inertial channel",
+    "estimator": "name of the leading estimator",
+    "f_b": "m/s^2, specific force: forward, right, down",
+    "false_sources": "name and probability (0..1) that each source is false",
+    "fix": "GPS_FIX_TYPE of MAVLink (3: 3D)",
+    "flags": "ESTIMATOR_STATUS_FLAGS of MAVLink",
+    "gnss_false": "probability (0..1) that GNSS is false",
+    "gnss_glitch": "whether the autopilot's estimator reports a GNSS glitch",
+    "groundspeed": "m/s",
+    "hdop": "horizontal dilution of precision (no unit)",
+    "heading": "rad clockwise from true north",
+    "healthy": "whether the sensor is present, enabled and healthy",
+    "height_above_home": "m",
+    "horizon_s": "s since the last accepted fix",
+    "horizontal_accuracy": "m",
+    "inertial_age_s": "s, age of the inertial sample",
+    "iterations": "count",
+    "jamming": "GPS_JAMMING_STATE of MAVLink",
+    "lat": "rad, geodetic latitude WGS84",
+    "limit": "limit of the value, in its unit",
+    "link": "name of the link",
+    "lon": "rad, longitude WGS84",
+    "lost": "count of frames missing by their sequence numbers",
+    "mode": "basis of the position",
+    "normalised": "normalised innovation squared, 2 degrees of freedom (no unit)",
+    "offset_ns": "ns, the companion's clock minus the autopilot's",
+    "pitch": "rad",
+    "position_ratio": "innovation test ratio of the autopilot (no unit)",
+    "projection": "local projection of the autopilot",
+    "protection": "m, horizontal protection level",
+    "reason": "text",
+    "received": "count of frames",
+    "receiver": "number of the GNSS receiver",
+    "roll": "rad",
+    "round_trip_ns": "ns",
+    "satellites": "count",
+    "sensed": "whether a sensor measures the airspeed",
+    "severity": "MAV_SEVERITY of MAVLink",
+    "sigma": "m/s",
+    "sigma_azimuth": "rad",
+    "sigma_horizontal": "m, per axis",
+    "sigma_range": "m",
+    "sigma_velocity": "m/s, per axis",
+    "sigma_vertical": "m",
+    "slant_range": "m",
+    "source": "name of the source",
+    "Imu.source": "number of the IMU",
+    "sources": "bits: 1 inertial, 2 GNSS, 4 azimuth, 8 range, 16 air data",
+    "spoofing": "GPS_SPOOFING_STATE of MAVLink",
+    "stamp_us": "us, time of the receiver as sent",
+    "static": "Pa",
+    "system": "MAVLink system number",
+    "temperature": "K",
+    "text": "text",
+    "toml": "the whole configuration as TOML",
+    "true": "whether the airspeed is true, else indicated or equivalent",
+    "trust": "0 normal, 1 degraded, 2 predicting, 3 untrusted",
+    "unix_ns": "ns since 1970-01-01 UTC",
+    "v_n": "m/s: north, east, down",
+    "value": "value that was judged, in its unit",
+    "velocity_bound_n": "m/s: north, east; guaranteed r.m.s. bound",
+    "velocity_error_n": "m/s: north, east; estimated error of the inertial channel",
+    "w_b": "rad/s: forward, right, down",
+    "what": "what was reset",
+    "witness": "whether a beacon confirms the solution",
+    "worst_n": "m: north, east; sigma under the worst correlation",
+    "x_n": "m from the local origin: north, east, down",
+}  # fmt: skip
+
+LOG_NAME, LOG_TOPIC = "foxglove.Log", "/log"
+TIME = {
+    "type": "object",
+    "title": "time",
+    "properties": {
+        "sec": {"type": "integer", "minimum": 0},
+        "nsec": {"type": "integer", "minimum": 0, "maximum": 999_999_999},
+    },
+}
+_LEVELS = {"UNKNOWN": 0, "DEBUG": 1, "INFO": 2, "WARNING": 3, "ERROR": 4, "FATAL": 5}
+LOG: dict[str, Any] = {
+    "title": LOG_NAME,
+    "description": "A log message",
+    "type": "object",
+    "properties": {
+        "timestamp": TIME,
+        "level": {
+            "title": "foxglove.LogLevel",
+            "oneOf": [{"title": name, "const": number} for name, number in _LEVELS.items()],
+        },
+        "message": {"type": "string"},
+        "name": {"type": "string"},
+        "file": {"type": "string"},
+        "line": {"type": "integer", "minimum": 0},
+    },
+}
+
+MAVLINK = "mavlink"  # encoding and schema of raw frames; the schema is the XML of our dialect
+_DIALECT = "rsbn.xml"
+
+
+class Log(msgspec.Struct, frozen=True, gc=False):
+    """An event with the field names of foxglove.Log."""
+
+    timestamp: dict[str, int]
+    level: int
+    message: str
+    name: str = "companion"
+    file: str = ""
+    line: int = 0
+
+
+def to_log(event: Event, unix_ns: int) -> Log:
+    """Return the event as foxglove.Log; `unix_ns` is its wall-clock time."""
+    if event.severity <= Severity.CRITICAL:
+        level = "FATAL"
+    elif event.severity == Severity.ERROR:
+        level = "ERROR"
+    elif event.severity == Severity.WARNING:
+        level = "WARNING"
+    else:
+        level = "DEBUG" if event.severity == Severity.DEBUG else "INFO"
+    return Log(to_time(unix_ns), _LEVELS[level], event.text)
+
+
+def to_time(unix_ns: int) -> dict[str, int]:
+    """Return a time with the field names of `TIME`."""
+    return dict(zip(("sec", "nsec"), divmod(max(unix_ns, 0), 1_000_000_000), strict=True))
+
+
+def record_schema(kind: type[Stamped]) -> bytes:
+    """Return the JSON schema of a record, an object with the unit of each field in its description."""
+    definitions: dict[str, Any] = msgspec.json.schema(kind)["$defs"]
+    for name, definition in definitions.items():
+        for field, found in definition.get("properties", {}).items():
+            if field != "type":
+                found["description"] = FIELDS.get(f"{name}.{field}") or FIELDS[field]
+    root = definitions.pop(kind.__name__)
+    return msgspec.json.encode(root | ({"$defs": definitions} if definitions else {}))
+
+
+def dialect_attachment(unix_ns: int) -> Attachment:
+    """Return the dialect as an attachment of a log."""
+    return Attachment(
+        create_time=unix_ns, log_time=unix_ns, name=_DIALECT, media_type="application/xml", data=dialect_xml()
+    )
+
+
+@cache
+def dialect_xml() -> bytes:
+    """Return the definition of our messages."""
+    return files("companion.link").joinpath(_DIALECT).read_bytes()

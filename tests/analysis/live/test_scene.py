@@ -1,0 +1,137 @@
+"""The scene shows what the records state, and its size does not grow with the flight."""
+
+import math
+
+import msgspec
+import pytest
+
+from companion.analysis.live.follow import Channel, Message
+from companion.analysis.live.scene import Scene
+from companion.nav.geometry import displace
+from companion.records import Event, Gnss, Mode, RsbnFix, Solution, Trust, encode
+from companion.storage.flight_log import topic_of
+
+S = 1_000_000_000
+LAT, LON = 0.97, 0.65
+
+
+def message(record):
+    kind = type(record)
+    return Message(Channel(topic_of(kind), "json", kind.__name__, b"{}"), record.rx_ns, encode(record))
+
+
+def solution(t, east=0.0, north=0.0, **more):
+    place = displace(LAT, LON, 0.0, north, east, 0.0)
+    fields = {
+        "mode": Mode.FIXED,
+        "estimator": "kalman",
+        "alt_msl": 300.0,
+        "v_n": (0.0, 20.0, 0.0),
+        "covariance": (4.0, 0.0, 0.0, 9.0, 0.0, 25.0),
+        "error_n": (30.0, 40.0),
+        "velocity_error_n": (0.0, 0.0),
+        "sources": 3,
+        "horizon_s": 0.0,
+        "bound_n": (30.0, 40.0),
+        "protection": 80.0,
+        "trust": Trust.NORMAL,
+    }
+    return Solution(round(t * S), round(t * S), lat=place.lat, lon=place.lon, **(fields | more))
+
+
+def test_an_hour_is_no_bigger_than_a_few_minutes():
+    scene, sizes = Scene("x"), {}
+    for k in range(3600 * 5):
+        t = 0.2 * k
+        scene.add(message(solution(t, east=20.0 * t, false_sources=(("gnss", 0.01),) if k % 5 == 0 else ())))
+        if k % 10 == 0:
+            scene.add(message(Gnss(round(t * S), round(t * S), 0, k + 1, 3, LAT, LON, 300.0)))
+        if k % 50 == 0:
+            scene.add(message(Event(round(t * S), round(t * S), 6, f"event {k}")))
+        if t in (1200.0, 3595.0):
+            sizes[t] = len(msgspec.json.encode(scene.frame(0.1, False)))
+    assert sizes[3595.0] < 1.3 * sizes[1200.0]
+    assert sizes[3595.0] < 500_000
+    (line,) = (line for line in scene.frame(0.1, False)["map"]["lines"] if line["name"] == "estimate")
+    assert line["x"][0] == 0.0 and line["x"][-1] == pytest.approx(72_000.0, abs=200.0)  # the whole flight
+
+
+def test_numbers_and_circles_are_those_of_the_solution():
+    scene = Scene("x")
+    scene.add(message(solution(1.0)))
+    frame = scene.frame(0.3, False)
+    numbers = dict(frame["numbers"])
+    assert (numbers["protection level"], numbers["guaranteed bound"]) == ("80 m", "50 m")
+    assert numbers["95 % radius"] == "7.3 m"  # sqrt(5.991) sigma of the worse axis, 3 m
+    lines = {line["name"]: line for line in frame["map"]["lines"]}
+    for name, radius in (("guaranteed circle", 50.0), ("protection level", 80.0)):
+        assert all(
+            math.hypot(x, y) == pytest.approx(radius, abs=0.02)
+            for x, y in zip(lines[name]["x"], lines[name]["y"])
+        )
+    ellipse = lines["95 % ellipse"]
+    assert (max(ellipse["x"]), max(ellipse["y"])) == pytest.approx((7.34, 4.9), abs=0.03)
+    assert (lines["inertial channel alone"]["x"], lines["inertial channel alone"]["y"]) == ([40], [30])
+
+
+@pytest.mark.parametrize(
+    ("more", "behind", "level", "word"),
+    [
+        ({}, 0.2, "good", "Trusted"),
+        ({"trust": Trust.DEGRADED}, 0.2, "caution", "Degraded"),
+        ({"trust": Trust.PREDICTING, "mode": Mode.PREDICTING, "sources": 1}, 0.2, "caution", "Predicting"),
+        ({"trust": Trust.UNTRUSTED, "mode": Mode.UNTRUSTED, "sources": 1}, 0.2, "fault", "Do not trust"),
+        ({}, 4.0, "fault", "No data"),
+    ],
+)
+def test_trust_is_a_word(more, behind, level, word):
+    scene = Scene("x")
+    scene.add(message(solution(1.0, **more)))
+    found = scene.frame(behind, False)["trust"]
+    assert (found["level"], found["word"]) == (level, word)
+
+
+def test_nothing_is_trusted_before_a_position():
+    trust = Scene("x").frame(0.1, False)["trust"]
+    assert (trust["level"], trust["word"], trust["why"]) == (
+        "caution",
+        "No position yet",
+        "No fix was received yet.",
+    )
+
+
+def test_sources_have_the_probability_that_each_is_false():
+    scene = Scene("x")
+    false = (("gnss", 0.9999), ("airspeed", 0.02), ("rsbn 7 azimuth", 0.6), ("rsbn 7 range", 0.001))
+    scene.add(message(Gnss(S, S, 0, 1, 3, LAT, LON, 300.0)))
+    scene.add(message(RsbnFix(S, S, 7, LAT, LON, 0.0, math.pi / 2, 5000.0, 0.002, 100.0)))
+    scene.add(message(solution(1.5, sources=1 | 8 | 16, false_sources=false)))
+    rows = {row["name"]: (row["state"], row["false"]) for row in scene.frame(0.1, False)["sources"]}
+    assert rows == {
+        "GNSS": ("excluded", 100.0),
+        "beacon 7 azimuth": ("suspect", 60.0),
+        "beacon 7 range": ("used", 0.1),
+        "airspeed": ("used", 2.0),
+    }
+    assert "Probably false: GNSS, beacon 7 azimuth." in scene.frame(0.1, False)["trust"]["why"]
+    scene.add(message(solution(10.0)))
+    assert {row["state"] for row in scene.frame(0.1, False)["sources"]} >= {"silent"}
+
+
+def test_lines_of_position_end_where_the_beacon_measured():
+    scene = Scene("x")
+    scene.add(message(RsbnFix(S, S, 7, LAT, LON, 0.0, math.pi / 2, 5000.0, 0.002, 100.0)))
+    frame = scene.frame(0.1, False)["map"]
+    (line,) = (line for line in frame["lines"] if line["name"] == "lines of position")
+    assert (line["x"][:2], line["y"][:2]) == (
+        [0, pytest.approx(5000.0, abs=1.0)],
+        [0, pytest.approx(0.0, abs=5.0)],
+    )
+    assert frame["places"] == [["beacon 7", 0.0, 0.0]]
+
+
+def test_a_record_of_another_version_is_left_out():
+    scene = Scene("x")
+    channel = Channel("/out/Solution", "json", "Solution", b"{}")
+    scene.add(Message(channel, S, b'{"unknown": 1}'))
+    assert scene.frame(0.1, False)["trust"]["word"] == "No position yet"

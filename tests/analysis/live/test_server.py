@@ -1,0 +1,165 @@
+"""The live view in a real browser, killed and started again; other sites cannot read it."""
+
+import json
+import re
+import signal
+import subprocess
+import sys
+import urllib.error
+import urllib.request
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from companion.analysis.live.follow import Channel, Message
+from companion.analysis.live.server import command
+from companion.records import Event, Gnss, Mode, Solution, Trust
+from companion.storage import flight_log
+from companion.storage.reader import LogError
+
+pytest.importorskip("websockets")
+S = 1_000_000_000
+NASTY = "<!--<script>alert(1)</script><img src=x onerror=alert(2)>"
+ROOT = Path(__file__).parents[3]
+
+
+class Live:
+    """A running `companion live`."""
+
+    def __init__(self, path, port=0):
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "companion", "live", str(path), "--listen", f"127.0.0.1:{port}"],
+            stderr=subprocess.PIPE,
+            text=True,
+            cwd=ROOT,
+        )
+        line = self.process.stderr.readline()
+        self.port = int(re.search(r"http://127\.0\.0\.1:(\d+) shows", line)[1])
+        self.url = f"http://127.0.0.1:{self.port}/"
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *error):
+        self.process.kill()
+        self.process.wait()
+        self.process.stderr.close()
+
+
+def get(url, **headers):
+    try:
+        with urllib.request.urlopen(urllib.request.Request(url, headers=headers), timeout=20) as answer:
+            return answer.status, answer.read().decode()
+    except urllib.error.HTTPError as error:
+        with error:
+            return error.code, error.read().decode()
+
+
+def fly(log, first, count):
+    for k in range(first, first + count):
+        t = k * S // 5
+        log.record(Gnss(t, t, 0, k + 1, 3, 0.97, 0.65 + 1e-6 * k, 100.0, 2.0))
+        log.record(
+            Solution(
+                *(t, t, Mode.FIXED, "kalman", 0.97, 0.65 + 1e-6 * k, 100.0),
+                v_n=(0.0, 20.0, 0.0),
+                covariance=(25.0, 0.0, 0.0, 25.0, 0.0, 25.0),
+                error_n=(3.0, 4.0),
+                velocity_error_n=(0.0, 0.0),
+                sources=3,
+                horizon_s=0.0,
+                protection=80.0,
+                trust=Trust.NORMAL,
+                false_sources=(("gnss", 0.01),),
+            )
+        )
+
+
+def test_page_follows_a_flight_and_survives_a_kill(tmp_path, browser):
+    text, word = (
+        "document.getElementById('events')?.textContent",
+        "document.getElementById('trust').textContent",
+    )
+    with flight_log.Writer(
+        tmp_path / "00001-x.mcap", metadata={}, start_unix_ns=0, start_ns=0, fsync_s=0.2
+    ) as log:
+        fly(log, 0, 100)
+        log.record(Event(20 * S, 20 * S, 4, NASTY))
+        with Live(tmp_path) as live:
+            browser.open(live.url)
+            assert browser.wait_for(text).endswith(NASTY)
+            assert "Trusted" in browser.evaluate(word)
+            assert browser.evaluate("document.getElementById('sources').textContent").startswith(
+                "GNSSused1.0"
+            )
+            assert browser.evaluate("document.querySelectorAll('img, #events script').length") == 0
+            fly(log, 100, 200)
+            browser.wait_for("Number(document.documentElement.dataset.t) > 59")
+            assert browser.console == []
+            live.process.send_signal(signal.SIGKILL)
+        browser.wait_for(f"{word}.includes('Not connected')")
+        with Live(tmp_path, live.port):
+            browser.wait_for(f"{word}.includes('Trusted')")
+            fly(log, 300, 100)
+            browser.wait_for("Number(document.documentElement.dataset.t) > 79")
+        assert log.trouble is None and log.dropped == 0
+    assert {url.split("/")[2] for url in browser.requests if url.startswith("http")} == {
+        f"127.0.0.1:{live.port}"
+    }
+
+
+def test_other_sites_and_paths_are_refused(tmp_path):
+    with Live(tmp_path) as live:
+        assert get(live.url)[0] == 200
+        assert get(f"{live.url}view.js")[0] == 200
+        assert get(f"{live.url}../../etc/passwd")[0] == 404
+        assert get(live.url, Host="evil.example")[0] == 403
+        from websockets.exceptions import InvalidStatus
+        from websockets.sync.client import connect
+
+        address = f"ws://127.0.0.1:{live.port}/socket"
+        with connect(address, origin=f"http://127.0.0.1:{live.port}") as client:
+            waiting = json.loads(client.recv(timeout=20))["trust"]
+            assert waiting["word"] == "Waiting for a flight"
+        with pytest.raises(InvalidStatus, match="403"), connect(address, origin="http://evil.example"):
+            pass
+        live.process.send_signal(signal.SIGINT)
+        assert live.process.wait(20) == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"), [(["--listen", "8300"], "give HOST:PORT"), (["--listen", "a:99999"], "give HOST")]
+)
+def test_address_is_checked(arguments, words, tmp_path):
+    assert words in CliRunner().invoke(command, [str(tmp_path), *arguments]).output
+
+
+def test_missing_log_is_reported(tmp_path):
+    found = CliRunner().invoke(command, [str(tmp_path / "none.mcap")])
+    assert isinstance(found.exception, LogError) and "there is no such log" in str(found.exception)
+
+
+def test_foxglove_clients_get_every_channel_with_its_schema():
+    pytest.importorskip("foxglove")
+    from websockets.sync.client import connect
+
+    from companion.analysis.live.foxglove_server import FoxgloveServer
+
+    server = FoxgloveServer("127.0.0.1", 0)
+    try:
+        channel = Channel("/out/Event", "json", "Event", b'{"type": "object"}')
+        server.forward([Message(channel, 5, b'{"text": "x"}')])
+        with connect(f"ws://127.0.0.1:{server.port}", subprotocols=["foxglove.sdk.v1"]) as client:
+            for _ in range(5):
+                message = json.loads(client.recv(timeout=20))
+                if message["op"] == "advertise":
+                    break
+        (shown,) = message["channels"]
+        assert (shown["topic"], shown["schemaName"], shown["schema"]) == (
+            "/out/Event",
+            "Event",
+            '{"type": "object"}',
+        )
+    finally:
+        server.stop()
