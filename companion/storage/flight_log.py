@@ -14,7 +14,7 @@ import os
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from types import TracebackType
@@ -22,11 +22,11 @@ from typing import Any, NamedTuple
 
 import msgspec
 from mcap.opcode import Opcode
-from mcap.records import Channel, Message, Schema
+from mcap.records import Attachment, Channel, Message, Schema
 
 from companion import __version__
-from companion.records import BY_NAME, INPUTS, LinkState, Stamped, Truth, encode
-from companion.storage import location_fix
+from companion.records import BY_NAME, INPUTS, Event, LinkState, Stamped, Truth, encode
+from companion.storage import location_fix, schemas
 from companion.storage.mcap_file import Disk, DiskFile, McapFile, sync_folder
 from companion.storage.reader import ACTIVE, DamagedError, LogError, LogReader, open_log
 from companion.storage.recovery import Recovered, recover
@@ -92,6 +92,7 @@ class Writer:
     block : wait for a slow disk instead of dropping (for simulations faster than any disk); a failing disk
         is never waited for.
     disk : opens the file.
+    attachments : are written at the start.
 
     Raises LogError if the file cannot be created, and never afterwards: `trouble` is the last error of the
     disk, None while writing works. Queued chunks are retried.
@@ -109,8 +110,10 @@ class Writer:
         depth: int = 1 << 25,
         block: bool = False,
         disk: Callable[[Path], Disk] = DiskFile,
+        attachments: Sequence[Attachment] = (),
     ) -> None:
         self.path = Path(path)
+        self._attachments = attachments
         self.dropped = 0
         self.trouble: str | None = None
         self._shift = start_unix_ns - start_ns
@@ -148,6 +151,10 @@ class Writer:
             for topic, fix in location_fix.to_location_fixes(record, record.t_ns + self._shift):
                 number = self._ids.get(topic) or self._channel_of_map(topic)
                 self._append(number, record.rx_ns, record.t_ns, msgspec.json.encode(fix))
+        elif kind is Event:
+            number = self._ids.get(schemas.LOG_TOPIC) or self._channel_of_events()
+            found = msgspec.json.encode(schemas.to_log(record, record.t_ns + self._shift))  # type: ignore[arg-type]
+            self._append(number, record.rx_ns, record.t_ns, found)
 
     def frame(self, link: str, outgoing: bool, data: bytes, t_ns: int) -> None:
         """Write one frame as transmitted on `link`. Never waits for the disk."""
@@ -155,7 +162,7 @@ class Writer:
         number = self._ids.get(key)
         if number is None:
             topic = f"/mavlink/{link.strip('/')}/{'tx' if outgoing else 'rx'}"
-            number = self._define_channel(key, topic, "mavlink", "", None)
+            number = self._define_channel(key, topic, schemas.MAVLINK, schemas.MAVLINK, schemas.FRAMES)
         self._append(number, t_ns, t_ns, data)
 
     @property
@@ -221,25 +228,27 @@ class Writer:
                 self.dropped += len(oldest.messages)
 
     def _channel_of_record(self, key: Any, kind: type[Stamped], channel: str | None) -> int:
-        schema = msgspec.json.encode(msgspec.json.schema(kind))
+        schema = schemas.record_schema(kind)
         return self._define_channel(key, channel or topic_of(kind), "json", kind.__name__, schema)
 
     def _channel_of_map(self, topic: str) -> int:
-        return self._define_channel(
-            topic, topic, "json", location_fix.SCHEMA_NAME, msgspec.json.encode(location_fix.SCHEMA)
-        )
+        schema = msgspec.json.encode(location_fix.SCHEMA)
+        return self._define_channel(topic, topic, "json", location_fix.SCHEMA_NAME, schema)
 
-    def _define_channel(self, key: Any, topic: str, encoding: str, name: str, schema: bytes | None) -> int:
+    def _channel_of_events(self) -> int:
+        topic, schema = schemas.LOG_TOPIC, msgspec.json.encode(schemas.LOG)
+        return self._define_channel(topic, topic, "json", schemas.LOG_NAME, schema)
+
+    def _define_channel(self, key: Any, topic: str, encoding: str, name: str, schema: bytes) -> int:
         with self._lock:
             number = len(self._channels) + 1
-            if schema is not None:
-                self._schemas[number] = Schema(id=number, data=schema, encoding="jsonschema", name=name)
+            of = next((known.id for known in self._schemas.values() if known.name == name), None)
+            if of is None:
+                of = len(self._schemas) + 1
+                kind = "jsonschema" if encoding == "json" else encoding
+                self._schemas[of] = Schema(id=of, data=schema, encoding=kind, name=name)
             self._channels[number] = Channel(
-                id=number,
-                topic=topic,
-                message_encoding=encoding,
-                metadata={},
-                schema_id=0 if schema is None else number,
+                id=number, topic=topic, message_encoding=encoding, metadata={}, schema_id=of
             )
             self._sequences.append(0)
             self._ids[key] = number
@@ -261,6 +270,7 @@ class Writer:
             file.begin(f"companion {__version__}")
             for name, values in {"log": log, **metadata}.items():
                 file.metadata(name, values)
+            file.write(self._attachments)
             file.sync()
         except OSError as error:
             raise LogError(f"cannot write a log to {active}: {error.strerror or error}") from None

@@ -1,7 +1,7 @@
 """Positions as `foxglove.LocationFix` messages (degrees, east-north-up), shown on a map by log viewers.
 
-Replay and report do not read them; they use the records. The altitude is above mean sea level if the
-altitude above the ellipsoid is not known.
+Replay and report do not read them; they use the records. Altitudes are above mean sea level. A truth has a
+height above the ellipsoid only; simulators have no geoid, so it is the same there.
 """
 
 from __future__ import annotations
@@ -13,29 +13,22 @@ import msgspec
 
 from companion.nav import earth
 from companion.records import Gnss, Solution, Stamped, Truth
+from companion.storage import schemas
 
 SCHEMA_NAME = "foxglove.LocationFix"
 
 UNKNOWN, APPROXIMATED, DIAGONAL_KNOWN, KNOWN = range(4)
 
-_time = {
-    "type": "object",
-    "title": "time",
-    "properties": {
-        "sec": {"type": "integer", "minimum": 0},
-        "nsec": {"type": "integer", "minimum": 0, "maximum": 999_999_999},
-    },
-}
 SCHEMA: dict[str, Any] = {
     "title": SCHEMA_NAME,
     "description": "A navigation satellite fix for any Global Navigation Satellite System",
     "type": "object",
     "properties": {
-        "timestamp": _time,
+        "timestamp": schemas.TIME,
         "frame_id": {"type": "string"},
         "latitude": {"type": "number", "description": "degrees"},
         "longitude": {"type": "number", "description": "degrees"},
-        "altitude": {"type": "number", "description": "m"},
+        "altitude": {"type": "number", "description": "m above mean sea level"},
         "position_covariance": {
             "type": "array",
             "items": {"type": "number"},
@@ -73,12 +66,12 @@ def to_location_fixes(record: Stamped, unix_ns: int) -> list[tuple[str, Location
 
     `unix_ns` is the wall-clock time of validity.
     """
-    stamp = dict(zip(("sec", "nsec"), divmod(max(unix_ns, 0), 1_000_000_000), strict=True))
+    stamp = schemas.to_time(unix_ns)
     match record:
         case Truth():
             return [("/map/truth", _fix(stamp, record.lat, record.lon, record.alt))]
         case Gnss():
-            alt = record.alt_msl if record.alt is None else record.alt
+            alt = record.alt_msl
             h, v = record.sigma_horizontal, record.sigma_vertical
             if h is None or v is None:
                 return [("/map/gnss", _fix(stamp, record.lat, record.lon, alt))]

@@ -18,6 +18,7 @@ from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 
+from companion.storage import schemas
 from companion.storage.flight_log import Writer
 from companion.storage.mcap_file import DiskFile
 from companion.storage.reader import ACTIVE, LogError
@@ -67,6 +68,7 @@ def create_log(
         depth=depth,
         block=block,
         disk=partial(DiskFile, reserve=min_free, relieve=partial(make_room, folder)),
+        attachments=[schemas.dialect_attachment(start_unix_ns)],
     )
 
 

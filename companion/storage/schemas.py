@@ -7,7 +7,6 @@ level in a field with `msl` in its name, else above the WGS84 ellipsoid.
 
 from __future__ import annotations
 
-from functools import cache
 from importlib.resources import files
 from typing import Any
 
@@ -138,8 +137,12 @@ LOG: dict[str, Any] = {
     },
 }
 
-MAVLINK = "mavlink"  # encoding and schema of raw frames; the schema is the XML of our dialect
+MAVLINK = "mavlink"  # encoding and schema of raw frames
 _DIALECT = "rsbn.xml"
+FRAMES = (
+    "One MAVLink 1 or 2 frame a message, as transmitted, from its start byte to its checksum or signature. "
+    f"Dialect: ardupilotmega and, for ids 180000 to 180099, the attachment {_DIALECT}."
+).encode()
 
 
 class Log(msgspec.Struct, frozen=True, gc=False):
@@ -183,13 +186,8 @@ def record_schema(kind: type[Stamped]) -> bytes:
 
 
 def dialect_attachment(unix_ns: int) -> Attachment:
-    """Return the dialect as an attachment of a log."""
+    """Return the definition of our messages as an attachment of a log."""
+    data = files("companion.link").joinpath(_DIALECT).read_bytes()
     return Attachment(
-        create_time=unix_ns, log_time=unix_ns, name=_DIALECT, media_type="application/xml", data=dialect_xml()
+        create_time=unix_ns, log_time=unix_ns, name=_DIALECT, media_type="application/xml", data=data
     )
-
-
-@cache
-def dialect_xml() -> bytes:
-    """Return the definition of our messages."""
-    return files("companion.link").joinpath(_DIALECT).read_bytes()

@@ -96,7 +96,7 @@ def test_records_and_frames_round_trip_bit_for_bit(tmp_path):
         assert log.path == path and not path.exists()
     assert (log.dropped, log.trouble) == (0, None)
     entries = list(read(path))
-    ours = [e for e in entries if not e.topic.startswith("/map/")]
+    ours = [e for e in entries if not e.topic.startswith(("/map/", "/log"))]
     assert [e.value for e in ours] == [*EVERY_KIND, EVERY_KIND[0], b"\xfd\x00\xff", b""]
     assert [r.encode(e.value) for e in ours[: len(EVERY_KIND)]] == [r.encode(one) for one in EVERY_KIND]
     shift = START["start_unix_ns"] - START["start_ns"]
@@ -158,7 +158,7 @@ def test_map_positions_are_limited_to_two_per_second(tmp_path):
 
 
 def test_implausible_times_round_trip(tmp_path):
-    mad = [r.Event(-(2**62), 2**63 - 1, 1, "a"), r.Event(2**63 - 1, -(2**62), 1, "b")]
+    mad = [r.Reset(-(2**62), 2**63 - 1, "x", "a"), r.Reset(2**63 - 1, -(2**62), "x", "b")]
     with Writer(tmp_path / "x.mcap", metadata={}, start_unix_ns=0, start_ns=2**60) as log:
         for one in mad:
             log.record(one)
@@ -173,7 +173,7 @@ def small(tmp_path_factory) -> bytes:
     path = tmp_path_factory.mktemp("small") / "x.mcap"
     with Writer(path, metadata={"c": {"k": "v"}}, chunk_bytes=300, **START) as log:
         for i in range(12):
-            log.record(r.Event(T + i, T + i, 6, f"event {i}"))
+            log.record(r.Reset(T + i, T + i, "x", f"event {i}"))
             log.frame("udp", i % 2 == 0, bytes(range(i)), T + i)
     return path.read_bytes()
 
@@ -598,12 +598,12 @@ def test_unwritable_folder_is_reported_in_one_sentence(tmp_path):
 KILLED = """
 import sys, time
 from companion.storage.flight_log import Writer
-from companion.records import Event
+from companion.records import Reset
 log = Writer(sys.argv[1], metadata={}, start_unix_ns=10**18, start_ns=0)
 i = 0
 while True:
     now = time.monotonic_ns()
-    log.record(Event(now, i, 6, "x"))
+    log.record(Reset(now, i, "x", "y"))
     print(now, i, flush=True)
     i += 1
     time.sleep(0.002)
@@ -640,10 +640,10 @@ def test_log_command_shows_recovers_and_reports_errors(tmp_path, small):
     (tmp_path / "x.mcap").write_bytes(small)
     (tmp_path / "y.mcap.active").write_bytes(small[:-60])
     shown = run.invoke(group, ["info", str(tmp_path / "x.mcap")])
-    assert shown.exit_code == 0 and "/out/Event" in shown.output and "closed" in shown.output
+    assert shown.exit_code == 0 and "/out/Reset" in shown.output and "closed" in shown.output
     shown = run.invoke(group, ["info", "--json", str(tmp_path / "x.mcap")])
     assert json.loads(shown.output)["counts"] == {
-        "/out/Event": 12, "/mavlink/udp/tx": 6, "/mavlink/udp/rx": 6
+        "/out/Reset": 12, "/mavlink/udp/tx": 6, "/mavlink/udp/rx": 6
     }  # fmt: skip
     assert "torn" in run.invoke(group, ["info", str(tmp_path / "y.mcap.active")]).output
     assert "24 messages" in run.invoke(group, ["recover", str(tmp_path / "y.mcap.active")]).output

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from companion.records import Event
+from companion.records import Reset
 from companion.storage import retention
 from companion.storage.flight_log import LogError, Writer, info
 
@@ -21,7 +21,7 @@ def write_log(place: Path, unix_s: int = 0, *, max_files: int = 100, min_free: i
     with retention.create_log(
         place, metadata={}, start_unix_ns=unix_s * NS, start_ns=0, max_files=max_files, min_free=min_free
     ) as log:
-        log.record(Event(1, 1, 6, "x"))
+        log.record(Reset(1, 1, "x", "y"))
     return log.path.name
 
 

@@ -29,8 +29,8 @@ class FoxgloveServer:
     def forward(self, messages: Iterable[follow.Message]) -> None:
         """Send messages to all clients; a slow client misses the oldest ones."""
         for message in messages:
-            if not message.channel.schema:
-                continue
+            if message.channel.encoding != "json":
+                continue  # raw frames
             channel = self._channels.get(message.channel)
             if channel is None:
                 channel = self._channels[message.channel] = self._open(message.channel)
