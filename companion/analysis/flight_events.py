@@ -237,17 +237,23 @@ def build_timeline(
     return sorted(lines)
 
 
+def describe_reason(group: RejectionGroup) -> str:
+    """Describe why a group was rejected, with the worst value and its limit."""
+    if not math.isfinite(group.value):
+        return group.reason
+    if not math.isfinite(group.limit):
+        return f"{group.reason} {group.value:.4g}"
+    return f"{group.reason} {group.value:.4g} (limit {group.limit:.4g})"
+
+
 def describe_rejections(group: RejectionGroup) -> str:
     """Describe a group of rejections in one line."""
     name = source_title(group.source)
     if group.number == 1:
-        text = f"{name} rejected once: {group.reason}"
+        text = f"{name} rejected once: {describe_reason(group)}"
     else:
         duration = group.end - group.start
-        text = f"{name} rejected for {duration:.1f} s, {group.number} in a row: {group.reason}"
+        text = f"{name} rejected for {duration:.1f} s, {group.number} in a row: {describe_reason(group)}"
     if math.isfinite(group.metres):
         text += f", up to {group.metres:.1f} m from the estimate"
-    if math.isfinite(group.value):
-        limit = f", limit {group.limit:.3g}" if math.isfinite(group.limit) else ""
-        text += f" (value {group.value:.3g}{limit})"
     return text

@@ -17,6 +17,7 @@ from companion.analysis.plot_data import COLOURS, LOGS, Figure, Line, PlacedName
 from companion.units import Floats
 
 ELLIPSES = 9
+FAR_M = 100_000.0  # a flight that begins farther from the first one is not on its map
 BOUND = "guaranteed bound"
 LOST = "estimate without fixes"
 
@@ -26,24 +27,29 @@ def build_map(flights: Sequence[Assessment], prefixes: Sequence[str]) -> Figure:
     plane = flights[0]
     lines: list[Line] = []
     places: dict[str, PlacedName] = {}
+    elsewhere = []
     for which, (a, prefix) in enumerate(zip(flights, prefixes, strict=True)):
         alone = len(flights) == 1
+        if math.hypot(*map(float, plane.north_east(*np.array(a.origin)))) > FAR_M:
+            elsewhere.append(prefix.strip())
+            continue
         if alone:
             lines += _context(plane, a)
         lines += _estimate(plane, a, prefix, None if alone else LOGS[which % len(LOGS)])
         for identity, lat, lon, _ in flight_events.beacon_places(a.flight):
             north, east = plane.north_east(np.array(lat), np.array(lon))
             places[f"beacon {identity}"] = PlacedName(f"beacon {identity}", float(east), float(north))
+    notes = [f"Flown elsewhere, not on this map: {', '.join(elsewhere)}."] if elsewhere else []
     lines = [line for line in lines if np.isfinite(line.x).any()]
+    if any(line.name == BOUND for line in lines):
+        notes.append("Dashed ellipses: the guaranteed r.m.s. bound where there were no fixes.")
     framed = [line for line in lines if line.name not in (BOUND, "beacon positions")]
     return Figure(
         "map",
         "Map",
         "m",
         lines,
-        "Dashed ellipses: the guaranteed r.m.s. bound where there were no fixes."
-        if any(line.name == BOUND for line in lines)
-        else "",
+        " ".join(notes),
         origin=(math.degrees(plane.origin[0]), math.degrees(plane.origin[1])),
         frame=_frame(framed),
         places=tuple(places.values()),

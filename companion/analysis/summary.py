@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from companion.analysis import error_statistics
+from companion.analysis import error_statistics, flight_events
 from companion.analysis.assessment import GNSS, SMOOTHED, TRUTH, Assessment
 from companion.analysis.flight_events import WITHOUT_FIXES, phase_title, source_title
 from companion.units import Floats
@@ -117,7 +117,7 @@ def _flight_sentences(a: Assessment) -> list[str]:
     started = float(a.flight.tables["Solution"]["t"][0])
     outages = [outage for outage in a.outages if outage.end > started]
     if not outages:
-        sentences.append("GNSS was available throughout.")
+        sentences.append("GNSS had a fix throughout.")
     else:
         longest = max(outages, key=lambda outage: outage.end - outage.start)
         times = "once" if len(outages) == 1 else f"{len(outages)} times"
@@ -223,10 +223,10 @@ def _rejection_sentences(a: Assessment) -> list[str]:
         when = f"at {format_time(largest.start)}"
     rejected = "1 fix was rejected" if total == 1 else f"{total} fixes were rejected"
     if len(fixes) == 1:
-        return [f"{rejected}, {when}: {largest.reason}{far}."]
+        return [f"{rejected}, {when}: {flight_events.describe_reason(largest)}{far}."]
     return [
         f"{rejected} in {len(fixes)} events; the largest, {when}, has {largest.number} from "
-        f"{source_title(largest.source)}{far}: {largest.reason}."
+        f"{source_title(largest.source)}{far}: {flight_events.describe_reason(largest)}."
     ]
 
 

@@ -186,9 +186,7 @@ def _kept(a: Assessment) -> Verdict:
     judged = [row for row in a.rows if row.held is not None]
     held = f"the guaranteed bound held in all {len(judged)} phases" if judged else "no bound was stated"
     longest = max((outage.end - outage.start for outage in a.outages), default=0.0)
-    gnss = (
-        f"GNSS was lost for up to {format_duration(longest)}" if longest else "GNSS was available throughout"
-    )
+    gnss = f"GNSS was lost for up to {format_duration(longest)}" if longest else "GNSS had a fix throughout"
     return Verdict("good", f"{gnss}, and {held}.", format_length(worst), describe_worst(a))
 
 

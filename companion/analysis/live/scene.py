@@ -20,6 +20,7 @@ from companion.analysis.drawing import to_page
 from companion.analysis.flight_events import source_title
 from companion.analysis.live.follow import Message
 from companion.analysis.plot_data import COLOURS, Figure, Line, Mark, PlacedName
+from companion.estimate import bank
 from companion.nav.geometry import Geodetic, displace, separation
 from companion.records import Event, Gnss, Mode, Rejection, Reset, RsbnFix, Solution, Source, Stamped, Trust
 from companion.units import Floats
@@ -30,6 +31,7 @@ EVENTS = 200
 SILENT_S = 5.0  # a source is silent after this time
 STALE_S = 3.0  # no solution for so long: the view says so
 CHI2_95_2 = 5.991
+SUSPECT, EXCLUDED = bank.Settings().suspect, bank.Settings().excluded
 NAMED = {
     Trust.NORMAL: ("good", "Trusted"),
     Trust.DEGRADED: ("caution", "Degraded"),
@@ -211,7 +213,7 @@ class Scene:
                 if s.sources & bits
             ]
             parts.append(f"Position by {' and '.join(used) or 'fixes'}.")
-        false = [source_title(name) for name, p in self._false.items() if p > 0.5]
+        false = [source_title(name) for name, p in self._false.items() if p > SUSPECT]
         if false:
             parts.append(f"Probably false: {', '.join(false)}.")
         if s.protection is not None:
@@ -255,7 +257,7 @@ class Scene:
                 if value is not None:
                     key = f"rsbn {number} {kind}"
                     yield self._row(f"beacon {number} {kind}", key, beacon.t, bool(used & bit))
-        if "airspeed" in self._false:
+        if used & Source.AIR_DATA or self._false.get("airspeed", 0.0) > SUSPECT:
             yield self._row("airspeed", "airspeed", self.t, bool(used & Source.AIR_DATA))
 
     def _row(self, name: str, key: str, t: float | None, used: bool) -> SourceRow:
@@ -264,9 +266,9 @@ class Scene:
         state, level = ("used", "good") if used else ("not used", "")
         if age is None or age > SILENT_S:
             state, level = "silent", "caution"
-        elif p is not None and p > 0.999:
+        elif p is not None and p > EXCLUDED:
             state, level = "excluded", "fault"
-        elif p is not None and p > 0.5:
+        elif p is not None and p > SUSPECT:
             state, level = "suspect", "caution"
         return SourceRow(
             name,
@@ -390,7 +392,7 @@ class Scene:
             "Probability that a source is false",
             "%",
             list(self._false_lines()),
-            zero=True,
+            view=(0.0, 100.0),
             marks=marks,
         )
         yield Figure(
