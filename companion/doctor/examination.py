@@ -30,6 +30,7 @@ from companion.doctor.diagnosis import (
 from companion.link import dialect, frame
 from companion.link.decode import MAKES, has_airspeed_sensor
 from companion.link.dialect import mavlink, rsbn
+from companion.link.firmware import firmware_of
 from companion.link.parameter_client import Answer, ParameterClient, encoding_of, equal_real32
 from companion.link.session import (
     LinkUp,
@@ -49,13 +50,6 @@ VERSION_TIMEOUT = 3 * SECOND_NS
 #: Observation time, and observation time if something is not well.
 OBSERVE, OBSERVE_LONGER = 6 * SECOND_NS, 14 * SECOND_NS
 MAX_LOSS = 0.05
-STAGES = {
-    mavlink.FIRMWARE_VERSION_TYPE_DEV: "-dev",
-    mavlink.FIRMWARE_VERSION_TYPE_ALPHA: "-alpha",
-    mavlink.FIRMWARE_VERSION_TYPE_BETA: "-beta",
-    mavlink.FIRMWARE_VERSION_TYPE_RC: "-rc",
-    mavlink.FIRMWARE_VERSION_TYPE_OFFICIAL: "",
-}
 
 
 class Examination:
@@ -219,11 +213,8 @@ class Examination:
     def _identity(self) -> Identity:
         kind = mavlink.enums["MAV_TYPE"].get(self._heartbeat.type)
         vehicle = kind.name.removeprefix("MAV_TYPE_").replace("_", " ").lower() if kind else "vehicle"
-        version = ""
-        if self._version is not None:
-            stated = self._version.flight_sw_version
-            major, minor, patch, stage = (stated >> shift & 255 for shift in (24, 16, 8, 0))
-            version = f"{major}.{minor}.{patch}{STAGES.get(stage, '')}"
+        firmware = None if self._version is None else firmware_of(self._version)
+        version = "" if firmware is None else str(firmware)
         armed = bool(self._heartbeat.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
         return Identity(self.session.autopilot or 0, self.make, vehicle, version, armed)
 

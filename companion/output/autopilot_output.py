@@ -13,12 +13,14 @@ from companion.config import Config
 from companion.config.profiles import MESSAGES, RESET
 from companion.link.dialect import Message, mavlink
 from companion.output.encode import CannotEncode, Receiver, encode
-from companion.output.gate import Gate, Position, WithholdingMonitor
+from companion.output.gate import Gate, LocalFrame, Position, WithholdingMonitor
 from companion.output.position_reset import PositionReset
 from companion.output.source_switch import SourceSwitch, selected
 from companion.records import Event, FilterStatus, GlobalPosition, Gnss, Solution, Stamped, SystemTime
 
 DISPLAY_NAMES = {RESET: "external position"}
+NOT_FUSED = frozenset({RESET, MESSAGES["gps_input"]})
+"""A reset is no series of measurements; a receiver's accuracy is judged by limits of its own."""
 ON_SOURCE_SET_2 = frozenset({MESSAGES["odometry"], MESSAGES["vision"]})
 
 
@@ -28,7 +30,7 @@ class AutopilotOutput:
     def __init__(self, config: Config) -> None:
         self.config = config
         self.unix_ns: int | None = None
-        self._gate, self._monitor = Gate(), WithholdingMonitor()
+        self._gate, self._local_frame, self._monitor = Gate(), LocalFrame(), WithholdingMonitor()
         self._position_reset, self._source_switch = PositionReset(), SourceSwitch()
         self._events: list[Event] = []
 
@@ -50,6 +52,7 @@ class AutopilotOutput:
     def handle_reboot(self) -> None:
         """Reset what was known of the autopilot; it has rebooted."""
         self._position_reset, self._source_switch = PositionReset(), SourceSwitch()
+        self._local_frame = LocalFrame()
 
     def handle_acknowledgement(self, command: int, result: int, now_ns: int) -> None:
         """Process the autopilot's COMMAND_ACK of one of our commands."""
@@ -72,9 +75,13 @@ class AutopilotOutput:
             )
             if isinstance(position, Position) and reason is None:
                 try:
-                    encoded[name] = encode(position, receiver, name)
+                    message = encode(position, receiver, name, self._rate_hz(name))
                 except CannotEncode as error:
                     reason = str(error)
+                else:
+                    reason = self._local_frame.withholding_reason(position, message)
+                    if reason is None:
+                        encoded[name] = message
             self._add_event(self._monitor.update(DISPLAY_NAMES.get(name, name), reason, now))
         if by_set := ON_SOURCE_SET_2.intersection(names):
             self._source_switch.note_output(solution, not by_set.isdisjoint(encoded), now)
@@ -91,6 +98,10 @@ class AutopilotOutput:
         """Return the events since the last call."""
         taken, self._events = [*self._events, *self._source_switch.take_events()], []
         return taken
+
+    def _rate_hz(self, name: str) -> float:
+        """Return how often a position goes out as a measurement; 0 for a reset, which is no series."""
+        return 0.0 if name in NOT_FUSED else self.config.output.rates_hz[name]
 
     def _withholding_reason(self, position: Position, name: str, receiver: Receiver) -> str | None:
         profile = self.config.output.profile

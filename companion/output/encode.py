@@ -19,6 +19,7 @@ from typing import Any, NamedTuple, TypeAlias
 from companion.link import dialect
 from companion.link.decode import Autopilot
 from companion.link.dialect import mavlink, rsbn
+from companion.link.firmware import Firmware
 from companion.nav.geometry import Geodetic, Projection, geodetic_to_local
 from companion.output.gate import Position
 from companion.records import LocalOrigin, Mode, Solution, Source
@@ -27,7 +28,10 @@ Message: TypeAlias = Any
 
 ARDUPILOT_MAX_SIGMA_M = 100.0
 """ArduPilot's filter limits every position sigma to this value, so a greater one cannot be stated."""
-_TOO_INACCURATE = f"accuracy worse than ArduPilot's limit of {ARDUPILOT_MAX_SIGMA_M:g} m"
+ROOT_OF_SUM = (4, 7)
+"""First ArduPilot that reads sqrt(c0 + c6 + c11) as the position error; before, cbrt(c0^2 + c6^2 + c11^2)."""
+CORRELATION_S = 20.0
+"""Time for which our position error keeps its sign (ArduPlane on one beacon 60 km away: 15 to 40 s)."""
 GPS_LAG_NS = 200_000_000
 """Age that ArduPilot assumes for a GPS_INPUT on arrival."""
 
@@ -60,24 +64,47 @@ class CannotEncode(Exception):
 class Receiver(NamedTuple):
     """The autopilot that receives a message, and the values that only its link knows.
 
-    `origin` is the autopilot's local origin, `geoid` the height of mean sea level above the ellipsoid (m) if
-    a receiver reports it, `sensor_id` PX4's EKF2_AGP0_ID, `unix_ns` UTC minus our clock (ns) if known,
-    `rejected` the number of rejected measurements.
+    `origin` is the autopilot's local origin, `origin_resets` how often it moved, `geoid` the height of mean
+    sea level above the ellipsoid (m) if a receiver reports it, `sensor_id` PX4's EKF2_AGP0_ID, `unix_ns` UTC
+    minus our clock (ns) if known, `firmware` the version if stated, `rejected` the number of rejected
+    measurements.
     """
 
     autopilot: Autopilot
     system: int
     component: int = 1
     origin: LocalOrigin | None = None
+    origin_resets: int = 0
     geoid: float | None = None
     sensor_id: int = 1
     unix_ns: int | None = None
+    firmware: Firmware | None = None
     rejected: int = 0
 
 
-def encode(position: Position, receiver: Receiver, name: str) -> Message:
-    """Encode the message `name` (a key of `ENCODERS`). Raises `CannotEncode` if it would be incorrect."""
+def encode(position: Position, receiver: Receiver, name: str, rate_hz: float = 0.0) -> Message:
+    """Encode the message `name` (a key of `ENCODERS`), sent `rate_hz` times a second (0: once).
+
+    Raises `CannotEncode` if it would be incorrect.
+    """
+    if receiver.autopilot != "ardupilot":
+        position = stated_as_independent(position, rate_hz)
     return ENCODERS[name](position, receiver)
+
+
+def stated_as_independent(position: Position, rate_hz: float) -> Position:
+    """Enlarge the covariance for a filter that takes the errors of successive messages as independent.
+
+    Such a filter gains the information rate_hz / s^2 per second from a stated sigma s. An error with sigma
+    and correlation time tau brings 1 / (2 tau sigma^2), the inverse of its spectral density at low
+    frequencies. So s^2 = 2 tau rate_hz sigma^2 gives the filter what there is.
+
+    ArduPilot receives sigma as it is. Its filter holds on to a wind that has changed, and follows a position
+    of 100 m too slowly: 49 and 31 m r.m.s. in the first minute instead of 31 and 24 m, the same after it.
+    """
+    factor = max(1.0, 2.0 * CORRELATION_S * rate_hz)
+    nn, ne, ee = position.covariance
+    return position._replace(covariance=(factor * nn, factor * ne, factor * ee))
 
 
 def odometry(position: Position, receiver: Receiver) -> Message:
@@ -104,9 +131,9 @@ def odometry(position: Position, receiver: Receiver) -> Message:
         rollspeed=nan,
         pitchspeed=nan,
         yawspeed=nan,
-        pose_covariance=_covariance(position, ardupilot),
+        pose_covariance=_covariance(position, receiver),
         velocity_covariance=[nan] + [0.0] * 20,
-        reset_counter=position.resets % 256,
+        reset_counter=(position.resets + receiver.origin_resets) % 256,
         estimator_type=_ESTIMATOR_UNKNOWN,
         quality=_FIXED if position.fixed else _PREDICTED,
     )
@@ -126,8 +153,8 @@ def vision_position_estimate(position: Position, receiver: Receiver) -> Message:
         roll=angle,
         pitch=angle,
         yaw=angle,
-        covariance=_covariance(position, ardupilot),
-        reset_counter=position.resets % 256,
+        covariance=_covariance(position, receiver),
+        reset_counter=(position.resets + receiver.origin_resets) % 256,
     )
 
 
@@ -135,9 +162,7 @@ def _local(position: Position, receiver: Receiver) -> tuple[float, float, float]
     """Return north, east, down from the autopilot's local origin, m."""
     origin = receiver.origin
     if origin is None:
-        raise CannotEncode("the autopilot's local origin is unknown")
-    if receiver.autopilot == "ardupilot" and position.sigma > ARDUPILOT_MAX_SIGMA_M:
-        raise CannotEncode(_TOO_INACCURATE)
+        raise CannotEncode("the autopilot's local origin is not confirmed by its positions")
     point = Geodetic(position.lat, position.lon, position.alt_msl)
     start = Geodetic(origin.lat, origin.lon, origin.alt_msl)
     return geodetic_to_local(_projection(origin), start, point)
@@ -150,23 +175,30 @@ def _projection(origin: LocalOrigin) -> Projection:
     raise ValueError(f"unknown local projection {origin.projection!r}: choose ardupilot, px4 or tangent")
 
 
-def _covariance(position: Position, ardupilot: bool) -> list[float]:
+def _covariance(position: Position, receiver: Receiver) -> list[float]:
     """Return the upper triangle of the 6 x 6 covariance, row by row.
 
-    ArduPilot reads one accuracy for all axes, A = sqrt(c0 + c6 + c11), so the horizontal accuracy A is
-    encoded as c0 = c6 = c11 = A^2 / 3, and the angles likewise. Trees before February 2026 read
-    cbrt(c0^2 + c6^2 + c11^2): they take it for more than A, never for less, from 3 m up. Others receive the
-    position variances, and NaN for the attitude.
+    ArduPilot reads one accuracy for all axes, A = sqrt(c0 + c6 + c11), so A is encoded as c0 = c6 = c11 =
+    A^2 / 3, and the angles likewise. Versions before `ROOT_OF_SUM` read cbrt(c0^2 + c6^2 + c11^2). A version
+    that is not known receives the former: the latter is then more than A from 3 m up, never less. Others
+    receive the position variances, and NaN for the attitude.
     """
     covariance = [0.0] * 21
-    if ardupilot:
-        covariance[0] = covariance[6] = covariance[11] = position.sigma**2 / 3.0
-        covariance[15] = covariance[18] = covariance[20] = _YAW_ERROR**2 / 3.0
+    if receiver.autopilot != "ardupilot":
+        covariance[0], covariance[1], covariance[6] = position.covariance
+        covariance[11] = position.variance_down
+        covariance[15:] = [math.nan] * 6
         return covariance
-    covariance[0], covariance[1], covariance[6] = position.covariance
-    covariance[11] = position.variance_down
-    covariance[15:] = [math.nan] * 6
+    is_old = receiver.firmware is not None and receiver.firmware[:2] < ROOT_OF_SUM
+    accuracy = min(position.sigma, ARDUPILOT_MAX_SIGMA_M)
+    covariance[0] = covariance[6] = covariance[11] = _element(accuracy, is_old)
+    covariance[15] = covariance[18] = covariance[20] = _element(_YAW_ERROR, is_old)
     return covariance
+
+
+def _element(accuracy: float, is_old: bool) -> float:
+    """Return the diagonal element that ArduPilot reads as `accuracy` (m or rad)."""
+    return math.sqrt(accuracy**3 / 3.0) if is_old else accuracy**2 / 3.0
 
 
 def gps_input(position: Position, receiver: Receiver) -> Message:
@@ -179,7 +211,7 @@ def gps_input(position: Position, receiver: Receiver) -> Message:
     if receiver.unix_ns is None:
         raise CannotEncode("the time of day is unknown")
     if position.sigma > ARDUPILOT_MAX_SIGMA_M:
-        raise CannotEncode(_TOO_INACCURATE)
+        raise CannotEncode(f"accuracy worse than ArduPilot's limit of {ARDUPILOT_MAX_SIGMA_M:g} m")
     if position.sigma_velocity is None:
         raise CannotEncode("velocity accuracy is unknown")
     then = position.at(position.t_ns - GPS_LAG_NS)

@@ -26,6 +26,7 @@ import math
 from collections import Counter
 from typing import NamedTuple
 
+from companion.link.dialect import Message
 from companion.nav.geometry import Geodetic, displace, separation_tuple, wrap_angle
 from companion.records import Event, Mode, Severity, Solution, Trust, Vector3
 from companion.units import SECOND_NS
@@ -44,6 +45,9 @@ MIN_SIGMA_M, MAX_SIGMA_M = (
 )  # a smaller sigma is not plausible, and could become 0 in single precision
 MIN_SIGMA_VELOCITY = 1e-3  # [m/s]
 SIGMAS = 3.0
+LOCAL_TOLERANCE_M, LOCAL_RECENT_NS = 5.0, 10 * SECOND_NS
+PROJECTION_ERROR = 0.05
+"""Greatest scale error of a flat local frame, 200 km from its origin."""
 REPORT_INTERVAL_NS = 5 * SECOND_NS
 
 
@@ -156,6 +160,34 @@ def _jump(last: Position, here: Position, dt: float) -> float:
     place = Geodetic(last.lat, last.lon, last.alt_msl)
     north, east, _ = separation_tuple(Geodetic(here.lat, here.lon, here.alt_msl), place)
     return math.hypot(north - 0.5 * (v_n + w_n) * dt, east - 0.5 * (v_e + w_e) * dt)
+
+
+class LocalFrame:
+    """Check of local coordinates in the frame in which they leave.
+
+    Between two messages x and y must change as the position does: a change of the origin that the reset
+    counter does not report moves the aircraft.
+    """
+
+    def __init__(self) -> None:
+        self._last: tuple[Position, Message] | None = None
+
+    def withholding_reason(self, position: Position, message: Message) -> str | None:
+        """Return why `message`, which carries `position`, must not be sent; None if it may be."""
+        if not hasattr(message, "reset_counter"):
+            return None  # not in local coordinates
+        before, sent = self._last or (position, message)
+        is_recent = position.t_ns - before.t_ns <= LOCAL_RECENT_NS
+        if is_recent and sent.reset_counter == message.reset_counter:
+            north, east, _ = separation_tuple(
+                Geodetic(position.lat, position.lon, position.alt_msl),
+                Geodetic(before.lat, before.lon, before.alt_msl),
+            )
+            off = math.hypot(message.x - sent.x - north, message.y - sent.y - east)
+            if not off <= LOCAL_TOLERANCE_M + PROJECTION_ERROR * math.hypot(north, east):
+                return "local coordinates moved otherwise than the position"
+        self._last = position, message
+        return None
 
 
 def distance(a: tuple[float, float], b: tuple[float, float]) -> float:

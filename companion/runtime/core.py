@@ -18,11 +18,12 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 from companion.config import Config, ConfigError, to_toml
-from companion.config.profiles import RESET
+from companion.config.profiles import MESSAGES, RESET
 from companion.config.validate import find_conflicts
 from companion.link import dialect
 from companion.link.decode import MAKES, Sender, decode
 from companion.link.dialect import mavlink, rsbn
+from companion.link.firmware import Firmware, firmware_of
 from companion.link.session import (
     ClockJump,
     FrameRejected,
@@ -45,7 +46,6 @@ from companion.records import (
     INPUTS,
     Event,
     LinkState,
-    LocalOrigin,
     LocalPosition,
     Mode,
     Reboot,
@@ -59,12 +59,14 @@ from companion.records import (
     Tuning,
 )
 from companion.runtime.ground_station_services import GroundStationServices
+from companion.runtime.origin import OriginCheck
 from companion.runtime.parameter_check import ParameterCheck
 from companion.storage.deferred_log import Log
 from companion.units import SECOND_NS
 
 STATUS = "NAVIGATION_STATUS"
 ORIGIN_REQUEST_INTERVAL = 3 * SECOND_NS
+FIRMWARE_REQUESTS = 10
 STALE_AFTER = 2 * SECOND_NS
 #: Messages of ground stations that the companion answers.
 REQUESTS = frozenset(
@@ -106,6 +108,8 @@ class Link:
         self.not_sent: Counter[str] = Counter()  # messages that did not fit their wire format, by reason
         self.dropped = 0  # frames not sent because the line was too slow; set by the service
         self.origin_request_ns = 0  # when the local origin is requested next
+        self.firmware: Firmware | None = None
+        self.firmware_requests = 0
 
     @property
     def lost(self) -> int:
@@ -120,7 +124,8 @@ class Link:
 
 def requested_rates(config: Config) -> dict[str, float]:
     """Return the stream rates to request from the autopilot, Hz by message name."""
-    rates = config.rates
+    rates, output_hz = config.rates, config.output.rates_hz
+    is_local = output_hz[MESSAGES["odometry"]] > 0.0 or output_hz[MESSAGES["vision"]] > 0.0
     rates_hz = {
         "LOCAL_POSITION_NED": rates.local_position_hz,
         "GPS_RAW_INT": rates.gnss_hz,
@@ -131,8 +136,9 @@ def requested_rates(config: Config) -> dict[str, float]:
         "SCALED_PRESSURE": 0.0 if config.has_own_ins else rates.air_data_hz,
         "EKF_STATUS_REPORT": rates.status_hz,
         "SYS_STATUS": 0.0 if config.has_own_ins else rates.status_hz,
-        "SYSTEM_TIME": float(config.output.rates_hz["GPS_INPUT"] > 0.0),
-        "GLOBAL_POSITION_INT": 2.0 * (config.output.rates_hz[RESET] > 0.0),
+        "SYSTEM_TIME": float(output_hz["GPS_INPUT"] > 0.0),
+        # for the check of the local origin, and for position resets
+        "GLOBAL_POSITION_INT": 2.0 * (output_hz[RESET] > 0.0 or (is_local and not config.has_own_ins)),
         "SIM_STATE": rates.truth_hz,
     }
     paced = "LOCAL_POSITION_NED" if config.has_own_ins else "ATTITUDE"
@@ -167,7 +173,7 @@ class CompanionCore:
         self._solution: Solution | None = None
         self._events: list[Event] = []
         self.rejected: Counter[str] = Counter()
-        self._origin: LocalOrigin | None = None
+        self._origin = OriginCheck(has_pairs=not config.has_own_ins)
         self._period_start: dict[str, int] = {}  # time from which each message's period is counted
         self._next_state_ns = 0
         self._stale = False  # no recent solution
@@ -202,7 +208,7 @@ class CompanionCore:
         """Do the periodic work that is due."""
         for link in self.links.values():
             self._on_events(link, link.session.poll(now_ns), now_ns)
-            if link is self.leading_link and self._origin is None and now_ns >= link.origin_request_ns:
+            if link is self.leading_link and self._origin.origin is None and now_ns >= link.origin_request_ns:
                 link.origin_request_ns = now_ns + ORIGIN_REQUEST_INTERVAL
                 self._request_message(link, mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN)
             for event in link.parameter_check.poll(now_ns):
@@ -211,6 +217,7 @@ class CompanionCore:
                 link.session.send(message)
         if now_ns >= self._next_state_ns:
             self._next_state_ns = now_ns + SECOND_NS
+            self._request_firmware()
             self._report_staleness(now_ns)
             if (leading := self.leading_link) is not None:
                 self._steer(leading, now_ns)
@@ -259,14 +266,15 @@ class CompanionCore:
                 for each in self.links.values():
                     each.session.lock_to_system(event.system)  # one aircraft only
                 # the origin may have changed during the silence
-                if link is self.leading_link and self._origin is not None:
+                if link is self.leading_link and self._origin.origin is not None:
                     self._request_message(link, mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN)
             elif isinstance(event, LinkLost):
                 silence_s = (now_ns - event.last_received_ns) / SECOND_NS
                 text = f"{link.name}: autopilot {event.system} silent for {silence_s:.0f} s"
                 self.report(Severity.WARNING, text + self._leading_link_note(link), now_ns)
             elif isinstance(event, Rebooted):
-                self._origin = None
+                self._origin.forget()
+                link.firmware, link.firmware_requests = None, 0  # a reboot may follow an update
                 link.output.handle_reboot()
                 link.parameter_check.start(self._config, event.system, link.session.autopilot_type)
                 self.report(Severity.WARNING, f"{link.name}: autopilot {event.system} rebooted", now_ns)
@@ -319,6 +327,8 @@ class CompanionCore:
         if event.frame.msgid == mavlink.MAVLINK_MSG_ID_COMMAND_ACK and event.message.target_component in ours:
             link.output.handle_acknowledgement(event.message.command, event.message.result, event.received_ns)
             self._emit_output_events(link)
+        if event.frame.msgid == mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION:
+            link.firmware = firmware_of(event.message)
         link.parameter_check.receive(event.message, event.frame)
         # the leading link receives the same messages
         is_duplicate = link.session.is_up and link is not self.leading_link
@@ -332,13 +342,13 @@ class CompanionCore:
             self._emit(record, "/link/Rejection" if isinstance(record, Rejection) else None)
             return
         self._log.record(record)
-        if isinstance(record, LocalOrigin):
-            self._origin = record
+        for event in self._origin.receive(record):
+            self._emit(event, "/link/Event")
         for output in self._navigator.handle(record):  # type: ignore[arg-type]
             if isinstance(output, Solution):
                 self._send(output, is_beacon_fix=isinstance(record, RsbnFix))
             elif isinstance(output, Reset) and isinstance(record, LocalPosition):
-                self._origin = None  # it may have moved: do not use it until received again
+                self._origin.forget()  # it may have moved: do not use it until received again
             self._emit(output)
 
     def _emit(self, record: Stamped, channel: str | None = None) -> None:
@@ -383,9 +393,11 @@ class CompanionCore:
         return Receiver(
             link.sender.autopilot,
             link.session.autopilot or 0,
-            origin=self._origin,
+            origin=self._origin.origin,
+            origin_resets=self._origin.resets,
             sensor_id=self._config.output.global_position_sensor_id,
             unix_ns=link.output.unix_ns,
+            firmware=link.firmware,
             rejected=self.rejected.total(),
         )
 
@@ -420,6 +432,13 @@ class CompanionCore:
     def _leading_link_note(self, link: Link) -> str:
         leading = self.leading_link
         return "" if leading in (None, link) else f"; {leading.name} leads"
+
+    def _request_firmware(self) -> None:
+        """Request the version of an autopilot that has not stated it, a few times."""
+        for link in self.links.values():
+            if link.session.is_up and link.firmware is None and link.firmware_requests < FIRMWARE_REQUESTS:
+                link.firmware_requests += 1
+                self._request_message(link, mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION)
 
     def _request_message(self, link: Link, msgid: int) -> None:
         link.session.send(

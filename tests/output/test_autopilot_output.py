@@ -16,7 +16,7 @@ from companion.link import dialect, frame
 from companion.nav.geometry import Geodetic, displace, local_to_geodetic, slant_range_azimuth
 from companion.navigator import Navigator
 from companion.output.autopilot_output import AutopilotOutput
-from companion.output.encode import ENCODERS, Receiver
+from companion.output.encode import CORRELATION_S, ENCODERS, Receiver
 from companion.records import (
     AirData,
     Attitude,
@@ -204,7 +204,8 @@ def falsify_position(name: str, values: dict[str, Any]) -> None:
     """Falsify the autopilot's own position, velocity, height and wind."""
     match name:
         case "LOCAL_POSITION_NED":
-            values |= {"x": 900.0, "y": -4000.0, "z": 30.0, "vx": -70.0, "vy": 55.0, "vz": 9.0}
+            x = values["x"] + 33.4  # as the global position: the origin follows from both
+            values |= {"x": x, "z": 30.0, "vx": -7.0, "vy": 5.5, "vz": 9.0}
         case "GLOBAL_POSITION_INT":
             # within the drift limit of a position reset
             values |= {"lat": values["lat"] + 3000, "alt": 90_000, "vx": -700, "vy": 550, "relative_alt": 7}
@@ -237,6 +238,41 @@ def test_falsified_position_reaches_the_output_of_an_independent_ins() -> None:
     for flight in (honest, falsified):
         flight.fly(15.0)
     assert honest.position_payloads() and falsified.position_payloads() != honest.position_payloads()
+
+
+@pytest.mark.parametrize("via", ["odometry", "vision"])
+def test_forged_origin_moves_no_position(via: str) -> None:
+    config = configured("output.profile=ardupilot", f"output.via={via}")
+
+    def forge(name: str, values: dict[str, Any]) -> None:
+        if name == "GPS_GLOBAL_ORIGIN" and forged.seconds > 10.0:
+            values["latitude"] += 300_000  # 3.3 km
+
+    honest, forged = Flight(config), Flight(config)
+    forged.falsify = forge
+    for flight in (honest, forged):
+        flight.fly(40.0)
+    assert len(honest.position_payloads()) > 200
+    assert forged.position_payloads() == honest.position_payloads()
+    assert any(text.startswith("GPS_GLOBAL_ORIGIN 33") and text.endswith("not used") for text in forged.texts)
+
+
+def test_origin_that_moves_is_followed_with_a_reset() -> None:
+    """The autopilot moves its origin by 111 m: its local coordinates and ours change by as much."""
+    flight = Flight(configured("output.profile=ardupilot"))
+
+    def move(name: str, values: dict[str, Any]) -> None:
+        if flight.seconds > 20.0 and name == "GPS_GLOBAL_ORIGIN":
+            values["latitude"] += 10_000
+        elif flight.seconds > 20.0 and name == "LOCAL_POSITION_NED":
+            values["x"] -= 111.3
+
+    flight.falsify = move
+    flight.fly(40.0)
+    before = [m for at, m in flight.sent if m.get_type() == "ODOMETRY" and at < 20.0]
+    after = flight.sent_messages("ODOMETRY", 25.0)
+    assert {m.reset_counter for m in before} == {0} and {m.reset_counter for m in after} == {1}
+    assert after[-1].x == pytest.approx(SPEED * flight.seconds - 111.3, abs=5.0)
 
 
 def test_core_rejects_a_configuration_with_feedback() -> None:
@@ -414,23 +450,14 @@ def at(seconds: float, **changes: Any) -> Solution:
     return msgspec.structs.replace(GOOD, t_ns=t_ns, rx_ns=t_ns, **changes)
 
 
-def test_odometry_beyond_ardupilots_accuracy_limit_is_withheld_and_reported() -> None:
-    """Sigma grows from 80 to 120 m and is 20 m after the next fix."""
+def test_odometry_beyond_ardupilots_accuracy_limit_is_sent() -> None:
+    """A position worse than 100 m is better than none: sigma grows to 900 m."""
     receiver = Receiver("ardupilot", 1, origin=LocalOrigin(START, START, *ORIGIN, "ardupilot"))
     output = AutopilotOutput(configured("output.profile=ardupilot", "output.switch_sources=false"))
-    sent, texts = [], []
-    for k in range(600):
-        sigma = 80.0 + 0.1 * k if k < 400 else 20.0
-        solution = at(0.1 * k, covariance=(sigma**2, 0.0, 0.0, sigma**2, 0.0, 25.0))
-        sent += [k for _ in output.messages(solution, ["ODOMETRY"], receiver)]
-        texts += [event.text for event in output.take_events()]
-    assert sent == [*range(201), *range(400, 600)]
-    assert texts == [
-        "sending ODOMETRY",
-        "ODOMETRY withheld: accuracy worse than ArduPilot's limit of 100 m",
-        "sending ODOMETRY, 199 withheld so far",
-    ]
-    assert sum(output.withheld.values()) == 199
+    for k in range(820):
+        solution = at(0.1 * k, covariance=((80.0 + k) ** 2, 0.0, 0.0, (80.0 + k) ** 2, 0.0, 25.0))
+        assert len(output.messages(solution, ["ODOMETRY"], receiver)) == 1
+    assert [event.text for event in output.take_events()] == ["sending ODOMETRY"]
 
 
 RECORDED = Attitude | AirData | Pressure | Truth | Gnss | LocalPosition | GlobalPosition
@@ -479,11 +506,11 @@ def test_gate_passes_recorded_flights(name: str) -> None:
     assert sent[True] > 1800 and sent[False] < 70
 
 
-def test_px4_receives_the_true_accuracy() -> None:
+def test_px4_receives_an_accuracy_that_allows_for_the_rate() -> None:
     output, receiver = AutopilotOutput(configured("output.profile=px4")), Receiver("px4", 1)
     solution = at(0.0, covariance=(4e4, 0.0, 0.0, 4e4, 0.0, 25.0))
     (m,) = output.messages(solution, ["GLOBAL_POSITION_SENSOR"], receiver)
-    assert m.eph == 200.0
+    assert m.eph == pytest.approx(200.0 * math.sqrt(2.0 * CORRELATION_S * 2.0))
 
 
 @pytest.mark.parametrize("name", sorted(ENCODERS))

@@ -6,6 +6,7 @@ import math
 from typing import Any
 
 import msgspec
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -13,7 +14,16 @@ from pymavlink.dialects.v20 import all as pymavlink
 
 from companion.link import dialect, frame
 from companion.link.decode import Autopilot
-from companion.output.encode import ENCODERS, CannotEncode, Receiver, encode, navigation_status
+from companion.link.firmware import Firmware
+from companion.output.encode import (
+    CORRELATION_S,
+    ENCODERS,
+    CannotEncode,
+    Receiver,
+    encode,
+    navigation_status,
+    stated_as_independent,
+)
 from companion.output.gate import Position
 from companion.records import LocalOrigin, Mode, Prediction, Solution, Source
 
@@ -194,23 +204,70 @@ def test_every_field_of_every_message(name: str, autopilot: Autopilot, fields: d
         assert getattr(m, field) == pytest.approx(expected, rel=2e-6, abs=1e-6, nan_ok=True), field
 
 
+def accuracy_read(message: Any, is_old: bool) -> float:
+    """Return the position error that ArduPilot reads: since 4.7 (PR 32084), and before."""
+    c = message.pose_covariance if message.get_type() == "ODOMETRY" else message.covariance
+    assert all(map(math.isfinite, c))
+    return math.cbrt(c[0] ** 2 + c[6] ** 2 + c[11] ** 2) if is_old else math.sqrt(c[0] + c[6] + c[11])
+
+
 @pytest.mark.parametrize("sigma", [0.5, 20.0, 99.9])
 @pytest.mark.parametrize("name", ["ODOMETRY", "VISION_POSITION_ESTIMATE"])
-def test_ardupilot_formula_returns_the_accuracy(name: str, sigma: float) -> None:
-    m = encoded(name, covariance=(sigma**2, 0.0, 0.25 * sigma**2))
-    c = m.pose_covariance if name == "ODOMETRY" else m.covariance
-    assert math.sqrt(c[0] + c[6] + c[11]) == pytest.approx(sigma)
-    assert math.sqrt(c[15] + c[18] + c[20]) == pytest.approx(1.5)
-    if sigma >= 3.0:  # older trees take it for less accurate, never for more
-        assert math.cbrt(c[0] ** 2 + c[6] ** 2 + c[11] ** 2) >= sigma
-    assert all(map(math.isfinite, c))
+@pytest.mark.parametrize(
+    ("version", "is_old"), [((4, 7), False), ((4, 8), False), ((4, 6), True), ((3, 9), True)]
+)
+def test_every_version_of_ardupilot_reads_the_accuracy(
+    name: str, sigma: float, version: tuple[int, int], is_old: bool
+) -> None:
+    to = receiver("ardupilot")._replace(firmware=Firmware(*version, 0, 0))
+    position = POSITION._replace(covariance=(sigma**2, 0.0, 0.25 * sigma**2))
+    assert accuracy_read(parsed(encode(position, to, name)), is_old) == pytest.approx(sigma)
 
 
-@pytest.mark.parametrize("name", ["ODOMETRY", "VISION_POSITION_ESTIMATE", "GPS_INPUT", "COMMAND_INT"])
-def test_accuracy_beyond_ardupilots_limit_is_not_encoded(name: str) -> None:
+@pytest.mark.parametrize("sigma", [3.0, 20.0, 99.9])
+def test_unknown_version_is_never_given_too_good_an_accuracy(sigma: float) -> None:
+    m = encoded("ODOMETRY", covariance=(sigma**2, 0.0, sigma**2))
+    assert accuracy_read(m, is_old=False) == pytest.approx(sigma)
+    assert accuracy_read(m, is_old=True) >= sigma
+
+
+@pytest.mark.parametrize("name", ["ODOMETRY", "VISION_POSITION_ESTIMATE"])
+def test_accuracy_beyond_ardupilots_limit_is_stated_as_the_limit(name: str) -> None:
+    """ArduPilot limits it itself; a position worse than 100 m is better than none."""
+    m = encoded(name, covariance=(300.0**2, 0.0, 300.0**2))
+    assert accuracy_read(m, is_old=False) == pytest.approx(100.0)
+
+
+@pytest.mark.parametrize("name", ["GPS_INPUT", "COMMAND_INT"])
+def test_receiver_and_reset_beyond_ardupilots_limit_are_not_encoded(name: str) -> None:
     encoded(name, covariance=(99.0**2, 0.0, 99.0**2))
     with pytest.raises(CannotEncode, match="worse than"):
         encoded(name, covariance=(80.0**2, 70.0**2, 80.0**2))  # 80 m each way, 106 m along the diagonal
+
+
+@pytest.mark.parametrize("rate_hz", [2.0, 10.0])
+def test_filter_that_takes_errors_as_independent_is_as_sure_as_our_error_allows(rate_hz: float) -> None:
+    """Mean of a correlated error over a long time against what the filter believes of it.
+
+    An exponentially correlated error (sigma, tau) is averaged over a time T >> tau. A filter that takes f
+    messages a second with stated sigma s as independent believes s / sqrt(f T).
+    """
+    sigma, seconds = 3.0, 4000.0
+    stated = stated_as_independent(POSITION._replace(covariance=(sigma**2, 0.0, sigma**2)), rate_hz).sigma
+    believed = stated / math.sqrt(rate_hz * seconds)
+    rng = np.random.default_rng(1)
+    n, keep = round(seconds * rate_hz), math.exp(-1.0 / (rate_hz * CORRELATION_S))
+    drive = sigma * math.sqrt(1.0 - keep**2) * rng.standard_normal((n, 300))
+    error = sigma * rng.standard_normal(300)
+    total = np.zeros(300)
+    for step in drive:
+        error = keep * error + step
+        total += error
+    assert np.sqrt(np.mean((total / n) ** 2)) == pytest.approx(believed, rel=0.1)
+
+
+def test_independent_messages_keep_their_accuracy() -> None:
+    assert stated_as_independent(POSITION, 0.0) == POSITION  # a single one
 
 
 def test_px4_receives_the_true_accuracy() -> None:

@@ -1,0 +1,138 @@
+"""Local origin: a forged GPS_GLOBAL_ORIGIN never leads, a true change is followed and counted as a reset."""
+
+import math
+from typing import Any
+
+import pytest
+
+from companion.nav.geometry import Geodetic, displace, geodetic_to_local
+from companion.records import GlobalPosition, LocalOrigin, LocalPosition
+from companion.runtime.origin import TOLERANCE_M, OriginCheck
+from companion.units import SECOND_NS
+
+TRUE = Geodetic(math.radians(55.7), math.radians(37.7), 150.0)
+SPEED = (20.0, -15.0, 0.0)
+
+
+def moved(north_m: float, east_m: float = 0.0) -> Geodetic:
+    return displace(*TRUE, north_m, east_m, 0.0)
+
+
+class Autopilot:
+    """One estimator: its local and global positions refer to `origin`."""
+
+    def __init__(self, check: OriginCheck) -> None:
+        self.check, self.now, self.origin = check, 10**12, TRUE
+        self.place = moved(3000.0, -8000.0)
+        self.texts: list[str] = []
+
+    def state(self, place: Geodetic) -> None:
+        """Send GPS_GLOBAL_ORIGIN, or somebody does in its name."""
+        self.take(LocalOrigin(self.now, self.now, *place, "ardupilot"))
+
+    def take(self, record: Any) -> None:
+        self.texts += [event.text for event in self.check.receive(record)]
+
+    def fly(self, seconds: float) -> None:
+        """Send local positions at 10 Hz and global ones at 2 Hz, 20 ms later."""
+        for k in range(round(10 * seconds)):
+            self.now += SECOND_NS // 10
+            self.place = displace(*self.place, *(0.1 * v for v in SPEED))
+            x_n = geodetic_to_local("ardupilot", self.origin, self.place)
+            self.take(LocalPosition(self.now, self.now, x_n, SPEED))
+            if k % 5 == 0:
+                later = self.now + SECOND_NS // 50
+                place = displace(*self.place, *(0.02 * v for v in SPEED))
+                self.take(GlobalPosition(later, later, *place, SPEED, 100.0))
+
+    def off(self) -> float:
+        """Return the distance of the origin in use from the true one, m."""
+        assert self.check.origin is not None
+        used = self.check.origin
+        north, east, _ = geodetic_to_local("tangent", self.origin, Geodetic(used.lat, used.lon, used.alt_msl))
+        return math.hypot(north, east)
+
+
+@pytest.fixture
+def autopilot() -> Autopilot:
+    return Autopilot(OriginCheck(has_pairs=True))
+
+
+def test_stated_origin_is_used_once_pairs_agree(autopilot: Autopilot) -> None:
+    autopilot.state(TRUE)
+    assert autopilot.check.origin is None
+    autopilot.fly(3.0)
+    assert autopilot.off() == 0.0
+    assert (autopilot.check.resets, autopilot.texts) == (0, [])
+
+
+@pytest.mark.parametrize("off", [6.0, 50.0, 10_000.0, 2e6])
+def test_forged_origin_moves_nothing(autopilot: Autopilot, off: float) -> None:
+    autopilot.state(TRUE)
+    autopilot.fly(3.0)
+    for _ in range(5):
+        autopilot.state(moved(off))
+        autopilot.fly(20.0)
+        assert autopilot.off() == 0.0
+    assert autopilot.check.resets == 0
+    (text,) = autopilot.texts
+    assert "off the autopilot's positions: not used" in text
+
+
+def test_forged_origin_before_the_true_one(autopilot: Autopilot) -> None:
+    autopilot.state(moved(5000.0))
+    autopilot.fly(10.0)
+    assert autopilot.off() < 0.5  # the origin of the pairs
+    autopilot.state(TRUE)
+    autopilot.fly(10.0)
+    assert autopilot.off() < 0.5
+    assert autopilot.check.resets == 0
+
+
+@pytest.mark.parametrize("is_stated", [True, False])
+def test_true_change_is_followed_and_counted(autopilot: Autopilot, is_stated: bool) -> None:
+    autopilot.state(TRUE)
+    autopilot.fly(10.0)
+    autopilot.origin = moved(800.0, 600.0)
+    if is_stated:
+        autopilot.state(autopilot.origin)
+    autopilot.fly(3.0)
+    assert autopilot.off() < 0.5
+    assert autopilot.check.resets == 1
+    assert autopilot.texts[-1] == "local origin moved by 1000 m: position reset"
+
+
+def test_one_pair_across_a_jump_of_the_estimator_changes_nothing(autopilot: Autopilot) -> None:
+    """The estimator is reset by 300 m between the local and the global position."""
+    autopilot.state(TRUE)
+    autopilot.fly(10.1)
+    autopilot.place = displace(*autopilot.place, 300.0, 0.0, 0.0)
+    autopilot.take(GlobalPosition(autopilot.now, autopilot.now, *autopilot.place, SPEED, 100.0))
+    autopilot.fly(10.0)
+    assert (autopilot.off(), autopilot.check.resets, autopilot.texts) == (0.0, 0, [])
+
+
+def test_small_difference_is_no_change(autopilot: Autopilot) -> None:
+    autopilot.state(moved(0.8 * TOLERANCE_M))
+    autopilot.fly(10.0)
+    assert autopilot.off() == pytest.approx(0.8 * TOLERANCE_M, rel=0.01)
+    assert autopilot.check.resets == 0
+
+
+def test_reboot_forgets_the_origin_and_keeps_the_count(autopilot: Autopilot) -> None:
+    test_true_change_is_followed_and_counted(autopilot, True)
+    autopilot.check.forget()
+    assert autopilot.check.origin is None
+    assert autopilot.check.resets == 1
+
+
+def test_ins_of_its_own_uses_the_stated_origin(autopilot: Autopilot) -> None:
+    """Its drifting local position and the autopilot's global one are no pair."""
+    autopilot.check = OriginCheck(has_pairs=False)
+    autopilot.state(TRUE)
+    assert autopilot.off() == 0.0
+    autopilot.origin = moved(0.0, 500.0)
+    autopilot.fly(10.0)
+    assert autopilot.check.resets == 0
+    autopilot.state(autopilot.origin)
+    assert (autopilot.off(), autopilot.check.resets) == (0.0, 1)
