@@ -227,6 +227,7 @@ class Session:
         self.reader = frame.Reader(counting=False)
         self.clock = BootClock()
         self.stream_rates = StreamRates(_by_id(rates_hz or {}))
+        self._unanswered: list[int] = []  # rates requested last: answers come in order and name no message
         self._system = system
         self._required_system = autopilot_system
         self._autopilot: int | None = None  # its system id
@@ -248,6 +249,7 @@ class Session:
         self._handlers = {
             mavlink.MAVLINK_MSG_ID_HEARTBEAT: self._on_heartbeat,
             mavlink.MAVLINK_MSG_ID_TIMESYNC: self._on_timesync,
+            mavlink.MAVLINK_MSG_ID_COMMAND_ACK: self._on_acknowledgement,
         }
 
     @property
@@ -311,7 +313,9 @@ class Session:
         if self._up and now_ns >= self._timesync_at:
             self._timesync_at = now_ns + TIMESYNC_INTERVAL
             self.send(dialect.new("TIMESYNC", ts1=self.clock.request(now_ns)))
-        for msgid, rate_hz in self.stream_rates.due(now_ns):
+        if due := self.stream_rates.due(now_ns):
+            self._unanswered = [msgid for msgid, _ in due]
+        for msgid, rate_hz in due:
             self._request_rate(msgid, rate_hz)
         return events
 
@@ -414,6 +418,14 @@ class Session:
         else:
             self._ignored.add(found.system)
             events.append(SecondAutopilot(now, found.system, self._autopilot or self._required_system or 0))
+
+    def _on_acknowledgement(self, message: Message, found: Frame, now: int, events: list[Event]) -> None:
+        """Match the answer to a requested rate with its message, by the order of the requests."""
+        is_rate = message.command == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL
+        if is_rate and self._unanswered and message.target_component in (0, self.component):
+            msgid = self._unanswered.pop(0)
+            if message.result != mavlink.MAV_RESULT_ACCEPTED:
+                self.stream_rates.refuse(msgid)
 
     def _on_timesync(self, message: Message, found: Frame, now: int, events: list[Event]) -> None:
         if message.tc1 == 0:

@@ -38,6 +38,7 @@ class Autopilot:
         self.received: list[dialect.Message] = []
         self.intervals: dict[int, int] = {}
         self.obeys = self.answers = True
+        self.limit_hz: float | None = None  # a faster rate is refused, in an answer that names no message
 
     def message(self, name: str, **values: object) -> bytes:
         self.sequence = self.sequence + 1 & 0xFF
@@ -55,7 +56,10 @@ class Autopilot:
             message = dialect.decode(found)
             self.received.append(message)
             if found.msgid == 76 and message.command == 511 and self.obeys:
-                self.intervals[int(message.param1)] = int(message.param2) * 1000
+                is_refused = self.limit_hz is not None and message.param2 < 1e6 / self.limit_hz
+                self.intervals[int(message.param1)] = SECOND if is_refused else int(message.param2) * 1000
+                if self.answers and self.limit_hz is not None:
+                    sent += self.message("COMMAND_ACK", command=511, result=2 if is_refused else 0)
             if found.msgid == 111 and message.tc1 == 0 and self.answers:
                 sent += self.message("TIMESYNC", tc1=boot, ts1=message.ts1)
         if boot % SECOND == 0:
@@ -248,11 +252,40 @@ def test_arriving_rate_is_requested_once_and_an_overwritten_one_again() -> None:
     assert peer.intervals[LOCAL_POSITION] == 100 * MS
 
 
-def test_refused_rate_is_requested_with_growing_pauses() -> None:
-    session, peer = Session(rates_hz={"LOCAL_POSITION_NED": 10}), Autopilot()
+def requests(peer: Autopilot) -> list[float]:
+    """Return the requested rates, Hz."""
+    return [1e6 / m.param2 for m in peer.received if m.get_type() == "COMMAND_LONG"]
+
+
+def test_request_without_effect_is_repeated_then_lowered_and_ends() -> None:
+    session, peer = Session(rates_hz={"LOCAL_POSITION_NED": 8}), Autopilot()
     peer.obeys = False
-    run(session, peer, 0, 300)
-    assert peer.names().count("COMMAND_LONG") == 8  # at 0, 5, 15, 35, 75, 135, 195, 255 s
+    peer.intervals[LOCAL_POSITION] = 0
+    run(session, peer, 0, 1500)
+    assert requests(peer) == pytest.approx([8, 8, 4, 4, 2, 2, 1, 1, 0.5, 0.5])
+
+
+@pytest.mark.parametrize("answers", [True, False])
+def test_rate_above_the_autopilots_limit_is_lowered_and_the_refusal_believed(answers: bool) -> None:
+    """As ArduPilot with a main loop of 50 Hz: 50 Hz is refused, and the stream stays at 1 Hz."""
+    session, peer = Session(rates_hz={"LOCAL_POSITION_NED": 50}), Autopilot()
+    peer.limit_hz, peer.answers = 40.0, answers
+    run(session, peer, 0, 600)
+    assert requests(peer) == pytest.approx([50, 25] if answers else [50, 50, 25])
+    assert session.stream_rates.rates()[LOCAL_POSITION][1] == pytest.approx(25, rel=0.05)
+
+
+def test_rate_once_reached_is_requested_until_it_is_back() -> None:
+    """A ground station that overwrites it for long, or a bad line: no reason to ask for less."""
+    session, peer = Session(rates_hz={"LOCAL_POSITION_NED": 10}), Autopilot()
+    run(session, peer, 0, 30)
+    peer.obeys = False
+    peer.intervals[LOCAL_POSITION] = SECOND
+    run(session, peer, 30 * SECOND, 600)
+    assert set(requests(peer)) == {10.0}
+    peer.obeys = True
+    run(session, peer, 630 * SECOND, 70)
+    assert peer.intervals[LOCAL_POSITION] == 100 * MS
 
 
 def test_second_autopilot_is_reported_once_and_ignored() -> None:
