@@ -16,7 +16,16 @@ from companion.output.encode import CannotEncode, Receiver, encode
 from companion.output.gate import Gate, LocalFrame, Position, WithholdingMonitor
 from companion.output.position_reset import PositionReset
 from companion.output.source_switch import SourceSwitch, selected
-from companion.records import Event, FilterStatus, GlobalPosition, Gnss, Solution, Stamped, SystemTime
+from companion.records import (
+    Event,
+    FilterStatus,
+    GlobalPosition,
+    Gnss,
+    RsbnFix,
+    Solution,
+    Stamped,
+    SystemTime,
+)
 
 DISPLAY_NAMES = {RESET: "external position"}
 NOT_FUSED = frozenset({RESET, MESSAGES["gps_input"]})
@@ -40,7 +49,7 @@ class AutopilotOutput:
         return self._monitor.counts
 
     def receive(self, record: Stamped) -> None:
-        """Process a record from the autopilot."""
+        """Process a record from the autopilot or a beacon."""
         if isinstance(record, SystemTime):
             if record.unix_ns is not None:
                 self.unix_ns = record.unix_ns - record.t_ns
@@ -48,6 +57,8 @@ class AutopilotOutput:
             self._position_reset.receive(record)
             if isinstance(record, Gnss) and record.receiver == 0:
                 self._source_switch.receive(record)
+        elif isinstance(record, RsbnFix):
+            self._source_switch.receive(record)
 
     def handle_reboot(self) -> None:
         """Reset what was known of the autopilot; it has rebooted."""

@@ -2,7 +2,7 @@
 
 ArduPilot accepts a source set that has no data, and is then lost; and a companion that takes an aircraft
 off a healthy GNSS does harm. So set 2 (our position) is requested only while our position goes out, and
-only if the receiver itself has no fix, or GNSS is false by the posterior with a beacon as witness: never
+only if the receiver itself has no fix, or GNSS is false by the posterior and a beacon contradicts it: never
 because innovations were rejected. Set 1 (GNSS) is requested whenever the receiver has a fix that is not
 held false, also when there is no solution. The command is repeated until it is acknowledged.
 
@@ -18,7 +18,8 @@ from typing import NamedTuple
 
 from companion.link import dialect
 from companion.link.dialect import Message, mavlink
-from companion.records import Event, Gnss, Severity, Solution
+from companion.output.beacon_witness import BeaconWitness
+from companion.records import Event, Gnss, RsbnFix, Severity, Solution
 from companion.units import SECOND_NS
 
 GNSS_SET, COMPANION_SET = 1, 2
@@ -84,7 +85,7 @@ class Situation(NamedTuple):
     no_fix_s: float  # the receiver has reported no fix
     silent_s: float  # nothing was received from a receiver that was received before
     gnss_false: float | None  # probability, None without a recent solution
-    witness: bool  # a beacon is received and believed
+    witness: bool  # a beacon is received and believed, and itself contradicts GNSS
     sent_s: float  # our position has gone out
     stopped_s: float  # our position has not gone out, after it did
 
@@ -169,6 +170,7 @@ class SourceSwitch:
         self._receiver_ns: int | None = None
         self._sent_ns: int | None = None
         self._solution: Solution | None = None
+        self._witness = BeaconWitness()
         self._required: int | None = None
         self._wanted: int | None = None
         self._held: int | None = None
@@ -178,8 +180,15 @@ class SourceSwitch:
         self._next_ns: int | None = None  # None: nothing to request
         self._events: list[Event] = []
 
-    def receive(self, record: Gnss) -> None:
-        """Note what the autopilot's receiver reports; a repeated fix counts: the receiver still reports."""
+    def receive(self, record: Gnss | RsbnFix) -> None:
+        """Note what the autopilot's receiver reports, or a beacon.
+
+        A repeated GNSS fix counts: the receiver still reports.
+        """
+        doubt = None if self._solution is None else self._solution.gnss_false
+        self._witness.receive(record, is_believed=doubt is not None and doubt < BELIEVED)
+        if isinstance(record, RsbnFix):
+            return
         now = record.rx_ns
         self._receiver_ns = now
         self._fix.update(record.has_3d_fix, now, 3 * SECOND_NS)
@@ -202,7 +211,7 @@ class SourceSwitch:
             no_fix_s=self._no_fix.held_s(now_ns, patience),
             silent_s=silent,
             gnss_false=solution.gnss_false if fresh and solution is not None else None,
-            witness=fresh and solution is not None and solution.witness,
+            witness=fresh and solution is not None and solution.witness and self._witness.contradicts,
             sent_s=self._sent.held_s(now_ns),
             stopped_s=-1.0 if self._sent_ns is None else (now_ns - self._sent_ns) * 1e-9,
         )

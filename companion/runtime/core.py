@@ -333,7 +333,11 @@ class CompanionCore:
         # the leading link receives the same messages
         is_duplicate = link.session.is_up and link is not self.leading_link
         for record in decode(event.message, event.received_ns, link.sender):
-            link.output.receive(record)
+            if not isinstance(record, RsbnFix):
+                link.output.receive(record)
+            elif not is_duplicate:
+                for each in self.links.values():
+                    each.output.receive(record)
             if not is_duplicate:
                 self._on_record(record)
 

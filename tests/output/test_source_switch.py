@@ -13,6 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from companion.link import dialect
+from companion.nav.geometry import Geodetic, displace, slant_range_azimuth
 from companion.output.source_switch import (
     BELIEVED,
     FALSE,
@@ -31,7 +32,7 @@ from companion.output.source_switch import (
     required_set,
     selected,
 )
-from companion.records import Gnss, Mode, Solution
+from companion.records import Gnss, Mode, RsbnFix, Solution
 from companion.units import SECOND_NS
 
 TENTH = SECOND_NS // 10
@@ -143,6 +144,14 @@ def solution(now: int, gnss_false: float | None, witness: bool) -> Solution:
     )
 
 
+def beacon_fix(now: int, off: float) -> RsbnFix:
+    """Return an answer of a beacon 60 km to the east, its azimuth off by `off` (m, one sigma is 131 m)."""
+    place, beacon = Geodetic(1.0, 0.5, 100.0), displace(1.0, 0.5, 100.0, 0.0, 60e3, 0.0)
+    true = slant_range_azimuth(beacon, place)
+    azimuth = true.azimuth + off / 60e3
+    return RsbnFix(now, now, 1, *beacon, azimuth, true.slant_range, math.radians(0.125), 110.0)
+
+
 class Flight:
     """An autopilot that answers with `answer` (None: no answer); its receiver and our solutions at 5 Hz."""
 
@@ -159,13 +168,20 @@ class Flight:
         solved: bool = True,
         false: float = 1e-6,
         witness: bool = True,
+        contradicted: bool | None = None,
     ) -> float:
-        """Simulate `seconds`, `fix` None is a silent receiver; return the time at the end, s."""
+        """Simulate `seconds`, `fix` None is a silent receiver; return the time at the end, s.
+
+        The beacon contradicts GNSS (by ten sigma) where GNSS is false, or as `contradicted`.
+        """
         for k in range(round(10 * seconds)):
             self.now += TENTH
             if fix is not None and k % 2:
                 kind = 3 if fix else 1
                 self.switch.receive(Gnss(self.now, self.now, 0, self.now // 1000, kind, 1.0, 0.5, 100.0))
+            if solved and witness and k % 10 == 0:
+                is_false = false > 0.9 if contradicted is None else contradicted
+                self.switch.receive(beacon_fix(self.now, 1300.0 if is_false else 0.0))
             if solved:
                 self.switch.note_output(solution(self.now, false, witness), sent, self.now)
             if solved or k % 10 == 0:
@@ -228,6 +244,14 @@ def test_false_gnss_with_a_witness() -> None:
     assert flight.sets == [1, 2]
     flight.fly(60.0, false=0.01)
     assert flight.sets == [1, 2, 1]
+
+
+def test_false_gnss_that_the_beacon_agrees_with_switches_nothing() -> None:
+    """Flown: a turn in turbulence was taken for a drift of GNSS; the beacon was received and saw nothing."""
+    flight = Flight()
+    flight.fly(60.0)
+    flight.fly(600.0, false=1.0, witness=True, contradicted=False)
+    assert flight.sets == [1]
 
 
 def test_lost_witness_leaves_the_aircraft_on_our_position_while_it_goes_out() -> None:

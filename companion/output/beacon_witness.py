@@ -1,0 +1,88 @@
+"""Beacon witness: whether the beacons themselves contradict GNSS, without any channel between. No I/O.
+
+A source set is a matter of the aircraft's safety, so "GNSS is false" is not left to the navigator alone: its
+channels are models (flown on ArduPlane: a turn in turbulence was taken for a GNSS that drifts). Here every
+azimuth and range is compared with the one that the GNSS fix of the same instant predicts. The mean of the
+last `WINDOW_NS` must differ from the earlier mean, of when GNSS was believed, by more than `SIGMAS` of both
+means: a constant error of the beacon cancels. At 60 km (131 m across) 2 m/s are seen after 45 s (at most
+75 s), and a healthy GNSS is contradicted 0.03 % of the time.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+
+from companion.nav.geometry import Geodetic, displace, slant_range_azimuth, wrap_angle
+from companion.records import Gnss, RsbnFix
+from companion.units import SECOND_NS
+
+WINDOW_NS = 20 * SECOND_NS
+SIGMAS = 3.0
+LEAST = 10  # fixes in the window
+MOST = 300  # fixes that the earlier mean remembers
+APART_S = 1.0  # a GNSS fix further from the beacon's time predicts nothing
+
+
+class Residuals:
+    """Residuals of one component of one beacon, in its sigmas: those of the window, and the earlier mean.
+
+    The earlier mean starts at 0 with the weight of one fix: an unknown constant error of one sigma.
+    """
+
+    def __init__(self) -> None:
+        self._window: deque[tuple[int, float, bool]] = deque()
+        self._mean, self._weight = 0.0, 1.0
+
+    def add(self, t_ns: int, residual: float, is_believed: bool) -> None:
+        """Add one; those that leave the window join the earlier mean if GNSS was believed."""
+        self._window.append((t_ns, residual, is_believed))
+        while t_ns - self._window[0][0] > WINDOW_NS:
+            _, old, was_believed = self._window.popleft()
+            if was_believed:
+                self._weight = min(self._weight + 1.0, MOST)
+                self._mean += (old - self._mean) / self._weight
+
+    @property
+    def significance(self) -> float:
+        """By how many sigmas the window differs from the earlier mean, at the time of the last fix."""
+        if len(self._window) < LEAST:
+            return 0.0
+        difference = sum(residual for _, residual, _ in self._window) / len(self._window) - self._mean
+        return abs(difference) / math.sqrt(1.0 / len(self._window) + 1.0 / self._weight)
+
+
+class BeaconWitness:
+    """Comparison of all beacons with the autopilot's first receiver."""
+
+    def __init__(self) -> None:
+        self._fix: Gnss | None = None
+        self._residuals: dict[tuple[int, str], Residuals] = {}
+
+    def receive(self, record: Gnss | RsbnFix, is_believed: bool) -> None:
+        """Process a fix; `is_believed`: the navigator believes GNSS."""
+        if isinstance(record, Gnss):
+            self._fix = record if record.has_3d_fix else None
+            return
+        fix = self._fix
+        if fix is None or abs(dt := (record.t_ns - fix.t_ns) * 1e-9) > APART_S:
+            return
+        north, east, _ = fix.v_n or (0.0, 0.0, 0.0)
+        place = displace(fix.lat, fix.lon, fix.alt_msl, north * dt, east * dt, 0.0)
+        predicted = slant_range_azimuth(Geodetic(record.lat, record.lon, record.alt), place)
+        if record.slant_range is not None:
+            off = record.slant_range - predicted.slant_range
+            self._add(record, "range", off / record.sigma_range, is_believed)
+        is_low = predicted.slant_range > 2.0 * abs(place.alt - record.alt)  # not in the cone of silence
+        if record.azimuth is not None and is_low:
+            off = wrap_angle(record.azimuth - predicted.azimuth)
+            self._add(record, "azimuth", off / record.sigma_azimuth, is_believed)
+
+    @property
+    def contradicts(self) -> bool:
+        """Whether a beacon contradicted GNSS when it was last received."""
+        return any(residuals.significance > SIGMAS for residuals in self._residuals.values())
+
+    def _add(self, record: RsbnFix, component: str, residual: float, is_believed: bool) -> None:
+        track = self._residuals.setdefault((record.beacon, component), Residuals())
+        track.add(record.t_ns, residual, is_believed)

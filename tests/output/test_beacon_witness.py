@@ -1,0 +1,74 @@
+"""Beacon witness: a GNSS that is drawn off is seen in time; a beacon's constant error and noise are not."""
+
+import math
+
+import numpy as np
+import pytest
+
+from companion.nav.geometry import Geodetic, displace, slant_range_azimuth
+from companion.output.beacon_witness import BeaconWitness
+from companion.records import Gnss, RsbnFix
+from companion.units import SECOND_NS
+
+BEACON = Geodetic(math.radians(55.75), math.radians(38.57), 200.0)
+START = displace(*BEACON, 0.0, -60e3, 0.0)
+SIGMA_AZIMUTH, SIGMA_RANGE = math.radians(0.125), 109.0
+
+
+class Flight:
+    """60 km west of a beacon, 25 m/s to the north; an answer a second."""
+
+    def __init__(self, seed: int, azimuth_deg: float = 0.0, range_m: float = 0.0) -> None:
+        self.witness, self.rng, self.seconds = BeaconWitness(), np.random.default_rng(seed), 0.0
+        self.azimuth, self.range = math.radians(azimuth_deg), range_m
+
+    def fly(
+        self, seconds: int, pull: tuple[float, float] = (0.0, 0.0), is_believed: bool = True
+    ) -> int | None:
+        """Fly, GNSS pulled off at `pull` (m/s north, east); return when the witness contradicted first."""
+        first = None
+        for k in range(seconds):
+            self.seconds += 1.0
+            now = round(self.seconds * SECOND_NS) + 10**12
+            true = displace(*START, 25.0 * self.seconds, 0.0, 300.0)
+            seen = displace(*true, pull[0] * k, pull[1] * k, 0.0)
+            self.witness.receive(Gnss(now, now, 0, now // 1000, 3, *seen, v_n=(25.0, 0.0, 0.0)), is_believed)
+            line = slant_range_azimuth(BEACON, true)
+            azimuth = line.azimuth + self.azimuth + SIGMA_AZIMUTH * self.rng.standard_normal()
+            slant = line.slant_range + self.range + SIGMA_RANGE * self.rng.standard_normal()
+            self.witness.receive(
+                RsbnFix(now, now, 7, *BEACON, azimuth, slant, SIGMA_AZIMUTH, SIGMA_RANGE), is_believed
+            )
+            if first is None and self.witness.contradicts:
+                first = k
+        return first
+
+
+@pytest.mark.parametrize("pull", [(2.0, 0.0), (-2.0, 0.0), (0.0, 2.0), (0.0, -2.0)])
+@pytest.mark.parametrize("seed", range(5))
+def test_gnss_drawn_off_is_seen_before_150_m(seed: int, pull: tuple[float, float]) -> None:
+    flight = Flight(seed)
+    flight.fly(120)
+    seen = flight.fly(150, pull)
+    assert seen is not None and 2.0 * seen < 150.0
+    assert flight.fly(300, pull, is_believed=False) == 0  # and stays seen
+
+
+@pytest.mark.parametrize(("azimuth_deg", "range_m"), [(0.0, 0.0), (0.125, 0.0), (0.0, 100.0)])
+def test_healthy_gnss_is_hardly_ever_contradicted(azimuth_deg: float, range_m: float) -> None:
+    """Noise and a constant error of one sigma: together with a wrong navigator this must not happen."""
+    contradicted = 0
+    for seed in range(3):
+        flight = Flight(seed, azimuth_deg, range_m)
+        contradicted += sum(flight.fly(1) is not None for _ in range(1200))
+    assert contradicted <= 0.01 * 3600
+
+
+def test_nothing_is_said_without_a_beacon_or_without_a_fix() -> None:
+    flight = Flight(1)
+    assert not flight.witness.contradicts
+    now = 10**12
+    for k in range(60):
+        fix = RsbnFix(now + k * SECOND_NS, now, 7, *BEACON, 1.0, 1e3, SIGMA_AZIMUTH, SIGMA_RANGE)
+        flight.witness.receive(fix, is_believed=True)
+    assert not flight.witness.contradicts
