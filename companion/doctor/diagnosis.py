@@ -5,7 +5,7 @@ Values only: `examination` observes, `rendering` shows.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Set
 from typing import NamedTuple
 
 from companion.config import Config, Sensor
@@ -35,6 +35,8 @@ RECORD_TYPES: Mapping[str, type] = {
 }
 #: Sensor of `inertial.source` that a record belongs to; the others are always used.
 SENSORS: Mapping[type, Sensor] = {Imu: "imu", AirData: "air_data", AirspeedSensor: "air_data"}
+#: ArduPilot's text after VISO_TYPE was set and before the reboot.
+NOT_REBOOTED = "VisOdom: out of memory"
 LOGGED = frozenset({"EKF_STATUS_REPORT", "SIM_STATE"})
 
 
@@ -136,6 +138,33 @@ def check_script(config: Config, make: str, runs: bool) -> list[Finding]:
         return []
     absent = "does not run: if the companion fails, the pilot must select set 1 (deploy/ardupilot)"
     return [Finding("source set script", "runs" if runs else absent, "", None)]
+
+
+def check_arming(make: str, failing: Set[str]) -> list[Finding]:
+    """Report the arming checks that fail, and a parameter that waits for a reboot."""
+    if make != "ardupilot":
+        return []
+    found = [Finding("arming checks", "; ".join(sorted(failing)) or "none fails", "", None)]
+    if any(text.startswith(NOT_REBOOTED) for text in failing):
+        advice = "reboot the autopilot: VISO_TYPE takes effect after it"
+        found.append(Finding("reboot", "needed", "done", False, advice))
+    return found
+
+
+def check_signing(is_refused: bool) -> list[Finding]:
+    """Report an autopilot that signs and answers nothing: it drops frames that are not signed by its key."""
+    advice = "the autopilot wants signed frames: set signing.key_file to its key"
+    return [Finding("signing", "no answer to our frames", "signed", False, advice)] if is_refused else []
+
+
+def check_feeders(feeders: Set[str]) -> list[Finding]:
+    """Report others that send positions to the autopilot's estimator."""
+    advice = "only one may feed the autopilot: stop the other"
+    return (
+        [Finding("other position source", ", ".join(sorted(feeders)), "none", False, advice)]
+        if feeders
+        else []
+    )
 
 
 def check_streams(

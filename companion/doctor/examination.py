@@ -15,7 +15,7 @@ from __future__ import annotations
 from typing import Any
 
 from companion.config import Config
-from companion.config.profiles import RequiredParameter
+from companion.config.profiles import MESSAGES, RequiredParameter
 from companion.config.required_parameters import required_parameters
 from companion.doctor.diagnosis import (
     Diagnosis,
@@ -23,8 +23,11 @@ from companion.doctor.diagnosis import (
     Identity,
     ParameterFinding,
     check_airspeed,
+    check_arming,
+    check_feeders,
     check_profile,
     check_script,
+    check_signing,
     check_streams,
 )
 from companion.link import dialect, frame
@@ -50,6 +53,11 @@ VERSION_TIMEOUT = 3 * SECOND_NS
 #: Observation time, and observation time if something is not well.
 OBSERVE, OBSERVE_LONGER = 6 * SECOND_NS, 14 * SECOND_NS
 MAX_LOSS = 0.05
+PREARM = "PreArm: "
+#: Messages that an autopilot sends only when asked, or in answer.
+ANSWERS = frozenset({"AUTOPILOT_VERSION", "COMMAND_ACK", "PARAM_VALUE"})
+#: Messages by which another component may feed the same input.
+FED = frozenset(MESSAGES.values()) - {MESSAGES["external_position"]}
 
 
 class Examination:
@@ -75,6 +83,10 @@ class Examination:
         self._origin: Any = None
         self._airspeed: bool | None = None  # whether the airspeed sensor is healthy
         self._has_script = False  # the source set script of deploy/ardupilot reports
+        self._is_signing = False  # the autopilot signs its frames
+        self._is_answering = False  # it answered one of our requests
+        self._arming_checks: set[str] = set()  # that fail
+        self._feeders: set[str] = set()  # others that send a position to it
         self._others: set[int] = set()
         self._beacons: set[int] = set()
         self._client: ParameterClient | None = None
@@ -119,6 +131,8 @@ class Examination:
                 self._request_message(mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION)
             if self._origin is None:
                 self._request_message(mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN)
+            if self.make == "ardupilot" and not self._arming_checks and not self._identity().is_armed:
+                self._command(mavlink.MAV_CMD_RUN_PREARM_CHECKS, 0)
         if self._client is None and (self._version is not None or now_ns - self._start >= VERSION_TIMEOUT):
             self._begin_reading()
         if self._client is not None:
@@ -170,8 +184,14 @@ class Examination:
         if event.frame.msgid == rsbn.MAVLINK_MSG_ID_RSBN_MEASUREMENT:
             self._beacons.add(event.message.beacon_id)
         if not event.from_autopilot:
+            if (name := event.message.get_type()) in FED:
+                self._feeders.add(f"{name} of {event.frame.system}/{event.frame.component}")
             return
-        if event.frame.msgid == mavlink.MAVLINK_MSG_ID_HEARTBEAT:
+        self._is_signing |= event.frame.signature is not None
+        self._is_answering |= event.message.get_type() in ANSWERS
+        if event.frame.msgid == mavlink.MAVLINK_MSG_ID_STATUSTEXT and event.message.text.startswith(PREARM):
+            self._arming_checks.add(event.message.text.removeprefix(PREARM))
+        elif event.frame.msgid == mavlink.MAVLINK_MSG_ID_HEARTBEAT:
             self._heartbeat = event.message
         elif event.frame.msgid == mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION:
             self._version = event.message
@@ -194,13 +214,16 @@ class Examination:
             self._client.read(need.name for need in self._needed)
 
     def _request_message(self, msgid: int) -> None:
+        self._command(mavlink.MAV_CMD_REQUEST_MESSAGE, msgid)
+
+    def _command(self, command: int, param1: float) -> None:
         self.session.send(
             dialect.new(
                 "COMMAND_LONG",
                 target_system=self.session.autopilot or 0,
                 target_component=mavlink.MAV_COMP_ID_AUTOPILOT1,
-                command=mavlink.MAV_CMD_REQUEST_MESSAGE,
-                param1=msgid,
+                command=command,
+                param1=param1,
             )
         )
 
@@ -232,6 +255,9 @@ class Examination:
             *check_streams(self._config, self.make, self.session.stream_rates.rates()),
             *check_airspeed(self._config, self._airspeed),
             *check_script(self._config, self.make, self._has_script),
+            *check_arming(self.make, self._arming_checks),
+            *check_signing(self._is_signing and not self._is_answering),
+            *check_feeders(self._feeders),
             *self._check_link(now),
             Finding("RSBN beacons", beacons or "none", "", None),
         ]

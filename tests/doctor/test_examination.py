@@ -10,8 +10,10 @@ from companion.config import Config, load
 from companion.config.required_parameters import required_parameters
 from companion.doctor.diagnosis import Diagnosis, Finding, check_airspeed
 from companion.doctor.examination import OBSERVE, OBSERVE_LONGER, Examination
+from companion.doctor.rendering import summary
 from companion.link import dialect, frame
 from companion.link.parameter_client import ATTEMPTS, SILENCE
+from companion.link.signing import Signing
 from sitl.autopilot import SimulatedAutopilot
 from sitl.scenarios import get_scenario
 from sitl.world import World
@@ -35,7 +37,8 @@ class Bench:
         world = WORLDS[make]
         self.autopilot = SimulatedAutopilot(world.scenario, world=world)
         self.autopilot.is_armed = False
-        self.examination = Examination(config or profile(make))
+        self.config = config or profile(make)
+        self.examination = Examination(self.config)
         self.now = 0
         self.sent: list[frame.Frame] = []
         self.to_us: Passing = lambda data: data
@@ -203,6 +206,58 @@ def test_missing_airspeed_sensor_is_reported_and_no_problem(
 
 def test_airspeed_sensor_of_the_autopilot_is_found() -> None:
     assert found(Bench("ardupilot").look(), "airspeed sensor").found == "healthy"
+
+
+def text(words: str) -> bytes:
+    return frame.encode(dialect.new("STATUSTEXT", severity=2, text=words.encode()), 0, 1, 1)
+
+
+@pytest.mark.parametrize(
+    ("words", "expected", "is_needed"),
+    [
+        ("PreArm: VisOdom: out of memory", "VisOdom: out of memory", True),
+        ("PreArm: VisOdom: not healthy", "VisOdom: not healthy", False),
+        ("EKF3 IMU0 is using GPS", "none fails", False),
+    ],
+)
+def test_arming_checks_are_reported_and_a_missing_reboot_is_a_problem(
+    words: str, expected: str, is_needed: bool
+) -> None:
+    bench = Bench("ardupilot")
+    while bench.now < SECOND:
+        bench.step()
+    bench.injected.append(text(words))
+    diagnosis = bench.look()
+    assert found(diagnosis, "arming checks").found == expected
+    assert ("reboot" in problems(diagnosis)) == is_needed
+    commands = {m.command for m in map(dialect.decode, bench.sent) if m.get_type() == "COMMAND_LONG"}
+    assert 401 in commands  # the checks were requested
+
+
+def test_autopilot_that_drops_unsigned_frames_is_recognised() -> None:
+    """It signs its own frames and answers nothing: no parameter is missing, the key is."""
+    bench = Bench("ardupilot")
+    signing = Signing(bytes(range(32)))
+
+    def signed(data: bytes) -> bytes:
+        parsed = frame.parse(data)
+        assert isinstance(parsed, frame.Frame)
+        message = dialect.decode(parsed)
+        sign = lambda raw: signing.sign(raw, 1, bench.now)  # noqa: E731
+        return frame.encode(message, parsed.sequence, parsed.system, parsed.component, sign)
+
+    bench.to_us, bench.to_it = signed, lambda data: b""
+    diagnosis = bench.look()
+    assert found(diagnosis, "signing").advice.startswith("the autopilot wants signed frames")
+    assert "absent" not in summary(bench.config, diagnosis)
+
+
+def test_another_position_source_is_a_problem() -> None:
+    bench = Bench("ardupilot")
+    while bench.now < SECOND:
+        bench.step()
+    bench.injected.append(frame.encode(dialect.new("ODOMETRY"), 0, 1, 197))
+    assert found(bench.look(), "other position source").found == "ODOMETRY of 1/197"
 
 
 def test_unanswered_timesync_is_found() -> None:
