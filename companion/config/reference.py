@@ -200,7 +200,7 @@ TEXTS: dict[str, dict[str, tuple[str, str]]] = {
             "the autopilot is set up for another: docs/outputs.md",
         ),
         "switch_sources": (
-            "Profile ardupilot: request EKF source set 2 while GNSS is lost, otherwise 1.",
+            "ardupilot: EKF source set 2 while GNSS is lost; px4: GNSS fusion off while GNSS is false.",
             "the pilot alone switches: false",
         ),
         "solution_hz": ("Least rate of solutions.", "the log needs more"),

@@ -199,7 +199,7 @@ class OutputConfig(Section, frozen=True):
 
     profile: Name = "monitor"
     via: Literal["auto"] | Via = "auto"
-    switch_sources: bool = True  # profile ardupilot: EKF source set 2 while GNSS is lost, otherwise 1
+    switch_sources: bool = True  # ardupilot: EKF source set 2 while GNSS is lost; px4: GNSS off while false
     solution_hz: Annotated[float, Meta(ge=0.1, le=50.0)] = (
         5.0  # minimum; at least the rate of the fastest message
     )
@@ -231,8 +231,8 @@ class OutputConfig(Section, frozen=True):
 
     @property
     def switches_sources(self) -> bool:
-        """Whether the companion selects the autopilot's EKF source set."""
-        return self.switch_sources and self.profile == "ardupilot"
+        """Whether the companion selects the autopilot's EKF source set, or switches PX4's GNSS fusion."""
+        return self.switch_sources and self.profile in ("ardupilot", "px4")
 
     @property
     def pace_hz(self) -> float:

@@ -14,6 +14,7 @@ from companion.config.profiles import MESSAGES, RESET
 from companion.link.dialect import Message, mavlink
 from companion.output.encode import CannotEncode, Receiver, encode
 from companion.output.gate import Gate, LocalFrame, Position, WithholdingMonitor
+from companion.output.gnss_fusion import GnssFusion
 from companion.output.position_reset import PositionReset
 from companion.output.source_switch import SourceSwitch, selected
 from companion.records import (
@@ -31,6 +32,11 @@ DISPLAY_NAMES = {RESET: "external position"}
 NOT_FUSED = frozenset({RESET, MESSAGES["gps_input"]})
 """A reset is no series of measurements; a receiver's accuracy is judged by limits of its own."""
 ON_SOURCE_SET_2 = frozenset({MESSAGES["odometry"], MESSAGES["vision"]})
+FUSED_BY_PX4 = ON_SOURCE_SET_2 | {MESSAGES["global_position_sensor"]}
+
+
+def _source_switch(config: Config) -> SourceSwitch:
+    return GnssFusion() if config.output.profile == "px4" else SourceSwitch()
 
 
 class AutopilotOutput:
@@ -40,7 +46,7 @@ class AutopilotOutput:
         self.config = config
         self.unix_ns: int | None = None
         self._gate, self._local_frame, self._monitor = Gate(), LocalFrame(), WithholdingMonitor()
-        self._position_reset, self._source_switch = PositionReset(), SourceSwitch()
+        self._position_reset, self._source_switch = PositionReset(), _source_switch(config)
         self._events: list[Event] = []
 
     @property
@@ -62,7 +68,7 @@ class AutopilotOutput:
 
     def handle_reboot(self) -> None:
         """Reset what was known of the autopilot; it has rebooted."""
-        self._position_reset, self._source_switch = PositionReset(), SourceSwitch()
+        self._position_reset, self._source_switch = PositionReset(), _source_switch(self.config)
         self._local_frame = LocalFrame()
 
     def handle_acknowledgement(self, command: int, result: int, now_ns: int) -> None:
@@ -94,7 +100,8 @@ class AutopilotOutput:
                     if reason is None:
                         encoded[name] = message
             self._add_event(self._monitor.update(DISPLAY_NAMES.get(name, name), reason, now))
-        if by_set := ON_SOURCE_SET_2.intersection(names):
+        led_by = FUSED_BY_PX4 if self.config.output.profile == "px4" else ON_SOURCE_SET_2
+        if by_set := led_by.intersection(names):
             self._source_switch.note_output(solution, not by_set.isdisjoint(encoded), now)
         return list(encoded.values())
 

@@ -98,7 +98,8 @@ class Predicate(NamedTuple):
     reason: str
 
 
-def _held_false(s: Situation) -> bool:
+def is_held_false(s: Situation) -> bool:
+    """Whether GNSS is false beyond doubt, with a beacon that contradicts it."""
     return s.gnss_false is not None and s.gnss_false > FALSE and s.witness
 
 
@@ -106,7 +107,7 @@ def _held_false(s: Situation) -> bool:
 TO_COMPANION = (
     Predicate("no fix", lambda s: s.no_fix_s >= NO_FIX_S, "GNSS is lost, using companion"),
     Predicate("receiver silent", lambda s: s.silent_s >= SILENT_S, "GNSS receiver silent, using companion"),
-    Predicate("GNSS false", _held_false, "GNSS is false, using companion"),
+    Predicate("GNSS false", is_held_false, "GNSS is false, using companion"),
 )
 #: Set 1 needs a fix and one of these.
 TO_GNSS = (
@@ -117,7 +118,7 @@ TO_GNSS = (
     ),
     Predicate(
         "companion stopped",
-        lambda s: s.stopped_s >= STOPPED_S and not _held_false(s),
+        lambda s: s.stopped_s >= STOPPED_S and not is_held_false(s),
         "no companion position",
     ),
 )
@@ -164,6 +165,8 @@ class SourceSwitch:
     `_required` is the decision of the table, `_wanted` the set that was requested last or that somebody else
     selected, `_held` the one that a person selected against the table.
     """
+
+    command = mavlink.MAV_CMD_SET_EKF_SOURCE_SET
 
     def __init__(self) -> None:
         self._fix, self._no_fix, self._sent = ConditionTimer(), ConditionTimer(), ConditionTimer()
@@ -216,9 +219,21 @@ class SourceSwitch:
             stopped_s=-1.0 if self._sent_ns is None else (now_ns - self._sent_ns) * 1e-9,
         )
 
+    def required(self, s: Situation) -> tuple[int, str] | None:
+        """Return the source set that must lead and the reason; None where the present one stays."""
+        return required_set(s)
+
+    def name(self, number: int | None) -> str:
+        """Return how a source set is reported."""
+        return f"EKF source set {number}"
+
+    def parameters(self, number: int | None) -> dict[str, float | None]:
+        """Return the parameters of the command that selects a source set."""
+        return {"param1": number}
+
     def update(self, now_ns: int) -> None:
         """Decide by the table; call it at least once a second, with or without solutions."""
-        decision = required_set(self.situation(now_ns))
+        decision = self.required(self.situation(now_ns))
         if decision is None:
             return
         is_new = decision[0] != self._required
@@ -253,11 +268,11 @@ class SourceSwitch:
 
     def handle_acknowledgement(self, command: int, result: int, now_ns: int) -> None:
         """Process the autopilot's COMMAND_ACK of one of our commands."""
-        if command != mavlink.MAV_CMD_SET_EKF_SOURCE_SET or self._next_ns is None or not self._tries:
+        if command != self.command or self._next_ns is None or not self._tries:
             return
         if result == mavlink.MAV_RESULT_ACCEPTED:
             self._next_ns = None
-            self._add_event(Severity.NOTICE, f"EKF source set {self._wanted}: {self._reason}", now_ns)
+            self._add_event(Severity.NOTICE, f"{self.name(self._wanted)}: {self._reason}", now_ns)
         elif result not in RETRIED:
             self._give_up(f"it answered MAV_RESULT {result}", now_ns)
 
@@ -275,9 +290,9 @@ class SourceSwitch:
                 "COMMAND_LONG",
                 target_system=system,
                 target_component=1,
-                command=mavlink.MAV_CMD_SET_EKF_SOURCE_SET,
+                command=self.command,
                 confirmation=confirmation,
-                param1=self._wanted,
+                **self.parameters(self._wanted),
             )
         ]
 
@@ -288,7 +303,7 @@ class SourceSwitch:
 
     def _give_up(self, why: str, now_ns: int) -> None:
         self._next_ns = None
-        text = f"the autopilot did not accept EKF source set {self._wanted} ({why}): switch it by hand"
+        text = f"the autopilot did not accept {self.name(self._wanted)} ({why}): switch it by hand"
         self._add_event(Severity.ERROR, text, now_ns)
 
     def _add_event(self, severity: int, text: str, now_ns: int) -> None:

@@ -1,0 +1,51 @@
+"""GNSS fusion of PX4, switched off while GNSS is held false. No I/O.
+
+PX4 has no source sets: it fuses GNSS and our position at once, so a false GNSS draws it off. Its estimator
+takes MAV_CMD_ESTIMATOR_SENSOR_ENABLE (development.xml of 2026; PR 26739 proposed 43005). GNSS is switched
+off only if it is false by the same predicate as on ArduPilot, never because it is lost: if the companion then
+failed, nobody would switch it on again. An autopilot that does not know the command is reported.
+"""
+
+from __future__ import annotations
+
+import math
+
+from companion.output.source_switch import (
+    COMPANION_SET,
+    GNSS_SET,
+    STEADY_S,
+    TO_GNSS,
+    Situation,
+    SourceSwitch,
+    is_held_false,
+)
+
+ESTIMATOR_SENSOR_ENABLE = 43006
+"""MAV_CMD_ESTIMATOR_SENSOR_ENABLE: source, instance, enable, estimator instance. Not in the dialect yet."""
+_GNSS, _FIRST = 0.0, 0.0  # ESTIMATOR_SENSOR_FUSION_SOURCE_GPS, the first receiver
+
+
+class GnssFusion(SourceSwitch):
+    """Fusion of PX4's first receiver; on at the start."""
+
+    command = ESTIMATOR_SENSOR_ENABLE
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._wanted = GNSS_SET
+
+    def required(self, s: Situation) -> tuple[int, str] | None:
+        """Return `COMPANION_SET` where GNSS must be off, `GNSS_SET` where on, and the reason."""
+        if is_held_false(s):
+            return (COMPANION_SET, "GNSS is false, using companion") if s.sent_s >= STEADY_S else None
+        reasons = [each.reason for each in TO_GNSS if s.fix_s >= 0.0 and each.holds(s)]
+        return (GNSS_SET, reasons[0]) if reasons else None
+
+    def name(self, number: int | None) -> str:
+        """Return how a state is reported."""
+        return "GNSS fusion off" if number == COMPANION_SET else "GNSS fusion on"
+
+    def parameters(self, number: int | None) -> dict[str, float | None]:
+        """Return the parameters of the command."""
+        is_on = float(number == GNSS_SET)
+        return {"param1": _GNSS, "param2": _FIRST, "param3": is_on, "param4": math.nan}

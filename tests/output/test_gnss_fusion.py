@@ -1,0 +1,70 @@
+"""GNSS fusion of PX4: off only for a false GNSS that a beacon contradicts, then on again; else untouched."""
+
+import math
+from typing import Any
+
+import pytest
+
+from companion.output.gnss_fusion import ESTIMATOR_SENSOR_ENABLE, GnssFusion
+from companion.output.source_switch import STEADY_S, Situation
+
+WELL = Situation(
+    fix_s=1e3, no_fix_s=-1.0, silent_s=0.1, gnss_false=1e-6, witness=False, sent_s=1e3, stopped_s=0.0
+)
+FALSE: dict[str, Any] = {"gnss_false": 0.9999, "witness": True}
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        ({}, 1),
+        (FALSE, 2),
+        ({**FALSE, "witness": False}, None),
+        ({**FALSE, "sent_s": STEADY_S - 0.1}, None),
+        ({"fix_s": -1.0, "no_fix_s": 100.0}, None),  # lost is not false
+        ({"fix_s": -1.0, "silent_s": 100.0}, None),
+        ({"gnss_false": 0.5}, None),
+        ({**FALSE, "witness": False, "sent_s": -1.0, "stopped_s": 5.0}, 1),
+    ],
+)
+def test_table(changes: dict[str, Any], expected: int | None) -> None:
+    decision = GnssFusion().required(WELL._replace(**changes))
+    assert (decision and decision[0]) == expected
+
+
+class Switch(GnssFusion):
+    """In a situation that the test sets."""
+
+    now = WELL
+
+    def situation(self, now_ns: int) -> Situation:
+        return self.now
+
+
+def requests(switch: Switch, situation: Situation, result: int, at: int) -> list[tuple[float, ...]]:
+    switch.now = situation
+    switch.update(at)
+    sent = switch.to_send(1, at)
+    for _ in sent:
+        switch.handle_acknowledgement(ESTIMATOR_SENSOR_ENABLE, result, at + 1)
+    return [(m.command, m.param1, m.param2, m.param3) for m in sent if math.isnan(m.param4)]
+
+
+def test_off_while_false_and_on_again() -> None:
+    switch, second = Switch(), 10**9
+    assert requests(switch, WELL, 0, second) == []  # on at the start: nothing to ask
+    assert requests(switch, WELL._replace(**FALSE), 0, 2 * second) == [(43006, 0.0, 0.0, 0.0)]
+    assert requests(switch, WELL._replace(**FALSE), 0, 9 * second) == []
+    assert requests(switch, WELL, 0, 10 * second) == [(43006, 0.0, 0.0, 1.0)]
+    assert [event.text for event in switch.take_events()] == [
+        "GNSS fusion off: GNSS is false, using companion",
+        "GNSS fusion on: GNSS has a fix",
+    ]
+
+
+def test_autopilot_that_does_not_know_the_command_is_reported_once() -> None:
+    switch, second = Switch(), 10**9
+    assert len(requests(switch, WELL._replace(**FALSE), 3, second)) == 1
+    assert requests(switch, WELL._replace(**FALSE), 3, 9 * second) == []
+    (event,) = switch.take_events()
+    assert event.text.startswith("the autopilot did not accept GNSS fusion off")
