@@ -10,9 +10,11 @@ import importlib
 import os
 import re
 import sys
+from collections.abc import Collection, Mapping
 from importlib.metadata import entry_points
 from importlib.util import find_spec
 from pathlib import Path
+from types import MappingProxyType
 
 import click
 
@@ -21,6 +23,7 @@ from companion.config import ConfigError
 from companion.storage.reader import LogError
 
 EX_IOERR, EX_CONFIG = 74, 78  # sysexits.h
+EX_INTERRUPTED = 130  # as a shell reports SIGINT
 COMMANDS = {
     "run": "companion.runtime.service:command",
     "replay": "companion.analysis.replay:command",
@@ -40,12 +43,27 @@ STUDIES = {
 }
 
 
+#: Sections of the help; a command that no section names is listed under the last one.
+SECTIONS = {
+    "Fly": ("run", "doctor", "check-config"),
+    "Look": ("live", "report", "log", "replay"),
+    "Study": ("loopback", "sitl", "campaign", "study"),
+    "Develop": ("bench", "kills", "soak"),
+}
+
+
 class LazyGroup(click.Group):
     """Command group whose commands are imported on use."""
 
-    def __init__(self, table: dict[str, str], plugins: str | None = None, **settings: object) -> None:
+    def __init__(
+        self,
+        table: dict[str, str],
+        plugins: str | None = None,
+        sections: Mapping[str, Collection[str]] = MappingProxyType({"Commands": ()}),
+        **settings: object,
+    ) -> None:
         super().__init__(**settings)  # type: ignore[arg-type]
-        self._table = dict(table)
+        self._table, self._sections = dict(table), sections
         if plugins:
             self._table |= {entry.name: entry.value for entry in entry_points(group=plugins)}
 
@@ -63,14 +81,19 @@ class LazyGroup(click.Group):
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the list of commands; a command of the table is not imported for its first sentence."""
-        limit = formatter.width - 6 - max(map(len, self.list_commands(ctx)))
-        rows = []
-        for name in self.list_commands(ctx):
-            doc = _docstring(*self._table[name].split(":")) if name in self._table else None
-            shown = click.Command(name, help=doc) if doc else self.get_command(ctx, name)
-            rows.append((name, shown.get_short_help_str(limit) if shown else ""))
-        with formatter.section("Commands"):
-            formatter.write_dl(rows)
+        left = self.list_commands(ctx)
+        limit = formatter.width - 6 - max(map(len, left))
+        for title, named in self._sections.items():
+            names = left if title == list(self._sections)[-1] else [name for name in named if name in left]
+            left = [name for name in left if name not in names]
+            if names:
+                with formatter.section(title):
+                    formatter.write_dl([(name, self._summary(ctx, name, limit)) for name in names])
+
+    def _summary(self, ctx: click.Context, name: str, limit: int) -> str:
+        doc = _docstring(*self._table[name].split(":")) if name in self._table else None
+        shown = click.Command(name, help=doc) if doc else self.get_command(ctx, name)
+        return shown.get_short_help_str(limit) if shown else ""
 
 
 def _docstring(module: str, function: str) -> str | None:
@@ -86,6 +109,7 @@ def _docstring(module: str, function: str) -> str | None:
 cli = LazyGroup(
     COMMANDS,
     "companion.commands",
+    SECTIONS,
     name="companion",
     help="Keeps an aircraft's position, and a guaranteed bound on it, when GNSS is gone.",
 )
@@ -98,7 +122,14 @@ cli.add_command(
 def main() -> None:
     """Run the command line; an error that the user can fix ends with one sentence and an exit code."""
     try:
-        cli(standalone_mode=True)
+        code = cli(standalone_mode=False)
+        sys.exit(code if isinstance(code, int) else 0)
+    except (KeyboardInterrupt, click.exceptions.Abort):
+        click.echo("companion: interrupted", err=True)
+        sys.exit(EX_INTERRUPTED)
+    except click.ClickException as error:
+        error.show()
+        sys.exit(error.exit_code)
     except ConfigError as error:
         click.echo(f"companion: {error}", err=True)
         sys.exit(EX_CONFIG)

@@ -218,7 +218,10 @@ def command(
     plot: Path | None,
     as_json: bool,
 ) -> None:
-    """Fly a scenario in virtual time, write its log, and print the error of each source in each phase."""
+    """Fly a scenario in virtual time and print the errors.
+
+    Writes the log of the flight, and prints the error of each source in each phase.
+    """
     try:
         chosen = get_scenario(scenario, **({} if seed is None else {"seed": seed}))
     except ValueError as error:

@@ -208,9 +208,10 @@ async def _run(runner: SimulatorRunner) -> None:
 def command(
     context: click.Context, connect: str, scenario: str, seed: int | None, speed: float, disarmed: bool
 ) -> None:
-    """Simulate an autopilot that flies a scenario in real time; connect `companion run` to the link.
+    """Simulate an autopilot in real time, or join a real one's.
 
-    Ends with the flight, at SIGINT or SIGTERM. Exit code 69: cannot listen on the address.
+    It flies a scenario; connect `companion run` to the link. Ends with the flight, at SIGINT or SIGTERM. Exit
+    code 69: cannot listen on the address.
 
     `bridge` connects to the simulator of a real autopilot, `play` plays back a recorded one.
     """

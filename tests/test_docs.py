@@ -11,6 +11,7 @@ from companion.config.profiles import PROFILES
 from companion.config.required_parameters import required_parameters
 from companion.estimate import bank
 from companion.link.dialect import type_named
+from companion.link.parameter_server import parameter_table
 from companion.navigator import own_channel
 from companion.output import source_switch
 from companion.output.gate import withholding_reason
@@ -206,3 +207,10 @@ def test_every_extra_in_docs_and_errors_exists() -> None:
     for source in (*ROOT.glob("companion/**/*.py"), *ROOT.glob("sitl/*.py")):
         assert set(re.findall(r"missing_package\(.*\"(\w+)\"\)", source.read_text())) <= set(extras), source
         assert "navigation-companion[" not in source.read_text(), source  # it is not on a package index
+
+
+def test_parameters_in_docs_are_those_of_the_server() -> None:
+    named = [cells for cells in rows("ground-station") if re.fullmatch(r"`[A-Z_]+`", cells[0])]
+    assert [(cells[0].strip("`"), tuple(cells[1].strip("`").split("."))) for cells in named] == [
+        (parameter.name, (parameter.section, parameter.key)) for parameter in parameter_table()
+    ]

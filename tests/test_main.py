@@ -1,8 +1,10 @@
 """Command line: help, output and exit codes."""
 
 import json
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -23,8 +25,32 @@ def companion(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
 def test_help_lists_every_command() -> None:
     done = CliRunner().invoke(cli, ["--help"])
     assert done.exit_code == 0
-    listed = {line.split()[0] for line in done.output.partition("Commands:")[2].splitlines() if line.split()}
-    assert listed >= set(COMMANDS)
+    lines = done.output.partition("Fly:")[2].splitlines()
+    assert {line.split()[0] for line in lines if line.split()} >= set(COMMANDS)
+    assert [line for line in lines if line and not line.startswith(" ")] == ["Look:", "Study:", "Develop:"]
+
+
+@pytest.mark.parametrize("arguments", [[], ["study"], ["log"], *([name] for name in COMMANDS)])
+def test_help_fits_80_columns(arguments: list[str]) -> None:
+    done = CliRunner().invoke(cli, [*arguments, "--help"], terminal_width=80)
+    assert max(len(line) for line in done.output.splitlines()) <= 80
+
+
+def test_interrupt_ends_in_one_line_and_130(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "companion", "loopback", "--logs", str(tmp_path)]
+    with subprocess.Popen(
+        command,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # a background shell ignores it
+    ) as running:
+        while not list(tmp_path.iterdir()):
+            time.sleep(0.05)
+        running.send_signal(signal.SIGINT)
+        out, err = running.communicate()
+    assert running.returncode == 130
+    assert (out, err.strip()) == ("", "companion: interrupted")
 
 
 @pytest.mark.parametrize(

@@ -173,11 +173,12 @@ def command(
     seed: int,
     as_json: bool,
 ) -> None:
-    """Run the navigator over LOG: our own MCAP (outputs are compared with the flight), or another recorder's.
+    """Run the navigator over a log.
 
-    Supported logs: MAVLink .tlog, ArduPilot .bin and .log, PX4 .ulg and folders of topics as CSV,
-    InertialNav .mat and .zip. A replay of another recorder's log, or with changes, is written to OUTPUT (by
-    default NAME.replay.mcap in the current folder). The CSV of beacons has the columns id, lat_deg, lon_deg,
+    LOG is our own MCAP (outputs are compared with the flight), or another recorder's. Supported logs:
+    MAVLink .tlog, ArduPilot .bin and .log, PX4 .ulg and folders of topics as CSV, InertialNav .mat and
+    .zip. A replay of another recorder's log, or with changes, is written to OUTPUT (by default
+    NAME.replay.mcap in the current folder). The CSV of beacons has the columns id, lat_deg, lon_deg,
     alt_m and optionally range_m; OurAirports' navaids.csv is also accepted.
     """
     start = time.perf_counter()

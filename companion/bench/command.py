@@ -58,8 +58,9 @@ def table(title: str, times: dict[str, list[float]]) -> Table:
 @click.argument("names", nargs=-1, type=click.Choice([*MODULES, "latency"]))
 @click.option("--json", "as_json", is_flag=True, help="Print JSON: seconds per call, every round.")
 def command(names: tuple[str, ...], as_json: bool) -> None:
-    """Time the parts NAMES (default: all except latency), interleaved in one run.
+    """Time the parts of the companion, interleaved in one run.
 
+    NAMES are the parts; default: all except latency.
     `latency` sends beacon measurements by UDP on the loopback interface to a complete service and waits for
     the corrected estimate; a plain asyncio UDP echo is measured for comparison.
     """

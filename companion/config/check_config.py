@@ -18,8 +18,9 @@ from companion.config.reference import commented_toml
 @click.option("--preset", metavar="NAME", help=f"Start from one of {', '.join(PRESETS)}.")
 @click.option("--json", "as_json", is_flag=True, help="Print the configuration in force as JSON.")
 def command(file: Path | None, defaults: bool, preset: str | None, as_json: bool) -> None:
-    """Check FILE and the COMPANION_SECTION__KEY variables, and print the configuration in force.
+    """Check a configuration, print it, or write one to start from.
 
+    Reads FILE and the COMPANION_SECTION__KEY variables, and prints the configuration in force.
     An unknown key or an invalid value is reported with the nearest valid one; the exit code is then 78.
 
     \b

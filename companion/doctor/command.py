@@ -21,6 +21,7 @@ from companion.config.profiles import PROFILES
 from companion.doctor.diagnosis import Diagnosis, Finding
 from companion.doctor.examination import Examination
 from companion.doctor.rendering import as_json, change_summary, parameter_table, print_diagnosis
+from companion.runtime.input_monitor import describe_silence
 from companion.runtime.service import EX_UNAVAILABLE
 from companion.runtime.signing_key import SigningKey
 from companion.transport.reconnect import Address, CannotListen, Connection, connect
@@ -98,7 +99,8 @@ async def run_examination(connection: AutopilotConnection, address: Address) -> 
     examination = connection.examination
     if not await connection.until(lambda now: examination.is_connected, CONNECT_TIMEOUT_S):
         raise NoAutopilot(
-            f"no autopilot found on {address} in {CONNECT_TIMEOUT_S:.0f} s: {_describe_traffic(connection)}"
+            f"no autopilot found on {address} in {CONNECT_TIMEOUT_S:.0f} s: "
+            f"{describe_silence(examination.session, connection.bytes > 0)}"
         )
     connection.reset_byte_count()
     await connection.until(examination.is_done, EXAMINATION_TIMEOUT_S)
@@ -124,19 +126,6 @@ async def set_parameters(connection: AutopilotConnection, before: Diagnosis) -> 
 def check_machine(bits: int) -> Finding:
     """Check that the numerical libraries are available for this computer."""
     return Finding("this machine", f"{bits}-bit", "64-bit", bits == 64, "install a 64-bit system")
-
-
-def _describe_traffic(connection: AutopilotConnection) -> str:
-    examination = connection.examination
-    senders = [f"{system}/{component}" for system, component in examination.session.reader.counts]
-    if refused := examination.session.rejected:
-        reasons = ", ".join(reason.name.lower() for reason in refused)
-        return f"frames rejected ({reasons}); let it sign with the key of signing.key_file"
-    if senders:
-        return f"received only {', '.join(senders)}; check the autopilot's connection and link.system_id"
-    if connection.bytes:
-        return f"{connection.bytes} bytes received, no MAVLink; check that both sides use the same baud rate"
-    return "no data received; check the address, the wiring (TX to RX) and the port's MAVLink protocol"
 
 
 def confirm_change(diagnosis: Diagnosis, yes: bool) -> str:
@@ -208,11 +197,11 @@ def command(
     yes: bool,
     as_json_: bool,
 ) -> None:
-    """Check the autopilot's parameters and the link against the output profile.
+    """Check the autopilot's parameters and the link.
 
-    Reads parameters and observes the link for 6 to 14 seconds. Nothing is set without --apply and
-    confirmation, or while the vehicle is armed. Exit codes: 0 all is well, 1 something is missing, 69 no
-    autopilot found, 78 invalid configuration.
+    Reads the parameters that the output profile requires and observes the link for 6 to 14 seconds. Nothing
+    is set without --apply and confirmation, or while the vehicle is armed. Exit codes: 0 all is well, 1
+    something is missing, 69 no autopilot found, 78 invalid configuration.
     """
     config = load(file, {"output.profile": profile}, pairs=pairs, preset=preset)
     try:

@@ -8,36 +8,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Set
 from typing import NamedTuple
 
-from companion.config import Config, Sensor
+from companion.config import Config
 from companion.config.profiles import PROFILES, RequiredParameter
-from companion.link.dialect import TYPES
 from companion.link.parameter_client import Value, equal_real32
-from companion.link.stream_rates import ENOUGH
-from companion.navigator.state import Settings
-from companion.navigator.step import uses
-from companion.records import AirData, AirspeedSensor, Attitude, Gnss, Imu, LocalPosition, Pressure
+from companion.runtime.input_monitor import stream_states
 
-#: Messages that a make does not send; it has others with the same content.
-MISSING_MESSAGES = {
-    "ardupilot": frozenset({"HIGHRES_IMU"}),
-    "px4": frozenset({"RAW_IMU", "EKF_STATUS_REPORT", "SIM_STATE"}),
-}
-#: Record type of each stream: one that the inertial channel does not use may be missing.
-RECORD_TYPES: Mapping[str, type] = {
-    "RAW_IMU": Imu,
-    "HIGHRES_IMU": Imu,
-    "LOCAL_POSITION_NED": LocalPosition,
-    "GPS_RAW_INT": Gnss,
-    "ATTITUDE": Attitude,
-    "VFR_HUD": AirData,
-    "SCALED_PRESSURE": Pressure,
-    "SYS_STATUS": AirspeedSensor,
-}
-#: Sensor of `inertial.source` that a record belongs to; the others are always used.
-SENSORS: Mapping[type, Sensor] = {Imu: "imu", AirData: "air_data", AirspeedSensor: "air_data"}
 #: ArduPilot's text after VISO_TYPE was set and before the reboot.
 NOT_REBOOTED = "VisOdom: out of memory"
-LOGGED = frozenset({"EKF_STATUS_REPORT", "SIM_STATE"})
 
 
 class ParameterFinding(NamedTuple):
@@ -110,11 +87,6 @@ def check_profile(config: Config, make: str) -> list[Finding]:
     return [Finding("output profile", profile, make, False, advice)]
 
 
-def _used_records(config: Config) -> set[type]:
-    kinds = uses(Settings.of(config))
-    return {kind for kind in kinds if kind not in SENSORS or config.uses(SENSORS[kind])}
-
-
 def check_airspeed(config: Config, healthy: bool | None) -> list[Finding]:
     """Report whether airspeed is measured; `healthy` None where the autopilot did not tell."""
     if config.has_own_ins or not config.uses("air_data"):
@@ -174,14 +146,10 @@ def check_streams(
 
     `rates` has both by message id, Hz; measured None is not known yet.
     """
-    found, used = [], _used_records(config)
-    for msgid, (asked, measured) in rates.items():
-        name = TYPES[msgid].name
-        if name in MISSING_MESSAGES.get(make, ()):
-            continue
-        comes = (measured or 0.0) >= ENOUGH * asked
-        idle = name in LOGGED or (name in RECORD_TYPES and RECORD_TYPES[name] not in used)
-        is_well = comes or (None if idle else False)
-        advice = "" if comes else "the line is too slow, or a ground station sets other rates"
-        found.append(Finding(name, f"{measured or 0.0:.1f} Hz", f"{asked:g} Hz", is_well, advice))
+    found = []
+    for state in stream_states(config, make, rates):
+        is_well = state.is_enough or (False if state.is_used else None)
+        advice = "" if state.is_enough else "the line is too slow, or a ground station sets other rates"
+        has, needs = f"{state.measured or 0.0:.1f} Hz", f"{state.requested:g} Hz"
+        found.append(Finding(state.name, has, needs, is_well, advice))
     return found

@@ -2,8 +2,9 @@
 
     replies = commands.receive(message, frame, system, now_ns)   # to be sent on the link it came from
 
-Supported commands: request a message, get and set message intervals, request our version. All others get
-UNSUPPORTED, an invalid parameter gets DENIED, and commands above the rate limit get TEMPORARILY_REJECTED.
+Supported commands: request a message, get and set message intervals, request our version. All others, and
+messages that we do not send, get UNSUPPORTED, an invalid parameter gets DENIED, and commands above the rate
+limit get TEMPORARILY_REJECTED.
 
 A command to all components (component 0) is answered only if we support it: a ground station may take our
 UNSUPPORTED, sent beside the autopilot's ACCEPTED, for the autopilot's answer. A command to another system, or
@@ -125,16 +126,16 @@ class CommandServer:
         return [ack, *replies]
 
     def _request_message(self, param1: float, param2: float) -> tuple[Result, list[Message]]:
-        source = self._sources.get(_to_message_id(param1))
-        if source is None:
-            return Result.DENIED, []
+        msgid = _to_message_id(param1)
+        if (source := self._sources.get(msgid)) is None:
+            return Result.UNSUPPORTED if msgid >= 0 else Result.DENIED, []
         message = source()
         return (Result.FAILED, []) if message is None else (Result.ACCEPTED, [message])
 
     def _set_message_interval(self, param1: float, param2: float) -> tuple[Result, list[Message]]:
         msgid, interval = _to_message_id(param1), param2
         if msgid not in self._defaults:
-            return Result.DENIED, []
+            return Result.UNSUPPORTED if msgid >= 0 else Result.DENIED, []
         if interval == 0:
             self.intervals_us[msgid] = self._defaults[msgid]
         elif interval == DISABLED:

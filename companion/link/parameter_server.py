@@ -3,22 +3,21 @@
     for change in parameters.receive(message, frame, system, now_ns): ...   # change.config is the new one
     for message in parameters.to_send(now_ns): ...                          # again at parameters.deadline()
 
-Numbers and switches are parameters. Texts and lists are not, nor are the sections that decide who may connect
-(LINK and SIGNING) and which earlier flights are kept (LOG). A value must pass the same checks as in the file.
+The parameters are those that an operator changes in flight, `PARAMETERS`; the rest belongs to the file, above
+all who may connect and which earlier flights are kept. A value must pass the same checks as in the file.
 If it does not, the answer is PARAM_ERROR and the value in effect. Set values are persistent: `save` receives
 the text of a TOML file to merge over the operator's file; if it fails, nothing is changed.
 
 Every parameter is a REAL32 on the wire. Ground stations disagree how an integer is stored in param_value
 (bytewise as PX4, or cast as ArduPilot): MAVProxy and MAVSDK choose by the vehicle's autopilot, QGroundControl
-by the component, and the companion runs with either autopilot. A REAL32 is the same in both encodings and
-holds integers up to 2^24 exactly; larger ones cannot be set.
+by the component, and the companion runs with either autopilot. A REAL32 is the same in both encodings.
 """
 
 from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import msgspec
@@ -35,42 +34,27 @@ DOES_NOT_EXIST: int = mavlink.MAV_PARAM_ERROR_DOES_NOT_EXIST
 OUT_OF_RANGE: int = mavlink.MAV_PARAM_ERROR_VALUE_OUT_OF_RANGE
 PERMISSION_DENIED: int = mavlink.MAV_PARAM_ERROR_PERMISSION_DENIED
 MAX_NAME_LENGTH = 16
-#: Largest integer that a REAL32 holds exactly.
-MAX_INTEGER = 1 << 24
 #: PARAM_VALUE per second, and at once: 37 bytes each.
 VALUES_HZ, VALUES_BURST = 40.0, 10
 #: Changes per second, and at once; faster ones are dropped, and a station tries again.
 CHANGES_HZ, CHANGES_BURST = 5.0, 20
 
-#: Sections without parameters; a wrong limit of the logs would erase flights.
-HIDDEN = frozenset({"link", "log", "signing"})
-#: Statement about the aircraft, not to be changed by a ground station.
-HIDDEN_KEYS = frozenset({("inertial", "independent")})
-_SECTIONS = {"RATES": "RATE", "INERTIAL": "INS", "PREDICTOR": "PRED", "ESTIMATOR": "EST", "OUTPUT": "OUT"}
-#: Abbreviations, applied in this order to names that are too long.
-_SHORT = {
-    "GLOBAL_POSITION_SENSOR": "GPSENS",
-    "ANGLE_RANDOM_WALK": "ARW",
-    "VELOCITY_NOISE": "VRW",
-    "SQRT_S": "RTS",
-    "SQRT_H": "RTH",
-    "DRIFT_DEG_H": "DRFT_DH",
-    "ACCELEROMETER": "ACC",
-    "ARCMIN": "AMIN",
-    "ARCSEC": "ASEC",
-    "ATTITUDE": "ATT",
-    "AZIMUTH": "AZ",
-    "CORRELATION": "CORR",
-    "DISTURBANCE": "DIST",
-    "EXTERNAL": "EXT",
-    "HEADING": "HDG",
-    "LOCAL": "LOC",
-    "PERCENT": "PCT",
-    "POSITION": "POS",
-    "RANGE": "RNG",
-    "REJECTION": "REJ",
-    "SIGMA": "SIG",
-    "VELOCITY": "VEL",
+#: What an operator changes in flight, by name: section and key. The file has everything else.
+PARAMETERS = {
+    "ALERT_M": ("integrity", "alert_m"),
+    "BOUND_LIMIT_M": ("predictor", "limit_m"),
+    "SWITCH_SOURCES": ("output", "switch_sources"),
+    "STATUS_HZ": ("output", "status_hz"),
+    "ODOMETRY_HZ": ("output", "odometry_hz"),
+    "POS_SENSOR_HZ": ("output", "global_position_sensor_hz"),
+    "GNSS_SIGMA_M": ("gnss", "sigma_m"),
+    "GNSS_LATENCY_S": ("gnss", "latency_s"),
+    "GNSS_TIMEOUT_S": ("gnss", "timeout_s"),
+    "GNSS_USE_VEL": ("gnss", "use_velocity"),
+    "RSBN_AZIMUTH_DEG": ("rsbn", "sigma_azimuth_deg"),
+    "RSBN_RANGE_M": ("rsbn", "sigma_range_m"),
+    "AIRSPEED_PCT": ("air_data", "airspeed_percent"),
+    "HEADING_DEG": ("air_data", "heading_deg"),
 }
 _REQUESTS = frozenset(
     {
@@ -80,11 +64,11 @@ _REQUESTS = frozenset(
     }
 )
 
-Value = float | int | bool
+Value = float | bool
 
 
 class Parameter(NamedTuple):
-    """A configuration key offered as a parameter; `kind` is float, int or bool (0 and 1 on the wire)."""
+    """A configuration key offered as a parameter; `kind` is float or bool (0 and 1 on the wire)."""
 
     name: str
     section: str
@@ -105,42 +89,13 @@ class ParameterChanged(NamedTuple):
     new: Value
 
 
-def parameter_name(section: str, key: str) -> str:
-    """Return the name SECTION_KEY, shortened to 16 characters; it depends on section and key only."""
-    prefix = section.upper()
-    name = f"{_SECTIONS.get(prefix, prefix)}_{key.upper()}"
-    if len(name) > MAX_NAME_LENGTH:
-        name = f"_{name}_"
-        for word, short in _SHORT.items():
-            name = name.replace(f"_{word}_", f"_{short}_")
-        name = name.strip("_")
-    words = name.split("_")
-    while len("_".join(words)) > MAX_NAME_LENGTH:  # keys not in _SHORT: cut the longest words
-        longest = max(range(len(words)), key=lambda i: len(words[i]))
-        words[longest] = words[longest][:-1]
-    return "_".join(words)
-
-
 def parameter_table() -> tuple[Parameter, ...]:
-    """Return all parameters in the order of the configuration. ValueError if two have the same name."""
-    found: dict[str, Parameter] = {}
-    for parameter in _keys():
-        if (other := found.setdefault(parameter.name, parameter)) is not parameter:
-            raise ValueError(
-                f"{other.section}.{other.key} and {parameter.section}.{parameter.key} would both be the "
-                f"parameter {parameter.name}: rename one, or shorten one in _SHORT"
-            )
-    return tuple(found.values())
-
-
-def _keys() -> Iterator[Parameter]:
-    for section in Config.__struct_fields__:
-        if section in HIDDEN:
-            continue
-        for field in msgspec.structs.fields(type(getattr(Config(), section))):
-            kind = type(field.default)
-            if kind in (float, int, bool) and (section, field.name) not in HIDDEN_KEYS:
-                yield Parameter(parameter_name(section, field.name), section, field.name, kind)
+    """Return all parameters in the order of their indices."""
+    default = Config()
+    return tuple(
+        Parameter(name, section, key, type(getattr(getattr(default, section), key)))
+        for name, (section, key) in PARAMETERS.items()
+    )
 
 
 class ParameterServer:
@@ -288,10 +243,9 @@ def _to_value(parameter: Parameter, wire: float) -> Value:
         raise ValueError(f"{parameter.name} = {wire} is not a number")
     if parameter.kind is float:
         return _shortest(wire)
-    if wire != int(wire) or abs(wire) > MAX_INTEGER or (parameter.kind is bool and wire not in (0.0, 1.0)):
-        raise ValueError(f"{parameter.name} = {wire} is not a {parameter.kind.__name__}")
-    value: Value = parameter.kind(wire)
-    return value
+    if wire not in (0.0, 1.0):
+        raise ValueError(f"{parameter.name} = {wire} is neither 0 nor 1")
+    return bool(wire)
 
 
 def _replace_value(config: Config, parameter: Parameter, value: Value) -> Config:

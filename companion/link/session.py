@@ -197,7 +197,7 @@ class Session:
         component
             Our component id.
         system
-            Our system id; if None, the autopilot's (1 until it is received).
+            Our system id; if None, the autopilot's (1 until it is known).
         autopilot_system
             If given, any other autopilot is ignored.
         rates_hz
@@ -255,7 +255,7 @@ class Session:
     @property
     def system(self) -> int:
         """Our own system id."""
-        return self._system or self._autopilot or 1
+        return self._system or self._autopilot or self._required_system or 1
 
     @property
     def autopilot(self) -> int | None:

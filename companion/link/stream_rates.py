@@ -99,6 +99,9 @@ class StreamRates:
         due = []
         if self._running:
             for msgid, stream in self._rates.items():
+                if stream.measured_hz == 0.0 and stream.count and stream.check_at - now > stream.window:
+                    # it arrives again: measure now, not at the end of a long pause
+                    stream.count, stream.since, stream.check_at = 0, now, now + stream.window
                 if stream.check_at <= now and self._check(stream, now):
                     due.append((msgid, stream.asked_hz))
         return due

@@ -22,7 +22,7 @@ from companion.link.dialect import mavlink, rsbn
 from companion.link.firmware import Firmware
 from companion.nav.geometry import Geodetic, Projection, geodetic_to_local
 from companion.output.gate import Position
-from companion.records import LocalOrigin, Mode, Solution, Source
+from companion.records import LocalOrigin, Mode, Solution, Source, Trust
 
 Message: TypeAlias = Any
 
@@ -324,6 +324,28 @@ def navigation_status(solution: Solution, receiver: Receiver) -> Message:
         protection=math.nan if s.protection is None else s.protection,
         trust=0 if s.trust is None else s.trust + 1,  # NAVIGATION_TRUST: 0 is "unknown"
     )
+
+
+def named_values(status: Message, now_ns: int, *, is_stale: bool) -> list[Message]:
+    """Encode the main values of NAVIGATION_STATUS as NAMED_VALUE_FLOAT.
+
+    Every ground station plots these, and ArduPilot forwards and logs them, where an unknown id is dropped.
+    Without a recent solution the trust is "untrusted" and all else NaN, so that no plot keeps an old value.
+    """
+    values = {
+        "nav_source": float(status.sources),
+        "nav_sigma": status.sigma_horizontal,
+        "nav_bound": status.bound_horizontal,
+        "nav_hpl": status.protection,
+    }
+    if is_stale:
+        values = dict.fromkeys(values, math.nan)
+    values["nav_trust"] = float(Trust.UNTRUSTED + 1 if is_stale else status.trust)
+    boot_ms = now_ns // 1_000_000 & 0xFFFFFFFF
+    return [
+        dialect.new("NAMED_VALUE_FLOAT", time_boot_ms=boot_ms, name=name, value=value)
+        for name, value in values.items()
+    ]
 
 
 def _deg_e7(angle: float) -> int:

@@ -17,6 +17,8 @@ from collections import Counter
 from collections.abc import Callable, Iterable
 from typing import Any
 
+import msgspec
+
 from companion.config import Config, ConfigError, to_toml
 from companion.config.profiles import MESSAGES, RESET
 from companion.config.validate import find_conflicts
@@ -41,7 +43,7 @@ from companion.link.session import (
 from companion.link.signing import Signing
 from companion.navigator import Navigator
 from companion.output.autopilot_output import AutopilotOutput
-from companion.output.encode import Receiver, navigation_status
+from companion.output.encode import Receiver, named_values, navigation_status
 from companion.records import (
     INPUTS,
     Event,
@@ -59,8 +61,10 @@ from companion.records import (
     Tuning,
 )
 from companion.runtime.ground_station_services import GroundStationServices
+from companion.runtime.input_monitor import InputMonitor
 from companion.runtime.origin import OriginCheck
 from companion.runtime.parameter_check import ParameterCheck
+from companion.runtime.status import Status
 from companion.storage.deferred_log import Log
 from companion.units import SECOND_NS
 
@@ -76,6 +80,8 @@ REQUESTS = frozenset(
         mavlink.MAVLINK_MSG_ID_PARAM_REQUEST_READ,
         mavlink.MAVLINK_MSG_ID_PARAM_REQUEST_LIST,
         mavlink.MAVLINK_MSG_ID_PARAM_SET,
+        mavlink.MAVLINK_MSG_ID_MISSION_REQUEST_LIST,
+        mavlink.MAVLINK_MSG_ID_PING,
     }
 )
 #: Messages that may report that somebody else selected an EKF source set.
@@ -104,6 +110,8 @@ class Link:
         self.sender = Sender(self.session.clock)
         self.output = AutopilotOutput(config)
         self.parameter_check = ParameterCheck()
+        self.has_bytes = False  # anything was received, MAVLink or not
+        self.has_station = False  # a ground station was received
         self.bad = 0
         self.not_sent: Counter[str] = Counter()  # messages that did not fit their wire format, by reason
         self.dropped = 0  # frames not sent because the line was too slow; set by the service
@@ -177,9 +185,11 @@ class CompanionCore:
         self._period_start: dict[str, int] = {}  # time from which each message's period is counted
         self._next_state_ns = 0
         self._stale = False  # no recent solution
+        self._inputs = InputMonitor()
 
     def receive(self, link: str, data: bytes, now_ns: int) -> None:
         """Process bytes received on `link`."""
+        self.links[link].has_bytes = True
         self._on_events(self.links[link], self.links[link].session.receive(data, now_ns), now_ns)
 
     @property
@@ -221,6 +231,10 @@ class CompanionCore:
             self._report_staleness(now_ns)
             if (leading := self.leading_link) is not None:
                 self._steer(leading, now_ns)
+            self._report_missing_inputs(now_ns)
+            if self._config.output.status_hz > 0.0 and (status := self._latest_status()) is not None:
+                for message in named_values(status, now_ns, is_stale=self._stale):
+                    self._broadcast(message)
             for link in self.links.values():
                 link.session.state = self._system_state(now_ns)
                 self._log.record(self._link_state(link, now_ns))
@@ -235,9 +249,7 @@ class CompanionCore:
     def to_send(self, link: str, now_ns: int) -> list[bytes]:
         """Return the frames to write to `link` now; they are logged as sent."""
         for message in self._services.to_send(now_ns):
-            for each in self.links.values():
-                if each.session.is_up:
-                    each.session.send(message)
+            self._broadcast(message)
         frames = self.links[link].session.to_send()
         for data in frames:
             self._log.frame(link, True, data, now_ns)
@@ -308,7 +320,10 @@ class CompanionCore:
 
     def _on_message(self, link: Link, event: MessageReceived) -> None:
         self._log.frame(link.name, False, event.frame.raw, event.received_ns)
-        if event.frame.msgid in REQUESTS:
+        if event.frame.msgid == mavlink.MAVLINK_MSG_ID_HEARTBEAT:
+            link.has_station |= event.message.type == mavlink.MAV_TYPE_GCS
+        elif event.frame.msgid in REQUESTS:
+            link.has_station = True
             replies, config = self._services.receive(event, link.session.system)
             for reply in replies:
                 link.session.send(reply)
@@ -359,9 +374,16 @@ class CompanionCore:
         self._log.record(record, channel)
         if isinstance(record, Event):
             self._events.append(record)
-            self._services.report(record, record.rx_ns)
+            text = self._without_link_names(record.text)
+            self._services.report(msgspec.structs.replace(record, text=text), record.rx_ns)
         elif isinstance(record, Rejection):
             self.rejected[record.source] += 1
+
+    def _without_link_names(self, text: str) -> str:
+        """Return a text for the 50 characters of STATUSTEXT: addresses of links mean nothing to a pilot."""
+        for name in self.links:
+            text = text.replace(f"{name}: ", "").replace(name, "another link")
+        return text
 
     def _send(self, solution: Solution, is_beacon_fix: bool) -> None:
         """Send the messages that are due; after a beacon fix, all position messages."""
@@ -378,9 +400,14 @@ class CompanionCore:
             for message in leading.output.messages(solution, feeding, self._receiver(leading)):
                 leading.session.send(message)
             self._steer(leading, solution.rx_ns)
-        for link in self.links.values() if STATUS in due else ():
-            if link.session.is_up:
-                link.session.send(navigation_status(solution, self._receiver(link)))
+        if STATUS in due:
+            self._broadcast(self._latest_status())
+
+    def _broadcast(self, message: Any) -> None:
+        """Send on every link with an autopilot or a ground station."""
+        for link in self.links.values():
+            if link.session.is_up or link.has_station:
+                link.session.send(message)
 
     def _steer(self, link: Link, now_ns: int) -> None:
         """Request the EKF source set that must lead, with or without a solution."""
@@ -432,6 +459,26 @@ class CompanionCore:
             self.report(Severity.ERROR, text, now_ns)
         else:
             self.report(Severity.NOTICE, "solutions resumed", now_ns)
+
+    def _report_missing_inputs(self, now_ns: int) -> None:
+        """Report inputs that never arrived, are slow or have stopped, and an autopilot that never came."""
+        leading = self.leading_link
+        if leading is not None:
+            events = self._inputs.update(leading.session, self._config, leading.sender.autopilot, now_ns)
+        else:
+            silent = [
+                (name, link.session, link.has_bytes)
+                for name, link in self.links.items()
+                if not link.has_station
+            ]
+            events = self._inputs.report_silence(silent, now_ns)
+        for event in events:
+            self._emit(event, "/link/Event")
+
+    def status(self) -> Status:
+        """Return the state for the status line."""
+        connected = self.leading_link is not None
+        return Status.of(self._solution, connected, self._stale, self._inputs.missing)
 
     def _leading_link_note(self, link: Link) -> str:
         leading = self.leading_link

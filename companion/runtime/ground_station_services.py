@@ -1,6 +1,6 @@
-"""Ground station services: commands, parameters and STATUSTEXT. No I/O.
+"""Ground station services: commands, parameters, STATUSTEXT, PING and an empty mission. No I/O.
 
-`receive` takes every message received; the messages from `to_send` go to every link with a vehicle.
+`receive` takes the requests of ground stations; the messages from `to_send` go to every link with a peer.
 """
 
 from __future__ import annotations
@@ -12,12 +12,16 @@ from companion.config import Config, OutputConfig
 from companion.config.profiles import RESET
 from companion.link import dialect
 from companion.link.commands import CommandServer, Source
+from companion.link.dialect import mavlink
 from companion.link.parameter_server import ParameterServer
+from companion.link.rate_limiter import RateLimiter
 from companion.link.session import MessageReceived
 from companion.link.status_text import StatusText
 from companion.records import Event
 
 NANO_PER_MICRO = 1000
+#: PING answers per second, and at once.
+PINGS_HZ, PINGS_BURST = 10.0, 10
 #: Interval of a disabled message.
 DISABLED_US = -1
 
@@ -50,7 +54,9 @@ class GroundStationServices:
     ) -> None:
         """`save` and `base`: see `ParameterServer`."""
         component = config.link.component_id
+        self._component = component
         self._output = config.output
+        self._ping_limiter = RateLimiter(PINGS_HZ, PINGS_BURST)
         self._commands = CommandServer(
             component,
             _by_id(config.output),
@@ -73,11 +79,28 @@ class GroundStationServices:
         replies = self._commands.receive(event.message, event.frame, system, event.received_ns)
         changes = self._parameters.receive(event.message, event.frame, system, event.received_ns)
         config = changes[-1].config if changes else None
+        if (reply := self._answer(event, system)) is not None:
+            replies.append(reply)
         if config is not None and config.output != self._output:
             self._output = config.output
             self._commands.set_default_intervals(_by_id(config.output))
         self.periods_ns = self._periods_ns()
         return replies, config
+
+    def _answer(self, event: MessageReceived, system: int) -> Any:
+        """Return the answer to a PING, or an empty mission to a request for ours; None for others."""
+        message, frame = event.message, event.frame
+        target = message.target_system, message.target_component
+        sender = {"target_system": frame.system, "target_component": frame.component}
+        if frame.msgid == mavlink.MAVLINK_MSG_ID_PING and target == (0, 0):  # with a target it is an answer
+            if self._ping_limiter.take(event.received_ns):
+                return dialect.new("PING", time_usec=message.time_usec, seq=message.seq, **sender)
+        elif frame.msgid == mavlink.MAVLINK_MSG_ID_MISSION_REQUEST_LIST and target == (
+            system,
+            self._component,
+        ):
+            return dialect.new("MISSION_COUNT", count=0, mission_type=message.mission_type, **sender)
+        return None
 
     def report(self, event: Event, now_ns: int) -> None:
         """Queue an event for STATUSTEXT, subject to its rate limit."""

@@ -30,11 +30,13 @@ from companion import __version__
 from companion.config import Config, ConfigError, LogConfig, load
 from companion.config.options import configuration_options
 from companion.records import Event, Severity
+from companion.runtime.console import Console, terminal_columns
 from companion.runtime.core import CompanionCore, Link
 from companion.runtime.daemon_thread import run_in_daemon_thread
 from companion.runtime.kept_parameters import KeptParameters
 from companion.runtime.signing_key import SigningKey
 from companion.runtime.state_file import StateFile
+from companion.runtime.status import Status
 from companion.runtime.stderr_writer import StderrWriter
 from companion.runtime.systemd import SystemdNotifier
 from companion.storage.deferred_log import DeferredLog
@@ -50,15 +52,21 @@ LOG_CHECK_S = 1.0
 SAVE_INTERVAL_S = 1.0
 STOP_TIMEOUT_S = 5.0  # limit on waiting for a disk at the end
 IMPORT_AFTER_S = 0.5
+STATUS_INTERVAL_NS = 1_000_000_000
 OVERDUE_NS = 2_000_000_000
 CONFIRM_AFTER_S = 60.0  # of solutions with parameters set by ground stations
+
+
+def ignore_status(status: Status, now_ns: int) -> None:
+    """Show no status."""
 
 
 class Service:
     """One run of the companion.
 
     `on_event` is called for every event, `now` reads the monotonic clock, `base` is the operator's
-    configuration without the values that ground stations set, `kept` the file of those.
+    configuration without the values that ground stations set, `kept` the file of those. `on_status` is called
+    once a second.
     """
 
     def __init__(
@@ -70,8 +78,10 @@ class Service:
         notifier: SystemdNotifier | None = None,
         base: Config | None = None,
         kept: KeptParameters | None = None,
+        on_status: Callable[[Status, int], None] = ignore_status,
     ) -> None:
         self._kept = kept
+        self._on_status, self._next_status_ns = on_status, 0
         self._notifier = notifier or SystemdNotifier({})
         self._addresses = {text: Address.parse(text) for text in config.link.connect}
         self._signing_key = SigningKey.from_config(config)
@@ -146,6 +156,9 @@ class Service:
                 self.core.report(Severity.WARNING if self._trouble else Severity.INFO, text, now)
             self._report_drops(now)
             self._flush()
+            if now >= self._next_status_ns:
+                self._next_status_ns = now + STATUS_INTERVAL_NS
+                self._on_status(self.core.status(), now)
             await asyncio.sleep(max(0.0, min(1e-9 * (self.core.deadline() - self._now()), LOG_CHECK_S)))
 
     async def _save_state_periodically(self) -> None:
@@ -224,6 +237,7 @@ async def run(
     base: Config | None = None,
     kept: KeptParameters | None = None,
     notes: Iterable[str] = (),
+    on_status: Callable[[Status, int], None] = ignore_status,
 ) -> None:
     """Open the log, report `notes`, serve until SIGINT or SIGTERM, close the log. Others: see `Service`."""
     start_ns, start_unix_ns = time.monotonic_ns(), time.time_ns()
@@ -239,11 +253,15 @@ async def run(
     )
     service, has_data = None, True
     try:
-        service = Service(config, log, on_event, notifier=SystemdNotifier(os.environ), base=base, kept=kept)
+        notifier = SystemdNotifier(os.environ)
+        service = Service(config, log, on_event, notifier=notifier, base=base, kept=kept, on_status=on_status)
         loop = asyncio.get_running_loop()
         for number in (signal.SIGINT, signal.SIGTERM):
             loop.add_signal_handler(number, service.stop)
         service.core.report(Severity.INFO, f"companion {__version__}: log {log.path}", time.monotonic_ns())
+        for address in map(Address.parse, config.link.connect):
+            verb = "listening" if address.listens else "connecting"
+            service.core.report(Severity.INFO, f"{verb}: {address}", time.monotonic_ns())
         for note in notes:
             service.core.report(Severity.WARNING, note, time.monotonic_ns())
         recover = partial(_recover_logs, settings, service, asyncio.get_running_loop())
@@ -284,11 +302,24 @@ def _recover_logs(settings: LogConfig, service: Service, loop: asyncio.AbstractE
 @configuration_options
 @click.option("--connect", multiple=True, help="Link (may be repeated): udpin:HOST:PORT, tcp:HOST:PORT, ...")
 @click.option("--logs", help="Folder for the flight's log.")
+@click.option(
+    "--log-format",
+    type=click.Choice(["text", "json"]),
+    default="text",
+    show_default=True,
+    help="Lines on stderr: text, with a live status line on a terminal, or JSON objects.",
+)
 def command(
-    file: Path | None, preset: str | None, pairs: tuple[str, ...], connect: tuple[str, ...], logs: str | None
+    file: Path | None,
+    preset: str | None,
+    pairs: tuple[str, ...],
+    connect: tuple[str, ...],
+    logs: str | None,
+    log_format: str,
 ) -> None:
-    """Navigate: receive from the autopilot, send it corrected estimates and log everything, until SIGINT or
-    SIGTERM.
+    """Navigate, send the autopilot corrected positions, and log.
+
+    Runs until SIGINT (Ctrl-C) or SIGTERM. Prints what it waits for and which inputs are missing.
 
     Links are serial:DEVICE:BAUD, udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT and tcpin:HOST:PORT. Exit
     codes: 0 stopped, 69 an address to listen on is in use or forbidden at the start, 73 no log can be created
@@ -307,13 +338,15 @@ def command(
             Address.parse(text)
     except ValueError as error:
         raise ConfigError(f"link.connect: {error}") from None
-    start_ns, writer = time.monotonic_ns(), StderrWriter()
-
-    def write_event(event: Event) -> None:
-        writer.write_line(f"{(event.rx_ns - start_ns) * 1e-9:9.3f} {event.text}")
-
+    writer = StderrWriter()
+    console = Console(
+        writer.write_line,
+        time.monotonic_ns(),
+        as_json=log_format == "json",
+        columns=terminal_columns(),
+    )
     try:
-        asyncio.run(run(config, write_event, base, kept, notes))
+        asyncio.run(run(config, console.event, base, kept, notes, console.status))
     except CannotListen as error:
         writer.write_line(f"companion: {error.strerror}")
         sys.exit(EX_UNAVAILABLE)

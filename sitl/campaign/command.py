@@ -300,9 +300,9 @@ def command(
     page: Path | None,
     as_json: bool,
 ) -> None:
-    """Fly every scenario with every fault and many seeds; tabulate detection times and position errors.
+    """Fly every scenario with every fault and many seeds.
 
-    Exit code 1 if a limit is exceeded.
+    Tabulates detection times and position errors. Exit code 1 if a limit is exceeded.
     """
     limits = CampaignLimits(harmless_m, misleading, alarms_per_hour)
     wanted = list_orders(scenarios or SCENARIOS, faults or FAULT_CASES, seeds)

@@ -263,7 +263,10 @@ def find_failures(hours: list[HourStatistics], depth: int = 1 << 25) -> list[str
 @click.option("--seed", type=int, default=1, show_default=True)
 @click.option("--json", "as_json", is_flag=True, help="Print JSON, one line per hour.")
 def command(hours: int, seed: int, as_json: bool) -> None:
-    """Fly for hours with random faults; report memory, queues and rates. Exit code 1 above a limit."""
+    """Fly for hours with random faults.
+
+    Reports memory, queues and rates. Exit code 1 above a limit.
+    """
     flown: list[HourStatistics] = []
     with tempfile.TemporaryDirectory() as folder:
         for hour in run_soak(hours, seed, Path(folder)):

@@ -161,8 +161,8 @@ def test_mavproxy(vehicle: Vehicle, tmp_path: pathlib.Path) -> None:
         proxy.type("param set GNSS_SIGMA_M 4")
         assert until(lambda: vehicle.parameters.config.gnss.sigma_m == 4.0)
         assert proxy.prints("GNSS_SIGMA_M is 4.0")  # our STATUSTEXT
-        proxy.type("param set OUT_GPSENS_ID 5")
-        assert until(lambda: vehicle.parameters.config.output.global_position_sensor_id == 5)
+        proxy.type("param set SWITCH_SOURCES 0")
+        assert until(lambda: not vehicle.parameters.config.output.switch_sources)
         proxy.type("long 512 148 0 0 0 0 0 0")
         assert until(lambda: 512 in vehicle.acknowledged)
         proxy.type("long 400 1 0 0 0 0 0 0")

@@ -290,7 +290,7 @@ def test_profile_monitor_rejects_requests_for_position_messages(msgid: int) -> N
     flight.send(
         "COMMAND_LONG", target_system=1, target_component=191, command=511, param1=msgid, param2=100_000
     )
-    values = {"param_id": "OUT_ODOMETRY_HZ", "param_value": 5.0, "param_type": 9}
+    values = {"param_id": "ODOMETRY_HZ", "param_value": 5.0, "param_type": 9}
     flight.send("PARAM_SET", target_system=1, target_component=191, **values)
     denied = [m.result for m in flight.sent_messages("COMMAND_ACK")]
     flight.fly(5.0)
@@ -303,7 +303,7 @@ def test_profile_monitor_rejects_requests_for_position_messages(msgid: int) -> N
 def test_ground_station_can_lower_the_output_rate() -> None:
     flight = Flight(configured("output.profile=ardupilot"))
     flight.fly(10.0)
-    values = {"param_id": "OUT_ODOMETRY_HZ", "param_value": 5.0, "param_type": 9}
+    values = {"param_id": "ODOMETRY_HZ", "param_value": 5.0, "param_type": 9}
     flight.send("PARAM_SET", target_system=1, target_component=191, **values)
     start = flight.seconds
     flight.fly(10.0)

@@ -8,6 +8,7 @@ import pytest
 
 from companion.config import Config, InertialConfig, OutputConfig
 from companion.link import dialect, frame
+from companion.link.parameter_server import parameter_table
 from companion.nav.geometry import Geodetic, local_to_geodetic, slant_range_azimuth
 from companion.navigator import Navigator
 from companion.records import (
@@ -59,9 +60,9 @@ class Log:
 class Flight:
     """An autopilot flying north with a companion, on a simulated clock."""
 
-    def __init__(self, *links: str) -> None:
+    def __init__(self, *links: str, config: Config = CONFIG) -> None:
         self.log = Log()
-        self.core = CompanionCore(CONFIG, self.log, links or ("main",))
+        self.core = CompanionCore(config, self.log, links or ("main",))
         self.now, self.boot, self.sends_origin = START, BOOT, True
         self.sent: list[tuple[int, dialect.Message]] = []
         self._sequence = 0
@@ -310,7 +311,7 @@ def test_faster_output_requests_a_faster_inertial_channel() -> None:
         component=190,
         target_system=1,
         target_component=191,
-        param_id=b"OUT_ODOMETRY_HZ",
+        param_id=b"ODOMETRY_HZ",
         param_value=20.0,
         param_type=9,
     )
@@ -389,3 +390,130 @@ def test_deadline_is_in_the_future_after_poll() -> None:
         flight.now = deadline
         flight.core.poll(flight.now)
         flight.collect()
+
+
+class Station:
+    """A ground station on a link of its own."""
+
+    def __init__(self, flight: Flight, link: str) -> None:
+        self._flight, self._link, self._sequence = flight, link, 0
+
+    def send(self, name: str, **values: object) -> list[dialect.Message]:
+        """Send a message; return what the companion answers on this link."""
+        self._sequence += 1
+        data = frame.encode(dialect.new(name, **values), self._sequence, 255, 190)
+        self._flight.core.receive(self._link, data, self._flight.now)
+        return self.take()
+
+    def take(self) -> list[dialect.Message]:
+        return decoded(self._flight.core.to_send(self._link, self._flight.now))
+
+
+OURS = {"target_system": 1, "target_component": 191}
+
+
+def test_station_on_a_link_without_an_autopilot_is_served() -> None:
+    flight = Flight("main", "station")
+    station = Station(flight, "station")
+    station.send("HEARTBEAT", type=6, autopilot=8)
+    received = station.send("PARAM_REQUEST_LIST", **OURS)
+    for _ in range(30):
+        flight.fly(0.5)
+        received += station.take()
+    names = Counter(message.get_type() for message in received)
+    assert names["PARAM_VALUE"] == len(parameter_table())
+    assert names["HEARTBEAT"] >= 14 and names["STATUSTEXT"] >= 1
+    assert names["NAVIGATION_STATUS"] >= 10 and names["NAMED_VALUE_FLOAT"] >= 50
+    assert not names["ODOMETRY"]  # positions go to the autopilot only
+    assert {message.get_srcSystem() for message in received} == {1}
+
+
+def test_link_without_a_station_gets_heartbeats_only() -> None:
+    flight = Flight("main", "beacon")
+    flight.fly(3.0)
+    assert {m.get_type() for m in decoded(flight.core.to_send("beacon", flight.now))} == {"HEARTBEAT"}
+
+
+def test_named_values_are_those_of_navigation_status() -> None:
+    flight = Flight()
+    flight.fly(20.0)
+    (status,) = [m for _, m in flight.sent if m.get_type() == "NAVIGATION_STATUS"][-1:]
+    values = {m.name: m.value for _, m in flight.sent if m.get_type() == "NAMED_VALUE_FLOAT"}
+    assert set(values) == {"nav_source", "nav_sigma", "nav_bound", "nav_hpl", "nav_trust"}
+    assert (values["nav_source"], values["nav_trust"]) == (status.sources, status.trust)
+    assert values["nav_sigma"] == pytest.approx(status.sigma_horizontal, rel=0.05)
+    assert len(flight.times_sent("NAMED_VALUE_FLOAT")) == pytest.approx(5 * 19, abs=5)
+
+
+def test_named_values_of_a_stopped_navigation_are_unknown_and_untrusted() -> None:
+    flight = Flight()
+    flight.fly(10.0)
+    for _ in range(40):
+        flight.now += 100 * MS
+        flight.send("HEARTBEAT", type=1, autopilot=3)
+        flight.core.poll(flight.now)
+        flight.collect()
+    last = {m.name: m.value for _, m in flight.sent if m.get_type() == "NAMED_VALUE_FLOAT"}
+    assert last.pop("nav_trust") == 4.0
+    assert all(math.isnan(value) for value in last.values())
+
+
+def test_ping_and_mission_list_are_answered() -> None:
+    flight = Flight("main", "station")
+    station = Station(flight, "station")
+    (ping,) = [m for m in station.send("PING", time_usec=123, seq=9) if m.get_type() == "PING"]
+    assert (ping.time_usec, ping.seq, ping.target_system, ping.target_component) == (123, 9, 255, 190)
+    assert not [m for m in station.send("PING", seq=9, target_system=1, target_component=191)]
+    (count,) = station.send("MISSION_REQUEST_LIST", mission_type=1, **OURS)
+    assert (count.get_type(), count.count, count.mission_type) == ("MISSION_COUNT", 0, 1)
+    assert station.send("MISSION_REQUEST_LIST", target_system=1, target_component=1) == []
+
+
+def test_status_text_names_no_link() -> None:
+    flight = Flight("udpin:127.0.0.1:14550")
+    flight.core.receive("udpin:127.0.0.1:14550", flight.frame("HEARTBEAT", type=1, autopilot=3), flight.now)
+    texts = [
+        m.text
+        for m in decoded(flight.core.to_send("udpin:127.0.0.1:14550", flight.now))
+        if m.get_type() == "STATUSTEXT"
+    ]
+    assert texts == ["autopilot 1 connected (ardupilot)"]
+    assert flight.log.of(Event)[0].text == "udpin:127.0.0.1:14550: autopilot 1 connected (ardupilot)"
+
+
+def test_silence_is_reported_once_with_what_to_check() -> None:
+    flight = Flight("serial:/dev/ttyS0:57600", "station")
+    Station(flight, "station").send("PARAM_REQUEST_LIST", **OURS)
+    for _ in range(200):
+        flight.now += 100 * MS
+        flight.core.receive("serial:/dev/ttyS0:57600", b"\x00\xff" * 8, flight.now)
+        flight.core.poll(flight.now)
+    (text,) = event_texts(flight)
+    assert "no autopilot in 5 s" in text and "same baud rate" in text
+    assert flight.core.status().text() == "waiting for an autopilot"
+
+
+def test_input_that_stops_is_reported_once_and_again_when_it_is_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    flight = Flight()
+    flight.fly(20.0)
+    assert flight.core.status().missing == ()
+    send = flight.send
+    monkeypatch.setattr(flight, "send", lambda name, **values: name == "GPS_RAW_INT" or send(name, **values))
+    flight.fly(30.0)
+    assert flight.core.status().missing == ("GNSS",)
+    monkeypatch.undo()
+    flight.fly(20.0)
+    texts = [text for text in event_texts(flight) if "GPS_RAW_INT" in text]
+    assert texts == [
+        "GNSS (GPS_RAW_INT) has stopped; check its sensor and the line",
+        "GNSS (GPS_RAW_INT) arrives again at 5.0 Hz",
+    ]
+
+
+def test_input_that_never_arrives_is_reported_if_it_is_used() -> None:
+    flight = Flight(config=Config())
+    flight.fly(30.0)
+    never = [text for text in event_texts(flight) if "never arrived" in text]
+    assert any(text.startswith("attitude (ATTITUDE)") for text in never)
+    assert not any("EKF_STATUS_REPORT" in text for text in never)
+    assert "attitude" in flight.core.status().text()

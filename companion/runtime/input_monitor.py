@@ -1,0 +1,180 @@
+"""Input monitor: which inputs never arrived, are slow or have stopped, and what to do. No I/O, no clock.
+
+    for event in monitor.update(link, config, now_ns): ...    # once a second
+    monitor.missing                                           # names for the status line
+
+Only what the navigator uses is reported, once when it has been missing for `PATIENCE`, and once when it is
+back. The table of used streams serves `companion doctor` too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping
+from functools import lru_cache
+from typing import NamedTuple
+
+from companion.config import Config, Sensor
+from companion.link.dialect import TYPES
+from companion.link.session import Session
+from companion.link.stream_rates import ENOUGH
+from companion.navigator.state import Settings
+from companion.navigator.step import uses
+from companion.records import (
+    AirData,
+    AirspeedSensor,
+    Attitude,
+    Event,
+    Gnss,
+    Imu,
+    LocalPosition,
+    Pressure,
+    Severity,
+)
+from companion.units import SECOND_NS
+
+#: A lost request is repeated after 5 s and measured for 5 s: report only what is missing for longer.
+PATIENCE = 12 * SECOND_NS
+#: First report that no autopilot is received.
+NO_AUTOPILOT_AFTER = 5 * SECOND_NS
+#: Messages that a make does not send; it has others with the same content.
+MISSING_MESSAGES = {
+    "ardupilot": frozenset({"HIGHRES_IMU"}),
+    "px4": frozenset({"RAW_IMU", "EKF_STATUS_REPORT", "SIM_STATE"}),
+}
+#: Sensor of `inertial.source` that a record belongs to; the others are always used.
+SENSORS: Mapping[type, Sensor] = {Imu: "imu", AirData: "air_data", AirspeedSensor: "air_data"}
+
+
+class Stream(NamedTuple):
+    """What a stream carries, in words and as a record, and the key of `rates` that requests it."""
+
+    what: str
+    record: type | None
+    key: str
+
+
+STREAMS: Mapping[str, Stream] = {
+    "LOCAL_POSITION_NED": Stream("local position", LocalPosition, "local_position_hz"),
+    "GPS_RAW_INT": Stream("GNSS", Gnss, "gnss_hz"),
+    "ATTITUDE": Stream("attitude", Attitude, "attitude_hz"),
+    "RAW_IMU": Stream("IMU", Imu, "imu_hz"),
+    "HIGHRES_IMU": Stream("IMU", Imu, "imu_hz"),
+    "VFR_HUD": Stream("airspeed", AirData, "air_data_hz"),
+    "SCALED_PRESSURE": Stream("pressure", Pressure, "air_data_hz"),
+    "SYS_STATUS": Stream("sensor health", AirspeedSensor, "status_hz"),
+    # only logged
+    "EKF_STATUS_REPORT": Stream("state of the EKF", None, "status_hz"),
+    "SIM_STATE": Stream("truth", None, "truth_hz"),
+}
+
+
+class StreamState(NamedTuple):
+    """Requested and measured rate of a stream, Hz; `measured` None before the first measurement."""
+
+    name: str
+    requested: float
+    measured: float | None
+    is_used: bool
+
+    @property
+    def is_enough(self) -> bool:
+        """Whether it arrives often enough."""
+        return (self.measured or 0.0) >= ENOUGH * self.requested
+
+
+def stream_states(
+    config: Config, make: str, rates: Mapping[int, tuple[float, float | None]]
+) -> Iterator[StreamState]:
+    """Yield the state of each requested stream that the make sends; `rates` by message id, Hz."""
+    used = _used_records(config)
+    for msgid, (requested, measured) in rates.items():
+        name = TYPES[msgid].name
+        if name not in MISSING_MESSAGES.get(make, ()):
+            stream = STREAMS.get(name)
+            yield StreamState(name, requested, measured, stream is None or stream.record in used)
+
+
+@lru_cache(maxsize=4)
+def _used_records(config: Config) -> frozenset[type]:
+    kinds = uses(Settings.of(config))
+    return frozenset(kind for kind in kinds if kind not in SENSORS or config.uses(SENSORS[kind]))
+
+
+def describe_silence(session: Session, has_bytes: bool) -> str:
+    """Return what was received on a link without an autopilot, and what to check."""
+    if session.rejected:
+        reasons = ", ".join(reason.name.lower() for reason in session.rejected)
+        return f"frames rejected ({reasons}); let it sign with the key of signing.key_file"
+    if senders := [f"{system}/{component}" for system, component in session.reader.counts]:
+        return f"received only {', '.join(senders)}; check the autopilot's connection and link.system_id"
+    if has_bytes:
+        return "bytes but no MAVLink received; check that both sides use the same baud rate"
+    return "no data received; check the address, the wiring (TX to RX) and the port's MAVLink protocol"
+
+
+class InputMonitor:
+    """Reports of missing inputs on the link that leads."""
+
+    def __init__(self) -> None:
+        self.missing: tuple[str, ...] = ()
+        self._arrived: set[str] = set()
+        self._bad_since: dict[str, int] = {}
+        self._reported: set[str] = set()
+        self._start_ns: int | None = None
+        self._silence_reported = False
+
+    def update(self, session: Session, config: Config, make: str, now_ns: int) -> list[Event]:
+        """Return what went missing or came back on a link whose autopilot is received."""
+        self._silence_reported = True  # of the start; a link lost later is an event of its own
+        events, missing = [], []
+        for state in stream_states(config, make, session.stream_rates.rates()):
+            if not state.is_used or state.measured is None:
+                continue
+            stream = STREAMS.get(state.name, Stream("input", None, ""))
+            if state.is_enough:
+                self._arrived.add(state.name)
+                self._bad_since.pop(state.name, None)
+                if state.name in self._reported:
+                    self._reported.discard(state.name)
+                    text = f"{stream.what} ({state.name}) arrives again at {state.measured:.1f} Hz"
+                    events.append(Event(now_ns, now_ns, Severity.NOTICE, text))
+                continue
+            if now_ns - self._bad_since.setdefault(state.name, now_ns) < PATIENCE:
+                continue
+            missing.append(stream.what)
+            if state.name not in self._reported:
+                self._reported.add(state.name)
+                text = f"{stream.what} ({state.name}) {self._trouble(state, stream)}"
+                events.append(Event(now_ns, now_ns, Severity.WARNING, text))
+        self.missing = tuple(dict.fromkeys(missing))
+        return events
+
+    def report_silence(self, sessions: Collection[tuple[str, Session, bool]], now_ns: int) -> list[Event]:
+        """Return one report for each link once no autopilot has been received since the start.
+
+        `sessions` has the name and session of each link, and whether bytes arrived.
+        """
+        self._start_ns = now_ns if self._start_ns is None else self._start_ns
+        if self._silence_reported or now_ns - self._start_ns < NO_AUTOPILOT_AFTER:
+            return []
+        self._silence_reported = True
+        seconds = (now_ns - self._start_ns) / SECOND_NS
+        return [
+            Event(
+                now_ns,
+                now_ns,
+                Severity.WARNING,
+                f"{name}: no autopilot in {seconds:.0f} s: {describe_silence(session, has_bytes)}",
+            )
+            for name, session, has_bytes in sessions
+        ]
+
+    def _trouble(self, state: StreamState, stream: Stream) -> str:
+        if state.measured:
+            return (
+                f"is slow: {state.measured:.1f} of {state.requested:g} Hz; use a faster line, or lower "
+                f"rates.{stream.key}"
+            )
+        if state.name in self._arrived:
+            return "has stopped; check its sensor and the line"
+        return "never arrived; does the autopilot have the sensor, and does a router pass this message?"
