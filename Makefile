@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help loopback test lint fuzz kills soak lock clean
+.PHONY: help loopback test lint fuzz kills soak docs lock clean
 
 # duration per fuzz target: make fuzz SECONDS=3600
 SECONDS := 120
@@ -44,6 +44,13 @@ kills: $(STAMP) ## kill test: 200 kills of the service in flight
 
 soak: $(STAMP) ## soak test: a day of flight in virtual time with all faults
 	$(BIN)/companion soak
+
+docs: $(VENV)/.docs ## build the documentation site in build/site
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
+
+$(VENV)/.docs: $(STAMP)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check 'mkdocs-material>=9.6,<10' 'mkdocstrings-python>=1.16,<3'
+	@touch $@
 
 docs/configuration.md: $(STAMP) companion/config/*.py
 	$(BIN)/python -m companion.config.reference > $@

@@ -1,0 +1,114 @@
+"""Every command of README and docs: parsed by its own parser, and run here unless a reason is stated."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import shutil
+from pathlib import Path
+
+import click
+import pytest
+from click.testing import CliRunner
+
+from companion.__main__ import cli
+from companion.config import ConfigError
+from sitl.loopback import command as loopback
+
+ROOT = Path(__file__).parents[2]
+RECORDING = ROOT / "tests" / "data" / "dronekit_copter_cut.tlog"
+SHELL = re.compile(r"(?:sudo|make|git|python3|companion|venv/|/opt/|pip|mavproxy|systemctl|journalctl)\b")
+
+#: Commands that are not run by this test, and why.
+NOT_RUN = {
+    r"make (test|loopback|lint|docs)": "a job of .ci/run",
+    r"make (kills|soak|fuzz)|companion campaign": "takes minutes to hours; tests/sitl has its parts",
+    r"git|python3 -m venv|venv/bin/pip|sudo|/opt/.*pip|systemctl|journalctl": "changes the system",
+    r"mavproxy": "needs MAVProxy: tests/clients",
+    r"companion run (?!--set gnss.sigm=)": "flies until stopped: tests/runtime/test_service.py",
+    r"companion doctor": "needs an autopilot: tests/doctor/test_command.py",
+    r"companion sitl": "flies in real time: tests/sitl/test_simulator_command.py, test_bridge.py",
+    r"companion loopback": "the fixture of this test flies it",
+}
+
+
+def commands() -> list[tuple[str, str]]:
+    """(page, command) of all code blocks, `companion` without the path of its environment."""
+    found = []
+    for path in (ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))):
+        for block in re.findall(r"^```\w*\n(.*?)^```", path.read_text(), re.DOTALL | re.MULTILINE):
+            for line in block.replace("\\\n", " ").splitlines():
+                text = re.sub(r"\s+#.*", "", line).strip().removeprefix("$ ")
+                if SHELL.match(text) and not text.startswith("companion:"):
+                    text = re.sub(r"^(?:\S*/bin/)companion\b", "companion", " ".join(text.split()))
+                    found.append((path.stem, text))
+    return found
+
+
+ALL = commands()
+OURS = sorted({text for _, text in ALL if text.startswith("companion ")})
+
+
+def arguments(text: str) -> list[str]:
+    """Arguments of a companion command, without redirection, pipe and background."""
+    return shlex.split(re.split(r" [>|&]", text)[0])[1:]
+
+
+def test_commands_are_found_on_the_pages_that_have_them() -> None:
+    assert {"README", "tutorial", "install", "logs", "sitl", "ground-station"} <= {page for page, _ in ALL}
+    assert len(OURS) >= 20
+
+
+@pytest.mark.parametrize("text", OURS)
+def test_options_and_commands_exist(text: str) -> None:
+    words, command = arguments(text), cli
+    context = click.Context(cli, info_name="companion")
+    while isinstance(command, click.Group) and words and not words[0].startswith("-"):
+        found = command.get_command(context, words[0])
+        assert found is not None, words[0]
+        if not isinstance(found, click.Group) or len(words) == 1 or words[1].startswith("-"):
+            command, words = found, words[1:]
+            break
+        command, words = found, words[1:]  # type: ignore[assignment]
+    command.make_context("companion", [*words], parent=context, resilient_parsing=True)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the files that the pages name, of the flight that they fly."""
+    path = tmp_path_factory.mktemp("docs")
+    words = ["--scenario", "short", "--logs", str(path / "logs"), "--set", "output.profile=ardupilot"]
+    done = CliRunner().invoke(loopback, words)
+    assert done.exit_code == 0, done.output
+    (log,) = (path / "logs").glob("*.mcap")
+    shutil.copy(log, path / "LOG.mcap")
+    shutil.copy(log, path / "LOG")
+    shutil.copy(RECORDING, path / "FLIGHT.tlog")
+    shutil.copy(RECORDING, path / "SOURCE.tlog")
+    return path
+
+
+def is_run(text: str) -> bool:
+    return not any(re.match(pattern, text) for pattern in NOT_RUN)
+
+
+@pytest.mark.parametrize("text", [text for text in sorted({text for _, text in ALL}) if is_run(text)])
+def test_command_runs(text: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(folder)
+    assert text.startswith("companion "), f"{text}: run it here, or state in NOT_RUN why not"
+    words = [str(next(folder.glob("logs/*.mcap"))) if w == "logs/*.mcap" else w for w in arguments(text)]
+    words = ["SOURCE.tlog" if word == "SOURCE" else word for word in words]
+    for output in ("LOG.mcap", "FLIGHT.replay.mcap", "other.mcap"):
+        if words[-2:] == ["-o", output] or output == "FLIGHT.replay.mcap":
+            (folder / output).unlink(missing_ok=True)
+    done = CliRunner().invoke(cli, words)
+    if "gnss.sigm=3" in text:  # the example of a mistake
+        assert isinstance(done.exception, ConfigError)
+    else:
+        assert done.exit_code == 0, done.output
+    shutil.copy(next(folder.glob("logs/*.mcap")), folder / "LOG.mcap")
+
+
+@pytest.mark.parametrize("pattern", NOT_RUN)
+def test_every_exception_is_needed(pattern: str) -> None:
+    assert any(re.match(pattern, text) for _, text in ALL)
