@@ -295,7 +295,7 @@ def _bound(row: error_statistics.PhaseErrors) -> str:
 
 def _print_table(flown: LoopbackFlight, rows: list[error_statistics.PhaseErrors], seconds: float) -> None:
     scenario = flown.autopilot.scenario
-    console = Console(width=max(80, Console().width))
+    console = Console(width=max(92, Console().width))
     table = Table(
         title=f"{scenario.name}: horizontal error, r.m.s. [m]", box=SIMPLE_HEAD, padding=(0, 1, 0, 0)
     )
