@@ -274,6 +274,8 @@ def _channel_event(record: Input, settings: Settings) -> Event:
         if config.output.feeds_estimator and "local_position" in allowed:
             allowed.remove("local_position")
         text = f"inertial channel: own, by {', '.join(a.replace('_', ' ') for a in allowed)}"
+        if "imu" in allowed:
+            text += "; no guaranteed bound by imu"
     else:
         text = "inertial channel: local position of an INS of its own"
     return Event(record.t_ns, record.rx_ns, Severity.INFO, text)
