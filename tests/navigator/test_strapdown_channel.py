@@ -565,8 +565,7 @@ def test_recorded_alone_it_bridges_seconds_and_says_how_far_it_may_be_off() -> N
     assert at(10.0) < 40.0
     assert 60.0 < at(20.0) < 200.0  # which is what it is good for: not for minutes
     assert at(120.0) > 500.0
-    told = after & np.isfinite(found.bound)
-    assert np.mean(np.square(found.error[told])) <= np.mean(np.square(found.bound[told]))
+    assert not np.isfinite(found.bound).any()  # nothing bounds the error of that attitude: none is stated
 
 
 def test_nothing_of_the_autopilots_own_position_comes_back_to_it() -> None:
