@@ -198,13 +198,15 @@ class BoundedDrift(NamedTuple):
 
     States: position (m) and velocity (m/s), north and east, relative error of the speed, error of the heading
     (rad). `velocity` is the r.m.s. of the first velocity error, `walk` that of its change (m/s/sqrt s), jumps
-    of stated size and rate included.
+    of stated size and rate included. `wander` (m/s) is an error of the velocity that lasts `wander_s`: crab.
     """
 
     velocity: float
     walk: float
     scale: float = 0.0
     heading: float = 0.0
+    wander: float = 0.0
+    wander_s: float = 1.0
     correlation_s: float = 0.0
     n: int = 6
     free: int = 2
@@ -215,14 +217,14 @@ class BoundedDrift(NamedTuple):
 
     def bound(self, age_s: Floats) -> Floats:
         """Return the r.m.s. bound of the velocity's change, m/s, at times from the anchor, s."""
-        return np.asarray(self.walk * np.sqrt(np.abs(age_s)), dtype=np.float64)
+        return np.asarray(np.sqrt(self.walk**2 * np.abs(age_s) + self.wander**2), dtype=np.float64)
 
     def covariance(self, age_s: Floats) -> Floats:
         """Return its expected covariance."""
         same = np.sign(age_s)[:, None] == np.sign(age_s)
         short = np.minimum(np.abs(age_s)[:, None], np.abs(age_s))
         F: Floats = np.where(same, self.walk**2 * short, 0.0)
-        return F
+        return F + self.wander**2 * np.exp(-np.abs(age_s[:, None] - age_s) / self.wander_s)
 
     def step(self, motion: Motion) -> tuple[Floats, Floats, Floats]:
         """Compute transition (6, 6), effect of a unit change of velocity (6, 2) and noise of an interval.

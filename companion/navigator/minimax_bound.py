@@ -115,8 +115,8 @@ class Guaranteed(NamedTuple):
     bounds: Bounds
 
 
-def law(config: Config, by: str) -> Channel | None:
-    """Return the error model of what moves the nominal trajectory; None where it has no bound."""
+def law(config: Config, by: str, v_n: tuple[float, ...] = (0.0, 0.0)) -> Channel | None:
+    """Return the error model of what moves the nominal trajectory at `v_n`; None where it has no bound."""
     correlation_s = config.gnss.correlation_s
     if by == "ins":
         unit = config.inertial
@@ -140,8 +140,9 @@ def law(config: Config, by: str) -> Channel | None:
     walk = math.hypot(air.wind_change_m_s_sqrt_s, jumps)
     if by == "air":
         scale, heading = 0.01 * air.airspeed_percent, math.radians(air.heading_deg)
-        return BoundedDrift(air.wind_m_s, walk, scale, heading, correlation_s)
-    return BoundedDrift(air.wind_m_s, walk, 0.0, 0.0, correlation_s) if by == "foreign" else None
+        crab = math.radians(air.crab_deg) * math.hypot(*v_n[:2])
+        return BoundedDrift(air.wind_m_s, walk, scale, heading, crab, air.crab_s, correlation_s)
+    return BoundedDrift(air.wind_m_s, walk, correlation_s=correlation_s) if by == "foreign" else None
 
 
 def tasks(config: Config, channel: Channel) -> tuple[Task, ...]:
@@ -164,7 +165,7 @@ def follow(g: Guarantee, nominal: Nominal, config: Config) -> Guarantee:
     point, reach = nominal.point, g.reach
     if by == g.by and (reach is None or 0.0 <= (point.t_ns - reach.at.t_ns) * 1e-9 < CHUNK_S):
         return g
-    channel = law(config, by)
+    channel = law(config, by, point.v_n)
     if channel is None:
         return Guarantee(by)
     seconds = 0.0 if reach is None else (point.t_ns - reach.at.t_ns) * 1e-9
@@ -271,7 +272,7 @@ def refresh(g: Guarantee, nominal: Nominal, rx_ns: int, config: Config) -> tuple
     window, t_ns = g.window, nominal.t_ns
     if window is None or g.reach is None or not window.fixes or abs(t_ns - g.worked_ns) < PIECE_NS:
         return g, []
-    channel, g = law(config, g.by), g._replace(worked_ns=t_ns)
+    channel, g = law(config, g.by, nominal.point.v_n), g._replace(worked_ns=t_ns)
     if channel is None:
         return g, []
     if g.anchored is None:

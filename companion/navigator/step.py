@@ -367,8 +367,16 @@ def shifted(state: State, north: float, east: float, v_n: Vector2 = (0.0, 0.0), 
         protection = (*protection[:2], protection[2] + north, protection[3] + east)
     promise = minimax_bound.shift(state.guarantee, north, east, v_n)
     bounded = state.restrictive and restrictive_filter.shift(state.restrictive, north, east)
+    pending = state.pending
+    if pending is not None:  # its correction is of the trajectory before
+        pending = pending._replace(centre=(pending.centre[0] + north, pending.centre[1] + east))
     return state._replace(
-        bank=bank, protection=protection, guarantee=promise, restrictive=bounded, gnss_fix=None
+        bank=bank,
+        protection=protection,
+        guarantee=promise,
+        restrictive=bounded,
+        gnss_fix=None,
+        pending=pending,
     )
 
 
