@@ -199,7 +199,9 @@ def _bound_sentences(a: Assessment) -> list[str]:
     useless = [row.phase for row in a.rows if row.bound is not None and not row.useful]
     found = []
     if useless:
-        found.append(f"No useful guaranteed bound in {len(useless)} phases, the first “{phase_title(useless[0])}”.")
+        found.append(
+            f"No useful guaranteed bound in {len(useless)} phases, the first “{phase_title(useless[0])}”."
+        )
     if judged and not broken:
         found.append(f"The guaranteed bound{reached} held at every instant of {len(judged)} phases.")
     elif broken:
