@@ -208,8 +208,8 @@ def _bound_sentences(a: Assessment) -> list[str]:
         worst = min(broken, key=lambda row: row.inside or 0.0)
         found.append(
             f"The guaranteed bound{reached} was exceeded in {len(broken)} of {len(judged)} phases, most often"
-            f" in “{phase_title(worst.phase)}”: there the error was within it {_percent(worst.inside or 0.0)} of the time,"
-            f" over the flight {_percent(inside)}."
+            f" in “{phase_title(worst.phase)}”: there the error was within it {_percent(worst.inside or 0.0)}"
+            f" of the time, over the flight {_percent(inside)}."
         )
     return found
 
