@@ -9,6 +9,8 @@ STAMP := $(VENV)/.installed
 
 # duration per fuzz target: make fuzz SECONDS=3600
 SECONDS := 120
+# forged frames: make fuzz FRAMES=1000000
+FRAMES := 10000000
 
 help: ## list the targets
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -34,6 +36,8 @@ lint: $(STAMP) ## ruff, mypy --strict and the import contracts
 
 fuzz: $(VENV)/.fuzz ## coverage-guided fuzzing of all byte inputs, SECONDS each (Linux)
 	$(BIN)/python -m sitl.endurance.fuzz --seconds $(SECONDS)
+	$(BIN)/python -m sitl.endurance.parameter_sweep
+	$(BIN)/python -m sitl.endurance.forged_frames --frames $(FRAMES)
 
 $(VENV)/.fuzz: $(STAMP)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check 'atheris>=3,<4'

@@ -9,6 +9,7 @@ from __future__ import annotations
 import importlib
 import os
 import re
+import signal
 import sys
 from collections.abc import Collection, Mapping
 from importlib.metadata import entry_points
@@ -31,6 +32,7 @@ COMMANDS = {
     "live": "companion.analysis.live.server:command",
     "log": "companion.analysis.log_command:group",
     "doctor": "companion.doctor.command:command",
+    "signing": "companion.doctor.signing_command:group",
     "check-config": "companion.config.check_config:command",
     "bench": "companion.bench.command:command",
 }
@@ -121,6 +123,8 @@ cli.add_command(
 
 def main() -> None:
     """Run the command line; an error that the user can fix ends with one sentence and an exit code."""
+    if sys.argv[1:2] == ["run"]:  # until the service handles it: a stop during the start is no failure
+        signal.signal(signal.SIGTERM, lambda number, stack: sys.exit(0))
     try:
         code = cli(standalone_mode=False)
         sys.exit(code if isinstance(code, int) else 0)

@@ -21,6 +21,7 @@ from companion.config.profiles import PROFILES
 from companion.doctor.diagnosis import Diagnosis, Finding
 from companion.doctor.examination import Examination
 from companion.doctor.rendering import as_json, change_summary, parameter_table, print_diagnosis
+from companion.runtime.exposure import exposure
 from companion.runtime.input_monitor import describe_silence
 from companion.runtime.service import EX_UNAVAILABLE
 from companion.runtime.signing_key import SigningKey
@@ -152,6 +153,8 @@ def examine(config: Config, address: Address, apply: bool, yes: bool, as_json_: 
             diagnosis = first = runner.run(run_examination(connection, address))
             status.stop()
             print_diagnosis(console, config, address, diagnosis)
+            is_open, sentence = exposure(address, config)
+            console.print(sentence, style="yellow" if is_open else "", highlight=False)
             if apply:
                 why = confirm_change(diagnosis, yes)
                 new = None if why else runner.run(set_parameters(connection, diagnosis))

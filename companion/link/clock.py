@@ -100,9 +100,10 @@ class BootClock:
     def __init__(self) -> None:
         self._requests: deque[int] = deque(maxlen=64)
         self.outlier: int | None = None
-        self._reset()
+        self.reset()
 
-    def _reset(self) -> None:
+    def reset(self) -> None:
+        """Forget the autopilot's clock."""
         self._newest = -1  # newest stamp
         self._newest_received = 0
         self._envelope: int | None = None
@@ -125,7 +126,7 @@ class BootClock:
                 return None
             is_young = boot <= received - self._newest_received + MAX_LATENESS
             change = ClockChange.REBOOTED if is_young else ClockChange.SET
-            self._reset()
+            self.reset()
         self._back = None
         if boot > self._newest:
             self._newest, self._newest_received = boot, received

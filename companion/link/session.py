@@ -9,8 +9,11 @@ reboots, maps its time to the companion's clock, answers TIMESYNC (rate-limited)
 message rates until they arrive. Every other message is passed up as MessageReceived; `companion.link.decode`
 interprets it.
 
-A vehicle has one autopilot: component 1 of a system, with a HEARTBEAT of a real autopilot and not of a ground
-station. The first one received is kept; any other is reported once, then ignored. No input of a peer raises.
+A vehicle has one autopilot: component 1 of a system, at one address; `autopilot_choice` decides which. Any
+other is reported once, then ignored. No input of a peer raises.
+
+`peer` is the address that bytes came from, on links that have several (UDP). Each peer has a frame reader of
+its own, so that no sender's bytes can swallow another's.
 
 With a `Signing`, every sent frame is signed; received frames that it rejects are reported as FrameRejected
 and not processed.
@@ -19,10 +22,11 @@ and not processed.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping
 from typing import NamedTuple
 
 from companion.link import dialect, frame
+from companion.link.autopilot_choice import AutopilotChoice, Candidate
 from companion.link.clock import JUMP, LATE, BootClock, ClockChange
 from companion.link.dialect import Message, mavlink
 from companion.link.frame import BadFrame, Frame, UnknownFrame
@@ -33,34 +37,18 @@ from companion.units import SECOND_NS
 
 HEARTBEAT_INTERVAL = SECOND_NS
 TIMESYNC_INTERVAL = SECOND_NS
-#: TIMESYNC answers per second, and at once.
-ANSWERS_HZ, ANSWERS_BURST = 20.0, 10
+#: TIMESYNC answers per second, and at once: to the autopilot, and to all others together.
+AUTOPILOT_ANSWERS_HZ, ANSWERS_HZ, ANSWERS_BURST = 50.0, 20.0, 10
+#: Peers with a reader of their own; datagrams of further ones are parsed by themselves.
+MAX_READERS = 16
+#: A peer is forgotten after this time without an accepted frame, if its place is needed.
+FORGET_AFTER = 30 * SECOND_NS
+#: Other vehicles reported on a link.
+MAX_REPORTED = 16
 #: The autopilot is lost when nothing was received from it for this time.
 LOST_AFTER = 5 * SECOND_NS
 #: A link is reported late, or prompt again, after this time: TIMESYNC has been answered by then.
 LATE_FOR = 2 * SECOND_NS
-#: HEARTBEAT types of peripherals and ground stations, whatever their autopilot field holds.
-NOT_VEHICLES = frozenset(
-    {
-        mavlink.MAV_TYPE_ANTENNA_TRACKER,
-        mavlink.MAV_TYPE_GCS,
-        mavlink.MAV_TYPE_ONBOARD_CONTROLLER,
-        mavlink.MAV_TYPE_GIMBAL,
-        mavlink.MAV_TYPE_ADSB,
-        mavlink.MAV_TYPE_CAMERA,
-        mavlink.MAV_TYPE_CHARGING_STATION,
-        mavlink.MAV_TYPE_FLARM,
-        mavlink.MAV_TYPE_SERVO,
-        mavlink.MAV_TYPE_ODID,
-        mavlink.MAV_TYPE_BATTERY,
-        mavlink.MAV_TYPE_PARACHUTE,
-        mavlink.MAV_TYPE_LOG,
-        mavlink.MAV_TYPE_OSD,
-        mavlink.MAV_TYPE_IMU,
-        mavlink.MAV_TYPE_GPS,
-        mavlink.MAV_TYPE_WINCH,
-    }
-)
 #: Messages stamped with time_boot_ms when they are sent.
 STAMPED_WHEN_SENT = frozenset(
     {
@@ -122,8 +110,16 @@ class TimesyncOutlier(NamedTuple):
     error_ns: int
 
 
+class AutopilotReleased(NamedTuple):
+    """The autopilot in use was released: it streams no navigation messages, or has been silent for long."""
+
+    at_ns: int
+    system: int
+    by: int | None  # the system in use now
+
+
 class SecondAutopilot(NamedTuple):
-    """Another autopilot is on the link and is ignored; reported once for each."""
+    """Another autopilot, or the same from another address, is ignored; reported once for each."""
 
     at_ns: int
     system: int
@@ -131,12 +127,13 @@ class SecondAutopilot(NamedTuple):
 
 
 class MessageReceived(NamedTuple):
-    """A message, its frame, and whether the vehicle's autopilot sent it."""
+    """A message, its frame, whether the vehicle's autopilot sent it, and its address."""
 
     received_ns: int
     message: Message
     frame: Frame
     from_autopilot: bool
+    peer: Hashable = None
 
 
 class NotUnderstood(NamedTuple):
@@ -169,6 +166,7 @@ Event = (
     | ClockJump
     | LinkLate
     | TimesyncOutlier
+    | AutopilotReleased
     | SecondAutopilot
     | MessageReceived
     | NotUnderstood
@@ -229,14 +227,13 @@ class Session:
         self.stream_rates = StreamRates(_by_id(rates_hz or {}))
         self._unanswered: list[int] = []  # rates requested last: answers come in order and name no message
         self._system = system
-        self._required_system = autopilot_system
-        self._autopilot: int | None = None  # its system id
-        self._autopilot_type: int = mavlink.MAV_AUTOPILOT_INVALID
+        self._choice = AutopilotChoice(autopilot_system)
+        self._readers: dict[Hashable, tuple[frame.Reader, int]] = {}  # by peer, and its last accepted frame
         self._last_received = 0  # from the autopilot
         self._up = False
         self._reported_late = False
         self._changed_at: int | None = None  # since when the lateness differs from the reported one
-        self._ignored: set[int] = set()
+        self._reported: set[tuple[int, Hashable]] = set()  # other autopilots
         self._sequence = 0
         self._send_queue: list[bytes] = []
         self._not_sent: list[Event] = []
@@ -246,50 +243,93 @@ class Session:
         self._heartbeat_at = 0
         self._timesync_at = 0
         self._answer_limiter = RateLimiter(ANSWERS_HZ, ANSWERS_BURST)
-        self._handlers = {
-            mavlink.MAVLINK_MSG_ID_HEARTBEAT: self._on_heartbeat,
-            mavlink.MAVLINK_MSG_ID_TIMESYNC: self._on_timesync,
-            mavlink.MAVLINK_MSG_ID_COMMAND_ACK: self._on_acknowledgement,
-        }
+        self._autopilot_answer_limiter = RateLimiter(AUTOPILOT_ANSWERS_HZ, ANSWERS_BURST)
 
     @property
     def system(self) -> int:
         """Our own system id."""
-        return self._system or self._autopilot or self._required_system or 1
+        return self._system or self.autopilot or self._choice.required_system or 1
 
     @property
     def autopilot(self) -> int | None:
         """The autopilot's system id, None before it was received."""
-        return self._autopilot
+        return self._choice.chosen.system if self._choice.chosen else None
 
     @property
     def autopilot_type(self) -> int:
         """The autopilot's MAV_AUTOPILOT, MAV_AUTOPILOT_INVALID before it was received."""
-        return self._autopilot_type
+        chosen = self._choice.chosen
+        return chosen.autopilot if chosen else int(mavlink.MAV_AUTOPILOT_INVALID)
 
     @property
     def is_up(self) -> bool:
         """Whether the autopilot is received."""
         return self._up
 
-    def lock_to_system(self, system: int) -> None:
-        """Accept no autopilot but that of `system`, unless one was set or received before."""
-        self._required_system = self._required_system or system
+    @property
+    def is_confirmed(self) -> bool:
+        """Whether the autopilot has streamed navigation messages for some seconds."""
+        return self._choice.chosen is not None and self._choice.chosen.is_confirmed
+
+    def is_promising(self, now_ns: int) -> bool:
+        """Whether the autopilot streams navigation messages, or was found too recently to judge."""
+        chosen = self._choice.chosen
+        return self._up and chosen is not None and chosen.is_promising(now_ns)
+
+    def lock_to_system(self, system: int | None, now_ns: int) -> list[Event]:
+        """Accept no autopilot but that of `system` (None: any), which another link has confirmed."""
+        events: list[Event] = []
+        if (released := self._choice.lock(system)) is not None:
+            self._release(released, now_ns, events)
+        return events
 
     def set_rates(self, rates_hz: Mapping[str, float], now_ns: int) -> None:
         """Request these rates (Hz, by message name) from the autopilot from now on."""
         self.stream_rates.set_rates(_by_id(rates_hz), now_ns)
 
-    def receive(self, data: bytes, now_ns: int) -> list[Event]:
-        """Process bytes that arrived at `now_ns`; return the events in order."""
+    def receive(self, data: bytes, now_ns: int, peer: Hashable = None) -> list[Event]:
+        """Process bytes that arrived at `now_ns` from `peer`; return the events in order."""
         self._now = now_ns
         events, self._not_sent = self._not_sent, []
-        for found in self.reader.receive(data):
+        for found in self._parse(data, peer):
             if isinstance(found, Frame):
-                self._on_frame(found, now_ns, events)
+                self._on_frame(found, peer, now_ns, events)
             else:
                 events.append(NotUnderstood(now_ns, found))
         return events
+
+    def would_accept(self, data: bytes, now_ns: int) -> bool:
+        """Return whether `data`, from a new sender, has a frame that proves it."""
+        reader = frame.Reader(counting=False)
+        return any(
+            isinstance(found, Frame)
+            and self.is_proof(found)
+            and (self._signing is None or self._signing.examine(found, now_ns) is None)
+            for found in reader.receive(data) + reader.close()
+        )
+
+    def is_proof(self, found: Frame) -> bool:
+        """Whether an accepted frame proves its sender; on a signed link RADIO_STATUS does not."""
+        return self._signing is None or found.signature is not None or not self._signing.refuse_unsigned
+
+    def _parse(self, data: bytes, peer: Hashable) -> list[frame.Event]:
+        if peer is None:
+            return self.reader.receive(data)
+        known = self._readers.get(peer)
+        if known is not None:
+            return known[0].receive(data)
+        alone = frame.Reader(counting=False)
+        return alone.receive(data) + alone.close()
+
+    def _keep_reader(self, peer: Hashable, now: int) -> None:
+        """Give a peer with an accepted frame a reader, so that its frames may span datagrams."""
+        known = self._readers.get(peer)
+        if known is None and len(self._readers) >= MAX_READERS:
+            oldest = min(self._readers, key=lambda one: self._readers[one][1])
+            if now - self._readers[oldest][1] < FORGET_AFTER:
+                return
+            del self._readers[oldest]
+        self._readers[peer] = (known[0] if known else frame.Reader(counting=False), now)
 
     def poll(self, now_ns: int) -> list[Event]:
         """Do what is due at `now_ns`; return the events caused by the elapsed time."""
@@ -298,7 +338,7 @@ class Session:
         if self._up and now_ns - self._last_received >= LOST_AFTER:
             self._up = False
             self.stream_rates.stop()
-            events.append(LinkLost(now_ns, self._autopilot or 0, self._last_received))
+            events.append(LinkLost(now_ns, self.autopilot or 0, self._last_received))
         if now_ns >= self._heartbeat_at:
             self._heartbeat_at = now_ns + HEARTBEAT_INTERVAL
             self.send(
@@ -355,25 +395,58 @@ class Session:
         assert self._signing is not None
         return self._signing.sign(data, self._link_id, self._now)
 
-    def _on_frame(self, found: Frame, now: int, events: list[Event]) -> None:
+    def _on_frame(self, found: Frame, peer: Hashable, now: int, events: list[Event]) -> None:
         if self._signing is not None and (reason := self._signing.verify(found, now)) is not None:
             self.rejected[reason] += 1
             events.append(FrameRejected(now, found.system, found.component, reason))
             return
         self.reader.count(found)
-        if found.system in self._ignored:
-            return
         if found.component == self.component and found.system == self.system:
             return  # our own frame, sent back by a router
+        is_proof = self.is_proof(found)
+        if peer is not None and is_proof:
+            self._keep_reader(peer, now)
         message = dialect.decode(found)
-        if (handler := self._handlers.get(found.msgid)) is not None:
-            handler(message, found, now, events)
-            if found.system in self._ignored:
-                return
-        from_autopilot = found.system == self._autopilot and found.component == _AUTOPILOT_COMPONENT
+        if found.component == _AUTOPILOT_COMPONENT and is_proof:
+            self._choose(message, found, peer, now, events)
+        if self._choice.is_rival(found.system, peer):
+            return
+        chosen = self._choice.chosen
+        from_autopilot = (
+            chosen is not None
+            and is_proof
+            and found.system == chosen.system
+            and found.component == _AUTOPILOT_COMPONENT
+            and peer == chosen.peer
+        )
+        if found.msgid == mavlink.MAVLINK_MSG_ID_TIMESYNC:
+            self._on_timesync(message, found, from_autopilot, now, events)
+        elif found.msgid == mavlink.MAVLINK_MSG_ID_COMMAND_ACK and from_autopilot:
+            self._on_acknowledgement(message)
         if from_autopilot:
             self._on_autopilot(message, found, now, events)
-        events.append(MessageReceived(now, message, found, from_autopilot))
+        events.append(MessageReceived(now, message, found, from_autopilot, peer))
+
+    def _choose(self, message: Message, found: Frame, peer: Hashable, now: int, events: list[Event]) -> None:
+        """Let a frame of an autopilot's component decide which autopilot is used."""
+        heartbeat = message if found.msgid == mavlink.MAVLINK_MSG_ID_HEARTBEAT else None
+        choice = self._choice
+        before = choice.receive(found.msgid, heartbeat, found.system, peer, now)
+        if before is not None and choice.chosen is not None and before.system != choice.chosen.system:
+            self._release(before, now, events)
+        key = found.system, peer
+        is_other = choice.is_candidate(*key) and (
+            choice.chosen is None or (choice.chosen.system, choice.chosen.peer) != key
+        )
+        if is_other and key not in self._reported and len(self._reported) < MAX_REPORTED:
+            self._reported.add(key)
+            events.append(SecondAutopilot(now, found.system, self.autopilot or choice.locked_system or 0))
+
+    def _release(self, before: Candidate, now: int, events: list[Event]) -> None:
+        self._up = False
+        self.clock.reset()
+        self.stream_rates.stop()
+        events.append(AutopilotReleased(now, before.system, self.autopilot))
 
     def _on_autopilot(self, message: Message, found: Frame, now: int, events: list[Event]) -> None:
         self._last_received = now
@@ -381,7 +454,7 @@ class Session:
             self._up = True
             self._timesync_at = now
             self.stream_rates.start(now)
-            events.append(LinkUp(now, found.system, self._autopilot_type))
+            events.append(LinkUp(now, found.system, self.autopilot_type))
         self.stream_rates.count(found.msgid)
         if found.msgid in STAMPED_WHEN_SENT and message.time_boot_ms:
             boot = message.time_boot_ms * 1_000_000
@@ -406,20 +479,7 @@ class Session:
             self._reported_late, self._changed_at = not self._reported_late, None
             events.append(LinkLate(now, system, late if self._reported_late else 0))
 
-    def _on_heartbeat(self, message: Message, found: Frame, now: int, events: list[Event]) -> None:
-        if found.component != _AUTOPILOT_COMPONENT or message.autopilot == mavlink.MAV_AUTOPILOT_INVALID:
-            return
-        if message.type in NOT_VEHICLES:
-            return
-        if self._autopilot is None and self._required_system in (None, found.system):
-            self._autopilot = found.system
-        if found.system == self._autopilot:
-            self._autopilot_type = message.autopilot
-        else:
-            self._ignored.add(found.system)
-            events.append(SecondAutopilot(now, found.system, self._autopilot or self._required_system or 0))
-
-    def _on_acknowledgement(self, message: Message, found: Frame, now: int, events: list[Event]) -> None:
+    def _on_acknowledgement(self, message: Message) -> None:
         """Match the answer to a requested rate with its message, by the order of the requests."""
         is_rate = message.command == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL
         if is_rate and self._unanswered and message.target_component in (0, self.component):
@@ -427,11 +487,14 @@ class Session:
             if message.result != mavlink.MAV_RESULT_ACCEPTED:
                 self.stream_rates.refuse(msgid)
 
-    def _on_timesync(self, message: Message, found: Frame, now: int, events: list[Event]) -> None:
+    def _on_timesync(
+        self, message: Message, found: Frame, from_autopilot: bool, now: int, events: list[Event]
+    ) -> None:
         if message.tc1 == 0:
-            if self._answer_limiter.take(now):
+            limiter = self._autopilot_answer_limiter if from_autopilot else self._answer_limiter
+            if limiter.take(now):
                 self.send(dialect.new("TIMESYNC", tc1=max(now, 1), ts1=message.ts1))
-        elif found.system == self._autopilot and found.component == _AUTOPILOT_COMPONENT:
+        elif from_autopilot:
             before = self.clock.offset(now)
             self.clock.update_timesync(message.ts1, message.tc1, now)
             if (error := self.clock.outlier) is not None:
@@ -443,7 +506,7 @@ class Session:
         self.send(
             dialect.new(
                 "COMMAND_LONG",
-                target_system=self._autopilot or 0,
+                target_system=self.autopilot or 0,
                 target_component=_AUTOPILOT_COMPONENT,
                 command=mavlink.MAV_CMD_SET_MESSAGE_INTERVAL,
                 param1=msgid,

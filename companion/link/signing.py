@@ -89,7 +89,7 @@ class Signing:
         if not 0 <= timestamp < MAX_TIMESTAMP:
             raise ValueError(f"signing timestamp {timestamp} is out of range: remove the stored timestamp")
         self._key = hashlib.sha256(key)
-        self._refuse_unsigned = refuse_unsigned
+        self.refuse_unsigned = refuse_unsigned
         self._always_accepted = frozenset(always_accepted)
         self._start = timestamp
         self._newest = timestamp  # of all that were sent, accepted or stored
@@ -115,24 +115,30 @@ class Signing:
 
     def verify(self, frame: Frame, now_ns: int) -> SignatureFault | None:
         """Return why `frame` must be rejected; None accepts it and advances its stream."""
+        fault = self.examine(frame, now_ns)
+        if fault is None and frame.signature is not None:
+            stamp = _timestamp(frame.signature)
+            self._streams[_stream(frame, frame.signature)] = stamp
+            self._newest = max(self._newest, stamp)
+        return fault
+
+    def examine(self, frame: Frame, now_ns: int) -> SignatureFault | None:
+        """Return why `frame` must be rejected, None if it may be accepted; changes nothing."""
         if frame.signature is None:
-            if self._refuse_unsigned and frame.msgid not in self._always_accepted:
+            if self.refuse_unsigned and frame.msgid not in self._always_accepted:
                 return SignatureFault.UNSIGNED
             return None
         if not hmac.compare_digest(self._hash(frame.raw[:-6]), frame.raw[-6:]):
             return SignatureFault.FORGED
-        stamp = int.from_bytes(frame.signature[1:7], "little")
-        stream = (frame.signature[0], frame.system, frame.component)
+        stamp = _timestamp(frame.signature)
         ours = self.time(now_ns)
-        last = self._streams.get(stream)
+        last = self._streams.get(_stream(frame, frame.signature))
         if last is not None and stamp <= last:
             return SignatureFault.REPLAYED
         if last is None and stamp < ours - BEHIND:
             return SignatureFault.OLD
         if stamp >= MAX_TIMESTAMP or (self._clock is not None and stamp > ours + AHEAD):
             return SignatureFault.FUTURE
-        self._streams[stream] = stamp
-        self._newest = max(self._newest, stamp)
         return None
 
     @property
@@ -149,6 +155,14 @@ class Signing:
         digest = self._key.copy()
         digest.update(data)
         return digest.digest()[:6]
+
+
+def _timestamp(signature: bytes) -> int:
+    return int.from_bytes(signature[1:7], "little")
+
+
+def _stream(frame: Frame, signature: bytes) -> tuple[int, int, int]:
+    return signature[0], frame.system, frame.component
 
 
 def read_key(path: Path) -> bytes:

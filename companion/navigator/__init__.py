@@ -2,7 +2,8 @@
 
 `Navigator` folds `step` over the records. A measurement that arrives late is applied at its own time: the
 states of the last seconds are kept, the navigator goes back to the one before it and folds forward again.
-Solutions that were already returned stay; a late measurement shows in the next one.
+Solutions that were already returned stay; a late measurement shows in the next one. Going back by t seconds
+is done at most once in t / 10, for all records that arrived late in between: the work per second is bounded.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from companion.estimate import bank as banks
 from companion.navigator import minimax_bound
 from companion.navigator.hypotheses import Model
 from companion.navigator.own_channel import OwnChannel
-from companion.navigator.solution import announce, refresh_bound, resolve_pending, solve
+from companion.navigator.solution import announce, resolve_pending, solve
 from companion.navigator.stale_data import REPORT_EVERY, StaleDataDetector
 from companion.navigator.state import FIXES, Settings, State, Step, initial, is_new_fix
 from companion.navigator.step import INPUTS_USED, step, uses
@@ -40,6 +41,10 @@ from companion.records import (
 
 __all__ = ["INPUTS_USED", "Navigator"]
 
+#: A roll-back costs 1 to 2 % of the time that it goes back: at most one in this share of it.
+ROLL_BACK_SHARE = 10
+#: Most late records that wait for the next roll-back, and most states kept (up to 0.2 MB each).
+MOST_WAITING, MOST_KEPT = 64, 1024
 PLAUSIBLE = 1e8  # in SI: no metres, pascals or metres a second of ours come near it
 
 
@@ -58,7 +63,9 @@ class Navigator:
     def __init__(self, config: Config, model: Model | None = None) -> None:
         self._settings = Settings(config, model or Model(config))
         self._state = initial(self._settings)
-        self._past: deque[_Past] = deque()
+        self._past: deque[_Past] = deque(maxlen=MOST_KEPT)
+        self._waiting: list[Input] = []  # late records, until the next roll-back
+        self._rolled_back_ns: int | None = None  # arrival of the record at the last roll-back
         self._deferred: list[Output] = []  # outputs of deferred updates, for the next `handle`
         self._late_ns = round(1e9 * config.estimator.late_s)
         self._gnss_latency_ns = round(1e9 * config.gnss.latency_s)
@@ -99,14 +106,18 @@ class Navigator:
             return []
         self.settle()
         outputs, self._deferred = self._deferred, []
+        folded: list[Input] = [record]
         if self._past and record.t_ns < self._past[-1].t_ns:
-            outputs += self._handle_late(record)
+            outputs += self._queue_late(record)
+            folded = []
         else:
             self._past.append(_Past(record.t_ns, record, self._state))
             outputs += self._step(record)
-        if (
-            isinstance(record, RsbnFix) and self._state.rsbn_ns == record.t_ns
-        ):  # a beacon's fix goes out at once
+        if self._waiting and self._may_roll_back(record.rx_ns):
+            folded += self._waiting
+            outputs += self._roll_back(record.rx_ns)
+        if any(isinstance(one, RsbnFix) and self._state.rsbn_ns == one.t_ns for one in folded):
+            # a solution at once after a beacon's fix
             self._state, solution = guarded(self._state, record, self._settings, _solve, record)
             outputs += solution
         return self._with_mode_events(outputs)
@@ -117,7 +128,7 @@ class Navigator:
         `handle` does it first if it was not done in between; its outputs come with the next `handle`.
         """
         self._deferred += self._resolve()[1]
-        while self._past and self._past[0].t_ns < self._past[-1].t_ns - self._late_ns:
+        while not self._waiting and self._past and self._past[0].t_ns < self._past[-1].t_ns - self._late_ns:
             self._past.popleft()
 
     def _reject_implausible(self, record: Input) -> list[Output]:
@@ -129,19 +140,13 @@ class Navigator:
         return [Rejection(record.t_ns, record.rx_ns, name, "a value is not finite or beyond 1e8")]
 
     def _resolve(self) -> tuple[Input | None, list[Output]]:
-        """Do the deferred update left by the last record: whose it was, and its outputs.
-
-        The fix is added to the window of the guaranteed bound, and one piece of that bound's work is done.
-        """
-        pending, outputs = self._state.pending, list[Output]()
-        if pending is not None:
-            state = self._state._replace(pending=None)
-            self._state, outputs = guarded(state, pending.record, self._settings, resolve_pending, pending)
-        if self._past and self._state.nominal is not None:
-            record = self._past[-1].record
-            self._state, more = guarded(self._state, record, self._settings, refresh_bound, record)
-            outputs = [*outputs, *more]
-        return pending.record if pending else None, outputs
+        """Do the deferred update left by the last record: whose it was, and its outputs."""
+        pending = self._state.pending
+        if pending is None:
+            return None, []
+        state = self._state._replace(pending=None)
+        self._state, outputs = guarded(state, pending.record, self._settings, resolve_pending, pending)
+        return pending.record, outputs
 
     def _step(self, record: Input) -> list[Output]:
         self._state, outputs = guarded(self._state, record, self._settings, step, record)
@@ -159,26 +164,50 @@ class Navigator:
         while len(self._past) > 1:  # the last one stays: it dates what is too late
             self._past.popleft()
 
-    def _handle_late(self, record: Input) -> list[Output]:
+    def _queue_late(self, record: Input) -> list[Output]:
+        """Let a late record wait for the next roll-back, or reject it."""
         if record.t_ns < self._past[0].t_ns:
             return self._too_late(record)
-        place = bisect_right(self._past, record.t_ns, key=lambda past: past.t_ns)
-        again = [record, *(past.record for past in list(self._past)[place:])]
-        self._state = self._rewound(self._past[place].before)
+        if len(self._waiting) >= MOST_WAITING:
+            why = f"more than {MOST_WAITING} late records wait: not used"
+            return [Rejection(record.t_ns, record.rx_ns, type(record).__name__, why)]
+        self._waiting.append(record)
+        return []
+
+    def _may_roll_back(self, now_ns: int) -> bool:
+        back_ns = self._past[-1].t_ns - min(record.t_ns for record in self._waiting)
+        last = self._rolled_back_ns
+        return last is None or not 0 <= now_ns - last < back_ns // ROLL_BACK_SHARE
+
+    def _roll_back(self, now_ns: int) -> list[Output]:
+        """Go back to the state before the oldest waiting record and fold all records since in their order."""
+        self._rolled_back_ns = now_ns
+        outputs: list[Output] = []
+        late, self._waiting = sorted(self._waiting, key=lambda record: record.t_ns), []
+        while late and late[0].t_ns < self._past[0].t_ns:  # dropped while they waited
+            outputs += self._too_late(late.pop(0))
+        if not late:
+            return outputs
+        place = bisect_right(self._past, late[0].t_ns, key=lambda past: past.t_ns)
+        later = [past.record for past in list(self._past)[place:]]
+        # a stable sort: of equal times the late one comes last
+        again = sorted([*later, *late], key=lambda record: record.t_ns)
+        if later:
+            self._state = self._rewound(self._past[place].before)
         while len(self._past) > place:
             self._past.pop()
-        given: list[Output] = []
+        new = set(map(id, late))
         for each in again:
             whose, resolved = self._resolve()
+            if id(whose) in new:  # the others were returned when they were resolved first
+                outputs += resolved
             self._past.append(_Past(each.t_ns, each, self._state))
-            outputs = self._step(each)
-            if whose is record:  # the others were returned when they were resolved first
-                given += resolved
-            if each is record:
+            found = self._step(each)
+            if id(each) in new:
                 last = self._last_solution_ns
-                given = [out for out in outputs if not isinstance(out, Solution) or out.t_ns > last]
+                outputs += [out for out in found if not isinstance(out, Solution) or out.t_ns > last]
         self._resolve()
-        return given
+        return outputs
 
     def _too_late(self, record: Input) -> list[Output]:
         """Reject it; a receiver without a fix has nothing to use."""
@@ -191,8 +220,9 @@ class Navigator:
 
     def _rewound(self, before: State) -> State:
         """An earlier state to fold forward from, keeping the latest forecast of the predictor."""
-        answers = self._state.guarantee.answers
-        return before._replace(guarantee=before.guarantee._replace(answers=answers))
+        now = self._state
+        promise = before.guarantee._replace(held=now.guarantee.held)
+        return before._replace(guarantee=promise, ahead=now.ahead, next_ahead_ns=now.next_ahead_ns)
 
     def _with_mode_events(self, outputs: list[Output]) -> list[Output]:
         """Add an event wherever the mode, or the fixes that the solution rests on, change."""
@@ -224,7 +254,7 @@ def tuned(state: State, before: Settings, config: Config) -> tuple[Settings, Sta
     )
     if same:
         settings = settings._replace(model=before.model)
-        return settings, state._replace(guarantee=minimax_bound.tuned(state.guarantee))
+        return settings, state._replace(guarantee=minimax_bound.tuned(state.guarantee, config))
     return settings, initial(settings)._replace(
         next_ns=state.next_ns, origin=state.origin, sensors=state.sensors, level=state.level
     )
@@ -274,8 +304,6 @@ def _channel_event(record: Input, settings: Settings) -> Event:
         if config.output.feeds_estimator and "local_position" in allowed:
             allowed.remove("local_position")
         text = f"inertial channel: own, by {', '.join(a.replace('_', ' ') for a in allowed)}"
-        if "imu" in allowed:
-            text += "; no guaranteed bound by imu"
     else:
         text = "inertial channel: local position of an INS of its own"
     return Event(record.t_ns, record.rx_ns, Severity.INFO, text)

@@ -14,7 +14,7 @@ other links are only logged, and position messages are sent on the leading link 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Hashable, Iterable
 from typing import Any
 
 import msgspec
@@ -26,7 +26,9 @@ from companion.link import dialect
 from companion.link.decode import MAKES, Sender, decode
 from companion.link.dialect import mavlink, rsbn
 from companion.link.firmware import Firmware, firmware_of
+from companion.link.rate_limiter import RateLimiter, SenderLimiter
 from companion.link.session import (
+    AutopilotReleased,
     ClockJump,
     FrameRejected,
     LinkLate,
@@ -44,6 +46,7 @@ from companion.link.signing import Signing
 from companion.navigator import Navigator
 from companion.output.autopilot_output import AutopilotOutput
 from companion.output.encode import Receiver, named_values, navigation_status
+from companion.output.pace import Pace
 from companion.records import (
     INPUTS,
     Event,
@@ -66,12 +69,19 @@ from companion.runtime.origin import OriginCheck
 from companion.runtime.parameter_check import ParameterCheck
 from companion.runtime.status import Status
 from companion.storage.deferred_log import Log
+from companion.transport.peers import Rank
 from companion.units import SECOND_NS
 
 STATUS = "NAVIGATION_STATUS"
 ORIGIN_REQUEST_INTERVAL = 3 * SECOND_NS
 FIRMWARE_REQUESTS = 10
 STALE_AFTER = 2 * SECOND_NS
+#: Beacon answers per second and at once of one sender, and the number of senders: bounds their work.
+ANSWERS_HZ, ANSWERS_BURST, MAX_RECEIVERS = 10.0, 20, 4
+REPORT_INTERVAL = 10 * SECOND_NS
+#: Bytes per second, at once and in all of frames that are logged though they are not used: those of stations,
+#: other vehicles and strangers. A flood must not fill the disk with them.
+UNUSED_LOG_HZ, UNUSED_LOG_BURST, UNUSED_LOG_TOTAL = 20_000.0, 1 << 18, 1 << 26
 #: Messages of ground stations that the companion answers.
 REQUESTS = frozenset(
     {
@@ -182,23 +192,38 @@ class CompanionCore:
         self._events: list[Event] = []
         self.rejected: Counter[str] = Counter()
         self._origin = OriginCheck(has_pairs=not config.has_own_ins)
-        self._period_start: dict[str, int] = {}  # time from which each message's period is counted
+        self._last_used: Link | None = None  # whose autopilot's records were used last
+        self._pace = Pace(at_least=frozenset({RESET}))
+        self._answers = SenderLimiter(ANSWERS_HZ, ANSWERS_BURST, MAX_RECEIVERS)
+        self._unused_log = RateLimiter(UNUSED_LOG_HZ, UNUSED_LOG_BURST)
+        self._unused_logged = 0
+        self.not_logged = 0  # frames
+        self._excess_reported_ns: dict[str, int] = {}
         self._next_state_ns = 0
         self._stale = False  # no recent solution
         self._inputs = InputMonitor()
 
-    def receive(self, link: str, data: bytes, now_ns: int) -> None:
-        """Process bytes received on `link`."""
+    def receive(self, link: str, data: bytes, now_ns: int, peer: Hashable = None) -> Rank:
+        """Process bytes received on `link` from `peer`; return how much their sender matters."""
         self.links[link].has_bytes = True
-        self._on_events(self.links[link], self.links[link].session.receive(data, now_ns), now_ns)
+        session = self.links[link].session
+        events = session.receive(data, now_ns, peer)
+        self._on_events(self.links[link], events, now_ns)
+        accepted = [e for e in events if isinstance(e, MessageReceived) and session.is_proof(e.frame)]
+        if any(event.from_autopilot for event in accepted):
+            return Rank.AUTOPILOT
+        return Rank.ACCEPTED if accepted else Rank.UNKNOWN
 
     @property
     def leading_link(self) -> Link | None:
         """The link whose messages are used and that carries the position messages."""
+        first = None
         for link in self.links.values():  # called for every message: cheaper than a generator
             if link.session.is_up:
-                return link
-        return None
+                if link.session.is_confirmed:
+                    return link
+                first = first or link
+        return first
 
     @property
     def config(self) -> Config:
@@ -216,6 +241,7 @@ class CompanionCore:
 
     def poll(self, now_ns: int) -> None:
         """Do the periodic work that is due."""
+        self._lock_links(now_ns)
         for link in self.links.values():
             self._on_events(link, link.session.poll(now_ns), now_ns)
             if link is self.leading_link and self._origin.origin is None and now_ns >= link.origin_request_ns:
@@ -238,6 +264,17 @@ class CompanionCore:
             for link in self.links.values():
                 link.session.state = self._system_state(now_ns)
                 self._log.record(self._link_state(link, now_ns))
+
+    def _lock_links(self, now_ns: int) -> None:
+        """Keep all links on one aircraft: the confirmed one, else one that may become so."""
+        links = self.links.values()
+        holder = next((link for link in links if link.session.is_confirmed), None)
+        if holder is None:
+            holder = next((link for link in links if link.session.is_promising(now_ns)), None)
+        locked = None if holder is None else holder.session.autopilot
+        for link in links:
+            if link is not holder:
+                self._on_events(link, link.session.lock_to_system(locked, now_ns), now_ns)
 
     def deadline(self) -> int:
         """Return the latest time of the next `poll`, ns."""
@@ -275,8 +312,7 @@ class CompanionCore:
                 text = f"{link.name}: autopilot {event.system} connected ({link.sender.autopilot})"
                 self.report(Severity.INFO, text + self._leading_link_note(link), now_ns)
                 link.parameter_check.start(self._config, event.system, event.autopilot)
-                for each in self.links.values():
-                    each.session.lock_to_system(event.system)  # one aircraft only
+                self._lock_links(now_ns)
                 # the origin may have changed during the silence
                 if link is self.leading_link and self._origin.origin is not None:
                     self._request_message(link, mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN)
@@ -284,6 +320,14 @@ class CompanionCore:
                 silence_s = (now_ns - event.last_received_ns) / SECOND_NS
                 text = f"{link.name}: autopilot {event.system} silent for {silence_s:.0f} s"
                 self.report(Severity.WARNING, text + self._leading_link_note(link), now_ns)
+            elif isinstance(event, AutopilotReleased):
+                link.output.handle_reboot()
+                by = "no other one yet" if event.by is None else f"autopilot {event.by} is used"
+                text = f"{link.name}: autopilot {event.system} released: no navigation messages; {by}"
+                self.report(Severity.WARNING, text, now_ns)
+                if link is self._last_used:
+                    self._origin.forget()
+                    self._on_record(Reboot(now_ns, now_ns, event.system))
             elif isinstance(event, Rebooted):
                 self._origin.forget()
                 link.firmware, link.firmware_requests = None, 0  # a reboot may follow an update
@@ -315,11 +359,21 @@ class CompanionCore:
                 if link.not_sent[event.why] == 1:
                     self.report(Severity.ERROR, f"{link.name}: not sent: {event.why}", now_ns)
             elif isinstance(event, SecondAutopilot):
-                text = f"{link.name}: second autopilot {event.system} ignored; connected to {event.kept}"
+                same = " from another address" if event.system == event.kept else ""
+                text = (
+                    f"{link.name}: second autopilot {event.system}{same} ignored; connected to {event.kept}"
+                )
                 self.report(Severity.WARNING, text, now_ns)
 
     def _on_message(self, link: Link, event: MessageReceived) -> None:
-        self._log.frame(link.name, False, event.frame.raw, event.received_ns)
+        is_used = event.from_autopilot
+        if event.frame.msgid == rsbn.MAVLINK_MSG_ID_RSBN_MEASUREMENT:
+            sender = event.peer, event.frame.system, event.frame.component
+            is_used = self._answers.take(sender, event.received_ns)
+            if not is_used:
+                self._report_excess_answers(link, event)
+        if is_used or self._may_log_unused(link, event):
+            self._log.frame(link.name, False, event.frame.raw, event.received_ns)
         if event.frame.msgid == mavlink.MAVLINK_MSG_ID_HEARTBEAT:
             link.has_station |= event.message.type == mavlink.MAV_TYPE_GCS
         elif event.frame.msgid in REQUESTS:
@@ -336,7 +390,7 @@ class CompanionCore:
         if event.frame.msgid in ABOUT_SOURCE_SET:
             link.output.handle_message(event.message, event.from_autopilot, event.received_ns)
             self._emit_output_events(link)
-        if not (event.from_autopilot or event.frame.msgid == rsbn.MAVLINK_MSG_ID_RSBN_MEASUREMENT):
+        if not is_used:
             return
         ours = (0, self._config.link.component_id)  # 0: the sender states no target
         if event.frame.msgid == mavlink.MAVLINK_MSG_ID_COMMAND_ACK and event.message.target_component in ours:
@@ -354,7 +408,36 @@ class CompanionCore:
                 for each in self.links.values():
                     each.output.receive(record)
             if not is_duplicate:
+                self._last_used = link if event.from_autopilot else self._last_used
                 self._on_record(record)
+
+    def _report_excess_answers(self, link: Link, event: MessageReceived) -> None:
+        self.rejected["beacon answers above their rate"] += 1
+        self._report_excess(
+            f"{link.name}: beacon answers of {event.frame.system}/{event.frame.component} not used: more "
+            f"than {ANSWERS_HZ:g} per second, or more than {MAX_RECEIVERS} receivers",
+            "answers",
+            event.received_ns,
+        )
+
+    def _may_log_unused(self, link: Link, event: MessageReceived) -> bool:
+        size, now = len(event.frame.raw), event.received_ns
+        if self._unused_logged < UNUSED_LOG_TOTAL and self._unused_log.take(now, size):
+            self._unused_logged += size
+            return True
+        self.not_logged += 1
+        text = (
+            f"{link.name}: {self.not_logged} frames of other senders not logged: more than "
+            f"{UNUSED_LOG_HZ / 1e3:g} kB/s, or {UNUSED_LOG_TOTAL >> 20} MiB in all"
+        )
+        self._report_excess(text, "log", now)
+        return False
+
+    def _report_excess(self, text: str, what: str, now: int) -> None:
+        last = self._excess_reported_ns.get(what)
+        if last is None or now - last >= REPORT_INTERVAL:
+            self._excess_reported_ns[what] = now
+            self.report(Severity.WARNING, text, now)
 
     def _on_record(self, record: Stamped) -> None:
         if not isinstance(record, INPUTS):  # truth, or a rejection by the decoder: only logged
@@ -365,7 +448,7 @@ class CompanionCore:
             self._emit(event, "/link/Event")
         for output in self._navigator.handle(record):  # type: ignore[arg-type]
             if isinstance(output, Solution):
-                self._send(output, is_beacon_fix=isinstance(record, RsbnFix))
+                self._send(output, early=isinstance(record, RsbnFix))
             elif isinstance(output, Reset) and isinstance(record, LocalPosition):
                 self._origin.forget()  # it may have moved: do not use it until received again
             self._emit(output)
@@ -385,16 +468,11 @@ class CompanionCore:
             text = text.replace(f"{name}: ", "").replace(name, "another link")
         return text
 
-    def _send(self, solution: Solution, is_beacon_fix: bool) -> None:
-        """Send the messages that are due; after a beacon fix, all position messages."""
+    def _send(self, solution: Solution, early: bool) -> None:
+        """Send the messages that are due; `early`: positions may leave earlier, after a beacon fix."""
         self._solution = solution
-        periods, t_ns = self._services.periods_ns, solution.t_ns
-        next_ns = {
-            name: self._period_start.get(name, t_ns - period) + period for name, period in periods.items()
-        }
-        due = [n for n in periods if (is_beacon_fix and n not in (RESET, STATUS)) or t_ns >= next_ns[n]]
-        for name in due:
-            self._period_start[name] = max(next_ns[name], t_ns if name == RESET else t_ns - periods[name])
+        periods = self._services.periods_ns
+        due = self._pace.due(periods, solution.t_ns, periods.keys() - {RESET, STATUS} if early else ())
         feeding = [name for name in due if name != STATUS]
         if feeding and (leading := self.leading_link) is not None:
             for message in leading.output.messages(solution, feeding, self._receiver(leading)):

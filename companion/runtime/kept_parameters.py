@@ -3,10 +3,10 @@
     config, notes = kept.load(base, lambda: load(..., tuned=kept.path))     # counts this start
     kept.confirm()                # the values have flown for a minute, or the service ended as requested
 
-A start is counted in a file beside the parameters and confirmed later. After two starts of the same boot that
-were not confirmed, or if the values do not pass the checks, the parameters are set aside and the operator's
-configuration is used. A power cut changes the boot, so it does not count. A disk that cannot be written
-disables the count, not the service.
+A start is counted in a file, in systemd's RUNTIME_DIRECTORY or beside the parameters, and confirmed later.
+After two starts of the same boot that were not confirmed, or if the values do not pass the checks, the
+parameters are set aside and the operator's configuration is used. A power cut does not count. A disk that
+cannot be written disables the count, not the service.
 """
 
 from __future__ import annotations
@@ -26,9 +26,10 @@ BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 class KeptParameters:
     """The parameters file of one service and the count of its unconfirmed starts."""
 
-    def __init__(self, path: Path, boot_id: Path = BOOT_ID) -> None:
+    def __init__(self, path: Path, boot_id: Path = BOOT_ID, runtime_folder: str = "") -> None:
         self.path = path
-        self._count_path = path.with_name(path.name + ".starts")
+        name = path.name + ".starts"
+        self._count_path = Path(runtime_folder) / name if runtime_folder else path.with_name(name)
         self._boot_id = boot_id
 
     def load(self, base: Config, load: Callable[[], Config]) -> tuple[Config, list[str]]:

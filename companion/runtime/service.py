@@ -19,7 +19,8 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterable
+from collections import deque
+from collections.abc import Callable, Hashable, Iterable
 from functools import partial
 from importlib import import_module
 from pathlib import Path
@@ -33,6 +34,7 @@ from companion.records import Event, Severity
 from companion.runtime.console import Console, terminal_columns
 from companion.runtime.core import CompanionCore, Link
 from companion.runtime.daemon_thread import run_in_daemon_thread
+from companion.runtime.exposure import exposure
 from companion.runtime.kept_parameters import KeptParameters
 from companion.runtime.signing_key import SigningKey
 from companion.runtime.state_file import StateFile
@@ -65,8 +67,8 @@ class Service:
     """One run of the companion.
 
     `on_event` is called for every event, `now` reads the monotonic clock, `base` is the operator's
-    configuration without the values that ground stations set, `kept` the file of those. `on_status` is called
-    once a second.
+    configuration without the values that ground stations set, `kept` the file of those, `deleted` the logs
+    that were deleted and are still to be reported. `on_status` is called once a second.
     """
 
     def __init__(
@@ -78,9 +80,11 @@ class Service:
         notifier: SystemdNotifier | None = None,
         base: Config | None = None,
         kept: KeptParameters | None = None,
+        deleted: deque[Path] | None = None,
         on_status: Callable[[Status, int], None] = ignore_status,
     ) -> None:
         self._kept = kept
+        self._deleted = deque[Path]() if deleted is None else deleted
         self._on_status, self._next_status_ns = on_status, 0
         self._notifier = notifier or SystemdNotifier({})
         self._addresses = {text: Address.parse(text) for text in config.link.connect}
@@ -127,19 +131,24 @@ class Service:
 
     async def _run_link(self, name: str) -> None:
         """Serve one link; reopen it whenever it fails."""
-        async for stream in connections(self._addresses[name], random.random, self.report):
-            link = self.core.links[name]
+        link = self.core.links[name]
+        is_valid = partial(self._is_valid, link)
+        async for stream in connections(self._addresses[name], random.random, self.report, is_valid):
+            link.session.reader.close()  # what is left of a frame of the connection before
             self._connections[name], self._dropped_before[name] = stream, link.dropped
             self._notifier.ready()
             try:
-                await stream.deliver_to(partial(self._receive, link))
+                await stream.deliver_to(partial(self._receive, link, stream))
             except ConnectionError as error:
                 self.report(f"{name}: {error}; reopening")
             self._count_dropped()
             del self._connections[name]
 
-    def _receive(self, link: Link, data: bytes) -> None:
-        self.core.receive(link.name, data, self._now())
+    def _is_valid(self, link: Link, data: bytes) -> bool:
+        return link.session.would_accept(data, self._now())
+
+    def _receive(self, link: Link, stream: Connection, data: bytes, peer: Hashable) -> None:
+        stream.note(peer, self.core.receive(link.name, data, self._now(), peer))
         self._flush()
 
     async def _run_timers(self) -> None:
@@ -155,6 +164,9 @@ class Service:
                 text += f"; {self._log.dropped} messages lost so far" if self._log.dropped else ""
                 self.core.report(Severity.WARNING if self._trouble else Severity.INFO, text, now)
             self._report_drops(now)
+            while self._deleted:
+                text = f"log: {self._deleted.popleft().name} deleted to keep the limits of [log]"
+                self.core.report(Severity.NOTICE, text, now)
             self._flush()
             if now >= self._next_status_ns:
                 self._next_status_ns = now + STATUS_INTERVAL_NS
@@ -241,7 +253,7 @@ async def run(
 ) -> None:
     """Open the log, report `notes`, serve until SIGINT or SIGTERM, close the log. Others: see `Service`."""
     start_ns, start_unix_ns = time.monotonic_ns(), time.time_ns()
-    settings = config.log
+    settings, deleted = config.log, deque[Path]()
     log = create_log(
         settings.folder,
         metadata=run_metadata(config),
@@ -250,11 +262,20 @@ async def run(
         max_files=settings.maximum_files,
         min_free=settings.minimum_free_mib << 20,
         chunk_bytes=settings.chunk_kib << 10,
+        on_delete=deleted.append,
     )
     service, has_data = None, True
     try:
-        notifier = SystemdNotifier(os.environ)
-        service = Service(config, log, on_event, notifier=notifier, base=base, kept=kept, on_status=on_status)
+        service = Service(
+            config,
+            log,
+            on_event,
+            notifier=SystemdNotifier(os.environ),
+            base=base,
+            kept=kept,
+            deleted=deleted,
+            on_status=on_status,
+        )
         loop = asyncio.get_running_loop()
         for number in (signal.SIGINT, signal.SIGTERM):
             loop.add_signal_handler(number, service.stop)
@@ -262,9 +283,12 @@ async def run(
         for address in map(Address.parse, config.link.connect):
             verb = "listening" if address.listens else "connecting"
             service.core.report(Severity.INFO, f"{verb}: {address}", time.monotonic_ns())
+            is_open, sentence = exposure(address, config)
+            severity = Severity.WARNING if is_open else Severity.INFO
+            service.core.report(severity, sentence, time.monotonic_ns())
         for note in notes:
             service.core.report(Severity.WARNING, note, time.monotonic_ns())
-        recover = partial(_recover_logs, settings, service, asyncio.get_running_loop())
+        recover = partial(_recover_logs, settings, service, asyncio.get_running_loop(), deleted)
         threading.Thread(target=recover, name="recover", daemon=True).start()
         # needed by the first solution with a protection level; not before the first frame is received
         load = threading.Thread(target=import_module, args=("scipy.special",), name="import", daemon=True)
@@ -286,13 +310,15 @@ async def run(
             log.path.unlink(missing_ok=True)
 
 
-def _recover_logs(settings: LogConfig, service: Service, loop: asyncio.AbstractEventLoop) -> None:
+def _recover_logs(
+    settings: LogConfig, service: Service, loop: asyncio.AbstractEventLoop, deleted: deque[Path]
+) -> None:
     """Recover the unclosed logs of earlier runs.
 
     This takes seconds per hour of log, so neither navigation nor the end of the service waits for it; an
     interrupted recovery restarts at the next run.
     """
-    for found in recover_unclosed(settings.folder, settings.minimum_free_mib << 20):
+    for found in recover_unclosed(settings.folder, settings.minimum_free_mib << 20, deleted.append):
         text = f"log: {found.path} recovered, {found.messages} messages"
         with contextlib.suppress(RuntimeError):  # the loop has ended
             loop.call_soon_threadsafe(service.report, text)
@@ -329,7 +355,9 @@ def command(
     base = config = load(file, flags, pairs=pairs, preset=preset)
     kept, notes = None, list[str]()
     if base.link.parameters_file:
-        kept = KeptParameters(Path(base.link.parameters_file))
+        kept = KeptParameters(
+            Path(base.link.parameters_file), runtime_folder=os.environ.get("RUNTIME_DIRECTORY", "")
+        )
         config, notes = kept.load(
             base, lambda: load(file, flags, pairs=pairs, tuned=kept.path, preset=preset)
         )

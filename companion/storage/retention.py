@@ -13,7 +13,7 @@ import fcntl
 import os
 import re
 import shutil
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
@@ -39,17 +39,19 @@ def create_log(
     fsync_s: float = 1.0,
     depth: int = 1 << 25,
     block: bool = False,
+    on_delete: Callable[[Path], None] = lambda log: None,
 ) -> Writer:
     """Create a log in `folder`, named by number and start time in UTC (00042-20260131T235959Z.mcap).
 
     At most `max_files` logs are kept, this one included, and `min_free` bytes of the disk are left free: the
     oldest logs are deleted first, at the start and, for space, while this log is written. Raises LogError if
-    the folder cannot be created or written, or if deleting all logs would not free enough space.
+    the folder cannot be created or written, or if deleting all logs would not free enough space. `on_delete`
+    is called with each deleted log, in any thread.
     """
     folder = Path(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        has_space = make_room(folder, min_free, max_files - 1)
+        has_space = make_room(folder, min_free, max_files - 1, on_delete)
         path = _next_path(folder, start_unix_ns)
     except OSError as error:
         raise LogError(f"cannot keep logs in {folder}: {error.strerror or error}") from None
@@ -67,12 +69,14 @@ def create_log(
         fsync_s=fsync_s,
         depth=depth,
         block=block,
-        disk=partial(DiskFile, reserve=min_free, relieve=partial(make_room, folder)),
+        disk=partial(DiskFile, reserve=min_free, relieve=partial(make_room, folder, on_delete=on_delete)),
         attachments=[schemas.dialect_attachment(start_unix_ns)],
     )
 
 
-def recover_unclosed(folder: str | os.PathLike[str], min_free: int = 0) -> list[Recovered]:
+def recover_unclosed(
+    folder: str | os.PathLike[str], min_free: int = 0, on_delete: Callable[[Path], None] = lambda log: None
+) -> list[Recovered]:
     """Recover every ".active" log in `folder` that no process is writing.
 
     A log with nothing to read is left unchanged, and so is one that would leave less than `min_free` bytes
@@ -81,13 +85,18 @@ def recover_unclosed(folder: str | os.PathLike[str], min_free: int = 0) -> list[
     saved: list[Recovered] = []
     for path in sorted(Path(folder).glob(f"*.mcap{ACTIVE}"), key=_age_key, reverse=True):
         try:
-            saved.append(recover(path, min_free, partial(make_room, Path(folder))))
+            saved.append(recover(path, min_free, partial(make_room, Path(folder), on_delete=on_delete)))
         except LogError:  # being written, empty, or no space: retried at the next start
             continue
     return saved
 
 
-def make_room(folder: Path, min_free: int, max_files: int | None = None) -> bool:
+def make_room(
+    folder: Path,
+    min_free: int,
+    max_files: int | None = None,
+    on_delete: Callable[[Path], None] = lambda log: None,
+) -> bool:
     """Delete the oldest logs, closed or torn, until at most `max_files` remain and `min_free` bytes are free.
 
     Return whether the space is free. If it cannot be reached, nothing is deleted.
@@ -110,6 +119,7 @@ def make_room(folder: Path, min_free: int, max_files: int | None = None) -> bool
         return False
     for log in chosen:
         log.unlink(missing_ok=True)
+        on_delete(log)
     return True
 
 

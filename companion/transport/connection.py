@@ -9,9 +9,11 @@ from __future__ import annotations
 import asyncio
 import os
 import socket
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from functools import partial
+from typing import TypeAlias
 
+from companion.transport.peers import PeerTable, Rank
 from companion.transport.send_queue import SendQueue
 
 #: A connection is read up to this number of bytes and of datagrams before others have their turn: input made
@@ -19,6 +21,10 @@ from companion.transport.send_queue import SendQueue
 READ_SIZE = 1 << 14
 BURST = 64
 INBOX_LIMIT = 1 << 20
+
+
+#: Takes bytes and their sender (None on a stream).
+Handler: TypeAlias = Callable[[bytes, Hashable], None]
 
 
 class Connection:
@@ -31,6 +37,8 @@ class Connection:
         receive: Callable[[], bytes | None],
         send: Callable[[bytes], int],
         release: Callable[[], None] | None = None,
+        peers: PeerTable | None = None,
+        first: bytes = b"",
     ) -> None:
         """Watch an open device.
 
@@ -47,6 +55,10 @@ class Connection:
             Returns how many bytes were accepted. May raise OSError; BlockingIOError: the line is full.
         release
             Closes the device; by default, it is only closed.
+        peers
+            Peers of a link that receives from several; `receive` then sets `sender`.
+        first
+            Bytes that were already received.
         """
         self.name = name
         self._device = device
@@ -54,12 +66,14 @@ class Connection:
         self._receive = receive
         self._release = release or (partial(os.close, device) if isinstance(device, int) else device.close)
         self._loop = asyncio.get_running_loop()
-        self._inbox: list[bytes] = []
-        self._inbox_size = 0
+        self.sender: Hashable = None  # of the last bytes received
+        self._peers = peers
+        self._inbox: list[tuple[bytes, Hashable]] = [(first, None)] if first else []
+        self._inbox_size = len(first)
         self._send_queue = SendQueue(send, self._loop.time)
         self._waiter: asyncio.Future[None] | None = None
         self._end: ConnectionError | None = None
-        self._handler: Callable[[bytes], None] | None = None
+        self._handler: Handler | None = None
         self._loop.add_reader(self._fd, self._on_readable)
 
     @property
@@ -82,23 +96,33 @@ class Connection:
                 await self._waiter
             finally:
                 self._waiter = None
-        return self._take_inbox()
+        return b"".join(data for data, _ in self._take_inbox())
 
-    async def deliver_to(self, handler: Callable[[bytes], None]) -> None:
+    async def deliver_to(self, handler: Handler) -> None:
         """Call `handler` with each piece as soon as it arrives, until the connection ends.
 
         Raises ConnectionError at the end, or what `handler` raised.
         """
         self._waiter, self._handler = self._loop.create_future(), handler
         try:
-            if self._inbox:
-                handler(self._take_inbox())
+            for data, sender in self._take_inbox():
+                handler(data, sender)
             if self._end is None:
                 await self._waiter
         finally:
             self._waiter = self._handler = None
         assert self._end is not None
         raise self._end
+
+    def note(self, sender: Hashable, rank: Rank) -> None:
+        """Note how much a sender matters: on a link with several, those that do are sent to."""
+        if self._peers is not None:
+            self._peers.note(sender, rank)
+
+    @property
+    def is_open(self) -> bool:
+        """Whether the connection has not ended."""
+        return self._end is None
 
     @property
     def dropped(self) -> int:
@@ -132,13 +156,12 @@ class Connection:
         self._release()
         self._wake()
 
-    def _take_inbox(self) -> bytes:
-        data = b"".join(self._inbox)
-        self._inbox.clear()
+    def _take_inbox(self) -> list[tuple[bytes, Hashable]]:
+        taken, self._inbox = self._inbox, []
         if self._inbox_size >= INBOX_LIMIT and self._end is None:
             self._loop.add_reader(self._fd, self._on_readable)
         self._inbox_size = 0
-        return data
+        return taken
 
     def _on_readable(self) -> None:
         size = 0
@@ -164,13 +187,15 @@ class Connection:
         """Pass `data` on; return whether reading may continue."""
         if self._handler is not None and self._waiter is not None:
             try:
-                self._handler(data)
+                self._handler(data, self.sender)
             except Exception as error:
                 if not self._waiter.done():
                     self._waiter.set_exception(error)
                 return False
             return self._end is None
-        self._inbox.append(data)
+        self._inbox.append((data, self.sender))
+        if self._handler is None:
+            self.note(self.sender, Rank.ACCEPTED)  # `read` does not judge
         self._inbox_size += len(data)
         if self._inbox_size >= INBOX_LIMIT:
             self._loop.remove_reader(self._fd)
@@ -189,9 +214,9 @@ class Connection:
             self._waiter.set_result(None)
 
 
-def socket_connection(name: str, sock: socket.socket) -> Connection:
-    """Return a connection over a connected stream socket."""
-    return Connection(name, sock, lambda: sock.recv(READ_SIZE), sock.send)
+def socket_connection(name: str, sock: socket.socket, first: bytes = b"") -> Connection:
+    """Return a connection over a connected stream socket, from which `first` was already read."""
+    return Connection(name, sock, lambda: sock.recv(READ_SIZE), sock.send, first=first)
 
 
 def pair() -> tuple[Connection, Connection]:

@@ -40,12 +40,17 @@ async def connect(address: Address) -> Connection:
             return await listener.accept()
         finally:
             listener.close()
-    over = {"udpin": listening_udp, "udpout": connected_udp, "tcp": tcp_connection}[address.kind]
-    return over(str(address), await open_socket(address))
+    sock = await open_socket(address)
+    if address.kind == "udpin":
+        return listening_udp(str(address), sock, asyncio.get_running_loop().time)
+    return {"udpout": connected_udp, "tcp": tcp_connection}[address.kind](str(address), sock)
 
 
 async def connections(
-    address: Address, random: Callable[[], float], report: Callable[[str], None]
+    address: Address,
+    random: Callable[[], float],
+    report: Callable[[str], None],
+    is_valid: Callable[[bytes], bool] | None = None,
 ) -> AsyncIterator[Connection]:
     """Open a connection, and open it again at every iteration of the `async for`, until stopped.
 
@@ -60,6 +65,8 @@ async def connections(
         Returns numbers in [0, 1), for the jitter of the pauses.
     report
         Receives one line for each failure that differs from the last.
+    is_valid
+        Judges the first bytes of a newcomer on a listening TCP link, see `Listener`.
     """
     loop = asyncio.get_running_loop()
     pauses = back_off(random)
@@ -69,7 +76,7 @@ async def connections(
         while True:
             try:
                 if address.kind == "tcpin":
-                    listener = listener or await Listener.open(address)
+                    listener = listener or await Listener.open(address, is_valid)
                 connection = await (listener.accept() if listener else connect(address))
             except OSError as error:
                 if is_first and isinstance(error, CannotListen):
@@ -87,7 +94,8 @@ async def connections(
                 if loop.time() - opened >= GOOD_AFTER:
                     pauses = back_off(random)
             is_first = False
-            await asyncio.sleep(next(pauses))
+            if listener is None:  # a listener that is open waits for its next client instead
+                await asyncio.sleep(next(pauses))
     finally:
         if listener is not None:
             listener.close()

@@ -11,8 +11,8 @@ from companion.transport.address import Address
 from companion.transport.connection import reason
 
 CONNECT_TIMEOUT = 10.0
-#: Clients of a listening TCP link that may wait while another is connected.
-BACKLOG = 4
+#: Clients that the system completes while the event loop is busy.
+BACKLOG = 64
 #: Errors of `bind` that do not go away: address in use, forbidden, invalid.
 PERMANENT_ERRORS = (errno.EADDRINUSE, errno.EACCES, errno.EINVAL)
 

@@ -1,16 +1,15 @@
-"""UDP connections: to one peer, or to the peers received most recently."""
+"""UDP connections: to one peer, or to the peers that are received."""
 
 from __future__ import annotations
 
 import contextlib
 import socket
-from typing import Any
+from collections.abc import Callable
 
 from companion.transport.connection import Connection
+from companion.transport.peers import PeerTable
 
 MAX_DATAGRAM = 65536
-#: Number of most recent peers that a listening link sends to.
-MAX_PEERS = 8
 
 
 def connected_udp(name: str, sock: socket.socket) -> Connection:
@@ -31,22 +30,19 @@ def connected_udp(name: str, sock: socket.socket) -> Connection:
     return Connection(name, sock, receive, send)
 
 
-def listening_udp(name: str, sock: socket.socket) -> Connection:
-    """Return a connection over a bound socket that sends to the last MAX_PEERS peers."""
-    peers: dict[Any, None] = {}  # in order of their last datagram
+def listening_udp(name: str, sock: socket.socket, now: Callable[[], float]) -> Connection:
+    """Return a connection over a bound socket that sends to its peers; `now` returns seconds."""
+    peers = PeerTable(now)
 
     def receive() -> bytes | None:
-        data, peer = sock.recvfrom(MAX_DATAGRAM)
-        peers.pop(peer, None)
-        peers[peer] = None
-        if len(peers) > MAX_PEERS:
-            del peers[next(iter(peers))]
+        data, connection.sender = sock.recvfrom(MAX_DATAGRAM)
         return data or None
 
     def send(frame: bytes) -> int:
-        for peer in peers:
+        for peer in peers.active():
             with contextlib.suppress(OSError):  # the peer has left, or the line is full: one datagram lost
-                sock.sendto(frame, peer)
+                sock.sendto(frame, peer)  # type: ignore[call-overload]
         return len(frame)
 
-    return Connection(name, sock, receive, send)
+    connection = Connection(name, sock, receive, send, peers=peers)
+    return connection

@@ -318,3 +318,21 @@ def test_invalid_keys_timestamps_and_link_ids_are_rejected() -> None:
         Signing(KEY, timestamp=MAX_TIMESTAMP)
     with pytest.raises(ValueError, match="link_id 256"):
         Session(link_id=256)
+
+
+def test_radio_status_without_a_signature_proves_nobody() -> None:
+    """It is accepted on a signed link, but makes no autopilot, keeps no link up and replaces no client."""
+    key = bytes(range(32))
+    session = Session(signing=Signing(key))
+    status = frame.encode(dialect.new("RADIO_STATUS", rssi=1), 0, 1, 1)
+    assert not session.would_accept(status, 0)
+    signing = Signing(key)
+    beat = dialect.new("HEARTBEAT", type=1, autopilot=3)
+    genuine = frame.encode(beat, 0, 1, 1, lambda data: signing.sign(data, 0, 0))
+    assert session.would_accept(genuine, 0)
+    session.receive(genuine, 0)
+    assert session.is_up
+    for k in range(1, 8):
+        session.receive(status, k * 10**9)
+        session.poll(k * 10**9)
+    assert not session.is_up

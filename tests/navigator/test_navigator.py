@@ -11,6 +11,7 @@ import msgspec
 import numpy as np
 import pytest
 
+import companion.navigator as navigator_module
 from companion.config import Config, InertialConfig, load
 from companion.estimate.fusion import Azimuth
 from companion.nav.geometry import (
@@ -181,6 +182,32 @@ def test_a_late_answer_is_folded_in_at_its_own_time() -> None:
     assert math.dist(a[0].error_n, b[0].error_n) < one_millimetre
     per_mille = 1e-3 * a[0].covariance[0]  # the covariance north-east is nearly nothing
     np.testing.assert_allclose(a[0].covariance, b[0].covariance, rtol=1e-3, atol=per_mille)
+
+
+def test_a_flood_of_late_answers_is_folded_in_by_few_roll_backs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """200 answers within a second, five seconds late: at most one roll-back in half a second."""
+    navigator, roll_backs = Navigator(CONFIG), []
+    rewound = Navigator._rewound
+    monkeypatch.setattr(
+        Navigator, "_rewound", lambda self, state: roll_backs.append(1) or rewound(self, state)
+    )
+    navigator.handle(origin())
+    records = [record for moment in flight(60, 60.0, 60.0) for record in moment.records]
+    for record in records:
+        navigator.handle(record)
+    answer = [record for record in records if isinstance(record, RsbnFix)][-6]
+    outputs, kept = [], 0
+    for k in range(200):
+        arrival = 60 * NS + k * NS // 200
+        late = msgspec.structs.replace(
+            answer, t_ns=answer.t_ns + k * 1000, rx_ns=arrival, slant_range=5e4 + k
+        )
+        outputs += navigator.handle(late)
+        kept = max(kept, len(navigator._past))
+    assert 1 <= len(roll_backs) <= 3
+    assert kept <= navigator_module.MOST_KEPT
+    rejected = [out for out in outputs if isinstance(out, Rejection) and "late records wait" in out.reason]
+    assert len(rejected) >= 200 - 3 * navigator_module.MOST_WAITING
 
 
 def test_what_is_settled_in_between_changes_nothing() -> None:

@@ -24,6 +24,7 @@ from companion.records import (
     Stamped,
     Truth,
 )
+from companion.runtime import core
 from companion.runtime.core import CompanionCore
 
 CONFIG = Config(
@@ -379,6 +380,34 @@ def test_every_frame_is_logged_in_both_directions() -> None:
     flight.fly(3.0)
     assert flight.log.frames[True] == len(flight.sent)
     assert flight.log.frames[False] == flight.core.links["main"].received
+
+
+def test_a_foreign_flood_is_logged_within_its_budget_and_reported() -> None:
+    """5,000 frames a second of strangers for ten seconds; the autopilot's are all logged."""
+    flight = Flight()
+    flight.fly(5.0)
+    before = flight.log.frames[False]
+    for _ in range(100):
+        flight.fly(0.1)
+        for _ in range(500):
+            flight.receive(flight.frame("STATUSTEXT", 66, 1, severity=6, text="flood"))
+    quiet = Flight()
+    quiet.fly(15.0)
+    size = len(flight.frame("STATUSTEXT", 66, 1, severity=6, text="flood"))
+    foreign = flight.log.frames[False] - quiet.log.frames[False]
+    assert before > 0 and 0 < foreign * size <= core.UNUSED_LOG_BURST + 11 * core.UNUSED_LOG_HZ
+    assert any("frames of other senders not logged" in text for text in event_texts(flight))
+
+
+def test_one_sender_cannot_have_more_than_its_share_of_beacon_answers() -> None:
+    flight = Flight()
+    flight.fly(5.0)
+    answers = len(flight.log.of(RsbnFix))
+    for k in range(2000):
+        flight.now += MS
+        flight.receive(flight.frame("RSBN_MEASUREMENT", 66, 1 + k % 200, status=1, time_usec=k))
+    assert len(flight.log.of(RsbnFix, Rejection)) - answers <= 4 * (20 + 10 * 2) + 4
+    assert any("beacon answers of 66/" in text for text in event_texts(flight))
 
 
 def test_deadline_is_in_the_future_after_poll() -> None:

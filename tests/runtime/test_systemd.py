@@ -219,3 +219,10 @@ def test_systemd_accepts_the_unit(tmp_path: Path) -> None:
     done = subprocess.run(["systemd-analyze", "verify", str(copy)], capture_output=True, text=True)
     ours = [line for line in done.stderr.splitlines() if "companion" in line]
     assert not ours and done.returncode == 0, done.stderr
+
+
+@pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="there is no systemd-analyze here")
+def test_the_unit_is_hardened() -> None:
+    rate = ["systemd-analyze", "security", "--offline=true", "--threshold=15", str(UNIT)]
+    done = subprocess.run(rate, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout[-300:]

@@ -110,6 +110,18 @@ def test_no_more_logs_are_deleted_than_needed(tmp_path, monkeypatch):
     assert names(tmp_path) == [f"{number:05d}-20260101T000000Z.mcap" for number in range(2, 9)]
 
 
+def test_every_deletion_is_reported(tmp_path):
+    for unix_s in range(3):
+        write_log(tmp_path, unix_s)
+    before, deleted = names(tmp_path), []
+    log = retention.create_log(
+        tmp_path, metadata={}, start_unix_ns=9 * NS, start_ns=0, max_files=2, on_delete=deleted.append
+    )
+    log.close()
+    assert [path.name for path in deleted] == before[:2]
+    assert set(before) - set(names(tmp_path)) == {path.name for path in deleted}
+
+
 def test_torn_logs_are_deleted_by_age_but_not_a_log_being_written(tmp_path, monkeypatch):
     filled(tmp_path, "00001-20260101T000000Z.mcap.active")
     filled(tmp_path, "00002-20260101T000000Z.mcap")
@@ -127,7 +139,7 @@ def test_recovery_deletes_the_oldest_and_keeps_the_newest(tmp_path, monkeypatch)
     torn = [truncate_log(tmp_path, write_log(tmp_path, i)) for i in range(4)]
     wanted = []
 
-    def make_room(place: Path, wanted_bytes: int) -> bool:
+    def make_room(place: Path, wanted_bytes: int, **rest) -> bool:
         wanted.append(wanted_bytes)
         return real(place, 0, max_files=3 if len(wanted) == 1 else None)
 

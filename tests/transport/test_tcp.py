@@ -150,3 +150,36 @@ def test_newest_of_the_waiting_clients_is_accepted() -> None:
         await first.aclose()
 
     run(test())
+
+
+def test_a_served_client_yields_to_a_valid_frame_only_and_without_a_pause() -> None:
+    """Connections that send nothing, or no frame, by the hundred do not disturb the client in use."""
+
+    async def test() -> None:
+        address = Address("tcpin", "127.0.0.1", port := free_port())
+        links = connections(address, lambda: 1.0, print, lambda data: data.startswith(b"frame"))
+        opening = asyncio.ensure_future(anext(links))
+        await asyncio.sleep(0.05)
+        client = await connect(Address("tcp", "127.0.0.1", port))
+        link = await opening
+        strangers = []
+        for k in range(200):
+            strangers.append(await connect(Address("tcp", "127.0.0.1", port)))
+            strangers[-1].write(b"junk" if k % 2 else b"")
+            client.write(b"position")
+            assert await link.read() == b"position"
+        assert link.is_open
+        for stranger in strangers:
+            stranger.close()
+        newcomer = await connect(Address("tcp", "127.0.0.1", port))
+        newcomer.write(b"frame 1")
+        with pytest.raises(ConnectionError, match="was replaced by a newer client"):
+            await link.read()
+        async with asyncio.timeout(0.2):
+            link = await anext(links)
+        assert await link.read() == b"frame 1"
+        newcomer.close()
+        client.close()
+        await links.aclose()
+
+    run(test())
