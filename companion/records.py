@@ -13,6 +13,7 @@ ellipsoid, or above mean sea level with `msl` in the name (the geoid is not know
 
 from __future__ import annotations
 
+import math
 from enum import IntEnum, IntFlag, StrEnum
 from typing import Any, TypeAlias, get_args
 
@@ -258,13 +259,28 @@ class Source(IntFlag):
 
 
 class Prediction(msgspec.Struct, frozen=True, gc=False):
-    """Predicted inertial error `ahead_s` from now, north and east (m): the guaranteed r.m.s. bound, and for
-    comparison the least-squares sigma under white noise and under the worst correlation."""
+    """Inertial error predicted `ahead_s` from now, straight on, north and east (m): the guaranteed r.m.s.
+    bound, the expected r.m.s. error, and the least bound that any estimate could have."""
 
     ahead_s: float
     bound_n: Vector2
     claimed_n: Vector2
-    worst_n: Vector2
+    optimum_n: Vector2 = (math.nan, math.nan)
+
+
+class Bounds(msgspec.Struct, frozen=True, gc=False):
+    """Guaranteed r.m.s. bounds beside that of the position that is sent, north and east.
+
+    `optimum_n` is the least bound of the position that any estimate could have (m), proved to within the
+    relative `gap`; `tilt_n` (rad) and `drift_n` (rad/s) are of an INS. All are `widening` times wider than
+    stated, more than 1 where the fixes contradict the stated errors.
+    """
+
+    optimum_n: Vector2
+    gap: float
+    widening: float
+    tilt_n: Vector2 | None = None
+    drift_n: Vector2 | None = None
 
 
 class Solution(Stamped, frozen=True, gc=False, tag=True):
@@ -301,6 +317,7 @@ class Solution(Stamped, frozen=True, gc=False, tag=True):
     gnss_false: float | None = None
     witness: bool = False
     false_sources: tuple[tuple[str, float], ...] = ()
+    bounds: Bounds | None = None
 
 
 class Fix(Stamped, frozen=True, gc=False, tag=True):

@@ -285,26 +285,43 @@ def _unless_held(held: bool) -> str:
     return "" if held else " NO"
 
 
+def _bound(row: error_statistics.PhaseErrors) -> str:
+    if row.bound is None:
+        return "-"
+    if not row.useful:
+        return "no use"
+    return _metres(row.bound) + ("" if row.held else f" {100.0 * (row.inside or 0.0):.0f} %")
+
+
 def _print_table(flown: LoopbackFlight, rows: list[error_statistics.PhaseErrors], seconds: float) -> None:
     scenario = flown.autopilot.scenario
-    console = Console(width=max(80, Console().width))
+    console = Console(width=max(92, Console().width))
     table = Table(
         title=f"{scenario.name}: horizontal error, r.m.s. [m]", box=SIMPLE_HEAD, padding=(0, 1, 0, 0)
     )
     sources = (source.replace(" ", "\n") for source in error_statistics.SOURCES)
-    for column in ("phase", "min", *sources, "95 %", "protected", "bound"):
+    for column in ("phase", "min", *sources, "expected", "95 %", "protected", "bound"):
         table.add_column(column, justify="left" if column == "phase" else "right", no_wrap=True)
     for row, level in zip(rows, protection_table(flown, rows), strict=True):
         cells = [_metres(row.rms.get(source)) for source in error_statistics.SOURCES]
         percentile = _metres(row.p95.get(error_statistics.CORRECTED))
         protected = "-" if level is None else _metres(level.level) + _unless_held(level.held)
-        bound = _metres(row.bound) + _unless_held(row.held is not False)
-        table.add_row(row.phase, f"{row.seconds / 60.0:.1f}", *cells, percentile, protected, bound)
+        bound = _bound(row)
+        table.add_row(
+            row.phase,
+            f"{row.seconds / 60.0:.1f}",
+            *cells,
+            _metres(row.expected),
+            percentile,
+            protected,
+            bound,
+        )
     console.print(table)
     click.echo(
-        "95 %: percentile of the corrected error; protected: median protection level, NO if\n"
-        "an error was beyond it; bound: r.m.s. of the guaranteed bound, NO if the r.m.s. error\n"
-        "was beyond it"
+        "expected: r.m.s. error that the corrected estimate claims; 95 %: percentile of its error;\n"
+        "protected: median protection level, NO if an error was beyond it; bound: r.m.s. of the\n"
+        "guaranteed bound, with the share of errors within that of their moment if not all are;\n"
+        "no use: above 10 times the claim or above 5 km"
     )
     reported = Counter(type(record).__name__ for record in flown.records)
     rate = scenario.duration_s / seconds

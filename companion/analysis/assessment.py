@@ -175,6 +175,7 @@ def _wrap(angle: Floats) -> Floats:
 def _source_errors(flight: Flight, reference: ReferenceTrack) -> dict[str, error_statistics.ErrorSeries]:
     solution, gnss = flight.tables["Solution"], usable_gnss(flight)
     bound = np.hypot(solution["bound_north"], solution["bound_east"])
+    claimed = np.sqrt(solution["nn"] + solution["ee"])
     tracks: list[tuple[str, Table]] = [
         (error_statistics.CORRECTED, solution),
         (error_statistics.RSBN, _beacon_positions(flight, reference)),
@@ -184,7 +185,8 @@ def _source_errors(flight: Flight, reference: ReferenceTrack) -> dict[str, error
     found = {}
     for source, table in tracks:
         north, east = _offset_from(reference, table["t"], table["lat"], table["lon"])
-        found[source] = _error_series(table["t"], np.hypot(north, east), bound if table is solution else None)
+        sent = (bound, claimed) if table is solution else None
+        found[source] = _error_series(table["t"], np.hypot(north, east), sent)
         if table is solution:
             ins = np.hypot(north + table["error_north"], east + table["error_east"])
             found[error_statistics.INS] = _error_series(table["t"], ins, None)
@@ -209,10 +211,13 @@ def _beacon_positions(flight: Flight, reference: ReferenceTrack) -> Table:
     return {"t": t, "lat": np.array([p.lat for p in positions]), "lon": np.array([p.lon for p in positions])}
 
 
-def _error_series(t: Floats, error: Floats, bound: Floats | None) -> error_statistics.ErrorSeries:
+def _error_series(
+    t: Floats, error: Floats, sent: tuple[Floats, Floats] | None
+) -> error_statistics.ErrorSeries:
     known = np.isfinite(error)
-    bound = np.full(len(t), np.nan) if bound is None else bound
-    return error_statistics.ErrorSeries(np.round(t[known] * 1e9).astype(np.int64), error[known], bound[known])
+    bound, claimed = sent or (np.full(len(t), np.nan),) * 2
+    t_ns = np.round(t[known] * 1e9).astype(np.int64)
+    return error_statistics.ErrorSeries(t_ns, error[known], bound[known], claimed[known])
 
 
 def _ins_error(flight: Flight, reference: ReferenceTrack | None) -> dict[str, Floats]:

@@ -21,6 +21,8 @@ TruthAt = Callable[[int], Geodetic | None]
 
 INS, GNSS, RSBN, CORRECTED = "INS alone", "GNSS fix", "RSBN fix", "corrected"
 SOURCES = (INS, GNSS, RSBN, CORRECTED)
+USEFUL = 10.0  # a bound beyond so many times the claimed error is of no use
+LIMIT_M = 5000.0  # as `predictor.limit_m`
 PHASE_START_DELAY_NS = 1_000_000_000  # maximum delay from the validity of a fix to the phase it starts
 _KINDS = ((GNSS, "GNSS"), (RSBN, "RSBN"))  # source, its word in the names of phases
 
@@ -36,10 +38,12 @@ class FlightPhase(NamedTuple):
 class PhaseErrors(NamedTuple):
     """Horizontal errors (m) of one phase: r.m.s. and 95th percentile by source, and the guaranteed bound.
 
-    The bound limits the r.m.s. error, so r.m.s. values are compared: `bound` is that of the phase, `share`
-    the error of the corrected estimate divided by it, `held` whether `share` is at most 1. `inside` and
-    `inside_twice` are the shares of instants with an error within the bound, and within twice the bound, of
-    that instant; twice a valid bound is exceeded in at most a quarter of cases (Chebyshev). None: no bound.
+    `bound` is its r.m.s. over the phase, `expected` that of the error that the estimate claims, `share` the
+    error of the corrected estimate divided by the bound. A bound is judged instant by instant: `held` is
+    whether every error is within the bound of that instant; one flight is no ensemble, whose r.m.s. error it
+    limits. `inside` and `inside_twice` are the shares of instants within the bound, and within twice the
+    bound; twice a valid bound is exceeded in at most a quarter of cases (Chebyshev). None: no bound, or no
+    useful one: more than `USEFUL` times the claim or `limit_m` over half of the phase.
     """
 
     phase: str
@@ -51,32 +55,44 @@ class PhaseErrors(NamedTuple):
     held: bool | None
     inside: float | None
     inside_twice: float | None
+    expected: float | None = None
+
+    @property
+    def useful(self) -> bool:
+        """Whether the bound of the phase, if there is one, is of use."""
+        return self.held is not None
 
 
 class ErrorSeries(NamedTuple):
-    """Horizontal errors over a flight: times (ns), errors (m), and the bound (m), NaN if there is none."""
+    """Horizontal errors over a flight: times (ns), errors (m), bound and claimed r.m.s. error (m), NaN if
+    there is none.
+    """
 
     t_ns: npt.NDArray[np.int64]
     error: Floats
     bound: Floats
+    claimed: Floats
 
 
 def horizontal_errors(records: Iterable[Stamped], truth: TruthAt) -> dict[str, ErrorSeries]:
     """Return the horizontal error of every source against `truth`, which returns None where unknown."""
-    found: dict[str, list[tuple[int, float, float]]] = defaultdict(list)
+    found: dict[str, list[tuple[int, float, float, float]]] = defaultdict(list)
 
-    def add(source: str, t_ns: int, place: Geodetic, bound: float = math.nan) -> None:
+    def add(
+        source: str, t_ns: int, place: Geodetic, bound: float = math.nan, claimed: float = math.nan
+    ) -> None:
         true = truth(t_ns)
         if true is not None:
             north, east, _ = separation(place, true)
-            found[source].append((t_ns, math.hypot(north, east), bound))
+            found[source].append((t_ns, math.hypot(north, east), bound, claimed))
 
     last: Gnss | None = None
     for record in records:
         if isinstance(record, Solution):
             bound = math.nan if record.bound_n is None else math.hypot(*record.bound_n)
             corrected = Geodetic(record.lat, record.lon, record.alt_msl)
-            add(CORRECTED, record.t_ns, corrected, bound)
+            claimed = math.sqrt(record.covariance[0] + record.covariance[3])
+            add(CORRECTED, record.t_ns, corrected, bound, claimed)
             add(INS, record.t_ns, displace(*corrected, *record.error_n, 0.0))
         elif isinstance(record, Gnss) and record.has_3d_fix and (last is None or not record.repeats(last)):
             last = record
@@ -110,7 +126,9 @@ def intersect_azimuth_range(beacon: Geodetic, azimuth: float, slant_range: float
     return place
 
 
-def summarize_phases(found: dict[str, ErrorSeries], phases: Sequence[FlightPhase]) -> list[PhaseErrors]:
+def summarize_phases(
+    found: dict[str, ErrorSeries], phases: Sequence[FlightPhase], limit_m: float = LIMIT_M
+) -> list[PhaseErrors]:
     """Return one row per phase. The fix that starts a phase is valid just before it and is not counted."""
     rows = []
     for phase, following in zip(phases, [*phases[1:], None]):
@@ -119,15 +137,16 @@ def summarize_phases(found: dict[str, ErrorSeries], phases: Sequence[FlightPhase
             for source, kind in _KINDS
             if following and kind in following.name and kind not in phase.name
         }
-        rows.append(_summarize_phase(found, phase, starting_sources))
+        rows.append(_summarize_phase(found, phase, starting_sources, limit_m))
     return rows
 
 
 def _summarize_phase(
-    found: dict[str, ErrorSeries], phase: FlightPhase, starting_sources: set[str]
+    found: dict[str, ErrorSeries], phase: FlightPhase, starting_sources: set[str], limit_m: float
 ) -> PhaseErrors:
     rms, p95 = {}, {}
-    compared: tuple[float, float, bool, float, float] | tuple[None, ...] = (None,) * 5
+    compared: _Compared | None = None
+    expected = None
     for source, e in found.items():
         end_ns = phase.end_ns - PHASE_START_DELAY_NS * (source in starting_sources)
         within = (e.t_ns >= phase.start_ns) & (e.t_ns < end_ns)
@@ -137,15 +156,28 @@ def _summarize_phase(
         rms[source] = float(np.sqrt(np.mean(error**2)))
         p95[source] = float(np.percentile(error, 95.0))
         if np.isfinite(e.bound[within]).any():
-            compared = _compare_with_bound(error, e.bound[within])
-    return PhaseErrors(phase.name, (phase.end_ns - phase.start_ns) * 1e-9, rms, p95, *compared)
+            compared = _compare_with_bound(error, e.bound[within], e.claimed[within], limit_m)
+        if np.isfinite(e.claimed[within]).any():
+            expected = float(np.sqrt(np.nanmean(e.claimed[within] ** 2)))
+    seconds = (phase.end_ns - phase.start_ns) * 1e-9
+    bounds = compared or _Compared(None, None, None, None, None)
+    return PhaseErrors(phase.name, seconds, rms, p95, *bounds, expected)
 
 
-def _compare_with_bound(error: Floats, bound: Floats) -> tuple[float, float, bool, float, float]:
-    """Return bound, share, held, inside and inside_twice of `PhaseErrors`."""
+class _Compared(NamedTuple):
+    bound: float | None
+    share: float | None
+    held: bool | None
+    inside: float | None
+    inside_twice: float | None
+
+
+def _compare_with_bound(error: Floats, bound: Floats, claimed: Floats, limit_m: float) -> _Compared:
     known = np.isfinite(bound)
-    error, bound = error[known], bound[known]
+    error, bound, claimed = error[known], bound[known], claimed[known]
     bound_rms = float(np.sqrt(np.mean(bound**2)))
+    if np.mean((bound > limit_m) | (bound > USEFUL * claimed)) > 0.5:
+        return _Compared(bound_rms, None, None, None, None)
     share = float(np.sqrt(np.mean(error**2))) / bound_rms
     inside, twice = (float(np.mean(error <= k * bound)) for k in (1.0, 2.0))
-    return bound_rms, share, share <= 1.0, inside, twice
+    return _Compared(bound_rms, share, inside == 1.0, inside, twice)

@@ -244,7 +244,8 @@ def _phases(a: Assessment) -> list[Table]:
         for source in sources:
             known = source in row.rms
             cells.append(_both(row.rms[source], row.p95[source]) if known else NO_NUMBER)
-        cells.append(NO_NUMBER if row.bound is None else format_length(row.bound))
+        bound = NO_NUMBER if row.bound is None else format_length(row.bound)
+        cells.append(bound if row.bound is None or row.useful else "no useful bound")
         cells.append(NO_NUMBER if row.share is None else f"{row.share:.2f}")
         held = Cell("yes", "good") if row.held else Cell("no", "fault")
         cells.append(NO_NUMBER if row.held is None else held)
@@ -253,8 +254,9 @@ def _phases(a: Assessment) -> list[Table]:
     what = "Horizontal errors" if a.reference and a.reference.what == TRUTH else "Horizontal distances"
     about = "" if a.reference is None else f"{what} from {a.reference.what}: r.m.s. / 95th percentile. "
     note = (
-        f"{about}The bound limits the r.m.s. error: it held if error / bound (r.m.s. of the phase) is "
-        "at most 1. Within, twice: share of moments with an error within the bound and twice the bound."
+        f"{about}The bound held if every error of the phase was within the bound of its moment. Within, "
+        "twice: share of moments with an error within the bound and twice the bound. No useful bound: above "
+        "ten times the error that the estimate claims, or above 5 km."
     )
     return [Table(head, rows, "cards", note)]
 

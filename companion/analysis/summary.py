@@ -195,18 +195,23 @@ def _bound_sentences(a: Assessment) -> list[str]:
         if alone.any()
         else ""
     )
-    if not broken:
-        return [
-            f"The guaranteed bound{reached} held in every phase; the error was within it {_percent(inside)} "
-            "of the time."
-        ]
-    worst = max(broken, key=lambda row: row.share or 0.0)
-    judged = sum(row.held is not None for row in a.rows)
-    return [
-        f"The guaranteed bound{reached} did not hold in {len(broken)} of {judged} phases: in the phase "
-        f"“{phase_title(worst.phase)}” the error was {worst.share:.2f} times the bound, r.m.s. The error was "
-        f"within the bound {_percent(inside)} of the time."
-    ]
+    judged = [row for row in a.rows if row.useful]
+    useless = [row.phase for row in a.rows if row.bound is not None and not row.useful]
+    found = []
+    if useless:
+        found.append(
+            f"No useful guaranteed bound in {len(useless)} phases, the first “{phase_title(useless[0])}”."
+        )
+    if judged and not broken:
+        found.append(f"The guaranteed bound{reached} held at every instant of {len(judged)} phases.")
+    elif broken:
+        worst = min(broken, key=lambda row: row.inside or 0.0)
+        found.append(
+            f"The guaranteed bound{reached} was exceeded in {len(broken)} of {len(judged)} phases, most often"
+            f" in “{phase_title(worst.phase)}”: there the error was within it {_percent(worst.inside or 0.0)}"
+            f" of the time, over the flight {_percent(inside)}."
+        )
+    return found
 
 
 def _rejection_sentences(a: Assessment) -> list[str]:

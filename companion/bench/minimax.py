@@ -1,4 +1,4 @@
-"""Benchmark of minimax prediction: closed form, exchange method, and HiGHS on the same linear programme."""
+"""Benchmark of minimax prediction: closed form, exchange, HiGHS, and the guaranteed bound in flight."""
 
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -8,9 +8,11 @@ from scipy.optimize import linprog
 
 from companion.estimate.minimax import closed_form_tau
 from companion.estimate.minimax_lp import solve
-from companion.estimate.predictor import Window, predict
+from companion.estimate.predictor import Step, Window, anchor
 from companion.estimate.schuler import schuler_row
-from companion.units import SECOND_NS
+from companion.nav.bounded_channel import BoundedIns, Motion, UnitErrors
+
+NAVIGATION = UnitErrors(4.8e-8, 18_000.0, 5.8e-7, 4.9e-4, 3600.0, 1e-3, 0.5, 1e-4, 9e-4)  # SI
 
 
 def cases() -> Iterator[tuple[str, Callable[[], object]]]:
@@ -27,9 +29,17 @@ def cases() -> Iterator[tuple[str, Callable[[], object]]]:
             f"minimax HiGHS, {n} samples",
             partial(linprog, -target, both, np.ones(2 * n), bounds=(None, None), method="highs"),
         )
-    window = Window.of(np.arange(1000) * SECOND_NS, "position", np.zeros(1000), 30.0)
-    last = predict(window, 1600 * SECOND_NS)
-    yield (
-        "minimax update, 1000 fixes: push, predict position and velocity",
-        lambda: predict(window.push(1000 * SECOND_NS, "position", 0.0, 30.0), 1601 * SECOND_NS, start=last),
-    )
+    law = BoundedIns(NAVIGATION)
+    window = Window.begin(0.0, law)
+    rows = np.eye(law.n)[:2]
+    motion = Motion(0.8, (30.0, 20.0), (30.0, 20.0), 10.0)
+    for k in range(150):
+        window = window.extend(10.0 * k + 10.0, *law.step(motion))
+        window = window.with_fix(10.0 * k + 5.0, rows @ window.C[-1], np.zeros(2), np.full(2, 2.0), 1500.0)
+    anchored = anchor(window, law)
+    ahead = [Step(10.0, *law.step(motion)[:2])] * 60
+    wanted = anchored.targets(window, (0,), ahead)[0]
+    solved = anchored.solve(wanted)
+    yield "guaranteed bound, 150 fixes of two axes: a new fix", partial(anchor, window, law)
+    yield "guaranteed bound: one axis, cold", partial(anchored.solve, wanted)
+    yield "guaranteed bound: one axis, warm", partial(anchored.solve, wanted, solved.start)

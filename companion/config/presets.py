@@ -34,6 +34,8 @@ PRESETS: Mapping[str, Preset] = {
             "inertial.accelerometer_correlation_h": 0.5,
             "inertial.tilt_arcsec": 40.0,
             "inertial.heading_arcmin": 12.0,
+            "inertial.gyro_scale_ppm": 100.0,
+            "inertial.accelerometer_scale_ppm": 300.0,
         },
     ),
     "mems": Preset(
@@ -48,6 +50,8 @@ PRESETS: Mapping[str, Preset] = {
             "inertial.tilt_arcsec": 120.0,
             "inertial.heading_arcmin": 60.0,
             "inertial.velocity_noise_m_s_sqrt_s": 0.002,
+            "inertial.gyro_scale_ppm": 500.0,
+            "inertial.accelerometer_scale_ppm": 1000.0,
         },
     ),
     "stock-autopilot": Preset(

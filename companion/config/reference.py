@@ -78,6 +78,8 @@ TEXTS: dict[str, dict[str, tuple[str, str]]] = {
         "tilt_arcsec": ("Tilt error after alignment.", _SHEET),
         "heading_arcmin": ("Heading error after alignment.", _SHEET),
         "velocity_noise_m_s_sqrt_s": ("Velocity random walk.", _SHEET),
+        "gyro_scale_ppm": ("Scale error of the gyros, for the guaranteed bound.", _SHEET),
+        "accelerometer_scale_ppm": ("Scale error of the accelerometers, for the guaranteed bound.", _SHEET),
         "height_sigma_m": (
             "Error of the height without GNSS, for the slant range of beacons.",
             "the pressure altitude is corrected, or is known to be worse",
@@ -102,10 +104,6 @@ TEXTS: dict[str, dict[str, tuple[str, str]]] = {
         "correlation_min": ("Correlation time of airspeed and heading errors.", _MEASURED),
         "crab_deg": ("Heading error or sideslip that lasts seconds.", "the aircraft flies with sideslip"),
         "crab_s": ("How long it lasts.", _MEASURED),
-        "wind_rate_m_s_min": (
-            "R.m.s. rate of change of the wind, for the guaranteed prediction.",
-            "the guaranteed radius has to hold in stronger changes",
-        ),
     },
     "strapdown": {
         "imu": ("Index of the IMU: 0 is RAW_IMU.", "another IMU of the autopilot is better"),
@@ -156,10 +154,6 @@ TEXTS: dict[str, dict[str, tuple[str, str]]] = {
     "predictor": {
         "window_min": ("Fixes of this time are fitted.", "the Schuler phase is known for longer or shorter"),
         "bin_s": ("Fixes are averaged over this time.", "the computer is slow: greater"),
-        "disturbance_ug": (
-            "R.m.s. specific force that the Schuler channel does not model.",
-            "gravity anomalies are strong, or the INS manoeuvres much",
-        ),
         "ahead_min": ("Times ahead for which the guaranteed radius is stated.", "the mission needs others"),
         "limit_m": (
             "With a greater guaranteed radius the position is untrusted.",
@@ -169,7 +163,8 @@ TEXTS: dict[str, dict[str, tuple[str, str]]] = {
     "estimator": {
         "output": (
             "Estimator that leads without fixes; the bank of hypotheses leads while fixes arrive. "
-            'kalman and auto: the bank always. restrictive needs inertial.source = "air_data".',
+            "kalman and auto: the bank always. restricted has the least expected error among those whose "
+            "guaranteed bound is near the least. restrictive needs inertial.source = 'air_data'.",
             "you study another estimator",
         ),
         "scheme": (
@@ -261,6 +256,7 @@ UNITS = {
     "_kib": "KiB",
     "_mib": "MiB",
     "_ug": "ug",
+    "_ppm": "ppm",
     "_hz": "Hz",
     "_m": "m",
     "_s": "s",

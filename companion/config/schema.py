@@ -69,6 +69,8 @@ class InertialConfig(Section, frozen=True):
     tilt_arcsec: Annotated[float, Meta(ge=0.1, le=36000.0)] = 20.0
     heading_arcmin: Annotated[float, Meta(ge=0.01, le=10800.0)] = 3.0
     velocity_noise_m_s_sqrt_s: Annotated[float, Meta(ge=1e-6, le=10.0)] = 0.001
+    gyro_scale_ppm: Annotated[float, Meta(ge=0.0, le=100000.0)] = 5.0
+    accelerometer_scale_ppm: Annotated[float, Meta(ge=0.0, le=100000.0)] = 50.0
     height_sigma_m: Annotated[float, Meta(ge=0.1, le=10000.0)] = 20.0
     strapped_down: bool = True  # the sensors turn with the aircraft; false: gimballed platform
 
@@ -91,9 +93,6 @@ class AirDataConfig(Section, frozen=True):
     correlation_min: Annotated[float, Meta(ge=0.1, le=1000.0)] = 10.0  # of airspeed and heading errors
     crab_deg: Annotated[float, Meta(ge=0.05, le=45.0)] = 2.0
     crab_s: Annotated[float, Meta(ge=0.5, le=600.0)] = 20.0
-    wind_rate_m_s_min: Annotated[float, Meta(ge=0.001, le=100.0)] = (
-        1.0  # r.m.s., for the guaranteed prediction
-    )
 
 
 class StrapdownConfig(Section, frozen=True):
@@ -147,11 +146,8 @@ class RsbnConfig(Section, frozen=True):
 class PredictorConfig(Section, frozen=True):
     """The window of trusted fixes that the guaranteed prediction is fitted to, and its limit."""
 
-    window_min: Annotated[float, Meta(ge=1.0, le=80.0)] = 25.0
+    window_min: Annotated[float, Meta(ge=1.0, le=60.0)] = 25.0
     bin_s: Annotated[float, Meta(ge=0.1, le=60.0)] = 10.0
-    disturbance_ug: Annotated[float, Meta(ge=0.0, le=100000.0)] = (
-        20.0  # r.m.s. specific force that the Schuler channel does not model
-    )
     ahead_min: tuple[Annotated[float, Meta(ge=0.1, le=120.0)], ...] = (1.0, 5.0, 10.0, 20.0)
     limit_m: Annotated[float, Meta(ge=1.0, le=1000000.0)] = (
         5000.0  # with a greater guaranteed bound the position is untrusted
@@ -162,12 +158,12 @@ class EstimatorConfig(Section, frozen=True):
     """The estimator of the output.
 
     The bank of hypotheses ("kalman", "auto") is used while fixes arrive. Without them `output` names the
-    estimator: "minimax" without fixes of any source, "restrictive" without GNSS fixes. `scheme` "feedback"
-    corrects the companion's own channel at every fix, "feedforward" only when its error is large; an INS of
-    its own cannot be corrected.
+    estimator: "minimax" and "restricted" without fixes of any source, "restrictive" without GNSS fixes.
+    `scheme` "feedback" corrects the companion's own channel at every fix, "feedforward" only when its error
+    is large; an INS of its own cannot be corrected.
     """
 
-    output: Literal["auto", "minimax", "kalman", "restrictive"] = "auto"
+    output: Literal["auto", "minimax", "kalman", "restricted", "restrictive"] = "auto"
     scheme: Literal["feedforward", "feedback"] = "feedforward"
     late_s: Annotated[float, Meta(ge=0.0, le=30.0)] = 6.0
 
@@ -296,6 +292,6 @@ class Config(Section, frozen=True):
         return self.inertial.source in ("auto", sensor)
 
     @property
-    def leading_estimator(self) -> Literal["minimax", "kalman", "restrictive"]:
+    def leading_estimator(self) -> Literal["minimax", "kalman", "restricted", "restrictive"]:
         """The estimator that leads when fixes stop; "auto" is the bank's."""
         return "kalman" if self.estimator.output == "auto" else self.estimator.output

@@ -20,7 +20,7 @@ Guaranteed prediction
     schuler              dynamics of one horizontal INS error
     minimax_lp           guaranteed linear estimation by exchange
     minimax              closed form on the Schuler channel
-    predictor            rolling window of fixes and its prediction
+    predictor            window of fixes, and the guaranteed error of linear estimates from it
 Curves
     polynomial           approximation of an unknown function, and its order
 Faults
@@ -64,7 +64,7 @@ from companion.estimate.fusion import (
 from companion.estimate.minimax import ClosedForm, Continuous, closed_form, closed_form_tau, continuous_tau
 from companion.estimate.minimax_lp import Design, Infeasible, LeastSquares, Minimax
 from companion.estimate.polynomial import Order, Track, select_order, smooth_track
-from companion.estimate.predictor import Forecast, Prediction, Window, predict_ahead
+from companion.estimate.predictor import Anchored, Estimate, Program, Target, Window, anchor
 from companion.estimate.schuler import MEAN_EARTH, Scale, schuler_row, transition
 from companion.estimate.smoother import (
     Smoothed,
@@ -79,13 +79,14 @@ from companion.estimate.smoother import (
 __all__ = [
     "MEAN_EARTH",
     "Ambiguous",
+    "Anchored",
     "Azimuth",
     "ClosedForm",
     "Continuous",
     "Design",
+    "Estimate",
     "Fix",
     "Fix3D",
-    "Forecast",
     "FullHorizonEstimate",
     "Height",
     "Infeasible",
@@ -95,14 +96,16 @@ __all__ = [
     "Observation",
     "Order",
     "Position",
-    "Prediction",
+    "Program",
     "Range",
     "Scale",
     "Smoothed",
+    "Target",
     "Track",
     "Trajectory",
     "Unobservable",
     "Window",
+    "anchor",
     "bank",
     "bounded_lsq",
     "closed_form",
@@ -117,7 +120,6 @@ __all__ = [
     "maximum_likelihood",
     "maximum_likelihood_3d",
     "minimax_lp",
-    "predict_ahead",
     "predictor",
     "restrictive",
     "rts",

@@ -1,17 +1,21 @@
 """Guaranteed linear estimation from sampled measurements: linear programme solved by exchange.
 
-Measurements z_j = H_j x + rho_j, E rho_j = 0, E rho_j^2 <= sigma_j^2, with ANY correlation between the rho.
-Of all linear unbiased estimates of a . x the one whose worst r.m.s. error is least solves (Matasov,
-Martirosyan (1.9)-(1.10))
+Measurements z_j = H_j x + G_j u + rho_j, E rho_j = 0, E rho_j^2 <= sigma_j^2, with ANY correlation of the
+rho; inputs u_i, E u_i^2 <= d_i^2, of any correlation too: steps of an unknown force, or constants that are
+unknown but bounded. Wanted is a . x + g . u. With k_i = g_i - sum_j G_ji w_j, what input i leaves in the
+error, the worst r.m.s. error of an estimate w . z is sum sigma_j |w_j| + sum d_i |k_i|, attained. Of all
+estimates that are unbiased in x the one whose worst error is least solves (Matasov, Martirosyan
+(1.9)-(1.10), with inputs)
 
-    minimise sum sigma_j |w_j|   subject to   sum H_j w_j = a                            (primal)
-    maximise a . lambda          subject to   |H_j . lambda| <= sigma_j                  (dual)
+    minimise sum sigma_j |w_j| + sum d_i |k_i|   subject to   sum H_j w_j = a                         (primal)
+    maximise a . lambda + g . u   subject to   |H_j . lambda + G_j . u| <= sigma_j,  |u_i| <= d_i       (dual)
 
-A basis of r independent rows, r the rank (4 on the Schuler channel), gives weights by one small solve and is
-feasible whatever their signs, so there is no first phase. Its dual vector is a generalised polynomial H .
-lambda that levels at +-sigma on the basis. The row with the largest excess enters, and a line search over
-its weight chooses the row that leaves: the simplex method, or Remez's exchange. At the end both values are
-equal, and that equality is the proof.
+so the dual is the motion that no measurement shows and that moves the target most. A basis has r + f rows A
+and f inputs F whose effect it cancels, r the rank of H (4 on the Schuler channel): w_A follows from one small
+solve, and is feasible whatever its signs, so there is no first phase. The dual follows from the signs of w_A
+and of the other k; it levels the residual at +-sigma on A. The row that exceeds sigma most, or the input of F
+that exceeds d most, enters, and a line search over the convex, piecewise linear cost chooses what leaves: the
+simplex method, or Remez's exchange. At the end both values are equal, and that equality is the proof.
 
 All work is done on orthonormal coordinates, H / sigma = Q S, computed once for many targets: there the
 levelled polynomial is accurate to a few units of the last place however short the window, and least squares
@@ -34,6 +38,7 @@ Indices = npt.NDArray[np.intp]
 
 LEVEL_TOLERANCE = 1e-12  # how far |H lambda| may exceed sigma, relative: also the duality gap left
 RANK_TOLERANCE = 1e-13  # singular values below this share of the largest are rounding
+ROUNDING = 1e-9  # of |H lambda| after many exchanges that gained nothing
 EXCHANGES_MAX = 1000  # a handful to thirty are usual
 
 
@@ -55,7 +60,9 @@ class Minimax(NamedTuple):
     gap : float
         Relative duality gap, (bound - a . dual) / bound.
     active : tuple of int
-        Rows of the last basis; a start for the next, similar problem.
+        Rows of the last basis.
+    cancelled : tuple of int
+        Inputs whose effect it cancels; with `active` a start for the next, similar problem.
     """
 
     weights: Floats
@@ -63,6 +70,7 @@ class Minimax(NamedTuple):
     dual: Floats
     gap: float
     active: tuple[int, ...]
+    cancelled: tuple[int, ...] = ()
 
 
 class LeastSquares(NamedTuple):
@@ -197,6 +205,10 @@ class Design:
         Projector, in scaled columns, on the directions that no row measures.
     columns : (m,)
         Scale of each column.
+    inputs : (p, n)
+        Effect of each input at its bound on each measurement, in sigmas.
+    bounds : (p,)
+        Bounds of the inputs.
     """
 
     sigmas: Floats
@@ -205,9 +217,17 @@ class Design:
     coordinates: Floats
     unobservable: Floats
     columns: Floats
+    inputs: Floats
+    bounds: Floats
 
     @classmethod
-    def of(cls, rows: npt.ArrayLike, sigmas: npt.ArrayLike) -> Self:
+    def of(
+        cls,
+        rows: npt.ArrayLike,
+        sigmas: npt.ArrayLike,
+        inputs: npt.ArrayLike | None = None,
+        bounds: npt.ArrayLike = (),
+    ) -> Self:
         """Check and factor rows and sigmas.
 
         Parameters
@@ -216,6 +236,10 @@ class Design:
             Measurement rows.
         sigmas : (n,) or float
             R.m.s. errors, one a row or one for all.
+        inputs : (n, p), optional
+            Effect G of unit inputs on the measurements.
+        bounds : (p,)
+            R.m.s. bounds d of the inputs, zero or more.
 
         Returns
         -------
@@ -243,6 +267,15 @@ class Design:
         if not (np.isfinite(sigmas) & (sigmas > 0.0)).all():
             i = int(np.argmin(np.isfinite(sigmas) & (sigmas > 0.0)))
             raise ValueError(f"sigmas[{i}] is {sigmas[i]}; give a positive one or leave the row out")
+        effects = np.zeros((len(rows), 0)) if inputs is None else np.asarray(inputs, dtype=np.float64)
+        limits = np.asarray(bounds, dtype=np.float64)
+        if limits.ndim != 1 or effects.shape != (len(rows), len(limits)):
+            raise ValueError(
+                f"inputs has shape {effects.shape}, bounds {limits.shape}; give ({len(rows)}, p) and (p,)"
+            )
+        if not (np.isfinite(effects).all() and np.isfinite(limits).all() and (limits >= 0.0).all()):
+            raise ValueError("inputs and bounds must be finite, and no bound negative")
+        scaled = np.ascontiguousarray(effects.T) * limits[:, None] / sigmas
         whitened = np.ascontiguousarray(rows.T) / sigmas
         columns = np.abs(whitened).max(axis=1)
         columns[columns == 0.0] = 1.0
@@ -252,7 +285,8 @@ class Design:
         observable = v_t[:rank]
         coordinates = (observable.T / singular[:rank]) / columns[:, None]
         unobservable = np.eye(len(columns)) - observable.T @ observable
-        return cls(sigmas, whitened, coordinates.T @ whitened, coordinates, unobservable, columns)
+        q = coordinates.T @ whitened
+        return cls(sigmas, whitened, q, coordinates, unobservable, columns, scaled, limits)
 
     def in_coordinates(self, target: npt.ArrayLike) -> tuple[Floats, Floats]:
         """Transform a target to the orthonormal coordinates.
@@ -292,15 +326,25 @@ class Design:
             )
         return a, a @ self.coordinates
 
-    def minimax(self, target: npt.ArrayLike, start: Sequence[int] | None = None) -> Minimax:
+    def minimax(
+        self,
+        target: npt.ArrayLike,
+        start: Minimax | Sequence[int] | None = None,
+        through: npt.ArrayLike | None = None,
+        tolerance: float = LEVEL_TOLERANCE,
+    ) -> Minimax:
         """Compute the minimax estimate of one target by exchange.
 
         Parameters
         ----------
         target : (m,)
             Coefficients of the wanted combination of unknowns.
-        start : sequence of int, optional
-            Rows to start from, if they are a basis.
+        start : Minimax or sequence of int, optional
+            Solution of a similar problem, or rows to start from, if they are a basis.
+        through : (p,), optional
+            Effect g of unit inputs on the target; zero where not given.
+        tolerance : float
+            Relative duality gap that is good enough.
 
         Returns
         -------
@@ -308,17 +352,55 @@ class Design:
             Weights, bound and certificate.
         """
         a, a_q = self.in_coordinates(target)
+        g = self._through(through) * self.bounds
         weights = np.zeros(len(self.sigmas))
-        if not a_q.any():
+        if not (a_q.any() or g.any()):
             return Minimax(weights, 0.0, np.zeros_like(a), 0.0, ())
-        basis, w, dual_q = _exchange(self.q, a_q, self._basis(start))
-        bound = float(np.abs(w).sum())
-        weights[basis] = w / self.sigmas[basis]
-        dual = self.coordinates @ dual_q
-        dual /= max(1.0, float(np.abs(dual @ self.whitened).max()))
+        rows, inputs = self._basis(start)
+        best = _exchange(self.q, self.inputs, a_q, g, rows, inputs, tolerance)
+        bound = best.cost
+        weights[best.rows] = best.weights / self.sigmas[best.rows]
+        dual, u = self.coordinates @ best.dual, best.u
+        excess = float(np.abs(dual @ self.whitened + u @ self.inputs).max())
+        scale = max(1.0, excess, float(np.abs(u).max(initial=0.0)))
+        dual, value = dual / scale, (float(a @ dual) + float(g @ u) / scale)
+        order = np.argsort(best.rows)
         return Minimax(
-            weights, bound, dual, (bound - float(a @ dual)) / bound, tuple(np.sort(basis).tolist())
+            weights,
+            bound,
+            dual,
+            (bound - value) / bound,
+            tuple(best.rows[order].tolist()),
+            tuple(best.inputs.tolist()),
         )
+
+    def worst(self, weights: Floats, through: npt.ArrayLike | None = None) -> Floats:
+        """Compute the worst r.m.s. error of any estimates W z, unbiased in x, from their weights.
+
+        Parameters
+        ----------
+        weights : (n,) or (k, n)
+            Weights of the measurements.
+        through : (p,) or (k, p), optional
+            Effect of unit inputs on the targets; zero where not given.
+
+        Returns
+        -------
+        float or (k,)
+            sum sigma |w| + sum d |g - G w|.
+        """
+        whitened = weights * self.sigmas
+        left = self._through(through) * self.bounds - whitened @ self.inputs.T
+        worst: Floats = np.abs(whitened).sum(axis=-1) + np.abs(left).sum(axis=-1)
+        return worst
+
+    def _through(self, through: npt.ArrayLike | None) -> Floats:
+        if through is None:
+            return np.zeros(len(self.bounds))
+        g = np.asarray(through, dtype=np.float64)
+        if g.shape[-1:] != self.bounds.shape or not np.isfinite(g).all():
+            raise ValueError(f"through has shape {g.shape}; give {self.bounds.shape}, one for each input")
+        return g
 
     def least_squares(self, target: npt.ArrayLike) -> LeastSquares:
         """Compute the least-squares estimate of one target.
@@ -339,79 +421,141 @@ class Design:
             whitened_weights / self.sigmas, float(np.linalg.norm(a_q)), float(np.abs(whitened_weights).sum())
         )
 
-    def _basis(self, start: Sequence[int] | None) -> Indices:
-        """Choose r independent rows: `start`, else the extremal nodes of a window, else by pivoting."""
+    def _basis(self, start: Minimax | Sequence[int] | None) -> tuple[Indices, Indices]:
+        """Choose independent rows: of `start`, else the extremal nodes of a window, else by pivoting."""
         rank, n = self.q.shape
+        none = np.empty(0, dtype=np.intp)
+        if isinstance(start, Minimax):
+            rows, inputs = (np.asarray(k, dtype=np.intp) for k in (start.active, start.cancelled))
+        else:
+            rows, inputs = np.asarray([] if start is None else start, dtype=np.intp), none
+        if len(rows) == rank + len(inputs) and self._is_basis(rows, inputs):
+            return rows, inputs
         nodes = 0.5 * (1.0 - np.cos(np.pi * np.arange(rank) / max(rank - 1, 1)))
-        for rows in (start, np.round(nodes * (n - 1))):
-            if rows is None or len(rows) != rank:
-                continue
-            basis = np.asarray(rows, dtype=np.intp)
-            if basis.min() >= 0 and basis.max() < n and np.linalg.cond(self.q[:, basis]) < 1e6:
-                return basis
-        from scipy.linalg import qr  # 0.2 s: not before the first frame is received
+        rows = np.round(nodes * (n - 1)).astype(np.intp)
+        if not self._is_basis(rows, none):
+            from scipy.linalg import qr  # 0.2 s: not before the first frame is received
 
-        return np.asarray(qr(self.q, mode="r", pivoting=True)[-1][:rank], dtype=np.intp)
+            rows = np.asarray(qr(self.q, mode="r", pivoting=True)[-1][:rank], dtype=np.intp)
+        return rows, none
+
+    def _is_basis(self, rows: Indices, inputs: Indices) -> bool:
+        n, p = len(self.sigmas), len(self.bounds)
+        within = all(not len(k) or (k.min() >= 0 and k.max() < m) for k, m in ((rows, n), (inputs, p)))
+        if not within or len(rows) != len(self.q) + len(inputs):
+            return False
+        matrix = np.vstack([self.q[:, rows], self.inputs[inputs][:, rows]])
+        return bool(np.linalg.cond(matrix / np.abs(matrix).max(axis=1, keepdims=True).clip(1e-300)) < 1e8)
 
 
-def _exchange(q: Floats, a: Floats, basis: Indices) -> tuple[Indices, Floats, Floats]:
-    """Find the optimal basis, its whitened weights and the dual vector, from any independent basis.
+class _Basis(NamedTuple):
+    """Basis found: rows A and their whitened weights, inputs F, dual lambda (r,), u (p,) in bounds, cost."""
 
-    q (r, n), a (r,). The sign of a weight is kept as part of the basis, so that a weight of zero has one too.
+    rows: Indices
+    weights: Floats
+    inputs: Indices
+    dual: Floats
+    u: Floats
+    cost: float
+
+
+def _exchange(
+    q: Floats, D: Floats, a: Floats, g: Floats, rows: Indices, inputs: Indices, tolerance: float
+) -> _Basis:
+    """Find the optimal basis from any independent one; q (r, n), D (p, n), a (r,), g (p,).
+
+    The sign of a weight, and of what is left of an input, is kept as part of the basis, so that a zero has
+    one too.
     """
-    basis = basis.copy()
-    sign = np.where(np.linalg.solve(q[:, basis], a) < 0.0, -1.0, 1.0)
-    cost, stalled = np.inf, 0
-    best: tuple[Indices, Floats, Floats] | None = None
+    r, n = q.shape
+    p = len(D)
+    rows, inputs = rows.copy(), inputs.copy()
+    sign, u = np.ones(n), np.ones(p)
+    first, cost, stalled = True, np.inf, 0
+    best: _Basis | None = None
     for _ in range(EXCHANGES_MAX):
-        b = q[:, basis]
-        inverse = np.linalg.inv(b)
-        w = inverse @ a
-        w += inverse @ (a - b @ w)
-        size = sign * w
-        wrong = size < -1e-13 * np.abs(size).sum()  # by rounding, in a nearly singular basis
-        sign[wrong], size[wrong] = -sign[wrong], -size[wrong]
-        now = float(size.sum())
-        biased = np.abs(b @ w - a).max() > 1e-10 * max(np.abs(a).max(), 1e-3 * now * np.abs(b).max())
+        b = np.concatenate([q[:, rows], D[inputs][:, rows]])
+        goal = np.concatenate([a, g[inputs]])
+        try:
+            inverse = np.linalg.inv(b)
+        except np.linalg.LinAlgError:
+            break
+        w = inverse @ goal
+        w += inverse @ (goal - b @ w)
+        left = g - D[:, rows] @ w
+        left[inputs] = 0.0
+        now = float(np.abs(w).sum() + np.abs(left).sum())
+        least = 0.0 if first else -1e-13 * now  # a wrong sign by rounding, in a nearly singular basis
+        sign[rows] = np.where(w * sign[rows] < least, -sign[rows], sign[rows])
+        u = np.where(left * u < least, -u, u)
+        first = False
+        biased = np.abs(b @ w - goal).max() > 1e-10 * max(np.abs(goal).max(), 1e-3 * now * np.abs(b).max())
         if best is not None and (biased or now > cost * (1.0 + 1e-9)):
             break  # two nearly equal rows: the basis before was optimal within rounding
-        dual = sign @ inverse
-        best = (basis.copy(), w, dual)
-        level = dual @ q
-        excess = np.abs(level)
+        u[inputs] = 0.0
+        dual = (sign[rows] - u @ D[:, rows]) @ inverse
+        u[inputs] = dual[r:]
+        best = _Basis(rows.copy(), w, inputs.copy(), dual[:r], u.copy(), now)
+        level = dual[:r] @ q + u @ D
+        excess = np.concatenate([np.abs(level), np.abs(dual[r:])])
         stalled = 0 if now < cost * (1.0 - 1e-14) else stalled + 1
         cost = now
-        bland = stalled > 3 * len(a)
-        enter = int(np.argmax(excess > 1.0 + LEVEL_TOLERANCE)) if bland else int(excess.argmax())
-        if excess[enter] <= 1.0 + LEVEL_TOLERANCE:
+        bland = stalled > 3 * len(b)
+        limit = 1.0 + max(tolerance, ROUNDING if bland else 0.0)
+        enter = int(np.argmax(excess > limit)) if bland else int(excess.argmax())
+        if excess[enter] <= limit:
             break
-        side = 1.0 if level[enter] > 0.0 else -1.0
-        rate = sign * (inverse @ q[:, enter]) * side  # how fast each |w| of the basis falls
-        leave = _first_to_vanish(size, rate, basis) if bland else _long_step(size, rate, sign, excess[enter])
-        basis[leave], sign[leave] = enter, side
+        if enter < n:
+            side = 1.0 if level[enter] > 0.0 else -1.0
+            column = np.concatenate([q[:, enter], D[inputs, enter]])
+            dw = -side * (inverse @ column)
+            moved = -(D[:, rows] @ dw) - side * D[:, enter]
+        else:
+            side = 1.0 if dual[r + enter - n] > 0.0 else -1.0
+            dw = -side * inverse[:, r + enter - n]
+            moved = -(D[:, rows] @ dw)
+        moved[inputs] = 0.0
+        rate = np.concatenate([-sign[rows] * dw, -u * moved])  # how fast each |w| and |left| falls
+        size = np.concatenate([np.abs(w), np.abs(left)])
+        passed, leave = _line_search(size, rate, excess[enter], bland)
+        for k in passed:
+            if k < len(rows):
+                sign[rows[k]] *= -1.0
+            else:
+                u[k - len(rows)] *= -1.0
+        if enter < n:
+            sign[enter] = side
+            if leave < len(rows):
+                rows[leave] = enter
+            else:
+                rows, inputs = np.append(rows, enter), np.append(inputs, leave - len(rows))
+        else:
+            gone = enter - n
+            u[inputs[gone]] = side
+            if leave < len(rows):
+                rows, inputs = np.delete(rows, leave), np.delete(inputs, gone)
+            else:
+                inputs[gone] = leave - len(rows)
     assert best is not None
     return best
 
 
-def _long_step(size: Floats, rate: Floats, sign: Floats, excess: float) -> int:
-    """Choose the weight that leaves, changing `sign` of those passed on the way.
+def _line_search(size: Floats, rate: Floats, excess: float, bland: bool) -> tuple[list[int], int]:
+    """Return the terms that change sign on the way, and the one that ends at zero.
 
-    The cost is convex in the entering weight and its slope, 1 - excess at first, grows by twice the rate of
-    each weight that vanishes; while the slope is negative that weight changes sign instead of leaving.
+    The cost is convex along the way and its slope, 1 - excess at first, grows by twice the rate of each term
+    that vanishes; while the slope is negative that term changes sign instead of ending there. By Bland's rule
+    the first term that vanishes, of several the first in order, ends there.
     """
     falling = np.flatnonzero(rate > 1e-11 * np.abs(rate).max())
-    slope = 1.0 - excess
-    for i in falling[np.argsort(size[falling] / rate[falling], kind="stable")]:
-        slope += 2.0 * rate[i]
+    when = size[falling] / rate[falling]
+    if bland:
+        return [], int(falling[np.argmin(when)])
+    slope, passed = 1.0 - excess, list[int]()
+    order = falling[np.argsort(when, kind="stable")].tolist()
+    for k in order:
+        slope += 2.0 * float(rate[k])
         if slope >= 0.0:
-            break
-        sign[i] = -sign[i]
-    return int(i)
-
-
-def _first_to_vanish(size: Floats, rate: Floats, basis: Indices) -> int:
-    """Choose the weight that vanishes first, of several the lowest row: Bland's rule."""
-    falling = np.flatnonzero(rate > 1e-11 * np.abs(rate).max())
-    when = np.maximum(size[falling], 0.0) / rate[falling]
-    first = falling[when <= when.min() * (1.0 + 1e-12) + 1e-300]
-    return int(first[np.argmin(basis[first])])
+            return passed, k
+        passed.append(k)
+    return passed[:-1], order[-1]

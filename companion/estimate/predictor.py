@@ -1,438 +1,578 @@
-"""Rolling minimax prediction of one INS channel from a window of fixes.
+"""Guaranteed prediction from a window of fixes: the worst r.m.s. error of any linear estimate; the least.
 
-A `Window` holds the trusted fixes of one channel, the longest stretch within a limit in seconds and in
-number: short windows are physically poor (40 s of positions, four minutes ahead: 8703 sigma). It is an
-immutable value; `push` returns a new one. It should not exceed an hour: beyond, the optimum relies on a
-single fix one Schuler period old, which a real INS does not honour (on recorded flight 0.32 m/s instead of
-0.16 m/s five minutes ahead, 90 against 60 minutes of velocities). `predict` gives position, velocity, tilt
-and drift error of the INS at one instant, each with the r.m.s. bound that holds under any correlation of the
-fixes' errors, and for comparison the least-squares estimate with its claimed and its worst error.
+A `Program` holds fixes z = H x + G u + rho of a window, with what is wanted as a . x + g . u. Of u, the
+inputs (steps of an unknown force, errors of the unit that are constants), two things are stated: a bound on
+the r.m.s. of each, of whatever correlation, and a covariance. With k = g - G' w, what an estimate w . z
+leaves of them, its error is
 
-Rows are taken about the middle of the window, where they are as well conditioned as powers of time, and the
-target is propagated there; so one factoring serves all targets and instants. It does not know whether a fix
-deserves trust, nor what is north: signs of tilt and drift for each axis are in `schuler`.
+    worst r.m.s.    sum sigma |w| + sum d |k|        over every correlation of fixes and inputs, attained
+    expected r.m.s. sqrt(w' R w + k' U k)            by the covariances
+
+Three estimates are compared, all unbiased in x: Bayes, of least expected error (the Kalman filter's, in one
+batch); minimax, of least worst error; and restricted Bayes (Hodges and Lehmann 1952), of least expected error
+among those whose worst error is at most kappa times the minimax one. The worst error of the first is the
+guaranteed bound of a position that a filter of the same model sends.
+
+A `Window` accumulates the transition of the error model along the flight. `anchor` makes its program: rows
+and inputs refer to the state at the last fix, so that a force that wanders is small where it matters most.
+The states at the anchor are unknown constants, each with a bound but the first ones. It does not know what
+the states mean, nor whether a fix deserves trust.
 """
+
+from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import Literal, NamedTuple, Self, cast
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
-from companion.estimate.minimax_lp import Design, Infeasible
-from companion.estimate.schuler import MEAN_EARTH, Scale, schuler_row, transition
+from companion.estimate.minimax_lp import LEVEL_TOLERANCE, Design, Minimax
 from companion.units import Floats
 
-Quantity = Literal["position", "velocity"]
-Target = Literal["position", "velocity", "tilt", "drift"]
-Key = tuple[int, bool]  # identifies a fix: its time, ns, and whether it is a velocity
-
-TARGETS: tuple[Target, ...] = (
-    "position",
-    "tilt",
-    "velocity",
-    "drift",
-)  # in the order gamma, phi, mu, vartheta
-MEASURED: dict[Quantity, bool] = {"position": False, "velocity": True}
-NS = 1e-9  # [s]
+KAPPA = 1.2  # worst error of the restricted estimate over the least possible
+RESTRICTED_TOLERANCE = 1e-2  # relative, of its worst error against the limit
+RESTRICTED_ROUNDS, RESTRICTED_LEAST = 500, 4
+RESTRICTED_GAIN = 4.0  # power of the excess over the limit by which the multiplier follows it
+GROUP_S, GROUP_RATIO = 10.0, 0.2  # length of the newest group of fixes, s; growth with age
+WHITE = 0.1  # share of white noise in the variance of a fix, expected
+UNLIKE = 4.0  # fixes so many times better or worse are not grouped
+TOLERANCE = 1e-4
+CONTRADICTION_SIGMA = 4.0  # residuals beyond chi-square by so many sigmas contradict the model
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Window:
-    """Measured INS errors of one channel, oldest first; its arrays are read-only.
+class Target(NamedTuple):
+    """Wanted combination a . x + g . u.
 
     Attributes
     ----------
-    span : float
-        Fixes older than this are dropped, s.
-    capacity : int
-        Above this number fixes are thinned evenly; the ends of each quantity stay.
-    t_ns : (n,) int64
-        Times of the fixes, ns.
-    velocity : (n,) bool
-        True for a velocity, False for a position.
-    value : (n,)
-        INS minus fix, m or m/s.
-    sigma : (n,)
-        R.m.s. errors of the fixes, m or m/s.
-    disturbance : float
-        R.m.s. of the specific force not modelled by (2.1), m/s^2.
-    drifting : bool
-        True where nothing restores a velocity error: air-data dead reckoning in a wind.
+    a : (m,)
+        Coefficients of the unknowns.
+    g : (p,)
+        Coefficients of the inputs.
+    beyond : float
+        Worst error added by inputs after the last fix, which no fix shows.
+    beyond_variance : float
+        Their variance.
     """
 
-    span: float = 3600.0
-    capacity: int = 1000
-    t_ns: npt.NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))
-    velocity: npt.NDArray[np.bool_] = field(default_factory=lambda: np.empty(0, np.bool_))
-    value: Floats = field(default_factory=lambda: np.empty(0))
-    sigma: Floats = field(default_factory=lambda: np.empty(0))
-    disturbance: float = 0.0
-    drifting: bool = False
+    a: Floats
+    g: Floats
+    beyond: float = 0.0
+    beyond_variance: float = 0.0
 
-    def __post_init__(self) -> None:
-        if not (math.isfinite(self.span) and self.span > 0.0):
-            raise ValueError(f"Window.span is {self.span}; give a positive number of seconds")
-        if self.capacity < 8:
-            raise ValueError(f"Window.capacity is {self.capacity}; give at least 8, four of each quantity")
+
+class Estimate(NamedTuple):
+    """Linear estimate of one target.
+
+    Attributes
+    ----------
+    value : float
+        Estimate.
+    expected : float
+        R.m.s. error by the covariances.
+    bound : float
+        Worst r.m.s. error.
+    weights : (n,)
+        Weights of the fixes.
+    """
+
+    value: float
+    expected: float
+    bound: float
+    weights: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class Program:
+    """Fixes of a window and all that is unknown.
+
+    Attributes
+    ----------
+    rows : (n, m)
+        Rows H on the unknowns of which nothing is known.
+    values : (n,)
+        Measurements.
+    sigmas : (n,)
+        R.m.s. errors of the measurements.
+    inputs : (n, p)
+        Effect G of unit inputs.
+    bounds : (p,)
+        R.m.s. bounds of the inputs.
+    covariance : (p, p)
+        Covariance U of the inputs.
+    noise : (n, n)
+        Covariance R of the measurements' errors.
+    """
+
+    rows: Floats
+    values: Floats
+    sigmas: Floats
+    inputs: Floats
+    bounds: Floats
+    covariance: Floats
+    noise: Floats
+
+    @cached_property
+    def design(self) -> Design:
+        """The linear programme, factored."""
+        return Design.of(self.rows, self.sigmas, self.inputs, self.bounds)
+
+    @cached_property
+    def crossed(self) -> Floats:
+        """Covariance of the fixes with the inputs, G U (n, p)."""
+        return self.inputs @ self.covariance
+
+    @cached_property
+    def spread(self) -> Floats:
+        """Covariance of the fixes at given x, R + G U G' (n, n)."""
+        return self.noise + self.crossed @ self.inputs.T
+
+    def grouped(self, fixes: Floats, inputs: Floats) -> Program:
+        """Replace fixes and inputs by fewer.
+
+        Parameters
+        ----------
+        fixes : (n, k)
+            Weights of the fixes in each mean; columns add up to one.
+        inputs : (p, l)
+            Inputs that are taken as equal: one 1 in each row.
+
+        Returns
+        -------
+        Program
+            Program of k fixes and l inputs.
+        """
+        mean = inputs / inputs.sum(axis=0)
+        return Program(
+            fixes.T @ self.rows,
+            fixes.T @ self.values,
+            fixes.T @ self.sigmas,
+            fixes.T @ (self.inputs @ inputs),
+            mean.T @ self.bounds,
+            mean.T @ self.covariance @ mean,
+            fixes.T @ self.noise @ fixes,
+        )
+
+    def bayes(self, target: Target) -> Estimate:
+        """Compute the estimate of least expected square: the Kalman filter's.
+
+        Raises
+        ------
+        Infeasible
+            If the fixes do not determine the target.
+        """
+        self.design.in_coordinates(target.a)
+        return self.judge(_least_square(self.rows, target.a, self.crossed @ target.g, self.spread), target)
+
+    def minimax(
+        self, target: Target, start: Minimax | None = None, tolerance: float = LEVEL_TOLERANCE
+    ) -> tuple[Estimate, Minimax]:
+        """Compute the estimate of least worst error, and its certificate: a start for the next."""
+        best = self.design.minimax(target.a, start, target.g, tolerance)
+        return self.judge(best.weights, target), best
+
+    def restricted(
+        self,
+        target: Target,
+        best: Estimate,
+        kappa: float = KAPPA,
+        start: tuple[float, Floats] | None = None,
+        tolerance: float = RESTRICTED_TOLERANCE,
+    ) -> tuple[Estimate, float]:
+        """Compute the estimate of least expected square whose worst error is at most kappa times the least.
+
+        With a multiplier mu on the worst error its terms are replaced by parabolas that touch them: each
+        round is one least-squares problem, with coarser noise where a term is small.
+
+        Parameters
+        ----------
+        target : Target
+            What is wanted.
+        best : Estimate
+            The minimax estimate.
+        kappa : float
+            Limit of the worst error, in those of `best`.
+        start : tuple, optional
+            Multiplier and weights of a similar problem.
+        tolerance : float
+            Relative, of the worst error against its limit and of the expected error in a round.
+
+        Returns
+        -------
+        tuple
+            Estimate, and its multiplier: 0 where the Kalman filter's is within the limit.
+
+        Raises
+        ------
+        ValueError
+            If kappa is below 1.
+
+        References
+        ----------
+        Hodges and Lehmann, The use of previous experience in reaching statistical decisions (1952).
+        """
+        if kappa < 1.0:
+            raise ValueError(f"kappa is {kappa:g}; give 1 or more: no estimate is below the minimax bound")
+        limit = kappa * best.bound
+        found = self.bayes(target)
+        if found.bound <= limit:
+            return found, 0.0
+        G, g = self.inputs * self.bounds, target.g * self.bounds
+        c, floor = self.crossed @ target.g, 1e-9 * limit
+        mu, weights = found.expected**2 / limit, found.weights
+        if start is not None and start[0] > 0.0 and start[1].shape == weights.shape:
+            mu, weights = start
+        feasible, before = best, found.expected
+        for k in range(RESTRICTED_ROUNDS):
+            fine = mu * self.sigmas / np.maximum(np.abs(weights), floor / self.sigmas)
+            coarse = mu / np.maximum(np.abs(g - weights @ G), floor)
+            spread = self.spread + np.diag(fine) + (G * coarse) @ G.T
+            weights = _least_square(self.rows, target.a, c + G @ (coarse * g), spread)
+            found = self.judge(weights, target)
+            excess = found.bound / limit
+            if excess <= 1.0 and found.expected < feasible.expected:
+                feasible = found
+            settled = abs(found.expected - before) <= tolerance * before
+            if settled and 1.0 - tolerance < excess <= 1.0:
+                break
+            before = found.expected
+            mu *= excess**RESTRICTED_GAIN if k < RESTRICTED_LEAST else excess ** (0.5 * RESTRICTED_GAIN)
+        return feasible, mu
+
+    def judge(self, weights: Floats, target: Target) -> Estimate:
+        """Compute value, expected and worst error of any linear estimate that is unbiased in x."""
+        left = target.g - weights @ self.inputs
+        variance = weights @ self.noise @ weights + left @ self.covariance @ left + target.beyond_variance
+        worst = np.abs(weights) @ self.sigmas + np.abs(left) @ self.bounds + target.beyond
+        return Estimate(float(weights @ self.values), math.sqrt(variance), float(worst), weights)
+
+    @property
+    def widening(self) -> float:
+        """Factor by which the residuals exceed what is stated, 1 where they do not contradict it.
+
+        R.m.s. of the whitened residuals, if chi-square is beyond `CONTRADICTION_SIGMA`.
+        """
+        weighed = _solve(self.spread, np.column_stack([self.values, self.rows]))
+        normal = self.rows.T @ weighed[:, 1:]
+        fitted = np.linalg.lstsq(normal, self.rows.T @ weighed[:, 0], rcond=None)[0]
+        degrees = len(self.values) - int(np.linalg.matrix_rank(normal))
+        if degrees <= 0:
+            return 1.0
+        mean = float(self.values @ weighed @ np.append(1.0, -fitted)) / degrees
+        return math.sqrt(mean) if mean > 1.0 + CONTRADICTION_SIGMA * math.sqrt(2.0 / degrees) else 1.0
+
+
+def _solve(A: Floats, b: Floats) -> Floats:
+    return np.asarray(np.linalg.solve(A, b), dtype=np.float64)
+
+
+def _least_square(rows: Floats, a: Floats, c: Floats, spread: Floats) -> Floats:
+    """Solve min w' S w - 2 c . w subject to rows' w = a."""
+    solved = _solve(spread, np.column_stack([c, rows]))
+    multiplier = np.linalg.lstsq(rows.T @ solved[:, 1:], a - rows.T @ solved[:, 0], rcond=None)[0]
+    weights: Floats = solved[:, 0] + solved[:, 1:] @ multiplier
+    return weights
+
+
+class Fix(NamedTuple):
+    """Mean of some fixes of the error of the channel.
+
+    Attributes
+    ----------
+    t_s : float
+        Time, s.
+    node : int
+        Number of the node that ends the interval it lies in.
+    rows : (k, m)
+        Rows on the state, carried back to the epoch.
+    values, sigmas : (k,)
+        Measured errors, and their r.m.s. errors.
+    """
+
+    t_s: float
+    node: int
+    rows: Floats
+    values: Floats
+    sigmas: Floats
+
+
+class Law(Protocol):
+    """Error model of a channel whose inputs and states have bounds."""
+
+    @property
+    def n(self) -> int:
+        """Number of states; position (2) and velocity (2) first."""
+
+    @property
+    def free(self) -> int:
+        """Number of states, the first ones, of which nothing is known."""
+
+    @property
+    def correlation_s(self) -> float:
+        """Correlation time of the fixes' errors, expected."""
+
+    def prior(self) -> Floats:
+        """R.m.s. of the states (n,) at the start."""
+
+    def bound(self, age_s: Floats) -> Floats:
+        """R.m.s. bound of the unknown input (k,) at times `age_s` from the anchor, of either sign."""
+
+    def covariance(self, age_s: Floats) -> Floats:
+        """Expected covariance of the unknown input (k, k) at such times."""
+
+
+class Window(NamedTuple):
+    """Fixes along the transition of the error model; an immutable value.
+
+    Attributes
+    ----------
+    t_s : tuple of float
+        Times of the nodes, s, increasing; the first is the epoch.
+    C : tuple of (m, m)
+        Transition from the epoch to each node.
+    S : tuple of (m, 2)
+        Effect of a unit input, north and east, in the interval that ends at the node, carried to the epoch.
+    sigma : tuple of (m,)
+        R.m.s. of the states at each node if no fix is used.
+    P : (m, m)
+        Their covariance at the last node.
+    fixes : tuple of Fix
+        Fixes, in order.
+    """
+
+    t_s: tuple[float, ...]
+    C: tuple[Floats, ...]
+    S: tuple[Floats, ...]
+    sigma: tuple[Floats, ...]
+    P: Floats
+    fixes: tuple[Fix, ...] = ()
 
     @classmethod
-    def of(
-        cls,
-        t_ns: npt.ArrayLike,
-        quantity: Quantity,
-        value: npt.ArrayLike,
-        sigma: npt.ArrayLike,
-        span: float = 3600.0,
-        capacity: int = 1000,
-    ) -> Self:
-        """Build a window of one quantity.
+    def begin(cls, t_s: float, law: Law) -> Window:
+        """Start with the epoch as the only node."""
+        sigma, n = law.prior(), law.n
+        return cls((t_s,), (np.eye(n),), (np.zeros((n, 2)),), (sigma,), np.diag(sigma**2))
 
-        Parameters
-        ----------
-        t_ns : (n,) int
-            Times, ns, strictly increasing.
-        quantity : {"position", "velocity"}
-            What the fixes measure.
-        value : (n,)
-            INS minus fix, m or m/s.
-        sigma : (n,) or float
-            R.m.s. errors of the fixes, in the unit of the values.
-        span : float
-            Length limit, s.
-        capacity : int
-            Limit of the number of fixes.
-
-        Returns
-        -------
-        Window
-            The window, shortened and thinned to its limits.
-
-        Raises
-        ------
-        ValueError
-            On wrong shapes, times out of order, or a fix that is not usable.
-        """
-        window = cls(span, capacity)
-        times, values = np.asarray(t_ns, np.int64), np.asarray(value, np.float64)
-        if times.ndim != 1 or times.shape != values.shape:
-            raise ValueError(f"t_ns has shape {times.shape}, value {values.shape}; give (n,) of both")
-        sigmas = np.broadcast_to(np.asarray(sigma, np.float64), times.shape)
-        if (late := np.diff(times) <= 0).any():
-            k = int(late.argmax())
-            raise ValueError(f"t_ns[{k + 1}] does not follow t_ns[{k}]; sort the fixes, drop repeated ones")
-        if (bad := ~(np.isfinite(values) & np.isfinite(sigmas) & (sigmas > 0.0))).any():
-            k = int(bad.argmax())
-            raise ValueError(
-                f"fix {k}: value {values[k]}, sigma {sigmas[k]}; leave out a fix that is not a measurement"
-            )
-        keep = times >= times[-1] - round(span / NS) if len(times) else slice(0)
-        window = window._with(
-            times[keep], np.full(len(times), MEASURED[quantity])[keep], values[keep], sigmas[keep]
+    def extend(self, t_s: float, Phi: Floats, B: Floats, Q: Floats) -> Window:
+        """Append a node: transition (m, m), effect (m, 2) of a unit input and noise (m, m) since the last."""
+        C, P = Phi @ self.C[-1], Phi @ self.P @ Phi.T + Q
+        S = _solve(C, B)
+        return self._replace(
+            t_s=(*self.t_s, t_s),
+            C=(*self.C, C),
+            S=(*self.S, S),
+            sigma=(*self.sigma, np.sqrt(P.diagonal())),
+            P=P,
         )
-        while len(window) > capacity:
-            window = window._thinned()
-        return window
 
-    def __len__(self) -> int:
-        return len(self.t_ns)
+    def with_fix(self, t_s: float, rows: Floats, values: Floats, sigmas: Floats, span_s: float) -> Window:
+        """Append a fix in the interval that ends at the last node; drop those `span_s` before it."""
+        fix = Fix(t_s, len(self.t_s) - 1, rows, values, sigmas)
+        kept = [f for f in self.fixes if f.t_s >= t_s - span_s]
+        first = max(kept[0].node - 1, 0) if kept else len(self.t_s) - 1
+        fixes = tuple(f._replace(node=f.node - first) for f in (*kept, fix))
+        return Window(self.t_s[first:], self.C[first:], self.S[first:], self.sigma[first:], self.P, fixes)
 
-    def push(self, t_ns: int, quantity: Quantity, value: float, sigma: float) -> Self:
-        """Append one fix.
-
-        Parameters
-        ----------
-        t_ns : int
-            Time, ns, not before the last fix.
-        quantity : {"position", "velocity"}
-            What the fix measures.
-        value : float
-            INS minus fix, m or m/s.
-        sigma : float
-            R.m.s. error of the fix, m or m/s.
-
-        Returns
-        -------
-        Window
-            A new window; older fixes are dropped or thinned by its limits.
-
-        Raises
-        ------
-        ValueError
-            If the fix is late, repeated or not a number.
-        """
-        if quantity not in MEASURED:
-            raise ValueError(f"quantity is {quantity!r}; give 'position' or 'velocity'")
-        if not (math.isfinite(value) and math.isfinite(sigma) and sigma > 0.0):
-            raise ValueError(
-                f"fix {len(self)}: value {value}, sigma {sigma}; leave out a fix that is not a measurement"
-            )
-        velocity = MEASURED[quantity]
-        if len(self) and t_ns < self.t_ns[-1]:
-            raise ValueError(
-                f"fix {len(self)} is at {t_ns} ns, before the last at {self.t_ns[-1]}; push in order"
-            )
-        if (self.velocity[self.t_ns.searchsorted(t_ns) :] == velocity).any():
-            raise ValueError(
-                f"fix {len(self)} repeats the {quantity} at {t_ns} ns; combine the two beforehand"
-            )
-        first = int(self.t_ns.searchsorted(t_ns - round(self.span / NS)))
-        grown = self._with(
-            np.append(self.t_ns[first:], np.int64(t_ns)),
-            np.append(self.velocity[first:], velocity),
-            np.append(self.value[first:], value),
-            np.append(self.sigma[first:], sigma),
-        )
-        return grown if len(grown) <= self.capacity else grown._thinned()
-
-    def _with(
-        self, t_ns: npt.NDArray[np.int64], velocity: npt.NDArray[np.bool_], value: Floats, sigma: Floats
-    ) -> Self:
-        for array in (t_ns, velocity, value, sigma):
-            array.setflags(write=False)
-        arrays = (t_ns, velocity, value, sigma)
-        return type(self)(self.span, self.capacity, *arrays, self.disturbance, self.drifting)
-
-    def _thinned(self) -> Self:
-        """Drop the fix that leaves the smallest gap between its neighbours of the same quantity."""
-        drop, least = -1, math.inf
-        for velocity in (False, True):
-            same = np.flatnonzero(self.velocity == velocity)
-            if len(same) > 2:
-                gap = self.t_ns[same[2:]] - self.t_ns[same[:-2]]
-                k = int(gap.argmin())
-                if gap[k] < least:
-                    drop, least = int(same[k + 1]), float(gap[k])
-        others = np.arange(len(self)) != drop
-        return self._with(self.t_ns[others], self.velocity[others], self.value[others], self.sigma[others])
+    def shift(self, offset: Floats) -> Window:
+        """Move every measured position with a jump (2,) of the channel."""
+        fixes = tuple(f._replace(values=f.values + offset) for f in self.fixes)
+        return self._replace(fixes=fixes)
 
 
-class Forecast(NamedTuple):
-    """One INS error at one instant, SI: m, rad, m/s, rad/s.
+Start = tuple[Minimax, tuple[float, Floats]]  # of the exchange, and of the restricted estimate
+
+
+class Solved(NamedTuple):
+    """Estimates of one target.
 
     Attributes
     ----------
-    feasible : bool
-        False if the fixes do not determine it; then estimates are nan and bounds infinite.
-    estimate : float
-        Minimax estimate.
-    bound : float
-        Its r.m.s. error under any correlation of the fixes' errors.
+    kalman, minimax, restricted : Estimate
+        Of least expected error, of least worst error, and of least expected error among those whose worst
+        error is at most `KAPPA` times the least.
     gap : float
-        Relative distance within which the bound is proved to be the least possible.
-    ls_estimate : float
-        Least-squares estimate.
-    ls_claimed : float
-        Its one sigma if the errors are uncorrelated.
-    ls_worst : float
-        Its r.m.s. error under the worst correlation.
-    active : tuple
-        Fixes that determine the bound, each (t_ns, is velocity).
+        Relative distance within which the minimax error is proved to be the least, for the grouped fixes.
+    start : tuple
+        Start for a similar problem.
     """
 
-    feasible: bool
-    estimate: float = math.nan
-    bound: float = math.inf
-    gap: float = math.inf
-    ls_estimate: float = math.nan
-    ls_claimed: float = math.inf
-    ls_worst: float = math.inf
-    active: tuple[Key, ...] = ()
+    kalman: Estimate
+    minimax: Estimate
+    restricted: Estimate
+    gap: float
+    start: Start
 
 
-class Prediction(NamedTuple):
-    """INS errors of one channel at one instant.
+class Anchored(NamedTuple):
+    """Program of a window, on the state at its last fix, and what carries targets there.
+
+    Estimates are sought among those that weigh neighbouring fixes alike, on `grouped`: a sixth of the fixes,
+    a hundredth of the work. Their errors are computed on `program`, where they are exact.
 
     Attributes
     ----------
-    t_ns : int
-        Time, ns.
-    feasible : bool
-        True if all requested targets are.
-    reason : str
-        Why not, or empty.
-    position, tilt, velocity, drift : Forecast or None
-        None if not requested.
+    program : Program
+        Unknowns: the free states; inputs: the unknown force by interval, north and east, oldest first, then
+        the states with a bound.
+    grouped : Program
+        The same with means of fixes, and with a force that is constant over longer intervals.
+    fixes, inputs : (n, k), (p, l)
+        The groups, as in `Program.grouped`.
+    node, t_s : int, float
+        Node and time of the last fix.
+    back : (m, m)
+        Transition from the state there to the epoch.
+    law : Law
+        Error model.
     """
 
-    t_ns: int
-    feasible: bool
-    reason: str
-    position: Forecast | None = None
-    tilt: Forecast | None = None
-    velocity: Forecast | None = None
-    drift: Forecast | None = None
+    program: Program
+    grouped: Program
+    fixes: Floats
+    inputs: Floats
+    node: int
+    t_s: float
+    back: Floats
+    law: Law
+
+    def solve(self, target: Target, start: Start | None = None, tolerance: float = TOLERANCE) -> Solved:
+        """Compute the three estimates of a target.
+
+        Parameters
+        ----------
+        target : Target
+            What is wanted.
+        start : tuple, optional
+            Start of a similar problem.
+        tolerance : float
+            Relative gap of the minimax error that is good enough.
+
+        Returns
+        -------
+        Solved
+            Estimates with their exact errors.
+
+        Raises
+        ------
+        Infeasible
+            If the fixes do not determine the target.
+        """
+        coarse = target._replace(g=self.inputs.T @ target.g)
+        kalman = self.grouped.bayes(coarse)
+        best, basis = self.grouped.minimax(coarse, start[0] if start else None, tolerance)
+        restricted, mu = self.grouped.restricted(coarse, best, start=start[1] if start else None)
+        k, m, r = (self.program.judge(self.fixes @ e.weights, target) for e in (kalman, best, restricted))
+        return Solved(k, m, r, basis.gap, (basis, (mu, restricted.weights)))
+
+    def targets(self, window: Window, which: Sequence[int], ahead: Sequence[Step] = ()) -> list[Target]:
+        """Build the targets of some states at the last node, or after further steps from there."""
+        rows = np.eye(self.law.n)[list(which)]
+        effects, ages, t_s = list[Floats](), list[float](), window.t_s[-1] + sum(s.seconds for s in ahead)
+        for step in reversed(ahead):
+            effects.append(rows @ step.B)
+            ages.append(t_s - 0.5 * step.seconds - self.t_s)
+            rows, t_s = rows @ step.Phi, t_s - step.seconds
+        rows = rows @ window.C[-1]  # on the state at the epoch
+        for k in range(len(window.t_s) - 1, self.node, -1):
+            effects.append(rows @ window.S[k])
+            ages.append(0.5 * (window.t_s[k] + window.t_s[k - 1]) - self.t_s)
+        rows = rows @ self.back
+        age = np.array(ages[::-1])
+        d, F = self.law.bound(age), self.law.covariance(age)
+        free, p = self.law.free, len(self.program.bounds)
+        found = []
+        for k, row in enumerate(rows):
+            beyond = np.array([effect[k] for effect in effects[::-1]]).reshape(-1, 2)
+            g = np.zeros(p)
+            g[p - self.law.n + free :] = row[free:]
+            worst = float(d @ np.abs(beyond).sum(axis=1))
+            variance = float(np.einsum("iq,ij,jq->", beyond, F, beyond))
+            found.append(Target(row[:free], g, worst, variance))
+        return found
 
 
-def predict(
-    window: Window,
-    t_ns: int,
-    targets: Sequence[Target] = ("position", "velocity"),
-    start: Prediction | None = None,
-    scale: Scale = MEAN_EARTH,
-) -> Prediction:
-    """Predict the INS errors at one instant, usually ahead of the window.
+class Step(NamedTuple):
+    """Step ahead of the last node: seconds, transition (m, m), effect of a unit input (m, 2)."""
 
-    Too few fixes raise nothing: they give `feasible=False` and the reason.
+    seconds: float
+    Phi: Floats
+    B: Floats
+
+
+def anchor(window: Window, law: Law) -> Anchored:
+    """Build the program of a window with its state at the last fix as the unknown.
 
     Parameters
     ----------
     window : Window
-        Fixes of the channel.
-    t_ns : int
-        Time of the prediction, ns.
-    targets : sequence of {"position", "tilt", "velocity", "drift"}
-        What to predict.
-    start : Prediction, optional
-        Previous prediction, from which the exchange starts.
-    scale : Scale
-        Earth radius and Schuler rate.
+        One fix or more.
+    law : Law
+        Error model.
 
     Returns
     -------
-    Prediction
-        Estimates and bounds, SI.
-    """
-    return predict_ahead(window, [t_ns], targets, start, scale)[0]
-
-
-def predict_ahead(
-    window: Window,
-    t_ns: Sequence[int],
-    targets: Sequence[Target] = ("position", "velocity"),
-    start: Prediction | None = None,
-    scale: Scale = MEAN_EARTH,
-) -> list[Prediction]:
-    """Predict the INS errors at several instants, each started from the one before.
-
-    Parameters
-    ----------
-    window : Window
-        Fixes of the channel.
-    t_ns : sequence of int
-        Times of the predictions, ns.
-    targets : sequence of {"position", "tilt", "velocity", "drift"}
-        What to predict.
-    start : Prediction, optional
-        Previous prediction, from which the exchange starts.
-    scale : Scale
-        Earth radius and Schuler rate.
-
-    Returns
-    -------
-    list of Prediction
-        One for each time.
+    Anchored
+        The program.
 
     Raises
     ------
     ValueError
-        For an unknown target.
+        Without fixes.
     """
-    for target in targets:
-        if target not in TARGETS:
-            raise ValueError(f"target {target!r} is unknown; give some of {', '.join(TARGETS)}")
-    if not len(window):
-        lost = dict.fromkeys(targets, Forecast(False))
-        return [Prediction(int(t), False, "no fixes in the window", **lost) for t in t_ns]
-    middle = (int(window.t_ns[0]) + int(window.t_ns[-1])) // 2
-    factored: tuple[Design, Floats] | None = None
-    predictions = []
-    for t in t_ns:
-        if factored is None or window.disturbance:
-            factored = _design(window, middle, int(t), scale)
-        design, whitened = factored
-        alpha = (int(t) - middle) * NS * scale.rate
-        ahead_rows = _drift(alpha) if window.drifting else transition(alpha)
-        forecasts, reasons = {}, []
-        for target in targets:
-            k = TARGETS.index(target)
-            before = cast("Forecast | None", getattr(start, target)) if start else None
-            try:
-                forecasts[target] = _forecast(window, design, whitened, ahead_rows[k], scale.units[k], before)
-            except Infeasible:
-                forecasts[target] = Forecast(False)
-                reasons.append(target)
-        rank, fixes = len(design.q), len(window)
-        why = (
-            f"{', '.join(reasons)} not observable: {fixes} fixes determine {rank} of 4 unknowns"
-            if reasons
-            else ""
-        )
-        start = Prediction(int(t), not reasons, why, **forecasts)
-        predictions.append(start)
-    return predictions
+    if not window.fixes:
+        raise ValueError("the window has no fixes; give one or more")
+    last, first = window.fixes[-1].node, window.fixes[0].node
+    back = _solve(window.C[last], np.eye(law.n))
+    rows = np.concatenate([f.rows for f in window.fixes]) @ back
+    each = [len(f.values) for f in window.fixes]
+    node = np.repeat([f.node for f in window.fixes], each)
+    values = np.concatenate([f.values for f in window.fixes])
+    sigmas = np.concatenate([f.sigmas for f in window.fixes])
+    steps = np.arange(first + 1, last + 1)
+    free, n = law.free, law.n
+    states = rows[:, free:]
+    effect = np.concatenate([window.C[last] @ window.S[i] for i in steps] or [np.zeros((n, 0))], axis=1)
+    G = -rows @ effect
+    G[node[:, None] >= np.repeat(steps, 2)] = 0.0  # a force before the fix is in the state that it measures
+    edges = np.array(window.t_s[first : last + 1])
+    age = 0.5 * (edges[1:] + edges[:-1]) - window.t_s[last]
+    d, F = np.repeat(law.bound(age), 2), np.kron(law.covariance(age), np.eye(2))
+    inputs = np.concatenate([G, states], axis=1)
+    sigma = window.sigma[last][free:]
+    U = np.zeros((len(d) + n - free,) * 2)
+    U[: len(d), : len(d)] = F
+    at = np.arange(len(d), len(U))
+    U[at, at] = sigma**2
+    t = np.repeat([f.t_s for f in window.fixes], each)
+    component = np.concatenate([np.arange(k) for k in each])
+    size = np.rint(np.log(sigmas / sigmas.min()) / math.log(UNLIKE)).astype(np.intp).clip(0, 63)
+    kind = component * 64 + size  # fixes as unlike as that are of different sources
+    decay = np.exp(-np.abs(t[:, None] - t) / max(law.correlation_s, 1e-3))
+    noise = np.where(kind[:, None] == kind, (1.0 - WHITE) * decay, 0.0) + WHITE * np.eye(len(t))
+    noise *= sigmas[:, None] * sigmas
+    program = Program(rows[:, :free], values, sigmas, inputs, np.concatenate([d, sigma]), U, noise)
+    age = window.t_s[last] - t
+    fixes = _groups(_by_age(age) * 512 + kind) / sigmas[:, None] ** 2
+    fixes /= fixes.sum(axis=0)
+    held = np.arange(n - free)
+    force = np.repeat(_by_age(window.t_s[last] - np.array(window.t_s[first + 1 : last + 1])), 2) * 2
+    force += np.arange(len(force)) % 2
+    alike = _groups(np.concatenate([force, force.max(initial=0) + 1 + held]))
+    grouped = program.grouped(fixes, alike)
+    return Anchored(program, grouped, fixes, alike, last, window.t_s[last], back, law)
 
 
-def _design(window: Window, middle: int, t_ns: int, scale: Scale) -> tuple[Design, Floats]:
-    """Factor the dimensionless rows about the middle of the window; also return the measurements in sigmas.
-
-    An unknown specific force between a fix and t_ns changes the relation of the fix to the state at t_ns. Its
-    effect, at most the disturbance times the integral of the channel's response, is one more error of that
-    fix of unknown correlation, and so adds to its sigma: an old fix counts for less, and the bound remains a
-    bound.
-    """
-    since = (middle - window.t_ns) * (NS * scale.rate)
-    position, _, velocity, _ = scale.units
-    rows = np.empty((len(window), 4))
-    if window.drifting:
-        rows = np.array([_drift(-s)[2 if v else 0] for s, v in zip(since, window.velocity, strict=True)])
-    else:
-        rows[~window.velocity] = schuler_row("gamma", since[~window.velocity])
-        rows[window.velocity] = schuler_row("mu", since[window.velocity])
-    sigma = window.sigma
-    if window.disturbance:
-        age = np.abs(t_ns - window.t_ns) * (NS * scale.rate)
-        swept = (0.5 * age**2, age) if window.drifting else (_swept(age, 0.0), _swept(age, 0.5 * math.pi))
-        of_position = window.disturbance / scale.rate**2 * swept[0]
-        of_velocity = window.disturbance / scale.rate * swept[1]
-        sigma = sigma + np.where(window.velocity, of_velocity, of_position)
-    return Design.of(rows, sigma / np.where(window.velocity, velocity, position)), window.value / sigma
+def _by_age(age_s: Floats) -> npt.NDArray[np.intp]:
+    """Number of the group of each age: groups grow with it."""
+    found = np.log1p(np.maximum(age_s, 0.0) * (GROUP_RATIO / GROUP_S)) / math.log1p(GROUP_RATIO)
+    return np.ceil(found - 1e-9).astype(np.intp)
 
 
-def _drift(alpha: float) -> Floats:
-    """Build the (4, 4) transition over a dimensionless time alpha of gamma on mu alone, mu constant."""
-    ahead = np.zeros((4, 4))
-    ahead[0, 0] = ahead[2, 2] = 1.0
-    ahead[0, 2] = alpha
-    return ahead
-
-
-def _swept(x: Floats, phase: float) -> Floats:
-    """Integrate |sin(u + phase)| from 0 to x."""
-
-    def antiderivative(y: Floats) -> Floats:
-        turns = np.floor(y / math.pi)
-        return 2.0 * turns + 1.0 - np.cos(y - math.pi * turns)
-
-    return antiderivative(x + phase) - antiderivative(np.full_like(x, phase))
-
-
-def _forecast(
-    window: Window, design: Design, whitened: Floats, a: Floats, unit: float, before: Forecast | None
-) -> Forecast:
-    best = design.minimax(a, _rows(window, before.active) if before and before.active else None)
-    ls = design.least_squares(a)
-    used = list(best.active)
-    active = tuple(zip(window.t_ns[used].tolist(), window.velocity[used].tolist(), strict=True))
-    return Forecast(
-        feasible=True,
-        estimate=unit * float((best.weights[used] * design.sigmas[used]) @ whitened[used]),
-        bound=unit * best.bound,
-        gap=best.gap,
-        ls_estimate=unit * float((ls.weights * design.sigmas) @ whitened),
-        ls_claimed=unit * ls.claimed,
-        ls_worst=unit * ls.worst,
-        active=active,
-    )
-
-
-def _rows(window: Window, active: Sequence[Key]) -> list[int]:
-    """Find the rows of the fixes of an earlier solution in the window, or those nearest to them."""
-    rows = []
-    for t_ns, velocity in active:
-        same = np.flatnonzero(window.velocity == velocity)
-        if len(same):
-            rows.append(int(same[np.abs(window.t_ns[same] - t_ns).argmin()]))
-    return rows
+def _groups(number: npt.NDArray[np.intp]) -> Floats:
+    """One 1 in each row: the group of that row, the oldest first within the order of their numbers."""
+    group: Floats = (number[:, None] == np.unique(number)).astype(np.float64)
+    return group

@@ -148,6 +148,50 @@ def schuler_row(quantity: Literal["gamma", "mu"], s: npt.ArrayLike) -> Floats:
     return row
 
 
+def force_response(
+    quantity: str,
+    t_s: npt.ArrayLike,
+    start_s: npt.ArrayLike,
+    end_s: npt.ArrayLike,
+    anchor_s: float,
+    scale: Scale = MEAN_EARTH,
+) -> Floats:
+    """Compute the effect of a unit specific force during a step on a state at another time.
+
+    The state at the anchor is taken as given: a force between a fix and the anchor counts against the fix,
+    one between the anchor and a later time against that time. mu' = -phi + force.
+
+    Parameters
+    ----------
+    quantity : {"gamma", "phi", "mu", "vartheta"}
+        State.
+    t_s : (n,) or (n, 1)
+        Times of the state, s.
+    start_s, end_s : (k,)
+        Steps, s.
+    anchor_s : float
+        Time of the given state, s.
+    scale : Scale
+        Earth radius and Schuler rate.
+
+    Returns
+    -------
+    array
+        Effect in SI (m, rad, m/s, rad/s) of 1 m/s^2; of the shape that the times and steps broadcast to.
+    """
+    t = np.asarray(t_s, dtype=np.float64)
+    early, late = np.minimum(t, anchor_s), np.maximum(t, anchor_s)
+    a = scale.rate * (t - np.clip(np.asarray(start_s, dtype=np.float64), early, late))
+    b = scale.rate * (t - np.clip(np.asarray(end_s, dtype=np.float64), early, late))
+    rate = scale.rate
+    # integral of sin for gamma and phi, of cos for mu; 1 / (radius rate^2) is the unit force's mu'
+    unit = {"gamma": 1.0 / rate**2, "phi": 1.0 / (scale.radius * rate**2), "mu": 1.0 / rate, "vartheta": 0.0}
+    middle, half = 0.5 * (a + b), 0.5 * (a - b)
+    found = 2.0 * np.sin(half) * (np.cos(middle) if quantity == "mu" else np.sin(middle))
+    response: Floats = unit[quantity] * np.where(t >= anchor_s, found, -found)
+    return response
+
+
 def transition(alpha: float) -> Floats:
     """Build the transition matrix over a dimensionless time: (2.1) solved forwards.
 

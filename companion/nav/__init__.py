@@ -4,6 +4,7 @@
     geometry         geodetic, ECEF and local positions, lines of sight, the autopilots' flat earths
     strapdown        integration of inertial measurements, and its inverse
     error_model      error equations of an INS, the paper's and the complete ones
+    bounded_channel  errors of a channel as unknown but bounded, by grade
     disturbances     slow disturbances, stochastic or bounded, that extend the error state
     correctors       measurement rows of airspeed, logs, GNSS, radio navigation, stars
     discretization   continuous system to one step, exact or Euler

@@ -20,7 +20,7 @@ from companion.estimate import bank as banks
 from companion.navigator import minimax_bound
 from companion.navigator.hypotheses import Model
 from companion.navigator.own_channel import OwnChannel
-from companion.navigator.solution import announce, resolve_pending, solve
+from companion.navigator.solution import announce, refresh_bound, resolve_pending, solve
 from companion.navigator.stale_data import REPORT_EVERY, StaleDataDetector
 from companion.navigator.state import FIXES, Settings, State, Step, initial, is_new_fix
 from companion.navigator.step import INPUTS_USED, step, uses
@@ -140,13 +140,19 @@ class Navigator:
         return [Rejection(record.t_ns, record.rx_ns, name, "a value is not finite or beyond 1e8")]
 
     def _resolve(self) -> tuple[Input | None, list[Output]]:
-        """Do the deferred update left by the last record: whose it was, and its outputs."""
-        pending = self._state.pending
-        if pending is None:
-            return None, []
-        state = self._state._replace(pending=None)
-        self._state, outputs = guarded(state, pending.record, self._settings, resolve_pending, pending)
-        return pending.record, outputs
+        """Do the deferred update left by the last record: whose it was, and its outputs.
+
+        The fix is added to the window of the guaranteed bound, and one piece of that bound's work is done.
+        """
+        pending, outputs = self._state.pending, list[Output]()
+        if pending is not None:
+            state = self._state._replace(pending=None)
+            self._state, outputs = guarded(state, pending.record, self._settings, resolve_pending, pending)
+        if self._past and self._state.nominal is not None:
+            record = self._past[-1].record
+            self._state, more = guarded(self._state, record, self._settings, refresh_bound, record)
+            outputs = [*outputs, *more]
+        return pending.record if pending else None, outputs
 
     def _step(self, record: Input) -> list[Output]:
         self._state, outputs = guarded(self._state, record, self._settings, step, record)
@@ -220,9 +226,8 @@ class Navigator:
 
     def _rewound(self, before: State) -> State:
         """An earlier state to fold forward from, keeping the latest forecast of the predictor."""
-        now = self._state
-        promise = before.guarantee._replace(held=now.guarantee.held)
-        return before._replace(guarantee=promise, ahead=now.ahead, next_ahead_ns=now.next_ahead_ns)
+        answers = self._state.guarantee.answers
+        return before._replace(guarantee=before.guarantee._replace(answers=answers))
 
     def _with_mode_events(self, outputs: list[Output]) -> list[Output]:
         """Add an event wherever the mode, or the fixes that the solution rests on, change."""
@@ -254,7 +259,7 @@ def tuned(state: State, before: Settings, config: Config) -> tuple[Settings, Sta
     )
     if same:
         settings = settings._replace(model=before.model)
-        return settings, state._replace(guarantee=minimax_bound.tuned(state.guarantee, config))
+        return settings, state._replace(guarantee=minimax_bound.tuned(state.guarantee))
     return settings, initial(settings)._replace(
         next_ns=state.next_ns, origin=state.origin, sensors=state.sensors, level=state.level
     )
@@ -304,6 +309,8 @@ def _channel_event(record: Input, settings: Settings) -> Event:
         if config.output.feeds_estimator and "local_position" in allowed:
             allowed.remove("local_position")
         text = f"inertial channel: own, by {', '.join(a.replace('_', ' ') for a in allowed)}"
+        if "imu" in allowed:
+            text += "; no guaranteed bound by imu"
     else:
         text = "inertial channel: local position of an INS of its own"
     return Event(record.t_ns, record.rx_ns, Severity.INFO, text)

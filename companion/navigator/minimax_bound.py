@@ -1,213 +1,390 @@
-"""What can be promised of the inertial error when fixes stop: the minimax predictor kept by the navigator.
+"""Guaranteed bound of the position that is sent, kept by the navigator beside its bank of hypotheses.
 
-Corrections (INS minus radio fix) are averaged over short bins and pushed into one window a channel, north and
-east. The mean of a bin has at most the weighted mean of its sigmas, whatever the correlation, so binning
-costs the guarantee nothing and takes the white part of the noise away. A forecast is made once a second; in
-between the position moves with the forecast velocity, and the bound by the velocity's bound (the triangle
-inequality).
+Radio-only corrections (nominal minus fix) are averaged over short bins into a window along the transition of
+the channel's error model. From it the restricted Bayes estimate is computed, linear in the fixes, whose
+worst r.m.s. error over every correlation of their errors and of the unknown force is known, and at most 1.2
+times the least that any estimate could promise. The bank's estimate is no linear function of the fixes, so
+what is sent has the bound of the linear estimate and the distance to it (the triangle inequality); both are
+of one model, and the distance is small beside the bound.
+
+All of it runs after the solution is out, one small piece after each record: the window is extended, or one
+target is solved. In between the error moves with the velocity of the linear estimate, and the bound grows by
+the velocity's bound. Where the residuals of the window contradict what is stated, all bounds are wider by
+their ratio, and an event reports it.
+
+An INS has the errors of its unit (`nav.bounded_channel`). Dead reckoning by airspeed and a foreign velocity
+have a velocity error that wanders and jumps. Strapdown with the autopilot's attitude has no bound: nothing
+bounds the error of that attitude in a turn.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
-from companion.config import Config, PredictorConfig
-from companion.estimate.predictor import MEASURED, Forecast, Quantity, Window, predict, predict_ahead
-from companion.estimate.predictor import Prediction as Channel
-from companion.records import Prediction, Vector2
-from companion.units import G0
+from companion.config import Config
+from companion.estimate.minimax_lp import Infeasible
+from companion.estimate.predictor import Anchored, Estimate, Solved, Start, Step, Window, anchor
+from companion.nav.bounded_channel import BoundedDrift, BoundedIns, Motion, UnitErrors
+from companion.navigator.channel import Nominal
+from companion.navigator.inertial_track import Point
+from companion.records import Bounds, Event, Output, Prediction, Severity, Vector2
+from companion.units import G0, SECOND_NS, Floats
 
-REFRESH_NS = 1_000_000_000
-HOPELESS_M = 1e6  # a bound beyond this is as good as none: the window is too short for so far ahead
+CHUNK_S = 1.0  # the transition is extended so often: a turn of 4 degrees
+SILENT_S = 60.0  # after a longer silence of the channel a new window begins
+STRAIGHT_S = 30.0  # steps ahead, straight on
 UNLIKE = 2.0  # a fix this many times better or worse than its bin begins a new one
+PIECE_NS = SECOND_NS // 10  # at most one piece of work so often
+NOW_NS, SELDOM_NS = SECOND_NS, 10 * SECOND_NS
+HOPELESS_M = 1e6  # a bound beyond this is as good as none: the window is too short for so far ahead
+POSITION, VELOCITY, TILT, DRIFT = (0, 1), (2, 3), (4, 5), (7, 8)  # states
+
+Channel = BoundedIns | BoundedDrift
 
 
 class Bin(NamedTuple):
-    """Weighted sums over the fixes of one bin: weight, time from start (s), value and sigma of each axis."""
+    """Weighted sums over the fixes of one bin, rows on the state at the last node."""
 
-    quantity: Quantity
     start_ns: int
     scale: float
     weight: float
-    time: float
+    time_s: float
+    rows: Floats
     value: Vector2
     sigma: Vector2
 
 
-class Bounded(NamedTuple):
-    """The INS error now, by minimax: position and velocity, their guaranteed r.m.s. bounds (m, m/s)."""
+class Reach(NamedTuple):
+    """Transition since the last node of the window, at the point `at`."""
+
+    at: Point
+    node_ns: int
+    Phi: Floats
+    B: Floats
+    Q: Floats
+
+
+class Task(NamedTuple):
+    """Target of the predictor: one state now, or `ahead_s` later."""
+
+    state: int
+    ahead_s: float
+    every_ns: int
+
+
+class Answer(NamedTuple):
+    """Solution of a task for `t_ns`, None where the fixes do not determine it; and the state it is of."""
+
+    t_ns: int
+    state: int
+    solved: Solved | None
+
+
+class Guarantee(NamedTuple):
+    """Window of one channel, what is not yet in it, and the last answers."""
+
+    by: str = ""  # what moves the nominal trajectory
+    window: Window | None = None
+    reach: Reach | None = None
+    bins: tuple[Bin, ...] = ()
+    anchored: Anchored | None = None
+    widening: float = 1.0
+    answers: tuple[Answer | None, ...] = ()
+    worked_ns: int = 0
+
+
+class Linear(NamedTuple):
+    """Error of the channel now by one linear estimate: m, m/s, their r.m.s. expected and guaranteed."""
 
     error_n: Vector2
     velocity_error_n: Vector2
+    expected_n: Vector2
+    velocity_expected_n: Vector2
     bound_n: Vector2
     velocity_bound_n: Vector2
 
 
-class Guarantee(NamedTuple):
-    """Windows of both channels, the bins not yet full, and the last forecast."""
+class Guaranteed(NamedTuple):
+    """Estimates of the channel's error now, and the bounds of all quantities of the first."""
 
-    north: Window
-    east: Window
-    bins: tuple[Bin, ...] = ()
-    held: tuple[Channel, Channel] | None = None
-
-
-def begin(config: Config) -> Guarantee:
-    """Start without fixes. The error of dead reckoning drifts with a wind of bounded rate of change, that
-    of strapdown with an unknown acceleration.
-    """
-    span = 60.0 * config.predictor.window_min
-    if config.has_own_ins:
-        window = Window(span, disturbance=config.predictor.disturbance_ug * 1e-6 * G0)
-    elif config.inertial.source == "imu":
-        strapdown = config.strapdown
-        acceleration = math.hypot(G0 * math.radians(strapdown.tilt_deg), strapdown.accelerometer_m_s2)
-        window = Window(span, disturbance=acceleration, drifting=True)
-    else:
-        window = Window(span, disturbance=config.air_data.wind_rate_m_s_min / 60.0, drifting=True)
-    return Guarantee(window, window)
+    restricted: Linear
+    minimax: Linear
+    bounds: Bounds
 
 
-def tuned(g: Guarantee, config: Config) -> Guarantee:
-    """Return the same windows of fixes under other settings."""
-    fresh = begin(config).north
-    north, east = (replace(w, span=fresh.span, disturbance=fresh.disturbance) for w in (g.north, g.east))
-    return Guarantee(north, east, g.bins)
+def law(config: Config, by: str, v_n: tuple[float, ...] = (0.0, 0.0)) -> Channel | None:
+    """Return the error model of what moves the nominal trajectory at `v_n`; None where it has no bound."""
+    correlation_s = config.gnss.correlation_s
+    if by == "ins":
+        unit = config.inertial
+        bias = 1e-6 * G0 * unit.accelerometer_bias_ug
+        errors = UnitErrors(
+            gyro=math.radians(unit.gyro_drift_deg_h) / 3600.0,
+            gyro_s=3600.0 * unit.gyro_correlation_h,
+            tilt_walk=math.radians(unit.angle_random_walk_deg_sqrt_h) / 60.0,
+            accelerometer=bias,
+            accelerometer_s=3600.0 * unit.accelerometer_correlation_h,
+            velocity_walk=unit.velocity_noise_m_s_sqrt_s,
+            velocity=unit.velocity_m_s,
+            tilt=math.hypot(math.radians(unit.tilt_arcsec / 3600.0), bias / G0),  # levelled by them
+            heading=math.radians(unit.heading_arcmin / 60.0),
+            gyro_scale=1e-6 * unit.gyro_scale_ppm,
+            accelerometer_scale=1e-6 * unit.accelerometer_scale_ppm,
+        )
+        return BoundedIns(errors, correlation_s, unit.strapped_down)
+    air = config.air_data
+    jumps = air.wind_jump_m_s * math.sqrt(air.wind_jumps_per_hour / 3600.0)
+    walk = math.hypot(air.wind_change_m_s_sqrt_s, jumps)
+    if by == "air":
+        scale, heading = 0.01 * air.airspeed_percent, math.radians(air.heading_deg)
+        crab = math.radians(air.crab_deg) * math.hypot(*v_n[:2])
+        return BoundedDrift(air.wind_m_s, walk, scale, heading, crab, air.crab_s, correlation_s)
+    return BoundedDrift(air.wind_m_s, walk, correlation_s=correlation_s) if by == "foreign" else None
 
 
-def add_fix(
-    g: Guarantee, t_ns: int, quantity: Quantity, value: Vector2, sigma: Vector2, settings: PredictorConfig
-) -> Guarantee:
-    """With one more correction `value` of INS position (m) or velocity (m/s), north and east."""
-    scale = sigma[0] + sigma[1]
+def tasks(config: Config, channel: Channel) -> tuple[Task, ...]:
+    """Return all targets: position and velocity now, tilt and drift of an INS, position ahead."""
+    now = [Task(state, 0.0, NOW_NS) for state in (*POSITION, *VELOCITY)]
+    if isinstance(channel, BoundedIns):
+        now += [Task(state, 0.0, SELDOM_NS) for state in (*TILT, *DRIFT)]
+    ahead = [Task(k, 60.0 * m, SELDOM_NS) for m in config.predictor.ahead_min for k in POSITION]
+    return (*now, *ahead)
+
+
+# ---------------------------------------------------------------------------------------------------------
+# Fixes
+# ---------------------------------------------------------------------------------------------------------
+
+
+def follow(g: Guarantee, nominal: Nominal, config: Config) -> Guarantee:
+    """Extend the transition to the nominal point, and the window when a bin is over."""
+    by = "ins" if nominal.interval is None else nominal.interval.by
+    point, reach = nominal.point, g.reach
+    if by == g.by and (reach is None or 0.0 <= (point.t_ns - reach.at.t_ns) * 1e-9 < CHUNK_S):
+        return g
+    channel = law(config, by, point.v_n)
+    if channel is None:
+        return Guarantee(by)
+    seconds = 0.0 if reach is None else (point.t_ns - reach.at.t_ns) * 1e-9
+    if by != g.by or reach is None or not 0.0 <= seconds <= SILENT_S:
+        window = Window.begin(point.t_ns * 1e-9, channel)
+        return Guarantee(by, window, _reach(point, channel.n))
+    Phi, B, Q = channel.step(Motion(point.position.lat, reach.at.v_n[:2], point.v_n[:2], seconds))
+    reach = Reach(point, reach.node_ns, Phi @ reach.Phi, Phi @ reach.B + B, Phi @ reach.Q @ Phi.T + Q)
+    g = g._replace(reach=reach)
+    bin_ns = round(1e9 * config.predictor.bin_s)
+    return _closed(g, config) if point.t_ns - reach.node_ns >= bin_ns or _returned(g, bin_ns) else g
+
+
+def _reach(point: Point, n: int) -> Reach:
+    return Reach(point, point.t_ns, np.eye(n), np.zeros((n, 2)), np.zeros((n, n)))
+
+
+def _returned(g: Guarantee, bin_ns: int) -> bool:
+    """Whether a first second of fixes after a time without waits in the bins."""
+    if g.window is None or g.reach is None or not g.bins or not g.window.fixes:
+        return False
+    silent_s = g.bins[0].start_ns * 1e-9 - g.window.fixes[-1].t_s
+    return silent_s > 2e-9 * bin_ns and g.reach.at.t_ns - g.bins[0].start_ns >= SECOND_NS
+
+
+def _closed(g: Guarantee, config: Config) -> Guarantee:
+    """With a node at the point reached, and the fixes of the open bins in the window."""
+    assert g.reach is not None
+    assert g.window is not None
+    reach, C = g.reach, g.window.C[-1]
+    window = g.window.extend(reach.at.t_ns * 1e-9, reach.Phi, reach.B, reach.Q)
+    for full in g.bins:
+        w = full.weight
+        window = window.with_fix(
+            full.start_ns * 1e-9 + full.time_s / w,
+            full.rows @ C / w,
+            np.array(full.value) / w,
+            np.array(full.sigma) / w,
+            60.0 * config.predictor.window_min,
+        )
+    anchored = None if g.bins else g.anchored
+    return g._replace(window=window, reach=_reach(reach.at, len(C)), bins=(), anchored=anchored)
+
+
+def add_fix(g: Guarantee, t_ns: int, value: Vector2, sigma: Vector2) -> Guarantee:
+    """Add a correction `value` of the position, north and east (m), of r.m.s. error `sigma`."""
+    if g.reach is None:
+        return g
+    reach, scale = g.reach, sigma[0] + sigma[1]
     weight = 1.0 / scale**2
-    mine = next((b for b in g.bins if b.quantity == quantity), None)
-    others = tuple(b for b in g.bins if b.quantity != quantity)
-    if mine is not None:
-        full = (t_ns - mine.start_ns) * 1e-9 >= settings.bin_s
-        if full or not 1.0 / UNLIKE < scale / mine.scale < UNLIKE:
-            g = _close(g)
-            mine, others = None, ()
-    if mine is None:
-        mine = Bin(quantity, t_ns, scale, 0.0, 0.0, (0.0, 0.0), (0.0, 0.0))
-    mine = mine._replace(
+    alike = [b for b in g.bins if 1.0 / UNLIKE < scale / b.scale < UNLIKE]
+    if alike:
+        mine = alike[0]
+    else:
+        mine = Bin(t_ns, scale, 0.0, 0.0, np.zeros((2, len(reach.Phi))), (0.0, 0.0), (0.0, 0.0))
+    rows = reach.Phi[:2] + (t_ns - reach.at.t_ns) * 1e-9 * reach.Phi[2:4]
+    new = mine._replace(
         weight=mine.weight + weight,
-        time=mine.time + weight * (t_ns - mine.start_ns) * 1e-9,
+        time_s=mine.time_s + weight * (t_ns - mine.start_ns) * 1e-9,
+        rows=mine.rows + weight * rows,
         value=(mine.value[0] + weight * value[0], mine.value[1] + weight * value[1]),
         sigma=(mine.sigma[0] + weight * sigma[0], mine.sigma[1] + weight * sigma[1]),
     )
-    return g._replace(bins=(*others, mine))
+    return g._replace(bins=(*(b for b in g.bins if b is not mine), new))
 
 
-def bounded(g: Guarantee, t_ns: int, settings: PredictorConfig) -> tuple[Guarantee, Bounded | None]:
-    """The INS error at `t_ns`; None where the fixes do not determine it (too few, too short)."""
-    held = g.held
-    if held is None or t_ns - held[0].t_ns >= REFRESH_NS or t_ns < held[0].t_ns:
-        now = _halves(g, t_ns, settings)
-        held = (
-            predict(now.north, t_ns, start=held[0] if held else None),
-            predict(now.east, t_ns, start=held[1] if held else None),
-        )
-        g = g._replace(held=held)
-    if not (held[0].feasible and held[1].feasible) or max(_bound(held[0]), _bound(held[1])) > HOPELESS_M:
-        return g, None
-    dt = (t_ns - held[0].t_ns) * 1e-9
-    north, east = _moved(held[0], dt), _moved(held[1], dt)
-    error, velocity, bound, velocity_bound = zip(north, east, strict=True)
-    return g, Bounded(error, velocity, bound, velocity_bound)
+def shift(g: Guarantee, north: float, east: float, v_n: Vector2 = (0.0, 0.0)) -> Guarantee:
+    """Move all errors measured with a jump of the nominal trajectory, m.
+
+    A jump of its velocity (m/s) begins a new window: no bound is stated of the sum of such jumps.
+    """
+    if g.window is None or any(v_n):
+        return Guarantee()
+    bins = tuple(
+        b._replace(value=(b.value[0] + b.weight * north, b.value[1] + b.weight * east)) for b in g.bins
+    )
+    window = g.window.shift(np.array((north, east)))
+    answers = tuple(_shifted(a, (north, east)) for a in g.answers)
+    return g._replace(window=window, bins=bins, anchored=None, answers=answers)
 
 
-def ahead(g: Guarantee, t_ns: int, settings: PredictorConfig) -> tuple[Prediction, ...]:
-    """Bounds for the minutes ahead of `t_ns` that are asked for, empty where there are none."""
-    minutes = settings.ahead_min
-    times = [t_ns + round(60e9 * m) for m in minutes]
-    now = _halves(g, t_ns, settings)
-    found = [
-        [p.position for p in predict_ahead(window, times, ("position",))] for window in (now.north, now.east)
+def _shifted(answer: Answer | None, offset: Vector2) -> Answer | None:
+    if answer is None or answer.solved is None or answer.state not in POSITION:
+        return answer
+    s, by = answer.solved, offset[answer.state]
+    kalman, minimax, restricted = (
+        e._replace(value=e.value + by) for e in (s.kalman, s.minimax, s.restricted)
+    )
+    return answer._replace(solved=s._replace(kalman=kalman, minimax=minimax, restricted=restricted))
+
+
+def tuned(g: Guarantee) -> Guarantee:
+    """Keep the window under other settings, and answer anew."""
+    return g._replace(anchored=None, answers=())
+
+
+# ---------------------------------------------------------------------------------------------------------
+# Answers
+# ---------------------------------------------------------------------------------------------------------
+
+
+def refresh(g: Guarantee, nominal: Nominal, rx_ns: int, config: Config) -> tuple[Guarantee, list[Output]]:
+    """Do the piece of work that is most overdue: make the program of the window, or solve one target."""
+    window, t_ns = g.window, nominal.t_ns
+    if window is None or g.reach is None or not window.fixes or abs(t_ns - g.worked_ns) < PIECE_NS:
+        return g, []
+    channel, g = law(config, g.by, nominal.point.v_n), g._replace(worked_ns=t_ns)
+    if channel is None:
+        return g, []
+    if g.anchored is None:
+        anchored = anchor(window, channel)
+        widening = anchored.grouped.widening
+        out: list[Output] = []
+        if (widening > 1.0) != (g.widening > 1.0):
+            out = [Event(t_ns, rx_ns, Severity.NOTICE, _contradiction(widening))]
+        return g._replace(anchored=anchored, widening=widening), out
+    todo = tasks(config, channel)
+    answers = g.answers if len(g.answers) == len(todo) else (None,) * len(todo)
+    late = [
+        math.inf if a is None else (t_ns - a.t_ns) / task.every_ns
+        for task, a in zip(todo, answers, strict=True)
     ]
-    return tuple(
-        Prediction(60.0 * m, (n.bound, e.bound), (n.ls_claimed, e.ls_claimed), (n.ls_worst, e.ls_worst))
-        for m, n, e in zip(minutes, *found, strict=True)
-        if n is not None and e is not None and max(n.bound, e.bound) < HOPELESS_M
+    k = max(range(len(todo)), key=late.__getitem__)
+    if late[k] < 1.0:
+        return g, []
+    before = answers[k]
+    start = before.solved.start if before is not None and before.solved is not None else None
+    answer = Answer(t_ns, todo[k].state, _solved(g, todo[k], channel, start))
+    return g._replace(answers=(*answers[:k], answer, *answers[k + 1 :])), []
+
+
+def _contradiction(widening: float) -> str:
+    if widening > 1.0:
+        return (
+            f"fixes of the window contradict the stated errors: guaranteed bound {widening:.1f} times wider"
+        )
+    return "fixes of the window agree with the stated errors again"
+
+
+def _solved(g: Guarantee, task: Task, channel: Channel, start: Start | None) -> Solved | None:
+    assert g.anchored is not None
+    assert g.reach is not None
+    assert g.window is not None
+    steps = []
+    if g.reach.at.t_ns > g.reach.node_ns:
+        steps.append(Step((g.reach.at.t_ns - g.reach.node_ns) * 1e-9, g.reach.Phi, g.reach.B))
+    count = math.ceil(task.ahead_s / STRAIGHT_S)
+    if count:
+        point, dt = g.reach.at, task.ahead_s / count
+        Phi, B, _ = channel.step(Motion(point.position.lat, point.v_n[:2], point.v_n[:2], dt))
+        steps += [Step(dt, Phi, B)] * count
+    try:
+        return g.anchored.solve(g.anchored.targets(g.window, (task.state,), steps)[0], start)
+    except Infeasible:
+        return None
+
+
+def guaranteed(g: Guarantee, t_ns: int) -> Guaranteed | None:
+    """Return the estimates of the channel's error at `t_ns` with their bounds; None where there are none."""
+    found = [None if a is None or a.solved is None else (a.t_ns, a.solved) for a in g.answers]
+    now = [one for one in found[:4] if one is not None]
+    if len(now) < 4 or max(s.restricted.bound for _, s in now[:2]) * g.widening > HOPELESS_M:
+        return None
+    restricted = _linear([(at, s.restricted) for at, s in now], t_ns, g.widening)
+    minimax = _linear([(at, s.minimax) for at, s in now], t_ns, g.widening)
+    later: list[Vector2 | None] = [None, None]
+    if g.by == "ins":
+        for k, first in enumerate((4, 6)):
+            pair = [one for one in found[first : first + 2] if one is not None]
+            if len(pair) == 2:
+                north, east = (g.widening * s.restricted.bound for _, s in pair)
+                later[k] = (north, east)
+    bounds = Bounds(
+        optimum_n=minimax.bound_n,
+        gap=max(s.gap for _, s in now[:2]),
+        widening=g.widening,
+        tilt_n=later[0],
+        drift_n=later[1],
     )
+    return Guaranteed(restricted, minimax, bounds)
 
 
-def shift(g: Guarantee, north: float, east: float, v_n: Vector2 = (0.0, 0.0), t_ns: int = 0) -> Guarantee:
-    """After the channel jumped by (north, east) m, so did every position error ever measured against it; with
-    `v_n` (m/s) it is as if it had always moved so much faster, the jump being that at `t_ns`.
-    """
-
-    def moved(b: Bin) -> Bin:
-        n, e = v_n
-        if b.quantity == "velocity":
-            return b._replace(value=(b.value[0] + b.weight * n, b.value[1] + b.weight * e))
-        since = b.time + b.weight * (b.start_ns - t_ns) * 1e-9
-        value = b.value[0] + b.weight * north + n * since, b.value[1] + b.weight * east + e * since
-        return b._replace(value=value)
-
-    window_n, window_e = _shifted(g.north, north, v_n[0], t_ns), _shifted(g.east, east, v_n[1], t_ns)
-    return Guarantee(window_n, window_e, tuple(moved(b) for b in g.bins))
-
-
-def forget(g: Guarantee, since_ns: int) -> Guarantee:
-    """Drop the fixes after `since_ns`: their source was false."""
-    return Guarantee(_until(g.north, since_ns), _until(g.east, since_ns))
+def _linear(found: list[tuple[int, Estimate]], t_ns: int, widening: float) -> Linear:
+    """Carry position and velocity (north, east of each) on to `t_ns`."""
+    axes = []
+    for (at, position), (_, velocity) in zip(found[:2], found[2:], strict=True):
+        dt = (t_ns - at) * 1e-9
+        grown = widening * (position.bound + abs(dt) * velocity.bound)
+        axes.append(
+            (
+                position.value + dt * velocity.value,
+                velocity.value,
+                position.expected + abs(dt) * velocity.expected,
+                velocity.expected,
+                grown,
+                widening * velocity.bound,
+            )
+        )
+    return Linear(*zip(*axes, strict=True))
 
 
-def _close(g: Guarantee) -> Guarantee:
-    """All bins pushed, oldest first: a window takes its fixes in the order of time, one of a kind at a time.
-
-    Two fixes of one instant, too unlike for one bin, stand a nanosecond apart.
-    """
-    north, east = g.north, g.east
-    for t_ns, full in sorted((b.start_ns + round(1e9 * b.time / b.weight), b) for b in g.bins):
-        w, t_ns = full.weight, max(t_ns, _free_ns(north, full.quantity))
-        north = north.push(t_ns, full.quantity, full.value[0] / w, full.sigma[0] / w)
-        east = east.push(t_ns, full.quantity, full.value[1] / w, full.sigma[1] / w)
-    return Guarantee(north, east, (), g.held)
-
-
-def _free_ns(window: Window, quantity: Quantity) -> int:
-    """From when on the window takes another fix of this quantity."""
-    same = window.t_ns[window.velocity == MEASURED[quantity]]
-    return max(int(window.t_ns[-1]), int(same[-1]) + 1 if len(same) else 0) if len(window) else 0
-
-
-def _halves(g: Guarantee, t_ns: int, settings: PredictorConfig) -> Guarantee:
-    """With the open bins once half full: fewer fixes would lend the estimate all their noise."""
-    if all((t_ns - b.start_ns) * 1e-9 >= 0.5 * settings.bin_s for b in g.bins):
-        return _close(g)
-    return g
-
-
-def _bound(channel: Channel) -> float:
-    return channel.position.bound if channel.position else math.inf
-
-
-def _moved(channel: Channel, dt: float) -> tuple[float, float, float, float]:
-    position, velocity = channel.position, channel.velocity
-    assert isinstance(position, Forecast)
-    assert isinstance(velocity, Forecast)
-    return (
-        position.estimate + velocity.estimate * dt,
-        velocity.estimate,
-        position.bound + velocity.bound * dt,
-        velocity.bound,
-    )
-
-
-def _until(window: Window, t_ns: int) -> Window:
-    kept = int(window.t_ns.searchsorted(t_ns, "right"))
-    columns = {name: getattr(window, name)[:kept] for name in ("t_ns", "velocity", "value", "sigma")}
-    return replace(window, **columns)
-
-
-def _shifted(window: Window, offset: float, rate: float, t_ns: int) -> Window:
-    positions = window.value + offset + rate * (window.t_ns - t_ns) * 1e-9
-    value = np.where(window.velocity, window.value + rate, positions)
-    value.setflags(write=False)
-    return replace(window, value=value)
+def ahead(g: Guarantee, config: Config) -> tuple[Prediction, ...]:
+    """Return the predictions for the minutes ahead that are asked for, as far as they are known."""
+    minutes = config.predictor.ahead_min
+    found = g.answers[len(g.answers) - 2 * len(minutes) :]
+    predictions = []
+    for m, north, east in zip(minutes, found[::2], found[1::2], strict=False):
+        solved = [a.solved for a in (north, east) if a is not None and a.solved is not None]
+        if len(solved) < 2:
+            continue
+        n, e = solved
+        wide = g.widening
+        if max(n.restricted.bound, e.restricted.bound) * wide < HOPELESS_M:
+            predictions.append(
+                Prediction(
+                    60.0 * m,
+                    (wide * n.restricted.bound, wide * e.restricted.bound),
+                    (n.restricted.expected, e.restricted.expected),
+                    (wide * n.minimax.bound, wide * e.minimax.bound),
+                )
+            )
+    return tuple(predictions)

@@ -1,7 +1,7 @@
 """Corrected estimate: the nominal trajectory less its error, by the estimator that leads, with its trust.
 
 The bank's leading family always leads, unless `estimator.output` names another estimator for the time without
-fixes. The minimax predictor runs beside it; its guaranteed radius is stated about the position that is sent.
+fixes. The guaranteed bound runs beside it, and is stated about the position that is sent.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from companion.estimate.fusion import Height, NoFix, maximum_likelihood
 from companion.nav.geometry import displace
 from companion.navigator import fix_observations, height_error, minimax_bound, restrictive_filter, trust
 from companion.navigator.hypotheses import GNSS
-from companion.navigator.minimax_bound import Bounded
+from companion.navigator.minimax_bound import Guaranteed, Linear
 from companion.navigator.own_channel import OwnChannel
 from companion.navigator.state import (
     EXCLUDED,
@@ -32,12 +32,11 @@ from companion.navigator.state import (
     source_name,
     sources,
 )
-from companion.records import Event, Fix, Gnss, Mode, Severity, Solution, Source, Vector2, Vector3
+from companion.records import Event, Fix, Gnss, Input, Mode, Severity, Solution, Source, Vector2, Vector3
 from companion.units import SECOND_NS, Floats
 
 UNCONFIRMED = 0.99  # greatest probability stated of a source that is not excluded
 PROTECTION_NS = SECOND_NS  # how often the protection level is computed
-AHEAD_NS = 5 * SECOND_NS  # how often the bounds ahead are computed
 TOGETHER_NS = SECOND_NS  # a fix of GNSS this near joins a beacon's answer
 
 
@@ -58,15 +57,12 @@ def solve(state: State, rx_ns: int, settings: Settings) -> Step:
     config, known = settings.config, hypotheses(state, settings)
     point = levelled(nominal.point, state)
     t_ns = point.t_ns
-    promise, bounded = minimax_bound.bounded(state.guarantee, t_ns, config.predictor)
-    if t_ns >= state.next_ahead_ns:
-        bounds = minimax_bound.ahead(promise, t_ns, config.predictor)
-        state = state._replace(ahead=bounds, next_ahead_ns=t_ns + AHEAD_NS)
+    promised = minimax_bound.guaranteed(state.guarantee, t_ns)
     rests_on = sources(state, t_ns, settings)
     fixes = rests_on & FIXES
     leading = estimate(state)
     state = state._replace(leading=(bank, leading))
-    candidates = _candidates(state, leading.x, leading.P, nominal.pending_s, bounded, settings)
+    candidates = _candidates(state, leading.x, leading.P, nominal.pending_s, promised, settings)
     leads = config.leading_estimator
     if (rests_on & Source.GNSS if leads == "restrictive" else fixes) or leads not in candidates:
         leads = "kalman"
@@ -80,7 +76,7 @@ def solve(state: State, rx_ns: int, settings: Settings) -> Step:
     assert state.protection is not None
     # in between the estimate moves: by the triangle inequality the level holds about its new place
     protection = state.protection[1] + math.dist(error, state.protection[2:])
-    bound_n, velocity_bound_n = _about(error, velocity_error, bounded)
+    bound_n, velocity_bound_n = _about(error, velocity_error, promised)
     witness = bool(rests_on & (Source.AZIMUTH | Source.RANGE))
     suspicion = any(state.reported)
     held = _trust(state, bool(fixes), suspicion, bound_n, protection, t_ns, settings)
@@ -112,19 +108,20 @@ def solve(state: State, rx_ns: int, settings: Settings) -> Step:
         velocity_bound_n=velocity_bound_n,
         disagreement=_disagreement(candidates),
         inertial_age_s=max(0.0, (rx_ns - t_ns) * 1e-9),
-        ahead=state.ahead,
+        ahead=minimax_bound.ahead(state.guarantee, config),
         sigma_velocity=math.hypot(math.sqrt(velocity_variance), settings.model.channel.velocity_noise),
         protection=protection,
         trust=held.trust,
         gnss_false=_gnss_false(state),
         witness=witness,
         false_sources=false_sources,
+        bounds=promised.bounds if promised else None,
     )
-    return state._replace(guarantee=promise, held=held), [solution]
+    return state._replace(held=held), [solution]
 
 
 def _candidates(
-    state: State, x: Floats, P: Floats, dt: float, bounded: Bounded | None, settings: Settings
+    state: State, x: Floats, P: Floats, dt: float, promised: Guaranteed | None, settings: Settings
 ) -> dict[str, _Estimate]:
     """Error of the channel by each estimator that runs; the bank is `dt` seconds older than the nominal."""
     n, e, vn, ve = x[:4].tolist()
@@ -137,10 +134,10 @@ def _candidates(
     )
     variance = max(vnn, vee, 0.0) + _velocity_growth(state, dt, settings)
     found = {"kalman": _Estimate((n + dt * vn, e + dt * ve), (vn, ve), place, variance)}
-    if bounded is not None:
-        variances = (bounded.bound_n[0] ** 2, 0.0, bounded.bound_n[1] ** 2)
-        variance = max(bounded.velocity_bound_n) ** 2
-        found["minimax"] = _Estimate(bounded.error_n, bounded.velocity_error_n, variances, variance)
+    if promised is not None:
+        best, restricted = promised.minimax, promised.restricted
+        found["minimax"] = _linear(best, best.bound_n, best.velocity_bound_n)
+        found["restricted"] = _linear(restricted, restricted.expected_n, restricted.velocity_expected_n)
     if state.restrictive is not None and state.nominal is not None:
         x4, P4 = restrictive_filter.at(state.restrictive, state.nominal.t_ns, settings.config.air_data)
         dx, dy, dv_n, dv_e = x4.tolist()
@@ -148,6 +145,11 @@ def _candidates(
         variance = float(max(P4[2, 2], P4[3, 3], 0.0))
         found["restrictive"] = _Estimate((dx, dy), (dv_n, dv_e), (var_n, cov, var_e), variance)
     return found
+
+
+def _linear(found: Linear, sigma_n: Vector2, velocity_sigma_n: Vector2) -> _Estimate:
+    variances = (sigma_n[0] ** 2, 0.0, sigma_n[1] ** 2)
+    return _Estimate(found.error_n, found.velocity_error_n, variances, max(velocity_sigma_n) ** 2)
 
 
 def _velocity_growth(state: State, dt: float, settings: Settings) -> float:
@@ -167,18 +169,19 @@ def _velocity_growth(state: State, dt: float, settings: Settings) -> float:
 
 
 def _about(
-    error: Vector2, velocity_error: Vector2, bounded: Bounded | None
+    error: Vector2, velocity_error: Vector2, promised: Guaranteed | None
 ) -> tuple[Vector2 | None, Vector2 | None]:
-    """Guaranteed r.m.s. bounds about what is sent: those of the minimax estimate and the distance to it."""
-    if bounded is None:
+    """Guaranteed r.m.s. bounds about what is sent: those of the linear estimate and the distance to it."""
+    if promised is None:
         return None, None
+    linear = promised.restricted
 
     def added(bound: Vector2, ours: Vector2, its: Vector2) -> Vector2:
         return bound[0] + abs(ours[0] - its[0]), bound[1] + abs(ours[1] - its[1])
 
     return (
-        added(bounded.bound_n, error, bounded.error_n),
-        added(bounded.velocity_bound_n, velocity_error, bounded.velocity_error_n),
+        added(linear.bound_n, error, linear.error_n),
+        added(linear.velocity_bound_n, velocity_error, linear.velocity_error_n),
     )
 
 
@@ -237,7 +240,7 @@ def announce(solution: Solution) -> Event:
 
 
 def resolve_pending(state: State, pending: Pending, settings: Settings) -> Step:
-    """Deferred update: make the radio-only fix after the solution is out, for the guaranteed predictor."""
+    """Deferred update: make the radio-only fix after the solution is out, for the guaranteed bound."""
     config, record, point = settings.config, pending.record, pending.point
     used = pending.used
     observations: tuple[object, ...]
@@ -263,7 +266,7 @@ def resolve_pending(state: State, pending: Pending, settings: Settings) -> Step:
     correction = (pending.centre[0] - north, pending.centre[1] - east)
     (var_e, cov), var_n = fix.covariance[0, :2].tolist(), float(fix.covariance[1, 1])
     sigma = (math.sqrt(var_n), math.sqrt(var_e))
-    g = minimax_bound.add_fix(state.guarantee, record.t_ns, "position", correction, sigma, config.predictor)
+    g = minimax_bound.add_fix(state.guarantee, record.t_ns, correction, sigma)
     lat, lon, alt = displace(*point.position, north, east, -up)
     out = Fix(
         t_ns=record.t_ns,
@@ -279,6 +282,16 @@ def resolve_pending(state: State, pending: Pending, settings: Settings) -> Step:
         iterations=fix.iterations,
     )
     return _restrict(state._replace(guarantee=g), out, used, settings), [out]
+
+
+def refresh_bound(state: State, record: Input, settings: Settings) -> Step:
+    """Deferred update: extend the window of the guaranteed bound, and do one piece of its work."""
+    nominal = state.nominal
+    if nominal is None or not state.fixed:
+        return state, []
+    g = minimax_bound.follow(state.guarantee, nominal, settings.config)
+    g, out = minimax_bound.refresh(g, nominal, record.rx_ns, settings.config)
+    return (state if g is state.guarantee else state._replace(guarantee=g)), out
 
 
 def _restrict(state: State, fix: Fix, used: Source, settings: Settings) -> State:

@@ -8,7 +8,7 @@ from companion.config import Config
 from companion.estimate import bank as banks
 from companion.estimate.bank import Bank, Estimate
 from companion.nav.geometry import Geodetic, displace
-from companion.navigator import height_error, minimax_bound
+from companion.navigator import height_error
 from companion.navigator.channel import Nominal
 from companion.navigator.height_error import Level
 from companion.navigator.hypotheses import Hypotheses, Model
@@ -17,7 +17,7 @@ from companion.navigator.minimax_bound import Guarantee
 from companion.navigator.own_channel import Sensors
 from companion.navigator.restrictive_filter import Restrictive
 from companion.navigator.trust import Held
-from companion.records import Gnss, LocalOrigin, LocalPosition, Output, Prediction, RsbnFix, Source, Vector2
+from companion.records import Gnss, LocalOrigin, LocalPosition, Output, RsbnFix, Source, Vector2
 from companion.units import SECOND_NS
 
 FIXES = Source.GNSS | Source.AZIMUTH | Source.RANGE
@@ -58,7 +58,7 @@ class Pending(NamedTuple):
 class State(NamedTuple):
     """All that the navigator remembers."""
 
-    guarantee: Guarantee
+    guarantee: Guarantee = Guarantee()
     origin: LocalOrigin | None = None
     local: LocalPosition | None = None
     waiting_ns: int | None = None  # since when a channel cannot begin
@@ -85,8 +85,6 @@ class State(NamedTuple):
     rsbn_used: Source = Source(0)  # which of azimuth and range were, then
     held: Held | None = None
     next_ns: int = 0
-    next_ahead_ns: int = 0
-    ahead: tuple[Prediction, ...] = ()
 
 
 Step = tuple[State, list[Output]]
@@ -94,7 +92,7 @@ Step = tuple[State, list[Output]]
 
 def initial(settings: Settings) -> State:
     """The state before anything was received."""
-    return State(minimax_bound.begin(settings.config))
+    return State()
 
 
 def is_new_fix(record: Gnss, state: State, settings: Settings) -> bool:

@@ -33,6 +33,7 @@ from companion.navigator.channel import Nominal, moved
 from companion.navigator.hypotheses import AIRSPEED, GNSS, JAMMED, MOST_BEACONS
 from companion.navigator.inertial_track import Point
 from companion.navigator.local_origin import LIVE_WINDOW_NS, infer_origin
+from companion.navigator.minimax_bound import Guarantee
 from companion.navigator.own_channel import AirspeedSums, OwnChannel, Sensors
 from companion.navigator.own_error_model import By
 from companion.navigator.solution import solve
@@ -351,9 +352,7 @@ def _jump_removed(state: State, last: Point, new: Point, record: LocalPosition, 
         out.append(_channel(record, f"jumped by {length:.1f} m"))
     if length > inertial_track.JUMP_M and silent > JUMP_SPREAD_S and state.bank is not None:
         sigma = min(length, most)
-        state = state._replace(
-            bank=banks.inflate(state.bank, (0, 1), sigma), guarantee=minimax_bound.begin(settings.config)
-        )
+        state = state._replace(bank=banks.inflate(state.bank, (0, 1), sigma), guarantee=Guarantee())
         out.append(_channel(record, f"no local position for {silent:.1f} s"))
     return state, out
 
@@ -366,10 +365,18 @@ def shifted(state: State, north: float, east: float, v_n: Vector2 = (0.0, 0.0), 
     protection = state.protection
     if protection is not None:
         protection = (*protection[:2], protection[2] + north, protection[3] + east)
-    promise = minimax_bound.shift(state.guarantee, north, east, v_n, t_ns)
+    promise = minimax_bound.shift(state.guarantee, north, east, v_n)
     bounded = state.restrictive and restrictive_filter.shift(state.restrictive, north, east)
+    pending = state.pending
+    if pending is not None:  # its correction is of the trajectory before
+        pending = pending._replace(centre=(pending.centre[0] + north, pending.centre[1] + east))
     return state._replace(
-        bank=bank, protection=protection, guarantee=promise, restrictive=bounded, gnss_fix=None
+        bank=bank,
+        protection=protection,
+        guarantee=promise,
+        restrictive=bounded,
+        gnss_fix=None,
+        pending=pending,
     )
 
 

@@ -47,7 +47,7 @@ _GPS_EPOCH_S, _LEAP_S = 315_964_800, 18  # UNIX time; GPS time is 18 s ahead of 
 _WEEK_MS, _WEEKS = 604_800_000, 1 << 16
 
 _MODES = {mode: getattr(rsbn, f"NAVIGATION_MODE_{mode.name}") for mode in Mode}
-_ESTIMATORS = ("none", "fusion", "minimax", "kalman", "restrictive", "smoother", "polynomial")
+_ESTIMATORS = ("none", "fusion", "minimax", "kalman", "restrictive", "smoother", "polynomial", "restricted")
 _SOURCES = {
     Source.INERTIAL: rsbn.NAVIGATION_SOURCE_INS,
     Source.GNSS: rsbn.NAVIGATION_SOURCE_GNSS,

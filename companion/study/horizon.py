@@ -16,12 +16,24 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from companion.estimate.minimax_lp import Design, Infeasible
-from companion.estimate.schuler import ARCSECOND, DEG_PER_HOUR, MEAN_EARTH, Scale, schuler_row, transition
+from companion.estimate.minimax import closed_form
+from companion.estimate.minimax_lp import Design, Infeasible, Minimax
+from companion.estimate.schuler import (
+    ARCSECOND,
+    DEG_PER_HOUR,
+    MEAN_EARTH,
+    STATE,
+    Scale,
+    force_response,
+    schuler_row,
+    transition,
+)
 from companion.study import plot_options
+from companion.units import G0, Floats
 
 GRADES_DEG_H = {"navigation": 0.01, "tactical": 1.0, "industrial": 10.0}
 LONGEST_MIN = 24 * 60
+FORCE_STEP_S = 10.0
 
 
 class Ahead(NamedTuple):
@@ -34,10 +46,16 @@ class Ahead(NamedTuple):
     drift_deg_h: float
     ls_claimed_m: float  # position, least squares, uncorrelated errors
     ls_worst_m: float  # position, least squares, worst correlation
+    closed_form_m: float | None  # position, closed form: measured always, no force, no knowledge of the drift
+    gap: float  # relative, within which the position bound is proved to be the least
 
 
 class Horizon:
-    """Bounds after a window of position fixes; `drift` [rad/s] is the constant drift of the INS, r.m.s."""
+    """Bounds after a window of position fixes, the last one at its end.
+
+    `drift` [rad/s] is the constant drift of the INS, r.m.s.; `force` [m/s^2] an unknown specific force,
+    r.m.s. at each moment, of any correlation.
+    """
 
     def __init__(
         self,
@@ -46,6 +64,7 @@ class Horizon:
         every: float = 1.0,
         drift: float | None = None,
         scale: Scale = MEAN_EARTH,
+        force: float = 0.0,
     ) -> None:
         if not (window > 0.0 and every > 0.0 and math.isfinite(window / every)):
             raise ValueError(
@@ -56,8 +75,19 @@ class Horizon:
         rows, sigmas = schuler_row("gamma", -tau), np.full(count, sigma / scale.radius)
         if drift is not None:  # prior knowledge of the constant, 0 +- drift, is one more measurement
             rows, sigmas = np.vstack([rows, [0.0, 0.0, 0.0, 1.0]]), np.append(sigmas, drift / scale.rate)
-        self._design, self._scale, self._half = Design.of(rows, sigmas), scale, 0.5 * window
-        self._starts: list[tuple[int, ...]] = [()] * 4
+        self._scale, self._half, self._force = scale, 0.5 * window, force
+        self._sigma, self._plain = sigma, drift is None and force == 0.0
+        t = tau / scale.rate
+        step = min(FORCE_STEP_S, every)
+        self._edges = np.linspace(t[0], t[-1], math.ceil(window / step) + 1)
+        effect = np.zeros((len(rows), len(self._edges) - 1 if force else 0))
+        if force:
+            start, end = self._edges[:-1], self._edges[1:]
+            effect[:count] = (
+                force_response("gamma", t[:, None], start, end, 0.5 * window, scale) / scale.radius
+            )
+        self._design = Design.of(rows, sigmas, effect, np.full(effect.shape[1], force))
+        self._starts: list[Minimax | None] = [None] * 4
 
     def position(self, ahead: float) -> float:
         """Return the bound of the position [m] at a time ahead [s] after the last fix."""
@@ -66,8 +96,12 @@ class Horizon:
     def at(self, ahead: float) -> Ahead:
         """Return all bounds at a time ahead [s] after the last fix."""
         position, tilt, velocity, drift = (self._bound(k, ahead) for k in range(4))
-        ls = self._design.least_squares(self._target(0, ahead))
-        radius = self._scale.radius
+        target, radius = self._target(0, ahead), self._scale.radius
+        ls = self._design.least_squares(target)
+        worst = radius * float(self._design.worst(ls.weights)) + self._beyond(0, ahead)
+        plain = closed_form(2.0 * self._half, ahead, self._sigma, self._scale) if self._plain else None
+        best = self._starts[0]
+        assert best is not None
         return Ahead(
             ahead / 60.0,
             position,
@@ -75,7 +109,9 @@ class Horizon:
             tilt / ARCSECOND,
             drift / DEG_PER_HOUR,
             radius * ls.claimed,
-            radius * ls.worst,
+            worst,
+            float(plain.bounds[0]) if plain else None,
+            best.gap,
         )
 
     def longest(self, limit: float) -> float:
@@ -89,16 +125,24 @@ class Horizon:
             (60.0 * minute - s for s in range(1, 61) if self.position(60.0 * minute - s) <= limit), 0.0
         )
 
-    def _target(self, k: int, ahead: float) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
-        row: np.ndarray[tuple[int], np.dtype[np.float64]] = transition(
-            (self._half + ahead) * self._scale.rate
-        )[k]
+    def _target(self, k: int, ahead: float) -> Floats:
+        # the state in the middle, about which the rows are best conditioned
+        row: Floats = transition((self._half + ahead) * self._scale.rate)[k]
         return row
+
+    def _beyond(self, k: int, ahead: float) -> float:
+        """Worst error of state k, SI, by the force after the last fix."""
+        if not self._force or ahead <= 0.0:
+            return 0.0
+        edges = np.linspace(self._half, self._half + ahead, math.ceil(ahead / FORCE_STEP_S) + 1)
+        end = np.array([self._half + ahead])
+        response = force_response(STATE[k], end, edges[:-1], edges[1:], self._half, self._scale)
+        return self._force * float(np.abs(response).sum())
 
     def _bound(self, k: int, ahead: float) -> float:
         best = self._design.minimax(self._target(k, ahead), self._starts[k])
-        self._starts[k] = best.active
-        return self._scale.units[k] * best.bound
+        self._starts[k] = best
+        return self._scale.units[k] * best.bound + self._beyond(k, ahead)
 
 
 def _minutes(context: click.Context, parameter: click.Parameter, text: str) -> list[float]:
@@ -153,6 +197,13 @@ def _drift(context: click.Context, parameter: click.Parameter, text: str | None)
     "--ins", "drift_deg_h", callback=_drift, help="Grade (navigation, tactical, industrial) or drift [deg/h]."
 )
 @click.option(
+    "--disturbance-ug",
+    default=0.0,
+    show_default=True,
+    type=click.FloatRange(0.0),
+    help="R.m.s. specific force that the channel does not model [micro-g].",
+)
+@click.option(
     "--limit-m",
     type=float,
     callback=_positive,
@@ -171,6 +222,7 @@ def command(
     every_s: float,
     ahead_min: list[float],
     drift_deg_h: float | None,
+    disturbance_ug: float,
     limit_m: float | None,
     as_json: bool,
     plot: Path | None,
@@ -178,7 +230,7 @@ def command(
     """Print the guaranteed bounds as a function of the time since the last fix."""
     try:
         drift = None if drift_deg_h is None else drift_deg_h * DEG_PER_HOUR
-        horizon = Horizon(sigma_m, 60.0 * window_min, every_s, drift)
+        horizon = Horizon(sigma_m, 60.0 * window_min, every_s, drift, force=disturbance_ug * 1e-6 * G0)
         table = [horizon.at(60.0 * minute) for minute in ahead_min]
     except Infeasible as error:
         raise click.UsageError(f"the window has too few fixes: {error}") from None
@@ -191,6 +243,7 @@ def command(
             "window_min": window_min,
             "every_s": every_s,
             "ins_drift_deg_h": drift_deg_h,
+            "disturbance_ug": disturbance_ug,
         }
         if longest is not None:
             answer |= {"limit_m": limit_m, "longest_min": longest / 60.0 if math.isfinite(longest) else None}
@@ -214,8 +267,16 @@ def _print(table: Sequence[Ahead], title: str, drift_deg_h: float | None) -> Non
         shown.add_column(head, justify="right")
     shown.add_column("least squares\nclaims, m", justify="right")
     shown.add_column("least squares\nworst, m", justify="right")
+    shown.add_column("closed\nform, m", justify="right")
+    shown.add_column("gap", justify="right")
     for row in table:
-        shown.add_row(*(f"{number:.5g}" for number in row))
+        *bounds, plain, gap = row
+        assert gap is not None
+        shown.add_row(
+            *(f"{number:.5g}" for number in bounds),
+            "-" if plain is None else f"{plain:.5g}",
+            f"{abs(gap):.0e}",
+        )
     Console(width=100).print(shown)
 
 

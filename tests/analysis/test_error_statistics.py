@@ -127,10 +127,20 @@ def test_fix_that_starts_a_phase_is_not_counted_in_the_previous_one():
     second = 1_000_000_000
     t = np.arange(0, 20 * second, second // 2)
     t = t[t > 9 * second]  # the first is valid half a second before the phase that it starts
-    fixes = error_statistics.ErrorSeries(t, np.ones(len(t)), np.full(len(t), np.nan))
+    fixes = error_statistics.ErrorSeries(t, np.ones(len(t)), *np.full((2, len(t)), np.nan))
     phases = [
         error_statistics.FlightPhase("neither", 0, 10 * second),
         error_statistics.FlightPhase("GNSS only", 10 * second, 20 * second),
     ]
     before, after = error_statistics.summarize_phases({error_statistics.GNSS: fixes}, phases)
     assert error_statistics.GNSS not in before.rms and after.rms[error_statistics.GNSS] == 1.0
+
+
+def test_bound_far_above_the_claim_or_the_limit_is_of_no_use() -> None:
+    """The claim is 1.4 m on both axes together: ten times that, or 5 km, and nothing is held."""
+    phase = [error_statistics.FlightPhase("all", 0, 20 * SECOND)]
+    for bound, useful in ((14.0, True), (14.3, False), (6000.0, False)):
+        records = [solution(t, 0.0, 1.0, bound_n=(0.0, bound)) for t in range(20)]
+        (row,) = error_statistics.summarize_phases(error_statistics.horizontal_errors(records, truth), phase)
+        assert row.useful is useful and row.held is (True if useful else None)
+        assert row.bound == pytest.approx(bound) and row.expected == pytest.approx(math.sqrt(2.0))

@@ -257,8 +257,8 @@ def test_violated_bound_is_reported(size, held):
     side = size / math.sqrt(2.0)
     a = assess_flight(flight(bound=(side, side)))
     assert all(row.held is held for row in a.rows)
-    assert ("did not hold in 3 of 3 phases" in sentences(a)) is not held
-    assert ("held in every phase" in sentences(a)) is held
+    assert ("was exceeded in 3 of 3 phases" in sentences(a)) is not held
+    assert ("held at every instant of 3 phases" in sentences(a)) is held
 
 
 def test_summary_describes_the_flight(assessed):

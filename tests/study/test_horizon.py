@@ -32,6 +32,25 @@ def test_bounds_match_the_closed_form():
     assert answer["table"][1]["ls_worst_m"] == pytest.approx(1786.5, abs=0.05)
 
 
+@pytest.mark.parametrize(
+    ("window", "ahead", "bound_m"), [(9.8334, 5, 90), (24.8334, 10, 164), (24.8334, 20, 582)]
+)
+def test_unknown_force_is_one_process(window, ahead, bound_m):
+    """The reference's fixes are at 5, 15, ... s of 10 and 25 min: the window ends with the last."""
+    arguments = ("--sigma-m", "2", "--every-s", "10", "--disturbance-ug", "20", "--window-min", str(window))
+    answer = json.loads(run(*arguments, "--ahead-min", f"{ahead},{ahead}", "--json").stdout)
+    row = answer["table"][0]
+    assert round(row["position_m"]) == bound_m
+    assert row["gap"] < 1e-9 and row["closed_form_m"] is None
+    assert row["ls_worst_m"] > row["position_m"]
+
+
+def test_closed_form_stands_beside_the_sampled_optimum():
+    answer = json.loads(run("--ahead-min", "5,20", "--json").stdout)
+    for row in answer["table"]:
+        assert row["closed_form_m"] <= row["position_m"] <= row["closed_form_m"] * (1.0 + 4.03 / 900**2)
+
+
 def test_longest_time_without_fixes():
     horizon = Horizon(30.0, 900.0)
     longest = horizon.longest(1000.0)
