@@ -30,6 +30,7 @@ COMMANDS = {
     "replay": "companion.analysis.replay:command",
     "report": "companion.analysis.report:command",
     "live": "companion.analysis.live.server:command",
+    "smooth": "companion.analysis.smooth_command:command",
     "log": "companion.analysis.log_command:group",
     "doctor": "companion.doctor.command:command",
     "signing": "companion.doctor.signing_command:group",
@@ -38,7 +39,10 @@ COMMANDS = {
 }
 STUDIES = {
     "horizon": "companion.study.horizon:command",
+    "ins-errors": "companion.study.ins_errors:command",
+    "map": "companion.study.map_smoothing:command",
     "order": "companion.study.order:command",
+    "schemes": "companion.study.schemes:command",
     "schuler": "companion.study.schuler_data:command",
     "weights": "companion.study.weights:command",
     "restrictive": "companion.study.restrictive:command",

@@ -340,6 +340,20 @@ class Fix(Stamped, frozen=True, gc=False, tag=True):
     normalised: float | None = None
 
 
+class Smoothed(Stamped, frozen=True, gc=False, tag=True):
+    """Position from all fixes of a flight, later ones included (`companion smooth`).
+
+    `covariance` is of north, east (upper triangle, m^2); `error_n` the error of the inertial channel that was
+    taken off (m).
+    """
+
+    lat: float
+    lon: float
+    alt_msl: float
+    covariance: Vector3
+    error_n: Vector2
+
+
 class Rejection(Stamped, frozen=True, gc=False, tag=True):
     """Measurement that was not used: source, reason, and the value with its limit."""
 
@@ -409,7 +423,7 @@ Input: TypeAlias = (
     | Tuning
 )
 Output: TypeAlias = Solution | Fix | Rejection | Reset | Event
-Record: TypeAlias = Input | Output | LinkState | Truth
+Record: TypeAlias = Input | Output | LinkState | Truth | Smoothed
 
 INPUTS: tuple[type[Stamped], ...] = get_args(Input)
 OUTPUTS: tuple[type[Stamped], ...] = get_args(Output)

@@ -249,7 +249,7 @@ def _replay_changed(
         records = progress.track(
             _observe(log_inputs.records, tracks, logged), description=f"replay {log.name}"
         )
-        sink = create_replay_log(output, run_metadata(config), *_start_times(log))
+        sink = create_replay_log(output, run_metadata(config), *start_times(log))
         try:
             found = replay_foreign(records, config, sink)
             analyses = [gnss_latency.analyze_track(track) for track in tracks.tracks()]
@@ -269,7 +269,7 @@ def _replay_changed(
     return found, [*notes, *gnss_latency.describe_analyses(analyses)], log_inputs.summary()
 
 
-def _start_times(log: Path) -> tuple[int, int]:
+def start_times(log: Path) -> tuple[int, int]:
     """Return time and wall-clock time of the first record; (0, 0) for the log of another recorder."""
     if not is_own_log(log):
         return 0, 0

@@ -21,6 +21,8 @@ plain path alone: it knows nothing of the chance that the first pass decided wro
 
 from __future__ import annotations
 
+import itertools
+import math
 from collections.abc import Iterable
 from typing import NamedTuple
 
@@ -31,7 +33,7 @@ from msgspec import structs
 from companion.config import Config, parse
 from companion.estimate import bank as banks
 from companion.estimate.bank import Bank
-from companion.estimate.smoother import rts_backward
+from companion.estimate.smoother import rts_backward, two_point
 from companion.nav.geometry import displace
 from companion.navigator import INPUTS_USED, Navigator, guarded, tuned
 from companion.navigator.channel import Nominal, Transition
@@ -61,10 +63,13 @@ class SmoothedRun(NamedTuple):
     P: Floats
     x_filter: Floats
     P_filter: Floats
+    apart_sigma: float = math.nan  # greatest distance to the solution of the two-point problem, if checked
 
 
-def smooth_flight(records: Iterable[Stamped], config: Config) -> list[SmoothedRun]:
+def smooth_flight(records: Iterable[Stamped], config: Config, check: bool = False) -> list[SmoothedRun]:
     """Smooth a flight. `records` may be of any types; they are sorted by time of validity.
+
+    With `check` every run is solved a second time as a two-point boundary problem.
 
     A run ends where the bank begins again: reboot of an INS, change of the error model by the operator.
 
@@ -76,7 +81,10 @@ def smooth_flight(records: Iterable[Stamped], config: Config) -> list[SmoothedRu
             "nothing to smooth: the records need a local position and its origin, or airspeed and attitude, "
             "and fixes"
         )
-    return [_rts_smooth(epochs) for epochs in runs]
+    smoothed = [_rts_smooth(epochs) for epochs in runs]
+    if not check:
+        return smoothed
+    return [run._replace(apart_sigma=_apart(run, epochs)) for run, epochs in zip(smoothed, runs, strict=True)]
 
 
 def join_runs(runs: Iterable[SmoothedRun]) -> tuple[npt.NDArray[np.int64], Floats, Floats, Floats]:
@@ -449,3 +457,50 @@ def _rts_smooth(epochs: list[_Epoch]) -> SmoothedRun:
     lat, lon, alt = np.array(places).T
     t_ns = np.array([epoch.point.t_ns for epoch in epochs], dtype=np.int64)
     return SmoothedRun(t_ns, lat, lon, alt, x, P, x_filter, P_filter)
+
+
+# ---------------------------------------------------------------------------------------------------------
+# Check
+# ---------------------------------------------------------------------------------------------------------
+
+_RANK = 1e-9  # a measurement reduces the variance of some direction by at least this share
+
+
+def _apart(run: SmoothedRun, epochs: list[_Epoch]) -> float:
+    """Solve the run again as the two-point problem (6.4.12); the greatest distance to `run`, in sigmas.
+
+    The steps of the nominal trajectory between epochs are known inputs, and taken off first: `offset`. The
+    measurements of an epoch enter as what they did to the filter: K S K' = P_{k|k-1} - P_k is L L' with few
+    columns, so that H = L' P_{k|k-1}^-1 with S = I is a measurement that does the same.
+    """
+    n = len(epochs[0].x)
+    offset, offsets = np.zeros(n), [np.zeros(n)]
+    H, R, z = list[Floats | None](), list[Floats | None](), list[Floats | None]()
+    for before, epoch in itertools.pairwise(epochs):
+        offset = epoch.Phi @ offset + epoch.predicted - epoch.Phi @ before.x
+        offsets.append(offset)
+        P = epoch.Phi @ before.P @ epoch.Phi.T + epoch.Q
+        row = _equivalent_measurement(P, epoch.P, epoch.predicted - offset, epoch.x - offset)
+        for each, value in zip((H, R, z), row, strict=True):
+            each.append(value)
+    later = epochs[1:]
+    Phi, Q = [e.Phi for e in later], [e.Q for e in later]
+    found = two_point(Phi, [np.eye(n)] * len(later), Q, H, R, z, epochs[0].x, epochs[0].P)
+    distance = np.abs(found.x + np.array(offsets) - run.x)[:, :2]
+    return float((distance / np.sqrt(np.einsum("ijj->ij", found.P[:, :2, :2]))).max())
+
+
+def _equivalent_measurement(
+    P: Floats, P_after: Floats, x: Floats, x_after: Floats
+) -> tuple[Floats | None, Floats | None, Floats | None]:
+    """H, R, z with unit innovation covariance that take (x, P) to (x_after, P_after); None without one."""
+    scale = np.sqrt(np.where(P.diagonal() > 0.0, P.diagonal(), 1.0))
+    values, vectors = np.linalg.eigh((P - P_after) / np.outer(scale, scale))
+    kept = values > _RANK
+    if not kept.any():
+        return None, None, None
+    L = vectors[:, kept] * np.sqrt(values[kept])  # of the states in units of `scale`
+    H = np.linalg.lstsq(P / np.outer(scale, scale), L, rcond=None)[0].T
+    nu = np.linalg.lstsq(L, (x_after - x) / scale, rcond=None)[0]
+    H = H / scale
+    return H, np.eye(len(H)) - H @ P @ H.T, nu + H @ x

@@ -13,7 +13,7 @@ import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from types import UnionType
-from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import msgspec
 
@@ -192,11 +192,17 @@ def _choices(kind: Any) -> tuple[str, ...]:
     return ()
 
 
+def _or_number(kind: Any) -> str:
+    """Return what a key accepts besides texts."""
+    limits = [get_args(one)[1] for one in get_args(kind) if get_origin(one) is Annotated]
+    return "".join(f", nor a number from {limit.ge:g} to {limit.le:g}" for limit in limits)
+
+
 def _convert(tree: Mapping[str, Mapping[str, Any]], origin: Mapping[tuple[str, str], str]) -> Config:
     sections: dict[str, Any] = {}
     for section, table in tree.items():
         kind = type(getattr(Config(), section))
-        hints = get_type_hints(kind)
+        hints = get_type_hints(kind, include_extras=True)
         table = {key: _as_list(value, hints[key]) for key, value in table.items()}
         for key, value in table.items():
             try:
@@ -208,7 +214,8 @@ def _convert(tree: Mapping[str, Mapping[str, Any]], origin: Mapping[tuple[str, s
                     close = difflib.get_close_matches(str(value), choices, 1, 0.4)
                     nearest = f"; did you mean `{close[0]}`?" if close else ""
                     raise ConfigError(
-                        f"{where}: {section}.{key}: {value!r} is not one of {', '.join(choices)}{nearest}"
+                        f"{where}: {section}.{key}: {value!r} is not one of {', '.join(choices)}"
+                        f"{_or_number(hints[key])}{nearest}"
                     ) from None
                 raise ConfigError(
                     f"{where}: {section}.{key} = {value!r} is invalid: {reason[0].lower()}{reason[1:]}"

@@ -168,7 +168,8 @@ TEXTS: dict[str, dict[str, tuple[str, str]]] = {
             "you study another estimator",
         ),
         "scheme": (
-            "feedforward corrects the own channel when its error is large, feedback at every fix.",
+            "feedforward corrects the own channel when its error is large, feedback at every fix; a number "
+            "from 0 to 1 corrects that share of the error at every fix.",
             "you study the schemes",
         ),
         "late_s": (

@@ -160,17 +160,18 @@ class EstimatorConfig(Section, frozen=True):
     The bank of hypotheses ("kalman", "auto") is used while fixes arrive. Without them `output` names the
     estimator: "minimax" and "restricted" without fixes of any source, "restrictive" without GNSS fixes.
     `scheme` "feedback" corrects the companion's own channel at every fix, "feedforward" only when its error
-    is large; an INS of its own cannot be corrected.
+    is large, a number from 0 to 1 by that share of its error; an INS of its own cannot be corrected.
     """
 
     output: Literal["auto", "minimax", "kalman", "restricted", "restrictive"] = "auto"
-    scheme: Literal["feedforward", "feedback"] = "feedforward"
+    scheme: Literal["feedforward", "feedback"] | Annotated[float, Meta(ge=0.0, le=1.0)] = "feedforward"
     late_s: Annotated[float, Meta(ge=0.0, le=30.0)] = 6.0
 
     @property
     def feedback(self) -> float:
         """Share of the estimated error that every fix takes off the companion's own channel."""
-        return 1.0 if self.scheme == "feedback" else 0.0
+        named = {"feedforward": 0.0, "feedback": 1.0}
+        return named[self.scheme] if isinstance(self.scheme, str) else self.scheme
 
 
 class IntegrityConfig(Section, frozen=True):

@@ -58,12 +58,12 @@ def find_conflicts(config: Config) -> Iterator[tuple[str, str, str]]:
             "gnss.receiver = 1 is the receiver that GPS_INPUT feeds, so our own position would come back as "
             "a fix: set gnss.receiver = 0",
         )
-    if config.estimator.scheme == "feedback" and config.has_own_ins:
+    if config.estimator.feedback > 0.0 and config.has_own_ins:
         yield (
             "estimator",
             "scheme",
-            "estimator.scheme = 'feedback' needs an inertial channel computed by the companion: "
-            "set inertial.source = 'air_data' or 'imu'",
+            f"estimator.scheme = {config.estimator.scheme!r} needs an inertial channel computed by the "
+            "companion: set inertial.source = 'air_data' or 'imu'",
         )
     if config.leading_estimator == "restrictive" and config.inertial.source != "air_data":
         yield (

@@ -367,17 +367,27 @@ def shifted(state: State, north: float, east: float, v_n: Vector2 = (0.0, 0.0), 
         protection = (*protection[:2], protection[2] + north, protection[3] + east)
     promise = minimax_bound.shift(state.guarantee, north, east, v_n)
     bounded = state.restrictive and restrictive_filter.shift(state.restrictive, north, east)
+    fix = state.gnss_fix and _fix_shifted(*state.gnss_fix, north, east, v_n, t_ns)
     pending = state.pending
-    if pending is not None:  # its correction is of the trajectory before
+    if pending is not None:  # the error that was taken off is that of the nominal trajectory as it is now
         pending = pending._replace(centre=(pending.centre[0] + north, pending.centre[1] + east))
     return state._replace(
         bank=bank,
         protection=protection,
         guarantee=promise,
         restrictive=bounded,
-        gnss_fix=None,
+        gnss_fix=fix,
         pending=pending,
     )
+
+
+def _fix_shifted(
+    record: Gnss, point: Point, north: float, east: float, v_n: Vector2, t_ns: int
+) -> tuple[Gnss, Point]:
+    """Return a GNSS fix beside the nominal trajectory as if that had always been where it is now."""
+    since = (point.t_ns - t_ns) * 1e-9
+    place = displace(*point.position, north + v_n[0] * since, east + v_n[1] * since, 0.0)
+    return record, point._replace(position=point.position._replace(lat=place.lat, lon=place.lon))
 
 
 # ---------------------------------------------------------------------------------------------------------

@@ -47,7 +47,12 @@ _GPS_EPOCH_S, _LEAP_S = 315_964_800, 18  # UNIX time; GPS time is 18 s ahead of 
 _WEEK_MS, _WEEKS = 604_800_000, 1 << 16
 
 _MODES = {mode: getattr(rsbn, f"NAVIGATION_MODE_{mode.name}") for mode in Mode}
-_ESTIMATORS = ("none", "fusion", "minimax", "kalman", "restrictive", "smoother", "polynomial", "restricted")
+_ESTIMATORS = {
+    "minimax": rsbn.NAVIGATION_ESTIMATOR_MINIMAX,
+    "kalman": rsbn.NAVIGATION_ESTIMATOR_KALMAN,
+    "restrictive": rsbn.NAVIGATION_ESTIMATOR_RESTRICTIVE,
+    "restricted": rsbn.NAVIGATION_ESTIMATOR_RESTRICTED,
+}
 _SOURCES = {
     Source.INERTIAL: rsbn.NAVIGATION_SOURCE_INS,
     Source.GNSS: rsbn.NAVIGATION_SOURCE_GNSS,
@@ -301,7 +306,7 @@ def navigation_status(solution: Solution, receiver: Receiver) -> Message:
     s = solution
     ahead = s.ahead[:4]
     unused = 4 - len(ahead)
-    variance = s.covariance[0] + s.covariance[3]
+    variance, bounds = s.covariance[0] + s.covariance[3], s.bounds
     return dialect.new(
         "NAVIGATION_STATUS",
         time_usec=s.t_ns // 1000,
@@ -320,9 +325,11 @@ def navigation_status(solution: Solution, receiver: Receiver) -> Message:
         if math.isfinite(s.inertial_age_s)
         else 0xFFFF,
         mode=_MODES[s.mode],
-        estimator=_ESTIMATORS.index(s.estimator) if s.estimator in _ESTIMATORS else 0,
+        estimator=_ESTIMATORS.get(s.estimator, rsbn.NAVIGATION_ESTIMATOR_NONE),
         protection=math.nan if s.protection is None else s.protection,
         trust=0 if s.trust is None else s.trust + 1,  # NAVIGATION_TRUST: 0 is "unknown"
+        tilt_bound=list(bounds.tilt_n) if bounds and bounds.tilt_n else [0.0, 0.0],
+        drift_bound=list(bounds.drift_n) if bounds and bounds.drift_n else [0.0, 0.0],
     )
 
 

@@ -337,7 +337,7 @@ class _Batch:
         self.size = 0
 
 
-_MAP_RECORDS = ("Gnss", "Solution", "Truth")
+_MAP_RECORDS = ("Gnss", "Smoothed", "Solution", "Truth")
 
 
 def topic_of(kind: type[Stamped]) -> str:

@@ -12,7 +12,7 @@ from typing import Any
 import msgspec
 
 from companion.nav import earth
-from companion.records import Gnss, Solution, Stamped, Truth
+from companion.records import Gnss, Smoothed, Solution, Stamped, Truth
 from companion.storage import schemas
 
 SCHEMA_NAME = "foxglove.LocationFix"
@@ -77,6 +77,11 @@ def to_location_fixes(record: Stamped, unix_ns: int) -> list[tuple[str, Location
                 return [("/map/gnss", _fix(stamp, record.lat, record.lon, alt))]
             covariance = (h * h, 0.0, 0.0, 0.0, h * h, 0.0, 0.0, 0.0, v * v)
             return [("/map/gnss", _fix(stamp, record.lat, record.lon, alt, covariance, DIAGONAL_KNOWN))]
+        case Smoothed():
+            nn, ne, ee = record.covariance
+            covariance = (ee, ne, 0.0, ne, nn, 0.0, 0.0, 0.0, 0.0)
+            place = (record.lat, record.lon, record.alt_msl)
+            return [("/map/smoothed", _fix(stamp, *place, covariance, APPROXIMATED))]
         case Solution():
             nn, ne, nd, ee, ed, dd = record.covariance
             covariance = (ee, ne, -ed, ne, nn, -nd, -ed, -nd, dd)

@@ -9,7 +9,7 @@ import json
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import click
 import numpy as np
@@ -34,6 +34,8 @@ from companion.units import G0, Floats
 GRADES_DEG_H = {"navigation": 0.01, "tactical": 1.0, "industrial": 10.0}
 LONGEST_MIN = 24 * 60
 FORCE_STEP_S = 10.0
+ALONE = tuple(tuple(float(i == k) for i in range(4)) for k in range(4))  # targets of one state
+WINDOWS = (1.0, 0.5, 0.25)  # of the window, in the plot
 
 
 class Ahead(NamedTuple):
@@ -54,7 +56,8 @@ class Horizon:
     """Bounds after a window of position fixes, the last one at its end.
 
     `drift` [rad/s] is the constant drift of the INS, r.m.s.; `force` [m/s^2] an unknown specific force,
-    r.m.s. at each moment, of any correlation.
+    r.m.s. at each moment, of any correlation; `velocity` [m/s] the r.m.s. error of a velocity measured with
+    each fix.
     """
 
     def __init__(
@@ -63,6 +66,7 @@ class Horizon:
         window: float,
         every: float = 1.0,
         drift: float | None = None,
+        velocity: float | None = None,
         scale: Scale = MEAN_EARTH,
         force: float = 0.0,
     ) -> None:
@@ -73,10 +77,15 @@ class Horizon:
         count = round(window / every) + 1
         tau = np.linspace(-0.5, 0.5, count) * (window * scale.rate)
         rows, sigmas = schuler_row("gamma", -tau), np.full(count, sigma / scale.radius)
+        if velocity is not None:  # the velocity of each fix is measured too
+            more = schuler_row("mu", -tau)
+            rows = np.vstack([rows, more])
+            sigmas = np.append(sigmas, np.full(count, velocity / (scale.radius * scale.rate)))
         if drift is not None:  # prior knowledge of the constant, 0 +- drift, is one more measurement
             rows, sigmas = np.vstack([rows, [0.0, 0.0, 0.0, 1.0]]), np.append(sigmas, drift / scale.rate)
         self._scale, self._half, self._force = scale, 0.5 * window, force
-        self._sigma, self._plain = sigma, drift is None and force == 0.0
+        self._sigma = sigma
+        self._plain = drift is None and velocity is None and force == 0.0
         t = tau / scale.rate
         step = min(FORCE_STEP_S, every)
         self._edges = np.linspace(t[0], t[-1], math.ceil(window / step) + 1)
@@ -86,6 +95,10 @@ class Horizon:
             effect[:count] = (
                 force_response("gamma", t[:, None], start, end, 0.5 * window, scale) / scale.radius
             )
+            if velocity is not None:
+                speed = scale.radius * scale.rate
+                response = force_response("mu", t[:, None], start, end, 0.5 * window, scale)
+                effect[count : 2 * count] = response / speed
         self._design = Design.of(rows, sigmas, effect, np.full(effect.shape[1], force))
         self._starts: list[Minimax | None] = [None] * 4
 
@@ -98,7 +111,7 @@ class Horizon:
         position, tilt, velocity, drift = (self._bound(k, ahead) for k in range(4))
         target, radius = self._target(0, ahead), self._scale.radius
         ls = self._design.least_squares(target)
-        worst = radius * float(self._design.worst(ls.weights)) + self._beyond(0, ahead)
+        worst = radius * float(self._design.worst(ls.weights)) + self._beyond(ALONE[0], ahead)
         plain = closed_form(2.0 * self._half, ahead, self._sigma, self._scale) if self._plain else None
         best = self._starts[0]
         assert best is not None
@@ -113,6 +126,14 @@ class Horizon:
             float(plain.bounds[0]) if plain else None,
             best.gap,
         )
+
+    def combination(self, ahead: float, target: Sequence[float]) -> float:
+        """Return the bound of a' x, with x position (m), tilt (rad), velocity (m/s), drift (rad/s),
+        at a time ahead [s]: `target` is a (4,).
+        """
+        a = np.array(target) * self._scale.units
+        best = self._design.minimax(a @ transition((self._half + ahead) * self._scale.rate))
+        return best.bound + self._beyond(target, ahead)
 
     def longest(self, limit: float) -> float:
         """Return the time [s] for which the position bound stays within limit [m]; inf beyond a day."""
@@ -130,19 +151,22 @@ class Horizon:
         row: Floats = transition((self._half + ahead) * self._scale.rate)[k]
         return row
 
-    def _beyond(self, k: int, ahead: float) -> float:
-        """Worst error of state k, SI, by the force after the last fix."""
+    def _beyond(self, target: Sequence[float], ahead: float) -> float:
+        """Worst error of a combination of the states, SI, by the force after the last fix."""
         if not self._force or ahead <= 0.0:
             return 0.0
         edges = np.linspace(self._half, self._half + ahead, math.ceil(ahead / FORCE_STEP_S) + 1)
         end = np.array([self._half + ahead])
-        response = force_response(STATE[k], end, edges[:-1], edges[1:], self._half, self._scale)
+        response = np.zeros(len(edges) - 1)
+        for name, a in zip(STATE, target, strict=True):
+            if a:
+                response += a * force_response(name, end, edges[:-1], edges[1:], self._half, self._scale)
         return self._force * float(np.abs(response).sum())
 
     def _bound(self, k: int, ahead: float) -> float:
         best = self._design.minimax(self._target(k, ahead), self._starts[k])
         self._starts[k] = best
-        return self._scale.units[k] * best.bound + self._beyond(k, ahead)
+        return self._scale.units[k] * best.bound + self._beyond(ALONE[k], ahead)
 
 
 def _minutes(context: click.Context, parameter: click.Parameter, text: str) -> list[float]:
@@ -159,6 +183,18 @@ def _positive(context: click.Context, parameter: click.Parameter, value: float |
     if value is not None and not (math.isfinite(value) and value > 0.0):
         raise click.BadParameter(f"{value:g} is not a valid distance: give metres above 0")
     return value
+
+
+def _target(context: click.Context, parameter: click.Parameter, text: str | None) -> list[float] | None:
+    if text is None:
+        return None
+    try:
+        found = [float(word) for word in text.split(",")]
+    except ValueError:
+        found = []
+    if len(found) != 4 or not all(map(math.isfinite, found)) or not any(found):
+        raise click.BadParameter(f"{text!r}: give four numbers A,B,C,D, not all 0")
+    return found
 
 
 def _drift(context: click.Context, parameter: click.Parameter, text: str | None) -> float | None:
@@ -204,6 +240,18 @@ def _drift(context: click.Context, parameter: click.Parameter, text: str | None)
     help="R.m.s. specific force that the channel does not model [micro-g].",
 )
 @click.option(
+    "--velocity-mps",
+    type=float,
+    callback=_positive,
+    help="A velocity is measured with each fix, of this r.m.s. error [m/s].",
+)
+@click.option(
+    "--target",
+    callback=_target,
+    metavar="A,B,C,D",
+    help="Also print the bound of A position + B tilt + C velocity + D drift [m, rad, m/s, rad/s].",
+)
+@click.option(
     "--limit-m",
     type=float,
     callback=_positive,
@@ -223,6 +271,8 @@ def command(
     ahead_min: list[float],
     drift_deg_h: float | None,
     disturbance_ug: float,
+    velocity_mps: float | None,
+    target: list[float] | None,
     limit_m: float | None,
     as_json: bool,
     plot: Path | None,
@@ -230,7 +280,8 @@ def command(
     """Print the guaranteed bounds as a function of the time since the last fix."""
     try:
         drift = None if drift_deg_h is None else drift_deg_h * DEG_PER_HOUR
-        horizon = Horizon(sigma_m, 60.0 * window_min, every_s, drift, force=disturbance_ug * 1e-6 * G0)
+        force = disturbance_ug * 1e-6 * G0
+        horizon = Horizon(sigma_m, 60.0 * window_min, every_s, drift, velocity_mps, force=force)
         table = [horizon.at(60.0 * minute) for minute in ahead_min]
     except Infeasible as error:
         raise click.UsageError(f"the window has too few fixes: {error}") from None
@@ -238,7 +289,7 @@ def command(
         raise click.UsageError(str(error)) from None
     longest = None if limit_m is None else horizon.longest(limit_m)
     if as_json:
-        answer = {
+        answer: dict[str, Any] = {
             "sigma_m": sigma_m,
             "window_min": window_min,
             "every_s": every_s,
@@ -247,14 +298,26 @@ def command(
         }
         if longest is not None:
             answer |= {"limit_m": limit_m, "longest_min": longest / 60.0 if math.isfinite(longest) else None}
+        if target is not None:
+            answer["target"] = target
+            answer["target_bound"] = [horizon.combination(60.0 * minute, target) for minute in ahead_min]
         click.echo(json.dumps({**answer, "table": [row._asdict() for row in table]}))
     else:
         _print(table, f"{sigma_m:g} m fixes every {every_s:g} s for {window_min:g} min", drift_deg_h)
+        if target is not None:
+            bounds = (f"{horizon.combination(60.0 * minute, target):.5g}" for minute in ahead_min)
+            click.echo(
+                f"Bound of {','.join(f'{a:g}' for a in target)} (A,B,C,D) at these times: {', '.join(bounds)}"
+            )
         if longest is not None:
             duration = f"{longest / 60.0:.1f} min" if math.isfinite(longest) else "more than a day"
             click.echo(f"The position bound stays below {limit_m:g} m for {duration} without fixes.")
     if plot is not None:
-        _plot(table, plot)
+        windows = [
+            Horizon(sigma_m, 60.0 * window_min * k, every_s, drift, velocity_mps, force=force)
+            for k in WINDOWS
+        ]
+        _plot(windows, [f"{window_min * k:.3g} min" for k in WINDOWS], ahead_min, plot)
 
 
 def _print(table: Sequence[Ahead], title: str, drift_deg_h: float | None) -> None:
@@ -280,16 +343,26 @@ def _print(table: Sequence[Ahead], title: str, drift_deg_h: float | None) -> Non
     Console(width=100).print(shown)
 
 
-def _plot(table: Sequence[Ahead], file: Path) -> None:
+def _plot(windows: Sequence[Horizon], names: Sequence[str], ahead_min: Sequence[float], file: Path) -> None:
+    """Plot the bounds of the four quantities over the time ahead, for several windows of fixes."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(8.0, 5.0), layout="constrained")
-    axes = figure.add_subplot()
-    minutes = [row.ahead_min for row in table]
-    axes.plot(minutes, [row.position_m for row in table], "k", label="minimax: guaranteed")
-    axes.plot(minutes, [row.ls_worst_m for row in table], "r--", label="least squares: worst")
-    axes.plot(minutes, [row.ls_claimed_m for row in table], "r:", label="least squares: claimed")
-    axes.set(xlabel="time since the last fix, min", ylabel="position error, m (r.m.s.)", yscale="log")
-    axes.grid(visible=True, which="both", alpha=0.3)
-    axes.legend()
+    figure = Figure(figsize=(11.0, 7.5), layout="constrained")
+    panels = figure.subplots(2, 2).ravel()
+    minutes = np.linspace(min(ahead_min), max(ahead_min), 61).tolist()
+    for k, (horizon, name) in enumerate(zip(windows, names, strict=True)):
+        rows = [horizon.at(60.0 * minute) for minute in minutes]
+        for axes, quantity in zip(
+            panels, ("position_m", "velocity_mps", "tilt_arcsec", "drift_deg_h"), strict=True
+        ):
+            axes.plot(minutes, [getattr(row, quantity) for row in rows], label=f"fixes for {name}")
+        if k == 0:
+            panels[0].plot(minutes, [row.ls_worst_m for row in rows], "k--", label="least squares: worst")
+            panels[0].plot(minutes, [row.ls_claimed_m for row in rows], "k:", label="least squares: claimed")
+    for axes, quantity in zip(
+        panels, ("position, m", "velocity, m/s", "tilt, arcsec", "drift, deg/h"), strict=True
+    ):
+        axes.set(xlabel="time since the last fix, min", ylabel=f"guaranteed bound: {quantity}", yscale="log")
+        axes.grid(visible=True, which="both", alpha=0.3)
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper center", ncols=5)
     figure.savefig(file)

@@ -1,11 +1,13 @@
 """`companion study order`: selection of the number of terms of an unknown function, for four bases.
 
-For a simulated signal, with known true error, or a file of samples: the criterion for every order, the order
-selected, and whether the basis spans the signal. See `estimate.polynomial`.
+For a simulated signal, with known true error, a table of samples, or a column of any log: the criterion for
+every order, the order selected, and whether the basis spans the signal. `--track` smooths a long column in
+windows, `--figures` draws the figures 6.5.1 to 6.5.4 of Brandin. See `estimate.polynomial`.
 """
 
 import json
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,7 +16,18 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from companion.estimate.polynomial import FAMILIES, Family, Order, select_order
+from companion.analysis.replay_inputs import input_errors_as_log_errors, is_own_log, open_inputs
+from companion.estimate.polynomial import (
+    FAMILIES,
+    Family,
+    Order,
+    Track,
+    orthonormal_basis,
+    select_order,
+    smooth_track,
+)
+from companion.records import Stamped
+from companion.storage import flight_log
 from companion.study import plot_options
 from companion.units import Floats
 
@@ -73,6 +86,65 @@ def read(file: Path, sigma: float) -> Samples:
     return Samples(table[:, 0], table[:, 1], known)
 
 
+def read_log(log: Path, topic: str, field: str, sigma: float | None) -> Samples:
+    """Read one field of the messages of one topic of a log, ours or another recorder's.
+
+    `topic` is that of our logs or the name of a record, /in/Gnss or Gnss; `field` is a name, with an index
+    for a vector: alt_msl, v_n.0. Without `sigma` it is estimated by `noise_of`.
+    """
+    values = []
+    names: set[str] = set()
+    with input_errors_as_log_errors():
+        for where, record in _messages(log):
+            names.add(where)
+            if topic in (where, type(record).__name__):
+                value = _field(record, field)
+                if value is not None and math.isfinite(value):
+                    values.append((record.t_ns, value))
+    if not values:
+        known = f"it has {', '.join(sorted(names))}" if topic not in names else "all its values are missing"
+        raise ValueError(f"{log}: no values of {field} in {topic}: {known}")
+    t_ns, first = np.unique(np.array([t for t, _ in values], dtype=np.int64), return_index=True)
+    z = np.array([value for _, value in values])[first]
+    if len(z) < 8:
+        raise ValueError(f"{log}: {len(z)} values of {field} in {topic}: at least 8 are needed")
+    t: Floats = (t_ns - t_ns[0]) * 1e-9
+    return Samples(t, z, np.full(len(z), noise_of(z) if sigma is None else sigma))
+
+
+def noise_of(z: Floats) -> float:
+    """Estimate the white noise of even samples of a smooth function from their third differences."""
+    noise = math.sqrt(float(np.mean(np.diff(z, 3) ** 2)) / 20.0)
+    return noise or 1e-9 * max(1.0, float(np.abs(z).max()))
+
+
+def _messages(log: Path) -> Iterator[tuple[str, Stamped]]:
+    if is_own_log(log):
+        for entry in flight_log.read(log):
+            if isinstance(entry.value, Stamped):
+                yield entry.topic, entry.value
+        return
+    for record in open_inputs(log).records:
+        yield flight_log.topic_of(type(record)), record
+
+
+def _field(record: Stamped, field: str) -> float | None:
+    value: Any = record
+    for name in field.split("."):
+        try:
+            value = value[int(name)] if name.isdigit() else getattr(value, name)
+        except (AttributeError, IndexError, TypeError):
+            fields = ", ".join(type(record).__struct_fields__)
+            raise ValueError(
+                f"{type(record).__name__} has no field {field!r}: it has {fields}; a component is v_n.0"
+            ) from None
+        if value is None:
+            return None
+    if not isinstance(value, int | float):
+        raise ValueError(f"{field!r} of {type(record).__name__} is no number: give a component, {field}.0")
+    return float(value)
+
+
 def study(samples: Samples, bases: Sequence[Family], r_max: int) -> list[BasisResult]:
     """Evaluate every basis on the same samples."""
     rows = []
@@ -112,7 +184,20 @@ def short_form(samples: Samples, found: Order) -> int:
 @click.option(
     "--samples", "count", default=101, show_default=True, help="Number of samples of the simulated signal."
 )
-@click.option("--sigma", default=0.2, show_default=True, help="R.m.s. noise, if FILE has no third column.")
+@click.option(
+    "--sigma",
+    type=click.FloatRange(min=0.0, min_open=True),
+    help="R.m.s. noise; default: 0.2 if FILE has no third column, estimated for a log.",
+)
+@click.option("--topic", help="Topic or record of a log, for example /in/Gnss or Gnss.")
+@click.option("--field", help="Field of its messages, for example alt_msl or v_n.0.")
+@click.option("--track", is_flag=True, help="Smooth the samples in windows of the basis (default: legendre).")
+@click.option(
+    "--figures",
+    type=click.Path(path_type=Path),
+    callback=plot_options.check_plot_file,
+    help="Draw the figures 6.5.1 to 6.5.4 of Brandin to this file.",
+)
 @click.option("--seed", default=1, show_default=True, help="Seed of the noise.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 @click.option(
@@ -127,21 +212,39 @@ def command(
     bases: tuple[Family, ...],
     r_max: int,
     count: int,
-    sigma: float,
+    sigma: float | None,
+    topic: str | None,
+    field: str | None,
+    track: bool,
+    figures: Path | None,
     seed: int,
     as_json: bool,
     plot: Path | None,
 ) -> None:
     """Select the number of terms of an unknown function.
 
-    The samples are read from FILE (CSV with t,z or t,z,sigma), or simulated.
+    The samples are read from FILE: a CSV with t,z or t,z,sigma, or with --topic and --field any log that
+    `replay` reads. Without FILE they are simulated.
     """
+    if (topic is None) != (field is None) or (topic and not file):
+        raise click.UsageError("a column of a log needs FILE, --topic and --field")
     try:
-        samples = read(file, sigma) if file else synthetic(signal, count, sigma, seed)
+        if file and topic and field:
+            samples = read_log(file, topic, field, sigma)
+        else:
+            known = 0.2 if sigma is None else sigma
+            samples = read(file, known) if file else synthetic(signal, count, known, seed)
+        if figures is not None:
+            draw_figures(synthetic(signal, count, 0.2 if sigma is None else sigma, seed), r_max, figures)
+        if track:
+            _smooth(samples, bases[0] if bases else "legendre", r_max, as_json, plot)
+            return
         rows = study(samples, bases or FAMILIES, r_max)  # type: ignore[arg-type]
     except ValueError as error:
         raise click.UsageError(str(error)) from None
     title = str(file) if file else f"{signal}, {count} samples, seed {seed}"
+    if topic:
+        title += f", {topic} {field}, noise {samples.sigma[0]:.3g}"
     if as_json:
         click.echo(json.dumps({"signal": title, "bases": [_plain(row) for row in rows]}))
     else:
@@ -203,4 +306,78 @@ def _plot(samples: Samples, rows: Sequence[BasisResult], file: Path) -> None:
     right.set(xlabel="terms", ylabel="estimated squared error")
     left.legend()
     right.grid(visible=True, alpha=0.3)
+    figure.savefig(file)
+
+
+def _smooth(samples: Samples, basis: Family, r_max: int, as_json: bool, plot: Path | None) -> None:
+    """Smooth a long column in windows; print the result, plot it."""
+    found = smooth_track(samples.t, samples.z[:, None], samples.sigma, basis, r_max)
+    residual = float(np.sqrt(np.mean((samples.z - found.x[:, 0]) ** 2)))
+    if as_json:
+        columns = {"t": samples.t, "z": samples.z, "x": found.x[:, 0], "sigma": found.sigma[:, 0]}
+        plain: dict[str, Any] = {name: column.tolist() for name, column in columns.items()}
+        click.echo(json.dumps({"windows": found.windows, "consistency": found.consistency, **plain}))
+    else:
+        click.echo(
+            f"{len(samples.t)} samples in {found.windows} windows of at most {r_max} {basis} functions:"
+            f" residual {residual:.4g} r.m.s., RSS/(N - r_max) {found.consistency:.3g} at a noise of"
+            f" {float(np.sqrt(np.mean(samples.sigma**2))):.3g}"
+        )
+    if plot is not None:
+        _plot_track(samples, found, plot)
+
+
+def _plot_track(samples: Samples, found: Track, file: Path) -> None:
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9.0, 4.5), layout="constrained")
+    axes = figure.add_subplot()
+    x, sigma = found.x[:, 0], found.sigma[:, 0]
+    axes.plot(samples.t, samples.z, ".", color="0.7", markersize=2, label="samples")
+    axes.plot(samples.t, x, label=f"smoothed, {found.windows} windows")
+    axes.fill_between(samples.t, x - 2.0 * sigma, x + 2.0 * sigma, alpha=0.3, label="two sigma")
+    axes.set(xlabel="time, s")
+    axes.legend()
+    axes.grid(visible=True, alpha=0.3)
+    figure.savefig(file)
+
+
+def errors_by_order(samples: Samples, basis: Family, r_max: int) -> tuple[Floats, Floats]:
+    """Return the r.m.s. methodical and random error (r_max,) of the fit with 1 to r_max terms."""
+    assert samples.truth is not None
+    Psi = orthonormal_basis(samples.t, samples.sigma, basis, r_max)(samples.t) / samples.sigma[:, None]
+    truth, methodical, random = samples.truth / samples.sigma, [], []
+    for r in range(1, r_max + 1):
+        P = Psi[:, :r] @ np.linalg.pinv(Psi[:, :r])
+        methodical.append(np.mean(((truth - P @ truth) * samples.sigma) ** 2))
+        random.append(np.mean(np.diag(P) * samples.sigma**2))
+    return np.sqrt(methodical), np.sqrt(random)
+
+
+def draw_figures(samples: Samples, r_max: int, file: Path) -> None:
+    """Draw 6.5.1 to 6.5.3, the families of functions, and 6.5.4, the errors by their number."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(10.0, 7.5), layout="constrained")
+    t, T = np.linspace(0.0, 1.0, 401), 1.0
+    power, sine, legendre, errors = figure.subplots(2, 2).ravel()
+    for m in range(5):
+        power.plot(t, t**m, label=f"m = {m}")
+        sine.plot(t, np.sin(np.pi * m * t / T), label=f"m = {m}")
+        shape = np.polynomial.legendre.Legendre.basis(m)(2.0 * t / T - 1.0)
+        legendre.plot(t, math.sqrt((2 * m + 1) / T) * shape, label=f"m = {m}")
+    power.set(title="6.5.1 power: t^m", xlabel="t / T")
+    sine.set(title="6.5.2 trigonometric: sin(pi m t / T)", xlabel="t / T")
+    legendre.set(title="6.5.3 Legendre, orthonormal", xlabel="t / T")
+    methodical, random = errors_by_order(samples, "legendre", r_max)
+    terms = np.arange(1, r_max + 1)
+    errors.semilogy(terms, np.maximum(methodical, 1e-4), label="methodical")
+    errors.semilogy(terms, random, label="random")
+    errors.semilogy(terms, np.hypot(methodical, random), "k", label="total")
+    errors.set(
+        title="6.5.4 errors by the number of terms", xlabel="terms", ylabel="r.m.s. error", ylim=(1e-3, None)
+    )
+    for axes in (power, sine, legendre, errors):
+        axes.grid(visible=True, alpha=0.3)
+        axes.legend(fontsize="small")
     figure.savefig(file)

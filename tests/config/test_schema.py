@@ -43,6 +43,7 @@ def test_flags_override_environment_overrides_file(tmp_path: Path) -> None:
         ("[output]\nvia = 'odometri'", "is not one of auto, odometry, "),
         ("[output]\nvia = 3", "output.via: 3 is not one of auto, "),
         ("[inertial]\nsource = 'ins'", "'ins' is not one of auto, local_position, air_data, imu"),
+        ("[estimator]\nscheme = 1.5", "1.5 is not one of feedforward, feedback, nor a number from 0 to 1"),
         ("[link]\nconnect = 3", "link.connect = [3] is invalid: expected str, got int"),
         ("link = 3", "`link` is a section: write [link] and its keys below it"),
         ("x = [", "not valid TOML"),
@@ -55,6 +56,12 @@ def test_mistake_is_reported_in_one_sentence(tmp_path: Path, text: str, expected
     assert expected in str(caught.value)
     assert str(path) in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(("scheme", "share"), [("feedforward", 0.0), (0.3, 0.3), ("feedback", 1.0)])
+def test_scheme_is_a_word_or_a_share(tmp_path: Path, scheme: object, share: float) -> None:
+    path = written(tmp_path, f"[inertial]\nsource = 'air_data'\n[estimator]\nscheme = {scheme!r}")
+    assert load(path, environment={}).estimator.feedback == share
 
 
 def test_mistake_in_the_environment_names_the_variable() -> None:

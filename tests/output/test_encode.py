@@ -25,7 +25,7 @@ from companion.output.encode import (
     stated_as_independent,
 )
 from companion.output.gate import Position
-from companion.records import LocalOrigin, Mode, Prediction, Solution, Source
+from companion.records import Bounds, LocalOrigin, Mode, Prediction, Solution, Source
 
 T = 123_456_789_000
 NAN = math.nan
@@ -354,6 +354,30 @@ def test_unknown_status_fields_are_nan() -> None:
     m = status(bound_n=None, velocity_bound_n=None, disagreement=None, ahead=())
     unknown = (m.bound_north, m.bound_east, m.bound_horizontal, m.bound_velocity, m.disagreement)
     assert all(map(math.isnan, unknown))
+
+
+def test_bounds_of_tilt_and_drift() -> None:
+    assert status().tilt_bound == status().drift_bound == [0.0, 0.0]
+    m = status(bounds=Bounds((3.0, 4.0), 0.0, 1.0, (3e-4, 4e-4), (7e-7, 8e-7)))
+    assert m.tilt_bound == pytest.approx([3e-4, 4e-4])
+    assert m.drift_bound == pytest.approx([7e-7, 8e-7])
+
+
+@pytest.mark.parametrize("name", ["kalman", "minimax", "restricted", "restrictive"])
+def test_every_estimator_has_its_number(name: str) -> None:
+    number = status(estimator=name).estimator
+    assert dialect.rsbn.enums["NAVIGATION_ESTIMATOR"][number].name == f"NAVIGATION_ESTIMATOR_{name.upper()}"
+
+
+def test_the_enumerations_have_nothing_that_is_never_sent() -> None:
+    enums = dialect.rsbn.enums
+    sent = {
+        status(estimator=name).estimator
+        for name in ("none", "kalman", "minimax", "restricted", "restrictive")
+    }
+    assert sent == set(enums["NAVIGATION_ESTIMATOR"]) - {max(enums["NAVIGATION_ESTIMATOR"])}  # ..._ENUM_END
+    modes = {status(mode=mode).mode for mode in Mode}
+    assert modes == set(enums["NAVIGATION_MODE"]) - {max(enums["NAVIGATION_MODE"])}
 
 
 @pytest.mark.parametrize("mode", list(Mode))

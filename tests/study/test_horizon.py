@@ -4,11 +4,12 @@ import json
 import math
 from itertools import pairwise
 
+import numpy as np
 import pytest
 from click.testing import CliRunner
 
 from companion.estimate.minimax import closed_form
-from companion.estimate.schuler import DEG_PER_HOUR
+from companion.estimate.schuler import ARCSECOND, DEG_PER_HOUR, MEAN_EARTH
 from companion.study.horizon import Horizon, command
 
 
@@ -96,3 +97,38 @@ def test_invalid_options_are_reported(arguments, message):
     result = run(*arguments)
     assert result.exit_code == 2
     assert message in " ".join(result.output.replace("│", " ").split())
+
+
+def test_target_combines_the_quantities():
+    horizon = Horizon(30.0, 900.0)
+    row = horizon.at(600.0)
+    assert horizon.combination(600.0, (1, 0, 0, 0)) == pytest.approx(row.position_m)
+    assert horizon.combination(600.0, (0, 1, 0, 0)) == pytest.approx(row.tilt_arcsec * ARCSECOND)
+    assert horizon.combination(600.0, (0, 0, 1, 0)) == pytest.approx(row.velocity_mps)
+    assert horizon.combination(600.0, (0, 0, 0, -2)) == pytest.approx(2 * row.drift_deg_h * DEG_PER_HOUR)
+    both = horizon.combination(600.0, (1, 0, 60.0, 0))  # a sum is bounded by the sum of the bounds
+    assert both <= row.position_m + 60.0 * row.velocity_mps
+    answer = json.loads(run("--ahead-min", "5,10", "--target", "1,0,60,0", "--json").stdout)
+    assert answer["target_bound"][1] == pytest.approx(both)
+
+
+def test_a_measured_velocity_lowers_the_bounds_and_agrees_with_linear_programming():
+    from scipy.optimize import linprog
+
+    horizon = Horizon(30.0, 900.0, 30.0, velocity=0.5)
+    scale = MEAN_EARTH
+    s = (600.0 + np.linspace(900.0, 0.0, 31)) * scale.rate  # from each fix to the target
+    H = np.concatenate(
+        [
+            np.stack([np.ones_like(s), np.cos(s) - 1, -np.sin(s), np.sin(s) - s], axis=1),
+            np.stack([0 * s, np.sin(s), np.cos(s), 1 - np.cos(s)], axis=1),
+        ]
+    )
+    sigma = np.repeat([30.0 / scale.radius, 0.5 / (scale.radius * scale.rate)], 31)
+    best = linprog(np.r_[sigma, sigma], A_eq=np.hstack([H.T, -H.T]), b_eq=[1.0, 0.0, 0.0, 0.0])
+    assert horizon.position(600.0) == pytest.approx(scale.radius * best.fun, rel=1e-6)
+    assert horizon.position(600.0) < 0.9 * Horizon(30.0, 900.0, 30.0).position(600.0)
+
+
+def test_bad_target():
+    assert "four numbers" in run("--target", "1,2").output

@@ -1,13 +1,15 @@
 """`companion study order` selects the order, detects whether the basis spans the signal, reports errors."""
 
 import json
+import lzma
+import math
 import pathlib
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from companion.study.order import Samples, command, study
+from companion.study.order import Samples, command, errors_by_order, noise_of, read_log, study, synthetic
 
 
 def run(*arguments):
@@ -74,3 +76,78 @@ def test_short_form_selects_nine_terms_for_a_cubic():
     (row,) = study(samples, ["power"], 12)
     assert row.found.order == data["results"]["cubic"]["power"]["r_J"] == 4
     assert row.short == data["results"]["cubic"]["power"]["r_simple"] == 9
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory):
+    packed = pathlib.Path(__file__).parents[1] / "data/plane_wind_change_cut.tlog.xz"
+    path = tmp_path_factory.mktemp("order") / "plane.tlog"
+    path.write_bytes(lzma.decompress(packed.read_bytes()))
+    return path
+
+
+def test_column_of_a_log(log):
+    for topic in ("/in/AirData", "AirData"):
+        samples = read_log(log, topic, "airspeed", None)
+        assert len(samples.t) > 400
+        assert samples.t[0] == 0.0
+        assert 0.0 < samples.sigma[0] < 1.0  # m/s, of an airspeed sensor
+    east = read_log(log, "Gnss", "v_n.1", 0.1)
+    assert set(east.sigma) == {0.1}
+
+
+def test_track_of_a_log_is_cut_into_windows(log, tmp_path):
+    pytest.importorskip("matplotlib")
+    plot = tmp_path / "track.png"
+    column = (log, "--topic", "AirData", "--field", "airspeed", "--track")
+    assert "windows of at most 12 legendre functions" in run(*column, "--plot", plot).output
+    found = json.loads(run(*column, "--json").output)
+    residual = np.array(found["z"]) - found["x"]
+    assert 0.5 < found["consistency"] < 2.0
+    assert np.std(residual) < 1.2 * np.median(read_log(log, "AirData", "airspeed", None).sigma)
+    assert plot.stat().st_size > 10_000
+
+
+def test_noise_is_estimated_beside_a_smooth_function():
+    t = np.linspace(0.0, 10.0, 2001)
+    z = 5.0 * np.sin(t) + 0.3 * np.random.default_rng(1).standard_normal(len(t))
+    assert noise_of(z) == pytest.approx(0.3, rel=0.05)
+
+
+def test_errors_by_order_are_those_of_many_fits():
+    """The methodical and the random error add up to what a hundred seeds have, term by term."""
+    one = synthetic("cubic", 101, 0.2, 0)
+    predicted = np.hypot(*errors_by_order(one, "legendre", 6))
+    squares = np.zeros(6)
+    for seed in range(100):
+        samples = synthetic("cubic", 101, 0.2, seed)
+        (row,) = study(samples, ["legendre"], 6)
+        Psi = row.found.basis(samples.t) / samples.sigma[:, None]
+        for r in range(1, 7):
+            a = np.linalg.lstsq(Psi[:, :r], samples.z / samples.sigma, rcond=None)[0]
+            squares[r - 1] += np.mean((Psi[:, :r] @ a * samples.sigma - samples.truth) ** 2)
+    np.testing.assert_allclose(np.sqrt(squares / 100), predicted, rtol=0.05)
+    assert predicted.argmin() == 3  # four terms
+    assert math.isclose(errors_by_order(one, "legendre", 6)[0][3], 0.0, abs_tol=1e-9)
+
+
+def test_figures(tmp_path):
+    pytest.importorskip("matplotlib")
+    file = tmp_path / "figures.png"
+    assert run("--figures", file, "--basis", "power").exit_code == 0
+    assert file.read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--topic", "Gnss"), "needs FILE, --topic and --field"),
+        (("--topic", "Gns", "--field", "lat"), "no values of lat in Gns: it has"),
+        (("--topic", "Gnss", "--field", "v_n"), "give a component"),
+        (("--topic", "Gnss", "--field", "height"), "has no field"),
+    ],
+)
+def test_wrong_column_is_reported_in_one_sentence(log, options, message):
+    result = run(log, *options)
+    assert result.exit_code != 0
+    assert message in result.output + str(result.exception)

@@ -380,15 +380,13 @@ enums["NAVIGATION_MODE"].bitmask = False
 NAVIGATION_MODE_INITIALISING = 0
 enums["NAVIGATION_MODE"][0] = EnumEntry("NAVIGATION_MODE_INITIALISING", """No estimate yet.""")
 NAVIGATION_MODE_FIXED = 1
-enums["NAVIGATION_MODE"][1] = EnumEntry("NAVIGATION_MODE_FIXED", """Corrected by a trusted fix.""")
+enums["NAVIGATION_MODE"][1] = EnumEntry("NAVIGATION_MODE_FIXED", """Corrected by fixes that are in use.""")
 NAVIGATION_MODE_PREDICTING = 2
-enums["NAVIGATION_MODE"][2] = EnumEntry("NAVIGATION_MODE_PREDICTING", """No trusted fix: the inertial error is predicted, inside the guaranteed bound.""")
+enums["NAVIGATION_MODE"][2] = EnumEntry("NAVIGATION_MODE_PREDICTING", """No fix in use: the inertial error is predicted; guaranteed bound or protection level within its limit.""")
 NAVIGATION_MODE_UNTRUSTED = 3
-enums["NAVIGATION_MODE"][3] = EnumEntry("NAVIGATION_MODE_UNTRUSTED", """An estimate exists, but its bound is not guaranteed.""")
-NAVIGATION_MODE_LOST = 4
-enums["NAVIGATION_MODE"][4] = EnumEntry("NAVIGATION_MODE_LOST", """The autopilot's inertial channel is not received.""")
-NAVIGATION_MODE_ENUM_END = 5
-enums["NAVIGATION_MODE"][5] = EnumEntry("NAVIGATION_MODE_ENUM_END", """""")
+enums["NAVIGATION_MODE"][3] = EnumEntry("NAVIGATION_MODE_UNTRUSTED", """No fix in use, and both guaranteed bound and protection level unknown or beyond the limit.""")
+NAVIGATION_MODE_ENUM_END = 4
+enums["NAVIGATION_MODE"][4] = EnumEntry("NAVIGATION_MODE_ENUM_END", """""")
 
 # NAVIGATION_TRUST
 enums["NAVIGATION_TRUST"] = Enum()
@@ -400,9 +398,9 @@ enums["NAVIGATION_TRUST"][1] = EnumEntry("NAVIGATION_TRUST_NORMAL", """Fixes tha
 NAVIGATION_TRUST_DEGRADED = 2
 enums["NAVIGATION_TRUST"][2] = EnumEntry("NAVIGATION_TRUST_DEGRADED", """Fixes, but a source is excluded or suspected, or they are not sufficiently cross-checked.""")
 NAVIGATION_TRUST_PREDICTING = 3
-enums["NAVIGATION_TRUST"][3] = EnumEntry("NAVIGATION_TRUST_PREDICTING", """No trusted fix: the inertial error is predicted, inside the guaranteed bound.""")
+enums["NAVIGATION_TRUST"][3] = EnumEntry("NAVIGATION_TRUST_PREDICTING", """No fix in use: the inertial error is predicted, with a protection level within its limit.""")
 NAVIGATION_TRUST_UNTRUSTED = 4
-enums["NAVIGATION_TRUST"][4] = EnumEntry("NAVIGATION_TRUST_UNTRUSTED", """No bound, or one beyond its limit.""")
+enums["NAVIGATION_TRUST"][4] = EnumEntry("NAVIGATION_TRUST_UNTRUSTED", """No fix in use and a protection level beyond its limit.""")
 NAVIGATION_TRUST_ENUM_END = 5
 enums["NAVIGATION_TRUST"][5] = EnumEntry("NAVIGATION_TRUST_ENUM_END", """""")
 
@@ -411,18 +409,12 @@ enums["NAVIGATION_ESTIMATOR"] = Enum()
 enums["NAVIGATION_ESTIMATOR"].bitmask = False
 NAVIGATION_ESTIMATOR_NONE = 0
 enums["NAVIGATION_ESTIMATOR"][0] = EnumEntry("NAVIGATION_ESTIMATOR_NONE", """None.""")
-NAVIGATION_ESTIMATOR_FUSION = 1
-enums["NAVIGATION_ESTIMATOR"][1] = EnumEntry("NAVIGATION_ESTIMATOR_FUSION", """Maximum-likelihood fusion at a common time.""")
 NAVIGATION_ESTIMATOR_MINIMAX = 2
-enums["NAVIGATION_ESTIMATOR"][2] = EnumEntry("NAVIGATION_ESTIMATOR_MINIMAX", """Minimax prediction of the inertial error.""")
+enums["NAVIGATION_ESTIMATOR"][2] = EnumEntry("NAVIGATION_ESTIMATOR_MINIMAX", """Minimax prediction of the inertial error, with a guaranteed r.m.s. bound.""")
 NAVIGATION_ESTIMATOR_KALMAN = 3
-enums["NAVIGATION_ESTIMATOR"][3] = EnumEntry("NAVIGATION_ESTIMATOR_KALMAN", """Kalman filter.""")
+enums["NAVIGATION_ESTIMATOR"][3] = EnumEntry("NAVIGATION_ESTIMATOR_KALMAN", """Bank of Kalman filters, one a hypothesis about what is wrong.""")
 NAVIGATION_ESTIMATOR_RESTRICTIVE = 4
-enums["NAVIGATION_ESTIMATOR"][4] = EnumEntry("NAVIGATION_ESTIMATOR_RESTRICTIVE", """Restrictive (guaranteed, ellipsoidal) filter.""")
-NAVIGATION_ESTIMATOR_SMOOTHER = 5
-enums["NAVIGATION_ESTIMATOR"][5] = EnumEntry("NAVIGATION_ESTIMATOR_SMOOTHER", """Maximum a posteriori smoother.""")
-NAVIGATION_ESTIMATOR_POLYNOMIAL = 6
-enums["NAVIGATION_ESTIMATOR"][6] = EnumEntry("NAVIGATION_ESTIMATOR_POLYNOMIAL", """Polynomial of a chosen order.""")
+enums["NAVIGATION_ESTIMATOR"][4] = EnumEntry("NAVIGATION_ESTIMATOR_RESTRICTIVE", """Restrictive filter: a Kalman filter whose wind changes within bounds. Its covariance is no guarantee.""")
 NAVIGATION_ESTIMATOR_RESTRICTED = 7
 enums["NAVIGATION_ESTIMATOR"][7] = EnumEntry("NAVIGATION_ESTIMATOR_RESTRICTED", """Restricted Bayes: least expected error, guaranteed bound near the least.""")
 NAVIGATION_ESTIMATOR_ENUM_END = 8
@@ -434,19 +426,15 @@ enums["NAVIGATION_SOURCE"].bitmask = True
 NAVIGATION_SOURCE_INS = 1
 enums["NAVIGATION_SOURCE"][1] = EnumEntry("NAVIGATION_SOURCE_INS", """The autopilot's inertial channel.""")
 NAVIGATION_SOURCE_GNSS = 2
-enums["NAVIGATION_SOURCE"][2] = EnumEntry("NAVIGATION_SOURCE_GNSS", """First GNSS receiver.""")
-NAVIGATION_SOURCE_GNSS2 = 4
-enums["NAVIGATION_SOURCE"][4] = EnumEntry("NAVIGATION_SOURCE_GNSS2", """Second GNSS receiver.""")
+enums["NAVIGATION_SOURCE"][2] = EnumEntry("NAVIGATION_SOURCE_GNSS", """GNSS.""")
 NAVIGATION_SOURCE_RSBN_AZIMUTH = 8
 enums["NAVIGATION_SOURCE"][8] = EnumEntry("NAVIGATION_SOURCE_RSBN_AZIMUTH", """Azimuth to a radio beacon.""")
 NAVIGATION_SOURCE_RSBN_RANGE = 16
 enums["NAVIGATION_SOURCE"][16] = EnumEntry("NAVIGATION_SOURCE_RSBN_RANGE", """Slant range to a radio beacon.""")
 NAVIGATION_SOURCE_AIR_DATA = 32
 enums["NAVIGATION_SOURCE"][32] = EnumEntry("NAVIGATION_SOURCE_AIR_DATA", """Airspeed and wind.""")
-NAVIGATION_SOURCE_BAROMETER = 64
-enums["NAVIGATION_SOURCE"][64] = EnumEntry("NAVIGATION_SOURCE_BAROMETER", """Barometric altitude.""")
-NAVIGATION_SOURCE_ENUM_END = 65
-enums["NAVIGATION_SOURCE"][65] = EnumEntry("NAVIGATION_SOURCE_ENUM_END", """""")
+NAVIGATION_SOURCE_ENUM_END = 33
+enums["NAVIGATION_SOURCE"][33] = EnumEntry("NAVIGATION_SOURCE_ENUM_END", """""")
 
 # message IDs
 MAVLINK_MSG_ID_BAD_DATA = -1
@@ -507,28 +495,29 @@ setattr(MAVLink_rsbn_measurement_message, "name", mavlink_msg_deprecated_name_pr
 class MAVLink_navigation_status_message(MAVLink_message):
     """
     State of the companion's estimate beyond the standard messages:
-    mode, sources, guaranteed bounds now and in the minutes ahead, and
-    disagreement of the estimators. NaN: unknown.
+    mode, sources, guaranteed bounds now and in the minutes ahead,
+    disagreement of the estimators, bounds of the tilt and drift of an
+    INS of its own. NaN: unknown.
     """
 
     id = MAVLINK_MSG_ID_NAVIGATION_STATUS
     msgname = "NAVIGATION_STATUS"
-    fieldnames = ["time_usec", "bound_north", "bound_east", "bound_horizontal", "bound_velocity", "sigma_horizontal", "horizon", "disagreement", "ahead", "bound_ahead", "sources", "rejected", "age", "mode", "estimator", "protection", "trust"]
-    ordered_fieldnames = ["time_usec", "bound_north", "bound_east", "bound_horizontal", "bound_velocity", "sigma_horizontal", "horizon", "disagreement", "ahead", "bound_ahead", "sources", "rejected", "age", "mode", "estimator", "protection", "trust"]
-    fieldtypes = ["uint64_t", "float", "float", "float", "float", "float", "float", "float", "float", "float", "uint16_t", "uint16_t", "uint16_t", "uint8_t", "uint8_t", "float", "uint8_t"]
+    fieldnames = ["time_usec", "bound_north", "bound_east", "bound_horizontal", "bound_velocity", "sigma_horizontal", "horizon", "disagreement", "ahead", "bound_ahead", "sources", "rejected", "age", "mode", "estimator", "protection", "trust", "tilt_bound", "drift_bound"]
+    ordered_fieldnames = ["time_usec", "bound_north", "bound_east", "bound_horizontal", "bound_velocity", "sigma_horizontal", "horizon", "disagreement", "ahead", "bound_ahead", "sources", "rejected", "age", "mode", "estimator", "protection", "trust", "tilt_bound", "drift_bound"]
+    fieldtypes = ["uint64_t", "float", "float", "float", "float", "float", "float", "float", "float", "float", "uint16_t", "uint16_t", "uint16_t", "uint8_t", "uint8_t", "float", "uint8_t", "float", "float"]
     fielddisplays_by_name: Dict[str, str] = {"sources": "bitmask"}
     fieldenums_by_name: Dict[str, str] = {"sources": "NAVIGATION_SOURCE", "mode": "NAVIGATION_MODE", "estimator": "NAVIGATION_ESTIMATOR", "trust": "NAVIGATION_TRUST"}
-    fieldunits_by_name: Dict[str, str] = {"time_usec": "us", "bound_north": "m", "bound_east": "m", "bound_horizontal": "m", "bound_velocity": "m/s", "sigma_horizontal": "m", "horizon": "s", "disagreement": "m", "ahead": "s", "bound_ahead": "m", "age": "ms", "protection": "m"}
-    native_format = bytearray(b"<QfffffffffHHHBBfB")
-    orders = [0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 16]
-    lengths = [1, 1, 1, 1, 1, 1, 1, 1, 4, 4, 1, 1, 1, 1, 1, 1, 1]
-    array_lengths = [0, 0, 0, 0, 0, 0, 0, 0, 4, 4, 0, 0, 0, 0, 0, 0, 0]
+    fieldunits_by_name: Dict[str, str] = {"time_usec": "us", "bound_north": "m", "bound_east": "m", "bound_horizontal": "m", "bound_velocity": "m/s", "sigma_horizontal": "m", "horizon": "s", "disagreement": "m", "ahead": "s", "bound_ahead": "m", "age": "ms", "protection": "m", "tilt_bound": "rad", "drift_bound": "rad/s"}
+    native_format = bytearray(b"<QfffffffffHHHBBfBff")
+    orders = [0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 16, 17, 18]
+    lengths = [1, 1, 1, 1, 1, 1, 1, 1, 4, 4, 1, 1, 1, 1, 1, 1, 1, 2, 2]
+    array_lengths = [0, 0, 0, 0, 0, 0, 0, 0, 4, 4, 0, 0, 0, 0, 0, 0, 0, 2, 2]
     crc_extra = 14
-    unpacker = struct.Struct("<Qfffffff4f4fHHHBBfB")
+    unpacker = struct.Struct("<Qfffffff4f4fHHHBBfB2f2f")
     instance_field = None
     instance_offset = -1
 
-    def __init__(self, time_usec: int, bound_north: float, bound_east: float, bound_horizontal: float, bound_velocity: float, sigma_horizontal: float, horizon: float, disagreement: float, ahead: Sequence[float], bound_ahead: Sequence[float], sources: int, rejected: int, age: int, mode: int, estimator: int, protection: float = 0, trust: int = 0):
+    def __init__(self, time_usec: int, bound_north: float, bound_east: float, bound_horizontal: float, bound_velocity: float, sigma_horizontal: float, horizon: float, disagreement: float, ahead: Sequence[float], bound_ahead: Sequence[float], sources: int, rejected: int, age: int, mode: int, estimator: int, protection: float = 0, trust: int = 0, tilt_bound: Sequence[float] = (0, 0), drift_bound: Sequence[float] = (0, 0)):
         MAVLink_message.__init__(self, MAVLink_navigation_status_message.id, MAVLink_navigation_status_message.msgname)
         self._fieldnames = MAVLink_navigation_status_message.fieldnames
         self._instance_field = MAVLink_navigation_status_message.instance_field
@@ -550,9 +539,11 @@ class MAVLink_navigation_status_message(MAVLink_message):
         self.estimator = estimator
         self.protection = protection
         self.trust = trust
+        self.tilt_bound = tilt_bound
+        self.drift_bound = drift_bound
 
     def pack(self, mav: "MAVLink", force_mavlink1: bool = False) -> bytes:
-        return self._pack(mav, self.crc_extra, self.unpacker.pack(self.time_usec, self.bound_north, self.bound_east, self.bound_horizontal, self.bound_velocity, self.sigma_horizontal, self.horizon, self.disagreement, self.ahead[0], self.ahead[1], self.ahead[2], self.ahead[3], self.bound_ahead[0], self.bound_ahead[1], self.bound_ahead[2], self.bound_ahead[3], self.sources, self.rejected, self.age, self.mode, self.estimator, self.protection, self.trust), force_mavlink1=force_mavlink1)
+        return self._pack(mav, self.crc_extra, self.unpacker.pack(self.time_usec, self.bound_north, self.bound_east, self.bound_horizontal, self.bound_velocity, self.sigma_horizontal, self.horizon, self.disagreement, self.ahead[0], self.ahead[1], self.ahead[2], self.ahead[3], self.bound_ahead[0], self.bound_ahead[1], self.bound_ahead[2], self.bound_ahead[3], self.sources, self.rejected, self.age, self.mode, self.estimator, self.protection, self.trust, self.tilt_bound[0], self.tilt_bound[1], self.drift_bound[0], self.drift_bound[1]), force_mavlink1=force_mavlink1)
 
 
 # Define name on the class for backwards compatibility (it is now msgname).
@@ -1001,11 +992,12 @@ class MAVLink(object):
         """
         self.send(self.rsbn_measurement_encode(time_usec, beacon_lat, beacon_lon, beacon_alt, azimuth, slant_range, sigma_azimuth, sigma_range, beacon_id, status), force_mavlink1=force_mavlink1)
 
-    def navigation_status_encode(self, time_usec: int, bound_north: float, bound_east: float, bound_horizontal: float, bound_velocity: float, sigma_horizontal: float, horizon: float, disagreement: float, ahead: Sequence[float], bound_ahead: Sequence[float], sources: int, rejected: int, age: int, mode: int, estimator: int, protection: float = 0, trust: int = 0) -> MAVLink_navigation_status_message:
+    def navigation_status_encode(self, time_usec: int, bound_north: float, bound_east: float, bound_horizontal: float, bound_velocity: float, sigma_horizontal: float, horizon: float, disagreement: float, ahead: Sequence[float], bound_ahead: Sequence[float], sources: int, rejected: int, age: int, mode: int, estimator: int, protection: float = 0, trust: int = 0, tilt_bound: Sequence[float] = (0, 0), drift_bound: Sequence[float] = (0, 0)) -> MAVLink_navigation_status_message:
         """
         State of the companion's estimate beyond the standard messages: mode,
-        sources, guaranteed bounds now and in the minutes ahead, and
-        disagreement of the estimators. NaN: unknown.
+        sources, guaranteed bounds now and in the minutes ahead,
+        disagreement of the estimators, bounds of the tilt and drift
+        of an INS of its own. NaN: unknown.
 
         time_usec                 : Time for which the estimate is valid (UNIX epoch time or time since boot, distinguished by magnitude). [us] (type:uint64_t)
         bound_north               : Guaranteed r.m.s. bound of the north error. [m] (type:float)
@@ -1024,15 +1016,18 @@ class MAVLink(object):
         estimator                 : The estimator in use. (type:uint8_t, values:NAVIGATION_ESTIMATOR)
         protection                : Horizontal protection level: the error exceeds it with the configured risk at most, even if any one source is faulty. 0: unknown. [m] (type:float)
         trust                     : How far the estimate can be trusted. (type:uint8_t, values:NAVIGATION_TRUST)
+        tilt_bound                : Guaranteed r.m.s. bounds of the tilt of an INS, of the north and of the east Schuler channel. 0: none. [rad] (type:float)
+        drift_bound               : Guaranteed r.m.s. bounds of the gyro drift of an INS, of the north and of the east Schuler channel. 0: none. [rad/s] (type:float)
 
         """
-        return MAVLink_navigation_status_message(time_usec, bound_north, bound_east, bound_horizontal, bound_velocity, sigma_horizontal, horizon, disagreement, ahead, bound_ahead, sources, rejected, age, mode, estimator, protection, trust)
+        return MAVLink_navigation_status_message(time_usec, bound_north, bound_east, bound_horizontal, bound_velocity, sigma_horizontal, horizon, disagreement, ahead, bound_ahead, sources, rejected, age, mode, estimator, protection, trust, tilt_bound, drift_bound)
 
-    def navigation_status_send(self, time_usec: int, bound_north: float, bound_east: float, bound_horizontal: float, bound_velocity: float, sigma_horizontal: float, horizon: float, disagreement: float, ahead: Sequence[float], bound_ahead: Sequence[float], sources: int, rejected: int, age: int, mode: int, estimator: int, protection: float = 0, trust: int = 0, force_mavlink1: bool = False) -> None:
+    def navigation_status_send(self, time_usec: int, bound_north: float, bound_east: float, bound_horizontal: float, bound_velocity: float, sigma_horizontal: float, horizon: float, disagreement: float, ahead: Sequence[float], bound_ahead: Sequence[float], sources: int, rejected: int, age: int, mode: int, estimator: int, protection: float = 0, trust: int = 0, tilt_bound: Sequence[float] = (0, 0), drift_bound: Sequence[float] = (0, 0), force_mavlink1: bool = False) -> None:
         """
         State of the companion's estimate beyond the standard messages: mode,
-        sources, guaranteed bounds now and in the minutes ahead, and
-        disagreement of the estimators. NaN: unknown.
+        sources, guaranteed bounds now and in the minutes ahead,
+        disagreement of the estimators, bounds of the tilt and drift
+        of an INS of its own. NaN: unknown.
 
         time_usec                 : Time for which the estimate is valid (UNIX epoch time or time since boot, distinguished by magnitude). [us] (type:uint64_t)
         bound_north               : Guaranteed r.m.s. bound of the north error. [m] (type:float)
@@ -1051,6 +1046,8 @@ class MAVLink(object):
         estimator                 : The estimator in use. (type:uint8_t, values:NAVIGATION_ESTIMATOR)
         protection                : Horizontal protection level: the error exceeds it with the configured risk at most, even if any one source is faulty. 0: unknown. [m] (type:float)
         trust                     : How far the estimate can be trusted. (type:uint8_t, values:NAVIGATION_TRUST)
+        tilt_bound                : Guaranteed r.m.s. bounds of the tilt of an INS, of the north and of the east Schuler channel. 0: none. [rad] (type:float)
+        drift_bound               : Guaranteed r.m.s. bounds of the gyro drift of an INS, of the north and of the east Schuler channel. 0: none. [rad/s] (type:float)
 
         """
-        self.send(self.navigation_status_encode(time_usec, bound_north, bound_east, bound_horizontal, bound_velocity, sigma_horizontal, horizon, disagreement, ahead, bound_ahead, sources, rejected, age, mode, estimator, protection, trust), force_mavlink1=force_mavlink1)
+        self.send(self.navigation_status_encode(time_usec, bound_north, bound_east, bound_horizontal, bound_velocity, sigma_horizontal, horizon, disagreement, ahead, bound_ahead, sources, rejected, age, mode, estimator, protection, trust, tilt_bound, drift_bound), force_mavlink1=force_mavlink1)

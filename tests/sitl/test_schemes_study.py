@@ -1,0 +1,36 @@
+"""Feedforward, feedback and shares in between are informationally equivalent in flight."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sitl.scenarios import get_scenario
+from sitl.schemes_study import SchemeFlight, apart_m, fly
+from sitl.world import World
+
+
+@pytest.fixture(scope="module")
+def flights() -> dict[object, SchemeFlight]:
+    world = World(get_scenario("short"))
+    return {scheme: fly(world, "air_data", scheme) for scheme in ("feedforward", 0.3, "feedback")}
+
+
+@pytest.mark.parametrize("scheme", [0.3, "feedback"])
+def test_schemes_use_the_same_fixes(flights: dict[object, SchemeFlight], scheme: object) -> None:
+    first, other = flights["feedforward"], flights[scheme]
+    assert (other.fixes, other.joint, other.rejected) == (first.fixes, first.joint, first.rejected)
+    assert first.joint > 100  # a beacon's answer with the GNSS fix of a moment ago
+
+
+@pytest.mark.parametrize("scheme", [0.3, "feedback"])
+def test_schemes_have_the_same_position_and_bound(
+    flights: dict[object, SchemeFlight], scheme: object
+) -> None:
+    first, other = flights["feedforward"], flights[scheme]
+    rms, most = apart_m(first, other)
+    assert rms < 0.1 and most < 0.5  # m; azimuth and range are linearised elsewhere
+    both = np.isfinite(first.bound).all(axis=1) & np.isfinite(other.bound).all(axis=1)
+    assert both.mean() > 0.9
+    ratio = np.hypot(*other.bound[both].T) / np.hypot(*first.bound[both].T)
+    assert np.median(np.abs(ratio - 1.0)) < 0.02
