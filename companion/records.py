@@ -203,6 +203,47 @@ class RsbnFix(Stamped, frozen=True, gc=False, tag=True):
     sigma_range: float
 
 
+class RangeDifference(Stamped, frozen=True, gc=False, tag=True):
+    """Line of position of a hyperbolic system: distance to station a minus distance to station b, m.
+
+    `chain` identifies the pair; altitudes of the stations are above the ellipsoid.
+    """
+
+    chain: int
+    lat_a: float
+    lon_a: float
+    alt_a: float
+    lat_b: float
+    lon_b: float
+    alt_b: float
+    difference: float
+    sigma: float
+
+
+class StarFix(Stamped, frozen=True, gc=False, tag=True):
+    """Altitude and azimuth of a star against the axes of the INS, rad, refraction removed.
+
+    `lat`, `lon`: where the star is in the zenith at that time (declination, and hour angle from Greenwich
+    taken east). `azimuth`, from the INS's north clockwise, may be None.
+    """
+
+    star: int
+    lat: float
+    lon: float
+    altitude: float
+    azimuth: float | None
+    sigma_altitude: float
+    sigma_azimuth: float
+
+
+class SecondIns(Stamped, frozen=True, gc=False, tag=True):
+    """Position of a second INS, rad; its errors are its own."""
+
+    source: int
+    lat: float
+    lon: float
+
+
 class Reboot(Stamped, frozen=True, gc=False, tag=True):
     """The autopilot rebooted: its origin, clock and inertial channel change."""
 
@@ -419,6 +460,9 @@ Input: TypeAlias = (
     | FilterStatus
     | SystemTime
     | RsbnFix
+    | RangeDifference
+    | StarFix
+    | SecondIns
     | Reboot
     | Tuning
 )

@@ -28,6 +28,7 @@ from companion.analysis.replay_inputs import (
     input_errors_as_log_errors,
     is_own_log,
     with_beacons_and_outages,
+    with_correctors,
 )
 from companion.config import Config, load
 from companion.importers import gnss_latency
@@ -155,6 +156,13 @@ def create_replay_log(
 )
 @click.option("--rsbn", "beacons", type=click.Path(path_type=Path), help="Simulate the beacons of this CSV.")
 @click.option(
+    "--correctors",
+    "tables",
+    multiple=True,
+    type=click.Path(path_type=Path),
+    help="Add the star fixes, lines of position or second INS of this CSV; may be repeated.",
+)
+@click.option(
     "--outage",
     "outages",
     multiple=True,
@@ -169,6 +177,7 @@ def command(
     config_file: Path | None,
     changes: tuple[str, ...],
     beacons: Path | None,
+    tables: tuple[Path, ...],
     outages: tuple[str, ...],
     seed: int,
     as_json: bool,
@@ -195,13 +204,15 @@ def command(
     if own and not is_closed(log):
         notes.append("the log was not closed: its last messages may be missing")
     if output is not None:
-        reject_own_input(output, log, beacons, config_file)
-    if has_navigator_outputs(log) and not (changes or beacons or simulated_outages):
+        reject_own_input(output, log, beacons, config_file, *tables)
+    if has_navigator_outputs(log) and not (changes or beacons or tables or simulated_outages):
         found = _replay_as_flown(log, output, config)
     else:
         output = output or Path(f"{log.name.split('.mcap')[0] if own else log.stem}.replay.mcap")
         with input_errors_as_log_errors():
-            found, more, counts = _replay_changed(log, output, config, beacons, simulated_outages, seed)
+            found, more, counts = _replay_changed(
+                log, output, config, beacons, tables, simulated_outages, seed
+            )
         notes += more
     seconds = time.perf_counter() - start
     if as_json:
@@ -239,11 +250,13 @@ def _replay_changed(
     output: Path,
     config: Config,
     beacons: Path | None,
+    tables: Sequence[Path],
     outages: Sequence[simulated_rsbn.SimulatedOutage],
     seed: int,
 ) -> tuple[ReplayResult, list[str], dict[str, int]]:
     """Replay any log, with changes, and write it to `output`. Return result, notes, counts."""
     log_inputs, note = with_beacons_and_outages(log, beacons, outages, seed, config)
+    log_inputs = with_correctors(log_inputs, tables)
     tracks, logged = gnss_latency.TrackCollector(), set[Stamped]()
     with Progress(console=Console(stderr=True), transient=True) as progress:
         records = progress.track(

@@ -18,7 +18,7 @@ from msgspec import structs
 
 from companion.analysis import simulated_rsbn
 from companion.config import Config, ConfigError, load
-from companion.importers import sources
+from companion.importers import corrector_csv, sources
 from companion.records import Stamped
 from companion.storage import flight_log
 from companion.storage.reader import ACTIVE, LogError
@@ -106,6 +106,18 @@ def input_errors_as_log_errors() -> Iterator[None]:
         raise
     except OSError as error:
         raise LogError(f"{error.filename} cannot be read: {error.strerror}") from None
+
+
+def with_correctors(log_inputs: LogInputs, tables: Sequence[Path]) -> LogInputs:
+    """Add the records of corrector tables (CSV) at their times; t_s = 0 is the first record of the log."""
+    records = iter(log_inputs.records)
+    first = next(records, None)
+    if first is None or not tables:
+        return log_inputs._replace(records=[] if first is None else chain([first], records))
+    with input_errors_as_log_errors():
+        added = [corrector_csv.read_correctors(table, first.rx_ns) for table in tables]
+    merged = heapq.merge(chain([first], records), *added, key=lambda record: record.rx_ns)
+    return log_inputs._replace(records=merged)
 
 
 def with_beacons_and_outages(

@@ -84,6 +84,10 @@ TEXTS: dict[str, dict[str, tuple[str, str]]] = {
             "Error of the height without GNSS, for the slant range of beacons.",
             "the pressure altitude is corrected, or is known to be worse",
         ),
+        "correctors": (
+            "Correctors of an INS of its own: airspeed, hyperbolic (lines of position), stars, second_ins.",
+            "the aircraft has one of them and its records are received",
+        ),
         "strapped_down": (
             "The sensors turn with the aircraft; false: gimballed platform.",
             "the INS is gimballed",

@@ -26,7 +26,7 @@ from companion.estimate.bank import (
     start,
 )
 from companion.navigator.channel import Channel, Nominal, Transition
-from companion.navigator.ins_channel import ins_channel
+from companion.navigator.corrected_ins import corrected_ins
 from companion.navigator.own_channel import OwnChannel
 
 GNSS, AIRSPEED = 0, 1  # sources; those of beacon k are `azimuth(k)` and `range(k)`
@@ -91,7 +91,7 @@ class Model:
         if plain is not None:
             config = structs.replace(config, air_data=without_jumps(config.air_data))
         self.config, self.plain = config, plain
-        self.channel: Channel = ins_channel(config) if config.has_own_ins else OwnChannel(config)
+        self.channel: Channel = corrected_ins(config) if config.has_own_ins else OwnChannel(config)
         self._known: dict[tuple[int, bool, bool], Hypotheses] = {}
 
     def hypotheses(self, beacons: int, by_air: bool = False, witness: bool = True) -> Hypotheses:

@@ -19,6 +19,7 @@ from companion.estimate.fusion import Azimuth, Range
 from companion.nav.geometry import Geodetic, separation_tuple
 from companion.navigator import fix_observations, own_error_model
 from companion.navigator.channel import Channel
+from companion.navigator.corrector_measurements import CorrectorRows
 from companion.navigator.hypotheses import AIRSPEED, AIRSPEED_GROUP, CONSISTENT, GNSS, GNSS_GROUP, Hypotheses
 from companion.navigator.inertial_track import Point
 from companion.navigator.own_channel import OwnChannel
@@ -33,6 +34,10 @@ OUTLIER = {
     "azimuth": math.log(1e-4 / 0.1),
     "range": math.log(1e-4 / 5000.0),
 }
+
+
+#: Half the normalised squared innovation of a corrector's component at which it is an outlier: five sigma.
+CORRECTOR_GATE = 12.5
 
 
 class Taken(NamedTuple):
@@ -137,6 +142,18 @@ def foreign_velocity(bank: Bank, known: Hypotheses, channel: OwnChannel, apart: 
         bank, known.layout, row.y, H, row.R, None, known.settings, outlier=OUTLIER["velocity"]
     )
     return _taken(after, seen, 2)
+
+
+def corrector(bank: Bank, known: Hypotheses, rows: CorrectorRows) -> Taken:
+    """Take what a corrector of an INS measures; it has no source that may be false, but may be an outlier."""
+    H = np.zeros((len(rows.z), known.layout.n_base))
+    H[:, : rows.H.shape[1]] = rows.H
+    spread = float(
+        np.linalg.slogdet(2.0 * math.pi * (H @ bank.P[0, : H.shape[1], : H.shape[1]] @ H.T + rows.R))[1]
+    )
+    outlier = -0.5 * spread - CORRECTOR_GATE * len(rows.z)
+    after, seen = banks.update(bank, known.layout, rows.z, H, rows.R, None, known.settings, outlier=outlier)
+    return _taken(after, seen, len(rows.z))
 
 
 def sight(

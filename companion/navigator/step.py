@@ -19,6 +19,7 @@ from companion.estimate.fusion import Azimuth
 from companion.nav.geometry import displace
 from companion.navigator import (
     air_data_channel,
+    corrector_measurements,
     fix_observations,
     height_error,
     inertial_track,
@@ -30,6 +31,8 @@ from companion.navigator import (
     strapdown_channel,
 )
 from companion.navigator.channel import Nominal, moved
+from companion.navigator.corrected_ins import CorrectedIns
+from companion.navigator.corrector_measurements import CorrectorRows
 from companion.navigator.hypotheses import AIRSPEED, GNSS, JAMMED, MOST_BEACONS
 from companion.navigator.inertial_track import Point
 from companion.navigator.local_origin import LIVE_WINDOW_NS, infer_origin
@@ -67,13 +70,16 @@ from companion.records import (
     LocalPosition,
     Output,
     Pressure,
+    RangeDifference,
     Reboot,
     Rejection,
     Reset,
     RsbnFix,
+    SecondIns,
     Severity,
     Source,
     Stamped,
+    StarFix,
     Tuning,
     Vector2,
 )
@@ -83,6 +89,7 @@ PATIENCE_NS = 5 * SECOND_NS  # wait for the autopilot's own origin
 CONFIRM_NS = SECOND_NS  # one fix in disagreement is an outlier: a source is excluded once it lasts
 JUMP_SPREAD_S = 0.5  # across a longer silence a turn explains a step as well as a jump does
 FAR_M, FAST_M_S = 500.0, 5.0  # the nominal trajectory is brought back from this far off
+CORRECTOR_AIRSPEED_NS = 5 * SECOND_NS  # gusts last seconds: beside an INS more often tells no more
 AIRSPEED_EVERY_NS = 500_000_000  # gusts are correlated: more often tells no more
 FOREIGN_EVERY_NS = SECOND_NS
 BLOCKED_M_S = 5.0  # slower, in flight, a pitot is blocked
@@ -480,6 +487,75 @@ def _rsbn(state: State, record: RsbnFix, settings: Settings) -> Step:
     return _nearer(state, settings), out
 
 
+# ---------------------------------------------------------------------------------------------------------
+# Correctors of an INS
+# ---------------------------------------------------------------------------------------------------------
+
+
+def _sensed(state: State, record: Attitude | Pressure, settings: Settings) -> Step:
+    """Remember attitude and pressure for the airspeed beside an INS."""
+    s = state.sensors
+    return state._replace(sensors=s._replace(air=air_data_channel.sense(s.air, record))), []
+
+
+def _airspeed_beside_ins(state: State, record: AirData, settings: Settings) -> Step:
+    s, nominal = state.sensors, state.nominal
+    if nominal is None or not own_channel.airspeed_is_sensed(s, record):
+        return state, []
+    V = own_channel.air_velocity(s, record, nominal.point.position.alt)
+    if V is None or math.hypot(*V) < own_error_model.FLYING_M_S:
+        return state, []
+    if record.t_ns - s.measured_ns < CORRECTOR_AIRSPEED_NS:
+        return state, []
+    state = state._replace(sensors=s._replace(measured_ns=record.t_ns))
+    return _corrected_by(state, record, settings, "airspeed")
+
+
+def _corrector(name: str) -> Callable[[State, Any, Settings], Step]:
+    def use(state: State, record: Any, settings: Settings) -> Step:
+        return _corrected_by(state, record, settings, name)
+
+    return use
+
+
+def _corrected_by(state: State, record: Any, settings: Settings, name: str) -> Step:
+    """Update by a corrector; nothing before the first fix."""
+    if state.nominal is None or state.bank is None or _silent(state, record.t_ns):
+        return state, []
+    state = _propagated(_carried(state, record.t_ns), settings)
+    assert state.nominal is not None
+    assert state.bank is not None
+    rows = _rows_of(state, record, settings)
+    if rows is None:
+        return state, [
+            Rejection(record.t_ns, record.rx_ns, name, "star below the horizon or near the zenith")
+        ]
+    taken = measurements.corrector(state.bank, hypotheses(state, settings), rows)
+    state, out = _decided(state._replace(bank=taken.bank), record, settings)
+    if not taken.accepted:
+        why = "outlier: normalised squared innovation"
+        out.append(Rejection(record.t_ns, record.rx_ns, name, why, taken.nis))
+    return state, out
+
+
+def _rows_of(state: State, record: Any, settings: Settings) -> CorrectorRows | None:
+    channel, nominal = settings.model.channel, state.nominal
+    assert isinstance(channel, CorrectedIns)
+    assert nominal is not None
+    if isinstance(record, AirData):
+        V = own_channel.air_velocity(state.sensors, record, nominal.point.position.alt)
+        assert V is not None
+        gust = settings.config.air_data.gust_m_s
+        heading = math.atan2(V[1], V[0])
+        return corrector_measurements.airspeed(channel, nominal.point, math.hypot(*V), heading, gust)
+    if isinstance(record, SecondIns):
+        return corrector_measurements.second_ins(channel, nominal.point, record)
+    point, centre = corrected(nominal.point, state)
+    if isinstance(record, StarFix):
+        return corrector_measurements.star(channel, point, centre, record)
+    return corrector_measurements.range_difference(channel, point, centre, record)
+
+
 def _beacon(state: State, record: RsbnFix, settings: Settings) -> tuple[State, int, list[Output]]:
     """The number of the beacon that answered; a new one takes a new place, or the most silent one's."""
     assert state.bank is not None
@@ -688,6 +764,17 @@ _COMMON: _Uses = {
     Reboot: _reboot,
 }
 _INS: _Uses = {**_COMMON, LocalPosition: _ins_position}
+_CORRECTORS: dict[str, _Uses] = {
+    "airspeed": {
+        AirData: _airspeed_beside_ins,
+        Attitude: _sensed,
+        Pressure: _sensed,
+        AirspeedSensor: _airspeed_sensor,
+    },
+    "hyperbolic": {RangeDifference: _corrector("hyperbolic")},
+    "stars": {StarFix: _corrector("star")},
+    "second_ins": {SecondIns: _corrector("second INS")},
+}
 _OWN: _Uses = {
     **_COMMON,
     LocalPosition: _foreign_position,
@@ -701,7 +788,7 @@ _OWN: _Uses = {
 
 _ABOUT_LOCAL = (LocalPosition, GlobalPosition, LocalOrigin)
 _OWN_FED: _Uses = {kind: use for kind, use in _OWN.items() if kind not in _ABOUT_LOCAL}
-INPUTS_USED = tuple({*_INS, *_OWN, Tuning})
+INPUTS_USED = tuple({*_INS, *_OWN, *(kind for use in _CORRECTORS.values() for kind in use), Tuning})
 """Kinds of records that a navigator may use."""
 
 
@@ -709,6 +796,7 @@ def uses(settings: Settings) -> _Uses:
     """What each kind of record is good for, by the channel; a local position that we feed is ignored."""
     config = settings.config
     if not isinstance(settings.model.channel, OwnChannel):
-        return _INS
+        added = [_CORRECTORS[name] for name in config.inertial.correctors]
+        return {kind: use for uses in (_INS, *added) for kind, use in uses.items()}
     fed = config.output.feeds_estimator or not config.uses("local_position")
     return _OWN_FED if fed else _OWN

@@ -177,3 +177,21 @@ def test_conversion_of_an_own_log_is_rejected(tmp_path: pathlib.Path) -> None:
         result = CliRunner().invoke(cli, ["log", "convert", str(source), "-o", str(again)])
         assert result.exit_code == 1 and message in result.output
     assert not again.exists()
+
+
+def test_correctors_join_at_seconds_of_the_log(tmp_path):
+    table = tmp_path / "ins2.csv"
+    table.write_text("t_s,ins,lat_deg,lon_deg\n2.5,2,60,30\n0.5,2,60.1,30\n")
+    log = [r.Pressure(k * 1_000_000_000, k * 1_000_000_000, 1e5) for k in range(7, 11)]
+    inputs = replay_inputs.LogInputs(log, dict)
+    merged = list(replay_inputs.with_correctors(inputs, [table]).records)
+    assert [record.rx_ns / 1e9 for record in merged] == [7.0, 7.5, 8.0, 9.0, 9.5, 10.0]
+    assert [type(record) for record in merged].count(r.SecondIns) == 2
+    assert list(replay_inputs.with_correctors(inputs, []).records) == log
+
+
+def test_table_that_is_none_of_the_correctors_is_reported(tmp_path):
+    table = tmp_path / "stars.csv"
+    table.write_text("time,star\n1,2\n")
+    with pytest.raises(LogError, match="the header is 'time,star'"):
+        replay_inputs.with_correctors(replay_inputs.LogInputs([r.Pressure(0, 0, 1e5)], dict), [table])

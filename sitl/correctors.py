@@ -1,0 +1,109 @@
+"""Simulated correctors of an INS: star fixes, lines of position of a hyperbolic system, a second INS.
+
+Records with the errors that `companion.navigator.corrected_ins` assumes, of a scenario's true flight.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from companion.nav.geometry import Geodetic, ecef_tuple
+from companion.navigator.corrected_ins import CHAIN_BIAS_M
+from companion.records import RangeDifference, SecondIns, StarFix
+from companion.units import SECOND_NS, Floats
+from sitl import sensors
+from sitl.flight import Trajectory
+from sitl.world import World
+
+STAR_EVERY_S, STAR_SIGMA = 60.0, math.radians(20.0 / 3600.0)
+LINE_EVERY_S, LINE_SIGMA_M = 5.0, 50.0
+SECOND_EVERY_S = 2.0
+
+
+class Station(NamedTuple):
+    """Transmitter of a hyperbolic system, deg and m."""
+
+    lat_deg: float
+    lon_deg: float
+    alt: float = 50.0
+
+
+#: A master and two secondaries, 300 to 500 km round the flights.
+MASTER = Station(61.5, 26.0)
+SECONDARIES = (Station(58.0, 27.0), Station(60.0, 36.0))
+#: Declination and hour angle at the start, deg: in the west, south-east and north-east of 60 N, 30 E.
+STARS = ((20.0, -20.0), (10.0, 70.0), (50.0, 100.0))
+
+
+def star_fixes(world: World, rng: np.random.Generator) -> list[StarFix]:
+    """One star a minute, in turn: its altitude and azimuth on the axes of the INS."""
+    flight = _sampled(world, STAR_EVERY_S)
+    psi = sensors.interpolate_error(world.inertial_error, flight.t).psi
+    found = []
+    for k, t in enumerate(flight.t.tolist()):
+        number = k % len(STARS)
+        declination, hour = STARS[number]
+        lon = math.radians(hour) - 7.292115e-5 * t
+        s_n = direction(float(flight.lat[k]), float(flight.lon[k]), math.radians(declination), lon)
+        seen = s_n + np.cross(psi[k], s_n)  # the platform is turned by -psi
+        altitude = math.asin(-seen[2] / float(np.linalg.norm(seen))) + STAR_SIGMA * rng.standard_normal()
+        azimuth = math.atan2(seen[1], seen[0]) + STAR_SIGMA / math.cos(altitude) * rng.standard_normal()
+        t_ns = round(t * SECOND_NS)
+        sigma_azimuth = STAR_SIGMA / math.cos(altitude)
+        place = (math.radians(declination), lon)
+        found.append(StarFix(t_ns, t_ns, number, *place, altitude, azimuth, STAR_SIGMA, sigma_azimuth))
+    return found
+
+
+def direction(lat: float, lon: float, star_lat: float, star_lon: float) -> Floats:
+    """Unit vector (3,) north, east, down to a star, from its vector in the earth's frame."""
+    s_e = np.array(
+        (math.cos(star_lat) * math.cos(star_lon), math.cos(star_lat) * math.sin(star_lon), math.sin(star_lat))
+    )
+    C_ne = np.array(
+        (
+            (-math.sin(lat) * math.cos(lon), -math.sin(lat) * math.sin(lon), math.cos(lat)),
+            (-math.sin(lon), math.cos(lon), 0.0),
+            (-math.cos(lat) * math.cos(lon), -math.cos(lat) * math.sin(lon), -math.sin(lat)),
+        )
+    )
+    s_n: Floats = C_ne @ s_e
+    return s_n
+
+
+def range_differences(world: World, rng: np.random.Generator) -> list[RangeDifference]:
+    """Two lines of position every five seconds, each with a bias of its own."""
+    flight = _sampled(world, LINE_EVERY_S)
+    bias = 0.5 * CHAIN_BIAS_M * rng.standard_normal(len(SECONDARIES))
+    places = [_place(station) for station in (MASTER, *SECONDARIES)]
+    found = []
+    for k, t in enumerate(flight.t.tolist()):
+        here = np.array(
+            ecef_tuple(Geodetic(float(flight.lat[k]), float(flight.lon[k]), float(flight.alt[k])))
+        )
+        d = [float(np.linalg.norm(here - ecef_tuple(place))) for place in places]
+        t_ns = round(t * SECOND_NS)
+        for chain, secondary in enumerate(places[1:]):
+            value = d[0] - d[chain + 1] + float(bias[chain]) + LINE_SIGMA_M * rng.standard_normal()
+            found.append(RangeDifference(t_ns, t_ns, chain, *places[0], *secondary, value, LINE_SIGMA_M))
+    return found
+
+
+def second_positions(world: World, rng: np.random.Generator) -> list[SecondIns]:
+    """Positions of a second INS of the same grade, with errors of its own."""
+    error = sensors.simulate_inertial_error(world.flight, sensors.GRADES[world.scenario.grade], rng)
+    flight = _sampled(world, SECOND_EVERY_S)
+    lat, lon, _ = sensors.displace_positions(flight, sensors.interpolate_error(error, flight.t).x_n)
+    times = [round(t * SECOND_NS) for t in flight.t.tolist()]
+    return [SecondIns(t, t, 2, *place) for t, *place in zip(times, lat.tolist(), lon.tolist(), strict=True)]
+
+
+def _sampled(world: World, every_s: float) -> Trajectory:
+    return world.truth_at(np.arange(1.0, world.scenario.duration_s, every_s))
+
+
+def _place(station: Station) -> Geodetic:
+    return Geodetic(math.radians(station.lat_deg), math.radians(station.lon_deg), station.alt)

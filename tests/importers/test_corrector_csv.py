@@ -1,0 +1,55 @@
+"""Tables of correctors: values arrive in SI units, mistakes are reported with their line."""
+
+import math
+
+import pytest
+
+from companion.importers.corrector_csv import read_correctors
+from companion.records import RangeDifference, SecondIns, StarFix
+
+STAR = "t_s,star,lat_deg,lon_deg,altitude_deg,azimuth_deg,sigma_altitude_arcsec,sigma_azimuth_arcsec"
+LINE = "t_s,chain,lat_a_deg,lon_a_deg,alt_a_m,lat_b_deg,lon_b_deg,alt_b_m,difference_m,sigma_m"
+NS = 1_000_000_000
+
+
+def read(tmp_path, text):
+    path = tmp_path / "correctors.csv"
+    path.write_text(text)
+    return read_correctors(path, 5 * NS)
+
+
+def test_stars(tmp_path):
+    first, second = read(tmp_path, f"{STAR}\n60,2,20,-75,30,,20,\n1.5,1,10,70,45,200,10,15\n")
+    assert isinstance(first, StarFix)
+    assert (first.t_ns, first.star, first.lat) == (6_500_000_000, 1, math.radians(10))
+    assert first.azimuth == pytest.approx(math.radians(200))
+    assert (first.sigma_altitude, first.sigma_azimuth) == pytest.approx((4.8481368e-5, 7.2722052e-5))
+    assert second.azimuth is None and second.t_ns == 65 * NS
+
+
+def test_lines_and_second_ins(tmp_path):
+    (line,) = read(tmp_path, f"{LINE}\n2,1,61,26,50,58,27,60,-1234.5,50\n")
+    assert isinstance(line, RangeDifference)
+    assert (line.chain, line.alt_b, line.difference, line.sigma) == (1, 60.0, -1234.5, 50.0)
+    assert line.lat_a == math.radians(61)
+    assert read(tmp_path, "t_s,ins,lat_deg,lon_deg\n0,2,60,30\n") == [
+        SecondIns(5 * NS, 5 * NS, 2, math.radians(60), math.radians(30))
+    ]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("a,b\n1,2\n", "the header is 'a,b'"),
+        ("", "the header is ''"),
+        (f"{STAR}\n1,1,10,70,x,200,10,15\n", "line 2: could not convert"),
+        (f"{STAR}\n1,1,10,70,45\n", "line 2"),
+        (f"{STAR}\n1,1,100,70,45,200,10,15\n", "line 2: lat is 100 deg"),
+        (f"{STAR}\n1,1,,70,45,200,10,15\n", "lat_deg is missing"),
+        (f"{LINE}\n2,1,61,26,50,58,27,60,-1234.5,0\n", "sigma is 0; it must be positive"),
+    ],
+)
+def test_mistakes_are_reported(tmp_path, text, message):
+    with pytest.raises(ValueError, match=r"correctors\.csv") as caught:
+        read(tmp_path, text)
+    assert message in str(caught.value)
