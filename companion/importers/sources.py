@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from companion.importers import dataflash, inertialnav, px4_csv, tlog, ulog
-from companion.link.decode import MAKES, Autopilot, Sender, decode
+from companion.link.decode import DECODED, MAKES, Autopilot, Sender, decode
 from companion.link.dialect import mavlink, rsbn
 from companion.link.session import LinkUp, MessageReceived, Rebooted, SecondAutopilot, Session
 from companion.nav.geometry import Projection
@@ -84,8 +84,10 @@ class TlogSource:
 
     def _records(self, event: object) -> Iterator[Stamped]:
         match event:
-            case MessageReceived(rx_ns, message, found, ours) if ours or found.msgid == _RSBN:
-                for record in decode(message, rx_ns, self._sender):
+            case MessageReceived(received_ns=rx_ns, frame=found, from_autopilot=ours):
+                if found.msgid not in DECODED or not (ours or found.msgid == _RSBN):
+                    return
+                for record in decode(event.message, rx_ns, self._sender):
                     yield record
                     if self._origin and (origin := self._origin.update(record, self._sender.autopilot)):
                         yield origin
