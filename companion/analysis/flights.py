@@ -23,6 +23,7 @@ from companion.storage import flight_log
 from companion.storage.reader import LogError
 from companion.storage.run_metadata import run_metadata
 
+MAX_NS = 2**62
 OWN_INS = "local position of an INS of its own"
 SENSORS = {
     "imu": "its IMU",
@@ -77,7 +78,9 @@ def _channel(config: Config) -> str:
 
 def _read_outputs(path: Path) -> Iterator[tuple[str, Stamped]]:
     for entry in flight_log.read(path):
-        if not isinstance(entry.value, bytes):
+        if isinstance(entry.value, Stamped):
+            if max(abs(entry.value.t_ns), abs(entry.value.rx_ns)) >= MAX_NS:
+                raise LogError(f"{path}: a record of {entry.topic} has an impossible time")
             yield entry.topic, entry.value
 
 

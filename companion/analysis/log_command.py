@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from companion.printable import printable
 from companion.storage.flight_log import Info, LogError, info, recover
 
 
@@ -117,7 +118,8 @@ def _print(found: Info) -> None:
     state = (
         "closed" if found.closed else f"torn ({found.bytes_lost} bytes unreadable; run companion log recover)"
     )
-    console.print(f"[bold]{escape(str(found.path))}[/]  {found.bytes / 1e6:.3f} MB, {state}", soft_wrap=True)
+    name = escape(printable(str(found.path)))
+    console.print(f"[bold]{name}[/]  {found.bytes / 1e6:.3f} MB, {state}", soft_wrap=True)
     if found.messages:
         start = datetime.fromtimestamp(found.start_ns / 1e9, UTC).isoformat(timespec="milliseconds")
         console.print(f"{start}, {found.duration_s:.1f} s, {found.messages} messages, {found.chunks} chunks")
@@ -125,15 +127,16 @@ def _print(found: Info) -> None:
     table.add_column("messages", justify="right")
     table.add_column("Hz", justify="right")
     for topic, count in sorted(found.counts.items()):
-        table.add_row(escape(topic), str(count), f"{count * rate:.2f}")
+        table.add_row(escape(printable(topic)), str(count), f"{count * rate:.2f}")
     console.print(table)
     for name, values in found.metadata.items():
         for key, value in values.items():
             head, *rest = value.splitlines() or [""]
             more = f" ... ({len(rest)} more lines)" if rest else ""
-            console.print(escape(f"{name}.{key}: {head}{more}"), soft_wrap=True, highlight=False)
+            line = printable(f"{name}.{key}: {head}{more}")
+            console.print(escape(line), soft_wrap=True, highlight=False)
 
 
 def _fail(error: LogError) -> NoReturn:
-    click.echo(str(error), err=True)
+    click.echo(printable(str(error)), err=True)
     sys.exit(1)

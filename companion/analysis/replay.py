@@ -33,6 +33,7 @@ from companion.analysis.replay_inputs import (
 from companion.config import Config, load
 from companion.importers import gnss_latency
 from companion.navigator import Navigator
+from companion.printable import printable
 from companion.records import INPUTS, OUTPUTS, Event, Reboot, Solution, Stamped
 from companion.storage import flight_log
 from companion.storage.reader import LogError, is_closed
@@ -160,7 +161,7 @@ def create_replay_log(
     "tables",
     multiple=True,
     type=click.Path(path_type=Path),
-    help="Add the star fixes or lines of position of this CSV; may be repeated.",
+    help="Add the star fixes, lines of position or second INS of this CSV; may be repeated.",
 )
 @click.option(
     "--outage",
@@ -319,7 +320,7 @@ def _print(
     if found.compared is not None:
         click.echo(f"  compared with the flight: {found.compared} outputs, {_comparison(found)}")
         if found.first_difference:
-            click.echo(f"  first difference: {found.first_difference}")
+            click.echo(f"  first difference: {printable(found.first_difference)}")
     if output is not None:
         click.echo(f"  written to {output}")
 

@@ -24,6 +24,7 @@ from companion.analysis.summary import summarize_flight
 from companion.analysis.verdict import judge_flight
 from companion.config import load
 from companion.optional_dependencies import missing_package
+from companion.printable import printable
 from companion.storage.reader import LogError
 
 
@@ -77,8 +78,8 @@ def command(
     for block in blocks:
         for flight in block.flights:
             verdict = judge_flight(flight)
-            click.echo(f"{verdict.word}: {verdict.reason} {verdict.number} {verdict.what}.")
-            click.echo(" ".join(summarize_flight(flight)))
+            click.echo(f"{verdict.word}: {printable(verdict.reason)} {verdict.number} {verdict.what}.")
+            click.echo(printable(" ".join(summarize_flight(flight))))
     click.echo(f"written: {', '.join(str(path) for path in written)}")
 
 

@@ -3,7 +3,7 @@
     log = dataflash.read(path)
     for record in log: ...              # in the order of the file
 
-pymavlink's DFReader splits the file into messages; `MessageConverter` turns messages into records and does no
+`dataflash_messages` splits the file into messages; `MessageConverter` turns messages into records and does no
 I/O, so that other formats with the same messages can use it. Arrival and validity are the same instant, as
 the log is written on board: UNIX time if the log has a GPS time, else time since boot. Only the primary lane
 of the filter is converted, EKF3 (XKF) before EKF2 (NKF). Names and units are those of the @LoggerMessage
@@ -12,13 +12,21 @@ comments in ArduPilot's sources.
 
 from __future__ import annotations
 
-import contextlib
-import io
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
-from typing import Any, TypeAlias
 
+from companion.importers import dataflash_messages
+from companion.importers.dataflash_messages import FoundMessage, Message
+from companion.importers.foreign_file import (
+    MAX_BOOT_US,
+    MAX_TEXT,
+    Damage,
+    Step,
+    map_file,
+    one_line,
+    steady_steps,
+)
 from companion.link.decode import UERE
 from companion.link.dialect import mavlink
 from companion.nav.geometry import Geodetic, separation
@@ -42,13 +50,13 @@ from companion.records import (
 )
 from companion.storage.reader import LogError
 
-Message: TypeAlias = Any  # its attributes are the columns of the log
-
 _ZERO_CELSIUS = 273.15
 _EKF_ORIGIN = 0  # LogOriginType
 _STATUS, _GLITCHING = 0x3FF, 1 << 14  # nav_filter_status; its first ten bits are EKF_STATUS_FLAGS
 _WEEK_US = 604_800_000_000
-_BACK_US = 1_000_000  # a larger decrease of the boot time is a reboot
+_GPS_EPOCH_US = 315_964_800_000_000  # 1980-01-06, UNIX time
+_LEAP_US = 18_000_000  # GPS - UTC since 2017
+_MAX_WEEK = 6000  # the year 2095
 
 
 class MessageConverter:
@@ -66,11 +74,13 @@ class MessageConverter:
         self._has_airspeed = False  # the log has ARSP
         self._true_v_n: Vector3 | None = None
         self._true: Truth | None = None
+        self._first_alt: float | None = None  # m, of the first POS
 
     def records(self, name: str, message: Message, t_ns: int) -> Iterator[Stamped]:
         """Yield the records of a message of type `name`.
 
-        Raises AttributeError if a required column is missing.
+        Raises AttributeError if a required column is missing, TypeError, ValueError or OverflowError if a
+        value does not fit it.
         """
         make = _TABLE.get(name)
         if make is not None:
@@ -150,9 +160,13 @@ class MessageConverter:
             yield LocalOrigin(t, t, math.radians(m.Lat), math.radians(m.Lng), m.Alt, "ardupilot")
 
     def _global(self, name: str, m: Message, t: int) -> Iterator[Stamped]:
+        """Convert a position; logs before ArduCopter 3.5 name its height RelAlt, or have none."""
+        if self._first_alt is None:
+            self._first_alt = m.Alt
         if self._v_n is not None:
             lat, lon = math.radians(m.Lat), math.radians(m.Lng)
-            yield GlobalPosition(t, t, lat, lon, m.Alt, self._v_n, m.RelHomeAlt)
+            above_home = getattr(m, "RelHomeAlt", getattr(m, "RelAlt", m.Alt - self._first_alt))
+            yield GlobalPosition(t, t, lat, lon, m.Alt, self._v_n, above_home)
 
     def _airspeed(self, name: str, m: Message, t: int) -> Iterator[Stamped]:
         if getattr(m, "I", 0) == 0 and name == "ARSP" and math.isfinite(m.Airspeed):
@@ -191,7 +205,7 @@ class MessageConverter:
         yield self._true
 
     def _text(self, name: str, m: Message, t: int) -> Iterator[Stamped]:
-        yield Event(t, t, Severity.INFO, str(m.Message))
+        yield Event(t, t, Severity.INFO, str(m.Message)[:MAX_TEXT])
 
     def _error(self, name: str, m: Message, t: int) -> Iterator[Stamped]:
         yield Event(t, t, Severity.WARNING, f"the autopilot logged error {m.ECode} of subsystem {m.Subsys}")
@@ -221,72 +235,72 @@ NAMES = tuple(_TABLE)
 class DataflashLog:
     """An opened log, to be iterated once. `reboots` counts decreases of the boot time."""
 
-    def __init__(self, path: Path, reader: Any) -> None:
+    def __init__(self, path: Path) -> None:
         self.path = path
-        self.messages = self.reboots = 0
-        self._reader = reader
-        self._epoch_us = round(getattr(reader.clock, "timebase", 0.0) * 1e6)
+        self.reboots = 0
+        self.damage = Damage()
+        self._data = map_file(path)
+        binary = dataflash_messages.is_binary(self._data[:65536])
+        if binary is None:
+            raise LogError(f"{path} is not a DataFlash log: no message format at its beginning")
+        self._binary = binary
+        self._missing: set[str] = set()  # types of message without a required column
 
     def __iter__(self) -> Iterator[Stamped]:
-        """Yield records in the order of the file. Raises LogError if a message lacks a required column."""
-        messages, last_us, shift_us = MessageConverter(), -1, self._epoch_us
-        with contextlib.redirect_stderr(io.StringIO()), contextlib.redirect_stdout(io.StringIO()):
-            while (m := self._reader.recv_match(type=list(NAMES), strict=True)) is not None:
-                name, boot_us = m.get_type(), boot_time_us(m)
-                if boot_us is None:
-                    boot_us = max(last_us, 0)
-                if boot_us < last_us - _BACK_US:
-                    shift_us += last_us - boot_us  # continue the time; the duration of the reboot is unknown
-                    self.reboots += 1
-                    messages = MessageConverter()
-                    t_ns = (shift_us + boot_us) * 1000
-                    yield Reboot(t_ns, t_ns, 1)
-                last_us = boot_us
-                self.messages += 1
-                try:
-                    yield from messages.records(name, m, (shift_us + boot_us) * 1000)
-                except (AttributeError, TypeError) as error:
-                    raise LogError(
-                        f"{self.path}: message {name} has no column {error}: not an ArduPilot log"
-                    ) from None
+        """Yield records in the order of the file. Messages without a required column are not converted."""
+        epoch_us, converter = self._epoch_us(), MessageConverter()
+        stamped = ((boot_time_us(m), place, (name, m)) for place, name, m in self._messages(NAMES))
+        for step in steady_steps(stamped, self.damage):
+            t_ns = (epoch_us + step.shift_us + step.boot_us) * 1000
+            if step.reboot:
+                self.reboots += 1
+                converter = MessageConverter()
+                yield Reboot(t_ns, t_ns, 1)
+            yield from self._converted(converter, step, t_ns)
+
+    def _messages(self, names: Collection[str], damage: Damage | None = None) -> Iterator[FoundMessage]:
+        found = self.damage if damage is None else damage
+        return dataflash_messages.messages(self._data, names, found, binary=self._binary)
+
+    def _converted(self, converter: MessageConverter, step: Step, t_ns: int) -> Iterator[Stamped]:
+        name, message = step.item
+        try:
+            yield from converter.records(name, message, t_ns)
+        except AttributeError as error:
+            if name not in self._missing:
+                self._missing.add(name)
+                self.damage.add(f"message {name}", 0, f"no column {error.name}")
+        except (TypeError, ValueError, OverflowError) as error:
+            self.damage.add(f"message {name} at {step.boot_us} us", 0, one_line(error))
+
+    def _epoch_us(self) -> int:
+        """Return UNIX time minus boot time by the first GPS fix; 0 if there is none."""
+        for _, _, m in self._messages(("GPS",), Damage()):
+            week, ms = getattr(m, "GWk", getattr(m, "Week", 0)), getattr(m, "GMS", getattr(m, "TimeMS", 0))
+            has_fix = getattr(m, "Status", 0) >= mavlink.GPS_FIX_TYPE_3D_FIX and 0 < week < _MAX_WEEK
+            if has_fix and (boot_us := boot_time_us(m)) is not None and 0 <= boot_us <= MAX_BOOT_US:
+                return _GPS_EPOCH_US + int(week) * _WEEK_US + int(ms) * 1000 - _LEAP_US - boot_us
+        return 0
 
 
 def boot_time_us(m: Message) -> int | None:
-    """Return the time since boot (TimeUS, TimeMS or T; in an old GPS message TimeMS is the time of week)."""
-    if (us := getattr(m, "TimeUS", None)) is not None:
-        return int(us)
-    ms = getattr(m, "T", None)
-    if ms is None and not hasattr(m, "Week"):
-        ms = getattr(m, "TimeMS", None)
-    return None if ms is None else int(ms) * 1000
+    """Return the time since boot (TimeUS, TimeMS or T; in an old GPS message TimeMS is the time of week).
+
+    -1 if it is not a number.
+    """
+    value, scale = getattr(m, "TimeUS", None), 1
+    if value is None:
+        value, scale = getattr(m, "T", None), 1000
+    if value is None and not hasattr(m, "Week"):
+        value = getattr(m, "TimeMS", None)
+    if value is None:
+        return None
+    return int(value) * scale if isinstance(value, int | float) and math.isfinite(value) else -1
 
 
 def read(path: Path) -> DataflashLog:
     """Open a `.bin` or `.log` file. Raises LogError if it is empty, not a DataFlash log, or unreadable."""
-    from pymavlink import DFReader
-
-    try:
-        with path.open("rb") as file:
-            head = file.read(65536)
-    except OSError as error:
-        raise LogError(f"{path} cannot be read: {error.strerror}") from None
-    if not head:
-        raise LogError(f"{path} is empty: nothing was recorded")
-    binary = b"\xa3\x95\x80" in head[:4096]
-    if not binary and b"FMT," not in head:
-        raise LogError(f"{path} is not a DataFlash log: no message format at its beginning")
-    kind = DFReader.DFReader_binary if binary else DFReader.DFReader_text
-    reader = kind.__new__(kind)  # separate from __init__, which leaves its file open if it fails
-    try:
-        with contextlib.redirect_stderr(io.StringIO()), contextlib.redirect_stdout(io.StringIO()):
-            reader.__init__(str(path))
-    except Exception as error:  # a damaged file raises various exceptions in the reader
-        raise LogError(f"{path} is damaged and cannot be read: {error or type(error).__name__}") from None
-    finally:
-        reader.filehandle.close()  # the reader uses its memory map
-    if not set(NAMES) & set(reader.name_to_id):
-        raise LogError(f"{path} is a DataFlash log without any supported message: it needs GPS, XKF1, ...")
-    return DataflashLog(path, reader)
+    return DataflashLog(path)
 
 
 def _finite(value: float) -> float | None:

@@ -10,47 +10,84 @@ first point. Its attitude is not used, as it disagrees with its gyros. Times cou
 from __future__ import annotations
 
 import heapq
-import io
 import math
+import struct
+import warnings
 import zipfile
-from collections.abc import Iterator
+import zlib
+from collections.abc import Callable, Iterable, Iterator
+from functools import partial
+from io import TextIOWrapper
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 
 from companion.importers import dataflash, gnss_latency
+from companion.importers.foreign_file import Damage, one_line, steady_steps
 from companion.nav.geometry import Geodetic, geodetic_to_local
 from companion.records import Event, GlobalPosition, Gnss, Imu, LocalOrigin, LocalPosition, Stamped
 from companion.storage.reader import LogError
 from companion.units import Floats
 
+MAX_TABLES = 1 << 25
+"""Bytes of one table, or of all tables of a `.mat`; the recordings have 2 MB."""
+MAX_NUMBER = 1e10  # ms, deg, m, m/s, rad/s, m/s^2
+_COMPRESSED = 15  # miCOMPRESSED
 _WIDTHS = {"IMU": 8, "GPSraw": 7, "GPOSonboard": 7}
 
 
-def read_matlab(path: Path) -> Iterator[Stamped]:
-    """Return the records of a `.mat` by time.
+class Recording:
+    """The records of a recording by time, to be iterated once."""
 
-    Raises LogError if it is not a MATLAB file or has no such table.
-    """
+    def __init__(self, records: Callable[[Damage], Iterator[Stamped]]) -> None:
+        self.damage = Damage()
+        self._records = records
+
+    def __iter__(self) -> Iterator[Stamped]:
+        """Yield the records."""
+        return self._records(self.damage)
+
+
+def read_matlab(path: Path) -> Recording:
+    """Open a `.mat`. Raises LogError if it is not a MATLAB file or has no such table."""
     from scipy.io import loadmat
 
+    wanted = [label for name in dataflash.NAMES for label in (name, f"{name}_label")]
     try:
-        tables: dict[str, Any] = loadmat(path)
+        _reject_bomb(path)
+        tables: dict[str, Any] = loadmat(path, variable_names=wanted)
+        rows = [
+            _rows(name, tables[name], [_label(cell) for cell in tables[f"{name}_label"]])
+            for name in dataflash.NAMES
+            if name in tables and f"{name}_label" in tables and tables[name].dtype.kind == "f"
+        ]
+    except LogError:
+        raise
     except FileNotFoundError:
         raise LogError(f"{path}: no such log") from None
     except Exception as error:  # scipy raises many different exceptions
-        raise LogError(f"{path} is not a MATLAB file: {error}") from None
-    rows = [
-        _rows(name, tables[name], [_label(cell) for cell in tables[f"{name}_label"]])
-        for name in dataflash.NAMES
-        if name in tables and f"{name}_label" in tables and tables[name].dtype.kind == "f"
-    ]
+        raise LogError(f"{path} is not a MATLAB file: {one_line(error)}") from None
     if not rows:
         raise LogError(f"{path} has no ArduPilot table: it needs GPS, IMU, ATT, ... each with its _label")
-    messages = dataflash.MessageConverter()
-    return _convert_rows(messages, heapq.merge(*rows, key=lambda row: row[0]))
+    return Recording(partial(_convert_rows, heapq.merge(*rows, key=lambda row: row[0])))
+
+
+def _reject_bomb(path: Path) -> None:
+    """Raise LogError if the compressed tables of a MATLAB file expand beyond `MAX_TABLES`."""
+    data, at, left = path.read_bytes(), 128, MAX_TABLES
+    while at + 8 <= len(data):
+        kind, size = struct.unpack_from("<II", data, at)
+        if kind == _COMPRESSED:
+            inflate = zlib.decompressobj()
+            rest = data[at + 8 : at + 8 + size]
+            while rest and left > 0 and not inflate.eof:
+                left -= len(inflate.decompress(rest, min(left, 1 << 20)))
+                rest = inflate.unconsumed_tail
+        if left <= 0:
+            raise LogError(f"{path}: its tables expand to more than {MAX_TABLES} bytes")
+        at += 8 + size
 
 
 def _label(cell: Any) -> str:
@@ -66,17 +103,26 @@ def _rows(name: str, table: Floats, columns: list[str]) -> Iterator[tuple[int, s
             yield boot_us, name, message
 
 
-def _convert_rows(messages: dataflash.MessageConverter, rows: Any) -> Iterator[Stamped]:
-    for boot_us, name, message in rows:
-        yield from messages.records(name, message, boot_us * 1000)
+def _convert_rows(rows: Iterable[tuple[int, str, SimpleNamespace]], damage: Damage) -> Iterator[Stamped]:
+    converter = dataflash.MessageConverter()
+    for step in steady_steps(((us, number, (name, m)) for number, (us, name, m) in enumerate(rows)), damage):
+        name, message = step.item
+        try:
+            yield from converter.records(name, message, step.boot_us * 1000)
+        except (AttributeError, TypeError, ValueError, OverflowError) as error:
+            damage.add(f"{name} at {step.boot_us} us", 0, one_line(error))
 
 
-def read_tables(path: Path) -> Iterator[Stamped]:
-    """Return the records of a `.zip` or folder of text tables by time, with GNSS glitches as events.
+def read_tables(path: Path) -> Recording:
+    """Open a `.zip` or folder of text tables, with GNSS glitches as events.
 
     Raises LogError if a table is missing or malformed.
     """
     columns = {name: _table(path, name, width) for name, width in _WIDTHS.items()}
+    return Recording(partial(_merged_tables, columns))
+
+
+def _merged_tables(columns: dict[str, Floats], damage: Damage) -> Iterator[Stamped]:
     fixes, onboard = list(_fixes(columns["GPSraw"])), list(_onboard_positions(columns["GPOSonboard"]))
     glitches: list[Event] = list(
         gnss_latency.glitch_events(
@@ -94,24 +140,41 @@ def has_tables(folder: Path) -> bool:
 def _table(path: Path, name: str, width: int) -> Floats:
     member = f"{name}.txt"
     try:
-        if path.is_dir():
-            text = (path / member).read_text(encoding="ascii")
-        else:
-            with zipfile.ZipFile(path) as archive:
-                text = archive.read(member).decode("ascii")
-        table = np.loadtxt(io.StringIO(text), ndmin=2)
+        with (
+            TextIOWrapper(_open_member(path, member), encoding="ascii") as file,
+            warnings.catch_warnings(action="error"),  # an empty table
+        ):
+            table = np.loadtxt(file, ndmin=2)
+    except LogError:
+        raise
     except FileNotFoundError:
         raise LogError(f"{path}: no such log") from None
     except KeyError:
         raise LogError(f"{path} has no {member}: it needs {', '.join(f'{n}.txt' for n in _WIDTHS)}") from None
-    except (zipfile.BadZipFile, ValueError) as error:
-        raise LogError(f"{path} is damaged in {member}: {error}") from None
+    except Exception as error:  # a damaged archive raises many different exceptions
+        raise LogError(f"{path} is damaged in {member}: {one_line(error)}") from None
+    if not np.isfinite(table).all() or np.abs(table).max(initial=0.0) > MAX_NUMBER:
+        raise LogError(f"{path} is damaged in {member}: a number is not finite or beyond {MAX_NUMBER:g}")
     if table.shape[0] < 2 or table.shape[1] != width:
         raise LogError(
             f"{path}: {member} has {table.shape[0]} rows of {table.shape[1]} columns;"
             f" it needs at least 2 rows of {width}"
         )
     return table[np.argsort(table[:, 0], kind="stable")]
+
+
+def _open_member(path: Path, member: str) -> IO[bytes]:
+    """Open one table. Raises LogError if it is larger than `MAX_TABLES`."""
+    if path.is_dir():
+        path = path / member
+        size, file = path.stat().st_size, path.open("rb")
+    else:
+        with zipfile.ZipFile(path) as archive:
+            size, file = archive.getinfo(member).file_size, archive.open(member)  # type: ignore[assignment]
+    if size > MAX_TABLES:
+        file.close()
+        raise LogError(f"{path}: {member} has {size} bytes (limit {MAX_TABLES})")
+    return file
 
 
 def _ns(milliseconds: float) -> int:

@@ -2,7 +2,7 @@
 
 Each file is one uORB topic, `timestamp` in microseconds since boot. The rows of all topics are merged by
 time; arrival and validity are the same instant, as the log is written on board. Raw inertial data is not
-read. Fields that a topic lacks remain None.
+read. Fields that a topic lacks remain None. A row that is not one of its topic is skipped and reported.
 """
 
 from __future__ import annotations
@@ -11,10 +11,12 @@ import csv
 import gzip
 import heapq
 import math
+import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TypeAlias
+from typing import BinaryIO, TypeAlias, cast
 
+from companion.importers.foreign_file import Damage, one_line, steady_steps
 from companion.link.fields import euler
 from companion.records import (
     AirData,
@@ -27,26 +29,75 @@ from companion.records import (
     Stamped,
     Wind,
 )
+from companion.storage.reader import LogError
 
 Row: TypeAlias = dict[str, str]
 
-
-def read(folder: Path) -> Iterator[Stamped]:
-    """Return the records of the topics in `folder` by time. Raises ValueError if no known topic is found."""
-    found = {path.name.split(".")[0]: path for path in sorted(folder.glob("*.csv*"))}
-    known = [(found[topic], make) for topic, make in _TOPICS.items() if topic in found]
-    if not known:
-        raise ValueError(f"{folder} has no supported topic: it needs {', '.join(_TOPICS)} as CSV")
-    return heapq.merge(*(_records(path, make()) for path, make in known), key=lambda record: record.t_ns)
+MAX_LINE = 1 << 16  # bytes
+MAX_EXPANSION = 60
+"""Largest ratio of uncompressed and compressed size; recorded topics reach 10."""
 
 
-def _records(path: Path, topic: Callable[[Row, int], Iterator[Stamped]]) -> Iterator[Stamped]:
-    with gzip.open(path, "rt", newline="") if path.suffix == ".gz" else path.open(newline="") as file:
-        for number, row in enumerate(csv.DictReader(file), start=2):
+class CsvFolder:
+    """The topics of a folder, to be iterated once."""
+
+    def __init__(self, folder: Path) -> None:
+        self.damage = Damage()
+        found = {path.name.split(".")[0]: path for path in sorted(folder.glob("*.csv*"))}
+        self._known = [(found[topic], make) for topic, make in _TOPICS.items() if topic in found]
+        if not self._known:
+            raise LogError(f"{folder} has no supported topic: it needs {', '.join(_TOPICS)} as CSV")
+
+    def __iter__(self) -> Iterator[Stamped]:
+        """Yield the records of all topics by time."""
+        topics = (self._records(path, make()) for path, make in self._known)
+        return heapq.merge(*topics, key=lambda record: record.t_ns)
+
+    def _records(self, path: Path, topic: Callable[[Row, int], Iterator[Stamped]]) -> Iterator[Stamped]:
+        def stamped() -> Iterator[tuple[int, int, Row]]:
+            for number, row in self._rows(path):
+                try:
+                    yield int(row["timestamp"]), number, row
+                except (KeyError, TypeError, ValueError) as error:
+                    self.damage.add(f"line {number} of {path.name}", 0, one_line(error))
+
+        for step in steady_steps(stamped(), self.damage):
             try:
-                yield from topic(row, int(row["timestamp"]) * 1000)
-            except (KeyError, TypeError, ValueError) as error:
-                raise ValueError(f"{path.name}, line {number}: not a row of its topic: {error}") from None
+                yield from topic(step.item, (step.boot_us + step.shift_us) * 1000)
+            except (KeyError, TypeError, ValueError, OverflowError) as error:
+                place = f"{path.name} at {step.boot_us} us"
+                self.damage.add(place, 0, f"not a row of its topic: {one_line(error)}")
+
+    def _rows(self, path: Path) -> Iterator[tuple[int, Row]]:
+        """Yield line number and row. The file ends where it cannot be read."""
+        try:
+            with path.open("rb") as file:
+                lines = _lines(file, path, self.damage)
+                yield from enumerate(csv.DictReader(lines), start=2)
+        except (OSError, EOFError, zlib.error, csv.Error) as error:
+            self.damage.add(path.name, 0, f"the rest of the file: {one_line(error)}")
+
+
+def read(folder: Path) -> CsvFolder:
+    """Open the topics in `folder`. Raises LogError if no known topic is found."""
+    return CsvFolder(folder)
+
+
+def _lines(file: BinaryIO, path: Path, damage: Damage) -> Iterator[str]:
+    """Yield the lines of a text file, or of a gzip-compressed one that does not expand without bounds."""
+    packed = path.suffix == ".gz"
+    limit = MAX_EXPANSION * path.stat().st_size + (1 << 20)
+    source: BinaryIO = cast(BinaryIO, gzip.GzipFile(fileobj=file)) if packed else file
+    total = 0
+    while line := source.readline(MAX_LINE + 1):
+        total += len(line)
+        if packed and total > limit:
+            damage.add(path.name, 0, f"it expands to more than {MAX_EXPANSION} times its size")
+            return
+        if len(line) > MAX_LINE:
+            damage.add(path.name, 0, f"a line is longer than {MAX_LINE} bytes")
+            return
+        yield line.decode("utf-8", "replace").replace("\0", "")
 
 
 def _number(row: Row, name: str) -> float | None:

@@ -5,20 +5,26 @@
     source.summary()                    # counts, after the iteration
 
 A tlog passes through the Session (autopilot detection, reboots, clock) and `link.decode` exactly as in
-flight; only the transport is missing. The clock is the UNIX time of the program that wrote the log. If no
-message of the log states the local origin (old autopilots), it is inferred from local and global positions.
+flight; only the transport is missing. Its clock is the autopilot's boot time, counted from the UNIX time of
+the first message, so that a stalled link does not change the flight. If no message of the log states the
+local origin (old autopilots), it is inferred from local and global positions.
+
+Every source reads what is intact: damaged parts are skipped and named once, by an event at the end.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
+from itertools import chain
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 from companion.importers import dataflash, inertialnav, px4_csv, tlog, ulog
-from companion.link.decode import DECODED, MAKES, Autopilot, Sender, decode
-from companion.link.dialect import mavlink, rsbn
+from companion.importers.foreign_file import MAX_TEXT, Damage, usable
+from companion.link.decode import MAKES, Autopilot, Sender, decode
+from companion.link.dialect import Message, mavlink, rsbn
 from companion.link.session import LinkUp, MessageReceived, Rebooted, SecondAutopilot, Session
+from companion.link.status_text import CHUNK
 from companion.nav.geometry import Projection
 from companion.navigator.local_origin import LOG_WINDOW_NS, infer_origin
 from companion.records import (
@@ -34,6 +40,7 @@ from companion.records import (
 )
 from companion.storage.reader import LogError
 
+_STATUSTEXT: int = mavlink.MAVLINK_MSG_ID_STATUSTEXT
 _RSBN = rsbn.MAVLINK_MSG_ID_RSBN_MEASUREMENT  # sent by a beacon receiver, which is a separate component
 _POSITION_ABSOLUTE = mavlink.EKF_POS_HORIZ_ABS  # the same bit as ESTIMATOR_POS_HORIZ_ABS
 
@@ -41,7 +48,7 @@ _POSITION_ABSOLUTE = mavlink.EKF_POS_HORIZ_ABS  # the same bit as ESTIMATOR_POS_
 class ImportSummary(NamedTuple):
     """Counts of an imported log.
 
-    `corrupt` counts runs of bytes that are not a frame, `torn` the bytes of a truncated end.
+    `corrupt` counts the parts that could not be read, `torn` the bytes of a truncated end of a tlog.
     """
 
     messages: int
@@ -52,42 +59,81 @@ class ImportSummary(NamedTuple):
     records: int
 
 
-class TlogSource:
-    """The records of one tlog, read once. With `autopilot_system`, only that system id is the autopilot."""
+class _Records:
+    """Usable records of a log, read once and counted."""
 
-    def __init__(self, log: tlog.Tlog, autopilot_system: int | None = None) -> None:
-        self.log = log
+    def __init__(self, path: Path, records: Iterable[Stamped], damage: Damage) -> None:
+        self.damage = damage
         self.reboots = self.records = 0
+        self._usable = usable(path, records, damage)
+
+    def read_first(self) -> None:
+        """Read the first record ahead. Raises LogError if nothing can be read."""
+        first = next(self._usable, None)
+        self._usable = self._usable if first is None else chain((first,), self._usable)
+
+    def __iter__(self) -> Iterator[Stamped]:
+        """Yield the records in the order of the log, damage as an event at the end."""
+        for record in self._usable:
+            self.records += 1
+            self.reboots += isinstance(record, Reboot)
+            yield record
+
+
+class TlogSource(_Records):
+    """The records of one tlog in order of arrival: inputs, truth, events, rejections; a Reset and a Reboot at
+    each reboot. With `autopilot_system`, only that system id is the autopilot.
+    """
+
+    def __init__(
+        self, log: tlog.Tlog, autopilot_system: int | None = None, path: Path = Path("the tlog")
+    ) -> None:
+        super().__init__(path, self._all_records(), Damage())
+        self.log = log
         self._session = Session(autopilot_system=autopilot_system)
         self._sender = Sender(self._session.clock)
+        self._times = tlog.BootTimeBase()
+        self._text = ""  # of a STATUSTEXT in several parts
         stated = any(
             entry.frame.msgid == mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN for entry in tlog.Tlog(log.data)
         )
         self._origin = None if stated else OriginFinder()
-
-    def __iter__(self) -> Iterator[Stamped]:
-        """Yield records in order of arrival.
-
-        Inputs, truth, rejections, and a Reset and a Reboot at each reboot.
-        """
-        for rx_ns, found in self.log:
-            for event in self._session.receive(found.raw, rx_ns):
-                for record in self._records(event):
-                    self.records += 1
-                    yield record
-            self._session.to_send()  # discard replies: there is no link
 
     def summary(self) -> ImportSummary:
         """Return the counts so far."""
         log = self.log
         return ImportSummary(log.messages, log.corrupt, log.unknown, log.torn, self.reboots, self.records)
 
+    def _all_records(self) -> Iterator[Stamped]:
+        log, session = self.log, self._session
+        doubtful: bytes | None = None  # a frame whose boot time has to be confirmed by the next
+        for rx_ns, found in log:
+            ours = found.system == session.autopilot and found.component == mavlink.MAV_COMP_ID_AUTOPILOT1
+            boot_us = tlog.boot_time_us(found) if ours else None
+            now_ns = self._times.update(rx_ns // 1000, boot_us)
+            if boot_us is not None and doubtful is not None and not self._times.confirmed:
+                self.damage.add(f"a message at {rx_ns} ns", len(doubtful), "its boot time does not continue")
+                doubtful = None
+            if now_ns is None:
+                doubtful = found.raw
+                continue
+            for raw in (found.raw,) if doubtful is None or boot_us is None else (doubtful, found.raw):
+                for event in session.receive(raw, now_ns):
+                    yield from self._records(event)
+            doubtful = doubtful if boot_us is None else None
+            session.to_send()  # discard replies: there is no link
+        if log.corrupt:
+            more = f"and {log.corrupt - 1} more" if log.corrupt > 1 else "only"
+            self.damage.add(f"byte {log.corrupt_at}", log.corrupt_bytes, f"not a frame, {more}")
+        if log.torn:
+            self.damage.add(f"byte {len(log.data) - log.torn}", log.torn, "truncated")
+
     def _records(self, event: object) -> Iterator[Stamped]:
         match event:
-            case MessageReceived(received_ns=rx_ns, frame=found, from_autopilot=ours):
-                if found.msgid not in DECODED or not (ours or found.msgid == _RSBN):
-                    return
-                for record in decode(event.message, rx_ns, self._sender):
+            case MessageReceived(rx_ns, message, found, True) if found.msgid == _STATUSTEXT:
+                yield from self._status_text(message, rx_ns)
+            case MessageReceived(rx_ns, message, found, ours) if ours or found.msgid == _RSBN:
+                for record in decode(message, rx_ns, self._sender):
                     yield record
                     if self._origin and (origin := self._origin.update(record, self._sender.autopilot)):
                         yield origin
@@ -96,7 +142,6 @@ class TlogSource:
                 self._sender = self._sender._replace(autopilot=make)
                 yield Event(at_ns, at_ns, Severity.INFO, f"autopilot {system} ({make}) detected")
             case Rebooted(at_ns, system):
-                self.reboots += 1
                 self._origin = self._origin and OriginFinder()
                 yield Reset(at_ns, at_ns, "flight", f"autopilot {system} rebooted: its boot time decreased")
                 yield Reboot(at_ns, at_ns, system)
@@ -104,6 +149,13 @@ class TlogSource:
                 yield Event(
                     at_ns, at_ns, Severity.WARNING, f"autopilot {system} ignored: autopilot {kept} is in use"
                 )
+
+    def _status_text(self, message: Message, rx_ns: int) -> Iterator[Event]:
+        """Convert a text of the autopilot; a text in parts (MAVLink 2) when its last part has arrived."""
+        part = message.text
+        self._text = part if message.chunk_seq == 0 else (self._text + part)[:MAX_TEXT]
+        if (message.id == 0 or len(part) < CHUNK) and self._text.strip():
+            yield Event(rx_ns, rx_ns, min(message.severity, Severity.DEBUG), self._text)
 
 
 class OriginFinder:
@@ -135,52 +187,57 @@ class OriginFinder:
         return origin
 
 
-class OnboardSource:
-    """A log recorded on board, read once; its counts are records, as it has no frames."""
+class OnboardSource(_Records):
+    """The records of a log recorded on board; it has no frames to count."""
 
-    def __init__(self, records: Iterable[Stamped]) -> None:
-        self._read = records
-        self.reboots = self.records = 0
-
-    def __iter__(self) -> Iterator[Stamped]:
-        """Yield records in the order of the log."""
-        for record in self._read:
-            self.records += 1
-            self.reboots += isinstance(record, Reboot)
-            yield record
+    def __init__(self, path: Path, log: ForeignLog) -> None:
+        super().__init__(path, log, log.damage)
 
     def summary(self) -> ImportSummary:
         """Return the counts so far."""
-        return ImportSummary(self.records, 0, 0, 0, self.reboots, self.records)
+        return ImportSummary(self.records, self.damage.parts, 0, 0, self.reboots, self.records)
 
 
-_READERS: dict[str, Callable[[Path], Iterable[Stamped]]] = {
+class ForeignLog(Protocol):
+    """A log of another recorder, opened; parts that cannot be read are in `damage`."""
+
+    damage: Damage
+
+    def __iter__(self) -> Iterator[Stamped]:
+        """Yield records by time."""
+
+
+_READERS: dict[str, Callable[[Path], ForeignLog]] = {
     ".bin": dataflash.read,
     ".log": dataflash.read,
     ".ulg": ulog.read,
     ".mat": inertialnav.read_matlab,
     ".zip": inertialnav.read_tables,
+    "tables": inertialnav.read_tables,  # folders
+    "topics": px4_csv.read,
 }
-LOG_SUFFIXES = (".tlog", *_READERS)
+LOG_SUFFIXES = (".tlog", *(kind for kind in _READERS if kind.startswith(".")))
 """File name suffixes of the logs of other recorders."""
 
 
 def open_source(path: Path, autopilot_system: int | None = None) -> TlogSource | OnboardSource:
     """Open a log of another recorder by its suffix: a `.tlog`, an onboard log, or a folder of topics.
 
-    Raises ValueError or LogError, one sentence, if it does not exist or its type is not supported.
+    Raises LogError, one sentence, if it does not exist or cannot be read, or its type is not supported.
     """
     if not path.exists():
         raise LogError(f"{path}: no such log")
     kind = path.suffix.lower()
     if kind not in LOG_SUFFIXES and not path.is_dir():
-        raise ValueError(
+        raise LogError(
             f"{path}: unknown file type; give .mcap, {', '.join(LOG_SUFFIXES)} or a folder of topics"
         )
     if path.is_dir():
-        return OnboardSource(
-            inertialnav.read_tables(path) if inertialnav.has_tables(path) else px4_csv.read(path)
-        )
+        kind = "tables" if inertialnav.has_tables(path) else "topics"
+    source: TlogSource | OnboardSource
     if kind == ".tlog":
-        return TlogSource(tlog.read(path), autopilot_system)
-    return OnboardSource(_READERS[kind](path))
+        source = TlogSource(tlog.read(path), autopilot_system, path)
+    else:
+        source = OnboardSource(path, _READERS[kind](path))
+    source.read_first()
+    return source

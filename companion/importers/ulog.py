@@ -1,24 +1,23 @@
-"""PX4 onboard logs (ULog, `.ulg`), read with pyulog -> records, merged by time.
+"""PX4 onboard logs (ULog, `.ulg`) -> records, in order of time.
 
 PX4 has renamed fields over the years: each is looked up under all of its names, and missing fields remain
 None. Only instance 0 of each topic is read. Arrival and validity are the same instant, as the log is written
-on board: UNIX time if a GPS provides it, else time since boot. Messages of the logger (texts, dropouts, a
-damaged end) become events.
+on board: UNIX time if a GPS provides it, else time since boot. Texts and dropouts of the logger become
+events.
 """
 
 from __future__ import annotations
 
-import contextlib
-import heapq
-import io
 import math
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, TypeAlias
 
+from companion.importers import ulog_messages
+from companion.importers.foreign_file import MAX_TEXT, Damage, in_order, map_file, one_line, steady_steps
+from companion.importers.ulog_messages import Dropout, LoggedText, Row
 from companion.link.dialect import mavlink
 from companion.link.fields import euler
-from companion.optional_dependencies import missing_package
 from companion.records import (
     AirData,
     Attitude,
@@ -37,91 +36,86 @@ from companion.records import (
 )
 from companion.storage.reader import LogError
 
-Row: TypeAlias = dict[str, Any]
 Topic: TypeAlias = Callable[[Row, int], Iterator[Stamped]]
 
-_MAGIC = b"\x55\x4c\x6f\x67\x01\x12\x35"
 _ZERO_CELSIUS = 273.15
-_UNIX_AFTER_US = 10**15
+_UNIX_FROM_US, _UNIX_TO_US = 10**15, 4_102_444_800_000_000  # 2001, 2100
 
 
-def read(path: Path) -> Iterator[Stamped]:
-    """Return the records of a `.ulg` by time. Raises LogError if it is not a ULog, or pyulog is missing."""
-    log = _open_ulog(path)
-    columns: dict[str, dict[str, list[Any]]] = {}
-    for data in log.data_list:
-        if data.multi_id == 0 and len(data.data.get("timestamp", ())):
-            columns[data.name] = {name: values.tolist() for name, values in data.data.items()}
-    if not columns:
-        raise LogError(f"{path} is a ULog without any supported topic: it needs {', '.join(_TOPICS)}")
-    epoch_us = _epoch_us(columns)
-    if "vehicle_gps_position" in columns:
-        columns.pop("sensor_gps", None)  # duplicates of vehicle_gps_position
-    if "airspeed_validated" in columns:
-        columns.pop("airspeed", None)
-    topics = {name: make() for name, make in _TOPICS.items() if name in columns}
-    if "vehicle_global_position_groundtruth" in columns:
-        topics["vehicle_global_position_groundtruth"] = _truth_topic(columns)
-    streams = [_records(path, name, columns[name], topic, epoch_us) for name, topic in topics.items()]
-    events = sorted(_logger_events(log, epoch_us), key=lambda event: event.t_ns)
-    return heapq.merge(*streams, events, key=lambda record: record.t_ns)
+class UlogFile:
+    """An opened log, to be iterated once."""
 
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.reboots = 0
+        self.damage = Damage()
+        self._data = map_file(path)
+        if self._data[: len(ulog_messages.MAGIC)] != ulog_messages.MAGIC:
+            raise LogError(f"{path} is not a ULog: wrong magic bytes at its beginning")
+        self._faulty: set[str] = set()  # topics without a required field
 
-def _open_ulog(path: Path) -> Any:
-    try:
-        with path.open("rb") as file:
-            head = file.read(len(_MAGIC))
-    except OSError as error:
-        raise LogError(f"{path} cannot be read: {error.strerror}") from None
-    if not head:
-        raise LogError(f"{path} is empty: nothing was recorded")
-    if head != _MAGIC:
-        raise LogError(f"{path} is not a ULog: wrong magic bytes at its beginning")
-    try:
-        from pyulog import ULog
-    except ImportError:
-        raise LogError(missing_package(str(path), "pyulog", "logs")) from None
-    try:
-        with path.open("rb") as file, contextlib.redirect_stdout(io.StringIO()):
-            return ULog(file, [*_TOPICS, *_TRUTHS])
-    except Exception as error:  # a damaged file raises various exceptions in pyulog
-        raise LogError(f"{path} is damaged and cannot be read: {error or type(error).__name__}") from None
-
-
-def _epoch_us(columns: dict[str, dict[str, list[Any]]]) -> int:
-    """Return the offset from time since boot to UNIX time; 0 if no GPS provides it."""
-    for name in ("vehicle_gps_position", "sensor_gps"):
-        found = columns.get(name, {})
-        for boot, utc in zip(found.get("timestamp", ()), found.get("time_utc_usec", ()), strict=False):
-            if utc > _UNIX_AFTER_US:
-                return int(utc) - int(boot)
-    return 0
-
-
-def _records(
-    path: Path, name: str, columns: dict[str, list[Any]], topic: Topic, epoch_us: int
-) -> Iterator[Stamped]:
-    names = list(columns)
-    for values in zip(*columns.values(), strict=True):
-        row = dict(zip(names, values, strict=True))
+    def __iter__(self) -> Iterator[Stamped]:
+        """Yield records by time. Rows of a topic without a required field are not converted."""
         try:
-            yield from topic(row, (row["timestamp"] + epoch_us) * 1000)
+            topics, epoch_us = self._survey()
+        except ValueError as error:
+            raise LogError(f"{self.path} cannot be read: {error}") from None
+        return in_order(self._records(topics, epoch_us))
+
+    def _survey(self) -> tuple[dict[str, Topic], int]:
+        """Return the topics to convert, and UNIX time minus boot time (0 if no GPS provides it)."""
+        seen, epoch_us = set[str](), 0
+        for found in ulog_messages.messages(self._data, _TOPICS, Damage()):
+            if isinstance(found, ulog_messages.TopicRow):
+                seen.add(found.topic)
+                utc, boot = found.row.get("time_utc_usec"), found.row.get("timestamp")
+                if type(utc) is int and type(boot) is int and _UNIX_FROM_US < utc < _UNIX_TO_US:
+                    epoch_us = epoch_us or utc - min(boot, utc)
+        if "vehicle_gps_position" in seen:
+            seen.discard("sensor_gps")  # duplicates of vehicle_gps_position
+        if "airspeed_validated" in seen:
+            seen.discard("airspeed")
+        if not seen:
+            needed = ", ".join(_TOPICS)
+            raise LogError(f"{self.path} is a ULog without any supported topic: it needs {needed}")
+        topics = {name: make() for name, make in _TOPICS.items() if name in seen}
+        return topics | _truth_topics(), epoch_us
+
+    def _records(self, topics: dict[str, Topic], epoch_us: int) -> Iterator[Stamped]:
+        found = ulog_messages.messages(self._data, topics, self.damage)
+        for step in steady_steps(((_boot_us(m), m.place, m) for m in found), self.damage):
+            t_ns = (step.boot_us + step.shift_us + epoch_us) * 1000
+            match step.item:
+                case LoggedText(_, _, severity, text):
+                    yield Event(t_ns, t_ns, severity, text[:MAX_TEXT])
+                case Dropout(_, duration_ms):
+                    yield Event(t_ns, t_ns, Severity.WARNING, f"logger dropout of {duration_ms} ms")
+                case (_, name, row):
+                    yield from self._converted(name, topics[name], row, t_ns)
+
+    def _converted(self, name: str, topic: Topic, row: Row, t_ns: int) -> Iterator[Stamped]:
+        try:
+            yield from topic(row, t_ns)
         except KeyError as error:
-            raise LogError(f"{path}: topic {name} has no field {error}: unsupported PX4 version") from None
+            if name not in self._faulty:
+                self._faulty.add(name)
+                self.damage.add(f"topic {name}", 0, f"no field {error}: unsupported PX4 version")
+        except (TypeError, ValueError, OverflowError) as error:
+            self.damage.add(f"topic {name} at {row.get('timestamp')} us", 0, one_line(error))
 
 
-def _logger_events(log: Any, epoch_us: int) -> Iterator[Event]:
-    def event(us: int, severity: int, text: str) -> Event:
-        t = (us + epoch_us) * 1000
-        return Event(t, t, severity, text)
+def read(path: Path) -> UlogFile:
+    """Open a `.ulg`. Raises LogError if it is not a ULog."""
+    return UlogFile(path)
 
-    for line in log.logged_messages:
-        severity = min(max(int(line.log_level) - ord("0"), 0), 7)
-        yield event(line.timestamp, severity, line.message)
-    for gap in log.dropouts:
-        yield event(gap.timestamp, Severity.WARNING, f"logger dropout of {gap.duration} ms")
-    if log.file_corruption:
-        yield event(log.last_timestamp, Severity.WARNING, "the log is damaged: some data is missing")
+
+def _boot_us(found: ulog_messages.TopicRow | LoggedText | Dropout) -> int | None:
+    if isinstance(found, LoggedText):
+        return found.boot_us
+    if isinstance(found, Dropout):
+        return None
+    stamp = found.row.get("timestamp")
+    return stamp if type(stamp) is int else -1
 
 
 def _finite(value: float | None) -> float | None:
@@ -225,28 +219,22 @@ def _local_positions() -> Topic:
     return topic
 
 
-_TRUTHS = (
-    "vehicle_global_position_groundtruth",
-    "vehicle_local_position_groundtruth",
-)
-
-
-def _truth_topic(columns: dict[str, dict[str, list[Any]]]) -> Topic:
+def _truth_topics() -> dict[str, Topic]:
     """Convert a simulator's truth: positions, each with the latest velocity of the local truth."""
-    local = columns.get(_TRUTHS[1], {"timestamp": []})
-    velocities = list(zip(*(local.get(name, ()) for name in ("timestamp", "vx", "vy", "vz")), strict=True))
-    steps = iter(velocities)
-    ahead = next(steps, None)
     v_n: Vector3 = (0.0, 0.0, 0.0)
 
-    def topic(row: Row, t: int) -> Iterator[Stamped]:
-        nonlocal ahead, v_n
-        while ahead is not None and ahead[0] <= row["timestamp"]:
-            v_n = ahead[1:]
-            ahead = next(steps, None)
+    def velocity(row: Row, t: int) -> Iterator[Stamped]:
+        nonlocal v_n
+        v_n = row["vx"], row["vy"], row["vz"]
+        return iter(())
+
+    def position(row: Row, t: int) -> Iterator[Stamped]:
         yield Truth(t, t, math.radians(row["lat"]), math.radians(row["lon"]), row["alt"], v_n)
 
-    return topic
+    return {
+        "vehicle_local_position_groundtruth": velocity,
+        "vehicle_global_position_groundtruth": position,
+    }
 
 
 def _stateless(topic: Topic) -> Callable[[], Topic]:

@@ -138,7 +138,8 @@ class LogReader:
     def damage_error(self, error: Exception) -> LogError:
         """Convert an error found while reading into a LogError for the user."""
         return LogError(
-            f"{self.path}: damaged near byte {self.end}: {error}; `companion log recover` saves the rest"
+            f"{self.path}: damaged near byte {self.end}: {' '.join(str(error).split())[:200]};"
+            " `companion log recover` saves the rest"
         )
 
 
@@ -160,7 +161,10 @@ def _break_up(chunk: Chunk) -> list[McapRecord]:
 
 @contextmanager
 def open_log(path: str | os.PathLike[str]) -> Iterator[LogReader]:
-    """Open the log at `path`. Raises LogError if it is missing, empty, not MCAP, or cut before its header."""
+    """Open the log at `path`. Raises LogError if it is missing, empty, not MCAP, or cut before its header.
+
+    An exception while the log is read becomes a LogError too.
+    """
     path = Path(path)
     try:
         file = path.open("rb")
@@ -178,7 +182,13 @@ def open_log(path: str | os.PathLike[str]) -> Iterator[LogReader]:
             raise LogError(f"{path}: is truncated within its header and contains no messages")
         if first.opcode != Opcode.HEADER:
             raise LogError(f"{path}: is not an MCAP log (its first record is not a header)")
-        yield LogReader(path, file, size)
+        source = LogReader(path, file, size)
+        try:
+            yield source
+        except (OSError, DamagedError):
+            raise
+        except Exception as error:  # the last guard: no content of a file ends the program
+            raise source.damage_error(error) from error
 
 
 def is_closed(path: str | os.PathLike[str]) -> bool:

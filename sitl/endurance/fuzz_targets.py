@@ -102,7 +102,7 @@ def script_entry(message: dialect.Message, wait_ms: int = 0, who: int = 0) -> by
     return bytes((MESSAGE_NAMES.index(name), who, 0, wait_ms // 10, len(payload))) + payload
 
 
-def _flight_script(seconds: int = 8) -> bytes:
+def flight_script(seconds: int = 8) -> bytes:
     """Short flight: autopilot, origin, inertial positions, air data, GNSS and RSBN fixes."""
     new = dialect.new
     entries = [
@@ -387,13 +387,13 @@ def check_config(data: bytes) -> None:
 
 
 TARGETS: dict[str, Target] = {
-    "stream": Target(check_stream, lambda: [b"".join(raw for _, raw in script_frames(_flight_script(1)))]),
-    "wire": Target(check_wire, lambda: [_flight_script(1)]),
+    "stream": Target(check_stream, lambda: [b"".join(raw for _, raw in script_frames(flight_script(1)))]),
+    "wire": Target(check_wire, lambda: [flight_script(1)]),
     "onboard": Target(
         check_onboard,
-        lambda: [b"\0" + _flight_script(), b"\xff" + _flight_script(), b"\0" + _ground_station_script()],
+        lambda: [b"\0" + flight_script(), b"\xff" + flight_script(), b"\0" + _ground_station_script()],
     ),
-    "signed": Target(check_signed, lambda: [_flight_script(1), _ground_station_script()]),
+    "signed": Target(check_signed, lambda: [flight_script(1), _ground_station_script()]),
     "log": Target(check_log, lambda: [small_log(), small_log(chunked=True)]),
     "config": Target(check_config, lambda: [to_toml(Config()).encode(), b"[gnss]\nsigma_m = 3.0\n", b"2.5"]),
 }

@@ -1,4 +1,4 @@
-"""`companion log recover` does not overwrite existing files."""
+"""`companion log recover` overwrites no file; `companion log info` cannot control the terminal."""
 
 from pathlib import Path
 
@@ -42,3 +42,16 @@ def test_recovery_without_copy_ignores_an_existing_copy(whole: bytes, tmp_path: 
     (tmp_path / "flight.mcap.active").write_bytes(whole[:-30])
     assert CliRunner().invoke(group, ["recover", f"{log}.active"]).exit_code == 0
     assert log.exists() and copy.read_bytes() == b"existing"
+
+
+def test_text_of_a_log_cannot_control_the_terminal(tmp_path: Path) -> None:
+    log = tmp_path / "hostile.mcap"
+    names = {"a\x1b[2J": {"k\x07": "v\x9b31m [bold]x[/]"}}
+    with Writer(log, metadata=names, start_unix_ns=10**18, start_ns=0, block=True) as writer:
+        writer.record(Event(1, 1, 6, "x"), "/\x1b]0;title\x07")
+    shown = CliRunner().invoke(group, ["info", str(log)]).stdout
+    assert r"/\x1b]0;title\x07" in shown and r"a\x1b[2J.k\x07: v\x9b31m [bold]x[/]" in shown
+    assert not {"\x1b", "\x07", "\x9b"} & set(shown)
+    bad = tmp_path / "no\x1b[2J.mcap"
+    bad.write_bytes(b"x")
+    assert "\x1b" not in CliRunner().invoke(group, ["info", str(bad)]).stderr

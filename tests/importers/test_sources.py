@@ -3,6 +3,7 @@
 import math
 import pathlib
 from collections import Counter
+from itertools import pairwise
 
 import pytest
 from hypothesis import given, settings
@@ -134,6 +135,50 @@ def test_clock_is_reset_at_a_reboot() -> None:
     assert all(record.t_ns == record.rx_ns for record in attitudes)
 
 
+def test_backlog_of_a_stalled_link_keeps_the_flight_s_time() -> None:
+    """490 s of boot time arrive within 47 s, after 443 s of silence: read as 490 s."""
+    stamps = [(10 * i, 10_000 + 10 * i) for i in range(100)]  # reception and boot time, ms
+    stamps += [(444_000 + i, 11_000 + 10 * i) for i in range(49_000)]
+    log = entry(0, heartbeat()) + b"".join(
+        (START_US + 1000 * rx).to_bytes(8, "big") + attitude(i, boot) for i, (rx, boot) in enumerate(stamps)
+    )
+    flown = [h for h in sources.TlogSource(tlog.Tlog(log)) if isinstance(h, r.Attitude)]
+    assert len(flown) == 49_100
+    assert (flown[-1].rx_ns - flown[0].rx_ns) * 1e-9 == pytest.approx(490.99)
+    assert all(record.t_ns == record.rx_ns for record in flown)
+
+
+def test_one_damaged_boot_time_moves_nothing() -> None:
+    stamps = [1000 + 10 * i for i in range(60)]
+    stamps[20], stamps[40] = 4_000_000_000, 1
+    log = entry(0, heartbeat()) + b"".join(entry(i, attitude(i, ms)) for i, ms in enumerate(stamps))
+    source = sources.TlogSource(tlog.Tlog(log))
+    times = [record.rx_ns for record in source if isinstance(record, r.Attitude)]
+    assert source.summary().reboots == 0
+    assert times == sorted(times) and (times[-1] - times[0]) * 1e-9 == pytest.approx(0.59, abs=1e-5)
+
+
+def test_messages_of_one_boot_time_keep_their_order() -> None:
+    """A burst is stamped with one millisecond: equal times would hide all but its first sample."""
+    log = entry(0, heartbeat()) + b"".join(
+        entry(5 * i, attitude(i, 1000 + 50 * (i // 5))) for i in range(100)
+    )
+    times = [h.rx_ns for h in sources.TlogSource(tlog.Tlog(log)) if isinstance(h, r.Attitude)]
+    assert all(0 < after - before <= 50_000_000 for before, after in pairwise(times))
+    assert (times[-1] - times[0]) * 1e-9 == pytest.approx(0.95, abs=0.01)
+
+
+def test_text_of_the_autopilot_is_an_event() -> None:
+    def text(part: bytes, number: int = 0, sequence: int = 0) -> bytes:
+        message = dialect.new("STATUSTEXT", severity=4, text=part, id=number, chunk_seq=sequence)
+        return frame.encode(message, 0, 1, 1)
+
+    bodies = [heartbeat(), text(b"EKF3 lane switch 1"), text(b"x" * 50, 9), text(b"y" * 3, 9, 1)]
+    log = b"".join(entry(i, body) for i, body in enumerate(bodies))
+    events = [record for record in sources.TlogSource(tlog.Tlog(log)) if isinstance(record, r.Event)]
+    assert [(e.severity, e.text) for e in events[1:]] == [(4, "EKF3 lane switch 1"), (4, "x" * 50 + "yyy")]
+
+
 def test_messages_of_a_beacon_receiver_are_accepted() -> None:
     message = dialect.new(
         "RSBN_MEASUREMENT",
@@ -174,7 +219,7 @@ def test_invalid_tlog_is_reported_in_one_sentence(tmp_path: pathlib.Path) -> Non
         (foreign, "is not a tlog"),
         (other, r"unknown file type; give \.mcap"),
     ):
-        with pytest.raises(ValueError, match=words):
+        with pytest.raises(LogError, match=words):
             sources.open_source(path)
 
 
@@ -223,12 +268,13 @@ def test_csv_topics_are_merged_by_time(tmp_path: pathlib.Path) -> None:
     ]
     assert records[1] == r.LocalPosition(1_000_000, 1_000_000, (1.0, 2.0, -3.0), (4.0, 5.0, 6.0))
     (tmp_path / "wind_estimate.csv").write_text(f"{wind}\n2000,north,-4,0.5,0.5")
-    with pytest.raises(ValueError, match=r"wind_estimate.csv, line 2"):
-        list(sources.open_source(tmp_path))
+    *good, event = sources.open_source(tmp_path)
+    assert [type(record) for record in good] == [r.LocalOrigin, r.LocalPosition, r.Event, r.LocalPosition]
+    assert isinstance(event, r.Event) and "wind_estimate.csv at 2000 us: not a row of its topic" in event.text
 
 
 def test_empty_folder_is_reported(tmp_path: pathlib.Path) -> None:
-    with pytest.raises(ValueError, match="has no supported topic"):
+    with pytest.raises(LogError, match="has no supported topic"):
         sources.open_source(tmp_path)
 
 
