@@ -11,6 +11,8 @@ STAMP := $(VENV)/.installed
 SECONDS := 120
 # forged frames: make fuzz FRAMES=1000000
 FRAMES := 10000000
+# mutated logs per format
+MUTANTS := 20000
 
 help: ## list the targets
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -26,7 +28,7 @@ loopback: $(STAMP) ## fly the default scenario in virtual time: log in logs/ and
 	$(BIN)/companion loopback
 
 test: $(STAMP) lint ## lint, type check and all tests
-	$(BIN)/python -m pytest -n auto --dist worksteal
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n auto
 
 lint: $(STAMP) ## ruff, mypy --strict and the import contracts
 	$(BIN)/ruff check .
@@ -34,7 +36,8 @@ lint: $(STAMP) ## ruff, mypy --strict and the import contracts
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-fuzz: $(VENV)/.fuzz ## coverage-guided fuzzing of all byte inputs, SECONDS each (Linux)
+fuzz: $(VENV)/.fuzz ## MUTANTS mutated logs per format; coverage-guided fuzzing, SECONDS per target (Linux)
+	$(BIN)/python -m sitl.endurance.file_mutants --mutants $(MUTANTS)
 	$(BIN)/python -m sitl.endurance.fuzz --seconds $(SECONDS)
 	$(BIN)/python -m sitl.endurance.parameter_sweep
 	$(BIN)/python -m sitl.endurance.forged_frames --frames $(FRAMES)
@@ -61,7 +64,7 @@ docs/configuration.md: $(STAMP) companion/config/*.py
 
 lock: ## regenerate requirements.lock from pyproject.toml (needs uv)
 	uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-emit-index-url \
-	  --no-annotate --no-header $(foreach e,dev plot report live logs campaign,--extra $(e)) \
+	  --no-annotate --no-header $(foreach e,dev plot report live campaign fleet,--extra $(e)) \
 	  -o requirements.lock pyproject.toml
 
 clean: ## remove the environment and tool caches

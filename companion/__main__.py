@@ -21,6 +21,7 @@ import click
 
 from companion import __version__
 from companion.config import ConfigError
+from companion.printable import printable
 from companion.storage.reader import LogError
 
 EX_IOERR, EX_CONFIG = 74, 78  # sysexits.h
@@ -31,6 +32,7 @@ COMMANDS = {
     "report": "companion.analysis.report:command",
     "live": "companion.analysis.live.server:command",
     "smooth": "companion.analysis.smooth_command:command",
+    "fleet": "companion.analysis.fleet:command",
     "log": "companion.analysis.log_command:group",
     "doctor": "companion.doctor.command:command",
     "signing": "companion.doctor.signing_command:group",
@@ -127,8 +129,6 @@ cli.add_command(
 
 def main() -> None:
     """Run the command line; an error that the user can fix ends with one sentence and an exit code."""
-    # before numpy is imported: with batches of 20 states, threads of BLAS only wait for each other
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     if sys.argv[1:2] == ["run"]:  # until the service handles it: a stop during the start is no failure
         signal.signal(signal.SIGTERM, lambda number, stack: sys.exit(0))
     try:
@@ -141,10 +141,10 @@ def main() -> None:
         error.show()
         sys.exit(error.exit_code)
     except ConfigError as error:
-        click.echo(f"companion: {error}", err=True)
+        click.echo(f"companion: {printable(str(error))}", err=True)
         sys.exit(EX_CONFIG)
     except LogError as error:
-        click.echo(f"companion: {error}", err=True)
+        click.echo(f"companion: {printable(str(error))}", err=True)
         sys.exit(1)
     except OSError as error:
         # prevent a second flush of stdout at exit, which would print its own error

@@ -203,7 +203,7 @@ def test_probabilities_in_docs_are_the_settings_of_the_bank() -> None:
 def test_every_extra_in_docs_and_errors_exists() -> None:
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
     named = set(re.findall(r"'\.\[(\w+)\]'", PAGES["install"]))
-    assert {"report", "plot", "logs", "campaign"} <= named <= set(extras)
+    assert {"report", "plot", "fleet", "campaign"} <= named <= set(extras)
     for source in (*ROOT.glob("companion/**/*.py"), *ROOT.glob("sitl/*.py")):
         assert set(re.findall(r"missing_package\(.*\"(\w+)\"\)", source.read_text())) <= set(extras), source
         assert "navigation-companion[" not in source.read_text(), source  # it is not on a package index

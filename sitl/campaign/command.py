@@ -7,8 +7,8 @@
 
 This process appends one line per finished flight to `flights.jsonl` in the results folder. Stored flights are
 not repeated, so an interrupted campaign continues. A flight whose worker died is retried by another worker,
-and after `RETRIES` failures by the next campaign. The flights themselves are defined in
-`sitl.campaign.flight`.
+and after several failures by the next campaign. The flights themselves are defined in `sitl.campaign.flight`,
+the distribution of work in `companion.analysis.jobs`.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from rich.console import Console
 from rich.progress import MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from companion.optional_dependencies import missing_package
+from companion.analysis.jobs import WORKER_LOST, Journal, run_jobs
 from sitl.campaign.flight import (
     FAULT_CASES,
     SCENARIOS,
@@ -37,8 +37,6 @@ from sitl.campaign.flight import (
     is_sensor_fault,
 )
 
-RETRIES = 3  # worker losses per flight before it counts as failed
-WORKER_LOST = "worker lost"
 EX_FAILED = 1
 HEADS = (
     *("fault", "flights", "detected", "median", "slowest", "excluded", "largest before", "largest"),
@@ -93,49 +91,20 @@ def list_orders(scenarios: Iterable[str], faults: Iterable[str], seeds: int) -> 
 
 def read_results(path: Path) -> list[FlightResult]:
     """Read the results of a file; an incomplete last line is removed, so that lines can be appended."""
-    if not path.exists():
-        return []
-    data = path.read_bytes()
-    whole = data[: data.rfind(b"\n") + 1]
-    if len(whole) < len(data):
-        os.truncate(path, len(whole))
     try:
-        return [FlightResult(**json.loads(line)) for line in whole.splitlines()]
-    except (ValueError, TypeError) as error:
-        raise ValueError(
-            f"{path}: invalid flight result ({error}); choose another folder with --results"
-        ) from None
+        return [FlightResult(**entry) for entry in Journal(path).entries]
+    except TypeError as error:
+        raise ValueError(f"{path}: invalid result ({error}); choose another --results folder") from None
 
 
 def fly_orders(todo: Sequence[FlightOrder], scheduler: str | None, workers: int) -> Iterator[FlightResult]:
     """Fly and yield each result when it is finished; in this process with 0 workers and no scheduler."""
-    if scheduler is None and workers == 0:
-        yield from map(fly_order, todo)
-        return
-    try:
-        from dask.distributed import Client, LocalCluster, as_completed
-    except ImportError:
-        without = "or fly with --workers 0"
-        raise ValueError(
-            f"{missing_package('a campaign by many workers', 'Dask', 'campaign')}, {without}"
-        ) from None
-    cluster = None
-    if scheduler is None:
-        cluster = LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address="127.0.0.1:0")
-    with Client(scheduler or cluster) as client:
-        flown = {
-            client.submit(fly_order, order, key=order.key, retries=RETRIES, pure=False): order
-            for order in todo
-        }
-        for future in as_completed(flown):
-            if future.status == "finished":
-                yield future.result()
-            else:
-                raised = f"{WORKER_LOST}: {future.exception()}"
-                yield FlightResult(flown[future].key, *flown[future], 0.0, 0.0, raised=raised)
-            future.release()
-    if cluster is not None:
-        cluster.close()
+    orders = {order.key: order for order in todo}
+    for done in run_jobs(fly_order, orders, scheduler, workers, "campaign"):
+        if done.failure:
+            yield FlightResult(done.key, *orders[done.key], 0.0, 0.0, raised=done.failure)
+        else:
+            yield done.result
 
 
 def run_campaign(
@@ -151,16 +120,12 @@ def run_campaign(
     known = {result.key: result for result in read_results(path) if result.key in keys}
     todo = [order for order in wanted if order.key not in known]
     columns = TextColumn("{task.description}"), MofNCompleteColumn(), TimeRemainingColumn()
-    with (
-        path.open("ab") as file,
-        Progress(*columns, console=Console(stderr=True), transient=True, disable=quiet) as progress,
-    ):
+    journal = Journal(path)
+    with Progress(*columns, console=Console(stderr=True), transient=True, disable=quiet) as progress:
         task = progress.add_task("flights", total=len(wanted), completed=len(known))
         for result in fly_orders(todo, scheduler, workers):
             if not (result.raised or "").startswith(WORKER_LOST):
-                file.write(json.dumps(result._asdict()).encode() + b"\n")
-                file.flush()
-                os.fsync(file.fileno())
+                journal.append(result._asdict())
             known[result.key] = result
             progress.update(task, advance=1, description=result.key)
     return [known[order.key] for order in wanted]

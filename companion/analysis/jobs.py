@@ -1,0 +1,91 @@
+"""Jobs run by many processes (Dask), and their journal, by which an interrupted run continues."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
+
+from companion.optional_dependencies import missing_package
+
+Job = TypeVar("Job")
+
+RETRIES = 3  # worker losses per job before it counts as failed
+WORKER_LOST = "worker lost"
+
+
+class FinishedJob(NamedTuple):
+    """Result of a job by its key; `failure` states why there is none."""
+
+    key: str
+    result: Any
+    failure: str = ""
+
+
+def run_jobs(
+    work: Callable[[Job], Any], jobs: Mapping[str, Job], scheduler: str | None, workers: int, extra: str
+) -> Iterator[FinishedJob]:
+    """Yield each job when it is finished, in any order.
+
+    Parameters
+    ----------
+    work : a function of a module; what it raises is a failure of the job, except in this process.
+    jobs : by key.
+    scheduler : address of a Dask scheduler; None for a cluster of this machine.
+    workers : processes of that cluster; with 0 the jobs run in this process, one after another.
+    extra : optional dependencies that contain Dask, named if it is missing.
+
+    Raises ValueError if Dask is missing. A job whose worker died is retried by another worker.
+    """
+    if scheduler is None and workers == 0:
+        yield from (FinishedJob(key, work(job)) for key, job in jobs.items())
+        return
+    try:
+        from dask.distributed import Client, LocalCluster, as_completed
+    except ImportError:
+        missing = missing_package("work by many processes", "Dask", extra)
+        raise ValueError(f"{missing}, or use --workers 0") from None
+    with ExitStack() as stack:
+        cluster = None
+        if scheduler is None:
+            cluster = stack.enter_context(
+                LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address="127.0.0.1:0")
+            )
+        client = stack.enter_context(Client(scheduler or cluster))
+        keys = {
+            client.submit(work, job, key=key, retries=RETRIES, pure=False): key for key, job in jobs.items()
+        }
+        for batch in as_completed(keys, with_results=True, raise_errors=False).batches():
+            for future, result in batch:
+                if future.status == "finished":
+                    yield FinishedJob(keys[future], result)
+                else:
+                    yield FinishedJob(keys[future], None, f"{WORKER_LOST}: {future.exception()}")
+                future.release()
+
+
+class Journal:
+    """One JSON object a line, appended: a kill while writing loses the last line only."""
+
+    def __init__(self, path: Path) -> None:
+        """Open the journal, which may not exist. Raises ValueError if it is another file."""
+        self.path = path
+        self.entries: list[dict[str, Any]] = []
+        if not path.exists():
+            return
+        data = path.read_bytes()
+        whole = data[: data.rfind(b"\n") + 1]
+        if len(whole) < len(data):
+            os.truncate(path, len(whole))
+        try:
+            self.entries = [dict(json.loads(line)) for line in whole.splitlines()]
+        except (ValueError, TypeError) as error:
+            raise ValueError(f"{path}: invalid result ({error}); choose another --results folder") from None
+
+    def append(self, entry: Mapping[str, Any]) -> None:
+        """Write one entry."""
+        with self.path.open("ab") as file:
+            file.write(json.dumps(entry).encode() + b"\n")

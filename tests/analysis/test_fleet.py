@@ -1,0 +1,136 @@
+"""Many logs become one row a flight; a bad log is a row with its reason; nothing is assessed twice."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import threading
+import time
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from companion.analysis import fleet, jobs
+from companion.analysis.fleet import FlightRow
+from companion.analysis.fleet_page import render_page
+from companion.config import Config
+from sitl.endurance import sample_logs
+
+
+@pytest.fixture
+def logs(tmp_path: Path) -> Path:
+    folder = tmp_path / "logs"
+    (folder / "sub").mkdir(parents=True)
+    (folder / "a.tlog").write_bytes(sample_logs.tlog())
+    (folder / "sub" / "b.bin").write_bytes(sample_logs.dataflash_binary())
+    (folder / "broken.ulg").write_bytes(b"not a log")
+    (folder / "notes.txt").write_text("no log")
+    return folder
+
+
+def run(*arguments: object) -> str:
+    done = CliRunner().invoke(fleet.command, [str(a) for a in arguments], catch_exceptions=False)
+    assert done.exit_code == 0, done.output
+    return done.output
+
+
+def test_each_log_is_a_row_and_a_bad_one_has_a_reason(logs: Path, tmp_path: Path) -> None:
+    parquet = pytest.importorskip("pyarrow.parquet")
+    results = tmp_path / "results"
+    shown = run(logs, "--results", results, "--workers", 0, "--reports", 0)
+    assert "3 logs: 2 flights" in shown and "1 logs not readable" in shown
+    table = parquet.read_table(results / fleet.TABLE).to_pylist()
+    assert {Path(row["log"]).name: row["reason"] for row in table} == {
+        "a.tlog": None,
+        "b.bin": None,
+        "broken.ulg": "is not a ULog: wrong magic bytes at its beginning",
+    }
+    assert all(row["duration_s"] > 5.0 for row in table if row["reason"] is None)
+    assert table[-1]["reason"] and "broken.ulg" in (results / fleet.PAGE).read_text()
+
+
+def test_only_new_and_changed_logs_are_read(
+    logs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("pyarrow")
+    options = (logs, "--results", tmp_path / "results", "--workers", 0, "--reports", 0)
+    run(*options)
+    read: list[str] = []
+
+    def remembered(job: fleet.LogJob) -> list[FlightRow]:
+        read.append(job.path.name)
+        return [FlightRow(str(job.path), reason="again")]
+
+    monkeypatch.setattr(fleet, "assess_log", remembered)
+    run(*options)
+    assert read == []
+    (logs / "a.tlog").write_bytes(sample_logs.tlog() + b"more")
+    (logs / "new.log").write_bytes(sample_logs.dataflash_text())
+    run(*options)
+    assert sorted(read) == ["a.tlog", "new.log"]
+    journal = tmp_path / "results" / fleet.JOURNAL
+    journal.write_bytes(journal.read_bytes()[:-30])  # killed while it wrote
+    run(*options)
+    assert len(read) == 3
+    assert all(json.loads(line) for line in journal.read_text().splitlines())
+
+
+def test_report_of_the_worst_is_linked(logs: Path, tmp_path: Path) -> None:
+    pytest.importorskip("pyarrow")
+    pytest.importorskip("plotly")
+    results = tmp_path / "results"
+    run(logs, "--results", results, "--workers", 0, "--reports", 1)
+    (report,) = (results / fleet.REPORTS).iterdir()
+    assert f"href='reports/{report.name}'" in (results / fleet.PAGE).read_text()
+
+
+def test_worst_flight_comes_first_and_text_is_escaped() -> None:
+    rows = [
+        FlightRow("x/<!--<script>.mcap", 1, 1, largest_m=3.0, duration_s=60.0),
+        FlightRow("unreadable", reason="<b>bad</b>"),
+        FlightRow("x/worst.mcap", 1, 1, largest_m=500.0, duration_s=60.0, report="reports/worst.html"),
+        FlightRow("x/unknown.mcap", 1, 1, duration_s=60.0),
+    ]
+    ordered = fleet.worst_first(rows)
+    assert [row.largest_m for row in ordered] == [500.0, 3.0, None, None]
+    assert ordered[-1].reason
+    page = render_page(ordered)
+    assert page.index("worst.mcap") < page.index("&lt;!--&lt;script&gt;.mcap") < page.index("unknown.mcap")
+    assert "<script" not in page and "<b>bad" not in page and "href='reports/worst.html'" in page
+
+
+def test_exit_code_without_any_readable_log(tmp_path: Path) -> None:
+    pytest.importorskip("pyarrow")
+    (tmp_path / "x.tlog").write_bytes(b"nothing")
+    done = CliRunner().invoke(
+        fleet.command, [str(tmp_path), "--results", str(tmp_path / "r"), "--workers", "0"]
+    )
+    assert done.exit_code == 1 and "0 flights" in done.output
+
+
+def slow_square(number: int) -> int:
+    time.sleep(0.05)
+    return number * number
+
+
+def test_killed_worker_loses_no_job() -> None:
+    """Two processes, one killed on the way."""
+    distributed = pytest.importorskip("distributed")
+    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
+        pids = [worker.pid for worker in cluster.workers.values()]
+        killer = threading.Timer(0.3, os.kill, (pids[0], signal.SIGKILL))
+        killer.start()
+        work = jobs.run_jobs(
+            slow_square, {f"job {k}": k for k in range(40)}, cluster.scheduler_address, 0, "fleet"
+        )
+        done = {one.key: one.result for one in work}
+        killer.join()
+    assert done == {f"job {k}": k * k for k in range(40)}
+
+
+def test_config_travels_to_workers() -> None:
+    import pickle
+
+    assert pickle.loads(pickle.dumps(Config())) == Config()
