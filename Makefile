@@ -28,7 +28,7 @@ loopback: $(STAMP) ## fly the default scenario in virtual time: log in logs/ and
 	$(BIN)/companion loopback
 
 test: $(STAMP) lint ## lint, type check and all tests
-	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n auto
+	$(BIN)/python -m pytest -n auto --dist worksteal
 
 lint: $(STAMP) ## ruff, mypy --strict and the import contracts
 	$(BIN)/ruff check .

@@ -129,6 +129,8 @@ cli.add_command(
 
 def main() -> None:
     """Run the command line; an error that the user can fix ends with one sentence and an exit code."""
+    # before numpy is imported: with batches of 20 states, threads of BLAS only wait for each other
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     if sys.argv[1:2] == ["run"]:  # until the service handles it: a stop during the start is no failure
         signal.signal(signal.SIGTERM, lambda number, stack: sys.exit(0))
     try:

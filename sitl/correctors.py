@@ -1,4 +1,4 @@
-"""Simulated correctors of an INS: star fixes, lines of position of a hyperbolic system, a second INS.
+"""Simulated correctors of an INS: star fixes, lines of position of a hyperbolic system.
 
 Records with the errors that `companion.navigator.corrected_ins` assumes, of a scenario's true flight.
 """
@@ -12,7 +12,7 @@ import numpy as np
 
 from companion.nav.geometry import Geodetic, ecef_tuple
 from companion.navigator.corrected_ins import CHAIN_BIAS_M
-from companion.records import RangeDifference, SecondIns, StarFix
+from companion.records import RangeDifference, StarFix
 from companion.units import SECOND_NS, Floats
 from sitl import sensors
 from sitl.flight import Trajectory
@@ -20,7 +20,6 @@ from sitl.world import World
 
 STAR_EVERY_S, STAR_SIGMA = 60.0, math.radians(20.0 / 3600.0)
 LINE_EVERY_S, LINE_SIGMA_M = 5.0, 50.0
-SECOND_EVERY_S = 2.0
 
 
 class Station(NamedTuple):
@@ -90,15 +89,6 @@ def range_differences(world: World, rng: np.random.Generator) -> list[RangeDiffe
             value = d[0] - d[chain + 1] + float(bias[chain]) + LINE_SIGMA_M * rng.standard_normal()
             found.append(RangeDifference(t_ns, t_ns, chain, *places[0], *secondary, value, LINE_SIGMA_M))
     return found
-
-
-def second_positions(world: World, rng: np.random.Generator) -> list[SecondIns]:
-    """Positions of a second INS of the same grade, with errors of its own."""
-    error = sensors.simulate_inertial_error(world.flight, sensors.GRADES[world.scenario.grade], rng)
-    flight = _sampled(world, SECOND_EVERY_S)
-    lat, lon, _ = sensors.displace_positions(flight, sensors.interpolate_error(error, flight.t).x_n)
-    times = [round(t * SECOND_NS) for t in flight.t.tolist()]
-    return [SecondIns(t, t, 2, *place) for t, *place in zip(times, lat.tolist(), lon.tolist(), strict=True)]
 
 
 def _sampled(world: World, every_s: float) -> Trajectory:

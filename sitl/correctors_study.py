@@ -1,5 +1,4 @@
-"""`companion study correctors`: an INS without GNSS and beacons, corrected by airspeed, stars, lines or a
-second INS.
+"""`companion study correctors`: an INS without GNSS, corrected by airspeed, stars or lines of position.
 
 Fixes of GNSS end at 15 min. The records of each corrector go through the navigator with the errors that
 its model assumes. The table has the error of the position over the time since the loss, with and without
@@ -37,7 +36,6 @@ from sitl.world import World
 SIMULATED: dict[str, Callable[[World, np.random.Generator], Sequence[Stamped]]] = {
     "hyperbolic": correctors.range_differences,
     "stars": correctors.star_fixes,
-    "second_ins": correctors.second_positions,
 }
 NAMES = ("none", "airspeed", *SIMULATED)
 LOSS_S, MARKS_MIN = 900.0, (2, 5, 10, 20)
@@ -91,7 +89,7 @@ def fly(world: World, name: str, seed: int, bank: bool = True) -> CorrectedFligh
 @click.option("--name", "names", multiple=True, type=click.Choice(NAMES), help="Corrector; default: each.")
 @click.option("--seed", default=1, show_default=True, help="Seed of the flight.")
 def command(grade: str, names: tuple[str, ...], seed: int) -> None:
-    """Fly an INS without GNSS, corrected by airspeed, lines of position, stars or a second INS."""
+    """Fly an INS without GNSS, corrected by airspeed, lines of position or stars."""
     scenario = dataclasses.replace(get_scenario("gnss-loss", seed=seed), grade=grade, beacons=())
     world = World(scenario)
     table = Table(title=f"{grade} INS, GNSS lost at 15 min, seed {seed}: error, m r.m.s. (claimed)")

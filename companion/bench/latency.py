@@ -48,8 +48,8 @@ def measure() -> dict[str, list[float]]:
     with (
         tempfile.TemporaryDirectory() as logs,
         _separate_processors() as others,
-        _peer(others, _companion, logs) as there,
-        _peer(others, _echo) as back,
+        peer(others, _companion, logs) as (there, _),
+        peer(others, _echo) as (back, _),
     ):
         autopilot = _Autopilot(there)
         start, answered = time.perf_counter(), 0
@@ -206,8 +206,8 @@ def _separate_processors() -> Iterator[set[int]]:
 
 
 @contextmanager
-def _peer(processors: set[int], serve: Any, *arguments: Any) -> Iterator[socket.socket]:
-    """Run `serve(port, *arguments)` in a process on `processors` (any if empty); yield a connected socket.
+def peer(processors: set[int], serve: Any, *arguments: Any) -> Iterator[tuple[socket.socket, int]]:
+    """Run `serve(port, *arguments)` in a process on `processors` (any if empty); yield a socket and its pid.
 
     The process is terminated by SIGTERM.
     """
@@ -222,7 +222,7 @@ def _peer(processors: set[int], serve: Any, *arguments: Any) -> Iterator[socket.
         try:
             sock.connect((LOOPBACK, port))
             sock.settimeout(TIMEOUT_S)
-            yield sock
+            yield sock, process.pid or 0
         finally:
             process.terminate()
             process.join(TIMEOUT_S)

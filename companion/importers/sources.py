@@ -21,7 +21,7 @@ from typing import NamedTuple, Protocol
 
 from companion.importers import dataflash, inertialnav, px4_csv, tlog, ulog
 from companion.importers.foreign_file import MAX_TEXT, Damage, usable
-from companion.link.decode import MAKES, Autopilot, Sender, decode
+from companion.link.decode import DECODED, MAKES, Autopilot, Sender, decode
 from companion.link.dialect import Message, mavlink, rsbn
 from companion.link.session import LinkUp, MessageReceived, Rebooted, SecondAutopilot, Session
 from companion.link.status_text import CHUNK
@@ -130,10 +130,12 @@ class TlogSource(_Records):
 
     def _records(self, event: object) -> Iterator[Stamped]:
         match event:
-            case MessageReceived(rx_ns, message, found, True) if found.msgid == _STATUSTEXT:
-                yield from self._status_text(message, rx_ns)
-            case MessageReceived(rx_ns, message, found, ours) if ours or found.msgid == _RSBN:
-                for record in decode(message, rx_ns, self._sender):
+            case MessageReceived(received_ns=rx_ns, frame=found, from_autopilot=ours):
+                if ours and found.msgid == _STATUSTEXT:
+                    yield from self._status_text(event.message, rx_ns)
+                if found.msgid not in DECODED or not (ours or found.msgid == _RSBN):
+                    return
+                for record in decode(event.message, rx_ns, self._sender):
                     yield record
                     if self._origin and (origin := self._origin.update(record, self._sender.autopilot)):
                         yield origin

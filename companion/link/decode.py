@@ -471,3 +471,7 @@ def _hil_state(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
     w, x, y, z = (float(c) for c in m.attitude_quaternion)
     t_ns = _stamped(m, rx, sender)
     return (Truth(t_ns, rx, lat, lon, m.alt * 1e-3, vector(m, "vx vy vz", 0.01), euler((w, x, y, z))),)
+
+
+#: Ids of the messages that carry records.
+DECODED = frozenset(_DECODERS)

@@ -59,6 +59,12 @@ STAMPED_WHEN_SENT = frozenset(
         mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT,
     }
 )
+#: Messages that the session reads itself.
+READ_HERE = STAMPED_WHEN_SENT | {
+    mavlink.MAVLINK_MSG_ID_HEARTBEAT,
+    mavlink.MAVLINK_MSG_ID_TIMESYNC,
+    mavlink.MAVLINK_MSG_ID_COMMAND_ACK,
+}
 _AUTOPILOT_COMPONENT: int = mavlink.MAV_COMP_ID_AUTOPILOT1
 _SYSTEM_TIME: int = mavlink.MAVLINK_MSG_ID_SYSTEM_TIME
 
@@ -126,14 +132,23 @@ class SecondAutopilot(NamedTuple):
     kept: int
 
 
-class MessageReceived(NamedTuple):
-    """A message, its frame, whether the vehicle's autopilot sent it, and its address."""
+class MessageReceived:
+    """A frame, whether the vehicle's autopilot sent it, and its address; decoded when `message` is read."""
 
-    received_ns: int
-    message: Message
-    frame: Frame
-    from_autopilot: bool
-    peer: Hashable = None
+    __slots__ = ("_message", "frame", "from_autopilot", "peer", "received_ns")
+
+    def __init__(
+        self, received_ns: int, message: Message | None, frame: Frame, from_autopilot: bool, peer: Hashable
+    ) -> None:
+        self.received_ns, self._message, self.frame = received_ns, message, frame
+        self.from_autopilot, self.peer = from_autopilot, peer
+
+    @property
+    def message(self) -> Message:
+        """The message of the frame."""
+        if self._message is None:
+            self._message = dialect.decode(self.frame)
+        return self._message
 
 
 class NotUnderstood(NamedTuple):
@@ -406,7 +421,7 @@ class Session:
         is_proof = self.is_proof(found)
         if peer is not None and is_proof:
             self._keep_reader(peer, now)
-        message = dialect.decode(found)
+        message = dialect.decode(found) if found.msgid in READ_HERE else None
         if found.component == _AUTOPILOT_COMPONENT and is_proof:
             self._choose(message, found, peer, now, events)
         if self._choice.is_rival(found.system, peer):

@@ -3,7 +3,6 @@
     airspeed     wind, north and east (random walk); airspeed scale
     hyperbolic   a bias for each chain, correlated over an hour
     stars        none: the tilt is a state of the INS
-    second_ins   its position and velocity errors: a Schuler oscillator driven by noise
 
 Only what `inertial.correctors` names has states, behind those of the INS. The rows are those of
 `corrector_measurements`.
@@ -16,7 +15,6 @@ from typing import NamedTuple
 import numpy as np
 
 from companion.config import Config
-from companion.nav.earth import SPHERE
 from companion.nav.error_model import INS_STATES
 from companion.navigator.channel import Nominal, Transition, discretise
 from companion.navigator.ins_channel import InsChannel, ins_channel
@@ -25,8 +23,6 @@ from companion.units import Floats
 INS_NAMES = (*INS_STATES, "EX", "EY", "EZ", "AX", "AY", "driftN", "driftE", "latency")
 CHAINS = 3  # lines of position with a bias of their own
 CHAIN_BIAS_M, CHAIN_S = 200.0, 3600.0
-SECOND_POSITION_M, SECOND_VELOCITY_M_S = 1000.0, 0.5
-SECOND_NOISE_M_S2_SQRT_S = 5e-4  # of a navigation-grade unit: 0.5 m/s grow in 20 min
 
 
 class ExtraStates(NamedTuple):
@@ -97,17 +93,10 @@ def _extra_states(config: Config) -> ExtraStates:
         names += [f"chain{k}" for k in range(CHAINS)]
         density += [2.0 * CHAIN_BIAS_M**2 / CHAIN_S] * CHAINS
         sigma += [CHAIN_BIAS_M] * CHAINS
-    if "second_ins" in used:
-        names += ["dx2", "dy2", "dVN2", "dVE2"]
-        density += [0.0, 0.0] + [SECOND_NOISE_M_S2_SQRT_S**2] * 2
-        sigma += [SECOND_POSITION_M] * 2 + [SECOND_VELOCITY_M_S] * 2
     A = np.zeros((len(names), len(names)))
     index = {name: i for i, name in enumerate(names)}
     for k in range(CHAINS if "hyperbolic" in used else 0):
         A[index[f"chain{k}"], index[f"chain{k}"]] = -1.0 / CHAIN_S
-    for position, velocity in (("dx2", "dVN2"), ("dy2", "dVE2")) if "second_ins" in used else ():
-        A[index[position], index[velocity]] = 1.0
-        A[index[velocity], index[position]] = -SPHERE.G / SPHERE.R
     return ExtraStates(tuple(names), A, np.array(density), np.array(sigma))
 
 

@@ -23,7 +23,7 @@ from companion.config import Config, ConfigError, to_toml
 from companion.config.profiles import MESSAGES, RESET
 from companion.config.validate import find_conflicts
 from companion.link import dialect
-from companion.link.decode import MAKES, Sender, decode
+from companion.link.decode import DECODED, MAKES, Sender, decode
 from companion.link.dialect import mavlink, rsbn
 from companion.link.firmware import Firmware, firmware_of
 from companion.link.rate_limiter import RateLimiter, SenderLimiter
@@ -103,6 +103,8 @@ ABOUT_SOURCE_SET = frozenset(
         mavlink.MAVLINK_MSG_ID_NAMED_VALUE_FLOAT,
     }
 )
+#: Answers to the parameter check.
+PARAMETERS = frozenset({mavlink.MAVLINK_MSG_ID_PARAM_VALUE, mavlink.MAVLINK_MSG_ID_PARAM_ERROR})
 
 
 class Link:
@@ -398,7 +400,10 @@ class CompanionCore:
             self._emit_output_events(link)
         if event.frame.msgid == mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION:
             link.firmware = firmware_of(event.message)
-        link.parameter_check.receive(event.message, event.frame)
+        if event.frame.msgid in PARAMETERS:
+            link.parameter_check.receive(event.message, event.frame)
+        if event.frame.msgid not in DECODED:  # most of a stock stream: never decoded
+            return
         # the leading link receives the same messages
         is_duplicate = link.session.is_up and link is not self.leading_link
         for record in decode(event.message, event.received_ns, link.sender):

@@ -180,13 +180,14 @@ def test_conversion_of_an_own_log_is_rejected(tmp_path: pathlib.Path) -> None:
 
 
 def test_correctors_join_at_seconds_of_the_log(tmp_path):
-    table = tmp_path / "ins2.csv"
-    table.write_text("t_s,ins,lat_deg,lon_deg\n2.5,2,60,30\n0.5,2,60.1,30\n")
+    table = tmp_path / "stars.csv"
+    header = "t_s,star,lat_deg,lon_deg,altitude_deg,azimuth_deg,sigma_altitude_arcsec,sigma_azimuth_arcsec"
+    table.write_text(f"{header}\n2.5,1,20,30,45,,20,\n0.5,2,10,70,40,,20,\n")
     log = [r.Pressure(k * 1_000_000_000, k * 1_000_000_000, 1e5) for k in range(7, 11)]
     inputs = replay_inputs.LogInputs(log, dict)
     merged = list(replay_inputs.with_correctors(inputs, [table]).records)
     assert [record.rx_ns / 1e9 for record in merged] == [7.0, 7.5, 8.0, 9.0, 9.5, 10.0]
-    assert [type(record) for record in merged].count(r.SecondIns) == 2
+    assert [type(record) for record in merged].count(r.StarFix) == 2
     assert list(replay_inputs.with_correctors(inputs, []).records) == log
 
 

@@ -81,6 +81,13 @@ def flight(duration_s: int, outage_s: tuple[int, int], seed: int = 1) -> Simulat
     return SimulatedFlight(tuple(records), truth, error)
 
 
+@lru_cache(maxsize=8)
+def smoothed(duration_s: int, outage_s: tuple[int, int], seed: int = 1) -> SmoothedRun:
+    """Smooth that flight."""
+    (found,) = smooth_flight(flight(duration_s, outage_s, seed).records, CONFIG)
+    return found
+
+
 def errors(found: SmoothedRun, flown: SimulatedFlight) -> tuple[Any, Any]:
     """Return the errors (N, n) of the smoothed and of the filtered states."""
     true = np.array([flown.error[int(t)] for t in found.t_ns])
@@ -94,22 +101,20 @@ def rms(e: Any) -> float:
 def test_smoothed_errors_are_below_filtered_errors() -> None:
     everywhere, outage = [], []
     for seed in range(1, 7):
-        flown = flight(600, (200, 400), seed)
-        (found,) = smooth_flight(flown.records, CONFIG)
+        found, flown = smoothed(600, (200, 400), seed), flight(600, (200, 400), seed)
         both = np.stack(errors(found, flown))
         everywhere.append(both)
         outage.append(both[:, (found.t_ns > 220 * NS) & (found.t_ns < 400 * NS)])
     # GNSS drift has only few independent values per flight: several flights are needed
     for state in (slice(0, 2), slice(2, 4), slice(4, 6), slice(12, 14)):
-        smoothed, filtered = np.concatenate(everywhere, axis=1)[:, :, state]
-        assert rms(smoothed) < rms(filtered)
-    smoothed, filtered = np.concatenate(outage, axis=1)[:, :, :2]
-    assert rms(smoothed) < 0.7 * rms(filtered)
+        after, before = np.concatenate(everywhere, axis=1)[:, :, state]
+        assert rms(after) < rms(before)
+    after, before = np.concatenate(outage, axis=1)[:, :, :2]
+    assert rms(after) < 0.7 * rms(before)
 
 
 def test_last_epoch_equals_the_filter() -> None:
-    flown = flight(600, (200, 400))
-    (found,) = smooth_flight(flown.records, CONFIG)
+    found, flown = smoothed(600, (200, 400)), flight(600, (200, 400))
     np.testing.assert_array_equal(found.x[-1], found.x_filter[-1])
     np.testing.assert_array_equal(found.P[-1], found.P_filter[-1])
     navigator, last = Navigator(CONFIG), None
@@ -128,9 +133,8 @@ def test_last_epoch_equals_the_filter() -> None:
 
 def test_smoothing_reduces_variances_and_is_consistent() -> None:
     nees = []
-    for seed in range(1, 9):
-        flown = flight(300, (100, 200), seed)
-        (found,) = smooth_flight(flown.records, CONFIG)
+    for seed in range(1, 7):
+        found, flown = smoothed(600, (200, 400), seed), flight(600, (200, 400), seed)
         smaller = np.einsum("ijj->ij", found.P) / np.einsum("ijj->ij", found.P_filter)
         assert smaller.max() < 1.0 + 1e-6
         for k in range(5, len(found.t_ns), 60):
@@ -140,8 +144,7 @@ def test_smoothing_reduces_variances_and_is_consistent() -> None:
 
 
 def test_smoothed_track_matches_the_truth() -> None:
-    flown = flight(600, (200, 400))
-    (found,) = smooth_flight(flown.records, CONFIG)
+    found, flown = smoothed(600, (200, 400)), flight(600, (200, 400))
     off = []
     for t_ns, *place in zip(found.t_ns.tolist(), found.lat, found.lon, found.alt_msl, strict=True):
         off.append(separation(Geodetic(*place), flown.truth[t_ns])[:2])

@@ -5,7 +5,7 @@ import math
 import pytest
 
 from companion.importers.corrector_csv import read_correctors
-from companion.records import RangeDifference, SecondIns, StarFix
+from companion.records import RangeDifference, StarFix
 
 STAR = "t_s,star,lat_deg,lon_deg,altitude_deg,azimuth_deg,sigma_altitude_arcsec,sigma_azimuth_arcsec"
 LINE = "t_s,chain,lat_a_deg,lon_a_deg,alt_a_m,lat_b_deg,lon_b_deg,alt_b_m,difference_m,sigma_m"
@@ -27,14 +27,11 @@ def test_stars(tmp_path):
     assert second.azimuth is None and second.t_ns == 65 * NS
 
 
-def test_lines_and_second_ins(tmp_path):
+def test_lines(tmp_path):
     (line,) = read(tmp_path, f"{LINE}\n2,1,61,26,50,58,27,60,-1234.5,50\n")
     assert isinstance(line, RangeDifference)
     assert (line.chain, line.alt_b, line.difference, line.sigma) == (1, 60.0, -1234.5, 50.0)
     assert line.lat_a == math.radians(61)
-    assert read(tmp_path, "t_s,ins,lat_deg,lon_deg\n0,2,60,30\n") == [
-        SecondIns(5 * NS, 5 * NS, 2, math.radians(60), math.radians(30))
-    ]
 
 
 @pytest.mark.parametrize(

@@ -16,10 +16,10 @@ from companion.navigator.channel import Nominal
 from companion.navigator.corrected_ins import CorrectedIns, corrected_ins
 from companion.navigator.inertial_track import Point
 from companion.navigator.ins_channel import InsChannel
-from companion.records import RangeDifference, SecondIns, StarFix
+from companion.records import RangeDifference, StarFix
 from sitl.correctors import direction
 
-ALL = ("airspeed", "hyperbolic", "stars", "second_ins")
+ALL = ("airspeed", "hyperbolic", "stars")
 TRUE = Geodetic(math.radians(60.0), math.radians(30.0), 800.0)
 ERROR = (400.0, -250.0)
 MASTER, SECONDARY = (
@@ -48,26 +48,21 @@ def state(model: CorrectedIns, **errors: float) -> Any:
 
 def test_states_of_the_correctors_follow_those_of_the_ins() -> None:
     model = channel()
-    assert model.n == len(model.names) == len(set(model.names)) == 25
-    assert model.prior().shape == (7, 25, 25)
+    assert model.n == len(model.names) == len(set(model.names)) == 21
+    assert model.prior().shape == (7, 21, 21)
     assert isinstance(corrected_ins(Config(inertial=InertialConfig(independent=True))), InsChannel)
     assert channel("stars").n == 15  # the tilt is a state of the INS
 
 
-def test_transition_is_that_of_the_ins_and_of_a_schuler_oscillator() -> None:
+def test_transition_is_that_of_the_ins_and_of_wandering_biases() -> None:
     model = channel()
     v_n = (30.0, 20.0, 0.0)
     nominal = Nominal(Point(20_000_000_000, TRUE, v_n), (0.0, 0.0), Point(0, TRUE, v_n))
     Phi, Q = model.transition(nominal)
     np.testing.assert_allclose(Phi[:15, :15], model.ins.transition(nominal).Phi)
     assert not Phi[:15, 15:].any() and not Phi[15:, :15].any()
-    i, j = model.names.index("dx2"), model.names.index("dVN2")
-    omega = math.sqrt(9.81 / 6371e3)
-    turned = [
-        [math.cos(20 * omega), math.sin(20 * omega) / omega],
-        [-omega * math.sin(20 * omega), math.cos(20 * omega)],
-    ]
-    np.testing.assert_allclose(Phi[np.ix_([i, j], [i, j])], turned, rtol=1e-9)
+    k = model.names.index("chain0")
+    assert Phi[k, k] == pytest.approx(math.exp(-20.0 / 3600.0), rel=1e-9)
     assert (np.linalg.eigvalsh(Q[0]) > -1e-12).all()
 
 
@@ -105,13 +100,6 @@ def test_star_against_a_tilted_ins(star_lat: float, star_lon: float) -> None:
 def test_star_below_the_horizon_is_not_used() -> None:
     record = StarFix(0, 0, 0, math.radians(-60.0), math.radians(30.0), 0.1, None, 1e-4, 1e-4)
     assert measured.star(channel(), ins(), (0.0, 0.0), record) is None
-
-
-def test_second_ins_is_compared_by_position() -> None:
-    model = channel()
-    other = displace(*TRUE, -900.0, 300.0, 0.0)
-    rows = measured.second_ins(model, ins(), SecondIns(0, 0, 2, other.lat, other.lon))
-    np.testing.assert_allclose(rows.z, rows.H @ state(model, dx2=-900.0, dy2=300.0), atol=0.5)
 
 
 def test_airspeed_at_a_wrong_heading_in_wind() -> None:

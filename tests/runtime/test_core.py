@@ -382,6 +382,19 @@ def test_every_frame_is_logged_in_both_directions() -> None:
     assert flight.log.frames[False] == flight.core.links["main"].received
 
 
+def test_a_message_that_nothing_uses_is_logged_but_not_decoded(monkeypatch) -> None:
+    flight = Flight()
+    flight.fly(1.0)
+    decoded, decode = list[int](), dialect.decode
+    monkeypatch.setattr(dialect, "decode", lambda found: decoded.append(found.msgid) or decode(found))
+    frames = flight.log.frames[False]
+    flight.core.receive("main", flight.frame("SERVO_OUTPUT_RAW", servo1_raw=1500), flight.now)
+    assert (flight.log.frames[False], decoded) == (frames + 1, [])
+    attitude = flight.frame("ATTITUDE", time_boot_ms=(flight.now - flight.boot) // MS, yaw=1.0)
+    flight.core.receive("main", attitude, flight.now)
+    assert decoded == [dialect.id_of(dialect.new("ATTITUDE"))]
+
+
 def test_a_foreign_flood_is_logged_within_its_budget_and_reported() -> None:
     """5,000 frames a second of strangers for ten seconds; the autopilot's are all logged."""
     flight = Flight()

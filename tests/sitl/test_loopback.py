@@ -78,7 +78,6 @@ def test_log_of_the_command_replays_bit_for_bit(tmp_path: Path) -> None:
     assert done.exit_code == 0, done.output
     summary = json.loads(done.stdout)
     assert {row["phase"] for row in summary["phases"]} >= {"GNSS+RSBN", "neither"}
-    assert summary["times_real_time"] > 10.0  # 100 on a quiet machine; see the benchmark
     log = Path(summary["log"])
     replayed = CliRunner().invoke(replay.command, [str(log), "--json"])
     assert replayed.exit_code == 0, replayed.output
