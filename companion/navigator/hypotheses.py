@@ -36,6 +36,7 @@ GROUPS = (2, 2, 1)
 CHANNEL_JUMPS_H = 1e-3
 BEACON_H = 2e-4  # a beacon steps, or is elsewhere, so often in an hour; it does not drift
 ORDERS = (3, 2, 2)  # GNSS may be drawn off with an acceleration
+APART_S = 10.0  # the estimate does not follow a jump of the channel while another explanation is likelier
 SILENCE_S = 5.0  # airspeed that is not used for longer is not judged
 MOST_BEACONS = 8  # followed at once: the work grows with their number
 BIAS_HOUR = 0.5  # a beacon's bias walks in an hour by this share of what it may be
@@ -54,6 +55,9 @@ GNSS_FIRST = (Lie(60.0, 0.3), Lie(300.0, 0.3), Lie(2000.0, 0.3))
 AIRSPEED_LIES = (Lie(3.0, 0.03), Lie(15.0, 0.3))  # m/s, m/s^2
 SHOCK = ((0, 15.0), (1, 15.0), (2, 15.0), (3, 15.0))  # of a false airspeed that moves the nominal: m, m/s
 HYSTERESIS = 999.0  # a source leads the estimate until it is false beyond doubt
+SURPRISE = (
+    5.0  # a step of 5 m/s beside gusts of 1.2 is one: an onset that is born late explains half of it as wind
+)
 JAMMED = 100.0  # times likelier while the receiver itself reports jamming or spoofing
 
 
@@ -200,9 +204,13 @@ def _hypotheses(config: Config, channel: Channel, beacons: int, by_air: bool, wi
         jumps.append(Jump("wind", states, (jump, jump) * sigmas, rate_h, quota=24))
     if channel.wind:
         # whatever the model does not know: GNSS is believed again after a second or two
-        jumps.append(Jump("channel", (0, 1, 2, 3), (100.0, 100.0, 20.0, 20.0), CHANNEL_JUMPS_H, quota=4))
+        jumps.append(
+            Jump(
+                "channel", (0, 1, 2, 3), (100.0, 100.0, 20.0, 20.0), CHANNEL_JUMPS_H, quota=4, apart_s=APART_S
+            )
+        )
     else:
-        jumps.append(Jump("channel", (0, 1), (100.0, 100.0), 0.01, quota=2))
+        jumps.append(Jump("channel", (0, 1), (100.0, 100.0), 0.01, quota=2, apart_s=APART_S))
     layout = Layout(
         channel.n + 2 * beacons,
         GROUPS,
@@ -214,6 +222,7 @@ def _hypotheses(config: Config, channel: Channel, beacons: int, by_air: bool, wi
     )
     settings = Settings(
         hysteresis=HYSTERESIS,
+        surprise=SURPRISE,
         rows=config.integrity.rows or (72 if config.has_own_ins else 96),
         risk=config.integrity.risk,
     )

@@ -1,7 +1,7 @@
 """Corrected estimate: the nominal trajectory less its error, by the estimator that leads, with its trust.
 
-The bank's leading family always leads, unless `estimator.output` names another estimator for the time without
-fixes. The guaranteed bound runs beside it, and is stated about the position that is sent.
+The bank's leading explanation always leads, unless `estimator.output` names another estimator for the time
+without fixes. The guaranteed bound runs beside it, and is stated about the position that is sent.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ def solve(state: State, rx_ns: int, settings: Settings) -> Step:
     promised = minimax_bound.guaranteed(state.guarantee, t_ns)
     rests_on = sources(state, t_ns, settings)
     fixes = rests_on & FIXES
-    leading = estimate(state)
+    leading = estimate(state, settings)
     state = state._replace(leading=(bank, leading))
     candidates = _candidates(state, leading.x, leading.P, nominal.pending_s, promised, settings)
     leads = config.leading_estimator
@@ -301,7 +301,7 @@ def _restrict(state: State, fix: Fix, used: Source, settings: Settings) -> State
         return state
     air = settings.config.air_data
     if state.restrictive is None:
-        found = estimate(state)
+        found = estimate(state, settings)
         begun = restrictive_filter.begin(nominal.t_ns, found.x[:4], found.P[:4, :4])
         return state._replace(restrictive=begun)
     var_n, cov, var_e = fix.covariance

@@ -125,20 +125,20 @@ def levelled(point: Point, state: State) -> Point:
     return Point(point.t_ns, Geodetic(lat, lon, alt - height_error.at(state.level, point).error), point.v_n)
 
 
-def corrected(point: Point, state: State) -> tuple[Point, Vector2]:
+def corrected(point: Point, state: State, settings: Settings) -> tuple[Point, Vector2]:
     """The nominal point less its estimated error, and that error, north and east (m)."""
-    north, east = estimate(state).x[:2].tolist()
+    north, east = estimate(state, settings).x[:2].tolist()
     point = levelled(point, state)
     place = displace(*point.position, -north, -east, 0.0)
     return point._replace(position=place._replace(alt=point.position.alt)), (north, east)
 
 
-def estimate(state: State) -> Estimate:
-    """Moments of the leading family."""
+def estimate(state: State, settings: Settings) -> Estimate:
+    """Moments of the leading explanation."""
     assert state.bank is not None
     if state.leading is not None and state.leading[0] is state.bank:
         return state.leading[1]
-    return banks.estimate(state.bank)
+    return banks.estimate(state.bank, hypotheses(state, settings).layout)
 
 
 def source_name(i: int, state: State) -> str:

@@ -462,7 +462,7 @@ def _rsbn(state: State, record: RsbnFix, settings: Settings) -> Step:
     nominal = state.nominal
     assert nominal is not None
     assert state.bank is not None
-    point, centre = corrected(nominal.point, state)
+    point, centre = corrected(nominal.point, state, settings)
     known, believed = hypotheses(state, settings), Source(0)
     height = settings.config.inertial.height_sigma_m
     for z in fix_observations.from_rsbn(record, point, settings.config.rsbn):
@@ -661,7 +661,7 @@ def _decided(state: State, record: Stamped, settings: Settings) -> Step:
             }[reported[i]]
             severity = Severity.WARNING if reported[i] else Severity.NOTICE
             out.append(Event(record.t_ns, record.rx_ns, severity, f"{source_name(i, state)} {text}"))
-    leading = (bank, banks.estimate(bank))
+    leading = (bank, banks.estimate(bank, known.layout))
     state = state._replace(
         bank=bank, leading=leading, false=false, reported=tuple(reported), certain_ns=tuple(since)
     )
@@ -686,7 +686,7 @@ def _nearer(state: State, settings: Settings) -> State:
     assert nominal is not None
     if nominal.interval is None:
         return state  # an INS of its own cannot be corrected
-    x = estimate(state).x
+    x = estimate(state, settings).x
     n, e, vn, ve = (float(c) for c in x[:4])
     share = settings.config.estimator.feedback
     if math.hypot(n, e) > FAR_M or (math.hypot(vn, ve) > FAST_M_S and nominal.interval.by == "imu"):

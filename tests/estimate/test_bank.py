@@ -279,7 +279,7 @@ def random_bank(seed, rows=12, layout=None):
         noise=np.zeros((rows, 2)),
         seen=np.full(2, 10.0),
         born_t=5.0,
-        family=0,
+        leading=0,
         excluded=np.zeros(2, dtype=bool),
     )
 
@@ -306,7 +306,7 @@ def test_order_of_rows_does_not_matter_and_weights_stay_normalised(seed):
         moved = b.decide(moved, layout, few)
         assert moved.weights.sum() == pytest.approx(1.0, abs=1e-12)
         assert len(moved.L) <= 9
-        at = b.estimate(moved)
+        at = b.estimate(moved, layout)
         results.append((b.false_probability(moved, layout), at.x, at.P, b.protection_level(moved, layout)))
     for left, right in zip(*results):
         np.testing.assert_allclose(left, right, rtol=1e-7, atol=1e-9)
@@ -446,7 +446,7 @@ def test_faults_of_a_silent_source_are_frozen():
         quiet = b.births(b.propagate(quiet, layout, 1.0, PHI, Q), layout, settings)
         assert b.false_probability(quiet, layout) == pytest.approx(frozen, abs=1e-12)
     # a return bears "captured" children, once
-    z = np.array([float(b.estimate(quiet).x[0])])
+    z = np.array([float(b.estimate(quiet, layout).x[0])])
     back, innovation = b.update(quiet, layout, z, H, R, 0, settings)
     assert innovation.born
     _, innovation = b.update(back, layout, z, H, R, 0, settings)
@@ -472,7 +472,7 @@ def cruise(layout, lie_at, T, settings, seed=0, grade=1.0):
         bank, _ = b.update(bank, layout, np.array([z]), H, 25.0 * np.eye(1), 1, settings)
         bank = b.decide(bank, layout, settings)
         history.append(
-            (b.false_probability(bank, layout), bank.excluded.copy(), b.estimate(bank).x[0] - x[0])
+            (b.false_probability(bank, layout), bank.excluded.copy(), b.estimate(bank, layout).x[0] - x[0])
         )
     return bank, history
 

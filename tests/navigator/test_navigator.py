@@ -357,9 +357,6 @@ def test_a_silence_without_a_step_changes_nothing_that_was_known() -> None:
     assert all(s.bound_n is not None for _, s in after)
 
 
-@pytest.mark.xfail(
-    reason="open: the estimate follows a 500 m jump of GNSS for an instant before it is excluded"
-)
 def test_a_gnss_jump_is_refused_and_counted() -> None:
     navigator, rejections, errors = Navigator(CONFIG), 0, []
     navigator.handle(origin())

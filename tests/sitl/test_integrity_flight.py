@@ -21,26 +21,21 @@ def flown(fault: str, seed: int = 1) -> FlightResult:
     return result
 
 
-SLOW = "open: suspect after about 190 s, not excluded within 4 min; error 98 m (version 0.1: 115 m)"
-UNFLAGGED = (
-    "open: the protection level is exceeded for 15 s before the source is suspect (excluded after 36 s)"
-)
-
-
-@pytest.mark.parametrize(
-    "fault",
-    [
-        pytest.param("gnss-spoof-0.5", marks=pytest.mark.xfail(reason=SLOW)),
-        pytest.param("gnss-spoof-2", marks=pytest.mark.xfail(reason=UNFLAGGED)),
-        pytest.param("gnss-spoof-5", marks=pytest.mark.xfail(reason=UNFLAGGED)),
-    ],
-)
+@pytest.mark.parametrize("fault", ["gnss-spoof-2", "gnss-spoof-5"])
 def test_spoofed_gnss_is_excluded_and_readmitted(fault: str) -> None:
     result = flown(fault)
     assert result.excluded_s is not None
     assert result.largest_m < HARMLESS_M
     assert result.beyond_s == 0.0
     assert result.last_m < 10.0  # by GNSS again
+
+
+def test_slow_spoofing_beside_one_beacon_stays_within_the_protection_level() -> None:
+    """0.5 m/s for 4 min cannot be told from wind with certainty; the level and the trust must show it."""
+    result = flown("gnss-spoof-0.5")
+    assert result.largest_m < 120.0  # 0.5 m/s for 240 s
+    assert result.beyond_s == 0.0
+    assert result.last_m < 10.0
 
 
 @pytest.mark.parametrize("fault", ["beacon-bias-300", "beacon-multipath"])
@@ -54,7 +49,6 @@ def test_air_data_alone_do_not_exclude_gnss_and_beacon() -> None:
     assert flown("airspeed-icing").largest_m < HARMLESS_M
 
 
-@pytest.mark.xfail(reason=UNFLAGGED)
 def test_guaranteed_bound_does_not_use_suspected_sources() -> None:
     """All fixes stop before the spoofed GNSS is excluded: the bound still holds."""
     fault = flight.FAULT_CASES["gnss-spoof-5"].fault

@@ -100,6 +100,7 @@ class Jump:
     sigma : one sigma of the jump, one per state.
     rate_h : prior rate, 1/h.
     quota : rows the jump may hold at least, when rows are short.
+    apart_s : for so long a row that jumped is an explanation of its own, see `explanations`.
     """
 
     name: str
@@ -107,6 +108,7 @@ class Jump:
     sigma: tuple[float, ...]
     rate_h: float
     quota: int = 4
+    apart_s: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -14,24 +14,46 @@ from companion.units import Floats
 
 
 class Estimate(NamedTuple):
-    """Moments of the leading family.
+    """Moments of the leading explanation.
 
     Attributes
     ----------
     x : (n,) mean.
     P : (n, n) covariance, spread of the rows' means included.
-    family : code of the family, see `families`.
+    code : code of the explanation, see `explanations`.
     weight : its weight; 0 if it has no rows left, then `x` and `P` are those of the heaviest row.
     """
 
     x: Floats
     P: Floats
-    family: int
+    code: int
     weight: float
 
 
+def explanations(bank: Bank, layout: Layout) -> Ints:
+    """Return the code of each row's explanation: its family, and a recent jump that stands apart.
+
+    A jump explains any disagreement at once. Within the family it would lead as soon as the rows without it
+    have lost their weight, although a false source is the likelier explanation.
+
+    Parameters
+    ----------
+    bank, layout : the bank.
+
+    Returns
+    -------
+    (R,) codes; 0 is "nothing false, no such jump".
+    """
+    code = families(bank) * (len(layout.jumps) + 1)
+    first = 1 + 2 * len(layout.faults)
+    for j, jump in enumerate(layout.jumps):
+        if jump.apart_s > 0.0:
+            code += (j + 1) * ((bank.event == first + j) & (bank.t - bank.since < jump.apart_s))
+    return code
+
+
 def decide(bank: Bank, layout: Layout, settings: Settings = DEFAULT) -> Bank:
-    """Advance the decisions that have hysteresis: leading family and excluded sources. Call after updates.
+    """Advance the decisions that have hysteresis: leading explanation and excluded sources. Call after updates.
 
     Parameters
     ----------
@@ -40,37 +62,37 @@ def decide(bank: Bank, layout: Layout, settings: Settings = DEFAULT) -> Bank:
 
     Returns
     -------
-    Bank : with `family` and `excluded` renewed.
+    Bank : with `leading` and `excluded` renewed.
     """
-    w, code = bank.weights, families(bank)
+    w, code = bank.weights, explanations(bank, layout)
     totals: dict[int, float] = {}
     for c, v in zip(code.tolist(), w.tolist()):
         totals[c] = totals.get(c, 0.0) + v
     best = max(totals, key=lambda c: totals[c])
-    leading = bank.family
+    leading = bank.leading
     if totals[best] > settings.hysteresis * totals.get(leading, 0.0):
         leading = best
     p = false_probability(bank, layout)
     excluded = np.where(bank.excluded, p >= settings.believed, p > settings.excluded)
-    return bank._replace(family=leading, excluded=excluded)
+    return bank._replace(leading=leading, excluded=excluded)
 
 
-def estimate(bank: Bank) -> Estimate:
-    """Return the moments of the leading family (see `decide`).
+def estimate(bank: Bank, layout: Layout) -> Estimate:
+    """Return the moments of the leading explanation (see `decide`).
 
     Parameters
     ----------
-    bank : the bank.
+    bank, layout : the bank.
 
     Returns
     -------
     Estimate
     """
-    w = np.where(families(bank) == bank.family, bank.weights, 0.0)
+    w = np.where(explanations(bank, layout) == bank.leading, bank.weights, 0.0)
     total = float(w.sum())
     if total == 0.0:
         i = int(np.argmax(bank.L))
-        return Estimate(bank.x[i], bank.P[i], bank.family, 0.0)
+        return Estimate(bank.x[i], bank.P[i], bank.leading, 0.0)
     w = w / total
     at = w > 1e-9
     w, x = w[at] / w[at].sum(), bank.x[at]
@@ -78,7 +100,7 @@ def estimate(bank: Bank) -> Estimate:
     d = (x - mean) * np.sqrt(w)[:, None]
     n = len(mean)
     P = (w @ bank.P[at].reshape(len(w), -1)).reshape(n, n) + d.T @ d
-    return Estimate(mean, P, bank.family, total)
+    return Estimate(mean, P, bank.leading, total)
 
 
 def false_probability(bank: Bank, layout: Layout) -> Floats:
@@ -156,7 +178,7 @@ def protection_level(
     ----------
     bank, layout : the bank.
     risk : probability, 1e-7 by default.
-    about : (2,) the position that is sent; the estimate of the leading family by default.
+    about : (2,) the position that is sent; the estimate by default.
 
     Returns
     -------
@@ -179,7 +201,7 @@ def about_estimate(bank: Bank, layout: Layout, about: Floats | None = None) -> t
     (R, 2) means and (R, 2, 2) covariances.
     """
     at = list(layout.position)
-    centre = estimate(bank).x[at] if about is None else about
+    centre = estimate(bank, layout).x[at] if about is None else about
     return bank.x[:, at] - centre, bank.P[:, at][:, :, at]
 
 

@@ -27,7 +27,7 @@ class Settings:
     dropped : share of the weight that a reduction may drop beyond what classes and quotas keep.
     switch_h : rate at which a grade changes, 1/h.
     suspect, excluded, believed : thresholds of the probability that a source is false.
-    hysteresis : the leading family changes once another is this many times heavier.
+    hysteresis : the leading explanation changes once another is this many times heavier.
     risk : probability that the protection level may be exceeded.
     """
 

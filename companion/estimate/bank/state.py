@@ -29,7 +29,7 @@ class Bank(NamedTuple):
     noise : (R, offsets) density of the lie rates' random walk.
     seen : (sources,) time of the last measurement.
     born_t : time of the last births.
-    family : code of the leading family, see `families`.
+    leading : code of the leading explanation, see `explanations`.
     excluded : (sources,) whether a source is excluded (with hysteresis).
     """
 
@@ -45,7 +45,7 @@ class Bank(NamedTuple):
     noise: Floats
     seen: Floats
     born_t: float
-    family: int
+    leading: int
     excluded: Bools
 
     @property
@@ -86,7 +86,7 @@ def start(layout: Layout, t: float, x0: Floats, P0: Floats, prior: Sequence[floa
         noise=np.zeros((k, len(layout.offsets))),
         seen=np.full(len(layout.sources), NEVER),
         born_t=t,
-        family=0,
+        leading=0,
         excluded=np.zeros(len(layout.sources), dtype=np.bool_),
     )
 
