@@ -54,7 +54,6 @@ GNSS_LIES = (
 GNSS_FIRST = (Lie(60.0, 0.3), Lie(300.0, 0.3), Lie(2000.0, 0.3))
 AIRSPEED_LIES = (Lie(3.0, 0.03), Lie(15.0, 0.3))  # m/s, m/s^2
 SHOCK = ((0, 15.0), (1, 15.0), (2, 15.0), (3, 15.0))  # of a false airspeed that moves the nominal: m, m/s
-HYSTERESIS = 999.0  # a source leads the estimate until it is false beyond doubt
 SURPRISE = (
     5.0  # a step of 5 m/s beside gusts of 1.2 is one: an onset that is born late explains half of it as wind
 )
@@ -175,7 +174,7 @@ def _hypotheses(config: Config, channel: Channel, beacons: int, by_air: bool, wi
     # an air-data or IMU channel alone is no witness against GNSS: its own model may be what is wrong
     doubt = 1.0 if witness or not channel.wind else 0.0
     sources = [
-        Source("gnss", 2, GNSS_GROUP),
+        Source("gnss", 2, GNSS_GROUP, presumed=True),
         Source("airspeed", 1, AIRSPEED_GROUP, silence_s=SILENCE_S),
     ]
     faults = [
@@ -221,7 +220,6 @@ def _hypotheses(config: Config, channel: Channel, beacons: int, by_air: bool, wi
         orders=ORDERS,
     )
     settings = Settings(
-        hysteresis=HYSTERESIS,
         surprise=SURPRISE,
         rows=config.integrity.rows or (72 if config.has_own_ins else 96),
         risk=config.integrity.risk,

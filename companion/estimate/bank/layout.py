@@ -31,6 +31,7 @@ class Source:
     group, slot : where its lie stands: the group of lie states and the first offset in it. Two sources may
         share slots unless one fault concerns both.
     silence_s : a longer gap freezes the faults of this source; the next measurement is a return.
+    presumed : the estimate follows an explanation that holds this source to be false only once it is excluded.
     """
 
     name: str
@@ -38,6 +39,7 @@ class Source:
     group: int
     slot: int = 0
     silence_s: float = 10.0
+    presumed: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -64,7 +64,12 @@ def decide(bank: Bank, layout: Layout, settings: Settings = DEFAULT) -> Bank:
     -------
     Bank : with `leading` and `excluded` renewed.
     """
+    p = false_probability(bank, layout)
+    excluded = np.where(bank.excluded, p >= settings.believed, p > settings.excluded)
     w, code = bank.weights, explanations(bank, layout)
+    for s, source in enumerate(layout.sources):
+        if source.presumed and not excluded[s]:
+            w[false_rows(bank, layout, s)] = 0.0
     totals: dict[int, float] = {}
     for c, v in zip(code.tolist(), w.tolist()):
         totals[c] = totals.get(c, 0.0) + v
@@ -72,8 +77,6 @@ def decide(bank: Bank, layout: Layout, settings: Settings = DEFAULT) -> Bank:
     leading = bank.leading
     if totals[best] > settings.hysteresis * totals.get(leading, 0.0):
         leading = best
-    p = false_probability(bank, layout)
-    excluded = np.where(bank.excluded, p >= settings.believed, p > settings.excluded)
     return bank._replace(leading=leading, excluded=excluded)
 
 
