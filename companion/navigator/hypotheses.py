@@ -34,6 +34,8 @@ CONSISTENT, POSITION_ONLY = 0, 1  # faults of GNSS: its velocity is false too, o
 GNSS_GROUP, BEACON_GROUP, AIRSPEED_GROUP = 0, 1, 2
 GROUPS = (2, 2, 1)
 CHANNEL_JUMPS_H = 1e-3
+INS_H, INS_M_S = 1e-5, 2.0  # an INS fails: its velocity steps
+BEACON_PLACE = 0.03  # its position is stated wrongly: likelier than a GNSS captured before the first fix
 BEACON_H = 2e-4  # a beacon steps, or is elsewhere, so often in an hour; it does not drift
 ORDERS = (3, 2, 2)  # GNSS may be drawn off with an acceleration
 APART_S = 10.0  # the estimate does not follow a jump of the channel while another explanation is likelier
@@ -51,6 +53,7 @@ GNSS_LIES = (
     Lie(30.0, 5.0, noise=0.03),
     Lie(300.0, 1.0, noise=0.01),
 )
+ELSEWHERE = (Lie(300.0, 1e-3), Lie(3000.0, 1e-3))  # displacement of a beacon whose stated position is wrong
 GNSS_FIRST = (Lie(60.0, 0.3), Lie(300.0, 0.3), Lie(2000.0, 0.3))
 AIRSPEED_LIES = (Lie(3.0, 0.03), Lie(15.0, 0.3))  # m/s, m/s^2
 SHOCK = ((0, 15.0), (1, 15.0), (2, 15.0), (3, 15.0))  # of a false airspeed that moves the nominal: m, m/s
@@ -60,11 +63,9 @@ SURPRISE = (
 JAMMED = 100.0  # times likelier while the receiver itself reports jamming or spoofing
 
 
-def beacon_lies(reach: tuple[float, ...], slow: tuple[float, ...], scales: int) -> tuple[Lie, ...]:
-    """Scales of a beacon's lie: offsets of 3 and 30 sigma, by components."""
-    return tuple(
-        Lie(tuple(x * 10.0**k for x in reach), tuple(x * 10.0**k for x in slow)) for k in range(scales)
-    )
+def beacon_lies(reach: float) -> tuple[Lie, ...]:
+    """Scales of the lie of an azimuth or a range, of which the first is `reach`: it steps and stays."""
+    return tuple(Lie(reach * scale, 1e-4 * reach * scale) for scale in (1.0, 10.0))
 
 
 class Hypotheses(NamedTuple):
@@ -81,6 +82,10 @@ class Hypotheses(NamedTuple):
     def range(self, k: int) -> int:
         """Source of beacon k's range."""
         return 3 + 2 * k
+
+    def elsewhere(self, k: int) -> int:
+        """Fault that beacon k is not where it states."""
+        return 5 + 3 * k
 
 
 class Model:
@@ -185,15 +190,13 @@ def _hypotheses(config: Config, channel: Channel, beacons: int, by_air: bool, wi
     for k in range(beacons):
         a, r = len(sources), len(sources) + 1
         sources += [Source(f"azimuth {k}", 1, BEACON_GROUP, 0), Source(f"range {k}", 1, BEACON_GROUP, 1)]
-        for name, which, reach in (
-            ("azimuth", (a,), (3.0 * sigma_a,)),
-            ("range", (r,), (3.0 * sigma_r,)),
-            ("beacon", (a, r), (3.0 * sigma_a, 3.0 * sigma_r)),
+        for name, which, lies, first in (
+            ("azimuth", (a,), beacon_lies(3.0 * sigma_a), 1e-3),
+            ("range", (r,), beacon_lies(3.0 * sigma_r), 1e-3),
+            ("elsewhere", (a, r), ELSEWHERE, BEACON_PLACE),
         ):
-            # one measurement steps; a beacon at another place seems to move as the aircraft does
-            slow = tuple(x * (3e-3 if name == "beacon" else 1e-4) for x in reach)
-            lies = beacon_lies(reach, slow, 2)
-            faults.append(Fault(f"{name} {k}", which, BEACON_H, lies, 1e-3, lies, change_h=BEACON_H, quota=4))
+            fault = Fault(f"{name} {k}", which, BEACON_H, lies, first, lies, change_h=BEACON_H, quota=4)
+            faults.append(fault)
     jumps = []
     if channel.wind:
         jump = config.air_data.wind_jump_m_s
@@ -210,6 +213,7 @@ def _hypotheses(config: Config, channel: Channel, beacons: int, by_air: bool, wi
         )
     else:
         jumps.append(Jump("channel", (0, 1), (100.0, 100.0), 0.01, quota=2, apart_s=APART_S))
+        jumps.append(Jump("ins", (2, 3), (INS_M_S, INS_M_S), INS_H, quota=4, apart_s=APART_S))
     layout = Layout(
         channel.n + 2 * beacons,
         GROUPS,

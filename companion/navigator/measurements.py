@@ -20,7 +20,15 @@ from companion.nav.geometry import Geodetic, separation_tuple
 from companion.navigator import fix_observations, own_error_model
 from companion.navigator.channel import Channel
 from companion.navigator.corrector_measurements import CorrectorRows
-from companion.navigator.hypotheses import AIRSPEED, AIRSPEED_GROUP, CONSISTENT, GNSS, GNSS_GROUP, Hypotheses
+from companion.navigator.hypotheses import (
+    AIRSPEED,
+    AIRSPEED_GROUP,
+    BEACON_GROUP,
+    CONSISTENT,
+    GNSS,
+    GNSS_GROUP,
+    Hypotheses,
+)
 from companion.navigator.inertial_track import Point
 from companion.navigator.own_channel import OwnChannel
 from companion.records import Gnss, Vector2
@@ -162,21 +170,27 @@ def sight(
     """Take an azimuth or a range of beacon number `beacon`, linearised for each row about its own position.
 
     `z` is in the plane tangent at the nominal point less the error `centre` (north, east, m): a nominal
-    trajectory kilometres off would otherwise cost tens of metres.
+    trajectory kilometres off would otherwise cost tens of metres. For rows that hold the beacon to be
+    elsewhere the lie is its displacement (north, east, m): the aircraft seen from it is displaced by as much.
     """
     layout = known.layout
     n = layout.n_base
+    place = layout.starts[BEACON_GROUP] + np.arange(2)
+    own_slot = place[0 if isinstance(z, Azimuth) else 1]  # the bank fills in a one here
     source = known.azimuth(beacon) if isinstance(z, Azimuth) else known.range(beacon)
     bias = n - len(known.biases) + 2 * beacon + (0 if isinstance(z, Azimuth) else 1)
 
     def linearised(bank: Bank) -> tuple[Floats, Floats]:
-        x = bank.x
+        elsewhere = (bank.fault[:, BEACON_GROUP] == known.elsewhere(beacon)).astype(np.float64)
+        x = bank.x[:, :2] + elsewhere[:, None] * bank.x[:, place]
         at = np.zeros((len(x), 3))
         at[:, 0], at[:, 1] = centre[1] - x[:, 1], centre[0] - x[:, 0]  # east, north of the plane's origin
         predicted, east, north = fix_observations.predict_sight(z, at)
-        H = np.zeros((len(x), 1, n))
+        H = np.zeros((len(x), 1, layout.n))
         H[:, 0, 0], H[:, 0, 1] = -north, -east
         H[:, 0, bias] = 1.0
+        H[:, 0, place] = elsewhere[:, None] * H[:, 0, :2]
+        H[:, 0, own_slot] -= elsewhere
         innovation = z.value - predicted
         if isinstance(z, Azimuth):
             innovation = np.remainder(innovation + math.pi, 2.0 * math.pi) - math.pi

@@ -106,13 +106,11 @@ def returns(bank: Bank, layout: Layout, source: int, settings: Settings) -> tupl
     -------
     Bank, bool : the bank to be updated, and whether children were born.
     """
-    heard = heard_sources(bank, layout)
-    heard[source] = True
     children: list[_Child] = []
     order = np.argsort(-bank.L)
     for p in order[: max(settings.parents, len(layout.grades))] if settings.parents else order:
         for f, fault in enumerate(layout.faults):
-            if source not in fault.sources or not all(heard[s] for s in fault.sources):
+            if source not in fault.sources:
                 continue
             now = bank.fault[p, layout.fault_group(f)]
             if now == NONE:

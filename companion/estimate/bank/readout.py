@@ -53,7 +53,7 @@ def explanations(bank: Bank, layout: Layout) -> Ints:
 
 
 def decide(bank: Bank, layout: Layout, settings: Settings = DEFAULT) -> Bank:
-    """Advance the decisions that have hysteresis: leading explanation and excluded sources. Call after updates.
+    """Advance the decisions that have hysteresis: leading explanation, excluded sources. Call after updates.
 
     Parameters
     ----------
