@@ -547,7 +547,7 @@ def _rows_of(state: State, record: Any, settings: Settings) -> CorrectorRows | N
         gust = settings.config.air_data.gust_m_s
         heading = math.atan2(V[1], V[0])
         return corrector_measurements.airspeed(channel, nominal.point, math.hypot(*V), heading, gust)
-    point, centre = corrected(nominal.point, state)
+    point, centre = corrected(nominal.point, state, settings)
     if isinstance(record, StarFix):
         return corrector_measurements.star(channel, point, centre, record)
     return corrector_measurements.range_difference(channel, point, centre, record)
