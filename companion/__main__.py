@@ -17,9 +17,6 @@ from importlib.util import find_spec
 from pathlib import Path
 from types import MappingProxyType
 
-# before numpy: matrices are small here, and a pool of BLAS threads that spins costs ten times the time
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-
 import click
 
 from companion import __version__
