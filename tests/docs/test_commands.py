@@ -27,6 +27,7 @@ NOT_RUN = {
     r"mavproxy": "needs MAVProxy: tests/clients",
     r"companion run (?!--set gnss.sigm=)": "flies until stopped: tests/runtime/test_service.py",
     r"companion doctor": "needs an autopilot: tests/doctor/test_command.py",
+    r"companion live": "serves until stopped: tests/analysis/live",
     r"companion sitl": "flies in real time: tests/sitl/test_simulator_command.py, test_bridge.py",
     r"companion loopback": "the fixture of this test flies it",
 }

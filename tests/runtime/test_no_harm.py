@@ -4,11 +4,16 @@ Without the companion the aircraft kept within 2 m. An older companion excluded 
 on the ground, the other 694 m off.
 """
 
+import gzip
+import math
 from pathlib import Path
 
+import msgspec
 import pytest
 
-from companion.records import Rejection, Solution
+from companion.config import load
+from companion.navigator import Navigator
+from companion.records import Gnss, Input, Rejection, Solution
 from sitl import harm_recordings
 
 DATA = Path(__file__).parents[1] / "data"
@@ -36,3 +41,26 @@ def test_healthy_gnss_is_kept_and_leads(name: str, monkeypatch: pytest.MonkeyPat
     assert result.refused_s <= harm_recordings.MOST_REFUSED_S
     assert result.truth_m is not None and result.truth_m < 3.0
     assert result.corrected_m is not None and result.corrected_m < 3.0
+
+
+def test_a_turn_in_turbulence_with_a_beacon_excludes_no_healthy_gnss() -> None:
+    # in flight an older bank excluded GNSS 89 s after the start of this log, and led the aircraft 148 m off
+    decoder = msgspec.json.Decoder(Input)
+    navigator = Navigator(load(flags={"output.profile": "ardupilot"}, environment={}))
+    fix, apart, rejected = None, [], []
+    with gzip.open(DATA / "plane_turbulence_cut.jsonl.gz") as lines:
+        for line in lines:
+            record = decoder.decode(line)
+            if isinstance(record, Gnss) and record.has_3d_fix:
+                fix = record
+            for out in navigator.handle(record):
+                if isinstance(out, Rejection):
+                    rejected.append(out)
+                elif isinstance(out, Solution) and fix is not None and fix.v_n is not None:
+                    dt = (out.t_ns - fix.t_ns) * 1e-9
+                    north = 6.371e6 * (out.lat - fix.lat) - dt * fix.v_n[0]
+                    east = 6.371e6 * math.cos(fix.lat) * (out.lon - fix.lon) - dt * fix.v_n[1]
+                    apart.append(math.hypot(north, east))
+            navigator.settle()
+    assert not rejected
+    assert len(apart) > 800 and max(apart) < 5.0
