@@ -21,6 +21,7 @@ Names
 
 Packages
     records     data types that flow between packages     units       units and constants
+    plausibility  limits of the numbers in a record
     config/     configuration and output profiles         transport/  serial, UDP and TCP connections
     link/       MAVLink: frames, sessions, decoding       nav/        earth, strapdown, INS error model
     estimate/   Kalman, minimax, maximum likelihood       navigator/  records in, solutions out; no I/O

@@ -10,14 +10,13 @@ Records with a number that is not finite or physically impossible become a `Reje
 from __future__ import annotations
 
 import heapq
-import math
 import mmap
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar, get_type_hints
+from typing import Any, NamedTuple, TypeVar
 
-from companion.link.decode import FARTHEST, FASTEST, HIGHEST
-from companion.records import BY_NAME, Event, Rejection, Severity, Stamped
+from companion.plausibility import implausible_field
+from companion.records import Event, Severity, Stamped
 from companion.storage.reader import LogError
 from companion.units import SECOND_NS
 
@@ -29,7 +28,6 @@ MAX_BACK_US = 1_000_000  # a larger decrease of the boot time is a reboot
 MAX_BOOT_US = 10**13  # 115 days
 ORDER_NS = 2 * SECOND_NS  # loggers write topics out of order by less
 
-_Number = int | float
 T = TypeVar("T")
 
 
@@ -102,62 +100,6 @@ def one_line(error: Exception) -> str:
     """Return an exception's text on one line, its type if it has none."""
     text = " ".join(str(error).split())[:200]
     return f"{type(error).__name__}: {text}" if text else type(error).__name__
-
-
-class ImplausibleField(NamedTuple):
-    """A field that makes a record unusable, with its value and its limit."""
-
-    name: str
-    value: _Number
-    limit: float
-
-    @property
-    def reason(self) -> str:
-        """Why the record is not used."""
-        if not math.isfinite(self.value):
-            return f"{self.name} is {self.value}"
-        return f"{self.name} {float(self.value):g} is beyond the limit {self.limit:g}"
-
-    def rejection(self, record: Stamped) -> Rejection:
-        """Return the rejection of `record`."""
-        value = float(self.value) if math.isfinite(self.value) else None
-        return Rejection(record.t_ns, record.rx_ns, type(record).__name__, self.reason, value, self.limit)
-
-
-#: Largest magnitude by field name; other numbers are limited to DEFAULT.
-LIMITS = {
-    **dict.fromkeys(("t_ns", "rx_ns", "boot_ns", "unix_ns", "stamp_us"), 2.0**62),
-    **dict.fromkeys(("alt", "alt_msl", "height_above_home"), HIGHEST),
-    **dict.fromkeys(("v_n", "airspeed", "groundspeed", "climb"), FASTEST),
-    "lat": math.pi / 2.0 + 1e-9,
-    "lon": math.pi + 1e-9,
-    "x_n": FARTHEST,
-}
-DEFAULT = 1e9
-_TEXT_FIELDS = (str, bool)
-_FIELDS = {
-    kind: tuple(
-        (name, LIMITS.get(name, DEFAULT))
-        for name, hint in get_type_hints(kind).items()
-        if hint not in _TEXT_FIELDS and name in kind.__struct_fields__
-    )
-    for kind in BY_NAME.values()
-}
-
-
-def implausible_field(record: Stamped) -> ImplausibleField | None:
-    """Return the first field that is not finite or beyond its limit, None if there is none."""
-    for name, limit in _FIELDS[type(record)]:
-        value: Any = getattr(record, name)
-        if value is None:
-            continue
-        if type(value) is tuple:
-            for part in value:
-                if isinstance(part, _Number) and not -limit <= part <= limit:
-                    return ImplausibleField(name, part, limit)
-        elif isinstance(value, _Number) and not -limit <= value <= limit:
-            return ImplausibleField(name, value, limit)
-    return None
 
 
 class Step(NamedTuple):

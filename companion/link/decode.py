@@ -31,6 +31,7 @@ from companion.link.fields import (
     vector,
     wrap_heading,
 )
+from companion.plausibility import FARTHEST, FASTEST, HIGHEST
 from companion.records import (
     AirData,
     AirspeedSensor,
@@ -64,8 +65,6 @@ UERE = 4.0
 """User range error, one sigma, m: converts a dilution of precision to metres where a receiver gives no
 accuracy; 7.8 m at 95 % (GPS SPS Performance Standard, 4th edition 2008, table 3.4-1)."""
 _ZERO_CELSIUS = 273.15
-FARTHEST, FASTEST, HIGHEST = 2.1e7, 3e3, 1e5
-"""Limits of a measurement: half the earth's circumference (m), 3 km/s, 100 km."""
 _UNIX_AFTER_US = 10**15  # 2001; fewer microseconds are not a date
 
 _INERTIAL_UPDATED = (

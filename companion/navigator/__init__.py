@@ -24,6 +24,7 @@ from companion.navigator.solution import announce, refresh_bound, resolve_pendin
 from companion.navigator.stale_data import REPORT_EVERY, StaleDataDetector
 from companion.navigator.state import FIXES, Settings, State, Step, initial, is_new_fix
 from companion.navigator.step import INPUTS_USED, step, uses
+from companion.plausibility import ImplausibleField, implausible_field
 from companion.records import (
     Event,
     Gnss,
@@ -45,7 +46,6 @@ __all__ = ["INPUTS_USED", "Navigator"]
 ROLL_BACK_SHARE = 10
 #: Most late records that wait for the next roll-back, and most states kept (up to 0.2 MB each).
 MOST_WAITING, MOST_KEPT = 64, 1024
-PLAUSIBLE = 1e8  # in SI: no metres, pascals or metres a second of ours come near it
 
 
 class _Past(NamedTuple):
@@ -72,7 +72,7 @@ class Navigator:
         self._stale_data = StaleDataDetector()
         self._last_mode = Mode.INITIALISING, Source(0)  # mode and fixes of the last solution, and its time
         self._last_solution_ns = 0
-        self._rejected_ns: dict[str, int] = {}  # when a non-finite record was last reported, by kind
+        self._rejected_ns: dict[str, int] = {}  # when an implausible record was last reported, by kind
         self._channel_reported = False
 
     @property
@@ -95,8 +95,8 @@ class Navigator:
         if not self._channel_reported:
             self._channel_reported = True
             return [_channel_event(record, self._settings), *self.handle(record)]
-        if not _is_plausible(record):
-            return self._reject_implausible(record)
+        if (fault := implausible_field(record)) is not None:
+            return self._reject_implausible(record, fault)
         if isinstance(record, Gnss) and self._gnss_latency_ns:
             record = structs.replace(record, t_ns=record.t_ns - self._gnss_latency_ns)
         stale = self._stale_data.judge(record)
@@ -131,13 +131,13 @@ class Navigator:
         while not self._waiting and self._past and self._past[0].t_ns < self._past[-1].t_ns - self._late_ns:
             self._past.popleft()
 
-    def _reject_implausible(self, record: Input) -> list[Output]:
+    def _reject_implausible(self, record: Input, fault: ImplausibleField) -> list[Output]:
         """Report it once a second."""
         name = type(record).__name__
         if record.rx_ns - self._rejected_ns.get(name, -REPORT_EVERY) < REPORT_EVERY:
             return []
         self._rejected_ns[name] = record.rx_ns
-        return [Rejection(record.t_ns, record.rx_ns, name, "a value is not finite or beyond 1e8")]
+        return [fault.rejection(record)]
 
     def _resolve(self) -> tuple[Input | None, list[Output]]:
         """Do the deferred update left by the last record: whose it was, and its outputs.
@@ -288,17 +288,6 @@ def guarded(
             fixed=False,
         )
     return after, outputs
-
-
-def _is_plausible(record: Input) -> bool:
-    """Whether all its numbers are finite and none is beyond anything in flight."""
-    for value in structs.astuple(record):
-        if isinstance(value, float):
-            if not abs(value) < PLAUSIBLE:  # false for NaN too
-                return False
-        elif isinstance(value, tuple) and not all(abs(x) < PLAUSIBLE for x in value):
-            return False
-    return True
 
 
 def _channel_event(record: Input, settings: Settings) -> Event:

@@ -32,7 +32,19 @@ from companion.navigator.state import (
     source_name,
     sources,
 )
-from companion.records import Event, Fix, Gnss, Input, Mode, Severity, Solution, Source, Vector2, Vector3
+from companion.records import (
+    Event,
+    Fix,
+    Gnss,
+    Input,
+    Mode,
+    Rejection,
+    Severity,
+    Solution,
+    Source,
+    Vector2,
+    Vector3,
+)
 from companion.units import SECOND_NS, Floats
 
 UNCONFIRMED = 0.99  # greatest probability stated of a source that is not excluded
@@ -82,6 +94,9 @@ def solve(state: State, rx_ns: int, settings: Settings) -> Step:
     held = _trust(state, bool(fixes), suspicion, bound_n, protection, t_ns, settings)
     north, east, down = point.v_n
     lat, lon, alt = displace(*point.position, -error[0], -error[1], 0.0)
+    if abs(lat) > math.pi / 2.0:
+        why = f"estimated latitude {math.degrees(lat):.1f} deg is beyond the pole: no solution"
+        return state, [Rejection(t_ns, rx_ns, "solution", why, abs(lat), math.pi / 2.0)]
     last = max((t for t in (state.gnss_ns, state.rsbn_ns) if t is not None), default=t_ns)
     solution = Solution(
         t_ns=t_ns,

@@ -484,6 +484,23 @@ def test_what_is_no_number_is_refused_and_changes_nothing(value: float) -> None:
     assert told == 3 * 20  # once a second of each kind
 
 
+def test_no_solution_lies_beyond_a_pole() -> None:
+    """A flat earth goes on north of the pole, the earth does not."""
+    navigator, outs = Navigator(CONFIG), []
+    lat = math.radians(89.99)
+    navigator.handle(LocalOrigin(0, 0, lat, 0.0, 0.0, "ardupilot"))
+    for k in range(1, 600):  # the pole is 1.1 km ahead
+        t_ns, north, v_n = k * NS // 10, 30.0 * k / 10, (30.0, 0.0, 0.0)
+        outs += navigator.handle(LocalPosition(t_ns, t_ns, (north, 0.0, 0.0), v_n))
+        if k < 20:
+            outs += navigator.handle(Gnss(t_ns, t_ns, 0, t_ns // 1000, 3, lat + north / 6.4e6, 0.0, 0.0))
+    solutions = [out for out in outs if isinstance(out, Solution)]
+    refused = [out for out in outs if isinstance(out, Rejection) and out.source == "solution"]
+    assert max(out.t_ns for out in solutions) < 40 * NS < max(out.t_ns for out in refused)
+    assert all(abs(out.lat) <= math.pi / 2.0 for out in solutions)
+    assert all(out.value > out.limit == math.pi / 2.0 for out in refused)
+
+
 def test_a_state_gone_wrong_is_begun_anew_and_said(monkeypatch: pytest.MonkeyPatch) -> None:
     sight = measurements.sight
 
