@@ -42,6 +42,7 @@ class OriginCheck:
     def __init__(self, has_pairs: bool) -> None:
         self.origin: LocalOrigin | None = None
         self.resets = 0
+        self._previous: LocalOrigin | None = None  # the last one in use: a reset is counted against it
         self._has_pairs = has_pairs
         self._stated: LocalOrigin | None = None
         self._projection: Projection = "tangent"
@@ -51,7 +52,7 @@ class OriginCheck:
         self._refused: tuple[float, float] | None = None  # a stated origin reported as false
 
     def forget(self) -> None:
-        """Forget the origin: the autopilot rebooted, or its INS jumped; `resets` is kept."""
+        """Forget the origin: the autopilot rebooted, or its INS jumped; another one afterwards is a reset."""
         self.origin = self._stated = self._local = self._known = self._refused = None
         self._pairs.clear()
 
@@ -97,7 +98,7 @@ class OriginCheck:
 
     def _replaced(self, new: LocalOrigin, now_ns: int) -> list[Event]:
         """Use another origin; one that moved is a reset."""
-        old, self.origin = self.origin, new
+        old, self.origin, self._previous = self._previous, new, new
         moved = 0.0 if old is None else _apart(old, new)
         if moved <= TOLERANCE_M:
             return []

@@ -28,6 +28,7 @@ NOT_RUN = {
     r"companion run (?!--set gnss.sigm=)": "flies until stopped: tests/runtime/test_service.py",
     r"companion doctor": "needs an autopilot: tests/doctor/test_command.py",
     r"companion live": "serves until stopped: tests/analysis/live",
+    r"companion signing": "reads /etc: tests/doctor/test_signing_command.py",
     r"companion sitl": "flies in real time: tests/sitl/test_simulator_command.py, test_bridge.py",
     r"companion loopback": "the fixture of this test flies it",
 }
@@ -98,7 +99,8 @@ def test_command_runs(text: str, folder: Path, monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.chdir(folder)
     assert text.startswith("companion "), f"{text}: run it here, or state in NOT_RUN why not"
     words = [str(next(folder.glob("logs/*.mcap"))) if w == "logs/*.mcap" else w for w in arguments(text)]
-    words = ["SOURCE.tlog" if word == "SOURCE" else word for word in words]
+    stands_for = {"SOURCE": "SOURCE.tlog", "FOLDER...": "logs"}
+    words = [stands_for.get(word, word) for word in words]
     for output in ("LOG.mcap", "FLIGHT.replay.mcap", "other.mcap"):
         if words[-2:] == ["-o", output] or output == "FLIGHT.replay.mcap":
             (folder / output).unlink(missing_ok=True)

@@ -294,7 +294,7 @@ def test_profile_monitor_rejects_requests_for_position_messages(msgid: int) -> N
     flight.send("PARAM_SET", target_system=1, target_component=191, **values)
     denied = [m.result for m in flight.sent_messages("COMMAND_ACK")]
     flight.fly(5.0)
-    assert denied == [2]
+    assert denied == [3]
     assert [m.error for m in flight.sent_messages("PARAM_ERROR")] == [2]  # out of range
     assert flight.position_payloads() == []
     assert flight.sent_messages("NAVIGATION_STATUS")
@@ -391,7 +391,7 @@ def test_rate_of_position_resets_cannot_be_changed() -> None:
     flight.fly(3.0)
     flight.send("COMMAND_LONG", target_system=1, target_component=191, command=511, param1=75, param2=50_000)
     flight.fly(10.0)
-    assert [m.result for m in flight.sent_messages("COMMAND_ACK")] == [2]
+    assert [m.result for m in flight.sent_messages("COMMAND_ACK")] == [3]
     at = [at for at, m in flight.sent if m.get_type() == "COMMAND_INT"]
     assert len(at) > 8 and min(np.diff(at)) >= 0.99
 
