@@ -233,8 +233,7 @@ def command(log: Path, connect: str, from_s: float, to_s: float, speed: float) -
         entries = list(tlog.read(log))
         TlogPlayer(entries, 0, from_s, to_s, speed)
     except (OSError, ValueError) as error:
-        reason = f"cannot be read: {error.strerror}" if isinstance(error, OSError) else str(error)
-        click.echo(f"companion: {log}: {reason}", err=True)
+        click.echo(f"companion: {error}", err=True)
         sys.exit(1)
     runner = PlayerRunner(
         lambda start_ns: TlogPlayer(entries, start_ns, from_s, to_s, speed),

@@ -18,7 +18,7 @@ import pytest
 
 from companion.config import load
 from companion.link import dialect, frame
-from companion.records import Event, Solution
+from companion.records import Event, Reset, Solution
 from companion.runtime import state_file
 from companion.runtime.service import Service
 from companion.storage import flight_log
@@ -276,7 +276,7 @@ def test_oldest_logs_are_deleted_while_a_log_is_written(small_disk) -> None:
         chunk_bytes=4096, fsync_s=0.05,
     )  # fmt: skip
     for i in range(1000):
-        log.record(Event(i, i, 6, random.randbytes(400).hex()))
+        log.record(Reset(i, i, "test", random.randbytes(400).hex()))
         time.sleep(0.001)
     room = free(small_disk)
     assert log.close() and log.dropped == 0
@@ -290,7 +290,7 @@ def torn_log(folder: Path) -> Path:
     """Return a log of 1000 messages, half a mebibyte, without its end."""
     with flight_log.Writer(folder / "x.mcap", metadata={}, start_unix_ns=10**18, start_ns=0) as log:
         for i in range(1000):
-            log.record(Event(i, i, 6, random.randbytes(400).hex()))
+            log.record(Reset(i, i, "test", random.randbytes(400).hex()))
     torn = folder / "20260101T000000Z.mcap.active"
     torn.write_bytes((folder / "x.mcap").read_bytes()[:-1000])
     (folder / "x.mcap").unlink()

@@ -57,7 +57,9 @@ def test_names_of_units_agree_with_the_names_of_fields():
 
 
 def test_no_field_of_the_table_is_unknown():
-    names = {field for kind in (*r.BY_NAME.values(), r.Prediction) for field in kind.__struct_fields__}
+    names = {
+        field for kind in (*r.BY_NAME.values(), r.Prediction, r.Bounds) for field in kind.__struct_fields__
+    }
     assert {name.rsplit(".", 1)[-1] for name in schemas.FIELDS} == names
 
 

@@ -46,4 +46,7 @@ def test_missing_matplotlib_is_reported_with_the_remedy(
     monkeypatch.setitem(sys.modules, "matplotlib.backend_bases", None)
     done = CliRunner().invoke(cli, [*command, "--plot", str(tmp_path / "x.png")])
     assert done.exit_code == 2
-    assert "plotting needs matplotlib: run `pip install '.[plot]'`" in done.stderr
+    assert (
+        "plotting needs matplotlib: run `pip install matplotlib`, or `pip install '.[plot]'` in a checkout"
+        in done.stderr
+    )

@@ -25,7 +25,7 @@ def test_values_beyond_the_limits_change_nothing() -> None:
         Setting("OUT_ODOMETRY_HZ", 4e-4),
         Setting("GNSS_SIGMA_M", EXTREMES[0]),
     ]
-    assert fly_with(CONFIGS[0], random.Random(1).sample(beyond, 30)) == 0
+    assert fly_with(CONFIGS[0], beyond) == 0
 
 
 @pytest.mark.parametrize("config", CONFIGS)
