@@ -53,8 +53,8 @@ STUDIES = {
 
 #: Sections of the help; a command that no section names is listed under the last one.
 SECTIONS = {
-    "Fly": ("run", "doctor", "check-config"),
-    "Look": ("live", "report", "log", "replay"),
+    "Fly": ("run", "doctor", "check-config", "signing"),
+    "Look": ("live", "report", "log", "replay", "smooth", "fleet"),
     "Study": ("loopback", "sitl", "campaign", "study"),
     "Develop": ("bench", "kills", "soak"),
 }

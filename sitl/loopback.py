@@ -246,7 +246,8 @@ def command(
         chunk_bytes=settings.chunk_kib << 10,
         block=True,
     )
-    with log, Progress(console=Console(stderr=True), transient=True) as progress:
+    console = Console(stderr=True)
+    with log, Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
         task = progress.add_task(f"flying {chosen.name}", total=chosen.duration_s)
         flown = fly_scenario(chosen, config, log, lambda flown_s: progress.update(task, completed=flown_s))
     seconds = time.perf_counter() - started

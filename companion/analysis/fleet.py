@@ -251,8 +251,9 @@ def command(
     reports: int,
     config_file: Path | None,
 ) -> None:
-    """Assess all logs in FOLDERS: one row a flight in RESULTS/flights.parquet, and a summary page.
+    """Assess all logs in FOLDERS, the worst flights first.
 
+    Writes one row a flight to RESULTS/flights.parquet, and a summary page.
     Logs that were assessed before are not read again. A log that cannot be read is a row with its reason.
     Exit code 1 if no log could be read.
     """

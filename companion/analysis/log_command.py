@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from companion.analysis.progress import show_step
 from companion.printable import printable
 from companion.storage.flight_log import Info, LogError, info, recover
 
@@ -28,7 +29,8 @@ def group() -> None:
 def info_command(log: Path, as_json: bool) -> None:
     """Show the contents of LOG: messages by topic, times, metadata, and whether it was closed."""
     try:
-        found = info(log)
+        with show_step(f"read {log}"):
+            found = info(log)
     except LogError as error:
         _fail(error)
     if as_json:
@@ -43,7 +45,8 @@ def info_command(log: Path, as_json: bool) -> None:
 def recover_command(log: Path) -> None:
     """Recover a torn or damaged LOG (x.mcap.active becomes x.mcap; x.mcap is copied to x.recovered.mcap)."""
     try:
-        saved = recover(log)
+        with show_step(f"recover {log}"):
+            saved = recover(log)
     except LogError as error:
         _fail(error)
     if saved.path == log:
@@ -63,7 +66,8 @@ def convert_command(source: Path, output: Path) -> None:
     from companion.analysis import convert
 
     try:
-        written = convert.convert_log(source, output)
+        with show_step(f"convert {source}"):
+            written = convert.convert_log(source, output)
     except LogError as error:
         _fail(error)
     click.echo(f"{output}: {written.records} records, {written.reboots} reboots")
@@ -100,7 +104,9 @@ def export_command(log: Path, output: Path, every_s: float, config_file: Path | 
         reject_own_input(output, log, config_file)
         reject_any_log(output)
         tracks, places = list[export.Track](), list[export.Place]()
-        for flight in open_flights(log, load(config_file)):
+        with show_step(f"read {log}"):
+            flights = open_flights(log, load(config_file))
+        for flight in flights:
             lines, places = export.flight_map(flight, every_s)
             k, n = flight.part
             tracks += [

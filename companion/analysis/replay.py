@@ -16,12 +16,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import click
-from rich.console import Console
-from rich.progress import Progress
 
 from companion.analysis import simulated_rsbn
 from companion.analysis.comparison import TOLERANCE, OutputComparison
 from companion.analysis.output_guard import reject_own_input
+from companion.analysis.progress import show_step
 from companion.analysis.replay_inputs import (
     apply_changes,
     has_navigator_outputs,
@@ -238,7 +237,8 @@ def _replay_as_flown(log: Path, output: Path | None, config: Config) -> ReplayRe
         sink = create_replay_log(
             output, run_metadata(config), getattr(first.value, "rx_ns", 0), first.log_time
         )
-    found = replay_own(log, config, sink)
+    with show_step(f"replay {log}"):
+        found = replay_own(log, config, sink)
     if sink is not None:
         sink.close()
     if not found.inputs:
@@ -259,10 +259,8 @@ def _replay_changed(
     log_inputs, note = with_beacons_and_outages(log, beacons, outages, seed, config)
     log_inputs = with_correctors(log_inputs, tables)
     tracks, logged = gnss_latency.TrackCollector(), set[Stamped]()
-    with Progress(console=Console(stderr=True), transient=True) as progress:
-        records = progress.track(
-            _observe(log_inputs.records, tracks, logged), description=f"replay {log.name}"
-        )
+    with show_step(f"replay {log}"):
+        records = _observe(log_inputs.records, tracks, logged)
         sink = create_replay_log(output, run_metadata(config), *start_times(log))
         try:
             found = replay_foreign(records, config, sink)

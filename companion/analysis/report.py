@@ -19,6 +19,7 @@ from companion.analysis.flights import open_flights
 from companion.analysis.html import ReportBlock, render_report
 from companion.analysis.output_guard import reject_any_log, reject_own_input
 from companion.analysis.plot_data import LETTERS, Figure
+from companion.analysis.progress import show_step
 from companion.analysis.replay_inputs import apply_changes, has_navigator_outputs
 from companion.analysis.summary import summarize_flight
 from companion.analysis.verdict import judge_flight
@@ -50,10 +51,10 @@ def command(
     config_file: Path | None,
     changes: tuple[str, ...],
 ) -> None:
-    """Write a report on LOG, or a comparison of several: our MCAP, or any log that `replay` supports.
+    """Write a report on LOG, or a comparison of several.
 
-    A reboot of the autopilot starts a new flight in a log: each flight has its own chapters; of several logs
-    the longest flights are compared.
+    LOG is our own MCAP, or any log that `replay` supports. A reboot of the autopilot starts a new flight in a
+    log: each flight has its own chapters; of several logs the longest flights are compared.
     """
     if len(logs) > len(LETTERS):
         raise click.UsageError(f"{len(logs)} logs given; at most {len(LETTERS)} can be compared")
@@ -66,15 +67,21 @@ def command(
     config = load(config_file)
     if changes:
         config = apply_changes(config, ",".join(changes))
-    found = [open_flights(path, config) for path in logs]
-    blocks = comparison_block(found, _names(logs)) if len(logs) > 1 else blocks_of_log(found[0])
-    try:
-        output.write_text(render_report(_title(_names(logs)), blocks), encoding="utf-8")
-        written = [output, *(write_figures(_all_figures(blocks), pdf, png) if pdf or png else [])]
-    except ModuleNotFoundError as error:
-        raise LogError(missing_package("a report", error.name, "report")) from None
-    except OSError as error:
-        raise LogError(f"cannot write the report to {error.filename}: {error.strerror}") from None
+    with show_step("report") as step:
+        found = []
+        for path in logs:
+            step(f"read {path.name}")
+            found.append(open_flights(path, config))
+        step("smooth the track and assess the errors")
+        blocks = comparison_block(found, _names(logs)) if len(logs) > 1 else blocks_of_log(found[0])
+        step(f"write {output}")
+        try:
+            output.write_text(render_report(_title(_names(logs)), blocks), encoding="utf-8")
+            written = [output, *(write_figures(_all_figures(blocks), pdf, png) if pdf or png else [])]
+        except ModuleNotFoundError as error:
+            raise LogError(missing_package("a report", error.name, "report")) from None
+        except OSError as error:
+            raise LogError(f"cannot write the report to {error.filename}: {error.strerror}") from None
     for block in blocks:
         for flight in block.flights:
             verdict = judge_flight(flight)

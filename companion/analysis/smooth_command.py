@@ -19,6 +19,7 @@ import numpy as np
 
 from companion.analysis.export import Track, write_map
 from companion.analysis.output_guard import reject_own_input
+from companion.analysis.progress import show_step
 from companion.analysis.replay import create_replay_log, start_times
 from companion.analysis.replay_inputs import (
     apply_changes,
@@ -146,8 +147,9 @@ def _ellipse(unix_ns: int, centre: Geodetic, covariance: Floats) -> Track:
 def command(
     log: Path, outputs: tuple[Path, ...], config_file: Path | None, changes: tuple[str, ...], check: bool
 ) -> None:
-    """Estimate the track of LOG from all of its fixes, those after each moment included.
+    """Estimate the track of LOG from all of its fixes.
 
+    Those after each moment are used too.
     LOG may be our own MCAP or that of another recorder, as for `replay`.
     """
     own = is_own_log(log)
@@ -159,7 +161,7 @@ def command(
     config = load(config_file) if config_file or not own else logged_configuration(log)
     if changes:
         config = apply_changes(config, ",".join(changes))
-    with input_errors_as_log_errors():
+    with input_errors_as_log_errors(), show_step(f"smooth {log}"):
         runs = smooth_flight(open_inputs(log).records, config, check=check)
     track = collect(runs)
     start_ns, start_unix_ns = start_times(log)

@@ -270,13 +270,14 @@ UNITS = {
 
 
 class Key(NamedTuple):
-    """One key: default, unit ("" without one), range or choices, meaning, and when to change it."""
+    """One key: default, unit ("" without one), range or choices, limits, meaning, when to change it."""
 
     section: str
     name: str
     default: Any
     unit: str
     allowed: str
+    limits: tuple[float | None, float | None]
     text: str
     change: str
 
@@ -289,7 +290,9 @@ def keys() -> Iterator[Key]:
         for field in msgspec.structs.fields(kind):
             unit = next((unit for end, unit in UNITS.items() if field.name.endswith(end)), "")
             text, change = TEXTS[section][field.name]
-            yield Key(section, field.name, field.default, unit, _allowed(hints[field.name]), text, change)
+            hint = hints[field.name]
+            limits = _limits(hint)
+            yield Key(section, field.name, field.default, unit, _allowed(hint), limits, text, change)
 
 
 def section_summary(section: str) -> str:
@@ -366,6 +369,16 @@ def _allowed(kind: Any) -> str:
     if choices := _choices(kind):
         return ", ".join(choices)
     return {bool: "true or false", str: "text"}.get(kind, "")
+
+
+def _limits(kind: Any) -> tuple[float | None, float | None]:
+    """Return the least and the greatest value of a number."""
+    if kind is bool:
+        return 0.0, 1.0
+    metas = [meta for meta in getattr(kind, "__metadata__", ()) if isinstance(meta, msgspec.Meta)]
+    low = next((m.ge if m.ge is not None else m.gt for m in metas), None)
+    high = next((m.le if m.le is not None else m.lt for m in metas), None)
+    return low, high
 
 
 def _choices(kind: Any) -> tuple[str, ...]:

@@ -5,8 +5,9 @@ The only importer of pymavlink. Its dialect `all` is used: it holds every messag
 compiled cache, and 13 MB. pymavlink's own parser and signature check are not used, see
 `companion.link.frame`.
 
-Our messages are defined in rsbn.xml. `python -m companion.link.dialect` regenerates generated/rsbn_dialect.py
-from it with the mavgen of the installed wheel; `regenerate` writes it to another path.
+Our messages are defined in rsbn.xml, a public one that pymavlink lacks in component_metadata.xml.
+`python -m companion.link.dialect` regenerates generated/rsbn_dialect.py from them with the mavgen of the
+installed wheel; `regenerate` writes it to another path.
 
 Create a message by its class (`RsbnMeasurement(time_usec=..., ...)`) or by `new("ODOMETRY", x=...)`, read its
 attributes, and get its id by `id_of(message)`. Do not read `.id`, `.name`, `.type`: payload fields shadow
@@ -41,6 +42,7 @@ RsbnMeasurement = rsbn.MAVLink_rsbn_measurement_message
 NavigationStatus = rsbn.MAVLink_navigation_status_message
 
 XML = Path(__file__).with_name("rsbn.xml")
+ADDED_XML = Path(__file__).with_name("component_metadata.xml")
 
 
 class Framed(Protocol):
@@ -229,13 +231,13 @@ def payload(message: Message) -> bytes:
 
 
 def regenerate(path: Path) -> None:
-    """Generate the Python module of rsbn.xml at `path` with the installed mavgen (wire protocol 2.0)."""
+    """Generate the Python module of both XML files at `path` with the installed mavgen (MAVLink 2)."""
     from pymavlink.generator import mavgen  # slow to import, not needed in flight
 
     options = mavgen.Opts(os.fspath(path), wire_protocol="2.0", language="Python", validate=True)
     output = io.StringIO()
     with contextlib.redirect_stdout(output):
-        done = mavgen.mavgen(options, [os.fspath(XML)])
+        done = mavgen.mavgen(options, [os.fspath(XML), os.fspath(ADDED_XML)])
     if not done:
         raise ValueError(f"mavgen rejected {XML.name}: {output.getvalue().strip()}")
 

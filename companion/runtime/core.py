@@ -92,6 +92,7 @@ REQUESTS = frozenset(
         mavlink.MAVLINK_MSG_ID_PARAM_SET,
         mavlink.MAVLINK_MSG_ID_MISSION_REQUEST_LIST,
         mavlink.MAVLINK_MSG_ID_PING,
+        mavlink.MAVLINK_MSG_ID_FILE_TRANSFER_PROTOCOL,
     }
 )
 #: Messages that may report that somebody else selected an EKF source set.

@@ -1,4 +1,4 @@
-"""Ground station services: commands, parameters, STATUSTEXT, PING and an empty mission. No I/O.
+"""Ground station services: commands, parameters and their metadata, STATUSTEXT, PING, empty mission. No I/O.
 
 `receive` takes the requests of ground stations; the messages from `to_send` go to every link with a peer.
 """
@@ -12,6 +12,7 @@ from companion.config import Config, OutputConfig
 from companion.config.profiles import RESET
 from companion.link import dialect
 from companion.link.commands import CommandServer, Source
+from companion.link.component_metadata import FileServer, component_metadata
 from companion.link.dialect import mavlink
 from companion.link.parameter_server import ParameterServer
 from companion.link.rate_limiter import RateLimiter
@@ -60,8 +61,12 @@ class GroundStationServices:
         self._commands = CommandServer(
             component,
             _by_id(config.output),
-            {dialect.type_named(name).msgid: source for name, source in sources.items()},
+            {
+                dialect.type_named(name).msgid: source
+                for name, source in {**sources, "COMPONENT_METADATA": component_metadata}.items()
+            },
         )
+        self._files = FileServer(component)
         self._parameters = ParameterServer(component, config, base=base, save=save)
         self._status = StatusText()
         #: Period of each enabled message, ns.
@@ -77,6 +82,7 @@ class GroundStationServices:
     def receive(self, event: MessageReceived, system: int) -> tuple[list[Any], Config | None]:
         """Process a message; return replies for its link, and the configuration if a parameter changed it."""
         replies = self._commands.receive(event.message, event.frame, system, event.received_ns)
+        replies += self._files.receive(event.message, event.frame, system, event.received_ns)
         changes = self._parameters.receive(event.message, event.frame, system, event.received_ns)
         config = changes[-1].config if changes else None
         if (reply := self._answer(event, system)) is not None:

@@ -21,6 +21,7 @@ import pytest
 from companion.config import Config
 from companion.link import dialect, frame
 from companion.link.commands import CommandServer, Result
+from companion.link.component_metadata import FileServer, component_metadata
 from companion.link.parameter_server import ParameterServer, parameter_table
 from companion.link.session import MessageReceived, Session
 from companion.link.signing import SignatureFault, Signing
@@ -37,7 +38,8 @@ class Vehicle(threading.Thread):
     def __init__(self, autopilot: int, signing: Signing | None = None) -> None:
         super().__init__(daemon=True)
         self.session = Session(system=SYSTEM, component=COMPONENT, signing=signing)
-        self.commands = CommandServer(COMPONENT, {331: 200_000}, {})
+        self.commands = CommandServer(COMPONENT, {331: 200_000}, {397: component_metadata})
+        self.files = FileServer(COMPONENT)
         self.parameters = ParameterServer(COMPONENT, Config())
         self.status_text = StatusText()
         self.received: list[str] = []
@@ -88,6 +90,8 @@ class Vehicle(threading.Thread):
                 self.session.send(reply)
                 if reply.get_type() == "COMMAND_ACK":
                     self.acknowledged.append(reply.command)
+            for reply in self.files.receive(event.message, event.frame, SYSTEM, now):
+                self.session.send(reply)
             for change in self.parameters.receive(event.message, event.frame, SYSTEM, now):
                 text = f"{change.parameter.name} is {change.new}"
                 self.status_text.add(Event(now, now, 5, text), now)
@@ -101,7 +105,7 @@ def vehicle(request: pytest.FixtureRequest) -> Iterator[Vehicle]:
     there.stop()
 
 
-def until(true: Callable[[], bool], seconds: float = 20.0) -> bool:
+def until(true: Callable[[], bool], seconds: float = 60.0) -> bool:
     ends = time.monotonic() + seconds
     while not true() and time.monotonic() < ends:
         time.sleep(0.05)
@@ -143,6 +147,34 @@ def test_mavsdk(vehicle: Vehicle) -> None:
             station.send_message(direct.MavlinkMessage("COMMAND_LONG", 0, 0, 0, 0, json.dumps(fields)))
         results = {512: Result.ACCEPTED, 400: Result.UNSUPPORTED}
         assert until(lambda: results.items() <= {m["command"]: m["result"] for m in received}.items())
+    finally:
+        sdk.destroy()
+
+
+@pytest.mark.parametrize("vehicle", [ARDUPILOT], indirect=True)
+def test_mavsdk_reads_what_the_parameters_mean(
+    vehicle: Vehicle, tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))  # MAVSDK keeps files by their checksum
+    mavsdk = pytest.importorskip("mavsdk.mavsdk")
+    component = pytest.importorskip("mavsdk.component_type").ComponentType.GROUND_STATION
+    metadata = pytest.importorskip("mavsdk.plugins.component_metadata.component_metadata")
+    sdk = mavsdk.Mavsdk(mavsdk.Configuration.create_with_component_type(component))
+    try:
+        sdk.add_any_connection(f"udpin://127.0.0.1:{vehicle.port}")
+        system = sdk.first_autopilot(20.0)
+        assert system is not None
+        assert until(lambda: COMPONENT in system.component_ids())
+        reader = metadata.ComponentMetadata(system)
+        received: list[object] = []
+        reader.subscribe_metadata_available(lambda update, *_: received.append(update))
+        reader.request_component(COMPONENT)
+        assert until(lambda: bool(received))
+        found = reader.get_metadata(COMPONENT, metadata.MetadataType.PARAMETER)
+        described = {entry["name"]: entry for entry in json.loads(found.json_metadata)["parameters"]}
+        assert set(described) == {parameter.name for parameter in parameter_table()}
+        sigma = described["GNSS_SIGMA_M"]
+        assert (sigma["units"], sigma["min"], sigma["default"]) == ("m", 0.01, Config().gnss.sigma_m)
     finally:
         sdk.destroy()
 

@@ -231,10 +231,10 @@ async def run(view: LiveView, host: str, port: int, on_ready: Callable[[int], No
     help="Serve Foxglove too, for example on 8765.",
 )
 def command(path: Path, listen: str, speed: float, foxglove: int | None) -> None:
-    """Show a flight in a browser while it happens: map, trust, sources, events.
+    """Show a flight in a browser while it happens.
 
-    A folder is followed: the newest log that is being written. A finished log is played back. Nothing is sent
-    to the flight.
+    The page has map, trust, sources, events and strip charts. A folder is followed: the newest log that is
+    being written. A finished log is played back. Nothing is sent to the flight.
     """
     host, _, port = listen.rpartition(":")
     if not host or not port.isdecimal() or int(port) > 65535:
