@@ -44,6 +44,9 @@ __all__ = ["INPUTS_USED", "Navigator"]
 
 #: A roll-back costs 1 to 2 % of the time that it goes back: at most one in this share of it.
 ROLL_BACK_SHARE = 10
+#: After a roll-back by t seconds for beacon answers, all of which were rejected, none that is older than
+#: CHEAP_NS is used for USELESS_TIMES t: forged ones would take the time of all others.
+USELESS_TIMES, CHEAP_NS = 2, 500_000_000
 #: Most late records that wait for the next roll-back, and most states kept (up to 0.2 MB each).
 MOST_WAITING, MOST_KEPT = 64, 1024
 
@@ -66,6 +69,7 @@ class Navigator:
         self._past: deque[_Past] = deque(maxlen=MOST_KEPT)
         self._waiting: list[Input] = []  # late records, until the next roll-back
         self._rolled_back_ns: int | None = None  # arrival of the record at the last roll-back
+        self._no_late_answers_ns = 0  # until when none is used: the last ones were all rejected
         self._deferred: list[Output] = []  # outputs of deferred updates, for the next `handle`
         self._late_ns = round(1e9 * config.estimator.late_s)
         self._gnss_latency_ns = round(1e9 * config.gnss.latency_s)
@@ -174,6 +178,11 @@ class Navigator:
         """Let a late record wait for the next roll-back, or reject it."""
         if record.t_ns < self._past[0].t_ns:
             return self._too_late(record)
+        age_ns = self._past[-1].t_ns - record.t_ns
+        if isinstance(record, RsbnFix) and age_ns > CHEAP_NS and record.rx_ns < self._no_late_answers_ns:
+            why = "late, and the last late answers were rejected: not used"
+            age, limit = age_ns * 1e-9, CHEAP_NS * 1e-9
+            return [Rejection(record.t_ns, record.rx_ns, f"rsbn {record.beacon}", why, age, limit)]
         if len(self._waiting) >= MOST_WAITING:
             why = f"more than {MOST_WAITING} late records wait: not used"
             return [Rejection(record.t_ns, record.rx_ns, type(record).__name__, why)]
@@ -202,7 +211,7 @@ class Navigator:
             self._state = self._rewound(self._past[place].before)
         while len(self._past) > place:
             self._past.pop()
-        new = set(map(id, late))
+        new, back_ns, useful = set(map(id, late)), again[-1].t_ns - again[0].t_ns, False
         for each in again:
             whose, resolved = self._resolve()
             if id(whose) in new:  # the others were returned when they were resolved first
@@ -210,9 +219,12 @@ class Navigator:
             self._past.append(_Past(each.t_ns, each, self._state))
             found = self._step(each)
             if id(each) in new:
+                useful |= not isinstance(each, RsbnFix) or self._state.rsbn_ns == each.t_ns
                 last = self._last_solution_ns
                 outputs += [out for out in found if not isinstance(out, Solution) or out.t_ns > last]
         self._resolve()
+        if not useful:
+            self._no_late_answers_ns = now_ns + USELESS_TIMES * back_ns
         return outputs
 
     def _too_late(self, record: Input) -> list[Output]:

@@ -23,10 +23,11 @@ from companion.config import Config, ConfigError, to_toml
 from companion.config.profiles import MESSAGES, RESET
 from companion.config.validate import find_conflicts
 from companion.link import dialect
+from companion.link.beacon_answers import BeaconAnswers
 from companion.link.decode import DECODED, MAKES, Sender, decode
 from companion.link.dialect import mavlink, rsbn
 from companion.link.firmware import Firmware, firmware_of
-from companion.link.rate_limiter import RateLimiter, SenderLimiter
+from companion.link.rate_limiter import RateLimiter
 from companion.link.session import (
     AutopilotReleased,
     ClockJump,
@@ -76,8 +77,6 @@ STATUS = "NAVIGATION_STATUS"
 ORIGIN_REQUEST_INTERVAL = 3 * SECOND_NS
 FIRMWARE_REQUESTS = 10
 STALE_AFTER = 2 * SECOND_NS
-#: Beacon answers per second and at once of one sender, and the number of senders: bounds their work.
-ANSWERS_HZ, ANSWERS_BURST, MAX_RECEIVERS = 10.0, 20, 4
 REPORT_INTERVAL = 10 * SECOND_NS
 #: Bytes per second, at once and in all of frames that are logged though they are not used: those of stations,
 #: other vehicles and strangers. A flood must not fill the disk with them.
@@ -197,7 +196,7 @@ class CompanionCore:
         self._origin = OriginCheck(has_pairs=not config.has_own_ins)
         self._last_used: Link | None = None  # whose autopilot's records were used last
         self._pace = Pace(at_least=frozenset({RESET}))
-        self._answers = SenderLimiter(ANSWERS_HZ, ANSWERS_BURST, MAX_RECEIVERS)
+        self._answers = BeaconAnswers()
         self._unused_log = RateLimiter(UNUSED_LOG_HZ, UNUSED_LOG_BURST)
         self._unused_logged = 0
         self.not_logged = 0  # frames
@@ -369,12 +368,12 @@ class CompanionCore:
                 self.report(Severity.WARNING, text, now_ns)
 
     def _on_message(self, link: Link, event: MessageReceived) -> None:
+        # the leading link receives the same messages
+        is_duplicate = link.session.is_up and link is not self.leading_link
         is_used = event.from_autopilot
+        receiver = event.peer, event.frame.system, event.frame.component
         if event.frame.msgid == rsbn.MAVLINK_MSG_ID_RSBN_MEASUREMENT:
-            sender = event.peer, event.frame.system, event.frame.component
-            is_used = self._answers.take(sender, event.received_ns)
-            if not is_used:
-                self._report_excess_answers(link, event)
+            is_used = is_duplicate or self._is_answer_used(link, event, receiver)
         if is_used or self._may_log_unused(link, event):
             self._log.frame(link.name, False, event.frame.raw, event.received_ns)
         if event.frame.msgid == mavlink.MAVLINK_MSG_ID_HEARTBEAT:
@@ -405,8 +404,6 @@ class CompanionCore:
             link.parameter_check.receive(event.message, event.frame)
         if event.frame.msgid not in DECODED:  # most of a stock stream: never decoded
             return
-        # the leading link receives the same messages
-        is_duplicate = link.session.is_up and link is not self.leading_link
         for record in decode(event.message, event.received_ns, link.sender):
             if not isinstance(record, RsbnFix):
                 link.output.receive(record)
@@ -415,16 +412,18 @@ class CompanionCore:
                     each.output.receive(record)
             if not is_duplicate:
                 self._last_used = link if event.from_autopilot else self._last_used
-                self._on_record(record)
+                is_rejected = self._on_record(record)
+                if is_rejected and event.frame.msgid == rsbn.MAVLINK_MSG_ID_RSBN_MEASUREMENT:
+                    self._answers.note_rejected(receiver, event.received_ns)
 
-    def _report_excess_answers(self, link: Link, event: MessageReceived) -> None:
-        self.rejected["beacon answers above their rate"] += 1
-        self._report_excess(
-            f"{link.name}: beacon answers of {event.frame.system}/{event.frame.component} not used: more "
-            f"than {ANSWERS_HZ:g} per second, or more than {MAX_RECEIVERS} receivers",
-            "answers",
-            event.received_ns,
-        )
+    def _is_answer_used(self, link: Link, event: MessageReceived, receiver: Hashable) -> bool:
+        why = self._answers.refusal(receiver, event.message.beacon_id, event.received_ns)
+        if why is not None:
+            self.rejected["beacon answers not used"] += 1
+            sender = f"{event.frame.system}/{event.frame.component}"
+            text = f"{link.name}: beacon answers of {sender} not used: {why}"
+            self._report_excess(text, "answers", event.received_ns)
+        return why is None
 
     def _may_log_unused(self, link: Link, event: MessageReceived) -> bool:
         size, now = len(event.frame.raw), event.received_ns
@@ -445,10 +444,12 @@ class CompanionCore:
             self._excess_reported_ns[what] = now
             self.report(Severity.WARNING, text, now)
 
-    def _on_record(self, record: Stamped) -> None:
+    def _on_record(self, record: Stamped) -> bool:
+        """Log a record and let the navigator use it; return whether anything was rejected."""
+        is_rejected = isinstance(record, Rejection)
         if not isinstance(record, INPUTS):  # truth, or a rejection by the decoder: only logged
-            self._emit(record, "/link/Rejection" if isinstance(record, Rejection) else None)
-            return
+            self._emit(record, "/link/Rejection" if is_rejected else None)
+            return is_rejected
         self._log.record(record)
         for event in self._origin.receive(record):
             self._emit(event, "/link/Event")
@@ -457,7 +458,9 @@ class CompanionCore:
                 self._send(output, early=isinstance(record, RsbnFix))
             elif isinstance(output, Reset) and isinstance(record, LocalPosition):
                 self._origin.forget()  # it may have moved: do not use it until received again
+            is_rejected |= isinstance(output, Rejection)
             self._emit(output)
+        return is_rejected
 
     def _emit(self, record: Stamped, channel: str | None = None) -> None:
         self._log.record(record, channel)

@@ -245,8 +245,8 @@ def _connected(kind: str, port: int) -> socket.socket:
     raise SystemExit("companion: the service did not listen")
 
 
-def fly(name: str, seconds: float) -> tuple[Phase, Phase, int]:
-    """Return the quiet phase, the attacked one, and the exit code of the service after SIGTERM."""
+def fly(name: str, seconds: float) -> tuple[Phase, Phase, float, int]:
+    """Return the quiet phase, the attacked one, the attack's rate (Hz), and the service's exit code."""
     attack = ATTACKS[name]
     kind = "tcpin" if attack.tcp else "udpin"
     with tempfile.TemporaryDirectory() as folder:
@@ -259,18 +259,24 @@ def fly(name: str, seconds: float) -> tuple[Phase, Phase, int]:
             station.run(SETTLE_S)
             quiet = station.measure(process.pid, seconds)
             attacker = [sys.executable, "-m", __spec__.name, "--inside", name, str(port), str(seconds + 1.0)]
-            with subprocess.Popen([*attacker, str(station.start)]) as other_process:
-                station.run(1.0)
+            attacker.append(str(station.start))
+            with subprocess.Popen(attacker, stdout=subprocess.PIPE) as other_process:
+                assert other_process.stdout is not None
+                while not select.select([other_process.stdout], [], [], 0.0)[0]:  # until it attacks
+                    station.run(0.1)
+                station.run(0.5)
                 attacked = station.measure(process.pid, seconds)
-                if other_process.poll():
+                station.run(1.0)
+                sent = other_process.stdout.read().split()
+                if other_process.wait():
                     raise SystemExit(f"companion: the attacker of {name!r} failed")
-                other_process.terminate()
-        return quiet, attacked, process.returncode
+        return quiet, attacked, float(sent[-1]), process.returncode
 
 
 def attack_from_here(name: str, port: int, seconds: float, start: float) -> None:
-    """Send the attack's datagrams, or open its connections, at its rate."""
+    """Send the attack's datagrams, or open its connections, at its rate; print the rate that was reached."""
     attack = ATTACKS[name]
+    click.echo("begins")
     began, sent, numbers = time.monotonic(), 0, itertools.count(1)
     clients: list[socket.socket] = []
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
@@ -289,6 +295,7 @@ def attack_from_here(name: str, port: int, seconds: float, start: float) -> None
                     with contextlib.suppress(OSError):
                         sock.sendto(attack.make(next(numbers), boot_us), (HOST, port))
             time.sleep(BATCH_S)
+    click.echo(f"{sent / (time.monotonic() - began):.0f}")
 
 
 class Cost(NamedTuple):
@@ -392,10 +399,10 @@ def main(seconds: float, only: tuple[str, ...], virtual: bool) -> None:
     for name in only or ATTACKS:
         if name == "term":
             continue
-        quiet, attacked, code = fly(name, seconds)
+        quiet, attacked, rate_hz, code = fly(name, seconds)
         table.add_row(
             name,
-            f"{ATTACKS[name].rate_hz:g}",
+            f"{rate_hz:g}",
             f"{100 * quiet.cpu:.0f} / {100 * attacked.cpu:.0f} %",
             f"{quiet.rss_mib:.0f} / {attacked.rss_mib:.0f} MiB",
             f"{quiet.odometry_hz:.1f} / {attacked.odometry_hz:.1f} Hz",

@@ -210,6 +210,34 @@ def test_a_flood_of_late_answers_is_folded_in_by_few_roll_backs(monkeypatch: pyt
     assert len(rejected) >= 200 - 3 * navigator_module.MOST_WAITING
 
 
+@pytest.mark.parametrize(("off_m", "least", "most"), [(5e4, 3, 5), (0.0, 30, 30)])
+def test_false_late_answers_share_few_roll_backs(
+    monkeypatch: pytest.MonkeyPatch, off_m: float, least: int, most: int
+) -> None:
+    """One answer a second, five seconds late: true ones are all folded in, false ones once in ten seconds."""
+    navigator, roll_backs = Navigator(CONFIG), []
+    rewound = Navigator._rewound
+    monkeypatch.setattr(
+        Navigator, "_rewound", lambda self, state: roll_backs.append(1) or rewound(self, state)
+    )
+    navigator.handle(origin())
+    late: list[RsbnFix] = []
+    for moment in flight(60, 60.0, 60.0):
+        now = moment.records[0].t_ns
+        for record in moment.records:
+            if isinstance(record, RsbnFix) and 20 * NS <= now < 50 * NS:
+                late.append(
+                    msgspec.structs.replace(
+                        record, rx_ns=now + 5 * NS, azimuth=None, slant_range=record.slant_range + off_m
+                    )
+                )
+            else:
+                navigator.handle(record)
+        while late and late[0].rx_ns <= now:
+            navigator.handle(late.pop(0))
+    assert least <= len(roll_backs) <= most
+
+
 def test_what_is_settled_in_between_changes_nothing() -> None:
     """The service learns while it waits, a replay when the next record is there: answers come late, one GNSS
     fix is wild, and parameters are set in flight."""

@@ -1,0 +1,48 @@
+"""Which beacon answers are used: so many per second of a receiver, and of one receiver for each beacon.
+
+On an unsigned link anyone can send answers, and each costs an update of the navigator. A receiver is a
+sender's address and ids. The one that gave a beacon's answers first keeps the beacon until it is silent, so
+that a stranger cannot displace a beacon that is followed. After an answer that the navigator rejected the
+receiver has to wait: hostile answers cost little, and a receiver in error returns by evidence.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Hashable
+
+from companion.link.rate_limiter import SenderLimiter
+from companion.units import SECOND_NS
+
+#: Answers per second and at once of one receiver, and the number of receivers.
+ANSWERS_HZ, ANSWERS_BURST, MAX_RECEIVERS = 10.0, 20, 4
+REJECTED_NS = SECOND_NS // 2  # wait after a rejected answer
+SILENT_NS = 3 * SECOND_NS  # a receiver silent for longer gives up its beacon
+RATE_REASON = (
+    f"more than {ANSWERS_HZ:g} per second, or 2 while they are rejected, or {MAX_RECEIVERS} receivers"
+)
+
+
+class BeaconAnswers:
+    """The receivers of the last seconds and their beacons."""
+
+    def __init__(self) -> None:
+        self._limiter = SenderLimiter(ANSWERS_HZ, ANSWERS_BURST, MAX_RECEIVERS)
+        self._followed: dict[int, tuple[Hashable, int]] = {}  # by beacon: its receiver, its last answer
+        self._waits_ns: dict[Hashable, int] = {}
+
+    def refusal(self, receiver: Hashable, beacon: int, now_ns: int) -> str | None:
+        """Return why an answer is not used, None if it is."""
+        if now_ns < self._waits_ns.get(receiver, now_ns) or not self._limiter.take(receiver, now_ns):
+            return RATE_REASON
+        holder, last_ns = self._followed.get(beacon, (receiver, now_ns))
+        if holder != receiver and now_ns - last_ns < SILENT_NS:
+            return f"beacon {beacon} is received by another receiver"
+        if beacon not in self._followed:  # bounded by the rate of new ones
+            self._followed = {b: f for b, f in self._followed.items() if now_ns - f[1] < SILENT_NS}
+        self._followed[beacon] = receiver, now_ns
+        return None
+
+    def note_rejected(self, receiver: Hashable, now_ns: int) -> None:
+        """Let a receiver wait whose answer the navigator rejected."""
+        self._waits_ns = {r: t for r, t in self._waits_ns.items() if t > now_ns}
+        self._waits_ns[receiver] = now_ns + REJECTED_NS
