@@ -368,12 +368,9 @@ class CompanionCore:
                 self.report(Severity.WARNING, text, now_ns)
 
     def _on_message(self, link: Link, event: MessageReceived) -> None:
-        # the leading link receives the same messages
-        is_duplicate = link.session.is_up and link is not self.leading_link
         is_used = event.from_autopilot
-        receiver = event.peer, event.frame.system, event.frame.component
         if event.frame.msgid == rsbn.MAVLINK_MSG_ID_RSBN_MEASUREMENT:
-            is_used = is_duplicate or self._is_answer_used(link, event, receiver)
+            is_used = self._is_duplicate(link) or self._is_answer_used(link, event)
         if is_used or self._may_log_unused(link, event):
             self._log.frame(link.name, False, event.frame.raw, event.received_ns)
         if event.frame.msgid == mavlink.MAVLINK_MSG_ID_HEARTBEAT:
@@ -404,6 +401,7 @@ class CompanionCore:
             link.parameter_check.receive(event.message, event.frame)
         if event.frame.msgid not in DECODED:  # most of a stock stream: never decoded
             return
+        is_duplicate = self._is_duplicate(link)
         for record in decode(event.message, event.received_ns, link.sender):
             if not isinstance(record, RsbnFix):
                 link.output.receive(record)
@@ -414,10 +412,14 @@ class CompanionCore:
                 self._last_used = link if event.from_autopilot else self._last_used
                 is_rejected = self._on_record(record)
                 if is_rejected and event.frame.msgid == rsbn.MAVLINK_MSG_ID_RSBN_MEASUREMENT:
-                    self._answers.note_rejected(receiver, event.received_ns)
+                    self._answers.note_rejected(_receiver_of(event), event.received_ns)
 
-    def _is_answer_used(self, link: Link, event: MessageReceived, receiver: Hashable) -> bool:
-        why = self._answers.refusal(receiver, event.message.beacon_id, event.received_ns)
+    def _is_duplicate(self, link: Link) -> bool:
+        """Whether the leading link receives the same messages."""
+        return link.session.is_up and link is not self.leading_link
+
+    def _is_answer_used(self, link: Link, event: MessageReceived) -> bool:
+        why = self._answers.refusal(_receiver_of(event), event.message.beacon_id, event.received_ns)
         if why is not None:
             self.rejected["beacon answers not used"] += 1
             sender = f"{event.frame.system}/{event.frame.component}"
@@ -604,3 +606,8 @@ class CompanionCore:
             offset,
             None if uncertainty is None else 2 * uncertainty,
         )
+
+
+def _receiver_of(event: MessageReceived) -> Hashable:
+    """Return the RSBN receiver that sent a message."""
+    return event.peer, event.frame.system, event.frame.component
