@@ -7,10 +7,11 @@ from pathlib import Path
 import pytest
 
 from companion.config import Config, load, parse, to_toml
-from companion.config.profiles import PROFILES
+from companion.config.profiles import MESSAGES, PROFILES
 from companion.config.required_parameters import required_parameters
 from companion.estimate import bank
-from companion.link.dialect import type_named
+from companion.link.decode import DECODED
+from companion.link.dialect import TYPES, type_named
 from companion.link.parameter_server import parameter_table
 from companion.navigator import own_channel
 from companion.output import source_switch
@@ -214,3 +215,22 @@ def test_parameters_in_docs_are_those_of_the_server() -> None:
     assert [(cells[0].strip("`"), tuple(cells[1].strip("`").split("."))) for cells in named] == [
         (parameter.name, (parameter.section, parameter.key)) for parameter in parameter_table()
     ]
+
+
+def test_messages_in_docs_are_those_of_the_code_at_their_rates() -> None:
+    received, sent = PAGES["messages"].split("## Sent")
+    named = set(re.findall(r"\b[A-Z][A-Z0-9]*_[A-Z0-9_]+\b", received)) | {"ATTITUDE", "AIRSPEED", "WIND"}
+    assert {TYPES[msgid].name for msgid in DECODED} <= named
+    for cells in rows("messages"):
+        for name in re.findall(r"[A-Z0-9_]+", cells[0]):
+            if (hz := requested_rates(profile("ardupilot", "output.via=gps_input")).get(name)) and cells[1]:
+                assert float(cells[1]) == hz, name
+    for message in MESSAGES.values():
+        assert message in sent, message
+
+
+@pytest.mark.parametrize("name", ["RSBN_MEASUREMENT", "NAVIGATION_STATUS"])
+def test_fields_of_private_messages_in_docs_are_all_of_them(name: str) -> None:
+    (table,) = re.findall(rf"^{name} .*?\n\n((?:\|.*\n)+)", PAGES["messages"], re.MULTILINE)
+    named = [field for line in table.splitlines() for field in re.findall(r"`(\w+)`", line.split("|")[1])]
+    assert sorted(named) == sorted(field.name for field in type_named(name).fields)

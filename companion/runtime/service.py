@@ -140,7 +140,7 @@ class Service:
             try:
                 await stream.deliver_to(partial(self._receive, link, stream))
             except ConnectionError as error:
-                self.report(f"{name}: {error}; reopening")
+                self.report(f"{error}; reopening")
             self._count_dropped()
             del self._connections[name]
 

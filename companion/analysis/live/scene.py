@@ -217,7 +217,7 @@ class Scene:
         if false:
             parts.append(f"Probably false: {', '.join(false)}.")
         if s.protection is not None:
-            parts.append(f"The error is below {_metres(s.protection)}, whatever single source is false.")
+            parts.append(f"Protection level {_metres(s.protection)}, a false source included.")
         return {"level": level, "word": word, "why": " ".join(parts)}
 
     def _waiting(self) -> str:
