@@ -119,7 +119,7 @@ def test_links_exist(page: str) -> None:
 def test_every_page_is_in_the_site_and_the_front_pages_in_the_readme() -> None:
     readme, site = (ROOT / "README.md").read_text(), (ROOT / "mkdocs.yml").read_text()
     for path in (ROOT / "docs").rglob("*.md"):
-        assert f"- {path.relative_to(ROOT / 'docs')}\n" in site, path
+        assert f" {path.relative_to(ROOT / 'docs')}\n" in site, path
     for page in ("docs/index", "docs/tutorial", *FRONT[1:]):
         assert f"({page}.md)" in readme, page
 
@@ -234,3 +234,9 @@ def test_fields_of_private_messages_in_docs_are_all_of_them(name: str) -> None:
     (table,) = re.findall(rf"^{name} .*?\n\n((?:\|.*\n)+)", PAGES["messages"], re.MULTILINE)
     named = [field for line in table.splitlines() for field in re.findall(r"`(\w+)`", line.split("|")[1])]
     assert sorted(named) == sorted(field.name for field in type_named(name).fields)
+
+
+@pytest.mark.parametrize("name", ["estimate", "nav"])
+def test_api_pages_show_examples(name: str) -> None:
+    shown = re.findall(r'^--8<-- "(.*)"$', (ROOT / "docs" / "api" / f"{name}.md").read_text(), re.MULTILINE)
+    assert shown and all((ROOT / path).exists() for path in shown)

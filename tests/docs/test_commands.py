@@ -1,4 +1,4 @@
-"""Every command of README and docs: parsed by its own parser, and run here unless a reason is stated."""
+"""Commands of README and docs: all are parsed, those of code blocks run or have a reason why not."""
 
 from __future__ import annotations
 
@@ -17,7 +17,14 @@ from sitl.loopback import command as loopback
 
 ROOT = Path(__file__).parents[2]
 RECORDING = ROOT / "tests" / "data" / "dronekit_copter_cut.tlog"
-SHELL = re.compile(r"(?:sudo|make|git|python3|companion|venv/|/opt/|pip|mavproxy|systemctl|journalctl)\b")
+SHELL = re.compile(
+    r"(?:sudo|make|git|python3|companion|venv/|/opt/|deploy/|pip|mavproxy|systemctl|journalctl)\b"
+)
+
+PAGES = [
+    *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "SECURITY.md", "examples/README.md")),
+    *sorted((ROOT / "docs").rglob("*.md")),
+]
 
 #: Commands that are not run by this test, and why.
 NOT_RUN = {
@@ -37,7 +44,7 @@ NOT_RUN = {
 def commands() -> list[tuple[str, str]]:
     """(page, command) of all code blocks, `companion` without the path of its environment."""
     found = []
-    for path in (ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))):
+    for path in PAGES:
         for block in re.findall(r"^```\w*\n(.*?)^```", path.read_text(), re.DOTALL | re.MULTILINE):
             for line in block.replace("\\\n", " ").splitlines():
                 text = re.sub(r"\s+#.*", "", line).strip().removeprefix("$ ")
@@ -47,8 +54,18 @@ def commands() -> list[tuple[str, str]]:
     return found
 
 
+def named_in_text() -> set[str]:
+    """Commands in the sentences of the pages."""
+    found = set()
+    for path in PAGES:
+        text = re.sub(r"^```.*?^```", "", path.read_text(), flags=re.DOTALL | re.MULTILINE)
+        for name in re.findall(r"`(companion [a-z][^`]*)`", text):
+            found.add(" ".join(name.split()))
+    return found
+
+
 ALL = commands()
-OURS = sorted({text for _, text in ALL if text.startswith("companion ")})
+OURS = sorted({text for _, text in ALL if text.startswith("companion ")} | named_in_text())
 
 
 def arguments(text: str) -> list[str]:
