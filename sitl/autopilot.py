@@ -9,7 +9,8 @@ sensor, time since boot, TIMESYNC, commands. An RSBN receiver, a component of it
 Latency, jitter and faults of the link are applied between the two sides.
 
 `now_ns` is the companion's clock; the flight starts at `start_ns` on it. Position and status messages of the
-companion are recorded in `outputs`; they do not affect the flight.
+companion are recorded in `outputs`. Where the scenario has an `own_estimate` they correct the autopilot's own
+position (`sitl.own_estimate`), which it sends and which its errors are seen in; the aircraft flies its plan.
 """
 
 from __future__ import annotations
@@ -54,7 +55,8 @@ from sitl.faults import (
     apply_link_faults,
     without_fix,
 )
-from sitl.parameters import CAPABILITIES, VERSIONS, SimulatedParameters
+from sitl.own_estimate import OwnEstimate
+from sitl.parameters import CAPABILITIES, FIRMWARE, VERSIONS, SimulatedParameters
 from sitl.scenarios import Scenario
 from sitl.world import World
 
@@ -73,6 +75,7 @@ _SLOW_HZ = 0.2
 RECORDED_MESSAGES = frozenset(
     {"ODOMETRY", "GLOBAL_POSITION_SENSOR", "NAVIGATION_STATUS", "VISION_POSITION_ESTIMATE"}
 )
+LOCAL_MESSAGES = frozenset({"ODOMETRY", "VISION_POSITION_ESTIMATE"})
 
 _SENSED: dict[str, type[Stamped]] = {
     "LOCAL_POSITION_NED": LocalPosition,
@@ -94,6 +97,7 @@ class SimulatedAutopilot:
         self.scenario = scenario
         self.world = world or World(scenario)
         self.outputs: list[tuple[int, Any]] = []
+        self.estimate = OwnEstimate(self.world, FIRMWARE) if scenario.own_estimate else None
         self.is_armed = True
         self.end_ns = start_ns + round(scenario.duration_s * 1e9)
         self._start_ns = start_ns
@@ -155,7 +159,9 @@ class SimulatedAutopilot:
             if isinstance(found, frame.Frame):
                 name = dialect.TYPES[found.msgid].name
                 if name in RECORDED_MESSAGES:
-                    self.outputs.append((now_ns, dialect.decode(found)))
+                    self.outputs.append((now_ns, message := dialect.decode(found)))
+                    if self.estimate is not None and name in LOCAL_MESSAGES:
+                        self.estimate.receive(message, self._origin_record(t), t)
                 elif name in self._commands:
                     message = dialect.decode(found)
                     if getattr(message, "target_system", 0) in (0, SYSTEM):
@@ -252,8 +258,8 @@ class SimulatedAutopilot:
             boot_shift = -round(self.scenario.boot_before_s * 1e6) - self._sender.boot_ns // 1000
             if boot_shift:
                 record = replace(record, stamp_us=max(record.stamp_us + boot_shift, 1))
-        if isinstance(record, LocalPosition) and self._local_origin != self.world.origin:
-            record = self._from_local_origin(record)
+        if isinstance(record, LocalPosition):
+            record = self._from_local_origin(self._local(t) if self.estimate is not None else record)
         return encode(record, self._sender)
 
     def _frame(self, message: Any, component: int) -> bytes:
@@ -299,7 +305,7 @@ class SimulatedAutopilot:
 
     def _from_local_origin(self, record: LocalPosition) -> LocalPosition:
         """Refer the local position to the current origin instead of the world's."""
-        if not math.isfinite(record.x_n[0]):
+        if not math.isfinite(record.x_n[0]) or self._local_origin == self.world.origin:
             return record
         projection: Any = self.scenario.autopilot
         place = local_to_geodetic(projection, self.world.origin, record.x_n)
@@ -330,8 +336,11 @@ class SimulatedAutopilot:
         return encode(record, self._sender)
 
     def _origin(self, t: int) -> Any:
+        return encode(self._origin_record(t), self._sender)
+
+    def _origin_record(self, t: int) -> LocalOrigin:
         lat, lon, alt = self._local_origin
-        return encode(LocalOrigin(t, t, lat, lon, alt - self.scenario.geoid_height), self._sender)
+        return LocalOrigin(t, t, lat, lon, alt - self.scenario.geoid_height)
 
     def _home(self, t: int) -> Any:
         lat, lon, alt = self.world.origin
@@ -352,8 +361,16 @@ class SimulatedAutopilot:
             index -= 1
         return stream[index]
 
+    def _local(self, t: int) -> LocalPosition:
+        """The local position at `t` from the world's origin: of its own filter, else of the INS."""
+        if self.estimate is None:
+            newest: LocalPosition = self._newest_record(LocalPosition, t)
+            return newest
+        self.estimate.advance(t, self.parameters.gnss_is_on)
+        return self.estimate.local_position()
+
     def _global_position(self, t: int) -> Any:
-        local = self._newest_record(LocalPosition, t)
+        local = self._local(t)
         if not math.isfinite(local.x_n[0]):
             return None
         projection: Any = self.scenario.autopilot
@@ -404,6 +421,8 @@ class SimulatedAutopilot:
                 self._transmit([self._frame(wanted, COMPONENT)], t)
         elif command == mavlink.MAV_CMD_SET_EKF_SOURCE_SET:
             result = mavlink.MAV_RESULT_ACCEPTED
+            if self.estimate is not None:
+                self.estimate.receive(message, self._origin_record(t), t)
         elif (
             command == mavlink.MAV_CMD_EXTERNAL_POSITION_ESTIMATE
             and dialect.id_of(message) == mavlink.MAVLINK_MSG_ID_COMMAND_INT

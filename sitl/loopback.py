@@ -6,6 +6,7 @@ flight takes seconds and is reproducible. The table at the end compares every so
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 import time
@@ -34,6 +35,7 @@ from companion.storage.run_metadata import run_metadata
 from companion.study import plot_options
 from companion.units import SECOND_NS
 from sitl.autopilot import UNIX_AT_START_NS, SimulatedAutopilot
+from sitl.own_estimate import unaided_errors
 from sitl.scenarios import SCENARIOS, Scenario, SchedulePhase, get_scenario
 
 LINK = "sitl"
@@ -80,6 +82,12 @@ def simulator_config(config: Config, own_ins: bool = True) -> Config:
     inertial = msgspec.structs.replace(config.inertial, independent=own_ins)
     output = DEFAULT_OUTPUT if config.output == OutputConfig() else config.output
     return msgspec.structs.replace(config, inertial=inertial, output=output)
+
+
+def simulated_for(scenario: Scenario, config: Config) -> Scenario:
+    """Let the autopilot take our positions where `config` feeds an ArduPilot without an INS of its own."""
+    feeds = config.output.profile == scenario.autopilot == "ardupilot" and not config.inertial.independent
+    return dataclasses.replace(scenario, own_estimate=True) if feeds else scenario
 
 
 def fly_scenario(
@@ -143,6 +151,27 @@ def error_table(flown: LoopbackFlight) -> list[error_statistics.PhaseErrors]:
     return error_statistics.summarize_phases(
         found, [_from_first_fix(phase, flown.records) for phase in phases]
     )
+
+
+class OwnPhase(NamedTuple):
+    """Error of the autopilot's own position in one phase, m: with the companion and without it."""
+
+    phase: str
+    rms: float
+    most: float
+    rms_alone: float
+    most_alone: float
+
+
+def own_table(autopilot: SimulatedAutopilot) -> list[OwnPhase]:
+    """Compute the error of the autopilot's own position in each phase; empty without an own estimate."""
+    if autopilot.estimate is None:
+        return []
+    ours, alone = autopilot.estimate.errors, unaided_errors(autopilot.world)
+    return [
+        OwnPhase(p.name, *ours.between(p.start_s, p.end_s), *alone.between(p.start_s, p.end_s))
+        for p in autopilot.scenario.phases()
+    ]
 
 
 class PhaseProtection(NamedTuple):
@@ -234,6 +263,7 @@ def command(
     }
     loaded = load(file, flags, pairs=pairs, preset=preset)
     config = simulator_config(loaded, own_ins=loaded.inertial.independent)
+    chosen = simulated_for(chosen, config)
     started = time.perf_counter()
     settings = config.log
     log = create_log(
@@ -268,7 +298,8 @@ def command(
             row._asdict() | {"protection": level._asdict() | {"held": level.held} if level else None}
             for row, level in zip(rows, protection_table(flown, rows), strict=True)
         ]
-        click.echo(json.dumps({**summary, "phases": phases}))
+        own = [row._asdict() for row in own_table(flown.autopilot)]
+        click.echo(json.dumps({**summary, "phases": phases, "own": own}))
     else:
         _print_table(flown, rows, seconds)
         click.echo(f"log: {log.path}")
@@ -292,6 +323,18 @@ def _bound(row: error_statistics.PhaseErrors) -> str:
     if not row.useful:
         return "no use"
     return _metres(row.bound) + ("" if row.held else f" {100.0 * (row.inside or 0.0):.0f} %")
+
+
+def _print_own(rows: list[OwnPhase], console: Console) -> None:
+    if not rows:
+        return
+    table = Table(title="the autopilot's own position: error, r.m.s. / most [m]", box=SIMPLE_HEAD)
+    for column in ("phase", "with us", "without"):
+        table.add_column(column, justify="left" if column == "phase" else "right", no_wrap=True)
+    for row in rows:
+        pairs = (row.rms, row.most), (row.rms_alone, row.most_alone)
+        table.add_row(row.phase, *(f"{_metres(rms)} / {_metres(most)}" for rms, most in pairs))
+    console.print(table)
 
 
 def _print_table(flown: LoopbackFlight, rows: list[error_statistics.PhaseErrors], seconds: float) -> None:
@@ -324,6 +367,7 @@ def _print_table(flown: LoopbackFlight, rows: list[error_statistics.PhaseErrors]
         "guaranteed bound, with the share of errors within that of their moment if not all are;\n"
         "no use: above 10 times the claim or above 5 km"
     )
+    _print_own(own_table(flown.autopilot), console)
     reported = Counter(type(record).__name__ for record in flown.records)
     rate = scenario.duration_s / seconds
     click.echo(

@@ -33,7 +33,8 @@ CAPABILITIES = {
     "ardupilot": _COMMON | mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_C_CAST,
     "px4": _COMMON | mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE,
 }
-VERSIONS = {"ardupilot": 4 << 24 | 7 << 16, "px4": 1 << 24 | 17 << 16}
+FIRMWARE = (4, 7)  # of ArduPilot
+VERSIONS = {"ardupilot": FIRMWARE[0] << 24 | FIRMWARE[1] << 16, "px4": 1 << 24 | 17 << 16}
 
 
 class SimulatedParameters:

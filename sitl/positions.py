@@ -18,6 +18,8 @@ from companion.nav.geometry import Geodetic, local_to_geodetic
 from companion.output.encode import GPS_LAG_NS
 from companion.records import LocalOrigin
 
+ROOT_OF_SUM = (4, 7)
+"""First ArduPilot that reads sqrt(c0 + c6 + c11) as the position error; before, cbrt(c0^2 + c6^2 + c11^2)."""
 POSITION_MESSAGES = frozenset(dialect.type_named(name).msgid for name in MESSAGES.values())
 
 
@@ -34,10 +36,12 @@ class ReportedPosition(NamedTuple):
     age_ns: int = 0
 
 
-def position_of(message: Any, origin: LocalOrigin | None, make: str) -> ReportedPosition | None:
+def position_of(
+    message: Any, origin: LocalOrigin | None, make: str, version: tuple[int, int] = ROOT_OF_SUM
+) -> ReportedPosition | None:
     """Decode a message of `POSITION_MESSAGES` as an autopilot of this make would; None without a position.
 
-    A local position needs the autopilot's `origin`.
+    A local position needs the autopilot's `origin`; its accuracy is read as by this `version` of ArduPilot.
     """
     name = message.get_type()
     if name in ("ODOMETRY", "VISION_POSITION_ESTIMATE"):
@@ -51,7 +55,7 @@ def position_of(message: Any, origin: LocalOrigin | None, make: str) -> Reported
         odometry = name == "ODOMETRY"
         covariance = message.pose_covariance if odometry else message.covariance
         stamp = message.time_usec if odometry else message.usec
-        return ReportedPosition(stamp * 1000, place, _sigma(covariance, make))
+        return ReportedPosition(stamp * 1000, place, _sigma(covariance, make, version))
     if name == "COMMAND_INT":
         if message.command != mavlink.MAV_CMD_EXTERNAL_POSITION_ESTIMATE:
             return None
@@ -81,11 +85,11 @@ def _geodetic(lat: int, lon: int, alt: float) -> Geodetic:
     return Geodetic(math.radians(lat * 1e-7), math.radians(lon * 1e-7), alt)
 
 
-def _sigma(covariance: list[float], make: str) -> float | None:
-    """Horizontal sigma, m. ArduPilot uses sqrt(c0 + c6 + c11) for all axes, others the variances."""
+def _sigma(covariance: list[float], make: str, version: tuple[int, int]) -> float | None:
+    """Horizontal sigma, m: ArduPilot reads one for all axes, others the variances."""
     c0, c6, c11 = covariance[0], covariance[6], covariance[11]
     if not all(map(math.isfinite, (c0, c6, c11))):
         return None
-    if make == "ardupilot":
-        return math.sqrt(c0 + c6 + c11)
-    return math.sqrt(max(c0, c6, 0.0))
+    if make != "ardupilot":
+        return math.sqrt(max(c0, c6, 0.0))
+    return math.sqrt(c0 + c6 + c11) if version >= ROOT_OF_SUM else math.cbrt(c0 * c0 + c6 * c6 + c11 * c11)

@@ -54,7 +54,9 @@ class LinkDelay:
 class Scenario:
     """One flight: plan, sensors, outages, faults. The seed determines every random number.
 
-    Without `airspeed_sensor` the autopilot sends its own synthetic airspeed.
+    Without `airspeed_sensor` the autopilot sends its own synthetic airspeed. With `own_estimate` its local
+    and global positions are those of its own filter, which takes the companion's positions (ArduPilot only);
+    otherwise they come from an INS of this grade.
     """
 
     name: str
@@ -68,6 +70,7 @@ class Scenario:
     rates: SensorRates = field(default_factory=SensorRates)
     link: LinkDelay = field(default_factory=LinkDelay)
     airspeed_sensor: bool = True
+    own_estimate: bool = False
     faults: tuple[Fault, ...] = ()
     seed: int = 1
     autopilot: Literal["ardupilot", "px4"] = "ardupilot"
@@ -82,6 +85,8 @@ class Scenario:
                 raise ValueError(
                     f"outage from {start:g} to {end:g} s: it must start at 0 or later and end after its start"
                 )
+        if self.own_estimate and self.autopilot != "ardupilot":
+            raise ValueError(f"the filter of {self.autopilot} is not simulated: ardupilot only")
         if min(dataclasses.astuple(self.rates)) <= 0.0:
             raise ValueError("a sensor rate is not positive: give a rate above 0 Hz")
 

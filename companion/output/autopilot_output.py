@@ -13,7 +13,7 @@ from companion.config import Config
 from companion.config.profiles import MESSAGES, RESET
 from companion.link.dialect import Message, mavlink
 from companion.output.encode import CannotEncode, Receiver, encode
-from companion.output.gate import Gate, LocalFrame, Position, WithholdingMonitor
+from companion.output.gate import STEP_M, Gate, LocalFrame, Position, WithholdingMonitor
 from companion.output.gnss_fusion import GnssFusion
 from companion.output.position_reset import PositionReset
 from companion.output.source_switch import SourceSwitch, selected
@@ -35,6 +35,11 @@ ON_SOURCE_SET_2 = frozenset({MESSAGES["odometry"], MESSAGES["vision"]})
 FUSED_BY_PX4 = ON_SOURCE_SET_2 | {MESSAGES["global_position_sensor"]}
 
 
+def _gate(config: Config) -> Gate:
+    is_stepped = config.output.profile == "ardupilot" and config.output.method in ("odometry", "vision")
+    return Gate(STEP_M) if is_stepped else Gate()
+
+
 def _source_switch(config: Config) -> SourceSwitch:
     return GnssFusion() if config.output.profile == "px4" else SourceSwitch()
 
@@ -45,7 +50,7 @@ class AutopilotOutput:
     def __init__(self, config: Config) -> None:
         self.config = config
         self.unix_ns: int | None = None
-        self._gate, self._local_frame, self._monitor = Gate(), LocalFrame(), WithholdingMonitor()
+        self._gate, self._local_frame, self._monitor = _gate(config), LocalFrame(), WithholdingMonitor()
         self._position_reset, self._source_switch = PositionReset(), _source_switch(config)
         self._events: list[Event] = []
 

@@ -17,7 +17,9 @@ The limit on a jump is derived, not tuned. Both positions are within three of th
 between them the truth moves with the mean of both velocities, up to a manoeuvre. A greater jump means that
 one of the two is wrong; the solution is withheld until the limit, which grows with time, admits it. A jump
 that only the old sigma justifies passes and is counted, so that the autopilot resets (`reset_counter`)
-instead of rejecting it as an outlier.
+instead of rejecting it as an outlier. An autopilot that takes `reset_counter` gets such a jump in steps of
+`STEP_M`, one a message, each a reset: a reset changes the position only, while a slope would be taken for a
+velocity. What is left of the jump is stated in the covariance.
 """
 
 from __future__ import annotations
@@ -45,6 +47,8 @@ MIN_SIGMA_M, MAX_SIGMA_M = (
 )  # a smaller sigma is not plausible, and could become 0 in single precision
 MIN_SIGMA_VELOCITY = 1e-3  # [m/s]
 SIGMAS = 3.0
+STEP_M = 10.0
+"""Greatest step of a position that is reset: 50 m take half a second at 10 Hz."""
 LOCAL_TOLERANCE_M, LOCAL_RECENT_NS = 5.0, 10 * SECOND_NS
 PROJECTION_ERROR = 0.05
 """Greatest scale error of a flat local frame, 200 km from its origin."""
@@ -118,11 +122,16 @@ def withholding_reason(solution: Solution) -> str | None:
 
 
 class Gate:
-    """Gate for successive solutions; stores the last one that passed."""
+    """Gate for successive solutions; stores the last one that passed.
 
-    def __init__(self) -> None:
+    A jump that is counted goes out in steps of `max_step_m` at most.
+    """
+
+    def __init__(self, max_step_m: float = math.inf) -> None:
         self._last: Position | None = None
         self._resets = 0
+        self._max_step_m = max_step_m
+        self._left_n = (0.0, 0.0)  # from the solution to the position that goes out, m north, east
 
     def admit(self, solution: Solution) -> Position | str:
         """Return the position to be sent for `solution`, or the reason why it is withheld."""
@@ -144,22 +153,36 @@ class Gate:
             if here.t_ns < self._last.t_ns:
                 return "timestamp before the previous position"
             dt = (here.t_ns - self._last.t_ns) * 1e-9
-            jump = _jump(self._last, here, dt)
+            moved_n = _jump(self._last, here, dt)
+            jump = math.hypot(*moved_n)
             room = JUMP_MARGIN_M + 0.5 * MANOEUVRE * dt * dt
             if jump > SIGMAS * (self._last.sigma + here.sigma) + room:
                 return "jump larger than its accuracy justifies"
             if jump > SIGMAS * here.sigma + room:
-                self._resets += 1
-        self._last = here._replace(resets=self._resets)
-        return self._last
+                self._left_n = self._left_n[0] - moved_n[0], self._left_n[1] - moved_n[1]
+        self._last = here
+        return self._stepped(here)
+
+    def _stepped(self, here: Position) -> Position:
+        """Return the position that goes out for `here`: a step nearer to it, if a jump is not over."""
+        left = math.hypot(*self._left_n)
+        if left == 0.0:
+            return here._replace(resets=self._resets)
+        self._resets += 1
+        share = max(0.0, 1.0 - self._max_step_m / left)
+        self._left_n = north, east = share * self._left_n[0], share * self._left_n[1]
+        lat, lon, _ = displace(here.lat, here.lon, here.alt_msl, north, east, 0.0)
+        nn, ne, ee = here.covariance
+        covariance = nn + north * north, ne + north * east, ee + east * east
+        return here._replace(lat=lat, lon=lon, covariance=covariance, resets=self._resets)
 
 
-def _jump(last: Position, here: Position, dt: float) -> float:
-    """Return the horizontal distance of `here` from the last position propagated by the mean velocity, m."""
+def _jump(last: Position, here: Position, dt: float) -> tuple[float, float]:
+    """Return `here` from the last position propagated by the mean velocity, m north, east."""
     (v_n, v_e, _), (w_n, w_e, _) = last.v_n, here.v_n
     place = Geodetic(last.lat, last.lon, last.alt_msl)
     north, east, _ = separation_tuple(Geodetic(here.lat, here.lon, here.alt_msl), place)
-    return math.hypot(north - 0.5 * (v_n + w_n) * dt, east - 0.5 * (v_e + w_e) * dt)
+    return north - 0.5 * (v_n + w_n) * dt, east - 0.5 * (v_e + w_e) * dt
 
 
 class LocalFrame:

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from companion.link import dialect, frame
-from companion.nav.geometry import displace
+from companion.nav.geometry import Geodetic, displace, separation
 from companion.output.encode import ENCODERS, CannotEncode, Receiver, encode
 from companion.output.gate import REPORT_INTERVAL_NS, Gate, Position, WithholdingMonitor, withholding_reason
 from companion.records import LocalOrigin, Mode, Solution, Source, Trust
@@ -144,6 +144,25 @@ def test_jump_within_the_old_accuracy_counts_as_a_reset() -> None:
     assert isinstance(back, Position) and back.resets == 1
     on = gate.admit(moved(0.4, east=300.0))
     assert isinstance(on, Position) and on.resets == 1
+
+
+def test_jump_goes_out_in_steps_each_counted() -> None:
+    """35 m in steps of 10: four resets, the truth within the stated accuracy, then exactly the solution."""
+    gate, poor = Gate(10.0), (2e3, 0.0, 0.0, 2e3, 0.0, 9.0)
+    last = gate.admit(changed(covariance=poor, mode=Mode.PREDICTING))
+    assert isinstance(last, Position)
+    for k in range(1, 7):
+        solution = moved(0.1 * k, east=35.0)
+        sent = gate.admit(solution)
+        assert isinstance(sent, Position)
+        true = Geodetic(solution.lat, solution.lon, solution.alt_msl)
+        north, east, _ = separation(Geodetic(sent.lat, sent.lon, sent.alt_msl), true)
+        left = min(10.0 * k - 35.0, 0.0)
+        assert (north, east) == (pytest.approx(0.0, abs=0.01), pytest.approx(left, abs=0.01))
+        assert sent.resets == min(k, 4)
+        assert abs(east) <= sent.sigma
+        last = sent
+    assert last.covariance == (16.0, 2.0, 25.0)
 
 
 def test_noise_within_the_accuracy_is_no_reset() -> None:
