@@ -18,10 +18,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 import click
-from rich.console import Console
 from rich.table import Table
 
 from companion.storage import flight_log
+from companion.tables import print_tables
 from sitl.scenarios import SCENARIOS
 
 BUDGET_S, BUDGET_MIB = 60.0, 1024.0  # time: replay and report together; memory: each
@@ -101,7 +101,7 @@ def command(scenario: str) -> None:
         table.add_column(column, justify="right" if column else "left")
     for what, *numbers in (flight, *costs):
         table.add_row(what, *(f"{number:.1f}" for number in numbers))
-    Console().print(table)
+    print_tables(table)
     total = costs[0].wall_s + max(cost.wall_s for cost in costs[1:])
     peak = max(cost.peak_mib for cost in costs)
     budget = f"{BUDGET_S:.0f} s, {BUDGET_MIB:.0f} MiB and a page of {BUDGET_MB} MB"

@@ -28,6 +28,7 @@ from companion.estimate.predictor import KAPPA, Step, Window, anchor
 from companion.nav.bounded_channel import BoundedIns, Motion, UnitErrors
 from companion.nav.earth import OMEGA
 from companion.study import plot_options
+from companion.tables import print_tables
 from companion.units import Floats
 from sitl.flight import Trajectory, rotation
 from sitl.sensors import DEG_H, GRADES, UG, G, Generator, InertialGrade, R, error_rates
@@ -299,7 +300,7 @@ def _print(found: Sequence[Ensemble], title: str) -> None:
         worst = max(e.ratio for e in group)
         texts = (f"{number:.3g}" for number in (*numbers, worst))
         table.add_row(grade, f"{ahead:g}", estimate, errors, *texts)
-    Console(width=110).print(table)
+    print_tables(table)
 
 
 def _plot(points: Sequence[CurvePoint], file: Path, grade: str) -> None:

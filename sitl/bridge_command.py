@@ -20,11 +20,11 @@ from pathlib import Path
 from typing import Any, TextIO
 
 import click
-from rich.console import Console
 from rich.table import Table
 
 from companion.analysis import simulated_rsbn
 from companion.storage.reader import LogError
+from companion.tables import print_tables
 from companion.transport.reconnect import Address, CannotListen, Connection, connections
 from sitl.beacon import Beacon
 from sitl.bridge import AUTOPILOT, COMPANION, RSBN, Bridge, BridgeMode, GnssSchedule
@@ -178,7 +178,7 @@ def _print(tables: list[tuple[str, list[OutageErrors]]]) -> None:
             within = "" if row.within is None else f"{row.within:.0%}"
             errors = (*row.at.values(), row.rms, row.largest)
             out.add_row(row.source, *map(metres, errors), within)
-        Console(width=max(100, Console().width)).print(out)
+        print_tables(out)
 
 
 def _parse_beacons(positions: tuple[str, ...], file: Path | None) -> tuple[Beacon, ...]:

@@ -25,6 +25,7 @@ from companion.config import Config, OutputConfig
 from companion.navigator import Navigator
 from companion.navigator.hypotheses import Model
 from companion.records import Solution, Stamped
+from companion.tables import print_tables
 from companion.units import Floats
 from sitl import correctors
 from sitl.campaign.flight import UNITS
@@ -104,4 +105,4 @@ def command(grade: str, names: tuple[str, ...], seed: int) -> None:
         spans = [(60.0, LOSS_S), *((LOSS_S + 60.0 * a, LOSS_S + 60.0 * b) for a, b in zip(edges, MARKS_MIN))]
         cells = (f"{flight.at(flight.error, *s):.0f} ({flight.at(flight.sigma, *s):.0f})" for s in spans)
         table.add_row(name, *cells, f"{np.mean(flight.error <= flight.protection):.1%}")
-    Console(width=max(120, Console().width)).print(table)
+    print_tables(table)

@@ -26,7 +26,6 @@ from typing import Any, NamedTuple
 import click
 import numpy as np
 from msgspec.structs import replace
-from rich.console import Console
 from rich.table import Table
 from threadpoolctl import threadpool_limits
 
@@ -35,6 +34,7 @@ from companion.navigator import Navigator
 from companion.output.source_switch import SourceSwitch
 from companion.records import Event, Gnss, LocalOrigin, Solution
 from companion.runtime.core import CompanionCore
+from companion.tables import print_tables
 from companion.units import SECOND_NS, Floats
 from sitl import loopback
 from sitl.autopilot import SimulatedAutopilot
@@ -356,17 +356,16 @@ def command(
         rows = [result._asdict() | {"passed": result.passed} for result in flights]
         click.echo(json.dumps({"flights": rows, "recordings": [r._asdict() for r in recordings]}))
     else:
-        console = Console(width=max(110, Console().width))
-        _print_flights(flights, console)
+        _print_flights(flights)
         if recordings:
-            _print_recordings(recordings, console)
+            _print_recordings(recordings)
         else:
             click.echo(f"{data}: no recordings")
     if not (all(flight.passed for flight in flights) and all(r.passed for r in recordings)):
         raise SystemExit(1)
 
 
-def _print_flights(flights: list[HarmResult], console: Console) -> None:
+def _print_flights(flights: list[HarmResult]) -> None:
     table = Table(title="GNSS healthy, one thing wrong")
     for head in ("wrong", "channel", "excluded", "set 2", "ratio", "since", "suspected", "passed"):
         table.add_column(head, justify="left" if head in ("wrong", "channel", "suspected") else "right")
@@ -388,7 +387,7 @@ def _print_flights(flights: list[HarmResult], console: Console) -> None:
             ", ".join(suspected) or "-",
             "yes" if passed == len(same) else f"NO ({passed} of {len(same)})",
         )
-    console.print(table)
+    print_tables(table)
     for result in flights:
         if result.raised is not None:
             click.echo(f"{result.wrong}, {result.channel}, seed {result.seed}: {result.raised}")
@@ -399,7 +398,7 @@ def _print_flights(flights: list[HarmResult], console: Console) -> None:
     )
 
 
-def _print_recordings(recordings: list[RecordingResult], console: Console) -> None:
+def _print_recordings(recordings: list[RecordingResult]) -> None:
     table = Table(title="recordings; medians against GNSS in m, times in s")
     heads = ("recording", "fixes", "refused", "corrected", "autopilot", "truth", "set 2", "passed")
     for head in heads:
@@ -413,7 +412,7 @@ def _print_recordings(recordings: list[RecordingResult], console: Console) -> No
             "-" if r.set_2_s is None else f"{r.set_2_s:.0f}{' HARM' if r.harmful else ''}",
             "yes" if r.passed else "NO",
         )
-    console.print(table)
+    print_tables(table)
     click.echo(
         "refused: longest time without a healthy fix used; truth: median of corrected against the truth;"
         " set 2: when first requested"

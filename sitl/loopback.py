@@ -18,7 +18,6 @@ from typing import NamedTuple
 import click
 import msgspec
 import numpy as np
-from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
@@ -33,6 +32,7 @@ from companion.storage.deferred_log import Log
 from companion.storage.retention import create_log
 from companion.storage.run_metadata import run_metadata
 from companion.study import plot_options
+from companion.tables import print_tables
 from companion.units import SECOND_NS
 from sitl.autopilot import UNIX_AT_START_NS, SimulatedAutopilot
 from sitl.own_estimate import unaided_errors
@@ -339,10 +339,7 @@ def _print_own(rows: list[OwnPhase], console: Console) -> None:
 
 def _print_table(flown: LoopbackFlight, rows: list[error_statistics.PhaseErrors], seconds: float) -> None:
     scenario = flown.autopilot.scenario
-    console = Console(width=max(92, Console().width))
-    table = Table(
-        title=f"{scenario.name}: horizontal error, r.m.s. [m]", box=SIMPLE_HEAD, padding=(0, 1, 0, 0)
-    )
+    table = Table(title=f"{scenario.name}: horizontal error, r.m.s. [m]")
     sources = (source.replace(" ", "\n") for source in error_statistics.SOURCES)
     for column in ("phase", "min", *sources, "expected", "95 %", "protected", "bound"):
         table.add_column(column, justify="left" if column == "phase" else "right", no_wrap=True)
@@ -360,12 +357,12 @@ def _print_table(flown: LoopbackFlight, rows: list[error_statistics.PhaseErrors]
             protected,
             bound,
         )
-    console.print(table)
+    print_tables(table)
     click.echo(
-        "expected: r.m.s. error that the corrected estimate claims; 95 %: percentile of its error;\n"
-        "protected: median protection level, NO if an error was beyond it; bound: r.m.s. of the\n"
-        "guaranteed bound, with the share of errors within that of their moment if not all are;\n"
-        "no use: above 10 times the claim or above 5 km"
+        "expected: r.m.s. error that the corrected estimate claims; 95 %: percentile of\n"
+        "its error; protected: median protection level, NO if an error was beyond it;\n"
+        "bound: r.m.s. of the guaranteed bound, with the share of errors within that of\n"
+        "their moment if not all are; no use: above 10 times the claim or above 5 km"
     )
     _print_own(own_table(flown.autopilot), console)
     reported = Counter(type(record).__name__ for record in flown.records)

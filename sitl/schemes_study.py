@@ -19,6 +19,7 @@ from rich.table import Table
 from companion.config import Config, EstimatorConfig, InertialConfig
 from companion.navigator import Navigator
 from companion.records import Fix, Rejection, Solution, Source
+from companion.tables import print_tables
 from companion.units import Floats
 from sitl.flight import radii
 from sitl.scenarios import get_scenario
@@ -111,4 +112,4 @@ def command(scenario: str, channels: Sequence[str], seed: int) -> None:
             *(f"{bound:.3f}", f"{apart[0]:.2g}", f"{apart[1]:.2g}"),
             end_section=scheme == SCHEMES[-1],
         )
-    Console(width=max(120, Console().width)).print(table)
+    print_tables(table)

@@ -44,6 +44,7 @@ from companion.records import (
     RsbnFix,
     Stamped,
 )
+from companion.tables import print_tables
 from companion.units import Floats
 from sitl.campaign.flight import UNITS
 from sitl.flight import fly_plan, radii
@@ -178,4 +179,4 @@ def _print_table(rows: Iterable[tuple[str, str, int, SmoothingComparison]], seed
             f"{c.misfit_filtered / c.epochs:.2f}, {c.misfit_smoothed / c.epochs:.2f}",
             f"{better} of {seeds}",
         )
-    Console(width=max(110, Console().width)).print(table)
+    print_tables(table)

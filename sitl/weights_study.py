@@ -22,6 +22,7 @@ from companion.config import Config, InertialConfig, OutputConfig
 from companion.navigator import Navigator
 from companion.navigator.hypotheses import Model
 from companion.records import Gnss, RsbnFix, Solution, Stamped
+from companion.tables import print_tables
 from sitl.campaign.flight import UNITS
 from sitl.flight import radii
 from sitl.scenarios import Scenario, get_scenario
@@ -127,4 +128,4 @@ def command(scenario: str, sources: Sequence[str], seed: int) -> None:
         cells = zip((*bank.phases, bank.overall), (*plain.phases, plain.overall), strict=True)
         end = factor == FACTORS[-1]
         table.add_row(source, f"{factor:g}", *(f"{a:.1f} / {b:.1f}" for a, b in cells), end_section=end)
-    Console(width=max(130, Console().width)).print(table)
+    print_tables(table)

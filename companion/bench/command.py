@@ -13,8 +13,9 @@ from collections.abc import Callable, Iterator
 from importlib import import_module
 
 import click
-from rich.console import Console
 from rich.table import Table
+
+from companion.tables import print_tables
 
 SERVICES = ("latency", "live")
 MODULES = ("bank", "fusion", "minimax", "kalman", "frame", "log")
@@ -77,6 +78,5 @@ def command(names: tuple[str, ...], as_json: bool) -> None:
     if as_json:
         click.echo(json.dumps(found))
         return
-    console = Console()
     for name, times in found.items():
-        console.print(table(name, times))
+        print_tables(table(name, times))

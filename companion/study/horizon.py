@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 
 import click
 import numpy as np
-from rich.console import Console
 from rich.table import Table
 
 from companion.estimate.minimax import closed_form
@@ -29,6 +28,7 @@ from companion.estimate.schuler import (
     transition,
 )
 from companion.study import plot_options
+from companion.tables import print_tables
 from companion.units import G0, Floats
 
 GRADES_DEG_H = {"navigation": 0.01, "tactical": 1.0, "industrial": 10.0}
@@ -328,8 +328,8 @@ def _print(table: Sequence[Ahead], title: str, drift_deg_h: float | None) -> Non
     )
     for head in ("ahead\nmin", "position\nm", "velocity\nm/s", "tilt\narcsec", "drift\ndeg/h"):
         shown.add_column(head, justify="right")
-    shown.add_column("least squares\nclaims, m", justify="right")
-    shown.add_column("least squares\nworst, m", justify="right")
+    shown.add_column("least\nsquares\nclaim, m", justify="right")
+    shown.add_column("least\nsquares\nworst, m", justify="right")
     shown.add_column("closed\nform, m", justify="right")
     shown.add_column("gap", justify="right")
     for row in table:
@@ -340,7 +340,7 @@ def _print(table: Sequence[Ahead], title: str, drift_deg_h: float | None) -> Non
             "-" if plain is None else f"{plain:.5g}",
             f"{abs(gap):.0e}",
         )
-    Console(width=100).print(shown)
+    print_tables(shown)
 
 
 def _plot(windows: Sequence[Horizon], names: Sequence[str], ahead_min: Sequence[float], file: Path) -> None:

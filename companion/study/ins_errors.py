@@ -12,11 +12,11 @@ import math
 
 import click
 import numpy as np
-from rich.console import Console
 from rich.table import Table
 
 from companion.nav.earth import SPHERE
 from companion.nav.error_model import aircraft_model, paper_model
+from companion.tables import print_tables
 
 HOUR = 3600.0
 MODELS = {"paper (1.18)": paper_model, "complete": aircraft_model}
@@ -54,7 +54,7 @@ def command(lat_deg: float, north_mps: float, east_mps: float, as_json: bool) ->
     for name, values in found.items():
         growth = max(abs(value.real) for value in values)
         table.add_row(name, *(f"{value.imag:.9f}" for value in values[:3]), f"{growth:.1e}")
-    Console(width=max(100, Console().width)).print(table)
+    print_tables(table)
     schuler = math.sqrt(SPHERE.G / SPHERE.R)
     click.echo(f"sqrt(G/R) = {schuler * HOUR:.9f} rad/h, period {2.0 * math.pi / schuler / 60.0:.4f} min")
     if north_mps == east_mps == 0.0:

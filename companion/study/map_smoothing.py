@@ -12,10 +12,10 @@ import json
 
 import click
 import numpy as np
-from rich.console import Console
 from rich.table import Table
 
 from companion.estimate import smoother
+from companion.tables import print_tables
 from companion.units import Floats
 
 PHI, GAMMA = np.array([[1.0, 1.0], [0.0, 1.0]]), np.array([[0.5], [1.0]])
@@ -86,16 +86,16 @@ def command(as_json: bool) -> None:
         return
     table = Table(title="position and velocity, ten measurements")
     table.add_column("i", justify="right")
+    table.add_column("")
     for name in found:
         table.add_column(name, justify="right")
     for i in (0, 5, 10):
-        table.add_row(str(i), *(f"{x[i, 0]:.12f}, {x[i, 1]:.12f}" for x in found.values()))
+        for k, state in enumerate(("x", "v")):
+            table.add_row(str(i), state, *(f"{x[i, k]:.12f}" for x in found.values()))
     law = Table(title="greatest distance from the direct solution, by the number of measurements")
     law.add_column("algorithm")
     for N in lengths:
         law.add_column(str(N), justify="right")
     for name in ("filter + RTS", "shooting"):
         law.add_row(name, *(f"{apart[N][name]:.1e}" for N in lengths))
-    console = Console(width=max(160, Console().width))
-    console.print(table)
-    console.print(law)
+    print_tables(table, law)

@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 
 import click
 import numpy as np
-from rich.console import Console
 from rich.table import Table
 
 from companion.analysis.replay_inputs import input_errors_as_log_errors, is_own_log, open_inputs
@@ -29,6 +28,7 @@ from companion.estimate.polynomial import (
 from companion.records import Stamped
 from companion.storage import flight_log
 from companion.study import plot_options
+from companion.tables import print_tables
 from companion.units import Floats
 
 SPAN_S = 10.0
@@ -281,7 +281,7 @@ def _print(rows: Sequence[BasisResult], title: str) -> None:
     shown.add_row("spans", *("yes" if row.found.spans else "no" for row in rows))
     if rows[0].error is not None:
         shown.add_row("true r.m.s. error", *(f"{row.error:.3g}" for row in rows))
-    Console(width=100).print(shown)
+    print_tables(shown)
 
 
 def _plot(samples: Samples, rows: Sequence[BasisResult], file: Path) -> None:

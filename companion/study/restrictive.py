@@ -13,12 +13,13 @@ from typing import Any, NamedTuple
 
 import click
 import numpy as np
-from rich.console import Console
 from rich.table import Table
 
+from companion.analysis.progress import show_step
 from companion.estimate import kalman, restrictive
 from companion.nav.error_model import Example, paper_example
 from companion.study import plot_options
+from companion.tables import print_tables
 from companion.units import Floats
 
 SAMPLES = 600
@@ -252,27 +253,26 @@ def command(names: tuple[str, ...], runs: int, seed: int, as_json: bool, plot: P
     The simulated flights have 16 states and last six hours, in unknown currents.
     """
     rows = []
-    for name in names or tuple(TRUTHS):
-        row, flights, minimax_result, restrictive_result, model = study(name, runs, seed)
-        rows.append(row)
-        if plot:
-            draw(plot, name, flights, minimax_result, restrictive_result, model)
+    with show_step("fly") as step:
+        for name in names or tuple(TRUTHS):
+            step(f"fly: {name}")
+            row, flights, minimax_result, restrictive_result, model = study(name, runs, seed)
+            rows.append(row)
+            if plot:
+                draw(plot, name, flights, minimax_result, restrictive_result, model)
     if as_json:
         click.echo(json.dumps(rows))
         return
-    console = Console()
-    console.print(
+    print_tables(
         build_table(rows, "ratio", "rms error, minimax / restrictive (above 1: restrictive better)", ".2f")
     )
-    console.print(build_table(rows, "rms_minimax", "rms error of the minimax filter, km, h, rad", ".2e"))
-    console.print(build_table(rows, "rms_restrictive", "rms error of the restrictive filter", ".2e"))
-    console.print(build_table(rows, "rms_free", "rms error of the INS without correction", ".2e"))
-    console.print(
-        build_table(rows, "nees_minimax", "mean error^2 / variance, minimax (1: consistent)", ".1f")
-    )
-    console.print(build_table(rows, "nees_restrictive", "mean error^2 / variance, restrictive", ".1f"))
+    print_tables(build_table(rows, "rms_minimax", "rms error of the minimax filter, km, h, rad", ".2e"))
+    print_tables(build_table(rows, "rms_restrictive", "rms error of the restrictive filter", ".2e"))
+    print_tables(build_table(rows, "rms_free", "rms error of the INS without correction", ".2e"))
+    print_tables(build_table(rows, "nees_minimax", "mean error^2 / variance, minimax (1: consistent)", ".1f"))
+    print_tables(build_table(rows, "nees_restrictive", "mean error^2 / variance, restrictive", ".1f"))
     for row in rows:
-        console.print(
+        click.echo(
             f"{row['title']}: U on the bound in {row['on_bound']:.0%} of steps, "
             f"{row['near_bound']:.0%} within 10 %; "
             f"NEES per dimension {row['nees_minimax_per_dimension']:.2f} minimax, "

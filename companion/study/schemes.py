@@ -15,10 +15,10 @@ from typing import NamedTuple
 
 import click
 import numpy as np
-from rich.console import Console
 from rich.table import Table
 
 from companion.estimate.schemes import FeedbackFractions, Plant, SchemeState, step
+from companion.tables import print_tables
 from companion.units import Floats
 
 DT, SPEED = 0.1, 20.0
@@ -131,6 +131,4 @@ def command(seeds: int, as_json: bool) -> None:
         law.add_column(f"errors x {scale:g}", justify="right")
     for name, row in apart.items():
         law.add_row(name, *(f"{value:.3g}" for value in row))
-    console = Console(width=max(100, Console().width))
-    console.print(table)
-    console.print(law)
+    print_tables(table, law)

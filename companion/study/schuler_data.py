@@ -24,13 +24,14 @@ from typing import NamedTuple
 import click
 import numpy as np
 import numpy.typing as npt
-from rich.console import Console
 from rich.table import Table
 
+from companion.analysis.progress import show_step
 from companion.estimate.minimax_lp import Design
 from companion.estimate.predictor import Start, Step, Window, anchor
 from companion.estimate.schuler import ARCSECOND, DEG_PER_HOUR, MEAN_EARTH, schuler_row, transition
 from companion.nav.bounded_channel import BoundedIns, Motion, UnitErrors
+from companion.tables import print_tables
 from companion.units import G0, SECOND_NS, Floats
 
 STATED_SIGMA = 0.10  # [m/s]
@@ -195,9 +196,10 @@ def command(
         recording = load(file)
         windows = [60.0 * float(word) for word in window_min.split(",")]
         ahead = [60.0 * float(word) for word in ahead_min.split(",")]
-        outcomes = [
-            outcome for window in windows for outcome in run(recording, window, ahead, sigma_mps, lat_deg)
-        ]
+        with show_step("predict"):
+            outcomes = [
+                outcome for window in windows for outcome in run(recording, window, ahead, sigma_mps, lat_deg)
+            ]
     except ValueError as error:
         raise click.UsageError(str(error)) from None
     if as_json:
@@ -226,4 +228,4 @@ def command(
         shown.add_column(head, justify="right")
     for outcome in outcomes:
         shown.add_row(outcome.channel, *(f"{number:.3g}" for number in outcome[1:]))
-    Console(width=120).print(shown)
+    print_tables(shown)

@@ -14,7 +14,6 @@ from typing import Any, Literal, NamedTuple
 
 import click
 import numpy as np
-from rich.console import Console
 from rich.table import Table
 
 from companion.estimate.readings import (
@@ -28,6 +27,7 @@ from companion.estimate.readings import (
 )
 from companion.estimate.weights import estimate_covariance, optimal_gain, perturb_weight
 from companion.study import plot_options
+from companion.tables import print_tables
 from companion.units import Floats
 
 Axis = Literal["x", "y"]
@@ -428,12 +428,11 @@ def command(
     if as_json:
         click.echo(json.dumps(plain(result), indent=1))
         return
-    console = Console(width=max(110, Console().width))
-    console.print(estimates_table(result, example=not readings and not correlations))
+    print_tables(estimates_table(result, example=not readings and not correlations))
     for a in result.axes:
         if len(a.K) > 1:
-            console.print(coefficients_table(a))
-    console.print(factors_table(result))
+            print_tables(coefficients_table(a))
+    print_tables(factors_table(result))
     for a in result.axes:
         if len(a.K) > 1:
-            console.print(correlations_table(a))
+            print_tables(correlations_table(a))
