@@ -325,16 +325,16 @@ def _bound(row: error_statistics.PhaseErrors) -> str:
     return _metres(row.bound) + ("" if row.held else f" {100.0 * (row.inside or 0.0):.0f} %")
 
 
-def _print_own(rows: list[OwnPhase], console: Console) -> None:
+def _print_own(rows: list[OwnPhase]) -> None:
     if not rows:
         return
-    table = Table(title="the autopilot's own position: error, r.m.s. / most [m]", box=SIMPLE_HEAD)
+    table = Table(title="the autopilot's own position: error, r.m.s. / most [m]")
     for column in ("phase", "with us", "without"):
         table.add_column(column, justify="left" if column == "phase" else "right", no_wrap=True)
     for row in rows:
         pairs = (row.rms, row.most), (row.rms_alone, row.most_alone)
         table.add_row(row.phase, *(f"{_metres(rms)} / {_metres(most)}" for rms, most in pairs))
-    console.print(table)
+    print_tables(table)
 
 
 def _print_table(flown: LoopbackFlight, rows: list[error_statistics.PhaseErrors], seconds: float) -> None:
@@ -364,7 +364,7 @@ def _print_table(flown: LoopbackFlight, rows: list[error_statistics.PhaseErrors]
         "bound: r.m.s. of the guaranteed bound, with the share of errors within that of\n"
         "their moment if not all are; no use: above 10 times the claim or above 5 km"
     )
-    _print_own(own_table(flown.autopilot), console)
+    _print_own(own_table(flown.autopilot))
     reported = Counter(type(record).__name__ for record in flown.records)
     rate = scenario.duration_s / seconds
     click.echo(
