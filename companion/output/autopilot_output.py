@@ -1,7 +1,8 @@
 """Autopilot output of one link: solutions in, messages to its estimator out. No I/O.
 
 Joins the gate, the encoders and the two commands with rules of their own (`position_reset`, `source_switch`).
-Records from the autopilot are used for these rules only, never for a position: positions come from solutions.
+Records from the autopilot are used for these rules only, never for a position: positions come from solutions;
+only the steps in which a jump goes out begin at its own.
 """
 
 from __future__ import annotations
@@ -90,7 +91,8 @@ class AutopilotOutput:
     def messages(self, solution: Solution, names: Collection[str], receiver: Receiver) -> list[Message]:
         """Return the messages among `names` that may be sent for `solution`, and the commands due."""
         now = solution.rx_ns
-        position, encoded = self._gate.admit(solution), dict[str, Message]()
+        position = self._gate.admit(solution, self._position_reset.autopilot_place(now))
+        encoded = dict[str, Message]()
         for name in names:
             reason = (
                 position if isinstance(position, str) else self._withholding_reason(position, name, receiver)

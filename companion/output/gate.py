@@ -19,7 +19,8 @@ one of the two is wrong; the solution is withheld until the limit, which grows w
 that only the old sigma justifies passes and is counted, so that the autopilot resets (`reset_counter`)
 instead of rejecting it as an outlier. An autopilot that takes `reset_counter` gets such a jump in steps of
 `STEP_M`, one a message, each a reset: a reset changes the position only, while a slope would be taken for a
-velocity. What is left of the jump is stated in the covariance.
+velocity. They begin at the autopilot's own position, as its filter lags behind ours. What is left of the jump
+is stated in the covariance.
 """
 
 from __future__ import annotations
@@ -133,8 +134,11 @@ class Gate:
         self._max_step_m = max_step_m
         self._left_n = (0.0, 0.0)  # from the solution to the position that goes out, m north, east
 
-    def admit(self, solution: Solution) -> Position | str:
-        """Return the position to be sent for `solution`, or the reason why it is withheld."""
+    def admit(self, solution: Solution, own: Geodetic | None = None) -> Position | str:
+        """Return the position to be sent for `solution`, or the reason why it is withheld.
+
+        `own` is the autopilot's own position at the time of sending, if known.
+        """
         if (reason := withholding_reason(solution)) is not None:
             return reason
         s = solution
@@ -160,8 +164,16 @@ class Gate:
                 return "jump larger than its accuracy justifies"
             if jump > SIGMAS * here.sigma + room:
                 self._left_n = self._left_n[0] - moved_n[0], self._left_n[1] - moved_n[1]
+                if own is not None:
+                    self._begin_at(own, here, SIGMAS * self._last.sigma + room)
         self._last = here
         return self._stepped(here)
+
+    def _begin_at(self, own: Geodetic, here: Position, near: float) -> None:
+        """Begin the steps at the autopilot's own position, if it is within `near` of the last one sent, m."""
+        north, east, _ = separation_tuple(own, Geodetic(here.lat, here.lon, here.alt_msl))
+        if math.hypot(north - self._left_n[0], east - self._left_n[1]) <= near:
+            self._left_n = north, east
 
     def _stepped(self, here: Position) -> Position:
         """Return the position that goes out for `here`: a step nearer to it, if a jump is not over."""

@@ -10,7 +10,7 @@ sigmas indicates a fault of ours: the reset is withheld.
 from __future__ import annotations
 
 from companion.link.dialect import mavlink
-from companion.nav.geometry import displace
+from companion.nav.geometry import Geodetic, displace
 from companion.output.gate import JUMP_MARGIN_M, SIGMAS, Position, distance
 from companion.records import Event, FilterStatus, GlobalPosition, Gnss, Severity, Stamped
 from companion.units import SECOND_NS
@@ -50,17 +50,23 @@ class PositionReset:
             if self._correct_ns is None:
                 self._correct_ns = record.rx_ns
 
+    def autopilot_place(self, now_ns: int) -> Geodetic | None:
+        """Return the autopilot's own position, propagated to `now_ns`; None without a recent one."""
+        own = self._autopilot_position
+        if own is None or now_ns - own.rx_ns > POSITION_TIMEOUT_NS:
+            return None
+        dt = (now_ns - own.t_ns) * 1e-9
+        return displace(own.lat, own.lon, own.alt_msl, own.v_n[0] * dt, own.v_n[1] * dt, 0.0)
+
     def withholding_reason(self, position: Position) -> str | None:
         """Return why `position` must not be sent now; None if it may be sent."""
-        now, own = position.t_ns, self._autopilot_position
+        now, there = position.t_ns, self.autopilot_place(position.t_ns)
         if not self._has_receiver:
             return "no GPS message received yet, so the autopilot may have a fix"
         if self._fixed_ns is not None and now - self._fixed_ns < GPS_TIMEOUT_NS:
             return "the autopilot has GPS"
-        if own is None or self._correct_ns is None or now - own.rx_ns > POSITION_TIMEOUT_NS:
+        if there is None or self._correct_ns is None:
             return "no recent position received from the autopilot"
-        dt = (now - own.t_ns) * 1e-9
-        there = displace(own.lat, own.lon, own.alt_msl, own.v_n[0] * dt, own.v_n[1] * dt, 0.0)
         drift = WIND_ERROR * (now - self._correct_ns) * 1e-9
         away = distance(there[:2], (position.lat, position.lon))
         if away > SIGMAS * position.sigma + drift + JUMP_MARGIN_M:

@@ -165,6 +165,20 @@ def test_jump_goes_out_in_steps_each_counted() -> None:
     assert last.covariance == (16.0, 2.0, 25.0)
 
 
+@pytest.mark.parametrize(("own_east", "first_east"), [(50.0, 40.0), (1000.0, 25.0)])
+def test_steps_begin_at_the_autopilots_own_position_if_it_follows(own_east, first_east) -> None:
+    """The jump is from 35 m east to 0; the autopilot is at 50 m, or so far off that it does not follow."""
+    gate, poor = Gate(10.0), (2e3, 0.0, 0.0, 2e3, 0.0, 9.0)
+    gate.admit(moved(0.0, east=35.0, covariance=poor, mode=Mode.PREDICTING))
+    good, own = moved(0.1), moved(0.1, east=own_east)
+    sent = gate.admit(good, Geodetic(own.lat, own.lon, own.alt_msl))
+    assert isinstance(sent, Position)
+    true = Geodetic(good.lat, good.lon, good.alt_msl)
+    assert separation(Geodetic(sent.lat, sent.lon, sent.alt_msl), true)[1] == pytest.approx(
+        first_east, abs=0.1
+    )
+
+
 def test_noise_within_the_accuracy_is_no_reset() -> None:
     gate = Gate()
     for k in range(100):
