@@ -49,7 +49,7 @@ SLIP = 0.012
 JUMP = 1 * SECOND_NS
 #: A TIMESYNC reading by which the last arrival is later than this belongs to another clock.
 MAX_LATENESS = 10 * SECOND_NS
-#: A message later than this is reported as late, and messages without a stamp are taken to be as late.
+#: A message later than this is reported as late.
 LATE = 1 * SECOND_NS
 #: A longer round trip does not measure the offset.
 MAX_ROUND_TRIP = SECOND_NS // 4
@@ -245,12 +245,12 @@ class BootClock:
         """Return the local time for which a message stamped `stamp` (since boot, or UNIX) is valid.
 
         Never later than its arrival. The arrival itself if the stamp cannot be mapped yet. For stamp 0
-        (unknown) the arrival too, less the delay of stamped messages if the link is late.
+        (unknown) the arrival less the delay of the last stamped message: both came over the same link in the
+        order in which they were sent, so an unstamped message is not ahead of those around it.
         """
         offset = self.offset(received)
         if stamp <= 0:
-            late = self.lateness(received)
-            return received - late if late > LATE else received
+            return received - self.lateness(received)
         if offset is None:
             return received
         if stamp >= UNIX_EPOCH_FROM:

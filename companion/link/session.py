@@ -306,11 +306,14 @@ class Session:
         """Process bytes that arrived at `now_ns` from `peer`; return the events in order."""
         self._now = now_ns
         events, self._not_sent = self._not_sent, []
+        is_accepted = False
         for found in self._parse(data, peer):
             if isinstance(found, Frame):
-                self._on_frame(found, peer, now_ns, events)
+                is_accepted |= self._on_frame(found, peer, now_ns, events)
             else:
                 events.append(NotUnderstood(now_ns, found))
+        if is_accepted and peer is not None:
+            self._keep_reader(peer, now_ns)
         return events
 
     def would_accept(self, data: bytes, now_ns: int) -> bool:
@@ -410,22 +413,21 @@ class Session:
         assert self._signing is not None
         return self._signing.sign(data, self._link_id, self._now)
 
-    def _on_frame(self, found: Frame, peer: Hashable, now: int, events: list[Event]) -> None:
+    def _on_frame(self, found: Frame, peer: Hashable, now: int, events: list[Event]) -> bool:
+        """Process a frame; return whether it is accepted and proves its sender."""
         if self._signing is not None and (reason := self._signing.verify(found, now)) is not None:
             self.rejected[reason] += 1
             events.append(FrameRejected(now, found.system, found.component, reason))
-            return
+            return False
         self.reader.count(found)
         if found.component == self.component and found.system == self.system:
-            return  # our own frame, sent back by a router
+            return False  # our own frame, sent back by a router
         is_proof = self.is_proof(found)
-        if peer is not None and is_proof:
-            self._keep_reader(peer, now)
         message = dialect.decode(found) if found.msgid in READ_HERE else None
         if found.component == _AUTOPILOT_COMPONENT and is_proof:
             self._choose(message, found, peer, now, events)
         if self._choice.is_rival(found.system, peer):
-            return
+            return is_proof
         chosen = self._choice.chosen
         from_autopilot = (
             chosen is not None
@@ -441,6 +443,7 @@ class Session:
         if from_autopilot:
             self._on_autopilot(message, found, now, events)
         events.append(MessageReceived(now, message, found, from_autopilot, peer))
+        return is_proof
 
     def _choose(self, message: Message, found: Frame, peer: Hashable, now: int, events: list[Event]) -> None:
         """Let a frame of an autopilot's component decide which autopilot is used."""

@@ -20,7 +20,7 @@ from companion.estimate import bank as banks
 from companion.navigator import minimax_bound
 from companion.navigator.hypotheses import Model
 from companion.navigator.own_channel import OwnChannel
-from companion.navigator.solution import announce, refresh_bound, resolve_pending, solve
+from companion.navigator.solution import announce, is_bound_due, refresh_bound, resolve_pending, solve
 from companion.navigator.stale_data import REPORT_EVERY, StaleDataDetector
 from companion.navigator.state import FIXES, Settings, State, Step, initial, is_new_fix
 from companion.navigator.step import INPUTS_USED, step, uses
@@ -44,6 +44,8 @@ __all__ = ["INPUTS_USED", "Navigator"]
 
 #: A roll-back costs 1 to 2 % of the time that it goes back: at most one in this share of it.
 ROLL_BACK_SHARE = 10
+#: Stamps in ms are behind those in us of the same instant by up to this: such a record is not late.
+TICK_NS = 1_000_000
 #: After a roll-back by t seconds for beacon answers, all of which were rejected, none that is older than
 #: CHEAP_NS is used for USELESS_TIMES t: forged ones would take the time of all others.
 USELESS_TIMES, CHEAP_NS = 2, 500_000_000
@@ -108,6 +110,8 @@ class Navigator:
             return stale
         if isinstance(record, Gnss) and not is_new_fix(record, self._state, self._settings):
             return []
+        if self._past and 0 < self._past[-1].t_ns - record.t_ns <= TICK_NS:
+            record = structs.replace(record, t_ns=self._past[-1].t_ns)
         self.settle()
         outputs, self._deferred = self._deferred, []
         folded: list[Input] = [record]
@@ -152,7 +156,7 @@ class Navigator:
         if pending is not None:
             state = self._state._replace(pending=None)
             self._state, outputs = guarded(state, pending.record, self._settings, resolve_pending, pending)
-        if self._past and self._state.nominal is not None:
+        if self._past and is_bound_due(self._state):
             record = self._past[-1].record
             self._state, more = guarded(self._state, record, self._settings, refresh_bound, record)
             outputs = [*outputs, *more]

@@ -159,12 +159,34 @@ def tasks(config: Config, channel: Channel) -> tuple[Task, ...]:
 # ---------------------------------------------------------------------------------------------------------
 
 
+def is_due(g: Guarantee, nominal: Nominal) -> bool:
+    """Whether `follow` or `refresh` has anything to do: asked after every record."""
+    return _is_behind(g, nominal) or _has_work(g, nominal)
+
+
+def _is_behind(g: Guarantee, nominal: Nominal) -> bool:
+    reach = g.reach
+    if _driver(nominal) != g.by:
+        return True
+    return reach is not None and not 0.0 <= (nominal.point.t_ns - reach.at.t_ns) * 1e-9 < CHUNK_S
+
+
+def _has_work(g: Guarantee, nominal: Nominal) -> bool:
+    window = g.window
+    if window is None or g.reach is None or not window.fixes:
+        return False
+    return abs(nominal.t_ns - g.worked_ns) >= PIECE_NS
+
+
+def _driver(nominal: Nominal) -> str:
+    return "ins" if nominal.interval is None else nominal.interval.by
+
+
 def follow(g: Guarantee, nominal: Nominal, config: Config) -> Guarantee:
     """Extend the transition to the nominal point, and the window when a bin is over."""
-    by = "ins" if nominal.interval is None else nominal.interval.by
-    point, reach = nominal.point, g.reach
-    if by == g.by and (reach is None or 0.0 <= (point.t_ns - reach.at.t_ns) * 1e-9 < CHUNK_S):
+    if not _is_behind(g, nominal):
         return g
+    by, point, reach = _driver(nominal), nominal.point, g.reach
     channel = law(config, by, point.v_n)
     if channel is None:
         return Guarantee(by)
@@ -269,9 +291,10 @@ def tuned(g: Guarantee) -> Guarantee:
 
 def refresh(g: Guarantee, nominal: Nominal, rx_ns: int, config: Config) -> tuple[Guarantee, list[Output]]:
     """Do the piece of work that is most overdue: make the program of the window, or solve one target."""
-    window, t_ns = g.window, nominal.t_ns
-    if window is None or g.reach is None or not window.fixes or abs(t_ns - g.worked_ns) < PIECE_NS:
+    if not _has_work(g, nominal):
         return g, []
+    window, t_ns = g.window, nominal.t_ns
+    assert window is not None
     channel, g = law(config, g.by, nominal.point.v_n), g._replace(worked_ns=t_ns)
     if channel is None:
         return g, []

@@ -299,6 +299,12 @@ def resolve_pending(state: State, pending: Pending, settings: Settings) -> Step:
     return _restrict(state._replace(guarantee=g), out, used, settings), [out]
 
 
+def is_bound_due(state: State) -> bool:
+    """Whether `refresh_bound` has anything to do."""
+    nominal = state.nominal
+    return nominal is not None and state.fixed and minimax_bound.is_due(state.guarantee, nominal)
+
+
 def refresh_bound(state: State, record: Input, settings: Settings) -> Step:
     """Deferred update: extend the window of the guaranteed bound, and do one piece of its work."""
     nominal = state.nominal

@@ -105,6 +105,18 @@ ABOUT_SOURCE_SET = frozenset(
 )
 #: Answers to the parameter check.
 PARAMETERS = frozenset({mavlink.MAVLINK_MSG_ID_PARAM_VALUE, mavlink.MAVLINK_MSG_ID_PARAM_ERROR})
+#: All messages that the core handles; others are logged only.
+HANDLED = (
+    REQUESTS
+    | ABOUT_SOURCE_SET
+    | PARAMETERS
+    | DECODED
+    | {
+        mavlink.MAVLINK_MSG_ID_HEARTBEAT,
+        mavlink.MAVLINK_MSG_ID_COMMAND_ACK,
+        mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION,
+    }
+)
 
 
 class Link:
@@ -211,10 +223,13 @@ class CompanionCore:
         session = self.links[link].session
         events = session.receive(data, now_ns, peer)
         self._on_events(self.links[link], events, now_ns)
-        accepted = [e for e in events if isinstance(e, MessageReceived) and session.is_proof(e.frame)]
-        if any(event.from_autopilot for event in accepted):
-            return Rank.AUTOPILOT
-        return Rank.ACCEPTED if accepted else Rank.UNKNOWN
+        rank = Rank.UNKNOWN
+        for event in events:
+            if isinstance(event, MessageReceived) and session.is_proof(event.frame):
+                if event.from_autopilot:
+                    return Rank.AUTOPILOT
+                rank = Rank.ACCEPTED
+        return rank
 
     @property
     def leading_link(self) -> Link | None:
@@ -368,14 +383,16 @@ class CompanionCore:
                 self.report(Severity.WARNING, text, now_ns)
 
     def _on_message(self, link: Link, event: MessageReceived) -> None:
-        is_used = event.from_autopilot
-        if event.frame.msgid == rsbn.MAVLINK_MSG_ID_RSBN_MEASUREMENT:
+        msgid, is_used = event.frame.msgid, event.from_autopilot
+        if msgid == rsbn.MAVLINK_MSG_ID_RSBN_MEASUREMENT:
             is_used = self._is_duplicate(link) or self._is_answer_used(link, event)
         if is_used or self._may_log_unused(link, event):
             self._log.frame(link.name, False, event.frame.raw, event.received_ns)
-        if event.frame.msgid == mavlink.MAVLINK_MSG_ID_HEARTBEAT:
+        if msgid not in HANDLED:  # most of a stock stream: never decoded
+            return
+        if msgid == mavlink.MAVLINK_MSG_ID_HEARTBEAT:
             link.has_station |= event.message.type == mavlink.MAV_TYPE_GCS
-        elif event.frame.msgid in REQUESTS:
+        elif msgid in REQUESTS:
             link.has_station = True
             replies, config = self._services.receive(event, link.session.system)
             for reply in replies:
@@ -386,20 +403,20 @@ class CompanionCore:
                     each.output.config = config
                     each.session.set_rates(requested_rates(config), event.received_ns)
                 self._on_record(Tuning(event.received_ns, event.received_ns, to_toml(config)))
-        if event.frame.msgid in ABOUT_SOURCE_SET:
+        if msgid in ABOUT_SOURCE_SET:
             link.output.handle_message(event.message, event.from_autopilot, event.received_ns)
             self._emit_output_events(link)
         if not is_used:
             return
         ours = (0, self._config.link.component_id)  # 0: the sender states no target
-        if event.frame.msgid == mavlink.MAVLINK_MSG_ID_COMMAND_ACK and event.message.target_component in ours:
+        if msgid == mavlink.MAVLINK_MSG_ID_COMMAND_ACK and event.message.target_component in ours:
             link.output.handle_acknowledgement(event.message.command, event.message.result, event.received_ns)
             self._emit_output_events(link)
-        if event.frame.msgid == mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION:
+        if msgid == mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION:
             link.firmware = firmware_of(event.message)
-        if event.frame.msgid in PARAMETERS:
+        if msgid in PARAMETERS:
             link.parameter_check.receive(event.message, event.frame)
-        if event.frame.msgid not in DECODED:  # most of a stock stream: never decoded
+        if msgid not in DECODED:
             return
         is_duplicate = self._is_duplicate(link)
         for record in decode(event.message, event.received_ns, link.sender):
@@ -411,7 +428,7 @@ class CompanionCore:
             if not is_duplicate:
                 self._last_used = link if event.from_autopilot else self._last_used
                 is_rejected = self._on_record(record)
-                if is_rejected and event.frame.msgid == rsbn.MAVLINK_MSG_ID_RSBN_MEASUREMENT:
+                if is_rejected and msgid == rsbn.MAVLINK_MSG_ID_RSBN_MEASUREMENT:
                     self._answers.note_rejected(_receiver_of(event), event.received_ns)
 
     def _is_duplicate(self, link: Link) -> bool:

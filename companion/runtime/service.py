@@ -217,7 +217,7 @@ class Service:
         for event in self.core.take_events():
             self._on_event(event)
             self._notifier.status(event.text)
-        if now - self.core.deadline() < OVERDUE_NS:
+        if self._notifier.is_watchdog_due(now) and now - self.core.deadline() < OVERDUE_NS:
             self._notifier.alive(now)
         self.core.settle()
         self._deferred.flush()

@@ -38,9 +38,14 @@ class SystemdNotifier:
             self._is_ready = True
             self._notify("READY=1")
 
+    def is_watchdog_due(self, now_ns: int) -> bool:
+        """Whether the watchdog is enabled and must be fed."""
+        fed_ns = self._fed_ns
+        return bool(self._interval_ns) and (fed_ns is None or now_ns - fed_ns >= self._interval_ns)
+
     def alive(self, now_ns: int) -> None:
         """Feed the watchdog, if enabled and due, for work completed at `now_ns`."""
-        if self._interval_ns and (self._fed_ns is None or now_ns - self._fed_ns >= self._interval_ns):
+        if self.is_watchdog_due(now_ns):
             self._fed_ns = now_ns
             self._notify("WATCHDOG=1")
 

@@ -238,6 +238,24 @@ def test_false_late_answers_share_few_roll_backs(
     assert least <= len(roll_backs) <= most
 
 
+def test_a_stamp_cut_to_milliseconds_is_not_late(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of one instant: a fix stamped in us before a local position stamped in ms."""
+    navigator, roll_backs = Navigator(CONFIG), []
+    rewound = Navigator._rewound
+    monkeypatch.setattr(
+        Navigator, "_rewound", lambda self, state: roll_backs.append(1) or rewound(self, state)
+    )
+    navigator.handle(origin())
+    outs = []
+    for moment in flight(30, 30.0, 0.0):
+        local, *fixes = moment.records
+        for fix in fixes:
+            outs += navigator.handle(msgspec.structs.replace(fix, t_ns=fix.t_ns + 700_000))
+        outs += navigator.handle(local)
+    assert not roll_backs
+    assert max(out.t_ns for out in outs if isinstance(out, Solution)) > 29 * NS
+
+
 def test_what_is_settled_in_between_changes_nothing() -> None:
     """The service learns while it waits, a replay when the next record is there: answers come late, one GNSS
     fix is wild, and parameters are set in flight."""

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from companion.estimate.bank.layout import NONE, Ints, Layout
+from companion.estimate.bank.layout import NONE, Layout
 from companion.estimate.bank.readout import level_rows
 from companion.estimate.bank.settings import Settings
 from companion.estimate.bank.state import Bank, families, normalised
@@ -49,6 +49,9 @@ def reduce(bank: Bank, layout: Layout, settings: Settings) -> Bank:
         bends |= (bank.P[:, layout.accelerations[2], layout.accelerations[2]] > 0.0).any(axis=1)
     label = 2 * bank.event + bends
     keys = list(zip(family.tolist(), label.tolist(), bins.astype(int).tolist()))
+    # lists: plain numbers are several times faster than elements of arrays
+    logs, since, scales, grade = L.tolist(), bank.since.tolist(), bank.scale.tolist(), bank.grade.tolist()
+    active = (bank.fault != NONE).sum(axis=1).tolist()
     # rank of a row: 0 protected, 1 heaviest of its class, 2 oldest of its class, 3 and 4 others
     rank = [4] * rows
     heaviest: dict[tuple[int, int, int], int] = {}
@@ -62,22 +65,22 @@ def reduce(bank: Bank, layout: Layout, settings: Settings) -> Bank:
             heaviest[key] = i
             rank[i] = 1
         j = oldest.get(key)
-        if j is None or bank.since[i] < bank.since[j]:
+        if j is None or since[i] < since[j]:
             oldest[key] = i
-        scale = (*key, int(bank.scale[i]))
+        scale = (*key, scales[i])
         if key[2] <= 1 and scale not in by_scale:
             by_scale.add(scale)
             rank[i] = min(rank[i], 2)
-        if key[0] not in by_fault and _single(bank.fault[i]):
+        if key[0] not in by_fault and active[i] <= 1:
             by_fault.add(key[0])
             rank[i] = 0
-        if key[0] == 0 and int(bank.grade[i]) not in grades:
-            grades.add(int(bank.grade[i]))
+        if key[0] == 0 and grade[i] not in grades:
+            grades.add(grade[i])
             rank[i] = 0
     for i in oldest.values():
         rank[i] = min(rank[i], 2)
     for i in range(rows):
-        if L[i] < settings.class_floor:
+        if logs[i] < settings.class_floor:
             rank[i] = max(rank[i], 3) if rank[i] else 0
     for i in level_rows(bank, layout, 3, settings.risk).tolist():
         rank[i] = 0
@@ -88,11 +91,12 @@ def reduce(bank: Bank, layout: Layout, settings: Settings) -> Bank:
             rank[i] = 0
     # quotas: the rows of a family beyond its quota rank behind all others
     used: dict[int, int] = {}
+    faults = bank.fault.tolist()
     score = []
     for i in sorted(range(rows), key=lambda i: (rank[i], place[i])):
         f = keys[i][0]
         used[f] = used.get(f, 0) + 1
-        over = rank[i] > 0 and used[f] > _quota(layout, bank.fault[i], int(bank.event[i]))
+        over = rank[i] > 0 and used[f] > _quota(layout, faults[i])
         score.append((rank[i] + (3 if over else 0), place[i], i))
     score.sort()
     keep = sorted(i for _, _, i in score[: settings.rows])
@@ -100,13 +104,9 @@ def reduce(bank: Bank, layout: Layout, settings: Settings) -> Bank:
     return _merged(bank, keep, dropped, keys, settings)
 
 
-def _single(fault: Ints) -> bool:
-    return int((fault != NONE).sum()) <= 1
-
-
-def _quota(layout: Layout, fault: Ints, event: int) -> int:
+def _quota(layout: Layout, fault: list[int]) -> int:
     """Rows that the family of a row may hold before others come first."""
-    active = [int(f) for f in fault if f != NONE]
+    active = [f for f in fault if f != NONE]
     if len(active) > 1:
         return 3
     if active:
@@ -118,8 +118,8 @@ def _merged(
     bank: Bank, keep: list[int], dropped: list[int], keys: list[tuple[int, int, int]], settings: Settings
 ) -> Bank:
     """The rows `keep`; the weights of `dropped`, in this order, go where `reduce` states."""
-    L = bank.L.copy()
-    x, P, since = bank.x.copy(), bank.P.copy(), bank.since.copy()
+    L, grade, noise = bank.L.tolist(), bank.grade.tolist(), bank.noise.tolist()
+    x, P = bank.x.copy(), bank.P.copy()
     by_key: dict[tuple[int, int, int], list[int]] = {}
     for i in keep:
         by_key.setdefault(keys[i], []).append(i)
@@ -129,26 +129,22 @@ def _merged(
             continue
         near = by_key[keys[i]]
         alike = [
-            j
-            for j in near
-            if abs(L[i] - L[j]) < log_ratio
-            and bank.grade[i] == bank.grade[j]
-            and np.array_equal(bank.noise[i], bank.noise[j])
+            j for j in near if abs(L[i] - L[j]) < log_ratio and grade[i] == grade[j] and noise[i] == noise[j]
         ]
-        j = max(alike or near, key=lambda j: L[j])
+        j = max(alike or near, key=L.__getitem__)
         if alike and _distance(x[i] - x[j], P[j]) < settings.merge_distance:
             L[j], x[j], P[j] = merge_moments(L[i], x[i], P[i], L[j], x[j], P[j])
         elif L[i] < L[j] + log_ratio:
-            L[j] = np.logaddexp(L[i], L[j])
+            L[j] = float(np.logaddexp(L[i], L[j]))
     at = np.array(keep)
     return bank._replace(
-        L=normalised(L[at]),
+        L=normalised(np.array(L)[at]),
         x=x[at],
         P=P[at],
         grade=bank.grade[at],
         fault=bank.fault[at],
         event=bank.event[at],
-        since=since[at],
+        since=bank.since[at],
         scale=bank.scale[at],
         noise=bank.noise[at],
     )
