@@ -192,13 +192,27 @@ _NAMES = {
     "Rejection": "rejections",
     "Fix": "radio-only fixes",
     "LinkState": "link state",
+    "AirspeedSensor": "state of the airspeed sensor",
+    "GnssIntegrity": "jamming and spoofing",
+    "RangeDifference": "lines of position",
+    "StarFix": "star fixes",
+    "Tuning": "changed parameters",
+    "Reboot": "reboots",
+    "Event": "events",
+    "Reset": "resets",
+    "Smoothed": "smoothed track",
+    "Truth": "true position",
 }
 
 
 def topic_name(topic: str) -> str:
     """Return the name of a topic for the user."""
     kind = topic.rsplit("/", 1)[-1]
-    return _NAMES.get(kind, kind) if topic.startswith(("/in/", "/out/", "/link/")) else topic.lstrip("/")
+    return (
+        _NAMES.get(kind, kind)
+        if topic.startswith(("/in/", "/out/", "/link/", "/truth/"))
+        else topic.lstrip("/")
+    )
 
 
 def message_rate(topic: str, stream: Stream, latency: Floats) -> MessageRate:

@@ -200,10 +200,10 @@ def _bound_sentences(a: Assessment) -> list[str]:
     found = []
     if useless:
         found.append(
-            f"No useful guaranteed bound in {len(useless)} phases, the first “{phase_title(useless[0])}”."
+            f"No useful guaranteed bound in {_count_phases(useless)}, the first “{phase_title(useless[0])}”."
         )
     if judged and not broken:
-        found.append(f"The guaranteed bound{reached} held at every instant of {len(judged)} phases.")
+        found.append(f"The guaranteed bound{reached} held at every instant of {_count_phases(judged)}.")
     elif broken:
         worst = min(broken, key=lambda row: row.inside or 0.0)
         found.append(
@@ -282,6 +282,10 @@ def _during(
 
 def _rms(error: Floats) -> float:
     return float(np.sqrt(np.mean(error**2)))
+
+
+def _count_phases(phases: Sequence[object]) -> str:
+    return f"{len(phases)} phase{'s' if len(phases) != 1 else ''}"
 
 
 def _percent(share: float) -> str:

@@ -149,10 +149,16 @@ def _inconsistent(a: Assessment) -> Verdict | None:
     )
 
 
-def _rejections(a: Assessment) -> Verdict | None:
+def _longest_rejection(a: Assessment) -> flight_events.RejectionGroup | None:
+    """Return the longest rejection of fixes, None if it is short."""
     fixes = [g for g in a.groups if g.source.lower().startswith(("gnss", "rsbn"))]
     longest = max(fixes, key=lambda g: g.end - g.start, default=None)
-    if longest is None or longest.end - longest.start < REJECTED_S or _promise(a) == "fault":
+    return None if longest is None or longest.end - longest.start < REJECTED_S else longest
+
+
+def _rejections(a: Assessment) -> Verdict | None:
+    longest = _longest_rejection(a)
+    if longest is None or _promise(a) == "fault":
         return None
     return Verdict(
         "caution",
@@ -184,10 +190,15 @@ def _no_reference(a: Assessment) -> Verdict | None:
 def _kept(a: Assessment) -> Verdict:
     worst = worst_of(a).estimate
     judged = [row for row in a.rows if row.held is not None]
-    held = f"the guaranteed bound held in all {len(judged)} phases" if judged else "no bound was stated"
+    held = "the guaranteed bound held in every phase that has one" if judged else "no bound was stated"
     longest = max((outage.end - outage.start for outage in a.outages), default=0.0)
-    gnss = f"GNSS was lost for up to {format_duration(longest)}" if longest else "GNSS had a fix throughout"
-    return Verdict("good", f"{gnss}, and {held}.", format_length(worst), describe_worst(a))
+    happened = (
+        f"GNSS was lost for up to {format_duration(longest)}" if longest else "GNSS had a fix throughout"
+    )
+    if (rejected := _longest_rejection(a)) is not None:
+        seconds = format_duration(rejected.end - rejected.start)
+        happened += f", {flight_events.source_title(rejected.source)} was rejected for {seconds}"
+    return Verdict("good", f"{happened}, and {held}.", format_length(worst), describe_worst(a))
 
 
 _RULES: tuple[Callable[[Assessment], Verdict | None], ...] = (

@@ -21,7 +21,7 @@ from companion.analysis.assessment import assess_flight
 from companion.analysis.convert import convert_log
 from companion.analysis.figures import build_figures
 from companion.analysis.flight_arrays import collect_flights
-from companion.analysis.flight_events import describe_rejections
+from companion.analysis.flight_events import describe_rejections, topic_name
 from companion.analysis.flights import open_flights
 from companion.analysis.html import comparison_table
 from companion.analysis.plot_data import thin_line
@@ -32,6 +32,8 @@ from companion.analysis.verdict import judge_flight
 from companion.config import Config
 from companion.nav.geometry import displace
 from companion.records import (
+    INPUTS,
+    OUTPUTS,
     AirData,
     Attitude,
     Event,
@@ -303,10 +305,10 @@ def test_flights_are_compared_in_one_table_and_in_the_same_axes(assessed):
 @pytest.mark.parametrize(
     ("kind", "level", "number", "reason"),
     [
-        ({}, "good", "5.0 m", "GNSS was lost for up to 2 min, and the guaranteed bound held in all 3 phases"),
+        ({}, "good", "5.0 m", "GNSS was lost for up to 2 min, and the guaranteed bound held in every phase"),
         ({"bound": (3.0, 3.0)}, "fault", "1.18 ×", "The guaranteed bound did not hold"),
         ({"protection": 4.0}, "fault", "1.25 ×", "exceeded the protection level"),
-        ({"protection": 5.1}, "good", "5.0 m", "held in all 3 phases"),
+        ({"protection": 5.1}, "good", "5.0 m", "held in every phase"),
         (
             {"error": (30.0, 40.0), "ins": (3.0, 4.0), "bound": None},
             "fault",
@@ -321,6 +323,11 @@ def test_verdict_names_the_number_that_decides(kind, level, number, reason):
     verdict = judge_flight(assess_flight(flight(**kind)))
     assert (verdict.level, verdict.number) == (level, number)
     assert reason in verdict.reason
+
+
+def test_every_kind_of_record_has_a_name_for_users():
+    for kind in (*INPUTS, *OUTPUTS, Truth):
+        assert topic_name(flight_log.topic_of(kind)) != kind.__name__, kind
 
 
 def test_a_flight_of_no_consequence_is_judged_by_its_reset():
