@@ -236,6 +236,14 @@ class StarFix(Stamped, frozen=True, gc=False, tag=True):
     sigma_azimuth: float
 
 
+class SecondIns(Stamped, frozen=True, gc=False, tag=True):
+    """Position of a second INS, rad; its errors are its own."""
+
+    ins: int
+    lat: float
+    lon: float
+
+
 class Reboot(Stamped, frozen=True, gc=False, tag=True):
     """The autopilot rebooted: its origin, clock and inertial channel change."""
 
@@ -454,6 +462,7 @@ Input: TypeAlias = (
     | RsbnFix
     | RangeDifference
     | StarFix
+    | SecondIns
     | Reboot
     | Tuning
 )

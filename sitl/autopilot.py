@@ -5,7 +5,8 @@
 
 It sends the records of a `World` as ArduPlane (system 1, component 1) or PX4 would: streams at 1 Hz until
 SET_MESSAGE_INTERVAL requests another rate, the newest value repeated where a stream is faster than its
-sensor, time since boot, TIMESYNC, commands. An RSBN receiver, a component of its own, sends each answer once.
+sensor, time since boot, TIMESYNC, commands. Receivers of
+beacons and correctors, a component of their own, send each answer once.
 Latency, jitter and faults of the link are applied between the two sides.
 
 `now_ns` is the companion's clock; the flight starts at `start_ns` on it. Position and status messages of the
@@ -62,7 +63,7 @@ from sitl.world import World
 
 NEVER = 2**63 - 1
 MOST_UNREAD = 1024  # most frames that wait for a slow consumer
-SYSTEM, COMPONENT, RSBN_COMPONENT = 1, 1, 42
+SYSTEM, COMPONENT, RECEIVER_COMPONENT = 1, 1, 42
 UNIX_AT_START_NS = 1_767_225_600 * SECOND_NS
 """The simulated date: 1 January 2026."""
 
@@ -123,8 +124,11 @@ class SimulatedAutopilot:
         }
         sensed = {**_SENSED, **_BY_MAKE[scenario.autopilot]}
         self._streams = {_msgid(name): self.world.streams[kind] for name, kind in sensed.items()}
-        self._rsbn = self.world.streams[RsbnFix]
-        self._rsbn_next = 0
+        # of receivers that are components of their own: each record is sent once
+        self._answers = list(
+            heapq.merge(self.world.streams[RsbnFix], self.world.corrections, key=lambda record: record.rx_ns)
+        )
+        self._next_answer = 0
         self.parameters = SimulatedParameters(scenario.autopilot)
         self._gnss_off_ns: int | None = None  # time at which the parameter switched GNSS off
         self._send_queue: list[tuple[int, int, bytes]] = []  # due, order, frame
@@ -182,8 +186,8 @@ class SimulatedAutopilot:
     def poll(self, now_ns: int) -> list[bytes]:
         """Return every frame that arrives at the companion up to `now_ns`, in order."""
         t = min(now_ns, self.end_ns) - self._start_ns
-        while (self._schedule and self._schedule[0][0] <= t) or self._rsbn_due() <= t:
-            self._emit(min(self._schedule[0][0] if self._schedule else NEVER, self._rsbn_due()))
+        while (self._schedule and self._schedule[0][0] <= t) or self._answer_due() <= t:
+            self._emit(min(self._schedule[0][0] if self._schedule else NEVER, self._answer_due()))
         due = []
         while self._send_queue and self._send_queue[0][0] <= now_ns:
             due.append(heapq.heappop(self._send_queue)[2])
@@ -191,7 +195,7 @@ class SimulatedAutopilot:
 
     def deadline(self) -> int:
         """Return the time of the next frame, `NEVER` after the flight."""
-        t = min(self._schedule[0][0] if self._schedule else NEVER, self._rsbn_due())
+        t = min(self._schedule[0][0] if self._schedule else NEVER, self._answer_due())
         sending = t + self._start_ns if t + self._start_ns <= self.end_ns else NEVER
         return min(sending, self._send_queue[0][0] if self._send_queue else NEVER)
 
@@ -204,7 +208,7 @@ class SimulatedAutopilot:
     def _boot(self, boot_ns: int, from_ns: int) -> None:
         """Boot: time since boot starts at `boot_ns`, every stream at its default rate at `from_ns`."""
         self._sender = SimulatedSender(self.scenario.autopilot, boot_ns)
-        self._sequences = {COMPONENT: 0, RSBN_COMPONENT: 0}
+        self._sequences = {COMPONENT: 0, RECEIVER_COMPONENT: 0}
         self._intervals: dict[int, int] = {}
         self._schedule: list[tuple[int, int]] = []
         self._newest = dict.fromkeys(self._streams, -1)
@@ -230,14 +234,14 @@ class SimulatedAutopilot:
             message = self._message(msgid, t)
             if message is not None:
                 frames.append(self._frame(message, COMPONENT))
-        while self._rsbn_due() <= t:
-            message = encode(self._rsbn[self._rsbn_next], self._sender)
-            frames.append(self._frame(message, RSBN_COMPONENT))
-            self._rsbn_next += 1
+        while self._answer_due() <= t:
+            message = encode(self._answers[self._next_answer], self._sender)
+            frames.append(self._frame(message, RECEIVER_COMPONENT))
+            self._next_answer += 1
         self._transmit(frames, t)
 
-    def _rsbn_due(self) -> int:
-        return self._rsbn[self._rsbn_next].rx_ns if self._rsbn_next < len(self._rsbn) else NEVER
+    def _answer_due(self) -> int:
+        return self._answers[self._next_answer].rx_ns if self._next_answer < len(self._answers) else NEVER
 
     def _message(self, msgid: int, t: int) -> Any:
         """The message of a stream at flight time `t`, None before its first record."""
@@ -291,8 +295,8 @@ class SimulatedAutopilot:
         if fault.name == "reboot":
             self._booting_until = start + size_ns
             self._boot(start, self._booting_until)
-            while self._rsbn_due() < self._booting_until:
-                self._rsbn_next += 1
+            while self._answer_due() < self._booting_until:
+                self._next_answer += 1
             return
         if fault.name == "clock-jump":
             self._sender = self._sender._replace(boot_ns=self._sender.boot_ns - size_ns)

@@ -1,25 +1,27 @@
-"""Simulated correctors of an INS: star fixes, lines of position of a hyperbolic system.
+"""Simulated correctors of an INS: star fixes, lines of position of a hyperbolic system, a second INS.
 
-Records with the errors that `companion.navigator.corrected_ins` assumes, of a scenario's true flight.
+Records with the errors that `companion.navigator.corrected_ins` assumes. `RECORDS` has them by the name of
+`inertial.correctors`; airspeed needs no record of its own.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from companion.nav.geometry import Geodetic, ecef_tuple
 from companion.navigator.corrected_ins import CHAIN_BIAS_M
-from companion.records import RangeDifference, StarFix
+from companion.records import RangeDifference, SecondIns, Stamped, StarFix
 from companion.units import SECOND_NS, Floats
 from sitl import sensors
 from sitl.flight import Trajectory
-from sitl.world import World
 
 STAR_EVERY_S, STAR_SIGMA = 60.0, math.radians(20.0 / 3600.0)
 LINE_EVERY_S, LINE_SIGMA_M = 5.0, 50.0
+SECOND_EVERY_S = 2.0
 
 
 class Station(NamedTuple):
@@ -37,10 +39,22 @@ SECONDARIES = (Station(58.0, 27.0), Station(60.0, 36.0))
 STARS = ((20.0, -20.0), (10.0, 70.0), (50.0, 100.0))
 
 
-def star_fixes(world: World, rng: np.random.Generator) -> list[StarFix]:
+class Aircraft(NamedTuple):
+    """True flight, errors of the INS that is corrected, and its grade."""
+
+    flight: Trajectory
+    error: sensors.InertialError
+    grade: sensors.InertialGrade
+
+    def every(self, seconds: float) -> Trajectory:
+        """Sample the flight."""
+        return self.flight.at(np.arange(1.0, float(self.flight.t[-1]), seconds))
+
+
+def star_fixes(aircraft: Aircraft, rng: np.random.Generator) -> list[StarFix]:
     """One star a minute, in turn: its altitude and azimuth on the axes of the INS."""
-    flight = _sampled(world, STAR_EVERY_S)
-    psi = sensors.interpolate_error(world.inertial_error, flight.t).psi
+    flight = aircraft.every(STAR_EVERY_S)
+    psi = sensors.interpolate_error(aircraft.error, flight.t).psi
     found = []
     for k, t in enumerate(flight.t.tolist()):
         number = k % len(STARS)
@@ -73,9 +87,9 @@ def direction(lat: float, lon: float, star_lat: float, star_lon: float) -> Float
     return s_n
 
 
-def range_differences(world: World, rng: np.random.Generator) -> list[RangeDifference]:
+def range_differences(aircraft: Aircraft, rng: np.random.Generator) -> list[RangeDifference]:
     """Two lines of position every five seconds, each with a bias of its own."""
-    flight = _sampled(world, LINE_EVERY_S)
+    flight = aircraft.every(LINE_EVERY_S)
     bias = 0.5 * CHAIN_BIAS_M * rng.standard_normal(len(SECONDARIES))
     places = [_place(station) for station in (MASTER, *SECONDARIES)]
     found = []
@@ -91,9 +105,33 @@ def range_differences(world: World, rng: np.random.Generator) -> list[RangeDiffe
     return found
 
 
-def _sampled(world: World, every_s: float) -> Trajectory:
-    return world.truth_at(np.arange(1.0, world.scenario.duration_s, every_s))
+def second_positions(aircraft: Aircraft, rng: np.random.Generator) -> list[SecondIns]:
+    """Positions of a second INS of the same grade, with errors of its own."""
+    error = sensors.simulate_inertial_error(aircraft.flight, aircraft.grade, rng)
+    flight = aircraft.every(SECOND_EVERY_S)
+    lat, lon, _ = sensors.displace_positions(flight, sensors.interpolate_error(error, flight.t).x_n)
+    times = [round(t * SECOND_NS) for t in flight.t.tolist()]
+    return [SecondIns(t, t, 2, *place) for t, *place in zip(times, lat.tolist(), lon.tolist(), strict=True)]
 
 
 def _place(station: Station) -> Geodetic:
     return Geodetic(math.radians(station.lat_deg), math.radians(station.lon_deg), station.alt)
+
+
+RECORDS: dict[str, Callable[[Aircraft, np.random.Generator], Sequence[Stamped]]] = {
+    "hyperbolic": range_differences,
+    "stars": star_fixes,
+    "second_ins": second_positions,
+}
+
+
+def simulate(aircraft: Aircraft, names: Sequence[str], seed: int) -> list[Stamped]:
+    """Simulate the records of the named correctors, in order of arrival."""
+    numbers = {name: number for number, name in enumerate(RECORDS)}
+    found = [
+        record
+        for name in names
+        if name in RECORDS
+        for record in RECORDS[name](aircraft, np.random.default_rng([seed, 2, numbers[name]]))
+    ]
+    return sorted(found, key=lambda record: record.rx_ns)

@@ -1,4 +1,4 @@
-"""`companion study correctors`: an INS without GNSS, corrected by airspeed, stars or lines of position.
+"""`companion study correctors`: an INS without GNSS, corrected by airspeed, stars, lines or a second INS.
 
 Fixes of GNSS end at 15 min. The records of each corrector go through the navigator with the errors that
 its model assumes. The table has the error of the position over the time since the loss, with and without
@@ -8,10 +8,7 @@ the corrector.
 from __future__ import annotations
 
 import dataclasses
-import heapq
 import math
-from collections.abc import Callable, Sequence
-from operator import attrgetter
 from typing import NamedTuple
 
 import click
@@ -24,21 +21,17 @@ from rich.table import Table
 from companion.config import Config, OutputConfig
 from companion.navigator import Navigator
 from companion.navigator.hypotheses import Model
-from companion.records import Solution, Stamped
+from companion.records import Solution
 from companion.tables import print_tables
 from companion.units import Floats
-from sitl import correctors
 from sitl.campaign.flight import UNITS
+from sitl.correctors import RECORDS
 from sitl.flight import radii
 from sitl.scenarios import get_scenario
 from sitl.smoothing_study import SENSORS, flight_records, simulated_gusts
 from sitl.world import World
 
-SIMULATED: dict[str, Callable[[World, np.random.Generator], Sequence[Stamped]]] = {
-    "hyperbolic": correctors.range_differences,
-    "stars": correctors.star_fixes,
-}
-NAMES = ("none", "airspeed", *SIMULATED)
+NAMES = ("none", "airspeed", *RECORDS)
 LOSS_S, MARKS_MIN = 900.0, (2, 5, 10, 20)
 
 
@@ -56,21 +49,15 @@ class CorrectedFlight(NamedTuple):
         return math.sqrt(float(np.mean(values[inside] ** 2)))
 
 
-def fly(world: World, name: str, seed: int, bank: bool = True) -> CorrectedFlight:
-    """Navigate the INS of a world with one corrector; `name` "none" has none. Without `bank`, one filter."""
-    unit = structs.replace(
-        UNITS[world.scenario.grade], independent=True, correctors=() if name == "none" else (name,)
-    )
-    air = simulated_gusts(world.scenario)
-    config = Config(inertial=unit, air_data=air, output=OutputConfig(solution_hz=1.0))
+def fly(world: World, bank: bool = True) -> CorrectedFlight:
+    """Navigate the INS of a world with the correctors of its scenario. Without `bank`, one filter."""
+    scenario = world.scenario
+    unit = structs.replace(UNITS[scenario.grade], independent=True, correctors=scenario.correctors)
+    config = Config(inertial=unit, air_data=simulated_gusts(scenario), output=OutputConfig(solution_hz=1.0))
     navigator = Navigator(config, None if bank else Model(config, plain=0))
-    added: Sequence[Stamped] = ()
-    if name in SIMULATED:
-        added = SIMULATED[name](world, np.random.default_rng([seed, NAMES.index(name)]))
-    records = heapq.merge(flight_records(world, SENSORS), added, key=attrgetter("rx_ns"))
     found = [
         output
-        for record in records
+        for record in flight_records(world, SENSORS)
         for output in navigator.handle(record)  # type: ignore[arg-type]
         if isinstance(output, Solution)
     ]
@@ -90,9 +77,8 @@ def fly(world: World, name: str, seed: int, bank: bool = True) -> CorrectedFligh
 @click.option("--name", "names", multiple=True, type=click.Choice(NAMES), help="Corrector; default: each.")
 @click.option("--seed", default=1, show_default=True, help="Seed of the flight.")
 def command(grade: str, names: tuple[str, ...], seed: int) -> None:
-    """Fly an INS without GNSS, corrected by airspeed, lines of position or stars."""
-    scenario = dataclasses.replace(get_scenario("gnss-loss", seed=seed), grade=grade, beacons=())
-    world = World(scenario)
+    """Fly an INS without GNSS, corrected by airspeed, lines of position, stars or a second INS."""
+    scenario = get_scenario("gnss-loss", seed=seed, grade=grade, beacons=())
     table = Table(title=f"{grade} INS, GNSS lost at 15 min, seed {seed}: error, m r.m.s. (claimed)")
     table.add_column("corrector")
     table.add_column("with GNSS", justify="right")
@@ -101,7 +87,8 @@ def command(grade: str, names: tuple[str, ...], seed: int) -> None:
         table.add_column(f"{a}-{b} min after", justify="right")
     table.add_column("within protection", justify="right")
     for name in track(names or NAMES, "flying", console=Console(stderr=True), transient=True):
-        flight = fly(world, name, seed)
+        used = () if name == "none" else (name,)
+        flight = fly(World(dataclasses.replace(scenario, correctors=used)))
         spans = [(60.0, LOSS_S), *((LOSS_S + 60.0 * a, LOSS_S + 60.0 * b) for a, b in zip(edges, MARKS_MIN))]
         cells = (f"{flight.at(flight.error, *s):.0f} ({flight.at(flight.sigma, *s):.0f})" for s in spans)
         table.add_row(name, *cells, f"{np.mean(flight.error <= flight.protection):.1%}")

@@ -25,8 +25,11 @@ from companion.records import (
     LocalOrigin,
     LocalPosition,
     Pressure,
+    RangeDifference,
     RsbnFix,
+    SecondIns,
     Stamped,
+    StarFix,
     SystemTime,
     Truth,
     Vector3,
@@ -298,6 +301,42 @@ def _rsbn(r: RsbnFix, a: SimulatedSender) -> Message:
     )
 
 
+def _star_fix(r: StarFix, a: SimulatedSender) -> Message:
+    return dialect.new(
+        "STAR_FIX",
+        time_usec=a.us(r.t_ns),
+        star_id=r.star,
+        zenith_lat=_deg_e7(r.lat),
+        zenith_lon=_deg_e7(_wrap_pi(r.lon)),
+        altitude=r.altitude,
+        azimuth=_or_nan(r.azimuth),
+        sigma_altitude=r.sigma_altitude,
+        sigma_azimuth=r.sigma_azimuth,
+    )
+
+
+def _range_difference(r: RangeDifference, a: SimulatedSender) -> Message:
+    return dialect.new(
+        "RANGE_DIFFERENCE",
+        time_usec=a.us(r.t_ns),
+        chain_id=r.chain,
+        a_lat=_deg_e7(r.lat_a),
+        a_lon=_deg_e7(r.lon_a),
+        a_alt=r.alt_a,
+        b_lat=_deg_e7(r.lat_b),
+        b_lon=_deg_e7(r.lon_b),
+        b_alt=r.alt_b,
+        difference=r.difference,
+        sigma=r.sigma,
+    )
+
+
+def _second_ins(r: SecondIns, a: SimulatedSender) -> Message:
+    return dialect.new(
+        "SECOND_INS_POSITION", time_usec=a.us(r.t_ns), ins_id=r.ins, lat=_deg_e7(r.lat), lon=_deg_e7(r.lon)
+    )
+
+
 _ENCODERS: dict[type[Stamped], Callable[[Any, SimulatedSender], Message]] = {
     Imu: _imu,
     Attitude: _attitude,
@@ -313,5 +352,8 @@ _ENCODERS: dict[type[Stamped], Callable[[Any, SimulatedSender], Message]] = {
     FilterStatus: _filter_status,
     SystemTime: _system_time,
     RsbnFix: _rsbn,
+    StarFix: _star_fix,
+    RangeDifference: _range_difference,
+    SecondIns: _second_ins,
     Truth: _truth,
 }

@@ -260,6 +260,7 @@ def command(
         "log.folder": logs,
         "rates.truth_hz": 10.0,
         "inertial.independent": True if preset is None else None,
+        "inertial.correctors": list(chosen.correctors) or None,
     }
     loaded = load(file, flags, pairs=pairs, preset=preset)
     config = simulator_config(loaded, own_ins=loaded.inertial.independent)

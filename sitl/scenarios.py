@@ -56,7 +56,8 @@ class Scenario:
 
     Without `airspeed_sensor` the autopilot sends its own synthetic airspeed. With `own_estimate` its local
     and global positions are those of its own filter, which takes the companion's positions (ArduPilot only);
-    otherwise they come from an INS of this grade.
+    otherwise they come from an INS of this grade. `correctors` names what
+    corrects that INS beside GNSS and beacons.
     """
 
     name: str
@@ -71,6 +72,7 @@ class Scenario:
     link: LinkDelay = field(default_factory=LinkDelay)
     airspeed_sensor: bool = True
     own_estimate: bool = False
+    correctors: tuple[str, ...] = ()
     faults: tuple[Fault, ...] = ()
     seed: int = 1
     autopilot: Literal["ardupilot", "px4"] = "ardupilot"
@@ -164,6 +166,13 @@ def _default_with(name: str, **changes: Any) -> Scenario:
     return dataclasses.replace(DEFAULT, name=name, **changes)
 
 
+def _corrected_by(name: str, corrector: str) -> Scenario:
+    """A tactical INS with one corrector; GNSS is lost after 10 of 23 min."""
+    plan = dataclasses.replace(_PLAN, legs=_LEGS[:5])
+    lost = {"gnss_outages": ((600.0, math.inf),), "beacons": (), "rsbn_outages": ()}
+    return _default_with(name, plan=plan, grade="tactical", correctors=(corrector,), **lost)
+
+
 SCENARIOS: dict[str, Scenario] = {
     scenario.name: scenario
     for scenario in (
@@ -190,6 +199,10 @@ SCENARIOS: dict[str, Scenario] = {
         _default_with(
             "spoof", gnss_outages=(), rsbn_outages=(), faults=(Fault("gnss-spoof", 1200.0, 1800.0),)
         ),
+        _corrected_by("airspeed-ins", "airspeed"),
+        _corrected_by("hyperbolic", "hyperbolic"),
+        _corrected_by("stars", "stars"),
+        _corrected_by("second-ins", "second_ins"),
         _default_with(
             "hostile",
             faults=(

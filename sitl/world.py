@@ -14,7 +14,7 @@ import numpy as np
 from companion.nav.geometry import Geodetic, geodetic_to_local
 from companion.records import AirData, Attitude, Gnss, Imu, LocalPosition, Pressure, RsbnFix, Stamped, Truth
 from companion.units import Floats
-from sitl import beacon, sensors
+from sitl import beacon, correctors, sensors
 from sitl.faults import apply_record_faults
 from sitl.flight import Trajectory, fly_plan
 from sitl.scenarios import Scenario
@@ -57,6 +57,9 @@ class World:
                 key=lambda fix: fix.rx_ns,
             ),
         }
+        aircraft = correctors.Aircraft(self.flight, self.inertial_error, sensors.GRADES[scenario.grade])
+        #: Records of correctors of the INS, of all kinds.
+        self.corrections = correctors.simulate(aircraft, scenario.correctors, scenario.seed)
         for kind, stream in self.streams.items():
             self.streams[kind] = apply_record_faults(kind, stream, scenario.faults, faults)
 

@@ -11,7 +11,7 @@ from companion.config.profiles import MESSAGES, PROFILES
 from companion.config.required_parameters import required_parameters
 from companion.estimate import bank
 from companion.link.decode import DECODED
-from companion.link.dialect import TYPES, type_named
+from companion.link.dialect import TYPES, rsbn, type_named
 from companion.link.parameter_server import parameter_table
 from companion.navigator import own_channel
 from companion.output import source_switch
@@ -229,7 +229,7 @@ def test_messages_in_docs_are_those_of_the_code_at_their_rates() -> None:
         assert message in sent, message
 
 
-@pytest.mark.parametrize("name", ["RSBN_MEASUREMENT", "NAVIGATION_STATUS"])
+@pytest.mark.parametrize("name", [TYPES[n].name for n in sorted(rsbn.mavlink_map) if n >= 180000])
 def test_fields_of_private_messages_in_docs_are_all_of_them(name: str) -> None:
     (table,) = re.findall(rf"^{name} .*?\n\n((?:\|.*\n)+)", PAGES["messages"], re.MULTILINE)
     named = [field for line in table.splitlines() for field in re.findall(r"`(\w+)`", line.split("|")[1])]

@@ -160,7 +160,7 @@ def create_replay_log(
     "tables",
     multiple=True,
     type=click.Path(path_type=Path),
-    help="Add the star fixes or lines of position of this CSV; may be repeated.",
+    help="Add the star fixes, lines of position or second INS of this CSV; may be repeated.",
 )
 @click.option(
     "--outage",

@@ -176,6 +176,8 @@ def command(
     sigma = np.sqrt(np.mean([r.covariance[0] + r.covariance[2] for r in track.records]))
     filtered = np.sqrt(np.mean(np.sum(track.filter_sigma**2, axis=1)))
     click.echo(f"claimed horizontal error, r.m.s.: {sigma:.2f} m smoothed, {filtered:.2f} m filtered")
+    if (gusts := runs[0].gusts) is not None:
+        click.echo(f"gusts of the flight: {gusts.sigma:.2f} m/s, {gusts.correlation_s:.1f} s")
     if check:
         apart = max(run.apart_sigma for run in runs)
         click.echo(f"two-point boundary problem: {apart:.2g} sigma away at most (limit {AGREE_SIGMA:g})")

@@ -2,10 +2,10 @@
 
 A smoother needs one Gaussian path, so the flight is filtered twice by the navigator's own step. The first
 pass is the flight: the bank of hypotheses tells which sources were false, from their onset on, when the wind
-jumped, and which grade of noise was right. The second pass runs a plain Kalman filter with that grade: it
-leaves out what was false, widens the wind where it jumped, and takes for all other jumps a random walk of
-their variance. Every step of it is an epoch: at a measurement, or half a second after
-the last.
+jumped, and which grade of noise was right. Airspeed and GNSS velocity show how strong the gusts were and how
+long they lasted (`analysis.gusts`). The second pass runs a plain Kalman filter with that grade and those
+gusts: it leaves out what was false, widens the wind where it jumped, and takes for all other jumps a random
+walk of their variance. Every step of it is an epoch: at a measurement, or half a second after the last.
 
 Backward pass: the recursion of Rauch, Tung and Striebel (1965), which does not need the (nonlinear)
 measurements. With Phi, Q from one epoch to the next, x_{k+1|k} the prediction before the measurement,
@@ -30,21 +30,37 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import structs
 
+from companion.analysis.gusts import Gusts, GustSamples
 from companion.config import Config, parse
 from companion.estimate import bank as banks
 from companion.estimate.bank import Bank
 from companion.estimate.smoother import rts_backward, two_point
 from companion.nav.geometry import displace
-from companion.navigator import INPUTS_USED, Navigator, guarded, tuned
+from companion.navigator import INPUTS_USED, Navigator, guarded, own_channel, tuned
 from companion.navigator.channel import Nominal, Transition
 from companion.navigator.hypotheses import MOST_BEACONS, Hypotheses, Model
 from companion.navigator.inertial_track import Point
 from companion.navigator.state import Beacon, Settings, State, hypotheses, initial, levelled, source_name
 from companion.navigator.step import step
-from companion.records import AirData, Gnss, Input, LocalPosition, Output, Reset, RsbnFix, Stamped, Tuning
+from companion.records import (
+    AirData,
+    Gnss,
+    Input,
+    LocalPosition,
+    Output,
+    RangeDifference,
+    Reset,
+    RsbnFix,
+    SecondIns,
+    Stamped,
+    StarFix,
+    Tuning,
+)
 from companion.units import SECOND_NS, Floats
 
 NEVER_NS = 2**63 - 1
+MEASURING = (AirData, RangeDifference, StarFix, SecondIns)  # besides fixes; AirData by itself too
+SAME_TIME_NS = 300_000_000  # in a turn the air velocity changes by less than 2 m/s
 APART_NS = 5 * SECOND_NS  # hypotheses of one wind jump differ by less
 
 
@@ -63,6 +79,7 @@ class SmoothedRun(NamedTuple):
     P: Floats
     x_filter: Floats
     P_filter: Floats
+    gusts: Gusts | None = None  # those of the flight, if it shows them; else those of the configuration
     apart_sigma: float = math.nan  # greatest distance to the solution of the two-point problem, if checked
 
 
@@ -75,13 +92,14 @@ def smooth_flight(records: Iterable[Stamped], config: Config, check: bool = Fals
 
     Raises ValueError if the navigator never had an estimate: no nominal trajectory, or no fix.
     """
-    runs = [run for run in _forward_pass(records, config) if run]
+    path = _forward_pass(records, config)
+    runs = [run for run in path.runs if run]
     if not runs:
         raise ValueError(
             "nothing to smooth: the records need a local position and its origin, or airspeed and attitude, "
             "and fixes"
         )
-    smoothed = [_rts_smooth(epochs) for epochs in runs]
+    smoothed = [_rts_smooth(epochs)._replace(gusts=path.gusts) for epochs in runs]
     if not check:
         return smoothed
     return [run._replace(apart_sigma=_apart(run, epochs)) for run, epochs in zip(smoothed, runs, strict=True)]
@@ -120,6 +138,7 @@ class _Witness(Navigator):
     def __init__(self, config: Config) -> None:
         super().__init__(config)
         self.folded: list[_Folded] = []
+        self.gusts = GustSamples()
         self.spans: dict[str, list[tuple[int, int]]] = {}  # when each source was false, by name
         self.jumps: list[_Jump] = []
         self.beacons: dict[int, Beacon] = {}
@@ -150,6 +169,8 @@ class _Witness(Navigator):
             return
         known = hypotheses(state, self.settings)
         self._last[-1] = state.bank, known
+        if isinstance(record, Gnss):
+            self._note_gust(state, record)
         for beacon in state.beacons:
             self.beacons.setdefault(beacon.identity, beacon)
         self._note_false(state, state.bank, known, t_ns)
@@ -163,6 +184,15 @@ class _Witness(Navigator):
                 self._open[name] = t_ns - _age_ns(bank, known, i)
             elif not false and name in self._open:
                 self.spans.setdefault(name, []).append((self._open.pop(name), t_ns))
+
+    def _note_gust(self, state: State, record: Gnss) -> None:
+        """Note air and ground velocity, if an airspeed that moves the aircraft is as new as the fix."""
+        s, air = state.sensors, state.sensors.air.air
+        if record.v_n is None or air is None or abs(record.t_ns - air.t_ns) > SAME_TIME_NS:
+            return
+        V = own_channel.air_velocity(s, air, state.nominal.point.position.alt) if state.nominal else None
+        if V is not None and s.ground.flying and s.air_ns == air.t_ns:
+            self.gusts.add(record.t_ns * 1e-9, V, record.v_n[:2])
 
     def _note_jump(self, bank: Bank, known: Hypotheses, t_ns: int) -> None:
         """Note the jump that the heaviest row holds, if that is what happened to it last."""
@@ -247,16 +277,12 @@ class _Epoch(NamedTuple):
     fixed: bool = False
 
 
-def _forward_pass(records: Iterable[Stamped], config: Config) -> list[list[_Epoch]]:
-    """Filter the records by one plain path; the epochs of each run."""
+def _forward_pass(records: Iterable[Stamped], config: Config) -> _Path:
+    """Filter the records by one plain path, and return it with the epochs of each run."""
     witness = _Witness(config)
     for record in sorted((r for r in records if isinstance(r, INPUTS_USED)), key=lambda r: r.t_ns):
         witness.handle(record)  # type: ignore[arg-type]
     witness.end()
-    return _plain_pass(witness, config)
-
-
-def _plain_pass(witness: _Witness, config: Config) -> list[list[_Epoch]]:
     path, run = _Path(config, witness), -1
     for t_ns, record, number in witness.folded:
         if number != run:
@@ -267,7 +293,7 @@ def _plain_pass(witness: _Witness, config: Config) -> list[list[_Epoch]]:
         if kept is not None:
             path.follow(kept)
     path.end()
-    return path.runs
+    return path
 
 
 def _believed(record: Input, witness: _Witness) -> Input | None:
@@ -291,9 +317,10 @@ class _Path:
 
     def __init__(self, config: Config, witness: _Witness) -> None:
         self.runs: list[list[_Epoch]] = []
-        self._witness = witness
+        self._witness, self.gusts = witness, witness.gusts.estimate()
         self._beacons = tuple(witness.beacons.values())[:MOST_BEACONS]
         self._jumps = sorted(witness.jumps)
+        config = self._with_gusts(config)
         self._model = _PlainModel(config, 0, len(self._beacons))
         self._settings = Settings(config, self._model)
         self._state = self._with_beacons(initial(self._settings))
@@ -348,13 +375,21 @@ class _Path:
 
     def _tune(self, record: Tuning) -> None:
         before = self._settings
-        self._settings, state = tuned(self._state, before, parse(record.toml, "parameters in the log"))
+        config = self._with_gusts(parse(record.toml, "parameters in the log"))
+        self._settings, state = tuned(self._state, before, config)
         if self._settings.model is not before.model:  # another error model: the next run brings its grade
             self.end()
             self._close()
             self._model = _PlainModel(self._settings.config, 0, len(self._beacons))
             self._settings = self._settings._replace(model=self._model)
         self._state = state if state.bank is not None else self._with_beacons(state)
+
+    def _with_gusts(self, config: Config) -> Config:
+        """With the gusts that the flight shows."""
+        if self.gusts is None:
+            return config
+        gusts = {"gust_m_s": self.gusts.sigma, "gust_s": self.gusts.correlation_s}
+        return structs.replace(config, air_data=structs.replace(config.air_data, **gusts))
 
     def _with_beacons(self, state: State) -> State:
         """With the beacons of the whole flight, as long as there is no bank."""
@@ -396,7 +431,9 @@ class _Path:
                     Q = Q + np.diag(variance)
             # the fix may have moved the nominal trajectory, and its error with it
             predicted = predicted + np.pad(_moved(point, state.nominal.point), (0, n - 4))
-        elif self._settings.config.has_own_ins or not isinstance(record, AirData | LocalPosition):
+        elif not isinstance(record, MEASURING) and (
+            self._settings.config.has_own_ins or not isinstance(record, LocalPosition)
+        ):
             measured, predicted = False, x
             if any(isinstance(output, Reset) for output in outputs):  # the INS jumped: widened, perhaps
                 P_before = before.bank.P[0, :n, :n]

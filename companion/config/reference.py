@@ -85,7 +85,7 @@ TEXTS: dict[str, dict[str, tuple[str, str]]] = {
             "the pressure altitude is corrected, or is known to be worse",
         ),
         "correctors": (
-            "Correctors of an INS of its own: airspeed, hyperbolic (lines of position), stars.",
+            "Correctors of an INS of its own: airspeed, hyperbolic (lines of position), stars, second_ins.",
             "the aircraft has one of them and its records are received",
         ),
         "strapped_down": (

@@ -72,7 +72,7 @@ class InertialConfig(Section, frozen=True):
     gyro_scale_ppm: Annotated[float, Meta(ge=0.0, le=100000.0)] = 5.0
     accelerometer_scale_ppm: Annotated[float, Meta(ge=0.0, le=100000.0)] = 50.0
     height_sigma_m: Annotated[float, Meta(ge=0.1, le=10000.0)] = 20.0
-    correctors: tuple[Literal["airspeed", "hyperbolic", "stars"], ...] = ()
+    correctors: tuple[Literal["airspeed", "hyperbolic", "stars", "second_ins"], ...] = ()
     strapped_down: bool = True  # the sensors turn with the aircraft; false: gimballed platform
 
 

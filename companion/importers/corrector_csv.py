@@ -1,9 +1,10 @@
-"""Records of correctors from a table: star fixes or lines of position.
+"""Records of correctors from a table: star fixes, lines of position, or positions of a second INS.
 
 The header decides which; times are seconds since the first record of the log they are replayed with.
 
     t_s, star, lat_deg, lon_deg, altitude_deg, azimuth_deg, sigma_altitude_arcsec, sigma_azimuth_arcsec
     t_s, chain, lat_a_deg, lon_a_deg, alt_a_m, lat_b_deg, lon_b_deg, alt_b_m, difference_m, sigma_m
+    t_s, ins, lat_deg, lon_deg
 
 For a star, lat_deg and lon_deg are those of the place where it is in the zenith: its declination, and its
 hour angle from Greenwich taken east. azimuth_deg may be empty.
@@ -16,7 +17,7 @@ import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from companion.records import RangeDifference, Stamped, StarFix
+from companion.records import RangeDifference, SecondIns, Stamped, StarFix
 from companion.units import SECOND_NS
 
 _DEG, _ARCSEC = math.radians(1.0), math.radians(1.0 / 3600.0)
@@ -46,11 +47,17 @@ def _line(t_ns: int, r: Row) -> RangeDifference:
     )
 
 
+def _second(t_ns: int, r: Row) -> SecondIns:
+    place = (_given(r, "lat_deg") * _DEG, _given(r, "lon_deg") * _DEG)
+    return SecondIns(t_ns, t_ns, int(_given(r, "ins")), *place)
+
+
 _STAR = "star lat_deg lon_deg altitude_deg azimuth_deg sigma_altitude_arcsec sigma_azimuth_arcsec"
 _LINE = "chain lat_a_deg lon_a_deg alt_a_m lat_b_deg lon_b_deg alt_b_m difference_m sigma_m"
 TABLES: dict[tuple[str, ...], Callable[[int, Row], Stamped]] = {
     ("t_s", *_STAR.split()): _star,
     ("t_s", *_LINE.split()): _line,
+    ("t_s", "ins", "lat_deg", "lon_deg"): _second,
 }
 
 

@@ -22,7 +22,7 @@ from typing import NamedTuple, Protocol
 from companion.importers import dataflash, inertialnav, px4_csv, tlog, ulog
 from companion.importers.foreign_file import MAX_TEXT, Damage, usable
 from companion.link.decode import DECODED, MAKES, Autopilot, Sender, decode
-from companion.link.dialect import Message, mavlink, rsbn
+from companion.link.dialect import MEASUREMENTS, Message, mavlink
 from companion.link.session import LinkUp, MessageReceived, Rebooted, SecondAutopilot, Session
 from companion.link.status_text import CHUNK
 from companion.nav.geometry import Projection
@@ -41,7 +41,6 @@ from companion.records import (
 from companion.storage.reader import LogError
 
 _STATUSTEXT: int = mavlink.MAVLINK_MSG_ID_STATUSTEXT
-_RSBN = rsbn.MAVLINK_MSG_ID_RSBN_MEASUREMENT  # sent by a beacon receiver, which is a separate component
 _POSITION_ABSOLUTE = mavlink.EKF_POS_HORIZ_ABS  # the same bit as ESTIMATOR_POS_HORIZ_ABS
 
 
@@ -133,7 +132,7 @@ class TlogSource(_Records):
             case MessageReceived(received_ns=rx_ns, frame=found, from_autopilot=ours):
                 if ours and found.msgid == _STATUSTEXT:
                     yield from self._status_text(event.message, rx_ns)
-                if found.msgid not in DECODED or not (ours or found.msgid == _RSBN):
+                if found.msgid not in DECODED or not (ours or found.msgid in MEASUREMENTS):
                     return
                 for record in decode(event.message, rx_ns, self._sender):
                     yield record

@@ -27,19 +27,19 @@ class BeaconAnswers:
 
     def __init__(self) -> None:
         self._limiter = SenderLimiter(ANSWERS_HZ, ANSWERS_BURST, MAX_RECEIVERS)
-        self._followed: dict[int, tuple[Hashable, int]] = {}  # by beacon: its receiver, its last answer
+        self._followed: dict[str, tuple[Hashable, int]] = {}  # by source: its receiver, its last answer
         self._waits_ns: dict[Hashable, int] = {}
 
-    def refusal(self, receiver: Hashable, beacon: int, now_ns: int) -> str | None:
-        """Return why an answer is not used, None if it is."""
+    def refusal(self, receiver: Hashable, source: str, now_ns: int) -> str | None:
+        """Return why an answer of a source ("beacon 7", "star 2") is not used, None if it is."""
         if now_ns < self._waits_ns.get(receiver, now_ns) or not self._limiter.take(receiver, now_ns):
             return RATE_REASON
-        holder, last_ns = self._followed.get(beacon, (receiver, now_ns))
+        holder, last_ns = self._followed.get(source, (receiver, now_ns))
         if holder != receiver and now_ns - last_ns < SILENT_NS:
-            return f"beacon {beacon} is received by another receiver"
-        if beacon not in self._followed:  # bounded by the rate of new ones
-            self._followed = {b: f for b, f in self._followed.items() if now_ns - f[1] < SILENT_NS}
-        self._followed[beacon] = receiver, now_ns
+            return f"{source} is received by another receiver"
+        if source not in self._followed:  # bounded by the rate of new ones
+            self._followed = {s: f for s, f in self._followed.items() if now_ns - f[1] < SILENT_NS}
+        self._followed[source] = receiver, now_ns
         return None
 
     def note_rejected(self, receiver: Hashable, now_ns: int) -> None:

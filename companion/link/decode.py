@@ -45,9 +45,12 @@ from companion.records import (
     LocalOrigin,
     LocalPosition,
     Pressure,
+    RangeDifference,
     Rejection,
     RsbnFix,
+    SecondIns,
     Stamped,
+    StarFix,
     SystemTime,
     Truth,
     Wind,
@@ -441,6 +444,53 @@ def _rsbn(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
             sigma_range=_sigma(m, "sigma_range", slant_range, sender.sigma_range),
         ),
     )
+
+
+@_of("STAR_FIX")
+def _star_fix(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
+    azimuth = optional_number(m, "azimuth")
+    if azimuth is not None and abs(azimuth) > math.tau:
+        raise InvalidField(
+            f"azimuth {azimuth:g} rad is not an angle in radians (limit 2 pi)", azimuth, math.tau
+        )
+    return (
+        StarFix(
+            _stamped(m, rx, sender),
+            rx,
+            m.star_id,
+            *position(m.zenith_lat, m.zenith_lon, ("zenith_lat", "zenith_lon")),
+            altitude=number(m, "altitude", limit=math.pi / 2.0),
+            azimuth=azimuth,
+            sigma_altitude=_stated_sigma(m, "sigma_altitude"),
+            sigma_azimuth=math.tau if azimuth is None else _stated_sigma(m, "sigma_azimuth"),
+        ),
+    )
+
+
+@_of("RANGE_DIFFERENCE")
+def _range_difference(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
+    a, b = (
+        (*position(lat, lon, (f"{name}_lat", f"{name}_lon")), number(m, f"{name}_alt", limit=HIGHEST))
+        for name, lat, lon in (("a", m.a_lat, m.a_lon), ("b", m.b_lat, m.b_lon))
+    )
+    if a[:2] == b[:2]:
+        raise InvalidField("stations a and b are at one place: their distances differ by nothing")
+    difference = number(m, "difference", limit=FARTHEST)
+    sigma = _stated_sigma(m, "sigma")
+    return (RangeDifference(_stamped(m, rx, sender), rx, m.chain_id, *a, *b, difference, sigma),)
+
+
+@_of("SECOND_INS_POSITION")
+def _second_ins(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
+    return (SecondIns(_stamped(m, rx, sender), rx, m.ins_id, *known_position(m)),)
+
+
+def _stated_sigma(m: Message, field: str) -> float:
+    """Return a standard deviation that must be stated."""
+    sigma = number(m, field, limit=FARTHEST)
+    if sigma <= 0.0:
+        raise InvalidField(f"{field} {sigma:g} is not positive", sigma, 0.0)
+    return sigma
 
 
 # ---------------------------------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""MAVLink messages and constants: pymavlink's generated dialect and our own two messages. No parser, no I/O.
+"""MAVLink messages and constants: pymavlink's generated dialect and our own messages. No parser, no I/O.
 
 The only importer of pymavlink. Its dialect `all` is used: it holds every message of `ardupilotmega` and
 `development` (PX4) with the same CRC_EXTRA bytes and 50 more, at the same cost: 0.03 s to import from a
@@ -40,6 +40,14 @@ Message = Any
 
 RsbnMeasurement = rsbn.MAVLink_rsbn_measurement_message
 NavigationStatus = rsbn.MAVLink_navigation_status_message
+
+#: Messages of receivers, which are components of their own, and the field that names what is received.
+MEASUREMENTS = {
+    rsbn.MAVLINK_MSG_ID_RSBN_MEASUREMENT: "beacon_id",
+    rsbn.MAVLINK_MSG_ID_STAR_FIX: "star_id",
+    rsbn.MAVLINK_MSG_ID_RANGE_DIFFERENCE: "chain_id",
+    rsbn.MAVLINK_MSG_ID_SECOND_INS_POSITION: "ins_id",
+}
 
 XML = Path(__file__).with_name("rsbn.xml")
 ADDED_XML = Path(__file__).with_name("component_metadata.xml")

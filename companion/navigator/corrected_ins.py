@@ -3,6 +3,7 @@
     airspeed     wind, north and east (random walk); airspeed scale
     hyperbolic   a bias for each chain, correlated over an hour
     stars        none: the tilt is a state of the INS
+    second_ins   the errors of the unit once more: a second one of the same kind, of the same grade
 
 Only what `inertial.correctors` names has states, behind those of the INS. The rows are those of
 `corrector_measurements`.
@@ -20,7 +21,8 @@ from companion.navigator.channel import Nominal, Transition, discretise
 from companion.navigator.ins_channel import InsChannel, ins_channel
 from companion.units import Floats
 
-INS_NAMES = (*INS_STATES, "EX", "EY", "EZ", "AX", "AY", "driftN", "driftE", "latency")
+UNIT_NAMES = (*INS_STATES, "EX", "EY", "EZ", "AX", "AY")
+INS_NAMES = (*UNIT_NAMES, "driftN", "driftE", "latency")
 CHAINS = 3  # lines of position with a bias of their own
 CHAIN_BIAS_M, CHAIN_S = 200.0, 3600.0
 
@@ -35,10 +37,14 @@ class ExtraStates(NamedTuple):
 
 
 class CorrectedIns(NamedTuple):
-    """Error model of an INS with correctors; it has the face of a `Channel`."""
+    """Error model of an INS with correctors; it has the face of a `Channel`.
+
+    The states are those of the INS, `extra`, and with `has_second` those of a second unit.
+    """
 
     ins: InsChannel
     extra: ExtraStates
+    has_second: bool
     drift: slice
     latency: int
     grades: tuple[float, ...]
@@ -48,29 +54,33 @@ class CorrectedIns(NamedTuple):
     @property
     def n(self) -> int:
         """Number of states."""
-        return self.ins.n + len(self.extra.names)
+        return self.ins.n + len(self.extra.names) + len(UNIT_NAMES) * self.has_second
 
     @property
     def names(self) -> tuple[str, ...]:
         """Names of all states."""
-        return (*INS_NAMES, *self.extra.names)
+        second = (f"{name}2" for name in UNIT_NAMES if self.has_second)
+        return (*INS_NAMES, *self.extra.names, *second)
 
     def prior(self) -> Floats:
         """First covariances (grades, n, n)."""
         first = self.ins.prior()
-        P = np.zeros((len(first), self.n, self.n))
-        P[:, : self.ins.n, : self.ins.n] = first
-        P[:, self.ins.n :, self.ins.n :] = np.diag(self.extra.sigma**2)
-        return P
+        return self._joined(first, np.diag(self.extra.sigma**2))
 
     def transition(self, nominal: Nominal) -> Transition:
-        """Phi and Q since the bank's time: both blocks are independent of each other."""
+        """Phi and Q since the bank's time; the blocks are independent of each other."""
         ins = self.ins.transition(nominal)
         extra = discretise(self.extra.A, np.diag(self.extra.density)[None], nominal.pending_s)
-        Phi, Q = np.eye(self.n), np.zeros((len(ins.Q), self.n, self.n))
-        Phi[: self.ins.n, : self.ins.n], Phi[self.ins.n :, self.ins.n :] = ins.Phi, extra.Phi
-        Q[:, : self.ins.n, : self.ins.n], Q[:, self.ins.n :, self.ins.n :] = ins.Q, extra.Q
-        return Transition(Phi, Q)
+        return Transition(self._joined(ins.Phi, extra.Phi), self._joined(ins.Q, extra.Q))
+
+    def _joined(self, ins: Floats, extra: Floats) -> Floats:
+        """Block diagonal of INS (..., n, n), further states (k, k) or (1, k, k), and the second unit."""
+        unit, end = len(UNIT_NAMES), self.ins.n + len(self.extra.names)
+        out = np.zeros((*ins.shape[:-2], self.n, self.n))
+        out[..., : self.ins.n, : self.ins.n] = ins
+        out[..., self.ins.n : end, self.ins.n : end] = extra
+        out[..., end:, end:] = ins[..., :unit, :unit] if self.has_second else 0.0
+        return out
 
 
 def corrected_ins(config: Config) -> InsChannel | CorrectedIns:
@@ -78,7 +88,8 @@ def corrected_ins(config: Config) -> InsChannel | CorrectedIns:
     ins = ins_channel(config)
     if not config.inertial.correctors:
         return ins
-    return CorrectedIns(ins, _extra_states(config), ins.drift, ins.latency, ins.grades)
+    second = "second_ins" in config.inertial.correctors
+    return CorrectedIns(ins, _extra_states(config), second, ins.drift, ins.latency, ins.grades)
 
 
 def _extra_states(config: Config) -> ExtraStates:

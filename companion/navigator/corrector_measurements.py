@@ -13,12 +13,13 @@ from typing import NamedTuple
 import numpy as np
 
 from companion.nav import correctors
-from companion.nav.geometry import Geodetic, ecef_tuple, enu_axes, wrap_angle
+from companion.nav.geometry import Geodetic, ecef_tuple, enu_axes, separation_tuple, wrap_angle
 from companion.navigator.corrected_ins import CorrectedIns, chain_state
 from companion.navigator.inertial_track import Point
-from companion.records import RangeDifference, StarFix, Vector2
+from companion.records import RangeDifference, SecondIns, StarFix, Vector2
 from companion.units import Floats
 
+SECOND_NOISE_M = 1.0  # beside a second INS: what sampling and rounding leave
 HIGHEST_STAR = math.radians(80.0)  # nearer to the zenith an azimuth means nothing
 
 
@@ -77,6 +78,14 @@ def star(channel: CorrectedIns, corrected: Point, centre: Vector2, record: StarF
         variances.append(record.sigma_azimuth**2)
     m = len(z)
     return CorrectorRows(np.array(z) + H[:m, :2] @ centre, H[:m], np.diag(variances))
+
+
+def second_ins(channel: CorrectedIns, point: Point, record: SecondIns) -> CorrectorRows:
+    """Position of the INS less that of a second one."""
+    H = correctors.observation_matrix(channel.names, *correctors.second_ins(compared=("dx", "dy")))
+    other = Geodetic(record.lat, record.lon, point.position.alt)
+    north, east, _ = separation_tuple(point.position, other)
+    return CorrectorRows(np.array((north, east)), H, SECOND_NOISE_M**2 * np.eye(2))
 
 
 def altitude_azimuth(lat: float, lon: float, star_lat: float, star_lon: float) -> tuple[float, float]:

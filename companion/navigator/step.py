@@ -75,6 +75,7 @@ from companion.records import (
     Rejection,
     Reset,
     RsbnFix,
+    SecondIns,
     Severity,
     Source,
     Stamped,
@@ -547,6 +548,8 @@ def _rows_of(state: State, record: Any, settings: Settings) -> CorrectorRows | N
         gust = settings.config.air_data.gust_m_s
         heading = math.atan2(V[1], V[0])
         return corrector_measurements.airspeed(channel, nominal.point, math.hypot(*V), heading, gust)
+    if isinstance(record, SecondIns):
+        return corrector_measurements.second_ins(channel, nominal.point, record)
     point, centre = corrected(nominal.point, state, settings)
     if isinstance(record, StarFix):
         return corrector_measurements.star(channel, point, centre, record)
@@ -770,6 +773,7 @@ _CORRECTORS: dict[str, _Uses] = {
     },
     "hyperbolic": {RangeDifference: _corrector("hyperbolic")},
     "stars": {StarFix: _corrector("star")},
+    "second_ins": {SecondIns: _corrector("second INS")},
 }
 _OWN: _Uses = {
     **_COMMON,

@@ -25,7 +25,7 @@ from companion.config.validate import find_conflicts
 from companion.link import dialect
 from companion.link.beacon_answers import BeaconAnswers
 from companion.link.decode import DECODED, MAKES, Sender, decode
-from companion.link.dialect import mavlink, rsbn
+from companion.link.dialect import MEASUREMENTS, mavlink
 from companion.link.firmware import Firmware, firmware_of
 from companion.link.rate_limiter import RateLimiter
 from companion.link.session import (
@@ -384,7 +384,7 @@ class CompanionCore:
 
     def _on_message(self, link: Link, event: MessageReceived) -> None:
         msgid, is_used = event.frame.msgid, event.from_autopilot
-        if msgid == rsbn.MAVLINK_MSG_ID_RSBN_MEASUREMENT:
+        if msgid in MEASUREMENTS:
             is_used = self._is_duplicate(link) or self._is_answer_used(link, event)
         if is_used or self._may_log_unused(link, event):
             self._log.frame(link.name, False, event.frame.raw, event.received_ns)
@@ -428,7 +428,7 @@ class CompanionCore:
             if not is_duplicate:
                 self._last_used = link if event.from_autopilot else self._last_used
                 is_rejected = self._on_record(record)
-                if is_rejected and msgid == rsbn.MAVLINK_MSG_ID_RSBN_MEASUREMENT:
+                if is_rejected and msgid in MEASUREMENTS:
                     self._answers.note_rejected(_receiver_of(event), event.received_ns)
 
     def _is_duplicate(self, link: Link) -> bool:
@@ -436,7 +436,9 @@ class CompanionCore:
         return link.session.is_up and link is not self.leading_link
 
     def _is_answer_used(self, link: Link, event: MessageReceived) -> bool:
-        why = self._answers.refusal(_receiver_of(event), event.message.beacon_id, event.received_ns)
+        name = MEASUREMENTS[event.frame.msgid]
+        source = f"{name.removesuffix('_id')} {getattr(event.message, name)}"
+        why = self._answers.refusal(_receiver_of(event), source, event.received_ns)
         if why is not None:
             self.rejected["beacon answers not used"] += 1
             sender = f"{event.frame.system}/{event.frame.component}"

@@ -67,6 +67,7 @@ FIELDS = {
     "horizon_s": "s since the last accepted fix",
     "horizontal_accuracy": "m",
     "inertial_age_s": "s, age of the inertial sample",
+    "ins": "identity of the second INS",
     "iterations": "count",
     "jamming": "GPS_JAMMING_STATE of MAVLink",
     "lat": "rad, geodetic latitude WGS84",

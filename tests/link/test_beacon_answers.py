@@ -10,17 +10,17 @@ def test_a_followed_beacon_cannot_be_taken_over() -> None:
     answers, taken = BeaconAnswers(), 0
     for ms in range(10_000):
         if ms % 1000 == 0:
-            assert answers.refusal("receiver", 7, ms * MILLI) is None
-        taken += answers.refusal(f"stranger {ms % 50}", 7, ms * MILLI) is None
+            assert answers.refusal("receiver", "beacon 7", ms * MILLI) is None
+        taken += answers.refusal(f"stranger {ms % 50}", "beacon 7", ms * MILLI) is None
     assert taken == 0
 
 
 def test_a_silent_receiver_gives_up_its_beacon() -> None:
     answers = BeaconAnswers()
-    assert answers.refusal("receiver", 7, 0) is None
-    assert answers.refusal("spare", 7, SILENT_NS - 1) == "beacon 7 is received by another receiver"
-    assert answers.refusal("spare", 7, SILENT_NS) is None
-    assert answers.refusal("receiver", 7, SILENT_NS + 1) is not None
+    assert answers.refusal("receiver", "beacon 7", 0) is None
+    assert answers.refusal("spare", "beacon 7", SILENT_NS - 1) == "beacon 7 is received by another receiver"
+    assert answers.refusal("spare", "beacon 7", SILENT_NS) is None
+    assert answers.refusal("receiver", "beacon 7", SILENT_NS + 1) is not None
 
 
 def test_a_rejected_receiver_waits_and_returns() -> None:

@@ -99,6 +99,8 @@ def test_lost_fix_is_decoded_without_a_position() -> None:
     assert fix.t_ns == RX  # time 0 is "unknown"
 
 
+STAR: dict[str, Any] = {"altitude": 0.7, "azimuth": NAN, "sigma_altitude": 1e-4}
+LINE: dict[str, Any] = {"a_lat": 600_000_000, "b_lat": 580_000_000, "difference": 1e4, "sigma": 50.0}
 REJECTED: list[tuple[str, dict[str, Any], str]] = [
     ("GPS_RAW_INT", FIX | {"lat": 0, "lon": 0}, "no position yet"),
     ("GPS_RAW_INT", FIX | {"lat": 900_000_001}, "lat 90 deg is outside"),
@@ -126,6 +128,14 @@ REJECTED: list[tuple[str, dict[str, Any], str]] = [
     ("RSBN_MEASUREMENT", {"status": 2, "slant_range": -5.0}, "not positive"),
     ("RSBN_MEASUREMENT", {"status": 2, "slant_range": 5e3, "sigma_range": -1.0}, "sigma_range -1"),
     ("RSBN_MEASUREMENT", {"status": 1, "azimuth": 1.0, "beacon_lat": 10**9}, "beacon_lat 100 deg"),
+    ("STAR_FIX", STAR | {"altitude": 45.0}, "altitude 45 is beyond the limit 1.57"),
+    ("STAR_FIX", STAR | {"azimuth": 200.0}, "not an angle in radians"),
+    ("STAR_FIX", STAR | {"sigma_altitude": 0.0}, "sigma_altitude 0 is not positive"),
+    ("STAR_FIX", STAR | {"zenith_lat": 10**9}, "zenith_lat 100 deg"),
+    ("RANGE_DIFFERENCE", LINE | {"sigma": NAN}, "sigma is nan"),
+    ("RANGE_DIFFERENCE", LINE | {"b_lat": LINE["a_lat"]}, "at one place"),
+    ("RANGE_DIFFERENCE", LINE | {"difference": 1e9}, "difference 1e+09 is beyond the limit"),
+    ("SECOND_INS_POSITION", {}, "no position yet"),
 ]
 
 

@@ -16,10 +16,10 @@ from companion.navigator.channel import Nominal
 from companion.navigator.corrected_ins import CorrectedIns, corrected_ins
 from companion.navigator.inertial_track import Point
 from companion.navigator.ins_channel import InsChannel
-from companion.records import RangeDifference, StarFix
+from companion.records import RangeDifference, SecondIns, StarFix
 from sitl.correctors import direction
 
-ALL = ("airspeed", "hyperbolic", "stars")
+ALL = ("airspeed", "hyperbolic", "stars", "second_ins")
 TRUE = Geodetic(math.radians(60.0), math.radians(30.0), 800.0)
 ERROR = (400.0, -250.0)
 MASTER, SECONDARY = (
@@ -48,8 +48,8 @@ def state(model: CorrectedIns, **errors: float) -> Any:
 
 def test_states_of_the_correctors_follow_those_of_the_ins() -> None:
     model = channel()
-    assert model.n == len(model.names) == len(set(model.names)) == 21
-    assert model.prior().shape == (7, 21, 21)
+    assert model.n == len(model.names) == len(set(model.names)) == 33
+    assert model.prior().shape == (7, 33, 33)
     assert isinstance(corrected_ins(Config(inertial=InertialConfig(independent=True))), InsChannel)
     assert channel("stars").n == 15  # the tilt is a state of the INS
 
@@ -61,6 +61,8 @@ def test_transition_is_that_of_the_ins_and_of_wandering_biases() -> None:
     Phi, Q = model.transition(nominal)
     np.testing.assert_allclose(Phi[:15, :15], model.ins.transition(nominal).Phi)
     assert not Phi[:15, 15:].any() and not Phi[15:, :15].any()
+    np.testing.assert_allclose(Phi[21:, 21:], model.ins.transition(nominal).Phi[:12, :12])  # second unit
+    assert not Phi[21:, :21].any() and not Phi[:21, 21:].any()
     k = model.names.index("chain0")
     assert Phi[k, k] == pytest.approx(math.exp(-20.0 / 3600.0), rel=1e-9)
     assert (np.linalg.eigvalsh(Q[0]) > -1e-12).all()
@@ -111,3 +113,16 @@ def test_airspeed_at_a_wrong_heading_in_wind() -> None:
     rows = measured.airspeed(model, point, 1.01 * speed, heading + PZ, 1.0)
     x = state(model, dVN=dv[0], dVE=dv[1], wN=wind[0], wE=wind[1], PZ=PZ, scale=0.01)
     np.testing.assert_allclose(rows.z, rows.H @ x, atol=0.02)
+
+
+def test_second_ins_is_compared_in_metres() -> None:
+    model = channel("second_ins")
+    place = displace(*TRUE, -120.0, 80.0, 0.0)
+    rows = measured.second_ins(model, ins(), SecondIns(0, 0, 2, place[0], place[1]))
+    np.testing.assert_allclose(rows.z, rows.H @ state(model, dx2=-120.0, dy2=80.0), atol=0.1)
+
+
+def test_second_ins_is_as_coarse_as_the_grade() -> None:
+    first = channel("second_ins").prior()
+    unit = slice(15, 27)
+    np.testing.assert_array_equal(first[:, unit, unit], first[:, :12, :12])

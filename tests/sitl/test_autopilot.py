@@ -6,7 +6,7 @@ import pytest
 
 from companion.link import dialect, frame
 from companion.units import SECOND_NS
-from sitl.autopilot import NEVER, RSBN_COMPONENT, SimulatedAutopilot
+from sitl.autopilot import NEVER, RECEIVER_COMPONENT, SimulatedAutopilot
 from sitl.faults import Fault
 from sitl.scenarios import get_scenario
 from sitl.world import World
@@ -120,7 +120,7 @@ def test_rsbn_receiver_is_a_component_that_sends_each_answer_once():
     received = [
         f for _, f in receive_all(autopilot(), 60.0) if dialect.TYPES[f.msgid].name == "RSBN_MEASUREMENT"
     ]
-    assert {f.component for f in received} == {RSBN_COMPONENT}
+    assert {f.component for f in received} == {RECEIVER_COMPONENT}
     stamps = [dialect.decode(f).time_usec for f in received]
     assert len(set(stamps)) == len(stamps) == pytest.approx(60, abs=4)
 

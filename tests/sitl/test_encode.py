@@ -51,6 +51,10 @@ RECORDS = {
     "rsbn": r.RsbnFix(T, RX, 7, LAT, LON, 600.0, 1.25, 54321.0, 0.004, 200.0),
     "rsbn azimuth": r.RsbnFix(T, RX, 7, LAT, LON, 600.0, 1.25, None, 0.004, 200.0),
     "rsbn range": r.RsbnFix(T, RX, 7, LAT, LON, 600.0, None, 54321.0, 0.004, 200.0),
+    "star": r.StarFix(T, RX, 3, LAT, LON, 0.75, 2.5, 1e-4, 1.5e-4),
+    "star without azimuth": r.StarFix(T, RX, 3, LAT, LON, 0.75, None, 1e-4, math.tau),
+    "line of position": r.RangeDifference(T, RX, 1, LAT, LON, 50.0, LAT + 0.01, LON, 60.0, -12345.0, 50.0),
+    "second ins": r.SecondIns(T, RX, 2, LAT, LON),
     "truth": r.Truth(RX, RX, LAT, LON, 600.0, (20.0, -3.0, 0.5), (0.1, -0.2, 6.0)),
 }
 PX4_RECORDS = {
@@ -81,7 +85,7 @@ def check(record: r.Stamped, autopilot: Autopilot) -> None:
     half_step = HALF_STEP.get(type(record), 1e-6)
     for name in record.__struct_fields__:
         assert_close(getattr(decoded, name), getattr(record, name), half_step)
-    for name in ("lat", "lon"):
+    for name in ("lat", "lon", "lat_a", "lon_a", "lat_b", "lon_b"):
         if hasattr(record, name):
             assert getattr(decoded, name) == pytest.approx(getattr(record, name), abs=math.radians(0.51e-7))
 

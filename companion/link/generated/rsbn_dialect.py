@@ -441,6 +441,9 @@ MAVLINK_MSG_ID_BAD_DATA = -1
 MAVLINK_MSG_ID_UNKNOWN = -2
 MAVLINK_MSG_ID_RSBN_MEASUREMENT = 180000
 MAVLINK_MSG_ID_NAVIGATION_STATUS = 180001
+MAVLINK_MSG_ID_STAR_FIX = 180002
+MAVLINK_MSG_ID_RANGE_DIFFERENCE = 180003
+MAVLINK_MSG_ID_SECOND_INS_POSITION = 180004
 MAVLINK_MSG_ID_COMPONENT_METADATA = 397
 
 
@@ -552,6 +555,142 @@ class MAVLink_navigation_status_message(MAVLink_message):
 setattr(MAVLink_navigation_status_message, "name", mavlink_msg_deprecated_name_property())
 
 
+class MAVLink_star_fix_message(MAVLink_message):
+    """
+    Altitude and azimuth of a star against the axes of an INS,
+    refraction removed. Corrects an INS of its own.
+    """
+
+    id = MAVLINK_MSG_ID_STAR_FIX
+    msgname = "STAR_FIX"
+    fieldnames = ["time_usec", "zenith_lat", "zenith_lon", "altitude", "azimuth", "sigma_altitude", "sigma_azimuth", "star_id"]
+    ordered_fieldnames = ["time_usec", "zenith_lat", "zenith_lon", "altitude", "azimuth", "sigma_altitude", "sigma_azimuth", "star_id"]
+    fieldtypes = ["uint64_t", "int32_t", "int32_t", "float", "float", "float", "float", "uint16_t"]
+    fielddisplays_by_name: Dict[str, str] = {}
+    fieldenums_by_name: Dict[str, str] = {}
+    fieldunits_by_name: Dict[str, str] = {"time_usec": "us", "zenith_lat": "degE7", "zenith_lon": "degE7", "altitude": "rad", "azimuth": "rad", "sigma_altitude": "rad", "sigma_azimuth": "rad"}
+    native_format = bytearray(b"<QiiffffH")
+    orders = [0, 1, 2, 3, 4, 5, 6, 7]
+    lengths = [1, 1, 1, 1, 1, 1, 1, 1]
+    array_lengths = [0, 0, 0, 0, 0, 0, 0, 0]
+    crc_extra = 66
+    unpacker = struct.Struct("<QiiffffH")
+    instance_field = None
+    instance_offset = -1
+
+    def __init__(self, time_usec: int, zenith_lat: int, zenith_lon: int, altitude: float, azimuth: float, sigma_altitude: float, sigma_azimuth: float, star_id: int):
+        MAVLink_message.__init__(self, MAVLink_star_fix_message.id, MAVLink_star_fix_message.msgname)
+        self._fieldnames = MAVLink_star_fix_message.fieldnames
+        self._instance_field = MAVLink_star_fix_message.instance_field
+        self._instance_offset = MAVLink_star_fix_message.instance_offset
+        self.time_usec = time_usec
+        self.zenith_lat = zenith_lat
+        self.zenith_lon = zenith_lon
+        self.altitude = altitude
+        self.azimuth = azimuth
+        self.sigma_altitude = sigma_altitude
+        self.sigma_azimuth = sigma_azimuth
+        self.star_id = star_id
+
+    def pack(self, mav: "MAVLink", force_mavlink1: bool = False) -> bytes:
+        return self._pack(mav, self.crc_extra, self.unpacker.pack(self.time_usec, self.zenith_lat, self.zenith_lon, self.altitude, self.azimuth, self.sigma_altitude, self.sigma_azimuth, self.star_id), force_mavlink1=force_mavlink1)
+
+
+# Define name on the class for backwards compatibility (it is now msgname).
+# Done with setattr to hide the class variable from mypy.
+setattr(MAVLink_star_fix_message, "name", mavlink_msg_deprecated_name_property())
+
+
+class MAVLink_range_difference_message(MAVLink_message):
+    """
+    Line of position of a hyperbolic system: distance to station a
+    minus distance to station b. Corrects an INS of its own.
+    """
+
+    id = MAVLINK_MSG_ID_RANGE_DIFFERENCE
+    msgname = "RANGE_DIFFERENCE"
+    fieldnames = ["time_usec", "a_lat", "a_lon", "a_alt", "b_lat", "b_lon", "b_alt", "difference", "sigma", "chain_id"]
+    ordered_fieldnames = ["time_usec", "a_lat", "a_lon", "a_alt", "b_lat", "b_lon", "b_alt", "difference", "sigma", "chain_id"]
+    fieldtypes = ["uint64_t", "int32_t", "int32_t", "float", "int32_t", "int32_t", "float", "float", "float", "uint16_t"]
+    fielddisplays_by_name: Dict[str, str] = {}
+    fieldenums_by_name: Dict[str, str] = {}
+    fieldunits_by_name: Dict[str, str] = {"time_usec": "us", "a_lat": "degE7", "a_lon": "degE7", "a_alt": "m", "b_lat": "degE7", "b_lon": "degE7", "b_alt": "m", "difference": "m", "sigma": "m"}
+    native_format = bytearray(b"<QiifiifffH")
+    orders = [0, 1, 2, 3, 4, 5, 6, 7, 8, 9]
+    lengths = [1, 1, 1, 1, 1, 1, 1, 1, 1, 1]
+    array_lengths = [0, 0, 0, 0, 0, 0, 0, 0, 0, 0]
+    crc_extra = 58
+    unpacker = struct.Struct("<QiifiifffH")
+    instance_field = None
+    instance_offset = -1
+
+    def __init__(self, time_usec: int, a_lat: int, a_lon: int, a_alt: float, b_lat: int, b_lon: int, b_alt: float, difference: float, sigma: float, chain_id: int):
+        MAVLink_message.__init__(self, MAVLink_range_difference_message.id, MAVLink_range_difference_message.msgname)
+        self._fieldnames = MAVLink_range_difference_message.fieldnames
+        self._instance_field = MAVLink_range_difference_message.instance_field
+        self._instance_offset = MAVLink_range_difference_message.instance_offset
+        self.time_usec = time_usec
+        self.a_lat = a_lat
+        self.a_lon = a_lon
+        self.a_alt = a_alt
+        self.b_lat = b_lat
+        self.b_lon = b_lon
+        self.b_alt = b_alt
+        self.difference = difference
+        self.sigma = sigma
+        self.chain_id = chain_id
+
+    def pack(self, mav: "MAVLink", force_mavlink1: bool = False) -> bytes:
+        return self._pack(mav, self.crc_extra, self.unpacker.pack(self.time_usec, self.a_lat, self.a_lon, self.a_alt, self.b_lat, self.b_lon, self.b_alt, self.difference, self.sigma, self.chain_id), force_mavlink1=force_mavlink1)
+
+
+# Define name on the class for backwards compatibility (it is now msgname).
+# Done with setattr to hide the class variable from mypy.
+setattr(MAVLink_range_difference_message, "name", mavlink_msg_deprecated_name_property())
+
+
+class MAVLink_second_ins_position_message(MAVLink_message):
+    """
+    Position of a second INS that uses no output of the companion.
+    Corrects an INS of its own.
+    """
+
+    id = MAVLINK_MSG_ID_SECOND_INS_POSITION
+    msgname = "SECOND_INS_POSITION"
+    fieldnames = ["time_usec", "lat", "lon", "ins_id"]
+    ordered_fieldnames = ["time_usec", "lat", "lon", "ins_id"]
+    fieldtypes = ["uint64_t", "int32_t", "int32_t", "uint16_t"]
+    fielddisplays_by_name: Dict[str, str] = {}
+    fieldenums_by_name: Dict[str, str] = {}
+    fieldunits_by_name: Dict[str, str] = {"time_usec": "us", "lat": "degE7", "lon": "degE7"}
+    native_format = bytearray(b"<QiiH")
+    orders = [0, 1, 2, 3]
+    lengths = [1, 1, 1, 1]
+    array_lengths = [0, 0, 0, 0]
+    crc_extra = 172
+    unpacker = struct.Struct("<QiiH")
+    instance_field = None
+    instance_offset = -1
+
+    def __init__(self, time_usec: int, lat: int, lon: int, ins_id: int):
+        MAVLink_message.__init__(self, MAVLink_second_ins_position_message.id, MAVLink_second_ins_position_message.msgname)
+        self._fieldnames = MAVLink_second_ins_position_message.fieldnames
+        self._instance_field = MAVLink_second_ins_position_message.instance_field
+        self._instance_offset = MAVLink_second_ins_position_message.instance_offset
+        self.time_usec = time_usec
+        self.lat = lat
+        self.lon = lon
+        self.ins_id = ins_id
+
+    def pack(self, mav: "MAVLink", force_mavlink1: bool = False) -> bytes:
+        return self._pack(mav, self.crc_extra, self.unpacker.pack(self.time_usec, self.lat, self.lon, self.ins_id), force_mavlink1=force_mavlink1)
+
+
+# Define name on the class for backwards compatibility (it is now msgname).
+# Done with setattr to hide the class variable from mypy.
+setattr(MAVLink_second_ins_position_message, "name", mavlink_msg_deprecated_name_property())
+
+
 class MAVLink_component_metadata_message(MAVLink_message):
     """
     Where a component's general metadata file is: requested by
@@ -597,6 +736,9 @@ setattr(MAVLink_component_metadata_message, "name", mavlink_msg_deprecated_name_
 mavlink_map: Dict[int, Type[MAVLink_message]] = {
     MAVLINK_MSG_ID_RSBN_MEASUREMENT: MAVLink_rsbn_measurement_message,
     MAVLINK_MSG_ID_NAVIGATION_STATUS: MAVLink_navigation_status_message,
+    MAVLINK_MSG_ID_STAR_FIX: MAVLink_star_fix_message,
+    MAVLINK_MSG_ID_RANGE_DIFFERENCE: MAVLink_range_difference_message,
+    MAVLINK_MSG_ID_SECOND_INS_POSITION: MAVLink_second_ins_position_message,
     MAVLINK_MSG_ID_COMPONENT_METADATA: MAVLink_component_metadata_message,
 }
 
@@ -1095,6 +1237,104 @@ class MAVLink(object):
 
         """
         self.send(self.navigation_status_encode(time_usec, bound_north, bound_east, bound_horizontal, bound_velocity, sigma_horizontal, horizon, disagreement, ahead, bound_ahead, sources, rejected, age, mode, estimator, protection, trust, tilt_bound, drift_bound), force_mavlink1=force_mavlink1)
+
+    def star_fix_encode(self, time_usec: int, zenith_lat: int, zenith_lon: int, altitude: float, azimuth: float, sigma_altitude: float, sigma_azimuth: float, star_id: int) -> MAVLink_star_fix_message:
+        """
+        Altitude and azimuth of a star against the axes of an INS, refraction
+        removed. Corrects an INS of its own.
+
+        time_usec                 : Time for which the measurement is valid (UNIX epoch time or time since the autopilot's boot, distinguished by magnitude). 0: unknown, use the time of arrival. [us] (type:uint64_t)
+        zenith_lat                : Latitude of the place where the star is in the zenith: its declination. [degE7] (type:int32_t)
+        zenith_lon                : Longitude of the place where the star is in the zenith: its hour angle from Greenwich, taken east. [degE7] (type:int32_t)
+        altitude                  : Altitude of the star above the level plane of the INS. [rad] (type:float)
+        azimuth                   : Azimuth of the star from the INS's north, clockwise. [rad] (type:float)
+        sigma_altitude            : One standard deviation of the altitude. [rad] (type:float)
+        sigma_azimuth             : One standard deviation of the azimuth. [rad] (type:float)
+        star_id                   : Identifier of the star. (type:uint16_t)
+
+        """
+        return MAVLink_star_fix_message(time_usec, zenith_lat, zenith_lon, altitude, azimuth, sigma_altitude, sigma_azimuth, star_id)
+
+    def star_fix_send(self, time_usec: int, zenith_lat: int, zenith_lon: int, altitude: float, azimuth: float, sigma_altitude: float, sigma_azimuth: float, star_id: int, force_mavlink1: bool = False) -> None:
+        """
+        Altitude and azimuth of a star against the axes of an INS, refraction
+        removed. Corrects an INS of its own.
+
+        time_usec                 : Time for which the measurement is valid (UNIX epoch time or time since the autopilot's boot, distinguished by magnitude). 0: unknown, use the time of arrival. [us] (type:uint64_t)
+        zenith_lat                : Latitude of the place where the star is in the zenith: its declination. [degE7] (type:int32_t)
+        zenith_lon                : Longitude of the place where the star is in the zenith: its hour angle from Greenwich, taken east. [degE7] (type:int32_t)
+        altitude                  : Altitude of the star above the level plane of the INS. [rad] (type:float)
+        azimuth                   : Azimuth of the star from the INS's north, clockwise. [rad] (type:float)
+        sigma_altitude            : One standard deviation of the altitude. [rad] (type:float)
+        sigma_azimuth             : One standard deviation of the azimuth. [rad] (type:float)
+        star_id                   : Identifier of the star. (type:uint16_t)
+
+        """
+        self.send(self.star_fix_encode(time_usec, zenith_lat, zenith_lon, altitude, azimuth, sigma_altitude, sigma_azimuth, star_id), force_mavlink1=force_mavlink1)
+
+    def range_difference_encode(self, time_usec: int, a_lat: int, a_lon: int, a_alt: float, b_lat: int, b_lon: int, b_alt: float, difference: float, sigma: float, chain_id: int) -> MAVLink_range_difference_message:
+        """
+        Line of position of a hyperbolic system: distance to station a minus
+        distance to station b. Corrects an INS of its own.
+
+        time_usec                 : Time for which the measurement is valid (UNIX epoch time or time since the autopilot's boot, distinguished by magnitude). 0: unknown, use the time of arrival. [us] (type:uint64_t)
+        a_lat                     : Latitude of station a, WGS84. [degE7] (type:int32_t)
+        a_lon                     : Longitude of station a, WGS84. [degE7] (type:int32_t)
+        a_alt                     : Altitude of station a above the WGS84 ellipsoid. [m] (type:float)
+        b_lat                     : Latitude of station b, WGS84. [degE7] (type:int32_t)
+        b_lon                     : Longitude of station b, WGS84. [degE7] (type:int32_t)
+        b_alt                     : Altitude of station b above the WGS84 ellipsoid. [m] (type:float)
+        difference                : Distance to station a minus distance to station b. [m] (type:float)
+        sigma                     : One standard deviation of the difference. [m] (type:float)
+        chain_id                  : Identifier of the pair of stations. (type:uint16_t)
+
+        """
+        return MAVLink_range_difference_message(time_usec, a_lat, a_lon, a_alt, b_lat, b_lon, b_alt, difference, sigma, chain_id)
+
+    def range_difference_send(self, time_usec: int, a_lat: int, a_lon: int, a_alt: float, b_lat: int, b_lon: int, b_alt: float, difference: float, sigma: float, chain_id: int, force_mavlink1: bool = False) -> None:
+        """
+        Line of position of a hyperbolic system: distance to station a minus
+        distance to station b. Corrects an INS of its own.
+
+        time_usec                 : Time for which the measurement is valid (UNIX epoch time or time since the autopilot's boot, distinguished by magnitude). 0: unknown, use the time of arrival. [us] (type:uint64_t)
+        a_lat                     : Latitude of station a, WGS84. [degE7] (type:int32_t)
+        a_lon                     : Longitude of station a, WGS84. [degE7] (type:int32_t)
+        a_alt                     : Altitude of station a above the WGS84 ellipsoid. [m] (type:float)
+        b_lat                     : Latitude of station b, WGS84. [degE7] (type:int32_t)
+        b_lon                     : Longitude of station b, WGS84. [degE7] (type:int32_t)
+        b_alt                     : Altitude of station b above the WGS84 ellipsoid. [m] (type:float)
+        difference                : Distance to station a minus distance to station b. [m] (type:float)
+        sigma                     : One standard deviation of the difference. [m] (type:float)
+        chain_id                  : Identifier of the pair of stations. (type:uint16_t)
+
+        """
+        self.send(self.range_difference_encode(time_usec, a_lat, a_lon, a_alt, b_lat, b_lon, b_alt, difference, sigma, chain_id), force_mavlink1=force_mavlink1)
+
+    def second_ins_position_encode(self, time_usec: int, lat: int, lon: int, ins_id: int) -> MAVLink_second_ins_position_message:
+        """
+        Position of a second INS that uses no output of the companion.
+        Corrects an INS of its own.
+
+        time_usec                 : Time for which the measurement is valid (UNIX epoch time or time since the autopilot's boot, distinguished by magnitude). 0: unknown, use the time of arrival. [us] (type:uint64_t)
+        lat                       : Latitude, WGS84. [degE7] (type:int32_t)
+        lon                       : Longitude, WGS84. [degE7] (type:int32_t)
+        ins_id                    : Identifier of the unit. (type:uint16_t)
+
+        """
+        return MAVLink_second_ins_position_message(time_usec, lat, lon, ins_id)
+
+    def second_ins_position_send(self, time_usec: int, lat: int, lon: int, ins_id: int, force_mavlink1: bool = False) -> None:
+        """
+        Position of a second INS that uses no output of the companion.
+        Corrects an INS of its own.
+
+        time_usec                 : Time for which the measurement is valid (UNIX epoch time or time since the autopilot's boot, distinguished by magnitude). 0: unknown, use the time of arrival. [us] (type:uint64_t)
+        lat                       : Latitude, WGS84. [degE7] (type:int32_t)
+        lon                       : Longitude, WGS84. [degE7] (type:int32_t)
+        ins_id                    : Identifier of the unit. (type:uint16_t)
+
+        """
+        self.send(self.second_ins_position_encode(time_usec, lat, lon, ins_id), force_mavlink1=force_mavlink1)
 
     def component_metadata_encode(self, time_boot_ms: int, file_crc: int, uri: bytes) -> MAVLink_component_metadata_message:
         """
