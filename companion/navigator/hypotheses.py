@@ -195,7 +195,8 @@ def _hypotheses(config: Config, channel: Channel, beacons: int, by_air: bool, wi
             ("range", (r,), beacon_lies(3.0 * sigma_r), 1e-3),
             ("elsewhere", (a, r), ELSEWHERE, BEACON_PLACE),
         ):
-            fault = Fault(f"{name} {k}", which, BEACON_H, lies, first, lies, change_h=BEACON_H, quota=4)
+            ends_h = BEACON_H if name == "elsewhere" else 1.0
+            fault = Fault(f"{name} {k}", which, BEACON_H, lies, first, lies, (), ends_h, BEACON_H, quota=4)
             faults.append(fault)
     jumps = []
     if channel.wind:

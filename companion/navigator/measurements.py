@@ -206,5 +206,4 @@ def sight(
 
 
 def _taken(bank: Bank, seen: Innovation, freedom: int) -> Taken:
-    best = int(np.argmax(bank.L))
-    return Taken(bank, float(seen.nis[best]), freedom, not bool(seen.refused[best]))
+    return Taken(bank, float(seen.nis[seen.leading]), freedom, not bool(seen.refused[seen.leading]))

@@ -67,6 +67,16 @@ def births(
     -------
     Bank : with at most `settings.rows` rows.
     """
+    return reduce(bear(bank, layout, settings, rate_factor), layout, settings)
+
+
+def bear(
+    bank: Bank,
+    layout: Layout,
+    settings: Settings = DEFAULT,
+    rate_factor: dict[int, float] | None = None,
+) -> Bank:
+    """Bear the children of `births`; the caller reduces the rows."""
     hours = (bank.t - bank.born_t) / HOUR_S
     if hours <= 0.0:
         return bank
@@ -89,7 +99,7 @@ def births(
             children.append(_Child(int(p), _log(jump.rate_h * hours), jump=j))
     children += _grade_children(bank, layout, settings, hours)
     grown = _with_children(bank, layout, [c for c in children if c.log_prior > NEVER])
-    return reduce(grown._replace(born_t=bank.t), layout, settings)
+    return grown._replace(born_t=bank.t)
 
 
 def returns(bank: Bank, layout: Layout, source: int, settings: Settings) -> tuple[Bank, bool]:
@@ -104,7 +114,7 @@ def returns(bank: Bank, layout: Layout, source: int, settings: Settings) -> tupl
 
     Returns
     -------
-    Bank, bool : the bank to be updated, and whether children were born.
+    Bank, bool : the bank to be updated, not yet reduced, and whether children were born.
     """
     children: list[_Child] = []
     order = np.argsort(-bank.L)
@@ -120,7 +130,7 @@ def returns(bank: Bank, layout: Layout, source: int, settings: Settings) -> tupl
     grown = _with_children(bank, layout, [c for c in children if c.log_prior > NEVER])
     if len(grown.L) == len(bank.L):
         return bank, False
-    return reduce(grown, layout, settings), True
+    return grown, True
 
 
 def _lie_children(parent: int, fault: int, lies: tuple[Lie, ...], prior: float) -> list[_Child]:

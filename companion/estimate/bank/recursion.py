@@ -12,8 +12,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from companion.estimate.bank.branching import births, returns
+from companion.estimate.bank.branching import bear, returns
 from companion.estimate.bank.layout import NEVER, Bools, Layout
+from companion.estimate.bank.reduction import reduce
 from companion.estimate.bank.settings import DEFAULT, Settings
 from companion.estimate.bank.state import Bank, false_rows, normalised
 from companion.units import Floats
@@ -25,7 +26,7 @@ Measurement = tuple[Floats, Floats]
 
 
 class Innovation(NamedTuple):
-    """Innovations of an update, per row of the bank that was updated.
+    """Innovations of an update, per row of the bank that was updated, children included.
 
     Attributes
     ----------
@@ -34,6 +35,7 @@ class Innovation(NamedTuple):
     nis : (R,) normalised squared innovations.
     born : whether births took place before the update.
     refused : (R,) whether the row took the measurement for an outlier.
+    leading : the heaviest row after the update.
     """
 
     nu: Floats
@@ -41,6 +43,7 @@ class Innovation(NamedTuple):
     nis: Floats
     born: bool
     refused: Bools
+    leading: int
 
 
 def propagate(bank: Bank, layout: Layout, dt: float, Phi: Floats, Q: Floats, u: Floats | None = None) -> Bank:
@@ -110,7 +113,8 @@ def update(
     """Update all rows by one measurement z = H x + lie + white noise, and reweight them.
 
     The first measurement of a source after silence bears "captured" children first; a measurement far from
-    the leading row bears children at once. Births in flight are `births`, on the caller's clock. A row for
+    the leading row bears children at once. Rows are reduced after the measurement has judged the children: a
+    newborn is too light to be kept before. Births in flight are `births`, on the caller's clock. A row for
     which the measurement is less likely than an outlier does not use it and pays the price of one.
 
     Parameters
@@ -148,15 +152,11 @@ def update(
     if source is not None and not fixed and bank.t - bank.seen[source] > layout.sources[source].silence_s:
         bank, born = returns(bank, layout, source, settings)
     step = innovations(bank)
-    if (
-        (source is not None or bears)
-        and not fixed
-        and not born
-        and settings.surprise < math.inf
-        and bank.t - bank.born_t >= settings.surprise_gap_s
-        and step.nis[int(np.argmax(bank.L))] > settings.surprise * step.nu.shape[-1]
-    ):
-        bank = births(bank, layout, settings)
+    passed = min((bank.t - bank.born_t) / settings.surprise_gap_s, 1.0)  # since births
+    nis = float(step.nis[int(np.argmax(bank.L))]) * passed**2
+    may_bear = (source is not None or bears) and not fixed and not born and settings.surprise < math.inf
+    if may_bear and nis > settings.surprise * step.nu.shape[-1]:
+        bank = bear(bank, layout, settings)
         born = True
         step = innovations(bank)
     refused = step.log_likelihood < outlier
@@ -171,7 +171,9 @@ def update(
     if source is not None:
         seen = seen.copy()
         seen[source] = bank.t
-    return bank._replace(L=L, x=x, P=P, seen=seen), Innovation(step.nu, step.S, step.nis, born, refused)
+    bank = bank._replace(L=L, x=x, P=P, seen=seen)
+    seen_by = Innovation(step.nu, step.S, step.nis, born, refused, int(np.argmax(L)))
+    return (reduce(bank, layout, settings) if born else bank), seen_by
 
 
 class _Step(NamedTuple):

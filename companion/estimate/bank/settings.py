@@ -20,7 +20,7 @@ class Settings:
     level_parents : rows that bear because they set the protection level.
     surprise : normalised squared innovation per component of the leading row above which births take place at
         once, before the measurement is used: the onset is then exact.
-    surprise_gap_s : shortest time between such births.
+    surprise_gap_s : sooner after births a surprise must be greater, by the square of the share passed.
     age_s, age_ratio : bins of age, the first and their ratio.
     merge_ratio : rows merge by moments if their weights differ by less than this factor.
     merge_distance : and their means by less than this many sigma (Mahalanobis).
