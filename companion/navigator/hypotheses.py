@@ -34,7 +34,6 @@ CONSISTENT, POSITION_ONLY = 0, 1  # faults of GNSS: its velocity is false too, o
 GNSS_GROUP, BEACON_GROUP, AIRSPEED_GROUP = 0, 1, 2
 GROUPS = (2, 2, 1)
 CHANNEL_JUMPS_H = 1e-3
-INS_H, INS_M_S = 1e-5, 2.0  # an INS fails: its velocity steps
 BEACON_PLACE = 0.03  # its position is stated wrongly: likelier than a GNSS captured before the first fix
 BEACON_H = 2e-4  # a beacon steps, or is elsewhere, so often in an hour; it does not drift
 ORDERS = (3, 2, 2)  # GNSS may be drawn off with an acceleration
@@ -214,7 +213,6 @@ def _hypotheses(config: Config, channel: Channel, beacons: int, by_air: bool, wi
         )
     else:
         jumps.append(Jump("channel", (0, 1), (100.0, 100.0), 0.01, quota=2, apart_s=APART_S))
-        jumps.append(Jump("ins", (2, 3), (INS_M_S, INS_M_S), INS_H, quota=4, apart_s=APART_S))
     layout = Layout(
         channel.n + 2 * beacons,
         GROUPS,
