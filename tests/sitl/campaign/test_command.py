@@ -162,7 +162,8 @@ def test_campaign_covers_every_simulator_fault() -> None:
 
 def test_exit_code_follows_the_limits(flown: tuple[Path, list[FlightResult]]) -> None:
     folder = str(flown[0])
-    options = ["--fault", "none", "--fault", "gnss-jump", "--workers", "0", "--results", folder, "--json"]
+    options = ["--scenario", "one-beacon", "--fault", "none", "--fault", "gnss-jump", "--seeds", "1"]
+    options += ["--workers", "0", "--results", folder, "--json"]
     events = CliRunner().invoke(command.command, options)
     assert events.exit_code == 0, events.output
     assert [line["fault"] for line in json.loads(events.stdout)] == ["none", "gnss-jump"]
