@@ -53,6 +53,7 @@ def births(
     layout: Layout,
     settings: Settings = DEFAULT,
     rate_factor: dict[int, float] | None = None,
+    reduced: bool = True,
 ) -> Bank:
     """Bear children for what may have started or ended since the last births, and reduce the rows.
 
@@ -62,21 +63,12 @@ def births(
     ----------
     bank, layout, settings : the bank.
     rate_factor : factor on the prior rate by fault, e.g. 100 while the receiver itself reports jamming.
+    reduced : False leaves all rows to the caller, whose measurement judges them first.
 
     Returns
     -------
-    Bank : with at most `settings.rows` rows.
+    Bank : with at most `settings.rows` rows if reduced.
     """
-    return reduce(bear(bank, layout, settings, rate_factor), layout, settings)
-
-
-def bear(
-    bank: Bank,
-    layout: Layout,
-    settings: Settings = DEFAULT,
-    rate_factor: dict[int, float] | None = None,
-) -> Bank:
-    """Bear the children of `births`; the caller reduces the rows."""
     hours = (bank.t - bank.born_t) / HOUR_S
     if hours <= 0.0:
         return bank
@@ -99,7 +91,8 @@ def bear(
             children.append(_Child(int(p), _log(jump.rate_h * hours), jump=j))
     children += _grade_children(bank, layout, settings, hours)
     grown = _with_children(bank, layout, [c for c in children if c.log_prior > NEVER])
-    return grown._replace(born_t=bank.t)
+    grown = grown._replace(born_t=bank.t)
+    return reduce(grown, layout, settings) if reduced else grown
 
 
 def returns(bank: Bank, layout: Layout, source: int, settings: Settings) -> tuple[Bank, bool]:

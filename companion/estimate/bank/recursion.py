@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from companion.estimate.bank.branching import bear, returns
+from companion.estimate.bank.branching import births, returns
 from companion.estimate.bank.layout import NEVER, Bools, Layout
 from companion.estimate.bank.reduction import reduce
 from companion.estimate.bank.settings import DEFAULT, Settings
@@ -156,7 +156,7 @@ def update(
     nis = float(step.nis[int(np.argmax(bank.L))]) * passed**2
     may_bear = (source is not None or bears) and not fixed and not born and settings.surprise < math.inf
     if may_bear and nis > settings.surprise * step.nu.shape[-1]:
-        bank = bear(bank, layout, settings)
+        bank = births(bank, layout, settings, reduced=False)
         born = True
         step = innovations(bank)
     refused = step.log_likelihood < outlier
