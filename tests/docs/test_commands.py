@@ -31,6 +31,7 @@ NOT_RUN = {
     r"make (test|loopback|lint|docs)": "a job of .ci/run",
     r"make (kills|soak|fuzz)|companion campaign": "takes minutes to hours; tests/sitl has its parts",
     r"git|python3 -m venv|venv/bin/pip|sudo|/opt/.*pip|systemctl|journalctl": "changes the system",
+    r"deploy/debian/build": "takes minutes, and the network",
     r"mavproxy": "needs MAVProxy: tests/clients",
     r"companion run (?!--set gnss.sigm=)": "flies until stopped: tests/runtime/test_service.py",
     r"companion doctor": "needs an autopilot: tests/doctor/test_command.py",
