@@ -23,7 +23,7 @@ from companion.navigator.own_channel import OwnChannel
 from companion.navigator.solution import announce, is_bound_due, refresh_bound, resolve_pending, solve
 from companion.navigator.stale_data import REPORT_EVERY, StaleDataDetector
 from companion.navigator.state import FIXES, Settings, State, Step, initial, is_new_fix
-from companion.navigator.step import INPUTS_USED, step, uses
+from companion.navigator.step import INPUTS_USED, uses
 from companion.plausibility import ImplausibleField, implausible_field
 from companion.records import (
     Event,
@@ -67,6 +67,7 @@ class Navigator:
 
     def __init__(self, config: Config, model: Model | None = None) -> None:
         self._settings = Settings(config, model or Model(config))
+        self._uses = uses(self._settings)
         self._state = initial(self._settings)
         self._past: deque[_Past] = deque(maxlen=MOST_KEPT)
         self._waiting: list[Input] = []  # late records, until the next roll-back
@@ -96,7 +97,7 @@ class Navigator:
         if isinstance(record, Tuning):
             self._tune(parse(record.toml, "parameters"))
             return []
-        if type(record) not in uses(self._settings):
+        if type(record) not in self._uses:
             return []
         if not self._channel_reported:
             self._channel_reported = True
@@ -163,7 +164,7 @@ class Navigator:
         return pending.record if pending else None, outputs
 
     def _step(self, record: Input) -> list[Output]:
-        self._state, outputs = guarded(self._state, record, self._settings, step, record)
+        self._state, outputs = guarded(self._state, record, self._settings, self._uses[type(record)], record)
         return outputs
 
     def _tune(self, config: Config) -> None:
@@ -171,6 +172,7 @@ class Navigator:
         self.settle()
         before = self._settings
         self._settings, self._state = tuned(self._state, before, config)
+        self._uses = uses(self._settings)
         self._late_ns = round(1e9 * config.estimator.late_s)
         self._gnss_latency_ns = round(1e9 * config.gnss.latency_s)
         same = config.has_own_ins == before.config.has_own_ins

@@ -68,8 +68,9 @@ def propagate(bank: Bank, layout: Layout, dt: float, Phi: Floats, Q: Floats, u: 
         FT = np.ascontiguousarray(F.T)
         x = bank.x @ FT
         # two flat products: P is symmetric, so (P F')' = F P, and one transposed copy stands in for F @ (.)
-        half = (bank.P.reshape(-1, n) @ FT).reshape(R, n, n)
-        P = (np.ascontiguousarray(half.transpose(0, 2, 1)).reshape(-1, n) @ FT).reshape(R, n, n)
+        half = bank.P.reshape(-1, n) @ FT
+        turned = np.ascontiguousarray(half.reshape(R, n, n).transpose(0, 2, 1)).reshape(-1, n)
+        P = np.matmul(turned, FT, out=half).reshape(R, n, n)
     else:
         x = (F @ bank.x[:, :, None])[:, :, 0]
         P = F @ bank.P @ F.transpose(0, 2, 1)
@@ -164,7 +165,8 @@ def update(
     if refused.any():
         taken = np.where(refused, 0.0, 1.0)
         G, white = G * taken[:, None, None], white * taken[:, None]
-    P = bank.P - G @ G.transpose(0, 2, 1)
+    P = G @ G.transpose(0, 2, 1)
+    np.subtract(bank.P, P, out=P)  # 0.8 MB: another array would push the rest of the flight out of the cache
     x = bank.x + (G @ white[:, :, None])[:, :, 0]
     L = normalised(bank.L + np.maximum(step.log_likelihood, outlier))
     seen = bank.seen
