@@ -81,7 +81,7 @@ class OwnChannel:
 
     def __init__(self, config: Config) -> None:
         air, strapdown, gnss = config.air_data, config.strapdown, config.gnss
-        self.settings = own_error_model.Settings(
+        self.settings = own_error_model.Amplitudes(
             wind_m_s=air.wind_m_s,
             wind_change_m_s_sqrt_s=air.wind_change_m_s_sqrt_s,
             wind_jump_m_s=air.wind_jump_m_s,

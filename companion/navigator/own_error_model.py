@@ -74,7 +74,7 @@ class Layout(NamedTuple):
         return N_BASE + 2 * self.foreign
 
 
-class Settings(NamedTuple):
+class Amplitudes(NamedTuple):
     """Standard deviations and correlation times of the error model; SI and radians."""
 
     position_m: float = 2000.0
@@ -229,7 +229,7 @@ def add_hold(i: Interval, dt: float) -> Interval:
 # ---------------------------------------------------------------------------------------------------------
 
 
-def prior(settings: Settings, layout: Layout, grades: tuple[Grade, ...]) -> Floats:
+def prior(settings: Amplitudes, layout: Layout, grades: tuple[Grade, ...]) -> Floats:
     """Return the first covariances (grades, n, n); the estimate is zero."""
     s = settings
     sigma = np.empty((len(grades), layout.n))
@@ -255,7 +255,7 @@ class Propagator:
         The error model, its optional states, and the ladder.
     """
 
-    def __init__(self, settings: Settings, layout: Layout, grades: tuple[Grade, ...] = GRADES) -> None:
+    def __init__(self, settings: Amplitudes, layout: Layout, grades: tuple[Grade, ...] = GRADES) -> None:
         self.settings, self.layout, self.grades = settings, layout, grades
         s, n = settings, layout.n
         rate, density = np.zeros(n), np.zeros((len(grades), n))
@@ -430,7 +430,7 @@ def velocity_row(layout: Layout, apart: Vector2, sigma: float, acceleration: Vec
     return Row(np.array(apart), H, np.diag((sigma * sigma, sigma * sigma)))
 
 
-def foreign_row(settings: Settings, layout: Layout, apart: Vector2) -> Row:
+def foreign_row(settings: Amplitudes, layout: Layout, apart: Vector2) -> Row:
     """Return the row of a foreign velocity: nominal minus foreign (m/s); not in intervals by `foreign`."""
     H = np.zeros((2, layout.n))
     at = layout.foreign_at.start
@@ -449,7 +449,7 @@ def standing_row(layout: Layout, velocity: Vector2, sigma: float = 0.1) -> Row:
 # ---------------------------------------------------------------------------------------------------------
 
 
-def wind_jump(settings: Settings, layout: Layout, by: By) -> Floats:
+def wind_jump(settings: Amplitudes, layout: Layout, by: By) -> Floats:
     """Return the covariance (n, n) that a jump of the wind adds.
 
     By the IMU the aircraft's velocity over ground does not jump with the wind; by air data it does, because
@@ -462,7 +462,7 @@ def wind_jump(settings: Settings, layout: Layout, by: By) -> Floats:
     return B @ B.T
 
 
-def foreign_jump(settings: Settings, layout: Layout, by: By) -> Floats:
+def foreign_jump(settings: Amplitudes, layout: Layout, by: By) -> Floats:
     """Return the covariance (n, n) that a jump of the foreign velocity error adds."""
     B = np.zeros((layout.n, 2))
     at = layout.foreign_at.start

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from companion.estimate import bank as banks
+from companion.estimate.bank.settings import DEFAULT as THRESHOLDS
 from companion.estimate.fusion import Azimuth
 from companion.nav.geometry import displace
 from companion.navigator import (
@@ -677,9 +678,8 @@ def _rejected(
     assert state.bank is not None
     label = f"gnss {record.receiver}" if isinstance(record, Gnss) else name
     if state.reported[source] == EXCLUDED:
-        return Rejection(
-            record.t_ns, record.rx_ns, label, "excluded: false with probability", state.false[source], 0.999
-        )
+        why, false = "excluded: false with probability", state.false[source]
+        return Rejection(record.t_ns, record.rx_ns, label, why, false, THRESHOLDS.excluded)
     return Rejection(record.t_ns, record.rx_ns, label, "outlier: normalised squared innovation", taken.nis)
 
 

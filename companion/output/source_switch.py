@@ -16,6 +16,7 @@ import re
 from collections.abc import Callable
 from typing import NamedTuple
 
+from companion.estimate.bank.settings import DEFAULT
 from companion.link import dialect
 from companion.link.dialect import Message, mavlink
 from companion.output.beacon_witness import BeaconWitness
@@ -27,7 +28,7 @@ NO_FIX_S, SILENT_S = 2.0, 3.0  # the receiver reports no fix, or nothing, for so
 STEADY_S = 3.0  # our position has gone out without a gap for so long
 FIX_S = 5.0  # the receiver has had a fix for so long
 STOPPED_S = 2.0  # our position has not gone out for so long
-FALSE, BELIEVED = 0.999, 0.1  # probability that GNSS is false
+FALSE, BELIEVED = DEFAULT.excluded, DEFAULT.believed  # probability that GNSS is false, as in the navigator
 FRESH_S = 60.0  # a solution older than this says nothing about GNSS
 MAX_GAP_NS = SECOND_NS  # a longer gap interrupts
 RETRY_NS = SECOND_NS
