@@ -190,6 +190,13 @@ def build_table(rows: list[dict[str, Any]], key: str, title: str, number: str) -
     return table
 
 
+def axis_label(state: str) -> str:
+    """Name of a state with its unit in the paper's system: km, h, rad."""
+    units = {"dx": "km", "dy": "km", "dV": "km/h", "P": "rad", "E": "rad/h", "V": "km/h", "G": "km/h$^2$"}
+    units["A"] = units["G"]
+    return f"{state}, {units.get(state[:2]) or units[state[0]]}"
+
+
 def draw(
     folder: Path,
     name: str,
@@ -202,30 +209,34 @@ def draw(
     from matplotlib.figure import Figure
 
     assert restrictive_result.u is not None
-    states = model.states
+    states, hours = [axis_label(state) for state in model.states], model.dt * np.arange(len(flights.z))
     groups = [range(i, min(i + 4, len(states))) for i in range(0, len(states), 4)]
 
     def save(number: int, panels: list[tuple[str, dict[str, Floats]]]) -> None:
         figure = Figure(figsize=(8, 2 * len(panels)), layout="constrained")
         for axes, (label, curves) in zip(np.atleast_1d(figure.subplots(len(panels), 1)), panels, strict=True):
             for legend, values in curves.items():
-                axes.plot(values, label=legend, linewidth=0.8)
+                axes.plot(hours[: len(values)], values, label=legend, linewidth=0.8)
             axes.set_ylabel(label)
             axes.legend(fontsize="x-small", loc="upper right")
+        axes.set_xlabel("time, h")
         figure.savefig(folder / f"{name}_{number:02d}.png", dpi=110)
 
-    save(1, [(f"Z{i + 1}", {"measured": flights.z[:, 0, i]}) for i in range(flights.z.shape[-1])])
+    save(1, [(f"Z{i + 1}, km/h", {"measured": flights.z[:, 0, i]}) for i in range(flights.z.shape[-1])])
     save(
         2,
         [
-            (f"U{i + 1}", {"true": flights.u[:, 0, i], "restrictive": restrictive_result.u[:, 0, i]})
+            (f"U{i + 1}, km/h", {"true": flights.u[:, 0, i], "restrictive": restrictive_result.u[:, 0, i]})
             for i in range(flights.u.shape[-1])
         ],
     )
     x, k, r = (f[:, 0] for f in (flights.x, minimax_result.x, restrictive_result.x))
     for number, group in enumerate(groups):
         curves = [(states[i], {"true": x[:, i], "restrictive": r[:, i], "minimax": k[:, i]}) for i in group]
-        errors = [(states[i], {"restrictive": abs(r - x)[:, i], "minimax": abs(k - x)[:, i]}) for i in group]
+        errors = [
+            (f"|error| of {states[i]}", {"restrictive": abs(r - x)[:, i], "minimax": abs(k - x)[:, i]})
+            for i in group
+        ]
         save(3 + number, curves)
         save(7 + number, errors)
 
