@@ -195,6 +195,7 @@ _NAMES = {
     "AirspeedSensor": "state of the airspeed sensor",
     "GnssIntegrity": "jamming and spoofing",
     "RangeDifference": "lines of position",
+    "SecondIns": "second INS",
     "StarFix": "star fixes",
     "Tuning": "changed parameters",
     "Reboot": "reboots",
