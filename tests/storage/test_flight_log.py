@@ -66,6 +66,7 @@ EVERY_KIND = [
     r.LinkState(T + 31, T + 31, "udp", True, 1000, 3, 1, 0, -5, 900_000),
     r.RangeDifference(T + 31, T + 31, 7, 0.9, -2.1, 100.0, 0.91, -2.2, 50.0, 1234.5, 30.0),
     r.StarFix(T + 31, T + 31, 3, 0.2, 1.1, 0.7, None, 1e-4, 2e-4),
+    r.SecondIns(T + 31, T + 31, 2, 0.9, -2.1),
     r.Smoothed(T + 31, T + 31, 0.9, -2.1, 333.0, (1.0, 0.1, 2.0), (3.0, -4.0)),
     r.Reboot(T + 31, T + 31, 1),
     r.Tuning(T + 32, T + 32, '[gnss]\nsigma_m = 3.0\n'),
