@@ -266,7 +266,7 @@ class Scene:
         state, level = ("used", "good") if used else ("not used", "")
         if age is None or age > SILENT_S:
             state, level = "silent", "caution"
-        elif p is not None and p > EXCLUDED:
+        elif p is not None and (p > EXCLUDED or (p > SUSPECT and not used)):  # excluded until believed
             state, level = "excluded", "fault"
         elif p is not None and p > SUSPECT:
             state, level = "suspect", "caution"

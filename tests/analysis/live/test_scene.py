@@ -105,7 +105,7 @@ def test_sources_have_the_probability_that_each_is_false():
     false = (("gnss", 0.9999), ("airspeed", 0.02), ("rsbn 7 azimuth", 0.6), ("rsbn 7 range", 0.001))
     scene.add(message(Gnss(S, S, 0, 1, 3, LAT, LON, 300.0)))
     scene.add(message(RsbnFix(S, S, 7, LAT, LON, 0.0, math.pi / 2, 5000.0, 0.002, 100.0)))
-    scene.add(message(solution(1.5, sources=1 | 8 | 16, false_sources=false)))
+    scene.add(message(solution(1.5, sources=1 | 4 | 8 | 16, false_sources=false)))
     rows = {row["name"]: (row["state"], row["false"]) for row in scene.frame(0.1, False)["sources"]}
     assert rows == {
         "GNSS": ("excluded", 100.0),
@@ -113,6 +113,9 @@ def test_sources_have_the_probability_that_each_is_false():
         "beacon 7 range": ("used", 0.1),
         "airspeed": ("used", 2.0),
     }
+    scene.add(message(solution(1.6, sources=1 | 4, false_sources=(("gnss", 0.9),))))
+    assert scene.frame(0.1, False)["sources"][0]["state"] == "excluded"  # until it is believed
+    scene.add(message(solution(1.7, sources=1 | 4 | 8 | 16, false_sources=false)))
     assert "Probably false: GNSS, beacon 7 azimuth." in scene.frame(0.1, False)["trust"]["why"]
     scene.add(message(solution(10.0)))
     assert {row["state"] for row in scene.frame(0.1, False)["sources"]} >= {"silent"}
