@@ -63,7 +63,8 @@ def _no_estimate(a: Assessment) -> Verdict | None:
 
 
 def _bound_broken(a: Assessment) -> Verdict | None:
-    broken = [row for row in a.rows if row.held is False]
+    """The error of a phase was above the guaranteed bound: r.m.s. against r.m.s., as it is stated."""
+    broken = [row for row in a.rows if row.held is False and (row.share or 0.0) > 1.0]
     if not broken:
         return None
     worst = max(broken, key=lambda row: row.share or 0.0)
@@ -72,6 +73,21 @@ def _bound_broken(a: Assessment) -> Verdict | None:
         f"The guaranteed bound did not hold in the phase “{flight_events.phase_title(worst.phase)}”.",
         f"{worst.share:.2f} ×",
         "the bound (r.m.s. error; limit 1)",
+    )
+
+
+def _moments_beyond_bound(a: Assessment) -> Verdict | None:
+    """Moments beyond a bound on the r.m.s. error break no promise, but a user wants to see them."""
+    beyond = [row for row in a.rows if row.held is False and row.inside is not None]
+    if not beyond:
+        return None
+    worst = min(beyond, key=lambda row: row.inside or 0.0)
+    return Verdict(
+        "caution",
+        "At moments the error was above the guaranteed bound, which is one on the r.m.s. error; most often "
+        f"in the phase “{flight_events.phase_title(worst.phase)}”.",
+        f"{100.0 * (worst.inside or 0.0):.1f} %",
+        "of this phase within the bound",
     )
 
 
@@ -206,6 +222,7 @@ _RULES: tuple[Callable[[Assessment], Verdict | None], ...] = (
     _bound_broken,
     _protection_broken,
     _worse_than_inertial,
+    _moments_beyond_bound,
     _contradiction,
     _untrusted,
     _no_reference,
