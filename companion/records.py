@@ -324,6 +324,19 @@ class Bounds(msgspec.Struct, frozen=True, gc=False):
     drift_n: Vector2 | None = None
 
 
+#: Filters that may run beside the leading estimator, in the order of NAVIGATION_STATUS.
+PARALLEL = ("minimax_filter", "restrictive")
+
+
+class ParallelEstimate(msgspec.Struct, frozen=True, gc=False):
+    """Error of the inertial channel by a filter that runs beside the leading estimator, north and east (m),
+    and the covariance that it claims: nn, ne, ee (m^2)."""
+
+    estimator: str
+    error_n: Vector2
+    covariance: Vector3
+
+
 class Solution(Stamped, frozen=True, gc=False, tag=True):
     """Corrected estimate.
 
@@ -359,6 +372,7 @@ class Solution(Stamped, frozen=True, gc=False, tag=True):
     witness: bool = False
     false_sources: tuple[tuple[str, float], ...] = ()
     bounds: Bounds | None = None
+    parallel: tuple[ParallelEstimate, ...] = ()
 
 
 class Fix(Stamped, frozen=True, gc=False, tag=True):

@@ -341,11 +341,16 @@ def _print_own(rows: list[OwnPhase]) -> None:
 def _print_table(flown: LoopbackFlight, rows: list[error_statistics.PhaseErrors], seconds: float) -> None:
     scenario = flown.autopilot.scenario
     table = Table(title=f"{scenario.name}: horizontal error, r.m.s. [m]")
-    sources = (source.replace(" ", "\n") for source in error_statistics.SOURCES)
-    for column in ("phase", "min", *sources, "expected", "95 %", "protected", "bound"):
+    sources = [
+        s
+        for s in error_statistics.SOURCES
+        if s not in error_statistics.FILTERS.values() or any(s in row.rms for row in rows)
+    ]
+    names = (source.replace(" ", "\n") for source in sources)
+    for column in ("phase", "min", *names, "expected", "95 %", "protected", "bound"):
         table.add_column(column, justify="left" if column == "phase" else "right", no_wrap=True)
     for row, level in zip(rows, protection_table(flown, rows), strict=True):
-        cells = [_metres(row.rms.get(source)) for source in error_statistics.SOURCES]
+        cells = [_metres(row.rms.get(source)) for source in sources]
         percentile = _metres(row.p95.get(error_statistics.CORRECTED))
         protected = "-" if level is None else _metres(level.level) + _unless_held(level.held)
         bound = _bound(row)

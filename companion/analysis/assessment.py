@@ -190,6 +190,11 @@ def _source_errors(flight: Flight, reference: ReferenceTrack) -> dict[str, error
         if table is solution:
             ins = np.hypot(north + table["error_north"], east + table["error_east"])
             found[error_statistics.INS] = _error_series(table["t"], ins, None)
+            for name, title in error_statistics.FILTERS.items():
+                runs = np.isfinite(table[f"{name}_north"])
+                off_north = (north + table["error_north"] - table[f"{name}_north"])[runs]
+                off_east = (east + table["error_east"] - table[f"{name}_east"])[runs]
+                found[title] = _error_series(table["t"][runs], np.hypot(off_north, off_east), None)
     return {
         source: found[source]
         for source in error_statistics.SOURCES

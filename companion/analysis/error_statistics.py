@@ -14,13 +14,14 @@ import numpy as np
 import numpy.typing as npt
 
 from companion.nav.geometry import Geodetic, displace, from_enu, separation
-from companion.records import Gnss, RsbnFix, Solution, Stamped
+from companion.records import PARALLEL, Gnss, RsbnFix, Solution, Stamped
 from companion.units import Floats
 
 TruthAt = Callable[[int], Geodetic | None]
 
 INS, GNSS, RSBN, CORRECTED = "INS alone", "GNSS fix", "RSBN fix", "corrected"
-SOURCES = (INS, GNSS, RSBN, CORRECTED)
+FILTERS = dict(zip(PARALLEL, ("minimax filter", "R1 filter"), strict=True))  # that run beside the leader
+SOURCES = (INS, GNSS, RSBN, CORRECTED, *FILTERS.values())
 USEFUL = 10.0  # a bound beyond so many times the claimed error is of no use
 LIMIT_M = 5000.0  # as `predictor.limit_m`
 PHASE_START_DELAY_NS = 1_000_000_000  # maximum delay from the validity of a fix to the phase it starts
@@ -93,7 +94,10 @@ def horizontal_errors(records: Iterable[Stamped], truth: TruthAt) -> dict[str, E
             corrected = Geodetic(record.lat, record.lon, record.alt_msl)
             claimed = math.sqrt(record.covariance[0] + record.covariance[3])
             add(CORRECTED, record.t_ns, corrected, bound, claimed)
-            add(INS, record.t_ns, displace(*corrected, *record.error_n, 0.0))
+            inertial = displace(*corrected, *record.error_n, 0.0)
+            add(INS, record.t_ns, inertial)
+            for p in record.parallel:
+                add(FILTERS[p.estimator], record.t_ns, displace(*inertial, -p.error_n[0], -p.error_n[1], 0.0))
         elif isinstance(record, Gnss) and record.has_3d_fix and (last is None or not record.repeats(last)):
             last = record
             add(GNSS, record.t_ns, Geodetic(record.lat, record.lon, record.alt_msl))

@@ -18,6 +18,7 @@ from companion.importers import gnss_latency
 from companion.importers.gnss_latency import Latency
 from companion.navigator import INPUTS_USED
 from companion.records import (
+    PARALLEL,
     Event,
     FilterStatus,
     Fix,
@@ -101,6 +102,8 @@ def _solution(r: Solution) -> tuple[float, ...]:
     ahead = [(p.ahead_s, math.hypot(*p.bound_n), math.hypot(*p.claimed_n)) for p in r.ahead[:AHEAD]]
     ahead += [(math.nan,) * 3] * (AHEAD - len(ahead))
     flat = (number for one in ahead for number in one)
+    beside = {p.estimator: p.error_n for p in r.parallel}
+    parallel = (number for name in PARALLEL for number in beside.get(name, (math.nan, math.nan)))
     c = r.covariance
     mode = float(MODES.index(r.mode))
     level = _or_nan(r.protection)
@@ -117,14 +120,16 @@ def _solution(r: Solution) -> tuple[float, ...]:
         *bound,
         level,
         *flat,
+        *parallel,
     )
 
 
 _AHEAD = " ".join(f"ahead_{i} ahead_bound_{i} ahead_claimed_{i}" for i in range(AHEAD))
+_PARALLEL = " ".join(f"{name}_north {name}_east" for name in PARALLEL)
 COLUMNS: dict[type[Stamped], tuple[str, Callable[[Any], tuple[float, ...]]]] = {
     Solution: (
         "mode lat lon alt nn ne ee error_north error_east sources bound_north bound_east protection "
-        + _AHEAD,
+        f"{_AHEAD} {_PARALLEL}",
         _solution,
     ),
     Fix: (

@@ -231,8 +231,9 @@ def _phases(a: Assessment) -> list[Table]:
         error_statistics.CORRECTED: "estimate",
         error_statistics.INS: "inertial alone",
         error_statistics.RSBN: "beacon",
+        error_statistics.GNSS: "GNSS",
     }
-    names = [titles.get(source, "GNSS") for source in sources]
+    names = [titles.get(source, source) for source in sources]
     head = ["phase", "from", "lasts", *names, "bound", "error / bound", "held", "within", "twice"]
     rows: list[list[str | Cell]] = []
     for row, phase in zip(a.rows, a.phases, strict=True):

@@ -171,6 +171,11 @@ TEXTS: dict[str, dict[str, tuple[str, str]]] = {
             "guaranteed bound is near the least. restrictive needs inertial.source = 'air_data'.",
             "you study another estimator",
         ),
+        "parallel": (
+            "Filters that run beside the bank and are logged, reported and never sent: the minimax Kalman "
+            "filter, and the restrictive filter R1. They need airspeed.",
+            "you compare estimators",
+        ),
         "scheme": (
             "feedforward corrects the own channel when its error is large, feedback at every fix; a number "
             "from 0 to 1 corrects that share of the error at every fix.",

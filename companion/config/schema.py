@@ -162,9 +162,11 @@ class EstimatorConfig(Section, frozen=True):
     estimator: "minimax" and "restricted" without fixes of any source, "restrictive" without GNSS fixes.
     `scheme` "feedback" corrects the companion's own channel at every fix, "feedforward" only when its error
     is large, a number from 0 to 1 by that share of its error; an INS of its own cannot be corrected.
+    `parallel` names filters that run beside the bank, for comparison.
     """
 
     output: Literal["auto", "minimax", "kalman", "restricted", "restrictive"] = "auto"
+    parallel: tuple[Literal["minimax_filter", "restrictive"], ...] = ()
     scheme: Literal["feedforward", "feedback"] | Annotated[float, Meta(ge=0.0, le=1.0)] = "feedforward"
     late_s: Annotated[float, Meta(ge=0.0, le=30.0)] = 6.0
 

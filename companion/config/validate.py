@@ -71,6 +71,15 @@ def find_conflicts(config: Config) -> Iterator[tuple[str, str, str]]:
             "output",
             "estimator.output = 'restrictive' runs on air data only: set inertial.source = 'air_data'",
         )
+    beside_ins = config.has_own_ins and "airspeed" in config.inertial.correctors
+    if config.estimator.parallel and config.inertial.source != "air_data" and not beside_ins:
+        yield (
+            "estimator",
+            "parallel",
+            f"estimator.parallel = {list(config.estimator.parallel)} bounds the change of the wind, so it "
+            "needs airspeed: set inertial.source = 'air_data', or with an INS of its own "
+            "inertial.correctors = ['airspeed']",
+        )
     yield from _too_slow_rates(config)
     bins = 60.0 * config.predictor.window_min / config.predictor.bin_s
     if bins > MAX_BINS:

@@ -277,7 +277,10 @@ def tuned(state: State, before: Settings, config: Config) -> tuple[Settings, Sta
     )
     if same:
         settings = settings._replace(model=before.model)
-        return settings, state._replace(guarantee=minimax_bound.tuned(state.guarantee))
+        same_filters = config.estimator == before.config.estimator
+        return settings, state._replace(
+            guarantee=minimax_bound.tuned(state.guarantee), parallel=state.parallel if same_filters else None
+        )
     return settings, initial(settings)._replace(
         next_ns=state.next_ns, origin=state.origin, sensors=state.sensors, level=state.level
     )
@@ -302,7 +305,7 @@ def guarded(
             false=(),
             reported=(),
             certain_ns=(),
-            restrictive=None,
+            parallel=None,
             fixed=False,
         )
     return after, outputs

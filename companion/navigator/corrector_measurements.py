@@ -24,11 +24,12 @@ HIGHEST_STAR = math.radians(80.0)  # nearer to the zenith an azimuth means nothi
 
 
 class CorrectorRows(NamedTuple):
-    """z (m,), H (m, n) on the states of the channel, R (m, m)."""
+    """z (m,), H (m, n) on the states of the channel, R (m, m); rows of one kind have one meaning."""
 
     z: Floats
     H: Floats
     R: Floats
+    kind: str
 
 
 def airspeed(channel: CorrectedIns, point: Point, V: float, heading: float, gust: float) -> CorrectorRows:
@@ -38,7 +39,7 @@ def airspeed(channel: CorrectedIns, point: Point, V: float, heading: float, gust
     north, east = point.v_n[:2]
     c, s = math.cos(heading), math.sin(heading)
     z = np.array((c * north + s * east - V, -s * north + c * east))
-    return CorrectorRows(z, H, gust**2 * np.eye(2))
+    return CorrectorRows(z, H, gust**2 * np.eye(2), "airspeed")
 
 
 def range_difference(
@@ -60,7 +61,7 @@ def range_difference(
         channel.names, correctors.line_of_position(north, east, chain_state(record.chain))
     )
     z = d_a - d_b - record.difference + north * centre[0] + east * centre[1]
-    return CorrectorRows(np.array([z]), H, np.array([[record.sigma**2]]))
+    return CorrectorRows(np.array([z]), H, np.array([[record.sigma**2]]), f"chain {record.chain}")
 
 
 def star(channel: CorrectedIns, corrected: Point, centre: Vector2, record: StarFix) -> CorrectorRows | None:
@@ -77,7 +78,8 @@ def star(channel: CorrectedIns, corrected: Point, centre: Vector2, record: StarF
         z.append(wrap_angle(q - record.azimuth))
         variances.append(record.sigma_azimuth**2)
     m = len(z)
-    return CorrectorRows(np.array(z) + H[:m, :2] @ centre, H[:m], np.diag(variances))
+    kind = f"star {record.star}, {m} rows"
+    return CorrectorRows(np.array(z) + H[:m, :2] @ centre, H[:m], np.diag(variances), kind)
 
 
 def second_ins(channel: CorrectedIns, point: Point, record: SecondIns) -> CorrectorRows:
@@ -85,7 +87,8 @@ def second_ins(channel: CorrectedIns, point: Point, record: SecondIns) -> Correc
     H = correctors.observation_matrix(channel.names, *correctors.second_ins(compared=("dx", "dy")))
     other = Geodetic(record.lat, record.lon, point.position.alt)
     north, east, _ = separation_tuple(point.position, other)
-    return CorrectorRows(np.array((north, east)), H, SECOND_NOISE_M**2 * np.eye(2))
+    kind = f"second INS {record.ins}"
+    return CorrectorRows(np.array((north, east)), H, SECOND_NOISE_M**2 * np.eye(2), kind)
 
 
 def altitude_azimuth(lat: float, lon: float, star_lat: float, star_lon: float) -> tuple[float, float]:

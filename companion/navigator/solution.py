@@ -15,7 +15,7 @@ import numpy as np
 from companion.estimate import bank as banks
 from companion.estimate.fusion import Height, NoFix, maximum_likelihood
 from companion.nav.geometry import displace
-from companion.navigator import fix_observations, height_error, minimax_bound, restrictive_filter, trust
+from companion.navigator import fix_observations, height_error, minimax_bound, parallel_filters, trust
 from companion.navigator.hypotheses import GNSS
 from companion.navigator.minimax_bound import Guaranteed, Linear
 from companion.navigator.own_channel import OwnChannel
@@ -38,6 +38,7 @@ from companion.records import (
     Gnss,
     Input,
     Mode,
+    ParallelEstimate,
     Rejection,
     Severity,
     Solution,
@@ -131,6 +132,11 @@ def solve(state: State, rx_ns: int, settings: Settings) -> Step:
         witness=witness,
         false_sources=false_sources,
         bounds=promised.bounds if promised else None,
+        parallel=tuple(
+            ParallelEstimate(name, c.error_n, c.covariance)
+            for name in config.estimator.parallel
+            if (c := candidates.get(name)) is not None
+        ),
     )
     return state._replace(held=held), [solution]
 
@@ -153,12 +159,13 @@ def _candidates(
         best, restricted = promised.minimax, promised.restricted
         found["minimax"] = _linear(best, best.bound_n, best.velocity_bound_n)
         found["restricted"] = _linear(restricted, restricted.expected_n, restricted.velocity_expected_n)
-    if state.restrictive is not None and state.nominal is not None:
-        x4, P4 = restrictive_filter.at(state.restrictive, state.nominal.t_ns, settings.config.air_data)
-        dx, dy, dv_n, dv_e = x4.tolist()
-        (var_n, cov), (_, var_e) = P4[:2, :2].tolist()
-        variance = float(max(P4[2, 2], P4[3, 3], 0.0))
-        found["restrictive"] = _Estimate((dx, dy), (dv_n, dv_e), (var_n, cov, var_e), variance)
+    if state.parallel is not None and state.nominal is not None:
+        point, channel = state.nominal.point, settings.model.channel
+        for name, x4, P4 in parallel_filters.at(state.parallel, point, settings.config, channel):
+            dx, dy, dv_n, dv_e = x4[:4].tolist()
+            (var_n, cov), (_, var_e) = P4[:2, :2].tolist()
+            variance = float(max(P4[2, 2], P4[3, 3], 0.0))
+            found[name] = _Estimate((dx, dy), (dv_n, dv_e), (var_n, cov, var_e), variance)
     return found
 
 
@@ -296,7 +303,8 @@ def resolve_pending(state: State, pending: Pending, settings: Settings) -> Step:
         degrees_of_freedom=fix.degrees_of_freedom,
         iterations=fix.iterations,
     )
-    return _restrict(state._replace(guarantee=g), out, used, settings), [out]
+    state = state._replace(guarantee=g)
+    return _filtered(state, pending, out, used, settings), [out]
 
 
 def is_bound_due(state: State) -> bool:
@@ -315,20 +323,27 @@ def refresh_bound(state: State, record: Input, settings: Settings) -> Step:
     return (state if g is state.guarantee else state._replace(guarantee=g)), out
 
 
-def _restrict(state: State, fix: Fix, used: Source, settings: Settings) -> State:
-    """The same fix for the restrictive filter, which runs on air data only."""
-    nominal = state.nominal
-    if settings.config.leading_estimator != "restrictive" or nominal is None or state.bank is None:
+def _filtered(state: State, pending: Pending, fix: Fix, used: Source, settings: Settings) -> State:
+    """The same fix for the filters that run beside the bank."""
+    config, channel = settings.config, settings.model.channel
+    if not parallel_filters.names(config) or state.bank is None:
         return state
-    air = settings.config.air_data
-    if state.restrictive is None:
+    parallel, point = state.parallel, pending.point._replace(t_ns=fix.t_ns)
+    if parallel is None:
         found = estimate(state, settings)
-        begun = restrictive_filter.begin(nominal.t_ns, found.x[:4], found.P[:4, :4])
-        return state._replace(restrictive=begun)
+        parallel = parallel_filters.begin(config, channel, point, found.x[:4], found.P[:4, :4])
+        return state._replace(parallel=parallel)
     var_n, cov, var_e = fix.covariance
-    covariance = np.array([[var_n, cov], [cov, var_e]])
-    white = not used & Source.GNSS
-    updated = restrictive_filter.update(
-        state.restrictive, fix.t_ns, np.array(fix.correction_n), covariance, white, air
+    by_gnss = bool(used & Source.GNSS)
+    parallel = parallel_filters.add(
+        parallel,
+        point,
+        "gnss" if by_gnss else "beacon",
+        np.array(fix.correction_n),
+        np.eye(2),
+        np.array([[var_n, cov], [cov, var_e]]),
+        white=not by_gnss,
+        config=config,
+        channel=channel,
     )
-    return state._replace(restrictive=updated)
+    return state._replace(parallel=parallel)

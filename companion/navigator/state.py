@@ -15,7 +15,7 @@ from companion.navigator.hypotheses import Hypotheses, Model
 from companion.navigator.inertial_track import Point
 from companion.navigator.minimax_bound import Guarantee
 from companion.navigator.own_channel import Sensors
-from companion.navigator.restrictive_filter import Restrictive
+from companion.navigator.parallel_filters import Parallel
 from companion.navigator.trust import Held
 from companion.records import Gnss, LocalOrigin, LocalPosition, Output, RsbnFix, Source, Vector2
 from companion.units import SECOND_NS
@@ -75,7 +75,7 @@ class State(NamedTuple):
     certain_ns: tuple[int, ...] = ()  # since when each is false beyond doubt, 0 where it is not
     reported: tuple[int, ...] = ()  # what was last reported of each source: 0 used, 1 suspect, 2 excluded
     level: Level = Level()
-    restrictive: Restrictive | None = None
+    parallel: Parallel | None = None  # filters beside the bank
     gnss: Gnss | None = None  # the last new one, used or not
     gnss_used_ns: int | None = None  # when a fix was last taken up, used or not
     gnss_fix: tuple[Gnss, Point] | None = None  # the last one believed

@@ -28,7 +28,7 @@ from companion.navigator import (
     minimax_bound,
     own_channel,
     own_error_model,
-    restrictive_filter,
+    parallel_filters,
     strapdown_channel,
 )
 from companion.navigator.channel import Nominal, moved
@@ -360,7 +360,8 @@ def _jump_removed(state: State, last: Point, new: Point, record: LocalPosition, 
         out.append(_channel(record, f"jumped by {length:.1f} m"))
     if length > inertial_track.JUMP_M and silent > JUMP_SPREAD_S and state.bank is not None:
         sigma = min(length, most)
-        state = state._replace(bank=banks.inflate(state.bank, (0, 1), sigma), guarantee=Guarantee())
+        bank = banks.inflate(state.bank, (0, 1), sigma)
+        state = state._replace(bank=bank, guarantee=Guarantee(), parallel=None)
         out.append(_channel(record, f"no local position for {silent:.1f} s"))
     return state, out
 
@@ -374,7 +375,7 @@ def shifted(state: State, north: float, east: float, v_n: Vector2 = (0.0, 0.0), 
     if protection is not None:
         protection = (*protection[:2], protection[2] + north, protection[3] + east)
     promise = minimax_bound.shift(state.guarantee, north, east, v_n)
-    bounded = state.restrictive and restrictive_filter.shift(state.restrictive, north, east)
+    parallel = state.parallel and parallel_filters.shift(state.parallel, north, east)
     fix = state.gnss_fix and _fix_shifted(*state.gnss_fix, north, east, v_n, t_ns)
     pending = state.pending
     if pending is not None:  # the error that was taken off is that of the nominal trajectory as it is now
@@ -383,7 +384,7 @@ def shifted(state: State, north: float, east: float, v_n: Vector2 = (0.0, 0.0), 
         bank=bank,
         protection=protection,
         guarantee=promise,
-        restrictive=bounded,
+        parallel=parallel,
         gnss_fix=fix,
         pending=pending,
     )
@@ -536,6 +537,20 @@ def _corrected_by(state: State, record: Any, settings: Settings, name: str) -> S
     if not taken.accepted:
         why = "outlier: normalised squared innovation"
         out.append(Rejection(record.t_ns, record.rx_ns, name, why, taken.nis))
+    elif state.parallel is not None and state.nominal is not None:
+        z, H, R, kind = rows
+        parallel = parallel_filters.add(
+            state.parallel,
+            state.nominal.point,
+            kind,
+            z,
+            H,
+            R,
+            white=True,
+            config=settings.config,
+            channel=settings.model.channel,
+        )
+        state = state._replace(parallel=parallel)
     return state, out
 
 

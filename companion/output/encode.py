@@ -22,7 +22,7 @@ from companion.link.dialect import mavlink, rsbn
 from companion.link.firmware import Firmware
 from companion.nav.geometry import Geodetic, Projection, geodetic_to_local
 from companion.output.gate import Position
-from companion.records import LocalOrigin, Mode, Solution, Source, Trust
+from companion.records import PARALLEL, LocalOrigin, Mode, Solution, Source, Trust
 
 Message: TypeAlias = Any
 
@@ -307,6 +307,8 @@ def navigation_status(solution: Solution, receiver: Receiver) -> Message:
     ahead = s.ahead[:4]
     unused = 4 - len(ahead)
     variance, bounds = s.covariance[0] + s.covariance[3], s.bounds
+    running = {p.estimator: p for p in s.parallel}
+    beside = [running.get(name) for name in PARALLEL]
     return dialect.new(
         "NAVIGATION_STATUS",
         time_usec=s.t_ns // 1000,
@@ -330,6 +332,8 @@ def navigation_status(solution: Solution, receiver: Receiver) -> Message:
         trust=0 if s.trust is None else s.trust + 1,  # NAVIGATION_TRUST: 0 is "unknown"
         tilt_bound=list(bounds.tilt_n) if bounds and bounds.tilt_n else [0.0, 0.0],
         drift_bound=list(bounds.drift_n) if bounds and bounds.drift_n else [0.0, 0.0],
+        parallel_distance=[math.dist(p.error_n, s.error_n) if p else 0.0 for p in beside],
+        parallel_sigma=[math.sqrt(max(0.0, p.covariance[0] + p.covariance[2])) if p else 0.0 for p in beside],
     )
 
 

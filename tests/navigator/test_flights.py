@@ -15,6 +15,7 @@ from msgspec.structs import replace
 from companion.config import Config, load
 from companion.navigator import Navigator
 from companion.records import (
+    PARALLEL,
     AirData,
     Attitude,
     Event,
@@ -320,3 +321,36 @@ def test_the_velocity_by_air_data_is_as_good_as_claimed_in_gusts() -> None:
     assert len(error) > 100
     assert np.mean(error > 3.0 * claimed) < 0.01
     assert np.median(claimed) < 2.0 * np.sqrt(np.mean(error**2))  # nor is too much claimed
+
+
+# ---------------------------------------------------------------------------------------------------------
+# Filters beside the bank
+# ---------------------------------------------------------------------------------------------------------
+
+PARALLEL_FILTERS = {"estimator.parallel": list(PARALLEL)}
+WITH_AIRSPEED = {"inertial.independent": True, "inertial.correctors": ["airspeed"]}
+BY_AIR = {"inertial.source": "air_data", "output.profile": "ardupilot"}
+
+
+@pytest.mark.parametrize(("channel", "flags"), [("ins", WITH_AIRSPEED), ("air", BY_AIR)])
+def test_filters_beside_the_bank_follow_the_flight_and_change_nothing_that_is_sent(
+    channel: str, flags: dict[str, Any]
+) -> None:
+    """GNSS until 150 s, then the beacon; the error of each filter is within what it claims."""
+
+    def sent(solutions: list[Solution]) -> list[object]:
+        return [replace(s, parallel=(), disagreement=None) for s in solutions]
+
+    alone = fly(channel, config=load(flags=flags, environment={}), gnss_until=150.0)
+    both = fly(channel, config=load(flags={**flags, **PARALLEL_FILTERS}, environment={}), gnss_until=150.0)
+    assert sent(both.solutions) == sent(alone.solutions)
+    assert not any(s.parallel for s in alone.solutions)
+    for k, name in enumerate(PARALLEL):
+        inside = []
+        for s, t, error_n in zip(both.solutions, both.t, both.error_n, strict=True):
+            if t > SETTLED_S:
+                p = s.parallel[k]
+                var_n, _, var_e = p.covariance
+                assert p.estimator == name
+                inside.append(math.dist(error_n + s.error_n, p.error_n) < 3.0 * math.sqrt(var_n + var_e))
+        assert np.mean(inside) > 0.95

@@ -25,7 +25,7 @@ from companion.output.encode import (
     stated_as_independent,
 )
 from companion.output.gate import Position
-from companion.records import Bounds, LocalOrigin, Mode, Prediction, Solution, Source
+from companion.records import Bounds, LocalOrigin, Mode, ParallelEstimate, Prediction, Solution, Source
 
 T = 123_456_789_000
 NAN = math.nan
@@ -361,6 +361,16 @@ def test_bounds_of_tilt_and_drift() -> None:
     m = status(bounds=Bounds((3.0, 4.0), 0.0, 1.0, (3e-4, 4e-4), (7e-7, 8e-7)))
     assert m.tilt_bound == pytest.approx([3e-4, 4e-4])
     assert m.drift_bound == pytest.approx([7e-7, 8e-7])
+
+
+def test_filters_beside_the_leader_have_their_places() -> None:
+    m = status()
+    assert m.parallel_distance == m.parallel_sigma == [0.0, 0.0]
+    m = status(
+        error_n=(10.0, 20.0), parallel=(ParallelEstimate("restrictive", (13.0, 24.0), (36.0, 5.0, 64.0)),)
+    )
+    assert m.parallel_distance == pytest.approx([0.0, 5.0])
+    assert m.parallel_sigma == pytest.approx([0.0, 10.0])
 
 
 @pytest.mark.parametrize("name", ["kalman", "minimax", "restricted", "restrictive"])

@@ -506,22 +506,22 @@ class MAVLink_navigation_status_message(MAVLink_message):
 
     id = MAVLINK_MSG_ID_NAVIGATION_STATUS
     msgname = "NAVIGATION_STATUS"
-    fieldnames = ["time_usec", "bound_north", "bound_east", "bound_horizontal", "bound_velocity", "sigma_horizontal", "horizon", "disagreement", "ahead", "bound_ahead", "sources", "rejected", "age", "mode", "estimator", "protection", "trust", "tilt_bound", "drift_bound"]
-    ordered_fieldnames = ["time_usec", "bound_north", "bound_east", "bound_horizontal", "bound_velocity", "sigma_horizontal", "horizon", "disagreement", "ahead", "bound_ahead", "sources", "rejected", "age", "mode", "estimator", "protection", "trust", "tilt_bound", "drift_bound"]
-    fieldtypes = ["uint64_t", "float", "float", "float", "float", "float", "float", "float", "float", "float", "uint16_t", "uint16_t", "uint16_t", "uint8_t", "uint8_t", "float", "uint8_t", "float", "float"]
+    fieldnames = ["time_usec", "bound_north", "bound_east", "bound_horizontal", "bound_velocity", "sigma_horizontal", "horizon", "disagreement", "ahead", "bound_ahead", "sources", "rejected", "age", "mode", "estimator", "protection", "trust", "tilt_bound", "drift_bound", "parallel_distance", "parallel_sigma"]
+    ordered_fieldnames = ["time_usec", "bound_north", "bound_east", "bound_horizontal", "bound_velocity", "sigma_horizontal", "horizon", "disagreement", "ahead", "bound_ahead", "sources", "rejected", "age", "mode", "estimator", "protection", "trust", "tilt_bound", "drift_bound", "parallel_distance", "parallel_sigma"]
+    fieldtypes = ["uint64_t", "float", "float", "float", "float", "float", "float", "float", "float", "float", "uint16_t", "uint16_t", "uint16_t", "uint8_t", "uint8_t", "float", "uint8_t", "float", "float", "float", "float"]
     fielddisplays_by_name: Dict[str, str] = {"sources": "bitmask"}
     fieldenums_by_name: Dict[str, str] = {"sources": "NAVIGATION_SOURCE", "mode": "NAVIGATION_MODE", "estimator": "NAVIGATION_ESTIMATOR", "trust": "NAVIGATION_TRUST"}
-    fieldunits_by_name: Dict[str, str] = {"time_usec": "us", "bound_north": "m", "bound_east": "m", "bound_horizontal": "m", "bound_velocity": "m/s", "sigma_horizontal": "m", "horizon": "s", "disagreement": "m", "ahead": "s", "bound_ahead": "m", "age": "ms", "protection": "m", "tilt_bound": "rad", "drift_bound": "rad/s"}
-    native_format = bytearray(b"<QfffffffffHHHBBfBff")
-    orders = [0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 16, 17, 18]
-    lengths = [1, 1, 1, 1, 1, 1, 1, 1, 4, 4, 1, 1, 1, 1, 1, 1, 1, 2, 2]
-    array_lengths = [0, 0, 0, 0, 0, 0, 0, 0, 4, 4, 0, 0, 0, 0, 0, 0, 0, 2, 2]
+    fieldunits_by_name: Dict[str, str] = {"time_usec": "us", "bound_north": "m", "bound_east": "m", "bound_horizontal": "m", "bound_velocity": "m/s", "sigma_horizontal": "m", "horizon": "s", "disagreement": "m", "ahead": "s", "bound_ahead": "m", "age": "ms", "protection": "m", "tilt_bound": "rad", "drift_bound": "rad/s", "parallel_distance": "m", "parallel_sigma": "m"}
+    native_format = bytearray(b"<QfffffffffHHHBBfBffff")
+    orders = [0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 16, 17, 18, 19, 20]
+    lengths = [1, 1, 1, 1, 1, 1, 1, 1, 4, 4, 1, 1, 1, 1, 1, 1, 1, 2, 2, 2, 2]
+    array_lengths = [0, 0, 0, 0, 0, 0, 0, 0, 4, 4, 0, 0, 0, 0, 0, 0, 0, 2, 2, 2, 2]
     crc_extra = 14
-    unpacker = struct.Struct("<Qfffffff4f4fHHHBBfB2f2f")
+    unpacker = struct.Struct("<Qfffffff4f4fHHHBBfB2f2f2f2f")
     instance_field = None
     instance_offset = -1
 
-    def __init__(self, time_usec: int, bound_north: float, bound_east: float, bound_horizontal: float, bound_velocity: float, sigma_horizontal: float, horizon: float, disagreement: float, ahead: Sequence[float], bound_ahead: Sequence[float], sources: int, rejected: int, age: int, mode: int, estimator: int, protection: float = 0, trust: int = 0, tilt_bound: Sequence[float] = (0, 0), drift_bound: Sequence[float] = (0, 0)):
+    def __init__(self, time_usec: int, bound_north: float, bound_east: float, bound_horizontal: float, bound_velocity: float, sigma_horizontal: float, horizon: float, disagreement: float, ahead: Sequence[float], bound_ahead: Sequence[float], sources: int, rejected: int, age: int, mode: int, estimator: int, protection: float = 0, trust: int = 0, tilt_bound: Sequence[float] = (0, 0), drift_bound: Sequence[float] = (0, 0), parallel_distance: Sequence[float] = (0, 0), parallel_sigma: Sequence[float] = (0, 0)):
         MAVLink_message.__init__(self, MAVLink_navigation_status_message.id, MAVLink_navigation_status_message.msgname)
         self._fieldnames = MAVLink_navigation_status_message.fieldnames
         self._instance_field = MAVLink_navigation_status_message.instance_field
@@ -545,9 +545,11 @@ class MAVLink_navigation_status_message(MAVLink_message):
         self.trust = trust
         self.tilt_bound = tilt_bound
         self.drift_bound = drift_bound
+        self.parallel_distance = parallel_distance
+        self.parallel_sigma = parallel_sigma
 
     def pack(self, mav: "MAVLink", force_mavlink1: bool = False) -> bytes:
-        return self._pack(mav, self.crc_extra, self.unpacker.pack(self.time_usec, self.bound_north, self.bound_east, self.bound_horizontal, self.bound_velocity, self.sigma_horizontal, self.horizon, self.disagreement, self.ahead[0], self.ahead[1], self.ahead[2], self.ahead[3], self.bound_ahead[0], self.bound_ahead[1], self.bound_ahead[2], self.bound_ahead[3], self.sources, self.rejected, self.age, self.mode, self.estimator, self.protection, self.trust, self.tilt_bound[0], self.tilt_bound[1], self.drift_bound[0], self.drift_bound[1]), force_mavlink1=force_mavlink1)
+        return self._pack(mav, self.crc_extra, self.unpacker.pack(self.time_usec, self.bound_north, self.bound_east, self.bound_horizontal, self.bound_velocity, self.sigma_horizontal, self.horizon, self.disagreement, self.ahead[0], self.ahead[1], self.ahead[2], self.ahead[3], self.bound_ahead[0], self.bound_ahead[1], self.bound_ahead[2], self.bound_ahead[3], self.sources, self.rejected, self.age, self.mode, self.estimator, self.protection, self.trust, self.tilt_bound[0], self.tilt_bound[1], self.drift_bound[0], self.drift_bound[1], self.parallel_distance[0], self.parallel_distance[1], self.parallel_sigma[0], self.parallel_sigma[1]), force_mavlink1=force_mavlink1)
 
 
 # Define name on the class for backwards compatibility (it is now msgname).
@@ -1178,7 +1180,7 @@ class MAVLink(object):
         """
         self.send(self.rsbn_measurement_encode(time_usec, beacon_lat, beacon_lon, beacon_alt, azimuth, slant_range, sigma_azimuth, sigma_range, beacon_id, status), force_mavlink1=force_mavlink1)
 
-    def navigation_status_encode(self, time_usec: int, bound_north: float, bound_east: float, bound_horizontal: float, bound_velocity: float, sigma_horizontal: float, horizon: float, disagreement: float, ahead: Sequence[float], bound_ahead: Sequence[float], sources: int, rejected: int, age: int, mode: int, estimator: int, protection: float = 0, trust: int = 0, tilt_bound: Sequence[float] = (0, 0), drift_bound: Sequence[float] = (0, 0)) -> MAVLink_navigation_status_message:
+    def navigation_status_encode(self, time_usec: int, bound_north: float, bound_east: float, bound_horizontal: float, bound_velocity: float, sigma_horizontal: float, horizon: float, disagreement: float, ahead: Sequence[float], bound_ahead: Sequence[float], sources: int, rejected: int, age: int, mode: int, estimator: int, protection: float = 0, trust: int = 0, tilt_bound: Sequence[float] = (0, 0), drift_bound: Sequence[float] = (0, 0), parallel_distance: Sequence[float] = (0, 0), parallel_sigma: Sequence[float] = (0, 0)) -> MAVLink_navigation_status_message:
         """
         State of the companion's estimate beyond the standard messages: mode,
         sources, guaranteed bounds now and in the minutes ahead,
@@ -1204,11 +1206,13 @@ class MAVLink(object):
         trust                     : How far the estimate can be trusted. (type:uint8_t, values:NAVIGATION_TRUST)
         tilt_bound                : Guaranteed r.m.s. bounds of the tilt of an INS, of the north and of the east Schuler channel. 0: none. [rad] (type:float)
         drift_bound               : Guaranteed r.m.s. bounds of the gyro drift of an INS, of the north and of the east Schuler channel. 0: none. [rad/s] (type:float)
+        parallel_distance         : Horizontal distance from the position sent of the minimax filter and of the restrictive filter R1. 0: does not run. [m] (type:float)
+        parallel_sigma            : Horizontal standard deviation claimed by each. 0: does not run. [m] (type:float)
 
         """
-        return MAVLink_navigation_status_message(time_usec, bound_north, bound_east, bound_horizontal, bound_velocity, sigma_horizontal, horizon, disagreement, ahead, bound_ahead, sources, rejected, age, mode, estimator, protection, trust, tilt_bound, drift_bound)
+        return MAVLink_navigation_status_message(time_usec, bound_north, bound_east, bound_horizontal, bound_velocity, sigma_horizontal, horizon, disagreement, ahead, bound_ahead, sources, rejected, age, mode, estimator, protection, trust, tilt_bound, drift_bound, parallel_distance, parallel_sigma)
 
-    def navigation_status_send(self, time_usec: int, bound_north: float, bound_east: float, bound_horizontal: float, bound_velocity: float, sigma_horizontal: float, horizon: float, disagreement: float, ahead: Sequence[float], bound_ahead: Sequence[float], sources: int, rejected: int, age: int, mode: int, estimator: int, protection: float = 0, trust: int = 0, tilt_bound: Sequence[float] = (0, 0), drift_bound: Sequence[float] = (0, 0), force_mavlink1: bool = False) -> None:
+    def navigation_status_send(self, time_usec: int, bound_north: float, bound_east: float, bound_horizontal: float, bound_velocity: float, sigma_horizontal: float, horizon: float, disagreement: float, ahead: Sequence[float], bound_ahead: Sequence[float], sources: int, rejected: int, age: int, mode: int, estimator: int, protection: float = 0, trust: int = 0, tilt_bound: Sequence[float] = (0, 0), drift_bound: Sequence[float] = (0, 0), parallel_distance: Sequence[float] = (0, 0), parallel_sigma: Sequence[float] = (0, 0), force_mavlink1: bool = False) -> None:
         """
         State of the companion's estimate beyond the standard messages: mode,
         sources, guaranteed bounds now and in the minutes ahead,
@@ -1234,9 +1238,11 @@ class MAVLink(object):
         trust                     : How far the estimate can be trusted. (type:uint8_t, values:NAVIGATION_TRUST)
         tilt_bound                : Guaranteed r.m.s. bounds of the tilt of an INS, of the north and of the east Schuler channel. 0: none. [rad] (type:float)
         drift_bound               : Guaranteed r.m.s. bounds of the gyro drift of an INS, of the north and of the east Schuler channel. 0: none. [rad/s] (type:float)
+        parallel_distance         : Horizontal distance from the position sent of the minimax filter and of the restrictive filter R1. 0: does not run. [m] (type:float)
+        parallel_sigma            : Horizontal standard deviation claimed by each. 0: does not run. [m] (type:float)
 
         """
-        self.send(self.navigation_status_encode(time_usec, bound_north, bound_east, bound_horizontal, bound_velocity, sigma_horizontal, horizon, disagreement, ahead, bound_ahead, sources, rejected, age, mode, estimator, protection, trust, tilt_bound, drift_bound), force_mavlink1=force_mavlink1)
+        self.send(self.navigation_status_encode(time_usec, bound_north, bound_east, bound_horizontal, bound_velocity, sigma_horizontal, horizon, disagreement, ahead, bound_ahead, sources, rejected, age, mode, estimator, protection, trust, tilt_bound, drift_bound, parallel_distance, parallel_sigma), force_mavlink1=force_mavlink1)
 
     def star_fix_encode(self, time_usec: int, zenith_lat: int, zenith_lon: int, altitude: float, azimuth: float, sigma_altitude: float, sigma_azimuth: float, star_id: int) -> MAVLink_star_fix_message:
         """
