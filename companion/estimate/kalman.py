@@ -391,30 +391,3 @@ def find_covariance_flaw(name: str, P: Floats, n: int, *, definite: bool = False
         kind = "definite" if definite else "semidefinite"
         return f"covariance {name} is not positive {kind} (least correlation eigenvalue {least:.3g})"
     return None
-
-
-def find_measurement_flaw(t_ns: int, z: Floats, R: Floats, last_t_ns: int) -> str | None:
-    """Describe why a measurement cannot be used.
-
-    Parameters
-    ----------
-    t_ns : int
-        Time of the measurement, ns.
-    z : (p,)
-        Measurement.
-    R : (p, p)
-        Its covariance.
-    last_t_ns : int
-        Time of the filter's state, ns.
-
-    Returns
-    -------
-    str or None
-        The reason, None if it can be used.
-    """
-    if t_ns < last_t_ns:
-        late = (last_t_ns - t_ns) / 1e9
-        return f"time runs backwards by {late:.3f} s: go back to an older state and forward again"
-    if not np.isfinite(z).all():
-        return "the measurement is not finite: check its source"
-    return find_covariance_flaw("R", R, len(z), definite=True)

@@ -39,7 +39,6 @@ rsbn: Any = _rsbn
 Message = Any
 
 RsbnMeasurement = rsbn.MAVLink_rsbn_measurement_message
-NavigationStatus = rsbn.MAVLink_navigation_status_message
 
 #: Messages of receivers, which are components of their own, and the field that names what is received.
 MEASUREMENTS = {

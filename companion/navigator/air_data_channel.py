@@ -20,7 +20,6 @@ LAPSE, T0 = 0.0065, 288.15  # [K/m], [K]
 TROPOPAUSE = 11_000.0  # [m], where the lapse ends
 HEIGHT_EXPONENT = 0.190263  # R L / (g M): T / T0 = (p / P0)^0.19
 DENSITY_EXPONENT = 1.0 - HEIGHT_EXPONENT  # rho / rho0 = (p / P0) / (T / T0)
-STALE_NS = 1_000_000_000  # an attitude older than this turns no airspeed into a velocity
 CLIMB_S = 2.0  # time constant of the climb taken from the pressure altitude
 
 

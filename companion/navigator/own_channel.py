@@ -84,7 +84,6 @@ class OwnChannel:
         self.settings = own_error_model.Amplitudes(
             wind_m_s=air.wind_m_s,
             wind_change_m_s_sqrt_s=air.wind_change_m_s_sqrt_s,
-            wind_jump_m_s=air.wind_jump_m_s,
             scale=0.01 * air.airspeed_percent,
             heading=math.radians(air.heading_deg),
             slow_s=60.0 * air.correlation_min,

@@ -81,8 +81,6 @@ class Amplitudes(NamedTuple):
     velocity_m_s: float = 30.0
     wind_m_s: float = 8.0
     wind_change_m_s_sqrt_s: float = 0.05
-    wind_jump_m_s: float = 4.0
-    wind_jumps_per_h: float = 1.0
     scale: float = 0.03
     heading: float = math.radians(1.5)
     slow_s: float = 600.0  # correlation of scale and heading
@@ -102,7 +100,6 @@ class Amplitudes(NamedTuple):
     drift_s: float = 300.0
     foreign_m_s: float = 0.3
     foreign_change_m_s_sqrt_s: float = 0.05
-    foreign_jump_m_s: float = 5.0
     foreign_noise_m_s: float = 0.5
     latency_s: float = 0.15  # sigma about the configured latency
     latency_change_s_sqrt_s: float = 1e-4
@@ -372,13 +369,6 @@ class Propagator:
         often = max(2.0 * s.gust_s / max(seconds, 0.05), 1.0)
         return Row(y, H, often * self._gust2 * nose_covariance(V, s.gust_along_m_s, s.gust_across_m_s))
 
-    def airspeed_along_row(self, velocity: Vector2, V: Vector2, seconds: float) -> Row:
-        """Return the scalar row of airspeed along the nose, where sideslip is unknown (copter)."""
-        full = self.airspeed_row(velocity, V, seconds)
-        speed = max(math.hypot(*V), 1e-6)
-        nose = np.array(((V[0] / speed, V[1] / speed),))
-        return Row(nose @ full.y, nose @ full.H, nose @ full.R @ nose.T)
-
 
 def _velocity_noise(Phi: Floats, Q: Floats, T: float, density: float | Floats) -> None:
     square, cube = density * (0.5 * T * T), density * (T * T * T / 3.0)
@@ -405,31 +395,6 @@ def nose_covariance(V: Vector2, along: float, across: float) -> Floats:
 # ---------------------------------------------------------------------------------------------------------
 
 
-def position_row(
-    layout: Layout, apart: Vector2, R: Floats, velocity: Vector2 = (0.0, 0.0), drifts: bool = True
-) -> Row:
-    """Return the row of a position: `apart` is nominal minus measured (m), `velocity` the corrected one.
-
-    `drifts` is True for GNSS: the shared drift is subtracted, and the latency seen through `velocity`.
-    """
-    H = np.zeros((2, layout.n))
-    H[0, 0] = H[1, 1] = 1.0
-    if drifts:
-        H[0, 13] = H[1, 14] = -1.0
-        if layout.latency:
-            H[:, layout.latency_at] = velocity
-    return Row(np.array(apart), H, R)
-
-
-def velocity_row(layout: Layout, apart: Vector2, sigma: float, acceleration: Vector2 = (0.0, 0.0)) -> Row:
-    """Return the row of a GNSS velocity: nominal minus measured (m/s), latency through the acceleration."""
-    H = np.zeros((2, layout.n))
-    H[0, 2] = H[1, 3] = 1.0
-    if layout.latency:
-        H[:, layout.latency_at] = acceleration
-    return Row(np.array(apart), H, np.diag((sigma * sigma, sigma * sigma)))
-
-
 def foreign_row(settings: Amplitudes, layout: Layout, apart: Vector2) -> Row:
     """Return the row of a foreign velocity: nominal minus foreign (m/s); not in intervals by `foreign`."""
     H = np.zeros((2, layout.n))
@@ -437,39 +402,6 @@ def foreign_row(settings: Amplitudes, layout: Layout, apart: Vector2) -> Row:
     H[0, 2] = H[1, 3] = 1.0
     H[0, at] = H[1, at + 1] = -1.0
     return Row(np.array(apart), H, np.eye(2) * settings.foreign_noise_m_s**2)
-
-
-def standing_row(layout: Layout, velocity: Vector2, sigma: float = 0.1) -> Row:
-    """Return the row of a parked aircraft: its velocity over ground is zero."""
-    return velocity_row(Layout(layout.foreign, layout.latency), velocity, sigma)
-
-
-# ---------------------------------------------------------------------------------------------------------
-# Jumps
-# ---------------------------------------------------------------------------------------------------------
-
-
-def wind_jump(settings: Amplitudes, layout: Layout, by: By) -> Floats:
-    """Return the covariance (n, n) that a jump of the wind adds.
-
-    By the IMU the aircraft's velocity over ground does not jump with the wind; by air data it does, because
-    the channel's velocity error is minus the wind.
-    """
-    B = np.zeros((layout.n, 2))
-    B[4, 0] = B[5, 1] = settings.wind_jump_m_s
-    if by == "air":
-        B[2, 0] = B[3, 1] = -settings.wind_jump_m_s
-    return B @ B.T
-
-
-def foreign_jump(settings: Amplitudes, layout: Layout, by: By) -> Floats:
-    """Return the covariance (n, n) that a jump of the foreign velocity error adds."""
-    B = np.zeros((layout.n, 2))
-    at = layout.foreign_at.start
-    B[at, 0] = B[at + 1, 1] = settings.foreign_jump_m_s
-    if by == "foreign":
-        B[2, 0] = B[3, 1] = settings.foreign_jump_m_s
-    return B @ B.T
 
 
 # ---------------------------------------------------------------------------------------------------------

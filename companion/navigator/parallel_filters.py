@@ -38,7 +38,7 @@ from companion.units import Floats
 
 INTERVAL_NS = 10_000_000_000
 EVEN = 1.0 / 3.0  # variance of a change even within its bounds, in units of the bound's square
-MINIMAX, RESTRICTIVE = "minimax_filter", "restrictive"
+RESTRICTIVE = "restrictive"
 WIND = ("wN", "wE")
 
 

@@ -28,7 +28,6 @@ LEAST = 0.7  # of which so much must come: streams are asked for again below it
 FEW = 5  # samples that tell no rate yet
 SLOWEST_S = 2.0  # a longer interval is a silence and tells no rate either
 STALE_S = 1.0  # an attitude older than this is not carried on by gyros
-BRIDGED_S = 0.3  # a silence of the IMU up to this long is nothing
 F_MAX = 0.995 * 16.0 * G0  # [m/s^2] the range of common accelerometers
 W_MAX = 0.995 * math.radians(2000.0)  # [rad/s] and gyros
 VERTICAL = 0.5  # of gravity, by which the vertical force may differ from it

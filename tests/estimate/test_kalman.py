@@ -163,11 +163,3 @@ def test_initial_state_accepts_exact_alignment_and_rejects_nan():
     assert kalman.InitialState(0, np.zeros(2), np.zeros((2, 2))).t_ns == 0
     with pytest.raises(ValueError, match="not finite"):
         kalman.InitialState(0, np.array([0.0, np.nan]), np.eye(2))
-
-
-def test_measurement_flaw_is_returned_not_raised():
-    z, R = np.zeros(2), np.eye(2)
-    assert kalman.find_measurement_flaw(5, z, R, 5) is None
-    assert "backwards" in str(kalman.find_measurement_flaw(4, z, R, 5))
-    assert "not finite" in str(kalman.find_measurement_flaw(6, z + np.inf, R, 5))
-    assert "must be positive" in str(kalman.find_measurement_flaw(6, z, 0 * R, 5))
