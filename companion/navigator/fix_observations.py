@@ -113,12 +113,18 @@ def predict_sight(z: Azimuth | Range, at: Floats) -> tuple[Floats, Floats, Float
     return np.arctan2(e, n), g[:, 0], g[:, 1]
 
 
+def distance(z: Azimuth | Range) -> float:
+    """Distance of the beacon from the nominal position, m."""
+    x, y, up = cast(Triple, z.beacon)
+    return math.hypot(x, y, up)
+
+
 def sight_variance(z: Azimuth | Range, height_sigma: float) -> float:
     """Variance of an azimuth (rad^2) or a range (m^2), the unknown height of the aircraft included."""
     if isinstance(z, Azimuth):
         return z.sigma**2
-    x, y, up = cast(Triple, z.beacon)
-    slope = up / max(math.hypot(x, y, up), 1.0)
+    up = cast(Triple, z.beacon)[2]
+    slope = up / max(distance(z), 1.0)
     return z.sigma**2 + (slope * height_sigma) ** 2
 
 

@@ -16,7 +16,7 @@ from companion.config import Config
 from companion.estimate import bank as banks
 from companion.estimate.bank import Bank, Innovation
 from companion.estimate.fusion import Azimuth, Range
-from companion.nav.geometry import Geodetic, separation_tuple
+from companion.nav.geometry import Geodetic, separation_tuple, wrap_angle
 from companion.navigator import fix_observations, own_error_model
 from companion.navigator.channel import Channel
 from companion.navigator.corrector_measurements import CorrectorRows
@@ -67,9 +67,13 @@ def gnss_position(
     nominal: Point,
     v_n: Vector2,
     config: Config,
+    factor: float = 1.0,
 ) -> Taken:
-    """Take the position of a fix: nominal minus GNSS is the error less drift, plus latency times velocity."""
-    north, east, _ = separation_tuple(Geodetic(record.lat, record.lon, record.alt_msl), nominal.position)
+    """Take the position of a fix: nominal minus GNSS is the error less drift, plus latency times velocity.
+
+    `factor` of the stated variance, by the scatter of the fixes; so below.
+    """
+    north, east = gnss_residual(record, nominal, (0.0, 0.0))
     H = np.zeros((2, known.layout.n_base))
     H[0, 0] = H[1, 1] = 1.0
     H[:, channel.drift] = -np.eye(2)
@@ -80,12 +84,18 @@ def gnss_position(
         known.layout,
         np.array((-north, -east)),
         H,
-        sigma**2 * np.eye(2),
+        factor * sigma**2 * np.eye(2),
         GNSS,
         known.settings,
         outlier=OUTLIER["position"],
     )
     return _taken(after, seen, 2)
+
+
+def gnss_residual(record: Gnss, nominal: Point, moved: Vector2) -> Vector2:
+    """Return the position of a fix less the nominal one before it `moved`, north and east (m)."""
+    north, east, _ = separation_tuple(Geodetic(record.lat, record.lon, record.alt_msl), nominal.position)
+    return north + moved[0], east + moved[1]
 
 
 def gnss_velocity(
@@ -96,6 +106,7 @@ def gnss_velocity(
     nominal: Point,
     a_n: Vector2,
     config: Config,
+    factor: float = 1.0,
 ) -> Taken:
     """Take the velocity of a fix; rows that hold GNSS and its velocity false see the rate of its error."""
     assert record.v_n is not None
@@ -112,7 +123,7 @@ def gnss_velocity(
         return np.broadcast_to(z, (len(bank.L), 2)), H
 
     stated = max(record.sigma_velocity or 0.0, config.gnss.sigma_velocity_m_s)
-    R = (stated**2 + channel.velocity_noise**2) * np.eye(2)
+    R = factor * (stated**2 + channel.velocity_noise**2) * np.eye(2)
     after, seen = banks.update(
         bank, layout, seen_by, None, R, None, known.settings, outlier=OUTLIER["velocity"], bears=True
     )
@@ -165,7 +176,13 @@ def corrector(bank: Bank, known: Hypotheses, rows: CorrectorRows) -> Taken:
 
 
 def sight(
-    bank: Bank, known: Hypotheses, z: Azimuth | Range, beacon: int, height_sigma: float, centre: Vector2
+    bank: Bank,
+    known: Hypotheses,
+    z: Azimuth | Range,
+    beacon: int,
+    height_sigma: float,
+    centre: Vector2,
+    factor: float = 1.0,
 ) -> Taken:
     """Take an azimuth or a range of beacon number `beacon`, linearised for each row about its own position.
 
@@ -197,12 +214,19 @@ def sight(
         lin = H[:, 0, 0] * x[:, 0] + H[:, 0, 1] * x[:, 1]
         return (innovation + lin)[:, None], H
 
-    R = np.array(((fix_observations.sight_variance(z, height_sigma),),))
+    R = np.array(((factor * fix_observations.sight_variance(z, height_sigma),),))
     kind = "azimuth" if isinstance(z, Azimuth) else "range"
     after, seen = banks.update(
         bank, layout, linearised, None, R, source, known.settings, outlier=OUTLIER[kind]
     )
     return _taken(after, seen, 1)
+
+
+def sight_residual(z: Azimuth | Range, centre: Vector2) -> float:
+    """Return an azimuth (rad) or a range (m) less that of the nominal point; `centre` as in `sight`."""
+    predicted, _, _ = fix_observations.predict_sight(z, np.array(((centre[1], centre[0], 0.0),)))
+    apart = z.value - float(predicted[0])
+    return wrap_angle(apart) if isinstance(z, Azimuth) else apart
 
 
 def _taken(bank: Bank, seen: Innovation, freedom: int) -> Taken:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import NamedTuple
 
 from companion.config import Config
@@ -16,6 +18,7 @@ from companion.navigator.inertial_track import Point
 from companion.navigator.minimax_bound import Guarantee
 from companion.navigator.own_channel import Sensors
 from companion.navigator.parallel_filters import Parallel
+from companion.navigator.scatter import Scatter
 from companion.navigator.trust import Held
 from companion.records import Gnss, LocalOrigin, LocalPosition, Output, RsbnFix, Source, Vector2
 from companion.units import SECOND_NS
@@ -75,6 +78,8 @@ class State(NamedTuple):
     certain_ns: tuple[int, ...] = ()  # since when each is false beyond doubt, 0 where it is not
     reported: tuple[int, ...] = ()  # what was last reported of each source: 0 used, 1 suspect, 2 excluded
     level: Level = Level()
+    moved: Vector2 = (0.0, 0.0)  # sum of the jumps of the nominal trajectory, north and east (m)
+    scatter: Mapping[str, Scatter] = MappingProxyType({})  # of the measurements, by name
     parallel: Parallel | None = None  # filters beside the bank
     gnss: Gnss | None = None  # the last new one, used or not
     gnss_used_ns: int | None = None  # when a fix was last taken up, used or not

@@ -29,6 +29,7 @@ from companion.navigator import (
     own_channel,
     own_error_model,
     parallel_filters,
+    scatter,
     strapdown_channel,
 )
 from companion.navigator.channel import Nominal, moved
@@ -382,6 +383,7 @@ def shifted(state: State, north: float, east: float, v_n: Vector2 = (0.0, 0.0), 
         pending = pending._replace(centre=(pending.centre[0] + north, pending.centre[1] + east))
     return state._replace(
         bank=bank,
+        moved=(state.moved[0] + north, state.moved[1] + east),
         protection=protection,
         guarantee=promise,
         parallel=parallel,
@@ -429,17 +431,22 @@ def _gnss(state: State, record: Gnss, settings: Settings) -> Step:
     known, channel, nominal = hypotheses(state, settings), settings.model.channel, state.nominal
     assert state.bank is not None
     assert nominal is not None
+    sigma = fix_observations.white_sigma(record, config)
+    residual = measurements.gnss_residual(record, nominal.point, state.moved)
+    state, factor, noted = _scattered(state, record, "gnss", residual, sigma**2)
+    assert state.bank is not None
     taken = measurements.gnss_position(
-        state.bank, known, channel, record, nominal.point, _velocity(state), settings.config
+        state.bank, known, channel, record, nominal.point, _velocity(state), settings.config, factor
     )
     bank, accepted = taken.bank, taken.accepted
     if config.use_velocity and record.v_n is not None:
         a_n = nominal.a_n
         bank = measurements.gnss_velocity(
-            bank, known, channel, record, nominal.point, a_n, settings.config
+            bank, known, channel, record, nominal.point, a_n, settings.config, factor
         ).bank
     state = state._replace(bank=bank, gnss_used_ns=record.t_ns, fixed=True)
     state, out = _decided(state, record, settings)
+    out = [*noted, *out]
     assert state.bank is not None
     if state.reported[GNSS] == EXCLUDED or not accepted:
         return _nearer(state, settings), [*out, _rejected(state, record, "gnss", GNSS, taken)]
@@ -472,13 +479,19 @@ def _rsbn(state: State, record: RsbnFix, settings: Settings) -> Step:
         if isinstance(z, Azimuth) and fix_observations.in_cone_of_silence(z, record.slant_range):
             continue
         source = known.azimuth(k) if isinstance(z, Azimuth) else known.range(k)
-        taken = measurements.sight(state.bank, known, z, k, height, centre)
+        label = f"{name} {'azimuth' if isinstance(z, Azimuth) else 'range'}"
+        metres = fix_observations.distance(z) if isinstance(z, Azimuth) else 1.0
+        still = (centre[0] - state.moved[0], centre[1] - state.moved[1])  # as if it had never jumped
+        residual = measurements.sight_residual(z, still)
+        variance = fix_observations.sight_variance(z, height)
+        state, factor, noted = _scattered(state, record, label, (residual,), variance, metres)
+        assert state.bank is not None
+        taken = measurements.sight(state.bank, known, z, k, height, centre, factor)
         state, more = _decided(state._replace(bank=taken.bank), record, settings)
-        out += more
+        out += [*noted, *more]
         assert state.bank is not None
         part = Source.AZIMUTH if isinstance(z, Azimuth) else Source.RANGE
         if state.reported[source] == EXCLUDED or not taken.accepted:
-            label = f"{name} {'azimuth' if isinstance(z, Azimuth) else 'range'}"
             out.append(_rejected(state, record, label, source, taken))
         elif state.false[source] < known.settings.suspect:
             believed |= part
@@ -570,6 +583,29 @@ def _rows_of(state: State, record: Any, settings: Settings) -> CorrectorRows | N
     if isinstance(record, StarFix):
         return corrector_measurements.star(channel, point, centre, record)
     return corrector_measurements.range_difference(channel, point, centre, record)
+
+
+def _scattered(
+    state: State,
+    record: Stamped,
+    name: str,
+    residual: tuple[float, ...],
+    variance: float,
+    metres: float = 1.0,
+) -> tuple[State, float, list[Output]]:
+    """With one more residual of a source; the factor of its stated variance; an event if that is news.
+
+    `metres` is the length of the residual's unit.
+    """
+    assert state.nominal is not None
+    interval = state.nominal.interval
+    lacking = scatter.LACKING.get("ins" if interval is None else interval.by, scatter.LACKING_ELSE)
+    seen = scatter.observe(
+        state.scatter.get(name), record.t_ns, residual, variance, lacking / max(metres, 1.0)
+    )
+    seen, text = scatter.report(seen, name)
+    out: list[Output] = [] if text is None else [Event(record.t_ns, record.rx_ns, Severity.NOTICE, text)]
+    return state._replace(scatter={**state.scatter, name: seen}), seen.variance, out
 
 
 def _beacon(state: State, record: RsbnFix, settings: Settings) -> tuple[State, int, list[Output]]:

@@ -107,7 +107,7 @@ def test_target_combines_the_quantities():
     assert horizon.combination(600.0, (0, 0, 1, 0)) == pytest.approx(row.velocity_mps)
     assert horizon.combination(600.0, (0, 0, 0, -2)) == pytest.approx(2 * row.drift_deg_h * DEG_PER_HOUR)
     both = horizon.combination(600.0, (1, 0, 60.0, 0))  # a sum is bounded by the sum of the bounds
-    assert both <= row.position_m + 60.0 * row.velocity_mps
+    assert both <= (row.position_m + 60.0 * row.velocity_mps) * (1.0 + 1e-9)
     answer = json.loads(run("--ahead-min", "5,10", "--target", "1,0,60,0", "--json").stdout)
     assert answer["target_bound"][1] == pytest.approx(both)
 

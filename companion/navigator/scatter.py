@@ -1,0 +1,72 @@
+"""How much noisier a source is than it states, by the scatter of its own measurements.
+
+With r a measurement minus what the nominal trajectory says, for three successive ones at equal distances
+
+    d = (r2 - 2 r1 + r0) / sqrt(6),  E d^2 = R + w,  w = (a dt^2)^2 / 6
+
+R is the variance of white noise. An offset, a rate and the slow errors of the channel are not in d: neither a
+spoofed GNSS nor a poor INS changes it; a is what the nominal trajectory's acceleration may lack. The mean of
+d^2 / (R + w), later surprises clipped, is a factor of the variance, and is used where it is above `FACTOR`.
+A source that states too little would otherwise be explained by one lie after another, and excluded.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+SILENT_S = 5.0  # after a longer silence the differences begin anew
+UNEQUAL = 1.5  # of two distances
+CLIPPED = 6.0  # times the mean
+FIRST, LAST = 10, 40  # measurements that the mean remembers, at the start and later
+FACTOR = 2.25  # of the variance: a smaller one may be chance
+MOST = 100.0
+REPORTED, FORGOTTEN = 4.0, 1.44  # the factor is reported above the one until it is below the other
+LACKING = {"ins": 0.0, "imu": 1.0}  # m/s^2, by what moves the nominal trajectory
+LACKING_ELSE = 3.0
+
+
+class Scatter(NamedTuple):
+    """Time and residual of the last measurement, distance (s) and residual of the one before; the factor, of
+    how many, and whether it was reported.
+    """
+
+    t_ns: int
+    last: tuple[float, ...]
+    dt: float = 0.0
+    before: tuple[float, ...] | None = None
+    factor: float = 1.0
+    many: int = 0
+    reported: bool = False
+
+    @property
+    def variance(self) -> float:
+        """Factor of the stated variance, 1 or more."""
+        return self.factor if self.factor > FACTOR else 1.0
+
+
+def observe(s: Scatter | None, t_ns: int, r: tuple[float, ...], variance: float, a: float) -> Scatter:
+    """Return the scatter with one more residual r, its stated variance, and a (unit of r / s^2)."""
+    if s is None:
+        return Scatter(t_ns, r)
+    dt = (t_ns - s.t_ns) * 1e-9
+    if not 0.0 < dt < SILENT_S:
+        return s if dt <= 0.0 else s._replace(t_ns=t_ns, last=r, dt=0.0, before=None)
+    if s.before is None or not 1.0 / UNEQUAL < dt / s.dt < UNEQUAL:
+        return s._replace(t_ns=t_ns, last=r, dt=dt, before=s.last)
+    squares = sum((r2 - 2.0 * r1 + r0) ** 2 for r0, r1, r2 in zip(s.before, s.last, r, strict=True)) / 6.0
+    ratio = squares / len(r) / (variance + (a * dt * dt) ** 2 / 6.0)
+    many = min(s.many + 1, LAST - FIRST)
+    most = CLIPPED * s.factor if s.many >= FIRST else MOST  # at the start the fixes themselves tell the scale
+    factor = s.factor + (min(ratio, most) - s.factor) / (FIRST + many)
+    return s._replace(t_ns=t_ns, last=r, dt=dt, before=s.last, factor=factor, many=many)
+
+
+def report(s: Scatter, name: str) -> tuple[Scatter, str | None]:
+    """Return the scatter, and what to report if its factor became great or small again."""
+    if not s.reported and s.factor > REPORTED:
+        text = f"{name} scatters {math.sqrt(s.factor):.1f} times as much as it states: used with that sigma"
+        return s._replace(reported=True), text
+    if s.reported and s.factor < FORGOTTEN:
+        return s._replace(reported=False), f"{name} scatters as it states again"
+    return s, None

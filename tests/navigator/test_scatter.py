@@ -1,0 +1,102 @@
+"""Scatter of a source's own measurements: found where it is misstated, blind to all that is slow."""
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from companion.navigator import scatter
+from companion.navigator.scatter import Scatter
+from companion.units import Floats
+
+STEP_NS = 200_000_000
+
+
+def observed(values: Floats, sigma: float = 1.0, a: float = 0.0) -> list[Scatter]:
+    """Scatter after each of the residuals (n, k), stated with `sigma`."""
+    found, s = [], None
+    for k, r in enumerate(values):
+        s = scatter.observe(s, k * STEP_NS, tuple(r), sigma**2, a)
+        found.append(s)
+    return found
+
+
+def noise(n: int = 400, seed: int = 1) -> Floats:
+    return np.random.default_rng(seed).standard_normal((n, 2))
+
+
+def test_honest_noise_is_used_as_stated() -> None:
+    used = [s.variance for seed in range(20) for s in observed(noise(seed=seed))]
+    assert np.mean(np.array(used) > 1.0) < 0.01
+
+
+@pytest.mark.parametrize("times", [2.0, 3.0, 10.0])
+def test_noise_greater_than_stated_is_found_within_four_seconds(times: float) -> None:
+    found = observed(times * noise())
+    assert np.mean([math.sqrt(s.variance) for s in found[20:]]) == pytest.approx(times, rel=0.15)
+
+
+SLOW: dict[str, Callable[[Floats], Floats]] = {
+    "offset of a kilometre": lambda t: np.full_like(t, 1000.0),
+    "drawn off at 5 m/s": lambda t: 5.0 * np.maximum(t - 30.0, 0.0),
+    "drawn off with 0.1 m/s^2": lambda t: 0.05 * t**2,
+    "Schuler oscillation of an INS": lambda t: 5000.0 * np.sin(1.24e-3 * t),
+    "jump by 300 m": lambda t: 300.0 * (t > 30.0),
+}
+
+
+@pytest.mark.parametrize("lie", SLOW)
+def test_a_lie_does_not_make_its_own_noise(lie: str) -> None:
+    t = np.arange(400) * STEP_NS * 1e-9
+    honest, false = observed(noise()), observed(noise() + SLOW[lie](t)[:, None])
+    apart = [abs(a.factor - b.factor) for a, b in zip(honest, false, strict=True)]
+    # a jump is in three differences, each clipped; a rate of 5 m/s begins with 1 m in one of them
+    assert max(apart) < (0.6 if "jump" in lie else 0.05)
+    assert max(s.variance for s in false) == 1.0
+
+
+@given(st.floats(1e-3, 1e3), st.floats(0.0, 1e4))
+def test_the_unit_does_not_matter(unit: float, offset: float) -> None:
+    one = observed(3.0 * noise(60))[-1].factor
+    other = observed(unit * (3.0 * noise(60) + offset), sigma=unit)[-1].factor
+    assert other == pytest.approx(one, rel=1e-5)
+
+
+def test_what_the_nominal_trajectory_lacks_is_not_the_sources() -> None:
+    """A velocity that is held for a second while the acceleration is 3 m/s^2, and a fix of 0.5 m."""
+    rng = np.random.default_rng(1)
+    r = np.cumsum(np.cumsum(rng.choice([-3.0, 3.0], (200, 2)), 0), 0) * 0.5 + 0.5 * rng.standard_normal(
+        (200, 2)
+    )
+
+    def last(a: float) -> float:
+        s = None
+        for k, one in enumerate(r):
+            s = scatter.observe(s, k * 1_000_000_000, tuple(one), 0.25, a)
+        assert s is not None
+        return s.variance
+
+    assert last(3.0) == 1.0
+    assert last(0.0) > 2.0
+
+
+def test_a_silence_and_an_unequal_distance_begin_anew() -> None:
+    s = observed(noise(50))[-1]
+    later = scatter.observe(s, s.t_ns + 10 * STEP_NS, (1e3, 1e3), 1.0, 0.0)
+    assert later.factor == s.factor
+    after = scatter.observe(s, s.t_ns + 100 * STEP_NS, (1e3, 1e3), 1.0, 0.0)
+    assert (after.factor, after.before) == (s.factor, None)
+    assert scatter.observe(s, s.t_ns, (1e3, 1e3), 1.0, 0.0) is s
+
+
+def test_it_is_reported_once_and_once_when_it_is_over() -> None:
+    texts = []
+    s = None
+    for k, r in enumerate(np.concatenate([noise(100), 4.0 * noise(100, 2), noise(300, 3)])):
+        s, text = scatter.report(scatter.observe(s, k * STEP_NS, tuple(r), 1.0, 0.0), "gnss")
+        texts += [text] if text else []
+    assert [text.split(" times")[0][:13] for text in texts] == ["gnss scatters", "gnss scatters"]
+    assert "as much as it states" in texts[0] and texts[1] == "gnss scatters as it states again"
