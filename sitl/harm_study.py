@@ -30,9 +30,10 @@ from rich.table import Table
 from threadpoolctl import threadpool_limits
 
 from companion.config import Config, InertialConfig, OutputConfig
+from companion.nav.geometry import displace
 from companion.navigator import Navigator
 from companion.output.source_switch import SourceSwitch
-from companion.records import Event, Gnss, LocalOrigin, Solution
+from companion.records import Event, Gnss, LocalOrigin, RsbnFix, Solution, Stamped
 from companion.runtime.core import CompanionCore
 from companion.tables import print_tables
 from companion.units import SECOND_NS, Floats
@@ -47,6 +48,7 @@ from sitl.scenarios import Scenario, SensorRates
 from sitl.world import World
 
 START_S = 120.0  # something goes wrong from here on, unless it is wrong from the start
+GNSS_NOISE_M = 0.8  # white noise of the simulated receiver, one sigma per axis
 WINDOW_S, MOST_RATIO, FREE_M = 10.0, 1.2, 3.0
 INS = ("INS navigation", "INS MEMS")
 OWN = ("air data", "stock")
@@ -63,6 +65,7 @@ class Wrong(NamedTuple):
     fault: Fault | None = None
     airspeed_sensor: bool = True
     stated: float = 1.0  # stated errors of the INS, as a multiple of the true ones
+    noisy: type[Stamped] | None = None  # kind of fixes three times as noisy as stated
     rate_hz: float | None = None
     feeds: bool = True  # a position is sent to the autopilot
     stall_s: float = 0.0
@@ -102,6 +105,8 @@ WRONG: dict[str, Wrong] = {
     "GNSS 0.1 s late": _beacon("gnss-latency", 0.1, 0.0),
     "GNSS 0.2 s late": _beacon("gnss-latency", 0.2, 0.0),
     "GNSS 0.3 s late": _beacon("gnss-latency", 0.3, 0.0),
+    "GNSS 3x as noisy as stated": Wrong(noisy=Gnss),
+    "beacon 3x as noisy as stated": Wrong(noisy=RsbnFix),
     "stall of 0.3 s": Wrong(stall_s=0.3, over_link=True),
     "stall of 1 s": Wrong(stall_s=1.0, over_link=True),
     "stall of 5 s": Wrong(stall_s=5.0, over_link=True),
@@ -217,7 +222,10 @@ def _fly_records(scenario: Scenario, order: HarmOrder) -> _Flown:
     start = LocalOrigin(0, 0, origin.lat, origin.lon, origin.alt - scenario.geoid_height, scenario.autopilot)
     streams = (world.streams[kind] for kind in sensors_of(config))
     solutions, events, set_2, next_ns = list[Solution](), list[Event](), False, 0
+    noisy, rng = WRONG[order.wrong].noisy, np.random.default_rng(order.seed)
     for record in chain([start], heapq.merge(*streams, key=attrgetter("rx_ns"))):
+        if noisy is not None and isinstance(record, noisy):
+            record = noisier(record, rng)
         if isinstance(record, Gnss):
             switch.receive(record)
         for output in navigator.handle(record):  # type: ignore[arg-type]
@@ -231,6 +239,22 @@ def _fly_records(scenario: Scenario, order: HarmOrder) -> _Flown:
             next_ns = record.rx_ns + SECOND_NS
             set_2 = bool(set_2_requests(switch, record.rx_ns)) or set_2
     return world, solutions, events, set_2
+
+
+def noisier(record: Stamped, rng: np.random.Generator) -> Stamped:
+    """Return a fix with three times the white noise that it states."""
+    more = math.sqrt(3.0**2 - 1.0) * rng.standard_normal(2)
+    if isinstance(record, Gnss):
+        north, east = GNSS_NOISE_M * more
+        place = displace(record.lat, record.lon, record.alt_msl, north, east, 0.0)
+        return replace(record, lat=place.lat, lon=place.lon)
+    assert isinstance(record, RsbnFix)
+    azimuth, slant_range = record.azimuth, record.slant_range
+    return replace(
+        record,
+        azimuth=None if azimuth is None else (azimuth + more[0] * record.sigma_azimuth) % math.tau,
+        slant_range=None if slant_range is None else slant_range + more[1] * record.sigma_range,
+    )
 
 
 def _fly_link(scenario: Scenario, order: HarmOrder) -> _Flown:

@@ -95,7 +95,7 @@ class Amplitudes(NamedTuple):
     hold_m_s_sqrt_s: float = 2.0
     gust_along_m_s: float = 1.2
     gust_across_m_s: float = 1.0
-    gust_s: float = 3.0
+    gust_s: float = 2.0
     drift_m: float = 1.5
     drift_s: float = 300.0
     foreign_m_s: float = 0.3

@@ -18,7 +18,7 @@ from typing import NamedTuple
 SILENT_S = 5.0  # after a longer silence the differences begin anew
 UNEQUAL = 1.5  # of two distances
 CLIPPED = 6.0  # times the mean
-FIRST, LAST = 10, 40  # measurements that the mean remembers, at the start and later
+FIRST, LAST = 4, 40  # measurements that the mean remembers, at the start and later
 FACTOR = 2.25  # of the variance: a smaller one may be chance
 MOST = 100.0
 REPORTED, FORGOTTEN = 4.0, 1.44  # the factor is reported above the one until it is below the other
