@@ -14,6 +14,7 @@ import numpy as np
 from msgspec import structs
 
 from companion.config import AirDataConfig, Config
+from companion.estimate import bank as banks
 from companion.estimate.bank import (
     Bank,
     Fault,
@@ -29,6 +30,7 @@ from companion.navigator.channel import Channel, Nominal, Transition
 from companion.navigator.corrected_ins import corrected_ins
 from companion.navigator.own_channel import OwnChannel
 
+POSITION = (0, 1)  # states
 GNSS, AIRSPEED = 0, 1  # sources; those of beacon k are `azimuth(k)` and `range(k)`
 CONSISTENT, POSITION_ONLY = 0, 1  # faults of GNSS: its velocity is false too, or true
 GNSS_GROUP, BEACON_GROUP, AIRSPEED_GROUP = 0, 1, 2
@@ -42,6 +44,7 @@ SILENCE_S = 5.0  # airspeed that is not used for longer is not judged
 MOST_BEACONS = 8  # followed at once: the work grows with their number
 BIAS_HOUR = 0.5  # a beacon's bias walks in an hour by this share of what it may be
 
+STILL = 3e-3  # m/s: a lie that stands still must not pay for a rate, or a beacon is blamed for it
 #: Offsets (m) and rates (m/s) of a false GNSS: several scales, or a wide prior makes a small lie improbable.
 GNSS_LIES = (
     Lie(3.0, 0.3),
@@ -53,7 +56,7 @@ GNSS_LIES = (
     Lie(300.0, 1.0, noise=0.01),
 )
 ELSEWHERE = (Lie(300.0, 1e-3), Lie(3000.0, 1e-3))  # displacement of a beacon whose stated position is wrong
-GNSS_FIRST = (Lie(60.0, 0.3), Lie(300.0, 0.3), Lie(2000.0, 0.3))
+GNSS_FIRST = (Lie(60.0, 0.3), Lie(300.0, 0.3), Lie(2000.0, 0.3), Lie(300.0, STILL), Lie(2000.0, STILL))
 AIRSPEED_LIES = (Lie(3.0, 0.03), Lie(15.0, 0.3))  # m/s, m/s^2
 SHOCK = ((0, 15.0), (1, 15.0), (2, 15.0), (3, 15.0))  # of a false airspeed that moves the nominal: m, m/s
 SURPRISE = (
@@ -125,6 +128,17 @@ class Model:
         """The bank with one beacon more than `beacons`, its biases unknown."""
         old, new = self.hypotheses(beacons), self.hypotheses(beacons + 1)
         return enlarge(bank, old.layout, new.layout, np.square(new.biases[-2:]))
+
+    def doubted(self, bank: Bank) -> Bank:
+        """The bank with a first beacon: it may tell that GNSS was false from its first fix on.
+
+        An INS could have told that before; the own channel is no witness.
+        """
+        if not self.channel.wind or self.plain is not None:
+            return bank
+        known, still = self.hypotheses(1), tuple(lie for lie in GNSS_FIRST if lie.rate == STILL)
+        lies = {i: still for i, fault in enumerate(known.layout.faults) if fault.sources == (GNSS,)}
+        return banks.false_since_first(bank, known.layout, known.settings, lies, POSITION)
 
     def transition(self, nominal: Nominal, beacons: int) -> Transition:
         """Phi (n, n) and Q (grades, n_base, n_base) over all states, the lies' motion left to the bank."""

@@ -629,6 +629,8 @@ def _beacon(state: State, record: RsbnFix, settings: Settings) -> tuple[State, i
     new = Beacon(record.beacon, place, t_ns)
     if len(state.beacons) < MOST_BEACONS:
         larger = settings.model.with_beacon(bank, len(state.beacons))
+        if not state.beacons and state.gnss_used_ns is not None:
+            larger = settings.model.doubted(larger)
         state = state._replace(bank=larger, beacons=(*state.beacons, new))
         state = state._replace(false=(*state.false, 0.0, 0.0), reported=(*state.reported, 0, 0))
         return state, len(state.beacons) - 1, []

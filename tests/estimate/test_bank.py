@@ -522,6 +522,51 @@ def test_lies_from_the_first_measurement_are_hypotheses():
     assert abs(history[-1][2]) < 10.0
 
 
+def test_a_source_doubted_late_is_as_one_that_lied_from_the_first_measurement_on():
+    """An offset that stands still: what the source told of the position is taken back, and nothing else."""
+    rng, offset, wide = np.random.default_rng(1), 30.0, 1e4
+    zs = 100.0 + np.cumsum(rng.standard_normal(40))
+    # Kalman filter of position, velocity and offset; nothing is known of the first two
+    x, P = np.zeros(3), np.diag([wide**2, wide**2, offset**2])
+    row = np.array([[1.0, 0.0, 1.0]])
+    for k, z in enumerate(zs):
+        if k:
+            F = np.eye(3)
+            F[:2, :2] = PHI
+            x, P = F @ x, F @ P @ F.T
+            P[:2, :2] += Q
+        K = P @ row.T / (row @ P @ row.T + R)
+        x, P = x + K[:, 0] * (z - row @ x), P - K @ row @ P
+    layout = scalar_layout(first=0.1)
+    bank = b.start(layout, 0.0, np.zeros(2), np.eye(2) * wide**2)._replace(seen=np.zeros(1))
+    plain = Settings(surprise=math.inf)
+    for k, z in enumerate(zs):
+        if k:
+            bank = b.propagate(bank, layout, 1.0, PHI, Q)
+        bank, _ = b.update(bank, layout, np.array([z]), H, R, 0, plain)
+    doubted = b.false_since_first(bank, layout, plain, {0: (Lie(offset, 0.0),)}, (0,))
+    (row_of_fault,) = np.flatnonzero(doubted.fault[:, 0] == 0)
+    used = np.ix_([0, 1, 2], [0, 1, 2])  # the rate is zero
+    assert doubted.x[row_of_fault][:3] == pytest.approx(x, abs=0.05)
+    assert doubted.P[row_of_fault][used] == pytest.approx(P, abs=0.05)
+    assert math.exp(doubted.L[row_of_fault]) == pytest.approx(0.1)
+    (honest,) = np.flatnonzero(doubted.fault[:, 0] == NONE)
+    np.testing.assert_array_equal(doubted.x[honest], bank.x[0])
+
+
+def test_a_family_keeps_its_grades():
+    """Of many rows of a false source the heaviest of each grade stays, however light."""
+    layout = flight_layout(grades=(1.0, 1.0, 1.0))
+    bank = b.start(layout, 0.0, np.zeros(layout.n_base), np.eye(layout.n_base), layout.grades)
+    bank = b.births(bank._replace(t=5.0), layout, Settings(rows=500, parents=0))
+    bank = b.births(bank._replace(t=10.0), layout, Settings(rows=500, parents=0))
+    false = bank.fault[:, 0] != NONE
+    lighter = bank._replace(L=normalised(bank.L - 4.0 * bank.grade))
+    kept = b.reduce(lighter, layout, Settings(rows=40))
+    for fault in np.unique(lighter.fault[false, 0]):
+        assert set(kept.grade[kept.fault[:, 0] == fault]) == {0, 1, 2}
+
+
 def test_jump_of_a_base_state_is_no_fault_of_a_source():
     layout = replace(flight_layout(), jumps=(Jump("channel", (0,), (50.0,), 1.0),))
     settings = Settings(rows=32)

@@ -39,7 +39,7 @@ readout     estimate, probabilities, decisions
 protection  protection level of a sum of Gaussians
 """
 
-from companion.estimate.bank.branching import births, births_due
+from companion.estimate.bank.branching import births, births_due, false_since_first
 from companion.estimate.bank.layout import NEVER, NONE, Bools, Fault, Ints, Jump, Layout, Lie, Source
 from companion.estimate.bank.protection import exceedance, level
 from companion.estimate.bank.readout import (
@@ -91,6 +91,7 @@ __all__ = [
     "exceedance",
     "explanations",
     "false_probability",
+    "false_since_first",
     "families",
     "fault_probability",
     "grade_probability",

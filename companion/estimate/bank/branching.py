@@ -29,6 +29,7 @@ class _Child(NamedTuple):
     lie: Lie | None = None
     scale: int = 0
     ends: bool = False
+    undone: tuple[int, ...] = ()
     jump: int = NONE
     grade: int = NONE
 
@@ -126,6 +127,37 @@ def returns(bank: Bank, layout: Layout, source: int, settings: Settings) -> tupl
     return grown, True
 
 
+def false_since_first(
+    bank: Bank, layout: Layout, settings: Settings, lies: dict[int, tuple[Lie, ...]], states: tuple[int, ...]
+) -> Bank:
+    """Bear children whose source was false by an offset that stood still since its first measurement.
+
+    For a source that could not be doubted before. What it told of the base states is taken back: their sum
+    with the lie, which was measured, stays known, and each alone becomes as unknown as the lie.
+
+    Parameters
+    ----------
+    bank, layout, settings : the bank.
+    lies : scales of the lie by fault, at the prior of its first measurement.
+    states : the base states that the source measures, in the order of its lie.
+
+    Returns
+    -------
+    Bank : with at most `settings.rows` rows.
+    """
+    heaviest: dict[int, int] = {}
+    for i in np.argsort(-bank.L).tolist():
+        heaviest.setdefault(int(bank.grade[i]), i)
+    children = [
+        child._replace(undone=states)
+        for f, scales in lies.items()
+        for p in heaviest.values()
+        if bank.fault[p, layout.fault_group(f)] == NONE
+        for child in _lie_children(p, f, scales, layout.faults[f].first)
+    ]
+    return reduce(_with_children(bank, layout, children), layout, settings)
+
+
 def _lie_children(parent: int, fault: int, lies: tuple[Lie, ...], prior: float) -> list[_Child]:
     """Children of one parent for one fault, one for each scale of the lie."""
     total = sum(lie.share for lie in lies)
@@ -211,6 +243,10 @@ def _with_children(bank: Bank, layout: Layout, children: list[_Child]) -> Bank:
             for state, sigma in layout.faults[c.fault].shock:
                 P[i, state, state] += sigma**2
             P[i, index, index] += variance
+            for state, lie, s2 in zip(c.undone, index.tolist(), variance.tolist()):
+                P[i, state, state] += s2
+                P[i, state, lie] -= s2
+                P[i, lie, state] -= s2
             noise[i, places] = density
             fault[i, layout.fault_group(c.fault)], event[i], scale[i] = c.fault, 1 + c.fault, c.scale
         elif c.jump != NONE:

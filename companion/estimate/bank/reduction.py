@@ -17,10 +17,11 @@ def reduce(bank: Bank, layout: Layout, settings: Settings) -> Bank:
     """Reduce the bank to `settings.rows` rows.
 
     Within a class (family, last event, whether the lie's rate changes, bin of age) the heaviest and the
-    oldest row are kept first, and in the young bins the heaviest of each scale. Protected are the rows that
-    carry the weight, the heaviest of each fault and of each grade, and those that set the protection level.
-    A dropped row merges by moments with a row of its label if their weights are alike; else its weight goes
-    to the heaviest of its class.
+    oldest row are kept first, in the young bins the heaviest of each scale, and of each family the heaviest
+    of each grade: a family that has lost the right grade loses to one that has it. Protected are the rows
+    that carry the weight, the heaviest of each fault and of each grade, and those that set the protection
+    level. A dropped row merges by moments with a row of its label if their weights are alike; else its weight
+    goes to the heaviest of its class.
 
     Parameters
     ----------
@@ -58,7 +59,7 @@ def reduce(bank: Bank, layout: Layout, settings: Settings) -> Bank:
     oldest: dict[tuple[int, int, int], int] = {}
     by_fault: set[int] = set()
     by_scale: set[tuple[int, ...]] = set()
-    grades: set[int] = set()
+    graded: set[tuple[int, int]] = set()
     for i in order:
         key = keys[i]
         if key not in heaviest:
@@ -74,9 +75,9 @@ def reduce(bank: Bank, layout: Layout, settings: Settings) -> Bank:
         if key[0] not in by_fault and active[i] <= 1:
             by_fault.add(key[0])
             rank[i] = 0
-        if key[0] == 0 and grade[i] not in grades:
-            grades.add(grade[i])
-            rank[i] = 0
+        if active[i] <= 1 and (key[0], grade[i]) not in graded:
+            graded.add((key[0], grade[i]))
+            rank[i] = 0 if key[0] == 0 else min(rank[i], 1)
     for i in oldest.values():
         rank[i] = min(rank[i], 2)
     for i in range(rows):
