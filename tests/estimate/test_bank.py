@@ -555,7 +555,7 @@ def test_a_source_doubted_late_is_as_one_that_lied_from_the_first_measurement_on
 
 
 def test_a_family_keeps_its_grades():
-    """Of many rows of a false source the heaviest of each grade stays, long after its onset and however light."""
+    """The heaviest row of each grade stays, long after the onset and however light it is."""
     layout = flight_layout(grades=(1.0, 1.0, 1.0))
     bank = b.start(layout, 0.0, np.zeros(layout.n_base), np.eye(layout.n_base), layout.grades)
     for t in (5.0, 10.0, 15.0):
