@@ -91,7 +91,7 @@ class Amplitudes(NamedTuple):
     accelerometer_m_s2: float = 0.1
     accelerometer_s: float = 600.0
     velocity_noise_m_s_sqrt_s: float = 0.25
-    manoeuvre_sqrt_s: float = 0.05  # velocity noise per horizontal acceleration
+    manoeuvre_sqrt_s: float = 0.1  # velocity noise per horizontal acceleration; 0.05 doubts GNSS in turns
     hold_m_s_sqrt_s: float = 2.0
     gust_along_m_s: float = 1.2
     gust_across_m_s: float = 1.0

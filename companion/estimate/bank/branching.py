@@ -165,14 +165,14 @@ def _lie_children(parent: int, fault: int, lies: tuple[Lie, ...], prior: float) 
 
 
 def _grade_children(bank: Bank, layout: Layout, settings: Settings, hours: float) -> list[_Child]:
-    """The heaviest row with another grade, where no row of that grade is as heavy as a switch's prior."""
+    """The heaviest row with another grade, where no row of its family has it with the weight of a switch."""
     if settings.switch_h <= 0.0 or len(layout.grades) < 2:
         return []
-    best = int(np.argmax(bank.L))
+    best, family = int(np.argmax(bank.L)), families(bank)
     prior = _log(settings.switch_h * hours / (len(layout.grades) - 1))
     out = []
     for g in range(len(layout.grades)):
-        rows = bank.grade == g
+        rows = (bank.grade == g) & (family == family[best])
         if g != bank.grade[best] and (not rows.any() or bank.L[rows].max() < bank.L[best] + prior):
             out.append(_Child(best, prior, grade=g))
     return out

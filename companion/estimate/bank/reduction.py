@@ -75,7 +75,8 @@ def reduce(bank: Bank, layout: Layout, settings: Settings) -> Bank:
         if key[0] not in by_fault and active[i] <= 1:
             by_fault.add(key[0])
             rank[i] = 0
-        if active[i] <= 1 and (key[0], grade[i]) not in graded:
+        alive = logs[i] >= settings.class_floor
+        if alive and active[i] <= 1 and (key[0], grade[i]) not in graded:
             graded.add((key[0], grade[i]))
             rank[i] = 0 if key[0] == 0 else min(rank[i], 1)
     for i in oldest.values():
@@ -111,7 +112,7 @@ def _quota(layout: Layout, fault: list[int]) -> int:
     if len(active) > 1:
         return 3
     if active:
-        return layout.faults[active[0]].quota
+        return max(layout.faults[active[0]].quota, len(layout.grades) + 1)
     return len(layout.grades) + sum(j.quota for j in layout.jumps) + 2
 
 
