@@ -45,8 +45,8 @@ def test_healthy_gnss_is_kept_and_leads(name: str, monkeypatch: pytest.MonkeyPat
 
 @pytest.mark.parametrize("name", ["plane_turbulence_cut", "plane_turn_cut"])
 def test_a_turn_in_turbulence_with_a_beacon_leaves_a_healthy_gnss_beyond_doubt(name: str) -> None:
-    # one bank excluded GNSS 89 s after the start of the first log, and led the aircraft 148 m off; a later one
-    # held it false with probability 0.998 in the second
+    # one bank excluded GNSS 89 s after the start of the first log, and led the aircraft 148 m off; a later
+    # one held it false with probability 0.998 in the second
     decoder = msgspec.json.Decoder(Input)
     navigator = Navigator(load(flags={"output.profile": "ardupilot"}, environment={}))
     fix, apart, rejected, doubt = None, [], [], 0.0
