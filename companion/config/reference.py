@@ -188,7 +188,7 @@ TEXTS: dict[str, dict[str, tuple[str, str]]] = {
     },
     "integrity": {
         "rows": (
-            "Hypotheses followed at once; 0: 72 on an INS of its own, else 96.",
+            "Hypotheses followed at once. With too few a slow spoofer, or the right grade of an INS, is lost.",
             "the computer is slow: fewer",
         ),
         "risk": ("Probability that the protection level is exceeded.", "the mission states its risk"),

@@ -184,7 +184,7 @@ class IntegrityConfig(Section, frozen=True):
     below `alert_m` and no source is suspect; it improves after `settle_s` without interruption.
     """
 
-    rows: Annotated[int, Meta(ge=0, le=192)] = 0  # hypotheses followed at once; 0: 72 on an INS, else 96
+    rows: Annotated[int, Meta(ge=8, le=192)] = 96  # hypotheses followed at once
     risk: Annotated[float, Meta(ge=1e-12, le=0.5)] = 1e-7
     alert_m: Annotated[float, Meta(ge=1.0, le=100000.0)] = 500.0
     settle_s: Annotated[float, Meta(ge=0.0, le=600.0)] = 10.0

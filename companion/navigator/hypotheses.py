@@ -238,7 +238,7 @@ def _hypotheses(config: Config, channel: Channel, beacons: int, by_air: bool, wi
     )
     settings = Settings(
         surprise=SURPRISE,
-        rows=config.integrity.rows or (72 if config.has_own_ins else 96),
+        rows=config.integrity.rows,
         risk=config.integrity.risk,
     )
     return Hypotheses(layout, settings, (azimuth_bias, range_bias) * beacons)

@@ -75,7 +75,7 @@ def reduce(bank: Bank, layout: Layout, settings: Settings) -> Bank:
         if key[0] not in by_fault and active[i] <= 1:
             by_fault.add(key[0])
             rank[i] = 0
-        alive = logs[i] >= settings.class_floor
+        alive = key[0] == 0 or logs[i] >= settings.class_floor
         if alive and active[i] <= 1 and (key[0], grade[i]) not in graded:
             graded.add((key[0], grade[i]))
             rank[i] = 0 if key[0] == 0 else min(rank[i], 1)
