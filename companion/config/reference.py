@@ -188,7 +188,7 @@ TEXTS: dict[str, dict[str, tuple[str, str]]] = {
     },
     "integrity": {
         "rows": (
-            "Hypotheses followed at once. With too few a slow spoofer, or the right grade of an INS, is lost.",
+            "Hypotheses followed at once. With too few a slow spoofer, or an INS's right grade, is lost.",
             "the computer is slow: fewer",
         ),
         "risk": ("Probability that the protection level is exceeded.", "the mission states its risk"),
