@@ -44,6 +44,9 @@ SILENCE_S = 5.0  # airspeed that is not used for longer is not judged
 MOST_BEACONS = 8  # followed at once: the work grows with their number
 BIAS_HOUR = 0.5  # a beacon's bias walks in an hour by this share of what it may be
 
+#: A lie that stood still from the first fix on is not pruned by its rate, and its end looks like a jump: with
+#: greater priors (shares below) a jump of 300 m is not beyond doubt for minutes.
+DOUBTED = 1e-5  # that GNSS was false before the first beacon
 STILL = 3e-3  # m/s: a lie that stands still must not pay for a rate, or a beacon is blamed for it
 #: Offsets (m) and rates (m/s) of a false GNSS: several scales, or a wide prior makes a small lie improbable.
 GNSS_LIES = (
@@ -56,7 +59,13 @@ GNSS_LIES = (
     Lie(300.0, 1.0, noise=0.01),
 )
 ELSEWHERE = (Lie(300.0, 1e-3), Lie(3000.0, 1e-3))  # displacement of a beacon whose stated position is wrong
-GNSS_FIRST = (Lie(60.0, 0.3), Lie(300.0, 0.3), Lie(2000.0, 0.3), Lie(300.0, STILL), Lie(2000.0, STILL))
+GNSS_FIRST = (
+    Lie(60.0, 0.3),
+    Lie(300.0, 0.3),
+    Lie(2000.0, 0.3),
+    Lie(300.0, STILL, share=0.05),
+    Lie(2000.0, STILL, share=0.05),
+)
 AIRSPEED_LIES = (Lie(3.0, 0.03), Lie(15.0, 0.3))  # m/s, m/s^2
 SHOCK = ((0, 15.0), (1, 15.0), (2, 15.0), (3, 15.0))  # of a false airspeed that moves the nominal: m, m/s
 SURPRISE = (
@@ -138,7 +147,7 @@ class Model:
             return bank
         known, still = self.hypotheses(1), tuple(lie for lie in GNSS_FIRST if lie.rate == STILL)
         lies = {i: still for i, fault in enumerate(known.layout.faults) if fault.sources == (GNSS,)}
-        return banks.false_since_first(bank, known.layout, known.settings, lies, POSITION)
+        return banks.false_since_first(bank, known.layout, known.settings, lies, DOUBTED, POSITION)
 
     def transition(self, nominal: Nominal, beacons: int) -> Transition:
         """Phi (n, n) and Q (grades, n_base, n_base) over all states, the lies' motion left to the bank."""

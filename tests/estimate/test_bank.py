@@ -537,14 +537,14 @@ def test_a_source_doubted_late_is_as_one_that_lied_from_the_first_measurement_on
             P[:2, :2] += Q
         K = P @ row.T / (row @ P @ row.T + R)
         x, P = x + K[:, 0] * (z - row @ x), P - K @ row @ P
-    layout = scalar_layout(first=0.1)
+    layout = scalar_layout()
     bank = b.start(layout, 0.0, np.zeros(2), np.eye(2) * wide**2)._replace(seen=np.zeros(1))
     plain = Settings(surprise=math.inf)
     for k, z in enumerate(zs):
         if k:
             bank = b.propagate(bank, layout, 1.0, PHI, Q)
         bank, _ = b.update(bank, layout, np.array([z]), H, R, 0, plain)
-    doubted = b.false_since_first(bank, layout, plain, {0: (Lie(offset, 0.0),)}, (0,))
+    doubted = b.false_since_first(bank, layout, plain, {0: (Lie(offset, 0.0),)}, 0.1, (0,))
     (row_of_fault,) = np.flatnonzero(doubted.fault[:, 0] == 0)
     used = np.ix_([0, 1, 2], [0, 1, 2])  # the rate is zero
     assert doubted.x[row_of_fault][:3] == pytest.approx(x, abs=0.05)

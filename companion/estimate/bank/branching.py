@@ -128,7 +128,12 @@ def returns(bank: Bank, layout: Layout, source: int, settings: Settings) -> tupl
 
 
 def false_since_first(
-    bank: Bank, layout: Layout, settings: Settings, lies: dict[int, tuple[Lie, ...]], states: tuple[int, ...]
+    bank: Bank,
+    layout: Layout,
+    settings: Settings,
+    lies: dict[int, tuple[Lie, ...]],
+    prior: float,
+    states: tuple[int, ...],
 ) -> Bank:
     """Bear children whose source was false by an offset that stood still since its first measurement.
 
@@ -138,7 +143,8 @@ def false_since_first(
     Parameters
     ----------
     bank, layout, settings : the bank.
-    lies : scales of the lie by fault, at the prior of its first measurement.
+    lies : scales of the lie by fault.
+    prior : probability of each fault.
     states : the base states that the source measures, in the order of its lie.
 
     Returns
@@ -153,7 +159,7 @@ def false_since_first(
         for f, scales in lies.items()
         for p in heaviest.values()
         if bank.fault[p, layout.fault_group(f)] == NONE
-        for child in _lie_children(p, f, scales, layout.faults[f].first)
+        for child in _lie_children(p, f, scales, prior)
     ]
     return reduce(_with_children(bank, layout, children), layout, settings)
 
