@@ -40,7 +40,7 @@ def test_slow_spoofing_beside_one_beacon_stays_within_the_protection_level() -> 
 
 @pytest.mark.parametrize("scenario", ["mems", "air-data", "stock"])
 def test_gnss_that_is_false_from_the_first_fix_stays_within_the_protection_level(scenario: str) -> None:
-    """By 450 m, until 540 s: a beacon at a wrong place looks the same and is likelier, but both are possible."""
+    """By 450 m, until 540 s: a beacon at a wrong place looks the same and is likelier; both are possible."""
     result = fly_order(FlightOrder(scenario, "gnss-first-450", 1))
     assert result.raised is None
     assert (result.misleading_s, result.beyond_s) == (0.0, 0.0)
