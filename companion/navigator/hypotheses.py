@@ -139,9 +139,9 @@ class Model:
         return enlarge(bank, old.layout, new.layout, np.square(new.biases[-2:]))
 
     def doubted(self, bank: Bank) -> Bank:
-        """The bank with a first beacon: it may tell that GNSS was false from its first fix on.
+        """The bank with a first beacon: it may show that GNSS was false from its first fix on.
 
-        An INS could have told that before; the own channel is no witness.
+        An INS could have shown that before; the own channel is no witness.
         """
         if not self.channel.wind or self.plain is not None:
             return bank

@@ -63,28 +63,25 @@ def gnss_position(
     bank: Bank,
     known: Hypotheses,
     channel: Channel,
-    record: Gnss,
-    nominal: Point,
+    apart: Vector2,
+    variance: float,
     v_n: Vector2,
-    config: Config,
-    factor: float = 1.0,
 ) -> Taken:
     """Take the position of a fix: nominal minus GNSS is the error less drift, plus latency times velocity.
 
-    `factor` of the stated variance, by the scatter of the fixes; so below.
+    `apart` is GNSS minus nominal (m), `variance` that of its white noise (m^2).
     """
-    north, east = gnss_residual(record, nominal, (0.0, 0.0))
+    north, east = apart
     H = np.zeros((2, known.layout.n_base))
     H[0, 0] = H[1, 1] = 1.0
     H[:, channel.drift] = -np.eye(2)
     H[:, channel.latency] = v_n
-    sigma = fix_observations.white_sigma(record, config.gnss)
     after, seen = banks.update(
         bank,
         known.layout,
         np.array((-north, -east)),
         H,
-        factor * sigma**2 * np.eye(2),
+        variance * np.eye(2),
         GNSS,
         known.settings,
         outlier=OUTLIER["position"],
@@ -92,10 +89,10 @@ def gnss_position(
     return _taken(after, seen, 2)
 
 
-def gnss_residual(record: Gnss, nominal: Point, moved: Vector2) -> Vector2:
-    """Return the position of a fix less the nominal one before it `moved`, north and east (m)."""
+def gnss_apart(record: Gnss, nominal: Point) -> Vector2:
+    """Return the position of a fix less the nominal one, north and east (m)."""
     north, east, _ = separation_tuple(Geodetic(record.lat, record.lon, record.alt_msl), nominal.position)
-    return north + moved[0], east + moved[1]
+    return north, east
 
 
 def gnss_velocity(
@@ -108,7 +105,10 @@ def gnss_velocity(
     config: Config,
     factor: float = 1.0,
 ) -> Taken:
-    """Take the velocity of a fix; rows that hold GNSS and its velocity false see the rate of its error."""
+    """Take the velocity of a fix; rows that hold GNSS and its velocity false see the rate of its error.
+
+    `factor` of the stated variance, by the scatter of the fixes.
+    """
     assert record.v_n is not None
     layout = known.layout
     z = np.array((nominal.v_n[0] - record.v_n[0], nominal.v_n[1] - record.v_n[1]))
@@ -180,15 +180,15 @@ def sight(
     known: Hypotheses,
     z: Azimuth | Range,
     beacon: int,
-    height_sigma: float,
+    variance: float,
     centre: Vector2,
-    factor: float = 1.0,
 ) -> Taken:
     """Take an azimuth or a range of beacon number `beacon`, linearised for each row about its own position.
 
     `z` is in the plane tangent at the nominal point less the error `centre` (north, east, m): a nominal
     trajectory kilometres off would otherwise cost tens of metres. For rows that hold the beacon to be
     elsewhere the lie is its displacement (north, east, m): the aircraft seen from it is displaced by as much.
+    `variance` is that of its noise, the unknown height included.
     """
     layout = known.layout
     n = layout.n_base
@@ -214,7 +214,7 @@ def sight(
         lin = H[:, 0, 0] * x[:, 0] + H[:, 0, 1] * x[:, 1]
         return (innovation + lin)[:, None], H
 
-    R = np.array(((factor * fix_observations.sight_variance(z, height_sigma),),))
+    R = np.array(((variance,),))
     kind = "azimuth" if isinstance(z, Azimuth) else "range"
     after, seen = banks.update(
         bank, layout, linearised, None, R, source, known.settings, outlier=OUTLIER[kind]

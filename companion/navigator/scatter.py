@@ -1,6 +1,6 @@
 """How much noisier a source is than it states, by the scatter of its own measurements.
 
-With r a measurement minus what the nominal trajectory says, for three successive ones at equal distances
+With r a measurement minus that of the nominal trajectory, for three successive ones at equal distances
 
     d = (r2 - 2 r1 + r0) / sqrt(6),  E d^2 = R + w,  w = (a dt^2)^2 / 6
 
@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-SILENT_S = 5.0  # after a longer silence the differences begin anew
+SILENT_S = 5.0  # after a longer silence the differences start again
 UNEQUAL = 1.5  # of two distances
 CLIPPED = 6.0  # times the mean
 FIRST, LAST = 4, 40  # measurements that the mean remembers, at the start and later
@@ -40,8 +40,8 @@ class Scatter(NamedTuple):
     reported: bool = False
 
     @property
-    def variance(self) -> float:
-        """Factor of the stated variance, 1 or more."""
+    def used(self) -> float:
+        """Factor by which the stated variance is enlarged: 1, or `factor` where it is no chance."""
         return self.factor if self.factor > FACTOR else 1.0
 
 
@@ -57,7 +57,7 @@ def observe(s: Scatter | None, t_ns: int, r: tuple[float, ...], variance: float,
     squares = sum((r2 - 2.0 * r1 + r0) ** 2 for r0, r1, r2 in zip(s.before, s.last, r, strict=True)) / 6.0
     ratio = squares / len(r) / (variance + (a * dt * dt) ** 2 / 6.0)
     many = min(s.many + 1, LAST - FIRST)
-    most = CLIPPED * s.factor if s.many >= FIRST else MOST  # at the start the fixes themselves tell the scale
+    most = CLIPPED * s.factor if s.many >= FIRST else MOST  # at the start the fixes themselves give the scale
     factor = s.factor + (min(ratio, most) - s.factor) / (FIRST + many)
     return s._replace(t_ns=t_ns, last=r, dt=dt, before=s.last, factor=factor, many=many)
 

@@ -431,13 +431,12 @@ def _gnss(state: State, record: Gnss, settings: Settings) -> Step:
     known, channel, nominal = hypotheses(state, settings), settings.model.channel, state.nominal
     assert state.bank is not None
     assert nominal is not None
-    sigma = fix_observations.white_sigma(record, config)
-    residual = measurements.gnss_residual(record, nominal.point, state.moved)
-    state, factor, noted = _scattered(state, record, "gnss", residual, sigma**2)
+    variance = fix_observations.white_sigma(record, config) ** 2
+    apart = measurements.gnss_apart(record, nominal.point)
+    still = (apart[0] + state.moved[0], apart[1] + state.moved[1])  # as if the nominal had never jumped
+    state, factor, noted = _scattered(state, record, "gnss", still, variance)
     assert state.bank is not None
-    taken = measurements.gnss_position(
-        state.bank, known, channel, record, nominal.point, _velocity(state), settings.config, factor
-    )
+    taken = measurements.gnss_position(state.bank, known, channel, apart, factor * variance, _velocity(state))
     bank, accepted = taken.bank, taken.accepted
     if config.use_velocity and record.v_n is not None:
         a_n = nominal.a_n
@@ -479,14 +478,14 @@ def _rsbn(state: State, record: RsbnFix, settings: Settings) -> Step:
         if isinstance(z, Azimuth) and fix_observations.in_cone_of_silence(z, record.slant_range):
             continue
         source = known.azimuth(k) if isinstance(z, Azimuth) else known.range(k)
-        label = f"{name} {'azimuth' if isinstance(z, Azimuth) else 'range'}"
+        label = source_name(source, state)
         metres = fix_observations.distance(z) if isinstance(z, Azimuth) else 1.0
         still = (centre[0] - state.moved[0], centre[1] - state.moved[1])  # as if it had never jumped
         residual = measurements.sight_residual(z, still)
         variance = fix_observations.sight_variance(z, height)
         state, factor, noted = _scattered(state, record, label, (residual,), variance, metres)
         assert state.bank is not None
-        taken = measurements.sight(state.bank, known, z, k, height, centre, factor)
+        taken = measurements.sight(state.bank, known, z, k, factor * variance, centre)
         state, more = _decided(state._replace(bank=taken.bank), record, settings)
         out += [*noted, *more]
         assert state.bank is not None
@@ -605,7 +604,7 @@ def _scattered(
     )
     seen, text = scatter.report(seen, name)
     out: list[Output] = [] if text is None else [Event(record.t_ns, record.rx_ns, Severity.NOTICE, text)]
-    return state._replace(scatter={**state.scatter, name: seen}), seen.variance, out
+    return state._replace(scatter={**state.scatter, name: seen}), seen.used, out
 
 
 def _beacon(state: State, record: RsbnFix, settings: Settings) -> tuple[State, int, list[Output]]:

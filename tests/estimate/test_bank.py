@@ -523,7 +523,7 @@ def test_lies_from_the_first_measurement_are_hypotheses():
 
 
 def test_a_source_doubted_late_is_as_one_that_lied_from_the_first_measurement_on():
-    """An offset that stands still: what the source told of the position is taken back, and nothing else."""
+    """An offset that stands still: what the source added about the position is taken back, no more."""
     rng, offset, wide = np.random.default_rng(1), 30.0, 1e4
     zs = 100.0 + np.cumsum(rng.standard_normal(40))
     # Kalman filter of position, velocity and offset; nothing is known of the first two

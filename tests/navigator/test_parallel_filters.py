@@ -18,7 +18,7 @@ BOTH = {"estimator.parallel": list(PARALLEL)}
 AIR = load(flags={"inertial.source": "air_data", "output.profile": "ardupilot", **BOTH}, environment={})
 INS = load(flags={"inertial.independent": True, "inertial.correctors": ["airspeed"], **BOTH}, environment={})
 START = Point(5 * NS, Geodetic(1.0, 0.5, 300.0), (30.0, 10.0, 0.0))
-BEGUN = Parallel(
+FIRST = Parallel(
     START,
     tuple(
         Filter(name, np.array([10.0, -20.0, 3.0, 1.0]), np.diag([400.0, 400.0, 4.0, 4.0]))
@@ -52,17 +52,17 @@ def fixed(
 def test_a_moment_before_its_first_fix_it_is_what_it_was_then() -> None:
     """A solution is of the channel's newest point, and a fix may be newer than that."""
     for earlier_s in (0.0, 1e-4, 0.15):
-        for found, begun in zip(
-            parallel_filters.at(BEGUN, later(-earlier_s), AIR, None), BEGUN.filters, strict=True
+        for found, first in zip(
+            parallel_filters.at(FIRST, later(-earlier_s), AIR, None), FIRST.filters, strict=True
         ):
-            assert np.array_equal(found.x, begun.x)
-            assert np.array_equal(found.P, begun.P)
+            assert np.array_equal(found.x, first.x)
+            assert np.array_equal(found.P, first.P)
 
 
 def test_without_fixes_the_wind_carries_them_off_and_they_are_one() -> None:
-    first, second = parallel_filters.at(BEGUN, later(10.0), AIR, None)
+    first, second = parallel_filters.at(FIRST, later(10.0), AIR, None)
     assert np.allclose(first.x, [10.0 + 30.0, -20.0 + 10.0, 3.0, 1.0])
-    assert np.all(np.diag(first.P) > np.diag(BEGUN.filters[0].P))
+    assert np.all(np.diag(first.P) > np.diag(FIRST.filters[0].P))
     assert np.array_equal(first.x, second.x)
     assert np.array_equal(first.P, second.P)
 
@@ -71,7 +71,7 @@ def test_fixes_of_an_interval_are_one_at_their_middle() -> None:
     """Fixes of an error that grows evenly leave an estimate that is on it."""
     velocity = np.array([3.0, 1.0])
     times = [float(s) for s in range(1, 400)]
-    p = fixed(BEGUN, times, [np.array([10.0, -20.0]) + s * velocity for s in times])
+    p = fixed(FIRST, times, [np.array([10.0, -20.0]) + s * velocity for s in times])
     for found in parallel_filters.at(p, later(400.0), AIR, None):
         assert found.x[:2] == pytest.approx([10.0 + 1200.0, -20.0 + 400.0], abs=1e-6)
         assert found.x[2:] == pytest.approx(velocity, abs=1e-9)
@@ -81,9 +81,9 @@ def test_after_a_jump_of_the_channel_the_filters_go_on_as_if_it_had_always_been_
     times, rng = [float(s) for s in range(1, 60)], np.random.default_rng(1)
     z = [10.0 * rng.standard_normal(2) for _ in times]
     moved = np.array([300.0, -70.0])
-    whole = fixed(parallel_filters.shift(BEGUN, *moved), times, [one + moved for one in z])
+    whole = fixed(parallel_filters.shift(FIRST, *moved), times, [one + moved for one in z])
     halves = fixed(
-        parallel_filters.shift(fixed(BEGUN, times[:25], z[:25]), *moved),
+        parallel_filters.shift(fixed(FIRST, times[:25], z[:25]), *moved),
         times[25:],
         [one + moved for one in z[25:]],
     )

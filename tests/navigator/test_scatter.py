@@ -29,14 +29,14 @@ def noise(n: int = 400, seed: int = 1) -> Floats:
 
 
 def test_honest_noise_is_used_as_stated() -> None:
-    used = [s.variance for seed in range(20) for s in observed(noise(seed=seed))]
+    used = [s.used for seed in range(20) for s in observed(noise(seed=seed))]
     assert np.mean(np.array(used) > 1.0) < 0.01
 
 
 @pytest.mark.parametrize("times", [2.0, 3.0, 10.0])
 def test_noise_greater_than_stated_is_found_within_four_seconds(times: float) -> None:
     found = observed(times * noise())
-    assert np.mean([math.sqrt(s.variance) for s in found[20:]]) == pytest.approx(times, rel=0.15)
+    assert np.mean([math.sqrt(s.used) for s in found[20:]]) == pytest.approx(times, rel=0.15)
 
 
 SLOW: dict[str, Callable[[Floats], Floats]] = {
@@ -55,7 +55,7 @@ def test_a_lie_does_not_make_its_own_noise(lie: str) -> None:
     apart = [abs(a.factor - b.factor) for a, b in zip(honest, false, strict=True)]
     # a jump is in three differences, each clipped; a rate of 5 m/s begins with 1 m in one of them
     assert max(apart) < (0.6 if "jump" in lie else 0.05)
-    assert max(s.variance for s in false) == 1.0
+    assert max(s.used for s in false) == 1.0
 
 
 @given(st.floats(1e-3, 1e3), st.floats(0.0, 1e4))
@@ -77,7 +77,7 @@ def test_what_the_nominal_trajectory_lacks_is_not_the_sources() -> None:
         for k, one in enumerate(r):
             s = scatter.observe(s, k * 1_000_000_000, tuple(one), 0.25, a)
         assert s is not None
-        return s.variance
+        return s.used
 
     assert last(3.0) == 1.0
     assert last(0.0) > 2.0

@@ -137,8 +137,8 @@ def false_since_first(
 ) -> Bank:
     """Bear children whose source was false by an offset that stood still since its first measurement.
 
-    For a source that could not be doubted before. What it told of the base states is taken back: their sum
-    with the lie, which was measured, stays known, and each alone becomes as unknown as the lie.
+    For a source that could not be doubted before. What it added about the base states is taken back: their
+    sum with the lie, which was measured, stays known, and each alone becomes as unknown as the lie.
 
     Parameters
     ----------
