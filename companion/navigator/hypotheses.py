@@ -226,7 +226,7 @@ def _hypotheses(config: Config, channel: Channel, beacons: int, by_air: bool, wi
         rate_h = config.air_data.wind_jumps_per_hour
         # by air data the velocity over ground jumps with the wind; it is noticed up to a second later
         states, sigmas = (channel.wind, 1) if not by_air else ((*channel.wind, 2, 3, 0, 1), 3)
-        jumps.append(Jump("wind", states, (jump, jump) * sigmas, rate_h, quota=24))
+        jumps.append(Jump("wind", states, (jump, jump) * sigmas, rate_h, quota=24, often=True))
     if channel.wind:
         # whatever the model does not know: GNSS is believed again after a second or two
         jumps.append(

@@ -684,6 +684,8 @@ def _propagated(state: State, settings: Settings) -> State:
     if banks.births_due(bank, known.settings):
         jammed = state.jammed_ns is not None and nominal.t_ns - state.jammed_ns < JAMMED_NS
         bank = banks.births(bank, known.layout, known.settings, {0: JAMMED, 1: JAMMED} if jammed else None)
+    else:
+        bank = banks.jump_births(bank, known.layout, known.settings)
     if nominal.interval is None:
         return state._replace(bank=bank, nominal=nominal._replace(since=nominal.point))
     velocity = nominal.point.v_n[:2]

@@ -279,6 +279,7 @@ def random_bank(seed, rows=12, layout=None):
         noise=np.zeros((rows, 2)),
         seen=np.full(2, 10.0),
         born_t=5.0,
+        jumped_t=5.0,
         leading=0,
         excluded=np.zeros(2, dtype=bool),
     )
@@ -564,6 +565,29 @@ def test_a_family_keeps_its_grades():
     kept = b.reduce(old, layout, Settings(rows=24))
     for fault in range(len(layout.faults)):
         assert set(kept.grade[(kept.fault == fault).any(axis=1)]) == {0, 1, 2}
+
+
+@pytest.mark.parametrize("often", [False, True])
+def test_a_jump_born_often_has_the_same_prior_and_its_onset_is_found_sooner(often):
+    jump = Jump("drift", (1,), (5.0,), 10.0, often=often)
+    layout = replace(scalar_layout(), faults=(), jumps=(jump,))
+    settings = Settings(rows=24, surprise=math.inf)
+    bank = b.start(layout, 0.0, np.zeros(2), np.eye(2) * 1e-4)._replace(seen=np.zeros(1))
+    silent, onset = bank, 11
+    for k in range(1, 16):
+        silent = b.propagate(silent, layout, 1.0, PHI, Q)
+        bank = b.propagate(bank, layout, 1.0, PHI, Q)
+        if k % 5 == 0:
+            silent, bank = b.births(silent, layout, settings), b.births(bank, layout, settings)
+        else:
+            silent = b.jump_births(silent, layout, settings)
+            bank = b.jump_births(bank, layout, settings)
+        z = 6.0 * max(k - onset, 0)
+        bank, _ = b.update(bank, layout, np.array([z]), H, R, 0, settings)
+    jumped = silent.weights[silent.event > 0].sum()
+    assert jumped == pytest.approx(1.0 - math.exp(-10.0 * 15.0 / HOUR), rel=0.01)
+    born = bank.since[np.argmax(bank.L)]
+    assert born == (onset if often else 10.0)
 
 
 def test_jump_of_a_base_state_is_no_fault_of_a_source():

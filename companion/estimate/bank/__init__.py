@@ -39,7 +39,7 @@ readout     estimate, probabilities, decisions
 protection  protection level of a sum of Gaussians
 """
 
-from companion.estimate.bank.branching import births, births_due, false_since_first
+from companion.estimate.bank.branching import births, births_due, false_since_first, jump_births
 from companion.estimate.bank.layout import NEVER, NONE, Bools, Fault, Ints, Jump, Layout, Lie, Source
 from companion.estimate.bank.protection import exceedance, level
 from companion.estimate.bank.readout import (
@@ -97,6 +97,7 @@ __all__ = [
     "grade_probability",
     "inflate",
     "is_sound",
+    "jump_births",
     "level",
     "merge_moments",
     "propagate",

@@ -89,11 +89,33 @@ def births(
                 children.append(_Child(int(p), _log(min(fault.death_h * hours, 0.5)), f, ends=True))
                 children += _lie_children(int(p), f, fault.lies, fault.change_h * hours)
         for j, jump in enumerate(layout.jumps):
-            children.append(_Child(int(p), _log(jump.rate_h * hours), jump=j))
+            since = bank.jumped_t if jump.often else bank.born_t
+            children.append(_Child(int(p), _log(jump.rate_h * (bank.t - since) / HOUR_S), jump=j))
     children += _grade_children(bank, layout, settings, hours)
     grown = _with_children(bank, layout, [c for c in children if c.log_prior > NEVER])
-    grown = grown._replace(born_t=bank.t)
+    grown = grown._replace(born_t=bank.t, jumped_t=bank.t)
     return reduce(grown, layout, settings) if reduced else grown
+
+
+def jump_births(bank: Bank, layout: Layout, settings: Settings = DEFAULT) -> Bank:
+    """Bear the children of jumps that are born often, where that is due; rows are reduced at the next births.
+
+    Parameters
+    ----------
+    bank, layout, settings : the bank.
+
+    Returns
+    -------
+    Bank : with a child of the heaviest row of each grade more for each such jump.
+    """
+    jumps = [(j, jump.rate_h) for j, jump in enumerate(layout.jumps) if jump.often]
+    passed = bank.t - bank.jumped_t
+    if not jumps or passed < settings.jump_s:
+        return bank
+    heaviest = _heaviest_of_grades(bank).values()
+    children = [_Child(p, _log(rate * passed / HOUR_S), jump=j) for p in heaviest for j, rate in jumps]
+    children = [child for child in children if child.log_prior > NEVER]
+    return _with_children(bank, layout, children)._replace(jumped_t=bank.t)
 
 
 def returns(bank: Bank, layout: Layout, source: int, settings: Settings) -> tuple[Bank, bool]:
@@ -151,17 +173,23 @@ def false_since_first(
     -------
     Bank : with at most `settings.rows` rows.
     """
-    heaviest: dict[int, int] = {}
-    for i in np.argsort(-bank.L).tolist():
-        heaviest.setdefault(int(bank.grade[i]), i)
+    heaviest = _heaviest_of_grades(bank).values()
     children = [
         child._replace(undone=states)
         for f, scales in lies.items()
-        for p in heaviest.values()
+        for p in heaviest
         if bank.fault[p, layout.fault_group(f)] == NONE
         for child in _lie_children(p, f, scales, prior)
     ]
     return reduce(_with_children(bank, layout, children), layout, settings)
+
+
+def _heaviest_of_grades(bank: Bank) -> dict[int, int]:
+    """The heaviest row by grade."""
+    heaviest: dict[int, int] = {}
+    for i in np.argsort(-bank.L).tolist():
+        heaviest.setdefault(int(bank.grade[i]), i)
+    return heaviest
 
 
 def _lie_children(parent: int, fault: int, lies: tuple[Lie, ...], prior: float) -> list[_Child]:

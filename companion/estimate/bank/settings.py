@@ -14,6 +14,7 @@ class Settings:
     ----------
     rows : most rows after a reduction.
     birth_s : interval of births.
+    jump_s : interval of births of the jumps that are born often.
     parents : rows that bear, heaviest first; 0 lets all rows bear.
     parent_floor : log weight above which the heaviest row of each family and grade bears too.
     class_floor : log weight below which a row is no longer kept for the sake of its class.
@@ -33,6 +34,7 @@ class Settings:
 
     rows: int = 48
     birth_s: float = 5.0
+    jump_s: float = 1.0
     parents: int = 3
     parent_floor: float = -14.0
     class_floor: float = -45.0

@@ -28,7 +28,7 @@ class Bank(NamedTuple):
     scale : (R,) index of the lie's scale at its birth.
     noise : (R, offsets) density of the lie rates' random walk.
     seen : (sources,) time of the last measurement.
-    born_t : time of the last births.
+    born_t, jumped_t : time of the last births, and of the last births of jumps that are born often.
     leading : code of the leading explanation, see `explanations`.
     excluded : (sources,) whether a source is excluded (with hysteresis).
     """
@@ -45,6 +45,7 @@ class Bank(NamedTuple):
     noise: Floats
     seen: Floats
     born_t: float
+    jumped_t: float
     leading: int
     excluded: Bools
 
@@ -86,6 +87,7 @@ def start(layout: Layout, t: float, x0: Floats, P0: Floats, prior: Sequence[floa
         noise=np.zeros((k, len(layout.offsets))),
         seen=np.full(len(layout.sources), NEVER),
         born_t=t,
+        jumped_t=t,
         leading=0,
         excluded=np.zeros(len(layout.sources), dtype=np.bool_),
     )
