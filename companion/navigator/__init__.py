@@ -42,8 +42,8 @@ from companion.records import (
 
 __all__ = ["INPUTS_USED", "Navigator"]
 
-#: A roll-back costs 1 to 2 % of the time that it goes back: at most one in this share of it.
-ROLL_BACK_SHARE = 10
+#: A roll-back takes 1 % of the time that it goes back, and holds up the answers to the autopilot: one in half of it.
+ROLL_BACK_SHARE = 2
 #: Stamps in ms are behind those in us of the same instant by up to this: such a record is not late.
 TICK_NS = 1_000_000
 #: After a roll-back by t seconds for beacon answers, all of which were rejected, none that is older than
