@@ -56,12 +56,12 @@ def _distance(a: Stamped | None, b: Stamped | None) -> float:
     return math.hypot(north, east)
 
 
-def _close_records(a: Any, b: Any) -> bool:
+def _close_records(a: Any, b: Any, relative: float = RELATIVE) -> bool:
     if type(a) is not type(b):
         return False
     names: Iterable[str] = a.__struct_fields__
     return all(
-        _close(getattr(a, name), getattr(b, name), RESTRICTED_TOLERANCE if name in BOUNDS else RELATIVE)
+        _close(getattr(a, name), getattr(b, name), RESTRICTED_TOLERANCE if name in BOUNDS else relative)
         for name in names
         if name not in ANGLES
     )
@@ -73,7 +73,7 @@ def _close(a: Any, b: Any, relative: float) -> bool:
     if isinstance(a, tuple) and isinstance(b, tuple):
         return len(a) == len(b) and all(_close(x, y, relative) for x, y in zip(a, b, strict=True))
     if hasattr(a, "__struct_fields__"):
-        return _close_records(a, b)
+        return _close_records(a, b, relative)
     if isinstance(a, str) and isinstance(b, str):
         return NUMBER.sub("", a) == NUMBER.sub("", b)
     return bool(a == b)

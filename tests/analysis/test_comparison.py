@@ -7,7 +7,8 @@ import math
 from msgspec import structs
 
 from companion.analysis.comparison import POSITION_M, OutputComparison
-from companion.records import Event, Mode, Rejection, Solution
+from companion.estimate.predictor import RESTRICTED_TOLERANCE
+from companion.records import Event, Mode, Prediction, Rejection, Solution
 
 SOLUTION = Solution(
     t_ns=1,
@@ -54,6 +55,15 @@ def test_other_kinds_missing_outputs_and_numbers_differ_elsewhere_too() -> None:
     missing = OutputComparison(False)
     missing.add([SOLUTION], [])
     assert (missing.compared, missing.different) == (1, 1)
+
+
+def test_what_is_in_a_bound_agrees_as_the_bound_does() -> None:
+    def with_claim(m: float) -> Solution:
+        return structs.replace(SOLUTION, ahead=(Prediction(60.0, (100.0, 100.0), (m, m), (1.0, 1.0)),))
+
+    off = 1.0 + 0.5 * RESTRICTED_TOLERANCE
+    assert compare(False, with_claim(50.0 * off), with_claim(50.0)).different == 0
+    assert compare(False, with_claim(50.0 * off**4), with_claim(50.0)).different == 1
 
 
 def test_a_text_may_round_its_number_differently_but_say_nothing_else() -> None:
