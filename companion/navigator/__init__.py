@@ -42,7 +42,7 @@ from companion.records import (
 
 __all__ = ["INPUTS_USED", "Navigator"]
 
-#: A roll-back takes 1 % of the time that it goes back, and holds up the answers to the autopilot: one in half of it.
+#: A roll-back takes 1 % of the time that it goes back and delays answers to the autopilot: one in half of it.
 ROLL_BACK_SHARE = 2
 #: Stamps in ms are behind those in us of the same instant by up to this: such a record is not late.
 TICK_NS = 1_000_000

@@ -422,7 +422,7 @@ class Ground(NamedTuple):
     parked_height: float | None = None
 
 
-def ground_phase(g: Ground, t: float, airspeed: float, speed: float, height: float) -> Ground:
+def ground_phase(g: Ground, t: float, airspeed: float, speed: float, height: float | None) -> Ground:
     """Follow parking, ground roll and flight.
 
     Airspeed is used only in flight: parked it measures nothing, and in the ground roll the wheels, not the
@@ -438,12 +438,12 @@ def ground_phase(g: Ground, t: float, airspeed: float, speed: float, height: flo
     airspeed, speed
         True airspeed and speed over ground (m/s).
     height
-        Pressure altitude (m).
+        Pressure altitude (m); without it airspeed alone decides.
     """
     if airspeed < PARKED_M_S and speed < PARKED_M_S:
         since = t if g.slow_since is None else g.slow_since
         if g.flying and t - since < PARKED_S:
             return Ground(True, since, g.parked_height)
         return Ground(False, since, height)
-    clear = g.parked_height is None or height > g.parked_height + CLEAR_M
+    clear = g.parked_height is None or height is None or height > g.parked_height + CLEAR_M
     return Ground(g.flying or (airspeed > FLYING_M_S and clear), None, g.parked_height)

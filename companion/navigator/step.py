@@ -199,7 +199,7 @@ def _air_data(state: State, record: AirData, settings: Settings) -> Step:
     speed = math.hypot(*_velocity(state))
     if s.ground.flying and math.hypot(*V) < BLOCKED_M_S < 0.5 * speed:
         return state, _blocked_pitot(s, record)
-    height = nominal.point.position.alt
+    height = None if s.air.static is None else nominal.point.position.alt
     ground = own_error_model.ground_phase(s.ground, record.t_ns * 1e-9, math.hypot(*V), speed, height)
     s = state.sensors._replace(ground=ground, air_ns=record.t_ns if ground.flying else s.air_ns)
     state = state._replace(sensors=s)

@@ -103,7 +103,7 @@ class Jump:
     rate_h : prior rate, 1/h.
     quota : rows the jump may hold at least, when rows are short.
     apart_s : for so long a row that jumped is an explanation of its own, see `explanations`.
-    often : it is born every `Settings.jump_s`: what states have learnt of it before its birth is learnt wrongly.
+    often : it is born every `Settings.jump_s`: before its birth other states learn wrongly from it.
     """
 
     name: str
