@@ -24,7 +24,7 @@ ROOT = Path(__file__).parents[1]
 PAGES = {path.stem: path.read_text() for path in (ROOT / "docs").glob("*.md")}
 FRONT = ("README", "ARCHITECTURE", "CONTRIBUTING", "CHANGELOG", "examples/README")
 OVERHEAD = 12  # bytes of a MAVLink 2 frame round its payload
-LACKING = {"ardupilot": {"HIGHRES_IMU"}, "px4": {"RAW_IMU", "EKF_STATUS_REPORT"}}
+LACKING = {"ardupilot": {"HIGHRES_IMU", "GPS2_RAW"}, "px4": {"RAW_IMU", "EKF_STATUS_REPORT", "GPS2_RAW"}}
 MAKES = ("ardupilot", "px4")
 
 

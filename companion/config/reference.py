@@ -124,6 +124,10 @@ TEXTS: dict[str, dict[str, tuple[str, str]]] = {
             "0: GPS_RAW_INT, 1: GPS2_RAW. The receiver that GPS_INPUT feeds is not allowed.",
             "the second receiver is the better one",
         ),
+        "second_receiver": (
+            "The other receiver is used while this one has no fix; never the one that GPS_INPUT feeds.",
+            "the other one is no GNSS receiver",
+        ),
         "sigma_m": ("Horizontal position error, correlated.", "the receiver is RTK or DGNSS, or is poor"),
         "sigma_velocity_m_s": ("Velocity error.", "the receiver's data sheet states another"),
         "correlation_s": ("Correlation time of the position error.", _MEASURED),

@@ -120,6 +120,7 @@ class GnssConfig(Section, frozen=True):
     receiver: Annotated[int, Meta(ge=0, le=1)] = (
         0  # GPS_RAW_INT is 0, GPS2_RAW is 1; the receiver that GPS_INPUT feeds is not allowed
     )
+    second_receiver: bool = True
     sigma_m: Annotated[float, Meta(ge=0.01, le=1000.0)] = 2.0
     sigma_velocity_m_s: Annotated[float, Meta(ge=0.001, le=100.0)] = 0.1
     correlation_s: Annotated[float, Meta(ge=1.0, le=10000.0)] = 60.0
@@ -290,6 +291,11 @@ class Config(Section, frozen=True):
     def has_own_ins(self) -> bool:
         """Whether LOCAL_POSITION_NED is that of an INS of its own, which takes no part of what we send."""
         return self.inertial.independent and self.inertial.source in ("auto", "local_position")
+
+    @property
+    def uses_second_receiver(self) -> bool:
+        """Whether the other GNSS receiver may be used; not the one that GPS_INPUT feeds."""
+        return self.gnss.second_receiver and self.output.rates_hz["GPS_INPUT"] == 0.0
 
     def uses(self, sensor: Sensor) -> bool:
         """Whether the own channel may use a sensor: `inertial.source` allows all or one."""

@@ -20,6 +20,7 @@ from companion.estimate import bank as banks
 from companion.navigator import minimax_bound
 from companion.navigator.hypotheses import Model
 from companion.navigator.own_channel import OwnChannel
+from companion.navigator.receiver_choice import ReceiverChoice
 from companion.navigator.solution import announce, is_bound_due, refresh_bound, resolve_pending, solve
 from companion.navigator.stale_data import REPORT_EVERY, StaleDataDetector
 from companion.navigator.state import FIXES, Settings, State, Step, initial, is_new_fix
@@ -77,6 +78,7 @@ class Navigator:
         self._late_ns = round(1e9 * config.estimator.late_s)
         self._gnss_latency_ns = round(1e9 * config.gnss.latency_s)
         self._stale_data = StaleDataDetector()
+        self._receivers = ReceiverChoice(config)
         self._last_mode = Mode.INITIALISING, Source(0)  # mode and fixes of the last solution, and its time
         self._last_solution_ns = 0
         self._rejected_ns: dict[str, int] = {}  # when an implausible record was last reported, by kind
@@ -109,12 +111,16 @@ class Navigator:
         stale = self._stale_data.judge(record)
         if stale is not None:
             return stale
-        if isinstance(record, Gnss) and not is_new_fix(record, self._state, self._settings):
-            return []
+        chosen: list[Output] = []
+        if isinstance(record, Gnss):
+            is_used, changes = self._receivers.takes(record)
+            chosen += changes
+            if not is_used or not is_new_fix(record, self._state):
+                return chosen
         if self._past and 0 < self._past[-1].t_ns - record.t_ns <= TICK_NS:
             record = structs.replace(record, t_ns=self._past[-1].t_ns)
         self.settle()
-        outputs, self._deferred = self._deferred, []
+        outputs, self._deferred = [*self._deferred, *chosen], []
         folded: list[Input] = [record]
         if self._past and record.t_ns < self._past[-1].t_ns:
             outputs += self._queue_late(record)
@@ -173,6 +179,8 @@ class Navigator:
         before = self._settings
         self._settings, self._state = tuned(self._state, before, config)
         self._uses = uses(self._settings)
+        if (config.gnss.receiver, config.uses_second_receiver) != self._receivers.settings:
+            self._receivers = ReceiverChoice(config)
         self._late_ns = round(1e9 * config.estimator.late_s)
         self._gnss_latency_ns = round(1e9 * config.gnss.latency_s)
         same = config.has_own_ins == before.config.has_own_ins

@@ -100,10 +100,10 @@ def initial(settings: Settings) -> State:
     return State()
 
 
-def is_new_fix(record: Gnss, state: State, settings: Settings) -> bool:
-    """Whether this is a new fix of the receiver in use: an autopilot repeats its last one."""
-    selected = record.receiver == settings.config.gnss.receiver
-    return selected and (state.gnss is None or not record.repeats(state.gnss))
+def is_new_fix(record: Gnss, state: State) -> bool:
+    """Whether this is a new fix: an autopilot repeats its receiver's last one."""
+    last = state.gnss
+    return last is None or last.receiver != record.receiver or not record.repeats(last)
 
 
 def hypotheses(state: State, settings: Settings) -> Hypotheses:

@@ -419,7 +419,7 @@ def _begun(state: State, record: Gnss | RsbnFix, settings: Settings) -> State:
 
 
 def _gnss(state: State, record: Gnss, settings: Settings) -> Step:
-    config = settings.config.gnss
+    config, before = settings.config.gnss, state.gnss
     state = state._replace(gnss=record)
     used = math.inf if state.gnss_used_ns is None else (record.t_ns - state.gnss_used_ns) * 1e-9
     if not record.has_3d_fix or used < config.every_s:
@@ -431,6 +431,10 @@ def _gnss(state: State, record: Gnss, settings: Settings) -> Step:
     known, channel, nominal = hypotheses(state, settings), settings.model.channel, state.nominal
     assert state.bank is not None
     assert nominal is not None
+    if before is not None and before.receiver != record.receiver:  # its drift is another
+        drift = range(channel.drift.start, channel.drift.stop)
+        state = state._replace(bank=banks.renew(state.bank, drift, [config.sigma_m] * 2))
+    assert state.bank is not None
     variance = fix_observations.white_sigma(record, config) ** 2
     apart = measurements.gnss_apart(record, nominal.point)
     still = (apart[0] + state.moved[0], apart[1] + state.moved[1])  # as if the nominal had never jumped

@@ -13,6 +13,7 @@ from collections.abc import Collection
 from companion.config import Config
 from companion.config.profiles import MESSAGES, RESET
 from companion.link.dialect import Message, mavlink
+from companion.navigator.receiver_choice import ReceiverChoice
 from companion.output.encode import CannotEncode, Receiver, encode
 from companion.output.gate import STEP_M, Gate, LocalFrame, Position, WithholdingMonitor
 from companion.output.gnss_fusion import GnssFusion
@@ -53,6 +54,7 @@ class AutopilotOutput:
         self.unix_ns: int | None = None
         self._gate, self._local_frame, self._monitor = _gate(config), LocalFrame(), WithholdingMonitor()
         self._position_reset, self._source_switch = PositionReset(), _source_switch(config)
+        self._receivers = ReceiverChoice(config)
         self._events: list[Event] = []
 
     @property
@@ -65,10 +67,12 @@ class AutopilotOutput:
         if isinstance(record, SystemTime):
             if record.unix_ns is not None:
                 self.unix_ns = record.unix_ns - record.t_ns
-        elif isinstance(record, Gnss | GlobalPosition | FilterStatus):
-            self._position_reset.receive(record)
-            if isinstance(record, Gnss) and record.receiver == 0:
+        elif isinstance(record, Gnss):
+            if self._receivers.takes(record)[0]:
+                self._position_reset.receive(record)
                 self._source_switch.receive(record)
+        elif isinstance(record, GlobalPosition | FilterStatus):
+            self._position_reset.receive(record)
         elif isinstance(record, RsbnFix):
             self._source_switch.receive(record)
 

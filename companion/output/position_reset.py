@@ -41,7 +41,7 @@ class PositionReset:
         """Process a record from the autopilot."""
         if isinstance(record, FilterStatus):
             self._glitching = record.gnss_glitch
-        elif isinstance(record, Gnss) and record.receiver == 0:
+        elif isinstance(record, Gnss):
             self._has_receiver = True
             if record.has_3d_fix and not self._glitching:
                 self._fixed_ns = self._correct_ns = record.rx_ns

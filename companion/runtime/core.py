@@ -45,6 +45,7 @@ from companion.link.session import (
 )
 from companion.link.signing import Signing
 from companion.navigator import Navigator
+from companion.navigator.receiver_choice import RECEIVER_MESSAGES
 from companion.output.autopilot_output import AutopilotOutput
 from companion.output.encode import Receiver, named_values, navigation_status
 from companion.output.pace import Pace
@@ -154,13 +155,19 @@ class Link:
         return self.session.reader.received
 
 
+#: Rate of the GNSS receiver that is not used while the other has a fix.
+STANDBY_HZ = 2.0
+
+
 def requested_rates(config: Config) -> dict[str, float]:
     """Return the stream rates to request from the autopilot, Hz by message name."""
     rates, output_hz = config.rates, config.output.rates_hz
+    standby_hz = min(rates.gnss_hz, STANDBY_HZ) * config.uses_second_receiver
     is_local = output_hz[MESSAGES["odometry"]] > 0.0 or output_hz[MESSAGES["vision"]] > 0.0
     rates_hz = {
         "LOCAL_POSITION_NED": rates.local_position_hz,
-        "GPS_RAW_INT": rates.gnss_hz,
+        RECEIVER_MESSAGES[config.gnss.receiver]: rates.gnss_hz,
+        RECEIVER_MESSAGES[1 - config.gnss.receiver]: standby_hz,
         "ATTITUDE": rates.attitude_hz,
         "RAW_IMU": rates.imu_hz * (config.output.profile != "px4"),
         "HIGHRES_IMU": rates.imu_hz * (config.output.profile != "ardupilot"),

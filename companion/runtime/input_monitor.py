@@ -56,6 +56,7 @@ class Stream(NamedTuple):
 STREAMS: Mapping[str, Stream] = {
     "LOCAL_POSITION_NED": Stream("local position", LocalPosition, "local_position_hz"),
     "GPS_RAW_INT": Stream("GNSS", Gnss, "gnss_hz"),
+    "GPS2_RAW": Stream("second GNSS", Gnss, "gnss_hz"),
     "ATTITUDE": Stream("attitude", Attitude, "attitude_hz"),
     "RAW_IMU": Stream("IMU", Imu, "imu_hz"),
     "HIGHRES_IMU": Stream("IMU", Imu, "imu_hz"),
@@ -89,7 +90,8 @@ def stream_states(
     used = _used_records(config)
     for msgid, (requested, measured) in rates.items():
         name = TYPES[msgid].name
-        if name not in MISSING_MESSAGES.get(make, ()):
+        is_absent = name == "GPS2_RAW" and not measured and config.gnss.receiver == 0  # few have a second one
+        if name not in MISSING_MESSAGES.get(make, ()) and not is_absent:
             stream = STREAMS.get(name)
             yield StreamState(name, requested, measured, stream is None or stream.record in used)
 

@@ -65,12 +65,6 @@ def test_rejected_gps_fix_counts_as_no_gps() -> None:
     assert reset.withholding_reason(position(60.0)) == "the autopilot has GPS"
 
 
-def test_second_receiver_is_not_the_autopilots_gps() -> None:
-    reset = flown(lost_s=0.0)
-    reset.receive(gnss(60.0, 3, receiver=1))
-    assert reset.withholding_reason(position(60.0)) is None
-
-
 def test_reset_requires_gps_status_and_position() -> None:
     reset = PositionReset()
     reset.receive(own(0.0))

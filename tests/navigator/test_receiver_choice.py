@@ -1,0 +1,126 @@
+"""Two GNSS receivers: the second one keeps a flight on GNSS while the first has no fix."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+from msgspec import structs
+
+from companion.config import load
+from companion.navigator import Navigator
+from companion.navigator.receiver_choice import ReceiverChoice
+from companion.output.autopilot_output import AutopilotOutput
+from companion.output.source_switch import SILENT_S
+from companion.records import Attitude, Event, Gnss, Imu, LocalOrigin, Solution, Source
+from companion.units import G0, SECOND_NS
+
+CONFIG = load(flags={"output.profile": "ardupilot"}, environment={})
+LAT, LON = 0.97, 0.65
+Fix = Callable[[float], int | None]  # fix type at a time (s), None where nothing arrives
+
+
+def fix(receiver: int, t: float, kind: int, north_m: float = 0.0) -> Gnss:
+    """A report of a receiver of an aircraft that flies north at 20 m/s."""
+    lat = LAT + (20.0 * t + north_m) / 6.37e6
+    at, ms = round(t * SECOND_NS), round(t * 1e6)
+    return Gnss(at, at, receiver, ms, kind, lat, LON, 300.0, v_n=(20.0, 0.0, 0.0), sigma_horizontal=1.0)
+
+
+def chosen(first: Fix, second: Fix, until: float) -> list[tuple[float, str]]:
+    """Changes of the receiver in use, with five reports a second of the first and two of the second."""
+    choice, found = ReceiverChoice(CONFIG), []
+    for k in range(round(10 * until)):
+        t = 0.1 * k
+        reports = ([(0, first(t))] if k % 2 == 0 else []) + ([(1, second(t))] if k % 5 == 0 else [])
+        for receiver, kind in reports:
+            if kind is not None:
+                _, events = choice.takes(fix(receiver, t, kind))
+                found += [(t, event.text) for event in events]
+    return found
+
+
+def test_the_second_is_used_while_the_first_has_no_fix_and_not_a_moment_longer() -> None:
+    def first(t: float) -> int:
+        return 1 if 20.0 <= t < 40.0 else 3
+
+    (lost, why), (back, again) = chosen(first, lambda t: 3, 60.0)
+    assert 21.0 <= lost <= 22.0
+    assert why == "GPS_RAW_INT has no fix: GPS2_RAW is used"
+    assert 45.0 <= back <= 45.4
+    assert again == "GPS_RAW_INT has a fix again: GPS_RAW_INT is used"
+
+
+def test_a_silent_first_receiver_is_replaced_before_it_is_called_silent() -> None:
+    ((lost, why),) = chosen(lambda t: 3 if t < 20.0 else None, lambda t: 3, 40.0)
+    assert lost - 19.8 < SILENT_S
+    assert why == "GPS_RAW_INT is silent: GPS2_RAW is used"
+
+
+def test_a_second_receiver_without_a_fix_or_flickering_changes_nothing() -> None:
+    assert chosen(lambda t: 3, lambda t: 3, 30.0) == []
+    assert chosen(lambda t: 3 if t < 10.0 else 1, lambda t: 1, 30.0) == []
+    assert chosen(lambda t: 1 if round(10 * t) % 10 == 0 else 3, lambda t: 3, 30.0) == []
+
+
+def test_it_returns_at_once_to_a_first_receiver_with_a_fix_when_the_second_has_none() -> None:
+    def first(t: float) -> int:
+        return 1 if 10.0 <= t < 20.0 else 3
+
+    changes = chosen(first, lambda t: 3 if t < 22.0 else 1, 40.0)
+    assert [round(t) for t, _ in changes] == [11, 22]
+
+
+def test_neither_the_receiver_that_gps_input_feeds_nor_one_switched_off_is_used() -> None:
+    fed = load(flags={"output.profile": "ardupilot", "output.via": "gps_input"}, environment={})
+    off = load(flags={"gnss.second_receiver": False}, environment={})
+    for config in (fed, off):
+        choice = ReceiverChoice(config)
+        for t in range(30):
+            assert choice.takes(fix(0, t, 1)) == (True, [])
+            assert choice.takes(fix(1, t + 0.1, 3)) == (False, [])
+
+
+def test_a_flight_goes_on_with_gnss_by_the_second_and_source_set_2_is_never_requested() -> None:
+    """The second receiver is 3 m off the first; the first is lost for good after a minute."""
+    navigator, output = Navigator(CONFIG), AutopilotOutput(CONFIG)
+    found: list[Solution] = []
+    events: list[str] = []
+    navigator.handle(LocalOrigin(0, 0, LAT, LON, 300.0, "ardupilot"))
+    for k in range(20 * 120):
+        t = 0.05 * k
+        at = round(t * SECOND_NS)
+        shake = 1e-4 * math.sin(k)  # numbers that stand still are taken for frozen
+        records = [Imu(at, at, 0, (shake, 0.0, -G0), (0.0, 0.0, shake))]
+        if k % 2 == 0:
+            records.append(Attitude(at, at, shake, 0.0, 0.0))
+        if k % 4 == 1:
+            records.append(fix(0, t, 3 if t < 60.0 else 1))
+        if k % 10 == 3:
+            records.append(fix(1, t, 3, 3.0))
+        for record in records:
+            output.receive(record)
+            for out in navigator.handle(record):
+                found += [out] if isinstance(out, Solution) else []
+                events += [out.text] if isinstance(out, Event) else []
+                if isinstance(out, Solution):
+                    output._source_switch.note_output(out, True, out.rx_ns)
+        navigator.settle()
+        output._source_switch.update(at)
+        commands = [m for m in output._source_switch.to_send(1, at) if m.param1 == 2]
+        assert not commands, t
+    assert [text for text in events if "GPS2_RAW" in text] == ["GPS_RAW_INT has no fix: GPS2_RAW is used"]
+    after = [s for s in found if s.t_ns > 65 * SECOND_NS]
+    assert all(s.sources & Source.GNSS for s in after)
+    assert max(s.gnss_false for s in after) < 0.1
+    off = [(s.lat - LAT) * 6.37e6 - 20.0 * s.t_ns / SECOND_NS for s in after]
+    assert max(map(abs, off)) < 4.0
+
+
+def test_a_repeated_fix_is_new_from_another_receiver_only() -> None:
+    navigator = Navigator(CONFIG)
+    one = fix(0, 1.0, 3)
+    navigator.handle(one)
+    before = navigator.state
+    navigator.handle(structs.replace(one, t_ns=one.t_ns + 1, rx_ns=one.rx_ns + 1))
+    assert navigator.state.gnss is before.gnss
