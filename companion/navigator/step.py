@@ -57,6 +57,7 @@ from companion.navigator.state import (
     hypotheses,
     initial,
     source_name,
+    sources,
 )
 from companion.records import (
     AirData,
@@ -88,6 +89,8 @@ from companion.records import (
 from companion.units import SECOND_NS
 
 PATIENCE_NS = 5 * SECOND_NS  # wait for the autopilot's own origin
+#: An autopilot checks its airspeed sensor against GPS only: ArduPlane dived to the ground for speed in 67 s.
+FALSE_AIRSPEED = "take the airspeed sensor out of use: ARSPD_USE 0"
 CONFIRM_NS = SECOND_NS  # one fix in disagreement is an outlier: a source is excluded once it lasts
 JUMP_SPREAD_S = 0.5  # across a longer silence a turn explains a step as well as a jump does
 FAR_M, FAST_M_S = 500.0, 5.0  # the nominal trajectory is brought back from this far off
@@ -723,6 +726,9 @@ def _decided(state: State, record: Stamped, settings: Settings) -> Step:
             }[reported[i]]
             severity = Severity.WARNING if reported[i] else Severity.NOTICE
             out.append(Event(record.t_ns, record.rx_ns, severity, f"{source_name(i, state)} {text}"))
+            by_gnss = sources(state, record.t_ns, settings) & Source.GNSS
+            if i == AIRSPEED and reported[i] == EXCLUDED and not by_gnss:
+                out.append(Event(record.t_ns, record.rx_ns, Severity.WARNING, FALSE_AIRSPEED))
     leading = (bank, banks.estimate(bank, known.layout))
     state = state._replace(
         bank=bank, leading=leading, false=false, reported=tuple(reported), certain_ns=tuple(since)

@@ -14,6 +14,7 @@ from msgspec.structs import replace
 
 from companion.config import Config, load
 from companion.navigator import Navigator
+from companion.navigator.step import FALSE_AIRSPEED
 from companion.records import (
     PARALLEL,
     AirData,
@@ -208,6 +209,16 @@ def test_a_healthy_gnss_is_never_excluded(channel: str, wrong: str) -> None:
     if channel != "air":  # there a false airspeed moves the nominal trajectory until the next fix
         assert flown.error[flown.t > SETTLED_S].max() < 10.0 + late_m
     assert np.all(flown.error <= flown.protection)
+
+
+@pytest.mark.parametrize(("gnss_until", "needed"), [(math.inf, False), (90.0, True)])
+def test_without_gnss_a_false_airspeed_must_be_taken_out_of_use(gnss_until: float, needed: bool) -> None:
+    """The autopilot compares it with GPS only, and dives for the speed that a stuck pitot lacks."""
+    flown = fly("imu", after(150.0, AirData, airspeed=noisy(8.0)), gnss_until=gnss_until)
+    texts = [event.text for event in flown.events]
+    assert any(text.startswith("airspeed is excluded") for text in texts)
+    assert (FALSE_AIRSPEED in texts) == needed
+    assert len(FALSE_AIRSPEED) <= 50  # one STATUSTEXT
 
 
 @pytest.mark.parametrize("channel", ["ins", "imu"])
