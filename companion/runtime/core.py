@@ -167,7 +167,6 @@ def requested_rates(config: Config) -> dict[str, float]:
     rates_hz = {
         "LOCAL_POSITION_NED": rates.local_position_hz,
         RECEIVER_MESSAGES[config.gnss.receiver]: rates.gnss_hz,
-        RECEIVER_MESSAGES[1 - config.gnss.receiver]: standby_hz,
         "ATTITUDE": rates.attitude_hz,
         "RAW_IMU": rates.imu_hz * (config.output.profile != "px4"),
         "HIGHRES_IMU": rates.imu_hz * (config.output.profile != "ardupilot"),
@@ -179,6 +178,7 @@ def requested_rates(config: Config) -> dict[str, float]:
         # for the check of the local origin, and for position resets
         "GLOBAL_POSITION_INT": 2.0 * (output_hz[RESET] > 0.0 or (is_local and not config.has_own_ins)),
         "SIM_STATE": rates.truth_hz,
+        RECEIVER_MESSAGES[1 - config.gnss.receiver]: standby_hz,
     }
     paced = "LOCAL_POSITION_NED" if config.has_own_ins else "ATTITUDE"
     if 0.0 < rates_hz[paced] < config.output.pace_hz:  # one solution per message of the channel

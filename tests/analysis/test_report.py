@@ -30,7 +30,7 @@ from companion.analysis.replay import command as replay_command
 from companion.analysis.report import command, comparison_block
 from companion.analysis.summary import format_duration, format_length, format_time, summarize_flight, worst_of
 from companion.analysis.verdict import judge_flight
-from companion.config import Config
+from companion.config import Config, load, to_toml
 from companion.nav.geometry import displace
 from companion.records import (
     INPUTS,
@@ -51,6 +51,7 @@ from companion.records import (
     RsbnFix,
     Solution,
     Truth,
+    Tuning,
 )
 from companion.storage import flight_log
 from companion.storage.reader import LogError
@@ -71,8 +72,11 @@ def sentences(a):
 def flight_records(
     error=(3.0, 4.0), bound=(30.0, 40.0), ins=(60.0, 80.0), truth=True, receiver=0, sigma=5.0, **more
 ):
-    """Five minutes eastwards at 20 m/s; GNSS lost from LOST to FOUND, rejected for 2 s at 60 s."""
-    rows = []
+    """Five minutes eastwards at 20 m/s; GNSS lost from LOST to FOUND, rejected for 2 s at 60 s. With receiver 1
+    no fix is used.
+    """
+    one = load(flags={"gnss.second_receiver": False}, environment={})
+    rows = [Tuning(START, START, to_toml(one))] if receiver else []
     for k in range(END * 5):
         t = START + k * S // 5
         second = k / 5

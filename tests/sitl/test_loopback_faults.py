@@ -172,7 +172,7 @@ def test_estimated_wind_survives_a_reboot(tmp_path: Path) -> None:
 def test_link_loss_of_thirty_seconds(tmp_path: Path, channel: str, outages) -> None:
     flown = LoggedFlight(tmp_path, channel, gnss_outages=outages, faults=(Fault("link-loss", 115.0, 145.0),))
     flown.assert_accuracy()
-    flown.assert_no_jump(longest_gap_s=31.0)
+    flown.assert_no_jump(longest_gap_s=31.01)  # the loss, a second to resume, and the jitter of the link
     flown.assert_events("silent for 5 s", r"14[56]\.\d sitl: autopilot 1 connected")
     down = [s for s in flown.logged if isinstance(s, LinkState) and not s.connected]
     assert 20 <= len(down) <= 30  # one per second after the link counts as lost
