@@ -99,7 +99,7 @@ class Amplitudes(NamedTuple):
     drift_m: float = 1.5
     drift_s: float = 300.0
     foreign_m_s: float = 0.3
-    foreign_change_m_s_sqrt_s: float = 0.05
+    foreign_change_m_s_sqrt_s: float = 0.5  # 1.2 km in three minutes, as an autopilot without GNSS
     foreign_noise_m_s: float = 0.5
     latency_s: float = 0.15  # sigma about the configured latency
     latency_change_s_sqrt_s: float = 1e-4

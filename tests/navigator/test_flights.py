@@ -211,6 +211,23 @@ def test_a_healthy_gnss_is_never_excluded(channel: str, wrong: str) -> None:
     assert np.all(flown.error <= flown.protection)
 
 
+def test_a_local_position_that_drifts_ever_faster_is_not_believed_against_gnss() -> None:
+    """As that of an estimator which does not use GNSS: 0.12 m/s^2 from 60 s on, 29 m/s and 3.5 km in the end."""
+
+    def drifting(record: Any) -> Any:
+        since = record.t_ns / NS - 60.0
+        if not isinstance(record, LocalPosition) or since < 0.0:
+            return record
+        (x, y, z), (vn, ve, vd) = record.x_n, record.v_n
+        x_n = x + 0.06 * since**2, y, z
+        return replace(record, x_n=x_n, v_n=(vn + 0.12 * since, ve, vd))
+
+    flown = fly("imu", drifting, config=Config())  # nothing is fed: its velocity is used
+    assert (flown.of("sources", 30.0) & Source.GNSS).all()
+    assert flown.of("gnss_false", 30.0).max() < 0.1
+    assert flown.error[flown.t > SETTLED_S].max() < 10.0
+
+
 @pytest.mark.parametrize(("gnss_until", "needed"), [(math.inf, False), (90.0, True)])
 def test_without_gnss_a_false_airspeed_must_be_taken_out_of_use(gnss_until: float, needed: bool) -> None:
     """The autopilot compares it with GPS only, and dives for the speed that a stuck pitot lacks."""
