@@ -72,8 +72,9 @@ def sentences(a):
 def flight_records(
     error=(3.0, 4.0), bound=(30.0, 40.0), ins=(60.0, 80.0), truth=True, receiver=0, sigma=5.0, **more
 ):
-    """Five minutes eastwards at 20 m/s; GNSS lost from LOST to FOUND, rejected for 2 s at 60 s. With receiver 1
-    no fix is used.
+    """Five minutes eastwards at 20 m/s; GNSS lost from LOST to FOUND, rejected for 2 s at 60 s.
+
+    With receiver 1 no fix is used.
     """
     one = load(flags={"gnss.second_receiver": False}, environment={})
     rows = [Tuning(START, START, to_toml(one))] if receiver else []

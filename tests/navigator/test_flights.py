@@ -212,7 +212,7 @@ def test_a_healthy_gnss_is_never_excluded(channel: str, wrong: str) -> None:
 
 
 def test_a_local_position_that_drifts_ever_faster_is_not_believed_against_gnss() -> None:
-    """As that of an estimator which does not use GNSS: 0.12 m/s^2 from 60 s on, 29 m/s and 3.5 km in the end."""
+    """As that of an estimator without GNSS: 0.12 m/s^2 from 60 s on, 29 m/s and 3.5 km in the end."""
 
     def drifting(record: Any) -> Any:
         since = record.t_ns / NS - 60.0
