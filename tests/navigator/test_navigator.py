@@ -185,7 +185,7 @@ def test_a_late_answer_is_folded_in_at_its_own_time() -> None:
 
 
 def test_a_flood_of_late_answers_is_folded_in_by_few_roll_backs(monkeypatch: pytest.MonkeyPatch) -> None:
-    """200 answers within a second, five seconds late: at most one roll-back in 2.5 s."""
+    """200 answers within a second, five seconds late: at most one roll-back in half a second."""
     navigator, roll_backs = Navigator(CONFIG), []
     rewound = Navigator._rewound
     monkeypatch.setattr(
@@ -204,18 +204,18 @@ def test_a_flood_of_late_answers_is_folded_in_by_few_roll_backs(monkeypatch: pyt
         )
         outputs += navigator.handle(late)
         kept = max(kept, len(navigator._past))
-    assert len(roll_backs) == 1
+    assert 1 <= len(roll_backs) <= 3
     assert kept <= navigator_module.MOST_KEPT
     rejected = [out for out in outputs if isinstance(out, Rejection) and "late records wait" in out.reason]
     assert len(rejected) >= 200 - 3 * navigator_module.MOST_WAITING
 
 
-@pytest.mark.parametrize(("off_m", "least", "most"), [(5e4, 3, 5), (0.0, 8, 12)])
+@pytest.mark.parametrize(("off_m", "least", "most"), [(5e4, 3, 5), (0.0, 30, 30)])
 def test_false_late_answers_share_few_roll_backs(
     monkeypatch: pytest.MonkeyPatch, off_m: float, least: int, most: int
 ) -> None:
-    """One answer a second, five seconds late: true ones are all used, by a roll-back in 2.5 s or more; false
-    ones are tried once in ten seconds.
+    """One answer a second, five seconds late: true ones are all used, false ones are tried once in ten
+    seconds.
     """
     navigator, roll_backs = Navigator(CONFIG), []
     rewound = Navigator._rewound
