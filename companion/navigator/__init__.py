@@ -180,8 +180,7 @@ class Navigator:
         before = self._settings
         self._settings, self._state = tuned(self._state, before, config)
         self._uses = uses(self._settings)
-        if (config.gnss.receiver, config.uses_second_receiver) != self._receivers.settings:
-            self._receivers = ReceiverChoice(config)
+        self._receivers = self._receivers.tuned(config)
         self._late_ns = round(1e9 * config.estimator.late_s)
         self._gnss_latency_ns = round(1e9 * config.gnss.latency_s)
         same = config.has_own_ins == before.config.has_own_ins

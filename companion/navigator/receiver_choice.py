@@ -15,49 +15,67 @@ STEADY_NS = 5 * SECOND_NS  # it has had a fix for so long: it is used again
 RECEIVER_MESSAGES = ("GPS_RAW_INT", "GPS2_RAW")  # by number
 
 
+class _Reports:
+    """Reports of one receiver by their arrival, ns: the last one, and the first of the present run."""
+
+    def __init__(self) -> None:
+        self.last_ns: int | None = None
+        self.has_fix = False
+        self.since_ns = 0  # since when with a fix, or without
+
+    def note(self, record: Gnss) -> None:
+        if self.is_silent(record.rx_ns) or record.has_3d_fix != self.has_fix:
+            self.has_fix, self.since_ns = record.has_3d_fix, record.rx_ns
+        self.last_ns = record.rx_ns
+
+    def is_silent(self, now_ns: int) -> bool:
+        return self.last_ns is None or now_ns - self.last_ns >= SILENT_NS
+
+
 class ReceiverChoice:
     """The receiver in use, by the fixes of both in order of arrival."""
 
     def __init__(self, config: Config) -> None:
-        self.settings = config.gnss.receiver, config.uses_second_receiver
-        self._preferred, self._has_second = self.settings
+        self._first_ns: int | None = None  # arrival of the first report of either
         self._is_second = False
-        self._received_ns: int | None = None  # a report of the preferred one; before it, the first report
-        self._fix_since_ns: int | None = None
-        self._no_fix_since_ns: int | None = None
+        self._settings = config.gnss.receiver, config.uses_second_receiver
+        self._reports = _Reports(), _Reports()
+
+    def tuned(self, config: Config) -> ReceiverChoice:
+        """Return the choice to go on with: this one, unless another preference is configured."""
+        same = self._settings == (config.gnss.receiver, config.uses_second_receiver)
+        return self if same else ReceiverChoice(config)
 
     def takes(self, record: Gnss) -> tuple[bool, list[Event]]:
         """Return whether the receiver of `record` is in use, and an event where that changes."""
-        if record.receiver == self._preferred:
-            self._note(record)
-            is_back = self._fix_since_ns is not None and record.rx_ns - self._fix_since_ns >= STEADY_NS
-            events = self._change(False, record, "has a fix again") if self._is_second and is_back else []
-            return not self._is_second, events
-        if not self._has_second:
+        preferred, has_second = self._settings
+        is_preferred, now = record.receiver == preferred, record.rx_ns
+        if not is_preferred and not has_second:
             return False, []
-        events = []
-        now, self._received_ns = record.rx_ns, self._received_ns or record.rx_ns
-        silent = now - self._received_ns >= SILENT_NS
-        lost = self._no_fix_since_ns is not None and now - self._no_fix_since_ns >= NO_FIX_NS
-        if not self._is_second and record.has_3d_fix and (silent or lost):
-            self._fix_since_ns = None
-            events = self._change(True, record, "is silent" if silent else "has no fix")
-        elif self._is_second and not record.has_3d_fix and self._fix_since_ns is not None and not silent:
-            events = self._change(False, record, "has a fix, the other none")
-        return self._is_second, events
+        if self._first_ns is None:
+            self._first_ns = now
+        first, second = self._reports[preferred], self._reports[1 - preferred]
+        (first if is_preferred else second).note(record)
+        why = None
+        if self._is_second:
+            why = self._reason_to_return(first, second, now)
+        elif second.has_fix and not second.is_silent(now) and now - self._first_ns >= SILENT_NS:
+            why = self._reason_to_leave(first, now)
+        if why is None:
+            return is_preferred != self._is_second, []
+        self._is_second = not self._is_second
+        name, other = RECEIVER_MESSAGES[preferred], RECEIVER_MESSAGES[1 - preferred]
+        text = f"{name} {why}: {other if self._is_second else name} is used"
+        return is_preferred != self._is_second, [Event(record.t_ns, now, Severity.NOTICE, text)]
 
-    def _note(self, record: Gnss) -> None:
-        now, last = record.rx_ns, self._received_ns
-        is_broken = last is None or now - last >= SILENT_NS
-        self._received_ns = now
-        if not record.has_3d_fix:
-            self._fix_since_ns, self._no_fix_since_ns = None, self._no_fix_since_ns or now
-        else:
-            self._no_fix_since_ns = None
-            self._fix_since_ns = now if is_broken or self._fix_since_ns is None else self._fix_since_ns
+    def _reason_to_return(self, first: _Reports, second: _Reports, now_ns: int) -> str | None:
+        if first.is_silent(now_ns) or not first.has_fix:
+            return None
+        if now_ns - first.since_ns >= STEADY_NS:
+            return "has a fix again"
+        return "has a fix, the other none" if second.is_silent(now_ns) or not second.has_fix else None
 
-    def _change(self, is_second: bool, record: Gnss, why: str) -> list[Event]:
-        self._is_second = is_second
-        first, other = RECEIVER_MESSAGES[self._preferred], RECEIVER_MESSAGES[1 - self._preferred]
-        text = f"{first} {why}: {other if is_second else first} is used"
-        return [Event(record.t_ns, record.rx_ns, Severity.NOTICE, text)]
+    def _reason_to_leave(self, first: _Reports, now_ns: int) -> str | None:
+        if first.is_silent(now_ns):
+            return "is silent"
+        return "has no fix" if not first.has_fix and now_ns - first.since_ns >= NO_FIX_NS else None

@@ -82,7 +82,7 @@ class State(NamedTuple):
     scatter: Mapping[str, Scatter] = MappingProxyType({})  # of the measurements, by name
     parallel: Parallel | None = None  # filters beside the bank
     gnss: Gnss | None = None  # the last new one, used or not
-    gnss_used_ns: int | None = None  # when a fix was last taken up, used or not
+    gnss_taken: Gnss | None = None  # the last one judged by the bank
     gnss_fix: tuple[Gnss, Point] | None = None  # the last one believed
     pending: Pending | None = None
     gnss_ns: int | None = None  # when fixes were last believed

@@ -90,7 +90,8 @@ from companion.units import SECOND_NS
 
 PATIENCE_NS = 5 * SECOND_NS  # wait for the autopilot's own origin
 #: An autopilot checks its airspeed sensor against GPS only: ArduPlane dived to the ground for speed in 67 s.
-FALSE_AIRSPEED = "take the airspeed sensor out of use: ARSPD_USE 0"
+FALSE_AIRSPEED = "take the airspeed sensor out of use"
+USE_AIRSPEED = {"ardupilot": ": ARSPD_USE 0", "px4": ": FW_USE_AIRSPD 0"}
 CONFIRM_NS = SECOND_NS  # one fix in disagreement is an outlier: a source is excluded once it lasts
 JUMP_SPREAD_S = 0.5  # across a longer silence a turn explains a step as well as a jump does
 FAR_M, FAST_M_S = 500.0, 5.0  # the nominal trajectory is brought back from this far off
@@ -422,10 +423,10 @@ def _begun(state: State, record: Gnss | RsbnFix, settings: Settings) -> State:
 
 
 def _gnss(state: State, record: Gnss, settings: Settings) -> Step:
-    config, before = settings.config.gnss, state.gnss
+    config, last = settings.config.gnss, state.gnss_taken
     state = state._replace(gnss=record)
-    used = math.inf if state.gnss_used_ns is None else (record.t_ns - state.gnss_used_ns) * 1e-9
-    if not record.has_3d_fix or used < config.every_s:
+    since = math.inf if last is None else (record.t_ns - last.t_ns) * 1e-9
+    if not record.has_3d_fix or since < config.every_s:
         return state, []
     state = _begun(state, record, settings)
     if state.nominal is None or state.bank is None or _silent(state, record.t_ns):
@@ -434,7 +435,7 @@ def _gnss(state: State, record: Gnss, settings: Settings) -> Step:
     known, channel, nominal = hypotheses(state, settings), settings.model.channel, state.nominal
     assert state.bank is not None
     assert nominal is not None
-    if before is not None and before.receiver != record.receiver:  # its drift is another
+    if last is not None and last.receiver != record.receiver:  # its drift is another
         drift = range(channel.drift.start, channel.drift.stop)
         state = state._replace(bank=banks.renew(state.bank, drift, [config.sigma_m] * 2))
     assert state.bank is not None
@@ -450,7 +451,7 @@ def _gnss(state: State, record: Gnss, settings: Settings) -> Step:
         bank = measurements.gnss_velocity(
             bank, known, channel, record, nominal.point, a_n, settings.config, factor
         ).bank
-    state = state._replace(bank=bank, gnss_used_ns=record.t_ns, fixed=True)
+    state = state._replace(bank=bank, gnss_taken=record, fixed=True)
     state, out = _decided(state, record, settings)
     out = [*noted, *out]
     assert state.bank is not None
@@ -635,7 +636,7 @@ def _beacon(state: State, record: RsbnFix, settings: Settings) -> tuple[State, i
     new = Beacon(record.beacon, place, t_ns)
     if len(state.beacons) < MOST_BEACONS:
         larger = settings.model.with_beacon(bank, len(state.beacons))
-        if not state.beacons and state.gnss_used_ns is not None:
+        if not state.beacons and state.gnss_taken is not None:
             larger = settings.model.doubted(larger)
         state = state._replace(bank=larger, beacons=(*state.beacons, new))
         state = state._replace(false=(*state.false, 0.0, 0.0), reported=(*state.reported, 0, 0))
@@ -728,7 +729,8 @@ def _decided(state: State, record: Stamped, settings: Settings) -> Step:
             out.append(Event(record.t_ns, record.rx_ns, severity, f"{source_name(i, state)} {text}"))
             by_gnss = sources(state, record.t_ns, settings) & Source.GNSS
             if i == AIRSPEED and reported[i] == EXCLUDED and not by_gnss:
-                out.append(Event(record.t_ns, record.rx_ns, Severity.WARNING, FALSE_AIRSPEED))
+                text = FALSE_AIRSPEED + USE_AIRSPEED.get(settings.config.output.profile, "")
+                out.append(Event(record.t_ns, record.rx_ns, Severity.WARNING, text))
     leading = (bank, banks.estimate(bank, known.layout))
     state = state._replace(
         bank=bank, leading=leading, false=false, reported=tuple(reported), certain_ns=tuple(since)

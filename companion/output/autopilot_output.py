@@ -62,6 +62,10 @@ class AutopilotOutput:
         """How often each message was withheld, by name and reason."""
         return self._monitor.counts
 
+    def tune(self, config: Config) -> None:
+        """Go on with another configuration, of the same profile."""
+        self.config, self._receivers = config, self._receivers.tuned(config)
+
     def receive(self, record: Stamped) -> None:
         """Process a record from the autopilot or a beacon."""
         if isinstance(record, SystemTime):

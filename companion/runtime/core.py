@@ -104,6 +104,8 @@ ABOUT_SOURCE_SET = frozenset(
         mavlink.MAVLINK_MSG_ID_NAMED_VALUE_FLOAT,
     }
 )
+#: Rate of the GNSS receiver that is not used while the other has a fix.
+STANDBY_HZ = 2.0
 #: Answers to the parameter check.
 PARAMETERS = frozenset({mavlink.MAVLINK_MSG_ID_PARAM_VALUE, mavlink.MAVLINK_MSG_ID_PARAM_ERROR})
 #: All messages that the core handles; others are logged only.
@@ -153,10 +155,6 @@ class Link:
     def received(self) -> int:
         """Frames received from all senders of this link."""
         return self.session.reader.received
-
-
-#: Rate of the GNSS receiver that is not used while the other has a fix.
-STANDBY_HZ = 2.0
 
 
 def requested_rates(config: Config) -> dict[str, float]:
@@ -407,7 +405,7 @@ class CompanionCore:
             if config is not None:
                 self._config = config
                 for each in self.links.values():
-                    each.output.config = config
+                    each.output.tune(config)
                     each.session.set_rates(requested_rates(config), event.received_ns)
                 self._on_record(Tuning(event.received_ns, event.received_ns, to_toml(config)))
         if msgid in ABOUT_SOURCE_SET:

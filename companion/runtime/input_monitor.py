@@ -17,6 +17,7 @@ from companion.config import Config, Sensor
 from companion.link.dialect import TYPES
 from companion.link.session import Session
 from companion.link.stream_rates import ENOUGH
+from companion.navigator.receiver_choice import RECEIVER_MESSAGES
 from companion.navigator.state import Settings
 from companion.navigator.step import uses
 from companion.records import (
@@ -87,10 +88,10 @@ def stream_states(
     config: Config, make: str, rates: Mapping[int, tuple[float, float | None]]
 ) -> Iterator[StreamState]:
     """Yield the state of each requested stream that the make sends; `rates` by message id, Hz."""
-    used = _used_records(config)
+    used, second = _used_records(config), RECEIVER_MESSAGES[1 - config.gnss.receiver]
     for msgid, (requested, measured) in rates.items():
         name = TYPES[msgid].name
-        is_absent = name == "GPS2_RAW" and not measured and config.gnss.receiver == 0  # few have a second one
+        is_absent = name == second and not measured  # few have a second one
         if name not in MISSING_MESSAGES.get(make, ()) and not is_absent:
             stream = STREAMS.get(name)
             yield StreamState(name, requested, measured, stream is None or stream.record in used)

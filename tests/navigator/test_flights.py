@@ -14,7 +14,7 @@ from msgspec.structs import replace
 
 from companion.config import Config, load
 from companion.navigator import Navigator
-from companion.navigator.step import FALSE_AIRSPEED
+from companion.navigator.step import FALSE_AIRSPEED, USE_AIRSPEED
 from companion.records import (
     PARALLEL,
     AirData,
@@ -235,7 +235,7 @@ def test_without_gnss_a_false_airspeed_must_be_taken_out_of_use(gnss_until: floa
     texts = [event.text for event in flown.events]
     assert any(text.startswith("airspeed is excluded") for text in texts)
     assert (FALSE_AIRSPEED in texts) == needed
-    assert len(FALSE_AIRSPEED) <= 50  # one STATUSTEXT
+    assert all(len(FALSE_AIRSPEED + name) <= 50 for name in USE_AIRSPEED.values())  # one STATUSTEXT
 
 
 @pytest.mark.parametrize("channel", ["ins", "imu"])

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Any
 
+import pytest
 from msgspec import structs
 
 from companion.config import load
+from companion.estimate import bank as banks
 from companion.navigator import Navigator
 from companion.navigator.receiver_choice import ReceiverChoice
 from companion.output.autopilot_output import AutopilotOutput
@@ -71,6 +74,28 @@ def test_it_returns_at_once_to_a_first_receiver_with_a_fix_when_the_second_has_n
     assert [round(t) for t, _ in changes] == [11, 22]
 
 
+def test_it_returns_at_once_to_a_first_receiver_with_a_fix_when_the_second_is_silent() -> None:
+    """The source switch would report a silent receiver after 3 s."""
+
+    def first(t: float) -> int:
+        return 1 if 10.0 <= t < 20.0 else 3
+
+    (_, _), (back, why) = chosen(first, lambda t: 3 if t < 19.0 else None, 40.0)
+    assert back - 18.5 < SILENT_S
+    assert why == "GPS_RAW_INT has a fix, the other none: GPS_RAW_INT is used"
+
+
+def test_another_preferred_receiver_applies_at_once_and_the_same_one_keeps_what_is_known() -> None:
+    other = load(flags={"gnss.receiver": 1}, environment={})
+    choice = ReceiverChoice(CONFIG)
+    assert choice.tuned(CONFIG) is choice
+    assert choice.tuned(other).takes(fix(1, 0.0, 3)) == (True, [])
+    output = AutopilotOutput(CONFIG)
+    output.tune(other)
+    output.receive(fix(1, 0.0, 3))
+    assert output._source_switch.situation(0).fix_s == 0.0
+
+
 def test_neither_the_receiver_that_gps_input_feeds_nor_one_switched_off_is_used() -> None:
     fed = load(flags={"output.profile": "ardupilot", "output.via": "gps_input"}, environment={})
     off = load(flags={"gnss.second_receiver": False}, environment={})
@@ -115,6 +140,33 @@ def test_a_flight_goes_on_with_gnss_by_the_second_and_source_set_2_is_never_requ
     assert max(s.gnss_false for s in after) < 0.1
     off = [(s.lat - LAT) * 6.37e6 - 20.0 * s.t_ns / SECOND_NS for s in after]
     assert max(map(abs, off)) < 4.0
+
+
+def test_each_change_of_the_receiver_makes_the_drift_of_gnss_unknown_again(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Also where reports without a fix, or closer than `gnss.every_s`, come in between."""
+    renewed: list[float] = []
+    renew = banks.renew
+
+    def counted(*args: Any) -> Any:
+        renewed.append(t)
+        return renew(*args)
+
+    monkeypatch.setattr(banks, "renew", counted)
+    navigator = Navigator(load(flags={"output.profile": "ardupilot", "gnss.every_s": 1.0}, environment={}))
+    for k in range(20 * 90):
+        t = 0.05 * k
+        at = round(t * SECOND_NS)
+        shake = 1e-4 * math.sin(k)
+        records = [Imu(at, at, 0, (shake, 0.0, -G0), (0.0, 0.0, shake)), Attitude(at, at, shake, 0.0, 0.0)]
+        if k % 4 == 1:
+            records.append(fix(0, t, 1 if 30.0 <= t < 60.0 else 3))
+        if k % 10 == 3:
+            records.append(fix(1, t, 3, 3.0))
+        for record in records:
+            navigator.handle(record)
+    assert [round(t) for t in renewed] == [31, 65]
 
 
 def test_a_repeated_fix_is_new_from_another_receiver_only() -> None:

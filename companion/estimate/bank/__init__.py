@@ -11,7 +11,7 @@ states and goes on using the source. The price of being false is paid once, by t
 and the consistency of the lie earns it back.
 
     births     every few seconds the heaviest rows get children, each with one fault more, at the prior rate;
-               jumps that are learnt wrongly before their birth, as those of the wind, every second
+               jumps that are taken for something else until they are born, as those of the wind: every second
     deaths     a fault ends at a rate of its own: the child believes the source again
     returns    the first measurement of a source after silence bears children of its own ("captured")
     grades     rows differ in the amplitude of the channel's noise; the evidence selects

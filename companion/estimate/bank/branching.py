@@ -92,7 +92,7 @@ def births(
             since = bank.jumped_t if jump.often else bank.born_t
             children.append(_Child(int(p), _log(jump.rate_h * (bank.t - since) / HOUR_S), jump=j))
     children += _grade_children(bank, layout, settings, hours)
-    grown = _with_children(bank, layout, [c for c in children if c.log_prior > NEVER])
+    grown = _with_children(bank, layout, children)
     grown = grown._replace(born_t=bank.t, jumped_t=bank.t)
     return reduce(grown, layout, settings) if reduced else grown
 
@@ -112,9 +112,8 @@ def jump_births(bank: Bank, layout: Layout, settings: Settings = DEFAULT) -> Ban
     passed = bank.t - bank.jumped_t
     if not jumps or passed < settings.jump_s:
         return bank
-    heaviest = _heaviest_of_grades(bank).values()
+    heaviest = _heaviest_of_grades(bank)
     children = [_Child(p, _log(rate * passed / HOUR_S), jump=j) for p in heaviest for j, rate in jumps]
-    children = [child for child in children if child.log_prior > NEVER]
     return _with_children(bank, layout, children)._replace(jumped_t=bank.t)
 
 
@@ -143,7 +142,7 @@ def returns(bank: Bank, layout: Layout, source: int, settings: Settings) -> tupl
                 children += _lie_children(int(p), f, fault.first_lies, fault.first)
             elif now == f:
                 children += _lie_children(int(p), f, fault.first_lies, 0.3)
-    grown = _with_children(bank, layout, [c for c in children if c.log_prior > NEVER])
+    grown = _with_children(bank, layout, children)
     if len(grown.L) == len(bank.L):
         return bank, False
     return grown, True
@@ -173,7 +172,7 @@ def false_since_first(
     -------
     Bank : with at most `settings.rows` rows.
     """
-    heaviest = _heaviest_of_grades(bank).values()
+    heaviest = _heaviest_of_grades(bank)
     children = [
         child._replace(undone=states)
         for f, scales in lies.items()
@@ -184,12 +183,12 @@ def false_since_first(
     return reduce(_with_children(bank, layout, children), layout, settings)
 
 
-def _heaviest_of_grades(bank: Bank) -> dict[int, int]:
-    """The heaviest row by grade."""
+def _heaviest_of_grades(bank: Bank) -> list[int]:
+    """The heaviest row of each grade."""
     heaviest: dict[int, int] = {}
     for i in np.argsort(-bank.L).tolist():
         heaviest.setdefault(int(bank.grade[i]), i)
-    return heaviest
+    return list(heaviest.values())
 
 
 def _lie_children(parent: int, fault: int, lies: tuple[Lie, ...], prior: float) -> list[_Child]:
@@ -248,7 +247,8 @@ def _log(p: float) -> float:
 
 
 def _with_children(bank: Bank, layout: Layout, children: list[_Child]) -> Bank:
-    """The bank with children appended; each parent keeps the weight it did not give away."""
+    """The bank with the possible children appended; each parent keeps the weight it did not give away."""
+    children = [child for child in children if child.log_prior > NEVER]
     if not children:
         return bank
     rows, k = len(bank.L), len(children)
