@@ -90,7 +90,7 @@ from companion.units import SECOND_NS
 
 PATIENCE_NS = 5 * SECOND_NS  # wait for the autopilot's own origin
 #: An autopilot checks its airspeed sensor against GPS only: ArduPlane dived to the ground for speed in 67 s.
-FALSE_AIRSPEED = "take the airspeed sensor out of use"
+FALSE_AIRSPEED = "switch the airspeed sensor off"
 USE_AIRSPEED = {"ardupilot": ": ARSPD_USE 0", "px4": ": FW_USE_AIRSPD 0"}
 CONFIRM_NS = SECOND_NS  # one fix in disagreement is an outlier: a source is excluded once it lasts
 JUMP_SPREAD_S = 0.5  # across a longer silence a turn explains a step as well as a jump does

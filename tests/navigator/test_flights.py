@@ -234,7 +234,7 @@ def test_without_gnss_a_false_airspeed_must_be_taken_out_of_use(gnss_until: floa
     flown = fly("imu", after(150.0, AirData, airspeed=noisy(8.0)), gnss_until=gnss_until)
     texts = [event.text for event in flown.events]
     assert any(text.startswith("airspeed is excluded") for text in texts)
-    assert (FALSE_AIRSPEED in texts) == needed
+    assert any(text.startswith(FALSE_AIRSPEED) for text in texts) == needed
     assert all(len(FALSE_AIRSPEED + name) <= 50 for name in USE_AIRSPEED.values())  # one STATUSTEXT
 
 
