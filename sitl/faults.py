@@ -255,6 +255,26 @@ def stamped_late(stream: Sequence[R], fault: Fault, size: float, rng: Generator)
     ]
 
 
+def lever_arm(stream: Sequence[Gnss], fault: Fault, size: float, rng: Generator) -> list[Gnss]:
+    """Move the antenna `size` metres ahead of the IMU along the course; in turns it has a velocity of its own."""
+    out = list(stream)
+    moving = [
+        (i, r.t_ns * 1e-9, *r.v_n) for i, r in enumerate(stream) if r.v_n and math.hypot(*r.v_n[:2]) > 1.0
+    ]
+    index, t, north, east, down = np.array(moving).T
+    course = np.unwrap(np.arctan2(east, north))
+    rate = (np.interp(t + 1.0, t, course) - np.interp(t - 1.0, t, course)) / 2.0
+    for i, c, w, *v_n in zip(index.astype(int), course, rate, north, east, down):
+        if fault.covers(stream[i].t_ns):
+            ahead, across = (
+                size * np.array((math.cos(c), math.sin(c))),
+                size * w * np.array((-math.sin(c), math.cos(c))),
+            )
+            velocity = (v_n[0] + across[0], v_n[1] + across[1], v_n[2])
+            out[i] = replace(_displace_fix(stream[i], *ahead), v_n=velocity)
+    return out
+
+
 class RecordFault(NamedTuple):
     """Record fault: kind of record, default size, function."""
 
@@ -269,6 +289,7 @@ RECORD_FAULTS: dict[str, RecordFault] = {
     "gnss-accelerate": RecordFault(Gnss, 0.003, per_record(gnss_accelerate)),
     "gnss-return": RecordFault(Gnss, 450.0, per_record(gnss_return)),
     "gnss-latency": RecordFault(Gnss, 0.2, stamped_late),
+    "gnss-lever-arm": RecordFault(Gnss, 5.0, lever_arm),
     "gnss-jam": RecordFault(Gnss, 0.0, per_record(gnss_jam)),
     "gnss-frozen": RecordFault(Gnss, 0.0, repeat_last),
     "gnss-stale": RecordFault(Gnss, 0.0, repeat_last_with_new_stamp),

@@ -76,7 +76,7 @@ def _fault(name: str, size: float | None = None, start_s: float = START_S) -> Fa
     return Fault(name, start_s, math.inf, size)
 
 
-def _beacon(name: str, size: float, start_s: float = START_S) -> Wrong:
+def _wrong(name: str, size: float, start_s: float = START_S) -> Wrong:
     return Wrong(fault=_fault(name, size, start_s))
 
 
@@ -96,15 +96,16 @@ WRONG: dict[str, Wrong] = {
     "position jumps 100 m": Wrong(INS, _fault("ins-reset", 100.0), feeds=False),
     # not of an INS stated to be independent: its drift is the mirror image of a GNSS that is drawn off
     "position drifts 1 m/s": Wrong(("stock",), _fault("ins-drift", 1.0), feeds=False),
-    "beacon range +50 m": _beacon("beacon-bias", 50.0),
-    "beacon range +200 m": _beacon("beacon-bias", 200.0),
-    "beacon range +1000 m": _beacon("beacon-bias", 1000.0),
-    "beacon azimuth +1 deg": _beacon("beacon-north", math.radians(1.0)),
-    "beacon azimuth +5 deg": _beacon("beacon-north", math.radians(5.0)),
-    "beacon 3 km away": _beacon("beacon-position", 3000.0, 0.0),
-    "GNSS 0.1 s late": _beacon("gnss-latency", 0.1, 0.0),
-    "GNSS 0.2 s late": _beacon("gnss-latency", 0.2, 0.0),
-    "GNSS 0.3 s late": _beacon("gnss-latency", 0.3, 0.0),
+    "beacon range +50 m": _wrong("beacon-bias", 50.0),
+    "beacon range +200 m": _wrong("beacon-bias", 200.0),
+    "beacon range +1000 m": _wrong("beacon-bias", 1000.0),
+    "beacon azimuth +1 deg": _wrong("beacon-north", math.radians(1.0)),
+    "beacon azimuth +5 deg": _wrong("beacon-north", math.radians(5.0)),
+    "beacon 3 km away": _wrong("beacon-position", 3000.0, 0.0),
+    "GNSS 0.1 s late": _wrong("gnss-latency", 0.1, 0.0),
+    "GNSS 0.2 s late": _wrong("gnss-latency", 0.2, 0.0),
+    "GNSS 0.3 s late": _wrong("gnss-latency", 0.3, 0.0),
+    "GNSS antenna 5 m ahead": _wrong("gnss-lever-arm", 5.0, 0.0),
     "GNSS 3x as noisy as stated": Wrong(noisy=Gnss),
     "beacon 3x as noisy as stated": Wrong(noisy=RsbnFix),
     "stall of 0.3 s": Wrong(stall_s=0.3, over_link=True),
