@@ -30,6 +30,7 @@ from companion.storage.mcap_file import DiskFile
 R = TypeVar("R", bound=Stamped)
 Generator = np.random.Generator
 
+FAST_M_S = 10.0  # the course is known at this speed
 OUTAGE_S = 60.0  # without a fix, before the fix of "gnss-return"
 
 
@@ -256,22 +257,21 @@ def stamped_late(stream: Sequence[R], fault: Fault, size: float, rng: Generator)
 
 
 def lever_arm(stream: Sequence[Gnss], fault: Fault, size: float, rng: Generator) -> list[Gnss]:
-    """Move the antenna `size` metres ahead of the IMU along the course; in turns it has a velocity of its own."""
-    out = list(stream)
-    moving = [
-        (i, r.t_ns * 1e-9, *r.v_n) for i, r in enumerate(stream) if r.v_n and math.hypot(*r.v_n[:2]) > 1.0
-    ]
-    index, t, north, east, down = np.array(moving).T
-    course = np.unwrap(np.arctan2(east, north))
-    rate = (np.interp(t + 1.0, t, course) - np.interp(t - 1.0, t, course)) / 2.0
-    for i, c, w, *v_n in zip(index.astype(int), course, rate, north, east, down):
-        if fault.covers(stream[i].t_ns):
-            ahead, across = (
-                size * np.array((math.cos(c), math.sin(c))),
-                size * w * np.array((-math.sin(c), math.cos(c))),
-            )
-            velocity = (v_n[0] + across[0], v_n[1] + across[1], v_n[2])
-            out[i] = replace(_displace_fix(stream[i], *ahead), v_n=velocity)
+    """Move the antenna `size` metres ahead of the IMU along the course; in turns it has its own velocity.
+
+    At a low speed the course is that of the nearest time at a higher one.
+    """
+    fixes = [(r.t_ns * 1e-9, *r.v_n[:2]) for r in stream if r.v_n and math.hypot(*r.v_n[:2]) > FAST_M_S]
+    t, north, east = np.array(fixes).T
+    at = np.array([r.t_ns * 1e-9 for r in stream])
+    course = np.interp(at, t, np.unwrap(np.arctan2(east, north)))
+    out = []
+    for fix, angle, rate in zip(stream, course.tolist(), np.gradient(course, at).tolist()):
+        if fault.covers(fix.t_ns):
+            ahead = size * math.cos(angle), size * math.sin(angle)
+            v = fix.v_n and (fix.v_n[0] - rate * ahead[1], fix.v_n[1] + rate * ahead[0], fix.v_n[2])
+            fix = replace(_displace_fix(fix, *ahead), v_n=v)
+        out.append(fix)
     return out
 
 

@@ -2,8 +2,8 @@
 
 A channel integrates a nominal trajectory from what the autopilot sends. Its error, nominal minus truth, is
 what the bank of hypotheses estimates. Position errors north and east (m) are states 0 and 1, velocity
-errors (m/s) states 2 and 3; drift and latency of GNSS are states too. A transition covers the time since
-the bank was last propagated and serves all rows; the process noise has one layer for each grade.
+errors (m/s) states 2 and 3; drift, latency and lever arm of GNSS are states too. A transition covers the
+time since the bank was last propagated and serves all rows; the process noise has one layer for each grade.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class Channel(Protocol):
 
     @property
     def n(self) -> int:
-        """Number of states, GNSS drift and latency included."""
+        """Number of states, those of GNSS included."""
 
     @property
     def drift(self) -> slice:
@@ -66,6 +66,10 @@ class Channel(Protocol):
     @property
     def latency(self) -> int:
         """The state of GNSS latency."""
+
+    @property
+    def arm(self) -> int | None:
+        """The state of the antenna's lever arm along the fuselage; None where it is far below the noise."""
 
     @property
     def grades(self) -> tuple[float, ...]:

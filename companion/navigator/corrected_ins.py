@@ -22,7 +22,7 @@ from companion.navigator.ins_channel import InsChannel, ins_channel
 from companion.units import Floats
 
 UNIT_NAMES = (*INS_STATES, "EX", "EY", "EZ", "AX", "AY")
-INS_NAMES = (*UNIT_NAMES, "driftN", "driftE", "latency")
+INS_NAMES = (*UNIT_NAMES, "driftN", "driftE", "latency", "arm")
 CHAINS = 3  # lines of position with a bias of their own
 CHAIN_BIAS_M, CHAIN_S = 200.0, 3600.0
 
@@ -47,6 +47,7 @@ class CorrectedIns(NamedTuple):
     has_second: bool
     drift: slice
     latency: int
+    arm: int | None
     grades: tuple[float, ...]
     velocity_noise: float = 0.0
     wind: tuple[int, ...] = ()
@@ -89,7 +90,7 @@ def corrected_ins(config: Config) -> InsChannel | CorrectedIns:
     if not config.inertial.correctors:
         return ins
     second = "second_ins" in config.inertial.correctors
-    return CorrectedIns(ins, _extra_states(config), second, ins.drift, ins.latency, ins.grades)
+    return CorrectedIns(ins, _extra_states(config), second, ins.drift, ins.latency, ins.arm, ins.grades)
 
 
 def _extra_states(config: Config) -> ExtraStates:

@@ -2,7 +2,8 @@
 
 The model is `nav.error_model.aircraft_matrix` with Markov gyro drift and accelerometer errors. States:
 position errors north and east (m), velocity errors (m/s), P minus the rotation of the platform (3, rad), E
-minus the gyro drift (3, rad/s), A accelerometer errors (2, m/s^2), GNSS drift (2, m), GNSS latency (s).
+minus the gyro drift (3, rad/s), A accelerometer errors (2, m/s^2), GNSS drift (2, m), GNSS latency (s),
+lever arm of the GNSS antenna ahead of the INS (m).
 Errors of sensors that are strapped down turn with the aircraft. A grade multiplies the amplitude of the
 unit's errors.
 """
@@ -20,12 +21,13 @@ from companion.nav.error_model import INS_STATES, aircraft_matrix
 from companion.navigator.channel import Nominal, Transition, discretise
 from companion.units import G0, Floats
 
-N = 15
+N = 16
 VELOCITY, TILT, INS = slice(2, 4), slice(4, 7), slice(0, 7)
 GYRO, ACCELEROMETER = (7, 8), (10, 11)  # north and east
-DRIFT, LATENCY = slice(12, 14), 14
+DRIFT, LATENCY, ARM = slice(12, 14), 14, 15
 TURNING_M_S = 5.0  # slower, the course does not give the heading
 LATENCY_S, LATENCY_WALK = 0.15, 1e-4  # one sigma of the latency (s) and its random walk (s/sqrt s)
+ARM_M = 1.5  # one sigma of the antenna's lever arm along the fuselage
 FIRST_POSITION_M = 1000.0  # the first fix tells where the INS is
 AMPLITUDES = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0)
 WEIGHTS = (1.0, 0.5, 0.35, 0.25, 0.18, 0.12, 0.09)
@@ -43,6 +45,7 @@ class InsChannel(NamedTuple):
     n: int = N
     drift: slice = DRIFT
     latency: int = LATENCY
+    arm: int | None = ARM
     grades: tuple[float, ...] = WEIGHTS
     velocity_noise: float = 0.0
     wind: tuple[int, ...] = ()
@@ -94,7 +97,7 @@ def ins_channel(config: Config) -> InsChannel:
         + [drift] * 3
         + [bias] * 2
         + [gnss.sigma_m] * 2
-        + [LATENCY_S]
+        + [LATENCY_S, ARM_M]
     )
     amplitude = np.ones((len(AMPLITUDES), N))
     amplitude[:, :ours] = np.array(AMPLITUDES)[:, None]

@@ -30,6 +30,7 @@ from companion.navigator.hypotheses import (
     Hypotheses,
 )
 from companion.navigator.inertial_track import Point
+from companion.navigator.ins_channel import ARM_M, TURNING_M_S
 from companion.navigator.own_channel import OwnChannel
 from companion.records import Gnss, Vector2
 from companion.units import Floats
@@ -67,15 +68,23 @@ def gnss_position(
     variance: float,
     v_n: Vector2,
 ) -> Taken:
-    """Take the position of a fix: nominal minus GNSS is the error less drift, plus latency times velocity.
+    """Take the position of a fix: nominal minus GNSS is the error less drift and arm, plus latency times
+    speed.
 
-    `apart` is GNSS minus nominal (m), `variance` that of its white noise (m^2).
+    `apart` is GNSS minus nominal (m), `variance` that of its white noise (m^2). The arm is along the
+    course; slower than TURNING_M_S its direction is unknown.
     """
     north, east = apart
     H = np.zeros((2, known.layout.n_base))
     H[0, 0] = H[1, 1] = 1.0
     H[:, channel.drift] = -np.eye(2)
     H[:, channel.latency] = v_n
+    if channel.arm is not None:
+        speed = math.hypot(*v_n)
+        if speed > TURNING_M_S:
+            H[:, channel.arm] = -v_n[0] / speed, -v_n[1] / speed
+        else:
+            variance += ARM_M**2
     after, seen = banks.update(
         bank,
         known.layout,
@@ -87,6 +96,13 @@ def gnss_position(
         outlier=OUTLIER["position"],
     )
     return _taken(after, seen, 2)
+
+
+def other_receiver(bank: Bank, channel: Channel) -> Bank:
+    """Forget drift, latency and lever arm: the next fix is another receiver's."""
+    arm = [] if channel.arm is None else [channel.arm]
+    states = [*range(channel.drift.start, channel.drift.stop), channel.latency, *arm]
+    return banks.renew(bank, states, np.sqrt(channel.prior()[0].diagonal()[states]).tolist())
 
 
 def gnss_apart(record: Gnss, nominal: Point) -> Vector2:
@@ -107,17 +123,23 @@ def gnss_velocity(
 ) -> Taken:
     """Take the velocity of a fix; rows that hold GNSS and its velocity false see the rate of its error.
 
-    `factor` of the stated variance, by the scatter of the fixes.
+    In turns an antenna ahead has a velocity of its own. `factor` of the stated variance, by the scatter of
+    the fixes.
     """
     assert record.v_n is not None
     layout = known.layout
     z = np.array((nominal.v_n[0] - record.v_n[0], nominal.v_n[1] - record.v_n[1]))
     rate = layout.starts[GNSS_GROUP] + layout.groups[GNSS_GROUP]
+    v_n = nominal.v_n
+    speed = math.hypot(*v_n[:2])
+    turn = (v_n[0] * a_n[1] - v_n[1] * a_n[0]) / max(speed, TURNING_M_S) ** 3  # rate of the course by speed
 
     def seen_by(bank: Bank) -> tuple[Floats, Floats]:
         H = np.zeros((len(bank.L), 2, layout.n))
         H[:, 0, 2] = H[:, 1, 3] = 1.0
         H[:, :, channel.latency] = a_n
+        if channel.arm is not None and speed > TURNING_M_S:
+            H[:, :, channel.arm] = turn * v_n[1], -turn * v_n[0]
         lying = (bank.fault[:, GNSS_GROUP] == CONSISTENT).astype(np.float64)
         H[:, 0, rate] = H[:, 1, rate + 1] = lying
         return np.broadcast_to(z, (len(bank.L), 2)), H

@@ -76,6 +76,7 @@ class OwnChannel:
 
     grades = WEIGHTS
     drift = own_error_model.DRIFT
+    arm = None  # airspeed and attitude are not known to a metre
     velocity_noise = 0.0
     wind = (4, 5)
 

@@ -435,9 +435,8 @@ def _gnss(state: State, record: Gnss, settings: Settings) -> Step:
     known, channel, nominal = hypotheses(state, settings), settings.model.channel, state.nominal
     assert state.bank is not None
     assert nominal is not None
-    if last is not None and last.receiver != record.receiver:  # its drift is another
-        drift = range(channel.drift.start, channel.drift.stop)
-        state = state._replace(bank=banks.renew(state.bank, drift, [config.sigma_m] * 2))
+    if last is not None and last.receiver != record.receiver:
+        state = state._replace(bank=measurements.other_receiver(state.bank, channel))
     assert state.bank is not None
     variance = fix_observations.white_sigma(record, config) ** 2
     apart = measurements.gnss_apart(record, nominal.point)
