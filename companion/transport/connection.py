@@ -70,7 +70,7 @@ class Connection:
         self._inbox_size = 0
         self._send_queue = SendQueue(send, self._loop.time)
         self._waiter: asyncio.Future[None] | None = None
-        self._end: ConnectionError | None = None
+        self._end: str | None = None  # why it ended
         self._handler: Handler | None = None
         self._loop.add_reader(self._fd, self._on_readable)
 
@@ -88,7 +88,7 @@ class Connection:
         """Wait for bytes and return all that arrived. ConnectionError when the connection has ended."""
         while not self._inbox:
             if self._end is not None:
-                raise self._end
+                raise ConnectionError(self._end)
             self._waiter = self._loop.create_future()
             try:
                 await self._waiter
@@ -109,8 +109,7 @@ class Connection:
                 await self._waiter
         finally:
             self._waiter = self._handler = None
-        assert self._end is not None
-        raise self._end
+        raise ConnectionError(self._end)
 
     def note(self, sender: Hashable, rank: Rank) -> None:
         """Note how much a sender matters: on a link with several, those that do are sent to."""
@@ -147,7 +146,7 @@ class Connection:
         """End the connection with `why` as the text of its ConnectionError. No effect after the end."""
         if self._end is not None:
             return
-        self._end = ConnectionError(f"{self.name} {why}")
+        self._end = f"{self.name} {why}"
         self._loop.remove_reader(self._fd)
         self._loop.remove_writer(self._fd)
         self._send_queue.clear()
