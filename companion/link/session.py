@@ -22,7 +22,7 @@ and not processed.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Hashable, Mapping
+from collections.abc import Callable, Hashable, Mapping
 from typing import NamedTuple
 
 from companion.link import dialect, frame
@@ -323,15 +323,19 @@ class Session:
                 self._keep_reader(peer, reader, now_ns)
         return events
 
-    def would_accept(self, data: bytes, now_ns: int) -> bool:
-        """Return whether `data`, from a new sender, has a frame that proves it."""
+    def judge(self) -> Callable[[bytes, int], bool]:
+        """Return a function of the next bytes of a new sender: whether a frame of them proves it."""
         reader = frame.Reader(counting=False)
-        return any(
-            isinstance(found, Frame)
-            and self.is_proof(found)
-            and (self._signing is None or self._signing.examine(found, now_ns) is None)
-            for found in reader.receive(data) + reader.close()
-        )
+
+        def is_proven(data: bytes, now_ns: int) -> bool:
+            return any(
+                isinstance(found, Frame)
+                and self.is_proof(found)
+                and (self._signing is None or self._signing.examine(found, now_ns) is None)
+                for found in reader.receive(data)
+            )
+
+        return is_proven
 
     def is_proof(self, found: Frame) -> bool:
         """Whether an accepted frame proves its sender; on a signed link RADIO_STATUS does not."""

@@ -20,7 +20,7 @@ from companion.transport.address import Address
 from companion.transport.connection import Connection, pair, reason
 from companion.transport.serial_line import open_serial
 from companion.transport.sockets import CannotListen, open_socket
-from companion.transport.tcp import Listener, tcp_connection
+from companion.transport.tcp import Judge, Listener, tcp_connection
 from companion.transport.udp import connected_udp, listening_udp
 
 __all__ = ["Address", "CannotListen", "Connection", "back_off", "connect", "connections", "pair"]
@@ -30,16 +30,16 @@ MIN_PAUSE, MAX_PAUSE = 0.25, 10.0
 GOOD_AFTER = 10.0
 
 
-async def connect(address: Address, is_valid: Callable[[bytes], bool] = bool) -> Connection:
+async def connect(address: Address, judge: Judge = lambda: bool) -> Connection:
     """Open a connection once. OSError if it fails, CannotListen if our own address cannot be used.
 
-    `is_valid` judges the first bytes of a client of a listening TCP link, see `Listener`.
+    `judge` judges the clients of a listening TCP link, see `Listener`.
     """
     if address.kind == "serial":
         return open_serial(address)
     sock = await open_socket(address)
     if address.kind == "tcpin":
-        return Listener(str(address), sock, is_valid)
+        return Listener(str(address), sock, judge)
     if address.kind == "udpin":
         return listening_udp(str(address), sock, asyncio.get_running_loop().time)
     return {"udpout": connected_udp, "tcp": tcp_connection}[address.kind](str(address), sock)
@@ -49,7 +49,7 @@ async def connections(
     address: Address,
     random: Callable[[], float],
     report: Callable[[str], None],
-    is_valid: Callable[[bytes], bool] = bool,
+    judge: Judge = lambda: bool,
 ) -> AsyncIterator[Connection]:
     """Open a connection, and open it again at every iteration of the `async for`, until stopped.
 
@@ -64,7 +64,7 @@ async def connections(
         Returns numbers in [0, 1), for the jitter of the pauses.
     report
         Receives one line for each failure that differs from the last.
-    is_valid
+    judge
         See `connect`.
     """
     loop = asyncio.get_running_loop()
@@ -72,7 +72,7 @@ async def connections(
     last_report, is_first = "", True
     while True:
         try:
-            connection = await connect(address, is_valid)
+            connection = await connect(address, judge)
         except OSError as error:
             if is_first and isinstance(error, CannotListen):
                 raise

@@ -16,7 +16,7 @@ import contextlib
 import math
 import socket
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeAlias
 
 from companion.transport.connection import Connection, socket_connection
 from companion.transport.peers import MAX_PEERS, PeerTable, Rank
@@ -45,6 +45,10 @@ YIELDS_S = 3.0
 PAUSE_S = 0.25
 
 
+#: Makes a function for each client that takes its next bytes and returns whether they complete a valid frame.
+Judge: TypeAlias = Callable[[], Callable[[bytes], bool]]
+
+
 def tcp_connection(name: str, sock: socket.socket) -> Connection:
     """Return a connection over a connected socket."""
     settings = [
@@ -66,14 +70,14 @@ class Listener(Connection):
     """Listening socket and its clients as one connection, open with or without clients.
 
     Frames are written to all clients that have a place, by a connection and send queue each; a sender is the
-    connection of a client. `is_valid` judges the first bytes of a client.
+    connection of a client.
     """
 
-    def __init__(self, name: str, sock: socket.socket, is_valid: Callable[[bytes], bool]) -> None:
+    def __init__(self, name: str, sock: socket.socket, judge: Judge) -> None:
         self._places = PeerTable(asyncio.get_running_loop().time, math.inf, YIELDS_S)
         super().__init__(name, sock, self._accept, self._send, self._close, self._places)
         self._sock = sock
-        self._is_valid = is_valid
+        self._judge = judge
         self._clients: dict[Connection, tuple[str, asyncio.Task[None]]] = {}  # host, and what serves it
         self._dropped_before = 0  # by clients that have left
 
@@ -114,15 +118,16 @@ class Listener(Connection):
 
     async def _serve(self, client: Connection) -> None:
         """Deliver what a client sends, from its first valid frame on if it has to wait for a place."""
-        first = b""
+        is_valid, first, has_frame = self._judge(), b"", False
         try:
             if client in self._places.active():
                 self._pass_on(client, b"")
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(WAIT_S):
-                    while not self._is_valid(first) and len(first) < MAX_BYTES:
-                        first += await client.read()
-            if client in self._places.active() or self._is_valid(first):
+                    while not has_frame and len(first) < MAX_BYTES:
+                        first += (data := await client.read())
+                        has_frame = is_valid(data)
+            if has_frame or client in self._places.active():
                 self._pass_on(client, first)
                 await client.deliver_to(lambda data, _: self._pass_on(client, data))
         except ConnectionError:
