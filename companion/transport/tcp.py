@@ -6,7 +6,7 @@ connection.
 
 A listening socket serves MAX_PEERS clients. When all places are taken, a newcomer's first valid frame takes
 the place of a client that has sent none, or none for YIELDS_S; the autopilot's takes any station's. So a
-client that reconnects from a new address gets in. What sends no valid frame in WAIT_S is closed.
+client that reconnects from a new address gets in. A newcomer that sends no valid frame in WAIT_S is closed.
 """
 
 from __future__ import annotations
@@ -43,8 +43,6 @@ MAX_WAITING, MAX_WAITING_OF_HOST, WAIT_S, MAX_BYTES = 32, 8, 3.0, 4096
 YIELDS_S = 3.0
 #: Pause (s) after a failed accept.
 PAUSE_S = 0.25
-
-
 #: Makes a function for each client that takes its next bytes and returns whether they complete a valid frame.
 Judge: TypeAlias = Callable[[], Callable[[bytes], bool]]
 
