@@ -16,7 +16,8 @@ import random
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Hashable, Iterable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,7 @@ from companion.importers import tlog
 from companion.importers.tlog import TlogEntry
 from companion.link import dialect, frame
 from companion.link.dialect import mavlink
+from companion.transport.peers import Rank
 from companion.transport.reconnect import Address, CannotListen, Connection, connections
 
 EX_UNAVAILABLE = 69  # sysexits.h
@@ -137,7 +139,7 @@ def _find_autopilot(entries: Iterable[TlogEntry]) -> int:
 
 
 class PlayerRunner:
-    """Real-time playback over one link, starting when the link first opens."""
+    """Real-time playback over one link, starting when a client connects or sends."""
 
     def __init__(
         self,
@@ -189,18 +191,21 @@ class PlayerRunner:
 
     async def _serve(self) -> None:
         async for stream in connections(self._address, random.random, self._report):
-            if self._player is None:
-                self._player = self._make(self._now())
-                self._report("a client connected: playing")
             self._stream = stream
-            self._started.set()
             try:
-                while True:
-                    self._player.receive(await stream.read())
-                    self._received.set()
+                await stream.deliver_to(partial(self._receive, stream))
             except ConnectionError as error:
                 self._report(f"{error}; reconnecting")
             self._stream = None
+
+    def _receive(self, stream: Connection, data: bytes, peer: Hashable) -> None:
+        stream.note(peer, Rank.ACCEPTED)
+        if self._player is None:
+            self._player = self._make(self._now())
+            self._report("a client connected: playing")
+            self._started.set()
+        self._player.receive(data)
+        self._received.set()
 
 
 @click.command("play")

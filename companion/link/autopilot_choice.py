@@ -152,6 +152,12 @@ class AutopilotChoice:
             return before
         return None
 
+    def leave(self, peer: Hashable, now_ns: int) -> None:
+        """Let the systems of `peer`, whose connection has ended, be taken over from another one at once."""
+        for candidate in self._candidates.values():
+            if candidate.peer == peer:
+                candidate.last_ns = min(candidate.last_ns, now_ns - TAKE_OVER_AFTER)
+
     def lock(self, system: int | None) -> Candidate | None:
         """Accept no other system until the next call; return the candidate in use if that releases it."""
         self.locked_system = system

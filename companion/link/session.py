@@ -22,7 +22,7 @@ and not processed.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Hashable, Mapping
+from collections.abc import Callable, Hashable, Mapping
 from typing import NamedTuple
 
 from companion.link import dialect, frame
@@ -303,51 +303,62 @@ class Session:
         self.stream_rates.set_rates(_by_id(rates_hz), now_ns)
 
     def receive(self, data: bytes, now_ns: int, peer: Hashable = None) -> list[Event]:
-        """Process bytes that arrived at `now_ns` from `peer`; return the events in order."""
+        """Process bytes that arrived at `now_ns` from `peer`; return the events in order.
+
+        No bytes: the stream of `peer` has ended.
+        """
         self._now = now_ns
         events, self._not_sent = self._not_sent, []
-        is_accepted = False
-        for found in self._parse(data, peer):
-            if isinstance(found, Frame):
-                is_accepted |= self._on_frame(found, peer, now_ns, events)
-            else:
-                events.append(NotUnderstood(now_ns, found))
-        if is_accepted and peer is not None:
-            self._keep_reader(peer, now_ns)
+        if peer is None:
+            self._on_found(self.reader.receive(data), peer, now_ns, events)
+        elif not data:
+            self._readers.pop(peer, None)
+            self._choice.leave(peer, now_ns)
+        else:
+            known = self._readers.get(peer)
+            reader = known[0] if known else frame.Reader(counting=False)
+            if self._on_found(reader.receive(data), peer, now_ns, events):
+                self._keep_reader(peer, reader, now_ns)
+            if peer not in self._readers and self._on_found(reader.close(), peer, now_ns, events):
+                self._keep_reader(peer, reader, now_ns)
         return events
 
-    def would_accept(self, data: bytes, now_ns: int) -> bool:
-        """Return whether `data`, from a new sender, has a frame that proves it."""
+    def judge(self) -> Callable[[bytes, int], bool]:
+        """Return a function of the next bytes of a new sender: whether a frame of them proves it."""
         reader = frame.Reader(counting=False)
-        return any(
-            isinstance(found, Frame)
-            and self.is_proof(found)
-            and (self._signing is None or self._signing.examine(found, now_ns) is None)
-            for found in reader.receive(data) + reader.close()
-        )
+
+        def is_proven(data: bytes, now_ns: int) -> bool:
+            return any(
+                isinstance(found, Frame)
+                and self.is_proof(found)
+                and (self._signing is None or self._signing.examine(found, now_ns) is None)
+                for found in reader.receive(data)
+            )
+
+        return is_proven
 
     def is_proof(self, found: Frame) -> bool:
         """Whether an accepted frame proves its sender; on a signed link RADIO_STATUS does not."""
         return self._signing is None or found.signature is not None or not self._signing.refuse_unsigned
 
-    def _parse(self, data: bytes, peer: Hashable) -> list[frame.Event]:
-        if peer is None:
-            return self.reader.receive(data)
-        known = self._readers.get(peer)
-        if known is not None:
-            return known[0].receive(data)
-        alone = frame.Reader(counting=False)
-        return alone.receive(data) + alone.close()
+    def _on_found(self, items: list[frame.Event], peer: Hashable, now: int, events: list[Event]) -> bool:
+        """Process what a reader found; return whether a frame is accepted and proves its sender."""
+        is_accepted = False
+        for found in items:
+            if isinstance(found, Frame):
+                is_accepted |= self._on_frame(found, peer, now, events)
+            else:
+                events.append(NotUnderstood(now, found))
+        return is_accepted
 
-    def _keep_reader(self, peer: Hashable, now: int) -> None:
-        """Give a peer with an accepted frame a reader, so that its frames may span datagrams."""
-        known = self._readers.get(peer)
-        if known is None and len(self._readers) >= MAX_READERS:
+    def _keep_reader(self, peer: Hashable, reader: frame.Reader, now: int) -> None:
+        """Keep the reader of a peer with an accepted frame, so that its frames may span datagrams."""
+        if peer not in self._readers and len(self._readers) >= MAX_READERS:
             oldest = min(self._readers, key=lambda one: self._readers[one][1])
             if now - self._readers[oldest][1] < FORGET_AFTER:
                 return
             del self._readers[oldest]
-        self._readers[peer] = (known[0] if known else frame.Reader(counting=False), now)
+        self._readers[peer] = reader, now
 
     def poll(self, now_ns: int) -> list[Event]:
         """Do what is due at `now_ns`; return the events caused by the elapsed time."""

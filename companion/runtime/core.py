@@ -224,7 +224,7 @@ class CompanionCore:
 
     def receive(self, link: str, data: bytes, now_ns: int, peer: Hashable = None) -> Rank:
         """Process bytes received on `link` from `peer`; return how much their sender matters."""
-        self.links[link].has_bytes = True
+        self.links[link].has_bytes |= bool(data)
         session = self.links[link].session
         events = session.receive(data, now_ns, peer)
         self._on_events(self.links[link], events, now_ns)

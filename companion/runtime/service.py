@@ -132,8 +132,8 @@ class Service:
     async def _run_link(self, name: str) -> None:
         """Serve one link; reopen it whenever it fails."""
         link = self.core.links[name]
-        is_valid = partial(self._is_valid, link)
-        async for stream in connections(self._addresses[name], random.random, self.report, is_valid):
+        judge = partial(self._judge, link)
+        async for stream in connections(self._addresses[name], random.random, self.report, judge):
             link.session.reader.close()  # what is left of a frame of the connection before
             self._connections[name], self._dropped_before[name] = stream, link.dropped
             self._notifier.ready()
@@ -144,8 +144,9 @@ class Service:
             self._count_dropped()
             del self._connections[name]
 
-    def _is_valid(self, link: Link, data: bytes) -> bool:
-        return link.session.would_accept(data, self._now())
+    def _judge(self, link: Link) -> Callable[[bytes], bool]:
+        is_proven = link.session.judge()
+        return lambda data: is_proven(data, self._now())
 
     def _receive(self, link: Link, stream: Connection, data: bytes, peer: Hashable) -> None:
         stream.note(peer, self.core.receive(link.name, data, self._now(), peer))

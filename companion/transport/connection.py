@@ -23,7 +23,8 @@ BURST = 64
 INBOX_LIMIT = 1 << 20
 
 
-#: Takes bytes and their sender (None on a stream).
+#: Takes bytes and their sender (None if there is only one); b"" when the stream of one of several begins or
+#: ends.
 Handler: TypeAlias = Callable[[bytes, Hashable], None]
 
 
@@ -38,7 +39,6 @@ class Connection:
         send: Callable[[bytes], int],
         release: Callable[[], None] | None = None,
         peers: PeerTable | None = None,
-        first: bytes = b"",
     ) -> None:
         """Watch an open device.
 
@@ -57,8 +57,6 @@ class Connection:
             Closes the device; by default, it is only closed.
         peers
             Peers of a link that receives from several; `receive` then sets `sender`.
-        first
-            Bytes that were already received.
         """
         self.name = name
         self._device = device
@@ -68,11 +66,11 @@ class Connection:
         self._loop = asyncio.get_running_loop()
         self.sender: Hashable = None  # of the last bytes received
         self._peers = peers
-        self._inbox: list[tuple[bytes, Hashable]] = [(first, None)] if first else []
-        self._inbox_size = len(first)
+        self._inbox: list[tuple[bytes, Hashable]] = []
+        self._inbox_size = 0
         self._send_queue = SendQueue(send, self._loop.time)
         self._waiter: asyncio.Future[None] | None = None
-        self._end: ConnectionError | None = None
+        self._end: str | None = None  # why it ended
         self._handler: Handler | None = None
         self._loop.add_reader(self._fd, self._on_readable)
 
@@ -90,7 +88,7 @@ class Connection:
         """Wait for bytes and return all that arrived. ConnectionError when the connection has ended."""
         while not self._inbox:
             if self._end is not None:
-                raise self._end
+                raise ConnectionError(self._end)
             self._waiter = self._loop.create_future()
             try:
                 await self._waiter
@@ -111,8 +109,7 @@ class Connection:
                 await self._waiter
         finally:
             self._waiter = self._handler = None
-        assert self._end is not None
-        raise self._end
+        raise ConnectionError(self._end)
 
     def note(self, sender: Hashable, rank: Rank) -> None:
         """Note how much a sender matters: on a link with several, those that do are sent to."""
@@ -149,7 +146,7 @@ class Connection:
         """End the connection with `why` as the text of its ConnectionError. No effect after the end."""
         if self._end is not None:
             return
-        self._end = ConnectionError(f"{self.name} {why}")
+        self._end = f"{self.name} {why}"
         self._loop.remove_reader(self._fd)
         self._loop.remove_writer(self._fd)
         self._send_queue.clear()
@@ -181,7 +178,7 @@ class Connection:
             size += len(data)
             if not self._deliver(data):
                 break
-        return self._wake() if self._inbox else None
+        return None
 
     def _deliver(self, data: bytes) -> bool:
         """Pass `data` on; return whether reading may continue."""
@@ -197,6 +194,7 @@ class Connection:
         if self._handler is None:
             self.note(self.sender, Rank.ACCEPTED)  # `read` does not judge
         self._inbox_size += len(data)
+        self._wake()
         if self._inbox_size >= INBOX_LIMIT:
             self._loop.remove_reader(self._fd)
         return self._inbox_size < INBOX_LIMIT
@@ -214,9 +212,9 @@ class Connection:
             self._waiter.set_result(None)
 
 
-def socket_connection(name: str, sock: socket.socket, first: bytes = b"") -> Connection:
-    """Return a connection over a connected stream socket, from which `first` was already read."""
-    return Connection(name, sock, lambda: sock.recv(READ_SIZE), sock.send, first=first)
+def socket_connection(name: str, sock: socket.socket) -> Connection:
+    """Return a connection over a connected stream socket."""
+    return Connection(name, sock, lambda: sock.recv(READ_SIZE), sock.send)
 
 
 def pair() -> tuple[Connection, Connection]:

@@ -20,7 +20,7 @@ from companion.transport.address import Address
 from companion.transport.connection import Connection, pair, reason
 from companion.transport.serial_line import open_serial
 from companion.transport.sockets import CannotListen, open_socket
-from companion.transport.tcp import Listener, tcp_connection
+from companion.transport.tcp import Judge, Listener, tcp_connection
 from companion.transport.udp import connected_udp, listening_udp
 
 __all__ = ["Address", "CannotListen", "Connection", "back_off", "connect", "connections", "pair"]
@@ -30,17 +30,16 @@ MIN_PAUSE, MAX_PAUSE = 0.25, 10.0
 GOOD_AFTER = 10.0
 
 
-async def connect(address: Address) -> Connection:
-    """Open a connection once. OSError if it fails, CannotListen if our own address cannot be used."""
+async def connect(address: Address, judge: Judge = lambda: bool) -> Connection:
+    """Open a connection once. OSError if it fails, CannotListen if our own address cannot be used.
+
+    `judge` judges the clients of a listening TCP link, see `Listener`.
+    """
     if address.kind == "serial":
         return open_serial(address)
-    if address.kind == "tcpin":
-        listener = await Listener.open(address)
-        try:
-            return await listener.accept()
-        finally:
-            listener.close()
     sock = await open_socket(address)
+    if address.kind == "tcpin":
+        return Listener(str(address), sock, judge)
     if address.kind == "udpin":
         return listening_udp(str(address), sock, asyncio.get_running_loop().time)
     return {"udpout": connected_udp, "tcp": tcp_connection}[address.kind](str(address), sock)
@@ -50,12 +49,12 @@ async def connections(
     address: Address,
     random: Callable[[], float],
     report: Callable[[str], None],
-    is_valid: Callable[[bytes], bool] | None = None,
+    judge: Judge = lambda: bool,
 ) -> AsyncIterator[Connection]:
     """Open a connection, and open it again at every iteration of the `async for`, until stopped.
 
     CannotListen is raised by the first attempt only: then an operator is present to correct the address,
-    later there may be none. A listening TCP link keeps listening between its clients.
+    later there may be none.
 
     Parameters
     ----------
@@ -65,40 +64,32 @@ async def connections(
         Returns numbers in [0, 1), for the jitter of the pauses.
     report
         Receives one line for each failure that differs from the last.
-    is_valid
-        Judges the first bytes of a newcomer on a listening TCP link, see `Listener`.
+    judge
+        See `connect`.
     """
     loop = asyncio.get_running_loop()
     pauses = back_off(random)
     last_report, is_first = "", True
-    listener: Listener | None = None
-    try:
-        while True:
+    while True:
+        try:
+            connection = await connect(address, judge)
+        except OSError as error:
+            if is_first and isinstance(error, CannotListen):
+                raise
+            line = f"{address}: {reason(error)}; trying again"
+            if line != last_report:
+                report(line)
+            last_report = line
+        else:
+            last_report, opened = "", loop.time()
             try:
-                if address.kind == "tcpin":
-                    listener = listener or await Listener.open(address, is_valid)
-                connection = await (listener.accept() if listener else connect(address))
-            except OSError as error:
-                if is_first and isinstance(error, CannotListen):
-                    raise
-                line = f"{address}: {reason(error)}; trying again"
-                if line != last_report:
-                    report(line)
-                last_report = line
-            else:
-                last_report, opened = "", loop.time()
-                try:
-                    yield connection
-                finally:
-                    connection.close()
-                if loop.time() - opened >= GOOD_AFTER:
-                    pauses = back_off(random)
-            is_first = False
-            if listener is None:  # a listener that is open waits for its next client instead
-                await asyncio.sleep(next(pauses))
-    finally:
-        if listener is not None:
-            listener.close()
+                yield connection
+            finally:
+                connection.close()
+            if loop.time() - opened >= GOOD_AFTER:
+                pauses = back_off(random)
+        is_first = False
+        await asyncio.sleep(next(pauses))
 
 
 def back_off(random: Callable[[], float]) -> Iterator[float]:

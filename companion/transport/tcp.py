@@ -1,22 +1,25 @@
-"""TCP connections with fast detection of lost peers, and a listener that serves one client.
+"""TCP connections with fast detection of lost peers, and a listening socket with its clients.
 
 A peer that disappeared without closing (a roaming ground station, a lost hotspot) is detected after
 PEER_TIMEOUT_S: an idle connection is probed, and unacknowledged data, or a peer that does not read, ends the
-connection. A client that reconnects sooner, from a new address, replaces its old connection with its first
-valid frame; what sends none, or has to wait longer than WAIT_S for its turn, is closed.
+connection.
+
+A listening socket serves MAX_PEERS clients. When all places are taken, a newcomer's first valid frame takes
+the place of a client that has sent none, or none for YIELDS_S; the autopilot's takes any station's. So a
+client that reconnects from a new address gets in. A newcomer that sends no valid frame in WAIT_S is closed.
 """
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import math
 import socket
-from collections import Counter
 from collections.abc import Callable
+from typing import Any, TypeAlias
 
-from companion.transport.address import Address
 from companion.transport.connection import Connection, socket_connection
-from companion.transport.sockets import open_socket
+from companion.transport.peers import MAX_PEERS, PeerTable, Rank
 
 #: A peer that does not answer for this time (s) is lost.
 PEER_TIMEOUT_S = 10
@@ -34,14 +37,18 @@ OPTIONS = {
 }
 #: Bytes sent and not yet acknowledged, about: more than 50 kB/s at a round trip of 0.2 s.
 SEND_BUFFER = 1 << 14
-#: Newcomers that may wait beside a served client, in all and of one host; seconds and bytes up to a frame.
+#: Newcomers that may wait for a place, in all and of one host; seconds and bytes up to a frame.
 MAX_WAITING, MAX_WAITING_OF_HOST, WAIT_S, MAX_BYTES = 32, 8, 3.0, 4096
-#: Newcomers accepted at once, before others have their turn, and pause (s) after a failed accept.
-BURST, PAUSE_S = 16, 0.25
+#: Silence (s) of a client after which it yields its place; a ground station sends HEARTBEAT every second.
+YIELDS_S = 3.0
+#: Pause (s) after a failed accept.
+PAUSE_S = 0.25
+#: Makes a function for each client that takes its next bytes and returns whether they complete a valid frame.
+Judge: TypeAlias = Callable[[], Callable[[bytes], bool]]
 
 
-def tcp_connection(name: str, sock: socket.socket, first: bytes = b"") -> Connection:
-    """Connection over a connected socket, from which `first` was already read."""
+def tcp_connection(name: str, sock: socket.socket) -> Connection:
+    """Return a connection over a connected socket."""
     settings = [
         (socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1),
         (socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER),
@@ -54,111 +61,95 @@ def tcp_connection(name: str, sock: socket.socket, first: bytes = b"") -> Connec
     for level, option, value in settings:
         with contextlib.suppress(OSError):  # unknown to this kernel, or the peer has left
             sock.setsockopt(level, option, value)
-    return socket_connection(name, sock, first)
+    return socket_connection(name, sock)
 
 
-class Listener:
-    """Listening TCP socket, open with or without a client.
+class Listener(Connection):
+    """Listening socket and its clients as one connection, open with or without clients.
 
-    Without a client the first newcomer is served at once. It yields to a newcomer whose first bytes pass
-    `is_valid` (by default, to any newcomer).
+    Frames are written to all clients that have a place, by a connection and send queue each; a sender is the
+    connection of a client.
     """
 
-    def __init__(
-        self, address: Address, sock: socket.socket, is_valid: Callable[[bytes], bool] | None = None
-    ) -> None:
-        self._name = str(address)
+    def __init__(self, name: str, sock: socket.socket, judge: Judge) -> None:
+        self._places = PeerTable(asyncio.get_running_loop().time, math.inf, YIELDS_S)
+        super().__init__(name, sock, self._accept, self._send, self._close, self._places)
         self._sock = sock
-        self._is_valid = is_valid
-        self._loop = asyncio.get_running_loop()
-        self._served: Connection | None = None
-        self._next: Connection | None = None
-        self._waiting: dict[socket.socket, tuple[str, bytes]] = {}  # host and first bytes, oldest first
-        self._arrived = asyncio.Event()
-        self._loop.add_reader(self._sock, self._on_connectable)
+        self._judge = judge
+        self._clients: dict[Connection, tuple[str, asyncio.Task[None]]] = {}  # host, and what serves it
+        self._dropped_before = 0  # by clients that have left
 
-    @classmethod
-    async def open(cls, address: Address, is_valid: Callable[[bytes], bool] | None = None) -> Listener:
-        """Start to listen. Raises as `open_socket`."""
-        return cls(address, await open_socket(address), is_valid)
+    @property
+    def dropped(self) -> int:
+        """Number of frames dropped because the line of a client was too slow."""
+        return self._dropped_before + sum(client.dropped for client in self._clients)
 
-    async def accept(self) -> Connection:
-        """Wait for a client. Its connection ends when a newer one replaces it."""
-        if self._next is None and self._waiting:
-            newest = next(reversed(self._waiting))
-            self._promote(newest, self._remove(newest))
-        while self._next is None or not self._next.is_open:
-            self._arrived.clear()
-            await self._arrived.wait()
-        self._served, self._next = self._next, None
-        return self._served
+    def note(self, sender: Any, rank: Rank) -> None:
+        """Note how much a client matters; end the one whose place it takes."""
+        replaced = self._places.note(sender, rank)
+        if replaced is not None:
+            replaced.end("was replaced by a newer client")
 
-    def close(self) -> None:
-        """Stop listening. An accepted client stays connected."""
-        self._loop.remove_reader(self._sock)
-        self._sock.close()
-        for client in list(self._waiting):
-            self._drop(client)
-
-    def _on_connectable(self) -> None:
-        for _ in range(BURST):
-            try:
-                client, where = self._sock.accept()
-            except BlockingIOError:
-                return
-            except OSError:  # out of descriptors, or the client has left
-                self._loop.remove_reader(self._sock)
-                self._loop.call_later(PAUSE_S, self._listen_again)
-                return
-            client.setblocking(False)
-            self._receive_newcomer(client, str(where[0]))
+    def _accept(self) -> None:
+        try:
+            sock, (host, *_) = self._sock.accept()
+        except BlockingIOError:
+            raise
+        except OSError:  # out of descriptors, or the client has left
+            self._loop.remove_reader(self._sock)
+            self._loop.call_later(PAUSE_S, self._listen_again)
+            raise BlockingIOError from None
+        places = self._places.active()
+        waiting = [of_client for client, (of_client, _) in self._clients.items() if client not in places]
+        is_full = len(waiting) >= MAX_WAITING or waiting.count(host) >= MAX_WAITING_OF_HOST
+        if len(places) >= MAX_PEERS and is_full:
+            sock.close()
+            return
+        sock.setblocking(False)
+        client = tcp_connection(self.name, sock)
+        self._places.join(client)
+        self._clients[client] = host, self._loop.create_task(self._serve(client))
 
     def _listen_again(self) -> None:
-        if self._sock.fileno() >= 0:
-            self._loop.add_reader(self._sock, self._on_connectable)
+        if self.is_open:
+            self._loop.add_reader(self._sock, self._on_readable)
 
-    def _receive_newcomer(self, client: socket.socket, host: str) -> None:
-        busy = any(one is not None and one.is_open for one in (self._served, self._next))
-        if not busy or self._is_valid is None:
-            self._promote(client, b"")
-            return
-        of_host = Counter(one for one, _ in self._waiting.values())[host]
-        if len(self._waiting) >= MAX_WAITING or of_host >= MAX_WAITING_OF_HOST:
-            client.close()
-            return
-        self._waiting[client] = host, b""
-        self._loop.add_reader(client, self._on_first_bytes, client)
-        self._loop.call_later(WAIT_S, self._drop, client)
-
-    def _on_first_bytes(self, client: socket.socket) -> None:
-        host, data = self._waiting[client]
+    async def _serve(self, client: Connection) -> None:
+        """Deliver what a client sends, from its first valid frame on if it has to wait for a place."""
+        is_valid, first, has_frame = self._judge(), b"", False
         try:
-            more = client.recv(MAX_BYTES)
-        except BlockingIOError:
-            return
-        except OSError:
-            more = b""
-        data += more
-        if not more or len(data) > MAX_BYTES:
-            self._drop(client)
-            return
-        self._waiting[client] = host, data
-        if self._is_valid is None or self._is_valid(data):
-            self._promote(client, self._remove(client))
+            if client in self._places.active():
+                self._pass_on(client, b"")
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(WAIT_S):
+                    while not has_frame and len(first) < MAX_BYTES:
+                        first += (data := await client.read())
+                        has_frame = is_valid(data)
+            if has_frame or client in self._places.active():
+                self._pass_on(client, first)
+                await client.deliver_to(lambda data, _: self._pass_on(client, data))
+        except ConnectionError:
+            pass
+        finally:
+            client.close()
+            self._dropped_before += client.dropped
+            del self._clients[client]
+            self._places.remove(client)
+            self._pass_on(client, b"")
 
-    def _promote(self, client: socket.socket, first: bytes) -> None:
-        """Serve `client` next; the client that is served ends."""
-        for one in (self._served, self._next):
-            if one is not None:
-                one.end("was replaced by a newer client")
-        self._next = tcp_connection(self._name, client, first)
-        self._arrived.set()
+    def _pass_on(self, client: Connection, data: bytes) -> None:
+        if data or self._handler is not None:
+            self.sender = client
+            self._deliver(data)
+        if client not in self._places.active():
+            client.end("found no place")
 
-    def _remove(self, client: socket.socket) -> bytes:
-        self._loop.remove_reader(client)
-        return self._waiting.pop(client)[1]
+    def _send(self, frame: bytes) -> int:
+        for client in self._places.active():
+            client.write(frame)
+        return len(frame)
 
-    def _drop(self, client: socket.socket) -> None:
-        if client in self._waiting:
-            self._remove(client)
+    def _close(self) -> None:
+        self._sock.close()
+        for client in list(self._clients):
             client.close()

@@ -41,7 +41,7 @@ def listening_udp(name: str, sock: socket.socket, now: Callable[[], float]) -> C
     def send(frame: bytes) -> int:
         for peer in peers.active():
             with contextlib.suppress(OSError):  # the peer has left, or the line is full: one datagram lost
-                sock.sendto(frame, peer)  # type: ignore[call-overload]
+                sock.sendto(frame, peer)
         return len(frame)
 
     connection = Connection(name, sock, receive, send, peers=peers)

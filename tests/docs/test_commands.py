@@ -60,7 +60,7 @@ def named_in_text() -> set[str]:
     found = set()
     for path in PAGES:
         text = re.sub(r"^```.*?^```", "", path.read_text(), flags=re.DOTALL | re.MULTILINE)
-        for name in re.findall(r"`(companion [a-z][^`]*)`", text):
+        for name in re.findall(r"`(?:venv/bin/)?(companion [a-z][^`]*)`", text):
             found.add(" ".join(name.split()))
     return found
 

@@ -108,6 +108,16 @@ def test_the_autopilots_system_at_another_address_is_not_believed_until_the_old_
     assert ups(events) == []  # the link was never lost
 
 
+def test_the_autopilot_is_taken_over_at_once_when_its_connection_has_ended() -> None:
+    air = Air()
+    air.fly(10.0, streaming(1, "old"))
+    assert air.session.receive(b"", air.now, "another") == air.session.receive(b"", air.now, "old") == []
+    assert list(air.session._readers) == []
+    events = air.fly(1.0, streaming(1, "new"))
+    assert all(e.from_autopilot for e in events if isinstance(e, MessageReceived))
+    assert not any(isinstance(e, SecondAutopilot) for e in events) and ups(events) == []
+
+
 def test_forged_vehicle_heartbeats_do_not_mute_a_ground_station() -> None:
     """System 255 forged as a vehicle from one address; the station at another is still received."""
     air = Air()
@@ -136,6 +146,14 @@ def test_a_frame_may_span_datagrams_of_a_known_peer() -> None:
     data = b"".join(packed("ATTITUDE", time_boot_ms=k) for k in range(50))
     events = [e for at in range(0, len(data), 7) for e in session.receive(data[at : at + 7], at, "bridge")]
     assert sum(isinstance(e, MessageReceived) for e in events) == 50
+
+
+def test_a_frame_may_begin_at_the_end_of_a_peers_first_bytes() -> None:
+    session, second = Session(), packed("ATTITUDE", time_boot_ms=1)
+    session.receive(heartbeat(1) + second[:5], 0, "a")
+    session.receive(heartbeat(2) + second[:7], 0, "b")
+    received = [session.receive(second[n:], 1, peer) for n, peer in ((5, "a"), (7, "b"))]
+    assert [e.from_autopilot for events in received for e in events] == [True, False]
 
 
 def test_readers_are_bounded() -> None:

@@ -325,11 +325,12 @@ def test_radio_status_without_a_signature_proves_nobody() -> None:
     key = bytes(range(32))
     session = Session(signing=Signing(key))
     status = frame.encode(dialect.new("RADIO_STATUS", rssi=1), 0, 1, 1)
-    assert not session.would_accept(status, 0)
+    assert not session.judge()(status, 0)
     signing = Signing(key)
     beat = dialect.new("HEARTBEAT", type=1, autopilot=3)
     genuine = frame.encode(beat, 0, 1, 1, lambda data: signing.sign(data, 0, 0))
-    assert session.would_accept(genuine, 0)
+    is_proven = session.judge()
+    assert [is_proven(part, 0) for part in (status, genuine[:9], genuine[9:])] == [False, False, True]
     session.receive(genuine, 0)
     assert session.is_up
     for k in range(1, 8):

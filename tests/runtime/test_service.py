@@ -342,6 +342,43 @@ def test_invalid_link_exits_78_with_one_line(tmp_path: Path) -> None:
     assert len(stderr.splitlines()) == 1 and "link.connect" in stderr
 
 
+def test_every_client_of_a_tcp_link_is_served_without_an_autopilot(tmp_path: Path) -> None:
+    """Eight ground stations, whose requests arrive in interleaved halves, and one that only listens."""
+    port = free_port()
+    stations = [socket.socket() for _ in range(8)]
+    kinds: list[set[str]] = [set() for _ in stations]
+
+    async def play(service: Service, events: list[Event]) -> None:
+        for sock in stations:
+            await until(lambda sock=sock: sock.connect_ex((LOOPBACK, port)) == 0)
+            sock.setblocking(False)
+        request = dialect.new("PARAM_REQUEST_LIST", target_system=1, target_component=191)
+        texts = [frame.encode(request, 0, 255 - k, 190) for k in range(len(stations) - 1)]
+        for half in (slice(0, 9), slice(9, None)):
+            for sock, text in zip(stations, texts, strict=False):
+                sock.send(text[half])
+            await asyncio.sleep(0.1)
+        service.report("a text")
+        readers = [frame.Reader() for _ in stations]
+
+        def all_served() -> bool:
+            for sock, reader, names in zip(stations, readers, kinds, strict=True):
+                with contextlib.suppress(BlockingIOError):
+                    found = reader.receive(sock.recv(65536))
+                    names |= {dialect.TYPES[f.msgid].name for f in found if isinstance(f, frame.Frame)}
+            return all({"HEARTBEAT", "PARAM_VALUE", "STATUSTEXT"} <= names for names in kinds)
+
+        await until(all_served)
+        (link,) = service.core.links.values()
+        assert link.received == len(texts) and link.bad == 0
+
+    try:
+        serve(tmp_path, (f"tcpin:{LOOPBACK}:{port}",), play)
+    finally:
+        for sock in stations:
+            sock.close()
+
+
 def test_stalled_tcp_peer_drops_the_oldest_frames_and_they_are_counted(tmp_path: Path) -> None:
     """A TCP peer sends and never reads: the newest frames are queued, the log counts the dropped ones."""
     port = free_port()

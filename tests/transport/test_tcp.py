@@ -1,18 +1,20 @@
-"""TCP connections: both directions, reconnecting, lost peers, and replacement by a newer client."""
+"""TCP connections: both directions, reconnecting, lost peers, and the clients of a listening socket."""
 
 import asyncio
 import errno
 import os
 import socket
-from collections.abc import Coroutine
+from collections.abc import Callable, Coroutine, Hashable
 from typing import Any
 
 import pytest
 
+from companion.transport import tcp
 from companion.transport.address import Address
 from companion.transport.connection import Connection
+from companion.transport.peers import MAX_PEERS, Rank
 from companion.transport.reconnect import connect, connections
-from companion.transport.tcp import PEER_TIMEOUT_S
+from companion.transport.tcp import PEER_TIMEOUT_S, Listener
 
 
 def run(test: Coroutine[Any, Any, None]) -> None:
@@ -27,6 +29,62 @@ def free_port() -> int:
     with socket.socket() as sock:
         sock.bind(("127.0.0.1", 0))
         return int(sock.getsockname()[1])
+
+
+async def until(condition: Callable[[], bool]) -> None:
+    for _ in range(2000):
+        if condition():
+            return
+        await asyncio.sleep(0.005)
+    raise TimeoutError
+
+
+def judge() -> Callable[[bytes], bool]:
+    seen = bytearray()
+
+    def is_valid(data: bytes) -> bool:
+        seen.extend(data)
+        return seen.startswith(b"frame")
+
+    return is_valid
+
+
+async def listen() -> Listener:
+    server = await connect(Address.parse("tcpin:0"), judge)
+    assert isinstance(server, Listener)
+    return server
+
+
+async def client_of(server: Connection) -> Connection:
+    return await connect(Address("tcp", "127.0.0.1", server.port))
+
+
+class Received:
+    """Bytes that a listener receives, by sender; the service's part: a frame makes its sender a peer."""
+
+    def __init__(self, server: Connection) -> None:
+        self.server, self.by_sender = server, dict[Hashable, bytes]()
+        self.task = asyncio.ensure_future(server.deliver_to(self._on_bytes))
+
+    def _on_bytes(self, data: bytes, sender: Hashable) -> None:
+        if data:  # neither the begin nor the end of a stream
+            self.by_sender[sender] = self.by_sender.get(sender, b"") + data
+        rank = Rank.AUTOPILOT if b"autopilot" in data else Rank.ACCEPTED
+        self.server.note(sender, rank if data else Rank.UNKNOWN)
+
+    def has(self, *streams: bytes) -> bool:
+        return set(streams) <= set(self.by_sender.values())
+
+    async def close(self) -> None:
+        self.server.close()
+        await asyncio.gather(self.task, return_exceptions=True)
+
+
+async def ended(client: Connection) -> None:
+    """Read a client to its end."""
+    with pytest.raises(ConnectionError, match="closed by the other side"):
+        while True:
+            await client.read()
 
 
 def test_tcp_both_ways_and_again_after_a_loss() -> None:
@@ -65,21 +123,16 @@ def test_lost_peer_detection_is_enabled_on_both_ends() -> None:
     """A real loss takes ten seconds and a broken network: only the socket options are checked."""
 
     async def test() -> None:
-        port = free_port()
-        accepting = asyncio.ensure_future(connect(Address("tcpin", "127.0.0.1", port)))
-        await asyncio.sleep(0)
-        while not accepting.done():
-            try:
-                near = await connect(Address("tcp", "127.0.0.1", port))
-            except ConnectionRefusedError:
-                continue
-            await accepting
-        for end in (near, accepting.result()):
+        server = await listen()
+        near = await client_of(server)
+        await until(lambda: bool(server._clients))
+        for end in (near, *server._clients):
             assert option(end, "TCP_USER_TIMEOUT") == 1000 * PEER_TIMEOUT_S
             assert option(end, "TCP_KEEPIDLE") + 3 * option(end, "TCP_KEEPINTVL") <= PEER_TIMEOUT_S + 2
             assert isinstance(end._device, socket.socket)
             assert end._device.getsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE)
-            end.close()
+        near.close()
+        server.close()
 
     run(test())
 
@@ -103,83 +156,163 @@ def test_system_buffers_little_for_a_peer_that_does_not_read() -> None:
     run(test())
 
 
-def test_newer_client_replaces_the_older() -> None:
+def test_all_clients_are_served_and_streams_do_not_mix() -> None:
+    """Eight clients send their bytes one by one, in turn."""
+
     async def test() -> None:
-        port = free_port()
-        address = Address("tcpin", "127.0.0.1", port)
-        links = connections(address, lambda: 1.0, print)
-        opening = asyncio.ensure_future(anext(links))
-        old = connections(Address("tcp", "127.0.0.1", port), lambda: 1.0, print)
-        away = await anext(old)
-        link = await opening
-        away.write(b"old")
-        assert await link.read() == b"old"
-        back = await connect(Address("tcp", "127.0.0.1", port))
-        with pytest.raises(ConnectionError, match=f"{address} was replaced by a newer client"):
-            await link.read()
-        back.write(b"new")
-        link = await anext(links)
-        assert await link.read() == b"new"
-        link.write(b"reply")
-        assert await back.read() == b"reply"
-        with pytest.raises(ConnectionError, match="closed by the other side"):
-            await away.read()
-        back.close()
-        await links.aclose()
-        await old.aclose()
+        received = Received(server := await listen())
+        clients = [await client_of(server) for _ in range(MAX_PEERS)]
+        sent = [b"frame of %d" % k for k in range(MAX_PEERS)]
+        for at in range(len(sent[0])):
+            for client, data in zip(clients, sent, strict=True):
+                client.write(data[at : at + 1])
+            await asyncio.sleep(0.002)
+        await until(lambda: received.has(*sent))
+        server.write(b"to all")
+        for client in clients:
+            assert await client.read() == b"to all"
+        clients.pop().close()
+        await until(lambda: len(server._clients) == len(clients))
+        server.write(b"again")
+        for client in clients:
+            assert await client.read() == b"again"
+            client.close()
+        await received.close()
 
     run(test())
 
 
-def test_newest_of_the_waiting_clients_is_accepted() -> None:
+def test_a_client_that_only_listens_is_served_and_yields_to_a_valid_frame() -> None:
     async def test() -> None:
-        links = connections(Address("tcpin", "127.0.0.1", port := free_port()), lambda: 1.0, print)
-        opening = asyncio.ensure_future(anext(links))
-        first = connections(Address("tcp", "127.0.0.1", port), lambda: 1.0, print)
-        (await anext(first)).close()
-        with pytest.raises(ConnectionError):
-            await (await opening).read()
-        clients = [await connect(Address("tcp", "127.0.0.1", port)) for _ in range(3)]  # during the pause
-        clients[-1].write(b"the newest")
-        assert await (await anext(links)).read() == b"the newest"
-        for client in clients[:-1]:
-            with pytest.raises(ConnectionError):
-                await client.read()
-        clients[-1].close()
-        await links.aclose()
-        await first.aclose()
+        received = Received(server := await listen())
+        clients = [await client_of(server) for _ in range(MAX_PEERS)]
+        await until(lambda: len(server._clients) == MAX_PEERS)
+        server.write(b"to all")
+        for client in clients:
+            assert await client.read() == b"to all"
+        for client in clients[1:]:
+            client.write(b"frame")
+        newcomer = await client_of(server)
+        newcomer.write(b"frame of the newcomer")
+        await until(lambda: received.has(b"frame of the newcomer"))
+        await ended(clients[0])
+        server.write(b"next")
+        assert [await client.read() for client in (*clients[1:], newcomer)] == [b"next"] * MAX_PEERS
+        for client in (*clients, newcomer):
+            client.close()
+        await received.close()
 
     run(test())
 
 
-def test_a_served_client_yields_to_a_valid_frame_only_and_without_a_pause() -> None:
-    """Connections that send nothing, or no frame, by the hundred do not disturb the client in use."""
+def test_newcomer_takes_the_place_of_a_silent_client_only_and_the_autopilot_any() -> None:
+    async def test() -> None:
+        received = Received(server := await listen())
+        seconds = 0.0
+        server._places._now = lambda: seconds
+        clients = [await client_of(server) for _ in range(MAX_PEERS)]
+        for client in clients:
+            client.write(b"frame")
+        await until(lambda: len(received.by_sender) == MAX_PEERS)
+        ninth = await client_of(server)
+        ninth.write(b"frame")
+        await ended(ninth)
+        lost = clients.pop(3)  # its network is gone: it neither sends nor closes
+        seconds = tcp.YIELDS_S + 1.0
+        for client in clients:
+            client.write(b"frame")
+        await until(lambda: list(received.by_sender.values()).count(b"frameframe") == len(clients))
+        again = await client_of(server)
+        again.write(b"frame again")
+        await ended(lost)
+        autopilot = await client_of(server)
+        autopilot.write(b"frame of the autopilot")
+        await until(lambda: received.has(b"frame again", b"frame of the autopilot"))
+        await until(lambda: len(server._clients) == MAX_PEERS)
+        server.write(b"to all")
+        assert await autopilot.read() == b"to all"
+        for client in (*clients, lost, ninth, again, autopilot):
+            client.close()
+        await received.close()
+
+    run(test())
+
+
+@pytest.mark.parametrize("data", [b"", b"junk", b"j" * 4096])
+def test_connections_without_a_frame_do_not_disturb_clients(
+    data: bytes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tcp, "WAIT_S", 0.2)
 
     async def test() -> None:
-        address = Address("tcpin", "127.0.0.1", port := free_port())
-        links = connections(address, lambda: 1.0, print, lambda data: data.startswith(b"frame"))
-        opening = asyncio.ensure_future(anext(links))
-        await asyncio.sleep(0.05)
-        client = await connect(Address("tcp", "127.0.0.1", port))
-        link = await opening
+        received = Received(server := await listen())
+        clients = [await client_of(server) for _ in range(MAX_PEERS)]
+        for client in clients:
+            client.write(b"frame")
+        await until(lambda: len(received.by_sender) == MAX_PEERS)
         strangers = []
         for k in range(200):
-            strangers.append(await connect(Address("tcp", "127.0.0.1", port)))
-            strangers[-1].write(b"junk" if k % 2 else b"")
-            client.write(b"position")
-            assert await link.read() == b"position"
-        assert link.is_open
+            strangers.append(await client_of(server))
+            strangers[-1].write(data)
+            server.write(b"%03d" % k)
+            for client in clients:
+                assert await client.read() == b"%03d" % k
+            assert len(server._clients) <= MAX_PEERS + tcp.MAX_WAITING_OF_HOST
         for stranger in strangers:
-            stranger.close()
-        newcomer = await connect(Address("tcp", "127.0.0.1", port))
-        newcomer.write(b"frame 1")
-        with pytest.raises(ConnectionError, match="was replaced by a newer client"):
-            await link.read()
-        async with asyncio.timeout(0.2):
-            link = await anext(links)
-        assert await link.read() == b"frame 1"
-        newcomer.close()
+            await ended(stranger)
+        assert len(server._clients) == len(received.by_sender) == MAX_PEERS
+        for client in clients:
+            client.close()
+        await received.close()
+
+    run(test())
+
+
+def test_client_that_does_not_read_delays_no_other() -> None:
+    async def test() -> None:
+        received = Received(server := await listen())
+        reading = await client_of(server)
+        stuck = socket.socket()
+        stuck.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        with stuck:
+            stuck.connect(("127.0.0.1", server.port))
+            stuck.send(b"frame")
+            reading.write(b"frame")
+            await until(lambda: len(received.by_sender) == 2)
+            for k in range(2000):
+                frame = k.to_bytes(4, "big") * 64
+                server.write(frame)
+                data = b""
+                while len(data) < len(frame):
+                    data += await reading.read()
+                assert data == frame
+            dropped = server.dropped
+            assert dropped > 1000
+        await until(lambda: len(server._clients) == 1)
+        assert server.dropped == dropped
+        reading.close()
+        await received.close()
+
+    run(test())
+
+
+def test_listening_goes_on_after_a_failed_accept(monkeypatch: pytest.MonkeyPatch) -> None:
+    """For example without a free file descriptor."""
+
+    async def test() -> None:
+        server = await listen()
+        real, failures = socket.socket.accept, [errno.EMFILE, errno.ECONNABORTED]
+
+        def accept(sock: socket.socket) -> tuple[socket.socket, Any]:
+            if failures:
+                raise OSError(failures.pop(), "no")
+            return real(sock)
+
+        monkeypatch.setattr(socket.socket, "accept", accept)
+        client = await client_of(server)
+        client.write(b"frame")
+        assert await server.read() == b"frame"
         client.close()
-        await links.aclose()
+        server.close()
 
     run(test())
