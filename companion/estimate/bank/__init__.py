@@ -59,6 +59,7 @@ from companion.estimate.bank.reduction import merge_moments, reduce
 from companion.estimate.bank.settings import EXHAUSTIVE, Settings
 from companion.estimate.bank.state import (
     Bank,
+    couple,
     enlarge,
     families,
     inflate,
@@ -86,6 +87,7 @@ __all__ = [
     "Source",
     "births",
     "births_due",
+    "couple",
     "decide",
     "enlarge",
     "estimate",
