@@ -1,0 +1,218 @@
+"""Fixes of GNSS and of beacons: measurements of the bank, and what follows from whether they are believed."""
+
+from __future__ import annotations
+
+import math
+
+from companion.estimate import bank as banks
+from companion.estimate.bank.settings import DEFAULT as THRESHOLDS
+from companion.estimate.fusion import Azimuth
+from companion.navigator import fix_observations, height_error, measurements, own_channel, scatter
+from companion.navigator.hypotheses import GNSS, MOST_BEACONS
+from companion.navigator.own_channel import OwnChannel
+from companion.navigator.progress import (
+    carried,
+    decided,
+    estimated_velocity,
+    is_driven_by,
+    is_silent,
+    nearer,
+    propagated,
+)
+from companion.navigator.state import (
+    EXCLUDED,
+    Beacon,
+    Pending,
+    Settings,
+    State,
+    Step,
+    corrected,
+    hypotheses,
+    source_name,
+)
+from companion.records import Event, Gnss, Output, Rejection, RsbnFix, Severity, Source, Stamped, Vector2
+
+GATE_SIGMA = 5.0
+
+
+def gnss(state: State, record: Gnss, settings: Settings) -> Step:
+    """Use a fix of GNSS: position and velocity are measurements of the bank."""
+    config, last = settings.config.gnss, state.gnss_taken
+    state = state._replace(gnss=record)
+    since = math.inf if last is None else (record.t_ns - last.t_ns) * 1e-9
+    if not record.has_3d_fix or since < config.every_s:
+        return state, []
+    state = _begun(state, record, settings)
+    if state.nominal is None or state.bank is None or is_silent(state, record.t_ns):
+        return state, []
+    state = propagated(carried(state, record.t_ns), settings)
+    known, channel, nominal = hypotheses(state, settings), settings.model.channel, state.nominal
+    assert state.bank is not None
+    assert nominal is not None
+    if last is not None and last.receiver != record.receiver:
+        state = state._replace(bank=measurements.other_receiver(state.bank, channel))
+    assert state.bank is not None
+    variance = fix_observations.white_sigma(record, config) ** 2
+    apart = measurements.gnss_apart(record, nominal.point)
+    still = (apart[0] + state.moved[0], apart[1] + state.moved[1])  # as if the nominal had never jumped
+    state, factor, noted = _scattered(state, record, "gnss", still, variance)
+    assert state.bank is not None
+    v_n = _latency_velocity(state)
+    taken = measurements.gnss_position(state.bank, known, channel, apart, factor * variance, v_n)
+    bank, accepted = taken.bank, taken.accepted
+    if config.use_velocity and record.v_n is not None:
+        a_n = nominal.a_n
+        bank = measurements.gnss_velocity(
+            bank, known, channel, record, nominal.point, a_n, settings.config, factor
+        ).bank
+    state = state._replace(bank=bank, gnss_taken=record, fixed=True)
+    state, out = decided(state, record, settings)
+    out = [*noted, *out]
+    assert state.bank is not None
+    if state.reported[GNSS] == EXCLUDED or not accepted:
+        return nearer(state, settings), [*out, _rejected(state, record, "gnss", GNSS, taken)]
+    since = math.inf if state.gnss_ns is None else (record.t_ns - state.gnss_ns) * 1e-9
+    part = min(since, config.correlation_s) / config.correlation_s
+    level = height_error.update(state.level, record, nominal.point, part, GATE_SIGMA**2)
+    pending = None
+    if state.false[GNSS] < known.settings.suspect:
+        pending = Pending(record, nominal.point, (0.0, 0.0), Source.GNSS)
+    state = state._replace(
+        gnss_ns=record.t_ns, gnss_fix=(record, nominal.point), level=level, pending=pending
+    )
+    return nearer(state, settings), out
+
+
+def _latency_velocity(state: State) -> Vector2:
+    """Return the velocity that GNSS latency multiplies in a position, north and east, m/s.
+
+    Where the nominal velocity is integrated it is that one, whose rate multiplies the latency in a velocity:
+    position and velocity error are then those of the time the fix was taken. The noise of the estimated
+    velocity is also in the estimated position: as a coefficient it made straight flight seem to measure the
+    latency, as 0.08 s after ten minutes where it was 0.
+    """
+    if state.nominal is not None and (is_driven_by(state, "imu") or is_driven_by(state, "hold")):
+        return state.nominal.point.v_n[:2]
+    return estimated_velocity(state)
+
+
+def rsbn(state: State, record: RsbnFix, settings: Settings) -> Step:
+    """Use a beacon's answer: azimuth and slant range are measurements of the bank."""
+    state = _begun(state, record, settings)
+    name = f"rsbn {record.beacon}"
+    if state.nominal is None or state.bank is None or is_silent(state, record.t_ns):
+        return state, [Rejection(record.t_ns, record.rx_ns, name, "no channel at its time")]
+    state = propagated(carried(state, record.t_ns), settings)
+    state, k, out = _beacon(state, record, settings)
+    nominal = state.nominal
+    assert nominal is not None
+    assert state.bank is not None
+    point, centre = corrected(nominal.point, state, settings)
+    known, believed = hypotheses(state, settings), Source(0)
+    height = settings.config.inertial.height_sigma_m
+    for z in fix_observations.from_rsbn(record, point, settings.config.rsbn):
+        if isinstance(z, Azimuth) and fix_observations.in_cone_of_silence(z, record.slant_range):
+            continue
+        source = known.azimuth(k) if isinstance(z, Azimuth) else known.range(k)
+        label = source_name(source, state)
+        metres = fix_observations.distance(z) if isinstance(z, Azimuth) else 1.0
+        still = (centre[0] - state.moved[0], centre[1] - state.moved[1])  # as if it had never jumped
+        residual = measurements.sight_residual(z, still)
+        variance = fix_observations.sight_variance(z, height)
+        state, factor, noted = _scattered(state, record, label, (residual,), variance, metres)
+        assert state.bank is not None
+        taken = measurements.sight(state.bank, known, z, k, factor * variance, centre)
+        state, more = decided(state._replace(bank=taken.bank), record, settings)
+        out += [*noted, *more]
+        assert state.bank is not None
+        part = Source.AZIMUTH if isinstance(z, Azimuth) else Source.RANGE
+        if state.reported[source] == EXCLUDED or not taken.accepted:
+            out.append(_rejected(state, record, label, source, taken))
+        elif state.false[source] < known.settings.suspect:
+            believed |= part
+    state = state._replace(fixed=True)
+    if believed:
+        pending = Pending(record, point, centre, believed)
+        state = state._replace(rsbn_ns=record.t_ns, rsbn_used=believed, pending=pending)
+    return nearer(state, settings), out
+
+
+def _beacon(state: State, record: RsbnFix, settings: Settings) -> tuple[State, int, list[Output]]:
+    """The number of the beacon that answered; a new one takes a new place, or the most silent one's."""
+    assert state.bank is not None
+    bank = state.bank
+    place, t_ns = (record.lat, record.lon, record.alt), record.t_ns
+    for k, beacon in enumerate(state.beacons):
+        if beacon.identity == record.beacon:
+            beacons = list(state.beacons)
+            beacons[k] = Beacon(record.beacon, place, t_ns)
+            out: list[Output] = []
+            if place != beacon.place:
+                known = hypotheses(state, settings)
+                first = known.layout.n_base - len(known.biases) + 2 * k
+                sigma = known.biases[2 * k : 2 * k + 2]
+                state = state._replace(bank=banks.renew(bank, (first, first + 1), sigma))
+                text = f"beacon {record.beacon} states another position"
+                out = [Event(record.t_ns, record.rx_ns, Severity.NOTICE, text)]
+            return state._replace(beacons=tuple(beacons)), k, out
+    new = Beacon(record.beacon, place, t_ns)
+    if len(state.beacons) < MOST_BEACONS:
+        larger = settings.model.with_beacon(bank, len(state.beacons))
+        if not state.beacons and state.gnss_taken is not None:
+            larger = settings.model.doubted(larger)
+        state = state._replace(bank=larger, beacons=(*state.beacons, new))
+        state = state._replace(false=(*state.false, 0.0, 0.0), reported=(*state.reported, 0, 0))
+        return state, len(state.beacons) - 1, []
+    k = min(range(len(state.beacons)), key=lambda i: state.beacons[i].last_ns)
+    known = hypotheses(state, settings)
+    first = known.layout.n_base - len(known.biases) + 2 * k
+    renewed = banks.renew(bank, (first, first + 1), known.biases[2 * k : 2 * k + 2])
+    beacons = list(state.beacons)
+    beacons[k] = new
+    return state._replace(bank=renewed, beacons=tuple(beacons)), k, []
+
+
+def _begun(state: State, record: Gnss | RsbnFix, settings: Settings) -> State:
+    """With a nominal trajectory and a bank, if this fix is the first to tell a place."""
+    nominal = state.nominal
+    if nominal is None and isinstance(settings.model.channel, OwnChannel):
+        nominal = own_channel.begin(state.sensors, record)
+    if nominal is None or state.bank is not None:
+        return state
+    if nominal.interval is not None:
+        nominal = own_channel.restart(nominal, nominal.interval.by, nominal.point.v_n[:2])
+    return state._replace(nominal=nominal._replace(since=nominal.point), bank=settings.model.begin(0.0))
+
+
+def _scattered(
+    state: State,
+    record: Stamped,
+    name: str,
+    residual: tuple[float, ...],
+    variance: float,
+    metres: float = 1.0,
+) -> tuple[State, float, list[Output]]:
+    """With one more residual of a source; the factor of its stated variance; an event if that is news.
+
+    `metres` is the length of the residual's unit.
+    """
+    assert state.nominal is not None
+    interval = state.nominal.interval
+    lacking = scatter.LACKING.get("ins" if interval is None else interval.by, scatter.LACKING_ELSE)
+    seen = scatter.observe(
+        state.scatter.get(name), record.t_ns, residual, variance, lacking / max(metres, 1.0)
+    )
+    seen, text = scatter.report(seen, name)
+    out: list[Output] = [] if text is None else [Event(record.t_ns, record.rx_ns, Severity.NOTICE, text)]
+    return state._replace(scatter={**state.scatter, name: seen}), seen.used, out
+
+
+def _rejected(
+    state: State, record: Gnss | RsbnFix, name: str, source: int, taken: measurements.Taken
+) -> Rejection:
+    assert state.bank is not None
+    label = f"gnss {record.receiver}" if isinstance(record, Gnss) else name
+    if state.reported[source] == EXCLUDED:
+        why, false = "excluded: false with probability", state.false[source]
+        return Rejection(record.t_ns, record.rx_ns, label, why, false, THRESHOLDS.excluded)
+    return Rejection(record.t_ns, record.rx_ns, label, "outlier: normalised squared innovation", taken.nis)

@@ -1,0 +1,226 @@
+"""Samples of the own channel: attitude, pressure, IMU, airspeed and a foreign velocity.
+
+A sample moves the nominal trajectory if its sensor leads; else airspeed and foreign velocity are
+measurements.
+"""
+
+from __future__ import annotations
+
+import math
+
+from companion.navigator import (
+    air_data_channel,
+    measurements,
+    own_channel,
+    own_error_model,
+    strapdown_channel,
+)
+from companion.navigator.channel import Nominal
+from companion.navigator.own_channel import AirspeedSums, OwnChannel, Sensors
+from companion.navigator.own_error_model import By
+from companion.navigator.progress import (
+    carried,
+    decided,
+    estimated_velocity,
+    is_driven_by,
+    propagated,
+    solved_if_due,
+)
+from companion.navigator.state import NEAR_S, Settings, State, Step, hypotheses
+from companion.records import (
+    AirData,
+    AirspeedSensor,
+    Attitude,
+    Imu,
+    LocalPosition,
+    Output,
+    Pressure,
+    Rejection,
+    Stamped,
+    Vector2,
+)
+from companion.units import SECOND_NS
+
+AIRSPEED_EVERY_NS = 500_000_000  # gusts are correlated: more often tells no more
+FOREIGN_EVERY_NS = SECOND_NS
+BLOCKED_M_S = 5.0  # slower, in flight, a pitot is blocked
+
+
+def airspeed_sensor(state: State, record: AirspeedSensor, settings: Settings) -> Step:
+    """Remember whether a healthy airspeed sensor is there."""
+    seen = record.t_ns if record.healthy else None
+    return state._replace(sensors=state.sensors._replace(sensor_ns=seen)), []
+
+
+def attitude(state: State, record: Attitude, settings: Settings) -> Step:
+    """Remember an attitude; without a driver the nominal trajectory goes straight on."""
+    s = state.sensors
+    s = s._replace(strap=strapdown_channel.sense(s.strap, record), air=air_data_channel.sense(s.air, record))
+    state = state._replace(sensors=s)
+    if state.nominal is None or not s.leads("hold", record.t_ns):
+        return state, []
+    return _driven(state, record, "hold", None, settings)
+
+
+def pressure(state: State, record: Pressure, settings: Settings) -> Step:
+    """Remember a static pressure."""
+    s = state.sensors
+    s = s._replace(strap=strapdown_channel.sense(s.strap, record), air=air_data_channel.sense(s.air, record))
+    return state._replace(sensors=s), []
+
+
+def imu(state: State, record: Imu, settings: Settings) -> Step:
+    """Move the nominal trajectory by the specific force, in the level frame."""
+    config = settings.config
+    if record.source != config.strapdown.imu or not config.uses("imu"):
+        return state, []
+    s = state.sensors
+    strap = strapdown_channel.receive(s.strap, record)
+    s = s._replace(strap=strap)
+    if strap.why or strap.C_nb is None:
+        return state._replace(sensors=s), []
+    a_n = strapdown_channel.level_acceleration(strap)
+    mean = (0.5 * (a_n[0] + s.acceleration[0]), 0.5 * (a_n[1] + s.acceleration[1]))
+    fresh = record.t_ns - s.imu_ns <= own_channel.SILENT_NS["imu"]
+    s = s._replace(imu_ns=record.t_ns, acceleration=a_n)
+    state = state._replace(sensors=s)
+    return _driven(state, record, "imu", mean if fresh else a_n, settings)
+
+
+def air_data(state: State, record: AirData, settings: Settings) -> Step:
+    """Use airspeed, as driver or as measurement; on the ground it only tells whether the aircraft flies."""
+    s = state.sensors
+    state = state._replace(sensors=s._replace(air=air_data_channel.sense(s.air, record)))
+    nominal = state.nominal
+    if nominal is None or not settings.config.uses("air_data"):
+        return state, []
+    if not own_channel.airspeed_is_sensed(s, record):
+        return state, []
+    V = own_channel.air_velocity(s, record, nominal.point.position.alt)
+    if V is None:
+        return state, []
+    speed = math.hypot(*estimated_velocity(state))
+    if s.ground.flying and math.hypot(*V) < BLOCKED_M_S < 0.5 * speed:
+        return state, _blocked_pitot(s, record)
+    height = None if s.air.static is None else nominal.point.position.alt
+    ground = own_error_model.ground_phase(s.ground, record.t_ns * 1e-9, math.hypot(*V), speed, height)
+    s = state.sensors._replace(ground=ground, air_ns=record.t_ns if ground.flying else s.air_ns)
+    state = state._replace(sensors=s)
+    if not ground.flying:
+        return _driven(state, record, "hold", None, settings) if s.leads("hold", record.t_ns) else (state, [])
+    if s.leads("air", record.t_ns):
+        return _driven(state, record, "air", V, settings)
+    if not is_driven_by(state, "imu"):
+        return state, []
+    state = carried(state, record.t_ns)
+    assert state.nominal is not None
+    v_n = state.nominal.point.v_n
+    sums = s.sums or AirspeedSums(record.t_ns, 0, (0.0, 0.0), (0.0, 0.0))
+    sums = AirspeedSums(
+        sums.start_ns,
+        sums.samples + 1,
+        (sums.velocity[0] + v_n[0], sums.velocity[1] + v_n[1]),
+        (sums.air[0] + V[0], sums.air[1] + V[1]),
+    )
+    if record.t_ns - sums.start_ns < AIRSPEED_EVERY_NS:
+        return state._replace(sensors=s._replace(sums=sums)), []
+    state = propagated(state, settings)
+    assert state.bank is not None
+    n, seconds = sums.samples, (record.t_ns - sums.start_ns) * 1e-9
+    taken = measurements.airspeed(
+        state.bank,
+        hypotheses(state, settings),
+        _own(settings),
+        (sums.air[0] / n, sums.air[1] / n),
+        (sums.velocity[0] / n, sums.velocity[1] / n),
+        seconds,
+    )
+    sums = AirspeedSums(record.t_ns, 0, (0.0, 0.0), (0.0, 0.0))
+    sensors = state.sensors._replace(measured_ns=record.t_ns, sums=sums)
+    return decided(state._replace(bank=taken.bank, sensors=sensors), record, settings)
+
+
+def _blocked_pitot(before: Sensors, record: AirData) -> list[Output]:
+    """Reject an airspeed at which nothing flies, once a second: without a direction it cannot be modelled."""
+    last = before.air.air
+    if last is not None and last.t_ns // SECOND_NS == record.t_ns // SECOND_NS:
+        return []
+    why = "airspeed too low for the speed over ground: not used"
+    return [Rejection(record.t_ns, record.rx_ns, "airspeed", why, record.airspeed, BLOCKED_M_S)]
+
+
+def foreign_position(state: State, record: LocalPosition, settings: Settings) -> Step:
+    """Use the velocity of the autopilot's estimator, as driver or as measurement, where we do not feed it."""
+    s, config = state.sensors, settings.config
+    state = state._replace(local=record)
+    if state.origin is None and state.waiting_ns is None:
+        state = state._replace(waiting_ns=record.t_ns)
+    if not config.uses("local_position") or config.output.feeds_estimator:
+        return state, []
+    before = s.foreign
+    s = s._replace(foreign=record, foreign_ns=record.t_ns)
+    state = state._replace(sensors=s)
+    if state.nominal is None:
+        return state, []
+    velocity = (record.v_n[0], record.v_n[1])
+    if s.leads("foreign", record.t_ns):
+        return _driven(state, record, "foreign", velocity, settings)
+    if before is not None and record.t_ns // FOREIGN_EVERY_NS == before.t_ns // FOREIGN_EVERY_NS:
+        return state, []
+    state = propagated(carried(state, record.t_ns), settings)
+    assert state.bank is not None
+    assert state.nominal is not None
+    v_n = state.nominal.point.v_n
+    apart = (v_n[0] - velocity[0], v_n[1] - velocity[1])
+    taken = measurements.foreign_velocity(state.bank, hypotheses(state, settings), _own(settings), apart)
+    return decided(state._replace(bank=taken.bank), record, settings)
+
+
+def _driven(state: State, record: Stamped, by: By, sample: Vector2 | None, settings: Settings) -> Step:
+    """Move the nominal trajectory to the time of a sample of its driver, and solve if that is due.
+
+    `sample` is the mean acceleration (imu) or the velocity (air, foreign); None goes straight on.
+    """
+    nominal, s = state.nominal, state.sensors
+    if nominal is None or record.t_ns <= nominal.t_ns:
+        return state, []
+    assert nominal.interval is not None
+    if nominal.interval.by != by:
+        s = s._replace(sums=None)
+        state = propagated(carried(state, record.t_ns), settings)._replace(sensors=s)
+        assert state.nominal is not None
+        velocity = sample if by in ("air", "foreign") and sample else state.nominal.point.v_n[:2]
+        nominal = own_channel.restart(state.nominal, by, velocity)
+        if by == "imu" and sample:
+            nominal = nominal._replace(a_n=sample)
+    elif by == "imu" and sample:
+        heading = s.heading() or 0.0
+        nominal = own_channel.by_imu(nominal, sample, heading, record.t_ns)._replace(a_n=s.acceleration)
+    else:
+        nominal = own_channel.by_velocity(nominal, sample or (0.0, 0.0), record.t_ns)
+    state = state._replace(nominal=_at_height(nominal, s, state))
+    if nominal.pending_s >= NEAR_S:
+        state, out = decided(propagated(state, settings), record, settings)
+    else:
+        out = []
+    state, more = solved_if_due(state, record, settings)
+    return state, [*out, *more]
+
+
+def _at_height(nominal: Nominal, s: Sensors, state: State) -> Nominal:
+    """With the height of the pressure, and its rate as the climb."""
+    if s.air.static is None:
+        return nominal
+    point = nominal.point
+    dt = (point.t_ns - nominal.since.t_ns) * 1e-9
+    alt = air_data_channel.pressure_altitude(s.air.static)
+    climb = -point.v_n[2]
+    if dt > 0.0:
+        climb += min(dt / air_data_channel.CLIMB_S, 0.2) * ((alt - nominal.since.position.alt) / dt - climb)
+    v_n = (point.v_n[0], point.v_n[1], -climb)
+    return nominal._replace(point=point._replace(position=point.position._replace(alt=alt), v_n=v_n))
+
+
+def _own(settings: Settings) -> OwnChannel:
+    assert isinstance(settings.model.channel, OwnChannel)
+    return settings.model.channel

@@ -1,0 +1,224 @@
+"""The bank in time: carried and propagated, decided, and the nominal trajectory brought nearer.
+
+What the samples of the channels, the fixes and the correctors have in common. All functions take a state and
+return the next one.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from companion.estimate import bank as banks
+from companion.nav.geometry import displace
+from companion.navigator import minimax_bound, own_channel, parallel_filters
+from companion.navigator.channel import Nominal, moved
+from companion.navigator.hypotheses import AIRSPEED, JAMMED
+from companion.navigator.inertial_track import Point
+from companion.navigator.own_error_model import By
+from companion.navigator.solution import solve
+from companion.navigator.state import (
+    EXCLUDED,
+    JAMMED_NS,
+    SUSPECT,
+    Settings,
+    State,
+    Step,
+    estimate,
+    hypotheses,
+    source_name,
+    sources,
+)
+from companion.records import Event, Gnss, Output, Severity, Source, Stamped, Vector2
+from companion.units import SECOND_NS
+
+#: An autopilot checks its airspeed sensor against GPS only: ArduPlane dived to the ground for speed in 67 s.
+FALSE_AIRSPEED = "switch the airspeed sensor off"
+USE_AIRSPEED = {"ardupilot": ": ARSPD_USE 0", "px4": ": FW_USE_AIRSPD 0"}
+CONFIRM_NS = SECOND_NS  # one fix in disagreement is an outlier: a source is excluded once it lasts
+FAR_M, FAST_M_S = 500.0, 5.0  # the nominal trajectory is brought back from this far off
+
+
+def carried(state: State, t_ns: int) -> State:
+    """With the nominal trajectory carried on to `t_ns`."""
+    nominal = state.nominal
+    assert nominal is not None
+    dt = (t_ns - nominal.t_ns) * 1e-9
+    if dt <= 0.0:
+        return state
+    if nominal.interval is not None:
+        return state._replace(nominal=own_channel.carry_on(nominal, state.sensors, t_ns))
+    v, a = nominal.point.v_n, nominal.a_n
+    point = moved(nominal.point, (v[0] + a[0] * dt, v[1] + a[1] * dt), t_ns)
+    return state._replace(nominal=nominal._replace(point=point))
+
+
+def propagated(state: State, settings: Settings) -> State:
+    """With the bank at the time of the nominal point, and births if they are due."""
+    nominal, bank = state.nominal, state.bank
+    assert nominal is not None
+    if bank is None or nominal.pending_s <= 0.0:
+        return state
+    known = hypotheses(state, settings)
+    Phi, Q = settings.model.transition(nominal, len(state.beacons))
+    bank = banks.propagate(bank, known.layout, nominal.pending_s, Phi, Q)
+    if nominal.interval is not None and nominal.interval.by == "air":
+        seen = bank.seen.copy()
+        seen[AIRSPEED] = bank.t
+        bank = bank._replace(seen=seen)
+    if banks.births_due(bank, known.settings):
+        jammed = state.jammed_ns is not None and nominal.t_ns - state.jammed_ns < JAMMED_NS
+        bank = banks.births(bank, known.layout, known.settings, {0: JAMMED, 1: JAMMED} if jammed else None)
+    else:
+        bank = banks.jump_births(bank, known.layout, known.settings)
+    if nominal.interval is None:
+        return state._replace(bank=bank, nominal=nominal._replace(since=nominal.point))
+    velocity = nominal.point.v_n[:2]
+    nominal = own_channel.restart(nominal, nominal.interval.by, velocity)
+    return state._replace(bank=bank, nominal=nominal)
+
+
+def decided(state: State, record: Stamped, settings: Settings) -> Step:
+    """With the decisions read off the bank, and an event for each source that they change."""
+    assert state.bank is not None
+    known = hypotheses(state, settings)
+    bank = banks.decide(state.bank, known.layout, known.settings)
+    false = tuple(banks.false_probability(bank, known.layout).tolist())
+    n = len(false)  # more than before if a beacon joined
+    before, certain = (*state.reported, *(0,) * n)[:n], (*state.certain_ns, *(0,) * n)[:n]
+    reported, since = list(before), list(certain)
+    out: list[Output] = []
+    for i, p in enumerate(false):
+        since[i] = (certain[i] or record.t_ns) if bank.excluded[i] else 0
+        if bank.excluded[i] and record.t_ns - since[i] >= CONFIRM_NS:
+            reported[i] = EXCLUDED
+        elif bank.excluded[i] or p > known.settings.suspect:
+            reported[i] = SUSPECT
+        elif p < known.settings.believed:
+            reported[i] = 0
+        if reported[i] != before[i]:
+            text = {
+                0: "is used again",
+                SUSPECT: f"is suspect: false with probability {p:.2f}",
+                EXCLUDED: f"is excluded: false with probability {p:.4f}",
+            }[reported[i]]
+            severity = Severity.WARNING if reported[i] else Severity.NOTICE
+            out.append(Event(record.t_ns, record.rx_ns, severity, f"{source_name(i, state)} {text}"))
+            by_gnss = sources(state, record.t_ns, settings) & Source.GNSS
+            if i == AIRSPEED and reported[i] == EXCLUDED and not by_gnss:
+                text = FALSE_AIRSPEED + USE_AIRSPEED.get(settings.config.output.profile, "")
+                out.append(Event(record.t_ns, record.rx_ns, Severity.WARNING, text))
+    leading = (bank, banks.estimate(bank, known.layout))
+    state = state._replace(
+        bank=bank, leading=leading, false=false, reported=tuple(reported), certain_ns=tuple(since)
+    )
+    return state, out
+
+
+def nearer(state: State, settings: Settings) -> State:
+    """With the nominal trajectory moved by the estimated error where it is far off, or as the scheme says."""
+    nominal = state.nominal
+    assert nominal is not None
+    if nominal.interval is None:
+        return state  # an INS of its own cannot be corrected
+    x = estimate(state, settings).x
+    n, e, vn, ve = (float(c) for c in x[:4])
+    share = settings.config.estimator.feedback
+    if math.hypot(n, e) > FAR_M or (math.hypot(vn, ve) > FAST_M_S and nominal.interval.by == "imu"):
+        share = 1.0
+    if share == 0.0:
+        return state
+    n, e, vn, ve = -share * n, -share * e, -share * vn, -share * ve
+    if nominal.interval.by in ("air", "foreign"):
+        vn = ve = 0.0  # the velocity is the sensor's, and its error follows from other states
+    state = shifted(state, n, e, (vn, ve), nominal.t_ns)
+    assert state.bank is not None
+    latency = settings.model.channel.latency  # `_latency_velocity` changes by vn, ve, the fixes do not
+    state = state._replace(bank=banks.couple(state.bank, (0, 1), latency, (-vn, -ve)))
+    sums = state.sensors.sums
+    if sums is not None:  # the samples of airspeed so far are moved with the nominal velocity, not dropped
+        mean_sum = (sums.velocity[0] + sums.samples * vn, sums.velocity[1] + sums.samples * ve)
+        state = state._replace(sensors=state.sensors._replace(sums=sums._replace(velocity=mean_sum)))
+    place = displace(*nominal.point.position, n, e, 0.0)
+    v = nominal.point.v_n
+    velocity = (v[0] + vn, v[1] + ve)
+    point = Point(nominal.t_ns, place._replace(alt=nominal.point.position.alt), (*velocity, v[2]))
+    nominal = nominal._replace(point=point, since=point)
+    return state._replace(nominal=own_channel.restart(nominal, _driver(nominal), velocity))
+
+
+def shifted(state: State, north: float, east: float, v_n: Vector2 = (0.0, 0.0), t_ns: int = 0) -> State:
+    """Move the errors with the nominal trajectory: by (north, east) m and `v_n` (m/s), at `t_ns`."""
+    bank = state.bank
+    if bank is not None:
+        bank = banks.shift(bank, np.array((north, east, *v_n)))
+    protection = state.protection
+    if protection is not None:
+        protection = (*protection[:2], protection[2] + north, protection[3] + east)
+    promise = minimax_bound.shift(state.guarantee, north, east, v_n)
+    parallel = state.parallel and parallel_filters.shift(state.parallel, north, east)
+    fix = state.gnss_fix and _fix_shifted(*state.gnss_fix, north, east, v_n, t_ns)
+    pending = state.pending
+    if pending is not None:  # the error that was taken off is that of the nominal trajectory as it is now
+        pending = pending._replace(centre=(pending.centre[0] + north, pending.centre[1] + east))
+    return state._replace(
+        bank=bank,
+        moved=(state.moved[0] + north, state.moved[1] + east),
+        protection=protection,
+        guarantee=promise,
+        parallel=parallel,
+        gnss_fix=fix,
+        pending=pending,
+    )
+
+
+def _fix_shifted(
+    record: Gnss, point: Point, north: float, east: float, v_n: Vector2, t_ns: int
+) -> tuple[Gnss, Point]:
+    """Return a GNSS fix beside the nominal trajectory as if that had always been where it is now."""
+    since = (point.t_ns - t_ns) * 1e-9
+    place = displace(*point.position, north + v_n[0] * since, east + v_n[1] * since, 0.0)
+    return record, point._replace(position=point.position._replace(lat=place.lat, lon=place.lon))
+
+
+def solved_if_due(state: State, record: Stamped, settings: Settings) -> Step:
+    """Solve if the pace of the output has come."""
+    if record.t_ns < state.next_ns or not state.fixed or state.nominal is None:
+        return state, []
+    state, solution = solve(state, record.rx_ns, settings)
+    if solution:
+        period = round(1e9 / settings.config.output.pace_hz)
+        state = state._replace(
+            next_ns=max(state.next_ns + period, state.nominal.t_ns if state.nominal else 0)
+        )
+    return state, solution
+
+
+def is_silent(state: State, t_ns: int) -> bool:
+    """Whether an INS has given nothing for too long to carry it on."""
+    assert state.nominal is not None
+    last_ns = state.ins.t_ns if state.ins else state.nominal.t_ns
+    return state.nominal.interval is None and (t_ns - last_ns) * 1e-9 > 1.5
+
+
+def estimated_velocity(state: State) -> Vector2:
+    """Estimated velocity over ground, north and east, m/s."""
+    assert state.nominal is not None
+    v_n = state.nominal.point.v_n
+    if state.bank is None:
+        return v_n[0], v_n[1]
+    x = state.bank.x[int(state.bank.L.argmax())]
+    return v_n[0] - float(x[2]), v_n[1] - float(x[3])
+
+
+def is_driven_by(state: State, by: By) -> bool:
+    """Whether the nominal trajectory is driven by a sensor now."""
+    return (
+        state.nominal is not None and state.nominal.interval is not None and state.nominal.interval.by == by
+    )
+
+
+def _driver(nominal: Nominal) -> By:
+    assert nominal.interval is not None
+    return nominal.interval.by
