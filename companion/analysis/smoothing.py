@@ -152,15 +152,15 @@ class _Witness(Navigator):
             self._note(record)
         return outputs
 
-    def _step(self, record: Input) -> list[Output]:
+    def _fold(self, record: Input) -> list[Output]:
         while self.folded and self.folded[-1].t_ns > record.t_ns:
             self.folded.pop()  # folded again, behind a late record
-        outputs = super()._step(record)
+        outputs = super()._fold(record)
         self._note(record)
         return outputs
 
     def _note(self, record: Input) -> None:
-        state, t_ns = self.state, record.t_ns
+        state, t_ns = self._state, record.t_ns
         if state.bank is None and self._last[-1] is not None:
             self._last.append(None)
         self.folded.append(_Folded(t_ns, record, len(self._last) - 1))
@@ -210,7 +210,8 @@ class _Witness(Navigator):
         self._open.clear()
 
     def end(self) -> None:
-        """Close what is still open."""
+        """Fold what waits, and close what is still open."""
+        self.finish()
         self._close(NEVER_NS)
 
     def was_false(self, name: str, t_ns: int) -> bool:

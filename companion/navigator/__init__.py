@@ -2,16 +2,17 @@
 
 `Navigator` folds `step` over the records. A measurement that arrives late is applied at its own time: the
 states of the last seconds are kept, the navigator goes back to the one before it and folds forward again.
-Solutions that were already returned stay; a late measurement shows in the next one. Going back by t seconds
-is done at most once in t / 10, for all records that arrived late in between: the work per second is bounded.
+With each record that arrives only a few are folded again, so that none waits long; until that has caught up
+the solutions come from a second state, without the late ones. Solutions that were already returned stay; a
+late measurement shows in the first one after that.
 """
 
 from __future__ import annotations
 
-from bisect import bisect_right
+from bisect import bisect_right, insort
 from collections import deque
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeGuard
 
 from msgspec import structs
 
@@ -43,9 +44,10 @@ from companion.records import (
 
 __all__ = ["INPUTS_USED", "Navigator"]
 
-#: A roll-back takes 1 % of the time that it goes back: at most one in this share of it. Fewer are no help,
-#: for more records wait: a flood of answers 5 s late delays TIMESYNC by 41 ms (p99) at 10, by 108 ms at 2.
-ROLL_BACK_SHARE = 10
+#: With each record that arrives at most so many are folded again, and so many fixes (2 ms each, 5 ms where
+#: they contradict others): a usual delay of a beacon at once, 5 s within half a second. Fewer than two would
+#: not catch up.
+MOST_AGAIN, MOST_FIXES = 16, 2
 #: Stamps in ms are behind those in us of the same instant by up to this: such a record is not late.
 TICK_NS = 1_000_000
 #: After a roll-back by t seconds for beacon answers, all of which were rejected, none that is older than
@@ -56,9 +58,31 @@ MOST_WAITING, MOST_KEPT = 64, 1024
 
 
 class _Past(NamedTuple):
-    t_ns: int
     record: Input
     before: State
+
+
+class _Again(NamedTuple):
+    record: Input
+    is_late: bool  # its outputs were not returned before
+
+
+class _RollBack:
+    """Records to fold again, in order of time, and the state that solutions come from meanwhile."""
+
+    def __init__(self, ahead: State, again: list[_Again]) -> None:
+        self.ahead = ahead
+        self.again = deque(again)
+        self.back_ns = again[-1].record.t_ns - again[0].record.t_ns
+        self.used: set[bool] = set()  # whether beacon answers older than CHEAP_NS were used
+
+
+def _time(kept: _Past | _Again) -> int:
+    return kept.record.t_ns
+
+
+def _is_old_answer(record: Input) -> TypeGuard[RsbnFix]:
+    return isinstance(record, RsbnFix) and record.rx_ns - record.t_ns > CHEAP_NS
 
 
 class Navigator:
@@ -70,10 +94,11 @@ class Navigator:
     def __init__(self, config: Config, model: Model | None = None) -> None:
         self._settings = Settings(config, model or Model(config))
         self._uses = uses(self._settings)
-        self._state = initial(self._settings)
+        self._state = initial(self._settings)  # after the last of `_past`
         self._past: deque[_Past] = deque(maxlen=MOST_KEPT)
+        self._newest: Input | None = None  # the last record that was not late
+        self._roll_back: _RollBack | None = None
         self._waiting: list[Input] = []  # late records, until the next roll-back
-        self._rolled_back_ns: int | None = None  # arrival of the record at the last roll-back
         self._no_late_answers_ns = 0  # until when none is used: the last ones were all rejected
         self._deferred: list[Output] = []  # outputs of deferred updates, for the next `handle`
         self._late_ns = round(1e9 * config.estimator.late_s)
@@ -87,8 +112,8 @@ class Navigator:
 
     @property
     def state(self) -> State:
-        """The state after the last record."""
-        return self._state
+        """The state after the last record; while records are folded again, without the late ones."""
+        return self._state if self._roll_back is None else self._roll_back.ahead
 
     @property
     def settings(self) -> Settings:
@@ -98,7 +123,7 @@ class Navigator:
     def handle(self, record: Input) -> list[Output]:
         """Return the outputs of one more record."""
         if isinstance(record, Tuning):
-            self._tune(parse(record.toml, "parameters"))
+            self._tune(record)
             return []
         if type(record) not in self._uses:
             return []
@@ -112,30 +137,21 @@ class Navigator:
         stale = self._stale_data.judge(record)
         if stale is not None:
             return stale
-        chosen: list[Output] = []
+        self.settle()
         if isinstance(record, Gnss):
             is_used, changes = self._receivers.takes(record)
-            chosen += changes
-            if not is_used or not is_new_fix(record, self._state):
-                return chosen
-        if self._past and 0 < self._past[-1].t_ns - record.t_ns <= TICK_NS:
-            record = structs.replace(record, t_ns=self._past[-1].t_ns)
-        self.settle()
-        outputs, self._deferred = [*self._deferred, *chosen], []
-        folded: list[Input] = [record]
-        if self._past and record.t_ns < self._past[-1].t_ns:
+            self._deferred += changes
+            if not is_used or not is_new_fix(record, self.state):
+                return []
+        outputs, self._deferred = self._deferred, []
+        late_ns = 0 if self._newest is None else self._newest.t_ns - record.t_ns
+        if 0 < late_ns <= TICK_NS:
+            record, late_ns = structs.replace(record, t_ns=record.t_ns + late_ns), 0
+        if late_ns > 0:
             outputs += self._queue_late(record)
-            folded = []
-        else:
-            self._past.append(_Past(record.t_ns, record, self._state))
-            outputs += self._step(record)
-        if self._waiting and self._may_roll_back(record.rx_ns):
-            folded += self._waiting
-            outputs += self._roll_back(record.rx_ns)
-        if any(isinstance(one, RsbnFix) and self._state.rsbn_ns == one.t_ns for one in folded):
-            # a solution at once after a beacon's fix
-            self._state, solution = guarded(self._state, record, self._settings, _solve, record)
-            outputs += solution
+        outputs += self._fold_again(record)
+        if late_ns <= 0:
+            outputs += self._take(record)
         return self._with_mode_events(outputs)
 
     def settle(self) -> None:
@@ -143,9 +159,21 @@ class Navigator:
 
         `handle` does it first if it was not done in between; its outputs come with the next `handle`.
         """
-        self._deferred += self._resolve()[1]
-        while not self._waiting and self._past and self._past[0].t_ns < self._past[-1].t_ns - self._late_ns:
+        if self._newest is None:
+            return
+        if self._roll_back is not None:
+            self._roll_back.ahead, outputs = self._resolved(self._roll_back.ahead, self._newest)
+        else:
+            self._state, outputs = self._resolved(self._state, self._newest)
+        self._deferred += outputs
+        while not self._waiting and _time(self._past[0]) < _time(self._past[-1]) - self._late_ns:
             self._past.popleft()
+
+    def finish(self) -> None:
+        """Fold all late records: before other parameters, and at the end of a log."""
+        self.settle()
+        while self._newest is not None and (self._waiting or self._roll_back is not None):
+            self._deferred += self._fold_again(self._newest)
 
     def _reject_implausible(self, record: Input, fault: ImplausibleField) -> list[Output]:
         """Report it once a second."""
@@ -155,28 +183,50 @@ class Navigator:
         self._rejected_ns[name] = record.rx_ns
         return [fault.rejection(record)]
 
-    def _resolve(self) -> tuple[Input | None, list[Output]]:
-        """Do the deferred update left by the last record: whose it was, and its outputs.
+    def _resolved(self, state: State, record: Input) -> Step:
+        """Do the deferred update left by `record`, the last one of `state`.
 
         The fix is added to the window of the guaranteed bound, and one piece of that bound's work is done.
         """
-        pending, outputs = self._state.pending, list[Output]()
+        pending, outputs = state.pending, list[Output]()
         if pending is not None:
-            state = self._state._replace(pending=None)
-            self._state, outputs = guarded(state, pending.record, self._settings, resolve_pending, pending)
-        if self._past and is_bound_due(self._state):
-            record = self._past[-1].record
-            self._state, more = guarded(self._state, record, self._settings, refresh_bound, record)
+            state = state._replace(pending=None)
+            state, outputs = guarded(state, pending.record, self._settings, resolve_pending, pending)
+        if is_bound_due(state):
+            state, more = guarded(state, record, self._settings, refresh_bound, record)
             outputs = [*outputs, *more]
-        return pending.record if pending else None, outputs
+        return state, outputs
 
-    def _step(self, record: Input) -> list[Output]:
-        self._state, outputs = guarded(self._state, record, self._settings, self._uses[type(record)], record)
+    def _take(self, record: Input) -> list[Output]:
+        """Return what follows from a record that is not late."""
+        self._newest, back = record, self._roll_back
+        if back is None:
+            outputs = self._fold(record)
+            self._state, solution = self._solved_after(self._state, record)
+        else:
+            back.again.append(_Again(record, False))
+            back.ahead, outputs = self._stepped(back.ahead, record)
+            back.ahead, solution = self._solved_after(back.ahead, record)
+        return outputs + solution
+
+    def _fold(self, record: Input) -> list[Output]:
+        self._past.append(_Past(record, self._state))
+        self._state, outputs = self._stepped(self._state, record)
         return outputs
 
-    def _tune(self, config: Config) -> None:
+    def _stepped(self, state: State, record: Input) -> Step:
+        return guarded(state, record, self._settings, self._uses[type(record)], record)
+
+    def _solved_after(self, state: State, record: Input) -> Step:
+        """A solution at once after a beacon's fix."""
+        if not isinstance(record, RsbnFix) or state.rsbn_ns != record.t_ns:
+            return state, []
+        return guarded(state, record, self._settings, _solve, record)
+
+    def _tune(self, record: Tuning) -> None:
         """Go on with another configuration; late measurements are no longer applied from before it."""
-        self.settle()
+        config = parse(record.toml, "parameters")
+        self.finish()
         before = self._settings
         self._settings, self._state = tuned(self._state, before, config)
         self._uses = uses(self._settings)
@@ -189,63 +239,76 @@ class Navigator:
             self._past.popleft()
 
     def _queue_late(self, record: Input) -> list[Output]:
-        """Let a late record wait for the next roll-back, or reject it."""
-        if record.t_ns < self._past[0].t_ns:
+        """Let a late record join the roll-back in progress or wait for the next one, or reject it."""
+        if record.t_ns < _time(self._past[0]):
             return self._too_late(record)
-        age_ns = self._past[-1].t_ns - record.t_ns
-        if isinstance(record, RsbnFix) and age_ns > CHEAP_NS and record.rx_ns < self._no_late_answers_ns:
+        if _is_old_answer(record) and record.rx_ns < self._no_late_answers_ns:
             why = "late, and the last late answers were rejected: not used"
-            age, limit = age_ns * 1e-9, CHEAP_NS * 1e-9
+            age, limit = (record.rx_ns - record.t_ns) * 1e-9, CHEAP_NS * 1e-9
             return [Rejection(record.t_ns, record.rx_ns, f"rsbn {record.beacon}", why, age, limit)]
-        if len(self._waiting) >= MOST_WAITING:
+        back = self._roll_back
+        if back is not None and record.t_ns >= _time(self._past[-1]):
+            insort(back.again, _Again(record, True), key=_time)
+        elif len(self._waiting) < MOST_WAITING:
+            self._waiting.append(record)
+        else:
             why = f"more than {MOST_WAITING} late records wait: not used"
             return [Rejection(record.t_ns, record.rx_ns, type(record).__name__, why)]
-        self._waiting.append(record)
         return []
 
-    def _may_roll_back(self, now_ns: int) -> bool:
-        back_ns = self._past[-1].t_ns - min(record.t_ns for record in self._waiting)
-        last = self._rolled_back_ns
-        return last is None or not 0 <= now_ns - last < back_ns // ROLL_BACK_SHARE
-
-    def _roll_back(self, now_ns: int) -> list[Output]:
-        """Go back to the state before the oldest waiting record and fold all records since in their order."""
-        self._rolled_back_ns = now_ns
+    def _begin_roll_back(self) -> list[Output]:
+        """Go back to the state before the oldest waiting record."""
         outputs: list[Output] = []
         late, self._waiting = sorted(self._waiting, key=lambda record: record.t_ns), []
-        while late and late[0].t_ns < self._past[0].t_ns:  # dropped while they waited
+        while late and late[0].t_ns < _time(self._past[0]):  # dropped while they waited
             outputs += self._too_late(late.pop(0))
-        if not late:
+        if late:
+            place = bisect_right(self._past, late[0].t_ns, key=_time)
+            later = [self._past.pop() for _ in range(place, len(self._past))]
+            again = [_Again(past.record, False) for past in reversed(later)]
+            again += [_Again(record, True) for record in late]
+            # a stable sort: of equal times the late one comes last
+            self._roll_back = _RollBack(self._state, sorted(again, key=_time))
+            self._state = self._rewound(later[-1].before)
+        return outputs
+
+    def _fold_again(self, now: Input) -> list[Output]:
+        """Fold some of the records behind late ones; return the outputs of the late ones alone."""
+        outputs = self._begin_roll_back() if self._waiting and self._roll_back is None else []
+        back, fixes = self._roll_back, 0
+        if back is None:
             return outputs
-        place = bisect_right(self._past, late[0].t_ns, key=lambda past: past.t_ns)
-        later = [past.record for past in list(self._past)[place:]]
-        # a stable sort: of equal times the late one comes last
-        again = sorted([*later, *late], key=lambda record: record.t_ns)
-        if later:
-            self._state = self._rewound(self._past[place].before)
-        while len(self._past) > place:
-            self._past.pop()
-        new, back_ns, useful = set(map(id, late)), again[-1].t_ns - again[0].t_ns, False
-        for each in again:
-            whose, resolved = self._resolve()
-            if id(whose) in new:  # the others were returned when they were resolved first
-                outputs += resolved
-            self._past.append(_Past(each.t_ns, each, self._state))
-            found = self._step(each)
-            if id(each) in new:
-                useful |= not isinstance(each, RsbnFix) or self._state.rsbn_ns == each.t_ns
+        for _ in range(min(MOST_AGAIN, len(back.again))):
+            fixes += isinstance(back.again[0].record, Gnss | RsbnFix)
+            if fixes > MOST_FIXES:
+                break
+            record, is_late = back.again.popleft()
+            found = self._fold(record)
+            self._state, resolved = self._resolved(self._state, record)
+            if is_late:
+                if _is_old_answer(record):
+                    back.used.add(self._state.rsbn_ns == record.t_ns)
                 last = self._last_solution_ns
                 outputs += [out for out in found if not isinstance(out, Solution) or out.t_ns > last]
-        self._resolve()
-        if not useful:
-            self._no_late_answers_ns = now_ns + USELESS_TIMES * back_ns
+                outputs += resolved
+        return outputs if back.again else outputs + self._end_roll_back(back, now)
+
+    def _end_roll_back(self, back: _RollBack, now: Input) -> list[Output]:
+        """Let solutions come from the state with the late records; the first at once if it has a new fix."""
+        self._roll_back = None
+        if back.used == {False}:
+            self._no_late_answers_ns = now.rx_ns + USELESS_TIMES * back.back_ns
+        if self._state.rsbn_ns == back.ahead.rsbn_ns:
+            return []
+        self._state, outputs = guarded(self._state, now, self._settings, _solve, now)
         return outputs
 
     def _too_late(self, record: Input) -> list[Output]:
         """Reject it; a receiver without a fix has nothing to use."""
         if isinstance(record, Gnss) and not record.has_3d_fix:
             return []
-        age, limit = (self._past[-1].t_ns - record.t_ns) * 1e-9, self._late_ns * 1e-9
+        assert self._newest is not None
+        age, limit = (self._newest.t_ns - record.t_ns) * 1e-9, self._late_ns * 1e-9
         name = type(record).__name__
         why = "late: not used" if age > limit else "older than the oldest kept state: not used"
         return [Rejection(record.t_ns, record.rx_ns, name, why, age, limit)]

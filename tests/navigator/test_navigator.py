@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from functools import lru_cache
+from itertools import pairwise
 from typing import Any
 
 import msgspec
@@ -32,6 +33,7 @@ from companion.records import (
     LocalOrigin,
     LocalPosition,
     Mode,
+    Reboot,
     Rejection,
     Reset,
     RsbnFix,
@@ -184,30 +186,112 @@ def test_a_late_answer_is_folded_in_at_its_own_time() -> None:
     np.testing.assert_allclose(a[0].covariance, b[0].covariance, rtol=1e-3, atol=per_mille)
 
 
-def test_a_flood_of_late_answers_is_folded_in_by_few_roll_backs(monkeypatch: pytest.MonkeyPatch) -> None:
-    """200 answers within a second, five seconds late: at most one roll-back in half a second."""
-    navigator, roll_backs = Navigator(CONFIG), []
-    rewound = Navigator._rewound
-    monkeypatch.setattr(
-        Navigator, "_rewound", lambda self, state: roll_backs.append(1) or rewound(self, state)
-    )
-    navigator.handle(origin())
-    records = [record for moment in flight(60, 60.0, 60.0) for record in moment.records]
+def with_late_answer(late_s: float) -> tuple[list[Any], RsbnFix, int]:
+    """A flight without GNSS from 20 s on, an answer of its beacon at 30 s, and the answer's place among the
+    other records if it arrives `late_s` later.
+    """
+    records = [origin(), *(record for moment in flight(60, 20.0, 60.0)[:420] for record in moment.records)]
+    answer = next(r for r in records if isinstance(r, RsbnFix) and r.t_ns == 30 * NS)
+    arrival = answer.t_ns + round(late_s * NS)
+    records.remove(answer)
+    place = next(k for k, record in enumerate(records) if record.t_ns > arrival)
+    return records, msgspec.structs.replace(answer, rx_ns=arrival), place
+
+
+def solutions(navigator: Navigator, records: list[Any]) -> list[Solution]:
+    return [out for record in records for out in navigator.handle(record) if isinstance(out, Solution)]
+
+
+def assert_same(ours: list[Solution], in_order: list[Solution]) -> None:
+    """The same but for the instants of the solutions, and with them the steps of the error equations."""
+    by_time = {solution.t_ns: solution for solution in in_order}
+    pairs = [(solution, by_time[solution.t_ns]) for solution in ours if solution.t_ns in by_time]
+    assert len(pairs) > 0.5 * len(in_order)
+    one_millimetre = 1e-3
+    for a, b in pairs:
+        assert math.dist(a.error_n, b.error_n) < one_millimetre
+        per_mille = 1e-3 * b.covariance[0]
+        np.testing.assert_allclose(a.covariance, b.covariance, rtol=1e-3, atol=per_mille)
+
+
+def test_solutions_go_on_while_a_late_answer_is_folded_in() -> None:
+    """Five seconds late: until all is folded again, the solutions are those without the answer; after half a
+    second, those of the records in order.
+    """
+    records, answer, place = with_late_answer(5.0)
+    without, in_order, ours = Navigator(CONFIG), Navigator(CONFIG), Navigator(CONFIG)
+    told = solutions(without, records)
+    wanted = solutions(in_order, sorted([*records, answer], key=lambda record: record.t_ns))
+    found = solutions(ours, [*records[:place], answer, *records[place:]])
+    first = next(k for k, (a, b) in enumerate(zip(found, told)) if a != b)
+    assert 0.0 < found[first].t_ns / NS - 35.0 < 0.5
+    assert {solution.t_ns for solution in found} >= {solution.t_ns for solution in told}
+    assert_same(found[first:], [solution for solution in wanted if solution.t_ns >= found[first].t_ns])
+
+
+def test_with_no_record_more_than_a_few_are_folded_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A hundred answers and more within a second, five seconds late, among the other records."""
+    navigator, folded = Navigator(CONFIG), list[Any]()
+    fold = Navigator._fold
+    monkeypatch.setattr(Navigator, "_fold", lambda self, record: folded.append(record) or fold(self, record))
+    records = [origin(), *(record for moment in flight(60, 60.0, 60.0) for record in moment.records)]
+    answer = next(r for r in records if isinstance(r, RsbnFix) and r.t_ns == 45 * NS)
+    outputs, kept, most, most_fixes, tried = [], 0, 0, 0, 0
     for record in records:
-        navigator.handle(record)
-    answer = [record for record in records if isinstance(record, RsbnFix)][-6]
-    outputs, kept = [], 0
-    for k in range(200):
-        arrival = 60 * NS + k * NS // 200
-        late = msgspec.structs.replace(
-            answer, t_ns=answer.t_ns + k * 1000, rx_ns=arrival, slant_range=5e4 + k
-        )
-        outputs += navigator.handle(late)
-        kept = max(kept, len(navigator._past))
-    assert 1 <= len(roll_backs) <= 3
+        arriving = [record]
+        if 50 * NS <= record.rx_ns < 51 * NS:
+            for k in range(tried, tried + 10):
+                t_ns, distance = answer.t_ns + k * 1000, answer.slant_range + k
+                arriving.append(
+                    msgspec.structs.replace(answer, t_ns=t_ns, rx_ns=record.rx_ns, slant_range=distance)
+                )
+            tried += 10
+        for each in arriving:
+            folded.clear()
+            outputs += navigator.handle(each)
+            kept = max(kept, len(navigator._past))
+            most = max(most, len(folded))
+            most_fixes = max(most_fixes, sum(isinstance(one, Gnss | RsbnFix) for one in folded))
+    assert tried > 100
+    assert most <= navigator_module.MOST_AGAIN + 1  # the record itself
+    assert most_fixes <= navigator_module.MOST_FIXES + 1
     assert kept <= navigator_module.MOST_KEPT
-    rejected = [out for out in outputs if isinstance(out, Rejection) and "late records wait" in out.reason]
-    assert len(rejected) >= 200 - 3 * navigator_module.MOST_WAITING
+    times = [out.t_ns for out in outputs if isinstance(out, Solution)]
+    assert max(b - a for a, b in pairwise(times)) <= NS // 5
+
+
+def test_more_late_answers_than_can_wait_are_rejected_aloud(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(navigator_module, "MOST_WAITING", 2)
+    navigator = Navigator(CONFIG)
+    records, answer, place = with_late_answer(5.0)
+    for record in records[:place]:
+        navigator.handle(record)
+    outputs = []
+    for k in range(4):  # each is older than where the roll-back is
+        older = msgspec.structs.replace(answer, t_ns=answer.t_ns - k * 1000, slant_range=5e4 + k)
+        outputs += navigator.handle(older)
+    (out,) = (out for out in outputs if isinstance(out, Rejection) and "wait" in out.reason)
+    assert out.reason == "more than 2 late records wait: not used"
+
+
+@pytest.mark.parametrize(
+    "between",
+    [Tuning(35 * NS, 35 * NS, "[estimator]\nlate_s = 7.0\n"), Reboot(35 * NS, 35 * NS, 1)],
+    ids=lambda record: type(record).__name__,
+)
+def test_what_comes_while_a_late_answer_is_folded_in_finds_it_used(between: Any) -> None:
+    """Parameters are set, or the autopilot reboots: afterwards all is as if the answer had come in time."""
+    records, answer, place = with_late_answer(5.0)
+    ours, in_order = Navigator(CONFIG), Navigator(CONFIG)
+    solutions(ours, [*records[:place], answer])
+    assert ours._roll_back is not None
+    solutions(in_order, sorted([*records[:place], answer], key=lambda each: each.t_ns))
+    rest = [between, msgspec.structs.replace(origin(), t_ns=35 * NS, rx_ns=35 * NS), *records[place:]]
+    found, wanted = solutions(ours, rest), solutions(in_order, rest)
+    assert ours._roll_back is None
+    assert_same(
+        [each for each in found if each.t_ns > 37 * NS], [each for each in wanted if each.t_ns > 37 * NS]
+    )
 
 
 @pytest.mark.parametrize(("off_m", "least", "most"), [(5e4, 3, 5), (0.0, 30, 30)])
@@ -242,6 +326,27 @@ def test_false_late_answers_share_few_roll_backs(
     assert bool(rejected) == (off_m > 0.0)
 
 
+def test_answers_in_time_do_not_excuse_false_late_ones() -> None:
+    """True answers 0.2 s late, false ones five seconds: these are tried twice in ten seconds."""
+    navigator = Navigator(CONFIG)
+    records = [record for moment in flight(60, 60.0, 60.0)[:400] for record in moment.records]
+    answers = [record for record in records if isinstance(record, RsbnFix)]
+    arriving = [record for record in records if not isinstance(record, RsbnFix)]
+    for answer in answers:
+        arriving.append(msgspec.structs.replace(answer, rx_ns=answer.t_ns + NS // 5))
+        if answer.t_ns > 10 * NS:
+            t_ns, far = answer.t_ns + NS // 2, answer.slant_range + 5e4
+            arriving.append(
+                msgspec.structs.replace(answer, t_ns=t_ns, rx_ns=t_ns + 5 * NS, azimuth=None, slant_range=far)
+            )
+    outputs = list[Any](navigator.handle(origin()))
+    for record in sorted(arriving, key=lambda each: each.rx_ns):
+        outputs += navigator.handle(record)
+    rejected = [out.reason for out in outputs if isinstance(out, Rejection)]
+    assert len(rejected) > 20
+    assert sum("outlier" in reason for reason in rejected) <= 8
+
+
 def test_a_stamp_cut_to_milliseconds_is_not_late(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of one instant: a fix stamped in us before a local position stamped in ms."""
     navigator, roll_backs = Navigator(CONFIG), []
@@ -260,7 +365,8 @@ def test_a_stamp_cut_to_milliseconds_is_not_late(monkeypatch: pytest.MonkeyPatch
     assert max(out.t_ns for out in outs if isinstance(out, Solution)) > 29 * NS
 
 
-def test_what_is_settled_in_between_changes_nothing() -> None:
+@pytest.mark.parametrize("late_ns", [7 * NS // 10, 5 * NS])
+def test_what_is_settled_in_between_changes_nothing(late_ns: int) -> None:
     """The service learns while it waits, a replay when the next record is there: answers come late, one GNSS
     fix is wild, and parameters are set in flight."""
     records = [record for moment in flight(60, 60.0, 60.0) for record in moment.records]
@@ -269,9 +375,9 @@ def test_what_is_settled_in_between_changes_nothing() -> None:
     for k, record in enumerate(records[wild : wild + 40], wild):  # not every fix is used
         if isinstance(record, Gnss) and record.t_ns < records[wild].t_ns + 6 * NS // 10:
             records[k] = msgspec.structs.replace(record, lat=record.lat + 1e-3)
-    for answer in answers[10::3]:  # 0.7 s late
+    for answer in answers[10:50:3]:
         records.remove(answer)
-        later = next(k for k, r in enumerate(records) if r.t_ns > answer.t_ns + 7 * NS // 10)
+        later = next(k for k, r in enumerate(records) if r.t_ns > answer.t_ns + late_ns)
         records.insert(later, answer)
     last = answers[15]  # right after it, its lesson not yet learnt perhaps
     tuning = Tuning(last.t_ns, last.rx_ns, "[rsbn]\nbias_range_m = 1.0\nbias_azimuth_deg = 0.001\n")
