@@ -471,7 +471,7 @@ class CompanionCore:
             self.report(Severity.WARNING, text, now)
 
     def _on_record(self, record: Stamped) -> bool:
-        """Log a record and let the navigator use it; return whether anything was rejected."""
+        """Log a record and let the navigator use it; return whether it was rejected."""
         is_rejected = isinstance(record, Rejection)
         if not isinstance(record, INPUTS):  # truth, or a rejection by the decoder: only logged
             self._emit(record, "/link/Rejection" if is_rejected else None)
@@ -484,7 +484,8 @@ class CompanionCore:
                 self._send(output, early=isinstance(record, RsbnFix))
             elif isinstance(output, Reset) and isinstance(record, LocalPosition):
                 self._origin.forget()  # it may have moved: do not use it until received again
-            is_rejected |= isinstance(output, Rejection)
+            # a late record folded again in this call is not this sender's
+            is_rejected |= isinstance(output, Rejection) and output.rx_ns == record.rx_ns
             self._emit(output)
         return is_rejected
 
