@@ -15,7 +15,15 @@ from companion.config.profiles import MESSAGES, RESET
 from companion.link.dialect import Message, mavlink
 from companion.navigator.receiver_choice import ReceiverChoice
 from companion.output.encode import CannotEncode, Receiver, encode
-from companion.output.gate import STEP_M, Gate, LocalFrame, Position, WithholdingMonitor
+from companion.output.gate import (
+    SIGMAS,
+    STEP_M,
+    Gate,
+    LocalFrame,
+    Position,
+    WithholdingMonitor,
+    distance,
+)
 from companion.output.gnss_fusion import GnssFusion
 from companion.output.position_reset import PositionReset
 from companion.output.source_switch import SourceSwitch, selected
@@ -107,7 +115,7 @@ class AutopilotOutput:
             )
             if isinstance(position, Position) and reason is None:
                 try:
-                    message = encode(position, receiver, name, self._rate_hz(name))
+                    message = encode(position, receiver, name, self._rate_hz(name, position))
                 except CannotEncode as error:
                     reason = str(error)
                 else:
@@ -132,9 +140,20 @@ class AutopilotOutput:
         taken, self._events = [*self._events, *self._source_switch.take_events()], []
         return taken
 
-    def _rate_hz(self, name: str) -> float:
-        """Return how often a position goes out as a measurement; 0 for a reset, which is no series."""
-        return 0.0 if name in NOT_FUSED else self.config.output.rates_hz[name]
+    def _rate_hz(self, name: str, position: Position) -> float:
+        """Return how often a position goes out as a measurement; 0 for one that is no part of a series."""
+        is_single = name in NOT_FUSED or self._is_drawn_off(position)
+        return 0.0 if is_single else self.config.output.rates_hz[name]
+
+    def _is_drawn_off(self, position: Position) -> bool:
+        """Return whether the autopilot's own position still is where a false GNSS has drawn it.
+
+        Its filter is sure of that position. Told our sigma as it is, it rejects ours and is then reset to it.
+        """
+        own = self._position_reset.autopilot_place(position.t_ns)
+        if own is None or not self._source_switch.is_on_companion:
+            return False
+        return distance(own[:2], (position.lat, position.lon)) > SIGMAS * position.sigma
 
     def _withholding_reason(self, position: Position, name: str, receiver: Receiver) -> str | None:
         profile = self.config.output.profile

@@ -15,6 +15,7 @@ from companion.output.source_switch import (
     GNSS_SET,
     STEADY_S,
     TO_GNSS,
+    Selected,
     Situation,
     SourceSwitch,
     is_held_false,
@@ -40,6 +41,9 @@ class GnssFusion(SourceSwitch):
             return (COMPANION_SET, "GNSS is false, using companion") if s.sent_s >= STEADY_S else None
         reasons = [each.reason for each in TO_GNSS if s.fix_s >= 0.0 and each.holds(s)]
         return (GNSS_SET, reasons[0]) if reasons else None
+
+    def handle_selected(self, by: Selected, now_ns: int) -> None:
+        """Ignore a source set that somebody selects: PX4 has none, and answers "unsupported"."""
 
     def name(self, number: int | None) -> str:
         """Return how a state is reported."""

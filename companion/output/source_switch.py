@@ -220,6 +220,11 @@ class SourceSwitch:
             stopped_s=-1.0 if self._sent_ns is None else (now_ns - self._sent_ns) * 1e-9,
         )
 
+    @property
+    def is_on_companion(self) -> bool:
+        """Whether the autopilot has acknowledged that our position leads."""
+        return self._wanted == COMPANION_SET and self._next_ns is None
+
     def required(self, s: Situation) -> tuple[int, str] | None:
         """Return the source set that must lead and the reason; None where the present one stays."""
         return required_set(s)

@@ -17,6 +17,8 @@ from companion.nav.geometry import Geodetic, displace, local_to_geodetic, slant_
 from companion.navigator import Navigator
 from companion.output.autopilot_output import AutopilotOutput
 from companion.output.encode import CORRELATION_S, ENCODERS, Receiver
+from companion.output.gnss_fusion import ESTIMATOR_SENSOR_ENABLE, GnssFusion
+from companion.output.source_switch import Situation
 from companion.records import (
     AirData,
     Attitude,
@@ -511,6 +513,25 @@ def test_px4_receives_an_accuracy_that_allows_for_the_rate() -> None:
     solution = at(0.0, covariance=(4e4, 0.0, 0.0, 4e4, 0.0, 25.0))
     (m,) = output.messages(solution, ["GLOBAL_POSITION_SENSOR"], receiver)
     assert m.eph == pytest.approx(200.0 * math.sqrt(2.0 * CORRELATION_S * 2.0))
+
+
+@pytest.mark.parametrize(
+    ("is_off", "drawn_m", "is_plain"), [(True, 61, True), (True, 59, False), (False, 61, False)]
+)
+def test_px4_drawn_off_by_a_false_gnss_receives_sigma_as_it_is(
+    is_off: bool, drawn_m: float, is_plain: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With the greater accuracy EKF2 averages for a minute; with this one it rejects ours and is reset."""
+    found = Situation(1e3, -1.0, 0.1, gnss_false=0.9999, witness=is_off, sent_s=1e3, stopped_s=0.0)
+    monkeypatch.setattr(GnssFusion, "situation", lambda self, now_ns: found)
+    output, receiver = AutopilotOutput(configured("output.profile=px4")), Receiver("px4", 1)
+    assert len(output.poll(1, START)) == is_off
+    output.handle_acknowledgement(ESTIMATOR_SENSOR_ENABLE, 0, START)
+    solution = at(1.0, covariance=(400.0, 0.0, 0.0, 400.0, 0.0, 25.0))
+    drawn = displace(solution.lat, solution.lon, solution.alt_msl, 0.0, drawn_m, 0.0)
+    output.receive(GlobalPosition(solution.t_ns, solution.t_ns, *drawn, (0.0, 0.0, 0.0), HEIGHT))
+    (m,) = output.messages(solution, ["GLOBAL_POSITION_SENSOR"], receiver)
+    assert m.eph == pytest.approx(20.0 if is_plain else 20.0 * math.sqrt(4.0 * CORRELATION_S))
 
 
 @pytest.mark.parametrize("name", sorted(ENCODERS))

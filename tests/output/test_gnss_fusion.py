@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from companion.output.gnss_fusion import ESTIMATOR_SENSOR_ENABLE, GnssFusion
-from companion.output.source_switch import STEADY_S, Situation
+from companion.output.source_switch import STEADY_S, Selected, Situation
 
 WELL = Situation(
     fix_s=1e3, no_fix_s=-1.0, silent_s=0.1, gnss_false=1e-6, witness=False, sent_s=1e3, stopped_s=0.0
@@ -68,3 +68,11 @@ def test_autopilot_that_does_not_know_the_command_is_reported_once() -> None:
     assert requests(switch, WELL._replace(**FALSE), 3, 9 * second) == []
     (event,) = switch.take_events()
     assert event.text.startswith("the autopilot did not accept GNSS fusion off")
+
+
+def test_source_set_of_another_sender_is_not_the_fusion_of_gnss() -> None:
+    switch, second = Switch(), 10**9
+    switch.handle_selected(Selected(2), second)
+    assert not switch.is_on_companion
+    assert len(requests(switch, WELL._replace(**FALSE), 0, 2 * second)) == 1
+    assert switch.is_on_companion
