@@ -431,10 +431,7 @@ class _Path:
                     predicted, Phi, Q = keep * predicted, keep[:, None] * Phi, Q * np.outer(keep, keep)
                     Q = Q + np.diag(variance)
             # the fix may have moved the nominal trajectory, and its error with it
-            moved = _moved(point, state.nominal.point)
-            T = np.eye(n)
-            T[0:2, self._model.channel.latency] = -moved[2:4]
-            predicted, Phi, Q = T @ predicted + np.pad(moved, (0, n - 4)), T @ Phi, T @ Q @ T.T
+            predicted = predicted + np.pad(_moved(point, state.nominal.point), (0, n - 4))
         elif not isinstance(record, MEASURING) and (
             self._settings.config.has_own_ins or not isinstance(record, LocalPosition)
         ):

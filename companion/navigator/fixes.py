@@ -26,6 +26,7 @@ from companion.navigator.state import (
     Settings,
     State,
     Step,
+    VelocityError,
     corrected,
     hypotheses,
     source_name,
@@ -33,6 +34,7 @@ from companion.navigator.state import (
 from companion.records import Event, Gnss, Output, Rejection, RsbnFix, Severity, Source, Stamped, Vector2
 
 GATE_SIGMA = 5.0
+MEAN_S = 60.0  # of the estimated velocity error, for GNSS latency
 
 
 def gnss(state: State, record: Gnss, settings: Settings) -> Step:
@@ -57,7 +59,8 @@ def gnss(state: State, record: Gnss, settings: Settings) -> Step:
     still = (apart[0] + state.moved[0], apart[1] + state.moved[1])  # as if the nominal had never jumped
     state, factor, noted = _scattered(state, record, "gnss", still, variance)
     assert state.bank is not None
-    v_n = _latency_velocity(state)
+    state, v_n = _latency_velocity(state, record.t_ns)
+    assert state.bank is not None
     taken = measurements.gnss_position(state.bank, known, channel, apart, factor * variance, v_n)
     bank, accepted = taken.bank, taken.accepted
     if config.use_velocity and record.v_n is not None:
@@ -83,17 +86,24 @@ def gnss(state: State, record: Gnss, settings: Settings) -> Step:
     return nearer(state, settings), out
 
 
-def _latency_velocity(state: State) -> Vector2:
+def _latency_velocity(state: State, t_ns: int) -> tuple[State, Vector2]:
     """Return the velocity that GNSS latency multiplies in a position, north and east, m/s.
 
-    Where the nominal velocity is integrated it is that one, whose rate multiplies the latency in a velocity:
-    position and velocity error are then those of the time the fix was taken. The noise of the estimated
-    velocity is also in the estimated position: as a coefficient it made straight flight seem to measure the
-    latency, as 0.08 s after ten minutes where it was 0.
+    The noise of the estimated velocity is also in the estimated position: as a coefficient it made straight
+    flight seem to measure the latency, as 0.08 s after ten minutes where it was 0. Where the nominal velocity
+    is integrated it is less a slow mean of its estimated error.
     """
-    if state.nominal is not None and (is_driven_by(state, "imu") or is_driven_by(state, "hold")):
-        return state.nominal.point.v_n[:2]
-    return estimated_velocity(state)
+    v_n = estimated_velocity(state)
+    if not is_driven_by(state, "imu") and not is_driven_by(state, "hold"):
+        return state._replace(velocity_error=None), v_n
+    assert state.nominal is not None
+    nominal, mean = state.nominal.point.v_n, state.velocity_error
+    north, east = nominal[0] - v_n[0], nominal[1] - v_n[1]
+    if mean is not None:
+        part = -math.expm1(-max(t_ns - mean.t_ns, 0) * 1e-9 / MEAN_S)
+        north, east = mean.north + part * (north - mean.north), mean.east + part * (east - mean.east)
+    state = state._replace(velocity_error=VelocityError(t_ns, north, east))
+    return state, (nominal[0] - north, nominal[1] - east)
 
 
 def rsbn(state: State, record: RsbnFix, settings: Settings) -> Step:

@@ -133,9 +133,6 @@ def nearer(state: State, settings: Settings) -> State:
     if nominal.interval.by in ("air", "foreign"):
         vn = ve = 0.0  # the velocity is the sensor's, and its error follows from other states
     state = shifted(state, n, e, (vn, ve), nominal.t_ns)
-    assert state.bank is not None
-    latency = settings.model.channel.latency  # `_latency_velocity` changes by vn, ve, the fixes do not
-    state = state._replace(bank=banks.couple(state.bank, (0, 1), latency, (-vn, -ve)))
     sums = state.sensors.sums
     if sums is not None:  # the samples of airspeed so far are moved with the nominal velocity, not dropped
         mean_sum = (sums.velocity[0] + sums.samples * vn, sums.velocity[1] + sums.samples * ve)
@@ -159,6 +156,9 @@ def shifted(state: State, north: float, east: float, v_n: Vector2 = (0.0, 0.0), 
     promise = minimax_bound.shift(state.guarantee, north, east, v_n)
     parallel = state.parallel and parallel_filters.shift(state.parallel, north, east)
     fix = state.gnss_fix and _fix_shifted(*state.gnss_fix, north, east, v_n, t_ns)
+    mean = state.velocity_error
+    if mean is not None:
+        mean = mean._replace(north=mean.north + v_n[0], east=mean.east + v_n[1])
     pending = state.pending
     if pending is not None:  # the error that was taken off is that of the nominal trajectory as it is now
         pending = pending._replace(centre=(pending.centre[0] + north, pending.centre[1] + east))
@@ -169,6 +169,7 @@ def shifted(state: State, north: float, east: float, v_n: Vector2 = (0.0, 0.0), 
         guarantee=promise,
         parallel=parallel,
         gnss_fix=fix,
+        velocity_error=mean,
         pending=pending,
     )
 

@@ -58,6 +58,14 @@ class Pending(NamedTuple):
     used: Source
 
 
+class VelocityError(NamedTuple):
+    """Mean of the estimated error of the nominal velocity over the last minute, m/s, at `t_ns`."""
+
+    t_ns: int
+    north: float
+    east: float
+
+
 class State(NamedTuple):
     """All that the navigator remembers."""
 
@@ -85,6 +93,7 @@ class State(NamedTuple):
     gnss_taken: Gnss | None = None  # the last one judged by the bank
     gnss_fix: tuple[Gnss, Point] | None = None  # the last one believed
     pending: Pending | None = None
+    velocity_error: VelocityError | None = None
     gnss_ns: int | None = None  # when fixes were last believed
     rsbn_ns: int | None = None
     rsbn_used: Source = Source(0)  # which of azimuth and range were, then

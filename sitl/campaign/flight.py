@@ -159,6 +159,7 @@ FAULT_CASES: dict[str, FaultCase] = {
     "gnss-latency-0.1": _case("gnss-latency", 0.1, math.inf, 0.0),
     "gnss-latency-0.2": _case("gnss-latency", 0.2, math.inf, 0.0),
     "gnss-latency-0.3": _case("gnss-latency", 0.3, math.inf, 0.0),
+    "gnss-lever-arm": _case("gnss-lever-arm", 5.0, math.inf, 0.0),
     "gnss-jam": _case("gnss-jam"),
     "gnss-frozen": _case("gnss-frozen"),
     "gnss-stale": _case("gnss-stale"),

@@ -815,18 +815,6 @@ def test_renewed_states_are_as_before_the_first_measurement_and_the_others_keep_
     np.testing.assert_array_equal(after.L, bank.L)
 
 
-def test_a_state_that_takes_in_another_is_measured_as_before_by_the_row_less_that_share():
-    layout, bank = random_bank(6)
-    after = b.couple(bank, (0,), 1, (-3.0,))
-    other = H @ np.array([[1.0, 3.0], [0.0, 1.0]])
-    plain, _ = b.update(bank, layout, np.array([0.4]), H, R, 0, EXHAUSTIVE)
-    coupled, _ = b.update(after, layout, np.array([0.4]), other, R, 0, EXHAUSTIVE)
-    np.testing.assert_allclose(coupled.L, plain.L, atol=1e-9)
-    back = b.couple(coupled, (0,), 1, (3.0,))
-    np.testing.assert_allclose(back.x, plain.x, atol=1e-9)
-    np.testing.assert_allclose(back.P, plain.P, atol=1e-9)
-
-
 def test_inflating_adds_variance_to_the_named_states_alone():
     _, bank = random_bank(6)
     after = b.inflate(bank, (0, 1), 3.0)

@@ -59,7 +59,6 @@ from companion.estimate.bank.reduction import merge_moments, reduce
 from companion.estimate.bank.settings import EXHAUSTIVE, Settings
 from companion.estimate.bank.state import (
     Bank,
-    couple,
     enlarge,
     families,
     inflate,
@@ -87,7 +86,6 @@ __all__ = [
     "Source",
     "births",
     "births_due",
-    "couple",
     "decide",
     "enlarge",
     "estimate",

@@ -159,25 +159,6 @@ def shift(bank: Bank, correction: Floats) -> Bank:
     return bank._replace(x=x)
 
 
-def couple(bank: Bank, states: Sequence[int], source: int, factors: Sequence[float]) -> Bank:
-    """Add multiples of one state to others in all rows: these states are defined differently from now on.
-
-    Parameters
-    ----------
-    bank : the bank.
-    states : indices of the states that change.
-    source : index of the state that is added.
-    factors : its multiple for each of `states`.
-
-    Returns
-    -------
-    Bank : at the same time, with the same weights.
-    """
-    T = np.eye(bank.x.shape[1])
-    T[list(states), source] = factors
-    return bank._replace(x=bank.x @ T.T, P=T @ bank.P @ T.T)
-
-
 def inflate(bank: Bank, states: Sequence[int], sigma: float) -> Bank:
     """Add independent errors of one sigma to some states of all rows.
 
