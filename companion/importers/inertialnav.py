@@ -10,8 +10,11 @@ first point. Its attitude is not used, as it disagrees with its gyros. Times cou
 from __future__ import annotations
 
 import heapq
+import io
 import math
 import struct
+import subprocess
+import sys
 import warnings
 import zipfile
 import zlib
@@ -34,6 +37,8 @@ from companion.units import Floats
 MAX_TABLES = 1 << 25
 """Bytes of one table, or of all tables of a `.mat`; the recordings have 2 MB."""
 MAX_NUMBER = 1e10  # ms, deg, m, m/s, rad/s, m/s^2
+READ_S = 60
+_TABLES = str(Path(__file__).with_name("matlab_tables.py"))
 _COMPRESSED = 15  # miCOMPRESSED
 _WIDTHS = {"IMU": 8, "GPSraw": 7, "GPOSonboard": 7}
 
@@ -52,26 +57,37 @@ class Recording:
 
 def read_matlab(path: Path) -> Recording:
     """Open a `.mat`. Raises LogError if it is not a MATLAB file or has no such table."""
-    from scipy.io import loadmat
-
-    wanted = [label for name in dataflash.NAMES for label in (name, f"{name}_label")]
     try:
         _reject_bomb(path)
-        tables: dict[str, Any] = loadmat(path, variable_names=wanted)
-        rows = [
-            _rows(name, tables[name], [_label(cell) for cell in tables[f"{name}_label"]])
-            for name in dataflash.NAMES
-            if name in tables and f"{name}_label" in tables and tables[name].dtype.kind == "f"
-        ]
-    except LogError:
-        raise
     except FileNotFoundError:
         raise LogError(f"{path}: no such log") from None
-    except Exception as error:  # scipy raises many different exceptions
+    except zlib.error as error:
         raise LogError(f"{path} is not a MATLAB file: {one_line(error)}") from None
+    tables = _matlab_tables(path)
+    rows = [
+        _rows(name, tables[name], tables[f"{name}_label"].tolist())
+        for name in dataflash.NAMES
+        if name in tables and f"{name}_label" in tables
+    ]
     if not rows:
         raise LogError(f"{path} has no ArduPilot table: it needs GPS, IMU, ATT, ... each with its _label")
     return Recording(partial(_convert_rows, heapq.merge(*rows, key=lambda row: row[0])))
+
+
+def _matlab_tables(path: Path) -> dict[str, Any]:
+    """Tables and labels by name, read in a process of its own, which a damaged file may end."""
+    command = [sys.executable, "-P", _TABLES, str(path), *dataflash.NAMES]
+    try:
+        found = subprocess.run(command, capture_output=True, timeout=READ_S, check=True)
+        return dict(np.load(io.BytesIO(found.stdout), allow_pickle=False))
+    except subprocess.TimeoutExpired:
+        why = f"it takes more than {READ_S} s to read"
+    except subprocess.CalledProcessError as error:
+        lines = error.stderr.decode(errors="replace").strip().splitlines()
+        why = lines[-1] if error.returncode > 0 and lines else "its reader failed on it"
+    except (ValueError, OSError, zipfile.BadZipFile) as error:
+        why = str(error)
+    raise LogError(f"{path} is not a MATLAB file: {' '.join(why.split())[:200]}")
 
 
 def _reject_bomb(path: Path) -> None:
@@ -88,11 +104,6 @@ def _reject_bomb(path: Path) -> None:
         if left <= 0:
             raise LogError(f"{path}: its tables expand to more than {MAX_TABLES} bytes")
         at += 8 + size
-
-
-def _label(cell: Any) -> str:
-    inner = cell[0]
-    return str(inner[0]) if inner.size else ""
 
 
 def _rows(name: str, table: Floats, columns: list[str]) -> Iterator[tuple[int, str, SimpleNamespace]]:

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 import multiprocessing
+import queue
 import random
 import resource
 import signal
@@ -32,6 +33,7 @@ from sitl.endurance.sample_logs import SAMPLES
 
 SLOWEST_S = 2.0
 MOST_MB = 300.0
+MOST_PROCESSES = 2000  # mutants of a format that is read in a process of its own
 _NUMBERS = (
     *(struct.pack("<f", v) for v in (math.nan, math.inf, -1e38, 1e-40)),
     *(struct.pack("<d", v) for v in (math.nan, math.inf, -1e308, 5e-324)),
@@ -119,6 +121,7 @@ def _stop(number: int, frame: object) -> None:
 def read_mutants(name: str, count: int, seed: int, keep: Path | None = None) -> MutantReport:
     """Read `count` mutants of one format; those with a defect go to the folder `keep`."""
     file_name, build = SAMPLES[name]
+    count = min(count, MOST_PROCESSES) if name == "mat" else count
     read = read_own if "mcap" in name else read_foreign
     original, rng = build(), random.Random(f"{name} {seed}")
     tally = {"read": 0, "rejected": 0, "defects": 0}
@@ -186,7 +189,15 @@ def run_formats(names: tuple[str, ...], count: int, seed: int, keep: Path) -> It
         results = context.Queue()
         process = context.Process(target=_run_inside, args=(name, count, seed, keep, results))
         process.start()
-        yield results.get()
+        report = None
+        while report is None:
+            try:
+                report = results.get(timeout=1.0)
+            except queue.Empty:
+                if not process.is_alive():
+                    text = f"the process ended with {process.exitcode}"
+                    report = MutantReport(name, count, 0, 0, 1, math.nan, math.nan, text)
+        yield report
         process.join()
 
 

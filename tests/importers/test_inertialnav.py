@@ -118,3 +118,15 @@ def test_recordings_are_read() -> None:
     quad = list(sources.open_source(SHARED / "f450_glitch_log.zip"))
     (glitch,) = [record for record in quad if isinstance(record, r.Event)]
     assert 126.2 < glitch.t_ns * 1e-9 < 127.7
+
+
+def test_a_damaged_matlab_file_that_ends_its_reader_is_rejected(tmp_path: pathlib.Path) -> None:
+    """A data type without a meaning: scipy's reader ends the process on it (scipy pull request 25349)."""
+    path = tmp_path / "log.mat"
+    savemat(path, {"IMU": np.ones((2, 3)), "IMU_label": labels("LineNo TimeMS GyrX")}, do_compression=False)
+    data = bytearray(path.read_bytes())
+    at = data.index(b"\x09\x00\x00\x00\x30\x00\x00\x00")  # miDOUBLE, 48 bytes
+    data[at] = 8
+    path.write_bytes(data)
+    with pytest.raises(LogError, match="is not a MATLAB file: its reader failed on it"):
+        sources.open_source(path)

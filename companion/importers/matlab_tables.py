@@ -1,0 +1,34 @@
+"""`python matlab_tables.py FILE NAME...`: tables of a MATLAB file with labels, as .npz on standard output.
+
+A process of its own, that knows nothing of this package: scipy's reader is not made for files that nobody
+vouches for, and a damaged data type ends the process in C (scipy pull request 25349).
+"""
+
+from __future__ import annotations
+
+import io
+import sys
+
+import numpy as np
+from scipy.io import loadmat
+
+
+def main(path: str, names: list[str]) -> None:
+    """Write each table of floats (n, columns) as NAME and its column names (columns,) as NAME_label."""
+    tables = loadmat(path, variable_names=[label for name in names for label in (name, f"{name}_label")])
+    found = {}
+    for name in names:
+        if name in tables and f"{name}_label" in tables and tables[name].dtype.kind == "f":
+            cells = [cell[0] for cell in tables[f"{name}_label"]]
+            found[name] = tables[name]
+            found[f"{name}_label"] = np.array([str(cell[0]) if cell.size else "" for cell in cells])
+    out = io.BytesIO()
+    np.savez(out, allow_pickle=False, **found)
+    sys.stdout.buffer.write(out.getvalue())
+
+
+if __name__ == "__main__":
+    try:
+        main(sys.argv[1], sys.argv[2:])
+    except Exception as error:  # scipy raises many different exceptions
+        sys.exit(f"{type(error).__name__}: {error}")
