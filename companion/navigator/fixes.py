@@ -90,11 +90,11 @@ def _latency_velocity(state: State, t_ns: int) -> tuple[State, Vector2]:
     """Return the velocity that GNSS latency multiplies in a position, north and east, m/s.
 
     The noise of the estimated velocity is also in the estimated position: as a coefficient it made straight
-    flight seem to measure the latency, as 0.08 s after ten minutes where it was 0. Where the nominal velocity
-    is integrated it is less a slow mean of its estimated error.
+    flight seem to measure the latency, as 0.08 s after ten minutes where it was 0. By IMU the nominal
+    velocity is taken less a slow mean of its estimated error; a held velocity is far off in every turn.
     """
     v_n = estimated_velocity(state)
-    if not is_driven_by(state, "imu") and not is_driven_by(state, "hold"):
+    if not is_driven_by(state, "imu"):
         return state._replace(velocity_error=None), v_n
     assert state.nominal is not None
     nominal, mean = state.nominal.point.v_n, state.velocity_error
