@@ -1,7 +1,7 @@
 """Fixed-interval smoothing of a flight: error of the nominal trajectory at every epoch, given all fixes.
 
 A smoother needs one Gaussian path, so the flight is filtered twice by the navigator's own step. The first
-pass is the flight: the bank of hypotheses tells which sources were false, from their onset on, when the wind
+pass is the flight: the bank of hypotheses gives which sources were false, from their onset on, when the wind
 jumped, and which grade of noise was right. Airspeed and GNSS velocity show how strong the gusts were and how
 long they lasted (`analysis.gusts`). The second pass runs a plain Kalman filter with that grade and those
 gusts: it leaves out what was false, widens the wind where it jumped, and takes for all other jumps a random

@@ -88,7 +88,7 @@ def check_profile(config: Config, make: str) -> list[Finding]:
 
 
 def check_airspeed(config: Config, healthy: bool | None) -> list[Finding]:
-    """Report whether airspeed is measured; `healthy` None where the autopilot did not tell."""
+    """Report whether airspeed is measured; `healthy` None where the autopilot did not report it."""
     if config.has_own_ins or not config.uses("air_data"):
         return []
     others = [sensor for sensor in ("IMU",) if config.uses("imu")]

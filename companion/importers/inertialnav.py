@@ -59,8 +59,8 @@ def read_matlab(path: Path) -> Recording:
     """Open a `.mat`. Raises LogError if it is not a MATLAB file or has no such table."""
     try:
         _reject_bomb(path)
-    except FileNotFoundError:
-        raise LogError(f"{path}: no such log") from None
+    except OSError as error:
+        raise LogError(f"{path} cannot be read: {error.strerror}") from None
     except zlib.error as error:
         raise LogError(f"{path} is not a MATLAB file: {one_line(error)}") from None
     tables = _matlab_tables(path)

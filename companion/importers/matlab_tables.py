@@ -1,7 +1,7 @@
 """`python matlab_tables.py FILE NAME...`: tables of a MATLAB file with labels, as .npz on standard output.
 
-A process of its own, that knows nothing of this package: scipy's reader is not made for files that nobody
-vouches for, and a damaged data type ends the process in C (scipy pull request 25349).
+A process of its own, that knows nothing of this package: scipy's reader is made for trusted
+files: a damaged data type ends the process in C (scipy pull request 25349).
 """
 
 from __future__ import annotations

@@ -42,7 +42,7 @@ def sense(r: Reckoner, record: Attitude | AirData | Pressure) -> Reckoner:
 
 
 def first_place(fix: Gnss | RsbnFix, static: float | None) -> Geodetic | None:
-    """The position that a fix alone tells, at the height of the pressure (Pa) if it is known; else None."""
+    """The position that a fix alone gives, at the height of the pressure (Pa) if it is known; else None."""
     if isinstance(fix, RsbnFix):
         return place(fix, pressure_altitude(static) if static else fix.alt)
     alt = pressure_altitude(static) if static else fix.alt_msl

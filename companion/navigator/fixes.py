@@ -183,7 +183,7 @@ def _beacon(state: State, record: RsbnFix, settings: Settings) -> tuple[State, i
 
 
 def _begun(state: State, record: Gnss | RsbnFix, settings: Settings) -> State:
-    """With a nominal trajectory and a bank, if this fix is the first to tell a place."""
+    """With a nominal trajectory and a bank, if this fix is the first that gives a place."""
     nominal = state.nominal
     if nominal is None and isinstance(settings.model.channel, OwnChannel):
         nominal = own_channel.begin(state.sensors, record)

@@ -28,7 +28,7 @@ DRIFT, LATENCY, ARM = slice(12, 14), 14, 15
 TURNING_M_S = 5.0  # slower, the course does not give the heading
 LATENCY_S, LATENCY_WALK = 0.15, 1e-4  # one sigma of the latency (s) and its random walk (s/sqrt s)
 ARM_M = 1.5  # one sigma of the antenna's lever arm along the fuselage
-FIRST_POSITION_M = 1000.0  # the first fix tells where the INS is
+FIRST_POSITION_M = 1000.0  # the first fix gives the place of the INS
 AMPLITUDES = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0)
 WEIGHTS = (1.0, 0.5, 0.35, 0.25, 0.18, 0.12, 0.09)
 
@@ -102,7 +102,7 @@ def ins_channel(config: Config) -> InsChannel:
     amplitude = np.ones((len(AMPLITUDES), N))
     amplitude[:, :ours] = np.array(AMPLITUDES)[:, None]
     first = amplitude.copy()
-    first[:, :2] = 1.0  # the first fix tells the position whatever the grade
+    first[:, :2] = 1.0  # the first fix gives the position whatever the grade
     scaled = density * amplitude**2
     scaled[:, DRIFT] = 2.0 * gnss.sigma_m**2 / gnss.correlation_s
     scaled[:, LATENCY] = LATENCY_WALK**2

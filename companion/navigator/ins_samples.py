@@ -38,7 +38,7 @@ from companion.records import (
 from companion.units import SECOND_NS
 
 JUMP_SPREAD_S = 0.5  # across a longer silence a turn explains a step as well as a jump does
-CORRECTOR_AIRSPEED_NS = 5 * SECOND_NS  # gusts last seconds: beside an INS more often tells no more
+CORRECTOR_AIRSPEED_NS = 5 * SECOND_NS  # gusts last seconds: beside an INS more often adds nothing
 
 
 def position(state: State, record: LocalPosition, settings: Settings) -> Step:

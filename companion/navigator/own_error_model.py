@@ -358,7 +358,7 @@ class Propagator:
         V
             Measured velocity through the air (m/s), `air_velocity`, mean over the same samples.
         seconds
-            Time since the last such row: gusts last `gust_s`, so that frequent rows tell less each.
+            Time since the last such row: gusts last `gust_s`, so that frequent rows weigh less each.
         """
         s = self.settings
         H = np.zeros((2, self.layout.n))

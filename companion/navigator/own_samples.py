@@ -41,7 +41,7 @@ from companion.records import (
 )
 from companion.units import SECOND_NS
 
-AIRSPEED_EVERY_NS = 500_000_000  # gusts are correlated: more often tells no more
+AIRSPEED_EVERY_NS = 500_000_000  # gusts are correlated: more often adds nothing
 FOREIGN_EVERY_NS = SECOND_NS
 BLOCKED_M_S = 5.0  # slower, in flight, a pitot is blocked
 
@@ -88,7 +88,7 @@ def imu(state: State, record: Imu, settings: Settings) -> Step:
 
 
 def air_data(state: State, record: AirData, settings: Settings) -> Step:
-    """Use airspeed, as driver or as measurement; on the ground it only tells whether the aircraft flies."""
+    """Use airspeed, as driver or as measurement; on the ground it only shows whether the aircraft flies."""
     s = state.sensors
     state = state._replace(sensors=s._replace(air=air_data_channel.sense(s.air, record)))
     nominal = state.nominal

@@ -25,8 +25,8 @@ from companion.units import G0, Floats
 
 IMU_HZ, ATTITUDE_HZ = 5.0, 2.0  # wanted at least
 LEAST = 0.7  # of which so much must come: streams are asked for again below it
-FEW = 5  # samples that tell no rate yet
-SLOWEST_S = 2.0  # a longer interval is a silence and tells no rate either
+FEW = 5  # samples that show no rate yet
+SLOWEST_S = 2.0  # a longer interval is a silence and shows no rate either
 STALE_S = 1.0  # an attitude older than this is not carried on by gyros
 F_MAX = 0.995 * 16.0 * G0  # [m/s^2] the range of common accelerometers
 W_MAX = 0.995 * math.radians(2000.0)  # [rad/s] and gyros

@@ -148,7 +148,7 @@ class AutopilotOutput:
     def _is_drawn_off(self, position: Position) -> bool:
         """Return whether the autopilot's own position still is where a false GNSS has drawn it.
 
-        Its filter is sure of that position. Told our sigma as it is, it rejects ours and is then reset to it.
+        Its filter is sure of that position. With our sigma as it is, it rejects ours and is then reset to it.
         """
         own = self._position_reset.autopilot_place(position.t_ns)
         if own is None or not self._source_switch.is_on_companion:

@@ -163,8 +163,9 @@ class ConditionTimer:
 class SourceSwitch:
     """The required EKF source set, requested until acknowledged; unknown at the start.
 
-    `_required` is the decision of the table, `_wanted` the set that was requested last or that somebody else
-    selected, `_held` the one that a person selected against the table.
+    `_required` is the decision of the table, `_wanted` the set that was requested last, `_leading` the one
+    that the autopilot acknowledged; both follow one that somebody else selected. `_held` is the one that a
+    person selected against the table.
     """
 
     command = mavlink.MAV_CMD_SET_EKF_SOURCE_SET
@@ -177,6 +178,7 @@ class SourceSwitch:
         self._witness = BeaconWitness()
         self._required: int | None = None
         self._wanted: int | None = None
+        self._leading: int | None = None
         self._held: int | None = None
         self._reported, self._reports = Selected(0), 0  # the last report of the script, how often in a row
         self._reason = ""
@@ -222,8 +224,8 @@ class SourceSwitch:
 
     @property
     def is_on_companion(self) -> bool:
-        """Whether the autopilot has acknowledged that our position leads."""
-        return self._wanted == COMPANION_SET and self._next_ns is None
+        """Whether our position leads: acknowledged by the autopilot, or selected by somebody else."""
+        return self._leading == COMPANION_SET
 
     def required(self, s: Situation) -> tuple[int, str] | None:
         """Return the source set that must lead and the reason; None where the present one stays."""
@@ -260,7 +262,8 @@ class SourceSwitch:
             is_old = self._reports < REPORTS or self._next_ns is not None or self._wanted is None
             if is_old or by.number == self._wanted:
                 return
-        self._wanted, self._next_ns = by.number, None
+        self._wanted = self._leading = by.number
+        self._next_ns = None
         if by.by_script:
             return  # the table decides again once our position goes out
         before, self._held = self._held, None if by.number == (self._required or GNSS_SET) else by.number
@@ -277,7 +280,7 @@ class SourceSwitch:
         if command != self.command or self._next_ns is None or not self._tries:
             return
         if result == mavlink.MAV_RESULT_ACCEPTED:
-            self._next_ns = None
+            self._leading, self._next_ns = self._wanted, None
             self._add_event(Severity.NOTICE, f"{self.name(self._wanted)}: {self._reason}", now_ns)
         elif result not in RETRIED:
             self._give_up(f"it answered MAV_RESULT {result}", now_ns)

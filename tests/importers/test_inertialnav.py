@@ -46,6 +46,19 @@ def test_airspeed_of_an_old_log_is_a_sensor(tmp_path: pathlib.Path) -> None:
     assert [(record.airspeed, record.sensed) for record in seen] == [(17.5, True), (18.0, True)]
 
 
+@pytest.mark.parametrize("error", [PermissionError(13, "Permission denied"), OSError(5, "I/O error")])
+def test_file_that_cannot_be_read_is_one_sentence(
+    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch, error: OSError
+) -> None:
+    def fail(_: pathlib.Path) -> bytes:
+        raise error
+
+    (tmp_path / "log.mat").touch()
+    monkeypatch.setattr(pathlib.Path, "read_bytes", fail)
+    with pytest.raises(LogError, match=rf"log\.mat cannot be read: {error.strerror}$"):
+        sources.open_source(tmp_path / "log.mat")
+
+
 def tables(glitch: float = 0.0) -> dict[str, str]:
     """One minute of flight eastwards at 10 m/s, with a GNSS error of `glitch` metres for one second."""
 

@@ -268,17 +268,17 @@ UNFED = load(flags={"inertial.independent": True}, environment={})
 
 def test_another_channel_in_flight_begins_anew() -> None:
     flown = flight("plane_gps_loss")
-    navigator, told, solutions = Navigator(FED), [], 0
+    navigator, reported, solutions = Navigator(FED), [], 0
     for record in flown.records:
         if isinstance(record, Truth) or not -60.0 < flown.since(record) < 10.0:
             continue
-        if not told or (len(told) == 1 and flown.since(record) > -10.0):
-            config = UNFED if told else FED
+        if not reported or (len(reported) == 1 and flown.since(record) > -10.0):
+            config = UNFED if reported else FED
             navigator.handle(Tuning(record.t_ns, record.rx_ns, to_toml(config)))
         outs = navigator.handle(record)
-        told += [out.text for out in outs if isinstance(out, Event) and "inertial channel" in out.text]
+        reported += [out.text for out in outs if isinstance(out, Event) and "inertial channel" in out.text]
         solutions += sum(isinstance(out, Solution) for out in outs)
-    assert told == [
+    assert reported == [
         "inertial channel: own, by imu, air data; no guaranteed bound by imu",
         "inertial channel: local position of an INS of its own",
     ]

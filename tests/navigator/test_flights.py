@@ -253,9 +253,9 @@ def test_a_spoofed_gnss_is_excluded_with_a_beacon_and_comes_back(channel: str) -
 
     legs = (*FIVE_MINUTES, Leg(120, 310, 38, 40))
     flown = fly(channel, spoofed, legs)
-    told = [(e.t_ns / NS, e.text) for e in flown.events if e.text.startswith("gnss is")]
-    excluded = next(t for t, text in told if "excluded" in text)
-    back = next(t for t, text in told if "used again" in text and t > excluded)
+    reported = [(e.t_ns / NS, e.text) for e in flown.events if e.text.startswith("gnss is")]
+    excluded = next(t for t, text in reported if "excluded" in text)
+    back = next(t for t, text in reported if "used again" in text and t > excluded)
     assert begin < excluded < end
     assert end <= back < end + 120.0
     held = flown.of("sources", excluded + 6.0, end) & Source.GNSS

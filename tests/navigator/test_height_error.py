@@ -43,8 +43,8 @@ def climbed(
         drift = keep * drift + 2.0 * math.sqrt(1.0 - keep**2) * rng.standard_normal()
         if t < until:
             part = min(t - last, CORRELATION_S) / CORRELATION_S
-            told = true + drift + (wrong or {}).get(k, 0.0)
-            level, last = height_error.update(level, fix(t, told), ins, part, GATE), t
+            reported = true + drift + (wrong or {}).get(k, 0.0)
+            level, last = height_error.update(level, fix(t, reported), ins, part, GATE), t
         now = height_error.at(level, ins)
         if k % round(hz) == 0:
             found.append((ins.position.alt - now.error - true, math.sqrt(now.covariance[0])))

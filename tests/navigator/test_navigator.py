@@ -220,12 +220,12 @@ def test_solutions_go_on_while_a_late_answer_is_folded_in() -> None:
     """
     records, answer, place = with_late_answer(5.0)
     without, in_order, ours = Navigator(CONFIG), Navigator(CONFIG), Navigator(CONFIG)
-    told = solutions(without, records)
+    reported = solutions(without, records)
     wanted = solutions(in_order, sorted([*records, answer], key=lambda record: record.t_ns))
     found = solutions(ours, [*records[:place], answer, *records[place:]])
-    first = next(k for k, (a, b) in enumerate(zip(found, told)) if a != b)
+    first = next(k for k, (a, b) in enumerate(zip(found, reported)) if a != b)
     assert 0.0 < found[first].t_ns / NS - 35.0 < 0.5
-    assert {solution.t_ns for solution in found} >= {solution.t_ns for solution in told}
+    assert {solution.t_ns for solution in found} >= {solution.t_ns for solution in reported}
     assert_same(found[first:], [solution for solution in wanted if solution.t_ns >= found[first].t_ns])
 
 
@@ -396,15 +396,15 @@ def test_what_is_settled_in_between_changes_nothing(late_ns: int) -> None:
 def test_a_fix_is_taken_to_be_as_old_as_the_receiver_is_slow() -> None:
     slow = Navigator(load(flags={"gnss.latency_s": 0.2, "inertial.independent": True}, environment={}))
     slow.handle(origin())
-    told, wanted = [], []
+    reported, wanted = [], []
     for moment in flight(60, 60.0, 0.0):
         for record in moment.records:
             if isinstance(record, Gnss):
                 wanted.append(record.t_ns)
                 record = msgspec.structs.replace(record, t_ns=record.t_ns + NS // 5)
-            told += [out.t_ns for out in slow.handle(record) if isinstance(out, Fix)]
-    assert len(told) > 50
-    assert set(told) <= set(wanted)
+            reported += [out.t_ns for out in slow.handle(record) if isinstance(out, Fix)]
+    assert len(reported) > 50
+    assert set(reported) <= set(wanted)
 
 
 def test_what_is_later_than_the_limit_is_rejected_aloud() -> None:
@@ -474,7 +474,7 @@ def silent(gnss_until: float, step_m: float) -> tuple[list[tuple[Moment, Solutio
     """The solutions of a flight whose local position is silent from 45 s to 50 s and comes back `step_m`
     further north, each with its moment, and what is begun anew or excluded from then on.
     """
-    navigator, solutions, told = Navigator(CONFIG), [], []
+    navigator, solutions, reported = Navigator(CONFIG), [], []
     navigator.handle(origin())
     for moment in flight(90, gnss_until, 90.0):
         for record in moment.records:
@@ -486,15 +486,15 @@ def silent(gnss_until: float, step_m: float) -> tuple[list[tuple[Moment, Solutio
             for out in navigator.handle(record):
                 solutions += [(moment, out)] if isinstance(out, Solution) else []
                 excluded = isinstance(out, Rejection) and "excluded" in out.reason
-                told += [out] if isinstance(out, Reset) or excluded else []
-    return solutions, told
+                reported += [out] if isinstance(out, Reset) or excluded else []
+    return solutions, reported
 
 
 @pytest.mark.parametrize("gnss_until", [90.0, 30.0], ids=["gnss", "a beacon"])
 def test_a_step_in_a_silence_is_undone_by_the_next_fix(gnss_until: float) -> None:
     """A turn would explain 200 m in 5 s, so it is no jump; but neither is it held against who contradicts."""
-    solutions, told = silent(gnss_until, 200.0)
-    assert [(type(out), out.reason) for out in told] == [(Reset, "no local position for 5.1 s")]
+    solutions, reported = silent(gnss_until, 200.0)
+    assert [(type(out), out.reason) for out in reported] == [(Reset, "no local position for 5.1 s")]
     after = [(m, s) for m, s in solutions if s.t_ns > 52 * NS]
     first = next(s for _, s in solutions if s.t_ns > 50 * NS)
     assert first.bound_n is None  # what was promised rests on what is no more
@@ -506,8 +506,8 @@ def test_a_step_in_a_silence_is_undone_by_the_next_fix(gnss_until: float) -> Non
 
 
 def test_a_silence_without_a_step_changes_nothing_that_was_known() -> None:
-    solutions, told = silent(90.0, 0.0)
-    assert told == []
+    solutions, reported = silent(90.0, 0.0)
+    assert reported == []
     after = [(m, s) for m, s in solutions if s.t_ns > 50 * NS]
     assert max(distance(s, m.truth) for m, s in after) < 10.0
     assert all(s.bound_n is not None for _, s in after)
@@ -625,7 +625,7 @@ def spoilt(record: Any, value: float) -> Iterator[Any]:
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 1e300])
 def test_what_is_no_number_is_refused_and_changes_nothing(value: float) -> None:
-    clean, spoiled, refused, told = Navigator(CONFIG), Navigator(CONFIG), 0, 0
+    clean, spoiled, refused, reported = Navigator(CONFIG), Navigator(CONFIG), 0, 0
     clean.handle(origin())
     spoiled.handle(origin())
     for k, moment in enumerate(flight(30, 30.0, 30.0)):
@@ -634,10 +634,10 @@ def test_what_is_no_number_is_refused_and_changes_nothing(value: float) -> None:
                 for wrong in spoilt(record, value):
                     outs = spoiled.handle(wrong)
                     assert {type(out) for out in outs} <= {Rejection}
-                    refused, told = refused + 1, told + len(outs)
+                    refused, reported = refused + 1, reported + len(outs)
             assert spoiled.handle(record) == clean.handle(record)
     assert refused > 200
-    assert told == 3 * 20  # once a second of each kind
+    assert reported == 3 * 20  # once a second of each kind
 
 
 def test_no_solution_lies_beyond_a_pole() -> None:

@@ -1,4 +1,4 @@
-"""Old numbers are known for what they are: told, and never used; honest repeats are passed over."""
+"""Old numbers are known for what they are: reported, and never used; honest repeats are passed over."""
 
 import math
 import random
@@ -48,11 +48,11 @@ def rsbn(
 
 
 def verdicts(records) -> list[str]:
-    """Of each record: "used", or what was told of it ("" where nothing was)."""
+    """Of each record: "used", or what was reported of it ("" where nothing was)."""
     detector, found = StaleDataDetector(), []
     for record in records:
-        told = detector.judge(record)
-        found.append("used" if told is None else " ".join(out.reason for out in told))
+        reported = detector.judge(record)
+        found.append("used" if reported is None else " ".join(out.reason for out in reported))
     return found
 
 
@@ -152,13 +152,13 @@ def test_the_navigator_takes_nothing_of_a_channel_that_froze() -> None:
     """Frozen at 40 m/s and believed, the channel would be off by 400 m after ten seconds."""
     navigator = Navigator(Config(inertial=InertialConfig(independent=True)))
     navigator.handle(LocalOrigin(0, 0, 1.0, 0.5, 0.0, "tangent"))
-    told, after = [], []
+    reported, after = [], []
     for i in range(1, 200):
         t = 0.1 * i
         out = navigator.handle(local(t, 4.0 * min(i, 100)))
         if i % 5 == 0:
             out += navigator.handle(gnss(t, 1.0 + 4.0 * i / 6.37e6))
-        told += [each for each in out if isinstance(each, Rejection)]
+        reported += [each for each in out if isinstance(each, Rejection)]
         after += out
-    assert {(out.source, out.reason[:12]) for out in told} == {("inertial channel", "it is frozen")}
+    assert {(out.source, out.reason[:12]) for out in reported} == {("inertial channel", "it is frozen")}
     assert max(out.t_ns for out in after if isinstance(out, Solution)) <= 10 * NS + NS // 10

@@ -414,7 +414,7 @@ def test_streams_are_requested_at_the_output_rate() -> None:
     fed = ("output.profile=ardupilot", "output.odometry_hz=20")
     assert requested_rates(configured("output.profile=ardupilot"))["ATTITUDE"] == 10.0
     assert requested_rates(configured(*fed))["ATTITUDE"] == 20.0
-    assert requested_rates(configured(*fed))["SYS_STATUS"] == 1.0  # tells whether airspeed is a sensor's
+    assert requested_rates(configured(*fed))["SYS_STATUS"] == 1.0  # states whether airspeed is a sensor's
     for make, imu in (
         ("ardupilot", ["RAW_IMU"]),
         ("px4", ["HIGHRES_IMU"]),

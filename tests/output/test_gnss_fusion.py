@@ -66,6 +66,7 @@ def test_autopilot_that_does_not_know_the_command_is_reported_once() -> None:
     switch, second = Switch(), 10**9
     assert len(requests(switch, WELL._replace(**FALSE), 3, second)) == 1
     assert requests(switch, WELL._replace(**FALSE), 3, 9 * second) == []
+    assert not switch.is_on_companion
     (event,) = switch.take_events()
     assert event.text.startswith("the autopilot did not accept GNSS fusion off")
 

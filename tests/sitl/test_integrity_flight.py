@@ -33,7 +33,7 @@ def test_spoofed_gnss_is_excluded_and_readmitted(fault: str, misleading_s: float
 
 
 def test_slow_spoofing_beside_one_beacon_stays_within_the_protection_level() -> None:
-    """0.5 m/s for 4 min cannot be told from wind with certainty: no worse than GNSS alone."""
+    """0.5 m/s for 4 min cannot be separated from wind with certainty: no worse than GNSS alone."""
     result = flown("gnss-spoof-0.5")
     assert result.largest_m < 0.5 * 240.0 + 5.0  # the lie, and three sigma of an honest fix
     assert result.beyond_s == 0.0
