@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help loopback test lint fuzz kills soak docs lock clean
+.PHONY: help loopback test flights lint fuzz kills soak docs lock clean
 
 # duration per fuzz target: make fuzz SECONDS=3600
 SECONDS := 120
@@ -27,8 +27,11 @@ $(STAMP): pyproject.toml requirements.lock
 loopback: $(STAMP) ## fly the default scenario in virtual time: log in logs/ and error table
 	$(BIN)/companion loopback
 
-test: $(STAMP) lint ## lint, type check and all tests
-	$(BIN)/python -m pytest -n auto --dist worksteal
+test: $(STAMP) lint ## lint, type check and all tests but those of `flights`
+	$(BIN)/python -m pytest -n auto --dist worksteal -m "not flight"
+
+flights: $(STAMP) ## the tests that fly for minutes of virtual time
+	$(BIN)/python -m pytest -n auto --dist worksteal -m flight
 
 lint: $(STAMP) ## ruff, mypy --strict and the import contracts
 	$(BIN)/ruff check .

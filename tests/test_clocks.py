@@ -37,6 +37,7 @@ def test_only_the_shell_reads_the_wall_clock() -> None:
     assert "runtime/service.py" in found  # the search works
 
 
+@pytest.mark.flight
 def test_jumping_system_clock_changes_no_solution(monkeypatch: pytest.MonkeyPatch) -> None:
     scenario, config = get_scenario("short"), loopback.simulator_config(load(None, {}, {}))
     reference = [r for r in loopback.fly_scenario(scenario, config).records if isinstance(r, Solution)]

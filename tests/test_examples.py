@@ -79,6 +79,7 @@ def test_fly_loopback() -> None:
     assert all(numbers(row[12:])[0] < 50.0 for row in rows)
 
 
+@pytest.mark.flight
 @pytest.mark.parametrize("source", ["tlog", "log"])
 def test_replay_with_another_estimator(source: str, flight: Path) -> None:
     shown = run("replay_with_another_estimator.py", RECORDING if source == "tlog" else flight)

@@ -98,6 +98,7 @@ def rms(e: Any) -> float:
     return float(np.sqrt(np.mean(np.square(e))))
 
 
+@pytest.mark.flight
 def test_smoothed_errors_are_below_filtered_errors() -> None:
     everywhere, outage = [], []
     for seed in range(1, 7):
@@ -113,6 +114,7 @@ def test_smoothed_errors_are_below_filtered_errors() -> None:
     assert rms(after) < 0.7 * rms(before)
 
 
+@pytest.mark.flight
 def test_last_epoch_equals_the_filter() -> None:
     found, flown = smoothed(600, (200, 400)), flight(600, (200, 400))
     np.testing.assert_array_equal(found.x[-1], found.x_filter[-1])

@@ -149,6 +149,7 @@ def raw_rms(flown: Recorded, records: Iterable[Any], start: float, end: float) -
 NEVER = (0.0, 0.0)
 
 
+@pytest.mark.flight
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("name", ["plane_gps_loss", "plane_wind_change"])
 def test_with_a_beacon_the_error_is_at_most_half_the_fixes(name: str, seed: int) -> None:
@@ -164,6 +165,7 @@ def test_with_a_beacon_the_error_is_at_most_half_the_fixes(name: str, seed: int)
         assert found.error[found.t >= 0.0].max() <= two_sigma
 
 
+@pytest.mark.flight
 @pytest.mark.parametrize("seed", range(3))
 def test_a_minute_without_the_beacon_in_a_changed_wind_wherever_it_begins(seed: int) -> None:
     """From one minute after GNSS is lost on."""
@@ -181,6 +183,7 @@ def test_a_minute_without_the_beacon_in_a_changed_wind_wherever_it_begins(seed: 
         assert np.all(found.error <= 3.0 * found.sigma)
 
 
+@pytest.mark.flight
 @pytest.mark.parametrize("seed", range(3))
 def test_a_minute_without_the_beacon_by_the_restrictive_estimator(seed: int) -> None:
     flown = flight("plane_wind_change")
@@ -195,6 +198,7 @@ def test_a_minute_without_the_beacon_by_the_restrictive_estimator(seed: int) -> 
     assert np.all(found.error[inside] <= 3.0 * found.sigma[inside])
 
 
+@pytest.mark.flight
 @pytest.mark.parametrize(("seed", "before"), [(0, 110.0), (1, 110.0), (2, 60.0)])
 def test_a_step_of_the_wind_is_not_taken_for_the_fault_of_a_beacon(seed: int, before: float) -> None:
     """By the only beacon left, however short GNSS was heard with it before."""
@@ -216,6 +220,7 @@ def test_air_data_alone_drifts_no_more_than_the_autopilot_and_says_so() -> None:
     assert np.all(found.error[after] <= 3.0 * found.sigma[after])
 
 
+@pytest.mark.flight
 @pytest.mark.parametrize("name", ["plane_gps_loss", "plane_wind_change"])
 def test_the_whole_logs_say_the_same_as_the_cut_ones(name: str) -> None:
     path = SHARED / f"{name}.tlog"

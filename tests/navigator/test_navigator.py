@@ -124,6 +124,7 @@ def of(outage: list[tuple[Moment, Solution]], start: float, end: float) -> list[
     return [(m, s) for m, s in outage if start * NS < s.t_ns <= end * NS]
 
 
+@pytest.mark.flight
 def test_with_fixes_the_estimate_beats_the_best_fix(outage: list[tuple[Moment, Solution]]) -> None:
     gnss = 1.5 * math.sqrt(2.0)
     assert rms([distance(s, m.truth) for m, s in of(outage, 120, 720)]) < gnss

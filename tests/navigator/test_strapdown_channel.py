@@ -311,6 +311,7 @@ def drawn(flight: Trajectory, rng: np.random.Generator) -> Errors:
     return Errors(attitude, body[None, :], tilt)
 
 
+@pytest.mark.flight
 def test_the_covariance_is_honest() -> None:
     """Normalised squared errors up to 20 s after GNSS is gone, in turns, over seeds: chi-square."""
     flight, runs = circles(), 12

@@ -217,6 +217,7 @@ def falsify_position(name: str, values: dict[str, Any]) -> None:
             values |= {"direction": 12.0, "speed": 25.0, "speed_z": 3.0}
 
 
+@pytest.mark.flight
 @pytest.mark.parametrize("source", ["auto", "air_data", "imu"])
 @pytest.mark.parametrize(("autopilot", "profile", "via"), METHODS)
 def test_autopilot_position_never_reaches_the_output(
@@ -475,6 +476,7 @@ def recorded(name: str) -> list[Any]:
     return [msgspec.structs.replace(r, sensed=True) if isinstance(r, AirData) else r for r in records]
 
 
+@pytest.mark.flight
 @pytest.mark.parametrize("name", ["plane_gps_loss", "plane_wind_change"])
 def test_gate_passes_recorded_flights(name: str) -> None:
     """Recordings with a simulated beacon 60 km away after the GNSS loss, and none for one minute of it: only

@@ -8,6 +8,7 @@ from click.testing import CliRunner
 from sitl import after_flight_study
 
 
+@pytest.mark.flight
 def test_short_flight_is_within_the_budget():
     pytest.importorskip("jinja2")
     found = CliRunner().invoke(after_flight_study.command, ["--scenario", "short"])

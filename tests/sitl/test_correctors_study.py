@@ -14,6 +14,7 @@ from sitl.scenarios import SensorRates, get_scenario
 from sitl.sensors import GRADES
 from sitl.world import World
 
+pytestmark = pytest.mark.flight
 SLOW = SensorRates(imu=1.0, local_position=5.0, attitude=5.0, gnss=1.0, air=5.0, truth=1.0)
 LOST = (200.0, 300.0)
 NAMES = ("hyperbolic", "airspeed", "stars", "second_ins")

@@ -11,6 +11,7 @@ from sitl import loopback
 from sitl.campaign import flight
 from sitl.campaign.flight import SCENARIOS, FlightOrder, FlightResult, fly_order
 
+pytestmark = pytest.mark.flight
 HARMLESS_M = 300.0
 
 

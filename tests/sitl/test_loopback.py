@@ -46,12 +46,14 @@ def flight_digest(seed: int) -> str:
     return log.digest.hexdigest()
 
 
+@pytest.mark.flight
 def test_output_bytes_depend_on_the_seed_only() -> None:
     first = flight_digest(1)
     assert first == flight_digest(1)
     assert first != flight_digest(2)
 
 
+@pytest.mark.flight
 def test_corrected_estimate_is_better_than_the_best_fix_source(flights) -> None:
     """Pooled over flights: the GNSS drift within one correlation time is unobservable in one flight."""
     for rows in zip(*flights, strict=True):
@@ -86,6 +88,7 @@ def test_log_of_the_command_replays_bit_for_bit(tmp_path: Path) -> None:
     assert found["outputs"]["Solution"] > 1000
 
 
+@pytest.mark.flight
 def test_replay_with_another_configuration_reports_the_first_difference(tmp_path: Path) -> None:
     done = CliRunner().invoke(command, ["--scenario", "short", "--logs", str(tmp_path), "--json"])
     other = tmp_path / "other.toml"

@@ -102,6 +102,7 @@ def stated_accuracy(solution: Solution) -> float:
     return math.hypot(*map(max, sigma, solution.bound_n or (0.0, 0.0)))
 
 
+@pytest.mark.flight
 @pytest.mark.parametrize("channel", CHANNELS)
 @pytest.mark.parametrize("beacons", [(), BEACONS])
 def test_ten_gnss_outages(tmp_path: Path, channel: str, beacons) -> None:
@@ -167,6 +168,7 @@ def test_estimated_wind_survives_a_reboot(tmp_path: Path) -> None:
     assert math.hypot(north, east) < 0.5 * 6.4 * 140.0  # half of the error without a wind estimate
 
 
+@pytest.mark.flight
 @pytest.mark.parametrize("channel", CHANNELS)
 @pytest.mark.parametrize("outages", [(), OUTAGE])
 def test_link_loss_of_thirty_seconds(tmp_path: Path, channel: str, outages) -> None:
@@ -178,6 +180,7 @@ def test_link_loss_of_thirty_seconds(tmp_path: Path, channel: str, outages) -> N
     assert 20 <= len(down) <= 30  # one per second after the link counts as lost
 
 
+@pytest.mark.flight
 @pytest.mark.parametrize("channel", CHANNELS)
 @pytest.mark.parametrize("outages", [(), OUTAGE])
 def test_local_origin_moves_by_a_kilometre(tmp_path: Path, channel: str, outages) -> None:
@@ -206,6 +209,7 @@ def test_local_origin_moves_by_a_kilometre(tmp_path: Path, channel: str, outages
         assert 2.0 < silent < 8.0
 
 
+@pytest.mark.flight
 @pytest.mark.parametrize("outages", [(), OUTAGE])
 def test_autopilot_filter_reset_of_forty_metres(tmp_path: Path, outages) -> None:
     flown = LoggedFlight(

@@ -33,6 +33,7 @@ def selected_sets(flown: loopback.LoopbackFlight) -> list[str]:
     ]
 
 
+@pytest.mark.flight
 @pytest.mark.parametrize(
     "fault",
     [

@@ -16,6 +16,7 @@ def flights() -> dict[object, SchemeFlight]:
     return {scheme: fly(world, "air_data", scheme) for scheme in ("feedforward", 0.3, "feedback")}
 
 
+@pytest.mark.flight
 @pytest.mark.parametrize("scheme", [0.3, "feedback"])
 def test_schemes_use_the_same_fixes(flights: dict[object, SchemeFlight], scheme: object) -> None:
     first, other = flights["feedforward"], flights[scheme]

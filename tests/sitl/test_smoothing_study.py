@@ -23,6 +23,7 @@ from sitl.scenarios import Scenario, SensorRates, get_scenario
 from sitl.sensors import GRADES, UG, G, GnssModel
 from sitl.world import World
 
+pytestmark = pytest.mark.flight
 INS = Config(inertial=InertialConfig(independent=True))
 AIR = Config(inertial=InertialConfig(source="air_data"))
 NS = 1_000_000_000

@@ -47,6 +47,7 @@ def test_only_the_source_states_another_sigma(world: World, source: str, kind: t
             assert a is b
 
 
+@pytest.mark.flight
 def test_one_filter_is_spoilt_by_a_sigma_stated_too_great(world: World) -> None:
     """GNSS stated ten times too coarse: the error with fixes grows; stated right, the phases are as flown."""
     right, wrong = (weights_study.fly(world, "GNSS", factor, bank=False) for factor in (1.0, 10.0))

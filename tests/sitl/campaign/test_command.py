@@ -37,6 +37,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[FlightRe
     return folder, command.run_campaign(wanted, folder, quiet=True)
 
 
+@pytest.mark.flight
 def test_flight_without_faults_has_no_alarms_and_small_errors(flown: tuple[Path, list[FlightResult]]) -> None:
     quiet = flown[1][0]
     assert quiet.raised is None
@@ -44,6 +45,7 @@ def test_flight_without_faults_has_no_alarms_and_small_errors(flown: tuple[Path,
     assert (quiet.detected_s, quiet.excluded_s, quiet.alarms, quiet.misleading_s) == (None, None, 0, 0.0)
 
 
+@pytest.mark.flight
 def test_gross_faults_are_detected_at_once(flown: tuple[Path, list[FlightResult]]) -> None:
     for r in flown[1][1:]:
         assert r.raised is None
@@ -52,11 +54,13 @@ def test_gross_faults_are_detected_at_once(flown: tuple[Path, list[FlightResult]
         assert r.before_m < 100.0, r.key
 
 
+@pytest.mark.flight
 def test_same_order_gives_the_same_result(flown: tuple[Path, list[FlightResult]]) -> None:
     repeated = fly_order(FlightOrder("one-beacon", "gnss-jump", 1))
     assert repeated._replace(took_s=0.0) == flown[1][1]._replace(took_s=0.0)
 
 
+@pytest.mark.flight
 def test_stored_flights_are_not_repeated(
     flown: tuple[Path, list[FlightResult]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -102,6 +106,7 @@ def test_table_applies_the_limits() -> None:
     assert jam.bound_held is False
 
 
+@pytest.mark.flight
 def test_slow_consumer_does_not_shift_the_clock() -> None:
     """Regression: reading every ten seconds shifted the clock by half a second, and GNSS was excluded."""
     flown = fly_order(FlightOrder("one-beacon", "slow-consumer", 1))
@@ -110,6 +115,7 @@ def test_slow_consumer_does_not_shift_the_clock() -> None:
     assert flown.largest_m < 15.0
 
 
+@pytest.mark.flight
 @pytest.mark.parametrize(
     ("scenario", "name"),
     [
@@ -130,6 +136,7 @@ def test_late_link_and_clock_jump_are_reported_without_position_error(scenario: 
     assert flown.largest_m < 15.0
 
 
+@pytest.mark.flight
 @pytest.mark.parametrize("name", ["gnss-stale", "beacon-frozen", "ins-frozen"])
 def test_stale_data_with_new_stamps_is_detected_at_once(name: str) -> None:
     flown = fly_order(FlightOrder("one-beacon", name, 1))

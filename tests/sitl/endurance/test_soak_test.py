@@ -4,6 +4,8 @@ from collections import deque
 from itertools import pairwise
 from pathlib import Path
 
+import pytest
+
 from sitl.endurance import soak_test as soak_module
 from sitl.endurance.soak_test import (
     QUIET_S,
@@ -19,6 +21,7 @@ from sitl.endurance.soak_test import (
 )
 
 
+@pytest.mark.flight
 def test_short_sorties_stay_within_the_limits(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr(soak_module, "SORTIES", 2)
     hours = list(run_soak(2, 1, tmp_path, sortie_s=150.0))
