@@ -7,7 +7,8 @@ With r a measurement minus that of the nominal trajectory, for three successive 
 R is the variance of white noise. An offset, a rate and the slow errors of the channel are not in d: neither a
 spoofed GNSS nor a poor INS changes it; a is what the nominal trajectory's acceleration may lack. The mean of
 d^2 / (R + w), later surprises clipped, is a factor of the variance, and is used where it is above `FACTOR`.
-A source that states too little would otherwise be explained by one lie after another, and excluded.
+A source that states too little would otherwise be explained by one lie after another, and excluded. Its first
+measurements, of which no scatter is known yet, are taken as noisy.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ UNEQUAL = 1.5  # of two distances
 CLIPPED = 6.0  # times the mean
 FIRST, LAST = 4, 40  # measurements that the mean remembers, at the start and later
 FACTOR = 2.25  # of the variance: a smaller one may be chance
+UNKNOWN, UNKNOWN_FOR = 9.0, 6  # factor of the first measurements, and their number: four differences
 MOST = 100.0
 REPORTED, FORGOTTEN = 4.0, 1.44  # the factor is reported above the one until it is below the other
 LACKING = {"ins": 0.0, "imu": 1.0}  # m/s^2, by what moves the nominal trajectory
@@ -28,7 +30,7 @@ LACKING_ELSE = 3.0
 
 class Scatter(NamedTuple):
     """Time and residual of the last measurement, distance (s) and residual of the one before; the factor, of
-    how many, and whether it was reported.
+    how many differences, whether it was reported, and the number of measurements up to `UNKNOWN_FOR`.
     """
 
     t_ns: int
@@ -38,10 +40,13 @@ class Scatter(NamedTuple):
     factor: float = 1.0
     many: int = 0
     reported: bool = False
+    seen: int = 1
 
     @property
     def used(self) -> float:
         """Factor by which the stated variance is enlarged: 1, or `factor` where it is no chance."""
+        if self.seen < UNKNOWN_FOR:
+            return max(self.factor, UNKNOWN)
         return self.factor if self.factor > FACTOR else 1.0
 
 
@@ -50,8 +55,11 @@ def observe(s: Scatter | None, t_ns: int, r: tuple[float, ...], variance: float,
     if s is None:
         return Scatter(t_ns, r)
     dt = (t_ns - s.t_ns) * 1e-9
-    if not 0.0 < dt < SILENT_S:
-        return s if dt <= 0.0 else s._replace(t_ns=t_ns, last=r, dt=0.0, before=None)
+    if dt <= 0.0:
+        return s
+    s = s._replace(seen=min(s.seen + 1, UNKNOWN_FOR))
+    if dt >= SILENT_S:
+        return s._replace(t_ns=t_ns, last=r, dt=0.0, before=None)
     if s.before is None or not 1.0 / UNEQUAL < dt / s.dt < UNEQUAL:
         return s._replace(t_ns=t_ns, last=r, dt=dt, before=s.last)
     squares = sum((r2 - 2.0 * r1 + r0) ** 2 for r0, r1, r2 in zip(s.before, s.last, r, strict=True)) / 6.0

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from companion.navigator import scatter
-from companion.navigator.scatter import Scatter
+from companion.navigator.scatter import UNKNOWN, UNKNOWN_FOR, Scatter
 from companion.units import Floats
 
 STEP_NS = 200_000_000
@@ -29,8 +29,18 @@ def noise(n: int = 400, seed: int = 1) -> Floats:
 
 
 def test_honest_noise_is_used_as_stated() -> None:
-    used = [s.used for seed in range(20) for s in observed(noise(seed=seed))]
+    used = [s.used for seed in range(20) for s in observed(noise(seed=seed))[UNKNOWN_FOR:]]
     assert np.mean(np.array(used) > 1.0) < 0.01
+
+
+@given(st.lists(st.floats(0.05, 60.0), min_size=10, max_size=10))
+def test_the_first_measurements_are_taken_as_noisy_however_they_are_spaced(intervals: list[float]) -> None:
+    s, t_ns, used = None, 0, []
+    for dt in intervals:
+        t_ns += round(dt * 1e9)
+        s = scatter.observe(s, t_ns, (0.0, 0.0), 1.0, 0.0)
+        used.append(s.used)
+    assert used == [UNKNOWN] * (UNKNOWN_FOR - 1) + [1.0] * (11 - UNKNOWN_FOR)
 
 
 @pytest.mark.parametrize("times", [2.0, 3.0, 10.0])
@@ -55,7 +65,7 @@ def test_a_lie_does_not_make_its_own_noise(lie: str) -> None:
     apart = [abs(a.factor - b.factor) for a, b in zip(honest, false, strict=True)]
     # a jump is in three differences, each clipped; a rate of 5 m/s begins with 1 m in one of them
     assert max(apart) < (0.6 if "jump" in lie else 0.05)
-    assert max(s.used for s in false) == 1.0
+    assert max(s.used for s in false[UNKNOWN_FOR:]) == 1.0
 
 
 @given(st.floats(1e-3, 1e3), st.floats(0.0, 1e4))

@@ -23,9 +23,9 @@ def flown(fault: str, seed: int = 1, misleading_s: float = 0.0) -> FlightResult:
     return result
 
 
-@pytest.mark.parametrize(("fault", "misleading_s"), [("gnss-spoof-2", 0.5), ("gnss-spoof-5", 0.0)])
+@pytest.mark.parametrize(("fault", "misleading_s"), [("gnss-spoof-2", 1.0), ("gnss-spoof-5", 0.0)])
 def test_spoofed_gnss_is_excluded_and_readmitted(fault: str, misleading_s: float) -> None:
-    """At 2 m/s the error touches the protection level 16 s after its begin (docs/limits.md)."""
+    """At 2 m/s the error touches the protection level for a moment 16 s after its begin (docs/limits.md)."""
     result = flown(fault, misleading_s=misleading_s)
     assert result.excluded_s is not None
     assert result.largest_m < HARMLESS_M
