@@ -101,7 +101,7 @@ async def run_examination(connection: AutopilotConnection, address: Address) -> 
     if not await connection.until(lambda now: examination.is_connected, CONNECT_TIMEOUT_S):
         raise NoAutopilot(
             f"no autopilot found on {address} in {CONNECT_TIMEOUT_S:.0f} s: "
-            f"{describe_silence(examination.session, connection.bytes > 0)}"
+            f"{describe_silence(str(address), examination.session, connection.bytes > 0)}"
         )
     connection.reset_byte_count()
     await connection.until(examination.is_done, EXAMINATION_TIMEOUT_S)

@@ -1,4 +1,4 @@
-"""COMMAND_LONG and COMMAND_INT server: every command addressed to us is acknowledged. No clock, no link.
+"""COMMAND_LONG and COMMAND_INT server of one link: every command addressed to us is acknowledged. No clock.
 
     replies = commands.receive(message, frame, system, now_ns)   # to be sent on the link it came from
 
@@ -64,7 +64,7 @@ def autopilot_version() -> Message:
 
 
 class CommandServer:
-    """Executes and acknowledges commands; holds the message intervals that were set."""
+    """Executes and acknowledges the commands of one link; holds the message intervals that were set there."""
 
     def __init__(
         self, component: int, intervals_us: Mapping[int, int], sources: Mapping[int, Source]
@@ -87,6 +87,7 @@ class CommandServer:
             **sources,
         }
         self._limiter = RateLimiter(RATE_HZ, BURST)
+        self._fixed_us: Mapping[int, int] = {}
         self._table: dict[int, Callable[[float, float], tuple[Result, list[Message]]]] = {
             mavlink.MAV_CMD_GET_MESSAGE_INTERVAL: self._get_message_interval,
             mavlink.MAV_CMD_SET_MESSAGE_INTERVAL: self._set_message_interval,
@@ -100,11 +101,15 @@ class CommandServer:
         """Replace the default intervals and discard those that were set by command."""
         self._defaults, self.intervals_us = dict(intervals_us), dict(intervals_us)
 
-    def receive(self, message: Message, frame: Frame, system: int, now_ns: int) -> list[Message]:
+    def receive(
+        self, message: Message, frame: Frame, system: int, now_ns: int, fixed_us: Mapping[int, int]
+    ) -> list[Message]:
         """Execute a command and return the replies; empty for other messages and other addressees.
 
-        `system` is our own id.
+        `system` is our own id, `fixed_us` the intervals on this link that no command may change: what the
+        autopilot is fed is set by parameters only.
         """
+        self._fixed_us = fixed_us
         if frame.msgid not in _COMMANDS or message.target_system != system:
             return []
         execute = self._table.get(message.command)
@@ -135,6 +140,8 @@ class CommandServer:
 
     def _set_message_interval(self, param1: float, param2: float) -> tuple[Result, list[Message]]:
         msgid, interval = _to_message_id(param1), param2
+        if msgid in self._fixed_us:
+            return Result.DENIED, []
         if msgid not in self._defaults:
             return Result.UNSUPPORTED if msgid >= 0 else Result.DENIED, []
         if interval == 0:
@@ -152,7 +159,8 @@ class CommandServer:
         if not 0 <= msgid < 1 << 16:  # the range of MESSAGE_INTERVAL.message_id
             return Result.DENIED, []
         # 0: message not available, by the description of MESSAGE_INTERVAL
-        interval = self.intervals_us.get(msgid, DISABLED if msgid in self._sources else 0)
+        known = {**self.intervals_us, **self._fixed_us}
+        interval = known.get(msgid, DISABLED if msgid in self._sources else 0)
         return Result.ACCEPTED, [dialect.new("MESSAGE_INTERVAL", message_id=msgid, interval_us=interval)]
 
     def _request_autopilot_capabilities(self, param1: float, param2: float) -> tuple[Result, list[Message]]:

@@ -337,21 +337,23 @@ def navigation_status(solution: Solution, receiver: Receiver) -> Message:
     )
 
 
-def named_values(status: Message, now_ns: int, *, is_stale: bool) -> list[Message]:
+def named_values(status: Message | None, now_ns: int) -> list[Message]:
     """Encode the main values of NAVIGATION_STATUS as NAMED_VALUE_FLOAT.
 
     Every ground station plots these, and ArduPilot forwards and logs them, where an unknown id is dropped.
-    Without a recent solution the trust is "untrusted" and all else NaN, so that no plot keeps an old value.
+    Without a recent solution (None) the trust is "untrusted" and all else NaN, so that no plot keeps an old
+    value.
     """
-    values = {
-        "nav_source": float(status.sources),
-        "nav_sigma": status.sigma_horizontal,
-        "nav_bound": status.bound_horizontal,
-        "nav_hpl": status.protection,
-    }
-    if is_stale:
-        values = dict.fromkeys(values, math.nan)
-    values["nav_trust"] = float(Trust.UNTRUSTED + 1 if is_stale else status.trust)
+    values = dict.fromkeys(("nav_source", "nav_sigma", "nav_bound", "nav_hpl"), math.nan)
+    values["nav_trust"] = float(Trust.UNTRUSTED + 1)
+    if status is not None:
+        values = {
+            "nav_source": float(status.sources),
+            "nav_sigma": status.sigma_horizontal,
+            "nav_bound": status.bound_horizontal,
+            "nav_hpl": status.protection,
+            "nav_trust": float(status.trust),
+        }
     boot_ms = now_ns // 1_000_000 & 0xFFFFFFFF
     return [
         dialect.new("NAMED_VALUE_FLOAT", time_boot_ms=boot_ms, name=name, value=value)

@@ -65,7 +65,7 @@ from companion.records import (
     Trust,
     Tuning,
 )
-from companion.runtime.ground_station_services import GroundStationServices
+from companion.runtime.ground_station_services import STATUS, GroundStationServices, feed_periods_ns
 from companion.runtime.input_monitor import InputMonitor
 from companion.runtime.origin import OriginCheck
 from companion.runtime.parameter_check import ParameterCheck
@@ -74,7 +74,6 @@ from companion.storage.deferred_log import Log
 from companion.transport.peers import Rank
 from companion.units import SECOND_NS
 
-STATUS = "NAVIGATION_STATUS"
 ORIGIN_REQUEST_INTERVAL = 3 * SECOND_NS
 FIRMWARE_REQUESTS = 10
 STALE_AFTER = 2 * SECOND_NS
@@ -136,6 +135,7 @@ class Link:
         )
         self.sender = Sender(self.session.clock)
         self.output = AutopilotOutput(config)
+        self.pace = Pace()  # of what was asked for on this link
         self.parameter_check = ParameterCheck()
         self.has_bytes = False  # anything was received, MAVLink or not
         self.has_station = False  # a ground station was received
@@ -280,8 +280,9 @@ class CompanionCore:
             if (leading := self.leading_link) is not None:
                 self._steer(leading, now_ns)
             self._report_missing_inputs(now_ns)
-            if self._config.output.status_hz > 0.0 and (status := self._latest_status()) is not None:
-                for message in named_values(status, now_ns, is_stale=self._stale):
+            if self._config.output.status_hz > 0.0:
+                status = self._latest_status() if self.has_solution else None
+                for message in named_values(status, now_ns):
                     self._broadcast(message)
             for link in self.links.values():
                 link.session.state = self._system_state(now_ns)
@@ -399,7 +400,8 @@ class CompanionCore:
             link.has_station |= event.message.type == mavlink.MAV_TYPE_GCS
         elif msgid in REQUESTS:
             link.has_station = True
-            replies, config = self._services.receive(event, link.session.system)
+            feeds = link is self.leading_link
+            replies, config = self._services.receive(event, link.session.system, link.name, feeds)
             for reply in replies:
                 link.session.send(reply)
             if config is not None:
@@ -507,15 +509,24 @@ class CompanionCore:
     def _send(self, solution: Solution, early: bool) -> None:
         """Send the messages that are due; `early`: positions may leave earlier, after a beacon fix."""
         self._solution = solution
-        periods = self._services.periods_ns
-        due = self._pace.due(periods, solution.t_ns, periods.keys() - {RESET, STATUS} if early else ())
-        feeding = [name for name in due if name != STATUS]
-        if feeding and (leading := self.leading_link) is not None:
-            for message in leading.output.messages(solution, feeding, self._receiver(leading)):
+        periods = feed_periods_ns(self._config.output)
+        due = self._pace.due(periods, solution.t_ns, periods.keys() - {RESET} if early else ())
+        fed, leading = dict[str, Any](), self.leading_link
+        if due and leading is not None:
+            for message in leading.output.messages(solution, due, self._receiver(leading)):
                 leading.session.send(message)
+                fed[message.get_type()] = message
             self._steer(leading, solution.rx_ns)
-        if STATUS in due:
-            self._broadcast(self._latest_status())
+        for link in self.links.values():
+            if link.session.is_up or link.has_station:
+                self._send_streams(link, {} if link is leading else fed, solution.t_ns)
+
+    def _send_streams(self, link: Link, fed: dict[str, Any], t_ns: int) -> None:
+        """Send what is due of the status, and of copies of the messages `fed`, as asked for on the link."""
+        streams = self._services.streams_ns(link.name)
+        ready = {name: period for name, period in streams.items() if name == STATUS or name in fed}
+        for name in link.pace.due(ready, t_ns, ()):
+            link.session.send(self._latest_status() if name == STATUS else fed[name])
 
     def _broadcast(self, message: Any) -> None:
         """Send on every link with an autopilot or a ground station."""

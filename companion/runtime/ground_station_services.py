@@ -23,24 +23,31 @@ from companion.records import Event
 NANO_PER_MICRO = 1000
 #: PING answers per second, and at once.
 PINGS_HZ, PINGS_BURST = 10.0, 10
+STATUS = "NAVIGATION_STATUS"
+NAMED_VALUES_US = 1_000_000
 #: Interval of a disabled message.
 DISABLED_US = -1
 
 
-def intervals_us(output: OutputConfig) -> dict[str, int]:
-    """Return the interval of each message that may be requested, microseconds.
+def feed_periods_ns(output: OutputConfig) -> dict[str, int]:
+    """Return the period of each message that the autopilot is fed, ns."""
+    return {name: round(1e9 / hz) for name, hz in output.rates_hz.items() if hz > 0.0 and name != STATUS}
 
-    Excluded are messages that the profile does not send, and the position reset, whose rate is fixed.
-    """
+
+def _fed_us(output: OutputConfig) -> dict[int, int]:
+    """Intervals of these messages by id, us; the position reset is a command and has none."""
     return {
-        name: round(1e6 / hz) if hz > 0.0 else DISABLED_US
-        for name, hz in output.rates_hz.items()
-        if name != RESET and (hz > 0.0 or name == "NAVIGATION_STATUS")
+        dialect.type_named(name).msgid: ns // NANO_PER_MICRO
+        for name, ns in feed_periods_ns(output).items()
+        if name != RESET
     }
 
 
-def _by_id(output: OutputConfig) -> dict[int, int]:
-    return {dialect.type_named(name).msgid: us for name, us in intervals_us(output).items()}
+def _offered_us(output: OutputConfig) -> dict[int, int]:
+    """Default interval of each message that a link may ask for: the status, and copies of what is fed."""
+    hz = output.rates_hz[STATUS]
+    status = round(1e6 / hz) if hz > 0.0 else DISABLED_US
+    return {**dict.fromkeys(_fed_us(output), DISABLED_US), dialect.type_named(STATUS).msgid: status}
 
 
 class GroundStationServices:
@@ -58,30 +65,38 @@ class GroundStationServices:
         self._component = component
         self._output = config.output
         self._ping_limiter = RateLimiter(PINGS_HZ, PINGS_BURST)
-        self._commands = CommandServer(
-            component,
-            _by_id(config.output),
-            {
-                dialect.type_named(name).msgid: source
-                for name, source in {**sources, "COMPONENT_METADATA": component_metadata}.items()
-            },
-        )
+        self._sources = {
+            dialect.type_named(name).msgid: source
+            for name, source in {**sources, "COMPONENT_METADATA": component_metadata}.items()
+        }
+        self._commands: dict[str, CommandServer] = {}  # by link
         self._files = FileServer(component)
         self._parameters = ParameterServer(component, config, base=base, save=save)
         self._status = StatusText()
-        #: Period of each enabled message, ns.
-        self.periods_ns = self._periods_ns()
 
-    def _periods_ns(self) -> dict[str, int]:
-        asked = self._commands.intervals_us.items()
-        periods = {dialect.TYPES[msgid].name: us * NANO_PER_MICRO for msgid, us in asked if us > 0}
-        if (hz := self._output.rates_hz[RESET]) > 0.0:
-            periods[RESET] = round(1e9 / hz)
-        return periods
+    def _server(self, link: str) -> CommandServer:
+        if link not in self._commands:
+            offered = _offered_us(self._output)
+            self._commands[link] = CommandServer(self._component, offered, self._sources)
+        return self._commands[link]
 
-    def receive(self, event: MessageReceived, system: int) -> tuple[list[Any], Config | None]:
-        """Process a message; return replies for its link, and the configuration if a parameter changed it."""
-        replies = self._commands.receive(event.message, event.frame, system, event.received_ns)
+    def streams_ns(self, link: str) -> dict[str, int]:
+        """Return the period of each message that goes to a link besides what its autopilot is fed, ns."""
+        asked = self._server(link).intervals_us.items()
+        return {dialect.TYPES[msgid].name: us * NANO_PER_MICRO for msgid, us in asked if us > 0}
+
+    def receive(
+        self, event: MessageReceived, system: int, link: str, feeds: bool
+    ) -> tuple[list[Any], Config | None]:
+        """Process a message; return replies for its link, and the configuration if a parameter changed it.
+
+        `feeds`: the link has the autopilot that is fed.
+        """
+        fixed = _fed_us(self._output) if feeds else {}
+        if self._output.status_hz > 0.0:
+            fixed[mavlink.MAVLINK_MSG_ID_NAMED_VALUE_FLOAT] = NAMED_VALUES_US
+        server = self._server(link)
+        replies = server.receive(event.message, event.frame, system, event.received_ns, fixed)
         replies += self._files.receive(event.message, event.frame, system, event.received_ns)
         changes = self._parameters.receive(event.message, event.frame, system, event.received_ns)
         config = changes[-1].config if changes else None
@@ -89,8 +104,8 @@ class GroundStationServices:
             replies.append(reply)
         if config is not None and config.output != self._output:
             self._output = config.output
-            self._commands.set_default_intervals(_by_id(config.output))
-        self.periods_ns = self._periods_ns()
+            for server in self._commands.values():
+                server.set_default_intervals(_offered_us(config.output))
         return replies, config
 
     def _answer(self, event: MessageReceived, system: int) -> Any:

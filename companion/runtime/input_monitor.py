@@ -103,7 +103,15 @@ def _used_records(config: Config) -> frozenset[type]:
     return frozenset(kind for kind in kinds if kind not in SENSORS or config.uses(SENSORS[kind]))
 
 
-def describe_silence(session: Session, has_bytes: bool) -> str:
+#: What to do where nothing arrives, by the kind of the link.
+NOTHING_ARRIVES = {
+    "serial": "check the wiring (TX to RX), the baud rate and the port's MAVLink protocol",
+    "udpin": "check the address and port that the other side sends to",
+    "tcpin": "nothing has connected",
+}
+
+
+def describe_silence(link: str, session: Session, has_bytes: bool) -> str:
     """Return what was received on a link without an autopilot, and what to check."""
     if session.rejected:
         reasons = ", ".join(reason.name.lower() for reason in session.rejected)
@@ -112,7 +120,8 @@ def describe_silence(session: Session, has_bytes: bool) -> str:
         return f"received only {', '.join(senders)}; check the autopilot's connection and link.system_id"
     if has_bytes:
         return "bytes but no MAVLink received; check that both sides use the same baud rate"
-    return "no data received; check the address, the wiring (TX to RX) and the port's MAVLink protocol"
+    advice = NOTHING_ARRIVES.get(link.split(":")[0], "check the address, and that the other side runs")
+    return f"no data received; {advice}"
 
 
 class InputMonitor:
@@ -167,7 +176,7 @@ class InputMonitor:
                 now_ns,
                 now_ns,
                 Severity.WARNING,
-                f"{name}: no autopilot in {seconds:.0f} s: {describe_silence(session, has_bytes)}",
+                f"{name}: no autopilot in {seconds:.0f} s: {describe_silence(name, session, has_bytes)}",
             )
             for name, session, has_bytes in sessions
         ]

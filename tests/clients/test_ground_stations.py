@@ -86,7 +86,7 @@ class Vehicle(threading.Thread):
             if not isinstance(event, MessageReceived):
                 continue
             self.received.append(event.message.get_type())
-            for reply in self.commands.receive(event.message, event.frame, SYSTEM, now):
+            for reply in self.commands.receive(event.message, event.frame, SYSTEM, now, {}):
                 self.session.send(reply)
                 if reply.get_type() == "COMMAND_ACK":
                     self.acknowledged.append(reply.command)

@@ -33,12 +33,13 @@ def ask(
     system: int = SYSTEM,
     component: int = COMPONENT,
     kind: str = "COMMAND_LONG",
+    fixed: dict[int, int] | None = None,
 ) -> list[dialect.Message]:
     values = {f"param{i}": value for i, value in enumerate(params, 1)}
     message = dialect.new(kind, command=command, target_system=system, target_component=component, **values)
     found = frame.parse(frame.encode(message, 0, 255, 190))
     assert isinstance(found, frame.Frame)
-    replies = to.receive(dialect.decode(found), found, SYSTEM, now)
+    replies = to.receive(dialect.decode(found), found, SYSTEM, now, fixed or {})
     for reply in replies:
         frame.encode(reply, 0, SYSTEM, COMPONENT)  # every reply can be encoded
     return replies
@@ -115,6 +116,14 @@ def test_intervals_are_set_read_disabled_and_restored() -> None:
     assert here.intervals_us[NAVIGATION_STATUS] == 500_000
 
 
+def test_what_the_autopilot_is_fed_is_not_changed_by_command() -> None:
+    here, fed = commands(), {ODOMETRY: 100_000}
+    for interval in (50_000, -1, 0):
+        assert ask(here, SET_INTERVAL, ODOMETRY, interval, fixed=fed)[0].result == Result.DENIED
+    assert ask(here, GET_INTERVAL, ODOMETRY, fixed=fed)[1].interval_us == 100_000
+    assert here.intervals_us[ODOMETRY] == 200_000
+
+
 def test_version_states_our_capabilities() -> None:
     version = ask(commands(), REQUEST, 148)[1]
     assert version.capabilities == CAPABILITIES
@@ -147,7 +156,7 @@ def test_two_sessions_joined_in_memory() -> None:
     station.send(dialect.new("COMMAND_LONG", **request))
     for event in companion.receive(b"".join(station.to_send()), 0):
         assert isinstance(event, MessageReceived)
-        for reply in here.receive(event.message, event.frame, companion.system, event.received_ns):
+        for reply in here.receive(event.message, event.frame, companion.system, event.received_ns, {}):
             companion.send(reply)
     received = station.receive(b"".join(companion.to_send()), 0)
     assert [e.message.get_type() for e in received if isinstance(e, MessageReceived)] == [

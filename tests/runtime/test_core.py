@@ -8,6 +8,7 @@ import pytest
 
 from companion.config import Config, InertialConfig, OutputConfig
 from companion.link import dialect, frame
+from companion.link.dialect import mavlink
 from companion.link.parameter_server import parameter_table
 from companion.nav.geometry import Geodetic, local_to_geodetic, slant_range_azimuth
 from companion.navigator import Navigator
@@ -280,26 +281,47 @@ def test_another_aircraft_on_a_second_link_is_reported_and_ignored() -> None:
     assert set(names) == {"HEARTBEAT"}
 
 
-def test_slow_message_interval_does_not_outlast_its_replacement() -> None:
+def test_a_station_gets_copies_of_the_feed_on_its_own_link_and_does_not_change_it() -> None:
+    flight, results = Flight("main", "station"), []
+
+    def ask(link: str, interval_us: float) -> None:
+        fields = {"target_system": 1, "target_component": 191, "command": 511}
+        fields |= {"param1": dialect.type_named("ODOMETRY").msgid, "param2": interval_us}
+        command = flight.frame("COMMAND_LONG", system=255, component=190, **fields)
+        flight.core.receive(link, command, flight.now)
+        sent = decoded(flight.core.to_send(link, flight.now))
+        results.extend(m.result for m in sent if m.get_type() == "COMMAND_ACK")
+
+    def flown(seconds: float) -> tuple[int, int]:
+        before, copies = len(flight.times_sent("ODOMETRY")), 0
+        for _ in range(round(seconds)):
+            flight.fly(1.0)
+            sent = decoded(flight.core.to_send("station", flight.now))
+            copies += sum(m.get_type() == "ODOMETRY" for m in sent)
+        return len(flight.times_sent("ODOMETRY")) - before, copies
+
+    flown(5.0)
+    fed, _ = flown(10.0)
+    assert fed == pytest.approx(50, abs=1)
+    for interval_us, copies in ((60e6, 1), (500e3, 20), (20e3, fed), (-1.0, 0), (500e3, 20), (0.0, 0)):
+        ask("station", interval_us)
+        found = flown(10.0)
+        assert found == (pytest.approx(fed, abs=1), pytest.approx(copies, abs=1)), interval_us
+    assert results == [mavlink.MAV_RESULT_ACCEPTED] * 6
+    ask("main", 60e6)
+    assert results[-1] == mavlink.MAV_RESULT_DENIED
+    assert flown(10.0) == (pytest.approx(fed, abs=1), 0)
+
+
+def test_before_the_first_solution_the_trust_is_untrusted_and_all_else_unknown() -> None:
     flight = Flight()
-    flight.fly(5.0)
-    odometry = dialect.type_named("ODOMETRY").msgid
-    for interval_us in (60e6, 0.0):  # once a minute, then the default
-        flight.send(
-            "COMMAND_LONG",
-            system=255,
-            component=190,
-            target_system=1,
-            target_component=191,
-            command=511,
-            param1=odometry,
-            param2=interval_us,
-        )
-        flight.fly(2.0)
-    assert [m.result for _, m in flight.sent if m.get_type() == "COMMAND_ACK"] == [0, 0]
-    before = len(flight.times_sent("ODOMETRY"))
-    flight.fly(10.0)
-    assert len(flight.times_sent("ODOMETRY")) - before == pytest.approx(50, abs=1)
+    flight.send("HEARTBEAT", type=1, autopilot=3)
+    flight.now += SECOND
+    flight.core.poll(flight.now)
+    flight.collect()
+    named = {m.name: m.value for _, m in flight.sent if m.get_type() == "NAMED_VALUE_FLOAT"}
+    assert named.pop("nav_trust") == 4.0
+    assert len(named) == 4 and all(math.isnan(value) for value in named.values())
 
 
 def test_faster_output_requests_a_faster_inertial_channel() -> None:
