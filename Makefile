@@ -67,7 +67,7 @@ docs/configuration.md: $(STAMP) companion/config/*.py
 
 lock: ## regenerate requirements.lock from pyproject.toml (needs uv)
 	uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-emit-index-url \
-	  --no-annotate --no-header $(foreach e,dev plot report live campaign fleet,--extra $(e)) \
+	  --no-annotate --no-header $(foreach e,dev plot report live foxglove campaign fleet,--extra $(e)) \
 	  -o requirements.lock pyproject.toml
 
 clean: ## remove the environment and tool caches

@@ -1,6 +1,6 @@
 """Parameter client against a foreign server: MAVSDK as an autopilot, over UDP.
 
-It needs its package (extra `clients`) and is skipped without it.
+It needs its package and is skipped without it.
 """
 
 import contextlib
