@@ -5,8 +5,10 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
+import click
 import pytest
 from click.testing import CliRunner
 
@@ -34,6 +36,26 @@ def test_help_lists_every_command() -> None:
 def test_help_fits_80_columns(arguments: list[str]) -> None:
     done = CliRunner().invoke(cli, [*arguments, "--help"], terminal_width=80)
     assert max(len(line) for line in done.output.splitlines()) <= 80
+
+
+def groups(context: click.Context) -> Iterator[click.Context]:
+    """Yield the context of each group of commands, the outermost first."""
+    assert isinstance(context.command, click.Group)
+    yield context
+    for name in context.command.list_commands(context):
+        command = context.command.get_command(context, name)
+        if isinstance(command, click.Group):
+            yield from groups(click.Context(command, context, name, terminal_width=80))
+
+
+def test_no_summary_is_cut_at_80_columns() -> None:
+    helps = {
+        context.info_name: context.get_help()
+        for context in groups(click.Context(cli, info_name="companion", terminal_width=80))
+    }
+    assert set(helps) >= {"companion", "log", "signing", "sitl", "study"}
+    lines = [line for text in helps.values() for line in text.splitlines()[1:]]
+    assert [line for line in lines if line.endswith("...")] == []
 
 
 def test_interrupt_ends_in_one_line_and_130(tmp_path: Path) -> None:
