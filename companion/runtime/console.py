@@ -49,7 +49,7 @@ class Console:
 
     def status(self, status: Status, now_ns: int) -> None:
         """Show the status; call it once a second."""
-        line = f"{self._seconds(now_ns):9.0f} {status.text()}"
+        line = f"{self._seconds(now_ns):5.0f} {status.text()}"
         if self._columns is not None:
             self._shown, before = line[: self._columns - 1], self._shown
             if self._shown != before:
