@@ -1,6 +1,7 @@
 """Console of `companion run`: events and one status line, on a terminal, in a journal and as JSON."""
 
 import json
+import re
 
 import pytest
 
@@ -14,13 +15,15 @@ STATUS = Status(True, "normal", "fixed", ("GNSS", "RANGE"), "normal", 1.234, 52.
 
 
 def played(lines: list[str]) -> list[str]:
-    """What a terminal shows after these lines: the cursor moves up and clears a line."""
-    shown: list[str] = []
+    """What a terminal shows after these lines: the cursor moves up, and clears what is below."""
+    shown, row = list[str](), 0
     for line in "\n".join(lines).split("\n"):
-        while line.startswith("\x1b[1A\r\x1b[2K"):
-            line = line.removeprefix("\x1b[1A\r\x1b[2K")
-            shown.pop()
-        shown.append(line)
+        ups = line.count("\x1b[1A")
+        if "\x1b[J" in line:
+            del shown[row - 1 :]
+        row += 1 - ups
+        if text := re.sub(r"\x1b\[\w+|\r", "", line):
+            shown[row - 1 :] = [text]
     return shown
 
 
@@ -40,6 +43,17 @@ def test_terminal_has_one_status_line_below_all_events() -> None:
     assert [line.split(maxsplit=1)[1] for line in shown[:2]] == ["first", "second"]
     (status,) = shown[2:]
     assert "degraded GNSS+range" in status
+
+
+def test_status_line_is_cleared_at_the_end() -> None:
+    lines: list[str] = []
+    console = Console(lines.append, 0, columns=80)
+    console.event(event(0.1, "first"))
+    console.status(STATUS, SECOND)
+    console.event(event(1.5, "log: closed"))
+    console.close()
+    lines.append("$")
+    assert [line.split(maxsplit=1)[-1] for line in played(lines)] == ["first", "log: closed", "$"]
 
 
 def test_status_line_is_cut_to_the_terminal() -> None:
