@@ -1,159 +1,20 @@
-"""Command line: table of commands, each imported only when it is called.
+"""Entry point of the command line, which is imported once Ctrl-C ends the process quietly."""
 
-A command is a click command in the module that does its work. The commands of the simulator come through
-entry points, so that nothing here imports it: on an aircraft it need not be installed.
-"""
-
-from __future__ import annotations
-
-import importlib
 import os
-import re
-import signal
-import sys
-from collections.abc import Collection, Mapping
-from importlib.metadata import entry_points
-from importlib.util import find_spec
-from pathlib import Path
-from types import MappingProxyType
-
-import click
-
-from companion import __version__
-from companion.config import ConfigError
-from companion.printable import printable
-from companion.storage.reader import LogError
-
-EX_IOERR, EX_CONFIG = 74, 78  # sysexits.h
-EX_INTERRUPTED = 130  # as a shell reports SIGINT
-COMMANDS = {
-    "run": "companion.runtime.service:command",
-    "replay": "companion.analysis.replay:command",
-    "report": "companion.analysis.report:command",
-    "live": "companion.analysis.live.server:command",
-    "smooth": "companion.analysis.smooth_command:command",
-    "fleet": "companion.analysis.fleet:command",
-    "log": "companion.analysis.log_command:group",
-    "doctor": "companion.doctor.command:command",
-    "signing": "companion.doctor.signing_command:group",
-    "check-config": "companion.config.check_config:command",
-    "bench": "companion.bench.command:command",
-}
-STUDIES = {
-    "horizon": "companion.study.horizon:command",
-    "ins-errors": "companion.study.ins_errors:command",
-    "map": "companion.study.map_smoothing:command",
-    "order": "companion.study.order:command",
-    "schemes": "companion.study.schemes:command",
-    "schuler": "companion.study.schuler_data:command",
-    "weights": "companion.study.weights:command",
-    "restrictive": "companion.study.restrictive:command",
-}
-
-
-#: Sections of the help; a command that no section names is listed under the last one.
-SECTIONS = {
-    "Fly": ("run", "doctor", "check-config", "signing"),
-    "Look": ("live", "report", "log", "replay", "smooth", "fleet"),
-    "Study": ("loopback", "sitl", "campaign", "study"),
-    "Develop": ("bench", "kills", "soak"),
-}
-
-
-class LazyGroup(click.Group):
-    """Command group whose commands are imported on use."""
-
-    def __init__(
-        self,
-        table: dict[str, str],
-        plugins: str | None = None,
-        sections: Mapping[str, Collection[str]] = MappingProxyType({"Commands": ()}),
-        **settings: object,
-    ) -> None:
-        super().__init__(**settings)  # type: ignore[arg-type]
-        self._table, self._sections = dict(table), sections
-        if plugins:
-            self._table |= {entry.name: entry.value for entry in entry_points(group=plugins)}
-
-    def list_commands(self, ctx: click.Context) -> list[str]:
-        """Return all names, sorted."""
-        return sorted({*self._table, *self.commands})
-
-    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        """Import and return the command of that name."""
-        if cmd_name not in self._table:
-            return super().get_command(ctx, cmd_name)
-        module, attribute = self._table[cmd_name].split(":")
-        command: click.Command = getattr(importlib.import_module(module), attribute)
-        return command
-
-    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Write the list of commands; a command of the table is not imported for its first sentence."""
-        left = self.list_commands(ctx)
-        limit = formatter.width - 6 - max(map(len, left))
-        for title, named in self._sections.items():
-            names = left if title == list(self._sections)[-1] else [name for name in named if name in left]
-            left = [name for name in left if name not in names]
-            if names:
-                with formatter.section(title):
-                    formatter.write_dl([(name, self._summary(ctx, name, limit)) for name in names])
-
-    def _summary(self, ctx: click.Context, name: str, limit: int) -> str:
-        doc = _docstring(*self._table[name].split(":")) if name in self._table else None
-        shown = click.Command(name, help=doc) if doc else self.get_command(ctx, name)
-        return shown.get_short_help_str(limit) if shown else ""
-
-
-def _docstring(module: str, function: str) -> str | None:
-    """Return the docstring of a function of a module, read from the source without importing it."""
-    spec = find_spec(module)
-    if spec is None or spec.origin is None:
-        return None
-    source = Path(spec.origin).read_text(encoding="utf-8")
-    found = re.search(rf'^def {function}\([^"]*?:\n    """(.*?)"""', source, re.MULTILINE | re.DOTALL)
-    return found and found[1]
-
-
-cli = LazyGroup(
-    COMMANDS,
-    "companion.commands",
-    SECTIONS,
-    name="companion",
-    help="Keeps an aircraft's position, and a guaranteed bound on it, when GNSS is gone.",
-)
-cli = click.version_option(__version__, prog_name="companion")(cli)
-cli.add_command(
-    LazyGroup(STUDIES, "companion.studies", name="study", help="Numerical studies of the estimators.")
-)
 
 
 def main() -> None:
-    """Run the command line; an error that the user can fix ends with one sentence and an exit code."""
-    # before numpy is imported: with batches of 20 states, threads of BLAS only wait for each other
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    if sys.argv[1:2] == ["run"]:  # until the service handles it: a stop during the start is no failure
-        signal.signal(signal.SIGTERM, lambda number, stack: sys.exit(0))
+    """Run the command line."""
     try:
-        code = cli(standalone_mode=False)
-        sys.exit(code if isinstance(code, int) else 0)
-    except (KeyboardInterrupt, click.exceptions.Abort):
-        click.echo("companion: interrupted", err=True)
-        sys.exit(EX_INTERRUPTED)
-    except click.ClickException as error:
-        error.show()
-        sys.exit(error.exit_code)
-    except ConfigError as error:
-        click.echo(f"companion: {printable(str(error))}", err=True)
-        sys.exit(EX_CONFIG)
-    except LogError as error:
-        click.echo(f"companion: {printable(str(error))}", err=True)
-        sys.exit(1)
-    except OSError as error:
-        # prevent a second flush of stdout at exit, which would print its own error
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        where = error.filename or "the output"
-        click.echo(f"companion: {where}: {error.strerror or error}", err=True)
-        sys.exit(EX_IOERR)
+        from companion import interrupt
+
+        interrupt.end_at_interrupt()
+    except KeyboardInterrupt:  # as `interrupt.end`, which may not be imported yet
+        os.write(2, b"companion: interrupted\n")
+        os._exit(130)
+    from companion import command_line
+
+    command_line.main()
 
 
 if __name__ == "__main__":

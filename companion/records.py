@@ -374,6 +374,19 @@ class Solution(Stamped, frozen=True, gc=False, tag=True):
     bounds: Bounds | None = None
     parallel: tuple[ParallelEstimate, ...] = ()
 
+    @property
+    def status_word(self) -> str:
+        """The state in one word for users: normal, degraded, predicting, recovering or untrusted.
+
+        It is the trust, or "recovering" while fixes are back and the trust is still that of the outage. The
+        mode if the trust is unknown.
+        """
+        if self.trust is None:
+            return str(self.mode)
+        if self.mode is Mode.FIXED and self.trust >= Trust.PREDICTING:
+            return "recovering"
+        return self.trust.name.lower()
+
 
 class Fix(Stamped, frozen=True, gc=False, tag=True):
     """Maximum-likelihood radio fix without the INS: correction vector, INS minus fix, north and east (m).

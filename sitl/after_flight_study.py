@@ -41,7 +41,7 @@ class CommandCost(NamedTuple):
 _REPORT_MEMORY = """
 import atexit, os, sys
 atexit.register(lambda: os.write(int(sys.argv.pop()), open("/proc/self/status", "rb").read()))
-from companion.__main__ import cli
+from companion.command_line import cli
 cli(sys.argv[1:-1])
 """
 

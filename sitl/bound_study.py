@@ -263,7 +263,7 @@ def curve(grade: InertialGrade, window_s: float, ahead_s: float) -> list[CurvePo
 def command(
     window_min: float, flights: int, seed: int, grade: str | None, as_json: bool, curve_file: Path | None
 ) -> None:
-    """Compare the guaranteed bound with the errors of simulated flights."""
+    """Compare the guaranteed bound with simulated errors."""
     if not 1.0 <= window_min <= 60.0:
         raise click.BadParameter(f"{window_min:g} min: give 1 to 60", param_hint="--window-min")
     if flights < 2:

@@ -251,11 +251,12 @@ def command(
     folder: Path | None,
     as_json: bool,
 ) -> None:
-    """Connect to a running ArduPilot or PX4 SITL: truth, beacons, GNSS loss, and a table of position errors.
+    """Connect to a running ArduPilot or PX4 SITL.
 
-    Relays between autopilot and companion. Seconds count from the first message of the autopilot. Ends at
-    SIGINT or SIGTERM with a table; GNSS is switched on again. Exit codes: 1 the beacons cannot be read, 69
-    cannot listen on an address or no autopilot found, 73 the folder cannot be written.
+    Relays between autopilot and companion, and gives truth, beacons and GNSS loss. Seconds count from the
+    first message of the autopilot. Ends at SIGINT or SIGTERM with a table of position errors; GNSS is
+    switched on again. Exit codes: 1 the beacons cannot be read, 69 cannot listen on an address or no
+    autopilot found, 73 the folder cannot be written.
     """
     autopilot = _parse_address(connect, "--connect")
     other = _parse_address(companion, "--companion") if companion else None

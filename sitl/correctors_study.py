@@ -77,7 +77,10 @@ def fly(world: World, bank: bool = True) -> CorrectedFlight:
 @click.option("--name", "names", multiple=True, type=click.Choice(NAMES), help="Corrector; default: each.")
 @click.option("--seed", default=1, show_default=True, help="Seed of the flight.")
 def command(grade: str, names: tuple[str, ...], seed: int) -> None:
-    """Fly an INS without GNSS, corrected by airspeed, lines of position, stars or a second INS."""
+    """Fly an INS without GNSS, with each corrector.
+
+    Correctors are airspeed, lines of position, stars and a second INS.
+    """
     scenario = get_scenario("gnss-loss", seed=seed, grade=grade, beacons=())
     table = Table(title=f"{grade} INS, GNSS lost at 15 min, seed {seed}: error, m r.m.s. (claimed)")
     table.add_column("corrector")

@@ -371,7 +371,10 @@ def command(
     workers: int,
     as_json: bool,
 ) -> None:
-    """Fly with a healthy GNSS and one thing wrong, and every recording. Exit code 1 if harm is done."""
+    """Fly with a healthy GNSS and one thing wrong.
+
+    Replays every recording too. Exit code 1 if harm is done.
+    """
     if quick:
         seeds, minutes = 1, QUICK_MINUTES
     orders = list_orders(names or WRONG, channels or CHANNELS, seeds, minutes)

@@ -81,7 +81,10 @@ def apart_m(a: SchemeFlight, b: SchemeFlight) -> tuple[float, float]:
 @click.option("--channel", "channels", multiple=True, type=click.Choice(OWN_CHANNELS), help="Default: all.")
 @click.option("--seed", default=1, show_default=True, help="Seed of the flight.")
 def command(scenario: str, channels: Sequence[str], seed: int) -> None:
-    """Fly one scenario by each scheme; compare fixes used, guaranteed bounds and positions."""
+    """Fly one scenario by each correction scheme.
+
+    Compares fixes used, guaranteed bounds and positions.
+    """
     try:
         world = World(get_scenario(scenario, seed=seed))
     except ValueError as error:

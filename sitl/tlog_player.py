@@ -225,10 +225,11 @@ class PlayerRunner:
     help="Times real time; the client sees a clock that runs faster by this factor.",
 )
 def command(log: Path, connect: str, from_s: float, to_s: float, speed: float) -> None:
-    """Play back the autopilot of a telemetry log (.tlog) as if it were live.
+    """Play back the autopilot of a telemetry log (.tlog).
 
-    Starts when a client connects; ends with the log, at SIGINT or SIGTERM. Requests do not change the
-    recording. Exit codes: 1 the log cannot be played, 69 cannot listen on the address.
+    Plays as if it were live. Starts when a client connects; ends with the log, at SIGINT or SIGTERM.
+    Requests do not change the recording. Exit codes: 1 the log cannot be played, 69 cannot listen on the
+    address.
     """
     try:
         address = Address.parse(connect)

@@ -112,7 +112,10 @@ def fly(world: World, source: str, factor: float, bank: bool) -> FlownError:
 @click.option("--source", "sources", multiple=True, type=click.Choice(SOURCES), help="Default: each.")
 @click.option("--seed", default=1, show_default=True, help="Seed of the flight.")
 def command(scenario: str, sources: Sequence[str], seed: int) -> None:
-    """Fly with the sigma of one source stated wrong, with the bank of hypotheses and without."""
+    """Fly with the sigma of one source stated wrong.
+
+    Flies with the bank of hypotheses and without.
+    """
     try:
         flight: Scenario = get_scenario(scenario, seed=seed)
     except ValueError as error:

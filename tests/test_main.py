@@ -5,13 +5,15 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
+import click
 import pytest
 from click.testing import CliRunner
 
 from companion import __version__
-from companion.__main__ import cli
+from companion.command_line import cli
 
 COMMANDS = ("bench", "check-config", "doctor", "log", "loopback", "replay", "run", "sitl")
 CUT = Path(__file__).parent / "data" / "dronekit_copter_cut.tlog"
@@ -36,6 +38,26 @@ def test_help_fits_80_columns(arguments: list[str]) -> None:
     assert max(len(line) for line in done.output.splitlines()) <= 80
 
 
+def groups(context: click.Context) -> Iterator[click.Context]:
+    """Yield the context of each group of commands, the outermost first."""
+    assert isinstance(context.command, click.Group)
+    yield context
+    for name in context.command.list_commands(context):
+        command = context.command.get_command(context, name)
+        if isinstance(command, click.Group):
+            yield from groups(click.Context(command, context, name, terminal_width=80))
+
+
+def test_no_summary_is_cut_at_80_columns() -> None:
+    helps = {
+        context.info_name: context.get_help()
+        for context in groups(click.Context(cli, info_name="companion", terminal_width=80))
+    }
+    assert set(helps) >= {"companion", "log", "signing", "sitl", "study"}
+    lines = [line for text in helps.values() for line in text.splitlines()[1:]]
+    assert [line for line in lines if line.endswith("...")] == []
+
+
 def test_interrupt_ends_in_one_line_and_130(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "companion", "loopback", "--logs", str(tmp_path)]
     with subprocess.Popen(
@@ -54,9 +76,42 @@ def test_interrupt_ends_in_one_line_and_130(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    "command",
+    [
+        ["run", "--connect", "udpin:127.0.0.1:0", "--logs", "{folder}"],
+        ["loopback", "--logs", "{folder}"],
+        ["doctor", "--connect", "udpin:127.0.0.1:0"],
+        ["study", "weights-flown"],
+        ["report", str(CUT), "-o", "{folder}/report.html"],
+    ],
+    ids=lambda command: command[0],
+)
+def test_interrupt_at_any_time_of_the_start_is_quiet(tmp_path: Path, command: list[str]) -> None:
+    words = [word.format(folder=tmp_path) for word in command]
+    for delay_s in (0.05, 0.08, 0.12, 0.2, 0.3, 0.45, 0.6, 0.8, 1.2, 2.0):
+        with subprocess.Popen(
+            [sys.executable, "-m", "companion", *words],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+        ) as running:
+            time.sleep(delay_s)
+            running.send_signal(signal.SIGINT)
+            _, err = running.communicate()
+        if running.returncode == 130:
+            assert err.strip() == "companion: interrupted"
+        elif running.returncode != 0:  # 0: it had ended, or `run` closed its log
+            assert str(Path(__file__).parents[1] / "companion") not in err  # in Python's own start only
+
+
+@pytest.mark.parametrize(
     ("code", "absent"),
     [
-        ("from companion.__main__ import cli; cli(['--help'], standalone_mode=False)", ("numpy", "asyncio")),
+        (
+            "from companion.command_line import cli; cli(['--help'], standalone_mode=False)",
+            ("numpy", "asyncio"),
+        ),
         ("import companion.runtime.service", ("scipy", "companion.analysis", "sitl")),
     ],
 )

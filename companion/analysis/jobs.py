@@ -9,6 +9,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
+from companion import interrupt
 from companion.optional_dependencies import missing_package
 
 Job = TypeVar("Job")
@@ -51,9 +52,11 @@ def run_jobs(
     with ExitStack() as stack:
         cluster = None
         if scheduler is None:
+            interrupt.end_at_interrupt()  # a cluster that is still starting cannot be closed
             cluster = stack.enter_context(
                 LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address="127.0.0.1:0")
             )
+            interrupt.raise_at_interrupt()
         client = stack.enter_context(Client(scheduler or cluster))
         keys = {
             client.submit(work, job, key=key, retries=RETRIES, pure=False): key for key, job in jobs.items()

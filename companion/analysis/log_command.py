@@ -27,7 +27,10 @@ def group() -> None:
 @click.argument("log", type=click.Path(path_type=Path))
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
 def info_command(log: Path, as_json: bool) -> None:
-    """Show the contents of LOG: messages by topic, times, metadata, and whether it was closed."""
+    """Show the contents of LOG.
+
+    Prints messages by topic, times, metadata, and whether it was closed.
+    """
     try:
         with show_step(f"read {log}"):
             found = info(log)
@@ -43,7 +46,10 @@ def info_command(log: Path, as_json: bool) -> None:
 @group.command("recover")
 @click.argument("log", type=click.Path(path_type=Path))
 def recover_command(log: Path) -> None:
-    """Recover a torn or damaged LOG (x.mcap.active becomes x.mcap; x.mcap is copied to x.recovered.mcap)."""
+    """Recover a torn or damaged LOG.
+
+    x.mcap.active becomes x.mcap; x.mcap is copied to x.recovered.mcap.
+    """
     try:
         with show_step(f"recover {log}"):
             saved = recover(log)
@@ -62,7 +68,10 @@ def recover_command(log: Path) -> None:
 @click.argument("source", type=click.Path(path_type=Path))
 @click.option("-o", "--output", type=click.Path(path_type=Path), required=True, help="MCAP file to write.")
 def convert_command(source: Path, output: Path) -> None:
-    """Convert SOURCE, a log of another recorder, to MCAP: inputs and truth only, nothing computed."""
+    """Convert SOURCE, a log of another recorder, to MCAP.
+
+    Writes inputs and truth only, nothing computed.
+    """
     from companion.analysis import convert
 
     try:
@@ -93,7 +102,10 @@ def convert_command(source: Path, output: Path) -> None:
     help="Configuration for the log of another recorder.",
 )
 def export_command(log: Path, output: Path, every_s: float, config_file: Path | None) -> None:
-    """Export the map of LOG: the estimate by legs with and without fixes, GNSS, truth, beacons."""
+    """Export the map of LOG.
+
+    It has the estimate by legs with and without fixes, GNSS, truth and beacons.
+    """
     from companion.analysis import export
     from companion.analysis.flights import open_flights
     from companion.analysis.output_guard import reject_any_log, reject_own_input

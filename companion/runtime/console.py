@@ -17,8 +17,8 @@ from companion.runtime.status import Status
 from companion.units import SECOND_NS
 
 STATUS_INTERVAL = 60 * SECOND_NS
-#: Move to the status line that was printed last, and clear it.
-_REPLACE = "\x1b[1A\r\x1b[2K"
+#: Move to the status line that was printed last, and clear it and what is below, such as ^C.
+_REPLACE = "\x1b[1A\r\x1b[J"
 
 
 class Console:
@@ -49,7 +49,7 @@ class Console:
 
     def status(self, status: Status, now_ns: int) -> None:
         """Show the status; call it once a second."""
-        line = f"{self._seconds(now_ns):9.0f} {status.text()}"
+        line = f"{self._seconds(now_ns):5.0f} {status.text()}"
         if self._columns is not None:
             self._shown, before = line[: self._columns - 1], self._shown
             if self._shown != before:
@@ -58,6 +58,12 @@ class Console:
             self._next_status_ns = now_ns + STATUS_INTERVAL
             values = {"t_s": self._seconds(now_ns), **status._asdict()}
             self._write_line(json.dumps(values) if self._as_json else line)
+
+    def close(self) -> None:
+        """Clear the status line: what is printed next takes its place."""
+        if self._shown is not None:
+            self._shown = None
+            self._write_line(f"{_REPLACE}\x1b[1A")  # one line up, because writing a line goes one down
 
     def _print(self, line: str) -> None:
         if self._shown is None:

@@ -603,7 +603,7 @@ class CompanionCore:
     def status(self) -> Status:
         """Return the state for the status line."""
         connected = self.leading_link is not None
-        return Status.of(self._solution, connected, self._stale, self._inputs.missing)
+        return Status.of(self._solution, connected, self._stale, self._inputs.missing, self._inputs.slow)
 
     def _leading_link_note(self, link: Link) -> str:
         leading = self.leading_link

@@ -1,7 +1,7 @@
 """Input monitor: which inputs never arrived, are slow or have stopped, and what to do. No I/O, no clock.
 
     for event in monitor.update(link, config, now_ns): ...    # once a second
-    monitor.missing                                           # names for the status line
+    monitor.missing, monitor.slow                             # names for the status line
 
 Only what the navigator uses is reported, once when it has been missing for `PATIENCE`, and once when it is
 back. The table of used streams serves `companion doctor` too.
@@ -129,6 +129,7 @@ class InputMonitor:
 
     def __init__(self) -> None:
         self.missing: tuple[str, ...] = ()
+        self.slow: tuple[str, ...] = ()
         self._arrived: set[str] = set()
         self._bad_since: dict[str, int] = {}
         self._reported: set[str] = set()
@@ -138,7 +139,7 @@ class InputMonitor:
     def update(self, session: Session, config: Config, make: str, now_ns: int) -> list[Event]:
         """Return what went missing or came back on a link whose autopilot is received."""
         self._silence_reported = True  # of the start; a link lost later is an event of its own
-        events, missing = [], []
+        events, missing, slow = list[Event](), list[str](), list[str]()
         for state in stream_states(config, make, session.stream_rates.rates()):
             if not state.is_used or state.measured is None:
                 continue
@@ -153,12 +154,12 @@ class InputMonitor:
                 continue
             if now_ns - self._bad_since.setdefault(state.name, now_ns) < PATIENCE:
                 continue
-            missing.append(stream.what)
+            (slow if state.measured else missing).append(stream.what)
             if state.name not in self._reported:
                 self._reported.add(state.name)
                 text = f"{stream.what} ({state.name}) {self._trouble(state, stream)}"
                 events.append(Event(now_ns, now_ns, Severity.WARNING, text))
-        self.missing = tuple(dict.fromkeys(missing))
+        self.missing, self.slow = tuple(dict.fromkeys(missing)), tuple(dict.fromkeys(slow))
         return events
 
     def report_silence(self, sessions: Collection[tuple[str, Session, bool]], now_ns: int) -> list[Event]:

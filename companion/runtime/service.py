@@ -375,7 +375,8 @@ def command(
         columns=terminal_columns(),
     )
     try:
-        asyncio.run(run(config, console.event, base, kept, notes, console.status))
+        with contextlib.closing(console):
+            asyncio.run(run(config, console.event, base, kept, notes, console.status))
     except CannotListen as error:
         writer.write_line(f"companion: {error.strerror}")
         sys.exit(EX_UNAVAILABLE)

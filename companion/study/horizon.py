@@ -277,7 +277,7 @@ def command(
     as_json: bool,
     plot: Path | None,
 ) -> None:
-    """Print the guaranteed bounds as a function of the time since the last fix."""
+    """Print the guaranteed bounds by time since the last fix."""
     try:
         drift = None if drift_deg_h is None else drift_deg_h * DEG_PER_HOUR
         force = disturbance_ug * 1e-6 * G0

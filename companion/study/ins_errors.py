@@ -42,7 +42,10 @@ def eigenvalues(model: str, lat: float, v_north: float, v_east: float) -> list[c
 @click.option("--east-mps", type=click.FloatRange(-1000.0, 1000.0), default=0.0, help="Velocity east [m/s].")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 def command(lat_deg: float, north_mps: float, east_mps: float, as_json: bool) -> None:
-    """Print the natural frequencies of the INS error equations in rad/h."""
+    """Print the INS error equations' natural frequencies.
+
+    They are in rad/h.
+    """
     lat = math.radians(lat_deg)
     found = {name: eigenvalues(name, lat, north_mps, east_mps) for name in MODELS}
     if as_json:

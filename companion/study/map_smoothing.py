@@ -71,7 +71,10 @@ def long_record(N: int, seed: int = 1) -> Floats:
 @click.command("map")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 def command(as_json: bool) -> None:
-    """Solve the example of (6.4.12) by three algorithms, and show where shooting fails."""
+    """Solve the example of (6.4.12) by three algorithms.
+
+    Shows where shooting fails.
+    """
     found = solve(np.array(Z))
     lengths = (10, 60, 120)
     apart = {}

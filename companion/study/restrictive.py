@@ -259,7 +259,7 @@ def draw(
     help="Folder for figures 1-10.",
 )
 def command(names: tuple[str, ...], runs: int, seed: int, as_json: bool, plot: Path | None) -> None:
-    """Compare the minimax Kalman filter and the restrictive filter.
+    """Compare the minimax and the restrictive filter.
 
     The simulated flights have 16 states and last six hours, in unknown currents.
     """

@@ -113,7 +113,10 @@ def distance(fractions: FeedbackFractions, scale: float) -> float:
 @click.option("--seeds", type=click.IntRange(min=1), default=2, show_default=True, help="Flights per cell.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 def command(seeds: int, as_json: bool) -> None:
-    """Compare correction schemes of an INS by their errors, and show the law of their difference."""
+    """Compare correction schemes of an INS by their errors.
+
+    Shows the law of their difference.
+    """
     errors = {name: [rms(s, f, seeds) for s in (FINE, COARSE)] for name, f in SCHEMES.items()}
     apart = {name: [distance(f, s) for s in SCALES] for name, f in SCHEMES.items() if name != "feedforward"}
     if as_json:

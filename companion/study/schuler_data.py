@@ -191,7 +191,10 @@ def _rms(errors: Floats) -> float:
 def command(
     file: Path, window_min: str, ahead_min: str, sigma_mps: float, lat_deg: float, as_json: bool
 ) -> None:
-    """Predict recorded INS velocity errors; compare them with their bound and with simpler predictions."""
+    """Predict recorded INS velocity errors.
+
+    Compares them with their bound and with simpler predictions.
+    """
     try:
         recording = load(file)
         windows = [60.0 * float(word) for word in window_min.split(",")]

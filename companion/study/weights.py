@@ -414,9 +414,10 @@ def command(
     plot_file: Path | None,
     as_json: bool,
 ) -> None:
-    """Fuse readings by maximum likelihood; print what wrong weights, sigmas and correlations cost.
+    """Fuse readings by maximum likelihood.
 
-    Lengths may be in any one unit; results have the same.
+    Prints what wrong weights, sigmas and correlations cost. Lengths may be in any one unit; results have the
+    same.
     """
     try:
         given, pairs = _parse(readings, beacons, correlations)

@@ -8,8 +8,8 @@ import pytest
 from click.testing import CliRunner, Result
 
 from companion import records as r
-from companion.__main__ import cli
 from companion.analysis import replay_inputs
+from companion.command_line import cli
 from companion.config import Config, ConfigError
 from companion.storage import flight_log
 from companion.storage.reader import LogError

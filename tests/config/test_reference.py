@@ -9,7 +9,7 @@ import msgspec
 import pytest
 from click.testing import CliRunner
 
-from companion.__main__ import cli
+from companion.command_line import cli
 from companion.config import Config, ConfigError, load, to_toml
 from companion.config.presets import PRESETS, recommend_preset
 from companion.config.reference import TEXTS, UNITS, Key, commented_toml, keys, markdown

@@ -11,7 +11,7 @@ import click
 import pytest
 from click.testing import CliRunner
 
-from companion.__main__ import cli
+from companion.command_line import cli
 from companion.config import ConfigError
 from sitl.loopback import command as loopback
 

@@ -1,23 +1,29 @@
 """Console of `companion run`: events and one status line, on a terminal, in a journal and as JSON."""
 
 import json
+import re
 
-from companion.records import Event, Severity
+import pytest
+
+from companion.records import Event, Mode, Severity, Solution, Source, Trust
 from companion.runtime.console import Console
+from companion.runtime.input_monitor import STREAMS
 from companion.runtime.status import Status
 
 SECOND = 1_000_000_000
-STATUS = Status(True, "fixed", ("GNSS", "RANGE"), "normal", 1.234, 52.8, 7.7)
+STATUS = Status(True, "normal", "fixed", ("GNSS", "RANGE"), "normal", 1.234, 52.8, 7.7)
 
 
 def played(lines: list[str]) -> list[str]:
-    """What a terminal shows after these lines: the cursor moves up and clears a line."""
-    shown: list[str] = []
+    """What a terminal shows after these lines: the cursor moves up, and clears what is below."""
+    shown, row = list[str](), 0
     for line in "\n".join(lines).split("\n"):
-        while line.startswith("\x1b[1A\r\x1b[2K"):
-            line = line.removeprefix("\x1b[1A\r\x1b[2K")
-            shown.pop()
-        shown.append(line)
+        ups = line.count("\x1b[1A")
+        if "\x1b[J" in line:
+            del shown[row - 1 :]
+        row += 1 - ups
+        if text := re.sub(r"\x1b\[\w+|\r", "", line):
+            shown[row - 1 :] = [text]
     return shown
 
 
@@ -32,11 +38,22 @@ def test_terminal_has_one_status_line_below_all_events() -> None:
     for second in range(1, 5):
         console.status(STATUS, second * SECOND)
     console.event(event(4.5, "second"))
-    console.status(STATUS._replace(trust="degraded"), 5 * SECOND)
+    console.status(STATUS._replace(state="degraded"), 5 * SECOND)
     shown = played(lines)
     assert [line.split(maxsplit=1)[1] for line in shown[:2]] == ["first", "second"]
     (status,) = shown[2:]
-    assert "trust degraded" in status and len(status) < 80
+    assert "degraded GNSS+range" in status
+
+
+def test_status_line_is_cleared_at_the_end() -> None:
+    lines: list[str] = []
+    console = Console(lines.append, 0, columns=80)
+    console.event(event(0.1, "first"))
+    console.status(STATUS, SECOND)
+    console.event(event(1.5, "log: closed"))
+    console.close()
+    lines.append("$")
+    assert [line.split(maxsplit=1)[-1] for line in played(lines)] == ["first", "log: closed", "$"]
 
 
 def test_status_line_is_cut_to_the_terminal() -> None:
@@ -63,9 +80,56 @@ def test_json_lines_are_objects() -> None:
     assert (second["mode"], second["sources"], second["protection"]) == ("fixed", ["GNSS", "RANGE"], 52.8)
 
 
-def test_status_text_fits_80_columns_if_nothing_is_missing() -> None:
-    worst = Status(True, "predicting", ("GNSS", "AZIMUTH", "RANGE"), "predicting", 12345.6, 12345.6, 12345.6)
-    assert len(worst.text()) + 10 < 100
-    assert STATUS.text() == "fixed GNSS+RANGE, trust normal, sigma 1.2 m, protection 53 m, guaranteed 7.7 m"
-    assert len(STATUS.text()) + 10 <= 90
-    assert Status(True, "no solution", missing=("GNSS",)).text() == "no solution, missing: GNSS"
+def solution(mode: Mode, trust: Trust | None, sources: Source, metres: float) -> Solution:
+    """A solution whose lengths have as many digits as `metres`; the sigma of fixes is below 10 m."""
+    sigma = 9.8 if sources else metres
+    return Solution(
+        t_ns=SECOND,
+        rx_ns=SECOND,
+        mode=mode,
+        estimator="kalman",
+        lat=0.7,
+        lon=0.6,
+        alt_msl=1000.0,
+        v_n=(60.0, 0.0, 0.0),
+        covariance=(sigma**2, 0.0, 0.0, 0.0, 0.0, 4.0),
+        error_n=(0.0, 0.0),
+        velocity_error_n=(0.0, 0.0),
+        sources=Source.INERTIAL | sources,
+        horizon_s=0.0,
+        bound_n=(metres, 0.0),
+        protection=metres,
+        trust=trust,
+    )
+
+
+@pytest.mark.parametrize("missing", sorted({stream.what for stream in STREAMS.values() if stream.record}))
+@pytest.mark.parametrize("trust", [None, *Trust])
+@pytest.mark.parametrize("mode", Mode)
+def test_whole_status_fits_80_columns_with_one_input_missing(
+    mode: Mode, trust: Trust | None, missing: str
+) -> None:
+    gnss, beacon = Source.GNSS, (Source.AZIMUTH, Source.RANGE, Source.AZIMUTH | Source.RANGE)
+    used = [gnss, *beacon, *(gnss | part for part in beacon)] if mode is Mode.FIXED else [Source(0)]
+    for sources in used:
+        lines: list[str] = []
+        given = solution(mode, trust, sources, 999.0 if sources else 4999.0)
+        status = Status.of(given, connected=True, is_stale=False, missing=(missing,))
+        Console(lines.append, 0, columns=80).status(status, 99_999 * SECOND)
+        assert lines[0] == f"99999 {status.text()}"  # not cut
+        assert lines[0].endswith(" m") and f"no {missing}, " in lines[0]
+
+
+def test_status_names_the_state_then_what_is_missing_then_lengths() -> None:
+    assert STATUS.text() == "normal GNSS+range, sigma 1.2 HPL 53 bound 7.7 m"
+    both = STATUS._replace(sources=("GNSS", "AZIMUTH", "RANGE"), missing=("airspeed",), slow=("IMU",))
+    assert both.text() == "normal GNSS+beacon, no airspeed, slow IMU, sigma 1.2 HPL 53 bound 7.7 m"
+    assert both._replace(connected=False).text().startswith("normal GNSS+beacon, no autopilot, sigma")
+    assert Status(True, "no solution", missing=("GNSS",)).text() == "no solution, no GNSS"
+
+
+def test_fixes_that_are_back_while_trust_lags_are_recovering() -> None:
+    outage = solution(Mode.PREDICTING, Trust.PREDICTING, Source(0), 300.0)
+    back = solution(Mode.FIXED, Trust.PREDICTING, Source.GNSS, 300.0)
+    texts = [Status.of(given, True, False, ()).text() for given in (outage, back)]
+    assert [text.partition(",")[0] for text in texts] == ["predicting", "recovering GNSS"]

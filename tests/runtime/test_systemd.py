@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pytest
 
-from companion.__main__ import EX_CONFIG
+from companion.command_line import EX_CONFIG
 from companion.link import dialect, frame
 from companion.runtime.service import LOG_CHECK_S
 from companion.runtime.systemd import FEEDS_PER_TIMEOUT, SystemdNotifier

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
-from companion.__main__ import cli
+from companion.command_line import cli
 
 COMMANDS = (
     ["loopback", "--scenario", "short"],
