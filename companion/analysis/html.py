@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 from companion import __version__
 from companion.analysis import error_statistics
-from companion.analysis.assessment import TRUTH, Assessment
+from companion.analysis.assessment import Assessment, deviation
 from companion.analysis.drawing import to_page
 from companion.analysis.flight_events import phase_title, source_title, topic_name
 from companion.analysis.plot_data import Figure
@@ -30,10 +30,11 @@ from companion.analysis.verdict import Verdict, judge_flight
 from companion.importers.gnss_latency import describe_latency
 from companion.storage.run_metadata import CONFIGURATION
 
-#: Chapters in order: title and its figures.
+#: Chapters in order: title and its figures. The one without a title is "Errors", or "Distances" where there
+#: is no truth.
 CHAPTERS = (
     ("Map", ("map",)),
-    ("Errors", ("error", "bound")),
+    ("", ("error", "bound")),
     ("Sources", ("sources",)),
     ("Events", ()),
     ("Consistency", ("consistency",)),
@@ -188,22 +189,24 @@ def comparison_table(block: ReportBlock) -> Table:
         )
     head = ("log", "verdict", "lasts", "GNSS lost for", "r.m.s. with fixes", "without", "greatest", "against")
     same = len({a.reference.what if a.reference else "" for a in block.flights}) == 1
-    note = "" if same else "The errors are relative to different references; compare them with care."
+    note = "" if same else "The logs have different references; compare with care."
     return Table(head, rows, "cards", note, "Comparison")
 
 
 def _chapters(key: str, block: ReportBlock) -> list[Chapter]:
     """Return the chapters of one block; `key` is the prefix of its element ids."""
     drawn = {figure.key: figure for figure in block.figures}
+    errors = f"{deviation(*block.flights).title()}s"
     tables = {
-        "Errors": _phases,
+        errors: _phases,
         "Consistency": _consistency,
         "Sources": _rejections,
         "Messages and clock": _messages,
         "Events": _events,
     }
     chapters = []
-    for title, keys in CHAPTERS:
+    for name_of, keys in CHAPTERS:
+        title = name_of or errors
         figures = [(key + k, drawn[k]) for k in keys if k in drawn]
         found: list[Table] = []
         texts: list[Text] = []
@@ -225,7 +228,7 @@ def _chapters(key: str, block: ReportBlock) -> list[Chapter]:
 
 def _phases(a: Assessment) -> list[Table]:
     if not a.rows or not a.errors:
-        return [Table((), (), note="No errors are known: the log has neither a truth nor a track to smooth.")]
+        return [Table((), (), note="There is nothing to compare the estimate with.")]
     sources = [source for source in error_statistics.SOURCES if source in a.errors]
     titles = {
         error_statistics.CORRECTED: "estimate",
@@ -234,7 +237,7 @@ def _phases(a: Assessment) -> list[Table]:
         error_statistics.GNSS: "GNSS",
     }
     names = [titles.get(source, source) for source in sources]
-    head = ["phase", "from", "lasts", *names, "bound", "error / bound", "held", "within", "twice"]
+    head = ["phase", "from", "lasts", *names, "bound", f"{deviation(a)} / bound", "held", "within", "twice"]
     rows: list[list[str | Cell]] = []
     for row, phase in zip(a.rows, a.phases, strict=True):
         cells: list[str | Cell] = [
@@ -252,12 +255,16 @@ def _phases(a: Assessment) -> list[Table]:
         cells.append(NO_NUMBER if row.held is None else held)
         cells += [NO_NUMBER if k is None else f"{100.0 * k:.0f} %" for k in (row.inside, row.inside_twice)]
         rows.append(cells)
-    what = "Horizontal errors" if a.reference and a.reference.what == TRUTH else "Horizontal distances"
-    about = "" if a.reference is None else f"{what} from {a.reference.what}: r.m.s. / 95th percentile. "
+    what = deviation(a)
+    about = (
+        ""
+        if a.reference is None
+        else f"Horizontal {what}s from {a.reference.what}: r.m.s. / 95th percentile. "
+    )
     note = (
-        f"{about}The bound held if every error of the phase was within the bound of its moment. Within, "
-        "twice: share of moments with an error within the bound and twice the bound. No useful bound: above "
-        "ten times the error that the estimate claims, or above 5 km."
+        f"{about}The bound held if every {what} of the phase was within the bound of its moment. Within, "
+        f"twice: share of moments with the {what} within the bound and twice the bound. No useful bound: "
+        "above ten times the sigma that the estimate claims, or above 5 km."
     )
     return [Table(head, rows, "cards", note)]
 
@@ -269,16 +276,21 @@ def _both(rms: float, p95: float) -> str:
     return f"{first.split()[0] if same else first} / {second}"
 
 
+_CONSISTENCY = {
+    "NEES": "error of the estimate against the truth",
+    "NIS": "innovation of each fix",
+    "lines of position": "residuals of fixes from more of them than are needed",
+}
+
+
 def _consistency(a: Assessment) -> list[Table]:
     if not a.normalized_errors:
         return [Table((), (), note="The log has no data to compare with covariances.")]
     rows = [
         (m.what, f"{len(m.t)}", f"{m.mean:.2f}", f"{100.0 * m.inside:.1f} %") for m in a.normalized_errors
     ]
-    note = (
-        "NEES: error of the estimate against the truth. NIS: innovation of each fix. Fix residuals: those "
-        "of a fix from several lines of position. A consistent filter has a mean of about 1 and 95 % within."
-    )
+    shown = "".join(f"{m.what}: {_CONSISTENCY[m.what]}. " for m in a.normalized_errors)
+    note = f"{shown}A consistent filter has a mean of about 1 and 95 % within."
     return [Table(("what", "number", "mean / degrees of freedom", "within 95 %"), rows, note=note)]
 
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from companion.analysis import error_statistics, flight_events
-from companion.analysis.assessment import GNSS, SMOOTHED, TRUTH, Assessment
+from companion.analysis.assessment import GNSS, SMOOTHED, Assessment, deviation
 from companion.analysis.flight_events import WITHOUT_FIXES, phase_title, source_title
 from companion.units import Floats
 
@@ -67,8 +67,8 @@ def worst_of(a: Assessment) -> Worst:
 
 def describe_worst(a: Assessment) -> str:
     """Name the greatest distance of the estimate: an error only against a truth."""
-    if a.reference is None or a.reference.what == TRUTH:
-        return "greatest error"
+    if a.reference is None or a.against_truth:
+        return f"greatest {deviation(a)}"
     return f"greatest distance from {a.reference.what}"
 
 
@@ -141,20 +141,20 @@ def _flight_sentences(a: Assessment) -> list[str]:
 def _error_sentences(a: Assessment) -> list[str]:
     corrected = a.errors.get(error_statistics.CORRECTED)
     if corrected is None or a.reference is None:
-        return ["There is neither a truth nor a track to smooth, so the errors are unknown."]
+        return ["There is nothing to compare the estimate with: its accuracy is unknown."]
     found = zip(_split_errors(a), ("with fixes", "without"), strict=True)
     parts = [f"{format_length(_rms(error))} {how}" for error, how in found if len(error)]
     ins = a.errors.get(error_statistics.INS)
     beside = f"; the inertial channel alone {format_length(_rms(ins.error))}" if ins is not None else ""
-    true = a.reference.what == TRUTH
-    subject = "The error of the estimate" if true else f"The distance of the estimate from {a.reference.what}"
+    subject = f"The {deviation(a)} of the estimate"
+    subject += "" if a.against_truth else f" from {a.reference.what}"
     sentences = [
         f"{subject} was {' and '.join(parts)} (r.m.s.), {format_length(worst_of(a).estimate)} at most"
         f"{beside}."
     ]
     if a.reference.what == SMOOTHED:
         sentences.append(
-            "The smoothed track uses the same fixes and error model; errors common to both are not visible."
+            "The smoothed track uses the same fixes and model; what is wrong in both is not visible."
         )
         if (apart := gnss_contradiction(a)) is not None:
             sentences.append(
@@ -162,7 +162,7 @@ def _error_sentences(a: Assessment) -> list[str]:
                 "rejected: one of them is wrong, and the stated distances cannot be trusted."
             )
     elif a.reference.what == GNSS:
-        sentences.append("GNSS is not a truth: its own error is included in these numbers.")
+        sentences.append("GNSS may itself be off; these distances include that.")
     return sentences
 
 
@@ -208,8 +208,8 @@ def _bound_sentences(a: Assessment) -> list[str]:
         worst = min(broken, key=lambda row: row.inside or 0.0)
         found.append(
             f"The guaranteed bound{reached} was exceeded in {len(broken)} of {len(judged)} phases, most often"
-            f" in “{phase_title(worst.phase)}”: there the error was within it {_percent(worst.inside or 0.0)}"
-            f" of the time, over the flight {_percent(inside)}."
+            f" in “{phase_title(worst.phase)}”: there the {deviation(a)} was within it "
+            f"{_percent(worst.inside or 0.0)} of the time, over the flight {_percent(inside)}."
         )
     return found
 
@@ -248,8 +248,8 @@ def _anomalies(a: Assessment) -> list[str]:
             )
         if row.inside_twice is not None and row.inside_twice < CHEBYSHEV:
             found.append(
-                f"in the phase “{phase_title(row.phase)}” the error was within twice the bound of its moment "
-                f"only {_percent(row.inside_twice)} of the time, where at least 75 % are expected"
+                f"in the phase “{phase_title(row.phase)}” the {deviation(a)} was within twice the bound of "
+                f"its moment only {_percent(row.inside_twice)} of the time, where at least 75 % are expected"
             )
     for series in a.normalized_errors:
         if series.inside < CONSISTENT:

@@ -12,7 +12,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from companion.analysis import error_statistics, flight_events
-from companion.analysis.assessment import GNSS, TRUTH, Assessment
+from companion.analysis.assessment import GNSS, Assessment, deviation
 from companion.analysis.flight_arrays import Flight
 from companion.analysis.summary import (
     CONSISTENT,
@@ -53,7 +53,7 @@ def judge_flight(a: Assessment) -> Verdict:
 
 def _promise(a: Assessment) -> Level:
     """The level of a promise that was not kept."""
-    return "fault" if a.reference is not None and a.reference.what == TRUTH else "caution"
+    return "fault" if a.against_truth else "caution"
 
 
 def _no_estimate(a: Assessment) -> Verdict | None:
@@ -72,7 +72,7 @@ def _bound_broken(a: Assessment) -> Verdict | None:
         _promise(a),
         f"The guaranteed bound did not hold in the phase “{flight_events.phase_title(worst.phase)}”.",
         f"{worst.share:.2f} ×",
-        "the bound (r.m.s. error; limit 1)",
+        f"the bound (r.m.s. {deviation(a)}; limit 1)",
     )
 
 
@@ -84,8 +84,8 @@ def _moments_beyond_bound(a: Assessment) -> Verdict | None:
     worst = min(beyond, key=lambda row: row.inside or 0.0)
     return Verdict(
         "caution",
-        "At moments the error was above the guaranteed bound, which is one on the r.m.s. error; most often "
-        f"in the phase “{flight_events.phase_title(worst.phase)}”.",
+        f"At moments the {deviation(a)} was above the guaranteed bound, which is one on its r.m.s.; most "
+        f"often in the phase “{flight_events.phase_title(worst.phase)}”.",
         f"{100.0 * (worst.inside or 0.0):.1f} %",
         "of this phase within the bound",
     )
@@ -124,7 +124,7 @@ def _worse_than_inertial(a: Assessment) -> Verdict | None:
         f"In the phase “{flight_events.phase_title(row.phase)}” the estimate was worse than the inertial "
         f"channel alone, which had {format_length(ins)}.",
         format_length(ours),
-        "r.m.s. error of the estimate",
+        f"r.m.s. {deviation(a)} of the estimate",
     )
 
 
@@ -159,7 +159,7 @@ def _inconsistent(a: Assessment) -> Verdict | None:
     worst = min(small, key=lambda series: series.inside)
     return Verdict(
         "caution",
-        f"The stated sigmas are too small for the errors found ({worst.what}).",
+        f"The stated sigmas are too small for what was found ({worst.what}).",
         f"{100.0 * worst.inside:.0f} %",
         "within the 95 % limit",
     )
@@ -179,7 +179,7 @@ def _rejections(a: Assessment) -> Verdict | None:
     return Verdict(
         "caution",
         f"Fixes of {flight_events.source_title(longest.source)} were rejected from "
-        f"{format_time(longest.start)}; without a truth it cannot be confirmed that this was right.",
+        f"{format_time(longest.start)}; whether this was right, the log cannot show.",
         format_duration(longest.end - longest.start),
         "of fixes rejected",
     )
@@ -200,7 +200,7 @@ def _torn_or_reset(a: Assessment) -> Verdict | None:
 def _no_reference(a: Assessment) -> Verdict | None:
     if a.reference is not None and error_statistics.CORRECTED in a.errors:
         return None
-    return Verdict("caution", "There is nothing to compare the estimate with.", "unknown", "error")
+    return Verdict("caution", "There is nothing to compare the estimate with.", "unknown", "accuracy")
 
 
 def _kept(a: Assessment) -> Verdict:

@@ -24,10 +24,10 @@ from companion.analysis.figures import build_figures
 from companion.analysis.flight_arrays import collect_flights
 from companion.analysis.flight_events import describe_rejections, topic_name
 from companion.analysis.flights import open_flights
-from companion.analysis.html import comparison_table
+from companion.analysis.html import comparison_table, render_report
 from companion.analysis.plot_data import thin_line
 from companion.analysis.replay import command as replay_command
-from companion.analysis.report import command, comparison_block
+from companion.analysis.report import blocks_of_log, command, comparison_block
 from companion.analysis.summary import format_duration, format_length, format_time, summarize_flight, worst_of
 from companion.analysis.verdict import judge_flight
 from companion.config import Config, load, to_toml
@@ -290,7 +290,7 @@ def test_estimate_worse_than_the_inertial_channel_is_an_anomaly():
 def test_reference_without_truth_is_named():
     a = assess_flight(flight(truth=False, receiver=1))  # no fix of the receiver in use: nothing to smooth
     assert a.reference.what == assessing.GNSS
-    assert "GNSS is not a truth" in sentences(a)
+    assert "GNSS may itself be off" in sentences(a)
     assert error_statistics.GNSS not in a.errors  # GNSS is the reference itself
 
 
@@ -394,6 +394,27 @@ def test_there_is_no_error_without_a_truth():
     assert figure.title == "Distance from GNSS itself"
     assert "The error of the estimate" not in sentences(a)
     assert "The distance of the estimate from GNSS itself was" in sentences(a)
+
+
+def visible_text(page):
+    """What a reader sees: no script, style or configuration; of the figures the names of their lines."""
+    (data,) = re.findall(r'id="figures">(.*?)</script>', page, re.DOTALL)
+    names = [line["name"] for figure in json.loads(data).values() for line in figure["lines"]]
+    page = re.sub(r"<(script|style|pre)\b.*?</\1>", "", page, flags=re.DOTALL)
+    return html.unescape(re.sub(r"<[^>]+>", " ", page)) + " ".join(names)
+
+
+@pytest.mark.parametrize(
+    "kind", [{}, {"bound": (3.0, 3.0)}, {"sigma": 1.0}, {"bound": None, "protection": 4.0}], ids=str
+)
+def test_the_whole_page_has_no_error_without_a_truth(kind):
+    pytest.importorskip("jinja2")
+    words = re.compile(r"(?i)[^.]*\b(?:errors?|tru\w+|actual\w*|NEES)\b[^.]*")
+    shown = visible_text(render_report("r", blocks_of_log([flight(truth=False, receiver=1, **kind)])))
+    assert "Distances" in shown and "Distance from GNSS itself" in shown
+    assert words.findall(shown) == []
+    against_truth = visible_text(render_report("r", blocks_of_log([flight(**kind)])))
+    assert "Error of the position" in against_truth and "NEES: error of the estimate" in against_truth
 
 
 def test_durations_and_times_are_formatted():
