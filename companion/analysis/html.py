@@ -18,6 +18,7 @@ from companion.analysis.drawing import to_page
 from companion.analysis.flight_events import phase_title, source_title, topic_name
 from companion.analysis.plot_data import Figure
 from companion.analysis.summary import (
+    count_held,
     describe_worst,
     format_duration,
     format_length,
@@ -157,14 +158,16 @@ def _summary(a: Assessment, name: str) -> Summary:
 
 def _tiles(a: Assessment) -> list[tuple[str, str]]:
     longest = max((outage.end - outage.start for outage in a.outages), default=0.0)
-    held = [row.held for row in a.rows if row.held is not None]
     worst = worst_of(a)
     return [
         ("duration", format_duration(a.flight.seconds)),
         ("longest without GNSS", format_duration(longest) if longest else "never lost"),
         (describe_worst(a), format_length(worst.estimate)),
         ("farthest GNSS fix", format_length(worst.gnss)),
-        ("bound held in phases", f"{sum(held)} of {len(held)}" if held else NO_NUMBER),
+        (
+            "bound held in phases",
+            count_held(a) if any(row.bound is not None for row in a.rows) else NO_NUMBER,
+        ),
     ]
 
 

@@ -72,6 +72,11 @@ def describe_worst(a: Assessment) -> str:
     return f"greatest distance from {a.reference.what}"
 
 
+def count_held(a: Assessment) -> str:
+    """Return in how many phases the guaranteed bound was useful and held, of how many: "3 of 5"."""
+    return f"{sum(row.held is True for row in a.rows)} of {len(a.rows)}"
+
+
 def summarize_flight(a: Assessment) -> list[str]:
     """Return the sentences."""
     return [

@@ -16,6 +16,8 @@ from companion.analysis.assessment import GNSS, Assessment, deviation
 from companion.analysis.flight_arrays import Flight
 from companion.analysis.summary import (
     CONSISTENT,
+    SHORT_S,
+    count_held,
     describe_worst,
     format_duration,
     format_length,
@@ -152,6 +154,27 @@ def _untrusted(a: Assessment) -> Verdict | None:
     )
 
 
+def _unlimited(a: Assessment) -> Verdict | None:
+    """Nothing limited the position in a phase without fixes: no useful guaranteed bound, no protection level.
+
+    A bound of no use alone is no caution: in flight the position is trusted by its protection level.
+    """
+    solution = a.flight.tables["Solution"]
+    seconds = 0.0
+    for row, phase in zip(a.rows, a.phases, strict=True):
+        if phase.name in flight_events.WITHOUT_FIXES and row.seconds >= SHORT_S and not row.useful:
+            inside = (solution["t"] >= phase.start_ns * 1e-9) & (solution["t"] < phase.end_ns * 1e-9)
+            seconds += row.seconds * (not np.isfinite(solution["protection"][inside]).any())
+    if not seconds:
+        return None
+    return Verdict(
+        "caution",
+        "Without fixes nothing limited the position: no useful guaranteed bound and no protection level.",
+        format_duration(seconds),
+        "without a limit",
+    )
+
+
 def _inconsistent(a: Assessment) -> Verdict | None:
     small = [series for series in a.normalized_errors if series.inside < CONSISTENT]
     if not small:
@@ -205,8 +228,6 @@ def _no_reference(a: Assessment) -> Verdict | None:
 
 def _kept(a: Assessment) -> Verdict:
     worst = worst_of(a).estimate
-    judged = [row for row in a.rows if row.held is not None]
-    held = "the guaranteed bound held in every phase that has one" if judged else "no bound was stated"
     longest = max((outage.end - outage.start for outage in a.outages), default=0.0)
     happened = (
         f"GNSS was lost for up to {format_duration(longest)}" if longest else "GNSS had a fix throughout"
@@ -214,7 +235,17 @@ def _kept(a: Assessment) -> Verdict:
     if (rejected := _longest_rejection(a)) is not None:
         seconds = format_duration(rejected.end - rejected.start)
         happened += f", {flight_events.source_title(rejected.source)} was rejected for {seconds}"
-    return Verdict("good", f"{happened}, and {held}.", format_length(worst), describe_worst(a))
+    reason = f"{happened}, and {_describe_bound(a)}."
+    return Verdict("good", reason, format_length(worst), describe_worst(a))
+
+
+def _describe_bound(a: Assessment) -> str:
+    """Say in how many phases the guaranteed bound held; it was exceeded in none."""
+    if not any(row.useful for row in a.rows):
+        return "no phase has a useful guaranteed bound"
+    if all(row.useful for row in a.rows):
+        return "the guaranteed bound held in every phase"
+    return f"the guaranteed bound held in {count_held(a)} phases; it was of no use in the others"
 
 
 _RULES: tuple[Callable[[Assessment], Verdict | None], ...] = (
@@ -227,6 +258,7 @@ _RULES: tuple[Callable[[Assessment], Verdict | None], ...] = (
     _untrusted,
     _no_reference,
     _inconsistent,
+    _unlimited,
     _rejections,
     _torn_or_reset,
 )

@@ -322,6 +322,10 @@ def test_flights_are_compared_in_one_table_and_in_the_same_axes(assessed):
             "worse than the inertial",
         ),
         ({"bound": (3.0, 3.0), "truth": False, "receiver": 1}, "caution", "15.17 ×", "did not hold"),
+        ({"bound": None}, "caution", "2 min", "no useful guaranteed bound and no protection level"),
+        ({"bound": (6e3, 6e3)}, "caution", "2 min", "Without fixes nothing limited"),
+        ({"bound": (6e3, 6e3), "protection": 9.0}, "good", "5.0 m", "no phase has a useful guaranteed bound"),
+        ({"bound": None, "protection": 9.0}, "good", "5.0 m", "no phase has a useful guaranteed bound"),
         ({"sigma": 1.0}, "caution", "0 %", "sigmas are too small"),
     ],
 )
@@ -329,6 +333,14 @@ def test_verdict_names_the_number_that_decides(kind, level, number, reason):
     verdict = judge_flight(assess_flight(flight(**kind)))
     assert (verdict.level, verdict.number) == (level, number)
     assert reason in verdict.reason
+
+
+def test_phases_without_a_useful_bound_are_counted():
+    a = assess_flight(flight(protection=9.0))
+    rows = [a.rows[0], a.rows[1]._replace(held=None, share=None, inside=None), a.rows[2]]
+    verdict = judge_flight(dataclasses.replace(a, rows=rows))
+    assert verdict.level == "good"
+    assert "held in 2 of 3 phases; it was of no use in the others" in verdict.reason
 
 
 def test_moments_above_the_bound_are_no_fault():
