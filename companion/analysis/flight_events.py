@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from itertools import groupby
 from typing import NamedTuple
 
@@ -89,16 +90,20 @@ def split_phases(solution: Table, seconds: float) -> list[error_statistics.Fligh
         for mode, sources in zip(solution["mode"], solution["sources"], strict=True)
     ]
     runs: list[tuple[str, float]] = []
+    lasting: defaultdict[str, float] = defaultdict(float)
     k = 0
     for name, group in groupby(names):
         count = len(list(group))
         end = k + count
         duration = (solution["t"][end] if end < len(names) else seconds) - solution["t"][k]
+        lasting[name] += duration
         if not runs or (duration >= PHASE_MIN_S and runs[-1][0] != name):
             runs.append((name, float(solution["t"][k])))
         k = end
     if len(runs) > 1 and runs[1][1] - runs[0][1] < PHASE_MIN_S:
         runs[:2] = [(runs[1][0], runs[0][1])]
+    if len(runs) == 1:  # nothing else lasted long enough, perhaps not even the first
+        runs = [(max(lasting, key=lambda name: lasting[name]), runs[0][1])]
     starts = [round(start * 1e9) for _, start in runs] + [round(seconds * 1e9)]
     return [error_statistics.FlightPhase(name, starts[i], starts[i + 1]) for i, (name, _) in enumerate(runs)]
 

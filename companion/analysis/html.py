@@ -19,6 +19,7 @@ from companion.analysis.flight_events import phase_title, source_title, topic_na
 from companion.analysis.plot_data import Figure
 from companion.analysis.summary import (
     count_held,
+    describe_outage,
     describe_worst,
     format_duration,
     format_length,
@@ -157,11 +158,10 @@ def _summary(a: Assessment, name: str) -> Summary:
 
 
 def _tiles(a: Assessment) -> list[tuple[str, str]]:
-    longest = max((outage.end - outage.start for outage in a.outages), default=0.0)
     worst = worst_of(a)
     return [
         ("duration", format_duration(a.flight.seconds)),
-        ("longest without GNSS", format_duration(longest) if longest else "never lost"),
+        ("longest without GNSS", describe_outage(a)),
         (describe_worst(a), format_length(worst.estimate)),
         ("farthest GNSS fix", format_length(worst.gnss)),
         (
@@ -175,7 +175,7 @@ def comparison_table(block: ReportBlock) -> Table:
     """Return a row for each flight of a block: verdict, duration, outage, errors."""
     rows = []
     for a, name in zip(block.flights, block.names, strict=True):
-        verdict, longest = judge_flight(a), max((o.end - o.start for o in a.outages), default=0.0)
+        verdict = judge_flight(a)
         reference = NO_NUMBER if a.reference is None else a.reference.what
         with_fixes, without = rms_by_fixes(a)
         rows.append(
@@ -183,7 +183,7 @@ def comparison_table(block: ReportBlock) -> Table:
                 name,
                 Cell(verdict.word, verdict.level),
                 format_duration(a.flight.seconds),
-                format_duration(longest) if longest else "never",
+                describe_outage(a),
                 format_length(with_fixes),
                 format_length(without),
                 format_length(worst_of(a).estimate),
@@ -230,7 +230,9 @@ def _chapters(key: str, block: ReportBlock) -> list[Chapter]:
 
 
 def _phases(a: Assessment) -> list[Table]:
-    if not a.rows or not a.errors:
+    if not a.rows:
+        return [Table((), (), note="There is no estimate.")]
+    if not a.errors:
         return [Table((), (), note="There is nothing to compare the estimate with.")]
     sources = [source for source in error_statistics.SOURCES if source in a.errors]
     titles = {

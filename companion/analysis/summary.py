@@ -10,7 +10,13 @@ import numpy as np
 
 from companion.analysis import error_statistics, flight_events
 from companion.analysis.assessment import GNSS, SMOOTHED, Assessment, deviation
-from companion.analysis.flight_events import WITHOUT_FIXES, phase_title, source_title
+from companion.analysis.flight_events import (
+    OUTAGE_MIN_S,
+    WITHOUT_FIXES,
+    phase_title,
+    source_title,
+    usable_gnss,
+)
 from companion.units import Floats
 
 FAR_M = 30.0  # a greater median distance between GNSS and the smoothed track is a contradiction
@@ -79,14 +85,40 @@ def count_held(a: Assessment) -> str:
 
 def summarize_flight(a: Assessment) -> list[str]:
     """Return the sentences."""
+    estimated = len(a.flight.tables["Solution"]["t"]) > 0
     return [
         *_flight_sentences(a),
-        *_error_sentences(a),
-        *_bound_sentences(a),
+        *(_error_sentences(a) if estimated else []),
+        *(_bound_sentences(a) if estimated else []),
         *_rejection_sentences(a),
         *_anomalies(a),
         *a.flight.remarks,
     ]
+
+
+def describe_gnss(a: Assessment) -> str:
+    """Say what became of GNSS over the flight, without a full stop."""
+    if absent := _absent_gnss(a):
+        return f"GNSS was {absent}"
+    if a.outages:
+        return f"GNSS was lost for up to {describe_outage(a)}"
+    first, start = float(usable_gnss(a.flight)["rx"].min()), float(a.flight.tables["Solution"]["t"][0])
+    if first > start + OUTAGE_MIN_S:
+        return f"GNSS had a fix from {format_time(first)} on"
+    return "GNSS had a fix throughout"
+
+
+def describe_outage(a: Assessment) -> str:
+    """Return the longest time without GNSS, or why there is none."""
+    longest = max((outage.end - outage.start for outage in a.outages), default=0.0)
+    return _absent_gnss(a) or (format_duration(longest) if longest else "never lost")
+
+
+def _absent_gnss(a: Assessment) -> str:
+    """Return how GNSS was missing all the time, empty if it ever had a fix."""
+    if len(usable_gnss(a.flight)["t"]):
+        return ""
+    return "received without a fix" if len(a.flight.tables["Gnss"]["t"]) else "never received"
 
 
 def rms_by_fixes(a: Assessment) -> tuple[float, float]:
@@ -119,20 +151,22 @@ def _flight_sentences(a: Assessment) -> list[str]:
     if not len(a.flight.tables["Solution"]["t"]):
         return [f"{duration}, without an estimate."]
     sentences = [f"{duration}."]
-    started = float(a.flight.tables["Solution"]["t"][0])
-    outages = [outage for outage in a.outages if outage.end > started]
-    if not outages:
-        sentences.append("GNSS had a fix throughout.")
+    alone = _seconds_without_fixes(a)
+    if not a.outages:
+        unused = alone > 0.0 and not _absent_gnss(a)
+        but = f", but was not used for {format_duration(alone)}" if unused else ""
+        alone = 0.0 if unused else alone
+        sentences.append(f"{describe_gnss(a)}{but}.")
     else:
-        longest = max(outages, key=lambda outage: outage.end - outage.start)
-        times = "once" if len(outages) == 1 else f"{len(outages)} times"
+        longest = max(a.outages, key=lambda outage: outage.end - outage.start)
+        times = "once" if len(a.outages) == 1 else f"{len(a.outages)} times"
         until = "to the end" if longest.end >= seconds else f"to {format_time(longest.end)}"
-        which = "for" if len(outages) == 1 else "longest for"
+        which = "for" if len(a.outages) == 1 else "longest for"
         span = format_duration(longest.end - longest.start)
         sentences.append(
             f"GNSS was lost {times}, {which} {span} (from {format_time(longest.start)} {until})."
         )
-    if alone := _seconds_without_fixes(a):
+    if alone:
         sentences.append(f"The position was predicted without any fix for {format_duration(alone)}.")
     untrusted = [phase for phase in a.phases if phase.name == "untrusted"]
     if untrusted:

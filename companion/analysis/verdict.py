@@ -18,6 +18,7 @@ from companion.analysis.summary import (
     CONSISTENT,
     SHORT_S,
     count_held,
+    describe_gnss,
     describe_worst,
     format_duration,
     format_length,
@@ -49,8 +50,7 @@ class Verdict(NamedTuple):
 
 def judge_flight(a: Assessment) -> Verdict:
     """Return the verdict: that of the first rule that applies."""
-    found = (rule(a) for rule in _RULES)
-    return next((verdict for verdict in found if verdict is not None), _kept(a))
+    return next((verdict for rule in _RULES if (verdict := rule(a)) is not None), None) or _kept(a)
 
 
 def _promise(a: Assessment) -> Level:
@@ -61,7 +61,7 @@ def _promise(a: Assessment) -> Level:
 def _no_estimate(a: Assessment) -> Verdict | None:
     if len(a.flight.tables["Solution"]["t"]):
         return None
-    return Verdict("fault", f"There is no estimate. {missing_input(a.flight)}", "none", "positions estimated")
+    return Verdict("fault", f"There is no estimate. {missing_input(a.flight)}", "0", "positions estimated")
 
 
 def _bound_broken(a: Assessment) -> Verdict | None:
@@ -228,10 +228,7 @@ def _no_reference(a: Assessment) -> Verdict | None:
 
 def _kept(a: Assessment) -> Verdict:
     worst = worst_of(a).estimate
-    longest = max((outage.end - outage.start for outage in a.outages), default=0.0)
-    happened = (
-        f"GNSS was lost for up to {format_duration(longest)}" if longest else "GNSS had a fix throughout"
-    )
+    happened = describe_gnss(a)
     if (rejected := _longest_rejection(a)) is not None:
         seconds = format_duration(rejected.end - rejected.start)
         happened += f", {flight_events.source_title(rejected.source)} was rejected for {seconds}"

@@ -10,6 +10,7 @@ import math
 import re
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 from click.testing import CliRunner
@@ -28,7 +29,14 @@ from companion.analysis.html import comparison_table, render_report
 from companion.analysis.plot_data import thin_line
 from companion.analysis.replay import command as replay_command
 from companion.analysis.report import blocks_of_log, command, comparison_block
-from companion.analysis.summary import format_duration, format_length, format_time, summarize_flight, worst_of
+from companion.analysis.summary import (
+    describe_outage,
+    format_duration,
+    format_length,
+    format_time,
+    summarize_flight,
+    worst_of,
+)
 from companion.analysis.verdict import judge_flight
 from companion.config import Config, load, to_toml
 from companion.nav.geometry import displace
@@ -74,7 +82,7 @@ def flight_records(
 ):
     """Five minutes eastwards at 20 m/s; GNSS lost from LOST to FOUND, rejected for 2 s at 60 s.
 
-    With receiver 1 no fix is used.
+    With receiver 1 no fix is used. `unused`: GNSS is not lost, but not used either.
     """
     one = load(flags={"gnss.second_receiver": False}, environment={})
     rows = [Tuning(START, START, to_toml(one))] if receiver else []
@@ -86,7 +94,7 @@ def flight_records(
         if truth:
             rows.append(Truth(t, t, lat, lon, 100.0, (0.0, 20.0, 0.0)))
         glitch = 60.0 <= second < 62.0
-        if not lost:
+        if not lost or more.get("unused"):
             off = 500.0 if glitch else 0.0
             place = displace(lat, lon, 0.0, off, 0.0, 0.0)
             rows.append(Gnss(t, t + 50_000_000, receiver, k, 3, place.lat, place.lon, 100.0, 2.0))
@@ -281,6 +289,45 @@ def test_summary_describes_the_flight(assessed):
         assert words in text_of_summary
 
 
+def collected(records):
+    (found,) = collect_flights(((flight_log.topic_of(type(r)), r) for r in records), "made.mcap")
+    return assess_flight(found)
+
+
+@pytest.mark.parametrize(
+    ("fix", "state"), [(None, "never received"), (1, "received without a fix")], ids=["no message", "no fix"]
+)
+def test_gnss_that_never_had_a_fix_was_not_kept(fix, state):
+    records = (r for r in flight_records() if fix or not isinstance(r, Gnss))
+    a = collected(msgspec.structs.replace(r, fix=fix) if isinstance(r, Gnss) else r for r in records)
+    assert f"GNSS was {state}. The position was predicted without any fix for 2 min." in sentences(a)
+    assert describe_outage(a) == state
+    assert judge_flight(a).reason.startswith(f"GNSS was {state}, and the guaranteed bound held")
+
+
+def test_gnss_that_is_there_but_not_used_is_reported_so():
+    text = sentences(assess_flight(flight(unused=True)))
+    assert "GNSS had a fix throughout, but was not used for 2 min." in text
+    assert "predicted without any fix" not in text
+
+
+def test_gnss_that_comes_late_was_not_there_throughout():
+    late = START + 60 * S
+    a = collected(r for r in flight_records(unused=True) if not isinstance(r, Gnss) or r.t_ns >= late)
+    assert "GNSS had a fix from 1:00 on" in sentences(a)
+
+
+def test_short_flight_is_named_by_what_lasted_longest():
+    """A second of prediction before four of GNSS: both are too short for a phase of their own."""
+    cut = START + LOST * S
+    solutions = [r for r in flight_records() if isinstance(r, Solution)]
+    lost = [r for r in solutions if r.t_ns >= cut][:5]
+    rest = [r for r in solutions if r.t_ns < cut][:20]
+    moved = [msgspec.structs.replace(r, t_ns=START + k * S // 5) for k, r in enumerate([*lost, *rest])]
+    a = collected(msgspec.structs.replace(r, rx_ns=r.t_ns) for r in moved)
+    assert [phase.name for phase in a.phases] == ["GNSS"]
+
+
 def test_estimate_worse_than_the_inertial_channel_is_an_anomaly():
     assert "worse than the inertial channel alone" in sentences(
         assess_flight(flight(error=(30.0, 40.0), ins=(3.0, 4.0)))
@@ -384,8 +431,9 @@ def test_a_flight_without_an_estimate_names_what_is_missing(kinds, wanted):
     records = [Event(START, START, 6, "x"), *(made[kind] for kind in kinds)]
     (empty,) = collect_flights(((flight_log.topic_of(type(r)), r) for r in records), "made.mcap")
     verdict = judge_flight(assess_flight(empty))
-    assert (verdict.level, verdict.number) == ("fault", "none")
+    assert (verdict.level, verdict.number) == ("fault", "0")
     assert wanted in verdict.reason
+    assert not re.search("compare|bound|error", sentences(assess_flight(empty)))
 
 
 def test_no_number_of_the_text_is_greater_than_the_cards(assessed):
