@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections import defaultdict
 from itertools import groupby
 from typing import NamedTuple
@@ -242,7 +243,7 @@ def build_timeline(
     flight: Flight, groups: list[RejectionGroup], outages: list[OutageInterval]
 ) -> list[TimelineEntry]:
     """Merge the entries of the log with grouped rejections, outages and glitch flags of the autopilot."""
-    lines = list(flight.log_entries)
+    lines = [line._replace(text=event_title(line.text)) for line in flight.log_entries]
     lines += [TimelineEntry(group.start, "rejected", 4, describe_rejections(group)) for group in groups]
     lines += [
         TimelineEntry(
@@ -257,13 +258,60 @@ def build_timeline(
     return sorted(lines)
 
 
+#: Reason of a rejection: for the user, and its value and limit with their unit. Other reasons state their own
+#: numbers.
+_REASONS = {
+    "late: not used": ("too late", "{value:.1f} s old (limit {limit:g} s)"),
+    "older than the oldest kept state: not used": ("from before the estimate began", "{value:.1f} s old"),
+    "late, and the last late answers were rejected: not used": (
+        "late, as rejected ones before",
+        "{value:.1f} s",
+    ),
+    "no channel at its time": ("no inertial channel at its time", ""),
+    "excluded: false with probability": ("source excluded", "false with probability {value:.4g}"),
+    "outlier: normalised squared innovation": ("outlier", "squared innovation {value:.4g} sigma²"),
+    "airspeed too low for the speed over ground: not used": (
+        "airspeed too low for the speed over ground",
+        "{value:.1f} m/s (limit {limit:g} m/s)",
+    ),
+    "its time stands still": ("its time stands still", "for {value:.1f} s"),
+    "it is frozen: old numbers under a new time": (
+        "frozen: old numbers under a new time",
+        "for {value:.1f} s",
+    ),
+    "TIMESYNC reply of another clock": ("TIMESYNC reply of another clock", "{value:.3g} s off"),
+}
+#: Texts of the navigator's events, for the user.
+_EVENTS = (
+    (r"^navigation fixed: (.*) fixes$", r"position from \1"),
+    (r"^navigation predicting: ", "position predicted: "),
+    (r"^navigation untrusted: ", "position not to be trusted: "),
+    (r"\bgnss\b", "GNSS"),
+    (r"\brsbn (?=\d)", "beacon "),
+    (r"^position from (GNSS and )?(azimuth|range)", r"position from \1beacon \2"),
+    (r"\bby imu\b", "by IMU"),
+    (r"^(?:sitl|(?:serial|udpin|udpout|tcp|tcpin):\S+): ", ""),
+)
+
+
+def reason_title(reason: str) -> str:
+    """Return the reason of a rejection for the user."""
+    return _REASONS.get(reason, (reason, ""))[0]
+
+
+def event_title(text: str) -> str:
+    """Return the text of an event for the user."""
+    for pattern, words in _EVENTS:
+        text = re.sub(pattern, words, text)
+    return text
+
+
 def describe_reason(group: RejectionGroup) -> str:
     """Describe why a group was rejected, with the worst value and its limit."""
-    if not math.isfinite(group.value):
-        return group.reason
-    if not math.isfinite(group.limit):
-        return f"{group.reason} {group.value:.4g}"
-    return f"{group.reason} {group.value:.4g} (limit {group.limit:.4g})"
+    title, numbers = _REASONS.get(group.reason, (group.reason, ""))
+    if not numbers or not math.isfinite(group.value):
+        return title
+    return f"{title}, {numbers.format(value=group.value, limit=group.limit)}"
 
 
 def describe_rejections(group: RejectionGroup) -> str:

@@ -15,7 +15,8 @@ from companion import __version__
 from companion.analysis import error_statistics
 from companion.analysis.assessment import Assessment, deviation
 from companion.analysis.drawing import to_page
-from companion.analysis.flight_events import phase_title, source_title, topic_name
+from companion.analysis.flight_arrays import TimelineEntry
+from companion.analysis.flight_events import phase_title, reason_title, source_title, topic_name
 from companion.analysis.plot_data import Figure
 from companion.analysis.summary import (
     count_held,
@@ -30,6 +31,7 @@ from companion.analysis.summary import (
 )
 from companion.analysis.verdict import Verdict, judge_flight
 from companion.importers.gnss_latency import describe_latency
+from companion.records import Severity
 from companion.storage.run_metadata import CONFIGURATION
 
 #: Chapters in order: title and its figures. The one without a title is "Errors", or "Distances" where there
@@ -309,7 +311,14 @@ def _rejections(a: Assessment) -> list[Table]:
         known[1] += 1
         known[3] = group.end
     rows = [
-        (source_title(source), reason, f"{n:.0f}", f"{events:.0f}", format_time(first), format_time(last))
+        (
+            source_title(source),
+            reason_title(reason),
+            f"{n:.0f}",
+            f"{events:.0f}",
+            format_time(first),
+            format_time(last),
+        )
         for (source, reason), (n, events, first, last) in counts.items()
     ]
     return [Table(("rejected", "reason", "number", "events", "first", "last"), rows, "cards")]
@@ -345,10 +354,17 @@ def _messages(a: Assessment) -> list[Table]:
 
 
 def _events(a: Assessment) -> list[Table]:
-    rows = [(format_time(line.t), line.kind, line.text) for line in a.timeline[:EVENTS]]
+    rows = [(format_time(line.t), _severity(line), line.text) for line in a.timeline[:EVENTS]]
     more = len(a.timeline) - len(rows)
     note = f"{more} more events are in the log." if more else ""
     return [Table(("at", "what", "text"), rows, "events", note)]
+
+
+def _severity(line: TimelineEntry) -> Cell:
+    """Return what a line of the timeline is: an event by its severity, in the colour of it."""
+    name = Severity(line.severity).name.lower() if line.kind == "event" else line.kind
+    warns, fails = line.severity <= Severity.WARNING, line.severity <= Severity.ERROR
+    return Cell(name, "fault" if fails else "caution" if warns else "")
 
 
 def _configuration(a: Assessment, heading: str) -> list[Text]:

@@ -258,6 +258,8 @@ def _rejection_sentences(a: Assessment) -> list[str]:
     if not fixes:
         return ["No fix was rejected."]
     total = sum(group.number for group in fixes)
+    if total == 1:  # one rejection in a flight is usual; it is in the table
+        return []
     largest = max(fixes, key=lambda group: group.number)
     far = (
         f", up to {format_length(largest.metres)} from the estimate" if math.isfinite(largest.metres) else ""
@@ -265,7 +267,7 @@ def _rejection_sentences(a: Assessment) -> list[str]:
     when = f"from {format_time(largest.start)} to {format_time(largest.end)}"
     if largest.number == 1:
         when = f"at {format_time(largest.start)}"
-    rejected = "1 fix was rejected" if total == 1 else f"{total} fixes were rejected"
+    rejected = f"{total} fixes were rejected"
     if len(fixes) == 1:
         return [f"{rejected}, {when}: {flight_events.describe_reason(largest)}{far}."]
     return [

@@ -23,7 +23,7 @@ from companion.analysis.assessment import assess_flight
 from companion.analysis.convert import convert_log
 from companion.analysis.figures import build_figures
 from companion.analysis.flight_arrays import collect_flights
-from companion.analysis.flight_events import describe_rejections, topic_name
+from companion.analysis.flight_events import describe_rejections, event_title, topic_name
 from companion.analysis.flights import open_flights
 from companion.analysis.html import comparison_table, render_report
 from companion.analysis.plot_data import thin_line
@@ -396,6 +396,44 @@ def test_moments_above_the_bound_are_no_fault():
     verdict = judge_flight(dataclasses.replace(a, rows=rows))
     assert (verdict.level, verdict.number) == ("caution", "91.2 %")
     assert "At moments the error was above the guaranteed bound" in verdict.reason
+
+
+@pytest.mark.parametrize(
+    ("logged", "shown"),
+    [
+        (
+            "navigation fixed: gnss and azimuth and range fixes",
+            "position from GNSS and beacon azimuth and range",
+        ),
+        ("navigation fixed: azimuth and range fixes", "position from beacon azimuth and range"),
+        ("navigation predicting: no fixes", "position predicted: no fixes"),
+        ("rsbn 7 range is used again", "beacon 7 range is used again"),
+        ("udpin:0.0.0.0:14550: autopilot 1 rebooted", "autopilot 1 rebooted"),
+        ("EKF3 IMU0 is using GPS", "EKF3 IMU0 is using GPS"),
+    ],
+)
+def test_events_are_in_words_for_users(logged, shown):
+    assert event_title(logged) == shown
+
+
+def test_rejections_have_units_and_a_single_one_is_not_in_the_lead():
+    records = [*flight_records(), Rejection(START, START, "gnss 0", "late: not used", 260.6, 6.0)]
+    records = [r for r in records if not isinstance(r, Rejection) or r.limit == 6.0]
+    a = collected(records)
+    assert describe_rejections(a.groups[0]).startswith(
+        "GNSS 0 rejected once: too late, 260.6 s old (limit 6 s)"
+    )
+    assert "rejected" not in sentences(a)
+
+
+def test_warnings_of_the_events_table_have_their_severity_and_colour():
+    pytest.importorskip("jinja2")
+    warning = Event(START + S, START + S, 4, "low battery")
+    (found,) = collect_flights(
+        ((flight_log.topic_of(type(r)), r) for r in [*flight_records(), warning]), "made.mcap"
+    )
+    page = render_report("r", blocks_of_log([found]))
+    assert re.search(r'class="caution">warning</td><td data-label="text">low battery', page)
 
 
 def test_every_kind_of_record_has_a_name_for_users():
