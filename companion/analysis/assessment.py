@@ -79,11 +79,21 @@ class Assessment:
     rates: list[MessageRate]
     timeline: list[TimelineEntry]
 
+    @property
+    def against_truth(self) -> bool:
+        """Whether the reference is the truth; another track may be wrong itself."""
+        return self.reference is not None and self.reference.what == TRUTH
+
     def north_east(self, lat: Floats, lon: Floats) -> tuple[Floats, Floats]:
         """Convert to a local plane at the first position of the flight, m; for maps."""
         R_N, R_E = radii(self.origin[0])
         lat_0, lon_0 = self.origin
         return (lat - lat_0) * R_N, _wrap(lon - lon_0) * R_E * math.cos(lat_0)
+
+
+def deviation(*flights: Assessment) -> str:
+    """Return the word for what is measured against the reference: an error only against a truth."""
+    return "error" if all(a.against_truth for a in flights) else "distance"
 
 
 def assess_flight(flight: Flight) -> Assessment:
@@ -255,7 +265,7 @@ def _normalized_errors(flight: Flight, reference: ReferenceTrack | None) -> list
         ):  # a single GNSS position with a height has no residual
             found.append(
                 NormalizedErrors(
-                    "fix residuals",
+                    "lines of position",
                     fix["t"][redundant],
                     fix["cost"][redundant],
                     fix["degrees_of_freedom"][redundant],

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from companion.analysis import error_statistics, flight_events
-from companion.analysis.assessment import TRUTH, Assessment, chi2_95
+from companion.analysis.assessment import Assessment, chi2_95, deviation
 from companion.analysis.flight_arrays import AHEAD
 from companion.analysis.map_figure import build_map
 from companion.analysis.plot_data import (
@@ -107,31 +107,44 @@ def _error(axes: _Axes) -> Figure:
             level = s["protection"]
             lines.append(axes.line("protection level", "second", which, s["t"], level, dash=True, width=1.1))
     references = dict.fromkeys(a.reference.what for a in axes.flights if a.reference is not None)
-    true = set(references) == {TRUTH}
     return axes.over_time(
         "error",
-        "Error of the position" if true else f"Distance from {' or '.join(references) or 'a reference'}",
+        "Error of the position"
+        if deviation(*axes.flights) == "error"
+        else f"Distance from {' or '.join(references) or 'a reference'}",
         "m",
         lines,
-        "Logarithmic. Shaded: no fixes. The r.m.s. error must stay below the guaranteed bound, every error "
-        "below the protection level." + ("" if true else " The reference is not a truth."),
+        f"Logarithmic. Shaded: no fixes. {_limits(axes)}",
         log=True,
     )
 
 
+def _limits(axes: _Axes) -> str:
+    """Say what the guaranteed bound and the protection level limit."""
+    if deviation(*axes.flights) == "error":
+        return (
+            "The r.m.s. error must stay below the guaranteed bound, every error below the protection level."
+        )
+    return (
+        "The guaranteed bound and the protection level limit how far the estimate is from where the aircraft "
+        "was; the reference may itself be off."
+    )
+
+
 def _ratio(axes: _Axes) -> Figure:
+    what = deviation(*axes.flights)
     lines = []
     for which, a, prefix in axes.each():
         if (e := a.errors.get(error_statistics.CORRECTED)) is not None and np.isfinite(e.bound).any():
             share = np.maximum(e.error / e.bound, 1e-4)
-            name = f"{prefix}error / bound"
+            name = f"{prefix}{what} / bound"
             lines.append(axes.line(name, error_statistics.CORRECTED, which, _seconds(e), share))
     return axes.over_time(
         "bound",
-        "Error divided by the guaranteed bound",
+        f"{what.title()} divided by the guaranteed bound",
         "× bound",
         lines,
-        "Above 1 the error exceeded the bound. The bound limits the r.m.s. error of a phase: single moments "
+        f"Above 1 the {what} exceeded the bound. The bound limits the r.m.s. of a phase: single moments "
         "above 1 are allowed.",
         log=True,
         level=1.0,
@@ -139,7 +152,7 @@ def _ratio(axes: _Axes) -> Figure:
 
 
 def _misfit(axes: _Axes) -> Figure:
-    roles = {"NEES": error_statistics.CORRECTED, "fix residuals": error_statistics.RSBN}
+    roles = {"NEES": error_statistics.CORRECTED, "lines of position": error_statistics.RSBN}
     lines = []
     for which, a, prefix in axes.each():
         for series in a.normalized_errors:
@@ -149,11 +162,11 @@ def _misfit(axes: _Axes) -> Figure:
             lines.append(axes.line(prefix + series.what, role, which, series.t, value, style=style))
     return axes.over_time(
         "consistency",
-        "Do errors fit their stated sigmas?",
+        "Consistency with the stated sigmas",
         "× limit",
         lines,
-        "Squared errors divided by their covariance and by the 95 % limit of chi-square. About 5 % of the "
-        "values should be above 1; if none are, the sigmas are too large.",
+        "Squared deviations divided by their covariance and by the 95 % limit of chi-square. About 5 % "
+        "of the values should be above 1; if none are, the sigmas are too large.",
         log=True,
         level=1.0,
     )
@@ -164,6 +177,7 @@ def _misfit(axes: _Axes) -> Figure:
 
 def _inertial(axis: str) -> Callable[[_Axes], Figure]:
     def build(axes: _Axes) -> Figure:
+        true = deviation(*axes.flights) == "error"
         lines = []
         for which, a, prefix in axes.each():
             s = a.flight.tables["Solution"]
@@ -179,10 +193,13 @@ def _inertial(axis: str) -> Callable[[_Axes], Figure]:
             lines.append(axes.line(f"{prefix}estimated", error_statistics.INS, which, s["t"], estimated))
         return axes.over_time(
             f"inertial_{axis}",
-            f"Error of the inertial channel, {axis}",
+            f"{'Error' if true else 'Correction'} of the inertial channel, {axis}",
             "m",
             lines,
-            "The estimated error, which is subtracted; the actual one; the bound where there were no fixes.",
+            "The estimated error, which is subtracted; the actual one; the bound where there were no fixes."
+            if true
+            else "What the estimate subtracts; the distance of the inertial channel from the reference; the "
+            "bound where there were no fixes.",
             view=_near([line for line in lines if not line.dash]),
         )
 
@@ -216,11 +233,11 @@ def _ahead(axes: _Axes) -> Figure:
                         lines.append(axes.line(name, roles[i], which, s["t"][known], y, dash=dash))
     return axes.over_time(
         "ahead",
-        "Predicted error, as reported in flight",
+        "Predicted uncertainty, as reported in flight",
         "m",
         lines,
-        "What the r.m.s. error would be some minutes later if all fixes were lost: guaranteed bound, and "
-        "(dashed) the value that least squares claims under white noise.",
+        "How uncertain the position would be some minutes later if all fixes were lost (r.m.s.): guaranteed "
+        "bound, and (dashed) the value that least squares claims under white noise.",
         log=True,
     )
 

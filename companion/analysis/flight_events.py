@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import re
+from collections import defaultdict
 from itertools import groupby
 from typing import NamedTuple
 
@@ -89,16 +91,20 @@ def split_phases(solution: Table, seconds: float) -> list[error_statistics.Fligh
         for mode, sources in zip(solution["mode"], solution["sources"], strict=True)
     ]
     runs: list[tuple[str, float]] = []
+    lasting: defaultdict[str, float] = defaultdict(float)
     k = 0
     for name, group in groupby(names):
         count = len(list(group))
         end = k + count
         duration = (solution["t"][end] if end < len(names) else seconds) - solution["t"][k]
+        lasting[name] += duration
         if not runs or (duration >= PHASE_MIN_S and runs[-1][0] != name):
             runs.append((name, float(solution["t"][k])))
         k = end
     if len(runs) > 1 and runs[1][1] - runs[0][1] < PHASE_MIN_S:
         runs[:2] = [(runs[1][0], runs[0][1])]
+    if len(runs) == 1:  # nothing else lasted long enough, perhaps not even the first
+        runs = [(max(lasting, key=lambda name: lasting[name]), runs[0][1])]
     starts = [round(start * 1e9) for _, start in runs] + [round(seconds * 1e9)]
     return [error_statistics.FlightPhase(name, starts[i], starts[i + 1]) for i, (name, _) in enumerate(runs)]
 
@@ -237,7 +243,7 @@ def build_timeline(
     flight: Flight, groups: list[RejectionGroup], outages: list[OutageInterval]
 ) -> list[TimelineEntry]:
     """Merge the entries of the log with grouped rejections, outages and glitch flags of the autopilot."""
-    lines = list(flight.log_entries)
+    lines = [line._replace(text=event_title(line.text)) for line in flight.log_entries]
     lines += [TimelineEntry(group.start, "rejected", 4, describe_rejections(group)) for group in groups]
     lines += [
         TimelineEntry(
@@ -252,13 +258,60 @@ def build_timeline(
     return sorted(lines)
 
 
+#: Reason of a rejection: for the user, and its value and limit with their unit. Other reasons state their own
+#: numbers.
+_REASONS = {
+    "late: not used": ("too late", "{value:.1f} s old (limit {limit:g} s)"),
+    "older than the oldest kept state: not used": ("from before the estimate began", "{value:.1f} s old"),
+    "late, and the last late answers were rejected: not used": (
+        "late, as rejected ones before",
+        "{value:.1f} s",
+    ),
+    "no channel at its time": ("no inertial channel at its time", ""),
+    "excluded: false with probability": ("source excluded", "false with probability {value:.4g}"),
+    "outlier: normalised squared innovation": ("outlier", "squared innovation {value:.4g} sigma²"),
+    "airspeed too low for the speed over ground: not used": (
+        "airspeed too low for the speed over ground",
+        "{value:.1f} m/s (limit {limit:g} m/s)",
+    ),
+    "its time stands still": ("its time stands still", "for {value:.1f} s"),
+    "it is frozen: old numbers under a new time": (
+        "frozen: old numbers under a new time",
+        "for {value:.1f} s",
+    ),
+    "TIMESYNC reply of another clock": ("TIMESYNC reply of another clock", "{value:.3g} s off"),
+}
+#: Texts of the navigator's events, for the user.
+_EVENTS = (
+    (r"^navigation fixed: (.*) fixes$", r"position from \1"),
+    (r"^navigation predicting: ", "position predicted: "),
+    (r"^navigation untrusted: ", "position not to be trusted: "),
+    (r"\bgnss\b", "GNSS"),
+    (r"\brsbn (?=\d)", "beacon "),
+    (r"^position from (GNSS and )?(azimuth|range)", r"position from \1beacon \2"),
+    (r"\bby imu\b", "by IMU"),
+    (r"^(?:sitl|(?:serial|udpin|udpout|tcp|tcpin):\S+): ", ""),
+)
+
+
+def reason_title(reason: str) -> str:
+    """Return the reason of a rejection for the user."""
+    return _REASONS.get(reason, (reason, ""))[0]
+
+
+def event_title(text: str) -> str:
+    """Return the text of an event for the user."""
+    for pattern, words in _EVENTS:
+        text = re.sub(pattern, words, text)
+    return text
+
+
 def describe_reason(group: RejectionGroup) -> str:
     """Describe why a group was rejected, with the worst value and its limit."""
-    if not math.isfinite(group.value):
-        return group.reason
-    if not math.isfinite(group.limit):
-        return f"{group.reason} {group.value:.4g}"
-    return f"{group.reason} {group.value:.4g} (limit {group.limit:.4g})"
+    title, numbers = _REASONS.get(group.reason, (group.reason, ""))
+    if not numbers or not math.isfinite(group.value):
+        return title
+    return f"{title}, {numbers.format(value=group.value, limit=group.limit)}"
 
 
 def describe_rejections(group: RejectionGroup) -> str:

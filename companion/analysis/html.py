@@ -13,11 +13,14 @@ from typing import Any, NamedTuple
 
 from companion import __version__
 from companion.analysis import error_statistics
-from companion.analysis.assessment import TRUTH, Assessment
+from companion.analysis.assessment import Assessment, deviation
 from companion.analysis.drawing import to_page
-from companion.analysis.flight_events import phase_title, source_title, topic_name
+from companion.analysis.flight_arrays import TimelineEntry
+from companion.analysis.flight_events import phase_title, reason_title, source_title, topic_name
 from companion.analysis.plot_data import Figure
 from companion.analysis.summary import (
+    count_held,
+    describe_outage,
     describe_worst,
     format_duration,
     format_length,
@@ -28,12 +31,14 @@ from companion.analysis.summary import (
 )
 from companion.analysis.verdict import Verdict, judge_flight
 from companion.importers.gnss_latency import describe_latency
+from companion.records import Severity
 from companion.storage.run_metadata import CONFIGURATION
 
-#: Chapters in order: title and its figures.
+#: Chapters in order: title and its figures. The one without a title is "Errors", or "Distances" where there
+#: is no truth.
 CHAPTERS = (
     ("Map", ("map",)),
-    ("Errors", ("error", "bound")),
+    ("", ("error", "bound")),
     ("Sources", ("sources",)),
     ("Events", ()),
     ("Consistency", ("consistency",)),
@@ -155,15 +160,16 @@ def _summary(a: Assessment, name: str) -> Summary:
 
 
 def _tiles(a: Assessment) -> list[tuple[str, str]]:
-    longest = max((outage.end - outage.start for outage in a.outages), default=0.0)
-    held = [row.held for row in a.rows if row.held is not None]
     worst = worst_of(a)
     return [
         ("duration", format_duration(a.flight.seconds)),
-        ("longest without GNSS", format_duration(longest) if longest else "never lost"),
+        ("longest without GNSS", describe_outage(a)),
         (describe_worst(a), format_length(worst.estimate)),
         ("farthest GNSS fix", format_length(worst.gnss)),
-        ("bound held in phases", f"{sum(held)} of {len(held)}" if held else NO_NUMBER),
+        (
+            "bound held in phases",
+            count_held(a) if any(row.bound is not None for row in a.rows) else NO_NUMBER,
+        ),
     ]
 
 
@@ -171,7 +177,7 @@ def comparison_table(block: ReportBlock) -> Table:
     """Return a row for each flight of a block: verdict, duration, outage, errors."""
     rows = []
     for a, name in zip(block.flights, block.names, strict=True):
-        verdict, longest = judge_flight(a), max((o.end - o.start for o in a.outages), default=0.0)
+        verdict = judge_flight(a)
         reference = NO_NUMBER if a.reference is None else a.reference.what
         with_fixes, without = rms_by_fixes(a)
         rows.append(
@@ -179,7 +185,7 @@ def comparison_table(block: ReportBlock) -> Table:
                 name,
                 Cell(verdict.word, verdict.level),
                 format_duration(a.flight.seconds),
-                format_duration(longest) if longest else "never",
+                describe_outage(a),
                 format_length(with_fixes),
                 format_length(without),
                 format_length(worst_of(a).estimate),
@@ -188,22 +194,24 @@ def comparison_table(block: ReportBlock) -> Table:
         )
     head = ("log", "verdict", "lasts", "GNSS lost for", "r.m.s. with fixes", "without", "greatest", "against")
     same = len({a.reference.what if a.reference else "" for a in block.flights}) == 1
-    note = "" if same else "The errors are relative to different references; compare them with care."
+    note = "" if same else "The logs have different references; compare with care."
     return Table(head, rows, "cards", note, "Comparison")
 
 
 def _chapters(key: str, block: ReportBlock) -> list[Chapter]:
     """Return the chapters of one block; `key` is the prefix of its element ids."""
     drawn = {figure.key: figure for figure in block.figures}
+    errors = f"{deviation(*block.flights).title()}s"
     tables = {
-        "Errors": _phases,
+        errors: _phases,
         "Consistency": _consistency,
         "Sources": _rejections,
         "Messages and clock": _messages,
         "Events": _events,
     }
     chapters = []
-    for title, keys in CHAPTERS:
+    for name_of, keys in CHAPTERS:
+        title = name_of or errors
         figures = [(key + k, drawn[k]) for k in keys if k in drawn]
         found: list[Table] = []
         texts: list[Text] = []
@@ -224,8 +232,10 @@ def _chapters(key: str, block: ReportBlock) -> list[Chapter]:
 
 
 def _phases(a: Assessment) -> list[Table]:
-    if not a.rows or not a.errors:
-        return [Table((), (), note="No errors are known: the log has neither a truth nor a track to smooth.")]
+    if not a.rows:
+        return [Table((), (), note="There is no estimate.")]
+    if not a.errors:
+        return [Table((), (), note="There is nothing to compare the estimate with.")]
     sources = [source for source in error_statistics.SOURCES if source in a.errors]
     titles = {
         error_statistics.CORRECTED: "estimate",
@@ -234,7 +244,7 @@ def _phases(a: Assessment) -> list[Table]:
         error_statistics.GNSS: "GNSS",
     }
     names = [titles.get(source, source) for source in sources]
-    head = ["phase", "from", "lasts", *names, "bound", "error / bound", "held", "within", "twice"]
+    head = ["phase", "from", "lasts", *names, "bound", f"{deviation(a)} / bound", "held", "within", "twice"]
     rows: list[list[str | Cell]] = []
     for row, phase in zip(a.rows, a.phases, strict=True):
         cells: list[str | Cell] = [
@@ -252,12 +262,16 @@ def _phases(a: Assessment) -> list[Table]:
         cells.append(NO_NUMBER if row.held is None else held)
         cells += [NO_NUMBER if k is None else f"{100.0 * k:.0f} %" for k in (row.inside, row.inside_twice)]
         rows.append(cells)
-    what = "Horizontal errors" if a.reference and a.reference.what == TRUTH else "Horizontal distances"
-    about = "" if a.reference is None else f"{what} from {a.reference.what}: r.m.s. / 95th percentile. "
+    what = deviation(a)
+    about = (
+        ""
+        if a.reference is None
+        else f"Horizontal {what}s from {a.reference.what}: r.m.s. / 95th percentile. "
+    )
     note = (
-        f"{about}The bound held if every error of the phase was within the bound of its moment. Within, "
-        "twice: share of moments with an error within the bound and twice the bound. No useful bound: above "
-        "ten times the error that the estimate claims, or above 5 km."
+        f"{about}The bound held if every {what} of the phase was within the bound of its moment. Within, "
+        f"twice: share of moments with the {what} within the bound and twice the bound. No useful bound: "
+        "above ten times the sigma that the estimate claims, or above 5 km."
     )
     return [Table(head, rows, "cards", note)]
 
@@ -269,16 +283,21 @@ def _both(rms: float, p95: float) -> str:
     return f"{first.split()[0] if same else first} / {second}"
 
 
+_CONSISTENCY = {
+    "NEES": "error of the estimate against the truth",
+    "NIS": "innovation of each fix",
+    "lines of position": "residuals of fixes from more of them than are needed",
+}
+
+
 def _consistency(a: Assessment) -> list[Table]:
     if not a.normalized_errors:
         return [Table((), (), note="The log has no data to compare with covariances.")]
     rows = [
         (m.what, f"{len(m.t)}", f"{m.mean:.2f}", f"{100.0 * m.inside:.1f} %") for m in a.normalized_errors
     ]
-    note = (
-        "NEES: error of the estimate against the truth. NIS: innovation of each fix. Fix residuals: those "
-        "of a fix from several lines of position. A consistent filter has a mean of about 1 and 95 % within."
-    )
+    shown = "".join(f"{m.what}: {_CONSISTENCY[m.what]}. " for m in a.normalized_errors)
+    note = f"{shown}A consistent filter has a mean of about 1 and 95 % within."
     return [Table(("what", "number", "mean / degrees of freedom", "within 95 %"), rows, note=note)]
 
 
@@ -292,7 +311,14 @@ def _rejections(a: Assessment) -> list[Table]:
         known[1] += 1
         known[3] = group.end
     rows = [
-        (source_title(source), reason, f"{n:.0f}", f"{events:.0f}", format_time(first), format_time(last))
+        (
+            source_title(source),
+            reason_title(reason),
+            f"{n:.0f}",
+            f"{events:.0f}",
+            format_time(first),
+            format_time(last),
+        )
         for (source, reason), (n, events, first, last) in counts.items()
     ]
     return [Table(("rejected", "reason", "number", "events", "first", "last"), rows, "cards")]
@@ -328,10 +354,17 @@ def _messages(a: Assessment) -> list[Table]:
 
 
 def _events(a: Assessment) -> list[Table]:
-    rows = [(format_time(line.t), line.kind, line.text) for line in a.timeline[:EVENTS]]
+    rows = [(format_time(line.t), _severity(line), line.text) for line in a.timeline[:EVENTS]]
     more = len(a.timeline) - len(rows)
     note = f"{more} more events are in the log." if more else ""
     return [Table(("at", "what", "text"), rows, "events", note)]
+
+
+def _severity(line: TimelineEntry) -> Cell:
+    """Return what a line of the timeline is: an event by its severity, in the colour of it."""
+    name = Severity(line.severity).name.lower() if line.kind == "event" else line.kind
+    warns, fails = line.severity <= Severity.WARNING, line.severity <= Severity.ERROR
+    return Cell(name, "fault" if fails else "caution" if warns else "")
 
 
 def _configuration(a: Assessment, heading: str) -> list[Text]:

@@ -9,8 +9,14 @@ from typing import NamedTuple
 import numpy as np
 
 from companion.analysis import error_statistics, flight_events
-from companion.analysis.assessment import GNSS, SMOOTHED, TRUTH, Assessment
-from companion.analysis.flight_events import WITHOUT_FIXES, phase_title, source_title
+from companion.analysis.assessment import GNSS, SMOOTHED, Assessment, deviation
+from companion.analysis.flight_events import (
+    OUTAGE_MIN_S,
+    WITHOUT_FIXES,
+    phase_title,
+    source_title,
+    usable_gnss,
+)
 from companion.units import Floats
 
 FAR_M = 30.0  # a greater median distance between GNSS and the smoothed track is a contradiction
@@ -67,21 +73,52 @@ def worst_of(a: Assessment) -> Worst:
 
 def describe_worst(a: Assessment) -> str:
     """Name the greatest distance of the estimate: an error only against a truth."""
-    if a.reference is None or a.reference.what == TRUTH:
-        return "greatest error"
+    if a.reference is None or a.against_truth:
+        return f"greatest {deviation(a)}"
     return f"greatest distance from {a.reference.what}"
+
+
+def count_held(a: Assessment) -> str:
+    """Return in how many phases the guaranteed bound was useful and held, of how many: "3 of 5"."""
+    return f"{sum(row.held is True for row in a.rows)} of {len(a.rows)}"
 
 
 def summarize_flight(a: Assessment) -> list[str]:
     """Return the sentences."""
+    estimated = len(a.flight.tables["Solution"]["t"]) > 0
     return [
         *_flight_sentences(a),
-        *_error_sentences(a),
-        *_bound_sentences(a),
+        *(_error_sentences(a) if estimated else []),
+        *(_bound_sentences(a) if estimated else []),
         *_rejection_sentences(a),
         *_anomalies(a),
         *a.flight.remarks,
     ]
+
+
+def describe_gnss(a: Assessment) -> str:
+    """Say what became of GNSS over the flight, without a full stop."""
+    if absent := _absent_gnss(a):
+        return f"GNSS was {absent}"
+    if a.outages:
+        return f"GNSS was lost for up to {describe_outage(a)}"
+    first, start = float(usable_gnss(a.flight)["rx"].min()), float(a.flight.tables["Solution"]["t"][0])
+    if first > start + OUTAGE_MIN_S:
+        return f"GNSS had a fix from {format_time(first)} on"
+    return "GNSS had a fix throughout"
+
+
+def describe_outage(a: Assessment) -> str:
+    """Return the longest time without GNSS, or why there is none."""
+    longest = max((outage.end - outage.start for outage in a.outages), default=0.0)
+    return _absent_gnss(a) or (format_duration(longest) if longest else "never lost")
+
+
+def _absent_gnss(a: Assessment) -> str:
+    """Return how GNSS was missing all the time, empty if it ever had a fix."""
+    if len(usable_gnss(a.flight)["t"]):
+        return ""
+    return "received without a fix" if len(a.flight.tables["Gnss"]["t"]) else "never received"
 
 
 def rms_by_fixes(a: Assessment) -> tuple[float, float]:
@@ -114,20 +151,22 @@ def _flight_sentences(a: Assessment) -> list[str]:
     if not len(a.flight.tables["Solution"]["t"]):
         return [f"{duration}, without an estimate."]
     sentences = [f"{duration}."]
-    started = float(a.flight.tables["Solution"]["t"][0])
-    outages = [outage for outage in a.outages if outage.end > started]
-    if not outages:
-        sentences.append("GNSS had a fix throughout.")
+    alone = _seconds_without_fixes(a)
+    if not a.outages:
+        unused = alone > 0.0 and not _absent_gnss(a)
+        but = f", but was not used for {format_duration(alone)}" if unused else ""
+        alone = 0.0 if unused else alone
+        sentences.append(f"{describe_gnss(a)}{but}.")
     else:
-        longest = max(outages, key=lambda outage: outage.end - outage.start)
-        times = "once" if len(outages) == 1 else f"{len(outages)} times"
+        longest = max(a.outages, key=lambda outage: outage.end - outage.start)
+        times = "once" if len(a.outages) == 1 else f"{len(a.outages)} times"
         until = "to the end" if longest.end >= seconds else f"to {format_time(longest.end)}"
-        which = "for" if len(outages) == 1 else "longest for"
+        which = "for" if len(a.outages) == 1 else "longest for"
         span = format_duration(longest.end - longest.start)
         sentences.append(
             f"GNSS was lost {times}, {which} {span} (from {format_time(longest.start)} {until})."
         )
-    if alone := _seconds_without_fixes(a):
+    if alone:
         sentences.append(f"The position was predicted without any fix for {format_duration(alone)}.")
     untrusted = [phase for phase in a.phases if phase.name == "untrusted"]
     if untrusted:
@@ -141,20 +180,20 @@ def _flight_sentences(a: Assessment) -> list[str]:
 def _error_sentences(a: Assessment) -> list[str]:
     corrected = a.errors.get(error_statistics.CORRECTED)
     if corrected is None or a.reference is None:
-        return ["There is neither a truth nor a track to smooth, so the errors are unknown."]
+        return ["There is nothing to compare the estimate with: its accuracy is unknown."]
     found = zip(_split_errors(a), ("with fixes", "without"), strict=True)
     parts = [f"{format_length(_rms(error))} {how}" for error, how in found if len(error)]
     ins = a.errors.get(error_statistics.INS)
     beside = f"; the inertial channel alone {format_length(_rms(ins.error))}" if ins is not None else ""
-    true = a.reference.what == TRUTH
-    subject = "The error of the estimate" if true else f"The distance of the estimate from {a.reference.what}"
+    subject = f"The {deviation(a)} of the estimate"
+    subject += "" if a.against_truth else f" from {a.reference.what}"
     sentences = [
         f"{subject} was {' and '.join(parts)} (r.m.s.), {format_length(worst_of(a).estimate)} at most"
         f"{beside}."
     ]
     if a.reference.what == SMOOTHED:
         sentences.append(
-            "The smoothed track uses the same fixes and error model; errors common to both are not visible."
+            "The smoothed track uses the same fixes and model; what is wrong in both is not visible."
         )
         if (apart := gnss_contradiction(a)) is not None:
             sentences.append(
@@ -162,7 +201,7 @@ def _error_sentences(a: Assessment) -> list[str]:
                 "rejected: one of them is wrong, and the stated distances cannot be trusted."
             )
     elif a.reference.what == GNSS:
-        sentences.append("GNSS is not a truth: its own error is included in these numbers.")
+        sentences.append("GNSS may itself be off; these distances include that.")
     return sentences
 
 
@@ -208,8 +247,8 @@ def _bound_sentences(a: Assessment) -> list[str]:
         worst = min(broken, key=lambda row: row.inside or 0.0)
         found.append(
             f"The guaranteed bound{reached} was exceeded in {len(broken)} of {len(judged)} phases, most often"
-            f" in “{phase_title(worst.phase)}”: there the error was within it {_percent(worst.inside or 0.0)}"
-            f" of the time, over the flight {_percent(inside)}."
+            f" in “{phase_title(worst.phase)}”: there the {deviation(a)} was within it "
+            f"{_percent(worst.inside or 0.0)} of the time, over the flight {_percent(inside)}."
         )
     return found
 
@@ -219,6 +258,8 @@ def _rejection_sentences(a: Assessment) -> list[str]:
     if not fixes:
         return ["No fix was rejected."]
     total = sum(group.number for group in fixes)
+    if total == 1:  # one rejection in a flight is usual; it is in the table
+        return []
     largest = max(fixes, key=lambda group: group.number)
     far = (
         f", up to {format_length(largest.metres)} from the estimate" if math.isfinite(largest.metres) else ""
@@ -226,7 +267,7 @@ def _rejection_sentences(a: Assessment) -> list[str]:
     when = f"from {format_time(largest.start)} to {format_time(largest.end)}"
     if largest.number == 1:
         when = f"at {format_time(largest.start)}"
-    rejected = "1 fix was rejected" if total == 1 else f"{total} fixes were rejected"
+    rejected = f"{total} fixes were rejected"
     if len(fixes) == 1:
         return [f"{rejected}, {when}: {flight_events.describe_reason(largest)}{far}."]
     return [
@@ -248,8 +289,8 @@ def _anomalies(a: Assessment) -> list[str]:
             )
         if row.inside_twice is not None and row.inside_twice < CHEBYSHEV:
             found.append(
-                f"in the phase “{phase_title(row.phase)}” the error was within twice the bound of its moment "
-                f"only {_percent(row.inside_twice)} of the time, where at least 75 % are expected"
+                f"in the phase “{phase_title(row.phase)}” the {deviation(a)} was within twice the bound of "
+                f"its moment only {_percent(row.inside_twice)} of the time, where at least 75 % are expected"
             )
     for series in a.normalized_errors:
         if series.inside < CONSISTENT:

@@ -12,10 +12,13 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from companion.analysis import error_statistics, flight_events
-from companion.analysis.assessment import GNSS, TRUTH, Assessment
+from companion.analysis.assessment import GNSS, Assessment, deviation
 from companion.analysis.flight_arrays import Flight
 from companion.analysis.summary import (
     CONSISTENT,
+    SHORT_S,
+    count_held,
+    describe_gnss,
     describe_worst,
     format_duration,
     format_length,
@@ -47,19 +50,18 @@ class Verdict(NamedTuple):
 
 def judge_flight(a: Assessment) -> Verdict:
     """Return the verdict: that of the first rule that applies."""
-    found = (rule(a) for rule in _RULES)
-    return next((verdict for verdict in found if verdict is not None), _kept(a))
+    return next((verdict for rule in _RULES if (verdict := rule(a)) is not None), None) or _kept(a)
 
 
 def _promise(a: Assessment) -> Level:
     """The level of a promise that was not kept."""
-    return "fault" if a.reference is not None and a.reference.what == TRUTH else "caution"
+    return "fault" if a.against_truth else "caution"
 
 
 def _no_estimate(a: Assessment) -> Verdict | None:
     if len(a.flight.tables["Solution"]["t"]):
         return None
-    return Verdict("fault", f"There is no estimate. {missing_input(a.flight)}", "none", "positions estimated")
+    return Verdict("fault", f"There is no estimate. {missing_input(a.flight)}", "0", "positions estimated")
 
 
 def _bound_broken(a: Assessment) -> Verdict | None:
@@ -72,7 +74,7 @@ def _bound_broken(a: Assessment) -> Verdict | None:
         _promise(a),
         f"The guaranteed bound did not hold in the phase “{flight_events.phase_title(worst.phase)}”.",
         f"{worst.share:.2f} ×",
-        "the bound (r.m.s. error; limit 1)",
+        f"the bound (r.m.s. {deviation(a)}; limit 1)",
     )
 
 
@@ -84,8 +86,8 @@ def _moments_beyond_bound(a: Assessment) -> Verdict | None:
     worst = min(beyond, key=lambda row: row.inside or 0.0)
     return Verdict(
         "caution",
-        "At moments the error was above the guaranteed bound, which is one on the r.m.s. error; most often "
-        f"in the phase “{flight_events.phase_title(worst.phase)}”.",
+        f"At moments the {deviation(a)} was above the guaranteed bound, which is one on its r.m.s.; most "
+        f"often in the phase “{flight_events.phase_title(worst.phase)}”.",
         f"{100.0 * (worst.inside or 0.0):.1f} %",
         "of this phase within the bound",
     )
@@ -124,7 +126,7 @@ def _worse_than_inertial(a: Assessment) -> Verdict | None:
         f"In the phase “{flight_events.phase_title(row.phase)}” the estimate was worse than the inertial "
         f"channel alone, which had {format_length(ins)}.",
         format_length(ours),
-        "r.m.s. error of the estimate",
+        f"r.m.s. {deviation(a)} of the estimate",
     )
 
 
@@ -152,6 +154,27 @@ def _untrusted(a: Assessment) -> Verdict | None:
     )
 
 
+def _unlimited(a: Assessment) -> Verdict | None:
+    """Nothing limited the position in a phase without fixes: no useful guaranteed bound, no protection level.
+
+    A bound of no use alone is no caution: in flight the position is trusted by its protection level.
+    """
+    solution = a.flight.tables["Solution"]
+    seconds = 0.0
+    for row, phase in zip(a.rows, a.phases, strict=True):
+        if phase.name in flight_events.WITHOUT_FIXES and row.seconds >= SHORT_S and not row.useful:
+            inside = (solution["t"] >= phase.start_ns * 1e-9) & (solution["t"] < phase.end_ns * 1e-9)
+            seconds += row.seconds * (not np.isfinite(solution["protection"][inside]).any())
+    if not seconds:
+        return None
+    return Verdict(
+        "caution",
+        "Without fixes nothing limited the position: no useful guaranteed bound and no protection level.",
+        format_duration(seconds),
+        "without a limit",
+    )
+
+
 def _inconsistent(a: Assessment) -> Verdict | None:
     small = [series for series in a.normalized_errors if series.inside < CONSISTENT]
     if not small:
@@ -159,7 +182,7 @@ def _inconsistent(a: Assessment) -> Verdict | None:
     worst = min(small, key=lambda series: series.inside)
     return Verdict(
         "caution",
-        f"The stated sigmas are too small for the errors found ({worst.what}).",
+        f"The stated sigmas are too small for what was found ({worst.what}).",
         f"{100.0 * worst.inside:.0f} %",
         "within the 95 % limit",
     )
@@ -179,7 +202,7 @@ def _rejections(a: Assessment) -> Verdict | None:
     return Verdict(
         "caution",
         f"Fixes of {flight_events.source_title(longest.source)} were rejected from "
-        f"{format_time(longest.start)}; without a truth it cannot be confirmed that this was right.",
+        f"{format_time(longest.start)}; whether this was right, the log cannot show.",
         format_duration(longest.end - longest.start),
         "of fixes rejected",
     )
@@ -200,21 +223,26 @@ def _torn_or_reset(a: Assessment) -> Verdict | None:
 def _no_reference(a: Assessment) -> Verdict | None:
     if a.reference is not None and error_statistics.CORRECTED in a.errors:
         return None
-    return Verdict("caution", "There is nothing to compare the estimate with.", "unknown", "error")
+    return Verdict("caution", "There is nothing to compare the estimate with.", "unknown", "accuracy")
 
 
 def _kept(a: Assessment) -> Verdict:
     worst = worst_of(a).estimate
-    judged = [row for row in a.rows if row.held is not None]
-    held = "the guaranteed bound held in every phase that has one" if judged else "no bound was stated"
-    longest = max((outage.end - outage.start for outage in a.outages), default=0.0)
-    happened = (
-        f"GNSS was lost for up to {format_duration(longest)}" if longest else "GNSS had a fix throughout"
-    )
+    happened = describe_gnss(a)
     if (rejected := _longest_rejection(a)) is not None:
         seconds = format_duration(rejected.end - rejected.start)
         happened += f", {flight_events.source_title(rejected.source)} was rejected for {seconds}"
-    return Verdict("good", f"{happened}, and {held}.", format_length(worst), describe_worst(a))
+    reason = f"{happened}, and {_describe_bound(a)}."
+    return Verdict("good", reason, format_length(worst), describe_worst(a))
+
+
+def _describe_bound(a: Assessment) -> str:
+    """Say in how many phases the guaranteed bound held; it was exceeded in none."""
+    if not any(row.useful for row in a.rows):
+        return "no phase has a useful guaranteed bound"
+    if all(row.useful for row in a.rows):
+        return "the guaranteed bound held in every phase"
+    return f"the guaranteed bound held in {count_held(a)} phases; it was of no use in the others"
 
 
 _RULES: tuple[Callable[[Assessment], Verdict | None], ...] = (
@@ -227,6 +255,7 @@ _RULES: tuple[Callable[[Assessment], Verdict | None], ...] = (
     _untrusted,
     _no_reference,
     _inconsistent,
+    _unlimited,
     _rejections,
     _torn_or_reset,
 )

@@ -10,6 +10,7 @@ import math
 import re
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 from click.testing import CliRunner
@@ -22,13 +23,20 @@ from companion.analysis.assessment import assess_flight
 from companion.analysis.convert import convert_log
 from companion.analysis.figures import build_figures
 from companion.analysis.flight_arrays import collect_flights
-from companion.analysis.flight_events import describe_rejections, topic_name
+from companion.analysis.flight_events import describe_rejections, event_title, topic_name
 from companion.analysis.flights import open_flights
-from companion.analysis.html import comparison_table
+from companion.analysis.html import comparison_table, render_report
 from companion.analysis.plot_data import thin_line
 from companion.analysis.replay import command as replay_command
-from companion.analysis.report import command, comparison_block
-from companion.analysis.summary import format_duration, format_length, format_time, summarize_flight, worst_of
+from companion.analysis.report import blocks_of_log, command, comparison_block
+from companion.analysis.summary import (
+    describe_outage,
+    format_duration,
+    format_length,
+    format_time,
+    summarize_flight,
+    worst_of,
+)
 from companion.analysis.verdict import judge_flight
 from companion.config import Config, load, to_toml
 from companion.nav.geometry import displace
@@ -74,7 +82,7 @@ def flight_records(
 ):
     """Five minutes eastwards at 20 m/s; GNSS lost from LOST to FOUND, rejected for 2 s at 60 s.
 
-    With receiver 1 no fix is used.
+    With receiver 1 no fix is used. `unused`: GNSS is not lost, but not used either.
     """
     one = load(flags={"gnss.second_receiver": False}, environment={})
     rows = [Tuning(START, START, to_toml(one))] if receiver else []
@@ -86,7 +94,7 @@ def flight_records(
         if truth:
             rows.append(Truth(t, t, lat, lon, 100.0, (0.0, 20.0, 0.0)))
         glitch = 60.0 <= second < 62.0
-        if not lost:
+        if not lost or more.get("unused"):
             off = 500.0 if glitch else 0.0
             place = displace(lat, lon, 0.0, off, 0.0, 0.0)
             rows.append(Gnss(t, t + 50_000_000, receiver, k, 3, place.lat, place.lon, 100.0, 2.0))
@@ -281,6 +289,45 @@ def test_summary_describes_the_flight(assessed):
         assert words in text_of_summary
 
 
+def collected(records):
+    (found,) = collect_flights(((flight_log.topic_of(type(r)), r) for r in records), "made.mcap")
+    return assess_flight(found)
+
+
+@pytest.mark.parametrize(
+    ("fix", "state"), [(None, "never received"), (1, "received without a fix")], ids=["no message", "no fix"]
+)
+def test_gnss_that_never_had_a_fix_was_not_kept(fix, state):
+    records = (r for r in flight_records() if fix or not isinstance(r, Gnss))
+    a = collected(msgspec.structs.replace(r, fix=fix) if isinstance(r, Gnss) else r for r in records)
+    assert f"GNSS was {state}. The position was predicted without any fix for 2 min." in sentences(a)
+    assert describe_outage(a) == state
+    assert judge_flight(a).reason.startswith(f"GNSS was {state}, and the guaranteed bound held")
+
+
+def test_gnss_that_is_there_but_not_used_is_reported_so():
+    text = sentences(assess_flight(flight(unused=True)))
+    assert "GNSS had a fix throughout, but was not used for 2 min." in text
+    assert "predicted without any fix" not in text
+
+
+def test_gnss_that_comes_late_was_not_there_throughout():
+    late = START + 60 * S
+    a = collected(r for r in flight_records(unused=True) if not isinstance(r, Gnss) or r.t_ns >= late)
+    assert "GNSS had a fix from 1:00 on" in sentences(a)
+
+
+def test_short_flight_is_named_by_what_lasted_longest():
+    """A second of prediction before four of GNSS: both are too short for a phase of their own."""
+    cut = START + LOST * S
+    solutions = [r for r in flight_records() if isinstance(r, Solution)]
+    lost = [r for r in solutions if r.t_ns >= cut][:5]
+    rest = [r for r in solutions if r.t_ns < cut][:20]
+    moved = [msgspec.structs.replace(r, t_ns=START + k * S // 5) for k, r in enumerate([*lost, *rest])]
+    a = collected(msgspec.structs.replace(r, rx_ns=r.t_ns) for r in moved)
+    assert [phase.name for phase in a.phases] == ["GNSS"]
+
+
 def test_estimate_worse_than_the_inertial_channel_is_an_anomaly():
     assert "worse than the inertial channel alone" in sentences(
         assess_flight(flight(error=(30.0, 40.0), ins=(3.0, 4.0)))
@@ -290,7 +337,7 @@ def test_estimate_worse_than_the_inertial_channel_is_an_anomaly():
 def test_reference_without_truth_is_named():
     a = assess_flight(flight(truth=False, receiver=1))  # no fix of the receiver in use: nothing to smooth
     assert a.reference.what == assessing.GNSS
-    assert "GNSS is not a truth" in sentences(a)
+    assert "GNSS may itself be off" in sentences(a)
     assert error_statistics.GNSS not in a.errors  # GNSS is the reference itself
 
 
@@ -322,6 +369,10 @@ def test_flights_are_compared_in_one_table_and_in_the_same_axes(assessed):
             "worse than the inertial",
         ),
         ({"bound": (3.0, 3.0), "truth": False, "receiver": 1}, "caution", "15.17 ×", "did not hold"),
+        ({"bound": None}, "caution", "2 min", "no useful guaranteed bound and no protection level"),
+        ({"bound": (6e3, 6e3)}, "caution", "2 min", "Without fixes nothing limited"),
+        ({"bound": (6e3, 6e3), "protection": 9.0}, "good", "5.0 m", "no phase has a useful guaranteed bound"),
+        ({"bound": None, "protection": 9.0}, "good", "5.0 m", "no phase has a useful guaranteed bound"),
         ({"sigma": 1.0}, "caution", "0 %", "sigmas are too small"),
     ],
 )
@@ -331,12 +382,58 @@ def test_verdict_names_the_number_that_decides(kind, level, number, reason):
     assert reason in verdict.reason
 
 
+def test_phases_without_a_useful_bound_are_counted():
+    a = assess_flight(flight(protection=9.0))
+    rows = [a.rows[0], a.rows[1]._replace(held=None, share=None, inside=None), a.rows[2]]
+    verdict = judge_flight(dataclasses.replace(a, rows=rows))
+    assert verdict.level == "good"
+    assert "held in 2 of 3 phases; it was of no use in the others" in verdict.reason
+
+
 def test_moments_above_the_bound_are_no_fault():
     a = assess_flight(flight())
     rows = [row._replace(held=False, share=0.45, inside=0.912) for row in a.rows]
     verdict = judge_flight(dataclasses.replace(a, rows=rows))
     assert (verdict.level, verdict.number) == ("caution", "91.2 %")
     assert "At moments the error was above the guaranteed bound" in verdict.reason
+
+
+@pytest.mark.parametrize(
+    ("logged", "shown"),
+    [
+        (
+            "navigation fixed: gnss and azimuth and range fixes",
+            "position from GNSS and beacon azimuth and range",
+        ),
+        ("navigation fixed: azimuth and range fixes", "position from beacon azimuth and range"),
+        ("navigation predicting: no fixes", "position predicted: no fixes"),
+        ("rsbn 7 range is used again", "beacon 7 range is used again"),
+        ("udpin:0.0.0.0:14550: autopilot 1 rebooted", "autopilot 1 rebooted"),
+        ("EKF3 IMU0 is using GPS", "EKF3 IMU0 is using GPS"),
+    ],
+)
+def test_events_are_in_words_for_users(logged, shown):
+    assert event_title(logged) == shown
+
+
+def test_rejections_have_units_and_a_single_one_is_not_in_the_lead():
+    records = [*flight_records(), Rejection(START, START, "gnss 0", "late: not used", 260.6, 6.0)]
+    records = [r for r in records if not isinstance(r, Rejection) or r.limit == 6.0]
+    a = collected(records)
+    assert describe_rejections(a.groups[0]).startswith(
+        "GNSS 0 rejected once: too late, 260.6 s old (limit 6 s)"
+    )
+    assert "rejected" not in sentences(a)
+
+
+def test_warnings_of_the_events_table_have_their_severity_and_colour():
+    pytest.importorskip("jinja2")
+    warning = Event(START + S, START + S, 4, "low battery")
+    (found,) = collect_flights(
+        ((flight_log.topic_of(type(r)), r) for r in [*flight_records(), warning]), "made.mcap"
+    )
+    page = render_report("r", blocks_of_log([found]))
+    assert re.search(r'class="caution">warning</td><td data-label="text">low battery', page)
 
 
 def test_every_kind_of_record_has_a_name_for_users():
@@ -372,8 +469,9 @@ def test_a_flight_without_an_estimate_names_what_is_missing(kinds, wanted):
     records = [Event(START, START, 6, "x"), *(made[kind] for kind in kinds)]
     (empty,) = collect_flights(((flight_log.topic_of(type(r)), r) for r in records), "made.mcap")
     verdict = judge_flight(assess_flight(empty))
-    assert (verdict.level, verdict.number) == ("fault", "none")
+    assert (verdict.level, verdict.number) == ("fault", "0")
     assert wanted in verdict.reason
+    assert not re.search("compare|bound|error", sentences(assess_flight(empty)))
 
 
 def test_no_number_of_the_text_is_greater_than_the_cards(assessed):
@@ -394,6 +492,27 @@ def test_there_is_no_error_without_a_truth():
     assert figure.title == "Distance from GNSS itself"
     assert "The error of the estimate" not in sentences(a)
     assert "The distance of the estimate from GNSS itself was" in sentences(a)
+
+
+def visible_text(page):
+    """What a reader sees: no script, style or configuration; of the figures the names of their lines."""
+    (data,) = re.findall(r'id="figures">(.*?)</script>', page, re.DOTALL)
+    names = [line["name"] for figure in json.loads(data).values() for line in figure["lines"]]
+    page = re.sub(r"<(script|style|pre)\b.*?</\1>", "", page, flags=re.DOTALL)
+    return html.unescape(re.sub(r"<[^>]+>", " ", page)) + " ".join(names)
+
+
+@pytest.mark.parametrize(
+    "kind", [{}, {"bound": (3.0, 3.0)}, {"sigma": 1.0}, {"bound": None, "protection": 4.0}], ids=str
+)
+def test_the_whole_page_has_no_error_without_a_truth(kind):
+    pytest.importorskip("jinja2")
+    words = re.compile(r"(?i)[^.]*\b(?:errors?|tru\w+|actual\w*|NEES)\b[^.]*")
+    shown = visible_text(render_report("r", blocks_of_log([flight(truth=False, receiver=1, **kind)])))
+    assert "Distances" in shown and "Distance from GNSS itself" in shown
+    assert words.findall(shown) == []
+    against_truth = visible_text(render_report("r", blocks_of_log([flight(**kind)])))
+    assert "Error of the position" in against_truth and "NEES: error of the estimate" in against_truth
 
 
 def test_durations_and_times_are_formatted():
