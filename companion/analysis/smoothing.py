@@ -36,7 +36,7 @@ from companion.estimate import bank as banks
 from companion.estimate.bank import Bank
 from companion.estimate.smoother import rts_backward, two_point
 from companion.nav.geometry import displace
-from companion.navigator import INPUTS_USED, Navigator, guarded, own_channel, tuned
+from companion.navigator import INPUTS_USED, Navigator, begins_again, guarded, own_channel, tuned
 from companion.navigator.channel import Nominal, Transition
 from companion.navigator.hypotheses import MOST_BEACONS, Hypotheses, Model
 from companion.navigator.inertial_track import Point
@@ -247,7 +247,7 @@ class _PlainModel(Model):
 
     def __init__(self, config: Config, grade: int, beacons: int) -> None:
         super().__init__(config, plain=grade)
-        self.beacons = beacons
+        self.grade, self.beacons = grade, beacons
         self.asked: list[tuple[Transition, Point]] = []
 
     def begin(self, t_s: float) -> Bank:
@@ -378,11 +378,13 @@ class _Path:
         before = self._settings
         config = self._with_gusts(parse(record.toml, "parameters in the log"))
         self._settings, state = tuned(self._state, before, config)
-        if self._settings.model is not before.model:  # another error model: the next run brings its grade
+        grade = self._model.grade
+        if begins_again(before.config, config):  # the next run brings its grade
             self.end()
             self._close()
-            self._model = _PlainModel(self._settings.config, 0, len(self._beacons))
-            self._settings = self._settings._replace(model=self._model)
+            grade = 0
+        self._model = _PlainModel(self._settings.config, grade, len(self._beacons))
+        self._settings = self._settings._replace(model=self._model)
         self._state = state if state.bank is not None else self._with_beacons(state)
 
     def _with_gusts(self, config: Config) -> Config:

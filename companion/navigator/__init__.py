@@ -20,6 +20,7 @@ from companion.config import Config, parse
 from companion.estimate import bank as banks
 from companion.navigator import minimax_bound
 from companion.navigator.hypotheses import Model
+from companion.navigator.measurements import other_receiver
 from companion.navigator.own_channel import OwnChannel
 from companion.navigator.receiver_choice import ReceiverChoice
 from companion.navigator.solution import announce, is_bound_due, refresh_bound, resolve_pending, solve
@@ -339,22 +340,26 @@ def _solve(state: State, record: Input, settings: Settings) -> Step:
 def tuned(state: State, before: Settings, config: Config) -> tuple[Settings, State]:
     """Return the settings of another configuration, and the state to go on with.
 
-    The bank is begun again where the error model changed: its states mean something else.
+    What a ground station sets keeps the estimate: without fixes there would be no other.
     """
-    settings = Settings.of(config)
-    same = all(
-        getattr(config, section) == getattr(before.config, section)
-        for section in ("inertial", "air_data", "strapdown", "gnss", "rsbn", "integrity")
-    )
-    if same:
-        settings = settings._replace(model=before.model)
-        same_filters = config.estimator == before.config.estimator
-        return settings, state._replace(
-            guarantee=minimax_bound.tuned(state.guarantee), parallel=state.parallel if same_filters else None
+    settings, old = Settings.of(config), before.config
+    if begins_again(old, config):
+        return settings, initial(settings)._replace(
+            next_ns=state.next_ns, origin=state.origin, sensors=state.sensors, level=state.level
         )
-    return settings, initial(settings)._replace(
-        next_ns=state.next_ns, origin=state.origin, sensors=state.sensors, level=state.level
+    state = state._replace(
+        guarantee=minimax_bound.tuned(state.guarantee),
+        parallel=state.parallel if config.estimator == old.estimator else None,
     )
+    if config.gnss.latency_s != old.gnss.latency_s and state.bank is not None:
+        state = state._replace(bank=other_receiver(state.bank, settings.model.channel))
+    return settings, state
+
+
+def begins_again(old: Config, new: Config) -> bool:
+    """Return whether the states of the bank mean something else: those of another inertial channel."""
+    same = (old.inertial, old.strapdown, old.has_own_ins) == (new.inertial, new.strapdown, new.has_own_ins)
+    return not same
 
 
 def guarded(

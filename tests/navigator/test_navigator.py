@@ -11,10 +11,12 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
+from msgspec import structs
 
 import companion.navigator as navigator_module
-from companion.config import Config, InertialConfig, load
+from companion.config import Config, InertialConfig, load, to_toml
 from companion.estimate.fusion import Azimuth
+from companion.link.parameter_server import PARAMETERS
 from companion.nav.geometry import (
     Geodetic,
     displace,
@@ -449,6 +451,25 @@ def test_what_is_too_late_is_so_after_parameters_were_set_too() -> None:
             assert isinstance(outputs[-1], Rejection)
             assert "not used" in outputs[-1].reason
             assert not any(isinstance(out, Solution) for out in outputs)
+
+
+@pytest.mark.parametrize("name", PARAMETERS)
+def test_what_a_station_sets_without_fixes_keeps_the_position(name: str) -> None:
+    """There is no other: only another inertial channel begins again."""
+    section, key = PARAMETERS[name]
+    old = getattr(getattr(CONFIG, section), key)
+    new = (not old) if isinstance(old, bool) else 1.1 * old + 0.01
+    changed = structs.replace(CONFIG, **{section: structs.replace(getattr(CONFIG, section), **{key: new})})
+    records = [record for moment in flight(60, 30.0, 30.0) for record in moment.records]
+    plain, tuned = Navigator(CONFIG), Navigator(CONFIG)
+    at = next(k for k, record in enumerate(records) if record.t_ns > 40 * NS)
+    before = solutions(plain, [origin(), *records[:at]]), solutions(tuned, [origin(), *records[:at]])
+    assert before[0] == before[1]
+    tuning = Tuning(40 * NS, 40 * NS, to_toml(changed))
+    wanted, found = solutions(plain, records[at:]), solutions(tuned, [tuning, *records[at:]])
+    assert [each.t_ns for each in found] == [each.t_ns for each in wanted]
+    for ours, its in zip(found, wanted, strict=True):
+        assert math.dist(ours.error_n[:2], its.error_n[:2]) < 0.1 * math.sqrt(its.covariance[0])
 
 
 def test_a_jump_of_the_inertial_channel_is_no_jump_of_the_estimate() -> None:
