@@ -202,7 +202,7 @@ class Scene:
         age = self.t - t + (behind_s or 0.0)
         if age > STALE_S and not ended:
             return {"level": "fault", "word": "No data", "why": f"The last position is {age:.0f} s old."}
-        level, word = NAMED[s.trust] if s.trust is not None else ("caution", str(s.mode).capitalize())
+        level, word = trust_word(s)
         parts = []
         if s.mode is not Mode.FIXED:
             parts.append(f"No fix for {s.horizon_s:.0f} s.")
@@ -421,6 +421,13 @@ class SourceRow(NamedTuple):
     level: str
     false: float | None
     age: float | None
+
+
+def trust_word(s: Solution) -> tuple[str, str]:
+    """Return level and word of the trust in a solution; it is recovering while the trust lags behind fixes."""
+    if s.trust is Trust.PREDICTING and s.mode is Mode.FIXED:
+        return "caution", "Recovering"
+    return NAMED[s.trust] if s.trust is not None else ("caution", str(s.mode).capitalize())
 
 
 def _largest_variance(s: Solution) -> float:

@@ -80,6 +80,7 @@ def test_numbers_and_circles_are_those_of_the_solution():
         ({}, 0.2, "good", "Trusted"),
         ({"trust": Trust.DEGRADED}, 0.2, "caution", "Degraded"),
         ({"trust": Trust.PREDICTING, "mode": Mode.PREDICTING, "sources": 1}, 0.2, "caution", "Predicting"),
+        ({"trust": Trust.PREDICTING}, 0.2, "caution", "Recovering"),  # fixes are back, the trust settles
         ({"trust": Trust.UNTRUSTED, "mode": Mode.UNTRUSTED, "sources": 1}, 0.2, "fault", "Do not trust"),
         ({}, 4.0, "fault", "No data"),
     ],
