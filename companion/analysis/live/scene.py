@@ -22,7 +22,7 @@ from companion.analysis.live.follow import Message
 from companion.analysis.plot_data import COLOURS, Figure, Line, Mark, PlacedName
 from companion.estimate import bank
 from companion.nav.geometry import Geodetic, displace, separation
-from companion.records import Event, Gnss, Mode, Rejection, Reset, RsbnFix, Solution, Source, Stamped, Trust
+from companion.records import Event, Gnss, Mode, Reset, RsbnFix, Solution, Source, Stamped, Trust
 from companion.units import Floats
 
 TRACK_POINTS = 2400
@@ -38,7 +38,13 @@ NAMED = {
     Trust.PREDICTING: ("caution", "Predicting"),
     Trust.UNTRUSTED: ("fault", "Do not trust"),
 }
-_SHOWN: tuple[type[Stamped], ...] = (Solution, Gnss, RsbnFix, Event, Reset, Rejection)
+BITS = {
+    "gnss": Source.GNSS,
+    "azimuth": Source.AZIMUTH,
+    "range": Source.RANGE,
+    "airspeed": Source.AIR_DATA,
+}  # by the last word of the source's name
+_SHOWN: tuple[type[Stamped], ...] = (Solution, Gnss, RsbnFix, Event, Reset)
 _decoders = {kind.__name__: msgspec.json.Decoder(kind) for kind in _SHOWN}
 
 
@@ -98,9 +104,9 @@ class Scene:
         self._first_ns: int | None = None
         self._origin: Geodetic | None = None
         self._solution: tuple[Solution, float] | None = None
-        self._gnss: tuple[Gnss, float] | None = None
+        self._gnss: Gnss | None = None
         self._beacons: dict[int, Beacon] = {}
-        self._rejected: dict[str, tuple[str, float]] = {}
+        self._measured: dict[str, float | None] = {"gnss": None}  # when each source measured last (s)
         self._false: dict[str, float] = {}
         self._fixed, self._lost, self._received, self._ins = Track(), Track(), Track(), Track()
         self._strips: dict[str, Strip] = {}
@@ -125,14 +131,11 @@ class Scene:
             case Gnss():
                 self._add_gnss(record)
             case RsbnFix():
-                self._beacons[record.beacon] = Beacon(record, self.t)
-                self._place(record.lat, record.lon)
+                self._add_reply(record)
             case Event():
                 self._events.append((self.t, record.severity, record.text))
             case Reset():
                 self._events.append((self.t, 4, f"{record.what} reset: {record.reason}"))
-            case Rejection():
-                self._rejected[record.source] = (record.reason, self.t)
 
     def _place(self, lat: float, lon: float) -> tuple[float, float]:
         """Return metres east and north of the first position."""
@@ -153,6 +156,8 @@ class Scene:
             self._false = dict(s.false_sources)
             for name, p in s.false_sources:
                 self._strip(f"false {name}").add(self.t, 100.0 * p)
+        if s.sources & Source.AIR_DATA or self._false.get("airspeed", 0.0) > SUSPECT:
+            self._measured["airspeed"] = self.t
         self._strip("protection").add(self.t, s.protection)
         self._strip("bound").add(self.t, None if s.bound_n is None else math.hypot(*s.bound_n))
         self._strip("sigma").add(self.t, math.sqrt(CHI2_95_2 * _largest_variance(s)))
@@ -160,12 +165,12 @@ class Scene:
         self._strip("error east").add(self.t, s.error_n[1])
 
     def _add_gnss(self, record: Gnss) -> None:
-        if self._gnss is not None and record.repeats(self._gnss[0]):
+        if self._gnss is not None and record.repeats(self._gnss):
             return
         if not record.has_3d_fix:
             self._strip("gnss").add(self.t, None)
             return
-        self._gnss = record, self.t
+        self._gnss, self._measured["gnss"] = record, self.t
         east, north = self._place(record.lat, record.lon)
         self._received.add(self.t, east, north)
         if self._solution is not None:
@@ -174,6 +179,13 @@ class Scene:
                 Geodetic(record.lat, record.lon, 0.0), Geodetic(s.lat, s.lon, 0.0)
             )
             self._strip("gnss").add(self.t, math.hypot(d_north, d_east))
+
+    def _add_reply(self, reply: RsbnFix) -> None:
+        self._beacons[reply.beacon] = Beacon(reply, self.t)
+        self._place(reply.lat, reply.lon)
+        for kind, value in (("azimuth", reply.azimuth), ("range", reply.slant_range)):
+            if value is not None:
+                self._measured[f"rsbn {reply.beacon} {kind}"] = self.t
 
     def _strip(self, name: str) -> Strip:
         return self._strips.setdefault(name, Strip())
@@ -244,23 +256,12 @@ class Scene:
         ]
 
     def _sources(self) -> Iterator[SourceRow]:
-        s = self._solution[0] if self._solution else None
-        used = Source(s.sources) if s else Source(0)
-        if self._gnss is not None or "gnss" in self._false:
-            t = self._gnss[1] if self._gnss else None
-            yield self._row("GNSS", "gnss", t, bool(used & Source.GNSS))
-        for number, beacon in sorted(self._beacons.items()):
-            for kind, value, bit in (
-                ("azimuth", beacon.reply.azimuth, Source.AZIMUTH),
-                ("range", beacon.reply.slant_range, Source.RANGE),
-            ):
-                if value is not None:
-                    key = f"rsbn {number} {kind}"
-                    yield self._row(f"beacon {number} {kind}", key, beacon.t, bool(used & bit))
-        if used & Source.AIR_DATA or self._false.get("airspeed", 0.0) > SUSPECT:
-            yield self._row("airspeed", "airspeed", self.t, bool(used & Source.AIR_DATA))
+        """Yield a row for GNSS and for every source that measured; the chart of probabilities has them too."""
+        sources = self._solution[0].sources if self._solution else 0
+        for key, t in self._measured.items():
+            yield self._row(key, t, bool(sources & BITS[key.rpartition(" ")[2]]))
 
-    def _row(self, name: str, key: str, t: float | None, used: bool) -> SourceRow:
+    def _row(self, key: str, t: float | None, used: bool) -> SourceRow:
         p = self._false.get(key)
         age = None if t is None else self.t - t
         state, level = ("used", "good") if used else ("not used", "")
@@ -271,7 +272,7 @@ class Scene:
         elif p is not None and p > SUSPECT:
             state, level = "suspect", "caution"
         return SourceRow(
-            name,
+            source_title(key),
             state,
             level,
             None if p is None else round(100.0 * p, 1),
@@ -406,9 +407,8 @@ class Scene:
 
     def _false_lines(self) -> Iterator[Line]:
         roles = {"gnss": error_statistics.GNSS, "airspeed": "second"}
-        for key, strip in self._strips.items():
-            kind, _, name = key.partition(" ")
-            if kind == "false":
+        for name in self._measured:
+            if strip := self._strips.get(f"false {name}"):
                 colour = COLOURS[roles.get(name, error_statistics.RSBN)]
                 yield strip.line(source_title(name), colour, dash=name.endswith("range"))
 
@@ -424,7 +424,7 @@ class SourceRow(NamedTuple):
 
 
 def trust_word(s: Solution) -> tuple[str, str]:
-    """Return level and word of the trust in a solution; it is recovering while the trust lags behind fixes."""
+    """Return level and word of the trust in a solution: recovering while the trust lags behind the fixes."""
     if s.trust is Trust.PREDICTING and s.mode is Mode.FIXED:
         return "caution", "Recovering"
     return NAMED[s.trust] if s.trust is not None else ("caution", str(s.mode).capitalize())

@@ -122,6 +122,20 @@ def test_sources_have_the_probability_that_each_is_false():
     assert {row["state"] for row in scene.frame(0.1, False)["sources"]} >= {"silent"}
 
 
+@pytest.mark.parametrize("sources", [1 | 2, 1 | 2 | 16])
+def test_table_and_chart_have_the_same_sources(sources):
+    """Airspeed is a source once it is used; a beacon's azimuth once it was measured."""
+    scene = Scene("x")
+    false = (("gnss", 0.01), ("airspeed", 0.0), ("rsbn 7 azimuth", 0.0), ("rsbn 7 range", 0.1))
+    scene.add(message(RsbnFix(S, S, 7, LAT, LON, 0.0, None, 5000.0, 0.002, 100.0)))
+    scene.add(message(solution(1.5, sources=sources, false_sources=false)))
+    frame = scene.frame(0.1, False)
+    (chart,) = (chart for chart in frame["charts"] if chart["key"] == "false")
+    names = [row["name"] for row in frame["sources"]]
+    assert names == [line["name"] for line in chart["lines"]]
+    assert names == ["GNSS", "beacon 7 range", *(["airspeed"] if sources & 16 else [])]
+
+
 def test_lines_of_position_end_where_the_beacon_measured():
     scene = Scene("x")
     scene.add(message(RsbnFix(S, S, 7, LAT, LON, 0.0, math.pi / 2, 5000.0, 0.002, 100.0)))
