@@ -88,10 +88,11 @@ class Strip:
 
 
 class Beacon(NamedTuple):
-    """The last reply of a beacon and when it came (s)."""
+    """The last reply of a beacon, when it came (s) and the point that it measured (m east and north)."""
 
     reply: RsbnFix
     t: float
+    end: tuple[float, float] | None
 
 
 class Scene:
@@ -106,6 +107,7 @@ class Scene:
         self._solution: tuple[Solution, float] | None = None
         self._gnss: Gnss | None = None
         self._beacons: dict[int, Beacon] = {}
+        self._miss = 0.0  # distance of those points from the aircraft (m)
         self._measured: dict[str, float | None] = {"gnss": None}  # when each source measured last (s)
         self._false: dict[str, float] = {}
         self._fixed, self._lost, self._received, self._ins = Track(), Track(), Track(), Track()
@@ -181,11 +183,29 @@ class Scene:
             self._strip("gnss").add(self.t, math.hypot(d_north, d_east))
 
     def _add_reply(self, reply: RsbnFix) -> None:
-        self._beacons[reply.beacon] = Beacon(reply, self.t)
-        self._place(reply.lat, reply.lon)
+        end = self._end(reply)
+        self._beacons[reply.beacon] = Beacon(reply, self.t, end)
+        if end is not None and self._solution is not None:
+            here = self._place(self._solution[0].lat, self._solution[0].lon)
+            self._miss = max(0.95 * self._miss, math.dist(end, here))  # slow, so that the map is steady
         for kind, value in (("azimuth", reply.azimuth), ("range", reply.slant_range)):
             if value is not None:
                 self._measured[f"rsbn {reply.beacon} {kind}"] = self.t
+
+    def _end(self, reply: RsbnFix) -> tuple[float, float] | None:
+        """Return the point that a reply measured; the position gives a missing range or azimuth."""
+        self._place(reply.lat, reply.lon)  # the first position is the origin, also a beacon's
+        reach, azimuth = reply.slant_range, reply.azimuth
+        if self._solution is not None:
+            s = self._solution[0]
+            north, east, _ = separation(Geodetic(s.lat, s.lon, 0.0), Geodetic(reply.lat, reply.lon, 0.0))
+            reach = math.hypot(north, east) if reach is None else reach
+            azimuth = math.atan2(east, north) if azimuth is None else azimuth
+        if reach is None or azimuth is None:
+            return None
+        north, east = reach * math.cos(azimuth), reach * math.sin(azimuth)
+        place = displace(reply.lat, reply.lon, 0.0, north, east, 0.0)
+        return self._place(place.lat, place.lon)
 
     def _strip(self, name: str) -> Strip:
         return self._strips.setdefault(name, Strip())
@@ -256,7 +276,7 @@ class Scene:
         ]
 
     def _sources(self) -> Iterator[SourceRow]:
-        """Yield a row for GNSS and for every source that measured; the chart of probabilities has them too."""
+        """Yield a row for GNSS and for every source that measured; the chart has the same sources."""
         sources = self._solution[0].sources if self._solution else 0
         for key, t in self._measured.items():
             yield self._row(key, t, bool(sources & BITS[key.rpartition(" ")[2]]))
@@ -296,7 +316,8 @@ class Scene:
         if self._solution is not None:
             s = self._solution[0]
             aircraft = (*self._place(s.lat, s.lon), math.atan2(s.v_n[1], s.v_n[0]))
-            frame = _frame([line for line in lines[1:4] if len(line.x)], *aircraft[:2])
+            miss = self._miss if len(lines[4].x) else 0.0
+            frame = _frame([line for line in lines[1:4] if len(line.x)], *aircraft[:2], miss)
             r = max(200.0, 1.5 * (s.protection or 0.0))
             near = (aircraft[0] - r, aircraft[0] + r, aircraft[1] - r, aircraft[1] + r)
         origin = self._origin or Geodetic(0.0, 0.0, 0.0)
@@ -311,31 +332,15 @@ class Scene:
         xs: list[float] = []
         ys: list[float] = []
         for beacon in self._beacons.values():
-            reply = beacon.reply
-            if self.t - beacon.t > SILENT_S:
+            reply, end = beacon.reply, beacon.end
+            if end is None or self.t - beacon.t > SILENT_S:
                 continue
             x, y = self._place(reply.lat, reply.lon)
-            reach = reply.slant_range
-            if reach is None and self._solution is not None:
-                reach = math.dist((x, y), self._place(self._solution[0].lat, self._solution[0].lon))
-            if reply.azimuth is not None and reach:
-                place = displace(
-                    reply.lat,
-                    reply.lon,
-                    0.0,
-                    reach * math.cos(reply.azimuth),
-                    reach * math.sin(reply.azimuth),
-                    0.0,
-                )
-                end = self._place(place.lat, place.lon)
+            if reply.azimuth is not None:
                 xs += [x, end[0], math.nan]
                 ys += [y, end[1], math.nan]
             if reply.slant_range is not None:
-                centre = reply.azimuth
-                if centre is None and self._solution is not None:
-                    here = self._place(self._solution[0].lat, self._solution[0].lon)
-                    centre = math.atan2(here[0] - x, here[1] - y)
-                arc = (centre or 0.0) + np.linspace(-0.15, 0.15, 25)
+                arc = math.atan2(end[0] - x, end[1] - y) + np.linspace(-0.15, 0.15, 25)
                 xs += [*(x + reply.slant_range * np.sin(arc)).tolist(), math.nan]
                 ys += [*(y + reply.slant_range * np.cos(arc)).tolist(), math.nan]
         return Line(
@@ -447,12 +452,21 @@ def _metres(value: float | None) -> str:
     )
 
 
-def _frame(lines: list[Line], x: float, y: float) -> tuple[float, float, float, float]:
-    """Return a view that covers the tracks and at least 200 m around the aircraft."""
-    xs = np.concatenate([[x - 200.0, x + 200.0], *(line.x for line in lines)])
-    ys = np.concatenate(
-        [[y - 200.0, y + 200.0], *(np.where(np.isfinite(line.x), line.y, np.nan) for line in lines)]
-    )
+def _frame(lines: list[Line], x: float, y: float, miss: float) -> tuple[float, float, float, float]:
+    """Return a view that covers the tracks and what is around the aircraft.
+
+    That is at least 200 m, and the ends of the lines of position, `miss` (m) from it, unless they are so far
+    off that the rest would become small: 500 m and half of the tracks' extent.
+    """
+    xs = np.concatenate([[x], *(line.x for line in lines)])
+    ys = np.concatenate([[y], *(np.where(np.isfinite(line.x), line.y, np.nan) for line in lines)])
     low_x, high_x, low_y, high_y = (float(f(a)) for a in (xs, ys) for f in (np.nanmin, np.nanmax))
+    r = max(200.0, min(miss, max(500.0, 0.5 * (high_x - low_x), 0.5 * (high_y - low_y))))
+    low_x, high_x, low_y, high_y = (
+        min(low_x, x - r),
+        max(high_x, x + r),
+        min(low_y, y - r),
+        max(high_y, y + r),
+    )
     dx, dy = 0.06 * (high_x - low_x), 0.06 * (high_y - low_y)
     return low_x - dx, high_x + dx, low_y - dy, high_y + dy

@@ -148,6 +148,32 @@ def test_lines_of_position_end_where_the_beacon_measured():
     assert frame["places"] == [["beacon 7", 0.0, 0.0]]
 
 
+@pytest.mark.parametrize(
+    ("azimuth", "slant_range"), [(math.pi / 2 - 0.01, 20_000.0), (math.pi / 2 - 0.01, None), (None, 20_400.0)]
+)
+def test_ends_of_lines_of_position_are_in_view(azimuth, slant_range):
+    scene = Scene("x")
+    for k in range(100):
+        scene.add(message(solution(k, east=20_000.0, north=20.0 * k - 1980.0)))
+    scene.add(message(RsbnFix(100 * S, 100 * S, 7, LAT, LON, 0.0, azimuth, slant_range, 0.004, 100.0)))
+    x0, x1, y0, y1 = (figure := scene.frame(0.1, False)["map"])["frame"]
+    (line,) = (line for line in figure["lines"] if line["name"] == "lines of position")
+    x, y = (line["x"][1], line["y"][1]) if azimuth else (line["x"][12], line["y"][12])
+    aircraft = figure["aircraft"]
+    assert math.dist((x, y), aircraft[:2]) == pytest.approx(200.0 if azimuth else 400.0, abs=40.0)
+    assert x0 < x < x1 and y0 < y < y1
+
+
+@pytest.mark.parametrize("seconds", [2, 200])
+def test_a_beacon_far_off_does_not_make_the_map_small(seconds):
+    scene = Scene("x")
+    for k in range(seconds):
+        scene.add(message(solution(k, east=20.0 * k)))
+    scene.add(message(RsbnFix(S * seconds, S * seconds, 7, LAT, LON, 0.0, 0.0, 90_000.0, 0.004, 100.0)))
+    x0, x1, y0, y1 = scene.frame(0.1, False)["map"]["frame"]
+    assert max(x1 - x0, y1 - y0) < 1.15 * max(1000.0, 2.0 * 20.0 * seconds)
+
+
 def test_a_record_of_another_version_is_left_out():
     scene = Scene("x")
     channel = Channel("/out/Solution", "json", "Solution", b"{}")
