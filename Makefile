@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help loopback test flights lint fuzz kills soak docs lock clean
+.PHONY: help loopback test flights lint fuzz kills soak docs pictures lock clean
 
 # duration per fuzz target: make fuzz SECONDS=3600
 SECONDS := 120
@@ -61,6 +61,9 @@ docs: $(VENV)/.docs ## build the documentation site in build/site
 $(VENV)/.docs: $(STAMP)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check 'mkdocs-material>=9.6,<10' 'mkdocstrings-python>=1.16,<3'
 	@touch $@
+
+pictures: $(STAMP) ## take the pictures of live view and report in docs/ again (needs Chromium)
+	$(BIN)/python -m tests.docs.pictures
 
 docs/configuration.md: $(STAMP) companion/config/*.py
 	$(BIN)/python -m companion.config.reference > $@

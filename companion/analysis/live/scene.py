@@ -22,7 +22,7 @@ from companion.analysis.live.follow import Message
 from companion.analysis.plot_data import COLOURS, Figure, Line, Mark, PlacedName
 from companion.estimate import bank
 from companion.nav.geometry import Geodetic, displace, separation
-from companion.records import Event, Gnss, Mode, Rejection, Reset, RsbnFix, Solution, Source, Stamped, Trust
+from companion.records import Event, Gnss, Mode, Reset, RsbnFix, Solution, Source, Stamped, Trust
 from companion.units import Floats
 
 TRACK_POINTS = 2400
@@ -38,7 +38,13 @@ NAMED = {
     Trust.PREDICTING: ("caution", "Predicting"),
     Trust.UNTRUSTED: ("fault", "Do not trust"),
 }
-_SHOWN: tuple[type[Stamped], ...] = (Solution, Gnss, RsbnFix, Event, Reset, Rejection)
+BITS = {
+    "gnss": Source.GNSS,
+    "azimuth": Source.AZIMUTH,
+    "range": Source.RANGE,
+    "airspeed": Source.AIR_DATA,
+}  # by the last word of the source's name
+_SHOWN: tuple[type[Stamped], ...] = (Solution, Gnss, RsbnFix, Event, Reset)
 _decoders = {kind.__name__: msgspec.json.Decoder(kind) for kind in _SHOWN}
 
 
@@ -82,10 +88,11 @@ class Strip:
 
 
 class Beacon(NamedTuple):
-    """The last reply of a beacon and when it came (s)."""
+    """The last reply of a beacon, when it came (s) and the point that it measured (m east and north)."""
 
     reply: RsbnFix
     t: float
+    end: tuple[float, float] | None
 
 
 class Scene:
@@ -98,9 +105,10 @@ class Scene:
         self._first_ns: int | None = None
         self._origin: Geodetic | None = None
         self._solution: tuple[Solution, float] | None = None
-        self._gnss: tuple[Gnss, float] | None = None
+        self._gnss: Gnss | None = None
         self._beacons: dict[int, Beacon] = {}
-        self._rejected: dict[str, tuple[str, float]] = {}
+        self._miss = 0.0  # distance of those points from the aircraft (m)
+        self._measured: dict[str, float | None] = {"gnss": None}  # when each source measured last (s)
         self._false: dict[str, float] = {}
         self._fixed, self._lost, self._received, self._ins = Track(), Track(), Track(), Track()
         self._strips: dict[str, Strip] = {}
@@ -125,14 +133,11 @@ class Scene:
             case Gnss():
                 self._add_gnss(record)
             case RsbnFix():
-                self._beacons[record.beacon] = Beacon(record, self.t)
-                self._place(record.lat, record.lon)
+                self._add_reply(record)
             case Event():
                 self._events.append((self.t, record.severity, record.text))
             case Reset():
                 self._events.append((self.t, 4, f"{record.what} reset: {record.reason}"))
-            case Rejection():
-                self._rejected[record.source] = (record.reason, self.t)
 
     def _place(self, lat: float, lon: float) -> tuple[float, float]:
         """Return metres east and north of the first position."""
@@ -153,6 +158,8 @@ class Scene:
             self._false = dict(s.false_sources)
             for name, p in s.false_sources:
                 self._strip(f"false {name}").add(self.t, 100.0 * p)
+        if s.sources & Source.AIR_DATA or self._false.get("airspeed", 0.0) > SUSPECT:
+            self._measured["airspeed"] = self.t
         self._strip("protection").add(self.t, s.protection)
         self._strip("bound").add(self.t, None if s.bound_n is None else math.hypot(*s.bound_n))
         self._strip("sigma").add(self.t, math.sqrt(CHI2_95_2 * _largest_variance(s)))
@@ -160,12 +167,12 @@ class Scene:
         self._strip("error east").add(self.t, s.error_n[1])
 
     def _add_gnss(self, record: Gnss) -> None:
-        if self._gnss is not None and record.repeats(self._gnss[0]):
+        if self._gnss is not None and record.repeats(self._gnss):
             return
         if not record.has_3d_fix:
             self._strip("gnss").add(self.t, None)
             return
-        self._gnss = record, self.t
+        self._gnss, self._measured["gnss"] = record, self.t
         east, north = self._place(record.lat, record.lon)
         self._received.add(self.t, east, north)
         if self._solution is not None:
@@ -174,6 +181,31 @@ class Scene:
                 Geodetic(record.lat, record.lon, 0.0), Geodetic(s.lat, s.lon, 0.0)
             )
             self._strip("gnss").add(self.t, math.hypot(d_north, d_east))
+
+    def _add_reply(self, reply: RsbnFix) -> None:
+        end = self._end(reply)
+        self._beacons[reply.beacon] = Beacon(reply, self.t, end)
+        if end is not None and self._solution is not None:
+            here = self._place(self._solution[0].lat, self._solution[0].lon)
+            self._miss = max(0.95 * self._miss, math.dist(end, here))  # slow, so that the map is steady
+        for kind, value in (("azimuth", reply.azimuth), ("range", reply.slant_range)):
+            if value is not None:
+                self._measured[f"rsbn {reply.beacon} {kind}"] = self.t
+
+    def _end(self, reply: RsbnFix) -> tuple[float, float] | None:
+        """Return the point that a reply measured; the position gives a missing range or azimuth."""
+        self._place(reply.lat, reply.lon)  # the first position is the origin, also a beacon's
+        reach, azimuth = reply.slant_range, reply.azimuth
+        if self._solution is not None:
+            s = self._solution[0]
+            north, east, _ = separation(Geodetic(s.lat, s.lon, 0.0), Geodetic(reply.lat, reply.lon, 0.0))
+            reach = math.hypot(north, east) if reach is None else reach
+            azimuth = math.atan2(east, north) if azimuth is None else azimuth
+        if reach is None or azimuth is None:
+            return None
+        north, east = reach * math.cos(azimuth), reach * math.sin(azimuth)
+        place = displace(reply.lat, reply.lon, 0.0, north, east, 0.0)
+        return self._place(place.lat, place.lon)
 
     def _strip(self, name: str) -> Strip:
         return self._strips.setdefault(name, Strip())
@@ -202,7 +234,7 @@ class Scene:
         age = self.t - t + (behind_s or 0.0)
         if age > STALE_S and not ended:
             return {"level": "fault", "word": "No data", "why": f"The last position is {age:.0f} s old."}
-        level, word = NAMED[s.trust] if s.trust is not None else ("caution", str(s.mode).capitalize())
+        level, word = trust_word(s)
         parts = []
         if s.mode is not Mode.FIXED:
             parts.append(f"No fix for {s.horizon_s:.0f} s.")
@@ -244,23 +276,12 @@ class Scene:
         ]
 
     def _sources(self) -> Iterator[SourceRow]:
-        s = self._solution[0] if self._solution else None
-        used = Source(s.sources) if s else Source(0)
-        if self._gnss is not None or "gnss" in self._false:
-            t = self._gnss[1] if self._gnss else None
-            yield self._row("GNSS", "gnss", t, bool(used & Source.GNSS))
-        for number, beacon in sorted(self._beacons.items()):
-            for kind, value, bit in (
-                ("azimuth", beacon.reply.azimuth, Source.AZIMUTH),
-                ("range", beacon.reply.slant_range, Source.RANGE),
-            ):
-                if value is not None:
-                    key = f"rsbn {number} {kind}"
-                    yield self._row(f"beacon {number} {kind}", key, beacon.t, bool(used & bit))
-        if used & Source.AIR_DATA or self._false.get("airspeed", 0.0) > SUSPECT:
-            yield self._row("airspeed", "airspeed", self.t, bool(used & Source.AIR_DATA))
+        """Yield a row for GNSS and for every source that measured; the chart has the same sources."""
+        sources = self._solution[0].sources if self._solution else 0
+        for key, t in self._measured.items():
+            yield self._row(key, t, bool(sources & BITS[key.rpartition(" ")[2]]))
 
-    def _row(self, name: str, key: str, t: float | None, used: bool) -> SourceRow:
+    def _row(self, key: str, t: float | None, used: bool) -> SourceRow:
         p = self._false.get(key)
         age = None if t is None else self.t - t
         state, level = ("used", "good") if used else ("not used", "")
@@ -271,7 +292,7 @@ class Scene:
         elif p is not None and p > SUSPECT:
             state, level = "suspect", "caution"
         return SourceRow(
-            name,
+            source_title(key),
             state,
             level,
             None if p is None else round(100.0 * p, 1),
@@ -295,7 +316,8 @@ class Scene:
         if self._solution is not None:
             s = self._solution[0]
             aircraft = (*self._place(s.lat, s.lon), math.atan2(s.v_n[1], s.v_n[0]))
-            frame = _frame([line for line in lines[1:4] if len(line.x)], *aircraft[:2])
+            miss = self._miss if len(lines[4].x) else 0.0
+            frame = _frame([line for line in lines[1:4] if len(line.x)], *aircraft[:2], miss)
             r = max(200.0, 1.5 * (s.protection or 0.0))
             near = (aircraft[0] - r, aircraft[0] + r, aircraft[1] - r, aircraft[1] + r)
         origin = self._origin or Geodetic(0.0, 0.0, 0.0)
@@ -310,31 +332,15 @@ class Scene:
         xs: list[float] = []
         ys: list[float] = []
         for beacon in self._beacons.values():
-            reply = beacon.reply
-            if self.t - beacon.t > SILENT_S:
+            reply, end = beacon.reply, beacon.end
+            if end is None or self.t - beacon.t > SILENT_S:
                 continue
             x, y = self._place(reply.lat, reply.lon)
-            reach = reply.slant_range
-            if reach is None and self._solution is not None:
-                reach = math.dist((x, y), self._place(self._solution[0].lat, self._solution[0].lon))
-            if reply.azimuth is not None and reach:
-                place = displace(
-                    reply.lat,
-                    reply.lon,
-                    0.0,
-                    reach * math.cos(reply.azimuth),
-                    reach * math.sin(reply.azimuth),
-                    0.0,
-                )
-                end = self._place(place.lat, place.lon)
+            if reply.azimuth is not None:
                 xs += [x, end[0], math.nan]
                 ys += [y, end[1], math.nan]
             if reply.slant_range is not None:
-                centre = reply.azimuth
-                if centre is None and self._solution is not None:
-                    here = self._place(self._solution[0].lat, self._solution[0].lon)
-                    centre = math.atan2(here[0] - x, here[1] - y)
-                arc = (centre or 0.0) + np.linspace(-0.15, 0.15, 25)
+                arc = math.atan2(end[0] - x, end[1] - y) + np.linspace(-0.15, 0.15, 25)
                 xs += [*(x + reply.slant_range * np.sin(arc)).tolist(), math.nan]
                 ys += [*(y + reply.slant_range * np.cos(arc)).tolist(), math.nan]
         return Line(
@@ -406,9 +412,8 @@ class Scene:
 
     def _false_lines(self) -> Iterator[Line]:
         roles = {"gnss": error_statistics.GNSS, "airspeed": "second"}
-        for key, strip in self._strips.items():
-            kind, _, name = key.partition(" ")
-            if kind == "false":
+        for name in self._measured:
+            if strip := self._strips.get(f"false {name}"):
                 colour = COLOURS[roles.get(name, error_statistics.RSBN)]
                 yield strip.line(source_title(name), colour, dash=name.endswith("range"))
 
@@ -421,6 +426,13 @@ class SourceRow(NamedTuple):
     level: str
     false: float | None
     age: float | None
+
+
+def trust_word(s: Solution) -> tuple[str, str]:
+    """Return level and word of the trust in a solution: recovering while the trust lags behind the fixes."""
+    if s.trust is Trust.PREDICTING and s.mode is Mode.FIXED:
+        return "caution", "Recovering"
+    return NAMED[s.trust] if s.trust is not None else ("caution", str(s.mode).capitalize())
 
 
 def _largest_variance(s: Solution) -> float:
@@ -440,12 +452,21 @@ def _metres(value: float | None) -> str:
     )
 
 
-def _frame(lines: list[Line], x: float, y: float) -> tuple[float, float, float, float]:
-    """Return a view that covers the tracks and at least 200 m around the aircraft."""
-    xs = np.concatenate([[x - 200.0, x + 200.0], *(line.x for line in lines)])
-    ys = np.concatenate(
-        [[y - 200.0, y + 200.0], *(np.where(np.isfinite(line.x), line.y, np.nan) for line in lines)]
-    )
+def _frame(lines: list[Line], x: float, y: float, miss: float) -> tuple[float, float, float, float]:
+    """Return a view that covers the tracks and what is around the aircraft.
+
+    That is at least 200 m, and the ends of the lines of position, `miss` (m) from it, unless they are so far
+    off that the rest would become small: 500 m and half of the tracks' extent.
+    """
+    xs = np.concatenate([[x], *(line.x for line in lines)])
+    ys = np.concatenate([[y], *(np.where(np.isfinite(line.x), line.y, np.nan) for line in lines)])
     low_x, high_x, low_y, high_y = (float(f(a)) for a in (xs, ys) for f in (np.nanmin, np.nanmax))
+    r = max(200.0, min(miss, max(500.0, 0.5 * (high_x - low_x), 0.5 * (high_y - low_y))))
+    low_x, high_x, low_y, high_y = (
+        min(low_x, x - r),
+        max(high_x, x + r),
+        min(low_y, y - r),
+        max(high_y, y + r),
+    )
     dx, dy = 0.06 * (high_x - low_x), 0.06 * (high_y - low_y)
     return low_x - dx, high_x + dx, low_y - dy, high_y + dy

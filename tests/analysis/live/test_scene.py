@@ -80,6 +80,7 @@ def test_numbers_and_circles_are_those_of_the_solution():
         ({}, 0.2, "good", "Trusted"),
         ({"trust": Trust.DEGRADED}, 0.2, "caution", "Degraded"),
         ({"trust": Trust.PREDICTING, "mode": Mode.PREDICTING, "sources": 1}, 0.2, "caution", "Predicting"),
+        ({"trust": Trust.PREDICTING}, 0.2, "caution", "Recovering"),  # fixes are back, the trust settles
         ({"trust": Trust.UNTRUSTED, "mode": Mode.UNTRUSTED, "sources": 1}, 0.2, "fault", "Do not trust"),
         ({}, 4.0, "fault", "No data"),
     ],
@@ -121,6 +122,20 @@ def test_sources_have_the_probability_that_each_is_false():
     assert {row["state"] for row in scene.frame(0.1, False)["sources"]} >= {"silent"}
 
 
+@pytest.mark.parametrize("sources", [1 | 2, 1 | 2 | 16])
+def test_table_and_chart_have_the_same_sources(sources):
+    """Airspeed is a source once it is used; a beacon's azimuth once it was measured."""
+    scene = Scene("x")
+    false = (("gnss", 0.01), ("airspeed", 0.0), ("rsbn 7 azimuth", 0.0), ("rsbn 7 range", 0.1))
+    scene.add(message(RsbnFix(S, S, 7, LAT, LON, 0.0, None, 5000.0, 0.002, 100.0)))
+    scene.add(message(solution(1.5, sources=sources, false_sources=false)))
+    frame = scene.frame(0.1, False)
+    (chart,) = (chart for chart in frame["charts"] if chart["key"] == "false")
+    names = [row["name"] for row in frame["sources"]]
+    assert names == [line["name"] for line in chart["lines"]]
+    assert names == ["GNSS", "beacon 7 range", *(["airspeed"] if sources & 16 else [])]
+
+
 def test_lines_of_position_end_where_the_beacon_measured():
     scene = Scene("x")
     scene.add(message(RsbnFix(S, S, 7, LAT, LON, 0.0, math.pi / 2, 5000.0, 0.002, 100.0)))
@@ -131,6 +146,32 @@ def test_lines_of_position_end_where_the_beacon_measured():
         [0, pytest.approx(0.0, abs=5.0)],
     )
     assert frame["places"] == [["beacon 7", 0.0, 0.0]]
+
+
+@pytest.mark.parametrize(
+    ("azimuth", "slant_range"), [(math.pi / 2 - 0.01, 20_000.0), (math.pi / 2 - 0.01, None), (None, 20_400.0)]
+)
+def test_ends_of_lines_of_position_are_in_view(azimuth, slant_range):
+    scene = Scene("x")
+    for k in range(100):
+        scene.add(message(solution(k, east=20_000.0, north=20.0 * k - 1980.0)))
+    scene.add(message(RsbnFix(100 * S, 100 * S, 7, LAT, LON, 0.0, azimuth, slant_range, 0.004, 100.0)))
+    x0, x1, y0, y1 = (figure := scene.frame(0.1, False)["map"])["frame"]
+    (line,) = (line for line in figure["lines"] if line["name"] == "lines of position")
+    x, y = (line["x"][1], line["y"][1]) if azimuth else (line["x"][12], line["y"][12])
+    aircraft = figure["aircraft"]
+    assert math.dist((x, y), aircraft[:2]) == pytest.approx(200.0 if azimuth else 400.0, abs=40.0)
+    assert x0 < x < x1 and y0 < y < y1
+
+
+@pytest.mark.parametrize("seconds", [2, 200])
+def test_a_beacon_far_off_does_not_make_the_map_small(seconds):
+    scene = Scene("x")
+    for k in range(seconds):
+        scene.add(message(solution(k, east=20.0 * k)))
+    scene.add(message(RsbnFix(S * seconds, S * seconds, 7, LAT, LON, 0.0, 0.0, 90_000.0, 0.004, 100.0)))
+    x0, x1, y0, y1 = scene.frame(0.1, False)["map"]["frame"]
+    assert max(x1 - x0, y1 - y0) < 1.15 * max(1000.0, 2.0 * 20.0 * seconds)
 
 
 def test_a_record_of_another_version_is_left_out():

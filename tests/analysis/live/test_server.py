@@ -1,12 +1,15 @@
 """The live view in a real browser, killed and started again; other sites cannot read it."""
 
+import contextlib
 import json
 import re
 import signal
+import socket
 import subprocess
 import sys
 import urllib.error
 import urllib.request
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -107,6 +110,55 @@ def test_page_follows_a_flight_and_survives_a_kill(tmp_path, browser):
     assert {url.split("/")[2] for url in browser.requests if url.startswith("http")} == {
         f"127.0.0.1:{live.port}"
     }
+
+
+def wait_for_position(live, t):
+    """Return the first frame with a position that is at least `t` (s) after the start of the log."""
+    from websockets.sync.client import connect
+
+    with connect(f"ws://127.0.0.1:{live.port}/socket", max_size=None) as client:
+        while True:
+            frame = json.loads(client.recv(timeout=20))
+            if frame.get("numbers") and frame["t"] >= t:
+                return frame
+
+
+@contextlib.contextmanager
+def until_interrupted(*arguments):
+    """A `companion` that is stopped at the end."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", "companion", *arguments], stderr=subprocess.DEVNULL, cwd=ROOT
+    )
+    try:
+        yield
+        process.send_signal(signal.SIGINT)
+        assert process.wait(20) == 0
+    finally:
+        process.kill()
+        process.wait()
+
+
+def test_a_flight_does_not_notice_that_the_live_view_is_killed(tmp_path):
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    settings = ("--preset", "navigation-ins", "--set", "output.profile=ardupilot")
+    with (
+        until_interrupted("run", "--connect", f"udpin:127.0.0.1:{port}", "--logs", str(tmp_path), *settings),
+        until_interrupted("sitl", "--scenario", "short", "--connect", f"udpout:127.0.0.1:{port}"),
+    ):
+        with Live(tmp_path) as live:
+            first = wait_for_position(live, 0.0)
+            live.process.send_signal(signal.SIGKILL)
+            assert live.process.wait(20) == -signal.SIGKILL
+        with Live(tmp_path) as live:
+            second = wait_for_position(live, first["t"] + 4.0)
+    assert second["log"] == first["log"] and second["behind"] < 3.0
+    (log,) = tmp_path.glob("*.mcap")
+    times = [e.value.rx_ns * 1e-9 for e in flight_log.read(log) if isinstance(e.value, Solution)]
+    assert times[-1] - times[0] > 4.0
+    assert max(b - a for a, b in pairwise(times)) < 0.3
+    assert len(times) >= 10.0 * (times[-1] - times[0])  # 10 a second for ODOMETRY
 
 
 def test_other_sites_and_paths_are_refused(tmp_path):
