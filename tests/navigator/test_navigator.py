@@ -458,7 +458,7 @@ def test_what_a_station_sets_without_fixes_keeps_the_position(name: str) -> None
     """There is no other: only another inertial channel begins again."""
     section, key = PARAMETERS[name]
     old = getattr(getattr(CONFIG, section), key)
-    new = (not old) if isinstance(old, bool) else 1.1 * old + 0.01
+    new = (not old) if isinstance(old, bool) else 1.1 * max(old, 0.0) + 0.01
     changed = structs.replace(CONFIG, **{section: structs.replace(getattr(CONFIG, section), **{key: new})})
     records = [record for moment in flight(60, 30.0, 30.0) for record in moment.records]
     plain, tuned = Navigator(CONFIG), Navigator(CONFIG)
