@@ -30,6 +30,7 @@ import click
 from companion import __version__
 from companion.config import Config, ConfigError, LogConfig, load
 from companion.config.options import configuration_options
+from companion.printable import printable
 from companion.records import Event, Severity
 from companion.runtime.console import Console, terminal_columns
 from companion.runtime.core import CompanionCore, Link
@@ -385,10 +386,10 @@ def command(
     try:
         asyncio.run(run(config, console.event, base, kept, notes, console.status))
     except CannotListen as error:
-        writer.write_line(f"companion: {error.strerror}")
+        writer.write_line(f"companion: {printable(str(error.strerror))}")
         sys.exit(EX_UNAVAILABLE)
     except LogError as error:
-        writer.write_line(f"companion: {error}")
+        writer.write_line(f"companion: {printable(str(error))}")
         sys.exit(EX_CANTCREAT)
     finally:
         writer.close()
