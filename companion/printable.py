@@ -1,10 +1,8 @@
-"""Text from outside (logs, messages, file names) made safe for a terminal."""
+"""Text from outside (logs, messages, file names) made safe for one line of a terminal."""
 
 from __future__ import annotations
 
 
 def printable(text: str) -> str:
-    r"""Return `text` with control and invisible characters written as escapes (\x1b); line ends stay."""
-    return "".join(
-        c if c.isprintable() or c == "\n" else c.encode("unicode_escape").decode("ascii") for c in text
-    )
+    r"""Return `text` in one line: control and invisible characters and line ends as escapes (\x1b, \n)."""
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)

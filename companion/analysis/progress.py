@@ -9,6 +9,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
+from companion.printable import printable
+
 
 @contextmanager
 def show_step(first: str) -> Iterator[Callable[[str], None]]:
@@ -16,5 +18,5 @@ def show_step(first: str) -> Iterator[Callable[[str], None]]:
     columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
     console = Console(stderr=True)
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
-        task = progress.add_task(escape(first))
-        yield lambda step: progress.reset(task, description=escape(step))
+        task = progress.add_task(escape(printable(first)))
+        yield lambda step: progress.reset(task, description=escape(printable(step)))

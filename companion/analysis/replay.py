@@ -222,7 +222,7 @@ def command(
     else:
         _print(log, output, counts, found, seconds)
         for note in notes:
-            click.echo(f"  {note}")
+            click.echo(f"  {printable(note)}")
     if found.different:
         raise SystemExit(1)
 

@@ -21,6 +21,9 @@ from companion.config.presets import PRESETS
 from companion.config.schema import Config
 from companion.config.validate import find_conflicts
 
+#: Bytes of a file and dots in a line of it: a dotted key takes memory by the square of its parts (60 kB of
+#: them, 3.5 GB).
+MAX_SIZE, MAX_DOTS = 1 << 16, 1000
 PREFIX = "COMPANION_"  # every environment variable with this prefix must name a key
 
 
@@ -126,17 +129,24 @@ def _preset(name: str | None) -> Mapping[str, Any]:
 
 def _read(path: Path) -> dict[str, dict[str, Any]]:
     try:
-        text = path.read_text(encoding="utf-8")
+        with path.open(encoding="utf-8") as file:
+            text = file.read(MAX_SIZE + 1)  # a device may be endless
+        size = max(path.stat().st_size, len(text))
     except FileNotFoundError:
         raise ConfigError(f"{path}: no such file; start from `companion check-config --defaults`") from None
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: cannot be read ({error})") from None
+    _check_size(size, str(path))
     tree = _tree(text, str(path))
     _check_keys(tree, str(path))
     return tree
 
 
 def _tree(text: str, where: str) -> dict[str, dict[str, Any]]:
+    _check_size(len(text), where)
+    for number, line in enumerate(text.split("\n"), 1):
+        if (dots := line.count(".")) > MAX_DOTS:
+            raise ConfigError(f"{where}: line {number} has {dots} dots, at most {MAX_DOTS} are allowed")
     try:
         tree = tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # an integer of thousands of digits is no TOMLDecodeError
@@ -145,6 +155,11 @@ def _tree(text: str, where: str) -> dict[str, dict[str, Any]]:
         if not isinstance(table, dict) and section in Config.__struct_fields__:
             raise ConfigError(f"{where}: `{section}` is a section: write [{section}] and its keys below it")
     return {name: table if isinstance(table, dict) else {"": table} for name, table in tree.items()}
+
+
+def _check_size(size: int, where: str) -> None:
+    if size > MAX_SIZE:
+        raise ConfigError(f"{where}: {size} bytes, but a configuration has at most {MAX_SIZE}")
 
 
 def _check_keys(tree: Mapping[str, Mapping[str, Any]], where: str) -> None:

@@ -21,6 +21,7 @@ from companion.config.profiles import PROFILES
 from companion.doctor.diagnosis import Diagnosis, Finding
 from companion.doctor.examination import Examination
 from companion.doctor.rendering import as_json, change_summary, parameter_table, print_diagnosis
+from companion.printable import printable
 from companion.runtime.exposure import exposure
 from companion.runtime.input_monitor import describe_silence
 from companion.runtime.service import EX_UNAVAILABLE
@@ -214,7 +215,7 @@ def command(
     try:
         well = examine(config, address, apply, yes, as_json_)
     except NoAutopilot as error:
-        click.echo(f"companion: {error}", err=True)
+        click.echo(f"companion: {printable(str(error))}", err=True)
         sys.exit(EX_UNAVAILABLE)
     except TimeoutError:
         click.echo(f"companion: {address}: no peer connected within {CONNECT_TIMEOUT_S:g} s", err=True)

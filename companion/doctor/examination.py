@@ -44,6 +44,7 @@ from companion.link.session import (
 )
 from companion.link.signing import Signing
 from companion.output.source_switch import selected
+from companion.printable import printable
 from companion.runtime.core import requested_rates
 from companion.units import SECOND_NS
 
@@ -190,7 +191,7 @@ class Examination:
         self._is_signing |= event.frame.signature is not None
         self._is_answering |= event.message.get_type() in ANSWERS
         if event.frame.msgid == mavlink.MAVLINK_MSG_ID_STATUSTEXT and event.message.text.startswith(PREARM):
-            self._arming_checks.add(event.message.text.removeprefix(PREARM))
+            self._arming_checks.add(printable(event.message.text.removeprefix(PREARM)))
         elif event.frame.msgid == mavlink.MAVLINK_MSG_ID_HEARTBEAT:
             self._heartbeat = event.message
         elif event.frame.msgid == mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION:

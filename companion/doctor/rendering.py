@@ -6,6 +6,7 @@ import json
 from typing import Any
 
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from companion.config import Config
@@ -53,7 +54,7 @@ def finding_table(diagnosis: Diagnosis) -> Table:
         table.add_column(column, no_wrap=column in ("", "what"))
     for found in diagnosis.findings:
         state = _NOTE if found.is_well is None else _GOOD if found.is_well else _BAD.format("wrong")
-        table.add_row(state, found.what, found.found, found.needs)
+        table.add_row(state, *map(escape, (found.what, found.found, found.needs)))
     return table
 
 
@@ -81,7 +82,7 @@ def summary(config: Config, diagnosis: Diagnosis) -> str:
         lines.append(
             f"{_number(absent, 'parameter')} absent: update the firmware, or use a build with this feature."
         )
-    lines += [f"{found.what}: {found.advice}." for found in diagnosis.problems]
+    lines += [escape(f"{found.what}: {found.advice}.") for found in diagnosis.problems]
     if not lines:
         lines.append("All is well.")
     if config.output.profile == "monitor":

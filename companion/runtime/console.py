@@ -12,6 +12,7 @@ import shutil
 import sys
 from collections.abc import Callable
 
+from companion.printable import printable
 from companion.records import Event, Severity
 from companion.runtime.status import Status
 from companion.units import SECOND_NS
@@ -45,7 +46,7 @@ class Console:
             severity = Severity(event.severity).name.lower()
             self._write_line(json.dumps({"t_s": seconds, "severity": severity, "text": event.text}))
         else:
-            self._print(f"{seconds:9.3f} {event.text}")
+            self._print(f"{seconds:9.3f} {printable(event.text)}")
 
     def status(self, status: Status, now_ns: int) -> None:
         """Show the status; call it once a second."""

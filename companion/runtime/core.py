@@ -49,6 +49,7 @@ from companion.navigator.receiver_choice import RECEIVER_MESSAGES
 from companion.output.autopilot_output import AutopilotOutput
 from companion.output.encode import Receiver, named_values, navigation_status
 from companion.output.pace import Pace
+from companion.printable import printable
 from companion.records import (
     INPUTS,
     Event,
@@ -495,7 +496,7 @@ class CompanionCore:
         self._log.record(record, channel)
         if isinstance(record, Event):
             self._events.append(record)
-            text = self._without_link_names(record.text)
+            text = self._without_link_names(printable(record.text))
             self._services.report(msgspec.structs.replace(record, text=text), record.rx_ns)
         elif isinstance(record, Rejection):
             self.rejected[record.source] += 1

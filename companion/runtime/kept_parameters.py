@@ -1,6 +1,8 @@
 """Kept parameters: values set by ground stations, loaded at the start unless they may have ended two starts.
 
-    config, notes = kept.load(base, lambda: load(..., tuned=kept.path))     # counts this start
+    config, notes = kept.load(base, lambda: load(..., tuned=kept.path))
+    kept.count_start()            # the log is open; from here on the values can end the service
+    kept.withdraw_start()         # it ended for another reason: an address in use, a configuration
     kept.confirm()                # the values have flown for a minute, or the service ended as requested
 
 A start is counted in a file, in systemd's RUNTIME_DIRECTORY or beside the parameters, and confirmed later.
@@ -39,21 +41,32 @@ class KeptParameters:
         """
         if not self.path.exists():
             return base, []
-        boot, failed = self._count()
+        _, failed = self._count()
         if failed >= MAX_FAILED_STARTS:
             return base, [self._set_aside(f"the last {failed} starts with them failed")]
         try:
-            config = load()
+            return load(), []
         except ConfigError as error:
             return base, [self._set_aside(str(error))]
-        with contextlib.suppress(OSError):
-            replace_text(self._count_path, f"{boot} {failed + 1}\n")
-        return config, []
+
+    def count_start(self) -> None:
+        """Count this start as failed, until it is withdrawn or confirmed."""
+        self._add(1)
+
+    def withdraw_start(self) -> None:
+        """Do not count this start: it failed for a reason that the values cannot have."""
+        self._add(-1)
 
     def confirm(self) -> None:
         """Forget the failed starts."""
         with contextlib.suppress(OSError):
             self._count_path.unlink(missing_ok=True)
+
+    def _add(self, number: int) -> None:
+        if self.path.exists():
+            boot, failed = self._count()
+            with contextlib.suppress(OSError):
+                replace_text(self._count_path, f"{boot} {failed + number}\n")
 
     def _count(self) -> tuple[str, int]:
         """Return the id of this boot and its number of unconfirmed starts."""

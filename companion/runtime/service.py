@@ -30,6 +30,7 @@ import click
 from companion import __version__
 from companion.config import Config, ConfigError, LogConfig, load
 from companion.config.options import configuration_options
+from companion.printable import printable
 from companion.records import Event, Severity
 from companion.runtime.console import Console, terminal_columns
 from companion.runtime.core import CompanionCore, Link
@@ -267,6 +268,8 @@ async def run(
     )
     service, has_data = None, True
     try:
+        if kept is not None:
+            kept.count_start()
         service = Service(
             config,
             log,
@@ -298,7 +301,10 @@ async def run(
         with contextlib.suppress(TimeoutError):
             await asyncio.wait_for(run_in_daemon_thread(service.save_state), STOP_TIMEOUT_S)
             await asyncio.wait_for(run_in_daemon_thread(service.confirm_parameters), STOP_TIMEOUT_S)
-    except (CannotListen, ConfigError):  # an empty log would count in log.maximum_files
+    except (CannotListen, ConfigError, SystemExit):
+        if kept is not None:  # neither the values' fault (`load` has checked them) nor a stop is one
+            kept.withdraw_start()
+        # an empty log would count in log.maximum_files
         has_data = service is not None and any(link.received for link in service.core.links.values())
         raise
     finally:
@@ -353,20 +359,23 @@ def command(
     (folder or free space), 78 invalid configuration.
     """
     flags = {"link.connect": connect or None, "log.folder": logs}
-    base = config = load(file, flags, pairs=pairs, preset=preset)
+
+    def load_with(tuned: Path | None) -> Config:
+        config = load(file, flags, pairs=pairs, tuned=tuned, preset=preset)
+        try:
+            for text in config.link.connect:
+                Address.parse(text)
+        except ValueError as error:
+            raise ConfigError(f"link.connect: {error}") from None
+        return config
+
+    base = config = load_with(None)
     kept, notes = None, list[str]()
     if base.link.parameters_file:
         kept = KeptParameters(
             Path(base.link.parameters_file), runtime_folder=os.environ.get("RUNTIME_DIRECTORY", "")
         )
-        config, notes = kept.load(
-            base, lambda: load(file, flags, pairs=pairs, tuned=kept.path, preset=preset)
-        )
-    try:
-        for text in config.link.connect:
-            Address.parse(text)
-    except ValueError as error:
-        raise ConfigError(f"link.connect: {error}") from None
+        config, notes = kept.load(base, partial(load_with, kept.path))
     writer = StderrWriter()
     console = Console(
         writer.write_line,
@@ -378,10 +387,10 @@ def command(
         with contextlib.closing(console):
             asyncio.run(run(config, console.event, base, kept, notes, console.status))
     except CannotListen as error:
-        writer.write_line(f"companion: {error.strerror}")
+        writer.write_line(f"companion: {printable(str(error.strerror))}")
         sys.exit(EX_UNAVAILABLE)
     except LogError as error:
-        writer.write_line(f"companion: {error}")
+        writer.write_line(f"companion: {printable(str(error))}")
         sys.exit(EX_CANTCREAT)
     finally:
         writer.close()

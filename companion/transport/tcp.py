@@ -6,7 +6,8 @@ connection.
 
 A listening socket serves MAX_PEERS clients. When all places are taken, a newcomer's first valid frame takes
 the place of a client that has sent none, or none for YIELDS_S; the autopilot's takes any station's. So a
-client that reconnects from a new address gets in. A newcomer that sends no valid frame in WAIT_S is closed.
+client that reconnects from a new address gets in. A newcomer that sends no valid frame in WAIT_S is closed,
+or earlier if MAX_WAITING others wait; none is closed on arrival, so idle connections cannot keep others out.
 """
 
 from __future__ import annotations
@@ -15,11 +16,12 @@ import asyncio
 import contextlib
 import math
 import socket
+from collections import Counter
 from collections.abc import Callable
 from typing import Any, TypeAlias
 
 from companion.transport.connection import Connection, socket_connection
-from companion.transport.peers import MAX_PEERS, PeerTable, Rank
+from companion.transport.peers import PeerTable, Rank
 
 #: A peer that does not answer for this time (s) is lost.
 PEER_TIMEOUT_S = 10
@@ -37,8 +39,10 @@ OPTIONS = {
 }
 #: Bytes sent and not yet acknowledged, about: more than 50 kB/s at a round trip of 0.2 s.
 SEND_BUFFER = 1 << 14
-#: Newcomers that may wait for a place, in all and of one host; seconds and bytes up to a frame.
-MAX_WAITING, MAX_WAITING_OF_HOST, WAIT_S, MAX_BYTES = 32, 8, 3.0, 4096
+#: Newcomers that may wait for a place: of 1,000 a second each has 0.25 s for its first frame.
+MAX_WAITING = 256
+#: Seconds and bytes that a newcomer has for its first frame.
+WAIT_S, MAX_BYTES = 3.0, 4096
 #: Silence (s) of a client after which it yields its place; a ground station sends HEARTBEAT every second.
 YIELDS_S = 3.0
 #: Pause (s) after a failed accept.
@@ -76,7 +80,8 @@ class Listener(Connection):
         super().__init__(name, sock, self._accept, self._send, self._close, self._places)
         self._sock = sock
         self._judge = judge
-        self._clients: dict[Connection, tuple[str, asyncio.Task[None]]] = {}  # host, and what serves it
+        self._clients: dict[Connection, asyncio.Task[None]] = {}
+        self._waiting: dict[Connection, str] = {}  # host of those without a place or a frame yet
         self._dropped_before = 0  # by clients that have left
 
     @property
@@ -99,16 +104,21 @@ class Listener(Connection):
             self._loop.remove_reader(self._sock)
             self._loop.call_later(PAUSE_S, self._listen_again)
             raise BlockingIOError from None
-        places = self._places.active()
-        waiting = [of_client for client, (of_client, _) in self._clients.items() if client not in places]
-        is_full = len(waiting) >= MAX_WAITING or waiting.count(host) >= MAX_WAITING_OF_HOST
-        if len(places) >= MAX_PEERS and is_full:
-            sock.close()
-            return
         sock.setblocking(False)
         client = tcp_connection(self.name, sock)
         self._places.join(client)
-        self._clients[client] = host, self._loop.create_task(self._serve(client))
+        if client not in self._places.active():
+            self._waiting[client] = host
+            if len(self._waiting) > MAX_WAITING:
+                self._end_waiting()
+        self._clients[client] = self._loop.create_task(self._serve(client))
+
+    def _end_waiting(self) -> None:
+        """Close the client that has waited longest, of the host with most waiting ones."""
+        host, _ = Counter(self._waiting.values()).most_common(1)[0]
+        oldest = next(client for client, of_client in self._waiting.items() if of_client == host)
+        del self._waiting[oldest]
+        oldest.end("made room for a newer client")
 
     def _listen_again(self) -> None:
         if self.is_open:
@@ -125,6 +135,7 @@ class Listener(Connection):
                     while not has_frame and len(first) < MAX_BYTES:
                         first += (data := await client.read())
                         has_frame = is_valid(data)
+            self._waiting.pop(client, None)
             if has_frame or client in self._places.active():
                 self._pass_on(client, first)
                 await client.deliver_to(lambda data, _: self._pass_on(client, data))
@@ -134,6 +145,7 @@ class Listener(Connection):
             client.close()
             self._dropped_before += client.dropped
             del self._clients[client]
+            self._waiting.pop(client, None)
             self._places.remove(client)
             self._pass_on(client, b"")
 

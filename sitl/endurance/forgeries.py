@@ -79,8 +79,8 @@ FORGERIES: dict[str, Callable[[int], dialect.Message]] = {
     "PARAM_SET GNSS_SIGMA_M": lambda ms: dialect.new(
         "PARAM_SET", param_id="GNSS_SIGMA_M", param_value=1000.0, param_type=9, **OURS
     ),
-    "PARAM_SET OUT_ODOMETRY_HZ": lambda ms: dialect.new(
-        "PARAM_SET", param_id="OUT_ODOMETRY_HZ", param_value=0.0, param_type=9, **OURS
+    "PARAM_SET ODOMETRY_HZ": lambda ms: dialect.new(
+        "PARAM_SET", param_id="ODOMETRY_HZ", param_value=0.0, param_type=9, **OURS
     ),
     "COMMAND_LONG 511, ODOMETRY off": lambda ms: dialect.new(
         "COMMAND_LONG", command=511, param1=mavlink.MAVLINK_MSG_ID_ODOMETRY, param2=-1.0, **OURS

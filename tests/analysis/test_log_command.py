@@ -47,12 +47,15 @@ def test_recovery_without_copy_ignores_an_existing_copy(whole: bytes, tmp_path: 
 
 def test_text_of_a_log_cannot_control_the_terminal(tmp_path: Path) -> None:
     log = tmp_path / "hostile.mcap"
-    names = {"a\x1b[2J": {"k\x07": "v\x9b31m [bold]x[/]"}}
+    names = {"a\x1b[2J": {"k\x07": "v\x9b31m [bold]x[/]"}, "b\nc": {"d\n": "e\nf"}}
     with Writer(log, metadata=names, start_unix_ns=10**18, start_ns=0, block=True) as writer:
         writer.record(Event(1, 1, 6, "x"), "/\x1b]0;title\x07")
+        writer.record(Event(2, 2, 6, "x"), "/y\nok: closed")
     shown = CliRunner().invoke(group, ["info", str(log)]).stdout
     assert r"/\x1b]0;title\x07" in shown and r"a\x1b[2J.k\x07: v\x9b31m [bold]x[/]" in shown
     assert not {"\x1b", "\x07", "\x9b"} & set(shown)
+    assert r"/y\nok: closed" in shown and r"b\nc.d\n: e ... (1 more lines)" in shown
+    assert not any(line.startswith(("ok", "c.d", ":")) for line in shown.splitlines())
     bad = tmp_path / "no\x1b[2J.mcap"
     bad.write_bytes(b"x")
     assert "\x1b" not in CliRunner().invoke(group, ["info", str(bad)]).stderr

@@ -47,6 +47,8 @@ def test_flags_override_environment_overrides_file(tmp_path: Path) -> None:
         ("[link]\nconnect = 3", "link.connect = [3] is invalid: expected str, got int"),
         ("link = 3", "`link` is a section: write [link] and its keys below it"),
         ("x = [", "not valid TOML"),
+        ("#" * 65_536 + "\n", "65537 bytes, but a configuration has at most 65536"),
+        ("\ngnss" + 1001 * ".a" + " = 1", "line 2 has 1001 dots, at most 1000 are allowed"),
     ],
 )
 def test_mistake_is_reported_in_one_sentence(tmp_path: Path, text: str, expected: str) -> None:
@@ -56,6 +58,11 @@ def test_mistake_is_reported_in_one_sentence(tmp_path: Path, text: str, expected
     assert expected in str(caught.value)
     assert str(path) in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_endless_file_is_rejected() -> None:
+    with pytest.raises(ConfigError, match="at most 65536"):
+        load(Path("/dev/zero"), environment={})
 
 
 @pytest.mark.parametrize(("scheme", "share"), [("feedforward", 0.0), (0.3, 0.3), ("feedback", 1.0)])

@@ -70,6 +70,12 @@ def test_journal_has_a_status_once_a_minute() -> None:
     assert len(lines) == 3 and not any("\x1b" in line for line in lines)
 
 
+def test_event_is_one_line_without_control_characters() -> None:
+    lines: list[str] = []
+    Console(lines.append, 0).event(event(1.5, "from a link\n    1.600 forged\x1b[2J"))
+    assert lines == [r"    1.500 from a link\n    1.600 forged\x1b[2J"]
+
+
 def test_json_lines_are_objects() -> None:
     lines: list[str] = []
     console = Console(lines.append, 0, as_json=True, columns=80)

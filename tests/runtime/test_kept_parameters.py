@@ -18,7 +18,9 @@ def kept(tmp_path: Path) -> KeptParameters:
 
 
 def start(kept: KeptParameters) -> tuple[Config, list[str]]:
-    return kept.load(Config(), lambda: load(None, environment={}, tuned=kept.path))
+    config, notes = kept.load(Config(), lambda: load(None, environment={}, tuned=kept.path))
+    kept.count_start()
+    return config, notes
 
 
 def test_two_failed_starts_drop_the_parameters(kept: KeptParameters) -> None:
@@ -37,6 +39,14 @@ def test_a_confirmed_start_does_not_count(kept: KeptParameters) -> None:
         config, notes = start(kept)
         assert config.gnss.sigma_m == 7.0 and notes == []
         kept.confirm()
+
+
+def test_a_withdrawn_start_neither_counts_nor_excuses_others(kept: KeptParameters) -> None:
+    for has_failed in (False, False, True, False, False, True):
+        assert start(kept)[1] == []
+        if not has_failed:
+            kept.withdraw_start()
+    assert "the last 2 starts with them failed" in start(kept)[1][0]
 
 
 def test_power_cuts_do_not_count(kept: KeptParameters, tmp_path: Path) -> None:

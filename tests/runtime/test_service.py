@@ -319,6 +319,47 @@ def test_port_in_use_exits_69_with_one_line(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())  # a failed start leaves no empty log
 
 
+def test_starts_that_fail_for_another_reason_keep_the_parameters(tmp_path: Path) -> None:
+    """An address in use, a log folder that cannot be used, no signing key, an invalid link: twice each."""
+    values = tmp_path / "set.toml"
+    values.write_text("[gnss]\nsigma_m = 7.0\n")
+    (tmp_path / "no_folder").write_text("")
+    keep = ("--set", f"link.parameters_file={values}")
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
+        taken.bind((LOOPBACK, 0))
+        in_use = ("--connect", f"udpin:{LOOPBACK}:{taken.getsockname()[1]}", "--logs", str(tmp_path / "logs"))
+        for code, arguments in (
+            (EX_UNAVAILABLE, in_use),
+            (EX_CANTCREAT, ("--logs", str(tmp_path / "no_folder"))),
+            (78, ("--set", f"signing.key_file={tmp_path / 'none'}", "--logs", str(tmp_path / "logs"))),
+            (78, ("--connect", "udp:1.2.3.4")),
+        ):
+            for _ in range(2):
+                found, stderr = finished(*keep, *arguments)
+                assert found == code and "failed" not in stderr
+    assert values.exists()
+
+
+def test_two_killed_starts_set_the_parameters_aside(tmp_path: Path) -> None:
+    values = tmp_path / "set.toml"
+    values.write_text("[gnss]\nsigma_m = 7.0\n")
+    run = [*RUN, "--set", f"link.parameters_file={values}", "--logs", str(tmp_path / "logs")]
+    run += ["--connect", f"udpin:{LOOPBACK}:{free_port()}"]
+    for _ in range(2):
+        with subprocess.Popen(run, stderr=subprocess.PIPE, env=ENVIRONMENT) as process:
+            assert process.stderr is not None
+            while b"listening" not in process.stderr.readline():
+                assert process.poll() is None
+            process.kill()
+    with subprocess.Popen(run, stderr=subprocess.PIPE, env=ENVIRONMENT, text=True) as process:
+        assert process.stderr is not None
+        while "the last 2 starts with them failed" not in process.stderr.readline():
+            assert process.poll() is None
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(20) == 0
+    assert values.with_name("set.toml.rejected").exists()
+
+
 def test_missing_key_exits_78_and_leaves_no_log(tmp_path: Path) -> None:
     code, stderr = finished("--set", f"signing.key_file={tmp_path / 'none'}", "--logs", str(tmp_path))
     assert code == 78 and "signing.key_file" in stderr

@@ -5,6 +5,7 @@ import errno
 import os
 import socket
 from collections.abc import Callable, Coroutine, Hashable
+from functools import partial
 from typing import Any
 
 import pytest
@@ -257,12 +258,80 @@ def test_connections_without_a_frame_do_not_disturb_clients(
             server.write(b"%03d" % k)
             for client in clients:
                 assert await client.read() == b"%03d" % k
-            assert len(server._clients) <= MAX_PEERS + tcp.MAX_WAITING_OF_HOST
+            assert len(server._clients) <= MAX_PEERS + tcp.MAX_WAITING
         for stranger in strangers:
             await ended(stranger)
         assert len(server._clients) == len(received.by_sender) == MAX_PEERS
         for client in clients:
             client.close()
+        await received.close()
+
+    run(test())
+
+
+@pytest.mark.parametrize("number", [17, 40, 200])
+def test_idle_connections_that_hold_on_keep_no_client_with_frames_out(number: int) -> None:
+    """They connect again whenever they are closed; a client joins, leaves and joins again."""
+
+    async def hold_on(server: Listener) -> None:
+        while True:
+            idle = await client_of(server)
+            try:
+                await ended(idle)
+            finally:
+                idle.close()
+
+    async def test() -> None:
+        received = Received(server := await listen())
+        idle = [asyncio.ensure_future(hold_on(server)) for _ in range(number)]
+        await until(lambda: len(server._clients) >= MAX_PEERS)
+        stays = await client_of(server)
+        stays.write(b"frame of one that stays")
+        for turn in (b"frame 1", b"frame 2", b"frame 3"):
+            client = await client_of(server)
+            await asyncio.sleep(0.05)  # as a line does
+            client.write(turn)
+            await until(partial(received.has, b"frame of one that stays", turn))
+            server.write(turn)
+            assert await client.read() == await stays.read() == turn
+            client.close()
+            assert len(server._clients) <= MAX_PEERS + tcp.MAX_WAITING
+        for task in idle:
+            task.cancel()
+        await asyncio.gather(*idle, return_exceptions=True)
+        stays.close()
+        await received.close()
+
+    run(test())
+
+
+def test_too_many_waiting_clients_close_the_oldest_of_the_host_with_most(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(tcp, "MAX_WAITING", 3)
+
+    async def test() -> None:
+        received = Received(server := await listen())
+        established = [await client_of(server) for _ in range(MAX_PEERS)]
+        for client in established:
+            client.write(b"frame")
+        await until(lambda: len(received.by_sender) == MAX_PEERS)
+        waiting = []
+
+        def has_clients(number: int) -> bool:
+            return len(server._clients) == number
+
+        for k, host in enumerate(["127.0.0.2", "127.0.0.1", "127.0.0.1", "127.0.0.1"]):
+            waiting.append(socket.create_connection(("127.0.0.1", server.port), source_address=(host, 0)))
+            await until(partial(has_clients, MAX_PEERS + min(k + 1, 3)))
+        waiting[1].settimeout(5.0)
+        assert await asyncio.to_thread(waiting[1].recv, 1) == b""
+        waiting[0].send(b"frame of the oldest")
+        await until(lambda: received.has(b"frame of the oldest"))
+        for client in established:
+            client.close()
+        for sock in waiting:
+            sock.close()
         await received.close()
 
     run(test())

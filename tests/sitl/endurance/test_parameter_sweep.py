@@ -21,8 +21,8 @@ def test_values_beyond_the_limits_change_nothing() -> None:
     greatest = {p.name: limits(p)[1] for p in parameter_table()}
     beyond = [Setting(name, 1.001 * value + 1.0) for name, value in greatest.items()]
     beyond += [
-        Setting("RATE_GNSS_HZ", 1e-40),
-        Setting("OUT_ODOMETRY_HZ", 4e-4),
+        Setting("STATUS_HZ", 1e-40),
+        Setting("ODOMETRY_HZ", 4e-4),
         Setting("GNSS_SIGMA_M", EXTREMES[0]),
     ]
     assert fly_with(CONFIGS[0], beyond) == 0
