@@ -383,7 +383,7 @@ class Solution(Stamped, frozen=True, gc=False, tag=True):
         """
         if self.trust is None:
             return str(self.mode)
-        if self.mode is Mode.FIXED and self.trust >= Trust.PREDICTING:
+        if self.mode is Mode.FIXED and self.trust is Trust.PREDICTING:
             return "recovering"
         return self.trust.name.lower()
 

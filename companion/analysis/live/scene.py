@@ -22,7 +22,7 @@ from companion.analysis.live.follow import Message
 from companion.analysis.plot_data import COLOURS, Figure, Line, Mark, PlacedName
 from companion.estimate import bank
 from companion.nav.geometry import Geodetic, displace, separation
-from companion.records import Event, Gnss, Mode, Reset, RsbnFix, Solution, Source, Stamped, Trust
+from companion.records import Event, Gnss, Mode, Reset, RsbnFix, Solution, Source, Stamped
 from companion.units import Floats
 
 TRACK_POINTS = 2400
@@ -32,12 +32,8 @@ SILENT_S = 5.0  # a source is silent after this time
 STALE_S = 3.0  # no solution for so long: the view says so
 CHI2_95_2 = 5.991
 SUSPECT, EXCLUDED = bank.Settings().suspect, bank.Settings().excluded
-NAMED = {
-    Trust.NORMAL: ("good", "Trusted"),
-    Trust.DEGRADED: ("caution", "Degraded"),
-    Trust.PREDICTING: ("caution", "Predicting"),
-    Trust.UNTRUSTED: ("fault", "Do not trust"),
-}
+#: Level and title of each `Solution.status_word`; others are a caution by their own name.
+NAMED = {"normal": ("good", "Trusted"), "untrusted": ("fault", "Do not trust")}
 BITS = {
     "gnss": Source.GNSS,
     "azimuth": Source.AZIMUTH,
@@ -234,7 +230,7 @@ class Scene:
         age = self.t - t + (behind_s or 0.0)
         if age > STALE_S and not ended:
             return {"level": "fault", "word": "No data", "why": f"The last position is {age:.0f} s old."}
-        level, word = trust_word(s)
+        level, word = NAMED.get(s.status_word, ("caution", s.status_word.capitalize()))
         parts = []
         if s.mode is not Mode.FIXED:
             parts.append(f"No fix for {s.horizon_s:.0f} s.")
@@ -426,13 +422,6 @@ class SourceRow(NamedTuple):
     level: str
     false: float | None
     age: float | None
-
-
-def trust_word(s: Solution) -> tuple[str, str]:
-    """Return level and word of the trust in a solution: recovering while the trust lags behind the fixes."""
-    if s.trust is Trust.PREDICTING and s.mode is Mode.FIXED:
-        return "caution", "Recovering"
-    return NAMED[s.trust] if s.trust is not None else ("caution", str(s.mode).capitalize())
 
 
 def _largest_variance(s: Solution) -> float:
