@@ -7,7 +7,9 @@ It does not decode messages.
 
 from __future__ import annotations
 
+import errno
 import os
+import stat
 import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -38,6 +40,13 @@ class LogError(OSError):
 
 class DamagedError(ValueError):
     """Inconsistent bytes, such as a wrong checksum or a length beyond the end of its record."""
+
+
+def open_regular(path: Path) -> BinaryIO:
+    """Open a file for reading. Raises OSError for a pipe or a device too, which could be read without end."""
+    if not stat.S_ISREG(path.stat().st_mode):
+        raise OSError(errno.EINVAL, "not a regular file", str(path))
+    return path.open("rb")
 
 
 class RawRecord(NamedTuple):
@@ -167,7 +176,7 @@ def open_log(path: str | os.PathLike[str]) -> Iterator[LogReader]:
     """
     path = Path(path)
     try:
-        file = path.open("rb")
+        file = open_regular(path)
     except OSError as error:
         raise LogError(f"{path}: cannot be read: {error.strerror or error}") from None
     with file:
