@@ -205,7 +205,7 @@ def _read_member(path: Path, member: str) -> bytes:
             # the others are not decompressed in steps
             if found.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
                 raise LogError(
-                    f"{path}: {member} is compressed by an unsupported method"
+                    f"{path}: {member} is compressed by another method than Deflate"
                 )  # expands unbounded
             with archive.open(found) as packed:
                 content = packed.read(MAX_TABLES + 1)
