@@ -97,7 +97,8 @@ def _lines(file: BinaryIO, path: Path, damage: Damage) -> Iterator[str]:
         if len(line) > MAX_LINE:
             damage.add(path.name, 0, f"a line is longer than {MAX_LINE} bytes")
             return
-        yield line.decode("utf-8", "replace").replace("\0", "")
+        # a quote that is not closed would hold the rest of the file; numbers need none
+        yield line.decode("utf-8", "replace").replace("\0", "").replace('"', "")
 
 
 def _number(row: Row, name: str) -> float | None:

@@ -275,6 +275,15 @@ def test_csv_topics_are_merged_by_time(tmp_path: pathlib.Path) -> None:
     assert isinstance(event, r.Event) and "wind_estimate.csv at 2000 us: not a row of its topic" in event.text
 
 
+@pytest.mark.parametrize("quote", ['"', '""', '"x', ',"'])
+def test_quote_in_a_topic_loses_at_most_its_line(quote: str, tmp_path: pathlib.Path) -> None:
+    rows = [f"{10_000 * k},{quote if k == 5 else ''}1.0,0,0,0,0,0,0" for k in range(20)]
+    header = "timestamp,q[0],q[1],q[2],q[3],rollspeed,pitchspeed,yawspeed"
+    (tmp_path / "vehicle_attitude.csv").write_text("\n".join([header, *rows]))
+    found = [record for record in sources.open_source(tmp_path) if isinstance(record, r.Attitude)]
+    assert len(found) >= 19
+
+
 @pytest.mark.parametrize("name", ["x.ulg", "x.bin", "x.tlog", "x.mat", "x.zip", "x.mcap"])
 def test_pipe_is_rejected_without_waiting_for_its_writer(name: str, tmp_path: pathlib.Path) -> None:
     os.mkfifo(tmp_path / name)
