@@ -36,13 +36,21 @@ class ImplausibleField(NamedTuple):
     @property
     def reason(self) -> str:
         """Why the record is not used."""
-        if not math.isfinite(self.value):
-            return f"{self.name} is {self.value}"
-        return f"{self.name} {self.value:g} is beyond the limit {self.limit:g}"
+        if not math.isfinite(self._number):
+            return f"{self.name} is {self._number}"
+        return f"{self.name} {self._number:g} is beyond the limit {self.limit:g}"
+
+    @property
+    def _number(self) -> float:
+        """The value; infinite if it is an integer beyond any float (a text log may have 400 digits)."""
+        try:
+            return float(self.value)
+        except OverflowError:
+            return math.inf if self.value > 0 else -math.inf
 
     def rejection(self, record: Stamped) -> Rejection:
         """Return the rejection of `record`."""
-        value = float(self.value) if math.isfinite(self.value) else None
+        value = self._number if math.isfinite(self._number) else None
         return Rejection(record.t_ns, record.rx_ns, type(record).__name__, self.reason, value, self.limit)
 
 

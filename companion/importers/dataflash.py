@@ -286,7 +286,7 @@ class DataflashLog:
 def boot_time_us(m: Message) -> int | None:
     """Return the time since boot (TimeUS, TimeMS or T; in an old GPS message TimeMS is the time of week).
 
-    -1 if it is not a number.
+    -1 if it is not a number, or beyond `MAX_BOOT_US`.
     """
     value, scale = getattr(m, "TimeUS", None), 1
     if value is None:
@@ -295,7 +295,7 @@ def boot_time_us(m: Message) -> int | None:
         value = getattr(m, "TimeMS", None)
     if value is None:
         return None
-    return int(value) * scale if isinstance(value, int | float) and math.isfinite(value) else -1
+    return int(value) * scale if isinstance(value, int | float) and 0 <= value <= MAX_BOOT_US else -1
 
 
 def read(path: Path) -> DataflashLog:

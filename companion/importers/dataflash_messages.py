@@ -1,7 +1,7 @@
 """DataFlash container (ArduPilot `.bin` and `.log`): bytes -> messages with named columns. Pure.
 
 A binary message is two magic bytes, a type and its columns; messages of type 128 (FMT) define the others.
-There are no checksums: after damage the reader continues at the next message that another one follows. It
+There are no checksums: after damage the reader continues at a message that another one follows soon. It
 trusts no length and always advances. pymavlink's DFReader, the reference in the tests, never returns from
 some damaged files, gives up on others, and prints to the terminal.
 """
@@ -24,6 +24,7 @@ HEAD = b"\xa3\x95"
 _FORMAT, _FORMAT_SIZE = 128, 89
 _FORMAT_LAYOUT = struct.Struct("<BB4s16s64s")
 _MAX_LINE = 4096
+_GAP = 8  # bytes of damage between two messages that confirm each other
 
 #: struct code and divisor of each format character (ArduPilot's LogStructure.h).
 _CODES: dict[str, tuple[str, float | None]] = {
@@ -86,11 +87,16 @@ def _binary_messages(data: Buffer, names: Collection[str], damage: Damage) -> It
         layout = layouts.get(data[place + 2])
         return layout.size if layout is not None and place + layout.size <= end else 0
 
+    def is_followed(stop: int) -> bool:
+        """Return whether a message that stops there is followed by another or the end, `_GAP` bytes apart."""
+        following = data.find(HEAD, stop, stop + _GAP + len(HEAD))
+        return stop + _GAP >= end or following == stop or (following > stop and size_at(following) > 0)
+
     def next_message(place: int) -> int:
         """Return where the next message begins that is followed by another or the end; the end if none is."""
         while (place := data.find(HEAD, place)) >= 0:
             size = size_at(place)
-            if size and (place + size == end or data[place + size : place + size + 2] == HEAD):
+            if size and is_followed(place + size):
                 return place
             place += 1
         return end

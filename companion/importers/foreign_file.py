@@ -17,7 +17,7 @@ from typing import Any, NamedTuple, TypeVar
 
 from companion.plausibility import implausible_field
 from companion.records import Event, Severity, Stamped
-from companion.storage.reader import LogError
+from companion.storage.reader import LogError, open_regular
 from companion.units import SECOND_NS
 
 MAX_BYTES = 1 << 36
@@ -51,15 +51,18 @@ class Damage:
         return f"{self.parts} parts of {self.size} bytes in total were not read, the first at {self.first}"
 
 
-def map_file(path: Path) -> mmap.mmap:
-    """Map a file into memory, read-only. Raises LogError if it is missing, empty or larger than the limit."""
+def map_file(path: Path, limit: int = MAX_BYTES) -> mmap.mmap:
+    """Map a file into memory, read-only.
+
+    Raises LogError if it is missing, empty, no regular file, or larger than `limit` bytes.
+    """
     try:
-        with path.open("rb") as file:
+        with open_regular(path) as file:
             size = file.seek(0, 2)
             if not size:
                 raise LogError(f"{path} is empty: nothing was recorded")
-            if size > MAX_BYTES:
-                raise LogError(f"{path} has {size} bytes (limit {MAX_BYTES})")
+            if size > limit:
+                raise LogError(f"{path} has {size} bytes (limit {limit})")
             return mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
     except LogError:
         raise

@@ -39,6 +39,7 @@ MAX_SIGMA_S = 0.1  # above it no delay is reported: the drift of the local posit
 REACH_S = 2.0  # no interpolation between local positions farther apart
 GLITCH_SIGMA_M = 2.0  # a glitch exceeds 4 of these and 6 times the usual deviation of the flight
 GLITCH_MAX_S = 10.0
+FASTEST_S = 0.02  # between fixes of the fastest receivers: limits the median filter's window
 MAX_ACCELERATION = 50.0  # m/s^2
 
 
@@ -174,7 +175,7 @@ def find_glitches(track: GnssLocalTrack, latency: float = 0.0) -> list[Glitch]:
     t, x, v = track.t[near], track.x[near], track.v[near]
     speed, implausible = np.nan_to_num(np.hypot(*v.T)), _implausible(t, x, v)
     difference = _difference(track, t, x, latency)
-    width = 2 * int(GLITCH_MAX_S / max(float(np.median(np.diff(t))), 1e-3)) + 1
+    width = 2 * int(GLITCH_MAX_S / max(float(np.median(np.diff(t))), FASTEST_S)) + 1
     usual = median_filter(difference, size=(min(width, t.size), 1), mode="nearest")
     off = np.hypot(*(difference - usual).T)
     limit = max(4.0 * GLITCH_SIGMA_M, 6.0 * 1.4826 * float(np.median(off)))

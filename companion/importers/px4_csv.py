@@ -29,7 +29,7 @@ from companion.records import (
     Stamped,
     Wind,
 )
-from companion.storage.reader import LogError
+from companion.storage.reader import LogError, open_regular
 
 Row: TypeAlias = dict[str, str]
 
@@ -71,7 +71,7 @@ class CsvFolder:
     def _rows(self, path: Path) -> Iterator[tuple[int, Row]]:
         """Yield line number and row. The file ends where it cannot be read."""
         try:
-            with path.open("rb") as file:
+            with open_regular(path) as file:
                 lines = _lines(file, path, self.damage)
                 yield from enumerate(csv.DictReader(lines), start=2)
         except (OSError, EOFError, zlib.error, csv.Error) as error:
@@ -97,7 +97,8 @@ def _lines(file: BinaryIO, path: Path, damage: Damage) -> Iterator[str]:
         if len(line) > MAX_LINE:
             damage.add(path.name, 0, f"a line is longer than {MAX_LINE} bytes")
             return
-        yield line.decode("utf-8", "replace").replace("\0", "")
+        # a quote that is not closed would hold the rest of the file; numbers need none
+        yield line.decode("utf-8", "replace").replace("\0", "").replace('"', "")
 
 
 def _number(row: Row, name: str) -> float | None:

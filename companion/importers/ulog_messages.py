@@ -43,7 +43,9 @@ _CODES = {
     "bool": "?",
     "char": "c",
 }
-_MAX_FIELDS, _MAX_DEPTH = 4096, 8
+MAX_FIELDS = 1 << 17
+"""Fields of all topics of a file, with those of nested types counted again; the recorded logs have 10,000."""
+_MAX_DEPTH, _MAX_LABEL = 8, 64
 
 
 class TopicRow(NamedTuple):
@@ -70,11 +72,13 @@ class Dropout(NamedTuple):
     duration_ms: int
 
 
-class _Subscription(NamedTuple):
+class _Layout(NamedTuple):
+    """A topic's rows: their bytes without padding at the end (which may be missing) and with it."""
+
     topic: str
-    wanted: bool
-    packed: struct.Struct  # without padding at the end, which may be missing
+    shortest: int
     longest: int
+    packed: struct.Struct | None  # None and no fields if the topic is not wanted
     fields: tuple[str, ...]
 
 
@@ -85,8 +89,8 @@ def messages(
 
     Raises ValueError if the file needs a newer reader.
     """
-    formats: dict[str, str] = {}
-    subscribed: dict[int, _Subscription] = {}
+    layouts = _Layouts(topics)
+    subscribed: dict[int, tuple[_Layout, bool]] = {}  # by number; whether it is the first instance
     appended: list[int] = []  # where data was appended to a log that may be torn there, descending
     at, end = _HEADER_SIZE, len(data)
 
@@ -99,7 +103,7 @@ def messages(
             return 0
         if kind == _DATA:
             found = subscribed.get(data[place + 3] | data[place + 4] << 8)
-            if found is None or not found.packed.size + 2 <= size <= found.longest + 2:
+            if found is None or not found[0].shortest + 2 <= size <= found[0].longest + 2:
                 return 0
         elif kind == _SYNCHRONISATION and data[place + 3 : place + 11] != _SYNC:
             return 0
@@ -131,17 +135,17 @@ def messages(
         kind, body = data[at + 2], at + 3
         try:
             if kind == _DATA:
-                found = subscribed[data[body] | data[body + 1] << 8]
-                if found.wanted:
-                    values = found.packed.unpack_from(data, body + 2)
-                    yield TopicRow(at, found.topic, dict(zip(found.fields, values)))
+                layout, first = subscribed[data[body] | data[body + 1] << 8]
+                if first and layout.packed is not None:
+                    values = layout.packed.unpack_from(data, body + 2)
+                    yield TopicRow(at, layout.topic, dict(zip(layout.fields, values)))
             elif kind == _FORMAT:
                 name, _, fields = data[body : at + size].decode("utf-8", "replace").partition(":")
-                formats[name] = fields
+                layouts.formats[name] = fields
             elif kind == _SUBSCRIPTION:
                 name = data[body + 3 : at + size].decode("utf-8", "replace")
                 number = data[body + 1] | data[body + 2] << 8
-                subscribed[number] = _subscribe(name, formats, name in topics and data[body] == 0)
+                subscribed[number] = layouts.find(name), data[body] == 0
             elif kind in (_TEXT, _TAGGED):
                 time_at = body + (1 if kind == _TEXT else 3)
                 boot_us = int.from_bytes(data[time_at : time_at + 8], "little")
@@ -163,35 +167,68 @@ def _appended_offsets(flags: bytes, end: int) -> list[int]:
     return sorted((offset for offset in offsets if _HEADER_SIZE < offset < end), reverse=True)
 
 
-def _subscribe(name: str, formats: dict[str, str], wanted: bool) -> _Subscription:
-    """Return the layout of a topic. Raises LookupError if it is not defined, or larger than a message."""
-    fields = list(_flatten(name, formats, "", _MAX_DEPTH))
-    longest = struct.calcsize("<" + "".join(code for _, code in fields))
-    if longest > 0xFFFF:
-        raise LookupError(f"topic {name} has {longest} bytes (limit 65535)")
-    while fields and fields[-1][0].startswith("_padding"):
-        fields.pop()
-    packed = struct.Struct("<" + "".join(code for _, code in fields))
-    return _Subscription(name, wanted, packed, longest, tuple(name for name, _ in fields))
+class _Layouts:
+    """Layouts of the topics, each made once from its format; names of fields are kept for `wanted` ones."""
 
+    def __init__(self, wanted: Collection[str]) -> None:
+        self.formats: dict[str, str] = {}
+        self._wanted = wanted
+        self._found: dict[str, _Layout | LookupError] = {}
+        self._left = MAX_FIELDS
 
-def _flatten(name: str, formats: dict[str, str], prefix: str, depth: int) -> Iterator[tuple[str, str]]:
-    """Yield the fields of a topic with their struct codes, nested ones as PREFIX.NAME, arrays as NAME[0]."""
-    if name not in formats or depth == 0:
-        raise LookupError(f"topic {name} is not defined" if depth else f"topic {name} is nested too deeply")
-    count = 0
-    for field in formats[name].split(";"):
-        if not field:
-            continue
-        kind, _, label = field.partition(" ")
-        kind, _, length = kind.partition("[")
-        if length and not (length[-1] == "]" and length[:-1].isdecimal() and len(length) < 7):
-            raise LookupError(f"topic {name} has the array length {length[:20]!r}")
-        labels = [f"{label}[{i}]" for i in range(int(length[:-1]))] if length else [label]
-        for one in labels:
-            inner = [(prefix + one, _CODES[kind])] if kind in _CODES else None
-            for flat in inner or _flatten(kind, formats, f"{prefix}{one}.", depth - 1):
-                yield flat
-                count += 1
-                if count > _MAX_FIELDS:
-                    raise LookupError(f"topic {name} has more than {_MAX_FIELDS} fields")
+    def find(self, name: str) -> _Layout:
+        """Return the layout of a topic. Raises LookupError if it is not defined, or too large."""
+        if name not in self.formats:
+            raise LookupError(f"topic {name} is not defined")
+        if name not in self._found:
+            try:
+                self._found[name] = self._make(name)
+            except LookupError as error:
+                self._found[name] = error
+        found = self._found[name]
+        if isinstance(found, LookupError):
+            raise LookupError(*found.args)
+        return found
+
+    def _make(self, name: str) -> _Layout:
+        fields = self._flatten(name, _MAX_DEPTH)
+        longest = struct.calcsize("<" + "".join(code for _, code in fields))
+        if longest > 0xFFFF:
+            raise LookupError(f"topic {name} has {longest} bytes (limit 65535)")
+        while fields and fields[-1][0].startswith("_padding"):
+            fields.pop()
+        packed = struct.Struct("<" + "".join(code for _, code in fields))
+        if name not in self._wanted:
+            return _Layout(name, packed.size, longest, None, ())
+        return _Layout(name, packed.size, longest, packed, tuple(label for label, _ in fields))
+
+    def _flatten(self, name: str, depth: int) -> list[tuple[str, str]]:
+        """Return the fields with their struct codes, nested ones as LABEL.NAME, arrays as LABEL[0]."""
+        if name not in self.formats or depth == 0:
+            raise LookupError(
+                f"topic {name} is not defined" if depth else f"topic {name} is nested too deeply"
+            )
+        self._count(name, self.formats[name].count(";"))
+        flat: list[tuple[str, str]] = []
+        for field in filter(None, self.formats[name].split(";")):
+            kind, _, label = field.partition(" ")
+            kind, _, length = kind.partition("[")
+            if length and not (length[-1] == "]" and length[:-1].isdecimal() and len(length) < 7):
+                raise LookupError(f"topic {name} has the array length {length[:20]!r}")
+            if len(label) > _MAX_LABEL:
+                raise LookupError(f"topic {name} has a field of {len(label)} letters (limit {_MAX_LABEL})")
+            inner = [("", _CODES[kind])] if kind in _CODES else self._flatten(kind, depth - 1)
+            count = int(length[:-1]) if length else 1
+            self._count(name, count * len(inner))
+            labels = [f"{label}[{i}]" for i in range(count)] if length else [label]
+            dot = "" if kind in _CODES else "."
+            flat += [(f"{one}{dot}{nested}", code) for one in labels for nested, code in inner]
+        if not flat:
+            raise LookupError(f"topic {name} has no fields")
+        return flat
+
+    def _count(self, name: str, fields: int) -> None:
+        """Count work before it is done: a small file can define, and nest, fields without number."""
+        self._left -= fields
+        if self._left < 0:
+            raise LookupError(f"topic {name} and those before have more than {MAX_FIELDS} fields")

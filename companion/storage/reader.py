@@ -7,29 +7,37 @@ It does not decode messages.
 
 from __future__ import annotations
 
+import errno
 import os
+import stat
 import struct
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
+import lz4.frame
 import zstandard
+from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, McapRecord, Message, Metadata, Schema
-from mcap.stream_reader import StreamReader, breakup_chunk
+from mcap.stream_reader import StreamReader
 
 from companion.storage.mcap_file import MAGIC
 
 ACTIVE = ".active"
 """Suffix of a log that is not closed."""
 
-MAX_UNCOMPRESSED = 1 << 28
-"""Larger chunks are rejected, so that a forged size field cannot exhaust the memory."""
+MAX_RECORD = 1 << 25
+"""Bytes of a record, and of a decompressed chunk; those of our chunks are 128 KiB. Larger ones are damage."""
+MAX_EXPANSION = 100
+"""Ratio of a log's decompressed and compressed size, beyond the first `MAX_RECORD` bytes; ours reach 10."""
 
 _HEAD = struct.Struct("<BQ")  # opcode, length
+_MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time; the data follows
 
 
 class LogError(OSError):
@@ -40,8 +48,18 @@ class DamagedError(ValueError):
     """Inconsistent bytes, such as a wrong checksum or a length beyond the end of its record."""
 
 
+def open_regular(path: Path) -> BinaryIO:
+    """Open a file for reading. Raises OSError for a pipe or a device too, which could be read without end."""
+    if not stat.S_ISREG(path.stat().st_mode):
+        raise OSError(errno.EINVAL, "not a regular file", str(path))
+    return path.open("rb")
+
+
 class RawRecord(NamedTuple):
-    """A complete record of a file: its offset, and its bytes with opcode and length."""
+    """A complete record of a file: its offset, and its bytes with opcode and length.
+
+    Only these two of a record larger than `MAX_RECORD`.
+    """
 
     start: int
     data: bytes
@@ -54,10 +72,12 @@ class RawRecord(NamedTuple):
     @property
     def end(self) -> int:
         """Offset of the next record."""
-        return self.start + len(self.data)
+        return self.start + _HEAD.size + int(_HEAD.unpack_from(self.data)[1])
 
     def parse(self) -> McapRecord:
-        """Parse the record, of a known opcode. Raises DamagedError if its content is inconsistent."""
+        """Parse the record, of a known opcode. Raises DamagedError if it is inconsistent or too large."""
+        if (size := self.end - self.start) != len(self.data):
+            raise DamagedError(f"a record has {size} bytes (limit {MAX_RECORD})")
         try:
             stream = StreamReader(BytesIO(self.data), skip_magic=True, emit_chunks=True)
             return next(stream.records)
@@ -79,6 +99,7 @@ class LogReader:
         self.closed = tail[:9] == _HEAD.pack(Opcode.FOOTER, 20) and tail[29:] == MAGIC
         self.end = len(MAGIC)
         self.chunks = 0
+        self._expanded = 0  # bytes of all chunks decompressed
         self.metadata: dict[str, dict[str, str]] = {}
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[int, Channel] = {}
@@ -91,8 +112,11 @@ class LogReader:
             opcode, length = _HEAD.unpack(head)
             if opcode == 0 or self.end + len(head) + length > self.size:
                 return
-            raw = RawRecord(self.end, head + self.file.read(length))
+            small = length <= MAX_RECORD
+            raw = RawRecord(self.end, head + self.file.read(length) if small else head)
             self.end = raw.end
+            if not small:
+                self.file.seek(self.end)
             has_data = has_data and opcode not in (Opcode.DATA_END, Opcode.FOOTER)
             if has_data and opcode < Opcode.DATA_END:  # others are private or of a later format
                 yield raw
@@ -104,25 +128,44 @@ class LogReader:
         """Yield the messages in the order written. Raises DamagedError at a record of wrong content."""
         for raw in self.records():
             if raw.opcode in (Opcode.CHUNK, Opcode.MESSAGE, Opcode.SCHEMA, Opcode.CHANNEL):
-                yield from self.unpack(raw.parse())
+                yield from self._unpacked(raw.parse())
             elif raw.opcode == Opcode.METADATA:
                 self.keep_metadata(raw)
 
     def unpack(self, record: McapRecord) -> list[Message]:
         """Return the messages of a chunk or message record; keep the definitions."""
-        inner: list[McapRecord] = [record]
-        if isinstance(record, Chunk):
-            inner = _break_up(record)
-            self.chunks += 1
-        messages = []
-        for one in inner:
+        return list(self._unpacked(record))
+
+    def _unpacked(self, record: McapRecord) -> Iterator[Message]:
+        """Yield what `unpack` returns: small messages take several times the memory of their chunk."""
+        for one in self._chunk_records(record) if isinstance(record, Chunk) else (record,):
             if isinstance(one, Message):
-                messages.append(one)
+                yield one
             elif isinstance(one, Schema):
                 self.schemas[one.id] = one
             elif isinstance(one, Channel):
                 self.channels[one.id] = one
-        return messages
+        self.chunks += isinstance(record, Chunk)
+
+    def _chunk_records(self, chunk: Chunk) -> Iterator[McapRecord]:
+        """Yield the records of a chunk. Raises DamagedError if size, checksum or content are wrong."""
+        size = chunk.uncompressed_size
+        self._expanded += size
+        if size > MAX_RECORD:
+            raise DamagedError(f"a chunk states {size} bytes (limit {MAX_RECORD})")
+        if self._expanded > MAX_RECORD + MAX_EXPANSION * self.size:
+            raise DamagedError(f"its chunks expand to more than {MAX_EXPANSION} times its size")
+        try:
+            yield from _break_up(_decompress(chunk))
+        except (
+            McapError,
+            zstandard.ZstdError,
+            struct.error,
+            ValueError,
+            OverflowError,
+            RuntimeError,
+        ) as error:
+            raise DamagedError(f"a chunk cannot be read ({error or type(error).__name__})") from None
 
     def keep_metadata(self, raw: RawRecord) -> None:
         """Parse a metadata record and keep it in `metadata`."""
@@ -143,20 +186,49 @@ class LogReader:
         )
 
 
-def _break_up(chunk: Chunk) -> list[McapRecord]:
-    """Return the records of a chunk. Raises DamagedError if size, checksum or content are wrong."""
-    if chunk.uncompressed_size > MAX_UNCOMPRESSED:
-        raise DamagedError(f"a chunk states {chunk.uncompressed_size} bytes (limit {MAX_UNCOMPRESSED})")
-    try:
-        if not chunk.uncompressed_size:
-            return []
-        if chunk.compression == "zstd":
-            content_size = zstandard.frame_content_size(chunk.data)  # -1: not stated
-            if content_size not in (-1, chunk.uncompressed_size):
-                raise DamagedError("a chunk's size differs from the stated one")
-        return list(breakup_chunk(chunk, validate_crc=True))
-    except (McapError, zstandard.ZstdError, struct.error, ValueError, OverflowError, RuntimeError) as error:
-        raise DamagedError(f"a chunk cannot be read ({error or type(error).__name__})") from None
+def _decompress(chunk: Chunk) -> bytes:
+    """Return the content of a chunk; no more than its stated size is decompressed.
+
+    Raises DamagedError if size or checksum are wrong, or the exceptions of the decompressor.
+    """
+    data: bytes = chunk.data
+    size = chunk.uncompressed_size
+    if not size:
+        return b""
+    if chunk.compression == "zstd":
+        # a frame's own size would override the limit; -1: not stated
+        if zstandard.frame_content_size(data) not in (-1, size):
+            raise DamagedError("its size differs from the stated one")
+        data = zstandard.decompress(data, size)
+    elif chunk.compression == "lz4":
+        data = lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size + 1)
+    elif chunk.compression:
+        raise DamagedError(f"unknown compression {chunk.compression[:20]!r}")
+    if len(data) != size:
+        raise DamagedError("its size differs from the stated one")
+    if chunk.uncompressed_crc not in (0, zlib.crc32(data)):
+        raise DamagedError("wrong checksum")
+    return data
+
+
+def _break_up(data: bytes) -> Iterator[McapRecord]:
+    """Yield the messages and definitions in a chunk's content. Raises ValueError, struct.error, McapError."""
+    at = 0
+    while at < len(data):
+        opcode, length = _HEAD.unpack_from(data, at)
+        start, at = at + _HEAD.size, at + _HEAD.size + length
+        if at > len(data):
+            raise DamagedError("one of its records is incomplete")
+        if opcode == Opcode.MESSAGE:
+            if length < _MESSAGE.size:
+                raise DamagedError("one of its messages is too short")
+            channel, sequence, log_time, publish_time = _MESSAGE.unpack_from(data, start)
+            content = data[start + _MESSAGE.size : at]
+            yield Message(channel, log_time, content, publish_time, sequence)
+        elif opcode == Opcode.CHANNEL:
+            yield Channel.read(ReadDataStream(BytesIO(data[start:at])))
+        elif opcode == Opcode.SCHEMA:
+            yield Schema.read(ReadDataStream(BytesIO(data[start:at])))
 
 
 @contextmanager
@@ -167,7 +239,7 @@ def open_log(path: str | os.PathLike[str]) -> Iterator[LogReader]:
     """
     path = Path(path)
     try:
-        file = path.open("rb")
+        file = open_regular(path)
     except OSError as error:
         raise LogError(f"{path}: cannot be read: {error.strerror or error}") from None
     with file:

@@ -161,7 +161,7 @@ def _copy_records(source: LogReader, file: McapFile) -> int:
                     file.chunk(between, source.schemas, source.channels)
                     between = []
         except DamagedError:
-            lost += len(raw.data)
+            lost += raw.end - raw.start
     if between:
         file.chunk(between, source.schemas, source.channels)
     return lost + (0 if source.closed else source.size - source.end)

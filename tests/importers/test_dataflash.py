@@ -182,6 +182,28 @@ def test_torn_or_damaged_log_gives_all_good_parts_and_names_the_rest(tmp_path: p
     assert [type(record) for record in records[:-1]] == [kind for kind in EVERY if kind is not r.Imu]
 
 
+@pytest.mark.parametrize("gap", [1, 8])
+def test_bytes_between_all_messages_lose_none(tmp_path: pathlib.Path, gap: int) -> None:
+    parts = [part + b"\n" * gap for part in LOG]
+    *records, event = sources.open_source(write(tmp_path, definitions(), *parts))
+    assert [type(record) for record in records] == EVERY
+    assert isinstance(event, r.Event) and f"{len(LOG)} parts of {gap * len(LOG)} bytes" in event.text
+
+
+def test_integer_beyond_any_float_loses_its_record_only(tmp_path: pathlib.Path) -> None:
+    head = "FMT, 128, 89, FMT, BBnNZ, Type,Length,Name,Format,Columns\n"
+    head += "FMT, 131, 30, IMU, QBffffff, TimeUS,I,GyrX,GyrY,GyrZ,AccX,AccY,AccZ\n"
+    rows = [
+        f"IMU, {10_000 * k}, {'-9' * (k == 5)}{'9' * 400 * (k == 5) or 0}, 0, 0, 0, 0, 0, -9.8\n"
+        for k in range(20)
+    ]
+    path = write(tmp_path, (head + "".join(rows)).encode(), name="flight.log")
+    records = list(sources.open_source(path))
+    (rejection,) = [record for record in records if isinstance(record, r.Rejection)]
+    assert (rejection.reason, rejection.value) == ("source is -inf", None)
+    assert sum(isinstance(record, r.Imu) for record in records) == 19
+
+
 def test_log_with_one_number_that_is_not_finite_is_read(tmp_path: pathlib.Path) -> None:
     parts = [*LOG[:5], message("IMU", 1_020_000, 1, 0.1, math.nan, 0.3, 0.4, 0.5, -9.8), *LOG[5:]]
     records = list(sources.open_source(write(tmp_path, definitions(), *parts)))

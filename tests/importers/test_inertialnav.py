@@ -3,14 +3,16 @@
 import io
 import math
 import pathlib
+import struct
 import zipfile
+import zlib
 
 import numpy as np
 import pytest
 from scipy.io import savemat
 
 from companion import records as r
-from companion.importers import sources
+from companion.importers import foreign_file, inertialnav, sources
 from companion.storage.reader import LogError
 
 SHARED = pathlib.Path(__file__).parents[2].parent / "shared" / "data" / "inertialnav"
@@ -54,9 +56,45 @@ def test_file_that_cannot_be_read_is_one_sentence(
         raise error
 
     (tmp_path / "log.mat").touch()
-    monkeypatch.setattr(pathlib.Path, "read_bytes", fail)
+    monkeypatch.setattr(foreign_file, "open_regular", fail)
     with pytest.raises(LogError, match=rf"log\.mat cannot be read: {error.strerror}$"):
         sources.open_source(tmp_path / "log.mat")
+
+
+def matlab(order: str, kind: int, content: bytes) -> bytes:
+    """A MATLAB file of one element, by the format's specification."""
+    header = b"MATLAB 5.0 MAT-file".ljust(124) + struct.pack(f"{order}HH", 0x0100, 0x4D49)
+    return header + struct.pack(f"{order}II", kind, len(content)) + content
+
+
+@pytest.mark.parametrize("order", "<>")
+def test_matlab_file_that_expands_beyond_the_limit_is_rejected(tmp_path: pathlib.Path, order: str) -> None:
+    (tmp_path / "log.mat").write_bytes(matlab(order, 15, zlib.compress(bytes(inertialnav.MAX_TABLES), 9)))
+    with pytest.raises(LogError, match=r"log\.mat: its tables expand to more than 33554432 bytes$"):
+        sources.open_source(tmp_path / "log.mat")
+
+
+def test_matlab_file_is_rejected_by_its_size_without_being_read(tmp_path: pathlib.Path) -> None:
+    with (tmp_path / "log.mat").open("wb") as file:
+        file.truncate(1 << 32)
+    with pytest.raises(LogError, match=r"log\.mat has 4294967296 bytes \(limit 33554432\)$"):
+        sources.open_source(tmp_path / "log.mat")
+    (tmp_path / "log.mat").write_bytes(bytes(200))
+    with pytest.raises(LogError, match="not a MATLAB file: its header states no byte order"):
+        sources.open_source(tmp_path / "log.mat")
+
+
+def test_tables_that_grow_in_the_reader_are_rejected(tmp_path: pathlib.Path) -> None:
+    """Rows become objects; column names take the space of the longest."""
+    path, table = tmp_path / "log.mat", np.zeros((inertialnav.MAX_ROWS + 1, 1), np.float32)
+    savemat(path, {"IMU": table, "IMU_label": labels("TimeMS")}, do_compression=True)
+    with pytest.raises(LogError, match="its tables have more than 524288 rows"):
+        sources.open_source(path)
+    names = labels("x" * 100_000 + " y" * 100)
+    savemat(path, {"IMU": table[:2], "IMU_label": names}, do_compression=True)
+    assert path.stat().st_size < 10_000
+    with pytest.raises(LogError, match=r"its tables have 40400008 bytes \(limit 33554432\)"):
+        sources.open_source(path)
 
 
 def tables(glitch: float = 0.0) -> dict[str, str]:
@@ -119,6 +157,23 @@ def test_missing_and_damaged_tables_are_reported(tmp_path: pathlib.Path) -> None
     savemat(tmp_path / "other.mat", {"x": np.ones(3)})
     with pytest.raises(LogError, match="has no ArduPilot table"):
         sources.open_source(tmp_path / "other.mat")
+
+
+def test_rows_of_text_tables_are_limited_in_total(tmp_path: pathlib.Path) -> None:
+    rows = inertialnav.MAX_ROWS // 2
+    bomb = {"IMU.txt": "1 0 0 0 0 0 0 0\n" * rows, "GPSraw.txt": "1 0 0 0 0 0 0\n" * (rows + 1)}
+    with zipfile.ZipFile(tmp_path / "log.zip", "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in (tables() | bomb).items():
+            archive.writestr(name, content)
+    assert (tmp_path / "log.zip").stat().st_size < 100_000
+    with pytest.raises(LogError, match="its tables have more than 524288 rows"):
+        sources.open_source(tmp_path / "log.zip")
+    with pytest.raises(LogError, match="a line has more than 1000 characters"):
+        sources.open_source(zipped(tmp_path / "log.zip", tables() | {"IMU.txt": "1 " * 1000}))
+    with zipfile.ZipFile(tmp_path / "log.zip", "w", zipfile.ZIP_BZIP2) as archive:
+        archive.writestr("IMU.txt", "1 " * 1000)
+    with pytest.raises(LogError, match=r"log\.zip: IMU\.txt is compressed by another method than Deflate"):
+        sources.open_source(tmp_path / "log.zip")
 
 
 @pytest.mark.shared

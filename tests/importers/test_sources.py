@@ -1,6 +1,7 @@
 """Telemetry logs are read to the end despite radio damage, and converted to records."""
 
 import math
+import os
 import pathlib
 from collections import Counter
 from itertools import pairwise
@@ -13,6 +14,7 @@ from companion import records as r
 from companion.importers import sources, tlog
 from companion.link import dialect, frame
 from companion.nav.geometry import Geodetic, geodetic_to_local
+from companion.storage import flight_log
 from companion.storage.reader import LogError
 
 DATA = pathlib.Path(__file__).parents[1] / "data"
@@ -271,6 +273,34 @@ def test_csv_topics_are_merged_by_time(tmp_path: pathlib.Path) -> None:
     *good, event = sources.open_source(tmp_path)
     assert [type(record) for record in good] == [r.LocalOrigin, r.LocalPosition, r.Event, r.LocalPosition]
     assert isinstance(event, r.Event) and "wind_estimate.csv at 2000 us: not a row of its topic" in event.text
+
+
+@pytest.mark.parametrize("quote", ['"', '""', '"x', ',"'])
+def test_quote_in_a_topic_loses_at_most_its_line(quote: str, tmp_path: pathlib.Path) -> None:
+    rows = [f"{10_000 * k},{quote if k == 5 else ''}1.0,0,0,0,0,0,0" for k in range(20)]
+    header = "timestamp,q[0],q[1],q[2],q[3],rollspeed,pitchspeed,yawspeed"
+    (tmp_path / "vehicle_attitude.csv").write_text("\n".join([header, *rows]))
+    found = [record for record in sources.open_source(tmp_path) if isinstance(record, r.Attitude)]
+    assert len(found) >= 19
+
+
+@pytest.mark.parametrize("name", ["x.ulg", "x.bin", "x.tlog", "x.mat", "x.zip", "x.mcap"])
+def test_pipe_is_rejected_without_waiting_for_its_writer(name: str, tmp_path: pathlib.Path) -> None:
+    os.mkfifo(tmp_path / name)
+    with pytest.raises(LogError, match=f"{name}.*not a regular file"):
+        if name == "x.mcap":
+            flight_log.info(tmp_path / name)
+        sources.open_source(tmp_path / name)
+
+
+def test_pipe_among_topics_or_tables_is_rejected(tmp_path: pathlib.Path) -> None:
+    os.mkfifo(tmp_path / "vehicle_attitude.csv")
+    with pytest.raises(LogError, match="not a regular file"):
+        sources.open_source(tmp_path)
+    os.mkfifo(tmp_path / "IMU.txt")
+    (tmp_path / "GPOSonboard.txt").touch()
+    with pytest.raises(LogError, match=r"damaged in IMU\.txt: .*not a regular file"):
+        sources.open_source(tmp_path)
 
 
 def test_empty_folder_is_reported(tmp_path: pathlib.Path) -> None:

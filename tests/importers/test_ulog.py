@@ -6,11 +6,13 @@ The logs are written here by the public format specification, not recorded.
 import math
 import pathlib
 import struct
+import tracemalloc
 
 import pytest
 
 from companion import records as r
 from companion.importers import foreign_file, sources, ulog_messages
+from companion.importers.foreign_file import Damage
 from companion.storage.reader import LogError
 
 CODES = {
@@ -199,6 +201,48 @@ def test_rows_agree_with_pyulog(tmp_path: pathlib.Path) -> None:
         for data in judge.data_list:
             for name, values in data.data.items():
                 assert [row[name] for row in rows[data.name]] == pytest.approx(values.tolist(), nan_ok=True)
+
+
+def peak_and_damage(content: bytes) -> tuple[float, Damage]:
+    """Memory (bytes) that reading all messages takes, and what was not read."""
+    damage = Damage()
+    tracemalloc.start()
+    try:
+        for _ in ulog_messages.messages(content, {"vehicle_attitude"}, damage):
+            pass
+        return tracemalloc.get_traced_memory()[1], damage
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.parametrize(
+    ("formats", "words"),
+    [
+        (("ee:", "b:ee[99999] x", "vehicle_attitude:b[99999] x"), "topic ee has no fields"),
+        (("e:uint8_t[0] x", "vehicle_attitude:e[99999] x"), "topic e has no fields"),
+        (("vehicle_attitude:uint8_t[99999] x;uint8_t[99999] y",), "more than 131072 fields"),
+        (("b:uint8_t[999] x", "vehicle_attitude:b[999] x"), "more than 131072 fields"),
+        (("vehicle_attitude:vehicle_attitude x",), "nested too deeply"),
+        ((f"vehicle_attitude:uint8_t[9999] {'x' * 60_000}",), "field of 60000 letters"),
+        (("vehicle_attitude:uint64_t[9999] x",), "79992 bytes"),
+    ],
+)
+def test_definition_that_expands_is_damage(formats: tuple[str, ...], words: str) -> None:
+    """Each of a thousand subscriptions of it takes its own ten bytes only."""
+    content = HEADER + b"".join(message("F", text.encode()) for text in formats)
+    content += message("A", struct.pack("<BH", 0, 1) + b"vehicle_attitude") * 1000
+    peak, damage = peak_and_damage(content)
+    assert damage.parts == 1000 and words in damage.first
+    assert peak < 25e6  # of 131,072 fields, once
+
+
+def test_many_subscriptions_of_a_topic_share_its_layout() -> None:
+    content = HEADER + message("F", b"vehicle_attitude:uint8_t[4000] x;")
+    numbers = range(2000)
+    content += b"".join(message("A", struct.pack("<BH", k % 2, k) + b"vehicle_attitude") for k in numbers)
+    content += message("D", struct.pack("<H", 1998) + bytes(4000)) * 2
+    peak, damage = peak_and_damage(content)
+    assert damage.parts == 0 and peak < 5e6
 
 
 def test_data_appended_after_a_tear_is_read(tmp_path: pathlib.Path) -> None:

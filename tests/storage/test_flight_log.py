@@ -8,23 +8,27 @@ import json
 import os
 import resource
 import signal
+import struct
 import subprocess
 import sys
 import tarfile
 import threading
 import time
+import tracemalloc
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
 
+import lz4.frame
 import msgspec
 import pytest
+import zstandard
 from click.testing import CliRunner
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.opcode import Opcode
 from mcap.reader import NonSeekingReader, make_reader
-from mcap.records import Channel, Chunk, DataEnd, Footer, Header, Message
+from mcap.records import Channel, Chunk, DataEnd, Footer, Header, Message, Schema
 from mcap.stream_reader import StreamReader
 
 from companion import records as r
@@ -369,6 +373,62 @@ def test_invalid_log_is_reported_in_one_sentence(tmp_path):
     (tmp_path / "bomb").write_bytes(log)
     with pytest.raises(LogError, match="states"):
         list(read(tmp_path / "bomb"))
+
+
+def chunk_log(compression: str, data: bytes, stated: int, repeats: int = 1) -> bytes:
+    definitions = [
+        *(Header("", ""), Schema(id=1, data=b"{}", encoding="jsonschema", name="Event")),
+        Channel(id=1, topic="/out/Event", message_encoding="json", metadata={}, schema_id=1),
+    ]
+    bomb = Chunk(compression, data, 0, 0, uncompressed_crc=0, uncompressed_size=stated)
+    return MAGIC + encode_records([*definitions, *[bomb] * repeats, Footer(0, 0, 0)]) + MAGIC
+
+
+EMPTY, LONG = (
+    encode_records([Message(channel_id=1, log_time=5, data=bytes(size), publish_time=5, sequence=0)])
+    for size in (0, 10_000)
+)
+
+
+@pytest.mark.parametrize(
+    ("log", "words"),
+    [
+        (chunk_log("lz4", lz4.frame.compress(bytes(10**8)), 100), "size differs"),
+        (chunk_log("zstd", zstandard.compress(bytes(10**8)), 100), "size differs"),
+        (chunk_log("", bytes(200), 100), "size differs"),
+        (chunk_log("zstd", zstandard.compress(EMPTY * 2**21), 2**21 * len(EMPTY)), "states 65011712 bytes"),
+        (chunk_log("zstd", zstandard.compress(LONG * 100), 100 * len(LONG), 200), "more than 100 times"),
+        (chunk_log("", EMPTY[:-1], len(EMPTY) - 1), "incomplete"),
+    ],
+)
+def test_chunk_that_expands_beyond_its_size_or_the_limit_is_damage(tmp_path, log, words):
+    (tmp_path / "x.mcap").write_bytes(log)
+    assert len(log) < 500_000
+    tracemalloc.start()
+    try:
+        with pytest.raises(LogError, match=words):
+            info(tmp_path / "x.mcap")
+        assert tracemalloc.get_traced_memory()[1] < 5e7
+    finally:
+        tracemalloc.stop()
+
+
+def test_record_beyond_the_limit_is_not_read_and_the_rest_is(tmp_path, small):
+    """An attachment of another recorder is no damage, a chunk is."""
+    (tmp_path / "small.mcap").write_bytes(small)
+    with open_log(tmp_path / "small.mcap") as source:
+        first = next(source.records()).end
+    for opcode, words in ((Opcode.ATTACHMENT, None), (Opcode.CHUNK, "a record has")):
+        path = tmp_path / f"{opcode}.mcap"
+        with path.open("wb") as file:
+            file.write(small[:first] + struct.pack("<BQ", opcode, 1 << 32))
+            file.seek(1 << 32, os.SEEK_CUR)
+            file.write(small[first:])
+        if words is None:
+            assert info(path).counts == info(tmp_path / "small.mcap").counts
+        else:
+            with pytest.raises(LogError, match=words):
+                info(path)
 
 
 # -- conformance suite ---------------------------------------------------------------------------------------

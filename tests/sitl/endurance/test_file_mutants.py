@@ -6,7 +6,7 @@ import random
 import pytest
 
 from companion.importers import sources
-from companion.records import Event
+from companion.records import Event, Rejection
 from companion.storage import flight_log
 from sitl.endurance import file_mutants
 from sitl.endurance.sample_logs import SAMPLES
@@ -30,6 +30,25 @@ def test_mutants_give_records_or_one_sentence(name: str) -> None:
     found = file_mutants.read_mutants(name, 100, seed=7)
     assert (found.defects, found.first_defect) == (0, "")
     assert found.read + found.rejected == 100 and found.read > 0
+
+
+@pytest.mark.parametrize("name", ["bin", "log", "ulg", "tlog", "csv"])
+@pytest.mark.parametrize("damage", [b"\n", b'"', b"\x00", b"9" * 400])
+def test_one_damage_after_the_definitions_loses_its_neighbours_only(
+    name: str, damage: bytes, tmp_path: pathlib.Path
+) -> None:
+    file_name, build = SAMPLES[name]
+    path, whole, rng = tmp_path / file_name, build(), random.Random(name)
+
+    def count() -> int:
+        found = sources.open_source(tmp_path if ".csv" in file_name else path)
+        return sum(not isinstance(record, Event | Rejection) for record in found)
+
+    path.write_bytes(whole)
+    complete = count()
+    for at in (rng.randrange(len(whole) // 2, len(whole)) for _ in range(20)):
+        path.write_bytes(whole[:at] + damage + whole[at + rng.randrange(2) :])
+        assert count() >= complete - 4, at
 
 
 def test_mutant_differs_and_is_repeatable() -> None:
