@@ -73,6 +73,7 @@ def test_predict_bound_prints_1217_m_ten_minutes_ahead() -> None:
     assert row[:2] == [10.0, 1217.0]
 
 
+@pytest.mark.flight
 def test_fly_loopback() -> None:
     rows = run("fly_loopback.py").splitlines()[1:]
     assert {"GNSS+RSBN", "GNSS only", "RSBN only", "neither"} == {row[:12].strip() for row in rows}

@@ -402,11 +402,15 @@ class CompanionCore:
         elif msgid in REQUESTS:
             link.has_station = True
             feeds = link is self.leading_link
-            replies, config = self._services.receive(event, link.session.system, link.name, feeds)
+            replies, changes = self._services.receive(event, link.session.system, link.name, feeds)
             for reply in replies:
                 link.session.send(reply)
-            if config is not None:
-                self._config = config
+            for _, parameter, old, new in changes:
+                if new != old:
+                    text = f"{parameter.name} set from {old:g} to {new:g} by {event.frame.system}"
+                    self.report(Severity.NOTICE, text, event.received_ns)
+            if changes:
+                config = self._config = changes[-1].config
                 for each in self.links.values():
                     each.output.tune(config)
                     each.session.set_rates(requested_rates(config), event.received_ns)

@@ -14,7 +14,7 @@ from companion.link import dialect
 from companion.link.commands import CommandServer, Source
 from companion.link.component_metadata import FileServer, component_metadata
 from companion.link.dialect import mavlink
-from companion.link.parameter_server import ParameterServer
+from companion.link.parameter_server import ParameterChanged, ParameterServer
 from companion.link.rate_limiter import RateLimiter
 from companion.link.session import MessageReceived
 from companion.link.status_text import StatusText
@@ -87,8 +87,8 @@ class GroundStationServices:
 
     def receive(
         self, event: MessageReceived, system: int, link: str, feeds: bool
-    ) -> tuple[list[Any], Config | None]:
-        """Process a message; return replies for its link, and the configuration if a parameter changed it.
+    ) -> tuple[list[Any], list[ParameterChanged]]:
+        """Process a message; return replies for its link, and the parameters that it changed.
 
         `feeds`: the link has the autopilot that is fed.
         """
@@ -99,14 +99,13 @@ class GroundStationServices:
         replies = server.receive(event.message, event.frame, system, event.received_ns, fixed)
         replies += self._files.receive(event.message, event.frame, system, event.received_ns)
         changes = self._parameters.receive(event.message, event.frame, system, event.received_ns)
-        config = changes[-1].config if changes else None
         if (reply := self._answer(event, system)) is not None:
             replies.append(reply)
-        if config is not None and config.output != self._output:
-            self._output = config.output
+        if changes and (output := changes[-1].config.output) != self._output:
+            self._output = output
             for server in self._commands.values():
-                server.set_default_intervals(_offered_us(config.output))
-        return replies, config
+                server.set_default_intervals(_offered_us(output))
+        return replies, changes
 
     def _answer(self, event: MessageReceived, system: int) -> Any:
         """Return the answer to a PING, or an empty mission to a request for ours; None for others."""

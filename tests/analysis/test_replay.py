@@ -70,6 +70,7 @@ def test_counts_are_printed(tmp_path: Path) -> None:
     assert str(tmp_path / "out.mcap") in done.stdout
 
 
+@pytest.mark.flight
 @pytest.mark.shared
 @pytest.mark.parametrize("name", REAL)
 def test_recordings_give_solutions(name: str, tmp_path: Path) -> None:

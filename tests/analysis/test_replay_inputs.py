@@ -94,6 +94,7 @@ def test_outage_after_the_end_is_reported(tmp_path: pathlib.Path) -> None:
     assert note.startswith("--outage GNSS:9000-9900 has no effect: the log ends at ")
 
 
+@pytest.mark.flight
 def test_simulated_measurements_depend_on_the_seed(tmp_path: pathlib.Path, beacons: pathlib.Path) -> None:
     one, same, other = (tmp_path / name for name in ("one.mcap", "same.mcap", "other.mcap"))
     report(FLIGHT, "-o", one, "--rsbn", beacons)

@@ -156,6 +156,7 @@ def test_smoothed_track_matches_the_truth() -> None:
     assert rms(off) < 2.0 * rms(sigma)
 
 
+@pytest.mark.flight
 def test_channel_jump_does_not_affect_the_smoothed_track() -> None:
     flown = flight(300, (0, 0))
     records = []
@@ -190,6 +191,7 @@ def test_false_gnss_is_left_out_from_its_onset() -> None:
     assert np.linalg.norm(smoothed[:, :2], axis=1).max() < 60.0  # GNSS is 3 km off in the end
 
 
+@pytest.mark.flight
 def test_reboot_starts_a_new_run() -> None:
     flown = flight(300, (0, 0))
     cut = 150 * NS + 1

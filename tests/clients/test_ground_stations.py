@@ -33,7 +33,7 @@ LOOPBACK = "127.0.0.1"
 SYSTEM, COMPONENT, ARDUPILOT, PX4 = 1, 191, 3, 12
 PARAMETERS = {parameter.name for parameter in parameter_table()}
 NAMED_VALUES = {"nav_source", "nav_sigma", "nav_bound", "nav_hpl", "nav_trust"}
-FIXED = "navigation fixed"  # STATUSTEXT after a parameter that restarts the navigator, such as GNSS_SIGMA_M
+FIXED, SET = "navigation fixed", "GNSS_SIGMA_M set from"  # beginnings of texts
 PASSPHRASE = "chickpea"  # a station derives the key from it by SHA-256
 
 
@@ -153,7 +153,7 @@ class Received:
             self.values[fields["name"]] = fields["value"]
 
     def is_complete(self) -> bool:
-        texts = any(text.startswith(FIXED) for text in self.texts)
+        texts = any(text.startswith(SET) for text in self.texts)
         return self.heartbeats > 1 and texts and set(self.values) == NAMED_VALUES
 
 
@@ -193,7 +193,7 @@ def test_mavproxy(second_link: int, tmp_path: pathlib.Path) -> None:
         proxy.type("watch NAMED_VALUE_FLOAT")
         assert all(proxy.prints(f"name : {name}, value : ") for name in NAMED_VALUES)
         proxy.type("param set GNSS_SIGMA_M 4")
-        assert proxy.prints(f"AP: {FIXED}")  # our STATUSTEXT
+        assert proxy.prints(f"AP: {SET}")  # our STATUSTEXT
         proxy.type("param fetch GNSS_SIGMA_M")
         assert proxy.prints("GNSS_SIGMA_M = 4.0")
         proxy.type("long 400 1 0 0 0 0 0 0")

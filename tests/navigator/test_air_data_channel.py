@@ -290,6 +290,7 @@ def test_another_channel_in_flight_begins_anew() -> None:
     assert solutions > 100
 
 
+@pytest.mark.flight
 def test_all_estimators_run_on_one_stream() -> None:
     flown = flight("plane_wind_change")
     for leading in ("kalman", "minimax", "restrictive"):

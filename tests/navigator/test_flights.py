@@ -229,6 +229,7 @@ def test_a_local_position_that_drifts_ever_faster_is_not_believed_against_gnss()
     assert flown.error[flown.t > SETTLED_S].max() < 10.0
 
 
+@pytest.mark.flight
 @pytest.mark.parametrize(("gnss_until", "needed"), [(math.inf, False), (90.0, True)])
 def test_without_gnss_a_false_airspeed_must_be_taken_out_of_use(gnss_until: float, needed: bool) -> None:
     """The autopilot compares it with GPS only, and dives for the speed that a stuck pitot lacks."""
@@ -269,6 +270,7 @@ def test_a_spoofed_gnss_is_excluded_with_a_beacon_and_comes_back(channel: str) -
     assert flown.error[flown.t > back + 20.0].max() < 10.0
 
 
+@pytest.mark.flight
 @pytest.mark.parametrize("channel", ["ins", "imu", "air"])
 def test_a_gnss_that_stops_is_no_step_of_the_output(channel: str) -> None:
     """What the output moves beyond its velocity, from one solution to the next, is no more than before."""

@@ -542,6 +542,7 @@ def raw_rms(records: Iterable[Any], start: float) -> float:
     return rms(errors)
 
 
+@pytest.mark.flight
 @pytest.mark.parametrize("seed", range(3))
 def test_recorded_with_a_beacon_the_error_is_at_most_half_the_fixes(seed: int) -> None:
     records = with_beacon(seed)

@@ -243,6 +243,7 @@ def test_falsified_position_reaches_the_output_of_an_independent_ins() -> None:
     assert honest.position_payloads() and falsified.position_payloads() != honest.position_payloads()
 
 
+@pytest.mark.flight
 @pytest.mark.parametrize("via", ["odometry", "vision"])
 def test_forged_origin_moves_no_position(via: str) -> None:
     config = configured("output.profile=ardupilot", f"output.via={via}")

@@ -324,6 +324,18 @@ def test_before_the_first_solution_the_trust_is_untrusted_and_all_else_unknown()
     assert len(named) == 4 and all(math.isnan(value) for value in named.values())
 
 
+def test_a_parameter_that_changes_is_reported_with_its_sender() -> None:
+    flight = Flight()
+    flight.fly(3.0)
+    for value in (3.0, 3.0, 2.5):
+        fields = {"target_system": 1, "target_component": 191, "param_id": "GNSS_SIGMA_M", "param_type": 9}
+        flight.send("PARAM_SET", system=254, component=190, param_value=value, **fields)
+    assert [text for text in event_texts(flight) if "GNSS_SIGMA_M" in text] == [
+        "GNSS_SIGMA_M set from 2 to 3 by 254",
+        "GNSS_SIGMA_M set from 3 to 2.5 by 254",
+    ]
+
+
 def test_faster_output_requests_a_faster_inertial_channel() -> None:
     flight = Flight()
     flight.fly(3.0)

@@ -201,6 +201,7 @@ def test_split_bytes_are_relayed_as_whole_frames(entries) -> None:
     assert cut.to_companion() == sent and b"".join(sent) == stream
 
 
+@pytest.mark.flight
 @pytest.mark.shared
 @pytest.mark.parametrize(
     ("log", "part", "profile", "expected"),

@@ -54,6 +54,7 @@ def test_every_case_has_a_scenario_and_a_configuration(name, minutes):
         assert config_of(order).has_own_ins == channel.startswith("INS")
 
 
+@pytest.mark.flight
 @pytest.mark.parametrize("channel", ["INS navigation", "air data"])
 def test_flight_with_nothing_wrong_passes(channel):
     result = fly(HarmOrder("nothing", channel, 1, 4.0))

@@ -75,6 +75,7 @@ def test_bound_holds_in_every_phase_and_always_without_fixes(flights) -> None:
         assert [row.inside for row in rows if row.phase == "neither"] == [1.0]
 
 
+@pytest.mark.flight
 def test_log_of_the_command_replays_bit_for_bit(tmp_path: Path) -> None:
     done = CliRunner().invoke(command, ["--scenario", "short", "--logs", str(tmp_path), "--json"])
     assert done.exit_code == 0, done.output

@@ -130,6 +130,7 @@ def test_gnss_is_accepted_after_an_outage_with_wind_change(tmp_path: Path) -> No
             assert math.hypot(north, east) <= 3.0 * stated_accuracy(s), s
 
 
+@pytest.mark.flight
 @pytest.mark.parametrize("channel", CHANNELS)
 def test_autopilot_reboot_during_gnss_outage(tmp_path: Path, channel: str) -> None:
     flown = LoggedFlight(
@@ -220,6 +221,7 @@ def test_autopilot_filter_reset_of_forty_metres(tmp_path: Path, outages) -> None
     flown.assert_events(r"120\.\d inertial channel: jumped by 40", r"180\.\d inertial channel: jumped by 40")
 
 
+@pytest.mark.flight
 def test_air_data_channel_ignores_local_position_resets(tmp_path: Path) -> None:
     fault = Fault("ins-reset", 120.0, 180.0, 40.0)
     calm, shaken = (

@@ -51,6 +51,7 @@ def test_no_harm_while_gnss_is_healthy(fault) -> None:
         assert row.most <= row.most_alone + FREE_M
 
 
+@pytest.mark.flight
 def test_wind_step_without_gnss_is_held() -> None:
     """The wind turns by 9 m/s as GNSS is lost; the beacon is 60 km away."""
     legs = (*LEGS[:3], Leg(60, 110, 38, 60), Leg(100, 110, 38, 60), Leg(30, 110, 38, 60))

@@ -23,6 +23,7 @@ def rows():
     return {row["truth"]: row for row in json.loads(done.output)}
 
 
+@pytest.mark.flight
 @pytest.mark.parametrize("truth", TRUTHS)
 def test_ratios(rows, truth):
     row = dict(zip(rows[truth]["states"], rows[truth]["ratio"], strict=True))

@@ -145,6 +145,7 @@ def test_stale_data_with_new_stamps_is_detected_at_once(name: str) -> None:
     assert flown.largest_m < 100.0
 
 
+@pytest.mark.flight
 def test_stop_and_resumption_of_solutions_are_reported() -> None:
     """The position freezes while the attitude continues; events as sent over the link."""
     fault = Fault("ins-frozen", 60.0, 75.0)
