@@ -17,7 +17,7 @@ import numpy as np
 
 from companion.analysis import error_statistics
 from companion.analysis.drawing import to_page
-from companion.analysis.flight_events import source_title
+from companion.analysis.flight_events import event_title, source_title
 from companion.analysis.live.follow import Message
 from companion.analysis.plot_data import COLOURS, Figure, Line, Mark, PlacedName
 from companion.estimate import bank
@@ -131,7 +131,7 @@ class Scene:
             case RsbnFix():
                 self._add_reply(record)
             case Event():
-                self._events.append((self.t, record.severity, record.text))
+                self._events.append((self.t, record.severity, event_title(record.text)))
             case Reset():
                 self._events.append((self.t, 4, f"{record.what} reset: {record.reason}"))
 
