@@ -120,7 +120,7 @@ def _error(axes: _Axes) -> Figure:
 
 
 def _limits(axes: _Axes) -> str:
-    """Say what the guaranteed bound and the protection level limit."""
+    """Describe what the guaranteed bound and the protection level limit."""
     if deviation(*axes.flights) == "error":
         return (
             "The r.m.s. error must stay below the guaranteed bound, every error below the protection level."

@@ -97,7 +97,7 @@ def summarize_flight(a: Assessment) -> list[str]:
 
 
 def describe_gnss(a: Assessment) -> str:
-    """Say what became of GNSS over the flight, without a full stop."""
+    """Describe what became of GNSS over the flight, without a full stop."""
     if absent := _absent_gnss(a):
         return f"GNSS was {absent}"
     if a.outages:

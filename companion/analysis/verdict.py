@@ -237,7 +237,7 @@ def _kept(a: Assessment) -> Verdict:
 
 
 def _describe_bound(a: Assessment) -> str:
-    """Say in how many phases the guaranteed bound held; it was exceeded in none."""
+    """Describe in how many phases the guaranteed bound held; it was exceeded in none."""
     if not any(row.useful for row in a.rows):
         return "no phase has a useful guaranteed bound"
     if all(row.useful for row in a.rows):

@@ -202,11 +202,9 @@ def _read_member(path: Path, member: str) -> bytes:
     else:
         with open_regular(path) as whole, zipfile.ZipFile(whole) as archive:
             found = archive.getinfo(member)
-            # the others are not decompressed in steps
+            # the others are not decompressed in steps: they expand without a limit
             if found.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-                raise LogError(
-                    f"{path}: {member} is compressed by another method than Deflate"
-                )  # expands unbounded
+                raise LogError(f"{path}: {member} is compressed by another method than Deflate")
             with archive.open(found) as packed:
                 content = packed.read(MAX_TABLES + 1)
     if len(content) > MAX_TABLES:
