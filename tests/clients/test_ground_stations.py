@@ -28,6 +28,7 @@ from companion.link.commands import Result
 from companion.link.parameter_server import ParameterServer, parameter_table
 from companion.link.session import MessageReceived, Session
 from companion.link.signing import SignatureFault, Signing
+from tests.network import free_port
 
 LOOPBACK = "127.0.0.1"
 SYSTEM, COMPONENT, ARDUPILOT, PX4 = 1, 191, 3, 12
@@ -35,13 +36,6 @@ PARAMETERS = {parameter.name for parameter in parameter_table()}
 NAMED_VALUES = {"nav_source", "nav_sigma", "nav_bound", "nav_hpl", "nav_trust"}
 FIXED, SET = "navigation fixed", "GNSS_SIGMA_M set from"  # beginnings of texts
 PASSPHRASE = "chickpea"  # a station derives the key from it by SHA-256
-
-
-def free_port(kind: socket.SocketKind = socket.SOCK_DGRAM) -> int:
-    with socket.socket(socket.AF_INET, kind) as free:
-        free.bind((LOOPBACK, 0))
-        port: int = free.getsockname()[1]
-        return port
 
 
 @pytest.fixture(scope="module")

@@ -13,6 +13,7 @@ import pytest
 from companion.link import dialect
 from companion.link.parameter_client import Answer, ParameterClient, encoding_of, equal_real32
 from companion.link.session import MessageReceived, Session
+from tests.network import free_port
 
 AUTOPILOT_VERSION, REQUEST_MESSAGE = 148, 512
 HAS = {"EKF2_AGP0_ID": 0, "EKF2_EV_CTRL": -2, "CAL_BARO0_ID": 6620172, "EKF2_AGP0_NOISE": 0.9}
@@ -24,9 +25,7 @@ def server() -> Iterator[int]:
     mavsdk = pytest.importorskip("mavsdk.mavsdk")
     component = pytest.importorskip("mavsdk.component_type").ComponentType.AUTOPILOT
     parameters = pytest.importorskip("mavsdk.plugins.param_server.param_server")
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
-        free.bind(("127.0.0.1", 0))
-        port: int = free.getsockname()[1]
+    port = free_port()
     sdk = mavsdk.Mavsdk(mavsdk.Configuration.create_with_component_type(component))
     try:
         mine = parameters.ParamServer(sdk.server_component())

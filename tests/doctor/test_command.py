@@ -23,15 +23,10 @@ from companion.doctor.command import EX_UNAVAILABLE, check_machine
 from companion.doctor.diagnosis import Diagnosis, Finding, Identity, ParameterFinding
 from companion.link import stream_rates
 from companion.transport.reconnect import Address
+from tests.network import free_port
 
 LOOPBACK = "127.0.0.1"
 SECOND = 1_000_000_000
-
-
-def free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
-        sock.bind((LOOPBACK, 0))
-        return sock.getsockname()[1]
 
 
 @pytest.fixture(autouse=True)

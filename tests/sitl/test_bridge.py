@@ -27,6 +27,7 @@ from sitl.bridge import AUTOPILOT, COMPANION, RSBN, Bridge, BridgeMode, GnssSche
 from sitl.bridge_command import command
 from sitl.comparison import outage_table
 from sitl.tlog_player import NEVER, TlogPlayer
+from tests.network import free_port
 
 SECOND = 1_000_000_000
 START = 1000 * SECOND
@@ -223,12 +224,6 @@ def test_table_of_a_recorded_flight(log: str, part, profile: str, expected) -> N
     assert rows[COMPANION].rms < 0.5 * rows[RSBN].rms
     assert not [r for r in flight.log.records if isinstance(r, Event) and "excluded" in r.text]
     assert rows[COMPANION].samples > 100
-
-
-def free_port(kind: int) -> int:
-    with socket.socket(socket.AF_INET, kind) as sock:
-        sock.bind((LOOPBACK, 0))
-        return sock.getsockname()[1]
 
 
 def test_three_processes_over_tcp_and_udp(entries, tmp_path: Path) -> None:

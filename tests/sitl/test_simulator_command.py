@@ -20,15 +20,10 @@ from sitl.autopilot import SimulatedAutopilot
 from sitl.loopback import simulator_config
 from sitl.scenarios import get_scenario
 from sitl.simulator_command import PositionScore, SimulatorRunner
+from tests.network import free_port
 
 LOOPBACK = "127.0.0.1"
 FED = ["--set", "output.profile=ardupilot", "--set", "inertial.independent=true"]
-
-
-def free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
-        sock.bind((LOOPBACK, 0))
-        return sock.getsockname()[1]
 
 
 class NullLog:

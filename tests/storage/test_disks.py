@@ -6,7 +6,6 @@ import errno
 import os
 import random
 import signal
-import socket
 import subprocess
 import sys
 import threading
@@ -27,25 +26,12 @@ from companion.storage.retention import create_log
 from companion.transport.reconnect import Address, connect
 from sitl.autopilot import SimulatedAutopilot
 from sitl.scenarios import SensorRates, get_scenario
+from tests.network import free_port, until
 
 LOOPBACK = "127.0.0.1"
 EVERY_S = 0.2  # interval of solutions and of their messages
 #: Tolerance for other programs on the processor; a blocking disk would delay for much longer.
 LATE_S = 0.8
-
-
-def free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
-        sock.bind((LOOPBACK, 0))
-        return sock.getsockname()[1]
-
-
-async def until(condition, seconds: float = 30.0) -> None:
-    for _ in range(round(seconds / 0.05)):
-        if condition():
-            return
-        await asyncio.sleep(0.05)
-    raise TimeoutError
 
 
 class FaultyDisk:
@@ -144,7 +130,7 @@ def test_solutions_are_on_time_with_a_failing_or_blocked_disk(tmp_path: Path, mo
         service = Service(config, log, events.append)
         serving, flying = (asyncio.create_task(c) for c in (service.serve(), fly(port, arrivals, more)))
         try:
-            await until(lambda: len(arrivals) >= 5)
+            await until(lambda: len(arrivals) >= 5, 30.0)
             await phase("working", 1.5)
             for name, number in (("full", errno.ENOSPC), ("read-only", errno.EROFS)):
                 disks[0].error = number
@@ -251,11 +237,11 @@ def test_full_disk_is_reported_and_writing_resumes(small_disk, tmp_path) -> None
     async def play() -> None:
         flying = asyncio.create_task(fly(port, arrivals, []))
         try:
-            await until(lambda: "No space left on device; navigation continues" in log_text.read_text())
+            await until(lambda: "No space left on device; navigation continues" in log_text.read_text(), 30.0)
             full = len(arrivals)
             await until(lambda: len(arrivals) > full + 2)  # solutions continue
             ballast.unlink()
-            await until(lambda: "log: writing resumed" in log_text.read_text())
+            await until(lambda: "log: writing resumed" in log_text.read_text(), 30.0)
         finally:
             flying.cancel()
 

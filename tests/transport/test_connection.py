@@ -1,28 +1,12 @@
 """Open connections: both directions, their end, full lines and slow readers."""
 
 import asyncio
-from collections.abc import Coroutine
-from typing import Any
 
 import pytest
 
 from companion.transport import connection
 from companion.transport.connection import Connection, pair
-
-
-def run(test: Coroutine[Any, Any, None]) -> None:
-    async def limited() -> None:
-        async with asyncio.timeout(20):
-            await test
-
-    asyncio.run(limited())
-
-
-async def read_exactly(connection: Connection, count: int) -> bytes:
-    data = b""
-    while len(data) < count:
-        data += await connection.read()
-    return data
+from tests.network import run
 
 
 def test_memory_pair_carries_both_ways_and_reports_its_end() -> None:

@@ -5,7 +5,6 @@ import errno
 import os
 import random
 import socket
-from collections.abc import Callable, Coroutine
 from typing import Any
 
 import pytest
@@ -13,14 +12,7 @@ import pytest
 from companion.transport import reconnect
 from companion.transport.address import Address
 from companion.transport.reconnect import CannotListen, back_off, connections
-
-
-def run(test: Coroutine[Any, Any, None]) -> None:
-    async def limited() -> None:
-        async with asyncio.timeout(20):
-            await test
-
-    asyncio.run(limited())
+from tests.network import run, until
 
 
 @pytest.mark.parametrize("kind", ["udpin", "tcpin"])
@@ -35,14 +27,6 @@ def test_port_in_use_is_one_error_without_retry(kind: str) -> None:
                 await anext(connections(address, random.random, print))
 
     run(test())
-
-
-async def until(condition: Callable[[], bool]) -> None:
-    for _ in range(2000):
-        if condition():
-            return
-        await asyncio.sleep(0.005)
-    raise TimeoutError
 
 
 def binding(monkeypatch: pytest.MonkeyPatch, *errors: int) -> list[Any]:

@@ -5,38 +5,13 @@ import errno
 import os
 import pty
 import tty
-from collections.abc import Callable, Coroutine
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from companion.transport.address import Address
-from companion.transport.connection import Connection
 from companion.transport.reconnect import connect, connections
-
-
-def run(test: Coroutine[Any, Any, None]) -> None:
-    async def limited() -> None:
-        async with asyncio.timeout(20):
-            await test
-
-    asyncio.run(limited())
-
-
-async def until(condition: Callable[[], bool]) -> None:
-    for _ in range(2000):
-        if condition():
-            return
-        await asyncio.sleep(0.005)
-    raise TimeoutError
-
-
-async def read_exactly(connection: Connection, count: int) -> bytes:
-    data = b""
-    while len(data) < count:
-        data += await connection.read()
-    return data
+from tests.network import read_exactly, run, until
 
 
 def test_missing_device_is_reported_once_and_opened_when_present(tmp_path: Path) -> None:

@@ -2,36 +2,14 @@
 
 import asyncio
 import socket
-from collections.abc import Coroutine
 from typing import Any
 
 import pytest
 
 from companion.transport import connection
 from companion.transport.address import Address
-from companion.transport.connection import Connection
 from companion.transport.reconnect import connect
-
-
-def run(test: Coroutine[Any, Any, None]) -> None:
-    async def limited() -> None:
-        async with asyncio.timeout(20):
-            await test
-
-    asyncio.run(limited())
-
-
-def free_port() -> int:
-    with socket.socket() as sock:
-        sock.bind(("127.0.0.1", 0))
-        return int(sock.getsockname()[1])
-
-
-async def read_exactly(connection: Connection, count: int) -> bytes:
-    data = b""
-    while len(data) < count:
-        data += await connection.read()
-    return data
+from tests.network import free_port, read_exactly, run
 
 
 def test_udp_sends_to_all_peers_and_survives_an_absent_one() -> None:

@@ -4,7 +4,7 @@ import asyncio
 import errno
 import os
 import socket
-from collections.abc import Callable, Coroutine, Hashable
+from collections.abc import Callable, Hashable
 from functools import partial
 from typing import Any
 
@@ -16,28 +16,7 @@ from companion.transport.connection import Connection
 from companion.transport.peers import MAX_PEERS, Rank
 from companion.transport.reconnect import connect, connections
 from companion.transport.tcp import PEER_TIMEOUT_S, Listener
-
-
-def run(test: Coroutine[Any, Any, None]) -> None:
-    async def limited() -> None:
-        async with asyncio.timeout(20):
-            await test
-
-    asyncio.run(limited())
-
-
-def free_port() -> int:
-    with socket.socket() as sock:
-        sock.bind(("127.0.0.1", 0))
-        return int(sock.getsockname()[1])
-
-
-async def until(condition: Callable[[], bool]) -> None:
-    for _ in range(2000):
-        if condition():
-            return
-        await asyncio.sleep(0.005)
-    raise TimeoutError
+from tests.network import free_port, run, until
 
 
 def judge() -> Callable[[bytes], bool]:

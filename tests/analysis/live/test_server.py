@@ -4,7 +4,6 @@ import contextlib
 import json
 import re
 import signal
-import socket
 import subprocess
 import sys
 import urllib.error
@@ -20,6 +19,7 @@ from companion.analysis.live.server import command
 from companion.records import Event, Gnss, Mode, Solution, Trust
 from companion.storage import flight_log
 from companion.storage.reader import LogError
+from tests.network import free_port
 
 pytest.importorskip("websockets")
 S = 1_000_000_000
@@ -139,9 +139,7 @@ def until_interrupted(*arguments):
 
 
 def test_a_flight_does_not_notice_that_the_live_view_is_killed(tmp_path):
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
+    port = free_port()
     settings = ("--preset", "navigation-ins", "--set", "output.profile=ardupilot")
     with (
         until_interrupted("run", "--connect", f"udpin:127.0.0.1:{port}", "--logs", str(tmp_path), *settings),

@@ -1,0 +1,44 @@
+"""Helpers of tests that use sockets and asyncio: free ports, time limits, waiting for a condition."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+from collections.abc import Callable, Coroutine
+from typing import Any, Protocol
+
+
+class Readable(Protocol):
+    async def read(self) -> bytes: ...
+
+
+def free_port(kind: int = socket.SOCK_DGRAM) -> int:
+    """Return a port of the loopback interface that is not in use."""
+    with socket.socket(socket.AF_INET, kind) as sock:
+        sock.bind(("127.0.0.1", 0))
+        return int(sock.getsockname()[1])
+
+
+def run(test: Coroutine[Any, Any, None], seconds: float = 20.0) -> None:
+    """Run a test, for `seconds` at most."""
+
+    async def limited() -> None:
+        async with asyncio.timeout(seconds):
+            await test
+
+    asyncio.run(limited())
+
+
+async def until(condition: Callable[[], object], seconds: float = 10.0) -> None:
+    """Wait until the condition is true; TimeoutError after `seconds`."""
+    async with asyncio.timeout(seconds):
+        while not condition():  # noqa: ASYNC110 (a socket, a file, another process: nothing that sets an event)
+            await asyncio.sleep(0.005)
+
+
+async def read_exactly(connection: Readable, count: int) -> bytes:
+    """Read until there are `count` bytes."""
+    data = b""
+    while len(data) < count:
+        data += await connection.read()
+    return data
