@@ -54,13 +54,15 @@ TICK_NS = 1_000_000
 #: After a roll-back by t seconds for beacon answers, all of which were rejected, none that is older than
 #: CHEAP_NS is used for USELESS_TIMES t: forged ones would take the time of all others.
 USELESS_TIMES, CHEAP_NS = 2, 500_000_000
-#: Most late records that wait for the next roll-back, and most states kept (up to 0.2 MB each).
+#: Most late records that wait for the next roll-back, and most records kept.
 MOST_WAITING, MOST_KEPT = 64, 1024
+#: A state takes up to 0.8 MB: of those older than DENSE_NS one per SPARSE_NS is kept.
+DENSE_NS, SPARSE_NS = 1_000_000_000, 1_000_000_000
 
 
 class _Past(NamedTuple):
     record: Input
-    before: State
+    before: State | None  # None: dropped; the first one of all has a state
 
 
 class _Again(NamedTuple):
@@ -74,7 +76,7 @@ class _RollBack:
     def __init__(self, ahead: State, again: list[_Again]) -> None:
         self.ahead = ahead
         self.again = deque(again)
-        self.back_ns = again[-1].record.t_ns - again[0].record.t_ns
+        self.back_ns = again[-1].record.t_ns - next(each.record.t_ns for each in again if each.is_late)
         self.used: set[bool] = set()  # whether beacon answers older than CHEAP_NS were used
 
 
@@ -96,7 +98,8 @@ class Navigator:
         self._settings = Settings(config, model or Model(config))
         self._uses = uses(self._settings)
         self._state = initial(self._settings)  # after the last of `_past`
-        self._past: deque[_Past] = deque(maxlen=MOST_KEPT)
+        self._past: deque[_Past] = deque()
+        self._thinned_ns = self._kept_ns = 0  # until when the states are thinned out; the last one kept there
         self._newest: Input | None = None  # the last record that was not late
         self._roll_back: _RollBack | None = None
         self._waiting: list[Input] = []  # late records, until the next roll-back
@@ -167,7 +170,27 @@ class Navigator:
         else:
             self._state, outputs = self._resolved(self._state, self._newest)
         self._deferred += outputs
-        while not self._waiting and _time(self._past[0]) < _time(self._past[-1]) - self._late_ns:
+        self._thin_out()
+        oldest_ns = _time(self._past[-1]) - self._late_ns - SPARSE_NS
+        while not self._waiting and _time(self._past[0]) < oldest_ns:
+            self._drop_oldest()
+
+    def _thin_out(self) -> None:
+        """Drop states of the records that have become older than DENSE_NS."""
+        past, until_ns = self._past, _time(self._past[-1]) - DENSE_NS
+        i = bisect_right(past, self._thinned_ns, key=_time)
+        while i < len(past) and _time(past[i]) <= until_ns:
+            self._thinned_ns = _time(past[i])
+            if self._thinned_ns - self._kept_ns >= SPARSE_NS or i == 0:
+                self._kept_ns = self._thinned_ns
+            else:
+                past[i] = _Past(past[i].record, None)
+            i += 1
+
+    def _drop_oldest(self) -> None:
+        """Drop the first record, and those that could only be folded again from its state."""
+        self._past.popleft()
+        while self._past[0].before is None:
             self._past.popleft()
 
     def finish(self) -> None:
@@ -212,6 +235,8 @@ class Navigator:
 
     def _fold(self, record: Input) -> list[Output]:
         self._past.append(_Past(record, self._state))
+        if len(self._past) > MOST_KEPT:
+            self._drop_oldest()
         self._state, outputs = self._stepped(self._state, record)
         return outputs
 
@@ -241,7 +266,8 @@ class Navigator:
 
     def _queue_late(self, record: Input) -> list[Output]:
         """Let a late record join the roll-back in progress or wait for the next one, or reject it."""
-        if record.t_ns < _time(self._past[0]):
+        assert self._newest is not None
+        if record.t_ns < max(_time(self._past[0]), self._newest.t_ns - self._late_ns):
             return self._too_late(record)
         if _is_old_answer(record) and record.rx_ns < self._no_late_answers_ns:
             why = "late, and the last late answers were rejected: not used"
@@ -265,12 +291,15 @@ class Navigator:
             outputs += self._too_late(late.pop(0))
         if late:
             place = bisect_right(self._past, late[0].t_ns, key=_time)
+            while (before := self._past[place].before) is None:
+                place -= 1
             later = [self._past.pop() for _ in range(place, len(self._past))]
+            self._thinned_ns = self._kept_ns = min(self._thinned_ns, _time(later[-1]) - 1)
             again = [_Again(past.record, False) for past in reversed(later)]
             again += [_Again(record, True) for record in late]
             # a stable sort: of equal times the late one comes last
             self._roll_back = _RollBack(self._state, sorted(again, key=_time))
-            self._state = self._rewound(later[-1].before)
+            self._state = self._rewound(before)
         return outputs
 
     def _fold_again(self, now: Input) -> list[Output]:

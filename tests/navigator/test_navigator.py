@@ -232,6 +232,27 @@ def test_solutions_go_on_while_a_late_answer_is_folded_in() -> None:
     assert_same(found[first:], [solution for solution in wanted if solution.t_ns >= found[first].t_ns])
 
 
+@pytest.mark.parametrize("late_s", [0.4, 1.3, 2.7, 5.9])
+def test_states_that_are_not_kept_change_no_solution(late_s: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of the seconds before the last, one state each is kept; a late answer is folded in as if all were."""
+    records, answer, place = with_late_answer(late_s)
+    records.insert(place, answer)
+    navigator, kept = Navigator(CONFIG), list[int]()
+    ours = list[Solution]()
+    for record in records:
+        in_order = navigator._roll_back is None
+        ours += solutions(navigator, [record])
+        if in_order and navigator._roll_back is None:
+            older = [past for past in navigator._past if past.record.t_ns < record.t_ns - 1.2 * NS]
+            kept.append(sum(past.before is not None for past in older))
+    assert 5 <= max(kept) <= 8
+    monkeypatch.setattr(navigator_module, "DENSE_NS", 60 * NS)
+    wanted = {each.t_ns: each for each in solutions(Navigator(CONFIG), records)}
+    later = [each for each in ours if each.t_ns > answer.rx_ns + NS]
+    assert len(later) > 10
+    assert all(each == wanted[each.t_ns] for each in later)
+
+
 def test_with_no_record_more_than_a_few_are_folded_again(monkeypatch: pytest.MonkeyPatch) -> None:
     """A hundred answers and more within a second, five seconds late, among the other records."""
     navigator, folded = Navigator(CONFIG), list[Any]()
