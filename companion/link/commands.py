@@ -51,6 +51,10 @@ class Result(enum.IntEnum):
 
 #: Makes a message on request, or None while there is nothing to send.
 Source = Callable[[], Message | None]
+#: Message interval in us by message id; -1 if disabled.
+Intervals = Mapping[int, int]
+Executed = tuple[Result, list[Message]]
+Execute = Callable[[float, float, Intervals], Executed]
 
 
 def autopilot_version() -> Message:
@@ -66,9 +70,7 @@ def autopilot_version() -> Message:
 class CommandServer:
     """Executes and acknowledges the commands of one link; holds the message intervals that were set there."""
 
-    def __init__(
-        self, component: int, intervals_us: Mapping[int, int], sources: Mapping[int, Source]
-    ) -> None:
+    def __init__(self, component: int, intervals_us: Intervals, sources: Mapping[int, Source]) -> None:
         """Create a server for our component id.
 
         Parameters
@@ -87,8 +89,7 @@ class CommandServer:
             **sources,
         }
         self._limiter = RateLimiter(RATE_HZ, BURST)
-        self._fixed_us: Mapping[int, int] = {}
-        self._table: dict[int, Callable[[float, float], tuple[Result, list[Message]]]] = {
+        self._table: dict[int, Execute] = {
             mavlink.MAV_CMD_GET_MESSAGE_INTERVAL: self._get_message_interval,
             mavlink.MAV_CMD_SET_MESSAGE_INTERVAL: self._set_message_interval,
             mavlink.MAV_CMD_REQUEST_MESSAGE: self._request_message,
@@ -97,19 +98,18 @@ class CommandServer:
         #: The present interval of each streamed message, us; -1: disabled.
         self.intervals_us = dict(intervals_us)
 
-    def set_default_intervals(self, intervals_us: Mapping[int, int]) -> None:
+    def set_default_intervals(self, intervals_us: Intervals) -> None:
         """Replace the default intervals and discard those that were set by command."""
         self._defaults, self.intervals_us = dict(intervals_us), dict(intervals_us)
 
     def receive(
-        self, message: Message, frame: Frame, system: int, now_ns: int, fixed_us: Mapping[int, int]
+        self, message: Message, frame: Frame, system: int, now_ns: int, fixed_us: Intervals
     ) -> list[Message]:
         """Execute a command and return the replies; empty for other messages and other addressees.
 
         `system` is our own id, `fixed_us` the intervals on this link that no command may change: what the
         autopilot is fed is set by parameters only.
         """
-        self._fixed_us = fixed_us
         if frame.msgid not in _COMMANDS or message.target_system != system:
             return []
         execute = self._table.get(message.command)
@@ -121,7 +121,7 @@ class CommandServer:
         elif execute is None:
             result = Result.UNSUPPORTED
         else:
-            result, replies = execute(message.param1, message.param2)
+            result, replies = execute(message.param1, message.param2, fixed_us)
         ack = dialect.new(
             "COMMAND_ACK",
             command=message.command,
@@ -131,16 +131,16 @@ class CommandServer:
         )
         return [ack, *replies]
 
-    def _request_message(self, param1: float, param2: float) -> tuple[Result, list[Message]]:
+    def _request_message(self, param1: float, param2: float, fixed_us: Intervals) -> Executed:
         msgid = _to_message_id(param1)
         if (source := self._sources.get(msgid)) is None:
             return Result.UNSUPPORTED if msgid >= 0 else Result.DENIED, []
         message = source()
         return (Result.FAILED, []) if message is None else (Result.ACCEPTED, [message])
 
-    def _set_message_interval(self, param1: float, param2: float) -> tuple[Result, list[Message]]:
+    def _set_message_interval(self, param1: float, param2: float, fixed_us: Intervals) -> Executed:
         msgid, interval = _to_message_id(param1), param2
-        if msgid in self._fixed_us:
+        if msgid in fixed_us:
             return Result.DENIED, []
         if msgid not in self._defaults:
             return Result.UNSUPPORTED if msgid >= 0 else Result.DENIED, []
@@ -154,19 +154,19 @@ class CommandServer:
             return Result.DENIED, []
         return Result.ACCEPTED, []
 
-    def _get_message_interval(self, param1: float, param2: float) -> tuple[Result, list[Message]]:
+    def _get_message_interval(self, param1: float, param2: float, fixed_us: Intervals) -> Executed:
         msgid = _to_message_id(param1)
         if not 0 <= msgid < 1 << 16:  # the range of MESSAGE_INTERVAL.message_id
             return Result.DENIED, []
         # 0: message not available, by the description of MESSAGE_INTERVAL
-        known = {**self.intervals_us, **self._fixed_us}
+        known = {**self.intervals_us, **fixed_us}
         interval = known.get(msgid, DISABLED if msgid in self._sources else 0)
         return Result.ACCEPTED, [dialect.new("MESSAGE_INTERVAL", message_id=msgid, interval_us=interval)]
 
-    def _request_autopilot_capabilities(self, param1: float, param2: float) -> tuple[Result, list[Message]]:
+    def _request_autopilot_capabilities(self, param1: float, param2: float, fixed_us: Intervals) -> Executed:
         if param1 != 1:
             return Result.DENIED, []
-        return self._request_message(mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION, 0.0)
+        return self._request_message(mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION, 0.0, fixed_us)
 
 
 _COMMANDS = frozenset({mavlink.MAVLINK_MSG_ID_COMMAND_INT, mavlink.MAVLINK_MSG_ID_COMMAND_LONG})
