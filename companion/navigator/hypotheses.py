@@ -36,6 +36,10 @@ CONSISTENT, POSITION_ONLY = 0, 1  # faults of GNSS: its velocity is false too, o
 GNSS_GROUP, BEACON_GROUP, AIRSPEED_GROUP = 0, 1, 2
 GROUPS = (2, 2, 1)
 CHANNEL_JUMPS_H = 1e-3
+INS_JUMPS_H = 0.01  # its position, by a reset of the unit
+#: The velocity of an INS steps (m, m/s), so rarely that a GNSS drawn off by 0.5 m/s is beyond doubt in 2.4 s.
+#: Beacons that contradict are believed within two minutes: without it an INS that drifted excluded all else.
+INS_DRIFTS_H, INS_DRIFT = 2e-7, (5.0, 5.0, 1.0, 1.0)
 BEACON_PLACE = 0.03  # its position is stated wrongly: likelier than a GNSS captured before the first fix
 BEACON_H = 2e-4  # a beacon steps, or is elsewhere, so often in an hour; it does not drift
 ORDERS = (3, 2, 2)  # GNSS may be drawn off with an acceleration
@@ -48,16 +52,9 @@ BIAS_HOUR = 0.5  # a beacon's bias walks in an hour by this share of what it may
 #: greater priors (shares below) a jump of 300 m is not beyond doubt for minutes.
 DOUBTED = 1e-5  # that GNSS was false before the first beacon
 STILL = 3e-3  # m/s: a lie that stands still must not pay for a rate, or a beacon is blamed for it
-#: Offsets (m) and rates (m/s) of a false GNSS: several scales, or a wide prior makes a small lie improbable.
-GNSS_LIES = (
-    Lie(3.0, 0.3),
-    Lie(3.0, 0.3, noise=0.01),
-    Lie(3.0, 0.1, acceleration=0.01, share=0.3),
-    Lie(3.0, 1.0),
-    Lie(3.0, 5.0, noise=0.01),
-    Lie(30.0, 5.0, noise=0.03),
-    Lie(300.0, 1.0, noise=0.01),
-)
+#: A GNSS that is drawn off with an acceleration; beside an INS, which shows one of 0.003 m/s^2 as it begins.
+ACCELERATED = Lie(3.0, 0.1, acceleration=0.01, share=0.3)
+ACCELERATED_GENTLY = Lie(1.5, 0.03, acceleration=0.005, share=2.0)
 ELSEWHERE = (Lie(300.0, 1e-3), Lie(3000.0, 1e-3))  # displacement of a beacon whose stated position is wrong
 GNSS_FIRST = (
     Lie(60.0, 0.3),
@@ -72,6 +69,22 @@ SURPRISE = (
     5.0  # a step of 5 m/s beside gusts of 1.2 is one: an onset that is born late explains half of it as wind
 )
 JAMMED = 100.0  # times likelier while the receiver itself reports jamming or spoofing
+
+
+def gnss_lies(accelerated: Lie) -> tuple[Lie, ...]:
+    """Offsets (m) and rates (m/s) of a false GNSS.
+
+    Several scales, or a wide prior makes a small lie improbable.
+    """
+    return (
+        Lie(3.0, 0.3),
+        Lie(3.0, 0.3, noise=0.01),
+        accelerated,
+        Lie(3.0, 1.0),
+        Lie(3.0, 5.0, noise=0.01),
+        Lie(30.0, 5.0, noise=0.03),
+        Lie(300.0, 1.0, noise=0.01),
+    )
 
 
 def beacon_lies(reach: float) -> tuple[Lie, ...]:
@@ -204,9 +217,10 @@ def _hypotheses(config: Config, channel: Channel, beacons: int, by_air: bool, wi
         Source("gnss", 2, GNSS_GROUP, presumed=True),
         Source("airspeed", 1, AIRSPEED_GROUP, silence_s=SILENCE_S),
     ]
+    lies = gnss_lies(ACCELERATED if channel.wind else ACCELERATED_GENTLY)
     faults = [
-        Fault("gnss", (GNSS,), 7e-4 * doubt, GNSS_LIES, 7e-4 * doubt, GNSS_FIRST, quota=20),
-        Fault("gnss position", (GNSS,), 3e-4 * doubt, GNSS_LIES, 3e-4 * doubt, GNSS_FIRST, quota=10),
+        Fault("gnss", (GNSS,), 7e-4 * doubt, lies, 7e-4 * doubt, GNSS_FIRST, quota=20),
+        Fault("gnss position", (GNSS,), 3e-4 * doubt, lies, 3e-4 * doubt, GNSS_FIRST, quota=10),
         Fault("airspeed", (AIRSPEED,), 1e-2, AIRSPEED_LIES, shock=SHOCK if by_air else (), quota=6),
     ]
     for k in range(beacons):
@@ -235,7 +249,8 @@ def _hypotheses(config: Config, channel: Channel, beacons: int, by_air: bool, wi
             )
         )
     else:
-        jumps.append(Jump("channel", (0, 1), (100.0, 100.0), 0.01, quota=2, apart_s=APART_S))
+        jumps.append(Jump("channel", (0, 1), (100.0, 100.0), INS_JUMPS_H, quota=2, apart_s=APART_S))
+        jumps.append(Jump("drift", (0, 1, 2, 3), INS_DRIFT, INS_DRIFTS_H, quota=2, apart_s=APART_S))
     layout = Layout(
         channel.n + 2 * beacons,
         GROUPS,

@@ -4,8 +4,9 @@ The model is `nav.error_model.aircraft_matrix` with Markov gyro drift and accele
 position errors north and east (m), velocity errors (m/s), P minus the rotation of the platform (3, rad), E
 minus the gyro drift (3, rad/s), A accelerometer errors (2, m/s^2), GNSS drift (2, m), GNSS latency (s),
 lever arm of the GNSS antenna ahead of the INS (m).
-Errors of sensors that are strapped down turn with the aircraft. A grade multiplies the amplitude of the
-unit's errors.
+Errors of sensors that are strapped down turn with the aircraft. A grade g multiplies the amplitudes of the
+unit's errors: accelerometers, velocity and tilt by g, gyros by g^1.5. Units differ more in their gyros: from
+navigation to tactical to MEMS grade 1, 10, 100, where the accelerometers are 1, 4, 10.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from companion.units import G0, Floats
 
 N = 16
 VELOCITY, TILT, INS = slice(2, 4), slice(4, 7), slice(0, 7)
+GYROS = slice(7, 10)
 GYRO, ACCELEROMETER = (7, 8), (10, 11)  # north and east
 DRIFT, LATENCY, ARM = slice(12, 14), 14, 15
 TURNING_M_S = 5.0  # slower, the course does not give the heading
@@ -31,6 +33,7 @@ ARM_M = 1.5  # one sigma of the antenna's lever arm along the fuselage
 FIRST_POSITION_M = 1000.0  # the first fix gives the place of the INS
 AMPLITUDES = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0)
 WEIGHTS = (1.0, 0.5, 0.35, 0.25, 0.18, 0.12, 0.09)
+GYRO_POWER = 1.5
 
 
 class InsChannel(NamedTuple):
@@ -101,8 +104,10 @@ def ins_channel(config: Config) -> InsChannel:
     )
     amplitude = np.ones((len(AMPLITUDES), N))
     amplitude[:, :ours] = np.array(AMPLITUDES)[:, None]
+    amplitude[:, GYROS] **= GYRO_POWER
     first = amplitude.copy()
     first[:, :2] = 1.0  # the first fix gives the position whatever the grade
+    amplitude[:, TILT] **= GYRO_POWER  # random walk of the gyros
     scaled = density * amplitude**2
     scaled[:, DRIFT] = 2.0 * gnss.sigma_m**2 / gnss.correlation_s
     scaled[:, LATENCY] = LATENCY_WALK**2

@@ -61,6 +61,13 @@ def test_flight_with_nothing_wrong_passes(channel):
     assert result.passed, result
 
 
+@pytest.mark.flight
+def test_a_mems_ins_stated_as_navigation_grade_does_not_exclude_gnss():
+    """Its gyros are 100 times as coarse, its accelerometers 10; by one factor for both GNSS was excluded."""
+    result = fly(HarmOrder("beacon 3x as noisy as stated", "INS MEMS", 3, 10.0))
+    assert result.passed, result
+
+
 def test_exception_in_a_flight_is_a_result(monkeypatch):
     monkeypatch.setattr(harm_study, "scenario_of", lambda order: 1 / 0)
     result = fly(HarmOrder("nothing", "stock", 1, 5.0))

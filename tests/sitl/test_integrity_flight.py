@@ -1,4 +1,4 @@
-"""Integrity on flights without an INS, one beacon: a fault of GNSS or beacon does no harm."""
+"""Integrity of flights: a fault of GNSS, beacon or INS does no harm; air data, one beacon by default."""
 
 from __future__ import annotations
 
@@ -78,3 +78,24 @@ def test_guaranteed_bound_does_not_use_suspected_sources() -> None:
     assert result.rms_error is not None and result.rms_bound is not None
     assert result.rms_error <= result.rms_bound
     assert result.misleading_s == 0.0
+
+
+@pytest.mark.parametrize("scenario", ["one-beacon", "two-beacons", "mems"])
+def test_ins_that_drifts_does_not_exclude_gnss_and_beacons_for_ever(scenario: str) -> None:
+    """1 m/s for 4 min: GNSS looks drawn off until the beacons contradict (236 m and no end before)."""
+    result = fly_order(FlightOrder(scenario, "ins-drift", 1))
+    assert result.raised is None
+    assert (result.misleading_s, result.beyond_s) == (0.0, 0.0)
+    assert result.largest_m < 120.0
+    assert result.last_m < 10.0  # by GNSS again
+
+
+@pytest.mark.parametrize("scenario", ["one-beacon", "two-beacons"])
+def test_gnss_that_is_drawn_off_gently_is_found_beside_an_ins(scenario: str) -> None:
+    """0.003 m/s^2; it ends at 87 m. It was taken for a coarser INS, and excluded once it was honest again."""
+    result = fly_order(FlightOrder(scenario, "gnss-accelerate", 1))
+    assert result.raised is None
+    assert result.excluded_s is not None
+    assert (result.misleading_s, result.beyond_s) == (0.0, 0.0)
+    assert result.largest_m < 60.0
+    assert result.last_m < 10.0
