@@ -8,6 +8,8 @@ imports it before all else.
 
 import os
 import signal
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from types import FrameType
 from typing import NoReturn
 
@@ -32,3 +34,38 @@ def raise_at_interrupt() -> None:
     """Raise KeyboardInterrupt at SIGINT again. No effect without `end_at_interrupt`."""
     if signal.getsignal(signal.SIGINT) is end:
         signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@contextmanager
+def passed_to(report: Callable[[], object]) -> Iterator[None]:
+    """Call `report` at SIGINT in place of KeyboardInterrupt, which is lost in a callback of the collector.
+
+    A second SIGINT ends the process. No effect where SIGINT is ignored or handled otherwise.
+    """
+    former = signal.getsignal(signal.SIGINT)
+    if former not in (signal.default_int_handler, end):
+        yield
+        return
+
+    def receive(number: int, frame: FrameType | None) -> None:
+        signal.signal(signal.SIGINT, end)
+        report()
+
+    signal.signal(signal.SIGINT, receive)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, former)
+
+
+@contextmanager
+def held() -> Iterator[None]:
+    """Hold SIGINT back until the end of the block; threads and processes started in it never receive it."""
+    from multiprocessing import resource_tracker
+
+    resource_tracker.ensure_running()  # its own start would let the signal through again
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})

@@ -1,6 +1,7 @@
 """Command line: help, output and exit codes."""
 
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -103,6 +104,49 @@ def test_interrupt_at_any_time_of_the_start_is_quiet(tmp_path: Path, command: li
             assert err.strip() == "companion: interrupted"
         elif running.returncode != 0:  # 0: it had ended, or `run` closed its log
             assert str(Path(__file__).parents[1] / "companion") not in err  # in Python's own start only
+
+
+@pytest.mark.parametrize("delay_s", [0.7, 1.5, 4.0])
+def test_interrupt_of_many_processes_is_one_line(tmp_path: Path, delay_s: float) -> None:
+    """Ctrl-C in a terminal goes to the workers as well."""
+    pytest.importorskip("distributed")
+    with subprocess.Popen(
+        [sys.executable, "-m", "companion", "campaign", "--results", str(tmp_path), "--workers", "2"],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    ) as running:
+        time.sleep(delay_s)
+        os.killpg(running.pid, signal.SIGINT)
+        _, err = running.communicate(timeout=60)
+    assert (running.returncode, err.strip()) == (130, "companion: interrupted")
+
+
+def test_interrupt_in_a_callback_of_the_collector_is_not_lost() -> None:
+    """Dask has such callbacks; what is raised in one is printed and forgotten."""
+    pytest.importorskip("distributed")
+    code = """
+import gc, os, signal, time
+from companion.analysis.jobs import run_jobs
+
+def main():
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    pending = [signal.SIGINT]
+    for _ in run_jobs(time.sleep, {str(k): 0.01 for k in range(3_000)}, None, 1, "fleet"):
+        if pending:
+            gc.callbacks.append(lambda phase, info: pending and os.kill(os.getpid(), pending.pop()))
+            gc.collect()
+
+if __name__ == "__main__":
+    try:
+        main()
+    except KeyboardInterrupt:
+        print("interrupted")
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "interrupted\n", "")
 
 
 @pytest.mark.parametrize(
