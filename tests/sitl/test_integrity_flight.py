@@ -99,3 +99,15 @@ def test_gnss_that_is_drawn_off_gently_is_found_beside_an_ins(scenario: str) -> 
     assert (result.misleading_s, result.beyond_s) == (0.0, 0.0)
     assert result.largest_m < 60.0
     assert result.last_m < 10.0
+
+
+def test_onsets_of_a_slow_lie_are_kept() -> None:
+    """A GNSS that is drawn off at 0.5 m/s without an INS: it looks like a change of wind for three minutes.
+
+    Two faults at once held a third of the rows, so its onset was lost: misleading for 5.1 s, never suspected.
+    """
+    result = fly_order(FlightOrder("stock", "gnss-spoof-0.5", 3))
+    assert result.raised is None
+    assert result.detected_s is not None
+    assert (result.misleading_s, result.beyond_s) == (0.0, 0.0)
+    assert result.normal_m < 130.0
