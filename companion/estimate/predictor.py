@@ -35,8 +35,8 @@ from companion.units import Floats
 
 KAPPA = 1.2  # worst error of the restricted estimate over the least possible
 RESTRICTED_TOLERANCE = 1e-2  # relative, of its worst error against the limit
-RESTRICTED_ROUNDS, RESTRICTED_LEAST = 500, 4
-RESTRICTED_GAIN = 4.0  # power of the excess over the limit by which the multiplier follows it
+RESTRICTED_ROUNDS = 500
+RESTRICTED_GAIN = 8.0  # power of the excess over the limit by which the multiplier follows it
 GROUP_S, GROUP_RATIO = 10.0, 0.2  # length of the newest group of fixes, s; growth with age
 WHITE = 0.1  # share of white noise in the variance of a fix, expected
 UNLIKE = 4.0  # fixes so many times better or worse are not grouped
@@ -227,7 +227,7 @@ class Program:
         if start is not None and start[0] > 0.0 and start[1].shape == weights.shape:
             mu, weights = start
         feasible, before = best, found.expected
-        for k in range(RESTRICTED_ROUNDS):
+        for _ in range(RESTRICTED_ROUNDS):
             fine = mu * self.sigmas / np.maximum(np.abs(weights), floor / self.sigmas)
             coarse = mu / np.maximum(np.abs(g - weights @ G), floor)
             spread = self.spread + np.diag(fine) + (G * coarse) @ G.T
@@ -240,7 +240,7 @@ class Program:
             if settled and 1.0 - tolerance < excess <= 1.0:
                 break
             before = found.expected
-            mu *= excess**RESTRICTED_GAIN if k < RESTRICTED_LEAST else excess ** (0.5 * RESTRICTED_GAIN)
+            mu *= excess**RESTRICTED_GAIN
         return feasible, mu
 
     def judge(self, weights: Floats, target: Target) -> Estimate:
