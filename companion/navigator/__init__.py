@@ -9,7 +9,7 @@ late measurement shows in the first one after that.
 
 from __future__ import annotations
 
-from bisect import bisect_right, insort
+from bisect import insort
 from collections import deque
 from collections.abc import Callable
 from typing import Any, NamedTuple, TypeGuard
@@ -22,6 +22,7 @@ from companion.navigator import minimax_bound
 from companion.navigator.hypotheses import Model
 from companion.navigator.measurements import other_receiver
 from companion.navigator.own_channel import OwnChannel
+from companion.navigator.past_states import PastStates
 from companion.navigator.receiver_choice import ReceiverChoice
 from companion.navigator.solution import announce, is_bound_due, refresh_bound, resolve_pending, solve
 from companion.navigator.stale_data import REPORT_EVERY, StaleDataDetector
@@ -54,15 +55,7 @@ TICK_NS = 1_000_000
 #: After a roll-back by t seconds for beacon answers, all of which were rejected, none that is older than
 #: CHEAP_NS is used for USELESS_TIMES t: forged ones would take the time of all others.
 USELESS_TIMES, CHEAP_NS = 2, 500_000_000
-#: Most late records that wait for the next roll-back, and most records kept.
-MOST_WAITING, MOST_KEPT = 64, 1024
-#: A state takes up to 0.8 MB: of those older than DENSE_NS one per SPARSE_NS is kept.
-DENSE_NS, SPARSE_NS = 1_000_000_000, 1_000_000_000
-
-
-class _Past(NamedTuple):
-    record: Input
-    before: State | None  # None: dropped; the first one of all has a state
+MOST_WAITING = 64  # late records, for the next roll-back
 
 
 class _Again(NamedTuple):
@@ -80,8 +73,8 @@ class _RollBack:
         self.used: set[bool] = set()  # whether beacon answers older than CHEAP_NS were used
 
 
-def _time(kept: _Past | _Again) -> int:
-    return kept.record.t_ns
+def _time(again: _Again) -> int:
+    return again.record.t_ns
 
 
 def _is_old_answer(record: Input) -> TypeGuard[RsbnFix]:
@@ -98,8 +91,7 @@ class Navigator:
         self._settings = Settings(config, model or Model(config))
         self._uses = uses(self._settings)
         self._state = initial(self._settings)  # after the last of `_past`
-        self._past: deque[_Past] = deque()
-        self._thinned_ns = self._kept_ns = 0  # until when the states are thinned out; the last one kept there
+        self._past = PastStates()
         self._newest: Input | None = None  # the last record that was not late
         self._roll_back: _RollBack | None = None
         self._waiting: list[Input] = []  # late records, until the next roll-back
@@ -170,28 +162,9 @@ class Navigator:
         else:
             self._state, outputs = self._resolved(self._state, self._newest)
         self._deferred += outputs
-        self._thin_out()
-        oldest_ns = _time(self._past[-1]) - self._late_ns - SPARSE_NS
-        while not self._waiting and _time(self._past[0]) < oldest_ns:
-            self._drop_oldest()
-
-    def _thin_out(self) -> None:
-        """Drop states of the records that have become older than DENSE_NS."""
-        past, until_ns = self._past, _time(self._past[-1]) - DENSE_NS
-        i = bisect_right(past, self._thinned_ns, key=_time)
-        while i < len(past) and _time(past[i]) <= until_ns:
-            self._thinned_ns = _time(past[i])
-            if self._thinned_ns - self._kept_ns >= SPARSE_NS or i == 0:
-                self._kept_ns = self._thinned_ns
-            else:
-                past[i] = _Past(past[i].record, None)
-            i += 1
-
-    def _drop_oldest(self) -> None:
-        """Drop the first record, and those that could only be folded again from its state."""
-        self._past.popleft()
-        while self._past[0].before is None:
-            self._past.popleft()
+        self._past.thin_out()
+        if not self._waiting:
+            self._past.keep_last(self._late_ns)
 
     def finish(self) -> None:
         """Fold all late records: before other parameters, and at the end of a log."""
@@ -234,9 +207,7 @@ class Navigator:
         return outputs + solution
 
     def _fold(self, record: Input) -> list[Output]:
-        self._past.append(_Past(record, self._state))
-        if len(self._past) > MOST_KEPT:
-            self._drop_oldest()
+        self._past.append(record, self._state)
         self._state, outputs = self._stepped(self._state, record)
         return outputs
 
@@ -261,20 +232,19 @@ class Navigator:
         self._gnss_latency_ns = round(1e9 * config.gnss.latency_s)
         same = config.has_own_ins == before.config.has_own_ins
         self._channel_reported = self._channel_reported and same
-        while len(self._past) > 1:  # the last one stays: it dates what is too late
-            self._past.popleft()
+        self._past.forget()
 
     def _queue_late(self, record: Input) -> list[Output]:
         """Let a late record join the roll-back in progress or wait for the next one, or reject it."""
         assert self._newest is not None
-        if record.t_ns < max(_time(self._past[0]), self._newest.t_ns - self._late_ns):
+        if record.t_ns < max(self._past.first_ns, self._newest.t_ns - self._late_ns):
             return self._too_late(record)
         if _is_old_answer(record) and record.rx_ns < self._no_late_answers_ns:
             why = "late, and the last late answers were rejected: not used"
             age, limit = (record.rx_ns - record.t_ns) * 1e-9, CHEAP_NS * 1e-9
             return [Rejection(record.t_ns, record.rx_ns, f"rsbn {record.beacon}", why, age, limit)]
         back = self._roll_back
-        if back is not None and record.t_ns >= _time(self._past[-1]):
+        if back is not None and record.t_ns >= self._past.last_ns:
             insort(back.again, _Again(record, True), key=_time)
         elif len(self._waiting) < MOST_WAITING:
             self._waiting.append(record)
@@ -287,15 +257,11 @@ class Navigator:
         """Go back to the state before the oldest waiting record."""
         outputs: list[Output] = []
         late, self._waiting = sorted(self._waiting, key=lambda record: record.t_ns), []
-        while late and late[0].t_ns < _time(self._past[0]):  # dropped while they waited
+        while late and late[0].t_ns < self._past.first_ns:  # dropped while they waited
             outputs += self._too_late(late.pop(0))
         if late:
-            place = bisect_right(self._past, late[0].t_ns, key=_time)
-            while (before := self._past[place].before) is None:
-                place -= 1
-            later = [self._past.pop() for _ in range(place, len(self._past))]
-            self._thinned_ns = self._kept_ns = min(self._thinned_ns, _time(later[-1]) - 1)
-            again = [_Again(past.record, False) for past in reversed(later)]
+            before, later = self._past.back_to(late[0].t_ns)
+            again = [_Again(record, False) for record in later]
             again += [_Again(record, True) for record in late]
             # a stable sort: of equal times the late one comes last
             self._roll_back = _RollBack(self._state, sorted(again, key=_time))

@@ -25,7 +25,7 @@ from companion.nav.geometry import (
     separation,
     slant_range_azimuth,
 )
-from companion.navigator import Navigator, measurements
+from companion.navigator import Navigator, measurements, past_states
 from companion.navigator.channel import Nominal
 from companion.navigator.inertial_track import Point
 from companion.navigator.ins_channel import ins_channel
@@ -243,10 +243,9 @@ def test_states_that_are_not_kept_change_no_solution(late_s: float, monkeypatch:
         in_order = navigator._roll_back is None
         ours += solutions(navigator, [record])
         if in_order and navigator._roll_back is None:
-            older = [past for past in navigator._past if past.record.t_ns < record.t_ns - 1.2 * NS]
-            kept.append(sum(past.before is not None for past in older))
+            kept.append(sum(t_ns < record.t_ns - 1.2 * NS for t_ns in navigator._past.states_ns))
     assert 5 <= max(kept) <= 8
-    monkeypatch.setattr(navigator_module, "DENSE_NS", 60 * NS)
+    monkeypatch.setattr(past_states, "DENSE_NS", 60 * NS)
     wanted = {each.t_ns: each for each in solutions(Navigator(CONFIG), records)}
     later = [each for each in ours if each.t_ns > answer.rx_ns + NS]
     assert len(later) > 10
@@ -279,7 +278,7 @@ def test_with_no_record_more_than_a_few_are_folded_again(monkeypatch: pytest.Mon
     assert tried > 100
     assert most <= navigator_module.MOST_AGAIN + 1  # the record itself
     assert most_fixes <= navigator_module.MOST_FIXES + 1
-    assert kept <= navigator_module.MOST_KEPT
+    assert kept <= past_states.MOST_KEPT
     times = [out.t_ns for out in outputs if isinstance(out, Solution)]
     assert max(b - a for a, b in pairwise(times)) <= NS // 5
 
