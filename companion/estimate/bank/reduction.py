@@ -20,9 +20,9 @@ def reduce(bank: Bank, layout: Layout, settings: Settings) -> Bank:
     oldest row are kept first, in the young bins the heaviest of each scale, and of each family the heaviest
     of each grade: a family that has lost the right grade loses to one that has it. Protected are the rows
     that carry the weight, the heaviest of each fault and of each grade, and those that set the protection
-    level. Two faults at once that are less probable than the risk have no claim to a row: a third of the rows
-    was theirs, and the onsets of a slow lie were lost. A dropped row merges by moments with a row of its
-    label if their weights are alike; else its weight goes to the heaviest of its class.
+    level. Two faults at once that are less probable than the risk stand behind: with an equal claim they held
+    a third of the rows, and the onsets of a slow lie were lost. A dropped row merges by moments with a row of
+    its label if their weights are alike; else its weight goes to the heaviest of its class.
 
     Parameters
     ----------
@@ -82,9 +82,10 @@ def reduce(bank: Bank, layout: Layout, settings: Settings) -> Bank:
             rank[i] = 0 if key[0] == 0 else min(rank[i], 1)
     for i in oldest.values():
         rank[i] = min(rank[i], 2)
-    floors = settings.class_floor, settings.class_floor, math.log(settings.risk)
     for i in range(rows):
-        if rank[i] and logs[i] < floors[min(active[i], 2)]:
+        if rank[i] and active[i] > 1 and logs[i] < math.log(settings.risk):
+            rank[i] += 1
+        if rank[i] and logs[i] < settings.class_floor:
             rank[i] = max(rank[i], 3)
     for i in level_rows(bank, layout, 3, settings.risk).tolist():
         rank[i] = 0
