@@ -62,16 +62,21 @@ class PastStates:
         while (before := self._past[place].before) is None:
             place -= 1
         later = [self._past.pop().record for _ in range(place, len(self._past))]
-        self._thinned_ns = self._kept_ns = min(self._thinned_ns, later[-1].t_ns - 1)
+        self._thinned_ns = min(self._thinned_ns, later[-1].t_ns - 1)
+        kept = (_time(past) for past in reversed(self._past) if past.before is not None)
+        self._kept_ns = next((t for t in kept if t <= self._thinned_ns), 0)
         return before, later[::-1]
 
     def thin_out(self) -> None:
-        """Drop states of the records that have become older than DENSE_NS."""
+        """Drop states of the records that have become older than DENSE_NS.
+
+        The second one is kept: after `forget` the first is from before.
+        """
         past, until_ns = self._past, self.last_ns - DENSE_NS
         i = bisect_right(past, self._thinned_ns, key=_time)
         while i < len(past) and _time(past[i]) <= until_ns:
             self._thinned_ns = _time(past[i])
-            if self._thinned_ns - self._kept_ns >= SPARSE_NS or i == 0:
+            if self._thinned_ns - self._kept_ns >= SPARSE_NS or i <= 1:
                 self._kept_ns = self._thinned_ns
             else:
                 past[i] = _Past(past[i].record, None)
@@ -88,7 +93,7 @@ class PastStates:
         return next(_time(past) for past in islice(self._past, 1, None) if past.before is not None)
 
     def forget(self) -> None:
-        """Drop all but the last record: it dates what is too late."""
+        """Drop all but the last record: it dates what is too late, and nothing goes back to its state."""
         while len(self._past) > 1:
             self._past.popleft()
 

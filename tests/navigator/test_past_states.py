@@ -16,6 +16,7 @@ from companion.records import Pressure
 
 MS = 1_000_000
 LATE_NS = 6_000_000_000
+START_NS = 100 * SPARSE_NS
 INITIAL = initial(Settings(Config(), Model(Config())))
 
 
@@ -28,35 +29,76 @@ def before(t_ns: int) -> State:
     return INITIAL._replace(next_ns=t_ns)
 
 
-@given(st.lists(st.integers(0, 1500), min_size=2, max_size=120), st.floats(0.0, 1.0))
-def test_goes_back_to_the_last_kept_state(gaps_ms: list[int], share: float) -> None:
-    past, times, t_ns = PastStates(), list[int](), 100 * SPARSE_NS
-    for gap in gaps_ms:
-        t_ns += gap * MS
-        past.append(record(t_ns), before(t_ns))
-        times.append(t_ns)
+class Kept:
+    """Past states as the navigator uses them, and what must hold of them after each record."""
+
+    def __init__(self) -> None:
+        self.past = PastStates()
+        self.times = list[int]()
+
+    def append(self, t_ns: int) -> None:
+        self.past.append(record(t_ns), before(t_ns))
+        self.past.thin_out()
+        self.past.keep_last(LATE_NS)
+        self.times.append(t_ns)
+
+    def fold_late(self, late_ns: int) -> None:
+        states, kept = self.past.states_ns, self.times[len(self.times) - len(self.past) :]
+        state, again = self.past.back_to(late_ns)
+        first_later = next(t for t in kept if t > late_ns)
+        assert state.next_ns == again[0].t_ns == max(t for t in states if t <= first_later)
+        again_ns = [each.t_ns for each in again]
+        assert again_ns == kept[len(kept) - len(again) :]
+        assert len(self.past) == len(kept) - len(again)
+        del self.times[len(self.times) - len(again) :]
+        for t_ns in sorted([*again_ns, late_ns]):
+            self.append(t_ns)
+
+    def check(self, gap_ns: int) -> None:
+        states, last = self.past.states_ns, self.times[-1]
+        assert self.past.first_ns <= max(self.times[0], last - LATE_NS)  # all that may come can be folded in
+        assert states[0] == self.past.first_ns
+        recent = [t for t in self.times[-len(self.past) :] if t > last - DENSE_NS]
+        assert states[len(states) - len(recent) :] == recent
+        older = states[: len(states) - len(recent) + 1]
+        assert all(b - a < SPARSE_NS + gap_ns for a, b in pairwise(older))
+        assert len(older) <= 2 * LATE_NS // SPARSE_NS + 3
+
+
+@given(st.lists(st.tuples(st.integers(0, 300), st.none() | st.floats(0.0, 1.0)), min_size=2, max_size=150))
+def test_goes_back_to_the_last_kept_state(steps: list[tuple[int, float | None]]) -> None:
+    """Records, each of which may be followed by a late one."""
+    kept, t_ns = Kept(), START_NS
+    for gap_ms, share in steps:
+        t_ns += gap_ms * MS
+        kept.append(t_ns)
+        if share is not None and kept.past.first_ns < t_ns:
+            kept.fold_late(kept.past.first_ns + round(share * (t_ns - 1 - kept.past.first_ns)))
+        kept.check(300 * MS)
+
+
+@pytest.mark.parametrize("late_ms", [30, 100, 300, 900, 2000])
+def test_late_records_that_come_often_cost_no_state(late_ms: int) -> None:
+    """One of ten records is late: as GNSS at 5 Hz is."""
+    kept = Kept()
+    for k in range(1500):
+        t_ns = START_NS + 20 * k * MS
+        kept.append(t_ns)
+        if k % 10 == 9 and late_ms * MS < t_ns - START_NS:
+            kept.fold_late(t_ns - late_ms * MS - 1)
+        kept.check(20 * MS)
+
+
+def test_nothing_goes_back_to_what_is_forgotten() -> None:
+    past = PastStates()
+    for k in range(400):
+        if k == 100:
+            past.forget()
+        past.append(record(k * 20 * MS), before(k * 20 * MS))
         past.thin_out()
         past.keep_last(LATE_NS)
-    assert past.first_ns <= max(times[0], t_ns - LATE_NS)  # all that may still come can be folded in
-    assert past.states_ns[0] == past.first_ns
-    recent = [t for t in times if t > t_ns - DENSE_NS]
-    assert past.states_ns[len(past.states_ns) - len(recent) :] == recent
-    older = past.states_ns[: len(past.states_ns) - len(recent)]
-    assert all(b - a >= SPARSE_NS for a, b in pairwise(older[1:]))
-
-    late_ns = past.first_ns + round(share * (t_ns - 1 - past.first_ns))
-    states, kept = past.states_ns, times[len(times) - len(past) :]
-    later = sum(t > late_ns for t in kept)
-    if not later:
-        return
-    state, again = past.back_to(late_ns)
-    assert state.next_ns == again[0].t_ns
-    assert [each.t_ns for each in again] == kept[len(kept) - len(again) :]
-    assert len(again) >= later
-    assert len(past) == len(kept) - len(again)
-    # no kept state is nearer to the late record
-    first_after = kept[len(kept) - later]
-    assert state.next_ns == max(t for t in states if t <= first_after)
+    state, _ = past.back_to(past.first_ns)
+    assert state.next_ns >= 100 * 20 * MS
 
 
 def test_number_of_records_is_limited() -> None:
