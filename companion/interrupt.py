@@ -8,6 +8,7 @@ imports it before all else.
 
 import os
 import signal
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
@@ -40,10 +41,12 @@ def raise_at_interrupt() -> None:
 def passed_to(report: Callable[[], object]) -> Iterator[None]:
     """Call `report` at SIGINT in place of KeyboardInterrupt, which is lost in a callback of the collector.
 
-    A second SIGINT ends the process. No effect where SIGINT is ignored or handled otherwise.
+    A second SIGINT ends the process. No effect where SIGINT is ignored or handled otherwise, nor in another
+    thread than the main one.
     """
     former = signal.getsignal(signal.SIGINT)
-    if former not in (signal.default_int_handler, end):
+    is_ours = former in (signal.default_int_handler, end)
+    if not is_ours or threading.current_thread() is not threading.main_thread():
         yield
         return
 
@@ -64,8 +67,8 @@ def held() -> Iterator[None]:
     from multiprocessing import resource_tracker
 
     resource_tracker.ensure_running()  # its own start would let the signal through again
-    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
     finally:
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import socket
 from collections.abc import Callable, Coroutine
 from typing import Any, Protocol
@@ -12,14 +13,21 @@ class Readable(Protocol):
     async def read(self) -> bytes: ...
 
 
-def free_port(kind: int = socket.SOCK_DGRAM) -> int:
-    """Return a port of the loopback interface that is not in use."""
-    with socket.socket(socket.AF_INET, kind) as sock:
-        sock.bind(("127.0.0.1", 0))
-        return int(sock.getsockname()[1])
+def free_port() -> int:
+    """Return a port of the loopback interface that neither TCP nor UDP uses."""
+    while True:
+        with (
+            socket.socket(socket.AF_INET, socket.SOCK_STREAM) as tcp,
+            socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp,
+            contextlib.suppress(OSError),
+        ):
+            tcp.bind(("127.0.0.1", 0))
+            port = int(tcp.getsockname()[1])
+            udp.bind(("127.0.0.1", port))
+            return port
 
 
-def run(test: Coroutine[Any, Any, None], seconds: float = 20.0) -> None:
+def run(test: Coroutine[Any, Any, None], seconds: float = 120.0) -> None:
     """Run a test, for `seconds` at most."""
 
     async def limited() -> None:
@@ -29,7 +37,7 @@ def run(test: Coroutine[Any, Any, None], seconds: float = 20.0) -> None:
     asyncio.run(limited())
 
 
-async def until(condition: Callable[[], object], seconds: float = 10.0) -> None:
+async def until(condition: Callable[[], object], seconds: float = 60.0) -> None:
     """Wait until the condition is true; TimeoutError after `seconds`."""
     async with asyncio.timeout(seconds):
         while not condition():  # noqa: ASYNC110 (a socket, a file, another process: nothing that sets an event)

@@ -52,22 +52,26 @@ def run_jobs(
         yield from (FinishedJob(key, work(job)) for key, job in jobs.items())
         return
     os.environ.setdefault("DASK_LOGGING__DISTRIBUTED", "100")  # above critical: what it loses is stated here
-    finished: SimpleQueue[Future | None] = SimpleQueue()  # None: interrupted
-    with ExitStack() as stack:
-        stack.enter_context(interrupt.passed_to(lambda: finished.put(None)))
+    with interrupt.held():  # an interrupted import ends in another error
         try:
             from dask import config
             from dask.distributed import Client, LocalCluster
         except ImportError:
             missing = missing_package("work by many processes", "Dask", extra)
             raise ValueError(f"{missing}, or use --workers 0") from None
-        cluster = None
+    finished: SimpleQueue[Future | None] = SimpleQueue()  # None: interrupted
+    noted = interrupt.passed_to(lambda: finished.put(None))
+    with ExitStack() as stack:
         if scheduler is None:
+            stack.enter_context(noted)
             with interrupt.held(), config.set({"distributed.nanny.pre-spawn-environ": ENVIRONMENT}):
                 cluster = stack.enter_context(
                     LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address="127.0.0.1:0")
                 )
-        client = stack.enter_context(Client(scheduler or cluster))
+            client = stack.enter_context(Client(cluster))
+        else:
+            client = stack.enter_context(Client(scheduler))
+            stack.enter_context(noted)
         keys = {
             client.submit(work, job, key=key, retries=RETRIES, pure=False): key for key, job in jobs.items()
         }
@@ -76,11 +80,14 @@ def run_jobs(
         for _ in keys:
             if (future := finished.get()) is None:
                 raise KeyboardInterrupt
-            if future.status == "finished":
+            failure = future.exception()  # of a result that was lost with its worker: after another try
+            if failure is None:
                 yield FinishedJob(keys[future], future.result())
             else:
-                yield FinishedJob(keys[future], None, f"{WORKER_LOST}: {future.exception()}")
+                yield FinishedJob(keys[future], None, f"{WORKER_LOST}: {failure}")
             future.release()
+    if not finished.empty():
+        raise KeyboardInterrupt
 
 
 class Journal:

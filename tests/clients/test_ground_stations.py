@@ -42,7 +42,7 @@ PASSPHRASE = "chickpea"  # a station derives the key from it by SHA-256
 def second_link(tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
     """The service and a simulated autopilot in flight; yield the TCP port of the service's second link."""
     folder = tmp_path_factory.mktemp("flight")
-    first, second = free_port(), free_port(socket.SOCK_STREAM)
+    first, second = free_port(), free_port()
     links = [f"--connect=udpin:{LOOPBACK}:{first}", f"--connect=tcpin:{LOOPBACK}:{second}"]
     commands = {
         "run": [*links, "--set=inertial.independent=true", f"--logs={folder / 'logs'}"],
@@ -59,7 +59,7 @@ def second_link(tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
         yield second
         for process in processes.values():
             process.send_signal(signal.SIGINT)
-        ended = {name: process.wait(10) for name, process in processes.items()}
+        ended = {name: process.wait(60) for name, process in processes.items()}
     assert ended == {"run": 0, "sitl": 0}, (folder / "run").read_text()
 
 

@@ -419,7 +419,7 @@ def test_stalled_tcp_peer_drops_the_oldest_frames_and_they_are_counted(tmp_path:
                 service._flush()
                 return link.dropped > 1000
 
-            await until(stuck, 20.0)
+            await until(stuck)
             await asyncio.sleep(1.2)  # the link state is logged every second
 
     events = serve(tmp_path, (f"tcpin:{LOOPBACK}:{port}",), play)

@@ -230,7 +230,7 @@ def test_three_processes_over_tcp_and_udp(entries, tmp_path: Path) -> None:
     """Recorded autopilot over TCP, bridge, and companion with log, for a quarter of a minute."""
     log, errors, logs = tmp_path / "cut.tlog", tmp_path / "errors", tmp_path / "logs"
     log.write_bytes(lzma.decompress(CUT.read_bytes()))
-    tcp, udp = free_port(socket.SOCK_STREAM), free_port(socket.SOCK_DGRAM)
+    tcp, udp = free_port(), free_port()
     python = [sys.executable, "-m", "companion"]
     play = [*python, "sitl", "play", str(log), "--from", "16", "--connect", f"tcpin:{LOOPBACK}:{tcp}"]
     flight = [*python, "run", "--connect", f"udpin:{LOOPBACK}:{udp}", "--logs", str(logs)]

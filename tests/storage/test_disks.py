@@ -130,7 +130,7 @@ def test_solutions_are_on_time_with_a_failing_or_blocked_disk(tmp_path: Path, mo
         service = Service(config, log, events.append)
         serving, flying = (asyncio.create_task(c) for c in (service.serve(), fly(port, arrivals, more)))
         try:
-            await until(lambda: len(arrivals) >= 5, 30.0)
+            await until(lambda: len(arrivals) >= 5)
             await phase("working", 1.5)
             for name, number in (("full", errno.ENOSPC), ("read-only", errno.EROFS)):
                 disks[0].error = number
@@ -237,11 +237,11 @@ def test_full_disk_is_reported_and_writing_resumes(small_disk, tmp_path) -> None
     async def play() -> None:
         flying = asyncio.create_task(fly(port, arrivals, []))
         try:
-            await until(lambda: "No space left on device; navigation continues" in log_text.read_text(), 30.0)
+            await until(lambda: "No space left on device; navigation continues" in log_text.read_text())
             full = len(arrivals)
             await until(lambda: len(arrivals) > full + 2)  # solutions continue
             ballast.unlink()
-            await until(lambda: "log: writing resumed" in log_text.read_text(), 30.0)
+            await until(lambda: "log: writing resumed" in log_text.read_text())
         finally:
             flying.cancel()
 
