@@ -31,7 +31,7 @@ from tests.network import free_port, until
 LOOPBACK = "127.0.0.1"
 EVERY_S = 0.2  # interval of solutions and of their messages
 #: Tolerance for other programs on the processor; a blocking disk would delay for much longer.
-LATE_S = 2.5
+LATE_S = 0.8
 
 
 class FaultyDisk:

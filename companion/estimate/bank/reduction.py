@@ -82,8 +82,9 @@ def reduce(bank: Bank, layout: Layout, settings: Settings) -> Bank:
             rank[i] = 0 if key[0] == 0 else min(rank[i], 1)
     for i in oldest.values():
         rank[i] = min(rank[i], 2)
+    log_risk = math.log(settings.risk)
     for i in range(rows):
-        if rank[i] and active[i] > 1 and logs[i] < math.log(settings.risk):
+        if rank[i] and active[i] > 1 and logs[i] < log_risk:
             rank[i] += 1
         if rank[i] and logs[i] < settings.class_floor:
             rank[i] = max(rank[i], 3)
