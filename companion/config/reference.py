@@ -117,7 +117,7 @@ TEXTS: dict[str, dict[str, tuple[str, str]]] = {
         ),
         "tilt_s": ("Correlation time of the attitude error.", _MEASURED),
         "accelerometer_m_s2": ("Accelerometer error, misalignment included.", _MEASURED),
-        "velocity_noise_m_s_sqrt_s": ("What vibration and sampling leave.", "the airframe vibrates strongly"),
+        "velocity_noise_m_s_sqrt_s": ("Noise that the scatter of the samples does not show.", _MEASURED),
     },
     "gnss": {
         "receiver": (

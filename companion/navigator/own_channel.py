@@ -15,7 +15,7 @@ import math
 from typing import NamedTuple
 
 from companion.config import Config
-from companion.navigator import air_data_channel, own_error_model
+from companion.navigator import air_data_channel, own_error_model, strapdown_channel
 from companion.navigator.air_data_channel import Reckoner
 from companion.navigator.channel import Nominal, Transition, moved
 from companion.navigator.inertial_track import Point
@@ -53,7 +53,7 @@ class Sensors(NamedTuple):
     imu_ns: int = -SENSOR_NS
     air_ns: int = -SENSOR_NS
     foreign_ns: int = -SENSOR_NS
-    acceleration: Vector2 = (0.0, 0.0)
+    accelerations: tuple[Vector2, ...] = ()  # level, of the last three samples without a gap
     sums: AirspeedSums | None = None  # since airspeed was last a measurement
     measured_ns: int = -SENSOR_NS
 
@@ -151,15 +151,17 @@ def carry_on(nominal: Nominal, s: Sensors, t_ns: int) -> Nominal:
     """Carry the nominal trajectory on to `t_ns` by the last sample of its driver."""
     assert nominal.interval is not None
     if nominal.interval.by == "imu":
-        return by_imu(nominal, nominal.a_n, s.heading() or 0.0, t_ns)
+        return by_imu(nominal, nominal.a_n, s, t_ns)
     return by_velocity(nominal, nominal.interval.velocity, t_ns)
 
 
-def by_imu(nominal: Nominal, a_n: Vector2, heading: float, t_ns: int) -> Nominal:
-    """Go on to `t_ns` by the mean acceleration `a_n` (m/s^2) at a mean heading (rad)."""
+def by_imu(nominal: Nominal, a_n: Vector2, s: Sensors, t_ns: int) -> Nominal:
+    """Go on to `t_ns` by the mean acceleration `a_n` (m/s^2)."""
     assert nominal.interval is not None
     dt = (t_ns - nominal.t_ns) * 1e-9
-    interval = own_error_model.add_imu(nominal.interval, dt, a_n, heading)
+    interval = own_error_model.add_imu(
+        nominal.interval, dt, a_n, s.heading() or 0.0, strapdown_channel.scatter(s.accelerations)
+    )
     return nominal._replace(point=moved(nominal.point, interval.velocity, t_ns), interval=interval)
 
 

@@ -91,7 +91,6 @@ class Amplitudes(NamedTuple):
     accelerometer_m_s2: float = 0.1
     accelerometer_s: float = 600.0
     velocity_noise_m_s_sqrt_s: float = 0.25
-    manoeuvre_sqrt_s: float = 0.1  # velocity noise per horizontal acceleration; 0.05 doubts GNSS in turns
     hold_m_s_sqrt_s: float = 2.0
     gust_along_m_s: float = 1.2
     gust_across_m_s: float = 1.0
@@ -120,8 +119,8 @@ class Interval(NamedTuple):
 
     `velocity` (m/s) is the nominal one now; `moved` (m) how far the nominal went. c1, s1 are the integrals of
     cosine and sine of the heading, c2, s2 those of c1, s1; n1, e1 of the acceleration, n2, e2 of n1, e1. For
-    `air`, n1 and e1 are the way through the air (m) and `V` is the air velocity at the end. aa is the
-    integral of the squared acceleration.
+    `air`, n1 and e1 are the way through the air (m) and `V` is the air velocity at the end. `scatter` is the
+    variance of the velocity by the scatter of the samples, (m/s)^2.
     """
 
     by: By
@@ -137,7 +136,7 @@ class Interval(NamedTuple):
     n2: float = 0.0
     e2: float = 0.0
     V: Vector2 = (0.0, 0.0)
-    aa: float = 0.0
+    scatter: float = 0.0
 
 
 class Transition(NamedTuple):
@@ -184,8 +183,11 @@ def begin(by: By, velocity: Vector2) -> Interval:
     return Interval(by, velocity, V=velocity)
 
 
-def add_imu(i: Interval, dt: float, a_n: Vector2, heading: float) -> Interval:
-    """Add one IMU step: `a_n` (m/s^2) and `heading` (rad) are means over `dt` (s)."""
+def add_imu(i: Interval, dt: float, a_n: Vector2, heading: float, variance: float) -> Interval:
+    """Add one IMU step: `a_n` (m/s^2) and `heading` (rad) are means over `dt` (s).
+
+    `variance` (m^2/s^4) is that of the noise of `a_n` on each axis.
+    """
     c, s = math.cos(heading) * dt, math.sin(heading) * dt
     vn, ve = a_n[0] * dt, a_n[1] * dt
     v, m = i.velocity, i.moved
@@ -203,7 +205,7 @@ def add_imu(i: Interval, dt: float, a_n: Vector2, heading: float) -> Interval:
         i.n2 + (i.n1 + 0.5 * vn) * dt,
         i.e2 + (i.e1 + 0.5 * ve) * dt,
         i.V,
-        i.aa + vn * a_n[0] + ve * a_n[1],
+        i.scatter + variance * dt * dt,
     )
 
 
@@ -303,8 +305,7 @@ class Propagator:
 
     def _inertial(self, i: Interval, T: float, Phi: Floats, Q: Floats) -> None:
         half, tilt = 0.5 * T * T, self._density[:, 9]
-        manoeuvre = self.settings.manoeuvre_sqrt_s**2 * i.aa / T if T > 0.0 else 0.0
-        _velocity_noise(Phi, Q, T, self._imu + manoeuvre)
+        _velocity_noise(Phi, Q, T, self._imu + (i.scatter / T if T > 0.0 else 0.0))
         Phi[0, 9] = Phi[1, 10] = half
         Phi[2, 9] = Phi[3, 10] = T
         Phi[0:4, 11] = i.c2, i.s2, i.c1, i.s1

@@ -8,8 +8,8 @@ in `tilterror`.
 
 It needs the IMU at `IMU_HZ` and the attitude at `ATTITUDE_HZ` or more, and says what it does not get. A
 sample at the end of an accelerometer's or gyro's range is not used, and none is while the vertical force,
-averaged, is not gravity's: then units or orientation are wrong. What it cannot see: vibration folded down by
-sampling, which it takes for noise.
+averaged, is not gravity's: then units or orientation are wrong. Vibration and buffet, folded down by
+sampling, are noise, measured by the `scatter` of the samples. What is folded to nearly 0 Hz it cannot see.
 """
 
 from __future__ import annotations
@@ -104,6 +104,18 @@ def level_acceleration(s: Strap) -> Vector2:
     assert s.C_nb is not None
     f_n = s.C_nb @ s.imu.f_b
     return float(f_n[0]), float(f_n[1])
+
+
+def scatter(a: tuple[Vector2, ...]) -> float:
+    """Variance (m^2/s^4) of the noise of a sample on each axis, by the second difference of three.
+
+    Buffet and vibration above half the rate of sampling are white noise to the integration. A steady turn
+    has no second difference.
+    """
+    if len(a) < 3:
+        return 0.0
+    (n0, e0), (n1, e1), (n2, e2) = a
+    return ((n2 - 2.0 * n1 + n0) ** 2 + (e2 - 2.0 * e1 + e0) ** 2) / 12.0
 
 
 def attitude_matrix(record: Attitude) -> Floats:

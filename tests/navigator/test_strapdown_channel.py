@@ -137,18 +137,18 @@ def reckoned(flight: Trajectory, records: Iterable[Any], start: float, lasting: 
     """The channel alone, from the true state at `start` on."""
     s, at = strapdown_channel.Strap(), true_point(flight, start)
     nominal = Nominal(at, (0.0, 0.0), at, own_error_model.begin("imu", at.v_n[:2]))
-    track, seconds, heading, before = [at], list[Nominal](), 0.0, (0.0, 0.0)
+    track, seconds, sensors, before = [at], list[Nominal](), own_channel.Sensors(), (0.0, 0.0)
     for record in records:
         if not isinstance(record, Imu):
             s = strapdown_channel.sense(s, record)
-            heading = record.heading if isinstance(record, Attitude) else heading
+            sensors = sensors._replace(air=air_data_channel.sense(sensors.air, record))
             continue
         s = strapdown_channel.receive(s, record)
         now = strapdown_channel.level_acceleration(s)
         if start < record.t_ns * 1e-9 <= start + lasting:
             assert not s.why
             mean = (0.5 * (before[0] + now[0]), 0.5 * (before[1] + now[1]))
-            nominal = own_channel.by_imu(nominal, mean, heading, record.t_ns)
+            nominal = own_channel.by_imu(nominal, mean, sensors, record.t_ns)
             track.append(nominal.point)
             if nominal.pending_s >= 1.0 - 1e-6:
                 seconds.append(nominal)
@@ -309,6 +309,20 @@ def drawn(flight: Trajectory, rng: np.random.Generator) -> Errors:
     body = np.append(settings.accelerometer_m_s2 * rng.standard_normal(2), 0.0)
     attitude = np.array([[0.0, 0.0, math.radians(STRAPDOWN.air_data.heading_deg) * rng.standard_normal()]])
     return Errors(attitude, body[None, :], tilt)
+
+
+def test_scatter_is_the_variance_of_white_noise_and_nothing_of_a_steady_turn() -> None:
+    rng, sigma = np.random.default_rng(1), 3.0
+    steady = np.outer(np.arange(4000), (0.2, -0.1)) + np.array((8.0, -5.0))
+    noise = sigma * rng.standard_normal(steady.shape)
+
+    def mean(a: Floats) -> float:
+        samples: list[Any] = a.tolist()
+        return float(np.mean([strapdown_channel.scatter(tuple(samples[k - 3 : k])) for k in range(3, 4000)]))
+
+    assert mean(steady) < 1e-12
+    assert mean(steady + noise) == pytest.approx(sigma**2, rel=0.05)
+    assert strapdown_channel.scatter(((1.0, 2.0), (4.0, 3.0))) == 0.0
 
 
 @pytest.mark.flight

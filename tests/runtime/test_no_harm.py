@@ -43,7 +43,7 @@ def test_healthy_gnss_is_kept_and_leads(name: str, monkeypatch: pytest.MonkeyPat
     assert result.corrected_m is not None and result.corrected_m < 3.0
 
 
-@pytest.mark.parametrize("name", ["plane_turbulence_cut", "plane_turn_cut"])
+@pytest.mark.parametrize("name", ["plane_turbulence_cut", "plane_turn_cut", "plane_take_off_cut"])
 def test_a_turn_in_turbulence_with_a_beacon_leaves_a_healthy_gnss_beyond_doubt(name: str) -> None:
     # one bank excluded GNSS 89 s after the start of the first log, and led the aircraft 148 m off; a later
     # one held it false with probability 0.998 in the second
