@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import CancelledError
 from contextlib import ExitStack
 from pathlib import Path
 from queue import SimpleQueue
@@ -46,7 +47,8 @@ def run_jobs(
     workers : processes of that cluster; with 0 the jobs run in this process, one after another.
     extra : optional dependencies that contain Dask, named if it is missing.
 
-    Raises ValueError if Dask is missing. A job whose worker died is retried by another worker.
+    Raises ValueError if Dask is missing or its scheduler is lost. A job whose worker died is retried by
+    another.
     """
     if scheduler is None and workers == 0:
         yield from (FinishedJob(key, work(job)) for key, job in jobs.items())
@@ -80,11 +82,12 @@ def run_jobs(
         for _ in keys:
             if (future := finished.get()) is None:
                 raise KeyboardInterrupt
-            failure = future.exception()  # of a result that was lost with its worker: after another try
-            if failure is None:
-                yield FinishedJob(keys[future], future.result())
-            else:
-                yield FinishedJob(keys[future], None, f"{WORKER_LOST}: {failure}")
+            try:
+                failure = future.exception()  # of a result that was lost with its worker: after another try
+                result = future.result() if failure is None else None
+            except CancelledError:
+                raise ValueError("Dask scheduler lost: start again, finished work is kept") from None
+            yield FinishedJob(keys[future], result, "" if failure is None else f"{WORKER_LOST}: {failure}")
             future.release()
     if not finished.empty():
         raise KeyboardInterrupt

@@ -131,6 +131,19 @@ def test_killed_worker_loses_no_job() -> None:
     assert done == {f"job {k}": k * k for k in range(40)}
 
 
+def test_a_lost_scheduler_is_one_sentence(capfd: pytest.CaptureFixture[str]) -> None:
+    distributed = pytest.importorskip("distributed")
+    with distributed.LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None) as cluster:
+        work = jobs.run_jobs(
+            slow_square, {f"job {k}": k for k in range(200)}, cluster.scheduler_address, 0, "fleet"
+        )
+        next(work)
+        cluster.close()
+        with pytest.raises(ValueError, match="Dask scheduler lost: start again, finished work is kept"):
+            list(work)
+    assert capfd.readouterr().err == ""
+
+
 def environment(name: str) -> str | None:
     return os.environ.get(name)
 
