@@ -160,7 +160,7 @@ def by_imu(nominal: Nominal, a_n: Vector2, s: Sensors, t_ns: int) -> Nominal:
     assert nominal.interval is not None
     dt = (t_ns - nominal.t_ns) * 1e-9
     interval = own_error_model.add_imu(
-        nominal.interval, dt, a_n, s.heading() or 0.0, strapdown_channel.scatter(s.accelerations)
+        nominal.interval, dt, a_n, s.heading() or 0.0, strapdown_channel.noise_variance(s.accelerations)
     )
     return nominal._replace(point=moved(nominal.point, interval.velocity, t_ns), interval=interval)
 

@@ -119,8 +119,8 @@ class Interval(NamedTuple):
 
     `velocity` (m/s) is the nominal one now; `moved` (m) how far the nominal went. c1, s1 are the integrals of
     cosine and sine of the heading, c2, s2 those of c1, s1; n1, e1 of the acceleration, n2, e2 of n1, e1. For
-    `air`, n1 and e1 are the way through the air (m) and `V` is the air velocity at the end. `scatter` is the
-    variance of the velocity by the scatter of the samples, (m/s)^2.
+    `air`, n1 and e1 are the way through the air (m) and `V` is the air velocity at the end. `noise` is the
+    variance of the velocity by the noise of the samples, (m/s)^2.
     """
 
     by: By
@@ -136,7 +136,7 @@ class Interval(NamedTuple):
     n2: float = 0.0
     e2: float = 0.0
     V: Vector2 = (0.0, 0.0)
-    scatter: float = 0.0
+    noise: float = 0.0
 
 
 class Transition(NamedTuple):
@@ -205,7 +205,7 @@ def add_imu(i: Interval, dt: float, a_n: Vector2, heading: float, variance: floa
         i.n2 + (i.n1 + 0.5 * vn) * dt,
         i.e2 + (i.e1 + 0.5 * ve) * dt,
         i.V,
-        i.scatter + variance * dt * dt,
+        i.noise + variance * dt * dt,
     )
 
 
@@ -305,7 +305,7 @@ class Propagator:
 
     def _inertial(self, i: Interval, T: float, Phi: Floats, Q: Floats) -> None:
         half, tilt = 0.5 * T * T, self._density[:, 9]
-        _velocity_noise(Phi, Q, T, self._imu + (i.scatter / T if T > 0.0 else 0.0))
+        _velocity_noise(Phi, Q, T, self._imu + (i.noise / T if T > 0.0 else 0.0))
         Phi[0, 9] = Phi[1, 10] = half
         Phi[2, 9] = Phi[3, 10] = T
         Phi[0:4, 11] = i.c2, i.s2, i.c1, i.s1

@@ -311,18 +311,20 @@ def drawn(flight: Trajectory, rng: np.random.Generator) -> Errors:
     return Errors(attitude, body[None, :], tilt)
 
 
-def test_scatter_is_the_variance_of_white_noise_and_nothing_of_a_steady_turn() -> None:
+def test_noise_is_a_share_of_the_scatter_and_nothing_of_a_steady_turn() -> None:
     rng, sigma = np.random.default_rng(1), 3.0
     steady = np.outer(np.arange(4000), (0.2, -0.1)) + np.array((8.0, -5.0))
     noise = sigma * rng.standard_normal(steady.shape)
 
     def mean(a: Floats) -> float:
         samples: list[Any] = a.tolist()
-        return float(np.mean([strapdown_channel.scatter(tuple(samples[k - 3 : k])) for k in range(3, 4000)]))
+        return float(
+            np.mean([strapdown_channel.noise_variance(tuple(samples[k - 3 : k])) for k in range(3, 4000)])
+        )
 
     assert mean(steady) < 1e-12
-    assert mean(steady + noise) == pytest.approx(sigma**2, rel=0.05)
-    assert strapdown_channel.scatter(((1.0, 2.0), (4.0, 3.0))) == 0.0
+    assert mean(steady + noise) == pytest.approx(strapdown_channel.STAYS * sigma**2, rel=0.05)
+    assert strapdown_channel.noise_variance(((1.0, 2.0), (4.0, 3.0))) == 0.0
 
 
 @pytest.mark.flight
