@@ -569,6 +569,23 @@ def test_recorded_with_a_beacon_the_error_is_at_most_half_the_fixes(seed: int) -
     assert np.all(found.error[after] <= 3.0 * found.sigma[after])
 
 
+@pytest.mark.flight
+def test_recorded_with_a_beacon_and_airspeed_the_new_wind_is_found() -> None:
+    """Without airspeed 54 and 59 m in these times; a filter told the moment of the step has 25 and 28 m."""
+    config = load(flags={"output.profile": "ardupilot"}, environment={})
+    minute, later = list[npt.NDArray[np.float64]](), list[npt.NDArray[np.float64]]()
+    for seed in range(3):
+        records = (
+            msgspec.structs.replace(r, sensed=True) if isinstance(r, AirData) else r
+            for r in with_beacon(seed)
+        )
+        found = navigated(records, recorded()[1], config)
+        minute.append(found.error[(found.t >= LOSS + 60.0) & (found.t < LOSS + 120.0)])
+        later.append(found.error[found.t >= LOSS + 120.0])
+    assert rms(np.concatenate(minute)) < 40.0
+    assert rms(np.concatenate(later)) < 40.0
+
+
 def test_recorded_alone_it_bridges_seconds_and_says_how_far_it_may_be_off() -> None:
     """The autopilot's attitude errs by 2.5 degrees once its GNSS is gone in a wind that it does not know."""
     records, truth = recorded()
