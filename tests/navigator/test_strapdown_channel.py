@@ -571,7 +571,7 @@ def test_recorded_with_a_beacon_the_error_is_at_most_half_the_fixes(seed: int) -
 
 @pytest.mark.flight
 def test_recorded_with_a_beacon_and_airspeed_the_new_wind_is_found() -> None:
-    """Without airspeed 54 and 59 m in these times; a filter told the moment of the step has 25 and 28 m."""
+    """Without airspeed 54 and 59 m in these times; a filter that knows when it steps has 25 and 28 m."""
     config = load(flags={"output.profile": "ardupilot"}, environment={})
     minute, later = list[npt.NDArray[np.float64]](), list[npt.NDArray[np.float64]]()
     for seed in range(3):
