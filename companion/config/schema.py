@@ -100,8 +100,8 @@ class StrapdownConfig(Section, frozen=True):
     """The error model of the IMU turned by the autopilot's attitude: one standard deviation each.
 
     `tilt_deg` is the attitude error, correlated over `tilt_s`; in an unmodelled wind the autopilot's tilt is
-    off by degrees. Vibration and buffet are measured by the scatter of the samples;
-    `velocity_noise_m_s_sqrt_s` is what it does not show.
+    off by degrees. Vibration and buffet are measured by the scatter of the samples, and a manoeuvre adds
+    noise; `velocity_noise_m_s_sqrt_s` is what neither shows.
     """
 
     imu: Annotated[int, Meta(ge=0, le=2)] = 0  # index of the IMU

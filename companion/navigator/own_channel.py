@@ -21,7 +21,7 @@ from companion.navigator.channel import Nominal, Transition, moved
 from companion.navigator.inertial_track import Point
 from companion.navigator.own_error_model import By, Ground, Layout, Propagator
 from companion.navigator.strapdown_channel import Strap
-from companion.records import AirData, Gnss, LocalPosition, RsbnFix, Vector2
+from companion.records import AirData, Gnss, LocalPosition, RsbnFix, Vector2, Vector3
 from companion.units import G0, Floats
 
 #: A driver that is silent for longer hands over to the next.
@@ -53,7 +53,8 @@ class Sensors(NamedTuple):
     imu_ns: int = -SENSOR_NS
     air_ns: int = -SENSOR_NS
     foreign_ns: int = -SENSOR_NS
-    accelerations: tuple[Vector2, ...] = ()  # level, of the last three samples without a gap
+    accelerations: tuple[Vector3, ...] = ()  # of the last three samples without a gap
+    manoeuvre: Vector3 = (0.0, 0.0, 0.0)  # their mean of the last seconds
     sums: AirspeedSums | None = None  # since airspeed was last a measurement
     measured_ns: int = -SENSOR_NS
 
@@ -159,9 +160,8 @@ def by_imu(nominal: Nominal, a_n: Vector2, s: Sensors, t_ns: int) -> Nominal:
     """Go on to `t_ns` by the mean acceleration `a_n` (m/s^2)."""
     assert nominal.interval is not None
     dt = (t_ns - nominal.t_ns) * 1e-9
-    interval = own_error_model.add_imu(
-        nominal.interval, dt, a_n, s.heading() or 0.0, strapdown_channel.noise_variance(s.accelerations)
-    )
+    noise = strapdown_channel.velocity_variance(s.accelerations, s.manoeuvre, dt)
+    interval = own_error_model.add_imu(nominal.interval, dt, a_n, s.heading() or 0.0, noise)
     return nominal._replace(point=moved(nominal.point, interval.velocity, t_ns), interval=interval)
 
 

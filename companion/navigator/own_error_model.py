@@ -183,10 +183,10 @@ def begin(by: By, velocity: Vector2) -> Interval:
     return Interval(by, velocity, V=velocity)
 
 
-def add_imu(i: Interval, dt: float, a_n: Vector2, heading: float, variance: float) -> Interval:
+def add_imu(i: Interval, dt: float, a_n: Vector2, heading: float, noise: float) -> Interval:
     """Add one IMU step: `a_n` (m/s^2) and `heading` (rad) are means over `dt` (s).
 
-    `variance` (m^2/s^4) is that of the noise of `a_n` on each axis.
+    `noise` (m/s)^2 is what the noise of the samples adds to the variance of the velocity on each axis.
     """
     c, s = math.cos(heading) * dt, math.sin(heading) * dt
     vn, ve = a_n[0] * dt, a_n[1] * dt
@@ -205,7 +205,7 @@ def add_imu(i: Interval, dt: float, a_n: Vector2, heading: float, variance: floa
         i.n2 + (i.n1 + 0.5 * vn) * dt,
         i.e2 + (i.e1 + 0.5 * ve) * dt,
         i.V,
-        i.noise + variance * dt * dt,
+        i.noise + noise,
     )
 
 

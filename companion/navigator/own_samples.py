@@ -79,13 +79,15 @@ def imu(state: State, record: Imu, settings: Settings) -> Step:
     s = s._replace(strap=strap)
     if strap.why or strap.C_nb is None:
         return state._replace(sensors=s), []
-    a_n = strapdown_channel.level_acceleration(strap)
+    now = strapdown_channel.acceleration(strap)
     fresh = record.t_ns - s.imu_ns <= own_channel.SILENT_NS["imu"]
     before = s.accelerations[-2:] if fresh else ()
-    state = state._replace(sensors=s._replace(imu_ns=record.t_ns, accelerations=(*before, a_n)))
-    last = before[-1] if before else a_n
-    mean = (0.5 * (a_n[0] + last[0]), 0.5 * (a_n[1] + last[1]))
-    return _driven(state, record, "imu", mean, settings)
+    mean = strapdown_channel.manoeuvre(s.manoeuvre, now, (record.t_ns - s.imu_ns) * 1e-9)
+    s = s._replace(imu_ns=record.t_ns, accelerations=(*before, now), manoeuvre=mean)
+    state = state._replace(sensors=s)
+    last = before[-1] if before else now
+    between = (0.5 * (now[0] + last[0]), 0.5 * (now[1] + last[1]))
+    return _driven(state, record, "imu", between, settings)
 
 
 def air_data(state: State, record: AirData, settings: Settings) -> Step:
@@ -195,7 +197,7 @@ def _driven(state: State, record: Stamped, by: By, sample: Vector2 | None, setti
         if by == "imu" and sample:
             nominal = nominal._replace(a_n=sample)
     elif by == "imu" and sample:
-        nominal = own_channel.by_imu(nominal, sample, s, record.t_ns)._replace(a_n=s.accelerations[-1])
+        nominal = own_channel.by_imu(nominal, sample, s, record.t_ns)._replace(a_n=s.accelerations[-1][:2])
     else:
         nominal = own_channel.by_velocity(nominal, sample or (0.0, 0.0), record.t_ns)
     state = state._replace(nominal=_at_height(nominal, s, state))

@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from companion.nav.strapdown import rotation_matrix
-from companion.records import Attitude, Imu, Pressure, Vector2
+from companion.records import Attitude, Imu, Pressure, Vector3
 from companion.units import G0, Floats
 
 IMU_HZ, ATTITUDE_HZ = 5.0, 2.0  # wanted at least
@@ -33,6 +33,8 @@ W_MAX = 0.995 * math.radians(2000.0)  # [rad/s] and gyros
 VERTICAL = 0.5  # of gravity, by which the vertical force may differ from it
 VERTICAL_S = 10.0  # averaged over so long: nobody climbs 50 m/s faster after it
 STAYS = 0.5  # of the scatter of the samples, in the velocity
+MANOEUVRE_SQRT_S = 0.1  # velocity noise per acceleration, m/s/sqrt(s) per m/s^2
+MANOEUVRE_S = 2.0  # of which the mean of so long counts
 
 
 class Pace(NamedTuple):
@@ -99,25 +101,36 @@ def receive(s: Strap, record: Imu) -> Strap:
     return s._replace(why=_unfit(s))
 
 
-def level_acceleration(s: Strap) -> Vector2:
-    """Horizontal acceleration over ground, north and east (m/s^2), of the last sample; Coriolis left out."""
+def acceleration(s: Strap) -> Vector3:
+    """Acceleration over ground, north, east and down (m/s^2), of the last sample; Coriolis left out."""
     assert s.imu is not None
     assert s.C_nb is not None
     f_n = s.C_nb @ s.imu.f_b
-    return float(f_n[0]), float(f_n[1])
+    return float(f_n[0]), float(f_n[1]), float(f_n[2]) + G0
 
 
-def noise_variance(a: tuple[Vector2, ...]) -> float:
-    """Variance (m^2/s^4) of a sample on each axis that is noise to the integration: half of the scatter.
+def manoeuvre(mean: Vector3, a: Vector3, dt: float) -> Vector3:
+    """Mean acceleration of the last `MANOEUVRE_S` with one more sample: that of gusts averages out."""
+    gain = min(dt / MANOEUVRE_S, 1.0)
+    n, e, d = mean
+    return n + gain * (a[0] - n), e + gain * (a[1] - e), d + gain * (a[2] - d)
 
-    The scatter is that of the second difference of three; a steady turn has none. Of white noise all of it
-    would stay in the velocity. Of an aircraft's buffet some is sampled fast enough and comes out again: 0.2
-    to 0.4 stayed in four flights of ArduPlane, at 20 and 24 Hz, straight and in turns, 0.6 in one turn.
+
+def velocity_variance(a: tuple[Vector3, ...], mean: Vector3, dt: float) -> float:
+    """Variance (m/s)^2, on each level axis, that the noise of the last sample of `a` adds in `dt` seconds.
+
+    Half of the scatter, which is that of the second difference of three samples; a steady turn has none. Of
+    white noise all of it would stay in the velocity. Of an aircraft's buffet some is sampled fast enough and
+    comes out again: 0.2 to 0.4 stayed in four flights of ArduPlane, at 20 and 24 Hz, straight and in turns,
+    0.6 in one turn. And a share of the `mean` acceleration, whatever its direction: an attitude that is wrong
+    while the aircraft manoeuvres turns it. In an aerobatic flight (InertialNav's TestLog2, up to 6 g) 0.06 to
+    0.13 m/s/sqrt(s) per m/s^2 were measured against GNSS velocity, over 0.4 to 5 s.
     """
-    if len(a) < 3:
-        return 0.0
-    (n0, e0), (n1, e1), (n2, e2) = a
-    return STAYS * ((n2 - 2.0 * n1 + n0) ** 2 + (e2 - 2.0 * e1 + e0) ** 2) / 12.0
+    variance = MANOEUVRE_SQRT_S**2 * dt * (mean[0] ** 2 + mean[1] ** 2 + mean[2] ** 2)
+    if len(a) == 3:
+        (n0, e0, _), (n1, e1, _), (n2, e2, _) = a
+        variance += STAYS * dt * dt * ((n2 - 2.0 * n1 + n0) ** 2 + (e2 - 2.0 * e1 + e0) ** 2) / 12.0
+    return variance
 
 
 def attitude_matrix(record: Attitude) -> Floats:

@@ -14,12 +14,17 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from scipy.signal import lfilter
 
+from companion.analysis import simulated_rsbn
 from companion.analysis.error_statistics import position_from_beacon
 from companion.config import Config, load
+from companion.importers import sources
 from companion.nav.geometry import Geodetic, from_enu, separation, slant_range_azimuth
 from companion.navigator import (
+    INPUTS_USED,
     Navigator,
     air_data_channel,
     own_channel,
@@ -50,6 +55,7 @@ from sitl.flight import FlightPlan, Leg, Trajectory, WindChange, fly_plan
 NS = 1_000_000_000
 G = 9.80665
 DATA = Path(__file__).parents[1] / "data"
+AEROBATICS = DATA.parents[2] / "shared" / "data" / "inertialnav" / "TestLog2.mat"
 SIGMA_AZIMUTH, SIGMA_RANGE = math.radians(0.125), 100.0  # one sigma
 STRAPDOWN = load(flags={"inertial.source": "imu", "output.profile": "ardupilot"}, environment={})
 
@@ -144,7 +150,7 @@ def reckoned(flight: Trajectory, records: Iterable[Any], start: float, lasting: 
             sensors = sensors._replace(air=air_data_channel.sense(sensors.air, record))
             continue
         s = strapdown_channel.receive(s, record)
-        now = strapdown_channel.level_acceleration(s)
+        now = strapdown_channel.acceleration(s)
         if start < record.t_ns * 1e-9 <= start + lasting:
             assert not s.why
             mean = (0.5 * (before[0] + now[0]), 0.5 * (before[1] + now[1]))
@@ -311,20 +317,41 @@ def drawn(flight: Trajectory, rng: np.random.Generator) -> Errors:
     return Errors(attitude, body[None, :], tilt)
 
 
+STRAIGHT = (0.0, 0.0, 0.0)
+
+
 def test_noise_is_a_share_of_the_scatter_and_nothing_of_a_steady_turn() -> None:
     rng, sigma = np.random.default_rng(1), 3.0
-    steady = np.outer(np.arange(4000), (0.2, -0.1)) + np.array((8.0, -5.0))
+    steady = np.outer(np.arange(4000), (0.2, -0.1, 0.0)) + np.array((8.0, -5.0, 0.0))
     noise = sigma * rng.standard_normal(steady.shape)
 
     def mean(a: Floats) -> float:
         samples: list[Any] = a.tolist()
-        return float(
-            np.mean([strapdown_channel.noise_variance(tuple(samples[k - 3 : k])) for k in range(3, 4000)])
-        )
+        found = [variance(tuple(samples[k - 3 : k]), STRAIGHT, 0.1) for k in range(3, 4000)]
+        return float(np.mean(found)) / 0.1**2
 
+    variance = strapdown_channel.velocity_variance
     assert mean(steady) < 1e-12
     assert mean(steady + noise) == pytest.approx(strapdown_channel.STAYS * sigma**2, rel=0.05)
-    assert strapdown_channel.noise_variance(((1.0, 2.0), (4.0, 3.0))) == 0.0
+    assert variance(((1.0, 2.0, 0.0), (4.0, 3.0, 0.0)), STRAIGHT, 0.1) == 0.0
+
+
+@given(st.floats(0.0, math.tau), st.floats(0.0, 60.0), st.floats(0.02, 0.2))
+def test_noise_of_a_manoeuvre_is_a_share_of_what_lasts_whatever_its_direction(
+    direction: float, load: float, dt: float
+) -> None:
+    """A pull counts as a turn does; what changes its sign every sample, as a gust, hardly counts."""
+    steps = round(20.0 / dt)
+    a = (load * math.cos(direction), 0.0, load * math.sin(direction))
+    lasting = gusts = STRAIGHT
+    for k in range(steps):
+        lasting = strapdown_channel.manoeuvre(lasting, a, dt)
+        sign = (-1.0) ** k
+        gusts = strapdown_channel.manoeuvre(gusts, (sign * a[0], 0.0, sign * a[2]), dt)
+    expected = (strapdown_channel.MANOEUVRE_SQRT_S * load) ** 2
+    found = strapdown_channel.velocity_variance((a, a, a), lasting, dt) / dt
+    assert found == pytest.approx(expected, rel=1e-3, abs=1e-9)
+    assert strapdown_channel.velocity_variance((a, a, a), gusts, dt) / dt <= 0.01 * expected + 1e-12
 
 
 @pytest.mark.flight
@@ -656,3 +683,30 @@ def test_the_rates_asked_for_are_enough() -> None:
     assert min(asked_imu) >= strapdown_channel.IMU_HZ
     assert asked["ATTITUDE"] >= strapdown_channel.ATTITUDE_HZ
     assert asked["SCALED_PRESSURE"] > 0.0
+
+
+@pytest.mark.flight
+@pytest.mark.skipif(not AEROBATICS.exists(), reason="the recording is not there")
+@pytest.mark.parametrize("seed", [2, 3])
+def test_gnss_is_not_suspected_in_real_aerobatics(seed: int) -> None:
+    """Up to 6 g and inverted, an attitude of 2013; GNSS itself is 7 m/s off for 2 s. One beacon, 60 km off.
+
+    The first ten seconds of GNSS are left out: the receiver, just switched on, reports 3 m/s at rest.
+    """
+    records = list(sources.open_source(AEROBATICS))
+    config = load(flags={"output.profile": "ardupilot"}, environment={})
+    start = next(r.t_ns for r in records if isinstance(r, Gnss) and r.has_3d_fix) + 10 * NS
+    heard = [r for r in records if not isinstance(r, Gnss) or r.t_ns >= start]
+    fix = next(r for r in heard if isinstance(r, Gnss))
+    beacon = simulated_rsbn.ListedBeacon(1, fix.lat + math.radians(0.54), fix.lon, 3000.0)
+    answers = simulated_rsbn.simulate_measurements(
+        [beacon], simulated_rsbn.extract_track(records, config), seed
+    )
+    navigator, false = Navigator(config), list[float]()
+    for record in heapq.merge(heard, answers, key=lambda r: r.rx_ns):
+        if isinstance(record, INPUTS_USED):
+            out = navigator.handle(record)
+            false += [o.gnss_false or 0.0 for o in out if isinstance(o, Solution)]
+            navigator.settle()
+    assert len(false) > 5000
+    assert max(false) < 0.5
