@@ -54,7 +54,7 @@ class Sensors(NamedTuple):
     air_ns: int = -SENSOR_NS
     foreign_ns: int = -SENSOR_NS
     accelerations: tuple[Vector3, ...] = ()  # of the last three samples without a gap
-    manoeuvre: Vector3 = (0.0, 0.0, 0.0)  # their mean of the last seconds
+    mean_acceleration: Vector3 = (0.0, 0.0, 0.0)  # of the last seconds
     sums: AirspeedSums | None = None  # since airspeed was last a measurement
     measured_ns: int = -SENSOR_NS
 
@@ -160,7 +160,7 @@ def by_imu(nominal: Nominal, a_n: Vector2, s: Sensors, t_ns: int) -> Nominal:
     """Go on to `t_ns` by the mean acceleration `a_n` (m/s^2)."""
     assert nominal.interval is not None
     dt = (t_ns - nominal.t_ns) * 1e-9
-    noise = strapdown_channel.velocity_variance(s.accelerations, s.manoeuvre, dt)
+    noise = strapdown_channel.velocity_variance(s.accelerations, s.mean_acceleration, dt)
     interval = own_error_model.add_imu(nominal.interval, dt, a_n, s.heading() or 0.0, noise)
     return nominal._replace(point=moved(nominal.point, interval.velocity, t_ns), interval=interval)
 

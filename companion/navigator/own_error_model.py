@@ -159,16 +159,6 @@ class Row(NamedTuple):
 # ---------------------------------------------------------------------------------------------------------
 
 
-def level_acceleration(f_b: Vector3, roll: float, pitch: float, heading: float) -> Vector2:
-    """Turn specific force to the level frame: north and east acceleration, m/s^2."""
-    x, y, z = f_b
-    sr, cr, sp, cp = math.sin(roll), math.cos(roll), math.sin(pitch), math.cos(pitch)
-    u = cr * z + sr * y
-    forward, right = cp * x + sp * u, cr * y - sr * z
-    sh, ch = math.sin(heading), math.cos(heading)
-    return ch * forward - sh * right, sh * forward + ch * right
-
-
 def air_velocity(true_airspeed: float, pitch: float, heading: float) -> Vector2:
     """Velocity through the air along the nose, north and east, m/s."""
     level = true_airspeed * math.cos(pitch)

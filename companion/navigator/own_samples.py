@@ -82,8 +82,8 @@ def imu(state: State, record: Imu, settings: Settings) -> Step:
     now = strapdown_channel.acceleration(strap)
     fresh = record.t_ns - s.imu_ns <= own_channel.SILENT_NS["imu"]
     before = s.accelerations[-2:] if fresh else ()
-    mean = strapdown_channel.manoeuvre(s.manoeuvre, now, (record.t_ns - s.imu_ns) * 1e-9)
-    s = s._replace(imu_ns=record.t_ns, accelerations=(*before, now), manoeuvre=mean)
+    mean = strapdown_channel.mean_acceleration(s.mean_acceleration, now, (record.t_ns - s.imu_ns) * 1e-9)
+    s = s._replace(imu_ns=record.t_ns, accelerations=(*before, now), mean_acceleration=mean)
     state = state._replace(sensors=s)
     last = before[-1] if before else now
     between = (0.5 * (now[0] + last[0]), 0.5 * (now[1] + last[1]))

@@ -109,7 +109,7 @@ def acceleration(s: Strap) -> Vector3:
     return float(f_n[0]), float(f_n[1]), float(f_n[2]) + G0
 
 
-def manoeuvre(mean: Vector3, a: Vector3, dt: float) -> Vector3:
+def mean_acceleration(mean: Vector3, a: Vector3, dt: float) -> Vector3:
     """Mean acceleration of the last `MANOEUVRE_S` with one more sample: that of gusts averages out."""
     gain = min(dt / MANOEUVRE_S, 1.0)
     n, e, d = mean

@@ -345,9 +345,9 @@ def test_noise_of_a_manoeuvre_is_a_share_of_what_lasts_above_a_turn_whatever_its
     a = (load * math.cos(direction), 0.0, load * math.sin(direction))
     lasting = gusts = STRAIGHT
     for k in range(steps):
-        lasting = strapdown_channel.manoeuvre(lasting, a, dt)
+        lasting = strapdown_channel.mean_acceleration(lasting, a, dt)
         sign = (-1.0) ** k
-        gusts = strapdown_channel.manoeuvre(gusts, (sign * a[0], 0.0, sign * a[2]), dt)
+        gusts = strapdown_channel.mean_acceleration(gusts, (sign * a[0], 0.0, sign * a[2]), dt)
     above = max(load - strapdown_channel.MANOEUVRE_M_S2, 0.0)
     expected = (strapdown_channel.MANOEUVRE_SQRT_S * above) ** 2
     found = strapdown_channel.velocity_variance((a, a, a), lasting, dt) / dt
@@ -697,14 +697,14 @@ def test_gnss_is_not_excluded_in_real_aerobatics(seed: int) -> None:
     records = list(sources.open_source(AEROBATICS))
     config = load(flags={"output.profile": "ardupilot"}, environment={})
     start = next(r.t_ns for r in records if isinstance(r, Gnss) and r.has_3d_fix) + 10 * NS
-    heard = [r for r in records if not isinstance(r, Gnss) or r.t_ns >= start]
-    fix = next(r for r in heard if isinstance(r, Gnss))
+    received = [r for r in records if not isinstance(r, Gnss) or r.t_ns >= start]
+    fix = next(r for r in received if isinstance(r, Gnss))
     beacon = simulated_rsbn.ListedBeacon(1, fix.lat + math.radians(0.54), fix.lon, 3000.0)
     answers = simulated_rsbn.simulate_measurements(
         [beacon], simulated_rsbn.extract_track(records, config), seed
     )
     navigator, false = Navigator(config), list[float]()
-    for record in heapq.merge(heard, answers, key=lambda r: r.rx_ns):
+    for record in heapq.merge(received, answers, key=lambda r: r.rx_ns):
         if isinstance(record, INPUTS_USED):
             out = navigator.handle(record)
             false += [o.gnss_false or 0.0 for o in out if isinstance(o, Solution)]
