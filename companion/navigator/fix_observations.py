@@ -26,6 +26,10 @@ from companion.navigator.inertial_track import Point
 from companion.records import Gnss, RsbnFix, Source, Vector2
 from companion.units import Floats
 
+#: A receiver that states no accuracy of its velocity was seen to report 2 to 3 m/s at rest in its first
+#: seven seconds. ArduPilot and PX4 wait for ten seconds of good fixes.
+SETTLING_S, SETTLING_M_S = 10.0, 3.0
+
 
 def from_gnss(
     record: Gnss, nominal: Point, settings: GnssConfig, centre: Vector2 = (0.0, 0.0)
@@ -41,6 +45,14 @@ def white_sigma(record: Gnss, settings: GnssConfig) -> float:
     """One sigma an axis (m) of a fix, its drift left out."""
     stated = _stated(record, settings)
     return max(math.sqrt(stated**2 - settings.sigma_m**2), settings.sigma_m / 3.0)
+
+
+def velocity_sigma(record: Gnss, first_ns: int, settings: GnssConfig) -> float:
+    """One sigma an axis (m/s) of a fix's velocity; the receiver's first fix was at `first_ns`."""
+    stated = record.sigma_velocity
+    if stated is None:
+        stated = SETTLING_M_S if (record.t_ns - first_ns) * 1e-9 < SETTLING_S else 0.0
+    return max(stated, settings.sigma_velocity_m_s)
 
 
 def _stated(record: Gnss, settings: GnssConfig) -> float:

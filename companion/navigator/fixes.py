@@ -44,7 +44,8 @@ def gnss(state: State, record: Gnss, settings: Settings) -> Step:
     since = math.inf if last is None else (record.t_ns - last.t_ns) * 1e-9
     if not record.has_3d_fix or since < config.every_s:
         return state, []
-    state = _begun(state, record, settings)
+    first_ns = record.t_ns if state.gnss_first_ns is None else state.gnss_first_ns
+    state = _begun(state._replace(gnss_first_ns=first_ns), record, settings)
     if state.nominal is None or state.bank is None or is_silent(state, record.t_ns):
         return state, []
     state = propagated(carried(state, record.t_ns), settings)
@@ -64,9 +65,10 @@ def gnss(state: State, record: Gnss, settings: Settings) -> Step:
     taken = measurements.gnss_position(state.bank, known, channel, apart, factor * variance, v_n)
     bank, accepted = taken.bank, taken.accepted
     if config.use_velocity and record.v_n is not None:
-        a_n = nominal.a_n
+        sigma = fix_observations.velocity_sigma(record, first_ns, config)
+        noise = factor * (sigma**2 + channel.velocity_noise**2)
         bank = measurements.gnss_velocity(
-            bank, known, channel, record, nominal.point, a_n, settings.config, factor
+            bank, known, channel, record, nominal.point, nominal.a_n, noise
         ).bank
     state = state._replace(bank=bank, gnss_taken=record, fixed=True)
     state, out = decided(state, record, settings)

@@ -12,7 +12,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from companion.config import Config
 from companion.estimate import bank as banks
 from companion.estimate.bank import Bank, Innovation
 from companion.estimate.fusion import Azimuth, Range
@@ -118,13 +117,11 @@ def gnss_velocity(
     record: Gnss,
     nominal: Point,
     a_n: Vector2,
-    config: Config,
-    factor: float = 1.0,
+    variance: float,
 ) -> Taken:
     """Take the velocity of a fix; rows that hold GNSS and its velocity false see the rate of its error.
 
-    In turns an antenna ahead has a velocity of its own. `factor` of the stated variance, by the scatter of
-    the fixes.
+    In turns an antenna ahead has a velocity of its own. `variance` is that of its noise (m^2/s^2).
     """
     assert record.v_n is not None
     layout = known.layout
@@ -144,8 +141,7 @@ def gnss_velocity(
         H[:, 0, rate] = H[:, 1, rate + 1] = lying
         return np.broadcast_to(z, (len(bank.L), 2)), H
 
-    stated = max(record.sigma_velocity or 0.0, config.gnss.sigma_velocity_m_s)
-    R = factor * (stated**2 + channel.velocity_noise**2) * np.eye(2)
+    R = variance * np.eye(2)
     after, seen = banks.update(
         bank, layout, seen_by, None, R, None, known.settings, outlier=OUTLIER["velocity"], bears=True
     )

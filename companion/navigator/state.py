@@ -94,6 +94,7 @@ class State(NamedTuple):
     gnss_fix: tuple[Gnss, Point] | None = None  # the last one believed
     pending: Pending | None = None
     velocity_error: VelocityError | None = None
+    gnss_first_ns: int | None = None  # of the first 3D fix
     gnss_ns: int | None = None  # when fixes were last believed
     rsbn_ns: int | None = None
     rsbn_used: Source = Source(0)  # which of azimuth and range were, then
