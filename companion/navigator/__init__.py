@@ -105,6 +105,7 @@ class Navigator:
         self._last_solution_ns = 0
         self._rejected_ns: dict[str, int] = {}  # when an implausible record was last reported, by kind
         self._channel_reported = False
+        self._is_settled = False  # whether the last record left nothing to do
 
     @property
     def state(self) -> State:
@@ -139,6 +140,7 @@ class Navigator:
             self._deferred += changes
             if not is_used or not is_new_fix(record, self.state):
                 return []
+        self._is_settled = False
         outputs, self._deferred = self._deferred, []
         late_ns = 0 if self._newest is None else self._newest.t_ns - record.t_ns
         if 0 < late_ns <= TICK_NS:
@@ -155,8 +157,9 @@ class Navigator:
 
         `handle` does it first if it was not done in between; its outputs come with the next `handle`.
         """
-        if self._newest is None:
+        if self._newest is None or self._is_settled:
             return
+        self._is_settled = True
         if self._roll_back is not None:
             self._roll_back.ahead, outputs = self._resolved(self._roll_back.ahead, self._newest)
         else:
