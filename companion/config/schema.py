@@ -187,7 +187,7 @@ class IntegrityConfig(Section, frozen=True):
     """
 
     rows: Annotated[int, Meta(ge=8, le=192)] = 96  # hypotheses followed at once
-    risk: Annotated[float, Meta(ge=1e-12, le=0.5)] = 1e-7
+    risk: Annotated[float, Meta(ge=1e-12, le=0.5)] = 1e-8  # below the prior of one onset
     alert_m: Annotated[float, Meta(ge=1.0, le=100000.0)] = 500.0
     settle_s: Annotated[float, Meta(ge=0.0, le=600.0)] = 10.0
 

@@ -263,6 +263,5 @@ def _hypotheses(config: Config, channel: Channel, beacons: int, by_air: bool, wi
     settings = Settings(
         surprise=SURPRISE,
         rows=config.integrity.rows,
-        risk=config.integrity.risk,
     )
     return Hypotheses(layout, settings, (azimuth_bias, range_bias) * beacons)

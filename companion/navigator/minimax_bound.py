@@ -38,8 +38,8 @@ SILENT_S = 60.0  # after a longer silence of the channel a new window begins
 STRAIGHT_S = 30.0  # steps ahead, straight on
 UNLIKE = 2.0  # a fix this many times better or worse than its bin begins a new one
 PIECE_NS = SECOND_NS // 10  # at most one piece of work so often
-#: A target is solved once for each program, and so often while no fix changes it: in between its bound grows
-#: by the velocity's, in the median by nothing and in 95 % of a flight by less than 5 %.
+#: A target is solved once the window has new fixes, and so often without: in between its bound grows by the
+#: velocity's, in the median by nothing and in 95 % of a flight by less than 5 %.
 POSITION_NS, SELDOM_NS = 5 * SECOND_NS, 10 * SECOND_NS
 HOPELESS_M = 1e6  # a bound beyond this is as good as none: the window is too short for so far ahead
 POSITION, VELOCITY, TILT, DRIFT = (0, 1), (2, 3), (4, 5), (7, 8)  # states
@@ -93,7 +93,7 @@ class Guarantee(NamedTuple):
     reach: Reach | None = None
     bins: tuple[Bin, ...] = ()
     anchored: Anchored | None = None
-    anchored_ns: int = 0
+    fixed_ns: int = 0  # when the window was last given fixes
     widening: float = 1.0
     answers: tuple[Answer | None, ...] = ()
     worked_ns: int = 0
@@ -231,8 +231,8 @@ def _closed(g: Guarantee, config: Config) -> Guarantee:
             np.array(full.sigma) / w,
             60.0 * config.predictor.window_min,
         )
-    anchored = None if g.bins else g.anchored
-    return g._replace(window=window, reach=_reach(reach.at, len(C)), bins=(), anchored=anchored)
+    g = g._replace(window=window, reach=_reach(reach.at, len(C)))
+    return g._replace(bins=(), anchored=None, fixed_ns=reach.at.t_ns) if g.bins else g
 
 
 def add_fix(g: Guarantee, t_ns: int, value: Vector2, sigma: Vector2) -> Guarantee:
@@ -307,11 +307,11 @@ def refresh(g: Guarantee, nominal: Nominal, rx_ns: int, config: Config) -> tuple
         out: list[Output] = []
         if (widening > 1.0) != (g.widening > 1.0):
             out = [Event(t_ns, rx_ns, Severity.NOTICE, _contradiction(widening))]
-        return g._replace(anchored=anchored, anchored_ns=t_ns, widening=widening), out
+        return g._replace(anchored=anchored, widening=widening), out
     todo = tasks(config, channel)
     answers = g.answers if len(g.answers) == len(todo) else (None,) * len(todo)
     late = [
-        math.inf if a is None or a.t_ns <= g.anchored_ns else (t_ns - a.t_ns) / task.every_ns
+        math.inf if a is None or a.t_ns <= g.fixed_ns else (t_ns - a.t_ns) / task.every_ns
         for task, a in zip(todo, answers, strict=True)
     ]
     k = max(range(len(todo)), key=late.__getitem__)

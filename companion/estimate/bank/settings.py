@@ -29,7 +29,8 @@ class Settings:
     switch_h : rate at which a grade changes, 1/h.
     suspect, excluded, believed : thresholds of the probability that a source is false.
     hysteresis : the leading explanation changes once another is this many times heavier.
-    risk : probability that the protection level may be exceeded.
+    risk : probability that the protection level may be exceeded: rows that set it then are kept. A level of
+        another risk may be read off.
     """
 
     rows: int = 48
