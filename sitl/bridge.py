@@ -38,7 +38,9 @@ from sitl.live_beacons import LiveBeacons
 from sitl.positions import POSITION_MESSAGES, affects_estimator, position_of
 
 COMPONENT = mavlink.MAV_COMP_ID_ONBOARD_COMPUTER3
-RATES_HZ = {"SIM_STATE": 10.0, "HIL_STATE_QUATERNION": 10.0, "GLOBAL_POSITION_INT": 5.0}
+RATES_HZ = {"GLOBAL_POSITION_INT": 5.0}
+TRUTH = {"ardupilot": "SIM_STATE", "px4": "HIL_STATE_QUATERNION"}
+TRUTH_HZ = 10.0
 ASK_ORIGIN_EVERY = 3 * SECOND_NS
 SILENT_AFTER = 3 * SECOND_NS
 AUTOPILOT, COMPANION, RSBN = "autopilot", "companion", "RSBN fix alone"
@@ -224,6 +226,9 @@ class Bridge:
         make = MAKES.get(event.autopilot, "other")
         self._sender = self._sender._replace(autopilot=make)
         self._report(f"connected to autopilot {event.system} ({make})")
+        # ArduPilot reports each request for a message that it does not have on every ground station
+        truth = (TRUTH[make],) if make in TRUTH else TRUTH.values()
+        self._session.set_rates({**RATES_HZ, **dict.fromkeys(truth, TRUTH_HZ)}, now_ns)
         if self.connected_ns is None:
             self.connected_ns = now_ns
             if self._due and make in GNSS_PARAMETERS:

@@ -18,6 +18,7 @@ from companion.analysis import simulated_rsbn
 from companion.config import Config, load
 from companion.importers import tlog
 from companion.link import dialect, frame
+from companion.link.dialect import mavlink
 from companion.records import Event, RsbnFix, Solution, Truth
 from companion.runtime.core import CompanionCore
 from companion.storage import flight_log
@@ -90,14 +91,17 @@ class BridgeFlight:
         return {row.source: row for row in rows}
 
 
-def names(chunks) -> list[str]:
+def frames(chunks) -> list[frame.Frame]:
     reader = frame.Reader()
-    return [
-        dialect.TYPES[f.msgid].name
-        for data in chunks
-        for f in reader.receive(data)
-        if isinstance(f, frame.Frame)
-    ]
+    return [f for data in chunks for f in reader.receive(data) if isinstance(f, frame.Frame)]
+
+
+def names(chunks) -> list[str]:
+    return [dialect.TYPES[f.msgid].name for f in frames(chunks)]
+
+
+def decoded(chunks) -> list:
+    return [dialect.decode(f) for f in frames(chunks)]
 
 
 @pytest.fixture(scope="module")
@@ -171,6 +175,17 @@ def test_events_are_reported(relayed) -> None:
 def test_positions_are_relayed_by_default(entries) -> None:
     flight = BridgeFlight(entries[: len(entries) // 4], Bridge([EAST]))
     assert "ODOMETRY" in names(flight.to_player)
+
+
+def test_only_the_truth_that_the_autopilot_has_is_requested(relayed) -> None:
+    """ArduPilot reports each request for a message that it does not have on every ground station."""
+    asked = {
+        dialect.TYPES[round(message.param1)].name
+        for message in decoded(relayed.to_player)
+        if message.get_type() == "COMMAND_LONG" and message.command == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL
+    }
+    assert "SIM_STATE" in asked
+    assert "HIL_STATE_QUATERNION" not in asked
 
 
 def test_beside_mode_sends_only_untimed_answers(entries) -> None:
