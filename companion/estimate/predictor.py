@@ -468,6 +468,31 @@ class Anchored(NamedTuple):
         k, m, r = (self.program.judge(self.fixes @ e.weights, target) for e in (kalman, best, restricted))
         return Solved(k, m, r, basis.gap, (basis, (mu, restricted.weights)))
 
+    def carried(self, solved: Solved, rate: Solved | None, seconds: float, target: Target) -> Solved:
+        """Judge the estimates of a target anew for a time `seconds` later, without seeking better ones.
+
+        Parameters
+        ----------
+        solved : Solved
+            Estimates of the target, by this program.
+        rate : Solved, optional
+            Those of its rate, by which they are carried on.
+        seconds : float
+            Time since they were found.
+        target : Target
+            The target then.
+
+        Returns
+        -------
+        Solved
+            Linear estimates with their exact errors; the gap is that of the time they were found at.
+        """
+        weights = [e.weights for e in solved[:3]]
+        if rate is not None:
+            weights = [w + seconds * e.weights for w, e in zip(weights, rate[:3], strict=True)]
+        k, m, r = (self.program.judge(w, target) for w in weights)
+        return solved._replace(kalman=k, minimax=m, restricted=r)
+
     def targets(self, window: Window, which: Sequence[int], ahead: Sequence[Step] = ()) -> list[Target]:
         """Build the targets of some states at the last node, or after further steps from there."""
         rows = np.eye(self.law.n)[list(which)]

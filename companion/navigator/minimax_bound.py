@@ -7,10 +7,10 @@ times the least that any estimate could promise. The bank's estimate is no linea
 what is sent has the bound of the linear estimate and the distance to it (the triangle inequality); both are
 of one model, and the distance is small beside the bound.
 
-All of it runs after the solution is out, one small piece after each record: the window is extended, or one
-target is solved. In between the error moves with the velocity of the linear estimate, and the bound grows by
-the velocity's bound. Where the residuals of the window contradict what is stated, all bounds are wider by
-their ratio, and an event reports it.
+All of it runs after the solution is out, one small piece after each record: the window is extended, one
+target is solved, or the last solutions are carried on and judged again. Within a second the error moves with
+the velocity of the linear estimate, and the bound grows by the velocity's bound. Where the residuals of the
+window contradict what is stated, all bounds are wider by their ratio, and an event reports it.
 
 An INS has the errors of its unit (`nav.bounded_channel`). Dead reckoning by airspeed and a foreign velocity
 have a velocity error that wanders and jumps. Strapdown with the autopilot's attitude has no bound: nothing
@@ -38,9 +38,9 @@ SILENT_S = 60.0  # after a longer silence of the channel a new window begins
 STRAIGHT_S = 30.0  # steps ahead, straight on
 UNLIKE = 2.0  # a fix this many times better or worse than its bin begins a new one
 PIECE_NS = SECOND_NS // 10  # at most one piece of work so often
-#: A target is solved once the window has new fixes, and so often without: in between its bound grows by the
-#: velocity's, in the median by nothing and in 95 % of a flight by less than 5 %.
-POSITION_NS, SELDOM_NS = 5 * SECOND_NS, 10 * SECOND_NS
+#: Estimates of a target are sought once the window has new fixes, and so often without. In between those of
+#: now are carried on by those of the velocity, and judged again so often.
+NOW_NS, SELDOM_NS, JUDGED_NS = 3 * SECOND_NS, 10 * SECOND_NS, SECOND_NS
 HOPELESS_M = 1e6  # a bound beyond this is as good as none: the window is too short for so far ahead
 POSITION, VELOCITY, TILT, DRIFT = (0, 1), (2, 3), (4, 5), (7, 8)  # states
 
@@ -78,11 +78,15 @@ class Task(NamedTuple):
 
 
 class Answer(NamedTuple):
-    """Solution of a task for `t_ns`, None where the fixes do not determine it; and the state it is of."""
+    """Solution of a task for `t_ns`, None where the fixes do not determine it; and the state it is of.
+
+    It was sought at `sought_ns`, and may have been carried on to `t_ns`.
+    """
 
     t_ns: int
     state: int
     solved: Solved | None
+    sought_ns: int
 
 
 class Guarantee(NamedTuple):
@@ -150,9 +154,9 @@ def law(config: Config, by: str, v_n: tuple[float, ...] = (0.0, 0.0)) -> Channel
 
 def tasks(config: Config, channel: Channel) -> tuple[Task, ...]:
     """Return all targets: position and velocity now, tilt and drift of an INS, position ahead."""
-    others = (*VELOCITY, *TILT, *DRIFT) if isinstance(channel, BoundedIns) else VELOCITY
-    now = [Task(state, 0.0, POSITION_NS) for state in POSITION]
-    now += [Task(state, 0.0, SELDOM_NS) for state in others]
+    now = [Task(state, 0.0, NOW_NS) for state in (*POSITION, *VELOCITY)]
+    if isinstance(channel, BoundedIns):
+        now += [Task(state, 0.0, SELDOM_NS) for state in (*TILT, *DRIFT)]
     ahead = [Task(k, 60.0 * m, SELDOM_NS) for m in config.predictor.ahead_min for k in POSITION]
     return (*now, *ahead)
 
@@ -311,15 +315,15 @@ def refresh(g: Guarantee, nominal: Nominal, rx_ns: int, config: Config) -> tuple
     todo = tasks(config, channel)
     answers = g.answers if len(g.answers) == len(todo) else (None,) * len(todo)
     late = [
-        math.inf if a is None or a.t_ns <= g.fixed_ns else (t_ns - a.t_ns) / task.every_ns
+        math.inf if a is None or a.sought_ns <= g.fixed_ns else (t_ns - a.sought_ns) / task.every_ns
         for task, a in zip(todo, answers, strict=True)
     ]
     k = max(range(len(todo)), key=late.__getitem__)
     if late[k] < 1.0:
-        return g, []
+        return _carried(g, t_ns), []
     before = answers[k]
     start = before.solved.start if before is not None and before.solved is not None else None
-    answer = Answer(t_ns, todo[k].state, _solved(g, todo[k], channel, start))
+    answer = Answer(t_ns, todo[k].state, _solved(g, todo[k], channel, start), t_ns)
     return g._replace(answers=(*answers[:k], answer, *answers[k + 1 :])), []
 
 
@@ -331,13 +335,35 @@ def _contradiction(widening: float) -> str:
     return "fixes of the window agree with the stated errors again"
 
 
+def _carried(g: Guarantee, t_ns: int) -> Guarantee:
+    """With the solutions for now carried on to `t_ns` if they are older than JUDGED_NS."""
+    assert g.anchored is not None
+    assert g.window is not None
+    states = (*POSITION, *VELOCITY)
+    now = [(a, a.solved) for a in g.answers[: len(states)] if a is not None and a.solved is not None]
+    if len(now) < len(states) or t_ns - min(a.t_ns for a, _ in now) < JUDGED_NS:
+        return g
+    rates = [*(solved for _, solved in now[len(POSITION) :]), None, None]
+    targets = g.anchored.targets(g.window, states, _since_node(g))
+    answers = [
+        a._replace(t_ns=t_ns, solved=g.anchored.carried(solved, rate, (t_ns - a.t_ns) * 1e-9, target))
+        for (a, solved), rate, target in zip(now, rates, targets, strict=True)
+    ]
+    return g._replace(answers=(*answers, *g.answers[len(states) :]))
+
+
+def _since_node(g: Guarantee) -> list[Step]:
+    """The step from the last node to the point reached."""
+    assert g.reach is not None
+    seconds = (g.reach.at.t_ns - g.reach.node_ns) * 1e-9
+    return [Step(seconds, g.reach.Phi, g.reach.B)] if seconds > 0.0 else []
+
+
 def _solved(g: Guarantee, task: Task, channel: Channel, start: Start | None) -> Solved | None:
     assert g.anchored is not None
     assert g.reach is not None
     assert g.window is not None
-    steps = []
-    if g.reach.at.t_ns > g.reach.node_ns:
-        steps.append(Step((g.reach.at.t_ns - g.reach.node_ns) * 1e-9, g.reach.Phi, g.reach.B))
+    steps = _since_node(g)
     count = math.ceil(task.ahead_s / STRAIGHT_S)
     if count:
         point, dt = g.reach.at, task.ahead_s / count

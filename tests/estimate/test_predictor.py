@@ -136,6 +136,26 @@ def test_bound_grows_with_the_time_without_fixes() -> None:
         last = solved.minimax.bound
 
 
+@pytest.mark.parametrize("law", [None, BoundedDrift(8.0, 0.1, 0.03, 0.03, correlation_s=5.0)])
+@pytest.mark.parametrize("silent_s", [0.0, 60.0])
+def test_what_is_carried_on_has_the_worst_error_of_any_such_estimate_and_little_more(
+    law: Any, silent_s: float
+) -> None:
+    """Three seconds on, in a turn of 30 deg: no bound is below the least, or more than 5 % above it."""
+    window, law = flown(10, law=law)
+    anchored = anchor(window, law)
+    before = steps(law, silent_s)
+    position, rate = (anchored.solve(t) for t in anchored.targets(window, (0, 2), before))
+    Phi, B, _ = law.step(
+        Motion(0.8, WEST, (0.87 * WEST[0] - 0.5 * WEST[1], 0.87 * WEST[1] + 0.5 * WEST[0]), 3.0)
+    )
+    (target,) = anchored.targets(window, (0,), [*before, Step(3.0, Phi, B)])
+    found, best = anchored.carried(position, rate, 3.0, target), anchored.solve(target)
+    assert best.minimax.bound * (1.0 - best.gap) <= found.minimax.bound < 1.05 * best.minimax.bound
+    assert found.restricted.bound < 1.05 * best.restricted.bound
+    assert found.minimax.value == pytest.approx(position.minimax.value + 3.0 * rate.minimax.value)
+
+
 def test_position_within_1000_m_for_twenty_minutes() -> None:
     """After 25 min of 2 m fixes, navigation grade, on each axis."""
     window, law = flown(25)
