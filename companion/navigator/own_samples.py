@@ -72,7 +72,7 @@ def pressure(state: State, record: Pressure, settings: Settings) -> Step:
 def imu(state: State, record: Imu, settings: Settings) -> Step:
     """Move the nominal trajectory by the specific force, in the level frame."""
     config = settings.config
-    if record.source != config.strapdown.imu or not config.uses("imu"):
+    if record.source != config.strapdown.imu:
         return state, []
     s = state.sensors
     strap = strapdown_channel.receive(s.strap, record)
