@@ -108,7 +108,7 @@ class StrapdownConfig(Section, frozen=True):
     tilt_deg: Annotated[float, Meta(ge=0.01, le=30.0)] = 1.2
     tilt_s: Annotated[float, Meta(ge=1.0, le=3600.0)] = 30.0
     accelerometer_m_s2: Annotated[float, Meta(ge=0.0001, le=10.0)] = 0.1  # including misalignment
-    velocity_noise_m_s_sqrt_s: Annotated[float, Meta(ge=1e-6, le=10.0)] = 0.25
+    velocity_noise_m_s_sqrt_s: Annotated[float, Meta(ge=1e-6, le=10.0)] = 0.15
 
 
 class GnssConfig(Section, frozen=True):

@@ -90,7 +90,7 @@ class Amplitudes(NamedTuple):
     tilt_s: float = 30.0
     accelerometer_m_s2: float = 0.1
     accelerometer_s: float = 600.0
-    velocity_noise_m_s_sqrt_s: float = 0.25
+    velocity_noise_m_s_sqrt_s: float = 0.15
     hold_m_s_sqrt_s: float = 2.0
     gust_along_m_s: float = 1.2
     gust_across_m_s: float = 1.0

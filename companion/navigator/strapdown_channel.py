@@ -33,8 +33,8 @@ W_MAX = 0.995 * math.radians(2000.0)  # [rad/s] and gyros
 VERTICAL = 0.5  # of gravity, by which the vertical force may differ from it
 VERTICAL_S = 10.0  # averaged over so long: nobody climbs 50 m/s faster after it
 STAYS = 0.5  # of the scatter of the samples, in the velocity
-MANOEUVRE_M_S2, MANOEUVRE_S = 5.0, 2.0  # a manoeuvre is a greater mean acceleration for so long
-MANOEUVRE_SQRT_S = 0.2  # velocity noise per acceleration above it, m/s/sqrt(s) per m/s^2
+MANOEUVRE_M_S2, MANOEUVRE_S = 1.0, 2.0  # a manoeuvre is a greater mean acceleration over so long
+MANOEUVRE_SQRT_S = 0.12  # velocity noise per acceleration above it, m/s/sqrt(s) per m/s^2
 
 
 class Pace(NamedTuple):
@@ -122,10 +122,10 @@ def velocity_variance(a: tuple[Vector3, ...], mean: Vector3, dt: float) -> float
     Half of the scatter, which is that of the second difference of three samples; a steady turn has none. Of
     white noise all of it would stay in the velocity. Of an aircraft's buffet some is sampled fast enough and
     comes out again: 0.2 to 0.4 stayed in four flights of ArduPlane, at 20 and 24 Hz, straight and in turns,
-    0.6 in one turn. And a share of a great `mean` acceleration, whatever its direction: an attitude that is
+    0.6 in one turn. And a share of the `mean` acceleration, whatever its direction: an attitude that is
     wrong while the aircraft manoeuvres turns it. In an aerobatic flight (InertialNav's TestLog2, up to 6 g)
-    0.06 to 0.13 m/s/sqrt(s) per m/s^2 of all of it were measured against GNSS velocity, over 0.4 to 5 s, and
-    twice as much in one of twenty. By a share of a gentle turn a slow spoofer would not be suspected.
+    0.06 to 0.13 m/s/sqrt(s) per m/s^2 were measured against GNSS velocity, over 0.4 to 5 s and from 2 m/s^2
+    up, and twice as much in one of twenty. Level in turbulence (ArduPlane) half of the means are below 1.2.
     """
     above = max(math.hypot(*mean) - MANOEUVRE_M_S2, 0.0)
     variance = MANOEUVRE_SQRT_S**2 * dt * above * above

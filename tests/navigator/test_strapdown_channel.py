@@ -337,7 +337,7 @@ def test_noise_is_a_share_of_the_scatter_and_nothing_of_a_steady_turn() -> None:
 
 
 @given(st.floats(0.0, math.tau), st.floats(0.0, 60.0), st.floats(0.02, 0.2))
-def test_noise_of_a_manoeuvre_is_a_share_of_what_lasts_above_a_turn_whatever_its_direction(
+def test_noise_of_a_manoeuvre_is_a_share_of_what_lasts_whatever_its_direction(
     direction: float, load: float, dt: float
 ) -> None:
     """A pull counts as a turn does; what changes its sign every sample, as a gust, hardly counts."""
