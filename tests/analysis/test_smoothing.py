@@ -133,6 +133,7 @@ def test_last_epoch_equals_the_filter() -> None:
     np.testing.assert_allclose(found.P[-1, 0, 0], last.covariance[0], rtol=1e-3)
 
 
+@pytest.mark.flight
 def test_smoothing_reduces_variances_and_is_consistent() -> None:
     nees = []
     for seed in range(1, 7):
@@ -145,6 +146,7 @@ def test_smoothing_reduces_variances_and_is_consistent() -> None:
     assert 2.0 < np.mean(nees) < 7.0
 
 
+@pytest.mark.flight
 def test_smoothed_track_matches_the_truth() -> None:
     found, flown = smoothed(600, (200, 400)), flight(600, (200, 400))
     off = []

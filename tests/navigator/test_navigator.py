@@ -135,6 +135,7 @@ def test_with_fixes_the_estimate_beats_the_best_fix(outage: list[tuple[Moment, S
     assert rms([distance(s, m.truth) for m, s in of(outage, 720, 960)]) < 0.25 * fix
 
 
+@pytest.mark.flight
 def test_without_fixes_the_error_stays_inside_the_guaranteed_bound(
     outage: list[tuple[Moment, Solution]],
 ) -> None:
@@ -146,6 +147,7 @@ def test_without_fixes_the_error_stays_inside_the_guaranteed_bound(
     assert rms([distance(s, m.truth) for m, s in alone]) < rms([math.hypot(*b) for b in bounds if b])
 
 
+@pytest.mark.flight
 def test_the_claimed_sigma_is_honest(outage: list[tuple[Moment, Solution]]) -> None:
     for start, end in ((60, 720), (720, 960)):
         errors = [distance(s, m.truth) for m, s in of(outage, start, end)]

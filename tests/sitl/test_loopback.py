@@ -69,6 +69,7 @@ def test_corrected_estimate_is_better_than_the_best_fix_source(flights) -> None:
     assert {row.phase for row in flights[0]} == {"GNSS+RSBN", "GNSS only", "RSBN only", "neither"}
 
 
+@pytest.mark.flight
 def test_bound_holds_in_every_phase_and_always_without_fixes(flights) -> None:
     for rows in flights:
         assert all(row.share < 1.0 and row.inside > 0.97 for row in rows)

@@ -24,6 +24,7 @@ def test_schemes_use_the_same_fixes(flights: dict[object, SchemeFlight], scheme:
     assert first.joint > 100  # a beacon's answer with the GNSS fix of a moment ago
 
 
+@pytest.mark.flight
 @pytest.mark.parametrize("scheme", [0.3, "feedback"])
 def test_schemes_have_the_same_position_and_bound(
     flights: dict[object, SchemeFlight], scheme: object

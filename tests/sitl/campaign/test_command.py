@@ -168,6 +168,7 @@ def test_campaign_covers_every_simulator_fault() -> None:
             assert flight.scenario_of(FlightOrder(name, fault, 1)).duration_s >= 600.0
 
 
+@pytest.mark.flight
 def test_exit_code_follows_the_limits(flown: tuple[Path, list[FlightResult]]) -> None:
     folder = str(flown[0])
     options = ["--scenario", "one-beacon", "--fault", "none", "--fault", "gnss-jump", "--seeds", "1"]
