@@ -32,13 +32,16 @@ class Residuals:
 
     def __init__(self) -> None:
         self._window: deque[tuple[int, float, bool]] = deque()
+        self._sum = 0.0  # of the window
         self._mean, self._weight = 0.0, 1.0
 
     def add(self, t_ns: int, residual: float, is_believed: bool) -> None:
         """Add one; those that leave the window join the earlier mean if GNSS was believed."""
         self._window.append((t_ns, residual, is_believed))
+        self._sum += residual
         while t_ns - self._window[0][0] > WINDOW_NS:
             _, old, was_believed = self._window.popleft()
+            self._sum -= old
             if was_believed:
                 self._weight = min(self._weight + 1.0, MOST)
                 self._mean += (old - self._mean) / self._weight
@@ -48,7 +51,7 @@ class Residuals:
         """By how many sigmas the window differs from the earlier mean, at the time of the last fix."""
         if len(self._window) < LEAST:
             return 0.0
-        difference = sum(residual for _, residual, _ in self._window) / len(self._window) - self._mean
+        difference = self._sum / len(self._window) - self._mean
         return abs(difference) / math.sqrt(1.0 / len(self._window) + 1.0 / self._weight)
 
 
