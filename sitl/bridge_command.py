@@ -25,7 +25,7 @@ from rich.table import Table
 from companion.analysis import simulated_rsbn
 from companion.storage.reader import LogError
 from companion.tables import print_tables
-from companion.transport.reconnect import Address, CannotListen, Connection, connections
+from companion.transport.reconnect import Address, CannotListen, Connection, cannot_listen, connections
 from sitl.beacon import Beacon
 from sitl.bridge import AUTOPILOT, COMPANION, RSBN, Bridge, BridgeMode, GnssSchedule
 from sitl.comparison import AFTER_S, OutageErrors, PositionError, outage_table
@@ -78,8 +78,8 @@ class BridgeRunner:
                 self._flush()
                 for task in serving:
                     task.cancel()
-        except* CannotListen as group:
-            raise group.exceptions[0] from None
+        except ExceptionGroup as group:
+            raise cannot_listen(group) from None
 
     def _elapsed(self) -> float:
         self.now_ns = self._now()

@@ -23,7 +23,7 @@ import numpy as np
 
 from companion.link.clock import BootClock
 from companion.nav.geometry import Geodetic, local_to_geodetic, separation
-from companion.transport.reconnect import Address, CannotListen, Connection, connections
+from companion.transport.reconnect import Address, CannotListen, Connection, cannot_listen, connections
 from companion.units import SECOND_NS
 from sitl.autopilot import SimulatedAutopilot
 from sitl.bridge_command import command as bridge
@@ -135,8 +135,8 @@ class SimulatorRunner:
                     left = (min(self.autopilot.deadline(), self.autopilot.end_ns + 1) - t) / self._speed
                     await self._wait(min(1e-9 * left, LONGEST_SLEEP_S))
                 serving.cancel()
-        except* CannotListen as group:
-            raise group.exceptions[0] from None
+        except ExceptionGroup as group:
+            raise cannot_listen(group) from None
         self._end_phase()
 
     def _flight_ns(self) -> int:

@@ -28,7 +28,7 @@ from companion.importers.tlog import TlogEntry
 from companion.link import dialect, frame
 from companion.link.dialect import mavlink
 from companion.transport.peers import Rank
-from companion.transport.reconnect import Address, CannotListen, Connection, connections
+from companion.transport.reconnect import Address, CannotListen, Connection, cannot_listen, connections
 
 EX_UNAVAILABLE = 69  # sysexits.h
 NEVER = 2**63 - 1
@@ -172,8 +172,8 @@ class PlayerRunner:
                     left = 1e-9 * (player.deadline() - self._now())
                     await self._wait(min(left, LONGEST_SLEEP_S))
                 serving.cancel()
-        except* CannotListen as group:
-            raise group.exceptions[0] from None
+        except ExceptionGroup as group:
+            raise cannot_listen(group) from None
 
     async def _wait(self, seconds: float) -> None:
         try:

@@ -50,7 +50,8 @@ def unpacked(tree: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The source distribution of `tree`, unpacked."""
     folder = tmp_path_factory.mktemp("sdist")
     with tarfile.open(built("sdist", tree, folder / "built")) as archive:
-        archive.extractall(folder, filter="data")
+        archive.extraction_filter = getattr(tarfile, "data_filter", None)  # not in Python 3.11.2
+        archive.extractall(folder)
     (found,) = folder.glob("navigation_companion-*")
     return found
 

@@ -48,7 +48,7 @@ from companion.storage.reader import LogError
 from companion.storage.retention import create_log, recover_unclosed
 from companion.storage.run_metadata import run_metadata
 from companion.transport.drop_monitor import DropMonitor
-from companion.transport.reconnect import Address, CannotListen, Connection, connections
+from companion.transport.reconnect import Address, CannotListen, Connection, cannot_listen, connections
 
 EX_UNAVAILABLE, EX_CANTCREAT = 69, 73  # sysexits.h
 LOG_CHECK_S = 1.0
@@ -125,8 +125,8 @@ class Service:
                 self._notifier.stopping()
                 for task in running:
                     task.cancel()
-        except* CannotListen as group:
-            raise group.exceptions[0] from None
+        except ExceptionGroup as group:
+            raise cannot_listen(group) from None
         finally:
             self._deferred.flush()
 

@@ -19,11 +19,20 @@ from collections.abc import AsyncIterator, Callable, Iterator
 from companion.transport.address import Address
 from companion.transport.connection import Connection, pair, reason
 from companion.transport.serial_line import open_serial
-from companion.transport.sockets import CannotListen, open_socket
+from companion.transport.sockets import CannotListen, cannot_listen, open_socket
 from companion.transport.tcp import Judge, Listener, tcp_connection
 from companion.transport.udp import connected_udp, listening_udp
 
-__all__ = ["Address", "CannotListen", "Connection", "back_off", "connect", "connections", "pair"]
+__all__ = [
+    "Address",
+    "CannotListen",
+    "Connection",
+    "back_off",
+    "cannot_listen",
+    "connect",
+    "connections",
+    "pair",
+]
 
 MIN_PAUSE, MAX_PAUSE = 0.25, 10.0
 #: After a connection that lasted this long (s), the pauses start again from the shortest.

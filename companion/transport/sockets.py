@@ -21,6 +21,15 @@ class CannotListen(OSError):
     """The address to listen on is in use or forbidden; the operator must correct it."""
 
 
+def cannot_listen(group: ExceptionGroup[Exception]) -> Exception:
+    """Return the CannotListen among the errors of a task group, or the group if there is none.
+
+    To be raised after `except`: in `except*` Python 3.11.2 (Debian 12) packs it into a group again.
+    """
+    found = group.subgroup(CannotListen)
+    return group if found is None else found.exceptions[0]
+
+
 async def open_socket(address: Address) -> socket.socket:
     """Open a non-blocking socket: bound if the address listens, else connected.
 
