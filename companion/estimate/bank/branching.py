@@ -251,7 +251,7 @@ def _with_children(bank: Bank, layout: Layout, children: list[_Child]) -> Bank:
     children = [child for child in children if child.log_prior > NEVER]
     if not children:
         return bank
-    rows, k = len(bank.L), len(children)
+    rows = len(bank.L)
     at = np.concatenate((np.arange(rows), [c.parent for c in children]))
     prior = np.array([c.log_prior for c in children])
     given = np.zeros(rows)
@@ -260,15 +260,19 @@ def _with_children(bank: Bank, layout: Layout, children: list[_Child]) -> Bank:
     x, P, noise = bank.x[at], bank.P[at], bank.noise[at]
     grade, fault, event, scale = bank.grade[at], bank.fault[at], bank.event[at], bank.scale[at]
     since = bank.since[at]
+    since[rows:] = bank.t
     F = len(layout.faults)
-    for i, c in zip(range(rows, rows + k), children):
-        since[i] = bank.t
+    alike: dict[tuple[object, ...], list[int]] = {}  # rows with the same change, of several parents
+    for row, child in enumerate(children, rows):
+        alike.setdefault(child[2:], []).append(row)
+    for born in alike.values():
+        c, i = children[born[0] - rows], np.array(born)
         if c.ends:
             g = layout.fault_group(c.fault)
-            index = layout.starts[g] + np.arange(layout.sizes[g])
-            x[i, index] = 0.0
-            P[i, index, :] = 0.0
-            P[i, :, index] = 0.0
+            states = slice(layout.starts[g], layout.starts[g] + layout.sizes[g])
+            x[i, states] = 0.0
+            P[i, states, :] = 0.0
+            P[i, :, states] = 0.0
             a = sum(layout.groups[:g])
             noise[i, a : a + layout.groups[g]] = 0.0
             fault[i, g], event[i], scale[i] = NONE, 1 + F + c.fault, 0
@@ -276,20 +280,20 @@ def _with_children(bank: Bank, layout: Layout, children: list[_Child]) -> Bank:
             index, variance, places, density = layout.lie_prior(c.fault, c.lie)
             for state, sigma in layout.faults[c.fault].shock:
                 P[i, state, state] += sigma**2
-            P[i, index, index] += variance
+            P[i[:, None], index, index] += variance
             for state, lie, s2 in zip(c.undone, index.tolist(), variance.tolist()):
                 P[i, state, state] += s2
                 P[i, state, lie] -= s2
                 P[i, lie, state] -= s2
-            noise[i, places] = density
+            noise[i[:, None], places] = density
             fault[i, layout.fault_group(c.fault)], event[i], scale[i] = c.fault, 1 + c.fault, c.scale
         elif c.jump != NONE:
             j = layout.jumps[c.jump]
-            P[i, list(j.states), list(j.states)] += np.square(j.sigma)
+            P[i[:, None], j.states, j.states] += np.square(j.sigma)
             event[i] = 1 + 2 * F + c.jump
         else:
-            grade[i] = c.grade
-            since[i], event[i] = bank.since[c.parent], bank.event[c.parent]
+            parent = at[i]
+            grade[i], since[i], event[i] = c.grade, bank.since[parent], bank.event[parent]
     return bank._replace(
         L=normalised(L),
         x=x,

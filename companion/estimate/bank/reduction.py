@@ -34,9 +34,8 @@ def reduce(bank: Bank, layout: Layout, settings: Settings) -> Bank:
     Bank : with at most `settings.rows` rows; covariances made symmetric.
     """
     rows = len(bank.L)
-    bank = bank._replace(P=0.5 * (bank.P + bank.P.transpose(0, 2, 1)))
     if rows <= settings.rows:
-        return bank
+        return bank._replace(P=_symmetric(bank.P))
     L, family = bank.L, families(bank)
     bins = np.floor(
         np.log(np.maximum((bank.t - bank.since) / settings.age_s, 0.1)) / math.log(settings.age_ratio) + 1.0
@@ -124,8 +123,10 @@ def _merged(
     bank: Bank, keep: list[int], dropped: list[int], keys: list[tuple[int, int, int]], settings: Settings
 ) -> Bank:
     """The rows `keep`; the weights of `dropped`, in this order, go where `reduce` states."""
+    at = np.array(keep)
     L, grade, noise = bank.L.tolist(), bank.grade.tolist(), bank.noise.tolist()
-    x, P = bank.x.copy(), bank.P.copy()
+    x, P = bank.x[at], _symmetric(bank.P[at])
+    place = {row: k for k, row in enumerate(keep)}
     by_key: dict[tuple[int, int, int], list[int]] = {}
     for i in keep:
         by_key.setdefault(keys[i], []).append(i)
@@ -138,15 +139,15 @@ def _merged(
             j for j in near if abs(L[i] - L[j]) < log_ratio and grade[i] == grade[j] and noise[i] == noise[j]
         ]
         j = max(alike or near, key=L.__getitem__)
-        if alike and _distance(x[i] - x[j], P[j]) < settings.merge_distance:
-            L[j], x[j], P[j] = merge_moments(L[i], x[i], P[i], L[j], x[j], P[j])
+        k = place[j]
+        if alike and _distance(bank.x[i] - x[k], P[k]) < settings.merge_distance:
+            L[j], x[k], P[k] = merge_moments(L[i], bank.x[i], _symmetric(bank.P[i]), L[j], x[k], P[k])
         elif L[i] < L[j] + log_ratio:
             L[j] = float(np.logaddexp(L[i], L[j]))
-    at = np.array(keep)
     return bank._replace(
         L=normalised(np.array(L)[at]),
-        x=x[at],
-        P=P[at],
+        x=x,
+        P=P,
         grade=bank.grade[at],
         fault=bank.fault[at],
         event=bank.event[at],
@@ -154,6 +155,11 @@ def _merged(
         scale=bank.scale[at],
         noise=bank.noise[at],
     )
+
+
+def _symmetric(P: Floats) -> Floats:
+    out: Floats = 0.5 * (P + P.swapaxes(-1, -2))
+    return out
 
 
 def _distance(d: Floats, P: Floats) -> float:
