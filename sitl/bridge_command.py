@@ -186,13 +186,18 @@ def _parse_beacons(positions: tuple[str, ...], file: Path | None) -> tuple[Beaco
     for number, text in enumerate(positions, start=1):
         try:
             lat, lon, *alt = map(float, text.split(","))
-            if len(alt) > 1 or abs(lat) > 90.0 or abs(lon) > 180.0 or not all(map(math.isfinite, alt)):
+            if len(alt) > 1 or not all(map(math.isfinite, (lat, lon, *alt))):
                 raise ValueError
         except ValueError:
             raise click.BadParameter(
                 f"invalid beacon {text!r}: write it as LAT,LON or LAT,LON,ALT in degrees and metres",
                 param_hint="--beacon",
             ) from None
+        if abs(lat) > 90.0 or abs(lon) > 180.0:
+            what, limit = (f"latitude {lat:g}", 90) if abs(lat) > 90.0 else (f"longitude {lon:g}", 180)
+            raise click.BadParameter(
+                f"invalid beacon {text!r}: {what}: give -{limit} to {limit} deg", param_hint="--beacon"
+            )
         height = alt[0] if alt else 0.0
         beacons.append(Beacon(number, lat, lon, height, ground_alt=simulated_rsbn.GROUND))
     if file is not None:

@@ -199,7 +199,7 @@ def collect_flights(
             parts.append(_FlightCollector())
         parts[-1].add(topic, record)
     if not parts[0].started:
-        raise ValueError(f"{name} contains no records: nothing to report")
+        raise ValueError(f"{name} contains no records of the companion")
     shift = 0 if unix_ns is None else unix_ns - parts[0].zero_ns
     about = metadata or {}
     return [

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import sys
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import NoReturn
 
 import click
 import msgspec
@@ -15,7 +13,7 @@ from rich.table import Table
 
 from companion.analysis.progress import show_step
 from companion.printable import printable
-from companion.storage.flight_log import Info, LogError, info, recover
+from companion.storage.flight_log import Info, info, recover
 
 
 @click.group("log")
@@ -31,11 +29,8 @@ def info_command(log: Path, as_json: bool) -> None:
 
     Prints messages by topic, times, metadata, and whether it was closed.
     """
-    try:
-        with show_step(f"read {log}"):
-            found = info(log)
-    except LogError as error:
-        _fail(error)
+    with show_step(f"read {log}"):
+        found = info(log)
     if as_json:
         values = found._asdict() | {"path": str(found.path), "duration_s": found.duration_s}
         click.echo(msgspec.json.format(msgspec.json.encode(values), indent=2))
@@ -50,11 +45,8 @@ def recover_command(log: Path) -> None:
 
     x.mcap.active becomes x.mcap; x.mcap is copied to x.recovered.mcap.
     """
-    try:
-        with show_step(f"recover {log}"):
-            saved = recover(log)
-    except LogError as error:
-        _fail(error)
+    with show_step(f"recover {log}"):
+        saved = recover(log)
     if saved.path == log:
         click.echo(f"{log} is complete: {saved.messages} messages in {saved.chunks} chunks")
     else:
@@ -74,11 +66,8 @@ def convert_command(source: Path, output: Path) -> None:
     """
     from companion.analysis import convert
 
-    try:
-        with show_step(f"convert {source}"):
-            written = convert.convert_log(source, output)
-    except LogError as error:
-        _fail(error)
+    with show_step(f"convert {source}"):
+        written = convert.convert_log(source, output)
     click.echo(f"{output}: {written.records} records, {written.reboots} reboots")
 
 
@@ -111,22 +100,17 @@ def export_command(log: Path, output: Path, every_s: float, config_file: Path | 
     from companion.analysis.output_guard import reject_any_log, reject_own_input
     from companion.config import load
 
-    try:
-        export.check_suffix(output)
-        reject_own_input(output, log, config_file)
-        reject_any_log(output)
-        tracks, places = list[export.Track](), list[export.Place]()
-        with show_step(f"read {log}"):
-            flights = open_flights(log, load(config_file))
-        for flight in flights:
-            lines, places = export.flight_map(flight, every_s)
-            k, n = flight.part
-            tracks += [
-                line._replace(name=f"flight {k}: {line.name}" if n > 1 else line.name) for line in lines
-            ]
-        export.write_map(output, log.name, tracks, places)
-    except LogError as error:
-        _fail(error)
+    export.check_suffix(output)
+    reject_own_input(output, log, config_file)
+    reject_any_log(output)
+    tracks, places = list[export.Track](), list[export.Place]()
+    with show_step(f"read {log}"):
+        flights = open_flights(log, load(config_file))
+    for flight in flights:
+        lines, places = export.flight_map(flight, every_s)
+        k, n = flight.part
+        tracks += [line._replace(name=f"flight {k}: {line.name}" if n > 1 else line.name) for line in lines]
+    export.write_map(output, log.name, tracks, places)
     click.echo(f"{output}: {len(tracks)} tracks, {len(places)} beacons")
 
 
@@ -153,8 +137,3 @@ def _print(found: Info) -> None:
             more = f" ... ({len(rest)} more lines)" if rest else ""
             line = printable(f"{name}.{key}: {head}{more}")
             console.print(escape(line), soft_wrap=True, highlight=False)
-
-
-def _fail(error: LogError) -> NoReturn:
-    click.echo(printable(str(error)), err=True)
-    sys.exit(1)

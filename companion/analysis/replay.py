@@ -141,7 +141,12 @@ def replay_foreign(records: Iterable[Stamped], config: Config, sink: Any) -> Rep
 def create_replay_log(
     path: Path, described: Mapping[str, Mapping[str, str]], start_ns: int = 0, start_unix_ns: int = 0
 ) -> flight_log.Writer:
-    """Create a log for a replay, which waits for the disk instead of dropping messages."""
+    """Create a log for a replay, which waits for the disk instead of dropping messages.
+
+    Raises LogError unless the name is that of a log: no other command would read it.
+    """
+    if path.suffix != ".mcap":
+        raise LogError(f"{path}: a log is written as .mcap: give a name that ends with it")
     return flight_log.Writer(
         path, metadata=described, start_unix_ns=start_unix_ns, start_ns=start_ns, block=True
     )

@@ -134,8 +134,10 @@ def _read(path: Path) -> dict[str, dict[str, Any]]:
         size = max(path.stat().st_size, len(text))
     except FileNotFoundError:
         raise ConfigError(f"{path}: no such file; start from `companion check-config --defaults`") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: cannot be read ({error})") from None
+    except UnicodeDecodeError:
+        raise ConfigError(f"{path}: not a text file in UTF-8; a configuration is TOML") from None
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read ({error.strerror or error})") from None
     _check_size(size, str(path))
     tree = _tree(text, str(path))
     _check_keys(tree, str(path))
@@ -213,6 +215,18 @@ def _or_number(kind: Any) -> str:
     return "".join(f", nor a number from {limit.ge:g} to {limit.le:g}" for limit in limits)
 
 
+def _wanted(kind: Any, value: Any) -> str:
+    """Return what to give for a number, or true or false; empty for another kind of key."""
+    if kind is bool:
+        return "give true or false"
+    if get_origin(kind) is not Annotated or get_args(kind)[0] not in (int, float):
+        return ""
+    base, limit = get_args(kind)
+    number = "a whole number" if base is int else "a number"
+    quotes = ", without quotes" if isinstance(value, str) else ""
+    return f"give {number} from {limit.ge:g} to {limit.le:g}{quotes}"
+
+
 def _convert(tree: Mapping[str, Mapping[str, Any]], origin: Mapping[tuple[str, str], str]) -> Config:
     sections: dict[str, Any] = {}
     for section, table in tree.items():
@@ -232,9 +246,8 @@ def _convert(tree: Mapping[str, Mapping[str, Any]], origin: Mapping[tuple[str, s
                         f"{where}: {section}.{key}: {value!r} is not one of {', '.join(choices)}"
                         f"{_or_number(hints[key])}{nearest}"
                     ) from None
-                raise ConfigError(
-                    f"{where}: {section}.{key} = {value!r} is invalid: {reason[0].lower()}{reason[1:]}"
-                ) from None
+                wanted = _wanted(hints[key], value) or f"{reason[0].lower()}{reason[1:]}"
+                raise ConfigError(f"{where}: {section}.{key} = {value!r} is invalid: {wanted}") from None
         sections[section] = msgspec.convert(table, kind)
     config = Config(**sections)
     for section, key, sentence in find_conflicts(config):

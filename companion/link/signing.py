@@ -179,8 +179,7 @@ def read_key(path: Path) -> bytes:
             data = file.read(1024)
     except OSError as error:
         raise ValueError(
-            f"{path}: the signing key cannot be read ({error.strerror}); "
-            "make one: (umask 077; head -c32 /dev/urandom | xxd -p -c64 > key)"
+            f"{path}: the signing key cannot be read ({error.strerror}); make one: companion signing init"
         ) from None
     if mode & 0o077:
         raise ValueError(f"{path}: the signing key is accessible to others (mode {mode:04o}); chmod 600 it")

@@ -246,14 +246,14 @@ def open_log(path: str | os.PathLike[str]) -> Iterator[LogReader]:
         size = os.fstat(file.fileno()).st_size
         magic = file.read(len(MAGIC))
         if not magic:
-            raise LogError(f"{path}: is empty")
+            raise LogError(f"{path} is empty: nothing was recorded")
         if not MAGIC.startswith(magic):
-            raise LogError(f"{path}: is not an MCAP log (it does not begin with MCAP's magic)")
+            raise LogError(f"{path} is not an MCAP log (it does not begin with MCAP's magic)")
         first = next(LogReader(path, file, size).records(), None)
         if first is None:
-            raise LogError(f"{path}: is truncated within its header and contains no messages")
+            raise LogError(f"{path} is truncated within its header and contains no messages")
         if first.opcode != Opcode.HEADER:
-            raise LogError(f"{path}: is not an MCAP log (its first record is not a header)")
+            raise LogError(f"{path} is not an MCAP log (its first record is not a header)")
         source = LogReader(path, file, size)
         try:
             yield source

@@ -7,7 +7,7 @@ from click.testing import CliRunner
 
 from companion.analysis.log_command import group
 from companion.records import Event
-from companion.storage.flight_log import Writer
+from companion.storage.flight_log import LogError, Writer
 
 
 @pytest.fixture
@@ -26,7 +26,8 @@ def test_existing_copy_is_not_overwritten(damage: str, whole: bytes, tmp_path: P
     log.write_bytes(whole[:at] if damage == "torn" else whole[:at] + bytes(20) + whole[at + 20 :])
     copy.write_bytes(b"existing")
     done = CliRunner().invoke(group, ["recover", str(log)])
-    assert (done.exit_code, done.stderr) == (1, f"{copy} already exists: move it away first\n")
+    assert isinstance(done.exception, LogError)
+    assert str(done.exception) == f"{copy} already exists: move it away first"
     assert copy.read_bytes() == b"existing"
     copy.unlink()
     assert CliRunner().invoke(group, ["recover", str(log)]).exit_code == 0

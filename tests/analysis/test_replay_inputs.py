@@ -145,17 +145,26 @@ def test_unreadable_log_is_reported_in_one_sentence(
     result = str(run("replay", path, "-o", tmp_path / "x.mcap", fails=LogError).exception)
     assert name in result and "\n" not in result
     if path.suffix != ".mcap":
-        result = CliRunner().invoke(cli, ["log", "convert", str(path), "-o", str(tmp_path / "y.mcap")])
-        assert result.exit_code == 1 and result.output.count("\n") == 1
+        result = str(run("log", "convert", path, "-o", tmp_path / "y.mcap", fails=LogError).exception)
+        assert name in result and "\n" not in result
     assert not list(tmp_path.glob("[xy].mcap*"))  # no partial files remain
 
 
 def test_convert_does_not_overwrite(tmp_path: pathlib.Path) -> None:
     there = tmp_path / "there.mcap"
     there.write_bytes(b"existing")
-    result = CliRunner().invoke(cli, ["log", "convert", str(FLIGHT), "-o", str(there)])
-    assert result.exit_code == 1 and "already exists" in result.output
+    result = run("log", "convert", FLIGHT, "-o", there, fails=LogError)
+    assert "already exists" in str(result.exception)
     assert there.read_bytes() == b"existing"
+
+
+@pytest.mark.parametrize("command", [("replay",), ("log", "convert")])
+def test_log_is_written_under_a_name_that_is_read_again(
+    command: tuple[str, ...], tmp_path: pathlib.Path
+) -> None:
+    result = run(*command, FLIGHT, "-o", tmp_path / "x.txt", fails=LogError)
+    assert "give a name that ends with it" in str(result.exception)
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.shared
@@ -175,8 +184,7 @@ def test_conversion_of_an_own_log_is_rejected(tmp_path: pathlib.Path) -> None:
     run("log", "convert", FLIGHT, "-o", log)
     foreign.write_bytes(b"what is this" * 20)
     for source, message in ((log, f"{log} is already an MCAP log"), (foreign, "is not an MCAP log")):
-        result = CliRunner().invoke(cli, ["log", "convert", str(source), "-o", str(again)])
-        assert result.exit_code == 1 and message in result.output
+        assert message in str(run("log", "convert", source, "-o", again, fails=LogError).exception)
     assert not again.exists()
 
 

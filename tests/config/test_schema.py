@@ -32,14 +32,21 @@ def test_flags_override_environment_overrides_file(tmp_path: Path) -> None:
     [
         ("[lnk]\nx = 1", "there is no section [lnk]; did you mean `link`?"),
         ("[link]\ncomponent = 1", "section [link] has no key `component`; did you mean `component_id`?"),
-        ("[link]\ncomponent_id = 1000", "link.component_id = 1000 is invalid: expected int <= 255"),
-        ("[gnss]\nsigma_m = -1", "gnss.sigma_m = -1 is invalid: expected float >= 0.01"),
-        ("[gnss]\nsigma_m = nan", "gnss.sigma_m = nan is invalid: expected float"),
-        ("[gnss]\nsigma_m = 'two'", "gnss.sigma_m = 'two' is invalid: expected float, got str"),
+        (
+            "[link]\ncomponent_id = 1000",
+            "link.component_id = 1000 is invalid: give a whole number from 1 to 255",
+        ),
+        ("[gnss]\nsigma_m = -1", "gnss.sigma_m = -1 is invalid: give a number from 0.01 to 1000"),
+        ("[gnss]\nsigma_m = nan", "gnss.sigma_m = nan is invalid: give a number from 0.01 to 1000"),
+        (
+            "[gnss]\nsigma_m = 'two'",
+            "gnss.sigma_m = 'two' is invalid: give a number from 0.01 to 1000, without quotes",
+        ),
         (
             "[output]\nprofile = 'px5'",
             "output.profile: 'px5' is not one of monitor, ardupilot, px4, custom; did you mean `px4`?",
         ),
+        ("[inertial]\nindependent = 'yes'", "inertial.independent = 'yes' is invalid: give true or false"),
         ("[output]\nvia = 'odometri'", "is not one of auto, odometry, "),
         ("[output]\nvia = 3", "output.via: 3 is not one of auto, "),
         ("[inertial]\nsource = 'ins'", "'ins' is not one of auto, local_position, air_data, imu"),

@@ -282,7 +282,8 @@ def test_three_processes_over_tcp_and_udp(entries, tmp_path: Path) -> None:
     ("arguments", "words"),
     [
         (["--beacon", "55.75"], "write it as LAT,LON"),
-        (["--beacon", "99,10"], "write it as LAT,LON"),
+        (["--beacon", "99,10"], "latitude 99: give -90 to 90 deg"),
+        (["--beacon", "10,-190"], "longitude -190: give -180 to 180 deg"),
         (["--connect", "nonsense"], "is not a connection string"),
         (["--gnss-on-after", "5"], "give --gnss-off-after"),
         (["--unaided"], "give --companion"),

@@ -715,4 +715,4 @@ def test_log_command_shows_recovers_and_reports_errors(tmp_path, small):
     assert "is complete" in run.invoke(group, ["recover", str(tmp_path / "y.mcap")]).output
     for command in ("info", "recover"):
         failed = run.invoke(group, [command, str(tmp_path / "none")])
-        assert failed.exit_code == 1 and failed.output.count("\n") == 1
+        assert isinstance(failed.exception, LogError) and "\n" not in str(failed.exception)

@@ -10,7 +10,10 @@ import time
 from pathlib import Path
 from typing import NamedTuple
 
-from companion.storage.reader import ACTIVE, DamagedError, LogError, LogReader, open_log
+from companion.importers.sources import LOG_SUFFIXES
+from companion.records import Stamped
+from companion.storage import flight_log
+from companion.storage.reader import ACTIVE, DamagedError, LogError, LogReader, is_closed, open_log
 
 BLOCK = 1 << 22  # bytes read at a time
 
@@ -107,6 +110,16 @@ class PlayedLog:
     def close(self) -> None:
         """Close the file."""
         self._log.close()
+
+
+def reject_foreign(path: Path) -> None:
+    """Raise LogError if the log at `path` is not one of ours; one that is still written may be empty."""
+    if path.suffix.lower() in LOG_SUFFIXES:
+        raise LogError(
+            f"{path}: convert it first: companion log convert {path} -o {path.with_suffix('.mcap')}"
+        )
+    if is_closed(path) and not any(isinstance(entry.value, Stamped) for entry in flight_log.read(path)):
+        raise LogError(f"{path} contains no records of the companion: nothing to show")
 
 
 def find_log(path: Path) -> Path | None:

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 import click
 import msgspec
 
-from companion.analysis.live.follow import FollowedLog, PlayedLog, find_log
+from companion.analysis.live.follow import FollowedLog, PlayedLog, find_log, reject_foreign
 from companion.analysis.live.scene import Scene
 from companion.optional_dependencies import missing_package
 from companion.storage.reader import ACTIVE, LogError
@@ -242,6 +242,8 @@ def command(path: Path, listen: str, speed: float, foxglove: int | None) -> None
             f"{listen!r}: give HOST:PORT, for example 127.0.0.1:{PORT}", param_hint="--listen"
         )
     found = find_log(path)
+    if found is not None:
+        reject_foreign(found)
     bridge: FoxgloveServer | None = None
     try:
         import websockets  # noqa: F401

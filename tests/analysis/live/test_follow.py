@@ -2,9 +2,10 @@
 
 import time
 
+import mcap.writer
 import pytest
 
-from companion.analysis.live.follow import FollowedLog, PlayedLog, find_log
+from companion.analysis.live.follow import FollowedLog, PlayedLog, find_log, reject_foreign
 from companion.records import Attitude, Event
 from companion.storage import flight_log
 from companion.storage.reader import LogError
@@ -115,3 +116,20 @@ def test_what_is_to_be_shown_is_found(tmp_path):
         find_log(tmp_path / "none")
     with pytest.raises(LogError, match="is not an MCAP log"):
         FollowedLog(tmp_path / "00001-x.mcap")
+
+
+def test_a_log_of_another_program_is_not_shown(tmp_path):
+    ours, other, telemetry = tmp_path / "ours.mcap", tmp_path / "other.mcap", tmp_path / "f.tlog"
+    with writer(ours) as log:
+        write(log, 0, 10)
+    reject_foreign(ours)
+    with other.open("wb") as file:
+        foreign = mcap.writer.Writer(file)
+        foreign.start()
+        channel = foreign.register_channel("/pose", "json", 0)
+        foreign.add_message(channel, log_time=1, publish_time=1, data=b"{}")
+        foreign.finish()
+    telemetry.write_text("what is this")
+    for path, sentence in ((other, "no records of the companion"), (telemetry, "companion log convert")):
+        with pytest.raises(LogError, match=sentence):
+            reject_foreign(path)
