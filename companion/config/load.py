@@ -204,7 +204,7 @@ def _choices(kind: Any) -> tuple[str, ...]:
     """Return the texts that a key accepts; empty if it accepts other values too."""
     if get_origin(kind) is Literal:
         return get_args(kind)
-    if get_origin(kind) in (Union, UnionType):
+    if get_origin(kind) in (Union, UnionType, tuple):
         return tuple(word for one in get_args(kind) for word in _choices(one))
     return ()
 

@@ -6,8 +6,9 @@ With r a measurement minus that of the nominal trajectory, for three successive 
 
 R is the variance of white noise. An offset, a rate and the slow errors of the channel are not in d: neither a
 spoofed GNSS nor a poor INS changes it; a is what the nominal trajectory's acceleration may lack. The mean of
-d^2 / (R + w), later surprises clipped, is a factor of the variance, and is used where it is above `FACTOR`.
-A source that states too little would otherwise be explained by one lie after another, and excluded. Its first
+d^2 / (R + w), later surprises clipped, is a factor of the variance, and is used where it is above one (of
+honest noise 1.05 in the mean). A source that states too little would otherwise be explained by one lie after
+another, and excluded: a healthy GNSS 1.3 times as noisy as it stated was, in aerobatics. Its first
 measurements, of which no scatter is known yet, are taken as noisy.
 """
 
@@ -20,7 +21,6 @@ SILENT_S = 5.0  # after a longer silence the differences start again
 UNEQUAL = 1.5  # of two distances
 CLIPPED = 6.0  # times the mean
 FIRST, LAST = 4, 40  # measurements that the mean remembers, at the start and later
-FACTOR = 2.25  # of the variance: a smaller one may be chance
 UNKNOWN, UNKNOWN_FOR = 9.0, 6  # factor of the first measurements, and their number: four differences
 MOST = 100.0
 REPORTED, FORGOTTEN = 4.0, 1.44  # the factor is reported above the one until it is below the other
@@ -44,10 +44,8 @@ class Scatter(NamedTuple):
 
     @property
     def used(self) -> float:
-        """Factor by which the stated variance is enlarged: 1, or `factor` where it is no chance."""
-        if self.seen < UNKNOWN_FOR:
-            return max(self.factor, UNKNOWN)
-        return self.factor if self.factor > FACTOR else 1.0
+        """Factor by which the stated variance is enlarged, at least 1."""
+        return max(self.factor, UNKNOWN if self.seen < UNKNOWN_FOR else 1.0)
 
 
 def observe(s: Scatter | None, t_ns: int, r: tuple[float, ...], variance: float, a: float) -> Scatter:

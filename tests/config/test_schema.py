@@ -52,6 +52,7 @@ def test_flags_override_environment_overrides_file(tmp_path: Path) -> None:
         ("[inertial]\nsource = 'ins'", "'ins' is not one of auto, local_position, air_data, imu"),
         ("[estimator]\nscheme = 1.5", "1.5 is not one of feedforward, feedback, nor a number from 0 to 1"),
         ("[link]\nconnect = 3", "link.connect = [3] is invalid: expected str, got int"),
+        ("[estimator]\nparallel = 'minmax_filter'", "is not one of minimax_filter, restrictive"),
         ("link = 3", "`link` is a section: write [link] and its keys below it"),
         ("x = [", "not valid TOML"),
         ("#" * 65_536 + "\n", "65537 bytes, but a configuration has at most 65536"),

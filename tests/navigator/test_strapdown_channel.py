@@ -688,12 +688,18 @@ def test_the_rates_asked_for_are_enough() -> None:
 
 @pytest.mark.flight
 @pytest.mark.skipif(not AEROBATICS.exists(), reason="the recording is not there")
-def test_gnss_is_not_excluded_in_real_aerobatics() -> None:
+@pytest.mark.parametrize(("noise_m", "most"), [(0.0, 0.9), (5.0, 0.999)])
+def test_gnss_is_not_excluded_in_real_aerobatics(noise_m: float, most: float) -> None:
     """Up to 6 g and inverted, an attitude of 2013; GNSS itself is 7 m/s off for 2 s. One beacon, 60 km off.
 
-    At the start the receiver, just switched on, reports 3 m/s at rest, and the attitude settles.
+    At the start the receiver, just switched on, reports 3 m/s at rest, and the attitude settles. It states
+    4 m and scatters by 1 m; with 5 m added it is 1.3 times as noisy as it states.
     """
-    records = list(sources.open_source(AEROBATICS))
+    records, rng = list(sources.open_source(AEROBATICS)), np.random.default_rng(1)
+    for k, r in enumerate(records):
+        if noise_m and isinstance(r, Gnss) and r.has_3d_fix:
+            north, east = noise_m * rng.standard_normal(2) / 6.37e6
+            records[k] = msgspec.structs.replace(r, lat=r.lat + north, lon=r.lon + east / math.cos(r.lat))
     config = load(flags={"output.profile": "ardupilot"}, environment={})
     fix = next(r for r in records if isinstance(r, Gnss) and r.has_3d_fix)
     beacon = simulated_rsbn.ListedBeacon(1, fix.lat + math.radians(0.54), fix.lon, 3000.0)
@@ -705,5 +711,5 @@ def test_gnss_is_not_excluded_in_real_aerobatics() -> None:
             false += [o.gnss_false or 0.0 for o in out if isinstance(o, Solution)]
             navigator.settle()
     assert len(false) > 5000  # at 10 Hz
-    assert max(false) < 0.9
-    assert sum(p > 0.5 for p in false) < 100
+    assert max(false) < most
+    assert noise_m or sum(p > 0.5 for p in false) < 100

@@ -53,9 +53,7 @@ def test_smoothed_track_is_nearer_and_consistent(channel: str) -> None:
 
 @pytest.mark.parametrize("channel", ["ins", "own"])
 def test_pooled_flights_with_short_outages(channel: str) -> None:
-    parts = [
-        smoothing_study.compare_flight(get_scenario("short", seed=seed), channel) for seed in range(1, 4)
-    ]
+    parts = [smoothing_study.compare_flight(get_scenario("short", seed=seed), channel) for seed in (1, 2)]
     found = smoothing_study.pool(parts)
     assert found.epochs == sum(part.epochs for part in parts)
     assert found.better

@@ -119,7 +119,6 @@ def test_slow_consumer_does_not_shift_the_clock() -> None:
 @pytest.mark.parametrize(
     ("scenario", "name"),
     [
-        ("one-beacon", "link-late"),
         ("air-data", "link-late"),
         ("one-beacon", "clock-jump"),
         ("one-beacon", "reboot-turning"),
