@@ -101,15 +101,10 @@ class Service:
         self._connections: dict[str, Connection] = {}
         self._dropped_before: dict[str, int] = {}  # by earlier connections of the link
         self._drop_monitors = {name: DropMonitor(address) for name, address in self._addresses.items()}
-        self._stopped = asyncio.Event()
         self._trouble: str | None = None
 
-    def stop(self) -> None:
-        """Request `serve` to end."""
-        self._stopped.set()
-
-    async def serve(self) -> None:
-        """Run links and timers until `stop`.
+    async def serve(self, stopped: asyncio.Event) -> None:
+        """Run links and timers until `stopped`.
 
         Raises CannotListen if at the start an address is in use or forbidden. An address that does not exist
         yet, or is in use later, is retried until stopped.
@@ -121,7 +116,7 @@ class Service:
                     tasks.create_task(self._run_timers()),
                     tasks.create_task(self._save_state_periodically()),
                 ]
-                await self._stopped.wait()
+                await stopped.wait()
                 self._notifier.stopping()
                 for task in running:
                     task.cancel()
@@ -255,6 +250,9 @@ async def run(
 ) -> None:
     """Open the log, report `notes`, serve until SIGINT or SIGTERM, close the log. Others: see `Service`."""
     start_ns, start_unix_ns = time.monotonic_ns(), time.time_ns()
+    loop, stopped = asyncio.get_running_loop(), asyncio.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, stopped.set)
     settings, deleted = config.log, deque[Path]()
     log = create_log(
         settings.folder,
@@ -280,9 +278,6 @@ async def run(
             deleted=deleted,
             on_status=on_status,
         )
-        loop = asyncio.get_running_loop()
-        for number in (signal.SIGINT, signal.SIGTERM):
-            loop.add_signal_handler(number, service.stop)
         service.core.report(Severity.INFO, f"companion {__version__}: log {log.path}", time.monotonic_ns())
         for address in map(Address.parse, config.link.connect):
             verb = "listening" if address.listens else "connecting"
@@ -292,12 +287,12 @@ async def run(
             service.core.report(severity, sentence, time.monotonic_ns())
         for note in notes:
             service.core.report(Severity.WARNING, note, time.monotonic_ns())
-        recover = partial(_recover_logs, settings, service, asyncio.get_running_loop(), deleted)
+        recover = partial(_recover_logs, settings, service, loop, deleted)
         threading.Thread(target=recover, name="recover", daemon=True).start()
         # needed by the first solution with a protection level; not before the first frame is received
         load = threading.Thread(target=import_module, args=("scipy.special",), name="import", daemon=True)
         loop.call_later(IMPORT_AFTER_S, load.start)
-        await service.serve()
+        await service.serve(stopped)
         with contextlib.suppress(TimeoutError):
             await asyncio.wait_for(run_in_daemon_thread(service.save_state), STOP_TIMEOUT_S)
             await asyncio.wait_for(run_in_daemon_thread(service.confirm_parameters), STOP_TIMEOUT_S)

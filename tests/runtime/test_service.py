@@ -17,8 +17,9 @@ import pytest
 from companion.config import load
 from companion.link import dialect, frame
 from companion.records import Event
+from companion.runtime import service
 from companion.runtime.service import EX_CANTCREAT, EX_UNAVAILABLE, Service
-from companion.storage import flight_log
+from companion.storage import flight_log, retention
 from companion.transport.reconnect import Address, CannotListen
 from tests.network import free_port, until
 
@@ -54,16 +55,29 @@ def serve(tmp_path: Path, connect: tuple[str, ...], play) -> list[Event]:
 
     async def both() -> None:
         with log_in(tmp_path) as log:
+            stopped = asyncio.Event()
             service = Service(load(None, {"link.connect": connect}, {}), log, events.append)
-            serving = asyncio.create_task(service.serve())
+            serving = asyncio.create_task(service.serve(stopped))
             try:
                 await play(service, events)
             finally:
-                service.stop()
+                stopped.set()
                 await serving
 
     asyncio.run(both())
     return events
+
+
+def test_interrupt_while_the_log_is_created_is_a_stop(tmp_path: Path, monkeypatch) -> None:
+    def create_log(*args, **options):
+        signal.raise_signal(signal.SIGINT)
+        return retention.create_log(*args, **options)
+
+    monkeypatch.setattr(service, "create_log", create_log)
+    flags = {"link.connect": (f"udpin:{LOOPBACK}:{free_port()}",), "log.folder": str(tmp_path)}
+    events: list[Event] = []
+    asyncio.run(service.run(load(None, flags, {}), events.append))
+    assert events[-1].text.startswith("log: closed as ")
 
 
 def test_udp_autopilot_is_answered_and_logged(tmp_path: Path) -> None:

@@ -127,8 +127,10 @@ def test_solutions_are_on_time_with_a_failing_or_blocked_disk(tmp_path: Path, mo
 
     async def play() -> None:
         config = load(None, flags | {"link.connect": (f"udpin:{LOOPBACK}:{port}",)}, {})
-        service = Service(config, log, events.append)
-        serving, flying = (asyncio.create_task(c) for c in (service.serve(), fly(port, arrivals, more)))
+        service, stopped = Service(config, log, events.append), asyncio.Event()
+        serving, flying = (
+            asyncio.create_task(c) for c in (service.serve(stopped), fly(port, arrivals, more))
+        )
         try:
             await until(lambda: len(arrivals) >= 5)
             await phase("working", 1.5)
@@ -144,7 +146,7 @@ def test_solutions_are_on_time_with_a_failing_or_blocked_disk(tmp_path: Path, mo
             await phase("working again", 2.5)
         finally:
             flying.cancel()
-            service.stop()
+            stopped.set()
             await serving
 
     asyncio.run(play())
