@@ -31,7 +31,7 @@ test: $(STAMP) lint ## lint, type check and all tests but those of `flights`
 	$(BIN)/python -m pytest -n auto --dist worksteal -m "not flight"
 
 flights: $(STAMP) ## the tests that fly for minutes of virtual time
-	$(BIN)/python -m pytest -n auto --dist worksteal -m flight
+	$(BIN)/python -m pytest -n auto --dist loadscope -m flight
 
 lint: $(STAMP) ## ruff, mypy --strict and the import contracts
 	$(BIN)/ruff check .

@@ -16,10 +16,10 @@ from typing import TypeAlias
 from companion.transport.peers import PeerTable, Rank
 from companion.transport.send_queue import SendQueue
 
-#: A connection is read up to this number of bytes and of datagrams before others have their turn: input made
+#: A connection is read up to this number of bytes, and for so long, before others have their turn: input made
 #: to be slow to parse (0.3 MB/s) then delays the others by 0.05 s at most.
 READ_SIZE = 1 << 14
-BURST = 64
+TURN_S = 0.003
 INBOX_LIMIT = 1 << 20
 
 
@@ -161,10 +161,8 @@ class Connection:
         return taken
 
     def _on_readable(self) -> None:
-        size = 0
-        for _ in range(BURST):
-            if size >= READ_SIZE:
-                break
+        size, until = 0, self._loop.time() + TURN_S
+        while size < READ_SIZE and self._loop.time() < until:
             try:
                 data = self._receive()
             except BlockingIOError:
