@@ -7,7 +7,7 @@ receiver that hangs goes on with its last numbers under new times. A repeat with
 and reported only if it lasts. The same numbers under a new time are another matter. No two readings
 of a noisy sensor are alike to the last bit, and what moves is not where it was: a position that stands still
 at a speed is false at once, an attitude or an airspeed after seconds, a beacon's answer (rounded to 10 m and
-0.01 degrees: two running are alike once in 1500) at the third of a kind.
+0.01 degrees: two running are alike once in 1500) and a sample of an IMU that turns at the third of a kind.
 
 It knows no other record than the one before of the same source, and no clock but their times.
 """
@@ -23,6 +23,7 @@ from companion.records import (
     AirData,
     Attitude,
     Gnss,
+    Imu,
     LocalPosition,
     Output,
     Reboot,
@@ -39,6 +40,8 @@ PATIENCE_S = 3.0
 AIRSPEED_S, ATTITUDE_S = 10.0, 2.0
 #: Answers of a beacon alike under new times: with azimuth and range, with one of them.
 ANSWERS, HALF_ANSWERS = 3, 5
+#: Samples of an IMU alike under new times; at rest a simulator's are alike, and their rates are zero.
+SAMPLES = 3
 #: Two answers alike and this near are one that came twice, and so are two of anything else: what maps the
 #: autopilot's times is adjusted in between.
 SAME_ANSWER_NS, SAME_NS = 50_000_000, 5_000_000
@@ -85,6 +88,11 @@ LAWS: dict[type[Stamped], Law] = {
         lambda r: f"gnss {r.receiver}",
         lambda r: (r.lat, r.lon, r.alt_msl, r.v_n, r.fix),
         lambda r, times, lasted_s: r.has_3d_fix and _moves(r.v_n),
+    ),
+    Imu: Law(
+        lambda r: f"imu {r.source}",
+        lambda r: (r.f_b, r.w_b),
+        lambda r, times, lasted_s: any(r.w_b) and times >= SAMPLES,
     ),
     Attitude: Law(
         lambda r: "attitude",

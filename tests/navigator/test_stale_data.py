@@ -13,12 +13,14 @@ from companion.navigator.stale_data import (
     ATTITUDE_S,
     HALF_ANSWERS,
     PATIENCE_S,
+    SAMPLES,
     StaleDataDetector,
 )
 from companion.records import (
     AirData,
     Attitude,
     Gnss,
+    Imu,
     LocalOrigin,
     LocalPosition,
     Reboot,
@@ -109,6 +111,15 @@ def test_an_answer_again_and_again_is_a_receiver_that_hangs(azimuth, slant, limi
     found = verdicts([rsbn(float(i), azimuth, slant) for i in range(12)])
     assert found[: limit - 1] == ["used"] * (limit - 1)
     assert all("frozen" in text for text in found[limit - 1 :])
+
+
+@pytest.mark.parametrize(("w_b", "stale"), [((0.0, 0.01, -0.02), True), ((0.0, 0.0, 0.0), False)])
+def test_samples_of_an_imu_alike_are_an_imu_that_hangs_unless_it_rests(w_b, stale: bool) -> None:
+    """Parked, ArduPilot's simulator sends 66 samples alike, and rates of exactly zero."""
+    found = verdicts([Imu(i * NS // 20, i * NS // 20, 0, (0.3, 0.1, -9.8), w_b) for i in range(30)])
+    assert found[: SAMPLES - 1] == ["used"] * (SAMPLES - 1)
+    assert "frozen" in found[SAMPLES - 1] if stale else found[SAMPLES - 1] == "used"
+    assert ("used" in found[SAMPLES - 1 :]) is not stale
 
 
 def test_an_answer_heard_on_two_links_is_used_once_in_whatever_order() -> None:
