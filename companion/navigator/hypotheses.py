@@ -26,6 +26,8 @@ from companion.estimate.bank import (
     enlarge,
     start,
 )
+from companion.estimate.bank.settings import DEFAULT
+from companion.navigator import own_error_model
 from companion.navigator.channel import Channel, Nominal, Transition
 from companion.navigator.corrected_ins import corrected_ins
 from companion.navigator.own_channel import OwnChannel
@@ -68,6 +70,10 @@ SHOCK = ((0, 15.0), (1, 15.0), (2, 15.0), (3, 15.0))  # of a false airspeed that
 SURPRISE = (
     5.0  # a step of 5 m/s beside gusts of 1.2 is one: an onset that is born late explains half of it as wind
 )
+#: The attitude, and the IMU with it, becomes worse and better again within a flight: parked, in a climb, in
+#: aerobatics. With 1e-5, as for an INS, a healthy GNSS was excluded beside a wrong IMU or a wrong heading.
+GRADE_CHANGES_H = 10.0
+HEADING_STEPS_H, HEADING_STEP = 1e-2, 0.3  # rad: a compass, or the autopilot resets its heading
 JAMMED = 100.0  # times likelier while the receiver itself reports jamming or spoofing
 
 
@@ -242,6 +248,7 @@ def _hypotheses(config: Config, channel: Channel, beacons: int, by_air: bool, wi
         states, sigmas = (channel.wind, 1) if not by_air else ((*channel.wind, 2, 3, 0, 1), 3)
         jumps.append(Jump("wind", states, (jump, jump) * sigmas, rate_h, quota=24, often=True))
     if channel.wind:
+        jumps.append(Jump("heading", (own_error_model.HEADING,), (HEADING_STEP,), HEADING_STEPS_H))
         # whatever the model does not know: GNSS is believed again after a second or two
         jumps.append(
             Jump(
@@ -263,5 +270,6 @@ def _hypotheses(config: Config, channel: Channel, beacons: int, by_air: bool, wi
     settings = Settings(
         surprise=SURPRISE,
         rows=config.integrity.rows,
+        switch_h=GRADE_CHANGES_H if channel.wind else DEFAULT.switch_h,
     )
     return Hypotheses(layout, settings, (azimuth_bias, range_bias) * beacons)

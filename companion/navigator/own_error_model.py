@@ -105,7 +105,7 @@ class Amplitudes(NamedTuple):
 
 
 class Grade(NamedTuple):
-    """How many times coarser than the settings: wind change and gusts; crab, tilt and velocity noise."""
+    """How many times coarser than the settings: wind change and gusts; attitude and IMU with all they do."""
 
     wind: float = 1.0
     attitude: float = 1.0
@@ -226,8 +226,8 @@ def prior(settings: Amplitudes, layout: Layout, grades: tuple[Grade, ...]) -> Fl
     sigma[:, SCALE], sigma[:, HEADING], sigma[:, CRAB] = s.scale, s.heading, s.crab
     sigma[:, TILT], sigma[:, ACCELEROMETER], sigma[:, DRIFT] = s.tilt, s.accelerometer_m_s2, s.drift_m
     coarser = np.array([g.attitude for g in grades])
-    sigma[:, CRAB] *= coarser
-    sigma[:, TILT] *= coarser[:, None]
+    scaled = np.r_[HEADING, CRAB, TILT, ACCELEROMETER]
+    sigma[:, scaled] *= coarser[:, None]
     if layout.foreign:
         sigma[:, layout.foreign_at] = s.foreign_m_s
     if layout.latency:
@@ -252,10 +252,10 @@ class Propagator:
         coarser = np.array([g.attitude for g in grades])
         for where, sigma, tau, scaled in (
             (SCALE, s.scale, s.slow_s, False),
-            (HEADING, s.heading, s.slow_s, False),
+            (HEADING, s.heading, s.slow_s, True),
             (CRAB, s.crab, s.crab_s, True),
             (TILT, s.tilt, s.tilt_s, True),
-            (ACCELEROMETER, s.accelerometer_m_s2, s.accelerometer_s, False),
+            (ACCELEROMETER, s.accelerometer_m_s2, s.accelerometer_s, True),
             (DRIFT, s.drift_m, s.drift_s, False),
         ):
             rate[where] = 1.0 / tau
@@ -267,7 +267,7 @@ class Propagator:
         if layout.latency:
             density[:, layout.latency_at] = s.latency_change_s_sqrt_s**2
         self._rate, self._density = rate, density
-        self._imu = np.square(s.velocity_noise_m_s_sqrt_s * coarser)  # velocity noise density by grade
+        self._coarser2 = np.square(coarser)
         self._diagonal = np.arange(n)
         self._wind_seen = np.zeros((len(grades), n, n))
         for k in (0, 1):
@@ -295,7 +295,8 @@ class Propagator:
 
     def _inertial(self, i: Interval, T: float, Phi: Floats, Q: Floats) -> None:
         half, tilt = 0.5 * T * T, self._density[:, 9]
-        _velocity_noise(Phi, Q, T, self._imu + (i.noise / T if T > 0.0 else 0.0))
+        noise = self.settings.velocity_noise_m_s_sqrt_s**2 + (i.noise / T if T > 0.0 else 0.0)
+        _velocity_noise(Phi, Q, T, noise * self._coarser2)
         Phi[0, 9] = Phi[1, 10] = half
         Phi[2, 9] = Phi[3, 10] = T
         Phi[0:4, 11] = i.c2, i.s2, i.c1, i.s1

@@ -567,6 +567,28 @@ def test_a_family_keeps_its_grades():
         assert set(kept.grade[(kept.fault == fault).any(axis=1)]) == {0, 1, 2}
 
 
+@pytest.mark.parametrize(("heard", "grades"), [(True, {0, 1, 2}), (False, {0})])
+def test_every_likely_family_may_change_its_grade_while_a_source_is_heard(heard, grades):
+    """Where only the leading explanation could, it beat the others by that."""
+    layout = flight_layout(grades=(1.0, 1.0, 1.0))
+    bank = b.start(layout, 0.0, np.zeros(layout.n_base), np.eye(layout.n_base), layout.grades)
+    seen = np.full(2, 5.0)
+    bank = b.births(bank._replace(t=5.0, seen=seen), layout, Settings(rows=500, parents=0))
+    fine = bank.grade == 0
+    bank = bank._replace(
+        **{
+            k: getattr(bank, k)[fine]
+            for k in ("x", "P", "grade", "fault", "event", "since", "scale", "noise")
+        },
+        L=normalised(np.zeros(int(fine.sum()))),
+    )
+    later = bank._replace(t=10.0, seen=np.full(2, 10.0) if heard else np.full(2, -1e6))
+    born = b.births(later, layout, Settings(rows=500, switch_h=10.0))
+    families = [born.fault[:, g] == f for f in range(len(layout.faults)) for g in (layout.fault_group(f),)]
+    for family in [(born.fault == NONE).all(axis=1), *families]:
+        assert set(born.grade[family]) == grades
+
+
 @pytest.mark.parametrize("often", [False, True])
 def test_a_jump_born_often_has_the_same_prior_and_its_onset_is_found_sooner(often):
     jump = Jump("drift", (1,), (5.0,), 10.0, often=often)

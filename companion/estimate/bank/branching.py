@@ -58,7 +58,7 @@ def births(
 ) -> Bank:
     """Bear children for what may have started or ended since the last births, and reduce the rows.
 
-    Faults of a silent source are frozen: they neither begin nor end.
+    Faults of a silent source are frozen: they neither begin nor end. Grades change while a source is heard.
 
     Parameters
     ----------
@@ -91,7 +91,8 @@ def births(
         for j, jump in enumerate(layout.jumps):
             since = bank.jumped_t if jump.often else bank.born_t
             children.append(_Child(int(p), _log(jump.rate_h * (bank.t - since) / HOUR_S), jump=j))
-    children += _grade_children(bank, layout, settings, hours)
+    if any(heard):
+        children += _grade_children(bank, layout, settings, hours)
     grown = _with_children(bank, layout, children)
     grown = grown._replace(born_t=bank.t, jumped_t=bank.t)
     return reduce(grown, layout, settings) if reduced else grown
@@ -198,16 +199,27 @@ def _lie_children(parent: int, fault: int, lies: tuple[Lie, ...], prior: float) 
 
 
 def _grade_children(bank: Bank, layout: Layout, settings: Settings, hours: float) -> list[_Child]:
-    """The heaviest row with another grade, where no row of its family has it with the weight of a switch."""
+    """The heaviest row of a family with another grade, where no row of it has that with a change's weight.
+
+    Of the leading family, and of others where the child may bear in turn: where grades change often, the
+    leading explanation would win by changing its grade alone.
+    """
     if settings.switch_h <= 0.0 or len(layout.grades) < 2:
         return []
-    best, family = int(np.argmax(bank.L)), families(bank)
+    family = families(bank)
     prior = _log(settings.switch_h * hours / (len(layout.grades) - 1))
-    out = []
-    for g in range(len(layout.grades)):
-        rows = (bank.grade == g) & (family == family[best])
-        if g != bank.grade[best] and (not rows.any() or bank.L[rows].max() < bank.L[best] + prior):
-            out.append(_Child(best, prior, grade=g))
+    out: list[_Child] = []
+    met: set[int] = set()
+    for i in np.argsort(-bank.L).tolist():
+        if met and bank.L[i] + prior < settings.parent_floor:
+            break
+        if int(family[i]) in met:
+            continue
+        met.add(int(family[i]))
+        for g in range(len(layout.grades)):
+            rows = (bank.grade == g) & (family == family[i])
+            if g != bank.grade[i] and (not rows.any() or bank.L[rows].max() < bank.L[i] + prior):
+                out.append(_Child(i, prior, grade=g))
     return out
 
 
