@@ -96,7 +96,7 @@ LAWS: dict[type[Stamped], Law] = {
     ),
     Attitude: Law(
         lambda r: "attitude",
-        lambda r: (r.roll, r.pitch, r.heading, r.w_b),
+        lambda r: (r.roll, r.pitch, r.heading),  # its rates may go on: they are the gyros' own
         lambda r, times, lasted_s: lasted_s >= ATTITUDE_S,
     ),
     AirData: Law(

@@ -143,6 +143,7 @@ def test_honest_rounding_costs_few_answers() -> None:
     ("make", "limit_s"),
     [
         (lambda t: Attitude(t, t, 0.1, 0.0, 1.0, (0.0, 0.0, 0.1)), ATTITUDE_S),
+        (lambda t: Attitude(t, t, 0.1, 0.0, 1.0, (0.0, 0.0, 1e-12 * t)), ATTITUDE_S),
         (lambda t: AirData(t, t, 38.0, climb=1e-9 * t), AIRSPEED_S),
     ],
 )
