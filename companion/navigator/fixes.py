@@ -48,7 +48,7 @@ def gnss(state: State, record: Gnss, settings: Settings) -> Step:
     state = _begun(state._replace(gnss_first_ns=first_ns), record, settings)
     if state.nominal is None or state.bank is None or is_silent(state, record.t_ns):
         return state, []
-    state = propagated(carried(state, record.t_ns), settings)
+    state = propagated(carried(state, record.t_ns, settings), settings)
     known, channel, nominal = hypotheses(state, settings), settings.model.channel, state.nominal
     assert state.bank is not None
     assert nominal is not None
@@ -114,7 +114,7 @@ def rsbn(state: State, record: RsbnFix, settings: Settings) -> Step:
     name = f"rsbn {record.beacon}"
     if state.nominal is None or state.bank is None or is_silent(state, record.t_ns):
         return state, [Rejection(record.t_ns, record.rx_ns, name, "no channel at its time")]
-    state = propagated(carried(state, record.t_ns), settings)
+    state = propagated(carried(state, record.t_ns, settings), settings)
     state, k, out = _beacon(state, record, settings)
     nominal = state.nominal
     assert nominal is not None

@@ -118,7 +118,7 @@ def _corrected_by(state: State, record: Any, settings: Settings, name: str) -> S
     """Update by a corrector; nothing before the first fix."""
     if state.nominal is None or state.bank is None or is_silent(state, record.t_ns):
         return state, []
-    state = propagated(carried(state, record.t_ns), settings)
+    state = propagated(carried(state, record.t_ns, settings), settings)
     assert state.nominal is not None
     assert state.bank is not None
     rows = _rows_of(state, record, settings)

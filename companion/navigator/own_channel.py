@@ -62,10 +62,14 @@ class Sensors(NamedTuple):
         """When a driver last gave a sample."""
         return {"imu": self.imu_ns, "air": self.air_ns, "foreign": self.foreign_ns, "hold": 0}[by]
 
+    def is_silent(self, by: By, t_ns: int) -> bool:
+        """Whether a driver has given no sample for too long; to go straight on needs none."""
+        return by != "hold" and t_ns - self.last_ns(by) > SILENT_NS[by]
+
     def leads(self, by: By, t_ns: int) -> bool:
         """Whether no better driver than `by` gives samples now."""
         better = ORDER[: ORDER.index(by)]
-        return all(t_ns - self.last_ns(b) > SILENT_NS[b] for b in better)
+        return all(self.is_silent(b, t_ns) for b in better)
 
     def heading(self) -> float | None:
         """Heading of the last attitude, rad."""

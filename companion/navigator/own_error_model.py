@@ -105,7 +105,7 @@ class Amplitudes(NamedTuple):
 
 
 class Grade(NamedTuple):
-    """How many times coarser than the settings: wind change and gusts; attitude and IMU with all they do."""
+    """How many times coarser than the settings: wind change and gusts; attitude, IMU and a held velocity."""
 
     wind: float = 1.0
     attitude: float = 1.0
@@ -290,7 +290,7 @@ class Propagator:
         elif i.by == "foreign":
             self._foreign(T, Phi, Q)
         else:
-            _velocity_noise(Phi, Q, T, self.settings.hold_m_s_sqrt_s**2)
+            _velocity_noise(Phi, Q, T, self.settings.hold_m_s_sqrt_s**2 * self._coarser2)
         return Transition(Phi, Q)
 
     def _inertial(self, i: Interval, T: float, Phi: Floats, Q: Floats) -> None:
@@ -362,7 +362,7 @@ class Propagator:
         return Row(y, H, often * self._gust2 * nose_covariance(V, s.gust_along_m_s, s.gust_across_m_s))
 
 
-def _velocity_noise(Phi: Floats, Q: Floats, T: float, density: float | Floats) -> None:
+def _velocity_noise(Phi: Floats, Q: Floats, T: float, density: Floats) -> None:
     square, cube = density * (0.5 * T * T), density * (T * T * T / 3.0)
     for k in (0, 1):
         Phi[k, 2 + k] = T

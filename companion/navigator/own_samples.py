@@ -53,20 +53,26 @@ def airspeed_sensor(state: State, record: AirspeedSensor, settings: Settings) ->
 
 
 def attitude(state: State, record: Attitude, settings: Settings) -> Step:
-    """Remember an attitude; without a driver the nominal trajectory goes straight on."""
-    s = state.sensors
-    s = s._replace(strap=strapdown_channel.sense(s.strap, record), air=air_data_channel.sense(s.air, record))
-    state = state._replace(sensors=s)
-    if state.nominal is None or not s.leads("hold", record.t_ns):
-        return state, []
-    return _driven(state, record, "hold", None, settings)
+    """Remember an attitude."""
+    return _straight_on(_sensed(state, record), record, settings)
 
 
 def pressure(state: State, record: Pressure, settings: Settings) -> Step:
     """Remember a static pressure."""
+    return _straight_on(_sensed(state, record), record, settings)
+
+
+def _sensed(state: State, record: Attitude | Pressure) -> State:
     s = state.sensors
     s = s._replace(strap=strapdown_channel.sense(s.strap, record), air=air_data_channel.sense(s.air, record))
-    return state._replace(sensors=s), []
+    return state._replace(sensors=s)
+
+
+def _straight_on(state: State, record: Stamped, settings: Settings) -> Step:
+    """Without a driver the nominal trajectory goes straight on, by whatever sample is still there."""
+    if not state.sensors.leads("hold", record.t_ns):
+        return state, []
+    return _driven(state, record, "hold", None, settings)
 
 
 def imu(state: State, record: Imu, settings: Settings) -> Step:
@@ -78,7 +84,7 @@ def imu(state: State, record: Imu, settings: Settings) -> Step:
     strap = strapdown_channel.receive(s.strap, record)
     s = s._replace(strap=strap)
     if strap.why or strap.C_nb is None:
-        return state._replace(sensors=s), []
+        return _straight_on(state._replace(sensors=s), record, settings)
     now = strapdown_channel.acceleration(strap)
     fresh = record.t_ns - s.imu_ns <= own_channel.SILENT_NS["imu"]
     before = s.accelerations[-2:] if fresh else ()
@@ -110,12 +116,12 @@ def air_data(state: State, record: AirData, settings: Settings) -> Step:
     s = state.sensors._replace(ground=ground, air_ns=record.t_ns if ground.flying else s.air_ns)
     state = state._replace(sensors=s)
     if not ground.flying:
-        return _driven(state, record, "hold", None, settings) if s.leads("hold", record.t_ns) else (state, [])
+        return _straight_on(state, record, settings)
     if s.leads("air", record.t_ns):
         return _driven(state, record, "air", V, settings)
     if not is_driven_by(state, "imu"):
         return state, []
-    state = carried(state, record.t_ns)
+    state = carried(state, record.t_ns, settings)
     assert state.nominal is not None
     v_n = state.nominal.point.v_n
     sums = s.sums or AirspeedSums(record.t_ns, 0, (0.0, 0.0), (0.0, 0.0))
@@ -170,7 +176,7 @@ def foreign_position(state: State, record: LocalPosition, settings: Settings) ->
         return _driven(state, record, "foreign", velocity, settings)
     if before is not None and record.t_ns // FOREIGN_EVERY_NS == before.t_ns // FOREIGN_EVERY_NS:
         return state, []
-    state = propagated(carried(state, record.t_ns), settings)
+    state = propagated(carried(state, record.t_ns, settings), settings)
     assert state.bank is not None
     assert state.nominal is not None
     v_n = state.nominal.point.v_n
@@ -190,7 +196,7 @@ def _driven(state: State, record: Stamped, by: By, sample: Vector2 | None, setti
     assert nominal.interval is not None
     if nominal.interval.by != by:
         s = s._replace(sums=None)
-        state = propagated(carried(state, record.t_ns), settings)._replace(sensors=s)
+        state = propagated(carried(state, record.t_ns, settings), settings)._replace(sensors=s)
         assert state.nominal is not None
         velocity = sample if by in ("air", "foreign") and sample else state.nominal.point.v_n[:2]
         nominal = own_channel.restart(state.nominal, by, velocity)

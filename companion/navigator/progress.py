@@ -40,14 +40,18 @@ CONFIRM_NS = SECOND_NS  # one fix in disagreement is an outlier: a source is exc
 FAR_M, FAST_M_S = 500.0, 5.0  # the nominal trajectory is brought back from this far off
 
 
-def carried(state: State, t_ns: int) -> State:
-    """With the nominal trajectory carried on to `t_ns`."""
+def carried(state: State, t_ns: int, settings: Settings) -> State:
+    """With the nominal trajectory carried on to `t_ns`: by its driver, or straight on if that is silent."""
     nominal = state.nominal
     assert nominal is not None
     dt = (t_ns - nominal.t_ns) * 1e-9
     if dt <= 0.0:
         return state
     if nominal.interval is not None:
+        if state.sensors.is_silent(nominal.interval.by, t_ns):
+            state = propagated(state, settings)
+            assert state.nominal is not None
+            nominal = own_channel.restart(state.nominal, "hold", state.nominal.point.v_n[:2])
         return state._replace(nominal=own_channel.carry_on(nominal, state.sensors, t_ns))
     v, a = nominal.point.v_n, nominal.a_n
     point = moved(nominal.point, (v[0] + a[0] * dt, v[1] + a[1] * dt), t_ns)

@@ -81,25 +81,55 @@ def test_a_turn_in_turbulence_with_a_beacon_leaves_a_healthy_gnss_beyond_doubt(
     # one bank excluded GNSS 89 s after the start of the first log, and led the aircraft 148 m off; a later
     # one held it false with probability 0.998 in the second; another excluded it beside a wrong heading and
     # a wrong IMU, up to 678 m off
-    decoder = msgspec.json.Decoder(Input)
-    navigator = Navigator(load(flags={"output.profile": "ardupilot"}, environment={}))
-    fix, apart, rejected, doubt = None, [], [], 0.0
-    with gzip.open(DATA / f"{name}.jsonl.gz") as lines:
-        for line in lines:
-            record = decoder.decode(line)
-            record = record if spoil is None else spoil(record)
-            if isinstance(record, Gnss) and record.has_3d_fix:
-                fix = record
-            for out in navigator.handle(record):
-                if isinstance(out, Rejection):
-                    rejected.append(out)
-                elif isinstance(out, Solution) and fix is not None and fix.v_n is not None:
-                    dt = (out.t_ns - fix.t_ns) * 1e-9
-                    north = 6.371e6 * (out.lat - fix.lat) - dt * fix.v_n[0]
-                    east = 6.371e6 * math.cos(fix.lat) * (out.lon - fix.lon) - dt * fix.v_n[1]
-                    apart.append(math.hypot(north, east))
-                    doubt = max(doubt, out.gnss_false or 0.0)
-            navigator.settle()
-    assert not [r for r in rejected if r.source == "gnss"]
+    records = recorded(name)
+    apart, doubt = flown(records if spoil is None else [spoil(r) for r in records])
     assert len(apart) > 700 and max(apart) < most_m
     assert doubt < 0.05
+
+
+@pytest.mark.parametrize("frozen", [False, True])
+@pytest.mark.parametrize("name", ["plane_turbulence_cut", "plane_turn_cut", "plane_take_off_cut"])
+def test_an_attitude_that_stops_or_stands_still_leaves_a_healthy_gnss_beyond_doubt(
+    name: str, frozen: bool
+) -> None:
+    # with the last acceleration carried on to each fix GNSS was excluded, up to 402 m off; and no position
+    # went out any more
+    records = recorded(name)
+    begin_ns = records[0].rx_ns + (records[-1].rx_ns - records[0].rx_ns) * 3 // 20
+    last = next(r for r in records if isinstance(r, Attitude) and r.rx_ns > begin_ns)
+    spoilt: list[Input] = []
+    for r in records:
+        if not isinstance(r, Attitude) or r.rx_ns <= begin_ns:
+            spoilt.append(r)
+        elif frozen:  # the rates, the gyros' own, go on
+            spoilt.append(msgspec.structs.replace(r, roll=last.roll, pitch=last.pitch, heading=last.heading))
+    apart, doubt = flown(spoilt)
+    assert len(apart) > 700 and max(apart) < 5.0
+    assert doubt < 0.05
+
+
+def recorded(name: str) -> list[Input]:
+    decoder = msgspec.json.Decoder(Input)
+    with gzip.open(DATA / f"{name}.jsonl.gz") as lines:
+        return [decoder.decode(line) for line in lines]
+
+
+def flown(records: list[Input]) -> tuple[list[float], float]:
+    """How far each position is off GNSS, m, and the greatest doubt of GNSS, which is never rejected."""
+    navigator = Navigator(load(flags={"output.profile": "ardupilot"}, environment={}))
+    fix, apart, rejected, doubt = None, [], [], 0.0
+    for record in records:
+        if isinstance(record, Gnss) and record.has_3d_fix:
+            fix = record
+        for out in navigator.handle(record):
+            if isinstance(out, Rejection):
+                rejected.append(out)
+            elif isinstance(out, Solution) and fix is not None and fix.v_n is not None:
+                dt = (out.t_ns - fix.t_ns) * 1e-9
+                north = 6.371e6 * (out.lat - fix.lat) - dt * fix.v_n[0]
+                east = 6.371e6 * math.cos(fix.lat) * (out.lon - fix.lon) - dt * fix.v_n[1]
+                apart.append(math.hypot(north, east))
+                doubt = max(doubt, out.gnss_false or 0.0)
+        navigator.settle()
+    assert not [r for r in rejected if r.source.startswith("gnss")]
+    return apart, doubt
