@@ -2,7 +2,8 @@
 
 A message may leave before its time, right after a beacon fix, if that raises its mean rate by no more than
 EARLY_SHARE: the time gained is taken from a budget that grows by this share of the elapsed time. So neither
-frequent fixes nor a flood of forged ones changes the rate that the autopilot expects.
+frequent fixes nor a flood of forged ones changes the rate that the autopilot expects. No message leaves twice
+with one time: ArduPilot drops the second.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ class Pace:
             at = min(at, last + period)  # the period was shortened
             missing = at - t_ns
             budget = min(budget + EARLY_SHARE * max(t_ns - last, 0), period)
-            if missing > 0 and not (name in early and missing <= budget):
+            if missing > 0 and not (name in early and missing <= budget and t_ns > last):
                 continue
             found.append(name)
             if missing > 0:

@@ -41,6 +41,13 @@ def test_a_fix_once_a_second_goes_out_at_once() -> None:
     assert len(fixes & found) >= 0.9 * len(fixes)
 
 
+def test_a_fix_at_the_time_of_a_message_is_in_the_next_one() -> None:
+    """An autopilot takes one of two messages with the same time; the budget is kept for a later fix."""
+    times = sorted([*range(0, 60_000 * MS, 100 * MS), *range(0, 60_000 * MS, 1000 * MS)])
+    found = sent(times, set(times))
+    assert len(found) == len(set(found)) == 600
+
+
 @pytest.mark.parametrize("late_ms", [30, 250])
 def test_a_minimum_period_is_never_shortened(late_ms: int) -> None:
     times = [k * 10 * MS for k in range(100) if not 20 < k < 20 + late_ms // 10]
