@@ -88,7 +88,7 @@ class AirDataConfig(Section, frozen=True):
     wind_jump_m_s: Annotated[float, Meta(ge=0.1, le=100.0)] = 4.0  # of wind jumps, north and east
     wind_jumps_per_hour: Annotated[float, Meta(ge=0.001, le=60.0)] = 1.0
     gust_m_s: Annotated[float, Meta(ge=0.01, le=50.0)] = 1.2
-    gust_s: Annotated[float, Meta(ge=0.01, le=60.0)] = 2.0
+    gust_s: Annotated[float, Meta(ge=0.01, le=60.0)] = 1.0
     airspeed_percent: Annotated[float, Meta(ge=0.1, le=50.0)] = 3.0
     heading_deg: Annotated[float, Meta(ge=0.05, le=45.0)] = 1.5
     correlation_min: Annotated[float, Meta(ge=0.1, le=1000.0)] = 10.0  # of airspeed and heading errors
@@ -105,7 +105,7 @@ class StrapdownConfig(Section, frozen=True):
     """
 
     imu: Annotated[int, Meta(ge=0, le=2)] = 0  # index of the IMU
-    tilt_deg: Annotated[float, Meta(ge=0.01, le=30.0)] = 1.2
+    tilt_deg: Annotated[float, Meta(ge=0.01, le=30.0)] = 2.0
     tilt_s: Annotated[float, Meta(ge=1.0, le=3600.0)] = 30.0
     accelerometer_m_s2: Annotated[float, Meta(ge=0.0001, le=10.0)] = 0.1  # including misalignment
     velocity_noise_m_s_sqrt_s: Annotated[float, Meta(ge=1e-6, le=10.0)] = 0.15

@@ -66,6 +66,8 @@ GNSS_FIRST = (
     Lie(2000.0, STILL, share=0.05),
 )
 AIRSPEED_LIES = (Lie(3.0, 0.03), Lie(15.0, 0.3))  # m/s, m/s^2
+GUST = tuple(range(own_error_model.GUST.start, own_error_model.GUST.stop))
+GUST_OPEN_M_S = 3.0  # what the gust may have taken up of a step of the wind
 SHOCK = ((0, 15.0), (1, 15.0), (2, 15.0), (3, 15.0))  # of a false airspeed that moves the nominal: m, m/s
 SURPRISE = (
     5.0  # a step of 5 m/s beside gusts of 1.2 is one: an onset that is born late explains half of it as wind
@@ -244,9 +246,11 @@ def _hypotheses(config: Config, channel: Channel, beacons: int, by_air: bool, wi
     if channel.wind:
         jump = config.air_data.wind_jump_m_s
         rate_h = config.air_data.wind_jumps_per_hour
-        # by air data the velocity over ground jumps with the wind; it is noticed up to a second later
-        states, sigmas = (channel.wind, 1) if not by_air else ((*channel.wind, 2, 3, 0, 1), 3)
-        jumps.append(Jump("wind", states, (jump, jump) * sigmas, rate_h, quota=24, often=True))
+        # until it is noticed, up to a second later, the gust takes it up, and by air data the velocity over
+        # ground, with the position, jumps with it
+        moved = (2, 3, 0, 1) if by_air else ()
+        sigmas = (jump, jump, GUST_OPEN_M_S, GUST_OPEN_M_S, *(jump,) * len(moved))
+        jumps.append(Jump("wind", (*channel.wind, *GUST, *moved), sigmas, rate_h, quota=24, often=True))
     if channel.wind:
         jumps.append(Jump("heading", (own_error_model.HEADING,), (HEADING_STEP,), HEADING_STEPS_H))
         # whatever the model does not know: GNSS is believed again after a second or two

@@ -148,23 +148,22 @@ def gnss_velocity(
     return _taken(after, seen, 2)
 
 
-def airspeed(
-    bank: Bank, known: Hypotheses, channel: OwnChannel, V: Vector2, velocity: Vector2, seconds: float
-) -> Taken:
+def airspeed(bank: Bank, known: Hypotheses, channel: OwnChannel, V: Vector2, velocity: Vector2) -> Taken:
     """Take airspeed and heading as a velocity through the air; a false airspeed is wrong along the nose.
 
-    `V` and the nominal `velocity` (m/s) are means over the same samples of the last `seconds`.
+    `V` and the nominal `velocity` (m/s) are means over the same samples.
     """
     layout = known.layout
-    row = channel.propagator.airspeed_row(velocity, V, seconds)
+    row = channel.propagator.airspeed_row(velocity, V)
     H = np.zeros((len(bank.L), 2, layout.n))
     H[:, :, : channel.n] = row.H
     speed = max(math.hypot(*V), 1.0)
     false = (bank.fault[:, AIRSPEED_GROUP] != banks.NONE).astype(np.float64)
     lie = layout.lie_states(AIRSPEED)[0]
     H[:, 0, lie], H[:, 1, lie] = -false * V[0] / speed, -false * V[1] / speed
-    R = row.R[bank.grade]
-    after, seen = banks.update(bank, layout, row.y, H, R, None, known.settings, outlier=OUTLIER["velocity"])
+    after, seen = banks.update(
+        bank, layout, row.y, H, row.R, None, known.settings, outlier=OUTLIER["velocity"]
+    )
     heard = after.seen.copy()
     heard[AIRSPEED] = after.t
     return _taken(after._replace(seen=heard), seen, 2)

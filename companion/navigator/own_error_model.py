@@ -11,7 +11,7 @@ Errors are nominal minus truth, north and east. The wind is the wind itself, not
 
     dp' = dv
     dv' = tilt + R(heading) accelerometer + heading J a + white           (imu)
-    dv  = -wind + (scale + (heading + crab) J) V + gust                   (air; not integrated, substituted)
+    dv  = -wind - gust + (scale + (heading + crab) J) V                   (air; not integrated, substituted)
     dv  = foreign + white                                                 (foreign; substituted)
     dv' = white                                                           (hold)
 
@@ -22,8 +22,10 @@ not move the aircraft: it shows in the difference of accelerometers and airspeed
 
 `heading` is what is wrong with the heading for minutes, `crab` for seconds (bank-dependent compass error,
 sideslip); only `crab` is not shared with the IMU. `tilt` (m/s^2) is gravity seen through the tilt of the
-attitude. A `Grade` states how many times coarser wind and attitude are than the settings say; one Phi serves
-all grades and Q has one layer for each.
+attitude. `gust` is the part of the wind that lasts a second: as a state, not as noise, it shows a step of the
+wind at once, which differs from the gust of half a second ago by more than a gust changes. A grade states how
+many times coarser attitude and IMU are than the settings say; one Phi serves all grades and Q has one layer
+for each.
 
 An `Interval` sums what Phi needs over many samples (a dozen numbers), so that Phi and Q are made once per
 measurement. Not modelled: Schuler loop, vertical channel (heights are pressure altitudes), Coriolis (it is
@@ -48,12 +50,14 @@ LONGEST_S = 1.0  # close an interval at this length even without a measurement: 
 
 POSITION, VELOCITY, WIND = slice(0, 2), slice(2, 4), slice(4, 6)
 SCALE, HEADING, CRAB = 6, 7, 8
-TILT, ACCELEROMETER, DRIFT = slice(9, 11), slice(11, 13), slice(13, 15)
-N_BASE = 15
+TILT, ACCELEROMETER, DRIFT, GUST = slice(9, 11), slice(11, 13), slice(13, 15), slice(15, 17)
+N_BASE = 17
+
+AIRSPEED_NOISE_M_S, AIRSPEED_MEAN_S = 1.0, 0.5  # pitot, angle of attack, sideslip: of so long a mean
 
 
 class Layout(NamedTuple):
-    """Which optional states follow the 15 basic ones."""
+    """Which optional states follow the 17 basic ones."""
 
     foreign: bool = False
     latency: bool = False
@@ -92,9 +96,8 @@ class Amplitudes(NamedTuple):
     accelerometer_s: float = 600.0
     velocity_noise_m_s_sqrt_s: float = 0.15
     hold_m_s_sqrt_s: float = 2.0
-    gust_along_m_s: float = 1.2
-    gust_across_m_s: float = 1.0
-    gust_s: float = 2.0
+    gust_m_s: float = 1.2
+    gust_s: float = 1.0
     drift_m: float = 1.5
     drift_s: float = 300.0
     foreign_m_s: float = 0.3
@@ -104,14 +107,8 @@ class Amplitudes(NamedTuple):
     latency_change_s_sqrt_s: float = 1e-4
 
 
-class Grade(NamedTuple):
-    """How many times coarser than the settings: wind change and gusts; attitude, IMU and a held velocity."""
-
-    wind: float = 1.0
-    attitude: float = 1.0
-
-
-GRADES = (Grade(1.0, 1.0), Grade(1.0, 4.0), Grade(1.0, 8.0))
+#: How many times coarser than the settings attitude, IMU and a held velocity are.
+GRADES = (1.0, 4.0, 8.0)
 
 
 class Interval(NamedTuple):
@@ -147,7 +144,7 @@ class Transition(NamedTuple):
 
 
 class Row(NamedTuple):
-    """y (m,) = H (m, n) x + noise of covariance R (m, m), or (grades, m, m); the innovation is y - H x."""
+    """y (m,) = H (m, n) x + noise of covariance R (m, m); the innovation is y - H x."""
 
     y: Floats
     H: Floats
@@ -218,14 +215,15 @@ def add_hold(i: Interval, dt: float) -> Interval:
 # ---------------------------------------------------------------------------------------------------------
 
 
-def prior(settings: Amplitudes, layout: Layout, grades: tuple[Grade, ...]) -> Floats:
+def prior(settings: Amplitudes, layout: Layout, grades: tuple[float, ...]) -> Floats:
     """Return the first covariances (grades, n, n); the estimate is zero."""
     s = settings
     sigma = np.empty((len(grades), layout.n))
     sigma[:, POSITION], sigma[:, VELOCITY], sigma[:, WIND] = s.position_m, s.velocity_m_s, s.wind_m_s
     sigma[:, SCALE], sigma[:, HEADING], sigma[:, CRAB] = s.scale, s.heading, s.crab
     sigma[:, TILT], sigma[:, ACCELEROMETER], sigma[:, DRIFT] = s.tilt, s.accelerometer_m_s2, s.drift_m
-    coarser = np.array([g.attitude for g in grades])
+    sigma[:, GUST] = s.gust_m_s
+    coarser = np.array(grades)
     scaled = np.r_[HEADING, CRAB, TILT, ACCELEROMETER]
     sigma[:, scaled] *= coarser[:, None]
     if layout.foreign:
@@ -244,12 +242,11 @@ class Propagator:
         The error model, its optional states, and the ladder.
     """
 
-    def __init__(self, settings: Amplitudes, layout: Layout, grades: tuple[Grade, ...] = GRADES) -> None:
+    def __init__(self, settings: Amplitudes, layout: Layout, grades: tuple[float, ...] = GRADES) -> None:
         self.settings, self.layout, self.grades = settings, layout, grades
         s, n = settings, layout.n
         rate, density = np.zeros(n), np.zeros((len(grades), n))
-        wind = np.array([g.wind for g in grades])
-        coarser = np.array([g.attitude for g in grades])
+        coarser = np.array(grades)
         for where, sigma, tau, scaled in (
             (SCALE, s.scale, s.slow_s, False),
             (HEADING, s.heading, s.slow_s, True),
@@ -257,11 +254,12 @@ class Propagator:
             (TILT, s.tilt, s.tilt_s, True),
             (ACCELEROMETER, s.accelerometer_m_s2, s.accelerometer_s, True),
             (DRIFT, s.drift_m, s.drift_s, False),
+            (GUST, s.gust_m_s, s.gust_s, False),
         ):
             rate[where] = 1.0 / tau
             amplitude = sigma * (coarser if scaled else np.ones_like(coarser))
             density[:, where] = ((2.0 / tau) * amplitude**2).reshape(-1, *([1] * isinstance(where, slice)))
-        density[:, WIND] = np.square(s.wind_change_m_s_sqrt_s * wind)[:, None]
+        density[:, WIND] = s.wind_change_m_s_sqrt_s**2
         if layout.foreign:
             density[:, layout.foreign_at] = s.foreign_change_m_s_sqrt_s**2
         if layout.latency:
@@ -269,11 +267,10 @@ class Propagator:
         self._rate, self._density = rate, density
         self._coarser2 = np.square(coarser)
         self._diagonal = np.arange(n)
-        self._wind_seen = np.zeros((len(grades), n, n))
+        self._wind_seen = np.zeros((n, n))
         for k in (0, 1):
-            self._wind_seen[:, 2 + k, 2 + k] = density[:, 4]
-            self._wind_seen[:, 2 + k, 4 + k] = self._wind_seen[:, 4 + k, 2 + k] = -density[:, 4]
-        self._gust2 = np.square(wind)[:, None, None]
+            self._wind_seen[2 + k, 2 + k] = s.wind_change_m_s_sqrt_s**2
+            self._wind_seen[2 + k, 4 + k] = self._wind_seen[4 + k, 2 + k] = -(s.wind_change_m_s_sqrt_s**2)
 
     def transition(self, i: Interval) -> Transition:
         """Return Phi (n, n) and Q (grades, n, n) of an interval of at most `LONGEST_S`."""
@@ -282,7 +279,7 @@ class Propagator:
         Phi = np.zeros((self.layout.n, self.layout.n))
         Phi[self._diagonal, self._diagonal] = decay
         Q = np.zeros((len(self.grades), self.layout.n, self.layout.n))
-        Q[:, self._diagonal, self._diagonal] = self._density * (0.5 * T * (1.0 + decay * decay))
+        Q[:, self._diagonal, self._diagonal] = self._density * self._grown(T, decay)
         if i.by == "imu":
             self._inertial(i, T, Phi, Q)
         elif i.by == "air":
@@ -292,6 +289,11 @@ class Propagator:
         else:
             _velocity_noise(Phi, Q, T, self.settings.hold_m_s_sqrt_s**2 * self._coarser2)
         return Transition(Phi, Q)
+
+    def _grown(self, T: float, decay: Floats) -> Floats:
+        """Variance that unit density adds to each state in `T` seconds."""
+        rate = np.where(self._rate > 0.0, self._rate, 1.0)
+        return np.where(self._rate > 0.0, (1.0 - decay * decay) / (2.0 * rate), T)
 
     def _inertial(self, i: Interval, T: float, Phi: Floats, Q: Floats) -> None:
         half, tilt = 0.5 * T * T, self._density[:, 9]
@@ -315,16 +317,23 @@ class Propagator:
         Phi[2, 4] = Phi[3, 5] = -1.0
         Phi[0:4, SCALE] = i.n1, i.e1, n, e
         Phi[0:4, HEADING] = Phi[0:4, CRAB] = -i.e1, i.n1, -e, n
-        gust = self._gust2 * nose_covariance(i.V, s.gust_along_m_s, s.gust_across_m_s)
-        both = gust * (
-            -s.gust_s * math.expm1(-T / s.gust_s)
-        )  # integral of the gust times the gust at the end
+        Q += T * self._wind_seen  # wind, gust and crab that come up within the interval: the velocity follows
+        kept = math.exp(-T / s.gust_s)
+        way = s.gust_s * (1.0 - kept)  # integral of a gust of 1 m/s
+        variance, half = s.gust_m_s**2, 0.5 * s.gust_s * (1.0 - kept * kept)
+        new, both = variance * (1.0 - kept * kept), variance * way * way / s.gust_s
+        moved = 2.0 * variance * s.gust_s * (T - 2.0 * way + half)
+        for k in (0, 1):
+            gust = GUST.start + k
+            Phi[k, gust], Phi[2 + k, gust] = -way, -kept
+            Q[:, k, k] += moved + AIRSPEED_NOISE_M_S**2 * AIRSPEED_MEAN_S * T
+            Q[:, 2 + k, 2 + k] += new + AIRSPEED_NOISE_M_S**2
+            Q[:, k, 2 + k] += both
+            Q[:, 2 + k, k] += both
+            Q[:, k, gust] = Q[:, gust, k] = -both
+            Q[:, 2 + k, gust] = Q[:, gust, 2 + k] = -new
         crab = self._density[:, CRAB] * T
-        Q += T * self._wind_seen  # wind and crab that come up within the interval: the velocity follows
-        Q[:, 0:2, 0:2] += (2.0 * s.gust_s * T) * gust
-        Q[:, 0:2, 2:4] += both
-        Q[:, 2:4, 0:2] += both
-        Q[:, 2:4, 2:4] += gust + crab[:, None, None] * np.array(((e * e, -n * e), (-n * e, n * n)))
+        Q[:, 2:4, 2:4] += crab[:, None, None] * np.array(((e * e, -n * e), (-n * e, n * n)))
         Q[:, 2, CRAB] = Q[:, CRAB, 2] = -e * crab
         Q[:, 3, CRAB] = Q[:, CRAB, 3] = n * crab
 
@@ -340,8 +349,8 @@ class Propagator:
             Q[:, 2 + k, at + k] += change
             Q[:, at + k, 2 + k] += change
 
-    def airspeed_row(self, velocity: Vector2, V: Vector2, seconds: float) -> Row:
-        """Return the row of airspeed and heading as a velocity vector; not in `air` intervals, <= 2 Hz.
+    def airspeed_row(self, velocity: Vector2, V: Vector2) -> Row:
+        """Return the row of airspeed and heading as a velocity vector; not in `air` intervals.
 
         Parameters
         ----------
@@ -349,17 +358,14 @@ class Propagator:
             Nominal velocity over ground (m/s), mean over the samples since the last such row.
         V
             Measured velocity through the air (m/s), `air_velocity`, mean over the same samples.
-        seconds
-            Time since the last such row: gusts last `gust_s`, so that frequent rows weigh less each.
         """
-        s = self.settings
         H = np.zeros((2, self.layout.n))
         H[0, 2] = H[1, 3] = H[0, 4] = H[1, 5] = 1.0
+        H[0, GUST.start] = H[1, GUST.start + 1] = 1.0
         H[:, SCALE] = -V[0], -V[1]
         H[:, HEADING] = H[:, CRAB] = V[1], -V[0]
         y = np.array((velocity[0] - V[0], velocity[1] - V[1]))
-        often = max(2.0 * s.gust_s / max(seconds, 0.05), 1.0)
-        return Row(y, H, often * self._gust2 * nose_covariance(V, s.gust_along_m_s, s.gust_across_m_s))
+        return Row(y, H, np.eye(2) * AIRSPEED_NOISE_M_S**2)
 
 
 def _velocity_noise(Phi: Floats, Q: Floats, T: float, density: Floats) -> None:
@@ -369,17 +375,6 @@ def _velocity_noise(Phi: Floats, Q: Floats, T: float, density: Floats) -> None:
         Q[:, k, k] = cube
         Q[:, k, 2 + k] = Q[:, 2 + k, k] = square
         Q[:, 2 + k, 2 + k] = density * T
-
-
-def nose_covariance(V: Vector2, along: float, across: float) -> Floats:
-    """Return the covariance (2, 2), north and east, of sigmas along and across the air velocity `V`."""
-    n, e = V
-    speed2 = n * n + e * e
-    a, b = along * along, across * across
-    if speed2 < 1.0:
-        return np.diag((max(a, b), max(a, b)))
-    nn, ne, ee = n * n / speed2, n * e / speed2, e * e / speed2
-    return np.array(((a * nn + b * ee, (a - b) * ne), ((a - b) * ne, a * ee + b * nn)))
 
 
 # ---------------------------------------------------------------------------------------------------------

@@ -135,14 +135,13 @@ def air_data(state: State, record: AirData, settings: Settings) -> Step:
         return state._replace(sensors=s._replace(sums=sums)), []
     state = propagated(state, settings)
     assert state.bank is not None
-    n, seconds = sums.samples, (record.t_ns - sums.start_ns) * 1e-9
+    n = sums.samples
     taken = measurements.airspeed(
         state.bank,
         hypotheses(state, settings),
         _own(settings),
         (sums.air[0] / n, sums.air[1] / n),
         (sums.velocity[0] / n, sums.velocity[1] / n),
-        seconds,
     )
     sums = AirspeedSums(record.t_ns, 0, (0.0, 0.0), (0.0, 0.0))
     sensors = state.sensors._replace(measured_ns=record.t_ns, sums=sums)
