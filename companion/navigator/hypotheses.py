@@ -246,11 +246,11 @@ def _hypotheses(config: Config, channel: Channel, beacons: int, by_air: bool, wi
     if channel.wind:
         jump = config.air_data.wind_jump_m_s
         rate_h = config.air_data.wind_jumps_per_hour
-        # until it is noticed, up to a second later, the gust takes it up, and by air data the velocity over
-        # ground, with the position, jumps with it
-        moved = (2, 3, 0, 1) if by_air else ()
-        sigmas = (jump, jump, GUST_OPEN_M_S, GUST_OPEN_M_S, *(jump,) * len(moved))
-        jumps.append(Jump("wind", (*channel.wind, *GUST, *moved), sigmas, rate_h, quota=24, often=True))
+        # it is noticed up to a second later: beside the IMU the gust has taken it up until then; by air data
+        # the velocity over ground jumps with the wind
+        states = (*channel.wind, *((2, 3, 0, 1) if by_air else GUST))
+        sigmas = (jump,) * 6 if by_air else (jump, jump, GUST_OPEN_M_S, GUST_OPEN_M_S)
+        jumps.append(Jump("wind", states, sigmas, rate_h, quota=24, often=True))
     if channel.wind:
         jumps.append(Jump("heading", (own_error_model.HEADING,), (HEADING_STEP,), HEADING_STEPS_H))
         # whatever the model does not know: GNSS is believed again after a second or two

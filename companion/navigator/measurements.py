@@ -148,13 +148,16 @@ def gnss_velocity(
     return _taken(after, seen, 2)
 
 
-def airspeed(bank: Bank, known: Hypotheses, channel: OwnChannel, V: Vector2, velocity: Vector2) -> Taken:
+def airspeed(
+    bank: Bank, known: Hypotheses, channel: OwnChannel, V: Vector2, velocity: Vector2, manoeuvre: float
+) -> Taken:
     """Take airspeed and heading as a velocity through the air; a false airspeed is wrong along the nose.
 
-    `V` and the nominal `velocity` (m/s) are means over the same samples.
+    `V` and the nominal `velocity` (m/s) are means over the same samples, `manoeuvre` the
+    acceleration above that of level flight (m/s^2).
     """
     layout = known.layout
-    row = channel.propagator.airspeed_row(velocity, V)
+    row = channel.propagator.airspeed_row(velocity, V, manoeuvre)
     H = np.zeros((len(bank.L), 2, layout.n))
     H[:, :, : channel.n] = row.H
     speed = max(math.hypot(*V), 1.0)

@@ -11,7 +11,7 @@ Errors are nominal minus truth, north and east. The wind is the wind itself, not
 
     dp' = dv
     dv' = tilt + R(heading) accelerometer + heading J a + white           (imu)
-    dv  = -wind - gust + (scale + (heading + crab) J) V                   (air; not integrated, substituted)
+    dv  = -wind + (scale + (heading + crab) J) V + turbulence             (air; not integrated, substituted)
     dv  = foreign + white                                                 (foreign; substituted)
     dv' = white                                                           (hold)
 
@@ -22,10 +22,13 @@ not move the aircraft: it shows in the difference of accelerometers and airspeed
 
 `heading` is what is wrong with the heading for minutes, `crab` for seconds (bank-dependent compass error,
 sideslip); only `crab` is not shared with the IMU. `tilt` (m/s^2) is gravity seen through the tilt of the
-attitude. `gust` is the part of the wind that lasts a second: as a state, not as noise, it shows a step of the
-wind at once, which differs from the gust of half a second ago by more than a gust changes. A grade states how
-many times coarser attitude and IMU are than the settings say; one Phi serves all grades and Q has one layer
-for each.
+attitude. A grade states how many times coarser attitude and IMU are than the settings say; one Phi serves all
+grades and Q has one layer for each.
+
+Beside the IMU the part of the wind that lasts a second is a state, `gust`: a step of the wind differs from
+the gust of half a second ago by more than a gust changes, so it shows at once. White noise would hide it for
+ten seconds. By airspeed alone gusts cannot be told from motion: turbulence is white noise there, with its
+part that lasts for seconds.
 
 An `Interval` sums what Phi needs over many samples (a dozen numbers), so that Phi and Q are made once per
 measurement. Not modelled: Schuler loop, vertical channel (heights are pressure altitudes), Coriolis (it is
@@ -53,7 +56,10 @@ SCALE, HEADING, CRAB = 6, 7, 8
 TILT, ACCELEROMETER, DRIFT, GUST = slice(9, 11), slice(11, 13), slice(13, 15), slice(15, 17)
 N_BASE = 17
 
-AIRSPEED_NOISE_M_S, AIRSPEED_MEAN_S = 1.0, 0.5  # pitot, angle of attack, sideslip: of so long a mean
+AIRSPEED_NOISE_M_S = 1.0  # of half a second's mean: pitot, angle of attack, sideslip
+AIRSPEED_MANOEUVRE_S = 0.2  # and per acceleration; 0.14 to 0.17 in an aerobatic flight (TestLog2)
+LASTING = 2.0  # turbulence by airspeed alone: how many times longer than the gusts it lasts
+ALONG = 1.2  # and how much greater it is along the nose than across
 
 
 class Layout(NamedTuple):
@@ -105,6 +111,11 @@ class Amplitudes(NamedTuple):
     foreign_noise_m_s: float = 0.5
     latency_s: float = 0.15  # sigma about the configured latency
     latency_change_s_sqrt_s: float = 1e-4
+
+    @property
+    def turbulence_s(self) -> float:
+        """Correlation time of turbulence by airspeed alone."""
+        return LASTING * self.gust_s
 
 
 #: How many times coarser than the settings attitude, IMU and a held velocity are.
@@ -317,23 +328,15 @@ class Propagator:
         Phi[2, 4] = Phi[3, 5] = -1.0
         Phi[0:4, SCALE] = i.n1, i.e1, n, e
         Phi[0:4, HEADING] = Phi[0:4, CRAB] = -i.e1, i.n1, -e, n
-        Q += T * self._wind_seen  # wind, gust and crab that come up within the interval: the velocity follows
-        kept = math.exp(-T / s.gust_s)
-        way = s.gust_s * (1.0 - kept)  # integral of a gust of 1 m/s
-        variance, half = s.gust_m_s**2, 0.5 * s.gust_s * (1.0 - kept * kept)
-        new, both = variance * (1.0 - kept * kept), variance * way * way / s.gust_s
-        moved = 2.0 * variance * s.gust_s * (T - 2.0 * way + half)
-        for k in (0, 1):
-            gust = GUST.start + k
-            Phi[k, gust], Phi[2 + k, gust] = -way, -kept
-            Q[:, k, k] += moved + AIRSPEED_NOISE_M_S**2 * AIRSPEED_MEAN_S * T
-            Q[:, 2 + k, 2 + k] += new + AIRSPEED_NOISE_M_S**2
-            Q[:, k, 2 + k] += both
-            Q[:, 2 + k, k] += both
-            Q[:, k, gust] = Q[:, gust, k] = -both
-            Q[:, 2 + k, gust] = Q[:, gust, 2 + k] = -new
+        lasting = s.turbulence_s
+        gust = nose_covariance(i.V, s.gust_m_s, s.gust_m_s / ALONG)
+        both = gust * (-lasting * math.expm1(-T / lasting))  # integral of the gust times the gust at the end
         crab = self._density[:, CRAB] * T
-        Q[:, 2:4, 2:4] += crab[:, None, None] * np.array(((e * e, -n * e), (-n * e, n * n)))
+        Q += T * self._wind_seen  # wind and crab that come up within the interval: the velocity follows
+        Q[:, 0:2, 0:2] += (2.0 * lasting * T) * gust
+        Q[:, 0:2, 2:4] += both
+        Q[:, 2:4, 0:2] += both
+        Q[:, 2:4, 2:4] += gust + crab[:, None, None] * np.array(((e * e, -n * e), (-n * e, n * n)))
         Q[:, 2, CRAB] = Q[:, CRAB, 2] = -e * crab
         Q[:, 3, CRAB] = Q[:, CRAB, 3] = n * crab
 
@@ -349,7 +352,7 @@ class Propagator:
             Q[:, 2 + k, at + k] += change
             Q[:, at + k, 2 + k] += change
 
-    def airspeed_row(self, velocity: Vector2, V: Vector2) -> Row:
+    def airspeed_row(self, velocity: Vector2, V: Vector2, manoeuvre: float = 0.0) -> Row:
         """Return the row of airspeed and heading as a velocity vector; not in `air` intervals.
 
         Parameters
@@ -358,6 +361,8 @@ class Propagator:
             Nominal velocity over ground (m/s), mean over the samples since the last such row.
         V
             Measured velocity through the air (m/s), `air_velocity`, mean over the same samples.
+        manoeuvre
+            Mean acceleration above that of level flight (m/s^2): the angle of attack grows with it.
         """
         H = np.zeros((2, self.layout.n))
         H[0, 2] = H[1, 3] = H[0, 4] = H[1, 5] = 1.0
@@ -365,7 +370,7 @@ class Propagator:
         H[:, SCALE] = -V[0], -V[1]
         H[:, HEADING] = H[:, CRAB] = V[1], -V[0]
         y = np.array((velocity[0] - V[0], velocity[1] - V[1]))
-        return Row(y, H, np.eye(2) * AIRSPEED_NOISE_M_S**2)
+        return Row(y, H, np.eye(2) * (AIRSPEED_NOISE_M_S**2 + (AIRSPEED_MANOEUVRE_S * manoeuvre) ** 2))
 
 
 def _velocity_noise(Phi: Floats, Q: Floats, T: float, density: Floats) -> None:
@@ -375,6 +380,17 @@ def _velocity_noise(Phi: Floats, Q: Floats, T: float, density: Floats) -> None:
         Q[:, k, k] = cube
         Q[:, k, 2 + k] = Q[:, 2 + k, k] = square
         Q[:, 2 + k, 2 + k] = density * T
+
+
+def nose_covariance(V: Vector2, along: float, across: float) -> Floats:
+    """Return the covariance (2, 2), north and east, of sigmas along and across the air velocity `V`."""
+    n, e = V
+    speed2 = n * n + e * e
+    a, b = along * along, across * across
+    if speed2 < 1.0:
+        return np.diag((max(a, b), max(a, b)))
+    nn, ne, ee = n * n / speed2, n * e / speed2, e * e / speed2
+    return np.array(((a * nn + b * ee, (a - b) * ne), ((a - b) * ne, a * ee + b * nn)))
 
 
 # ---------------------------------------------------------------------------------------------------------
@@ -414,7 +430,8 @@ def ground_phase(g: Ground, t: float, airspeed: float, speed: float, height: flo
 
     Airspeed is used only in flight: parked it measures nothing, and in the ground roll the wheels, not the
     air, hold the course, so that crosswind would be taken for none. After lift-off the wind is as open as
-    before. In the air at the start (no parked height) airspeed alone decides. A flight ends after `PARKED_S`
+    before. Without a parked height (in the air at the start, or no pressure) it flies once it moves: beside a
+    running propeller a parked pitot measures 20 m/s (InertialNav's TestLog2). A flight ends after `PARKED_S`
     of slowness, for a light aircraft may stall or hang in the wind (UMN: airspeed 4 m/s, 1.4 m/s over ground
     at 71 m).
 
@@ -425,12 +442,15 @@ def ground_phase(g: Ground, t: float, airspeed: float, speed: float, height: flo
     airspeed, speed
         True airspeed and speed over ground (m/s).
     height
-        Pressure altitude (m); without it airspeed alone decides.
+        Pressure altitude (m), if any.
     """
     if airspeed < PARKED_M_S and speed < PARKED_M_S:
         since = t if g.slow_since is None else g.slow_since
         if g.flying and t - since < PARKED_S:
             return Ground(True, since, g.parked_height)
         return Ground(False, since, height)
-    clear = g.parked_height is None or height is None or height > g.parked_height + CLEAR_M
+    if g.parked_height is None or height is None:
+        clear = speed > PARKED_M_S
+    else:
+        clear = height > g.parked_height + CLEAR_M
     return Ground(g.flying or (airspeed > FLYING_M_S and clear), None, g.parked_height)

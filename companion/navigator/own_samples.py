@@ -142,6 +142,7 @@ def air_data(state: State, record: AirData, settings: Settings) -> Step:
         _own(settings),
         (sums.air[0] / n, sums.air[1] / n),
         (sums.velocity[0] / n, sums.velocity[1] / n),
+        strapdown_channel.manoeuvre(s.mean_acceleration),
     )
     sums = AirspeedSums(record.t_ns, 0, (0.0, 0.0), (0.0, 0.0))
     sensors = state.sensors._replace(measured_ns=record.t_ns, sums=sums)

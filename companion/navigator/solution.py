@@ -184,7 +184,7 @@ def _velocity_growth(state: State, dt: float, settings: Settings) -> float:
         return 0.0
     model = channel.settings
     if nominal.interval.by == "air":
-        return -(model.gust_m_s**2) * math.expm1(-2.0 * dt / model.gust_s)
+        return -(model.gust_m_s**2) * math.expm1(-2.0 * dt / model.turbulence_s)
     if nominal.interval.by == "foreign":
         return model.foreign_noise_m_s**2
     return model.hold_m_s_sqrt_s**2 * dt if nominal.interval.by == "hold" else 0.0

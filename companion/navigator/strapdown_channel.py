@@ -116,6 +116,11 @@ def mean_acceleration(mean: Vector3, a: Vector3, dt: float) -> Vector3:
     return n + gain * (a[0] - n), e + gain * (a[1] - e), d + gain * (a[2] - d)
 
 
+def manoeuvre(mean: Vector3) -> float:
+    """How much a mean acceleration is above that of level flight in turbulence, m/s^2."""
+    return max(math.hypot(*mean) - MANOEUVRE_M_S2, 0.0)
+
+
 def velocity_variance(a: tuple[Vector3, ...], mean: Vector3, dt: float) -> float:
     """Variance (m/s)^2, on each level axis, that the noise of the last sample of `a` adds in `dt` seconds.
 
@@ -127,8 +132,7 @@ def velocity_variance(a: tuple[Vector3, ...], mean: Vector3, dt: float) -> float
     0.06 to 0.13 m/s/sqrt(s) per m/s^2 were measured against GNSS velocity, over 0.4 to 5 s and from 2 m/s^2
     up, and twice as much in one of twenty. Level in turbulence (ArduPlane) half of the means are below 1.2.
     """
-    above = max(math.hypot(*mean) - MANOEUVRE_M_S2, 0.0)
-    variance = MANOEUVRE_SQRT_S**2 * dt * above * above
+    variance = dt * (MANOEUVRE_SQRT_S * manoeuvre(mean)) ** 2
     if len(a) == 3:
         (n0, e0, _), (n1, e1, _), (n2, e2, _) = a
         variance += STAYS * dt * dt * ((n2 - 2.0 * n1 + n0) ** 2 + (e2 - 2.0 * e1 + e0) ** 2) / 12.0

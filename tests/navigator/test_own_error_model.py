@@ -1,10 +1,23 @@
-"""The own channel on the ground and in flight."""
+"""The error model of the own channel, on the ground and in flight."""
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
-from companion.navigator.own_error_model import CLEAR_M, Ground, ground_phase
+from companion.navigator.own_error_model import (
+    CLEAR_M,
+    GUST,
+    Amplitudes,
+    Ground,
+    Layout,
+    Propagator,
+    Row,
+    add_imu,
+    begin,
+    ground_phase,
+    prior,
+)
 
 
 def phases(*samples: tuple[float, float, float | None]) -> list[bool]:
@@ -21,11 +34,56 @@ def test_in_the_ground_roll_airspeed_is_not_used_until_the_wheels_are_off_the_gr
     assert phases(*roll) == [False, False, False, False, True]
 
 
-def test_without_a_pressure_airspeed_alone_decides() -> None:
+def test_without_a_pressure_it_flies_once_it_moves() -> None:
     """The flight of UMN has none: its airspeed was never used."""
     assert phases((0.5, 0.0, None), (3.0, 3.0, None), (15.0, 14.0, None)) == [False, False, True]
+
+
+def test_a_pitot_behind_a_running_propeller_is_no_flight() -> None:
+    """It taught a wind of 20 m/s; the airspeed was false after lift-off, and later GNSS."""
+    assert phases((21.0, 0.1, None), (21.0, 1.0, None), (18.0, 9.0, None)) == [False, False, True]
 
 
 @pytest.mark.parametrize("seconds", [9, 11])
 def test_a_flight_ends_after_ten_slow_seconds(seconds: int) -> None:
     assert phases((20.0, 20.0, None), *[(1.0, 1.0, None)] * (seconds + 1))[-1] == (seconds < 10)
+
+
+def test_two_intervals_beside_the_imu_are_one() -> None:
+    """The gust is a Gauss-Markov process: exactly, however long the interval."""
+    propagator, at = Propagator(Amplitudes(), Layout()), GUST.start
+
+    def over(seconds: float) -> tuple[float, float]:
+        Phi, Q = propagator.transition(add_imu(begin("imu", (20.0, 0.0)), seconds, (0.0, 0.0), 0.0, 0.0))
+        return float(Phi[at, at]), float(Q[0, at, at])
+
+    (first, q1), (second, q2), (whole, q) = over(0.2), over(0.6), over(0.8)
+    assert first * second == pytest.approx(whole)
+    assert second * second * q1 + q2 == pytest.approx(q)
+
+
+def test_a_step_of_the_wind_shows_in_the_first_airspeed_after_it() -> None:
+    """Beside the IMU; as white noise of the same strength the gusts would hide 3.4 m/s."""
+    settings, layout = Amplitudes(), Layout()
+    propagator = Propagator(settings, layout)
+    P, V, spread = prior(settings, layout, propagator.grades)[0], (20.0, 0.0), []
+    P[2:4, 2:4] = 0.1**2 * np.eye(2)
+    for _ in range(120):
+        interval = begin("imu", V)
+        for _ in range(10):
+            interval = add_imu(interval, 0.05, (0.0, 0.0), 0.0, 0.0)
+        Phi, Q = propagator.transition(interval)
+        P = Phi @ P @ Phi.T + Q[0]
+        for row in (propagator.airspeed_row(V, V), gnss_velocity(layout.n)):
+            S = row.H @ P @ row.H.T + row.R
+            K = np.linalg.solve(S, row.H @ P).T
+            P = P - K @ S @ K.T
+            spread.append(S[0, 0])
+    step = 5.0
+    assert step**2 / spread[-2] > 8.0
+
+
+def gnss_velocity(n: int) -> Row:
+    H = np.zeros((2, n))
+    H[0, 2] = H[1, 3] = 1.0
+    return Row(np.zeros(2), H, 0.1**2 * np.eye(2))
