@@ -129,6 +129,24 @@ def test_beacon_answers_once_a_second_with_stated_accuracy(relayed) -> None:
     assert 0.7 * sigma < row.rms < 1.3 * sigma
 
 
+@pytest.mark.parametrize(("lat_deg", "scored"), [(0.0003, False), (55.75, True)])
+def test_an_autopilot_without_a_position_is_not_scored(lat_deg: float, scored: bool) -> None:
+    """ArduPilot states metres from 0 N 0 E before its first position: 6891 km r.m.s. in the table."""
+    bridge = Bridge()
+    for k in range(1, 20):
+        now = START + k * SECOND // 5
+        stamp, deg = k * 200, round(1e7 * lat_deg)
+        sent = [
+            dialect.new("HEARTBEAT", type=1, autopilot=mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA),
+            dialect.new("SIM_STATE", lat=55.75, lon=1e-4, lat_int=557_500_000, lon_int=1000),
+            dialect.new("GLOBAL_POSITION_INT", time_boot_ms=stamp, lat=deg, lon=1000, alt=100_000),
+        ]
+        for n, message in enumerate(sent):
+            bridge.from_autopilot(frame.encode(message, (3 * k + n) % 256, 1, 1), now)
+        bridge.poll(now)
+    assert any(error.source == AUTOPILOT for error in bridge.comparison.errors) == scored
+
+
 def test_unaided_scores_companion_positions_without_relaying_them(relayed) -> None:
     row = relayed.rows()[COMPANION]
     assert row.samples > 350 and row.within is not None
