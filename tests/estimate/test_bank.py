@@ -567,6 +567,22 @@ def test_a_family_keeps_its_grades():
         assert set(kept.grade[(kept.fault == fault).any(axis=1)]) == {0, 1, 2}
 
 
+def test_a_rare_jump_is_kept_beside_many_of_another_kind():
+    """Without it a rare jump lived on beside a false source only, and spoke against that source."""
+    often, rare = Jump("often", (0,), (3.0,), 30.0, often=True), Jump("rare", (1,), (1.0,), 1e-3)
+    layout = replace(flight_layout(), jumps=(often, rare))
+    bank = b.start(layout, 0.0, np.zeros(layout.n_base), np.eye(layout.n_base), (1.0,))
+    settings = Settings(rows=24)
+    for t in range(1, 200):
+        bank = bank._replace(t=float(t), seen=np.full(2, float(t)))
+        if b.births_due(bank, settings):
+            bank = b.births(bank, layout, settings)
+            jumped = bank.event == 1 + 2 * len(layout.faults) + 1
+            assert (jumped & (bank.fault == NONE).all(axis=1)).any()
+        else:
+            bank = b.jump_births(bank, layout, settings)
+
+
 @pytest.mark.parametrize(("heard", "grades"), [(True, {0, 1, 2}), (False, {0})])
 def test_every_likely_family_may_change_its_grade_while_a_source_is_heard(heard, grades):
     """Where only the leading explanation could, it beat the others by that."""

@@ -19,7 +19,8 @@ def reduce(bank: Bank, layout: Layout, settings: Settings) -> Bank:
     Within a class (family, last event, whether the lie's rate changes, bin of age) the heaviest and the
     oldest row are kept first, in the young bins the heaviest of each scale, and of each family the heaviest
     of each grade: a family that has lost the right grade loses to one that has it. Protected are the rows
-    that carry the weight, the heaviest of each fault and of each grade, and those that set the protection
+    that carry the weight, the heaviest of each fault, of each grade and of each jump without a fault (a step
+    of the heading was kept beside a false GNSS only, and proved that), and those that set the protection
     level. Two faults at once that are less probable than the risk stand behind: with an equal claim they held
     a third of the rows, and the onsets of a slow lie were lost. A dropped row merges by moments with a row of
     its label if their weights are alike; else its weight goes to the heaviest of its class.
@@ -58,6 +59,8 @@ def reduce(bank: Bank, layout: Layout, settings: Settings) -> Bank:
     heaviest: dict[tuple[int, int, int], int] = {}
     oldest: dict[tuple[int, int, int], int] = {}
     by_fault: set[int] = set()
+    jumped: set[int] = set()
+    first_jump = 1 + 2 * len(layout.faults)
     by_scale: set[tuple[int, ...]] = set()
     graded: set[tuple[int, int]] = set()
     for i in order:
@@ -74,6 +77,10 @@ def reduce(bank: Bank, layout: Layout, settings: Settings) -> Bank:
             rank[i] = min(rank[i], 2)
         if key[0] not in by_fault and active[i] <= 1:
             by_fault.add(key[0])
+            rank[i] = 0
+        event = key[1] // 2
+        if key[0] == 0 and event >= first_jump and event not in jumped:
+            jumped.add(event)
             rank[i] = 0
         alive = key[0] == 0 or logs[i] >= settings.class_floor
         if alive and active[i] <= 1 and (key[0], grade[i]) not in graded:
