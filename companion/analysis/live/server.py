@@ -107,10 +107,16 @@ class LiveView:
         found = find_log(self._path)
         if found is None or (self._source is not None and self._source.path == found):
             return
+        live = found.name.endswith(ACTIVE)
+        try:
+            source = FollowedLog(found) if live else PlayedLog(found, self._speed)
+        except LogError:
+            if self._path.is_dir():
+                return  # just created, without its header: tried again
+            raise
         if self._source is not None:
             self._source.close()
-        live = found.name.endswith(ACTIVE)
-        self._source = FollowedLog(found) if live else PlayedLog(found, self._speed)
+        self._source = source
         self._scene = Scene(found.name.removesuffix(ACTIVE))
 
     def _encode(self) -> bytes:

@@ -159,6 +159,17 @@ def test_a_flight_does_not_notice_that_the_live_view_is_killed(tmp_path):
     assert len(times) >= 10.0 * (times[-1] - times[0])  # 10 a second for ODOMETRY
 
 
+def test_a_log_that_is_just_created_is_waited_for(tmp_path):
+    """The service creates the file, then writes its header; in between the live view ended."""
+    log = tmp_path / "00001.mcap.active"
+    with Live(tmp_path) as live:
+        for content in (b"", b"\x89MCAP0"):
+            log.write_bytes(content)
+            with pytest.raises(subprocess.TimeoutExpired):
+                live.process.wait(1.0)
+            assert get(live.url)[0] == 200
+
+
 def test_other_sites_and_paths_are_refused(tmp_path):
     with Live(tmp_path) as live:
         assert get(live.url)[0] == 200
