@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 
 POLL_S = 0.1
 HEARTBEAT_S = 1.0  # a frame at least so often, also without messages
+FIRST_CHUNK = 256  # bytes: a shorter log is just being created and has no message yet
 PORT = 8300
 _PAGES = {
     "/": ("live.html", "text/html; charset=utf-8"),
@@ -107,16 +108,12 @@ class LiveView:
         found = find_log(self._path)
         if found is None or (self._source is not None and self._source.path == found):
             return
-        live = found.name.endswith(ACTIVE)
-        try:
-            source = FollowedLog(found) if live else PlayedLog(found, self._speed)
-        except LogError:
-            if self._path.is_dir():
-                return  # just created, without its header: tried again
-            raise
+        if self._path.is_dir() and found.stat().st_size < FIRST_CHUNK:
+            return  # just created: its header may not be complete
         if self._source is not None:
             self._source.close()
-        self._source = source
+        live = found.name.endswith(ACTIVE)
+        self._source = FollowedLog(found) if live else PlayedLog(found, self._speed)
         self._scene = Scene(found.name.removesuffix(ACTIVE))
 
     def _encode(self) -> bytes:
