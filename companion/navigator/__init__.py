@@ -23,6 +23,7 @@ from companion.navigator.hypotheses import Model
 from companion.navigator.measurements import other_receiver
 from companion.navigator.own_channel import OwnChannel
 from companion.navigator.past_states import PastStates
+from companion.navigator.progress import with_births
 from companion.navigator.receiver_choice import ReceiverChoice
 from companion.navigator.solution import announce, is_bound_due, refresh_bound, resolve_pending, solve
 from companion.navigator.stale_data import REPORT_EVERY, StaleDataDetector
@@ -134,7 +135,7 @@ class Navigator:
         stale = self._stale_data.judge(record)
         if stale is not None:
             return stale
-        self.settle()
+        self._resolve_last()
         if isinstance(record, Gnss):
             is_used, changes = self._receivers.takes(record)
             self._deferred += changes
@@ -153,10 +154,22 @@ class Navigator:
         return self._with_mode_events(outputs)
 
     def settle(self) -> None:
-        """Do the deferred update of the last record and drop old states: no answer waits for this.
+        """Do the deferred update of the last record, and ready the births of hypotheses that are due.
 
-        `handle` does it first if it was not done in between; its outputs come with the next `handle`.
+        No answer waits for this. `handle` does what was not done in between; outputs come with the next one.
         """
+        self._resolve_last()
+        if self._newest is None or self.state.bank is None:
+            return
+        state, outputs = guarded(self.state, self._newest, self._settings, with_births, self._newest)
+        self._deferred += outputs
+        if self._roll_back is not None:
+            self._roll_back.ahead = state
+        else:
+            self._state = state
+
+    def _resolve_last(self) -> None:
+        """Do the deferred update of the last record and drop old states."""
         if self._newest is None or self._is_settled:
             return
         self._is_settled = True
@@ -171,7 +184,7 @@ class Navigator:
 
     def finish(self) -> None:
         """Fold all late records: before other parameters, and at the end of a log."""
-        self.settle()
+        self._resolve_last()
         while self._newest is not None and (self._waiting or self._roll_back is not None):
             self._deferred += self._fold_again(self._newest)
 

@@ -11,6 +11,7 @@ import math
 import numpy as np
 
 from companion.estimate import bank as banks
+from companion.estimate.bank import Bank
 from companion.nav.geometry import displace
 from companion.navigator import minimax_bound, own_channel, parallel_filters
 from companion.navigator.channel import Nominal, moved
@@ -58,24 +59,44 @@ def carried(state: State, t_ns: int, settings: Settings) -> State:
     return state._replace(nominal=nominal._replace(point=point))
 
 
-def propagated(state: State, settings: Settings) -> State:
-    """With the bank at the time of the nominal point, and births if they are due."""
-    nominal, bank = state.nominal, state.bank
-    assert nominal is not None
-    if bank is None or nominal.pending_s <= 0.0:
-        return state
+def with_births(state: State, record: Stamped, settings: Settings) -> Step:
+    """Deferred update: ready the births that are due, for the next propagation.
+
+    Until a measurement has judged them, children would raise the protection level.
+    """
+    return state._replace(newborn=_born(state, settings)), []
+
+
+def _born(state: State, settings: Settings) -> tuple[Bank, Bank]:
+    """The bank, and the bank after the births that are due."""
+    bank = state.bank
+    assert bank is not None
+    if state.newborn is not None and state.newborn[0] is bank:
+        return state.newborn
     known = hypotheses(state, settings)
+    if not banks.births_due(bank, known.settings):
+        return bank, banks.jump_births(bank, known.layout, known.settings)
+    now = state.nominal.t_ns if state.nominal else 0
+    jammed = state.jammed_ns is not None and now - state.jammed_ns < JAMMED_NS
+    factor = {0: JAMMED, 1: JAMMED} if jammed else None
+    return bank, banks.births(bank, known.layout, known.settings, factor)
+
+
+def propagated(state: State, settings: Settings) -> State:
+    """With the bank at the time of the nominal point; births that are due come first."""
+    nominal = state.nominal
+    assert nominal is not None
+    if state.bank is None or nominal.pending_s <= 0.0:
+        return state
+    _, bank = _born(state, settings)
+    known = hypotheses(state, settings)
+    state = state._replace(newborn=None)
     Phi, Q = settings.model.transition(nominal, len(state.beacons))
     bank = banks.propagate(bank, known.layout, nominal.pending_s, Phi, Q)
     if nominal.interval is not None and nominal.interval.by == "air":
         seen = bank.seen.copy()
         seen[AIRSPEED] = bank.t
         bank = bank._replace(seen=seen)
-    if banks.births_due(bank, known.settings):
-        jammed = state.jammed_ns is not None and nominal.t_ns - state.jammed_ns < JAMMED_NS
-        bank = banks.births(bank, known.layout, known.settings, {0: JAMMED, 1: JAMMED} if jammed else None)
-    else:
-        bank = banks.jump_births(bank, known.layout, known.settings)
     if nominal.interval is None:
         return state._replace(bank=bank, nominal=nominal._replace(since=nominal.point))
     velocity = nominal.point.v_n[:2]

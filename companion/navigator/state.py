@@ -77,6 +77,7 @@ class State(NamedTuple):
     nominal: Nominal | None = None
     ins: Point | None = None  # the last sample of an INS; the nominal point may be carried on beyond it
     bank: Bank | None = None
+    newborn: tuple[Bank, Bank] | None = None  # a bank, and what it is after the births that are due
     leading: tuple[Bank, Estimate] | None = None  # moments of the leading family, and of which bank
     protection: tuple[int, float, float, float] | None = None  # when computed; radius, position error (m)
     fixed: bool = False  # whether a fix was ever used

@@ -106,6 +106,7 @@ ABOUT_SOURCE_SET = frozenset(
 )
 #: Rate of the GNSS receiver that is not used while the other has a fix.
 STANDBY_HZ = 2.0
+ATTITUDE, QUATERNION = mavlink.MAVLINK_MSG_ID_ATTITUDE, mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION
 #: Answers to the parameter check.
 PARAMETERS = frozenset({mavlink.MAVLINK_MSG_ID_PARAM_VALUE, mavlink.MAVLINK_MSG_ID_PARAM_ERROR})
 #: All messages that the core handles; others are logged only.
@@ -146,6 +147,13 @@ class Link:
         self.origin_request_ns = 0  # when the local origin is requested next
         self.firmware: Firmware | None = None
         self.firmware_requests = 0
+        self._euler_ns: int | None = None  # when ATTITUDE was last received
+
+    def repeats_attitude(self, msgid: int, now_ns: int) -> bool:
+        """Whether this is ATTITUDE_QUATERNION beside ATTITUDE: PX4 sends both, at 50 Hz."""
+        if msgid == ATTITUDE:
+            self._euler_ns = now_ns
+        return msgid == QUATERNION and self._euler_ns is not None and now_ns - self._euler_ns < STALE_AFTER
 
     @property
     def lost(self) -> int:
@@ -428,7 +436,7 @@ class CompanionCore:
             link.firmware = firmware_of(event.message)
         if msgid in PARAMETERS:
             link.parameter_check.receive(event.message, event.frame)
-        if msgid not in DECODED:
+        if msgid not in DECODED or link.repeats_attitude(msgid, event.received_ns):
             return
         is_duplicate = self._is_duplicate(link)
         for record in decode(event.message, event.received_ns, link.sender):

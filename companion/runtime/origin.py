@@ -21,6 +21,8 @@ from companion.units import SECOND_NS
 TOLERANCE_M = 5.0
 """The inferred origin is in error by up to half a metre in a turn (the velocity is one loop old)."""
 PAIRS = 3
+PAIR_NS = SECOND_NS // 10
+"""At most one pair in this time: PX4 sends GLOBAL_POSITION_INT at 50 Hz."""
 RECENT_NS = 10 * SECOND_NS
 """Pairs older than this confirm nothing."""
 
@@ -73,6 +75,8 @@ class OriginCheck:
     def _paired(self, now_ns: int) -> list[Event]:
         """Use the last two positions as a pair if they are of the same instant."""
         if self._stated is None or self._local is None or self._known is None or not self._has_pairs:
+            return []
+        if self._pairs and 0 <= now_ns - self._pairs[-1].t_ns < PAIR_NS:
             return []
         inferred = infer_origin(self._local, self._known, self._projection, LIVE_WINDOW_NS)
         if inferred is None:

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import gc
 import os
 import random
 import signal
@@ -22,7 +23,6 @@ import time
 from collections import deque
 from collections.abc import Callable, Hashable, Iterable
 from functools import partial
-from importlib import import_module
 from pathlib import Path
 
 import click
@@ -54,7 +54,6 @@ EX_UNAVAILABLE, EX_CANTCREAT = 69, 73  # sysexits.h
 LOG_CHECK_S = 1.0
 SAVE_INTERVAL_S = 1.0
 STOP_TIMEOUT_S = 5.0  # limit on waiting for a disk at the end
-IMPORT_AFTER_S = 0.5
 STATUS_INTERVAL_NS = 1_000_000_000
 OVERDUE_NS = 2_000_000_000
 CONFIRM_AFTER_S = 60.0  # of solutions with parameters set by ground stations
@@ -216,6 +215,10 @@ class Service:
             self._notifier.status(event.text)
         if self._notifier.is_watchdog_due(now) and now - self.core.deadline() < OVERDUE_NS:
             self._notifier.alive(now)
+        # a turn of its own: what arrives meanwhile is not behind both an answer and the births
+        asyncio.get_running_loop().call_soon(self._settle)
+
+    def _settle(self) -> None:
         self.core.settle()
         self._deferred.flush()
 
@@ -289,9 +292,7 @@ async def run(
             service.core.report(Severity.WARNING, note, time.monotonic_ns())
         recover = partial(_recover_logs, settings, service, loop, deleted)
         threading.Thread(target=recover, name="recover", daemon=True).start()
-        # needed by the first solution with a protection level; not before the first frame is received
-        load = threading.Thread(target=import_module, args=("scipy.special",), name="import", daemon=True)
-        loop.call_later(IMPORT_AFTER_S, load.start)
+        gc.freeze()  # what was imported stays: looking through all of it for cycles takes 25 ms
         await service.serve(stopped)
         with contextlib.suppress(TimeoutError):
             await asyncio.wait_for(run_in_daemon_thread(service.save_state), STOP_TIMEOUT_S)

@@ -13,6 +13,7 @@ from companion.link.parameter_server import parameter_table
 from companion.nav.geometry import Geodetic, local_to_geodetic, slant_range_azimuth
 from companion.navigator import Navigator
 from companion.records import (
+    Attitude,
     Event,
     Gnss,
     LinkState,
@@ -158,6 +159,26 @@ def test_truth_is_logged_but_not_passed_to_the_navigator(monkeypatch: pytest.Mon
     assert len(flight.log.of(Truth)) == 2
     assert Truth not in handled
     assert LocalPosition in handled and Gnss in handled
+
+
+def test_an_attitude_sent_twice_is_decoded_once() -> None:
+    """PX4 sends ATTITUDE and ATTITUDE_QUATERNION; the second is used where the first is missing."""
+    flight = Flight()
+    flight.fly(1.0)
+
+    def attitudes(*names: str) -> int:
+        before = len(flight.log.of(Attitude))
+        for _ in range(10):
+            flight.now += 20 * MS
+            stamp = {"time_boot_ms": (flight.now - flight.boot) // MS}
+            for name in names:
+                flight.send(name, **stamp, **({"q1": 1.0} if "QUATERNION" in name else {}))
+        return len(flight.log.of(Attitude)) - before
+
+    assert attitudes("ATTITUDE_QUATERNION") == 10
+    assert attitudes("ATTITUDE", "ATTITUDE_QUATERNION") == 10
+    flight.fly(2.0)
+    assert attitudes("ATTITUDE_QUATERNION") == 10
 
 
 def test_solutions_are_sent_at_their_rates_and_immediately_after_a_beacon_fix() -> None:
