@@ -14,8 +14,8 @@ import numpy as np
 from companion.estimate import bank as banks
 from companion.estimate.bank import EXHAUSTIVE, NONE, Bank, Fault, Layout, Lie, Settings, Source
 
-SIZES = ((48, 10), (96, 10), (96, 17))
-"""Rows and base states; one group of two offsets and two rates is added."""
+SIZES = ((48, 10), (96, 10), (96, 17), (96, 30))
+"""Rows and base states; one group of two offsets and two rates is added. A stock autopilot has 96 x 34."""
 GRADED = 1e-4 * np.array((1.0, 16.0, 256.0, 4096.0))  # process noise of the four grades
 
 
