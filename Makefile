@@ -7,6 +7,11 @@ STAMP := $(VENV)/.installed
 .DEFAULT_GOAL := help
 .PHONY: help loopback test flights lint fuzz kills soak docs pictures lock clean
 
+# one worker more than processors: many tests wait for a process or a disk
+WORKERS := $(shell echo $$(($$(getconf _NPROCESSORS_ONLN) + 1)))
+# hundreds of processes start in the tests: what one has compiled the next ones load
+unexport PYTHONDONTWRITEBYTECODE
+
 # duration per fuzz target: make fuzz SECONDS=3600
 SECONDS := 120
 # forged frames: make fuzz FRAMES=1000000
@@ -28,7 +33,7 @@ loopback: $(STAMP) ## fly the default scenario in virtual time: log in logs/ and
 	$(BIN)/companion loopback
 
 test: $(STAMP) lint ## lint, type check and all tests but those of `flights`
-	$(BIN)/python -m pytest -n auto --dist worksteal -m "not flight"
+	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal -m "not flight"
 
 flights: $(STAMP) ## the tests that fly for minutes of virtual time
 	$(BIN)/python -m pytest -n auto --dist loadscope -m flight

@@ -43,6 +43,7 @@ STUDIES = {
     "ins-errors": "companion.study.ins_errors:command",
     "map": "companion.study.map_smoothing:command",
     "order": "companion.study.order:command",
+    "outages": "companion.study.outages:command",
     "schemes": "companion.study.schemes:command",
     "schuler": "companion.study.schuler_data:command",
     "weights": "companion.study.weights:command",

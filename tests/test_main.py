@@ -90,23 +90,28 @@ def test_interrupt_ends_in_one_line_and_130(tmp_path: Path) -> None:
 )
 def test_interrupt_at_any_time_of_the_start_is_quiet(tmp_path: Path, command: list[str]) -> None:
     words = [word.format(folder=tmp_path) for word in command]
-    for delay_s in (0.05, 0.08, 0.12, 0.2, 0.3, 0.45, 0.6, 0.8, 1.2, 2.0):
-        with subprocess.Popen(
-            [sys.executable, "-m", "companion", *words],
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.PIPE,
-            text=True,
-            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
-        ) as running:
-            time.sleep(delay_s)
-            running.send_signal(signal.SIGINT)
-            _, err = running.communicate()
-        if running.returncode == 130:
-            assert err.endswith("companion: interrupted\n")
-            assert "Traceback" not in err
-        elif running.returncode != 0:  # 0: it had ended, or `run` closed its log
-            # in Python's own start only: no line of ours was running
-            assert f'File "{Path(__file__).parents[1] / "companion"}' not in err
+    running: list[tuple[float, subprocess.Popen[str]]] = []
+    with contextlib.ExitStack() as stack:
+        for delay_s in (0.05, 0.08, 0.12, 0.2, 0.3, 0.45, 0.6, 0.8, 1.2, 2.0):
+            begun = subprocess.Popen(
+                [sys.executable, "-m", "companion", *words],
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.PIPE,
+                text=True,
+                preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+            )
+            running.append((time.monotonic() + delay_s, stack.enter_context(begun)))
+        for due, process in sorted(running, key=lambda each: each[0]):
+            time.sleep(max(0.0, due - time.monotonic()))
+            process.send_signal(signal.SIGINT)
+        for _, process in running:
+            _, err = process.communicate()
+            if process.returncode == 130:
+                assert err.endswith("companion: interrupted\n")
+                assert "Traceback" not in err
+            elif process.returncode != 0:  # 0: it had ended, or `run` closed its log
+                # in Python's own start only: no line of ours was running
+                assert f'File "{Path(__file__).parents[1] / "companion"}' not in err
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="what a process has loaded is read as on Linux")

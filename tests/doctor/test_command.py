@@ -32,8 +32,8 @@ SECOND = 1_000_000_000
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(stream_rates, "WINDOW", SECOND)
-    monkeypatch.setattr(examination, "OBSERVE", 4 * SECOND)
-    monkeypatch.setattr(examination, "OBSERVE_LONGER", 4 * SECOND)
+    monkeypatch.setattr(examination, "OBSERVE", 2 * SECOND)
+    monkeypatch.setattr(examination, "OBSERVE_LONGER", 2 * SECOND)
     monkeypatch.setattr(command, "CONNECT_TIMEOUT_S", 8.0)
     for name in list(os.environ):
         if name.startswith("COMPANION_"):

@@ -35,6 +35,8 @@ from sitl.flight import FlightPlan, Leg, WindChange
 from sitl.scenarios import Scenario, SensorRates
 from sitl.world import World
 
+pytestmark = pytest.mark.flight
+
 NS = 1_000_000_000
 FIVE_MINUTES = (
     Leg(5, 40, 0, 0),
@@ -197,7 +199,6 @@ CASES = [
 ]
 
 
-@pytest.mark.flight
 @pytest.mark.parametrize(("channel", "wrong"), CASES)
 def test_a_healthy_gnss_is_never_excluded(channel: str, wrong: str) -> None:
     flown = fly(channel, ONE_WRONG[wrong](), config=FINE if wrong == "stated too fine" else None)
@@ -228,7 +229,6 @@ def test_a_local_position_that_drifts_ever_faster_is_not_believed_against_gnss()
     assert flown.error[flown.t > SETTLED_S].max() < 10.0
 
 
-@pytest.mark.flight
 @pytest.mark.parametrize(("gnss_until", "needed"), [(math.inf, False), (90.0, True)])
 def test_without_gnss_a_false_airspeed_must_be_taken_out_of_use(gnss_until: float, needed: bool) -> None:
     """The autopilot compares it with GPS only, and dives for the speed that a stuck pitot lacks."""
@@ -239,7 +239,6 @@ def test_without_gnss_a_false_airspeed_must_be_taken_out_of_use(gnss_until: floa
     assert all(len(FALSE_AIRSPEED + name) <= 50 for name in USE_AIRSPEED.values())  # one STATUSTEXT
 
 
-@pytest.mark.flight
 @pytest.mark.parametrize("channel", ["ins", "imu"])
 def test_a_spoofed_gnss_is_excluded_with_a_beacon_and_comes_back(channel: str) -> None:
     """Drawn off by 2 m/s from 120 s to 210 s, velocity alike."""
@@ -269,7 +268,6 @@ def test_a_spoofed_gnss_is_excluded_with_a_beacon_and_comes_back(channel: str) -
     assert flown.error[flown.t > back + 20.0].max() < 10.0
 
 
-@pytest.mark.flight
 @pytest.mark.parametrize("channel", ["ins", "imu", "air"])
 def test_a_gnss_that_stops_is_no_step_of_the_output(channel: str) -> None:
     """What the output moves beyond its velocity, from one solution to the next, is no more than before."""
@@ -290,7 +288,6 @@ def test_a_gnss_that_stops_is_no_step_of_the_output(channel: str) -> None:
 SHORT = (Leg(5, 40, 0, 0), Leg(55, 40, 38, 40), Leg(30, 40, 38, 40), Leg(60, 130, 34, 40))
 
 
-@pytest.mark.flight
 @pytest.mark.parametrize("channel", ["ins", "imu", "air"])
 def test_the_claims_are_consistent(channel: str) -> None:
     """Normalised squared errors over seeds, with GNSS and 20 s after its loss without any fix."""
@@ -364,7 +361,6 @@ WITH_AIRSPEED = {"inertial.independent": True, "inertial.correctors": ["airspeed
 BY_AIR = {"inertial.source": "air_data", "output.profile": "ardupilot"}
 
 
-@pytest.mark.flight
 @pytest.mark.parametrize(("channel", "flags"), [("ins", WITH_AIRSPEED), ("air", BY_AIR)])
 def test_filters_beside_the_bank_follow_the_flight_and_change_nothing_that_is_sent(
     channel: str, flags: dict[str, Any]

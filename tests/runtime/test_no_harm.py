@@ -17,6 +17,8 @@ from companion.navigator import Navigator
 from companion.records import Attitude, Gnss, Imu, Input, Rejection, Solution
 from sitl import harm_recordings
 
+pytestmark = pytest.mark.flight
+
 DATA = Path(__file__).parents[1] / "data"
 
 

@@ -1,0 +1,244 @@
+"""`companion study outages`: what a recorded flight would have been worth without GNSS, from every minute on.
+
+    companion study outages flight.ulg
+    companion study outages flight.tlog --rsbn beacons.csv --lasting 60 --lasting 300
+
+GNSS is taken from the navigator, for as long as is asked; then the flight goes on with GNSS up to the next
+minute. The error is the distance from GNSS itself. Beside it stand two rules that need no filter: the
+airspeed along the heading plus the mean wind of the last minute, and straight on with the last velocity.
+"""
+
+from __future__ import annotations
+
+import copy
+import json
+import math
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import click
+import numpy as np
+from rich.table import Table
+
+from companion.analysis.replay_inputs import input_errors_as_log_errors, with_beacons_and_outages
+from companion.config import Config, load
+from companion.config.options import configuration_options
+from companion.nav.geometry import Geodetic, separation
+from companion.navigator import INPUTS_USED, Navigator
+from companion.records import AirData, Attitude, Gnss, Reboot, Solution, Stamped
+from companion.storage.reader import LogError
+from companion.tables import print_tables
+from companion.units import SECOND_NS, Floats
+
+LASTING_S = (10.0, 30.0, 60.0, 120.0)
+FLYING_M_S = 8.0
+LEARNING_S = 90.0  # in flight with GNSS, before the first outage
+WIND_S = 60.0
+GAP_S = 3.0  # the recorded GNSS was lost itself: there is nothing to compare with
+STEP_S = 0.1  # of the rules
+
+
+class Row(NamedTuple):
+    """Errors after outages of one duration: r.m.s. and greatest (m), and the share within 2 sigma an axis."""
+
+    lasting_s: float
+    outages: int
+    rms_m: float | None
+    worst_m: float | None
+    within: float | None
+    by_wind_m: float | None  # None: no airspeed or no attitude
+    straight_on_m: float
+
+
+class Fixes:
+    """The GNSS fixes of a flight: times (ns), positions (rad) and velocities (m/s) of those with one."""
+
+    def __init__(self, records: Sequence[Stamped]) -> None:
+        fixes = {r.t_ns: r for r in records if isinstance(r, Gnss) and r.has_3d_fix}
+        found = [fixes[t_ns] for t_ns in sorted(fixes)]
+        self.t_ns = np.array([r.t_ns for r in found])
+        self.lat, self.lon = np.array([r.lat for r in found]), np.array([r.lon for r in found])
+        moving = [(r.t_ns, r.v_n[0], r.v_n[1]) for r in found if r.v_n is not None]
+        columns: Floats = np.array(moving, dtype=np.float64).reshape(-1, 3).T
+        self.v_t_ns, self.v_n, self.v_e = columns
+
+    def at(self, t_ns: float) -> Geodetic:
+        """The position, interpolated."""
+        return Geodetic(
+            float(np.interp(t_ns, self.t_ns, self.lat)), float(np.interp(t_ns, self.t_ns, self.lon)), 0.0
+        )
+
+    def starts(self, every_s: float, longest_s: float) -> list[float]:
+        """When outages may begin, ns: in flight, after a time to learn, with GNSS all the while."""
+        flying = self.v_t_ns[np.hypot(self.v_n, self.v_e) > FLYING_M_S]
+        if not len(flying):
+            return []
+        first, last = flying[0] + LEARNING_S * SECOND_NS, flying[-1] - longest_s * SECOND_NS
+        gaps = self.t_ns[:-1][np.diff(self.t_ns) > GAP_S * SECOND_NS]
+        return [
+            float(t)
+            for t in np.arange(first, last, every_s * SECOND_NS)
+            if not ((gaps > t - WIND_S * SECOND_NS) & (gaps < t + longest_s * SECOND_NS)).any()
+        ]
+
+
+def companion_errors(
+    records: Sequence[Stamped],
+    fixes: Fixes,
+    config: Config,
+    starts: Sequence[float],
+    lasting: Sequence[float],
+) -> Iterator[dict[float, tuple[float, float, float, float]]]:
+    """Fly every outage; yield by duration the error of the solution (north, east, m) and its sigmas."""
+    navigator, i = Navigator(config), 0
+    for start in starts:
+        while i < len(records) and records[i].rx_ns <= start:
+            navigator.handle(records[i])  # type: ignore[arg-type]
+            i += 1
+        alone, found = copy.deepcopy(navigator), dict[float, tuple[float, float, float, float]]()
+        end = start + (max(lasting) + 1.0) * SECOND_NS
+        for record in records[i:]:
+            if record.rx_ns > end:
+                break
+            if isinstance(record, Gnss):
+                continue
+            for out in alone.handle(record):  # type: ignore[arg-type]
+                if not isinstance(out, Solution):
+                    continue
+                for seconds in lasting:
+                    if seconds not in found and out.t_ns >= start + seconds * SECOND_NS:
+                        north, east, _ = separation(Geodetic(out.lat, out.lon, 0.0), fixes.at(out.t_ns))
+                        var_n, _, _, var_e, *_ = out.covariance
+                        found[seconds] = (north, east, math.sqrt(var_n), math.sqrt(var_e))
+        yield found
+
+
+class Air:
+    """The velocity through the air of a flight, north and east (m/s), by airspeed and attitude."""
+
+    def __init__(self, records: Sequence[Stamped]) -> None:
+        air = sorted({r.t_ns: r.airspeed for r in records if isinstance(r, AirData)}.items())
+        attitude = sorted({r.t_ns: (r.heading, r.pitch) for r in records if isinstance(r, Attitude)}.items())
+        self.known = len(air) > 1 and len(attitude) > 1
+        if self.known:
+            self._t, self._speed = np.array(air).T
+            self._t_attitude = np.array([t for t, _ in attitude])
+            heading, self._pitch = np.array([each for _, each in attitude]).T
+            self._heading = np.unwrap(heading)
+
+    def at(self, t_ns: Floats) -> Floats:
+        """Return (n, 2)."""
+        heading, pitch = (np.interp(t_ns, self._t_attitude, x) for x in (self._heading, self._pitch))
+        level = np.interp(t_ns, self._t, self._speed) * np.cos(pitch)
+        return np.stack([level * np.cos(heading), level * np.sin(heading)], axis=1)
+
+
+def by_wind(air: Air, fixes: Fixes, start: float, seconds: float) -> Floats:
+    """Displacement (north, east, m) by airspeed, heading and the mean wind of the last minute."""
+    last = (fixes.v_t_ns > start - WIND_S * SECOND_NS) & (fixes.v_t_ns <= start)
+    over_ground = np.stack([fixes.v_n[last], fixes.v_e[last]], axis=1)
+    wind = (over_ground - air.at(fixes.v_t_ns[last])).mean(axis=0)
+    t = start + np.arange(0.0, seconds, STEP_S) * SECOND_NS
+    moved: Floats = ((air.at(t) + wind) * STEP_S).sum(axis=0)
+    return moved
+
+
+def straight_on(fixes: Fixes, start: float, seconds: float) -> Floats:
+    """Displacement (north, east, m) with the last velocity."""
+    k = int(np.searchsorted(fixes.v_t_ns, start, side="right")) - 1
+    return np.array([fixes.v_n[k], fixes.v_e[k]]) * seconds
+
+
+def study(records: Sequence[Stamped], config: Config, every_s: float, lasting: Sequence[float]) -> list[Row]:
+    """Return a row for every duration; none if no outage fits into the flight."""
+    fixes, air = Fixes(records), Air(records)
+    starts = fixes.starts(every_s, max(lasting))
+    flown = list(companion_errors(records, fixes, config, starts, lasting))
+    rows = []
+    for seconds in lasting:
+        rules: dict[str, list[float]] = {"wind": [], "straight": []}
+        for start in starts:
+            there, begun = fixes.at(start + seconds * SECOND_NS), fixes.at(start)
+            true = np.array(separation(there, begun)[:2])
+            rules["straight"].append(math.dist(straight_on(fixes, start, seconds), true))
+            if air.known:
+                rules["wind"].append(math.dist(by_wind(air, fixes, start, seconds), true))
+        errors = np.array([found[seconds] for found in flown if seconds in found]).reshape(-1, 4)
+        if starts:
+            rows.append(_row(seconds, len(starts), errors, rules["wind"], rules["straight"]))
+    return rows
+
+
+def _row(
+    seconds: float, outages: int, errors: Floats, by_wind_m: list[float], straight_on_m: list[float]
+) -> Row:
+    rms_m = worst_m = within = None
+    if len(errors):
+        distance = np.hypot(errors[:, 0], errors[:, 1])
+        rms_m, worst_m = _rms(distance), float(distance.max())
+        within = float((np.abs(errors[:, :2]) <= 2.0 * errors[:, 2:]).mean())
+    wind = _rms(np.array(by_wind_m)) if by_wind_m else None
+    return Row(seconds, outages, rms_m, worst_m, within, wind, _rms(np.array(straight_on_m)))
+
+
+def _rms(x: Floats) -> float:
+    return math.sqrt(float(np.mean(x * x)))
+
+
+@click.command("outages")
+@click.argument("log", type=click.Path(path_type=Path))
+@click.option(
+    "--lasting", type=click.FloatRange(1.0, 3600.0), multiple=True, help="Seconds; may be repeated."
+)
+@click.option(
+    "--every", "every_s", type=click.FloatRange(min=1.0), default=60.0, show_default=True, help="s."
+)
+@click.option("--rsbn", "beacons", type=click.Path(path_type=Path), help="Simulate the beacons of this CSV.")
+@click.option("--seed", type=click.IntRange(min=0), default=0, help="Seed of the noise of simulated beacons.")
+@configuration_options
+@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+def command(
+    log: Path,
+    lasting: tuple[float, ...],
+    every_s: float,
+    beacons: Path | None,
+    seed: int,
+    file: Path | None,
+    preset: str | None,
+    pairs: tuple[str, ...],
+    as_json: bool,
+) -> None:
+    """Take GNSS from a recorded flight, again and again.
+
+    LOG is any log that `companion replay` reads. From every minute of the flight on GNSS is withheld for 10,
+    30, 60 and 120 s (--lasting), and the solution is compared with GNSS. Beside it: airspeed and heading plus
+    the mean wind of the last minute, and straight on.
+    """
+    config = load(file, {}, pairs=pairs, preset=preset)
+    durations = tuple(sorted(set(lasting))) or LASTING_S
+    with input_errors_as_log_errors():
+        inputs, note = with_beacons_and_outages(log, beacons, (), seed, config)
+        records = [r for r in inputs.records if isinstance(r, INPUTS_USED) and not isinstance(r, Reboot)]
+    records.sort(key=lambda record: record.rx_ns)
+    rows = study(records, config, every_s, durations)
+    if not rows:
+        raise LogError(
+            f"{log}: no {LEARNING_S + max(durations):.0f} s of flight with GNSS faster than "
+            f"{FLYING_M_S:g} m/s: choose a longer flight, or a shorter --lasting"
+        )
+    if as_json:
+        click.echo(json.dumps([row._asdict() for row in rows]))
+        return
+    table = Table(title=f"Error after an outage of GNSS, m r.m.s. of {rows[0].outages} outages", caption=note)
+    for head in ("s", "companion", "worst", "within 2 sigma", "wind of the last minute", "straight on"):
+        table.add_column(head, justify="right")
+    for row in rows:
+        table.add_row(
+            f"{row.lasting_s:g}",
+            *("-" if x is None else f"{x:.0f}" for x in (row.rms_m, row.worst_m)),
+            "-" if row.within is None else f"{100.0 * row.within:.0f} %",
+            "-" if row.by_wind_m is None else f"{row.by_wind_m:.0f}",
+            f"{row.straight_on_m:.0f}",
+        )
+    print_tables(table)

@@ -1,0 +1,84 @@
+"""Outages of a recorded flight: the rules are right where they must be, and the companion is no worse."""
+
+from __future__ import annotations
+
+import json
+import math
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from companion.command_line import cli
+from companion.config import load
+from companion.nav.geometry import Geodetic, displace
+from companion.records import AirData, Attitude, Gnss, Stamped
+from companion.storage.reader import LogError
+from companion.study import outages
+
+NS = 1_000_000_000
+DATA = Path(__file__).parents[1] / "data"
+SHARED = Path(__file__).parents[3] / "shared" / "data"
+AIRSPEED, WIND, TURN_S = 25.0, (6.0, -4.0), 200.0
+
+
+def circling(seconds: float, lost: tuple[float, float] = (0.0, 0.0)) -> list[Stamped]:
+    """An aircraft that turns in a wind that stays; GNSS without noise, not there during `lost`."""
+    place, records = Geodetic(0.8, 0.1, 500.0), list[Stamped]()
+    v_n = (0.0, 0.0)
+    for k in range(round(10 * seconds)):
+        t_ns = k * NS // 10
+        heading = math.tau * k / 10 / TURN_S
+        v_n = (AIRSPEED * math.cos(heading) + WIND[0], AIRSPEED * math.sin(heading) + WIND[1])
+        bank = math.atan(AIRSPEED * math.tau / TURN_S / 9.81)
+        records.append(Attitude(t_ns, t_ns, bank, 0.0, math.remainder(heading, math.tau), (0.0, 0.0, 0.0)))
+        live = 0.1 * math.sin(k)  # the same number for seconds is a frozen sensor
+        records.append(AirData(t_ns, t_ns, AIRSPEED + live, True, sensed=True))
+        if k % 2 == 0 and not lost[0] <= k / 10 < lost[1]:
+            stated = {"sigma_horizontal": 2.0, "sigma_velocity": 0.3}
+            records.append(Gnss(t_ns, t_ns, 0, t_ns // 1000, 3, *place, v_n=(*v_n, 0.0), **stated))
+        place = displace(*place, 0.1 * v_n[0], 0.1 * v_n[1], 0.0)
+    return records
+
+
+def test_rules_and_companion_on_a_flight_that_is_known() -> None:
+    config = load(flags={"inertial.source": "air_data"}, environment={})
+    rows = outages.study(circling(330.0), config, 60.0, (10.0, 60.0))
+    assert [row.outages for row in rows] == [3, 3]
+    for row in rows:
+        assert row.by_wind_m is not None and row.by_wind_m < 3.0
+        arc = AIRSPEED * TURN_S / math.tau * math.tau / TURN_S * row.lasting_s
+        angle = math.tau * row.lasting_s / TURN_S
+        true = AIRSPEED * TURN_S / math.tau * np.array([math.sin(angle), 1.0 - math.cos(angle)])
+        assert row.straight_on_m == pytest.approx(math.hypot(true[0] - arc, true[1]), rel=0.02)
+        assert row.rms_m is not None and row.rms_m < 10.0
+        assert row.within is not None and row.within > 0.9
+
+
+def test_no_outage_where_the_recorded_gnss_was_lost() -> None:
+    fixes = outages.Fixes(circling(400.0, lost=(150.0, 160.0)))
+    starts = [t / NS for t in fixes.starts(30.0, 20.0)]
+    assert starts and not [t for t in starts if 130.0 < t < 210.0]
+    assert all(b - a >= 30.0 for a, b in pairwise(starts))
+
+
+def test_a_flight_too_short_is_one_sentence() -> None:
+    log = DATA / "dronekit_copter_cut.tlog"
+    with pytest.raises(
+        LogError, match="no 210 s of flight with GNSS faster than 8 m/s: choose a longer flight"
+    ):
+        CliRunner().invoke(cli, ["study", "outages", str(log)], catch_exceptions=False)
+
+
+@pytest.mark.shared
+@pytest.mark.flight
+def test_recorded_outages_are_bridged_as_well_as_by_the_best_rule() -> None:
+    log = SHARED / "umn_fixed_wing"
+    if not log.exists():
+        pytest.skip("recordings are not there")
+    done = CliRunner().invoke(cli, ["study", "outages", str(log), "--json"], catch_exceptions=False)
+    rows = [outages.Row(**row) for row in json.loads(done.stdout)]
+    ours, rule = zip(*((row.rms_m or math.inf, row.by_wind_m or math.inf) for row in rows))
+    assert all(a < 1.05 * b for a, b in zip(ours, rule)) and sum(ours) < sum(rule)
