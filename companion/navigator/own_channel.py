@@ -49,6 +49,7 @@ class Sensors(NamedTuple):
     air: Reckoner = Reckoner()
     ground: Ground = Ground()
     sensor_ns: int | None = None  # when the autopilot last called its airspeed sensor healthy
+    steady: AirData | None = None  # the last airspeed that moved the position
     foreign: LocalPosition | None = None
     imu_ns: int = -SENSOR_NS
     air_ns: int = -SENSOR_NS

@@ -44,6 +44,8 @@ from companion.units import SECOND_NS
 AIRSPEED_EVERY_NS = 500_000_000  # gusts are correlated: more often adds nothing
 FOREIGN_EVERY_NS = SECOND_NS
 BLOCKED_M_S = 5.0  # slower, in flight, a pitot is blocked
+#: Between two samples, up to so far apart, no airspeed changes by more; one that did is not used for so long.
+STEP_M_S, STEP_M_S2, STEP_GAP_S, STEP_NS = 10.0, 10.0, 1.0, 10 * SECOND_NS
 
 
 def airspeed_sensor(state: State, record: AirspeedSensor, settings: Settings) -> Step:
@@ -99,6 +101,7 @@ def imu(state: State, record: Imu, settings: Settings) -> Step:
 def air_data(state: State, record: AirData, settings: Settings) -> Step:
     """Use airspeed, as driver or as measurement; on the ground it only shows whether the aircraft flies."""
     s = state.sensors
+    before, air_ns = s.air.air, s.air_ns
     state = state._replace(sensors=s._replace(air=air_data_channel.sense(s.air, record)))
     nominal = state.nominal
     if nominal is None or not settings.config.uses("air_data"):
@@ -118,6 +121,9 @@ def air_data(state: State, record: AirData, settings: Settings) -> Step:
     if not ground.flying:
         return _straight_on(state, record, settings)
     if s.leads("air", record.t_ns):
+        if (step := _step(s.steady, before, record)) is not None:
+            return state._replace(sensors=s._replace(air_ns=air_ns)), [step]
+        state = state._replace(sensors=s._replace(steady=record))
         return _driven(state, record, "air", V, settings)
     if not is_driven_by(state, "imu"):
         return state, []
@@ -147,6 +153,20 @@ def air_data(state: State, record: AirData, settings: Settings) -> Step:
     sums = AirspeedSums(record.t_ns, 0, (0.0, 0.0), (0.0, 0.0))
     sensors = state.sensors._replace(measured_ns=record.t_ns, sums=sums)
     return decided(state._replace(bank=taken.bank, sensors=sensors), record, settings)
+
+
+def _step(last: AirData | None, before: AirData | None, record: AirData) -> Rejection | None:
+    """Reject an airspeed that would move the position, if no aircraft reaches it since the sample `before`.
+
+    `last` is the last one used. It is used again after some seconds, as after a silence.
+    """
+    if last is None or before is None or record.true != last.true:
+        return None
+    gap_s = (record.t_ns - before.t_ns) * 1e-9
+    step, limit = abs(record.airspeed - last.airspeed), STEP_M_S + STEP_M_S2 * gap_s
+    if step <= limit or gap_s > STEP_GAP_S or record.t_ns - last.t_ns > STEP_NS:
+        return None
+    return Rejection(record.t_ns, record.rx_ns, "airspeed", "it steps: not used", step, limit)
 
 
 def _blocked_pitot(before: Sensors, record: AirData) -> list[Output]:

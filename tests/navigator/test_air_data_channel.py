@@ -344,6 +344,20 @@ def test_a_silence_of_the_air_data_widens_the_claim() -> None:
     assert np.all(found.error[found.t > 0.0] <= 3.0 * found.sigma[found.t > 0.0])
 
 
+@pytest.mark.parametrize("stuck_at", [6.0, 60.0])
+def test_a_pitot_that_steps_does_not_move_the_position(stuck_at: float) -> None:
+    """GNSS is healthy. The position was 26 m off before the next fix came, at a claimed sigma of 4 m."""
+    flown, navigator = flight("plane_gps_loss"), Navigator(AIR)
+    records, begin = [r for r in flown.records if flown.since(r) < 0.0], -20.0
+    for k, r in enumerate(records):
+        if isinstance(r, AirData) and flown.since(r) > begin:
+            records[k] = msgspec.structs.replace(r, airspeed=stuck_at)
+    found = flown_on(flown, navigator, records)
+    after = found.t > begin
+    assert after.sum() > 50 and found.error[after].max() < 8.0
+    assert not navigator.state.reported[0]
+
+
 @pytest.mark.parametrize(("height", "ratio"), [(0.0, 1.0), (1000.0, 0.9075), (5000.0, 0.6009)])
 def test_true_airspeed_by_the_standard_atmosphere(height: float, ratio: float) -> None:
     """Densities of the standard atmosphere, ISO 2533, over that at sea level, by geopotential height."""
