@@ -192,6 +192,7 @@ core = CompanionCore(load(None, {"output.profile": "ardupilot"}, {}), Log())
 for t, data in fly(STREAMS["ArduPilot, 500 messages/s"]):
     core.receive("main", data, round(1e9 * (t + 1.0)))
     core.settle()
+    core.bear()
     if t > 12.0:
         break
 assert core.has_solution

@@ -23,7 +23,7 @@ from companion.navigator.hypotheses import Model
 from companion.navigator.measurements import other_receiver
 from companion.navigator.own_channel import OwnChannel
 from companion.navigator.past_states import PastStates
-from companion.navigator.progress import with_births
+from companion.navigator.progress import births_due, with_births
 from companion.navigator.receiver_choice import ReceiverChoice
 from companion.navigator.solution import announce, is_bound_due, refresh_bound, resolve_pending, solve
 from companion.navigator.stale_data import REPORT_EVERY, StaleDataDetector
@@ -135,7 +135,7 @@ class Navigator:
         stale = self._stale_data.judge(record)
         if stale is not None:
             return stale
-        self._resolve_last()
+        self.settle()
         if isinstance(record, Gnss):
             is_used, changes = self._receivers.takes(record)
             self._deferred += changes
@@ -154,22 +154,10 @@ class Navigator:
         return self._with_mode_events(outputs)
 
     def settle(self) -> None:
-        """Do the deferred update of the last record, and ready the births of hypotheses that are due.
+        """Do the deferred update of the last record and drop old states: no answer waits for this.
 
-        No answer waits for this. `handle` does what was not done in between; outputs come with the next one.
+        `handle` does it first if it was not done in between; its outputs come with the next `handle`.
         """
-        self._resolve_last()
-        if self._newest is None or self.state.bank is None:
-            return
-        state, outputs = guarded(self.state, self._newest, self._settings, with_births, self._newest)
-        self._deferred += outputs
-        if self._roll_back is not None:
-            self._roll_back.ahead = state
-        else:
-            self._state = state
-
-    def _resolve_last(self) -> None:
-        """Do the deferred update of the last record and drop old states."""
         if self._newest is None or self._is_settled:
             return
         self._is_settled = True
@@ -182,9 +170,25 @@ class Navigator:
         if not self._waiting:
             self._past.keep_last(self._late_ns)
 
+    @property
+    def births_due(self) -> bool:
+        """Whether hypotheses are to be born: the next measurement does it if `bear` does not."""
+        return births_due(self.state, self._settings)
+
+    def bear(self) -> None:
+        """Ready the births that are due: 5 ms in which no answer waits. It changes no output."""
+        if self._newest is None or not self.births_due:
+            return
+        state, outputs = guarded(self.state, self._newest, self._settings, with_births, self._newest)
+        self._deferred += outputs
+        if self._roll_back is not None:
+            self._roll_back.ahead = state
+        else:
+            self._state = state
+
     def finish(self) -> None:
         """Fold all late records: before other parameters, and at the end of a log."""
-        self._resolve_last()
+        self.settle()
         while self._newest is not None and (self._waiting or self._roll_back is not None):
             self._deferred += self._fold_again(self._newest)
 

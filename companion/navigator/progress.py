@@ -59,6 +59,15 @@ def carried(state: State, t_ns: int, settings: Settings) -> State:
     return state._replace(nominal=nominal._replace(point=point))
 
 
+def births_due(state: State, settings: Settings) -> bool:
+    """Whether births are due and not readied."""
+    bank = state.bank
+    if bank is None or (state.newborn is not None and state.newborn[0] is bank):
+        return False
+    known = hypotheses(state, settings)
+    return banks.births_due(bank, known.settings) or banks.jump_births_due(bank, known.layout, known.settings)
+
+
 def with_births(state: State, record: Stamped, settings: Settings) -> Step:
     """Deferred update: ready the births that are due, for the next propagation.
 

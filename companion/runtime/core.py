@@ -4,6 +4,7 @@
     core.poll(now_ns)                    # no later than core.deadline()
     core.to_send(link, now_ns)           # after either: the frames to write to a link
     core.settle()                        # then, if there is time: deferred work
+    core.bear()                          # and births of hypotheses, if core.births_due
 
 The asyncio service and the virtual-time loopback drive the same object. It holds no navigation state. It
 decides which senders are accepted (one autopilot, any beacon receiver), what is logged and when a solution is
@@ -269,6 +270,15 @@ class CompanionCore:
     def settle(self) -> None:
         """Run deferred work after the output has been sent; otherwise the next record runs it."""
         self._navigator.settle()
+
+    @property
+    def births_due(self) -> bool:
+        """Whether `bear` has anything to do."""
+        return self._navigator.births_due
+
+    def bear(self) -> None:
+        """Ready the births of hypotheses while nothing arrives; otherwise the next measurement bears them."""
+        self._navigator.bear()
 
     def poll(self, now_ns: int) -> None:
         """Do the periodic work that is due."""

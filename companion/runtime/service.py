@@ -215,12 +215,10 @@ class Service:
             self._notifier.status(event.text)
         if self._notifier.is_watchdog_due(now) and now - self.core.deadline() < OVERDUE_NS:
             self._notifier.alive(now)
-        # a turn of its own: what arrives meanwhile is not behind both an answer and the births
-        asyncio.get_running_loop().call_soon(self._settle)
-
-    def _settle(self) -> None:
         self.core.settle()
         self._deferred.flush()
+        if self.core.births_due:  # a turn of their own: they take as long as an answer
+            asyncio.get_running_loop().call_soon(self.core.bear)
 
     def save_state(self) -> str | None:
         """Save the timestamp and the parameters; return the error of the parameters' disk, None if saved.

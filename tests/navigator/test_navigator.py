@@ -412,6 +412,7 @@ def test_what_is_settled_in_between_changes_nothing(late_ns: int) -> None:
     for record in (origin(), *records):
         settled += settling.handle(record)
         settling.settle()
+        settling.bear()
         left += waiting.handle(record)
     assert settled == left
     assert any(isinstance(out, Rejection) for out in left)

@@ -40,7 +40,13 @@ readout     estimate, probabilities, decisions
 protection  protection level of a sum of Gaussians
 """
 
-from companion.estimate.bank.branching import births, births_due, false_since_first, jump_births
+from companion.estimate.bank.branching import (
+    births,
+    births_due,
+    false_since_first,
+    jump_births,
+    jump_births_due,
+)
 from companion.estimate.bank.layout import NEVER, NONE, Bools, Fault, Ints, Jump, Layout, Lie, Source
 from companion.estimate.bank.protection import exceedance, level
 from companion.estimate.bank.readout import (
@@ -99,6 +105,7 @@ __all__ = [
     "inflate",
     "is_sound",
     "jump_births",
+    "jump_births_due",
     "level",
     "merge_moments",
     "propagate",

@@ -98,6 +98,20 @@ def births(
     return reduce(grown, layout, settings) if reduced else grown
 
 
+def jump_births_due(bank: Bank, layout: Layout, settings: Settings = DEFAULT) -> bool:
+    """Report whether `jump_births` is due.
+
+    Parameters
+    ----------
+    bank, layout, settings : the bank at the present time.
+
+    Returns
+    -------
+    bool : whether there are jumps that are born often, and their interval has passed.
+    """
+    return bank.t - bank.jumped_t >= settings.jump_s and any(jump.often for jump in layout.jumps)
+
+
 def jump_births(bank: Bank, layout: Layout, settings: Settings = DEFAULT) -> Bank:
     """Bear the children of jumps that are born often, where that is due; rows are reduced at the next births.
 
@@ -109,10 +123,10 @@ def jump_births(bank: Bank, layout: Layout, settings: Settings = DEFAULT) -> Ban
     -------
     Bank : with a child of the heaviest row of each grade more for each such jump.
     """
+    if not jump_births_due(bank, layout, settings):
+        return bank
     jumps = [(j, jump.rate_h) for j, jump in enumerate(layout.jumps) if jump.often]
     passed = bank.t - bank.jumped_t
-    if not jumps or passed < settings.jump_s:
-        return bank
     heaviest = _heaviest_of_grades(bank)
     children = [_Child(p, _log(rate * passed / HOUR_S), jump=j) for p in heaviest for j, rate in jumps]
     return _with_children(bank, layout, children)._replace(jumped_t=bank.t)
