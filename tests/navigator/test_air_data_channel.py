@@ -40,6 +40,8 @@ from companion.records import (
 from companion.units import Floats
 
 NS = 1_000_000_000
+pytestmark = pytest.mark.flight
+
 DATA = Path(__file__).parents[1] / "data"
 SHARED = Path(__file__).parents[2].parent / "shared" / "data" / "autopilot_sitl"
 SIGMA_AZIMUTH, SIGMA_RANGE = math.radians(0.125), 100.0  # one sigma
@@ -149,7 +151,6 @@ def raw_rms(flown: Recorded, records: Iterable[Any], start: float, end: float) -
 NEVER = (0.0, 0.0)
 
 
-@pytest.mark.flight
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("name", ["plane_gps_loss", "plane_wind_change"])
 def test_with_a_beacon_the_error_is_at_most_half_the_fixes(name: str, seed: int) -> None:
@@ -165,7 +166,6 @@ def test_with_a_beacon_the_error_is_at_most_half_the_fixes(name: str, seed: int)
         assert found.error[found.t >= 0.0].max() <= two_sigma
 
 
-@pytest.mark.flight
 @pytest.mark.parametrize("seed", range(3))
 def test_a_minute_without_the_beacon_in_a_changed_wind_wherever_it_begins(seed: int) -> None:
     """From one minute after GNSS is lost on."""
@@ -183,7 +183,6 @@ def test_a_minute_without_the_beacon_in_a_changed_wind_wherever_it_begins(seed: 
         assert np.all(found.error <= 3.0 * found.sigma)
 
 
-@pytest.mark.flight
 @pytest.mark.parametrize("seed", range(3))
 def test_a_minute_without_the_beacon_by_the_restrictive_estimator(seed: int) -> None:
     flown = flight("plane_wind_change")
@@ -198,7 +197,6 @@ def test_a_minute_without_the_beacon_by_the_restrictive_estimator(seed: int) -> 
     assert np.all(found.error[inside] <= 3.0 * found.sigma[inside])
 
 
-@pytest.mark.flight
 @pytest.mark.parametrize(("seed", "before"), [(0, 110.0), (1, 110.0), (2, 60.0)])
 def test_a_step_of_the_wind_is_not_taken_for_the_fault_of_a_beacon(seed: int, before: float) -> None:
     """By the only beacon left, however short GNSS was heard with it before."""
@@ -220,7 +218,6 @@ def test_air_data_alone_drifts_no_more_than_the_autopilot_and_says_so() -> None:
     assert np.all(found.error[after] <= 3.0 * found.sigma[after])
 
 
-@pytest.mark.flight
 @pytest.mark.parametrize("name", ["plane_gps_loss", "plane_wind_change"])
 def test_the_whole_logs_say_the_same_as_the_cut_ones(name: str) -> None:
     path = SHARED / f"{name}.tlog"
@@ -290,7 +287,6 @@ def test_another_channel_in_flight_begins_anew() -> None:
     assert solutions > 100
 
 
-@pytest.mark.flight
 def test_all_estimators_run_on_one_stream() -> None:
     flown = flight("plane_wind_change")
     for leading in ("kalman", "minimax", "restrictive"):
