@@ -130,6 +130,11 @@ def intersect_azimuth_range(beacon: Geodetic, azimuth: float, slant_range: float
     return place
 
 
+def root_mean_square(x: Floats) -> float:
+    """Return the r.m.s. of all numbers of an array, in their unit."""
+    return float(np.sqrt(np.mean(x**2)))
+
+
 def summarize_phases(
     found: dict[str, ErrorSeries], phases: Sequence[FlightPhase], limit_m: float = LIMIT_M
 ) -> list[PhaseErrors]:
@@ -157,7 +162,7 @@ def _summarize_phase(
         if not within.any():
             continue
         error = e.error[within]
-        rms[source] = float(np.sqrt(np.mean(error**2)))
+        rms[source] = root_mean_square(error)
         p95[source] = float(np.percentile(error, 95.0))
         if np.isfinite(e.bound[within]).any():
             compared = _compare_with_bound(error, e.bound[within], e.claimed[within], limit_m)
@@ -179,9 +184,9 @@ class _Compared(NamedTuple):
 def _compare_with_bound(error: Floats, bound: Floats, claimed: Floats, limit_m: float) -> _Compared:
     known = np.isfinite(bound)
     error, bound, claimed = error[known], bound[known], claimed[known]
-    bound_rms = float(np.sqrt(np.mean(bound**2)))
+    bound_rms = root_mean_square(bound)
     if np.mean((bound > limit_m) | (bound > USEFUL * claimed)) > 0.5:
         return _Compared(bound_rms, None, None, None, None)
-    share = float(np.sqrt(np.mean(error**2))) / bound_rms
+    share = root_mean_square(error) / bound_rms
     inside, twice = (float(np.mean(error <= k * bound)) for k in (1.0, 2.0))
     return _Compared(bound_rms, share, inside == 1.0, inside, twice)

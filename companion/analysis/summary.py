@@ -10,6 +10,7 @@ import numpy as np
 
 from companion.analysis import error_statistics, flight_events
 from companion.analysis.assessment import GNSS, SMOOTHED, Assessment, deviation
+from companion.analysis.error_statistics import root_mean_square
 from companion.analysis.flight_events import (
     OUTAGE_MIN_S,
     WITHOUT_FIXES,
@@ -123,7 +124,7 @@ def _absent_gnss(a: Assessment) -> str:
 
 def rms_by_fixes(a: Assessment) -> tuple[float, float]:
     """Return the r.m.s. distance from the reference with fixes and without, m; NaN if there is none."""
-    with_fixes, without = (_rms(error) if len(error) else math.nan for error in _split_errors(a))
+    with_fixes, without = (root_mean_square(error) if len(error) else math.nan for error in _split_errors(a))
     return with_fixes, without
 
 
@@ -182,9 +183,13 @@ def _error_sentences(a: Assessment) -> list[str]:
     if corrected is None or a.reference is None:
         return ["There is nothing to compare the estimate with: its accuracy is unknown."]
     found = zip(_split_errors(a), ("with fixes", "without"), strict=True)
-    parts = [f"{format_length(_rms(error))} {how}" for error, how in found if len(error)]
+    parts = [f"{format_length(root_mean_square(error))} {how}" for error, how in found if len(error)]
     ins = a.errors.get(error_statistics.INS)
-    beside = f"; the inertial channel alone {format_length(_rms(ins.error))}" if ins is not None else ""
+    beside = (
+        f"; the inertial channel alone {format_length(root_mean_square(ins.error))}"
+        if ins is not None
+        else ""
+    )
     subject = f"The {deviation(a)} of the estimate"
     subject += "" if a.against_truth else f" from {a.reference.what}"
     sentences = [
@@ -319,10 +324,6 @@ def _during(
         if phase.name in names:
             inside |= (e.t_ns >= phase.start_ns) & (e.t_ns < phase.end_ns)
     return inside
-
-
-def _rms(error: Floats) -> float:
-    return float(np.sqrt(np.mean(error**2)))
 
 
 def _count_phases(phases: Sequence[object]) -> str:

@@ -21,6 +21,7 @@ import click
 import numpy as np
 from rich.table import Table
 
+from companion.analysis.error_statistics import root_mean_square
 from companion.analysis.replay_inputs import input_errors_as_log_errors, with_beacons_and_outages
 from companion.config import Config, load
 from companion.config.options import configuration_options
@@ -154,19 +155,19 @@ def study(records: Sequence[Stamped], config: Config, every_s: float, lasting: S
     """Return a row for every duration; none if no outage fits into the flight."""
     fixes, air = Fixes(records), Air(records)
     starts = fixes.starts(every_s, max(lasting))
+    if not starts:
+        return []
     flown = list(companion_errors(records, fixes, config, starts, lasting))
     rows = []
     for seconds in lasting:
         rules: dict[str, list[float]] = {"wind": [], "straight": []}
         for start in starts:
-            there, begun = fixes.at(start + seconds * SECOND_NS), fixes.at(start)
-            true = np.array(separation(there, begun)[:2])
-            rules["straight"].append(math.dist(straight_on(fixes, start, seconds), true))
+            moved = separation(fixes.at(start + seconds * SECOND_NS), fixes.at(start))[:2]
+            rules["straight"].append(math.dist(straight_on(fixes, start, seconds), moved))
             if air.known:
-                rules["wind"].append(math.dist(by_wind(air, fixes, start, seconds), true))
+                rules["wind"].append(math.dist(by_wind(air, fixes, start, seconds), moved))
         errors = np.array([found[seconds] for found in flown if seconds in found]).reshape(-1, 4)
-        if starts:
-            rows.append(_row(seconds, len(starts), errors, rules["wind"], rules["straight"]))
+        rows.append(_row(seconds, len(starts), errors, rules["wind"], rules["straight"]))
     return rows
 
 
@@ -176,14 +177,10 @@ def _row(
     rms_m = worst_m = within = None
     if len(errors):
         distance = np.hypot(errors[:, 0], errors[:, 1])
-        rms_m, worst_m = _rms(distance), float(distance.max())
+        rms_m, worst_m = root_mean_square(distance), float(distance.max())
         within = float((np.abs(errors[:, :2]) <= 2.0 * errors[:, 2:]).mean())
-    wind = _rms(np.array(by_wind_m)) if by_wind_m else None
-    return Row(seconds, outages, rms_m, worst_m, within, wind, _rms(np.array(straight_on_m)))
-
-
-def _rms(x: Floats) -> float:
-    return math.sqrt(float(np.mean(x * x)))
+    wind = root_mean_square(np.array(by_wind_m)) if by_wind_m else None
+    return Row(seconds, outages, rms_m, worst_m, within, wind, root_mean_square(np.array(straight_on_m)))
 
 
 @click.command("outages")
@@ -192,7 +189,12 @@ def _rms(x: Floats) -> float:
     "--lasting", type=click.FloatRange(1.0, 3600.0), multiple=True, help="Seconds; may be repeated."
 )
 @click.option(
-    "--every", "every_s", type=click.FloatRange(min=1.0), default=60.0, show_default=True, help="s."
+    "--every",
+    "every_s",
+    type=click.FloatRange(min=1.0),
+    default=60.0,
+    show_default=True,
+    help="Seconds between.",
 )
 @click.option("--rsbn", "beacons", type=click.Path(path_type=Path), help="Simulate the beacons of this CSV.")
 @click.option("--seed", type=click.IntRange(min=0), default=0, help="Seed of the noise of simulated beacons.")

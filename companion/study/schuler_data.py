@@ -26,6 +26,7 @@ import numpy as np
 import numpy.typing as npt
 from rich.table import Table
 
+from companion.analysis.error_statistics import root_mean_square
 from companion.analysis.progress import show_step
 from companion.estimate.minimax_lp import Design
 from companion.estimate.predictor import Start, Step, Window, anchor
@@ -113,9 +114,9 @@ def run(
         e = np.array(rows)
         if not len(e):
             continue
-        bound, optimum, expected = (_rms(e[:, k]) for k in range(3))
+        bound, optimum, expected = (root_mean_square(e[:, k]) for k in range(3))
         inside = float((np.abs(e[:, 4]) <= e[:, 0]).mean())
-        rms = [_rms(e[:, k]) for k in range(3, 9)]
+        rms = [root_mean_square(e[:, k]) for k in range(3, 9)]
         sizes = (window_s / 60.0, ahead / 60.0, len(e), bound, inside, optimum, expected)
         outcomes.append(Outcome(channel, *sizes, *rms))
     return outcomes
@@ -175,10 +176,6 @@ def _windows(t_ns: npt.NDArray[np.int64], window_s: float) -> Iterator[slice]:
         first, end = t_ns.searchsorted(np.array([start, start + window_s]) * SECOND_NS)
         if end - first >= 4:
             yield slice(int(first), int(end))
-
-
-def _rms(errors: Floats) -> float:
-    return float(np.sqrt(np.mean(errors**2)))
 
 
 @click.command("schuler")

@@ -636,7 +636,7 @@ def test_recorded_with_a_beacon_the_error_is_at_most_half_the_fixes(seed: int) -
 def test_recorded_with_a_beacon_and_airspeed_a_step_of_the_wind_is_found(
     flown: Any, half_minute_m: float
 ) -> None:
-    """A filter told the moment has 9, 22, 25 and 28 m; with gusts as white noise it was 53, 48, 34 and 34.
+    """A filter that knows the moment has 9, 22, 25 and 28 m; with gusts as white noise: 53, 48, 34 and 34.
 
     The cut has airspeed at 5 Hz and fixes at 2.5 Hz.
     """
