@@ -93,14 +93,14 @@ def test_interrupt_at_any_time_of_the_start_is_quiet(tmp_path: Path, command: li
     running: list[tuple[float, subprocess.Popen[str]]] = []
     with contextlib.ExitStack() as stack:
         for delay_s in (0.05, 0.08, 0.12, 0.2, 0.3, 0.45, 0.6, 0.8, 1.2, 2.0):
-            begun = subprocess.Popen(
+            process = subprocess.Popen(
                 [sys.executable, "-m", "companion", *words],
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.PIPE,
                 text=True,
                 preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
             )
-            running.append((time.monotonic() + delay_s, stack.enter_context(begun)))
+            running.append((time.monotonic() + delay_s, stack.enter_context(process)))
         for due, process in sorted(running, key=lambda each: each[0]):
             time.sleep(max(0.0, due - time.monotonic()))
             process.send_signal(signal.SIGINT)

@@ -101,7 +101,6 @@ def imu(state: State, record: Imu, settings: Settings) -> Step:
 def air_data(state: State, record: AirData, settings: Settings) -> Step:
     """Use airspeed, as driver or as measurement; on the ground it only shows whether the aircraft flies."""
     s = state.sensors
-    before, air_ns = s.air.air, s.air_ns
     state = state._replace(sensors=s._replace(air=air_data_channel.sense(s.air, record)))
     nominal = state.nominal
     if nominal is None or not settings.config.uses("air_data"):
@@ -114,15 +113,16 @@ def air_data(state: State, record: AirData, settings: Settings) -> Step:
     speed = math.hypot(*estimated_velocity(state))
     if s.ground.flying and math.hypot(*V) < BLOCKED_M_S < 0.5 * speed:
         return state, _blocked_pitot(s, record)
+    leads = s.leads("air", record.t_ns)
+    if s.ground.flying and leads and (step := _step(s, record)) is not None:
+        return state, [step]
     height = None if s.air.static is None else nominal.point.position.alt
     ground = own_error_model.ground_phase(s.ground, record.t_ns * 1e-9, math.hypot(*V), speed, height)
     s = state.sensors._replace(ground=ground, air_ns=record.t_ns if ground.flying else s.air_ns)
     state = state._replace(sensors=s)
     if not ground.flying:
         return _straight_on(state, record, settings)
-    if s.leads("air", record.t_ns):
-        if (step := _step(s.steady, before, record)) is not None:
-            return state._replace(sensors=s._replace(air_ns=air_ns)), [step]
+    if leads:
         state = state._replace(sensors=s._replace(steady=record))
         return _driven(state, record, "air", V, settings)
     if not is_driven_by(state, "imu"):
@@ -155,11 +155,12 @@ def air_data(state: State, record: AirData, settings: Settings) -> Step:
     return decided(state._replace(bank=taken.bank, sensors=sensors), record, settings)
 
 
-def _step(last: AirData | None, before: AirData | None, record: AirData) -> Rejection | None:
-    """Reject an airspeed that would move the position, if no aircraft reaches it since the sample `before`.
+def _step(s: Sensors, record: AirData) -> Rejection | None:
+    """Reject an airspeed that would move the position, if no aircraft reaches it since the sample before.
 
-    `last` is the last one used. It is used again after some seconds, as after a silence.
+    It is compared with the last one used, and used again after some seconds, as after a silence.
     """
+    last, before = s.steady, s.air.air
     if last is None or before is None or record.true != last.true:
         return None
     gap_s = (record.t_ns - before.t_ns) * 1e-9

@@ -12,7 +12,17 @@ from hypothesis import strategies as st
 from scipy.stats import multivariate_normal, ncx2
 
 from companion.estimate import bank as b
-from companion.estimate.bank import EXHAUSTIVE, NONE, Fault, Jump, Layout, Lie, Settings, Source
+from companion.estimate.bank import (
+    EXHAUSTIVE,
+    NONE,
+    Fault,
+    Jump,
+    Layout,
+    Lie,
+    Settings,
+    Source,
+    protection,
+)
 from companion.estimate.bank.state import normalised
 
 HOUR = 3600.0
@@ -414,6 +424,14 @@ def test_protection_level_is_conservative_and_within_three_percent(rows, seed, r
     got, want = b.level(w, d, C, risk), exact_level(w, d, C, risk)
     # a row of about the weight of the risk makes the tail flat: there the margin in probability decides
     assert want * (1.0 - 1e-4) <= got <= 1.03 * exact_level(w, d, C, risk / 1.04)
+
+
+def test_tail_and_quantile_of_the_normal_distribution_are_those_of_scipy():
+    from scipy.special import erfc, ndtri
+
+    x, p = np.linspace(-3.9, 25.9, 100_001), np.logspace(-290, -0.31, 1001)
+    np.testing.assert_allclose(protection._erfc(x), erfc(x), rtol=2e-5)
+    np.testing.assert_allclose(protection._normal_quantile(p), -ndtri(p), rtol=1e-4, atol=2e-5)
 
 
 def test_protection_level_holds_against_monte_carlo():

@@ -140,7 +140,7 @@ def test_solutions_are_on_time_with_a_failing_or_blocked_disk(tmp_path: Path, mo
             disks[0].error = None
             disks[0].working.clear()
             more.append(frame.encode(wish, 0, 255, 190))  # the parameter is stored on the same disk
-            await phase("blocked", 5.0)
+            await phase("blocked", 10.0)
             assert not parameters.exists()
             disks[0].working.set()
             await phase("working again", 2.5)

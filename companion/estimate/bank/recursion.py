@@ -85,7 +85,7 @@ def _both_sides(P: Floats, FT: Floats, Q: Floats, grade: Ints) -> Floats:
     """F P F' + Q of all rows, P symmetric.
 
     Two flat products: (P F')' = F P, so one transposed copy stands in for F @ (.). Some rows at a time, so
-    that what is between stays in the cache: 3.4 times as fast as all at once, at 96 rows of 34 states.
+    that what is between stays in the cache.
     """
     n, k = len(FT), Q.shape[-1]
     out = np.empty_like(P)
