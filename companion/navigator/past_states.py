@@ -11,8 +11,8 @@ from companion.navigator.state import State
 from companion.records import Input
 
 MOST_KEPT = 1024  # records
-#: A state takes up to 0.8 MB: of those older than DENSE_NS one per SPARSE_NS is kept.
-DENSE_NS, SPARSE_NS = 1_000_000_000, 1_000_000_000
+#: A state takes up to 0.9 MB: of those older than DENSE_NS one per SPARSE_NS is kept.
+DENSE_NS, SPARSE_NS = 500_000_000, 1_000_000_000
 
 
 class _Past(NamedTuple):

@@ -165,7 +165,8 @@ def _merged(
 
 
 def _symmetric(P: Floats) -> Floats:
-    out: Floats = 0.5 * (P + P.swapaxes(-1, -2))
+    out: Floats = P + P.swapaxes(-1, -2)
+    out *= 0.5
     return out
 
 
