@@ -77,22 +77,27 @@ def test_interrupt_ends_in_one_line_and_130(tmp_path: Path) -> None:
     assert (out, err.strip()) == ("", "companion: interrupted")
 
 
+MOMENTS_S = (0.05, 0.08, 0.12, 0.2, 0.3, 0.45, 0.6, 0.8, 1.2, 2.0)
+
+
 @pytest.mark.parametrize(
-    "command",
+    ("moments_s", "command"),
     [
-        ["run", "--connect", "udpin:127.0.0.1:0", "--logs", "{folder}"],
-        ["loopback", "--logs", "{folder}"],
-        ["doctor", "--connect", "udpin:127.0.0.1:0"],
-        ["study", "weights-flown"],
-        ["report", str(CUT), "-o", "{folder}/report.html"],
+        (MOMENTS_S, ["run", "--connect", "udpin:127.0.0.1:0", "--logs", "{folder}"]),
+        (MOMENTS_S[::3], ["loopback", "--logs", "{folder}"]),
+        (MOMENTS_S[1::3], ["doctor", "--connect", "udpin:127.0.0.1:0"]),
+        (MOMENTS_S[2::3], ["study", "weights-flown"]),
+        (MOMENTS_S[::3], ["report", str(CUT), "-o", "{folder}/report.html"]),
     ],
-    ids=lambda command: command[0],
+    ids=lambda value: value[0],
 )
-def test_interrupt_at_any_time_of_the_start_is_quiet(tmp_path: Path, command: list[str]) -> None:
+def test_interrupt_at_any_time_of_the_start_is_quiet(
+    tmp_path: Path, moments_s: tuple[float, ...], command: list[str]
+) -> None:
     words = [word.format(folder=tmp_path) for word in command]
     running: list[tuple[float, subprocess.Popen[str]]] = []
     with contextlib.ExitStack() as stack:
-        for delay_s in (0.05, 0.08, 0.12, 0.2, 0.3, 0.45, 0.6, 0.8, 1.2, 2.0):
+        for delay_s in moments_s:
             process = subprocess.Popen(
                 [sys.executable, "-m", "companion", *words],
                 stdout=subprocess.DEVNULL,
@@ -149,7 +154,7 @@ def test_interrupt_of_many_processes_is_one_line(tmp_path: Path, moment: str) ->
     ("jobs", "interrupt"),
     [
         # in a callback of the collector, as Dask has: what is raised there is printed and forgotten
-        (3000, "gc.callbacks.append(lambda phase, info: sent or sent.append(kill())); gc.collect()"),
+        (300, "gc.callbacks.append(lambda phase, info: sent or sent.append(kill())); gc.collect()"),
         (5, "done == 5 and kill()"),  # nothing is left to wait for
     ],
 )

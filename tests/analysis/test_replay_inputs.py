@@ -45,6 +45,7 @@ def beacons(tmp_path: pathlib.Path) -> pathlib.Path:
     return path
 
 
+@pytest.mark.flight
 def test_converted_log_replays_as_the_original(tmp_path: pathlib.Path) -> None:
     converted = tmp_path / "flight.mcap"
     assert "879 records" in run("log", "convert", FLIGHT, "-o", converted).output
@@ -62,6 +63,7 @@ def test_gnss_delay_is_reported(tmp_path: pathlib.Path) -> None:
     assert "GNSS is 0.18 s (sigma 0.01) behind the local position: median distance 3.15 m, 0.31 m" in result
 
 
+@pytest.mark.flight
 def test_navigator_predicts_in_an_outage_and_uses_simulated_beacons(
     tmp_path: pathlib.Path, beacons: pathlib.Path
 ) -> None:
@@ -104,6 +106,7 @@ def test_simulated_measurements_depend_on_the_seed(tmp_path: pathlib.Path, beaco
     assert values(one, r.Solution) == values(same, r.Solution)
 
 
+@pytest.mark.flight
 def test_own_log_is_replayed_with_changed_keys(tmp_path: pathlib.Path) -> None:
     flown, other = tmp_path / "flown.mcap", tmp_path / "other.mcap"
     report(FLIGHT, "-o", flown, "--with", "sigma_m=3.5")
@@ -167,6 +170,7 @@ def test_log_is_written_under_a_name_that_is_read_again(
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.flight
 @pytest.mark.shared
 def test_recorded_quadrotor_glitch_is_an_event(tmp_path: pathlib.Path) -> None:
     path = SHARED / "inertialnav" / "f450_glitch_log.zip"

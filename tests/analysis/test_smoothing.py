@@ -174,6 +174,7 @@ def test_channel_jump_does_not_affect_the_smoothed_track() -> None:
     assert abs(shift).max() < 1.0  # the jump is detected to about a decimetre
 
 
+@pytest.mark.flight
 def test_false_gnss_is_left_out_from_its_onset() -> None:
     """GNSS runs away at 20 m/s from the 150th second on, its velocity stays true: it is left out from the
     onset on, not only from the moment at which the navigator noticed.

@@ -29,6 +29,8 @@ from sitl.flight import FlightPlan, Leg, WindChange
 from sitl.loopback import START_NS, fly_scenario, simulator_config, truth_function
 from sitl.scenarios import Scenario, SensorRates, get_scenario
 
+pytestmark = pytest.mark.flight
+
 PLAN = FlightPlan(
     (Leg(10, 40, 0, 0), Leg(90, 40, 38, 100), Leg(60, 40, 38, 100), Leg(80, 100, 36, 100)),
     winds=(WindChange(0, 4, 5),),
@@ -102,7 +104,6 @@ def stated_accuracy(solution: Solution) -> float:
     return math.hypot(*map(max, sigma, solution.bound_n or (0.0, 0.0)))
 
 
-@pytest.mark.flight
 @pytest.mark.parametrize("channel", CHANNELS)
 @pytest.mark.parametrize("beacons", [(), BEACONS])
 def test_ten_gnss_outages(tmp_path: Path, channel: str, beacons) -> None:
@@ -130,7 +131,6 @@ def test_gnss_is_accepted_after_an_outage_with_wind_change(tmp_path: Path) -> No
             assert math.hypot(north, east) <= 3.0 * stated_accuracy(s), s
 
 
-@pytest.mark.flight
 @pytest.mark.parametrize("channel", CHANNELS)
 def test_autopilot_reboot_during_gnss_outage(tmp_path: Path, channel: str) -> None:
     flown = LoggedFlight(
@@ -169,7 +169,6 @@ def test_estimated_wind_survives_a_reboot(tmp_path: Path) -> None:
     assert math.hypot(north, east) < 0.5 * 6.4 * 140.0  # half of the error without a wind estimate
 
 
-@pytest.mark.flight
 @pytest.mark.parametrize("channel", CHANNELS)
 @pytest.mark.parametrize("outages", [(), OUTAGE])
 def test_link_loss_of_thirty_seconds(tmp_path: Path, channel: str, outages) -> None:
@@ -181,7 +180,6 @@ def test_link_loss_of_thirty_seconds(tmp_path: Path, channel: str, outages) -> N
     assert 20 <= len(down) <= 30  # one per second after the link counts as lost
 
 
-@pytest.mark.flight
 @pytest.mark.parametrize("channel", CHANNELS)
 @pytest.mark.parametrize("outages", [(), OUTAGE])
 def test_local_origin_moves_by_a_kilometre(tmp_path: Path, channel: str, outages) -> None:
@@ -210,7 +208,6 @@ def test_local_origin_moves_by_a_kilometre(tmp_path: Path, channel: str, outages
         assert 2.0 < silent < 8.0
 
 
-@pytest.mark.flight
 @pytest.mark.parametrize("outages", [(), OUTAGE])
 def test_autopilot_filter_reset_of_forty_metres(tmp_path: Path, outages) -> None:
     flown = LoggedFlight(
@@ -221,7 +218,6 @@ def test_autopilot_filter_reset_of_forty_metres(tmp_path: Path, outages) -> None
     flown.assert_events(r"120\.\d inertial channel: jumped by 40", r"180\.\d inertial channel: jumped by 40")
 
 
-@pytest.mark.flight
 def test_air_data_channel_ignores_local_position_resets(tmp_path: Path) -> None:
     fault = Fault("ins-reset", 120.0, 180.0, 40.0)
     calm, shaken = (

@@ -6,6 +6,8 @@ from click.testing import CliRunner
 
 from companion.study.restrictive import TRUTHS, command
 
+pytestmark = pytest.mark.flight
+
 COLUMNS = ["dx", "dy", "dVN", "dVE", "PX", "PY", "PZ", "VcX", "VcY", "GX", "GY", "AX"]
 # rms error of the minimax filter divided by that of R1, from an independent program, 200 runs
 RATIOS = {
@@ -23,7 +25,6 @@ def rows():
     return {row["truth"]: row for row in json.loads(done.output)}
 
 
-@pytest.mark.flight
 @pytest.mark.parametrize("truth", TRUTHS)
 def test_ratios(rows, truth):
     row = dict(zip(rows[truth]["states"], rows[truth]["ratio"], strict=True))

@@ -2,9 +2,12 @@
 
 from pathlib import Path
 
+import pytest
+
 from sitl.endurance.kill_test import AT_RISK_S, KilledRun, _compare_with_log, run_kills
 
 
+@pytest.mark.flight
 def test_kills_of_the_service_lose_at_most_a_second(tmp_path: Path) -> None:
     runs = run_kills(4, 3, tmp_path)
     flown = [run for run in runs if run.connected_s is not None]
