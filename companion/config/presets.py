@@ -59,8 +59,8 @@ PRESETS: Mapping[str, Preset] = {
         {"output.profile": "ardupilot"},
     ),
     "px4": Preset(
-        "PX4 without another INS: it gets a position",
-        {"output.profile": "px4"},
+        "PX4 without another INS: it gets a position; its attitude stays right without GNSS",
+        {"output.profile": "px4", "strapdown.tilt_deg": 0.5},
     ),
 }
 

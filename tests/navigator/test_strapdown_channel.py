@@ -40,6 +40,7 @@ from companion.records import (
     GlobalPosition,
     Gnss,
     Imu,
+    Input,
     LocalPosition,
     Pressure,
     RsbnFix,
@@ -661,6 +662,17 @@ def test_recorded_with_a_beacon_and_airspeed_a_step_of_the_wind_is_found(
     assert between(0.0, 60.0)[0] < 45.0
     assert between(60.0, 120.0)[0] < 40.0
     assert between(120.0, math.inf)[0] < 40.0
+
+
+@pytest.mark.flight
+def test_recorded_on_px4_its_preset_finds_a_step_of_the_wind() -> None:
+    """EKF2 keeps its attitude within 0.3 deg for a quarter of a minute; with 2 deg it is 68 m."""
+    with gzip.open(DATA / "px4_wind_step_cut.jsonl.gz") as file:
+        records = [msgspec.json.decode(line, type=Input | Truth) for line in file]
+    found = navigated(records, interpolated(records), load(preset="px4", environment={}))
+    minute = (found.t >= LOSS) & (found.t < LOSS + 60.0)
+    assert rms(found.error[minute]) < 50.0
+    assert np.mean(np.square(found.error[minute] / found.sigma[minute])) < 4.0
 
 
 def test_recorded_alone_it_bridges_seconds_and_says_how_far_it_may_be_off() -> None:
