@@ -42,6 +42,7 @@ INS_JUMPS_H = 0.01  # its position, by a reset of the unit
 #: The velocity of an INS steps (m, m/s), so rarely that a GNSS drawn off by 0.5 m/s is beyond doubt in 2.4 s.
 #: Beacons that contradict are believed within two minutes: without it an INS that drifted excluded all else.
 INS_DRIFTS_H, INS_DRIFT = 2e-7, (5.0, 5.0, 1.0, 1.0)
+INS_DRIFTS_AGAIN_H = 1.0  # once it has stepped
 BEACON_PLACE = 0.03  # its position is stated wrongly: likelier than a GNSS captured before the first fix
 BEACON_H = 2e-4  # a beacon steps, or is elsewhere, so often in an hour; it does not drift
 ORDERS = (3, 2, 2)  # GNSS may be drawn off with an acceleration
@@ -261,7 +262,10 @@ def _hypotheses(config: Config, channel: Channel, beacons: int, by_air: bool, wi
         )
     else:
         jumps.append(Jump("channel", (0, 1), (100.0, 100.0), INS_JUMPS_H, quota=2, apart_s=APART_S))
-        jumps.append(Jump("drift", (0, 1, 2, 3), INS_DRIFT, INS_DRIFTS_H, quota=2, apart_s=APART_S))
+        again_h = INS_DRIFTS_AGAIN_H
+        jumps.append(
+            Jump("drift", (0, 1, 2, 3), INS_DRIFT, INS_DRIFTS_H, quota=2, apart_s=APART_S, again_h=again_h)
+        )
     layout = Layout(
         channel.n + 2 * beacons,
         GROUPS,

@@ -623,6 +623,17 @@ def test_every_likely_family_may_change_its_grade_while_a_source_is_heard(heard,
         assert set(born.grade[family]) == grades
 
 
+def test_what_has_jumped_jumps_again_at_a_rate_of_its_own():
+    jump = Jump("drift", (1,), (5.0,), 1e-6, again_h=10.0)
+    layout = replace(scalar_layout(), faults=(), jumps=(jump,))
+    bank = b.start(layout, 0.0, np.zeros(2), np.eye(2) * 1e-4)._replace(seen=np.zeros(1))
+    for _ in range(2):
+        bank = b.births(b.propagate(bank, layout, 5.0, PHI, Q), layout, EXHAUSTIVE)
+    once, again = 1e-6 * 5.0 / HOUR, 10.0 * 5.0 / HOUR
+    weights = sorted(bank.weights[bank.since == 10.0])
+    assert weights == pytest.approx([once * again, once], rel=1e-6)
+
+
 @pytest.mark.parametrize("often", [False, True])
 def test_a_jump_born_often_has_the_same_prior_and_its_onset_is_found_sooner(often):
     jump = Jump("drift", (1,), (5.0,), 10.0, often=often)

@@ -90,7 +90,10 @@ def births(
                 children += _lie_children(int(p), f, fault.lies, fault.change_h * hours)
         for j, jump in enumerate(layout.jumps):
             since = bank.jumped_t if jump.often else bank.born_t
-            children.append(_Child(int(p), _log(jump.rate_h * (bank.t - since) / HOUR_S), jump=j))
+            rate = jump.rate_h
+            if jump.again_h is not None and bank.event[p] == 1 + 2 * len(layout.faults) + j:
+                rate = jump.again_h
+            children.append(_Child(int(p), _log(rate * (bank.t - since) / HOUR_S), jump=j))
     if any(heard):
         children += _grade_children(bank, layout, settings, hours)
     grown = _with_children(bank, layout, children)

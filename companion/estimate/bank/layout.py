@@ -104,6 +104,7 @@ class Jump:
     quota : rows the jump may hold at least, when rows are short.
     apart_s : for so long a row that jumped is an explanation of its own, see `explanations`.
     often : it is born every `Settings.jump_s`: before its birth other states learn wrongly from it.
+    again_h : rate after it, 1/h; None: the same. What has jumped may jump back.
     """
 
     name: str
@@ -113,6 +114,7 @@ class Jump:
     quota: int = 4
     apart_s: float = 0.0
     often: bool = False
+    again_h: float | None = None
 
 
 @dataclass(frozen=True)

@@ -136,6 +136,15 @@ def test_late_link_and_clock_jump_are_reported_without_position_error(scenario: 
 
 
 @pytest.mark.flight
+def test_an_ins_that_drifts_and_stops_is_not_trusted_beyond_its_level() -> None:
+    """Regression: that its velocity steps twice was as good as excluded: level 31 m, error 243 m."""
+    flown = fly_order(FlightOrder("no-beacon", "ins-drift", 1))
+    assert flown.raised is None
+    assert flown.largest_m > 200.0
+    assert (flown.misleading_s, flown.beyond_s) == (0.0, 0.0)
+
+
+@pytest.mark.flight
 @pytest.mark.parametrize("name", ["gnss-stale", "beacon-frozen", "ins-frozen"])
 def test_stale_data_with_new_stamps_is_detected_at_once(name: str) -> None:
     flown = fly_order(FlightOrder("one-beacon", name, 1))
