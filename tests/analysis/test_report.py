@@ -224,12 +224,15 @@ def test_every_flight_has_its_own_chapters(tmp_path):
     ) as writer:
         for record in rebooted():
             writer.record(record)
-    found = CliRunner().invoke(command, [str(log), "-o", str(out)], catch_exceptions=False)
+    found = CliRunner().invoke(
+        command, [str(log), "-o", str(out), "--png", str(tmp_path)], catch_exceptions=False
+    )
     assert "Flight 1 of 2" in found.output and "Flight 2 of 2" in found.output
     text = out.read_text("utf-8")
     ids = re.findall(r'id="plot-(\w+)"', text)
     assert {"flight1_map", "flight2_map"} <= set(ids) and len(set(ids)) == len(ids)
     assert set(json.loads(re.search(r'id="figures">(.*?)</script>', text, re.S)[1])) == set(ids)
+    assert (tmp_path / "flight2_map.png").exists()
     replayed = CliRunner().invoke(replay_command, [str(log), "-o", str(tmp_path / "x.mcap")])
     assert "2 flights, separated by reboots of the autopilot" in replayed.output
 

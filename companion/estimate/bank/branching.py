@@ -88,12 +88,7 @@ def births(
             elif now == f:
                 children.append(_Child(int(p), _log(min(fault.death_h * hours, 0.5)), f, ends=True))
                 children += _lie_children(int(p), f, fault.lies, fault.change_h * hours)
-        for j, jump in enumerate(layout.jumps):
-            since = bank.jumped_t if jump.often else bank.born_t
-            rate = jump.rate_h
-            if jump.again_h is not None and bank.event[p] == 1 + 2 * len(layout.faults) + j:
-                rate = jump.again_h
-            children.append(_Child(int(p), _log(rate * (bank.t - since) / HOUR_S), jump=j))
+        children += [_jump_child(bank, layout, int(p), j) for j in range(len(layout.jumps))]
     if any(heard):
         children += _grade_children(bank, layout, settings, hours)
     grown = _with_children(bank, layout, children)
@@ -128,10 +123,9 @@ def jump_births(bank: Bank, layout: Layout, settings: Settings = DEFAULT) -> Ban
     """
     if not jump_births_due(bank, layout, settings):
         return bank
-    jumps = [(j, jump.rate_h) for j, jump in enumerate(layout.jumps) if jump.often]
-    passed = bank.t - bank.jumped_t
+    often = [j for j, jump in enumerate(layout.jumps) if jump.often]
     heaviest = _heaviest_of_grades(bank)
-    children = [_Child(p, _log(rate * passed / HOUR_S), jump=j) for p in heaviest for j, rate in jumps]
+    children = [_jump_child(bank, layout, p, j) for p in heaviest for j in often]
     return _with_children(bank, layout, children)._replace(jumped_t=bank.t)
 
 
@@ -213,6 +207,15 @@ def _lie_children(parent: int, fault: int, lies: tuple[Lie, ...], prior: float) 
     """Children of one parent for one fault, one for each scale of the lie."""
     total = sum(lie.share for lie in lies)
     return [_Child(parent, _log(prior * lie.share / total), fault, lie, i) for i, lie in enumerate(lies)]
+
+
+def _jump_child(bank: Bank, layout: Layout, parent: int, jump: int) -> _Child:
+    """Child of one parent that jumped since the last births of such children."""
+    j = layout.jumps[jump]
+    since = bank.jumped_t if j.often else bank.born_t
+    again = bank.event[parent] == layout.jump_event(jump)
+    rate_h = j.again_h if again and j.again_h is not None else j.rate_h
+    return _Child(parent, _log(rate_h * (bank.t - since) / HOUR_S), jump=jump)
 
 
 def _grade_children(bank: Bank, layout: Layout, settings: Settings, hours: float) -> list[_Child]:
@@ -319,7 +322,7 @@ def _with_children(bank: Bank, layout: Layout, children: list[_Child]) -> Bank:
         elif c.jump != NONE:
             j = layout.jumps[c.jump]
             P[i[:, None], j.states, j.states] += np.square(j.sigma)
-            event[i] = 1 + 2 * F + c.jump
+            event[i] = layout.jump_event(c.jump)
         else:
             parent = at[i]
             grade[i], since[i], event[i] = c.grade, bank.since[parent], bank.event[parent]

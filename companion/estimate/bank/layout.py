@@ -208,6 +208,10 @@ class Layout:
         """Group of lie states that a fault uses."""
         return self.sources[self.faults[fault].sources[0]].group
 
+    def jump_event(self, jump: int) -> int:
+        """Code of a jump in `Bank.event`."""
+        return 1 + 2 * len(self.faults) + jump
+
     @cached_property
     def _priors(self) -> dict[tuple[int, Lie], tuple[Ints, Floats, Ints, Floats]]:
         """What `lie_prior` returned before."""

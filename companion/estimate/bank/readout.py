@@ -45,10 +45,9 @@ def explanations(bank: Bank, layout: Layout) -> Ints:
     (R,) codes; 0 is "nothing false, no such jump".
     """
     code = families(bank) * (len(layout.jumps) + 1)
-    first = 1 + 2 * len(layout.faults)
     for j, jump in enumerate(layout.jumps):
         if jump.apart_s > 0.0:
-            code += (j + 1) * ((bank.event == first + j) & (bank.t - bank.since < jump.apart_s))
+            code += (j + 1) * ((bank.event == layout.jump_event(j)) & (bank.t - bank.since < jump.apart_s))
     return code
 
 

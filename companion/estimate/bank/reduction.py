@@ -60,7 +60,7 @@ def reduce(bank: Bank, layout: Layout, settings: Settings) -> Bank:
     oldest: dict[tuple[int, int, int], int] = {}
     by_fault: set[int] = set()
     jumped: set[int] = set()
-    first_jump = 1 + 2 * len(layout.faults)
+    first_jump = layout.jump_event(0)
     by_scale: set[tuple[int, ...]] = set()
     graded: set[tuple[int, int]] = set()
     for i in order:
