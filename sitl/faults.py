@@ -265,8 +265,10 @@ def lever_arm(stream: Sequence[Gnss], fault: Fault, size: float, rng: Generator)
     t, north, east = np.array(fixes).T
     at = np.array([r.t_ns * 1e-9 for r in stream])
     course = np.interp(at, t, np.unwrap(np.arctan2(east, north)))
+    times, first = np.unique(at, return_index=True)  # a fix may come twice
+    rates = np.interp(at, times, np.gradient(course[first], times))
     out = []
-    for fix, angle, rate in zip(stream, course.tolist(), np.gradient(course, at).tolist()):
+    for fix, angle, rate in zip(stream, course.tolist(), rates.tolist()):
         if fault.covers(fix.t_ns):
             ahead = size * math.cos(angle), size * math.sin(angle)
             v = fix.v_n and (fix.v_n[0] - rate * ahead[1], fix.v_n[1] + rate * ahead[0], fix.v_n[2])

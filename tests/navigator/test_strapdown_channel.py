@@ -671,6 +671,7 @@ def test_recorded_on_px4_its_preset_finds_a_step_of_the_wind() -> None:
         records = [msgspec.json.decode(line, type=Input | Truth) for line in file]
     found = navigated(records, interpolated(records), load(preset="px4", environment={}))
     minute = (found.t >= LOSS) & (found.t < LOSS + 60.0)
+    assert found.error[found.t < LOSS].max() < 3.0
     assert rms(found.error[minute]) < 50.0
     assert np.mean(np.square(found.error[minute] / found.sigma[minute])) < 4.0
 

@@ -69,6 +69,14 @@ def test_gnss_jump_and_spoof():
     assert after[30].v_n == (0.0, 32.0, 0.0)
 
 
+def test_gnss_lever_arm_of_a_fix_that_comes_twice():
+    """The antenna's velocity was 0/0 there."""
+    before = [fix for fix in stream_of(Gnss) for _ in range(2)]
+    after = apply_record_faults(Gnss, before, (Fault("gnss-lever-arm", 20.0, 40.0, 5.0),), RNG(1))
+    assert np.array([r.v_n for r in after]) == pytest.approx(np.array([b.v_n for b in before]), abs=1e-9)
+    assert [east_of(r, b) for r, b in zip(after[40:80], before[40:80])] == pytest.approx([5.0] * 40, rel=5e-3)
+
+
 def test_gnss_jam_and_frozen_fix():
     _, after = apply_fault("gnss-jam")
     assert {r.fix for r in after[20:40]} == {1}

@@ -13,7 +13,7 @@ import numpy as np
 
 from companion.units import Floats
 
-NODES = np.linspace(-6.75, 6.75, 46)  # trapezoid in units of the minor sigma: 1.5e-11 is beyond
+NODES = np.linspace(-6.75, 6.75, 46)  # trapezoid in units of sigma: 1.5e-11 is beyond
 _w = np.exp(-0.5 * NODES**2)
 NODE_WEIGHTS = _w / _w.sum()
 del _w
@@ -27,7 +27,7 @@ _LOG_ERFC = np.log([math.erfc(x) for x in _X])
 def exceedance(r: float, d: Floats, C: Floats) -> Floats:
     """Return P(|d + e| > r), e ~ N(0, C), for each row.
 
-    Integrates the tail along the major axis, in closed form, over the minor axis by the trapezoidal rule.
+    Integrates the tail along one principal axis, in closed form, over the other by the trapezoidal rule.
 
     Parameters
     ----------
@@ -53,6 +53,10 @@ def _principal(d: Floats, C: Floats) -> tuple[Floats, Floats, Floats, Floats]:
 
 
 def _tail(r: float, a: Floats, b: Floats, ma: Floats, mb: Floats) -> Floats:
+    # the closed form has a kink where the other axis leaves the circle: that must be far from the mean
+    near = (r - mb) * a < (r - ma) * b
+    a, b = np.where(near, b, a), np.where(near, a, b)
+    ma, mb = np.where(near, mb, ma), np.where(near, ma, mb)
     v = mb[:, None] + b[:, None] * NODES
     h = np.sqrt(np.maximum(r * r - v * v, 0.0))
     scale = 1.0 / (a * math.sqrt(2.0))
