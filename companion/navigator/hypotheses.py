@@ -43,6 +43,8 @@ INS_JUMPS_H = 0.01  # its position, by a reset of the unit
 #: Beacons that contradict are believed within two minutes: without it an INS that drifted excluded all else.
 INS_DRIFTS_H, INS_DRIFT = 2e-7, (5.0, 5.0, 1.0, 1.0)
 INS_DRIFTS_AGAIN_H = 1.0  # once it has stepped
+#: Its position with it: a GNSS that drew the INS off unnoticed is true again.
+INS_MISLED = (100.0, 100.0, 1.0, 1.0)
 BEACON_PLACE = 0.03  # its position is stated wrongly: likelier than a GNSS captured before the first fix
 BEACON_H = 2e-4  # a beacon steps, or is elsewhere, so often in an hour; it does not drift
 ORDERS = (3, 2, 2)  # GNSS may be drawn off with an acceleration
@@ -262,10 +264,11 @@ def _hypotheses(config: Config, channel: Channel, beacons: int, by_air: bool, wi
         )
     else:
         jumps.append(Jump("channel", (0, 1), (100.0, 100.0), INS_JUMPS_H, quota=2, apart_s=APART_S))
-        again_h = INS_DRIFTS_AGAIN_H
-        jumps.append(
-            Jump("drift", (0, 1, 2, 3), INS_DRIFT, INS_DRIFTS_H, quota=2, apart_s=APART_S, again_h=again_h)
-        )
+        for name, sigmas, again_h in (("drift", INS_DRIFT, INS_DRIFTS_AGAIN_H), ("misled", INS_MISLED, None)):
+            states = (0, 1, 2, 3)
+            jumps.append(
+                Jump(name, states, sigmas, INS_DRIFTS_H, quota=2, apart_s=APART_S, again_h=again_h)
+            )
     layout = Layout(
         channel.n + 2 * beacons,
         GROUPS,

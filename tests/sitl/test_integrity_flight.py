@@ -107,6 +107,16 @@ def test_gnss_that_is_drawn_off_gently_is_found_beside_an_ins(scenario: str) -> 
     assert result.last_m < 10.0
 
 
+@pytest.mark.parametrize("scenario", ["tactical", "mems"])
+def test_gnss_that_drew_an_ins_off_unnoticed_is_believed_once_it_is_true_again(scenario: str) -> None:
+    """It was excluded as it returned by 87 m, then the beacon too: 232 m off beyond a level of 63 m."""
+    result = fly_order(FlightOrder(scenario, "gnss-accelerate", 1))
+    assert result.raised is None
+    assert (result.misleading_s, result.beyond_s) == (0.0, 0.0)
+    assert result.largest_m < 100.0
+    assert result.last_m < 10.0
+
+
 def test_onsets_of_a_slow_lie_are_kept() -> None:
     """A GNSS that is drawn off at 0.5 m/s without an INS: it looks like a change of wind for three minutes.
 
