@@ -85,8 +85,8 @@ class AirDataConfig(Section, frozen=True):
 
     wind_m_s: Annotated[float, Meta(ge=0.1, le=100.0)] = 8.0
     wind_change_m_s_sqrt_s: Annotated[float, Meta(ge=0.0001, le=10.0)] = 0.05
-    wind_jump_m_s: Annotated[float, Meta(ge=0.1, le=100.0)] = 4.0  # of wind jumps, north and east
-    wind_jumps_per_hour: Annotated[float, Meta(ge=0.001, le=60.0)] = 1.0
+    wind_jump_m_s: Annotated[float, Meta(ge=0.1, le=100.0)] = 6.0  # of wind jumps, north and east
+    wind_jumps_per_hour: Annotated[float, Meta(ge=0.001, le=60.0)] = 10.0
     gust_m_s: Annotated[float, Meta(ge=0.01, le=50.0)] = 1.2
     gust_s: Annotated[float, Meta(ge=0.01, le=60.0)] = 1.0
     airspeed_percent: Annotated[float, Meta(ge=0.1, le=50.0)] = 3.0

@@ -266,9 +266,7 @@ def _hypotheses(config: Config, channel: Channel, beacons: int, by_air: bool, wi
         jumps.append(Jump("channel", (0, 1), (100.0, 100.0), INS_JUMPS_H, quota=2, apart_s=APART_S))
         for name, sigmas, again_h in (("drift", INS_DRIFT, INS_DRIFTS_AGAIN_H), ("misled", INS_MISLED, None)):
             states = (0, 1, 2, 3)
-            jumps.append(
-                Jump(name, states, sigmas, INS_DRIFTS_H, quota=2, apart_s=APART_S, again_h=again_h)
-            )
+            jumps.append(Jump(name, states, sigmas, INS_DRIFTS_H, quota=2, apart_s=APART_S, again_h=again_h))
     layout = Layout(
         channel.n + 2 * beacons,
         GROUPS,

@@ -166,6 +166,30 @@ def test_with_a_beacon_the_error_is_at_most_half_the_fixes(name: str, seed: int)
         assert found.error[found.t >= 0.0].max() <= two_sigma
 
 
+@pytest.mark.flight
+@pytest.mark.parametrize(
+    ("flags", "first_m", "third_m"),
+    [({}, 70.0, 34.0), ({"rsbn.bias_azimuth_deg": 0.001, "rsbn.bias_range_m": 0.1}, 70.0, 30.0)],
+    ids=["by default", "a beacon stated to have no bias"],
+)
+def test_a_step_of_the_wind_is_found_by_fixes_alone(
+    flags: dict[str, float], first_m: float, third_m: float
+) -> None:
+    """Error in the first minute and from the third on, six noises; 80 m with a step an hour.
+
+    What is left from the third minute on is the beacon's bias, as far as two minutes of GNSS have shown it.
+    """
+    air = {"inertial.source": "air_data", "output.profile": "ardupilot"}
+    config, flown = load(flags=air | flags, environment={}), flight("plane_wind_change")
+    found = [flown_by(flown, with_beacon(flown, seed, 120.0 * seed, NEVER), config) for seed in range(6)]
+
+    def between(start: float, end: float) -> float:
+        return rms(np.concatenate([f.error[(f.t >= start) & (f.t < end)] for f in found]))
+
+    assert between(0.0, 60.0) < first_m
+    assert between(120.0, math.inf) < third_m
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_a_minute_without_the_beacon_in_a_changed_wind_wherever_it_begins(seed: int) -> None:
     """From one minute after GNSS is lost on."""
