@@ -61,6 +61,16 @@ def test_growth_is_reported() -> None:
         assert word in sentence and sentence.startswith("hour 2: ")
 
 
+def test_a_leak_is_found_among_counts_that_differ_by_a_tenth() -> None:
+    def day(leak: int) -> list[HourStatistics]:
+        """A count differs by a tenth from hour to hour, in no order."""
+        return [GOOD._replace(hour=h, objects=4000 + 97 * h % 400 + leak * (h - 1)) for h in range(1, 25)]
+
+    assert find_failures(day(0)) == []
+    (sentence,) = find_failures(day(20))  # half a per cent an hour
+    assert sentence.startswith("hour 19: objects grew from 40")
+
+
 class BoundedHolder:
     def __init__(self) -> None:
         self.kept = deque[list[int]](maxlen=64)
