@@ -199,18 +199,7 @@ class Model:
 
 def only(bank: Bank, row: int) -> Bank:
     """The bank with one of its rows, which has all the weight."""
-    at = slice(row, row + 1)
-    return bank._replace(
-        L=np.zeros(1),
-        x=bank.x[at],
-        P=bank.P[at],
-        grade=bank.grade[at],
-        fault=bank.fault[at],
-        event=bank.event[at],
-        since=bank.since[at],
-        scale=bank.scale[at],
-        noise=bank.noise[at],
-    )
+    return banks.picked(bank, [row])._replace(L=np.zeros(1))
 
 
 def without_jumps(air: AirDataConfig) -> AirDataConfig:

@@ -15,7 +15,7 @@ from companion.estimate.bank.layout import NEVER, NONE, Layout, Lie
 from companion.estimate.bank.readout import level_rows
 from companion.estimate.bank.reduction import reduce
 from companion.estimate.bank.settings import DEFAULT, Settings
-from companion.estimate.bank.state import Bank, families, normalised
+from companion.estimate.bank.state import Bank, families, normalised, picked
 
 HOUR_S = 3600.0
 
@@ -289,9 +289,9 @@ def _with_children(bank: Bank, layout: Layout, children: list[_Child]) -> Bank:
     given = np.zeros(rows)
     np.add.at(given, [c.parent for c in children], np.exp(prior))
     L = np.concatenate((bank.L + np.log1p(-np.minimum(given, 0.9)), bank.L[at[rows:]] + prior))
-    x, P, noise = bank.x[at], bank.P[at], bank.noise[at]
-    grade, fault, event, scale = bank.grade[at], bank.fault[at], bank.event[at], bank.scale[at]
-    since = bank.since[at]
+    grown = picked(bank, at)._replace(L=normalised(L))
+    x, P, noise, since = grown.x, grown.P, grown.noise, grown.since
+    grade, fault, event, scale = grown.grade, grown.fault, grown.event, grown.scale
     since[rows:] = bank.t
     F = len(layout.faults)
     alike: dict[tuple[object, ...], list[int]] = {}  # rows with the same change, of several parents
@@ -326,14 +326,4 @@ def _with_children(bank: Bank, layout: Layout, children: list[_Child]) -> Bank:
         else:
             parent = at[i]
             grade[i], since[i], event[i] = c.grade, bank.since[parent], bank.event[parent]
-    return bank._replace(
-        L=normalised(L),
-        x=x,
-        P=P,
-        grade=grade,
-        fault=fault,
-        event=event,
-        since=since,
-        scale=scale,
-        noise=noise,
-    )
+    return grown

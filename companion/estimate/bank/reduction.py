@@ -9,7 +9,7 @@ import numpy as np
 from companion.estimate.bank.layout import NONE, Layout
 from companion.estimate.bank.readout import level_rows
 from companion.estimate.bank.settings import Settings
-from companion.estimate.bank.state import Bank, families, normalised
+from companion.estimate.bank.state import Bank, families, normalised, picked
 from companion.units import Floats
 
 
@@ -130,9 +130,9 @@ def _merged(
     bank: Bank, keep: list[int], dropped: list[int], keys: list[tuple[int, int, int]], settings: Settings
 ) -> Bank:
     """The rows `keep`; the weights of `dropped`, in this order, go where `reduce` states."""
-    at = np.array(keep)
+    kept = picked(bank, keep)
     L, grade, noise = bank.L.tolist(), bank.grade.tolist(), bank.noise.tolist()
-    x, P = bank.x[at], _symmetric(bank.P[at])
+    x, P = kept.x, _symmetric(kept.P)
     place = {row: k for k, row in enumerate(keep)}
     by_key: dict[tuple[int, int, int], list[int]] = {}
     for i in keep:
@@ -151,17 +151,7 @@ def _merged(
             L[j], x[k], P[k] = merge_moments(L[i], bank.x[i], _symmetric(bank.P[i]), L[j], x[k], P[k])
         elif L[i] < L[j] + log_ratio:
             L[j] = float(np.logaddexp(L[i], L[j]))
-    return bank._replace(
-        L=normalised(np.array(L)[at]),
-        x=x,
-        P=P,
-        grade=bank.grade[at],
-        fault=bank.fault[at],
-        event=bank.event[at],
-        since=bank.since[at],
-        scale=bank.scale[at],
-        noise=bank.noise[at],
-    )
+    return kept._replace(L=normalised(np.array(L)[keep]), x=x, P=P)
 
 
 def _symmetric(P: Floats) -> Floats:

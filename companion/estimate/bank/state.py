@@ -93,6 +93,31 @@ def start(layout: Layout, t: float, x0: Floats, P0: Floats, prior: Sequence[floa
     )
 
 
+def picked(bank: Bank, at: Sequence[int] | Ints | slice) -> Bank:
+    """Return the bank with some of its rows, their weights as they were.
+
+    Parameters
+    ----------
+    bank : the bank.
+    at : indices of the rows; a row may come more than once.
+
+    Returns
+    -------
+    Bank : with the rows in the order of `at`.
+    """
+    return bank._replace(
+        L=bank.L[at],
+        x=bank.x[at],
+        P=bank.P[at],
+        grade=bank.grade[at],
+        fault=bank.fault[at],
+        event=bank.event[at],
+        since=bank.since[at],
+        scale=bank.scale[at],
+        noise=bank.noise[at],
+    )
+
+
 def families(bank: Bank) -> Ints:
     """Return the code of each row's set of active faults.
 
