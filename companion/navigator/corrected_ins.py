@@ -51,6 +51,7 @@ class CorrectedIns(NamedTuple):
     grades: tuple[float, ...]
     velocity_noise: float = 0.0
     wind: tuple[int, ...] = ()
+    doppler: None = None
 
     @property
     def n(self) -> int:
@@ -97,7 +98,7 @@ def _extra_states(config: Config) -> ExtraStates:
     air, used = config.air_data, config.inertial.correctors
     names, density, sigma = list[str](), list[float](), list[float]()
     if "airspeed" in used:
-        wind = air.wind_change_m_s_sqrt_s**2 + air.wind_jump_m_s**2 * air.wind_jumps_per_hour / 3600.0
+        wind = air.wind_walk_m_s_sqrt_s**2
         names += ["wN", "wE", "scale"]
         density += [wind, wind, 0.0]
         sigma += [air.wind_m_s, air.wind_m_s, 0.01 * air.airspeed_percent]

@@ -203,9 +203,8 @@ def only(bank: Bank, row: int) -> Bank:
 
 
 def without_jumps(air: AirDataConfig) -> AirDataConfig:
-    """With a random walk of the wind that has the variance of random walk and jumps together."""
-    density = air.wind_change_m_s_sqrt_s**2 + air.wind_jump_m_s**2 * air.wind_jumps_per_hour / 3600.0
-    return structs.replace(air, wind_change_m_s_sqrt_s=math.sqrt(density))
+    """With a random walk of the wind that stands for its jumps too."""
+    return structs.replace(air, wind_change_m_s_sqrt_s=air.wind_walk_m_s_sqrt_s)
 
 
 def _hypotheses(config: Config, channel: Channel, beacons: int, by_air: bool, witness: bool) -> Hypotheses:

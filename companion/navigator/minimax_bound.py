@@ -143,8 +143,7 @@ def law(config: Config, by: str, v_n: tuple[float, ...] = (0.0, 0.0)) -> Channel
         )
         return BoundedIns(errors, correlation_s, unit.strapped_down)
     air = config.air_data
-    jumps = air.wind_jump_m_s * math.sqrt(air.wind_jumps_per_hour / 3600.0)
-    walk = math.hypot(air.wind_change_m_s_sqrt_s, jumps)
+    walk = air.wind_walk_m_s_sqrt_s
     if by == "air":
         scale, heading = 0.01 * air.airspeed_percent, math.radians(air.heading_deg)
         crab = math.radians(air.crab_deg) * math.hypot(*v_n[:2])
