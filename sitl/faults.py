@@ -98,6 +98,14 @@ def gnss_accelerate(fix: Gnss, fault: Fault, size: float, rng: Generator) -> Gns
     return replace(_displace_fix(fix, 0.0, 0.5 * size * t * t), v_n=v_n)
 
 
+def gnss_velocity(fix: Gnss, fault: Fault, size: float, rng: Generator) -> Gnss:
+    """Make the velocity greater by the share `size` than the positions move.
+
+    ArduPilot's simulator flies over a sphere, whose positions are read on the ellipsoid: 0.25 % at 60 deg.
+    """
+    return replace(fix, v_n=fix.v_n and (fix.v_n[0] * (1.0 + size), fix.v_n[1] * (1.0 + size), fix.v_n[2]))
+
+
 def gnss_return(fix: Gnss, fault: Fault, size: float, rng: Generator) -> Gnss:
     """Remove the fix for `OUTAGE_S`; after it the fix is displaced `size` metres to the north-east."""
     in_outage = fix.t_ns * 1e-9 - fault.start_s < OUTAGE_S
@@ -289,6 +297,7 @@ RECORD_FAULTS: dict[str, RecordFault] = {
     "gnss-jump": RecordFault(Gnss, 500.0, per_record(gnss_jump)),
     "gnss-spoof": RecordFault(Gnss, 2.0, per_record(gnss_spoof)),
     "gnss-accelerate": RecordFault(Gnss, 0.003, per_record(gnss_accelerate)),
+    "gnss-velocity": RecordFault(Gnss, -0.003, per_record(gnss_velocity)),
     "gnss-return": RecordFault(Gnss, 450.0, per_record(gnss_return)),
     "gnss-latency": RecordFault(Gnss, 0.2, stamped_late),
     "gnss-lever-arm": RecordFault(Gnss, 5.0, lever_arm),

@@ -64,6 +64,10 @@ class Channel(Protocol):
         """The two states of GNSS drift."""
 
     @property
+    def doppler(self) -> slice | None:
+        """The two states of the lasting error of the GNSS velocity; None where there are none."""
+
+    @property
     def latency(self) -> int:
         """The state of GNSS latency."""
 

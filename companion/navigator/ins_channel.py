@@ -47,6 +47,7 @@ class InsChannel(NamedTuple):
     body_fixed: bool
     n: int = N
     drift: slice = DRIFT
+    doppler: None = None
     latency: int = LATENCY
     arm: int | None = ARM
     grades: tuple[float, ...] = WEIGHTS

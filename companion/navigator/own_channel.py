@@ -81,7 +81,7 @@ class OwnChannel:
     """Error model of the own channel with the constants of one configuration."""
 
     grades = WEIGHTS
-    drift = own_error_model.DRIFT
+    drift, doppler = own_error_model.DRIFT, own_error_model.DOPPLER
     arm = None  # airspeed and attitude are not known to a metre
     velocity_noise = 0.0
     wind = (4, 5)
@@ -104,6 +104,7 @@ class OwnChannel:
             velocity_noise_m_s_sqrt_s=strapdown.velocity_noise_m_s_sqrt_s,
             drift_m=gnss.sigma_m,
             drift_s=gnss.correlation_s,
+            doppler_m_s=gnss.sigma_velocity_m_s,
             hold_m_s_sqrt_s=HOLD_M_S_SQRT_S,
         )
         self.layout = Layout(foreign=True, latency=True)

@@ -30,6 +30,9 @@ the gust of half a second ago by more than a gust changes, so it shows at once. 
 ten seconds. By airspeed alone gusts cannot be told from motion: turbulence is white noise there, with its
 part that lasts for seconds.
 
+`doppler` is what is wrong with the velocity of GNSS for minutes. As white noise alone a thousand fixes make a
+velocity that is 0.05 m/s off beyond doubt, and then the position of GNSS, which contradicts it, false.
+
 An `Interval` sums what Phi needs over many samples (a dozen numbers), so that Phi and Q are made once per
 measurement. Not modelled: Schuler loop, vertical channel (heights are pressure altitudes), Coriolis (it is
 0.003 m/s^2 at 25 m/s; put it into `a_n` for fast aircraft).
@@ -54,7 +57,8 @@ LONGEST_S = 1.0  # close an interval at this length even without a measurement: 
 POSITION, VELOCITY, WIND = slice(0, 2), slice(2, 4), slice(4, 6)
 SCALE, HEADING, CRAB = 6, 7, 8
 TILT, ACCELEROMETER, DRIFT, GUST = slice(9, 11), slice(11, 13), slice(13, 15), slice(15, 17)
-N_BASE = 17
+DOPPLER = slice(17, 19)
+N_BASE = 19
 
 AIRSPEED_NOISE_M_S = 1.0  # of half a second's mean: pitot, angle of attack, sideslip
 AIRSPEED_MANOEUVRE_S = 0.2  # and per acceleration; 0.14 to 0.17 in an aerobatic flight (TestLog2)
@@ -63,7 +67,7 @@ ALONG = 1.2  # and how much greater it is along the nose than across
 
 
 class Layout(NamedTuple):
-    """Which optional states follow the 17 basic ones."""
+    """Which optional states follow the 19 basic ones."""
 
     foreign: bool = False
     latency: bool = False
@@ -106,6 +110,8 @@ class Amplitudes(NamedTuple):
     gust_s: float = 1.0
     drift_m: float = 1.5
     drift_s: float = 300.0
+    doppler_m_s: float = 0.1
+    doppler_s: float = 600.0
     foreign_m_s: float = 0.3
     foreign_change_m_s_sqrt_s: float = 0.5  # 1.2 km in three minutes, as an autopilot without GNSS
     foreign_noise_m_s: float = 0.5
@@ -233,7 +239,7 @@ def prior(settings: Amplitudes, layout: Layout, grades: tuple[float, ...]) -> Fl
     sigma[:, POSITION], sigma[:, VELOCITY], sigma[:, WIND] = s.position_m, s.velocity_m_s, s.wind_m_s
     sigma[:, SCALE], sigma[:, HEADING], sigma[:, CRAB] = s.scale, s.heading, s.crab
     sigma[:, TILT], sigma[:, ACCELEROMETER], sigma[:, DRIFT] = s.tilt, s.accelerometer_m_s2, s.drift_m
-    sigma[:, GUST] = s.gust_m_s
+    sigma[:, GUST], sigma[:, DOPPLER] = s.gust_m_s, s.doppler_m_s
     coarser = np.array(grades)
     scaled = np.r_[HEADING, CRAB, TILT, ACCELEROMETER]
     sigma[:, scaled] *= coarser[:, None]
@@ -265,6 +271,7 @@ class Propagator:
             (TILT, s.tilt, s.tilt_s, True),
             (ACCELEROMETER, s.accelerometer_m_s2, s.accelerometer_s, True),
             (DRIFT, s.drift_m, s.drift_s, False),
+            (DOPPLER, s.doppler_m_s, s.doppler_s, False),
             (GUST, s.gust_m_s, s.gust_s, False),
         ):
             rate[where] = 1.0 / tau

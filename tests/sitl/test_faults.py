@@ -69,6 +69,12 @@ def test_gnss_jump_and_spoof():
     assert after[30].v_n == (0.0, 32.0, 0.0)
 
 
+def test_gnss_velocity_is_off_by_a_share():
+    before, after = apply_fault("gnss-velocity", -0.003)
+    assert after[30].v_n == pytest.approx([0.997 * v for v in before[30].v_n[:2]] + [before[30].v_n[2]])
+    assert (after[30].lat, after[30].lon) == (before[30].lat, before[30].lon)
+
+
 def test_gnss_lever_arm_of_a_fix_that_comes_twice():
     """The antenna's velocity was 0/0 there."""
     before = [fix for fix in stream_of(Gnss) for _ in range(2)]
