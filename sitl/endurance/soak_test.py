@@ -7,9 +7,9 @@ off; the companion is never restarted. In every sortie random faults last about 
 minutes apart, about 14 per hour. Each hour yields one line with memory, queues and rates. Limits:
 
     memory     resident memory of the process: at most 5 % above the first hour; number of objects reachable
-               from the companion, the least at the ends of the sorties: in the last quarter of the hours at most
-               5 % above that of the first. A roll-back in progress holds records and the past is thinned out
-               now and then, so single counts differ by 10 %; what leaks raises the least
+               from the companion, the least at the ends of the sorties: in the last quarter of the hours at
+               most 5 % above that of the first. A roll-back in progress holds records, and the past is
+               thinned out now and then, so single counts differ by a tenth; what leaks raises the least
     queues     the longest container in the companion, and the bytes that wait for the log's disk: bounded
     rates      in the quiet time between faults: of solutions and of messages received within 1 % of the first
                hour; of messages sent within 1 % beyond the 5 % that may leave early (`output.pace`), which
