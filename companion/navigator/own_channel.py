@@ -30,6 +30,7 @@ ORDER: tuple[By, ...] = ("imu", "air", "foreign", "hold")
 FRESH_NS = 1_000_000_000  # an attitude older than this turns no airspeed into a velocity
 HOLD_M_S_SQRT_S = 4.0  # a turn of 30 degrees of bank changes the velocity by 5.7 m/s in a second
 SENSOR_NS = 10_000_000_000  # the word of the autopilot that its airspeed sensor is healthy lasts so long
+LASTING = 0.5  # share of the velocity error of GNSS that lasts for minutes
 WEIGHTS = (1.0, 0.5, 0.25)  # of `own_error_model.GRADES`
 
 
@@ -104,7 +105,7 @@ class OwnChannel:
             velocity_noise_m_s_sqrt_s=strapdown.velocity_noise_m_s_sqrt_s,
             drift_m=gnss.sigma_m,
             drift_s=gnss.correlation_s,
-            doppler_m_s=gnss.sigma_velocity_m_s,
+            doppler_m_s=LASTING * gnss.sigma_velocity_m_s,
             hold_m_s_sqrt_s=HOLD_M_S_SQRT_S,
         )
         self.layout = Layout(foreign=True, latency=True)

@@ -110,7 +110,7 @@ class Amplitudes(NamedTuple):
     gust_s: float = 1.0
     drift_m: float = 1.5
     drift_s: float = 300.0
-    doppler_m_s: float = 0.1
+    doppler_m_s: float = 0.05
     doppler_s: float = 600.0
     foreign_m_s: float = 0.3
     foreign_change_m_s_sqrt_s: float = 0.5  # 1.2 km in three minutes, as an autopilot without GNSS
