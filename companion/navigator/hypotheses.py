@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from msgspec import structs
 
-from companion.config import AirDataConfig, Config
+from companion.config import Config
 from companion.estimate import bank as banks
 from companion.estimate.bank import (
     Bank,
@@ -127,12 +127,14 @@ class Model:
     """Channel and hypotheses of one configuration.
 
     `plain` is a grade: then there is that grade alone, nothing is ever false and nothing jumps. The bank is a
-    Kalman filter, and the wind a random walk of the variance that random walk and jumps have together.
+    Kalman filter, and a random walk of the wind stands for its jumps too.
     """
 
     def __init__(self, config: Config, plain: int | None = None) -> None:
         if plain is not None:
-            config = structs.replace(config, air_data=without_jumps(config.air_data))
+            air = config.air_data
+            air = structs.replace(air, wind_change_m_s_sqrt_s=air.wind_walk_m_s_sqrt_s)
+            config = structs.replace(config, air_data=air)
         self.config, self.plain = config, plain
         self.channel: Channel = corrected_ins(config) if config.has_own_ins else OwnChannel(config)
         self._known: dict[tuple[int, bool, bool], Hypotheses] = {}
@@ -202,11 +204,6 @@ def only(bank: Bank, row: int) -> Bank:
     return banks.picked(bank, [row])._replace(L=np.zeros(1))
 
 
-def without_jumps(air: AirDataConfig) -> AirDataConfig:
-    """With a random walk of the wind that stands for its jumps too."""
-    return structs.replace(air, wind_change_m_s_sqrt_s=air.wind_walk_m_s_sqrt_s)
-
-
 def _hypotheses(config: Config, channel: Channel, beacons: int, by_air: bool, witness: bool) -> Hypotheses:
     azimuth_bias, range_bias = math.radians(config.rsbn.bias_azimuth_deg), config.rsbn.bias_range_m
     sigma_a, sigma_r = math.radians(config.rsbn.sigma_azimuth_deg), config.rsbn.sigma_range_m
@@ -252,8 +249,8 @@ def _hypotheses(config: Config, channel: Channel, beacons: int, by_air: bool, wi
         )
     else:
         jumps.append(Jump("channel", (0, 1), (100.0, 100.0), INS_JUMPS_H, quota=2, apart_s=APART_S))
+        states = (0, 1, 2, 3)
         for name, sigmas, again_h in (("drift", INS_DRIFT, INS_DRIFTS_AGAIN_H), ("misled", INS_MISLED, None)):
-            states = (0, 1, 2, 3)
             jumps.append(Jump(name, states, sigmas, INS_DRIFTS_H, quota=2, apart_s=APART_S, again_h=again_h))
     layout = Layout(
         channel.n + 2 * beacons,
