@@ -106,8 +106,7 @@ WRONG: dict[str, Wrong] = {
     "GNSS 0.2 s late": _wrong("gnss-latency", 0.2, 0.0),
     "GNSS 0.3 s late": _wrong("gnss-latency", 0.3, 0.0),
     "GNSS antenna 5 m ahead": _wrong("gnss-lever-arm", 5.0, 0.0),
-    # beside an INS, whose velocity is known to a few cm/s, GNSS is excluded: docs/limits.md
-    "GNSS velocity 0.3 % too small": Wrong(OWN, _fault("gnss-velocity", -0.003, 0.0)),
+    "GNSS velocity 0.3 % too small": Wrong(fault=_fault("gnss-velocity", -0.003, 0.0)),
     "GNSS 3x as noisy as stated": Wrong(noisy=Gnss),
     "beacon 3x as noisy as stated": Wrong(noisy=RsbnFix),
     "stall of 0.3 s": Wrong(stall_s=0.3, over_link=True),

@@ -19,6 +19,7 @@ from companion.navigator.own_error_model import Interval
 from companion.records import Vector2
 from companion.units import Floats
 
+DOPPLER_S = 600.0  # how long the lasting part of the velocity error of GNSS lasts
 STEP_S = 2.0  # the transition is a power series: its fifth term is below 1e-12 of the first here
 
 
@@ -64,8 +65,8 @@ class Channel(Protocol):
         """The two states of GNSS drift."""
 
     @property
-    def doppler(self) -> slice | None:
-        """The two states of the lasting error of the GNSS velocity; None where there are none."""
+    def doppler(self) -> slice:
+        """The two states of the lasting error of the GNSS velocity."""
 
     @property
     def latency(self) -> int:

@@ -18,11 +18,11 @@ import numpy as np
 from companion.config import Config
 from companion.nav.error_model import INS_STATES
 from companion.navigator.channel import Nominal, Transition, discretise
-from companion.navigator.ins_channel import InsChannel, ins_channel
+from companion.navigator.ins_channel import ARM, DOPPLER, DRIFT, LATENCY, WEIGHTS, InsChannel, ins_channel
 from companion.units import Floats
 
 UNIT_NAMES = (*INS_STATES, "EX", "EY", "EZ", "AX", "AY")
-INS_NAMES = (*UNIT_NAMES, "driftN", "driftE", "latency", "arm")
+INS_NAMES = (*UNIT_NAMES, "driftN", "driftE", "latency", "arm", "dopplerN", "dopplerE")
 CHAINS = 3  # lines of position with a bias of their own
 CHAIN_BIAS_M, CHAIN_S = 200.0, 3600.0
 
@@ -45,13 +45,13 @@ class CorrectedIns(NamedTuple):
     ins: InsChannel
     extra: ExtraStates
     has_second: bool
-    drift: slice
-    latency: int
-    arm: int | None
-    grades: tuple[float, ...]
+    drift: slice = DRIFT
+    doppler: slice = DOPPLER
+    latency: int = LATENCY
+    arm: int | None = ARM
+    grades: tuple[float, ...] = WEIGHTS
     velocity_noise: float = 0.0
     wind: tuple[int, ...] = ()
-    doppler: None = None
 
     @property
     def n(self) -> int:
@@ -90,8 +90,7 @@ def corrected_ins(config: Config) -> InsChannel | CorrectedIns:
     ins = ins_channel(config)
     if not config.inertial.correctors:
         return ins
-    second = "second_ins" in config.inertial.correctors
-    return CorrectedIns(ins, _extra_states(config), second, ins.drift, ins.latency, ins.arm, ins.grades)
+    return CorrectedIns(ins, _extra_states(config), "second_ins" in config.inertial.correctors)
 
 
 def _extra_states(config: Config) -> ExtraStates:

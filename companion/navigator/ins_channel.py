@@ -3,7 +3,7 @@
 The model is `nav.error_model.aircraft_matrix` with Markov gyro drift and accelerometer errors. States:
 position errors north and east (m), velocity errors (m/s), P minus the rotation of the platform (3, rad), E
 minus the gyro drift (3, rad/s), A accelerometer errors (2, m/s^2), GNSS drift (2, m), GNSS latency (s),
-lever arm of the GNSS antenna ahead of the INS (m).
+lever arm of the GNSS antenna ahead of the INS (m), lasting error of the GNSS velocity (2, m/s).
 Errors of sensors that are strapped down turn with the aircraft. A grade g multiplies the amplitudes of the
 unit's errors: accelerometers, velocity and tilt by g, gyros by g^1.5. Units differ more in their gyros: from
 navigation to tactical to MEMS grade 1, 10, 100, where the accelerometers are 1, 4, 10.
@@ -19,16 +19,17 @@ import numpy as np
 from companion.config import Config
 from companion.nav.disturbances import accelerometer_slow, compose, gyro_drift
 from companion.nav.error_model import INS_STATES, aircraft_matrix
-from companion.navigator.channel import Nominal, Transition, discretise
+from companion.navigator.channel import DOPPLER_S, Nominal, Transition, discretise
 from companion.units import G0, Floats
 
-N = 16
+N = 18
 VELOCITY, TILT, INS = slice(2, 4), slice(4, 7), slice(0, 7)
 GYROS = slice(7, 10)
 GYRO, ACCELEROMETER = (7, 8), (10, 11)  # north and east
-DRIFT, LATENCY, ARM = slice(12, 14), 14, 15
+DRIFT, LATENCY, ARM, DOPPLER = slice(12, 14), 14, 15, slice(16, 18)
 TURNING_M_S = 5.0  # slower, the course does not give the heading
 LATENCY_S, LATENCY_WALK = 0.15, 1e-4  # one sigma of the latency (s) and its random walk (s/sqrt s)
+LASTING = 0.3  # share of the velocity error of GNSS that lasts: more hides one that is drawn off gently
 ARM_M = 1.5  # one sigma of the antenna's lever arm along the fuselage
 FIRST_POSITION_M = 1000.0  # the first fix gives the place of the INS
 AMPLITUDES = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0)
@@ -47,7 +48,7 @@ class InsChannel(NamedTuple):
     body_fixed: bool
     n: int = N
     drift: slice = DRIFT
-    doppler: None = None
+    doppler: slice = DOPPLER
     latency: int = LATENCY
     arm: int | None = ARM
     grades: tuple[float, ...] = WEIGHTS
@@ -82,6 +83,7 @@ def ins_channel(config: Config) -> InsChannel:
     bias = unit.accelerometer_bias_ug * 1e-6 * G0
     tilt = math.radians(unit.tilt_arcsec / 3600.0)
     heading = math.radians(unit.heading_arcmin / 60.0)
+    doppler = LASTING * gnss.sigma_velocity_m_s
     slow = (
         gyro_drift(1.0 / (3600.0 * unit.gyro_correlation_h), drift),
         accelerometer_slow(1.0 / (3600.0 * unit.accelerometer_correlation_h), bias),
@@ -90,6 +92,7 @@ def ins_channel(config: Config) -> InsChannel:
     A, ours = np.zeros((N, N)), len(bare.A)
     A[:ours, :ours] = bare.A
     A[DRIFT, DRIFT] = -np.eye(2) / gnss.correlation_s
+    A[DOPPLER, DOPPLER] = -np.eye(2) / DOPPLER_S
     density = np.zeros(N)
     density[:ours] = bare.Q.diagonal()
     density[VELOCITY] = unit.velocity_noise_m_s_sqrt_s**2
@@ -102,6 +105,7 @@ def ins_channel(config: Config) -> InsChannel:
         + [bias] * 2
         + [gnss.sigma_m] * 2
         + [LATENCY_S, ARM_M]
+        + [doppler] * 2
     )
     amplitude = np.ones((len(AMPLITUDES), N))
     amplitude[:, :ours] = np.array(AMPLITUDES)[:, None]
@@ -112,5 +116,6 @@ def ins_channel(config: Config) -> InsChannel:
     scaled = density * amplitude**2
     scaled[:, DRIFT] = 2.0 * gnss.sigma_m**2 / gnss.correlation_s
     scaled[:, LATENCY] = LATENCY_WALK**2
+    scaled[:, DOPPLER] = 2.0 * doppler**2 / DOPPLER_S
     one = np.eye(N)
     return InsChannel(A, scaled[:, :, None] * one, (sigma * first)[:, :, None] ** 2 * one, unit.strapped_down)

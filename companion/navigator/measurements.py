@@ -101,8 +101,7 @@ def other_receiver(bank: Bank, channel: Channel) -> Bank:
     """Forget drift, lasting velocity error, latency and lever arm: the next fix is another receiver's."""
     base = range(channel.n)
     arm = [] if channel.arm is None else [channel.arm]
-    doppler = [] if channel.doppler is None else base[channel.doppler]
-    states = [*base[channel.drift], *doppler, channel.latency, *arm]
+    states = [*base[channel.drift], *base[channel.doppler], channel.latency, *arm]
     return banks.renew(bank, states, np.sqrt(channel.prior()[0].diagonal()[states]).tolist())
 
 
@@ -137,8 +136,7 @@ def gnss_velocity(
         H = np.zeros((len(bank.L), 2, layout.n))
         H[:, 0, 2] = H[:, 1, 3] = 1.0
         H[:, :, channel.latency] = a_n
-        if channel.doppler is not None:
-            H[:, :, channel.doppler] = -np.eye(2)
+        H[:, :, channel.doppler] = -np.eye(2)
         if channel.arm is not None and speed > TURNING_M_S:
             H[:, :, channel.arm] = turn * v_n[1], -turn * v_n[0]
         lying = (bank.fault[:, GNSS_GROUP] == CONSISTENT).astype(np.float64)

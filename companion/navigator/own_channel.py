@@ -17,7 +17,7 @@ from typing import NamedTuple
 from companion.config import Config
 from companion.navigator import air_data_channel, own_error_model, strapdown_channel
 from companion.navigator.air_data_channel import Reckoner
-from companion.navigator.channel import Nominal, Transition, moved
+from companion.navigator.channel import DOPPLER_S, Nominal, Transition, moved
 from companion.navigator.inertial_track import Point
 from companion.navigator.own_error_model import By, Ground, Layout, Propagator
 from companion.navigator.strapdown_channel import Strap
@@ -106,6 +106,7 @@ class OwnChannel:
             drift_m=gnss.sigma_m,
             drift_s=gnss.correlation_s,
             doppler_m_s=LASTING * gnss.sigma_velocity_m_s,
+            doppler_s=DOPPLER_S,
             hold_m_s_sqrt_s=HOLD_M_S_SQRT_S,
         )
         self.layout = Layout(foreign=True, latency=True)

@@ -48,10 +48,10 @@ def state(model: CorrectedIns, **errors: float) -> Any:
 
 def test_states_of_the_correctors_follow_those_of_the_ins() -> None:
     model = channel()
-    assert model.n == len(model.names) == len(set(model.names)) == 34
-    assert model.prior().shape == (7, 34, 34)
+    assert model.n == len(model.names) == len(set(model.names)) == 36
+    assert model.prior().shape == (7, 36, 36)
     assert isinstance(corrected_ins(Config(inertial=InertialConfig(independent=True))), InsChannel)
-    assert channel("stars").n == 16  # the tilt is a state of the INS
+    assert channel("stars").n == 18  # the tilt is a state of the INS
 
 
 def test_transition_is_that_of_the_ins_and_of_wandering_biases() -> None:
@@ -59,10 +59,10 @@ def test_transition_is_that_of_the_ins_and_of_wandering_biases() -> None:
     v_n = (30.0, 20.0, 0.0)
     nominal = Nominal(Point(20_000_000_000, TRUE, v_n), (0.0, 0.0), Point(0, TRUE, v_n))
     Phi, Q = model.transition(nominal)
-    np.testing.assert_allclose(Phi[:16, :16], model.ins.transition(nominal).Phi)
-    assert not Phi[:16, 16:].any() and not Phi[16:, :16].any()
-    np.testing.assert_allclose(Phi[22:, 22:], model.ins.transition(nominal).Phi[:12, :12])  # second unit
-    assert not Phi[22:, :22].any() and not Phi[:22, 22:].any()
+    np.testing.assert_allclose(Phi[:18, :18], model.ins.transition(nominal).Phi)
+    assert not Phi[:18, 18:].any() and not Phi[18:, :18].any()
+    np.testing.assert_allclose(Phi[24:, 24:], model.ins.transition(nominal).Phi[:12, :12])  # second unit
+    assert not Phi[24:, :24].any() and not Phi[:24, 24:].any()
     k = model.names.index("chain0")
     assert Phi[k, k] == pytest.approx(math.exp(-20.0 / 3600.0), rel=1e-9)
     assert (np.linalg.eigvalsh(Q[0]) > -1e-12).all()
@@ -124,5 +124,5 @@ def test_second_ins_is_compared_in_metres() -> None:
 
 def test_second_ins_is_as_coarse_as_the_grade() -> None:
     first = channel("second_ins").prior()
-    unit = slice(16, 28)
+    unit = slice(18, 30)
     np.testing.assert_array_equal(first[:, unit, unit], first[:, :12, :12])

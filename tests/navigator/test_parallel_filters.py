@@ -93,11 +93,11 @@ def test_after_a_jump_of_the_channel_the_filters_go_on_as_if_it_had_always_been_
 
 
 def test_beside_an_ins_they_have_all_its_states() -> None:
-    """INS 7, gyro drift 3, accelerometers 2, GNSS drift, latency and arm 4, wind and airspeed scale 3."""
+    """INS 7, gyro drift 3, accelerometers 2, GNSS 6, wind and airspeed scale 3."""
     channel = corrected_ins(INS)
     p = parallel_filters.begin(INS, channel, START, np.zeros(4), np.eye(4))
     assert [f.name for f in p.filters] == list(PARALLEL)
-    assert all(len(f.x) == channel.n == 19 for f in p.filters)
+    assert all(len(f.x) == channel.n == 21 for f in p.filters)
     p = fixed(p, [1.0, 2.0, 12.0, 13.0, 25.0], [np.array([500.0, -200.0])] * 5, INS, channel)
     for found in parallel_filters.at(p, later(25.0), INS, channel):
         assert found.x[:2] == pytest.approx([500.0, -200.0], abs=1.0)
