@@ -13,10 +13,15 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import hypothesis
 import pytest
 
 # as the command line does: with batches of 20 states, threads of BLAS only wait for each other
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+# a busy machine is no failure; pytest has its own limit
+hypothesis.settings.register_profile("untimed", deadline=None)
+hypothesis.settings.load_profile("untimed")
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import msgspec
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from companion import records
 
 
 @given(st.floats(allow_nan=False, allow_infinity=False), st.integers(0, 2**62))
-@settings(deadline=None)
 def test_doubles_and_times_survive_json(value: float, t_ns: int) -> None:
     record = records.RsbnFix(t_ns, t_ns + 1, 7, value, -value, value, None, value, value, value)
     assert records.decode("RsbnFix", records.encode(record)) == record

@@ -103,7 +103,7 @@ def test_phase_without_records_has_no_numbers() -> None:
     )
 
 
-@settings(deadline=None, max_examples=50)
+@settings(max_examples=50)
 @given(st.floats(-math.pi, math.pi), st.floats(2e3, 250e3), st.floats(100.0, 9000.0))
 def test_exact_beacon_measurement_gives_the_true_position(
     azimuth: float, distance: float, alt: float

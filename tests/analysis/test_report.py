@@ -522,7 +522,7 @@ def test_durations_and_times_are_formatted():
     assert [format_time(s) for s in (0.0, 187.4, -26.0, 7200.0)] == ["0:00", "3:07", "-0:26", "120:00"]
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(st.integers(1, 5000), st.integers(20, 400), st.integers(0, 2**32 - 1))
 def test_thinning_keeps_extremes_and_ends(n, most, seed):
     rng = np.random.default_rng(seed)

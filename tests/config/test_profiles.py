@@ -104,7 +104,7 @@ outputs = st.builds(
 sources = st.sampled_from(["auto", "local_position", "air_data", "imu"])
 
 
-@settings(deadline=None, max_examples=300)
+@settings(max_examples=300)
 @given(output=outputs, source=sources)
 def test_no_configuration_feeds_an_autopilot_its_own_position(output: OutputConfig, source: str) -> None:
     config = Config(output=output, inertial=InertialConfig(source=source))

@@ -304,7 +304,7 @@ def permuted(bank, order):
 
 
 @given(st.integers(0, 10_000))
-@hypothesis_settings(max_examples=25, deadline=None)
+@hypothesis_settings(max_examples=25)
 def test_order_of_rows_does_not_matter_and_weights_stay_normalised(seed):
     layout, bank = random_bank(seed)
     order = np.random.default_rng(seed + 1).permutation(len(bank.L))
@@ -324,7 +324,7 @@ def test_order_of_rows_does_not_matter_and_weights_stay_normalised(seed):
 
 
 @given(st.integers(0, 10_000))
-@hypothesis_settings(max_examples=25, deadline=None)
+@hypothesis_settings(max_examples=25)
 def test_per_row_arguments_equal_shared_ones(seed):
     layout, bank = random_bank(seed)
     k = len(bank.L)
@@ -351,7 +351,7 @@ def test_old_banks_are_left_untouched():
 
 
 @given(st.integers(0, 10_000))
-@hypothesis_settings(max_examples=25, deadline=None)
+@hypothesis_settings(max_examples=25)
 def test_merge_preserves_moments(seed):
     rng = np.random.default_rng(seed)
     A, B = rng.standard_normal((2, 3, 3))
@@ -409,7 +409,7 @@ def test_tail_equals_the_noncentral_chi_square():
 )
 @example(6, 365, 1e-5, 1.0)  # means along the minor axis: 0.2 % too small
 @example(8, 5306, 1e-3, 1.0)
-@hypothesis_settings(max_examples=15, deadline=None)
+@hypothesis_settings(max_examples=15)
 def test_protection_level_is_conservative_and_within_three_percent(rows, seed, risk, aspect):
     rng = np.random.default_rng(seed)
     w = 10.0 ** rng.uniform(-9.0, 0.0, rows)
@@ -725,7 +725,7 @@ def test_a_receiver_that_reports_jamming_raises_the_prior():
 
 
 @given(st.integers(0, 1000))
-@hypothesis_settings(max_examples=10, deadline=None)
+@hypothesis_settings(max_examples=10)
 def test_feedback_of_a_known_correction_changes_no_decision(seed):
     layout, bank = random_bank(seed)
     c = np.array([3.0, -0.2])
@@ -765,7 +765,7 @@ def test_a_row_that_explains_what_others_refuse_gains_the_difference():
 
 
 @given(st.integers(0, 1000))
-@hypothesis_settings(max_examples=10, deadline=None)
+@hypothesis_settings(max_examples=10)
 def test_a_measurement_as_a_function_is_linearised_about_each_row(seed):
     """A linear function gives the plain update; a range gives each row its own extended Kalman filter."""
     layout, bank = random_bank(seed)

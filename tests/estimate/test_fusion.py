@@ -131,7 +131,7 @@ unit = st.integers(-100, 100).map(lambda k: k / 100)
 plane = st.tuples(unit, unit)
 
 
-@settings(max_examples=120, deadline=None)
+@settings(max_examples=120)
 @given(
     n=st.sampled_from([2, 3]),
     x=plane,
@@ -212,7 +212,7 @@ def test_errors_and_cost_match_their_distribution():
     assert fix.p_value == pytest.approx(chi2.sf(fix.cost, 5))
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(A=st.floats(-math.pi, math.pi), D=st.floats(20e3, 400e3), seed=st.integers(0, 2**32 - 1))
 def test_one_more_observation_never_raises_the_bound(A, D, seed):
     rng = np.random.default_rng(seed)

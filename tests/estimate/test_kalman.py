@@ -62,7 +62,7 @@ def test_minimax_is_the_markov_filter_for_one_bound():
     np.testing.assert_allclose(kalman.minimax_noise(e.B, C, e.Q), e.Q_markov, atol=1e-15)
 
 
-@settings(deadline=None, max_examples=20)
+@settings(max_examples=20)
 @given(st.integers(0, 2**32 - 1))
 def test_all_filters_are_dense_least_squares(seed):
     """Kalman filter, R1 with zero bounds, full horizon and dense least squares agree."""

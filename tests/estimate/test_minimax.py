@@ -218,7 +218,7 @@ def problems(draw):
     return rows, target, sigmas, seed.choice([1e-6, 1.0, 1e5], m) if kind == "scaled" else np.ones(m)
 
 
-@settings(max_examples=500, deadline=None)
+@settings(max_examples=500)
 @given(problems())
 def test_exchange_equals_a_linear_programme(problem):
     rows, target, sigmas, columns = problem
@@ -236,7 +236,7 @@ def test_exchange_equals_a_linear_programme(problem):
     assert again.bound == pytest.approx(result.bound, rel=1e-11)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(
     T=st.floats(0.05, 6.0),
     alpha=st.floats(-0.5, 6.0),
@@ -265,7 +265,7 @@ def test_short_windows_are_solved_in_the_middle_of_the_window(T):
     assert abs(result.gap) < 1e-9
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(
     exponent=st.floats(-4.0, 1.2),
     ahead=st.floats(-1.0, 8.0),
@@ -299,7 +299,7 @@ def test_bad_start_does_not_change_the_result():
 # Laws
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(st.data())
 def test_bound_is_attained_and_never_exceeded(data):
     seed = np.random.default_rng(data.draw(st.integers(0, 2**32 - 1)))
@@ -321,7 +321,7 @@ def test_bound_is_attained_and_never_exceeded(data):
         assert white_noise_rms(other, sigmas) <= worst_case_rms(other, sigmas)
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(seed=st.integers(0, 2**32 - 1), velocity=st.booleans(), k=st.integers(0, 3))
 def test_one_more_measurement_never_raises_the_bound(seed, velocity, k):
     rng = np.random.default_rng(seed)
@@ -332,7 +332,7 @@ def test_one_more_measurement_never_raises_the_bound(seed, velocity, k):
     assert after <= before * (1.0 + 1e-10)
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(seed=st.integers(0, 2**32 - 1), factor=st.floats(1e-3, 1e3))
 def test_scaling(seed, factor):
     rng = np.random.default_rng(seed)

@@ -58,7 +58,7 @@ def test_the_basis_is_orthonormal_with_the_weight(basis: Any) -> None:
     np.testing.assert_allclose(inner, np.eye(9), atol=1e-6)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.integers(0, 10**6), st.integers(13, 200), st.floats(1e-3, 1e3), st.floats(-1e6, 1e6))
 def test_result_is_independent_of_units_and_origins(
     seed: int, count: int, unit: float, origin: float
@@ -74,7 +74,7 @@ def test_result_is_independent_of_units_and_origins(
     assert one.consistency == pytest.approx(other.consistency, rel=1e-6)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.integers(0, 10**6))
 def test_power_and_legendre_are_one_basis(seed: int) -> None:
     rng = np.random.default_rng(seed)

@@ -129,7 +129,7 @@ def test_undetermined_inputs_take_the_minimax_prior(C):
     assert np.isfinite(partly.P).all() and np.linalg.eigvalsh(partly.P)[0] > -1e-9
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 4))
 def test_box_by_enumeration_and_by_bvls_agree(seed, m):
     rng = np.random.default_rng(seed)

@@ -44,7 +44,7 @@ def test_linear_reference(name, feed):
     np.testing.assert_allclose(linear(feed)[shown], LINEAR[name], rtol=1e-12, atol=1e-10)
 
 
-@settings(deadline=None, max_examples=25)
+@settings(max_examples=25)
 @given(st.floats(0, 1), st.floats(0, 1))
 def test_every_mixture_is_informationally_equivalent(state, readings):
     np.testing.assert_allclose(

@@ -116,7 +116,7 @@ def conditioned(problem: tuple[Any, ...]) -> tuple[Any, Any, Any, Any]:
     return x, P, [mean[p] for p in parts], [prior[p, p] for p in parts]
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.integers(0, 10**6), st.integers(1, 5), st.integers(1, 12), st.booleans())
 def test_all_algorithms_agree(seed: int, n: int, N: int, singular: bool) -> None:
     problem = random_problem(seed, n, N, singular)
@@ -137,7 +137,7 @@ def test_all_algorithms_agree(seed: int, n: int, N: int, singular: bool) -> None
             np.testing.assert_allclose(found.theta_P[i], theta_P[i], rtol=AGREE, atol=AGREE)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.integers(0, 10**6), st.integers(1, 4), st.integers(2, 10))
 def test_rts_equals_the_recursion_of_rauch_tung_and_striebel(seed: int, n: int, N: int) -> None:
     problem = random_problem(seed, n, N, singular=False)
@@ -160,7 +160,7 @@ def test_rts_equals_the_recursion_of_rauch_tung_and_striebel(seed: int, n: int, 
     np.testing.assert_allclose(backward.P, found.P, rtol=1e-7, atol=1e-8)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.integers(0, 10**6), st.integers(1, 3), st.integers(1, 8))
 def test_block_elimination_solves_the_whole_system(seed: int, n: int, N: int) -> None:
     rng = np.random.default_rng(seed)

@@ -115,7 +115,7 @@ class TestSensitivity:
         assert rms_ratio_assuming([500.0, 100.0, 200.0], R) == pytest.approx(1.72103, abs=5e-6)
         assert rms_ratio_assuming([500.0, 10.0, 20.0], R) == pytest.approx(1.66973, abs=5e-6)
 
-    @settings(max_examples=80, deadline=None)
+    @settings(max_examples=80)
     @given(r=variances, eps=st.floats(-2.0, 2.0), data=st.data())
     def test_one_weight_changed(self, r, eps, data):
         w = estimate_axis(np.zeros(len(r)), r).weights
@@ -125,7 +125,7 @@ class TestSensitivity:
         rest = 1.0 - w[i] if w[i] < 0.5 else np.delete(w, i).sum()
         assert rms_ratio(new, r) == pytest.approx(math.sqrt(1.0 + eps**2 * w[i] / rest), rel=1e-8)
 
-    @settings(max_examples=80, deadline=None)
+    @settings(max_examples=80)
     @given(r=variances, seed=st.integers(0, 2**32 - 1))
     def test_any_weights_of_sum_one(self, r, seed):
         r = np.array(r)
@@ -135,7 +135,7 @@ class TestSensitivity:
         law = best.variance + float(r @ (w - best.weights) ** 2)
         assert float(r @ w**2) == pytest.approx(law, rel=1e-9)
 
-    @settings(max_examples=80, deadline=None)
+    @settings(max_examples=80)
     @given(n=st.integers(1, 4), extra=st.integers(0, 4), seed=st.integers(0, 2**32 - 1))
     def test_the_matrix_form(self, n, extra, seed):
         rng = np.random.default_rng(seed)

@@ -35,7 +35,7 @@ def make_track(
     return gnss_latency.GnssLocalTrack(0, t, x + noise + [offset, 0.0], v, t_local, x_local, v_local)
 
 
-@settings(deadline=None, max_examples=15)
+@settings(max_examples=15)
 @given(tau=st.floats(-1.0, 1.0), offset=st.floats(-50.0, 50.0), seed=st.integers(0, 99))
 def test_delay_is_estimated_despite_noise_and_offset(tau: float, offset: float, seed: int) -> None:
     found = gnss_latency.estimate_latency(make_track(tau, seed=seed, offset=offset))

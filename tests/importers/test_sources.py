@@ -99,7 +99,7 @@ def test_times_never_decrease() -> None:
     assert len(times) == 20 and times == sorted(times)
 
 
-@settings(deadline=None, max_examples=100)
+@settings(max_examples=100)
 @given(st.binary(max_size=60), st.integers(0, len(b"".join(CLEAN))))
 def test_inserted_bytes_lose_at_most_one_entry(junk: bytes, at: int) -> None:
     data = b"".join(CLEAN)

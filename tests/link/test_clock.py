@@ -153,7 +153,7 @@ def test_clock_recovers_from_a_false_future_stamp_at_the_second_message() -> Non
     assert clock.local(12 * SECOND_NS, 10**18) == 12 * SECOND_NS + OFFSET
 
 
-@settings(deadline=None, max_examples=100)
+@settings(max_examples=100)
 @given(
     st.lists(
         st.tuples(st.integers(0, 2 * SECOND_NS), st.integers(0, SECOND_NS // 2)), min_size=1, max_size=60

@@ -139,7 +139,7 @@ def test_commands_above_the_rate_limit_are_rejected() -> None:
     assert results[:BURST] == [Result.ACCEPTED] * BURST
 
 
-@settings(deadline=None, max_examples=200)
+@settings(max_examples=200)
 @given(
     command=st.sampled_from([GET_INTERVAL, SET_INTERVAL, REQUEST, CAPABILITIES_OF]) | st.integers(0, 65_535),
     params=st.lists(st.floats(width=32), min_size=7, max_size=7),
@@ -165,7 +165,7 @@ def test_two_sessions_joined_in_memory() -> None:
     ]
 
 
-@settings(deadline=None, max_examples=100)
+@settings(max_examples=100)
 @given(
     waits=st.lists(st.integers(0, 3 * SECOND), max_size=60),
     rate_hz=st.sampled_from([0.5, 3.0, 10.0]),

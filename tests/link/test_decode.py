@@ -305,7 +305,7 @@ def test_other_messages_give_no_record() -> None:
 READ = sorted({name for name, _, _ in REJECTED} | {"RAW_IMU", "SCALED_IMU", "VFR_HUD", "ESTIMATOR_STATUS"})
 
 
-@settings(deadline=None, max_examples=300)
+@settings(max_examples=300)
 @given(st.sampled_from(READ), st.binary(max_size=255), st.sampled_from(["ardupilot", "px4", "other"]))
 def test_no_payload_raises_and_every_record_survives_the_log(
     name: str, payload: bytes, autopilot: Autopilot

@@ -199,7 +199,7 @@ pieces = st.one_of(
 )
 
 
-@settings(deadline=None, max_examples=300)
+@settings(max_examples=300)
 @given(st.lists(pieces, max_size=12).map(b"".join), st.lists(st.integers(1, 400), max_size=12))
 def test_events_do_not_depend_on_the_split_of_the_stream(data: bytes, cuts: list[int]) -> None:
     _, whole = read(data)
@@ -215,7 +215,7 @@ def test_events_do_not_depend_on_the_split_of_the_stream(data: bytes, cuts: list
     assert sum(len(e.raw) if isinstance(e, Frame) else e.size for e in whole) == len(data)
 
 
-@settings(deadline=None, max_examples=200)
+@settings(max_examples=200)
 @given(st.binary(max_size=60), st.integers(0, 5000))
 def test_frames_between_noise_without_magic_are_all_found(noise: bytes, seed: int) -> None:
     noise = noise.replace(b"\xfd", b"").replace(b"\xfe", b"")

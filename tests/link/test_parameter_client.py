@@ -188,7 +188,7 @@ def test_a_slow_line_is_not_flooded() -> None:
 
 
 @given(st.randoms(use_true_random=False), st.sampled_from(["cast", "bytewise"]))
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 def test_with_losses_an_answer_is_right_or_absent(random, encoding: Encoding) -> None:
     client = ParameterClient(SYSTEM, COMPONENT, encoding)
     vehicle = Vehicle(encoding, VALUES)
@@ -278,7 +278,7 @@ def test_values_recorded_from_real_autopilots(
 
 
 @given(st.sampled_from(sorted(LAYOUTS)), st.sampled_from(["cast", "bytewise"]), st.data())
-@settings(deadline=None, max_examples=200)
+@settings(max_examples=200)
 def test_encoding_and_decoding_are_inverse(kind: int, encoding: Encoding, data: st.DataObject) -> None:
     if kind == REAL32:
         value: float = data.draw(st.floats(width=32, allow_nan=False))

@@ -240,7 +240,7 @@ def test_value_that_cannot_be_saved_is_not_changed() -> None:
     assert station.parameters.config == Config()
 
 
-@settings(deadline=None, max_examples=300)
+@settings(max_examples=300)
 @given(
     name=st.sampled_from([parameter.name for parameter in TABLE])
     | st.text(max_size=16).filter(lambda t: len(t.encode()) <= 16),
@@ -262,7 +262,7 @@ def test_no_value_raises_and_accepted_values_are_valid_configuration(
         assert station.parameters.config == Config()
 
 
-@settings(deadline=None, max_examples=200)
+@settings(max_examples=200)
 @given(wish=st.floats(0.5, 600.0, width=32))
 def test_set_value_is_read_back_exactly(wish: float) -> None:
     station = Station()

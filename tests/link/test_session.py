@@ -344,7 +344,7 @@ def test_invalid_settings_are_reported(values: dict, words: str) -> None:
         Session(**values)
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(st.lists(st.one_of(st.binary(max_size=50), st.integers(0, 2**32)), max_size=20))
 def test_no_input_raises_and_the_deadline_stays_in_the_future(inputs: list[bytes | int]) -> None:
     session, now = Session(rates_hz={"ATTITUDE": 5}), 0

@@ -153,7 +153,7 @@ def test_rejected_frames_count_neither_as_received_nor_as_lost() -> None:
     assert session.rejected == {SignatureFault.FORGED: 200, SignatureFault.REPLAYED: 100}
 
 
-@settings(deadline=None, max_examples=200)
+@settings(max_examples=200)
 @given(at=st.integers(1, 100), flip=st.integers(1, 255))
 def test_changed_byte_of_a_genuine_frame_is_detected(at: int, flip: int) -> None:
     raw = bytearray(signed(NOON).raw)
@@ -231,7 +231,7 @@ def test_unsigned_frames_are_rejected_unless_configured() -> None:
     )  # a wrong signature is never accepted
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(
     steps=st.lists(st.tuples(st.floats(0.0, 90.0), st.floats(-40.0, 50.0)), max_size=12),
     pause=st.floats(0.0, 200.0),

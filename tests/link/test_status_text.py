@@ -44,7 +44,7 @@ def test_a_text_arrives_whole_at_any_length(size: int) -> None:
     assert texts_of((4, text)) == [(4, text)]
 
 
-@settings(deadline=None, max_examples=100)
+@settings(max_examples=100)
 @given(texts=st.lists(st.text(max_size=300), max_size=BURST))
 def test_any_text_arrives_as_far_as_it_fits(texts: list[str]) -> None:
     received = texts_of(*[(6, text) for text in texts])

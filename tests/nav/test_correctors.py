@@ -53,7 +53,7 @@ def derivative(f: object, eps: Floats) -> npt.NDArray[np.float64]:
 
 
 @given(st.floats(0.1, 1.2), st.floats(-3.0, 3.0))
-@settings(deadline=None, max_examples=50)
+@settings(max_examples=50)
 def test_a_star_against_a_tilted_platform(h: float, q: float) -> None:
     """(1.22): what the star should be at the computed place, less what the turned platform shows."""
     star_e = axes(lat, lon).T @ ned(q, h)
@@ -70,7 +70,7 @@ def test_a_star_against_a_tilted_platform(h: float, q: float) -> None:
 
 
 @given(st.floats(0.1, 1.2), st.floats(-3.0, 3.0))
-@settings(deadline=None, max_examples=50)
+@settings(max_examples=50)
 def test_the_axis_of_a_free_gyro(h: float, q: float) -> None:
     """dd raises the declination, dg moves the axis westward; P is the zenith's place about it, westward."""
     star_e = axes(lat, lon).T @ ned(q, h)
@@ -91,7 +91,7 @@ def test_the_axis_of_a_free_gyro(h: float, q: float) -> None:
 
 
 @given(st.floats(0.0, 6.28), st.floats(20e3, 200e3), st.floats(500.0, 9000.0))
-@settings(deadline=None, max_examples=50)
+@settings(max_examples=50)
 def test_a_beacon_seen_by_a_displaced_aircraft(azimuth: float, distance: float, alt: float) -> None:
     """Range and azimuth on the ellipsoid; the rows are flat, so the tolerance is the curvature's, d/R."""
     aircraft = Geodetic(lat, lon, alt)
@@ -120,7 +120,7 @@ def test_a_beacon_overhead_has_no_azimuth() -> None:
 
 
 @given(st.floats(-3.0, 3.0), st.floats(-20.0, 20.0), st.floats(-20.0, 20.0))
-@settings(deadline=None, max_examples=50)
+@settings(max_examples=50)
 def test_airspeed_in_a_wind(K: float, wind_n: float, wind_e: float) -> None:
     """INS velocity turned into the hull by the computed heading K + PZ, less the air velocity measured."""
     V_air = 60.0

@@ -18,7 +18,7 @@ def system(seed: int, n: int = 5, m: int = 2) -> tuple[Floats, Floats, Floats]:
 
 
 @given(st.integers(0, 10**6), st.floats(1e-3, 1.5))
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 def test_van_loan_is_the_integral(seed: int, dt: float) -> None:
     A, Q, B = system(seed)
     step = discretise(A, Q, B, dt)
@@ -30,7 +30,7 @@ def test_van_loan_is_the_integral(seed: int, dt: float) -> None:
 
 
 @given(st.integers(0, 10**6))
-@settings(deadline=None, max_examples=20)
+@settings(max_examples=20)
 def test_two_half_steps_are_one(seed: int) -> None:
     A, Q, B = system(seed)
     half, whole = discretise(A, Q, B, 0.2), discretise(A, Q, B, 0.4)

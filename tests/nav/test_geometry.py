@@ -62,7 +62,7 @@ def test_ecef_golden_values(point: Geodetic, xyz: tuple[float, float, float], to
 
 
 @given(points)
-@settings(deadline=None, max_examples=300)
+@settings(max_examples=300)
 def test_ecef_there_and_back_within_a_micrometre(point: Geodetic) -> None:
     r_e = to_ecef(point)
     back = from_ecef(r_e)
@@ -105,7 +105,7 @@ def test_line_of_sight_of_pymap3d() -> None:
 
 
 @given(points, points)
-@settings(deadline=None, max_examples=200)
+@settings(max_examples=200)
 def test_enu_there_and_back(point: Geodetic, origin: Geodetic) -> None:
     try:
         back = from_enu(to_enu(point, origin), origin)
@@ -115,14 +115,14 @@ def test_enu_there_and_back(point: Geodetic, origin: Geodetic) -> None:
 
 
 @given(away_from_poles, st.tuples(*[st.floats(-2e3, 2e3)] * 3))
-@settings(deadline=None, max_examples=200)
+@settings(max_examples=200)
 def test_separation_undoes_displace(at: Geodetic, ned: tuple[float, float, float]) -> None:
     moved = displace(*at, *ned)
     np.testing.assert_allclose(separation(moved, at), ned, rtol=0.0, atol=1e-8)
 
 
 @given(away_from_poles, st.floats(0.0, math.tau), st.floats(0.0, 300.0))
-@settings(deadline=None, max_examples=200)
+@settings(max_examples=200)
 def test_displace_agrees_with_the_tangent_plane_to_its_first_order(
     at: Geodetic, azimuth: float, d: float
 ) -> None:
@@ -136,7 +136,7 @@ def test_displace_agrees_with_the_tangent_plane_to_its_first_order(
     origin=away_from_poles,
     ned=st.tuples(st.floats(-5e4, 5e4), st.floats(-5e4, 5e4), st.floats(-1e4, 1e4)),
 )
-@settings(deadline=None, max_examples=150)
+@settings(max_examples=150)
 def test_local_positions_there_and_back(
     projection: Projection, origin: Geodetic, ned: tuple[float, float, float]
 ) -> None:
@@ -230,7 +230,6 @@ def test_radio_horizon_is_the_tangent_line_over_the_four_thirds_earth() -> None:
 
 
 @given(st.floats(-1e3, 1e3))
-@settings(deadline=None)
 def test_wrap(angle: float) -> None:
     assert -math.pi <= wrap_angle(angle) < math.pi
     assert math.remainder(wrap_angle(angle) - angle, math.tau) == pytest.approx(0.0, abs=1e-12)

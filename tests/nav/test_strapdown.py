@@ -23,7 +23,6 @@ def start(lat_deg: float = 55.0, v_n: tuple[float, float, float] = (0.0, 0.0, 0.
 
 
 @given(vectors)
-@settings(deadline=None)
 def test_rotation_and_its_vector(v: Floats) -> None:
     C = rotation_matrix(3.0 / math.sqrt(3.0) * v)
     np.testing.assert_allclose(C @ C.T, np.eye(3), atol=2e-15)
@@ -144,7 +143,7 @@ def test_the_sensors_of_a_flat_turn_are_the_textbook_ones() -> None:
 
 
 @given(vectors, vectors, vectors)
-@settings(deadline=None, max_examples=100)
+@settings(max_examples=100)
 def test_one_step_and_its_inverse(f: Floats, w: Floats, v: Floats) -> None:
     state = start(v_n=tuple(50.0 * v))
     f_b, w_b = 30.0 * f, 5.0 * w

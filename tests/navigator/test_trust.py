@@ -14,7 +14,7 @@ GOOD = Evidence(True, False, 10.0)
 evidence = st.builds(Evidence, st.booleans(), st.booleans(), st.none() | st.floats(0.0, 1e4))
 
 
-@settings(deadline=None, max_examples=200)
+@settings(max_examples=200)
 @given(st.lists(evidence, min_size=1, max_size=60))
 def test_trust_falls_at_once_and_rises_after_settling(course: list[Evidence]) -> None:
     limits = Limits(settle_s=5.0)

@@ -293,7 +293,7 @@ def test_gps_input_requires_a_velocity() -> None:
 
 
 @given(ns=st.integers(1, 10**16))
-@settings(deadline=None, max_examples=300)
+@settings(max_examples=300)
 def test_command_timestamp_is_never_ahead_of_the_clock(ns: int) -> None:
     """A timestamp ahead of the clock would shift ArduPilot's clock offset of the whole link."""
     m, odometry = encoded("COMMAND_INT", t_ns=ns), encoded("ODOMETRY", t_ns=ns)

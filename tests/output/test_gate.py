@@ -251,7 +251,7 @@ def _numbers(message: Any) -> Iterator[tuple[str, float]]:
             yield name, number
 
 
-@settings(deadline=None, max_examples=400)
+@settings(max_examples=400)
 @given(sent=st.lists(solutions(), min_size=1, max_size=4))
 def test_every_encoded_message_is_finite_and_in_range(sent: list[Solution]) -> None:
     gate = Gate()

@@ -22,7 +22,7 @@ def test_without_fixes_the_rate_is_exact() -> None:
     assert len(sent(times, set())) == 600
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(st.sets(st.integers(0, 30_000), max_size=3000))
 def test_fixes_raise_the_rate_by_five_per_cent_at_most_and_leave_no_gap(fixes: set[int]) -> None:
     early = {7 * MS * fix for fix in fixes}

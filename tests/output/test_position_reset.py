@@ -125,7 +125,7 @@ def test_autopilot_position_is_propagated_to_our_time() -> None:
     assert reset.withholding_reason(position(4.9, north=190.0, sigma=1.0)) is None
 
 
-@settings(deadline=None, max_examples=200)
+@settings(max_examples=200)
 @given(
     lost=st.floats(-9.0, 9.0),
     now=st.floats(0.0, 10.0),

@@ -19,7 +19,7 @@ def off(seconds: float, north: float, east: float = 0.0) -> Geodetic:
     return displace(*flying(seconds), north, east, 0.0)
 
 
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 @given(
     st.lists(st.floats(0.0, 9.0), min_size=1, max_size=20),
     st.floats(-500.0, 500.0),

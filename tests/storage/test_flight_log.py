@@ -247,7 +247,7 @@ class LimitedCalls:
         return result
 
 
-@settings(deadline=None, max_examples=300)
+@settings(max_examples=300)
 @given(cut=st.integers(0, 900), steps=st.integers(0, 8), part=st.floats(0, 1))
 def test_kill_during_recovery_leaves_a_log_that_reads_as_before(tmp_path_factory, small, cut, steps, part):
     path = tmp_path_factory.mktemp("killed") / "x.mcap.active"
@@ -331,7 +331,7 @@ def test_damaged_byte_is_reported_and_the_rest_is_recovered(tmp_path, small):
     assert info(saved.path).messages == saved.messages
 
 
-@settings(deadline=None, max_examples=1500)
+@settings(max_examples=1500)
 @given(data=st.data())
 def test_arbitrary_bytes_raise_only_log_error(tmp_path_factory, small, data):
     kind = data.draw(st.integers(0, 2))

@@ -55,7 +55,7 @@ def filled(place: Path, name: str, size: int = MIB) -> Path:
     return path
 
 
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 @given(clock=st.lists(st.integers(0, 3) | st.integers(0, 2_000_000_000), min_size=1, max_size=12))
 def test_newest_logs_are_kept_independently_of_the_clock(tmp_path_factory, clock):
     """A board without a clock battery starts in 1970 each time: names differ only in the number."""

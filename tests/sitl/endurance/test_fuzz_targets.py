@@ -81,7 +81,7 @@ def test_any_bytes_pass(name: str) -> None:
     target = TARGETS[name]
     good = st.builds(edited, st.sampled_from(list(target.seeds())), EDITS)
 
-    @settings(deadline=None, max_examples=60 if name == "onboard" else 250)
+    @settings(max_examples=60 if name == "onboard" else 250)
     @given(st.one_of(st.binary(max_size=600), good, good))
     def check(data: bytes) -> None:
         target.check(data)
