@@ -11,6 +11,7 @@ import statistics
 import time
 from collections.abc import Callable, Iterator
 from importlib import import_module
+from typing import Any
 
 import click
 from rich.table import Table
@@ -65,18 +66,24 @@ def command(names: tuple[str, ...], as_json: bool) -> None:
     NAMES are the parts; default: all except latency and live.
     `latency` sends beacon measurements by UDP on the loopback interface to a complete service and waits for
     the corrected estimate; a plain asyncio UDP echo is measured for comparison. `live` gives the share of a
-    processor that a service takes in flight (us in a second; 10,000 are 1 %), beside a bare receiver.
+    processor and the memory that a service takes in flight, beside a bare receiver.
     """
-    found = {}
+    found: dict[str, Any] = {}
+    tables = []
     for name in names or MODULES:
         module = import_module(f"companion.bench.{name}")
+        if name == "live":
+            costs = module.measure()
+            found[name] = [cost._asdict() for cost in costs]
+            tables.append(module.table(costs))
+            continue
         found[name] = (
             module.measure()
-            if name in SERVICES
+            if name == "latency"
             else measure(module.cases(), getattr(module, "ROUNDS", ROUNDS))
         )
+        tables.append(table(name, found[name]))
     if as_json:
         click.echo(json.dumps(found))
-        return
-    for name, times in found.items():
-        print_tables(table(name, times))
+    else:
+        print_tables(*tables)

@@ -1,4 +1,4 @@
-"""Benchmark of the live path: share of a processor that a flying companion takes, and a bare receiver.
+"""Benchmark of the live path: processor and memory that a flying companion takes, and a bare receiver.
 
 A complete `companion run` (log on, real sockets), a bare asyncio receiver with pymavlink's parser and one
 that only receives run in processes of their own and get the same stream. An aircraft flies north at 40 m/s
@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import asyncio
 import math
+import re
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -18,6 +19,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from rich.table import Table
 
 from companion.bench.latency import BEACON, HEIGHT, LOOPBACK, ORIGIN, V_NORTH, peer
 from companion.config import load
@@ -64,30 +66,59 @@ STREAMS = {
 }  # fmt: skip
 
 
-def measure() -> dict[str, list[float]]:
-    """Measure the processor seconds for a second of flight, of the companion and of bare receivers.
-
-    Of the companion also the turn of the event loop that one in a thousand exceeds.
+class Cost(NamedTuple):
+    """What a process takes: processor time of a second of flight (%), resident memory (MiB), and the turn of
+    its event loop that one in a thousand exceeds (ms of processor time).
     """
-    found = {}
+
+    stream: str
+    process: str
+    processor_percent: float
+    memory_mib: float | None = None
+    turn_ms: float | None = None
+
+
+def measure() -> list[Cost]:
+    """Measure the companion beside bare receivers, and the companion where nothing waits."""
+    found = []
     for name, stream in STREAMS.items():
         with tempfile.TemporaryDirectory() as logs:
             with ExitStack() as stack:
                 peers = {
-                    f"companion: {name}": stack.enter_context(peer(set(), _companion, logs, stream.profile)),
-                    f"asyncio and pymavlink: {name}": stack.enter_context(peer(set(), _bare, True)),
-                    f"asyncio alone: {name}": stack.enter_context(peer(set(), _bare, False)),
+                    "companion": stack.enter_context(peer(set(), _companion, logs, stream.profile)),
+                    "asyncio and pymavlink": stack.enter_context(peer(set(), _bare, True)),
+                    "asyncio alone": stack.enter_context(peer(set(), _bare, False)),
                 }
                 flight = fly(stream)
                 _send_until(flight, [sock for sock, _ in peers.values()], SETTLE_S)
-                before = {case: _processor_s(pid) for case, (_, pid) in peers.items()}
+                before = {pid: _processor_s(pid) for _, pid in peers.values()}
                 _send_until(flight, [sock for sock, _ in peers.values()], SETTLE_S + FLIGHT_S)
-                for case, (_, pid) in peers.items():
-                    found[case] = [(_processor_s(pid) - before[case]) / FLIGHT_S]
-            found[f"companion, in one go without a log: {name}"] = [in_one_go(stream)]
-            turns = np.load(Path(logs, TURNS))
-            found[f"turn of the loop, 99.9 %: {name}"] = [float(np.percentile(turns, 99.9))]
+                costs = [
+                    Cost(
+                        name, process, 100.0 * (_processor_s(pid) - before[pid]) / FLIGHT_S, _memory_mib(pid)
+                    )
+                    for process, (_, pid) in peers.items()
+                ]
+            turn_ms = 1e3 * float(np.percentile(np.load(Path(logs, TURNS)), 99.9))
+            found += [costs[0]._replace(turn_ms=turn_ms), *costs[1:]]
+            found.append(Cost(name, "companion in one go, no log", 100.0 * in_one_go(stream)))
     return found
+
+
+def table(costs: list[Cost]) -> Table:
+    """Build the table, with the processor time over that of the receiver that parses."""
+    shown = Table(title="live: of one processor")
+    for column in ("stream", "process", "processor", "over pymavlink", "memory", "turn 99.9 %"):
+        shown.add_column(column, justify="left" if column in ("stream", "process") else "right")
+    parsing = {c.stream: c.processor_percent for c in costs if c.process == "asyncio and pymavlink"}
+    for c in costs:
+        shown.add_row(
+            *(c.stream, c.process, f"{c.processor_percent:.1f} %"),
+            f"{c.processor_percent / parsing[c.stream]:.1f}",
+            "" if c.memory_mib is None else f"{c.memory_mib:.0f} MiB",
+            "" if c.turn_ms is None else f"{c.turn_ms:.1f} ms",
+        )
+    return shown
 
 
 class _NoLog:
@@ -227,6 +258,13 @@ def _processor_s(pid: int) -> float:
     """Return the processor time of all threads of a process, s."""
     stats = Path(f"/proc/{pid}/task").glob("*/schedstat")
     return sum(int(stat.read_text().split()[0]) for stat in stats) * 1e-9
+
+
+def _memory_mib(pid: int) -> float:
+    """Return the resident memory of a process, MiB."""
+    resident = re.search(r"VmRSS:\s+(\d+) kB", Path(f"/proc/{pid}/status").read_text())
+    assert resident
+    return int(resident[1]) / 1024.0
 
 
 def _companion(port: int, logs: str, profile: str) -> None:
