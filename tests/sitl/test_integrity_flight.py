@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 
 import pytest
 
@@ -96,18 +97,29 @@ def test_ins_that_drifts_does_not_exclude_gnss_and_beacons_for_ever(scenario: st
     assert result.last_m < 10.0  # by GNSS again
 
 
-@pytest.mark.parametrize(("scenario", "most_m"), [("one-beacon", 85.0), ("two-beacons", 60.0)])
-def test_gnss_that_is_drawn_off_gently_is_found_beside_an_ins(scenario: str, most_m: float) -> None:
-    """0.003 m/s^2; it ends at 87 m. It was taken for a coarser INS, and excluded once it was honest again.
+@functools.cache
+def drawn_off_gently(scenario: str) -> FlightResult:
+    """At 0.003 m/s^2; it ends at 87 m."""
+    return fly_order(FlightOrder(scenario, "gnss-accelerate", 1))
 
-    One beacon: 57 m before the lasting velocity error was a state; without it a healthy GNSS is excluded.
-    """
-    result = fly_order(FlightOrder(scenario, "gnss-accelerate", 1))
+
+@pytest.mark.parametrize("scenario", ["one-beacon", "two-beacons"])
+def test_gnss_that_is_drawn_off_gently_is_found_beside_an_ins(scenario: str) -> None:
+    """It was taken for a coarser INS, and excluded once it was honest again."""
+    result = drawn_off_gently(scenario)
     assert result.raised is None
     assert result.excluded_s is not None
     assert (result.misleading_s, result.beyond_s) == (0.0, 0.0)
-    assert result.largest_m < most_m
     assert result.last_m < 10.0
+
+
+#: 57 m before the lasting velocity error of GNSS was a state, without which a healthy one is excluded.
+NOT_REACHED = pytest.mark.xfail(strict=True, raises=AssertionError, reason="83 m: docs/limits.md")
+
+
+@pytest.mark.parametrize("scenario", [pytest.param("one-beacon", marks=NOT_REACHED), "two-beacons"])
+def test_gnss_that_is_drawn_off_gently_is_found_within_60_m(scenario: str) -> None:
+    assert drawn_off_gently(scenario).largest_m < 60.0
 
 
 @pytest.mark.parametrize("scenario", ["tactical", "mems"])
