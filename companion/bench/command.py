@@ -59,7 +59,12 @@ def table(title: str, times: dict[str, list[float]]) -> Table:
 
 @click.command("bench")
 @click.argument("names", nargs=-1, type=click.Choice([*MODULES, *SERVICES]))
-@click.option("--json", "as_json", is_flag=True, help="Print JSON: seconds per call, every round.")
+@click.option(
+    "--json",
+    "as_json",
+    is_flag=True,
+    help="Print JSON: seconds per call, every round; of live a row a process.",
+)
 def command(names: tuple[str, ...], as_json: bool) -> None:
     """Time the parts of the companion, interleaved in one run.
 
@@ -76,13 +81,12 @@ def command(names: tuple[str, ...], as_json: bool) -> None:
             costs = module.measure()
             found[name] = [cost._asdict() for cost in costs]
             tables.append(module.table(costs))
-            continue
-        found[name] = (
-            module.measure()
-            if name == "latency"
-            else measure(module.cases(), getattr(module, "ROUNDS", ROUNDS))
-        )
-        tables.append(table(name, found[name]))
+        elif name == "latency":
+            found[name] = module.measure()
+            tables.append(table(name, found[name]))
+        else:
+            found[name] = measure(module.cases(), getattr(module, "ROUNDS", ROUNDS))
+            tables.append(table(name, found[name]))
     if as_json:
         click.echo(json.dumps(found))
     else:

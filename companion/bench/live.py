@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import asyncio
 import math
-import re
+import os
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -91,12 +91,10 @@ def measure() -> list[Cost]:
                 }
                 flight = fly(stream)
                 _send_until(flight, [sock for sock, _ in peers.values()], SETTLE_S)
-                before = {pid: _processor_s(pid) for _, pid in peers.values()}
+                before = {pid: processor_s(pid) for _, pid in peers.values()}
                 _send_until(flight, [sock for sock, _ in peers.values()], SETTLE_S + FLIGHT_S)
                 costs = [
-                    Cost(
-                        name, process, 100.0 * (_processor_s(pid) - before[pid]) / FLIGHT_S, _memory_mib(pid)
-                    )
+                    Cost(name, process, 100.0 * (processor_s(pid) - before[pid]) / FLIGHT_S, memory_mib(pid))
                     for process, (_, pid) in peers.items()
                 ]
             turn_ms = 1e3 * float(np.percentile(np.load(Path(logs, TURNS)), 99.9))
@@ -254,17 +252,15 @@ def _exchange(sock: Any, data: bytes) -> None:
         pass
 
 
-def _processor_s(pid: int) -> float:
+def processor_s(pid: int) -> float:
     """Return the processor time of all threads of a process, s."""
     stats = Path(f"/proc/{pid}/task").glob("*/schedstat")
     return sum(int(stat.read_text().split()[0]) for stat in stats) * 1e-9
 
 
-def _memory_mib(pid: int) -> float:
+def memory_mib(pid: int) -> float:
     """Return the resident memory of a process, MiB."""
-    resident = re.search(r"VmRSS:\s+(\d+) kB", Path(f"/proc/{pid}/status").read_text())
-    assert resident
-    return int(resident[1]) / 1024.0
+    return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / (1 << 20)
 
 
 def _companion(port: int, logs: str, profile: str) -> None:

@@ -19,7 +19,7 @@ from companion.navigator.own_error_model import Interval
 from companion.records import Vector2
 from companion.units import Floats
 
-DOPPLER_S = 600.0  # how long the lasting part of the velocity error of GNSS lasts
+DOPPLER_S = 600.0  # s; correlation of the lasting part of the velocity error of GNSS
 STEP_S = 2.0  # the transition is a power series: its fifth term is below 1e-12 of the first here
 
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import contextlib
 import itertools
-import os
 import select
 import signal
 import socket
@@ -28,6 +27,7 @@ import click
 from rich.console import Console
 from rich.table import Table
 
+from companion.bench.live import memory_mib, processor_s
 from companion.link import dialect, frame
 from companion.link.dialect import mavlink, rsbn
 from companion.records import Stamped
@@ -194,21 +194,12 @@ class _Station:
         """Run for `seconds` and measure the process."""
         self.requests.clear()
         self.delays, self.odometry = [], 0
-        before, started = _cpu_s(pid), time.monotonic()
+        before, started = processor_s(pid), time.monotonic()
         self.run(seconds)
         elapsed = time.monotonic() - started
         late = sum(time.monotonic() - sent > 1.0 for sent in self.requests.values())
-        cpu = (_cpu_s(pid) - before) / elapsed
-        return Phase(cpu, _rss_mib(pid), self.odometry / elapsed, self.delays, late)
-
-
-def _cpu_s(pid: int) -> float:
-    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
-
-
-def _rss_mib(pid: int) -> float:
-    return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / (1 << 20)
+        cpu = (processor_s(pid) - before) / elapsed
+        return Phase(cpu, memory_mib(pid), self.odometry / elapsed, self.delays, late)
 
 
 @contextlib.contextmanager
