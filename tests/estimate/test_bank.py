@@ -521,6 +521,17 @@ def test_nothing_is_excluded_for_ever():
     assert max(h[0][1] for h in history) < 0.5
 
 
+def test_the_newborn_do_not_displace_an_onset_that_has_no_evidence_yet():
+    """With a first bin of 6 s the newborn were the heaviest of it, and onsets of 5 s before were dropped."""
+    layout, settings = flight_layout(), Settings(rows=20, jump_s=math.inf, surprise=math.inf)
+    assert settings.age_s < settings.birth_s
+    bank, _ = cruise(layout, lambda t: 0.0, 61, settings)
+    bank = b.births(bank._replace(t=bank.t + 5.0), layout, settings)
+    for fault in range(len(layout.faults)):
+        ages = {round(age) for age in (bank.t - bank.since)[bank.fault[:, fault] == fault]}
+        assert 0 in ages and any(5 <= age < 10 for age in ages), ages
+
+
 def test_a_slow_lie_is_found_and_an_honest_source_is_not_blamed():
     layout = flight_layout()
     _, history = cruise(layout, lambda t: 0.5 * max(0, t - 100), 200, Settings(rows=32))

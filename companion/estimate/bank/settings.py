@@ -22,7 +22,8 @@ class Settings:
     surprise : normalised squared innovation per component of the leading row above which births take place at
         once, before the measurement is used: the onset is then exact.
     surprise_gap_s : sooner after births a surprise must be greater, by the square of the share passed.
-    age_s, age_ratio : bins of age, the first and their ratio.
+    age_s, age_ratio : bins of age, the first and their ratio. The first is shorter than `birth_s`: the
+        newborn, which have their whole prior, displace no onset of just before that has no evidence yet.
     merge_ratio : rows merge by moments if their weights differ by less than this factor.
     merge_distance : and their means by less than this many sigma (Mahalanobis).
     dropped : share of the weight that a reduction may drop beyond what classes and quotas keep.
@@ -42,7 +43,7 @@ class Settings:
     level_parents: int = 1
     surprise: float = 12.0
     surprise_gap_s: float = 1.0
-    age_s: float = 6.0
+    age_s: float = 4.5
     age_ratio: float = 2.0
     merge_ratio: float = 3.0
     merge_distance: float = 1.0
