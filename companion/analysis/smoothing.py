@@ -300,7 +300,10 @@ def _forward_pass(records: Iterable[Stamped], config: Config) -> _Path:
 def _believed(record: Input, witness: _Witness) -> Input | None:
     """The record without what was false; None if nothing is left."""
     if isinstance(record, Gnss):
-        return None if witness.was_false("gnss", record.t_ns) else record
+        if witness.was_false("gnss", record.t_ns):
+            return None
+        false = witness.was_false("gnss velocity", record.t_ns)
+        return structs.replace(record, v_n=None) if false else record
     if not isinstance(record, RsbnFix):
         return record
     if witness.was_false(f"rsbn {record.beacon} azimuth", record.t_ns):

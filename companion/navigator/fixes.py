@@ -8,7 +8,7 @@ from companion.estimate import bank as banks
 from companion.estimate.bank.settings import DEFAULT as THRESHOLDS
 from companion.estimate.fusion import Azimuth
 from companion.navigator import fix_observations, height_error, measurements, own_channel, scatter
-from companion.navigator.hypotheses import GNSS, MOST_BEACONS
+from companion.navigator.hypotheses import GNSS, MOST_BEACONS, VELOCITY
 from companion.navigator.own_channel import OwnChannel
 from companion.navigator.progress import (
     carried,
@@ -63,19 +63,20 @@ def gnss(state: State, record: Gnss, settings: Settings) -> Step:
     state, v_n = _latency_velocity(state, record.t_ns)
     assert state.bank is not None
     taken = measurements.gnss_position(state.bank, known, channel, apart, factor * variance, v_n)
-    bank, accepted = taken.bank, taken.accepted
+    bank, velocity = taken.bank, None
     if config.use_velocity and record.v_n is not None:
         sigma = fix_observations.velocity_sigma(record, first_ns, config)
         noise = factor * (sigma**2 + channel.velocity_noise**2)
-        bank = measurements.gnss_velocity(
-            bank, known, channel, record, nominal.point, nominal.a_n, noise
-        ).bank
+        velocity = measurements.gnss_velocity(bank, known, channel, record, nominal.point, nominal.a_n, noise)
+        bank = velocity.bank
     state = state._replace(bank=bank, gnss_taken=record, fixed=True)
     state, out = decided(state, record, settings)
     out = [*noted, *out]
-    assert state.bank is not None
-    if state.reported[GNSS] == EXCLUDED or not accepted:
-        return nearer(state, settings), [*out, _rejected(state, record, "gnss", GNSS, taken)]
+    label = f"gnss {record.receiver}"
+    if velocity is not None and (state.reported[VELOCITY] == EXCLUDED or not velocity.accepted):
+        out.append(_rejected(state, record, f"{label} velocity", VELOCITY, velocity))
+    if state.reported[GNSS] == EXCLUDED or not taken.accepted:
+        return nearer(state, settings), [*out, _rejected(state, record, label, GNSS, taken)]
     since = math.inf if state.gnss_ns is None else (record.t_ns - state.gnss_ns) * 1e-9
     part = min(since, config.correlation_s) / config.correlation_s
     level = height_error.update(state.level, record, nominal.point, part, GATE_SIGMA**2)
@@ -220,10 +221,8 @@ def _scattered(
 
 
 def _rejected(
-    state: State, record: Gnss | RsbnFix, name: str, source: int, taken: measurements.Taken
+    state: State, record: Gnss | RsbnFix, label: str, source: int, taken: measurements.Taken
 ) -> Rejection:
-    assert state.bank is not None
-    label = f"gnss {record.receiver}" if isinstance(record, Gnss) else name
     if state.reported[source] == EXCLUDED:
         why, false = "excluded: false with probability", state.false[source]
         return Rejection(record.t_ns, record.rx_ns, label, why, false, THRESHOLDS.excluded)

@@ -33,7 +33,7 @@ from companion.navigator.corrected_ins import corrected_ins
 from companion.navigator.own_channel import OwnChannel
 
 POSITION = (0, 1)  # states
-GNSS, AIRSPEED = 0, 1  # sources; those of beacon k are `azimuth(k)` and `range(k)`
+GNSS, AIRSPEED, VELOCITY = 0, 1, 2  # sources, VELOCITY that of GNSS; of beacon k `azimuth(k)` and `range(k)`
 CONSISTENT, POSITION_ONLY = 0, 1  # faults of GNSS: its velocity is false too, or true
 GNSS_GROUP, BEACON_GROUP, AIRSPEED_GROUP = 0, 1, 2
 GROUPS = (2, 2, 1)
@@ -69,6 +69,7 @@ GNSS_FIRST = (
     Lie(2000.0, STILL, share=0.05),
 )
 AIRSPEED_LIES = (Lie(3.0, 0.03), Lie(15.0, 0.3))  # m/s, m/s^2
+VELOCITY_LIES = (Lie(0.3, 0.003), Lie(3.0, 0.03), Lie(0.3, 0.03, noise=0.01))  # m/s, m/s^2
 GUST = tuple(range(own_error_model.GUST.start, own_error_model.GUST.stop))
 GUST_OPEN_M_S = 3.0  # what the gust may have taken up of a step of the wind
 SHOCK = ((0, 15.0), (1, 15.0), (2, 15.0), (3, 15.0))  # of a false airspeed that moves the nominal: m, m/s
@@ -112,15 +113,15 @@ class Hypotheses(NamedTuple):
 
     def azimuth(self, k: int) -> int:
         """Source of beacon k's azimuth."""
-        return 2 + 2 * k
+        return 3 + 2 * k
 
     def range(self, k: int) -> int:
         """Source of beacon k's range."""
-        return 3 + 2 * k
+        return 4 + 2 * k
 
     def elsewhere(self, k: int) -> int:
         """Fault that beacon k is not where it states."""
-        return 5 + 3 * k
+        return 6 + 3 * k
 
 
 class Model:
@@ -212,12 +213,14 @@ def _hypotheses(config: Config, channel: Channel, beacons: int, by_air: bool, wi
     sources = [
         Source("gnss", 2, GNSS_GROUP, presumed=True),
         Source("airspeed", 1, AIRSPEED_GROUP, silence_s=SILENCE_S),
+        Source("gnss velocity", 2, GNSS_GROUP),
     ]
     lies = gnss_lies(ACCELERATED if channel.wind else ACCELERATED_GENTLY)
     faults = [
         Fault("gnss", (GNSS,), 7e-4 * doubt, lies, 7e-4 * doubt, GNSS_FIRST, quota=20),
         Fault("gnss position", (GNSS,), 3e-4 * doubt, lies, 3e-4 * doubt, GNSS_FIRST, quota=10),
         Fault("airspeed", (AIRSPEED,), 1e-2, AIRSPEED_LIES, shock=SHOCK if by_air else (), quota=6),
+        Fault("gnss velocity", (VELOCITY,), 1e-2, VELOCITY_LIES, 5e-2, VELOCITY_LIES, quota=12),
     ]
     for k in range(beacons):
         a, r = len(sources), len(sources) + 1

@@ -26,6 +26,7 @@ from companion.navigator.hypotheses import (
     CONSISTENT,
     GNSS,
     GNSS_GROUP,
+    VELOCITY,
     Hypotheses,
 )
 from companion.navigator.inertial_track import Point
@@ -120,7 +121,7 @@ def gnss_velocity(
     a_n: Vector2,
     variance: float,
 ) -> Taken:
-    """Take the velocity of a fix; rows that hold GNSS and its velocity false see the rate of its error.
+    """Take the velocity of a fix; rows that hold GNSS and its velocity false measure the rate of its error.
 
     In turns an antenna ahead has a velocity of its own. `variance` is that of its noise (m^2/s^2).
     """
@@ -145,7 +146,7 @@ def gnss_velocity(
 
     R = variance * np.eye(2)
     after, seen = banks.update(
-        bank, layout, seen_by, None, R, None, known.settings, outlier=OUTLIER["velocity"], bears=True
+        bank, layout, seen_by, None, R, VELOCITY, known.settings, outlier=OUTLIER["velocity"]
     )
     return _taken(after, seen, 2)
 

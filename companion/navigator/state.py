@@ -159,10 +159,10 @@ def estimate(state: State, settings: Settings) -> Estimate:
 
 def source_name(i: int, state: State) -> str:
     """Name of source number `i`, with the beacon's identity."""
-    if i < 2:
-        return ("gnss", "airspeed")[i]
-    beacon = state.beacons[(i - 2) // 2].identity
-    return f"rsbn {beacon} {'azimuth' if i % 2 == 0 else 'range'}"
+    if i < 3:
+        return ("gnss", "airspeed", "gnss velocity")[i]
+    beacon = state.beacons[(i - 3) // 2].identity
+    return f"rsbn {beacon} {'azimuth' if i % 2 else 'range'}"
 
 
 def sources(state: State, t_ns: int, settings: Settings) -> Source:

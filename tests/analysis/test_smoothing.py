@@ -195,6 +195,27 @@ def test_false_gnss_is_left_out_from_its_onset() -> None:
 
 
 @pytest.mark.flight
+def test_false_velocity_of_gnss_is_left_out_from_its_onset() -> None:
+    """The path is that of a receiver that stops sending a velocity there; its positions are used."""
+    flown = flight(300, (0, 0))
+    begun = 150 * NS
+
+    def records(off_m_s: float | None) -> list[Any]:
+        out = []
+        for record in flown.records:
+            if isinstance(record, Gnss) and record.v_n is not None and record.t_ns > begun:
+                north, east, down = record.v_n
+                v_n = None if off_m_s is None else (north + off_m_s, east, down)
+                record = msgspec.structs.replace(record, v_n=v_n)
+            out.append(record)
+        return out
+
+    (wrong,), (silent,) = smooth_flight(records(3.0), CONFIG), smooth_flight(records(None), CONFIG)
+    assert rms((wrong.x - silent.x)[:, :2]) < 0.1
+    assert rms(errors(wrong, flown)[0][:, :2]) < 1.5
+
+
+@pytest.mark.flight
 def test_reboot_starts_a_new_run() -> None:
     flown = flight(300, (0, 0))
     cut = 150 * NS + 1

@@ -25,6 +25,7 @@ from companion.records import (
     LocalOrigin,
     LocalPosition,
     Pressure,
+    Rejection,
     RsbnFix,
     Solution,
     Source,
@@ -59,13 +60,14 @@ Change = Callable[[Any], Any]
 
 
 class Flown(NamedTuple):
-    """Solutions with their times (s), errors north and east (m), and events."""
+    """Solutions with their times (s), errors north and east (m), events and rejections."""
 
     solutions: list[Solution]
     t: Floats
     error_n: Floats
     velocity_error_n: Floats
     events: list[Event]
+    rejections: list[Rejection]
 
     @property
     def error(self) -> Floats:
@@ -128,7 +130,8 @@ def fly(
     north, east = (place[:, 0] - truth.lat) * radius, (place[:, 1] - truth.lon) * radius * np.cos(truth.lat)
     velocity = np.array([s.v_n for s in solutions])[:, :2] - truth.v_n[:, :2]
     events = [out for out in outputs if isinstance(out, Event)]
-    return Flown(solutions, t, np.stack([north, east], axis=1), velocity, events)
+    rejections = [out for out in outputs if isinstance(out, Rejection)]
+    return Flown(solutions, t, np.stack([north, east], axis=1), velocity, events, rejections)
 
 
 def after(start: float, kind: type, **fields: Callable[[Any], Any]) -> Change:
@@ -189,12 +192,14 @@ ONE_WRONG: dict[str, Callable[[], Change]] = {
     "pitot zero": lambda: after(120.0, AirData, airspeed=noisy(0.0)),
     "range": lambda: after(120.0, RsbnFix, slant_range=lambda d: d + 200.0),
     "azimuth": lambda: after(120.0, RsbnFix, azimuth=lambda a: (a + math.radians(1.0)) % math.tau),
+    "velocity": lambda: after(120.0, Gnss, v_n=lambda v: (v[0] + 0.4, v[1] - 0.3, v[2])),
     "late 0.3 s": lambda: late(0.3),
     "stated too fine": lambda: lambda record: record,
 }
 CASES = [
     *((c, f) for c in ("imu", "air") for f in ("pitot low", "pitot high", "pitot zero")),
     *((c, f) for c in ("ins", "imu") for f in ("nothing", "range", "azimuth", "late 0.3 s")),
+    ("ins", "velocity"),
     ("ins", "stated too fine"),
 ]
 
@@ -237,6 +242,30 @@ def test_without_gnss_a_false_airspeed_must_be_taken_out_of_use(gnss_until: floa
     assert any(text.startswith("airspeed is excluded") for text in texts)
     assert any(text.startswith(FALSE_AIRSPEED) for text in texts) == needed
     assert all(len(FALSE_AIRSPEED + name) <= 50 for name in USE_AIRSPEED.values())  # one STATUSTEXT
+
+
+@pytest.mark.parametrize("channel", ["ins", "imu", "air"])
+def test_a_false_velocity_of_gnss_is_excluded_and_its_position_stays_in_use(channel: str) -> None:
+    """Off by 2.2 m/s from 120 s to 210 s."""
+    begin, end = 120.0, 210.0
+
+    def wrong(record: Any) -> Any:
+        if not isinstance(record, Gnss) or record.v_n is None or not begin <= record.t_ns / NS < end:
+            return record
+        north, east, down = record.v_n
+        return replace(record, v_n=(north + 2.0, east - 1.0, down))
+
+    flown = fly(channel, wrong, (*FIVE_MINUTES, Leg(60, 310, 38, 40)))
+    texts = [event.text for event in flown.events]
+    excluded = next(k for k, text in enumerate(texts) if text.startswith("gnss velocity is excluded"))
+    assert "gnss velocity is used again" in texts[excluded:]
+    rejected = [r for r in flown.rejections if r.source == "gnss 0 velocity" and "excluded" in r.reason]
+    assert len(rejected) > 100
+    assert not [r for r in flown.rejections if r.source == "gnss 0" and "excluded" in r.reason]
+    assert (flown.of("sources", 30.0) & Source.GNSS).all()
+    assert flown.of("gnss_false", 30.0).max() < 0.5
+    assert np.all(flown.error <= flown.protection)
+    assert flown.error[flown.t > SETTLED_S].max() < 10.0
 
 
 @pytest.mark.parametrize("channel", ["ins", "imu"])

@@ -75,6 +75,14 @@ def test_a_velocity_of_gnss_that_lags_its_positions_does_not_exclude_it(channel)
     assert fly(HarmOrder("GNSS velocity 0.3 % too small", channel, 1, 10.0)).passed
 
 
+@pytest.mark.flight
+@pytest.mark.parametrize("channel", harm_study.CHANNELS)
+def test_a_false_velocity_of_gnss_does_not_exclude_its_position(channel):
+    """Excluded before, 570 m off (stock)."""
+    found = fly(HarmOrder("GNSS velocity 5 % too small", channel, 1, 5.0))
+    assert found.passed and "gnss velocity" in found.suspected
+
+
 def test_exception_in_a_flight_is_a_result(monkeypatch):
     monkeypatch.setattr(harm_study, "scenario_of", lambda order: 1 / 0)
     result = fly(HarmOrder("nothing", "stock", 1, 5.0))

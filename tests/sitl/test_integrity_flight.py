@@ -114,7 +114,7 @@ def test_gnss_that_is_drawn_off_gently_is_found_beside_an_ins(scenario: str) -> 
 
 
 #: 57 m before the lasting velocity error of GNSS was a state, without which a healthy one is excluded.
-NOT_REACHED = pytest.mark.xfail(strict=True, raises=AssertionError, reason="83 m: docs/limits.md")
+NOT_REACHED = pytest.mark.xfail(strict=True, raises=AssertionError, reason="78 m: docs/limits.md")
 
 
 @pytest.mark.parametrize("scenario", [pytest.param("one-beacon", marks=NOT_REACHED), "two-beacons"])

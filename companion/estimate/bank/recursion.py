@@ -125,7 +125,6 @@ def update(
     settings: Settings = DEFAULT,
     outlier: float = NEVER,
     derivative: bool = False,
-    bears: bool = False,
 ) -> tuple[Bank, Innovation]:
     """Update all rows by one measurement z = H x + lie + white noise, and reweight them.
 
@@ -146,7 +145,6 @@ def update(
     settings : births on return and on surprise.
     outlier : log density of a measurement that has nothing to do with its quantity, prior included.
     derivative : the measurement is a velocity of the source, so it sees the rate of the lie, not the offset.
-    bears : a surprise bears children although the measurement itself cannot be false.
 
     Returns
     -------
@@ -171,7 +169,7 @@ def update(
     step = innovations(bank)
     passed = min((bank.t - bank.born_t) / settings.surprise_gap_s, 1.0)  # since births
     nis = float(step.nis[int(np.argmax(bank.L))]) * passed**2
-    may_bear = (source is not None or bears) and not fixed and not born and settings.surprise < math.inf
+    may_bear = source is not None and not fixed and not born and settings.surprise < math.inf
     if may_bear and nis > settings.surprise * step.nu.shape[-1]:
         bank = births(bank, layout, settings, reduced=False)
         born = True
