@@ -1,7 +1,8 @@
 """What may be wrong: the layout of the navigator's bank, its priors, and beacons as they appear.
 
 Base states are those of the channel, then the biases of azimuth and range of each beacon, by identity. GNSS,
-beacons and airspeed have a group of lie states each, so that one source of each kind may be false at once.
+beacons and airspeed have a group of lie states each, so that one source of each kind may be false at once. Of
+GNSS either the position, with its velocity or alone, or the velocity alone is false.
 """
 
 from __future__ import annotations

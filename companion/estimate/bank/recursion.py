@@ -124,7 +124,6 @@ def update(
     source: int | None,
     settings: Settings = DEFAULT,
     outlier: float = NEVER,
-    derivative: bool = False,
 ) -> tuple[Bank, Innovation]:
     """Update all rows by one measurement z = H x + lie + white noise, and reweight them.
 
@@ -144,7 +143,6 @@ def update(
     source : index of the source, None for a measurement that cannot be false.
     settings : births on return and on surprise.
     outlier : log density of a measurement that has nothing to do with its quantity, prior included.
-    derivative : the measurement is a velocity of the source, so it sees the rate of the lie, not the offset.
 
     Returns
     -------
@@ -162,7 +160,7 @@ def update(
         assert H_rows is not None
         if not np.isfinite(z_rows).all():
             raise ValueError("measurement is not a number")
-        return _innovations(bank, layout, z_rows, H_rows, R, source, derivative)
+        return _innovations(bank, layout, z_rows, H_rows, R, source)
 
     if source is not None and not fixed and bank.t - bank.seen[source] > layout.sources[source].silence_s:
         bank, born = returns(bank, layout, source, settings)
@@ -203,9 +201,7 @@ class _Step(NamedTuple):
     log_likelihood: Floats
 
 
-def _innovations(
-    bank: Bank, layout: Layout, z: Floats, H: Floats, R: Floats, source: int | None, derivative: bool
-) -> _Step:
+def _innovations(bank: Bank, layout: Layout, z: Floats, H: Floats, R: Floats, source: int | None) -> _Step:
     """Innovations and square-root gains of all rows; P - G G' is the posterior covariance."""
     rows, n = bank.x.shape
     m, k = H.shape[-2:]
@@ -223,7 +219,7 @@ def _innovations(
     if source is not None:
         false = false_rows(bank, layout, source)
         if false.any():
-            lie = layout.lie_states(source) + derivative * layout.groups[layout.sources[source].group]
+            lie = layout.lie_states(source)
             a, b = int(lie[0]), int(lie[-1]) + 1
             mask = false.astype(np.float64)
             PHt = PHt + mask[:, None, None] * bank.P[:, :, a:b]
