@@ -38,7 +38,7 @@ from companion.estimate.smoother import rts_backward, two_point
 from companion.nav.geometry import displace
 from companion.navigator import INPUTS_USED, Navigator, begins_again, guarded, own_channel, tuned
 from companion.navigator.channel import Nominal, Transition
-from companion.navigator.hypotheses import MOST_BEACONS, Hypotheses, Model
+from companion.navigator.hypotheses import MOST_BEACONS, VELOCITY, Hypotheses, Model
 from companion.navigator.inertial_track import Point
 from companion.navigator.state import Beacon, Settings, State, hypotheses, initial, levelled, source_name
 from companion.navigator.step import step
@@ -190,6 +190,8 @@ class _Witness(Navigator):
         s, air = state.sensors, state.sensors.air.air
         if record.v_n is None or air is None or abs(record.t_ns - air.t_ns) > SAME_TIME_NS:
             return
+        if state.reported and state.reported[VELOCITY]:
+            return
         V = own_channel.air_velocity(s, air, state.nominal.point.position.alt) if state.nominal else None
         if V is not None and s.ground.flying and s.air_ns == air.t_ns:
             self.gusts.add(record.t_ns * 1e-9, V, record.v_n[:2])
@@ -302,7 +304,7 @@ def _believed(record: Input, witness: _Witness) -> Input | None:
     if isinstance(record, Gnss):
         if witness.was_false("gnss", record.t_ns):
             return None
-        false = witness.was_false("gnss velocity", record.t_ns)
+        false = witness.was_false("velocity of gnss", record.t_ns)
         return structs.replace(record, v_n=None) if false else record
     if not isinstance(record, RsbnFix):
         return record

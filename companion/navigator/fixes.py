@@ -74,7 +74,7 @@ def gnss(state: State, record: Gnss, settings: Settings) -> Step:
     out = [*noted, *out]
     label = f"gnss {record.receiver}"
     if velocity is not None and (state.reported[VELOCITY] == EXCLUDED or not velocity.accepted):
-        out.append(_rejected(state, record, f"{label} velocity", VELOCITY, velocity))
+        out.append(_rejected(state, record, f"velocity of {label}", VELOCITY, velocity))
     if state.reported[GNSS] == EXCLUDED or not taken.accepted:
         return nearer(state, settings), [*out, _rejected(state, record, label, GNSS, taken)]
     since = math.inf if state.gnss_ns is None else (record.t_ns - state.gnss_ns) * 1e-9

@@ -214,14 +214,14 @@ def _hypotheses(config: Config, channel: Channel, beacons: int, by_air: bool, wi
     sources = [
         Source("gnss", 2, GNSS_GROUP, presumed=True),
         Source("airspeed", 1, AIRSPEED_GROUP, silence_s=SILENCE_S),
-        Source("gnss velocity", 2, GNSS_GROUP),
+        Source("velocity of gnss", 2, GNSS_GROUP),
     ]
     lies = gnss_lies(ACCELERATED if channel.wind else ACCELERATED_GENTLY)
     faults = [
         Fault("gnss", (GNSS,), 7e-4 * doubt, lies, 7e-4 * doubt, GNSS_FIRST, quota=20),
         Fault("gnss position", (GNSS,), 3e-4 * doubt, lies, 3e-4 * doubt, GNSS_FIRST, quota=10),
         Fault("airspeed", (AIRSPEED,), 1e-2, AIRSPEED_LIES, shock=SHOCK if by_air else (), quota=6),
-        Fault("gnss velocity", (VELOCITY,), 1e-2, VELOCITY_LIES, 5e-2, VELOCITY_LIES, quota=12),
+        Fault("velocity of gnss", (VELOCITY,), 1e-2, VELOCITY_LIES, 5e-2, VELOCITY_LIES, quota=12),
     ]
     for k in range(beacons):
         a, r = len(sources), len(sources) + 1

@@ -16,7 +16,7 @@ from companion.estimate import bank as banks
 from companion.estimate.fusion import Height, NoFix, maximum_likelihood
 from companion.nav.geometry import displace
 from companion.navigator import fix_observations, height_error, minimax_bound, parallel_filters, trust
-from companion.navigator.hypotheses import GNSS
+from companion.navigator.hypotheses import GNSS, VELOCITY
 from companion.navigator.minimax_bound import Guaranteed, Linear
 from companion.navigator.own_channel import OwnChannel
 from companion.navigator.state import (
@@ -91,7 +91,9 @@ def solve(state: State, rx_ns: int, settings: Settings) -> Step:
     protection = state.protection[1] + math.dist(error, state.protection[2:])
     bound_n, velocity_bound_n = _about(error, velocity_error, promised)
     witness = bool(rests_on & (Source.AZIMUTH | Source.RANGE))
-    suspicion = any(state.reported)
+    suspicion = _is_suspicious(
+        state, bank.t - bank.seen[VELOCITY] <= known.layout.sources[VELOCITY].silence_s
+    )
     held = _trust(state, bool(fixes), suspicion, bound_n, protection, t_ns, settings)
     north, east, down = point.v_n
     lat, lon, alt = displace(*point.position, -error[0], -error[1], 0.0)
@@ -212,6 +214,13 @@ def _gnss_false(state: State) -> float | None:
     if not state.false:
         return None
     return state.false[GNSS] if state.reported[GNSS] == EXCLUDED else min(state.false[GNSS], UNCONFIRMED)
+
+
+def _is_suspicious(state: State, has_velocity: bool) -> bool:
+    """Whether a source is suspect or excluded. A velocity of GNSS that is no longer received is not: nothing
+    could clear it, and the positions go on.
+    """
+    return any(how and (i != VELOCITY or has_velocity) for i, how in enumerate(state.reported))
 
 
 def _disagreement(candidates: dict[str, _Estimate]) -> float | None:

@@ -160,7 +160,7 @@ def estimate(state: State, settings: Settings) -> Estimate:
 def source_name(i: int, state: State) -> str:
     """Name of source number `i`, with the beacon's identity."""
     if i < 3:
-        return ("gnss", "airspeed", "gnss velocity")[i]
+        return ("gnss", "airspeed", "velocity of gnss")[i]
     beacon = state.beacons[(i - 3) // 2].identity
     return f"rsbn {beacon} {'azimuth' if i % 2 else 'range'}"
 

@@ -386,7 +386,8 @@ def score_flight(order: FlightOrder, world: World, outputs: Sequence[Stamped]) -
     reported = [r.t_ns * 1e-9 for r in outputs if _reports_fault(r, kind.concerns)]
     worse = t[on & (trust > trust[max(int(on.argmax()) - 1, 0)])].tolist() if on.any() else []
     detected = min((x for x in (*reported, *dropped, *worse) if start <= x < end), default=None)
-    wrong = [r for r in exclusions if not _concerns(r, kind.concerns)]
+    of_gnss = "velocity of gnss" if kind.concerns == "gnss" else ""  # its velocity is no other source
+    wrong = [r for r in exclusions if not _concerns(r, kind.concerns) and not _concerns(r, of_gnss)]
     before = (t >= start) & (t <= (end if excluded is None else excluded))
     settled, beyond = t >= SETTLED_S, error > levels
     flagged = (trust == Trust.DEGRADED) | (trust == Trust.UNTRUSTED)

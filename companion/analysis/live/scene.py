@@ -169,6 +169,8 @@ class Scene:
             self._strip("gnss").add(self.t, None)
             return
         self._gnss, self._measured["gnss"] = record, self.t
+        if record.v_n is not None:
+            self._measured["velocity of gnss"] = self.t
         east, north = self._place(record.lat, record.lon)
         self._received.add(self.t, east, north)
         if self._solution is not None:
@@ -407,11 +409,14 @@ class Scene:
         )  # fmt: skip
 
     def _false_lines(self) -> Iterator[Line]:
-        roles = {"gnss": error_statistics.GNSS, "airspeed": "second"}
+        gnss = error_statistics.GNSS
+        roles = {"gnss": gnss, "velocity of gnss": gnss, "airspeed": "second"}
         for name in self._measured:
             if strip := self._strips.get(f"false {name}"):
                 colour = COLOURS[roles.get(name, error_statistics.RSBN)]
-                yield strip.line(source_title(name), colour, dash=name.endswith("range"))
+                yield strip.line(
+                    source_title(name), colour, dash=name.startswith("vel") or name.endswith("range")
+                )
 
 
 class SourceRow(NamedTuple):

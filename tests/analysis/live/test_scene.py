@@ -104,12 +104,14 @@ def test_nothing_is_trusted_before_a_position():
 def test_sources_have_the_probability_that_each_is_false():
     scene = Scene("x")
     false = (("gnss", 0.9999), ("airspeed", 0.02), ("rsbn 7 azimuth", 0.6), ("rsbn 7 range", 0.001))
-    scene.add(message(Gnss(S, S, 0, 1, 3, LAT, LON, 300.0)))
+    false = (*false, ("velocity of gnss", 0.03))
+    scene.add(message(Gnss(S, S, 0, 1, 3, LAT, LON, 300.0, v_n=(30.0, 0.0, 0.0))))
     scene.add(message(RsbnFix(S, S, 7, LAT, LON, 0.0, math.pi / 2, 5000.0, 0.002, 100.0)))
     scene.add(message(solution(1.5, sources=1 | 4 | 8 | 16, false_sources=false)))
     rows = {row["name"]: (row["state"], row["false"]) for row in scene.frame(0.1, False)["sources"]}
     assert rows == {
         "GNSS": ("excluded", 100.0),
+        "velocity of GNSS": ("not used", 3.0),
         "beacon 7 azimuth": ("suspect", 60.0),
         "beacon 7 range": ("used", 0.1),
         "airspeed": ("used", 2.0),
@@ -126,14 +128,21 @@ def test_sources_have_the_probability_that_each_is_false():
 def test_table_and_chart_have_the_same_sources(sources):
     """Airspeed is a source once it is used; a beacon's azimuth once it was measured."""
     scene = Scene("x")
-    false = (("gnss", 0.01), ("airspeed", 0.0), ("rsbn 7 azimuth", 0.0), ("rsbn 7 range", 0.1))
+    false = (
+        ("gnss", 0.01),
+        ("velocity of gnss", 0.02),
+        ("airspeed", 0.0),
+        ("rsbn 7 azimuth", 0.0),
+        ("rsbn 7 range", 0.1),
+    )
+    scene.add(message(Gnss(S, S, 0, 1, 3, LAT, LON, 300.0, v_n=(30.0, 0.0, 0.0))))
     scene.add(message(RsbnFix(S, S, 7, LAT, LON, 0.0, None, 5000.0, 0.002, 100.0)))
     scene.add(message(solution(1.5, sources=sources, false_sources=false)))
     frame = scene.frame(0.1, False)
     (chart,) = (chart for chart in frame["charts"] if chart["key"] == "false")
     names = [row["name"] for row in frame["sources"]]
     assert names == [line["name"] for line in chart["lines"]]
-    assert names == ["GNSS", "beacon 7 range", *(["airspeed"] if sources & 16 else [])]
+    assert names == ["GNSS", "velocity of GNSS", "beacon 7 range", *(["airspeed"] if sources & 16 else [])]
 
 
 def test_lines_of_position_end_where_the_beacon_measured():
