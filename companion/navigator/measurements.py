@@ -123,7 +123,8 @@ def gnss_velocity(
 ) -> Taken:
     """Take the velocity of a fix; rows that hold GNSS and its velocity false measure the rate of its error.
 
-    In turns an antenna ahead has a velocity of its own. `variance` is that of its noise (m^2/s^2).
+    For rows that hold the velocity alone false, `update` adds its error. In turns an antenna ahead has a
+    velocity of its own. `variance` is that of its noise (m^2/s^2).
     """
     assert record.v_n is not None
     layout = known.layout

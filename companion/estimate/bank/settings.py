@@ -23,7 +23,8 @@ class Settings:
         once, before the measurement is used: the onset is then exact.
     surprise_gap_s : sooner after births a surprise must be greater, by the square of the share passed.
     age_s, age_ratio : bins of age, the first and their ratio. The first is shorter than `birth_s`: the
-        newborn, which have their whole prior, displace no onset of just before that has no evidence yet.
+        newborn, which have their whole prior, displace no onset of the scheduled births before, which has no
+        evidence yet.
     merge_ratio : rows merge by moments if their weights differ by less than this factor.
     merge_distance : and their means by less than this many sigma (Mahalanobis).
     dropped : share of the weight that a reduction may drop beyond what classes and quotas keep.
