@@ -72,17 +72,20 @@ class Tlog:
 
     def _skip(self, at: int) -> int:
         """Count the bytes at `at` as corrupt, unknown or torn, and return the offset of the next entry."""
-        if (size := self._stated_length(at)) is not None:
-            if _msgid(self.data, at + _STAMP) in TYPES:
-                self._count_corrupt(at, size)
-            else:
-                self.unknown += 1
-            return at + size
-        for magic in _MAGIC.finditer(self.data, at + _STAMP + 1):
+        size = self._stated_length(at)
+        end = len(self.data) if size is None else at + size
+        # a valid entry before the stated end: the length is not that of an entry
+        for magic in _MAGIC.finditer(self.data, at + _STAMP + 1, end):
             begin = magic.start() - _STAMP
             if self._has_time_stamp(begin) and isinstance(frame.parse(self.data, begin + _STAMP), Frame):
                 self._count_corrupt(at, begin - at)
                 return begin
+        if size is not None:
+            if _msgid(self.data, at + _STAMP) in TYPES:
+                self._count_corrupt(at, size)
+            else:
+                self.unknown += 1
+            return end
         left = len(self.data) - at
         starts = self._has_time_stamp(at) and self.data[at + _STAMP : at + _STAMP + 1] in (
             b"",

@@ -7,7 +7,7 @@ from collections import Counter
 from itertools import pairwise
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from companion import records as r
@@ -101,6 +101,7 @@ def test_times_never_decrease() -> None:
 
 @settings(max_examples=100)
 @given(st.binary(max_size=60), st.integers(0, len(b"".join(CLEAN))))
+@example(b"\0\xfe\xb0" + bytes(21), 287)  # states a length at whose end there is an entry, five entries later
 def test_inserted_bytes_lose_at_most_one_entry(junk: bytes, at: int) -> None:
     data = b"".join(CLEAN)
     entries, log = read(data[:at] + junk + data[at:])
