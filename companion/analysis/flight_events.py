@@ -125,10 +125,10 @@ def phase_title(name: str) -> str:
 
 def source_title(source: str) -> str:
     """Return the name of a source of measurements for the user: GNSS 0, beacon 7 azimuth, airspeed."""
-    before, of, source = source.rpartition("velocity of ")
+    _, of, source = source.rpartition("velocity of ")
     kind, _, rest = source.partition(" ")
     name = {"gnss": "GNSS", "rsbn": "beacon"}.get(kind.lower(), _NAMES.get(kind, kind))
-    return f"{before}{of}{name} {rest}".strip()
+    return f"{of}{name} {rest}".strip()
 
 
 def find_gnss_outages(flight: Flight) -> list[OutageInterval]:

@@ -34,7 +34,8 @@ from companion.navigator.corrected_ins import corrected_ins
 from companion.navigator.own_channel import OwnChannel
 
 POSITION = (0, 1)  # states
-GNSS, AIRSPEED, VELOCITY = 0, 1, 2  # sources, VELOCITY that of GNSS; of beacon k `azimuth(k)` and `range(k)`
+SOURCES = ("gnss", "airspeed", "velocity of gnss")  # then `azimuth(k)` and `range(k)` of each beacon k
+GNSS, AIRSPEED, VELOCITY = range(len(SOURCES))
 CONSISTENT, POSITION_ONLY = 0, 1  # faults of GNSS: its velocity is false too, or true
 GNSS_GROUP, BEACON_GROUP, AIRSPEED_GROUP = 0, 1, 2
 GROUPS = (2, 2, 1)
@@ -114,11 +115,11 @@ class Hypotheses(NamedTuple):
 
     def azimuth(self, k: int) -> int:
         """Source of beacon k's azimuth."""
-        return 3 + 2 * k
+        return len(SOURCES) + 2 * k
 
     def range(self, k: int) -> int:
         """Source of beacon k's range."""
-        return 4 + 2 * k
+        return len(SOURCES) + 2 * k + 1
 
     def elsewhere(self, k: int) -> int:
         """Fault that beacon k is not where it states."""
@@ -212,9 +213,9 @@ def _hypotheses(config: Config, channel: Channel, beacons: int, by_air: bool, wi
     # an air-data or IMU channel alone is no witness against GNSS: its own model may be what is wrong
     doubt = 1.0 if witness or not channel.wind else 0.0
     sources = [
-        Source("gnss", 2, GNSS_GROUP, presumed=True),
-        Source("airspeed", 1, AIRSPEED_GROUP, silence_s=SILENCE_S),
-        Source("velocity of gnss", 2, GNSS_GROUP),
+        Source(SOURCES[GNSS], 2, GNSS_GROUP, presumed=True),
+        Source(SOURCES[AIRSPEED], 1, AIRSPEED_GROUP, silence_s=SILENCE_S),
+        Source(SOURCES[VELOCITY], 2, GNSS_GROUP),
     ]
     lies = gnss_lies(ACCELERATED if channel.wind else ACCELERATED_GENTLY)
     faults = [

@@ -91,9 +91,7 @@ def solve(state: State, rx_ns: int, settings: Settings) -> Step:
     protection = state.protection[1] + math.dist(error, state.protection[2:])
     bound_n, velocity_bound_n = _about(error, velocity_error, promised)
     witness = bool(rests_on & (Source.AZIMUTH | Source.RANGE))
-    suspicion = _is_suspicious(
-        state, bank.t - bank.seen[VELOCITY] <= known.layout.sources[VELOCITY].silence_s
-    )
+    suspicion = _is_suspicious(state, banks.heard_sources(bank, known.layout)[VELOCITY])
     held = _trust(state, bool(fixes), suspicion, bound_n, protection, t_ns, settings)
     north, east, down = point.v_n
     lat, lon, alt = displace(*point.position, -error[0], -error[1], 0.0)

@@ -13,7 +13,7 @@ from companion.nav.geometry import Geodetic, displace
 from companion.navigator import height_error
 from companion.navigator.channel import Nominal
 from companion.navigator.height_error import Level
-from companion.navigator.hypotheses import Hypotheses, Model
+from companion.navigator.hypotheses import SOURCES, Hypotheses, Model
 from companion.navigator.inertial_track import Point
 from companion.navigator.minimax_bound import Guarantee
 from companion.navigator.own_channel import Sensors
@@ -159,10 +159,10 @@ def estimate(state: State, settings: Settings) -> Estimate:
 
 def source_name(i: int, state: State) -> str:
     """Name of source number `i`, with the beacon's identity."""
-    if i < 3:
-        return ("gnss", "airspeed", "velocity of gnss")[i]
-    beacon = state.beacons[(i - 3) // 2].identity
-    return f"rsbn {beacon} {'azimuth' if i % 2 else 'range'}"
+    if i < len(SOURCES):
+        return SOURCES[i]
+    k, part = divmod(i - len(SOURCES), 2)
+    return f"rsbn {state.beacons[k].identity} {('azimuth', 'range')[part]}"
 
 
 def sources(state: State, t_ns: int, settings: Settings) -> Source:

@@ -198,12 +198,12 @@ def test_false_gnss_is_left_out_from_its_onset() -> None:
 def test_false_velocity_of_gnss_is_left_out_from_its_onset() -> None:
     """The path is that of a receiver that stops sending a velocity there; its positions are used."""
     flown = flight(300, (0, 0))
-    begun = 150 * NS
+    onset_ns = 150 * NS
 
     def records(off_m_s: float | None) -> list[Any]:
         out = []
         for record in flown.records:
-            if isinstance(record, Gnss) and record.v_n is not None and record.t_ns > begun:
+            if isinstance(record, Gnss) and record.v_n is not None and record.t_ns > onset_ns:
                 north, east, down = record.v_n
                 v_n = None if off_m_s is None else (north + off_m_s, east, down)
                 record = msgspec.structs.replace(record, v_n=v_n)

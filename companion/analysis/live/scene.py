@@ -414,9 +414,8 @@ class Scene:
         for name in self._measured:
             if strip := self._strips.get(f"false {name}"):
                 colour = COLOURS[roles.get(name, error_statistics.RSBN)]
-                yield strip.line(
-                    source_title(name), colour, dash=name.startswith("vel") or name.endswith("range")
-                )
+                dash = name.startswith("velocity") or name.endswith("range")
+                yield strip.line(source_title(name), colour, dash=dash)
 
 
 class SourceRow(NamedTuple):

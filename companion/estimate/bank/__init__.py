@@ -44,6 +44,7 @@ from companion.estimate.bank.branching import (
     births,
     births_due,
     false_since_first,
+    heard_sources,
     jump_births,
     jump_births_due,
 )
@@ -103,6 +104,7 @@ __all__ = [
     "families",
     "fault_probability",
     "grade_probability",
+    "heard_sources",
     "inflate",
     "is_sound",
     "jump_births",
