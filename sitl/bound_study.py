@@ -250,7 +250,7 @@ def curve(grade: InertialGrade, window_s: float, ahead_s: float) -> list[CurvePo
 @click.command("bound")
 @click.option("--window-min", default=25.0, show_default=True, help="Duration of the window of fixes [min].")
 @click.option("--flights", default=19, show_default=True, help="Flights in each of the 54 ensembles.")
-@click.option("--seed", default=1, show_default=True, help="Seed of the errors.")
+@click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Seed of the errors.")
 @click.option("--grade", type=click.Choice(tuple(GRADES)), help="Only this grade.")
 @click.option("--json", "as_json", is_flag=True, help="Print every ensemble as JSON.")
 @click.option(

@@ -239,7 +239,9 @@ def _parse_address(text: str, option: str) -> Address:
 @click.option("--seconds", type=click.FloatRange(1.0), default=math.inf, help="Duration of the run.")
 @click.option("--unaided", is_flag=True, help="Do not relay the companion's positions to the autopilot.")
 @click.option("--beacons-only", is_flag=True, help="Send the companion only the beacons' answers.")
-@click.option("--seed", type=int, default=1, show_default=True, help="Seed of the beacons' noise.")
+@click.option(
+    "--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Seed of the beacons' noise."
+)
 @click.option("--log", "folder", type=click.Path(path_type=Path), help="Folder for the errors, as CSV.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 def command(

@@ -75,7 +75,7 @@ def fly(world: World, bank: bool = True) -> CorrectedFlight:
     "--grade", type=click.Choice(list(UNITS)), default="tactical", show_default=True, help="INS grade."
 )
 @click.option("--name", "names", multiple=True, type=click.Choice(NAMES), help="Corrector; default: each.")
-@click.option("--seed", default=1, show_default=True, help="Seed of the flight.")
+@click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Seed of the flight.")
 def command(grade: str, names: tuple[str, ...], seed: int) -> None:
     """Fly an INS without GNSS, with each corrector.
 

@@ -227,7 +227,7 @@ def _from_first_fix(phase: SchedulePhase, records: Iterable[Stamped]) -> error_s
 
 @click.command("loopback")
 @click.option("--scenario", default="default", show_default=True, help=f"One of {', '.join(SCENARIOS)}.")
-@click.option("--seed", type=int, help="Seed of the noise.")
+@click.option("--seed", type=click.IntRange(min=0), help="Seed of the noise.")
 @configuration_options
 @click.option("--logs", help="Folder for the log.")
 @click.option(

@@ -79,7 +79,7 @@ def apart_m(a: SchemeFlight, b: SchemeFlight) -> tuple[float, float]:
 @click.command("schemes-flown")
 @click.option("--scenario", default="short", show_default=True, help="A loopback scenario.")
 @click.option("--channel", "channels", multiple=True, type=click.Choice(OWN_CHANNELS), help="Default: all.")
-@click.option("--seed", default=1, show_default=True, help="Seed of the flight.")
+@click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Seed of the flight.")
 def command(scenario: str, channels: Sequence[str], seed: int) -> None:
     """Fly one scenario by each correction scheme.
 

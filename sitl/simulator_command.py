@@ -196,7 +196,7 @@ async def _run(runner: SimulatorRunner) -> None:
 @click.pass_context
 @click.option("--connect", default="udpout:127.0.0.1:14550", show_default=True, help="Link to the companion.")
 @click.option("--scenario", default="default", show_default=True, help=f"One of {', '.join(SCENARIOS)}.")
-@click.option("--seed", type=int, help="Seed of the noise.")
+@click.option("--seed", type=click.IntRange(min=0), help="Seed of the noise.")
 @click.option(
     "--speed",
     type=click.FloatRange(0.1, 20.0),

@@ -110,7 +110,7 @@ def fly(world: World, source: str, factor: float, bank: bool) -> FlownError:
 @click.command("weights-flown")
 @click.option("--scenario", default="default", show_default=True, help="A loopback scenario.")
 @click.option("--source", "sources", multiple=True, type=click.Choice(SOURCES), help="Default: each.")
-@click.option("--seed", default=1, show_default=True, help="Seed of the flight.")
+@click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Seed of the flight.")
 def command(scenario: str, sources: Sequence[str], seed: int) -> None:
     """Fly with the sigma of one source stated wrong.
 

@@ -16,6 +16,7 @@ from click.testing import CliRunner
 
 from companion import __version__
 from companion.command_line import cli
+from sitl.endurance import file_mutants, forged_frames, parameter_sweep
 
 COMMANDS = ("bench", "check-config", "doctor", "log", "loopback", "replay", "run", "sitl")
 CUT = Path(__file__).parent / "data" / "dronekit_copter_cut.tlog"
@@ -58,6 +59,21 @@ def test_no_summary_is_cut_at_80_columns() -> None:
     assert set(helps) >= {"companion", "log", "signing", "sitl", "study"}
     lines = [line for text in helps.values() for line in text.splitlines()[1:]]
     assert [line for line in lines if line.endswith("...")] == []
+
+
+def test_seeds_are_not_negative() -> None:
+    commands = [
+        command
+        for context in groups(click.Context(cli))
+        for name in context.command.list_commands(context)
+        if (command := context.command.get_command(context, name))
+    ]
+    commands += [file_mutants.main, forged_frames.main, parameter_sweep.main]
+    seeded = [command for command in commands if "seed" in {option.name for option in command.params}]
+    assert len(seeded) >= 15
+    for command in seeded:
+        done = CliRunner().invoke(command, ["--seed", "-1"])
+        assert (done.exit_code, "-1 is not in the range x>=0" in done.output) == (2, True), command.name
 
 
 def test_interrupt_ends_in_one_line_and_130(tmp_path: Path) -> None:

@@ -198,7 +198,7 @@ def short_form(samples: Samples, found: Order) -> int:
     callback=plot_options.check_plot_file,
     help="Draw the figures 6.5.1 to 6.5.4 of Brandin to this file.",
 )
-@click.option("--seed", default=1, show_default=True, help="Seed of the noise.")
+@click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Seed of the noise.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 @click.option(
     "--plot",

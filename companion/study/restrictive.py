@@ -250,7 +250,9 @@ def draw(
     type=click.Choice(list(TRUTHS)),
     help="Truth, may be repeated; default: all.",
 )
-@click.option("--seed", default=1, show_default=True, help="Seed of the random numbers.")
+@click.option(
+    "--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Seed of the random numbers."
+)
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 @click.option(
     "--plot",

@@ -99,7 +99,7 @@ def fly(config: Config, seed: int, frames: int) -> int:
 
 @click.command()
 @click.option("--frames", type=click.IntRange(1), default=10_000_000, show_default=True)
-@click.option("--seed", type=int, default=1, show_default=True, help="Of the first flight.")
+@click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Of the first flight.")
 def main(frames: int, seed: int) -> None:
     """Fly with forged frames until `--frames` were received. Exit code 1 if a flight failed."""
     total, failed, started = 0, 0, time.monotonic()

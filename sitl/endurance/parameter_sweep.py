@@ -123,7 +123,7 @@ def _param_set(setting: Setting, sequence: int) -> bytes:
 
 @click.command()
 @click.option("--several", type=click.IntRange(0), default=100, show_default=True, help="Flights with ten.")
-@click.option("--seed", type=int, default=1, show_default=True)
+@click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True)
 def main(several: int, seed: int) -> None:
     """Set every parameter to its limits and beyond in flight. Exit code 1 if a flight failed."""
     everything, rng = list(settings()), random.Random(seed)

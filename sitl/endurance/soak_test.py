@@ -277,7 +277,7 @@ def find_failures(hours: list[HourStatistics], depth: int = 1 << 25) -> list[str
 
 @click.command("soak")
 @click.option("--hours", type=click.IntRange(1), default=24, show_default=True)
-@click.option("--seed", type=int, default=1, show_default=True)
+@click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True)
 @click.option("--json", "as_json", is_flag=True, help="Print JSON, one line per hour.")
 def command(hours: int, seed: int, as_json: bool) -> None:
     """Fly for hours with random faults.
