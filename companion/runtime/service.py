@@ -132,6 +132,9 @@ class Service:
             link.session.reader.close()  # what is left of a frame of the connection before
             self._connections[name], self._dropped_before[name] = stream, link.dropped
             self._notifier.ready()
+            if self._addresses[name].listens:
+                self.core.report(Severity.INFO, f"listening: {self._addresses[name]}", self._now())
+                self._flush()
             try:
                 await stream.deliver_to(partial(self._receive, link, stream))
             except ConnectionError as error:
@@ -281,8 +284,8 @@ async def run(
         )
         service.core.report(Severity.INFO, f"companion {__version__}: log {log.path}", time.monotonic_ns())
         for address in map(Address.parse, config.link.connect):
-            verb = "listening" if address.listens else "connecting"
-            service.core.report(Severity.INFO, f"{verb}: {address}", time.monotonic_ns())
+            if not address.listens:  # those that listen are reported once they do
+                service.core.report(Severity.INFO, f"connecting: {address}", time.monotonic_ns())
             is_open, sentence = exposure(address, config)
             severity = Severity.WARNING if is_open else Severity.INFO
             service.core.report(severity, sentence, time.monotonic_ns())

@@ -149,9 +149,18 @@ def test_only_loopback_addresses_listen_unless_configured(
         await until(lambda: listening() - before)
         seen.update(listening() - before)
 
-    before = listening()
-    serve(tmp_path, (connect.format(port=free_port()),), play)
+    before, address = listening(), connect.format(port=free_port())
+    events = serve(tmp_path, (address,), play)
     assert seen == {expected}
+    assert [e.text for e in events if "listening" in e.text] == [f"listening: {Address.parse(address)}"]
+
+
+def test_listening_is_reported_only_once_the_socket_is_bound(tmp_path: Path) -> None:
+    async def play(service: Service, events: list[Event]) -> None:
+        await until(lambda: any("at present; trying again" in event.text for event in events))
+
+    events = serve(tmp_path, ("udpin:192.0.2.1:14550",), play)  # an address of examples, of no computer
+    assert not any("listening" in event.text for event in events)
 
 
 def test_address_in_use_raises_cannot_listen(tmp_path: Path) -> None:
@@ -309,7 +318,7 @@ def test_port_in_use_exits_69_with_one_line(tmp_path: Path) -> None:
         )
     assert code == EX_UNAVAILABLE
     assert sum(line.startswith("companion: cannot listen") for line in stderr.splitlines()) == 1
-    assert "Traceback" not in stderr
+    assert "Traceback" not in stderr and "listening:" not in stderr
     assert not list(tmp_path.iterdir())  # a failed start leaves no empty log
 
 
