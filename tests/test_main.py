@@ -3,6 +3,7 @@
 import contextlib
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -16,6 +17,7 @@ from click.testing import CliRunner
 
 from companion import __version__
 from companion.command_line import cli
+from companion.config import ConfigError
 from sitl.endurance import file_mutants, forged_frames, parameter_sweep
 
 COMMANDS = ("bench", "check-config", "doctor", "log", "loopback", "replay", "run", "sitl")
@@ -61,19 +63,35 @@ def test_no_summary_is_cut_at_80_columns() -> None:
     assert [line for line in lines if line.endswith("...")] == []
 
 
-def test_seeds_are_not_negative() -> None:
-    commands = [
-        command
-        for context in groups(click.Context(cli))
+def commands() -> dict[str, click.Command]:
+    """All commands by their names, for example `study order`."""
+    return {
+        f"{context.command_path} {name}".removeprefix("companion "): command
+        for context in groups(click.Context(cli, info_name="companion"))
         for name in context.command.list_commands(context)
         if (command := context.command.get_command(context, name))
-    ]
-    commands += [file_mutants.main, forged_frames.main, parameter_sweep.main]
-    seeded = [command for command in commands if "seed" in {option.name for option in command.params}]
+    }
+
+
+def has_option(command: click.Command, name: str) -> bool:
+    return name in {option.name for option in command.params}
+
+
+def test_seeds_are_not_negative() -> None:
+    tools = [file_mutants.main, forged_frames.main, parameter_sweep.main]
+    seeded = [command for command in [*commands().values(), *tools] if has_option(command, "seed")]
     assert len(seeded) >= 15
     for command in seeded:
         done = CliRunner().invoke(command, ["--seed", "-1"])
         assert (done.exit_code, "-1 is not in the range x>=0" in done.output) == (2, True), command.name
+
+
+def test_page_names_the_commands_with_presets() -> None:
+    page = (Path(__file__).parents[1] / "docs" / "configuration.md").read_text()
+    (named,) = re.findall(r"The commands (.*) have\s`--preset NAME` and `--set`", page)
+    with_presets = {name for name, command in commands().items() if has_option(command, "preset")}
+    assert set(re.findall("`(.*?)`", named)) == with_presets
+    assert all(has_option(commands()[name], "pairs") for name in with_presets)
 
 
 def test_interrupt_ends_in_one_line_and_130(tmp_path: Path) -> None:
@@ -274,6 +292,15 @@ def test_json_output_is_valid(tmp_path: Path) -> None:
     assert json.loads(replay.stdout)["messages"] == 841
     info = CliRunner().invoke(cli, ["log", "info", str(tmp_path / "out.mcap"), "--json"])
     assert json.loads(info.stdout)
+
+
+def test_an_override_is_checked_like_a_file() -> None:
+    done = CliRunner().invoke(cli, ["check-config", "--set", "gnss.sigma_m=3", "--json"])
+    assert json.loads(done.stdout)["gnss"]["sigma_m"] == 3.0
+    done = CliRunner().invoke(cli, ["check-config", "--defaults", "--set", "gnss.sigma_m=3"])
+    assert "\nsigma_m = 3.0\n" in done.stdout
+    done = CliRunner().invoke(cli, ["check-config", "--set", "gnss.sigma=3"])
+    assert isinstance(done.exception, ConfigError) and "did you mean `sigma_m`?" in str(done.exception)
 
 
 def test_printed_defaults_are_a_valid_configuration(tmp_path: Path) -> None:

@@ -8,26 +8,31 @@ import click
 import msgspec
 
 from companion.config import load, to_toml
-from companion.config.presets import PRESETS
+from companion.config.options import override_options
 from companion.config.reference import commented_toml
 
 
 @click.command("check-config")
 @click.argument("file", type=click.Path(path_type=Path), required=False)
 @click.option("--defaults", is_flag=True, help="Print every key with its comment, as a file to start from.")
-@click.option("--preset", metavar="NAME", help=f"Start from one of {', '.join(PRESETS)}.")
+@override_options
 @click.option("--json", "as_json", is_flag=True, help="Print the configuration in force as JSON.")
-def command(file: Path | None, defaults: bool, preset: str | None, as_json: bool) -> None:
+def command(
+    file: Path | None, defaults: bool, preset: str | None, pairs: tuple[str, ...], as_json: bool
+) -> None:
     """Check a configuration, print it, or write one to start from.
 
-    Reads FILE and the COMPANION_SECTION__KEY variables, and prints the configuration in force.
+    Reads FILE, the COMPANION_SECTION__KEY variables and --set, and prints the configuration in force.
     An unknown key or an invalid value is reported with the nearest valid one; the exit code is then 78.
 
     \b
     A file to start from:
       companion check-config --defaults --preset stock-autopilot > companion.toml
     """
-    config = load(environment={}, preset=preset) if defaults else load(file, preset=preset)
+    if defaults:
+        config = load(environment={}, preset=preset, pairs=pairs)
+    else:
+        config = load(file, preset=preset, pairs=pairs)
     if as_json:
         click.echo(msgspec.json.encode(config).decode(), nl=False)
     else:

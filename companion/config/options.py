@@ -15,14 +15,16 @@ Command = TypeVar("Command", bound=Callable[..., Any])
 
 def configuration_options(command: Command) -> Command:
     """Add the options; they arrive as `file`, `preset` and `pairs`, the arguments of `load`."""
-    for option in (
-        click.option(
-            "--set", "pairs", multiple=True, metavar="SECTION.KEY=VALUE", help="Any key of the file."
-        ),
-        click.option("--preset", metavar="NAME", help=f"Start from one of {', '.join(PRESETS)}."),
-        click.option(
-            "--config", "file", type=click.Path(path_type=Path), help="TOML file; see check-config."
-        ),
-    ):
-        command = option(command)
-    return command
+    file = click.option(
+        "--config", "file", type=click.Path(path_type=Path), help="TOML file; see check-config."
+    )
+    return file(override_options(command))
+
+
+def override_options(command: Command) -> Command:
+    """Add --preset and --set, for a command that takes the file as an argument."""
+    preset = click.option("--preset", metavar="NAME", help=f"Start from one of {', '.join(PRESETS)}.")
+    pairs = click.option(
+        "--set", "pairs", multiple=True, metavar="SECTION.KEY=VALUE", help="Any key of the file."
+    )
+    return preset(pairs(command))

@@ -335,8 +335,9 @@ reported in one sentence with the nearest valid key, and the service does not st
 
 ## Presets
 
-`--preset NAME` (of `run`, `check-config`, `doctor` and `loopback`) sets the keys below; everything else,
-the file included, overrides it. `companion doctor` recommends one.
+The commands `run`, `check-config`, `doctor`, `signing init`, `loopback` and `study outages` have
+`--preset NAME` and `--set`. A preset sets the keys below; everything else, the file included, overrides it.
+`companion doctor` recommends one.
 """
 
 
