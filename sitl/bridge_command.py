@@ -26,6 +26,7 @@ from companion.analysis import simulated_rsbn
 from companion.storage.reader import LogError
 from companion.tables import print_tables
 from companion.transport.reconnect import Address, CannotListen, Connection, cannot_listen, connections
+from companion.write_errors import make_folder
 from sitl.beacon import Beacon
 from sitl.bridge import AUTOPILOT, COMPANION, RSBN, Bridge, BridgeMode, GnssSchedule
 from sitl.comparison import AFTER_S, OutageErrors, PositionError, outage_table
@@ -125,7 +126,7 @@ class ErrorFile:
     """CSV file of all errors in `folder`; times are seconds since `start_ns`. Raises OSError."""
 
     def __init__(self, folder: Path, start_ns: int) -> None:
-        folder.mkdir(parents=True, exist_ok=True)
+        make_folder(folder)
         self.path = folder / f"{datetime.now(UTC):bridge-%Y%m%dT%H%M%SZ}.csv"
         self._file: TextIO = self.path.open("x", newline="", buffering=1)
         self._start_ns = start_ns

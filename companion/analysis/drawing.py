@@ -11,6 +11,7 @@ import numpy as np
 
 from companion.analysis.plot_data import Figure, Line
 from companion.units import Floats
+from companion.write_errors import make_folder
 
 INK, GRID, SHADE = "#374151", "#e5e7eb", "#fee2e2"
 
@@ -77,7 +78,7 @@ def write_figures(figures: Sequence[Figure], pdf: Path | None, png: Path | None)
                 pages.savefig(sheet)
         written.append(pdf)
     if png is not None:
-        png.mkdir(parents=True, exist_ok=True)
+        make_folder(png)
         for figure, sheet in zip(figures, sheets, strict=True):
             written.append(png / f"{figure.key}.png")
             sheet.savefig(written[-1])

@@ -24,6 +24,7 @@ from companion.analysis.flight_events import WITHOUT_FIXES, beacon_places, split
 from companion.analysis.plot_data import COLOURS
 from companion.storage.reader import LogError
 from companion.units import Floats
+from companion.write_errors import describe_write_error
 
 SUFFIXES = (".geojson", ".json", ".kml")
 GAP_S = 10.0  # a line is cut where no point is known for longer
@@ -69,7 +70,7 @@ def write_map(path: Path, title: str, tracks: Sequence[Track], places: Sequence[
     try:
         path.write_text(text, encoding="utf-8")
     except OSError as error:
-        raise LogError(f"{path} cannot be written: {error.strerror}") from None
+        raise LogError(f"{path} cannot be written: {describe_write_error(error)}") from None
 
 
 def check_suffix(path: Path) -> None:

@@ -27,6 +27,7 @@ from companion.config import load
 from companion.optional_dependencies import missing_package
 from companion.printable import printable
 from companion.storage.reader import LogError
+from companion.write_errors import describe_write_error
 
 
 @click.command("report")
@@ -81,7 +82,9 @@ def command(
         except ModuleNotFoundError as error:
             raise LogError(missing_package("a report", error.name, "report")) from None
         except OSError as error:
-            raise LogError(f"cannot write the report to {error.filename}: {error.strerror}") from None
+            raise LogError(
+                f"cannot write the report to {error.filename}: {describe_write_error(error)}"
+            ) from None
     for block in blocks:
         for flight in block.flights:
             verdict = judge_flight(flight)

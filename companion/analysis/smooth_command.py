@@ -34,6 +34,7 @@ from companion.records import Smoothed
 from companion.storage.reader import LogError
 from companion.storage.run_metadata import logged_configuration, run_metadata
 from companion.units import SECOND_NS, Floats
+from companion.write_errors import describe_write_error
 
 FORMATS = (".mcap", ".csv", ".kml", ".geojson", ".json")
 AGREE_SIGMA = 1e-3
@@ -87,7 +88,7 @@ def write_csv(path: Path, track: SmoothedTrack, start_ns: int, start_unix_ns: in
                 since = record.t_ns - track.records[0].t_ns
                 out.writerow(_row(record, filtered, since, record.t_ns - start_ns + start_unix_ns))
     except OSError as error:
-        raise LogError(f"{path} cannot be written: {error.strerror}") from None
+        raise LogError(f"{path} cannot be written: {describe_write_error(error)}") from None
 
 
 def _row(record: Smoothed, filtered: list[float], since_ns: int, log_ns: int) -> list[str]:

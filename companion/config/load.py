@@ -136,6 +136,8 @@ def _read(path: Path) -> dict[str, dict[str, Any]]:
         raise ConfigError(f"{path}: no such file; start from `companion check-config --defaults`") from None
     except UnicodeDecodeError:
         raise ConfigError(f"{path}: not a text file in UTF-8; a configuration is TOML") from None
+    except IsADirectoryError:
+        raise ConfigError(f"{path} is a folder; give the TOML file") from None
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read ({error.strerror or error})") from None
     _check_size(size, str(path))

@@ -30,6 +30,7 @@ from companion.storage import location_fix, schemas
 from companion.storage.mcap_file import Disk, DiskFile, McapFile, sync_folder
 from companion.storage.reader import ACTIVE, DamagedError, LogError, LogReader, open_log
 from companion.storage.recovery import Recovered, recover
+from companion.write_errors import describe_write_error
 
 __all__ = [
     "Entry",
@@ -273,7 +274,7 @@ class Writer:
             file.write(self._attachments)
             file.sync()
         except OSError as error:
-            raise LogError(f"cannot write a log to {active}: {error.strerror or error}") from None
+            raise LogError(f"cannot write a log to {active}: {describe_write_error(error)}") from None
         return file
 
     def _write_loop(self) -> None:

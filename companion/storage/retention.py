@@ -23,6 +23,7 @@ from companion.storage.flight_log import Writer
 from companion.storage.mcap_file import DiskFile
 from companion.storage.reader import ACTIVE, LogError
 from companion.storage.recovery import Recovered, recover
+from companion.write_errors import make_folder
 
 _LOG_NAME = re.compile(r"(?:(\d{5,})-)?(\d{8}T\d{6}Z)(?:-(\d+))?(?:\.recovered)?\.mcap(?:\.active)?")
 
@@ -50,7 +51,7 @@ def create_log(
     """
     folder = Path(folder)
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        make_folder(folder)
         has_space = make_room(folder, min_free, max_files - 1, on_delete)
         path = _next_path(folder, start_unix_ns)
     except OSError as error:

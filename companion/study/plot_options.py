@@ -8,6 +8,7 @@ from pathlib import Path
 import click
 
 from companion.optional_dependencies import missing_package
+from companion.write_errors import make_folder
 
 
 def check_plot_file(context: click.Context, parameter: click.Parameter, path: Path | None) -> Path | None:
@@ -30,7 +31,7 @@ def make_plot_folder(context: click.Context, parameter: click.Parameter, path: P
         return None
     _supported_formats()
     try:
-        path.mkdir(parents=True, exist_ok=True)
+        make_folder(path)
     except OSError as error:
         raise click.BadParameter(f"{path} cannot be created: {error.strerror}") from None
     return path

@@ -13,6 +13,7 @@ from companion.transport.address import BAUD_RATES, Address
 from companion.transport.connection import READ_SIZE, Connection
 
 IN_USE = "another program has this line open: end it"
+NO_DEVICE = "no such device; see `ls /dev/serial/by-id`"
 
 
 def open_serial(address: Address) -> Connection:
@@ -24,6 +25,8 @@ def open_serial(address: Address) -> Connection:
     """
     try:
         fd = os.open(address.place, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+    except FileNotFoundError:
+        raise OSError(NO_DEVICE) from None
     except OSError as error:
         if error.errno == errno.EBUSY:
             raise OSError(IN_USE) from None

@@ -114,3 +114,8 @@ def test_a_flight_is_cut_into_legs_with_and_without_fixes(tmp_path):
 def test_unknown_suffix_is_reported_in_one_sentence(tmp_path):
     with pytest.raises(LogError, match=r"\.geojson, \.json, \.kml"):
         export.write_map(tmp_path / "x.gpx", "m", [])
+
+
+def test_missing_folder_is_named(tmp_path):
+    with pytest.raises(LogError, match=r"x\.kml cannot be written: no folder .*none$"):
+        export.write_map(tmp_path / "none" / "x.kml", "m", [])

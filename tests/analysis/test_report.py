@@ -665,7 +665,19 @@ def test_unwritable_page_is_reported(log, tmp_path):
     pytest.importorskip("jinja2")
     found = CliRunner().invoke(command, [str(log), "-o", str(tmp_path / "no" / "r.html")])
     assert isinstance(found.exception, LogError)
-    assert "cannot write the report" in str(found.exception)
+    assert str(found.exception).startswith("cannot write the report")
+    assert str(found.exception).endswith(f": no folder {tmp_path / 'no'}")
+
+
+def test_file_in_place_of_the_folder_of_figures_is_reported(log, tmp_path):
+    pytest.importorskip("jinja2")
+    pytest.importorskip("matplotlib")
+    (tmp_path / "file").touch()
+    found = CliRunner().invoke(
+        command, [str(log), "-o", str(tmp_path / "r.html"), "--png", str(tmp_path / "file")]
+    )
+    assert isinstance(found.exception, LogError)
+    assert str(found.exception).endswith("file: it is a file; give a folder")
 
 
 def test_converted_log_is_reported_as_the_original(tmp_path):

@@ -68,6 +68,11 @@ def test_mistake_is_reported_in_one_sentence(tmp_path: Path, text: str, expected
     assert "\n" not in str(caught.value)
 
 
+def test_folder_in_place_of_the_file_is_reported(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"is a folder; give the TOML file$"):
+        load(tmp_path, environment={})
+
+
 def test_endless_file_is_rejected() -> None:
     with pytest.raises(ConfigError, match="at most 65536"):
         load(Path("/dev/zero"), environment={})

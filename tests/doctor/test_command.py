@@ -134,7 +134,9 @@ def test_port_in_use_suggests_a_running_companion() -> None:
 
 
 def test_missing_or_forbidden_device_is_one_sentence() -> None:
-    assert "No such file" in line(doctor("--connect", "serial:/dev/ttyNONE:57600"))
+    assert "no such device; see `ls /dev/serial/by-id`" in line(
+        doctor("--connect", "serial:/dev/ttyNONE:57600")
+    )
     assert "dialout" in command._advice(PermissionError(13, "Permission denied"))
 
 

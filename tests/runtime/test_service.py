@@ -194,7 +194,7 @@ def test_missing_serial_device_is_reported_once_and_the_other_link_works(tmp_pat
 
     events = serve(tmp_path, (missing, f"udpin:{LOOPBACK}:{port}"), play)
     assert sum("ttyNONE" in event.text for event in events) == 1
-    assert any("No such file" in event.text for event in events)
+    assert any("no such device" in event.text for event in events)
 
 
 # -- whole processes ----------------------------------------------------------------------------------------
@@ -378,6 +378,8 @@ def test_unwritable_log_folder_exits_73_with_one_line(tmp_path: Path) -> None:
     code, stderr = finished("--logs", str(folder))
     assert code == EX_CANTCREAT
     assert len(stderr.splitlines()) == 1 and str(folder) in stderr
+    if folder.is_file():
+        assert "it is a file; give a folder" in stderr
 
 
 def test_invalid_link_exits_78_with_one_line(tmp_path: Path) -> None:

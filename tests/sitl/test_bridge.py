@@ -319,7 +319,7 @@ def test_exit_codes_of_busy_address_and_unwritable_folder(tmp_path: Path) -> Non
     assert done.exit_code == 69 and "cannot listen on" in done.output
     (tmp_path / "file").touch()
     done = CliRunner().invoke(command, ["--log", str(tmp_path / "file")])
-    assert done.exit_code == 73 and "cannot be written" in done.output
+    assert done.exit_code == 73 and "cannot be written: it is a file; give a folder" in done.output
 
 
 def test_invalid_beacon_file_is_reported(tmp_path: Path) -> None:

@@ -35,8 +35,9 @@ def test_invalid_plot_target_is_reported_before_any_work(
 def test_file_as_plot_folder_is_rejected(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     (tmp_path / "x").touch()
-    done = CliRunner().invoke(cli, ["study", "restrictive", "--plot", str(tmp_path / "x" / "y")])
-    assert done.exit_code == 2 and "cannot be created: Not a directory" in done.stderr
+    for folder, message in (("x", "it is a file; give a folder"), ("x/y", "Not a directory")):
+        done = CliRunner().invoke(cli, ["study", "restrictive", "--plot", str(tmp_path / folder)])
+        assert done.exit_code == 2 and f"cannot be created: {message}" in done.stderr
 
 
 @pytest.mark.parametrize("command", [*COMMANDS, ["study", "restrictive"]])
