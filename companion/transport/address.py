@@ -35,6 +35,8 @@ class Address(NamedTuple):
         listens = kind in LISTENING
         if not colon and listens:
             place = ""
+        if kind == "serial" and place and not digits.isdecimal():
+            raise ValueError(f"{text!r}: {digits!r} is not a baud rate: give one like 57600 or 921600")
         if kind not in KINDS or not digits.isdecimal():
             raise ValueError(f"{text!r} is not a connection string: give {FORMS}")
         number = int(digits)

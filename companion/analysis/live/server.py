@@ -240,10 +240,12 @@ def command(path: Path, listen: str, speed: float, foxglove: int | None) -> None
     being written. A finished log is played back. Nothing is sent to the flight.
     """
     host, _, port = listen.rpartition(":")
-    if not host or not port.isdecimal() or int(port) > 65535:
+    if not host or not port.isdecimal():
         raise click.BadParameter(
             f"{listen!r}: give HOST:PORT, for example 127.0.0.1:{PORT}", param_hint="--listen"
         )
+    if int(port) > 65535:
+        raise click.BadParameter(f"{listen!r}: {port} is not a port: give 1 to 65535", param_hint="--listen")
     found = find_log(path)
     if found is not None:
         reject_foreign(found)
