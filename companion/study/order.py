@@ -182,7 +182,12 @@ def short_form(samples: Samples, found: Order) -> int:
 )
 @click.option("--r-max", default=12, show_default=True, help="Greatest number of terms.")
 @click.option(
-    "--samples", "count", default=101, show_default=True, help="Number of samples of the simulated signal."
+    "--samples",
+    "count",
+    type=click.IntRange(min=2),
+    default=101,
+    show_default=True,
+    help="Number of samples of the simulated signal.",
 )
 @click.option(
     "--sigma",

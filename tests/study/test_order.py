@@ -52,6 +52,12 @@ def test_plot(tmp_path):
     assert file.read_bytes().startswith(b"\x89PNG")
 
 
+def test_number_of_samples_is_checked():
+    result = run("--samples", 0)
+    assert result.exit_code == 2
+    assert "'--samples': 0 is not in the range x>=2" in result.output
+
+
 @pytest.mark.parametrize(
     ("text", "options", "message"),
     [
