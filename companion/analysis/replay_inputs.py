@@ -73,7 +73,7 @@ def open_inputs(log: Path) -> LogInputs:
     if is_own_log(log):
         return LogInputs(_own_inputs(log), dict)
     with input_errors_as_log_errors():
-        source = sources.open_source(log)
+        source = sources.open_source(log, others=(".mcap",))
     return LogInputs(source, lambda: source.summary()._asdict())
 
 

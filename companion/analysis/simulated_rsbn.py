@@ -146,9 +146,12 @@ def _parse_degrees(text: str, limit: float) -> float:
 def parse_outage(text: str) -> SimulatedOutage:
     """Parse an outage such as GNSS:600-900. Raises ValueError, one sentence, if it is invalid."""
     match = _OUTAGE.fullmatch(text.strip())
-    if match is None or float(match[2]) >= float(match[3]):
+    if match is None:
         raise ValueError(f"--outage {text}: write it as GNSS:600-900 or RSBN:600-900, in seconds of the log")
-    return SimulatedOutage(match[1].upper(), float(match[2]), float(match[3]))
+    source, start, end = match.groups()
+    if float(end) <= float(start):
+        raise ValueError(f"--outage {text}: the end, {end}, is not after the start, {start}")
+    return SimulatedOutage(source.upper(), float(start), float(end))
 
 
 def apply_outages(

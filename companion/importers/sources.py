@@ -221,18 +221,20 @@ LOG_SUFFIXES = (".tlog", *(kind for kind in _READERS if kind.startswith(".")))
 """File name suffixes of the logs of other recorders."""
 
 
-def open_source(path: Path, autopilot_system: int | None = None) -> TlogSource | OnboardSource:
+def open_source(
+    path: Path, autopilot_system: int | None = None, others: tuple[str, ...] = ()
+) -> TlogSource | OnboardSource:
     """Open a log of another recorder by its suffix: a `.tlog`, an onboard log, or a folder of topics.
 
-    Raises LogError, one sentence, if it does not exist or cannot be read, or its type is not supported.
+    Raises LogError, one sentence, if it does not exist or cannot be read, or its type is not supported; the
+    sentence lists `others`, suffixes that the caller reads itself, too.
     """
     if not path.exists():
         raise LogError(f"{path}: no such log")
     kind = path.suffix.lower()
     if kind not in LOG_SUFFIXES and not path.is_dir():
-        raise LogError(
-            f"{path}: unknown file type; give .mcap, {', '.join(LOG_SUFFIXES)} or a folder of topics"
-        )
+        known = ", ".join((*others, *LOG_SUFFIXES))
+        raise LogError(f"{path}: unknown file type; give {known} or a folder of topics")
     if path.is_dir():
         kind = "tables" if inertialnav.has_tables(path) else "topics"
     source: TlogSource | OnboardSource

@@ -248,7 +248,9 @@ def open_log(path: str | os.PathLike[str]) -> Iterator[LogReader]:
         if not magic:
             raise LogError(f"{path} is empty: nothing was recorded")
         if not MAGIC.startswith(magic):
-            raise LogError(f"{path} is not an MCAP log (it does not begin with MCAP's magic)")
+            is_named_so = path.suffix in (".mcap", ACTIVE)
+            advice = "" if is_named_so else "; convert it first with `companion log convert`"
+            raise LogError(f"{path} is not an MCAP log (it does not begin with MCAP's magic){advice}")
         first = next(LogReader(path, file, size).records(), None)
         if first is None:
             raise LogError(f"{path} is truncated within its header and contains no messages")

@@ -192,6 +192,15 @@ def test_conversion_of_an_own_log_is_rejected(tmp_path: pathlib.Path) -> None:
     assert not again.exists()
 
 
+@pytest.mark.parametrize(("command", "first"), [(("replay",), ".mcap, .tlog"), (("log", "convert"), ".tlog")])
+def test_only_what_the_command_reads_is_offered(
+    command: tuple[str, ...], first: str, tmp_path: pathlib.Path
+) -> None:
+    (tmp_path / "x.pdf").touch()
+    result = run(*command, tmp_path / "x.pdf", "-o", tmp_path / "x.mcap", fails=LogError)
+    assert f"unknown file type; give {first}, " in str(result.exception)
+
+
 def test_correctors_join_at_seconds_of_the_log(tmp_path):
     table = tmp_path / "stars.csv"
     header = "t_s,star,lat_deg,lon_deg,altitude_deg,azimuth_deg,sigma_altitude_arcsec,sigma_azimuth_arcsec"

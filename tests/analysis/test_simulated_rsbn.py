@@ -135,9 +135,15 @@ def test_outage_removes_the_named_source() -> None:
     assert sum(isinstance(x, r.RsbnFix) for x in left) == 0
 
 
-@pytest.mark.parametrize("text", ["GNSS", "GNSS:5-2", "GPS:1-2", "GNSS:1", "GNSS:1-2-3", "GNSS:-1-2"])
+@pytest.mark.parametrize("text", ["GNSS", "GPS:1-2", "GNSS:1", "GNSS:1-2-3", "GNSS:-1-2"])
 def test_invalid_outage_is_rejected(text: str) -> None:
     with pytest.raises(ValueError, match="write it as GNSS:600-900"):
+        simulated_rsbn.parse_outage(text)
+
+
+@pytest.mark.parametrize("text", ["GNSS:20-10", "GNSS:20-20"])
+def test_outage_that_ends_before_its_start_is_rejected(text: str) -> None:
+    with pytest.raises(ValueError, match=r"the end, [12]0, is not after the start, 20$"):
         simulated_rsbn.parse_outage(text)
 
 

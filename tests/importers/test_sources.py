@@ -220,7 +220,7 @@ def test_invalid_tlog_is_reported_in_one_sentence(tmp_path: pathlib.Path) -> Non
     for path, words in (
         (empty, "is empty"),
         (foreign, "is not a tlog"),
-        (other, r"unknown file type; give \.mcap"),
+        (other, r"unknown file type; give \.tlog"),
     ):
         with pytest.raises(LogError, match=words):
             sources.open_source(path)

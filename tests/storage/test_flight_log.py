@@ -359,7 +359,8 @@ def test_arbitrary_bytes_raise_only_log_error(tmp_path_factory, small, data):
 def test_invalid_log_is_reported_in_one_sentence(tmp_path):
     for name, content, words in (
         ("empty", b"", "is empty"),
-        ("foreign", b"\x7fELF" * 20, "is not an MCAP log"),
+        ("foreign.mcap", b"\x7fELF" * 20, r"is not an MCAP log \(.*magic\)$"),
+        ("foreign.tlog", b"\x7fELF" * 20, "is not an MCAP log .* convert it first"),
         ("short", MAGIC[:5], "is truncated within its header"),
         ("zeros", MAGIC + bytes(100), "is truncated within its header"),
     ):
