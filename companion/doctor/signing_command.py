@@ -133,12 +133,13 @@ def init(
     """
     config = load(file, {"link.connect": (link,) if link else None}, pairs=pairs, preset=preset)
     path = key_file or Path(config.signing.key_file or "signing.key")
+    is_new = not path.exists()
     try:
-        key = read_key(path) if path.exists() else write_key(path)
+        key = write_key(path) if is_new else read_key(path)
         address = Address.parse(config.link.connect[0])
     except (OSError, ValueError) as error:
         raise ConfigError(f"--key-file {path}: {error}") from None
-    click.echo(f"key: {path} (mode 0600)")
+    click.echo(f"key: {path} ({'new, mode 0600' if is_new else 'exists, used again'})")
     if not no_autopilot:
         if exposure(address, config).is_open:
             raise SystemExit(

@@ -77,9 +77,9 @@ def test_both_ends_have_the_key_and_nobody_else(tmp_path: Path, port: int) -> No
 
 def test_an_existing_key_is_not_replaced(tmp_path: Path) -> None:
     path = tmp_path / "key"
-    assert init(path, "--no-autopilot").exit_code == 0
+    assert "key (new, mode 0600)" in init(path, "--no-autopilot").output
     before = path.read_bytes()
-    assert init(path, "--no-autopilot").exit_code == 0
+    assert "key (exists, used again)" in init(path, "--no-autopilot").output
     assert path.read_bytes() == before
 
 
