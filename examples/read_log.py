@@ -10,6 +10,8 @@ from companion.nav import Geodetic, separation
 from companion.records import Solution, Truth
 from companion.storage import flight_log
 
+if len(sys.argv) != 2:
+    sys.exit("usage: python examples/read_log.py LOG.mcap")
 truth = None
 next_ns = 0
 for entry in flight_log.read(sys.argv[1]):

@@ -26,10 +26,11 @@ def solutions(path: Path, config: Config) -> dict[int, Solution]:
     return found
 
 
-path = Path(sys.argv[1])
-default = solutions(path, Config())
+if len(sys.argv) < 2:
+    sys.exit("usage: python examples/replay_with_another_estimator.py FLIGHT.tlog [KEY=VALUE,...]")
+default = solutions(Path(sys.argv[1]), Config())
 changes = sys.argv[2] if len(sys.argv) > 2 else "inertial.source=air_data,estimator.scheme=feedback"
-other = solutions(path, apply_changes(Config(), changes))
+other = solutions(Path(sys.argv[1]), apply_changes(Config(), changes))
 apart = [
     np.hypot(*separation(Geodetic(a.lat, a.lon, 0.0), Geodetic(b.lat, b.lon, 0.0))[:2])
     for t, a in default.items()

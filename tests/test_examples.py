@@ -57,6 +57,14 @@ def test_read_log(flight: Path) -> None:
     assert all(float(re.search(r"error +([\d.]+) m", line)[1]) < 50.0 for line in lines)  # type: ignore[index]
 
 
+@pytest.mark.parametrize("script", ["read_log.py", "replay_with_another_estimator.py"])
+def test_example_without_its_log_states_its_usage(script: str) -> None:
+    command = [sys.executable, ROOT / "examples" / script]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 1
+    assert re.fullmatch(rf"usage: python examples/{script} .*\n", done.stderr)
+
+
 def test_fuse_two_beacons() -> None:
     sigma, error = (
         numbers(line)
