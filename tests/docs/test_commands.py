@@ -116,9 +116,8 @@ def is_run(text: str) -> bool:
 def test_command_runs(text: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(folder)
     assert text.startswith("companion "), f"{text}: run it here, or state in NOT_RUN why not"
-    words = [str(next(folder.glob("logs/*.mcap"))) if w == "logs/*.mcap" else w for w in arguments(text)]
-    stands_for = {"SOURCE": "SOURCE.tlog", "FOLDER...": "logs"}
-    words = [stands_for.get(word, word) for word in words]
+    stands_for = {"SOURCE": "SOURCE.tlog", "FOLDER...": "logs", "$LOG": "LOG.mcap"}
+    words = [stands_for.get(word, word) for word in arguments(text)]
     for output in ("LOG.mcap", "FLIGHT.replay.mcap", "other.mcap"):
         if words[-2:] == ["-o", output] or output == "FLIGHT.replay.mcap":
             (folder / output).unlink(missing_ok=True)
