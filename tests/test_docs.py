@@ -6,6 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from companion.analysis import error_statistics
+from companion.analysis.summary import is_worse_than_inertial
 from companion.config import Config, load, parse, to_toml
 from companion.config.profiles import MESSAGES, PROFILES
 from companion.config.required_parameters import required_parameters
@@ -199,6 +201,22 @@ def test_probabilities_in_docs_are_the_settings_of_the_bank() -> None:
     assert f"again: below {settings.believed:g}" in text
     assert settings.hysteresis == 9.0
     assert "nine times as probable" in text
+
+
+def test_limit_against_the_inertial_channel_in_docs() -> None:
+    limit = (
+        r"phase of (\d+) s or more was above ([\d.]+) times that of the inertial channel alone plus (\d+) m"
+    )
+    ((seconds, times, more),) = re.findall(limit, PAGES["report"])
+
+    def is_worse(seconds: float, error: float) -> bool:
+        rms = {error_statistics.INS: 10.0, error_statistics.CORRECTED: error}
+        return is_worse_than_inertial(error_statistics.PhaseErrors("neither", seconds, rms, {}, *(None,) * 5))
+
+    largest = 10.0 * float(times) + float(more)
+    assert is_worse(float(seconds), largest + 0.01)
+    assert not is_worse(float(seconds), largest - 0.01)
+    assert not is_worse(float(seconds) - 1.0, 10.0 * largest)
 
 
 def test_every_extra_in_docs_and_errors_exists() -> None:
