@@ -17,7 +17,7 @@ from companion.link.dialect import TYPES, rsbn, type_named
 from companion.link.parameter_server import parameter_table
 from companion.navigator import own_channel
 from companion.output import source_switch
-from companion.output.gate import withholding_reason
+from companion.output.gate import MAX_AGE_S, withholding_reason
 from companion.records import Mode, Solution, Trust
 from companion.runtime.core import requested_rates
 from companion.units import SECOND_NS
@@ -217,6 +217,22 @@ def test_limit_against_the_inertial_channel_in_docs() -> None:
     assert is_worse(float(seconds), largest + 0.01)
     assert not is_worse(float(seconds), largest - 0.01)
     assert not is_worse(float(seconds) - 1.0, 10.0 * largest)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "fixes of the window contradict the stated errors: guaranteed bound 4.2 times wider",
+        "autopilot 1 silent for 5 s",
+        "no solution for 3 s: no data from the inertial channel",
+        f"ODOMETRY withheld: position is older than {MAX_AGE_S:g} s",
+    ],
+)
+def test_troubleshooting_has_the_text_of_the_code(text: str) -> None:
+    assert row("troubleshooting", f"`{text}`")
+    source = "\n".join(path.read_text() for path in ROOT.glob("companion/**/*.py"))
+    for part in re.split(r"[\d.]+|ODOMETRY|: ", text):  # without what is filled in
+        assert part in source
 
 
 def test_every_extra_in_docs_and_errors_exists() -> None:
