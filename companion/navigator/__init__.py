@@ -56,7 +56,10 @@ TICK_NS = 1_000_000
 #: After a roll-back by t seconds for beacon answers, all of which were rejected, none that is older than
 #: CHEAP_NS is used for USELESS_TIMES t: forged ones would take the time of all others.
 USELESS_TIMES, CHEAP_NS = 2, 500_000_000
-MOST_WAITING = 64  # late records, for the next roll-back
+MOST_WAITING = 1024  # late records, for the next roll-back: what a link that is late by six seconds delivers
+#: Late samples wait for those behind them, this share of their lateness: each roll-back folds all that came
+#: since again, and what a link delivers after a delay of seconds is hundreds of samples.
+PATIENCE = 0.25
 
 
 class _Again(NamedTuple):
@@ -96,6 +99,7 @@ class Navigator:
         self._newest: Input | None = None  # the last record that was not late
         self._roll_back: _RollBack | None = None
         self._waiting: list[Input] = []  # late records, until the next roll-back
+        self._roll_back_ns = 0  # when that begins
         self._no_late_answers_ns = 0  # until when none is used: the last ones were all rejected
         self._deferred: list[Output] = []  # outputs of deferred updates, for the next `handle`
         self._late_ns = round(1e9 * config.estimator.late_s)
@@ -189,6 +193,7 @@ class Navigator:
     def finish(self) -> None:
         """Fold all late records: before other parameters, and at the end of a log."""
         self.settle()
+        self._roll_back_ns = 0
         while self._newest is not None and (self._waiting or self._roll_back is not None):
             self._deferred += self._fold_again(self._newest)
 
@@ -267,6 +272,9 @@ class Navigator:
         if back is not None and record.t_ns >= self._past.last_ns:
             insort(back.again, _Again(record, True), key=_time)
         elif len(self._waiting) < MOST_WAITING:
+            if not self._waiting:
+                late_ns = 0 if isinstance(record, Gnss | RsbnFix) else self._newest.t_ns - record.t_ns
+                self._roll_back_ns = record.rx_ns + round(PATIENCE * late_ns)
             self._waiting.append(record)
         else:
             why = f"more than {MOST_WAITING} late records wait: not used"
@@ -290,7 +298,9 @@ class Navigator:
 
     def _fold_again(self, now: Input) -> list[Output]:
         """Fold some of the records behind late ones; return the outputs of the late ones alone."""
-        outputs = self._begin_roll_back() if self._waiting and self._roll_back is None else []
+        outputs: list[Output] = []
+        if self._waiting and self._roll_back is None and now.rx_ns >= self._roll_back_ns:
+            outputs = self._begin_roll_back()
         back, fixes = self._roll_back, 0
         if back is None:
             return outputs

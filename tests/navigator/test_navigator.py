@@ -285,6 +285,41 @@ def test_with_no_record_more_than_a_few_are_folded_again(monkeypatch: pytest.Mon
     assert max(b - a for a, b in pairwise(times)) <= NS // 5
 
 
+@pytest.mark.parametrize(
+    ("late_s", "burst"), [(5.0, True), (5.0, False), (1.0, False)], ids=["burst", "5 s", "1 s"]
+)
+def test_samples_behind_answers_in_time_share_roll_backs(
+    monkeypatch: pytest.MonkeyPatch, late_s: float, burst: bool
+) -> None:
+    """The autopilot's link is late, a beacon's is not: each sample alone would fold all answers since again,
+    and a computer that has been late once would never catch up.
+    """
+    folded, ours, in_order = [0], Navigator(CONFIG), Navigator(CONFIG)
+    records = [record for moment in flight(60, 20.0, 60.0) for record in moment.records]
+    late_ns, end_ns = round(late_s * NS), 50 * NS
+
+    def arrival(record: Any) -> int:
+        if isinstance(record, RsbnFix) or not 30 * NS <= record.t_ns < end_ns:
+            return int(record.t_ns)
+        return 35 * NS if burst and record.t_ns < 35 * NS else int(record.t_ns) + (0 if burst else late_ns)
+
+    arriving = [msgspec.structs.replace(record, rx_ns=arrival(record)) for record in records]
+    for navigator in (ours, in_order):
+        navigator.handle(origin())
+    wanted = solutions(in_order, records)
+    fold = Navigator._fold
+
+    def counted(self: Navigator, record: Any) -> Any:
+        folded[0] += 1
+        return fold(self, record)
+
+    monkeypatch.setattr(Navigator, "_fold", counted)
+    found = solutions(ours, sorted(arriving, key=lambda record: record.rx_ns))
+    assert folded[0] < 1.5 * len(records)
+    ends = [[each for each in run if each.t_ns > 57 * NS] for run in (found, wanted)]
+    assert_same(*ends)
+
+
 def test_more_late_answers_than_can_wait_are_rejected_aloud(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(navigator_module, "MOST_WAITING", 2)
     navigator = Navigator(CONFIG)
