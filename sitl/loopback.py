@@ -23,6 +23,7 @@ from rich.progress import Progress
 from rich.table import Table
 
 from companion.analysis import error_statistics
+from companion.analysis.summary import format_share
 from companion.config import Config, OutputConfig, load
 from companion.config.options import configuration_options
 from companion.nav.geometry import Geodetic, separation
@@ -323,7 +324,7 @@ def _bound(row: error_statistics.PhaseErrors) -> str:
         return "-"
     if not row.useful:
         return "no use"
-    return _metres(row.bound) + ("" if row.held else f" {100.0 * (row.inside or 0.0):.0f} %")
+    return _metres(row.bound) + ("" if row.held else f" {format_share(row.inside or 0.0)}")
 
 
 def _print_own(rows: list[OwnPhase]) -> None:

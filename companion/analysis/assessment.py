@@ -76,6 +76,7 @@ class Assessment:
     normalized_errors: list[NormalizedErrors]
     groups: list[RejectionGroup]
     outages: list[OutageInterval]
+    silences: list[OutageInterval]
     rates: list[MessageRate]
     timeline: list[TimelineEntry]
 
@@ -102,7 +103,8 @@ def assess_flight(flight: Flight) -> Assessment:
     phases = flight_events.split_phases(flight.tables["Solution"], flight.seconds)
     errors = {} if reference is None else _source_errors(flight, reference)
     groups = flight_events.group_rejections(flight)
-    outages = flight_events.find_gnss_outages(flight)
+    silences = flight_events.find_silences(flight)
+    outages = flight_events.find_gnss_outages(flight, silences)
     return Assessment(
         flight=flight,
         origin=_origin(flight),
@@ -114,11 +116,12 @@ def assess_flight(flight: Flight) -> Assessment:
         normalized_errors=_normalized_errors(flight, reference),
         groups=groups,
         outages=outages,
+        silences=silences,
         rates=[
             flight_events.message_rate(topic, stream, flight_events.message_latency(flight, topic)[1])
             for topic, stream in flight.streams.items()
         ],
-        timeline=flight_events.build_timeline(flight, groups, outages),
+        timeline=flight_events.build_timeline(flight, groups, outages, silences),
     )
 
 

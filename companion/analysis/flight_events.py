@@ -21,6 +21,7 @@ PHASE_MIN_S = 5.0  # a shorter phase is merged into the previous one, the first 
 GROUP_GAP_S = 3.0  # rejections of one source closer than this form one group
 OUTAGE_MIN_S = 5.0  # a longer time without GNSS is an outage
 WITHOUT_FIXES = ("prediction", "untrusted")  # phases in which no fix was used
+NO_ESTIMATE = "no estimate"  # phase
 BEACON = Source.AZIMUTH | Source.RANGE
 
 
@@ -38,7 +39,7 @@ class RejectionGroup(NamedTuple):
 
 
 class OutageInterval(NamedTuple):
-    """Interval without a GNSS fix, `start` to `end` (s)."""
+    """Interval without a GNSS fix, or without any message of the autopilot, `start` to `end` (s)."""
 
     start: float
     end: float
@@ -85,28 +86,30 @@ def rests_on_beacons(flight: Flight) -> npt.NDArray[np.bool_]:
 
 
 def split_phases(solution: Table, seconds: float) -> list[error_statistics.FlightPhase]:
-    """Split the flight into phases by the sources of the position: which fixes, prediction, or untrusted."""
-    names = [
-        _phase_name(MODES[int(mode)], int(sources))
-        for mode, sources in zip(solution["mode"], solution["sources"], strict=True)
-    ]
+    """Split the flight into phases by the sources of the position: fixes, prediction, untrusted, or none."""
+    names, starts = list[str](), list[float]()
+    t = solution["t"].tolist()
+    for mode, sources, now, later in zip(solution["mode"], solution["sources"], t, [*t[1:], seconds]):
+        missing = later - now > PHASE_MIN_S
+        names += [_phase_name(MODES[int(mode)], int(sources)), *[NO_ESTIMATE] * missing]
+        starts += [now, *[now + 1e-6] * missing]
+    starts.append(seconds)
     runs: list[tuple[str, float]] = []
     lasting: defaultdict[str, float] = defaultdict(float)
     k = 0
     for name, group in groupby(names):
-        count = len(list(group))
-        end = k + count
-        duration = (solution["t"][end] if end < len(names) else seconds) - solution["t"][k]
+        end = k + len(list(group))
+        duration = starts[end] - starts[k]
         lasting[name] += duration
         if not runs or (duration >= PHASE_MIN_S and runs[-1][0] != name):
-            runs.append((name, float(solution["t"][k])))
+            runs.append((name, starts[k]))
         k = end
     if len(runs) > 1 and runs[1][1] - runs[0][1] < PHASE_MIN_S:
         runs[:2] = [(runs[1][0], runs[0][1])]
     if len(runs) == 1:  # nothing else lasted long enough, perhaps not even the first
         runs = [(max(lasting, key=lambda name: lasting[name]), runs[0][1])]
-    starts = [round(start * 1e9) for _, start in runs] + [round(seconds * 1e9)]
-    return [error_statistics.FlightPhase(name, starts[i], starts[i + 1]) for i, (name, _) in enumerate(runs)]
+    bounds = [round(start * 1e9) for _, start in runs] + [round(seconds * 1e9)]
+    return [error_statistics.FlightPhase(name, *bounds[i : i + 2]) for i, (name, _) in enumerate(runs)]
 
 
 def _phase_name(mode: Mode, sources: int) -> str:
@@ -131,12 +134,32 @@ def source_title(source: str) -> str:
     return f"{of}{name} {rest}".strip()
 
 
-def find_gnss_outages(flight: Flight) -> list[OutageInterval]:
-    """Find gaps between arrivals of usable GNSS fixes, and a final gap, after the first fix."""
-    t = np.sort(usable_gnss(flight)["rx"])
-    if not len(t):
-        return []
-    t = np.append(t, max(flight.seconds, t[-1]))
+def find_silences(flight: Flight) -> list[OutageInterval]:
+    """Find gaps in which nothing arrived from the autopilot, and a final gap."""
+    heard = [
+        stream.rx
+        for topic, stream in flight.streams.items()
+        if topic.startswith("/in/") and not topic.endswith("/RsbnFix")
+    ]
+    return _find_gaps(np.concatenate(heard), flight.seconds) if heard else []
+
+
+def find_gnss_outages(flight: Flight, silences: list[OutageInterval]) -> list[OutageInterval]:
+    """Find gaps between arrivals of usable GNSS fixes, and a final gap, after the first fix.
+
+    Where nothing arrived at all it is not GNSS that was lost.
+    """
+    gaps = _find_gaps(usable_gnss(flight)["rx"], flight.seconds)
+    return [gap for gap in gaps if gap.end - gap.start - _shared(gap, silences) > OUTAGE_MIN_S]
+
+
+def _shared(gap: OutageInterval, others: list[OutageInterval]) -> float:
+    return sum(max(0.0, min(gap.end, one.end) - max(gap.start, one.start)) for one in others)
+
+
+def _find_gaps(arrivals: Floats, seconds: float) -> list[OutageInterval]:
+    t = np.sort(arrivals)
+    t = np.append(t, max(seconds, t[-1])) if len(t) else t
     return [OutageInterval(float(t[k]), float(t[k + 1])) for k in np.flatnonzero(np.diff(t) > OUTAGE_MIN_S)]
 
 
@@ -241,17 +264,19 @@ def message_rate(topic: str, stream: Stream, latency: Floats) -> MessageRate:
 
 
 def build_timeline(
-    flight: Flight, groups: list[RejectionGroup], outages: list[OutageInterval]
+    flight: Flight,
+    groups: list[RejectionGroup],
+    outages: list[OutageInterval],
+    silences: list[OutageInterval],
 ) -> list[TimelineEntry]:
-    """Merge the entries of the log with grouped rejections, outages and glitch flags of the autopilot."""
+    """Merge the log's entries with grouped rejections, outages, silences and the autopilot's glitch flags."""
     lines = [line._replace(text=event_title(line.text)) for line in flight.log_entries]
     lines += [TimelineEntry(group.start, "rejected", 4, describe_rejections(group)) for group in groups]
-    lines += [
-        TimelineEntry(
-            outage.start, "outage", 4, f"no GNSS fix for the next {outage.end - outage.start:.1f} s"
-        )
-        for outage in outages
-    ]
+    for gaps, what in ((outages, "no GNSS fix"), (silences, "nothing from the autopilot")):
+        lines += [
+            TimelineEntry(gap.start, "outage", 4, f"{what} for the next {gap.end - gap.start:.1f} s")
+            for gap in gaps
+        ]
     status = flight.tables["FilterStatus"]
     rises = np.flatnonzero(np.diff(status["gnss_glitch"], prepend=0.0) > 0.0)
     text = "the autopilot's estimator reports a GNSS glitch"

@@ -24,6 +24,7 @@ from companion.analysis.summary import (
     describe_worst,
     format_duration,
     format_length,
+    format_share,
     format_time,
     rms_by_fixes,
     summarize_flight,
@@ -260,7 +261,7 @@ def _phases(a: Assessment) -> list[Table]:
         cells.append(NO_NUMBER if row.share is None else f"{row.share:.2f}")
         held = Cell("yes", "good") if row.held else Cell("no", "fault")
         cells.append(NO_NUMBER if row.held is None else held)
-        cells += [NO_NUMBER if k is None else f"{100.0 * k:.0f} %" for k in (row.inside, row.inside_twice)]
+        cells += [NO_NUMBER if k is None else format_share(k) for k in (row.inside, row.inside_twice)]
         rows.append(cells)
     what = deviation(a)
     about = (

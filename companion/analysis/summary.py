@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -14,6 +15,7 @@ from companion.analysis.error_statistics import root_mean_square
 from companion.analysis.flight_events import (
     OUTAGE_MIN_S,
     WITHOUT_FIXES,
+    OutageInterval,
     phase_title,
     source_title,
     usable_gnss,
@@ -53,11 +55,19 @@ def format_length(value: float) -> str:
     return f"{value:.0f} m" if value >= 100.0 else f"{value:.1f} m" if value >= 1.0 else f"{value:.2f} m"
 
 
+def format_share(share: float) -> str:
+    """Format a share; 100 % is all of it, 0 % nothing."""
+    if share in (0.0, 1.0):
+        return f"{100.0 * share:.0f} %"
+    return f"{min(100.0 * share, 99.9):.1f} %"
+
+
 class Worst(NamedTuple):
-    """The greatest horizontal distances of a flight, m: of the estimate from the reference, of GNSS from the
-    estimate or the reference. NaN if unknown."""
+    """The greatest horizontal distances of a flight, m: of the estimate from the reference and its time (s),
+    of GNSS from the estimate or the reference. NaN if unknown."""
 
     estimate: float
+    t: float
     gnss: float
 
 
@@ -66,22 +76,27 @@ def worst_of(a: Assessment) -> Worst:
     corrected, gnss = a.errors.get(error_statistics.CORRECTED), a.errors.get(error_statistics.GNSS)
     far = [group.metres for group in a.groups if group.source.lower().startswith("gnss")]
     far += [float(gnss.error.max())] if gnss is not None else []
+    k = 0 if corrected is None else int(np.argmax(corrected.error))
     return Worst(
-        math.nan if corrected is None else float(corrected.error.max()),
+        math.nan if corrected is None else float(corrected.error[k]),
+        math.nan if corrected is None else corrected.t_ns[k] * 1e-9,
         max((d for d in far if math.isfinite(d)), default=math.nan),
     )
 
 
 def describe_worst(a: Assessment) -> str:
     """Name the greatest distance of the estimate: an error only against a truth."""
+    t = worst_of(a).t
+    when = f", at {format_time(t)}" if math.isfinite(t) else ""
     if a.reference is None or a.against_truth:
-        return f"greatest {deviation(a)}"
-    return f"greatest distance from {a.reference.what}"
+        return f"greatest {deviation(a)}{when}"
+    return f"greatest distance from {a.reference.what}{when}"
 
 
 def count_held(a: Assessment) -> str:
-    """Return in how many phases the guaranteed bound was useful and held, of how many: "3 of 5"."""
-    return f"{sum(row.held is True for row in a.rows)} of {len(a.rows)}"
+    """Return in how many of the phases with a useful guaranteed bound it held: "3 of 5"."""
+    useful = [row for row in a.rows if row.useful]
+    return f"{sum(row.held is True for row in useful)} of {len(useful)}" if useful else "none useful"
 
 
 def summarize_flight(a: Assessment) -> list[str]:
@@ -159,14 +174,9 @@ def _flight_sentences(a: Assessment) -> list[str]:
         alone = 0.0 if unused else alone
         sentences.append(f"{describe_gnss(a)}{but}.")
     else:
-        longest = max(a.outages, key=lambda outage: outage.end - outage.start)
-        times = "once" if len(a.outages) == 1 else f"{len(a.outages)} times"
-        until = "to the end" if longest.end >= seconds else f"to {format_time(longest.end)}"
-        which = "for" if len(a.outages) == 1 else "longest for"
-        span = format_duration(longest.end - longest.start)
-        sentences.append(
-            f"GNSS was lost {times}, {which} {span} (from {format_time(longest.start)} {until})."
-        )
+        sentences.append(f"GNSS was lost {_how_often(a.outages, seconds)}.")
+    if a.silences:
+        sentences.append(f"Nothing was received from the autopilot {_how_often(a.silences, seconds)}.")
     if alone:
         sentences.append(f"The position was predicted without any fix for {format_duration(alone)}.")
     untrusted = [phase for phase in a.phases if phase.name == "untrusted"]
@@ -176,6 +186,14 @@ def _flight_sentences(a: Assessment) -> list[str]:
             "bound exceeded the configured limit or was not available."
         )
     return sentences
+
+
+def _how_often(gaps: Sequence[OutageInterval], seconds: float) -> str:
+    longest = max(gaps, key=lambda gap: gap.end - gap.start)
+    times, which = ("once", "for") if len(gaps) == 1 else (f"{len(gaps)} times", "longest for")
+    until = "to the end" if longest.end >= seconds else f"to {format_time(longest.end)}"
+    span = format_duration(longest.end - longest.start)
+    return f"{times}, {which} {span} (from {format_time(longest.start)} {until})"
 
 
 def _error_sentences(a: Assessment) -> list[str]:
@@ -192,9 +210,10 @@ def _error_sentences(a: Assessment) -> list[str]:
     )
     subject = f"The {deviation(a)} of the estimate"
     subject += "" if a.against_truth else f" from {a.reference.what}"
+    worst = worst_of(a)
     sentences = [
-        f"{subject} was {' and '.join(parts)} (r.m.s.), {format_length(worst_of(a).estimate)} at most"
-        f"{beside}."
+        f"{subject} was {' and '.join(parts)} (r.m.s.), {format_length(worst.estimate)} at most "
+        f"({format_time(worst.t)}){beside}."
     ]
     if a.reference.what == SMOOTHED:
         sentences.append(
@@ -247,13 +266,13 @@ def _bound_sentences(a: Assessment) -> list[str]:
             f"No useful guaranteed bound in {_count_phases(useless)}, the first “{phase_title(useless[0])}”."
         )
     if judged and not broken:
-        found.append(f"The guaranteed bound{reached} held at every instant of {_count_phases(judged)}.")
+        found.append(f"The guaranteed bound{reached} held at every instant that had one.")
     elif broken:
         worst = min(broken, key=lambda row: row.inside or 0.0)
         found.append(
             f"The guaranteed bound{reached} was exceeded in {len(broken)} of {len(judged)} phases, most often"
             f" in “{phase_title(worst.phase)}”: there the {deviation(a)} was within it "
-            f"{_percent(worst.inside or 0.0)} of the time, over the flight {_percent(inside)}."
+            f"{format_share(worst.inside or 0.0)} of the time, over the flight {format_share(inside)}."
         )
     return found
 
@@ -261,7 +280,7 @@ def _bound_sentences(a: Assessment) -> list[str]:
 def _rejection_sentences(a: Assessment) -> list[str]:
     fixes = [group for group in a.groups if group.source.lower().startswith(("gnss", "rsbn"))]
     if not fixes:
-        return ["No fix was rejected."]
+        return ["No fix was rejected.", *_other_rejections(a)]
     total = sum(group.number for group in fixes)
     if total == 1:  # one rejection in a flight is usual; it is in the table
         return []
@@ -281,6 +300,14 @@ def _rejection_sentences(a: Assessment) -> list[str]:
     ]
 
 
+def _other_rejections(a: Assessment) -> list[str]:
+    """Return a sentence on the source, no fix, of which most was rejected."""
+    numbers = Counter[str]()
+    for group in a.groups:
+        numbers[source_title(group.source)] += group.number
+    return [f"Rejected most: {name}, {n} times." for name, n in numbers.most_common(1) if n > 1]
+
+
 def _anomalies(a: Assessment) -> list[str]:
     found = []
     for row in a.rows:
@@ -295,11 +322,12 @@ def _anomalies(a: Assessment) -> list[str]:
         if row.inside_twice is not None and row.inside_twice < CHEBYSHEV:
             found.append(
                 f"in the phase “{phase_title(row.phase)}” the {deviation(a)} was within twice the bound of "
-                f"its moment only {_percent(row.inside_twice)} of the time, where at least 75 % are expected"
+                f"its moment only {format_share(row.inside_twice)} of the time, where at least 75 % are "
+                "expected"
             )
     for series in a.normalized_errors:
         if series.inside < CONSISTENT:
-            share = _percent(series.inside)
+            share = format_share(series.inside)
             found.append(f"only {share} of {series.what} is within its 95 % limit: the sigmas are too small")
     resets = [line for line in a.timeline if line.kind == "reset"]
     if resets:
@@ -328,7 +356,3 @@ def _during(
 
 def _count_phases(phases: Sequence[object]) -> str:
     return f"{len(phases)} phase{'s' if len(phases) != 1 else ''}"
-
-
-def _percent(share: float) -> str:
-    return "100 %" if share == 1.0 else f"{min(100.0 * share, 99.9):.1f} %"

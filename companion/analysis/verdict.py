@@ -17,11 +17,11 @@ from companion.analysis.flight_arrays import Flight
 from companion.analysis.summary import (
     CONSISTENT,
     SHORT_S,
-    count_held,
     describe_gnss,
     describe_worst,
     format_duration,
     format_length,
+    format_share,
     format_time,
     gnss_contradiction,
     is_worse_than_inertial,
@@ -88,7 +88,7 @@ def _moments_beyond_bound(a: Assessment) -> Verdict | None:
         "caution",
         f"At moments the {deviation(a)} was above the guaranteed bound, which is one on its r.m.s.; most "
         f"often in the phase “{flight_events.phase_title(worst.phase)}”.",
-        f"{100.0 * (worst.inside or 0.0):.1f} %",
+        format_share(worst.inside or 0.0),
         "of this phase within the bound",
     )
 
@@ -142,6 +142,21 @@ def _contradiction(a: Assessment) -> Verdict | None:
     )
 
 
+def _missing(a: Assessment) -> Verdict | None:
+    """A part without an estimate, but for a silence at the end: the autopilot was switched off then."""
+    parts = [p for p in a.phases if p.name == flight_events.NO_ESTIMATE]
+    if parts and parts[-1] is a.phases[-1] and a.silences and a.silences[-1].end >= a.flight.seconds:
+        parts.pop()
+    if not parts:
+        return None
+    return Verdict(
+        "caution",
+        f"There was no estimate for a part of the flight, from {format_time(parts[0].start_ns * 1e-9)} on.",
+        format_duration(sum(p.end_ns - p.start_ns for p in parts) * 1e-9),
+        "without an estimate",
+    )
+
+
 def _untrusted(a: Assessment) -> Verdict | None:
     seconds = sum((p.end_ns - p.start_ns) * 1e-9 for p in a.phases if p.name == "untrusted")
     if not seconds:
@@ -183,7 +198,7 @@ def _inconsistent(a: Assessment) -> Verdict | None:
     return Verdict(
         "caution",
         f"The stated sigmas are too small for what was found ({worst.what}).",
-        f"{100.0 * worst.inside:.0f} %",
+        format_share(worst.inside),
         "within the 95 % limit",
     )
 
@@ -242,7 +257,8 @@ def _describe_bound(a: Assessment) -> str:
         return "no phase has a useful guaranteed bound"
     if all(row.useful for row in a.rows):
         return "the guaranteed bound held in every phase"
-    return f"the guaranteed bound held in {count_held(a)} phases; it was of no use in the others"
+    useful = sum(row.useful for row in a.rows)
+    return f"the guaranteed bound held in {useful} of {len(a.rows)} phases; it was of no use in the others"
 
 
 _RULES: tuple[Callable[[Assessment], Verdict | None], ...] = (
@@ -252,6 +268,7 @@ _RULES: tuple[Callable[[Assessment], Verdict | None], ...] = (
     _worse_than_inertial,
     _moments_beyond_bound,
     _contradiction,
+    _missing,
     _untrusted,
     _no_reference,
     _inconsistent,
