@@ -14,6 +14,7 @@ from companion.units import Floats
 from companion.write_errors import make_folder
 
 INK, GRID, SHADE = "#374151", "#e5e7eb", "#fee2e2"
+TICKS_S = (1.0, 5.0, 10.0, 30.0, 60.0, 120.0, 300.0, 600.0, 1800.0, 3600.0)  # steps of a time axis
 
 
 def to_page(figure: Figure) -> dict[str, Any]:
@@ -111,6 +112,9 @@ def _paint(figure: Figure, axes: Any) -> None:
     if figure.origin:
         _paint_map(figure, axes)
     else:
+        low, high = axes.get_xlim()
+        step = next((s for s in TICKS_S if high - low <= 8.0 * s), 7200.0)
+        axes.set_xticks(np.arange(math.ceil(low / step), math.floor(high / step) + 1) * step)
         axes.set_xlabel("time, min:s")
         axes.xaxis.set_major_formatter(
             lambda s, _: f"{'-' if s < 0 else ''}{abs(s) // 60:.0f}:{abs(s) % 60:02.0f}"
