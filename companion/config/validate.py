@@ -71,14 +71,6 @@ def find_conflicts(config: Config) -> Iterator[tuple[str, str, str]]:
             "output",
             "estimator.output = 'restrictive' runs on air data only: set inertial.source = 'air_data'",
         )
-    if config.inertial.correctors and not config.has_own_ins:
-        yield (
-            "inertial",
-            "correctors",
-            f"inertial.correctors = {list(config.inertial.correctors)} has an effect only with an INS of "
-            "its own: set inertial.independent = true and inertial.source = 'auto', or "
-            "inertial.correctors = []",
-        )
     beside_ins = config.has_own_ins and "airspeed" in config.inertial.correctors
     if config.estimator.parallel and config.inertial.source != "air_data" and not beside_ins:
         yield (
