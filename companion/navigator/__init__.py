@@ -23,7 +23,7 @@ from companion.navigator.hypotheses import Model
 from companion.navigator.measurements import other_receiver
 from companion.navigator.own_channel import OwnChannel
 from companion.navigator.past_states import PastStates
-from companion.navigator.progress import births_due, with_births
+from companion.navigator.progress import SILENT_INS_NS, births_due, with_births
 from companion.navigator.receiver_choice import ReceiverChoice
 from companion.navigator.solution import announce, is_bound_due, refresh_bound, resolve_pending, solve
 from companion.navigator.stale_data import REPORT_EVERY, StaleDataDetector
@@ -44,6 +44,7 @@ from companion.records import (
     Source,
     Tuning,
 )
+from companion.units import SECOND_NS
 
 __all__ = ["INPUTS_USED", "Navigator"]
 
@@ -58,8 +59,9 @@ TICK_NS = 1_000_000
 USELESS_TIMES, CHEAP_NS = 2, 500_000_000
 MOST_WAITING = 1024  # late records, for the next roll-back: what a link that is late by six seconds delivers
 #: Late samples wait for those behind them, this share of their lateness: each roll-back folds all that came
-#: since again, and what a link delivers after a delay of seconds is hundreds of samples.
-PATIENCE = 0.25
+#: since again, and what a link delivers after a delay of seconds is hundreds of samples. By waiting none
+#: becomes older than a silence of the channel.
+PATIENCE, MOST_AGE_NS = 0.25, SILENT_INS_NS - SECOND_NS // 10
 
 
 class _Again(NamedTuple):
@@ -272,14 +274,20 @@ class Navigator:
         if back is not None and record.t_ns >= self._past.last_ns:
             insort(back.again, _Again(record, True), key=_time)
         elif len(self._waiting) < MOST_WAITING:
-            if not self._waiting:
-                late_ns = 0 if isinstance(record, Gnss | RsbnFix) else self._newest.t_ns - record.t_ns
-                self._roll_back_ns = record.rx_ns + round(PATIENCE * late_ns)
+            due_ns = record.rx_ns + self._patience(record, self._newest.t_ns - record.t_ns)
+            self._roll_back_ns = min(self._roll_back_ns, due_ns) if self._waiting else due_ns
             self._waiting.append(record)
         else:
             why = f"more than {MOST_WAITING} late records wait: not used"
             return [Rejection(record.t_ns, record.rx_ns, type(record).__name__, why)]
         return []
+
+    def _patience(self, record: Input, late_ns: int) -> int:
+        """How long a late record may wait: a fix only if it is old and samples wait already."""
+        if isinstance(record, Gnss | RsbnFix) and (late_ns < CHEAP_NS or not self._waiting):
+            return 0
+        wait_ns = round(PATIENCE * late_ns)
+        return wait_ns if late_ns > MOST_AGE_NS else min(wait_ns, MOST_AGE_NS - late_ns)
 
     def _begin_roll_back(self) -> list[Output]:
         """Go back to the state before the oldest waiting record."""
@@ -340,9 +348,15 @@ class Navigator:
         return [Rejection(record.t_ns, record.rx_ns, name, why, age, limit)]
 
     def _rewound(self, before: State) -> State:
-        """An earlier state to fold forward from, keeping the latest forecast of the predictor."""
-        answers = self._state.guarantee.answers
-        return before._replace(guarantee=before.guarantee._replace(answers=answers))
+        """An earlier state to fold forward from, keeping the latest forecast of the predictor.
+
+        Of another program of fixes it is due again.
+        """
+        now, then = self._state.guarantee, before.guarantee
+        answers = now.answers
+        if then.anchored is None or then.anchored is not now.anchored:
+            answers = tuple(a and a._replace(sought_ns=min(a.sought_ns, then.fixed_ns)) for a in answers)
+        return before._replace(guarantee=then._replace(answers=answers))
 
     def _with_mode_events(self, outputs: list[Output]) -> list[Output]:
         """Add an event wherever the mode, or the fixes that the solution rests on, change."""

@@ -37,6 +37,7 @@ from companion.units import SECOND_NS
 #: An autopilot checks its airspeed sensor against GPS only: ArduPlane dived to the ground for speed in 67 s.
 FALSE_AIRSPEED = "switch the airspeed sensor off"
 USE_AIRSPEED = {"ardupilot": ": ARSPD_USE 0", "px4": ": FW_USE_AIRSPD 0"}
+SILENT_INS_NS = 3 * SECOND_NS // 2
 CONFIRM_NS = SECOND_NS  # one fix in disagreement is an outlier: a source is excluded once it lasts
 FAR_M, FAST_M_S = 500.0, 5.0  # the nominal trajectory is brought back from this far off
 
@@ -234,7 +235,7 @@ def is_silent(state: State, t_ns: int) -> bool:
     """Whether an INS has given nothing for too long to carry it on."""
     assert state.nominal is not None
     last_ns = state.ins.t_ns if state.ins else state.nominal.t_ns
-    return state.nominal.interval is None and (t_ns - last_ns) * 1e-9 > 1.5
+    return state.nominal.interval is None and t_ns - last_ns > SILENT_INS_NS
 
 
 def estimated_velocity(state: State) -> Vector2:
