@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections import defaultdict
+from collections.abc import Iterator
 from itertools import groupby
 from typing import NamedTuple
 
@@ -88,9 +89,11 @@ def rests_on_beacons(flight: Flight) -> npt.NDArray[np.bool_]:
 def split_phases(solution: Table, seconds: float) -> list[error_statistics.FlightPhase]:
     """Split the flight into phases by the sources of the position: fixes, prediction, untrusted, or none."""
     names, starts = list[str](), list[float]()
-    t = solution["t"].tolist()
+    times = np.maximum.accumulate(solution["t"])
+    longest = max(PHASE_MIN_S, 3.0 * float(np.median(np.diff(times)))) if len(times) > 1 else PHASE_MIN_S
+    t = times.tolist()
     for mode, sources, now, later in zip(solution["mode"], solution["sources"], t, [*t[1:], seconds]):
-        missing = later - now > PHASE_MIN_S
+        missing = later - now > longest
         names += [_phase_name(MODES[int(mode)], int(sources)), *[NO_ESTIMATE] * missing]
         starts += [now, *[now + 1e-6] * missing]
     starts.append(seconds)
@@ -134,12 +137,16 @@ def source_title(source: str) -> str:
     return f"{of}{name} {rest}".strip()
 
 
+#: Streams of other instruments, or made by the companion.
+_NOT_OF_THE_AUTOPILOT = ("RsbnFix", "StarFix", "RangeDifference", "SecondIns", "Tuning")
+
+
 def find_silences(flight: Flight) -> list[OutageInterval]:
     """Find gaps in which nothing arrived from the autopilot, and a final gap."""
     heard = [
         stream.rx
         for topic, stream in flight.streams.items()
-        if topic.startswith("/in/") and not topic.endswith("/RsbnFix")
+        if topic.startswith("/in/") and topic.removeprefix("/in/") not in _NOT_OF_THE_AUTOPILOT
     ]
     return _find_gaps(np.concatenate(heard), flight.seconds) if heard else []
 
@@ -150,11 +157,17 @@ def find_gnss_outages(flight: Flight, silences: list[OutageInterval]) -> list[Ou
     Where nothing arrived at all it is not GNSS that was lost.
     """
     gaps = _find_gaps(usable_gnss(flight)["rx"], flight.seconds)
-    return [gap for gap in gaps if gap.end - gap.start - _shared(gap, silences) > OUTAGE_MIN_S]
+    parts = (part for gap in gaps for part in _outside(gap, silences))
+    return [part for part in parts if part.end - part.start > OUTAGE_MIN_S]
 
 
-def _shared(gap: OutageInterval, others: list[OutageInterval]) -> float:
-    return sum(max(0.0, min(gap.end, one.end) - max(gap.start, one.start)) for one in others)
+def _outside(gap: OutageInterval, silences: list[OutageInterval]) -> Iterator[OutageInterval]:
+    start = gap.start
+    for one in silences:
+        if start < one.end and one.start < gap.end:
+            yield OutageInterval(start, one.start)
+            start = one.end
+    yield OutageInterval(start, gap.end)
 
 
 def _find_gaps(arrivals: Floats, seconds: float) -> list[OutageInterval]:

@@ -266,7 +266,8 @@ def _bound_sentences(a: Assessment) -> list[str]:
             f"No useful guaranteed bound in {_count_phases(useless)}, the first “{phase_title(useless[0])}”."
         )
     if judged and not broken:
-        found.append(f"The guaranteed bound{reached} held at every instant that had one.")
+        where = "that had one" if inside == 1.0 else f"of the {_count_phases(judged)} in which it is of use"
+        found.append(f"The guaranteed bound{reached} held at every instant {where}.")
     elif broken:
         worst = min(broken, key=lambda row: row.inside or 0.0)
         found.append(

@@ -6,6 +6,7 @@ themselves, it is a reason for caution. The first rule that applies decides.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Literal, NamedTuple
 
@@ -145,7 +146,8 @@ def _contradiction(a: Assessment) -> Verdict | None:
 def _missing(a: Assessment) -> Verdict | None:
     """A part without an estimate, but for a silence at the end: the autopilot was switched off then."""
     parts = [p for p in a.phases if p.name == flight_events.NO_ESTIMATE]
-    if parts and parts[-1] is a.phases[-1] and a.silences and a.silences[-1].end >= a.flight.seconds:
+    off = next((s.start for s in a.silences if s.end >= a.flight.seconds), math.inf)
+    if parts and parts[-1].start_ns * 1e-9 > off - flight_events.PHASE_MIN_S:
         parts.pop()
     if not parts:
         return None
@@ -253,12 +255,13 @@ def _kept(a: Assessment) -> Verdict:
 
 def _describe_bound(a: Assessment) -> str:
     """Describe in how many phases the guaranteed bound held; it was exceeded in none."""
-    if not any(row.useful for row in a.rows):
+    useful = [row.useful for row in a.rows if row.phase != flight_events.NO_ESTIMATE]
+    if not any(useful):
         return "no phase has a useful guaranteed bound"
-    if all(row.useful for row in a.rows):
+    if all(useful):
         return "the guaranteed bound held in every phase"
-    useful = sum(row.useful for row in a.rows)
-    return f"the guaranteed bound held in {useful} of {len(a.rows)} phases; it was of no use in the others"
+    counted = f"{sum(useful)} of {len(useful)} phases"
+    return f"the guaranteed bound held in {counted}; it was of no use in the others"
 
 
 _RULES: tuple[Callable[[Assessment], Verdict | None], ...] = (
