@@ -143,12 +143,12 @@ _NOT_OF_THE_AUTOPILOT = ("RsbnFix", "StarFix", "RangeDifference", "SecondIns", "
 
 def find_silences(flight: Flight) -> list[OutageInterval]:
     """Find gaps in which nothing arrived from the autopilot, and a final gap."""
-    heard = [
+    arrivals = [
         stream.rx
         for topic, stream in flight.streams.items()
         if topic.startswith("/in/") and topic.removeprefix("/in/") not in _NOT_OF_THE_AUTOPILOT
     ]
-    return _find_gaps(np.concatenate(heard), flight.seconds) if heard else []
+    return _find_gaps(np.concatenate(arrivals), flight.seconds) if arrivals else []
 
 
 def find_gnss_outages(flight: Flight, silences: list[OutageInterval]) -> list[OutageInterval]:

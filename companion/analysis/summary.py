@@ -121,7 +121,7 @@ def describe_gnss(a: Assessment) -> str:
     first, start = float(usable_gnss(a.flight)["rx"].min()), float(a.flight.tables["Solution"]["t"][0])
     if first > start + OUTAGE_MIN_S:
         return f"GNSS had a fix from {format_time(first)} on"
-    return "GNSS had a fix throughout"
+    return "GNSS had a fix throughout" + (", while the autopilot sent" if a.silences else "")
 
 
 def describe_outage(a: Assessment) -> str:

@@ -30,6 +30,7 @@ from companion.analysis.plot_data import thin_line
 from companion.analysis.replay import command as replay_command
 from companion.analysis.report import blocks_of_log, command, comparison_block
 from companion.analysis.summary import (
+    describe_gnss,
     describe_outage,
     format_duration,
     format_length,
@@ -216,10 +217,10 @@ def test_reboot_splits_a_log_into_flights():
     )  # the outage is in the first flight: here GNSS starts at 0:40
 
 
-def silent_flight(start_s, end_s):
+def silent_flight(start_s, end_s, **kind):
     """The same five minutes; nothing arrives from the autopilot for a part of them."""
     a, b = START + start_s * S, START + end_s * S
-    rows = [r for r in flight_records() if not a <= r.rx_ns < b or isinstance(r, LinkState)]
+    rows = [r for r in flight_records(**kind) if not a <= r.rx_ns < b or isinstance(r, LinkState)]
     (found,) = collect_flights(((flight_log.topic_of(type(r)), r) for r in rows), "made.mcap")
     return assess_flight(found)
 
@@ -242,6 +243,10 @@ def test_an_autopilot_that_is_switched_off_at_the_end_is_no_reason_for_caution()
     a = silent_flight(260, END)
     assert [(round(h.start), round(h.end)) for h in a.outages] == [(LOST, FOUND)]
     assert "(from 4:20 to the end)" in sentences(a)
+    assert describe_gnss(a) == "GNSS was lost for up to 2 min"
+    assert describe_gnss(silent_flight(260, END, unused=True)) == (
+        "GNSS had a fix throughout, while the autopilot sent"
+    )
     assert a.rows[-1].phase == "no estimate"
     assert judge_flight(a).level == "good"
 

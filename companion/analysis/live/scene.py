@@ -247,7 +247,7 @@ class Scene:
         if false:
             parts.append(f"Probably false: {', '.join(false)}.")
         if s.protection is not None:
-            parts.append(f"Protection level {_metres(s.protection)}, even if a source is false.")
+            parts.append(f"Protection level {_metres(s.protection)}, a false source included.")
         return {"level": level, "word": word, "why": " ".join(parts)}
 
     def _waiting(self) -> str:
