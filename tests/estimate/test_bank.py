@@ -598,6 +598,24 @@ def test_a_family_keeps_its_grades():
         assert set(kept.grade[(kept.fault == fault).any(axis=1)]) == {0, 1, 2}
 
 
+@pytest.mark.parametrize("lead", [0, 1])
+def test_the_leading_family_keeps_each_grade_and_jump_whatever_is_false(lead):
+    """Beside a false range one grade was left of an INS coarser than stated, and GNSS paid for it."""
+    jumps = (Jump("often", (0,), (3.0,), 30.0), Jump("rare", (1,), (1.0,), 1e-3))
+    layout = replace(flight_layout(grades=(1.0,) * 5), jumps=jumps)
+    bank = b.start(layout, 0.0, np.zeros(layout.n_base), np.eye(layout.n_base), layout.grades)
+    for t in (5.0, 10.0, 15.0):
+        bank = b.births(bank._replace(t=t, seen=np.full(2, t)), layout, Settings(rows=2000, parents=0))
+    false = (bank.fault == lead).any(axis=1) & ((bank.fault != NONE).sum(axis=1) == 1)
+    light = 40.0 * ((bank.grade > 0) | (bank.event > 2 * len(layout.faults)))
+    old = bank._replace(t=1000.0, L=normalised(np.where(false, -light, -50.0 - light)))
+    kept = b.reduce(old, layout, Settings(rows=40))
+    leading = (kept.fault == lead).any(axis=1) & ((kept.fault != NONE).sum(axis=1) == 1)
+    assert set(kept.grade[leading]) == set(range(5))
+    jumped = {int(layout.jump_event(j)) for j in range(len(jumps))}
+    assert jumped <= set(kept.event[leading].tolist())
+
+
 def test_a_rare_jump_is_kept_beside_many_of_another_kind():
     """Without it a rare jump lived on beside a false source only, and spoke against that source."""
     often, rare = Jump("often", (0,), (3.0,), 30.0, often=True), Jump("rare", (1,), (1.0,), 1e-3)

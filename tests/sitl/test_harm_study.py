@@ -62,9 +62,13 @@ def test_flight_with_nothing_wrong_passes(channel):
 
 
 @pytest.mark.flight
-def test_a_mems_ins_stated_as_navigation_grade_does_not_exclude_gnss():
-    """Its gyros are 100 times as coarse, its accelerometers 10; by one factor for both GNSS was excluded."""
-    result = fly(HarmOrder("beacon 3x as noisy as stated", "INS MEMS", 3, 10.0))
+@pytest.mark.parametrize("wrong", ["beacon 3x as noisy as stated", "beacon range +200 m"])
+def test_a_mems_ins_stated_as_navigation_grade_does_not_exclude_gnss(wrong):
+    """Its gyros are 100 times as coarse, its accelerometers 10; by one factor for both GNSS was excluded.
+
+    So it was once the range was false, of which the bank kept one grade.
+    """
+    result = fly(HarmOrder(wrong, "INS MEMS", 3, 10.0))
     assert result.passed, result
 
 

@@ -19,11 +19,13 @@ def reduce(bank: Bank, layout: Layout, settings: Settings) -> Bank:
     Within a class (family, last event, whether the lie's rate changes, bin of age) the heaviest and the
     oldest row are kept first, in the young bins the heaviest of each scale, and of each family the heaviest
     of each grade: a family that has lost the right grade loses to one that has it. Protected are the rows
-    that carry the weight, the heaviest of each fault, of each grade and of each jump without a fault (a step
-    of the heading was kept beside a false GNSS only, and proved that), and those that set the protection
-    level. Two faults at once that are less probable than the risk stand behind: with an equal claim they held
-    a third of the rows, and the onsets of a slow lie were lost. A dropped row merges by moments with a row of
-    its label if their weights are alike; else its weight goes to the heaviest of its class.
+    that carry the weight, the heaviest of each fault, those that set the protection level, and, without a
+    fault and in the leading family, the heaviest of each grade and of each jump. A step of the heading kept
+    beside a false GNSS only proves that; with one grade left beside a false range, GNSS was blamed for
+    what a coarser INS explains. Two faults at once that are less probable than the risk stand behind: with an
+    equal claim they held a third of the rows, and the onsets of a slow lie were lost. A dropped row merges by
+    moments with a row of its label if their weights are alike; else its weight goes to the heaviest of its
+    class.
 
     Parameters
     ----------
@@ -58,8 +60,9 @@ def reduce(bank: Bank, layout: Layout, settings: Settings) -> Bank:
     rank = [4] * rows
     heaviest: dict[tuple[int, int, int], int] = {}
     oldest: dict[tuple[int, int, int], int] = {}
+    leading = {0, keys[order[0]][0]}
     by_fault: set[int] = set()
-    jumped: set[int] = set()
+    jumped: set[tuple[int, int]] = set()
     first_jump = layout.jump_event(0)
     by_scale: set[tuple[int, ...]] = set()
     graded: set[tuple[int, int]] = set()
@@ -79,13 +82,13 @@ def reduce(bank: Bank, layout: Layout, settings: Settings) -> Bank:
             by_fault.add(key[0])
             rank[i] = 0
         event = key[1] // 2
-        if key[0] == 0 and event >= first_jump and event not in jumped:
-            jumped.add(event)
+        if key[0] in leading and event >= first_jump and (key[0], event) not in jumped:
+            jumped.add((key[0], event))
             rank[i] = 0
         alive = key[0] == 0 or logs[i] >= settings.class_floor
-        if alive and active[i] <= 1 and (key[0], grade[i]) not in graded:
+        if alive and (active[i] <= 1 or key[0] in leading) and (key[0], grade[i]) not in graded:
             graded.add((key[0], grade[i]))
-            rank[i] = 0 if key[0] == 0 else min(rank[i], 1)
+            rank[i] = 0 if key[0] in leading else min(rank[i], 1)
     for i in oldest.values():
         rank[i] = min(rank[i], 2)
     log_risk = math.log(settings.risk)
