@@ -19,7 +19,7 @@ import msgspec
 
 from companion.config.presets import PRESETS
 from companion.config.schema import Config
-from companion.config.validate import find_conflicts
+from companion.config.validate import find_conflicts, find_idle
 
 #: Bytes of a file and dots in a line of it: a dotted key takes memory by the square of its parts (60 kB of
 #: them, 3.5 GB).
@@ -93,11 +93,13 @@ def load(
         _check_keys({section: {key: text}}, f"--set {pair}")
         tree.setdefault(section, {})[key] = _parse_value(text.strip())
         origin[section, key] = f"--set {pair}"
-    return _convert(tree, origin)
+    config = _convert(tree, origin)
+    _refuse(find_idle(config), origin)
+    return config
 
 
 def parse(text: str, where: str) -> Config:
-    """Parse the configuration in `text`; `where` names its source in a `ConfigError`."""
+    """Parse the configuration in `text`, e.g. of a log; `where` names its source in a `ConfigError`."""
     tree = _tree(text, where)
     _check_keys(tree, where)
     return _convert(tree, {(section, key): where for section, table in tree.items() for key in table})
@@ -252,6 +254,10 @@ def _convert(tree: Mapping[str, Mapping[str, Any]], origin: Mapping[tuple[str, s
                 raise ConfigError(f"{where}: {section}.{key} = {value!r} is invalid: {wanted}") from None
         sections[section] = msgspec.convert(table, kind)
     config = Config(**sections)
-    for section, key, sentence in find_conflicts(config):
-        raise ConfigError(f"{origin.get((section, key), 'configuration')}: {sentence}")
+    _refuse(find_conflicts(config), origin)
     return config
+
+
+def _refuse(found: Iterable[tuple[str, str, str]], origin: Mapping[tuple[str, str], str]) -> None:
+    for section, key, sentence in found:
+        raise ConfigError(f"{origin.get((section, key), 'configuration')}: {sentence}")

@@ -91,6 +91,21 @@ def find_conflicts(config: Config) -> Iterator[tuple[str, str, str]]:
         )
 
 
+def find_idle(config: Config) -> Iterator[tuple[str, str, str]]:
+    """Yield section, key and sentence, as `find_conflicts`, of what has no effect.
+
+    For a configuration that somebody writes now: an old log was flown with it, and can be replayed.
+    """
+    if config.inertial.correctors and not config.has_own_ins:
+        yield (
+            "inertial",
+            "correctors",
+            f"inertial.correctors = {list(config.inertial.correctors)} has an effect only with an INS of "
+            "its own: set inertial.independent = true and inertial.source = 'auto', or "
+            "inertial.correctors = []",
+        )
+
+
 def _too_slow_rates(config: Config) -> Iterator[tuple[str, str, str]]:
     for section in ("rates", "output"):
         table = getattr(config, section)

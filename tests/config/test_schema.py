@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from companion.config import Config, ConfigError, load, to_toml
+from companion.config import Config, ConfigError, load, parse, to_toml
 
 
 def written(tmp_path: Path, text: str) -> Path:
@@ -126,6 +126,13 @@ def test_restrictive_estimator_requires_air_data() -> None:
     assert load(pairs=both, environment={}).leading_estimator == "restrictive"
 
 
+def test_correctors_are_taken_with_an_ins_of_its_own_or_from_a_log() -> None:
+    pairs = ["inertial.correctors=stars", "inertial.independent=true"]
+    for source in ("auto", "local_position"):
+        assert load(pairs=[*pairs, f"inertial.source={source}"], environment={}).has_own_ins
+    assert parse("[inertial]\ncorrectors = ['stars']", "a log").inertial.correctors == ("stars",)
+
+
 @pytest.mark.parametrize(
     ("pairs", "expected"),
     [
@@ -147,6 +154,14 @@ def test_restrictive_estimator_requires_air_data() -> None:
             "is not available in profile 'custom': remove this key",
         ),
         (["output.profile=ardupilot", "output.via=gps_input", "gnss.receiver=1"], "set gnss.receiver = 0"),
+        (
+            ["inertial.correctors=stars"],
+            "['stars'] has an effect only with an INS of its own: set inertial.independent",
+        ),
+        (
+            ["inertial.correctors=stars", "inertial.independent=true", "inertial.source=imu"],
+            "and inertial.source = 'auto', or inertial.correctors = []",
+        ),
     ],
 )
 def test_invalid_combination_is_reported_in_one_sentence(pairs: list[str], expected: str) -> None:
