@@ -257,13 +257,13 @@ def command(
     except ValueError as error:
         raise click.BadParameter(str(error), param_hint="--scenario") from None
     # log the truth: reports use it
-    flags = {
-        "log.folder": logs,
-        "rates.truth_hz": 10.0,
-        "inertial.independent": True if preset is None else None,
-        "inertial.correctors": list(chosen.correctors) or None,
-    }
+    flags: dict[str, object] = {"log.folder": logs, "rates.truth_hz": 10.0}
+    if preset is None:
+        flags["inertial.independent"] = True
     loaded = load(file, flags, pairs=pairs, preset=preset)
+    if loaded.has_own_ins and chosen.correctors:
+        flags["inertial.correctors"] = list(chosen.correctors)
+        loaded = load(file, flags, pairs=pairs, preset=preset)
     config = simulator_config(loaded, own_ins=loaded.inertial.independent)
     chosen = simulated_for(chosen, config)
     started = time.perf_counter()

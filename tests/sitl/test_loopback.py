@@ -104,3 +104,20 @@ def test_unknown_scenario_suggests_the_nearest(tmp_path: Path) -> None:
     done = CliRunner().invoke(command, ["--scenario", "shrt", "--logs", str(tmp_path)])
     assert done.exit_code == 2
     assert "did you mean short?" in done.output
+
+
+@pytest.mark.parametrize(("arguments", "correctors"), [([], ("stars",)), (["--preset", "px4"], ())])
+def test_correctors_of_a_scenario_are_used_by_an_ins_of_its_own_only(
+    monkeypatch, tmp_path: Path, arguments, correctors
+) -> None:
+    """A preset without one flies the scenario all the same."""
+
+    class Flown(Exception):
+        pass
+
+    def fly(scenario, config, log, progress):
+        raise Flown(config.inertial.correctors)
+
+    monkeypatch.setattr("sitl.loopback.fly_scenario", fly)
+    done = CliRunner().invoke(command, ["--scenario", "stars", "--logs", str(tmp_path), *arguments])
+    assert isinstance(done.exception, Flown) and done.exception.args == (correctors,)
