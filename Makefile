@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help loopback test flights lint fuzz kills soak docs pictures lock clean
+.PHONY: help loopback test flights all-flights lint fuzz kills soak docs pictures lock clean
 
 # one worker more than processors: many tests wait for a process or a disk
 WORKERS := $(shell echo $$(($$(getconf _NPROCESSORS_ONLN) + 1)))
@@ -36,6 +36,9 @@ test: $(STAMP) lint ## lint, type check and all tests but those of `flights`
 	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal -m "not flight"
 
 flights: $(STAMP) ## the tests that fly for minutes of virtual time
+	$(BIN)/python -m pytest -n auto --dist loadscope -m "flight and not long"
+
+all-flights: $(STAMP) ## flights, on further channels and with further seeds
 	$(BIN)/python -m pytest -n auto --dist loadscope -m flight
 
 lint: $(STAMP) ## ruff, mypy --strict and the import contracts

@@ -89,7 +89,7 @@ def test_fly_loopback() -> None:
 
 
 @pytest.mark.flight
-@pytest.mark.parametrize("source", ["tlog", "log"])
+@pytest.mark.parametrize("source", ["tlog", pytest.param("log", marks=pytest.mark.long)])
 def test_replay_with_another_estimator(source: str, flight: Path) -> None:
     shown = run("replay_with_another_estimator.py", RECORDING if source == "tlog" else flight)
     default, other = re.search(r"(\d+) by default, (\d+) with", shown).groups()  # type: ignore[union-attr]

@@ -99,6 +99,7 @@ def rms(e: Any) -> float:
 
 
 @pytest.mark.flight
+@pytest.mark.long
 def test_smoothed_errors_are_below_filtered_errors() -> None:
     everywhere, outage = [], []
     for seed in range(1, 5):
@@ -134,6 +135,7 @@ def test_last_epoch_equals_the_filter() -> None:
 
 
 @pytest.mark.flight
+@pytest.mark.long
 def test_smoothing_reduces_variances_and_is_consistent() -> None:
     nees = []
     for seed in range(1, 7):

@@ -149,9 +149,10 @@ def raw_rms(flown: Recorded, records: Iterable[Any], start: float, end: float) -
 
 
 NEVER = (0.0, 0.0)
+SEEDS = [0, *(pytest.param(seed, marks=pytest.mark.long) for seed in (1, 2))]
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("name", ["plane_gps_loss", "plane_wind_change"])
 def test_with_a_beacon_the_error_is_at_most_half_the_fixes(name: str, seed: int) -> None:
     flown = flight(name)
@@ -166,7 +167,7 @@ def test_with_a_beacon_the_error_is_at_most_half_the_fixes(name: str, seed: int)
         assert found.error[found.t >= 0.0].max() <= two_sigma
 
 
-@pytest.mark.flight
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("flags", "first_m", "third_m"),
     [({}, 70.0, 34.0), ({"rsbn.bias_azimuth_deg": 0.001, "rsbn.bias_range_m": 0.1}, 70.0, 30.0)],
@@ -190,7 +191,7 @@ def test_a_step_of_the_wind_is_found_by_fixes_alone(
     assert between(120.0, math.inf) < third_m
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", SEEDS)
 def test_a_minute_without_the_beacon_in_a_changed_wind_wherever_it_begins(seed: int) -> None:
     """From one minute after GNSS is lost on."""
     flown = flight("plane_wind_change")
@@ -207,7 +208,7 @@ def test_a_minute_without_the_beacon_in_a_changed_wind_wherever_it_begins(seed: 
         assert np.all(found.error <= 3.0 * found.sigma)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", SEEDS)
 def test_a_minute_without_the_beacon_by_the_restrictive_estimator(seed: int) -> None:
     flown = flight("plane_wind_change")
     records = [r for r in with_beacon(flown, seed, 120.0 * seed, (120.0, 180.0)) if flown.since(r) <= 180.0]
@@ -221,7 +222,9 @@ def test_a_minute_without_the_beacon_by_the_restrictive_estimator(seed: int) -> 
     assert np.all(found.error[inside] <= 3.0 * found.sigma[inside])
 
 
-@pytest.mark.parametrize(("seed", "before"), [(0, 110.0), (1, 110.0), (2, 60.0)])
+@pytest.mark.parametrize(
+    ("seed", "before"), [(2, 60.0), *(pytest.param(seed, 110.0, marks=pytest.mark.long) for seed in (0, 1))]
+)
 def test_a_step_of_the_wind_is_not_taken_for_the_fault_of_a_beacon(seed: int, before: float) -> None:
     """By the only beacon left, however short GNSS was heard with it before."""
     flown = flight("plane_wind_change")
@@ -242,6 +245,7 @@ def test_air_data_alone_drifts_no_more_than_the_autopilot_and_says_so() -> None:
     assert np.all(found.error[after] <= 3.0 * found.sigma[after])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["plane_gps_loss", "plane_wind_change"])
 def test_the_whole_logs_say_the_same_as_the_cut_ones(name: str) -> None:
     path = SHARED / f"{name}.tlog"

@@ -198,10 +198,24 @@ ONE_WRONG: dict[str, Callable[[], Change]] = {
     "stated too fine": lambda: lambda record: record,
 }
 CASES = [
-    *((c, f) for c in ("imu", "air") for f in ("pitot low", "pitot high", "pitot zero")),
-    *((c, f) for c in ("ins", "imu") for f in ("nothing", "range", "azimuth", "late 0.3 s")),
+    ("imu", "pitot high"),
+    ("air", "pitot low"),
+    *((c, f) for c in ("ins", "imu") for f in ("nothing", "range")),
+    ("imu", "azimuth"),
+    ("ins", "late 0.3 s"),
     ("ins", "velocity"),
     ("ins", "stated too fine"),
+    *(
+        pytest.param(*case, marks=pytest.mark.long)
+        for case in (
+            ("imu", "pitot low"),
+            ("imu", "pitot zero"),
+            ("air", "pitot high"),
+            ("air", "pitot zero"),
+            ("ins", "azimuth"),
+            ("imu", "late 0.3 s"),
+        )
+    ),
 ]
 
 
@@ -245,7 +259,9 @@ def test_without_gnss_a_false_airspeed_must_be_taken_out_of_use(gnss_until: floa
     assert all(len(FALSE_AIRSPEED + name) <= 50 for name in USE_AIRSPEED.values())  # one STATUSTEXT
 
 
-@pytest.mark.parametrize("channel", ["ins", "imu", "air"])
+@pytest.mark.parametrize(
+    "channel", ["imu", *(pytest.param(c, marks=pytest.mark.long) for c in ("ins", "air"))]
+)
 def test_a_false_velocity_of_gnss_is_excluded_and_its_position_stays_in_use(channel: str) -> None:
     """Off by 2.2 m/s from 120 s to 210 s."""
     begin, end = 120.0, 210.0
@@ -284,7 +300,7 @@ def test_a_false_velocity_of_gnss_that_stops_leaves_no_suspicion() -> None:
     assert (flown.of("trust", 240.0) == Trust.NORMAL).all()
 
 
-@pytest.mark.parametrize("channel", ["ins", "imu"])
+@pytest.mark.parametrize("channel", ["ins", pytest.param("imu", marks=pytest.mark.long)])
 def test_a_spoofed_gnss_is_excluded_with_a_beacon_and_comes_back(channel: str) -> None:
     """Drawn off by 2 m/s from 120 s to 210 s, velocity alike."""
     begin, end = 120.0, 210.0
@@ -333,7 +349,7 @@ def test_a_gnss_that_stops_is_no_step_of_the_output(channel: str) -> None:
 SHORT = (Leg(5, 40, 0, 0), Leg(55, 40, 38, 40), Leg(30, 40, 38, 40), Leg(60, 130, 34, 40))
 
 
-@pytest.mark.parametrize("channel", ["ins", "imu", "air"])
+@pytest.mark.parametrize("channel", ["ins", "imu", pytest.param("air", marks=pytest.mark.long)])
 def test_the_claims_are_consistent(channel: str) -> None:
     """Normalised squared errors over seeds, with GNSS and 20 s after its loss without any fix."""
     seeds, at = range(8), (100.0, 135.0)
@@ -406,7 +422,9 @@ WITH_AIRSPEED = {"inertial.independent": True, "inertial.correctors": ["airspeed
 BY_AIR = {"inertial.source": "air_data", "output.profile": "ardupilot"}
 
 
-@pytest.mark.parametrize(("channel", "flags"), [("ins", WITH_AIRSPEED), ("air", BY_AIR)])
+@pytest.mark.parametrize(
+    ("channel", "flags"), [pytest.param("ins", WITH_AIRSPEED, marks=pytest.mark.long), ("air", BY_AIR)]
+)
 def test_filters_beside_the_bank_follow_the_flight_and_change_nothing_that_is_sent(
     channel: str, flags: dict[str, Any]
 ) -> None:

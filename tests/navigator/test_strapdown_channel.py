@@ -622,7 +622,7 @@ def raw_rms(records: Iterable[Any], start: float) -> float:
 
 
 @pytest.mark.flight
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.long) for seed in (1, 2))])
 def test_recorded_with_a_beacon_the_error_is_at_most_half_the_fixes(seed: int) -> None:
     records = with_beacon(seed)
     found = navigated(records, recorded()[1])
@@ -633,7 +633,13 @@ def test_recorded_with_a_beacon_the_error_is_at_most_half_the_fixes(seed: int) -
 
 
 @pytest.mark.flight
-@pytest.mark.parametrize(("flown", "half_minute_m"), [(recorded, 45.0), (whole, 25.0)], ids=["cut", "whole"])
+@pytest.mark.parametrize(
+    ("flown", "half_minute_m"),
+    [
+        pytest.param(recorded, 45.0, id="cut"),
+        pytest.param(whole, 25.0, id="whole", marks=pytest.mark.long),
+    ],
+)
 def test_recorded_with_a_beacon_and_airspeed_a_step_of_the_wind_is_found(
     flown: Any, half_minute_m: float
 ) -> None:
@@ -750,7 +756,7 @@ def test_the_rates_asked_for_are_enough() -> None:
 
 @pytest.mark.flight
 @pytest.mark.skipif(not AEROBATICS.exists(), reason="the recording is not there")
-@pytest.mark.parametrize(("noise_m", "most"), [(0.0, 0.9), (5.0, 0.999)])
+@pytest.mark.parametrize(("noise_m", "most"), [pytest.param(0.0, 0.9, marks=pytest.mark.long), (5.0, 0.999)])
 def test_gnss_is_not_excluded_in_real_aerobatics(noise_m: float, most: float) -> None:
     """Up to 6 g and inverted, an attitude of 2013; GNSS itself is 7 m/s off for 2 s. One beacon, 60 km off.
 

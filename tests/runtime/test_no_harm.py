@@ -65,7 +65,9 @@ def imu_turned(record: Input) -> Input:
     return msgspec.structs.replace(record, f_b=(-y, x, z))
 
 
-@pytest.mark.parametrize("tilt_deg", [2.0, 0.5])  # ArduPilot, preset px4
+@pytest.mark.parametrize(
+    "tilt_deg", [2.0, pytest.param(0.5, marks=pytest.mark.long)]
+)  # ArduPilot, preset px4
 @pytest.mark.parametrize(
     ("name", "spoil", "most_m"),
     [

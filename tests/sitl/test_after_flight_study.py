@@ -9,6 +9,7 @@ from sitl import after_flight_study
 
 
 @pytest.mark.flight
+@pytest.mark.long
 def test_short_flight_is_within_the_budget():
     pytest.importorskip("jinja2")
     found = CliRunner().invoke(after_flight_study.command, ["--scenario", "short"])

@@ -240,7 +240,13 @@ def test_split_bytes_are_relayed_as_whole_frames(entries) -> None:
 @pytest.mark.parametrize(
     ("log", "part", "profile", "expected"),
     [
-        ("plane_wind_change", (195.0, 400.0), "ardupilot", {60: 387.0, 120: 794.0, 180: 1206.0}),
+        pytest.param(
+            "plane_wind_change",
+            (195.0, 400.0),
+            "ardupilot",
+            {60: 387.0, 120: 794.0, 180: 1206.0},
+            marks=pytest.mark.long,
+        ),
         ("plane_gps_loss", (130.0, 285.0), "ardupilot", {30: 2.0, 60: 6.0, 120: 27.0}),
         ("px4_global_position_sensor", (45.0, 130.0), "px4", {30: 12.0, 60: 25.0}),
     ],

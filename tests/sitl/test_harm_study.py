@@ -62,7 +62,9 @@ def test_flight_with_nothing_wrong_passes(channel):
 
 
 @pytest.mark.flight
-@pytest.mark.parametrize("wrong", ["beacon 3x as noisy as stated", "beacon range +200 m"])
+@pytest.mark.parametrize(
+    "wrong", [pytest.param("beacon 3x as noisy as stated", marks=pytest.mark.long), "beacon range +200 m"]
+)
 def test_a_mems_ins_stated_as_navigation_grade_does_not_exclude_gnss(wrong):
     """Its gyros are 100 times as coarse, its accelerometers 10; by one factor for both GNSS was excluded.
 
@@ -73,14 +75,17 @@ def test_a_mems_ins_stated_as_navigation_grade_does_not_exclude_gnss(wrong):
 
 
 @pytest.mark.flight
-@pytest.mark.parametrize("channel", ["INS navigation", "stock"])
+@pytest.mark.parametrize("channel", ["INS navigation", pytest.param("stock", marks=pytest.mark.long)])
 def test_a_velocity_of_gnss_that_lags_its_positions_does_not_exclude_it(channel):
     """As of ArduPilot's simulator: excluded before, 13 m (stock) and 130 m (INS) beside a right GNSS."""
     assert fly(HarmOrder("GNSS velocity 0.3 % too small", channel, 1, 10.0)).passed
 
 
 @pytest.mark.flight
-@pytest.mark.parametrize("channel", harm_study.CHANNELS)
+@pytest.mark.parametrize(
+    "channel",
+    ["stock", *(pytest.param(c, marks=pytest.mark.long) for c in harm_study.CHANNELS if c != "stock")],
+)
 def test_a_false_velocity_of_gnss_does_not_exclude_its_position(channel):
     """Before, GNSS was excluded for it (stock, from take-off on: 574 times its own error)."""
     found = fly(HarmOrder("GNSS velocity 5 % too small", channel, 1, 5.0))

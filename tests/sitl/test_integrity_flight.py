@@ -24,7 +24,9 @@ def flown(fault: str, seed: int = 1) -> FlightResult:
     return result
 
 
-@pytest.mark.parametrize(("fault", "seed"), [("gnss-spoof-2", 1), ("gnss-spoof-5", 1)])
+@pytest.mark.parametrize(
+    ("fault", "seed"), [pytest.param("gnss-spoof-2", 1, marks=pytest.mark.long), ("gnss-spoof-5", 1)]
+)
 def test_spoofed_gnss_is_excluded_and_readmitted(fault: str, seed: int) -> None:
     result = flown(fault, seed)
     assert result.excluded_s is not None
@@ -41,6 +43,7 @@ def test_slow_spoofing_beside_one_beacon_stays_within_the_protection_level() -> 
     assert result.last_m < 10.0
 
 
+@pytest.mark.long
 def test_an_onset_without_evidence_is_within_the_protection_level() -> None:
     """0.5 m/s beside a stock autopilot and one beacon: at a risk of 1e-7 beyond it for up to 30 s."""
     result = fly_order(FlightOrder("stock", "gnss-spoof-0.5", 5))
@@ -48,7 +51,10 @@ def test_an_onset_without_evidence_is_within_the_protection_level() -> None:
     assert (result.misleading_s, result.beyond_s) == (0.0, 0.0)
 
 
-@pytest.mark.parametrize("scenario", ["mems", "air-data", "stock"])
+@pytest.mark.parametrize(
+    "scenario",
+    [pytest.param("mems", marks=pytest.mark.long), pytest.param("air-data", marks=pytest.mark.long), "stock"],
+)
 def test_gnss_that_is_false_from_the_first_fix_stays_within_the_protection_level(scenario: str) -> None:
     """By 450 m, until 540 s: a beacon at a wrong place looks the same and is likelier; both are possible."""
     result = fly_order(FlightOrder(scenario, "gnss-first-450", 1))
@@ -57,13 +63,16 @@ def test_gnss_that_is_false_from_the_first_fix_stays_within_the_protection_level
     assert result.last_m < 10.0  # by the honest GNSS again
 
 
-@pytest.mark.parametrize("fault", ["beacon-bias-300", "beacon-multipath"])
+@pytest.mark.parametrize(
+    "fault", ["beacon-bias-300", pytest.param("beacon-multipath", marks=pytest.mark.long)]
+)
 def test_faulty_beacon_does_not_exclude_gnss(fault: str) -> None:
     result = flown(fault, 3)
     assert result.detected_s is not None and result.detected_s < 15.0
     assert result.largest_m < 10.0
 
 
+@pytest.mark.long
 def test_air_data_alone_do_not_exclude_gnss_and_beacon() -> None:
     assert flown("airspeed-icing").largest_m < HARMLESS_M
 
@@ -87,7 +96,14 @@ def test_guaranteed_bound_does_not_use_suspected_sources() -> None:
     assert result.misleading_s == 0.0
 
 
-@pytest.mark.parametrize("scenario", ["one-beacon", "two-beacons", "mems"])
+@pytest.mark.parametrize(
+    "scenario",
+    [
+        "one-beacon",
+        pytest.param("two-beacons", marks=pytest.mark.long),
+        pytest.param("mems", marks=pytest.mark.long),
+    ],
+)
 def test_ins_that_drifts_does_not_exclude_gnss_and_beacons_for_ever(scenario: str) -> None:
     """1 m/s for 4 min: GNSS looks drawn off until the beacons contradict (236 m and no end before)."""
     result = fly_order(FlightOrder(scenario, "ins-drift", 1))
@@ -103,7 +119,7 @@ def drawn_off_gently(scenario: str) -> FlightResult:
     return fly_order(FlightOrder(scenario, "gnss-accelerate", 1))
 
 
-@pytest.mark.parametrize("scenario", ["one-beacon", "two-beacons"])
+@pytest.mark.parametrize("scenario", [pytest.param("one-beacon", marks=pytest.mark.long), "two-beacons"])
 def test_gnss_that_is_drawn_off_gently_is_found_beside_an_ins(scenario: str) -> None:
     """It was taken for a coarser INS, and excluded once it was honest again."""
     result = drawn_off_gently(scenario)
@@ -117,12 +133,14 @@ def test_gnss_that_is_drawn_off_gently_is_found_beside_an_ins(scenario: str) -> 
 NOT_REACHED = pytest.mark.xfail(strict=True, raises=AssertionError, reason="78 m: docs/limits.md")
 
 
-@pytest.mark.parametrize("scenario", [pytest.param("one-beacon", marks=NOT_REACHED), "two-beacons"])
+@pytest.mark.parametrize(
+    "scenario", [pytest.param("one-beacon", marks=(NOT_REACHED, pytest.mark.long)), "two-beacons"]
+)
 def test_gnss_that_is_drawn_off_gently_is_found_within_60_m(scenario: str) -> None:
     assert drawn_off_gently(scenario).largest_m < 60.0
 
 
-@pytest.mark.parametrize("scenario", ["tactical", "mems"])
+@pytest.mark.parametrize("scenario", ["tactical", pytest.param("mems", marks=pytest.mark.long)])
 def test_gnss_that_drew_an_ins_off_unnoticed_is_believed_once_it_is_true_again(scenario: str) -> None:
     """It was excluded as it returned by 87 m, then the beacon too: 232 m off beyond a level of 63 m."""
     result = fly_order(FlightOrder(scenario, "gnss-accelerate", 1))

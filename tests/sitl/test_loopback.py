@@ -91,6 +91,7 @@ def test_log_of_the_command_replays_bit_for_bit(tmp_path: Path) -> None:
 
 
 @pytest.mark.flight
+@pytest.mark.long
 def test_replay_with_another_configuration_reports_the_first_difference(tmp_path: Path) -> None:
     done = CliRunner().invoke(command, ["--scenario", "short", "--logs", str(tmp_path), "--json"])
     other = tmp_path / "other.toml"

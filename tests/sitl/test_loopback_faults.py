@@ -105,7 +105,7 @@ def stated_accuracy(solution: Solution) -> float:
 
 
 @pytest.mark.parametrize("channel", CHANNELS)
-@pytest.mark.parametrize("beacons", [(), BEACONS])
+@pytest.mark.parametrize("beacons", [pytest.param((), marks=pytest.mark.long), BEACONS])
 def test_ten_gnss_outages(tmp_path: Path, channel: str, beacons) -> None:
     outages = tuple((OUTAGE_S + 13.0 * i, OUTAGE_S + 13.0 * i + 7.0) for i in range(10))
     flown = LoggedFlight(tmp_path, channel, gnss_outages=outages, beacons=beacons)
@@ -170,7 +170,7 @@ def test_estimated_wind_survives_a_reboot(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("channel", CHANNELS)
-@pytest.mark.parametrize("outages", [(), OUTAGE])
+@pytest.mark.parametrize("outages", [pytest.param((), marks=pytest.mark.long), OUTAGE])
 def test_link_loss_of_thirty_seconds(tmp_path: Path, channel: str, outages) -> None:
     flown = LoggedFlight(tmp_path, channel, gnss_outages=outages, faults=(Fault("link-loss", 115.0, 145.0),))
     flown.assert_accuracy()
@@ -181,7 +181,7 @@ def test_link_loss_of_thirty_seconds(tmp_path: Path, channel: str, outages) -> N
 
 
 @pytest.mark.parametrize("channel", CHANNELS)
-@pytest.mark.parametrize("outages", [(), OUTAGE])
+@pytest.mark.parametrize("outages", [pytest.param((), marks=pytest.mark.long), OUTAGE])
 def test_local_origin_moves_by_a_kilometre(tmp_path: Path, channel: str, outages) -> None:
     """And back; the new origin is sent two seconds after the first local positions that refer to it."""
     there, back = 118.0, 198.0
@@ -208,7 +208,7 @@ def test_local_origin_moves_by_a_kilometre(tmp_path: Path, channel: str, outages
         assert 2.0 < silent < 8.0
 
 
-@pytest.mark.parametrize("outages", [(), OUTAGE])
+@pytest.mark.parametrize("outages", [pytest.param((), marks=pytest.mark.long), OUTAGE])
 def test_autopilot_filter_reset_of_forty_metres(tmp_path: Path, outages) -> None:
     flown = LoggedFlight(
         tmp_path, "local_position", gnss_outages=outages, faults=(Fault("ins-reset", 120.0, 180.0, 40.0),)

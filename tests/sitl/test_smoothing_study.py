@@ -44,14 +44,14 @@ def three_outages() -> Scenario:
     )
 
 
-@pytest.mark.parametrize("channel", ["ins", "air_data"])
+@pytest.mark.parametrize("channel", ["ins", pytest.param("air_data", marks=pytest.mark.long)])
 def test_smoothed_track_is_nearer_and_consistent(channel: str) -> None:
     found = smoothing_study.compare_flight(three_outages(), channel)
     assert math.sqrt(found.smoothed / found.filtered) < 0.8
     assert found.misfit_smoothed / found.epochs < 1.5
 
 
-@pytest.mark.parametrize("channel", ["ins", "own"])
+@pytest.mark.parametrize("channel", [pytest.param("ins", marks=pytest.mark.long), "own"])
 def test_pooled_flights_with_short_outages(channel: str) -> None:
     parts = [smoothing_study.compare_flight(get_scenario("short", seed=seed), channel) for seed in (1, 2)]
     found = smoothing_study.pool(parts)
@@ -78,6 +78,7 @@ def test_process_noise_covers_a_gap_in_the_channel() -> None:
     assert np.trace(Q[:2, :2]) > 2 * HOLD_M_S_SQRT_S**2 * 2.0**3 / 3.0
 
 
+@pytest.mark.long
 def test_channel_change_in_flight_splits_the_track_and_sigma_change_does_not() -> None:
     records, at = received(get_scenario("short")), 100 * NS
     (one,) = smoothing.smooth_flight([*records, Tuning(at, at, to_toml(INS))], INS)
@@ -89,6 +90,7 @@ def test_channel_change_in_flight_splits_the_track_and_sigma_change_does_not() -
     assert first.t_ns[-1] <= at < second.t_ns[0] < at + 2 * NS
 
 
+@pytest.mark.long
 def test_feedback_and_feedforward_agree() -> None:
     """A correction of the channel is subtracted from the estimate of its error: on a linear model (dead
     reckoning nearly is one) both schemes give the same position, and the smoother the same track.
@@ -163,6 +165,7 @@ def optimum_of_straight_flight(seconds: float, step: float = 0.5) -> tuple[float
     return math.sqrt(2.0 * filtered.P[1:, 0, 0].mean()), math.sqrt(2.0 * smoothed.P[1:, 0, 0].mean())
 
 
+@pytest.mark.long
 def test_command_prints_a_line_for_each_case() -> None:
     found = CliRunner().invoke(smoothing_study.command, ["--scenario", "short"])
     assert found.exit_code == 0
