@@ -60,7 +60,7 @@ def reduce(bank: Bank, layout: Layout, settings: Settings) -> Bank:
     rank = [4] * rows
     heaviest: dict[tuple[int, int, int], int] = {}
     oldest: dict[tuple[int, int, int], int] = {}
-    leading = {0, keys[order[0]][0]}
+    whole = {0, keys[order[0]][0]}  # families that keep each grade and jump: nothing false, and the leading
     by_fault: set[int] = set()
     jumped: set[tuple[int, int]] = set()
     first_jump = layout.jump_event(0)
@@ -82,13 +82,13 @@ def reduce(bank: Bank, layout: Layout, settings: Settings) -> Bank:
             by_fault.add(key[0])
             rank[i] = 0
         event = key[1] // 2
-        if key[0] in leading and event >= first_jump and (key[0], event) not in jumped:
+        if key[0] in whole and event >= first_jump and (key[0], event) not in jumped:
             jumped.add((key[0], event))
             rank[i] = 0
         alive = key[0] == 0 or logs[i] >= settings.class_floor
-        if alive and (active[i] <= 1 or key[0] in leading) and (key[0], grade[i]) not in graded:
+        if alive and (active[i] <= 1 or key[0] in whole) and (key[0], grade[i]) not in graded:
             graded.add((key[0], grade[i]))
-            rank[i] = 0 if key[0] in leading else min(rank[i], 1)
+            rank[i] = 0 if key[0] in whole else min(rank[i], 1)
     for i in oldest.values():
         rank[i] = min(rank[i], 2)
     log_risk = math.log(settings.risk)
