@@ -21,8 +21,10 @@ All work is done on orthonormal coordinates, H / sigma = Q S, computed once for 
 levelled polynomial is accurate to a few units of the last place however short the window, and least squares
 costs one product, because the same problem with |w|_2 for |w|_1 is solved by w = Q a.
 
-It knows neither time nor navigation. Degenerate targets (weights that vanish) are handled by Bland's rule
-after a stall; unobservable ones raise `Infeasible`. The optimum need not be unique, its value is.
+It knows neither time nor navigation. Where weights vanish, exchanges may gain nothing and never end. Then a
+target close by, none of whose weights vanishes, is solved first: its optimal basis is that of the target
+within rounding, since the dual constraints do not depend on it. Unobservable targets raise `Infeasible`. The
+optimum need not be unique, its value is.
 """
 
 from collections.abc import Sequence
@@ -38,8 +40,9 @@ Indices = npt.NDArray[np.intp]
 
 LEVEL_TOLERANCE = 1e-12  # how far |H lambda| may exceed sigma, relative: also the duality gap left
 RANK_TOLERANCE = 1e-13  # singular values below this share of the largest are rounding
-ROUNDING = 1e-9  # of |H lambda| after many exchanges that gained nothing
-EXCHANGES_MAX = 1000  # a handful to thirty are usual
+ROUNDING = 1e-9  # of |H lambda| after exchanges that gained nothing
+PERTURBATION = 1e-7  # of the largest term of the cost: how far a target is moved whose weights vanish
+EXCHANGES_MAX = 200  # a handful to thirty are usual
 
 
 class Infeasible(ValueError):
@@ -469,9 +472,10 @@ def _exchange(
     """
     r, n = q.shape
     p = len(D)
+    wanted = a, g
     rows, inputs = rows.copy(), inputs.copy()
     sign, u = np.ones(n), np.ones(p)
-    first, cost, stalled = True, np.inf, 0
+    first, cost, stalled, perturbed = True, np.inf, 0, False
     best: _Basis | None = None
     for _ in range(EXCHANGES_MAX):
         b = np.concatenate([q[:, rows], D[inputs][:, rows]])
@@ -500,11 +504,16 @@ def _exchange(
         excess = np.concatenate([np.abs(level), np.abs(dual[r:])])
         stalled = 0 if now < cost * (1.0 - 1e-14) else stalled + 1
         cost = now
-        bland = stalled > 3 * len(b)
-        limit = 1.0 + max(tolerance, ROUNDING if bland else 0.0)
-        enter = int(np.argmax(excess > limit)) if bland else int(excess.argmax())
-        if excess[enter] <= limit:
-            break
+        enter, degenerate = int(excess.argmax()), stalled > len(b)
+        if excess[enter] <= 1.0 + max(tolerance, ROUNDING if degenerate else 0.0):
+            if not perturbed:
+                break
+            (a, g), cost, stalled, perturbed = wanted, np.inf, 0, False
+            continue
+        if degenerate:
+            a, g = _perturbed(q[:, rows], D[:, rows], w, left, sign[rows], u, inputs)
+            cost, stalled, perturbed = np.inf, 0, True
+            continue
         if enter < n:
             side = 1.0 if level[enter] > 0.0 else -1.0
             column = np.concatenate([q[:, enter], D[inputs, enter]])
@@ -517,7 +526,7 @@ def _exchange(
         moved[inputs] = 0.0
         rate = np.concatenate([-sign[rows] * dw, -u * moved])  # how fast each |w| and |left| falls
         size = np.concatenate([np.abs(w), np.abs(left)])
-        passed, leave = _line_search(size, rate, excess[enter], bland)
+        passed, leave = _line_search(size, rate, excess[enter])
         for k in passed:
             if k < len(rows):
                 sign[rows[k]] *= -1.0
@@ -537,20 +546,37 @@ def _exchange(
             else:
                 inputs[gone] = leave - len(rows)
     assert best is not None
+    if perturbed:
+        w = np.linalg.solve(
+            np.concatenate([q[:, best.rows], D[best.inputs][:, best.rows]]),
+            np.concatenate([wanted[0], wanted[1][best.inputs]]),
+        )
+        left = wanted[1] - D[:, best.rows] @ w
+        left[best.inputs] = 0.0
+        best = best._replace(weights=w, cost=float(np.abs(w).sum() + np.abs(left).sum()))
     return best
 
 
-def _line_search(size: Floats, rate: Floats, excess: float, bland: bool) -> tuple[list[int], int]:
+def _perturbed(
+    q: Floats, D: Floats, w: Floats, left: Floats, sign: Floats, u: Floats, inputs: Indices
+) -> tuple[Floats, Floats]:
+    """Return a target close by for which no term of the cost vanishes on the basis; all keep their signs."""
+    size = PERTURBATION * max(float(np.abs(w).max()), float(np.abs(left).max(initial=0.0)))
+    uneven = 1.0 + np.modf(0.618034 * np.arange(len(w) + len(left)))[0]  # no two steps of equal length
+    w = w + size * uneven[: len(w)] * sign
+    left = left + size * uneven[len(w) :] * np.where(u < 0.0, -1.0, 1.0)
+    left[inputs] = 0.0
+    return q @ w, D @ w + left
+
+
+def _line_search(size: Floats, rate: Floats, excess: float) -> tuple[list[int], int]:
     """Return the terms that change sign on the way, and the one that ends at zero.
 
     The cost is convex along the way and its slope, 1 - excess at first, grows by twice the rate of each term
-    that vanishes; while the slope is negative that term changes sign instead of ending there. By Bland's rule
-    the first term that vanishes, of several the first in order, ends there.
+    that vanishes; while the slope is negative that term changes sign instead of ending there.
     """
     falling = np.flatnonzero(rate > 1e-11 * np.abs(rate).max())
     when = size[falling] / rate[falling]
-    if bland:
-        return [], int(falling[np.argmin(when)])
     slope, passed = 1.0 - excess, list[int]()
     order = falling[np.argsort(when, kind="stable")].tolist()
     for k in order:

@@ -35,8 +35,8 @@ from companion.units import Floats
 
 KAPPA = 1.2  # worst error of the restricted estimate over the least possible
 RESTRICTED_TOLERANCE = 1e-2  # relative, of its worst error against the limit
-RESTRICTED_ROUNDS = 500
-RESTRICTED_GAIN = 8.0  # power of the excess over the limit by which the multiplier follows it
+RESTRICTED_ROUNDS = 20  # in flight; the next search goes on from there
+RESTRICTED_GAIN = 12.0  # power of the excess over what is aimed at by which the multiplier follows it
 GROUP_S, GROUP_RATIO = 10.0, 0.2  # length of the newest group of fixes, s; growth with age
 WHITE = 0.1  # share of white noise in the variance of a fix, expected
 UNLIKE = 4.0  # fixes so many times better or worse are not grouped
@@ -182,11 +182,15 @@ class Program:
         kappa: float = KAPPA,
         start: tuple[float, Floats] | None = None,
         tolerance: float = RESTRICTED_TOLERANCE,
+        rounds: int = RESTRICTED_ROUNDS,
     ) -> tuple[Estimate, float]:
         """Compute the estimate of least expected square whose worst error is at most kappa times the least.
 
         With a multiplier mu on the worst error its terms are replaced by parabolas that touch them: each
-        round is one least-squares problem, with coarser noise where a term is small.
+        round is one least-squares problem, with coarser noise where a term is small. The multiplier aims at
+        the middle of what is good enough: aimed at the limit, the worst error nears it from above for
+        hundreds of rounds. It may swing about the limit as long; so after a round beyond the limit the best
+        estimate within it is moved towards that round's as far as the limit allows. Both errors are convex.
 
         Parameters
         ----------
@@ -200,6 +204,8 @@ class Program:
             Multiplier and weights of a similar problem.
         tolerance : float
             Relative, of the worst error against its limit and of the expected error in a round.
+        rounds : int
+            Most rounds: the estimate is within its limit after any of them.
 
         Returns
         -------
@@ -227,20 +233,24 @@ class Program:
         if start is not None and start[0] > 0.0 and start[1].shape == weights.shape:
             mu, weights = start
         feasible, before = best, found.expected
-        for _ in range(RESTRICTED_ROUNDS):
+        for _ in range(rounds):
             fine = mu * self.sigmas / np.maximum(np.abs(weights), floor / self.sigmas)
             coarse = mu / np.maximum(np.abs(g - weights @ G), floor)
             spread = self.spread + np.diag(fine) + (G * coarse) @ G.T
             weights = _least_square(self.rows, target.a, c + G @ (coarse * g), spread)
             found = self.judge(weights, target)
             excess = found.bound / limit
-            if excess <= 1.0 and found.expected < feasible.expected:
-                feasible = found
             settled = abs(found.expected - before) <= tolerance * before
+            before = found.expected
+            if excess > 1.0:
+                share = (limit - feasible.bound) / (found.bound - feasible.bound)
+                found = self.judge(feasible.weights + share * (weights - feasible.weights), target)
+            if found.bound <= limit and found.expected < feasible.expected:
+                feasible = found
+                weights = found.weights
             if settled and 1.0 - tolerance < excess <= 1.0:
                 break
-            before = found.expected
-            mu *= excess**RESTRICTED_GAIN
+            mu *= (excess / (1.0 - 0.5 * tolerance)) ** RESTRICTED_GAIN
         return feasible, mu
 
     def judge(self, weights: Floats, target: Target) -> Estimate:
