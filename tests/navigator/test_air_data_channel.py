@@ -153,7 +153,9 @@ SEEDS = [0, *(pytest.param(seed, marks=pytest.mark.long) for seed in (1, 2))]
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-@pytest.mark.parametrize("name", ["plane_gps_loss", "plane_wind_change"])
+@pytest.mark.parametrize(
+    "name", [pytest.param("plane_gps_loss", marks=pytest.mark.long), "plane_wind_change"]
+)
 def test_with_a_beacon_the_error_is_at_most_half_the_fixes(name: str, seed: int) -> None:
     flown = flight(name)
     records = list(with_beacon(flown, seed, 120.0 * seed, NEVER))

@@ -755,8 +755,9 @@ def test_the_rates_asked_for_are_enough() -> None:
 
 
 @pytest.mark.flight
+@pytest.mark.long
 @pytest.mark.skipif(not AEROBATICS.exists(), reason="the recording is not there")
-@pytest.mark.parametrize(("noise_m", "most"), [pytest.param(0.0, 0.9, marks=pytest.mark.long), (5.0, 0.999)])
+@pytest.mark.parametrize(("noise_m", "most"), [(0.0, 0.9), (5.0, 0.999)])
 def test_gnss_is_not_excluded_in_real_aerobatics(noise_m: float, most: float) -> None:
     """Up to 6 g and inverted, an attitude of 2013; GNSS itself is 7 m/s off for 2 s. One beacon, 60 km off.
 

@@ -478,7 +478,9 @@ def recorded(name: str) -> list[Any]:
 
 
 @pytest.mark.flight
-@pytest.mark.parametrize("name", ["plane_gps_loss", "plane_wind_change"])
+@pytest.mark.parametrize(
+    "name", [pytest.param("plane_gps_loss", marks=pytest.mark.long), "plane_wind_change"]
+)
 def test_gate_passes_recorded_flights(name: str) -> None:
     """Recordings with a simulated beacon 60 km away after the GNSS loss, and none for one minute of it: only
     positions beyond ArduPilot's accuracy limit are withheld.

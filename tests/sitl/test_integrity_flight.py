@@ -35,6 +35,7 @@ def test_spoofed_gnss_is_excluded_and_readmitted(fault: str, seed: int) -> None:
     assert result.last_m < 10.0  # by GNSS again
 
 
+@pytest.mark.long
 def test_slow_spoofing_beside_one_beacon_stays_within_the_protection_level() -> None:
     """0.5 m/s for 4 min cannot be separated from wind with certainty: no worse than GNSS alone."""
     result = flown("gnss-spoof-0.5")
@@ -51,10 +52,8 @@ def test_an_onset_without_evidence_is_within_the_protection_level() -> None:
     assert (result.misleading_s, result.beyond_s) == (0.0, 0.0)
 
 
-@pytest.mark.parametrize(
-    "scenario",
-    [pytest.param("mems", marks=pytest.mark.long), pytest.param("air-data", marks=pytest.mark.long), "stock"],
-)
+@pytest.mark.long
+@pytest.mark.parametrize("scenario", ["mems", "air-data", "stock"])
 def test_gnss_that_is_false_from_the_first_fix_stays_within_the_protection_level(scenario: str) -> None:
     """By 450 m, until 540 s: a beacon at a wrong place looks the same and is likelier; both are possible."""
     result = fly_order(FlightOrder(scenario, "gnss-first-450", 1))
@@ -63,9 +62,8 @@ def test_gnss_that_is_false_from_the_first_fix_stays_within_the_protection_level
     assert result.last_m < 10.0  # by the honest GNSS again
 
 
-@pytest.mark.parametrize(
-    "fault", ["beacon-bias-300", pytest.param("beacon-multipath", marks=pytest.mark.long)]
-)
+@pytest.mark.long
+@pytest.mark.parametrize("fault", ["beacon-bias-300", "beacon-multipath"])
 def test_faulty_beacon_does_not_exclude_gnss(fault: str) -> None:
     result = flown(fault, 3)
     assert result.detected_s is not None and result.detected_s < 15.0
@@ -96,14 +94,8 @@ def test_guaranteed_bound_does_not_use_suspected_sources() -> None:
     assert result.misleading_s == 0.0
 
 
-@pytest.mark.parametrize(
-    "scenario",
-    [
-        "one-beacon",
-        pytest.param("two-beacons", marks=pytest.mark.long),
-        pytest.param("mems", marks=pytest.mark.long),
-    ],
-)
+@pytest.mark.long
+@pytest.mark.parametrize("scenario", ["one-beacon", "two-beacons", "mems"])
 def test_ins_that_drifts_does_not_exclude_gnss_and_beacons_for_ever(scenario: str) -> None:
     """1 m/s for 4 min: GNSS looks drawn off until the beacons contradict (236 m and no end before)."""
     result = fly_order(FlightOrder(scenario, "ins-drift", 1))
@@ -140,7 +132,8 @@ def test_gnss_that_is_drawn_off_gently_is_found_within_60_m(scenario: str) -> No
     assert drawn_off_gently(scenario).largest_m < 60.0
 
 
-@pytest.mark.parametrize("scenario", ["tactical", pytest.param("mems", marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("scenario", ["tactical", "mems"])
 def test_gnss_that_drew_an_ins_off_unnoticed_is_believed_once_it_is_true_again(scenario: str) -> None:
     """It was excluded as it returned by 87 m, then the beacon too: 232 m off beyond a level of 63 m."""
     result = fly_order(FlightOrder(scenario, "gnss-accelerate", 1))
@@ -150,6 +143,7 @@ def test_gnss_that_drew_an_ins_off_unnoticed_is_believed_once_it_is_true_again(s
     assert result.last_m < 10.0
 
 
+@pytest.mark.long
 def test_onsets_of_a_slow_lie_are_kept() -> None:
     """A GNSS that is drawn off at 0.5 m/s without an INS: it looks like a change of wind for three minutes.
 

@@ -37,12 +37,11 @@ def selected_sets(flown: loopback.LoopbackFlight) -> list[str]:
 @pytest.mark.parametrize(
     "fault",
     [
-        None,
-        Fault("pitot-stuck", 90.0, size=8.0),
-        Fault("pitot-stuck", 90.0, size=0.0),
-        Fault("beacon-bias", 90.0, size=200.0),
+        pytest.param(None, id="nothing"),
+        pytest.param(Fault("pitot-stuck", 90.0, size=8.0), id="pitot-stuck 8"),
+        pytest.param(Fault("pitot-stuck", 90.0, size=0.0), id="pitot-stuck 0", marks=pytest.mark.long),
+        pytest.param(Fault("beacon-bias", 90.0, size=200.0), id="beacon-bias 200"),
     ],
-    ids=lambda fault: "nothing" if fault is None else f"{fault.name} {fault.size:g}",
 )
 def test_no_harm_while_gnss_is_healthy(fault) -> None:
     flown = fly(dataclasses.replace(HEALTHY, faults=() if fault is None else (fault,)))

@@ -17,6 +17,7 @@ def flights() -> dict[object, SchemeFlight]:
 
 
 @pytest.mark.flight
+@pytest.mark.long
 @pytest.mark.parametrize("scheme", [0.3, "feedback"])
 def test_schemes_use_the_same_fixes(flights: dict[object, SchemeFlight], scheme: object) -> None:
     first, other = flights["feedforward"], flights[scheme]
@@ -25,6 +26,7 @@ def test_schemes_use_the_same_fixes(flights: dict[object, SchemeFlight], scheme:
 
 
 @pytest.mark.flight
+@pytest.mark.long
 @pytest.mark.parametrize("scheme", [0.3, "feedback"])
 def test_schemes_have_the_same_position_and_bound(
     flights: dict[object, SchemeFlight], scheme: object

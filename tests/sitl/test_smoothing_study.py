@@ -44,14 +44,16 @@ def three_outages() -> Scenario:
     )
 
 
-@pytest.mark.parametrize("channel", ["ins", pytest.param("air_data", marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("channel", ["ins", "air_data"])
 def test_smoothed_track_is_nearer_and_consistent(channel: str) -> None:
     found = smoothing_study.compare_flight(three_outages(), channel)
     assert math.sqrt(found.smoothed / found.filtered) < 0.8
     assert found.misfit_smoothed / found.epochs < 1.5
 
 
-@pytest.mark.parametrize("channel", [pytest.param("ins", marks=pytest.mark.long), "own"])
+@pytest.mark.long
+@pytest.mark.parametrize("channel", ["ins", "own"])
 def test_pooled_flights_with_short_outages(channel: str) -> None:
     parts = [smoothing_study.compare_flight(get_scenario("short", seed=seed), channel) for seed in (1, 2)]
     found = smoothing_study.pool(parts)
@@ -117,6 +119,7 @@ def test_feedback_and_feedforward_agree() -> None:
     assert np.abs(north[one.t_ns > 30 * NS]).max() * 6.4e6 < 1.0
 
 
+@pytest.mark.long
 def test_straight_flight_with_gnss_alone_is_smoothed_as_the_optimum_smooths_it() -> None:
     """Only manoeuvres measure the latency of GNSS, 0 here. Straight flight seemed to: 0.06 and 0.12 s.
 
