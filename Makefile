@@ -38,7 +38,7 @@ test: $(STAMP) lint ## lint, type check and all tests but those of `flights`
 flights: $(STAMP) ## the tests that fly for minutes of virtual time
 	$(BIN)/python -m pytest -n auto --dist loadscope -m "flight and not long"
 
-all-flights: $(STAMP) ## flights, on further channels and with further seeds
+all-flights: $(STAMP) ## flights, on further channels, with further seeds and cells of the campaign
 	$(BIN)/python -m pytest -n auto --dist loadscope -m flight
 
 lint: $(STAMP) ## ruff, mypy --strict and the import contracts

@@ -22,9 +22,9 @@ levelled polynomial is accurate to a few units of the last place however short t
 costs one product, because the same problem with |w|_2 for |w|_1 is solved by w = Q a.
 
 It knows neither time nor navigation. Where weights vanish, exchanges may gain nothing and never end. Then a
-target close by, none of whose weights vanishes, is solved first: its optimal basis is that of the target
-within rounding, since the dual constraints do not depend on it. Unobservable targets raise `Infeasible`. The
-optimum need not be unique, its value is.
+target close by, none of whose weights vanishes, is solved first. The dual constraints do not depend on the
+target, so its optimal basis is nearly always that of the target too; the exchange goes on from there.
+Unobservable targets raise `Infeasible`. The optimum need not be unique, its value is.
 """
 
 from collections.abc import Sequence
@@ -42,7 +42,7 @@ LEVEL_TOLERANCE = 1e-12  # how far |H lambda| may exceed sigma, relative: also t
 RANK_TOLERANCE = 1e-13  # singular values below this share of the largest are rounding
 ROUNDING = 1e-9  # of |H lambda| after exchanges that gained nothing
 PERTURBATION = 1e-7  # of the largest term of the cost: how far a target is moved whose weights vanish
-EXCHANGES_MAX = 200  # a handful to thirty are usual
+EXCHANGES_MAX = 1000  # a handful to thirty are usual
 
 
 class Infeasible(ValueError):
@@ -50,18 +50,18 @@ class Infeasible(ValueError):
 
 
 class Minimax(NamedTuple):
-    """Minimax estimate w . z and its certificate: a . dual <= least worst error <= bound.
+    """Minimax estimate w . z and its certificate: bound (1 - gap) <= least worst error <= bound.
 
     Attributes
     ----------
     weights : (n,)
         Weights w.
     bound : float
-        Worst r.m.s. error, sum sigma |w|.
+        Worst r.m.s. error, sum sigma |w| + sum d |g - G w|.
     dual : (m,)
-        Feasible dual vector lambda.
+        Feasible dual vector lambda; that of the inputs is not kept.
     gap : float
-        Relative duality gap, (bound - a . dual) / bound.
+        Relative duality gap.
     active : tuple of int
         Rows of the last basis.
     cancelled : tuple of int
@@ -366,12 +366,12 @@ class Design:
         dual, u = self.coordinates @ best.dual, best.u
         excess = float(np.abs(dual @ self.whitened + u @ self.inputs).max())
         scale = max(1.0, excess, float(np.abs(u).max(initial=0.0)))
-        dual, value = dual / scale, (float(a @ dual) + float(g @ u) / scale)
+        value = (float(a @ dual) + float(g @ u)) / scale
         order = np.argsort(best.rows)
         return Minimax(
             weights,
             bound,
-            dual,
+            dual / scale,
             (bound - value) / bound,
             tuple(best.rows[order].tolist()),
             tuple(best.inputs.tolist()),
@@ -475,7 +475,7 @@ def _exchange(
     wanted = a, g
     rows, inputs = rows.copy(), inputs.copy()
     sign, u = np.ones(n), np.ones(p)
-    first, cost, stalled, perturbed = True, np.inf, 0, False
+    first, cost, stalled, perturbed, approximate = True, np.inf, 0, False, False
     best: _Basis | None = None
     for _ in range(EXCHANGES_MAX):
         b = np.concatenate([q[:, rows], D[inputs][:, rows]])
@@ -499,7 +499,7 @@ def _exchange(
         u[inputs] = 0.0
         dual = (sign[rows] - u @ D[:, rows]) @ inverse
         u[inputs] = dual[r:]
-        best = _Basis(rows.copy(), w, inputs.copy(), dual[:r], u.copy(), now)
+        best, approximate = _Basis(rows.copy(), w, inputs.copy(), dual[:r], u.copy(), now), perturbed
         level = dual[:r] @ q + u @ D
         excess = np.concatenate([np.abs(level), np.abs(dual[r:])])
         stalled = 0 if now < cost * (1.0 - 1e-14) else stalled + 1
@@ -546,7 +546,7 @@ def _exchange(
             else:
                 inputs[gone] = leave - len(rows)
     assert best is not None
-    if perturbed:
+    if approximate:
         w = np.linalg.solve(
             np.concatenate([q[:, best.rows], D[best.inputs][:, best.rows]]),
             np.concatenate([wanted[0], wanted[1][best.inputs]]),

@@ -36,7 +36,7 @@ from companion.units import Floats
 KAPPA = 1.2  # worst error of the restricted estimate over the least possible
 RESTRICTED_TOLERANCE = 1e-2  # relative, of its worst error against the limit
 RESTRICTED_ROUNDS = 20  # in flight; the next search goes on from there
-RESTRICTED_GAIN = 12.0  # power of the excess over what is aimed at by which the multiplier follows it
+RESTRICTED_GAIN = 8.0  # power of the excess over what is aimed at by which the multiplier follows it
 GROUP_S, GROUP_RATIO = 10.0, 0.2  # length of the newest group of fixes, s; growth with age
 WHITE = 0.1  # share of white noise in the variance of a fix, expected
 UNLIKE = 4.0  # fixes so many times better or worse are not grouped

@@ -5,6 +5,7 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import linprog
 
+from companion.estimate import minimax_lp
 from companion.estimate.minimax_lp import Design
 from companion.estimate.schuler import MEAN_EARTH, force_response, schuler_row, transition
 from companion.units import G0
@@ -97,6 +98,22 @@ def test_random_problems_against_highs(seed: int) -> None:
         assert again.bound == pytest.approx(best.bound, rel=1e-9)
         rough = design.minimax(target, through=through, tolerance=1e-3)
         assert best.bound * (1.0 - 1e-9) <= rough.bound <= 1.001 * best.bound / (1.0 - 1e-3)
+
+
+@pytest.mark.parametrize("exchanges", [1, 3, 10])
+@pytest.mark.parametrize("through", [0.0, 1.0])
+def test_the_gap_says_how_far_an_unfinished_exchange_may_be_off(
+    monkeypatch: pytest.MonkeyPatch, exchanges: int, through: float
+) -> None:
+    """Of a target without inputs it was 0 whatever the dual: bound 25 for an optimum of 1.8."""
+    monkeypatch.setattr(minimax_lp, "EXCHANGES_MAX", exchanges)
+    rng = np.random.default_rng(exchanges)
+    rows, effect, sigmas = rng.normal(size=(60, 4)), rng.normal(size=(60, 30)), np.ones(60)
+    target, g, d = rng.normal(size=4), through * rng.normal(size=30), np.ones(30)
+    best = Design.of(rows, sigmas, effect, d).minimax(target, through=g)
+    least = highs(rows, sigmas, effect, d, target, g)
+    assert best.bound > 1.05 * least
+    assert best.bound * (1.0 - best.gap) <= least * (1.0 + 1e-9)
 
 
 def test_inputs_are_checked() -> None:

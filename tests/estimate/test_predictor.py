@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
+from companion.estimate import minimax_lp
 from companion.estimate.minimax_lp import Infeasible
 from companion.estimate.predictor import Program, Step, Target, Window, anchor
 from companion.nav.bounded_channel import BoundedDrift, BoundedIns, Motion, UnitErrors
@@ -173,6 +174,24 @@ def test_what_fixes_tell_little_of_has_a_certificate_too(minutes: int) -> None:
     anchored = anchor(window, law)
     for target in anchored.targets(window, range(law.n)):
         assert -1e-9 < anchored.solve(target).gap < 1e-4
+
+
+def test_an_exchange_that_is_stopped_gives_an_estimate_of_the_target(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whenever it is, also while a target close by is solved: unbiased, with the bound and gap it states."""
+    window, law = flown(13)
+    anchored = anchor(window, law)
+    program = anchored.grouped
+    for wanted in anchored.targets(window, (0, 7)):
+        target = wanted._replace(g=anchored.inputs.T @ wanted.g)
+        least = program.minimax(target)[0].bound
+        for exchanges in range(1, 60):
+            monkeypatch.setattr(minimax_lp, "EXCHANGES_MAX", exchanges)
+            estimate, best = program.minimax(target)
+            assert program.rows.T @ estimate.weights == pytest.approx(target.a, abs=1e-9)
+            assert estimate.bound == pytest.approx(best.bound, rel=1e-9)
+            assert best.bound * (1.0 - best.gap) <= least * (1.0 + 1e-9)
+            assert best.bound >= least * (1.0 - 1e-9)
+        monkeypatch.undo()
 
 
 def test_neighbours_weighed_alike_cost_two_per_cent() -> None:

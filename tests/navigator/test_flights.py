@@ -252,9 +252,7 @@ def test_a_local_position_that_drifts_ever_faster_is_not_believed_against_gnss()
     assert flown.error[flown.t > SETTLED_S].max() < 10.0
 
 
-@pytest.mark.parametrize(
-    ("gnss_until", "needed"), [pytest.param(math.inf, False, marks=pytest.mark.long), (90.0, True)]
-)
+@pytest.mark.parametrize(("gnss_until", "needed"), [(math.inf, False), (90.0, True)])
 def test_without_gnss_a_false_airspeed_must_be_taken_out_of_use(gnss_until: float, needed: bool) -> None:
     """The autopilot compares it with GPS only, and dives for the speed that a stuck pitot lacks."""
     flown = fly("imu", after(150.0, AirData, airspeed=noisy(8.0)), gnss_until=gnss_until)

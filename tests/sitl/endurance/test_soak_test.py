@@ -22,7 +22,6 @@ from sitl.endurance.soak_test import (
 
 
 @pytest.mark.flight
-@pytest.mark.long
 def test_short_sorties_stay_within_the_limits(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr(soak_module, "SORTIES", 2)
     hours = list(run_soak(2, 1, tmp_path, sortie_s=150.0))
