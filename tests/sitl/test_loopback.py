@@ -83,6 +83,7 @@ def test_bound_holds_in_every_phase_and_always_without_fixes(tables) -> None:
 
 
 @pytest.mark.flight
+@pytest.mark.long
 def test_log_of_the_command_replays_bit_for_bit(tmp_path: Path) -> None:
     done = CliRunner().invoke(command, ["--scenario", "short", "--logs", str(tmp_path), "--json"])
     assert done.exit_code == 0, done.output
