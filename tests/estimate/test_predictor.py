@@ -166,7 +166,7 @@ def test_position_within_1000_m_for_twenty_minutes() -> None:
 
 
 @pytest.mark.parametrize("minutes", [13, 19, 25])
-def test_what_fixes_tell_little_of_has_a_certificate_too(minutes: int) -> None:
+def test_hardly_observable_states_have_a_certificate_too(minutes: int) -> None:
     """Gyro drift and accelerometer bias: all weights of the estimate vanish. Exchanges that gained nothing
     went on for 0.2 s, and ended with nothing proved: a duality gap of 0.9999.
     """
