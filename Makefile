@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help loopback test flights all-flights lint fuzz kills soak docs pictures lock clean
+.PHONY: help loopback test tests flights all-flights lint fuzz kills soak docs pictures lock clean
 
 # one worker more than processors: many tests wait for a process or a disk
 WORKERS := $(shell echo $$(($$(getconf _NPROCESSORS_ONLN) + 1)))
@@ -32,7 +32,9 @@ $(STAMP): pyproject.toml requirements.lock
 loopback: $(STAMP) ## fly the default scenario in virtual time: log in logs/ and error table
 	$(BIN)/companion loopback
 
-test: $(STAMP) lint ## lint, type check and all tests but those of `flights`
+test: lint tests ## lint, type check and all tests but those of `flights`
+
+tests: $(STAMP)
 	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal -m "not flight"
 
 flights: $(STAMP) ## the tests that fly for minutes of virtual time

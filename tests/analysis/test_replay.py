@@ -23,9 +23,9 @@ CUT = DATA / "dronekit_copter_cut.tlog"
 REAL = (
     "dronekit_copter/flight.tlog",
     "autopilot_sitl/plane_gps_loss.tlog",
-    "autopilot_sitl/plane_gps_input_aid.tlog",
-    "autopilot_sitl/plane_wind_change.tlog",
     "autopilot_sitl/px4_global_position_sensor.tlog",
+    pytest.param("autopilot_sitl/plane_gps_input_aid.tlog", marks=pytest.mark.long),
+    pytest.param("autopilot_sitl/plane_wind_change.tlog", marks=pytest.mark.long),
 )
 
 

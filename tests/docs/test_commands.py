@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 import shlex
 import shutil
@@ -14,6 +15,8 @@ from click.testing import CliRunner
 from companion.bench import live
 from companion.command_line import cli
 from companion.config import ConfigError
+from sitl import scenarios
+from sitl.flight import Leg
 from sitl.loopback import command as loopback
 
 ROOT = Path(__file__).parents[2]
@@ -96,10 +99,15 @@ def test_options_and_commands_exist(text: str) -> None:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the files that the pages name, of the flight that they fly."""
+    """A folder with the files that the pages name, of a flight of 150 s."""
     path = tmp_path_factory.mktemp("docs")
+    plan = scenarios.SCENARIOS["short"].plan
+    plan = dataclasses.replace(plan, legs=(*plan.legs[:2], Leg(90, 40, 38, 120)))
+    flight = scenarios.get_scenario("short", plan=plan, gnss_outages=((80.0, 110.0),), rsbn_outages=())
     words = ["--scenario", "short", "--logs", str(path / "logs"), "--set", "output.profile=ardupilot"]
-    done = CliRunner().invoke(loopback, words)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(scenarios.SCENARIOS, "short", flight)
+        done = CliRunner().invoke(loopback, words)
     assert done.exit_code == 0, done.output
     (log,) = (path / "logs").glob("*.mcap")
     shutil.copy(log, path / "LOG.mcap")

@@ -21,7 +21,7 @@ from scipy.signal import lfilter
 
 from companion.analysis import simulated_rsbn
 from companion.analysis.error_statistics import position_from_beacon
-from companion.config import Config, load
+from companion.config import load
 from companion.importers import sources
 from companion.nav.geometry import Geodetic, from_enu, separation, slant_range_azimuth
 from companion.navigator import (
@@ -271,9 +271,9 @@ class Flown(NamedTuple):
         return np.sqrt(np.trace(self.P, axis1=1, axis2=2))
 
 
-def navigated(records: Iterable[Any], truth: Any, config: Config = STRAPDOWN) -> Flown:
+def navigated(records: Iterable[Any], truth: Any, navigator: Navigator | None = None) -> Flown:
     """`truth`: the true Geodetic at a time in ns."""
-    navigator, rows, others = Navigator(config), list[Any](), list[Stamped]()
+    navigator, rows, others = navigator or Navigator(STRAPDOWN), list[Any](), list[Stamped]()
     for record in records:
         for out in navigator.handle(record):
             if isinstance(out, Solution):
@@ -431,12 +431,9 @@ def test_a_lost_packet_is_nothing() -> None:
 def test_what_makes_no_sense_is_not_integrated(how: dict[str, Any], word: str) -> None:
     """The flight goes on without an IMU, and says how far it may be off."""
     flight = circles()
-    records = changed(lost(flight), **how)
     navigator = Navigator(STRAPDOWN)
-    for record in records:
-        navigator.handle(record)
+    found = navigated(changed(lost(flight), **how), truth_of(flight), navigator)
     assert word in navigator.state.sensors.strap.why
-    found = navigated(records, truth_of(flight))
     assert found.t[-1] > 139.0
     assert np.all(found.error <= 3.0 * found.sigma)
 
@@ -653,7 +650,7 @@ def test_recorded_with_a_beacon_and_airspeed_a_step_of_the_wind_is_found(
             msgspec.structs.replace(r, sensed=True) if isinstance(r, AirData) else r
             for r in with_beacon(seed, flown=flown)
         )
-        found.append(navigated(records, flown()[1], config))
+        found.append(navigated(records, flown()[1], Navigator(config)))
 
     def between(start: float, end: float) -> tuple[float, float]:
         """The error, r.m.s. (m), and its square over the variance."""
@@ -675,7 +672,7 @@ def test_recorded_on_px4_its_preset_finds_a_step_of_the_wind() -> None:
     """EKF2 keeps its attitude within 0.3 deg for a quarter of a minute; with 2 deg it is 68 m."""
     with gzip.open(DATA / "px4_wind_step_cut.jsonl.gz") as file:
         records = [msgspec.json.decode(line, type=Input | Truth) for line in file]
-    found = navigated(records, interpolated(records), load(preset="px4", environment={}))
+    found = navigated(records, interpolated(records), Navigator(load(preset="px4", environment={})))
     minute = (found.t >= LOSS) & (found.t < LOSS + 60.0)
     assert found.error[found.t < LOSS].max() < 3.0
     assert rms(found.error[minute]) < 50.0

@@ -218,7 +218,9 @@ def falsify_position(name: str, values: dict[str, Any]) -> None:
 
 
 @pytest.mark.flight
-@pytest.mark.parametrize("source", ["auto", "air_data", "imu"])
+@pytest.mark.parametrize(
+    "source", ["auto", *(pytest.param(s, marks=pytest.mark.long) for s in ("air_data", "imu"))]
+)
 @pytest.mark.parametrize(("autopilot", "profile", "via"), METHODS)
 def test_autopilot_position_never_reaches_the_output(
     autopilot: int, profile: str, via: str, source: str

@@ -28,17 +28,32 @@ def result(fault: str, seed: int, **changes: object) -> FlightResult:
     )
 
 
-@pytest.fixture(scope="module")
-def flown(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[FlightResult]]:
-    """Two flights in this process."""
-    folder = tmp_path_factory.mktemp("campaign")
-    wanted = command.list_orders(("one-beacon",), ("none", "gnss-jump"), 1)
-    return folder, command.run_campaign(wanted, folder, quiet=True)
+JUMP = FlightOrder("one-beacon", "gnss-jump", 1)
+#: Results as of flights, where only their storage and their table matter.
+RESULTS = [
+    result("none", 1),
+    result("gnss-jump", 1, detected_s=1.0, excluded_s=3.0, before_m=20.0, largest_m=50.0, normal_m=9.0),
+]
+ORDERS = [FlightOrder(r.scenario, r.fault, r.seed) for r in RESULTS]
+
+
+@pytest.fixture
+def requested(monkeypatch: pytest.MonkeyPatch) -> list[FlightOrder]:
+    """Orders that were flown; each gives its result of `RESULTS`."""
+    orders: list[FlightOrder] = []
+
+    def remembered(order: FlightOrder) -> FlightResult:
+        orders.append(order)
+        return next(r for r in RESULTS if r.key == order.key)
+
+    monkeypatch.setattr(command, "fly_order", remembered)
+    return orders
 
 
 @pytest.mark.flight
-def test_flight_without_faults_has_no_alarms_and_small_errors(flown: tuple[Path, list[FlightResult]]) -> None:
-    quiet = flown[1][0]
+@pytest.mark.long
+def test_flight_without_faults_has_no_alarms_and_small_errors() -> None:
+    quiet = fly_order(FlightOrder("one-beacon", "none", 1))
     assert quiet.raised is None
     assert quiet.largest_m < 15.0
     assert (quiet.detected_s, quiet.excluded_s, quiet.alarms, quiet.misleading_s) == (None, None, 0, 0.0)
@@ -51,8 +66,8 @@ def assert_detected_at_once(found: FlightResult) -> None:
 
 
 @pytest.mark.flight
-def test_a_jump_of_gnss_is_detected_at_once(flown: tuple[Path, list[FlightResult]]) -> None:
-    assert_detected_at_once(flown[1][1])
+def test_a_jump_of_gnss_is_detected_at_once() -> None:
+    assert_detected_at_once(fly_order(JUMP))
 
 
 @pytest.mark.flight
@@ -64,32 +79,21 @@ def test_gross_faults_of_other_sources_are_detected_at_once(fault: str) -> None:
 
 @pytest.mark.flight
 @pytest.mark.long
-def test_same_order_gives_the_same_result(flown: tuple[Path, list[FlightResult]]) -> None:
-    repeated = fly_order(FlightOrder("one-beacon", "gnss-jump", 1))
-    assert repeated._replace(took_s=0.0) == flown[1][1]._replace(took_s=0.0)
+def test_same_order_gives_the_same_result() -> None:
+    first, second = (fly_order(JUMP)._replace(took_s=0.0) for _ in range(2))
+    assert first == second
 
 
-@pytest.mark.flight
-def test_stored_flights_are_not_repeated(
-    flown: tuple[Path, list[FlightResult]], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_stored_flights_are_not_repeated(requested: list[FlightOrder], tmp_path: Path) -> None:
     """After an interruption with an incomplete last line, that flight and the missing ones are flown."""
-    folder, results = flown
-    path = folder / "flights.jsonl"
+    assert command.run_campaign(ORDERS, tmp_path, quiet=True) == RESULTS
+    path = tmp_path / "flights.jsonl"
     lines = path.read_bytes().splitlines(keepends=True)
-    assert len(lines) == len(results) == 2
+    assert len(lines) == 2
     path.write_bytes(lines[0] + lines[1][:25])
-    requested: list[FlightOrder] = []
-
-    def remembered(order: FlightOrder) -> FlightResult:
-        requested.append(order)
-        return next(r for r in results if r.key == order.key)
-
-    monkeypatch.setattr(command, "fly_order", remembered)
-    wanted = [FlightOrder(r.scenario, r.fault, r.seed) for r in results]
-    assert command.run_campaign(wanted, folder, quiet=True) == results
-    assert requested == wanted[1:]
-    assert [json.loads(line)["key"] for line in path.read_bytes().splitlines()] == [r.key for r in results]
+    assert command.run_campaign(ORDERS, tmp_path, quiet=True) == RESULTS
+    assert requested == [*ORDERS, ORDERS[1]]
+    assert [json.loads(line)["key"] for line in path.read_bytes().splitlines()] == [r.key for r in RESULTS]
 
 
 def test_exception_in_a_flight_is_a_result() -> None:
@@ -188,11 +192,10 @@ def test_campaign_covers_every_simulator_fault() -> None:
             assert flight.scenario_of(FlightOrder(name, fault, 1)).duration_s >= 600.0
 
 
-@pytest.mark.flight
-def test_exit_code_follows_the_limits(flown: tuple[Path, list[FlightResult]]) -> None:
-    folder = str(flown[0])
+@pytest.mark.usefixtures("requested")
+def test_exit_code_follows_the_limits(tmp_path: Path) -> None:
     options = ["--scenario", "one-beacon", "--fault", "none", "--fault", "gnss-jump", "--seeds", "1"]
-    options += ["--workers", "0", "--results", folder, "--json"]
+    options += ["--workers", "0", "--results", str(tmp_path), "--json"]
     events = CliRunner().invoke(command.command, options)
     assert events.exit_code == 0, events.output
     assert [line["fault"] for line in json.loads(events.stdout)] == ["none", "gnss-jump"]
