@@ -23,7 +23,7 @@ from companion.navigator.hypotheses import Model
 from companion.navigator.measurements import other_receiver
 from companion.navigator.own_channel import OwnChannel
 from companion.navigator.past_states import PastStates
-from companion.navigator.progress import SILENT_INS_NS, births_due, with_births
+from companion.navigator.progress import SILENT_INS_NS, births_due, changed_beliefs, with_births
 from companion.navigator.receiver_choice import ReceiverChoice
 from companion.navigator.solution import announce, is_bound_due, refresh_bound, resolve_pending, solve
 from companion.navigator.stale_data import REPORT_EVERY, StaleDataDetector
@@ -112,6 +112,8 @@ class Navigator:
         self._last_solution_ns = 0
         self._rejected_ns: dict[str, int] = {}  # when an implausible record was last reported, by kind
         self._channel_reported = False
+        self._last_beliefs: tuple[int, ...] = ()  # `State.reported` as it was last said
+        self._was_wider = False  # the guaranteed bound, as it was last said
         self._is_settled = False  # whether the last record left nothing to do
 
     @property
@@ -157,7 +159,7 @@ class Navigator:
         outputs += self._fold_again(record)
         if late_ns <= 0:
             outputs += self._take(record)
-        return self._with_mode_events(outputs)
+        return self._with_events(outputs, record)
 
     def settle(self) -> None:
         """Do the deferred update of the last record and drop old states: no answer waits for this.
@@ -358,9 +360,17 @@ class Navigator:
             answers = tuple(a and a._replace(sought_ns=min(a.sought_ns, then.fixed_ns)) for a in answers)
         return before._replace(guarantee=then._replace(answers=answers))
 
-    def _with_mode_events(self, outputs: list[Output]) -> list[Output]:
-        """Add an event wherever the mode, or the fixes that the solution rests on, change."""
-        found: list[Output] = []
+    def _with_events(self, outputs: list[Output], record: Input) -> list[Output]:
+        """Add an event wherever a source is believed other than before, the guaranteed bound is wider or no
+        longer, or the mode changes, or the fixes that the solution rests on.
+
+        The first two are changes of the state that leads, so records that are folded again report nothing.
+        """
+        found = changed_beliefs(self._last_beliefs, self.state, record, self._settings)
+        self._last_beliefs = self.state.reported
+        if (text := minimax_bound.contradiction(self.state.guarantee, self._was_wider)) is not None:
+            self._was_wider = not self._was_wider
+            found.append(Event(record.t_ns, record.rx_ns, Severity.NOTICE, text))
         for output in outputs:
             found.append(output)
             if isinstance(output, Solution):

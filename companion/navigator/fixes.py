@@ -70,8 +70,7 @@ def gnss(state: State, record: Gnss, settings: Settings) -> Step:
         velocity = measurements.gnss_velocity(bank, known, channel, record, nominal.point, nominal.a_n, noise)
         bank = velocity.bank
     state = state._replace(bank=bank, gnss_taken=record, fixed=True)
-    state, out = decided(state, record, settings)
-    out = [*noted, *out]
+    state, out = decided(state, record, settings), noted
     label = f"gnss {record.receiver}"
     if velocity is not None and (state.reported[VELOCITY] == EXCLUDED or not velocity.accepted):
         out.append(_rejected(state, record, f"velocity of {label}", VELOCITY, velocity))
@@ -135,8 +134,8 @@ def rsbn(state: State, record: RsbnFix, settings: Settings) -> Step:
         state, factor, noted = _scattered(state, record, label, (residual,), variance, metres)
         assert state.bank is not None
         taken = measurements.sight(state.bank, known, z, k, factor * variance, centre)
-        state, more = decided(state._replace(bank=taken.bank), record, settings)
-        out += [*noted, *more]
+        state = decided(state._replace(bank=taken.bank), record, settings)
+        out += noted
         assert state.bank is not None
         part = Source.AZIMUTH if isinstance(z, Azimuth) else Source.RANGE
         if state.reported[source] == EXCLUDED or not taken.accepted:

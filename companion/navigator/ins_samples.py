@@ -62,8 +62,7 @@ def position(state: State, record: LocalPosition, settings: Settings) -> Step:
     nominal = state.nominal._replace(point=new, a_n=a_n)
     state = state._replace(nominal=nominal, ins=new)
     if nominal.pending_s >= NEAR_S and state.bank is not None:
-        state, more = decided(propagated(state, settings), record, settings)
-        out += more
+        state = decided(propagated(state, settings), record, settings)
     state, more = solved_if_due(state, record, settings)
     return state, [*out, *more]
 
@@ -127,7 +126,7 @@ def _corrected_by(state: State, record: Any, settings: Settings, name: str) -> S
             Rejection(record.t_ns, record.rx_ns, name, "star below the horizon or near the zenith")
         ]
     taken = measurements.corrector(state.bank, hypotheses(state, settings), rows)
-    state, out = decided(state._replace(bank=taken.bank), record, settings)
+    state, out = decided(state._replace(bank=taken.bank), record, settings), list[Output]()
     if not taken.accepted:
         why = "outlier: normalised squared innovation"
         out.append(Rejection(record.t_ns, record.rx_ns, name, why, taken.nis))

@@ -30,7 +30,7 @@ from companion.estimate.predictor import Anchored, Estimate, Solved, Start, Step
 from companion.nav.bounded_channel import BoundedDrift, BoundedIns, Motion, UnitErrors
 from companion.navigator.channel import Nominal
 from companion.navigator.inertial_track import Point
-from companion.records import Bounds, Event, Output, Prediction, Severity, Vector2
+from companion.records import Bounds, Prediction, Vector2
 from companion.units import G0, SECOND_NS, Floats
 
 CHUNK_S = 1.0  # the transition is extended so often: a turn of 4 degrees
@@ -295,22 +295,18 @@ def tuned(g: Guarantee) -> Guarantee:
 # ---------------------------------------------------------------------------------------------------------
 
 
-def refresh(g: Guarantee, nominal: Nominal, rx_ns: int, config: Config) -> tuple[Guarantee, list[Output]]:
+def refresh(g: Guarantee, nominal: Nominal, config: Config) -> Guarantee:
     """Do the piece of work that is most overdue: make the program of the window, or solve one target."""
     if not _has_work(g, nominal):
-        return g, []
+        return g
     window, t_ns = g.window, nominal.t_ns
     assert window is not None
     channel, g = law(config, g.by, nominal.point.v_n), g._replace(worked_ns=t_ns)
     if channel is None:
-        return g, []
+        return g
     if g.anchored is None:
         anchored = anchor(window, channel)
-        widening = anchored.grouped.widening
-        out: list[Output] = []
-        if (widening > 1.0) != (g.widening > 1.0):
-            out = [Event(t_ns, rx_ns, Severity.NOTICE, _contradiction(widening))]
-        return g._replace(anchored=anchored, widening=widening), out
+        return g._replace(anchored=anchored, widening=anchored.grouped.widening)
     todo = tasks(config, channel)
     answers = g.answers if len(g.answers) == len(todo) else (None,) * len(todo)
     late = [
@@ -319,19 +315,20 @@ def refresh(g: Guarantee, nominal: Nominal, rx_ns: int, config: Config) -> tuple
     ]
     k = max(range(len(todo)), key=late.__getitem__)
     if late[k] < 1.0:
-        return _carried(g, t_ns), []
+        return _carried(g, t_ns)
     before = answers[k]
     start = before.solved.start if before is not None and before.solved is not None else None
     answer = Answer(t_ns, todo[k].state, _solved(g, todo[k], channel, start), t_ns)
-    return g._replace(answers=(*answers[:k], answer, *answers[k + 1 :])), []
+    return g._replace(answers=(*answers[:k], answer, *answers[k + 1 :]))
 
 
-def _contradiction(widening: float) -> str:
-    if widening > 1.0:
-        return (
-            f"fixes of the window contradict the stated errors: guaranteed bound {widening:.1f} times wider"
-        )
-    return "fixes of the window agree with the stated errors again"
+def contradiction(g: Guarantee, was_wider: bool) -> str | None:
+    """Return what to report if the bound is wider now and was not, or is no longer."""
+    if g.anchored is None or (g.widening > 1.0) == was_wider:
+        return None
+    if was_wider:
+        return "fixes of the window agree with the stated errors again"
+    return f"fixes of the window contradict the stated errors: guaranteed bound {g.widening:.1f} times wider"
 
 
 def _carried(g: Guarantee, t_ns: int) -> Guarantee:

@@ -152,7 +152,7 @@ def air_data(state: State, record: AirData, settings: Settings) -> Step:
     )
     sums = AirspeedSums(record.t_ns, 0, (0.0, 0.0), (0.0, 0.0))
     sensors = state.sensors._replace(measured_ns=record.t_ns, sums=sums)
-    return decided(state._replace(bank=taken.bank, sensors=sensors), record, settings)
+    return decided(state._replace(bank=taken.bank, sensors=sensors), record, settings), []
 
 
 def _step(s: Sensors, record: AirData) -> Rejection | None:
@@ -203,7 +203,7 @@ def foreign_position(state: State, record: LocalPosition, settings: Settings) ->
     v_n = state.nominal.point.v_n
     apart = (v_n[0] - velocity[0], v_n[1] - velocity[1])
     taken = measurements.foreign_velocity(state.bank, hypotheses(state, settings), _own(settings), apart)
-    return decided(state._replace(bank=taken.bank), record, settings)
+    return decided(state._replace(bank=taken.bank), record, settings), []
 
 
 def _driven(state: State, record: Stamped, by: By, sample: Vector2 | None, settings: Settings) -> Step:
@@ -229,11 +229,8 @@ def _driven(state: State, record: Stamped, by: By, sample: Vector2 | None, setti
         nominal = own_channel.by_velocity(nominal, sample or (0.0, 0.0), record.t_ns)
     state = state._replace(nominal=_at_height(nominal, s, state))
     if nominal.pending_s >= NEAR_S:
-        state, out = decided(propagated(state, settings), record, settings)
-    else:
-        out = []
-    state, more = solved_if_due(state, record, settings)
-    return state, [*out, *more]
+        state = decided(propagated(state, settings), record, settings)
+    return solved_if_due(state, record, settings)
 
 
 def _at_height(nominal: Nominal, s: Sensors, state: State) -> Nominal:

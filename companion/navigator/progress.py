@@ -114,8 +114,8 @@ def propagated(state: State, settings: Settings) -> State:
     return state._replace(bank=bank, nominal=nominal)
 
 
-def decided(state: State, record: Stamped, settings: Settings) -> Step:
-    """With the decisions read off the bank, and an event for each source that they change."""
+def decided(state: State, record: Stamped, settings: Settings) -> State:
+    """With the decisions read off the bank."""
     assert state.bank is not None
     known = hypotheses(state, settings)
     bank = banks.decide(state.bank, known.layout, known.settings)
@@ -123,7 +123,6 @@ def decided(state: State, record: Stamped, settings: Settings) -> Step:
     n = len(false)  # more than before if a beacon joined
     before, certain = (*state.reported, *(0,) * n)[:n], (*state.certain_ns, *(0,) * n)[:n]
     reported, since = list(before), list(certain)
-    out: list[Output] = []
     for i, p in enumerate(false):
         since[i] = (certain[i] or record.t_ns) if bank.excluded[i] else 0
         if bank.excluded[i] and record.t_ns - since[i] >= CONFIRM_NS:
@@ -132,23 +131,34 @@ def decided(state: State, record: Stamped, settings: Settings) -> Step:
             reported[i] = SUSPECT
         elif p < known.settings.believed:
             reported[i] = 0
-        if reported[i] != before[i]:
-            text = {
-                0: "is used again",
-                SUSPECT: f"is suspect: false with probability {p:.2f}",
-                EXCLUDED: f"is excluded: false with probability {p:.4f}",
-            }[reported[i]]
-            severity = Severity.WARNING if reported[i] else Severity.NOTICE
-            out.append(Event(record.t_ns, record.rx_ns, severity, f"{source_name(i, state)} {text}"))
-            by_gnss = sources(state, record.t_ns, settings) & Source.GNSS
-            if i == AIRSPEED and reported[i] == EXCLUDED and not by_gnss:
-                text = FALSE_AIRSPEED + USE_AIRSPEED.get(settings.config.output.profile, "")
-                out.append(Event(record.t_ns, record.rx_ns, Severity.WARNING, text))
     leading = (bank, banks.estimate(bank, known.layout))
-    state = state._replace(
+    return state._replace(
         bank=bank, leading=leading, false=false, reported=tuple(reported), certain_ns=tuple(since)
     )
-    return state, out
+
+
+def changed_beliefs(
+    before: tuple[int, ...], state: State, record: Stamped, settings: Settings
+) -> list[Output]:
+    """Return an event for each source whose belief is not that of `before`, the `reported` of a state that
+    led earlier. Records are folded again behind late ones; only the state that leads is reported.
+    """
+    out: list[Output] = []
+    for i, (now, p) in enumerate(zip(state.reported, state.false, strict=True)):
+        if now == (before[i] if i < len(before) else 0):
+            continue
+        text = {
+            0: "is used again",
+            SUSPECT: f"is suspect: false with probability {p:.2f}",
+            EXCLUDED: f"is excluded: false with probability {p:.4f}",
+        }[now]
+        severity = Severity.WARNING if now else Severity.NOTICE
+        out.append(Event(record.t_ns, record.rx_ns, severity, f"{source_name(i, state)} {text}"))
+        by_gnss = sources(state, record.t_ns, settings) & Source.GNSS
+        if i == AIRSPEED and now == EXCLUDED and not by_gnss:
+            text = FALSE_AIRSPEED + USE_AIRSPEED.get(settings.config.output.profile, "")
+            out.append(Event(record.t_ns, record.rx_ns, Severity.WARNING, text))
+    return out
 
 
 def nearer(state: State, settings: Settings) -> State:

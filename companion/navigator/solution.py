@@ -326,8 +326,8 @@ def refresh_bound(state: State, record: Input, settings: Settings) -> Step:
     if nominal is None or not state.fixed:
         return state, []
     g = minimax_bound.follow(state.guarantee, nominal, settings.config)
-    g, out = minimax_bound.refresh(g, nominal, record.rx_ns, settings.config)
-    return (state if g is state.guarantee else state._replace(guarantee=g)), out
+    g = minimax_bound.refresh(g, nominal, settings.config)
+    return (state if g is state.guarantee else state._replace(guarantee=g)), []
 
 
 def _filtered(state: State, pending: Pending, fix: Fix, used: Source, settings: Settings) -> State:

@@ -14,7 +14,6 @@ from companion.navigator.channel import Nominal
 from companion.navigator.inertial_track import Point
 from companion.navigator.minimax_bound import Guarantee
 from companion.navigator.own_error_model import begin
-from companion.records import Event
 
 CONFIG = Config(inertial=InertialConfig(independent=True))
 NS = 1_000_000_000
@@ -27,8 +26,8 @@ def nominal(t_s: float, by: str = "ins") -> Nominal:
 
 
 def flown(seconds: int, sigmas=(2.0,), noise=1.0, by="ins", fixes_until=10**9, g=None, start=0):
-    """Fixes each second of each sigma, and the work that follows each record at 2 Hz; also the events."""
-    rng, events, g = np.random.default_rng(1), [], g or Guarantee()
+    """Fixes each second of each sigma, and the work that follows each record at 2 Hz; also the reports."""
+    rng, reports, g = np.random.default_rng(1), [], g or Guarantee()
     for half in range(2 * start, 2 * seconds):
         now = nominal(0.5 * half, by)
         if half % 2 == 0 and half < 2 * fixes_until:
@@ -36,9 +35,10 @@ def flown(seconds: int, sigmas=(2.0,), noise=1.0, by="ins", fixes_until=10**9, g
                 value = tuple((noise * sigma * rng.standard_normal(2)).tolist())
                 g = minimax_bound.add_fix(g, now.t_ns, value, (sigma, sigma))
         g = minimax_bound.follow(g, now, CONFIG)
-        g, more = minimax_bound.refresh(g, now, now.t_ns, CONFIG)
-        events += more
-    return g, events
+        g = minimax_bound.refresh(g, now, CONFIG)
+        if (text := minimax_bound.contradiction(g, was_wider=bool(len(reports) % 2))) is not None:
+            reports.append(text)
+    return g, reports
 
 
 def bounds(g: Guarantee, t_s: float) -> minimax_bound.Guaranteed:
@@ -55,9 +55,9 @@ def test_two_fixes_of_one_instant_too_unlike_for_one_bin_both_count() -> None:
 
 
 def test_bound_grows_without_fixes_and_shrinks_within_seconds_of_a_return() -> None:
-    g, events = flown(150)
+    g, reports = flown(150)
     fixed = bounds(g, 150.0)
-    assert events == []
+    assert reports == []
     assert fixed.bounds.widening == 1.0 and fixed.bounds.gap < 1e-3
     assert fixed.bounds.tilt_n is not None and fixed.bounds.drift_n is not None
     assert max(fixed.bounds.optimum_n) <= max(fixed.restricted.bound_n) < 12.0
@@ -85,8 +85,8 @@ def test_a_jump_of_the_channel_is_one_of_its_error() -> None:
 
 def test_fixes_that_contradict_the_grade_widen_the_bound_and_say_so() -> None:
     stated, _ = flown(150)
-    wild, events = flown(150, noise=30.0)
-    assert any(isinstance(e, Event) and "times wider" in e.text for e in events)
+    wild, (report,) = flown(150, noise=30.0)
+    assert "times wider" in report
     assert bounds(wild, 150.0).bounds.widening > 5.0
     assert max(bounds(wild, 150.0).restricted.bound_n) > 5.0 * max(bounds(stated, 150.0).restricted.bound_n)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
+import re
 from collections.abc import Iterator
 from functools import lru_cache
 from itertools import pairwise
@@ -30,7 +31,9 @@ from companion.navigator import Navigator, measurements, past_states
 from companion.navigator.channel import Nominal
 from companion.navigator.inertial_track import Point
 from companion.navigator.ins_channel import ins_channel
+from companion.navigator.state import EXCLUDED, SUSPECT, source_name
 from companion.records import (
+    Event,
     Fix,
     Gnss,
     LocalOrigin,
@@ -616,6 +619,33 @@ def test_a_gnss_jump_is_refused_and_counted() -> None:
                     errors.append(distance(out, moment.truth))
     assert rejections >= 9
     assert max(errors) < 15.0
+
+
+@pytest.mark.parametrize("late_s", [0.3, 0.9])
+def test_each_change_of_belief_is_reported_once_beside_late_answers(late_s: float) -> None:
+    """Each answer of the beacon folds what came since again, and may decide other than before."""
+    navigator, reported, waiting = Navigator(CONFIG), list[tuple[str, str]](), list[RsbnFix]()
+    navigator.handle(origin())
+    for record in (record for moment in flight(42, 90.0, 90.0) for record in moment.records):
+        if isinstance(record, RsbnFix):
+            waiting.append(structs.replace(record, rx_ns=record.t_ns + round(late_s * NS)))
+            continue
+        if isinstance(record, Gnss) and 30.5 * NS < record.t_ns < 37.5 * NS:
+            off = 25.0 * (record.t_ns / NS - 29.5)
+            record = structs.replace(record, lat=record.lat + off / 6.4e6)
+        due = [waiting.pop(0)] if waiting and waiting[0].rx_ns <= record.rx_ns else []
+        for out in (out for each in (*due, record) for out in navigator.handle(each)):
+            if isinstance(out, Event) and (
+                found := re.match("(.*) is (excluded|suspect|used again)", out.text)
+            ):
+                reported.append((found[1], found[2]))
+    names = [source_name(i, navigator.state) for i in range(len(navigator.state.reported))]
+    assert ("gnss", "excluded") in reported
+    for source in {source for source, _ in reported}:
+        words = [word for of, word in reported if of == source]
+        assert all(a != b for a, b in pairwise(words)), (source, words)
+        number = navigator.state.reported[names.index(source)]
+        assert words[-1] == {0: "used again", SUSPECT: "suspect", EXCLUDED: "excluded"}[number]
 
 
 def test_a_repeated_fix_teaches_once() -> None:
