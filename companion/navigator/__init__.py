@@ -112,8 +112,8 @@ class Navigator:
         self._last_solution_ns = 0
         self._rejected_ns: dict[str, int] = {}  # when an implausible record was last reported, by kind
         self._channel_reported = False
-        self._last_beliefs: tuple[int, ...] = ()  # `State.reported` as it was last said
-        self._was_wider = False  # the guaranteed bound, as it was last said
+        self._last_beliefs: tuple[int, ...] = ()  # `State.reported` of the last events
+        self._was_wider = False  # the guaranteed bound, in the last event
         self._is_settled = False  # whether the last record left nothing to do
 
     @property
@@ -366,9 +366,11 @@ class Navigator:
 
         The first two are changes of the state that leads, so records that are folded again report nothing.
         """
-        found = changed_beliefs(self._last_beliefs, self.state, record, self._settings)
-        self._last_beliefs = self.state.reported
-        if (text := minimax_bound.contradiction(self.state.guarantee, self._was_wider)) is not None:
+        found, state = list[Output](), self.state
+        if state.reported != self._last_beliefs:
+            found = changed_beliefs(self._last_beliefs, state, record, self._settings)
+            self._last_beliefs = state.reported
+        if (text := minimax_bound.contradiction(state.guarantee, self._was_wider)) is not None:
             self._was_wider = not self._was_wider
             found.append(Event(record.t_ns, record.rx_ns, Severity.NOTICE, text))
         for output in outputs:
