@@ -19,29 +19,28 @@ from msgspec import structs
 from companion.config import Config, parse
 from companion.estimate import bank as banks
 from companion.navigator import minimax_bound
+from companion.navigator.changes import Changes
 from companion.navigator.hypotheses import Model
 from companion.navigator.measurements import other_receiver
 from companion.navigator.own_channel import OwnChannel
 from companion.navigator.past_states import PastStates
-from companion.navigator.progress import SILENT_INS_NS, births_due, changed_beliefs, with_births
+from companion.navigator.progress import SILENT_INS_NS, births_due, with_births
 from companion.navigator.receiver_choice import ReceiverChoice
-from companion.navigator.solution import announce, is_bound_due, refresh_bound, resolve_pending, solve
+from companion.navigator.solution import is_bound_due, refresh_bound, resolve_pending, solve
 from companion.navigator.stale_data import REPORT_EVERY, StaleDataDetector
-from companion.navigator.state import FIXES, Settings, State, Step, initial, is_new_fix
+from companion.navigator.state import Settings, State, Step, initial, is_new_fix
 from companion.navigator.step import INPUTS_USED, uses
 from companion.plausibility import ImplausibleField, implausible_field
 from companion.records import (
     Event,
     Gnss,
     Input,
-    Mode,
     Output,
     Rejection,
     Reset,
     RsbnFix,
     Severity,
     Solution,
-    Source,
     Tuning,
 )
 from companion.units import SECOND_NS
@@ -108,12 +107,10 @@ class Navigator:
         self._gnss_latency_ns = round(1e9 * config.gnss.latency_s)
         self._stale_data = StaleDataDetector()
         self._receivers = ReceiverChoice(config)
-        self._last_mode = Mode.INITIALISING, Source(0)  # mode and fixes of the last solution, and its time
         self._last_solution_ns = 0
         self._rejected_ns: dict[str, int] = {}  # when an implausible record was last reported, by kind
         self._channel_reported = False
-        self._last_beliefs: tuple[int, ...] = ()  # `State.reported` of the last events
-        self._was_wider = False  # the guaranteed bound, in the last event
+        self._changes = Changes()
         self._is_settled = False  # whether the last record left nothing to do
 
     @property
@@ -361,26 +358,13 @@ class Navigator:
         return before._replace(guarantee=then._replace(answers=answers))
 
     def _with_events(self, outputs: list[Output], record: Input) -> list[Output]:
-        """Add an event wherever a source is believed other than before, the guaranteed bound is wider or no
-        longer, or the mode changes, or the fixes that the solution rests on.
-
-        The first two are changes of the state that leads, so records that are folded again report nothing.
-        """
-        found, state = list[Output](), self.state
-        if state.reported != self._last_beliefs:
-            found = changed_beliefs(self._last_beliefs, state, record, self._settings)
-            self._last_beliefs = state.reported
-        if (text := minimax_bound.contradiction(state.guarantee, self._was_wider)) is not None:
-            self._was_wider = not self._was_wider
-            found.append(Event(record.t_ns, record.rx_ns, Severity.NOTICE, text))
+        """Add an event for each change of the state that leads, and of the solutions' mode."""
+        found = self._changes.of_state(self.state, record, self._settings)
         for output in outputs:
             found.append(output)
             if isinstance(output, Solution):
                 self._last_solution_ns = output.t_ns
-                mode = output.mode, output.sources & FIXES
-                if mode != self._last_mode:
-                    self._last_mode = mode
-                    found.append(announce(output))
+                found += self._changes.of_mode(output)
         return found
 
 

@@ -58,7 +58,7 @@ def gnss(state: State, record: Gnss, settings: Settings) -> Step:
     variance = fix_observations.white_sigma(record, config) ** 2
     apart = measurements.gnss_apart(record, nominal.point)
     still = (apart[0] + state.moved[0], apart[1] + state.moved[1])  # as if the nominal had never jumped
-    state, factor, noted = _scattered(state, record, "gnss", still, variance)
+    state, factor = _scattered(state, record, "gnss", still, variance)
     assert state.bank is not None
     state, v_n = _latency_velocity(state, record.t_ns)
     assert state.bank is not None
@@ -70,7 +70,7 @@ def gnss(state: State, record: Gnss, settings: Settings) -> Step:
         velocity = measurements.gnss_velocity(bank, known, channel, record, nominal.point, nominal.a_n, noise)
         bank = velocity.bank
     state = state._replace(bank=bank, gnss_taken=record, fixed=True)
-    state, out = decided(state, record, settings), noted
+    state, out = decided(state, record, settings), list[Output]()
     label = f"gnss {record.receiver}"
     if velocity is not None and (state.reported[VELOCITY] == EXCLUDED or not velocity.accepted):
         out.append(_rejected(state, record, f"velocity of {label}", VELOCITY, velocity))
@@ -131,11 +131,10 @@ def rsbn(state: State, record: RsbnFix, settings: Settings) -> Step:
         still = (centre[0] - state.moved[0], centre[1] - state.moved[1])  # as if it had never jumped
         residual = measurements.sight_residual(z, still)
         variance = fix_observations.sight_variance(z, height)
-        state, factor, noted = _scattered(state, record, label, (residual,), variance, metres)
+        state, factor = _scattered(state, record, label, (residual,), variance, metres)
         assert state.bank is not None
         taken = measurements.sight(state.bank, known, z, k, factor * variance, centre)
         state = decided(state._replace(bank=taken.bank), record, settings)
-        out += noted
         assert state.bank is not None
         part = Source.AZIMUTH if isinstance(z, Azimuth) else Source.RANGE
         if state.reported[source] == EXCLUDED or not taken.accepted:
@@ -203,8 +202,8 @@ def _scattered(
     residual: tuple[float, ...],
     variance: float,
     metres: float = 1.0,
-) -> tuple[State, float, list[Output]]:
-    """With one more residual of a source; the factor of its stated variance; an event if that is news.
+) -> tuple[State, float]:
+    """With one more residual of a source; the factor of its stated variance.
 
     `metres` is the length of the residual's unit.
     """
@@ -214,9 +213,7 @@ def _scattered(
     seen = scatter.observe(
         state.scatter.get(name), record.t_ns, residual, variance, lacking / max(metres, 1.0)
     )
-    seen, text = scatter.report(seen, name)
-    out: list[Output] = [] if text is None else [Event(record.t_ns, record.rx_ns, Severity.NOTICE, text)]
-    return state._replace(scatter={**state.scatter, name: seen}), seen.used, out
+    return state._replace(scatter={**state.scatter, name: seen}), seen.used
 
 
 def _rejected(

@@ -322,15 +322,6 @@ def refresh(g: Guarantee, nominal: Nominal, config: Config) -> Guarantee:
     return g._replace(answers=(*answers[:k], answer, *answers[k + 1 :]))
 
 
-def contradiction(g: Guarantee, was_wider: bool) -> str | None:
-    """Return what to report if the bound is wider now and was not, or is no longer."""
-    if g.anchored is None or (g.widening > 1.0) == was_wider:
-        return None
-    if was_wider:
-        return "fixes of the window agree with the stated errors again"
-    return f"fixes of the window contradict the stated errors: guaranteed bound {g.widening:.1f} times wider"
-
-
 def _carried(g: Guarantee, t_ns: int) -> Guarantee:
     """With the solutions for now carried on to `t_ns` if they are older than JUDGED_NS."""
     assert g.anchored is not None

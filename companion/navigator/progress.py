@@ -28,15 +28,10 @@ from companion.navigator.state import (
     Step,
     estimate,
     hypotheses,
-    source_name,
-    sources,
 )
-from companion.records import Event, Gnss, Output, Severity, Source, Stamped, Vector2
+from companion.records import Gnss, Stamped, Vector2
 from companion.units import SECOND_NS
 
-#: An autopilot checks its airspeed sensor against GPS only: ArduPlane dived to the ground for speed in 67 s.
-FALSE_AIRSPEED = "switch the airspeed sensor off"
-USE_AIRSPEED = {"ardupilot": ": ARSPD_USE 0", "px4": ": FW_USE_AIRSPD 0"}
 SILENT_INS_NS = 3 * SECOND_NS // 2
 CONFIRM_NS = SECOND_NS  # one fix in disagreement is an outlier: a source is excluded once it lasts
 FAR_M, FAST_M_S = 500.0, 5.0  # the nominal trajectory is brought back from this far off
@@ -135,30 +130,6 @@ def decided(state: State, record: Stamped, settings: Settings) -> State:
     return state._replace(
         bank=bank, leading=leading, false=false, reported=tuple(reported), certain_ns=tuple(since)
     )
-
-
-def changed_beliefs(
-    before: tuple[int, ...], state: State, record: Stamped, settings: Settings
-) -> list[Output]:
-    """Return an event for each source whose belief is not that of `before`, the `reported` of a state that
-    led earlier. Records are folded again behind late ones; only the state that leads is reported.
-    """
-    out: list[Output] = []
-    for i, (now, p) in enumerate(zip(state.reported, state.false, strict=True)):
-        if now == (before[i] if i < len(before) else 0):
-            continue
-        text = {
-            0: "is used again",
-            SUSPECT: f"is suspect: false with probability {p:.2f}",
-            EXCLUDED: f"is excluded: false with probability {p:.4f}",
-        }[now]
-        severity = Severity.WARNING if now else Severity.NOTICE
-        out.append(Event(record.t_ns, record.rx_ns, severity, f"{source_name(i, state)} {text}"))
-        by_gnss = sources(state, record.t_ns, settings) & Source.GNSS
-        if i == AIRSPEED and now == EXCLUDED and not by_gnss:
-            text = FALSE_AIRSPEED + USE_AIRSPEED.get(settings.config.output.profile, "")
-            out.append(Event(record.t_ns, record.rx_ns, Severity.WARNING, text))
-    return out
 
 
 def nearer(state: State, settings: Settings) -> State:

@@ -14,7 +14,6 @@ measurements, of which no scatter is known yet, are taken as noisy.
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 SILENT_S = 5.0  # after a longer silence the differences start again
@@ -23,14 +22,14 @@ CLIPPED = 6.0  # times the mean
 FIRST, LAST = 4, 40  # measurements that the mean remembers, at the start and later
 UNKNOWN, UNKNOWN_FOR = 9.0, 6  # factor of the first measurements, and their number: four differences
 MOST = 100.0
-REPORTED, FORGOTTEN = 4.0, 1.44  # the factor is reported above the one until it is below the other
+NOISY, QUIET = 4.0, 1.44  # a source is noisy once the factor is above the one until it is below the other
 LACKING = {"ins": 0.0, "imu": 1.0}  # m/s^2, by what moves the nominal trajectory
 LACKING_ELSE = 3.0
 
 
 class Scatter(NamedTuple):
     """Time and residual of the last measurement, distance (s) and residual of the one before; the factor, of
-    how many differences, whether it was reported, and the number of measurements up to `UNKNOWN_FOR`.
+    how many differences, whether it is great, and the number of measurements up to `UNKNOWN_FOR`.
     """
 
     t_ns: int
@@ -39,7 +38,7 @@ class Scatter(NamedTuple):
     before: tuple[float, ...] | None = None
     factor: float = 1.0
     many: int = 0
-    reported: bool = False
+    noisy: bool = False
     seen: int = 1
 
     @property
@@ -65,14 +64,5 @@ def observe(s: Scatter | None, t_ns: int, r: tuple[float, ...], variance: float,
     many = min(s.many + 1, LAST - FIRST)
     most = CLIPPED * s.factor if s.many >= FIRST else MOST  # at the start the fixes themselves give the scale
     factor = s.factor + (min(ratio, most) - s.factor) / (FIRST + many)
-    return s._replace(t_ns=t_ns, last=r, dt=dt, before=s.last, factor=factor, many=many)
-
-
-def report(s: Scatter, name: str) -> tuple[Scatter, str | None]:
-    """Return the scatter, and what to report if its factor became great or small again."""
-    if not s.reported and s.factor > REPORTED:
-        text = f"{name} scatters {math.sqrt(s.factor):.1f} times as much as it states: used with that sigma"
-        return s._replace(reported=True), text
-    if s.reported and s.factor < FORGOTTEN:
-        return s._replace(reported=False), f"{name} scatters as it states again"
-    return s, None
+    noisy = factor > (QUIET if s.noisy else NOISY)
+    return s._replace(t_ns=t_ns, last=r, dt=dt, before=s.last, factor=factor, many=many, noisy=noisy)

@@ -33,14 +33,12 @@ from companion.navigator.state import (
     sources,
 )
 from companion.records import (
-    Event,
     Fix,
     Gnss,
     Input,
     Mode,
     ParallelEstimate,
     Rejection,
-    Severity,
     Solution,
     Source,
     Vector2,
@@ -253,19 +251,6 @@ def _trust(
     if state.held is None:
         return trust.Held(trust.judge(evidence, limits), t_ns)
     return trust.turn(state.held, t_ns, evidence, limits)
-
-
-def announce(solution: Solution) -> Event:
-    """Report a change of mode, or of the fixes that the solution rests on."""
-    fixes = [s.name.lower() for s in Source if s.name and s & FIXES & solution.sources]
-    if solution.mode is Mode.FIXED:
-        why = " and ".join(fixes) + " fixes"
-    elif solution.protection is not None:
-        why = f"no fixes; protection level {solution.protection:.0f} m"
-    else:
-        why = "no fixes"
-    severity = Severity.WARNING if solution.mode is Mode.UNTRUSTED else Severity.NOTICE
-    return Event(solution.t_ns, solution.rx_ns, severity, f"navigation {solution.mode}: {why}")
 
 
 def resolve_pending(state: State, pending: Pending, settings: Settings) -> Step:

@@ -14,7 +14,7 @@ from msgspec.structs import replace
 
 from companion.config import Config, load
 from companion.navigator import Navigator
-from companion.navigator.progress import FALSE_AIRSPEED, USE_AIRSPEED
+from companion.navigator.changes import FALSE_AIRSPEED, USE_AIRSPEED
 from companion.records import (
     PARALLEL,
     AirData,

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -103,11 +104,6 @@ def test_a_silence_and_an_unequal_distance_begin_anew() -> None:
     assert scatter.observe(s, s.t_ns, (1e3, 1e3), 1.0, 0.0) is s
 
 
-def test_it_is_reported_once_and_once_when_it_is_over() -> None:
-    texts = []
-    s = None
-    for k, r in enumerate(np.concatenate([noise(100), 4.0 * noise(100, 2), noise(300, 3)])):
-        s, text = scatter.report(scatter.observe(s, k * STEP_NS, tuple(r), 1.0, 0.0), "gnss")
-        texts += [text] if text else []
-    assert [text.split(" times")[0][:13] for text in texts] == ["gnss scatters", "gnss scatters"]
-    assert "as much as it states" in texts[0] and texts[1] == "gnss scatters as it states again"
+def test_a_source_is_noisy_once_until_it_is_quiet_again() -> None:
+    noisy = [s.noisy for s in observed(np.concatenate([noise(100), 4.0 * noise(100, 2), noise(300, 3)]))]
+    assert [b for a, b in pairwise(noisy) if a != b] == [True, False]

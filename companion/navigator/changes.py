@@ -1,0 +1,94 @@
+"""What changed in the state that leads, each change reported once.
+
+Records are folded again behind late ones, and the same change may then follow from two records or from none
+that is new. So no record reports what it changes: the state after it is compared with the last report.
+"""
+
+from __future__ import annotations
+
+import math
+
+from companion.navigator.hypotheses import AIRSPEED
+from companion.navigator.minimax_bound import Guarantee
+from companion.navigator.scatter import Scatter
+from companion.navigator.state import EXCLUDED, FIXES, SUSPECT, Settings, State, source_name, sources
+from companion.records import Event, Mode, Output, Severity, Solution, Source, Stamped
+
+#: An autopilot checks its airspeed sensor against GPS only: ArduPlane dived to the ground for speed in 67 s.
+FALSE_AIRSPEED = "switch the airspeed sensor off"
+USE_AIRSPEED = {"ardupilot": ": ARSPD_USE 0", "px4": ": FW_USE_AIRSPD 0"}
+
+
+class Changes:
+    """What was last reported of the sources, of their scatter, of the guaranteed bound and of the mode."""
+
+    def __init__(self) -> None:
+        self._beliefs: tuple[int, ...] = ()  # `State.reported`
+        self._scatter: dict[str, bool] = {}  # whether each source is noisy
+        self._wider = False  # whether the guaranteed bound is
+        self._mode = Mode.INITIALISING, Source(0)  # and the fixes that the solution rests on
+
+    def of_state(self, state: State, record: Stamped, settings: Settings) -> list[Output]:
+        """Return an event for each change of the state that leads, after `record`."""
+        found: list[tuple[Severity, str]] = []
+        if state.reported != self._beliefs:
+            found += _of_beliefs(self._beliefs, state, record.t_ns, settings)
+            self._beliefs = state.reported
+        for name, scatter in state.scatter.items():
+            if scatter.noisy != self._scatter.get(name, False):
+                self._scatter[name] = scatter.noisy
+                found.append((Severity.NOTICE, _of_scatter(name, scatter)))
+        g = state.guarantee
+        if g.anchored is not None and (g.widening > 1.0) != self._wider:
+            self._wider = not self._wider
+            found.append((Severity.NOTICE, _of_bound(g)))
+        return [Event(record.t_ns, record.rx_ns, severity, text) for severity, text in found]
+
+    def of_mode(self, solution: Solution) -> list[Output]:
+        """Return an event if the mode of a solution is another, or the fixes that it rests on are."""
+        mode = solution.mode, solution.sources & FIXES
+        if mode == self._mode:
+            return []
+        self._mode = mode
+        fixes = [s.name.lower() for s in Source if s.name and s & FIXES & solution.sources]
+        if solution.mode is Mode.FIXED:
+            why = " and ".join(fixes) + " fixes"
+        elif solution.protection is not None:
+            why = f"no fixes; protection level {solution.protection:.0f} m"
+        else:
+            why = "no fixes"
+        severity = Severity.WARNING if solution.mode is Mode.UNTRUSTED else Severity.NOTICE
+        return [Event(solution.t_ns, solution.rx_ns, severity, f"navigation {solution.mode}: {why}")]
+
+
+def _of_beliefs(
+    before: tuple[int, ...], state: State, t_ns: int, settings: Settings
+) -> list[tuple[Severity, str]]:
+    found: list[tuple[Severity, str]] = []
+    for i, (now, p) in enumerate(zip(state.reported, state.false, strict=True)):
+        if now == (before[i] if i < len(before) else 0):
+            continue
+        text = {
+            0: "is used again",
+            SUSPECT: f"is suspect: false with probability {p:.2f}",
+            EXCLUDED: f"is excluded: false with probability {p:.4f}",
+        }[now]
+        severity = Severity.WARNING if now else Severity.NOTICE
+        found.append((severity, f"{source_name(i, state)} {text}"))
+        by_gnss = sources(state, t_ns, settings) & Source.GNSS
+        if i == AIRSPEED and now == EXCLUDED and not by_gnss:
+            text = FALSE_AIRSPEED + USE_AIRSPEED.get(settings.config.output.profile, "")
+            found.append((Severity.WARNING, text))
+    return found
+
+
+def _of_scatter(name: str, scatter: Scatter) -> str:
+    if not scatter.noisy:
+        return f"{name} scatters as it states again"
+    return f"{name} scatters {math.sqrt(scatter.factor):.1f} times as much as it states: used with that sigma"
+
+
+def _of_bound(g: Guarantee) -> str:
+    if g.widening <= 1.0:
+        return "fixes of the window agree with the stated errors again"
+    return f"fixes of the window contradict the stated errors: guaranteed bound {g.widening:.1f} times wider"
