@@ -44,6 +44,7 @@ STUDIES = {
     "map": "companion.study.map_smoothing:command",
     "order": "companion.study.order:command",
     "outages": "companion.study.outages:command",
+    "wrong-sensors": "companion.study.wrong_sensors:command",
     "schemes": "companion.study.schemes:command",
     "schuler": "companion.study.schuler_data:command",
     "weights": "companion.study.weights:command",

@@ -88,7 +88,7 @@ def test_seeds_are_not_negative() -> None:
 
 def test_page_names_the_commands_with_presets() -> None:
     page = (Path(__file__).parents[1] / "docs" / "configuration.md").read_text()
-    (named,) = re.findall(r"The commands (.*) have\s`--preset NAME` and `--set`", page)
+    (named,) = re.findall(r"The commands (`[^.]*`) have\s`--preset NAME` and `--set`", page)
     with_presets = {name for name, command in commands().items() if has_option(command, "preset")}
     assert set(re.findall("`(.*?)`", named)) == with_presets
     assert all(has_option(commands()[name], "pairs") for name in with_presets)

@@ -131,17 +131,18 @@ def with_beacons_and_outages(
 
     With beacons the log is read twice: first for its track.
     """
+    listed = [] if beacons is None else simulated_rsbn.read_beacons(beacons)  # a mistake costs no reading
     log_inputs = open_inputs(log)
-    if beacons is None and not outages:
+    if not listed and not outages:
         return log_inputs, ""
     records = iter(log_inputs.records)
     first = next(records, None)
     if first is None:
         raise LogError(f"{log} contains no messages: nothing to replay")
     merged, note = chain([first], records), ""
-    if beacons is not None:
+    if listed:
         track = simulated_rsbn.extract_track(open_inputs(log).records, config)
-        measurements = simulated_rsbn.simulate_measurements(simulated_rsbn.read_beacons(beacons), track, seed)
+        measurements = simulated_rsbn.simulate_measurements(listed, track, seed)
         numbers = sorted({answer.beacon for answer in measurements})
         note = (
             f"{len(measurements)} RSBN measurements of {len(numbers)} beacons"
