@@ -40,7 +40,7 @@ from companion.navigator import INPUTS_USED, Navigator, begins_again, guarded, o
 from companion.navigator.channel import Nominal, Transition
 from companion.navigator.hypotheses import MOST_BEACONS, VELOCITY, Hypotheses, Model
 from companion.navigator.inertial_track import Point
-from companion.navigator.state import Beacon, Settings, State, hypotheses, initial, levelled, source_name
+from companion.navigator.state import Beacon, Settings, State, hypotheses, levelled, source_name
 from companion.navigator.step import step
 from companion.records import (
     AirData,
@@ -329,7 +329,7 @@ class _Path:
         config = self._with_gusts(config)
         self._model = _PlainModel(config, 0, len(self._beacons))
         self._settings = Settings(config, self._model)
-        self._state = self._with_beacons(initial(self._settings))
+        self._state = self._with_beacons(State())
         self._Phi, self._Q = np.eye(0), np.eye(0)
 
     def begin(self, run: int) -> None:

@@ -226,7 +226,7 @@ def continuous_tau(T: float, alpha: float, target: npt.ArrayLike, sigma: float =
         best = solve(schuler_row("gamma", -x), a_mid, sigma)
         used = np.flatnonzero(np.abs(best.weights) > 1e-12 * np.abs(best.weights).sum())
         times, weights = x[used] + h, best.weights[used]
-        peaks = _extrema(x, best.dual, h)
+        peaks = _extrema(x, best.dual)
         excess = max(1.0, float(np.abs(schuler_row("gamma", -peaks) @ best.dual).max()) / sigma)
         if excess <= 1.0 + REMEZ_TOLERANCE:
             break
@@ -235,7 +235,7 @@ def continuous_tau(T: float, alpha: float, target: npt.ArrayLike, sigma: float =
     return Continuous(times, weights, best.bound, dual, (best.bound - float(a @ dual)) / best.bound)
 
 
-def _extrema(x: Floats, dual: Floats, h: float) -> Floats:
+def _extrema(x: Floats, dual: Floats) -> Floats:
     """Find the local extrema of the dual polynomial from the grid x (n,), by Newton on its slope."""
     value = np.abs(schuler_row("gamma", -x) @ dual)
     inner = np.flatnonzero((value[1:-1] >= value[:-2]) & (value[1:-1] >= value[2:])) + 1

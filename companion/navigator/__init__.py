@@ -28,7 +28,7 @@ from companion.navigator.progress import SILENT_INS_NS, births_due, with_births
 from companion.navigator.receiver_choice import ReceiverChoice
 from companion.navigator.solution import is_bound_due, refresh_bound, resolve_pending, solve
 from companion.navigator.stale_data import REPORT_EVERY, StaleDataDetector
-from companion.navigator.state import Settings, State, Step, initial, is_new_fix
+from companion.navigator.state import Settings, State, Step, is_new_fix
 from companion.navigator.step import INPUTS_USED, uses
 from companion.plausibility import ImplausibleField, implausible_field
 from companion.records import (
@@ -95,7 +95,7 @@ class Navigator:
     def __init__(self, config: Config, model: Model | None = None) -> None:
         self._settings = Settings(config, model or Model(config))
         self._uses = uses(self._settings)
-        self._state = initial(self._settings)  # after the last of `_past`
+        self._state = State()  # after the last of `_past`
         self._past = PastStates()
         self._newest: Input | None = None  # the last record that was not late
         self._roll_back: _RollBack | None = None
@@ -379,7 +379,7 @@ def tuned(state: State, before: Settings, config: Config) -> tuple[Settings, Sta
     """
     settings, old = Settings.of(config), before.config
     if begins_again(old, config):
-        return settings, initial(settings)._replace(
+        return settings, State()._replace(
             next_ns=state.next_ns, origin=state.origin, sensors=state.sensors, level=state.level
         )
     state = state._replace(

@@ -24,12 +24,11 @@ CLIMB_S = 2.0  # time constant of the climb taken from the pressure altitude
 
 
 class Reckoner(NamedTuple):
-    """What is needed to go on: last attitude, airspeed, pressure (Pa), None before one; climb (m/s)."""
+    """What is needed to go on: last attitude, airspeed and pressure (Pa), None before one."""
 
     attitude: Attitude | None = None
     air: AirData | None = None
     static: float | None = None
-    climb: float = 0.0
 
 
 def sense(r: Reckoner, record: Attitude | AirData | Pressure) -> Reckoner:

@@ -14,7 +14,7 @@ from companion.navigator.progress import (
     carried,
     decided,
     estimated_velocity,
-    is_driven_by,
+    is_driven_by_imu,
     is_silent,
     nearer,
     propagated,
@@ -96,7 +96,7 @@ def _latency_velocity(state: State, t_ns: int) -> tuple[State, Vector2]:
     velocity is taken less a slow mean of its estimated error; a held velocity is far off in every turn.
     """
     v_n = estimated_velocity(state)
-    if not is_driven_by(state, "imu"):
+    if not is_driven_by_imu(state):
         return state._replace(velocity_error=None), v_n
     assert state.nominal is not None
     nominal, mean = state.nominal.point.v_n, state.velocity_error
@@ -150,37 +150,28 @@ def rsbn(state: State, record: RsbnFix, settings: Settings) -> Step:
 
 def _beacon(state: State, record: RsbnFix, settings: Settings) -> tuple[State, int, list[Output]]:
     """The number of the beacon that answered; a new one takes a new place, or the most silent one's."""
-    assert state.bank is not None
-    bank = state.bank
-    place, t_ns = (record.lat, record.lon, record.alt), record.t_ns
-    for k, beacon in enumerate(state.beacons):
-        if beacon.identity == record.beacon:
-            beacons = list(state.beacons)
-            beacons[k] = Beacon(record.beacon, place, t_ns)
-            out: list[Output] = []
-            if place != beacon.place:
-                known = hypotheses(state, settings)
-                first = known.layout.n_base - len(known.biases) + 2 * k
-                sigma = known.biases[2 * k : 2 * k + 2]
-                state = state._replace(bank=banks.renew(bank, (first, first + 1), sigma))
-                text = f"beacon {record.beacon} states another position"
-                out = [Event(record.t_ns, record.rx_ns, Severity.NOTICE, text)]
-            return state._replace(beacons=tuple(beacons)), k, out
-    new = Beacon(record.beacon, place, t_ns)
-    if len(state.beacons) < MOST_BEACONS:
-        larger = settings.model.with_beacon(bank, len(state.beacons))
-        if not state.beacons and state.gnss_taken is not None:
+    bank, beacons, out = state.bank, list(state.beacons), list[Output]()
+    assert bank is not None
+    new = Beacon(record.beacon, (record.lat, record.lon, record.alt), record.t_ns)
+    k = next((i for i, beacon in enumerate(beacons) if beacon.identity == new.identity), None)
+    if k is None and len(beacons) < MOST_BEACONS:
+        larger = settings.model.with_beacon(bank, len(beacons))
+        if not beacons and state.gnss_taken is not None:
             larger = settings.model.doubted(larger)
-        state = state._replace(bank=larger, beacons=(*state.beacons, new))
+        state = state._replace(bank=larger, beacons=(*beacons, new))
         state = state._replace(false=(*state.false, 0.0, 0.0), reported=(*state.reported, 0, 0))
-        return state, len(state.beacons) - 1, []
-    k = min(range(len(state.beacons)), key=lambda i: state.beacons[i].last_ns)
-    known = hypotheses(state, settings)
-    first = known.layout.n_base - len(known.biases) + 2 * k
-    renewed = banks.renew(bank, (first, first + 1), known.biases[2 * k : 2 * k + 2])
-    beacons = list(state.beacons)
+        return state, len(beacons), out
+    if k is None:
+        k = min(range(len(beacons)), key=lambda i: beacons[i].last_ns)
+    elif new.place != beacons[k].place:
+        text = f"beacon {record.beacon} states another position"
+        out.append(Event(record.t_ns, record.rx_ns, Severity.NOTICE, text))
+    if (new.identity, new.place) != (beacons[k].identity, beacons[k].place):
+        known = hypotheses(state, settings)
+        first, sigma = known.bias(k), known.biases[2 * k : 2 * k + 2]
+        state = state._replace(bank=banks.renew(bank, (first, first + 1), sigma))
     beacons[k] = new
-    return state._replace(bank=renewed, beacons=tuple(beacons)), k, []
+    return state._replace(beacons=tuple(beacons)), k, out
 
 
 def _begun(state: State, record: Gnss | RsbnFix, settings: Settings) -> State:

@@ -121,6 +121,10 @@ class Hypotheses(NamedTuple):
         """Source of beacon k's range."""
         return len(SOURCES) + 2 * k + 1
 
+    def bias(self, k: int) -> int:
+        """State that is the bias of beacon k's azimuth; that of its range is the next one."""
+        return self.layout.n_base - len(self.biases) + 2 * k
+
     def elsewhere(self, k: int) -> int:
         """Fault that beacon k is not where it states."""
         return 6 + 3 * k

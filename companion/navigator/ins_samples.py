@@ -56,7 +56,7 @@ def position(state: State, record: LocalPosition, settings: Settings) -> Step:
     dt = (new.t_ns - last.t_ns) * 1e-9
     if dt <= 0.0 or new.t_ns < nominal.t_ns:
         return state, []
-    state, out = _jump_removed(state, last, new, record, settings)
+    state, out = _jump_removed(state, last, new, record)
     a_n = ((new.v_n[0] - last.v_n[0]) / dt, (new.v_n[1] - last.v_n[1]) / dt)
     assert state.nominal is not None
     nominal = state.nominal._replace(point=new, a_n=a_n)
@@ -67,7 +67,7 @@ def position(state: State, record: LocalPosition, settings: Settings) -> Step:
     return state, [*out, *more]
 
 
-def _jump_removed(state: State, last: Point, new: Point, record: LocalPosition, settings: Settings) -> Step:
+def _jump_removed(state: State, last: Point, new: Point, record: LocalPosition) -> Step:
     """Move the errors with a jump of the channel; across a silence what is left may be a turn or a step."""
     out = list[Output]()
     north, east, _ = inertial_track.beyond(last, new)

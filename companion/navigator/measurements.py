@@ -50,13 +50,12 @@ CORRECTOR_GATE = 12.5
 
 
 class Taken(NamedTuple):
-    """The bank after a measurement; its normalised squared innovation by the leading row, its degrees of
-    freedom, and whether the leading row took it.
+    """The bank after a measurement; its normalised squared innovation by the leading row, and whether that
+    row took it.
     """
 
     bank: Bank
     nis: float
-    freedom: int
     accepted: bool
 
 
@@ -95,7 +94,7 @@ def gnss_position(
         known.settings,
         outlier=OUTLIER["position"],
     )
-    return _taken(after, seen, 2)
+    return _taken(after, seen)
 
 
 def other_receiver(bank: Bank, channel: Channel) -> Bank:
@@ -149,7 +148,7 @@ def gnss_velocity(
     after, seen = banks.update(
         bank, layout, seen_by, None, R, VELOCITY, known.settings, outlier=OUTLIER["velocity"]
     )
-    return _taken(after, seen, 2)
+    return _taken(after, seen)
 
 
 def airspeed(
@@ -173,18 +172,18 @@ def airspeed(
     )
     heard = after.seen.copy()
     heard[AIRSPEED] = after.t
-    return _taken(after._replace(seen=heard), seen, 2)
+    return _taken(after._replace(seen=heard), seen)
 
 
 def foreign_velocity(bank: Bank, known: Hypotheses, channel: OwnChannel, apart: Vector2) -> Taken:
     """Take the velocity of the autopilot's own estimator; `apart` is nominal minus foreign (m/s)."""
-    row = own_error_model.foreign_row(channel.settings, channel.layout, apart)
+    row = own_error_model.foreign_row(channel.settings, apart)
     H = np.zeros((2, known.layout.n_base))
     H[:, : channel.n] = row.H
     after, seen = banks.update(
         bank, known.layout, row.y, H, row.R, None, known.settings, outlier=OUTLIER["velocity"]
     )
-    return _taken(after, seen, 2)
+    return _taken(after, seen)
 
 
 def corrector(bank: Bank, known: Hypotheses, rows: CorrectorRows) -> Taken:
@@ -196,7 +195,7 @@ def corrector(bank: Bank, known: Hypotheses, rows: CorrectorRows) -> Taken:
     )
     outlier = -0.5 * spread - CORRECTOR_GATE * len(rows.z)
     after, seen = banks.update(bank, known.layout, rows.z, H, rows.R, None, known.settings, outlier=outlier)
-    return _taken(after, seen, len(rows.z))
+    return _taken(after, seen)
 
 
 def sight(
@@ -215,11 +214,10 @@ def sight(
     `variance` is that of its noise, the unknown height included.
     """
     layout = known.layout
-    n = layout.n_base
     place = layout.starts[BEACON_GROUP] + np.arange(2)
     own_slot = place[0 if isinstance(z, Azimuth) else 1]  # the bank fills in a one here
     source = known.azimuth(beacon) if isinstance(z, Azimuth) else known.range(beacon)
-    bias = n - len(known.biases) + 2 * beacon + (0 if isinstance(z, Azimuth) else 1)
+    bias = known.bias(beacon) + (0 if isinstance(z, Azimuth) else 1)
 
     def linearised(bank: Bank) -> tuple[Floats, Floats]:
         elsewhere = (bank.fault[:, BEACON_GROUP] == known.elsewhere(beacon)).astype(np.float64)
@@ -243,7 +241,7 @@ def sight(
     after, seen = banks.update(
         bank, layout, linearised, None, R, source, known.settings, outlier=OUTLIER[kind]
     )
-    return _taken(after, seen, 1)
+    return _taken(after, seen)
 
 
 def sight_residual(z: Azimuth | Range, centre: Vector2) -> float:
@@ -253,5 +251,5 @@ def sight_residual(z: Azimuth | Range, centre: Vector2) -> float:
     return wrap_angle(apart) if isinstance(z, Azimuth) else apart
 
 
-def _taken(bank: Bank, seen: Innovation, freedom: int) -> Taken:
-    return Taken(bank, float(seen.nis[seen.leading]), freedom, not bool(seen.refused[seen.leading]))
+def _taken(bank: Bank, seen: Innovation) -> Taken:
+    return Taken(bank, float(seen.nis[seen.leading]), not bool(seen.refused[seen.leading]))

@@ -1,6 +1,6 @@
 """Own channel: dead reckoning by whatever the autopilot's sensors allow, best first.
 
-    imu      specific force turned by the autopilot's attitude, from 4 Hz up
+    imu      specific force turned by the autopilot's attitude, from 3.5 Hz up
     air      airspeed along the nose, where there is a sensor and the aircraft flies
     foreign  velocity of the autopilot's estimator, where it is not fed by us
     hold     the last velocity
@@ -19,7 +19,7 @@ from companion.navigator import air_data_channel, own_error_model, strapdown_cha
 from companion.navigator.air_data_channel import Reckoner
 from companion.navigator.channel import DOPPLER_S, Nominal, Transition, moved
 from companion.navigator.inertial_track import Point
-from companion.navigator.own_error_model import By, Ground, Layout, Propagator
+from companion.navigator.own_error_model import By, Ground, Propagator
 from companion.navigator.strapdown_channel import Strap
 from companion.records import AirData, Gnss, LocalPosition, RsbnFix, Vector2, Vector3
 from companion.units import G0, Floats
@@ -109,13 +109,12 @@ class OwnChannel:
             doppler_s=DOPPLER_S,
             hold_m_s_sqrt_s=HOLD_M_S_SQRT_S,
         )
-        self.layout = Layout(foreign=True, latency=True)
-        self.propagator = Propagator(self.settings, self.layout)
-        self.n, self.latency = self.layout.n, self.layout.latency_at
+        self.propagator = Propagator(self.settings)
+        self.n, self.latency = own_error_model.N, own_error_model.LATENCY
 
     def prior(self) -> Floats:
         """First covariances (grades, n, n)."""
-        return own_error_model.prior(self.settings, self.layout, self.propagator.grades)
+        return own_error_model.prior(self.settings)
 
     def transition(self, nominal: Nominal) -> Transition:
         """Phi and Q of the interval."""

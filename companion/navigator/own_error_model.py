@@ -2,7 +2,7 @@
 
 The nominal trajectory is integrated from what the autopilot streams, the best source first:
 
-    imu      specific force turned to the level frame by the autopilot's attitude (from `IMU_HZ` up)
+    imu      specific force turned to the level frame by the autopilot's attitude
     air      the velocity through the air: airspeed along the nose
     foreign  the velocity of another estimator (LOCAL_POSITION_NED not fed by us)
     hold     the last velocity
@@ -45,47 +45,22 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
+from companion.records import Vector2
 from companion.units import Floats
 
-Vector2 = tuple[float, float]
-Vector3 = tuple[float, float, float]
 By = Literal["imu", "air", "foreign", "hold"]
-
-IMU_HZ = 4.0  # slower samples are not integrated
-LONGEST_S = 1.0  # close an interval at this length even without a measurement: Q is of low order in it
 
 POSITION, VELOCITY, WIND = slice(0, 2), slice(2, 4), slice(4, 6)
 SCALE, HEADING, CRAB = 6, 7, 8
 TILT, ACCELEROMETER, DRIFT, GUST = slice(9, 11), slice(11, 13), slice(13, 15), slice(15, 17)
-DOPPLER = slice(17, 19)
-N_BASE = 19
+DOPPLER, FOREIGN = slice(17, 19), slice(19, 21)
+LATENCY = 21
+N = 22
 
 AIRSPEED_NOISE_M_S = 1.0  # of half a second's mean: pitot, angle of attack, sideslip
 AIRSPEED_MANOEUVRE_S = 0.2  # and per acceleration; 0.14 to 0.17 in an aerobatic flight (TestLog2)
 LASTING = 2.0  # turbulence by airspeed alone: how many times longer than the gusts it lasts
 ALONG = 1.2  # and how much greater it is along the nose than across
-
-
-class Layout(NamedTuple):
-    """Which optional states follow the 19 basic ones."""
-
-    foreign: bool = False
-    latency: bool = False
-
-    @property
-    def n(self) -> int:
-        """Number of states."""
-        return N_BASE + 2 * self.foreign + self.latency
-
-    @property
-    def foreign_at(self) -> slice:
-        """Where the foreign velocity error is."""
-        return slice(N_BASE, N_BASE + 2)
-
-    @property
-    def latency_at(self) -> int:
-        """Where the GNSS latency is."""
-        return N_BASE + 2 * self.foreign
 
 
 class Amplitudes(NamedTuple):
@@ -151,13 +126,6 @@ class Interval(NamedTuple):
     e2: float = 0.0
     V: Vector2 = (0.0, 0.0)
     noise: float = 0.0
-
-
-class Transition(NamedTuple):
-    """x <- Phi x, P <- Phi P Phi' + Q[grade]; Phi (n, n), Q (grades, n, n)."""
-
-    Phi: Floats
-    Q: Floats
 
 
 class Row(NamedTuple):
@@ -232,38 +200,26 @@ def add_hold(i: Interval, dt: float) -> Interval:
 # ---------------------------------------------------------------------------------------------------------
 
 
-def prior(settings: Amplitudes, layout: Layout, grades: tuple[float, ...]) -> Floats:
+def prior(settings: Amplitudes) -> Floats:
     """Return the first covariances (grades, n, n); the estimate is zero."""
     s = settings
-    sigma = np.empty((len(grades), layout.n))
+    sigma = np.empty((len(GRADES), N))
     sigma[:, POSITION], sigma[:, VELOCITY], sigma[:, WIND] = s.position_m, s.velocity_m_s, s.wind_m_s
     sigma[:, SCALE], sigma[:, HEADING], sigma[:, CRAB] = s.scale, s.heading, s.crab
     sigma[:, TILT], sigma[:, ACCELEROMETER], sigma[:, DRIFT] = s.tilt, s.accelerometer_m_s2, s.drift_m
     sigma[:, GUST], sigma[:, DOPPLER] = s.gust_m_s, s.doppler_m_s
-    coarser = np.array(grades)
+    sigma[:, FOREIGN], sigma[:, LATENCY] = s.foreign_m_s, s.latency_s
     scaled = np.r_[HEADING, CRAB, TILT, ACCELEROMETER]
-    sigma[:, scaled] *= coarser[:, None]
-    if layout.foreign:
-        sigma[:, layout.foreign_at] = s.foreign_m_s
-    if layout.latency:
-        sigma[:, layout.latency_at] = s.latency_s
-    return np.asarray(np.square(sigma)[:, :, None] * np.eye(layout.n), dtype=np.float64)
+    sigma[:, scaled] *= np.array(GRADES)[:, None]
+    return np.asarray(np.square(sigma)[:, :, None] * np.eye(N), dtype=np.float64)
 
 
 class Propagator:
-    """Makes Phi and Q of intervals; holds the constants of one configuration, no state.
+    """Makes Phi and Q of intervals; holds the constants of one configuration, no state."""
 
-    Parameters
-    ----------
-    settings, layout, grades
-        The error model, its optional states, and the ladder.
-    """
-
-    def __init__(self, settings: Amplitudes, layout: Layout, grades: tuple[float, ...] = GRADES) -> None:
-        self.settings, self.layout, self.grades = settings, layout, grades
-        s, n = settings, layout.n
-        rate, density = np.zeros(n), np.zeros((len(grades), n))
-        coarser = np.array(grades)
+    def __init__(self, settings: Amplitudes) -> None:
+        self.settings = s = settings
+        rate, density, coarser = np.zeros(N), np.zeros((len(GRADES), N)), np.array(GRADES)
         for where, sigma, tau, scaled in (
             (SCALE, s.scale, s.slow_s, False),
             (HEADING, s.heading, s.slow_s, True),
@@ -278,25 +234,23 @@ class Propagator:
             amplitude = sigma * (coarser if scaled else np.ones_like(coarser))
             density[:, where] = ((2.0 / tau) * amplitude**2).reshape(-1, *([1] * isinstance(where, slice)))
         density[:, WIND] = s.wind_change_m_s_sqrt_s**2
-        if layout.foreign:
-            density[:, layout.foreign_at] = s.foreign_change_m_s_sqrt_s**2
-        if layout.latency:
-            density[:, layout.latency_at] = s.latency_change_s_sqrt_s**2
+        density[:, FOREIGN] = s.foreign_change_m_s_sqrt_s**2
+        density[:, LATENCY] = s.latency_change_s_sqrt_s**2
         self._rate, self._density = rate, density
         self._coarser2 = np.square(coarser)
-        self._diagonal = np.arange(n)
-        self._wind_seen = np.zeros((n, n))
+        self._diagonal = np.arange(N)
+        self._wind_seen = np.zeros((N, N))
         for k in (0, 1):
             self._wind_seen[2 + k, 2 + k] = s.wind_change_m_s_sqrt_s**2
             self._wind_seen[2 + k, 4 + k] = self._wind_seen[4 + k, 2 + k] = -(s.wind_change_m_s_sqrt_s**2)
 
-    def transition(self, i: Interval) -> Transition:
-        """Return Phi (n, n) and Q (grades, n, n) of an interval of at most `LONGEST_S`."""
+    def transition(self, i: Interval) -> tuple[Floats, Floats]:
+        """Return Phi (n, n) and Q (grades, n, n) of an interval of about a second."""
         T = i.seconds
         decay = np.exp(-T * self._rate)
-        Phi = np.zeros((self.layout.n, self.layout.n))
+        Phi = np.zeros((N, N))
         Phi[self._diagonal, self._diagonal] = decay
-        Q = np.zeros((len(self.grades), self.layout.n, self.layout.n))
+        Q = np.zeros((len(GRADES), N, N))
         Q[:, self._diagonal, self._diagonal] = self._density * self._grown(T, decay)
         if i.by == "imu":
             self._inertial(i, T, Phi, Q)
@@ -306,7 +260,7 @@ class Propagator:
             self._foreign(T, Phi, Q)
         else:
             _velocity_noise(Phi, Q, T, self.settings.hold_m_s_sqrt_s**2 * self._coarser2)
-        return Transition(Phi, Q)
+        return Phi, Q
 
     def _grown(self, T: float, decay: Floats) -> Floats:
         """Variance that unit density adds to each state in `T` seconds."""
@@ -348,7 +302,7 @@ class Propagator:
         Q[:, 3, CRAB] = Q[:, CRAB, 3] = n * crab
 
     def _foreign(self, T: float, Phi: Floats, Q: Floats) -> None:
-        at = self.layout.foreign_at.start
+        at = FOREIGN.start
         noise = self.settings.foreign_noise_m_s**2
         change = self.settings.foreign_change_m_s_sqrt_s**2 * T
         for k in (0, 1):
@@ -371,7 +325,7 @@ class Propagator:
         manoeuvre
             Mean acceleration above that of level flight (m/s^2): the angle of attack grows with it.
         """
-        H = np.zeros((2, self.layout.n))
+        H = np.zeros((2, N))
         H[0, 2] = H[1, 3] = H[0, 4] = H[1, 5] = 1.0
         H[0, GUST.start] = H[1, GUST.start + 1] = 1.0
         H[:, SCALE] = -V[0], -V[1]
@@ -405,10 +359,10 @@ def nose_covariance(V: Vector2, along: float, across: float) -> Floats:
 # ---------------------------------------------------------------------------------------------------------
 
 
-def foreign_row(settings: Amplitudes, layout: Layout, apart: Vector2) -> Row:
+def foreign_row(settings: Amplitudes, apart: Vector2) -> Row:
     """Return the row of a foreign velocity: nominal minus foreign (m/s); not in intervals by `foreign`."""
-    H = np.zeros((2, layout.n))
-    at = layout.foreign_at.start
+    H = np.zeros((2, N))
+    at = FOREIGN.start
     H[0, 2] = H[1, 3] = 1.0
     H[0, at] = H[1, at + 1] = -1.0
     return Row(np.array(apart), H, np.eye(2) * settings.foreign_noise_m_s**2)

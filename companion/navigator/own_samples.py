@@ -22,7 +22,7 @@ from companion.navigator.progress import (
     carried,
     decided,
     estimated_velocity,
-    is_driven_by,
+    is_driven_by_imu,
     propagated,
     solved_if_due,
 )
@@ -56,18 +56,16 @@ def airspeed_sensor(state: State, record: AirspeedSensor, settings: Settings) ->
 
 def attitude(state: State, record: Attitude, settings: Settings) -> Step:
     """Remember an attitude."""
-    return _straight_on(_sensed(state, record), record, settings)
+    s = state.sensors
+    s = s._replace(strap=strapdown_channel.sense(s.strap, record), air=air_data_channel.sense(s.air, record))
+    return _straight_on(state._replace(sensors=s), record, settings)
 
 
 def pressure(state: State, record: Pressure, settings: Settings) -> Step:
     """Remember a static pressure."""
-    return _straight_on(_sensed(state, record), record, settings)
-
-
-def _sensed(state: State, record: Attitude | Pressure) -> State:
     s = state.sensors
-    s = s._replace(strap=strapdown_channel.sense(s.strap, record), air=air_data_channel.sense(s.air, record))
-    return state._replace(sensors=s)
+    s = s._replace(air=air_data_channel.sense(s.air, record))
+    return _straight_on(state._replace(sensors=s), record, settings)
 
 
 def _straight_on(state: State, record: Stamped, settings: Settings) -> Step:
@@ -125,7 +123,7 @@ def air_data(state: State, record: AirData, settings: Settings) -> Step:
     if leads:
         state = state._replace(sensors=s._replace(steady=record))
         return _driven(state, record, "air", V, settings)
-    if not is_driven_by(state, "imu"):
+    if not is_driven_by_imu(state):
         return state, []
     state = carried(state, record.t_ns, settings)
     assert state.nominal is not None
@@ -227,13 +225,13 @@ def _driven(state: State, record: Stamped, by: By, sample: Vector2 | None, setti
         nominal = own_channel.by_imu(nominal, sample, s, record.t_ns)._replace(a_n=s.accelerations[-1][:2])
     else:
         nominal = own_channel.by_velocity(nominal, sample or (0.0, 0.0), record.t_ns)
-    state = state._replace(nominal=_at_height(nominal, s, state))
+    state = state._replace(nominal=_at_height(nominal, s))
     if nominal.pending_s >= NEAR_S:
         state = decided(propagated(state, settings), record, settings)
     return solved_if_due(state, record, settings)
 
 
-def _at_height(nominal: Nominal, s: Sensors, state: State) -> Nominal:
+def _at_height(nominal: Nominal, s: Sensors) -> Nominal:
     """With the height of the pressure, and its rate as the climb."""
     if s.air.static is None:
         return nominal

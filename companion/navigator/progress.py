@@ -14,20 +14,19 @@ from companion.estimate import bank as banks
 from companion.estimate.bank import Bank
 from companion.nav.geometry import displace
 from companion.navigator import minimax_bound, own_channel, parallel_filters
-from companion.navigator.channel import Nominal, moved
+from companion.navigator.channel import moved
 from companion.navigator.hypotheses import AIRSPEED, JAMMED
 from companion.navigator.inertial_track import Point
-from companion.navigator.own_error_model import By
 from companion.navigator.solution import solve
 from companion.navigator.state import (
     EXCLUDED,
-    JAMMED_NS,
     SUSPECT,
     Settings,
     State,
     Step,
     estimate,
     hypotheses,
+    is_jammed,
 )
 from companion.records import Gnss, Stamped, Vector2
 from companion.units import SECOND_NS
@@ -81,9 +80,7 @@ def _born(state: State, settings: Settings) -> tuple[Bank, Bank]:
     known = hypotheses(state, settings)
     if not banks.births_due(bank, known.settings):
         return bank, banks.jump_births(bank, known.layout, known.settings)
-    now = state.nominal.t_ns if state.nominal else 0
-    jammed = state.jammed_ns is not None and now - state.jammed_ns < JAMMED_NS
-    factor = {0: JAMMED, 1: JAMMED} if jammed else None
+    factor = {0: JAMMED, 1: JAMMED} if is_jammed(state) else None
     return bank, banks.births(bank, known.layout, known.settings, factor)
 
 
@@ -138,15 +135,16 @@ def nearer(state: State, settings: Settings) -> State:
     assert nominal is not None
     if nominal.interval is None:
         return state  # an INS of its own cannot be corrected
+    by = nominal.interval.by
     x = estimate(state, settings).x
     n, e, vn, ve = (float(c) for c in x[:4])
     share = settings.config.estimator.feedback
-    if math.hypot(n, e) > FAR_M or (math.hypot(vn, ve) > FAST_M_S and nominal.interval.by == "imu"):
+    if math.hypot(n, e) > FAR_M or (math.hypot(vn, ve) > FAST_M_S and by == "imu"):
         share = 1.0
     if share == 0.0:
         return state
     n, e, vn, ve = -share * n, -share * e, -share * vn, -share * ve
-    if nominal.interval.by in ("air", "foreign"):
+    if by in ("air", "foreign"):
         vn = ve = 0.0  # the velocity is the sensor's, and its error follows from other states
     state = shifted(state, n, e, (vn, ve), nominal.t_ns)
     sums = state.sensors.sums
@@ -158,7 +156,7 @@ def nearer(state: State, settings: Settings) -> State:
     velocity = (v[0] + vn, v[1] + ve)
     point = Point(nominal.t_ns, place._replace(alt=nominal.point.position.alt), (*velocity, v[2]))
     nominal = nominal._replace(point=point, since=point)
-    return state._replace(nominal=own_channel.restart(nominal, _driver(nominal), velocity))
+    return state._replace(nominal=own_channel.restart(nominal, by, velocity))
 
 
 def shifted(state: State, north: float, east: float, v_n: Vector2 = (0.0, 0.0), t_ns: int = 0) -> State:
@@ -229,13 +227,7 @@ def estimated_velocity(state: State) -> Vector2:
     return v_n[0] - float(x[2]), v_n[1] - float(x[3])
 
 
-def is_driven_by(state: State, by: By) -> bool:
-    """Whether the nominal trajectory is driven by a sensor now."""
-    return (
-        state.nominal is not None and state.nominal.interval is not None and state.nominal.interval.by == by
-    )
-
-
-def _driver(nominal: Nominal) -> By:
-    assert nominal.interval is not None
-    return nominal.interval.by
+def is_driven_by_imu(state: State) -> bool:
+    """Whether the IMU drives the nominal trajectory now."""
+    interval = state.nominal.interval if state.nominal else None
+    return interval is not None and interval.by == "imu"

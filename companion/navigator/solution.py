@@ -90,7 +90,7 @@ def solve(state: State, rx_ns: int, settings: Settings) -> Step:
     bound_n, velocity_bound_n = _about(error, velocity_error, promised)
     witness = bool(rests_on & (Source.AZIMUTH | Source.RANGE))
     suspicion = _is_suspicious(state, banks.heard_sources(bank, known.layout)[VELOCITY])
-    held = _trust(state, bool(fixes), suspicion, bound_n, protection, t_ns, settings)
+    held = _trust(state, bool(fixes), suspicion, protection, t_ns, settings)
     north, east, down = point.v_n
     lat, lon, alt = displace(*point.position, -error[0], -error[1], 0.0)
     if abs(lat) > math.pi / 2.0:
@@ -237,7 +237,6 @@ def _trust(
     state: State,
     fixes: bool,
     suspicion: bool,
-    bound_n: Vector2 | None,
     protection: float,
     t_ns: int,
     settings: Settings,

@@ -106,11 +106,6 @@ class State(NamedTuple):
 Step = tuple[State, list[Output]]
 
 
-def initial(settings: Settings) -> State:
-    """The state before anything was received."""
-    return State()
-
-
 def is_new_fix(record: Gnss, state: State) -> bool:
     """Whether this is a new fix: an autopilot repeats its receiver's last one."""
     last = state.gnss
@@ -124,13 +119,19 @@ def hypotheses(state: State, settings: Settings) -> Hypotheses:
     return settings.model.hypotheses(len(state.beacons), by_air, has_witness(state, settings))
 
 
+def is_jammed(state: State) -> bool:
+    """Whether the receiver reported jamming or spoofing within the last seconds."""
+    now = state.nominal.t_ns if state.nominal else 0
+    return state.jammed_ns is not None and now - state.jammed_ns < JAMMED_NS
+
+
 def has_witness(state: State, settings: Settings) -> bool:
     """Whether a beacon was received within its timeout, or the receiver reports jamming or spoofing."""
     if state.bank is None:
         return False
-    now = state.nominal.t_ns if state.nominal else 0
-    if state.jammed_ns is not None and now - state.jammed_ns < JAMMED_NS:
+    if is_jammed(state):
         return True
+    now = state.nominal.t_ns if state.nominal else 0
     timeout = round(1e9 * settings.config.rsbn.timeout_s)
     return any(now - beacon.last_ns < timeout for beacon in state.beacons)
 

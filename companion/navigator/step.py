@@ -14,7 +14,7 @@ from typing import Any
 from companion.navigator import fixes, ins_samples, own_samples
 from companion.navigator.local_origin import LIVE_WINDOW_NS, infer_origin
 from companion.navigator.own_channel import OwnChannel, Sensors
-from companion.navigator.state import Settings, State, Step, initial
+from companion.navigator.state import Settings, State, Step
 from companion.records import (
     AirData,
     AirspeedSensor,
@@ -73,9 +73,7 @@ def _reboot(state: State, record: Reboot, settings: Settings) -> Step:
     if isinstance(settings.model.channel, OwnChannel) and not restarted:
         state = state._replace(sensors=Sensors(), gnss=None, gnss_fix=None, local=None)
         return state, [Reset(record.t_ns, record.rx_ns, "sensors", why)]
-    return initial(settings)._replace(next_ns=state.next_ns), [
-        Reset(record.t_ns, record.rx_ns, "navigator", why)
-    ]
+    return State()._replace(next_ns=state.next_ns), [Reset(record.t_ns, record.rx_ns, "navigator", why)]
 
 
 def _gnss_integrity(state: State, record: GnssIntegrity, settings: Settings) -> Step:

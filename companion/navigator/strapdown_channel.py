@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from companion.nav.strapdown import rotation_matrix
-from companion.records import Attitude, Imu, Pressure, Vector3
+from companion.records import Attitude, Imu, Vector3
 from companion.units import G0, Floats
 
 IMU_HZ, ATTITUDE_HZ = 5.0, 2.0  # wanted at least
@@ -60,7 +60,7 @@ class Pace(NamedTuple):
 
 class Strap(NamedTuple):
     """What is needed to go on: last sample, attitude at its time, rates, vertical specific force averaged
-    (m/s^2, down), static pressure (Pa), climb (m/s); why the last sample is of no use, and when it last was.
+    (m/s^2, down); why the last sample is of no use.
     """
 
     imu: Imu | None = None
@@ -68,16 +68,11 @@ class Strap(NamedTuple):
     imu_pace: Pace = Pace()
     attitude_pace: Pace = Pace()
     down: float = -G0
-    static: float | None = None
-    climb: float = 0.0
     why: str = "no IMU is heard"
-    refused_ns: int | None = None
 
 
-def sense(s: Strap, record: Attitude | Pressure) -> Strap:
-    """With one more attitude or static pressure."""
-    if isinstance(record, Pressure):
-        return s._replace(static=record.static) if 1e3 < record.static < 2e5 else s
+def sense(s: Strap, record: Attitude) -> Strap:
+    """With one more attitude."""
     C_nb = attitude_matrix(record)
     if s.imu is not None:
         dt = (s.imu.t_ns - record.t_ns) * 1e-9

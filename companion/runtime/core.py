@@ -304,7 +304,7 @@ class CompanionCore:
                 for message in named_values(status, now_ns):
                     self._broadcast(message)
             for link in self.links.values():
-                link.session.state = self._system_state(now_ns)
+                link.session.state = self._system_state()
                 self._log.record(self._link_state(link, now_ns))
 
     def _lock_links(self, now_ns: int) -> None:
@@ -587,7 +587,7 @@ class CompanionCore:
         link = next(iter(self.links.values()))
         return navigation_status(self._solution, self._receiver(link))
 
-    def _system_state(self, now_ns: int) -> int:
+    def _system_state(self) -> int:
         """Return MAV_STATE for our heartbeat: ACTIVE only while solutions are recent and trusted."""
         if self._solution is None:
             return int(mavlink.MAV_STATE_STANDBY)

@@ -10,7 +10,7 @@ from companion.navigator.own_error_model import (
     GUST,
     Amplitudes,
     Ground,
-    Layout,
+    N,
     Propagator,
     Row,
     add_imu,
@@ -51,7 +51,7 @@ def test_a_flight_ends_after_ten_slow_seconds(seconds: int) -> None:
 
 def test_two_intervals_beside_the_imu_are_one() -> None:
     """The gust is a Gauss-Markov process: exactly, however long the interval."""
-    propagator, at = Propagator(Amplitudes(), Layout()), GUST.start
+    propagator, at = Propagator(Amplitudes()), GUST.start
 
     def over(seconds: float) -> tuple[float, float]:
         Phi, Q = propagator.transition(add_imu(begin("imu", (20.0, 0.0)), seconds, (0.0, 0.0), 0.0, 0.0))
@@ -64,9 +64,8 @@ def test_two_intervals_beside_the_imu_are_one() -> None:
 
 def test_a_step_of_the_wind_shows_in_the_first_airspeed_after_it() -> None:
     """Beside the IMU; as white noise of the same strength the gusts would hide 3.4 m/s."""
-    settings, layout = Amplitudes(), Layout()
-    propagator = Propagator(settings, layout)
-    P, V, spread = prior(settings, layout, propagator.grades)[0], (20.0, 0.0), []
+    propagator = Propagator(Amplitudes())
+    P, V, spread = prior(Amplitudes())[0], (20.0, 0.0), []
     P[2:4, 2:4] = 0.1**2 * np.eye(2)
     for _ in range(120):
         interval = begin("imu", V)
@@ -74,7 +73,7 @@ def test_a_step_of_the_wind_shows_in_the_first_airspeed_after_it() -> None:
             interval = add_imu(interval, 0.05, (0.0, 0.0), 0.0, 0.0)
         Phi, Q = propagator.transition(interval)
         P = Phi @ P @ Phi.T + Q[0]
-        for row in (propagator.airspeed_row(V, V), gnss_velocity(layout.n)):
+        for row in (propagator.airspeed_row(V, V), gnss_velocity(N)):
             S = row.H @ P @ row.H.T + row.R
             K = np.linalg.solve(S, row.H @ P).T
             P = P - K @ S @ K.T

@@ -8,16 +8,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from companion.config import Config
-from companion.navigator.hypotheses import Model
 from companion.navigator.past_states import DENSE_NS, MOST_KEPT, SPARSE_NS, PastStates
-from companion.navigator.state import Settings, State, initial
+from companion.navigator.state import State
 from companion.records import Pressure
 
 MS = 1_000_000
 LATE_NS = 6_000_000_000
 START_NS = 100 * SPARSE_NS
-INITIAL = initial(Settings(Config(), Model(Config())))
 
 
 def record(t_ns: int) -> Pressure:
@@ -26,7 +23,7 @@ def record(t_ns: int) -> Pressure:
 
 def before(t_ns: int) -> State:
     """A state that is recognised by its time."""
-    return INITIAL._replace(next_ns=t_ns)
+    return State()._replace(next_ns=t_ns)
 
 
 class Kept:

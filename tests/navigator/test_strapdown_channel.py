@@ -149,7 +149,8 @@ def reckoned(flight: Trajectory, records: Iterable[Any], start: float, lasting: 
     track, seconds, sensors, before = [at], list[Nominal](), own_channel.Sensors(), (0.0, 0.0)
     for record in records:
         if not isinstance(record, Imu):
-            s = strapdown_channel.sense(s, record)
+            if isinstance(record, Attitude):
+                s = strapdown_channel.sense(s, record)
             sensors = sensors._replace(air=air_data_channel.sense(sensors.air, record))
             continue
         s = strapdown_channel.receive(s, record)

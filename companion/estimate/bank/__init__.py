@@ -56,10 +56,8 @@ from companion.estimate.bank.readout import (
     estimate,
     explanations,
     false_probability,
-    fault_probability,
     grade_probability,
     protection_level,
-    suspects,
 )
 from companion.estimate.bank.recursion import Innovation, Measurement, propagate, update
 from companion.estimate.bank.reduction import merge_moments, reduce
@@ -102,7 +100,6 @@ __all__ = [
     "false_probability",
     "false_since_first",
     "families",
-    "fault_probability",
     "grade_probability",
     "heard_sources",
     "inflate",
@@ -118,6 +115,5 @@ __all__ = [
     "renew",
     "shift",
     "start",
-    "suspects",
     "update",
 ]

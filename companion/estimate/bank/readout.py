@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from companion.estimate.bank.layout import Bools, Ints, Layout
+from companion.estimate.bank.layout import Ints, Layout
 from companion.estimate.bank.protection import exceedance, level
 from companion.estimate.bank.settings import DEFAULT, Settings
 from companion.estimate.bank.state import Bank, false_rows, families
@@ -123,21 +123,6 @@ def false_probability(bank: Bank, layout: Layout) -> Floats:
     return out
 
 
-def fault_probability(bank: Bank, layout: Layout) -> Floats:
-    """Return the probability that each fault is active now.
-
-    Parameters
-    ----------
-    bank, layout : the bank.
-
-    Returns
-    -------
-    (faults,) probabilities.
-    """
-    w = bank.weights
-    return np.array([float(w[(bank.fault == f).any(axis=1)].sum()) for f in range(len(layout.faults))])
-
-
 def grade_probability(bank: Bank, layout: Layout) -> Floats:
     """Return the probability of each grade.
 
@@ -150,22 +135,6 @@ def grade_probability(bank: Bank, layout: Layout) -> Floats:
     (grades,) probabilities.
     """
     out: Floats = np.bincount(bank.grade, bank.weights, len(layout.grades)).astype(np.float64)
-    return out
-
-
-def suspects(bank: Bank, layout: Layout, settings: Settings = DEFAULT) -> Bools:
-    """Return which sources are suspected.
-
-    Parameters
-    ----------
-    bank, layout : the bank.
-    settings : threshold of the probability.
-
-    Returns
-    -------
-    (sources,) booleans.
-    """
-    out: Bools = false_probability(bank, layout) > settings.suspect
     return out
 
 

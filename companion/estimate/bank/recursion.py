@@ -27,19 +27,17 @@ Measurement = tuple[Floats, Floats]
 
 
 class Innovation(NamedTuple):
-    """Innovations of an update, per row of the bank that was updated, children included.
+    """What an update saw, per row of the bank that was updated, children included.
 
     Attributes
     ----------
-    nu : (R, m) innovations.
-    S : (R, m, m) their covariances.
+    S : (R, m, m) covariances of the innovations.
     nis : (R,) normalised squared innovations.
     born : whether births took place before the update.
     refused : (R,) whether the row took the measurement for an outlier.
     leading : the heaviest row after the update.
     """
 
-    nu: Floats
     S: Floats
     nis: Floats
     born: bool
@@ -47,34 +45,25 @@ class Innovation(NamedTuple):
     leading: int
 
 
-def propagate(bank: Bank, layout: Layout, dt: float, Phi: Floats, Q: Floats, u: Floats | None = None) -> Bank:
-    """Propagate all rows by dt seconds: x = Phi x + u, P = Phi P Phi' + Q, offsets += rates dt.
+def propagate(bank: Bank, layout: Layout, dt: float, Phi: Floats, Q: Floats) -> Bank:
+    """Propagate all rows by dt seconds: x = Phi x, P = Phi P Phi' + Q, offsets += rates dt.
 
     Parameters
     ----------
     bank, layout : the bank.
     dt : s.
-    Phi : transition, (k, k) for all rows or (R, k, k) per row; k is n_base or n. With n the caller may let
-        a lie feed base states; the motion of the lies themselves is filled in here.
+    Phi : (k, k) transition; k is n_base or n. With n the caller may let a lie feed base states; the motion of
+        the lies themselves is filled in here.
     Q : process noise, (k, k) for all or (grades, k, k) by grade.
-    u : (k,) known increment of the base states, or None.
 
     Returns
     -------
     Bank : at t + dt.
     """
     R, n = bank.x.shape
-    F = _padded(layout, Phi, dt)
-    if F.ndim == 2:
-        FT = np.ascontiguousarray(F.T)
-        x = bank.x @ FT
-        P = _both_sides(bank.P, FT, Q, bank.grade)
-    else:
-        x = (F @ bank.x[:, :, None])[:, :, 0]
-        P = F @ bank.P @ F.transpose(0, 2, 1)
-        P[:, : Q.shape[-1], : Q.shape[-1]] += Q[bank.grade] if Q.ndim == 3 else Q
-    if u is not None:
-        x[:, : len(u)] += u
+    FT = np.ascontiguousarray(_padded(layout, Phi, dt).T)
+    x = bank.x @ FT
+    P = _both_sides(bank.P, FT, Q, bank.grade)
     if len(layout.rates):
         diagonal = P.reshape(R, -1)[:, :: n + 1]
         diagonal[:, layout.rates] += bank.noise * dt
@@ -102,16 +91,16 @@ def _both_sides(P: Floats, FT: Floats, Q: Floats, grade: Ints) -> Floats:
 
 def _padded(layout: Layout, Phi: Floats, dt: float) -> Floats:
     """Phi over all states, the lies moving on by their rates."""
-    k, n = Phi.shape[-1], layout.n
-    F = np.zeros((*Phi.shape[:-2], n, n))
-    F[..., :k, :k] = Phi
+    k, n = len(Phi), layout.n
+    F = np.zeros((n, n))
+    F[:k, :k] = Phi
     lies = np.arange(layout.n_base, n)
-    F[..., lies, lies] = 1.0
-    F[..., layout.offsets, layout.rates] = dt
+    F[lies, lies] = 1.0
+    F[layout.offsets, layout.rates] = dt
     if layout.accelerations[0].size:
         offsets, rates, accelerations = layout.accelerations
-        F[..., offsets, accelerations] = 0.5 * dt * dt
-        F[..., rates, accelerations] = dt
+        F[offsets, accelerations] = 0.5 * dt * dt
+        F[rates, accelerations] = dt
     return F
 
 
@@ -168,7 +157,7 @@ def update(
     passed = min((bank.t - bank.born_t) / settings.surprise_gap_s, 1.0)  # since births
     nis = float(step.nis[int(np.argmax(bank.L))]) * passed**2
     may_bear = source is not None and not fixed and not born and settings.surprise < math.inf
-    if may_bear and nis > settings.surprise * step.nu.shape[-1]:
+    if may_bear and nis > settings.surprise * step.white.shape[-1]:
         bank = births(bank, layout, settings, reduced=False)
         born = True
         step = innovations(bank)
@@ -186,14 +175,13 @@ def update(
         seen = seen.copy()
         seen[source] = bank.t
     bank = bank._replace(L=L, x=x, P=P, seen=seen)
-    seen_by = Innovation(step.nu, step.S, step.nis, born, refused, int(np.argmax(L)))
+    seen_by = Innovation(step.S, step.nis, born, refused, int(np.argmax(L)))
     return (reduce(bank, layout, settings) if born else bank), seen_by
 
 
 class _Step(NamedTuple):
-    """Of an update: innovation, its covariance, S^-1/2 nu, P H' S^-T/2, NIS, log likelihood; per row."""
+    """Per row: covariance S of the innovation, S^-1/2 times it, P H' S^-T/2, NIS, log likelihood."""
 
-    nu: Floats
     S: Floats
     white: Floats
     G: Floats
@@ -257,4 +245,4 @@ def _innovations(bank: Bank, layout: Layout, z: Floats, H: Floats, R: Floats, so
         G = np.linalg.solve(root, PHt_T).transpose(0, 2, 1)
         log_root = np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)
     nis = (white * white).sum(axis=1)
-    return _Step(nu, S, white, G, nis, -0.5 * (nis + m * LOG_2PI) - log_root)
+    return _Step(S, white, G, nis, -0.5 * (nis + m * LOG_2PI) - log_root)
