@@ -200,7 +200,7 @@ class Examination:
             self._origin = event.message
         elif event.frame.msgid == mavlink.MAVLINK_MSG_ID_SYS_STATUS:
             self._airspeed = has_airspeed_sensor(event.message)
-        elif (by := selected(event.message, event.from_autopilot)) is not None and by.is_report:
+        elif (by := selected(event.message, event.from_autopilot, 0)) is not None and by.is_report:
             self._has_script = True
         if self._client is not None:
             answers = self._client.receive(event.message, event.frame)

@@ -99,9 +99,9 @@ class AutopilotOutput:
         if command == mavlink.MAV_CMD_EXTERNAL_POSITION_ESTIMATE:
             self._add_event(self._position_reset.handle_acknowledgement(result, now_ns))
 
-    def handle_message(self, message: Message, from_autopilot: bool, now_ns: int) -> None:
-        """Process a message of another sender that may concern the source set."""
-        if (by := selected(message, from_autopilot)) is not None:
+    def handle_message(self, message: Message, from_autopilot: bool, system: int, now_ns: int) -> None:
+        """Process a message of another sender that may concern the source set of autopilot `system`."""
+        if (by := selected(message, from_autopilot, system)) is not None:
             self._source_switch.handle_selected(by, now_ns)
 
     def messages(self, solution: Solution, names: Collection[str], receiver: Receiver) -> list[Message]:

@@ -30,6 +30,7 @@ class GnssFusion(SourceSwitch):
     """Fusion of PX4's first receiver; on at the start."""
 
     command = ESTIMATOR_SENSOR_ENABLE
+    is_silence_judged = False
 
     def __init__(self) -> None:
         super().__init__()

@@ -8,6 +8,9 @@ held false, also when there is no solution. The command is repeated until it is 
 
 A set that somebody else selected (the pilot's switch, a ground station) is left as it is: no set is requested
 until a person selects the one that the table requires at that time, or the autopilot reboots.
+
+ArduPilot sends GPS_RAW_INT whatever its receiver does, so a receiver that seems silent is mostly a stream
+that another station has slowed down: the message is requested before the silence counts.
 """
 
 from __future__ import annotations
@@ -33,6 +36,9 @@ FRESH_S = 60.0  # a solution older than this says nothing about GNSS
 MAX_GAP_NS = SECOND_NS  # a longer gap interrupts
 RETRY_NS = SECOND_NS
 MAX_TRIES = 10
+AGAIN_NS = 30 * SECOND_NS  # after so many tries without an answer: the link may have been lost
+ASKED_NS = SECOND_NS  # after this silence of the receiver, and so often, its message is requested
+ASKED_UNTIL_NS = 10 * SECOND_NS
 REPORTS = 2
 """Equal reports of the script in a row that count: one may have been made just before our command."""
 _SWITCH_TEXT = re.compile(r"Using EKF Source Set ([123])")  # ArduPilot, RCx_OPTION 90
@@ -59,18 +65,19 @@ class Selected(NamedTuple):
     is_report: bool = False
 
 
-def selected(message: Message, from_autopilot: bool) -> Selected | None:
-    """Return what `message`, not sent by us, states about the source set; None if nothing.
+def selected(message: Message, from_autopilot: bool, system: int) -> Selected | None:
+    """Return what `message`, not sent by us, states about the source set of autopilot `system`, else None.
 
-    MAV_CMD_SET_EKF_SOURCE_SET of another sender, ArduPilot's text on a switch by RCx_OPTION 90, and the
-    script's report.
+    MAV_CMD_SET_EKF_SOURCE_SET of another sender to this autopilot, ArduPilot's text on a switch by RCx_OPTION
+    90, and the script's report.
     """
     name = message.get_type()
     if not from_autopilot:
         if name not in ("COMMAND_LONG", "COMMAND_INT"):
             return None
+        is_ours = message.target_system in (0, system) and message.target_component in (0, 1)
         is_switch = message.command == mavlink.MAV_CMD_SET_EKF_SOURCE_SET and message.param1 in _SETS
-        return Selected(int(message.param1)) if is_switch else None
+        return Selected(int(message.param1)) if is_ours and is_switch else None
     if name == "STATUSTEXT":
         found = _SWITCH_TEXT.match(message.text)
         return Selected(int(found[1])) if found else None
@@ -97,6 +104,10 @@ class Predicate(NamedTuple):
     name: str
     holds: Callable[[Situation], bool]
     reason: str
+
+
+def _command(system: int, command: int, **fields: float | None) -> Message:
+    return dialect.new("COMMAND_LONG", target_system=system, target_component=1, command=command, **fields)
 
 
 def is_held_false(s: Situation) -> bool:
@@ -169,10 +180,11 @@ class SourceSwitch:
     """
 
     command = mavlink.MAV_CMD_SET_EKF_SOURCE_SET
+    is_silence_judged = True
 
     def __init__(self) -> None:
         self._fix, self._no_fix, self._sent = ConditionTimer(), ConditionTimer(), ConditionTimer()
-        self._receiver_ns: int | None = None
+        self._receiver, self._receiver_ns = 0, 0  # its number, and when it last reported: 0 for never
         self._sent_ns: int | None = None
         self._solution: Solution | None = None
         self._witness = BeaconWitness()
@@ -184,6 +196,8 @@ class SourceSwitch:
         self._reason = ""
         self._tries = 0
         self._next_ns: int | None = None  # None: nothing to request
+        self._unanswered_ns: int | None = None  # when the last of MAX_TRIES was in vain
+        self._asked_ns = 0  # when the receiver's message was last requested
         self._events: list[Event] = []
 
     def receive(self, record: Gnss | RsbnFix) -> None:
@@ -196,7 +210,7 @@ class SourceSwitch:
         if isinstance(record, RsbnFix):
             return
         now = record.rx_ns
-        self._receiver_ns = now
+        self._receiver, self._receiver_ns = record.receiver, now
         self._fix.update(record.has_3d_fix, now, 3 * SECOND_NS)
         self._no_fix.update(not record.has_3d_fix, now, 3 * SECOND_NS)
 
@@ -211,7 +225,7 @@ class SourceSwitch:
         """Return the facts at `now_ns`."""
         solution, patience = self._solution, 3 * SECOND_NS
         fresh = solution is not None and (now_ns - solution.rx_ns) * 1e-9 <= FRESH_S
-        silent = -1.0 if self._receiver_ns is None else (now_ns - self._receiver_ns) * 1e-9
+        silent = (now_ns - self._receiver_ns) * 1e-9 if self._receiver_ns else -1.0
         return Situation(
             fix_s=self._fix.held_s(now_ns, patience),
             no_fix_s=self._no_fix.held_s(now_ns, patience),
@@ -250,7 +264,7 @@ class SourceSwitch:
             if is_new and self._required != self._held:
                 need = f"EKF source set {self._required} needed ({self._reason})"
                 self._add_event(Severity.WARNING, f"{need}, but set {self._held} selected by hand", now_ns)
-        elif self._required != self._wanted:
+        elif self._required != self._wanted or self._is_again_due(now_ns):
             self._wanted = self._required
             self._tries, self._next_ns = 0, now_ns
 
@@ -280,30 +294,40 @@ class SourceSwitch:
         if command != self.command or self._next_ns is None or not self._tries:
             return
         if result == mavlink.MAV_RESULT_ACCEPTED:
-            self._leading, self._next_ns = self._wanted, None
+            self._leading, self._next_ns, self._unanswered_ns = self._wanted, None, None
             self._add_event(Severity.NOTICE, f"{self.name(self._wanted)}: {self._reason}", now_ns)
         elif result not in RETRIED:
+            self._unanswered_ns = None
             self._give_up(f"it answered MAV_RESULT {result}", now_ns)
 
     def to_send(self, system: int, now_ns: int) -> list[Message]:
-        """Return the command if it is due."""
+        """Return the commands that are due."""
+        asked = self._to_ask(system, now_ns)
         if self._next_ns is None or now_ns < self._next_ns:
-            return []
+            return asked
         if self._tries == MAX_TRIES:
-            self._give_up(f"{MAX_TRIES} tries", now_ns)
-            return []
+            if self._unanswered_ns is None:
+                self._give_up(f"{MAX_TRIES} tries, then again every {AGAIN_NS // SECOND_NS} s", now_ns)
+            self._next_ns, self._unanswered_ns = None, now_ns
+            return asked
         self._next_ns = now_ns + RETRY_NS
         confirmation, self._tries = self._tries, self._tries + 1
-        return [
-            dialect.new(
-                "COMMAND_LONG",
-                target_system=system,
-                target_component=1,
-                command=self.command,
-                confirmation=confirmation,
-                **self.parameters(self._wanted),
-            )
-        ]
+        parameters = self.parameters(self._wanted)
+        return [*asked, _command(system, self.command, confirmation=confirmation, **parameters)]
+
+    def _to_ask(self, system: int, now_ns: int) -> list[Message]:
+        """Request the receiver's message where it has not come for a second."""
+        silent_ns = now_ns - self._receiver_ns if self._receiver_ns and self.is_silence_judged else 0
+        if not ASKED_NS < silent_ns <= ASKED_UNTIL_NS or now_ns - self._asked_ns < ASKED_NS:
+            return []
+        self._asked_ns = now_ns
+        number = (mavlink.MAVLINK_MSG_ID_GPS_RAW_INT, mavlink.MAVLINK_MSG_ID_GPS2_RAW)[self._receiver > 0]
+        return [_command(system, mavlink.MAV_CMD_REQUEST_MESSAGE, param1=number)]
+
+    def _is_again_due(self, now_ns: int) -> bool:
+        """Whether a command that nobody answered is to be tried again."""
+        since_ns = self._unanswered_ns
+        return since_ns is not None and self._next_ns is None and now_ns - since_ns >= AGAIN_NS
 
     def take_events(self) -> list[Event]:
         """Return the events since the last call."""

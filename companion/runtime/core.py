@@ -434,7 +434,8 @@ class CompanionCore:
                     each.session.set_rates(requested_rates(config), event.received_ns)
                 self._on_record(Tuning(event.received_ns, event.received_ns, to_toml(config)))
         if msgid in ABOUT_SOURCE_SET:
-            link.output.handle_message(event.message, event.from_autopilot, event.received_ns)
+            system = link.session.autopilot or 0
+            link.output.handle_message(event.message, event.from_autopilot, system, event.received_ns)
             self._emit_output_events(link)
         if not is_used:
             return

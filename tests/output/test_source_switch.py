@@ -13,6 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from companion.link import dialect
+from companion.link.dialect import mavlink
 from companion.nav.geometry import Geodetic, displace, slant_range_azimuth
 from companion.output.source_switch import (
     BELIEVED,
@@ -153,11 +154,16 @@ def beacon_fix(now: int, off: float) -> RsbnFix:
 
 
 class Flight:
-    """An autopilot that answers with `answer` (None: no answer); its receiver and our solutions at 5 Hz."""
+    """An autopilot that answers with `answer` (None: no answer); its receiver and our solutions at 5 Hz.
 
-    def __init__(self, answer: int | None = ACCEPTED) -> None:
+    `sends_when_asked`: it sends the receiver's message on request.
+    """
+
+    def __init__(self, answer: int | None = ACCEPTED, sends_when_asked: bool = False) -> None:
         self.switch, self.now, self.answer = SourceSwitch(), 10**12, answer
+        self.sends_when_asked = sends_when_asked
         self.requests: list[tuple[float, int, int]] = []
+        self.asked: list[float] = []
         self.reports: list[tuple[float, str]] = []
 
     def fly(
@@ -177,8 +183,7 @@ class Flight:
         for k in range(round(10 * seconds)):
             self.now += TENTH
             if fix is not None and k % 2:
-                kind = 3 if fix else 1
-                self.switch.receive(Gnss(self.now, self.now, 0, self.now // 1000, kind, 1.0, 0.5, 100.0))
+                self.switch.receive(self.gnss(3 if fix else 1))
             if solved and witness and k % 10 == 0:
                 is_false = false > 0.9 if contradicted is None else contradicted
                 self.switch.receive(beacon_fix(self.now, 1300.0 if is_false else 0.0))
@@ -187,12 +192,21 @@ class Flight:
             if solved or k % 10 == 0:
                 self.switch.update(self.now)
             for m in self.switch.to_send(7, self.now):
+                if m.command == mavlink.MAV_CMD_REQUEST_MESSAGE:
+                    assert (m.target_system, m.param1) == (7, mavlink.MAVLINK_MSG_ID_GPS_RAW_INT)
+                    self.asked.append(self.now * 1e-9)
+                    if self.sends_when_asked:
+                        self.switch.receive(self.gnss(3))
+                    continue
                 assert (m.target_system, m.target_component, m.command) == (7, 1, 42007)
                 self.requests.append((self.now * 1e-9, m.param1, m.confirmation))
                 if self.answer is not None:
                     self.switch.handle_acknowledgement(42007, self.answer, self.now + TENTH // 2)
             self.reports += [(e.rx_ns * 1e-9, e.text) for e in self.switch.take_events()]
         return self.now * 1e-9
+
+    def gnss(self, fix: int) -> Gnss:
+        return Gnss(self.now, self.now, 0, self.now // 1000, fix, 1.0, 0.5, 100.0)
 
     @property
     def sets(self) -> list[int]:
@@ -223,6 +237,15 @@ def test_silent_receiver() -> None:
     assert flight.sets == [1, 2, 1]
     assert flight.requests[1][0] - silent == pytest.approx(SILENT_S, abs=0.31)
     assert flight.reports[1][1] == "EKF source set 2: GNSS receiver silent, using companion"
+    assert len(flight.asked) == 9  # and no longer in vain
+
+
+def test_a_stream_that_another_station_has_stopped_is_no_silent_receiver() -> None:
+    flight = Flight(sends_when_asked=True)
+    flight.fly(30.0)
+    flight.fly(60.0, fix=None)
+    assert flight.sets == [1]
+    assert 50 <= len(flight.asked) <= 60  # once a second
 
 
 def test_rejected_innovations_never_switch() -> None:
@@ -350,12 +373,30 @@ def test_rejected_command_is_reported_once() -> None:
     for answer, expected in ((None, "10 tries"), (FAILED, "10 tries"), (DENIED, "2"), (UNSUPPORTED, "3")):
         flight = Flight(answer)
         flight.fly(100.0, fix=False)
-        assert len(flight.requests) == (MAX_TRIES if "tries" in expected else 1)
+        times = [t for t, _, _ in flight.requests]
+        rounds = [0, *(k for k, (a, b) in enumerate(itertools.pairwise(times), 1) if b - a > 2.0)]
+        assert rounds == ([0, MAX_TRIES, 2 * MAX_TRIES] if "tries" in expected else [0])
         ((_, text),) = flight.reports
         assert expected in text and "source set 2" in text and "by hand" in text
         flight.answer = ACCEPTED
         flight.fly(30.0)
         assert flight.sets[-1] == 1  # the next set is requested
+
+
+def test_a_command_that_nobody_heard_is_repeated_when_the_link_is_back() -> None:
+    """The link to the autopilot is lost for 18 s as GNSS returns: set 1 is requested again later."""
+    flight = Flight()
+    flight.fly(30.0)
+    flight.fly(30.0, fix=False)
+    flight.answer = None
+    flight.fly(18.0)
+    flight.answer = ACCEPTED
+    flight.fly(40.0)
+    assert flight.reports[-1][1] == "EKF source set 1: GNSS has a fix"
+    assert not flight.switch.is_on_companion
+    quiet = len(flight.requests)
+    flight.fly(100.0)
+    assert len(flight.requests) == quiet
 
 
 def test_acknowledgement_of_another_command_is_ignored() -> None:
@@ -398,7 +439,7 @@ BY_PERSON = [
 
 
 def by_others(flight: Flight, message: Any, from_autopilot: bool) -> None:
-    by = selected(message, from_autopilot)
+    by = selected(message, from_autopilot, 1)
     assert by is not None
     for _ in range(2):
         flight.switch.handle_selected(by, flight.now)
@@ -465,6 +506,8 @@ def test_one_report_made_before_our_command_is_ignored() -> None:
         ("COMMAND_LONG", {"command": 42007, "param1": math.nan}, False),
         ("COMMAND_LONG", {"command": 42007, "param1": 1.5}, False),
         ("COMMAND_LONG", {"command": 400, "param1": 1.0}, False),
+        ("COMMAND_LONG", {"command": 42007, "param1": 3.0, "target_system": 2}, False),  # another aircraft's
+        ("COMMAND_INT", {"command": 42007, "param1": 3.0, "target_component": 191}, False),
         ("STATUSTEXT", {"text": b"Using EKF Source Set 2"}, False),
         ("STATUSTEXT", {"text": b"Using EKF Source Set 4"}, True),
         ("NAMED_VALUE_FLOAT", {"name": b"EKFSRC", "value": 0.0}, True),
@@ -473,4 +516,4 @@ def test_one_report_made_before_our_command_is_ignored() -> None:
     ],
 )
 def test_other_messages_select_nothing(name: str, fields: dict[str, Any], from_autopilot: bool) -> None:
-    assert selected(dialect.new(name, **fields), from_autopilot) is None
+    assert selected(dialect.new(name, **fields), from_autopilot, 1) is None
