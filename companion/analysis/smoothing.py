@@ -38,7 +38,7 @@ from companion.estimate.smoother import rts_backward, two_point
 from companion.nav.geometry import displace
 from companion.navigator import INPUTS_USED, Navigator, begins_again, guarded, own_channel, tuned
 from companion.navigator.channel import Nominal, Transition
-from companion.navigator.hypotheses import MOST_BEACONS, VELOCITY, Hypotheses, Model
+from companion.navigator.hypotheses import BIASES, MOST_BEACONS, VELOCITY, Hypotheses, Model
 from companion.navigator.inertial_track import Point
 from companion.navigator.state import Beacon, Settings, State, hypotheses, levelled, source_name
 from companion.navigator.step import step
@@ -455,11 +455,11 @@ class _Path:
         and new variances (n,).
         """
         keep, variance = np.ones(n), np.zeros(n)
-        biases = hypotheses(self._state, self._settings).biases
+        known = hypotheses(self._state, self._settings)
         for k, (a, b) in enumerate(zip(before.beacons, self._state.beacons, strict=True)):
             if (a.identity, a.place) != (b.identity, b.place):
-                at = slice(n - len(biases) + 2 * k, n - len(biases) + 2 * k + 2)
-                keep[at], variance[at] = 0.0, np.square(biases[2 * k : 2 * k + 2])
+                at = slice(known.bias(k), known.bias(k + 1))
+                keep[at], variance[at] = 0.0, np.square(known.biases[BIASES * k : BIASES * (k + 1)])
         return None if keep.all() else (keep, variance)
 
     def _append(self, point: Point, x: Floats, P: Floats, predicted: Floats, fixed: bool = False) -> None:

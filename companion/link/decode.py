@@ -186,7 +186,7 @@ def _gnss(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
             sigma_velocity=accuracy(m.vel_acc),
             satellites=None if m.satellites_visible == _SATELLITES_UNKNOWN else m.satellites_visible,
             hdop=hdop,
-            alt=m.alt_ellipsoid * 1e-3 if m.alt_ellipsoid else None,
+            alt=m.alt_ellipsoid * 1e-3 if 0 < abs(m.alt_ellipsoid) < HIGHEST * 1e3 else None,
         ),
     )
 
@@ -430,6 +430,8 @@ def _rsbn(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
         raise InvalidField(
             f"slant range {slant_range:g} m is beyond the limit {FARTHEST:g} m", slant_range, FARTHEST
         )
+    if m.beacon_lat == 0 == m.beacon_lon:
+        raise InvalidField(f"beacon {m.beacon_id} has no position: beacon_lat and beacon_lon are 0")
     return (
         RsbnFix(
             t_ns=_stamped(m, rx, sender),

@@ -29,6 +29,9 @@ from companion.units import Floats
 #: A receiver that states no accuracy of its velocity was seen to report 2 to 3 m/s at rest in its first
 #: seven seconds. ArduPilot and PX4 wait for ten seconds of good fixes.
 SETTLING_S, SETTLING_M_S = 10.0, 3.0
+#: A beacon's stated place (m) and the times of its answers (s) are so far off. Beside a runway an angle is a
+#: metre: answers 0.3 s late excluded a healthy GNSS, 1 km from a beacon.
+PLACE_M, LATE_S = 5.0, 0.3
 
 
 def from_gnss(
@@ -60,21 +63,32 @@ def _stated(record: Gnss, settings: GnssConfig) -> float:
 
 
 def from_rsbn(record: RsbnFix, ins: Point, settings: RsbnConfig) -> tuple[Azimuth | Range, ...]:
-    """A beacon's azimuth and slant range, whichever are there, with the floors of the configuration."""
+    """A beacon's azimuth and slant range, whichever are there, with the floors of the configuration.
+
+    Their sigmas take in how far place and time of the beacon may be off.
+    """
     here = ins.position
     (x, y, z), axes_beacon = _on_earth(record.lat, record.lon, record.alt)
     x_0, y_0, z_0 = ecef_tuple(here)
     axes = enu_axes_tuple(here.lat, here.lon)
     place = _times(axes, (x - x_0, y - y_0, z - z_0))
+    displaced = displaced_sigma(math.hypot(*ins.v_n[:2]))
     observations: list[Azimuth | Range] = []
     if record.azimuth is not None:
         sigma = max(record.sigma_azimuth, math.radians(settings.sigma_azimuth_deg))
+        sigma = math.hypot(sigma, displaced / max(math.hypot(*place), 1.0))
         turned = tuple([_times(axes, axis) for axis in axes_beacon])  # C_e^b C_enu^e, row by row
         observations.append(Azimuth(place, record.azimuth, sigma, turned))
     if record.slant_range is not None:
         floor = settings.sigma_range_m + 0.01 * settings.sigma_range_percent * record.slant_range
-        observations.append(Range(place, record.slant_range, max(record.sigma_range, floor)))
+        sigma = math.hypot(max(record.sigma_range, floor), displaced)
+        observations.append(Range(place, record.slant_range, sigma))
     return tuple(observations)
+
+
+def displaced_sigma(speed: float) -> float:
+    """How far off a sight may be by the beacon's stated place and the time of its answer, m."""
+    return math.hypot(PLACE_M, LATE_S * speed)
 
 
 def in_cone_of_silence(z: Azimuth, distance: float | None) -> bool:

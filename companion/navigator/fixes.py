@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 
-from companion.estimate import bank as banks
 from companion.estimate.bank.settings import DEFAULT as THRESHOLDS
 from companion.estimate.fusion import Azimuth
 from companion.navigator import fix_observations, height_error, measurements, own_channel, scatter
@@ -109,14 +108,19 @@ def _latency_velocity(state: State, t_ns: int) -> tuple[State, Vector2]:
 
 
 def rsbn(state: State, record: RsbnFix, settings: Settings) -> Step:
-    """Use a beacon's answer: azimuth and slant range are measurements of the bank."""
+    """Use a beacon's answer: azimuth and slant range are measurements of the bank.
+
+    A beacon is followed from the first answer on that any hypothesis can take: one whose place is stated
+    500 km off proves nothing, and would only raise the protection level by what it might have shown.
+    """
     state = _begun(state, record, settings)
     name = f"rsbn {record.beacon}"
     if state.nominal is None or state.bank is None or is_silent(state, record.t_ns):
         return state, [Rejection(record.t_ns, record.rx_ns, name, "no channel at its time")]
     state = propagated(carried(state, record.t_ns, settings), settings)
+    before = state
     state, k, out = _beacon(state, record, settings)
-    nominal = state.nominal
+    is_followed, nominal = len(state.beacons) == len(before.beacons), state.nominal
     assert nominal is not None
     assert state.bank is not None
     point, centre = corrected(nominal.point, state, settings)
@@ -133,14 +137,16 @@ def rsbn(state: State, record: RsbnFix, settings: Settings) -> Step:
         variance = fix_observations.sight_variance(z, height)
         state, factor = _scattered(state, record, label, (residual,), variance, metres)
         assert state.bank is not None
-        taken = measurements.sight(state.bank, known, z, k, factor * variance, centre)
+        taken = measurements.sight(state.bank, known, z, k, factor * variance, centre, point.v_n)
         state = decided(state._replace(bank=taken.bank), record, settings)
-        assert state.bank is not None
+        is_followed |= taken.by_any
         part = Source.AZIMUTH if isinstance(z, Azimuth) else Source.RANGE
         if state.reported[source] == EXCLUDED or not taken.accepted:
             out.append(_rejected(state, record, label, source, taken))
         elif state.false[source] < known.settings.suspect:
             believed |= part
+    if not is_followed:
+        return before, out
     state = state._replace(fixed=True)
     if believed:
         pending = Pending(record, point, centre, believed)
@@ -167,9 +173,7 @@ def _beacon(state: State, record: RsbnFix, settings: Settings) -> tuple[State, i
         text = f"beacon {record.beacon} states another position"
         out.append(Event(record.t_ns, record.rx_ns, Severity.NOTICE, text))
     if (new.identity, new.place) != (beacons[k].identity, beacons[k].place):
-        known = hypotheses(state, settings)
-        first, sigma = known.bias(k), known.biases[2 * k : 2 * k + 2]
-        state = state._replace(bank=banks.renew(bank, (first, first + 1), sigma))
+        state = state._replace(bank=hypotheses(state, settings).renewed(bank, k))
     beacons[k] = new
     return state._replace(beacons=tuple(beacons)), k, out
 

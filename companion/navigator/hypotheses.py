@@ -1,6 +1,7 @@
 """What may be wrong: the layout of the navigator's bank, its priors, and beacons as they appear.
 
-Base states are those of the channel, then the biases of azimuth and range of each beacon, by identity. GNSS,
+Base states are those of the channel, then the biases of each beacon, by identity: of its azimuth, of its
+range, and of the time of its answers. GNSS,
 beacons and airspeed have a group of lie states each, so that one source of each kind may be false at once. Of
 GNSS either the position, with its velocity or alone, or the velocity alone is false.
 """
@@ -31,6 +32,7 @@ from companion.estimate.bank.settings import DEFAULT
 from companion.navigator import own_error_model
 from companion.navigator.channel import Channel, Nominal, Transition
 from companion.navigator.corrected_ins import corrected_ins
+from companion.navigator.fix_observations import LATE_S
 from companion.navigator.own_channel import OwnChannel
 
 POSITION = (0, 1)  # states
@@ -53,6 +55,7 @@ ORDERS = (3, 2, 2)  # GNSS may be drawn off with an acceleration
 APART_S = 10.0  # the estimate does not follow a jump of the channel while another explanation is likelier
 SILENCE_S = 5.0  # airspeed that is not used for longer is not judged
 MOST_BEACONS = 8  # followed at once: the work grows with their number
+BIASES = 3  # states of a beacon
 BIAS_HOUR = 0.5  # a beacon's bias walks in an hour by this share of what it may be
 
 #: A lie that stood still from the first fix on is not pruned by its rate, and its end looks like a jump: with
@@ -111,7 +114,7 @@ class Hypotheses(NamedTuple):
 
     layout: Layout
     settings: Settings
-    biases: tuple[float, ...]  # one sigma of each bias state: azimuth (rad), range (m), by beacon
+    biases: tuple[float, ...]  # one sigma of each bias state: azimuth (rad), range (m), time (s), by beacon
 
     def azimuth(self, k: int) -> int:
         """Source of beacon k's azimuth."""
@@ -122,8 +125,13 @@ class Hypotheses(NamedTuple):
         return len(SOURCES) + 2 * k + 1
 
     def bias(self, k: int) -> int:
-        """State that is the bias of beacon k's azimuth; that of its range is the next one."""
-        return self.layout.n_base - len(self.biases) + 2 * k
+        """First of beacon k's bias states."""
+        return self.layout.n_base - len(self.biases) + BIASES * k
+
+    def renewed(self, bank: Bank, k: int) -> Bank:
+        """The bank with the biases of beacon k unknown."""
+        first, sigma = self.bias(k), self.biases[BIASES * k : BIASES * (k + 1)]
+        return banks.renew(bank, range(first, first + BIASES), sigma)
 
     def elsewhere(self, k: int) -> int:
         """Fault that beacon k is not where it states."""
@@ -169,7 +177,7 @@ class Model:
     def with_beacon(self, bank: Bank, beacons: int) -> Bank:
         """The bank with one beacon more than `beacons`, its biases unknown."""
         old, new = self.hypotheses(beacons), self.hypotheses(beacons + 1)
-        return enlarge(bank, old.layout, new.layout, np.square(new.biases[-2:]))
+        return enlarge(bank, old.layout, new.layout, np.square(new.biases[-BIASES:]))
 
     def doubted(self, bank: Bank) -> Bank:
         """The bank with a first beacon: it may show that GNSS was false from its first fix on.
@@ -262,7 +270,7 @@ def _hypotheses(config: Config, channel: Channel, beacons: int, by_air: bool, wi
         for name, sigmas, again_h in (("drift", INS_DRIFT, INS_DRIFTS_AGAIN_H), ("misled", INS_MISLED, None)):
             jumps.append(Jump(name, states, sigmas, INS_DRIFTS_H, quota=2, apart_s=APART_S, again_h=again_h))
     layout = Layout(
-        channel.n + 2 * beacons,
+        channel.n + BIASES * beacons,
         GROUPS,
         tuple(sources),
         tuple(faults),
@@ -275,4 +283,4 @@ def _hypotheses(config: Config, channel: Channel, beacons: int, by_air: bool, wi
         rows=config.integrity.rows,
         switch_h=GRADE_CHANGES_H if channel.wind else DEFAULT.switch_h,
     )
-    return Hypotheses(layout, settings, (azimuth_bias, range_bias) * beacons)
+    return Hypotheses(layout, settings, (azimuth_bias, range_bias, LATE_S) * beacons)

@@ -50,13 +50,14 @@ CORRECTOR_GATE = 12.5
 
 
 class Taken(NamedTuple):
-    """The bank after a measurement; its normalised squared innovation by the leading row, and whether that
-    row took it.
+    """The bank after a measurement; its normalised squared innovation by the leading row, whether that row
+    took it, and whether any did.
     """
 
     bank: Bank
     nis: float
     accepted: bool
+    by_any: bool
 
 
 def gnss_position(
@@ -205,19 +206,22 @@ def sight(
     beacon: int,
     variance: float,
     centre: Vector2,
+    v_n: tuple[float, ...],
 ) -> Taken:
     """Take an azimuth or a range of beacon number `beacon`, linearised for each row about its own position.
 
     `z` is in the plane tangent at the nominal point less the error `centre` (north, east, m): a nominal
     trajectory kilometres off would otherwise cost tens of metres. For rows that hold the beacon to be
     elsewhere the lie is its displacement (north, east, m): the aircraft seen from it is displaced by as much.
-    `variance` is that of its noise, the unknown height included.
+    An answer that is late sees where the aircraft was: `v_n` is the nominal velocity (m/s). `variance` is
+    that of its noise, the unknown height included.
     """
     layout = known.layout
     place = layout.starts[BEACON_GROUP] + np.arange(2)
     own_slot = place[0 if isinstance(z, Azimuth) else 1]  # the bank fills in a one here
     source = known.azimuth(beacon) if isinstance(z, Azimuth) else known.range(beacon)
-    bias = known.bias(beacon) + (0 if isinstance(z, Azimuth) else 1)
+    first = known.bias(beacon)
+    bias, late = first + (0 if isinstance(z, Azimuth) else 1), first + 2
 
     def linearised(bank: Bank) -> tuple[Floats, Floats]:
         elsewhere = (bank.fault[:, BEACON_GROUP] == known.elsewhere(beacon)).astype(np.float64)
@@ -228,6 +232,7 @@ def sight(
         H = np.zeros((len(x), 1, layout.n))
         H[:, 0, 0], H[:, 0, 1] = -north, -east
         H[:, 0, bias] = 1.0
+        H[:, 0, late] = H[:, 0, 0] * v_n[0] + H[:, 0, 1] * v_n[1]
         H[:, 0, place] = elsewhere[:, None] * H[:, 0, :2]
         H[:, 0, own_slot] -= elsewhere
         innovation = z.value - predicted
@@ -252,4 +257,5 @@ def sight_residual(z: Azimuth | Range, centre: Vector2) -> float:
 
 
 def _taken(bank: Bank, seen: Innovation) -> Taken:
-    return Taken(bank, float(seen.nis[seen.leading]), not bool(seen.refused[seen.leading]))
+    refused = seen.refused
+    return Taken(bank, float(seen.nis[seen.leading]), not refused[seen.leading], not refused.all())

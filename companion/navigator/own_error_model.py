@@ -375,15 +375,27 @@ def foreign_row(settings: Amplitudes, apart: Vector2) -> Row:
 FLYING_M_S = 8.0  # [m/s] airspeed from which a fixed wing may fly
 PARKED_M_S = 4.0  # [m/s] below it, slow over ground, it may be parked
 PARKED_S = 10.0  # [s] of it
-CLEAR_M = 5.0  # [m] above the last parked height: the wheels are off the ground
+CLEAR_M = 5.0  # [m] from the last parked height: the wheels are off the ground
+
+
+#: The wind grows with the logarithm of the height: by about a quarter of itself from 20 to 100 m.
+SHEAR_M_S, SHEAR_TOP_M = 2.0, 200.0  # [m/s] for a height e times as great; [m] above it is as it is
 
 
 class Ground(NamedTuple):
-    """Flying or not, since when slow (s, None if not slow), the height (m) where it was last parked."""
+    """Flying or not, since when slow (s, None if not slow), the height (m) where it was last parked, and the
+    greatest distance (m) from that since lift-off.
+    """
 
     flying: bool = False
     slow_since: float | None = None
     parked_height: float | None = None
+    climbed: float = CLEAR_M
+
+
+def wind_opened(before: Ground, after: Ground) -> float:
+    """By how much the wind may have changed with height between two phases: one sigma an axis, m/s."""
+    return SHEAR_M_S * math.sqrt(math.log(max(after.climbed / before.climbed, 1.0)))
 
 
 def ground_phase(g: Ground, t: float, airspeed: float, speed: float, height: float | None) -> Ground:
@@ -408,10 +420,14 @@ def ground_phase(g: Ground, t: float, airspeed: float, speed: float, height: flo
     if airspeed < PARKED_M_S and speed < PARKED_M_S:
         since = t if g.slow_since is None else g.slow_since
         if g.flying and t - since < PARKED_S:
-            return Ground(True, since, g.parked_height)
+            return g._replace(slow_since=since)
         return Ground(False, since, height)
     if g.parked_height is None or height is None:
         clear = speed > PARKED_M_S
     else:
-        clear = height > g.parked_height + CLEAR_M
-    return Ground(g.flying or (airspeed > FLYING_M_S and clear), None, g.parked_height)
+        clear = abs(height - g.parked_height) > CLEAR_M  # below it after a launch from a hill
+    flying = g.flying or (airspeed > FLYING_M_S and clear)
+    climbed = g.climbed
+    if flying and g.parked_height is not None and height is not None:
+        climbed = max(climbed, min(abs(height - g.parked_height), SHEAR_TOP_M))
+    return Ground(flying, None, g.parked_height, climbed)

@@ -14,6 +14,7 @@ import math
 from collections import deque
 
 from companion.nav.geometry import Geodetic, displace, slant_range_azimuth, wrap_angle
+from companion.navigator.fix_observations import displaced_sigma
 from companion.records import Gnss, RsbnFix
 from companion.units import SECOND_NS
 
@@ -73,13 +74,15 @@ class BeaconWitness:
         north, east, _ = fix.v_n or (0.0, 0.0, 0.0)
         place = displace(fix.lat, fix.lon, fix.alt_msl, north * dt, east * dt, 0.0)
         predicted = slant_range_azimuth(Geodetic(record.lat, record.lon, record.alt), place)
+        displaced = displaced_sigma(math.hypot(north, east))
         if record.slant_range is not None:
             off = record.slant_range - predicted.slant_range
-            self._add(record, "range", off / record.sigma_range, is_believed)
+            self._add(record, "range", off / math.hypot(record.sigma_range, displaced), is_believed)
         is_low = predicted.slant_range > 2.0 * abs(place.alt - record.alt)  # not in the cone of silence
         if record.azimuth is not None and is_low:
             off = wrap_angle(record.azimuth - predicted.azimuth)
-            self._add(record, "azimuth", off / record.sigma_azimuth, is_believed)
+            sigma = math.hypot(record.sigma_azimuth, displaced / max(predicted.slant_range, 1.0))
+            self._add(record, "azimuth", off / sigma, is_believed)
 
     @property
     def contradicts(self) -> bool:

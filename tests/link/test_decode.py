@@ -64,6 +64,11 @@ def test_a_full_fix() -> None:
     assert fix.v_n == pytest.approx((0.0, 17.29, 0.0), abs=1e-12)
 
 
+@pytest.mark.parametrize("ellipsoid", [0, 2**31 - 1, -(2**31)])
+def test_a_height_above_the_ellipsoid_that_is_none_is_left_out(ellipsoid: int) -> None:
+    assert one("GPS_RAW_INT", **FIX, alt_ellipsoid=ellipsoid).alt is None
+
+
 def test_second_receiver_has_its_own_number() -> None:
     assert one("GPS2_RAW", **FIX).receiver == 1
 
@@ -126,8 +131,13 @@ REJECTED: list[tuple[str, dict[str, Any], str]] = [
     ("RSBN_MEASUREMENT", {"status": 0, "azimuth": 1.0, "slant_range": 1.0}, "neither azimuth nor range"),
     ("RSBN_MEASUREMENT", {"status": 1, "azimuth": 57.3}, "not an angle in radians"),
     ("RSBN_MEASUREMENT", {"status": 2, "slant_range": -5.0}, "not positive"),
-    ("RSBN_MEASUREMENT", {"status": 2, "slant_range": 5e3, "sigma_range": -1.0}, "sigma_range -1"),
+    (
+        "RSBN_MEASUREMENT",
+        {"status": 2, "slant_range": 5e3, "sigma_range": -1.0, "beacon_lat": LAT},
+        "sigma_range -1",
+    ),
     ("RSBN_MEASUREMENT", {"status": 1, "azimuth": 1.0, "beacon_lat": 10**9}, "beacon_lat 100 deg"),
+    ("RSBN_MEASUREMENT", {"status": 1, "azimuth": 1.0}, "beacon_lat and beacon_lon are 0"),
     ("STAR_FIX", STAR | {"altitude": 45.0}, "altitude 45 is beyond the limit 1.57"),
     ("STAR_FIX", STAR | {"azimuth": 200.0}, "not an angle in radians"),
     ("STAR_FIX", STAR | {"sigma_altitude": 0.0}, "sigma_altitude 0 is not positive"),

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 
 from companion.navigator.own_error_model import (
     CLEAR_M,
     GUST,
+    SHEAR_M_S,
+    SHEAR_TOP_M,
     Amplitudes,
     Ground,
     N,
@@ -17,6 +21,7 @@ from companion.navigator.own_error_model import (
     begin,
     ground_phase,
     prior,
+    wind_opened,
 )
 
 
@@ -32,6 +37,25 @@ def phases(*samples: tuple[float, float, float | None]) -> list[bool]:
 def test_in_the_ground_roll_airspeed_is_not_used_until_the_wheels_are_off_the_ground() -> None:
     roll = [(0.5, 0.0, 100.0)] * 3 + [(15.0, 14.0, 100.5), (25.0, 24.0, 100.0 + CLEAR_M + 0.1)]
     assert phases(*roll) == [False, False, False, False, True]
+
+
+def test_below_the_parked_height_it_flies_too() -> None:
+    """Launched from a hill its airspeed was never used."""
+    assert phases((0.5, 0.0, 100.0), (25.0, 24.0, 100.0 - CLEAR_M - 0.1))[-1]
+
+
+def test_the_wind_is_as_open_after_many_small_steps_of_height_as_after_one() -> None:
+    def variance(step: float) -> float:
+        g, total = Ground(False, None, 100.0), 0.0
+        for k in range(1, round(300.0 / step) + 1):
+            after = ground_phase(g, 0.1 * k, 25.0, 25.0, 100.0 + step * k)
+            total, g = total + wind_opened(g, after) ** 2, after
+        return total
+
+    assert variance(1.0) == pytest.approx(variance(300.0), rel=1e-12)
+    assert variance(1.0) == pytest.approx(SHEAR_M_S**2 * math.log(SHEAR_TOP_M / CLEAR_M))
+    level = Ground(True, None, 100.0, 80.0)
+    assert wind_opened(level, ground_phase(level, 1.0, 25.0, 25.0, 170.0)) == 0.0  # up and down in cruise
 
 
 def test_without_a_pressure_it_flies_once_it_moves() -> None:
