@@ -6,15 +6,13 @@
 
 from __future__ import annotations
 
-import asyncio
 import csv
 import json
 import math
-import random
-import signal
+import os
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, TextIO
@@ -25,101 +23,54 @@ from rich.table import Table
 from companion.analysis import simulated_rsbn
 from companion.storage.reader import LogError
 from companion.tables import print_tables
-from companion.transport.reconnect import Address, CannotListen, Connection, cannot_listen, connections
+from companion.transport.address import Address
 from companion.write_errors import make_folder
 from sitl.beacon import Beacon
 from sitl.bridge import AUTOPILOT, COMPANION, RSBN, Bridge, BridgeMode, GnssSchedule
 from sitl.comparison import AFTER_S, OutageErrors, PositionError, outage_table
+from sitl.real_time import RealTimeRunner, parse_address
 
-EX_UNAVAILABLE, EX_CANTCREAT = 69, 73  # sysexits.h
-LONGEST_SLEEP_S = 0.2
 ORDER = AUTOPILOT, COMPANION, RSBN
 COLUMNS = ("t_s", "source", "north_m", "east_m", "error_m", "sigma_m", "bound_m")
 TRUTH_COLUMNS = ("true_lat_deg", "true_lon_deg", "true_alt_m")
 
 
-class BridgeRunner:
+class BridgeRunner(RealTimeRunner):
     """One run over two links, or over one without relaying. `store` receives every new error."""
 
     def __init__(
         self,
         bridge: Bridge,
-        autopilot: Address,
-        companion: Address | None,
+        addresses: Sequence[Address],
         report: Callable[[float, str], None],
         store: Callable[[Sequence[PositionError]], None],
-        now: Callable[[], int] = time.monotonic_ns,
+        seconds: float,
     ) -> None:
-        self._bridge, self._report_line, self._store, self._now = bridge, report, store, now
-        self._addresses = [autopilot, *([companion] if companion else [])]
-        self._receive = bridge.from_autopilot, bridge.from_companion
-        self._streams: dict[int, Connection] = {}
-        self._received = asyncio.Event()
-        self._stopped = False
+        super().__init__(addresses, lambda text: report(1e-9 * self._elapsed_ns(), text))
+        self._bridge, self._store, self._seconds = bridge, store, seconds
+        self._feed = bridge.from_autopilot, bridge.from_companion
         self._stored = 0
-        self.started_ns = self.now_ns = now()
 
-    def stop(self) -> None:
-        """Make `run` return soon."""
-        self._stopped = True
-        self._received.set()
+    def _steps(self) -> Iterator[float]:
+        while not self._stopped and (left := self._seconds - 1e-9 * self._elapsed_ns()) > 0.0:
+            self._bridge.poll(time.monotonic_ns())
+            self._flush()
+            yield min(1e-9 * (self._bridge.deadline() - time.monotonic_ns()), left)
+        self._bridge.finish(time.monotonic_ns())
+        self._flush()
 
-    async def run(self, seconds: float = math.inf) -> None:
-        """Run for `seconds` or until `stop`. Raises CannotListen if an address is in use."""
-        self.started_ns = self._now()
-        try:
-            async with asyncio.TaskGroup() as tasks:
-                serving = [tasks.create_task(self._serve(side)) for side in range(len(self._addresses))]
-                while not self._stopped and self._elapsed() < seconds:
-                    self._bridge.poll(self._now())
-                    self._flush()
-                    left = min(1e-9 * (self._bridge.deadline() - self._now()), seconds - self._elapsed())
-                    await self._wait(min(left, LONGEST_SLEEP_S))
-                self._bridge.finish(self._now())
-                self._flush()
-                for task in serving:
-                    task.cancel()
-        except ExceptionGroup as group:
-            raise cannot_listen(group) from None
-
-    def _elapsed(self) -> float:
-        self.now_ns = self._now()
-        return (self.now_ns - self.started_ns) * 1e-9
-
-    async def _wait(self, seconds: float) -> None:
-        """Sleep until the time is over or bytes arrive: relayed frames must not wait."""
-        try:
-            async with asyncio.timeout(max(0.0, seconds)):
-                await self._received.wait()
-        except TimeoutError:
-            pass
-        self._received.clear()
-
-    async def _serve(self, side: int) -> None:
-        async for stream in connections(self._addresses[side], random.random, self._report):
-            self._streams[side] = stream
-            try:
-                while True:
-                    self._receive[side](await stream.read(), self._now())
-                    self._received.set()
-            except ConnectionError as error:
-                self._report(f"{error}; reconnecting")
-            del self._streams[side]
+    def _receive(self, link: int, data: bytes) -> None:
+        self._feed[link](data, time.monotonic_ns())
 
     def _flush(self) -> None:
-        for side, frames in enumerate((self._bridge.to_autopilot(), self._bridge.to_companion())):
-            if (stream := self._streams.get(side)) is not None:
-                for data in frames:
-                    stream.write(data)
+        self._send(self._bridge.to_autopilot(), 0)
+        self._send(self._bridge.to_companion(), 1)
         for line in self._bridge.take_reports():
             self._report(line)
         scored = self._bridge.comparison.errors
         if len(scored) > self._stored:
             self._store(scored[self._stored :])
             self._stored = len(scored)
-
-    def _report(self, text: str) -> None:
-        self._report_line(self._elapsed(), text)
 
 
 class ErrorFile:
@@ -212,13 +163,6 @@ def _parse_beacons(positions: tuple[str, ...], file: Path | None) -> tuple[Beaco
     return tuple(beacons)
 
 
-def _parse_address(text: str, option: str) -> Address:
-    try:
-        return Address.parse(text)
-    except ValueError as error:
-        raise click.BadParameter(str(error), param_hint=option) from None
-
-
 @click.command("bridge")
 @click.option("--connect", default="tcp:127.0.0.1:5760", show_default=True, help="Link to the autopilot.")
 @click.option("--companion", help="Link to the companion; without it all share the first link (a router).")
@@ -266,8 +210,8 @@ def command(
     switched on again. Exit codes: 1 the beacons cannot be read, 69 cannot listen on an address or no
     autopilot found, 73 the folder cannot be written.
     """
-    autopilot = _parse_address(connect, "--connect")
-    other = _parse_address(companion, "--companion") if companion else None
+    autopilot = parse_address(connect)
+    other = parse_address(companion, "--companion") if companion else None
     if gnss_on_after is not None and (gnss_off_after is None or gnss_on_after <= gnss_off_after):
         raise click.BadParameter("give --gnss-off-after, and a later time here", param_hint="--gnss-on-after")
     if other is None and (beacons_only or unaided):
@@ -283,27 +227,25 @@ def command(
         record = ErrorFile(folder, time.monotonic_ns()) if folder else None
     except OSError as error:
         click.echo(f"companion: {folder} cannot be written: {error.strerror}", err=True)
-        sys.exit(EX_CANTCREAT)
+        sys.exit(os.EX_CANTCREAT)
     runner = BridgeRunner(
         bridge,
-        autopilot,
-        other,
+        (autopilot, other) if other else (autopilot,),
         lambda t, text: click.echo(f"{t:8.1f} s  {text}", err=True),
         record.store if record else lambda scored: None,
+        seconds,
     )
     try:
-        asyncio.run(_until_stopped(runner, seconds))
-    except CannotListen as error:
-        click.echo(f"companion: {error.strerror}", err=True)
-        sys.exit(EX_UNAVAILABLE)
+        runner.run_command()
     finally:
         if record is not None:
             record.close()
+    end_ns = time.monotonic_ns()
     if bridge.connected_ns is None:
-        seconds = (runner.now_ns - runner.started_ns) * 1e-9
+        seconds = (end_ns - runner.started_ns) * 1e-9
         click.echo(f"companion: no autopilot on {connect} in {seconds:.0f} s", err=True)
-        sys.exit(EX_UNAVAILABLE)
-    tables = outage_tables(bridge, runner.now_ns)
+        sys.exit(os.EX_UNAVAILABLE)
+    tables = outage_tables(bridge, end_ns)
     if as_json:
         click.echo(json.dumps(_json(tables, record)))
         return
@@ -315,10 +257,3 @@ def command(
 def _json(tables: list[tuple[str, list[OutageErrors]]], record: ErrorFile | None) -> dict[str, Any]:
     losses = [{"title": title, "rows": [row._asdict() for row in rows]} for title, rows in tables]
     return {"tables": losses, "errors": str(record.path) if record else None}
-
-
-async def _until_stopped(runner: BridgeRunner, seconds: float) -> None:
-    loop = asyncio.get_running_loop()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        loop.add_signal_handler(number, runner.stop)
-    await runner.run(seconds)

@@ -9,13 +9,8 @@ it receives for each phase of the flight.
 
 from __future__ import annotations
 
-import asyncio
 import math
-import random
-import signal
-import sys
-import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import click
@@ -23,16 +18,15 @@ import numpy as np
 
 from companion.link.clock import BootClock
 from companion.nav.geometry import Geodetic, local_to_geodetic, separation
-from companion.transport.reconnect import Address, CannotListen, Connection, cannot_listen, connections
+from companion.transport.address import Address
 from companion.units import SECOND_NS
 from sitl.autopilot import SimulatedAutopilot
 from sitl.bridge_command import command as bridge
+from sitl.real_time import RealTimeRunner, parse_address
 from sitl.scenarios import SCENARIOS, Scenario, SchedulePhase, get_scenario
 from sitl.tlog_player import command as play
 
-EX_UNAVAILABLE = 69  # sysexits.h
 SILENT_AFTER = 3 * SECOND_NS
-LONGEST_SLEEP_S = 0.2
 
 
 class PositionScore:
@@ -97,75 +91,31 @@ class PositionScore:
         return math.hypot(north, east)
 
 
-class SimulatorRunner:
+class SimulatorRunner(RealTimeRunner):
     """One flight over one link, `speed` times real time; `report` receives the flight time (s) and a line."""
 
     def __init__(
-        self,
-        scenario: Scenario,
-        address: Address,
-        speed: float,
-        report: Callable[[float, str], None],
-        now: Callable[[], int] = time.monotonic_ns,
+        self, scenario: Scenario, address: Address, speed: float, report: Callable[[float, str], None]
     ) -> None:
+        super().__init__((address,), lambda text: report(self._flight_ns() * 1e-9, text))
         self.autopilot = SimulatedAutopilot(scenario)
-        self._address, self._speed, self._report_line, self._now = address, speed, report, now
+        self._speed = speed
         self._score = PositionScore(self.autopilot)
         self._phases = scenario.phases()
         self._phase: SchedulePhase | None = None
-        self._stream: Connection | None = None
-        self._received = asyncio.Event()
-        self._stopped = False
-        self._started_ns = now()
 
-    def stop(self) -> None:
-        """Make `run` return soon."""
-        self._stopped = True
-        self._received.set()
-
-    async def run(self) -> None:
-        """Fly to the end or until `stop`. Raises CannotListen if the address is in use."""
-        self._started_ns = self._now()
-        try:
-            async with asyncio.TaskGroup() as tasks:
-                serving = tasks.create_task(self._serve())
-                while not self._stopped and (t := self._flight_ns()) <= self.autopilot.end_ns:
-                    self._send(t)
-                    self._report_progress(t)
-                    left = (min(self.autopilot.deadline(), self.autopilot.end_ns + 1) - t) / self._speed
-                    await self._wait(min(1e-9 * left, LONGEST_SLEEP_S))
-                serving.cancel()
-        except ExceptionGroup as group:
-            raise cannot_listen(group) from None
+    def _steps(self) -> Iterator[float]:
+        while not self._stopped and (t := self._flight_ns()) <= self.autopilot.end_ns:
+            self._send(self.autopilot.poll(t))
+            self._report_progress(t)
+            yield 1e-9 * (min(self.autopilot.deadline(), self.autopilot.end_ns + 1) - t) / self._speed
         self._end_phase()
 
+    def _receive(self, link: int, data: bytes) -> None:
+        self.autopilot.receive(data, self._flight_ns())
+
     def _flight_ns(self) -> int:
-        return int((self._now() - self._started_ns) * self._speed)
-
-    def _send(self, t: int) -> None:
-        for data in self.autopilot.poll(t):
-            if self._stream is not None:
-                self._stream.write(data)
-
-    async def _wait(self, seconds: float) -> None:
-        """Sleep until the time is over or the companion sends, as it may request another rate."""
-        try:
-            async with asyncio.timeout(max(0.0, seconds)):
-                await self._received.wait()
-        except TimeoutError:
-            pass
-        self._received.clear()
-
-    async def _serve(self) -> None:
-        async for stream in connections(self._address, random.random, self._report):
-            self._stream = stream
-            try:
-                while True:
-                    self.autopilot.receive(await stream.read(), self._flight_ns())
-                    self._received.set()
-            except ConnectionError as error:
-                self._report(f"{error}; reconnecting")
-            self._stream = None
+        return int(self._elapsed_ns() * self._speed)
 
     def _report_progress(self, t: int) -> None:
         for line in self._score.update(t):
@@ -180,16 +130,6 @@ class SimulatorRunner:
     def _end_phase(self) -> None:
         if self._phase is not None:
             self._report(f"{self._phase.name}: {self._score.summary()}")
-
-    def _report(self, text: str) -> None:
-        self._report_line(self._flight_ns() * 1e-9, text)
-
-
-async def _run(runner: SimulatorRunner) -> None:
-    loop = asyncio.get_running_loop()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        loop.add_signal_handler(number, runner.stop)
-    await runner.run()
 
 
 @click.group("sitl", invoke_without_command=True, subcommand_metavar="[bridge|play ...]")
@@ -221,10 +161,7 @@ def command(
         chosen = get_scenario(scenario, **({} if seed is None else {"seed": seed}))
     except ValueError as error:
         raise click.BadParameter(str(error), param_hint="--scenario") from None
-    try:
-        address = Address.parse(connect)
-    except ValueError as error:
-        raise click.BadParameter(str(error), param_hint="--connect") from None
+    address = parse_address(connect)
 
     def report(seconds: float, text: str) -> None:
         click.echo(f"{seconds:8.1f} s  {text}", err=True)
@@ -235,11 +172,7 @@ def command(
     click.echo(
         f"{chosen.name}: {minutes:.0f} min as {chosen.autopilot} over {address}; stop with ^C", err=True
     )
-    try:
-        asyncio.run(_run(runner))
-    except CannotListen as error:
-        click.echo(f"companion: {error.strerror}", err=True)
-        sys.exit(EX_UNAVAILABLE)
+    runner.run_command()
 
 
 command.add_command(bridge)

@@ -10,14 +10,10 @@ parameters are unknown, and TIMESYNC is not answered.
 
 from __future__ import annotations
 
-import asyncio
 import math
-import random
-import signal
 import sys
 import time
-from collections.abc import Callable, Hashable, Iterable
-from functools import partial
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -27,12 +23,10 @@ from companion.importers import tlog
 from companion.importers.tlog import TlogEntry
 from companion.link import dialect, frame
 from companion.link.dialect import mavlink
-from companion.transport.peers import Rank
-from companion.transport.reconnect import Address, CannotListen, Connection, cannot_listen, connections
+from companion.transport.address import Address
+from sitl.real_time import LONGEST_SLEEP_S, RealTimeRunner, parse_address
 
-EX_UNAVAILABLE = 69  # sysexits.h
 NEVER = 2**63 - 1
-LONGEST_SLEEP_S = 0.2
 #: Answers to clients of the recording: not played.
 ANSWERS = frozenset({mavlink.MAVLINK_MSG_ID_TIMESYNC, mavlink.MAVLINK_MSG_ID_COMMAND_ACK})
 
@@ -138,74 +132,28 @@ def _find_autopilot(entries: Iterable[TlogEntry]) -> int:
     raise ValueError("the log holds no HEARTBEAT of an autopilot")
 
 
-class PlayerRunner:
+class PlayerRunner(RealTimeRunner):
     """Real-time playback over one link, starting when a client connects or sends."""
 
     def __init__(
-        self,
-        make: Callable[[int], TlogPlayer],
-        address: Address,
-        report: Callable[[str], None],
-        now: Callable[[], int] = time.monotonic_ns,
+        self, make: Callable[[int], TlogPlayer], address: Address, report: Callable[[str], None]
     ) -> None:
-        self._make, self._address, self._report, self._now = make, address, report, now
-        self._stream: Connection | None = None
+        super().__init__((address,), report)
+        self._make = make
         self._player: TlogPlayer | None = None
-        self._started, self._received = asyncio.Event(), asyncio.Event()
-        self._stopped = False
 
-    def stop(self) -> None:
-        """Make `run` return soon."""
-        self._stopped = True
-        self._started.set()
-        self._received.set()
+    def _steps(self) -> Iterator[float]:
+        while not self._stopped and self._player is None:
+            yield LONGEST_SLEEP_S
+        while not self._stopped and self._player and self._player.deadline() < NEVER:
+            self._send(self._player.poll(time.monotonic_ns()))
+            yield 1e-9 * (self._player.deadline() - time.monotonic_ns())
 
-    async def run(self) -> None:
-        """Play to the end or until `stop`. Raises CannotListen if the address is in use."""
-        try:
-            async with asyncio.TaskGroup() as tasks:
-                serving = tasks.create_task(self._serve())
-                await self._started.wait()
-                player = self._player
-                while not self._stopped and player is not None and player.deadline() < NEVER:
-                    self._send()
-                    left = 1e-9 * (player.deadline() - self._now())
-                    await self._wait(min(left, LONGEST_SLEEP_S))
-                serving.cancel()
-        except ExceptionGroup as group:
-            raise cannot_listen(group) from None
-
-    async def _wait(self, seconds: float) -> None:
-        try:
-            async with asyncio.timeout(max(0.0, seconds)):
-                await self._received.wait()
-        except TimeoutError:
-            pass
-        self._received.clear()
-
-    def _send(self) -> None:
-        assert self._player is not None
-        for data in self._player.poll(self._now()):
-            if self._stream is not None:
-                self._stream.write(data)
-
-    async def _serve(self) -> None:
-        async for stream in connections(self._address, random.random, self._report):
-            self._stream = stream
-            try:
-                await stream.deliver_to(partial(self._receive, stream))
-            except ConnectionError as error:
-                self._report(f"{error}; reconnecting")
-            self._stream = None
-
-    def _receive(self, stream: Connection, data: bytes, peer: Hashable) -> None:
-        stream.note(peer, Rank.ACCEPTED)
+    def _receive(self, link: int, data: bytes) -> None:
         if self._player is None:
-            self._player = self._make(self._now())
+            self._player = self._make(time.monotonic_ns())
             self._report("a client connected: playing")
-            self._started.set()
         self._player.receive(data)
-        self._received.set()
 
 
 @click.command("play")
@@ -231,10 +179,7 @@ def command(log: Path, connect: str, from_s: float, to_s: float, speed: float) -
     Requests do not change the recording. Exit codes: 1 the log cannot be played, 69 cannot listen on the
     address.
     """
-    try:
-        address = Address.parse(connect)
-    except ValueError as error:
-        raise click.BadParameter(str(error), param_hint="--connect") from None
+    address = parse_address(connect)
     try:
         entries = list(tlog.read(log))
         TlogPlayer(entries, 0, from_s, to_s, speed)
@@ -246,16 +191,5 @@ def command(log: Path, connect: str, from_s: float, to_s: float, speed: float) -
         address,
         lambda text: click.echo(text, err=True),
     )
-
-    async def run() -> None:
-        loop = asyncio.get_running_loop()
-        for number in (signal.SIGINT, signal.SIGTERM):
-            loop.add_signal_handler(number, runner.stop)
-        await runner.run()
-
     click.echo(f"playing {log} over {address}; stop with ^C", err=True)
-    try:
-        asyncio.run(run())
-    except CannotListen as error:
-        click.echo(f"companion: {error.strerror}", err=True)
-        sys.exit(EX_UNAVAILABLE)
+    runner.run_command()
