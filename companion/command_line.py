@@ -24,7 +24,6 @@ from companion.config import ConfigError
 from companion.printable import printable
 from companion.storage.reader import LogError
 
-EX_IOERR, EX_CONFIG = 74, 78  # sysexits.h
 COMMANDS = {
     "run": "companion.runtime.service:command",
     "replay": "companion.analysis.replay:command",
@@ -149,7 +148,7 @@ def main() -> None:
         sys.exit(error.exit_code)
     except ConfigError as error:
         click.echo(f"companion: {printable(str(error))}", err=True)
-        sys.exit(EX_CONFIG)
+        sys.exit(os.EX_CONFIG)
     except LogError as error:
         click.echo(f"companion: {printable(str(error))}", err=True)
         sys.exit(1)
@@ -158,4 +157,4 @@ def main() -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         where = error.filename or "the output"
         click.echo(f"companion: {where}: {error.strerror or error}", err=True)
-        sys.exit(EX_IOERR)
+        sys.exit(os.EX_IOERR)

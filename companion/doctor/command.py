@@ -6,6 +6,7 @@ Nothing is set without confirmation, or while the vehicle is armed.
 from __future__ import annotations
 
 import asyncio
+import os
 import struct
 import sys
 import time
@@ -24,7 +25,6 @@ from companion.doctor.rendering import as_json, change_summary, parameter_table,
 from companion.printable import printable
 from companion.runtime.exposure import exposure
 from companion.runtime.input_monitor import describe_silence
-from companion.runtime.service import EX_UNAVAILABLE
 from companion.runtime.signing_key import SigningKey
 from companion.transport.reconnect import Address, CannotListen, Connection, connect
 
@@ -216,11 +216,11 @@ def command(
         well = examine(config, address, apply, yes, as_json_)
     except NoAutopilot as error:
         click.echo(f"companion: {printable(str(error))}", err=True)
-        sys.exit(EX_UNAVAILABLE)
+        sys.exit(os.EX_UNAVAILABLE)
     except TimeoutError:
         click.echo(f"companion: {address}: no peer connected within {CONNECT_TIMEOUT_S:g} s", err=True)
-        sys.exit(EX_UNAVAILABLE)
+        sys.exit(os.EX_UNAVAILABLE)
     except OSError as error:
         click.echo(f"companion: {address}: {error.strerror or error}{_advice(error)}", err=True)
-        sys.exit(EX_UNAVAILABLE)
+        sys.exit(os.EX_UNAVAILABLE)
     sys.exit(0 if well else 1)

@@ -50,7 +50,6 @@ from companion.storage.run_metadata import run_metadata
 from companion.transport.drop_monitor import DropMonitor
 from companion.transport.reconnect import Address, CannotListen, Connection, cannot_listen, connections
 
-EX_UNAVAILABLE, EX_CANTCREAT = 69, 73  # sysexits.h
 LOG_CHECK_S = 1.0
 SAVE_INTERVAL_S = 1.0
 STOP_TIMEOUT_S = 5.0  # limit on waiting for a disk at the end
@@ -385,9 +384,9 @@ def command(
             asyncio.run(run(config, console.event, base, kept, notes, console.status))
     except CannotListen as error:
         writer.write_line(f"companion: {printable(str(error.strerror))}")
-        sys.exit(EX_UNAVAILABLE)
+        sys.exit(os.EX_UNAVAILABLE)
     except LogError as error:
         writer.write_line(f"companion: {printable(str(error))}")
-        sys.exit(EX_CANTCREAT)
+        sys.exit(os.EX_CANTCREAT)
     finally:
         writer.close()

@@ -19,7 +19,7 @@ from rich.console import Console
 from companion.config import load
 from companion.config.required_parameters import required_parameters
 from companion.doctor import command, examination, rendering
-from companion.doctor.command import EX_UNAVAILABLE, check_machine
+from companion.doctor.command import check_machine
 from companion.doctor.diagnosis import Diagnosis, Finding, Identity, ParameterFinding
 from companion.link import stream_rates
 from companion.transport.reconnect import Address
@@ -94,7 +94,7 @@ def test_nothing_is_set_while_armed() -> None:
 
 
 def line(result: Result) -> str:
-    assert result.exit_code == EX_UNAVAILABLE
+    assert result.exit_code == os.EX_UNAVAILABLE
     (only,) = result.stderr.splitlines()
     assert only.startswith("companion: ")
     return only

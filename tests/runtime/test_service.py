@@ -18,7 +18,7 @@ from companion.config import load
 from companion.link import dialect, frame
 from companion.records import Event
 from companion.runtime import service
-from companion.runtime.service import EX_CANTCREAT, EX_UNAVAILABLE, Service
+from companion.runtime.service import Service
 from companion.storage import flight_log, retention
 from companion.transport.reconnect import Address, CannotListen
 from tests.network import free_port, until
@@ -316,7 +316,7 @@ def test_port_in_use_exits_69_with_one_line(tmp_path: Path) -> None:
         code, stderr = finished(
             "--connect", f"udpin:{LOOPBACK}:{taken.getsockname()[1]}", "--logs", str(tmp_path)
         )
-    assert code == EX_UNAVAILABLE
+    assert code == os.EX_UNAVAILABLE
     assert sum(line.startswith("companion: cannot listen") for line in stderr.splitlines()) == 1
     assert "Traceback" not in stderr and "listening:" not in stderr
     assert not list(tmp_path.iterdir())  # a failed start leaves no empty log
@@ -332,8 +332,8 @@ def test_starts_that_fail_for_another_reason_keep_the_parameters(tmp_path: Path)
         taken.bind((LOOPBACK, 0))
         in_use = ("--connect", f"udpin:{LOOPBACK}:{taken.getsockname()[1]}", "--logs", str(tmp_path / "logs"))
         for code, arguments in (
-            (EX_UNAVAILABLE, in_use),
-            (EX_CANTCREAT, ("--logs", str(tmp_path / "no_folder"))),
+            (os.EX_UNAVAILABLE, in_use),
+            (os.EX_CANTCREAT, ("--logs", str(tmp_path / "no_folder"))),
             (78, ("--set", f"signing.key_file={tmp_path / 'none'}", "--logs", str(tmp_path / "logs"))),
             (78, ("--connect", "udp:1.2.3.4")),
         ):
@@ -376,7 +376,7 @@ def test_unwritable_log_folder_exits_73_with_one_line(tmp_path: Path) -> None:
     else:
         folder.mkdir(mode=0o555)
     code, stderr = finished("--logs", str(folder))
-    assert code == EX_CANTCREAT
+    assert code == os.EX_CANTCREAT
     assert len(stderr.splitlines()) == 1 and str(folder) in stderr
     if folder.is_file():
         assert "it is a file; give a folder" in stderr

@@ -16,7 +16,6 @@ from pathlib import Path
 
 import pytest
 
-from companion.command_line import EX_CONFIG
 from companion.link import dialect, frame
 from companion.runtime.service import LOG_CHECK_S
 from companion.runtime.systemd import FEEDS_PER_TIMEOUT, SystemdNotifier
@@ -202,7 +201,7 @@ def test_unit_matches_the_service() -> None:
     assert service["Type"] == "notify"
     # without an autopilot it wakes once a second
     assert float(service["WatchdogSec"]) > FEEDS_PER_TIMEOUT * LOG_CHECK_S
-    assert str(EX_CONFIG) in service["RestartPreventExitStatus"].split()
+    assert str(os.EX_CONFIG) in service["RestartPreventExitStatus"].split()
     _, command, *options = shlex.split(service["ExecStart"])
     shown = subprocess.run(
         [sys.executable, "-m", "companion", command, "--help"], capture_output=True, text=True, check=True
