@@ -28,7 +28,7 @@ from sitl.campaign.flight import UNITS
 from sitl.correctors import RECORDS
 from sitl.flight import radii
 from sitl.scenarios import get_scenario
-from sitl.smoothing_study import SENSORS, flight_records, simulated_gusts
+from sitl.smoothing_study import simulated_gusts
 from sitl.world import World
 
 NAMES = ("none", "airspeed", *RECORDS)
@@ -57,7 +57,7 @@ def fly(world: World, bank: bool = True) -> CorrectedFlight:
     navigator = Navigator(config, None if bank else Model(config, plain=0))
     found = [
         output
-        for record in flight_records(world, SENSORS)
+        for record in world.records()
         for output in navigator.handle(record)  # type: ignore[arg-type]
         if isinstance(output, Solution)
     ]

@@ -12,14 +12,12 @@ simulated link, all others record by record.
 
 from __future__ import annotations
 
-import heapq
 import json
 import math
 import re
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
-from itertools import chain, repeat
-from operator import attrgetter
+from itertools import repeat
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -33,7 +31,7 @@ from companion.config import Config, InertialConfig, OutputConfig
 from companion.nav.geometry import displace
 from companion.navigator import Navigator
 from companion.output.source_switch import SourceSwitch
-from companion.records import Event, Gnss, LocalOrigin, RsbnFix, Solution, Stamped
+from companion.records import Event, Gnss, RsbnFix, Solution, Stamped
 from companion.runtime.core import CompanionCore
 from companion.tables import print_tables
 from companion.units import SECOND_NS, Floats
@@ -222,12 +220,10 @@ _Flown = tuple[World, list[Solution], list[Event], bool]
 
 def _fly_records(scenario: Scenario, order: HarmOrder) -> _Flown:
     config, world, switch = config_of(order), World(scenario), SourceSwitch()
-    navigator, origin = Navigator(config), world.origin
-    start = LocalOrigin(0, 0, origin.lat, origin.lon, origin.alt - scenario.geoid_height, scenario.autopilot)
-    streams = (world.streams[kind] for kind in sensors_of(config))
+    navigator = Navigator(config)
     solutions, events, set_2, next_ns = list[Solution](), list[Event](), False, 0
     noisy, rng = WRONG[order.wrong].noisy, np.random.default_rng(order.seed)
-    for record in chain([start], heapq.merge(*streams, key=attrgetter("rx_ns"))):
+    for record in world.records(sensors_of(config)):
         if noisy is not None and isinstance(record, noisy):
             record = noisier(record, rng)
         if isinstance(record, Gnss):

@@ -23,7 +23,7 @@ from companion.tables import print_tables
 from companion.units import Floats
 from sitl.flight import radii
 from sitl.scenarios import get_scenario
-from sitl.smoothing_study import CHANNELS, flight_records
+from sitl.smoothing_study import CHANNELS
 from sitl.world import World
 
 SCHEMES: tuple[Any, ...] = ("feedforward", 0.3, 0.7, "feedback")
@@ -49,7 +49,7 @@ def fly(world: World, channel: str, scheme: Any) -> SchemeFlight:
     solutions: list[Solution] = []
     fixes: list[Fix] = []
     rejected = 0
-    for record in flight_records(world, CHANNELS[channel]):
+    for record in world.records(CHANNELS[channel]):
         for output in navigator.handle(record):  # type: ignore[arg-type]
             if isinstance(output, Solution):
                 solutions.append(output)

@@ -16,10 +16,8 @@ per flight, so a single flight may be better filtered by chance. Messages and li
 
 from __future__ import annotations
 
-import heapq
 import math
 from collections.abc import Iterable, Sequence
-from operator import attrgetter
 from typing import NamedTuple
 
 import click
@@ -31,28 +29,17 @@ from rich.table import Table
 
 from companion.analysis.smoothing import SmoothedRun, smooth_flight
 from companion.config import AirDataConfig, Config, InertialConfig
-from companion.records import (
-    AirData,
-    Attitude,
-    Gnss,
-    Imu,
-    LocalOrigin,
-    LocalPosition,
-    Pressure,
-    RsbnFix,
-    Stamped,
-)
+from companion.records import Gnss, Imu, RsbnFix, Stamped
 from companion.tables import print_tables
 from companion.units import Floats
 from sitl.campaign.flight import UNITS
 from sitl.flight import fly_plan, radii
 from sitl.scenarios import SCENARIOS, Scenario, get_scenario
-from sitl.world import World
+from sitl.world import SENSORS, World
 
-SENSORS = (LocalPosition, Attitude, Gnss, AirData, Pressure, RsbnFix)
 SAME_SIGMA = 1e-6
 #: An INS of its own; the companion's own channel by airspeed alone; the same by all that it gets.
-CHANNELS = {"ins": SENSORS, "air_data": SENSORS, "own": (Imu, *SENSORS)}
+CHANNELS: dict[str, tuple[type[Stamped], ...]] = {"ins": SENSORS, "air_data": SENSORS, "own": (Imu, *SENSORS)}
 
 
 class SmoothingComparison(NamedTuple):
@@ -74,17 +61,6 @@ class SmoothingComparison(NamedTuple):
         return self.smoothed < self.filtered
 
 
-def flight_records(world: World, sensors: Sequence[type[Stamped]] = SENSORS) -> Iterable[Stamped]:
-    """Return the records the companion receives, in order of arrival; invalid positions are left out."""
-    origin, scenario = world.origin, world.scenario
-    height = origin.alt - scenario.geoid_height
-    yield LocalOrigin(0, 0, origin.lat, origin.lon, height, scenario.autopilot)
-    streams = (*(world.streams[kind] for kind in sensors), world.corrections)
-    for record in heapq.merge(*streams, key=attrgetter("rx_ns")):
-        if not isinstance(record, LocalPosition) or all(map(math.isfinite, record.x_n)):
-            yield record
-
-
 def simulated_gusts(scenario: Scenario) -> AirDataConfig:
     """Return the air-data model with the turbulence of the simulator: Dryden's, of correlation time L / V."""
     speed = float(np.mean(fly_plan(scenario.plan).airspeed))
@@ -101,7 +77,7 @@ def compare_flight(scenario: Scenario, channel: str) -> SmoothingComparison:
         inertial = InertialConfig(source="air_data" if channel == "air_data" else "auto")
     fixes = (*world.streams[Gnss], *world.streams[RsbnFix])
     end_ns = max(fix.rx_ns for fix in fixes if getattr(fix, "has_3d_fix", True))
-    records = (r for r in flight_records(world, CHANNELS[channel]) if r.rx_ns <= end_ns)
+    records = (r for r in world.records(CHANNELS[channel]) if r.rx_ns <= end_ns)
     return pool([_against_truth(run, world) for run in smooth_flight(records, Config(inertial=inertial))])
 
 

@@ -26,7 +26,6 @@ from companion.tables import print_tables
 from sitl.campaign.flight import UNITS
 from sitl.flight import radii
 from sitl.scenarios import Scenario, get_scenario
-from sitl.smoothing_study import flight_records
 from sitl.world import World
 
 SOURCES = ("INS", "GNSS", "RSBN")
@@ -92,7 +91,7 @@ def fly(world: World, source: str, factor: float, bank: bool) -> FlownError:
     navigator = Navigator(config, None if bank else Model(config, plain=0))
     found = [
         (output.t_ns * 1e-9, output.lat, output.lon)
-        for record in restated(flight_records(world), source, factor)
+        for record in restated(world.records(), source, factor)
         for output in navigator.handle(record)  # type: ignore[arg-type]
         if isinstance(output, Solution)
     ]

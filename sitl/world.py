@@ -6,19 +6,35 @@ rates, links and the companion's clock belong to `sitl.autopilot`.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import heapq
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from operator import attrgetter
 from typing import Literal
 
 import numpy as np
 
 from companion.nav.geometry import Geodetic, geodetic_to_local
-from companion.records import AirData, Attitude, Gnss, Imu, LocalPosition, Pressure, RsbnFix, Stamped, Truth
+from companion.records import (
+    AirData,
+    Attitude,
+    Gnss,
+    Imu,
+    LocalOrigin,
+    LocalPosition,
+    Pressure,
+    RsbnFix,
+    Stamped,
+    Truth,
+)
 from companion.units import Floats
 from sitl import beacon, correctors, sensors
 from sitl.faults import apply_record_faults
 from sitl.flight import Trajectory, fly_plan
 from sitl.scenarios import Scenario
 
+#: Kinds of records that the companion receives from every autopilot.
+SENSORS: tuple[type[Stamped], ...] = (LocalPosition, Attitude, Gnss, AirData, Pressure, RsbnFix)
 _TURN = 2.0 * np.pi
 
 
@@ -62,6 +78,19 @@ class World:
         self.corrections = correctors.simulate(aircraft, scenario.correctors, scenario.seed)
         for kind, stream in self.streams.items():
             self.streams[kind] = apply_record_faults(kind, stream, scenario.faults, faults)
+
+    def records(self, kinds: Iterable[type[Stamped]] = SENSORS) -> Iterator[Stamped]:
+        """Yield what the companion receives: the local origin, then records of `kinds` and of correctors.
+
+        They are in order of arrival; invalid local positions are left out.
+        """
+        origin, scenario = self.origin, self.scenario
+        height = origin.alt - scenario.geoid_height
+        yield LocalOrigin(0, 0, origin.lat, origin.lon, height, scenario.autopilot)
+        streams = (*(self.streams[kind] for kind in kinds), self.corrections)
+        for record in heapq.merge(*streams, key=attrgetter("rx_ns")):
+            if not isinstance(record, LocalPosition) or all(map(math.isfinite, record.x_n)):
+                yield record
 
     def truth_at(self, t: Floats) -> Trajectory:
         """Return the truth at flight times `t` (s)."""

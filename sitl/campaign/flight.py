@@ -19,12 +19,10 @@ Workers, files and tables belong to `sitl.campaign.command`. A fault counts as
 from __future__ import annotations
 
 import dataclasses
-import heapq
 import math
 import tempfile
 import time
 from collections.abc import Iterable, Iterator, Sequence
-from operator import attrgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -33,24 +31,7 @@ import numpy.typing as npt
 
 from companion.config import Config, InertialConfig
 from companion.navigator import Navigator
-from companion.records import (
-    AirData,
-    Attitude,
-    Event,
-    Gnss,
-    Imu,
-    LocalOrigin,
-    LocalPosition,
-    Mode,
-    Pressure,
-    Rejection,
-    Reset,
-    RsbnFix,
-    Solution,
-    Source,
-    Stamped,
-    Trust,
-)
+from companion.records import Event, Imu, Mode, Rejection, Reset, Solution, Source, Stamped, Trust
 from companion.storage.flight_log import Writer
 from companion.units import SECOND_NS, Floats
 from sitl import loopback
@@ -59,13 +40,12 @@ from sitl.beacon import Beacon
 from sitl.faults import RECORD_FAULTS, Fault, FullDisk
 from sitl.flight import FlightPlan, Leg, WindChange, radii
 from sitl.scenarios import Scenario, SensorRates
-from sitl.world import World
+from sitl.world import SENSORS, World
 
 FAULT_S, OVER_S = 300.0, 540.0
 TURN_S = 430.0
 FAULT_EVENTS = ("the link is late", "the clock of autopilot")  # events that report a fault contain one
 SUSPICION, EXCLUSION = " is suspect:", " is excluded:"  # after the name of the source, in events
-SENSORS: tuple[type[Stamped], ...] = (LocalPosition, Attitude, Gnss, AirData, Pressure, RsbnFix)
 SETTLED_S = 60.0  # alarms count from here on
 _LEGS = (
     Leg(10, 40, 0, 0),
@@ -310,11 +290,8 @@ def sensors_of(config: Config) -> tuple[type[Stamped], ...]:
 def fly_records(scenario: Scenario, config: Config) -> tuple[World, list[Stamped]]:
     """Fly without messages: pass every record to the navigator at its arrival. Times are flight time."""
     world, navigator = World(scenario), Navigator(config)
-    origin = world.origin
-    height = origin.alt - scenario.geoid_height
     outputs: list[Stamped] = []
-    outputs += navigator.handle(LocalOrigin(0, 0, origin.lat, origin.lon, height, scenario.autopilot))
-    for record in heapq.merge(*(world.streams[kind] for kind in sensors_of(config)), key=attrgetter("rx_ns")):
+    for record in world.records(sensors_of(config)):
         outputs += navigator.handle(record)  # type: ignore[arg-type]
         navigator.settle()
     return world, outputs

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import heapq
 import math
 from collections.abc import Callable
-from operator import attrgetter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,13 +16,10 @@ from companion.navigator.changes import FALSE_AIRSPEED, USE_AIRSPEED
 from companion.records import (
     PARALLEL,
     AirData,
-    Attitude,
     Event,
     Gnss,
     Imu,
-    LocalOrigin,
     LocalPosition,
-    Pressure,
     Rejection,
     RsbnFix,
     Solution,
@@ -35,7 +30,7 @@ from companion.units import Floats
 from sitl.beacon import Beacon
 from sitl.flight import FlightPlan, Leg, WindChange
 from sitl.scenarios import Scenario, SensorRates
-from sitl.world import World
+from sitl.world import SENSORS, World
 
 pytestmark = pytest.mark.flight
 
@@ -48,7 +43,6 @@ FIVE_MINUTES = (
     Leg(60, 220, 38, 40),
     Leg(60, 310, 38, 40),
 )
-SENSORS = (LocalPosition, Attitude, Gnss, AirData, Pressure, RsbnFix)
 INS = load(flags={"inertial.independent": True}, environment={})
 OWN = load(flags={"output.profile": "ardupilot"}, environment={})
 CHANNELS: dict[str, tuple[Config, tuple[type, ...]]] = {
@@ -121,10 +115,8 @@ def fly(
             **scenario,
         )
     )
-    start, outputs = world.origin, list[Any]()
-    navigator = Navigator(config or chosen)
-    navigator.handle(LocalOrigin(0, 0, start.lat, start.lon, start.alt - 16.0, "ardupilot"))
-    for record in heapq.merge(*(world.streams[kind] for kind in kinds), key=attrgetter("rx_ns")):
+    navigator, outputs = Navigator(config or chosen), list[Any]()
+    for record in world.records(kinds):
         changed = change(record)
         outputs += [] if changed is None else navigator.handle(changed)
     solutions = [out for out in outputs if isinstance(out, Solution)]

@@ -30,7 +30,7 @@ NS = 1_000_000_000
 
 
 def received(scenario: Scenario) -> list:
-    return list(smoothing_study.flight_records(World(scenario)))
+    return list(World(scenario).records())
 
 
 def three_outages() -> Scenario:
@@ -129,7 +129,7 @@ def test_straight_flight_with_gnss_alone_is_smoothed_as_the_optimum_smooths_it()
     parts = []
     for seed in (1, 2):
         world = World(get_scenario("airspeed-ins", seed=seed, rates=rates))
-        heard = smoothing_study.flight_records(world, smoothing_study.CHANNELS["own"])
+        heard = world.records(smoothing_study.CHANNELS["own"])
         records = [record for record in heard if record.rx_ns < 600 * NS]
         (run,) = smoothing.smooth_flight(records, Config(), check=True)
         latency = OwnChannel(Config()).latency
@@ -184,7 +184,7 @@ def test_correctors_are_measurements_of_the_smoother_too() -> None:
         get_scenario("short", grade="mems", correctors=used, rates=slow, gnss_outages=lost, beacons=())
     )
     unit = structs.replace(UNITS["mems"], independent=True, correctors=used)
-    (run,) = smoothing.smooth_flight(smoothing_study.flight_records(world), Config(inertial=unit), check=True)
+    (run,) = smoothing.smooth_flight(world.records(), Config(inertial=unit), check=True)
     found = smoothing_study._against_truth(run, world)
     assert math.sqrt(found.smoothed / found.filtered) < 0.4
     assert found.misfit_smoothed < found.misfit_filtered

@@ -8,7 +8,6 @@ from companion.config import Config
 from companion.records import AirData, Gnss, RsbnFix
 from sitl import weights_study
 from sitl.scenarios import get_scenario
-from sitl.smoothing_study import flight_records
 from sitl.world import World
 
 
@@ -38,7 +37,7 @@ def test_configuration_and_records_are_scaled() -> None:
     ],
 )
 def test_only_the_source_states_another_sigma(world: World, source: str, kind: type, field: str) -> None:
-    before = list(flight_records(world))
+    before = list(world.records())
     after = list(weights_study.restated(before, source, 3.0))
     for a, b in zip(before, after, strict=True):
         if isinstance(a, kind) and getattr(a, "has_3d_fix", True):
