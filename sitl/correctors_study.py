@@ -26,7 +26,6 @@ from companion.tables import print_tables
 from companion.units import Floats
 from sitl.campaign.flight import UNITS
 from sitl.correctors import RECORDS
-from sitl.flight import radii
 from sitl.scenarios import get_scenario
 from sitl.smoothing_study import simulated_gusts
 from sitl.world import World
@@ -61,11 +60,7 @@ def fly(world: World, bank: bool = True) -> CorrectedFlight:
         for output in navigator.handle(record)  # type: ignore[arg-type]
         if isinstance(output, Solution)
     ]
-    t = np.array([s.t_ns for s in found]) * 1e-9
-    truth = world.truth_at(t)
-    R_N, R_E = radii(truth.lat)
-    lat, lon = np.array([(s.lat, s.lon) for s in found]).T
-    error = np.hypot((lat - truth.lat) * R_N, (lon - truth.lon) * R_E * np.cos(truth.lat))
+    t, error = world.horizontal_errors(found)
     sigma = np.sqrt([s.covariance[0] + s.covariance[3] for s in found])
     return CorrectedFlight(t, error, sigma, np.array([s.protection or math.inf for s in found]))
 

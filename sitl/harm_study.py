@@ -38,9 +38,9 @@ from companion.units import SECOND_NS, Floats
 from sitl import loopback
 from sitl.autopilot import SimulatedAutopilot
 from sitl.beacon import Beacon
-from sitl.campaign.flight import UNITS, horizontal_errors, sensors_of
+from sitl.campaign.flight import UNITS, sensors_of
 from sitl.faults import Fault
-from sitl.flight import FlightPlan, Leg, WindChange, radii
+from sitl.flight import FlightPlan, Leg, WindChange
 from sitl.harm_recordings import RecordingResult, fly_named, list_recordings, set_2_requests
 from sitl.scenarios import Scenario, SensorRates
 from sitl.world import World
@@ -201,7 +201,8 @@ def fly(order: HarmOrder) -> HarmResult:
             flown = _fly_link if WRONG[order.wrong].over_link else _fly_records
             world, solutions, events, set_2 = flown(scenario_of(order), order)
         excluded = any(event.text.startswith(_EXCLUDED) for event in events)
-        ours, its = _errors(world, solutions), _gnss_errors(world)
+        fixes = [r for r in world.streams[Gnss] if isinstance(r, Gnss) and r.has_3d_fix]
+        ours, its = world.horizontal_errors(solutions), world.horizontal_errors(fixes)
         suspected = sorted({found[1] for event in events if (found := _SUSPECTED.match(event.text))})
         return HarmResult(
             *order[:3],
@@ -267,21 +268,6 @@ def _fly_link(scenario: Scenario, order: HarmOrder) -> _Flown:
     solutions = [replace(r, t_ns=r.t_ns - start) for r in log.records if isinstance(r, Solution)]
     events = [r for r in log.records if isinstance(r, Event)]
     return autopilot.world, solutions, events, any(_SET_2 in event.text for event in events)
-
-
-def _errors(world: World, solutions: list[Solution]) -> tuple[Floats, Floats]:
-    t = np.array([s.t_ns for s in solutions]) * 1e-9
-    return t, horizontal_errors(world, solutions, t) if len(t) else t
-
-
-def _gnss_errors(world: World) -> tuple[Floats, Floats]:
-    fixes = [r for r in world.streams[Gnss] if isinstance(r, Gnss) and r.has_3d_fix]
-    t = np.array([r.t_ns for r in fixes]) * 1e-9
-    truth = world.truth_at(t)
-    R_N, R_E = radii(truth.lat)
-    north = (np.array([r.lat for r in fixes]) - truth.lat) * (R_N + truth.alt)
-    east = (np.array([r.lon for r in fixes]) - truth.lon) * (R_E + truth.alt) * np.cos(truth.lat)
-    return t, np.hypot(north, east)
 
 
 def _from(start_s: float, ours: tuple[Floats, Floats], its: tuple[Floats, Floats]) -> tuple[Floats, ...]:

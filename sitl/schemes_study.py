@@ -16,12 +16,12 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
+from companion.analysis.error_statistics import root_mean_square
 from companion.config import Config, EstimatorConfig, InertialConfig
 from companion.navigator import Navigator
 from companion.records import Fix, Rejection, Solution, Source
 from companion.tables import print_tables
 from companion.units import Floats
-from sitl.flight import radii
 from sitl.scenarios import get_scenario
 from sitl.smoothing_study import CHANNELS
 from sitl.world import World
@@ -58,14 +58,11 @@ def fly(world: World, channel: str, scheme: Any) -> SchemeFlight:
             rejected += isinstance(output, Rejection)
     beacon = Source.AZIMUTH | Source.RANGE
     joint = sum(bool(fix.sources & Source.GNSS and fix.sources & beacon) for fix in fixes)
+    _, error = world.horizontal_errors(solutions)
     t = np.array([s.t_ns for s in solutions], dtype=np.float64)
     place = np.array([(s.lat, s.lon) for s in solutions])
     bound = np.array([s.bound_n or (np.nan, np.nan) for s in solutions])
-    truth = world.truth_at(t * 1e-9)
-    R_N, R_E = radii(truth.lat)
-    squares = ((place[:, 0] - truth.lat) * R_N) ** 2
-    squares += ((place[:, 1] - truth.lon) * R_E * np.cos(truth.lat)) ** 2
-    return SchemeFlight(t, place, bound, float(np.sqrt(squares.mean())), len(fixes), joint, rejected)
+    return SchemeFlight(t, place, bound, root_mean_square(error), len(fixes), joint, rejected)
 
 
 def apart_m(a: SchemeFlight, b: SchemeFlight) -> tuple[float, float]:

@@ -33,7 +33,7 @@ from companion.records import Gnss, Imu, RsbnFix, Stamped
 from companion.tables import print_tables
 from companion.units import Floats
 from sitl.campaign.flight import UNITS
-from sitl.flight import fly_plan, radii
+from sitl.flight import fly_plan
 from sitl.scenarios import SCENARIOS, Scenario, get_scenario
 from sitl.world import SENSORS, World
 
@@ -87,11 +87,7 @@ def pool(parts: Sequence[SmoothingComparison]) -> SmoothingComparison:
 
 
 def _against_truth(run: SmoothedRun, world: World) -> SmoothingComparison:
-    truth = world.truth_at(np.asarray(run.t_ns * 1e-9, dtype=np.float64))
-    R_N, R_E = radii(truth.lat)
-    north = (run.lat - truth.lat) * (R_N + truth.alt)
-    east = (run.lon - truth.lon) * (R_E + truth.alt) * np.cos(truth.lat)
-    smoothed = np.stack([north, east], axis=1)
+    smoothed = world.errors_at(np.asarray(run.t_ns * 1e-9, dtype=np.float64), run.lat, run.lon)
     filtered = smoothed + run.x[:, :2] - run.x_filter[:, :2]  # both are channel minus estimated error
     # after the last fix both are the same up to rounding
     sigma = np.sqrt(np.einsum("nii->ni", run.P_filter[:, :2, :2]))

@@ -12,19 +12,18 @@ from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import click
-import numpy as np
 from msgspec import structs
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
+from companion.analysis.error_statistics import root_mean_square
 from companion.config import Config, InertialConfig, OutputConfig
 from companion.navigator import Navigator
 from companion.navigator.hypotheses import Model
 from companion.records import Gnss, RsbnFix, Solution, Stamped
 from companion.tables import print_tables
 from sitl.campaign.flight import UNITS
-from sitl.flight import radii
 from sitl.scenarios import Scenario, get_scenario
 from sitl.world import World
 
@@ -90,19 +89,15 @@ def fly(world: World, source: str, factor: float, bank: bool) -> FlownError:
     config = stated(Config(inertial=inertial, output=OutputConfig(solution_hz=1.0)), source, factor)
     navigator = Navigator(config, None if bank else Model(config, plain=0))
     found = [
-        (output.t_ns * 1e-9, output.lat, output.lon)
+        output
         for record in restated(world.records(), source, factor)
         for output in navigator.handle(record)  # type: ignore[arg-type]
         if isinstance(output, Solution)
     ]
-    t, lat, lon = np.array(found).T
-    truth = world.truth_at(t)
-    R_N, R_E = radii(truth.lat)
-    squares = ((lat - truth.lat) * R_N) ** 2 + ((lon - truth.lon) * R_E * np.cos(truth.lat)) ** 2
-    phases = [squares[(t >= phase.start_s) & (t < phase.end_s)] for phase in scenario.phases()]
+    t, error = world.horizontal_errors(found)
+    phases = [error[(t >= phase.start_s) & (t < phase.end_s)] for phase in scenario.phases()]
     return FlownError(
-        tuple(math.sqrt(float(each.mean())) if len(each) else math.nan for each in phases),
-        math.sqrt(float(squares.mean())),
+        tuple(root_mean_square(each) if len(each) else math.nan for each in phases), root_mean_square(error)
     )
 
 

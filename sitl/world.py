@@ -24,13 +24,14 @@ from companion.records import (
     LocalPosition,
     Pressure,
     RsbnFix,
+    Solution,
     Stamped,
     Truth,
 )
 from companion.units import Floats
 from sitl import beacon, correctors, sensors
 from sitl.faults import apply_record_faults
-from sitl.flight import Trajectory, fly_plan
+from sitl.flight import Trajectory, fly_plan, radii
 from sitl.scenarios import Scenario
 
 #: Kinds of records that the companion receives from every autopilot.
@@ -95,6 +96,20 @@ class World:
     def truth_at(self, t: Floats) -> Trajectory:
         """Return the truth at flight times `t` (s)."""
         return self.flight.at(t)
+
+    def errors_at(self, t: Floats, lat: Floats, lon: Floats) -> Floats:
+        """Return the errors north and east (n, 2) m of positions (n,) rad at flight times `t` (n,) s."""
+        truth = self.truth_at(t)
+        R_N, R_E = radii(truth.lat)
+        north = (lat - truth.lat) * (R_N + truth.alt)
+        east = np.remainder(lon - truth.lon + np.pi, _TURN) - np.pi
+        return np.stack([north, east * (R_E + truth.alt) * np.cos(truth.lat)], axis=1)
+
+    def horizontal_errors(self, records: Sequence[Solution | Gnss]) -> tuple[Floats, Floats]:
+        """Return the flight times (n,) s of solutions or fixes and their horizontal errors (n,) m."""
+        t = np.array([r.t_ns for r in records]) * 1e-9
+        lat, lon = np.array([(r.lat, r.lon) for r in records]).reshape(-1, 2).T
+        return t, np.hypot(*self.errors_at(t, lat, lon).T)
 
     def _sampled(self, rate_hz: float) -> Trajectory:
         count = int(self.scenario.duration_s * rate_hz * (1.0 + 1e-12)) + 1

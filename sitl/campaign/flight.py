@@ -22,7 +22,7 @@ import dataclasses
 import math
 import tempfile
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -38,7 +38,7 @@ from sitl import loopback
 from sitl.autopilot import UNIX_AT_START_NS
 from sitl.beacon import Beacon
 from sitl.faults import RECORD_FAULTS, Fault, FullDisk
-from sitl.flight import FlightPlan, Leg, WindChange, radii
+from sitl.flight import FlightPlan, Leg, WindChange
 from sitl.scenarios import Scenario, SensorRates
 from sitl.world import SENSORS, World
 
@@ -348,8 +348,8 @@ def score_flight(order: FlightOrder, world: World, outputs: Sequence[Stamped]) -
     solutions = [r for r in outputs if isinstance(r, Solution) and r.mode is not Mode.INITIALISING]
     if not solutions:
         return FlightResult(order.key, *order, world.scenario.duration_s, 0.0, raised="no solution at all")
-    kind, t = FAULT_CASES[order.fault], np.array([s.t_ns for s in solutions]) * 1e-9
-    error = horizontal_errors(world, solutions, t)
+    kind = FAULT_CASES[order.fault]
+    t, error = world.horizontal_errors(solutions)
     dt = np.clip(np.diff(t, append=t[-1]), 0.0, 1.0)
     levels = np.array([math.inf if s.protection is None else s.protection for s in solutions])
     trust = np.array([Trust.UNTRUSTED if s.trust is None else s.trust for s in solutions])
@@ -397,17 +397,6 @@ def score_flight(order: FlightOrder, world: World, outputs: Sequence[Stamped]) -
         _rms(error[predicting]),
         _rms(bounds[predicting]),
     )
-
-
-def horizontal_errors(world: World, solutions: Iterable[Solution], t: Floats) -> Floats:
-    """Return the horizontal errors (n,) m of the solutions at flight times `t` (n,) s."""
-    place = np.array([(s.lat, s.lon) for s in solutions])
-    truth = world.truth_at(t)
-    R_N, R_E = radii(truth.lat)
-    north = (place[:, 0] - truth.lat) * (R_N + truth.alt)
-    east = np.remainder(place[:, 1] - truth.lon + np.pi, 2.0 * np.pi) - np.pi
-    out: Floats = np.hypot(north, east * (R_E + truth.alt) * np.cos(truth.lat))
-    return out
 
 
 def _losses_of(solutions: Sequence[Solution], t: Floats, bits: Source) -> Iterator[float]:
