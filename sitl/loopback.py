@@ -37,7 +37,7 @@ from companion.tables import print_tables
 from companion.units import SECOND_NS
 from sitl.autopilot import UNIX_AT_START_NS, SimulatedAutopilot
 from sitl.own_estimate import unaided_errors
-from sitl.scenarios import SCENARIOS, Scenario, SchedulePhase, get_scenario
+from sitl.scenarios import SCENARIOS, Scenario, SchedulePhase, parse_scenario
 
 LINK = "sitl"
 START_NS = 1000 * SECOND_NS  # companion's clock at the start of the flight: any value but 0
@@ -252,10 +252,7 @@ def command(
 
     Writes the log of the flight, and prints the error of each source in each phase.
     """
-    try:
-        chosen = get_scenario(scenario, **({} if seed is None else {"seed": seed}))
-    except ValueError as error:
-        raise click.BadParameter(str(error), param_hint="--scenario") from None
+    chosen = parse_scenario(scenario, seed)
     # log the truth: reports use it
     flags: dict[str, object] = {"log.folder": logs, "rates.truth_hz": 10.0}
     if preset is None:

@@ -13,6 +13,8 @@ import math
 from dataclasses import dataclass, field
 from typing import Any, Literal, NamedTuple
 
+import click
+
 from sitl.beacon import Beacon
 from sitl.faults import Fault
 from sitl.flight import FlightPlan, Leg, WindChange
@@ -228,3 +230,11 @@ def get_scenario(name: str, **changes: Any) -> Scenario:
         hint = f"did you mean {near[0]}?" if near else f"choose one of {', '.join(SCENARIOS)}"
         raise ValueError(f"unknown scenario {name!r}: {hint}")
     return dataclasses.replace(scenario, **changes)
+
+
+def parse_scenario(name: str, seed: int | None = None) -> Scenario:
+    """Return the scenario given with `--scenario`, with another seed if there is one. Raises BadParameter."""
+    try:
+        return get_scenario(name, **({} if seed is None else {"seed": seed}))
+    except ValueError as error:
+        raise click.BadParameter(str(error), param_hint="--scenario") from None

@@ -22,7 +22,7 @@ from companion.navigator import Navigator
 from companion.records import Fix, Rejection, Solution, Source
 from companion.tables import print_tables
 from companion.units import Floats
-from sitl.scenarios import get_scenario
+from sitl.scenarios import parse_scenario
 from sitl.smoothing_study import CHANNELS
 from sitl.world import World
 
@@ -82,10 +82,7 @@ def command(scenario: str, channels: Sequence[str], seed: int) -> None:
 
     Compares fixes used, guaranteed bounds and positions.
     """
-    try:
-        world = World(get_scenario(scenario, seed=seed))
-    except ValueError as error:
-        raise click.BadParameter(str(error), param_hint="--scenario") from None
+    world = World(parse_scenario(scenario, seed))
     table = Table(title=f"{scenario}, seed {seed}, no INS of its own")
     heads = (
         "error, m",

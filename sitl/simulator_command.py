@@ -23,7 +23,7 @@ from companion.units import SECOND_NS
 from sitl.autopilot import SimulatedAutopilot
 from sitl.bridge_command import command as bridge
 from sitl.real_time import RealTimeRunner, parse_address
-from sitl.scenarios import SCENARIOS, Scenario, SchedulePhase, get_scenario
+from sitl.scenarios import SCENARIOS, Scenario, SchedulePhase, parse_scenario
 from sitl.tlog_player import command as play
 
 SILENT_AFTER = 3 * SECOND_NS
@@ -157,10 +157,7 @@ def command(
     """
     if context.invoked_subcommand is not None:
         return
-    try:
-        chosen = get_scenario(scenario, **({} if seed is None else {"seed": seed}))
-    except ValueError as error:
-        raise click.BadParameter(str(error), param_hint="--scenario") from None
+    chosen = parse_scenario(scenario, seed)
     address = parse_address(connect)
 
     def report(seconds: float, text: str) -> None:

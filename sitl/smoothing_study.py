@@ -34,7 +34,7 @@ from companion.tables import print_tables
 from companion.units import Floats
 from sitl.campaign.flight import UNITS
 from sitl.flight import fly_plan
-from sitl.scenarios import SCENARIOS, Scenario, get_scenario
+from sitl.scenarios import SCENARIOS, Scenario, get_scenario, parse_scenario
 from sitl.world import SENSORS, World
 
 SAME_SIGMA = 1e-6
@@ -116,10 +116,7 @@ def _normalised_error(e: Floats, P: Floats) -> float:
 )
 def command(names: tuple[str, ...], channels: tuple[str, ...], seeds: int) -> None:
     """Compare the smoothed track with the filter by scenario. Exit code 1 if it is worse."""
-    try:
-        scenarios = [get_scenario(name) for name in names or SCENARIOS]
-    except ValueError as error:
-        raise click.BadParameter(str(error), param_hint="--scenario") from None
+    scenarios = [parse_scenario(name) for name in names or SCENARIOS]
     cases = [(scenario, channel) for scenario in scenarios for channel in channels or CHANNELS]
     rows = []
     console = Console(stderr=True)

@@ -24,7 +24,7 @@ from companion.navigator.hypotheses import Model
 from companion.records import Gnss, RsbnFix, Solution, Stamped
 from companion.tables import print_tables
 from sitl.campaign.flight import UNITS
-from sitl.scenarios import Scenario, get_scenario
+from sitl.scenarios import parse_scenario
 from sitl.world import World
 
 SOURCES = ("INS", "GNSS", "RSBN")
@@ -110,10 +110,7 @@ def command(scenario: str, sources: Sequence[str], seed: int) -> None:
 
     Flies with the bank of hypotheses and without.
     """
-    try:
-        flight: Scenario = get_scenario(scenario, seed=seed)
-    except ValueError as error:
-        raise click.BadParameter(str(error), param_hint="--scenario") from None
+    flight = parse_scenario(scenario, seed)
     world = World(flight)
     table = Table(title=f"{scenario}, seed {seed}: horizontal error, m r.m.s.: bank / one Kalman filter")
     for column in ("source", "stated / true sigma", *(phase.name for phase in flight.phases()), "overall"):
