@@ -4,7 +4,7 @@ Linear filtering
     kalman               predict, update, consistency tests; the one implementation of the update
     schemes              feedforward and feedback correction of an INS
     linear_system        a linear Gaussian system as a list of stages
-    smoother             Rauch-Tung-Striebel, two-point and Gauss-Newton smoothing
+    smoother             Rauch-Tung-Striebel and two-point smoothing
     two_point_bvp        block-tridiagonal solver of the two-point boundary value problem
 Bounded disturbances
     restrictive          filter with bounded inputs, one step at a time
@@ -70,7 +70,6 @@ from companion.estimate.smoother import (
     Smoothed,
     Trajectory,
     forward_filter,
-    gauss_newton,
     rts,
     rts_backward,
     two_point,
@@ -115,7 +114,6 @@ __all__ = [
     "cramer_rao_bound",
     "fisher_information",
     "forward_filter",
-    "gauss_newton",
     "kalman",
     "maximum_likelihood",
     "maximum_likelihood_3d",

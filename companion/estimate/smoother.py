@@ -9,11 +9,10 @@ After Brandin et al., section 6.4, which ends in the two-point boundary problem
     x_{i+1} = Phi_i x_i + Gamma_i D_i Gamma_i' s_i                                          (6.4.12)
     s_i     = Phi_{i+1}' s_{i+1} + H_{i+1}' R_{i+1}^-1 (z_{i+1} - H_{i+1} x_{i+1}),   s_N = 0
 
-and theta_i = D_i Gamma_i' s_i (6.4.11). Three algorithms solve it, and agree:
+and theta_i = D_i Gamma_i' s_i (6.4.11). Two algorithms solve it, and agree:
 
-    rts           a Kalman filter forward, then a pass backward
-    two_point     the sparse linear system itself (`two_point_bvp`)
-    gauss_newton  the same for z = h(x) + N(0, R): linearised, solved, repeated, with a line search
+    rts        a Kalman filter forward, then a pass backward
+    two_point  the sparse linear system itself (`two_point_bvp`)
 
 `rts_backward` is the backward pass alone, over the stored states of any forward filter, for filters whose
 updates are nonlinear or gated.
@@ -28,7 +27,7 @@ singular, R not. Memory and time grow as N. It does not know what the states mea
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -37,11 +36,6 @@ import numpy.typing as npt
 from companion.estimate import kalman, two_point_bvp
 from companion.estimate.linear_system import Arrays, OptionalArrays, Stage, make_stages
 from companion.units import Floats
-
-MeasurementFunction = Callable[[int, Floats], tuple[npt.ArrayLike, npt.ArrayLike]]
-
-_ARMIJO = 1e-4  # least part of the decrease predicted by the linearised problem
-_SHORTEST = 2.0**-30
 
 
 class Smoothed(NamedTuple):
@@ -66,34 +60,6 @@ class Smoothed(NamedTuple):
     s: Floats
     theta: tuple[Floats, ...]
     theta_P: tuple[Floats, ...]
-
-
-class Iterated(NamedTuple):
-    """Result of `gauss_newton`.
-
-    Attributes
-    ----------
-    smoothed : Smoothed
-        Trajectory of the problem linearised at the end.
-    cost : float
-        Twice the criterion (6.4.8).
-    iterations : int
-        Steps taken.
-    """
-
-    smoothed: Smoothed
-    cost: float
-    iterations: int
-
-    @property
-    def x(self) -> Floats:
-        """Return the means (N+1, n), as in `Smoothed`."""
-        return self.smoothed.x
-
-    @property
-    def P(self) -> Floats:
-        """Return the covariances (N+1, n, n), as in `Smoothed`, of the problem linearised at the end."""
-        return self.smoothed.P
 
 
 class Trajectory(NamedTuple):
@@ -290,156 +256,6 @@ def two_point(
     Brandin et al. (6.4.12).
     """
     stages, m, B = make_stages(Phi, Gamma, D, H, R, z, m, B)
-    return _solve_two_point(stages, m, B)[0]
-
-
-def gauss_newton(
-    Phi: Arrays,
-    Gamma: Arrays,
-    D: Arrays,
-    h: MeasurementFunction,
-    R: OptionalArrays,
-    z: OptionalArrays,
-    m: npt.ArrayLike,
-    B: npt.ArrayLike,
-    tolerance: float = 1e-9,
-    steps: int = 50,
-) -> Iterated:
-    """Smooth a system with nonlinear measurements z_i = h(i, x_i) + N(0, R_i).
-
-    Each step solves the problem linearised along the last trajectory and moves towards its solution as far as
-    the criterion (6.4.8) falls. It ends once a full step is shorter than `tolerance` standard deviations
-    everywhere.
-
-    Parameters
-    ----------
-    Phi, Gamma, D, R, z, m, B
-        As in `rts`.
-    h : callable
-        (i, x (n,)) -> value (p,) and Jacobian (p, n) for list entry i; an angle within half a turn of z_i.
-    tolerance : float
-        Length of the last step, in standard deviations.
-    steps : int
-        Limit of the number of steps.
-
-    Returns
-    -------
-    Iterated
-        Trajectory, cost and number of steps.
-
-    Raises
-    ------
-    ValueError
-        If it does not converge, or h does not fit z.
-
-    References
-    ----------
-    Brandin et al. (6.4.8), (6.4.12).
-    """
-    n = np.size(m)
-    none = [None if each is None else np.zeros((np.size(each), n)) for each in z]
-    stages, m, B = make_stages(Phi, Gamma, D, none, R, z, m, B)
-    at = _Iterate(_propagate_mean(stages, m), np.zeros((len(stages) + 1, n)))
-    for iteration in range(1, steps + 1):
-        linear, cost = _linearise(stages, h, at, B)
-        smoothed, s = _solve_two_point(linear, m, B)
-        step = _Iterate(smoothed.x - at.x, s - at.s)
-        variance = np.einsum("ijj->ij", smoothed.P)
-        converged = (step.x**2 <= tolerance**2 * variance + 1e-30 * smoothed.x**2).all()
-        if converged:
-            return Iterated(smoothed, cost, iteration)
-        predicted_decrease = cost - _prior_cost(stages, B, s) - _residual_cost(linear, smoothed.x)
-        at = _line_search(stages, h, at, step, cost, predicted_decrease, B)
-    raise ValueError(f"no minimum of the criterion within {steps} steps: give a nearer m or a greater R")
-
-
-class _Iterate(NamedTuple):
-    """Trajectory x (N+1, n) that obeys the dynamics, with its multipliers s_{-1}..s_{N-1}."""
-
-    x: Floats
-    s: Floats
-
-
-def _line_search(
-    stages: list[Stage],
-    h: MeasurementFunction,
-    at: _Iterate,
-    step: _Iterate,
-    cost: float,
-    predicted_decrease: float,
-    B: Floats,
-) -> _Iterate:
-    """Halve the step until the criterion falls as Armijo requires.
-
-    The linearised criterion is a parabola with its minimum a whole step away, so that its slope here is
-    -2 predicted.
-    """
-    length = 1.0
-    while length > _SHORTEST:
-        trial = _Iterate(at.x + length * step.x, at.s + length * step.s)
-        if (
-            _linearise(stages, h, trial, B)[1]
-            <= cost - 2.0 * _ARMIJO * length * predicted_decrease + 1e-13 * cost
-        ):
-            return trial
-        length *= 0.5
-    raise ValueError("no step lowers the criterion: the Jacobian returned by h does not match its value")
-
-
-def _linearise(
-    stages: list[Stage], h: MeasurementFunction, at: _Iterate, B: Floats
-) -> tuple[list[Stage], float]:
-    """Linearise along a trajectory: z - h(x) + H x for z; also return the criterion there."""
-    linear, cost = [], _prior_cost(stages, B, at.s)
-    for i, stage in enumerate(stages):
-        if not len(stage.z):
-            linear.append(stage)
-            continue
-        value, jacobian = h(i, at.x[i + 1])
-        value, H = np.atleast_1d(np.asarray(value, float)), np.atleast_2d(np.asarray(jacobian, float))
-        if value.shape != stage.z.shape or H.shape != stage.H.shape:
-            shapes = f"{value.shape} and {H.shape} for z {stage.z.shape} and {H.shape[-1]} states"
-            raise ValueError(f"h({i}, x) returns value and Jacobian of shapes {shapes}: make them fit")
-        r = stage.z - value
-        cost += float(r @ np.linalg.solve(stage.R, r))
-        linear.append(stage._replace(H=H, z=r + H @ at.x[i + 1]))
-    return linear, cost
-
-
-def _residual_cost(linear: list[Stage], x: Floats) -> float:
-    """Sum the squared residuals of the linear measurements, in standard deviations."""
-    total = 0.0
-    for i, stage in enumerate(linear):
-        r = stage.z - stage.H @ x[i + 1]
-        total += float(r @ np.linalg.solve(stage.R, r))
-    return total
-
-
-def _prior_cost(stages: list[Stage], B: Floats, s: Floats) -> float:
-    """Compute the prior and the disturbances in (6.4.8) by their multipliers; needs no inverse of B or D."""
-    return float(s[0] @ B @ s[0]) + sum(float(a @ b.Q @ a) for a, b in zip(s[1:], stages, strict=True))
-
-
-def _propagate_mean(stages: list[Stage], m: Floats) -> Floats:
-    x = [m]
-    for stage in stages:
-        x.append(stage.Phi @ x[-1])
-    return np.array(x)
-
-
-def _filter(stages: list[Stage], m: Floats, B: Floats) -> Trajectory:
-    N, n = len(stages), len(m)
-    x, P = np.zeros((N + 1, n)), np.zeros((N + 1, n, n))
-    x[0], P[0] = m, B
-    for i, stage in enumerate(stages):
-        x[i + 1], P[i + 1] = kalman.predict(x[i], P[i], stage.Phi, stage.Q)
-        if len(stage.z):
-            x[i + 1], P[i + 1] = kalman.update(x[i + 1], P[i + 1], stage.z, stage.H, stage.R)[:2]
-    return Trajectory(x, P)
-
-
-def _solve_two_point(stages: list[Stage], m: Floats, B: Floats) -> tuple[Smoothed, Floats]:
-    """Solve for the trajectory; also return s (N+1, n) from the multiplier of the prior on, Phi_0' s_0."""
     N, n = len(stages), len(m)
     scale = _state_scale(stages, B)
     outer = np.outer(scale, scale)
@@ -456,11 +272,22 @@ def _solve_two_point(stages: list[Stage], m: Floats, B: Floats) -> tuple[Smoothe
             diagonal[i + 1, n:, n:] = HP @ stage.H * scale
             right[i + 1, n:] = HP @ stage.z
     y, inverse = two_point_bvp.solve(diagonal, lower, right)
-    s, x = y[:, :n] / scale, y[:, n:] * scale
+    s, x = y[1:, :n] / scale, y[:, n:] * scale
     P, L = inverse[:, n:, n:] * outer, -inverse[1:, :n, :n] / outer
-    disturbances = [_disturbance(stage, a, b) for stage, a, b in zip(stages, s[1:], L, strict=True)]
+    disturbances = [_disturbance(stage, a, b) for stage, a, b in zip(stages, s, L, strict=True)]
     theta, theta_P = zip(*disturbances, strict=True)
-    return Smoothed(x, P, s[1:], theta, theta_P), s
+    return Smoothed(x, P, s, theta, theta_P)
+
+
+def _filter(stages: list[Stage], m: Floats, B: Floats) -> Trajectory:
+    N, n = len(stages), len(m)
+    x, P = np.zeros((N + 1, n)), np.zeros((N + 1, n, n))
+    x[0], P[0] = m, B
+    for i, stage in enumerate(stages):
+        x[i + 1], P[i + 1] = kalman.predict(x[i], P[i], stage.Phi, stage.Q)
+        if len(stage.z):
+            x[i + 1], P[i + 1] = kalman.update(x[i + 1], P[i + 1], stage.z, stage.H, stage.R)[:2]
+    return Trajectory(x, P)
 
 
 def _state_scale(stages: list[Stage], B: Floats) -> Floats:

@@ -1,4 +1,4 @@
-"""Smoother: three algorithms for one trajectory, reference values, consistency of the errors."""
+"""Smoother: two algorithms for one trajectory, reference values, consistency of the errors."""
 
 from __future__ import annotations
 
@@ -121,13 +121,7 @@ def conditioned(problem: tuple[Any, ...]) -> tuple[Any, Any, Any, Any]:
 def test_all_algorithms_agree(seed: int, n: int, N: int, singular: bool) -> None:
     problem = random_problem(seed, n, N, singular)
     x, P, theta, theta_P = conditioned(problem)
-    H, z = problem[3], problem[5]
     ways = [smoother.rts(*problem), smoother.two_point(*problem)]
-    ways.append(
-        smoother.gauss_newton(
-            *problem[:3], lambda i, x: (H[i] @ x, H[i]), problem[4], z, *problem[6:]
-        ).smoothed
-    )
     for found in ways:
         np.testing.assert_allclose(found.x, x, rtol=AGREE, atol=AGREE)
         np.testing.assert_allclose(found.P, P, rtol=AGREE, atol=AGREE)
@@ -179,102 +173,6 @@ def test_block_elimination_solves_the_whole_system(seed: int, n: int, N: int) ->
     for i in range(N + 1):
         block = dense[2 * n * i : 2 * n * (i + 1), 2 * n * i : 2 * n * (i + 1)]
         np.testing.assert_allclose(inverse[i], block, atol=1e-10)
-
-
-# Azimuth and range to a beacon: an aircraft in the plane (x north, y east), position and velocity
-
-BEACON = np.array([20e3, -15e3])
-SIGMA = np.array([math.radians(0.125), 100.0])
-
-
-def sight(x: Any) -> tuple[Any, Any]:
-    """Azimuth and range from the beacon, and their partials."""
-    north, east = x[:2] - BEACON
-    rho = math.hypot(north, east)
-    H = np.zeros((2, 4))
-    H[0, :2] = -east / rho**2, north / rho**2
-    H[1, :2] = north / rho, east / rho
-    return np.array([math.atan2(east, north), rho]), H
-
-
-def flight(seed: int, N: int = 150) -> tuple[Any, Any, Any]:
-    rng = np.random.default_rng(seed)
-    Phi, Gamma = np.eye(4), np.vstack((0.5 * np.eye(2), np.eye(2)))
-    Phi[:2, 2:] = np.eye(2)
-    D, B = 0.3**2 * np.eye(2), np.diag([2e3, 2e3, 20.0, 20.0]) ** 2
-    m = np.array([0.0, -14e3, 60.0, 0.0])
-    x = [m + np.sqrt(np.diag(B)) * rng.standard_normal(4)]
-    z: list[Any] = []
-    for i in range(N):
-        x.append(Phi @ x[-1] + Gamma @ (0.3 * rng.standard_normal(2)))
-        z.append(None if 40 <= i < 60 else sight(x[-1])[0] + SIGMA * rng.standard_normal(2))
-
-    def h(i: int, state: Any) -> tuple[Any, Any]:
-        value, H = sight(state)
-        value[0] = z[i][0] + math.remainder(value[0] - z[i][0], math.tau)
-        return value, H
-
-    R = [np.diag(SIGMA**2)] * N
-    return ([Phi] * N, [Gamma] * N, [D] * N, h, R, z, m, B), np.array(x), h
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_beacon_only_the_nonlinear_problem_is_solved(seed: int) -> None:
-    problem, _, h = flight(seed)
-    Phi, Gamma, D, _, R, z, m, B = problem
-    found = smoother.gauss_newton(*problem)
-    assert found.iterations < 20
-    x, s = found.x, [*found.smoothed.s, np.zeros(4)]
-    sigma = np.sqrt(np.einsum("ijj->ij", found.P))
-    assert (abs(x[0] - m - B @ Phi[0].T @ s[0]) < 1e-8 * sigma[0]).all()
-    for i in range(len(z)):  # (6.4.12) with h in place of H x
-        s_i = (Phi[i].T if i + 1 < len(z) else np.eye(4)) @ s[i + 1]
-        if z[i] is not None:
-            value, H = h(i, x[i + 1])
-            s_i = s_i + H.T @ np.linalg.solve(R[i], z[i] - value)
-        Q = Gamma[i] @ D[i] @ Gamma[i].T
-        assert (abs(x[i + 1] - Phi[i] @ x[i] - Q @ s_i) < 1e-7 * sigma[i + 1]).all()
-
-
-def test_beacon_only_the_result_is_a_minimum() -> None:
-    problem, _, h = flight(7)
-    Phi, Gamma, D, _, R, z, m, B = problem
-    found = smoother.gauss_newton(*problem)
-
-    def criterion(start: Any, theta: Any) -> float:
-        x, total = start, (start - m) @ np.linalg.solve(B, start - m)
-        for i in range(len(z)):
-            x = Phi[i] @ x + Gamma[i] @ theta[i]
-            total += theta[i] @ np.linalg.solve(D[i], theta[i])
-            if z[i] is not None:
-                r = z[i] - h(i, x)[0]
-                total += r @ np.linalg.solve(R[i], r)
-        return float(total)
-
-    theta = np.array(found.smoothed.theta)
-    least = criterion(found.x[0], theta)
-    assert least == pytest.approx(found.cost, rel=1e-9)
-    rng = np.random.default_rng(0)
-    for size in (1e-3, 1e-1):
-        for _ in range(10):
-            start = found.x[0] + size * np.sqrt(np.diag(found.P[0])) * rng.standard_normal(4)
-            assert criterion(start, theta + 0.1 * size * rng.standard_normal(theta.shape)) > least
-
-
-def test_beacon_only_errors_match_their_covariance() -> None:
-    states, disturbances = [], []
-    for seed in range(20):
-        problem, truth, _ = flight(seed, N=100)
-        found = smoother.gauss_newton(*problem)
-        for k in range(0, 101, 20):
-            e = found.x[k] - truth[k]
-            states.append(e @ np.linalg.solve(found.P[k], e))
-        theta, P = found.smoothed.theta, found.smoothed.theta_P
-        for k in range(0, 99, 20):
-            true = truth[k + 1, 2:] - truth[k, 2:]
-            disturbances.append((theta[k] - true) @ np.linalg.solve(P[k], theta[k] - true))
-    assert 3.4 < np.mean(states) < 4.6
-    assert 1.7 < np.mean(disturbances) < 2.3
 
 
 def test_smoothing_makes_every_variance_smaller() -> None:
@@ -348,14 +246,3 @@ def test_bad_input_is_reported(change: dict[int, Any], message: str) -> None:
     for solve in (smoother.rts, smoother.two_point):
         with pytest.raises(ValueError, match=message):
             solve(*problem)
-
-
-def test_wrong_jacobian_is_reported() -> None:
-    problem = list(flight(1)[0])
-    right = problem[3]
-    problem[3] = lambda i, x: (right(i, x)[0], -right(i, x)[1])
-    with pytest.raises(ValueError, match=r"Jacobian|within 50 steps"):
-        smoother.gauss_newton(*problem)
-    problem[3] = lambda i, x: (right(i, x)[0][:1], right(i, x)[1])
-    with pytest.raises(ValueError, match="make them fit"):
-        smoother.gauss_newton(*problem)
