@@ -15,7 +15,7 @@ Positions from beacons
     initial_position     intersections of lines of position
     levenberg_marquardt  minimisation in two or three unknowns
     fusion               maximum-likelihood position and its covariance
-    weights              the per-axis estimator of the paper, and the cost of wrong weights
+    weights              best coefficients for readings of known errors, and departures from them
 Guaranteed prediction
     schuler              dynamics of one horizontal INS error
     minimax_lp           guaranteed linear estimation by exchange

@@ -35,6 +35,7 @@ DEVIATIONS = (0.05, 0.1, 0.2, 0.5)  # the result is the same for both signs
 FACTORS = (0.1, math.sqrt(0.1), 0.5, 2.0, math.sqrt(10.0), 10.0)  # the roots are variances x 0.1 and x 10
 CORRELATIONS = (-0.9, -0.5, 0.5, 0.9)
 PRINTED = (101.139, 100.0)
+_NO_ROW = 1e-18  # claimed over true variance: the range is across the axis to a billionth
 _ISOTROPIC = math.sqrt(200.0)
 #: Variances 500, 10, 200 km^2 as printed; that of RSBN is the one of both axes.
 PAPER = (
@@ -88,11 +89,11 @@ def exact_azimuth(readings: Sequence[Reading], R: Floats, axis: Axis) -> tuple[f
     rows = axis_rows(readings, axis)
     known = np.array([0.0 if reading.kind == "azimuth" else 1.0 for reading in readings])
     claimed = rows.T @ (R * np.outer(known, known)) @ rows.T.T
-    try:
-        K = optimal_gain(np.ones((len(rows.z), 1)), claimed)
-    except ValueError:
+    true = rows.T @ R @ rows.T.T
+    if (claimed.diagonal() <= _NO_ROW * true.diagonal()).any():
         return None
-    actual = estimate_covariance(K, rows.T @ R @ rows.T.T)
+    K = optimal_gain(np.ones((len(rows.z), 1)), claimed)
+    actual = estimate_covariance(K, true)
     return float(K[0] @ rows.z), math.sqrt(float((K @ claimed @ K.T)[0, 0])), math.sqrt(float(actual[0, 0]))
 
 

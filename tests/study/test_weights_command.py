@@ -1,11 +1,14 @@
 """`companion study weights` prints tables, data and plot; its numbers are the reference's."""
 
 import json
+import math
 
+import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from companion.study.weights import command
+from companion.estimate.readings import Reading, error_covariance
+from companion.study.weights import PAPER, command, cost_of_factor, exact_azimuth, misprinted
 
 AXIS = (
     "--reading=INS.x=105,22.360679775",
@@ -30,9 +33,9 @@ def test_worked_example():
     result = data()
     x, y = result["axes"]
     assert (x["value"], y["value"]) == pytest.approx((100.981072400285825, 100.476399503089563), rel=1e-12)
-    assert x["variance"] == pytest.approx(9.34579439252336)
+    assert x["variance"] == pytest.approx(9.34579439252336, rel=1e-13)
     assert list(x["weights"].values()) == pytest.approx(
-        [0.0186915887850467, 0.934579439252336, 0.0467289719626168]
+        [0.0186915887850467, 0.934579439252336, 0.0467289719626168], rel=1e-12
     )
     # reference/ml_fusion.json, case 1: computed with multi-precision arithmetic
     assert result["joint"]["position"] == pytest.approx([100.98128612192838, 100.4762138564679], rel=1e-11)
@@ -42,6 +45,30 @@ def test_worked_example():
     output = run().output
     for number in ("101.139", "101.138939", "100.981072", "100.892406", "100.981286"):
         assert number in output
+
+
+def test_printed_x_and_the_corrected_row():
+    # R's entries squared once more (read as deviations) and z_P = D with the printed sin A for a gain
+    assert misprinted(PAPER) == pytest.approx(101.13893902309513, rel=1e-14)
+    # entry 1/sin A instead, the azimuth taken for exact
+    value, claimed, _ = exact_azimuth(PAPER, error_covariance(PAPER), "x")
+    assert (value, claimed) == pytest.approx((100.89240619340327, 2.98807152334), rel=1e-11)
+
+
+def test_weight_that_is_not_rescaled_biases_the_estimate():
+    # one per cent of the weight of GNSS, times 100 km
+    same = ("--reading=INS.x=100,22.360679775", "--reading=GNSS.x=100,3.16227766")
+    output = run(*same, "--reading=RSBN.x=100,14.142135624").output
+    (row,) = [line for line in output.splitlines() if "not rescaled" in line]
+    assert "0.93458" in row
+
+
+def test_wrong_variances():
+    H, R = np.ones((3, 1)), np.diag([500.0, 10.0, 200.0])
+    root = math.sqrt(10.0)
+    gnss, rsbn = (False, True, False), (False, False, True)
+    assert cost_of_factor(H, R, gnss, root).actual == pytest.approx(1.72103, abs=5e-6)
+    assert cost_of_factor(H, R, rsbn, 1.0 / root).actual == pytest.approx(1.66973, abs=5e-6)
 
 
 def test_wrong_sigmas_of_one_coordinate():
@@ -59,6 +86,27 @@ def test_row_of_the_paper_near_north_claims_what_it_has_not():
     output = run(*NEAR_NORTH).output
     assert "3.4883" in output and "610.03" in output  # MATH: claims 3.5 m where the true error is 610 m
     assert data(*NEAR_NORTH)["joint"]["covariance"][0][0] ** 0.5 == pytest.approx(98.5, abs=0.05)
+
+
+@pytest.mark.parametrize(("axis", "A_deg"), [("x", 1.0), ("x", 179.0), ("y", 91.0), ("y", 271.0)])
+def test_row_near_its_singular_azimuth_claims_3_metres_and_errs_by_610(axis, A_deg):
+    _, claimed, actual = exact_azimuth(*beacon_alone(A_deg), axis)
+    assert (claimed, actual) == pytest.approx((3.49048, 610.78), rel=1e-5)
+
+
+@pytest.mark.parametrize(("axis", "A_deg"), [("x", 0.0), ("x", 180.0), ("y", 90.0), ("y", 270.0)])
+def test_no_row_at_the_singular_azimuth_itself(axis, A_deg):
+    assert exact_azimuth(*beacon_alone(A_deg), axis) is None
+    assert exact_azimuth(*beacon_alone(A_deg), "y" if axis == "x" else "x") is not None
+
+
+def beacon_alone(A_deg):
+    """Azimuth and range, their covariance."""
+    pair = (
+        Reading("RSBN", "azimuth", math.radians(A_deg), math.radians(0.25)),
+        Reading("RSBN", "range", 140e3, 200.0),
+    )
+    return pair, error_covariance(pair)
 
 
 def test_correlated_readings_count_less():
