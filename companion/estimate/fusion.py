@@ -17,7 +17,7 @@ Degenerate cases
     A direction that no observation measures: `Unobservable`, with the direction and what to add.
     Two places that explain the same ranges (two beacons: two crossings, mirrored in the line between them):
         a position among the observations, or `start`, chooses; without either `Ambiguous`, with both places.
-    Over a beacon: an azimuth whose beacon sees the fix higher than `cone` is left out and listed in
+    Over a beacon: an azimuth whose beacon sees the fix higher than CONE_OF_SILENCE is left out and listed in
         `in_cone_of_silence`. The plane has no elevations: there the caller leaves out azimuths of a beacon
         too near.
     A start near a wrong local minimum: a misfit that noise does not explain is retried from the crossings.
@@ -53,7 +53,6 @@ __all__ = [
     "Ambiguous",
     "Azimuth",
     "Fix",
-    "Fix3D",
     "Height",
     "NoFix",
     "Observation",
@@ -61,10 +60,7 @@ __all__ = [
     "Range",
     "Unobservable",
     "convert_to_position",
-    "cramer_rao_bound",
-    "fisher_information",
     "maximum_likelihood",
-    "maximum_likelihood_3d",
 ]
 
 CONE_OF_SILENCE = math.radians(60.0)
@@ -137,39 +133,8 @@ class Fix(NamedTuple):
     chi_squares: tuple[float, ...]
     in_cone_of_silence: tuple[int, ...]
 
-    @property
-    def p_value(self) -> float:
-        """Return the probability of a cost at least this large under the stated errors.
 
-        1 without redundancy."""
-        from scipy.special import gammaincc
-
-        if self.degrees_of_freedom == 0:
-            return 1.0
-        return float(gammaincc(self.degrees_of_freedom / 2.0, self.cost / 2.0))
-
-
-class Fix3D(NamedTuple):
-    """Maximum-likelihood position in plain numbers.
-
-    Attributes
-    ----------
-    position : Point
-        East, north, up, m.
-    covariance : tuple of rows
-        Its covariance, m^2.
-    cost : float
-        Sum of squared residuals in standard deviations.
-    """
-
-    position: Point
-    covariance: tuple[tuple[float, ...], ...]
-    cost: float
-
-
-def maximum_likelihood(
-    observations: Sequence[Observation], start: npt.ArrayLike | None = None, cone: float = CONE_OF_SILENCE
-) -> Fix:
+def maximum_likelihood(observations: Sequence[Observation], start: npt.ArrayLike | None = None) -> Fix:
     """Compute the most likely position and its covariance.
 
     Parameters
@@ -179,8 +144,6 @@ def maximum_likelihood(
     start : (n,), optional
         First point of the search, m. Needed only where two places are equally likely and no observation
         chooses; it is not an observation and has no weight.
-    cone : float
-        Elevation above which an azimuth is left out, rad.
 
     Returns
     -------
@@ -204,7 +167,7 @@ def maximum_likelihood(
         x0 = mean_position(model)
     if x0 is not None and len(x0) != model.n:
         raise ValueError(f"start has {len(x0)} coordinates, the observations {model.n}: give as many")
-    model, found = _fix_outside_cone(model, None if x0 is None else model.point(x0), cone)
+    model, found = _fix_outside_cone(model, None if x0 is None else model.point(x0))
     covariance = np.array(_invert(model, found.at))
     residuals, shares = model.residuals(found.p)
     return Fix(
@@ -219,98 +182,6 @@ def maximum_likelihood(
     )
 
 
-def maximum_likelihood_3d(
-    observations: Sequence[Observation], start: Point, cone: float = CONE_OF_SILENCE
-) -> Fix3D:
-    """Compute the most likely position in space in plain numbers, without residuals.
-
-    Parameters
-    ----------
-    observations : sequence of Observation
-        In one Cartesian frame, see `observations`.
-    start : Point
-        First point of the search, m.
-    cone : float
-        Elevation above which an azimuth is left out, rad.
-
-    Returns
-    -------
-    Fix3D
-        Position, covariance and cost.
-
-    Raises
-    ------
-    ValueError, NoFix, Unobservable, Ambiguous
-        As in `maximum_likelihood`.
-    """
-    model, found = _fix_outside_cone(Model(observations, 3), start, cone)
-    return Fix3D(found.p, _invert(model, found.at), found.at.cost)
-
-
-def fisher_information(
-    observations: Sequence[Observation], position: npt.ArrayLike, cone: float = CONE_OF_SILENCE
-) -> Floats:
-    """Compute the Fisher information F = J^T J for an aircraft at a position.
-
-    Only the places of the beacons and the sizes of the errors enter, not the measured values. An azimuth in
-    its beacon's cone of silence has no information.
-
-    Parameters
-    ----------
-    observations : sequence of Observation
-        In one Cartesian frame.
-    position : (n,)
-        Position of the aircraft, m.
-    cone : float
-        Elevation above which an azimuth is left out, rad.
-
-    Returns
-    -------
-    (n, n)
-        Information, 1/m^2.
-    """
-    J = _equations_outside_cone(observations, position, cone)[1].J
-    return J.T @ J
-
-
-def cramer_rao_bound(
-    observations: Sequence[Observation], position: npt.ArrayLike, cone: float = CONE_OF_SILENCE
-) -> Floats:
-    """Compute the Cramer-Rao bound F^-1: no unbiased estimator has a smaller covariance.
-
-    Parameters
-    ----------
-    observations : sequence of Observation
-        In one Cartesian frame.
-    position : (n,)
-        Position of the aircraft, m.
-    cone : float
-        Elevation above which an azimuth is left out, rad.
-
-    Returns
-    -------
-    (n, n)
-        Covariance, m^2.
-
-    Raises
-    ------
-    Unobservable
-        If a direction is not measured.
-    """
-    return np.array(_invert(*_equations_outside_cone(observations, position, cone)))
-
-
-def _equations_outside_cone(
-    observations: Sequence[Observation], position: npt.ArrayLike, cone: float
-) -> tuple[Model, Linearised]:
-    x = _check_start(position)
-    model = Model(observations, len(x))
-    p = model.point(x)
-    if model.n == 3:
-        model = model.without(model.azimuths_above(p, cone))
-    return model, model.at(p)
-
-
 def _check_start(start: npt.ArrayLike) -> Floats:
     x = np.array(start, dtype=float)
     if x.shape not in ((2,), (3,)) or not np.isfinite(x).all():
@@ -318,21 +189,20 @@ def _check_start(start: npt.ArrayLike) -> Floats:
     return x
 
 
-def _fix_outside_cone(model: Model, p0: Point | None, cone: float) -> tuple[Model, Minimum]:
+def _fix_outside_cone(model: Model, p0: Point | None) -> tuple[Model, Minimum]:
     """Compute the fix and the model without the azimuths in the cone of silence; a plane has no cone."""
-    if model.n == 3 and p0 is not None and (in_cone := model.azimuths_above(p0, cone)):
+    if model.n == 3 and p0 is not None and (in_cone := model.azimuths_above(p0, CONE_OF_SILENCE)):
         # near its beacon an azimuth pulls the fix into the singular point: try without it first
         reduced = model.without(in_cone)
         with contextlib.suppress(NoFix):
             found = _descend_from(reduced, p0)
-            if in_cone <= reduced.azimuths_above(found.p, cone):
+            if in_cone <= reduced.azimuths_above(found.p, CONE_OF_SILENCE):
                 model, p0 = reduced, found.p
     while True:
         found = _descend_from(model, p0)
-        # an azimuth once left out stays out: the loop ends
-        in_cone = model.azimuths_above(found.p, cone) - model.in_cone if model.n == 3 else frozenset[int]()
-        if not in_cone:
+        if model.n == 2 or not (in_cone := model.azimuths_above(found.p, CONE_OF_SILENCE) - model.in_cone):
             return model, found
+        # an azimuth once left out stays out: the loop ends
         model, p0 = model.without(in_cone), found.p
 
 
