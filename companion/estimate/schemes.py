@@ -82,7 +82,6 @@ class FeedbackFractions:
 
 
 FEEDFORWARD = FeedbackFractions()
-FEEDBACK = FeedbackFractions(1.0, 1.0)
 
 
 class SchemeState(NamedTuple):
@@ -127,7 +126,7 @@ def step(
     plant : Plant
         INS and its error model.
     fractions : FeedbackFractions
-        What is fed back after a fix; `FEEDFORWARD`, `FEEDBACK` or any mixture.
+        What is fed back after a fix: nothing (`FEEDFORWARD`), all or any share.
 
     Returns
     -------

@@ -413,13 +413,6 @@ class Session:
         sent, self._send_queue = self._send_queue, []
         return sent
 
-    def to_local_ns(self, time_usec: int, received_ns: int) -> int:
-        """Return the local time for which a message stamped `time_usec` (since boot, or UNIX) is valid.
-
-        The arrival if the stamp is 0 or cannot be mapped yet. For a time_boot_ms give 1000 times it.
-        """
-        return self.clock.local(time_usec * 1000, received_ns)
-
     def _sign(self, data: bytes) -> bytes:
         assert self._signing is not None
         return self._signing.sign(data, self._link_id, self._now)

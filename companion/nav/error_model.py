@@ -151,39 +151,6 @@ def aircraft_matrix(
     )
 
 
-def combine_systems(
-    first: Model, second: Model, suffix: str = "2", common: Sequence[Disturbance] = ()
-) -> Model:
-    """Combine two inertial systems to one model.
-
-    Parameters
-    ----------
-    first, second : Model
-        The systems; disturbances of each are its own.
-    suffix : str
-        Suffix of the second's states.
-    common : sequence of Disturbance
-        Disturbances of both (gravity); they feed states of both by name.
-
-    Returns
-    -------
-    Model
-        Both systems, then the common disturbances.
-    """
-    n = len(first.states)
-    states = (*first.states, *(s + suffix for s in second.states))
-    frame = compose(np.zeros((len(states), len(states))), states, common)
-    A, Q, sigma = frame.A, frame.Q, frame.sigma
-    m = n + len(second.states)
-    A[:n, :n], A[n:m, n:m] = first.A, second.A
-    Q[:n, :n], Q[n:m, n:m] = first.Q, second.Q
-    sigma[:n], sigma[n:m] = first.sigma, second.sigma
-    B = np.zeros((len(frame.states), first.B.shape[1] + second.B.shape[1]))
-    B[:n, : first.B.shape[1]], B[n:m, first.B.shape[1] :] = first.B, second.B
-    C = np.concatenate([first.C, second.C, frame.C])
-    return Model(A, frame.states, Q, np.hstack([B, frame.B]), C, sigma)
-
-
 class Example(NamedTuple):
     """One step of the paper's section 3, in the form the filters take.
 

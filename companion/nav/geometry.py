@@ -328,25 +328,6 @@ def radio_horizon(height_a: float, height_b: float) -> float:
     return math.sqrt(2.0 * _RADIO_R) * (math.sqrt(max(height_a, 0.0)) + math.sqrt(max(height_b, 0.0)))
 
 
-def in_radio_sight(beacon: Geodetic, aircraft: Geodetic, ground_alt: float = 0.0) -> bool:
-    """Decide whether the aircraft is above the beacon's radio horizon over a smooth earth.
-
-    Parameters
-    ----------
-    beacon, aircraft : Geodetic
-        Positions.
-    ground_alt : float
-        Height of the smooth earth above the ellipsoid, m.
-
-    Returns
-    -------
-    bool
-        True above the horizon.
-    """
-    horizon = radio_horizon(beacon.alt - ground_alt, aircraft.alt - ground_alt)
-    return slant_range_azimuth(beacon, aircraft).slant_range <= horizon
-
-
 def local_to_geodetic(projection: Projection, origin: Geodetic, x_n: Sequence[float] | Floats) -> Geodetic:
     """Convert an autopilot's local NED position to a geodetic position.
 

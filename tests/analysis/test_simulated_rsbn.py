@@ -10,7 +10,7 @@ from companion import records as r
 from companion.analysis import simulated_rsbn
 from companion.config import Config
 from companion.importers import sources
-from companion.nav.geometry import Geodetic, in_radio_sight, slant_range_azimuth
+from companion.nav.geometry import Geodetic, radio_horizon, slant_range_azimuth
 from companion.storage.reader import LogError
 
 TESTS = pathlib.Path(__file__).parents[1]
@@ -60,7 +60,9 @@ def test_only_beacons_above_the_horizon_and_within_range_are_received() -> None:
     fixes = {
         a.t_ns for a in simulated_rsbn.simulate_measurements([simulated_rsbn.ListedBeacon(1, *beacon)], low)
     }
-    records = {int(t) for t in low.t_ns[::2] if in_radio_sight(beacon, place(low, int(t)))}
+    horizon = radio_horizon(beacon.alt - simulated_rsbn.GROUND, 20.0 - simulated_rsbn.GROUND)
+    slant = {int(t): slant_range_azimuth(beacon, place(low, int(t))).slant_range for t in low.t_ns[::2]}
+    records = {t for t, distance in slant.items() if distance <= horizon}
     assert fixes == records and 0 < len(records) < 1000
     far = track(alt=300.0 + 9000.0)
     limit = 50_000.0

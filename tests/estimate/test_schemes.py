@@ -9,7 +9,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from companion.estimate.schemes import (
-    FEEDBACK,
     FEEDFORWARD,
     FeedbackFractions,
     Plant,
@@ -22,6 +21,7 @@ LINEAR = json.loads((Path(__file__).parents[1] / "data/schemes.json").read_text(
 F, G, A, Q, H, R, P0, X0, READ, Z, TRUTH = (
     np.array(LINEAR[k], float) for k in ("F", "G", "A", "Q", "H", "R", "P0", "X_ins0", "f_meas", "Z", "truth")
 )
+FEEDBACK = FeedbackFractions(1.0, 1.0)
 PLANT = Plant(lambda X, u: F @ X + G @ u, lambda X, u: A, lambda X: X[:1], lambda X: H, Q, R)
 
 

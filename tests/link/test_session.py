@@ -137,13 +137,13 @@ def test_only_heartbeat_is_sent_before_an_autopilot_is_received() -> None:
 def test_timesync_finds_the_boot_time_through_a_slow_link() -> None:
     session, peer = Session(rates_hz={"LOCAL_POSITION_NED": 10}), Autopilot(booted=-500 * SECOND)
     run(session, peer, 0, 10, delay=30 * MS)
-    assert abs(session.to_local_ns(505_000_000, 10 * SECOND) - 5 * SECOND) <= 10 * MS
+    assert abs(session.clock.local(505 * SECOND, 10 * SECOND) - 5 * SECOND) <= 10 * MS
     peer = Autopilot(booted=-500 * SECOND)
     peer.answers = False
     session = Session(rates_hz={"LOCAL_POSITION_NED": 10})
     run(session, peer, 0, 10, delay=30 * MS)
     assert session.clock.uncertainty(10 * SECOND) is None
-    assert session.to_local_ns(505_000_000, 10 * SECOND) - 5 * SECOND == pytest.approx(40 * MS, abs=11 * MS)
+    assert session.clock.local(505 * SECOND, 10 * SECOND) - 5 * SECOND == pytest.approx(40 * MS, abs=11 * MS)
 
 
 def test_timesync_request_is_answered_at_once() -> None:
@@ -170,7 +170,7 @@ def test_reboot_is_detected_and_rates_are_requested_again() -> None:
     # a TIMESYNC answer arrives before the two stamps that reveal the reboot: it seems to be of another clock
     assert kinds(events) == [TimesyncOutlier, Rebooted]
     assert "COMMAND_LONG" in peer.names()
-    assert abs(session.to_local_ns(2_000_000, 20 * SECOND) - 11 * SECOND) <= 10 * MS
+    assert abs(session.clock.local(2 * SECOND, 20 * SECOND) - 11 * SECOND) <= 10 * MS
 
 
 def test_forward_clock_jump_is_reported_once_with_its_size_and_followed() -> None:

@@ -23,7 +23,7 @@ from companion.nav.correctors import (
     relative_log,
 )
 from companion.nav.earth import SPHERE, SPHERE_KM_H
-from companion.nav.error_model import INS_STATES, aircraft_model, combine_systems, paper_example, paper_model
+from companion.nav.error_model import INS_STATES, aircraft_model, paper_example, paper_model
 from companion.nav.strapdown import navigation_rates, rotation_matrix
 from companion.units import Floats
 
@@ -309,22 +309,6 @@ def test_euler_magnifies_schuler_and_the_exact_step_does_not() -> None:
 def test_unknown_units_are_reported() -> None:
     with pytest.raises(ValueError, match="km-h or SI"):
         paper_example("miles")  # type: ignore[arg-type]
-
-
-def test_two_systems_share_gravity_and_nothing_else() -> None:
-    one = aircraft_model(1.0, 10.0, 20.0, added=(dist.gyro_drift(1e-5, 1e-8),))
-    two = aircraft_model(1.0, 10.0, 20.0, added=(dist.gyro_drift(2e-5, bound=1e-12),))
-    feeds = tuple((f"{v}{s}", g, 1.0) for s in ("", "2") for v, g in (("dVN", "GX"), ("dVE", "GY")))
-    gravity = dist.Disturbance(("GX", "GY"), 1e-3, 1e-4, feeds=feeds)
-    both = combine_systems(one, two, common=(gravity,))
-    assert both.states == (*one.states, *(s + "2" for s in two.states), "GX", "GY")
-    n = len(one.states)
-    np.testing.assert_array_equal(both.A[:n, :n], one.A)
-    np.testing.assert_array_equal(both.A[n : 2 * n, n : 2 * n], two.A)
-    assert not both.A[:n, n : 2 * n].any() and not both.A[n : 2 * n, :n].any()
-    assert both.A[2, -2] == both.A[n + 2, -2] == both.A[n + 3, -1] == 1.0
-    assert both.B.shape == (2 * n + 2, 3) and both.B[n + 7, 0] == 1.0
-    np.testing.assert_array_equal(both.C, two.C)
 
 
 def test_logs_with_the_paper_velocity_are_the_printed_rows() -> None:

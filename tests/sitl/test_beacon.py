@@ -4,7 +4,7 @@ import math
 import numpy as np
 import pytest
 
-from companion.nav.geometry import Geodetic, in_radio_sight, slant_range_azimuth
+from companion.nav.geometry import Geodetic, radio_horizon, slant_range_azimuth
 from sitl.beacon import Beacon, azimuth_range_elevation, in_reach, simulate_answers
 from sitl.flight import fly_plan
 from sitl.scenarios import get_scenario
@@ -64,9 +64,10 @@ def test_range_bias_north_offset_and_quantisation(flight):
 def test_no_answer_beyond_horizon_or_limit(flight):
     lons = BEACON.lon_deg + np.linspace(0.1, 8.0, 80)
     there = at_distance(flight, BEACON, lons, 1000.0)
-    ground = Geodetic(math.radians(BEACON.lat_deg), math.radians(BEACON.lon_deg), BEACON.alt)
+    mast = Geodetic(math.radians(BEACON.lat_deg), math.radians(BEACON.lon_deg), BEACON.alt)
+    horizon = radio_horizon(BEACON.alt - BEACON.ground_alt, 1000.0 - BEACON.ground_alt)
     expected = [
-        in_radio_sight(ground, Geodetic(lat, lon, 1000.0), BEACON.ground_alt)
+        slant_range_azimuth(mast, Geodetic(lat, lon, 1000.0)).slant_range <= horizon
         for lat, lon in zip(there.lat, there.lon)
     ]
     assert in_reach(BEACON, there).tolist() == expected
