@@ -261,23 +261,25 @@ def test_version_is_printed() -> None:
     assert __version__ in CliRunner().invoke(cli, ["--version"]).output
 
 
+MISSPELT = "[predictor]\nwindow_mn = 3\n"
+
+
 @pytest.mark.parametrize(
-    ("text", "expected"),
+    ("command", "text", "expected"),
     [
-        ("[predictor]\nwindow_mn = 3\n", ("window_mn", "window_min")),
-        ("[predicter]\n", ("predicter", "predictor")),
-        ("[gnss]\nsigma_m = -1\n", ("gnss.sigma_m",)),
-        ("[gnss\n", ("TOML",)),
+        (["check-config"], MISSPELT, ("window_mn", "window_min")),
+        (["check-config"], "[predicter]\n", ("predicter", "predictor")),
+        (["check-config"], "[gnss]\nsigma_m = -1\n", ("gnss.sigma_m",)),
+        (["check-config"], "[gnss\n", ("TOML",)),
+        (["run", "--config"], MISSPELT, ("window_mn", "window_min")),
+        (["loopback", "--config"], MISSPELT, ("window_mn", "window_min")),
     ],
 )
-@pytest.mark.parametrize("command", [["check-config"], ["run", "--config"], ["loopback", "--config"]])
 def test_configuration_mistake_exits_78_with_one_sentence(
     tmp_path: Path, command: list[str], text: str, expected: tuple[str, ...]
 ) -> None:
     file = tmp_path / "mine.toml"
     file.write_text(text)
-    if command != ["check-config"] and "mn" not in text:
-        pytest.skip("one case a command is enough")
     done = companion(*command, file)
     assert done.returncode == 78
     assert len(done.stderr.splitlines()) == 1

@@ -238,7 +238,7 @@ def test_solutions_go_on_while_a_late_answer_is_folded_in() -> None:
     assert_same(found[first:], [solution for solution in wanted if solution.t_ns >= found[first].t_ns])
 
 
-@pytest.mark.parametrize("late_s", [0.4, 1.3, 2.7, 5.9])
+@pytest.mark.parametrize("late_s", [0.4, 5.9])
 def test_states_that_are_not_kept_change_no_solution(late_s: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of the seconds before the last, one state each is kept; a late answer is folded in as if all were."""
     records, answer, place = with_late_answer(late_s)
