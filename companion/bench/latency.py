@@ -22,6 +22,7 @@ import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from pathlib import Path
 from typing import Any
 
 from companion.config import load
@@ -33,6 +34,8 @@ from companion.runtime.service import run
 ROUNDS = 100
 WARM_UP = 20  # measurements before timing starts
 FIX_TIMEOUT_S = 60.0
+START_TIMEOUT_S = 30.0
+UDP_PORTS = Path("/proc/net/udp")
 ROUND_S = 0.1  # local position at 10 Hz
 REST_S = 0.35 * ROUND_S  # before each measurement, so that everything is idle
 TIMEOUT_S = 5.0
@@ -209,7 +212,7 @@ def _separate_processors() -> Iterator[set[int]]:
 def peer(processors: set[int], serve: Any, *arguments: Any) -> Iterator[tuple[socket.socket, int]]:
     """Run `serve(port, *arguments)` in a process on `processors` (any if empty); yield a socket and its pid.
 
-    The process is terminated by SIGTERM.
+    It listens by then. The process is terminated by SIGTERM.
     """
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
@@ -222,10 +225,20 @@ def peer(processors: set[int], serve: Any, *arguments: Any) -> Iterator[tuple[so
         try:
             sock.connect((LOOPBACK, port))
             sock.settimeout(TIMEOUT_S)
+            _wait_until_bound(port)
             yield sock, process.pid or 0
         finally:
             process.terminate()
             process.join(TIMEOUT_S)
+
+
+def _wait_until_bound(port: int) -> None:
+    """Wait until a process has the UDP port; imports take seconds on a busy computer."""
+    start = time.perf_counter()
+    while not any(line.split()[1].endswith(f":{port:04X}") for line in UDP_PORTS.read_text().splitlines()):
+        if time.perf_counter() - start > START_TIMEOUT_S:
+            raise TimeoutError(f"nothing listens on UDP port {port} after {START_TIMEOUT_S:g} s")
+        time.sleep(0.02)
 
 
 def _companion(port: int, logs: str) -> None:

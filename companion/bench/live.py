@@ -31,7 +31,7 @@ from companion.runtime.core import CompanionCore
 from companion.runtime.service import run
 
 FLIGHT_S = 20.0
-SETTLE_S = 10.0  # imports, the first fix
+SETTLE_S = 10.0  # the first fix
 TICK_S = 0.01
 TURNS = "turns.npy"
 

@@ -125,7 +125,7 @@ def is_run(text: str) -> bool:
 def test_command_runs(text: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(folder)
     monkeypatch.setattr(live, "FLIGHT_S", 1.0)  # of `companion bench live`
-    monkeypatch.setattr(live, "SETTLE_S", 4.0)
+    monkeypatch.setattr(live, "SETTLE_S", 1.0)
     assert text.startswith("companion "), f"{text}: run it here, or state in NOT_RUN why not"
     stands_for = {"SOURCE": "SOURCE.tlog", "FOLDER...": "logs", "$LOG": "LOG.mcap"}
     words = [stands_for.get(word, word) for word in arguments(text)]
