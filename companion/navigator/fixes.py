@@ -104,7 +104,16 @@ def _latency_velocity(state: State, t_ns: int) -> tuple[State, Vector2]:
         part = -math.expm1(-max(t_ns - mean.t_ns, 0) * 1e-9 / MEAN_S)
         north, east = mean.north + part * (north - mean.north), mean.east + part * (east - mean.east)
     state = state._replace(velocity_error=VelocityError(t_ns, north, east))
-    return state, (nominal[0] - north, nominal[1] - east)
+    return state, _smooth_velocity(state)
+
+
+def _smooth_velocity(state: State) -> Vector2:
+    """The nominal velocity less the slow mean of its error, if there is one; else the estimated one, m/s."""
+    mean = state.velocity_error
+    if mean is None or state.nominal is None:
+        return estimated_velocity(state)
+    north, east, _ = state.nominal.point.v_n
+    return north - mean.north, east - mean.east
 
 
 def rsbn(state: State, record: RsbnFix, settings: Settings) -> Step:
@@ -124,6 +133,7 @@ def rsbn(state: State, record: RsbnFix, settings: Settings) -> Step:
     assert nominal is not None
     assert state.bank is not None
     point, centre = corrected(nominal.point, state, settings)
+    point = point._replace(v_n=(*_smooth_velocity(state), point.v_n[2]))
     known, believed = hypotheses(state, settings), Source(0)
     height = settings.config.inertial.height_sigma_m
     for z in fix_observations.from_rsbn(record, point, settings.config.rsbn):

@@ -149,9 +149,15 @@ def begin(s: Sensors, fix: Gnss | RsbnFix) -> Nominal | None:
 
 
 def restart(nominal: Nominal, by: By, velocity: Vector2) -> Nominal:
-    """Begin the next interval at the nominal point, driven `by` a sensor, at a nominal `velocity` (m/s)."""
+    """Begin the next interval at the nominal point, driven `by` a sensor, at a nominal `velocity` (m/s).
+
+    The wind's shear of an interval that the bank was propagated over is over with it.
+    """
     point = nominal.point._replace(v_n=(*velocity, nominal.point.v_n[2]))
-    return Nominal(point, nominal.a_n, point, own_error_model.begin(by, velocity))
+    interval = own_error_model.begin(by, velocity)
+    if nominal.interval is not None and nominal.pending_s <= 0.0:
+        interval = interval._replace(shear=nominal.interval.shear)
+    return Nominal(point, nominal.a_n, point, interval)
 
 
 def carry_on(nominal: Nominal, s: Sensors, t_ns: int) -> Nominal:

@@ -109,7 +109,7 @@ class Interval(NamedTuple):
     `velocity` (m/s) is the nominal one now; `moved` (m) how far the nominal went. c1, s1 are the integrals of
     cosine and sine of the heading, c2, s2 those of c1, s1; n1, e1 of the acceleration, n2, e2 of n1, e1. For
     `air`, n1 and e1 are the way through the air (m) and `V` is the air velocity at the end. `noise` is the
-    variance of the velocity by the noise of the samples, (m/s)^2.
+    variance of the velocity by the noise of the samples, (m/s)^2, `shear` that of the wind by height.
     """
 
     by: By
@@ -126,6 +126,7 @@ class Interval(NamedTuple):
     e2: float = 0.0
     V: Vector2 = (0.0, 0.0)
     noise: float = 0.0
+    shear: float = 0.0
 
 
 class Row(NamedTuple):
@@ -178,6 +179,7 @@ def add_imu(i: Interval, dt: float, a_n: Vector2, heading: float, noise: float) 
         i.e2 + (i.e1 + 0.5 * ve) * dt,
         i.V,
         i.noise + noise,
+        i.shear,
     )
 
 
@@ -185,7 +187,9 @@ def add_velocity(i: Interval, dt: float, velocity: Vector2) -> Interval:
     """Add one sample of the air velocity or of the foreign velocity (m/s), `dt` (s) after the last."""
     n, e = 0.5 * (i.velocity[0] + velocity[0]) * dt, 0.5 * (i.velocity[1] + velocity[1]) * dt
     moved = (i.moved[0] + n, i.moved[1] + e)
-    return Interval(i.by, velocity, moved, i.seconds + dt, n1=i.n1 + n, e1=i.e1 + e, V=velocity)
+    return i._replace(
+        velocity=velocity, moved=moved, seconds=i.seconds + dt, n1=i.n1 + n, e1=i.e1 + e, V=velocity
+    )
 
 
 def add_hold(i: Interval, dt: float) -> Interval:
@@ -241,8 +245,8 @@ class Propagator:
         self._diagonal = np.arange(N)
         self._wind_seen = np.zeros((N, N))
         for k in (0, 1):
-            self._wind_seen[2 + k, 2 + k] = s.wind_change_m_s_sqrt_s**2
-            self._wind_seen[2 + k, 4 + k] = self._wind_seen[4 + k, 2 + k] = -(s.wind_change_m_s_sqrt_s**2)
+            self._wind_seen[2 + k, 2 + k] = 1.0
+            self._wind_seen[2 + k, 4 + k] = self._wind_seen[4 + k, 2 + k] = -1.0
 
     def transition(self, i: Interval) -> tuple[Floats, Floats]:
         """Return Phi (n, n) and Q (grades, n, n) of an interval of about a second."""
@@ -252,6 +256,7 @@ class Propagator:
         Phi[self._diagonal, self._diagonal] = decay
         Q = np.zeros((len(GRADES), N, N))
         Q[:, self._diagonal, self._diagonal] = self._density * self._grown(T, decay)
+        Q[:, WIND, WIND] += i.shear * np.eye(2)
         if i.by == "imu":
             self._inertial(i, T, Phi, Q)
         elif i.by == "air":
@@ -293,7 +298,9 @@ class Propagator:
         gust = nose_covariance(i.V, s.gust_m_s, s.gust_m_s / ALONG)
         both = gust * (-lasting * math.expm1(-T / lasting))  # integral of the gust times the gust at the end
         crab = self._density[:, CRAB] * T
-        Q += T * self._wind_seen  # wind and crab that come up within the interval: the velocity follows
+        Q += (
+            T * s.wind_change_m_s_sqrt_s**2 + i.shear
+        ) * self._wind_seen  # wind and crab that come up within the interval: the velocity follows
         Q[:, 0:2, 0:2] += (2.0 * lasting * T) * gust
         Q[:, 0:2, 2:4] += both
         Q[:, 2:4, 0:2] += both
@@ -393,9 +400,9 @@ class Ground(NamedTuple):
     climbed: float = CLEAR_M
 
 
-def wind_opened(before: Ground, after: Ground) -> float:
-    """By how much the wind may have changed with height between two phases: one sigma an axis, m/s."""
-    return SHEAR_M_S * math.sqrt(math.log(max(after.climbed / before.climbed, 1.0)))
+def wind_shear(before: Ground, after: Ground) -> float:
+    """Variance of what the wind may have changed with height between two phases, (m/s)^2 an axis."""
+    return SHEAR_M_S**2 * math.log(max(after.climbed / before.climbed, 1.0))
 
 
 def ground_phase(g: Ground, t: float, airspeed: float, speed: float, height: float | None) -> Ground:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 
-from companion.estimate import bank as banks
 from companion.navigator import (
     air_data_channel,
     measurements,
@@ -18,7 +17,7 @@ from companion.navigator import (
 )
 from companion.navigator.channel import Nominal
 from companion.navigator.own_channel import AirspeedSums, OwnChannel, Sensors
-from companion.navigator.own_error_model import WIND, By
+from companion.navigator.own_error_model import By
 from companion.navigator.progress import (
     carried,
     decided,
@@ -118,10 +117,11 @@ def air_data(state: State, record: AirData, settings: Settings) -> Step:
     height = None if s.air.static is None else nominal.point.position.alt
     ground = own_error_model.ground_phase(s.ground, record.t_ns * 1e-9, math.hypot(*V), speed, height)
     s = state.sensors._replace(ground=ground, air_ns=record.t_ns if ground.flying else s.air_ns)
-    opened = own_error_model.wind_opened(state.sensors.ground, ground)
+    sheared = own_error_model.wind_shear(state.sensors.ground, ground)
     state = state._replace(sensors=s)
-    if opened and state.bank is not None:
-        state = state._replace(bank=banks.inflate(state.bank, range(WIND.start, WIND.stop), opened))
+    if sheared and nominal.interval is not None:
+        interval = nominal.interval._replace(shear=nominal.interval.shear + sheared)
+        state = state._replace(nominal=nominal._replace(interval=interval))
     if not ground.flying:
         return _straight_on(state, record, settings)
     if leads:

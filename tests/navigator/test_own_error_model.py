@@ -21,7 +21,7 @@ from companion.navigator.own_error_model import (
     begin,
     ground_phase,
     prior,
-    wind_opened,
+    wind_shear,
 )
 
 
@@ -49,13 +49,13 @@ def test_the_wind_is_as_open_after_many_small_steps_of_height_as_after_one() -> 
         g, total = Ground(False, None, 100.0), 0.0
         for k in range(1, round(300.0 / step) + 1):
             after = ground_phase(g, 0.1 * k, 25.0, 25.0, 100.0 + step * k)
-            total, g = total + wind_opened(g, after) ** 2, after
+            total, g = total + wind_shear(g, after), after
         return total
 
     assert variance(1.0) == pytest.approx(variance(300.0), rel=1e-12)
     assert variance(1.0) == pytest.approx(SHEAR_M_S**2 * math.log(SHEAR_TOP_M / CLEAR_M))
     level = Ground(True, None, 100.0, 80.0)
-    assert wind_opened(level, ground_phase(level, 1.0, 25.0, 25.0, 170.0)) == 0.0  # up and down in cruise
+    assert wind_shear(level, ground_phase(level, 1.0, 25.0, 25.0, 170.0)) == 0.0  # up and down in cruise
 
 
 def test_without_a_pressure_it_flies_once_it_moves() -> None:
