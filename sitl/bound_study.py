@@ -27,6 +27,7 @@ from scipy.signal import lfilter
 from companion.estimate.predictor import KAPPA, Step, Window, anchor
 from companion.nav.bounded_channel import BoundedIns, Motion, UnitErrors
 from companion.nav.earth import OMEGA
+from companion.option_types import FloatRange
 from companion.study import plot_options
 from companion.tables import print_tables
 from companion.units import Floats
@@ -248,7 +249,13 @@ def curve(grade: InertialGrade, window_s: float, ahead_s: float) -> list[CurvePo
 
 
 @click.command("bound")
-@click.option("--window-min", default=25.0, show_default=True, help="Duration of the window of fixes [min].")
+@click.option(
+    "--window-min",
+    type=FloatRange(1.0, 60.0),
+    default=25.0,
+    show_default=True,
+    help="Duration of the window of fixes [min].",
+)
 @click.option("--flights", default=19, show_default=True, help="Flights in each of the 54 ensembles.")
 @click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Seed of the errors.")
 @click.option("--grade", type=click.Choice(tuple(GRADES)), help="Only this grade.")
@@ -264,8 +271,6 @@ def command(
     window_min: float, flights: int, seed: int, grade: str | None, as_json: bool, curve_file: Path | None
 ) -> None:
     """Compare the guaranteed bound with simulated errors."""
-    if not 1.0 <= window_min <= 60.0:
-        raise click.BadParameter(f"{window_min:g} min: give 1 to 60", param_hint="--window-min")
     if flights < 2:
         raise click.BadParameter(f"{flights}: give 2 or more", param_hint="--flights")
     grades = [GRADES[grade]] if grade else list(GRADES.values())

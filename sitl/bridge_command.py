@@ -21,6 +21,7 @@ import click
 from rich.table import Table
 
 from companion.analysis import simulated_rsbn
+from companion.option_types import FloatRange
 from companion.storage.reader import LogError
 from companion.tables import print_tables
 from companion.transport.address import Address
@@ -174,14 +175,14 @@ def _parse_beacons(positions: tuple[str, ...], file: Path | None) -> tuple[Beaco
 )
 @click.option(
     "--gnss-off-after",
-    type=click.FloatRange(0.0),
+    type=FloatRange(0.0),
     metavar="S",
     help="Switch the simulated GNSS off after S seconds.",
 )
 @click.option(
-    "--gnss-on-after", type=click.FloatRange(0.0), metavar="S", help="Switch it on again after S seconds."
+    "--gnss-on-after", type=FloatRange(0.0), metavar="S", help="Switch it on again after S seconds."
 )
-@click.option("--seconds", type=click.FloatRange(1.0), default=math.inf, help="Duration of the run.")
+@click.option("--seconds", type=FloatRange(1.0), default=math.inf, help="Duration of the run.")
 @click.option("--unaided", is_flag=True, help="Do not relay the companion's positions to the autopilot.")
 @click.option("--beacons-only", is_flag=True, help="Send the companion only the beacons' answers.")
 @click.option(

@@ -30,6 +30,7 @@ from threadpoolctl import threadpool_limits
 from companion.config import Config, InertialConfig, OutputConfig
 from companion.nav.geometry import displace
 from companion.navigator import Navigator
+from companion.option_types import FloatRange
 from companion.output.source_switch import SourceSwitch
 from companion.records import Event, Gnss, RsbnFix, Solution, Stamped
 from companion.runtime.core import CompanionCore
@@ -331,7 +332,7 @@ def fly_one_recording(data: Path, name: str) -> RecordingResult:
 
 @click.command("harm")
 @click.option("--seeds", type=click.IntRange(1), default=3, show_default=True, help="Flights per case.")
-@click.option("--minutes", type=click.FloatRange(4.0), default=10.0, show_default=True, help="Of each.")
+@click.option("--minutes", type=FloatRange(4.0), default=10.0, show_default=True, help="Of each.")
 @click.option("--quick", is_flag=True, help="One seed, five minutes.")
 @click.option("--case", "names", multiple=True, type=click.Choice(list(WRONG)), help="Default: all.")
 @click.option("--channel", "channels", multiple=True, type=click.Choice(CHANNELS), help="Default: all.")

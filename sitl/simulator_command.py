@@ -18,6 +18,7 @@ import numpy as np
 
 from companion.link.clock import BootClock
 from companion.nav.geometry import Geodetic, local_to_geodetic, separation
+from companion.option_types import FloatRange
 from companion.transport.address import Address
 from companion.units import SECOND_NS
 from sitl.autopilot import SimulatedAutopilot
@@ -139,7 +140,7 @@ class SimulatorRunner(RealTimeRunner):
 @click.option("--seed", type=click.IntRange(min=0), help="Seed of the noise.")
 @click.option(
     "--speed",
-    type=click.FloatRange(0.1, 20.0),
+    type=FloatRange(0.1, 20.0),
     default=1.0,
     show_default=True,
     help="Times real time; the companion sees a clock that runs faster by this factor.",

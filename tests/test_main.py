@@ -18,7 +18,8 @@ from click.testing import CliRunner
 from companion import __version__
 from companion.command_line import cli
 from companion.config import ConfigError
-from sitl.endurance import file_mutants, forged_frames, parameter_sweep
+from companion.option_types import FloatRange
+from sitl.endurance import attacks, file_mutants, forged_frames, parameter_sweep
 
 COMMANDS = ("bench", "check-config", "doctor", "log", "loopback", "replay", "run", "sitl")
 CUT = Path(__file__).parent / "data" / "dronekit_copter_cut.tlog"
@@ -84,6 +85,29 @@ def test_seeds_are_not_negative() -> None:
     for command in seeded:
         done = CliRunner().invoke(command, ["--seed", "-1"])
         assert (done.exit_code, "-1 is not in the range x>=0" in done.output) == (2, True), command.name
+
+
+def test_no_number_is_nan() -> None:
+    """Infinity only where it is the default: no end."""
+    tools = [attacks.main, file_mutants.main, forged_frames.main, parameter_sweep.main]
+    checked = set()
+    for command in [*commands().values(), *tools]:
+        context = click.Context(command)
+        for option in command.params:
+            if isinstance(option.type, click.types.FloatParamType):
+                assert isinstance(option.type, FloatRange), (command.name, option.name)
+                for text in ("nan", "-nan", "inf", "-inf"):
+                    if float(text) != option.get_default(context):
+                        with pytest.raises(click.BadParameter, match="is not"):
+                            option.type.convert(text, option, context)
+                checked.add((command.name, option.name))
+    assert {("live", "speed"), ("bridge", "gnss_off_after"), ("harm", "minutes")} < checked
+
+
+@pytest.mark.parametrize(("end", "code"), [("inf", 1), ("nan", 2), ("-inf", 2)])
+def test_infinity_means_no_end(end: str, code: int, tmp_path: Path) -> None:
+    done = CliRunner().invoke(cli, ["sitl", "play", str(tmp_path / "none.tlog"), "--to", end])
+    assert done.exit_code == code
 
 
 def test_page_names_the_commands_with_presets() -> None:

@@ -12,6 +12,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from companion.analysis.progress import show_step
+from companion.option_types import FloatRange
 from companion.printable import printable
 from companion.storage.flight_log import Info, info, recover
 
@@ -79,7 +80,7 @@ def convert_command(source: Path, output: Path) -> None:
 @click.option(
     "--every",
     "every_s",
-    type=click.FloatRange(min=0.01),
+    type=FloatRange(min=0.01),
     default=1.0,
     show_default=True,
     help="Seconds between points.",

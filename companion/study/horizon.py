@@ -27,6 +27,7 @@ from companion.estimate.schuler import (
     schuler_row,
     transition,
 )
+from companion.option_types import FloatRange
 from companion.study import plot_options
 from companion.tables import print_tables
 from companion.units import G0, Floats
@@ -179,12 +180,6 @@ def _minutes(context: click.Context, parameter: click.Parameter, text: str) -> l
     return given if len(given) > 1 else np.linspace(0.0, given[0], 13).tolist()
 
 
-def _positive(context: click.Context, parameter: click.Parameter, value: float | None) -> float | None:
-    if value is not None and not (math.isfinite(value) and value > 0.0):
-        raise click.BadParameter(f"{value:g} is not a valid distance: give metres above 0")
-    return value
-
-
 def _target(context: click.Context, parameter: click.Parameter, text: str | None) -> list[float] | None:
     if text is None:
         return None
@@ -215,13 +210,25 @@ def _drift(context: click.Context, parameter: click.Parameter, text: str | None)
 @click.command("horizon")
 @click.option(
     "--sigma-m",
+    type=FloatRange(0.0, min_open=True),
     default=30.0,
     show_default=True,
-    callback=_positive,
     help="R.m.s. of one position fix [m].",
 )
-@click.option("--window-min", default=15.0, show_default=True, help="Duration of the window of fixes [min].")
-@click.option("--every-s", default=1.0, show_default=True, help="Interval of the fixes [s].")
+@click.option(
+    "--window-min",
+    type=FloatRange(0.0, min_open=True),
+    default=15.0,
+    show_default=True,
+    help="Duration of the window of fixes [min].",
+)
+@click.option(
+    "--every-s",
+    type=FloatRange(0.0, min_open=True),
+    default=1.0,
+    show_default=True,
+    help="Interval of the fixes [s].",
+)
 @click.option(
     "--ahead-min",
     default="60",
@@ -236,13 +243,12 @@ def _drift(context: click.Context, parameter: click.Parameter, text: str | None)
     "--disturbance-ug",
     default=0.0,
     show_default=True,
-    type=click.FloatRange(0.0),
+    type=FloatRange(0.0),
     help="R.m.s. specific force that the channel does not model [micro-g].",
 )
 @click.option(
     "--velocity-mps",
-    type=float,
-    callback=_positive,
+    type=FloatRange(0.0, min_open=True),
     help="A velocity is measured with each fix, of this r.m.s. error [m/s].",
 )
 @click.option(
@@ -253,8 +259,7 @@ def _drift(context: click.Context, parameter: click.Parameter, text: str | None)
 )
 @click.option(
     "--limit-m",
-    type=float,
-    callback=_positive,
+    type=FloatRange(0.0, min_open=True),
     help="Also print how long the position bound stays below this [m].",
 )
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")

@@ -16,6 +16,7 @@ from rich.table import Table
 
 from companion.nav.earth import SPHERE
 from companion.nav.error_model import aircraft_model, paper_model
+from companion.option_types import FloatRange
 from companion.tables import print_tables
 
 HOUR = 3600.0
@@ -33,13 +34,9 @@ def eigenvalues(model: str, lat: float, v_north: float, v_east: float) -> list[c
 
 
 @click.command("ins-errors")
-@click.option(
-    "--lat-deg", type=click.FloatRange(-85.0, 85.0), default=60.0, show_default=True, help="Latitude."
-)
-@click.option(
-    "--north-mps", type=click.FloatRange(-1000.0, 1000.0), default=0.0, help="Velocity north [m/s]."
-)
-@click.option("--east-mps", type=click.FloatRange(-1000.0, 1000.0), default=0.0, help="Velocity east [m/s].")
+@click.option("--lat-deg", type=FloatRange(-85.0, 85.0), default=60.0, show_default=True, help="Latitude.")
+@click.option("--north-mps", type=FloatRange(-1000.0, 1000.0), default=0.0, help="Velocity north [m/s].")
+@click.option("--east-mps", type=FloatRange(-1000.0, 1000.0), default=0.0, help="Velocity east [m/s].")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 def command(lat_deg: float, north_mps: float, east_mps: float, as_json: bool) -> None:
     """Print the INS error equations' natural frequencies.

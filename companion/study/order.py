@@ -25,6 +25,7 @@ from companion.estimate.polynomial import (
     select_order,
     smooth_track,
 )
+from companion.option_types import FloatRange
 from companion.records import Stamped
 from companion.storage import flight_log
 from companion.study import plot_options
@@ -191,7 +192,7 @@ def short_form(samples: Samples, found: Order) -> int:
 )
 @click.option(
     "--sigma",
-    type=click.FloatRange(min=0.0, min_open=True),
+    type=FloatRange(min=0.0, min_open=True),
     help="R.m.s. noise; default: 0.2 if FILE has no third column, estimated for a log.",
 )
 @click.option("--topic", help="Topic or record of a log, for example /in/Gnss or Gnss.")

@@ -27,6 +27,7 @@ from companion.config import Config, load
 from companion.config.options import configuration_options
 from companion.nav.geometry import Geodetic, separation
 from companion.navigator import INPUTS_USED, Navigator
+from companion.option_types import FloatRange
 from companion.records import AirData, Attitude, Gnss, Reboot, Solution, Stamped
 from companion.storage.reader import LogError
 from companion.tables import print_tables
@@ -185,13 +186,11 @@ def _row(
 
 @click.command("outages")
 @click.argument("log", type=click.Path(path_type=Path))
-@click.option(
-    "--lasting", type=click.FloatRange(1.0, 3600.0), multiple=True, help="Seconds; may be repeated."
-)
+@click.option("--lasting", type=FloatRange(1.0, 3600.0), multiple=True, help="Seconds; may be repeated.")
 @click.option(
     "--every",
     "every_s",
-    type=click.FloatRange(min=1.0),
+    type=FloatRange(min=1.0),
     default=60.0,
     show_default=True,
     help="Seconds between.",

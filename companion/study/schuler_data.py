@@ -32,6 +32,7 @@ from companion.estimate.minimax_lp import Design
 from companion.estimate.predictor import Start, Step, Window, anchor
 from companion.estimate.schuler import ARCSECOND, DEG_PER_HOUR, MEAN_EARTH, schuler_row, transition
 from companion.nav.bounded_channel import BoundedIns, Motion, UnitErrors
+from companion.option_types import FloatRange
 from companion.tables import print_tables
 from companion.units import G0, SECOND_NS, Floats
 
@@ -182,8 +183,20 @@ def _windows(t_ns: npt.NDArray[np.int64], window_s: float) -> Iterator[slice]:
 @click.argument("file", type=click.Path(exists=True, dir_okay=False, path_type=Path))
 @click.option("--window-min", default="20,30,60", show_default=True, help="Windows of the estimation [min].")
 @click.option("--ahead-min", default="5,10,20,40", show_default=True, help="Horizons [min].")
-@click.option("--sigma-mps", default=STATED_SIGMA, show_default=True, help="Stated sigma [m/s].")
-@click.option("--lat-deg", default=LATITUDE_DEG, show_default=True, help="Latitude of the flight [deg].")
+@click.option(
+    "--sigma-mps",
+    type=FloatRange(0.0, min_open=True),
+    default=STATED_SIGMA,
+    show_default=True,
+    help="Stated sigma [m/s].",
+)
+@click.option(
+    "--lat-deg",
+    type=FloatRange(-85.0, 85.0),
+    default=LATITUDE_DEG,
+    show_default=True,
+    help="Latitude of the flight [deg].",
+)
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 def command(
     file: Path, window_min: str, ahead_min: str, sigma_mps: float, lat_deg: float, as_json: bool

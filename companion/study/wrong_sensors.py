@@ -26,6 +26,7 @@ from companion.config.options import configuration_options
 from companion.estimate.bank.settings import DEFAULT as THRESHOLDS
 from companion.nav.geometry import Geodetic, separation, wrap_angle
 from companion.navigator import INPUTS_USED, Navigator
+from companion.option_types import FloatRange
 from companion.records import AirData, Attitude, Imu, Reboot, Solution, Stamped
 from companion.storage.reader import LogError
 from companion.study.outages import Fixes
@@ -128,7 +129,7 @@ def study(records: Sequence[Stamped], config: Config, from_s: float) -> Iterator
 @click.option(
     "--from",
     "from_s",
-    type=click.FloatRange(min=0.0),
+    type=FloatRange(min=0.0),
     default=0.0,
     show_default=True,
     help="Second of the log from which on it is wrong.",

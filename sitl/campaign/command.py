@@ -27,6 +27,7 @@ from rich.progress import MofNCompleteColumn, Progress, TextColumn, TimeRemainin
 from rich.table import Table
 
 from companion.analysis.jobs import WORKER_LOST, Journal, run_jobs
+from companion.option_types import FloatRange
 from sitl.campaign.flight import (
     FAULT_CASES,
     SCENARIOS,
@@ -247,9 +248,11 @@ def _cell(value: Any) -> str:
     default=os.cpu_count() or 1,
     help="Worker processes; 0: fly in this process.",
 )
-@click.option("--harmless-m", type=float, default=CampaignLimits().harmless_m, show_default=True)
-@click.option("--misleading", type=float, default=CampaignLimits().misleading, show_default=True)
-@click.option("--alarms-per-hour", type=float, default=CampaignLimits().alarms_per_hour, show_default=True)
+@click.option("--harmless-m", type=FloatRange(0.0), default=CampaignLimits().harmless_m, show_default=True)
+@click.option("--misleading", type=FloatRange(0.0), default=CampaignLimits().misleading, show_default=True)
+@click.option(
+    "--alarms-per-hour", type=FloatRange(0.0), default=CampaignLimits().alarms_per_hour, show_default=True
+)
 @click.option("--report", "page", type=click.Path(path_type=Path), help="Write the tables to this .md file.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 def command(

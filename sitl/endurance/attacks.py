@@ -30,6 +30,7 @@ from rich.table import Table
 from companion.bench.live import memory_mib, processor_s
 from companion.link import dialect, frame
 from companion.link.dialect import mavlink, rsbn
+from companion.option_types import FloatRange
 from companion.records import Stamped
 from companion.runtime.core import CompanionCore
 from sitl.autopilot import SimulatedAutopilot
@@ -362,7 +363,7 @@ def stop_during_start(times: int) -> list[int]:
 
 
 @click.command()
-@click.option("--seconds", type=float, default=15.0, show_default=True, help="Of each phase.")
+@click.option("--seconds", type=FloatRange(1.0), default=15.0, show_default=True, help="Of each phase.")
 @click.option("--only", type=click.Choice([*ATTACKS, "term"]), multiple=True)
 @click.option("--virtual", is_flag=True, help="In virtual time: the processor time alone, on any machine.")
 def main(seconds: float, only: tuple[str, ...], virtual: bool) -> None:

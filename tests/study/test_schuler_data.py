@@ -65,7 +65,10 @@ def test_command():
         ("north", 20),
     ]
     assert CliRunner().invoke(command, [str(FLIGHT), "--window-min", "x"]).exit_code == 2
-    assert "sigmas[0] is -1.0" in CliRunner().invoke(command, [*arguments, "--sigma-mps", "-1"]).output
+    assert (
+        "-1.0 is not in the range x>0.0"
+        in CliRunner().invoke(command, [*arguments, "--sigma-mps", "-1"]).output
+    )
 
 
 @pytest.mark.parametrize(

@@ -20,6 +20,7 @@ import msgspec
 
 from companion.analysis.live.follow import FollowedLog, PlayedLog, find_log, reject_foreign
 from companion.analysis.live.scene import Scene
+from companion.option_types import FloatRange
 from companion.optional_dependencies import missing_package
 from companion.storage.reader import ACTIVE, LogError
 
@@ -222,7 +223,7 @@ async def run(view: LiveView, host: str, port: int, on_ready: Callable[[int], No
 )
 @click.option(
     "--speed",
-    type=click.FloatRange(0.1, 1000.0),
+    type=FloatRange(0.1, 1000.0),
     default=1.0,
     show_default=True,
     help="Pace of a finished log.",
