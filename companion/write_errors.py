@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 
@@ -11,6 +12,24 @@ def make_folder(path: Path) -> None:
         path.mkdir(parents=True, exist_ok=True)
     except FileExistsError as error:
         raise FileExistsError(error.errno, "it is a file; give a folder", str(path)) from None
+
+
+def write_whole(path: Path, data: bytes) -> None:
+    """Write a file at once: after an error the older one is still there. OSError, always with the path."""
+    target = path.resolve()
+    part = target.with_name(f"{target.name}.part")
+    try:
+        if target.exists() and not target.is_file():  # a folder, or a device such as /dev/stdout
+            target.write_bytes(data)
+            return
+        try:
+            part.write_bytes(data)
+            os.replace(part, target)
+        except BaseException:
+            part.unlink(missing_ok=True)
+            raise
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(path)) from None
 
 
 def describe_write_error(error: OSError) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ import numpy as np
 
 from companion.analysis.plot_data import Figure, Line
 from companion.units import Floats
-from companion.write_errors import make_folder
+from companion.write_errors import make_folder, write_whole
 
 INK, GRID, SHADE = "#374151", "#e5e7eb", "#fee2e2"
 TICKS_S = (1.0, 5.0, 10.0, 30.0, 60.0, 120.0, 300.0, 600.0, 1800.0, 3600.0)  # steps of a time axis
@@ -74,15 +75,19 @@ def write_figures(figures: Sequence[Figure], pdf: Path | None, png: Path | None)
         _paint(figure, sheet.subplots())
         sheets.append(sheet)
     if pdf is not None:
-        with PdfPages(pdf) as pages:
-            for sheet in sheets:
-                pages.savefig(sheet)
+        with BytesIO() as file:
+            with PdfPages(file) as pages:
+                for sheet in sheets:
+                    pages.savefig(sheet)
+            write_whole(pdf, file.getvalue())
         written.append(pdf)
     if png is not None:
         make_folder(png)
         for figure, sheet in zip(figures, sheets, strict=True):
             written.append(png / f"{figure.key}.png")
-            sheet.savefig(written[-1])
+            with BytesIO() as file:
+                sheet.savefig(file, format="png")
+                write_whole(written[-1], file.getvalue())
     return written
 
 

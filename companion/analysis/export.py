@@ -24,7 +24,7 @@ from companion.analysis.flight_events import WITHOUT_FIXES, beacon_places, split
 from companion.analysis.plot_data import COLOURS
 from companion.storage.reader import LogError
 from companion.units import Floats
-from companion.write_errors import describe_write_error
+from companion.write_errors import describe_write_error, write_whole
 
 SUFFIXES = (".geojson", ".json", ".kml")
 GAP_S = 10.0  # a line is cut where no point is known for longer
@@ -68,7 +68,7 @@ def write_map(path: Path, title: str, tracks: Sequence[Track], places: Sequence[
     write = to_kml if path.suffix.lower() == ".kml" else to_geojson
     text = write(_NOT_XML.sub("\ufffd", title), tracks, places)
     try:
-        path.write_text(text, encoding="utf-8")
+        write_whole(path, text.encode())
     except OSError as error:
         raise LogError(f"{path} cannot be written: {describe_write_error(error)}") from None
 

@@ -34,6 +34,7 @@ from companion.optional_dependencies import missing_package
 from companion.printable import printable
 from companion.records import Severity
 from companion.storage.reader import LogError
+from companion.write_errors import write_whole
 
 SUFFIXES = (".mcap", ".tlog", ".bin", ".ulg", ".log")
 TABLE, PAGE, JOURNAL, REPORTS = "flights.parquet", "index.html", "logs.jsonl", "reports"
@@ -129,7 +130,7 @@ def write_report(job: LogJob) -> str:
     assert job.report is not None
     try:
         page = render_report(job.path.name, blocks_of_log(open_flights(job.path, job.config)))
-        job.report.write_text(page, encoding="utf-8", errors="replace")
+        write_whole(job.report, page.encode(errors="replace"))
     except Exception as error:
         return one_line(error)
     return ""
@@ -218,7 +219,7 @@ def _write_all(rows: Sequence[FlightRow], results: Path) -> Iterator[Path]:
 
     write_table(rows, results / TABLE)
     yield results / TABLE
-    (results / PAGE).write_text(render_page(rows), encoding="utf-8", errors="replace")
+    write_whole(results / PAGE, render_page(rows).encode(errors="replace"))
     yield results / PAGE
 
 

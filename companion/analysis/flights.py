@@ -46,7 +46,8 @@ def open_flights(path: Path, config: Config) -> list[Flight]:
                 raise LogError(f"{path} contains no messages: nothing to report")
             first_unix_ns = first.log_time
             if not info.closed:
-                remarks.append(f"The log was not closed; {info.bytes_lost} bytes at its end are unreadable.")
+                lost = f"; {info.bytes_lost} bytes at its end are unreadable" if info.bytes_lost else ""
+                remarks.append(f"The log was not closed{lost}.")
             if has_navigator_outputs(path):
                 return collect_flights(
                     _read_outputs(path),

@@ -118,9 +118,8 @@ def export_command(log: Path, output: Path, every_s: float, config_file: Path | 
 def _print(found: Info) -> None:
     console = Console()
     rate = 1.0 / found.duration_s if found.duration_s > 0 else 0.0
-    state = (
-        "closed" if found.closed else f"torn ({found.bytes_lost} bytes unreadable; run companion log recover)"
-    )
+    lost = f"{found.bytes_lost} bytes unreadable; " if found.bytes_lost else ""
+    state = "closed" if found.closed else f"torn ({lost}run companion log recover)"
     name = escape(printable(str(found.path)))
     console.print(f"[bold]{name}[/]  {found.bytes / 1e6:.3f} MB, {state}", soft_wrap=True)
     if found.messages:

@@ -24,6 +24,7 @@ from companion.storage import flight_log
 from companion.storage.reader import ACTIVE, LogError
 
 CONVERTED = "converted"  # metadata record of a converted log; its key is `from`
+DERIVED = "derived"  # metadata record of a log that replay or smooth made; its keys are `by` and `from`
 
 
 def apply_changes(config: Config, text: str) -> Config:

@@ -17,7 +17,7 @@ from companion.analysis.figures import build_figures
 from companion.analysis.flight_arrays import Flight
 from companion.analysis.flights import open_flights
 from companion.analysis.html import ReportBlock, render_report
-from companion.analysis.output_guard import reject_any_log, reject_own_input
+from companion.analysis.output_guard import reject_any_log, reject_own_input, reject_same_output
 from companion.analysis.plot_data import LETTERS, Figure
 from companion.analysis.progress import show_step
 from companion.analysis.replay_inputs import apply_changes, has_navigator_outputs
@@ -27,7 +27,7 @@ from companion.config import load
 from companion.optional_dependencies import missing_package
 from companion.printable import printable
 from companion.storage.reader import LogError
-from companion.write_errors import describe_write_error
+from companion.write_errors import describe_write_error, write_whole
 
 
 @click.command("report")
@@ -59,10 +59,11 @@ def command(
     """
     if len(logs) > len(LETTERS):
         raise click.UsageError(f"{len(logs)} logs given; at most {len(LETTERS)} can be compared")
-    for target in (output, pdf):
-        if target is not None:
-            reject_own_input(target, *logs, config_file)
-            reject_any_log(target)
+    outputs = [target for target in (output, pdf) if target is not None]
+    reject_same_output(outputs)
+    for target in outputs:
+        reject_own_input(target, *logs, config_file)
+        reject_any_log(target)
     if changes or config_file:
         _reject_flown(logs)
     config = load(config_file)
@@ -77,7 +78,7 @@ def command(
         blocks = comparison_block(found, _names(logs)) if len(logs) > 1 else blocks_of_log(found[0])
         step(f"write {output}")
         try:
-            output.write_text(render_report(_title(_names(logs)), blocks), encoding="utf-8")
+            write_whole(output, render_report(_title(_names(logs)), blocks).encode(errors="replace"))
             written = [output, *(write_figures(_all_figures(blocks), pdf, png) if pdf or png else [])]
         except ModuleNotFoundError as error:
             raise LogError(missing_package("a report", error.name, "report")) from None

@@ -129,6 +129,7 @@ class Writer:
         self._queued_bytes = 0
         self._wake = threading.Event()
         self._closing = False
+        self._finishing = True
 
         self._ids: dict[Any, int] = {}
         self._sequences: list[int] = [0]
@@ -171,13 +172,14 @@ class Writer:
         """Bytes queued for the disk."""
         return self._queued_bytes
 
-    def close(self, timeout_s: float = 30.0) -> bool:
+    def close(self, timeout_s: float = 30.0, *, finish: bool = True) -> bool:
         """Write everything queued, close the file and rename it. Return whether this succeeded.
 
+        Without `finish` the log stays ".active", as of an interrupted run.
         If the disk fails or takes longer than `timeout_s`, the log stays ".active" and can be recovered.
         """
         with self._lock:
-            self._closing = True
+            self._closing, self._finishing = True, finish
         self._wake.set()
         self._thread.join(timeout_s)
         if self._thread.is_alive():
@@ -292,7 +294,8 @@ class Writer:
         with self._lock:
             self._queue_open_chunk()
         written = self._write_queued()
-        finished = written and self._attempt(self._file.finish) and self._attempt(self._file.sync)
+        finish = written and self._finishing
+        finished = finish and self._attempt(self._file.finish) and self._attempt(self._file.sync)
         if finished:
             self._attempt(self._rename)
         self._file.close()  # last: releases the lock that keeps others from recovering the log

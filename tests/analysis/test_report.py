@@ -4,9 +4,11 @@ The page is opened in a real browser (skipped without chromium).
 """
 
 import dataclasses
+import errno
 import html
 import json
 import math
+import os
 import re
 from pathlib import Path
 
@@ -26,6 +28,7 @@ from companion.analysis.flight_arrays import collect_flights
 from companion.analysis.flight_events import describe_rejections, event_title, topic_name
 from companion.analysis.flights import open_flights
 from companion.analysis.html import comparison_table, render_report
+from companion.analysis.log_command import group as log_group
 from companion.analysis.plot_data import thin_line
 from companion.analysis.replay import command as replay_command
 from companion.analysis.report import blocks_of_log, command, comparison_block
@@ -706,6 +709,50 @@ def test_unwritable_page_is_reported(log, tmp_path):
     assert isinstance(found.exception, LogError)
     assert str(found.exception).startswith("cannot write the report")
     assert str(found.exception).endswith(f": no folder {tmp_path / 'no'}")
+
+
+@pytest.mark.parametrize("option", ["-o", "--pdf"])
+def test_failed_report_keeps_the_older_one(option, log, tmp_path, monkeypatch):
+    pytest.importorskip("jinja2")
+    pytest.importorskip("matplotlib")
+    older = tmp_path / "older"
+    older.write_text("an older one")
+    replace = os.replace
+
+    def full(source, target):
+        if Path(target) == older:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        replace(source, target)
+
+    monkeypatch.setattr("companion.write_errors.os.replace", full)
+    found = CliRunner().invoke(command, [str(log), "-o", str(tmp_path / "r.html"), option, str(older)])
+    assert isinstance(found.exception, LogError)
+    assert str(found.exception) == f"cannot write the report to {older}: No space left on device"
+    assert older.read_text() == "an older one"
+    assert not list(tmp_path.glob("*.part"))
+
+
+def test_same_output_twice_is_rejected(log, tmp_path):
+    found = CliRunner().invoke(command, [str(log), "-o", str(tmp_path / "x"), "--pdf", str(tmp_path / "x")])
+    assert isinstance(found.exception, LogError) and "would be written twice" in str(found.exception)
+
+
+def test_report_is_written_to_a_device(log):
+    pytest.importorskip("jinja2")
+    assert CliRunner().invoke(command, [str(log), "-o", os.devnull]).exit_code == 0
+    assert not Path(os.devnull).is_file()
+
+
+def test_log_that_is_not_closed_has_no_unreadable_bytes(log, tmp_path):
+    assert "not closed" not in " ".join(open_flights(log, Config())[0].remarks)
+    active = tmp_path / "x.mcap.active"
+    with flight_log.Writer(tmp_path / "x.mcap", metadata={}, start_unix_ns=0, start_ns=0, block=True) as sink:
+        for entry in flight_log.read(log):
+            if isinstance(entry.value, (*INPUTS, *OUTPUTS)):
+                sink.record(entry.value)
+        sink.close(finish=False)
+    assert open_flights(active, Config())[0].remarks[0] == "The log was not closed."
+    assert "torn (run companion log recover)" in CliRunner().invoke(log_group, ["info", str(active)]).output
 
 
 def test_file_in_place_of_the_folder_of_figures_is_reported(log, tmp_path):
