@@ -24,13 +24,8 @@ def convert_log(source: Path, output: Path) -> ImportSummary:
         if output.resolve() == source.resolve() or output.exists():
             raise LogError(f"{output} already exists: give another name")
         records = sources.open_source(source)
-        sink = create_replay_log(output, {CONVERTED: {"from": source.name}})
-        try:
+        with create_replay_log(output, {CONVERTED: {"from": source.name}}) as sink:
             for record in records:
                 from_importer = isinstance(record, OUTPUTS)
                 sink.record(record, f"/link/{type(record).__name__}" if from_importer else None)
-        finally:
-            sink.close()
-        if sink.trouble:
-            raise LogError(f"{output} is incomplete: {sink.trouble}")
     return records.summary()

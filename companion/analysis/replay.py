@@ -12,6 +12,7 @@ import json
 import time
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,9 +20,10 @@ import click
 
 from companion.analysis import simulated_rsbn
 from companion.analysis.comparison import TOLERANCE, OutputComparison
-from companion.analysis.output_guard import reject_own_input
+from companion.analysis.output_guard import reject_other_flight, reject_own_input, remove_leftover
 from companion.analysis.progress import show_step
 from companion.analysis.replay_inputs import (
+    DERIVED,
     apply_changes,
     has_navigator_outputs,
     input_errors_as_log_errors,
@@ -35,7 +37,7 @@ from companion.navigator import Navigator
 from companion.printable import printable
 from companion.records import INPUTS, OUTPUTS, Event, Reboot, Solution, Stamped
 from companion.storage import flight_log
-from companion.storage.reader import LogError, is_closed
+from companion.storage.reader import ACTIVE, LogError, is_closed
 from companion.storage.run_metadata import PLATFORM, logged_configuration, numerical_platform, run_metadata
 
 
@@ -138,18 +140,33 @@ def replay_foreign(records: Iterable[Stamped], config: Config, sink: Any) -> Rep
     return count.result()
 
 
+@contextmanager
 def create_replay_log(
     path: Path, described: Mapping[str, Mapping[str, str]], start_ns: int = 0, start_unix_ns: int = 0
-) -> flight_log.Writer:
-    """Create a log for a replay, which waits for the disk instead of dropping messages.
+) -> Iterator[flight_log.Writer]:
+    """Create a log for a replay, which waits for the disk instead of dropping messages, and close it.
 
-    Raises LogError unless the name is that of a log: no other command would read it.
+    After an exception it stays ".active": it is incomplete, and an older log of its name is kept.
+    Raises LogError if the disk fails, and unless the name is that of a log: no other command would read it.
     """
     if path.suffix != ".mcap":
         raise LogError(f"{path}: a log is written as .mcap: give a name that ends with it")
-    return flight_log.Writer(
+    remove_leftover(path)
+    sink = flight_log.Writer(
         path, metadata=described, start_unix_ns=start_unix_ns, start_ns=start_ns, block=True
     )
+    try:
+        yield sink
+    except BaseException:
+        sink.close(finish=False)
+        raise
+    if not sink.close():
+        raise LogError(f"{sink.trouble}; {path}{ACTIVE} is incomplete: run the command again")
+
+
+def derived_metadata(config: Config, by: str, log: Path) -> dict[str, dict[str, str]]:
+    """Return the metadata of a log that the command `by` makes from `log`: it may be replaced."""
+    return {DERIVED: {"by": by, "from": log.name}, **run_metadata(config)}
 
 
 @click.command("replay")
@@ -208,12 +225,15 @@ def command(
     counts: dict[str, int] = {}
     if own and not is_closed(log):
         notes.append("the log was not closed: its last messages may be missing")
+    as_flown = has_navigator_outputs(log) and not (changes or beacons or tables or simulated_outages)
+    if output is None and not as_flown:
+        output = Path(f"{log.name.split('.mcap')[0] if own else log.stem}.replay.mcap")
     if output is not None:
         reject_own_input(output, log, beacons, config_file, *tables)
-    if has_navigator_outputs(log) and not (changes or beacons or tables or simulated_outages):
+        reject_other_flight(output)
+    if output is None or as_flown:
         found = _replay_as_flown(log, output, config)
     else:
-        output = output or Path(f"{log.name.split('.mcap')[0] if own else log.stem}.replay.mcap")
         with input_errors_as_log_errors():
             found, more, counts = _replay_changed(
                 log, output, config, beacons, tables, simulated_outages, seed
@@ -237,15 +257,13 @@ def _replay_as_flown(log: Path, output: Path | None, config: Config) -> ReplayRe
     first = next(iter(flight_log.read(log)), None)
     if first is None:
         raise LogError(f"{log} contains no messages: nothing to replay")
-    sink = None
-    if output is not None:
-        sink = create_replay_log(
-            output, run_metadata(config), getattr(first.value, "rx_ns", 0), first.log_time
-        )
-    with show_step(f"replay {log}"):
+    with show_step(f"replay {log}"), ExitStack() as stack:
+        sink = None
+        if output is not None:
+            described = derived_metadata(config, "replay", log)
+            start_ns = getattr(first.value, "rx_ns", 0)
+            sink = stack.enter_context(create_replay_log(output, described, start_ns, first.log_time))
         found = replay_own(log, config, sink)
-    if sink is not None:
-        sink.close()
     if not found.inputs:
         raise LogError(f"{log} contains no inputs of a navigator: nothing to replay")
     return found
@@ -264,16 +282,15 @@ def _replay_changed(
     log_inputs, note = with_beacons_and_outages(log, beacons, outages, seed, config)
     log_inputs = with_correctors(log_inputs, tables)
     tracks, logged = gnss_latency.TrackCollector(), set[Stamped]()
-    with show_step(f"replay {log}"):
-        records = _observe(log_inputs.records, tracks, logged)
-        sink = create_replay_log(output, run_metadata(config), *start_times(log))
-        try:
-            found = replay_foreign(records, config, sink)
-            analyses = [gnss_latency.analyze_track(track) for track in tracks.tracks()]
-            for event in set(gnss_latency.glitch_events(analyses)) - logged:
-                sink.record(event, "/link/Event")
-        finally:
-            sink.close()
+    described = derived_metadata(config, "replay", log)
+    with (
+        show_step(f"replay {log}"),
+        create_replay_log(output, described, *start_times(log)) as sink,
+    ):
+        found = replay_foreign(_observe(log_inputs.records, tracks, logged), config, sink)
+        analyses = [gnss_latency.analyze_track(track) for track in tracks.tracks()]
+        for event in set(gnss_latency.glitch_events(analyses)) - logged:
+            sink.record(event, "/link/Event")
     notes = [note] if note else []
     if outages and config.uses("local_position") and not config.has_own_ins:
         notes.append(

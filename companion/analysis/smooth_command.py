@@ -11,6 +11,7 @@ from __future__ import annotations
 import csv
 import math
 from collections.abc import Iterator, Sequence
+from io import StringIO
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,9 +19,14 @@ import click
 import numpy as np
 
 from companion.analysis.export import Track, write_map
-from companion.analysis.output_guard import reject_own_input
+from companion.analysis.output_guard import (
+    reject_any_log,
+    reject_other_flight,
+    reject_own_input,
+    reject_same_output,
+)
 from companion.analysis.progress import show_step
-from companion.analysis.replay import create_replay_log, start_times
+from companion.analysis.replay import create_replay_log, derived_metadata, start_times
 from companion.analysis.replay_inputs import (
     apply_changes,
     input_errors_as_log_errors,
@@ -28,13 +34,13 @@ from companion.analysis.replay_inputs import (
     open_inputs,
 )
 from companion.analysis.smoothing import SmoothedRun, smooth_flight
-from companion.config import Config, load
+from companion.config import load
 from companion.nav.geometry import Geodetic, displace
 from companion.records import Smoothed
 from companion.storage.reader import LogError
-from companion.storage.run_metadata import logged_configuration, run_metadata
+from companion.storage.run_metadata import logged_configuration
 from companion.units import SECOND_NS, Floats
-from companion.write_errors import describe_write_error
+from companion.write_errors import describe_write_error, write_whole
 
 FORMATS = (".mcap", ".csv", ".kml", ".geojson", ".json")
 AGREE_SIGMA = 1e-3
@@ -66,27 +72,25 @@ def collect(runs: Sequence[SmoothedRun]) -> SmoothedTrack:
     return SmoothedTrack(records, np.sqrt(np.concatenate(variances)))
 
 
-def write_mcap(path: Path, track: SmoothedTrack, config: Config, start_ns: int, start_unix_ns: int) -> None:
+def write_mcap(
+    path: Path, track: SmoothedTrack, described: dict[str, dict[str, str]], start_ns: int, start_unix_ns: int
+) -> None:
     """Write the track as records `Smoothed`, with points for the map."""
-    sink = create_replay_log(path, run_metadata(config), start_ns, start_unix_ns)
-    try:
+    with create_replay_log(path, described, start_ns, start_unix_ns) as sink:
         for record in track.records:
             sink.record(record)
-    finally:
-        sink.close()
-    if sink.trouble:
-        raise LogError(f"{path} is incomplete: {sink.trouble}")
 
 
 def write_csv(path: Path, track: SmoothedTrack, start_ns: int, start_unix_ns: int) -> None:
     """Write the track as a table; `log_time_s` is UNIX time if the log has it, else its recorder's clock."""
+    file = StringIO(newline="")
+    out = csv.writer(file)
+    out.writerow(COLUMNS)
+    for record, filtered in zip(track.records, track.filter_sigma.tolist(), strict=True):
+        since = record.t_ns - track.records[0].t_ns
+        out.writerow(_row(record, filtered, since, record.t_ns - start_ns + start_unix_ns))
     try:
-        with path.open("w", newline="", encoding="utf-8") as file:
-            out = csv.writer(file)
-            out.writerow(COLUMNS)
-            for record, filtered in zip(track.records, track.filter_sigma.tolist(), strict=True):
-                since = record.t_ns - track.records[0].t_ns
-                out.writerow(_row(record, filtered, since, record.t_ns - start_ns + start_unix_ns))
+        write_whole(path, file.getvalue().encode())
     except OSError as error:
         raise LogError(f"{path} cannot be written: {describe_write_error(error)}") from None
 
@@ -159,6 +163,11 @@ def command(
         if path.suffix.lower() not in FORMATS:
             raise click.UsageError(f"{path}: give a name that ends with one of {', '.join(FORMATS)}")
         reject_own_input(path, log, config_file)
+        if path.suffix.lower() == ".mcap":
+            reject_other_flight(path)
+        else:
+            reject_any_log(path)
+    reject_same_output(paths)
     config = load(config_file) if config_file or not own else logged_configuration(log)
     if changes:
         config = apply_changes(config, ",".join(changes))
@@ -168,7 +177,7 @@ def command(
     start_ns, start_unix_ns = start_times(log)
     for path in paths:
         if path.suffix.lower() == ".mcap":
-            write_mcap(path, track, config, start_ns, start_unix_ns)
+            write_mcap(path, track, derived_metadata(config, "smooth", log), start_ns, start_unix_ns)
         elif path.suffix.lower() == ".csv":
             write_csv(path, track, start_ns, start_unix_ns)
         else:

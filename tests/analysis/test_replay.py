@@ -1,5 +1,6 @@
 """Logs of other recorders are replayed to the end and written as our own logs."""
 
+import errno
 import json
 import shutil
 from collections import Counter
@@ -8,10 +9,11 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
-from companion.analysis import replay
+from companion.analysis import replay, smooth_command
 from companion.config import Config
 from companion.records import Event, Reboot, Reset
 from companion.storage import flight_log
+from companion.storage.mcap_file import DiskFile
 from companion.storage.reader import LogError
 from companion.storage.run_metadata import logged_configuration
 
@@ -123,3 +125,104 @@ def test_own_log_is_not_overwritten_by_its_replay(tmp_path: Path) -> None:
         done = CliRunner().invoke(replay.command, [str(log), "-o", str(log), *changes])
         assert isinstance(done.exception, LogError) and "not overwritten" in str(done.exception)
     assert log.read_bytes() == before
+
+
+def test_log_of_another_flight_is_not_overwritten(tmp_path: Path) -> None:
+    flight, text = tmp_path / "flight.mcap", tmp_path / "text.mcap"
+    with flight_log.Writer(flight, metadata={}, start_unix_ns=10**18, start_ns=0, block=True) as log:
+        log.record(Event(1, 1, 6, "hello"))
+    text.write_text("not a log")
+    before = flight.read_bytes()
+    for command, output in (
+        (replay.command, flight),
+        (smooth_command.command, flight),
+        (replay.command, text),
+    ):
+        done = CliRunner().invoke(command, [str(CUT), "-o", str(output)])
+        assert isinstance(done.exception, LogError)
+        assert str(done.exception) == (
+            f"{output} already exists and was not made by replay or smooth: give another name, or delete it"
+        )
+    assert (flight.read_bytes(), text.read_text()) == (before, "not a log")
+
+
+def test_replay_may_be_repeated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    for _ in range(2):
+        assert CliRunner().invoke(replay.command, [str(CUT)]).exit_code == 0
+    replayed(CUT, tmp_path / "dronekit_copter_cut.replay.mcap")
+
+
+def interrupted(log: Path, metadata: dict[str, dict[str, str]]) -> Path:
+    """Leave what a killed writer of `log` leaves."""
+    sink = flight_log.Writer(log, metadata=metadata, start_unix_ns=10**18, start_ns=0, block=True)
+    sink.record(Event(1, 1, 6, "hello"))
+    sink.close(finish=False)
+    return log.with_name(log.name + ".active")
+
+
+def test_leftover_of_a_replay_is_replaced(tmp_path: Path) -> None:
+    output = tmp_path / "out.mcap"
+    active = interrupted(output, {"derived": {"by": "replay"}})
+    assert active.exists() and not output.exists()
+    replayed(CUT, output)
+    assert list(tmp_path.iterdir()) == [output]
+    active.touch()  # on a full disk
+    replayed(CUT, output)
+    assert list(tmp_path.iterdir()) == [output]
+
+
+def test_leftover_of_a_flight_is_kept(tmp_path: Path) -> None:
+    output = tmp_path / "out.mcap"
+    active = interrupted(output, {})
+    before = active.read_bytes()
+    done = CliRunner().invoke(replay.command, [str(CUT), "-o", str(output)])
+    assert isinstance(done.exception, LogError)
+    assert str(done.exception) == (
+        f"{active} already exists and may be of a flight: give another name, or delete it"
+    )
+    assert active.read_bytes() == before
+
+
+def test_leftover_that_is_the_input_is_kept(tmp_path: Path) -> None:
+    output = tmp_path / "out.mcap"
+    active = interrupted(output, {"derived": {"by": "replay"}})
+    done = CliRunner().invoke(replay.command, [str(active), "-o", str(output)])
+    assert isinstance(done.exception, LogError) and "is an input" in str(done.exception)
+    assert active.exists()
+
+
+def test_log_that_is_still_written_is_not_replaced(tmp_path: Path) -> None:
+    output = tmp_path / "out.mcap"
+    with flight_log.Writer(output, metadata={"derived": {}}, start_unix_ns=10**18, start_ns=0):
+        done = CliRunner().invoke(replay.command, [str(CUT), "-o", str(output)])
+    assert isinstance(done.exception, LogError) and "is still being written" in str(done.exception)
+
+
+def test_replay_that_fails_keeps_the_older_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    output = tmp_path / "out.mcap"
+    replayed(CUT, output)
+    before = output.read_bytes()
+
+    def interrupt(*arguments: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(replay.gnss_latency, "glitch_events", interrupt)
+        assert CliRunner().invoke(replay.command, [str(CUT), "-o", str(output)]).exit_code == 1
+    assert output.read_bytes() == before
+    write = DiskFile.write
+
+    def full(self: DiskFile, at: int, data: bytes) -> None:
+        if at > 10_000:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        write(self, at, data)
+
+    monkeypatch.setattr(DiskFile, "write", full)
+    done = CliRunner().invoke(replay.command, [str(CUT), "-o", str(output)])
+    assert isinstance(done.exception, LogError)
+    assert str(done.exception) == (
+        f"cannot write the log {output}: No space left on device; {output}.active is incomplete:"
+        " run the command again"
+    )
+    assert output.read_bytes() == before

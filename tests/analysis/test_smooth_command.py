@@ -15,6 +15,7 @@ from companion.analysis import smoothing
 from companion.analysis.smooth_command import ELLIPSE_95, command
 from companion.records import Smoothed
 from companion.storage import flight_log
+from companion.storage.reader import LogError
 
 LOG = Path(__file__).parents[1] / "data/plane_wind_change_cut.tlog.xz"
 
@@ -88,3 +89,22 @@ def test_bad_options(log, arguments, message):
     result = CliRunner().invoke(command, [str(log), *arguments])
     assert result.exit_code != 0
     assert message in result.output + str(result.exception)
+
+
+def test_same_output_twice_is_rejected(log, tmp_path):
+    first, second = tmp_path / "t.csv", tmp_path / "." / "t.csv"
+    result = CliRunner().invoke(command, [str(log), "-o", str(first), "-o", str(second)])
+    assert isinstance(result.exception, LogError) and "would be written twice" in str(result.exception)
+    assert not first.exists()
+
+
+def test_no_log_is_overwritten_by_a_table(log, tmp_path):
+    link = tmp_path / "t.csv"
+    other = tmp_path / "other.tlog"
+    other.write_bytes(log.read_bytes())
+    link.symlink_to(other)
+    result = CliRunner().invoke(command, [str(log), "-o", str(link)])
+    assert isinstance(result.exception, LogError) and "is a log and is not overwritten" in str(
+        result.exception
+    )
+    assert other.read_bytes() == log.read_bytes()
