@@ -155,6 +155,7 @@ def main() -> None:
     except OSError as error:
         # prevent a second flush of stdout at exit, which would print its own error
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        where = error.filename or "the output"
-        click.echo(f"companion: {where}: {error.strerror or error}", err=True)
+        where = error.filename or ("the output" if error.errno else "")  # no errno: from no system call
+        text = f"{where}: {error.strerror or error}" if where else str(error)
+        click.echo(f"companion: {printable(text)}", err=True)
         sys.exit(os.EX_IOERR)

@@ -47,8 +47,8 @@ def run_jobs(
     workers : processes of that cluster; with 0 the jobs run in this process, one after another.
     extra : optional dependencies that contain Dask, named if it is missing.
 
-    Raises ValueError if Dask is missing or its scheduler is lost. A job whose worker died is retried by
-    another.
+    Raises ValueError if Dask is missing, or its scheduler is not found or lost. A job whose worker died is
+    retried by another.
     """
     if scheduler is None and workers == 0:
         yield from (FinishedJob(key, work(job)) for key, job in jobs.items())
@@ -72,7 +72,13 @@ def run_jobs(
                 )
             client = stack.enter_context(Client(cluster))
         else:
-            client = stack.enter_context(Client(scheduler))
+            try:
+                client = stack.enter_context(Client(scheduler))
+            except (OSError, ValueError) as error:
+                raise ValueError(
+                    f"--scheduler {scheduler}: {error}: give the HOST:PORT of a Dask scheduler that runs, or"
+                    " leave it out for workers on this machine"
+                ) from None
             stack.enter_context(noted)
         keys = {
             client.submit(work, job, key=key, retries=RETRIES, pure=False): key for key, job in jobs.items()

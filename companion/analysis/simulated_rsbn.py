@@ -15,6 +15,7 @@ import csv
 import gzip
 import math
 import re
+import sys
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -27,6 +28,7 @@ from companion.config import Config
 from companion.nav.earth import E2, A
 from companion.nav.geometry import enu_axes, radio_horizon
 from companion.navigator import INPUTS_USED
+from companion.plausibility import HIGHEST
 from companion.records import Gnss, RsbnFix, Stamped, Truth
 from companion.storage.reader import LogError
 from companion.units import Floats
@@ -34,6 +36,7 @@ from companion.units import Floats
 PERIOD_NS = 1_000_000_000
 MAX_GAP_NS = 3 * PERIOD_NS  # no interpolation of the track across a longer gap
 CHANNELS = 4
+MAX_NUMBER = 65535  # of a beacon in a list of ours: 16 bits in the message
 GROUND = 0.0  # m; not the height of the beacon, so that a higher beacon is never hidden
 RANGE_LIMIT_M = 370_000.0  # 200 nautical miles
 CONE_OF_SILENCE = math.radians(45.0)  # no azimuth in the cone above a beacon
@@ -91,7 +94,8 @@ def read_beacons(path: Path) -> list[ListedBeacon]:
     one sentence, if the file cannot be read or a line is invalid.
     """
     try:
-        with gzip.open(path, "rt", newline="") if path.suffix == ".gz" else path.open(newline="") as file:
+        open_text = gzip.open if path.suffix == ".gz" else open
+        with open_text(path, "rt", newline="", encoding="utf-8-sig") as file:
             reader = csv.DictReader(file)
             columns = set(reader.fieldnames or ())
             if {"id", "lat_deg", "lon_deg", "alt_m"} <= columns:
@@ -100,12 +104,15 @@ def read_beacons(path: Path) -> list[ListedBeacon]:
                 read = _parse_ourairports_row
             else:
                 raise LogError(
-                    f"{path} is not a beacon list: it needs the columns id, lat_deg, lon_deg, alt_m"
+                    f"{path} is not a beacon list: it needs the columns id, lat_deg, lon_deg, alt_m,"
+                    " separated by commas"
                 )
-            found = []
+            found = dict[int, ListedBeacon]()
             for row in reader:
                 try:
-                    found += read(row)
+                    for beacon in read(row):
+                        if found.setdefault(beacon.number, beacon) is not beacon:
+                            raise ValueError(f"id {beacon.number} is given twice")
                 except (TypeError, ValueError) as error:
                     raise LogError(f"{path}, line {reader.line_num} is not a valid beacon: {error}") from None
     except (OSError, EOFError, UnicodeDecodeError) as error:
@@ -114,16 +121,19 @@ def read_beacons(path: Path) -> list[ListedBeacon]:
         raise LogError(f"{path} cannot be read: {getattr(error, 'strerror', None) or error}") from None
     if not found:
         raise LogError(f"{path} contains no beacons")
-    return found
+    return list(found.values())
 
 
 def _parse_row(row: dict[str, str]) -> list[ListedBeacon]:
-    limit = float(row["range_m"]) if row.get("range_m") else RANGE_LIMIT_M
-    lat, lon = _parse_degrees(row["lat_deg"], 90.0), _parse_degrees(row["lon_deg"], 180.0)
-    alt = float(row["alt_m"])
-    if not (math.isfinite(alt) and 0.0 < limit < math.inf):
-        raise ValueError("alt_m and range_m must be finite and range_m positive")
-    return [ListedBeacon(int(row["id"]), lat, lon, alt, limit)]
+    number = row["id"].strip()
+    if not (number.isascii() and number.isdecimal() and int(number) <= MAX_NUMBER):
+        raise ValueError(f"id {number!r} is not an integer from 0 to {MAX_NUMBER}")
+    limit = _parse_number(row, "range_m") if row.get("range_m") else RANGE_LIMIT_M
+    if not limit > 0.0:
+        raise ValueError(f"range_m {limit:g} is not above 0")
+    lat, lon = _parse_number(row, "lat_deg", 90.0), _parse_number(row, "lon_deg", 180.0)
+    alt = _parse_number(row, "alt_m", HIGHEST)
+    return [ListedBeacon(int(number), math.radians(lat), math.radians(lon), alt, limit)]
 
 
 def _parse_ourairports_row(row: dict[str, str]) -> list[ListedBeacon]:
@@ -131,16 +141,24 @@ def _parse_ourairports_row(row: dict[str, str]) -> list[ListedBeacon]:
     if row["type"] not in _KINDS:
         return []
     azimuth, ranging = _KINDS[row["type"]]
-    lat, lon = _parse_degrees(row["latitude_deg"], 90.0), _parse_degrees(row["longitude_deg"], 180.0)
-    alt = float(row["elevation_ft"] or 0.0) * _FEET
-    return [ListedBeacon(int(row["id"]), lat, lon, alt, RANGE_LIMIT_M, azimuth, ranging)]
+    lat, lon = _parse_number(row, "latitude_deg", 90.0), _parse_number(row, "longitude_deg", 180.0)
+    alt = _parse_number(row, "elevation_ft", HIGHEST / _FEET) * _FEET if row["elevation_ft"] else 0.0
+    place = math.radians(lat), math.radians(lon), alt
+    return [ListedBeacon(int(row["id"]), *place, RANGE_LIMIT_M, azimuth, ranging)]
 
 
-def _parse_degrees(text: str, limit: float) -> float:
-    value = float(text)
+def _parse_number(row: dict[str, str], column: str, limit: float = sys.float_info.max) -> float:
+    text = (row[column] or "").strip()
+    if not text:
+        raise ValueError(f"{column} is empty")
+    try:
+        value = float(text)
+    except ValueError:
+        raise ValueError(f"{column} {text!r} is not a number") from None
     if not abs(value) <= limit:
-        raise ValueError(f"{value} deg is outside +-{limit:g} deg")
-    return math.radians(value)
+        wanted = "finite" if limit == sys.float_info.max else f"within +-{limit:.6g}"
+        raise ValueError(f"{column} {value:g} is not {wanted}")
+    return value
 
 
 def parse_outage(text: str) -> SimulatedOutage:

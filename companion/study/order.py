@@ -80,7 +80,10 @@ def read(file: Path, sigma: float) -> Samples:
     try:
         table = np.loadtxt(file, delimiter=",", ndmin=2, encoding="utf-8")
     except (ValueError, OSError) as error:
-        raise ValueError(f"{file}: is not a table of numbers t,z[,sigma] ({error})") from None
+        why = str(error).rstrip(".")
+        raise ValueError(
+            f"{file}: {why}: give rows of numbers t,z or t,z,sigma, without a line of column names"
+        ) from None
     if table.shape[1] not in (2, 3):
         raise ValueError(f"{file}: has {table.shape[1]} columns; give t,z or t,z,sigma")
     known = table[:, 2] if table.shape[1] == 3 else np.full(len(table), sigma)
@@ -229,8 +232,8 @@ def command(
 ) -> None:
     """Select the number of terms of an unknown function.
 
-    The samples are read from FILE: a CSV with t,z or t,z,sigma, or with --topic and --field any log that
-    `replay` reads. Without FILE they are simulated.
+    The samples are read from FILE: a CSV with t,z or t,z,sigma without a line of column names, or with
+    --topic and --field any log that `replay` reads. Without FILE they are simulated.
     """
     if (topic is None) != (field is None) or (topic and not file):
         raise click.UsageError("a column of a log needs FILE, --topic and --field")

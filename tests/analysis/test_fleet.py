@@ -15,6 +15,7 @@ from companion.analysis import fleet, jobs
 from companion.analysis.fleet import FlightRow
 from companion.analysis.fleet_page import render_page
 from companion.config import Config
+from companion.storage.reader import LogError
 from sitl.endurance import sample_logs
 
 
@@ -142,6 +143,19 @@ def test_a_lost_scheduler_is_one_sentence(capfd: pytest.CaptureFixture[str]) -> 
         with pytest.raises(ValueError, match="Dask scheduler lost: start again, finished work is kept"):
             list(work)
     assert capfd.readouterr().err == ""
+
+
+def test_an_absent_scheduler_is_one_sentence(logs: Path, tmp_path: Path) -> None:
+    dask = pytest.importorskip("dask")
+    pytest.importorskip("distributed")
+    with dask.config.set({"distributed.comm.timeouts.connect": "200ms"}):
+        for address in ("127.0.0.1:1", "nowhere"):
+            done = CliRunner().invoke(
+                fleet.command, [str(logs), "--results", str(tmp_path / "results"), "--scheduler", address]
+            )
+            assert isinstance(done.exception, LogError)
+            assert str(done.exception).startswith(f"--scheduler {address}: ")
+            assert str(done.exception).endswith("leave it out for workers on this machine")
 
 
 def environment(name: str) -> str | None:

@@ -1,5 +1,6 @@
 """Simulated beacon measurements follow geometry and stated noise; outages remove the named source."""
 
+import gzip
 import math
 import pathlib
 
@@ -171,6 +172,16 @@ def test_both_beacon_list_formats_are_read(tmp_path: pathlib.Path) -> None:
     assert (ranging.number, ranging.azimuth, ranging.ranging) == (7, False, True)
 
 
+def test_beacon_list_may_have_a_byte_order_mark(tmp_path: pathlib.Path) -> None:
+    plain, packed = tmp_path / "beacons.csv", tmp_path / "beacons.csv.gz"
+    text = "id,lat_deg,lon_deg,alt_m\n1,45,-93,300\n".encode("utf-8-sig")
+    plain.write_bytes(text)
+    packed.write_bytes(gzip.compress(text))
+    for path in (plain, packed):
+        (beacon,) = simulated_rsbn.read_beacons(path)
+        assert beacon.number == 1
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [
@@ -179,11 +190,26 @@ def test_both_beacon_list_formats_are_read(tmp_path: pathlib.Path) -> None:
         ("id,lat_deg,lon_deg,alt_m\n", "contains no beacons"),
         (
             "id,lat_deg,lon_deg,alt_m\n1,45,-93,3\n1,95,-93,3\n",
-            "line 3 is not a valid beacon: 95.0 deg is outside",
+            "line 3 is not a valid beacon: lat_deg 95 is not within",
         ),
         ("id,lat_deg,lon_deg,alt_m\none,45,-93,3\n", "line 2 is not a valid beacon"),
         ("id,lat_deg,lon_deg,alt_m\n1,45\n", "line 2 is not a valid beacon"),
-        ("id,lat_deg,lon_deg,alt_m\n1,45,-93,nan\n", "line 2 is not a valid beacon: alt_m and range_m"),
+        ("id,lat_deg,lon_deg,alt_m\n1,45,-93,nan\n", "line 2 is not a valid beacon: alt_m nan is not within"),
+        ("id,lat_deg,lon_deg,alt_m\n1,45,-93,\n", "line 2 is not a valid beacon: alt_m is empty"),
+        ("id,lat_deg,lon_deg,alt_m\n1,45,-93,x\n", "line 2 is not a valid beacon: alt_m 'x' is not a number"),
+        (
+            "id,lat_deg,lon_deg,alt_m\n1,45,-93,2e5\n",
+            "line 2 .*: alt_m 200000 is not within",
+        ),
+        (
+            "id,lat_deg,lon_deg,alt_m\n-1,45,-93,3\n",
+            "line 2 .*: id '-1' is not an integer",
+        ),
+        ("id,lat_deg,lon_deg,alt_m\n65536,45,-93,3\n", "line 2 .* from 0 to 65535"),
+        ("id,lat_deg,lon_deg,alt_m\n1,45,-93,3\n1,46,-93,3\n", "line 3 .*: id 1 is given twice"),
+        ("id,lat_deg,lon_deg,alt_m,range_m\n1,45,-93,3,inf\n", "line 2 .*: range_m inf is not finite"),
+        ("id,lat_deg,lon_deg,alt_m,range_m\n1,45,-93,3,0\n", "line 2 .*: range_m 0 is not above 0"),
+        ("id;lat_deg;lon_deg;alt_m\n1;45;-93;3\n", "columns .* separated by commas"),
     ],
 )
 def test_invalid_beacon_list_is_reported_in_one_sentence(

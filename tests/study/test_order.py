@@ -45,6 +45,15 @@ def test_samples_from_a_file(tmp_path):
     assert row["rms_error"] is None
 
 
+def test_column_names_are_reported(tmp_path):
+    file = tmp_path / "samples.csv"
+    file.write_text("t,z\n1,2\n")
+    result = run(file)
+    assert result.exit_code == 2
+    assert "without a line of column names" in " ".join(result.output.split())
+    assert "without a line of column names" in " ".join(run("--help").output.split())
+
+
 def test_plot(tmp_path):
     pytest.importorskip("matplotlib")
     file = tmp_path / "order.png"
@@ -61,7 +70,7 @@ def test_number_of_samples_is_checked():
 @pytest.mark.parametrize(
     ("text", "options", "message"),
     [
-        ("t,z\n1,2\n", (), "is not a table of numbers"),
+        ("t,z\n1,2\n", (), "give rows of numbers t,z or t,z,sigma"),
         ("1,2,3,4\n", (), "has 4 columns"),
         ("1,2\n0,3\n4,5\n", ("--r-max", 2), "the times are not increasing"),
         ("0,2\n1,3\n", (), "r_max is 12 for 2 samples"),
