@@ -216,7 +216,12 @@ def _choices(kind: Any) -> tuple[str, ...]:
 def _or_number(kind: Any) -> str:
     """Return what a key accepts besides texts."""
     limits = [get_args(one)[1] for one in get_args(kind) if get_origin(one) is Annotated]
-    return "".join(f", nor a number from {limit.ge:g} to {limit.le:g}" for limit in limits)
+    return "".join(f", nor a number {_interval(limit)}" for limit in limits)
+
+
+def _interval(limit: msgspec.Meta) -> str:
+    """Return the limits of a number in words; some have no upper one."""
+    return f"of at least {limit.ge:g}" if limit.le is None else f"from {limit.ge:g} to {limit.le:g}"
 
 
 def _wanted(kind: Any, value: Any) -> str:
@@ -227,8 +232,10 @@ def _wanted(kind: Any, value: Any) -> str:
         return ""
     base, limit = get_args(kind)
     number = "a whole number" if base is int else "a number"
-    quotes = ", without quotes" if isinstance(value, str) else ""
-    return f"give {number} from {limit.ge:g} to {limit.le:g}{quotes}"
+    without = ", without quotes" if isinstance(value, str) else ""
+    if base is int and isinstance(value, float) and value.is_integer():
+        without = ", without point or exponent"
+    return f"give {number} {_interval(limit)}{without}"
 
 
 def _convert(tree: Mapping[str, Mapping[str, Any]], origin: Mapping[tuple[str, str], str]) -> Config:

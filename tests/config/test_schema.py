@@ -51,6 +51,12 @@ def test_flags_override_environment_overrides_file(tmp_path: Path) -> None:
         ("[output]\nvia = 3", "output.via: 3 is not one of auto, "),
         ("[inertial]\nsource = 'ins'", "'ins' is not one of auto, local_position, air_data, imu"),
         ("[estimator]\nscheme = 1.5", "1.5 is not one of feedforward, feedback, nor a number from 0 to 1"),
+        (
+            "[log]\nmaximum_files = 1e3",
+            "maximum_files = 1000.0 is invalid: give a whole number of at least 1, without point or exponent",
+        ),
+        ("[log]\nmaximum_files = 0", "log.maximum_files = 0 is invalid: give a whole number of at least 1"),
+        ("[log]\nminimum_free_mib = 1.5", "give a whole number of at least 0"),
         ("[link]\nconnect = 3", "link.connect = [3] is invalid: expected str, got int"),
         ("[estimator]\nparallel = 'minmax_filter'", "is not one of minimax_filter, restrictive"),
         ("link = 3", "`link` is a section: write [link] and its keys below it"),
@@ -82,6 +88,16 @@ def test_endless_file_is_rejected() -> None:
 def test_scheme_is_a_word_or_a_share(tmp_path: Path, scheme: object, share: float) -> None:
     path = written(tmp_path, f"[inertial]\nsource = 'air_data'\n[estimator]\nscheme = {scheme!r}")
     assert load(path, environment={}).estimator.feedback == share
+
+
+def test_number_without_an_upper_limit_is_reported_from_every_source() -> None:
+    for sources in (
+        {"pairs": ["log.maximum_files=100.0"], "environment": {}},
+        {"environment": {"COMPANION_LOG__MAXIMUM_FILES": "1e3"}},
+        {"flags": {"log.minimum_free_mib": 2.5}, "environment": {}},
+    ):
+        with pytest.raises(ConfigError, match="give a whole number of at least"):
+            load(**sources)
 
 
 def test_mistake_in_the_environment_names_the_variable() -> None:
