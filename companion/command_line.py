@@ -34,7 +34,7 @@ COMMANDS = {
     "log": "companion.analysis.log_command:group",
     "doctor": "companion.doctor.command:command",
     "signing": "companion.doctor.signing_command:group",
-    "check-config": "companion.config.check_config:command",
+    "check-config": "companion.runtime.check_config:command",
     "bench": "companion.bench.command:command",
 }
 STUDIES = {

@@ -5,7 +5,6 @@ load        file, environment and command line merged; `ConfigError` for every m
 validate    combinations of keys that are invalid
 profiles    table of output profiles: messages, rates and autopilot parameters per make of autopilot
 required_parameters     autopilot parameters that a configuration requires
-check_config            the command `companion check-config`
 """
 
 from companion.config.load import PREFIX, ConfigError, load, parse, to_toml

@@ -37,6 +37,7 @@ from companion.runtime.core import CompanionCore, Link
 from companion.runtime.daemon_thread import run_in_daemon_thread
 from companion.runtime.exposure import exposure
 from companion.runtime.kept_parameters import KeptParameters
+from companion.runtime.link_addresses import check_links
 from companion.runtime.signing_key import SigningKey
 from companion.runtime.state_file import StateFile
 from companion.runtime.status import Status
@@ -358,11 +359,7 @@ def command(
 
     def load_with(tuned: Path | None) -> Config:
         config = load(file, flags, pairs=pairs, tuned=tuned, preset=preset)
-        try:
-            for text in config.link.connect:
-                Address.parse(text)
-        except ValueError as error:
-            raise ConfigError(f"link.connect: {error}") from None
+        check_links(config)
         return config
 
     base = config = load_with(None)

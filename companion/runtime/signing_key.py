@@ -41,6 +41,19 @@ def synchronized_time(platform: str = sys.platform, synchronized: str = SYNCHRON
     return unix_ns if synchronized_now else None
 
 
+def read_configured_key(config: Config) -> bytes | None:
+    """Read the key of `signing.key_file`; None without one. Raises ConfigError for an unusable file."""
+    if not config.signing.key_file:
+        return None
+    path = Path(config.signing.key_file)
+    try:
+        if os.path.exists(path) and not os.path.isfile(path):  # a pipe would keep the reader waiting
+            raise ValueError(f"{path} is not a regular file; make one: companion signing init")
+        return read_key(path)
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"signing.key_file: {error}") from None
+
+
 class SigningKey:
     """MAVLink 2 signing with its key and the timestamp that outlives a restart."""
 
@@ -55,12 +68,12 @@ class SigningKey:
     def from_config(cls, config: Config) -> Self | None:
         """Create from the configuration; None without a key. Raises ConfigError for an unusable key."""
         settings = config.signing
-        if not settings.key_file:
+        if (key := read_configured_key(config)) is None:
             return None
         stamp = Path(settings.stamp_file)
         try:
             signing = Signing(
-                read_key(Path(settings.key_file)),
+                key,
                 timestamp=load_timestamp(stamp),
                 refuse_unsigned=settings.refuse_unsigned,
                 always_accepted=settings.always_accepted,

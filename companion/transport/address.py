@@ -9,9 +9,11 @@ import termios
 from typing import NamedTuple
 
 FORMS = "serial:DEVICE:BAUD, udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or tcpin:HOST:PORT"
-#: Baud rates of this system: termios constant by number.
+#: Baud rates of this system: termios constant by number. B0 is none: it hangs up.
 BAUD_RATES = {
-    int(name[1:]): value for name, value in vars(termios).items() if name[0] == "B" and name[1:].isdigit()
+    int(name[1:]): value
+    for name, value in vars(termios).items()
+    if name[0] == "B" and name[1:].isdigit() and name != "B0"
 }
 LOOPBACK = "127.0.0.1"
 LISTENING = ("udpin", "tcpin")

@@ -38,6 +38,8 @@ def test_invalid_ports_and_baud_rates_are_reported() -> None:
         Address.parse("tcp:host:70000")
     with pytest.raises(ValueError, match="57601 is not a baud rate"):
         Address.parse("serial:/dev/ttyS0:57601")
+    with pytest.raises(ValueError, match=": 0 is not a baud rate"):
+        Address.parse("serial:/dev/ttyS0:0")
     with pytest.raises(ValueError, match="'abc' is not a baud rate"):
         Address.parse("serial:/dev/ttyS0:abc")
 

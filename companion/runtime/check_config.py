@@ -7,9 +7,12 @@ from pathlib import Path
 import click
 import msgspec
 
-from companion.config import load, to_toml
+from companion.config import ConfigError, load, to_toml
 from companion.config.options import override_options
 from companion.config.reference import commented_toml
+from companion.printable import printable
+from companion.runtime.link_addresses import check_links
+from companion.runtime.signing_key import read_configured_key
 
 
 @click.command("check-config")
@@ -24,6 +27,7 @@ def command(
 
     Reads FILE, the COMPANION_SECTION__KEY variables and --set, and prints the configuration in force.
     An unknown key or an invalid value is reported with the nearest valid one; the exit code is then 78.
+    A signing key that this computer cannot read is only a warning: it may be on another computer.
 
     \b
     A file to start from:
@@ -33,6 +37,11 @@ def command(
         config = load(environment={}, preset=preset, pairs=pairs)
     else:
         config = load(file, preset=preset, pairs=pairs)
+    check_links(config)
+    try:
+        read_configured_key(config)
+    except ConfigError as error:
+        click.echo(f"companion: warning: {printable(str(error))}", err=True)
     if as_json:
         click.echo(msgspec.json.encode(config).decode(), nl=False)
     else:
