@@ -19,7 +19,7 @@ import msgspec
 
 from companion.config.presets import PRESETS
 from companion.config.schema import Config
-from companion.config.validate import find_conflicts, find_idle
+from companion.config.validate import find_conflicts, find_mistakes
 
 #: Bytes of a file and dots in a line of it: a dotted key takes memory by the square of its parts (60 kB of
 #: them, 3.5 GB).
@@ -94,7 +94,7 @@ def load(
         tree.setdefault(section, {})[key] = _parse_value(text.strip())
         origin[section, key] = f"--set {pair}"
     config = _convert(tree, origin)
-    _refuse(find_idle(config), origin)
+    _refuse(find_mistakes(config), origin)
     return config
 
 

@@ -17,6 +17,10 @@ from companion.config.schema import Config
 MIN_RATE_HZ = 0.01
 #: Most bins of the predictor's window: a greater linear program delays the solutions.
 MAX_BINS = 600
+AUTOPILOT_COMPONENT = 1  # MAV_COMP_ID_AUTOPILOT1
+MAX_MESSAGE_ID = (1 << 24) - 1
+#: Keys that hold a path.
+PATHS = (("link", "parameters_file"), ("log", "folder"), ("signing", "key_file"), ("signing", "stamp_file"))
 
 
 def find_conflicts(config: Config) -> Iterator[tuple[str, str, str]]:
@@ -80,7 +84,7 @@ def find_conflicts(config: Config) -> Iterator[tuple[str, str, str]]:
             "needs airspeed: set inertial.source = 'air_data', or with an INS of its own "
             "inertial.correctors = ['airspeed']",
         )
-    yield from _too_slow_rates(config)
+    yield from _invalid_rates(config)
     bins = 60.0 * config.predictor.window_min / config.predictor.bin_s
     if bins > MAX_BINS:
         yield (
@@ -91,11 +95,46 @@ def find_conflicts(config: Config) -> Iterator[tuple[str, str, str]]:
         )
 
 
-def find_idle(config: Config) -> Iterator[tuple[str, str, str]]:
-    """Yield section, key and sentence, as `find_conflicts`, of what has no effect.
+def find_mistakes(config: Config) -> Iterator[tuple[str, str, str]]:
+    """Yield section, key and sentence, as `find_conflicts`, of what has no effect or cannot be meant.
 
     For a configuration that somebody writes now: an old log was flown with it, and can be replayed.
     """
+    link, ahead = config.link, config.predictor.ahead_min
+    if not link.connect:
+        yield (
+            "link",
+            "connect",
+            "link.connect = [] names no link: give one, for example udpin:127.0.0.1:14550",
+        )
+    if link.component_id == AUTOPILOT_COMPONENT:
+        yield (
+            "link",
+            "component_id",
+            "link.component_id = 1 is the component of the autopilot: give another, for example 191",
+        )
+    if list(ahead) != (ascending := sorted(set(ahead))):
+        yield (
+            "predictor",
+            "ahead_min",
+            f"predictor.ahead_min = {list(ahead)} is not in ascending order: write {ascending}",
+        )
+    if not config.log.folder.strip():
+        yield (
+            "log",
+            "folder",
+            f"log.folder = {config.log.folder!r} names no folder: give one, for example logs",
+        )
+    for section, key in PATHS:
+        if "\0" in (path := getattr(getattr(config, section), key)):
+            yield section, key, f"{section}.{key} = {path!r} has a null character: remove it"
+    for msgid in config.signing.always_accepted:
+        if not 0 <= msgid <= MAX_MESSAGE_ID:
+            yield (
+                "signing",
+                "always_accepted",
+                f"signing.always_accepted has {msgid}: give message ids from 0 to {MAX_MESSAGE_ID}",
+            )
     if config.inertial.correctors and not config.has_own_ins:
         yield (
             "inertial",
@@ -106,9 +145,19 @@ def find_idle(config: Config) -> Iterator[tuple[str, str, str]]:
         )
 
 
-def _too_slow_rates(config: Config) -> Iterator[tuple[str, str, str]]:
+def _invalid_rates(config: Config) -> Iterator[tuple[str, str, str]]:
     for section in ("rates", "output"):
         table = getattr(config, section)
         for key in table.__struct_fields__:
-            if key.endswith("_hz") and 0.0 < (hz := getattr(table, key)) < MIN_RATE_HZ:
+            if not key.endswith("_hz"):
+                continue
+            hz = getattr(table, key)
+            if 0.0 < hz < MIN_RATE_HZ:
                 yield section, key, f"{section}.{key} = {hz:g}: set 0, or at least {MIN_RATE_HZ:g} Hz"
+            elif -1.0 < hz < 0.0:
+                yield (
+                    section,
+                    key,
+                    f"{section}.{key} = {hz:g}: set -1 (the profile's rate), 0 (never), or at least "
+                    f"{MIN_RATE_HZ:g} Hz",
+                )

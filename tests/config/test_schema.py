@@ -149,6 +149,11 @@ def test_correctors_are_taken_with_an_ins_of_its_own_or_from_a_log() -> None:
     assert parse("[inertial]\ncorrectors = ['stars']", "a log").inertial.correctors == ("stars",)
 
 
+def test_no_prediction_ahead_and_the_ends_of_the_message_ids_are_accepted() -> None:
+    pairs = ["predictor.ahead_min=[]", "signing.always_accepted=[0,16777215]", "output.odometry_hz=-1"]
+    assert load(pairs=pairs, environment={}).predictor.ahead_min == ()
+
+
 @pytest.mark.parametrize(
     ("pairs", "expected"),
     [
@@ -178,6 +183,18 @@ def test_correctors_are_taken_with_an_ins_of_its_own_or_from_a_log() -> None:
             ["inertial.correctors=stars", "inertial.independent=true", "inertial.source=imu"],
             "and inertial.source = 'auto', or inertial.correctors = []",
         ),
+        (["link.connect=[]"], "link.connect = [] names no link: give one, for example udpin:127.0.0.1:14550"),
+        (["link.component_id=1"], "link.component_id = 1 is the component of the autopilot: give another"),
+        (["output.odometry_hz=-0.5"], "odometry_hz = -0.5: set -1 (the profile's rate), 0 (never), or at "),
+        (
+            ["predictor.ahead_min=[5,1,5]"],
+            "ahead_min = [5.0, 1.0, 5.0] is not in ascending order: write [1.0, 5",
+        ),
+        (["signing.always_accepted=[109,-1]"], "always_accepted has -1: give message ids from 0 to 16777215"),
+        (["signing.always_accepted=16777216"], "always_accepted has 16777216: give message ids from 0 to"),
+        (['log.folder=""'], "log.folder = '' names no folder: give one, for example logs"),
+        (['log.folder="a\\u0000"'], "log.folder = 'a\\x00' has a null character: remove it"),
+        (['signing.stamp_file="\\u0000"'], "signing.stamp_file = '\\x00' has a null character"),
     ],
 )
 def test_invalid_combination_is_reported_in_one_sentence(pairs: list[str], expected: str) -> None:
