@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import difflib
 import os
+import stat
 import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -131,8 +132,10 @@ def _preset(name: str | None) -> Mapping[str, Any]:
 
 def _read(path: Path) -> dict[str, dict[str, Any]]:
     try:
-        with path.open(encoding="utf-8") as file:
-            text = file.read(MAX_SIZE + 1)  # a device may be endless
+        if not stat.S_ISREG(path.stat().st_mode) and not path.is_dir():
+            raise ConfigError(f"{path} is not a regular file; give the TOML file")  # a pipe may never end
+        with path.open(encoding="utf-8-sig") as file:  # some editors begin a file with a byte order mark
+            text = file.read(MAX_SIZE + 1)
         size = max(path.stat().st_size, len(text))
     except FileNotFoundError:
         raise ConfigError(f"{path}: no such file; start from `companion check-config --defaults`") from None
@@ -158,9 +161,12 @@ def _tree(text: str, where: str) -> dict[str, dict[str, Any]]:
     except (ValueError, RecursionError) as error:  # an integer of thousands of digits is no TOMLDecodeError
         raise ConfigError(f"{where}: not valid TOML: {error}") from None
     for section, table in tree.items():
-        if not isinstance(table, dict) and section in Config.__struct_fields__:
+        if isinstance(table, dict):
+            continue
+        if section in Config.__struct_fields__:
             raise ConfigError(f"{where}: `{section}` is a section: write [{section}] and its keys below it")
-    return {name: table if isinstance(table, dict) else {"": table} for name, table in tree.items()}
+        raise ConfigError(f"{where}: the key `{section}` is in no section{_sections_of(section)}")
+    return tree
 
 
 def _check_size(size: int, where: str) -> None:
@@ -182,6 +188,14 @@ def _check_keys(tree: Mapping[str, Mapping[str, Any]], where: str) -> None:
 def _nearest(name: str, known: tuple[str, ...]) -> str:
     close = difflib.get_close_matches(name, known, 1, 0.4)
     return f"; did you mean `{close[0]}`?" if close else f"; it has {', '.join(known)}"
+
+
+def _sections_of(key: str) -> str:
+    """Return the advice for a key without its section: every section that has it, or the nearest key."""
+    tables = {name: type(getattr(Config(), name)).__struct_fields__ for name in Config.__struct_fields__}
+    close = difflib.get_close_matches(key, sorted({name for names in tables.values() for name in names}), 1)
+    found = [f"`{section}.{name}`" for name in close for section in tables if name in tables[section]]
+    return f"; did you mean {' or '.join(found)}?" if found else f"; the sections are {', '.join(tables)}"
 
 
 def _nearest_variable(name: str) -> str:

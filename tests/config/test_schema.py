@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
@@ -11,7 +12,7 @@ from companion.config import Config, ConfigError, load, parse, to_toml
 
 def written(tmp_path: Path, text: str) -> Path:
     path = tmp_path / "companion.toml"
-    path.write_text(text)
+    path.write_text(text, encoding="utf-8")
     return path
 
 
@@ -60,6 +61,10 @@ def test_flags_override_environment_overrides_file(tmp_path: Path) -> None:
         ("[link]\nconnect = 3", "link.connect = [3] is invalid: expected str, got int"),
         ("[estimator]\nparallel = 'minmax_filter'", "is not one of minimax_filter, restrictive"),
         ("link = 3", "`link` is a section: write [link] and its keys below it"),
+        ("sigma_m = 2", "the key `sigma_m` is in no section; did you mean `gnss.sigma_m`?"),
+        ("timeout_s = 2", "no section; did you mean `gnss.timeout_s` or `rsbn.timeout_s`?"),
+        ("maximum_file = 2", "no section; did you mean `log.maximum_files`?"),
+        ("xyzzy = 2", "the key `xyzzy` is in no section; the sections are link, rates, "),
         ("x = [", "not valid TOML"),
         ("#" * 65_536 + "\n", "65537 bytes, but a configuration has at most 65536"),
         ("\ngnss" + 1001 * ".a" + " = 1", "line 2 has 1001 dots, at most 1000 are allowed"),
@@ -79,9 +84,17 @@ def test_folder_in_place_of_the_file_is_reported(tmp_path: Path) -> None:
         load(tmp_path, environment={})
 
 
-def test_endless_file_is_rejected() -> None:
-    with pytest.raises(ConfigError, match="at most 65536"):
-        load(Path("/dev/zero"), environment={})
+def test_pipe_and_endless_file_are_rejected(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    for path in (tmp_path / "pipe", Path("/dev/zero")):
+        with pytest.raises(ConfigError, match=f"^{path} is not a regular file; give the TOML file$"):
+            load(path, environment={})
+
+
+def test_file_with_a_byte_order_mark_is_read(tmp_path: Path) -> None:
+    path = written(tmp_path, "\ufeff[gnss]\nsigma_m = 4.0\n")
+    assert path.read_bytes().startswith(b"\xef\xbb\xbf")
+    assert load(path, environment={}).gnss.sigma_m == 4.0
 
 
 @pytest.mark.parametrize(("scheme", "share"), [("feedforward", 0.0), (0.3, 0.3), ("feedback", 1.0)])
