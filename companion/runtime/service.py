@@ -252,11 +252,15 @@ async def run(
     notes: Iterable[str] = (),
     on_status: Callable[[Status, int], None] = ignore_status,
 ) -> None:
-    """Open the log, report `notes`, serve until SIGINT or SIGTERM, close the log. Others: see `Service`."""
+    """Open the log, report `notes`, serve until SIGINT, SIGTERM or SIGHUP, close the log.
+
+    The other parameters are those of `Service`.
+    """
     start_ns, start_unix_ns = time.monotonic_ns(), time.time_ns()
     loop, stopped = asyncio.get_running_loop(), asyncio.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        loop.add_signal_handler(number, stopped.set)
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:  # nohup ignores it
+            loop.add_signal_handler(number, stopped.set)
     settings, deleted = config.log, deque[Path]()
     log = create_log(
         settings.folder,
@@ -349,7 +353,7 @@ def command(
 ) -> None:
     """Navigate, send the autopilot corrected positions, and log.
 
-    Runs until SIGINT (Ctrl-C) or SIGTERM. Prints what it waits for and which inputs are missing.
+    Runs until SIGINT (Ctrl-C), SIGTERM or SIGHUP. Prints what it waits for and which inputs are missing.
 
     Links are serial:DEVICE:BAUD, udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT and tcpin:HOST:PORT. Exit
     codes: 0 stopped, 69 an address to listen on is in use or forbidden at the start, 73 no log can be created

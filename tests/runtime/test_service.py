@@ -204,7 +204,7 @@ ENVIRONMENT = {name: value for name, value in os.environ.items() if not name.sta
 RUN = [sys.executable, "-m", "companion", "run"]
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
 def test_signal_closes_the_log(tmp_path: Path, number: signal.Signals) -> None:
     port, logs, output = free_port(), tmp_path / "logs", tmp_path / "stderr"
     command = [*RUN, "--connect", f"udpin:{LOOPBACK}:{port}", "--logs", str(logs)]
@@ -227,6 +227,19 @@ def test_signal_closes_the_log(tmp_path: Path, number: signal.Signals) -> None:
     info = flight_log.info(log)
     assert info.closed and info.counts["/link/Event"] >= 2
     assert any(isinstance(e.value, Event) and "connected" in e.value.text for e in flight_log.read(log))
+
+
+def test_nohup_keeps_the_service_running(tmp_path: Path) -> None:
+    command = ["nohup", *RUN, "--connect", f"udpin:{LOOPBACK}:{free_port()}", "--logs", str(tmp_path)]
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, env=ENVIRONMENT) as run:
+        assert run.stderr is not None
+        while b"listening" not in run.stderr.readline():
+            assert run.poll() is None
+        run.send_signal(signal.SIGHUP)
+        with pytest.raises(subprocess.TimeoutExpired):
+            run.wait(1.0)
+        run.send_signal(signal.SIGTERM)
+        assert run.wait(20) == 0
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="a pipe's size is set and asked for as on Linux")
