@@ -298,9 +298,8 @@ class Propagator:
         gust = nose_covariance(i.V, s.gust_m_s, s.gust_m_s / ALONG)
         both = gust * (-lasting * math.expm1(-T / lasting))  # integral of the gust times the gust at the end
         crab = self._density[:, CRAB] * T
-        Q += (
-            T * s.wind_change_m_s_sqrt_s**2 + i.shear
-        ) * self._wind_seen  # wind and crab that come up within the interval: the velocity follows
+        # wind and crab that come up within the interval: the velocity follows
+        Q += (T * s.wind_change_m_s_sqrt_s**2 + i.shear) * self._wind_seen
         Q[:, 0:2, 0:2] += (2.0 * lasting * T) * gust
         Q[:, 0:2, 2:4] += both
         Q[:, 2:4, 0:2] += both
