@@ -258,7 +258,7 @@ def test_every_flight_has_its_own_chapters(tmp_path, monkeypatch):
     """Files of figures are named only: that they are drawn is another test."""
     pytest.importorskip("jinja2")
     sheet = pytest.importorskip("matplotlib.figure").Figure
-    monkeypatch.setattr(sheet, "savefig", lambda self, path: path.touch())
+    monkeypatch.setattr(sheet, "savefig", lambda self, file, format: None)
     log, out = tmp_path / "two.mcap", tmp_path / "r.html"
     with flight_log.Writer(
         log, metadata=run_metadata(Config()), start_unix_ns=1_700_000_000 * S, start_ns=START, block=True

@@ -208,11 +208,13 @@ RUN = [sys.executable, "-m", "companion", "run"]
 def test_signal_closes_the_log(tmp_path: Path, number: signal.Signals) -> None:
     port, logs, output = free_port(), tmp_path / "logs", tmp_path / "stderr"
     command = [*RUN, "--connect", f"udpin:{LOOPBACK}:{port}", "--logs", str(logs)]
+    before = signal.signal(number, signal.SIG_DFL)  # a process inherits what is ignored, as by nohup
     with (
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock,
         output.open("w") as stderr,
         subprocess.Popen(command, stderr=stderr, env=ENVIRONMENT) as process,
     ):
+        signal.signal(number, before)
         sock.connect((LOOPBACK, port))
         deadline = time.monotonic() + 30.0
         while "connected" not in output.read_text() and time.monotonic() < deadline:
