@@ -129,7 +129,8 @@ def rsbn(state: State, record: RsbnFix, settings: Settings) -> Step:
     state = propagated(carried(state, record.t_ns, settings), settings)
     before = state
     state, k, out = _beacon(state, record, settings)
-    is_followed, nominal = len(state.beacons) == len(before.beacons), state.nominal
+    is_followed = any(beacon.identity == record.beacon for beacon in before.beacons)
+    nominal = state.nominal
     assert nominal is not None
     assert state.bank is not None
     point, centre = corrected(nominal.point, state, settings)

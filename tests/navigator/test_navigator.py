@@ -648,6 +648,20 @@ def test_each_change_of_belief_is_reported_once_beside_late_answers(late_s: floa
         assert words[-1] == {0: "used again", SUSPECT: "suspect", EXCLUDED: "excluded"}[number]
 
 
+def test_an_answer_that_fits_nothing_displaces_no_beacon() -> None:
+    """Eight are followed; the ninth is stated 900 km off."""
+    navigator, answers = Navigator(CONFIG), 0
+    navigator.handle(origin())
+    for record in (record for moment in flight(24, 24.0, 24.0) for record in moment.records):
+        if isinstance(record, RsbnFix):
+            number, answers = min(answers, 8), answers + 1
+            lat = record.lat + (0.15 if number == 8 else 0.0)
+            record = structs.replace(record, beacon=10 + number, lat=lat)
+        navigator.handle(record)
+    assert answers > 9
+    assert {beacon.identity for beacon in navigator.state.beacons} == set(range(10, 18))
+
+
 def test_a_repeated_fix_teaches_once() -> None:
     moments = flight(30, 30.0, 0.0)
     once = [o for _, outs in flown(moments) for o in outs]
