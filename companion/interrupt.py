@@ -68,7 +68,17 @@ def held() -> Iterator[None]:
 
     resource_tracker.ensure_running()  # its own start would let the signal through again
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    # a thread of before, as those of linear algebra, can receive it still, and Python then handles it here
+    received: list[int] = []
+    former = signal.getsignal(signal.SIGINT)
+    is_handled = callable(former) and threading.current_thread() is threading.main_thread()
+    if is_handled:
+        signal.signal(signal.SIGINT, lambda number, frame: received.append(number))
     try:
         yield
     finally:
+        if is_handled:
+            signal.signal(signal.SIGINT, former)
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        for number in received[:1]:
+            signal.raise_signal(number)

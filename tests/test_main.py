@@ -237,6 +237,28 @@ if __name__ == "__main__":
     assert (done.returncode, done.stdout, done.stderr) == (0, "interrupted\n", "")
 
 
+@pytest.mark.parametrize("with_thread", [False, True])
+def test_interrupt_is_held_until_the_end_of_the_block(with_thread: bool) -> None:
+    """Also where another thread than the main one may receive the signal."""
+    code = f"""
+import os, signal, threading, time
+from companion import interrupt
+
+signal.signal(signal.SIGINT, signal.default_int_handler)
+if {with_thread}:
+    threading.Thread(target=time.sleep, args=(5,), daemon=True).start()
+try:
+    with interrupt.held():
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(0.2)
+        print("whole")
+except KeyboardInterrupt:
+    print("interrupted")
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "whole\ninterrupted\n", "")
+
+
 FLIGHT = """
 from companion.bench.live import STREAMS, fly
 from companion.config import load
