@@ -6,8 +6,9 @@
 Simulated flights with a healthy GNSS and one thing wrong, on every inertial channel that it concerns; then
 the recordings, where they are there (`sitl.harm_recordings`). A flight passes if GNSS is never excluded, EKF
 source set 2 is never requested, and the corrected error is at no time more than 1.2 times as far off as GNSS
-itself, r.m.s. over 10 s, plus 3 m. Stalls and reboots are flown over the
-simulated link, all others record by record.
+itself, r.m.s. over 10 s, plus 3 m. Where no fix has come for 3 s GNSS has no error, and nothing is compared:
+in a reboot of the autopilot, until its first fix. Stalls and reboots are flown over the simulated link, all
+others record by record.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ from companion.config import Config, InertialConfig, OutputConfig
 from companion.nav.geometry import displace
 from companion.navigator import Navigator
 from companion.option_types import FloatRange
-from companion.output.source_switch import SourceSwitch
+from companion.output.source_switch import SILENT_S, SourceSwitch
 from companion.records import Event, Gnss, RsbnFix, Solution, Stamped
 from companion.runtime.core import CompanionCore
 from companion.tables import print_tables
@@ -200,7 +201,7 @@ def fly(order: HarmOrder) -> HarmResult:
     try:
         with threadpool_limits(1):
             flown = _fly_link if WRONG[order.wrong].over_link else _fly_records
-            world, solutions, events, set_2 = flown(scenario_of(order), order)
+            world, solutions, events, set_2, t_fix = flown(scenario_of(order), order)
         excluded = any(event.text.startswith(_EXCLUDED) for event in events)
         fixes = [r for r in world.streams[Gnss] if isinstance(r, Gnss) and r.has_3d_fix]
         ours, its = world.horizontal_errors(solutions), world.horizontal_errors(fixes)
@@ -209,15 +210,16 @@ def fly(order: HarmOrder) -> HarmResult:
             *order[:3],
             excluded,
             set_2,
-            ratio=worst_ratio(*_from(0.0, ours, its)),
-            since=worst_ratio(*_from(START_S, ours, its)),
+            ratio=worst_ratio(*_from(0.0, *beside_fixes(*ours, t_fix), *its)),
+            since=worst_ratio(*_from(START_S, *beside_fixes(*ours, t_fix), *its)),
             suspected=tuple(suspected),
         )
     except Exception as error:  # the study goes on and lists it
         return HarmResult(*order[:3], False, False, None, raised=f"{type(error).__name__}: {error}")
 
 
-_Flown = tuple[World, list[Solution], list[Event], bool]
+#: world, solutions, events, whether source set 2 was requested, times of the fixes that arrived (s)
+_Flown = tuple[World, list[Solution], list[Event], bool, Floats]
 
 
 def _fly_records(scenario: Scenario, order: HarmOrder) -> _Flown:
@@ -240,7 +242,11 @@ def _fly_records(scenario: Scenario, order: HarmOrder) -> _Flown:
         if record.rx_ns >= next_ns:
             next_ns = record.rx_ns + SECOND_NS
             set_2 = bool(set_2_requests(switch, record.rx_ns)) or set_2
-    return world, solutions, events, set_2
+    return world, solutions, events, set_2, _fix_times(world.streams[Gnss])
+
+
+def _fix_times(records: Iterable[Stamped]) -> Floats:
+    return np.array([r.t_ns * 1e-9 for r in records if isinstance(r, Gnss) and r.has_3d_fix])
 
 
 def noisier(record: Stamped, rng: np.random.Generator) -> Stamped:
@@ -268,14 +274,23 @@ def _fly_link(scenario: Scenario, order: HarmOrder) -> _Flown:
     loopback.fly_connected(autopilot, core, start, stalls=((begin, begin + stall_ns),) if stall_ns else ())
     solutions = [replace(r, t_ns=r.t_ns - start) for r in log.records if isinstance(r, Solution)]
     events = [r for r in log.records if isinstance(r, Event)]
-    return autopilot.world, solutions, events, any(_SET_2 in event.text for event in events)
+    t_fix = _fix_times(log.records) - start * 1e-9
+    return autopilot.world, solutions, events, any(_SET_2 in event.text for event in events), t_fix
 
 
-def _from(start_s: float, ours: tuple[Floats, Floats], its: tuple[Floats, Floats]) -> tuple[Floats, ...]:
-    """Cut both series to the time from `start_s` on and after the first fix: GNSS has no error before it."""
-    (t, error), (t_gnss, error_gnss) = ours, its
-    first = float(t_gnss[0]) if len(t_gnss) else math.inf
-    now, its_now = (t >= start_s) & (t > first), t_gnss >= start_s
+def beside_fixes(t: Floats, error: Floats, t_fix: Floats) -> tuple[Floats, Floats]:
+    """Leave out the errors of times after which no fix is there: none came yet, or in the last `SILENT_S`.
+
+    Parameters: times (n,) s, errors (n,) m, and times (m,) s of the fixes that arrived.
+    """
+    last = np.concatenate(([-math.inf], np.sort(t_fix)))[np.searchsorted(np.sort(t_fix), t, side="right")]
+    there = t - last <= SILENT_S
+    return t[there], error[there]
+
+
+def _from(start_s: float, t: Floats, error: Floats, t_gnss: Floats, error_gnss: Floats) -> tuple[Floats, ...]:
+    """Cut both series to the time from `start_s` on."""
+    now, its_now = t >= start_s, t_gnss >= start_s
     return t[now], error[now], t_gnss[its_now], error_gnss[its_now]
 
 

@@ -11,7 +11,17 @@ from click.testing import CliRunner
 from companion.records import Event, GlobalPosition, Gnss, Rejection, Solution
 from sitl import harm_study
 from sitl.harm_recordings import LOGS, RecordingLog, Track, judge_recording, longest_refusal
-from sitl.harm_study import CHANNELS, WRONG, HarmOrder, HarmResult, config_of, fly, scenario_of, worst_ratio
+from sitl.harm_study import (
+    CHANNELS,
+    WRONG,
+    HarmOrder,
+    HarmResult,
+    beside_fixes,
+    config_of,
+    fly,
+    scenario_of,
+    worst_ratio,
+)
 
 S = 1_000_000_000
 
@@ -37,6 +47,14 @@ def test_ratio_is_that_of_the_worst_ten_seconds_less_three_metres():
     error = np.where((t >= 30.0) & (t < 40.0), 9.0, 1.0)
     assert worst_ratio(t, error, t, gnss) == pytest.approx(3.0)
     assert worst_ratio(t[:0], error[:0], t, gnss) is None
+
+
+def test_nothing_is_compared_where_no_fix_is_there():
+    """Before the first fix, and from three silent seconds on until the next."""
+    t = np.arange(0.0, 20.0, 0.5)
+    left, _ = beside_fixes(t, t, np.array([2.0, 3.0, 14.0, 15.0]))
+    assert list(left) == [*np.arange(2.0, 6.5, 0.5), *np.arange(14.0, 18.5, 0.5)]
+    assert [len(x) for x in beside_fixes(t, t, np.array([]))] == [0, 0]
 
 
 def test_a_flight_passes_only_without_exclusion_set_2_or_exception():
