@@ -58,17 +58,16 @@ def gnss(state: State, record: Gnss, settings: Settings) -> Step:
     apart = measurements.gnss_apart(record, nominal.point)
     still = (apart[0] + state.moved[0], apart[1] + state.moved[1])  # as if the nominal had never jumped
     state, factor = _scattered(state, record, "gnss", still, variance)
-    assert state.bank is not None
-    state, v_n = _latency_velocity(state, record.t_ns)
-    assert state.bank is not None
-    taken = measurements.gnss_position(state.bank, known, channel, apart, factor * variance, v_n)
-    bank, velocity = taken.bank, None
-    if config.use_velocity and record.v_n is not None:
+    bank, velocity = state.bank, None
+    assert bank is not None
+    if config.use_velocity and record.v_n is not None:  # first: the position needs it
         sigma = fix_observations.velocity_sigma(record, first_ns, config)
         noise = factor * (sigma**2 + channel.velocity_noise**2)
         velocity = measurements.gnss_velocity(bank, known, channel, record, nominal.point, nominal.a_n, noise)
         bank = velocity.bank
-    state = state._replace(bank=bank, gnss_taken=record, fixed=True)
+    state, v_n = _latency_velocity(state._replace(bank=bank), record.t_ns)
+    taken = measurements.gnss_position(bank, known, channel, apart, factor * variance, v_n)
+    state = state._replace(bank=taken.bank, gnss_taken=record, fixed=True)
     state, out = decided(state, record, settings), list[Output]()
     label = f"gnss {record.receiver}"
     if velocity is not None and (state.reported[VELOCITY] == EXCLUDED or not velocity.accepted):
@@ -92,7 +91,9 @@ def _latency_velocity(state: State, t_ns: int) -> tuple[State, Vector2]:
 
     The noise of the estimated velocity is also in the estimated position: as a coefficient it made straight
     flight seem to measure the latency, as 0.08 s after ten minutes where it was 0. By IMU the nominal
-    velocity is taken less a slow mean of its estimated error; a held velocity is far off in every turn.
+    velocity is taken less a slow mean of its estimated error; a held velocity is far off in every turn. After
+    a silence the velocity must be that of the fix: 5 m/s off in the first of two positions, they seemed to
+    measure a latency of 0.13 s.
     """
     v_n = estimated_velocity(state)
     if not is_driven_by_imu(state):

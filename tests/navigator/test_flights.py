@@ -11,8 +11,10 @@ import pytest
 from msgspec.structs import replace
 
 from companion.config import Config, load
+from companion.estimate.bank import Bank
 from companion.navigator import Navigator
 from companion.navigator.changes import FALSE_AIRSPEED, USE_AIRSPEED
+from companion.navigator.own_error_model import LATENCY
 from companion.records import (
     PARALLEL,
     AirData,
@@ -285,6 +287,34 @@ def test_a_local_position_that_drifts_ever_faster_is_not_believed_against_gnss()
     assert (flown.of("sources", 30.0) & Source.GNSS).all()
     assert flown.of("gnss_false", 30.0).max() < 0.1
     assert flown.error[flown.t > SETTLED_S].max() < 10.0
+
+
+@pytest.mark.parametrize("seed", [1, 3])
+def test_straight_flight_after_a_silence_does_not_measure_the_latency_of_gnss(seed: int) -> None:
+    """As when the autopilot reboots: the beacon comes first, with the velocity of before, the IMU last."""
+    first = {RsbnFix: 68.0, Gnss: 68.15, Imu: 68.5, AirData: 68.5}
+    navigator, sigma = Navigator(OWN), dict[str, float]()
+    scenario = Scenario(
+        "straight",
+        FlightPlan((Leg(100, 40, 38, 0),)),
+        grade="mems",
+        beacons=(FAR,),
+        rates=SensorRates(imu=10.0),
+        seed=seed,
+    )
+    for record in World(scenario).records((*SENSORS, Imu)):
+        t = record.t_ns / NS
+        if not 60.0 < t < first.get(type(record), 68.0):
+            navigator.handle(record)
+        if navigator.state.bank is not None:
+            sigma["before" if t <= 60.0 else "after"] = spread(navigator.state.bank, LATENCY)
+    assert sigma["after"] > 0.99 * sigma["before"]  # 0.5 to 0.9 of it, and 6 m along the track, before
+
+
+def spread(bank: Bank, state: int) -> float:
+    """One sigma of a state over all hypotheses."""
+    x = bank.x[:, state]
+    return math.sqrt(bank.weights @ (bank.P[:, state, state] + (x - bank.weights @ x) ** 2))
 
 
 @pytest.mark.parametrize(("gnss_until", "needed"), [(math.inf, False), (90.0, True)])
