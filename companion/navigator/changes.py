@@ -17,14 +17,16 @@ from companion.records import Event, Mode, Output, Severity, Solution, Source, S
 #: An autopilot checks its airspeed sensor against GPS only: ArduPlane dived to the ground for speed in 67 s.
 FALSE_AIRSPEED = "switch the airspeed sensor off"
 USE_AIRSPEED = {"ardupilot": ": ARSPD_USE 0", "px4": ": FW_USE_AIRSPD 0"}
+UNFIT_ANSWERS = 10  # of a beacon, none of which fits, until it is reported
 
 
 class Changes:
-    """What was last reported of the sources, of their scatter, of the guaranteed bound and of the mode."""
+    """What was last reported of sources, of their scatter, of the guaranteed bound and of the mode."""
 
     def __init__(self) -> None:
         self._beliefs: tuple[int, ...] = ()  # `State.reported`
         self._scatter: dict[str, bool] = {}  # whether each source is noisy
+        self._unfit: set[int] = set()  # beacons that are reported to fit nothing
         self._wider = False  # whether the guaranteed bound is
         self._mode = Mode.INITIALISING, Source(0)  # and the fixes that the solution rests on
 
@@ -38,6 +40,11 @@ class Changes:
             if scatter.noisy != self._scatter.get(name, False):
                 self._scatter[name] = scatter.noisy
                 found.append((Severity.NOTICE, _of_scatter(name, scatter)))
+        unfit = {beacon for beacon, answers in state.unfit if answers >= UNFIT_ANSWERS}
+        for beacon in unfit - self._unfit:
+            text = "is not used: no answer fits its stated place; check its number and its place"
+            found.append((Severity.WARNING, f"rsbn {beacon} {text}"))
+        self._unfit = unfit
         g = state.guarantee
         if g.anchored is not None and (g.widening > 1.0) != self._wider:
             self._wider = not self._wider

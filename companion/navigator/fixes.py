@@ -157,9 +157,11 @@ def rsbn(state: State, record: RsbnFix, settings: Settings) -> Step:
             out.append(_rejected(state, record, label, source, taken))
         elif state.false[source] < known.settings.suspect:
             believed |= part
+    others = tuple(beacon for beacon in before.unfit if beacon[0] != record.beacon)
     if not is_followed:
-        return before, out
-    state = state._replace(fixed=True)
+        count = 1 + dict(before.unfit).get(record.beacon, 0)
+        return before._replace(unfit=((record.beacon, count), *others)[:MOST_BEACONS]), out
+    state = state._replace(fixed=True, unfit=others)
     if believed:
         pending = Pending(record, point, centre, believed)
         state = state._replace(rsbn_ns=record.t_ns, rsbn_used=believed, pending=pending)

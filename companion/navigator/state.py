@@ -82,6 +82,7 @@ class State(NamedTuple):
     protection: tuple[int, float, float, float] | None = None  # when computed; radius, position error (m)
     fixed: bool = False  # whether a fix was ever used
     beacons: tuple[Beacon, ...] = ()
+    unfit: tuple[tuple[int, int], ...] = ()  # beacons none of whose answers fits: identity, answers so far
     jammed_ns: int | None = None  # when the receiver last reported jamming or spoofing
     false: tuple[float, ...] = ()  # probability that each source is false
     certain_ns: tuple[int, ...] = ()  # since when each is false beyond doubt, 0 where it is not

@@ -256,6 +256,9 @@ def test_a_beacon_whose_place_is_stated_far_off_changes_nothing() -> None:
     assert np.abs(wrong.error_n - none.error_n).max() < 1.0
     assert wrong.protection[dark].max() == pytest.approx(none.protection[dark].max(), rel=0.05)
     assert sum(rejection.source.startswith("rsbn 1") for rejection in wrong.rejections) > 200
+    assert [event.text for event in wrong.events if event.text.startswith("rsbn 1")] == [
+        "rsbn 1 is not used: no answer fits its stated place; check its number and its place"
+    ]
 
 
 @pytest.mark.parametrize("height", [80.0, -80.0])
