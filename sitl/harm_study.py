@@ -279,11 +279,12 @@ def _fly_link(scenario: Scenario, order: HarmOrder) -> _Flown:
 
 
 def beside_fixes(t: Floats, error: Floats, t_fix: Floats) -> tuple[Floats, Floats]:
-    """Leave out the errors of times after which no fix is there: none came yet, or in the last `SILENT_S`.
+    """Leave out the errors of times before which no fix came, or none in the last `SILENT_S`.
 
-    Parameters: times (n,) s, errors (n,) m, and times (m,) s of the fixes that arrived.
+    A solution at the time of a fix is from before it. Parameters: times (n,) s, errors (n,) m, and times (m,)
+    s of the fixes that arrived.
     """
-    last = np.concatenate(([-math.inf], np.sort(t_fix)))[np.searchsorted(np.sort(t_fix), t, side="right")]
+    last = np.concatenate(([-math.inf], np.sort(t_fix)))[np.searchsorted(np.sort(t_fix), t)]
     there = t - last <= SILENT_S
     return t[there], error[there]
 

@@ -50,10 +50,10 @@ def test_ratio_is_that_of_the_worst_ten_seconds_less_three_metres():
 
 
 def test_nothing_is_compared_where_no_fix_is_there():
-    """Before the first fix, and from three silent seconds on until the next."""
+    """Until the first fix, and from three silent seconds on until the next."""
     t = np.arange(0.0, 20.0, 0.5)
     left, _ = beside_fixes(t, t, np.array([2.0, 3.0, 14.0, 15.0]))
-    assert list(left) == [*np.arange(2.0, 6.5, 0.5), *np.arange(14.0, 18.5, 0.5)]
+    assert list(left) == [*np.arange(2.5, 6.5, 0.5), *np.arange(14.5, 18.5, 0.5)]
     assert [len(x) for x in beside_fixes(t, t, np.array([]))] == [0, 0]
 
 
