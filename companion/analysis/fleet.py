@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, NamedTuple, get_args, get_type_hints
@@ -28,6 +28,7 @@ from companion.analysis.flights import open_flights
 from companion.analysis.html import BOOTED_NS
 from companion.analysis.jobs import Journal, run_jobs
 from companion.analysis.replay_inputs import is_own_log
+from companion.analysis.verdict import judge_flight
 from companion.config import Config, load
 from companion.importers.foreign_file import one_line
 from companion.optional_dependencies import missing_package
@@ -46,6 +47,8 @@ class FlightRow(NamedTuple):
     log: str
     flight: int = 0  # of `flights` in the log
     flights: int = 0
+    verdict: str | None = None  # Good, Caution or Fault, as in the report
+    verdict_reason: str | None = None  # in one sentence
     start_utc: str | None = None
     duration_s: float = 0.0
     solutions: int = 0
@@ -102,11 +105,14 @@ def _row(name: str, a: Assessment) -> FlightRow:
     corrected = a.errors.get(error_statistics.CORRECTED)
     ins = a.errors.get(error_statistics.INS)
     held = [row.held for row in a.rows if row.held is not None]
+    verdict = judge_flight(a)
     start = datetime.fromtimestamp(a.flight.unix_ns * 1e-9, UTC) if a.flight.unix_ns > BOOTED_NS else None
     return FlightRow(
         log=name,
         flight=a.flight.part[0],
         flights=a.flight.part[1],
+        verdict=verdict.word,
+        verdict_reason=verdict.reason,
         start_utc=None if start is None else start.isoformat(timespec="seconds"),
         duration_s=round(a.flight.seconds, 3),
         solutions=len(a.flight.tables["Solution"]["t"]),
@@ -155,7 +161,14 @@ class Fleet:
     def assess(self, logs: Sequence[Path], progress: Progress) -> list[FlightRow]:
         """Assess the logs that are new or changed; return the rows of all of them."""
         keys = {log_key(path): path for path in logs}
-        known = {entry["key"]: entry["rows"] for entry in self._journal.entries if entry["key"] in keys}
+        found = {entry["key"]: entry["rows"] for entry in self._journal.entries if entry["key"] in keys}
+        known = {key: rows for key, rows in found.items() if all(map(_is_current, rows))}
+        if old := len(found) - len(known):
+            click.echo(
+                f"companion: {self._journal.path}: {old} of {len(keys)} logs were assessed by another"
+                " version, with other columns: they are assessed again",
+                err=True,
+            )
         todo = {key: LogJob(path, self._config) for key, path in keys.items() if key not in known}
         task = progress.add_task("logs", total=len(keys), completed=len(known))
         rows = [FlightRow(**row) for rows in known.values() for row in rows]
@@ -184,6 +197,11 @@ class Fleet:
             progress.update(task, advance=1)
         written = {log: f"{REPORTS}/{name}" for log, name in names.items() if (folder / name).exists()}
         return [row._replace(report=written.get(row.log)) for row in rows]
+
+
+def _is_current(row: Mapping[str, Any]) -> bool:
+    """Whether a row of the journal has the columns of this version."""
+    return row.keys() == set(FlightRow._fields)
 
 
 def _digest(log: str) -> str:
@@ -277,7 +295,7 @@ def command(
     )
     for row in good[:5]:
         worst = "no reference" if row.largest_m is None else f"largest error {row.largest_m:.1f} m"
-        click.echo(f"  {printable(row.log)}: {worst}")
+        click.echo(f"  {printable(row.log)}: {row.verdict}, {worst}")
     click.echo(f"written: {', '.join(map(str, written))}")
     if not good:
         raise SystemExit(1)

@@ -8,6 +8,7 @@ from importlib.resources import files
 from typing import TYPE_CHECKING
 
 from companion import __version__
+from companion.analysis.html import Cell
 from companion.analysis.summary import format_duration, format_length
 
 if TYPE_CHECKING:
@@ -15,8 +16,8 @@ if TYPE_CHECKING:
 
 SHOWN = 1000
 POLICY = "default-src 'none'; style-src 'unsafe-inline'"
-HEADS = ("flight", "start, UTC", "lasts", "longest without GNSS", "largest error", "r.m.s.", "INS alone")
-MORE_HEADS = ("bound held in phases", "rejected", "warnings")
+HEADS = ("flight", "verdict", "start, UTC", "lasts", "longest without GNSS")
+MORE_HEADS = ("largest error", "r.m.s.", "INS alone", "bound held in phases", "rejected", "warnings")
 
 
 def render_page(rows: Sequence[FlightRow]) -> str:
@@ -25,7 +26,7 @@ def render_page(rows: Sequence[FlightRow]) -> str:
     bad = [row for row in rows if row.reason is not None]
     tiles = {
         "flights": str(len(good)),
-        "in the air or on the ground": format_duration(sum(row.duration_s for row in good)),
+        "total duration": format_duration(sum(row.duration_s for row in good)),
         "largest error": format_length(max((row.largest_m or 0.0 for row in good), default=0.0)),
         "logs not readable": str(len(bad)),
     }
@@ -41,31 +42,36 @@ def render_page(rows: Sequence[FlightRow]) -> str:
             *(f"<div><dt>{name}</dt><dd>{value}</dd></div>" for name, value in tiles.items()),
             "</dl><p class='when'>Errors are horizontal, relative to the truth of the log or to its smoothed "
             "track. All rows are in flights.parquet.</p></header><main>",
-            _section("Flights", (*HEADS, *MORE_HEADS), [_flight_cells(row) for row in good[:SHOWN]]),
-            _section("Not readable", ("log", "reason"), [_reason_cells(row) for row in bad[:SHOWN]]),
+            _section(
+                "Flights", "flights", (*HEADS, *MORE_HEADS), [_flight_cells(row) for row in good[:SHOWN]]
+            ),
+            _section("Not readable", "logs", ("log", "reason"), [_reason_cells(row) for row in bad[:SHOWN]]),
             f"</main><footer>companion {__version__}</footer></body></html>\n",
         )
     )
 
 
-def _section(title: str, heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Return a table; the cells are HTML."""
+def _section(title: str, kind: str, heads: Sequence[str], rows: Sequence[Sequence[str | Cell]]) -> str:
+    """Return a table of the CSS class `kind`; the cells are HTML."""
     if not rows:
         return ""
     head = "".join(f"<th>{name}</th>" for name in heads)
     body = "".join(
-        "<tr>"
-        + "".join(f"<td data-label='{name}'>{cell}</td>" for name, cell in zip(heads, row, strict=True))
-        + "</tr>"
+        "<tr>" + "".join(_td(name, cell) for name, cell in zip(heads, row, strict=True)) + "</tr>"
         for row in rows
     )
     return (
-        f"<section><h2>{title}</h2><div class='scroll'><table class='cards'><thead><tr>{head}</tr></thead>"
-        f"<tbody>{body}</tbody></table></div></section>"
+        f"<section><h2>{title}</h2><div class='scroll'><table class='cards {kind}'>"
+        f"<thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div></section>"
     )
 
 
-def _flight_cells(row: FlightRow) -> list[str]:
+def _td(name: str, cell: str | Cell) -> str:
+    text, kind = (cell.text, f" class='{cell.level}'") if isinstance(cell, Cell) else (cell, "")
+    return f"<td data-label='{name}'{kind}>{text}</td>"
+
+
+def _flight_cells(row: FlightRow) -> list[str | Cell]:
     name = escape(row.log.rpartition("/")[2]) + (
         f", {row.flight} of {row.flights}" if row.flights > 1 else ""
     )
@@ -73,8 +79,10 @@ def _flight_cells(row: FlightRow) -> list[str]:
     named = f"<span title='{title}'>{name}</span>"
     if row.report:
         named = f"<a href='{escape(row.report)}' title='{title}'>{name}</a>"
+    verdict, why = escape(row.verdict or "–"), escape(row.verdict_reason or "")
     return [
         named,
+        Cell(f"<span title='{why}'>{verdict}</span>", verdict.lower()),
         (row.start_utc or "–").replace("T", " ").removesuffix("+00:00"),
         format_duration(row.duration_s),
         format_duration(row.gnss_outage_s) if row.gnss_outage_s else "–",

@@ -47,6 +47,10 @@ def test_each_log_is_a_row_and_a_bad_one_has_a_reason(logs: Path, tmp_path: Path
         "b.bin": None,
         "broken.ulg": "is not a ULog: wrong magic bytes at its beginning",
     }
+    verdicts = {Path(row["log"]).name: row["verdict"] for row in table}
+    assert verdicts == {"a.tlog": "Caution", "b.bin": "Good", "broken.ulg": None}
+    assert all(row["verdict_reason"] for row in table if row["verdict"])
+    assert "a.tlog: Caution, " in shown
     assert all(row["duration_s"] > 5.0 for row in table if row["reason"] is None)
     assert table[-1]["reason"] and "broken.ulg" in (results / fleet.PAGE).read_text()
 
@@ -77,6 +81,22 @@ def test_only_new_and_changed_logs_are_read(
     assert all(json.loads(line) for line in journal.read_text().splitlines())
 
 
+def test_rows_of_another_version_are_assessed_again(logs: Path, tmp_path: Path) -> None:
+    pytest.importorskip("pyarrow")
+    results = tmp_path / "results"
+    options = (logs, "--results", results, "--workers", 0, "--reports", 0)
+    run(*options)
+    journal = results / fleet.JOURNAL
+    older = [json.loads(line) for line in journal.read_text().splitlines()]
+    for entry in older:
+        for row in entry["rows"]:
+            del row["verdict"], row["verdict_reason"]
+    journal.write_text("".join(json.dumps(entry) + "\n" for entry in older))
+    again = "3 of 3 logs were assessed by another version, with other columns: they are assessed again"
+    assert f"companion: {journal}: {again}" in run(*options)
+    assert "another version" not in run(*options)
+
+
 def test_report_of_the_worst_is_linked(logs: Path, tmp_path: Path) -> None:
     pytest.importorskip("pyarrow")
     pytest.importorskip("plotly")
@@ -88,7 +108,7 @@ def test_report_of_the_worst_is_linked(logs: Path, tmp_path: Path) -> None:
 
 def test_worst_flight_comes_first_and_text_is_escaped() -> None:
     rows = [
-        FlightRow("x/<!--<script>.mcap", 1, 1, largest_m=3.0, duration_s=60.0),
+        FlightRow("x/<!--<script>.mcap", 1, 1, largest_m=3.0, duration_s=60.0, verdict="Good"),
         FlightRow("unreadable", reason="<b>bad</b>"),
         FlightRow("x/worst.mcap", 1, 1, largest_m=500.0, duration_s=60.0, report="reports/worst.html"),
         FlightRow("x/unknown.mcap", 1, 1, duration_s=60.0),
@@ -98,6 +118,7 @@ def test_worst_flight_comes_first_and_text_is_escaped() -> None:
     assert ordered[-1].reason
     page = render_page(ordered)
     assert page.index("worst.mcap") < page.index("&lt;!--&lt;script&gt;.mcap") < page.index("unknown.mcap")
+    assert "<td data-label='verdict' class='good'><span title=''>Good</span></td>" in page
     assert "<script" not in page and "<b>bad" not in page and "href='reports/worst.html'" in page
 
 
