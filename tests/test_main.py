@@ -87,6 +87,17 @@ def test_seeds_are_not_negative() -> None:
         assert (done.exit_code, "-1 is not in the range x>=0" in done.output) == (2, True), command.name
 
 
+def test_a_seed_without_beacons_is_rejected() -> None:
+    seeded = [c for c in commands().values() if has_option(c, "seed") and has_option(c, "beacons")]
+    assert {command.name for command in seeded} == {"replay", "outages", "wrong-sensors"}
+    for command in seeded:
+        done = CliRunner().invoke(command, [str(CUT), "--seed", "3"])
+        assert done.exit_code == 2, command.name
+        assert "--seed 3 has no effect without --rsbn: add --rsbn" in done.output
+        done = CliRunner().invoke(command, [str(CUT), "--seed", "3", "--rsbn", "absent.csv"])
+        assert "absent.csv" in str(done.exception), command.name
+
+
 def test_no_number_is_nan() -> None:
     """Infinity only where it is the default: no end."""
     tools = [attacks.main, file_mutants.main, forged_frames.main, parameter_sweep.main]
@@ -355,6 +366,12 @@ def test_printed_defaults_are_a_valid_configuration(tmp_path: Path) -> None:
     file = tmp_path / "defaults.toml"
     file.write_text(CliRunner().invoke(cli, ["check-config", "--defaults"]).stdout)
     assert CliRunner().invoke(cli, ["check-config", str(file)]).exit_code == 0
+
+
+def test_a_file_beside_the_defaults_is_rejected() -> None:
+    done = CliRunner().invoke(cli, ["check-config", "absent.toml", "--defaults"])
+    assert done.exit_code == 2
+    assert "FILE absent.toml has no effect with --defaults" in done.stderr
 
 
 @pytest.mark.parametrize("command", ["sitl", "loopback"])

@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 import click
 
 from companion.analysis import simulated_rsbn
+from companion.analysis.beacon_options import beacon_options
 from companion.analysis.comparison import TOLERANCE, OutputComparison
 from companion.analysis.output_guard import reject_other_flight, reject_own_input, remove_leftover
 from companion.analysis.progress import show_step
@@ -176,7 +177,7 @@ def derived_metadata(config: Config, by: str, log: Path) -> dict[str, dict[str, 
 @click.option(
     "--with", "changes", multiple=True, metavar="KEY=VALUE,...", help="Change these configuration keys."
 )
-@click.option("--rsbn", "beacons", type=click.Path(path_type=Path), help="Simulate the beacons of this CSV.")
+@beacon_options
 @click.option(
     "--correctors",
     "tables",
@@ -191,7 +192,6 @@ def derived_metadata(config: Config, by: str, log: Path) -> dict[str, dict[str, 
     metavar="GNSS:FROM-TO",
     help="Remove GNSS or RSBN in this interval, s of the log.",
 )
-@click.option("--seed", type=click.IntRange(min=0), default=0, help="Seed of the noise of simulated beacons.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 def command(
     log: Path,

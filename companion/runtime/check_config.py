@@ -33,6 +33,10 @@ def command(
     A file to start from:
       companion check-config --defaults --preset stock-autopilot > companion.toml
     """
+    if defaults and file is not None:
+        raise click.UsageError(
+            f"FILE {file} has no effect with --defaults, which prints the defaults: leave one of them out"
+        )
     if defaults:
         config = load(environment={}, preset=preset, pairs=pairs)
     else:

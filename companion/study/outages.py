@@ -21,6 +21,7 @@ import click
 import numpy as np
 from rich.table import Table
 
+from companion.analysis.beacon_options import beacon_options
 from companion.analysis.error_statistics import root_mean_square
 from companion.analysis.replay_inputs import input_errors_as_log_errors, with_beacons_and_outages
 from companion.config import Config, load
@@ -195,8 +196,7 @@ def _row(
     show_default=True,
     help="Seconds between.",
 )
-@click.option("--rsbn", "beacons", type=click.Path(path_type=Path), help="Simulate the beacons of this CSV.")
-@click.option("--seed", type=click.IntRange(min=0), default=0, help="Seed of the noise of simulated beacons.")
+@beacon_options
 @configuration_options
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 def command(

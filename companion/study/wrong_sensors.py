@@ -20,6 +20,7 @@ import numpy as np
 from msgspec.structs import replace
 from rich.table import Table
 
+from companion.analysis.beacon_options import beacon_options
 from companion.analysis.replay_inputs import input_errors_as_log_errors, with_beacons_and_outages
 from companion.config import Config, load
 from companion.config.options import configuration_options
@@ -124,8 +125,7 @@ def study(records: Sequence[Stamped], config: Config, from_s: float) -> Iterator
 
 @click.command("wrong-sensors")
 @click.argument("log", type=click.Path(path_type=Path))
-@click.option("--rsbn", "beacons", type=click.Path(path_type=Path), help="Simulate the beacons of this CSV.")
-@click.option("--seed", type=click.IntRange(min=0), default=0, help="Seed of the noise of simulated beacons.")
+@beacon_options
 @click.option(
     "--from",
     "from_s",
