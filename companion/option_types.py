@@ -17,3 +17,19 @@ class FloatRange(click.FloatRange):
         if not math.isfinite(number) and (param is None or number != param.default):
             self.fail(f"{value} is not a finite number.", param, ctx)
         return number
+
+
+class FloatList(click.ParamType):  # type: ignore[type-arg]
+    """Finite numbers within limits, written A,B,C; a tuple."""
+
+    name = "number,..."
+
+    def __init__(self, *limits: Any, **more_limits: Any) -> None:
+        """Take the limits of one number, those of `FloatRange`."""
+        self._number = FloatRange(*limits, **more_limits)
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[float, ...]:
+        """Convert each number of the list."""
+        return tuple(self._number.convert(word, param, ctx) for word in str(value).split(","))

@@ -32,7 +32,7 @@ from companion.estimate.minimax_lp import Design
 from companion.estimate.predictor import Start, Step, Window, anchor
 from companion.estimate.schuler import ARCSECOND, DEG_PER_HOUR, MEAN_EARTH, schuler_row, transition
 from companion.nav.bounded_channel import BoundedIns, Motion, UnitErrors
-from companion.option_types import FloatRange
+from companion.option_types import FloatList, FloatRange
 from companion.tables import print_tables
 from companion.units import G0, SECOND_NS, Floats
 
@@ -181,8 +181,22 @@ def _windows(t_ns: npt.NDArray[np.int64], window_s: float) -> Iterator[slice]:
 
 @click.command("schuler")
 @click.argument("file", type=click.Path(exists=True, dir_okay=False, path_type=Path))
-@click.option("--window-min", default="20,30,60", show_default=True, help="Windows of the estimation [min].")
-@click.option("--ahead-min", default="5,10,20,40", show_default=True, help="Horizons [min].")
+@click.option(
+    "--window-min",
+    "windows_min",
+    type=FloatList(0.0, min_open=True),
+    default="20,30,60",
+    show_default=True,
+    help="Windows of the estimation [min].",
+)
+@click.option(
+    "--ahead-min",
+    "aheads_min",
+    type=FloatList(0.0),
+    default="5,10,20,40",
+    show_default=True,
+    help="Horizons [min].",
+)
 @click.option(
     "--sigma-mps",
     type=FloatRange(0.0, min_open=True),
@@ -199,7 +213,12 @@ def _windows(t_ns: npt.NDArray[np.int64], window_s: float) -> Iterator[slice]:
 )
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 def command(
-    file: Path, window_min: str, ahead_min: str, sigma_mps: float, lat_deg: float, as_json: bool
+    file: Path,
+    windows_min: tuple[float, ...],
+    aheads_min: tuple[float, ...],
+    sigma_mps: float,
+    lat_deg: float,
+    as_json: bool,
 ) -> None:
     """Predict recorded INS velocity errors.
 
@@ -207,11 +226,12 @@ def command(
     """
     try:
         recording = load(file)
-        windows = [60.0 * float(word) for word in window_min.split(",")]
-        ahead = [60.0 * float(word) for word in ahead_min.split(",")]
+        ahead = [60.0 * minutes for minutes in aheads_min]
         with show_step("predict"):
             outcomes = [
-                outcome for window in windows for outcome in run(recording, window, ahead, sigma_mps, lat_deg)
+                outcome
+                for minutes in windows_min
+                for outcome in run(recording, 60.0 * minutes, ahead, sigma_mps, lat_deg)
             ]
     except ValueError as error:
         raise click.UsageError(str(error)) from None

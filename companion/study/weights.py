@@ -361,6 +361,8 @@ def _numbers(text: str, numbers: str) -> tuple[float, float]:
         a, b = (float(word) for word in numbers.split(","))
     except ValueError:
         raise ValueError(f"{text!r}: give two numbers after '='") from None
+    if not (math.isfinite(a) and math.isfinite(b)):
+        raise ValueError(f"{text!r}: give two finite numbers after '='")
     return a, b
 
 

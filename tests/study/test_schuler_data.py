@@ -65,6 +65,11 @@ def test_command():
         ("north", 20),
     ]
     assert CliRunner().invoke(command, [str(FLIGHT), "--window-min", "x"]).exit_code == 2
+    for option in ("--window-min", "--ahead-min"):
+        for number in ("nan", "inf"):
+            done = CliRunner().invoke(command, [str(FLIGHT), option, f"20,{number}"])
+            assert done.exit_code == 2
+            assert f"Invalid value for '{option}': {number} is not a finite number." in done.stderr
     assert (
         "-1.0 is not in the range x>0.0"
         in CliRunner().invoke(command, [*arguments, "--sigma-mps", "-1"]).output

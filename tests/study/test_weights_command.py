@@ -149,6 +149,7 @@ def test_plot(tmp_path):
         (("--correlation=INS.x,VOR.x=0.5",), "no reading 'VOR.x'"),
         (("--correlation=INS.x=0.5",), "no reading ''"),
         (("--reading=A.x=1,2", "--reading=B.azimuth=0,1"), "azimuths that do not meet"),
+        (("--reading=A.x=1,2", "--reading=A.range=1,2", "--beacon=A=nan,2"), "'A=nan,2': give two finite"),
         (("--beacon=VOR=1,2",), "no reading of beacon VOR"),
     ],
 )
