@@ -45,9 +45,10 @@ def recover_command(log: Path) -> None:
     """Recover a torn or damaged LOG.
 
     x.mcap.active becomes x.mcap; x.mcap is copied to x.recovered.mcap.
+    A log without a message that can be read is left as it is; the exit code is then 1.
     """
     with show_step(f"recover {log}"):
-        saved = recover(log)
+        saved = recover(log, reject_empty=True)
     if saved.path == log:
         click.echo(f"{log} is complete: {saved.messages} messages in {saved.chunks} chunks")
     else:

@@ -28,6 +28,7 @@ def recover(
     path: str | os.PathLike[str],
     reserve: int = 0,
     relieve: Callable[[int], object] = lambda wanted: None,
+    reject_empty: bool = False,
 ) -> Recovered:
     """Recover every complete chunk of a torn or damaged log.
 
@@ -40,6 +41,8 @@ def recover(
     ----------
     reserve : bytes of the disk to leave free.
     relieve : frees space for the end of a log, as for `DiskFile`; never called for a copy.
+    reject_empty : raise LogError, and write nothing, if no message of a torn or damaged log can be read. At
+        its start the service closes such a log like any other.
 
     Raises LogError if there is nothing to read or no space, if a process still writes the log, or if the
     target exists.
@@ -53,14 +56,16 @@ def recover(
         target = _target_path(path)
         try:
             if locked.closed and path.suffix != ACTIVE:
-                saved = _finish_in_place(path, reserve, relieve)
+                saved = _finish_in_place(path, reserve, relieve, reject_empty)
                 if saved is not None:
                     return saved
             if target.exists():
                 raise LogError(f"{target} already exists: move it away first")
-            saved = _finish_in_place(path, reserve, relieve) if path.suffix == ACTIVE else None
+            saved = None
+            if path.suffix == ACTIVE:
+                saved = _finish_in_place(path, reserve, relieve, reject_empty)
             if saved is None:
-                saved = _recover_by_copy(path, target, reserve)
+                saved = _recover_by_copy(path, target, reserve, reject_empty)
             else:
                 os.replace(path, target)
                 sync_folder(target.parent)
@@ -78,7 +83,13 @@ def _target_path(path: Path) -> Path:
     return stem.with_name(f"{stem.stem}.recovered.mcap")
 
 
-def _finish_in_place(path: Path, reserve: int, relieve: Callable[[int], object]) -> Recovered | None:
+def _empty(path: Path) -> LogError:
+    return LogError(f"{path} contains no message that can be read: nothing to recover")
+
+
+def _finish_in_place(
+    path: Path, reserve: int, relieve: Callable[[int], object], reject_empty: bool
+) -> Recovered | None:
     """Write what is missing after the last complete chunk at `path`; None, unchanged, if it is damaged."""
     file = McapFile(DiskFile(path, reserve, relieve, new=False))
     try:
@@ -88,6 +99,8 @@ def _finish_in_place(path: Path, reserve: int, relieve: Callable[[int], object])
             except DamagedError:
                 return None
             if not source.closed:
+                if reject_empty and not messages:
+                    raise _empty(path)
                 if messages != file.messages + len(last):
                     return None  # some are outside chunks
                 if last:
@@ -125,7 +138,7 @@ def _enter_all(source: LogReader, file: McapFile) -> tuple[int, list[Message]]:
     return count, last
 
 
-def _recover_by_copy(path: Path, target: Path, reserve: int) -> Recovered:
+def _recover_by_copy(path: Path, target: Path, reserve: int, reject_empty: bool) -> Recovered:
     """Copy everything readable from `path` to `target`, and remove `path` if it is ".active"."""
     part = target.with_name(target.name + ".part")
     part.unlink(missing_ok=True)
@@ -134,6 +147,8 @@ def _recover_by_copy(path: Path, target: Path, reserve: int) -> Recovered:
         file.begin("companion recover")
         with open_log(path) as source:
             lost = _copy_records(source, file)
+        if reject_empty and not file.messages:
+            raise _empty(path)
         file.finish()
         file.sync()
         os.replace(part, target)

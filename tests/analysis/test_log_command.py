@@ -13,7 +13,7 @@ from companion.storage.flight_log import LogError, Writer
 @pytest.fixture
 def whole(tmp_path: Path) -> bytes:
     log = tmp_path / "written.mcap"
-    with Writer(log, metadata={}, start_unix_ns=10**18, start_ns=0, block=True) as writer:
+    with Writer(log, metadata={}, start_unix_ns=10**18, start_ns=0, block=True, chunk_bytes=2000) as writer:
         for k in range(100):
             writer.record(Event(k, k, 6, "hello"))
     return log.read_bytes()
@@ -22,7 +22,7 @@ def whole(tmp_path: Path) -> bytes:
 @pytest.mark.parametrize("damage", ["torn", "changed"])
 def test_existing_copy_is_not_overwritten(damage: str, whole: bytes, tmp_path: Path) -> None:
     log, copy = tmp_path / "flight.mcap", tmp_path / "flight.recovered.mcap"
-    at = whole.index(b"zstd") + 40  # within its chunk
+    at = whole.index(b"zstd", len(whole) // 2) + 40  # within a chunk that is not the first
     log.write_bytes(whole[:at] if damage == "torn" else whole[:at] + bytes(20) + whole[at + 20 :])
     copy.write_bytes(b"existing")
     done = CliRunner().invoke(group, ["recover", str(log)])
@@ -44,6 +44,25 @@ def test_recovery_without_copy_ignores_an_existing_copy(whole: bytes, tmp_path: 
     (tmp_path / "flight.mcap.active").write_bytes(whole[:-30])
     assert CliRunner().invoke(group, ["recover", f"{log}.active"]).exit_code == 0
     assert log.exists() and copy.read_bytes() == b"existing"
+
+
+@pytest.mark.parametrize("name", ["flight.mcap", "flight.mcap.active"])
+@pytest.mark.parametrize("damage", ["empty", "torn", "changed"])
+def test_a_log_without_messages_is_left_as_it_is(
+    damage: str, name: str, whole: bytes, tmp_path: Path
+) -> None:
+    at = whole.index(b"zstd") + 40  # within the first chunk
+    end = whole.index(b"zstd", at)  # within the head of the second
+    changed = whole[:at] + bytes(20) + whole[at + 20 : end]
+    left = {"empty": b"", "torn": whole[:at], "changed": changed}[damage]
+    log = tmp_path / "flights" / name
+    log.parent.mkdir()
+    log.write_bytes(left)
+    done = CliRunner().invoke(group, ["recover", str(log)])
+    assert isinstance(done.exception, LogError)
+    nothing = f"{log} contains no message that can be read: nothing to recover"
+    assert str(done.exception) == (nothing if left else f"{log} is empty: nothing was recorded")
+    assert [one.name for one in log.parent.iterdir()] == [name] and log.read_bytes() == left
 
 
 def test_text_of_a_log_cannot_control_the_terminal(tmp_path: Path) -> None:
