@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+import socket
 import struct
 import sys
 import time
@@ -26,6 +27,7 @@ from companion.printable import printable
 from companion.runtime.exposure import exposure
 from companion.runtime.input_monitor import describe_silence
 from companion.runtime.signing_key import SigningKey
+from companion.transport.connection import reason
 from companion.transport.reconnect import Address, CannotListen, Connection, connect
 
 CONNECT_TIMEOUT_S = 10.0
@@ -176,10 +178,21 @@ def _is_interactive() -> bool:
     return sys.stdin.isatty()
 
 
+def describe_open_error(address: Address, error: OSError) -> str:
+    """Describe why a link cannot be opened, and what to do."""
+    if isinstance(error, CannotListen):  # it names the address
+        return f"{error.strerror}; is `companion run` still running?"
+    return f"{address}: {reason(error)}{_advice(error)}"
+
+
 def _advice(error: OSError) -> str:
     if isinstance(error, PermissionError):
         return "; add this user to the group of the serial port (usually dialout) and log in again"
-    return "; is `companion run` still running?" if isinstance(error, CannotListen) else ""
+    if isinstance(error, ConnectionRefusedError):
+        return "; start the program that listens there, or give another port"
+    if isinstance(error, socket.gaierror):
+        return "; check the host name, or give an IP address"
+    return ""
 
 
 @click.command("doctor")
@@ -221,6 +234,6 @@ def command(
         click.echo(f"companion: {address}: no peer connected within {CONNECT_TIMEOUT_S:g} s", err=True)
         sys.exit(os.EX_UNAVAILABLE)
     except OSError as error:
-        click.echo(f"companion: {address}: {error.strerror or error}{_advice(error)}", err=True)
+        click.echo(f"companion: {describe_open_error(address, error)}", err=True)
         sys.exit(os.EX_UNAVAILABLE)
     sys.exit(0 if well else 1)

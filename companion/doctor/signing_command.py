@@ -18,11 +18,13 @@ import click
 
 from companion.config import Config, ConfigError, load
 from companion.config.options import configuration_options
+from companion.doctor.command import describe_open_error
 from companion.link import dialect, frame
 from companion.link.dialect import mavlink
 from companion.link.session import MessageReceived, Session
 from companion.link.signing import EPOCH_NS, TICK_NS, Signing, read_key
 from companion.runtime.exposure import exposure
+from companion.runtime.link_addresses import check_links
 from companion.transport.reconnect import Address, Connection, connect
 
 FIND_S, ANSWER_S = 10.0, 6.0
@@ -133,12 +135,18 @@ def init(
     """
     config = load(file, {"link.connect": (link,) if link else None}, pairs=pairs, preset=preset)
     path = key_file or Path(config.signing.key_file or "signing.key")
+    check_links(config)
+    address = Address.parse(config.link.connect[0])
     is_new = not path.exists()
     try:
         key = write_key(path) if is_new else read_key(path)
-        address = Address.parse(config.link.connect[0])
-    except (OSError, ValueError) as error:
-        raise ConfigError(f"--key-file {path}: {error}") from None
+    except OSError as error:
+        raise ConfigError(
+            f"--key-file {path}: the key cannot be written ({error.strerror or error}): give a file in a "
+            "folder that exists and that you may write"
+        ) from None
+    except ValueError as error:  # it names the file
+        raise ConfigError(f"--key-file {error}") from None
     click.echo(f"key: {path} ({'new, mode 0600' if is_new else 'exists, used again'})")
     if not no_autopilot:
         if exposure(address, config).is_open:
@@ -148,8 +156,10 @@ def init(
             )
         try:
             system = asyncio.run(_give_key_over(address, config, key))
-        except (CannotSetUp, OSError, TimeoutError) as error:
+        except CannotSetUp as error:
             raise SystemExit(f"companion: {address}: {error}") from None
+        except OSError as error:
+            raise SystemExit(f"companion: {describe_open_error(address, error)}") from None
         click.echo(f"autopilot {system} on {address} signs with this key")
     click.echo(f"set in the configuration:\n[signing]\nkey_file = {str(path.absolute())!r}")
 

@@ -13,6 +13,7 @@ from companion.transport.address import BAUD_RATES, Address
 from companion.transport.connection import READ_SIZE, Connection
 
 IN_USE = "another program has this line open: end it"
+NOT_SERIAL = "not a serial line; see `ls /dev/serial/by-id`"
 NO_DEVICE = "no such device; see `ls /dev/serial/by-id`"
 
 
@@ -27,6 +28,8 @@ def open_serial(address: Address) -> Connection:
         fd = os.open(address.place, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
     except FileNotFoundError:
         raise OSError(NO_DEVICE) from None
+    except IsADirectoryError:
+        raise OSError(NOT_SERIAL) from None
     except OSError as error:
         if error.errno == errno.EBUSY:
             raise OSError(IN_USE) from None
@@ -44,7 +47,8 @@ def open_serial(address: Address) -> Connection:
         if isinstance(error, BlockingIOError):
             raise OSError(IN_USE) from None
         if isinstance(error, termios.error):
-            raise OSError(f"not a serial line: {error.args[1]}") from None
+            not_serial = error.args[0] == errno.ENOTTY
+            raise OSError(NOT_SERIAL if not_serial else f"cannot be set up: {error.args[1]}") from None
         raise
 
     def release() -> None:

@@ -130,7 +130,7 @@ def test_port_in_use_suggests_a_running_companion() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
         taken.bind((LOOPBACK, 0))
         data_sent = line(doctor("--connect", f"udpin:{LOOPBACK}:{taken.getsockname()[1]}"))
-    assert "companion run" in data_sent
+    assert "companion run" in data_sent and data_sent.count(LOOPBACK) == 1
 
 
 def test_missing_or_forbidden_device_is_one_sentence() -> None:
@@ -138,6 +138,19 @@ def test_missing_or_forbidden_device_is_one_sentence() -> None:
         doctor("--connect", "serial:/dev/ttyNONE:57600")
     )
     assert "dialout" in command._advice(PermissionError(13, "Permission denied"))
+
+
+@pytest.mark.parametrize(
+    ("link", "expected"),
+    [
+        ("tcp:127.0.0.1:1", "Connection refused; start the program that listens there, or give another port"),
+        ("serial:/tmp:57600", "not a serial line; see `ls /dev/serial/by-id`"),
+        ("serial:/dev/null:57600", "not a serial line; see `ls /dev/serial/by-id`"),
+        ("udpin:192.0.2.1:14550", "this computer has no address 192.0.2.1 at present"),
+    ],
+)
+def test_a_link_that_cannot_be_opened_is_one_sentence(link: str, expected: str) -> None:
+    assert line(doctor("--connect", link)) == f"companion: {link}: {expected}"
 
 
 def test_tcp_listener_without_a_peer_times_out(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -100,3 +100,28 @@ def test_an_autopilot_that_does_not_sign_is_reported(
 def test_the_key_is_not_sent_over_a_network(tmp_path: Path) -> None:
     done = init(tmp_path / "key", "--connect", "udpin:0.0.0.0:14550")
     assert done.exit_code == 1 and "in plain" in done.output
+
+
+def test_a_key_that_cannot_be_written_is_one_sentence(tmp_path: Path) -> None:
+    path = tmp_path / "absent" / "key"
+    assert str(init(path, "--no-autopilot").exception) == (
+        f"--key-file {path}: the key cannot be written (No such file or directory): give a file in a folder "
+        "that exists and that you may write"
+    )
+    assert str(init(tmp_path, "--no-autopilot").exception).startswith(
+        f"--key-file {tmp_path}: the signing key cannot be read (Is a directory)"
+    )
+
+
+def test_an_invalid_link_writes_no_key(tmp_path: Path) -> None:
+    done = init(tmp_path / "key", "--no-autopilot", "--connect", "nothing")
+    assert str(done.exception).startswith("link.connect: 'nothing' is not a connection string")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_link_that_cannot_be_opened_is_one_sentence(tmp_path: Path) -> None:
+    done = init(tmp_path / "key", "--connect", f"tcp:{HOST}:1")
+    assert str(done.exception) == (
+        f"companion: tcp:{HOST}:1: Connection refused; start the program that listens there, or give another "
+        "port"
+    )
