@@ -23,6 +23,7 @@ Buffer: TypeAlias = Any
 HEAD = b"\xa3\x95"
 _FORMAT, _FORMAT_SIZE = 128, 89
 _FORMAT_LAYOUT = struct.Struct("<BB4s16s64s")
+_FORMAT_CELLS = 4  # of a FMT line, at least: type, length, name, format
 _MAX_LINE = 4096
 _GAP = 8  # bytes of damage between two messages that confirm each other
 
@@ -166,14 +167,18 @@ def _text_messages(data: Buffer, names: Collection[str], damage: Damage) -> Iter
         name, *cells = (cell.strip() for cell in line.split(","))
         try:
             if name == "FMT":
+                if len(cells) < _FORMAT_CELLS:
+                    raise ValueError(f"a FMT of {len(cells)} values (at least {_FORMAT_CELLS})")
                 layouts[cells[2]] = cells[3], tuple(cells[4:])
-            elif name in names:
+            elif name in names and name in layouts:
                 codes, columns = layouts[name]
                 if name == "MSG":  # its text may contain commas
                     cells[len(columns) - 1 :] = [", ".join(cells[len(columns) - 1 :])]
+                if len(cells) != len(codes):
+                    raise ValueError(f"{name} of {len(cells)} values (its FMT has {len(codes)})")
                 values = [_parse_cell(code, cell) for code, cell in zip(codes, cells, strict=True)]
                 yield FoundMessage(place, name, SimpleNamespace(**dict(zip(columns, values))))
-            elif cells and layouts and name not in layouts:
+            elif name in names or (cells and layouts and name not in layouts):
                 damage.add(f"byte {place}", len(line) + 1, "a line of an undefined message")
         except (ValueError, KeyError, IndexError) as error:
             damage.add(f"byte {place}", len(line) + 1, one_line(error))

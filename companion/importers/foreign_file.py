@@ -11,6 +11,9 @@ from __future__ import annotations
 
 import heapq
 import mmap
+import struct
+import zipfile
+import zlib
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
@@ -27,6 +30,9 @@ MAX_STEP_US = 60_000_000
 MAX_BACK_US = 1_000_000  # a larger decrease of the boot time is a reboot
 MAX_BOOT_US = 10**13  # 115 days
 ORDER_NS = 2 * SECOND_NS  # loggers write topics out of order by less
+
+_OF_A_FILE = (ValueError, OSError, EOFError, struct.error, zipfile.BadZipFile, zlib.error)
+"""What readers raise for damaged content; the texts need no type."""
 
 T = TypeVar("T")
 
@@ -100,8 +106,14 @@ def usable(path: Path, records: Iterable[Stamped], damage: Damage) -> Iterator[S
 
 
 def one_line(error: Exception) -> str:
-    """Return an exception's text on one line, its type if it has none."""
+    """Describe an exception on one line: what a file lacks, or the text; the type of an unexpected one."""
     text = " ".join(str(error).split())[:200]
+    if isinstance(error, AttributeError) and error.name:
+        return f"no column {error.name}"
+    if isinstance(error, KeyError):
+        return f"{text} is missing"
+    if text and isinstance(error, _OF_A_FILE):
+        return text
     return f"{type(error).__name__}: {text}" if text else type(error).__name__
 
 

@@ -45,6 +45,7 @@ _TABLES = str(Path(__file__).with_name("matlab_tables.py"))
 _COMPRESSED = 15  # miCOMPRESSED
 _BYTE_ORDERS = {b"IM": "<", b"MI": ">"}
 _MAX_LINE = 1000
+_ENCRYPTED = 1  # bit of the flags of a ZIP member
 _WIDTHS = {"IMU": 8, "GPSraw": 7, "GPOSonboard": 7}
 
 
@@ -65,7 +66,9 @@ def read_matlab(path: Path) -> Recording:
     try:
         _reject_bomb(path)
     except zlib.error as error:
-        raise LogError(f"{path} is not a MATLAB file: {one_line(error)}") from None
+        raise LogError(
+            f"{path} is no MATLAB file, or is damaged ({one_line(error)}): copy the recording again"
+        ) from None
     tables = _matlab_tables(path)
     if sum(len(tables[name]) for name in dataflash.NAMES if name in tables) > MAX_ROWS:
         raise LogError(f"{path}: its tables have more than {MAX_ROWS} rows")
@@ -93,7 +96,8 @@ def _matlab_tables(path: Path) -> dict[str, Any]:
         why = lines[-1] if error.returncode > 0 and lines else "its reader failed on it"
     except (ValueError, OSError, zipfile.BadZipFile) as error:
         why = str(error)
-    raise LogError(f"{path} is not a MATLAB file: {' '.join(why.split())[:200]}")
+    why = " ".join(why.split())[:200]
+    raise LogError(f"{path} is no MATLAB file, or is damaged ({why}): copy the recording again")
 
 
 def _reject_bomb(path: Path) -> None:
@@ -172,8 +176,13 @@ def _table(path: Path, name: str, width: int, max_rows: int) -> Floats:
         raise LogError(f"{path}: no such log") from None
     except KeyError:
         raise LogError(f"{path} has no {member}: it needs {', '.join(f'{n}.txt' for n in _WIDTHS)}") from None
+    except zipfile.BadZipFile:
+        raise LogError(f"{path} is no ZIP archive, or is incomplete: copy the recording again") from None
+    except UserWarning:
+        raise LogError(f"{path}: {member} is empty: it needs at least 2 rows of {width} columns") from None
     except Exception as error:  # a damaged archive raises many different exceptions
-        raise LogError(f"{path} is damaged in {member}: {one_line(error)}") from None
+        why = one_line(error).partition("; use `usecols`")[0]
+        raise LogError(f"{path} is damaged in {member}: {why}") from None
     if len(table) > max_rows:
         raise LogError(f"{path}: its tables have more than {MAX_ROWS} rows")
     if not np.isfinite(table).all() or np.abs(table).max(initial=0.0) > MAX_NUMBER:
@@ -202,6 +211,8 @@ def _read_member(path: Path, member: str) -> bytes:
     else:
         with open_regular(path) as whole, zipfile.ZipFile(whole) as archive:
             found = archive.getinfo(member)
+            if found.flag_bits & _ENCRYPTED:
+                raise LogError(f"{path}: {member} is encrypted: pack it without a password")
             # the others are not decompressed in steps: they expand without a limit
             if found.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
                 raise LogError(f"{path}: {member} is compressed by another method than Deflate")

@@ -42,4 +42,4 @@ if __name__ == "__main__":
     try:
         main(sys.argv[1], int(sys.argv[2]), sys.argv[3:])
     except Exception as error:  # scipy raises many different exceptions
-        sys.exit(f"{type(error).__name__}: {error}")
+        sys.exit(str(error) or type(error).__name__)

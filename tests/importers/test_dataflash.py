@@ -212,6 +212,18 @@ def test_log_with_one_number_that_is_not_finite_is_read(tmp_path: pathlib.Path) 
     assert [type(record) for record in records if record is not rejection] == EVERY
 
 
+def test_damaged_lines_are_reported_without_the_types_of_python(tmp_path: pathlib.Path) -> None:
+    for line, why in (
+        ("FMT, 1, 2", "a FMT of 2 values (at least 4)"),
+        ("FMT, 1, 2, ATT, ff, Roll, Yaw\nATT, 1", "ATT of 1 values (its FMT has 2)"),
+        ("FMT, 1, 2, ATT, ff, Roll, Yaw\nGPS, 1, 2", "a line of an undefined message"),
+    ):
+        path = write(tmp_path, f"{line}\n".encode(), name="flight.log")
+        with pytest.raises(LogError) as caught:
+            list(sources.open_source(path))
+        assert str(caught.value).endswith(f": {why}"), line
+
+
 def test_text_and_binary_logs_agree(tmp_path: pathlib.Path) -> None:
     lines = ["FMT, 128, 89, FMT, BBnNZ, Type,Length,Name,Format,Columns"]
     lines += [f"FMT, {TYPES[n]}, 50, {n}, {lay}, {col}" for n, (lay, col) in FORMATS.items()]

@@ -146,10 +146,13 @@ def test_missing_and_damaged_tables_are_reported(tmp_path: pathlib.Path) -> None
     lacking = {name: text for name, text in tables().items() if name != "GPSraw.txt"}
     narrow = tables() | {"IMU.txt": "1 2 3\n4 5 6\n"}
     damaged = tables() | {"IMU.txt": "1 2 three\n"}
+    ragged = tables() | {"IMU.txt": "1 2 3\n4 5\n"}
     for members, words in (
         (lacking, "has no GPSraw.txt"),
         (narrow, "has 2 rows of 3 columns"),
-        (damaged, "damaged in IMU"),
+        (damaged, r"damaged in IMU\.txt: could not convert string 'three'"),
+        (ragged, "the number of columns changed from 3 to 2 at row 2$"),
+        (tables() | {"IMU.txt": ""}, r"IMU\.txt is empty: it needs at least 2 rows of 8 columns$"),
     ):
         with pytest.raises(LogError, match=words) as caught:
             sources.open_source(zipped(tmp_path / "log.zip", members))
@@ -157,6 +160,29 @@ def test_missing_and_damaged_tables_are_reported(tmp_path: pathlib.Path) -> None
     savemat(tmp_path / "other.mat", {"x": np.ones(3)})
     with pytest.raises(LogError, match="has no ArduPilot table"):
         sources.open_source(tmp_path / "other.mat")
+
+
+def test_a_damaged_archive_is_reported_without_the_types_of_python(tmp_path: pathlib.Path) -> None:
+    path = zipped(tmp_path / "log.zip", tables())
+    whole, entry = path.read_bytes(), path.read_bytes().index(b"PK\x01\x02")
+    encrypted = bytearray(whole)
+    encrypted[entry + 8] |= 1
+    for content in (b"no archive", whole[: len(whole) // 2], b"abcd" + whole[4:]):
+        path.write_bytes(content)
+        with pytest.raises(LogError) as caught:
+            sources.open_source(path)
+        assert str(caught.value) == f"{path} is no ZIP archive, or is incomplete: copy the recording again"
+    path.write_bytes(encrypted)
+    with pytest.raises(LogError, match=r"\.txt is encrypted: pack it without a password"):
+        sources.open_source(path)
+    mat = tmp_path / "log.mat"
+    savemat(mat, {"IMU": np.ones((2, 3)), "IMU_label": labels("LineNo TimeMS GyrX")})
+    mat.write_bytes(mat.read_bytes()[:-60])
+    with pytest.raises(LogError, match=r"damaged \(could not read bytes\): copy the recording again$"):
+        sources.open_source(mat)
+    savemat(mat, {"GPS": np.ones((2, 2)), "GPS_label": labels("TimeMS Status")})
+    with pytest.raises(LogError, match="nothing could be read: GPS at 1000 us: no column"):
+        list(sources.open_source(mat))
 
 
 def test_rows_of_text_tables_are_limited_in_total(tmp_path: pathlib.Path) -> None:
@@ -196,5 +222,5 @@ def test_a_damaged_matlab_file_that_ends_its_reader_is_rejected(tmp_path: pathli
     at = data.index(b"\x09\x00\x00\x00\x30\x00\x00\x00")  # miDOUBLE, 48 bytes
     data[at] = 8
     path.write_bytes(data)
-    with pytest.raises(LogError, match="is not a MATLAB file: its reader failed on it"):
+    with pytest.raises(LogError, match=r"is no MATLAB file, or is damaged \(its reader failed on it\)"):
         sources.open_source(path)
