@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import os
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import CancelledError
@@ -21,6 +22,9 @@ Job = TypeVar("Job")
 
 RETRIES = 3  # worker losses per job before it counts as failed
 WORKER_LOST = "worker lost"
+SILENT = "100"  # a level above critical: what Dask loses is stated by `run_jobs`
+#: The variable of the environment, which workers inherit, leaves the level of the last two unchanged.
+DASK_LOGGERS = ("distributed", "distributed.client", "distributed.gc")
 #: One thread of linear algebra a worker. Dask's own MALLOC_TRIM_THRESHOLD_ is left out: by it every array of
 #: more than 128 KiB goes back to the kernel, and a third of a flight's time into page faults.
 ENVIRONMENT = {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
@@ -53,7 +57,7 @@ def run_jobs(
     if scheduler is None and workers == 0:
         yield from (FinishedJob(key, work(job)) for key, job in jobs.items())
         return
-    os.environ.setdefault("DASK_LOGGING__DISTRIBUTED", "100")  # above critical: what it loses is stated here
+    quiet = os.environ.setdefault("DASK_LOGGING__DISTRIBUTED", SILENT) == SILENT
     with interrupt.held():  # an interrupted import ends in another error
         try:
             from dask import config
@@ -61,6 +65,8 @@ def run_jobs(
         except ImportError:
             missing = missing_package("work by many processes", "Dask", extra)
             raise ValueError(f"{missing}, or use --workers 0") from None
+    for name in DASK_LOGGERS if quiet else ():
+        logging.getLogger(name).setLevel(int(SILENT))
     finished: SimpleQueue[Future | None] = SimpleQueue()  # None: interrupted
     noted = interrupt.passed_to(lambda: finished.put(None))
     with ExitStack() as stack:
