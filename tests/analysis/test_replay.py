@@ -2,8 +2,10 @@
 
 import errno
 import json
+import re
 import shutil
 from collections import Counter
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -226,3 +228,31 @@ def test_replay_that_fails_keeps_the_older_one(tmp_path: Path, monkeypatch: pyte
         " run the command again"
     )
     assert output.read_bytes() == before
+
+
+@pytest.mark.parametrize("changes", [(), ("--with", "gnss.sigma_m=3")])
+def test_messages_lost_on_a_disk_that_recovers_are_stated(
+    changes: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log, output = tmp_path / "log.mcap", tmp_path / "out.mcap"
+    replayed(CUT, log)
+    write, fails = DiskFile.write, True
+
+    def full(self: DiskFile, at: int, data: bytes) -> None:
+        if fails and at > 10_000:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        write(self, at, data)
+
+    def recover(writer: flight_log.Writer, finish: bool = True) -> bool:
+        nonlocal fails
+        fails = False
+        return close(writer, finish=finish)
+
+    close = flight_log.Writer.close
+    monkeypatch.setattr(DiskFile, "write", full)
+    monkeypatch.setattr(flight_log.Writer, "close", recover)
+    short = partial(flight_log.Writer, depth=30_000, chunk_bytes=2000)
+    monkeypatch.setattr(replay.flight_log, "Writer", short)
+    done = CliRunner().invoke(replay.command, [str(log), "-o", str(output), *changes])
+    lost = re.search(rf"  (\d+) messages were lost while {output} could not be written", done.stdout)
+    assert lost and int(lost[1]) > 0, done.output
