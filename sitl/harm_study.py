@@ -204,14 +204,15 @@ def fly(order: HarmOrder) -> HarmResult:
             world, solutions, events, set_2, t_fix = flown(scenario_of(order), order)
         excluded = any(event.text.startswith(_EXCLUDED) for event in events)
         fixes = [r for r in world.streams[Gnss] if isinstance(r, Gnss) and r.has_3d_fix]
-        ours, its = world.horizontal_errors(solutions), world.horizontal_errors(fixes)
+        ours = beside_fixes(*world.horizontal_errors(solutions), t_fix)
+        its = world.horizontal_errors(fixes)
         suspected = sorted({found[1] for event in events if (found := _SUSPECTED.match(event.text))})
         return HarmResult(
             *order[:3],
             excluded,
             set_2,
-            ratio=worst_ratio(*_from(0.0, *beside_fixes(*ours, t_fix), *its)),
-            since=worst_ratio(*_from(START_S, *beside_fixes(*ours, t_fix), *its)),
+            ratio=worst_ratio(*_from(0.0, ours, its)),
+            since=worst_ratio(*_from(START_S, ours, its)),
             suspected=tuple(suspected),
         )
     except Exception as error:  # the study goes on and lists it
@@ -284,13 +285,15 @@ def beside_fixes(t: Floats, error: Floats, t_fix: Floats) -> tuple[Floats, Float
     A solution at the time of a fix is from before it. Parameters: times (n,) s, errors (n,) m, and times (m,)
     s of the fixes that arrived.
     """
-    last = np.concatenate(([-math.inf], np.sort(t_fix)))[np.searchsorted(np.sort(t_fix), t)]
+    t_fix = np.sort(t_fix)
+    last = np.concatenate(([-math.inf], t_fix))[np.searchsorted(t_fix, t)]
     there = t - last <= SILENT_S
     return t[there], error[there]
 
 
-def _from(start_s: float, t: Floats, error: Floats, t_gnss: Floats, error_gnss: Floats) -> tuple[Floats, ...]:
+def _from(start_s: float, ours: tuple[Floats, Floats], its: tuple[Floats, Floats]) -> tuple[Floats, ...]:
     """Cut both series to the time from `start_s` on."""
+    (t, error), (t_gnss, error_gnss) = ours, its
     now, its_now = t >= start_s, t_gnss >= start_s
     return t[now], error[now], t_gnss[its_now], error_gnss[its_now]
 
