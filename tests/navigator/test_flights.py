@@ -331,9 +331,8 @@ def test_without_gnss_a_false_airspeed_must_be_taken_out_of_use(gnss_until: floa
     assert all(len(FALSE_AIRSPEED + name) <= 50 for name in USE_AIRSPEED.values())  # one STATUSTEXT
 
 
-@pytest.mark.parametrize(
-    "channel", ["imu", *(pytest.param(c, marks=pytest.mark.long) for c in ("ins", "air"))]
-)
+@pytest.mark.long
+@pytest.mark.parametrize("channel", ["imu", "ins", "air"])
 def test_a_false_velocity_of_gnss_is_excluded_and_its_position_stays_in_use(channel: str) -> None:
     """Off by 2.2 m/s from 120 s to 210 s."""
     begin, end = 120.0, 210.0
@@ -422,9 +421,8 @@ def test_a_gnss_that_stops_is_no_step_of_the_output(channel: str) -> None:
 SHORT = (Leg(5, 40, 0, 0), Leg(55, 40, 38, 40), Leg(30, 40, 38, 40), Leg(60, 130, 34, 40))
 
 
-@pytest.mark.parametrize(
-    "channel", ["imu", *(pytest.param(c, marks=pytest.mark.long) for c in ("ins", "air"))]
-)
+@pytest.mark.long
+@pytest.mark.parametrize("channel", ["imu", "ins", "air"])
 def test_the_claims_are_consistent(channel: str) -> None:
     """Normalised squared errors over seeds, with GNSS and 20 s after its loss without any fix."""
     seeds, at = range(8), (100.0, 135.0)

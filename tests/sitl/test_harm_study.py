@@ -93,7 +93,8 @@ def test_a_mems_ins_stated_as_navigation_grade_does_not_exclude_gnss(wrong):
 
 
 @pytest.mark.flight
-@pytest.mark.parametrize("channel", ["INS navigation", pytest.param("stock", marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("channel", ["INS navigation", "stock"])
 def test_a_velocity_of_gnss_that_lags_its_positions_does_not_exclude_it(channel):
     """As of ArduPilot's simulator: excluded before, 13 m (stock) and 130 m (INS) beside a right GNSS."""
     assert fly(HarmOrder("GNSS velocity 0.3 % too small", channel, 1, 10.0)).passed

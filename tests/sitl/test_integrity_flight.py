@@ -111,7 +111,8 @@ def drawn_off_gently(scenario: str) -> FlightResult:
     return fly_order(FlightOrder(scenario, "gnss-accelerate", 1))
 
 
-@pytest.mark.parametrize("scenario", [pytest.param("one-beacon", marks=pytest.mark.long), "two-beacons"])
+@pytest.mark.long
+@pytest.mark.parametrize("scenario", ["one-beacon", "two-beacons"])
 def test_gnss_that_is_drawn_off_gently_is_found_beside_an_ins(scenario: str) -> None:
     """It was taken for a coarser INS, and excluded once it was honest again."""
     result = drawn_off_gently(scenario)
@@ -125,9 +126,8 @@ def test_gnss_that_is_drawn_off_gently_is_found_beside_an_ins(scenario: str) -> 
 NOT_REACHED = pytest.mark.xfail(strict=True, raises=AssertionError, reason="78 m: docs/limits.md")
 
 
-@pytest.mark.parametrize(
-    "scenario", [pytest.param("one-beacon", marks=(NOT_REACHED, pytest.mark.long)), "two-beacons"]
-)
+@pytest.mark.long
+@pytest.mark.parametrize("scenario", [pytest.param("one-beacon", marks=NOT_REACHED), "two-beacons"])
 def test_gnss_that_is_drawn_off_gently_is_found_within_60_m(scenario: str) -> None:
     assert drawn_off_gently(scenario).largest_m < 60.0
 

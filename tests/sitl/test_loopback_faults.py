@@ -220,6 +220,7 @@ def test_autopilot_filter_reset_of_forty_metres(tmp_path: Path, outages) -> None
     flown.assert_events(r"120\.\d inertial channel: jumped by 40", r"180\.\d inertial channel: jumped by 40")
 
 
+@pytest.mark.long
 def test_air_data_channel_ignores_local_position_resets(tmp_path: Path) -> None:
     fault = Fault("ins-reset", 120.0, 180.0, 40.0)
     calm, shaken = (
