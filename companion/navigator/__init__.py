@@ -20,6 +20,7 @@ from companion.config import Config, parse
 from companion.estimate import bank as banks
 from companion.navigator import minimax_bound
 from companion.navigator.changes import Changes
+from companion.navigator.fixes import is_too_soon
 from companion.navigator.hypotheses import Model
 from companion.navigator.measurements import other_receiver
 from companion.navigator.own_channel import OwnChannel
@@ -28,7 +29,7 @@ from companion.navigator.progress import SILENT_INS_NS, births_due, with_births
 from companion.navigator.receiver_choice import ReceiverChoice
 from companion.navigator.solution import is_bound_due, refresh_bound, resolve_pending, solve
 from companion.navigator.stale_data import REPORT_EVERY, StaleDataDetector
-from companion.navigator.state import Settings, State, Step, is_new_fix
+from companion.navigator.state import Settings, State, Step
 from companion.navigator.step import INPUTS_USED, uses
 from companion.plausibility import ImplausibleField, implausible_field
 from companion.records import (
@@ -107,6 +108,7 @@ class Navigator:
         self._gnss_latency_ns = round(1e9 * config.gnss.latency_s)
         self._stale_data = StaleDataDetector()
         self._receivers = ReceiverChoice(config)
+        self._last_fix: Gnss | None = None  # the last new one, used or not
         self._last_solution_ns = 0
         self._rejected_ns: dict[str, int] = {}  # when an implausible record was last reported, by kind
         self._channel_reported = False
@@ -144,7 +146,7 @@ class Navigator:
         if isinstance(record, Gnss):
             is_used, changes = self._receivers.takes(record)
             self._deferred += changes
-            if not is_used or not is_new_fix(record, self.state):
+            if not is_used or not self._is_wanted(record):
                 return []
         self._is_settled = False
         outputs, self._deferred = self._deferred, []
@@ -197,6 +199,17 @@ class Navigator:
         self._roll_back_ns = 0
         while self._newest is not None and (self._waiting or self._roll_back is not None):
             self._deferred += self._fold_again(self._newest)
+
+    def _is_wanted(self, record: Gnss) -> bool:
+        """Whether a fix is new, and would be used: most are late, and each costs a roll-back.
+
+        An autopilot repeats its receiver's last one.
+        """
+        last = self._last_fix
+        if last is not None and last.receiver == record.receiver and record.repeats(last):
+            return False
+        self._last_fix = record
+        return record.has_3d_fix and not is_too_soon(record, self.state, self._settings)
 
     def _reject_implausible(self, record: Input, fault: ImplausibleField) -> list[Output]:
         """Report it once a second."""

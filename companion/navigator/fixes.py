@@ -39,9 +39,7 @@ MEAN_S = 60.0  # of the estimated velocity error, for GNSS latency
 def gnss(state: State, record: Gnss, settings: Settings) -> Step:
     """Use a fix of GNSS: position and velocity are measurements of the bank."""
     config, last = settings.config.gnss, state.gnss_taken
-    state = state._replace(gnss=record)
-    since = math.inf if last is None else (record.t_ns - last.t_ns) * 1e-9
-    if not record.has_3d_fix or since < config.every_s:
+    if not record.has_3d_fix or is_too_soon(record, state, settings):
         return state, []
     first_ns = record.t_ns if state.gnss_first_ns is None else state.gnss_first_ns
     state = _begun(state._replace(gnss_first_ns=first_ns), record, settings)
@@ -84,6 +82,12 @@ def gnss(state: State, record: Gnss, settings: Settings) -> Step:
         gnss_ns=record.t_ns, gnss_fix=(record, nominal.point), level=level, pending=pending
     )
     return nearer(state, settings), out
+
+
+def is_too_soon(record: Gnss, state: State, settings: Settings) -> bool:
+    """Whether the last fix that was used is too close: fixes are used every `gnss.every_s`."""
+    last = state.gnss_taken
+    return last is not None and (record.t_ns - last.t_ns) * 1e-9 < settings.config.gnss.every_s
 
 
 def _latency_velocity(state: State, t_ns: int) -> tuple[State, Vector2]:

@@ -91,7 +91,6 @@ class State(NamedTuple):
     moved: Vector2 = (0.0, 0.0)  # sum of the jumps of the nominal trajectory, north and east (m)
     scatter: Mapping[str, Scatter] = MappingProxyType({})  # of the measurements, by name
     parallel: Parallel | None = None  # filters beside the bank
-    gnss: Gnss | None = None  # the last new one, used or not
     gnss_taken: Gnss | None = None  # the last one judged by the bank
     gnss_fix: tuple[Gnss, Point] | None = None  # the last one believed
     pending: Pending | None = None
@@ -105,12 +104,6 @@ class State(NamedTuple):
 
 
 Step = tuple[State, list[Output]]
-
-
-def is_new_fix(record: Gnss, state: State) -> bool:
-    """Whether this is a new fix: an autopilot repeats its receiver's last one."""
-    last = state.gnss
-    return last is None or last.receiver != record.receiver or not record.repeats(last)
 
 
 def hypotheses(state: State, settings: Settings) -> Hypotheses:

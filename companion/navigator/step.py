@@ -71,7 +71,7 @@ def _reboot(state: State, record: Reboot, settings: Settings) -> Step:
     why = f"autopilot {record.system} rebooted"
     restarted = state.nominal is not None and record.t_ns < state.nominal.t_ns - SECOND_NS  # a log's clock
     if isinstance(settings.model.channel, OwnChannel) and not restarted:
-        state = state._replace(sensors=Sensors(), gnss=None, gnss_fix=None, local=None)
+        state = state._replace(sensors=Sensors(), gnss_fix=None, local=None)
         return state, [Reset(record.t_ns, record.rx_ns, "sensors", why)]
     return State()._replace(next_ns=state.next_ns), [Reset(record.t_ns, record.rx_ns, "navigator", why)]
 

@@ -30,6 +30,12 @@ def fix(receiver: int, t: float, kind: int, north_m: float = 0.0) -> Gnss:
     return Gnss(at, at, receiver, ms, kind, lat, LON, 300.0, v_n=(20.0, 0.0, 0.0), sigma_horizontal=1.0)
 
 
+def shaken(t: float) -> list[Any]:
+    """Samples of the IMU of the same aircraft."""
+    at, shake = round(t * SECOND_NS), 1e-4 * math.sin(20.0 * t)
+    return [Imu(at, at, 0, (shake, 0.0, -G0), (0.0, 0.0, shake)), Attitude(at, at, shake, 0.0, 0.0)]
+
+
 def chosen(first: Fix, second: Fix, until: float) -> list[tuple[float, str]]:
     """Changes of the receiver in use, with five reports a second of the first and two of the second."""
     choice, found = ReceiverChoice(CONFIG), []
@@ -157,9 +163,7 @@ def test_each_change_of_the_receiver_makes_the_drift_of_gnss_unknown_again(
     navigator = Navigator(load(flags={"output.profile": "ardupilot", "gnss.every_s": 1.0}, environment={}))
     for k in range(20 * 90):
         t = 0.05 * k
-        at = round(t * SECOND_NS)
-        shake = 1e-4 * math.sin(k)
-        records = [Imu(at, at, 0, (shake, 0.0, -G0), (0.0, 0.0, shake)), Attitude(at, at, shake, 0.0, 0.0)]
+        records = shaken(t)
         if k % 4 == 1:
             records.append(fix(0, t, 1 if 30.0 <= t < 60.0 else 3))
         if k % 10 == 3:
@@ -169,10 +173,31 @@ def test_each_change_of_the_receiver_makes_the_drift_of_gnss_unknown_again(
     assert [round(t) for t in renewed] == [31, 65]
 
 
-def test_a_repeated_fix_is_new_from_another_receiver_only() -> None:
-    navigator = Navigator(CONFIG)
-    one = fix(0, 1.0, 3)
-    navigator.handle(one)
-    before = navigator.state
-    navigator.handle(structs.replace(one, t_ns=one.t_ns + 1, rx_ns=one.rx_ns + 1))
-    assert navigator.state.gnss is before.gnss
+def test_a_repeated_fix_is_not_used_again() -> None:
+    navigator = Navigator(load(flags={"output.profile": "ardupilot", "gnss.every_s": 0.0}, environment={}))
+    first, second = fix(0, 2.0, 3), fix(0, 2.3, 3)
+    repeated = structs.replace(first, t_ns=first.t_ns + SECOND_NS // 10)
+    taken = []
+    for k in range(60):
+        for record in shaken(0.05 * k):
+            navigator.handle(record)
+        for record in (first, repeated, second):
+            if record.t_ns == round(0.05 * k * SECOND_NS):
+                navigator.handle(record)
+                taken.append(navigator.state.gnss_taken)
+    assert taken == [first, first, second]
+
+
+def test_fixes_that_are_not_used_cost_no_roll_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An autopilot's fixes are 0.1 to 0.2 s late: each was a roll-back, five a second instead of two."""
+    navigator, rewound = Navigator(CONFIG), list[float]()
+    begin = Navigator._begin_roll_back
+    monkeypatch.setattr(Navigator, "_begin_roll_back", lambda self: rewound.append(t) or begin(self))
+    for k in range(20 * 30):
+        t = 0.05 * k
+        for record in shaken(t):
+            navigator.handle(record)
+        if k % 4 == 3:
+            navigator.handle(structs.replace(fix(0, t - 0.14, 3), rx_ns=round(t * SECOND_NS)))
+    assert navigator.state.gnss_taken is not None
+    assert 45 <= len(rewound) <= 60
