@@ -147,7 +147,8 @@ def create_replay_log(
 ) -> Iterator[flight_log.Writer]:
     """Create a log for a replay, which waits for the disk instead of dropping messages, and close it.
 
-    After an exception it stays ".active": it is incomplete, and an older log of its name is kept.
+    If the disk failed for a while and recovered, the number of lost messages is stated on stderr. After an
+    exception the log stays ".active": it is incomplete, and an older log of its name is kept.
     Raises LogError if the disk fails, and unless the name is that of a log: no other command would read it.
     """
     if path.suffix != ".mcap":
@@ -163,6 +164,9 @@ def create_replay_log(
         raise
     if not sink.close():
         raise LogError(f"{sink.trouble}; {path}{ACTIVE} is incomplete: run the command again")
+    if sink.dropped:
+        lost = f"{sink.dropped} messages were lost while {path} could not be written: run the command again"
+        click.echo(f"companion: {printable(lost)}", err=True)
 
 
 def derived_metadata(config: Config, by: str, log: Path) -> dict[str, dict[str, str]]:
@@ -232,13 +236,13 @@ def command(
         reject_own_input(output, log, beacons, config_file, *tables)
         reject_other_flight(output)
     if output is None or as_flown:
-        found, more = _replay_as_flown(log, output, config)
+        found = _replay_as_flown(log, output, config)
     else:
         with input_errors_as_log_errors():
             found, more, counts = _replay_changed(
                 log, output, config, beacons, tables, simulated_outages, seed
             )
-    notes += more
+        notes += more
     seconds = time.perf_counter() - start
     if as_json:
         report = {"log": str(log), **counts, **found._asdict(), "notes": notes, "seconds": round(seconds, 3)}
@@ -252,8 +256,8 @@ def command(
         raise SystemExit(1)
 
 
-def _replay_as_flown(log: Path, output: Path | None, config: Config) -> tuple[ReplayResult, list[str]]:
-    """Replay our own log unchanged. Return result and notes."""
+def _replay_as_flown(log: Path, output: Path | None, config: Config) -> ReplayResult:
+    """Replay our own log unchanged."""
     first = next(iter(flight_log.read(log)), None)
     if first is None:
         raise LogError(f"{log} contains no messages: nothing to replay")
@@ -266,7 +270,7 @@ def _replay_as_flown(log: Path, output: Path | None, config: Config) -> tuple[Re
         found = replay_own(log, config, sink)
     if not found.inputs:
         raise LogError(f"{log} contains no inputs of a navigator: nothing to replay")
-    return found, _lost_messages(sink)
+    return found
 
 
 def _replay_changed(
@@ -291,7 +295,7 @@ def _replay_changed(
         analyses = [gnss_latency.analyze_track(track) for track in tracks.tracks()]
         for event in set(gnss_latency.glitch_events(analyses)) - logged:
             sink.record(event, "/link/Event")
-    notes = [*_lost_messages(sink), *([note] if note else [])]
+    notes = [note] if note else []
     if outages and config.uses("local_position") and not config.has_own_ins:
         notes.append(
             "the velocity in the log's local position includes the effect of the autopilot's own GNSS during "
@@ -301,14 +305,6 @@ def _replay_changed(
     late = (outage for outage in outages if outage.start > end_s)
     notes += [f"{outage} has no effect: the log ends at {end_s:.0f} s" for outage in late]
     return found, [*notes, *gnss_latency.describe_analyses(analyses)], log_inputs.summary()
-
-
-def _lost_messages(sink: flight_log.Writer | None) -> list[str]:
-    """Note the messages that a disk lost which failed for a while and recovered."""
-    if sink is None or not sink.dropped:
-        return []
-    why = f"while {sink.path} could not be written: run the command again"
-    return [f"{sink.dropped} messages were lost {why}"]
 
 
 def start_times(log: Path) -> tuple[int, int]:

@@ -12,6 +12,7 @@ import pytest
 from click.testing import CliRunner
 
 from companion.analysis import replay, smooth_command
+from companion.command_line import cli
 from companion.config import Config
 from companion.records import Event, Reboot, Reset
 from companion.storage import flight_log
@@ -230,12 +231,17 @@ def test_replay_that_fails_keeps_the_older_one(tmp_path: Path, monkeypatch: pyte
     assert output.read_bytes() == before
 
 
-@pytest.mark.parametrize("changes", [(), ("--with", "gnss.sigma_m=3")])
+@pytest.mark.parametrize(
+    "command",
+    [("replay", "LOG"), ("replay", "LOG", "--with", "gnss.sigma_m=3"), ("log", "convert", str(CUT))],
+    ids=["as flown", "changed", "converted"],
+)
 def test_messages_lost_on_a_disk_that_recovers_are_stated(
-    changes: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    command: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     log, output = tmp_path / "log.mcap", tmp_path / "out.mcap"
     replayed(CUT, log)
+    arguments = [str(log) if word == "LOG" else word for word in command]
     write, fails = DiskFile.write, True
 
     def full(self: DiskFile, at: int, data: bytes) -> None:
@@ -253,6 +259,6 @@ def test_messages_lost_on_a_disk_that_recovers_are_stated(
     monkeypatch.setattr(flight_log.Writer, "close", recover)
     short = partial(flight_log.Writer, depth=30_000, chunk_bytes=2000)
     monkeypatch.setattr(replay.flight_log, "Writer", short)
-    done = CliRunner().invoke(replay.command, [str(log), "-o", str(output), *changes])
-    lost = re.search(rf"  (\d+) messages were lost while {output} could not be written", done.stdout)
+    done = CliRunner().invoke(cli, [*arguments, "-o", str(output)])
+    lost = re.search(rf"(\d+) messages were lost while {output} could not be written", done.stderr)
     assert lost and int(lost[1]) > 0, done.output
