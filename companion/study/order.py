@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import click
 import numpy as np
+from click.core import ParameterSource
 from rich.table import Table
 
 from companion.analysis.replay_inputs import input_errors_as_log_errors, is_own_log, open_inputs
@@ -237,6 +238,14 @@ def command(
     """
     if (topic is None) != (field is None) or (topic and not file):
         raise click.UsageError("a column of a log needs FILE, --topic and --field")
+    if file and figures is None:
+        for option, name in (("--signal", "signal"), ("--samples", "count"), ("--seed", "seed")):
+            context = click.get_current_context()
+            if context.get_parameter_source(name) is not ParameterSource.DEFAULT:
+                raise click.UsageError(
+                    f"{option} {context.params[name]} has no effect on the samples of {file}:"
+                    f" leave out {option}, or leave out FILE to simulate samples"
+                )
     try:
         if file and topic and field:
             samples = read_log(file, topic, field, sigma)

@@ -84,6 +84,17 @@ def test_invalid_input_is_reported_in_one_sentence(tmp_path, text, options, mess
     assert message in " ".join(result.output.split())
 
 
+@pytest.mark.parametrize(("option", "value"), [("--signal", "cubic"), ("--samples", 50), ("--seed", 1)])
+def test_options_of_simulated_samples_beside_a_file_are_rejected(tmp_path, option, value):
+    file = tmp_path / "samples.csv"
+    file.write_text("".join(f"{k},{k}\n" for k in range(20)))
+    result = run(file, option, value)
+    assert result.exit_code == 2
+    assert f"{option} {value} has no effect on the samples of {file}: leave out {option}" in result.output
+    drawn = run(file, option, value, "--figures", tmp_path / "figures.png")
+    assert drawn.exit_code == 0, drawn.output  # of simulated samples
+
+
 def test_short_form_selects_nine_terms_for_a_cubic():
     data = json.loads((pathlib.Path(__file__).parents[1] / "data/map_and_order.json").read_text())["order"]
     t = np.linspace(0.0, 10.0, 101)
