@@ -235,6 +235,13 @@ def command(
             ]
     except ValueError as error:
         raise click.UsageError(str(error)) from None
+    if not outcomes:
+        windows, aheads = (" or ".join(f"{m:g}" for m in minutes) for minutes in (windows_min, aheads_min))
+        raise click.UsageError(
+            f"nothing to predict: in {file}, {recording.t_ns[-1] / SECOND_NS / 60.0:.3g} min long, no window"
+            f" of {windows} min has four samples and a measurement {aheads} min later: change --window-min or"
+            " --ahead-min"
+        )
     if as_json:
         click.echo(json.dumps([outcome._asdict() for outcome in outcomes]))
         return

@@ -77,6 +77,25 @@ def test_command():
 
 
 @pytest.mark.parametrize(
+    ("option", "value", "wanted"),
+    [
+        (
+            "--ahead-min",
+            "1000",
+            "no window of 20 or 30 or 60 min has four samples and a measurement 1000 min later",
+        ),
+        ("--window-min", "1000", "no window of 1000 min has"),
+        ("--window-min", "0.1", "no window of 0.1 min has"),
+    ],
+)
+def test_a_window_or_horizon_beyond_the_recording_is_rejected(option, value, wanted):
+    done = CliRunner().invoke(command, [str(FLIGHT), option, value])
+    assert done.exit_code == 2
+    assert f"nothing to predict: in {FLIGHT}, 304 min long, {wanted}" in done.stderr
+    assert "change --window-min or --ahead-min" in done.stderr
+
+
+@pytest.mark.parametrize(
     ("name", "content"),
     [
         ("empty.csv", b""),
