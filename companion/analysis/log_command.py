@@ -15,6 +15,7 @@ from companion.analysis.progress import show_step
 from companion.option_types import FloatRange
 from companion.printable import printable
 from companion.storage.flight_log import Info, info, recover
+from companion.storage.reader import LogError
 
 
 @click.group("log")
@@ -100,11 +101,17 @@ def export_command(log: Path, output: Path, every_s: float, config_file: Path | 
     from companion.analysis import export
     from companion.analysis.flights import open_flights
     from companion.analysis.output_guard import reject_any_log, reject_own_input
+    from companion.analysis.replay_inputs import has_navigator_outputs
     from companion.config import load
 
     export.check_suffix(output)
     reject_own_input(output, log, config_file)
     reject_any_log(output)
+    if config_file and has_navigator_outputs(log):
+        raise LogError(
+            f"--config {config_file} has no effect on {log}, which is exported as flown; replay it first:"
+            f" companion replay {log} --config {config_file} -o REPLAY.mcap, then export that"
+        )
     tracks, places = list[export.Track](), list[export.Place]()
     with show_step(f"read {log}"):
         flights = open_flights(log, load(config_file))

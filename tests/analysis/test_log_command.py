@@ -79,3 +79,14 @@ def test_text_of_a_log_cannot_control_the_terminal(tmp_path: Path) -> None:
     bad = tmp_path / "no\x1b[2J.mcap"
     bad.write_bytes(b"x")
     assert "\x1b" not in CliRunner().invoke(group, ["info", str(bad)]).stderr
+
+
+def test_export_of_a_log_as_flown_rejects_a_configuration(whole: bytes, tmp_path: Path) -> None:
+    log, file, output = tmp_path / "written.mcap", tmp_path / "mine.toml", tmp_path / "map.kml"
+    file.write_text("[gnss]\nsigma_m = 3.0\n")
+    done = CliRunner().invoke(group, ["export", str(log), "-o", str(output), "--config", str(file)])
+    assert isinstance(done.exception, LogError)
+    assert str(done.exception).startswith(
+        f"--config {file} has no effect on {log}, which is exported as flown"
+    )
+    assert not output.exists()
