@@ -231,7 +231,8 @@ def command(
         click.echo(f"companion: {printable(str(error))}", err=True)
         sys.exit(os.EX_UNAVAILABLE)
     except TimeoutError:
-        click.echo(f"companion: {address}: no peer connected within {CONNECT_TIMEOUT_S:g} s", err=True)
+        advice = "check the address, and that the other side runs"
+        click.echo(f"companion: {address}: no answer in {CONNECT_TIMEOUT_S:g} s; {advice}", err=True)
         sys.exit(os.EX_UNAVAILABLE)
     except OSError as error:
         click.echo(f"companion: {describe_open_error(address, error)}", err=True)

@@ -106,8 +106,8 @@ def _used_records(config: Config) -> frozenset[type]:
 #: What to do where nothing arrives, by the kind of the link.
 NOTHING_ARRIVES = {
     "serial": "check the wiring (TX to RX), the baud rate and the port's MAVLink protocol",
-    "udpin": "check the address and port that the other side sends to",
-    "tcpin": "nothing has connected",
+    "udpin": "check that the autopilot or router sends to this address and port, and the firewall",
+    "tcpin": "check that the autopilot or router connects to this address and port, and the firewall",
 }
 
 
@@ -119,8 +119,10 @@ def describe_silence(link: str, session: Session, has_bytes: bool) -> str:
     if senders := [f"{system}/{component}" for system, component in session.reader.counts]:
         return f"received only {', '.join(senders)}; check the autopilot's connection and link.system_id"
     if has_bytes:
-        return "bytes but no MAVLink received; check that both sides use the same baud rate"
+        return "bytes but no MAVLink received; check that the other side sends MAVLink, at the same baud rate"
     advice = NOTHING_ARRIVES.get(link.split(":")[0], "check the address, and that the other side runs")
+    if link.startswith(("udpin:127.", "tcpin:127.")):
+        advice += "; a loopback address is reached from this computer only"
     return f"no data received; {advice}"
 
 
