@@ -13,7 +13,12 @@ from companion.storage.reader import ACTIVE, LogError
 
 
 def reject_own_input(output: Path, *read: Path | None) -> None:
-    """Raise LogError if `output`, or the name it has while written, is an input file, also through a link."""
+    """Raise LogError if `output`, or the name it has while written, is an input file, also through a link.
+
+    An empty name is that of the current folder, and no name of a file.
+    """
+    if not output.name:
+        raise LogError(f"'{output}' as output is a folder: give the name of a file")
     names = [name for name in (output, output.with_name(output.name + ACTIVE)) if name.exists()]
     for path in read:
         if path is not None and path.exists() and any(name.samefile(path) for name in names):

@@ -70,7 +70,8 @@ def read_correctors(path: Path, start_ns: int) -> list[Stamped]:
         with path.open(newline="", encoding="utf-8") as file:
             rows = list(csv.reader(file))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise ValueError(f"{path}: cannot be read ({error})") from None
+        why = getattr(error, "strerror", None) or error
+        raise ValueError(f"{path}: cannot be read ({why})") from None
     header = tuple(name.strip() for name in rows[0]) if rows else ()
     build = TABLES.get(header)
     if build is None:

@@ -8,10 +8,11 @@ from collections import Counter
 from functools import partial
 from pathlib import Path
 
+import click
 import pytest
 from click.testing import CliRunner
 
-from companion.analysis import replay, smooth_command
+from companion.analysis import replay, report, smooth_command
 from companion.command_line import cli
 from companion.config import Config
 from companion.records import Event, Reboot, Reset
@@ -118,6 +119,14 @@ def test_input_log_is_not_overwritten(how: str, tmp_path: Path) -> None:
     assert isinstance(done.exception, LogError)
     assert str(done.exception) == f"{output} is an input (as {log}) and is not overwritten: give another name"
     assert log.read_bytes() == CUT.read_bytes()
+
+
+@pytest.mark.parametrize("command", [replay.command, report.command])
+@pytest.mark.parametrize("output", ["", "/"])
+def test_output_without_a_name_is_rejected(command: click.Command, output: str) -> None:
+    done = CliRunner().invoke(command, [str(CUT), "-o", output])
+    assert isinstance(done.exception, LogError)
+    assert str(done.exception) == f"'{output or '.'}' as output is a folder: give the name of a file"
 
 
 def test_own_log_is_not_overwritten_by_its_replay(tmp_path: Path) -> None:

@@ -50,3 +50,9 @@ def test_mistakes_are_reported(tmp_path, text, message):
     with pytest.raises(ValueError, match=r"correctors\.csv") as caught:
         read(tmp_path, text)
     assert message in str(caught.value)
+
+
+def test_missing_file_is_named_without_names_of_python(tmp_path):
+    with pytest.raises(ValueError) as caught:
+        list(read_correctors(tmp_path / "none.csv", 0))
+    assert str(caught.value) == f"{tmp_path / 'none.csv'}: cannot be read (No such file or directory)"
