@@ -220,9 +220,11 @@ def command(
     is set without --apply and confirmation, or while the vehicle is armed. Exit codes: 0 all is well, 1
     something is missing, 69 no autopilot found, 78 invalid configuration.
     """
+    if yes and not apply:
+        raise click.UsageError("--yes has no effect without --apply: add --apply, or leave --yes out")
     config = load(file, {"output.profile": profile}, pairs=pairs, preset=preset)
     try:
-        address = Address.parse(connect or config.link.connect[0])
+        address = Address.parse(config.link.connect[0] if connect is None else connect)
     except (ValueError, IndexError) as error:
         raise ConfigError(f"--connect: {error}") from None
     try:

@@ -144,6 +144,12 @@ def test_missing_or_forbidden_device_is_one_sentence() -> None:
     assert "dialout" in command._advice(PermissionError(13, "Permission denied"))
 
 
+def test_yes_without_apply_and_an_empty_link_are_rejected() -> None:
+    alone = doctor("--yes")
+    assert alone.exit_code == 2 and "--yes has no effect without --apply: add --apply" in alone.stderr
+    assert "'' is not a connection string" in str(doctor("--connect", "").exception)
+
+
 @pytest.mark.parametrize(
     ("link", "expected"),
     [
