@@ -23,6 +23,7 @@ from companion.analysis.live.scene import Scene
 from companion.option_types import FloatRange
 from companion.optional_dependencies import missing_package
 from companion.storage.reader import ACTIVE, LogError
+from companion.transport.connection import reason
 
 if TYPE_CHECKING:
     from websockets.asyncio.server import ServerConnection
@@ -275,9 +276,7 @@ def command(path: Path, listen: str, speed: float, foxglove: int | None) -> None
     except LogError:
         raise
     except OSError as error:
-        raise LogError(
-            f"cannot listen on {listen}: {error.strerror or error}; give another --listen"
-        ) from None
+        raise LogError(f"cannot listen on {listen}: {reason(error)}; give another --listen") from None
     finally:
         if bridge is not None:
             bridge.stop()

@@ -196,6 +196,12 @@ def test_address_is_checked(listen, words, tmp_path):
     assert words in CliRunner().invoke(command, [str(tmp_path), "--listen", listen]).output
 
 
+def test_address_of_another_computer_is_reported_in_the_systems_words(tmp_path):
+    done = CliRunner().invoke(command, [str(tmp_path), "--listen", "192.0.2.1:8300"])
+    wanted = "cannot listen on 192.0.2.1:8300: Cannot assign requested address; give another --listen"
+    assert str(done.exception) == wanted
+
+
 def test_missing_log_is_reported(tmp_path):
     found = CliRunner().invoke(command, [str(tmp_path / "none.mcap")])
     assert isinstance(found.exception, LogError) and "there is no such log" in str(found.exception)
