@@ -43,13 +43,17 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @contextlib.contextmanager
 def flying(*options: str) -> Iterator[str]:
-    """Run a simulated autopilot; yield the address for the doctor."""
+    """Run a simulated autopilot; yield the address for the doctor once it sends."""
     port = free_port()
     data_sent = [sys.executable, "-m", "companion", "sitl", "--scenario", "short"]
     with subprocess.Popen(
         [*data_sent, "--connect", f"udpout:{LOOPBACK}:{port}", *options], stderr=subprocess.DEVNULL
     ) as process:
         try:
+            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
+                receiver.settimeout(60.0)
+                receiver.bind((LOOPBACK, port))
+                receiver.recv(1)
             yield f"udpin:{LOOPBACK}:{port}"
         finally:
             process.terminate()
