@@ -29,6 +29,10 @@ from companion.units import Floats
 #: A receiver that states no accuracy of its velocity was seen to report 2 to 3 m/s at rest in its first
 #: seven seconds. ArduPilot and PX4 wait for ten seconds of good fixes.
 SETTLING_S, SETTLING_M_S = 10.0, 3.0
+#: Below a speed (seen up to 1.75 m/s, fix after fix for seconds) u-blox receivers hold the last course, and
+#: GPS_RAW_INT and DataFlash have speed and course: the velocity is in any direction. Its sigma in speeds.
+HELD_COURSE_M_S, HELD_COURSE = 3.0, 4.0
+_SAME_COURSE = 1e-5  # rad; messages have steps of 1.7e-4
 #: A beacon's stated place (m) and the times of its answers (s) are so far off. Beside a runway an angle is a
 #: metre: answers 0.3 s late excluded a healthy GNSS, 1 km from a beacon.
 PLACE_M, LATE_S = 5.0, 0.3
@@ -50,12 +54,28 @@ def white_sigma(record: Gnss, settings: GnssConfig) -> float:
     return max(math.sqrt(stated**2 - settings.sigma_m**2), settings.sigma_m / 3.0)
 
 
-def velocity_sigma(record: Gnss, first_ns: int, settings: GnssConfig) -> float:
-    """One sigma an axis (m/s) of a fix's velocity; the receiver's first fix was at `first_ns`."""
+def velocity_sigma(record: Gnss, first_ns: int, settings: GnssConfig, before: Gnss | None = None) -> float:
+    """One sigma an axis (m/s) of a fix's velocity.
+
+    The receiver's first fix was at `first_ns`; `before` is the fix before, if there is one.
+    """
     stated = record.sigma_velocity
     if stated is None:
         stated = SETTLING_M_S if (record.t_ns - first_ns) * 1e-9 < SETTLING_S else 0.0
+    if before is not None and _is_course_held(before, record):
+        assert record.v_n is not None
+        stated = max(stated, HELD_COURSE * math.hypot(*record.v_n[:2]))
     return max(stated, settings.sigma_velocity_m_s)
+
+
+def _is_course_held(before: Gnss, record: Gnss) -> bool:
+    """Whether a slow receiver states the course of the fix before to the last digit."""
+    if before.v_n is None or record.v_n is None or before.receiver != record.receiver:
+        return False
+    (n, e, _), (north, east, _) = before.v_n, record.v_n
+    size = math.hypot(n, e) * math.hypot(north, east)
+    slow = 0.0 < math.hypot(north, east) < HELD_COURSE_M_S
+    return slow and abs(n * east - e * north) <= _SAME_COURSE * size and n * north + e * east > 0.0
 
 
 def _stated(record: Gnss, settings: GnssConfig) -> float:

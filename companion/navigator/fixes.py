@@ -59,7 +59,7 @@ def gnss(state: State, record: Gnss, settings: Settings) -> Step:
     bank, velocity = state.bank, None
     assert bank is not None
     if config.use_velocity and record.v_n is not None:  # first: the position needs it
-        sigma = fix_observations.velocity_sigma(record, first_ns, config)
+        sigma = fix_observations.velocity_sigma(record, first_ns, config, last)
         noise = factor * (sigma**2 + channel.velocity_noise**2)
         velocity = measurements.gnss_velocity(bank, known, channel, record, nominal.point, nominal.a_n, noise)
         bank = velocity.bank
