@@ -1,8 +1,8 @@
 """PX4 topics as CSV files in a folder (`vehicle_gps_position.csv.gz`, ..., as named by ulog2csv) -> records.
 
-Each file is one uORB topic, `timestamp` in microseconds since boot. The rows of all topics are merged by
-time; arrival and validity are the same instant, as the log is written on board. Raw inertial data is not
-read. Fields that a topic lacks remain None. A row that is not one of its topic is skipped and reported.
+Each file is one uORB topic, `timestamp` in microseconds since boot, converted as in a ULog of any version of
+PX4. The rows of all topics are merged by time; arrival and validity are the same instant, as the log is
+written on board. A row that is not one of its topic is skipped and reported.
 """
 
 from __future__ import annotations
@@ -10,25 +10,14 @@ from __future__ import annotations
 import csv
 import gzip
 import heapq
-import math
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import BinaryIO, TypeAlias, cast
+from typing import Any, BinaryIO, TypeAlias, cast
 
+from companion.importers import ulog
 from companion.importers.foreign_file import Damage, one_line, steady_steps
-from companion.link.fields import euler
-from companion.records import (
-    AirData,
-    Attitude,
-    Event,
-    Gnss,
-    LocalOrigin,
-    LocalPosition,
-    Severity,
-    Stamped,
-    Wind,
-)
+from companion.records import Stamped
 from companion.storage.reader import LogError, open_regular
 
 Row: TypeAlias = dict[str, str]
@@ -38,22 +27,35 @@ MAX_EXPANSION = 60
 """Largest ratio of uncompressed and compressed size; recorded topics reach 10."""
 
 
+class _Numbers(dict[str, Any]):
+    """A row as numbers. A cell is read when it is needed: one that is not may be damaged."""
+
+    def __getitem__(self, name: str) -> float:
+        return float(super().__getitem__(name))
+
+    def get(self, name: str, default: Any = None) -> Any:
+        try:
+            return self[name]
+        except KeyError:
+            return default
+
+
 class CsvFolder:
     """The topics of a folder, to be iterated once."""
 
     def __init__(self, folder: Path) -> None:
         self.damage = Damage()
         found = {path.name.split(".")[0]: path for path in sorted(folder.glob("*.csv*"))}
-        self._known = [(found[topic], make) for topic, make in _TOPICS.items() if topic in found]
+        self._known = [(found[name], topic) for name, topic in ulog.supported_topics(found).items()]
         if not self._known:
-            raise LogError(f"{folder} has no supported topic: it needs {', '.join(_TOPICS)} as CSV")
+            raise LogError(f"{folder} has no supported topic: it needs {', '.join(ulog.TOPICS)} as CSV")
 
     def __iter__(self) -> Iterator[Stamped]:
         """Yield the records of all topics by time."""
-        topics = (self._records(path, make()) for path, make in self._known)
+        topics = (self._records(path, topic) for path, topic in self._known)
         return heapq.merge(*topics, key=lambda record: record.t_ns)
 
-    def _records(self, path: Path, topic: Callable[[Row, int], Iterator[Stamped]]) -> Iterator[Stamped]:
+    def _records(self, path: Path, topic: ulog.Topic) -> Iterator[Stamped]:
         def stamped() -> Iterator[tuple[int, int, Row]]:
             for number, row in self._rows(path):
                 try:
@@ -63,8 +65,11 @@ class CsvFolder:
 
         for step in steady_steps(stamped(), self.damage):
             try:
-                yield from topic(step.item, (step.boot_us + step.shift_us) * 1000)
-            except (KeyError, TypeError, ValueError, OverflowError) as error:
+                yield from topic(_Numbers(step.item), (step.boot_us + step.shift_us) * 1000)
+            except KeyError as error:  # the first row says it for all
+                self.damage.add(path.name, 0, f"no column {error}: unsupported PX4 version")
+                return
+            except (TypeError, ValueError, OverflowError) as error:
                 place = f"{path.name} at {step.boot_us} us"
                 self.damage.add(place, 0, f"not a row of its topic: {one_line(error)}")
 
@@ -99,78 +104,3 @@ def _lines(file: BinaryIO, path: Path, damage: Damage) -> Iterator[str]:
             return
         # a quote that is not closed would hold the rest of the file; numbers need none
         yield line.decode("utf-8", "replace").replace("\0", "").replace('"', "")
-
-
-def _number(row: Row, name: str) -> float | None:
-    value = float(row[name])
-    return value if math.isfinite(value) else None
-
-
-def _gnss(row: Row, t: int) -> Iterator[Stamped]:
-    valid = row["vel_ned_valid"] == "1"
-    velocity = float(row["vel_n_m_s"]), float(row["vel_e_m_s"]), float(row["vel_d_m_s"])
-    yield Gnss(
-        t,
-        t,
-        receiver=0,
-        stamp_us=t // 1000,  # each row is a fix; time_utc_usec of the receiver may change only once a second
-        fix=int(row["fix_type"]),
-        lat=math.radians(int(row["lat"]) / 1e7),
-        lon=math.radians(int(row["lon"]) / 1e7),
-        alt_msl=int(row["alt"]) * 1e-3,
-        sigma_horizontal=_number(row, "eph"),
-        sigma_vertical=_number(row, "epv"),
-        v_n=velocity if valid else None,
-        sigma_velocity=_number(row, "s_variance_m_s"),
-        satellites=int(row["satellites_used"]),
-        hdop=_number(row, "hdop"),
-        alt=int(row["alt_ellipsoid"]) * 1e-3,
-    )
-
-
-def _attitude(row: Row, t: int) -> Iterator[Stamped]:
-    w, x, y, z = (float(row[f"q[{i}]"]) for i in range(4))
-    rates = float(row["rollspeed"]), float(row["pitchspeed"]), float(row["yawspeed"])
-    yield Attitude(t, t, *euler((w, x, y, z)), rates)
-
-
-def _air_data(row: Row, t: int) -> Iterator[Stamped]:
-    yield AirData(t, t, float(row["true_airspeed_m_s"]), True, sensed=True)
-
-
-def _wind(row: Row, t: int) -> Iterator[Stamped]:
-    variance = 0.5 * (float(row["covariance_north"]) + float(row["covariance_east"]))
-    v_n = float(row["windspeed_north"]), float(row["windspeed_east"]), 0.0
-    yield Wind(t, t, v_n, math.sqrt(variance) if variance > 0.0 else None)
-
-
-def _local_positions() -> Callable[[Row, int], Iterator[Stamped]]:
-    """Convert the inertial channel, with its origin when stated or changed, and an event at each reset."""
-    last: tuple[str, ...] = ()
-    resets = ""
-
-    def topic(row: Row, t: int) -> Iterator[Stamped]:
-        nonlocal last, resets
-        if row["xy_valid"] != "1" or row["z_valid"] != "1":
-            return
-        origin = row["ref_lat"], row["ref_lon"], row["ref_alt"]
-        if origin != last and row["xy_global"] == "1":
-            last = origin
-            lat, lon, alt_msl = map(float, origin)
-            yield LocalOrigin(t, t, math.radians(lat), math.radians(lon), alt_msl, "px4")
-        if resets and row["xy_reset_counter"] != resets:
-            yield Event(t, t, Severity.WARNING, "the autopilot reset its horizontal position")
-        resets = row["xy_reset_counter"]
-        x_n = float(row["x"]), float(row["y"]), float(row["z"])
-        yield LocalPosition(t, t, x_n, (float(row["vx"]), float(row["vy"]), float(row["vz"])))
-
-    return topic
-
-
-_TOPICS: dict[str, Callable[[], Callable[[Row, int], Iterator[Stamped]]]] = {
-    "vehicle_local_position": _local_positions,
-    "vehicle_gps_position": lambda: _gnss,
-    "vehicle_attitude": lambda: _attitude,
-    "airspeed": lambda: _air_data,
-    "wind_estimate": lambda: _wind,
-}

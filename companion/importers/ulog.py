@@ -9,7 +9,7 @@ events.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -65,21 +65,17 @@ class UlogFile:
     def _survey(self) -> tuple[dict[str, Topic], int]:
         """Return the topics to convert, and UNIX time minus boot time (0 if no GPS provides it)."""
         seen, epoch_us = set[str](), 0
-        for found in ulog_messages.messages(self._data, _TOPICS, Damage()):
+        for found in ulog_messages.messages(self._data, TOPICS, Damage()):
             if isinstance(found, ulog_messages.TopicRow):
                 seen.add(found.topic)
                 utc, boot = found.row.get("time_utc_usec"), found.row.get("timestamp")
                 if type(utc) is int and type(boot) is int and _UNIX_FROM_US < utc < _UNIX_TO_US:
                     epoch_us = epoch_us or utc - min(boot, utc)
-        if "vehicle_gps_position" in seen:
-            seen.discard("sensor_gps")  # duplicates of vehicle_gps_position
-        if "airspeed_validated" in seen:
-            seen.discard("airspeed")
-        if not seen:
-            needed = ", ".join(_TOPICS)
+        found_topics = supported_topics(seen)
+        if not found_topics:
+            needed = ", ".join(TOPICS)
             raise LogError(f"{self.path} is a ULog without any supported topic: it needs {needed}")
-        topics = {name: make() for name, make in _TOPICS.items() if name in seen}
-        return topics | _truth_topics(), epoch_us
+        return found_topics | _truth_topics(), epoch_us
 
     def _records(self, topics: dict[str, Topic], epoch_us: int) -> Iterator[Stamped]:
         found = ulog_messages.messages(self._data, topics, self.damage)
@@ -241,7 +237,7 @@ def _stateless(topic: Topic) -> Callable[[], Topic]:
     return lambda: topic
 
 
-_TOPICS: dict[str, Callable[[], Topic]] = {
+TOPICS: dict[str, Callable[[], Topic]] = {
     "vehicle_local_position": _local_positions,
     "vehicle_gps_position": _stateless(_gnss),
     "sensor_gps": _stateless(_gnss),
@@ -254,3 +250,12 @@ _TOPICS: dict[str, Callable[[], Topic]] = {
     "vehicle_air_data": _stateless(_pressure),
     "estimator_status": _stateless(_status),
 }
+"""Topics that are converted, each with the maker of its conversion."""
+
+
+def supported_topics(names: Collection[str]) -> dict[str, Topic]:
+    """Return the conversions for those of the topics `names` that are of use, each fact from one topic."""
+    doubled = {"sensor_gps"} if "vehicle_gps_position" in names else set()
+    if "airspeed_validated" in names:
+        doubled.add("airspeed")
+    return {name: make() for name, make in TOPICS.items() if name in names and name not in doubled}

@@ -276,6 +276,41 @@ def test_csv_topics_are_merged_by_time(tmp_path: pathlib.Path) -> None:
     assert isinstance(event, r.Event) and "wind_estimate.csv at 2000 us: not a row of its topic" in event.text
 
 
+def test_csv_topics_of_any_px4_version_are_read(tmp_path: pathlib.Path) -> None:
+    """PX4 1.11 took the rates from the attitude, 1.12 renamed the wind, 1.14 the position of GNSS."""
+    tables = {
+        "vehicle_attitude": "timestamp,q[0],q[1],q[2],q[3]\n1000,1,0,0,0\n2000,1,0,0,0",
+        "sensor_gps": "timestamp,latitude_deg,longitude_deg,altitude_msl_m,altitude_ellipsoid_m,fix_type,"
+        "vel_ned_valid,vel_n_m_s,vel_e_m_s,vel_d_m_s,eph,satellites_used\n3000,45.0,-90.0,100,80,3,1,4,5,6,nan,9",
+        "airspeed": "timestamp,true_airspeed_m_s\n4000,77",
+        "airspeed_validated": "timestamp,true_airspeed_m_s\n5000,12.5\n6000,nan",
+        "wind": "timestamp,windspeed_north,windspeed_east,variance_north,variance_east\n7000,3,-4,0.5,0.5",
+        "sensor_combined": "timestamp,"
+        + ",".join(f"{name}[{i}]" for name in ("gyro_rad", "accelerometer_m_s2") for i in range(3))
+        + "\n8000,1,2,3,4,5,6",
+        "vehicle_air_data": "timestamp,baro_pressure_pa,baro_temp_celcius\n9000,90000,20",
+    }
+    for name, table in tables.items():
+        (tmp_path / f"{name}.csv").write_text(table)
+    level, _, fix, air, wind, imu, pressure = sources.open_source(tmp_path)
+    assert level == r.Attitude(1_000_000, 1_000_000, 0.0, 0.0, 0.0)
+    assert isinstance(fix, r.Gnss) and fix.sigma_horizontal is None and fix.v_n == (4.0, 5.0, 6.0)
+    assert (fix.lat, fix.lon) == (math.radians(45.0), math.radians(-90.0))
+    assert (fix.alt_msl, fix.alt, fix.satellites) == (100.0, 80.0, 9)
+    assert air == r.AirData(5_000_000, 5_000_000, 12.5, True, sensed=True)
+    assert wind == r.Wind(7_000_000, 7_000_000, (3.0, -4.0, 0.0), math.sqrt(0.5))
+    assert imu == r.Imu(8_000_000, 8_000_000, 0, (4.0, 5.0, 6.0), (1.0, 2.0, 3.0))
+    assert pressure == r.Pressure(9_000_000, 9_000_000, 90_000.0, None, pytest.approx(293.15))
+
+
+def test_csv_topic_without_a_column_is_reported_once(tmp_path: pathlib.Path) -> None:
+    (tmp_path / "vehicle_attitude.csv").write_text("timestamp,q[0]\n" + "1000,1\n" * 50)
+    (tmp_path / "airspeed.csv").write_text("timestamp,true_airspeed_m_s\n2000,15")
+    air, event = sources.open_source(tmp_path)
+    assert isinstance(air, r.AirData) and isinstance(event, r.Event)
+    assert "1 part of 0 bytes was not read: vehicle_attitude.csv: no column 'q[1]'" in event.text
+
+
 @pytest.mark.parametrize("quote", ['"', '""', '"x', ',"'])
 def test_quote_in_a_topic_loses_at_most_its_line(quote: str, tmp_path: pathlib.Path) -> None:
     rows = [f"{10_000 * k},{quote if k == 5 else ''}1.0,0,0,0,0,0,0" for k in range(20)]
