@@ -14,7 +14,15 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from companion.importers import ulog_messages
-from companion.importers.foreign_file import MAX_TEXT, Damage, in_order, map_file, one_line, steady_steps
+from companion.importers.foreign_file import (
+    MAX_STEP_US,
+    MAX_TEXT,
+    Damage,
+    in_order,
+    map_file,
+    one_line,
+    steady_steps,
+)
 from companion.importers.ulog_messages import Dropout, LoggedText, Row
 from companion.link.dialect import mavlink
 from companion.link.fields import euler
@@ -53,6 +61,7 @@ class UlogFile:
         if self._data[: len(ulog_messages.MAGIC)] != ulog_messages.MAGIC:
             raise LogError(f"{path} is not a ULog: wrong magic bytes at its beginning")
         self._faulty: set[str] = set()  # topics without a required field
+        self._start_us = self._clock_start_us()
 
     def __iter__(self) -> Iterator[Stamped]:
         """Yield records by time. Rows of a topic without a required field are not converted."""
@@ -68,8 +77,8 @@ class UlogFile:
         for found in ulog_messages.messages(self._data, TOPICS, Damage()):
             if isinstance(found, ulog_messages.TopicRow):
                 seen.add(found.topic)
-                utc, boot = found.row.get("time_utc_usec"), found.row.get("timestamp")
-                if type(utc) is int and type(boot) is int and _UNIX_FROM_US < utc < _UNIX_TO_US:
+                utc, boot = found.row.get("time_utc_usec"), self._boot_us(found)
+                if type(utc) is int and boot is not None and _UNIX_FROM_US < utc < _UNIX_TO_US and boot >= 0:
                     epoch_us = epoch_us or utc - min(boot, utc)
         found_topics = supported_topics(seen)
         if not found_topics:
@@ -79,7 +88,7 @@ class UlogFile:
 
     def _records(self, topics: dict[str, Topic], epoch_us: int) -> Iterator[Stamped]:
         found = ulog_messages.messages(self._data, topics, self.damage)
-        for step in steady_steps(((_boot_us(m), m.place, m) for m in found), self.damage):
+        for step in steady_steps(((self._boot_us(m), m.place, m) for m in found), self.damage):
             t_ns = (step.boot_us + step.shift_us + epoch_us) * 1000
             match step.item:
                 case LoggedText(_, _, severity, text):
@@ -88,6 +97,20 @@ class UlogFile:
                     yield Event(t_ns, t_ns, Severity.WARNING, f"logger dropout of {duration_ms} ms")
                 case (_, name, row):
                     yield from self._converted(name, topics[name], row, t_ns)
+
+    def _clock_start_us(self) -> int:
+        """Return where the clock is taken to begin: 0, or near the start of a log that counts UNIX time.
+
+        PX4's clock does so in some simulations. The first rows may be older than the log.
+        """
+        start = int.from_bytes(self._data[8:16], "little")
+        return start - MAX_STEP_US if _UNIX_FROM_US < start < _UNIX_TO_US else 0
+
+    def _boot_us(self, found: ulog_messages.TopicRow | LoggedText | Dropout) -> int | None:
+        if isinstance(found, Dropout):
+            return None
+        stamp = found.boot_us if isinstance(found, LoggedText) else found.row.get("timestamp")
+        return stamp - self._start_us if type(stamp) is int else -1
 
     def _converted(self, name: str, topic: Topic, row: Row, t_ns: int) -> Iterator[Stamped]:
         try:
@@ -103,15 +126,6 @@ class UlogFile:
 def read(path: Path) -> UlogFile:
     """Open a `.ulg`. Raises LogError if it is not a ULog."""
     return UlogFile(path)
-
-
-def _boot_us(found: ulog_messages.TopicRow | LoggedText | Dropout) -> int | None:
-    if isinstance(found, LoggedText):
-        return found.boot_us
-    if isinstance(found, Dropout):
-        return None
-    stamp = found.row.get("timestamp")
-    return stamp if type(stamp) is int else -1
 
 
 def _finite(value: float | None) -> float | None:

@@ -121,6 +121,16 @@ def flight() -> bytes:
     )
 
 
+def test_clock_of_a_simulation_may_count_unix_time(tmp_path: pathlib.Path) -> None:
+    start = UTC - 3_000_000  # as the header states; the first fix is older
+    head = HEADER[:8] + struct.pack("<Q", start)
+    content = definitions("vehicle_gps_position", "vehicle_local_position")[len(head) :]
+    rows = fix(start - 500_000, 47.0), local(start + 10_000, 1.0), fix(start + 200_000, 47.00001)
+    records = list(sources.open_source(write(tmp_path, head + content + b"".join(rows))))
+    assert [type(record) for record in records] == [r.Gnss, r.LocalOrigin, r.LocalPosition, r.Gnss]
+    assert (records[0].t_ns, records[-1].t_ns - records[0].t_ns) == (UTC * 1000, 700_000_000)
+
+
 def test_every_topic_is_converted(tmp_path: pathlib.Path) -> None:
     records = list(sources.open_source(write(tmp_path, flight())))
     assert [type(record) for record in records if not isinstance(record, r.Event)] == [
