@@ -340,7 +340,10 @@ def _print(
             span = f"{part.start_s:.1f} to {part.end_s:.1f} s"
             click.echo(f"    {k}: {span}, {part.inputs} inputs, {part.solutions} solutions")
     if not found.outputs.get(Solution.__name__):
-        click.echo("  no solution: the log has no local position with an origin, or no fix was accepted")
+        click.echo(
+            "  no solution: no fix was accepted, or the log lacks attitude with airspeed or an IMU"
+            " (with an INS of its own: local position with its origin); companion report says which"
+        )
     if found.compared is not None:
         click.echo(f"  compared with the flight: {found.compared} outputs, {_comparison(found)}")
         if found.first_difference:

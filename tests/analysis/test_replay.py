@@ -105,6 +105,16 @@ def test_empty_and_torn_logs_are_reported(tmp_path: Path) -> None:
     assert "not closed" not in CliRunner().invoke(replay.command, [str(tmp_path / "out.mcap")]).output
 
 
+def test_log_without_a_solution_is_told_what_an_estimate_needs(tmp_path: Path) -> None:
+    (tmp_path / "topics").mkdir()
+    table = "timestamp,true_airspeed_m_s\n1000000,15.0\n2000000,15.5"
+    (tmp_path / "topics" / "airspeed.csv").write_text(table)
+    arguments = [str(tmp_path / "topics"), "-o", str(tmp_path / "out.mcap")]
+    done = CliRunner().invoke(replay.command, arguments)
+    assert done.exit_code == 0
+    assert "or the log lacks attitude with airspeed or an IMU" in done.output
+
+
 @pytest.mark.parametrize("how", ["itself", "symbolic link", "hard link"])
 def test_input_log_is_not_overwritten(how: str, tmp_path: Path) -> None:
     log, output = tmp_path / "flight.tlog", tmp_path / "other.mcap"
