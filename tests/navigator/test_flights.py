@@ -233,7 +233,7 @@ def test_a_healthy_gnss_is_never_excluded(channel: str, wrong: str) -> None:
     assert np.all(flown.error <= flown.protection)
 
 
-@pytest.mark.parametrize("channel", ["imu", "ins"])
+@pytest.mark.parametrize("channel", ["imu", pytest.param("ins", marks=pytest.mark.long)])
 def test_late_answers_of_a_beacon_beside_the_runway_move_nothing(channel: str) -> None:
     """At 1 km its azimuth is good to 2 m: answers 0.5 s late moved the position by 18 m, beside an INS those
     0.3 s late excluded GNSS.
@@ -261,7 +261,7 @@ def test_a_beacon_whose_place_is_stated_far_off_changes_nothing() -> None:
     ]
 
 
-@pytest.mark.parametrize("height", [80.0, -80.0])
+@pytest.mark.parametrize("height", [80.0, pytest.param(-80.0, marks=pytest.mark.long)])
 def test_wind_that_grew_with_height_is_known_as_well_as_claimed(height: float) -> None:
     """GNSS is lost 50 s after lift-off. The wind of the first metres was believed too much: 450 m off, 2.5
     times the sigma. After a launch from a hill airspeed was not used.
@@ -356,6 +356,7 @@ def test_a_false_velocity_of_gnss_is_excluded_and_its_position_stays_in_use(chan
     assert flown.error[flown.t > SETTLED_S].max() < 10.0
 
 
+@pytest.mark.long
 def test_a_false_velocity_of_gnss_that_stops_leaves_no_suspicion() -> None:
     """Nothing could clear it: the positions go on, and both explanations agree with them."""
 

@@ -100,8 +100,17 @@ def test_a_long_straight_course_leaves_the_position_at_a_healthy_gnss() -> None:
     assert doubt < 0.05
 
 
-@pytest.mark.parametrize("frozen", [False, True])
-@pytest.mark.parametrize("name", ["plane_turbulence_cut", "plane_turn_cut", "plane_take_off_cut"])
+@pytest.mark.parametrize(
+    ("name", "frozen"),
+    [
+        ("plane_turn_cut", False),
+        ("plane_take_off_cut", True),
+        pytest.param("plane_turbulence_cut", False, marks=pytest.mark.long),
+        pytest.param("plane_turbulence_cut", True, marks=pytest.mark.long),
+        pytest.param("plane_turn_cut", True, marks=pytest.mark.long),
+        pytest.param("plane_take_off_cut", False, marks=pytest.mark.long),
+    ],
+)
 def test_an_attitude_that_stops_or_stands_still_leaves_a_healthy_gnss_beyond_doubt(
     name: str, frozen: bool
 ) -> None:

@@ -74,6 +74,7 @@ def test_a_flight_too_short_is_one_sentence() -> None:
 
 @pytest.mark.shared
 @pytest.mark.flight
+@pytest.mark.long
 def test_recorded_outages_are_bridged_as_well_as_by_the_best_rule() -> None:
     log = SHARED / "umn_fixed_wing"
     if not log.exists():
