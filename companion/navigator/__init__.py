@@ -350,9 +350,7 @@ class Navigator:
         return outputs
 
     def _too_late(self, record: Input) -> list[Output]:
-        """Reject it; a receiver without a fix has nothing to use."""
-        if isinstance(record, Gnss) and not record.has_3d_fix:
-            return []
+        """Reject it."""
         assert self._newest is not None
         age, limit = (self._newest.t_ns - record.t_ns) * 1e-9, self._late_ns * 1e-9
         name = type(record).__name__

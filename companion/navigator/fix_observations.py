@@ -57,7 +57,7 @@ def white_sigma(record: Gnss, settings: GnssConfig) -> float:
 def velocity_sigma(record: Gnss, first_ns: int, settings: GnssConfig, before: Gnss | None = None) -> float:
     """One sigma an axis (m/s) of a fix's velocity.
 
-    The receiver's first fix was at `first_ns`; `before` is the fix before, if there is one.
+    The receiver's first fix was at `first_ns`; `before` is the last one that was used, if there is one.
     """
     stated = record.sigma_velocity
     if stated is None:
@@ -69,7 +69,7 @@ def velocity_sigma(record: Gnss, first_ns: int, settings: GnssConfig, before: Gn
 
 
 def _is_course_held(before: Gnss, record: Gnss) -> bool:
-    """Whether a slow receiver states the course of the fix before to the last digit."""
+    """Whether a slow receiver repeats the course of an earlier fix to the last digit."""
     if before.v_n is None or record.v_n is None or before.receiver != record.receiver:
         return False
     (n, e, _), (north, east, _) = before.v_n, record.v_n

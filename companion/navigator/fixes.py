@@ -85,9 +85,12 @@ def gnss(state: State, record: Gnss, settings: Settings) -> Step:
 
 
 def is_too_soon(record: Gnss, state: State, settings: Settings) -> bool:
-    """Whether the last fix that was used is too close: fixes are used every `gnss.every_s`."""
+    """Whether the last fix that was used is too close: fixes are used every `gnss.every_s`.
+
+    One from before it is judged by the state of its own time.
+    """
     last = state.gnss_taken
-    return last is not None and (record.t_ns - last.t_ns) * 1e-9 < settings.config.gnss.every_s
+    return last is not None and 0.0 <= (record.t_ns - last.t_ns) * 1e-9 < settings.config.gnss.every_s
 
 
 def _latency_velocity(state: State, t_ns: int) -> tuple[State, Vector2]:

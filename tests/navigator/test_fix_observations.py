@@ -38,7 +38,7 @@ def test_only_a_receiver_that_states_nothing_is_given_time_to_settle(
         (1.3, 0.0, 0, 5.2),
         (1.3, 0.02, 0, 0.1),  # two steps of the message
         (1.3, 180.0, 0, 0.1),
-        (1.3, 0.0, 1, 0.1),  # another receiver's course says nothing
+        (1.3, 0.0, 1, 0.1),  # another receiver's course proves nothing
         (0.0, 0.0, 0, 0.1),  # at rest a simulated receiver states exactly that
         (3.5, 0.0, 0, 0.1),  # straight flight
     ],

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 import pytest
 from msgspec import structs
 
@@ -201,3 +202,22 @@ def test_fixes_that_are_not_used_cost_no_roll_back(monkeypatch: pytest.MonkeyPat
             navigator.handle(structs.replace(fix(0, t - 0.14, 3), rx_ns=round(t * SECOND_NS)))
     assert navigator.state.gnss_taken is not None
     assert 45 <= len(rewound) <= 60
+
+
+def test_a_fix_that_arrives_after_a_later_one_is_used_at_its_own_time() -> None:
+    late, states = fix(0, 10.0, 3), []
+    for arrives in (10.0, 11.0):
+        navigator = Navigator(CONFIG)
+        for k in range(20 * 14):
+            t = 0.05 * k
+            records = shaken(t)
+            if k % 12 == 8 and t != late.t_ns / SECOND_NS:
+                records.append(fix(0, t, 3))
+            if k == round(20.0 * arrives):
+                records.append(structs.replace(late, rx_ns=round(arrives * SECOND_NS)))
+            for record in records:
+                navigator.handle(record)
+        navigator.finish()
+        assert navigator.state.bank is not None
+        states.append(navigator.state.bank.x)
+    np.testing.assert_allclose(*states, rtol=1e-6, atol=1e-9)
