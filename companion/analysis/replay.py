@@ -342,7 +342,7 @@ def _print(
     if not found.outputs.get(Solution.__name__):
         click.echo(
             "  no solution: no fix was accepted, or the log lacks attitude with airspeed or an IMU"
-            " (with an INS of its own: local position with its origin); companion report says which"
+            " (with an INS of its own: local position with its origin); companion report names it"
         )
     if found.compared is not None:
         click.echo(f"  compared with the flight: {found.compared} outputs, {_comparison(found)}")

@@ -66,7 +66,7 @@ class CsvFolder:
         for step in steady_steps(stamped(), self.damage):
             try:
                 yield from topic(_Numbers(step.item), (step.boot_us + step.shift_us) * 1000)
-            except KeyError as error:  # the first row says it for all
+            except KeyError as error:  # once for all rows
                 self.damage.add(path.name, 0, f"no column {error}: unsupported PX4 version")
                 return
             except (TypeError, ValueError, OverflowError) as error:

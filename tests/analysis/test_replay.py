@@ -105,7 +105,7 @@ def test_empty_and_torn_logs_are_reported(tmp_path: Path) -> None:
     assert "not closed" not in CliRunner().invoke(replay.command, [str(tmp_path / "out.mcap")]).output
 
 
-def test_log_without_a_solution_is_told_what_an_estimate_needs(tmp_path: Path) -> None:
+def test_what_an_estimate_needs_is_named_where_there_is_no_solution(tmp_path: Path) -> None:
     (tmp_path / "topics").mkdir()
     table = "timestamp,true_airspeed_m_s\n1000000,15.0\n2000000,15.5"
     (tmp_path / "topics" / "airspeed.csv").write_text(table)

@@ -107,9 +107,9 @@ def line(result: Result) -> str:
 
 def test_no_data_exits_69_with_advice(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(command, "CONNECT_TIMEOUT_S", 0.5)
-    told = line(doctor("--connect", f"udpin:{LOOPBACK}:{free_port()}"))
-    assert "no data received; check that the autopilot or router sends to this address and port" in told
-    assert "firewall; a loopback address is reached from this computer only" in told
+    advice = line(doctor("--connect", f"udpin:{LOOPBACK}:{free_port()}"))
+    assert "no data received; check that the autopilot or router sends to this address and port" in advice
+    assert "firewall; a loopback address is reached from this computer only" in advice
     assert "loopback" not in line(doctor("--connect", f"udpin:0.0.0.0:{free_port()}"))
 
 
@@ -170,16 +170,16 @@ def test_a_link_that_cannot_be_opened_is_one_sentence(link: str, expected: str) 
 def test_tcp_listener_without_a_peer_times_out(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(command, "CONNECT_TIMEOUT_S", 0.3)
     start = time.monotonic()
-    told = line(doctor("--connect", f"tcpin:{LOOPBACK}:0"))
-    assert "no data received; check that the autopilot or router connects to this address and port" in told
+    advice = line(doctor("--connect", f"tcpin:{LOOPBACK}:0"))
+    assert "no data received; check that the autopilot or router connects to this address and port" in advice
     assert time.monotonic() - start < 5.0
 
 
 def test_host_that_does_not_answer_is_one_sentence_with_advice(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(command, "CONNECT_TIMEOUT_S", 0.1)
     monkeypatch.setattr(command, "connect", lambda address: asyncio.sleep(9.0))
-    told = line(doctor("--connect", "tcp:192.0.2.1:5760"))
-    assert "tcp:192.0.2.1:5760: no answer in 0.1 s; check the address" in told
+    advice = line(doctor("--connect", "tcp:192.0.2.1:5760"))
+    assert "tcp:192.0.2.1:5760: no answer in 0.1 s; check the address" in advice
 
 
 # -- what is shown -------------------------------------------------------------------------------------------
