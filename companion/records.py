@@ -158,6 +158,13 @@ class AirspeedSensor(Stamped, frozen=True, gc=False, tag=True):
     healthy: bool
 
 
+class Vehicle(Stamped, frozen=True, gc=False, tag=True):
+    """Whether rotors alone hold the vehicle up, and whether it is in the air; None: not stated."""
+
+    multirotor: bool | None = None
+    flying: bool | None = None
+
+
 class GnssIntegrity(Stamped, frozen=True, gc=False, tag=True):
     """Jamming and spoofing as the receiver reports them (GNSS_INTEGRITY)."""
 
@@ -481,6 +488,7 @@ Input: TypeAlias = (
     | GlobalPosition
     | AirData
     | AirspeedSensor
+    | Vehicle
     | GnssIntegrity
     | Wind
     | Pressure

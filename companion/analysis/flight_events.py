@@ -236,6 +236,7 @@ _NAMES = {
     "Fix": "radio-only fixes",
     "LinkState": "link state",
     "AirspeedSensor": "state of the airspeed sensor",
+    "Vehicle": "kind of vehicle, landed or flying",
     "GnssIntegrity": "jamming and spoofing",
     "RangeDifference": "lines of position",
     "SecondIns": "second INS",

@@ -36,7 +36,15 @@ from companion.estimate import bank as banks
 from companion.estimate.bank import Bank
 from companion.estimate.smoother import rts_backward, two_point
 from companion.nav.geometry import displace
-from companion.navigator import INPUTS_USED, Navigator, begins_again, guarded, own_channel, tuned
+from companion.navigator import (
+    INPUTS_USED,
+    Navigator,
+    begins_again,
+    guarded,
+    own_channel,
+    own_error_model,
+    tuned,
+)
 from companion.navigator.channel import Nominal, Transition
 from companion.navigator.hypotheses import BIASES, MOST_BEACONS, VELOCITY, Hypotheses, Model
 from companion.navigator.inertial_track import Point
@@ -45,6 +53,7 @@ from companion.navigator.step import step
 from companion.records import (
     AirData,
     Gnss,
+    Imu,
     Input,
     LocalPosition,
     Output,
@@ -430,18 +439,14 @@ class _Path:
             A, B = A[:n, :n], B[int(state.bank.grade[0]), :n, :n]
             Phi, Q, point = A @ Phi, A @ Q @ A.T + B, reached
         predicted, measured = Phi @ before.bank.x[0, :n], True
+        if isinstance(record, RsbnFix | Imu) and (forget := self._renewed(before, n)) is not None:
+            keep, variance = forget
+            predicted, Phi, Q = keep * predicted, keep[:, None] * Phi, Q * np.outer(keep, keep)
+            Q = Q + np.diag(variance)
         if isinstance(record, Gnss | RsbnFix):
-            if isinstance(record, RsbnFix):
-                forget = self._renewed(before, n)
-                if forget is not None:
-                    keep, variance = forget
-                    predicted, Phi, Q = keep * predicted, keep[:, None] * Phi, Q * np.outer(keep, keep)
-                    Q = Q + np.diag(variance)
             # the fix may have moved the nominal trajectory, and its error with it
             predicted = predicted + np.pad(_moved(point, state.nominal.point), (0, n - 4))
-        elif not isinstance(record, MEASURING) and (
-            self._settings.config.has_own_ins or not isinstance(record, LocalPosition)
-        ):
+        elif not self._measures(before, record):
             measured, predicted = False, x
             if any(isinstance(output, Reset) for output in outputs):  # the INS jumped: widened, perhaps
                 P_before = before.bank.P[0, :n, :n]
@@ -450,9 +455,16 @@ class _Path:
         if measured or self._model.asked:
             self._append(state.nominal.point, x, P, predicted, isinstance(record, Gnss | RsbnFix))
 
+    def _measures(self, before: State, record: Input) -> bool:
+        """Whether a record besides the fixes may have been a measurement."""
+        if isinstance(record, Imu):  # of a multirotor's drag
+            return self._state.sensors.measured_ns != before.sensors.measured_ns
+        own_position = isinstance(record, LocalPosition) and not self._settings.config.has_own_ins
+        return own_position or isinstance(record, MEASURING)
+
     def _renewed(self, before: State, n: int) -> tuple[Floats, Floats] | None:
-        """Zeros (n,) for states forgotten by a beacon that moved or took the place of another, and ones;
-        and new variances (n,).
+        """Zeros (n,) for states forgotten by a beacon that moved or took the place of another, or by a drag
+        that takes the place of airspeed, and ones; and new variances (n,).
         """
         keep, variance = np.ones(n), np.zeros(n)
         known = hypotheses(self._state, self._settings)
@@ -460,6 +472,8 @@ class _Path:
             if (a.identity, a.place) != (b.identity, b.place):
                 at = slice(known.bias(k), known.bias(k + 1))
                 keep[at], variance[at] = 0.0, np.square(known.biases[BIASES * k : BIASES * (k + 1)])
+        if _uses_drag(self._state) and not _uses_drag(before):
+            keep[own_error_model.SCALE], variance[own_error_model.SCALE] = 0.0, own_error_model.DRAG_SCALE**2
         return None if keep.all() else (keep, variance)
 
     def _append(self, point: Point, x: Floats, P: Floats, predicted: Floats, fixed: bool = False) -> None:
@@ -475,6 +489,11 @@ class _Path:
         else:
             epochs.append(_Epoch(point, x, P, predicted, self._Phi, self._Q, fixed))
         self._Phi, self._Q = np.eye(n), np.zeros((n, n))
+
+
+def _uses_drag(state: State) -> bool:
+    interval = state.nominal.interval if state.nominal else None
+    return interval is not None and interval.drag
 
 
 def _moved(before: Point, after: Point) -> Floats:

@@ -108,6 +108,10 @@ TEXTS: dict[str, dict[str, tuple[str, str]]] = {
         "correlation_min": ("Correlation time of airspeed and heading errors.", _MEASURED),
         "crab_deg": ("Heading error or sideslip that lasts seconds.", "the aircraft flies with sideslip"),
         "crab_s": ("How long it lasts.", _MEASURED),
+        "rotor_drag_per_s": (
+            "A multirotor's drag per velocity through the air, to 40 %; 0: not used.",
+            "its motors are tilted to push sideways: 0",
+        ),
     },
     "strapdown": {
         "imu": ("Index of the IMU: 0 is RAW_IMU.", "another IMU of the autopilot is better"),
@@ -259,6 +263,7 @@ UNITS = {
     "_m_s_sqrt_s": "m/s/sqrt(s)",
     "_m_s_min": "m/s per min",
     "_per_hour": "1/h",
+    "_per_s": "1/s",
     "_percent": "%",
     "_arcsec": "arcsec",
     "_arcmin": "arcmin",

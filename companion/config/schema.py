@@ -85,6 +85,9 @@ class AirDataConfig(Section, frozen=True):
     of the heading, or the sideslip, that lasts seconds. The defaults are supported by recorded flights.
     Jumps are hypotheses, so many that a step is found early. Where they are none (in the guaranteed bound,
     beside an INS) the random walk stands for them, and one of 22 counts.
+
+    A multirotor's accelerometers measure its drag, `rotor_drag_per_s` times its velocity through the air. It
+    is estimated within 40 %, so that the default does for most; with 0 it is not used.
     """
 
     wind_m_s: Annotated[float, Meta(ge=0.1, le=100.0)] = 8.0
@@ -98,6 +101,7 @@ class AirDataConfig(Section, frozen=True):
     correlation_min: Annotated[float, Meta(ge=0.1, le=1000.0)] = 10.0  # of airspeed and heading errors
     crab_deg: Annotated[float, Meta(ge=0.05, le=45.0)] = 2.0
     crab_s: Annotated[float, Meta(ge=0.5, le=600.0)] = 20.0
+    rotor_drag_per_s: Annotated[float, Meta(ge=0.0, le=5.0)] = 0.22
 
     @property
     def wind_walk_m_s_sqrt_s(self) -> float:

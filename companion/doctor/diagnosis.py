@@ -87,10 +87,15 @@ def check_profile(config: Config, make: str) -> list[Finding]:
     return [Finding("output profile", profile, make, False, advice)]
 
 
-def check_airspeed(config: Config, healthy: bool | None) -> list[Finding]:
-    """Report whether airspeed is measured; `healthy` None where the autopilot did not report it."""
+def check_airspeed(config: Config, healthy: bool | None, multirotor: bool = False) -> list[Finding]:
+    """Report whether airspeed is measured; `healthy` None where the autopilot did not report it.
+
+    A multirotor's drag is its airspeed.
+    """
     if config.has_own_ins or not config.uses("air_data"):
         return []
+    if multirotor and not healthy and config.air_data.rotor_drag_per_s and config.uses("imu"):
+        return [Finding("airspeed sensor", "none: by the drag of the rotors, in the air", "", None)]
     others = [sensor for sensor in ("IMU",) if config.uses("imu")]
     if config.uses("local_position") and not config.output.feeds_estimator:
         others.append("local position")

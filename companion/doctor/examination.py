@@ -31,7 +31,7 @@ from companion.doctor.diagnosis import (
     check_streams,
 )
 from companion.link import dialect, frame
-from companion.link.decode import MAKES, has_airspeed_sensor
+from companion.link.decode import MAKES, MULTIROTORS, has_airspeed_sensor
 from companion.link.dialect import mavlink, rsbn
 from companion.link.firmware import firmware_of
 from companion.link.parameter_client import Answer, ParameterClient, encoding_of, equal_real32
@@ -254,7 +254,7 @@ class Examination:
         return [
             *check_profile(self._config, self.make),
             *check_streams(self._config, self.make, self.session.stream_rates.rates()),
-            *check_airspeed(self._config, self._airspeed),
+            *check_airspeed(self._config, self._airspeed, self._heartbeat.type in MULTIROTORS),
             *check_script(self._config, self.make, self._has_script),
             *check_arming(self.make, self._arming_checks),
             *check_signing(self._is_signing and not self._is_answering),

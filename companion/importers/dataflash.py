@@ -46,6 +46,7 @@ from companion.records import (
     Stamped,
     Truth,
     Vector3,
+    Vehicle,
     Wind,
 )
 from companion.storage.reader import LogError
@@ -53,6 +54,9 @@ from companion.storage.reader import LogError
 _ZERO_CELSIUS = 273.15
 _EKF_ORIGIN = 0  # LogOriginType
 _STATUS, _GLITCHING = 0x3FF, 1 << 14  # nav_filter_status; its first ten bits are EKF_STATUS_FLAGS
+_FLYING = {18: False, 28: True}  # LogEvent: landed, not landed
+_COPTER = ("ArduCopter", "APM:Copter")
+_HELICOPTER = "Frame: HELI"
 _WEEK_US = 604_800_000_000
 _GPS_EPOCH_US = 315_964_800_000_000  # 1980-01-06, UNIX time
 _LEAP_US = 18_000_000  # GPS - UTC since 2017
@@ -205,7 +209,14 @@ class MessageConverter:
         yield self._true
 
     def _text(self, name: str, m: Message, t: int) -> Iterator[Stamped]:
-        yield Event(t, t, Severity.INFO, str(m.Message)[:MAX_TEXT])
+        text = str(m.Message)
+        if text.startswith((*_COPTER, _HELICOPTER)):
+            yield Vehicle(t, t, multirotor=not text.startswith(_HELICOPTER))
+        yield Event(t, t, Severity.INFO, text[:MAX_TEXT])
+
+    def _landed(self, name: str, m: Message, t: int) -> Iterator[Stamped]:
+        if (flying := _FLYING.get(m.Id)) is not None:
+            yield Vehicle(t, t, flying=flying)
 
     def _error(self, name: str, m: Message, t: int) -> Iterator[Stamped]:
         yield Event(t, t, Severity.WARNING, f"the autopilot logged error {m.ECode} of subsystem {m.Subsys}")
@@ -228,6 +239,7 @@ _TABLE: dict[str, Callable[[MessageConverter, str, Message, int], Iterator[Stamp
     "SIM": MessageConverter._truth,
     "MSG": MessageConverter._text,
     "ERR": MessageConverter._error,
+    "EV": MessageConverter._landed,
 }
 NAMES = tuple(_TABLE)
 

@@ -24,6 +24,7 @@ from companion.importers.foreign_file import (
     steady_steps,
 )
 from companion.importers.ulog_messages import Dropout, LoggedText, Row
+from companion.link.decode import MULTIROTORS
 from companion.link.dialect import mavlink
 from companion.link.fields import euler
 from companion.records import (
@@ -40,6 +41,7 @@ from companion.records import (
     Stamped,
     Truth,
     Vector3,
+    Vehicle,
     Wind,
 )
 from companion.storage.reader import LogError
@@ -208,6 +210,14 @@ def _status(row: Row, t: int) -> Iterator[Stamped]:
     yield FilterStatus(t, t, flags, glitch, ratio, accuracy)
 
 
+def _vehicle(row: Row, t: int) -> Iterator[Stamped]:
+    yield Vehicle(t, t, row["system_type"] in MULTIROTORS)
+
+
+def _landed(row: Row, t: int) -> Iterator[Stamped]:
+    yield Vehicle(t, t, flying=not row["landed"])
+
+
 def _local_positions() -> Topic:
     """Convert the inertial channel, with its origin when stated or changed, and an event at each reset."""
     last: tuple[float, ...] = ()
@@ -263,6 +273,8 @@ TOPICS: dict[str, Callable[[], Topic]] = {
     "wind_estimate": _stateless(_wind),
     "vehicle_air_data": _stateless(_pressure),
     "estimator_status": _stateless(_status),
+    "vehicle_status": _stateless(_vehicle),
+    "vehicle_land_detected": _stateless(_landed),
 }
 """Topics that are converted, each with the maker of its conversion."""
 

@@ -53,6 +53,7 @@ from companion.records import (
     StarFix,
     SystemTime,
     Truth,
+    Vehicle,
     Wind,
 )
 from companion.units import G0
@@ -68,6 +69,26 @@ UERE = 4.0
 """User range error, one sigma, m: converts a dilution of precision to metres where a receiver gives no
 accuracy; 7.8 m at 95 % (GPS SPS Performance Standard, 4th edition 2008, table 3.4-1)."""
 _ZERO_CELSIUS = 273.15
+#: MAV_TYPE of vehicles that rotors of fixed pitch hold up.
+MULTIROTORS = frozenset(
+    {
+        mavlink.MAV_TYPE_QUADROTOR,
+        mavlink.MAV_TYPE_HEXAROTOR,
+        mavlink.MAV_TYPE_OCTOROTOR,
+        mavlink.MAV_TYPE_TRICOPTER,
+        mavlink.MAV_TYPE_DODECAROTOR,
+        mavlink.MAV_TYPE_DECAROTOR,
+        mavlink.MAV_TYPE_GENERIC_MULTIROTOR,
+    }
+)
+_FLYING = {mavlink.MAV_STATE_BOOT: False, mavlink.MAV_STATE_STANDBY: False, mavlink.MAV_STATE_ACTIVE: True}
+_IN_THE_AIR = frozenset(
+    {
+        mavlink.MAV_LANDED_STATE_IN_AIR,
+        mavlink.MAV_LANDED_STATE_TAKEOFF,
+        mavlink.MAV_LANDED_STATE_LANDING,
+    }
+)
 _UNIX_AFTER_US = 10**15  # 2001; fewer microseconds are not a date
 
 _INERTIAL_UPDATED = (
@@ -357,6 +378,21 @@ def has_airspeed_sensor(m: Message) -> bool:
 @_of("SYS_STATUS")
 def _sys_status(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
     return (AirspeedSensor(_unstamped(rx, sender), rx, has_airspeed_sensor(m)),)
+
+
+@_of("HEARTBEAT")
+def _heartbeat(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
+    """Decode the kind of vehicle. ArduCopter is active in the air only, others once they are armed."""
+    multirotor = m.type in MULTIROTORS
+    stated = _FLYING.get(m.system_status) if multirotor and sender.autopilot == "ardupilot" else None
+    return (Vehicle(_unstamped(rx, sender), rx, multirotor, stated),)
+
+
+@_of("EXTENDED_SYS_STATE")
+def _extended_sys_state(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
+    if m.landed_state == mavlink.MAV_LANDED_STATE_UNDEFINED:
+        return ()
+    return (Vehicle(_unstamped(rx, sender), rx, flying=m.landed_state in _IN_THE_AIR),)
 
 
 @_of("GNSS_INTEGRITY")

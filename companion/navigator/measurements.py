@@ -176,6 +176,36 @@ def airspeed(
     return _taken(after._replace(seen=heard), seen)
 
 
+def rotor_drag(
+    bank: Bank,
+    known: Hypotheses,
+    V: Vector2,
+    velocity: Vector2,
+    manoeuvre: float,
+    heading: float,
+    drag_per_s: float,
+) -> Taken:
+    """Take the velocity through the air by a multirotor's drag. It is no source that may be false.
+
+    A constant error along the velocity, as a pitot's, would stand for drag that is not quite linear: it was
+    held false beside a healthy GNSS. `V` and `velocity` as in `own_error_model.drag_rows`, `manoeuvre` as in
+    `airspeed`.
+    """
+    layout = known.layout
+
+    def seen_by(bank: Bank) -> tuple[Floats, Floats]:
+        z, own = own_error_model.drag_rows(bank.x, velocity, V, heading, drag_per_s)
+        H = np.zeros((len(bank.L), 2, layout.n_base))
+        H[:, :, : own.shape[2]] = own
+        return z, H
+
+    R = own_error_model.airspeed_variance(manoeuvre) * np.eye(2)
+    after, seen = banks.update(
+        bank, layout, seen_by, None, R, None, known.settings, outlier=OUTLIER["velocity"]
+    )
+    return _taken(after, seen)
+
+
 def foreign_velocity(bank: Bank, known: Hypotheses, channel: OwnChannel, apart: Vector2) -> Taken:
     """Take the velocity of the autopilot's own estimator; `apart` is nominal minus foreign (m/s)."""
     row = own_error_model.foreign_row(channel.settings, apart)

@@ -35,7 +35,7 @@ WEIGHTS = (1.0, 0.5, 0.25)  # of `own_error_model.GRADES`
 
 
 class AirspeedSums(NamedTuple):
-    """Sums over the samples of airspeed since `start_ns`: of nominal velocity and of air velocity (m/s)."""
+    """Sums over the samples since `start_ns`: of nominal velocity and of velocity through the air (m/s)."""
 
     start_ns: int
     samples: int
@@ -59,6 +59,8 @@ class Sensors(NamedTuple):
     mean_acceleration: Vector3 = (0.0, 0.0, 0.0)  # of the last seconds
     sums: AirspeedSums | None = None  # since airspeed was last a measurement
     measured_ns: int = -SENSOR_NS
+    multirotor: bool = False
+    aloft_ns: int | None = None  # since when a multirotor flies, by the autopilot
 
     def last_ns(self, by: By) -> int:
         """When a driver last gave a sample."""
@@ -129,6 +131,16 @@ def airspeed_is_sensed(s: Sensors, record: AirData) -> bool:
     return s.sensor_ns is not None and record.t_ns - s.sensor_ns <= SENSOR_NS
 
 
+def drag_is_sensed(s: Sensors, t_ns: int) -> bool:
+    """Whether the accelerometers show the velocity through the air: of a flying multirotor.
+
+    One with an airspeed sensor has that instead.
+    """
+    has_sensor = s.sensor_ns is not None and t_ns - s.sensor_ns <= SENSOR_NS
+    is_sensed = has_sensor or (s.air.air is not None and s.air.air.sensed)
+    return s.multirotor and s.aloft_ns is not None and not is_sensed
+
+
 def air_velocity(s: Sensors, record: AirData, alt: float) -> Vector2 | None:
     """Velocity through the air, north and east (m/s); None without a fresh attitude."""
     attitude = s.air.attitude
@@ -155,8 +167,9 @@ def restart(nominal: Nominal, by: By, velocity: Vector2) -> Nominal:
     """
     point = nominal.point._replace(v_n=(*velocity, nominal.point.v_n[2]))
     interval = own_error_model.begin(by, velocity)
-    if nominal.interval is not None and nominal.pending_s <= 0.0:
-        interval = interval._replace(shear=nominal.interval.shear)
+    if nominal.interval is not None:
+        shear = nominal.interval.shear if nominal.pending_s <= 0.0 else 0.0
+        interval = interval._replace(shear=shear, drag=nominal.interval.drag)
     return Nominal(point, nominal.a_n, point, interval)
 
 

@@ -33,6 +33,10 @@ part that lasts for seconds.
 `doppler` is what is wrong with the velocity of GNSS for minutes. As white noise alone a thousand fixes make a
 velocity that is 0.05 m/s off beyond doubt, and then the position of GNSS, which contradicts it, false.
 
+The drag of a multirotor in the plane of its rotors is proportional to its velocity through the air, and its
+accelerometers measure it: -f / `drag` is a velocity as airspeed is one, in both directions. `scale` is then
+what is wrong with the drag's coefficient, and the error of the accelerometers counts.
+
 An `Interval` sums what Phi needs over many samples (a dozen numbers), so that Phi and Q are made once per
 measurement. Not modelled: Schuler loop, vertical channel (heights are pressure altitudes), Coriolis (it is
 0.003 m/s^2 at 25 m/s; put it into `a_n` for fast aircraft).
@@ -60,6 +64,7 @@ N = 22
 AIRSPEED_NOISE_M_S = 1.0  # of half a second's mean: pitot, angle of attack, sideslip
 AIRSPEED_MANOEUVRE_S = 0.2  # and per acceleration; 0.14 to 0.17 in an aerobatic flight (TestLog2)
 LASTING = 2.0  # turbulence by airspeed alone: how many times longer than the gusts it lasts
+DRAG_SCALE, DRAG_SCALE_S = 0.25, 600.0  # of a multirotor's drag; it changes with speed too
 ALONG = 1.2  # and how much greater it is along the nose than across
 
 
@@ -109,7 +114,8 @@ class Interval(NamedTuple):
     `velocity` (m/s) is the nominal one now; `moved` (m) how far the nominal went. c1, s1 are the integrals of
     cosine and sine of the heading, c2, s2 those of c1, s1; n1, e1 of the acceleration, n2, e2 of n1, e1. For
     `air`, n1 and e1 are the way through the air (m) and `V` is the air velocity at the end. `noise` is the
-    variance of the velocity by the noise of the samples, (m/s)^2, `shear` that of the wind by height.
+    variance of the velocity by the noise of the samples, (m/s)^2, `shear` that of the wind by height. With
+    `drag` the scale is that of a multirotor's drag.
     """
 
     by: By
@@ -127,6 +133,7 @@ class Interval(NamedTuple):
     V: Vector2 = (0.0, 0.0)
     noise: float = 0.0
     shear: float = 0.0
+    drag: bool = False
 
 
 class Row(NamedTuple):
@@ -180,6 +187,7 @@ def add_imu(i: Interval, dt: float, a_n: Vector2, heading: float, noise: float) 
         i.V,
         i.noise + noise,
         i.shear,
+        i.drag,
     )
 
 
@@ -257,6 +265,9 @@ class Propagator:
         Q = np.zeros((len(GRADES), N, N))
         Q[:, self._diagonal, self._diagonal] = self._density * self._grown(T, decay)
         Q[:, WIND, WIND] += i.shear * np.eye(2)
+        if i.drag:
+            Phi[SCALE, SCALE] = math.exp(-T / DRAG_SCALE_S)
+            Q[:, SCALE, SCALE] = 2.0 * DRAG_SCALE**2 / DRAG_SCALE_S * T
         if i.by == "imu":
             self._inertial(i, T, Phi, Q)
         elif i.by == "air":
@@ -337,7 +348,7 @@ class Propagator:
         H[:, SCALE] = -V[0], -V[1]
         H[:, HEADING] = H[:, CRAB] = V[1], -V[0]
         y = np.array((velocity[0] - V[0], velocity[1] - V[1]))
-        return Row(y, H, np.eye(2) * (AIRSPEED_NOISE_M_S**2 + (AIRSPEED_MANOEUVRE_S * manoeuvre) ** 2))
+        return Row(y, H, np.eye(2) * airspeed_variance(manoeuvre))
 
 
 def _velocity_noise(Phi: Floats, Q: Floats, T: float, density: Floats) -> None:
@@ -363,6 +374,44 @@ def nose_covariance(V: Vector2, along: float, across: float) -> Floats:
 # ---------------------------------------------------------------------------------------------------------
 # Measurements
 # ---------------------------------------------------------------------------------------------------------
+
+
+def airspeed_variance(manoeuvre: float) -> float:
+    """Variance of an airspeed on each axis, (m/s)^2, by the acceleration above that of level flight."""
+    return AIRSPEED_NOISE_M_S**2 + (AIRSPEED_MANOEUVRE_S * manoeuvre) ** 2
+
+
+def drag_rows(
+    x: Floats, velocity: Vector2, V: Vector2, heading: float, drag_per_s: float
+) -> tuple[Floats, Floats]:
+    """Return z (rows, 2) and H (rows, 2, n) of a multirotor's drag, linearised at each state `x` (rows, n).
+
+    The velocity through the air is that over ground less the wind: a hovering multirotor's is not far above
+    the noise of its drag, so that the scale may not be multiplied by the measured one.
+
+    Parameters
+    ----------
+    velocity
+        Nominal velocity over ground (m/s), mean over the samples since the last measurement.
+    V
+        Specific force across the axis of the rotors over -`drag_per_s`, north and east (m/s), the same mean.
+    heading
+        Turns the error of the accelerometers (rad).
+    """
+    air = np.array(velocity) - x[:, VELOCITY] - x[:, WIND] - x[:, GUST]  # (rows, 2)
+    scale = 1.0 + x[:, SCALE]
+    turned = np.stack((-air[:, 1], air[:, 0]), axis=1) * scale[:, None]
+    H = np.zeros((len(x), 2, N))
+    for k in (0, 1):
+        H[:, k, VELOCITY.start + k] = H[:, k, WIND.start + k] = H[:, k, GUST.start + k] = scale
+    H[:, :, SCALE] = -air
+    H[:, :, HEADING] = H[:, :, CRAB] = -turned
+    c, s = math.cos(heading) / drag_per_s, math.sin(heading) / drag_per_s
+    H[:, :, ACCELEROMETER] = (c, -s), (s, c)
+    angle = (x[:, HEADING] + x[:, CRAB])[:, None]
+    predicted = scale[:, None] * air + angle * turned - x[:, ACCELEROMETER] @ np.array(((c, s), (-s, c)))
+    z: Floats = predicted - np.array(V) + np.einsum("rij,rj->ri", H, x[:, :N])
+    return z, H
 
 
 def foreign_row(settings: Amplitudes, apart: Vector2) -> Row:
@@ -428,12 +477,24 @@ def ground_phase(g: Ground, t: float, airspeed: float, speed: float, height: flo
         if g.flying and t - since < PARKED_S:
             return g._replace(slow_since=since)
         return Ground(False, since, height)
+    clear = is_clear(g, height)
+    flying = g.flying or (airspeed > FLYING_M_S and (speed > PARKED_M_S if clear is None else clear))
+    return lifted(g, height) if flying else Ground(False, None, g.parked_height, g.climbed)
+
+
+def is_clear(g: Ground, height: float | None) -> bool | None:
+    """Whether a pressure altitude (m) is off the ground: above, or below after a launch from a hill.
+
+    None where it is not known, or was never parked.
+    """
     if g.parked_height is None or height is None:
-        clear = speed > PARKED_M_S
-    else:
-        clear = abs(height - g.parked_height) > CLEAR_M  # below it after a launch from a hill
-    flying = g.flying or (airspeed > FLYING_M_S and clear)
+        return None
+    return abs(height - g.parked_height) > CLEAR_M
+
+
+def lifted(g: Ground, height: float | None) -> Ground:
+    """In flight, at a pressure altitude (m), if any."""
     climbed = g.climbed
-    if flying and g.parked_height is not None and height is not None:
+    if g.parked_height is not None and height is not None:
         climbed = max(climbed, min(abs(height - g.parked_height), SHEAR_TOP_M))
-    return Ground(flying, None, g.parked_height, climbed)
+    return Ground(True, None, g.parked_height, climbed)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 
+from companion.estimate import bank as banks
 from companion.navigator import (
     air_data_channel,
     measurements,
@@ -38,11 +39,13 @@ from companion.records import (
     Rejection,
     Stamped,
     Vector2,
+    Vehicle,
 )
 from companion.units import SECOND_NS
 
 AIRSPEED_EVERY_NS = 500_000_000  # gusts are correlated: more often adds nothing
 FOREIGN_EVERY_NS = SECOND_NS
+TAKE_OFF_NS = 10 * SECOND_NS  # a multirotor is off the ground after it, at whatever height
 BLOCKED_M_S = 5.0  # slower, in flight, a pitot is blocked
 #: Between two samples, up to so far apart, no airspeed changes by more; one that did is not used for so long.
 STEP_M_S, STEP_M_S2, STEP_GAP_S, STEP_NS = 10.0, 10.0, 1.0, 10 * SECOND_NS
@@ -52,6 +55,16 @@ def airspeed_sensor(state: State, record: AirspeedSensor, settings: Settings) ->
     """Remember whether a healthy airspeed sensor is there."""
     seen = record.t_ns if record.healthy else None
     return state._replace(sensors=state.sensors._replace(sensor_ns=seen)), []
+
+
+def vehicle(state: State, record: Vehicle, settings: Settings) -> Step:
+    """Remember whether it is a multirotor, and whether it flies."""
+    s = state.sensors
+    multirotor = s.multirotor if record.multirotor is None else record.multirotor
+    aloft_ns = s.aloft_ns
+    if record.flying is not None:
+        aloft_ns = (aloft_ns or record.t_ns) if record.flying else None
+    return state._replace(sensors=s._replace(multirotor=multirotor, aloft_ns=aloft_ns)), []
 
 
 def attitude(state: State, record: Attitude, settings: Settings) -> Step:
@@ -93,7 +106,33 @@ def imu(state: State, record: Imu, settings: Settings) -> Step:
     state = state._replace(sensors=s)
     last = before[-1] if before else now
     between = (0.5 * (now[0] + last[0]), 0.5 * (now[1] + last[1]))
-    return _driven(state, record, "imu", between, settings)
+    state, outputs = _driven(state, record, "imu", between, settings)
+    return _rotor_drag(state, record, settings), outputs
+
+
+def _rotor_drag(state: State, record: Imu, settings: Settings) -> State:
+    """Use the drag of a multirotor as a measurement of its velocity through the air."""
+    nominal, s, drag = state.nominal, state.sensors, settings.config.air_data.rotor_drag_per_s
+    if nominal is None or not s.multirotor or drag == 0.0 or not settings.config.uses("air_data"):
+        return state
+    height = None if s.air.static is None else nominal.point.position.alt
+    if s.aloft_ns is None:
+        parked = own_error_model.Ground(parked_height=height)
+        return state._replace(sensors=s._replace(ground=parked, sums=None))
+    taking_off = not s.ground.flying and record.t_ns - s.aloft_ns < TAKE_OFF_NS
+    near_ground = taking_off and own_error_model.is_clear(s.ground, height) is False
+    if near_ground or not own_channel.drag_is_sensed(s, record.t_ns):
+        return state  # while it takes off the ground pushes too
+    state = _sheared(state, own_error_model.lifted(s.ground, height))
+    assert state.nominal is not None
+    interval = state.nominal.interval
+    if state.bank is not None and interval is not None and not interval.drag:
+        state = state._replace(
+            bank=banks.renew(state.bank, [own_error_model.SCALE], [own_error_model.DRAG_SCALE]),
+            nominal=state.nominal._replace(interval=interval._replace(drag=True)),
+        )
+    north, east = strapdown_channel.lateral_force(s.strap)
+    return _measured(state, record, (-north / drag, -east / drag), settings)
 
 
 def air_data(state: State, record: AirData, settings: Settings) -> Step:
@@ -116,12 +155,9 @@ def air_data(state: State, record: AirData, settings: Settings) -> Step:
         return state, [step]
     height = None if s.air.static is None else nominal.point.position.alt
     ground = own_error_model.ground_phase(s.ground, record.t_ns * 1e-9, math.hypot(*V), speed, height)
-    s = state.sensors._replace(ground=ground, air_ns=record.t_ns if ground.flying else s.air_ns)
-    sheared = own_error_model.wind_shear(state.sensors.ground, ground)
+    state = _sheared(state, ground)
+    s = state.sensors._replace(air_ns=record.t_ns if ground.flying else s.air_ns)
     state = state._replace(sensors=s)
-    if sheared and nominal.interval is not None:
-        interval = nominal.interval._replace(shear=nominal.interval.shear + sheared)
-        state = state._replace(nominal=nominal._replace(interval=interval))
     if not ground.flying:
         return _straight_on(state, record, settings)
     if leads:
@@ -129,9 +165,24 @@ def air_data(state: State, record: AirData, settings: Settings) -> Step:
         return _driven(state, record, "air", V, settings)
     if not is_driven_by_imu(state):
         return state, []
-    state = carried(state, record.t_ns, settings)
+    return _measured(carried(state, record.t_ns, settings), record, V, settings), []
+
+
+def _sheared(state: State, ground: own_error_model.Ground) -> State:
+    """With another phase of the flight, and with what the wind may have changed with height in it."""
+    s, nominal = state.sensors, state.nominal
+    sheared = own_error_model.wind_shear(s.ground, ground)
+    state = state._replace(sensors=s._replace(ground=ground))
+    if sheared and nominal is not None and nominal.interval is not None:
+        interval = nominal.interval._replace(shear=nominal.interval.shear + sheared)
+        state = state._replace(nominal=nominal._replace(interval=interval))
+    return state
+
+
+def _measured(state: State, record: AirData | Imu, V: Vector2, settings: Settings) -> State:
+    """Use a velocity `V` through the air (m/s) as a measurement, the mean of half a second at once."""
     assert state.nominal is not None
-    v_n = state.nominal.point.v_n
+    s, v_n = state.sensors, state.nominal.point.v_n
     sums = s.sums or AirspeedSums(record.t_ns, 0, (0.0, 0.0), (0.0, 0.0))
     sums = AirspeedSums(
         sums.start_ns,
@@ -140,21 +191,20 @@ def air_data(state: State, record: AirData, settings: Settings) -> Step:
         (sums.air[0] + V[0], sums.air[1] + V[1]),
     )
     if record.t_ns - sums.start_ns < AIRSPEED_EVERY_NS:
-        return state._replace(sensors=s._replace(sums=sums)), []
+        return state._replace(sensors=s._replace(sums=sums))
     state = propagated(state, settings)
     assert state.bank is not None
-    n = sums.samples
-    taken = measurements.airspeed(
-        state.bank,
-        hypotheses(state, settings),
-        _own(settings),
-        (sums.air[0] / n, sums.air[1] / n),
-        (sums.velocity[0] / n, sums.velocity[1] / n),
-        strapdown_channel.manoeuvre(s.mean_acceleration),
-    )
+    known, n = hypotheses(state, settings), sums.samples
+    V, velocity = (sums.air[0] / n, sums.air[1] / n), (sums.velocity[0] / n, sums.velocity[1] / n)
+    manoeuvre = strapdown_channel.manoeuvre(s.mean_acceleration)
+    if isinstance(record, AirData):
+        taken = measurements.airspeed(state.bank, known, _own(settings), V, velocity, manoeuvre)
+    else:
+        drag, heading = settings.config.air_data.rotor_drag_per_s, s.heading() or 0.0
+        taken = measurements.rotor_drag(state.bank, known, V, velocity, manoeuvre, heading, drag)
     sums = AirspeedSums(record.t_ns, 0, (0.0, 0.0), (0.0, 0.0))
     sensors = state.sensors._replace(measured_ns=record.t_ns, sums=sums)
-    return decided(state._replace(bank=taken.bank, sensors=sensors), record, settings), []
+    return decided(state._replace(bank=taken.bank, sensors=sensors), record, settings)
 
 
 def _step(s: Sensors, record: AirData) -> Rejection | None:

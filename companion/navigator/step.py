@@ -36,6 +36,7 @@ from companion.records import (
     Severity,
     StarFix,
     Tuning,
+    Vehicle,
 )
 from companion.units import SECOND_NS
 
@@ -109,6 +110,7 @@ _OWN: _Uses = {
     AirData: own_samples.air_data,
     AirspeedSensor: own_samples.airspeed_sensor,
     Imu: own_samples.imu,
+    Vehicle: own_samples.vehicle,
 }
 
 

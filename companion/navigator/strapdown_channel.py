@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from companion.nav.strapdown import rotation_matrix
-from companion.records import Attitude, Imu, Vector3
+from companion.records import Attitude, Imu, Vector2, Vector3
 from companion.units import G0, Floats
 
 IMU_HZ, ATTITUDE_HZ = 5.0, 2.0  # wanted at least
@@ -102,6 +102,17 @@ def acceleration(s: Strap) -> Vector3:
     assert s.C_nb is not None
     f_n = s.C_nb @ s.imu.f_b
     return float(f_n[0]), float(f_n[1]), float(f_n[2]) + G0
+
+
+def lateral_force(s: Strap) -> Vector2:
+    """Specific force in the plane of the rotors, north and east (m/s^2), of the last sample.
+
+    Rotors of fixed pitch pull along the body's z axis: what is across is drag.
+    """
+    assert s.imu is not None
+    assert s.C_nb is not None
+    f_n = s.C_nb[:2, :2] @ s.imu.f_b[:2]
+    return float(f_n[0]), float(f_n[1])
 
 
 def mean_acceleration(mean: Vector3, a: Vector3, dt: float) -> Vector3:

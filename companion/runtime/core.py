@@ -116,11 +116,7 @@ HANDLED = (
     | ABOUT_SOURCE_SET
     | PARAMETERS
     | DECODED
-    | {
-        mavlink.MAVLINK_MSG_ID_HEARTBEAT,
-        mavlink.MAVLINK_MSG_ID_COMMAND_ACK,
-        mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION,
-    }
+    | {mavlink.MAVLINK_MSG_ID_COMMAND_ACK, mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION}
 )
 
 
@@ -182,6 +178,7 @@ def requested_rates(config: Config) -> dict[str, float]:
         "SCALED_PRESSURE": 0.0 if config.has_own_ins else rates.air_data_hz,
         "EKF_STATUS_REPORT": rates.status_hz,
         "SYS_STATUS": 0.0 if config.has_own_ins else rates.status_hz,
+        "EXTENDED_SYS_STATE": 0.0 if config.has_own_ins else rates.status_hz,
         "SYSTEM_TIME": float(output_hz["GPS_INPUT"] > 0.0),
         # for the check of the local origin, and for position resets
         "GLOBAL_POSITION_INT": 2.0 * (output_hz[RESET] > 0.0 or (is_local and not config.has_own_ins)),

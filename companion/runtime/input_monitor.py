@@ -64,7 +64,8 @@ STREAMS: Mapping[str, Stream] = {
     "VFR_HUD": Stream("airspeed", AirData, "air_data_hz"),
     "SCALED_PRESSURE": Stream("pressure", Pressure, "air_data_hz"),
     "SYS_STATUS": Stream("sensor health", AirspeedSensor, "status_hz"),
-    # only logged
+    # not missed: only multirotors need it, or only logged
+    "EXTENDED_SYS_STATE": Stream("landed or flying", None, "status_hz"),
     "EKF_STATUS_REPORT": Stream("state of the EKF", None, "status_hz"),
     "SIM_STATE": Stream("truth", None, "truth_hz"),
 }

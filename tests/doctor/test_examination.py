@@ -341,3 +341,18 @@ def test_autopilot_without_version_is_identified_by_make() -> None:
     assert {p.need.name: p.has for p in diagnosis.parameters} == {"EKF2_AGP0_ID": 0, "EKF2_AGP0_CTRL": 0}
     assert bench.change().wrong_parameters == ()
     assert bench.now < (ATTEMPTS + OBSERVE_LONGER / SECOND + 2) * SECOND
+
+
+@pytest.mark.parametrize(
+    ("healthy", "pairs", "text"),
+    [
+        (False, [], "none: by the drag of the rotors, in the air"),
+        (None, [], "none: by the drag of the rotors, in the air"),
+        (True, [], "healthy"),
+        (False, ["air_data.rotor_drag_per_s=0"], "none: reckoning by IMU only"),
+    ],
+)
+def test_the_airspeed_of_a_multirotor_is_its_drag(healthy: bool | None, pairs: list[str], text: str) -> None:
+    config = load(None, {}, {}, ["output.profile=ardupilot", *pairs])
+    (airspeed,) = check_airspeed(config, healthy, multirotor=True)
+    assert (airspeed.found, airspeed.is_well) == (text, None)

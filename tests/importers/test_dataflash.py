@@ -32,6 +32,7 @@ FORMATS = {
     "SIM": ("QccCfLL", "TimeUS,Roll,Pitch,Yaw,Alt,Lat,Lng"),
     "SIM2": ("Qffffff", "TimeUS,PN,PE,PD,VN,VE,VD"),
     "MSG": ("QZ", "TimeUS,Message"),
+    "EV": ("QB", "TimeUS,Id"),
 }
 TYPES = {name: 130 + k for k, name in enumerate(FORMATS)}
 GWK, GMS = 2300, 100_000_000
@@ -125,6 +126,22 @@ def test_every_message_is_converted(tmp_path: pathlib.Path) -> None:
     assert by[r.Truth].v_n == (11.0, 12.0, 13.0)  # type: ignore[attr-defined]
     assert by[r.Event].text == "Throttle armed"  # type: ignore[attr-defined]
     assert source.summary().records == len(records)
+
+
+def test_a_copter_and_its_flight_are_known_by_texts_and_events(tmp_path: pathlib.Path) -> None:
+    texts = ("ArduCopter V4.5.7 (2a3dc4b7)", "ChibiOS: 6a85082c", "Frame: QUAD/X")
+    parts = [message("MSG", 1_100_000 + k, text) for k, text in enumerate(texts)]
+    parts += [message("EV", 1_200_000 + k, number) for k, number in enumerate((10, 28, 25, 18, 11))]
+    found = list(sources.open_source(write(tmp_path, definitions(), gps(1_000_000, GMS), *parts)))
+    vehicles = [(record.multirotor, record.flying) for record in found if isinstance(record, r.Vehicle)]
+    assert vehicles == [(True, None), (None, True), (None, False)]
+    assert sum(isinstance(record, r.Event) for record in found) == len(texts)
+
+
+def test_a_helicopter_flies_the_same_firmware(tmp_path: pathlib.Path) -> None:
+    parts = [message("MSG", 1_100_000, "ArduCopter V4.5.7"), message("MSG", 1_100_001, "Frame: HELI")]
+    found = list(sources.open_source(write(tmp_path, definitions(), gps(1_000_000, GMS), *parts)))
+    assert [record.multirotor for record in found if isinstance(record, r.Vehicle)] == [True, False]
 
 
 def test_primary_lane_is_converted(tmp_path: pathlib.Path) -> None:

@@ -54,6 +54,8 @@ TOPICS = {
     "vehicle_air_data": "uint64_t timestamp;float baro_pressure_pa;float baro_temp_celcius;",
     "estimator_status": "uint64_t timestamp;float pos_test_ratio;float pos_horiz_accuracy;"
     "uint32_t solution_status_flags;",
+    "vehicle_status": "uint64_t timestamp;uint8_t system_type;",
+    "vehicle_land_detected": "uint64_t timestamp;bool landed;",
     "vehicle_global_position_groundtruth": "uint64_t timestamp;double lat;double lon;float alt;",
     "vehicle_local_position_groundtruth": "uint64_t timestamp;float vx;float vy;float vz;",
 }
@@ -111,6 +113,8 @@ def flight() -> bytes:
             data("wind", 2_050_000, 3.0, -4.0, 0.5, 0.5),
             data("vehicle_air_data", 2_060_000, 95_000.0, 20.0),
             data("estimator_status", 2_070_000, 0.2, 1.5, 0x33F),
+            data("vehicle_status", 2_071_000, 2),
+            data("vehicle_land_detected", 2_072_000, False),
             data("vehicle_local_position_groundtruth", 2_075_000, 7.0, 8.0, 9.0),
             data("vehicle_global_position_groundtruth", 2_080_000, 47.0, 8.0, 501.0),
             message("L", b"4" + struct.pack("<Q", 2_090_000) + b"Failsafe enabled"),
@@ -135,7 +139,7 @@ def test_every_topic_is_converted(tmp_path: pathlib.Path) -> None:
     records = list(sources.open_source(write(tmp_path, flight())))
     assert [type(record) for record in records if not isinstance(record, r.Event)] == [
         *(r.Gnss, r.LocalOrigin, r.LocalPosition, r.Attitude, r.Imu, r.AirData, r.Wind, r.Pressure),
-        *(r.FilterStatus, r.Truth, r.LocalPosition, r.Gnss),
+        *(r.FilterStatus, r.Vehicle, r.Vehicle, r.Truth, r.LocalPosition, r.Gnss),
     ]
     first, last = records[0], records[-1]
     assert isinstance(first, r.Gnss) and isinstance(last, r.Gnss)
@@ -150,6 +154,8 @@ def test_every_topic_is_converted(tmp_path: pathlib.Path) -> None:
     assert by[r.Imu].f_b == pytest.approx((0.0, 0.0, -9.8))  # type: ignore[attr-defined]
     assert by[r.Wind].sigma == pytest.approx(math.sqrt(0.5))  # type: ignore[attr-defined]
     assert by[r.FilterStatus].horizontal_accuracy == 1.5  # type: ignore[attr-defined]
+    vehicles = [record for record in records if isinstance(record, r.Vehicle)]
+    assert [(v.multirotor, v.flying) for v in vehicles] == [(True, None), (None, True)]
     assert by[r.Truth].v_n == (7.0, 8.0, 9.0)  # type: ignore[attr-defined]
     events = {event.text: event.severity for event in records if isinstance(event, r.Event)}
     assert events["Failsafe enabled"] == 4

@@ -13,6 +13,7 @@ from companion.importers import tlog
 from companion.link import dialect, frame
 from companion.link.clock import BootClock
 from companion.link.decode import UERE, Autopilot, Sender, decode
+from companion.link.dialect import mavlink
 from companion.units import G0
 
 CUT = (pathlib.Path(__file__).parents[1] / "data" / "dronekit_copter_cut.tlog").read_bytes()
@@ -308,8 +309,37 @@ def test_truth_uses_the_integer_position() -> None:
     assert (turned.v_n, turned.attitude) == ((-0.5, 0.0, 0.0), (0.0, 0.0, 0.0))
 
 
+@pytest.mark.parametrize(
+    ("autopilot", "kind", "status", "multirotor", "flying"),
+    [
+        ("ardupilot", "QUADROTOR", "ACTIVE", True, True),
+        ("ardupilot", "HEXAROTOR", "STANDBY", True, False),
+        ("ardupilot", "QUADROTOR", "BOOT", True, False),
+        ("ardupilot", "OCTOROTOR", "CRITICAL", True, None),  # a failsafe, on the ground or not
+        ("px4", "QUADROTOR", "ACTIVE", True, None),  # armed, perhaps on the ground
+        ("ardupilot", "FIXED_WING", "ACTIVE", False, None),
+        ("ardupilot", "HELICOPTER", "ACTIVE", False, None),
+        ("px4", "VTOL_QUADROTOR", "ACTIVE", False, None),
+    ],
+)
+def test_heartbeat_states_the_kind_of_vehicle(
+    autopilot: Autopilot, kind: str, status: str, multirotor: bool, flying: bool | None
+) -> None:
+    fields = {
+        "type": getattr(mavlink, f"MAV_TYPE_{kind}"),
+        "system_status": getattr(mavlink, f"MAV_STATE_{status}"),
+    }
+    assert one("HEARTBEAT", autopilot, **fields) == r.Vehicle(RX, RX, multirotor, flying)
+
+
+@pytest.mark.parametrize(("landed", "flying"), [(1, False), (2, True), (3, True), (4, True)])
+def test_landed_state(landed: int, flying: bool) -> None:
+    assert one("EXTENDED_SYS_STATE", landed_state=landed) == r.Vehicle(RX, RX, flying=flying)
+    assert decoded("EXTENDED_SYS_STATE", landed_state=0) == ()
+
+
 def test_other_messages_give_no_record() -> None:
-    assert decoded("STATUSTEXT", text="hello") == decoded("HEARTBEAT") == ()
+    assert decoded("STATUSTEXT", text="hello") == decoded("PING") == ()
 
 
 READ = sorted({name for name, _, _ in REJECTED} | {"RAW_IMU", "SCALED_IMU", "VFR_HUD", "ESTIMATOR_STATUS"})

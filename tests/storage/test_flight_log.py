@@ -55,6 +55,7 @@ EVERY_KIND = [
     r.Pressure(T + 18, T + 19, 101325.0, None, 288.15),
     r.FilterStatus(T + 20, T + 21, 831, False, 0.05),
     r.AirspeedSensor(T + 20, T + 21, True),
+    r.Vehicle(T + 20, T + 21, multirotor=True, flying=False),
     r.GnssIntegrity(T + 20, T + 21, 0, 1, 2),
     r.SystemTime(T + 22, T + 23, 10**9),
     r.RsbnFix(T + 24, T + 25, 7, 0.91, -2.0, 120.0, None, 81234.5, 0.0044, 200.0),

@@ -1,0 +1,223 @@
+"""A multirotor's drag as its airspeed: on a recorded copter, and linearised rightly."""
+
+from __future__ import annotations
+
+import gzip
+import math
+from collections.abc import Callable
+from functools import lru_cache
+from pathlib import Path
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from msgspec.structs import replace
+
+from companion.analysis.smoothing import smooth_flight
+from companion.config import Config, load
+from companion.nav.geometry import Geodetic, separation
+from companion.navigator import Navigator
+from companion.navigator.hypotheses import AIRSPEED, GNSS, VELOCITY
+from companion.navigator.own_error_model import (
+    ACCELEROMETER,
+    GUST,
+    SCALE,
+    WIND,
+    N,
+    drag_rows,
+)
+from companion.navigator.own_error_model import (
+    VELOCITY as SPEED,
+)
+from companion.records import (
+    AirData,
+    AirspeedSensor,
+    Attitude,
+    Gnss,
+    Imu,
+    Input,
+    Pressure,
+    Rejection,
+    Solution,
+    Vehicle,
+)
+from companion.records import Source as Basis
+
+NS = 1_000_000_000
+COPTER = Path(__file__).parents[1] / "data" / "copter_cut.jsonl.gz"
+LOSS_S = 105.0  # since boot; it flies at 2 to 14 m/s
+DEFAULT = load(flags={"output.profile": "ardupilot"}, environment={})
+WITHOUT = load(flags={"output.profile": "ardupilot", "air_data.rotor_drag_per_s": 0.0}, environment={})
+Change = Callable[[Input], Input | None]
+
+
+@lru_cache(maxsize=1)
+def recorded() -> tuple[Input, ...]:
+    decoder: msgspec.json.Decoder[Input] = msgspec.json.Decoder(Input)
+    with gzip.open(COPTER) as lines:
+        return tuple(decoder.decode(line) for line in lines)
+
+
+class Flown(NamedTuple):
+    """Errors against GNSS by time (s), in m and in sigmas an axis; greatest probability that GNSS, airspeed
+    and velocity of GNSS are false; rejections; the last solution.
+    """
+
+    errors: list[tuple[float, float, float]]
+    false: tuple[float, float, float]
+    rejections: list[Rejection]
+    last: Solution | None
+
+    def rms(self, start: float, end: float) -> float:
+        found = [e for t, e, _ in self.errors if start <= t < end]
+        return math.sqrt(sum(e * e for e in found) / len(found))
+
+
+def fly(config: Config, change: Change = lambda record: record, dark: tuple[float, float] = (0, 0)) -> Flown:
+    """Fly the recording, each record changed or left out, without GNSS for a time (s)."""
+    fixes = [r for r in recorded() if isinstance(r, Gnss)]
+    t = np.array([r.t_ns for r in fixes])
+    lat, lon = np.array([(r.lat, r.lon) for r in fixes]).T
+    navigator, rejections, last = Navigator(config), list[Rejection](), None
+    errors: list[tuple[float, float, float]] = []
+    false = np.zeros(3)
+    for record in recorded():
+        if isinstance(record, Gnss) and dark[0] * NS < record.t_ns < dark[1] * NS:
+            continue
+        changed = change(record)
+        for out in () if changed is None else navigator.handle(changed):
+            if isinstance(out, Rejection):
+                rejections.append(out)
+            elif isinstance(out, Solution):
+                last = out
+                place = Geodetic(np.interp(out.t_ns, t, lat), np.interp(out.t_ns, t, lon), 0.0)
+                apart = separation(Geodetic(out.lat, out.lon, 0.0), place)[:2]
+                sigmas = np.sqrt([out.covariance[0], out.covariance[3]])
+                errors.append((out.t_ns / NS, float(np.hypot(*apart)), float(np.abs(apart / sigmas).max())))
+        held = navigator._state.false
+        if held:
+            false = np.maximum(false, [held[GNSS], held[AIRSPEED], held[VELOCITY]])
+    return Flown(errors, (float(false[0]), float(false[1]), float(false[2])), rejections, last)
+
+
+def test_a_real_copter_reckons_by_its_drag() -> None:
+    """After a minute without GNSS it is less than half as far off as by its IMU alone, within its sigmas."""
+    dark = LOSS_S, LOSS_S + 61.0
+    with_drag, alone = fly(DEFAULT, dark=dark), fly(WITHOUT, dark=dark)
+    end = LOSS_S + 55.0, LOSS_S + 60.0
+    assert with_drag.rms(*end) < 0.5 * alone.rms(*end)
+    assert max(sigmas for t, _, sigmas in with_drag.errors if LOSS_S < t < end[1]) < 3.0
+    assert with_drag.last is not None and alone.last is not None
+    assert with_drag.last.sources & Basis.AIR_DATA
+    assert not alone.last.sources & Basis.AIR_DATA
+
+
+def test_with_gnss_nothing_is_false_and_nothing_rejected() -> None:
+    flown = fly(DEFAULT)
+    assert max(flown.false) < 0.5
+    assert flown.rms(30.0, 215.0) < 2.0
+    assert not [r for r in flown.rejections if r.source == "gnss"]
+
+
+def crooked(record: Input) -> Input:
+    """An autopilot that is mounted with a roll of 10 deg against the plane of the rotors."""
+    angle = math.radians(10.0)
+    if isinstance(record, Imu):
+        x, y, z = record.f_b
+        c, s = math.cos(angle), math.sin(angle)
+        return replace(record, f_b=(x, c * y + s * z, c * z - s * y))
+    return replace(record, roll=record.roll + angle) if isinstance(record, Attitude) else record
+
+
+def half(record: Input) -> Input:
+    """A drag of which but half is measured, from a time on."""
+    if not isinstance(record, Imu) or record.t_ns < 80 * NS:
+        return record
+    return replace(record, f_b=(0.5 * record.f_b[0], 0.5 * record.f_b[1], record.f_b[2]))
+
+
+def stuck(record: Input) -> Input:
+    """An accelerometer that measures no drag at all, as that of a simulator without one."""
+    return replace(record, f_b=(0.0, 0.0, record.f_b[2])) if isinstance(record, Imu) else record
+
+
+@pytest.mark.parametrize("change", [crooked, half, stuck])
+def test_beside_a_healthy_gnss_a_wrong_drag_does_no_harm(change: Change) -> None:
+    flown = fly(DEFAULT, change)
+    assert flown.false[0] < 0.5  # GNSS
+    assert not [r for r in flown.rejections if r.source == "gnss"]
+    assert max(flown.rms(t, t + 10.0) for t in range(30, 200, 10)) < 5.0
+
+
+@pytest.mark.parametrize(
+    "added",
+    [
+        (Vehicle(15 * NS, 15 * NS, multirotor=False),),
+        (Vehicle(15 * NS, 15 * NS, flying=False),),
+        tuple(AirspeedSensor(t * NS, t * NS, True) for t in range(15, 215, 5)),
+        (AirData(15 * NS, 15 * NS, 3.0, sensed=True),),
+    ],
+)
+def test_it_is_used_of_flying_multirotors_without_an_airspeed_sensor_only(added: tuple[Input, ...]) -> None:
+    navigator, last = Navigator(DEFAULT), None
+    for record in sorted((*recorded()[:1500], *added), key=lambda record: record.t_ns):
+        last = next((o for o in navigator.handle(record) if isinstance(o, Solution)), last)
+    assert last is not None and not last.sources & Basis.AIR_DATA
+
+
+@pytest.mark.parametrize(("height", "begins_s"), [(2.0, 30.0), (20.0, 20.0)])
+def test_while_it_takes_off_it_is_not_used(height: float, begins_s: float) -> None:
+    """The ground pushes too: up to 5 m above it, or for ten seconds."""
+    navigator, begun = Navigator(DEFAULT), math.inf
+    landed, flying = Vehicle(15 * NS, 15 * NS, True, False), Vehicle(20 * NS, 20 * NS, True, True)
+    copter = [r for r in recorded()[:1000] if not isinstance(r, Vehicle)]
+    above = 12.0 * height  # Pa
+    pressures = [
+        Pressure(t * NS // 5, t * NS // 5, 101_325.0 - above * (t > 100) + 0.1 * (t % 7))
+        for t in range(75, 300)
+    ]
+    for record in sorted((*copter, landed, flying, *pressures), key=lambda record: record.t_ns):
+        for out in navigator.handle(record):
+            if isinstance(out, Solution) and out.sources & Basis.AIR_DATA:
+                begun = min(begun, out.t_ns / NS)
+    assert begins_s < begun < begins_s + 1.5
+
+
+def test_the_smoother_is_the_two_point_solution_with_drag_too() -> None:
+    runs = smooth_flight(
+        (r for r in recorded() if not isinstance(r, Gnss) or not 105 * NS < r.t_ns < 165 * NS),
+        DEFAULT,
+        check=True,
+    )
+    assert len(runs) == 1 and runs[0].apart_sigma < 1e-6
+
+
+VECTOR = st.lists(st.floats(-10.0, 10.0), min_size=2, max_size=2).map(np.array)
+
+
+@given(VECTOR, VECTOR, VECTOR, VECTOR, st.floats(-0.5, 1.0), st.floats(-math.pi, math.pi))
+def test_the_row_of_drag_is_its_derivative(
+    over_ground: np.ndarray, error: np.ndarray, wind: np.ndarray, V: np.ndarray, scale: float, heading: float
+) -> None:
+    """z - H x is the predicted drag less the measured one, and H is what it changes by, at that state."""
+    x = np.zeros((1, N))
+    x[0, SPEED], x[0, WIND], x[0, SCALE], x[0, GUST] = error, wind, scale, 0.3
+    x[0, ACCELEROMETER] = 0.1, -0.05
+
+    def innovation(x: np.ndarray) -> np.ndarray:
+        z, H = drag_rows(x, tuple(over_ground), tuple(V), heading, 0.2)
+        return (z - np.einsum("rij,rj->ri", H, x))[0]
+
+    air, f = over_ground - error - wind - 0.3, np.array((0.1, -0.05))
+    turned = np.array(((math.cos(heading), -math.sin(heading)), (math.sin(heading), math.cos(heading)))) @ f
+    np.testing.assert_allclose(innovation(x), (1.0 + scale) * air - turned / 0.2 - V, atol=1e-12)
+    _, H = drag_rows(x, tuple(over_ground), tuple(V), heading, 0.2)
+    step = 1e-6
+    for k in range(N):
+        moved = x.copy()
+        moved[0, k] += step
+        slope = (innovation(x) - innovation(moved)) / step
+        np.testing.assert_allclose(slope, H[0, :, k], atol=1e-4)
