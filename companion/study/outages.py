@@ -13,6 +13,7 @@ from __future__ import annotations
 import copy
 import json
 import math
+from bisect import bisect_right
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -29,7 +30,7 @@ from companion.config.options import configuration_options
 from companion.nav.geometry import Geodetic, separation
 from companion.navigator import INPUTS_USED, Navigator
 from companion.option_types import FloatRange
-from companion.records import AirData, Attitude, Gnss, Reboot, Solution, Stamped
+from companion.records import AirData, Attitude, Gnss, Reboot, Solution, Stamped, Vehicle
 from companion.storage.reader import LogError
 from companion.tables import print_tables
 from companion.units import SECOND_NS, Floats
@@ -55,9 +56,14 @@ class Row(NamedTuple):
 
 
 class Fixes:
-    """The GNSS fixes of a flight: times (ns), positions (rad) and velocities (m/s) of those with one."""
+    """The GNSS fixes of a flight: times (ns), positions (rad) and velocities (m/s) of those with one.
+
+    It flies while the log states so, or while it is fast.
+    """
 
     def __init__(self, records: Sequence[Stamped]) -> None:
+        stated = {r.t_ns: r.flying for r in records if isinstance(r, Vehicle) and r.flying is not None}
+        self._stated = sorted(stated.items()) if any(stated.values()) else []
         fixes = {r.t_ns: r for r in records if isinstance(r, Gnss) and r.has_3d_fix}
         found = [fixes[t_ns] for t_ns in sorted(fixes)]
         self.t_ns = np.array([r.t_ns for r in found])
@@ -74,16 +80,25 @@ class Fixes:
 
     def starts(self, every_s: float, longest_s: float) -> list[float]:
         """When outages may begin, ns: in flight, after a time to learn, with GNSS all the while."""
-        flying = self.v_t_ns[np.hypot(self.v_n, self.v_e) > FLYING_M_S]
+        fast = np.hypot(self.v_n, self.v_e) > FLYING_M_S
+        flying = self.v_t_ns[[self._is_aloft(t) for t in self.v_t_ns] if self._stated else fast]
         if not len(flying):
             return []
         first, last = flying[0] + LEARNING_S * SECOND_NS, flying[-1] - longest_s * SECOND_NS
-        gaps = self.t_ns[:-1][np.diff(self.t_ns) > GAP_S * SECOND_NS]
+        gap = np.diff(self.t_ns) > GAP_S * SECOND_NS
+        begin, end = self.t_ns[:-1][gap], self.t_ns[1:][gap]
         return [
             float(t)
             for t in np.arange(first, last, every_s * SECOND_NS)
-            if not ((gaps > t - WIND_S * SECOND_NS) & (gaps < t + longest_s * SECOND_NS)).any()
+            if not ((end > t - WIND_S * SECOND_NS) & (begin < t + longest_s * SECOND_NS)).any()
+            and self._is_aloft(t)
+            and self._is_aloft(t + longest_s * SECOND_NS)
         ]
+
+    def _is_aloft(self, t_ns: float) -> bool:
+        """Whether it flies by the log; True where that states nothing."""
+        k = bisect_right(self._stated, t_ns, key=lambda stated: stated[0])
+        return not self._stated or (k > 0 and self._stated[k - 1][1])
 
 
 def companion_errors(
@@ -225,8 +240,8 @@ def command(
     rows = study(records, config, every_s, durations)
     if not rows:
         raise LogError(
-            f"{log}: no {LEARNING_S + max(durations):.0f} s of flight with GNSS faster than "
-            f"{FLYING_M_S:g} m/s: choose a longer flight, or a shorter --lasting"
+            f"{log}: no {LEARNING_S + max(durations):.0f} s of flight with GNSS (stated by the log, or "
+            f"faster than {FLYING_M_S:g} m/s): choose a longer flight, or a shorter --lasting"
         )
     if as_json:
         click.echo(json.dumps([row._asdict() for row in rows]))

@@ -10,11 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from msgspec.structs import replace
 
 from companion.command_line import cli
 from companion.config import load
 from companion.nav.geometry import Geodetic, displace
-from companion.records import AirData, Attitude, Gnss, Stamped
+from companion.records import AirData, Attitude, Gnss, Stamped, Vehicle
 from companion.storage.reader import LogError
 from companion.study import outages
 
@@ -62,12 +63,27 @@ def test_no_outage_where_the_recorded_gnss_was_lost() -> None:
     starts = [t / NS for t in fixes.starts(30.0, 20.0)]
     assert starts and not [t for t in starts if 130.0 < t < 210.0]
     assert all(b - a >= 30.0 for a, b in pairwise(starts))
+    longer = outages.Fixes(circling(500.0, lost=(150.0, 300.0)))
+    assert not [t for t in longer.starts(10.0, 20.0) if 130.0 * NS < t < 360.0 * NS]
+
+
+def test_a_slow_flight_is_one_where_the_log_states_it() -> None:
+    """A copter: outages begin and end in the air."""
+    slow = [replace(r, v_n=(1.0, 0.0, 0.0)) if isinstance(r, Gnss) else r for r in circling(400.0)]
+    assert not outages.Fixes(slow).starts(10.0, 20.0)
+    spans = {10: True, 150: False, 200: True, 390: False}
+    stated = [Vehicle(t * NS, t * NS, True, flying) for t, flying in spans.items()]
+    starts = [t / NS for t in outages.Fixes([*slow, *stated]).starts(10.0, 20.0)]
+    assert starts and starts[0] >= 100.0
+    assert all(t < 130.0 or 200.0 <= t < 370.0 for t in starts)
+    assert [t for t in starts if t < 130.0] and [t for t in starts if t > 340.0]
 
 
 def test_a_flight_too_short_is_one_sentence() -> None:
     log = DATA / "dronekit_copter_cut.tlog"
     with pytest.raises(
-        LogError, match="no 210 s of flight with GNSS faster than 8 m/s: choose a longer flight"
+        LogError,
+        match=r"no 210 s of flight with GNSS \(stated by the log, or faster than 8 m/s\): choose a longer",
     ):
         CliRunner().invoke(cli, ["study", "outages", str(log)], catch_exceptions=False)
 
