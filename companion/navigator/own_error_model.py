@@ -64,7 +64,7 @@ N = 22
 AIRSPEED_NOISE_M_S = 1.0  # of half a second's mean: pitot, angle of attack, sideslip
 AIRSPEED_MANOEUVRE_S = 0.2  # and per acceleration; 0.14 to 0.17 in an aerobatic flight (TestLog2)
 LASTING = 2.0  # turbulence by airspeed alone: how many times longer than the gusts it lasts
-DRAG_SCALE, DRAG_SCALE_S = 0.25, 600.0  # of a multirotor's drag; it changes with speed too
+DRAG_SCALE, DRAG_SCALE_S = 0.25, 1800.0  # of a multirotor's drag; it changes with speed too
 ALONG = 1.2  # and how much greater it is along the nose than across
 
 
