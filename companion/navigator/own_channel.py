@@ -5,8 +5,8 @@
     foreign  velocity of the autopilot's estimator, where it is not fed by us
     hold     the last velocity
 
-Airspeed beside the IMU, and the foreign velocity beside either, are measurements (see `own_error_model`). No
-position of the autopilot's is used, and no velocity of an estimator that we feed.
+Airspeed or a multirotor's drag beside the IMU, and the foreign velocity beside any, are measurements (see
+`own_error_model`). No position of the autopilot's is used, and no velocity of an estimator that we feed.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Samples of the own channel: attitude, pressure, IMU, airspeed and a foreign velocity.
 
 A sample moves the nominal trajectory if its sensor leads; else airspeed and foreign velocity are
-measurements.
+measurements. So is the drag in the IMU's samples of a multirotor.
 """
 
 from __future__ import annotations
