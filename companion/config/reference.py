@@ -54,7 +54,7 @@ TEXTS: dict[str, dict[str, tuple[str, str]]] = {
             "the line is slow, but not below 4 Hz",
         ),
         "air_data_hz": ("VFR_HUD and SCALED_PRESSURE.", "the line is slow"),
-        "status_hz": ("EKF_STATUS_REPORT and SYS_STATUS.", "the line is slow"),
+        "status_hz": ("EKF_STATUS_REPORT, SYS_STATUS and EXTENDED_SYS_STATE.", "the line is slow"),
         "truth_hz": ("SIM_STATE: the true position of ArduPilot's SITL, for reports.", "in SITL: 10"),
     },
     "inertial": {
