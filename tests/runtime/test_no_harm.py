@@ -65,20 +65,25 @@ def imu_turned(record: Input) -> Input:
     return msgspec.structs.replace(record, f_b=(-y, x, z))
 
 
-@pytest.mark.parametrize(
-    "tilt_deg", [2.0, pytest.param(0.5, marks=pytest.mark.long)]
-)  # ArduPilot, preset px4
-@pytest.mark.parametrize(
-    ("name", "spoil", "most_m"),
-    [
-        ("plane_turbulence_cut", None, 5.0),
-        ("plane_turn_cut", None, 5.0),
-        ("plane_take_off_cut", None, 5.0),
-        ("plane_turbulence_cut", heading_off(-20.0), 5.0),
-        ("plane_turn_cut", heading_off(20.0), 5.0),
-        ("plane_turbulence_cut", imu_turned, 20.0),
-        ("plane_turn_cut", imu_turned, 20.0),
-    ],
+TURNS = [
+    ("plane_turbulence_cut", None, 5.0),
+    ("plane_turn_cut", None, 5.0),
+    ("plane_take_off_cut", None, 5.0),
+    ("plane_turbulence_cut", heading_off(-20.0), 5.0),
+    ("plane_turn_cut", heading_off(20.0), 5.0),
+    ("plane_turn_cut", imu_turned, 20.0),
+    ("plane_turbulence_cut", imu_turned, 20.0),
+]
+#: An IMU that is turned by 90 deg beside an attitude stated as exact as PX4's: docs/limits.md.
+EXCLUDED = pytest.mark.xfail(strict=True, reason="GNSS is excluded since its velocity is taken first")
+STATED_FINER = [
+    *(pytest.param(*case, 0.5, marks=pytest.mark.long) for case in TURNS[:-1]),
+    pytest.param(*TURNS[-1], 0.5, marks=[pytest.mark.long, EXCLUDED]),
+]
+
+
+@pytest.mark.parametrize(  # ArduPilot, preset px4
+    ("name", "spoil", "most_m", "tilt_deg"), [*((*case, 2.0) for case in TURNS), *STATED_FINER]
 )
 def test_a_turn_in_turbulence_with_a_beacon_leaves_a_healthy_gnss_beyond_doubt(
     name: str, spoil: Callable[[Input], Input] | None, most_m: float, tilt_deg: float

@@ -15,6 +15,7 @@ from companion.analysis import smoothing
 from companion.config import Config, EstimatorConfig, InertialConfig, to_toml
 from companion.estimate.smoother import forward_filter, rts
 from companion.navigator import Navigator
+from companion.navigator.hypotheses import BIASES
 from companion.navigator.own_channel import HOLD_M_S_SQRT_S, OwnChannel
 from companion.records import AirData, RsbnFix, Solution, Tuning
 from sitl import smoothing_study
@@ -87,7 +88,7 @@ def test_channel_change_in_flight_splits_the_track_and_sigma_change_does_not() -
     (same,) = smoothing.smooth_flight(records, INS)
     np.testing.assert_array_equal(one.x, same.x)
     first, second = smoothing.smooth_flight([*records, Tuning(at, at, to_toml(AIR))], INS)
-    beacons = 2 * len({r.beacon for r in records if isinstance(r, RsbnFix)})
+    beacons = BIASES * len({r.beacon for r in records if isinstance(r, RsbnFix)})
     assert (first.x.shape[1], second.x.shape[1]) == (18 + beacons, 22 + beacons)
     assert first.t_ns[-1] <= at < second.t_ns[0] < at + 2 * NS
 
