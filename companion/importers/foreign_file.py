@@ -14,6 +14,7 @@ import mmap
 import struct
 import zipfile
 import zlib
+from collections import deque
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
@@ -29,6 +30,7 @@ MAX_STEP_US = 60_000_000
 """A longer step of a log's clock is confirmed by the next stamp, or the stamp is damaged."""
 MAX_BACK_US = 1_000_000  # a larger decrease of the boot time is a reboot
 MAX_BOOT_US = 10**13  # 115 days
+MAX_UNSTAMPED = 100_000  # messages in a row without a time
 ORDER_NS = 2 * SECOND_NS  # loggers write topics out of order by less
 
 _OF_A_FILE = (ValueError, OSError, EOFError, struct.error, zipfile.BadZipFile, zlib.error)
@@ -131,14 +133,39 @@ def steady_steps(stamped: Iterable[tuple[int | None, int, Any]], damage: Damage)
 
     `stamped` has boot time (us; None if an item has none), place in the file, item. A stamp that leaves the
     last one by more than `MAX_STEP_US`, or decreases, has to be confirmed by the next; else it is damage. A
-    confirmed decrease is a reboot: the time goes on, as the duration of the reboot is not known.
+    confirmed decrease is a reboot: the time goes on, as the duration of the reboot is not known. An item
+    without a stamp has the time of the item before it, or of the first one that has a stamp. After
+    `MAX_UNSTAMPED` in a row the log ends: its time is not known.
     """
+    waiting = deque[tuple[int, Any]]()  # number and item of those without a stamp
+
+    def with_stamps() -> Iterator[tuple[int, int, tuple[int, Any]]]:
+        for number, (us, place, item) in enumerate(stamped):
+            if us is not None:
+                yield us, place, (number, item)
+            elif len(waiting) < MAX_UNSTAMPED:
+                waiting.append((number, item))
+            else:
+                damage.add(f"byte {place}", 0, f"{MAX_UNSTAMPED} messages before have no time since boot")
+                return
+
+    last: Step | None = None
+    for step in _steady_stamps(with_stamps(), damage):
+        number, item = step.item
+        while waiting and waiting[0][0] < number:
+            yield (last or step)._replace(reboot=False, item=waiting.popleft()[1])
+        last = step._replace(item=item)
+        yield last
+    end = last or Step(0, 0, False, None)
+    yield from (end._replace(reboot=False, item=item) for _, item in waiting)
+
+
+def _steady_stamps(stamped: Iterable[tuple[int, int, Any]], damage: Damage) -> Iterator[Step]:
+    """Yield the items of `steady_steps` that have a stamp."""
     last: int | None = None
     doubtful: tuple[int, int, Any] | None = None
     shift = 0
     for us, place, item in stamped:
-        if us is None:
-            us = last if last is not None else 0 if doubtful is None else doubtful[0]
         if not 0 <= us <= MAX_BOOT_US:
             damage.add(f"byte {place}", 0, f"boot time of {us} us")
             continue

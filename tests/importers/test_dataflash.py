@@ -331,3 +331,75 @@ def test_missing_log_is_reported(tmp_path: pathlib.Path) -> None:
     for read in readers:
         with pytest.raises(LogError, match=r"no such log|No such file"):
             read(tmp_path / "none.bin")
+
+
+OLD = {
+    "GPS": ("BIHBcLLeeEefI", "Status,TimeMS,Week,NSats,HDop,Lat,Lng,RelAlt,Alt,Spd,GCrs,VZ,T"),
+    "IMU": ("Iffffff", "TimeMS,GyrX,GyrY,GyrZ,AccX,AccY,AccZ"),
+    "ATT": ("cccccCC", "RollIn,Roll,PitchIn,Pitch,YawIn,Yaw,NavYaw"),
+    "MSG": ("Z", "Message"),
+}
+
+
+def old_log(tmp_path: pathlib.Path, *lines: str) -> sources.OnboardSource:
+    """A text log with the columns of ArduCopter 3.1; rows of ATT and MSG have no time."""
+    head = ["FMT, 128, 89, FMT, BBnNZ, Type,Length,Name,Format,Columns"]
+    head += [f"FMT, {TYPES[name]}, 50, {name}, {codes}, {columns}" for name, (codes, columns) in OLD.items()]
+    path = write(tmp_path, "\n".join([*head, *lines, ""]).encode(), name="old.log")
+    found = sources.open_source(path)
+    assert isinstance(found, sources.OnboardSource)
+    return found
+
+
+def old_gps(ms: int) -> str:
+    return f"GPS, 3, {GMS + ms}, {GWK}, 9, 1.0, 45.0, 7.0, 0.0, 300.0, 1.0, 90.0, 0.0, {ms}"
+
+
+def old_imu(ms: int) -> str:
+    return f"IMU, {ms}, 0, 0, 0, 0, 0, -9.8"
+
+
+ATTITUDE = "ATT, 0, 1, 0, 2, 0, 90, 90"
+
+
+def test_a_row_without_a_time_has_that_of_the_row_before(tmp_path: pathlib.Path) -> None:
+    """The first rows have the time of the first one that has one: the log does not begin at boot."""
+    rows = ["MSG, first", "MSG, second", old_gps(313_000), ATTITUDE, old_imu(313_200), ATTITUDE]
+    records = list(old_log(tmp_path, *rows))
+    kinds = [type(record) for record in records]
+    assert kinds == [r.Event, r.Event, r.Gnss, r.Attitude, r.Imu, r.Attitude]
+    seconds = [(record.rx_ns - records[0].rx_ns) * 1e-9 for record in records]
+    assert seconds == pytest.approx([0.0, 0.0, 0.0, 0.0, 0.2, 0.2])
+    assert records[0].rx_ns * 1e-9 == pytest.approx(UNIX_S + 313.0, abs=1e-3)
+
+
+def test_a_row_without_a_time_neither_confirms_a_damaged_one_nor_is_lost_with_it(
+    tmp_path: pathlib.Path,
+) -> None:
+    """The first stamp of the log is damaged, and one in the middle of it."""
+    rows = ["MSG, first", old_imu(9_000_000), ATTITUDE, old_gps(1000), old_imu(1100), "MSG, second"]
+    rows += [old_imu(8_000_000), "MSG, third", old_imu(1200)]
+    *records, damaged = old_log(tmp_path, *rows)
+    kinds = [type(record) for record in records]
+    assert kinds == [r.Event, r.Attitude, r.Gnss, r.Imu, r.Event, r.Event, r.Imu]
+    ms = [round((record.rx_ns - records[0].rx_ns) * 1e-6) for record in records]
+    assert ms == [0, 0, 0, 100, 100, 100, 200]
+    assert isinstance(damaged, r.Event) and "2 parts" in damaged.text
+
+
+def test_rows_without_a_time_are_kept_up_to_a_limit(
+    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(foreign_file, "MAX_UNSTAMPED", 3)
+    *records, damaged = old_log(tmp_path, old_gps(1000), *[ATTITUDE] * 5, old_gps(1200))
+    assert [type(record) for record in records] == [r.Gnss, *[r.Attitude] * 3]
+    assert isinstance(damaged, r.Event) and "3 messages before have no time since boot" in damaged.text
+
+
+def test_rows_without_a_time_do_not_move_a_reboot(tmp_path: pathlib.Path) -> None:
+    rows = [old_gps(50_000), old_imu(50_100), "MSG, again", old_imu(300), ATTITUDE, old_imu(400)]
+    records = list(old_log(tmp_path, *rows))
+    kinds = [type(record) for record in records]
+    assert kinds == [r.Gnss, r.Imu, r.Event, r.Reboot, r.Imu, r.Attitude, r.Imu]
+    ms = [round((record.rx_ns - records[0].rx_ns) * 1e-6) for record in records]
+    assert ms == [0, 100, 100, 100, 100, 100, 200]
