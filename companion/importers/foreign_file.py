@@ -40,11 +40,14 @@ T = TypeVar("T")
 
 
 class Damage:
-    """Parts of a file that were not read: number, total size in bytes, place and reason of the first."""
+    """Parts of a file that were not read: number, total size in bytes, place and reason of the first.
+
+    `whole` is the reason if nothing of the file is of use.
+    """
 
     def __init__(self) -> None:
         self.parts = self.size = 0
-        self.first = ""
+        self.first = self.whole = ""
 
     def add(self, place: str, size: int, reason: str) -> None:
         """Add a part of `size` bytes at `place`."""
@@ -101,7 +104,7 @@ def usable(path: Path, records: Iterable[Stamped], damage: Damage) -> Iterator[S
     except Exception as error:  # the last guard: no content of a file ends the program
         damage.add("the rest of the file", 0, one_line(error))
     if not found:
-        why = damage.first or "it contains no supported message"
+        why = damage.whole or damage.first or "it contains no supported message"
         raise LogError(f"{path}: nothing could be read: {why}")
     if damage.parts:
         yield Event(last_ns, last_ns, Severity.WARNING, f"{path.name} is damaged: {damage}"[:MAX_TEXT])
@@ -156,8 +159,10 @@ def steady_steps(stamped: Iterable[tuple[int | None, int, Any]], damage: Damage)
             yield (last or step)._replace(reboot=False, item=waiting.popleft()[1])
         last = step._replace(item=item)
         yield last
-    end = last or Step(0, 0, False, None)
-    yield from (end._replace(reboot=False, item=item) for _, item in waiting)
+    if last is not None:
+        yield from (last._replace(reboot=False, item=item) for _, item in waiting)
+    elif waiting:
+        damage.whole = f"none of its {len(waiting)} messages has a time since boot"
 
 
 def _steady_stamps(stamped: Iterable[tuple[int, int, Any]], damage: Damage) -> Iterator[Step]:

@@ -403,3 +403,14 @@ def test_rows_without_a_time_do_not_move_a_reboot(tmp_path: pathlib.Path) -> Non
     assert kinds == [r.Gnss, r.Imu, r.Event, r.Reboot, r.Imu, r.Attitude, r.Imu]
     ms = [round((record.rx_ns - records[0].rx_ns) * 1e-6) for record in records]
     assert ms == [0, 100, 100, 100, 100, 100, 200]
+
+
+def test_a_log_without_any_time_is_rejected(tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As those of ArduCopter 3.0, whose GPS has a time of week only: all rows were put at one instant."""
+    gps = old_gps(0).rpartition(",")[0]
+    monkeypatch.setitem(OLD, "GPS", (OLD["GPS"][0][:-1], OLD["GPS"][1].rpartition(",")[0]))
+    with pytest.raises(LogError) as caught:
+        old_log(tmp_path, "ERR, 1, 2", *[gps, ATTITUDE] * 5)
+    assert str(caught.value).endswith(
+        "old.log: nothing could be read: none of its 10 messages has a time since boot"
+    )
