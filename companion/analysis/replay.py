@@ -43,7 +43,7 @@ from companion.storage.run_metadata import PLATFORM, logged_configuration, numer
 
 
 class FlightPart(NamedTuple):
-    """A flight in the log: start and end (s since the first input), counts of inputs and solutions."""
+    """A flight in the log: start and end (s since the log's first record), counts of inputs and solutions."""
 
     start_s: float
     end_s: float
@@ -72,7 +72,13 @@ class _ReplayCounter:
 
     def __init__(self) -> None:
         self.outputs = Counter[str]()
+        self._zero_ns: int | None = None  # arrival of the first record of the log
         self._parts: list[list[int]] = []  # per flight: first and last arrival (ns), inputs, solutions
+
+    def record(self, record: Stamped) -> None:
+        """Note any record of the log: times count from the first one."""
+        if self._zero_ns is None:
+            self._zero_ns = record.rx_ns
 
     def input(self, record: Stamped) -> None:
         """Count one input."""
@@ -89,7 +95,7 @@ class _ReplayCounter:
 
     def result(self, comparison: OutputComparison | None = None) -> ReplayResult:
         """Return everything counted."""
-        zero_ns = self._parts[0][0] if self._parts else 0
+        zero_ns = self._zero_ns or 0
         parts = [FlightPart((a - zero_ns) * 1e-9, (b - zero_ns) * 1e-9, *n) for a, b, *n in self._parts]
         counted = ReplayResult(sum(part.inputs for part in parts), dict(self.outputs), parts)
         if comparison is None:
@@ -111,6 +117,8 @@ def replay_own(path: Path, config: Config, sink: Any = None) -> ReplayResult:
     flown: list[Stamped] = []
 
     for entry in flight_log.read(path):
+        if isinstance(entry.value, Stamped):
+            count.record(entry.value)
         if entry.topic.startswith("/in/") and isinstance(entry.value, Stamped):
             comparison.add(flown, ours)
             count.input(entry.value)
@@ -133,6 +141,7 @@ def replay_foreign(records: Iterable[Stamped], config: Config, sink: Any) -> Rep
     for record in records:
         from_importer = isinstance(record, OUTPUTS)
         sink.record(record, f"/link/{type(record).__name__}" if from_importer else None)
+        count.record(record)
         if isinstance(record, INPUTS):
             count.input(record)
             for output in navigator.handle(record):  # type: ignore[arg-type]
@@ -194,7 +203,7 @@ def derived_metadata(config: Config, by: str, log: Path) -> dict[str, dict[str, 
     "outages",
     multiple=True,
     metavar="GNSS:FROM-TO",
-    help="Remove GNSS or RSBN in this interval, s of the log.",
+    help="Remove GNSS or RSBN in this interval, s since the first record of the log.",
 )
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 def command(
@@ -301,9 +310,8 @@ def _replay_changed(
             "the velocity in the log's local position includes the effect of the autopilot's own GNSS during "
             "the outage"
         )
-    end_s = found.flights[-1].end_s if found.flights else 0.0
-    late = (outage for outage in outages if outage.start > end_s)
-    notes += [f"{outage} has no effect: the log ends at {end_s:.0f} s" for outage in late]
+    if log_inputs.outages is not None:
+        notes += log_inputs.outages.describe_unused()
     return found, [*notes, *gnss_latency.describe_analyses(analyses)], log_inputs.summary()
 
 

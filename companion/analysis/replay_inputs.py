@@ -60,10 +60,14 @@ def _full_name(name: str) -> str:
 
 
 class LogInputs(NamedTuple):
-    """The inputs of a log; `summary` returns the importer's counts after they are read."""
+    """The inputs of a log; `summary` returns the importer's counts after they are read.
+
+    `outages` were removed from them, if any.
+    """
 
     records: Iterable[Stamped]
     summary: Callable[[], dict[str, int]]
+    outages: simulated_rsbn.OutageFilter | None = None
 
 
 def open_inputs(log: Path) -> LogInputs:
@@ -130,7 +134,8 @@ def with_beacons_and_outages(
 ) -> tuple[LogInputs, str]:
     """Open the inputs of `log` with simulated beacons and outages. Return them and a note on the beacons.
 
-    With beacons the log is read twice: first for its track.
+    The outages count from the first record, as the times of a report do. With beacons the log is read twice:
+    first for its track.
     """
     listed = [] if beacons is None else simulated_rsbn.read_beacons(beacons)  # a mistake costs no reading
     log_inputs = open_inputs(log)
@@ -152,4 +157,5 @@ def with_beacons_and_outages(
             else f"no beacon of {beacons} is above the radio horizon along {track.origin}"
         )
         merged = heapq.merge(merged, measurements, key=lambda record: record.rx_ns)  # type: ignore[assignment]
-    return LogInputs(simulated_rsbn.apply_outages(merged, outages, first.rx_ns), log_inputs.summary), note
+    removing = simulated_rsbn.OutageFilter(outages, first.rx_ns)
+    return LogInputs(removing.left(merged), log_inputs.summary, removing), note

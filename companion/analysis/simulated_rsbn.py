@@ -51,6 +51,7 @@ _KINDS = {
     "DME": (False, True),
     "VOR": (True, False),
 }
+_SOURCES: dict[type[Stamped], str] = {Gnss: "GNSS", RsbnFix: "RSBN"}  # as an outage names them
 _OUTAGE = re.compile(r"(GNSS|RSBN):(\d+(?:\.\d+)?)-(\d+(?:\.\d+)?)", re.IGNORECASE)
 
 
@@ -77,7 +78,7 @@ class AircraftTrack(NamedTuple):
 
 
 class SimulatedOutage(NamedTuple):
-    """Outage of `source`, "GNSS" or "RSBN", from `start` to before `end`, seconds of the log."""
+    """Outage of `source`, "GNSS" or "RSBN", from `start` to before `end`, s since the log's first record."""
 
     source: str
     start: float
@@ -172,22 +173,40 @@ def parse_outage(text: str) -> SimulatedOutage:
     return SimulatedOutage(source.upper(), float(start), float(end))
 
 
-def apply_outages(
-    records: Iterable[Stamped], outages: Sequence[SimulatedOutage], start_ns: int
-) -> Iterator[Stamped]:
-    """Yield the records that do not arrive during an outage; times count from `start_ns`."""
-    intervals: dict[type[Stamped], list[tuple[int, int]]] = {
-        kind: [
-            (start_ns + round(o.start * 1e9), start_ns + round(o.end * 1e9))
-            for o in outages
-            if o.source == name
+class OutageFilter:
+    """Outages of a log whose first record arrived at `start_ns`; `removed` counts what each took away."""
+
+    def __init__(self, outages: Sequence[SimulatedOutage], start_ns: int) -> None:
+        self.removed = dict.fromkeys(outages, 0)
+        self._start_ns = self._end_ns = start_ns
+
+    def left(self, records: Iterable[Stamped]) -> Iterator[Stamped]:
+        """Yield the records that do not arrive during an outage."""
+        for record in records:
+            self._end_ns = max(self._end_ns, record.rx_ns)
+            during = list(self._outages_at(record))
+            for outage in during:
+                self.removed[outage] += 1
+            if not during:
+                yield record
+
+    def _outages_at(self, record: Stamped) -> Iterator[SimulatedOutage]:
+        source = _SOURCES.get(type(record))
+        if source is not None:
+            at = record.rx_ns - self._start_ns
+            for o in self.removed:
+                if o.source == source and round(o.start * 1e9) <= at < round(o.end * 1e9):
+                    yield o
+
+    def describe_unused(self) -> list[str]:
+        """Describe the outages that removed nothing, after the records are read."""
+        end_s = (self._end_ns - self._start_ns) * 1e-9
+        beyond = f"the log ends at {end_s:.0f} s"
+        return [
+            f"{o} has no effect: {beyond if o.start > end_s else f'no {o.source} arrives then'}"
+            for o, number in self.removed.items()
+            if not number
         ]
-        for name, kind in (("GNSS", Gnss), ("RSBN", RsbnFix))
-    }
-    for record in records:
-        spans = intervals.get(type(record), ())
-        if not any(begin <= record.rx_ns < end for begin, end in spans):
-            yield record
 
 
 def extract_track(records: Iterable[Stamped], config: Config) -> AircraftTrack:

@@ -96,6 +96,35 @@ def test_outage_after_the_end_is_reported(tmp_path: pathlib.Path) -> None:
     assert note.startswith("--outage GNSS:9000-9900 has no effect: the log ends at ")
 
 
+def dataflash_with_text_first(tmp_path: pathlib.Path) -> pathlib.Path:
+    """A text log of ArduPilot: a message at 1 s, a fix each second from 31 to 41 s, nothing else."""
+    lines = [
+        "FMT, 128, 89, FMT, BBnNZ, Type,Length,Name,Format,Columns",
+        "FMT, 130, 50, GPS, QBIHBcLLeee, TimeUS,Status,GMS,GWk,NSats,HDop,Lat,Lng,Alt,Spd,GCrs",
+        "FMT, 131, 75, MSG, QZ, TimeUS,Message",
+        "MSG, 1000000, ArduPlane",
+    ]
+    lines += [f"GPS, {s}000000, 3, {s}000, 2300, 9, 1.0, 45.0, 7.0, 300.0, 0.0, 0.0" for s in range(31, 42)]
+    path = tmp_path / "text_first.log"
+    path.write_text("\n".join([*lines, ""]))
+    return path
+
+
+def test_outage_counts_from_the_first_record_as_the_report_does(tmp_path: pathlib.Path) -> None:
+    """The first record is a text, no input: an outage that removed fixes was reported as without effect."""
+    log, output = dataflash_with_text_first(tmp_path), tmp_path / "x.mcap"
+    outages = ("--outage", "GNSS:35-38", "--outage", "GNSS:41-50")
+    result = report(log, "-o", output, *outages)
+    first = next(iter(flight_log.read(output))).value
+    assert type(first) is r.Event
+    seconds = [round((fix.rx_ns - first.rx_ns) * 1e-9) for fix in values(output, r.Gnss)]
+    assert seconds == [30, 31, 32, 33, 34, 38, 39, 40]
+    (note,) = [note for note in result["notes"] if "has no effect" in note]
+    assert note == "--outage GNSS:41-50 has no effect: the log ends at 40 s"
+    (flight,) = result["flights"]
+    assert (flight["start_s"], flight["end_s"]) == (pytest.approx(30.0), pytest.approx(40.0))
+
+
 @pytest.mark.flight
 def test_simulated_measurements_depend_on_the_seed(tmp_path: pathlib.Path, beacons: pathlib.Path) -> None:
     one, same, other = (tmp_path / name for name in ("one.mcap", "same.mcap", "other.mcap"))

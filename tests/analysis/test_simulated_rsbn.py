@@ -120,6 +120,12 @@ def test_track_without_truth_is_the_smoothed_flight() -> None:
         simulated_rsbn.extract_track([], Config())
 
 
+def without(records: list[r.Stamped], *outages: str) -> tuple[list[r.Stamped], list[str]]:
+    """Return the records left by outages of a log from 100 s on, and what is reported of the outages."""
+    found = simulated_rsbn.OutageFilter([simulated_rsbn.parse_outage(o) for o in outages], 100 * 10**9)
+    return list(found.left(records)), found.describe_unused()
+
+
 def test_outage_removes_the_named_source() -> None:
     def fix(second: int) -> r.Gnss:
         return r.Gnss(10**9 * second, 10**9 * second, 0, second, 3, 0.1, 0.2, 3.0)
@@ -129,13 +135,18 @@ def test_outage_removes_the_named_source() -> None:
         return r.RsbnFix(t, t, 1, 0.1, 0.2, 3.0, 0.4, 5.0, 0.1, 1.0)
 
     records: list[r.Stamped] = [make(s) for s in range(100, 110) for make in (fix, answer)]
-    left = list(simulated_rsbn.apply_outages(records, [simulated_rsbn.parse_outage("gnss:2-5")], 100 * 10**9))
+    left, _ = without(records, "gnss:2-5")
     assert [x.stamp_us for x in left if isinstance(x, r.Gnss)] == [100, 101, 105, 106, 107, 108, 109]
     assert sum(isinstance(x, r.RsbnFix) for x in left) == 10
-    left = list(
-        simulated_rsbn.apply_outages(records, [simulated_rsbn.parse_outage("RSBN:0-9.5")], 100 * 10**9)
-    )
+    left, _ = without(records, "RSBN:0-9.5")
     assert sum(isinstance(x, r.RsbnFix) for x in left) == 0
+    left, unused = without(records[::2], "GNSS:2-5", "GNSS:9.1-12", "GNSS:3.1-3.9", "RSBN:0-5")
+    assert len(left) == 7
+    assert unused == [
+        "--outage GNSS:9.1-12 has no effect: the log ends at 9 s",
+        "--outage GNSS:3.1-3.9 has no effect: no GNSS arrives then",
+        "--outage RSBN:0-5 has no effect: no RSBN arrives then",
+    ]
 
 
 @pytest.mark.parametrize("text", ["GNSS", "GPS:1-2", "GNSS:1", "GNSS:1-2-3", "GNSS:-1-2"])
