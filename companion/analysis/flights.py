@@ -6,7 +6,8 @@ inputs only: the navigator is run over them here, in memory.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Set
+from dataclasses import replace
 from pathlib import Path
 
 from companion.analysis.flight_arrays import Flight, collect_flights
@@ -16,19 +17,28 @@ from companion.analysis.replay_inputs import (
     is_own_log,
     open_inputs,
 )
-from companion.config import Config
+from companion.config import Config, Sensor
 from companion.navigator import Navigator
-from companion.records import INPUTS, OUTPUTS, Stamped
+from companion.records import (
+    INPUTS,
+    OUTPUTS,
+    AirData,
+    AirspeedSensor,
+    Attitude,
+    Imu,
+    LocalPosition,
+    Stamped,
+)
 from companion.storage import flight_log
 from companion.storage.reader import LogError
 from companion.storage.run_metadata import run_metadata
 
 MAX_NS = 2**62
 OWN_INS = "local position of an INS of its own"
-SENSORS = {
-    "imu": "its IMU",
-    "air_data": "its airspeed",
-    "local_position": "its velocity, which may depend on that GNSS (see inertial.source)",
+SENSORS: dict[Sensor, str] = {
+    "imu": "IMU",
+    "air_data": "airspeed",
+    "local_position": "velocity, which may depend on that GNSS (see inertial.source)",
 }
 
 
@@ -56,25 +66,47 @@ def open_flights(path: Path, config: Config) -> list[Flight]:
                     metadata=info.metadata,
                     remarks=tuple(remarks),
                 )
-        remarks.append(
-            "This is the log of another recorder: the navigator was run over it for this report. The "
-            f"inertial channel is {_channel(config)}."
-        )
-        return collect_flights(
-            _run_navigator(open_inputs(path).records, config),
+        sensors = set[str]()
+        flights = collect_flights(
+            _run_navigator(open_inputs(path).records, config, sensors),
             path.name,
             unix_ns=first_unix_ns,
             metadata=run_metadata(config),
             remarks=tuple(remarks),
         )
+        ours = "This is the log of another recorder: the navigator was run over it for this report."
+        added = f"{ours} {describe_channel(config, sensors)}"
+        return [replace(flight, remarks=(*flight.remarks, added)) for flight in flights]
 
 
-def _channel(config: Config) -> str:
-    """Say what the inertial channel may rest on."""
-    if config.has_own_ins:
-        return OWN_INS
-    used = [SENSORS[name] for name in ("imu", "air_data", "local_position") if config.uses(name)]
-    return f"the companion's own, by the autopilot's attitude and {', '.join(used)}"
+def describe_channel(config: Config, sensors: Set[str]) -> str:
+    """Describe what the inertial channel rests on: the `sensors` in the log that the configuration uses."""
+    if config.has_own_ins and "local_position" in sensors:
+        return f"The inertial channel is the {OWN_INS}."
+    used = [
+        name
+        for name in SENSORS
+        if name in sensors and config.uses(name) and (name == "local_position" or "attitude" in sensors)
+    ]
+    if config.has_own_ins or not used:
+        return "The log has nothing for an inertial channel."
+    *others, last = (["attitude"] if "attitude" in sensors else []) + [SENSORS[name] for name in used]
+    by = f"{', '.join(others)} and {last}" if others else last
+    return f"The inertial channel is the companion's own, by the autopilot's {by}."
+
+
+def _sensor(record: Stamped) -> str | None:
+    """Return the name of the sensor that the record shows to be there, None if it shows none."""
+    match record:
+        case Imu():
+            return "imu"
+        case AirData(sensed=True) | AirspeedSensor(healthy=True):
+            return "air_data"  # without a sensor VFR_HUD has the autopilot's own number, which is not used
+        case LocalPosition():
+            return "local_position"
+        case Attitude():
+            return "attitude"
+    return None
 
 
 def _read_outputs(path: Path) -> Iterator[tuple[str, Stamped]]:
@@ -85,9 +117,14 @@ def _read_outputs(path: Path) -> Iterator[tuple[str, Stamped]]:
             yield entry.topic, entry.value
 
 
-def _run_navigator(records: Iterable[Stamped], config: Config) -> Iterator[tuple[str, Stamped]]:
+def _run_navigator(
+    records: Iterable[Stamped], config: Config, sensors: set[str]
+) -> Iterator[tuple[str, Stamped]]:
+    """Yield records and outputs of the navigator, by topic; add the sensors of the log to `sensors`."""
     navigator = Navigator(config)
     for record in records:
+        if (sensor := _sensor(record)) is not None:
+            sensors.add(sensor)
         kind = type(record)
         from_importer = isinstance(record, OUTPUTS)
         yield f"/link/{kind.__name__}" if from_importer else flight_log.topic_of(kind), record

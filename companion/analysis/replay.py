@@ -36,7 +36,7 @@ from companion.config import Config, load
 from companion.importers import gnss_latency
 from companion.navigator import Navigator
 from companion.printable import printable
-from companion.records import INPUTS, OUTPUTS, Event, Reboot, Solution, Stamped
+from companion.records import INPUTS, OUTPUTS, Event, LocalPosition, Reboot, Solution, Stamped
 from companion.storage import flight_log
 from companion.storage.reader import ACTIVE, LogError, is_closed
 from companion.storage.run_metadata import PLATFORM, logged_configuration, numerical_platform, run_metadata
@@ -294,18 +294,21 @@ def _replay_changed(
     """Replay any log, with changes, and write it to `output`. Return result, notes, counts."""
     log_inputs, note = with_beacons_and_outages(log, beacons, outages, seed, config)
     log_inputs = with_correctors(log_inputs, tables)
-    tracks, logged = gnss_latency.TrackCollector(), set[Stamped]()
+    tracks, logged, kinds = gnss_latency.TrackCollector(), set[Stamped](), set[type[Stamped]]()
     described = derived_metadata(config, "replay", log)
     with (
         show_step(f"replay {log}"),
         create_replay_log(output, described, *start_times(log)) as sink,
     ):
-        found = replay_foreign(_observe(log_inputs.records, tracks, logged), config, sink)
+        found = replay_foreign(_observe(log_inputs.records, tracks, logged, kinds), config, sink)
         analyses = [gnss_latency.analyze_track(track) for track in tracks.tracks()]
         for event in set(gnss_latency.glitch_events(analyses)) - logged:
             sink.record(event, "/link/Event")
     notes = [note] if note else []
-    if outages and config.uses("local_position") and not config.has_own_ins:
+    removed = log_inputs.outages.removed if log_inputs.outages is not None else {}
+    without_gnss = any(number for outage, number in removed.items() if outage.source == "GNSS")
+    foreign_velocity = LocalPosition in kinds and config.uses("local_position") and not config.has_own_ins
+    if without_gnss and foreign_velocity:
         notes.append(
             "the velocity in the log's local position includes the effect of the autopilot's own GNSS during "
             "the outage"
@@ -324,10 +327,15 @@ def start_times(log: Path) -> tuple[int, int]:
 
 
 def _observe(
-    records: Iterable[Stamped], tracks: gnss_latency.TrackCollector, logged: set[Stamped]
+    records: Iterable[Stamped],
+    tracks: gnss_latency.TrackCollector,
+    logged: set[Stamped],
+    kinds: set[type[Stamped]],
 ) -> Iterator[Stamped]:
+    """Yield the records; collect the tracks of GNSS, the events and the kinds of record."""
     for record in records:
         tracks.add(record)
+        kinds.add(type(record))
         if isinstance(record, Event):
             logged.add(record)
         yield record

@@ -26,7 +26,7 @@ from companion.analysis.convert import convert_log
 from companion.analysis.figures import build_figures
 from companion.analysis.flight_arrays import collect_flights
 from companion.analysis.flight_events import describe_rejections, event_title, topic_name
-from companion.analysis.flights import open_flights
+from companion.analysis.flights import describe_channel, open_flights
 from companion.analysis.html import comparison_table, render_report
 from companion.analysis.log_command import group as log_group
 from companion.analysis.plot_data import thin_line
@@ -777,6 +777,48 @@ def test_converted_log_is_reported_as_the_original(tmp_path):
     (delay,) = converted.latencies
     assert delay.seconds == pytest.approx(0.2, abs=0.05)
     assert "behind the local position" in sentences(assess_flight(converted))
+
+
+@pytest.mark.parametrize(
+    ("sensors", "keys", "words"),
+    [
+        ("attitude imu", {}, "is the companion's own, by the autopilot's attitude and IMU."),
+        (
+            "attitude imu air_data local_position",
+            {},
+            "by the autopilot's attitude, IMU, airspeed and velocity, which may depend on that GNSS",
+        ),
+        ("attitude imu air_data", {"inertial.source": "imu"}, "by the autopilot's attitude and IMU."),
+        ("local_position", {}, "by the autopilot's velocity, which may depend"),
+        ("imu air_data", {}, "has nothing for an inertial channel."),
+        ("attitude", {}, "has nothing for an inertial channel."),
+        ("attitude imu", {"inertial.independent": True}, "has nothing for an inertial channel."),
+        ("local_position", {"inertial.independent": True}, "is the local position of an INS of its own."),
+    ],
+)
+def test_channel_is_described_by_what_the_log_has(sensors, keys, words):
+    assert words in describe_channel(load(flags=keys, environment={}), set(sensors.split()))
+
+
+def test_report_of_a_foreign_log_names_the_sensors_in_it(tmp_path):
+    """Airspeed without a sensor is the autopilot's own number: it is not used, and not named."""
+    records = [
+        record
+        for k in range(200)
+        for record in (
+            Attitude(START + k * S // 50, START + k * S // 50, 0.0, 0.0, 0.0),
+            Imu(START + k * S // 50, START + k * S // 50, 0, (0.0, 0.0, -9.8), (0.0, 0.0, 0.0)),
+            AirData(START + k * S // 50, START + k * S // 50, 15.0),
+        )
+    ]
+    path, about = tmp_path / "converted.mcap", {"converted": {"from": "flight.bin"}}
+    with flight_log.Writer(path, metadata=about, start_unix_ns=10**18, start_ns=START, block=True) as out:
+        for record in records:
+            out.record(record)
+    (found,) = open_flights(path, Config())
+    assert found.remarks[-1].endswith(
+        "The inertial channel is the companion's own, by the autopilot's attitude and IMU."
+    )
 
 
 @pytest.mark.flight
