@@ -13,6 +13,7 @@ from companion.analysis import error_statistics, flight_events
 from companion.analysis.assessment import GNSS, SMOOTHED, Assessment, deviation
 from companion.analysis.error_statistics import root_mean_square
 from companion.analysis.flight_events import (
+    NO_ESTIMATE,
     OUTAGE_MIN_S,
     WITHOUT_FIXES,
     OutageInterval,
@@ -239,9 +240,12 @@ def gnss_contradiction(a: Assessment) -> float | None:
 
 
 def is_worse_than_inertial(row: error_statistics.PhaseErrors) -> bool:
-    """Return whether in a phase worth mentioning the estimate was worse than the inertial channel alone."""
+    """Return whether in a phase worth mentioning the estimate was worse than the inertial channel alone.
+
+    A phase without an estimate may have a few at its end: those do not stand for it.
+    """
     ins, corrected = row.rms.get(error_statistics.INS), row.rms.get(error_statistics.CORRECTED)
-    if row.seconds < SHORT_S or ins is None or corrected is None:
+    if row.seconds < SHORT_S or row.phase == NO_ESTIMATE or ins is None or corrected is None:
         return False
     return corrected > 1.2 * ins + FLAT_M
 

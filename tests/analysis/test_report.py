@@ -376,6 +376,23 @@ def test_estimate_worse_than_the_inertial_channel_is_an_anomaly():
     )
 
 
+def test_a_phase_without_an_estimate_is_not_compared_with_the_inertial_channel():
+    """The autopilot is silent for a minute; the first estimate after it, 400 m off, belongs to that phase."""
+    start, end = START + 60 * S, START + 110 * S
+    rows = [r for r in flight_records() if not start <= r.rx_ns < end or isinstance(r, Truth)]
+    first = next(k for k, r in enumerate(rows) if isinstance(r, Solution) and r.t_ns >= end)
+    far = displace(rows[first].lat, rows[first].lon, 0.0, 400.0, 0.0, 0.0)
+    ins = (-400.0 + 3.0, 4.0)
+    rows[first] = msgspec.structs.replace(
+        rows[first], mode=Mode.UNTRUSTED, lat=far.lat, lon=far.lon, error_n=ins, bound_n=None
+    )
+    a = collected(rows)
+    (row,) = (row for row in a.rows if row.phase == "no estimate")
+    assert row.rms["corrected"] > 1.2 * row.rms["INS alone"] + 1.0
+    assert "worse than the inertial channel" not in sentences(a)
+    assert judge_flight(a).reason == "There was no estimate for a part of the flight, from 1:00 on."
+
+
 def test_reference_without_truth_is_named():
     a = assess_flight(flight(truth=False, receiver=1))  # no fix of the receiver in use: nothing to smooth
     assert a.reference.what == assessing.GNSS
