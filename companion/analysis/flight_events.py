@@ -129,6 +129,16 @@ def phase_title(name: str) -> str:
     )
 
 
+def is_fix(source: str) -> bool:
+    """Return whether what was rejected is a position fix of GNSS or of a beacon."""
+    return source.lower().startswith(("gnss", "rsbn"))
+
+
+def is_gnss_velocity(source: str) -> bool:
+    """Return whether what was rejected is the velocity of a GNSS fix, whose position may have been used."""
+    return source.lower().startswith("velocity of gnss")
+
+
 def source_title(source: str) -> str:
     """Return the name of a source of measurements for the user: GNSS 0, beacon 7 azimuth, airspeed."""
     _, of, source = source.rpartition("velocity of ")

@@ -17,6 +17,7 @@ from companion.analysis.flight_events import (
     OUTAGE_MIN_S,
     WITHOUT_FIXES,
     OutageInterval,
+    RejectionGroup,
     phase_title,
     source_title,
     usable_gnss,
@@ -283,12 +284,23 @@ def _bound_sentences(a: Assessment) -> list[str]:
 
 
 def _rejection_sentences(a: Assessment) -> list[str]:
-    fixes = [group for group in a.groups if group.source.lower().startswith(("gnss", "rsbn"))]
+    """Describe what was rejected: positions of fixes, velocities of GNSS, and what else most.
+
+    One rejected fix in a flight is usual: it is in the table.
+    """
+    velocities = _velocity_rejections(a)
+    fixes = [group for group in a.groups if flight_events.is_fix(group.source)]
     if not fixes:
-        return ["No fix was rejected.", *_other_rejections(a)]
+        what = "position fix" if any(map(_of_velocity, a.groups)) else "fix"
+        return [f"No {what} was rejected.", *velocities, *_other_rejections(a)]
     total = sum(group.number for group in fixes)
-    if total == 1:  # one rejection in a flight is usual; it is in the table
-        return []
+    if total == 1:
+        return velocities
+    return [_fix_rejections(fixes, total), *velocities]
+
+
+def _fix_rejections(fixes: Sequence[RejectionGroup], total: int) -> str:
+    """Return the sentence on rejected positions of fixes."""
     largest = max(fixes, key=lambda group: group.number)
     far = (
         f", up to {format_length(largest.metres)} from the estimate" if math.isfinite(largest.metres) else ""
@@ -298,19 +310,42 @@ def _rejection_sentences(a: Assessment) -> list[str]:
         when = f"at {format_time(largest.start)}"
     rejected = f"{total} fixes were rejected"
     if len(fixes) == 1:
-        return [f"{rejected}, {when}: {flight_events.describe_reason(largest)}{far}."]
-    return [
+        return f"{rejected}, {when}: {flight_events.describe_reason(largest)}{far}."
+    return (
         f"{rejected} in {len(fixes)} events; the largest, {when}, has {largest.number} from "
         f"{source_title(largest.source)}{far}: {flight_events.describe_reason(largest)}."
+    )
+
+
+def _of_velocity(group: RejectionGroup) -> bool:
+    return flight_events.is_gnss_velocity(group.source)
+
+
+def _velocity_rejections(a: Assessment) -> list[str]:
+    """Return a sentence for each receiver whose velocity was rejected more than once."""
+    found: dict[str, list[RejectionGroup]] = {}
+    for group in a.groups:
+        if _of_velocity(group):
+            found.setdefault(source_title(group.source), []).append(group)
+    return [
+        f"The {name} was rejected {number} times, from {format_time(groups[0].start)} to "
+        f"{format_time(max(group.end for group in groups))}."
+        for name, groups in found.items()
+        if (number := sum(group.number for group in groups)) > 1
     ]
 
 
 def _other_rejections(a: Assessment) -> list[str]:
-    """Return a sentence on the source, no fix, of which most was rejected."""
-    numbers = Counter[str]()
+    """Return a sentence on the source, neither fix nor velocity of one, of which most was rejected."""
+    numbers = Counter[tuple[str, str]]()
     for group in a.groups:
-        numbers[source_title(group.source)] += group.number
-    return [f"Rejected most: {name}, {n} times." for name, n in numbers.most_common(1) if n > 1]
+        if not _of_velocity(group):
+            numbers[source_title(group.source), flight_events.reason_title(group.reason)] += group.number
+    return [
+        f"Of other measurements, {name} was rejected most, {n} times: {reason}."
+        for (name, reason), n in numbers.most_common(1)
+        if n > 1
+    ]
 
 
 def _anomalies(a: Assessment) -> list[str]:

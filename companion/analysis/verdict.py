@@ -95,9 +95,14 @@ def _moments_beyond_bound(a: Assessment) -> Verdict | None:
 
 
 def _protection_broken(a: Assessment) -> Verdict | None:
-    """The error exceeded the protection level; stated against a truth only."""
+    """The error exceeded the protection level.
+
+    Not stated against GNSS, which may be rejected rightly, nor against a track that GNSS contradicts.
+    """
     corrected = a.errors.get(error_statistics.CORRECTED)
-    if corrected is None or _promise(a) != "fault":
+    if corrected is None or a.reference is None or a.reference.what == GNSS:
+        return None
+    if gnss_contradiction(a) is not None:
         return None
     solution, t = a.flight.tables["Solution"], corrected.t_ns * 1e-9
     level = solution["protection"][
@@ -107,9 +112,10 @@ def _protection_broken(a: Assessment) -> Verdict | None:
     if not len(beyond):
         return None
     k = beyond[np.argmax(corrected.error[beyond] / level[beyond])]
+    off = deviation(a) if a.against_truth else f"{deviation(a)} from {a.reference.what}"
     return Verdict(
-        "fault",
-        f"The error exceeded the protection level at {format_time(t[k])}: "
+        _promise(a),
+        f"The {off} exceeded the protection level at {format_time(t[k])}: "
         f"{format_length(corrected.error[k])} against {format_length(level[k])}.",
         f"{corrected.error[k] / level[k]:.2f} ×",
         "the protection level (limit 1)",
@@ -206,9 +212,11 @@ def _inconsistent(a: Assessment) -> Verdict | None:
 
 
 def _longest_rejection(a: Assessment) -> flight_events.RejectionGroup | None:
-    """Return the longest rejection of fixes, None if it is short."""
-    fixes = [g for g in a.groups if g.source.lower().startswith(("gnss", "rsbn"))]
-    longest = max(fixes, key=lambda g: g.end - g.start, default=None)
+    """Return the longest rejection of fixes or of the velocities of GNSS, None if it is short."""
+    found = [
+        g for g in a.groups if flight_events.is_fix(g.source) or flight_events.is_gnss_velocity(g.source)
+    ]
+    longest = max(found, key=lambda g: g.end - g.start, default=None)
     return None if longest is None or longest.end - longest.start < REJECTED_S else longest
 
 
@@ -216,12 +224,14 @@ def _rejections(a: Assessment) -> Verdict | None:
     longest = _longest_rejection(a)
     if longest is None or _promise(a) == "fault":
         return None
+    name = flight_events.source_title(longest.source)
+    velocity = flight_events.is_gnss_velocity(longest.source)
+    what, kind = (f"The {name} was", "velocities") if velocity else (f"Fixes of {name} were", "fixes")
     return Verdict(
         "caution",
-        f"Fixes of {flight_events.source_title(longest.source)} were rejected from "
-        f"{format_time(longest.start)}; whether this was right, the log cannot show.",
+        f"{what} rejected from {format_time(longest.start)}; whether this was right, the log cannot show.",
         format_duration(longest.end - longest.start),
-        "of fixes rejected",
+        f"of {kind} rejected",
     )
 
 
@@ -248,7 +258,8 @@ def _kept(a: Assessment) -> Verdict:
     happened = describe_gnss(a)
     if (rejected := _longest_rejection(a)) is not None:
         seconds = format_duration(rejected.end - rejected.start)
-        happened += f", {flight_events.source_title(rejected.source)} was rejected for {seconds}"
+        the = "the " * flight_events.is_gnss_velocity(rejected.source)
+        happened += f", {the}{flight_events.source_title(rejected.source)} was rejected for {seconds}"
     reason = f"{happened}, and {_describe_bound(a)}."
     return Verdict("good", reason, format_length(worst), describe_worst(a))
 

@@ -485,6 +485,57 @@ def test_rejections_have_units_and_a_single_one_is_not_in_the_lead():
     assert "rejected" not in sentences(a)
 
 
+def with_velocity_rejected(number, every_s=0.5, **kind):
+    """The five minutes without a rejected fix; from 1:00 on velocities of GNSS are, and other messages."""
+    rows = [r for r in flight_records(**kind) if not isinstance(r, Rejection)]
+    for k in range(number):
+        t = START + 60 * S + round(k * every_s * S)
+        rows.append(Rejection(t, t, "velocity of gnss 0", "excluded: false with probability", 0.9999, 0.999))
+    rows += [Rejection(START + 90 * S, START + 90 * S, "GLOBAL_POSITION_INT", "no position yet")] * 3
+    return rows
+
+
+def test_rejected_velocities_are_not_rejected_fixes():
+    text = sentences(collected(with_velocity_rejected(73)))
+    assert (
+        "No position fix was rejected. The velocity of GNSS 0 was rejected 73 times, from 1:00 to 1:36. "
+        "Of other measurements, GLOBAL_POSITION_INT was rejected most, 3 times: no position yet." in text
+    )
+    assert "No position fix was rejected. Of other" in sentences(collected(with_velocity_rejected(1)))
+    assert "No fix was rejected. Of other" in sentences(collected(with_velocity_rejected(0)))
+    fixes = [r for r in flight_records() if isinstance(r, Rejection)]
+    both = sentences(collected([*with_velocity_rejected(73), *fixes]))
+    assert "10 fixes were rejected, from 1:00 to 1:02" in both and "GNSS 0 was rejected 73 times" in both
+
+
+def against(reference, a):
+    """The same flight, as if its reference were another one."""
+    return dataclasses.replace(a, reference=a.reference._replace(what=reference))
+
+
+def test_velocities_rejected_for_long_are_no_good_flight_without_a_truth():
+    a = collected(with_velocity_rejected(73))
+    verdict = judge_flight(against(assessing.SMOOTHED, a))
+    assert (verdict.level, verdict.number, verdict.what) == ("caution", "36 s", "of velocities rejected")
+    assert verdict.reason.startswith("The velocity of GNSS 0 was rejected from 1:00;")
+    known = judge_flight(a)
+    assert known.level == "good" and "the velocity of GNSS 0 was rejected for 36 s" in known.reason
+    assert judge_flight(against(assessing.SMOOTHED, collected(with_velocity_rejected(9)))).level == "good"
+
+
+def test_a_distance_beyond_the_protection_level_is_a_caution():
+    """Of the smoothed track, unless GNSS contradicts that; GNSS itself may have been rejected rightly."""
+    a = assess_flight(flight(protection=4.0))
+    verdict = judge_flight(against(assessing.SMOOTHED, a))
+    assert (verdict.level, verdict.number) == ("caution", "1.25 ×")
+    assert verdict.reason.startswith("The distance from the smoothed track exceeded the protection level at ")
+    assert verdict.reason.endswith(": 5.0 m against 4.0 m.")
+    assert judge_flight(against(assessing.GNSS, a)).level == "good"
+    far = a.errors["GNSS fix"]._replace(error=a.errors["GNSS fix"].error + 50.0)
+    torn = dataclasses.replace(against(assessing.SMOOTHED, a), errors={**a.errors, "GNSS fix": far})
+    assert "contradict each other" in judge_flight(torn).reason
+
+
 def test_warnings_of_the_events_table_have_their_severity_and_colour():
     pytest.importorskip("jinja2")
     warning = Event(START + S, START + S, 4, "low battery")
