@@ -32,8 +32,13 @@ class GustSamples:
         self._rows: list[tuple[float, float, float]] = []
 
     def add(self, t_s: float, air: tuple[float, float], ground: tuple[float, float]) -> None:
-        """Add a velocity through the air and one over ground, both north and east, m/s."""
+        """Add a velocity through the air and one over ground, both north and east, m/s.
+
+        A velocity of 0 has no direction: it is left out.
+        """
         speed = math.hypot(*air)
+        if not speed > 0.0:
+            return
         c, s = air[0] / speed, air[1] / speed
         self._rows.append((t_s, speed - c * ground[0] - s * ground[1], math.atan2(s, c)))
 

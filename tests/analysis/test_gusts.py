@@ -51,3 +51,10 @@ def test_pause_does_not_join_what_is_apart() -> None:
     assert whole is not None
     assert apart is not None
     assert apart.correlation_s == pytest.approx(whole.correlation_s, rel=0.15)
+
+
+def test_airspeed_of_zero_is_left_out() -> None:
+    """A parked aircraft: an airspeed of exactly 0 ended the report of its recording."""
+    found, same = flight(1.2, 0.7), flight(1.2, 0.7)
+    found.add(2000.0, (0.0, 0.0), (0.1, 0.0))
+    assert found.estimate() == same.estimate() is not None
