@@ -58,12 +58,14 @@ class Row(NamedTuple):
 class Fixes:
     """The GNSS fixes of a flight: times (ns), positions (rad) and velocities (m/s) of those with one.
 
-    It flies while the log states so, or while it is fast.
+    A multirotor flies while the log states so, others while they are fast.
     """
 
     def __init__(self, records: Sequence[Stamped]) -> None:
-        stated = {r.t_ns: r.flying for r in records if isinstance(r, Vehicle) and r.flying is not None}
-        self._stated = sorted(stated.items()) if any(stated.values()) else []
+        vehicles = [r for r in records if isinstance(r, Vehicle)]
+        stated = {r.t_ns: r.flying for r in vehicles if r.flying is not None}
+        slow = any(r.multirotor for r in vehicles) and any(stated.values())
+        self._stated = sorted(stated.items()) if slow else []
         fixes = {r.t_ns: r for r in records if isinstance(r, Gnss) and r.has_3d_fix}
         found = [fixes[t_ns] for t_ns in sorted(fixes)]
         self.t_ns = np.array([r.t_ns for r in found])

@@ -79,6 +79,12 @@ def test_a_slow_flight_is_one_where_the_log_states_it() -> None:
     assert [t for t in starts if t < 130.0] and [t for t in starts if t > 340.0]
 
 
+def test_of_an_aeroplane_the_speed_counts_whatever_its_log_states() -> None:
+    fast = circling(330.0)
+    landed = [Vehicle(t * NS, t * NS, False, t > 200) for t in range(0, 330, 10)]
+    assert outages.Fixes([*fast, *landed]).starts(10.0, 20.0) == outages.Fixes(fast).starts(10.0, 20.0)
+
+
 def test_a_flight_too_short_is_one_sentence() -> None:
     log = DATA / "dronekit_copter_cut.tlog"
     with pytest.raises(
