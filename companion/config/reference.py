@@ -109,7 +109,7 @@ TEXTS: dict[str, dict[str, tuple[str, str]]] = {
         "crab_deg": ("Heading error or sideslip that lasts seconds.", "the aircraft flies with sideslip"),
         "crab_s": ("How long it lasts.", _MEASURED),
         "rotor_drag_per_s": (
-            "A multirotor's drag per velocity through the air, to 40 %; 0: not used.",
+            "A multirotor's drag per velocity through the air, to 25 %; 0: not used.",
             "its motors are tilted to push sideways: 0",
         ),
     },

@@ -87,7 +87,7 @@ class AirDataConfig(Section, frozen=True):
     beside an INS) the random walk stands for them, and one of 22 counts.
 
     A multirotor's accelerometers measure its drag, `rotor_drag_per_s` times its velocity through the air. It
-    is estimated within 40 %, so that the default does for most; with 0 it is not used.
+    is estimated within 25 %, so that the default does for most; with 0 it is not used.
     """
 
     wind_m_s: Annotated[float, Meta(ge=0.1, le=100.0)] = 8.0

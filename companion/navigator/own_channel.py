@@ -126,19 +126,20 @@ class OwnChannel:
 
 def airspeed_is_sensed(s: Sensors, record: AirData) -> bool:
     """Whether the airspeed is a sensor's: without one VFR_HUD carries the estimator's own number."""
-    if record.sensed is not None:
-        return record.sensed
-    return s.sensor_ns is not None and record.t_ns - s.sensor_ns <= SENSOR_NS
+    return _has_airspeed_sensor(s, record.t_ns) if record.sensed is None else record.sensed
+
+
+def _has_airspeed_sensor(s: Sensors, t_ns: int) -> bool:
+    return s.sensor_ns is not None and t_ns - s.sensor_ns <= SENSOR_NS
 
 
 def drag_is_sensed(s: Sensors, t_ns: int) -> bool:
-    """Whether the accelerometers show the velocity through the air: of a flying multirotor.
+    """Whether the accelerometers show the velocity through the air: of a multirotor, in flight.
 
     One with an airspeed sensor has that instead.
     """
-    has_sensor = s.sensor_ns is not None and t_ns - s.sensor_ns <= SENSOR_NS
-    is_sensed = has_sensor or (s.air.air is not None and s.air.air.sensed)
-    return s.multirotor and s.aloft_ns is not None and not is_sensed
+    air = s.air.air
+    return s.multirotor and not _has_airspeed_sensor(s, t_ns) and not (air is not None and air.sensed)
 
 
 def air_velocity(s: Sensors, record: AirData, alt: float) -> Vector2 | None:

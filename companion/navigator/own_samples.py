@@ -113,16 +113,17 @@ def imu(state: State, record: Imu, settings: Settings) -> Step:
 def _rotor_drag(state: State, record: Imu, settings: Settings) -> State:
     """Use the drag of a multirotor as a measurement of its velocity through the air."""
     nominal, s, drag = state.nominal, state.sensors, settings.config.air_data.rotor_drag_per_s
-    if nominal is None or not s.multirotor or drag == 0.0 or not settings.config.uses("air_data"):
+    if nominal is None or drag == 0.0 or not settings.config.uses("air_data"):
+        return state
+    if not own_channel.drag_is_sensed(s, record.t_ns):
         return state
     height = None if s.air.static is None else nominal.point.position.alt
     if s.aloft_ns is None:
         parked = own_error_model.Ground(parked_height=height)
         return state._replace(sensors=s._replace(ground=parked, sums=None))
     taking_off = not s.ground.flying and record.t_ns - s.aloft_ns < TAKE_OFF_NS
-    near_ground = taking_off and own_error_model.is_clear(s.ground, height) is False
-    if near_ground or not own_channel.drag_is_sensed(s, record.t_ns):
-        return state  # while it takes off the ground pushes too
+    if taking_off and own_error_model.is_clear(s.ground, height) is False:
+        return state  # the ground pushes too
     state = _sheared(state, own_error_model.lifted(s.ground, height))
     assert state.nominal is not None
     interval = state.nominal.interval

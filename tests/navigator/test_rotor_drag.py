@@ -168,10 +168,22 @@ def test_it_is_used_of_flying_multirotors_without_an_airspeed_sensor_only(added:
     assert last is not None and not last.sources & Basis.AIR_DATA
 
 
+def test_a_multirotor_with_an_airspeed_sensor_uses_that_though_nothing_states_that_it_flies() -> None:
+    added: list[Input] = [Vehicle(15 * NS, 15 * NS, multirotor=True)]
+    added += [AirspeedSensor(t * NS, t * NS, True) for t in range(15, 40, 5)]
+    added += [AirData(t * NS // 5, t * NS // 5, 12.0 + 0.1 * (t % 7)) for t in range(100, 200)]
+    copter = [r for r in recorded()[:600] if not isinstance(r, Vehicle)]
+    navigator, used = Navigator(DEFAULT), False
+    for record in sorted((*copter, *added), key=lambda record: record.t_ns):
+        for out in navigator.handle(record):
+            used |= isinstance(out, Solution) and bool(out.sources & Basis.AIR_DATA)
+    assert used
+
+
 @pytest.mark.parametrize(("height", "begins_s"), [(2.0, 30.0), (20.0, 20.0)])
 def test_while_it_takes_off_it_is_not_used(height: float, begins_s: float) -> None:
     """The ground pushes too: up to 5 m above it, or for ten seconds."""
-    navigator, begun = Navigator(DEFAULT), math.inf
+    navigator, first_s = Navigator(DEFAULT), math.inf
     landed, flying = Vehicle(15 * NS, 15 * NS, True, False), Vehicle(20 * NS, 20 * NS, True, True)
     copter = [r for r in recorded()[:1000] if not isinstance(r, Vehicle)]
     above = 12.0 * height  # Pa
@@ -182,8 +194,8 @@ def test_while_it_takes_off_it_is_not_used(height: float, begins_s: float) -> No
     for record in sorted((*copter, landed, flying, *pressures), key=lambda record: record.t_ns):
         for out in navigator.handle(record):
             if isinstance(out, Solution) and out.sources & Basis.AIR_DATA:
-                begun = min(begun, out.t_ns / NS)
-    assert begins_s < begun < begins_s + 1.5
+                first_s = min(first_s, out.t_ns / NS)
+    assert begins_s < first_s < begins_s + 1.5
 
 
 def test_the_smoother_is_the_two_point_solution_with_drag_too() -> None:
