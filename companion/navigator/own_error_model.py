@@ -45,12 +45,13 @@ measurement. Not modelled: Schuler loop, vertical channel (heights are pressure 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from typing import Literal, NamedTuple
 
 import numpy as np
 
 from companion.records import Vector2
-from companion.units import Floats
+from companion.units import G0, Floats
 
 By = Literal["imu", "air", "foreign", "hold"]
 
@@ -80,7 +81,7 @@ class Amplitudes(NamedTuple):
     slow_s: float = 600.0  # correlation of scale and heading
     crab: float = math.radians(2.0)
     crab_s: float = 20.0
-    tilt: float = 0.2  # m/s^2
+    tilt: float = G0 * math.radians(2.0)  # m/s^2
     tilt_s: float = 30.0
     accelerometer_m_s2: float = 0.1
     accelerometer_s: float = 600.0
@@ -106,6 +107,8 @@ class Amplitudes(NamedTuple):
 
 #: How many times coarser than the settings attitude, IMU and a held velocity are.
 GRADES = (1.0, 4.0, 8.0)
+#: The coarsest grade is no finer than that of these: that the settings are wrong is a hypothesis too.
+USUAL = Amplitudes()
 
 
 class Interval(NamedTuple):
@@ -212,17 +215,33 @@ def add_hold(i: Interval, dt: float) -> Interval:
 # ---------------------------------------------------------------------------------------------------------
 
 
+def _correlated(s: Amplitudes) -> Iterator[tuple[int | slice, float, Floats]]:
+    """Yield the states that are correlated over a time, that time (s), and their sigmas by grade."""
+    for where, tau, sigma, usual in (
+        (SCALE, s.slow_s, s.scale, None),
+        (HEADING, s.slow_s, s.heading, USUAL.heading),
+        (CRAB, s.crab_s, s.crab, USUAL.crab),
+        (TILT, s.tilt_s, s.tilt, USUAL.tilt),
+        (ACCELEROMETER, s.accelerometer_s, s.accelerometer_m_s2, USUAL.accelerometer_m_s2),
+        (DRIFT, s.drift_s, s.drift_m, None),
+        (DOPPLER, s.doppler_s, s.doppler_m_s, None),
+        (GUST, s.gust_s, s.gust_m_s, None),
+    ):
+        amplitudes = np.full(len(GRADES), sigma)
+        if usual is not None:
+            amplitudes *= GRADES
+            amplitudes[-1] = max(amplitudes[-1], GRADES[-1] * usual)
+        yield where, tau, amplitudes
+
+
 def prior(settings: Amplitudes) -> Floats:
     """Return the first covariances (grades, n, n); the estimate is zero."""
     s = settings
     sigma = np.empty((len(GRADES), N))
     sigma[:, POSITION], sigma[:, VELOCITY], sigma[:, WIND] = s.position_m, s.velocity_m_s, s.wind_m_s
-    sigma[:, SCALE], sigma[:, HEADING], sigma[:, CRAB] = s.scale, s.heading, s.crab
-    sigma[:, TILT], sigma[:, ACCELEROMETER], sigma[:, DRIFT] = s.tilt, s.accelerometer_m_s2, s.drift_m
-    sigma[:, GUST], sigma[:, DOPPLER] = s.gust_m_s, s.doppler_m_s
     sigma[:, FOREIGN], sigma[:, LATENCY] = s.foreign_m_s, s.latency_s
-    scaled = np.r_[HEADING, CRAB, TILT, ACCELEROMETER]
-    sigma[:, scaled] *= np.array(GRADES)[:, None]
+    for where, _, amplitudes in _correlated(s):
+        sigma.T[where] = amplitudes
     return np.asarray(np.square(sigma)[:, :, None] * np.eye(N), dtype=np.float64)
 
 
@@ -231,25 +250,15 @@ class Propagator:
 
     def __init__(self, settings: Amplitudes) -> None:
         self.settings = s = settings
-        rate, density, coarser = np.zeros(N), np.zeros((len(GRADES), N)), np.array(GRADES)
-        for where, sigma, tau, scaled in (
-            (SCALE, s.scale, s.slow_s, False),
-            (HEADING, s.heading, s.slow_s, True),
-            (CRAB, s.crab, s.crab_s, True),
-            (TILT, s.tilt, s.tilt_s, True),
-            (ACCELEROMETER, s.accelerometer_m_s2, s.accelerometer_s, True),
-            (DRIFT, s.drift_m, s.drift_s, False),
-            (DOPPLER, s.doppler_m_s, s.doppler_s, False),
-            (GUST, s.gust_m_s, s.gust_s, False),
-        ):
+        rate, density = np.zeros(N), np.zeros((len(GRADES), N))
+        for where, tau, amplitudes in _correlated(s):
             rate[where] = 1.0 / tau
-            amplitude = sigma * (coarser if scaled else np.ones_like(coarser))
-            density[:, where] = ((2.0 / tau) * amplitude**2).reshape(-1, *([1] * isinstance(where, slice)))
+            density.T[where] = (2.0 / tau) * amplitudes**2
         density[:, WIND] = s.wind_change_m_s_sqrt_s**2
         density[:, FOREIGN] = s.foreign_change_m_s_sqrt_s**2
         density[:, LATENCY] = s.latency_change_s_sqrt_s**2
         self._rate, self._density = rate, density
-        self._coarser2 = np.square(coarser)
+        self._coarser2 = np.square(GRADES)
         self._diagonal = np.arange(N)
         self._wind_seen = np.zeros((N, N))
         for k in (0, 1):

@@ -73,6 +73,17 @@ def test_a_flight_ends_after_ten_slow_seconds(seconds: int) -> None:
     assert phases((20.0, 20.0, None), *[(1.0, 1.0, None)] * (seconds + 1))[-1] == (seconds < 10)
 
 
+@pytest.mark.parametrize("name", ["heading", "crab", "tilt", "accelerometer_m_s2"])
+def test_the_coarsest_grade_doubts_settings_that_are_too_exact(name: str) -> None:
+    usual, interval = Amplitudes(), add_imu(begin("imu", (20.0, 0.0)), 1.0, (0.0, 0.0), 0.0, 0.0)
+    exact = usual._replace(**{name: getattr(usual, name) / 20.0})
+    found = [(prior(s), Propagator(s).transition(interval)[1]) for s in (usual, exact)]
+    for by_default, stated in zip(*found, strict=True):
+        np.testing.assert_array_equal(stated[-1], by_default[-1])
+        assert (np.diagonal(stated[0]) <= np.diagonal(by_default[0])).all()
+        assert stated[0].trace() < by_default[0].trace()
+
+
 def test_two_intervals_beside_the_imu_are_one() -> None:
     """The gust is a Gauss-Markov process: exactly, however long the interval."""
     propagator, at = Propagator(Amplitudes()), GUST.start

@@ -74,12 +74,7 @@ TURNS = [
     ("plane_turn_cut", imu_turned, 20.0),
     ("plane_turbulence_cut", imu_turned, 20.0),
 ]
-#: An IMU that is turned by 90 deg beside an attitude stated as exact as PX4's: docs/limits.md.
-EXCLUDED = pytest.mark.xfail(strict=True, reason="GNSS is excluded since its velocity is taken first")
-STATED_FINER = [
-    *(pytest.param(*case, 0.5, marks=pytest.mark.long) for case in TURNS[:-1]),
-    pytest.param(*TURNS[-1], 0.5, marks=[pytest.mark.long, EXCLUDED]),
-]
+STATED_FINER = [pytest.param(*case, 0.5, marks=pytest.mark.long) for case in TURNS]
 
 
 @pytest.mark.parametrize(  # ArduPilot, preset px4
