@@ -13,12 +13,12 @@ from companion.navigator import (
     inertial_track,
     measurements,
     own_channel,
-    own_error_model,
     parallel_filters,
 )
 from companion.navigator.channel import Nominal
 from companion.navigator.corrected_ins import CorrectedIns
 from companion.navigator.corrector_measurements import CorrectorRows
+from companion.navigator.ground import FLYING_M_S
 from companion.navigator.inertial_track import Point
 from companion.navigator.minimax_bound import Guarantee
 from companion.navigator.progress import carried, decided, is_silent, propagated, shifted, solved_if_due
@@ -96,7 +96,7 @@ def airspeed(state: State, record: AirData, settings: Settings) -> Step:
     if nominal is None or not own_channel.airspeed_is_sensed(s, record):
         return state, []
     V = own_channel.air_velocity(s, record, nominal.point.position.alt)
-    if V is None or math.hypot(*V) < own_error_model.FLYING_M_S:
+    if V is None or math.hypot(*V) < FLYING_M_S:
         return state, []
     if record.t_ns - s.measured_ns < CORRECTOR_AIRSPEED_NS:
         return state, []

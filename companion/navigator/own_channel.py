@@ -18,8 +18,9 @@ from companion.config import Config
 from companion.navigator import air_data_channel, own_error_model, strapdown_channel
 from companion.navigator.air_data_channel import Reckoner
 from companion.navigator.channel import DOPPLER_S, Nominal, Transition, moved
+from companion.navigator.ground import Ground
 from companion.navigator.inertial_track import Point
-from companion.navigator.own_error_model import By, Ground, Propagator
+from companion.navigator.own_error_model import By, Propagator
 from companion.navigator.strapdown_channel import Strap
 from companion.records import AirData, Gnss, LocalPosition, RsbnFix, Vector2, Vector3
 from companion.units import G0, Floats

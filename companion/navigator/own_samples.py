@@ -17,6 +17,7 @@ from companion.navigator import (
     strapdown_channel,
 )
 from companion.navigator.channel import Nominal
+from companion.navigator.ground import Ground, ground_phase, is_clear, lifted, wind_shear
 from companion.navigator.own_channel import AirspeedSums, OwnChannel, Sensors
 from companion.navigator.own_error_model import By
 from companion.navigator.progress import (
@@ -119,12 +120,12 @@ def _rotor_drag(state: State, record: Imu, settings: Settings) -> State:
         return state
     height = None if s.air.static is None else nominal.point.position.alt
     if s.aloft_ns is None:
-        parked = own_error_model.Ground(parked_height=height)
+        parked = Ground(parked_height=height)
         return state._replace(sensors=s._replace(ground=parked, sums=None))
     taking_off = not s.ground.flying and record.t_ns - s.aloft_ns < TAKE_OFF_NS
-    if taking_off and own_error_model.is_clear(s.ground, height) is False:
+    if taking_off and is_clear(s.ground, height) is False:
         return state  # the ground pushes too
-    state = _sheared(state, own_error_model.lifted(s.ground, height))
+    state = _sheared(state, lifted(s.ground, height))
     assert state.nominal is not None
     interval = state.nominal.interval
     if state.bank is not None and interval is not None and not interval.drag:
@@ -155,7 +156,7 @@ def air_data(state: State, record: AirData, settings: Settings) -> Step:
     if s.ground.flying and leads and (step := _step(s, record)) is not None:
         return state, [step]
     height = None if s.air.static is None else nominal.point.position.alt
-    ground = own_error_model.ground_phase(s.ground, record.t_ns * 1e-9, math.hypot(*V), speed, height)
+    ground = ground_phase(s.ground, record.t_ns * 1e-9, math.hypot(*V), speed, height)
     state = _sheared(state, ground)
     s = state.sensors._replace(air_ns=record.t_ns if ground.flying else s.air_ns)
     state = state._replace(sensors=s)
@@ -169,10 +170,10 @@ def air_data(state: State, record: AirData, settings: Settings) -> Step:
     return _measured(carried(state, record.t_ns, settings), record, V, settings), []
 
 
-def _sheared(state: State, ground: own_error_model.Ground) -> State:
+def _sheared(state: State, ground: Ground) -> State:
     """With another phase of the flight, and with what the wind may have changed with height in it."""
     s, nominal = state.sensors, state.nominal
-    sheared = own_error_model.wind_shear(s.ground, ground)
+    sheared = wind_shear(s.ground, ground)
     state = state._replace(sensors=s._replace(ground=ground))
     if sheared and nominal is not None and nominal.interval is not None:
         interval = nominal.interval._replace(shear=nominal.interval.shear + sheared)

@@ -1,76 +1,20 @@
-"""The error model of the own channel, on the ground and in flight."""
+"""The error model of the own channel."""
 
 from __future__ import annotations
-
-import math
 
 import numpy as np
 import pytest
 
 from companion.navigator.own_error_model import (
-    CLEAR_M,
     GUST,
-    SHEAR_M_S,
-    SHEAR_TOP_M,
     Amplitudes,
-    Ground,
     N,
     Propagator,
     Row,
     add_imu,
     begin,
-    ground_phase,
     prior,
-    wind_shear,
 )
-
-
-def phases(*samples: tuple[float, float, float | None]) -> list[bool]:
-    """Whether it flies after each (airspeed, ground speed, height), one second apart."""
-    g, found = Ground(), []
-    for t, (airspeed, speed, height) in enumerate(samples):
-        g = ground_phase(g, float(t), airspeed, speed, height)
-        found.append(g.flying)
-    return found
-
-
-def test_in_the_ground_roll_airspeed_is_not_used_until_the_wheels_are_off_the_ground() -> None:
-    roll = [(0.5, 0.0, 100.0)] * 3 + [(15.0, 14.0, 100.5), (25.0, 24.0, 100.0 + CLEAR_M + 0.1)]
-    assert phases(*roll) == [False, False, False, False, True]
-
-
-def test_below_the_parked_height_it_flies_too() -> None:
-    """Launched from a hill its airspeed was never used."""
-    assert phases((0.5, 0.0, 100.0), (25.0, 24.0, 100.0 - CLEAR_M - 0.1))[-1]
-
-
-def test_the_wind_is_as_open_after_many_small_steps_of_height_as_after_one() -> None:
-    def variance(step: float) -> float:
-        g, total = Ground(False, None, 100.0), 0.0
-        for k in range(1, round(300.0 / step) + 1):
-            after = ground_phase(g, 0.1 * k, 25.0, 25.0, 100.0 + step * k)
-            total, g = total + wind_shear(g, after), after
-        return total
-
-    assert variance(1.0) == pytest.approx(variance(300.0), rel=1e-12)
-    assert variance(1.0) == pytest.approx(SHEAR_M_S**2 * math.log(SHEAR_TOP_M / CLEAR_M))
-    level = Ground(True, None, 100.0, 80.0)
-    assert wind_shear(level, ground_phase(level, 1.0, 25.0, 25.0, 170.0)) == 0.0  # up and down in cruise
-
-
-def test_without_a_pressure_it_flies_once_it_moves() -> None:
-    """The flight of UMN has none: its airspeed was never used."""
-    assert phases((0.5, 0.0, None), (3.0, 3.0, None), (15.0, 14.0, None)) == [False, False, True]
-
-
-def test_a_pitot_behind_a_running_propeller_is_no_flight() -> None:
-    """It taught a wind of 20 m/s; the airspeed was false after lift-off, and later GNSS."""
-    assert phases((21.0, 0.1, None), (21.0, 1.0, None), (18.0, 9.0, None)) == [False, False, True]
-
-
-@pytest.mark.parametrize("seconds", [9, 11])
-def test_a_flight_ends_after_ten_slow_seconds(seconds: int) -> None:
-    assert phases((20.0, 20.0, None), *[(1.0, 1.0, None)] * (seconds + 1))[-1] == (seconds < 10)
 
 
 @pytest.mark.parametrize("name", ["heading", "crab", "tilt", "accelerometer_m_s2"])
