@@ -1,4 +1,4 @@
-"""`companion study wrong-sensors`: a recorded flight again, its attitude, IMU or airspeed made wrong.
+"""`companion study wrong-sensors`: a recorded flight again, attitude, IMU, airspeed or beacons made wrong.
 
     companion study wrong-sensors flight.bin --rsbn beacons.csv
     companion study wrong-sensors flight.tlog --rsbn beacons.csv --from 300
@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import json
 import math
+from bisect import bisect_right
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -28,9 +29,9 @@ from companion.estimate.bank.settings import DEFAULT as THRESHOLDS
 from companion.nav.geometry import Geodetic, separation, wrap_angle
 from companion.navigator import INPUTS_USED, Navigator
 from companion.option_types import FloatRange
-from companion.records import AirData, Attitude, Imu, Reboot, Solution, Stamped
+from companion.records import AirData, Attitude, Imu, Reboot, RsbnFix, Solution, Stamped
 from companion.storage.reader import LogError
-from companion.study.outages import Fixes
+from companion.study.outages import GAP_S, Fixes
 from companion.tables import print_tables
 from companion.units import SECOND_NS
 
@@ -58,6 +59,19 @@ def _force(change: Callable[[np.random.Generator], Sequence[float]]) -> Change:
     return lambda r, held, rng: replace(r, f_b=tuple(f + d for f, d in zip(r.f_b, change(rng), strict=True)))
 
 
+def _range(metres: float) -> Change:
+    return lambda r, held, rng: replace(
+        r, slant_range=None if r.slant_range is None else r.slant_range + metres
+    )
+
+
+def _azimuth(deg: float) -> Change:
+    turn = math.radians(deg)
+    return lambda r, held, rng: replace(
+        r, azimuth=None if r.azimuth is None else (r.azimuth + turn) % math.tau
+    )
+
+
 WRONG: dict[str, tuple[type[Stamped], Change]] = {
     "heading off by 20 deg": (Attitude, _heading(20.0)),
     "heading off by 90 deg": (Attitude, _heading(90.0)),
@@ -77,6 +91,12 @@ WRONG: dict[str, tuple[type[Stamped], Change]] = {
     ),
     "IMU stuck": (Imu, lambda r, held, rng: replace(r, f_b=held.f_b, w_b=held.w_b)),
     "airspeed stuck at zero": (AirData, lambda r, held, rng: replace(r, airspeed=0.0)),
+    "airspeed reads 1.5 times": (AirData, lambda r, held, rng: replace(r, airspeed=1.5 * r.airspeed)),
+    "ranges of beacons off by 50 m": (RsbnFix, _range(50.0)),
+    "ranges of beacons off by 200 m": (RsbnFix, _range(200.0)),
+    "ranges of beacons off by 1000 m": (RsbnFix, _range(1000.0)),
+    "azimuths of beacons off by 1 deg": (RsbnFix, _azimuth(1.0)),
+    "azimuths of beacons off by 5 deg": (RsbnFix, _azimuth(5.0)),
 }
 
 
@@ -95,7 +115,10 @@ def made_wrong(
 
 
 def fly(wrong: str, records: Sequence[Stamped], fixes: Fixes, config: Config) -> Row:
-    """Fly the records through the navigator, and compare each solution with the GNSS of its time."""
+    """Fly the records through the navigator, and compare each solution with the GNSS of its time.
+
+    Not within a gap of the fixes, nor before the first of them after it has come.
+    """
     navigator, farthest, suspect_ns, excluded_ns, last_ns = Navigator(config), 0.0, 0, 0, 0
     for record in sorted(records, key=lambda record: record.rx_ns):
         for out in navigator.handle(record):  # type: ignore[arg-type]
@@ -105,7 +128,9 @@ def fly(wrong: str, records: Sequence[Stamped], fixes: Fixes, config: Config) ->
             suspect_ns += passed * ((out.gnss_false or 0.0) > THRESHOLDS.suspect)
             excluded_ns += passed * ((out.gnss_false or 0.0) > THRESHOLDS.excluded)
             last_ns = out.t_ns
-            if np.abs(fixes.t_ns - out.t_ns).min() < SECOND_NS:
+            k = bisect_right(fixes.t_ns, out.t_ns - LATE_NS)
+            beside = k > 0 and out.t_ns <= fixes.t_ns[-1]
+            if beside and fixes.t_ns[k] - fixes.t_ns[k - 1] <= GAP_S * SECOND_NS:
                 north, east, _ = separation(Geodetic(out.lat, out.lon, 0.0), fixes.at(out.t_ns))
                 farthest = max(farthest, math.hypot(north, east))
         navigator.settle()
@@ -146,7 +171,7 @@ def command(
     pairs: tuple[str, ...],
     as_json: bool,
 ) -> None:
-    """Make attitude, IMU or airspeed of a recorded flight wrong.
+    """Make attitude, IMU, airspeed or beacons of a recorded flight wrong.
 
     LOG is any log that `companion replay` reads. One thing at a time is wrong; GNSS is as recorded. The table
     has the greatest distance of the position from GNSS, and for how long GNSS was suspect and excluded.

@@ -12,9 +12,10 @@ from click.testing import CliRunner
 
 from companion.command_line import cli
 from companion.config import load
-from companion.records import AirData, Attitude, Gnss, Imu, Stamped
+from companion.records import AirData, Attitude, Gnss, Imu, RsbnFix, Stamped
 from companion.storage.reader import LogError
-from companion.study.wrong_sensors import LATE_NS, WRONG, Row, made_wrong, study
+from companion.study.outages import Fixes
+from companion.study.wrong_sensors import LATE_NS, WRONG, Row, fly, made_wrong, study
 from tests.study.test_outages import AIRSPEED, circling
 
 NS = 1_000_000_000
@@ -30,6 +31,7 @@ def recorded() -> list[Stamped]:
         found.append(Attitude(t_ns, t_ns, 0.01 * k, 0.02 * k, 3.0, (0.0, 0.0, 0.1)))
         found.append(AirData(t_ns, t_ns, 20.0 + k, True, sensed=True))
         found.append(Gnss(t_ns, t_ns, 0, k, 3, 0.8, 0.1, 300.0))
+        found.append(RsbnFix(t_ns, t_ns, 7, 0.8, 0.2, 100.0, 6.25, 4e4, 2e-3, 100.0))
     return found
 
 
@@ -65,10 +67,26 @@ def test_what_is_stuck_keeps_its_last_value() -> None:
     assert stuck[-1].w_b == (0.0, 0.0, 0.1)  # type: ignore[attr-defined]
 
 
+def test_of_a_beacon_either_azimuth_or_range_is_wrong() -> None:
+    (*_, before), (*_, after) = of("azimuths of beacons off by 5 deg")
+    assert isinstance(before, RsbnFix) and isinstance(after, RsbnFix)
+    assert after.azimuth == pytest.approx(6.25 + math.radians(5.0) - math.tau)
+    assert after.slant_range == before.slant_range
+    (*_, after) = of("ranges of beacons off by 200 m")[1]
+    assert isinstance(after, RsbnFix)
+    assert (after.azimuth, after.slant_range) == (before.azimuth, 4e4 + 200.0)
+
+
+def test_a_gap_of_the_fixes_is_not_compared() -> None:
+    config, flight = load(flags={"inertial.source": "air_data"}, environment={}), circling(60.0, (30.0, 50.0))
+    row = fly("nothing", flight, Fixes(flight), config)  # a straight line over 20 s is 50 m off a circle
+    assert row.farthest_m < 5.0
+
+
 def test_without_a_beacon_gnss_is_never_suspect() -> None:
     config = load(flags={"inertial.source": "air_data"}, environment={})
     rows = {row.wrong: row for row in study(circling(60.0), config, 20.0)}
-    assert set(rows) == {"nothing", *(w for w, (kind, _) in WRONG.items() if kind is not Imu)}
+    assert set(rows) == {"nothing", *(w for w, (kind, _) in WRONG.items() if kind not in (Imu, RsbnFix))}
     assert rows["nothing"].farthest_m < 1.0
     assert all(row[2:] == (0.0, 0.0) for row in rows.values())
     second = math.sqrt(2.0) * AIRSPEED  # at 90 deg to the true velocity, until the next fix
