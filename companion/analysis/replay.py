@@ -2,8 +2,8 @@
 
 Our own MCAP log contains inputs, outputs and configuration: the inputs are replayed and every output is
 compared (see `comparison`). The log of another recorder contains inputs only (see `importers.sources`): the
-outputs are written. The same applies to a replay with changes: another configuration (--with), simulated
-beacons (--rsbn), simulated outages (--outage).
+outputs are written. The same applies to a replay with changes: another configuration (--config, --with),
+simulated beacons (--rsbn), simulated outages (--outage).
 """
 
 from __future__ import annotations
@@ -238,7 +238,8 @@ def command(
     counts: dict[str, int] = {}
     if own and not is_closed(log):
         notes.append("the log was not closed: its last messages may be missing")
-    as_flown = has_navigator_outputs(log) and not (changes or beacons or tables or simulated_outages)
+    changed = config_file or changes or beacons or tables or simulated_outages
+    as_flown = has_navigator_outputs(log) and not changed
     if output is None and not as_flown:
         output = Path(f"{log.name.split('.mcap')[0] if own else log.stem}.replay.mcap")
     if output is not None:

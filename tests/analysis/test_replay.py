@@ -13,6 +13,7 @@ import pytest
 from click.testing import CliRunner
 
 from companion.analysis import replay, report, smooth_command
+from companion.analysis.replay_inputs import apply_changes
 from companion.command_line import cli
 from companion.config import Config
 from companion.records import Event, Reboot, Reset
@@ -35,8 +36,8 @@ REAL = (
 )
 
 
-def replayed(log: Path, output: Path) -> dict:
-    done = CliRunner().invoke(replay.command, [str(log), "-o", str(output), "--json"])
+def replayed(log: Path, output: Path, *options: str) -> dict:
+    done = CliRunner().invoke(replay.command, [str(log), "-o", str(output), "--json", *options])
     assert done.exit_code == 0, done.output
     return json.loads(done.stdout)
 
@@ -68,6 +69,26 @@ def test_configuration_is_stored_in_the_log(tmp_path: Path) -> None:
     assert done.exit_code == 0, done.output
     assert logged_configuration(log).gnss.sigma_m == 7.5
     assert logged_configuration(log) != Config()
+
+
+def test_another_configuration_is_not_compared_with_the_flight(tmp_path: Path) -> None:
+    flight, file, output = (tmp_path / name for name in ("flight.mcap", "other.toml", "other.mcap"))
+    replayed(CUT, flight)
+    file.write_text("[gnss]\nsigma_m = 7.5\n")
+    found = replayed(flight, output, "--config", str(file))
+    assert (found["compared"], found["different"]) == (None, 0)
+    assert logged_configuration(output).gnss.sigma_m == 7.5
+
+
+def test_outputs_that_differ_from_the_flight_are_reported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    flight = tmp_path / "flight.mcap"
+    replayed(CUT, flight)
+    monkeypatch.setattr(replay, "logged_configuration", lambda path: apply_changes(Config(), "every_s=5"))
+    done = CliRunner().invoke(replay.command, [str(flight)])
+    assert done.exit_code == 1
+    assert "DIFFERENT" in done.stdout and "first difference: in flight" in done.stdout
 
 
 def test_counts_are_printed(tmp_path: Path) -> None:

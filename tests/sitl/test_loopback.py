@@ -97,17 +97,6 @@ def test_log_of_the_command_replays_bit_for_bit(tmp_path: Path) -> None:
     assert found["outputs"]["Solution"] > 1000
 
 
-@pytest.mark.flight
-@pytest.mark.long
-def test_replay_with_another_configuration_reports_the_first_difference(tmp_path: Path) -> None:
-    done = CliRunner().invoke(command, ["--scenario", "short", "--logs", str(tmp_path), "--json"])
-    other = tmp_path / "other.toml"
-    other.write_text("[gnss]\nsigma_m = 4.0\n")
-    replayed = CliRunner().invoke(replay.command, [json.loads(done.stdout)["log"], "--config", str(other)])
-    assert replayed.exit_code == 1
-    assert "DIFFERENT" in replayed.stdout and "first difference" in replayed.stdout
-
-
 def test_unknown_scenario_suggests_the_nearest(tmp_path: Path) -> None:
     done = CliRunner().invoke(command, ["--scenario", "shrt", "--logs", str(tmp_path)])
     assert done.exit_code == 2
