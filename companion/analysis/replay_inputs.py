@@ -33,14 +33,15 @@ def apply_changes(config: Config, text: str) -> Config:
     KEY is SECTION.KEY, or KEY alone if only one section has it, or `estimator` for estimator.output. Raises
     ConfigError, one sentence, if a key or value is invalid, or the result is inconsistent.
     """
-    pairs = [
-        f"{section}.{key}={msgspec.json.encode(value).decode()}"
+    changes = [pair.partition("=") for pair in re.split(r",(?=[A-Za-z_.]+=)", text)]
+    changed = [(_full_name(name.strip()), value) for name, _, value in changes]
+    kept = [
+        (f"{section}.{key}", msgspec.json.encode(value).decode())
         for section in config.__struct_fields__
         for key, value in structs.asdict(getattr(config, section)).items()
+        if f"{section}.{key}" not in dict(changed)
     ]
-    for pair in re.split(r",(?=[A-Za-z_.]+=)", text):
-        name, _, value = pair.partition("=")
-        pairs.append(f"{_full_name(name.strip())}={value}")
+    pairs = [f"{name}={value}" for name, value in kept + changed]
     try:
         return load(environment={}, pairs=pairs)
     except ConfigError as error:

@@ -92,6 +92,8 @@ def load(
         if not key or not text:
             raise ConfigError(f"--set {pair}: write it as SECTION.KEY=VALUE, for example gnss.sigma_m=3.0")
         _check_keys({section: {key: text}}, f"--set {pair}")
+        if (first := origin.get((section, key), "")).startswith("--set "):
+            raise ConfigError(f"--set {pair}: {section}.{key} is given twice, also as {first}: leave one out")
         tree.setdefault(section, {})[key] = _parse_value(text.strip())
         origin[section, key] = f"--set {pair}"
     config = _convert(tree, origin)

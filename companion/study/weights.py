@@ -369,14 +369,21 @@ def _numbers(text: str, numbers: str) -> tuple[float, float]:
 def _parse(
     readings: Sequence[str], beacons: Sequence[str], correlations: Sequence[str]
 ) -> tuple[list[Reading], dict[tuple[str, str], float]]:
-    places = {name: _numbers(text, rest) for text in beacons for name, _, rest in [text.partition("=")]}
+    places: dict[str, tuple[float, float]] = {}
+    for text in beacons:
+        name, _, numbers = text.partition("=")
+        if name in places:
+            raise ValueError(f"{text!r}: the place of {name} is given twice: leave one out")
+        places[name] = _numbers(text, numbers)
     found = [parse_reading(text, places) for text in readings]
     if unknown := set(places) - {reading.source for reading in found}:
         raise ValueError(f"no reading of beacon {', '.join(sorted(unknown))}")
-    pairs = {}
+    pairs: dict[tuple[str, str], float] = {}
     for text in correlations:
         names, _, number = text.partition("=")
         a, _, b = names.partition(",")
+        if (a, b) in pairs or (b, a) in pairs:
+            raise ValueError(f"{text!r}: the correlation of {a} and {b} is given twice: leave one out")
         try:
             pairs[a, b] = float(number)
         except ValueError:

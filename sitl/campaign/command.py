@@ -80,7 +80,7 @@ def list_orders(scenarios: Iterable[str], faults: Iterable[str], seeds: int) -> 
     Faults of the link and of the autopilot and delays do not depend on grade and beacons: they are flown in
     the first scenario only. A fault is not flown in a scenario without the sensor that it concerns.
     """
-    names, kinds = list(scenarios), list(faults)
+    names, kinds = list(dict.fromkeys(scenarios)), list(dict.fromkeys(faults))
     every = itertools.product(range(1, seeds + 1), names, kinds)
     once = {f for f in kinds if not is_sensor_fault(f) or f.endswith("-late")}
     return [

@@ -161,6 +161,7 @@ def test_keys_with_and_without_section() -> None:
         ("beta=3", "no section has this key"),
         ("gnss.sigma=3", "did you mean `sigma_m`"),
         ("estimator", "write it as SECTION.KEY=VALUE"),
+        ("sigma_m=3,gnss.sigma_m=4", "--with gnss.sigma_m=4: gnss.sigma_m is given twice"),
         ("independent=true,scheme=feedback", "set inertial.source = 'air_data' or 'imu'"),
     ):
         with pytest.raises(ConfigError, match=words) as caught:

@@ -196,6 +196,10 @@ def test_no_prediction_ahead_and_the_ends_of_the_message_ids_are_accepted() -> N
             ["inertial.correctors=stars", "inertial.independent=true", "inertial.source=imu"],
             "and inertial.source = 'auto', or inertial.correctors = []",
         ),
+        (
+            ["gnss.sigma_m=3", "rsbn.timeout_s=9", "gnss.sigma_m=4"],
+            "--set gnss.sigma_m=4: gnss.sigma_m is given twice, also as --set gnss.sigma_m=3: leave one out",
+        ),
         (["link.connect=[]"], "link.connect = [] names no link: give one, for example udpin:127.0.0.1:14550"),
         (["link.component_id=1"], "link.component_id = 1 is the component of the autopilot: give another"),
         (["output.odometry_hz=-0.5"], "odometry_hz = -0.5: set -1 (the profile's rate), 0 (never), or at "),

@@ -151,6 +151,11 @@ def test_plot(tmp_path):
         (("--reading=A.x=1,2", "--reading=B.azimuth=0,1"), "azimuths that do not meet"),
         (("--reading=A.x=1,2", "--reading=A.range=1,2", "--beacon=A=nan,2"), "'A=nan,2': give two finite"),
         (("--beacon=VOR=1,2",), "no reading of beacon VOR"),
+        (("--beacon=A=1,2", "--beacon=A=3,2"), "'A=3,2': the place of A is given twice: leave one out"),
+        (
+            ("--correlation=INS.x,GNSS.x=0.5", "--correlation=GNSS.x,INS.x=0.1"),
+            "the correlation of GNSS.x and INS.x is given twice: leave one out",
+        ),
     ],
 )
 def test_invalid_input_is_reported_in_one_sentence(arguments, message):

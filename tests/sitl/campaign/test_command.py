@@ -182,6 +182,11 @@ def test_campaign_covers_every_simulator_fault() -> None:
             assert flight.scenario_of(FlightOrder(name, fault, 1)).duration_s >= 600.0
 
 
+def test_a_case_given_twice_is_flown_once() -> None:
+    """The table counted each of its flights twice."""
+    assert command.list_orders(["one-beacon"] * 2, ["none"] * 2, 1) == [FlightOrder("one-beacon", "none", 1)]
+
+
 @pytest.mark.usefixtures("requested")
 def test_exit_code_follows_the_limits(tmp_path: Path) -> None:
     options = ["--scenario", "one-beacon", "--fault", "none", "--fault", "gnss-jump", "--seeds", "1"]
