@@ -133,6 +133,10 @@ def init(
 
     An existing key file is used again and not replaced. Exit code 1 if the autopilot does not sign with it.
     """
+    if link and no_autopilot:
+        raise click.UsageError(
+            f"--connect {link} has no effect with --no-autopilot, which only writes the key: leave one out"
+        )
     config = load(file, {"link.connect": (link,) if link else None}, pairs=pairs, preset=preset)
     path = key_file or Path(config.signing.key_file or "signing.key")
     check_links(config)

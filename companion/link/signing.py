@@ -173,14 +173,16 @@ def read_key(path: Path) -> bytes:
     ValueError
         If it cannot be read, is accessible to others than its owner, or holds no key.
     """
+    if path.exists() and not path.is_file():  # a pipe would keep the reader waiting
+        raise ValueError(f"{path} is not a regular file: give the name of a file")
     try:
         with path.open("rb") as file:
             mode = os.fstat(file.fileno()).st_mode & 0o777
             data = file.read(1024)
     except OSError as error:
-        raise ValueError(
-            f"{path}: the signing key cannot be read ({error.strerror}); make one: companion signing init"
-        ) from None
+        absent = isinstance(error, FileNotFoundError)
+        advice = "make one: companion signing init" if absent else "give a file that you may read"
+        raise ValueError(f"{path}: the signing key cannot be read ({error.strerror}); {advice}") from None
     if mode & 0o077:
         raise ValueError(f"{path}: the signing key is accessible to others (mode {mode:04o}); chmod 600 it")
     if len(data) == 32:

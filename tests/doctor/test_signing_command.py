@@ -1,5 +1,6 @@
 """`companion signing init`: the key reaches both ends, is private, is not replaced nor sent in the open."""
 
+import os
 import socket
 import stat
 import threading
@@ -108,14 +109,28 @@ def test_a_key_that_cannot_be_written_is_one_sentence(tmp_path: Path) -> None:
         f"--key-file {path}: the key cannot be written (No such file or directory): give a file in a folder "
         "that exists and that you may write"
     )
-    assert str(init(tmp_path, "--no-autopilot").exception).startswith(
-        f"--key-file {tmp_path}: the signing key cannot be read (Is a directory)"
+
+
+@pytest.mark.parametrize("kind", ["folder", "pipe"])
+def test_a_key_file_that_is_no_regular_file_is_one_sentence(tmp_path: Path, kind: str) -> None:
+    """The advice for a folder was to run this command; a pipe kept it waiting."""
+    path = tmp_path / kind
+    path.mkdir() if kind == "folder" else os.mkfifo(path)
+    assert str(init(path, "--no-autopilot").exception) == (
+        f"--key-file {path} is not a regular file: give the name of a file"
     )
 
 
 def test_an_invalid_link_writes_no_key(tmp_path: Path) -> None:
-    done = init(tmp_path / "key", "--no-autopilot", "--connect", "nothing")
+    done = init(tmp_path / "key", "--connect", "nothing")
     assert str(done.exception).startswith("link.connect: 'nothing' is not a connection string")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_link_without_effect_is_rejected(tmp_path: Path) -> None:
+    done = init(tmp_path / "key", "--no-autopilot", "--connect", "serial:/dev/autopilot:921600")
+    assert done.exit_code == 2
+    assert "--connect serial:/dev/autopilot:921600 has no effect with --no-autopilot" in done.output
     assert not list(tmp_path.iterdir())
 
 
