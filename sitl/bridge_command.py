@@ -215,6 +215,12 @@ def command(
     other = parse_address(companion, "--companion") if companion else None
     if gnss_on_after is not None and (gnss_off_after is None or gnss_on_after <= gnss_off_after):
         raise click.BadParameter("give --gnss-off-after, and a later time here", param_hint="--gnss-on-after")
+    for option, after_s in (("--gnss-off-after", gnss_off_after), ("--gnss-on-after", gnss_on_after)):
+        if after_s is not None and after_s >= seconds:
+            raise click.UsageError(
+                f"{option} {after_s:g} has no effect: the run ends after --seconds {seconds:g}: give a"
+                " smaller number, or a longer run"
+            )
     if other is None and (beacons_only or unaided):
         raise click.UsageError("--beacons-only and --unaided need a link to the companion: give --companion")
     mode = BridgeMode.SAME if other is None else BridgeMode.BESIDE if beacons_only else BridgeMode.RELAY
