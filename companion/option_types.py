@@ -3,9 +3,24 @@
 from __future__ import annotations
 
 import math
+import os
+from pathlib import Path
 from typing import Any
 
 import click
+
+
+class InputPath(click.Path):
+    """Path of a file or folder to read. An empty one is rejected: pathlib takes it for the current folder."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
+        """Convert to a path."""
+        if not str(value):
+            self.fail("'' is no name: give that of a file", param, ctx)
+        return Path(os.fsdecode(super().convert(value, param, ctx)))
+
+
+INPUT_PATH = InputPath()
 
 
 class FloatRange(click.FloatRange):

@@ -23,7 +23,7 @@ from companion.importers import tlog
 from companion.importers.tlog import TlogEntry
 from companion.link import dialect, frame
 from companion.link.dialect import mavlink
-from companion.option_types import FloatRange
+from companion.option_types import INPUT_PATH, FloatRange
 from companion.transport.address import Address
 from sitl.real_time import LONGEST_SLEEP_S, RealTimeRunner, parse_address
 
@@ -158,7 +158,7 @@ class PlayerRunner(RealTimeRunner):
 
 
 @click.command("play")
-@click.argument("log", type=click.Path(path_type=Path))
+@click.argument("log", type=INPUT_PATH)
 @click.option("--connect", default="tcpin:127.0.0.1:5760", show_default=True, help="Link to the client.")
 @click.option("--from", "from_s", type=FloatRange(0.0), default=0.0, help="Start at this second of the log.")
 @click.option("--to", "to_s", type=FloatRange(0.0), default=math.inf, help="End at this second of the log.")

@@ -115,6 +115,17 @@ def test_no_number_is_nan() -> None:
     assert {("live", "speed"), ("bridge", "gnss_off_after"), ("harm", "minutes")} < checked
 
 
+def test_an_empty_name_is_not_the_current_folder() -> None:
+    checked = set()
+    for name, command in commands().items():
+        for argument in command.params:
+            if isinstance(argument, click.Argument) and isinstance(argument.type, click.Path):
+                with pytest.raises(click.BadParameter, match="''"):
+                    argument.type.convert("", argument, click.Context(command))
+                checked.add(name)
+    assert {"report", "replay", "log info", "live", "fleet", "study outages", "sitl play"} < checked
+
+
 @pytest.mark.parametrize(("end", "code"), [("inf", 1), ("nan", 2), ("-inf", 2)])
 def test_infinity_means_no_end(end: str, code: int, tmp_path: Path) -> None:
     done = CliRunner().invoke(cli, ["sitl", "play", str(tmp_path / "none.tlog"), "--to", end])

@@ -12,7 +12,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from companion.analysis.progress import show_step
-from companion.option_types import FloatRange
+from companion.option_types import INPUT_PATH, FloatRange
 from companion.printable import printable
 from companion.storage.flight_log import Info, info, recover
 from companion.storage.reader import LogError
@@ -24,7 +24,7 @@ def group() -> None:
 
 
 @group.command("info")
-@click.argument("log", type=click.Path(path_type=Path))
+@click.argument("log", type=INPUT_PATH)
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
 def info_command(log: Path, as_json: bool) -> None:
     """Show the contents of LOG.
@@ -41,7 +41,7 @@ def info_command(log: Path, as_json: bool) -> None:
 
 
 @group.command("recover")
-@click.argument("log", type=click.Path(path_type=Path))
+@click.argument("log", type=INPUT_PATH)
 def recover_command(log: Path) -> None:
     """Recover a torn or damaged LOG.
 
@@ -60,7 +60,7 @@ def recover_command(log: Path) -> None:
 
 
 @group.command("convert")
-@click.argument("source", type=click.Path(path_type=Path))
+@click.argument("source", type=INPUT_PATH)
 @click.option("-o", "--output", type=click.Path(path_type=Path), required=True, help="MCAP file to write.")
 def convert_command(source: Path, output: Path) -> None:
     """Convert SOURCE, a log of another recorder, to MCAP.
@@ -75,7 +75,7 @@ def convert_command(source: Path, output: Path) -> None:
 
 
 @group.command("export")
-@click.argument("log", type=click.Path(path_type=Path))
+@click.argument("log", type=INPUT_PATH)
 @click.option(
     "-o", "--output", type=click.Path(path_type=Path), required=True, help="File to write: .geojson or .kml."
 )

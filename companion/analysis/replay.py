@@ -35,6 +35,7 @@ from companion.analysis.replay_inputs import (
 from companion.config import Config, load
 from companion.importers import gnss_latency
 from companion.navigator import Navigator
+from companion.option_types import INPUT_PATH
 from companion.printable import printable
 from companion.records import INPUTS, OUTPUTS, Event, LocalPosition, Reboot, Solution, Stamped
 from companion.storage import flight_log
@@ -184,7 +185,7 @@ def derived_metadata(config: Config, by: str, log: Path) -> dict[str, dict[str, 
 
 
 @click.command("replay")
-@click.argument("log", type=click.Path(path_type=Path))
+@click.argument("log", type=INPUT_PATH)
 @click.option("-o", "--output", type=click.Path(path_type=Path), help="MCAP file to write.")
 @click.option("--config", "config_file", type=click.Path(path_type=Path), help="Use this configuration.")
 @click.option(

@@ -24,6 +24,7 @@ from companion.analysis.replay_inputs import apply_changes, has_navigator_output
 from companion.analysis.summary import summarize_flight
 from companion.analysis.verdict import judge_flight
 from companion.config import load
+from companion.option_types import INPUT_PATH
 from companion.optional_dependencies import missing_package
 from companion.printable import printable
 from companion.storage.reader import LogError
@@ -31,7 +32,7 @@ from companion.write_errors import describe_write_error, write_whole
 
 
 @click.command("report")
-@click.argument("logs", type=click.Path(path_type=Path), nargs=-1, required=True, metavar="LOG...")
+@click.argument("logs", type=INPUT_PATH, nargs=-1, required=True, metavar="LOG...")
 @click.option(
     "-o", "--output", type=click.Path(path_type=Path), default=Path("report.html"), show_default=True
 )

@@ -36,6 +36,7 @@ from companion.analysis.replay_inputs import (
 from companion.analysis.smoothing import SmoothedRun, smooth_flight
 from companion.config import load
 from companion.nav.geometry import Geodetic, displace
+from companion.option_types import INPUT_PATH
 from companion.records import Smoothed
 from companion.storage.reader import LogError
 from companion.storage.run_metadata import logged_configuration
@@ -135,7 +136,7 @@ def _ellipse(unix_ns: int, centre: Geodetic, covariance: Floats) -> Track:
 
 
 @click.command("smooth")
-@click.argument("log", type=click.Path(path_type=Path))
+@click.argument("log", type=INPUT_PATH)
 @click.option(
     "-o",
     "--output",

@@ -29,7 +29,7 @@ from companion.config import Config, load
 from companion.config.options import configuration_options
 from companion.nav.geometry import Geodetic, separation
 from companion.navigator import INPUTS_USED, Navigator
-from companion.option_types import FloatRange
+from companion.option_types import INPUT_PATH, FloatRange
 from companion.records import AirData, Attitude, Gnss, Reboot, Solution, Stamped, Vehicle
 from companion.storage.reader import LogError
 from companion.tables import print_tables
@@ -203,7 +203,7 @@ def _row(
 
 
 @click.command("outages")
-@click.argument("log", type=click.Path(path_type=Path))
+@click.argument("log", type=INPUT_PATH)
 @click.option("--lasting", type=FloatRange(1.0, 3600.0), multiple=True, help="Seconds; may be repeated.")
 @click.option(
     "--every",

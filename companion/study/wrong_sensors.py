@@ -28,7 +28,7 @@ from companion.config.options import configuration_options
 from companion.estimate.bank.settings import DEFAULT as THRESHOLDS
 from companion.nav.geometry import Geodetic, separation, wrap_angle
 from companion.navigator import INPUTS_USED, Navigator
-from companion.option_types import FloatRange
+from companion.option_types import INPUT_PATH, FloatRange
 from companion.records import AirData, Attitude, Imu, Reboot, RsbnFix, Solution, Stamped
 from companion.storage.reader import LogError
 from companion.study.outages import GAP_S, Fixes
@@ -149,7 +149,7 @@ def study(records: Sequence[Stamped], config: Config, from_s: float) -> Iterator
 
 
 @click.command("wrong-sensors")
-@click.argument("log", type=click.Path(path_type=Path))
+@click.argument("log", type=INPUT_PATH)
 @beacon_options
 @click.option(
     "--from",

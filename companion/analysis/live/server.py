@@ -20,7 +20,7 @@ import msgspec
 
 from companion.analysis.live.follow import FollowedLog, PlayedLog, find_log, reject_foreign
 from companion.analysis.live.scene import Scene
-from companion.option_types import FloatRange
+from companion.option_types import INPUT_PATH, FloatRange
 from companion.optional_dependencies import missing_package
 from companion.storage.reader import ACTIVE, LogError
 from companion.transport.connection import reason
@@ -214,7 +214,7 @@ async def run(view: LiveView, host: str, port: int, on_ready: Callable[[int], No
 
 
 @click.command("live")
-@click.argument("path", type=click.Path(path_type=Path), default=Path("logs"), metavar="[LOG or FOLDER]")
+@click.argument("path", type=INPUT_PATH, default=Path("logs"), metavar="[LOG or FOLDER]")
 @click.option(
     "--listen",
     default=f"127.0.0.1:{PORT}",
