@@ -98,6 +98,16 @@ def test_a_seed_without_beacons_is_rejected() -> None:
         assert "absent.csv" in str(done.exception), command.name
 
 
+def test_a_number_of_workers_beside_a_scheduler_is_rejected() -> None:
+    working = [c for c in commands().values() if has_option(c, "scheduler")]
+    assert {command.name for command in working} == {"fleet", "campaign"}
+    for command in working:
+        folders = [str(CUT)] if command.name == "fleet" else []
+        done = CliRunner().invoke(command, [*folders, "--workers", "0", "--scheduler", "127.0.0.1:8786"])
+        assert done.exit_code == 2, command.name
+        assert "--workers 0 has no effect with --scheduler 127.0.0.1:8786" in done.output
+
+
 def test_no_number_is_nan() -> None:
     """Infinity only where it is the default: no end."""
     tools = [attacks.main, file_mutants.main, forged_frames.main, parameter_sweep.main]

@@ -29,6 +29,7 @@ from companion.analysis.html import BOOTED_NS
 from companion.analysis.jobs import Journal, run_jobs
 from companion.analysis.replay_inputs import is_own_log
 from companion.analysis.verdict import judge_flight
+from companion.analysis.worker_options import worker_options
 from companion.config import Config, load
 from companion.importers.foreign_file import one_line
 from companion.optional_dependencies import missing_package
@@ -246,13 +247,7 @@ def _write_all(rows: Sequence[FlightRow], results: Path) -> Iterator[Path]:
 @click.option(
     "--results", type=click.Path(path_type=Path, file_okay=False), default=Path("fleet"), show_default=True
 )
-@click.option("--scheduler", help="Address of a Dask scheduler; default: a local cluster.")
-@click.option(
-    "--workers",
-    type=click.IntRange(0),
-    default=os.cpu_count() or 1,
-    help="Worker processes; 0: assess in this process.",
-)
+@worker_options
 @click.option(
     "--reports", type=click.IntRange(0), default=20, show_default=True, help="Write this many reports."
 )

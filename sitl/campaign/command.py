@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import itertools
 import json
-import os
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -27,6 +26,7 @@ from rich.progress import MofNCompleteColumn, Progress, TextColumn, TimeRemainin
 from rich.table import Table
 
 from companion.analysis.jobs import WORKER_LOST, Journal, run_jobs
+from companion.analysis.worker_options import worker_options
 from companion.option_types import FloatRange
 from sitl.campaign.flight import (
     FAULT_CASES,
@@ -241,13 +241,7 @@ def _cell(value: Any) -> str:
     "--seeds", type=click.IntRange(1), default=1, show_default=True, help="Seeds per scenario and fault."
 )
 @click.option("--results", type=click.Path(path_type=Path, file_okay=False), default=Path("logs/campaign"))
-@click.option("--scheduler", help="Address of a Dask scheduler; default: a local cluster.")
-@click.option(
-    "--workers",
-    type=click.IntRange(0),
-    default=os.cpu_count() or 1,
-    help="Worker processes; 0: fly in this process.",
-)
+@worker_options
 @click.option("--harmless-m", type=FloatRange(0.0), default=CampaignLimits().harmless_m, show_default=True)
 @click.option("--misleading", type=FloatRange(0.0), default=CampaignLimits().misleading, show_default=True)
 @click.option(
