@@ -27,10 +27,10 @@ from companion.analysis.assessment import Assessment, assess_flight
 from companion.analysis.flights import open_flights
 from companion.analysis.html import BOOTED_NS
 from companion.analysis.jobs import Journal, run_jobs
-from companion.analysis.replay_inputs import is_own_log
+from companion.analysis.replay_inputs import has_navigator_outputs, is_own_log
 from companion.analysis.verdict import judge_flight
 from companion.analysis.worker_options import worker_options
-from companion.config import Config, load
+from companion.config import Config, load, to_toml
 from companion.importers.foreign_file import one_line
 from companion.optional_dependencies import missing_package
 from companion.printable import printable
@@ -86,10 +86,10 @@ def find_logs(folders: Sequence[Path], results: Path) -> list[Path]:
     return sorted(path for path in found if own not in path.parents)
 
 
-def log_key(path: Path) -> str:
-    """Return a key that changes when the log does."""
+def log_key(path: Path, config: Config) -> str:
+    """Return a key that changes when the log or the configuration does."""
     status = path.stat()
-    return f"{path}|{status.st_size}|{status.st_mtime_ns}"
+    return f"{path}|{status.st_size}|{status.st_mtime_ns}|{_digest(to_toml(config))}"
 
 
 def assess_log(job: LogJob) -> list[FlightRow]:
@@ -150,6 +150,14 @@ def worst_first(rows: Sequence[FlightRow]) -> list[FlightRow]:
     )
 
 
+def _is_flown(path: Path) -> bool:
+    """Whether a log is assessed as flown, or cannot be read: the configuration has no effect on it."""
+    try:
+        return has_navigator_outputs(path)
+    except OSError:
+        return True
+
+
 class Fleet:
     """A run over many logs with its results folder."""
 
@@ -161,7 +169,7 @@ class Fleet:
 
     def assess(self, logs: Sequence[Path], progress: Progress) -> list[FlightRow]:
         """Assess the logs that are new or changed; return the rows of all of them."""
-        keys = {log_key(path): path for path in logs}
+        keys = {log_key(path, self._config): path for path in logs}
         found = {entry["key"]: entry["rows"] for entry in self._journal.entries if entry["key"] in keys}
         known = {key: rows for key, rows in found.items() if all(map(_is_current, rows))}
         if old := len(found) - len(known):
@@ -187,7 +195,8 @@ class Fleet:
         worst = list(dict.fromkeys(row.log for row in worst_first(rows) if row.reason is None))[:count]
         folder = self._results / REPORTS
         folder.mkdir(exist_ok=True)
-        names = {log: f"{_safe(Path(log).stem)}-{_digest(log)}.html" for log in worst}
+        digests = {log: _digest(log_key(Path(log), self._config)) for log in worst}
+        names = {log: f"{_safe(Path(log).stem)}-{digest}.html" for log, digest in digests.items()}
         jobs = {
             f"report {log}": LogJob(Path(log), self._config, (folder / name).resolve())
             for log, name in names.items()
@@ -205,8 +214,8 @@ def _is_current(row: Mapping[str, Any]) -> bool:
     return row.keys() == set(FlightRow._fields)
 
 
-def _digest(log: str) -> str:
-    return hashlib.sha256(log_key(Path(log)).encode(errors="replace")).hexdigest()[:10]
+def _digest(text: str) -> str:
+    return hashlib.sha256(text.encode(errors="replace")).hexdigest()[:10]
 
 
 def _safe(name: str) -> str:
@@ -274,6 +283,11 @@ def command(
     logs = find_logs(folders, results)
     if not logs:
         raise LogError(f"{', '.join(map(str, folders))}: no logs ({', '.join(SUFFIXES)})")
+    if config_file and all(map(_is_flown, logs)):
+        raise LogError(
+            f"--config {config_file} has no effect: all logs are our own, assessed as flown; replay them:"
+            f" companion replay LOG --config {config_file} -o REPLAY.mcap, then assess the replays"
+        )
     columns = TextColumn("{task.description}"), MofNCompleteColumn(), TimeRemainingColumn()
     try:
         fleet = Fleet(results, load(config_file), scheduler, workers)
@@ -291,6 +305,8 @@ def command(
     for row in good[:5]:
         worst = "no reference" if row.largest_m is None else f"largest error {row.largest_m:.1f} m"
         click.echo(f"  {printable(row.log)}: {row.verdict}, {worst}")
+    for row in [row for row in rows if row.reason is not None][:5]:
+        click.echo(f"  {printable(row.log)}: {printable(row.reason or '')}")
     click.echo(f"written: {', '.join(map(str, written))}")
     if not good:
         raise SystemExit(1)

@@ -83,6 +83,24 @@ def test_only_new_and_changed_logs_are_read(
     assert all(json.loads(line) for line in journal.read_text().splitlines())
 
 
+def test_another_configuration_assesses_the_logs_again(logs: Path, tmp_path: Path) -> None:
+    pytest.importorskip("pyarrow")
+    file, results = tmp_path / "mine.toml", tmp_path / "results"
+    file.write_text("[gnss]\nsigma_m = 7.5\n")
+    for options in ([], ["--config", file], ["--config", file]):
+        run(logs, "--results", results, "--workers", 0, "--reports", 0, *options)
+    assert len((results / fleet.JOURNAL).read_text().splitlines()) == 2 * 3
+
+
+def test_a_configuration_for_logs_of_our_own_is_rejected(tmp_path: Path) -> None:
+    (tmp_path / "a.mcap").write_bytes(sample_logs.mcap())
+    file = tmp_path / "mine.toml"
+    file.write_text("[gnss]\nsigma_m = 7.5\n")
+    done = CliRunner().invoke(fleet.command, [str(tmp_path), "--config", str(file), "--workers", "0"])
+    assert isinstance(done.exception, LogError)
+    assert str(done.exception).startswith(f"--config {file} has no effect: all logs are our own")
+
+
 def test_rows_of_another_version_are_assessed_again(logs: Path, tmp_path: Path) -> None:
     pytest.importorskip("pyarrow")
     results = tmp_path / "results"
@@ -131,6 +149,7 @@ def test_exit_code_without_any_readable_log(tmp_path: Path) -> None:
         fleet.command, [str(tmp_path), "--results", str(tmp_path / "r"), "--workers", "0"]
     )
     assert done.exit_code == 1 and "0 flights" in done.output
+    assert f"  {tmp_path / 'x.tlog'}: is not a tlog" in done.output
 
 
 def slow_square(number: int) -> int:
