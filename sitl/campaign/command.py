@@ -266,6 +266,8 @@ def command(
 
     Tabulates detection times and position errors. Exit code 1 if a limit is exceeded.
     """
+    if page is not None and (page.suffix != ".md" or page.is_dir()):
+        raise click.UsageError(f"--report {page}: the tables are Markdown: give a file that ends with .md")
     limits = CampaignLimits(harmless_m, misleading, alarms_per_hour)
     wanted = list_orders(scenarios or SCENARIOS, faults or FAULT_CASES, seeds)
     try:
@@ -279,7 +281,7 @@ def command(
             made_by = " ".join(["companion campaign", *options, f"--seeds {seeds} --report {page}"])
             page.parent.mkdir(parents=True, exist_ok=True)
             page.write_text(markdown_report(flown, limits, made_by))
-    except (ValueError, OSError) as error:
+    except ValueError as error:
         raise SystemExit(f"companion: {error}") from None
     lines = summarise(flown, limits)
     if as_json:

@@ -187,6 +187,19 @@ def test_a_case_given_twice_is_flown_once() -> None:
     assert command.list_orders(["one-beacon"] * 2, ["none"] * 2, 1) == [FlightOrder("one-beacon", "none", 1)]
 
 
+@pytest.mark.parametrize("name", ["x.txt", "flight.mcap", "folder.md", ""])
+def test_a_report_that_is_no_markdown_is_rejected_before_the_flights(
+    name: str, tmp_path: Path, requested: list[FlightOrder]
+) -> None:
+    (tmp_path / "folder.md").mkdir()
+    page = str(tmp_path / name) if name else ""
+    done = CliRunner().invoke(
+        command.command, ["--report", page, "--results", str(tmp_path), "--workers", "0"]
+    )
+    assert done.exit_code == 2 and not requested
+    assert "ends with .md" in done.output.replace("\n", " ")
+
+
 @pytest.mark.usefixtures("requested")
 def test_exit_code_follows_the_limits(tmp_path: Path) -> None:
     options = ["--scenario", "one-beacon", "--fault", "none", "--fault", "gnss-jump", "--seeds", "1"]
