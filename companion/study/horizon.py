@@ -35,6 +35,7 @@ from companion.units import G0, Floats
 GRADES_DEG_H = {"navigation": 0.01, "tactical": 1.0, "industrial": 10.0}
 LONGEST_MIN = 24 * 60
 FORCE_STEP_S = 10.0
+MAX_FIXES = 1_000_000  # in the window
 ALONE = tuple(tuple(float(i == k) for i in range(4)) for k in range(4))  # targets of one state
 WINDOWS = (1.0, 0.5, 0.25)  # of the window, in the plot
 
@@ -76,6 +77,11 @@ class Horizon:
                 f"a window of {window} s with a fix every {every} s contains none; give positive seconds"
             )
         count = round(window / every) + 1
+        if count > MAX_FIXES:
+            raise ValueError(
+                f"a window of {window:g} s with a fix every {every:g} s has {count} fixes, at most"
+                f" {MAX_FIXES}: give a shorter window or a longer interval"
+            )
         tau = np.linspace(-0.5, 0.5, count) * (window * scale.rate)
         rows, sigmas = schuler_row("gamma", -tau), np.full(count, sigma / scale.radius)
         if velocity is not None:  # the velocity of each fix is measured too
@@ -210,7 +216,7 @@ def _drift(context: click.Context, parameter: click.Parameter, text: str | None)
 @click.command("horizon")
 @click.option(
     "--sigma-m",
-    type=FloatRange(0.0, min_open=True),
+    type=FloatRange(1e-3, 1e6),
     default=30.0,
     show_default=True,
     help="R.m.s. of one position fix [m].",
@@ -243,12 +249,12 @@ def _drift(context: click.Context, parameter: click.Parameter, text: str | None)
     "--disturbance-ug",
     default=0.0,
     show_default=True,
-    type=FloatRange(0.0),
+    type=FloatRange(0.0, 1e6),
     help="R.m.s. specific force that the channel does not model [micro-g].",
 )
 @click.option(
     "--velocity-mps",
-    type=FloatRange(0.0, min_open=True),
+    type=FloatRange(1e-6, 1e6),
     help="A velocity is measured with each fix, of this r.m.s. error [m/s].",
 )
 @click.option(

@@ -26,6 +26,7 @@ from companion.estimate.polynomial import (
     select_order,
     smooth_track,
 )
+from companion.importers.sources import LOG_SUFFIXES
 from companion.option_types import FloatRange
 from companion.records import Stamped
 from companion.storage import flight_log
@@ -34,6 +35,7 @@ from companion.tables import print_tables
 from companion.units import Floats
 
 SPAN_S = 10.0
+SIGMA = 0.2
 
 
 def cubic(t: Floats) -> Floats:
@@ -76,8 +78,12 @@ def synthetic(signal: str, count: int, sigma: float, seed: int) -> Samples:
     return Samples(t, truth + noise * np.random.default_rng(seed).standard_normal(count), noise, truth)
 
 
-def read(file: Path, sigma: float) -> Samples:
-    """Read samples from a CSV file: t, z and, if there is a third column, sigma."""
+def read(file: Path, sigma: float | None) -> Samples:
+    """Read samples from a CSV file: t, z and, if there is a third column, sigma; else 0.2 by default."""
+    if is_own_log(file) or file.suffix.lower() in LOG_SUFFIXES:
+        raise ValueError(f"{file} is a log: give --topic and --field of the samples in it")
+    if not file.stat().st_size:
+        raise ValueError(f"{file} is empty: give rows of numbers t,z or t,z,sigma")
     try:
         table = np.loadtxt(file, delimiter=",", ndmin=2, encoding="utf-8")
     except (ValueError, OSError) as error:
@@ -87,7 +93,9 @@ def read(file: Path, sigma: float) -> Samples:
         ) from None
     if table.shape[1] not in (2, 3):
         raise ValueError(f"{file}: has {table.shape[1]} columns; give t,z or t,z,sigma")
-    known = table[:, 2] if table.shape[1] == 3 else np.full(len(table), sigma)
+    if table.shape[1] == 3 and sigma is not None:
+        raise ValueError(f"--sigma {sigma:g} has no effect: {file} has a third column, sigma: leave one out")
+    known = table[:, 2] if table.shape[1] == 3 else np.full(len(table), SIGMA if sigma is None else sigma)
     return Samples(table[:, 0], table[:, 1], known)
 
 
@@ -189,14 +197,14 @@ def short_form(samples: Samples, found: Order) -> int:
 @click.option(
     "--samples",
     "count",
-    type=click.IntRange(min=2),
+    type=click.IntRange(2, 100_000),
     default=101,
     show_default=True,
     help="Number of samples of the simulated signal.",
 )
 @click.option(
     "--sigma",
-    type=FloatRange(min=0.0, min_open=True),
+    type=FloatRange(1e-100, 1e100),
     help="R.m.s. noise; default: 0.2 if FILE has no third column, estimated for a log.",
 )
 @click.option("--topic", help="Topic or record of a log, for example /in/Gnss or Gnss.")
@@ -250,11 +258,12 @@ def command(
         if file and topic and field:
             samples = read_log(file, topic, field, sigma)
         else:
-            known = 0.2 if sigma is None else sigma
-            samples = read(file, known) if file else synthetic(signal, count, known, seed)
+            samples = read(file, sigma) if file else synthetic(signal, count, sigma or SIGMA, seed)
         if figures is not None:
-            draw_figures(synthetic(signal, count, 0.2 if sigma is None else sigma, seed), r_max, figures)
+            draw_figures(synthetic(signal, count, sigma or SIGMA, seed), r_max, figures)
         if track:
+            if len(bases) > 1:
+                raise ValueError(f"--track smooths by one basis, {len(bases)} are given: leave one --basis")
             _smooth(samples, bases[0] if bases else "legendre", r_max, as_json, plot)
             return
         rows = study(samples, bases or FAMILIES, r_max)  # type: ignore[arg-type]

@@ -242,7 +242,9 @@ def draw(
 
 
 @click.command("restrictive")
-@click.option("--runs", default=200, show_default=True, type=click.IntRange(2), help="Flights per truth.")
+@click.option(
+    "--runs", default=200, show_default=True, type=click.IntRange(2, 10_000), help="Flights per truth."
+)
 @click.option(
     "--truth",
     "names",

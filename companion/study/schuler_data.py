@@ -199,7 +199,7 @@ def _windows(t_ns: npt.NDArray[np.int64], window_s: float) -> Iterator[slice]:
 )
 @click.option(
     "--sigma-mps",
-    type=FloatRange(0.0, min_open=True),
+    type=FloatRange(1e-6, 1e6),
     default=STATED_SIGMA,
     show_default=True,
     help="Stated sigma [m/s].",

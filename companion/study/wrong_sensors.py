@@ -182,6 +182,9 @@ def command(
         records = [r for r in inputs.records if isinstance(r, INPUTS_USED) and not isinstance(r, Reboot)]
     if not len(Fixes(records).t_ns):
         raise LogError(f"{log}: no GNSS fix to compare with: choose a flight with GNSS")
+    end_s = (records[-1].rx_ns - records[0].rx_ns) / SECOND_NS
+    if from_s >= end_s:
+        raise click.UsageError(f"--from {from_s:g} has no effect: the log ends at {end_s:.0f} s: give less")
     rows = list(study(records, config, from_s))
     if as_json:
         click.echo(json.dumps([row._asdict() for row in rows]))

@@ -86,7 +86,12 @@ def test_table_grade_and_plot(tmp_path):
         (("--ahead-min", "ten"), "neither a number nor a list"),
         (("--ahead-min", "-5,3"), "give minutes of 0 or more"),
         (("--ins", "best"), "neither a grade"),
-        (("--sigma-m", "-3"), "'--sigma-m': -3.0 is not in the range x>0.0"),
+        (("--sigma-m", "-3"), "'--sigma-m': -3.0 is not in the range 0.001<=x<=1000000.0"),
+        (("--disturbance-ug", "1e300"), "1e+300 is not in the range"),
+        (
+            ("--window-min", "1e9"),
+            "60000000001 fixes, at most 1000000: give a shorter window or a longer interval",
+        ),
         (("--sigma-m", "nan"), "'--sigma-m': nan is not a finite number"),
         (("--limit-m", "-5"), "'--limit-m': -5.0 is not in the range x>0.0"),
         (("--window-min", "0"), "0.0 is not in the range x>0.0"),

@@ -64,7 +64,10 @@ def test_plot(tmp_path):
 def test_number_of_samples_is_checked():
     result = run("--samples", 0)
     assert result.exit_code == 2
-    assert "'--samples': 0 is not in the range x>=2" in result.output
+    assert "'--samples': 0 is not in the range 2<=x<=100000" in result.output
+
+
+BASES = ("--basis", "power", "--basis", "fourier")
 
 
 @pytest.mark.parametrize(
@@ -74,6 +77,10 @@ def test_number_of_samples_is_checked():
         ("1,2,3,4\n", (), "has 4 columns"),
         ("1,2\n0,3\n4,5\n", ("--r-max", 2), "the times are not increasing"),
         ("0,2\n1,3\n", (), "r_max is 12 for 2 samples"),
+        ("", (), "samples.csv is empty: give rows of numbers"),
+        ("1,2,3\n2,3,3\n", ("--sigma", 3), "samples.csv has a third column, sigma: leave one out"),
+        ("1,2\n2,3\n", ("--sigma", 1e-300), "is not in the range"),
+        ("0,0\n1,1\n2,2\n", ("--r-max", 1, "--track", *BASES), "2 are given: leave one --basis"),
     ],
 )
 def test_invalid_input_is_reported_in_one_sentence(tmp_path, text, options, message):
@@ -168,6 +175,7 @@ def test_figures(tmp_path):
     ("options", "message"),
     [
         (("--topic", "Gnss"), "needs FILE, --topic and --field"),
+        ((), "is a log: give --topic and --field"),
         (("--topic", "Gns", "--field", "lat"), "no values of lat in Gns: it has"),
         (("--topic", "Gnss", "--field", "v_n"), "give a component"),
         (("--topic", "Gnss", "--field", "height"), "has no field"),

@@ -56,6 +56,11 @@ def test_consistency(rows):
         assert bound["nees_restrictive"][i] == pytest.approx(restrictive, rel=0.15)
 
 
+def test_a_number_of_flights_beyond_the_memory_is_rejected():
+    done = CliRunner().invoke(command, ["--runs", "1000000000"])
+    assert done.exit_code == 2 and "is not in the range 2<=x<=10000" in done.output
+
+
 def test_table_and_figures(tmp_path):
     pytest.importorskip("matplotlib")
     options = ["--runs", "2", "--truth", "slow", "--plot", str(tmp_path)]

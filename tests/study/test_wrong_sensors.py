@@ -101,6 +101,13 @@ def test_table_and_json() -> None:
     assert [Row(**row).wrong in printed for row in rows] == [True] * len(rows)
 
 
+def test_a_start_after_the_end_of_the_log_is_rejected() -> None:
+    words = ["study", "wrong-sensors", str(DATA / "dronekit_copter_cut.tlog"), "--from", "3600"]
+    done = CliRunner().invoke(cli, words)
+    assert done.exit_code == 2
+    assert "--from 3600 has no effect: the log ends at 27 s" in done.output
+
+
 def test_a_list_of_beacons_that_is_not_there_is_missed_before_the_log_is_read(tmp_path: Path) -> None:
     words = ["study", "wrong-sensors", str(tmp_path / "flight.tlog"), "--rsbn", str(tmp_path / "beacons.csv")]
     with pytest.raises(LogError, match=r"beacons\.csv cannot be read: No such file"):
