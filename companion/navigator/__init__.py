@@ -434,13 +434,13 @@ def guarded(
 
 
 def _channel_event(record: Input, settings: Settings) -> Event:
-    """Report which inertial channel is corrected."""
+    """Report which inertial channel is corrected: before its first sample, so what it may use."""
     if isinstance(settings.model.channel, OwnChannel):
         config = settings.config
         allowed = [name for name in ("imu", "air_data", "local_position") if config.uses(name)]
         if config.output.feeds_estimator and "local_position" in allowed:
             allowed.remove("local_position")
-        text = f"inertial channel: own, by {', '.join(a.replace('_', ' ') for a in allowed)}"
+        text = f"inertial channel: own, by what arrives of {', '.join(a.replace('_', ' ') for a in allowed)}"
         if "imu" in allowed:
             text += "; no guaranteed bound by imu"
     else:
