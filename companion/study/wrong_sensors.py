@@ -171,7 +171,7 @@ def command(
     pairs: tuple[str, ...],
     as_json: bool,
 ) -> None:
-    """Make attitude, IMU, airspeed or beacons of a recorded flight wrong.
+    """Make one sensor or beacon of a recorded flight wrong.
 
     LOG is any log that `companion replay` reads. One thing at a time is wrong; GNSS is as recorded. The table
     has the greatest distance of the position from GNSS, and for how long GNSS was suspect and excluded.
