@@ -185,7 +185,9 @@ class Examination:
         if event.frame.msgid == rsbn.MAVLINK_MSG_ID_RSBN_MEASUREMENT:
             self._beacons.add(event.message.beacon_id)
         if not event.from_autopilot:
-            if (name := event.message.get_type()) in FED:
+            # before its first HEARTBEAT the autopilot's own estimate is not known as such
+            is_estimate = event.frame.component == mavlink.MAV_COMP_ID_AUTOPILOT1
+            if (name := event.message.get_type()) in FED and not is_estimate:
                 self._feeders.add(f"{name} of {event.frame.system}/{event.frame.component}")
             return
         self._is_signing |= event.frame.signature is not None

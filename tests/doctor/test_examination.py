@@ -260,6 +260,12 @@ def test_another_position_source_is_a_problem() -> None:
     assert found(bench.look(), "other position source").found == "ODOMETRY of 1/197"
 
 
+def test_estimate_of_an_autopilot_whose_heartbeat_is_still_to_come_is_no_other_source() -> None:
+    bench = Bench("px4")
+    bench.examination.receive(frame.encode(dialect.new("ODOMETRY"), 0, 1, 1), bench.now)
+    assert "other position source" not in problems(bench.look())
+
+
 def test_unanswered_timesync_is_found() -> None:
     bench = Bench("ardupilot")
     bench.to_it = without("TIMESYNC")
