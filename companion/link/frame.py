@@ -11,7 +11,8 @@ frame it hit, and not the frames that a wrong length would cover.
 
 The checksum of an unknown message id cannot be verified. Such a frame is skipped as a whole only if another
 frame starts where it ends (a magic byte, and legal flags for MAVLink 2); otherwise it is treated as noise and
-its bytes are searched too. It is reported without its payload, and not counted in the sequence.
+its bytes are searched too. It is reported without its payload. It counts as neither received nor lost where
+its sequence number is the next one of its sender.
 
 The buffer holds at most one frame of maximum size and the header of the next. No input raises. A signature is
 kept with its frame and not verified.
@@ -65,6 +66,7 @@ class UnknownFrame(NamedTuple):
     """An apparent frame of a message unknown to the dialects; its contents are not verified."""
 
     msgid: int
+    sequence: int
     system: int
     component: int
     size: int
@@ -134,7 +136,7 @@ def parse(buffer: bytes, at: int = 0) -> Frame | UnknownFrame | Reason | None:
         follows = _starts_frame(buffer, at + size)
         if follows is None:
             return None
-        return UnknownFrame(msgid, system, component, size) if follows else Reason.UNKNOWN
+        return UnknownFrame(msgid, sequence, system, component, size) if follows else Reason.UNKNOWN
     if _crc(buffer[at + 1 : end] + check_byte) != buffer[end] | buffer[end + 1] << 8:
         return Reason.CHECKSUM
     if magic == MAGIC_V1 and end - head < _BASE_SIZE[msgid]:
@@ -204,6 +206,12 @@ class Reader:
         sender[0] = sequence + 1 & 0xFF
         sender[1] += 1
 
+    def _pass(self, frame: UnknownFrame) -> None:
+        """Expect the sequence number after `frame`, if its own was expected; it may be noise."""
+        sender = self._senders.get((frame.system, frame.component))
+        if sender is not None and sender[0] == frame.sequence:
+            sender[0] = frame.sequence + 1 & 0xFF
+
     def _scan(self, buffer: bytes, ended: bool) -> list[Event]:
         events: list[Event] = []
         at, end = 0, len(buffer)
@@ -218,6 +226,7 @@ class Reader:
                 at += len(found.raw)
             elif isinstance(found, UnknownFrame):
                 self._end_run(events)
+                self._pass(found)
                 events.append(found)
                 at += found.size
             elif found is not None or ended:

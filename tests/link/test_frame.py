@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from companion.link import dialect, frame
-from companion.link.frame import BadFrame, Frame, Reader, Reason, UnknownFrame, encode
+from companion.link.frame import BadFrame, Counts, Frame, Reader, Reason, UnknownFrame, encode
 
 VECTORS = json.loads((Path(__file__).parents[1] / "data" / "mavlink_vectors.json").read_text())
 GOOD = [v for v in VECTORS if v.get("verified")]
@@ -121,10 +121,9 @@ def test_unknown_incompatibility_flags_reject_the_frame_and_not_the_next() -> No
     assert events == [BadFrame(Reason.FLAGS, len(first)), frames(read(second)[1])[0]]
 
 
-def unknown(payload: bytes, msgid: int = 190_000) -> bytes:
-    return (
-        b"\xfd" + bytes((len(payload), 0, 0, 0, 1, 1)) + msgid.to_bytes(3, "little") + payload + b"\x12\x34"
-    )
+def unknown(payload: bytes, msgid: int = 190_000, sequence: int = 0) -> bytes:
+    head = b"\xfd" + bytes((len(payload), 0, 0, sequence, 1, 1))
+    return head + msgid.to_bytes(3, "little") + payload + b"\x12\x34"
 
 
 @pytest.mark.parametrize("step", [None, 1])
@@ -134,7 +133,18 @@ def test_unknown_message_is_skipped_whole_and_reported(step: int | None) -> None
     strange = unknown(inside)
     _, events = read(first + strange + second, step)
     assert [type(e) for e in events] == [Frame, UnknownFrame, Frame]
-    assert events[1] == UnknownFrame(190_000, 1, 1, len(strange))
+    assert events[1] == UnknownFrame(190_000, 0, 1, 1, len(strange))
+
+
+@pytest.mark.parametrize(("sequences", "lost"), [((1, 2, 3), 0), ((0, 1, 4), 2), ((77, 2), 1)])
+def test_unknown_messages_are_not_lost_frames(sequences: tuple[int, ...], lost: int) -> None:
+    """The sender's frame 0 before, then unknown ones but for the last, which is known."""
+    heartbeat = dialect.new("HEARTBEAT")
+    strange = (unknown(b"12345", sequence=n) for n in sequences[:-1])
+    data = b"".join((encode(heartbeat, 0, 1, 1), *strange, encode(heartbeat, sequences[-1], 1, 1)))
+    reader, _ = read(data)
+    assert reader.counts == {(1, 1): Counts(received=2, lost=lost)}
+    assert reader.lost == lost
 
 
 def test_unknown_id_in_noise_does_not_hide_the_next_frames() -> None:
