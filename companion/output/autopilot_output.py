@@ -101,7 +101,10 @@ class AutopilotOutput:
 
     def handle_message(self, message: Message, from_autopilot: bool, system: int, now_ns: int) -> None:
         """Process a message of another sender that may concern the source set of autopilot `system`."""
-        if (by := selected(message, from_autopilot, system)) is not None:
+        if from_autopilot and message.get_type() == "HEARTBEAT":
+            is_armed = bool(message.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
+            self._source_switch.note_armed(is_armed)
+        elif (by := selected(message, from_autopilot, system)) is not None:
             self._source_switch.handle_selected(by, now_ns)
 
     def messages(self, solution: Solution, names: Collection[str], receiver: Receiver) -> list[Message]:

@@ -4,6 +4,9 @@ PX4 has no source sets: it fuses GNSS and our position at once, so a false GNSS 
 takes MAV_CMD_ESTIMATOR_SENSOR_ENABLE (development.xml of 2026; PR 26739 proposed 43005). GNSS is switched
 off only if it is false by the same predicate as on ArduPilot, never because it is lost: if the companion then
 failed, nobody would switch it on again. An autopilot that does not know the command is reported.
+
+While disarmed it is always on: PX4 stores it in EKF2_SENS_EN then, and when it disarms. The next flight would
+begin without GNSS.
 """
 
 from __future__ import annotations
@@ -35,9 +38,16 @@ class GnssFusion(SourceSwitch):
     def __init__(self) -> None:
         super().__init__()
         self._wanted = GNSS_SET
+        self._is_disarmed = False
+
+    def note_armed(self, is_armed: bool) -> None:
+        """Note whether the autopilot is armed."""
+        self._is_disarmed = not is_armed
 
     def required(self, s: Situation) -> tuple[int, str] | None:
         """Return `COMPANION_SET` where GNSS must be off, `GNSS_SET` where on, and the reason."""
+        if self._is_disarmed:
+            return GNSS_SET, "disarmed"
         if is_held_false(s):
             return (COMPANION_SET, "GNSS is false, using companion") if s.sent_s >= STEADY_S else None
         reasons = [each.reason for each in TO_GNSS if s.fix_s >= 0.0 and each.holds(s)]

@@ -221,6 +221,9 @@ class SourceSwitch:
         if sent:
             self._sent_ns = now_ns
 
+    def note_armed(self, is_armed: bool) -> None:
+        """Ignore whether it is armed: ArduPilot stores no source set."""
+
     def situation(self, now_ns: int) -> Situation:
         """Return the facts at `now_ns`."""
         solution, patience = self._solution, 3 * SECOND_NS

@@ -101,6 +101,7 @@ ABOUT_SOURCE_SET = frozenset(
     {
         mavlink.MAVLINK_MSG_ID_COMMAND_INT,
         mavlink.MAVLINK_MSG_ID_COMMAND_LONG,
+        mavlink.MAVLINK_MSG_ID_HEARTBEAT,
         mavlink.MAVLINK_MSG_ID_STATUSTEXT,
         mavlink.MAVLINK_MSG_ID_NAMED_VALUE_FLOAT,
     }

@@ -62,6 +62,19 @@ def test_off_while_false_and_on_again() -> None:
     ]
 
 
+def test_on_while_disarmed() -> None:
+    """PX4 stores it in EKF2_SENS_EN when it disarms. The next flight would begin without GNSS."""
+    switch, second = Switch(), 10**9
+    switch.note_armed(True)
+    assert requests(switch, WELL._replace(**FALSE), 0, second) == [(43006, 0.0, 0.0, 0.0)]
+    switch.note_armed(False)
+    assert requests(switch, WELL._replace(**FALSE), 0, 2 * second) == [(43006, 0.0, 0.0, 1.0)]
+    assert requests(switch, WELL._replace(**FALSE), 0, 9 * second) == []
+    assert switch.take_events()[-1].text == "GNSS fusion on: disarmed"
+    switch.note_armed(True)
+    assert requests(switch, WELL._replace(**FALSE), 0, 10 * second) == [(43006, 0.0, 0.0, 0.0)]
+
+
 def test_autopilot_that_does_not_know_the_command_is_reported_once() -> None:
     switch, second = Switch(), 10**9
     assert len(requests(switch, WELL._replace(**FALSE), 3, second)) == 1
