@@ -3,7 +3,8 @@
 PX4 has no source sets: it fuses GNSS and our position at once, so a false GNSS draws it off. Its estimator
 takes MAV_CMD_ESTIMATOR_SENSOR_ENABLE (development.xml of 2026; PR 26739 proposed 43005). GNSS is switched
 off only if it is false by the same predicate as on ArduPilot, never because it is lost: if the companion then
-failed, nobody would switch it on again. An autopilot that does not know the command is reported.
+failed, it would stay off. An autopilot that does not know the command is reported. At the start
+it is switched on once: a companion that failed may have left it off.
 
 While disarmed it is always on: PX4 stores it in EKF2_SENS_EN then, and when it disarms. The next flight would
 begin without GNSS.
@@ -30,14 +31,13 @@ _GNSS, _FIRST = 0.0, 0.0  # ESTIMATOR_SENSOR_FUSION_SOURCE_GPS, the first receiv
 
 
 class GnssFusion(SourceSwitch):
-    """Fusion of PX4's first receiver; on at the start."""
+    """Fusion of PX4's first receiver; unknown at the start."""
 
     command = ESTIMATOR_SENSOR_ENABLE
     is_silence_judged = False
 
     def __init__(self) -> None:
         super().__init__()
-        self._wanted = GNSS_SET
         self._is_disarmed = False
 
     def note_armed(self, is_armed: bool) -> None:
@@ -64,3 +64,10 @@ class GnssFusion(SourceSwitch):
         """Return the parameters of the command."""
         is_on = float(number == GNSS_SET)
         return {"param1": _GNSS, "param2": _FIRST, "param3": is_on, "param4": math.nan}
+
+    def _give_up(self, why: str, now_ns: int) -> None:
+        """Report it, unless fusion was never off: firmware that has no such command fuses GNSS."""
+        if self._wanted == GNSS_SET and not self.is_on_companion:
+            self._next_ns = None
+        else:
+            super()._give_up(why, now_ns)

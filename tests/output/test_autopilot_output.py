@@ -545,7 +545,7 @@ def test_gnss_fusion_of_px4_is_switched_off_only_while_armed(monkeypatch: pytest
     found = Situation(1e3, -1.0, 0.1, gnss_false=0.9999, witness=True, sent_s=1e3, stopped_s=0.0)
     monkeypatch.setattr(GnssFusion, "situation", lambda self, now_ns: found)
     output = AutopilotOutput(configured("output.profile=px4"))
-    for k, (base_mode, enabled) in enumerate(((0, []), (128, [0.0]), (0, [1.0]))):
+    for k, (base_mode, enabled) in enumerate(((0, [1.0]), (128, [0.0]), (0, [1.0]))):
         output.handle_message(dialect.new("HEARTBEAT", base_mode=base_mode), True, 1, START)
         assert [m.param3 for m in output.poll(1, START + k * SECOND)] == enabled
         output.handle_acknowledgement(ESTIMATOR_SENSOR_ENABLE, 0, START + k * SECOND)

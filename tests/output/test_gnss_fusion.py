@@ -52,11 +52,13 @@ def requests(switch: Switch, situation: Situation, result: int, at: int) -> list
 
 def test_off_while_false_and_on_again() -> None:
     switch, second = Switch(), 10**9
-    assert requests(switch, WELL, 0, second) == []  # on at the start: nothing to ask
+    assert requests(switch, WELL, 0, second) == [(43006, 0.0, 0.0, 1.0)]  # another may have left it off
+    assert requests(switch, WELL, 0, second) == []
     assert requests(switch, WELL._replace(**FALSE), 0, 2 * second) == [(43006, 0.0, 0.0, 0.0)]
     assert requests(switch, WELL._replace(**FALSE), 0, 9 * second) == []
     assert requests(switch, WELL, 0, 10 * second) == [(43006, 0.0, 0.0, 1.0)]
     assert [event.text for event in switch.take_events()] == [
+        "GNSS fusion on: GNSS has a fix",
         "GNSS fusion off: GNSS is false, using companion",
         "GNSS fusion on: GNSS has a fix",
     ]
@@ -77,6 +79,8 @@ def test_on_while_disarmed() -> None:
 
 def test_autopilot_that_does_not_know_the_command_is_reported_once() -> None:
     switch, second = Switch(), 10**9
+    assert len(requests(switch, WELL, 3, second)) == 1
+    assert requests(switch, WELL, 3, 40 * second) == [] and switch.take_events() == []  # it is on
     assert len(requests(switch, WELL._replace(**FALSE), 3, second)) == 1
     assert requests(switch, WELL._replace(**FALSE), 3, 9 * second) == []
     assert not switch.is_on_companion
