@@ -25,7 +25,13 @@ _ARDUPILOT: dict[str, Value] = {
     "EK3_GPS_CHECK": 31,
     "SIM_GPS1_ENABLE": 1,
 }
-_PX4: dict[str, Value] = {"EKF2_AGP0_ID": 0, "EKF2_AGP0_CTRL": 0, "EKF2_EV_CTRL": 0, "SIM_GPS_USED": 10}
+_PX4: dict[str, Value] = {
+    "EKF2_AGP0_ID": 0,
+    "EKF2_AGP0_CTRL": 0,
+    "EKF2_EV_CTRL": 0,
+    "COM_POS_LOW_EPH": 50,
+    "SIM_GPS_USED": 10,
+}
 SATELLITES_OF_A_FIX = 4
 _COMMON = mavlink.MAV_PROTOCOL_CAPABILITY_COMMAND_INT | mavlink.MAV_PROTOCOL_CAPABILITY_MAVLINK2
 #: AUTOPILOT_VERSION.capabilities by make.

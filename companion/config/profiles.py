@@ -39,6 +39,21 @@ class RequiredParameter(NamedTuple):
     reboot: bool = False
 
 
+class FailsafeLimit(NamedTuple):
+    """Limit of an autopilot's failsafe: the least value with which it flies on by our position (-1: none),
+    what it does by another, and whether multirotors alone have it. The user decides on it.
+    """
+
+    name: str
+    value: float
+    otherwise: str
+    multirotor: bool = False
+
+    def is_met(self, has: float) -> bool:
+        """Whether the autopilot's value lets it fly on."""
+        return has < 0.0 if self.value < 0.0 else has >= self.value
+
+
 class OutputMethod(NamedTuple):
     """Message by which an autopilot accepts a position: its rate and the parameters it requires."""
 
@@ -47,9 +62,10 @@ class OutputMethod(NamedTuple):
 
 
 class Profile(NamedTuple):
-    """Output methods of one make of autopilot, the best first."""
+    """Output methods of one make of autopilot, the best first, and limits of its failsafe."""
 
     methods: Mapping[Via, OutputMethod]
+    failsafe: tuple[FailsafeLimit, ...] = ()
 
 
 _EXTERNAL_NAVIGATION = (
@@ -75,6 +91,11 @@ _AUXILIARY_POSITION = (
     RequiredParameter(AGP_ID, 1, "the `id` of our GLOBAL_POSITION_SENSOR", reboot=True),
     RequiredParameter("EKF2_AGP0_CTRL", 1, "fuse its horizontal position", reboot=True),
 )
+_PX4_FAILSAFE = (
+    FailsafeLimit("COM_POS_LOW_EPH", -1.0, "{} m: it returns home once its own accuracy is worse"),
+    FailsafeLimit("COM_POS_FS_EPH", -1.0, "{} m: it lands once its own accuracy is 2.5 times worse", True),
+    FailsafeLimit("EKF2_NOAID_TOUT", 1e7, "{} us: it descends when no position comes for so long", True),
+)
 
 PROFILES: Mapping[Name, Profile] = {
     "monitor": Profile({}),
@@ -92,7 +113,8 @@ PROFILES: Mapping[Name, Profile] = {
             "odometry": OutputMethod(10.0, _EXTERNAL_VISION),  # starts under 200 ms apart, stops at 400 ms
             "vision": OutputMethod(10.0, _EXTERNAL_VISION),
             "external_position": OutputMethod(0.5),
-        }
+        },
+        _PX4_FAILSAFE,
     ),
     "custom": Profile({}),
 }

@@ -1,8 +1,8 @@
-"""Autopilot parameters that a configuration requires, from the table of output profiles."""
+"""Autopilot parameters that concern a configuration, from the table of output profiles."""
 
 from __future__ import annotations
 
-from companion.config.profiles import AGP_ID, MESSAGES, PROFILES, RequiredParameter
+from companion.config.profiles import AGP_ID, MESSAGES, PROFILES, FailsafeLimit, Profile, RequiredParameter
 from companion.config.schema import Config
 
 
@@ -12,9 +12,7 @@ def required_parameters(config: Config, autopilot: str | None = None) -> tuple[R
     `autopilot`, the connected make ("ardupilot", "px4"), is used for the profile "custom" only, which states
     no make itself. Other makes have no known requirements.
     """
-    profile = PROFILES[config.output.profile]
-    if config.output.profile == "custom":
-        profile = next((p for name, p in PROFILES.items() if name == autopilot), profile)
+    profile = _profile(config, autopilot)
     found: dict[str, RequiredParameter] = {}
     for via, method in profile.methods.items():
         if config.output.rates_hz[MESSAGES[via]] > 0.0:
@@ -23,3 +21,18 @@ def required_parameters(config: Config, autopilot: str | None = None) -> tuple[R
                     parameter = parameter._replace(value=config.output.global_position_sensor_id)
                 found[parameter.name] = parameter
     return tuple(found.values())
+
+
+def failsafe_limits(config: Config, autopilot: str, is_multirotor: bool) -> tuple[FailsafeLimit, ...]:
+    """Return the limits of the failsafe of the make `autopilot` that matter if it is fed by `config`."""
+    if not config.output.feeds_estimator:
+        return ()
+    limits = _profile(config, autopilot).failsafe
+    return tuple(limit for limit in limits if is_multirotor or not limit.multirotor)
+
+
+def _profile(config: Config, autopilot: str | None) -> Profile:
+    profile = PROFILES[config.output.profile]
+    if config.output.profile == "custom":
+        profile = next((p for name, p in PROFILES.items() if name == autopilot), profile)
+    return profile

@@ -5,11 +5,11 @@ Values only: `examination` observes, `rendering` shows.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Set
+from collections.abc import Iterable, Mapping, Set
 from typing import NamedTuple
 
 from companion.config import Config
-from companion.config.profiles import PROFILES, RequiredParameter
+from companion.config.profiles import PROFILES, FailsafeLimit, RequiredParameter
 from companion.link.parameter_client import Value, equal_real32
 from companion.runtime.input_monitor import stream_states
 
@@ -107,6 +107,15 @@ def check_airspeed(config: Config, healthy: bool | None, multirotor: bool = Fals
         text = f"none: reckoning by {' and '.join(others) or 'the last velocity'} only"
     advice = "" if healthy else "without GNSS the wind cannot be separated from the error: add a sensor"
     return [Finding("airspeed sensor", text, "", None, advice)]
+
+
+def check_failsafe(limits: Iterable[FailsafeLimit], values: Mapping[str, Value | None]) -> list[Finding]:
+    """Report the limits by which the autopilot would not fly on without GNSS."""
+    return [
+        Finding(limit.name, limit.otherwise.format(f"{has:.10g}"), f"{limit.value:.10g} to fly on", None)
+        for limit in limits
+        if (has := values.get(limit.name)) is not None and not limit.is_met(has)
+    ]
 
 
 def check_script(config: Config, make: str, runs: bool) -> list[Finding]:

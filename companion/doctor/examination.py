@@ -15,8 +15,8 @@ from __future__ import annotations
 from typing import Any
 
 from companion.config import Config
-from companion.config.profiles import MESSAGES, RequiredParameter
-from companion.config.required_parameters import required_parameters
+from companion.config.profiles import MESSAGES, FailsafeLimit, RequiredParameter
+from companion.config.required_parameters import failsafe_limits, required_parameters
 from companion.doctor.diagnosis import (
     Diagnosis,
     Finding,
@@ -24,6 +24,7 @@ from companion.doctor.diagnosis import (
     ParameterFinding,
     check_airspeed,
     check_arming,
+    check_failsafe,
     check_feeders,
     check_profile,
     check_script,
@@ -92,6 +93,7 @@ class Examination:
         self._beacons: set[int] = set()
         self._client: ParameterClient | None = None
         self._needed: tuple[RequiredParameter, ...] = ()
+        self._limits: tuple[FailsafeLimit, ...] = ()
         self._answers: dict[str, Answer] = {}
 
     @property
@@ -214,7 +216,9 @@ class Examination:
         self._client = ParameterClient(self.session.autopilot or 0, mavlink.MAV_COMP_ID_AUTOPILOT1, encoding)
         if self._is_profile_applicable:
             self._needed = required_parameters(self._config, self.make)
-            self._client.read(need.name for need in self._needed)
+            self._limits = failsafe_limits(self._config, self.make, self._heartbeat.type in MULTIROTORS)
+            self._client.read(p.name for p in self._needed)
+            self._client.read(p.name for p in self._limits)
 
     def _request_message(self, msgid: int) -> None:
         self._command(mavlink.MAV_CMD_REQUEST_MESSAGE, msgid)
@@ -257,6 +261,7 @@ class Examination:
             *check_profile(self._config, self.make),
             *check_streams(self._config, self.make, self.session.stream_rates.rates()),
             *check_airspeed(self._config, self._airspeed, self._heartbeat.type in MULTIROTORS),
+            *check_failsafe(self._limits, {name: answer.value for name, answer in self._answers.items()}),
             *check_script(self._config, self.make, self._has_script),
             *check_arming(self.make, self._arming_checks),
             *check_signing(self._is_signing and not self._is_answering),

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from companion.config import Config, ConfigError, InertialConfig, OutputConfig, load
 from companion.config.profiles import MESSAGES, PROFILES
-from companion.config.required_parameters import required_parameters
+from companion.config.required_parameters import failsafe_limits, required_parameters
 from companion.config.validate import find_conflicts
 
 STATUS = {"NAVIGATION_STATUS": 1.0}
@@ -89,6 +89,25 @@ def test_profile_custom_requires_the_parameters_of_the_connected_make() -> None:
     assert {p.name: p.value for p in required_parameters(config, "ardupilot")} == VISO
     assert {p.name: p.value for p in required_parameters(config, "px4")} == {"EKF2_EV_CTRL": 1}
     assert required_parameters(config) == required_parameters(config, "other") == ()
+
+
+@pytest.mark.parametrize(
+    ("pairs", "make", "is_multirotor", "names"),
+    [
+        ([], "px4", True, set()),
+        (["output.profile=ardupilot"], "ardupilot", True, set()),
+        (["output.profile=px4"], "px4", False, {"COM_POS_LOW_EPH"}),
+        (["output.profile=px4"], "px4", True, {"COM_POS_LOW_EPH", "COM_POS_FS_EPH", "EKF2_NOAID_TOUT"}),
+        (["output.profile=custom", "output.odometry_hz=5"], "px4", False, {"COM_POS_LOW_EPH"}),
+        (["output.profile=custom", "output.odometry_hz=5"], "other", True, set()),
+    ],
+)
+def test_failsafe_limits(pairs: list[str], make: str, is_multirotor: bool, names: set[str]) -> None:
+    limits = failsafe_limits(configured(*pairs), make, is_multirotor)
+    assert {limit.name for limit in limits} == names
+    for limit in limits:  # its value lets the autopilot fly on, and PX4's default does not
+        default = {"COM_POS_LOW_EPH": 50.0, "COM_POS_FS_EPH": 5.0, "EKF2_NOAID_TOUT": 5e6}[limit.name]
+        assert limit.is_met(limit.value) and not limit.is_met(default)
 
 
 outputs = st.builds(

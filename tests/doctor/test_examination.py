@@ -204,6 +204,16 @@ def test_missing_airspeed_sensor_is_reported_and_no_problem(
     assert not check_airspeed(load(None, {}, {}, [*pairs, "inertial.independent=true"]), healthy)
 
 
+def test_failsafe_that_ends_a_flight_without_gnss_is_shown_and_never_set() -> None:
+    bench = Bench("px4")
+    limit = found(bench.look(), "COM_POS_LOW_EPH")
+    assert (limit.found[:6], limit.needs, limit.is_well) == ("50 m: ", "-1 to fly on", None)
+    assert found(bench.change(), "COM_POS_LOW_EPH") == limit
+    other = Bench("px4")
+    other.autopilot.parameters.values["COM_POS_LOW_EPH"] = -1
+    assert "COM_POS_LOW_EPH" not in {finding.what for finding in other.look().findings}
+
+
 def test_airspeed_sensor_of_the_autopilot_is_found() -> None:
     assert found(Bench("ardupilot").look(), "airspeed sensor").found == "healthy"
 
