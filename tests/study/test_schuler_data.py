@@ -71,7 +71,7 @@ def test_command():
             assert done.exit_code == 2
             assert f"Invalid value for '{option}': {number} is not a finite number." in done.stderr
     assert (
-        "-1.0 is not in the range x>0.0"
+        "-1.0 is not in the range 1e-06<=x<=1000000.0"
         in CliRunner().invoke(command, [*arguments, "--sigma-mps", "-1"]).output
     )
 
