@@ -101,7 +101,7 @@ class AirDataConfig(Section, frozen=True):
     correlation_min: Annotated[float, Meta(ge=0.1, le=1000.0)] = 10.0  # of airspeed and heading errors
     crab_deg: Annotated[float, Meta(ge=0.05, le=45.0)] = 2.0
     crab_s: Annotated[float, Meta(ge=0.5, le=600.0)] = 20.0
-    rotor_drag_per_s: Annotated[float, Meta(ge=0.0, le=5.0)] = 0.22
+    rotor_drag_per_s: Annotated[float, Meta(ge=0.0, le=5.0)] = 0.23
 
     @property
     def wind_walk_m_s_sqrt_s(self) -> float:

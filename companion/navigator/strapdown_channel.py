@@ -33,6 +33,7 @@ W_MAX = 0.995 * math.radians(2000.0)  # [rad/s] and gyros
 VERTICAL = 0.5  # of gravity, by which the vertical force may differ from it
 VERTICAL_S = 10.0  # averaged over so long: nobody climbs 50 m/s faster after it
 STAYS = 0.5  # of the scatter of the samples, in the velocity
+UPRIGHT = 0.5  # cosine of the tilt up to which the drag of rotors is used
 MANOEUVRE_M_S2, MANOEUVRE_S = 1.0, 2.0  # a manoeuvre is a greater mean acceleration over so long
 MANOEUVRE_SQRT_S = 0.12  # velocity noise per acceleration above it, m/s/sqrt(s) per m/s^2
 
@@ -104,15 +105,20 @@ def acceleration(s: Strap) -> Vector3:
     return float(f_n[0]), float(f_n[1]), float(f_n[2]) + G0
 
 
-def lateral_force(s: Strap) -> Vector2:
-    """Specific force in the plane of the rotors, north and east (m/s^2), of the last sample.
+def drag_force(s: Strap) -> Vector2 | None:
+    """Specific force of a multirotor's drag, north and east (m/s^2), by the last sample; None if it is steep.
 
-    Rotors of fixed pitch pull along the body's z axis: what is across is drag.
+    Rotors of fixed pitch pull along the body's z axis; what is across is the drag of the velocity in their
+    plane, f_b = -drag C_nb' v of a level velocity v. Returned is -drag v: the level part of f_b is less, by
+    the square of the cosine of the tilt. A climb is left out.
     """
     assert s.imu is not None
     assert s.C_nb is not None
-    f_n = s.C_nb[:2, :2] @ s.imu.f_b[:2]
-    return float(f_n[0]), float(f_n[1])
+    (a, b, _), (c, d, _), (_, _, upright) = s.C_nb.tolist()
+    if upright < UPRIGHT:
+        return None
+    x, y, _ = s.imu.f_b
+    return (d * x - c * y) / upright, (a * y - b * x) / upright
 
 
 def mean_acceleration(mean: Vector3, a: Vector3, dt: float) -> Vector3:
