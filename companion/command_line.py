@@ -44,6 +44,7 @@ STUDIES = {
     "order": "companion.study.order:command",
     "outages": "companion.study.outages:command",
     "wrong-sensors": "companion.study.wrong_sensors:command",
+    "rotor-drag": "companion.study.rotor_drag:command",
     "schemes": "companion.study.schemes:command",
     "schuler": "companion.study.schuler_data:command",
     "weights": "companion.study.weights:command",

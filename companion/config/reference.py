@@ -110,7 +110,7 @@ TEXTS: dict[str, dict[str, tuple[str, str]]] = {
         "crab_s": ("How long it lasts.", _MEASURED),
         "rotor_drag_per_s": (
             "A multirotor's drag per velocity through the air, to 25 %; 0: not used.",
-            "its motors are tilted to push sideways: 0",
+            "`companion study rotor-drag` measures another; its motors are tilted to push sideways: 0",
         ),
     },
     "strapdown": {
