@@ -340,9 +340,9 @@ reported in one sentence with the nearest valid key, and the service does not st
 
 ## Presets
 
-The commands `run`, `check-config`, `doctor`, `signing init`, `loopback`, `study outages` and
-`study wrong-sensors` have `--preset NAME` and `--set`. A preset sets the keys below; everything else, the
-file included, overrides it. `companion doctor` recommends one.
+The commands `run`, `check-config`, `doctor`, `signing init`, `loopback`, `study outages`,
+`study rotor-drag` and `study wrong-sensors` have `--preset NAME` and `--set`. A preset sets the keys below;
+everything else, the file included, overrides it. `companion doctor` recommends one.
 """
 
 
