@@ -116,8 +116,7 @@ def _rotor_drag(state: State, record: Imu, settings: Settings) -> State:
     nominal, s, drag = state.nominal, state.sensors, settings.config.air_data.rotor_drag_per_s
     if nominal is None or drag == 0.0 or not settings.config.uses("air_data"):
         return state
-    force = strapdown_channel.drag_force(s.strap)
-    if force is None or not own_channel.drag_is_sensed(s, record.t_ns):
+    if not own_channel.drag_is_sensed(s, record.t_ns):
         return state
     height = None if s.air.static is None else nominal.point.position.alt
     if s.aloft_ns is None:
@@ -134,6 +133,9 @@ def _rotor_drag(state: State, record: Imu, settings: Settings) -> State:
             bank=banks.renew(state.bank, [own_error_model.SCALE], [own_error_model.DRAG_SCALE]),
             nominal=state.nominal._replace(interval=interval._replace(drag=True)),
         )
+    force = strapdown_channel.drag_force(s.strap)
+    if force is None:
+        return state
     return _measured(state, record, (-force[0] / drag, -force[1] / drag), settings)
 
 
