@@ -187,10 +187,11 @@ class Examination:
         if event.frame.msgid == rsbn.MAVLINK_MSG_ID_RSBN_MEASUREMENT:
             self._beacons.add(event.message.beacon_id)
         if not event.from_autopilot:
-            # before its first HEARTBEAT the autopilot's own estimate is not known as such
-            is_estimate = event.frame.component == mavlink.MAV_COMP_ID_AUTOPILOT1
-            if (name := event.message.get_type()) in FED and not is_estimate:
-                self._feeders.add(f"{name} of {event.frame.system}/{event.frame.component}")
+            sender, autopilot = (event.frame.system, event.frame.component), self.session.autopilot
+            # what the autopilot itself sends before its first HEARTBEAT is not known as such
+            is_other = autopilot is not None and sender != (autopilot, mavlink.MAV_COMP_ID_AUTOPILOT1)
+            if (name := event.message.get_type()) in FED and is_other:
+                self._feeders.add("{} of {}/{}".format(name, *sender))
             return
         self._is_signing |= event.frame.signature is not None
         self._is_answering |= event.message.get_type() in ANSWERS

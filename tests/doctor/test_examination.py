@@ -274,6 +274,19 @@ def test_estimate_of_an_autopilot_whose_heartbeat_is_still_to_come_is_no_other_s
     bench = Bench("px4")
     bench.examination.receive(frame.encode(dialect.new("ODOMETRY"), 0, 1, 1), bench.now)
     assert "other position source" not in problems(bench.look())
+    bench = Bench("px4")  # both in one datagram
+    estimate = frame.encode(dialect.new("ODOMETRY"), 0, 1, 1)
+    bench.to_us = lambda data: estimate + data
+    bench.step()
+    bench.to_us = lambda data: data
+    assert "other position source" not in problems(bench.look())
+
+
+def test_another_autopilot_is_another_position_source() -> None:
+    bench = Bench("px4")
+    bench.look()
+    bench.examination.receive(frame.encode(dialect.new("ODOMETRY"), 0, 2, 1), bench.now)
+    assert found(bench.examination.diagnosis(bench.now), "other position source").found == "ODOMETRY of 2/1"
 
 
 def test_unanswered_timesync_is_found() -> None:
