@@ -58,14 +58,14 @@ class Row(NamedTuple):
 class Fixes:
     """The GNSS fixes of a flight: times (ns), positions (rad) and velocities (m/s) of those with one.
 
-    A multirotor flies while the log states so, others while they are fast.
+    A multirotor flies while the log states so (`is_multirotor`), others while they are fast.
     """
 
     def __init__(self, records: Sequence[Stamped]) -> None:
         vehicles = [r for r in records if isinstance(r, Vehicle)]
         stated = {r.t_ns: r.flying for r in vehicles if r.flying is not None}
-        slow = any(r.multirotor for r in vehicles) and any(stated.values())
-        self._stated = sorted(stated.items()) if slow else []
+        self.is_multirotor = any(r.multirotor for r in vehicles) and any(stated.values())
+        self._stated = sorted(stated.items()) if self.is_multirotor else []
         fixes = {r.t_ns: r for r in records if isinstance(r, Gnss) and r.has_3d_fix}
         found = [fixes[t_ns] for t_ns in sorted(fixes)]
         self.t_ns = np.array([r.t_ns for r in found])
@@ -73,6 +73,11 @@ class Fixes:
         moving = [(r.t_ns, r.v_n[0], r.v_n[1]) for r in found if r.v_n is not None]
         columns: Floats = np.array(moving, dtype=np.float64).reshape(-1, 3).T
         self.v_t_ns, self.v_n, self.v_e = columns
+
+    def covers(self, t_ns: float, gap_s: float = GAP_S) -> bool:
+        """Whether the fixes before and after are at most `gap_s` apart."""
+        k = bisect_right(self.t_ns, t_ns)
+        return 0 < k < len(self.t_ns) and bool(self.t_ns[k] - self.t_ns[k - 1] <= gap_s * SECOND_NS)
 
     def at(self, t_ns: float) -> Geodetic:
         """The position, interpolated."""
@@ -83,7 +88,7 @@ class Fixes:
     def starts(self, every_s: float, longest_s: float) -> list[float]:
         """When outages may begin, ns: in flight, after a time to learn, with GNSS all the while."""
         fast = np.hypot(self.v_n, self.v_e) > FLYING_M_S
-        flying = self.v_t_ns[[self._is_aloft(t) for t in self.v_t_ns] if self._stated else fast]
+        flying = self.v_t_ns[[self.is_aloft(t) for t in self.v_t_ns] if self._stated else fast]
         if not len(flying):
             return []
         first, last = flying[0] + LEARNING_S * SECOND_NS, flying[-1] - longest_s * SECOND_NS
@@ -93,11 +98,11 @@ class Fixes:
             float(t)
             for t in np.arange(first, last, every_s * SECOND_NS)
             if not ((end > t - WIND_S * SECOND_NS) & (begin < t + longest_s * SECOND_NS)).any()
-            and self._is_aloft(t)
-            and self._is_aloft(t + longest_s * SECOND_NS)
+            and self.is_aloft(t)
+            and self.is_aloft(t + longest_s * SECOND_NS)
         ]
 
-    def _is_aloft(self, t_ns: float) -> bool:
+    def is_aloft(self, t_ns: float) -> bool:
         """Whether it flies by the log; True where that states nothing."""
         k = bisect_right(self._stated, t_ns, key=lambda stated: stated[0])
         return not self._stated or (k > 0 and self._stated[k - 1][1])

@@ -10,7 +10,7 @@ changes of speed or course the drag cannot be separated from the wind.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -24,14 +24,16 @@ from companion.config.options import configuration_options
 from companion.navigator import strapdown_channel
 from companion.navigator.strapdown_channel import Strap
 from companion.option_types import INPUT_PATH
-from companion.records import Attitude, Gnss, Imu, Stamped, Vehicle
+from companion.records import Attitude, Gnss, Imu, Stamped
 from companion.storage.reader import LogError
+from companion.study.outages import Fixes
 from companion.tables import print_tables
 from companion.units import SECOND_NS, Floats
 
 WIND_S = 120.0
 LASTING_S = 10.0  # gusts: residuals are independent after it
 LEAST = 60  # seconds in flight
+FIXES_S = 2.0  # no velocity is interpolated across a longer gap
 COARSEST = 0.25  # of the drag: the navigator's own uncertainty
 
 
@@ -55,37 +57,29 @@ class RotorDrag(NamedTuple):
     left_m_s: float
 
 
-def seconds_in_flight(records: Iterable[Stamped], config: Config) -> Seconds:
+def seconds_in_flight(records: Sequence[Stamped], config: Config) -> Seconds:
     """Average over each second of a multirotor's flight in which IMU, attitude and GNSS velocity came."""
-    strap, flying, is_multirotor = Strap(), False, False
-    rows: dict[int, list[tuple[float, ...]]] = {}
-    fixes: dict[int, tuple[float, float]] = {}
-    for record in records:
-        if isinstance(record, Vehicle):
-            is_multirotor = is_multirotor if record.multirotor is None else record.multirotor
-            flying = flying if record.flying is None else record.flying
-        elif isinstance(record, Attitude):
+    receiver, imu = config.gnss.receiver, config.strapdown.imu
+    fixes = Fixes([r for r in records if not (isinstance(r, Gnss) and r.receiver != receiver)])
+    strap, rows = Strap(), dict[int, list[tuple[float, ...]]]()
+    for record in records if fixes.is_multirotor else ():
+        if isinstance(record, Attitude):
             strap = strapdown_channel.sense(strap, record)
-        elif isinstance(record, Gnss) and record.receiver == config.gnss.receiver and record.v_n is not None:
-            fixes[record.t_ns] = record.v_n[:2]
-        elif isinstance(record, Imu) and record.source == config.strapdown.imu:
+        elif isinstance(record, Imu) and record.source == imu:
             strap = strapdown_channel.receive(strap, record)
-            if not (flying and is_multirotor) or strap.why or strap.C_nb is None:
+            if strap.why or strap.C_nb is None or not fixes.is_aloft(record.t_ns):
                 continue
             if (force := strapdown_channel.drag_force(strap)) is not None:
                 row = (*force, float(strap.C_nb[0, 0]), float(strap.C_nb[1, 0]))
                 rows.setdefault(record.t_ns // SECOND_NS, []).append(row)
-    t_fix = np.array(sorted(fixes), dtype=np.int64)
-    middle = np.array([second * SECOND_NS + SECOND_NS // 2 for second in rows], dtype=np.int64)
-    if not len(t_fix) or not len(middle):
+    middles = {second: second * SECOND_NS + SECOND_NS // 2 for second in rows}
+    known = [second for second, middle in middles.items() if fixes.covers(middle, FIXES_S)]
+    t_ns = np.array([middles[second] for second in known])
+    v = [np.interp(t_ns, fixes.v_t_ns, each) for each in (fixes.v_n, fixes.v_e)] if len(fixes.v_n) else []
+    if not known or not v:
         return Seconds(np.zeros(0), *(np.zeros((0, 2)) for _ in range(3)))
-    after = np.searchsorted(t_fix, middle).clip(1, len(t_fix) - 1)
-    beside = (t_fix[after] - t_fix[after - 1] <= 2 * SECOND_NS) & (middle >= t_fix[0]) & (middle <= t_fix[-1])
-    found = np.array([fixes[t] for t in t_fix.tolist()])
-    v = np.column_stack([np.interp(middle, t_fix, found[:, k]) for k in (0, 1)])
-    means = np.array([np.mean(samples, axis=0) for samples in rows.values()])
-    t = (middle - middle[0]) / SECOND_NS
-    return Seconds(t[beside], means[beside, :2], v[beside], means[beside, 2:])
+    means = np.array([np.mean(rows[second], axis=0) for second in known])
+    return Seconds((t_ns - t_ns[0]) / SECOND_NS, means[:, :2], np.column_stack(v), means[:, 2:])
 
 
 def fit(s: Seconds) -> RotorDrag:
@@ -114,7 +108,7 @@ def command(log: Path, file: Path | None, preset: str | None, pairs: tuple[str, 
     """
     config = load(file, {}, pairs=pairs, preset=preset)
     with input_errors_as_log_errors():
-        s = seconds_in_flight(open_inputs(log).records, config)
+        s = seconds_in_flight(list(open_inputs(log).records), config)
     if len(s.t) < LEAST:
         raise LogError(
             f"{log}: {len(s.t)} s of a multirotor's flight with IMU, attitude and velocity of GNSS, {LEAST} s"

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import json
 import math
-from bisect import bisect_right
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -31,7 +30,7 @@ from companion.navigator import INPUTS_USED, Navigator
 from companion.option_types import INPUT_PATH, FloatRange
 from companion.records import AirData, Attitude, Imu, Reboot, RsbnFix, Solution, Stamped
 from companion.storage.reader import LogError
-from companion.study.outages import GAP_S, Fixes
+from companion.study.outages import Fixes
 from companion.tables import print_tables
 from companion.units import SECOND_NS
 
@@ -128,9 +127,7 @@ def fly(wrong: str, records: Sequence[Stamped], fixes: Fixes, config: Config) ->
             suspect_ns += passed * ((out.gnss_false or 0.0) > THRESHOLDS.suspect)
             excluded_ns += passed * ((out.gnss_false or 0.0) > THRESHOLDS.excluded)
             last_ns = out.t_ns
-            k = bisect_right(fixes.t_ns, out.t_ns - LATE_NS)
-            beside = k > 0 and out.t_ns <= fixes.t_ns[-1]
-            if beside and fixes.t_ns[k] - fixes.t_ns[k - 1] <= GAP_S * SECOND_NS:
+            if out.t_ns <= fixes.t_ns[-1] and fixes.covers(out.t_ns - LATE_NS):
                 north, east, _ = separation(Geodetic(out.lat, out.lon, 0.0), fixes.at(out.t_ns))
                 farthest = max(farthest, math.hypot(north, east))
         navigator.settle()
