@@ -86,10 +86,10 @@ def find_logs(folders: Sequence[Path], results: Path) -> list[Path]:
     return sorted(path for path in found if own not in path.parents)
 
 
-def log_key(path: Path, config: Config) -> str:
+def log_key(path: Path, config_digest: str) -> str:
     """Return a key that changes when the log or the configuration does."""
     status = path.stat()
-    return f"{path}|{status.st_size}|{status.st_mtime_ns}|{_digest(to_toml(config))}"
+    return f"{path}|{status.st_size}|{status.st_mtime_ns}|{config_digest}"
 
 
 def assess_log(job: LogJob) -> list[FlightRow]:
@@ -164,12 +164,13 @@ class Fleet:
     def __init__(self, results: Path, config: Config, scheduler: str | None, workers: int) -> None:
         results.mkdir(parents=True, exist_ok=True)
         self._results, self._config = results, config
+        self._config_digest = _digest(to_toml(config))
         self._scheduler, self._workers = scheduler, workers
         self._journal = Journal(results / JOURNAL)
 
     def assess(self, logs: Sequence[Path], progress: Progress) -> list[FlightRow]:
         """Assess the logs that are new or changed; return the rows of all of them."""
-        keys = {log_key(path, self._config): path for path in logs}
+        keys = {log_key(path, self._config_digest): path for path in logs}
         found = {entry["key"]: entry["rows"] for entry in self._journal.entries if entry["key"] in keys}
         known = {key: rows for key, rows in found.items() if all(map(_is_current, rows))}
         if old := len(found) - len(known):
@@ -195,7 +196,7 @@ class Fleet:
         worst = list(dict.fromkeys(row.log for row in worst_first(rows) if row.reason is None))[:count]
         folder = self._results / REPORTS
         folder.mkdir(exist_ok=True)
-        digests = {log: _digest(log_key(Path(log), self._config)) for log in worst}
+        digests = {log: _digest(log_key(Path(log), self._config_digest)) for log in worst}
         names = {log: f"{_safe(Path(log).stem)}-{digest}.html" for log, digest in digests.items()}
         jobs = {
             f"report {log}": LogJob(Path(log), self._config, (folder / name).resolve())

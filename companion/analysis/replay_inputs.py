@@ -35,11 +35,12 @@ def apply_changes(config: Config, text: str) -> Config:
     """
     changes = [pair.partition("=") for pair in re.split(r",(?=[A-Za-z_.]+=)", text)]
     changed = [(_full_name(name.strip()), value) for name, _, value in changes]
+    names = {name for name, _ in changed}
     kept = [
         (f"{section}.{key}", msgspec.json.encode(value).decode())
         for section in config.__struct_fields__
         for key, value in structs.asdict(getattr(config, section)).items()
-        if f"{section}.{key}" not in dict(changed)
+        if f"{section}.{key}" not in names
     ]
     pairs = [f"{name}={value}" for name, value in kept + changed]
     try:
