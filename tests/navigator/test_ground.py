@@ -48,7 +48,7 @@ def test_without_a_pressure_it_flies_once_it_moves() -> None:
 
 
 def test_a_pitot_behind_a_running_propeller_is_no_flight() -> None:
-    """It taught a wind of 20 m/s; the airspeed was false after lift-off, and later GNSS."""
+    """The wind was estimated as 20 m/s; the airspeed was false after lift-off, and later GNSS."""
     assert phases((21.0, 0.1, None), (21.0, 1.0, None), (18.0, 9.0, None)) == [False, False, True]
 
 

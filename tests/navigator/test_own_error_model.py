@@ -5,8 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from companion.config import Config
+from companion.navigator.own_channel import OwnChannel
 from companion.navigator.own_error_model import (
     GUST,
+    USUAL,
     Amplitudes,
     N,
     Propagator,
@@ -19,7 +22,8 @@ from companion.navigator.own_error_model import (
 
 @pytest.mark.parametrize("name", ["heading", "crab", "tilt", "accelerometer_m_s2"])
 def test_the_coarsest_grade_doubts_settings_that_are_too_exact(name: str) -> None:
-    usual, interval = Amplitudes(), add_imu(begin("imu", (20.0, 0.0)), 1.0, (0.0, 0.0), 0.0, 0.0)
+    assert getattr(OwnChannel(Config()).settings, name) == getattr(USUAL, name)
+    usual, interval = USUAL, add_imu(begin("imu", (20.0, 0.0)), 1.0, (0.0, 0.0), 0.0, 0.0)
     exact = usual._replace(**{name: getattr(usual, name) / 20.0})
     found = [(prior(s), Propagator(s).transition(interval)[1]) for s in (usual, exact)]
     for by_default, stated in zip(*found, strict=True):
