@@ -307,19 +307,21 @@ class Writer:
         sync_folder(self.path.parent)
 
     def _write_queued(self) -> bool:
-        """Write all queued chunks. On the first failure re-queue that chunk and return False."""
+        """Write all queued chunks. Return False on the first failure; that chunk stays the oldest queued."""
         while True:
             with self._lock:
                 if not self._queued:
                     return True
-                batch = self._queued.popleft()
-                self._queued_bytes -= batch.size
-                self._space_available.notify_all()
+                batch = self._queued[0]
             if not self._attempt(partial(self._file.chunk, batch.messages, self._schemas, self._channels)):
-                with self._lock:
-                    self._queued.appendleft(batch)
-                    self._queued_bytes += batch.size
                 return False
+            with self._lock:
+                if self._queued and self._queued[0] is batch:
+                    self._queued.popleft()
+                    self._queued_bytes -= batch.size
+                else:  # dropped by the caller while it was being written
+                    self.dropped -= len(batch.messages)
+                self._space_available.notify_all()
 
     def _attempt(self, act: Callable[[], None]) -> bool:
         try:

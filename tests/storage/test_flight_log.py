@@ -569,6 +569,43 @@ def test_permanently_full_disk_drops_the_oldest_and_counts_them(tmp_path):
     assert log.dropped + len(kept) == 500
 
 
+@pytest.mark.parametrize("fails", [True, False])
+def test_chunk_that_is_being_written_is_the_oldest_and_is_dropped_first(tmp_path, fails):
+    """The disk is blocked while the queue overflows. If it then fails, no gap is left before later records."""
+    slow, holds, go = threading.Event(), threading.Event(), threading.Event()
+
+    def fault():
+        if not slow.is_set():
+            return None
+        holds.set()
+        go.wait(30.0)
+        return OSError(errno.EIO, "broken") if fails and slow.is_set() else None
+
+    log = Writer(
+        tmp_path / "x.mcap",
+        metadata={},
+        chunk_bytes=500,
+        fsync_s=0.05,
+        depth=2000,
+        disk=lambda p: FaultyDisk(p, fault),
+        **START,
+    )
+    slow.set()
+    log.record(imu(0))
+    wait_until(holds.is_set)
+    for i in range(1, 500):
+        log.record(imu(i))
+    assert log.waiting <= 2000
+    go.set()
+    wait_until(lambda: log.trouble is not None if fails else log.waiting == 0)
+    slow.clear()
+    assert log.close()
+    kept = [e.value for e in read(tmp_path / "x.mcap")]
+    first = [] if fails else [imu(0)]  # written after all, and not counted as dropped
+    assert kept == [*first, *(imu(i) for i in range(500 - len(kept) + len(first), 500))]
+    assert log.dropped + len(kept) == 500
+
+
 def test_failed_disk_leaves_a_recoverable_log(tmp_path):
     full = threading.Event()
     log = Writer(
