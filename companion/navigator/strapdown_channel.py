@@ -33,7 +33,7 @@ W_MAX = 0.995 * math.radians(2000.0)  # [rad/s] and gyros
 VERTICAL = 0.5  # of gravity, by which the vertical force may differ from it
 VERTICAL_S = 10.0  # averaged over so long: nobody climbs 50 m/s faster after it
 STAYS = 0.5  # of the scatter of the samples, in the velocity
-UPRIGHT = 0.5  # cosine of the tilt up to which the drag of rotors is used
+UPRIGHT = 0.87  # cosine of the tilt (30 deg) up to which the drag of rotors is used
 MANOEUVRE_M_S2, MANOEUVRE_S = 1.0, 2.0  # a manoeuvre is a greater mean acceleration over so long
 MANOEUVRE_SQRT_S = 0.12  # velocity noise per acceleration above it, m/s/sqrt(s) per m/s^2
 
@@ -105,8 +105,10 @@ def acceleration(s: Strap) -> Vector3:
     return float(f_n[0]), float(f_n[1]), float(f_n[2]) + G0
 
 
-def drag_force(s: Strap) -> Vector2 | None:
-    """Specific force of a multirotor's drag, north and east (m/s^2), by the last sample; None if it is steep.
+def drag_force(s: Strap, least: float = UPRIGHT) -> Vector2 | None:
+    """Specific force of a multirotor's drag, north and east (m/s^2), by the last sample.
+
+    None where the cosine of the tilt is below `least`: an attitude that is wrong or late counts most there.
 
     Rotors of fixed pitch pull along the body's z axis; what is across is the drag of the velocity in their
     plane, f_b = -drag C_nb' v of a level velocity v. Returned is -drag v: the level part of f_b is less, by
@@ -115,7 +117,7 @@ def drag_force(s: Strap) -> Vector2 | None:
     assert s.imu is not None
     assert s.C_nb is not None
     (a, b, _), (c, d, _), (_, _, upright) = s.C_nb.tolist()
-    if upright < UPRIGHT:
+    if upright < least:
         return None
     x, y, _ = s.imu.f_b
     return (d * x - c * y) / upright, (a * y - b * x) / upright

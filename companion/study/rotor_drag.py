@@ -33,6 +33,7 @@ from companion.units import SECOND_NS, Floats
 WIND_S = 120.0
 LASTING_S = 10.0  # gusts: residuals are independent after it
 LEAST = 60  # seconds in flight
+UPRIGHT = 0.5  # cosine of the tilt: here an attitude that is wrong at times only adds noise
 FIXES_S = 2.0  # no velocity is interpolated across a longer gap
 COARSEST = 0.25  # of the drag: the navigator's own uncertainty
 
@@ -69,7 +70,7 @@ def seconds_in_flight(records: Sequence[Stamped], config: Config) -> Seconds:
             strap = strapdown_channel.receive(strap, record)
             if strap.why or strap.C_nb is None or not fixes.is_aloft(record.t_ns):
                 continue
-            if (force := strapdown_channel.drag_force(strap)) is not None:
+            if (force := strapdown_channel.drag_force(strap, UPRIGHT)) is not None:
                 row = (*force, float(strap.C_nb[0, 0]), float(strap.C_nb[1, 0]))
                 rows.setdefault(record.t_ns // SECOND_NS, []).append(row)
     middles = {second: second * SECOND_NS + SECOND_NS // 2 for second in rows}

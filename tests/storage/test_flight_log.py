@@ -571,7 +571,7 @@ def test_permanently_full_disk_drops_the_oldest_and_counts_them(tmp_path):
 
 @pytest.mark.parametrize("fails", [True, False])
 def test_chunk_that_is_being_written_is_the_oldest_and_is_dropped_first(tmp_path, fails):
-    """The disk is blocked while the queue overflows. If it then fails, no gap is left before later records."""
+    """The disk is blocked while the queue overflows. If it then fails, what is kept is without a gap."""
     slow, holds, go = threading.Event(), threading.Event(), threading.Event()
 
     def fault():

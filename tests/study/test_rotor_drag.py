@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from companion.analysis.replay_inputs import LogInputs
 from companion.config import Config
-from companion.navigator.strapdown_channel import Strap, attitude_matrix, drag_force
+from companion.navigator.strapdown_channel import UPRIGHT, Strap, attitude_matrix, drag_force
 from companion.records import Attitude, Gnss, Imu, Input, Stamped, Vehicle
 from companion.storage.reader import LogError
 from companion.study import rotor_drag
@@ -34,7 +34,9 @@ def test_the_drag_of_a_level_velocity_is_the_same_at_any_tilt(
     held = Attitude(0, 0, tilt * math.sin(towards), tilt * math.cos(towards), heading, (0.0, 0.0, 0.0))
     C_nb, v = attitude_matrix(held), np.array((speed, 0.3 * speed + 1.0, 0.0))
     x, y, _ = (-0.2 * C_nb.T @ v).tolist()
-    force = drag_force(Strap(Imu(0, 0, 0, (x, y, -G0), (0.0, 0.0, 0.0)), C_nb))
+    strap = Strap(Imu(0, 0, 0, (x, y, -G0), (0.0, 0.0, 0.0)), C_nb)
+    assert (drag_force(strap) is None) == (C_nb[2, 2] < UPRIGHT)
+    force = drag_force(strap, 0.5)
     if C_nb[2, 2] < 0.5:
         assert force is None
     else:
