@@ -257,6 +257,17 @@ class Reboot(Stamped, frozen=True, gc=False, tag=True):
     system: int
 
 
+class TimeStep(Stamped, frozen=True, gc=False, tag=True):
+    """The autopilot's times map `step_s` later than before, at once, though its clock was not set.
+
+    Its clock stood still or was slow (a simulator on a busy computer), or the mapping was wrong until now.
+    Which of them is not known, nor how far the aircraft has flown meanwhile.
+    """
+
+    system: int
+    step_s: float
+
+
 class Tuning(Stamped, frozen=True, gc=False, tag=True):
     """A ground station set parameters: the whole new configuration, as TOML."""
 
@@ -499,6 +510,7 @@ Input: TypeAlias = (
     | StarFix
     | SecondIns
     | Reboot
+    | TimeStep
     | Tuning
 )
 Output: TypeAlias = Solution | Fix | Rejection | Reset | Event

@@ -253,6 +253,7 @@ _NAMES = {
     "StarFix": "star fixes",
     "Tuning": "changed parameters",
     "Reboot": "reboots",
+    "TimeStep": "steps of the autopilot's time",
     "Event": "events",
     "Reset": "resets",
     "Smoothed": "smoothed track",

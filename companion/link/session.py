@@ -49,6 +49,7 @@ MAX_REPORTED = 16
 LOST_AFTER = 5 * SECOND_NS
 #: A link is reported late, or prompt again, after this time: TIMESYNC has been answered by then.
 LATE_FOR = 2 * SECOND_NS
+STEP = SECOND_NS // 10  # a smaller step of the mapping is that of TIMESYNC on a slow link
 #: Messages stamped with time_boot_ms when they are sent.
 STAMPED_WHEN_SENT = frozenset(
     {
@@ -93,7 +94,15 @@ class Rebooted(NamedTuple):
 
 
 class ClockJump(NamedTuple):
-    """The autopilot's clock was set: its times now map `by_ns` later than before."""
+    """The autopilot's clock was set forward by `by_ns`; negative: it was set back, or stood still."""
+
+    at_ns: int
+    system: int
+    by_ns: int
+
+
+class MappingStepped(NamedTuple):
+    """The autopilot's times map `by_ns` later than before, at once, though its clock was not set."""
 
     at_ns: int
     system: int
@@ -179,6 +188,7 @@ Event = (
     | LinkLost
     | Rebooted
     | ClockJump
+    | MappingStepped
     | LinkLate
     | TimesyncOutlier
     | AutopilotReleased
@@ -487,9 +497,16 @@ class Session:
                 events.append(Rebooted(now, found.system))
             elif change is ClockChange.SET:
                 events.append(ClockJump(now, found.system, (before or 0) - (self.clock.offset(now) or 0)))
+            else:
+                self._note_step(before, now, found.system, events)
             if found.msgid == _SYSTEM_TIME:
                 self.clock.update_unix(message.time_unix_usec * 1000, boot)
             self._report_lateness(now, found.system, events)
+
+    def _note_step(self, before: int | None, now: int, system: int, events: list[Event]) -> None:
+        after = self.clock.offset(now)
+        if before is not None and after is not None and abs(after - before) > STEP:
+            events.append(MappingStepped(now, system, after - before))
 
     def _report_lateness(self, now: int, system: int, events: list[Event]) -> None:
         late = self.clock.lateness(now)
@@ -519,6 +536,7 @@ class Session:
         elif from_autopilot:
             before = self.clock.offset(now)
             self.clock.update_timesync(message.ts1, message.tc1, now)
+            self._note_step(before, now, found.system, events)
             if (error := self.clock.outlier) is not None:
                 events.append(TimesyncOutlier(now, found.system, error))
             elif before is not None and (by := before - (self.clock.offset(now) or 0)) < -JUMP:

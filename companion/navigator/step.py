@@ -8,11 +8,14 @@ solution is the nominal trajectory less its estimated error.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
+from companion.estimate import bank as banks
 from companion.navigator import fixes, ins_samples, own_samples
 from companion.navigator.local_origin import LIVE_WINDOW_NS, infer_origin
+from companion.navigator.minimax_bound import Guarantee
 from companion.navigator.own_channel import OwnChannel, Sensors
 from companion.navigator.state import Settings, State, Step
 from companion.records import (
@@ -35,6 +38,7 @@ from companion.records import (
     SecondIns,
     Severity,
     StarFix,
+    TimeStep,
     Tuning,
     Vehicle,
 )
@@ -77,6 +81,15 @@ def _reboot(state: State, record: Reboot, settings: Settings) -> Step:
     return State()._replace(next_ns=state.next_ns), [Reset(record.t_ns, record.rx_ns, "navigator", why)]
 
 
+def _time_step(state: State, record: TimeStep, settings: Settings) -> Step:
+    """Doubt the position: the time that stepped was flown, or was not."""
+    if state.bank is None or state.nominal is None:
+        return state, []
+    sigma = math.hypot(*state.nominal.point.v_n[:2]) * abs(record.step_s)
+    bank = banks.inflate(state.bank, (0, 1), sigma)
+    return state._replace(bank=bank, guarantee=Guarantee(), parallel=None), []
+
+
 def _gnss_integrity(state: State, record: GnssIntegrity, settings: Settings) -> Step:
     return (state._replace(jammed_ns=record.t_ns) if record.threatened else state), []
 
@@ -89,6 +102,7 @@ _COMMON: _Uses = {
     GnssIntegrity: _gnss_integrity,
     RsbnFix: fixes.rsbn,
     Reboot: _reboot,
+    TimeStep: _time_step,
 }
 _INS: _Uses = {**_COMMON, LocalPosition: ins_samples.position}
 _CORRECTORS: dict[str, _Uses] = {

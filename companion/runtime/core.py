@@ -36,6 +36,7 @@ from companion.link.session import (
     LinkLate,
     LinkLost,
     LinkUp,
+    MappingStepped,
     MessageReceived,
     NotSent,
     NotUnderstood,
@@ -64,6 +65,7 @@ from companion.records import (
     Severity,
     Solution,
     Stamped,
+    TimeStep,
     Trust,
     Tuning,
 )
@@ -382,6 +384,10 @@ class CompanionCore:
                     f"{link.name}: the clock of autopilot {event.system} jumped by {jump_s:.1f} s",
                     now_ns,
                 )
+            elif isinstance(event, MappingStepped):
+                if link is self._last_used:
+                    step_s = event.by_ns / SECOND_NS
+                    self._on_record(TimeStep(now_ns, now_ns, event.system, step_s))
             elif isinstance(event, LinkLate):
                 text = f"late by {event.by_ns / SECOND_NS:.1f} s" if event.by_ns else "no longer late"
                 self.report(

@@ -115,6 +115,7 @@ FIELDS = {
     "star": "number of the star",
     "stamp_us": "us, time of the receiver as sent",
     "static": "Pa",
+    "step_s": "s by which the autopilot's times map later than before",
     "system": "MAVLink system number",
     "temperature": "K",
     "text": "text",

@@ -15,6 +15,7 @@ from companion.link.session import (
     LinkLate,
     LinkLost,
     LinkUp,
+    MappingStepped,
     MessageReceived,
     NotUnderstood,
     Rebooted,
@@ -200,12 +201,19 @@ def test_stopped_clock_is_reported_at_the_next_answer() -> None:
     run(session, peer, 0, 10)
     peer.booted += 4 * SECOND
     events = [e for e in run(session, peer, 14 * SECOND, 3) if not isinstance(e, MessageReceived)]
-    assert [type(e) for e in events] == [
-        TimesyncOutlier,
-        ClockJump,
-    ]  # the first answer arrives before a stamp
-    assert events[1].by_ns / SECOND == pytest.approx(-4, abs=0.1)
+    # the first answer arrives before a stamp
+    assert kinds(events) == [TimesyncOutlier, MappingStepped, ClockJump]
+    assert events[1].by_ns == -events[2].by_ns == pytest.approx(4 * SECOND, abs=SECOND // 10)
     assert abs(session.clock.offset(17 * SECOND) + 4996 * SECOND) <= 10 * MS
+
+
+@pytest.mark.parametrize("by_ms", [0, 50, 300, 700])
+def test_pause_of_the_clock_steps_the_mapping(by_ms: int) -> None:
+    session, peer = Session(rates_hz={"LOCAL_POSITION_NED": 10}), Autopilot(booted=-5000 * SECOND)
+    run(session, peer, 0, 10)
+    peer.booted += by_ms * MS
+    steps = [e for e in run(session, peer, 10 * SECOND, 5) if isinstance(e, MappingStepped)]
+    assert [round(e.by_ns / MS) for e in steps] == ([pytest.approx(by_ms, abs=10)] if by_ms > 100 else [])
 
 
 def test_late_link_is_reported_and_its_recovery_too() -> None:

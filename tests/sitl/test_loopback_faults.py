@@ -20,13 +20,24 @@ import pytest
 
 from companion.config import load
 from companion.nav.geometry import Geodetic, displace, local_to_geodetic, separation
-from companion.records import Event, LinkState, Reboot, Reset, Solution
+from companion.records import Event, LinkState, Reboot, Reset, Solution, Stamped, TimeStep
+from companion.runtime.core import CompanionCore
 from companion.storage import flight_log
 from companion.storage.retention import create_log
-from sitl.autopilot import UNIX_AT_START_NS
+from companion.units import SECOND_NS
+from sitl.autopilot import UNIX_AT_START_NS, SimulatedAutopilot
 from sitl.faults import Fault
 from sitl.flight import FlightPlan, Leg, WindChange
-from sitl.loopback import START_NS, fly_scenario, simulator_config, truth_function
+from sitl.loopback import (
+    LINK,
+    START_NS,
+    CollectingLog,
+    fly_connected,
+    fly_scenario,
+    simulated_for,
+    simulator_config,
+    truth_function,
+)
 from sitl.scenarios import Scenario, SensorRates, get_scenario
 
 pytestmark = pytest.mark.flight
@@ -227,3 +238,55 @@ def test_air_data_channel_ignores_local_position_resets(tmp_path: Path) -> None:
         LoggedFlight(tmp_path, "air_data", gnss_outages=OUTAGE, faults=faults) for faults in ((), (fault,))
     )
     assert [place(s) for s in shaken.solutions] == [place(s) for s in calm.solutions]
+
+
+class Everything(CollectingLog):
+    """All records."""
+
+    def record(self, record: Stamped, channel: str | None = None) -> None:
+        self.records.append(record)
+
+
+class StandsStill:
+    """A simulated autopilot on a busy computer: its world and its clock stand still for `lasting_s`."""
+
+    def __init__(self, autopilot: SimulatedAutopilot, begin_ns: int, lasting_s: float) -> None:
+        self.autopilot, self.begin_ns, self.lasting_ns = autopilot, begin_ns, round(1e9 * lasting_s)
+        self.end_ns = autopilot.end_ns + self.lasting_ns
+
+    def world_ns(self, now_ns: int) -> int:
+        return min(now_ns, max(self.begin_ns, now_ns - self.lasting_ns))
+
+    def poll(self, now_ns: int) -> list[bytes]:
+        return self.autopilot.poll(self.world_ns(now_ns))
+
+    def receive(self, data: bytes, now_ns: int) -> None:
+        self.autopilot.receive(data, self.world_ns(now_ns))
+
+    def deadline(self) -> int:
+        due = self.autopilot.deadline()
+        return due if due <= self.begin_ns else due + self.lasting_ns
+
+
+@pytest.mark.parametrize("own_ins", [True, False])
+@pytest.mark.parametrize("lasting_s", [0.3, 0.7, 3.0])
+def test_simulator_that_stands_still_leaves_a_healthy_gnss_beyond_doubt(
+    own_ins: bool, lasting_s: float
+) -> None:
+    """What it did not fly is not known, so the position is doubted instead, until the next fix."""
+    config = simulator_config(load(environment={}), own_ins)
+    scenario = simulated_for(Scenario("slow", PLAN, beacons=BEACONS), config)
+    log = Everything(None)
+    slow = StandsStill(SimulatedAutopilot(scenario, START_NS), START_NS + 100 * SECOND_NS, lasting_s)
+    fly_connected(slow, CompanionCore(config, log, (LINK,)), START_NS)
+    steps = [r for r in log.records if isinstance(r, TimeStep)]
+    assert sum(step.step_s for step in steps) == pytest.approx(lasting_s, abs=0.05)
+    texts = [r.text for r in log.records if isinstance(r, Event)]
+    assert not [text for text in texts if "suspect" in text or "excluded" in text]
+    truth, late = truth_function(slow.autopilot), 0
+    for s in (r for r in log.records if isinstance(r, Solution)):
+        if s.t_ns > steps[-1].t_ns + SECOND_NS:
+            north, east, _ = separation(place(s), truth(slow.world_ns(s.t_ns)))
+            assert math.hypot(north, east) <= 3.0 * stated_accuracy(s), s
+            late += 1
+    assert late > 500
