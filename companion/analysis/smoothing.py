@@ -63,6 +63,7 @@ from companion.records import (
     SecondIns,
     Stamped,
     StarFix,
+    TimeStep,
     Tuning,
 )
 from companion.units import SECOND_NS, Floats
@@ -448,7 +449,8 @@ class _Path:
             predicted = predicted + np.pad(_moved(point, state.nominal.point), (0, n - 4))
         elif not self._measures(before, record):
             measured, predicted = False, x
-            if any(isinstance(output, Reset) for output in outputs):  # the INS jumped: widened, perhaps
+            if isinstance(record, TimeStep) or any(isinstance(output, Reset) for output in outputs):
+                # widened; perhaps, if the INS jumped
                 P_before = before.bank.P[0, :n, :n]
                 Q = P - Phi @ P_before @ Phi.T
         self._Phi, self._Q = Phi @ self._Phi, Phi @ self._Q @ Phi.T + Q

@@ -24,7 +24,7 @@ from companion.navigator import Navigator
 from companion.navigator.channel import Nominal
 from companion.navigator.inertial_track import Point
 from companion.navigator.ins_channel import N, ins_channel
-from companion.records import Gnss, LocalOrigin, LocalPosition, Reboot, RsbnFix, Solution
+from companion.records import Gnss, LocalOrigin, LocalPosition, Reboot, RsbnFix, Solution, TimeStep
 
 ORIGIN = Geodetic(math.radians(60.0), math.radians(30.0), 0.0)
 BEACON = Geodetic(math.radians(60.4), math.radians(30.3), 100.0)
@@ -225,6 +225,16 @@ def test_reboot_starts_a_new_run() -> None:
     found = smooth_flight(records, CONFIG)
     (first,) = smooth_flight([r for r in flown.records if r.t_ns < cut], CONFIG)
     np.testing.assert_array_equal(found[0].x, first.x)
+
+
+def test_a_step_of_time_widens_the_position_in_both_directions() -> None:
+    flown = flight(300, (120, 180))
+    step = TimeStep(150 * NS, 150 * NS, 1, 1.0)
+    (plain,) = smooth_flight(flown.records, CONFIG)
+    (found,) = smooth_flight((*flown.records, step), CONFIG, check=True)
+    assert found.apart_sigma < 1e-6
+    wider = found.P[:, 0, 0] / np.interp(found.t_ns, plain.t_ns, plain.P[:, 0, 0])
+    assert wider.max() > 1.05 > 1.01 > wider[found.t_ns < 100 * NS].max()
 
 
 def test_nothing_to_smooth_is_reported_in_one_sentence() -> None:
