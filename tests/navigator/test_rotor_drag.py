@@ -103,6 +103,7 @@ def fly(config: Config, change: Change = lambda record: record, dark: tuple[floa
     return Flown(errors, (float(false[0]), float(false[1]), float(false[2])), rejections, last)
 
 
+@pytest.mark.flight
 def test_a_real_copter_reckons_by_its_drag() -> None:
     """After a minute without GNSS it is less than half as far off as by its IMU alone, within its sigmas."""
     dark = LOSS_S, LOSS_S + 61.0
@@ -115,6 +116,7 @@ def test_a_real_copter_reckons_by_its_drag() -> None:
     assert not alone.last.sources & Basis.AIR_DATA
 
 
+@pytest.mark.flight
 def test_with_gnss_nothing_is_false_and_nothing_rejected() -> None:
     flown = fly(DEFAULT)
     assert max(flown.false) < 0.5
@@ -144,6 +146,7 @@ def stuck(record: Input) -> Input:
     return replace(record, f_b=(0.0, 0.0, record.f_b[2])) if isinstance(record, Imu) else record
 
 
+@pytest.mark.flight
 @pytest.mark.parametrize("change", [crooked, half, stuck])
 def test_beside_a_healthy_gnss_a_wrong_drag_does_no_harm(change: Change) -> None:
     flown = fly(DEFAULT, change)
@@ -198,6 +201,7 @@ def test_while_it_takes_off_it_is_not_used(height: float, begins_s: float) -> No
     assert begins_s < first_s < begins_s + 1.5
 
 
+@pytest.mark.flight
 def test_the_smoother_is_the_two_point_solution_with_drag_too() -> None:
     runs = smooth_flight(
         (r for r in recorded() if not isinstance(r, Gnss) or not 105 * NS < r.t_ns < 165 * NS),

@@ -697,6 +697,7 @@ def test_recorded_on_px4_its_preset_finds_a_step_of_the_wind() -> None:
     assert np.mean(np.square(found.error[minute] / found.sigma[minute])) < 4.0
 
 
+@pytest.mark.flight
 def test_recorded_alone_it_bridges_seconds_and_says_how_far_it_may_be_off() -> None:
     """The autopilot's attitude errs by 2.5 degrees once its GNSS is gone in a wind that it does not know."""
     records, truth = recorded()

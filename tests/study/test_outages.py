@@ -44,6 +44,7 @@ def circling(seconds: float, lost: tuple[float, float] = (0.0, 0.0)) -> list[Sta
     return records
 
 
+@pytest.mark.flight
 def test_rules_and_companion_on_a_flight_that_is_known() -> None:
     config = load(flags={"inertial.source": "air_data"}, environment={})
     rows = outages.study(circling(330.0), config, 60.0, (10.0, 60.0))

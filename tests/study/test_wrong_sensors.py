@@ -83,6 +83,7 @@ def test_a_gap_of_the_fixes_is_not_compared() -> None:
     assert row.farthest_m < 5.0
 
 
+@pytest.mark.flight
 def test_without_a_beacon_gnss_is_never_suspect() -> None:
     config = load(flags={"inertial.source": "air_data"}, environment={})
     rows = {row.wrong: row for row in study(circling(60.0), config, 20.0)}
