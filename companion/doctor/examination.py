@@ -291,6 +291,9 @@ class Examination:
                 "let TIMESYNC through the router; without it arrival times are used",
             )
         )
+        if (rate := session.clock.rate) != 1.0:
+            advice = "fly the simulation in real time: nothing of a clock that is too fast is used"
+            found.append(Finding("clock", f"{rate:g} times as fast as ours", "real time", False, advice))
         place = "not known"
         if self._origin is not None:
             place = f"{self._origin.latitude * 1e-7:.5f}, {self._origin.longitude * 1e-7:.5f}"

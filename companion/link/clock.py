@@ -55,6 +55,9 @@ LATE = 1 * SECOND_NS
 MAX_ROUND_TRIP = SECOND_NS // 4
 #: How long a TIMESYNC answer is used.
 FRESH = 60 * SECOND_NS
+#: A simulation is not flown in real time if its clock is faster or slower than ours by more than this share
+#: between the most of so many TIMESYNC answers.
+RATE_LIMIT, RATE_SAMPLES = 0.05, 10
 #: Stamps from here on (September 2001) are UNIX time; no autopilot runs for 31 years.
 UNIX_EPOCH_FROM = 10**9 * SECOND_NS
 
@@ -94,6 +97,34 @@ class TimesyncSample(NamedTuple):
         return (self.requested + self.received) // 2 - self.reading
 
 
+class RateDetector:
+    """Shows that the autopilot's clock does not run in real time, by TIMESYNC alone."""
+
+    def __init__(self) -> None:
+        self.rate = 1.0  # how fast it runs by ours
+        self._last: TimesyncSample | None = None
+        self._drifts: deque[float] = deque(maxlen=RATE_SAMPLES)
+
+    def follow(self, sample: TimesyncSample) -> None:
+        """Take the next answer.
+
+        The bounds of two answers prove the least drift of the offset between them, whatever the delays; most
+        of the last answers must show it, for a clock that is set or stands still once is not fast or slow.
+        """
+        last, self._last = self._last, sample
+        if last is None or sample.requested <= last.requested:
+            return
+        elapsed = sample.requested - last.requested
+        falls = min(sample.max_offset - last.min_offset, 0) / elapsed
+        rises = max(sample.min_offset - last.max_offset, 0) / elapsed
+        self._drifts.append(rises + falls)
+        beyond = sorted(drift for drift in self._drifts if abs(drift) > RATE_LIMIT)
+        if not beyond:
+            self.rate = 1.0
+        elif self.rate == 1.0 and (len(beyond) > RATE_SAMPLES // 2 and beyond[0] * beyond[-1] > 0.0):
+            self.rate = round(1.0 - beyond[len(beyond) // 2], 1)
+
+
 class BootClock:
     """Maps one autopilot's stamps to the companion's clock. All times are integer nanoseconds."""
 
@@ -116,6 +147,12 @@ class BootClock:
         self._best: TimesyncSample | None = None
         self._unix_minus_boot: int | None = None
         self._requests.clear()
+        self._rate_detector = RateDetector()
+
+    @property
+    def rate(self) -> float:
+        """How fast the autopilot's clock runs by ours: 1 in real time."""
+        return self._rate_detector.rate
 
     def update(self, boot: int, received: int) -> ClockChange | None:
         """Process the stamp of a message that was stamped when sent; return a detected clock change."""
@@ -197,6 +234,7 @@ class BootClock:
         if self._envelope is None:
             return False  # no stamp to check it against
         sample = TimesyncSample(requested, reading, now)
+        self._rate_detector.follow(sample)
         age = self._last_difference
         if age - sample.min_offset < -JUMP or age - sample.max_offset > MAX_LATENESS:
             self.outlier = age - sample.offset

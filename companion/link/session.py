@@ -109,6 +109,14 @@ class MappingStepped(NamedTuple):
     by_ns: int
 
 
+class ClockRate(NamedTuple):
+    """The autopilot's clock runs `rate` times as fast as ours, for seconds; 1: it runs as ours again."""
+
+    at_ns: int
+    system: int
+    rate: float
+
+
 class LinkLate(NamedTuple):
     """Messages have arrived late for LATE_FOR, by `by_ns` now; 0: the link is prompt again."""
 
@@ -189,6 +197,7 @@ Event = (
     | Rebooted
     | ClockJump
     | MappingStepped
+    | ClockRate
     | LinkLate
     | TimesyncOutlier
     | AutopilotReleased
@@ -534,8 +543,10 @@ class Session:
             if limiter.take(now):
                 self.send(dialect.new("TIMESYNC", tc1=max(now, 1), ts1=message.ts1))
         elif from_autopilot:
-            before = self.clock.offset(now)
+            before, rate = self.clock.offset(now), self.clock.rate
             self.clock.update_timesync(message.ts1, message.tc1, now)
+            if self.clock.rate != rate:
+                events.append(ClockRate(now, found.system, self.clock.rate))
             self._note_step(before, now, found.system, events)
             if (error := self.clock.outlier) is not None:
                 events.append(TimesyncOutlier(now, found.system, error))

@@ -32,6 +32,7 @@ from companion.link.rate_limiter import RateLimiter
 from companion.link.session import (
     AutopilotReleased,
     ClockJump,
+    ClockRate,
     FrameRejected,
     LinkLate,
     LinkLost,
@@ -378,16 +379,18 @@ class CompanionCore:
                 self.report(Severity.WARNING, f"{link.name}: autopilot {event.system} rebooted", now_ns)
                 self._on_record(Reboot(now_ns, now_ns, event.system))
             elif isinstance(event, ClockJump):
-                jump_s = event.by_ns / SECOND_NS
-                self.report(
-                    Severity.WARNING,
-                    f"{link.name}: the clock of autopilot {event.system} jumped by {jump_s:.1f} s",
-                    now_ns,
-                )
+                if link.session.clock.rate == 1.0:
+                    jump_s = event.by_ns / SECOND_NS
+                    text = f"{link.name}: the clock of autopilot {event.system} jumped by {jump_s:.1f} s"
+                    self.report(Severity.WARNING, text, now_ns)
             elif isinstance(event, MappingStepped):
-                if link is self._last_used:
+                if link is self._last_used and link.session.clock.rate <= 1.0:
                     step_s = event.by_ns / SECOND_NS
                     self._on_record(TimeStep(now_ns, now_ns, event.system, step_s))
+            elif isinstance(event, ClockRate):
+                text = f"{link.name}: the clock of autopilot {event.system} {_rate_text(event.rate)}"
+                severity = Severity.NOTICE if event.rate == 1.0 else Severity.ERROR
+                self.report(severity, text, now_ns)
             elif isinstance(event, LinkLate):
                 text = f"late by {event.by_ns / SECOND_NS:.1f} s" if event.by_ns else "no longer late"
                 self.report(
@@ -460,7 +463,7 @@ class CompanionCore:
             elif not is_duplicate:
                 for each in self.links.values():
                     each.output.receive(record)
-            if not is_duplicate:
+            if not is_duplicate and link.session.clock.rate <= 1.0:
                 self._last_used = link if event.from_autopilot else self._last_used
                 is_rejected = self._on_record(record)
                 if is_rejected and msgid in MEASUREMENTS:
@@ -670,6 +673,15 @@ class CompanionCore:
             offset,
             None if uncertainty is None else 2 * uncertainty,
         )
+
+
+def _rate_text(rate: float) -> str:
+    """What the user must know of an autopilot's clock that runs `rate` times as fast as ours."""
+    if rate == 1.0:
+        return "runs as ours again"
+    if rate > 1.0:
+        return f"runs {rate:g} times as fast as ours: nothing of it is used; fly the simulation in real time"
+    return f"runs {rate:g} times as fast as ours: the simulation is too slow for its computer"
 
 
 def _receiver_of(event: MessageReceived) -> Hashable:

@@ -1,6 +1,7 @@
 """Clock mapping from arrivals and TIMESYNC, with jitter, drift, false stamps and reboots."""
 
 import random
+from collections.abc import Callable
 
 import pytest
 from hypothesis import given, settings
@@ -336,3 +337,48 @@ def test_unstamped_message_is_as_late_as_a_stamped_one() -> None:
     clock.update(12 * SECOND_NS, 17 * SECOND_NS + OFFSET)
     arrival = 17 * SECOND_NS + OFFSET + 10 * MS
     assert clock.local(0, arrival) == pytest.approx(arrival - 5 * SECOND_NS, abs=MS)
+
+
+DELAYS = st.lists(st.tuples(*[st.integers(1, 5000)] * 2), min_size=5, max_size=40)
+
+
+def answered(clock: BootClock, boot: Callable[[int], int], delays: list[tuple[int, int]]) -> list[float]:
+    """The rate after each answer, one requested a second; delays there and back in ms."""
+    rates = []
+    for i, (there, back) in enumerate(delays):
+        now = OFFSET + i * SECOND_NS
+        clock.update(boot(now), now + MS)
+        requested = clock.request(now)
+        clock.update_timesync(requested, boot(now + there * MS), now + (there + back) * MS)
+        rates.append(clock.rate)
+    return rates
+
+
+@given(DELAYS, st.floats(-1e-4, 1e-4))
+def test_no_delay_makes_a_clock_of_real_time_seem_fast_or_slow(
+    delays: list[tuple[int, int]], drift: float
+) -> None:
+    rates = answered(BootClock(), lambda now: round((now - OFFSET) * (1.0 + drift)) + 10**12, delays)
+    assert set(rates) == {1.0}
+
+
+@pytest.mark.parametrize("rate", [0.2, 0.5, 0.9, 1.1, 1.5, 3.0, 20.0])
+def test_simulation_that_is_not_in_real_time_is_found_in_seconds(rate: float) -> None:
+    rates = answered(BootClock(), lambda now: round((now - OFFSET) * rate) + 10**12, [(3, 5)] * 20)
+    assert rates[5] == 1.0 and rates[7:] == pytest.approx([rate] * 13, abs=0.05 * rate)
+
+
+def test_simulation_that_is_in_real_time_again_is_used_again() -> None:
+    def boot(now: int) -> int:
+        return 10**12 + 4 * min(now - OFFSET, 20 * SECOND_NS) + max(now - OFFSET - 20 * SECOND_NS, 0)
+
+    rates = answered(BootClock(), boot, [(3, 5)] * 40)
+    assert rates[19] == pytest.approx(4.0, abs=0.1) and rates[25] != 1.0 == rates[33]
+
+
+@pytest.mark.parametrize("by_s", [-3.0, 3600.0])
+def test_clock_that_is_set_once_is_not_fast(by_s: float) -> None:
+    def boot(now: int) -> int:
+        return 10**13 + now + (round(by_s * SECOND_NS) if now > OFFSET + 10 * SECOND_NS else 0)
+
+    assert set(answered(BootClock(), boot, [(3, 5)] * 30)) == {1.0}

@@ -11,6 +11,7 @@ from companion.link import dialect, frame
 from companion.link.session import (
     BadFrame,
     ClockJump,
+    ClockRate,
     Event,
     LinkLate,
     LinkLost,
@@ -205,6 +206,15 @@ def test_stopped_clock_is_reported_at_the_next_answer() -> None:
     assert kinds(events) == [TimesyncOutlier, MappingStepped, ClockJump]
     assert events[1].by_ns == -events[2].by_ns == pytest.approx(4 * SECOND, abs=SECOND // 10)
     assert abs(session.clock.offset(17 * SECOND) + 4996 * SECOND) <= 10 * MS
+
+
+def test_fast_clock_is_reported_once() -> None:
+    session, peer = Session(rates_hz={"LOCAL_POSITION_NED": 10}), Autopilot(booted=-5000 * SECOND)
+    events = run(session, peer, 0, 3)
+    for second in range(3, 40):
+        peer.booted -= 2 * SECOND  # three times as fast
+        events += run(session, peer, second * SECOND, 1)
+    assert [e.rate for e in events if isinstance(e, ClockRate)] == [3.0]
 
 
 @pytest.mark.parametrize("by_ms", [0, 50, 300, 700])

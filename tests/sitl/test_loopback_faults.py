@@ -290,3 +290,39 @@ def test_simulator_that_stands_still_leaves_a_healthy_gnss_beyond_doubt(
             assert math.hypot(north, east) <= 3.0 * stated_accuracy(s), s
             late += 1
     assert late > 500
+
+
+class SpedUp:
+    """A simulated autopilot whose world and clock run `rate` times as fast as ours."""
+
+    def __init__(self, autopilot: SimulatedAutopilot, rate: float) -> None:
+        self.autopilot, self.rate = autopilot, rate
+        self.end_ns = START_NS + round((autopilot.end_ns - START_NS) / rate)
+
+    def world_ns(self, now_ns: int) -> int:
+        return START_NS + int((now_ns - START_NS) * self.rate)
+
+    def poll(self, now_ns: int) -> list[bytes]:
+        return self.autopilot.poll(self.world_ns(now_ns))
+
+    def receive(self, data: bytes, now_ns: int) -> None:
+        self.autopilot.receive(data, self.world_ns(now_ns))
+
+    def deadline(self) -> int:
+        return START_NS + math.ceil((self.autopilot.deadline() - START_NS) / self.rate) + 1
+
+
+def test_nothing_of_a_simulation_that_is_sped_up_is_used_and_that_is_reported() -> None:
+    """Its velocities fit no clock of ours: with them a healthy GNSS was excluded after 8 s."""
+    config = simulator_config(load(environment={}), own_ins=False)
+    scenario = simulated_for(Scenario("fast", PLAN, beacons=BEACONS), config)
+    log = Everything(None)
+    fast = SpedUp(SimulatedAutopilot(scenario, START_NS), 3.0)
+    fly_connected(fast, CompanionCore(config, log, (LINK,)), START_NS)
+    events = [r for r in log.records if isinstance(r, Event)]
+    (at,) = (e.t_ns for e in events if "runs 3 times as fast as ours: nothing of it is used" in e.text)
+    assert at < START_NS + 8 * SECOND_NS
+    later = [e.text for e in events if e.t_ns > at]
+    assert later == ["no solution for 2 s: no data from the inertial channel"]
+    assert not [r for r in log.records if isinstance(r, Solution) and r.t_ns > at + 2 * SECOND_NS]
+    assert not [e for e in events if "excluded" in e.text or "source set 2" in e.text]
