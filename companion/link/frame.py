@@ -158,7 +158,9 @@ class Reader:
     """Frame reader of one byte stream, which may be split anywhere; counts frames by sender."""
 
     def __init__(self, counting: bool = True) -> None:
-        """`counting`: count every frame; if False, the caller calls `count` for each accepted frame."""
+        """`counting`: count every frame; if False, the caller calls `count` for each accepted frame, and
+        `skip` for each unknown one, in their order.
+        """
         self._counting = counting
         self._waiting = b""
         self._run = 0
@@ -206,7 +208,7 @@ class Reader:
         sender[0] = sequence + 1 & 0xFF
         sender[1] += 1
 
-    def _pass(self, frame: UnknownFrame) -> None:
+    def skip(self, frame: UnknownFrame) -> None:
         """Expect the sequence number after `frame`, if its own was expected; it may be noise."""
         sender = self._senders.get((frame.system, frame.component))
         if sender is not None and sender[0] == frame.sequence:
@@ -226,7 +228,8 @@ class Reader:
                 at += len(found.raw)
             elif isinstance(found, UnknownFrame):
                 self._end_run(events)
-                self._pass(found)
+                if self._counting:
+                    self.skip(found)
                 events.append(found)
                 at += found.size
             elif found is not None or ended:

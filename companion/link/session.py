@@ -367,6 +367,8 @@ class Session:
             if isinstance(found, Frame):
                 is_accepted |= self._on_frame(found, peer, now, events)
             else:
+                if isinstance(found, UnknownFrame):
+                    self.reader.skip(found)
                 events.append(NotUnderstood(now, found))
         return is_accepted
 

@@ -333,6 +333,21 @@ def test_ground_stations_and_peripherals_are_received_but_not_as_autopilots() ->
     assert session.autopilot is None
 
 
+@pytest.mark.parametrize("peer", [None, ("10.0.0.1", 14550)])
+@pytest.mark.parametrize("at_once", [1, 2, 9])
+def test_unknown_messages_are_not_lost_frames(at_once: int, peer: tuple[str, int] | None) -> None:
+    """Every second frame is of an unknown message; several come in one datagram."""
+    session, plane, frames = Session(), Autopilot(), list[bytes]()
+    for _ in range(9):
+        frames.append(plane.heartbeat())
+        plane.sequence += 1
+        frames.append(bytes((0xFD, 2, 0, 0, plane.sequence, 7, 1, 0x30, 0xE6, 2)) + b"ab\x12\x34")
+    frames.append(plane.heartbeat())
+    for k in range(0, len(frames), at_once):
+        session.receive(b"".join(frames[k : k + at_once]), k, peer)
+    assert session.reader.counts == {(7, 1): frame.Counts(received=10, lost=0)}
+
+
 def test_own_frames_sent_back_are_ignored() -> None:
     session = Session()
     session.poll(0)
