@@ -1,4 +1,4 @@
-"""Autopilot output of one link: solutions in, messages to its estimator out. No I/O.
+"""Autopilot output: solutions in, messages to its estimator out, by whichever link leads. No I/O.
 
 Joins the gate, the encoders and the two commands with rules of their own (`position_reset`, `source_switch`).
 Records from the autopilot are used for these rules only, never for a position: positions come from solutions;
@@ -55,7 +55,7 @@ def _source_switch(config: Config) -> SourceSwitch:
 
 
 class AutopilotOutput:
-    """Messages to one link's autopilot, by the last ones sent and by the state of its GPS and its time."""
+    """Messages to the autopilot, by the last ones sent and by the state of its GPS and its time."""
 
     def __init__(self, config: Config) -> None:
         self.config = config

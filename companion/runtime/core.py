@@ -9,7 +9,8 @@
 The asyncio service and the virtual-time loopback drive the same object. It holds no navigation state. It
 decides which senders are accepted (one autopilot, any beacon receiver), what is logged and when a solution is
 sent. If several links receive the autopilot, the first one in configuration order leads: frames from the
-other links are only logged, and position messages are sent on the leading link only.
+other links are only logged, and position messages are sent on the leading link only. What is known of the
+autopilot and of what it was sent is the same whichever link leads.
 """
 
 from __future__ import annotations
@@ -125,7 +126,7 @@ HANDLED = (
 
 
 class Link:
-    """One link: its session, decoder state, autopilot output and counters."""
+    """One link: its session, decoder state and counters."""
 
     def __init__(self, name: str, config: Config, number: int, signing: Signing | None) -> None:
         self.name = name
@@ -137,7 +138,6 @@ class Link:
             link_id=number,
         )
         self.sender = Sender(self.session.clock)
-        self.output = AutopilotOutput(config)
         self.pace = Pace()  # of what was asked for on this link
         self.parameter_check = ParameterCheck()
         self.has_bytes = False  # anything was received, MAVLink or not
@@ -217,6 +217,7 @@ class CompanionCore:
         self._log = log
         self._navigator = Navigator(config)
         self.links = {name: Link(name, config, number, signing) for number, name in enumerate(links)}
+        self._output = AutopilotOutput(config)
         self._services = GroundStationServices(config, {STATUS: self._latest_status}, save, base)
         self._solution: Solution | None = None
         self._events: list[Event] = []
@@ -364,20 +365,16 @@ class CompanionCore:
                 text = f"{link.name}: autopilot {event.system} silent for {silence_s:.0f} s"
                 self.report(Severity.WARNING, text + self._leading_link_note(link), now_ns)
             elif isinstance(event, AutopilotReleased):
-                link.output.handle_reboot()
                 by = "no other one yet" if event.by is None else f"autopilot {event.by} is used"
                 text = f"{link.name}: autopilot {event.system} released: no navigation messages; {by}"
                 self.report(Severity.WARNING, text, now_ns)
                 if link is self._last_used:
-                    self._origin.forget()
-                    self._on_record(Reboot(now_ns, now_ns, event.system))
+                    self._restart(event.system, now_ns)
             elif isinstance(event, Rebooted):
-                self._origin.forget()
                 link.firmware, link.firmware_requests = None, 0  # a reboot may follow an update
-                link.output.handle_reboot()
                 link.parameter_check.start(self._config, event.system, link.session.autopilot_type)
                 self.report(Severity.WARNING, f"{link.name}: autopilot {event.system} rebooted", now_ns)
-                self._on_record(Reboot(now_ns, now_ns, event.system))
+                self._restart(event.system, now_ns)
             elif isinstance(event, ClockJump):
                 if link.session.clock.rate == 1.0:
                     jump_s = event.by_ns / SECOND_NS
@@ -414,6 +411,12 @@ class CompanionCore:
                 )
                 self.report(Severity.WARNING, text, now_ns)
 
+    def _restart(self, system: int, now_ns: int) -> None:
+        """Restart with an autopilot of which nothing is known: it rebooted, or is another one."""
+        self._origin.forget()
+        self._output.handle_reboot()
+        self._on_record(Reboot(now_ns, now_ns, system))
+
     def _on_message(self, link: Link, event: MessageReceived) -> None:
         msgid, is_used = event.frame.msgid, event.from_autopilot
         if msgid in MEASUREMENTS:
@@ -436,38 +439,38 @@ class CompanionCore:
                     self.report(Severity.NOTICE, text, event.received_ns)
             if changes:
                 config = self._config = changes[-1].config
+                self._output.tune(config)
                 for each in self.links.values():
-                    each.output.tune(config)
                     each.session.set_rates(requested_rates(config), event.received_ns)
                 self._on_record(Tuning(event.received_ns, event.received_ns, to_toml(config)))
-        if msgid in ABOUT_SOURCE_SET:
+        is_duplicate = self._is_duplicate(link)
+        if msgid in ABOUT_SOURCE_SET and link.session.is_up and not (event.from_autopilot and is_duplicate):
             system = link.session.autopilot or 0
-            link.output.handle_message(event.message, event.from_autopilot, system, event.received_ns)
-            self._emit_output_events(link)
+            self._output.handle_message(event.message, event.from_autopilot, system, event.received_ns)
+            self._emit_output_events()
         if not is_used:
             return
-        ours = (0, self._config.link.component_id)  # 0: the sender states no target
-        if msgid == mavlink.MAVLINK_MSG_ID_COMMAND_ACK and event.message.target_component in ours:
-            link.output.handle_acknowledgement(event.message.command, event.message.result, event.received_ns)
-            self._emit_output_events(link)
         if msgid == mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION:
             link.firmware = firmware_of(event.message)
         if msgid in PARAMETERS:
             link.parameter_check.receive(event.message, event.frame)
+        if is_duplicate:
+            return
+        ours = (0, self._config.link.component_id)  # 0: the sender states no target
+        if msgid == mavlink.MAVLINK_MSG_ID_COMMAND_ACK and event.message.target_component in ours:
+            command, result = event.message.command, event.message.result
+            self._output.handle_acknowledgement(command, result, event.received_ns)
+            self._emit_output_events()
         if msgid not in DECODED or link.repeats_attitude(msgid, event.received_ns):
             return
-        is_duplicate = self._is_duplicate(link)
         for record in decode(event.message, event.received_ns, link.sender):
-            if not isinstance(record, RsbnFix):
-                link.output.receive(record)
-            elif not is_duplicate:
-                for each in self.links.values():
-                    each.output.receive(record)
-            if not is_duplicate and link.session.clock.rate <= 1.0:
-                self._last_used = link if event.from_autopilot else self._last_used
-                is_rejected = self._on_record(record)
-                if is_rejected and msgid in MEASUREMENTS:
-                    self._answers.note_rejected(_receiver_of(event), event.received_ns)
+            self._output.receive(record)
+            if link.session.clock.rate > 1.0:
+                continue
+            self._last_used = link if event.from_autopilot else self._last_used
+            is_rejected = self._on_record(record)
+            if is_rejected and msgid in MEASUREMENTS:
+                self._answers.note_rejected(_receiver_of(event), event.received_ns)
 
     def _is_duplicate(self, link: Link) -> bool:
         """Whether the leading link receives the same messages."""
@@ -544,7 +547,7 @@ class CompanionCore:
         due = self._pace.due(periods, solution.t_ns, periods.keys() - {RESET} if early else ())
         fed, leading = dict[str, Any](), self.leading_link
         if due and leading is not None:
-            for message in leading.output.messages(solution, due, self._receiver(leading)):
+            for message in self._output.messages(solution, due, self._receiver(leading)):
                 leading.session.send(message)
                 fed[message.get_type()] = message
             self._steer(leading, solution.rx_ns)
@@ -567,13 +570,13 @@ class CompanionCore:
 
     def _steer(self, link: Link, now_ns: int) -> None:
         """Request the EKF source set that must lead, with or without a solution."""
-        for message in link.output.poll(link.session.autopilot or 0, now_ns):
+        for message in self._output.poll(link.session.autopilot or 0, now_ns):
             link.session.send(message)
-        self._emit_output_events(link)
+        self._emit_output_events()
 
-    def _emit_output_events(self, link: Link) -> None:
+    def _emit_output_events(self) -> None:
         """Log and report the events of the autopilot output."""
-        for event in link.output.take_events():
+        for event in self._output.take_events():
             self._emit(event, "/link/Event")
 
     def _receiver(self, link: Link) -> Receiver:
@@ -583,7 +586,7 @@ class CompanionCore:
             origin=self._origin.origin,
             origin_resets=self._origin.resets,
             sensor_id=self._config.output.global_position_sensor_id,
-            unix_ns=link.output.unix_ns,
+            unix_ns=self._output.unix_ns,
             firmware=link.firmware,
             rejected=self.rejected.total(),
         )

@@ -68,16 +68,20 @@ class EventLog:
 
 
 class Flight:
-    """Flight with heading north in a west wind; `falsify` changes the messages of the autopilot."""
+    """Flight with heading north in a west wind; `falsify` changes the messages of the autopilot.
+
+    It sends on all of `links`; one that is taken out is cut.
+    """
 
     def __init__(
         self,
         config: Config,
         autopilot: int = 3,
         falsify: Callable[[str, dict[str, Any]], None] = lambda name, values: None,
+        links: tuple[str, ...] = ("main",),
     ) -> None:
-        self.log = EventLog()
-        self.core, self.falsify, self.autopilot = CompanionCore(config, self.log), falsify, autopilot
+        self.log, self.links = EventLog(), links
+        self.core, self.falsify, self.autopilot = CompanionCore(config, self.log, links), falsify, autopilot
         self.now, self.ticks = START, 0
         self.gnss = self.rsbn = True
         self.source_set, self.answers = 1, True
@@ -85,15 +89,17 @@ class Flight:
         self.payloads: list[Frame] = []
         self._sequence, self._reader = 0, frame.Reader()
 
-    def send(self, name: str, **values: Any) -> None:
+    def send(self, name: str, /, **values: Any) -> None:
         self.falsify(name, values)
         self._sequence = self._sequence + 1 & 0xFF
         data = frame.encode(dialect.new(name, **values), self._sequence, 1, 1)
-        self.core.receive("main", data, self.now)
+        for link in self.links:
+            self.core.receive(link, data, self.now)
         self.collect()
 
     def collect(self) -> None:
-        for data in self.core.to_send("main", self.now):
+        frames = {link: self.core.to_send(link, self.now) for link in self.core.links}
+        for data in (each for link in self.links for each in frames[link]):
             for found in self._reader.receive(data):
                 assert isinstance(found, frame.Frame)
                 message = dialect.decode(found)
@@ -348,6 +354,32 @@ def test_ardupilot_source_set_follows_gnss() -> None:
         "EKF source set 1: GNSS has a fix",
         "EKF source set 2: GNSS is lost, using companion",
         "EKF source set 1: GNSS has a fix",
+    ]
+
+
+def test_source_set_is_known_whichever_link_leads() -> None:
+    """Each link had a switch of its own: the first one, back again, took set 2 to lead, where set 1 did."""
+
+    def report(flight: Flight) -> None:  # of the script in deploy/ardupilot
+        flight.send("NAMED_VALUE_FLOAT", name="EKFSRC", value=float(flight.source_set))
+
+    flight = Flight(configured("output.profile=ardupilot"), links=("main", "radio"))
+    for links, gnss, leading in (
+        (("main", "radio"), True, 1),
+        (("main", "radio"), False, 2),
+        (("radio",), False, 2),
+        (("radio",), True, 1),
+        (("main", "radio"), False, 2),
+        (("main", "radio"), True, 1),
+    ):
+        flight.links, flight.gnss = links, gnss
+        for _ in range(15):
+            flight.fly(1.0)
+            report(flight)
+        assert flight.source_set == leading, (links, gnss)
+    assert [t for t in flight.texts if "source set" in t] == [
+        "EKF source set 1: GNSS has a fix",
+        *("EKF source set 2: GNSS is lost, using companion", "EKF source set 1: GNSS has a fix") * 2,
     ]
 
 
