@@ -26,6 +26,7 @@ from companion.config.profiles import MESSAGES, RESET
 from companion.config.validate import find_conflicts
 from companion.link import dialect
 from companion.link.beacon_answers import BeaconAnswers
+from companion.link.clock import MAX_LATENESS
 from companion.link.decode import DECODED, MAKES, Sender, decode
 from companion.link.dialect import MEASUREMENTS, mavlink
 from companion.link.firmware import Firmware, firmware_of
@@ -224,6 +225,7 @@ class CompanionCore:
         self.rejected: Counter[str] = Counter()
         self._origin = OriginCheck(has_pairs=not config.has_own_ins)
         self._last_used: Link | None = None  # whose autopilot's records were used last
+        self._booted_ns, self._reboot_seen_on = 0, set[str]()  # the last reboot
         self._pace = Pace(at_least=frozenset({RESET}))
         self._answers = BeaconAnswers()
         self._unused_log = RateLimiter(UNUSED_LOG_HZ, UNUSED_LOG_BURST)
@@ -373,8 +375,9 @@ class CompanionCore:
             elif isinstance(event, Rebooted):
                 link.firmware, link.firmware_requests = None, 0  # a reboot may follow an update
                 link.parameter_check.start(self._config, event.system, link.session.autopilot_type)
-                self.report(Severity.WARNING, f"{link.name}: autopilot {event.system} rebooted", now_ns)
-                self._restart(event.system, now_ns)
+                if self._is_new_reboot(link, now_ns):
+                    self.report(Severity.WARNING, f"{link.name}: autopilot {event.system} rebooted", now_ns)
+                    self._restart(event.system, now_ns)
             elif isinstance(event, ClockJump):
                 if link.session.clock.rate == 1.0:
                     jump_s = event.by_ns / SECOND_NS
@@ -410,6 +413,14 @@ class CompanionCore:
                     f"{link.name}: second autopilot {event.system}{same} ignored; connected to {event.kept}"
                 )
                 self.report(Severity.WARNING, text, now_ns)
+
+    def _is_new_reboot(self, link: Link, now_ns: int) -> bool:
+        """Note the autopilot's reboot as seen on `link`; return whether another link has not reported it."""
+        booted_ns = link.session.clock.offset(now_ns) or now_ns
+        if abs(booted_ns - self._booted_ns) > MAX_LATENESS or link.name in self._reboot_seen_on:
+            self._booted_ns, self._reboot_seen_on = booted_ns, set()
+        self._reboot_seen_on.add(link.name)
+        return len(self._reboot_seen_on) == 1
 
     def _restart(self, system: int, now_ns: int) -> None:
         """Restart with an autopilot of which nothing is known: it rebooted, or is another one."""

@@ -286,6 +286,20 @@ def test_second_link_leads_while_the_first_is_silent() -> None:
     assert not flight.log.of(Reset)
 
 
+@pytest.mark.parametrize("late", [0, 2 * SECOND])
+def test_reboot_seen_on_two_links_is_one(late: int) -> None:
+    flight = TwoLinks(late)
+    for reboots in (1, 2):
+        flight.fly(8.0)
+        flight.boot = flight.now - SECOND
+        flight.fly(8.0)
+        assert len(flight.log.of(Reboot)) == len(flight.log.of(Reset)) == reboots
+        assert sum("rebooted" in text for text in event_texts(flight)) == reboots
+    flight.cut, flight.boot = True, flight.now - SECOND  # seen on the second link only
+    flight.fly(20.0)
+    assert len(flight.log.of(Reboot)) == 3
+
+
 def test_another_aircraft_on_a_second_link_is_reported_and_ignored() -> None:
     alone, disturbed = Flight(), Flight("main", "radio")
     alone.fly(6.0)
