@@ -62,12 +62,17 @@ class OutputMethod(NamedTuple):
 
 
 class Profile(NamedTuple):
-    """Output methods of one make of autopilot, the best first, and limits of its failsafe."""
+    """Output methods of one make of autopilot, the best first, and limits of its failsafe.
+
+    `switched` has the messages beside which its sources are switched, as it fuses them in the place of GNSS.
+    """
 
     methods: Mapping[Via, OutputMethod]
     failsafe: tuple[FailsafeLimit, ...] = ()
+    switched: frozenset[str] = frozenset()
 
 
+_EXTERNAL = frozenset({MESSAGES["odometry"], MESSAGES["vision"]})
 _EXTERNAL_NAVIGATION = (
     RequiredParameter("VISO_TYPE", 1, "accept external navigation positions over MAVLink", reboot=True),
     RequiredParameter("EK3_SRC2_POSXY", 6, "source set 2: horizontal position from external navigation"),
@@ -105,7 +110,8 @@ PROFILES: Mapping[Name, Profile] = {
             "vision": OutputMethod(10.0, _EXTERNAL_NAVIGATION),
             "gps_input": OutputMethod(10.0, _SECOND_RECEIVER),  # below 5 Hz it cannot arm
             "external_position": OutputMethod(1.0),
-        }
+        },
+        switched=_EXTERNAL,
     ),
     "px4": Profile(
         {
@@ -115,6 +121,7 @@ PROFILES: Mapping[Name, Profile] = {
             "external_position": OutputMethod(0.5),
         },
         _PX4_FAILSAFE,
+        _EXTERNAL | {MESSAGES["global_position_sensor"]},
     ),
     "custom": Profile({}),
 }

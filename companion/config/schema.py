@@ -248,7 +248,12 @@ class OutputConfig(Section, frozen=True):
     @property
     def switches_sources(self) -> bool:
         """Whether the companion selects the autopilot's EKF source set, or switches PX4's GNSS fusion."""
-        return self.switch_sources and self.profile in ("ardupilot", "px4")
+        switched = PROFILES[self.profile].switched
+        return self.switch_sources and any(self.rates_hz[name] > 0.0 for name in switched)
+
+    def fits(self, make: str) -> bool:
+        """Whether the profile is for this make of autopilot."""
+        return self.profile in ("monitor", "custom", make)
 
     @property
     def pace_hz(self) -> float:

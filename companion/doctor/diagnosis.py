@@ -80,11 +80,10 @@ class Diagnosis(NamedTuple):
 
 def check_profile(config: Config, make: str) -> list[Finding]:
     """Report an output profile of another make of autopilot."""
-    profile = config.output.profile
-    if profile in ("monitor", "custom", make):
+    if config.output.fits(make):
         return []
     advice = f"set output.profile = '{make if make in PROFILES else 'monitor'}'"
-    return [Finding("output profile", profile, make, False, advice)]
+    return [Finding("output profile", config.output.profile, make, False, advice)]
 
 
 def check_airspeed(config: Config, healthy: bool | None, multirotor: bool = False) -> list[Finding]:

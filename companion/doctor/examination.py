@@ -215,7 +215,7 @@ class Examination:
         capabilities = None if self._version is None else self._version.capabilities
         encoding = encoding_of(capabilities, self._heartbeat.autopilot)
         self._client = ParameterClient(self.session.autopilot or 0, mavlink.MAV_COMP_ID_AUTOPILOT1, encoding)
-        if self._is_profile_applicable:
+        if self._config.output.fits(self.make):
             self._needed = required_parameters(self._config, self.make)
             self._limits = failsafe_limits(self._config, self.make, self._heartbeat.type in MULTIROTORS)
             self._client.read(p.name for p in self._needed)
@@ -236,10 +236,6 @@ class Examination:
         )
 
     # -- findings -------------------------------------------------------------------------------------------
-
-    @property
-    def _is_profile_applicable(self) -> bool:
-        return not check_profile(self._config, self.make)
 
     def _identity(self) -> Identity:
         kind = mavlink.enums["MAV_TYPE"].get(self._heartbeat.type)

@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Collection
 
 from companion.config import Config
-from companion.config.profiles import MESSAGES, RESET
+from companion.config.profiles import MESSAGES, PROFILES, RESET
 from companion.link.dialect import Message, mavlink
 from companion.navigator.receiver_choice import ReceiverChoice
 from companion.output.encode import CannotEncode, Receiver, encode
@@ -41,8 +41,6 @@ from companion.records import (
 DISPLAY_NAMES = {RESET: "external position"}
 NOT_FUSED = frozenset({RESET, MESSAGES["gps_input"]})
 """A reset is no series of measurements; a receiver's accuracy is judged by limits of its own."""
-ON_SOURCE_SET_2 = frozenset({MESSAGES["odometry"], MESSAGES["vision"]})
-FUSED_BY_PX4 = ON_SOURCE_SET_2 | {MESSAGES["global_position_sensor"]}
 
 
 def _gate(config: Config) -> Gate:
@@ -126,17 +124,17 @@ class AutopilotOutput:
                     if reason is None:
                         encoded[name] = message
             self._add_event(self._monitor.update(DISPLAY_NAMES.get(name, name), reason, now))
-        led_by = FUSED_BY_PX4 if self.config.output.profile == "px4" else ON_SOURCE_SET_2
-        if by_set := led_by.intersection(names):
+        if by_set := PROFILES[self.config.output.profile].switched.intersection(names):
             self._source_switch.note_output(solution, not by_set.isdisjoint(encoded), now)
         return list(encoded.values())
 
-    def poll(self, system: int, now_ns: int) -> list[Message]:
+    def poll(self, receiver: Receiver, now_ns: int) -> list[Message]:
         """Return the commands that are due; call it once a second and after every solution."""
-        if not self.config.output.switches_sources:
+        output = self.config.output
+        if not output.switches_sources or not output.fits(receiver.autopilot):
             return []
         self._source_switch.update(now_ns)
-        return self._source_switch.to_send(system, now_ns)
+        return self._source_switch.to_send(receiver.system, now_ns)
 
     def take_events(self) -> list[Event]:
         """Return the events since the last call."""
@@ -159,9 +157,9 @@ class AutopilotOutput:
         return distance(own[:2], (position.lat, position.lon)) > SIGMAS * position.sigma
 
     def _withholding_reason(self, position: Position, name: str, receiver: Receiver) -> str | None:
-        profile = self.config.output.profile
-        if profile not in ("custom", receiver.autopilot):
-            return f"the autopilot is not {profile}: set output.profile"
+        output = self.config.output
+        if not output.fits(receiver.autopilot):
+            return f"the autopilot is not {output.profile}: set output.profile"
         return self._position_reset.withholding_reason(position) if name == RESET else None
 
     def _add_event(self, event: Event | None) -> None:

@@ -581,7 +581,7 @@ class CompanionCore:
 
     def _steer(self, link: Link, now_ns: int) -> None:
         """Request the EKF source set that must lead, with or without a solution."""
-        for message in self._output.poll(link.session.autopilot or 0, now_ns):
+        for message in self._output.poll(self._receiver(link), now_ns):
             link.session.send(message)
         self._emit_output_events()
 

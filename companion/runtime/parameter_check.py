@@ -29,7 +29,7 @@ class ParameterCheck:
         """Start reading the parameters; `make` is MAV_AUTOPILOT."""
         self._client = None  # of the make before
         self._needed, self._answers = required_parameters(config, MAKES.get(make)), {}
-        if config.output.profile in ("custom", MAKES.get(make)) and self._needed:
+        if config.output.fits(MAKES.get(make, "other")) and self._needed:
             self._client = ParameterClient(system, mavlink.MAV_COMP_ID_AUTOPILOT1, encoding_of(None, make))
             self._client.read(need.name for need in self._needed)
 

@@ -322,11 +322,13 @@ def test_ground_station_can_lower_the_output_rate() -> None:
     assert len(flight.sent_messages("ODOMETRY", start)) == pytest.approx(50, abs=5)
 
 
-def test_autopilot_of_another_make_receives_no_position() -> None:
-    flight = Flight(configured("output.profile=px4"), autopilot=3)
+@pytest.mark.parametrize(("profile", "autopilot"), [("px4", 3), ("ardupilot", 12)])
+def test_autopilot_of_another_make_receives_no_position_and_no_command(profile: str, autopilot: int) -> None:
+    flight = Flight(configured(f"output.profile={profile}"), autopilot)
     flight.fly(10.0)
     assert flight.position_payloads() == []
-    assert sum("the autopilot is not px4" in text for text in flight.texts) == 1
+    assert not {42007, ESTIMATOR_SENSOR_ENABLE} & {m.command for m in flight.sent_messages("COMMAND_LONG")}
+    assert sum(f"the autopilot is not {profile}" in text for text in flight.texts) == 1
 
 
 def test_ardupilot_source_set_follows_gnss() -> None:
@@ -390,6 +392,14 @@ def test_source_switch_can_be_disabled() -> None:
     flight.fly(15.0)
     assert not [m for m in flight.sent_messages("COMMAND_LONG") if m.command == 42007]
     assert flight.sent_messages("ODOMETRY")
+
+
+@pytest.mark.parametrize("via", ["gps_input", "external_position"])
+def test_source_set_is_the_pilots_where_none_carries_our_position(via: str) -> None:
+    flight = Flight(configured("output.profile=ardupilot", f"output.via={via}"))
+    flight.source_set = 3
+    flight.fly(10.0)
+    assert flight.source_set == 3
 
 
 def test_beacon_before_the_first_gnss_fix() -> None:
@@ -564,7 +574,7 @@ def test_px4_drawn_off_by_a_false_gnss_receives_sigma_as_it_is(
     found = Situation(1e3, -1.0, 0.1, gnss_false=0.9999, witness=is_off, sent_s=1e3, stopped_s=0.0)
     monkeypatch.setattr(GnssFusion, "situation", lambda self, now_ns: found)
     output, receiver = AutopilotOutput(configured("output.profile=px4")), Receiver("px4", 1)
-    assert len(output.poll(1, START)) == is_off
+    assert len(output.poll(receiver, START)) == is_off
     output.handle_acknowledgement(ESTIMATOR_SENSOR_ENABLE, 0, START)
     solution = at(1.0, covariance=(400.0, 0.0, 0.0, 400.0, 0.0, 25.0))
     drawn = displace(solution.lat, solution.lon, solution.alt_msl, 0.0, drawn_m, 0.0)
@@ -576,10 +586,10 @@ def test_px4_drawn_off_by_a_false_gnss_receives_sigma_as_it_is(
 def test_gnss_fusion_of_px4_is_switched_off_only_while_armed(monkeypatch: pytest.MonkeyPatch) -> None:
     found = Situation(1e3, -1.0, 0.1, gnss_false=0.9999, witness=True, sent_s=1e3, stopped_s=0.0)
     monkeypatch.setattr(GnssFusion, "situation", lambda self, now_ns: found)
-    output = AutopilotOutput(configured("output.profile=px4"))
+    output, receiver = AutopilotOutput(configured("output.profile=px4")), Receiver("px4", 1)
     for k, (base_mode, enabled) in enumerate(((0, [1.0]), (128, [0.0]), (0, [1.0]))):
         output.handle_message(dialect.new("HEARTBEAT", base_mode=base_mode), True, 1, START)
-        assert [m.param3 for m in output.poll(1, START + k * SECOND)] == enabled
+        assert [m.param3 for m in output.poll(receiver, START + k * SECOND)] == enabled
         output.handle_acknowledgement(ESTIMATOR_SENSOR_ENABLE, 0, START + k * SECOND)
 
 
