@@ -367,6 +367,7 @@ class CompanionCore:
                 text = f"{link.name}: autopilot {event.system} silent for {silence_s:.0f} s"
                 self.report(Severity.WARNING, text + self._leading_link_note(link), now_ns)
             elif isinstance(event, AutopilotReleased):
+                link.firmware, link.firmware_requests = None, 0
                 by = "no other one yet" if event.by is None else f"autopilot {event.by} is used"
                 text = f"{link.name}: autopilot {event.system} released: no navigation messages; {by}"
                 self.report(Severity.WARNING, text, now_ns)

@@ -432,6 +432,23 @@ def test_navigation_restarts_after_a_reboot() -> None:
     assert any(at > flight.now - SECOND for at in flight.times_sent("ODOMETRY"))
 
 
+def test_version_of_another_autopilot_is_requested_again() -> None:
+    """ArduPilot's version decides how it reads the accuracy of ODOMETRY."""
+    flight = Flight()
+    flight.fly(3.0)
+    flight.send("AUTOPILOT_VERSION", flight_sw_version=4 << 24 | 6 << 16)
+    for k in range(1000):  # a hundred seconds of another aircraft only
+        flight.now += 100 * MS
+        if k % 10 == 0:
+            flight.send("HEARTBEAT", system=2, type=1, autopilot=3)
+        flight.send("ATTITUDE", system=2, time_boot_ms=(flight.now - flight.boot) // MS, yaw=1.0)
+        flight.core.poll(flight.now)
+        flight.collect()
+    asked = [m for _, m in flight.sent if m.get_type() == "COMMAND_LONG" and m.param1 == 148]
+    assert flight.core.links["main"].session.autopilot == 2
+    assert {m.target_system for m in asked} == {1, 2}
+
+
 def test_lost_and_regained_autopilot_is_reported() -> None:
     flight = Flight()
     flight.fly(2.0)
