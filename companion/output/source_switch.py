@@ -4,7 +4,8 @@ ArduPilot accepts a source set that has no data, and is then lost; and a compani
 off a healthy GNSS does harm. So set 2 (our position) is requested only while our position goes out, and
 only if the receiver itself has no fix, or GNSS is false by the posterior and a beacon contradicts it: never
 because innovations were rejected. Set 1 (GNSS) is requested whenever the receiver has a fix that is not
-held false, also when there is no solution. The command is repeated until it is acknowledged.
+held false, also when there is no solution. The command is repeated until it is acknowledged, as long as the
+table requires it.
 
 A set that somebody else selected (the pilot's switch, a ground station) is left as it is: no set is requested
 until a person selects the one that the table requires at that time, or the autopilot reboots.
@@ -260,6 +261,8 @@ class SourceSwitch:
         """Decide by the table; call it at least once a second, with or without solutions."""
         decision = self.required(self.situation(now_ns))
         if decision is None:
+            if self._next_ns is not None:  # stop requesting it; whether it was accepted is not known
+                self._wanted = self._next_ns = None
             return
         is_new = decision[0] != self._required
         self._required, self._reason = decision

@@ -369,6 +369,25 @@ def test_command_is_repeated_until_acknowledged() -> None:
     assert flight.reports[-1][1].startswith("EKF source set 2")
 
 
+@pytest.mark.parametrize(
+    ("then", "sets"),
+    [({"fix": True}, [2, 2, 1]), ({"fix": False, "sent": False}, [2, 2])],
+    ids=["GNSS is back", "our position is withheld"],
+)
+def test_command_is_not_repeated_once_it_is_not_required(then: dict[str, Any], sets: list[int]) -> None:
+    """ArduPilot accepts set 2 without a position too; an acknowledgement may have been lost."""
+    flight = Flight()
+    flight.fly(30.0)
+    flight.answer = None
+    flight.fly(3.5, fix=False)
+    flight.fly(5.5, **then)
+    assert flight.sets == [1, *sets]
+    flight.answer = ACCEPTED
+    flight.fly(5.0, fix=False)
+    flight.fly(20.0, fix=False)
+    assert flight.sets[-1] == 2 and flight.switch.is_on_companion
+
+
 def test_rejected_command_is_reported_once() -> None:
     for answer, expected in ((None, "10 tries"), (FAILED, "10 tries"), (DENIED, "2"), (UNSUPPORTED, "3")):
         flight = Flight(answer)
