@@ -17,6 +17,7 @@ that another station has slowed down: the message is requested before the silenc
 from __future__ import annotations
 
 import re
+from collections import deque
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -38,6 +39,7 @@ MAX_GAP_NS = SECOND_NS  # a longer gap interrupts
 RETRY_NS = SECOND_NS
 MAX_TRIES = 10
 AGAIN_NS = 30 * SECOND_NS  # after so many tries without an answer: the link may have been lost
+ANSWER_NS = 5 * SECOND_NS  # a command is answered within this time, or never
 ASKED_NS = SECOND_NS  # after this silence of the receiver, and so often, its message is requested
 ASKED_UNTIL_NS = 10 * SECOND_NS
 REPORTS = 2
@@ -197,6 +199,7 @@ class SourceSwitch:
         self._reason = ""
         self._tries = 0
         self._next_ns: int | None = None  # None: nothing to request
+        self._sent_sets = deque[tuple[int, int | None]]()  # when sent, of which set
         self._unanswered_ns: int | None = None  # when the last of MAX_TRIES was in vain
         self._asked_ns = 0  # when the receiver's message was last requested
         self._events: list[Event] = []
@@ -297,7 +300,7 @@ class SourceSwitch:
 
     def handle_acknowledgement(self, command: int, result: int, now_ns: int) -> None:
         """Process the autopilot's COMMAND_ACK of one of our commands."""
-        if command != self.command or self._next_ns is None or not self._tries:
+        if command != self.command or self._answered(now_ns) != self._wanted or self._next_ns is None:
             return
         if result == mavlink.MAV_RESULT_ACCEPTED:
             self._leading, self._next_ns, self._unanswered_ns = self._wanted, None, None
@@ -305,6 +308,12 @@ class SourceSwitch:
         elif result not in RETRIED:
             self._unanswered_ns = None
             self._give_up(f"it answered MAV_RESULT {result}", now_ns)
+
+    def _answered(self, now_ns: int) -> int | None:
+        """Return the set that an answer is about: answers come in the order of the commands and name none."""
+        while self._sent_sets and now_ns - self._sent_sets[0][0] > ANSWER_NS:
+            self._sent_sets.popleft()
+        return self._sent_sets.popleft()[1] if self._sent_sets else None
 
     def to_send(self, system: int, now_ns: int) -> list[Message]:
         """Return the commands that are due."""
@@ -317,6 +326,7 @@ class SourceSwitch:
             self._next_ns, self._unanswered_ns = None, now_ns
             return asked
         self._next_ns = now_ns + RETRY_NS
+        self._sent_sets.append((now_ns, self._wanted))
         confirmation, self._tries = self._tries, self._tries + 1
         parameters = self.parameters(self._wanted)
         return [*asked, _command(system, self.command, confirmation=confirmation, **parameters)]

@@ -77,6 +77,31 @@ def test_on_while_disarmed() -> None:
     assert requests(switch, WELL._replace(**FALSE), 0, 10 * second) == [(43006, 0.0, 0.0, 0.0)]
 
 
+def test_late_acknowledgement_of_off_is_not_one_of_on() -> None:
+    """The answers name no state. On a slow link PX4 disarms before it has answered; our command is lost."""
+    switch, now = Switch(), 10**9
+    switch.now = WELL._replace(**FALSE)
+    sent = list[tuple[float, float]]()
+
+    def fly(tenths: int, *answered_at: int) -> None:
+        nonlocal now
+        for k in range(tenths):
+            now += 10**8
+            switch.update(now)
+            sent.extend((now * 1e-9, m.param3) for m in switch.to_send(1, now))
+            if k in answered_at:
+                switch.handle_acknowledgement(ESTIMATOR_SENSOR_ENABLE, 0, now)
+
+    fly(13)
+    switch.note_armed(False)
+    fly(10, 1, 9)  # the answers to off, twice
+    assert not switch.take_events()
+    fly(20, 4)
+    assert [event.text for event in switch.take_events()] == ["GNSS fusion on: disarmed"]
+    assert [round(t, 1) for t, enabled in sent if enabled] == [2.4, 3.4]
+    assert [round(t, 1) for t, enabled in sent if not enabled] == [1.1, 2.1]
+
+
 def test_autopilot_that_does_not_know_the_command_is_reported_once() -> None:
     switch, second = Switch(), 10**9
     assert len(requests(switch, WELL, 3, second)) == 1
