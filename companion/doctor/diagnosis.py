@@ -125,9 +125,9 @@ def check_script(config: Config, make: str, runs: bool) -> list[Finding]:
     return [Finding("source set script", "runs" if runs else absent, "", None)]
 
 
-def check_arming(make: str, failing: Set[str]) -> list[Finding]:
+def check_arming(make: str, failing: Set[str], is_answering: bool) -> list[Finding]:
     """Report the arming checks that fail, and a parameter that waits for a reboot."""
-    if make != "ardupilot":
+    if make != "ardupilot" or not is_answering:
         return []
     found = [Finding("arming checks", "; ".join(sorted(failing)) or "none fails", "", None)]
     if any(text.startswith(NOT_REBOOTED) for text in failing):
@@ -136,10 +136,15 @@ def check_arming(make: str, failing: Set[str]) -> list[Finding]:
     return found
 
 
-def check_signing(is_refused: bool) -> list[Finding]:
-    """Report an autopilot that signs and answers nothing: it drops frames that are not signed by its key."""
-    advice = "the autopilot wants signed frames: set signing.key_file to its key"
-    return [Finding("signing", "no answer to our frames", "signed", False, advice)] if is_refused else []
+def check_answers(is_answering: bool, is_signing: bool) -> list[Finding]:
+    """Report an autopilot that answers nothing; one that signs drops what is not signed by its key."""
+    if is_answering:
+        return []
+    if is_signing:
+        advice = "the autopilot wants signed frames: set signing.key_file to its key"
+        return [Finding("signing", "no answer to our frames", "signed", False, advice)]
+    advice = "no request arrives: check the line from our TX, the port's MAVLink protocol and the router"
+    return [Finding("answers", "none", "to our requests", False, advice)]
 
 
 def check_feeders(feeders: Set[str]) -> list[Finding]:
@@ -153,15 +158,15 @@ def check_feeders(feeders: Set[str]) -> list[Finding]:
 
 
 def check_streams(
-    config: Config, make: str, rates: Mapping[int, tuple[float, float | None]]
+    config: Config, make: str, rates: Mapping[int, tuple[float, float | None]], is_answering: bool
 ) -> list[Finding]:
-    """Compare requested and measured stream rates.
+    """Compare requested and measured stream rates; they are not judged where no request is answered.
 
     `rates` has both by message id, Hz; measured None is not known yet.
     """
     found = []
     for state in stream_states(config, make, rates):
-        is_well = state.is_enough or (False if state.is_used else None)
+        is_well = state.is_enough or (False if state.is_used and is_answering else None)
         advice = "" if state.is_enough else "the line is too slow, or a ground station sets other rates"
         has, needs = f"{state.measured or 0.0:.1f} Hz", f"{state.requested:g} Hz"
         found.append(Finding(state.name, has, needs, is_well, advice))

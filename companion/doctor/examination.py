@@ -23,12 +23,12 @@ from companion.doctor.diagnosis import (
     Identity,
     ParameterFinding,
     check_airspeed,
+    check_answers,
     check_arming,
     check_failsafe,
     check_feeders,
     check_profile,
     check_script,
-    check_signing,
     check_streams,
 )
 from companion.link import dialect, frame
@@ -256,12 +256,12 @@ class Examination:
         beacons = ", ".join(map(str, sorted(self._beacons)))
         return [
             *check_profile(self._config, self.make),
-            *check_streams(self._config, self.make, self.session.stream_rates.rates()),
+            *check_streams(self._config, self.make, self.session.stream_rates.rates(), self._is_answering),
             *check_airspeed(self._config, self._airspeed, self._heartbeat.type in MULTIROTORS),
             *check_failsafe(self._limits, {name: answer.value for name, answer in self._answers.items()}),
             *check_script(self._config, self.make, self._has_script),
-            *check_arming(self.make, self._arming_checks),
-            *check_signing(self._is_signing and not self._is_answering),
+            *check_arming(self.make, self._arming_checks, self._is_answering),
+            *check_answers(self._is_answering, self._is_signing),
             *check_feeders(self._feeders),
             *self._check_link(now),
             Finding("RSBN beacons", beacons or "none", "", None),

@@ -77,7 +77,7 @@ def summary(config: Config, diagnosis: Diagnosis) -> str:
     lines = []
     if there := sum(found.has is not None for found in diagnosis.wrong_parameters):
         lines.append(f"{_number(there, 'parameter')} wrong: --apply sets them, after confirmation.")
-    is_answering = all(found.what != "signing" for found in diagnosis.problems)
+    is_answering = all(found.what not in ("answers", "signing") for found in diagnosis.problems)
     if is_answering and (absent := len(diagnosis.wrong_parameters) - there):
         lines.append(
             f"{_number(absent, 'parameter')} absent: update the firmware, or use a build with this feature."

@@ -51,9 +51,9 @@ class ParameterCheck:
         ]
         if not wrong:
             return []
-        has = self._answers[wrong[0].name].value
+        _, has, trouble = self._answers[wrong[0].name]
         more = f" and {len(wrong) - 1} more" if wrong[1:] else ""
-        state = "is missing" if has is None else f"is {has:g}"
+        state = f"cannot be read ({trouble})" if has is None else f"is {has:g}"
         text = f"{wrong[0].name} {state}, needs {wrong[0].value:g}{more}: run companion doctor"
         return [Event(now_ns, now_ns, Severity.WARNING, text)]
 

@@ -262,6 +262,17 @@ def test_autopilot_that_drops_unsigned_frames_is_recognised() -> None:
     assert "absent" not in summary(bench.config, diagnosis)
 
 
+@pytest.mark.parametrize("make", ["ardupilot", "px4"])
+def test_line_that_carries_nothing_of_ours_is_recognised(make: str) -> None:
+    """Our TX is not connected: no parameter is absent, and no stream is slow by its line."""
+    bench = Bench(make)
+    bench.to_it = lambda data: b""
+    diagnosis = bench.look()
+    assert problems(diagnosis) == {"answers", "TIMESYNC"}
+    assert "check the line from our TX" in summary(bench.config, diagnosis)
+    assert "absent" not in summary(bench.config, diagnosis)
+
+
 def test_another_position_source_is_a_problem() -> None:
     bench = Bench("ardupilot")
     while bench.now < SECOND:

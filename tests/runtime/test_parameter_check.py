@@ -31,7 +31,15 @@ class NullLog:
 class Flight:
     """An autopilot and a companion connected for some seconds; the requests and the reports."""
 
-    def __init__(self, make: str, *pairs: str, right: bool = False, seconds: float = 8.0, **scenario) -> None:
+    def __init__(
+        self,
+        make: str,
+        *pairs: str,
+        right: bool = False,
+        seconds: float = 8.0,
+        is_deaf: bool = False,
+        **scenario,
+    ) -> None:
         world = WORLDS[make] if not scenario else None
         autopilot = SimulatedAutopilot(get_scenario("short", autopilot=make, **scenario), world=world)
         config = load(None, None, {}, pairs)
@@ -47,7 +55,8 @@ class Flight:
                 core.receive("main", data, now)
             core.poll(now)
             for data in core.to_send("main", now):
-                autopilot.receive(data, now)
+                if not is_deaf:
+                    autopilot.receive(data, now)
                 found = frame.parse(data)
                 assert isinstance(found, frame.Frame)
                 self.requests += [found.msgid] if found.msgid in (REQUEST_READ, SET) else []
@@ -67,6 +76,11 @@ def test_wrong_parameters_are_reported_in_one_event(make: str, line: str, custom
     rate = "odometry_hz=10" if make == "ardupilot" else "global_position_sensor_hz=2"
     pairs = ("output.profile=custom", f"output.{rate}") if custom else (f"output.profile={make}",)
     assert Flight(make, *pairs).reports == [line]
+
+
+def test_autopilot_that_answers_nothing_lacks_no_parameter() -> None:
+    (report,) = Flight("ardupilot", "output.profile=ardupilot", is_deaf=True).reports
+    assert report == "main: VISO_TYPE cannot be read (no answer), needs 1 and 5 more: run companion doctor"
 
 
 def test_correct_parameters_are_not_reported() -> None:
