@@ -69,18 +69,15 @@ class CannotEncode(Exception):
 class Receiver(NamedTuple):
     """The autopilot that receives a message, and the values that only its link knows.
 
-    `origin` is the autopilot's local origin, `origin_resets` how often it moved, `geoid` the height of mean
-    sea level above the ellipsoid (m) if a receiver reports it, `sensor_id` PX4's EKF2_AGP0_ID, `unix_ns` UTC
-    minus our clock (ns) if known, `firmware` the version if stated, `rejected` the number of rejected
-    measurements.
+    `origin` is the autopilot's local origin, `origin_resets` how often it moved, `sensor_id` PX4's
+    EKF2_AGP0_ID, `unix_ns` UTC minus our clock (ns) if known, `firmware` the version if stated, `rejected`
+    the number of rejected measurements.
     """
 
     autopilot: Autopilot
     system: int
-    component: int = 1
     origin: LocalOrigin | None = None
     origin_resets: int = 0
-    geoid: float | None = None
     sensor_id: int = 1
     unix_ns: int | None = None
     firmware: Firmware | None = None
@@ -253,13 +250,13 @@ def global_position_sensor(position: Position, receiver: Receiver) -> Message:
     return dialect.new(
         "GLOBAL_POSITION_SENSOR",
         target_system=receiver.system,
-        target_component=receiver.component,
+        target_component=mavlink.MAV_COMP_ID_AUTOPILOT1,
         id=receiver.sensor_id,
         time_usec=position.t_ns // 1000,
         source=mavlink.GLOBAL_POSITION_SRC_ESTIMATOR,
         lat=_deg_e7(position.lat),
         lon=_deg_e7(position.lon),
-        alt_ellipsoid=math.nan if receiver.geoid is None else position.alt_msl + receiver.geoid,
+        alt_ellipsoid=math.nan,  # the geoid is not known
         alt=position.alt_msl,
         eph=position.sigma,
         epv=math.sqrt(position.variance_down),
@@ -278,7 +275,7 @@ def external_position_estimate(position: Position, receiver: Receiver) -> Messag
     return dialect.new(
         "COMMAND_INT",
         target_system=receiver.system,
-        target_component=receiver.component,
+        target_component=mavlink.MAV_COMP_ID_AUTOPILOT1,
         frame=mavlink.MAV_FRAME_GLOBAL_INT,
         command=mavlink.MAV_CMD_EXTERNAL_POSITION_ESTIMATE,
         param1=_single_below(position.t_ns * 1e-9),

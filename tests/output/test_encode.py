@@ -48,7 +48,7 @@ UNIX_NS = 1_795_248_000 * 10**9 - T  # at T it is 2026-11-21 08:00:00 UTC
 def receiver(autopilot: Autopilot) -> Receiver:
     projection = "tangent" if autopilot == "other" else autopilot
     origin = LocalOrigin(T, T, math.radians(55.7), math.radians(37.7), 150.0, projection)
-    return Receiver(autopilot, 1, origin=origin, geoid=14.5, sensor_id=3, unix_ns=UNIX_NS, rejected=70_000)
+    return Receiver(autopilot, 1, origin=origin, sensor_id=3, unix_ns=UNIX_NS, rejected=70_000)
 
 
 def parsed(message: Any) -> Any:
@@ -165,7 +165,7 @@ CASES: list[tuple[str, Autopilot, dict[str, Any]]] = [
             "source": 6,
             "flags": 0,
             **GLOBAL,
-            "alt_ellipsoid": 264.5,
+            "alt_ellipsoid": NAN,
             "eph": SIGMA,
             "epv": 3.0,
         },
