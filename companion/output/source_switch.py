@@ -42,6 +42,7 @@ AGAIN_NS = 30 * SECOND_NS  # after so many tries without an answer: the link may
 ANSWER_NS = 5 * SECOND_NS  # a command is answered within this time, or never
 ASKED_NS = SECOND_NS  # after this silence of the receiver, and so often, its message is requested
 ASKED_UNTIL_NS = 10 * SECOND_NS
+UNCONFIRMED_NS = 15 * SECOND_NS  # a set that is reported was selected by us if we requested it so recently
 REPORTS = 2
 """Equal reports of the script in a row that count: one may have been made just before our command."""
 _SWITCH_TEXT = re.compile(r"Using EKF Source Set ([123])")  # ArduPilot, RCx_OPTION 90
@@ -200,6 +201,7 @@ class SourceSwitch:
         self._tries = 0
         self._next_ns: int | None = None  # None: nothing to request
         self._sent_sets = deque[tuple[int, int | None]]()  # when sent, of which set
+        self._unconfirmed: dict[int | None, int] = {}  # when each set was requested, if not acknowledged
         self._unanswered_ns: int | None = None  # when the last of MAX_TRIES was in vain
         self._asked_ns = 0  # when the receiver's message was last requested
         self._events: list[Event] = []
@@ -279,16 +281,18 @@ class SourceSwitch:
 
     def handle_selected(self, by: Selected, now_ns: int) -> None:
         """Process a source set that somebody else selected, or the script's report."""
+        is_ours = False  # our request, whose acknowledgement was lost
         if by.is_report:
             self._reports = self._reports + 1 if by == self._reported else 1
             self._reported = by
-            is_old = self._reports < REPORTS or self._next_ns is not None or self._wanted is None
-            if is_old or by.number == self._wanted:
+            is_old = self._reports < REPORTS or self._next_ns is not None
+            if is_old or self._leading in (None, by.number):
                 return
+            is_ours = now_ns - self._unconfirmed.get(by.number, -UNCONFIRMED_NS) < UNCONFIRMED_NS
         self._wanted = self._leading = by.number
         self._next_ns = None
-        if by.by_script:
-            return  # the table decides again once our position goes out
+        if by.by_script or is_ours:
+            return  # the table decides again, after the script's choice once our position goes out
         before, self._held = self._held, None if by.number == (self._required or GNSS_SET) else by.number
         if self._held == before:
             return
@@ -304,6 +308,8 @@ class SourceSwitch:
             return
         if result == mavlink.MAV_RESULT_ACCEPTED:
             self._leading, self._next_ns, self._unanswered_ns = self._wanted, None, None
+            self._unconfirmed.clear()
+            self._reports = 0
             self._add_event(Severity.NOTICE, f"{self.name(self._wanted)}: {self._reason}", now_ns)
         elif result not in RETRIED:
             self._unanswered_ns = None
@@ -327,6 +333,7 @@ class SourceSwitch:
             return asked
         self._next_ns = now_ns + RETRY_NS
         self._sent_sets.append((now_ns, self._wanted))
+        self._unconfirmed[self._wanted] = now_ns
         confirmation, self._tries = self._tries, self._tries + 1
         parameters = self.parameters(self._wanted)
         return [*asked, _command(system, self.command, confirmation=confirmation, **parameters)]

@@ -507,15 +507,54 @@ def test_the_scripts_own_choice_is_no_persons() -> None:
     assert flight.sets == [1, 2, 2]
 
 
-def test_one_report_made_before_our_command_is_ignored() -> None:
+@pytest.mark.parametrize("is_steady", [False, True])
+def test_one_report_made_before_our_command_is_ignored(is_steady: bool) -> None:
     flight = Flight()
     flight.fly(30.0)
+    if is_steady:
+        reported(flight, 1, 10)
     flight.fly(10.0, fix=False)
     flight.switch.handle_selected(Selected(1, is_report=True), flight.now)
     flight.switch.handle_selected(Selected(2, is_report=True), flight.now)
     flight.switch.handle_selected(Selected(1, is_report=True), flight.now)
     flight.fly(10.0)
     assert flight.sets == [1, 2, 1]
+    assert len(flight.reports) == 3
+
+
+def reported(flight: Flight, source_set: int, seconds: int, **situation: Any) -> None:
+    """Fly while the script reports `source_set` once a second."""
+    for _ in range(seconds):
+        flight.fly(1.0, **situation)
+        flight.switch.handle_selected(Selected(source_set, is_report=True), flight.now)
+
+
+def test_the_scripts_report_of_the_former_set_is_no_choice_while_ours_is_not_answered() -> None:
+    """The uplink is lost for 18 s as GNSS is: the companion took set 1 for a person's choice for good."""
+    flight = Flight()
+    reported(flight, 1, 30)
+    flight.answer = None
+    reported(flight, 1, 18, fix=False)
+    flight.answer = ACCEPTED
+    reported(flight, 1, 20, fix=False)
+    assert not flight.switch.is_on_companion
+    reported(flight, 2, 10, fix=False)  # tried again after 30 s
+    assert flight.switch.is_on_companion
+    assert not any("by hand: the companion" in text for _, text in flight.reports)
+
+
+def test_the_scripts_report_of_our_set_is_no_choice_where_its_acknowledgement_was_lost() -> None:
+    flight = Flight()
+    reported(flight, 1, 30)
+    flight.answer = None
+    flight.fly(3.0, fix=False)
+    assert flight.sets == [1, 2]
+    flight.answer = ACCEPTED
+    reported(flight, 2, 4)  # GNSS is back before the next try
+    assert flight.switch.is_on_companion
+    flight.fly(10.0)
+    assert flight.sets == [1, 2, 1]
+    assert [text for _, text in flight.reports] == ["EKF source set 1: GNSS has a fix"] * 2
 
 
 @pytest.mark.parametrize(
