@@ -25,11 +25,13 @@ from companion.records import (
     AirspeedSensor,
     Attitude,
     Event,
+    GlobalPosition,
     Gnss,
     Imu,
     LocalPosition,
     Pressure,
     Severity,
+    SystemTime,
 )
 from companion.units import SECOND_NS
 
@@ -47,11 +49,14 @@ SENSORS: Mapping[type, Sensor] = {Imu: "imu", AirData: "air_data", AirspeedSenso
 
 
 class Stream(NamedTuple):
-    """What a stream carries, in words and as a record, and the key of `rates` that requests it."""
+    """What a stream carries, in words and as a record, and the key of `rates` that requests it.
+
+    Without a key the output requests it, at a rate of its own, and needs it whatever the navigator uses.
+    """
 
     what: str
     record: type | None
-    key: str
+    key: str | None
 
 
 STREAMS: Mapping[str, Stream] = {
@@ -64,6 +69,8 @@ STREAMS: Mapping[str, Stream] = {
     "VFR_HUD": Stream("airspeed", AirData, "air_data_hz"),
     "SCALED_PRESSURE": Stream("pressure", Pressure, "air_data_hz"),
     "SYS_STATUS": Stream("sensor health", AirspeedSensor, "status_hz"),
+    "GLOBAL_POSITION_INT": Stream("EKF position", GlobalPosition, None),
+    "SYSTEM_TIME": Stream("time of day", SystemTime, None),
     # not missed: only multirotors need it, or only logged
     "EXTENDED_SYS_STATE": Stream("landed or flying", None, "status_hz"),
     "EKF_STATUS_REPORT": Stream("state of the EKF", None, "status_hz"),
@@ -94,8 +101,8 @@ def stream_states(
         name = TYPES[msgid].name
         is_absent = name == second and not measured  # few have a second one
         if name not in MISSING_MESSAGES.get(make, ()) and not is_absent:
-            stream = STREAMS.get(name)
-            yield StreamState(name, requested, measured, stream is None or stream.record in used)
+            stream = STREAMS[name]
+            yield StreamState(name, requested, measured, stream.key is None or stream.record in used)
 
 
 @lru_cache(maxsize=4)
@@ -146,7 +153,7 @@ class InputMonitor:
         for state in stream_states(config, make, session.stream_rates.rates()):
             if not state.is_used or state.measured is None:
                 continue
-            stream = STREAMS.get(state.name, Stream("input", None, ""))
+            stream = STREAMS[state.name]
             if state.is_enough:
                 self._arrived.add(state.name)
                 self._bad_since.pop(state.name, None)
@@ -187,10 +194,8 @@ class InputMonitor:
 
     def _trouble(self, state: StreamState, stream: Stream) -> str:
         if state.measured:
-            return (
-                f"is slow: {state.measured:.1f} of {state.requested:g} Hz; use a faster line, or lower "
-                f"rates.{stream.key}"
-            )
+            advice = "use a faster line" + (f", or lower rates.{stream.key}" if stream.key else "")
+            return f"is slow: {state.measured:.1f} of {state.requested:g} Hz; {advice}"
         if state.name in self._arrived:
             return "has stopped; check its sensor and the line"
         return "never arrived; does the autopilot have the sensor, and does a router pass this message?"

@@ -6,7 +6,7 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from companion.config import Config, InertialConfig, OutputConfig
+from companion.config import Config, InertialConfig, OutputConfig, load
 from companion.link import dialect, frame
 from companion.link.dialect import mavlink
 from companion.link.parameter_server import parameter_table
@@ -28,6 +28,7 @@ from companion.records import (
 )
 from companion.runtime import core
 from companion.runtime.core import CompanionCore
+from companion.runtime.input_monitor import STREAMS
 
 CONFIG = Config(
     inertial=InertialConfig(independent=True),
@@ -636,6 +637,23 @@ def test_input_that_stops_is_reported_once_and_again_when_it_is_back(monkeypatch
         "GNSS (GPS_RAW_INT) has stopped; check its sensor and the line",
         "GNSS (GPS_RAW_INT) arrives again at 5.0 Hz",
     ]
+
+
+def test_slow_input_of_the_output_is_named_and_no_key_that_does_not_exist() -> None:
+    flight = Flight(config=load(pairs=("output.profile=ardupilot",), environment={}))
+    for _ in range(30):
+        stamp = (flight.now - flight.boot) // MS
+        flight.send("GLOBAL_POSITION_INT", time_boot_ms=stamp, lat=600_000_000, lon=300_000_000)
+        flight.fly(1.0)
+    assert [text for text in event_texts(flight) if "GLOBAL_POSITION_INT" in text] == [
+        "EKF position (GLOBAL_POSITION_INT) is slow: 1.0 of 2 Hz; use a faster line"
+    ]
+
+
+def test_every_requested_stream_has_its_words() -> None:
+    for via in ("odometry", "gps_input", "external_position"):
+        config = load(pairs=("output.profile=ardupilot", f"output.via={via}"), environment={})
+        assert core.requested_rates(config).keys() <= STREAMS.keys()
 
 
 def test_input_that_never_arrives_is_reported_if_it_is_used() -> None:
