@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
+import itertools
 import socket
 from collections.abc import Callable, Coroutine
 from typing import Any, Protocol
@@ -13,18 +13,29 @@ class Readable(Protocol):
     async def read(self) -> bytes: ...
 
 
+#: Below the ports that the system gives to others without being asked (net.ipv4.ip_local_port_range).
+_PORTS = itertools.cycle(range(16_384, 32_768))
+
+
 def free_port() -> int:
-    """Return a port of the loopback interface that neither TCP nor UDP uses."""
-    while True:
-        with (
-            socket.socket(socket.AF_INET, socket.SOCK_STREAM) as tcp,
-            socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp,
-            contextlib.suppress(OSError),
-        ):
-            tcp.bind(("127.0.0.1", 0))
-            port = int(tcp.getsockname()[1])
-            udp.bind(("127.0.0.1", port))
-            return port
+    """Return a port of the loopback interface that neither TCP nor UDP uses; only one test gets it.
+
+    Between this call and its use no connection of another process may be given it, so it is none of those
+    that the system chooses from, and a name in the abstract namespace keeps it for this process.
+    """
+    for port in _PORTS:
+        mine = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        try:
+            mine.bind(f"\0companion-tests-port-{port}")
+            with socket.socket(type=socket.SOCK_STREAM) as tcp, socket.socket(type=socket.SOCK_DGRAM) as udp:
+                tcp.bind(("127.0.0.1", port))
+                udp.bind(("127.0.0.1", port))
+        except OSError:
+            mine.close()
+            continue
+        mine.detach()  # open until the process ends
+        return port
+    raise AssertionError("the ports go round")
 
 
 def run(test: Coroutine[Any, Any, None], seconds: float = 120.0) -> None:
