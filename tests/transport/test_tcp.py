@@ -19,6 +19,12 @@ from companion.transport.tcp import PEER_TIMEOUT_S, Listener
 from tests.network import free_port, run, until
 
 
+@pytest.fixture(autouse=True)
+def patient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A busy machine may take seconds over the turn in which a frame is read."""
+    monkeypatch.setattr(tcp, "WAIT_S", 60.0)
+
+
 def judge() -> Callable[[bytes], bool]:
     seen = bytearray()
 
@@ -73,13 +79,14 @@ def test_tcp_both_ways_and_again_after_a_loss() -> None:
         reports: list[str] = []
         client = connections(Address("tcp", "127.0.0.1", port), lambda: 1.0, reports.append)
         waiting = asyncio.ensure_future(anext(client))
-        await asyncio.sleep(0.05)  # no listener yet
+        await until(lambda: reports)  # no listener yet
         for turn in (b"one", b"two"):
             accepting = asyncio.ensure_future(connect(Address("tcpin", "127.0.0.1", port)))
             near, far = await asyncio.gather(waiting, accepting)
             near.write(turn)
+            assert await far.read() == turn  # it has accepted: what it writes now reaches a client
             far.write(turn[::-1])
-            assert (await far.read(), await near.read()) == (turn, turn[::-1])
+            assert await near.read() == turn[::-1]
             far.close()
             with pytest.raises(ConnectionError, match=f"tcp:127.0.0.1:{port} was closed by the other side"):
                 await near.read()
@@ -296,14 +303,11 @@ def test_too_many_waiting_clients_close_the_oldest_of_the_host_with_most(
             client.write(b"frame")
         await until(lambda: len(received.by_sender) == MAX_PEERS)
         waiting = []
-
-        def has_clients(number: int) -> bool:
-            return len(server._clients) == number
-
         for k, host in enumerate(["127.0.0.2", "127.0.0.1", "127.0.0.1", "127.0.0.1"]):
             waiting.append(socket.create_connection(("127.0.0.1", server.port), source_address=(host, 0)))
-            await until(partial(has_clients, MAX_PEERS + min(k + 1, 3)))
-        waiting[1].settimeout(5.0)
+            if k < 3:
+                await until(lambda number=MAX_PEERS + k + 1: len(server._clients) == number)
+        waiting[1].settimeout(30.0)
         assert await asyncio.to_thread(waiting[1].recv, 1) == b""
         waiting[0].send(b"frame of the oldest")
         await until(lambda: received.has(b"frame of the oldest"))
