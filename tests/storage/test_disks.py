@@ -1,4 +1,4 @@
-"""Failing disks: full, read-only or blocked for ten seconds, they never delay navigation."""
+"""Failing disks: full, read-only or blocked, they never hold navigation up."""
 
 import asyncio
 import dataclasses
@@ -10,7 +10,6 @@ import subprocess
 import sys
 import threading
 import time
-from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -30,35 +29,41 @@ from tests.network import free_port, until
 
 LOOPBACK = "127.0.0.1"
 EVERY_S = 0.2  # interval of solutions and of their messages
-#: Tolerance for other programs on the processor; a blocking disk would delay for much longer.
-LATE_S = 0.8
 
 
 class FaultyDisk:
-    """A disk that blocks or fails until it is set to work again."""
+    """A disk that blocks or fails until it is set to work again; the thread that navigates never uses it."""
 
     def __init__(self, path: Path) -> None:
         self.disk = DiskFile(path)
         self.error: int | None = None
         self.working = threading.Event()
         self.working.set()
+        self.navigates: threading.Thread | None = None  # not before the log is open
+        self.held = set[threading.Thread]()
+
+    def wait(self) -> None:
+        assert threading.current_thread() is not self.navigates
+        if not self.working.is_set():
+            self.held.add(threading.current_thread())
+        assert self.working.wait(200.0)
 
     def write(self, at: int, data: bytes) -> None:
-        self.working.wait(30.0)
+        self.wait()
         if self.error is not None:
             raise OSError(self.error, os.strerror(self.error))
         self.disk.write(at, data)
 
     def sync(self) -> None:
-        self.working.wait(30.0)
+        self.wait()
         self.disk.sync()
 
     def __getattr__(self, name: str):
         return getattr(self.disk, name)
 
 
-async def fly(port: int, arrivals: list[float], more: list[bytes]) -> None:
-    """Simulate an autopilot until cancelled; append the arrival times of NAVIGATION_STATUS."""
+async def fly(port: int, arrivals: list[int], more: list[bytes]) -> None:
+    """Simulate an autopilot until cancelled; append the times that NAVIGATION_STATUS states."""
     scenario = dataclasses.replace(get_scenario("short"), rates=SensorRates(imu=1.0, truth=1.0))
     autopilot, begun = SimulatedAutopilot(scenario), time.monotonic_ns()
     stream = await connect(Address.parse(f"udpout:{LOOPBACK}:{port}"))
@@ -67,9 +72,7 @@ async def fly(port: int, arrivals: list[float], more: list[bytes]) -> None:
         while True:
             data = await stream.read()
             autopilot.receive(data, time.monotonic_ns() - begun)
-            arrivals.extend(
-                time.monotonic() for _, m in autopilot.outputs if m.get_type() == "NAVIGATION_STATUS"
-            )
+            arrivals.extend(m.time_usec for _, m in autopilot.outputs if m.get_type() == "NAVIGATION_STATUS")
             autopilot.outputs.clear()
 
     listening = asyncio.create_task(listen())
@@ -85,15 +88,18 @@ async def fly(port: int, arrivals: list[float], more: list[bytes]) -> None:
         stream.close()
 
 
-def longest_gap(arrivals: list[float], since: float, until: float) -> float:
-    inside = [t for t in arrivals if since <= t <= until]
-    return max((b - a for a, b in pairwise([since, *inside, until])), default=until - since)
+def statuses(log: Path) -> set[int]:
+    """Return the times that NAVIGATION_STATUS states in the sent frames of a log."""
+    frames = (e.value for e in flight_log.read(log) if e.topic.endswith("/tx"))
+    found = (one for data in frames for one in frame.Reader().receive(data) if isinstance(one, frame.Frame))
+    messages = (dialect.decode(one) for one in found if one.msgid in dialect.TYPES)
+    return {message.time_usec for message in messages if message.get_type() == "NAVIGATION_STATUS"}
 
 
-def test_solutions_are_on_time_with_a_failing_or_blocked_disk(tmp_path: Path, monkeypatch) -> None:
-    port, events, arrivals, more = free_port(), list[Event](), list[float](), list[bytes]()
+def test_solutions_go_on_with_a_failing_or_blocked_disk(tmp_path: Path, monkeypatch) -> None:
+    """The disk is blocked until fifty more have arrived: whatever waited for it would wait for ever."""
+    port, events, arrivals, more = free_port(), list[Event](), list[int](), list[bytes]()
     disks: list[FaultyDisk] = []
-    gaps: dict[str, float] = {}
     log = flight_log.Writer(
         tmp_path / "a.mcap",
         metadata={},
@@ -101,10 +107,11 @@ def test_solutions_are_on_time_with_a_failing_or_blocked_disk(tmp_path: Path, mo
         start_ns=time.monotonic_ns(),
         disk=lambda path: disks.append(FaultyDisk(path)) or disks[0],
     )
+    disks[0].navigates = threading.main_thread()
     whole = state_file.replace_text
 
     def replace_slowly(path: Path, text: str) -> None:
-        disks[0].working.wait(30.0)
+        disks[0].wait()
         whole(path, text)
 
     monkeypatch.setattr(state_file, "replace_text", replace_slowly)
@@ -120,10 +127,12 @@ def test_solutions_are_on_time_with_a_failing_or_blocked_disk(tmp_path: Path, mo
         target_component=191,
     )
 
-    async def phase(name: str, seconds: float) -> None:
-        since = time.monotonic()
-        await asyncio.sleep(seconds)
-        gaps[name] = longest_gap(arrivals, since, time.monotonic())
+    async def solutions(number: int) -> None:
+        wanted = len(arrivals) + number
+        await until(lambda: len(arrivals) >= wanted, 150.0)
+
+    def reported(text: str) -> bool:
+        return any(text in event.text for event in events)
 
     async def play() -> None:
         config = load(None, flags | {"link.connect": (f"udpin:{LOOPBACK}:{port}",)}, {})
@@ -132,44 +141,57 @@ def test_solutions_are_on_time_with_a_failing_or_blocked_disk(tmp_path: Path, mo
             asyncio.create_task(c) for c in (service.serve(stopped), fly(port, arrivals, more))
         )
         try:
-            await until(lambda: len(arrivals) >= 5)
-            await phase("working", 1.5)
-            for name, number in (("full", errno.ENOSPC), ("read-only", errno.EROFS)):
+            await solutions(12)
+            for number, text in ((errno.ENOSPC, "No space left"), (errno.EROFS, "Read-only file system")):
                 disks[0].error = number
-                await phase(name, 2.5)
-            disks[0].error = None
+                await until(lambda text=text: reported(text))
+                assert reported("; navigation continues")
+                await solutions(12)
+                disks[0].error = None
+                await until(lambda: reported("log: writing resumed"))
+                events.clear()
             disks[0].working.clear()
             more.append(frame.encode(wish, 0, 255, 190))  # the parameter is stored on the same disk
-            await phase("blocked", 10.0)
+            await until(lambda: len(disks[0].held) == 2)
+            await solutions(50)
             assert not parameters.exists()
             disks[0].working.set()
-            await phase("working again", 2.5)
+            await until(lambda: parameters.exists() and "sigma_m = 3.5" in parameters.read_text())
+            await solutions(12)
         finally:
+            disks[0].working.set()
             flying.cancel()
             stopped.set()
             await serving
 
     asyncio.run(play())
     assert log.close() and log.dropped == 0
-    assert all(gap < LATE_S for gap in gaps.values()), gaps
-    texts = " ".join(event.text for event in events)
-    assert "No space left on device; navigation continues" in texts and "log: writing resumed" in texts
-    assert "sigma_m = 3.5" in parameters.read_text()
-    solutions = [e.value.rx_ns for e in flight_log.read(tmp_path / "a.mcap") if isinstance(e.value, Solution)]
-    assert max(b - a for a, b in pairwise(solutions)) < LATE_S * 1e9  # nothing was lost
+    assert set(arrivals) <= statuses(tmp_path / "a.mcap")  # nothing was lost
+    kinds = [type(e.value) for e in flight_log.read(tmp_path / "a.mcap")]
+    assert kinds.count(Solution) >= len(set(arrivals))
 
 
-#: Fault: the disk of the parameters file, to which a parameter is written, responds late or never.
+#: Fault: the disk of the parameters file, to which a parameter is written, responds late or never. It is late
+#: by the end of the flight and a second; a busy machine may take longer, so the limit is a minute then.
 KEEPING = """
 import sys, threading, time
 from pathlib import Path
 from companion.runtime import service, state_file
 from companion.__main__ import main
-whole, wait = state_file.replace_text, {wait}
+whole, serve, ended = state_file.replace_text, service.Service.serve, threading.Event()
 def hang(path, text):
     print("writing", flush=True)
-    wait()
+    ended.wait()
+    if {dead}:
+        threading.Event().wait()
+    time.sleep(1.0)
     whole(path, text)
+async def serve_and_tell(self, stopped):
+    await serve(self, stopped)
+    ended.set()
+service.Service.serve = serve_and_tell
+if not {dead}:
+    service.STOP_TIMEOUT_S = 60.0
 state_file.replace_text = hang
 init = service.Service.__init__
 def wishing(self, *arguments, **named):
@@ -181,24 +203,20 @@ main()
 """
 
 
-@pytest.mark.parametrize(
-    ("wait", "kept_text"), [("threading.Event().wait", None), ("lambda: time.sleep(2.0)", "kept")]
-)
-def test_shutdown_waits_for_a_slow_disk_but_not_for_a_dead_one(
-    tmp_path: Path, wait: str, kept_text: str | None
-) -> None:
+@pytest.mark.parametrize("dead", [True, False])
+def test_shutdown_waits_for_a_slow_disk_but_not_for_a_dead_one(tmp_path: Path, dead: bool) -> None:
     parameters, logs = tmp_path / "set.toml", tmp_path / "logs"
-    command = [sys.executable, "-c", KEEPING.format(wait=wait), "run", "--logs", str(logs)]
+    command = [sys.executable, "-c", KEEPING.format(dead=dead), "run", "--logs", str(logs)]
     command += ["--connect", f"udpin:{LOOPBACK}:{free_port()}"]
     command += ["--set", f"link.parameters_file={parameters}"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as process:
         try:
             assert process.stdout is not None and process.stdout.readline() == "writing\n"
             process.send_signal(signal.SIGTERM)
-            assert process.wait(25) == 0
+            assert process.wait(120) == 0
         finally:
             process.kill()
-    assert (parameters.read_text() if parameters.exists() else None) == kept_text
+    assert (parameters.read_text() if parameters.exists() else None) == (None if dead else "kept")
     (log,) = logs.iterdir()
     assert flight_log.info(log).closed
 
@@ -250,7 +268,7 @@ def test_full_disk_is_reported_and_writing_resumes(small_disk, tmp_path) -> None
     with log_text.open("w") as stderr, subprocess.Popen(command, stderr=stderr) as process:
         asyncio.run(play())
         process.send_signal(signal.SIGTERM)
-        assert process.wait(20) == 0
+        assert process.wait(60) == 0
     (log,) = (small_disk / "logs").iterdir()
     assert flight_log.info(log).closed
 
