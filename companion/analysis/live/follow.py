@@ -5,6 +5,7 @@ Both give the messages that are new since the last call. The flight does not not
 
 from __future__ import annotations
 
+import contextlib
 import os
 import time
 from pathlib import Path
@@ -128,8 +129,11 @@ def find_log(path: Path) -> Path | None:
     Raises LogError if there is nothing at `path`.
     """
     if path.is_dir():
-        logs = sorted(path.glob(f"*.mcap{ACTIVE}"), key=lambda log: (log.stat().st_mtime_ns, log.name))
-        return logs[-1] if logs else None
+        logs = list[tuple[int, Path]]()
+        for log in path.glob(f"*.mcap{ACTIVE}"):
+            with contextlib.suppress(FileNotFoundError):  # closed in between: it has another name
+                logs.append((log.stat().st_mtime_ns, log))
+        return max(logs)[1] if logs else None
     if not path.exists():
         active = path.with_name(path.name + ACTIVE)
         if active.exists():

@@ -110,12 +110,18 @@ class LiveView:
         found = find_log(self._path)
         if found is None or (self._source is not None and self._source.path == found):
             return
-        if self._path.is_dir() and found.stat().st_size < FIRST_CHUNK:
-            return  # just created: its header may not be complete
+        if self._path.is_dir() and not _has_begun(found):
+            return
+        live = found.name.endswith(ACTIVE)
+        try:
+            source = FollowedLog(found) if live else PlayedLog(found, self._speed)
+        except (FileNotFoundError, LogError):
+            if found.exists():
+                raise
+            return  # closed in between: it has another name
         if self._source is not None:
             self._source.close()
-        live = found.name.endswith(ACTIVE)
-        self._source = FollowedLog(found) if live else PlayedLog(found, self._speed)
+        self._source = source
         self._scene = Scene(found.name.removesuffix(ACTIVE))
 
     def _encode(self) -> bytes:
@@ -152,6 +158,13 @@ class LiveView:
                     await client.send(frame.decode())
         finally:
             self._clients -= 1
+
+
+def _has_begun(log: Path) -> bool:
+    """Whether a log that is being written has its header: no when just created, or closed and renamed."""
+    with contextlib.suppress(FileNotFoundError):
+        return log.stat().st_size >= FIRST_CHUNK
+    return False
 
 
 def answer_pages(hosts: frozenset[str] | None) -> Callable[[ServerConnection, Request], Response | None]:
@@ -249,6 +262,8 @@ def command(path: Path, listen: str, speed: float, foxglove: int | None) -> None
     if int(port) > 65535:
         raise click.BadParameter(f"{listen!r}: {port} is not a port: give 1 to 65535", param_hint="--listen")
     found = find_log(path)
+    if found is not None and path.is_dir() and not _has_begun(found):
+        found = None  # waited for
     if found is not None:
         reject_foreign(found)
     bridge: FoxgloveServer | None = None

@@ -2,20 +2,21 @@
 
 import contextlib
 import json
+import math
 import re
 import signal
 import subprocess
 import sys
 import urllib.error
 import urllib.request
-from itertools import pairwise
 from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
 
-from companion.analysis.live.follow import Channel, Message
-from companion.analysis.live.server import command
+from companion.analysis.live import server
+from companion.analysis.live.follow import Channel, Message, find_log
+from companion.analysis.live.server import LiveView, command
 from companion.records import Event, Gnss, Mode, Solution, Trust
 from companion.storage import flight_log
 from companion.storage.reader import LogError
@@ -52,7 +53,7 @@ class Live:
 
 def get(url, **headers):
     try:
-        with urllib.request.urlopen(urllib.request.Request(url, headers=headers), timeout=20) as answer:
+        with urllib.request.urlopen(urllib.request.Request(url, headers=headers), timeout=60) as answer:
             return answer.status, answer.read().decode()
     except urllib.error.HTTPError as error:
         with error:
@@ -112,14 +113,15 @@ def test_page_follows_a_flight_and_survives_a_kill(tmp_path, browser):
     }
 
 
-def wait_for_position(live, t):
-    """Return the first frame with a position that is at least `t` (s) after the start of the log."""
+def wait_for_position(live, t, behind=math.inf):
+    """Return the first frame with a position that is at least `t` (s) after the start of the log, and at most
+    `behind` (s) old."""
     from websockets.sync.client import connect
 
     with connect(f"ws://127.0.0.1:{live.port}/socket", max_size=None) as client:
         while True:
-            frame = json.loads(client.recv(timeout=20))
-            if frame.get("numbers") and frame["t"] >= t:
+            frame = json.loads(client.recv(timeout=60))
+            if frame.get("numbers") and frame["t"] >= t and frame["behind"] <= behind:
                 return frame
 
 
@@ -132,7 +134,7 @@ def until_interrupted(*arguments):
     try:
         yield
         process.send_signal(signal.SIGINT)
-        assert process.wait(20) == 0
+        assert process.wait(60) == 0
     finally:
         process.kill()
         process.wait()
@@ -148,26 +150,45 @@ def test_a_flight_does_not_notice_that_the_live_view_is_killed(tmp_path):
         with Live(tmp_path) as live:
             first = wait_for_position(live, 0.0)
             live.process.send_signal(signal.SIGKILL)
-            assert live.process.wait(20) == -signal.SIGKILL
+            assert live.process.wait(60) == -signal.SIGKILL
         with Live(tmp_path) as live:
-            second = wait_for_position(live, first["t"] + 4.0)
-    assert second["log"] == first["log"] and second["behind"] < 3.0
+            second = wait_for_position(live, first["t"] + 4.0, behind=3.0)
+            live.process.send_signal(signal.SIGKILL)
+            assert live.process.wait(60) == -signal.SIGKILL
+        with Live(tmp_path) as live:
+            wait_for_position(live, second["t"] + 2.0)
+    assert second["log"] == first["log"]
     (log,) = tmp_path.glob("*.mcap")
-    times = [e.value.rx_ns * 1e-9 for e in flight_log.read(log) if isinstance(e.value, Solution)]
-    assert times[-1] - times[0] > 4.0
-    assert max(b - a for a, b in pairwise(times)) < 0.3
-    assert len(times) >= 10.0 * (times[-1] - times[0])  # 10 a second for ODOMETRY
+    values = [e.value for e in flight_log.read(log)]
+    texts = [value.text for value in values if isinstance(value, Event)]
+    assert not [text for text in texts if text.startswith("log: ") or "lost" in text], texts
+    assert sum(isinstance(value, Solution) and value.mode is Mode.FIXED for value in values) > 10
 
 
 def test_a_log_that_is_just_created_is_waited_for(tmp_path):
-    """The service creates the file, then writes its header; in between the live view ended."""
+    """The service creates the file, then writes its header; in between the view ended, or did not start."""
     log = tmp_path / "00001.mcap.active"
-    with Live(tmp_path) as live:
-        for content in (b"", b"\x89MCAP0"):
-            log.write_bytes(content)
-            with pytest.raises(subprocess.TimeoutExpired):
-                live.process.wait(1.0)
-            assert get(live.url)[0] == 200
+    for content in (b"", b"\x89MCAP0"):
+        log.write_bytes(content)
+        with Live(tmp_path) as live:
+            for later in (content, b"\x89MCAP0"):
+                log.write_bytes(later)
+                with pytest.raises(subprocess.TimeoutExpired):
+                    live.process.wait(1.0)
+                assert get(live.url)[0] == 200
+
+
+def test_a_log_that_is_closed_while_it_is_looked_for_is_no_end(tmp_path, monkeypatch):
+    """It is renamed at its end: what was listed is not there any more."""
+    gone = tmp_path / "00001-x.mcap.active"
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "glob", lambda folder, pattern: iter([gone]))
+        assert find_log(tmp_path) is None
+    view = LiveView(tmp_path)
+    monkeypatch.setattr(server, "find_log", lambda path: gone)
+    for has_begun in (False, True):  # renamed before its size is read, or after it
+        monkeypatch.setattr(server, "_has_begun", lambda log, begun=has_begun: begun)
+        assert view._step() == b""
 
 
 def test_other_sites_and_paths_are_refused(tmp_path):
@@ -181,12 +202,12 @@ def test_other_sites_and_paths_are_refused(tmp_path):
 
         address = f"ws://127.0.0.1:{live.port}/socket"
         with connect(address, origin=f"http://127.0.0.1:{live.port}") as client:
-            waiting = json.loads(client.recv(timeout=20))["trust"]
+            waiting = json.loads(client.recv(timeout=60))["trust"]
             assert waiting["word"] == "Waiting for a flight"
         with pytest.raises(InvalidStatus, match="403"), connect(address, origin="http://evil.example"):
             pass
         live.process.send_signal(signal.SIGINT)
-        assert live.process.wait(20) == 0
+        assert live.process.wait(60) == 0
 
 
 @pytest.mark.parametrize(
@@ -213,13 +234,13 @@ def test_foxglove_clients_get_every_channel_with_its_schema():
 
     from companion.analysis.live.foxglove_server import FoxgloveServer
 
-    server = FoxgloveServer("127.0.0.1", 0)
+    foxglove = FoxgloveServer("127.0.0.1", 0)
     try:
         channel = Channel("/out/Event", "json", "Event", b'{"type": "object"}')
-        server.forward([Message(channel, 5, b'{"text": "x"}')])
-        with connect(f"ws://127.0.0.1:{server.port}", subprotocols=["foxglove.sdk.v1"]) as client:
+        foxglove.forward([Message(channel, 5, b'{"text": "x"}')])
+        with connect(f"ws://127.0.0.1:{foxglove.port}", subprotocols=["foxglove.sdk.v1"]) as client:
             for _ in range(5):
-                message = json.loads(client.recv(timeout=20))
+                message = json.loads(client.recv(timeout=60))
                 if message["op"] == "advertise":
                     break
         (shown,) = message["channels"]
@@ -229,4 +250,4 @@ def test_foxglove_clients_get_every_channel_with_its_schema():
             '{"type": "object"}',
         )
     finally:
-        server.stop()
+        foxglove.stop()
