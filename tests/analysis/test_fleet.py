@@ -178,7 +178,7 @@ def test_killed_worker_loses_no_job() -> None:
 LOST = """
 import sys, time
 from companion.analysis.jobs import run_jobs
-work = run_jobs(time.sleep, {str(k): 0.05 for k in range(200)}, sys.argv[1], 0, "fleet")
+work = run_jobs(time.sleep, {str(k): 0.05 for k in range(2000)}, sys.argv[1], 0, "fleet")
 print(next(work).key, flush=True)
 try:
     list(work)

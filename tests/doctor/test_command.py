@@ -22,8 +22,8 @@ from companion.config.required_parameters import required_parameters
 from companion.doctor import command, examination, rendering
 from companion.doctor.command import check_machine
 from companion.doctor.diagnosis import Diagnosis, Finding, Identity, ParameterFinding
-from companion.link import stream_rates
-from companion.transport.reconnect import Address
+from companion.link import dialect, frame, stream_rates
+from companion.transport.reconnect import Address, Connection, connect
 from tests.network import free_port
 
 LOOPBACK = "127.0.0.1"
@@ -35,7 +35,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(stream_rates, "WINDOW", SECOND)
     monkeypatch.setattr(examination, "OBSERVE", 2 * SECOND)
     monkeypatch.setattr(examination, "OBSERVE_LONGER", 2 * SECOND)
-    monkeypatch.setattr(command, "CONNECT_TIMEOUT_S", 8.0)
+    monkeypatch.setattr(command, "CONNECT_TIMEOUT_S", 60.0)
     for name in list(os.environ):
         if name.startswith("COMPANION_"):
             monkeypatch.delenv(name)
@@ -120,18 +120,18 @@ def test_no_data_exits_69_with_advice(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_noise_and_other_senders_are_described(
     monkeypatch: pytest.MonkeyPatch, data_sent: bytes | None, expected: str
 ) -> None:
-    from companion.link import dialect, frame
-
     monkeypatch.setattr(command, "CONNECT_TIMEOUT_S", 1.0)
     data = data_sent or frame.encode(dialect.new("HEARTBEAT", type=6, autopilot=8), 0, 255, 190)
-    port = free_port()
-    code = (
-        "import socket, time\ns = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)\n"
-        f"for _ in range(60): s.sendto({data!r}, ('{LOOPBACK}', {port})); time.sleep(0.05)"
-    )
-    with subprocess.Popen([sys.executable, "-c", code]) as process:
-        assert expected in line(doctor("--connect", f"udpin:{LOOPBACK}:{port}"))
-        process.terminate()
+
+    async def connect_and_receive(address: Address) -> Connection:
+        stream = await connect(address)
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+            for _ in range(20):
+                sender.sendto(data, (LOOPBACK, stream.port))
+        return stream
+
+    monkeypatch.setattr(command, "connect", connect_and_receive)
+    assert expected in line(doctor("--connect", f"udpin:{LOOPBACK}:0"))
 
 
 def test_port_in_use_suggests_a_running_companion() -> None:
@@ -169,10 +169,9 @@ def test_a_link_that_cannot_be_opened_is_one_sentence(link: str, expected: str) 
 
 def test_tcp_listener_without_a_peer_times_out(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(command, "CONNECT_TIMEOUT_S", 0.3)
-    start = time.monotonic()
     advice = line(doctor("--connect", f"tcpin:{LOOPBACK}:0"))
+    assert f"no autopilot found on tcpin:{LOOPBACK}:0 in 0 s: " in advice
     assert "no data received; check that the autopilot or router connects to this address and port" in advice
-    assert time.monotonic() - start < 5.0
 
 
 def test_host_that_does_not_answer_is_one_sentence_with_advice(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,6 +14,7 @@ from companion.doctor import signing_command
 from companion.link import dialect, frame
 from companion.link.dialect import mavlink
 from companion.link.signing import Signing, read_key
+from tests.network import free_port
 
 HOST = "127.0.0.1"
 
@@ -49,9 +50,7 @@ class SigningAutopilot(threading.Thread):
 
 @pytest.fixture
 def port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
-        sock.bind((HOST, 0))
-        return int(sock.getsockname()[1])
+    return free_port()
 
 
 def init(path: Path, *options: str):

@@ -4,6 +4,7 @@ import itertools
 import json
 import lzma
 import math
+import re
 import signal
 import socket
 import subprocess
@@ -265,8 +266,22 @@ def test_table_of_a_recorded_flight(log: str, part, profile: str, expected) -> N
     assert rows[COMPANION].samples > 100
 
 
+LOST = "the receiver lost its fix"
+
+
+def are_scored(errors: Path, told: Path) -> bool:
+    """Whether the errors of all three are known after the loss, twenty of the companion."""
+    loss = next((line for line in told.read_text().splitlines() if LOST in line), None)
+    if loss is None:
+        return False
+    (path,) = errors.iterdir()
+    rows = [line.split(",")[:2] for line in path.read_text().splitlines()[1:-1]]
+    later = [row[1] for row in rows if float(row[0]) > float(loss.split()[0]) + 5.0]
+    return later.count(COMPANION) > 20 and {AUTOPILOT, RSBN} <= set(later)
+
+
 def test_three_processes_over_tcp_and_udp(entries, tmp_path: Path) -> None:
-    """Recorded autopilot over TCP, bridge, and companion with log, for a quarter of a minute."""
+    """Recorded autopilot over TCP, bridge, and companion with log, until there are errors after the loss."""
     log, errors, logs = tmp_path / "cut.tlog", tmp_path / "errors", tmp_path / "logs"
     log.write_bytes(lzma.decompress(CUT.read_bytes()))
     tcp, udp = free_port(), free_port()
@@ -274,29 +289,36 @@ def test_three_processes_over_tcp_and_udp(entries, tmp_path: Path) -> None:
     play = [*python, "sitl", "play", str(log), "--from", "16", "--connect", f"tcpin:{LOOPBACK}:{tcp}"]
     flight = [*python, "run", "--connect", f"udpin:{LOOPBACK}:{udp}", "--logs", str(logs)]
     flight += ["--set", "output.profile=ardupilot"]
-    bridge = [*python, "sitl", "bridge", "--connect", f"tcp:{LOOPBACK}:{tcp}", "--json", "--seconds", "12"]
+    bridge = [*python, "sitl", "bridge", "--connect", f"tcp:{LOOPBACK}:{tcp}", "--json", "--seconds", "60"]
     bridge += ["--companion", f"udpout:{LOOPBACK}:{udp}", "--beacon", "55.75,38.57,200", "--log", str(errors)]
     with (
         subprocess.Popen(play, stderr=subprocess.DEVNULL) as autopilot,
         subprocess.Popen(flight, stderr=subprocess.DEVNULL) as companion,
     ):
-        deadline = time.monotonic() + 20.0
+        deadline = time.monotonic() + 60.0
         while not list(logs.glob("*")) and time.monotonic() < deadline:
             time.sleep(0.1)
-        done = subprocess.run(bridge, capture_output=True, text=True, timeout=60)
+        with (
+            (tmp_path / "shown").open("w") as shown,
+            (tmp_path / "told").open("w") as told,
+            subprocess.Popen(bridge, stdout=shown, stderr=told) as relaying,
+        ):
+            while relaying.poll() is None and not are_scored(errors, tmp_path / "told"):
+                time.sleep(0.1)
+            relaying.send_signal(signal.SIGINT)
+            assert relaying.wait(60) == 0, (tmp_path / "told").read_text()
         for process in (companion, autopilot):
             process.send_signal(signal.SIGINT)
-            assert process.wait(20) == 0
-    assert done.returncode == 0, done.stderr
-    found = json.loads(done.stdout)
+            assert process.wait(60) == 0
+    found = json.loads((tmp_path / "shown").read_text())
     (lost,) = found["tables"]
     assert "GNSS lost at" in lost["title"]
     rows = {row["source"]: row for row in lost["rows"]}
     assert set(rows) == {AUTOPILOT, COMPANION, RSBN}
-    assert "the receiver lost its fix" in done.stderr
+    assert LOST in (tmp_path / "told").read_text()
     lines = Path(found["errors"]).read_text().splitlines()
     assert lines[0].startswith("t_s,source,north_m,east_m,error_m,sigma_m,bound_m,true_lat_deg")
-    assert sum(COMPANION in line for line in lines) > 20  # in real time: fewer on a busy machine
+    assert sum(COMPANION in line for line in lines) > 20
     (flown,) = logs.iterdir()
     kinds = {type(entry.value) for entry in flight_log.read(flown)}
     assert {Solution, RsbnFix, Truth} <= kinds
@@ -349,10 +371,8 @@ def test_bridge_and_replay_use_the_same_radio_horizon(height: float, tmp_path) -
 
 
 def test_missing_autopilot_is_reported() -> None:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
-        free.bind((LOOPBACK, 0))
-        link = f"udpin:{LOOPBACK}:{free.getsockname()[1]}"
+    link = f"udpin:{LOOPBACK}:{free_port()}"
     done = CliRunner().invoke(command, ["--connect", link, "--seconds", "1"])
     assert done.exit_code == 69
-    assert f"companion: no autopilot on {link} in 1 s" in done.stderr
+    assert re.search(rf"companion: no autopilot on {link} in \d+ s", done.stderr)
     assert not done.stdout
