@@ -99,7 +99,7 @@ class Browser:
         assert "exceptionDetails" not in found, found
         return found["result"].get("value")
 
-    def wait_for(self, script: str, timeout_s: float = 20.0) -> Any:
+    def wait_for(self, script: str, timeout_s: float = 60.0) -> Any:
         """Return the first true value of an expression."""
         end = time.monotonic() + timeout_s
         while not (value := self.evaluate(script)):

@@ -60,7 +60,7 @@ def test_read_log(flight: Path) -> None:
 @pytest.mark.parametrize("script", ["read_log.py", "replay_with_another_estimator.py"])
 def test_example_without_its_log_states_its_usage(script: str) -> None:
     command = [sys.executable, ROOT / "examples" / script]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=200)
     assert done.returncode == 1
     assert re.fullmatch(rf"usage: python examples/{script} .*\n", done.stderr)
 

@@ -261,7 +261,7 @@ def test_mavsdk(second_link: int, sdk: Any) -> None:
 @pytest.mark.parametrize("vehicle", [(ARDUPILOT,), (PX4,)], indirect=True)
 def test_mavsdk_beside_an_autopilot(vehicle: Vehicle, sdk: Any) -> None:
     sdk.add_any_connection(f"udpin://{LOOPBACK}:{vehicle.port}")
-    system = sdk.first_autopilot(20.0)
+    system = sdk.first_autopilot(60.0)
     assert system is not None
     check_mavsdk_parameters(system, 4.0)
 

@@ -84,7 +84,7 @@ class Station:
         if self.client is not None:
             self.answers |= {a.name: a for a in self.client.receive(event.message, event.frame)}
 
-    def until(self, done: Callable[[], bool], seconds: float = 15.0) -> None:
+    def until(self, done: Callable[[], bool], seconds: float = 60.0) -> None:
         end = time.monotonic() + seconds
         while not done() and time.monotonic() < end:
             self.step()

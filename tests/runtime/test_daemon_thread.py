@@ -54,5 +54,5 @@ async def main():
         await asyncio.wait_for(run_in_daemon_thread(threading.Event().wait), 0.01)
 asyncio.run(main())
 """
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=30)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=200)
     assert (done.returncode, done.stderr) == (0, "")
