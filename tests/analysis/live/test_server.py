@@ -90,7 +90,7 @@ def test_page_follows_a_flight_and_survives_a_kill(tmp_path, browser):
     ) as log:
         fly(log, 0, 100)
         log.record(Event(20 * S, 20 * S, 4, NASTY))
-        with Live(tmp_path) as live:
+        with Live(tmp_path, free_port()) as live:
             browser.open(live.url)
             assert browser.wait_for(text).endswith(NASTY)
             assert "Trusted" in browser.evaluate(word)
