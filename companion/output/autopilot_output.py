@@ -26,7 +26,7 @@ from companion.output.gate import (
 )
 from companion.output.gnss_fusion import GnssFusion
 from companion.output.position_reset import PositionReset
-from companion.output.source_switch import SourceSwitch, selected
+from companion.output.source_switch import BELIEVED, SourceSwitch, selected
 from companion.records import (
     Event,
     FilterStatus,
@@ -116,7 +116,7 @@ class AutopilotOutput:
             )
             if isinstance(position, Position) and reason is None:
                 try:
-                    message = encode(position, receiver, name, self._rate_hz(name, position))
+                    message = encode(position, receiver, name, self._rate_hz(name, position, solution))
                 except CannotEncode as error:
                     reason = str(error)
                 else:
@@ -141,18 +141,20 @@ class AutopilotOutput:
         taken, self._events = [*self._events, *self._source_switch.take_events()], []
         return taken
 
-    def _rate_hz(self, name: str, position: Position) -> float:
+    def _rate_hz(self, name: str, position: Position, solution: Solution) -> float:
         """Return how often a position goes out as a measurement; 0 for one that is no part of a series."""
-        is_single = name in NOT_FUSED or self._is_drawn_off(position)
+        is_single = name in NOT_FUSED or self._is_drawn_off(position, solution)
         return 0.0 if is_single else self.config.output.rates_hz[name]
 
-    def _is_drawn_off(self, position: Position) -> bool:
-        """Return whether the autopilot's own position still is where a false GNSS has drawn it.
+    def _is_drawn_off(self, position: Position, solution: Solution) -> bool:
+        """Return whether the autopilot's own position is where a false GNSS has drawn it.
 
-        Its filter is sure of that position. With our sigma as it is, it rejects ours and is then reset to it.
+        Its filter is sure of that position. With our sigma as it is, it rejects ours, and is reset to it once
+        it has rejected it for 7 s and GNSS is not fused: so it begins while GNSS is only in doubt.
         """
         own = self._position_reset.autopilot_place(position.t_ns)
-        if own is None or not self._source_switch.is_on_companion:
+        is_doubted = solution.gnss_false is not None and solution.gnss_false >= BELIEVED
+        if own is None or not (is_doubted or self._source_switch.is_on_companion):
             return False
         return distance(own[:2], (position.lat, position.lon)) > SIGMAS * position.sigma
 

@@ -15,12 +15,13 @@ GLOBAL_POSITION_SENSOR). The encoders accept only a `Position`.
 
 The limit on a jump is derived, not tuned. Both positions are within three of their sigmas of the truth, and
 between them the truth moves with the mean of both velocities, up to a manoeuvre. A greater jump means that
-one of the two is wrong; the solution is withheld until the limit, which grows with time, admits it. A jump
-that only the old sigma justifies passes and is counted, so that the autopilot resets (`reset_counter`)
-instead of rejecting it as an outlier. An autopilot that takes `reset_counter` gets such a jump in steps of
-`STEP_M`, one a message, each a reset: a reset changes the position only, while a slope would be taken for a
-velocity. They begin at the autopilot's own position, as its filter lags behind ours. What is left of the jump
-is stated in the covariance.
+one of the two is wrong; the solution is withheld until the limit, which grows with time, admits it. Where
+GNSS has been found false since, it was the old one, and the new one passes at once. A jump that only the old
+sigma justifies passes and is counted, so that the autopilot resets (`reset_counter`) instead of rejecting it
+as an outlier. An autopilot that takes `reset_counter` gets such a jump in steps of `STEP_M`, one a message,
+each a reset: a reset changes the position only, while a slope would be taken for a velocity. They begin at
+the autopilot's own position, as its filter lags behind ours. What is left of the jump is stated in the
+covariance.
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ import math
 from collections import Counter
 from typing import NamedTuple
 
+from companion.estimate.bank.settings import DEFAULT
 from companion.link.dialect import Message
 from companion.nav.geometry import Geodetic, displace, separation_tuple, wrap_angle
 from companion.records import Event, Mode, Severity, Solution, Trust, Vector3
@@ -130,6 +132,7 @@ class Gate:
 
     def __init__(self, max_step_m: float = math.inf) -> None:
         self._last: Position | None = None
+        self._is_gnss_false = False  # as the last one passed
         self._resets = 0
         self._max_step_m = max_step_m
         self._left_n = (0.0, 0.0)  # from the solution to the position that goes out, m north, east
@@ -153,6 +156,7 @@ class Gate:
             s.mode is Mode.FIXED,
             s.sigma_velocity,
         ).at(s.rx_ns)
+        is_false = s.gnss_false is not None and s.gnss_false > DEFAULT.excluded
         if self._last is not None:
             if here.t_ns < self._last.t_ns:
                 return "timestamp before the previous position"
@@ -160,13 +164,14 @@ class Gate:
             moved_n = _jump(self._last, here, dt)
             jump = math.hypot(*moved_n)
             room = JUMP_MARGIN_M + 0.5 * MANOEUVRE * dt * dt
-            if jump > SIGMAS * (self._last.sigma + here.sigma) + room:
+            is_explained = is_false and not self._is_gnss_false
+            if jump > SIGMAS * (self._last.sigma + here.sigma) + room and not is_explained:
                 return "jump larger than its accuracy justifies"
             if jump > SIGMAS * here.sigma + room:
                 self._left_n = self._left_n[0] - moved_n[0], self._left_n[1] - moved_n[1]
                 if own is not None:
                     self._begin_at(own, here, SIGMAS * self._last.sigma + room)
-        self._last = here
+        self._last, self._is_gnss_false = here, is_false
         return self._stepped(here)
 
     def _begin_at(self, own: Geodetic, here: Position, near: float) -> None:

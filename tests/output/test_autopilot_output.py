@@ -565,10 +565,18 @@ def test_px4_receives_an_accuracy_that_allows_for_the_rate() -> None:
 
 
 @pytest.mark.parametrize(
-    ("is_off", "drawn_m", "is_plain"), [(True, 61, True), (True, 59, False), (False, 61, False)]
+    ("is_off", "doubt", "drawn_m", "is_plain"),
+    [
+        (True, 0.0, 61, True),
+        (True, 0.0, 59, False),
+        (False, 0.0, 61, False),
+        (False, None, 61, False),
+        (False, 0.5, 61, True),
+        (False, 0.5, 59, False),
+    ],
 )
 def test_px4_drawn_off_by_a_false_gnss_receives_sigma_as_it_is(
-    is_off: bool, drawn_m: float, is_plain: bool, monkeypatch: pytest.MonkeyPatch
+    is_off: bool, doubt: float | None, drawn_m: float, is_plain: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """With the greater accuracy EKF2 averages for a minute; with this one it rejects ours and is reset."""
     found = Situation(1e3, -1.0, 0.1, gnss_false=0.9999, witness=is_off, sent_s=1e3, stopped_s=0.0)
@@ -576,7 +584,7 @@ def test_px4_drawn_off_by_a_false_gnss_receives_sigma_as_it_is(
     output, receiver = AutopilotOutput(configured("output.profile=px4")), Receiver("px4", 1)
     assert len(output.poll(receiver, START)) == is_off
     output.handle_acknowledgement(ESTIMATOR_SENSOR_ENABLE, 0, START)
-    solution = at(1.0, covariance=(400.0, 0.0, 0.0, 400.0, 0.0, 25.0))
+    solution = at(1.0, covariance=(400.0, 0.0, 0.0, 400.0, 0.0, 25.0), gnss_false=doubt)
     drawn = displace(solution.lat, solution.lon, solution.alt_msl, 0.0, drawn_m, 0.0)
     output.receive(GlobalPosition(solution.t_ns, solution.t_ns, *drawn, (0.0, 0.0, 0.0), HEIGHT))
     (m,) = output.messages(solution, ["GLOBAL_POSITION_SENSOR"], receiver)

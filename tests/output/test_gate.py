@@ -127,6 +127,17 @@ def test_jump_beyond_both_accuracies_is_withheld(seconds: float) -> None:
     assert isinstance(gate.admit(moved(seconds, east=0.99 * room)), Position)
 
 
+def test_jump_by_a_gnss_that_is_found_false_passes_at_once_and_counts_as_a_reset() -> None:
+    """The position up to then was that GNSS's own, 130 m off with a sigma of 2 m."""
+    gate = Gate()
+    for seconds, doubt in ((0.0, 0.0), (0.2, 0.6)):
+        assert isinstance(gate.admit(moved(seconds, gnss_false=doubt)), Position)
+    assert gate.admit(moved(0.4, east=130.0, gnss_false=0.9)) == "jump larger than its accuracy justifies"
+    found = gate.admit(moved(0.6, east=130.0, gnss_false=0.9999))
+    assert isinstance(found, Position) and found.resets == 1
+    assert isinstance(gate.admit(moved(0.8, east=260.0, gnss_false=0.9999)), str)
+
+
 def test_withheld_position_passes_later() -> None:
     gate = Gate()
     gate.admit(GOOD)
