@@ -507,17 +507,17 @@ class Session:
                 self.stream_rates.start(now)
                 events.append(Rebooted(now, found.system))
             elif change is ClockChange.SET:
-                events.append(ClockJump(now, found.system, (before or 0) - (self.clock.offset(now) or 0)))
-            else:
-                self._note_step(before, now, found.system, events)
+                events.append(ClockJump(now, found.system, -self._later_by(before, now)))
+            elif abs(by := self._later_by(before, now)) > STEP:
+                events.append(MappingStepped(now, found.system, by))
             if found.msgid == _SYSTEM_TIME:
                 self.clock.update_unix(message.time_unix_usec * 1000, boot)
             self._report_lateness(now, found.system, events)
 
-    def _note_step(self, before: int | None, now: int, system: int, events: list[Event]) -> None:
+    def _later_by(self, before: int | None, now: int) -> int:
+        """How much later the autopilot's times map now than by the offset `before`; 0 if it had none."""
         after = self.clock.offset(now)
-        if before is not None and after is not None and abs(after - before) > STEP:
-            events.append(MappingStepped(now, system, after - before))
+        return 0 if before is None or after is None else after - before
 
     def _report_lateness(self, now: int, system: int, events: list[Event]) -> None:
         late = self.clock.lateness(now)
@@ -549,11 +549,12 @@ class Session:
             self.clock.update_timesync(message.ts1, message.tc1, now)
             if self.clock.rate != rate:
                 events.append(ClockRate(now, found.system, self.clock.rate))
-            self._note_step(before, now, found.system, events)
+            if abs(by := self._later_by(before, now)) > STEP:
+                events.append(MappingStepped(now, found.system, by))
             if (error := self.clock.outlier) is not None:
                 events.append(TimesyncOutlier(now, found.system, error))
-            elif before is not None and (by := before - (self.clock.offset(now) or 0)) < -JUMP:
-                events.append(ClockJump(now, found.system, by))  # the clock stopped, or was set back
+            elif by > JUMP:
+                events.append(ClockJump(now, found.system, -by))  # the clock stopped, or was set back
 
     def _request_rate(self, msgid: int, rate_hz: float) -> None:
         self.send(

@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-from companion.estimate import bank as banks
 from companion.navigator import (
     air_data_channel,
     corrector_measurements,
@@ -20,8 +19,15 @@ from companion.navigator.corrected_ins import CorrectedIns
 from companion.navigator.corrector_measurements import CorrectorRows
 from companion.navigator.ground import FLYING_M_S
 from companion.navigator.inertial_track import Point
-from companion.navigator.minimax_bound import Guarantee
-from companion.navigator.progress import carried, decided, is_silent, propagated, shifted, solved_if_due
+from companion.navigator.progress import (
+    carried,
+    decided,
+    is_silent,
+    propagated,
+    shifted,
+    solved_if_due,
+    widened,
+)
 from companion.navigator.state import NEAR_S, Settings, State, Step, corrected, hypotheses
 from companion.records import (
     AirData,
@@ -77,9 +83,7 @@ def _jump_removed(state: State, last: Point, new: Point, record: LocalPosition) 
         state = shifted(state, north, east)
         out.append(_channel(record, f"jumped by {length:.1f} m"))
     if length > inertial_track.JUMP_M and silent > JUMP_SPREAD_S and state.bank is not None:
-        sigma = min(length, most)
-        bank = banks.inflate(state.bank, (0, 1), sigma)
-        state = state._replace(bank=bank, guarantee=Guarantee(), parallel=None)
+        state = widened(state, min(length, most))
         out.append(_channel(record, f"no local position for {silent:.1f} s"))
     return state, out
 

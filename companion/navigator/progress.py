@@ -188,6 +188,13 @@ def shifted(state: State, north: float, east: float, v_n: Vector2 = (0.0, 0.0), 
     )
 
 
+def widened(state: State, sigma: float) -> State:
+    """With an independent position error of one `sigma` (m) more on each axis; bound and filters restart."""
+    assert state.bank is not None
+    bank = banks.inflate(state.bank, (0, 1), sigma)
+    return state._replace(bank=bank, guarantee=minimax_bound.Guarantee(), parallel=None)
+
+
 def _fix_shifted(
     record: Gnss, point: Point, north: float, east: float, v_n: Vector2, t_ns: int
 ) -> tuple[Gnss, Point]:

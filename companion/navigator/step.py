@@ -12,11 +12,10 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-from companion.estimate import bank as banks
 from companion.navigator import fixes, ins_samples, own_samples
 from companion.navigator.local_origin import LIVE_WINDOW_NS, infer_origin
-from companion.navigator.minimax_bound import Guarantee
 from companion.navigator.own_channel import OwnChannel, Sensors
+from companion.navigator.progress import widened
 from companion.navigator.state import Settings, State, Step
 from companion.records import (
     AirData,
@@ -86,8 +85,7 @@ def _time_step(state: State, record: TimeStep, settings: Settings) -> Step:
     if state.bank is None or state.nominal is None:
         return state, []
     sigma = math.hypot(*state.nominal.point.v_n[:2]) * abs(record.step_s)
-    bank = banks.inflate(state.bank, (0, 1), sigma)
-    return state._replace(bank=bank, guarantee=Guarantee(), parallel=None), []
+    return widened(state, sigma), []
 
 
 def _gnss_integrity(state: State, record: GnssIntegrity, settings: Settings) -> Step:

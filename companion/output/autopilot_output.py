@@ -153,7 +153,7 @@ class AutopilotOutput:
         it has rejected it for 7 s and GNSS is not fused: so it begins while GNSS is only in doubt.
         """
         own = self._position_reset.autopilot_place(position.t_ns)
-        is_doubted = solution.gnss_false is not None and solution.gnss_false >= BELIEVED
+        is_doubted = (solution.gnss_false or 0.0) >= BELIEVED
         if own is None or not (is_doubted or self._source_switch.is_on_companion):
             return False
         return distance(own[:2], (position.lat, position.lon)) > SIGMAS * position.sigma

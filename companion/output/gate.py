@@ -156,7 +156,7 @@ class Gate:
             s.mode is Mode.FIXED,
             s.sigma_velocity,
         ).at(s.rx_ns)
-        is_false = s.gnss_false is not None and s.gnss_false > DEFAULT.excluded
+        is_false = (s.gnss_false or 0.0) > DEFAULT.excluded
         if self._last is not None:
             if here.t_ns < self._last.t_ns:
                 return "timestamp before the previous position"
