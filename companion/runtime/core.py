@@ -125,6 +125,8 @@ HANDLED = (
     | {mavlink.MAVLINK_MSG_ID_COMMAND_ACK, mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION}
 )
 
+ABOUT_TIME = (ClockJump, MappingStepped, ClockRate, LinkLate, TimesyncOutlier)
+
 
 class Link:
     """One link: its session, decoder state and counters."""
@@ -379,29 +381,8 @@ class CompanionCore:
                 if self._is_new_reboot(link, now_ns):
                     self.report(Severity.WARNING, f"{link.name}: autopilot {event.system} rebooted", now_ns)
                     self._restart(event.system, now_ns)
-            elif isinstance(event, ClockJump):
-                if link.session.clock.rate == 1.0:
-                    jump_s = event.by_ns / SECOND_NS
-                    text = f"{link.name}: the clock of autopilot {event.system} jumped by {jump_s:.1f} s"
-                    self.report(Severity.WARNING, text, now_ns)
-            elif isinstance(event, MappingStepped):
-                if link is self._last_used and link.session.clock.rate <= 1.0:
-                    step_s = event.by_ns / SECOND_NS
-                    self._on_record(TimeStep(now_ns, now_ns, event.system, step_s))
-            elif isinstance(event, ClockRate):
-                text = f"{link.name}: the clock of autopilot {event.system} {_rate_text(event.rate)}"
-                severity = Severity.NOTICE if event.rate == 1.0 else Severity.ERROR
-                self.report(severity, text, now_ns)
-            elif isinstance(event, LinkLate):
-                text = f"late by {event.by_ns / SECOND_NS:.1f} s" if event.by_ns else "no longer late"
-                self.report(
-                    Severity.WARNING if event.by_ns else Severity.NOTICE,
-                    f"{link.name}: the link is {text}",
-                    now_ns,
-                )
-            elif isinstance(event, TimesyncOutlier):
-                why = "TIMESYNC reply of another clock"
-                self._on_record(Rejection(now_ns, now_ns, "timesync", why, event.error_ns / SECOND_NS))
+            elif isinstance(event, ABOUT_TIME):
+                self._on_time(link, event, now_ns)
             elif isinstance(event, FrameRejected):
                 self.rejected[f"{link.name}: {event.reason.name.lower()} frame"] += 1
             elif isinstance(event, NotSent):
@@ -414,6 +395,26 @@ class CompanionCore:
                     f"{link.name}: second autopilot {event.system}{same} ignored; connected to {event.kept}"
                 )
                 self.report(Severity.WARNING, text, now_ns)
+
+    def _on_time(self, link: Link, event: Any, now_ns: int) -> None:
+        """Process what a session found about the autopilot's clock and the delay of its link."""
+        who, rate = f"{link.name}: the clock of autopilot {event.system}", link.session.clock.rate
+        if isinstance(event, ClockJump):
+            if rate == 1.0:
+                self.report(Severity.WARNING, f"{who} jumped by {event.by_ns / SECOND_NS:.1f} s", now_ns)
+        elif isinstance(event, MappingStepped):
+            if link is self._last_used and rate <= 1.0:
+                self._on_record(TimeStep(now_ns, now_ns, event.system, event.by_ns / SECOND_NS))
+        elif isinstance(event, ClockRate):
+            severity = Severity.NOTICE if event.rate == 1.0 else Severity.ERROR
+            self.report(severity, f"{who} {_rate_text(event.rate)}", now_ns)
+        elif isinstance(event, LinkLate):
+            text = f"late by {event.by_ns / SECOND_NS:.1f} s" if event.by_ns else "no longer late"
+            severity = Severity.WARNING if event.by_ns else Severity.NOTICE
+            self.report(severity, f"{link.name}: the link is {text}", now_ns)
+        else:
+            why = "TIMESYNC reply of another clock"
+            self._on_record(Rejection(now_ns, now_ns, "timesync", why, event.error_ns / SECOND_NS))
 
     def _is_new_reboot(self, link: Link, now_ns: int) -> bool:
         """Note the autopilot's reboot as seen on `link`; return whether another link has not reported it."""
