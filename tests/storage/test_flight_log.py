@@ -483,6 +483,32 @@ class FaultyDisk:
         return getattr(self.disk, name)
 
 
+class Blocked:
+    """A fault: a write waits from `begin` to `end`; until `works` each one fails, if there is an `error`."""
+
+    def __init__(self, error=None):
+        self.error, self.released = error, []
+        self.slow, self.holds, self.go = threading.Event(), threading.Event(), threading.Event()
+
+    def __call__(self):
+        if not self.slow.is_set():
+            return None
+        self.holds.set()
+        self.released.append(self.go.wait(30.0))
+        return self.error if self.slow.is_set() else None
+
+    def begin(self, log):
+        self.slow.set()
+        log.record(imu(0))
+        wait_until(self.holds.is_set)
+
+    def end(self):
+        self.go.set()
+
+    def works(self):
+        self.slow.clear()
+
+
 def test_full_disk_is_reported_and_queued_records_are_not_lost(tmp_path):
     full = threading.Event()
 
@@ -574,33 +600,23 @@ def test_permanently_full_disk_drops_the_oldest_and_counts_them(tmp_path):
 @pytest.mark.parametrize("fails", [True, False])
 def test_chunk_that_is_being_written_is_the_oldest_and_is_dropped_first(tmp_path, fails):
     """The disk is blocked while the queue overflows. If it then fails, what is kept is without a gap."""
-    slow, holds, go = threading.Event(), threading.Event(), threading.Event()
-
-    def fault():
-        if not slow.is_set():
-            return None
-        holds.set()
-        go.wait(30.0)
-        return OSError(errno.EIO, "broken") if fails and slow.is_set() else None
-
+    blocked = Blocked(OSError(errno.EIO, "broken") if fails else None)
     log = Writer(
         tmp_path / "x.mcap",
         metadata={},
         chunk_bytes=500,
         fsync_s=0.05,
         depth=2000,
-        disk=lambda p: FaultyDisk(p, fault),
+        disk=lambda p: FaultyDisk(p, blocked),
         **START,
     )
-    slow.set()
-    log.record(imu(0))
-    wait_until(holds.is_set)
+    blocked.begin(log)
     for i in range(1, 500):
         log.record(imu(i))
     assert log.waiting <= 2000
-    go.set()
+    blocked.end()
     wait_until(lambda: log.trouble is not None if fails else log.waiting == 0)
-    slow.clear()
+    blocked.works()
     assert log.close()
     kept = [e.value for e in read(tmp_path / "x.mcap")]
     first = [] if fails else [imu(0)]  # written after all, and not counted as dropped
@@ -629,31 +645,22 @@ def test_failed_disk_leaves_a_recoverable_log(tmp_path):
 
 def test_slow_disk_does_not_block_the_caller(tmp_path):
     """The disk is blocked until after the last record; no call of the writer waits for it."""
-    slow, holds, go = threading.Event(), threading.Event(), threading.Event()
-    released = []
-
-    def wait():
-        if slow.is_set():
-            holds.set()
-            released.append(go.wait(30.0))
-
+    blocked = Blocked()
     log = Writer(
         tmp_path / "x.mcap",
         metadata={},
         chunk_bytes=2000,
         fsync_s=0.05,
-        disk=lambda p: FaultyDisk(p, wait),
+        disk=lambda p: FaultyDisk(p, blocked),
         **START,
     )
-    slow.set()
-    log.record(imu(0))
-    wait_until(holds.is_set)
+    blocked.begin(log)
     i = 1000
     for k in range(1, i):
         log.record(imu(k))
-    slow.clear()
-    go.set()
-    assert log.close() and log.dropped == 0 and all(released)
+    blocked.works()
+    blocked.end()
+    assert log.close() and log.dropped == 0 and all(blocked.released)
     assert sum(1 for _ in read(tmp_path / "x.mcap")) == i
 
 
