@@ -134,7 +134,7 @@ def until(true: Callable[[], bool], seconds: float = 60.0) -> bool:
 def while_set(done: Callable[[], bool], set_sigma: Callable[[float], object]) -> Callable[[], bool]:
     """Return `done`, which sets GNSS_SIGMA_M to 6 and 7 m in turn, every five seconds, until it is true.
 
-    The text that tells of it may have given way to a more severe one: texts are few.
+    The text about it may have given way to a more severe one: texts are few.
     """
     values, due = itertools.cycle((6.0, 7.0)), [time.monotonic() + 5.0]
 
@@ -211,11 +211,11 @@ def test_mavproxy(second_link: int, tmp_path: pathlib.Path) -> None:
         proxy.type("watch NAMED_VALUE_FLOAT")
         assert all(proxy.prints(f"name : {name}, value : ") for name in NAMED_VALUES)
         proxy.type("param set GNSS_SIGMA_M 4")
-        told = while_set(
+        changed = while_set(
             lambda: proxy.has_printed(f"AP: {SET}"),  # our STATUSTEXT
             lambda value: proxy.type(f"param set GNSS_SIGMA_M {value:g}"),
         )
-        assert until(told)
+        assert until(changed)
         proxy.type("param set GNSS_SIGMA_M 4")
         proxy.type("param fetch GNSS_SIGMA_M")
         assert proxy.prints("GNSS_SIGMA_M = 4.0")

@@ -1,7 +1,7 @@
 """Source switch over a link that loses and delays commands and answers: on a good link the table rules again.
 
 GNSS, our output and the link change at random; the autopilot does what arrives and answers it. The script of
-deploy/ardupilot reports the leading set once a second. Nobody selects by hand.
+deploy/ardupilot reports the leading set once a second. No set is selected by hand.
 """
 
 import random

@@ -24,7 +24,7 @@ LOOPBACK = "127.0.0.1"
 TERM_S = 0.8
 LIMIT_S = 60.0  # for what comes in less than a second, except on a busy machine
 RUN = "import sys; from companion.__main__ import main; sys.argv[0] = 'companion'; main()"
-#: What a faulty service tells its manager when the fault is there; the datagrams keep their order.
+#: What a faulty service sends its manager when the fault is there; the datagrams keep their order.
 FAULT = "STATUS=the fault is there"
 #: Fault: a navigator that never returns after the first GNSS fix.
 HANGING = f"""
@@ -48,13 +48,13 @@ import os
 from companion.runtime.core import CompanionCore
 from companion.runtime.service import OVERDUE_NS
 from companion.runtime.systemd import SystemdNotifier
-poll, polls, told = CompanionCore.poll, [], []
+poll, polls, sent = CompanionCore.poll, [], []
 def twice(self, now):
     polls.append(now)
     if len(polls) < 3:
         poll(self, now)
-    elif now - self.deadline() >= OVERDUE_NS and not told:
-        told.append(now)
+    elif now - self.deadline() >= OVERDUE_NS and not sent:
+        sent.append(now)
         SystemdNotifier(os.environ)._notify("{FAULT}")
 CompanionCore.poll = twice
 {RUN}

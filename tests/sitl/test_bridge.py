@@ -269,9 +269,9 @@ def test_table_of_a_recorded_flight(log: str, part, profile: str, expected) -> N
 LOST = "the receiver lost its fix"
 
 
-def are_scored(errors: Path, told: Path) -> bool:
+def are_scored(errors: Path, reported: Path) -> bool:
     """Whether the errors of all three are known after the loss, twenty of the companion."""
-    loss = next((line for line in told.read_text().splitlines() if LOST in line), None)
+    loss = next((line for line in reported.read_text().splitlines() if LOST in line), None)
     if loss is None:
         return False
     (path,) = errors.iterdir()
@@ -300,13 +300,13 @@ def test_three_processes_over_tcp_and_udp(entries, tmp_path: Path) -> None:
             time.sleep(0.1)
         with (
             (tmp_path / "shown").open("w") as shown,
-            (tmp_path / "told").open("w") as told,
-            subprocess.Popen(bridge, stdout=shown, stderr=told) as relaying,
+            (tmp_path / "reported").open("w") as reported,
+            subprocess.Popen(bridge, stdout=shown, stderr=reported) as relaying,
         ):
-            while relaying.poll() is None and not are_scored(errors, tmp_path / "told"):
+            while relaying.poll() is None and not are_scored(errors, tmp_path / "reported"):
                 time.sleep(0.1)
             relaying.send_signal(signal.SIGINT)
-            assert relaying.wait(60) == 0, (tmp_path / "told").read_text()
+            assert relaying.wait(60) == 0, (tmp_path / "reported").read_text()
         for process in (companion, autopilot):
             process.send_signal(signal.SIGINT)
             assert process.wait(60) == 0
@@ -315,7 +315,7 @@ def test_three_processes_over_tcp_and_udp(entries, tmp_path: Path) -> None:
     assert "GNSS lost at" in lost["title"]
     rows = {row["source"]: row for row in lost["rows"]}
     assert set(rows) == {AUTOPILOT, COMPANION, RSBN}
-    assert LOST in (tmp_path / "told").read_text()
+    assert LOST in (tmp_path / "reported").read_text()
     lines = Path(found["errors"]).read_text().splitlines()
     assert lines[0].startswith("t_s,source,north_m,east_m,error_m,sigma_m,bound_m,true_lat_deg")
     assert sum(COMPANION in line for line in lines) > 20

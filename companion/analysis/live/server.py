@@ -110,7 +110,7 @@ class LiveView:
         found = find_log(self._path)
         if found is None or (self._source is not None and self._source.path == found):
             return
-        if self._path.is_dir() and not _has_begun(found):
+        if self._path.is_dir() and not _has_header(found):
             return
         live = found.name.endswith(ACTIVE)
         try:
@@ -160,7 +160,7 @@ class LiveView:
             self._clients -= 1
 
 
-def _has_begun(log: Path) -> bool:
+def _has_header(log: Path) -> bool:
     """Whether a log that is being written has its header: no when just created, or closed and renamed."""
     with contextlib.suppress(FileNotFoundError):
         return log.stat().st_size >= FIRST_CHUNK
@@ -262,7 +262,7 @@ def command(path: Path, listen: str, speed: float, foxglove: int | None) -> None
     if int(port) > 65535:
         raise click.BadParameter(f"{listen!r}: {port} is not a port: give 1 to 65535", param_hint="--listen")
     found = find_log(path)
-    if found is not None and path.is_dir() and not _has_begun(found):
+    if found is not None and path.is_dir() and not _has_header(found):
         found = None  # waited for
     if found is not None:
         reject_foreign(found)

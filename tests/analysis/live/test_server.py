@@ -186,8 +186,8 @@ def test_a_log_that_is_closed_while_it_is_looked_for_is_no_end(tmp_path, monkeyp
         assert find_log(tmp_path) is None
     view = LiveView(tmp_path)
     monkeypatch.setattr(server, "find_log", lambda path: gone)
-    for has_begun in (False, True):  # renamed before its size is read, or after it
-        monkeypatch.setattr(server, "_has_begun", lambda log, begun=has_begun: begun)
+    for has_header in (False, True):  # renamed before its size is read, or after it
+        monkeypatch.setattr(server, "_has_header", lambda log, there=has_header: there)
         assert view._step() == b""
 
 
