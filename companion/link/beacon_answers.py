@@ -30,12 +30,16 @@ class BeaconAnswers:
         self._followed: dict[str, tuple[Hashable, int]] = {}  # by source: its receiver, its last answer
         self._waits_ns: dict[Hashable, int] = {}
 
+    def followed(self, source: str, now_ns: int) -> Hashable | None:
+        """Return the receiver whose answers of a source are used, None if it is silent."""
+        receiver, last_ns = self._followed.get(source, (None, now_ns - SILENT_NS))
+        return receiver if now_ns - last_ns < SILENT_NS else None
+
     def refusal(self, receiver: Hashable, source: str, now_ns: int) -> str | None:
         """Return why an answer of a source ("beacon 7", "star 2") is not used, None if it is."""
         if now_ns < self._waits_ns.get(receiver, now_ns) or not self._limiter.take(receiver, now_ns):
             return RATE_REASON
-        holder, last_ns = self._followed.get(source, (receiver, now_ns))
-        if holder != receiver and now_ns - last_ns < SILENT_NS:
+        if self.followed(source, now_ns) not in (None, receiver):
             return f"{source} is received by another receiver"
         if source not in self._followed:  # bounded by the rate of new ones
             self._followed = {s: f for s, f in self._followed.items() if now_ns - f[1] < SILENT_NS}

@@ -47,6 +47,8 @@ FORGET_AFTER = 30 * SECOND_NS
 MAX_REPORTED = 16
 #: The autopilot is lost when nothing was received from it for this time.
 LOST_AFTER = 5 * SECOND_NS
+#: One of several links does not lead while nothing arrives on it for the first, or no answer for the second.
+QUIET_AFTER, UNANSWERED_AFTER = SECOND_NS, 10 * SECOND_NS
 #: A link is reported late, or prompt again, after this time: TIMESYNC has been answered by then.
 LATE_FOR = 2 * SECOND_NS
 STEP = SECOND_NS // 10  # a smaller step of the mapping is that of TIMESYNC on a slow link
@@ -264,6 +266,7 @@ class Session:
         self._choice = AutopilotChoice(autopilot_system)
         self._readers: dict[Hashable, tuple[frame.Reader, int]] = {}  # by peer, and its last accepted frame
         self._last_received = 0  # from the autopilot
+        self._answered = -UNANSWERED_AFTER  # when the autopilot last answered a TIMESYNC
         self._up = False
         self._reported_late = False
         self._changed_at: int | None = None  # since when the lateness differs from the reported one
@@ -304,6 +307,14 @@ class Session:
     def is_confirmed(self) -> bool:
         """Whether the autopilot has streamed navigation messages for some seconds."""
         return self._choice.chosen is not None and self._choice.chosen.is_confirmed
+
+    def is_quiet(self, now_ns: int) -> bool:
+        """Whether nothing of the autopilot arrived for a second."""
+        return now_ns - self._last_received >= QUIET_AFTER
+
+    def is_answered(self, now_ns: int) -> bool:
+        """Whether the autopilot receives us: it answered a TIMESYNC of the last seconds."""
+        return now_ns - self._answered < UNANSWERED_AFTER
 
     def is_promising(self, now_ns: int) -> bool:
         """Whether the autopilot streams navigation messages, or was found too recently to judge."""
@@ -487,6 +498,7 @@ class Session:
 
     def _release(self, before: Candidate, now: int, events: list[Event]) -> None:
         self._up = False
+        self._answered = -UNANSWERED_AFTER
         self.clock.reset()
         self.stream_rates.stop()
         events.append(AutopilotReleased(now, before.system, self.autopilot))
@@ -545,6 +557,7 @@ class Session:
             if limiter.take(now):
                 self.send(dialect.new("TIMESYNC", tc1=max(now, 1), ts1=message.ts1))
         elif from_autopilot:
+            self._answered = now
             before, rate = self.clock.offset(now), self.clock.rate
             self.clock.update_timesync(message.ts1, message.tc1, now)
             if self.clock.rate != rate:

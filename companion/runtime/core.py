@@ -8,9 +8,10 @@
 
 The asyncio service and the virtual-time loopback drive the same object. It holds no navigation state. It
 decides which senders are accepted (one autopilot, any beacon receiver), what is logged and when a solution is
-sent. If several links receive the autopilot, the first one in configuration order leads: frames from the
-other links are only logged, and position messages are sent on the leading link only. What is known of the
-autopilot and of what it was sent is the same whichever link leads.
+sent. If several links receive the autopilot, the first one in configuration order that works in both
+directions leads: what the autopilot sends on the others is only logged, and positions, texts and values are
+sent on the leading link only. What is known of the autopilot and of what it was sent is the same whichever
+link leads.
 """
 
 from __future__ import annotations
@@ -142,9 +143,9 @@ class Link:
         )
         self.sender = Sender(self.session.clock)
         self.pace = Pace()  # of what was asked for on this link
-        self.parameter_check = ParameterCheck()
         self.has_bytes = False  # anything was received, MAVLink or not
-        self.has_station = False  # a ground station was received
+        self.stations: set[int] = set()  # the ground stations received
+        self.standing = 0  # how well it works: 2 in both directions, 1 from the autopilot, 0 it is quiet
         self.bad = 0
         self.not_sent: Counter[str] = Counter()  # messages that did not fit their wire format, by reason
         self.dropped = 0  # frames not sent because the line was too slow; set by the service
@@ -226,6 +227,7 @@ class CompanionCore:
         self._events: list[Event] = []
         self.rejected: Counter[str] = Counter()
         self._origin = OriginCheck(has_pairs=not config.has_own_ins)
+        self._led: Link | None = None  # the leading link of the last poll
         self._last_used: Link | None = None  # whose autopilot's records were used last
         self._booted_ns, self._reboot_seen_on = 0, set[str]()  # the last reboot
         self._pace = Pace(at_least=frozenset({RESET}))
@@ -237,6 +239,7 @@ class CompanionCore:
         self._next_state_ns = 0
         self._stale = False  # no recent solution
         self._inputs = InputMonitor()
+        self._parameter_check = ParameterCheck()
 
     def receive(self, link: str, data: bytes, now_ns: int, peer: Hashable = None) -> Rank:
         """Process bytes received on `link` from `peer`; return how much their sender matters."""
@@ -255,13 +258,11 @@ class CompanionCore:
     @property
     def leading_link(self) -> Link | None:
         """The link whose messages are used and that carries the position messages."""
-        first = None
-        for link in self.links.values():  # called for every message: cheaper than a generator
-            if link.session.is_up:
-                if link.session.is_confirmed:
-                    return link
-                first = first or link
-        return first
+        best, best_rank = None, -1
+        for link in self.links.values():  # called for every message: cheaper than max()
+            if link.session.is_up and (rank := link.standing + 3 * link.session.is_confirmed) > best_rank:
+                best, best_rank = link, rank
+        return best
 
     @property
     def config(self) -> Config:
@@ -291,18 +292,22 @@ class CompanionCore:
         self._lock_links(now_ns)
         for link in self.links.values():
             self._on_events(link, link.session.poll(now_ns), now_ns)
+            is_quiet = link.session.is_quiet(now_ns)
+            link.standing = 0 if is_quiet else 1 + link.session.is_answered(now_ns)
             if link is self.leading_link and self._origin.origin is None and now_ns >= link.origin_request_ns:
                 link.origin_request_ns = now_ns + ORIGIN_REQUEST_INTERVAL
                 self._request_message(link, mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN)
-            for event in link.parameter_check.poll(now_ns):
-                self.report(event.severity, f"{link.name}: {event.text}", now_ns)
-            for message in link.parameter_check.to_send():
-                link.session.send(message)
+        self._report_change_of_lead(now_ns)
+        if (leading := self.leading_link) is not None:
+            for event in self._parameter_check.poll(now_ns):
+                self.report(event.severity, f"{leading.name}: {event.text}", now_ns)
+            for message in self._parameter_check.to_send():
+                leading.session.send(message)
         if now_ns >= self._next_state_ns:
             self._next_state_ns = now_ns + SECOND_NS
             self._request_firmware()
             self._report_staleness(now_ns)
-            if (leading := self.leading_link) is not None:
+            if leading is not None:
                 self._steer(leading, now_ns)
             self._report_missing_inputs(now_ns)
             if self._config.output.status_hz > 0.0:
@@ -359,7 +364,8 @@ class CompanionCore:
                 link.sender = link.sender._replace(autopilot=MAKES.get(event.autopilot, "other"))
                 text = f"{link.name}: autopilot {event.system} connected ({link.sender.autopilot})"
                 self.report(Severity.INFO, text + self._leading_link_note(link), now_ns)
-                link.parameter_check.start(self._config, event.system, event.autopilot)
+                if not self._is_received_elsewhere(link):
+                    self._parameter_check.start(self._config, event.system, event.autopilot)
                 self._lock_links(now_ns)
                 # the origin may have changed during the silence
                 if link is self.leading_link and self._origin.origin is not None:
@@ -377,8 +383,8 @@ class CompanionCore:
                     self._restart(event.system, now_ns)
             elif isinstance(event, Rebooted):
                 link.firmware, link.firmware_requests = None, 0  # a reboot may follow an update
-                link.parameter_check.start(self._config, event.system, link.session.autopilot_type)
                 if self._is_new_reboot(link, now_ns):
+                    self._parameter_check.start(self._config, event.system, link.session.autopilot_type)
                     self.report(Severity.WARNING, f"{link.name}: autopilot {event.system} rebooted", now_ns)
                     self._restart(event.system, now_ns)
             elif isinstance(event, ABOUT_TIME):
@@ -433,17 +439,18 @@ class CompanionCore:
     def _on_message(self, link: Link, event: MessageReceived) -> None:
         msgid, is_used = event.frame.msgid, event.from_autopilot
         if msgid in MEASUREMENTS:
-            is_used = self._is_duplicate(link) or self._is_answer_used(link, event)
+            is_used = self._is_answer_used(link, event)
         if is_used or self._may_log_unused(link, event):
             self._log.frame(link.name, False, event.frame.raw, event.received_ns)
         if msgid not in HANDLED:  # most of a stock stream: never decoded
             return
         if msgid == mavlink.MAVLINK_MSG_ID_HEARTBEAT:
-            link.has_station |= event.message.type == mavlink.MAV_TYPE_GCS
+            if event.message.type == mavlink.MAV_TYPE_GCS:
+                link.stations.add(event.frame.system)
         elif msgid in REQUESTS:
-            link.has_station = True
-            feeds = link is self.leading_link
-            replies, changes = self._services.receive(event, link.session.system, link.name, feeds)
+            link.stations.add(event.frame.system)
+            is_fed = link.session.is_up
+            replies, changes = self._services.receive(event, link.session.system, link.name, is_fed)
             for reply in replies:
                 link.session.send(reply)
             for _, parameter, old, new in changes:
@@ -456,7 +463,7 @@ class CompanionCore:
                 for each in self.links.values():
                     each.session.set_rates(requested_rates(config), event.received_ns)
                 self._on_record(Tuning(event.received_ns, event.received_ns, to_toml(config)))
-        is_duplicate = self._is_duplicate(link)
+        is_duplicate = self._is_duplicate(link) and msgid not in MEASUREMENTS
         if msgid in ABOUT_SOURCE_SET and link.session.is_up and not (event.from_autopilot and is_duplicate):
             system = link.session.autopilot or 0
             self._output.handle_message(event.message, event.from_autopilot, system, event.received_ns)
@@ -465,10 +472,10 @@ class CompanionCore:
             return
         if msgid == mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION:
             link.firmware = firmware_of(event.message)
-        if msgid in PARAMETERS:
-            link.parameter_check.receive(event.message, event.frame)
         if is_duplicate:
             return
+        if msgid in PARAMETERS:
+            self._parameter_check.receive(event.message, event.frame)
         ours = (0, self._config.link.component_id)  # 0: the sender states no target
         if msgid == mavlink.MAVLINK_MSG_ID_COMMAND_ACK and event.message.target_component in ours:
             command, result = event.message.command, event.message.result
@@ -483,7 +490,15 @@ class CompanionCore:
             self._last_used = link if event.from_autopilot else self._last_used
             is_rejected = self._on_record(record)
             if is_rejected and msgid in MEASUREMENTS:
-                self._answers.note_rejected(_receiver_of(event), event.received_ns)
+                self._answers.note_rejected(_receiver_of(link, event), event.received_ns)
+
+    def _is_received_elsewhere(self, link: Link) -> bool:
+        """Whether another link receives the same autopilot."""
+        system = link.session.autopilot
+        return any(
+            other is not link and other.session.is_up and other.session.autopilot == system
+            for other in self.links.values()
+        )
 
     def _is_duplicate(self, link: Link) -> bool:
         """Whether the leading link receives the same messages."""
@@ -492,7 +507,11 @@ class CompanionCore:
     def _is_answer_used(self, link: Link, event: MessageReceived) -> bool:
         name = MEASUREMENTS[event.frame.msgid]
         source = f"{name.removesuffix('_id')} {getattr(event.message, name)}"
-        why = self._answers.refusal(_receiver_of(event), source, event.received_ns)
+        receiver = _receiver_of(link, event)
+        followed: Any = self._answers.followed(source, event.received_ns)
+        if followed is not None and followed[0] != link.name and followed[2:] == receiver[2:]:
+            return False  # the same answers on a second link
+        why = self._answers.refusal(receiver, source, event.received_ns)
         if why is not None:
             self.rejected["beacon answers not used"] += 1
             sender = f"{event.frame.system}/{event.frame.component}"
@@ -565,8 +584,8 @@ class CompanionCore:
                 fed[message.get_type()] = message
             self._steer(leading, solution.rx_ns)
         for link in self.links.values():
-            if link.session.is_up or link.has_station:
-                self._send_streams(link, {} if link is leading else fed, solution.t_ns)
+            if link.session.is_up or link.stations:
+                self._send_streams(link, {} if link.session.is_up else fed, solution.t_ns)
 
     def _send_streams(self, link: Link, fed: dict[str, Any], t_ns: int) -> None:
         """Send what is due of the status, and of copies of the messages `fed`, as asked for on the link."""
@@ -576,9 +595,14 @@ class CompanionCore:
             link.session.send(self._latest_status() if name == STATUS else fed[name])
 
     def _broadcast(self, message: Any) -> None:
-        """Send on every link with an autopilot or a ground station."""
+        """Send to the autopilot, which forwards it, and to the ground stations that it does not reach."""
+        leading = self.leading_link
         for link in self.links.values():
-            if link.session.is_up or link.has_station:
+            if self._is_duplicate(link) and leading is not None:
+                is_addressed = bool(link.stations - leading.stations)
+            else:
+                is_addressed = link.session.is_up or bool(link.stations)
+            if is_addressed:
                 link.session.send(message)
 
     def _steer(self, link: Link, now_ns: int) -> None:
@@ -639,9 +663,7 @@ class CompanionCore:
             events = self._inputs.update(leading.session, self._config, leading.sender.autopilot, now_ns)
         else:
             silent = [
-                (name, link.session, link.has_bytes)
-                for name, link in self.links.items()
-                if not link.has_station
+                (name, link.session, link.has_bytes) for name, link in self.links.items() if not link.stations
             ]
             events = self._inputs.report_silence(silent, now_ns)
         for event in events:
@@ -651,6 +673,17 @@ class CompanionCore:
         """Return the state for the status line."""
         connected = self.leading_link is not None
         return Status.of(self._solution, connected, self._stale, self._inputs.missing, self._inputs.slow)
+
+    def _report_change_of_lead(self, now_ns: int) -> None:
+        """Report that another link leads; lost and regained autopilots are reported as such."""
+        before, leading = self._led, self.leading_link
+        self._led = leading
+        if before is None or leading in (None, before) or not before.session.is_up:
+            return
+        is_deaf = leading.standing > before.standing > 0
+        severity = Severity.WARNING if is_deaf else Severity.DEBUG
+        why = f": the autopilot does not answer on {before.name}" if is_deaf else ""
+        self.report(severity, f"{leading.name} leads{why}", now_ns)
 
     def _leading_link_note(self, link: Link) -> str:
         leading = self.leading_link
@@ -700,6 +733,6 @@ def _rate_text(rate: float) -> str:
     return f"runs {rate:g} times as fast as ours: the simulation is too slow for its computer"
 
 
-def _receiver_of(event: MessageReceived) -> Hashable:
-    """Return the RSBN receiver that sent a message."""
-    return event.peer, event.frame.system, event.frame.component
+def _receiver_of(link: Link, event: MessageReceived) -> tuple[str, Hashable, int, int]:
+    """Return the RSBN receiver that sent a message, with its way to us."""
+    return link.name, event.peer, event.frame.system, event.frame.component

@@ -86,13 +86,13 @@ class GroundStationServices:
         return {dialect.TYPES[msgid].name: us * NANO_PER_MICRO for msgid, us in asked if us > 0}
 
     def receive(
-        self, event: MessageReceived, system: int, link: str, feeds: bool
+        self, event: MessageReceived, system: int, link: str, is_fed: bool
     ) -> tuple[list[Any], list[ParameterChanged]]:
         """Process a message; return replies for its link, and the parameters that it changed.
 
-        `feeds`: the link has the autopilot that is fed.
+        `is_fed`: the link has the autopilot that is fed.
         """
-        fixed = _fed_us(self._output) if feeds else {}
+        fixed = _fed_us(self._output) if is_fed else {}
         if self._output.status_hz > 0.0:
             fixed[mavlink.MAVLINK_MSG_ID_NAMED_VALUE_FLOAT] = NAMED_VALUES_US
         server = self._server(link)

@@ -18,7 +18,7 @@ from companion.records import Event, Severity
 
 
 class ParameterCheck:
-    """Parameter check of one link's autopilot."""
+    """Parameter check of the autopilot."""
 
     def __init__(self) -> None:
         self._client: ParameterClient | None = None

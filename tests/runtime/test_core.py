@@ -22,6 +22,7 @@ from companion.records import (
     Rejection,
     Reset,
     RsbnFix,
+    Severity,
     Solution,
     Stamped,
     Truth,
@@ -123,6 +124,9 @@ class Flight:
         self.send("GPS_GLOBAL_ORIGIN", latitude=lat, longitude=lon, altitude=round(ORIGIN.alt * 1e3))
 
     def rsbn(self, component: int = 1, **changes: object) -> None:
+        self.receive(self.rsbn_frame(component, **changes))
+
+    def rsbn_frame(self, component: int = 1, **changes: object) -> bytes:
         true = slant_range_azimuth(BEACON, self.place())
         values = {
             "time_usec": (self.now - self.boot) // 1000,
@@ -136,7 +140,7 @@ class Flight:
             "beacon_id": 1,
             "status": 3,
         }
-        self.send("RSBN_MEASUREMENT", component=component, **(values | changes))
+        return self.frame("RSBN_MEASUREMENT", component=component, **(values | changes))
 
     def times_sent(self, name: str) -> list[int]:
         return [at for at, message in self.sent if message.get_type() == name]
@@ -237,12 +241,16 @@ def event_texts(flight: Flight) -> list[str]:
 
 
 class TwoLinks(Flight):
-    """The same autopilot on a second, delayed link; the first link can be cut."""
+    """The same autopilot on a second, delayed link; the first can be cut.
 
-    def __init__(self, late: int) -> None:
+    TIMESYNC is answered on the links `answering`.
+    """
+
+    def __init__(self, late: int, *answering: str) -> None:
         super().__init__("main", "radio")
-        self.late, self.cut = late, False
+        self.late, self.cut, self.answering = late, False, set(answering)
         self.steered: Counter[str] = Counter()
+        self.texts: Counter[tuple[str, str]] = Counter()  # by link and text
         self._way: list[tuple[int, bytes]] = []
 
     def receive(self, data: bytes) -> None:
@@ -252,8 +260,16 @@ class TwoLinks(Flight):
         while self._way and self._way[0][0] <= self.now:
             self.core.receive("radio", self._way.pop(0)[1], self.now)
         for name in ("main", "radio"):
-            for message in decoded(self.core.to_send(name, self.now)):
-                self.steered[name] += message.get_type() == "ODOMETRY"
+            self.answer(name)
+
+    def answer(self, name: str) -> None:
+        for message in decoded(self.core.to_send(name, self.now)):
+            self.steered[name] += message.get_type() == "ODOMETRY"
+            if message.get_type() == "STATUSTEXT":
+                self.texts[name, message.text] += 1
+            if message.get_type() == "TIMESYNC" and not message.tc1 and name in self.answering:
+                reply = self.frame("TIMESYNC", tc1=self.now - self.boot, ts1=message.ts1)
+                self.core.receive(name, reply, self.now)
 
     def collect(self) -> None:
         pass
@@ -285,6 +301,75 @@ def test_second_link_leads_while_the_first_is_silent() -> None:
     flight.fly(10.0)
     assert flight.steered["main"] - before["main"] >= 45
     assert not flight.log.of(Reset)
+
+
+def test_second_link_leads_before_the_loss_of_the_first_is_noticed() -> None:
+    flight = TwoLinks(20 * MS)
+    flight.fly(60.0)
+    flight.cut = True
+    flight.fly(4.0)
+    assert flight.steered["radio"] >= 9
+    texts = event_texts(flight)
+    assert not any("silent" in text or "no solution" in text for text in texts)
+    times = [s.rx_ns for s in flight.log.of(Solution)]
+    assert max(np.diff(times)) <= 2 * SECOND
+
+
+def test_a_link_on_which_the_autopilot_does_not_answer_does_not_lead() -> None:
+    flight = TwoLinks(20 * MS, "main", "radio")
+    flight.fly(20.0)
+    assert flight.steered["radio"] == 0
+    flight.answering.remove("main")
+    flight.fly(12.0)
+    before = flight.steered.copy()
+    flight.fly(10.0)
+    assert flight.steered["main"] == before["main"]
+    assert event_texts(flight)[-1] == "radio leads: the autopilot does not answer on main"
+    assert flight.steered["radio"] - before["radio"] >= 45
+    flight.answering.add("main")
+    flight.fly(3.0)
+    before = flight.steered.copy()
+    flight.fly(10.0)
+    assert flight.steered["radio"] == before["radio"] and not flight.log.of(Reset)
+
+
+@pytest.mark.parametrize("names", [("radio",), ("main", "radio")])
+def test_a_beacon_is_used_on_any_link_and_once(names: tuple[str, ...]) -> None:
+    alone, both = Flight(), TwoLinks(0)
+    for _ in range(20):
+        alone.fly(1.0)
+        alone.rsbn(component=77)
+        both.fly(1.0)
+        data = both.rsbn_frame(component=77)
+        for name in names:
+            both.core.receive(name, data, both.now)
+    assert len(both.log.of(RsbnFix)) == 20 and not both.log.of(Rejection)
+    assert not any("not used" in text for text in event_texts(both))
+    assert both.log.of(Solution) == alone.log.of(Solution)
+
+
+def test_a_text_goes_out_once_on_the_way_to_each_station() -> None:
+    flight = TwoLinks(0)
+    flight.fly(30.0)
+    station = Station(flight, "radio")
+    for name in ("main", "radio"):  # one that the autopilot forwards
+        Station(flight, name).send("HEARTBEAT", type=6, autopilot=8)
+    flight.texts.clear()
+    flight.core.report(Severity.INFO, "a", flight.now)
+    flight.fly(1.0)
+    assert flight.texts == {("main", "a"): 1}
+    data = frame.encode(dialect.new("HEARTBEAT", type=6, autopilot=8), 1, 254, 190)
+    flight.core.receive("radio", data, flight.now)  # one that only the second link has
+    flight.core.report(Severity.INFO, "b", flight.now)
+    flight.fly(1.0)
+    assert flight.texts["main", "b"] == flight.texts["radio", "b"] == 1
+    assert station.send("PING", time_usec=7)
+
+
+def test_parameters_are_checked_once_for_two_links() -> None:
+    flight = TwoLinks(0)
+    flight.fly(60.0)
+    assert sum("run companion doctor" in text for text in event_texts(flight)) == 1
 
 
 @pytest.mark.parametrize("late", [0, 2 * SECOND])
