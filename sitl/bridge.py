@@ -301,15 +301,8 @@ class Bridge:
         return "px4" if self._sender.autopilot == "px4" else "ardupilot"
 
     def _ask_for_origin(self) -> None:
-        self._session.send(
-            dialect.new(
-                "COMMAND_LONG",
-                target_system=self._session.autopilot or 0,
-                target_component=mavlink.MAV_COMP_ID_AUTOPILOT1,
-                command=mavlink.MAV_CMD_REQUEST_MESSAGE,
-                param1=mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN,
-            )
-        )
+        msgid = mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN
+        self._session.send_command(mavlink.MAV_CMD_REQUEST_MESSAGE, param1=msgid)
 
     def _is_due(self, due: list[tuple[int, bool]], now_ns: int) -> bool:
         return self.connected_ns is not None and bool(due) and now_ns >= self.connected_ns + due[0][0]

@@ -135,7 +135,7 @@ class Examination:
             if self._origin is None:
                 self._request_message(mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN)
             if self.make == "ardupilot" and not self._arming_checks and not self._identity().is_armed:
-                self._command(mavlink.MAV_CMD_RUN_PREARM_CHECKS, 0)
+                self.session.send_command(mavlink.MAV_CMD_RUN_PREARM_CHECKS)
         if self._client is None and (self._version is not None or now_ns - self._start >= VERSION_TIMEOUT):
             self._begin_reading()
         if self._client is not None:
@@ -222,18 +222,7 @@ class Examination:
             self._client.read(p.name for p in self._limits)
 
     def _request_message(self, msgid: int) -> None:
-        self._command(mavlink.MAV_CMD_REQUEST_MESSAGE, msgid)
-
-    def _command(self, command: int, param1: float) -> None:
-        self.session.send(
-            dialect.new(
-                "COMMAND_LONG",
-                target_system=self.session.autopilot or 0,
-                target_component=mavlink.MAV_COMP_ID_AUTOPILOT1,
-                command=command,
-                param1=param1,
-            )
-        )
+        self.session.send_command(mavlink.MAV_CMD_REQUEST_MESSAGE, param1=msgid)
 
     # -- findings -------------------------------------------------------------------------------------------
 

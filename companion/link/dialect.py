@@ -173,6 +173,14 @@ def new(name: str, /, **values: Any) -> Message:
     return message
 
 
+def command_long(system: int, command: int, **parameters: float | None) -> Message:
+    """Create COMMAND_LONG to the autopilot of `system`; `command` is MAV_CMD."""
+    component = mavlink.MAV_COMP_ID_AUTOPILOT1
+    return new(
+        "COMMAND_LONG", target_system=system, target_component=component, command=command, **parameters
+    )
+
+
 def decode(frame: Framed) -> Message:
     """Decode the message of a frame; a payload shorter than the message is padded with zeros.
 

@@ -417,7 +417,8 @@ class Session:
         if due := self.stream_rates.due(now_ns):
             self._unanswered = [msgid for msgid, _ in due]
         for msgid, rate_hz in due:
-            self._request_rate(msgid, rate_hz)
+            parameters = {"param1": msgid, "param2": 1e6 / rate_hz}
+            self.send_command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, **parameters)
         return events
 
     def deadline(self) -> int:
@@ -439,6 +440,10 @@ class Session:
             return
         self._send_queue.append(data)
         self._sequence = self._sequence + 1 & 0xFF
+
+    def send_command(self, command: int, **parameters: float) -> None:
+        """Queue COMMAND_LONG to the autopilot."""
+        self.send(dialect.command_long(self.autopilot or 0, command, **parameters))
 
     def to_send(self) -> list[bytes]:
         """Return and clear the queued frames, oldest first."""
@@ -568,18 +573,6 @@ class Session:
                 events.append(TimesyncOutlier(now, found.system, error))
             elif by > JUMP:
                 events.append(ClockJump(now, found.system, -by))  # the clock stopped, or was set back
-
-    def _request_rate(self, msgid: int, rate_hz: float) -> None:
-        self.send(
-            dialect.new(
-                "COMMAND_LONG",
-                target_system=self.autopilot or 0,
-                target_component=_AUTOPILOT_COMPONENT,
-                command=mavlink.MAV_CMD_SET_MESSAGE_INTERVAL,
-                param1=msgid,
-                param2=1e6 / rate_hz,
-            )
-        )
 
 
 def _by_id(rates_hz: Mapping[str, float]) -> dict[int, float]:

@@ -22,8 +22,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from companion.estimate.bank.settings import DEFAULT
-from companion.link import dialect
-from companion.link.dialect import Message, mavlink
+from companion.link.dialect import Message, command_long, mavlink
 from companion.output.beacon_witness import BeaconWitness
 from companion.records import Event, Gnss, RsbnFix, Severity, Solution
 from companion.units import SECOND_NS
@@ -108,10 +107,6 @@ class Predicate(NamedTuple):
     name: str
     holds: Callable[[Situation], bool]
     reason: str
-
-
-def _command(system: int, command: int, **fields: float | None) -> Message:
-    return dialect.new("COMMAND_LONG", target_system=system, target_component=1, command=command, **fields)
 
 
 def is_held_false(s: Situation) -> bool:
@@ -336,7 +331,7 @@ class SourceSwitch:
         self._unconfirmed[self._wanted] = now_ns
         confirmation, self._tries = self._tries, self._tries + 1
         parameters = self.parameters(self._wanted)
-        return [*asked, _command(system, self.command, confirmation=confirmation, **parameters)]
+        return [*asked, command_long(system, self.command, confirmation=confirmation, **parameters)]
 
     def _to_ask(self, system: int, now_ns: int) -> list[Message]:
         """Request the receiver's message where it has not come for a second."""
@@ -345,7 +340,7 @@ class SourceSwitch:
             return []
         self._asked_ns = now_ns
         number = (mavlink.MAVLINK_MSG_ID_GPS_RAW_INT, mavlink.MAVLINK_MSG_ID_GPS2_RAW)[self._receiver > 0]
-        return [_command(system, mavlink.MAV_CMD_REQUEST_MESSAGE, param1=number)]
+        return [command_long(system, mavlink.MAV_CMD_REQUEST_MESSAGE, param1=number)]
 
     def _is_again_due(self, now_ns: int) -> bool:
         """Whether a command that nobody answered is to be tried again."""

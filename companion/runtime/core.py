@@ -25,7 +25,6 @@ import msgspec
 from companion.config import Config, ConfigError, to_toml
 from companion.config.profiles import MESSAGES, RESET
 from companion.config.validate import find_conflicts
-from companion.link import dialect
 from companion.link.beacon_answers import BeaconAnswers
 from companion.link.clock import MAX_LATENESS
 from companion.link.decode import DECODED, MAKES, Sender, decode
@@ -697,15 +696,7 @@ class CompanionCore:
                 self._request_message(link, mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION)
 
     def _request_message(self, link: Link, msgid: int) -> None:
-        link.session.send(
-            dialect.new(
-                "COMMAND_LONG",
-                target_system=link.session.autopilot or 0,
-                target_component=1,
-                command=mavlink.MAV_CMD_REQUEST_MESSAGE,
-                param1=msgid,
-            )
-        )
+        link.session.send_command(mavlink.MAV_CMD_REQUEST_MESSAGE, param1=msgid)
 
     def _link_state(self, link: Link, now_ns: int) -> LinkState:
         clock = link.session.clock
