@@ -126,9 +126,7 @@ def _preset(name: str | None) -> Mapping[str, Any]:
     if name is None:
         return {}
     if name not in PRESETS:
-        close = difflib.get_close_matches(name, PRESETS, 1, 0.4)
-        nearest = f"; did you mean `{close[0]}`?" if close else ""
-        raise ConfigError(f"--preset {name}: not one of {', '.join(PRESETS)}{nearest}")
+        raise ConfigError(f"--preset {name}: not one of {', '.join(PRESETS)}{_did_you_mean(name, PRESETS)}")
     return PRESETS[name].values
 
 
@@ -187,9 +185,13 @@ def _check_keys(tree: Mapping[str, Mapping[str, Any]], where: str) -> None:
                 raise ConfigError(f"{where}: section [{section}] has no key `{key}`{_nearest(key, keys)}")
 
 
+def _did_you_mean(name: str, known: Iterable[str], cutoff: float = 0.4) -> str:
+    close = difflib.get_close_matches(name, list(known), 1, cutoff)
+    return f"; did you mean `{close[0]}`?" if close else ""
+
+
 def _nearest(name: str, known: tuple[str, ...]) -> str:
-    close = difflib.get_close_matches(name, known, 1, 0.4)
-    return f"; did you mean `{close[0]}`?" if close else f"; it has {', '.join(known)}"
+    return _did_you_mean(name, known) or f"; it has {', '.join(known)}"
 
 
 def _sections_of(key: str) -> str:
@@ -203,8 +205,7 @@ def _sections_of(key: str) -> str:
 def _nearest_variable(name: str) -> str:
     tables = {section: type(getattr(Config(), section)) for section in Config.__struct_fields__}
     known = [f"{PREFIX}{s}__{key}".upper() for s, table in tables.items() for key in table.__struct_fields__]
-    close = difflib.get_close_matches(name, known, 1, 0.6)
-    return f"; did you mean `{close[0]}`?" if close else f"; write it as {PREFIX}SECTION__KEY"
+    return _did_you_mean(name, known, 0.6) or f"; write it as {PREFIX}SECTION__KEY"
 
 
 def _parse_value(text: str) -> Any:
@@ -220,12 +221,12 @@ def _as_list(value: Any, kind: Any) -> Any:
     return [value] if get_origin(kind) is tuple and not isinstance(value, list | tuple) else value
 
 
-def _choices(kind: Any) -> tuple[str, ...]:
+def choices(kind: Any) -> tuple[str, ...]:
     """Return the texts that a key accepts; empty if it accepts other values too."""
     if get_origin(kind) is Literal:
         return get_args(kind)
     if get_origin(kind) in (Union, UnionType, tuple):
-        return tuple(word for one in get_args(kind) for word in _choices(one))
+        return tuple(word for one in get_args(kind) for word in choices(one))
     return ()
 
 
@@ -266,12 +267,10 @@ def _convert(tree: Mapping[str, Mapping[str, Any]], origin: Mapping[tuple[str, s
             except msgspec.ValidationError as error:
                 reason = str(error).split(" - at ")[0].replace("`", "")
                 where = origin[section, key]
-                if choices := _choices(hints[key]):
-                    close = difflib.get_close_matches(str(value), choices, 1, 0.4)
-                    nearest = f"; did you mean `{close[0]}`?" if close else ""
+                if words := choices(hints[key]):
                     raise ConfigError(
-                        f"{where}: {section}.{key}: {value!r} is not one of {', '.join(choices)}"
-                        f"{_or_number(hints[key])}{nearest}"
+                        f"{where}: {section}.{key}: {value!r} is not one of {', '.join(words)}"
+                        f"{_or_number(hints[key])}{_did_you_mean(str(value), words)}"
                     ) from None
                 wanted = _wanted(hints[key], value) or f"{reason[0].lower()}{reason[1:]}"
                 raise ConfigError(f"{where}: {section}.{key} = {value!r} is invalid: {wanted}") from None

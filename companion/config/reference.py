@@ -11,11 +11,11 @@ from __future__ import annotations
 import inspect
 import textwrap
 from collections.abc import Iterator
-from types import UnionType
-from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, NamedTuple, get_args, get_origin, get_type_hints
 
 import msgspec
 
+from companion.config.load import choices
 from companion.config.presets import PRESETS
 from companion.config.schema import Config
 
@@ -261,7 +261,6 @@ TEXTS: dict[str, dict[str, tuple[str, str]]] = {
 UNITS = {
     "_deg_sqrt_h": "deg/sqrt(h)",
     "_m_s_sqrt_s": "m/s/sqrt(s)",
-    "_m_s_min": "m/s per min",
     "_per_hour": "1/h",
     "_per_s": "1/s",
     "_percent": "%",
@@ -376,13 +375,13 @@ def _toml(value: Any) -> str:
 def _allowed(kind: Any) -> str:
     """Describe the values that a type accepts, without its unit."""
     if get_origin(kind) is Annotated:
-        base, *metas = get_args(kind)
-        return _bounds([meta for meta in metas if isinstance(meta, msgspec.Meta)]) or _allowed(base)
+        low, high = _limits(kind)
+        return f"at least {low:g}" if high is None else f"{low:g} to {high:g}"
     if get_origin(kind) is tuple:
         inner = _allowed(get_args(kind)[0])
         return f"list{f', each {inner}' if inner else ''}"
-    if choices := _choices(kind):
-        return ", ".join(choices)
+    if words := choices(kind):
+        return ", ".join(words)
     return {bool: "true or false", str: "text"}.get(kind, "")
 
 
@@ -390,35 +389,8 @@ def _limits(kind: Any) -> tuple[float | None, float | None]:
     """Return the least and the greatest value of a number."""
     if kind is bool:
         return 0.0, 1.0
-    metas = [meta for meta in getattr(kind, "__metadata__", ()) if isinstance(meta, msgspec.Meta)]
-    low = next((m.ge if m.ge is not None else m.gt for m in metas), None)
-    high = next((m.le if m.le is not None else m.lt for m in metas), None)
-    return low, high
-
-
-def _choices(kind: Any) -> tuple[str, ...]:
-    if get_origin(kind) is Literal:
-        return get_args(kind)
-    if get_origin(kind) in (Union, UnionType):
-        return tuple(choice for one in get_args(kind) for choice in _choices(one))
-    return ()
-
-
-def _bounds(metas: list[msgspec.Meta]) -> str:
-    """Describe numeric limits; an upper limit of 1e9 only excludes the absurd and is not shown."""
-    low = high = ""
-    for meta in metas:
-        if meta.ge is not None:
-            low = f"at least {meta.ge:g}"
-        elif meta.gt is not None:
-            low = f"above {meta.gt:g}"
-        if meta.le is not None and meta.le < 1e9:
-            high = f"at most {meta.le:g}"
-        elif meta.lt is not None and meta.lt < 1e9:
-            high = f"below {meta.lt:g}"
-    if low.startswith("at least") and high.startswith("at most"):
-        return f"{low.split()[-1]} to {high.split()[-1]}"
-    return ", ".join(part for part in (low, high) if part)
+    (limit,) = getattr(kind, "__metadata__", (msgspec.Meta(),))
+    return limit.ge, limit.le
 
 
 if __name__ == "__main__":

@@ -1,5 +1,7 @@
 """Configuration schema: one frozen structure per section of the file, with the unit in every key.
 
+The meaning of each key, and when to change it, is in `reference`.
+
 Every number has a physical minimum and maximum, because ground stations may set it: whatever passes can be
 computed with for hours of flight, and fits the messages that carry it. `validate` adds the limits that a
 single interval cannot express.
@@ -31,10 +33,10 @@ class Section(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class LinkConfig(Section, frozen=True):
     """Links to the autopilot, and our MAVLink identity."""
 
-    connect: tuple[str, ...] = ("udpin:127.0.0.1:14550",)  # one address per link; see `companion run --help`
-    system_id: Annotated[int, Meta(ge=0, le=255)] = 0  # 0: use the autopilot's
-    parameters_file: str = ""  # values set by ground stations are saved here and loaded at the next start
-    component_id: NodeId = 191  # MAV_COMP_ID_ONBOARD_COMPUTER; 197 is visual-inertial odometry
+    connect: tuple[str, ...] = ("udpin:127.0.0.1:14550",)
+    system_id: Annotated[int, Meta(ge=0, le=255)] = 0
+    parameters_file: str = ""
+    component_id: NodeId = 191
 
 
 class RatesConfig(Section, frozen=True):
@@ -43,7 +45,7 @@ class RatesConfig(Section, frozen=True):
     local_position_hz: RateHz = 10.0
     gnss_hz: RateHz = 5.0
     attitude_hz: RateHz = 10.0
-    imu_hz: RateHz = 20.0  # ArduPilot denies more than 0.8 of SCHED_LOOP_RATE, which is 50 on planes
+    imu_hz: RateHz = 20.0
     air_data_hz: RateHz = 5.0
     status_hz: RateHz = 1.0
     truth_hz: RateHz = 0.0
@@ -75,7 +77,7 @@ class InertialConfig(Section, frozen=True):
     accelerometer_scale_ppm: Annotated[float, Meta(ge=0.0, le=100000.0)] = 50.0
     height_sigma_m: Annotated[float, Meta(ge=0.1, le=10000.0)] = 20.0
     correctors: tuple[Literal["airspeed", "hyperbolic", "stars", "second_ins"], ...] = ()
-    strapped_down: bool = True  # the sensors turn with the aircraft; false: gimballed platform
+    strapped_down: bool = True
 
 
 class AirDataConfig(Section, frozen=True):
@@ -92,13 +94,13 @@ class AirDataConfig(Section, frozen=True):
 
     wind_m_s: Annotated[float, Meta(ge=0.1, le=100.0)] = 8.0
     wind_change_m_s_sqrt_s: Annotated[float, Meta(ge=0.0001, le=10.0)] = 0.05
-    wind_jump_m_s: Annotated[float, Meta(ge=0.1, le=100.0)] = 6.0  # of wind jumps, north and east
+    wind_jump_m_s: Annotated[float, Meta(ge=0.1, le=100.0)] = 6.0
     wind_jumps_per_hour: Annotated[float, Meta(ge=0.001, le=60.0)] = 10.0
     gust_m_s: Annotated[float, Meta(ge=0.01, le=50.0)] = 1.2
     gust_s: Annotated[float, Meta(ge=0.01, le=60.0)] = 1.0
     airspeed_percent: Annotated[float, Meta(ge=0.1, le=50.0)] = 3.0
     heading_deg: Annotated[float, Meta(ge=0.05, le=45.0)] = 1.5
-    correlation_min: Annotated[float, Meta(ge=0.1, le=1000.0)] = 10.0  # of airspeed and heading errors
+    correlation_min: Annotated[float, Meta(ge=0.1, le=1000.0)] = 10.0
     crab_deg: Annotated[float, Meta(ge=0.05, le=45.0)] = 2.0
     crab_s: Annotated[float, Meta(ge=0.5, le=600.0)] = 20.0
     rotor_drag_per_s: Annotated[float, Meta(ge=0.0, le=5.0)] = 0.23
@@ -118,10 +120,10 @@ class StrapdownConfig(Section, frozen=True):
     noise; `velocity_noise_m_s_sqrt_s` is what neither shows.
     """
 
-    imu: Annotated[int, Meta(ge=0, le=2)] = 0  # index of the IMU
+    imu: Annotated[int, Meta(ge=0, le=2)] = 0
     tilt_deg: Annotated[float, Meta(ge=0.01, le=30.0)] = 2.0
     tilt_s: Annotated[float, Meta(ge=1.0, le=3600.0)] = 30.0
-    accelerometer_m_s2: Annotated[float, Meta(ge=0.0001, le=10.0)] = 0.1  # including misalignment
+    accelerometer_m_s2: Annotated[float, Meta(ge=0.0001, le=10.0)] = 0.1
     velocity_noise_m_s_sqrt_s: Annotated[float, Meta(ge=1e-6, le=10.0)] = 0.15
 
 
@@ -132,18 +134,14 @@ class GnssConfig(Section, frozen=True):
     the inertial errors, plus white noise of a third of that, or more if the receiver states more.
     """
 
-    receiver: Annotated[int, Meta(ge=0, le=1)] = (
-        0  # GPS_RAW_INT is 0, GPS2_RAW is 1; the receiver that GPS_INPUT feeds is not allowed
-    )
+    receiver: Annotated[int, Meta(ge=0, le=1)] = 0
     second_receiver: bool = True
     sigma_m: Annotated[float, Meta(ge=0.01, le=1000.0)] = 2.0
     sigma_velocity_m_s: Annotated[float, Meta(ge=0.001, le=100.0)] = 0.1
     correlation_s: Annotated[float, Meta(ge=1.0, le=10000.0)] = 60.0
-    every_s: Annotated[float, Meta(ge=0.0, le=60.0)] = 0.5  # minimum interval between fixes that are used
+    every_s: Annotated[float, Meta(ge=0.0, le=60.0)] = 0.5
     use_velocity: bool = True
-    latency_s: Annotated[float, Meta(ge=0.0, le=2.0)] = (
-        0.0  # age of a fix at its timestamp; `companion report` estimates it
-    )
+    latency_s: Annotated[float, Meta(ge=0.0, le=2.0)] = 0.0
     timeout_s: Annotated[float, Meta(ge=0.5, le=600.0)] = 3.0
 
 
@@ -153,9 +151,7 @@ class RsbnConfig(Section, frozen=True):
     sigma_azimuth_deg: Annotated[float, Meta(ge=0.001, le=20.0)] = 0.125
     sigma_range_m: Annotated[float, Meta(ge=0.1, le=10000.0)] = 100.0
     sigma_range_percent: Annotated[float, Meta(ge=0.0, le=10.0)] = 0.015
-    bias_azimuth_deg: Annotated[float, Meta(ge=0.001, le=20.0)] = (
-        0.1  # constant errors, estimated while other sources are available
-    )
+    bias_azimuth_deg: Annotated[float, Meta(ge=0.001, le=20.0)] = 0.1
     bias_range_m: Annotated[float, Meta(ge=0.1, le=10000.0)] = 50.0
     timeout_s: Annotated[float, Meta(ge=0.5, le=600.0)] = 10.0
 
@@ -166,9 +162,7 @@ class PredictorConfig(Section, frozen=True):
     window_min: Annotated[float, Meta(ge=1.0, le=60.0)] = 25.0
     bin_s: Annotated[float, Meta(ge=0.1, le=60.0)] = 10.0
     ahead_min: tuple[Annotated[float, Meta(ge=0.1, le=120.0)], ...] = (1.0, 5.0, 10.0, 20.0)
-    limit_m: Annotated[float, Meta(ge=1.0, le=1000000.0)] = (
-        5000.0  # with a greater guaranteed bound the position is untrusted
-    )
+    limit_m: Annotated[float, Meta(ge=1.0, le=1000000.0)] = 5000.0
 
 
 class EstimatorConfig(Section, frozen=True):
@@ -200,7 +194,7 @@ class IntegrityConfig(Section, frozen=True):
     below `alert_m` and no source is suspect; it improves after `settle_s` without interruption.
     """
 
-    rows: Annotated[int, Meta(ge=8, le=192)] = 96  # hypotheses followed at once
+    rows: Annotated[int, Meta(ge=8, le=192)] = 96
     risk: Annotated[float, Meta(ge=1e-12, le=0.5)] = 1e-8  # below the prior of one onset
     alert_m: Annotated[float, Meta(ge=1.0, le=100000.0)] = 500.0
     settle_s: Annotated[float, Meta(ge=0.0, le=600.0)] = 10.0
@@ -215,17 +209,13 @@ class OutputConfig(Section, frozen=True):
 
     profile: Name = "monitor"
     via: Literal["auto"] | Via = "auto"
-    switch_sources: bool = True  # ardupilot: EKF source set 2 while GNSS is lost; px4: GNSS off while false
-    solution_hz: Annotated[float, Meta(ge=0.1, le=50.0)] = (
-        5.0  # minimum; at least the rate of the fastest message
-    )
+    switch_sources: bool = True
+    solution_hz: Annotated[float, Meta(ge=0.1, le=50.0)] = 5.0
     odometry_hz: OutputHz = -1.0
     vision_hz: OutputHz = -1.0
     gps_input_hz: OutputHz = -1.0
     global_position_sensor_hz: OutputHz = -1.0
-    external_position_hz: Annotated[
-        float, Meta(ge=-1.0, le=1.0)
-    ] = -1.0  # each one resets the autopilot's estimator
+    external_position_hz: Annotated[float, Meta(ge=-1.0, le=1.0)] = -1.0
     status_hz: RateHz = 1.0
     global_position_sensor_id: Annotated[int, Meta(ge=0, le=255)] = 1
 
@@ -285,7 +275,7 @@ class SigningConfig(Section, frozen=True):
     """MAVLink 2 signing; off without a key file (32 bytes or 64 hexadecimal digits, mode 0600)."""
 
     key_file: str = ""
-    stamp_file: str = "signing.stamp"  # the last timestamp: prevents replay after a restart
+    stamp_file: str = "signing.stamp"
     refuse_unsigned: bool = True
     always_accepted: tuple[int, ...] = (109,)  # RADIO_STATUS: the radio does not sign
 
