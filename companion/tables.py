@@ -10,6 +10,14 @@ from rich.table import Table
 _WIDEST = 1000
 
 
+def number_table(title: str, *heads: str, texts: int = 1, caption: str | None = None) -> Table:
+    """Return an empty table: the first `texts` columns are left-justified, the others right-justified."""
+    table = Table(title=title, caption=caption)
+    for k, head in enumerate(heads):
+        table.add_column(head, justify="left" if k < texts else "right")
+    return table
+
+
 def print_tables(*tables: Table) -> None:
     """Print tables at their natural width."""
     for table in tables:

@@ -18,10 +18,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 import click
-from rich.table import Table
 
 from companion.storage import flight_log
-from companion.tables import print_tables
+from companion.tables import number_table, print_tables
 from sitl.scenarios import parse_scenario
 
 #: Processor time of replay and report together, which other programs do not change; memory of each.
@@ -99,9 +98,7 @@ def command(scenario: str) -> None:
             ),
         ]
         size = Path(page).stat().st_size / 1e6
-    table = Table(title=f"{minutes:.0f} min of flight")
-    for column in ("", "s", "s of processor", "peak, MiB"):
-        table.add_column(column, justify="right" if column else "left")
+    table = number_table(f"{minutes:.0f} min of flight", "", "s", "s of processor", "peak, MiB")
     for what, *numbers in (flight, *costs):
         table.add_row(what, *(f"{number:.1f}" for number in numbers))
     print_tables(table)

@@ -18,12 +18,11 @@ from pathlib import Path
 from typing import Any, TextIO
 
 import click
-from rich.table import Table
 
 from companion.analysis import simulated_rsbn
 from companion.option_types import FloatRange
 from companion.storage.reader import LogError
-from companion.tables import print_tables
+from companion.tables import number_table, print_tables
 from companion.transport.address import Address
 from companion.write_errors import make_folder
 from sitl.beacon import Beacon
@@ -123,10 +122,8 @@ def _print(tables: list[tuple[str, list[OutageErrors]]]) -> None:
         return "" if value is None else f"{value:.0f}"
 
     for title, rows in tables:
-        out = Table(title=f"{title}: horizontal error, m")
-        out.add_column("")
-        for column in (*(f"{s} s" for s in AFTER_S), "r.m.s.", "max", "in 3 sigma"):
-            out.add_column(column, justify="right")
+        heads = "", *(f"{s} s" for s in AFTER_S), "r.m.s.", "max", "in 3 sigma"
+        out = number_table(f"{title}: horizontal error, m", *heads)
         for row in rows:
             within = "" if row.within is None else f"{row.within:.0%}"
             errors = (*row.at.values(), row.rms, row.largest)

@@ -16,13 +16,12 @@ import numpy as np
 from msgspec import structs
 from rich.console import Console
 from rich.progress import track
-from rich.table import Table
 
 from companion.config import Config, OutputConfig
 from companion.navigator import Navigator
 from companion.navigator.hypotheses import Model
 from companion.records import Solution
-from companion.tables import print_tables
+from companion.tables import number_table, print_tables
 from companion.units import Floats
 from sitl.campaign.flight import UNITS
 from sitl.correctors import RECORDS
@@ -77,13 +76,10 @@ def command(grade: str, names: tuple[str, ...], seed: int) -> None:
     Correctors are airspeed, lines of position, stars and a second INS.
     """
     scenario = get_scenario("gnss-loss", seed=seed, grade=grade, beacons=())
-    table = Table(title=f"{grade} INS, GNSS lost at 15 min, seed {seed}: error, m r.m.s. (claimed)")
-    table.add_column("corrector")
-    table.add_column("with GNSS", justify="right")
+    title = f"{grade} INS, GNSS lost at 15 min, seed {seed}: error, m r.m.s. (claimed)"
     edges = [0, *MARKS_MIN]
-    for a, b in zip(edges, MARKS_MIN):
-        table.add_column(f"{a}-{b} min after", justify="right")
-    table.add_column("within protection", justify="right")
+    after = (f"{a}-{b} min after" for a, b in zip(edges, MARKS_MIN))
+    table = number_table(title, "corrector", "with GNSS", *after, "within protection")
     for name in track(names or NAMES, "flying", console=Console(stderr=True), transient=True):
         used = () if name == "none" else (name,)
         flight = fly(World(dataclasses.replace(scenario, correctors=used)))

@@ -20,7 +20,6 @@ import msgspec
 import numpy as np
 from rich.console import Console
 from rich.progress import Progress
-from rich.table import Table
 
 from companion.analysis import error_statistics
 from companion.analysis.summary import format_share
@@ -33,7 +32,7 @@ from companion.storage.deferred_log import Log
 from companion.storage.retention import create_log
 from companion.storage.run_metadata import run_metadata
 from companion.study import plot_options
-from companion.tables import print_tables
+from companion.tables import number_table, print_tables
 from companion.units import SECOND_NS
 from sitl.autopilot import UNIX_AT_START_NS, SimulatedAutopilot
 from sitl.own_estimate import unaided_errors
@@ -327,9 +326,8 @@ def _bound(row: error_statistics.PhaseErrors) -> str:
 def _print_own(rows: list[OwnPhase]) -> None:
     if not rows:
         return
-    table = Table(title="the autopilot's own position: error, r.m.s. / most [m]")
-    for column in ("phase", "with us", "without"):
-        table.add_column(column, justify="left" if column == "phase" else "right", no_wrap=True)
+    title = "the autopilot's own position: error, r.m.s. / most [m]"
+    table = number_table(title, "phase", "with us", "without")
     for row in rows:
         pairs = (row.rms, row.most), (row.rms_alone, row.most_alone)
         table.add_row(row.phase, *(f"{_metres(rms)} / {_metres(most)}" for rms, most in pairs))
@@ -338,15 +336,14 @@ def _print_own(rows: list[OwnPhase]) -> None:
 
 def _print_table(flown: LoopbackFlight, rows: list[error_statistics.PhaseErrors], seconds: float) -> None:
     scenario = flown.autopilot.scenario
-    table = Table(title=f"{scenario.name}: horizontal error, r.m.s. [m]")
     sources = [
         s
         for s in error_statistics.SOURCES
         if s not in error_statistics.FILTERS.values() or any(s in row.rms for row in rows)
     ]
     names = (source.replace(" ", "\n") for source in sources)
-    for column in ("phase", "min", *names, "expected", "95 %", "protected", "bound"):
-        table.add_column(column, justify="left" if column == "phase" else "right", no_wrap=True)
+    heads = "phase", "min", *names, "expected", "95 %", "protected", "bound"
+    table = number_table(f"{scenario.name}: horizontal error, r.m.s. [m]", *heads)
     for row, level in zip(rows, protection_table(flown, rows), strict=True):
         cells = [_metres(row.rms.get(source)) for source in sources]
         percentile = _metres(row.p95.get(error_statistics.CORRECTED))

@@ -14,13 +14,12 @@ import click
 import numpy as np
 from rich.console import Console
 from rich.progress import track
-from rich.table import Table
 
 from companion.analysis.error_statistics import root_mean_square
 from companion.config import Config, EstimatorConfig, InertialConfig
 from companion.navigator import Navigator
 from companion.records import Fix, Rejection, Solution, Source
-from companion.tables import print_tables
+from companion.tables import number_table, print_tables
 from companion.units import Floats
 from sitl.scenarios import parse_scenario
 from sitl.smoothing_study import CHANNELS
@@ -83,20 +82,12 @@ def command(scenario: str, channels: Sequence[str], seed: int) -> None:
     Compares fixes used, guaranteed bounds and positions.
     """
     world = World(parse_scenario(scenario, seed))
-    table = Table(title=f"{scenario}, seed {seed}, no INS of its own")
-    heads = (
-        "error, m",
-        "fixes",
-        "of GNSS and beacon",
-        "rejected",
-        "bound, m",
-        "apart, m r.m.s.",
-        "apart, m most",
+    table = number_table(
+        f"{scenario}, seed {seed}, no INS of its own",
+        *("channel", "scheme", "error, m", "fixes", "of GNSS and beacon", "rejected", "bound, m"),
+        *("apart, m r.m.s.", "apart, m most"),
+        texts=2,
     )
-    table.add_column("channel")
-    table.add_column("scheme")
-    for head in heads:
-        table.add_column(head, justify="right")
     cases = [(channel, scheme) for channel in channels or OWN_CHANNELS for scheme in SCHEMES]
     first: dict[str, SchemeFlight] = {}
     for channel, scheme in track(cases, "flying", console=Console(stderr=True), transient=True):

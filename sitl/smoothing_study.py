@@ -25,12 +25,11 @@ import numpy as np
 from msgspec import structs
 from rich.console import Console
 from rich.progress import track
-from rich.table import Table
 
 from companion.analysis.smoothing import SmoothedRun, smooth_flight
 from companion.config import AirDataConfig, Config, InertialConfig
 from companion.records import Gnss, Imu, RsbnFix, Stamped
-from companion.tables import print_tables
+from companion.tables import number_table, print_tables
 from companion.units import Floats
 from sitl.campaign.flight import UNITS
 from sitl.flight import fly_plan
@@ -131,9 +130,8 @@ def command(names: tuple[str, ...], channels: tuple[str, ...], seeds: int) -> No
 
 
 def _print_table(rows: Iterable[tuple[str, str, int, SmoothingComparison]], seeds: int) -> None:
-    table = Table(title=f"horizontal error, m r.m.s. (claimed), {seeds} flights each")
-    for column in ("scenario", "channel", "filtered", "smoothed", "ratio (claimed)", "misfit", "better"):
-        table.add_column(column, justify="left" if column in ("scenario", "channel") else "right")
+    heads = "scenario", "channel", "filtered", "smoothed", "ratio (claimed)", "misfit", "better"
+    table = number_table(f"horizontal error, m r.m.s. (claimed), {seeds} flights each", *heads, texts=2)
     for name, channel, better, c in rows:
         f, s, claimed_f, claimed_s = (math.sqrt(value / c.epochs) for value in c[1:5])
         table.add_row(

@@ -15,14 +15,13 @@ import click
 from msgspec import structs
 from rich.console import Console
 from rich.progress import track
-from rich.table import Table
 
 from companion.analysis.error_statistics import root_mean_square
 from companion.config import Config, InertialConfig, OutputConfig
 from companion.navigator import Navigator
 from companion.navigator.hypotheses import Model
 from companion.records import Gnss, RsbnFix, Solution, Stamped
-from companion.tables import print_tables
+from companion.tables import number_table, print_tables
 from sitl.campaign.flight import UNITS
 from sitl.scenarios import parse_scenario
 from sitl.world import World
@@ -112,9 +111,9 @@ def command(scenario: str, sources: Sequence[str], seed: int) -> None:
     """
     flight = parse_scenario(scenario, seed)
     world = World(flight)
-    table = Table(title=f"{scenario}, seed {seed}: horizontal error, m r.m.s.: bank / one Kalman filter")
-    for column in ("source", "stated / true sigma", *(phase.name for phase in flight.phases()), "overall"):
-        table.add_column(column, justify="left" if column == "source" else "right")
+    title = f"{scenario}, seed {seed}: horizontal error, m r.m.s.: bank / one Kalman filter"
+    phases = (phase.name for phase in flight.phases())
+    table = number_table(title, "source", "stated / true sigma", *phases, "overall")
     console = Console(stderr=True)
     cases = [(source, factor) for source in sources or SOURCES for factor in FACTORS]
     for source, factor in track(cases, "flying", console=console, transient=True):

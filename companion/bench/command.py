@@ -16,7 +16,7 @@ from typing import Any
 import click
 from rich.table import Table
 
-from companion.tables import print_tables
+from companion.tables import number_table, print_tables
 
 SERVICES = ("latency", "live")
 MODULES = ("bank", "fusion", "minimax", "kalman", "frame", "log")
@@ -46,9 +46,7 @@ def measure(
 
 def table(title: str, times: dict[str, list[float]]) -> Table:
     """Build a table of median, minimum and maximum per call, and the slowest median over each median."""
-    shown = Table(title=title)
-    for column in ("case", "median us", "min", "max", "slowest / this"):
-        shown.add_column(column, justify="left" if column == "case" else "right")
+    shown = number_table(title, "case", "median us", "min", "max", "slowest / this")
     medians = {name: statistics.median(values) for name, values in times.items()}
     slowest = max(medians.values())
     for name, values in times.items():

@@ -29,6 +29,7 @@ from companion.nav.geometry import local_to_geodetic, slant_range_azimuth
 from companion.records import Stamped
 from companion.runtime.core import CompanionCore
 from companion.runtime.service import run
+from companion.tables import number_table
 
 FLIGHT_S = 20.0
 SETTLE_S = 10.0  # the first fix
@@ -105,9 +106,8 @@ def measure() -> list[Cost]:
 
 def table(costs: list[Cost]) -> Table:
     """Build the table, with the processor time over that of the receiver that parses."""
-    shown = Table(title="live: of one processor")
-    for column in ("stream", "process", "processor", "over pymavlink", "memory", "turn 99.9 %"):
-        shown.add_column(column, justify="left" if column in ("stream", "process") else "right")
+    heads = "stream", "process", "processor", "over pymavlink", "memory", "turn 99.9 %"
+    shown = number_table("live: of one processor", *heads, texts=2)
     parsing = {c.stream: c.processor_percent for c in costs if c.process == "asyncio and pymavlink"}
     for c in costs:
         shown.add_row(

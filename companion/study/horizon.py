@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 
 import click
 import numpy as np
-from rich.table import Table
 
 from companion.estimate.minimax import closed_form
 from companion.estimate.minimax_lp import Design, Infeasible, Minimax
@@ -29,7 +28,7 @@ from companion.estimate.schuler import (
 )
 from companion.option_types import FloatRange
 from companion.study import plot_options
-from companion.tables import print_tables
+from companion.tables import number_table, print_tables
 from companion.units import G0, Floats
 
 GRADES_DEG_H = {"navigation": 0.01, "tactical": 1.0, "industrial": 10.0}
@@ -334,18 +333,15 @@ def command(
 def _print(table: Sequence[Ahead], title: str, drift_deg_h: float | None) -> None:
     if drift_deg_h is not None:
         title += f", INS drift {drift_deg_h:g} deg/h r.m.s."
-    shown = Table(
-        title=title, caption="bounds on the r.m.s. error under any correlation of the fixes' errors"
+    shown = number_table(
+        title,
+        *("ahead\nmin", "position\nm", "velocity\nm/s", "tilt\narcsec", "drift\ndeg/h"),
+        *("least\nsquares\nclaim, m", "least\nsquares\nworst, m", "closed\nform, m", "gap"),
+        texts=0,
+        caption="bounds on the r.m.s. error under any correlation of the fixes' errors",
     )
-    for head in ("ahead\nmin", "position\nm", "velocity\nm/s", "tilt\narcsec", "drift\ndeg/h"):
-        shown.add_column(head, justify="right")
-    shown.add_column("least\nsquares\nclaim, m", justify="right")
-    shown.add_column("least\nsquares\nworst, m", justify="right")
-    shown.add_column("closed\nform, m", justify="right")
-    shown.add_column("gap", justify="right")
     for row in table:
         *bounds, plain, gap = row
-        assert gap is not None
         shown.add_row(
             *(f"{number:.5g}" for number in bounds),
             "-" if plain is None else f"{plain:.5g}",

@@ -12,12 +12,11 @@ import math
 
 import click
 import numpy as np
-from rich.table import Table
 
 from companion.nav.earth import SPHERE
 from companion.nav.error_model import aircraft_model, paper_model
 from companion.option_types import FloatRange
-from companion.tables import print_tables
+from companion.tables import number_table, print_tables
 
 HOUR = 3600.0
 MODELS = {"paper (1.18)": paper_model, "complete": aircraft_model}
@@ -48,9 +47,9 @@ def command(lat_deg: float, north_mps: float, east_mps: float, as_json: bool) ->
     if as_json:
         click.echo(json.dumps({name: [[v.real, v.imag] for v in values] for name, values in found.items()}))
         return
-    table = Table(title=f"latitude {lat_deg:g} deg, velocity {north_mps:g}, {east_mps:g} m/s; rad/h")
-    for column in ("model", "Schuler, fast", "Schuler, slow", "Earth's rate", "growth at most, 1/h"):
-        table.add_column(column, justify="left" if column == "model" else "right")
+    title = f"latitude {lat_deg:g} deg, velocity {north_mps:g}, {east_mps:g} m/s; rad/h"
+    heads = "model", "Schuler, fast", "Schuler, slow", "Earth's rate", "growth at most, 1/h"
+    table = number_table(title, *heads)
     for name, values in found.items():
         growth = max(abs(value.real) for value in values)
         table.add_row(name, *(f"{value.imag:.9f}" for value in values[:3]), f"{growth:.1e}")

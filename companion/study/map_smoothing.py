@@ -15,7 +15,7 @@ import numpy as np
 from rich.table import Table
 
 from companion.estimate import smoother
-from companion.tables import print_tables
+from companion.tables import number_table, print_tables
 from companion.units import Floats
 
 PHI, GAMMA = np.array([[1.0, 1.0], [0.0, 1.0]]), np.array([[0.5], [1.0]])
@@ -95,10 +95,8 @@ def command(as_json: bool) -> None:
     for i in (0, 5, 10):
         for k, state in enumerate(("x", "v")):
             table.add_row(str(i), state, *(f"{x[i, k]:.12f}" for x in found.values()))
-    law = Table(title="greatest distance from the direct solution, by the number of measurements")
-    law.add_column("algorithm")
-    for N in lengths:
-        law.add_column(str(N), justify="right")
+    title = "greatest distance from the direct solution, by the number of measurements"
+    law = number_table(title, "algorithm", *map(str, lengths))
     for name in ("filter + RTS", "shooting"):
         law.add_row(name, *(f"{apart[N][name]:.1e}" for N in lengths))
     print_tables(table, law)

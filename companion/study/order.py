@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 import click
 import numpy as np
 from click.core import ParameterSource
-from rich.table import Table
 
 from companion.analysis.replay_inputs import input_errors_as_log_errors, is_own_log, open_inputs
 from companion.estimate.polynomial import (
@@ -31,7 +30,7 @@ from companion.option_types import FloatRange
 from companion.records import Stamped
 from companion.storage import flight_log
 from companion.study import plot_options
-from companion.tables import print_tables
+from companion.tables import number_table, print_tables
 from companion.units import Floats
 
 SPAN_S = 10.0
@@ -295,10 +294,8 @@ def _plain(row: BasisResult) -> dict[str, Any]:
 
 
 def _print(rows: Sequence[BasisResult], title: str) -> None:
-    shown = Table(title=title, caption="estimated squared error (6.5.7); * marks the minimum")
-    shown.add_column("terms", justify="right")
-    for row in rows:
-        shown.add_column(row.basis, justify="right")
+    caption = "estimated squared error (6.5.7); * marks the minimum"
+    shown = number_table(title, "terms", *(row.basis for row in rows), texts=0, caption=caption)
     for k in range(len(rows[0].found.criterion)):
         cells = (f"{row.found.criterion[k]:.4g}{'*' if k + 1 == row.found.order else ' '}" for row in rows)
         shown.add_row(str(k + 1), *cells, end_section=k + 1 == len(rows[0].found.criterion))

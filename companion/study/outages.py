@@ -20,7 +20,6 @@ from typing import NamedTuple
 
 import click
 import numpy as np
-from rich.table import Table
 
 from companion.analysis.beacon_options import beacon_options
 from companion.analysis.error_statistics import root_mean_square
@@ -32,7 +31,7 @@ from companion.navigator import INPUTS_USED, Navigator
 from companion.option_types import INPUT_PATH, FloatRange
 from companion.records import AirData, Attitude, Gnss, Reboot, Solution, Stamped, Vehicle
 from companion.storage.reader import LogError
-from companion.tables import print_tables
+from companion.tables import number_table, print_tables
 from companion.units import SECOND_NS, Floats
 
 LASTING_S = (10.0, 30.0, 60.0, 120.0)
@@ -253,9 +252,9 @@ def command(
     if as_json:
         click.echo(json.dumps([row._asdict() for row in rows]))
         return
-    table = Table(title=f"Error after an outage of GNSS, m r.m.s. of {rows[0].outages} outages", caption=note)
-    for head in ("s", "companion", "worst", "within 2 sigma", "wind of the last minute", "straight on"):
-        table.add_column(head, justify="right")
+    title = f"Error after an outage of GNSS, m r.m.s. of {rows[0].outages} outages"
+    heads = "s", "companion", "worst", "within 2 sigma", "wind of the last minute", "straight on"
+    table = number_table(title, *heads, texts=0, caption=note)
     for row in rows:
         table.add_row(
             f"{row.lasting_s:g}",

@@ -19,7 +19,7 @@ from companion.analysis.progress import show_step
 from companion.estimate import kalman, restrictive
 from companion.nav.error_model import Example, paper_example
 from companion.study import plot_options
-from companion.tables import print_tables
+from companion.tables import number_table, print_tables
 from companion.units import Floats
 
 SAMPLES = 600
@@ -181,10 +181,7 @@ def study(
 
 def build_table(rows: list[dict[str, Any]], key: str, title: str, number: str) -> Table:
     """Build a table with a row per state and a column per truth; it fits 80 columns."""
-    table = Table(title=title)
-    table.add_column("state")
-    for row in rows:
-        table.add_column(row["truth"], justify="right")
+    table = number_table(title, "state", *(row["truth"] for row in rows))
     for i, state in enumerate(rows[0]["states"]):
         table.add_row(state, *(format(row[key][i], number) for row in rows))
     return table
@@ -293,7 +290,3 @@ def command(names: tuple[str, ...], runs: int, seed: int, as_json: bool, plot: P
             f"NEES per dimension {row['nees_minimax_per_dimension']:.2f} minimax, "
             f"{row['nees_restrictive_per_dimension']:.2f} restrictive"
         )
-
-
-if __name__ == "__main__":
-    command()

@@ -16,7 +16,6 @@ from typing import NamedTuple
 
 import click
 import numpy as np
-from rich.table import Table
 
 from companion.analysis.replay_inputs import input_errors_as_log_errors, open_inputs
 from companion.config import Config, load
@@ -27,7 +26,7 @@ from companion.option_types import INPUT_PATH
 from companion.records import Attitude, Gnss, Imu, Stamped
 from companion.storage.reader import LogError
 from companion.study.outages import Fixes
-from companion.tables import print_tables
+from companion.tables import number_table, print_tables
 from companion.units import SECOND_NS, Floats
 
 WIND_S = 120.0
@@ -119,9 +118,8 @@ def command(log: Path, file: Path | None, preset: str | None, pairs: tuple[str, 
     if as_json:
         click.echo(json.dumps(found._asdict()))
     else:
-        table = Table(title="drag of the rotors")
-        for head in ("drag, 1/s", "sigma", "of seconds", "left in a second, m/s"):
-            table.add_column(head, justify="right")
+        heads = "drag, 1/s", "sigma", "of seconds", "left in a second, m/s"
+        table = number_table("drag of the rotors", *heads, texts=0)
         row = f"{found.drag_per_s:.3f}", f"{found.sigma:.3f}", f"{found.seconds}", f"{found.left_m_s:.2f}"
         table.add_row(*row)
         print_tables(table)

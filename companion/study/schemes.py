@@ -15,10 +15,9 @@ from typing import NamedTuple
 
 import click
 import numpy as np
-from rich.table import Table
 
 from companion.estimate.schemes import FeedbackFractions, Plant, SchemeState, step
-from companion.tables import print_tables
+from companion.tables import number_table, print_tables
 from companion.units import Floats
 
 DT, SPEED = 0.1, 20.0
@@ -122,16 +121,12 @@ def command(seeds: int, as_json: bool) -> None:
     if as_json:
         click.echo(json.dumps({"rms_m": errors, "scales": SCALES, "distance_m": apart}))
         return
-    table = Table(title=f"position error, m r.m.s., {seeds} flights")
-    table.add_column("share fed back")
-    for sensors in (FINE, COARSE):
-        table.add_column(sensors.title, justify="right")
+    title = f"position error, m r.m.s., {seeds} flights"
+    table = number_table(title, "share fed back", FINE.title, COARSE.title)
     for name, row in errors.items():
         table.add_row(name, *(f"{value:.2f}" for value in row))
-    law = Table(title="greatest distance from feedforward, m: the square of the errors")
-    law.add_column("share fed back")
-    for scale in SCALES:
-        law.add_column(f"errors x {scale:g}", justify="right")
+    title = "greatest distance from feedforward, m: the square of the errors"
+    law = number_table(title, "share fed back", *(f"errors x {scale:g}" for scale in SCALES))
     for name, row in apart.items():
         law.add_row(name, *(f"{value:.3g}" for value in row))
     print_tables(table, law)

@@ -24,7 +24,6 @@ from typing import NamedTuple
 import click
 import numpy as np
 import numpy.typing as npt
-from rich.table import Table
 
 from companion.analysis.error_statistics import root_mean_square
 from companion.analysis.progress import show_step
@@ -33,7 +32,7 @@ from companion.estimate.predictor import Start, Step, Window, anchor
 from companion.estimate.schuler import ARCSECOND, DEG_PER_HOUR, MEAN_EARTH, schuler_row, transition
 from companion.nav.bounded_channel import BoundedIns, Motion, UnitErrors
 from companion.option_types import FloatList, FloatRange
-from companion.tables import print_tables
+from companion.tables import number_table, print_tables
 from companion.units import G0, SECOND_NS, Floats
 
 STATED_SIGMA = 0.10  # [m/s]
@@ -245,27 +244,13 @@ def command(
     if as_json:
         click.echo(json.dumps([outcome._asdict() for outcome in outcomes]))
         return
-    shown = Table(
-        title=f"{file.name}: velocity error predicted, m/s",
+    shown = number_table(
+        f"{file.name}: velocity error predicted, m/s",
+        *("channel", "window\nmin", "ahead\nmin", "n", "bound", "inside", "least\nbound", "Kalman\nclaims"),
+        *(f"{name}\nrms" for name in ("Kalman", "restricted", "minimax", "LS", "line", "hold")),
+        texts=0,
         caption="bound: guaranteed r.m.s. of the restricted estimate; inside: share of its errors within it",
     )
-    for head in (
-        "channel",
-        "window\nmin",
-        "ahead\nmin",
-        "n",
-        "bound",
-        "inside",
-        "least\nbound",
-        "Kalman\nclaims",
-        "Kalman\nrms",
-        "restricted\nrms",
-        "minimax\nrms",
-        "LS\nrms",
-        "line\nrms",
-        "hold\nrms",
-    ):
-        shown.add_column(head, justify="right")
     for outcome in outcomes:
         shown.add_row(outcome.channel, *(f"{number:.3g}" for number in outcome[1:]))
     print_tables(shown)

@@ -27,7 +27,7 @@ from companion.estimate.readings import (
 )
 from companion.estimate.weights import estimate_covariance, optimal_gain, perturb_weight
 from companion.study import plot_options
-from companion.tables import print_tables
+from companion.tables import number_table, print_tables
 from companion.units import Floats
 
 Axis = Literal["x", "y"]
@@ -234,9 +234,8 @@ def _weight_cost(a: AxisStudy, i: int, eps: float) -> float | None:
 
 def estimates_table(result: Study, example: bool) -> Table:
     """Build the table of estimates."""
-    table = Table(title="the paper's worked example" if example else "estimates")
-    for head in ("estimator", "x", "y", "sigma x", "sigma y", "true sigma x", "true sigma y"):
-        table.add_column(head, justify="left" if head == "estimator" else "right")
+    heads = "estimator", "x", "y", "sigma x", "sigma y", "true sigma x", "true sigma y"
+    table = number_table("the paper's worked example" if example else "estimates", *heads)
     if example:
         table.add_row("printed", *(f"{v:.6g}" for v in PRINTED), "", "", "", "")
         table.add_row(
@@ -263,10 +262,8 @@ def estimates_table(result: Study, example: bool) -> Table:
 
 def coefficients_table(a: AxisStudy) -> Table:
     """Build the table of one coordinate: weights, weights changed, correlations ignored."""
-    table = Table(title=f"coefficients of {a.axis}: rms error over the least, {a.sigma:.6g}")
-    table.add_column("deviation")
-    for source in a.rows.sources:
-        table.add_column(source, justify="right")
+    title = f"coefficients of {a.axis}: rms error over the least, {a.sigma:.6g}"
+    table = number_table(title, "deviation", *a.rows.sources)
     table.add_row("none: the weight", *(f"{w:.6f}" for w in a.K), end_section=True)
     for eps in DEVIATIONS:
         costs = (_weight_cost(a, i, eps) for i in range(len(a.K)))
@@ -281,10 +278,8 @@ def coefficients_table(a: AxisStudy) -> Table:
 def factors_table(result: Study) -> Table:
     """Build the table of wrong sigmas."""
     what = "joint estimate" if result.joint is not None else result.axes[0].axis
-    table = Table(title=f"sigma assumed wrong, {what}: rms error over the least (claimed over true)")
-    table.add_column("assumed / true sigma")
-    for source in result.sources:
-        table.add_column(source, justify="right")
+    title = f"sigma assumed wrong, {what}: rms error over the least (claimed over true)"
+    table = number_table(title, "assumed / true sigma", *result.sources)
     columns = [result.factor_costs(source, FACTORS) for source in result.sources]
     for k, factor in enumerate(FACTORS):
         variance = {FACTORS[1]: " (variance x 0.1)", FACTORS[4]: " (variance x 10)"}.get(factor, "")
@@ -296,11 +291,10 @@ def factors_table(result: Study) -> Table:
 
 def correlations_table(a: AxisStudy) -> Table:
     """Build the table of correlations that are assumed to be zero."""
-    table = Table(title=f"correlation ignored, {a.axis}: rms error over the least (claimed over true)")
-    table.add_column("true correlation", justify="right")
     pairs = _pairs(a)
-    for i, j in pairs:
-        table.add_column(f"{a.rows.sources[i]}, {a.rows.sources[j]}", justify="right")
+    title = f"correlation ignored, {a.axis}: rms error over the least (claimed over true)"
+    heads = (f"{a.rows.sources[i]}, {a.rows.sources[j]}" for i, j in pairs)
+    table = number_table(title, "true correlation", *heads, texts=0)
     for rho in CORRELATIONS:
         costs = (cost_of_ignored_correlation(a.R, i, j, rho) for i, j in pairs)
         table.add_row(f"{rho:+.1f}", *(f"{c.actual:.5f} ({c.claimed:.3f})" if c else "-" for c in costs))

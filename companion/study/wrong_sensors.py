@@ -18,7 +18,6 @@ from typing import Any, NamedTuple
 import click
 import numpy as np
 from msgspec.structs import replace
-from rich.table import Table
 
 from companion.analysis.beacon_options import beacon_options
 from companion.analysis.replay_inputs import input_errors_as_log_errors, with_beacons_and_outages
@@ -31,7 +30,7 @@ from companion.option_types import INPUT_PATH, FloatRange
 from companion.records import AirData, Attitude, Imu, Reboot, RsbnFix, Solution, Stamped
 from companion.storage.reader import LogError
 from companion.study.outages import Fixes
-from companion.tables import print_tables
+from companion.tables import number_table, print_tables
 from companion.units import SECOND_NS
 
 SETTLED_S = 5.0  # after the first fix
@@ -186,10 +185,8 @@ def command(
     if as_json:
         click.echo(json.dumps([row._asdict() for row in rows]))
         return
-    table = Table(title=f"Distance from GNSS, wrong from {from_s:g} s on", caption=note)
-    table.add_column("wrong")
-    for head in ("at most, m", "suspect, s", "excluded, s"):
-        table.add_column(head, justify="right")
+    heads = "wrong", "at most, m", "suspect, s", "excluded, s"
+    table = number_table(f"Distance from GNSS, wrong from {from_s:g} s on", *heads, caption=note)
     for row in rows:
         times = (f"{s:.0f}" if s else "-" for s in (row.suspect_s, row.excluded_s))
         table.add_row(row.wrong, f"{row.farthest_m:.0f}", *times)

@@ -38,7 +38,6 @@ from typing import NamedTuple
 
 import click
 from rich.console import Console
-from rich.table import Table
 
 from companion.config import Config
 from companion.output.pace import EARLY_SHARE
@@ -46,6 +45,7 @@ from companion.records import Stamped
 from companion.runtime.core import CompanionCore
 from companion.storage.flight_log import Writer
 from companion.storage.run_metadata import run_metadata
+from companion.tables import number_table
 from companion.units import SECOND_NS
 from sitl.autopilot import UNIX_AT_START_NS, SimulatedAutopilot
 from sitl.beacon import Beacon
@@ -301,9 +301,9 @@ def command(hours: int, seed: int, as_json: bool) -> None:
 
 
 def _print_table(hours: list[HourStatistics]) -> None:
-    table = Table(title="memory and queues at the end of each hour, rates in its quiet time")
-    for name in HourStatistics._fields:
-        table.add_column(name.replace("_", " "), justify="right")
+    title = "memory and queues at the end of each hour, rates in its quiet time"
+    heads = (name.replace("_", " ") for name in HourStatistics._fields)
+    table = number_table(title, *heads, texts=0)
     for hour in hours:
         table.add_row(*(f"{value:g}" if isinstance(value, float) else str(value) for value in hour))
     Console(width=max(150, Console().width)).print(table)
