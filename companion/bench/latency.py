@@ -20,7 +20,7 @@ import os
 import socket
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -43,6 +43,7 @@ LOOPBACK = "127.0.0.1"
 ORIGIN = Geodetic(math.radians(60.0), math.radians(30.0), 50.0)
 BEACON = Geodetic(math.radians(60.05), math.radians(31.07), 80.0)
 V_NORTH, HEIGHT = 40.0, 800.0
+OWN_INS = {"inertial.independent": True, "output.profile": "ardupilot"}
 COMPANION, ECHO = "companion: RSBN in to corrected estimate out", "bare asyncio UDP echo"
 
 
@@ -51,7 +52,7 @@ def measure() -> dict[str, list[float]]:
     with (
         tempfile.TemporaryDirectory() as logs,
         _separate_processors() as others,
-        peer(others, _companion, logs) as (there, _),
+        peer(others, run_companion, logs, OWN_INS) as (there, _),
         peer(others, _echo) as (back, _),
     ):
         autopilot = _Autopilot(there)
@@ -74,6 +75,69 @@ def measure() -> dict[str, list[float]]:
     return times
 
 
+def _degrees_e7(angle: float) -> int:
+    return round(math.degrees(angle) * 1e7)
+
+
+def _ms(t: float) -> int:
+    return 10_000 + round(t * 1e3)
+
+
+def _position(t: float) -> Geodetic:
+    return local_to_geodetic("ardupilot", ORIGIN, (V_NORTH * t, 0.0, -HEIGHT))
+
+
+def _place(t: float) -> dict[str, Any]:
+    here = _position(t)
+    return {"lat": _degrees_e7(here.lat), "lon": _degrees_e7(here.lon), "alt": round(here.alt * 1e3)}
+
+
+def _rsbn(t: float) -> dict[str, Any]:
+    sight = slant_range_azimuth(BEACON, _position(t))
+    return {
+        "time_usec": 10_000_000 + round(t * 1e6),
+        "beacon_lat": _degrees_e7(BEACON.lat), "beacon_lon": _degrees_e7(BEACON.lon),
+        "beacon_alt": BEACON.alt, "azimuth": sight.azimuth % math.tau, "slant_range": sight.slant_range,
+        "sigma_azimuth": math.radians(0.125), "sigma_range": 100.0, "beacon_id": 1,
+        "status": rsbn.RSBN_STATUS_AZIMUTH_VALID | rsbn.RSBN_STATUS_RANGE_VALID,
+    }  # fmt: skip
+
+
+#: Fields of the messages that the navigator uses, without errors, by the time of flight (s).
+FIELDS: dict[str, Callable[[float], dict[str, Any]]] = {
+    "HEARTBEAT": lambda t: {
+        "type": mavlink.MAV_TYPE_FIXED_WING, "autopilot": mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA,
+        "system_status": mavlink.MAV_STATE_ACTIVE, "mavlink_version": 3,
+    },
+    "GPS_GLOBAL_ORIGIN": lambda t: {
+        "latitude": _degrees_e7(ORIGIN.lat), "longitude": _degrees_e7(ORIGIN.lon),
+        "altitude": round(ORIGIN.alt * 1e3),
+    },
+    "LOCAL_POSITION_NED": lambda t: {
+        "time_boot_ms": _ms(t), "x": V_NORTH * t, "z": -HEIGHT, "vx": V_NORTH
+    },
+    "ATTITUDE": lambda t: {"time_boot_ms": _ms(t), "pitch": 0.03},
+    "VFR_HUD": lambda t: {"airspeed": V_NORTH, "groundspeed": V_NORTH, "alt": HEIGHT, "heading": 0},
+    "RAW_IMU": lambda t: {"time_usec": _ms(t) * 1000, "zacc": -1000},
+    "HIGHRES_IMU": lambda t: {
+        "time_usec": _ms(t) * 1000, "zacc": -9.81, "abs_pressure": 920.0, "temperature": 20.0,
+        "fields_updated": 63,
+    },
+    "SCALED_PRESSURE": lambda t: {"time_boot_ms": _ms(t), "press_abs": 920.0, "temperature": 2000},
+    "GPS_RAW_INT": lambda t: {
+        "time_usec": _ms(t) * 1000, "fix_type": mavlink.GPS_FIX_TYPE_3D_FIX, "eph": 80, "epv": 80,
+        "vel": round(V_NORTH * 100), "cog": 0, "satellites_visible": 14, **_place(t),
+    },
+    "SYS_STATUS": lambda t: dict.fromkeys(
+        (f"onboard_control_sensors_{x}" for x in ("present", "enabled", "health")),
+        mavlink.MAV_SYS_STATUS_SENSOR_DIFFERENTIAL_PRESSURE,
+    ),
+    "RSBN_MEASUREMENT": _rsbn,
+    "GLOBAL_POSITION_INT": lambda t: {"time_boot_ms": _ms(t), **_place(t)},
+    "ATTITUDE_QUATERNION": lambda t: {"time_boot_ms": _ms(t), "q1": 1.0},
+}  # fmt: skip
+
+
 class _Autopilot:
     """A minimal autopilot: only the messages that the navigator needs."""
 
@@ -87,52 +151,15 @@ class _Autopilot:
         """Wait for the next tenth of a second, send the messages that are due, discard the replies."""
         self._next += ROUND_S
         time.sleep(max(0.0, self._start + self._next - time.perf_counter()))
-        t, place = self._where()
-        ms = round(t * 1e3)
-        here = [round(math.degrees(x) * 1e7) for x in place[:2]]
-        lat, lon = (round(math.degrees(x) * 1e7) for x in ORIGIN[:2])
-        self._send(
-            "HEARTBEAT",
-            type=mavlink.MAV_TYPE_FIXED_WING,
-            autopilot=mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA,
-            system_status=mavlink.MAV_STATE_ACTIVE,
-            mavlink_version=3,
-        )
-        self._send("GPS_GLOBAL_ORIGIN", latitude=lat, longitude=lon, altitude=round(ORIGIN.alt * 1e3))
-        self._send("LOCAL_POSITION_NED", time_boot_ms=ms, x=V_NORTH * t, z=-HEIGHT, vx=V_NORTH)
-        self._send(
-            "GPS_RAW_INT",
-            time_usec=ms * 1000,
-            fix_type=mavlink.GPS_FIX_TYPE_3D_FIX,
-            lat=here[0],
-            lon=here[1],
-            alt=round(place.alt * 1e3),
-            eph=80,
-            epv=80,
-            vel=round(V_NORTH * 100),
-            cog=0,
-            satellites_visible=14,
-        )
+        for name in ("HEARTBEAT", "GPS_GLOBAL_ORIGIN", "LOCAL_POSITION_NED", "GPS_RAW_INT"):
+            with suppress(ConnectionRefusedError):  # not there yet
+                self._sock.send(self._frame(name))
         time.sleep(0.1 * ROUND_S)
         self._drain()
 
     def rsbn_frame(self) -> bytes:
         """Return the frame of a beacon measurement without errors, valid now."""
-        t, place = self._where()
-        geometry = slant_range_azimuth(BEACON, place)
-        return self._frame(
-            "RSBN_MEASUREMENT",
-            time_usec=round(t * 1e6),
-            beacon_lat=round(math.degrees(BEACON.lat) * 1e7),
-            beacon_lon=round(math.degrees(BEACON.lon) * 1e7),
-            beacon_alt=BEACON.alt,
-            azimuth=geometry.azimuth % math.tau,
-            slant_range=geometry.slant_range,
-            sigma_azimuth=math.radians(0.125),
-            sigma_range=100.0,
-            beacon_id=1,
-            status=rsbn.RSBN_STATUS_AZIMUTH_VALID | rsbn.RSBN_STATUS_RANGE_VALID,
-        )
+        return self._frame("RSBN_MEASUREMENT")
 
     def time_response(self, answer: bytes, timeout_s: float) -> float:
         """Send a beacon measurement.
@@ -151,17 +178,10 @@ class _Autopilot:
                 return here - start
         return math.nan
 
-    def _where(self) -> tuple[float, Geodetic]:
-        t = 10.0 + time.perf_counter() - self._start
-        return t, local_to_geodetic("ardupilot", ORIGIN, (V_NORTH * t, 0.0, -HEIGHT))
-
-    def _frame(self, name: str, **values: Any) -> bytes:
+    def _frame(self, name: str) -> bytes:
         self._sequence = self._sequence + 1 & 0xFF
+        values = FIELDS[name](time.perf_counter() - self._start)
         return frame.encode(dialect.new(name, **values), self._sequence, 1, 1)
-
-    def _send(self, name: str, **values: Any) -> None:
-        with suppress(ConnectionRefusedError):  # not there yet
-            self._sock.send(self._frame(name, **values))
 
     def _drain(self) -> None:
         self._sock.setblocking(False)
@@ -241,15 +261,25 @@ def _wait_until_bound(port: int) -> None:
         time.sleep(0.02)
 
 
-def _companion(port: int, logs: str) -> None:
+def run_companion(port: int, logs: str, flags: dict[str, Any]) -> None:
+    """Run the service on a UDP port until SIGTERM."""
     flags = {
         "link.connect": (f"udpin:{LOOPBACK}:{port}",),
         "log.folder": logs,
         "log.minimum_free_mib": 0,
-        "inertial.independent": True,
-        "output.profile": "ardupilot",
+        **flags,
     }
     asyncio.run(run(load(None, flags, {}), lambda event: None))
+
+
+def receive_datagrams(port: int, protocol: type[asyncio.DatagramProtocol]) -> None:
+    """Serve a UDP port by `protocol` until terminated."""
+
+    async def serve() -> None:
+        await asyncio.get_running_loop().create_datagram_endpoint(protocol, local_addr=(LOOPBACK, port))
+        await asyncio.Event().wait()
+
+    asyncio.run(serve())
 
 
 def _echo(port: int) -> None:
@@ -260,8 +290,4 @@ def _echo(port: int) -> None:
         def datagram_received(self, data: bytes, addr: Any) -> None:
             self._transport.sendto(data, addr)
 
-    async def serve() -> None:
-        await asyncio.get_running_loop().create_datagram_endpoint(Echo, local_addr=(LOOPBACK, port))
-        await asyncio.Event().wait()
-
-    asyncio.run(serve())
+    receive_datagrams(port, Echo)

@@ -9,11 +9,10 @@ is read from the kernel, that of the turns of the companion's event loop is meas
 from __future__ import annotations
 
 import asyncio
-import math
 import os
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,14 +20,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from rich.table import Table
 
-from companion.bench.latency import BEACON, HEIGHT, LOOPBACK, ORIGIN, V_NORTH, peer
+from companion.bench.latency import FIELDS, peer, receive_datagrams, run_companion
 from companion.config import load
 from companion.link import dialect, frame
-from companion.link.dialect import mavlink, rsbn
-from companion.nav.geometry import local_to_geodetic, slant_range_azimuth
+from companion.link.dialect import mavlink
 from companion.records import Stamped
 from companion.runtime.core import CompanionCore
-from companion.runtime.service import run
 from companion.tables import number_table
 
 FLIGHT_S = 20.0
@@ -160,75 +157,17 @@ def datagrams(flight: Iterator[tuple[float, bytes]], end: float) -> Iterator[tup
 
 def fly(stream: Stream) -> Iterator[tuple[float, bytes]]:
     """Yield the time (s) and the frame of every message of the stream, endlessly."""
-    make: dict[str, Callable[[float], dict[str, Any]]] = {
-        "HEARTBEAT": lambda t: {
-            "type": mavlink.MAV_TYPE_FIXED_WING, "autopilot": stream.autopilot,
-            "system_status": mavlink.MAV_STATE_ACTIVE, "mavlink_version": 3,
-        },
-        "GPS_GLOBAL_ORIGIN": lambda t: {
-            "latitude": _degrees(ORIGIN.lat), "longitude": _degrees(ORIGIN.lon),
-            "altitude": round(ORIGIN.alt * 1e3),
-        },
-        "LOCAL_POSITION_NED": lambda t: {
-            "time_boot_ms": _ms(t), "x": V_NORTH * t, "z": -HEIGHT, "vx": V_NORTH
-        },
-        "ATTITUDE": lambda t: {"time_boot_ms": _ms(t), "pitch": 0.03},
-        "VFR_HUD": lambda t: {"airspeed": V_NORTH, "groundspeed": V_NORTH, "alt": HEIGHT, "heading": 0},
-        "RAW_IMU": lambda t: {"time_usec": _ms(t) * 1000, "zacc": -1000},
-        "HIGHRES_IMU": lambda t: {
-            "time_usec": _ms(t) * 1000, "zacc": -9.81, "abs_pressure": 920.0, "temperature": 20.0,
-            "fields_updated": 63,
-        },
-        "SCALED_PRESSURE": lambda t: {"time_boot_ms": _ms(t), "press_abs": 920.0, "temperature": 2000},
-        "GPS_RAW_INT": _gps,
-        "SYS_STATUS": lambda t: dict.fromkeys(
-            (f"onboard_control_sensors_{x}" for x in ("present", "enabled", "health")),
-            mavlink.MAV_SYS_STATUS_SENSOR_DIFFERENTIAL_PRESSURE,
-        ),
-        "RSBN_MEASUREMENT": _rsbn,
-        "GLOBAL_POSITION_INT": lambda t: {"time_boot_ms": _ms(t), **_place(t)},
-        "ATTITUDE_QUATERNION": lambda t: {"time_boot_ms": _ms(t), "q1": 1.0},
-    }  # fmt: skip
     rates = {"HEARTBEAT": 1.0, "GPS_GLOBAL_ORIGIN": 0.2, **stream.used, **stream.unused}
     due = dict.fromkeys(rates, 0.0)
     sequence = 0
     while True:
         name = min(due, key=due.__getitem__)
         t, due[name] = due[name], due[name] + 1.0 / rates[name]
-        values = make[name](t) if name in make else {}
+        values = FIELDS[name](t) if name in FIELDS else {}
+        if name == "HEARTBEAT":
+            values["autopilot"] = stream.autopilot
         yield t, frame.encode(dialect.new(name, **values), sequence, 1, 1)
         sequence = sequence + 1 & 0xFF
-
-
-def _ms(t: float) -> int:
-    return 10_000 + round(t * 1e3)
-
-
-def _degrees(angle: float) -> int:
-    return round(math.degrees(angle) * 1e7)
-
-
-def _place(t: float) -> dict[str, Any]:
-    here = local_to_geodetic("ardupilot", ORIGIN, (V_NORTH * t, 0.0, -HEIGHT))
-    return {"lat": _degrees(here.lat), "lon": _degrees(here.lon), "alt": round(here.alt * 1e3)}
-
-
-def _gps(t: float) -> dict[str, Any]:
-    return {
-        "time_usec": _ms(t) * 1000, "fix_type": mavlink.GPS_FIX_TYPE_3D_FIX, "eph": 80, "epv": 80,
-        "vel": round(V_NORTH * 100), "cog": 0, "satellites_visible": 14, **_place(t),
-    }  # fmt: skip
-
-
-def _rsbn(t: float) -> dict[str, Any]:
-    here = local_to_geodetic("ardupilot", ORIGIN, (V_NORTH * t, 0.0, -HEIGHT))
-    sight = slant_range_azimuth(BEACON, here)
-    return {
-        "time_usec": _ms(t) * 1000, "beacon_lat": _degrees(BEACON.lat), "beacon_lon": _degrees(BEACON.lon),
-        "beacon_alt": BEACON.alt, "azimuth": sight.azimuth % math.tau, "slant_range": sight.slant_range,
-        "sigma_azimuth": math.radians(0.125), "sigma_range": 100.0, "beacon_id": 1,
-        "status": rsbn.RSBN_STATUS_AZIMUTH_VALID | rsbn.RSBN_STATUS_RANGE_VALID,
-    }  # fmt: skip
 
 
 def _send_until(flight: Iterator[tuple[float, bytes]], socks: list[Any], end: float) -> None:
@@ -264,12 +203,6 @@ def memory_mib(pid: int) -> float:
 
 
 def _companion(port: int, logs: str, profile: str) -> None:
-    flags = {
-        "link.connect": (f"udpin:{LOOPBACK}:{port}",),
-        "log.folder": logs,
-        "log.minimum_free_mib": 0,
-        "output.profile": profile,
-    }
     turns: list[float] = []
 
     class Turn(asyncio.Handle):  # the loop's own, timed
@@ -279,7 +212,7 @@ def _companion(port: int, logs: str, profile: str) -> None:
             turns.append(time.thread_time() - start)
 
     asyncio.events.Handle = asyncio.Handle = Turn  # type: ignore[misc]
-    asyncio.run(run(load(None, flags, {}), lambda event: None))
+    run_companion(port, logs, {"output.profile": profile})
     np.save(Path(logs, TURNS), turns)
 
 
@@ -293,8 +226,4 @@ def _bare(port: int, parses: bool) -> None:
             if parses:
                 parser.parse_buffer(data)
 
-    async def serve() -> None:
-        await asyncio.get_running_loop().create_datagram_endpoint(Receiver, local_addr=(LOOPBACK, port))
-        await asyncio.Event().wait()
-
-    asyncio.run(serve())
+    receive_datagrams(port, Receiver)
