@@ -17,10 +17,9 @@ from companion.analysis import error_statistics, flight_events
 from companion.analysis.flight_arrays import Flight, Table, TimelineEntry
 from companion.analysis.flight_events import MessageRate, OutageInterval, RejectionGroup, usable_gnss
 from companion.analysis.smoothing import join_runs, smooth_flight
-from companion.config import Config, parse
 from companion.nav.earth import radii
 from companion.nav.geometry import Geodetic
-from companion.storage.run_metadata import CONFIGURATION
+from companion.storage.run_metadata import configuration_in
 from companion.units import Floats
 
 REACH_S = 2.0  # no interpolation of the reference across a longer gap
@@ -141,19 +140,13 @@ def _select_reference(flight: Flight) -> ReferenceTrack | None:
     if len(truth["t"]) > 1:
         return _track_from(TRUTH, truth["t"], truth["lat"], truth["lon"], truth["alt"])
     try:
-        runs = smooth_flight(flight.smoother_inputs, configuration(flight))
+        runs = smooth_flight(flight.smoother_inputs, configuration_in(flight.metadata, flight.name))
     except ValueError:
         if len(gnss["t"]) > 1:
             return _track_from(GNSS, gnss["t"], gnss["lat"], gnss["lon"], gnss["alt"])
         return None
     t_ns, lat, lon, alt = join_runs(runs)
     return _track_from(SMOOTHED, 1e-9 * (t_ns - flight.zero_ns), lat, lon, alt)
-
-
-def configuration(flight: Flight) -> Config:
-    """Return the configuration stored in the log; the defaults if none is stored."""
-    text = flight.metadata.get(CONFIGURATION, {}).get("toml")
-    return Config() if text is None else parse(text, f"{flight.name} (its own configuration)")
 
 
 def _track_from(what: str, t: npt.ArrayLike, lat: Floats, lon: Floats, alt: Floats) -> ReferenceTrack:

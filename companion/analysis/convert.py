@@ -8,7 +8,7 @@ from companion.analysis.replay import create_replay_log
 from companion.analysis.replay_inputs import CONVERTED, input_errors_as_log_errors, is_own_log
 from companion.importers import sources
 from companion.importers.sources import ImportSummary
-from companion.records import OUTPUTS
+from companion.storage.flight_log import topic_of_input
 from companion.storage.reader import LogError, open_log
 
 
@@ -26,6 +26,5 @@ def convert_log(source: Path, output: Path) -> ImportSummary:
         records = sources.open_source(source)
         with create_replay_log(output, {CONVERTED: {"from": source.name}}) as sink:
             for record in records:
-                from_importer = isinstance(record, OUTPUTS)
-                sink.record(record, f"/link/{type(record).__name__}" if from_importer else None)
+                sink.record(record, topic_of_input(record))
     return records.summary()

@@ -44,7 +44,7 @@ class PhaseErrors(NamedTuple):
     whether every error is within the bound of that instant; one flight is no ensemble, whose r.m.s. error it
     limits. `inside` and `inside_twice` are the shares of instants within the bound, and within twice the
     bound; twice a valid bound is exceeded in at most a quarter of cases (Chebyshev). None: no bound, or no
-    useful one: more than `USEFUL` times the claim or `limit_m` over half of the phase.
+    useful one: more than `USEFUL` times the claim or `LIMIT_M` over half of the phase.
     """
 
     phase: str
@@ -135,9 +135,7 @@ def root_mean_square(x: Floats) -> float:
     return float(np.sqrt(np.mean(x**2)))
 
 
-def summarize_phases(
-    found: dict[str, ErrorSeries], phases: Sequence[FlightPhase], limit_m: float = LIMIT_M
-) -> list[PhaseErrors]:
+def summarize_phases(found: dict[str, ErrorSeries], phases: Sequence[FlightPhase]) -> list[PhaseErrors]:
     """Return one row per phase. The fix that starts a phase is valid just before it and is not counted."""
     rows = []
     for phase, following in zip(phases, [*phases[1:], None]):
@@ -146,12 +144,12 @@ def summarize_phases(
             for source, kind in _KINDS
             if following and kind in following.name and kind not in phase.name
         }
-        rows.append(_summarize_phase(found, phase, starting_sources, limit_m))
+        rows.append(_summarize_phase(found, phase, starting_sources))
     return rows
 
 
 def _summarize_phase(
-    found: dict[str, ErrorSeries], phase: FlightPhase, starting_sources: set[str], limit_m: float
+    found: dict[str, ErrorSeries], phase: FlightPhase, starting_sources: set[str]
 ) -> PhaseErrors:
     rms, p95 = {}, {}
     compared: _Compared | None = None
@@ -165,7 +163,7 @@ def _summarize_phase(
         rms[source] = root_mean_square(error)
         p95[source] = float(np.percentile(error, 95.0))
         if np.isfinite(e.bound[within]).any():
-            compared = _compare_with_bound(error, e.bound[within], e.claimed[within], limit_m)
+            compared = _compare_with_bound(error, e.bound[within], e.claimed[within])
         if np.isfinite(e.claimed[within]).any():
             expected = float(np.sqrt(np.nanmean(e.claimed[within] ** 2)))
     seconds = (phase.end_ns - phase.start_ns) * 1e-9
@@ -181,11 +179,11 @@ class _Compared(NamedTuple):
     inside_twice: float | None
 
 
-def _compare_with_bound(error: Floats, bound: Floats, claimed: Floats, limit_m: float) -> _Compared:
+def _compare_with_bound(error: Floats, bound: Floats, claimed: Floats) -> _Compared:
     known = np.isfinite(bound)
     error, bound, claimed = error[known], bound[known], claimed[known]
     bound_rms = root_mean_square(bound)
-    if np.mean((bound > limit_m) | (bound > USEFUL * claimed)) > 0.5:
+    if np.mean((bound > LIMIT_M) | (bound > USEFUL * claimed)) > 0.5:
         return _Compared(bound_rms, None, None, None, None)
     share = root_mean_square(error) / bound_rms
     inside, twice = (float(np.mean(error <= k * bound)) for k in (1.0, 2.0))

@@ -66,9 +66,13 @@ def write_map(path: Path, title: str, tracks: Sequence[Track], places: Sequence[
     """
     check_suffix(path)
     write = to_kml if path.suffix.lower() == ".kml" else to_geojson
-    text = write(_NOT_XML.sub("\ufffd", title), tracks, places)
+    write_file(path, write(_NOT_XML.sub("\ufffd", title), tracks, places).encode())
+
+
+def write_file(path: Path, data: bytes) -> None:
+    """Write a file at once. Raises LogError, one sentence, if it cannot be written."""
     try:
-        write_whole(path, text.encode())
+        write_whole(path, data)
     except OSError as error:
         raise LogError(f"{path} cannot be written: {describe_write_error(error)}") from None
 

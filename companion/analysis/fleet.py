@@ -119,7 +119,7 @@ def _row(name: str, a: Assessment) -> FlightRow:
         solutions=len(a.flight.tables["Solution"]["t"]),
         gnss_outage_s=round(max((outage.end - outage.start for outage in a.outages), default=0.0), 3),
         reference=a.reference and a.reference.what,
-        rms_m=None if corrected is None else float((corrected.error**2).mean() ** 0.5),
+        rms_m=None if corrected is None else error_statistics.root_mean_square(corrected.error),
         largest_m=None if corrected is None else float(corrected.error.max()),
         ins_largest_m=None if ins is None else float(ins.error.max()),
         phases_held=sum(held),

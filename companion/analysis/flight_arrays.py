@@ -137,8 +137,8 @@ COLUMNS: dict[type[Stamped], tuple[str, Callable[[Any], tuple[float, ...]]]] = {
         lambda r: (r.lat, r.lon, r.sources, r.cost, r.degrees_of_freedom, _or_nan(r.normalised)),
     ),
     Gnss: (
-        "receiver fix lat lon alt sigma",
-        lambda r: (r.receiver, r.fix, r.lat, r.lon, r.alt_msl, _or_nan(r.sigma_horizontal)),
+        "fix lat lon alt",
+        lambda r: (r.fix, r.lat, r.lon, r.alt_msl),
     ),
     RsbnFix: (
         "beacon lat lon alt azimuth slant",
@@ -147,13 +147,13 @@ COLUMNS: dict[type[Stamped], tuple[str, Callable[[Any], tuple[float, ...]]]] = {
     Truth: ("lat lon alt", lambda r: (r.lat, r.lon, r.alt)),
     FilterStatus: ("gnss_glitch", lambda r: (float(r.gnss_glitch),)),
 }
-_LINK = "connected received lost bad dropped offset round_trip"
+_LINK = "received lost bad dropped offset round_trip"
 
 
 def _link(r: LinkState) -> tuple[float, ...]:
     offset = math.nan if r.offset_ns is None else r.offset_ns * 1e-9
     trip = math.nan if r.round_trip_ns is None else r.round_trip_ns * 1e-9
-    return (r.connected, r.received, r.lost, r.bad, r.dropped, offset, trip)
+    return (r.received, r.lost, r.bad, r.dropped, offset, trip)
 
 
 class _Columns:

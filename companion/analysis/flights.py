@@ -21,7 +21,6 @@ from companion.config import Config, Sensor
 from companion.navigator import Navigator
 from companion.records import (
     INPUTS,
-    OUTPUTS,
     AirData,
     AirspeedSensor,
     Attitude,
@@ -125,9 +124,7 @@ def _run_navigator(
     for record in records:
         if (sensor := _sensor(record)) is not None:
             sensors.add(sensor)
-        kind = type(record)
-        from_importer = isinstance(record, OUTPUTS)
-        yield f"/link/{kind.__name__}" if from_importer else flight_log.topic_of(kind), record
+        yield flight_log.topic_of_input(record), record
         if isinstance(record, INPUTS):
             for output in navigator.handle(record):  # type: ignore[arg-type]
                 yield flight_log.topic_of(type(output)), output

@@ -25,22 +25,22 @@ from companion.analysis.output_guard import reject_other_flight, reject_own_inpu
 from companion.analysis.progress import show_step
 from companion.analysis.replay_inputs import (
     DERIVED,
-    apply_changes,
+    choose_configuration,
     has_navigator_outputs,
     input_errors_as_log_errors,
     is_own_log,
     with_beacons_and_outages,
     with_correctors,
 )
-from companion.config import Config, load
+from companion.config import Config
 from companion.importers import gnss_latency
 from companion.navigator import Navigator
 from companion.option_types import INPUT_PATH
 from companion.printable import printable
-from companion.records import INPUTS, OUTPUTS, Event, LocalPosition, Reboot, Solution, Stamped
+from companion.records import INPUTS, Event, LocalPosition, Reboot, Solution, Stamped
 from companion.storage import flight_log
 from companion.storage.reader import ACTIVE, LogError, is_closed
-from companion.storage.run_metadata import PLATFORM, logged_configuration, numerical_platform, run_metadata
+from companion.storage.run_metadata import PLATFORM, numerical_platform, run_metadata
 
 
 class FlightPart(NamedTuple):
@@ -140,8 +140,7 @@ def replay_foreign(records: Iterable[Stamped], config: Config, sink: Any) -> Rep
     """Replay the records of another recorder's log and write inputs and outputs to `sink`."""
     navigator, count = Navigator(config), _ReplayCounter()
     for record in records:
-        from_importer = isinstance(record, OUTPUTS)
-        sink.record(record, f"/link/{type(record).__name__}" if from_importer else None)
+        sink.record(record, flight_log.topic_of_input(record))
         count.record(record)
         if isinstance(record, INPUTS):
             count.input(record)
@@ -182,6 +181,11 @@ def create_replay_log(
 def derived_metadata(config: Config, by: str, log: Path) -> dict[str, dict[str, str]]:
     """Return the metadata of a log that the command `by` makes from `log`: it may be replaced."""
     return {DERIVED: {"by": by, "from": log.name}, **run_metadata(config)}
+
+
+def default_output(log: Path, what: str) -> Path:
+    """Return the name of a log made from another one: NAME.replay.mcap in the current folder."""
+    return Path(f"{log.name.split('.mcap')[0] if is_own_log(log) else log.stem}.{what}.mcap")
 
 
 @click.command("replay")
@@ -231,18 +235,15 @@ def command(
         simulated_outages = [simulated_rsbn.parse_outage(text) for text in outages]
     except ValueError as error:
         raise click.UsageError(str(error)) from None
-    own = is_own_log(log)
-    config = load(config_file) if config_file or not own else logged_configuration(log)
-    if changes:
-        config = apply_changes(config, ",".join(changes))
+    config = choose_configuration(log, config_file, changes)
     notes: list[str] = []
     counts: dict[str, int] = {}
-    if own and not is_closed(log):
+    if is_own_log(log) and not is_closed(log):
         notes.append("the log was not closed: its last messages may be missing")
     changed = config_file or changes or beacons or tables or simulated_outages
     as_flown = has_navigator_outputs(log) and not changed
     if output is None and not as_flown:
-        output = Path(f"{log.name.split('.mcap')[0] if own else log.stem}.replay.mcap")
+        output = default_output(log, "replay")
     if output is not None:
         reject_own_input(output, log, beacons, config_file, *tables)
         reject_other_flight(output)

@@ -22,6 +22,7 @@ from companion.importers import corrector_csv, sources
 from companion.records import Stamped
 from companion.storage import flight_log
 from companion.storage.reader import ACTIVE, LogError
+from companion.storage.run_metadata import logged_configuration
 
 CONVERTED = "converted"  # metadata record of a converted log; its key is `from`
 DERIVED = "derived"  # metadata record of a log that replay or smooth made; its keys are `by` and `from`
@@ -47,6 +48,12 @@ def apply_changes(config: Config, text: str) -> Config:
         return load(environment={}, pairs=pairs)
     except ConfigError as error:
         raise ConfigError(str(error).replace("--set", "--with")) from None
+
+
+def choose_configuration(log: Path, config_file: Path | None, changes: Sequence[str]) -> Config:
+    """Load the configuration in `config_file`, or that of our own log, or the default, with `changes`."""
+    config = load(config_file) if config_file or not is_own_log(log) else logged_configuration(log)
+    return apply_changes(config, ",".join(changes)) if changes else config
 
 
 def _full_name(name: str) -> str:

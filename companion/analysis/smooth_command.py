@@ -18,7 +18,7 @@ from typing import NamedTuple
 import click
 import numpy as np
 
-from companion.analysis.export import Track, write_map
+from companion.analysis.export import Track, write_file, write_map
 from companion.analysis.output_guard import (
     reject_any_log,
     reject_other_flight,
@@ -26,22 +26,17 @@ from companion.analysis.output_guard import (
     reject_same_output,
 )
 from companion.analysis.progress import show_step
-from companion.analysis.replay import create_replay_log, derived_metadata, start_times
+from companion.analysis.replay import create_replay_log, default_output, derived_metadata, start_times
 from companion.analysis.replay_inputs import (
-    apply_changes,
+    choose_configuration,
     input_errors_as_log_errors,
-    is_own_log,
     open_inputs,
 )
 from companion.analysis.smoothing import SmoothedRun, smooth_flight
-from companion.config import load
 from companion.nav.geometry import Geodetic, displace
 from companion.option_types import INPUT_PATH
 from companion.records import Smoothed
-from companion.storage.reader import LogError
-from companion.storage.run_metadata import logged_configuration
 from companion.units import SECOND_NS, Floats
-from companion.write_errors import describe_write_error, write_whole
 
 FORMATS = (".mcap", ".csv", ".kml", ".geojson", ".json")
 AGREE_SIGMA = 1e-3
@@ -73,15 +68,6 @@ def collect(runs: Sequence[SmoothedRun]) -> SmoothedTrack:
     return SmoothedTrack(records, np.sqrt(np.concatenate(variances)))
 
 
-def write_mcap(
-    path: Path, track: SmoothedTrack, described: dict[str, dict[str, str]], start_ns: int, start_unix_ns: int
-) -> None:
-    """Write the track as records `Smoothed`, with points for the map."""
-    with create_replay_log(path, described, start_ns, start_unix_ns) as sink:
-        for record in track.records:
-            sink.record(record)
-
-
 def write_csv(path: Path, track: SmoothedTrack, start_ns: int, start_unix_ns: int) -> None:
     """Write the track as a table; `log_time_s` is UNIX time if the log has it, else its recorder's clock."""
     file = StringIO(newline="")
@@ -90,10 +76,7 @@ def write_csv(path: Path, track: SmoothedTrack, start_ns: int, start_unix_ns: in
     for record, filtered in zip(track.records, track.filter_sigma.tolist(), strict=True):
         since = record.t_ns - track.records[0].t_ns
         out.writerow(_row(record, filtered, since, record.t_ns - start_ns + start_unix_ns))
-    try:
-        write_whole(path, file.getvalue().encode())
-    except OSError as error:
-        raise LogError(f"{path} cannot be written: {describe_write_error(error)}") from None
+    write_file(path, file.getvalue().encode())
 
 
 def _row(record: Smoothed, filtered: list[float], since_ns: int, log_ns: int) -> list[str]:
@@ -158,8 +141,7 @@ def command(
     Those after each moment are used too.
     LOG may be our own MCAP or that of another recorder, as for `replay`.
     """
-    own = is_own_log(log)
-    paths = outputs or (Path(f"{log.name.split('.mcap')[0] if own else log.stem}.smoothed.mcap"),)
+    paths = outputs or (default_output(log, "smoothed"),)
     for path in paths:
         if path.suffix.lower() not in FORMATS:
             raise click.UsageError(f"{path}: give a name that ends with one of {', '.join(FORMATS)}")
@@ -169,16 +151,17 @@ def command(
         else:
             reject_any_log(path)
     reject_same_output(paths)
-    config = load(config_file) if config_file or not own else logged_configuration(log)
-    if changes:
-        config = apply_changes(config, ",".join(changes))
+    config = choose_configuration(log, config_file, changes)
     with input_errors_as_log_errors(), show_step(f"smooth {log}"):
         runs = smooth_flight(open_inputs(log).records, config, check=check)
     track = collect(runs)
     start_ns, start_unix_ns = start_times(log)
     for path in paths:
         if path.suffix.lower() == ".mcap":
-            write_mcap(path, track, derived_metadata(config, "smooth", log), start_ns, start_unix_ns)
+            described = derived_metadata(config, "smooth", log)
+            with create_replay_log(path, described, start_ns, start_unix_ns) as sink:
+                for record in track.records:
+                    sink.record(record)
         elif path.suffix.lower() == ".csv":
             write_csv(path, track, start_ns, start_unix_ns)
         else:

@@ -25,7 +25,7 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Message, Schema
 
 from companion import __version__
-from companion.records import BY_NAME, INPUTS, Event, LinkState, Stamped, Truth, encode
+from companion.records import BY_NAME, INPUTS, OUTPUTS, Event, LinkState, Stamped, Truth, encode
 from companion.storage import location_fix, schemas
 from companion.storage.mcap_file import Disk, DiskFile, McapFile, sync_folder
 from companion.storage.reader import ACTIVE, DamagedError, LogError, LogReader, open_log
@@ -43,6 +43,7 @@ __all__ = [
     "read",
     "recover",
     "topic_of",
+    "topic_of_input",
 ]
 
 MAP_PERIOD_NS = 500_000_000
@@ -353,6 +354,12 @@ def topic_of(kind: type[Stamped]) -> str:
     if kind is LinkState:
         return "/link/LinkState"
     return f"/{'in' if kind in INPUTS else 'out'}/{kind.__name__}"
+
+
+def topic_of_input(record: Stamped) -> str:
+    """Return the topic of a record of an importer; its events and rejections are under /link."""
+    kind = type(record)
+    return f"/link/{kind.__name__}" if isinstance(record, OUTPUTS) else topic_of(kind)
 
 
 # ---------------------------------------------------------------------------------------------------------

@@ -7,6 +7,7 @@ order.
 from __future__ import annotations
 
 import platform
+from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
 
@@ -31,9 +32,14 @@ def run_metadata(config: Config) -> dict[str, dict[str, str]]:
 
 
 def logged_configuration(path: Path) -> Config:
-    """Return the configuration stored in the log at `path`; the defaults where none is stored."""
-    text = flight_log.metadata(path).get(CONFIGURATION, {}).get("toml")
-    return Config() if text is None else parse(text, f"{path} (its own configuration)")
+    """Return the configuration in the log at `path`, as `configuration_in`."""
+    return configuration_in(flight_log.metadata(path), str(path))
+
+
+def configuration_in(metadata: Mapping[str, Mapping[str, str]], log: str) -> Config:
+    """Return the configuration in the metadata of a log; the defaults where none is stored."""
+    text = metadata.get(CONFIGURATION, {}).get("toml")
+    return Config() if text is None else parse(text, f"{log} (its own configuration)")
 
 
 def numerical_platform() -> dict[str, str]:

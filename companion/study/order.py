@@ -137,7 +137,7 @@ def _messages(log: Path) -> Iterator[tuple[str, Stamped]]:
                 yield entry.topic, entry.value
         return
     for record in open_inputs(log).records:
-        yield flight_log.topic_of(type(record)), record
+        yield flight_log.topic_of_input(record), record
 
 
 def _field(record: Stamped, field: str) -> float | None:

@@ -12,7 +12,7 @@ import click
 import pytest
 from click.testing import CliRunner
 
-from companion.analysis import replay, report, smooth_command
+from companion.analysis import replay, replay_inputs, report, smooth_command
 from companion.analysis.replay_inputs import apply_changes
 from companion.command_line import cli
 from companion.config import Config
@@ -85,7 +85,8 @@ def test_outputs_that_differ_from_the_flight_are_reported(
 ) -> None:
     flight = tmp_path / "flight.mcap"
     replayed(CUT, flight)
-    monkeypatch.setattr(replay, "logged_configuration", lambda path: apply_changes(Config(), "every_s=5"))
+    other = apply_changes(Config(), "every_s=5")
+    monkeypatch.setattr(replay_inputs, "logged_configuration", lambda path: other)
     done = CliRunner().invoke(replay.command, [str(flight)])
     assert done.exit_code == 1
     assert "DIFFERENT" in done.stdout and "first difference: in flight" in done.stdout
