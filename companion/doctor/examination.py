@@ -227,8 +227,7 @@ class Examination:
     # -- findings -------------------------------------------------------------------------------------------
 
     def _identity(self) -> Identity:
-        kind = mavlink.enums["MAV_TYPE"].get(self._heartbeat.type)
-        vehicle = kind.name.removeprefix("MAV_TYPE_").replace("_", " ").lower() if kind else "vehicle"
+        vehicle = dialect.entry_name("MAV_TYPE", self._heartbeat.type)
         firmware = None if self._version is None else firmware_of(self._version)
         version = "" if firmware is None else str(firmware)
         armed = bool(self._heartbeat.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)

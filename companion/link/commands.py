@@ -28,6 +28,7 @@ from companion.link.rate_limiter import RateLimiter
 RATE_HZ, BURST = 10.0, 20
 #: Shortest message interval that may be requested.
 MIN_INTERVAL_US = 20_000
+#: Interval of a disabled message.
 DISABLED = -1
 
 #: Parameters are all REAL32, which both encodings store alike; AUTOPILOT_VERSION must name one of them.

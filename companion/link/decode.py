@@ -433,6 +433,16 @@ def _scaled_pressure(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]
     return (Pressure(_booted(m, rx, sender), rx, number(m, "press_abs", 100.0), differential, kelvin),)
 
 
+def _azimuth(message: Message) -> float | None:
+    """Return the azimuth as sent, rad; None if it is absent."""
+    azimuth = optional_number(message, "azimuth")
+    if azimuth is not None and abs(azimuth) > math.tau:
+        raise InvalidField(
+            f"azimuth {azimuth:g} rad is not an angle in radians (limit 2 pi)", azimuth, math.tau
+        )
+    return azimuth
+
+
 def _sigma(message: Message, field: str, measured: float | None, configured: float) -> float:
     """Return the sigma as sent, or as configured if the message gives none."""
     sigma = optional_number(message, field)
@@ -452,14 +462,10 @@ def _rsbn(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
     if m.status & rsbn.RSBN_STATUS_MEMORY:
         raise InvalidField(f"beacon {m.beacon_id} is not received: the receiver repeats its last answer")
     lat, lon = position(m.beacon_lat, m.beacon_lon, ("beacon_lat", "beacon_lon"))
-    azimuth = optional_number(m, "azimuth") if m.status & rsbn.RSBN_STATUS_AZIMUTH_VALID else None
+    azimuth = _azimuth(m) if m.status & rsbn.RSBN_STATUS_AZIMUTH_VALID else None
     slant_range = optional_number(m, "slant_range") if m.status & rsbn.RSBN_STATUS_RANGE_VALID else None
     if azimuth is None and slant_range is None:
         raise InvalidField(f"beacon {m.beacon_id} gives neither azimuth nor range")
-    if azimuth is not None and abs(azimuth) > math.tau:
-        raise InvalidField(
-            f"azimuth {azimuth:g} rad is not an angle in radians (limit 2 pi)", azimuth, math.tau
-        )
     if slant_range is not None and slant_range <= 0.0:
         raise InvalidField(f"slant range {slant_range:g} m is not positive", slant_range, 0.0)
     if slant_range is not None and slant_range > FARTHEST:
@@ -486,11 +492,7 @@ def _rsbn(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
 
 @_of("STAR_FIX")
 def _star_fix(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
-    azimuth = optional_number(m, "azimuth")
-    if azimuth is not None and abs(azimuth) > math.tau:
-        raise InvalidField(
-            f"azimuth {azimuth:g} rad is not an angle in radians (limit 2 pi)", azimuth, math.tau
-        )
+    azimuth = _azimuth(m)
     return (
         StarFix(
             _stamped(m, rx, sender),

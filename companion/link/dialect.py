@@ -9,9 +9,8 @@ Our messages are defined in rsbn.xml, a public one that pymavlink lacks in compo
 `python -m companion.link.dialect` regenerates generated/rsbn_dialect.py from them with the mavgen of the
 installed wheel; `regenerate` writes it to another path.
 
-Create a message by its class (`RsbnMeasurement(time_usec=..., ...)`) or by `new("ODOMETRY", x=...)`, read its
-attributes, and get its id by `id_of(message)`. Do not read `.id`, `.name`, `.type`: payload fields shadow
-them in 41 messages.
+Create a message by `new("ODOMETRY", x=...)`, read its attributes, and get its id by `id_of(message)`. Do not
+read `.id`, `.name`, `.type`: payload fields shadow them in 41 messages.
 """
 
 from __future__ import annotations
@@ -24,11 +23,14 @@ import re
 import struct
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from pymavlink.dialects.v20 import all as _all
 
 from companion.link.generated import rsbn_dialect as _rsbn
+
+if TYPE_CHECKING:
+    from companion.link.frame import Frame
 
 #: The generated dialects, for their constants: `mavlink.MAV_TYPE_GCS`, `mavlink.MAVLINK_MSG_ID_HEARTBEAT`,
 #: `rsbn.RSBN_STATUS_TEST`. Import MAVLink ids and enum values from here.
@@ -37,8 +39,6 @@ rsbn: Any = _rsbn
 
 #: A MAVLink message: an instance of one of pymavlink's generated classes, which carry no types.
 Message = Any
-
-RsbnMeasurement = rsbn.MAVLink_rsbn_measurement_message
 
 #: Messages of receivers, which are components of their own, and the field that names what is received.
 MEASUREMENTS = {
@@ -50,21 +50,6 @@ MEASUREMENTS = {
 
 XML = Path(__file__).with_name("rsbn.xml")
 ADDED_XML = Path(__file__).with_name("component_metadata.xml")
-
-
-class Framed(Protocol):
-    """Frame as read by `decode`; `companion.link.frame.Frame` is one."""
-
-    @property
-    def msgid(self) -> int: ...  # noqa: D102
-    @property
-    def payload(self) -> bytes: ...  # noqa: D102
-    @property
-    def sequence(self) -> int: ...  # noqa: D102
-    @property
-    def system(self) -> int: ...  # noqa: D102
-    @property
-    def component(self) -> int: ...  # noqa: D102
 
 
 class Field(NamedTuple):
@@ -145,6 +130,12 @@ def id_of(message: Message) -> int:
     return int(message._header.msgId)
 
 
+def entry_name(enum: str, value: int) -> str:
+    """Return an entry of an enum as words, "temporarily rejected"; "MAV_RESULT 99" if it is unknown."""
+    entry = mavlink.enums[enum].get(value)
+    return entry.name.removeprefix(f"{enum}_").replace("_", " ").lower() if entry else f"{enum} {value}"
+
+
 def type_named(name: str) -> MessageType:
     """Return the type of the message `name` (as in the XML, "GPS_RAW_INT"). ValueError if unknown."""
     try:
@@ -181,7 +172,7 @@ def command_long(system: int, command: int, **parameters: float | None) -> Messa
     )
 
 
-def decode(frame: Framed) -> Message:
+def decode(frame: Frame) -> Message:
     """Decode the message of a frame; a payload shorter than the message is padded with zeros.
 
     KeyError if the id is unknown. The checksum was verified by the frame reader.

@@ -4,7 +4,7 @@
     signing.set_time(unix_ns, now_ns)           # whenever a trusted clock is read
     tail = signing.sign(data, link_id, now_ns)  # 13 bytes after a frame whose flags mark it as signed
     fault = signing.verify(frame, now_ns)       # None: accepted
-    if signing.needs_saving: save_timestamp(stamp_path, signing.timestamp_to_save())
+    if signing.needs_saving: replace_text(stamp_path, f"{signing.timestamp_to_save()}\n")
 
 After https://mavlink.io/en/guide/message_signing.html. One object serves all links that share a key, so that
 a frame received on one link cannot be replayed on another. The hash is verified first: only a frame made by a
@@ -197,7 +197,7 @@ def read_key(path: Path) -> bytes:
 
 
 def load_timestamp(path: Path) -> int:
-    """Read the timestamp written by `save_timestamp`; 0 if there is no file, ValueError if it is invalid."""
+    """Read the timestamp of a file; 0 if there is none, ValueError if it is invalid."""
     try:
         text = path.read_text("ascii").strip()
         if not text.isdecimal():
@@ -209,13 +209,3 @@ def load_timestamp(path: Path) -> int:
             f"{path}: holds no signing timestamp; remove it (old frames may then be accepted once)"
         ) from None
     return int(text)
-
-
-def save_timestamp(path: Path, stamp: int) -> None:
-    """Write `stamp` so that a power cut leaves the old one or this one. OSError if it cannot be written."""
-    beside = path.with_name(path.name + ".new")
-    with beside.open("w", encoding="ascii") as file:
-        file.write(f"{stamp}\n")
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(beside, path)

@@ -9,7 +9,7 @@ sigmas indicates a fault of ours: the reset is withheld.
 
 from __future__ import annotations
 
-from companion.link.dialect import mavlink
+from companion.link.dialect import entry_name, mavlink
 from companion.nav.geometry import Geodetic, displace
 from companion.output.gate import JUMP_MARGIN_M, SIGMAS, Position, distance
 from companion.records import Event, FilterStatus, GlobalPosition, Gnss, Severity, Stamped
@@ -18,13 +18,6 @@ from companion.units import SECOND_NS
 GPS_TIMEOUT_NS = 2 * SECOND_NS  # ArduPilot rejects the command for 1 s after a GPS fix
 POSITION_TIMEOUT_NS = 2 * SECOND_NS
 WIND_ERROR = 20.0  # [m/s], greatest error of its wind (7 m/s observed after a change)
-RESULTS = {
-    mavlink.MAV_RESULT_ACCEPTED: "accepted",
-    mavlink.MAV_RESULT_TEMPORARILY_REJECTED: "temporarily rejected",
-    mavlink.MAV_RESULT_DENIED: "denied",
-    mavlink.MAV_RESULT_UNSUPPORTED: "unsupported",
-    mavlink.MAV_RESULT_FAILED: "failed",
-}
 
 
 class PositionReset:
@@ -80,10 +73,9 @@ class PositionReset:
         news, self._answer = result != self._answer, result
         if not news:
             return None
-        name = RESULTS.get(result, f"MAV_RESULT {result}")
         return Event(
             now_ns,
             now_ns,
             Severity.INFO if result == mavlink.MAV_RESULT_ACCEPTED else Severity.WARNING,
-            f"external position {name}",
+            f"external position {entry_name('MAV_RESULT', result)}",
         )

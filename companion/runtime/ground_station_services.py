@@ -11,7 +11,7 @@ from typing import Any
 from companion.config import Config, OutputConfig
 from companion.config.profiles import RESET
 from companion.link import dialect
-from companion.link.commands import CommandServer, Source
+from companion.link.commands import DISABLED, CommandServer, Source
 from companion.link.component_metadata import FileServer, component_metadata
 from companion.link.dialect import mavlink
 from companion.link.parameter_server import ParameterChanged, ParameterServer
@@ -25,8 +25,6 @@ NANO_PER_MICRO = 1000
 PINGS_HZ, PINGS_BURST = 10.0, 10
 STATUS = "NAVIGATION_STATUS"
 NAMED_VALUES_US = 1_000_000
-#: Interval of a disabled message.
-DISABLED_US = -1
 
 
 def feed_periods_ns(output: OutputConfig) -> dict[str, int]:
@@ -46,8 +44,8 @@ def _fed_us(output: OutputConfig) -> dict[int, int]:
 def _offered_us(output: OutputConfig) -> dict[int, int]:
     """Default interval of each message that a link may ask for: the status, and copies of what is fed."""
     hz = output.rates_hz[STATUS]
-    status = round(1e6 / hz) if hz > 0.0 else DISABLED_US
-    return {**dict.fromkeys(_fed_us(output), DISABLED_US), dialect.type_named(STATUS).msgid: status}
+    status = round(1e6 / hz) if hz > 0.0 else DISABLED
+    return {**dict.fromkeys(_fed_us(output), DISABLED), dialect.type_named(STATUS).msgid: status}
 
 
 class GroundStationServices:

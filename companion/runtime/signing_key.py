@@ -26,7 +26,8 @@ from pathlib import Path
 from typing import Self
 
 from companion.config import Config, ConfigError
-from companion.link.signing import Signing, load_timestamp, read_key, save_timestamp
+from companion.link.signing import Signing, load_timestamp, read_key
+from companion.runtime.state_file import replace_text
 
 #: Created by systemd-timesyncd (239 and later) after the clock was synchronized with a server.
 SYNCHRONIZED = "/run/systemd/timesync/synchronized"
@@ -88,4 +89,4 @@ class SigningKey:
         """Store the timestamp; if the disk fails, signed links start a minute late after the next start."""
         if self.signing.needs_saving:
             with contextlib.suppress(OSError):
-                save_timestamp(self._stamp, self.signing.timestamp_to_save())
+                replace_text(self._stamp, f"{self.signing.timestamp_to_save()}\n")

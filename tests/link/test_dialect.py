@@ -61,7 +61,7 @@ def test_trimmed_payload_is_padded_and_a_longer_one_is_cut() -> None:
 
 
 def test_rsbn_measurement_keeps_its_precision() -> None:
-    sent = dialect.RsbnMeasurement(
+    sent = dialect.rsbn.MAVLink_rsbn_measurement_message(
         1_700_000_000_000_000, 557_512_345, 376_123_456, 187.5, 6.1, 250_000.0, 0.004, 200.0, 12, 3
     )
     got = dialect.decode(frame_of(180000, dialect.payload(sent)))

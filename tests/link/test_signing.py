@@ -12,6 +12,7 @@ from pymavlink.dialects.v20 import common
 from companion.link import dialect, frame, signing
 from companion.link.session import FrameRejected, MessageReceived, Session
 from companion.link.signing import AHEAD, BEHIND, LEAD, MAX_TIMESTAMP, SignatureFault, Signing
+from companion.runtime.state_file import replace_text
 
 VECTORS = json.loads((pathlib.Path(__file__).parents[1] / "data" / "mavlink_vectors.json").read_text())
 SIGNED = [vector for vector in VECTORS if "key_hex" in vector]
@@ -282,8 +283,8 @@ def test_restarted_peer_is_accepted_at_once() -> None:
 def test_timestamp_file_is_read_back_and_an_invalid_one_is_reported(tmp_path: pathlib.Path) -> None:
     path = tmp_path / "stamp"
     assert signing.load_timestamp(path) == 0
-    signing.save_timestamp(path, NOON)
-    signing.save_timestamp(path, NOON + 1)
+    replace_text(path, f"{NOON}\n")
+    replace_text(path, f"{NOON + 1}\n")
     assert signing.load_timestamp(path) == NOON + 1
     assert [p.name for p in tmp_path.iterdir()] == ["stamp"]
     for torn in ("", "-5", "12x"):

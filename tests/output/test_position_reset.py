@@ -108,14 +108,14 @@ def test_resets_continue_after_an_accepted_one() -> None:
 
 def test_result_is_reported_when_it_changes() -> None:
     reset = flown()
-    answers = [4, 4, 4, 0, 0, 2, 2, 3, 8]
+    answers = [4, 4, 4, 0, 0, 2, 2, 3, 99]
     texts = [e.text for answer in answers if (e := reset.handle_acknowledgement(answer, START)) is not None]
     assert texts == [
         "external position failed",
         "external position accepted",
         "external position denied",
         "external position unsupported",
-        "external position MAV_RESULT 8",
+        "external position MAV_RESULT 99",
     ]
 
 
