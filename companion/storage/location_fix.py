@@ -11,7 +11,7 @@ from typing import Any
 
 import msgspec
 
-from companion.nav import earth
+from companion.nav.geometry import displace
 from companion.records import Gnss, Smoothed, Solution, Stamped, Truth
 from companion.storage import schemas
 
@@ -86,13 +86,10 @@ def to_location_fixes(record: Stamped, unix_ns: int) -> list[tuple[str, Location
             nn, ne, nd, ee, ed, dd = record.covariance
             covariance = (ee, ne, -ed, ne, nn, -nd, -ed, -nd, dd)
             # error = INS - truth: the inertial position is the corrected one plus the error
-            R_N, R_E = earth.radii(record.lat)
-            north, east = record.error_n
-            lat = record.lat + north / (R_N + record.alt_msl)
-            lon = record.lon + east / ((R_E + record.alt_msl) * max(math.cos(record.lat), 1e-9))
+            inertial = displace(record.lat, record.lon, record.alt_msl, *record.error_n, 0.0)
             return [
                 ("/map/solution", _fix(stamp, record.lat, record.lon, record.alt_msl, covariance, KNOWN)),
-                ("/map/inertial", _fix(stamp, lat, lon, record.alt_msl)),
+                ("/map/inertial", _fix(stamp, *inertial)),
             ]
         case _:
             return []

@@ -38,7 +38,6 @@ def create_log(
     min_free: int = 1 << 28,
     chunk_bytes: int = 131072,
     fsync_s: float = 1.0,
-    depth: int = 1 << 25,
     block: bool = False,
     on_delete: Callable[[Path], None] = lambda log: None,
 ) -> Writer:
@@ -68,7 +67,6 @@ def create_log(
         start_ns=start_ns,
         chunk_bytes=chunk_bytes,
         fsync_s=fsync_s,
-        depth=depth,
         block=block,
         disk=partial(DiskFile, reserve=min_free, relieve=partial(make_room, folder, on_delete=on_delete)),
         attachments=[schemas.dialect_attachment(start_unix_ns)],
