@@ -12,10 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from companion.nav.earth import E2, A
-from companion.nav.geometry import enu_axes
+from companion.analysis.simulated_rsbn import Sight, ecef, sight_from
+from companion.nav.geometry import Geodetic
 from companion.records import RsbnFix
-from companion.units import Floats
 from sitl.flight import Trajectory
 
 _RADIO_R = 4.0 / 3.0 * 6371000.0
@@ -48,21 +47,10 @@ class Beacon:
     latency_s: float = 0.15
 
 
-def azimuth_range_elevation(beacon: Beacon, flight: Trajectory) -> tuple[Floats, Floats, Floats]:
+def azimuth_range_elevation(beacon: Beacon, flight: Trajectory) -> Sight:
     """Return azimuth in [0, 2 pi) rad, slant range (m) and elevation (rad) of the aircraft at the beacon."""
-
-    def ecef(lat: Floats, lon: Floats, alt: Floats) -> Floats:
-        R_E = A / np.sqrt(1.0 - E2 * np.sin(lat) ** 2)
-        rho = (R_E + alt) * np.cos(lat)
-        return np.stack(
-            [rho * np.cos(lon), rho * np.sin(lon), ((1.0 - E2) * R_E + alt) * np.sin(lat)], axis=-1
-        )
-
-    lat, lon = math.radians(beacon.lat_deg), math.radians(beacon.lon_deg)
-    away = ecef(flight.lat, flight.lon, flight.alt) - ecef(np.array(lat), np.array(lon), np.array(beacon.alt))
-    east, north, up = enu_axes(lat, lon) @ away.T
-    level = np.hypot(east, north)
-    return np.arctan2(east, north) % (2.0 * np.pi), np.hypot(level, up), np.arctan2(up, level)
+    place = Geodetic(math.radians(beacon.lat_deg), math.radians(beacon.lon_deg), beacon.alt)
+    return sight_from(place, ecef(flight.lat, flight.lon, flight.alt))
 
 
 def in_reach(beacon: Beacon, flight: Trajectory) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:

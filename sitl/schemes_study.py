@@ -69,7 +69,7 @@ def apart_m(a: SchemeFlight, b: SchemeFlight) -> tuple[float, float]:
     _, i, j = np.intersect1d(a.t_ns, b.t_ns, return_indices=True)
     d = a.place[i] - b.place[j]
     metres = 6.371e6 * np.hypot(d[:, 0], d[:, 1] * np.cos(a.place[i, 0]))
-    return float(np.sqrt(np.mean(metres**2))), float(metres.max())
+    return root_mean_square(metres), float(metres.max())
 
 
 @click.command("schemes-flown")

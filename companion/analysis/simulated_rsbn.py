@@ -26,7 +26,7 @@ import numpy.typing as npt
 from companion.analysis.smoothing import join_runs, smooth_flight
 from companion.config import Config
 from companion.nav.earth import E2, A
-from companion.nav.geometry import enu_axes, radio_horizon
+from companion.nav.geometry import Geodetic, enu_axes, radio_horizon, to_ecef
 from companion.navigator import INPUTS_USED
 from companion.plausibility import HIGHEST
 from companion.records import Gnss, RsbnFix, Stamped, Truth
@@ -242,10 +242,10 @@ def simulate_measurements(
     t_ns, lat, lon, alt = _sample_track(track)
     if not t_ns.size:
         return []
-    place = _ecef(lat, lon, alt)
+    place = ecef(lat, lon, alt)
     visible = []
     for beacon in beacons:
-        geometry = _beacon_geometry(beacon, place)
+        geometry = sight_from(Geodetic(beacon.lat, beacon.lon, beacon.alt), place)
         if (reach := _in_reach(beacon, geometry, alt)).any():
             visible.append((beacon, geometry, reach))
     if not visible:
@@ -258,7 +258,9 @@ def simulate_measurements(
     return sorted(found, key=lambda answer: (answer.rx_ns, answer.beacon))
 
 
-class _Geometry(NamedTuple):
+class Sight(NamedTuple):
+    """Azimuth in [0, 2 pi) rad, slant range (m) and elevation (rad) at a beacon, each (n,)."""
+
     azimuth: Floats
     slant: Floats
     elevation: Floats
@@ -266,7 +268,7 @@ class _Geometry(NamedTuple):
 
 def _simulate_beacon(
     beacon: ListedBeacon,
-    geometry: _Geometry,
+    geometry: Sight,
     t_ns: npt.NDArray[np.int64],
     visible: npt.NDArray[np.bool_],
     seed: int,
@@ -302,22 +304,21 @@ def _sample_track(track: AircraftTrack) -> tuple[npt.NDArray[np.int64], Floats, 
     return t_ns, lat, np.interp(at, known, np.unwrap(track.lon)), alt
 
 
-def _ecef(lat: Floats, lon: Floats, alt: Floats) -> Floats:
+def ecef(lat: Floats, lon: Floats, alt: Floats) -> Floats:
     """Convert to earth-centred coordinates (n, 3), m."""
     N = A / np.sqrt(1.0 - E2 * np.sin(lat) ** 2)
     level = (N + alt) * np.cos(lat)
     return np.stack([level * np.cos(lon), level * np.sin(lon), (N * (1.0 - E2) + alt) * np.sin(lat)], axis=1)
 
 
-def _beacon_geometry(beacon: ListedBeacon, place: Floats) -> _Geometry:
-    """Compute `nav.geometry.slant_range_azimuth` for many positions (n, 3), with elevations."""
-    lat, lon, alt = (np.array([value]) for value in (beacon.lat, beacon.lon, beacon.alt))
-    east, north, up = enu_axes(beacon.lat, beacon.lon) @ (place - _ecef(lat, lon, alt)).T
+def sight_from(beacon: Geodetic, place: Floats) -> Sight:
+    """Compute `nav.geometry.slant_range_azimuth` for many earth-centred positions (n, 3), with elevations."""
+    east, north, up = enu_axes(beacon.lat, beacon.lon) @ (place - to_ecef(beacon)).T
     level = np.hypot(east, north)
-    return _Geometry(np.arctan2(east, north) % math.tau, np.hypot(level, up), np.arctan2(up, level))
+    return Sight(np.arctan2(east, north) % math.tau, np.hypot(level, up), np.arctan2(up, level))
 
 
-def _in_reach(beacon: ListedBeacon, geometry: _Geometry, alt: Floats) -> npt.NDArray[np.bool_]:
+def _in_reach(beacon: ListedBeacon, geometry: Sight, alt: Floats) -> npt.NDArray[np.bool_]:
     near = geometry.slant <= beacon.range_limit
     if not near.any():
         return near
