@@ -28,7 +28,7 @@ from companion.config.options import configuration_options
 from companion.nav.geometry import Geodetic, separation
 from companion.records import Event, Gnss, Rejection, Reset, RsbnFix, Solution, Stamped
 from companion.runtime.core import CompanionCore
-from companion.storage.deferred_log import Log
+from companion.storage.deferred_log import Log, NoLog
 from companion.storage.retention import create_log
 from companion.storage.run_metadata import run_metadata
 from companion.study import plot_options
@@ -50,19 +50,17 @@ class CollectingLog:
 
     def __init__(self, log: Log | None) -> None:
         self.records: list[Stamped] = []
-        self._log = log
+        self._log = log or NoLog()
 
     def record(self, record: Stamped, channel: str | None = None) -> None:
         """Write one record and collect it if its kind is in `COLLECTED`."""
         if isinstance(record, COLLECTED):
             self.records.append(record)
-        if self._log is not None:
-            self._log.record(record, channel)
+        self._log.record(record, channel)
 
     def frame(self, link: str, outgoing: bool, data: bytes, t_ns: int) -> None:
         """Write one frame."""
-        if self._log is not None:
-            self._log.frame(link, outgoing, data, t_ns)
+        self._log.frame(link, outgoing, data, t_ns)
 
 
 class LoopbackFlight(NamedTuple):

@@ -295,12 +295,9 @@ FLIGHT = """
 from companion.bench.live import STREAMS, fly
 from companion.config import load
 from companion.runtime.core import CompanionCore
+from companion.storage.deferred_log import NoLog
 
-class Log:
-    def record(self, record, channel=None): pass
-    def frame(self, link, outgoing, data, t_ns): pass
-
-core = CompanionCore(load(None, {"output.profile": "ardupilot"}, {}), Log())
+core = CompanionCore(load(None, {"output.profile": "ardupilot"}, {}), NoLog())
 for t, data in fly(STREAMS["ArduPilot, 500 messages/s"]):
     core.receive("main", data, round(1e9 * (t + 1.0)))
     core.settle()

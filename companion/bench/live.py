@@ -24,8 +24,8 @@ from companion.bench.latency import FIELDS, peer, receive_datagrams, run_compani
 from companion.config import load
 from companion.link import dialect, frame
 from companion.link.dialect import mavlink
-from companion.records import Stamped
 from companion.runtime.core import CompanionCore
+from companion.storage.deferred_log import NoLog
 from companion.tables import number_table
 
 FLIGHT_S = 20.0
@@ -116,17 +116,9 @@ def table(costs: list[Cost]) -> Table:
     return shown
 
 
-class _NoLog:
-    def record(self, record: Stamped, channel: str | None = None) -> None:
-        """Write nothing."""
-
-    def frame(self, link: str, outgoing: bool, data: bytes, t_ns: int) -> None:
-        """Write nothing."""
-
-
 def in_one_go(stream: Stream) -> float:
     """Return the processor seconds for a second of flight where nothing waits for the next datagram."""
-    core = CompanionCore(load(None, {"output.profile": stream.profile}, {}), _NoLog())
+    core = CompanionCore(load(None, {"output.profile": stream.profile}, {}), NoLog())
     spent = 0.0
     for t, data in datagrams(fly(stream), SETTLE_S + FLIGHT_S):
         now = round(1e9 * (t + 1.0))

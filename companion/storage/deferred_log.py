@@ -25,6 +25,16 @@ class Log(Protocol):
         """Write one frame."""
 
 
+class NoLog:
+    """A `Log` that writes nothing."""
+
+    def record(self, record: Stamped, channel: str | None = None) -> None:
+        """Ignore one record."""
+
+    def frame(self, link: str, outgoing: bool, data: bytes, t_ns: int) -> None:
+        """Ignore one frame."""
+
+
 class DeferredLog:
     """A `Log` that buffers in front of another one."""
 

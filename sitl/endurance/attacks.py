@@ -31,8 +31,8 @@ from companion.bench.live import memory_mib, processor_s
 from companion.link import dialect, frame
 from companion.link.dialect import mavlink, rsbn
 from companion.option_types import FloatRange
-from companion.records import Stamped
 from companion.runtime.core import CompanionCore
+from companion.storage.deferred_log import NoLog
 from sitl.autopilot import SimulatedAutopilot
 from sitl.endurance.fuzz_targets import make_frame
 from sitl.endurance.parameter_sweep import CONFIGS, recorded_flight, settings
@@ -298,17 +298,9 @@ class Cost(NamedTuple):
     odometry_hz: float
 
 
-class _NoLog:
-    def record(self, record: Stamped, channel: str | None = None) -> None:
-        pass
-
-    def frame(self, link: str, outgoing: bool, data: bytes, t_ns: int) -> None:
-        pass
-
-
 def virtual_cost(name: str, seconds: float = 10.0) -> Cost:
     """Fly the recorded flight in virtual time; attack after the first SETTLE_S for `seconds`."""
-    attack, core = ATTACKS[name], CompanionCore(CONFIGS[1], _NoLog(), (LINK,))
+    attack, core = ATTACKS[name], CompanionCore(CONFIGS[1], NoLog(), (LINK,))
     sent, odometry, used, longest, reader = 0, 0, 0.0, 0.0, frame.Reader()
 
     def process(data: bytes, now: int, peer: str) -> None:
@@ -345,16 +337,8 @@ def stop_during_start(times: int) -> list[int]:
     codes = []
     for number in range(times):
         with tempfile.TemporaryDirectory() as folder:
-            command = [
-                sys.executable,
-                "-m",
-                "companion",
-                "run",
-                "--connect",
-                f"udpin:{HOST}:0",
-                "--logs",
-                folder,
-            ]
+            command = [sys.executable, "-m", "companion", "run", "--connect", f"udpin:{HOST}:0"]
+            command += ["--logs", folder]
             with subprocess.Popen(command, stderr=subprocess.DEVNULL) as process:
                 time.sleep(0.1 + 1.4 * number / max(times - 1, 1))
                 process.send_signal(signal.SIGTERM)
@@ -377,16 +361,7 @@ def main(seconds: float, only: tuple[str, ...], virtual: bool) -> None:
                 costs.add_row(name, *row)
         Console(width=100).print(costs)
         return
-    columns = (
-        "attack",
-        "per second",
-        "processor",
-        "memory",
-        "ODOMETRY",
-        "p99 of delay",
-        "unanswered",
-        "exit",
-    )
+    columns = "attack", "per second", "processor", "memory", "ODOMETRY", "p99 of delay", "unanswered", "exit"
     table = Table(*columns, caption="each value: quiet, then attacked")
     for name in only or ATTACKS:
         if name == "term":

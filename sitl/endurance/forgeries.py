@@ -23,8 +23,8 @@ from companion.config import Config
 from companion.link import dialect, frame
 from companion.link.dialect import mavlink, rsbn
 from companion.link.signing import Signing
-from companion.records import Stamped
 from companion.runtime.core import CompanionCore
+from companion.storage.deferred_log import NoLog
 from companion.units import SECOND_NS
 from sitl.endurance.parameter_sweep import CONFIGS, recorded_flight
 from sitl.loopback import LINK, START_NS
@@ -109,18 +109,6 @@ class Effect(NamedTuple):
     event: str
 
 
-class _Log:
-    def __init__(self) -> None:
-        self.frames: list[tuple[int, bytes]] = []
-
-    def record(self, record: Stamped, channel: str | None = None) -> None:
-        pass
-
-    def frame(self, link: str, outgoing: bool, data: bytes, t_ns: int) -> None:
-        if outgoing:
-            self.frames.append((t_ns, data))
-
-
 def signed(data: bytes, signing: Signing, now_ns: int) -> bytes:
     """Return an unsigned MAVLink 2 frame with a signature."""
     (found,) = frame.Reader().receive(data)
@@ -137,10 +125,10 @@ def signed(data: bytes, signing: Signing, now_ns: int) -> bytes:
 
 def fly(config: Config, forged: Forger, key: bytes | None = None) -> Sent:
     """Fly the recorded flight, signed with `key`, with the `forged` frames of each tenth of a second."""
-    log = _Log()
-    core = CompanionCore(config, log, (LINK,), Signing(key, timestamp=1 << 40) if key else None)
+    core = CompanionCore(config, NoLog(), (LINK,), Signing(key, timestamp=1 << 40) if key else None)
     autopilot = Signing(key, timestamp=1 << 40) if key else None
     due, events = START_NS + round(FORGED_FROM_S * 1e9), list[str]()
+    odometry, messages = list[tuple[int, float, float]](), list[tuple[int, bytes]]()
     for now, data in recorded_flight(config.inertial.independent):
         core.receive(LINK, signed(data, autopilot, now) if autopilot else data, now, AUTOPILOT)
         if now >= due:
@@ -149,18 +137,16 @@ def fly(config: Config, forged: Forger, key: bytes | None = None) -> Sent:
                 core.receive(LINK, raw, now, peer)
         if core.deadline() <= now:
             core.poll(now)
-        core.to_send(LINK, now)
+        for sent in core.to_send(LINK, now):
+            (found,) = frame.Reader().receive(sent)
+            assert isinstance(found, frame.Frame)
+            message = dialect.decode(found)
+            if found.msgid == mavlink.MAVLINK_MSG_ID_ODOMETRY:
+                odometry.append((now, message.x, message.y))
+            if found.msgid == rsbn.MAVLINK_MSG_ID_NAVIGATION_STATUS:
+                message.rejected = 0  # counts the forged frames that were rejected
+            messages.append((found.msgid, dialect.payload(message)))
         events += [event.text for event in core.take_events()]
-    odometry, messages = list[tuple[int, float, float]](), list[tuple[int, bytes]]()
-    for now, data in log.frames:
-        (found,) = frame.Reader().receive(data)
-        assert isinstance(found, frame.Frame)
-        message = dialect.decode(found)
-        if found.msgid == mavlink.MAVLINK_MSG_ID_ODOMETRY:
-            odometry.append((now, message.x, message.y))
-        if found.msgid == rsbn.MAVLINK_MSG_ID_NAVIGATION_STATUS:
-            message.rejected = 0  # counts the forged frames that were rejected
-        messages.append((found.msgid, dialect.payload(message)))
     return Sent(odometry, messages, events)
 
 

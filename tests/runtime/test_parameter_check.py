@@ -5,8 +5,8 @@ import pytest
 from companion.config import load
 from companion.config.required_parameters import required_parameters
 from companion.link import frame
-from companion.records import Stamped
 from companion.runtime.core import CompanionCore
+from companion.storage.deferred_log import NoLog
 from sitl.autopilot import SimulatedAutopilot
 from sitl.faults import Fault
 from sitl.scenarios import get_scenario
@@ -16,16 +16,6 @@ SECOND = 1_000_000_000
 STEP = SECOND // 50
 REQUEST_READ, SET = 20, 23
 WORLDS = {make: World(get_scenario("short", autopilot=make)) for make in ("ardupilot", "px4")}
-
-
-class NullLog:
-    """Log that discards everything."""
-
-    def record(self, record: Stamped, channel: str | None = None) -> None:
-        pass
-
-    def frame(self, link: str, outgoing: bool, data: bytes, t_ns: int) -> None:
-        pass
 
 
 class Flight:
@@ -48,7 +38,7 @@ class Flight:
                 need.name: need.value for need in required_parameters(config, make)
             }
         before = dict(autopilot.parameters.values)
-        core = CompanionCore(config, NullLog())
+        core = CompanionCore(config, NoLog())
         self.requests: list[int] = []
         for now in range(STEP, round(seconds * SECOND), STEP):
             for data in autopilot.poll(now):

@@ -15,6 +15,7 @@ from companion.config import Config
 from companion.records import Solution
 from companion.runtime.core import CompanionCore
 from companion.storage import flight_log
+from companion.storage.deferred_log import NoLog
 from companion.transport.reconnect import Address, CannotListen
 from sitl.autopilot import SimulatedAutopilot
 from sitl.loopback import simulator_config
@@ -26,16 +27,11 @@ LOOPBACK = "127.0.0.1"
 FED = ["--set", "output.profile=ardupilot", "--set", "inertial.independent=true"]
 
 
-class NullLog:
-    def record(self, record, channel=None) -> None: ...
-    def frame(self, link, outgoing, data, t_ns) -> None: ...
-
-
 def test_score_agrees_with_the_loopback() -> None:
     """With a clock offset between the two, scored errors stay at the navigator's level of metres."""
     autopilot, apart = SimulatedAutopilot(get_scenario("short")), 77_000_000_000_000
     onboard, score, lines, now = (
-        CompanionCore(simulator_config(Config()), NullLog()),
+        CompanionCore(simulator_config(Config()), NoLog()),
         PositionScore(autopilot),
         [],
         0,
