@@ -15,9 +15,9 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import click
-import msgspec
 
 from companion.config import AirDataConfig, Config, InertialConfig, OutputConfig
+from companion.config.reference import keys
 from companion.link import dialect, frame
 from companion.link.dialect import mavlink
 from companion.link.parameter_server import REAL32, Parameter, parameter_table
@@ -37,6 +37,7 @@ CONFIGS = (
     Config(output=OutputConfig(profile="ardupilot")),
     Config(inertial=InertialConfig(source="air_data"), air_data=AirDataConfig(), output=ALL_OUTPUTS),
 )
+_LIMITS = {(key.section, key.name): key.limits for key in keys()}
 
 
 class Setting(NamedTuple):
@@ -48,15 +49,10 @@ class Setting(NamedTuple):
 
 def limits(parameter: Parameter) -> tuple[float, ...]:
     """Return the least and the greatest value that a parameter accepts by itself."""
-    if parameter.kind is bool:
-        return 0.0, 1.0
-    info = msgspec.inspect.type_info(type(getattr(Config(), parameter.section)))
-    assert isinstance(info, msgspec.inspect.StructType)
-    (kind,) = [field.type for field in info.fields if field.name == parameter.key]
-    assert isinstance(kind, msgspec.inspect.FloatType | msgspec.inspect.IntType), parameter
-    if kind.ge is None or kind.le is None:
+    least, greatest = _LIMITS[parameter.section, parameter.key]
+    if least is None or greatest is None:
         raise ValueError(f"{parameter.section}.{parameter.key} has no minimum or no maximum")
-    return float(kind.ge), float(kind.le)
+    return float(least), float(greatest)
 
 
 def settings() -> Iterator[Setting]:

@@ -26,7 +26,6 @@ import json
 import math
 import os
 import random
-import resource
 import tempfile
 import time
 import types
@@ -39,6 +38,7 @@ from typing import NamedTuple
 import click
 from rich.console import Console
 
+from companion.bench.live import memory_mib
 from companion.config import Config
 from companion.output.pace import EARLY_SHARE
 from companion.records import Stamped
@@ -213,7 +213,7 @@ def _measure_hour(
     _trim_memory()  # exclude memory freed by the simulator
     return HourStatistics(
         hour,
-        round(_resident_mib(), 1),
+        round(memory_mib(os.getpid()), 1),
         min(each.objects for each in reached),
         max(each.longest for each in reached),
         round(counter.waiting / 1024.0, 1),
@@ -235,15 +235,6 @@ def _trim_memory() -> None:
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
     if trim is not None:
         trim(0)
-
-
-def _resident_mib() -> float:
-    """Resident memory of this process; its maximum where /proc is not available."""
-    try:
-        pages = int(Path("/proc/self/statm").read_text().split()[1])
-    except OSError:
-        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
-    return pages * os.sysconf("SC_PAGE_SIZE") / (1 << 20)
 
 
 def find_failures(hours: list[HourStatistics], depth: int = 1 << 25) -> list[str]:
