@@ -13,6 +13,7 @@ from typing import Any, Literal, NamedTuple, TypeAlias
 
 from companion.link import dialect
 from companion.link.dialect import mavlink, rsbn
+from companion.link.fields import deg_e7
 from companion.records import (
     AirData,
     AirspeedSensor,
@@ -72,10 +73,6 @@ def encode(record: Stamped, sender: SimulatedSender) -> Message:
     if encoder is None:
         raise ValueError(f"no autopilot sends a {type(record).__name__}: only sensor records can be encoded")
     return encoder(record, sender)
-
-
-def _deg_e7(angle: float) -> int:
-    return round(math.degrees(angle) * 1e7)
 
 
 def _mm(metres: float) -> int:
@@ -148,8 +145,8 @@ def _gnss(r: Gnss, a: SimulatedSender) -> Message:
         "GPS_RAW_INT" if r.receiver == 0 else "GPS2_RAW",
         time_usec=r.stamp_us,
         fix_type=r.fix,
-        lat=_deg_e7(r.lat),
-        lon=_deg_e7(r.lon),
+        lat=deg_e7(r.lat),
+        lon=deg_e7(r.lon),
         alt=_mm(r.alt_msl),
         eph=0xFFFF if r.hdop is None else round(r.hdop * 100.0),
         epv=0xFFFF,
@@ -172,8 +169,8 @@ def _position_encoder(name: str) -> Callable[[LocalOrigin | HomePosition, Simula
     def encode_position(r: LocalOrigin | HomePosition, a: SimulatedSender) -> Message:
         return dialect.new(
             name,
-            latitude=_deg_e7(r.lat),
-            longitude=_deg_e7(r.lon),
+            latitude=deg_e7(r.lat),
+            longitude=deg_e7(r.lon),
             altitude=_mm(r.alt_msl),
             time_usec=a.us(r.t_ns),
         )
@@ -186,8 +183,8 @@ def _global_position(r: GlobalPosition, a: SimulatedSender) -> Message:
     return dialect.new(
         "GLOBAL_POSITION_INT",
         time_boot_ms=a.ms(r.t_ns),
-        lat=_deg_e7(r.lat),
-        lon=_deg_e7(r.lon),
+        lat=deg_e7(r.lat),
+        lon=deg_e7(r.lon),
         alt=_mm(r.alt_msl),
         relative_alt=_mm(r.height_above_home),
         vx=vx,
@@ -259,7 +256,7 @@ def _system_time(r: SystemTime, a: SimulatedSender) -> Message:
 
 def _truth(r: Truth, a: SimulatedSender) -> Message:
     attitude = r.attitude or (0.0, 0.0, 0.0)
-    lat, lon = _deg_e7(r.lat), _deg_e7(r.lon)
+    lat, lon = deg_e7(r.lat), deg_e7(r.lon)
     if a.autopilot == "px4":
         vx, vy, vz = (round(v * 100.0) for v in r.v_n)
         return dialect.new(
@@ -290,8 +287,8 @@ def _rsbn(r: RsbnFix, a: SimulatedSender) -> Message:
         "RSBN_MEASUREMENT",
         time_usec=a.us(r.t_ns),
         beacon_id=r.beacon,
-        beacon_lat=_deg_e7(r.lat),
-        beacon_lon=_deg_e7(r.lon),
+        beacon_lat=deg_e7(r.lat),
+        beacon_lon=deg_e7(r.lon),
         beacon_alt=r.alt,
         azimuth=_or_nan(r.azimuth),
         slant_range=_or_nan(r.slant_range),
@@ -306,8 +303,8 @@ def _star_fix(r: StarFix, a: SimulatedSender) -> Message:
         "STAR_FIX",
         time_usec=a.us(r.t_ns),
         star_id=r.star,
-        zenith_lat=_deg_e7(r.lat),
-        zenith_lon=_deg_e7(_wrap_pi(r.lon)),
+        zenith_lat=deg_e7(r.lat),
+        zenith_lon=deg_e7(_wrap_pi(r.lon)),
         altitude=r.altitude,
         azimuth=_or_nan(r.azimuth),
         sigma_altitude=r.sigma_altitude,
@@ -320,11 +317,11 @@ def _range_difference(r: RangeDifference, a: SimulatedSender) -> Message:
         "RANGE_DIFFERENCE",
         time_usec=a.us(r.t_ns),
         chain_id=r.chain,
-        a_lat=_deg_e7(r.lat_a),
-        a_lon=_deg_e7(r.lon_a),
+        a_lat=deg_e7(r.lat_a),
+        a_lon=deg_e7(r.lon_a),
         a_alt=r.alt_a,
-        b_lat=_deg_e7(r.lat_b),
-        b_lon=_deg_e7(r.lon_b),
+        b_lat=deg_e7(r.lat_b),
+        b_lon=deg_e7(r.lon_b),
         b_alt=r.alt_b,
         difference=r.difference,
         sigma=r.sigma,
@@ -333,7 +330,7 @@ def _range_difference(r: RangeDifference, a: SimulatedSender) -> Message:
 
 def _second_ins(r: SecondIns, a: SimulatedSender) -> Message:
     return dialect.new(
-        "SECOND_INS_POSITION", time_usec=a.us(r.t_ns), ins_id=r.ins, lat=_deg_e7(r.lat), lon=_deg_e7(r.lon)
+        "SECOND_INS_POSITION", time_usec=a.us(r.t_ns), ins_id=r.ins, lat=deg_e7(r.lat), lon=deg_e7(r.lon)
     )
 
 

@@ -28,6 +28,7 @@ from typing import Any
 from companion.config import load
 from companion.link import dialect, frame
 from companion.link.dialect import mavlink, rsbn
+from companion.link.fields import deg_e7
 from companion.nav.geometry import Geodetic, local_to_geodetic, slant_range_azimuth
 from companion.runtime.service import run
 
@@ -75,10 +76,6 @@ def measure() -> dict[str, list[float]]:
     return times
 
 
-def _degrees_e7(angle: float) -> int:
-    return round(math.degrees(angle) * 1e7)
-
-
 def _ms(t: float) -> int:
     return 10_000 + round(t * 1e3)
 
@@ -89,14 +86,14 @@ def _position(t: float) -> Geodetic:
 
 def _place(t: float) -> dict[str, Any]:
     here = _position(t)
-    return {"lat": _degrees_e7(here.lat), "lon": _degrees_e7(here.lon), "alt": round(here.alt * 1e3)}
+    return {"lat": deg_e7(here.lat), "lon": deg_e7(here.lon), "alt": round(here.alt * 1e3)}
 
 
 def _rsbn(t: float) -> dict[str, Any]:
     sight = slant_range_azimuth(BEACON, _position(t))
     return {
         "time_usec": 10_000_000 + round(t * 1e6),
-        "beacon_lat": _degrees_e7(BEACON.lat), "beacon_lon": _degrees_e7(BEACON.lon),
+        "beacon_lat": deg_e7(BEACON.lat), "beacon_lon": deg_e7(BEACON.lon),
         "beacon_alt": BEACON.alt, "azimuth": sight.azimuth % math.tau, "slant_range": sight.slant_range,
         "sigma_azimuth": math.radians(0.125), "sigma_range": 100.0, "beacon_id": 1,
         "status": rsbn.RSBN_STATUS_AZIMUTH_VALID | rsbn.RSBN_STATUS_RANGE_VALID,
@@ -110,7 +107,7 @@ FIELDS: dict[str, Callable[[float], dict[str, Any]]] = {
         "system_status": mavlink.MAV_STATE_ACTIVE, "mavlink_version": 3,
     },
     "GPS_GLOBAL_ORIGIN": lambda t: {
-        "latitude": _degrees_e7(ORIGIN.lat), "longitude": _degrees_e7(ORIGIN.lon),
+        "latitude": deg_e7(ORIGIN.lat), "longitude": deg_e7(ORIGIN.lon),
         "altitude": round(ORIGIN.alt * 1e3),
     },
     "LOCAL_POSITION_NED": lambda t: {

@@ -61,6 +61,11 @@ def position(lat: int, lon: int, names: tuple[str, str] = ("lat", "lon")) -> tup
     return math.radians(lat / 1e7), math.radians(lon / 1e7)
 
 
+def deg_e7(angle: float) -> int:
+    """Return a latitude or longitude in 1e-7 degrees: the inverse of `position`."""
+    return round(math.degrees(angle) * 1e7)
+
+
 def known_position(message: Message, lat: str = "lat", lon: str = "lon") -> tuple[float, float]:
     """Return a mandatory position in radians; autopilots send 0, 0 while they have none."""
     values = getattr(message, lat), getattr(message, lon)

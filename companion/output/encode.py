@@ -19,6 +19,7 @@ from typing import Any, NamedTuple, TypeAlias
 from companion.link import dialect
 from companion.link.decode import Autopilot
 from companion.link.dialect import mavlink, rsbn
+from companion.link.fields import deg_e7
 from companion.link.firmware import Firmware
 from companion.nav.geometry import Geodetic, Projection, geodetic_to_local
 from companion.output.gate import Position
@@ -229,8 +230,8 @@ def gps_input(position: Position, receiver: Receiver) -> Message:
         time_week_ms=gps_ms % _WEEK_MS,
         time_week=gps_ms // _WEEK_MS,
         fix_type=mavlink.GPS_FIX_TYPE_3D_FIX,
-        lat=_deg_e7(then.lat),
-        lon=_deg_e7(then.lon),
+        lat=deg_e7(then.lat),
+        lon=deg_e7(then.lon),
         alt=then.alt_msl,
         hdop=_DOP,
         vdop=_DOP,
@@ -254,8 +255,8 @@ def global_position_sensor(position: Position, receiver: Receiver) -> Message:
         id=receiver.sensor_id,
         time_usec=position.t_ns // 1000,
         source=mavlink.GLOBAL_POSITION_SRC_ESTIMATOR,
-        lat=_deg_e7(position.lat),
-        lon=_deg_e7(position.lon),
+        lat=deg_e7(position.lat),
+        lon=deg_e7(position.lon),
         alt_ellipsoid=math.nan,  # the geoid is not known
         alt=position.alt_msl,
         eph=position.sigma,
@@ -282,8 +283,8 @@ def external_position_estimate(position: Position, receiver: Receiver) -> Messag
         param2=0.0,
         param3=position.sigma,
         param4=0.0,
-        x=_deg_e7(position.lat),
-        y=_deg_e7(position.lon),
+        x=deg_e7(position.lat),
+        y=deg_e7(position.lon),
         z=math.nan,
     )
 
@@ -356,10 +357,6 @@ def named_values(status: Message | None, now_ns: int) -> list[Message]:
         dialect.new("NAMED_VALUE_FLOAT", time_boot_ms=boot_ms, name=name, value=value)
         for name, value in values.items()
     ]
-
-
-def _deg_e7(angle: float) -> int:
-    return round(math.degrees(angle) * 1e7)
 
 
 ENCODERS: Mapping[str, Callable[[Position, Receiver], Message]] = {

@@ -13,6 +13,7 @@ import pytest
 
 from companion.config import Config, ConfigError, InertialConfig, OutputConfig, load
 from companion.link import dialect, frame
+from companion.link.fields import deg_e7
 from companion.nav.geometry import Geodetic, displace, local_to_geodetic, slant_range_azimuth
 from companion.navigator import Navigator
 from companion.output.autopilot_output import AutopilotOutput
@@ -50,10 +51,6 @@ AIRSPEED_SENSOR = {f"onboard_control_sensors_{name}": 16 for name in ("present",
 
 def configured(*pairs: str) -> Config:
     return load(pairs=pairs, environment={})
-
-
-def deg_e7(angle: float) -> int:
-    return round(math.degrees(angle) * 1e7)
 
 
 class EventLog:

@@ -9,6 +9,7 @@ import pytest
 from companion.config import Config, InertialConfig, OutputConfig, load
 from companion.link import dialect, frame
 from companion.link.dialect import mavlink
+from companion.link.fields import deg_e7
 from companion.link.parameter_server import parameter_table
 from companion.nav.geometry import Geodetic, local_to_geodetic, slant_range_azimuth
 from companion.navigator import Navigator
@@ -41,10 +42,6 @@ BOOT = START - 30 * SECOND
 ORIGIN = Geodetic(math.radians(60.0), math.radians(30.0), 50.0)
 BEACON = Geodetic(math.radians(60.05), math.radians(31.07), 80.0)
 V_NORTH, HEIGHT = 40.0, 800.0
-
-
-def deg_e7(angle: float) -> int:
-    return round(math.degrees(angle) * 1e7)
 
 
 class Log:
