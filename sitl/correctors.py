@@ -12,7 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from companion.nav.geometry import Geodetic, ecef_tuple
+from companion.nav.earth import OMEGA
+from companion.nav.geometry import Geodetic, ecef_tuple, enu_axes
 from companion.navigator.corrected_ins import CHAIN_BIAS_M
 from companion.records import RangeDifference, SecondIns, Stamped, StarFix
 from companion.units import SECOND_NS, Floats
@@ -59,7 +60,7 @@ def star_fixes(aircraft: Aircraft, rng: np.random.Generator) -> list[StarFix]:
     for k, t in enumerate(flight.t.tolist()):
         number = k % len(STARS)
         declination, hour = STARS[number]
-        lon = math.radians(hour) - 7.292115e-5 * t
+        lon = math.radians(hour) - OMEGA * t
         s_n = direction(float(flight.lat[k]), float(flight.lon[k]), math.radians(declination), lon)
         seen = s_n + np.cross(psi[k], s_n)  # the platform is turned by -psi
         altitude = math.asin(-seen[2] / float(np.linalg.norm(seen))) + STAR_SIGMA * rng.standard_normal()
@@ -76,15 +77,8 @@ def direction(lat: float, lon: float, star_lat: float, star_lon: float) -> Float
     s_e = np.array(
         (math.cos(star_lat) * math.cos(star_lon), math.cos(star_lat) * math.sin(star_lon), math.sin(star_lat))
     )
-    C_ne = np.array(
-        (
-            (-math.sin(lat) * math.cos(lon), -math.sin(lat) * math.sin(lon), math.cos(lat)),
-            (-math.sin(lon), math.cos(lon), 0.0),
-            (-math.cos(lat) * math.cos(lon), -math.cos(lat) * math.sin(lon), -math.sin(lat)),
-        )
-    )
-    s_n: Floats = C_ne @ s_e
-    return s_n
+    east, north, up = enu_axes(lat, lon) @ s_e
+    return np.array((north, east, -up))
 
 
 def range_differences(aircraft: Aircraft, rng: np.random.Generator) -> list[RangeDifference]:

@@ -14,6 +14,7 @@ from typing import Any, Literal, NamedTuple, TypeAlias
 from companion.link import dialect
 from companion.link.dialect import mavlink, rsbn
 from companion.link.fields import deg_e7
+from companion.nav.geometry import wrap_angle
 from companion.records import (
     AirData,
     AirspeedSensor,
@@ -91,10 +92,6 @@ def _accuracy(sigma: float | None) -> int:
     return 0 if sigma is None else max(1, _mm(sigma))
 
 
-def _wrap_pi(heading: float) -> float:
-    return math.remainder(heading, math.tau)
-
-
 def _quaternion(attitude: Vector3) -> list[float]:
     """Quaternion w, x, y, z of the rotation b -> n by roll, pitch, heading."""
     (sr, cr), (sp, cp), (sh, ch) = ((math.sin(0.5 * a), math.cos(0.5 * a)) for a in attitude)
@@ -129,7 +126,7 @@ def _attitude(r: Attitude, a: SimulatedSender) -> Message:
         time_boot_ms=a.ms(r.t_ns),
         roll=r.roll,
         pitch=r.pitch,
-        yaw=_wrap_pi(r.heading),
+        yaw=wrap_angle(r.heading),
         rollspeed=p,
         pitchspeed=q,
         yawspeed=s,
@@ -275,7 +272,7 @@ def _truth(r: Truth, a: SimulatedSender) -> Message:
     q = dict(zip(("q1", "q2", "q3", "q4"), _quaternion(attitude)))
     # ArduPilot 4.7 puts 1e-7 degrees into the float fields: single precision, too coarse to use
     places = {"lat": float(lat), "lon": float(lon), "lat_int": lat, "lon_int": lon, "alt": r.alt}
-    angles = {"roll": roll, "pitch": pitch, "yaw": _wrap_pi(heading)}
+    angles = {"roll": roll, "pitch": pitch, "yaw": wrap_angle(heading)}
     return dialect.new("SIM_STATE", vn=vn, ve=ve, vd=vd, **q, **angles, **places)
 
 
@@ -304,7 +301,7 @@ def _star_fix(r: StarFix, a: SimulatedSender) -> Message:
         time_usec=a.us(r.t_ns),
         star_id=r.star,
         zenith_lat=deg_e7(r.lat),
-        zenith_lon=deg_e7(_wrap_pi(r.lon)),
+        zenith_lon=deg_e7(wrap_angle(r.lon)),
         altitude=r.altitude,
         azimuth=_or_nan(r.azimuth),
         sigma_altitude=r.sigma_altitude,
