@@ -12,7 +12,6 @@ rows, `index.html` lists the worst flights first, with links to the reports of t
 from __future__ import annotations
 
 import hashlib
-import os
 from collections.abc import Iterator, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
@@ -234,9 +233,9 @@ def write_table(rows: Sequence[FlightRow], path: Path) -> None:
     hints = {name: [*get_args(hint), hint][0] for name, hint in get_type_hints(FlightRow).items()}
     schema = pa.schema([(name, kinds[hint]) for name, hint in hints.items()])
     values = [{name: _storable(value) for name, value in row._asdict().items()} for row in rows]
-    part = path.with_name(path.name + ".part")
-    pq.write_table(pa.Table.from_pylist(values, schema=schema), part)
-    os.replace(part, path)
+    table = pa.BufferOutputStream()
+    pq.write_table(pa.Table.from_pylist(values, schema=schema), table)
+    write_whole(path, table.getvalue())
 
 
 def _storable(value: Any) -> Any:
