@@ -44,7 +44,10 @@ class OwnErrors(NamedTuple):
 
 
 class OwnEstimate:
-    """ArduPilot's filter on the sensors of `world`; `version` is the firmware's."""
+    """ArduPilot's filter on the sensors of `world`; `version` is the firmware's.
+
+    `truth_n` is the true position (n, 2) at each step, from the world's origin.
+    """
 
     def __init__(self, world: World, version: tuple[int, int]) -> None:
         self.filter = Ekf3()
@@ -57,7 +60,7 @@ class OwnEstimate:
         noise = IMU_NOISE / np.sqrt(RATE_HZ) * rng.standard_normal((count, 2))
         self._dv = np.diff(truth.v_n[:, :2], axis=0) + bias + noise
         places = zip(truth.lat[1:], truth.lon[1:], truth.alt[1:])
-        self._truth_n = np.array([self._local(Geodetic(*place)) for place in places])
+        self.truth_n = np.array([self._local(Geodetic(*place)) for place in places])
         self._down = world.origin.alt - truth.alt[1:]
         self._climb = truth.v_n[1:, 2]
         self._next = dict.fromkeys((Gnss, AirData, Attitude), 0)
@@ -70,11 +73,6 @@ class OwnEstimate:
     def errors(self) -> OwnErrors:
         """The errors so far."""
         return OwnErrors(self._t[: len(self._errors)], np.array(self._errors).reshape(-1, 2))
-
-    def truth_n(self, t_s: float) -> Floats:
-        """Return the true position (2,) at the step nearest to `t_s`, from the world's origin."""
-        true: Floats = self._truth_n[round(t_s * RATE_HZ) - 1]
-        return true
 
     def receive(self, message: Any, origin: LocalOrigin, t_ns: int) -> None:
         """Process a position from the companion, relative to `origin`, or a command for a source set."""
@@ -109,7 +107,7 @@ class OwnEstimate:
                 ekf.fuse_gnss(self._local(Geodetic(fix.lat, fix.lon, fix.alt)), velocity, t)
         while self._waiting and self._waiting[0][0] <= t_ns:
             self._take(*self._waiting.pop(0)[1:], t)
-        self._errors.append(ekf.x[0:2] - self._truth_n[k])
+        self._errors.append(ekf.x[0:2] - self.truth_n[k])
 
     def _take(self, message: Any, origin: LocalOrigin, t: float) -> None:
         if message.get_type() in ("COMMAND_LONG", "COMMAND_INT"):

@@ -65,7 +65,7 @@ def fed(world, offset_m=(0.0, 0.0), seed=3) -> OwnEstimate:
     own.filter.select(OUTSIDE_SET)
     for k in range(round(LOST_S * 10) + 1, round(world.scenario.duration_s * 10)):
         t_ns = k * SECOND_NS // 10
-        x, y = own.truth_n(t_ns * 1e-9) + offset_m + 20.0 * rng.standard_normal(2)
+        x, y = own.truth_n[k - 1] + offset_m + 20.0 * rng.standard_normal(2)
         own.receive(odometry(x, y), start, t_ns)
         own.advance(t_ns)
     return own
