@@ -211,11 +211,8 @@ def _round_trip(sock: socket.socket, data: bytes) -> float:
 def _separate_processors() -> Iterator[set[int]]:
     """Pin this process to one processor and yield the others, for its peers.
 
-    With a single processor all processes share it; without `sched_setaffinity` (not Linux) nothing is pinned.
+    With a single processor all processes share it.
     """
-    if not hasattr(os, "sched_setaffinity"):
-        yield set()
-        return
     every = os.sched_getaffinity(0)
     mine = {min(every)}
     os.sched_setaffinity(0, mine)
