@@ -220,7 +220,3 @@ def command(times: int, seed: int, at_once: int) -> None:
     )
     if worst > AT_RISK_S or holes:
         raise SystemExit(1)
-
-
-if __name__ == "__main__":
-    command()

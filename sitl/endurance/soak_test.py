@@ -298,7 +298,3 @@ def _print_table(hours: list[HourStatistics]) -> None:
     for hour in hours:
         table.add_row(*(f"{value:g}" if isinstance(value, float) else str(value) for value in hour))
     Console(width=max(150, Console().width)).print(table)
-
-
-if __name__ == "__main__":
-    command()
