@@ -25,17 +25,11 @@ LINE_EVERY_S, LINE_SIGMA_M = 5.0, 50.0
 SECOND_EVERY_S = 2.0
 
 
-class Station(NamedTuple):
-    """Transmitter of a hyperbolic system, deg and m."""
-
-    lat_deg: float
-    lon_deg: float
-    alt: float = 50.0
-
-
-#: A master and two secondaries, 300 to 500 km round the flights.
-MASTER = Station(61.5, 26.0)
-SECONDARIES = (Station(58.0, 27.0), Station(60.0, 36.0))
+#: A master and two secondaries of a hyperbolic system, 300 to 500 km round the flights.
+MASTER, *SECONDARIES = (
+    Geodetic(math.radians(lat), math.radians(lon), 50.0)
+    for lat, lon in ((61.5, 26.0), (58.0, 27.0), (60.0, 36.0))
+)
 #: Declination and hour angle at the start, deg: in the west, south-east and north-east of 60 N, 30 E.
 STARS = ((20.0, -20.0), (10.0, 70.0), (50.0, 100.0))
 
@@ -85,17 +79,16 @@ def range_differences(aircraft: Aircraft, rng: np.random.Generator) -> list[Rang
     """Two lines of position every five seconds, each with a bias of its own."""
     flight = aircraft.every(LINE_EVERY_S)
     bias = 0.5 * CHAIN_BIAS_M * rng.standard_normal(len(SECONDARIES))
-    places = [_place(station) for station in (MASTER, *SECONDARIES)]
     found = []
     for k, t in enumerate(flight.t.tolist()):
         here = np.array(
             ecef_tuple(Geodetic(float(flight.lat[k]), float(flight.lon[k]), float(flight.alt[k])))
         )
-        d = [float(np.linalg.norm(here - ecef_tuple(place))) for place in places]
+        d = [float(np.linalg.norm(here - ecef_tuple(place))) for place in (MASTER, *SECONDARIES)]
         t_ns = round(t * SECOND_NS)
-        for chain, secondary in enumerate(places[1:]):
+        for chain, secondary in enumerate(SECONDARIES):
             value = d[0] - d[chain + 1] + float(bias[chain]) + LINE_SIGMA_M * rng.standard_normal()
-            found.append(RangeDifference(t_ns, t_ns, chain, *places[0], *secondary, value, LINE_SIGMA_M))
+            found.append(RangeDifference(t_ns, t_ns, chain, *MASTER, *secondary, value, LINE_SIGMA_M))
     return found
 
 
@@ -106,10 +99,6 @@ def second_positions(aircraft: Aircraft, rng: np.random.Generator) -> list[Secon
     lat, lon, _ = sensors.displace_positions(flight, sensors.interpolate_error(error, flight.t).x_n)
     times = [round(t * SECOND_NS) for t in flight.t.tolist()]
     return [SecondIns(t, t, 2, *place) for t, *place in zip(times, lat.tolist(), lon.tolist(), strict=True)]
-
-
-def _place(station: Station) -> Geodetic:
-    return Geodetic(math.radians(station.lat_deg), math.radians(station.lon_deg), station.alt)
 
 
 RECORDS: dict[str, Callable[[Aircraft, np.random.Generator], Sequence[Stamped]]] = {
