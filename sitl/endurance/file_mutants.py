@@ -26,9 +26,8 @@ from typing import NamedTuple
 import click
 
 from companion.importers import sources
-from companion.storage import flight_log
 from companion.storage.reader import LogError
-from sitl.endurance.fuzz_targets import check_record
+from sitl.endurance.fuzz_targets import check_record, read_log
 from sitl.endurance.sample_logs import SAMPLES
 
 SLOWEST_S = 2.0
@@ -93,23 +92,6 @@ def read_foreign(path: Path) -> None:
     source.summary()
 
 
-def read_own(path: Path) -> None:
-    """Read an MCAP log in every way. LogError if any of them fails."""
-    failed: LogError | None = None
-    for look in (_read_records, flight_log.info, flight_log.metadata, flight_log.recover):
-        try:
-            look(path)
-        except LogError as error:
-            failed = error
-    if failed is not None:
-        raise failed
-
-
-def _read_records(path: Path) -> None:
-    for _ in flight_log.read(path):
-        pass
-
-
 class _TooSlow(BaseException):
     """Raised by the timer: the last guard of a reader must not catch it."""
 
@@ -122,7 +104,7 @@ def read_mutants(name: str, count: int, seed: int, keep: Path | None = None) -> 
     """Read `count` mutants of one format; those with a defect go to the folder `keep`."""
     file_name, build = SAMPLES[name]
     count = min(count, MOST_PROCESSES) if name == "mat" else count
-    read = read_own if "mcap" in name else read_foreign
+    read = read_log if "mcap" in name else read_foreign
     original, rng = build(), random.Random(f"{name} {seed}")
     tally = {"read": 0, "rejected": 0, "defects": 0}
     slowest, first = 0.0, ""
