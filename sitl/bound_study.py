@@ -28,7 +28,7 @@ from companion.estimate.predictor import KAPPA, Step, Window, anchor
 from companion.nav.bounded_channel import BoundedIns, Motion, UnitErrors
 from companion.nav.earth import OMEGA
 from companion.option_types import FloatRange
-from companion.study import plot_options
+from companion.study.plot_options import PLOT_FILE
 from companion.tables import print_tables
 from companion.units import Floats
 from sitl.flight import Trajectory, rotation
@@ -263,8 +263,7 @@ def curve(grade: InertialGrade, window_s: float, ahead_s: float) -> list[CurvePo
 @click.option(
     "--curve",
     "curve_file",
-    type=click.Path(path_type=Path),
-    callback=plot_options.check_plot_file,
+    type=PLOT_FILE,
     help="Only plot expected against guaranteed error, Kalman to minimax, 10 min ahead, to this file.",
 )
 def command(

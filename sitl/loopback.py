@@ -31,7 +31,7 @@ from companion.runtime.core import CompanionCore
 from companion.storage.deferred_log import Log, NoLog
 from companion.storage.retention import create_log
 from companion.storage.run_metadata import run_metadata
-from companion.study import plot_options
+from companion.study.plot_options import PLOT_FILE
 from companion.tables import number_table, print_tables
 from companion.units import SECOND_NS
 from sitl.autopilot import UNIX_AT_START_NS, SimulatedAutopilot
@@ -228,12 +228,7 @@ def _from_first_fix(phase: SchedulePhase, records: Iterable[Stamped]) -> error_s
 @click.option("--seed", type=click.IntRange(min=0), help="Seed of the noise.")
 @configuration_options
 @click.option("--logs", help="Folder for the log.")
-@click.option(
-    "--plot",
-    type=click.Path(path_type=Path),
-    callback=plot_options.check_plot_file,
-    help="Plot the errors and the bound to this file.",
-)
+@click.option("--plot", type=PLOT_FILE, help="Plot the errors and the bound to this file.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 def command(
     scenario: str,

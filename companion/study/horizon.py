@@ -27,7 +27,7 @@ from companion.estimate.schuler import (
     transition,
 )
 from companion.option_types import FloatRange
-from companion.study import plot_options
+from companion.study.plot_options import PLOT_FILE
 from companion.tables import number_table, print_tables
 from companion.units import G0, Floats
 
@@ -268,12 +268,7 @@ def _drift(context: click.Context, parameter: click.Parameter, text: str | None)
     help="Also print how long the position bound stays below this [m].",
 )
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
-@click.option(
-    "--plot",
-    type=click.Path(path_type=Path),
-    callback=plot_options.check_plot_file,
-    help="Also write a plot to this file.",
-)
+@click.option("--plot", type=PLOT_FILE, help="Also write a plot to this file.")
 def command(
     sigma_m: float,
     window_min: float,

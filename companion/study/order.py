@@ -29,7 +29,7 @@ from companion.importers.sources import LOG_SUFFIXES
 from companion.option_types import FloatRange
 from companion.records import Stamped
 from companion.storage import flight_log
-from companion.study import plot_options
+from companion.study.plot_options import PLOT_FILE
 from companion.tables import number_table, print_tables
 from companion.units import Floats
 
@@ -209,20 +209,10 @@ def short_form(samples: Samples, found: Order) -> int:
 @click.option("--topic", help="Topic or record of a log, for example /in/Gnss or Gnss.")
 @click.option("--field", help="Field of its messages, for example alt_msl or v_n.0.")
 @click.option("--track", is_flag=True, help="Smooth the samples in windows of the basis (default: legendre).")
-@click.option(
-    "--figures",
-    type=click.Path(path_type=Path),
-    callback=plot_options.check_plot_file,
-    help="Draw the figures 6.5.1 to 6.5.4 of Brandin to this file.",
-)
+@click.option("--figures", type=PLOT_FILE, help="Draw the figures 6.5.1 to 6.5.4 of Brandin to this file.")
 @click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Seed of the noise.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
-@click.option(
-    "--plot",
-    type=click.Path(path_type=Path),
-    callback=plot_options.check_plot_file,
-    help="Also write a plot to this file.",
-)
+@click.option("--plot", type=PLOT_FILE, help="Also write a plot to this file.")
 def command(
     file: Path | None,
     signal: str,

@@ -18,7 +18,7 @@ from rich.table import Table
 from companion.analysis.progress import show_step
 from companion.estimate import kalman, restrictive
 from companion.nav.error_model import Example, paper_example
-from companion.study import plot_options
+from companion.study.plot_options import PLOT_FOLDER
 from companion.tables import number_table, print_tables
 from companion.units import Floats
 
@@ -253,12 +253,7 @@ def draw(
     "--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Seed of the random numbers."
 )
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
-@click.option(
-    "--plot",
-    type=click.Path(path_type=Path),
-    callback=plot_options.make_plot_folder,
-    help="Folder for figures 1-10.",
-)
+@click.option("--plot", type=PLOT_FOLDER, help="Folder for figures 1-10.")
 def command(names: tuple[str, ...], runs: int, seed: int, as_json: bool, plot: Path | None) -> None:
     """Compare the minimax and the restrictive filter.
 

@@ -26,7 +26,7 @@ from companion.estimate.readings import (
     estimate_joint,
 )
 from companion.estimate.weights import estimate_covariance, optimal_gain, perturb_weight
-from companion.study import plot_options
+from companion.study.plot_options import PLOT_FILE
 from companion.tables import number_table, print_tables
 from companion.units import Floats
 
@@ -403,13 +403,7 @@ def _parse(
     metavar="A.KIND,B.KIND=RHO",
     help="Correlation of the errors of two readings.",
 )
-@click.option(
-    "--plot",
-    "plot_file",
-    type=click.Path(path_type=Path),
-    callback=plot_options.check_plot_file,
-    help="Also write a plot to this file.",
-)
+@click.option("--plot", "plot_file", type=PLOT_FILE, help="Also write a plot to this file.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 def command(
     readings: tuple[str, ...],
