@@ -23,8 +23,6 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from scipy.ndimage import median_filter
-from scipy.optimize import minimize_scalar
 
 from companion.nav.geometry import Geodetic, Projection, geodetic_to_local
 from companion.records import Event, Gnss, LocalOrigin, LocalPosition, Reboot, Severity, Stamped
@@ -172,6 +170,8 @@ def find_glitches(track: GnssLocalTrack, latency: float = 0.0) -> list[Glitch]:
     near = _interpolatable(track)
     if int(near.sum()) < MIN_PAIRS:
         return []
+    from scipy.ndimage import median_filter  # 0.2 s: not at the start of a command
+
     t, x, v = track.t[near], track.x[near], track.v[near]
     speed, implausible = np.nan_to_num(np.hypot(*v.T)), _implausible(t, x, v)
     difference = _difference(track, t, x, latency)
@@ -236,6 +236,8 @@ def describe_latency(found: Latency) -> str:
 
 
 def _delay(track: GnssLocalTrack, t: Floats, x: Floats) -> float:
+    from scipy.optimize import minimize_scalar  # 0.2 s: not at the start of a command
+
     def cost(tau: float) -> float:
         difference = _difference(track, t, x, tau)
         return float(np.median(np.hypot(*(difference - np.median(difference, axis=0)).T)))
