@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import os
 import re
@@ -22,6 +23,12 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 # a busy machine is no failure; pytest has its own limit
 hypothesis.settings.register_profile("untimed", deadline=None)
 hypothesis.settings.load_profile("untimed")
+
+
+def pytest_collection_finish() -> None:
+    """Leave the collected tests, which live to the end, out of every later garbage collection."""
+    gc.freeze()
+
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 
