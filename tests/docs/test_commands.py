@@ -99,11 +99,11 @@ def test_options_and_commands_exist(text: str) -> None:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the files that the pages name, of a flight of 150 s."""
+    """A folder with the files that the pages name, of a flight of 100 s."""
     path = tmp_path_factory.mktemp("docs")
     plan = scenarios.SCENARIOS["short"].plan
-    plan = dataclasses.replace(plan, legs=(*plan.legs[:2], Leg(90, 40, 38, 120)))
-    flight = scenarios.get_scenario("short", plan=plan, gnss_outages=((80.0, 110.0),), rsbn_outages=())
+    plan = dataclasses.replace(plan, legs=(*plan.legs[:2], Leg(40, 40, 38, 30)))
+    flight = scenarios.get_scenario("short", plan=plan, gnss_outages=((60.0, 80.0),), rsbn_outages=())
     words = ["--scenario", "short", "--logs", str(path / "logs"), "--set", "output.profile=ardupilot"]
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(scenarios.SCENARIOS, "short", flight)
@@ -129,6 +129,8 @@ def test_command_runs(text: str, folder: Path, monkeypatch: pytest.MonkeyPatch) 
     assert text.startswith("companion "), f"{text}: run it here, or state in NOT_RUN why not"
     stands_for = {"SOURCE": "SOURCE.tlog", "FOLDER...": "logs", "$LOG": "LOG.mcap"}
     words = [stands_for.get(word, word) for word in arguments(text)]
+    if words[0] == "fleet":
+        words += ["--workers", "0"]  # in this process: processes are started in tests/analysis/test_fleet.py
     for output in ("LOG.mcap", "FLIGHT.replay.mcap", "other.mcap"):
         if words[-2:] == ["-o", output] or output == "FLIGHT.replay.mcap":
             (folder / output).unlink(missing_ok=True)
