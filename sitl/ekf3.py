@@ -153,5 +153,5 @@ class Ekf3:
         elif self._wind_is_kept:
             k[4:] = 0.0
         self.x += k * nu
-        kPh = np.outer(k, Ph)
-        self.P = self.P - kPh - kPh.T + s * np.outer(k, k)  # Joseph's form: k need not be optimal
+        kPh = k[:, None] * Ph
+        self.P = self.P - kPh - kPh.T + s * (k[:, None] * k)  # Joseph's form: k need not be optimal
