@@ -228,8 +228,8 @@ def test_reboot_starts_a_new_run() -> None:
 
 
 def test_a_step_of_time_widens_the_position_in_both_directions() -> None:
-    flown = flight(100, (30, 70))
-    step = TimeStep(50 * NS, 50 * NS, 1, 1.0)
+    flown = flight(80, (20, 60))
+    step = TimeStep(40 * NS, 40 * NS, 1, 1.0)
     (plain,) = smooth_flight(flown.records, CONFIG)
     (found,) = smooth_flight((*flown.records, step), CONFIG, check=True)
     assert found.apart_sigma < 1e-6
