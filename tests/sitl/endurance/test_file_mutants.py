@@ -27,9 +27,10 @@ def test_sample_is_read_without_damage(name: str, tmp_path: pathlib.Path) -> Non
 
 @pytest.mark.parametrize("name", SAMPLES)
 def test_mutants_give_records_or_one_sentence(name: str) -> None:
-    found = file_mutants.read_mutants(name, 100, seed=7)
+    count = 40 if name == "mat" else 100  # the reader of .mat is a process
+    found = file_mutants.read_mutants(name, count, seed=7)
     assert (found.defects, found.first_defect) == (0, "")
-    assert found.read + found.rejected == 100 and found.read > 0
+    assert found.read + found.rejected == count and found.read > 0
 
 
 @pytest.mark.parametrize("name", ["bin", "log", "ulg", "tlog", "csv"])
