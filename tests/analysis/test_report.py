@@ -793,6 +793,7 @@ def test_failed_report_keeps_the_older_one(option, log, tmp_path, monkeypatch):
         replace(source, target)
 
     monkeypatch.setattr("companion.write_errors.os.replace", full)
+    monkeypatch.setattr("companion.analysis.report._all_figures", lambda blocks: blocks[0].figures[:1])
     found = CliRunner().invoke(command, [str(log), "-o", str(tmp_path / "r.html"), option, str(older)])
     assert isinstance(found.exception, LogError)
     assert str(found.exception) == f"cannot write the report to {older}: No space left on device"

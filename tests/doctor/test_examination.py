@@ -2,6 +2,7 @@
 removed in turn and found; nothing is changed without a request."""
 
 from collections.abc import Callable
+from functools import lru_cache
 from typing import Any
 
 import pytest
@@ -21,7 +22,13 @@ from sitl.world import World
 SECOND = 1_000_000_000
 STEP = SECOND // 100
 PARAM_SET = 23
-WORLDS = {make: World(get_scenario("short", autopilot=make)) for make in ("ardupilot", "px4")}
+
+
+@lru_cache(maxsize=2)
+def world_of(make) -> World:
+    return World(get_scenario("short", autopilot=make))
+
+
 #: Transforms the bytes of one direction of the line.
 Passing = Callable[[bytes], bytes]
 
@@ -34,7 +41,7 @@ class Bench:
     """An autopilot and an examination connected; `to_us` and `to_it` are the line with its faults."""
 
     def __init__(self, make: str, config: Config | None = None) -> None:
-        world = WORLDS[make]
+        world = world_of(make)
         self.autopilot = SimulatedAutopilot(world.scenario, world=world)
         self.autopilot.is_armed = False
         self.config = config or profile(make)

@@ -336,7 +336,7 @@ def test_ardupilot_source_set_follows_gnss() -> None:
     assert rates["ODOMETRY"] == pytest.approx(200, abs=25)
     flight.gnss = False
     lost = flight.seconds
-    flight.fly(30.0)
+    flight.fly(20.0)
     assert flight.source_set == 2
     switched = [at for at, m in flight.sent if m.get_type() == "COMMAND_LONG" and m.command == 42007]
     assert len(switched) == 2 and 2.0 <= switched[1] - lost <= 3.0  # 2 s without a fix
@@ -347,7 +347,7 @@ def test_ardupilot_source_set_follows_gnss() -> None:
     ]
     assert max(error[100:]) < 30.0
     flight.gnss = True
-    flight.fly(20.0)
+    flight.fly(10.0)
     assert flight.source_set == 1
     assert [t for t in flight.texts if "source set" in t] == [
         "EKF source set 1: GNSS has a fix",
@@ -372,7 +372,7 @@ def test_source_set_is_known_whichever_link_leads() -> None:
         (("main", "radio"), True, 1),
     ):
         flight.links, flight.gnss = links, gnss
-        for _ in range(15):
+        for _ in range(10):
             flight.fly(1.0)
             report(flight)
         assert flight.source_set == leading, (links, gnss)

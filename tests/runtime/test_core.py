@@ -284,7 +284,7 @@ def test_one_of_two_links_leads(late: int) -> None:
 
 def test_second_link_leads_while_the_first_is_silent() -> None:
     flight = TwoLinks(20 * MS)
-    flight.fly(90.0)
+    flight.fly(40.0)
     flight.cut = True
     flight.fly(20.0)
     assert any(

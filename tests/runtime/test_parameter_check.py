@@ -1,5 +1,7 @@
 """Parameter check: one event if the autopilot's parameters are wrong, and never a change."""
 
+from functools import lru_cache
+
 import pytest
 
 from companion.config import load
@@ -15,7 +17,11 @@ from sitl.world import World
 SECOND = 1_000_000_000
 STEP = SECOND // 50
 REQUEST_READ, SET = 20, 23
-WORLDS = {make: World(get_scenario("short", autopilot=make)) for make in ("ardupilot", "px4")}
+
+
+@lru_cache(maxsize=2)
+def world_of(make) -> World:
+    return World(get_scenario("short", autopilot=make))
 
 
 class Flight:
@@ -30,7 +36,7 @@ class Flight:
         is_deaf: bool = False,
         **scenario,
     ) -> None:
-        world = WORLDS[make] if not scenario else None
+        world = world_of(make) if not scenario else None
         autopilot = SimulatedAutopilot(get_scenario("short", autopilot=make, **scenario), world=world)
         config = load(None, None, {}, pairs)
         if right:

@@ -1,4 +1,5 @@
 from collections import Counter, defaultdict
+from functools import lru_cache
 
 import numpy as np
 import pytest
@@ -11,12 +12,16 @@ from sitl.scenarios import get_scenario
 from sitl.world import World
 
 START = 1_000 * SECOND_NS
-WORLD = World(get_scenario("short"))
+
+
+@lru_cache(maxsize=1)
+def short_flight() -> World:
+    return World(get_scenario("short"))
 
 
 def autopilot(**changes):
     scenario = get_scenario("short", **changes)
-    shared = WORLD if not changes else None
+    shared = short_flight() if not changes else None
     return SimulatedAutopilot(scenario, START, shared)
 
 
