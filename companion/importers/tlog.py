@@ -20,8 +20,8 @@ from companion.storage.reader import LogError
 
 _STAMP = 8
 _MAGIC = re.compile(b"[\xfd\xfe]")
-_EARLIEST_US, _LATEST_US = 946_684_800_000_000, 4_102_444_800_000_000  # 2000, 2100
-_APART_US = 86_400_000_000  # neighbours a day apart: one stamp is damaged
+_LATEST_US = 4_102_444_800_000_000  # 2100; a clock without a battery starts in 1970
+_APART_US = 86_400_000_000  # neighbours a day apart: one stamp is damaged, or the clock was set
 _BURST_US = 1000  # frames of one boot time keep their order, at most this far apart
 _MAX_UNSTAMPED = 500  # frames without a boot time, after which the time of reception counts
 
@@ -46,14 +46,19 @@ class Tlog:
         self.messages = self.corrupt = self.unknown = self.torn = self.corrupt_bytes = 0
         self.corrupt_at: int | None = None
         self._last_us = 0
+        self._stamp_us: int | None = None  # of the last entry, as written
+        self._shift_us = 0  # of the writer's clock, where it was set
 
     def __iter__(self) -> Iterator[TlogEntry]:
-        """Yield entries in order; their times never decrease, even if the writer's clock did."""
+        """Yield entries in order; their times never decrease, and go on where the writer's clock was set."""
         data, at = self.data, 0
         while at < len(data):
             found = frame.parse(data, at + _STAMP) if self._has_time_stamp(at) else frame.Reason.JUNK
             if isinstance(found, Frame):
-                self._last_us = max(self._last_us, self._us(at))
+                stamp = self._us(at)
+                if self._stamp_us is not None and not _near(stamp, self._stamp_us):
+                    self._shift_us = self._last_us - stamp
+                self._stamp_us, self._last_us = stamp, max(self._last_us, stamp + self._shift_us)
                 self.messages += 1
                 yield TlogEntry(self._last_us * 1000, found)
                 at += _STAMP + len(found.raw)
@@ -64,11 +69,16 @@ class Tlog:
         return int.from_bytes(self.data[at : at + _STAMP], "big")
 
     def _has_time_stamp(self, at: int) -> bool:
-        """Return whether a plausible time stamp is at `at`."""
+        """Return whether a plausible time stamp is at `at`: near the last one, or confirmed by the next."""
         stamp = self._us(at)
-        if self._last_us:
-            return abs(stamp - self._last_us) < _APART_US
-        return _EARLIEST_US < stamp < _LATEST_US
+        if self._stamp_us is None or _near(stamp, self._stamp_us):
+            return stamp < _LATEST_US
+        first = frame.parse(self.data, at + _STAMP)
+        if not isinstance(first, Frame):
+            return False
+        following = at + _STAMP + len(first.raw)
+        confirmed = stamp < _LATEST_US and _near(self._us(following), stamp)
+        return confirmed and isinstance(frame.parse(self.data, following + _STAMP), Frame)
 
     def _skip(self, at: int) -> int:
         """Count the bytes at `at` as corrupt, unknown or torn, and return the offset of the next entry."""
@@ -115,6 +125,10 @@ class Tlog:
             return _STAMP + size
         follows = self.data[following + _STAMP : following + _STAMP + 1] in (b"\xfd", b"\xfe")
         return _STAMP + size if follows and self._has_time_stamp(following) else None
+
+
+def _near(stamp_us: int, other_us: int) -> bool:
+    return abs(stamp_us - other_us) < _APART_US
 
 
 class BootTimeBase:

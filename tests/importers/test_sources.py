@@ -99,6 +99,29 @@ def test_times_never_decrease() -> None:
     assert len(times) == 20 and times == sorted(times)
 
 
+DAY_US = 86_400_000_000
+
+
+@pytest.mark.parametrize("set_to_us", [START_US + 9 * DAY_US, START_US - 9 * DAY_US, 5_000_000])
+def test_a_recorder_whose_clock_is_set_loses_nothing(set_to_us: int) -> None:
+    """As a board without a battery does: from the time it was switched off, or 1970, to that of a server."""
+    moved = [(set_to_us + 10_000 * i).to_bytes(8, "big") + attitude(i) for i in range(20)]
+    for first, then in ((CLEAN, moved), (moved, CLEAN)):
+        entries, log = read(b"".join([*first[:7], *then[7:]]))
+        assert [e.frame.sequence for e in entries] == list(range(20))
+        assert (log.messages, log.corrupt) == (20, 0)
+        steps = [b.rx_ns - a.rx_ns for a, b in pairwise(entries)]
+        assert steps[:6] + steps[7:] == [10_000_000] * 18 and 0 <= steps[6] <= 10_000_000
+
+
+@pytest.mark.parametrize("stamp_us", [START_US + 9 * DAY_US, START_US - 9 * DAY_US, 5_000_000])
+def test_one_damaged_stamp_loses_one_entry(stamp_us: int) -> None:
+    damaged = stamp_us.to_bytes(8, "big") + attitude(7)
+    entries, log = read(b"".join([*CLEAN[:7], damaged, *CLEAN[8:]]))
+    assert [e.rx_ns for e in entries] == [(START_US + 10_000 * i) * 1000 for i in range(20) if i != 7]
+    assert log.corrupt == 1
+
+
 @settings(max_examples=100)
 @given(st.binary(max_size=60), st.integers(0, len(b"".join(CLEAN))))
 @example(b"\0\xfe\xb0" + bytes(21), 287)  # states a length at whose end there is an entry, five entries later
