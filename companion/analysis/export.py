@@ -27,7 +27,7 @@ from companion.units import Floats
 from companion.write_errors import describe_write_error, write_whole
 
 SUFFIXES = (".geojson", ".json", ".kml")
-GAP_S = 10.0  # a line is cut where no point is known for longer
+GAP_S = 10.0  # a line is cut where no point is known for longer, unless its points are wanted farther apart
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 _KML = "http://www.opengis.net/kml/2.2"
 _GX = "http://www.google.com/kml/ext/2.2"
@@ -37,7 +37,8 @@ _NOT_XML = re.compile("[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]"
 class Track(NamedTuple):
     """A line on the map: points (n,) at wall-clock times; NaN positions are gaps.
 
-    `colour` is "#rrggbb"; `about` are its properties in GeoJSON.
+    `colour` is "#rrggbb"; `about` are its properties in GeoJSON. Points more than `gap_s` apart are not
+    joined.
     """
 
     name: str
@@ -47,6 +48,7 @@ class Track(NamedTuple):
     alt_msl: Floats
     colour: str
     about: Mapping[str, Any] = MappingProxyType({})
+    gap_s: float = GAP_S
 
 
 class Place(NamedTuple):
@@ -190,13 +192,14 @@ def _track(
         thin[np.unique(np.floor(t / every_s), return_index=True)[1]] = True
         thin[-1] = True
     unix_ns = flight.unix_ns + np.round(t[thin] * 1e9).astype(np.int64)
-    return Track(name, unix_ns, table["lat"][thin], table["lon"][thin], table["alt"][thin], colour, about)
+    lat, lon, alt = (table[key][thin] for key in ("lat", "lon", "alt"))
+    return Track(name, unix_ns, lat, lon, alt, colour, about, max(GAP_S, 2.0 * every_s))
 
 
 def _parts(track: Track) -> Iterator[npt.NDArray[np.int64]]:
     """Yield the indices of each unbroken line: cut at gaps and at the antimeridian (RFC 7946, 3.1.9)."""
     known = np.flatnonzero(np.isfinite(track.lat) & np.isfinite(track.lon))
-    far = np.diff(track.unix_ns[known]) > GAP_S * 1e9
+    far = np.diff(track.unix_ns[known]) > track.gap_s * 1e9
     across = np.abs(np.diff(track.lon[known])) > np.pi
     broken = far | across | (np.diff(known) > 1)
     yield from (part for part in np.split(known, np.flatnonzero(broken) + 1) if len(part) > 1)

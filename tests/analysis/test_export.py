@@ -107,6 +107,13 @@ def test_a_flight_is_cut_into_legs_with_and_without_fixes(tmp_path):
     assert (lost["properties"]["from_s"], lost["properties"]["to_s"]) == (40.0, 80.0)
     assert [len(line) for line in lost["geometry"]["coordinates"]] == [41]
     assert [len(line) for line in features["GNSS"]["geometry"]["coordinates"]] == [40, 41]
+    few = ["export", str(log), "-o", str(out), "--every", "15"]
+    assert CliRunner().invoke(group, few, catch_exceptions=False).exit_code == 0
+    lines = {
+        f["properties"]["name"]: f["geometry"]["coordinates"] for f in json.loads(out.read_text())["features"]
+    }
+    assert [len(line) for line in lines["estimate, no fixes"]] == [5]  # 40, 45, 60, 75 s and the last
+    assert [len(line) for line in lines["GNSS"]] == [3, 4]  # 0, 15, 30 s; 80, 90, 105 s and the last
     lon, lat = features["beacon 7"]["geometry"]["coordinates"]
     assert (math.radians(lat), math.radians(lon)) == pytest.approx((0.971, 0.651), abs=1e-9)
 
