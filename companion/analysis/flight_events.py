@@ -214,15 +214,18 @@ def _summarize_group(flight: Flight, row: list[RejectedMeasurement]) -> Rejectio
 
 
 def _max_distance(flight: Flight, row: list[RejectedMeasurement]) -> float:
-    """Return the greatest distance of the rejected GNSS fixes from the estimate, m."""
+    """Return the greatest distance of the rejected fixes of a GNSS receiver from the estimate, m."""
     gnss, solution = usable_gnss(flight), flight.tables["Solution"]
+    receiver = row[0].source.removeprefix("gnss ")
     in_group = (gnss["t"] >= row[0].t - 1e-3) & (gnss["t"] <= row[-1].t + 1e-3)
+    in_group &= gnss["receiver"] == (int(receiver) if receiver.isdecimal() else -1)
     if not in_group.any() or len(solution["t"]) < 2:
         return math.nan
     order = np.argsort(solution["t"], kind="stable")
     t, lat, lon = (solution[name][order] for name in ("t", "lat", "lon"))
     north = gnss["lat"][in_group] - np.interp(gnss["t"][in_group], t, lat)
-    east = gnss["lon"][in_group] - np.interp(gnss["t"][in_group], t, lon)
+    east = gnss["lon"][in_group] - np.interp(gnss["t"][in_group], t, np.unwrap(lon))
+    east = np.remainder(east + math.pi, math.tau) - math.pi
     R_N, R_E = radii(float(lat[0]))
     return float(np.max(np.hypot(north * R_N, east * R_E * math.cos(lat[0]))))
 

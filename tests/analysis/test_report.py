@@ -297,6 +297,31 @@ def test_consecutive_rejections_are_grouped(assessed):
     ]
 
 
+def test_distance_of_rejected_fixes_is_that_of_their_receiver():
+    """The second receiver agrees with the estimate while the first is rejected, and far off at the end."""
+    rows = flight_records()
+    for second in (60.5, 61.0, 61.5, 280.0, 281.0):
+        t = START + round(second * S)
+        lat, lon, _ = displace(LAT, LON, 0.0, 0.0, 20.0 * second, 0.0)
+        north = 900.0 if second > 61.0 else 0.0
+        place = displace(lat, lon, 0.0, north, 0.0, 0.0)
+        rows.append(Gnss(t, t, 1, round(10 * second), 3, place.lat, place.lon, 100.0, 2.0))
+        if second <= 61.0 or second >= 280.0:
+            rows.append(Rejection(t, t, "gnss 1", "outlier: normalised squared innovation", 99.0, 27.6))
+    rows.sort(key=lambda r: r.rx_ns)
+    (found,) = collect_flights(((flight_log.topic_of(type(r)), r) for r in rows), "made.mcap")
+    apart = {k: [g.metres for g in assess_flight(found).groups if g.source == f"gnss {k}"] for k in (0, 1)}
+    assert apart[0] == pytest.approx([497.0], abs=0.1)  # the estimate is 3 m north, 4 m east
+    assert apart[1] == pytest.approx([5.0, 897.0], abs=0.1)
+
+
+def test_a_report_is_the_same_across_the_antimeridian(monkeypatch, assessed):
+    """The aircraft crosses it at 61 s, while GNSS is rejected."""
+    at_61_s = displace(LAT, LON, 0.0, 0.0, 20.0 * 61.0, 0.0).lon - LON
+    monkeypatch.setitem(globals(), "LON", math.pi - at_61_s)
+    assert sentences(assess_flight(flight())) == sentences(assessed)
+
+
 def test_nees_is_the_normalized_squared_error(assessed):
     (nees,) = (series for series in assessed.normalized_errors if series.what == "NEES")
     assert np.allclose(nees.value, 1.0, atol=1e-3)
