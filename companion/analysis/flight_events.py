@@ -111,7 +111,8 @@ def split_phases(solution: Table, seconds: float) -> list[error_statistics.Fligh
         runs[:2] = [(runs[1][0], runs[0][1])]
     if len(runs) == 1:  # nothing else lasted long enough, perhaps not even the first
         runs = [(max(lasting, key=lambda name: lasting[name]), runs[0][1])]
-    bounds = [round(start * 1e9) for _, start in runs] + [round(seconds * 1e9)]
+    last = max([seconds, *t[-1:]])  # the last phase holds it
+    bounds = [round(start * 1e9) for _, start in runs] + [round(last * 1e9) + 1]
     return [error_statistics.FlightPhase(name, *bounds[i : i + 2]) for i, (name, _) in enumerate(runs)]
 
 

@@ -294,9 +294,7 @@ _CONSISTENCY = {
 def _consistency(a: Assessment) -> list[Table]:
     if not a.normalized_errors:
         return [Table((), (), note="The log has no data to compare with covariances.")]
-    rows = [
-        (m.what, f"{len(m.t)}", f"{m.mean:.2f}", f"{100.0 * m.inside:.1f} %") for m in a.normalized_errors
-    ]
+    rows = [(m.what, f"{len(m.t)}", f"{m.mean:.2f}", format_share(m.inside)) for m in a.normalized_errors]
     shown = "".join(f"{m.what}: {_CONSISTENCY[m.what]}. " for m in a.normalized_errors)
     note = f"{shown}A consistent filter has a mean of about 1 and 95 % within."
     return [Table(("what", "number", "mean / degrees of freedom", "within 95 %"), rows, note=note)]

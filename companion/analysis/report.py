@@ -87,10 +87,11 @@ def command(
             raise LogError(
                 f"cannot write the report to {error.filename}: {describe_write_error(error)}"
             ) from None
+    several = sum(len(block.flights) for block in blocks) > 1
     for block in blocks:
-        for flight in block.flights:
-            verdict = judge_flight(flight)
-            click.echo(f"{verdict.word}: {printable(verdict.reason)} {verdict.number} {verdict.what}.")
+        for name, flight in zip(block.names, block.flights, strict=True):
+            verdict, head = judge_flight(flight), f"{printable(name)}: " if several else ""
+            click.echo(f"{head}{verdict.word}: {printable(verdict.reason)} {verdict.number} {verdict.what}.")
             click.echo(printable(" ".join(summarize_flight(flight))))
     click.echo(f"written: {', '.join(str(path) for path in written)}")
 

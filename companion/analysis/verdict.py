@@ -99,25 +99,23 @@ def _protection_broken(a: Assessment) -> Verdict | None:
 
     Not stated against GNSS, which may be rejected rightly, nor against a track that GNSS contradicts.
     """
-    corrected = a.errors.get(error_statistics.CORRECTED)
-    if corrected is None or a.reference is None or a.reference.what == GNSS:
+    if not a.ins_error or a.reference is None or a.reference.what == GNSS:
         return None
     if gnss_contradiction(a) is not None:
         return None
-    solution, t = a.flight.tables["Solution"], corrected.t_ns * 1e-9
-    level = solution["protection"][
-        np.clip(np.searchsorted(solution["t"], t - 1e-6), 0, len(solution["t"]) - 1)
-    ]
-    beyond = np.flatnonzero(corrected.error > level)  # False where there is no level
+    solution = a.flight.tables["Solution"]
+    off_north, off_east = (a.ins_error[d] - solution[f"error_{d}"] for d in ("north", "east"))
+    error, level = np.hypot(off_north, off_east), solution["protection"]
+    beyond = np.flatnonzero(error > level)  # False where one of them is not known
     if not len(beyond):
         return None
-    k = beyond[np.argmax(corrected.error[beyond] / level[beyond])]
+    k = beyond[np.argmax(error[beyond] / level[beyond])]
     off = deviation(a) if a.against_truth else f"{deviation(a)} from {a.reference.what}"
     return Verdict(
         _promise(a),
-        f"The {off} exceeded the protection level at {format_time(t[k])}: "
-        f"{format_length(corrected.error[k])} against {format_length(level[k])}.",
-        f"{corrected.error[k] / level[k]:.2f} ×",
+        f"The {off} exceeded the protection level at {format_time(solution['t'][k])}: "
+        f"{format_length(error[k])} against {format_length(level[k])}.",
+        f"{error[k] / level[k]:.2f} ×",
         "the protection level (limit 1)",
     )
 

@@ -10,6 +10,7 @@ import json
 import math
 import os
 import re
+import shutil
 from pathlib import Path
 
 import msgspec
@@ -27,7 +28,7 @@ from companion.analysis.figures import build_figures
 from companion.analysis.flight_arrays import collect_flights
 from companion.analysis.flight_events import describe_rejections, event_title, topic_name
 from companion.analysis.flights import describe_channel, open_flights
-from companion.analysis.html import comparison_table, render_report
+from companion.analysis.html import ReportBlock, comparison_table, render_report
 from companion.analysis.log_command import group as log_group
 from companion.analysis.plot_data import thin_line
 from companion.analysis.replay import command as replay_command
@@ -38,6 +39,7 @@ from companion.analysis.summary import (
     format_duration,
     format_length,
     format_time,
+    rms_by_fixes,
     summarize_flight,
     worst_of,
 )
@@ -322,6 +324,20 @@ def test_a_report_is_the_same_across_the_antimeridian(monkeypatch, assessed):
     assert sentences(assess_flight(flight())) == sentences(assessed)
 
 
+def test_the_last_moment_belongs_to_the_last_phase():
+    """The log ends with an estimate without fixes, 500 m off: of the flight with fixes it is none."""
+    last = max(r.t_ns for r in flight_records() if isinstance(r, Solution) and r.t_ns < START + 150 * S)
+    rows = [r for r in flight_records() if r.rx_ns <= last and not isinstance(r, Event)]
+    far = displace(LAT, LON, 0.0, 500.0, 20.0 * (last - START) / S, 0.0)
+    rows[-1] = msgspec.structs.replace(rows[-1], lat=far.lat, lon=far.lon)
+    a = collected(rows)
+    assert [phase.name for phase in a.phases] == ["GNSS", "prediction"]
+    with_fixes, without = rms_by_fixes(a)
+    assert with_fixes == pytest.approx(5.0, abs=0.1)
+    assert without == a.rows[-1].rms[error_statistics.CORRECTED]
+    assert without == pytest.approx(math.sqrt((149 * 5.0**2 + 500.0**2) / 150), rel=1e-3)
+
+
 def test_nees_is_the_normalized_squared_error(assessed):
     (nees,) = (series for series in assessed.normalized_errors if series.what == "NEES")
     assert np.allclose(nees.value, 1.0, atol=1e-3)
@@ -548,6 +564,18 @@ def test_velocities_rejected_for_long_are_no_good_flight_without_a_truth():
     assert judge_flight(against(assessing.SMOOTHED, collected(with_velocity_rejected(9)))).level == "good"
 
 
+def test_each_estimate_is_judged_by_its_own_protection_level():
+    """At the time of a fix there are two: predicted up to the fix, and with it."""
+    rows = []
+    for row in flight_records(protection=4.0):
+        if isinstance(row, Solution):
+            rows.append(msgspec.structs.replace(row, protection=400.0))
+        rows.append(row)
+    verdict = judge_flight(collected(rows))
+    assert (verdict.level, verdict.number) == ("fault", "1.25 ×")
+    assert verdict.reason.endswith(": 5.0 m against 4.0 m.")
+
+
 def test_a_distance_beyond_the_protection_level_is_a_caution():
     """Of the smoothed track, unless GNSS contradicts that; GNSS itself may have been rejected rightly."""
     a = assess_flight(flight(protection=4.0))
@@ -569,6 +597,14 @@ def test_warnings_of_the_events_table_have_their_severity_and_colour():
     )
     page = render_report("r", blocks_of_log([found]))
     assert re.search(r'class="caution">warning</td><td data-label="text">low battery', page)
+
+
+def test_a_share_below_100_percent_is_not_written_as_100_percent(assessed):
+    value = np.where(np.arange(4000) == 7, 99.0, 1.0)
+    nis = assessing.NormalizedErrors("NIS", np.arange(4000.0), value, np.full(4000, 2.0))
+    shown = dataclasses.replace(assessed, normalized_errors=[nis])
+    page = render_report("r", [ReportBlock(["a"], [shown], [])])
+    assert "99.9 %" in page and "100.0 %" not in page
 
 
 def test_every_kind_of_record_has_a_name_for_users():
@@ -790,6 +826,15 @@ def test_configuration_options_are_rejected_for_flown_logs(log, tmp_path):
         assert isinstance(found.exception, LogError)
         assert f"replay it first: companion replay {log} --with" in str(found.exception)
         assert not (tmp_path / "r.html").exists()
+
+
+def test_each_verdict_in_the_terminal_names_its_flight(log, tmp_path):
+    pytest.importorskip("jinja2")
+    other = tmp_path / "other.mcap"
+    shutil.copy(log, other)
+    found = CliRunner().invoke(command, [str(log), str(other), "-o", str(tmp_path / "r.html")])
+    verdicts = [line for line in found.output.splitlines() if "Good: " in line]
+    assert [line.partition(": Good: ")[0] for line in verdicts] == [f"A: {log.name}", "B: other.mcap"]
 
 
 def test_report_accepts_as_many_logs_as_there_are_letters(log):
