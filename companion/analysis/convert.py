@@ -8,6 +8,7 @@ from companion.analysis.replay import create_replay_log
 from companion.analysis.replay_inputs import CONVERTED, input_errors_as_log_errors, is_own_log
 from companion.importers import sources
 from companion.importers.sources import ImportSummary
+from companion.printable import printable
 from companion.storage.flight_log import topic_of_input
 from companion.storage.reader import LogError, open_log
 
@@ -24,7 +25,7 @@ def convert_log(source: Path, output: Path) -> ImportSummary:
         if output.resolve() == source.resolve() or output.exists():
             raise LogError(f"{output} already exists: give another name")
         records = sources.open_source(source)
-        with create_replay_log(output, {CONVERTED: {"from": source.name}}) as sink:
+        with create_replay_log(output, {CONVERTED: {"from": printable(source.name)}}) as sink:
             for record in records:
                 sink.record(record, topic_of_input(record))
     return records.summary()

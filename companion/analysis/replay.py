@@ -180,7 +180,7 @@ def create_replay_log(
 
 def derived_metadata(config: Config, by: str, log: Path) -> dict[str, dict[str, str]]:
     """Return the metadata of a log that the command `by` makes from `log`: it may be replaced."""
-    return {DERIVED: {"by": by, "from": log.name}, **run_metadata(config)}
+    return {DERIVED: {"by": by, "from": printable(log.name)}, **run_metadata(config)}
 
 
 def default_output(log: Path, what: str) -> Path:

@@ -33,6 +33,7 @@ from companion.analysis.replay_inputs import (
     open_inputs,
 )
 from companion.analysis.smoothing import SmoothedRun, smooth_flight
+from companion.config import ConfigError
 from companion.nav.geometry import Geodetic, displace
 from companion.option_types import INPUT_PATH
 from companion.records import Smoothed
@@ -153,7 +154,12 @@ def command(
     reject_same_output(paths)
     config = choose_configuration(log, config_file, changes)
     with input_errors_as_log_errors(), show_step(f"smooth {log}"):
-        runs = smooth_flight(open_inputs(log).records, config, check=check)
+        try:
+            runs = smooth_flight(open_inputs(log).records, config, check=check)
+        except ConfigError:
+            raise
+        except ValueError as error:
+            raise LogError(f"{log}: {error}") from None
     track = collect(runs)
     start_ns, start_unix_ns = start_times(log)
     for path in paths:

@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 from companion.plausibility import implausible_field
+from companion.printable import printable
 from companion.records import Event, Severity, Stamped
 from companion.storage.reader import LogError, open_regular
 from companion.units import SECOND_NS
@@ -107,7 +108,8 @@ def usable(path: Path, records: Iterable[Stamped], damage: Damage) -> Iterator[S
         why = damage.whole or damage.first or "it contains no supported message"
         raise LogError(f"{path}: nothing could be read: {why}")
     if damage.parts:
-        yield Event(last_ns, last_ns, Severity.WARNING, f"{path.name} is damaged: {damage}"[:MAX_TEXT])
+        text = printable(f"{path.name} is damaged: {damage}")[:MAX_TEXT]
+        yield Event(last_ns, last_ns, Severity.WARNING, text)
 
 
 def one_line(error: Exception) -> str:

@@ -2,6 +2,7 @@
 
 import errno
 import json
+import os
 import re
 import shutil
 from collections import Counter
@@ -13,6 +14,7 @@ import pytest
 from click.testing import CliRunner
 
 from companion.analysis import replay, replay_inputs, report, smooth_command
+from companion.analysis.convert import convert_log
 from companion.analysis.replay_inputs import apply_changes
 from companion.command_line import cli
 from companion.config import Config
@@ -195,6 +197,15 @@ def test_replay_may_be_repeated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     for _ in range(2):
         assert CliRunner().invoke(replay.command, [str(CUT)]).exit_code == 0
     replayed(CUT, tmp_path / "dronekit_copter_cut.replay.mcap")
+
+
+def test_name_of_a_log_may_be_of_any_bytes(tmp_path: Path) -> None:
+    log = tmp_path / os.fsdecode(b"flight \xff\n.tlog")
+    shutil.copy(CUT, log)
+    replayed(log, tmp_path / "out.mcap")
+    assert flight_log.metadata(tmp_path / "out.mcap")["derived"]["from"] == r"flight \udcff\n.tlog"
+    convert_log(log, tmp_path / "in.mcap")
+    assert flight_log.metadata(tmp_path / "in.mcap")["converted"]["from"] == r"flight \udcff\n.tlog"
 
 
 def interrupted(log: Path, metadata: dict[str, dict[str, str]]) -> Path:

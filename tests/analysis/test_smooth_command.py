@@ -13,6 +13,7 @@ from click.testing import CliRunner
 
 from companion.analysis import smoothing
 from companion.analysis.smooth_command import ELLIPSE_95, command
+from companion.link import dialect, frame
 from companion.records import Smoothed
 from companion.storage import flight_log
 from companion.storage.reader import LogError
@@ -89,6 +90,16 @@ def test_bad_options(log, arguments, message):
     result = CliRunner().invoke(command, [str(log), *arguments])
     assert result.exit_code != 0
     assert message in result.output + str(result.exception)
+
+
+def test_a_log_without_an_estimate_is_named(tmp_path):
+    path = tmp_path / "parked.tlog"
+    beat = frame.encode(dialect.new("HEARTBEAT", type=1, autopilot=3), 0, 1, 1)
+    stamps = range(1_700_000_000_000_000, 1_700_000_005_000_000, 1_000_000)
+    path.write_bytes(b"".join(us.to_bytes(8, "big") + beat for us in stamps))
+    result = CliRunner().invoke(command, [str(path), "-o", str(tmp_path / "t.csv")])
+    assert isinstance(result.exception, LogError)
+    assert str(result.exception).startswith(f"{path}: nothing to smooth: ")
 
 
 def test_same_output_twice_is_rejected(log, tmp_path):
