@@ -67,7 +67,7 @@ def open_flights(path: Path, config: Config) -> list[Flight]:
                 )
         sensors = set[str]()
         flights = collect_flights(
-            _run_navigator(open_inputs(path).records, config, sensors),
+            _run_navigator(open_inputs(path, config).records, config, sensors),
             path.name,
             unix_ns=first_unix_ns,
             metadata=run_metadata(config),

@@ -79,15 +79,18 @@ class LogInputs(NamedTuple):
     outages: simulated_rsbn.OutageFilter | None = None
 
 
-def open_inputs(log: Path) -> LogInputs:
+def open_inputs(log: Path, config: Config | None = None) -> LogInputs:
     """Open the inputs of a log, ours or another recorder's, with the truth if it has one.
+
+    `config` selects the vehicle of a telemetry log with several (`link.system_id`).
 
     Raises LogError, one sentence, if it cannot be read.
     """
     if is_own_log(log):
         return LogInputs(_own_inputs(log), dict)
     with input_errors_as_log_errors():
-        source = sources.open_source(log, others=(".mcap",))
+        system = config.link.system_id if config is not None else 0
+        source = sources.open_source(log, system or None, others=(".mcap",))
     return LogInputs(source, lambda: source.summary()._asdict())
 
 
@@ -147,7 +150,7 @@ def with_beacons_and_outages(
     first for its track.
     """
     listed = [] if beacons is None else simulated_rsbn.read_beacons(beacons)  # a mistake costs no reading
-    log_inputs = open_inputs(log)
+    log_inputs = open_inputs(log, config)
     if not listed and not outages:
         return log_inputs, ""
     records = iter(log_inputs.records)
@@ -156,7 +159,7 @@ def with_beacons_and_outages(
         raise LogError(f"{log} contains no messages: nothing to replay")
     merged, note = chain([first], records), ""
     if listed:
-        track = simulated_rsbn.extract_track(open_inputs(log).records, config)
+        track = simulated_rsbn.extract_track(open_inputs(log, config).records, config)
         measurements = simulated_rsbn.simulate_measurements(listed, track, seed)
         numbers = sorted({answer.beacon for answer in measurements})
         note = (

@@ -155,7 +155,7 @@ def command(
     config = choose_configuration(log, config_file, changes)
     with input_errors_as_log_errors(), show_step(f"smooth {log}"):
         try:
-            runs = smooth_flight(open_inputs(log).records, config, check=check)
+            runs = smooth_flight(open_inputs(log, config).records, config, check=check)
         except ConfigError:
             raise
         except ValueError as error:

@@ -124,6 +124,8 @@ class TlogSource(_Records):
         if log.corrupt:
             more = f"and {log.corrupt - 1} more" if log.corrupt > 1 else "only"
             self.damage.add(f"byte {log.corrupt_at}", log.corrupt_bytes, f"not a frame, {more}")
+        if session.autopilot is None:
+            self.damage.whole = "it has no HEARTBEAT of an autopilot"
         if log.torn:
             self.damage.add(f"byte {len(log.data) - log.torn}", log.torn, "truncated")
 
@@ -147,9 +149,8 @@ class TlogSource(_Records):
                 yield Reset(at_ns, at_ns, "flight", f"autopilot {system} rebooted: its boot time decreased")
                 yield Reboot(at_ns, at_ns, system)
             case SecondAutopilot(at_ns, system, kept):
-                yield Event(
-                    at_ns, at_ns, Severity.WARNING, f"autopilot {system} ignored: autopilot {kept} is in use"
-                )
+                text = f"autopilot {system} ignored: autopilot {kept} is in use; link.system_id selects one"
+                yield Event(at_ns, at_ns, Severity.WARNING, text)
 
     def _status_text(self, message: Message, rx_ns: int) -> Iterator[Event]:
         """Convert a text of the autopilot; a text in parts (MAVLink 2) when its last part has arrived."""

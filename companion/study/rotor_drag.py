@@ -108,7 +108,7 @@ def command(log: Path, file: Path | None, preset: str | None, pairs: tuple[str, 
     """
     config = load(file, {}, pairs=pairs, preset=preset)
     with input_errors_as_log_errors():
-        s = seconds_in_flight(list(open_inputs(log).records), config)
+        s = seconds_in_flight(list(open_inputs(log, config).records), config)
     if len(s.t) < LEAST:
         raise LogError(
             f"{log}: {len(s.t)} s of a multirotor's flight with IMU, attitude and velocity of GNSS, {LEAST} s"

@@ -11,6 +11,7 @@ from companion import records as r
 from companion.analysis import replay_inputs
 from companion.command_line import cli
 from companion.config import Config, ConfigError
+from companion.link import dialect, frame
 from companion.storage import flight_log
 from companion.storage.reader import LogError
 from companion.storage.run_metadata import logged_configuration
@@ -36,6 +37,27 @@ def report(*arguments: object) -> dict[str, Any]:
 
 def values(path: pathlib.Path, kind: type[r.Stamped]) -> list[Any]:
     return [entry.value for entry in flight_log.read(path) if type(entry.value) is kind]
+
+
+def test_configuration_selects_the_vehicle_of_a_log_with_two(tmp_path: pathlib.Path) -> None:
+    log, start_us = tmp_path / "two.tlog", 1_700_000_000_000_000
+    beat = dialect.new("HEARTBEAT", type=1, autopilot=3)
+    rolled = {1: 0.25, 2: 0.5}
+    frames = [frame.encode(beat, 0, system, 1) for system in rolled] + [
+        frame.encode(dialect.new("ATTITUDE", time_boot_ms=1000 + 100 * k, roll=roll), k, system, 1)
+        for k in range(10)
+        for system, roll in rolled.items()
+    ]
+    log.write_bytes(
+        b"".join((start_us + 50_000 * k).to_bytes(8, "big") + raw for k, raw in enumerate(frames))
+    )
+    for system, roll in {0: 0.25, **rolled}.items():
+        config = replay_inputs.apply_changes(Config(), f"link.system_id={system}")
+        found = list(replay_inputs.open_inputs(log, config).records)
+        assert [one.roll for one in found if isinstance(one, r.Attitude)] == [roll] * 10
+    output = tmp_path / "out.mcap"
+    run("replay", log, "-o", output, "--with", "link.system_id=2")
+    assert {one.roll for one in values(output, r.Attitude)} == {0.5}
 
 
 @pytest.fixture

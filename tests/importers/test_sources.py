@@ -249,6 +249,13 @@ def test_invalid_tlog_is_reported_in_one_sentence(tmp_path: pathlib.Path) -> Non
             sources.open_source(path)
 
 
+def test_log_without_the_autopilot_states_so(tmp_path: pathlib.Path) -> None:
+    path = tmp_path / "flight.tlog"
+    path.write_bytes(b"".join(CLEAN))
+    with pytest.raises(LogError, match="nothing could be read: it has no HEARTBEAT of an autopilot"):
+        sources.open_source(path)
+
+
 @pytest.mark.parametrize("name", ["nofile", "nofile.pdf", "nofile.tlog", "nofile.bin"])
 def test_missing_log_of_any_type_is_reported(name: str, tmp_path: pathlib.Path) -> None:
     with pytest.raises(LogError, match=f"{name}: no such log"):

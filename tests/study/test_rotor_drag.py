@@ -77,7 +77,7 @@ def test_a_recorded_copter_has_the_drag_of_the_others(monkeypatch: pytest.Monkey
     with gzip.open(DATA / "copter_cut.jsonl.gz") as lines:
         decoder: msgspec.json.Decoder[Input] = msgspec.json.Decoder(Input)
         records = [decoder.decode(line) for line in lines]
-    monkeypatch.setattr(rotor_drag, "open_inputs", lambda log: LogInputs(records, dict))
+    monkeypatch.setattr(rotor_drag, "open_inputs", lambda log, config: LogInputs(records, dict))
     done = CliRunner().invoke(command, ["quad106.bin", "--json"], catch_exceptions=False)
     found = json.loads(done.stdout)
     assert 0.17 < found["drag_per_s"] < 0.29
@@ -91,6 +91,6 @@ def test_a_flight_too_short_and_one_without_changes_of_speed_are_one_sentence(
         (flown(0.2)[:500], "s of a multirotor's flight"),
         (flown(0.002, wavering=0.01), "is not known to 25%: choose a flight with more changes"),
     ):
-        monkeypatch.setattr(rotor_drag, "open_inputs", lambda log, r=records: LogInputs(r, dict))
+        monkeypatch.setattr(rotor_drag, "open_inputs", lambda log, config, r=records: LogInputs(r, dict))
         with pytest.raises(LogError, match=sentence):
             CliRunner().invoke(command, ["flight.bin"], catch_exceptions=False)
