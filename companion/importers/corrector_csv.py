@@ -17,10 +17,12 @@ import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
+from companion.plausibility import DEFAULT, implausible_field
 from companion.records import RangeDifference, SecondIns, Stamped, StarFix
 from companion.units import SECOND_NS
 
 _DEG, _ARCSEC = math.radians(1.0), math.radians(1.0 / 3600.0)
+MOST_IDENTITY = 65535  # of a star, a chain or an INS, as in their messages
 Row = Mapping[str, float | None]
 
 
@@ -29,7 +31,7 @@ def _star(t_ns: int, r: Row) -> StarFix:
     return StarFix(
         t_ns,
         t_ns,
-        star=int(_given(r, "star")),
+        star=_identity(r, "star"),
         lat=_given(r, "lat_deg") * _DEG,
         lon=_given(r, "lon_deg") * _DEG,
         altitude=_given(r, "altitude_deg") * _DEG,
@@ -43,13 +45,13 @@ def _line(t_ns: int, r: Row) -> RangeDifference:
     a = (_given(r, "lat_a_deg") * _DEG, _given(r, "lon_a_deg") * _DEG, _given(r, "alt_a_m"))
     b = (_given(r, "lat_b_deg") * _DEG, _given(r, "lon_b_deg") * _DEG, _given(r, "alt_b_m"))
     return RangeDifference(
-        t_ns, t_ns, int(_given(r, "chain")), *a, *b, _given(r, "difference_m"), _given(r, "sigma_m")
+        t_ns, t_ns, _identity(r, "chain"), *a, *b, _given(r, "difference_m"), _given(r, "sigma_m")
     )
 
 
 def _second(t_ns: int, r: Row) -> SecondIns:
     place = (_given(r, "lat_deg") * _DEG, _given(r, "lon_deg") * _DEG)
-    return SecondIns(t_ns, t_ns, int(_given(r, "ins")), *place)
+    return SecondIns(t_ns, t_ns, _identity(r, "ins"), *place)
 
 
 _STAR = "star lat_deg lon_deg altitude_deg azimuth_deg sigma_altitude_arcsec sigma_azimuth_arcsec"
@@ -67,7 +69,7 @@ def read_correctors(path: Path, start_ns: int) -> list[Stamped]:
     Raises ValueError, one sentence with the line, if the file is not such a table.
     """
     try:
-        with path.open(newline="", encoding="utf-8") as file:
+        with path.open(newline="", encoding="utf-8-sig") as file:
             rows = list(csv.reader(file))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         why = getattr(error, "strerror", None) or error
@@ -82,15 +84,35 @@ def read_correctors(path: Path, start_ns: int) -> list[Stamped]:
         if not row:
             continue
         try:
-            values = {
-                name: float(text) if text.strip() else None for name, text in zip(header, row, strict=True)
-            }
-            record = build(start_ns + round(_given(values, "t_s") * SECOND_NS), values)
+            values = _values(header, row)
+            t_s = _given(values, "t_s")
+            if abs(t_s) > DEFAULT:
+                raise ValueError(f"t_s is {t_s:g}, beyond {DEFAULT:g} s from the start of the log")
+            record = build(start_ns + round(t_s * SECOND_NS), values)
+            _check(record)
         except ValueError as error:
             raise ValueError(f"{path}, line {number}: {error}") from None
-        _check(record, f"{path}, line {number}")
         found.append(record)
     return sorted(found, key=lambda record: record.t_ns)
+
+
+def _values(header: tuple[str, ...], row: list[str]) -> Row:
+    if len(row) != len(header):
+        raise ValueError(f"it has {len(row)} columns, and the header {len(header)}")
+    values = dict[str, float | None]()
+    for name, text in zip(header, row, strict=True):
+        try:
+            values[name] = float(text) if text.strip() else None
+        except ValueError:
+            raise ValueError(f"{name} is {text[:40]!r}; it must be a number") from None
+    return values
+
+
+def _identity(row: Row, name: str) -> int:
+    value = _given(row, name)
+    if value not in range(MOST_IDENTITY + 1):
+        raise ValueError(f"{name} is {value:g}; it must be an integer from 0 to {MOST_IDENTITY}")
+    return int(value)
 
 
 def _given(row: Row, name: str) -> float:
@@ -100,13 +122,16 @@ def _given(row: Row, name: str) -> float:
     return value
 
 
-def _check(record: Stamped, where: str) -> None:
-    """Reject angles and sigmas that cannot be."""
-    for name in ("lat", "lat_a", "lat_b", "altitude"):
-        value = getattr(record, name, 0.0)
-        if abs(value) > math.pi / 2.0:
-            raise ValueError(f"{where}: {name} is {math.degrees(value):g} deg, beyond 90 deg")
+def _check(record: Stamped) -> None:
+    """Reject numbers that cannot be."""
+    for limit, names in ((90, ("lat", "lat_a", "lat_b", "altitude")), (180, ("lon", "lon_a", "lon_b"))):
+        for name in names:
+            value = math.degrees(getattr(record, name, 0.0))
+            if abs(value) > limit:
+                raise ValueError(f"{name} is {value:g} deg, beyond {limit} deg")
     for name in ("sigma", "sigma_altitude", "sigma_azimuth"):
         value = getattr(record, name, 1.0)
         if not value > 0.0:
-            raise ValueError(f"{where}: {name} is {value:g}; it must be positive")
+            raise ValueError(f"{name} is {value:g}; it must be positive")
+    if (fault := implausible_field(record)) is not None:
+        raise ValueError(fault.reason)

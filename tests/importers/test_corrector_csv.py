@@ -9,6 +9,7 @@ from companion.records import RangeDifference, StarFix
 
 STAR = "t_s,star,lat_deg,lon_deg,altitude_deg,azimuth_deg,sigma_altitude_arcsec,sigma_azimuth_arcsec"
 LINE = "t_s,chain,lat_a_deg,lon_a_deg,alt_a_m,lat_b_deg,lon_b_deg,alt_b_m,difference_m,sigma_m"
+INS = "t_s,ins,lat_deg,lon_deg"
 NS = 1_000_000_000
 
 
@@ -27,6 +28,12 @@ def test_stars(tmp_path):
     assert second.azimuth is None and second.t_ns == 65 * NS
 
 
+def test_a_table_of_a_spreadsheet_may_begin_with_a_byte_order_mark(tmp_path):
+    assert read(tmp_path, f"\ufeff{STAR}\n1,1,10,70,45,200,10,15\n") == read(
+        tmp_path, f"{STAR}\n1,1,10,70,45,200,10,15\n"
+    )
+
+
 def test_lines(tmp_path):
     (line,) = read(tmp_path, f"{LINE}\n2,1,61,26,50,58,27,60,-1234.5,50\n")
     assert isinstance(line, RangeDifference)
@@ -39,8 +46,13 @@ def test_lines(tmp_path):
     [
         ("a,b\n1,2\n", "the header is 'a,b'"),
         ("", "the header is ''"),
-        (f"{STAR}\n1,1,10,70,x,200,10,15\n", "line 2: could not convert"),
-        (f"{STAR}\n1,1,10,70,45\n", "line 2"),
+        (f"{STAR}\n1,1,10,70,x,200,10,15\n", "line 2: altitude_deg is 'x'; it must be a number"),
+        (f"{STAR}\n1,1,10,70,45\n", "line 2: it has 5 columns, and the header 8"),
+        (f"{INS}\n1e300,0,55.7,37.6\n", "line 2: t_s is 1e+300, beyond 1e+08 s"),
+        (f"{INS}\n1,0.5,55.7,37.6\n", "line 2: ins is 0.5; it must be an integer from 0 to 65535"),
+        (f"{INS}\n1,1e300,55.7,37.6\n", "line 2: ins is 1e+300; it must be an integer"),
+        (f"{INS}\n1,0,55.7,437.6\n", "line 2: lon is 437.6 deg, beyond 180 deg"),
+        (f"{LINE}\n2,1,61,26,1e9,58,27,60,-1234.5,50\n", "line 2: alt_a 1e+09 is beyond the limit 100000"),
         (f"{STAR}\n1,1,100,70,45,200,10,15\n", "line 2: lat is 100 deg"),
         (f"{STAR}\n1,1,,70,45,200,10,15\n", "lat_deg is missing"),
         (f"{LINE}\n2,1,61,26,50,58,27,60,-1234.5,0\n", "sigma is 0; it must be positive"),
