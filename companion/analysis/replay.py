@@ -26,6 +26,7 @@ from companion.analysis.progress import show_step
 from companion.analysis.replay_inputs import (
     DERIVED,
     choose_configuration,
+    default_output,
     has_navigator_outputs,
     input_errors_as_log_errors,
     is_own_log,
@@ -181,11 +182,6 @@ def create_replay_log(
 def derived_metadata(config: Config, by: str, log: Path) -> dict[str, dict[str, str]]:
     """Return the metadata of a log that the command `by` makes from `log`: it may be replaced."""
     return {DERIVED: {"by": by, "from": printable(log.name)}, **run_metadata(config)}
-
-
-def default_output(log: Path, what: str) -> Path:
-    """Return the name of a log made from another one: NAME.replay.mcap in the current folder."""
-    return Path(f"{log.name.split('.mcap')[0] if is_own_log(log) else log.stem}.{what}.mcap")
 
 
 @click.command("replay")

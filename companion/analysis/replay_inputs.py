@@ -99,6 +99,12 @@ def is_own_log(log: Path) -> bool:
     return log.suffix == ".mcap" or log.name.endswith(f".mcap{ACTIVE}")
 
 
+def default_output(log: Path, kind: str) -> Path:
+    """Return the name of the log of a `kind` made from `log`, in the current folder: NAME.KIND.mcap."""
+    name = log.resolve().name if log.is_dir() else log.stem
+    return Path(f"{log.name.split('.mcap')[0] if is_own_log(log) else name}.{kind}.mcap")
+
+
 def has_navigator_outputs(log: Path) -> bool:
     """Return whether a log is our own and has navigator outputs, that is, was not converted."""
     return is_own_log(log) and CONVERTED not in flight_log.metadata(log)

@@ -26,9 +26,10 @@ from companion.analysis.output_guard import (
     reject_same_output,
 )
 from companion.analysis.progress import show_step
-from companion.analysis.replay import create_replay_log, default_output, derived_metadata, start_times
+from companion.analysis.replay import create_replay_log, derived_metadata, start_times
 from companion.analysis.replay_inputs import (
     choose_configuration,
+    default_output,
     input_errors_as_log_errors,
     open_inputs,
 )

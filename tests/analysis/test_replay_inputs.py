@@ -60,6 +60,22 @@ def test_configuration_selects_the_vehicle_of_a_log_with_two(tmp_path: pathlib.P
     assert {one.roll for one in values(output, r.Attitude)} == {0.5}
 
 
+def test_output_has_the_name_of_its_log(tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = tmp_path / "flight.2024-05-01"
+    (folder / "topics").mkdir(parents=True)
+    monkeypatch.chdir(folder / "topics")
+    for log, name in {
+        "a.b.tlog": "a.b",
+        "../a.mcap": "a",
+        "a.mcap.active": "a",
+        ".": "topics",
+        "..": "flight.2024-05-01",
+        str(folder): "flight.2024-05-01",
+    }.items():
+        found = replay_inputs.default_output(pathlib.Path(log), "replay")
+        assert found == pathlib.Path(f"{name}.replay.mcap")
+
+
 @pytest.fixture
 def beacons(tmp_path: pathlib.Path) -> pathlib.Path:
     path = tmp_path / "beacons.csv"
