@@ -27,6 +27,7 @@ from companion.analysis.flights import open_flights
 from companion.analysis.html import BOOTED_NS
 from companion.analysis.jobs import Journal, run_jobs
 from companion.analysis.replay_inputs import has_navigator_outputs, is_own_log
+from companion.analysis.summary import longest_outage
 from companion.analysis.verdict import judge_flight
 from companion.analysis.worker_options import worker_options
 from companion.config import Config, load, to_toml
@@ -52,7 +53,7 @@ class FlightRow(NamedTuple):
     start_utc: str | None = None
     duration_s: float = 0.0
     solutions: int = 0
-    gnss_outage_s: float = 0.0  # the longest
+    gnss_outage_s: float = 0.0  # the longest; the duration if GNSS never had a fix
     reference: str | None = None
     rms_m: float | None = None
     largest_m: float | None = None
@@ -116,7 +117,7 @@ def _row(name: str, a: Assessment) -> FlightRow:
         start_utc=None if start is None else start.isoformat(timespec="seconds"),
         duration_s=round(a.flight.seconds, 3),
         solutions=len(a.flight.tables["Solution"]["t"]),
-        gnss_outage_s=round(max((outage.end - outage.start for outage in a.outages), default=0.0), 3),
+        gnss_outage_s=round(longest_outage(a), 3),
         reference=a.reference and a.reference.what,
         rms_m=None if corrected is None else error_statistics.root_mean_square(corrected.error),
         largest_m=None if corrected is None else float(corrected.error.max()),

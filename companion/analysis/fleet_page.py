@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from html import escape
 from importlib.resources import files
@@ -27,7 +28,9 @@ def render_page(rows: Sequence[FlightRow]) -> str:
     tiles = {
         "flights": str(len(good)),
         "total duration": format_duration(sum(row.duration_s for row in good)),
-        "largest error": format_length(max((row.largest_m or 0.0 for row in good), default=0.0)),
+        "largest error": format_length(
+            max((row.largest_m for row in good if row.largest_m is not None), default=math.nan)
+        ),
         "logs not readable": str(len(bad)),
     }
     style = files("companion.analysis").joinpath("web", "style.css").read_text("utf-8")

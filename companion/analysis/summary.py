@@ -126,9 +126,16 @@ def describe_gnss(a: Assessment) -> str:
     return "GNSS had a fix throughout" + (", while the autopilot sent" if a.silences else "")
 
 
+def longest_outage(a: Assessment) -> float:
+    """Return the longest time without GNSS, s: the whole flight if it never had a fix."""
+    if _absent_gnss(a):
+        return a.flight.seconds
+    return max((outage.end - outage.start for outage in a.outages), default=0.0)
+
+
 def describe_outage(a: Assessment) -> str:
     """Return the longest time without GNSS, or why there is none."""
-    longest = max((outage.end - outage.start for outage in a.outages), default=0.0)
+    longest = longest_outage(a)
     return _absent_gnss(a) or (format_duration(longest) if longest else "never lost")
 
 

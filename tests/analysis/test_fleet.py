@@ -18,6 +18,7 @@ from companion.analysis import fleet, jobs
 from companion.analysis.fleet import FlightRow
 from companion.analysis.fleet_page import render_page
 from companion.config import Config
+from companion.link import dialect, frame
 from companion.storage.reader import LogError
 from sitl.endurance import sample_logs
 
@@ -141,6 +142,17 @@ def test_worst_flight_comes_first_and_text_is_escaped() -> None:
     assert page.index("worst.mcap") < page.index("&lt;!--&lt;script&gt;.mcap") < page.index("unknown.mcap")
     assert "<td data-label='verdict' class='good'><span title=''>Good</span></td>" in page
     assert "<script" not in page and "<b>bad" not in page and "href='reports/worst.html'" in page
+
+
+def test_a_flight_that_never_had_gnss_was_without_it_for_its_duration(tmp_path: Path) -> None:
+    log = tmp_path / "parked.tlog"
+    beat = frame.encode(dialect.new("HEARTBEAT", type=1, autopilot=3), 0, 1, 1)
+    stamps = range(1_700_000_000_000_000, 1_700_000_061_000_000, 1_000_000)
+    log.write_bytes(b"".join(us.to_bytes(8, "big") + beat for us in stamps))
+    (row,) = fleet.assess_log(fleet.LogJob(log, Config()))
+    assert row.gnss_outage_s == row.duration_s == 60.0
+    page = render_page([row])
+    assert "1 min" in page and "<dt>largest error</dt><dd>–</dd>" in page  # not known, which is not 0.00 m
 
 
 def test_exit_code_without_any_readable_log(tmp_path: Path) -> None:
