@@ -303,12 +303,13 @@ def _latency(axes: _Axes) -> Figure:
 def _pace(axes: _Axes) -> Figure:
     lines = []
     for which, a, prefix in axes.each():
-        edges = np.arange(0.0, a.flight.seconds + 5.0, max(5.0, a.flight.seconds / 400.0))
+        seconds = a.flight.seconds
+        edges = np.linspace(0.0, seconds, min(max(int(seconds / 5.0), 1), 400) + 1)  # none beyond the end
         for topic, role in _TOPICS:
-            if (stream := a.flight.streams.get(topic)) is not None and len(edges) > 1:
+            if (stream := a.flight.streams.get(topic)) is not None and seconds > 0.0:
                 hz = np.histogram(stream.rx, edges)[0] / np.diff(edges)
                 name = f"{prefix}{flight_events.topic_name(topic)}"
-                lines.append(axes.line(name, role, which, np.asarray(edges[:-1], dtype=np.float64), hz))
+                lines.append(axes.line(name, role, which, edges[:-1], hz))
     note = "Averaged over a few seconds."
     return axes.over_time("rates", "Messages per second", "Hz", lines, note, zero=True)
 

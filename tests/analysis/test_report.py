@@ -338,6 +338,17 @@ def test_the_last_moment_belongs_to_the_last_phase():
     assert without == pytest.approx(math.sqrt((149 * 5.0**2 + 500.0**2) / 150), rel=1e-3)
 
 
+@pytest.mark.parametrize("seconds", [3, 12, 121])
+def test_a_steady_message_has_one_rate_to_the_end_of_the_chart(seconds):
+    """Five estimates a second."""
+    a = collected([r for r in flight_records() if r.rx_ns < START + seconds * S])
+    (figure,) = (figure for figure in build_figures([a]) if figure.key == "rates")
+    (line,) = (line for line in figure.lines if line.name == "estimate")
+    width = a.flight.seconds / len(line.y)
+    assert np.allclose(line.y, 5.0, atol=1.0 / width + 1e-9)  # one message more or less
+    assert np.sum(line.y) * width == pytest.approx(5 * seconds)
+
+
 def test_nees_is_the_normalized_squared_error(assessed):
     (nees,) = (series for series in assessed.normalized_errors if series.what == "NEES")
     assert np.allclose(nees.value, 1.0, atol=1e-3)
