@@ -12,6 +12,7 @@ import csv
 import math
 from collections.abc import Iterator, Sequence
 from io import StringIO
+from itertools import chain, islice
 from pathlib import Path
 from typing import NamedTuple
 
@@ -38,6 +39,7 @@ from companion.config import ConfigError
 from companion.nav.geometry import Geodetic, displace
 from companion.option_types import INPUT_PATH
 from companion.records import Smoothed
+from companion.storage.reader import LogError
 from companion.units import SECOND_NS, Floats
 
 FORMATS = (".mcap", ".csv", ".kml", ".geojson", ".json")
@@ -70,14 +72,18 @@ def collect(runs: Sequence[SmoothedRun]) -> SmoothedTrack:
     return SmoothedTrack(records, np.sqrt(np.concatenate(variances)))
 
 
-def write_csv(path: Path, track: SmoothedTrack, start_ns: int, start_unix_ns: int) -> None:
-    """Write the track as a table; `log_time_s` is UNIX time if the log has it, else its recorder's clock."""
+def write_csv(path: Path, track: SmoothedTrack, first_ns: int, start_ns: int, start_unix_ns: int) -> None:
+    """Write the track as a table.
+
+    `t_s` counts from the first record of the log, at `first_ns`, as the times of a report and of correctors
+    do; `log_time_s` is UNIX time if the log has it, else its recorder's clock.
+    """
     file = StringIO(newline="")
     out = csv.writer(file)
     out.writerow(COLUMNS)
     for record, filtered in zip(track.records, track.filter_sigma.tolist(), strict=True):
-        since = record.t_ns - track.records[0].t_ns
-        out.writerow(_row(record, filtered, since, record.t_ns - start_ns + start_unix_ns))
+        log_ns = record.t_ns - start_ns + start_unix_ns
+        out.writerow(_row(record, filtered, record.t_ns - first_ns, log_ns))
     write_file(path, file.getvalue().encode())
 
 
@@ -156,7 +162,9 @@ def command(
     config = choose_configuration(log, config_file, changes)
     with input_errors_as_log_errors(), show_step(f"smooth {log}"):
         try:
-            runs = smooth_flight(open_inputs(log, config).records, config, check=check)
+            records = iter(open_inputs(log, config).records)
+            first = list(islice(records, 1))
+            runs = smooth_flight(chain(first, records), config, check=check)
         except ConfigError:
             raise
         except ValueError as error:
@@ -170,7 +178,7 @@ def command(
                 for record in track.records:
                     sink.record(record)
         elif path.suffix.lower() == ".csv":
-            write_csv(path, track, start_ns, start_unix_ns)
+            write_csv(path, track, first[0].rx_ns, start_ns, start_unix_ns)
         else:
             write_map(path, f"{log.name}, smoothed", list(map_tracks(track, start_ns, start_unix_ns)))
         click.echo(f"{path}: {len(track.records)} points")

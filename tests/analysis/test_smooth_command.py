@@ -12,6 +12,7 @@ import pytest
 from click.testing import CliRunner
 
 from companion.analysis import smoothing
+from companion.analysis.replay_inputs import open_inputs
 from companion.analysis.smooth_command import ELLIPSE_95, command
 from companion.link import dialect, frame
 from companion.records import Smoothed
@@ -48,6 +49,17 @@ def test_table_and_log_have_the_same_track(written):
         assert float(row["sigma_east_m"]) == pytest.approx(math.sqrt(record.covariance[2]), rel=1e-5)
         for axis in ("north", "east"):  # later fixes can only help
             assert float(row[f"sigma_{axis}_m"]) <= 1.00001 * float(row[f"filter_sigma_{axis}_m"])
+
+
+def test_times_count_from_the_first_record_of_the_log(log, written):
+    """As those of reports, of outages and of correctors."""
+    paths, _ = written
+    first = next(iter(open_inputs(log).records))
+    rows = csv.DictReader(paths[".csv"].read_text().splitlines())
+    records = [e.value for e in flight_log.read(paths[".mcap"]) if isinstance(e.value, Smoothed)]
+    for row, record in zip(rows, records, strict=True):
+        assert float(row["t_s"]) == pytest.approx((record.t_ns - first.rx_ns) * 1e-9, abs=6e-4)
+    assert records[0].t_ns > first.rx_ns
 
 
 def test_maps_have_track_and_ellipses(written):
