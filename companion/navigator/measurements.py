@@ -36,7 +36,8 @@ from companion.records import Gnss, Vector2
 from companion.units import Floats
 
 #: Log density of a measurement that has nothing to do with its quantity: one in ten thousand, anywhere within
-#: 2 km, 0.1 rad, 5 km, 20 m/s.
+#: 2 km, 0.1 rad, 5 km, 20 m/s; or as far as the leading hypothesis itself expects it.
+RARE = math.log(1e-4)
 OUTLIER = {
     "position": math.log(1e-4 / 2000.0**2),
     "velocity": math.log(1e-4 / 20.0**2),
@@ -94,6 +95,7 @@ def gnss_position(
         GNSS,
         known.settings,
         outlier=OUTLIER["position"],
+        rare=RARE,
     )
     return _taken(after, seen)
 
@@ -147,7 +149,7 @@ def gnss_velocity(
 
     R = variance * np.eye(2)
     after, seen = banks.update(
-        bank, layout, seen_by, None, R, VELOCITY, known.settings, outlier=OUTLIER["velocity"]
+        bank, layout, seen_by, None, R, VELOCITY, known.settings, outlier=OUTLIER["velocity"], rare=RARE
     )
     return _taken(after, seen)
 
@@ -169,7 +171,7 @@ def airspeed(
     lie = layout.lie_states(AIRSPEED)[0]
     H[:, 0, lie], H[:, 1, lie] = -false * V[0] / speed, -false * V[1] / speed
     after, seen = banks.update(
-        bank, layout, row.y, H, row.R, None, known.settings, outlier=OUTLIER["velocity"]
+        bank, layout, row.y, H, row.R, None, known.settings, outlier=OUTLIER["velocity"], rare=RARE
     )
     heard = after.seen.copy()
     heard[AIRSPEED] = after.t
@@ -201,7 +203,7 @@ def rotor_drag(
 
     R = own_error_model.airspeed_variance(manoeuvre) * np.eye(2)
     after, seen = banks.update(
-        bank, layout, seen_by, None, R, None, known.settings, outlier=OUTLIER["velocity"]
+        bank, layout, seen_by, None, R, None, known.settings, outlier=OUTLIER["velocity"], rare=RARE
     )
     return _taken(after, seen)
 
@@ -212,7 +214,7 @@ def foreign_velocity(bank: Bank, known: Hypotheses, channel: OwnChannel, apart: 
     H = np.zeros((2, known.layout.n_base))
     H[:, : channel.n] = row.H
     after, seen = banks.update(
-        bank, known.layout, row.y, H, row.R, None, known.settings, outlier=OUTLIER["velocity"]
+        bank, known.layout, row.y, H, row.R, None, known.settings, outlier=OUTLIER["velocity"], rare=RARE
     )
     return _taken(after, seen)
 
@@ -274,7 +276,7 @@ def sight(
     R = np.array(((variance,),))
     kind = "azimuth" if isinstance(z, Azimuth) else "range"
     after, seen = banks.update(
-        bank, layout, linearised, None, R, source, known.settings, outlier=OUTLIER[kind]
+        bank, layout, linearised, None, R, source, known.settings, outlier=OUTLIER[kind], rare=RARE
     )
     return _taken(after, seen)
 

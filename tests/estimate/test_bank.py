@@ -798,6 +798,20 @@ def test_a_row_that_explains_what_others_refuse_gains_the_difference():
     np.testing.assert_array_equal(after.x[found.refused], bank.x[found.refused])
 
 
+@pytest.mark.parametrize("sigma", [10.0, 1e3, 1e7])
+def test_what_is_within_the_spread_of_the_heaviest_row_is_no_outlier_however_wide_that_is(sigma):
+    """Outliers are expected within 100 m: after a silence of hours a true fix is as improbable anywhere."""
+    rare = math.log(1e-4)
+    bank = b.start(scalar_layout(), 0.0, np.zeros(2), np.diag([sigma**2, 1.0]), [1.0])
+    for z, refused in ((2.0 * sigma, False), (20.0 * sigma, True)):
+        after, found = b.update(
+            bank, scalar_layout(), np.array([z]), H, R, None, outlier=rare - math.log(100.0), rare=rare
+        )
+        assert found.refused.all() == refused
+        want = 0.0 if refused else z * sigma**2 / (sigma**2 + R[0, 0])
+        np.testing.assert_allclose(after.x[0, 0], want, rtol=1e-9)
+
+
 @given(st.integers(0, 1000))
 @hypothesis_settings(max_examples=10)
 def test_a_measurement_as_a_function_is_linearised_about_each_row(seed):

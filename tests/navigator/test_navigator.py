@@ -33,6 +33,7 @@ from companion.navigator.inertial_track import Point
 from companion.navigator.ins_channel import ins_channel
 from companion.navigator.state import EXCLUDED, SUSPECT, source_name
 from companion.records import (
+    Attitude,
     Event,
     Fix,
     Gnss,
@@ -619,6 +620,21 @@ def test_a_gnss_jump_is_refused_and_counted() -> None:
                     errors.append(distance(out, moment.truth))
     assert rejections >= 9
     assert max(errors) < 15.0
+
+
+@pytest.mark.parametrize("hours", [0.5, 2.0, 10.0, 72.0])
+@pytest.mark.parametrize("moved_m", [0.0, 3e3])
+def test_a_fix_is_used_after_a_silence_of_any_length(hours: float, moved_m: float) -> None:
+    """Parked, moved, and switched on again: from 20 minutes on every fix was an outlier, until a restart."""
+    navigator, errors = Navigator(load(environment={})), list[float]()
+    for k in range(1, 120):
+        t_ns = k * NS // 2 + (0 if k < 60 else round(hours * 3600.0) * NS)
+        place = displace(*ORIGIN, 0.0 if k < 60 else moved_m, 0.0, 0.0)
+        found = navigator.handle(Gnss(t_ns, t_ns, 0, t_ns // 1000, 3, *place, 1.5, 3.0, v_n=(0.0, 0.1, 0.0)))
+        found += navigator.handle(Attitude(t_ns + NS // 10, t_ns + NS // 10, 1e-4 * k, 0.0, 0.0))
+        errors += [distance(out, place) for out in found if isinstance(out, Solution) and k > 70]
+    assert len(errors) > 40
+    assert max(errors) < 5.0
 
 
 @pytest.mark.parametrize("late_s", [0.3, 0.9])

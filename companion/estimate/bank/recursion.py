@@ -113,6 +113,7 @@ def update(
     source: int | None,
     settings: Settings = DEFAULT,
     outlier: float = NEVER,
+    rare: float = math.inf,
 ) -> tuple[Bank, Innovation]:
     """Update all rows by one measurement z = H x + lie + white noise, and reweight them.
 
@@ -132,6 +133,8 @@ def update(
     source : index of the source, None for a measurement that cannot be false.
     settings : births on return and on surprise.
     outlier : log density of a measurement that has nothing to do with its quantity, prior included.
+    rare : log of that prior. Where the heaviest row itself expects the measurement over a wider place than
+        `outlier` is spread over, outliers are spread as widely: nothing would be taken after a long silence.
 
     Returns
     -------
@@ -161,6 +164,8 @@ def update(
         bank = births(bank, layout, settings, reduced=False)
         born = True
         step = innovations(bank)
+    heaviest = int(np.argmax(bank.L))
+    outlier = min(outlier, float(step.log_likelihood[heaviest] + 0.5 * step.nis[heaviest]) + rare)
     refused = step.log_likelihood < outlier
     G, white = step.G, step.white
     if refused.any():
