@@ -17,9 +17,11 @@ from companion.navigator.progress import (
     is_silent,
     nearer,
     propagated,
+    widened,
 )
 from companion.navigator.state import (
     EXCLUDED,
+    FIXES,
     Beacon,
     Pending,
     Settings,
@@ -27,13 +29,29 @@ from companion.navigator.state import (
     Step,
     VelocityError,
     corrected,
+    estimate,
     hypotheses,
+    is_jammed,
     source_name,
+    sources,
 )
-from companion.records import Event, Gnss, Output, Rejection, RsbnFix, Severity, Source, Stamped, Vector2
+from companion.records import (
+    Event,
+    Gnss,
+    Output,
+    Rejection,
+    Reset,
+    RsbnFix,
+    Severity,
+    Source,
+    Stamped,
+    Vector2,
+)
+from companion.units import SECOND_NS
 
 GATE_SIGMA = 5.0
 MEAN_S = 60.0  # of the estimated velocity error, for GNSS latency
+REFUSED_NS = 10 * SECOND_NS  # fixes that no hypothesis takes begin the position again after so long at least
 
 
 def gnss(state: State, record: Gnss, settings: Settings) -> Step:
@@ -71,7 +89,10 @@ def gnss(state: State, record: Gnss, settings: Settings) -> Step:
     if velocity is not None and (state.reported[VELOCITY] == EXCLUDED or not velocity.accepted):
         out.append(_rejected(state, record, f"velocity of {label}", VELOCITY, velocity))
     if state.reported[GNSS] == EXCLUDED or not taken.accepted:
-        return nearer(state, settings), [*out, _rejected(state, record, label, GNSS, taken)]
+        out.append(_rejected(state, record, label, GNSS, taken))
+        refused_ns = None if taken.by_any else state.refused_ns or record.t_ns
+        state, again = _begun_again(state._replace(refused_ns=refused_ns), record, settings)
+        return nearer(state, settings), [*out, *again]
     since = math.inf if state.gnss_ns is None else (record.t_ns - state.gnss_ns) * 1e-9
     part = min(since, config.correlation_s) / config.correlation_s
     level = height_error.update(state.level, record, nominal.point, part, GATE_SIGMA**2)
@@ -79,7 +100,11 @@ def gnss(state: State, record: Gnss, settings: Settings) -> Step:
     if state.false[GNSS] < known.settings.suspect:
         pending = Pending(record, nominal.point, (0.0, 0.0), Source.GNSS)
     state = state._replace(
-        gnss_ns=record.t_ns, gnss_fix=(record, nominal.point), level=level, pending=pending
+        gnss_ns=record.t_ns,
+        gnss_fix=(record, nominal.point),
+        level=level,
+        pending=pending,
+        refused_ns=None,
     )
     return nearer(state, settings), out
 
@@ -208,7 +233,30 @@ def _begun(state: State, record: Gnss | RsbnFix, settings: Settings) -> State:
         return state
     if nominal.interval is not None:
         nominal = own_channel.restart(nominal, nominal.interval.by, nominal.point.v_n[:2])
-    return state._replace(nominal=nominal._replace(since=nominal.point), bank=settings.model.begin(0.0))
+    nominal = nominal._replace(since=nominal.point)
+    return state._replace(nominal=nominal, bank=settings.model.begin(0.0), begun_ns=record.t_ns)
+
+
+def _begun_again(state: State, record: Gnss, settings: Settings) -> Step:
+    """With the position as open as GNSS is far off, once no hypothesis has taken its fixes for too long.
+
+    Of two runs of fixes that contradict each other the longer one is believed: a receiver's first fix may be
+    kilometres off, and a spoofer that comes later must last longer than the flight before it. Not where a
+    beacon bears the position out, nor beside an INS, which shows a jump of GNSS.
+    """
+    begun_ns, since_ns = state.begun_ns, state.refused_ns
+    if begun_ns is None or since_ns is None or not settings.model.channel.wind or is_jammed(state):
+        return state, []
+    last_ns = max(t or begun_ns for t in (state.gnss_ns, state.rsbn_ns))
+    refused_ns = record.t_ns - since_ns
+    if refused_ns < max(REFUSED_NS, last_ns - begun_ns) or sources(state, record.t_ns, settings) & FIXES:
+        return state, []
+    assert state.nominal is not None
+    centre = estimate(state, settings).x[:2].tolist()
+    apart = math.dist(measurements.gnss_apart(record, state.nominal.point), (-centre[0], -centre[1]))
+    why = f"no hypothesis explains GNSS, {apart:.0f} m off for {refused_ns * 1e-9:.0f} s: position restarted"
+    state = widened(state, apart)._replace(begun_ns=record.t_ns, refused_ns=None)
+    return state, [Reset(record.t_ns, record.rx_ns, "position", why)]
 
 
 def _scattered(

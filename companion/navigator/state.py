@@ -96,6 +96,8 @@ class State(NamedTuple):
     pending: Pending | None = None
     velocity_error: VelocityError | None = None
     gnss_first_ns: int | None = None  # of the first 3D fix
+    begun_ns: int | None = None  # when the position was begun
+    refused_ns: int | None = None  # since when no hypothesis takes a fix of GNSS
     gnss_ns: int | None = None  # when fixes were last believed
     rsbn_ns: int | None = None
     rsbn_used: Source = Source(0)  # which of azimuth and range were, then

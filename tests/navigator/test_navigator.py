@@ -622,19 +622,63 @@ def test_a_gnss_jump_is_refused_and_counted() -> None:
     assert max(errors) < 15.0
 
 
+def parked(stated: Iterator[tuple[float, float]], config: Config) -> Iterator[tuple[float, float, list[Any]]]:
+    """Time of each fix of an aircraft at rest, how far north it is (m), and what the navigator returns."""
+    navigator = Navigator(config)
+    for k, (t, north) in enumerate(stated):
+        t_ns, place = round(t * NS), displace(*ORIGIN, north, 0.0, 0.0)
+        found = navigator.handle(Gnss(t_ns, t_ns, 0, t_ns // 1000, 3, *place, 1.5, 3.0, v_n=(0.0, 0.1, 0.0)))
+        found += navigator.handle(Attitude(t_ns + NS // 10, t_ns + NS // 10, 1e-4 * k, 0.0, 0.0))
+        yield t, north, found
+
+
+def solved_off(found: list[Any], north: float) -> list[float]:
+    """Distances of the solutions from a place `north` of the origin, m."""
+    place = displace(*ORIGIN, north, 0.0, 0.0)
+    return [distance(out, place) for out in found if isinstance(out, Solution)]
+
+
+OWN_CHANNEL = load(flags={"output.profile": "ardupilot"}, environment={})
+
+
 @pytest.mark.parametrize("hours", [0.5, 2.0, 10.0, 72.0])
 @pytest.mark.parametrize("moved_m", [0.0, 3e3])
 def test_a_fix_is_used_after_a_silence_of_any_length(hours: float, moved_m: float) -> None:
     """Parked, moved, and switched on again: from 20 minutes on every fix was an outlier, until a restart."""
-    navigator, errors = Navigator(load(environment={})), list[float]()
-    for k in range(1, 120):
-        t_ns = k * NS // 2 + (0 if k < 60 else round(hours * 3600.0) * NS)
-        place = displace(*ORIGIN, 0.0 if k < 60 else moved_m, 0.0, 0.0)
-        found = navigator.handle(Gnss(t_ns, t_ns, 0, t_ns // 1000, 3, *place, 1.5, 3.0, v_n=(0.0, 0.1, 0.0)))
-        found += navigator.handle(Attitude(t_ns + NS // 10, t_ns + NS // 10, 1e-4 * k, 0.0, 0.0))
-        errors += [distance(out, place) for out in found if isinstance(out, Solution) and k > 70]
+    before, after = 0.5 * np.arange(1, 60), 3600.0 * hours + 0.5 * np.arange(60, 120)
+    fixes = [*((t, 0.0) for t in before), *((t, moved_m) for t in after)]
+    errors = [
+        error
+        for t, north, found in parked(iter(fixes), OWN_CHANNEL)
+        for error in solved_off(found, north)
+        if t > after[10]
+    ]
     assert len(errors) > 40
     assert max(errors) < 5.0
+
+
+@pytest.mark.parametrize("wrong_m", [1e3, 5e3, 1e5])
+@pytest.mark.parametrize("wrong_s", [0.5, 1.0, 20.0])
+def test_of_two_runs_of_fixes_that_contradict_each_other_the_longer_one_is_believed(
+    wrong_m: float, wrong_s: float
+) -> None:
+    """First fixes may be far off: one, and GNSS was rejected for a minute by 1 km, for good by 5 km."""
+    limit = wrong_s + max(10.0, wrong_s) + 2.0
+    fixes = [(t, wrong_m if t <= wrong_s else 0.0) for t in 0.5 * np.arange(1, 2 * limit + 20)]
+    last, resets = 0.0, list[Reset]()
+    for t, _, found in parked(iter(fixes), OWN_CHANNEL):
+        last = t if max(solved_off(found, 0.0), default=0.0) > 10.0 else last
+        resets += [out for out in found if isinstance(out, Reset)]
+    assert last <= limit
+    assert [reset.what for reset in resets] == ["position"]
+
+
+def test_a_gnss_that_jumps_far_is_not_followed_before_it_outlasts_the_flight_before() -> None:
+    """A spoofer's: 5 km off for 50 s after a minute, and true again."""
+    fixes = [(t, 5e3 if 60.0 < t <= 110.0 else 0.0) for t in 0.5 * np.arange(1, 240)]
+    for t, _, found in parked(iter(fixes), OWN_CHANNEL):
+        assert not [out for out in found if isinstance(out, Reset)]
+        assert max(solved_off(found, 0.0), default=0.0) < (200.0 if 60.0 < t <= 112.0 else 5.0)
 
 
 @pytest.mark.parametrize("late_s", [0.3, 0.9])
