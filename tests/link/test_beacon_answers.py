@@ -1,6 +1,8 @@
 """Beacon answers: a beacon keeps its receiver, and hostile receivers get little of the navigator's time."""
 
-from companion.link.beacon_answers import MAX_RECEIVERS, REJECTED_NS, SILENT_NS, BeaconAnswers
+import pytest
+
+from companion.link.beacon_answers import MAX_RECEIVERS, MAX_WAITING, REJECTED_NS, SILENT_NS, BeaconAnswers
 from companion.units import SECOND_NS
 
 MILLI = SECOND_NS // 1000
@@ -28,15 +30,46 @@ def test_a_rejected_receiver_waits_and_returns() -> None:
     answers, used = BeaconAnswers(), 0
     for ms in range(10_000):
         receiver = f"stranger {ms % 50}"
-        if answers.refusal(receiver, ms % 50, ms * MILLI) is None:
+        if answers.refusal(receiver, f"beacon {ms % 50}", ms * MILLI) is None:
             used += 1
             answers.note_rejected(receiver, ms * MILLI)
     assert used <= MAX_RECEIVERS * 10 * SECOND_NS // REJECTED_NS
-    assert answers.refusal("stranger 0", 0, 10 * SECOND_NS + REJECTED_NS) is None
+    assert answers.refusal("stranger 0", "beacon 0", 10 * SECOND_NS + REJECTED_NS) is None
+
+
+@pytest.mark.parametrize("false", [1, 2, 5])
+@pytest.mark.parametrize("gap_ms", [10, 90])
+def test_beacons_whose_answers_are_rejected_keep_no_other_of_the_receiver_out(
+    false: int, gap_ms: int
+) -> None:
+    """A receiver's beacons answer in turn once a second; all but the last are rejected. It was never used."""
+    answers, used = BeaconAnswers(), list[int]()
+    for second in range(100):
+        for k in range(false + 1):
+            now = second * SECOND_NS + k * gap_ms * MILLI
+            if answers.refusal("receiver", f"beacon {k}", now) is not None:
+                continue
+            if k < false:
+                answers.note_rejected("receiver", now)
+            else:
+                used.append(second)
+    assert len(used) >= 100 // (false + 1) - 2
+    assert used[-1] > 100 - 2 * (false + 1)
+
+
+def test_a_beacon_that_waits_and_is_silent_keeps_no_other_out() -> None:
+    answers = BeaconAnswers()
+    assert answers.refusal("receiver", "beacon 1", 0) is None
+    answers.note_rejected("receiver", 0)
+    assert answers.refusal("receiver", "beacon 2", 1) is not None
+    assert answers.refusal("receiver", "beacon 1", SECOND_NS) is not None
+    assert answers.refusal("receiver", "beacon 1", SILENT_NS + 1) is None
 
 
 def test_memory_is_bounded_whatever_beacons_are_stated() -> None:
     answers = BeaconAnswers()
     for ms in range(100_000):
-        answers.refusal(f"stranger {ms % 4}", ms % 65_536, ms * MILLI)
+        if answers.refusal(f"stranger {ms % 4}", f"beacon {ms % 65_536}", ms * MILLI) is None and ms % 2:
+            answers.note_rejected(f"stranger {ms % 4}", ms * MILLI)
+    assert sum(map(len, answers._waiting.values())) <= MAX_RECEIVERS * MAX_WAITING
     assert len(answers._followed) <= MAX_RECEIVERS * (20 + 10 * (SILENT_NS // SECOND_NS + 1))
