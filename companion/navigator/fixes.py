@@ -196,7 +196,11 @@ def rsbn(state: State, record: RsbnFix, settings: Settings) -> Step:
     state = state._replace(fixed=True, unfit=others)
     if believed:
         pending = Pending(record, point, centre, believed)
-        state = state._replace(rsbn_ns=record.t_ns, rsbn_used=believed, pending=pending)
+        state = state._replace(rsbn_ns=record.t_ns, pending=pending)
+        if record.azimuth is not None:
+            state = state._replace(azimuth_ns=record.t_ns if believed & Source.AZIMUTH else None)
+        if record.slant_range is not None:
+            state = state._replace(range_ns=record.t_ns if believed & Source.RANGE else None)
     return nearer(state, settings), out
 
 

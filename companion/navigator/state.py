@@ -100,7 +100,8 @@ class State(NamedTuple):
     refused_ns: int | None = None  # since when no hypothesis takes a fix of GNSS
     gnss_ns: int | None = None  # when fixes were last believed
     rsbn_ns: int | None = None
-    rsbn_used: Source = Source(0)  # which of azimuth and range were, then
+    azimuth_ns: int | None = None  # when an azimuth was last believed, None if the last one was not
+    range_ns: int | None = None
     held: Held | None = None
     next_ns: int = 0
 
@@ -170,6 +171,7 @@ def sources(state: State, t_ns: int, settings: Settings) -> Source:
         found |= Source.AIR_DATA
     if state.gnss_ns is not None and (t_ns - state.gnss_ns) * 1e-9 <= config.gnss.timeout_s:
         found |= Source.GNSS
-    if state.rsbn_ns is not None and (t_ns - state.rsbn_ns) * 1e-9 <= config.rsbn.timeout_s:
-        found |= state.rsbn_used
+    for part, last_ns in ((Source.AZIMUTH, state.azimuth_ns), (Source.RANGE, state.range_ns)):
+        if last_ns is not None and (t_ns - last_ns) * 1e-9 <= config.rsbn.timeout_s:
+            found |= part
     return found

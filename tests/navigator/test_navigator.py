@@ -763,6 +763,29 @@ def test_an_azimuth_alone_corrects_across_and_is_no_fix() -> None:
     assert last.mode is Mode.FIXED
 
 
+def test_azimuth_and_range_in_messages_of_their_own_are_as_one_answer() -> None:
+    """As of a VOR and a DME receiver: two events a second named one part, then the other."""
+
+    def fly(is_apart: bool) -> tuple[list[Solution], list[str]]:
+        navigator, out = Navigator(CONFIG), list[Any]()
+        navigator.handle(origin())
+        for record in (record for moment in flight(42, 20.0, 30.0) for record in moment.records):
+            if is_apart and isinstance(record, RsbnFix):
+                out += navigator.handle(structs.replace(record, slant_range=None))
+                record = structs.replace(record, azimuth=None)
+            out += navigator.handle(record)
+        last = {each.t_ns: each for each in out if isinstance(each, Solution)}
+        events = [each.text for each in out if isinstance(each, Event) and each.text.startswith("navigation")]
+        return list(last.values()), events
+
+    (whole, expected), (apart, events) = fly(False), fly(True)
+    assert [text for text in events if text not in expected] == ["navigation fixed: gnss and azimuth fixes"]
+    assert [text for text in events if text in expected] == expected
+    for a, b in zip(whole, apart, strict=True):
+        assert distance(a, Geodetic(b.lat, b.lon, b.alt_msl)) < 0.5
+        assert a.sources == b.sources
+
+
 @pytest.mark.parametrize("ranged", [True, False], ids=["with a range", "an azimuth alone"])
 def test_in_the_cone_of_silence_an_azimuth_is_no_fix(ranged: bool) -> None:
     """The beacon stands where the aircraft is after 40 s, 1 km up: it crosses the cone in 38 s."""
