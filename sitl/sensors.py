@@ -279,8 +279,8 @@ def simulate_air_data(flight: Trajectory, model: AirDataModel, rng: Generator) -
     aloft = np.clip(flight.airspeed / 15.0, 0.0, 1.0)
     true_airspeed = (flight.airspeed + gust * aloft) * (1.0 + model.scale * rng.standard_normal())
     true_airspeed = np.maximum(true_airspeed + model.noise_m_s * rng.standard_normal(n), 0.0)
-    temperature = T_0 - 0.0065 * flight.alt
-    static = P_0 * (temperature / T_0) ** 5.25588
+    temperature = np.maximum(T_0 - 0.0065 * flight.alt, 216.65)  # which it is from 11 km up
+    static = P_0 * (temperature / T_0) ** 5.25588 * np.exp(np.minimum(11_000.0 - flight.alt, 0.0) / 6341.62)
     equivalent = true_airspeed * np.sqrt(static * T_0 / (P_0 * temperature))
     noise = model.pressure_noise_pa * rng.standard_normal(n)
     noise += model.pressure_wander_pa * gauss_markov(n, dt, 1800.0, rng)[:, 0]

@@ -18,6 +18,7 @@ from companion.records import AirData, Attitude, Gnss, Pressure, RsbnFix
 P0 = 101_325.0  # [Pa] of the standard atmosphere at sea level
 LAPSE, T0 = 0.0065, 288.15  # [K/m], [K]
 TROPOPAUSE = 11_000.0  # [m], where the lapse ends
+P1, T1, SCALE_M = 22_632.06, 216.65, 6341.62  # there [Pa], [K]; above, the pressure falls to 1 / e in [m]
 HEIGHT_EXPONENT = 0.190263  # R L / (g M): T / T0 = (p / P0)^0.19
 DENSITY_EXPONENT = 1.0 - HEIGHT_EXPONENT  # rho / rho0 = (p / P0) / (T / T0)
 CLIMB_S = 2.0  # time constant of the climb taken from the pressure altitude
@@ -57,9 +58,12 @@ def true_airspeed(record: AirData, static: float | None, alt: float) -> float:
     if record.true:
         return record.airspeed
     ratio = static / P0 if static else (1.0 - LAPSE * min(alt, TROPOPAUSE) / T0) ** (1.0 / HEIGHT_EXPONENT)
-    return float(record.airspeed / math.sqrt(ratio**DENSITY_EXPONENT))
+    density = ratio**DENSITY_EXPONENT if not static or static >= P1 else ratio * T0 / T1
+    return float(record.airspeed / math.sqrt(density))
 
 
 def pressure_altitude(static: float) -> float:
     """Height (m) at which the standard atmosphere has this pressure (Pa)."""
+    if static < P1:
+        return TROPOPAUSE - SCALE_M * math.log(static / P1)
     return float(T0 / LAPSE * (1.0 - (static / P0) ** HEIGHT_EXPONENT))

@@ -396,6 +396,16 @@ def test_true_airspeed_by_the_standard_atmosphere(height: float, ratio: float) -
     assert air_data_channel.pressure_altitude(pressure) == pytest.approx(height, abs=0.5)
 
 
+@pytest.mark.parametrize(
+    ("height", "pressure", "ratio"), [(15e3, 12044.6, 0.15810), (20e3, 5474.88, 0.071865)]
+)
+def test_above_the_tropopause_the_temperature_stays(height: float, pressure: float, ratio: float) -> None:
+    """ISO 2533 as above. By the lapse of the lower air airspeed was 6 and 13 % low, height 0.2 and 1.1 km."""
+    found = air_data_channel.true_airspeed(AirData(0, 0, 20.0), pressure, 0.0)
+    assert found == pytest.approx(20.0 / math.sqrt(ratio), rel=1e-4)
+    assert air_data_channel.pressure_altitude(pressure) == pytest.approx(height, abs=0.5)
+
+
 def test_it_begins_at_a_beacons_fix_where_there_is_no_gnss() -> None:
     flown = flight("plane_gps_loss")
     records = [r for r in with_beacon(flown, 0, 120.0, NEVER) if not isinstance(r, Gnss)]
