@@ -31,9 +31,8 @@ class BeaconAnswers:
         self._limiter = SenderLimiter(ANSWERS_HZ, ANSWERS_BURST, MAX_RECEIVERS)
         self._followed: dict[str, tuple[Hashable, int]] = {}  # by source: its receiver, its last answer
         self._waits_ns: dict[Hashable, int] = {}
-        self._waiting: dict[
-            Hashable, dict[str, int]
-        ] = {}  # by receiver: sources that wait, when they last asked
+        # by receiver: the sources that wait, in their order, and when they last asked
+        self._waiting: dict[Hashable, dict[str, int]] = {}
 
     def followed(self, source: str, now_ns: int) -> Hashable | None:
         """Return the receiver whose answers of a source are used, None if it is silent."""
