@@ -137,8 +137,8 @@ COLUMNS: dict[type[Stamped], tuple[str, Callable[[Any], tuple[float, ...]]]] = {
         lambda r: (r.lat, r.lon, r.sources, r.cost, r.degrees_of_freedom, _or_nan(r.normalised)),
     ),
     Gnss: (
-        "fix lat lon alt",
-        lambda r: (r.fix, r.lat, r.lon, r.alt_msl),
+        "receiver fix lat lon alt",
+        lambda r: (r.receiver, r.fix, r.lat, r.lon, r.alt_msl),
     ),
     RsbnFix: (
         "beacon lat lon alt azimuth slant",
