@@ -1,6 +1,6 @@
 """Measurements of the bank: GNSS position and velocity, azimuth and range of a beacon, airspeed.
 
-Each says what a record measures of the error states, for all rows at once. A measurement goes to every row,
+Each states what a record measures of the error states, for all rows at once. A measurement goes to every row,
 those that hold its source to be false included: they estimate its error. It counts as used where its source
 is not excluded and the leading hypothesis could take it.
 """
@@ -8,6 +8,7 @@ is not excluded and the leading hypothesis could take it.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -86,18 +87,7 @@ def gnss_position(
             H[:, channel.arm] = -v_n[0] / speed, -v_n[1] / speed
         else:
             variance += ARM_M**2
-    after, seen = banks.update(
-        bank,
-        known.layout,
-        np.array((-north, -east)),
-        H,
-        variance * np.eye(2),
-        GNSS,
-        known.settings,
-        outlier=OUTLIER["position"],
-        rare=RARE,
-    )
-    return _taken(after, seen)
+    return _take(bank, known, np.array((-north, -east)), H, variance * np.eye(2), GNSS, "position")
 
 
 def other_receiver(bank: Bank, channel: Channel) -> Bank:
@@ -147,11 +137,7 @@ def gnss_velocity(
         H[:, 0, rate] = H[:, 1, rate + 1] = lying
         return np.broadcast_to(z, (len(bank.L), 2)), H
 
-    R = variance * np.eye(2)
-    after, seen = banks.update(
-        bank, layout, seen_by, None, R, VELOCITY, known.settings, outlier=OUTLIER["velocity"], rare=RARE
-    )
-    return _taken(after, seen)
+    return _take(bank, known, seen_by, None, variance * np.eye(2), VELOCITY, "velocity")
 
 
 def airspeed(
@@ -170,12 +156,10 @@ def airspeed(
     false = (bank.fault[:, AIRSPEED_GROUP] != banks.NONE).astype(np.float64)
     lie = layout.lie_states(AIRSPEED)[0]
     H[:, 0, lie], H[:, 1, lie] = -false * V[0] / speed, -false * V[1] / speed
-    after, seen = banks.update(
-        bank, layout, row.y, H, row.R, None, known.settings, outlier=OUTLIER["velocity"], rare=RARE
-    )
-    heard = after.seen.copy()
-    heard[AIRSPEED] = after.t
-    return _taken(after._replace(seen=heard), seen)
+    taken = _take(bank, known, row.y, H, row.R, None, "velocity")
+    seen = taken.bank.seen.copy()
+    seen[AIRSPEED] = taken.bank.t
+    return taken._replace(bank=taken.bank._replace(seen=seen))
 
 
 def rotor_drag(
@@ -193,19 +177,15 @@ def rotor_drag(
     held false beside a healthy GNSS. `V` and `velocity` as in `own_error_model.drag_rows`, `manoeuvre` as in
     `airspeed`.
     """
-    layout = known.layout
 
     def seen_by(bank: Bank) -> tuple[Floats, Floats]:
         z, own = own_error_model.drag_rows(bank.x, velocity, V, heading, drag_per_s)
-        H = np.zeros((len(bank.L), 2, layout.n_base))
+        H = np.zeros((len(bank.L), 2, known.layout.n_base))
         H[:, :, : own.shape[2]] = own
         return z, H
 
     R = own_error_model.airspeed_variance(manoeuvre) * np.eye(2)
-    after, seen = banks.update(
-        bank, layout, seen_by, None, R, None, known.settings, outlier=OUTLIER["velocity"], rare=RARE
-    )
-    return _taken(after, seen)
+    return _take(bank, known, seen_by, None, R, None, "velocity")
 
 
 def foreign_velocity(bank: Bank, known: Hypotheses, channel: OwnChannel, apart: Vector2) -> Taken:
@@ -213,10 +193,7 @@ def foreign_velocity(bank: Bank, known: Hypotheses, channel: OwnChannel, apart: 
     row = own_error_model.foreign_row(channel.settings, apart)
     H = np.zeros((2, known.layout.n_base))
     H[:, : channel.n] = row.H
-    after, seen = banks.update(
-        bank, known.layout, row.y, H, row.R, None, known.settings, outlier=OUTLIER["velocity"], rare=RARE
-    )
-    return _taken(after, seen)
+    return _take(bank, known, row.y, H, row.R, None, "velocity")
 
 
 def corrector(bank: Bank, known: Hypotheses, rows: CorrectorRows) -> Taken:
@@ -275,10 +252,7 @@ def sight(
 
     R = np.array(((variance,),))
     kind = "azimuth" if isinstance(z, Azimuth) else "range"
-    after, seen = banks.update(
-        bank, layout, linearised, None, R, source, known.settings, outlier=OUTLIER[kind], rare=RARE
-    )
-    return _taken(after, seen)
+    return _take(bank, known, linearised, None, R, source, kind)
 
 
 def sight_residual(z: Azimuth | Range, centre: Vector2) -> float:
@@ -286,6 +260,22 @@ def sight_residual(z: Azimuth | Range, centre: Vector2) -> float:
     predicted, _, _ = fix_observations.predict_sight(z, np.array(((centre[1], centre[0], 0.0),)))
     apart = z.value - float(predicted[0])
     return wrap_angle(apart) if isinstance(z, Azimuth) else apart
+
+
+def _take(
+    bank: Bank,
+    known: Hypotheses,
+    z: Floats | Callable[[Bank], tuple[Floats, Floats]],
+    H: Floats | None,
+    R: Floats,
+    source: int | None,
+    kind: str,
+) -> Taken:
+    """Update by a measurement whose outliers are those of its `kind`; arguments as of `banks.update`."""
+    outlier = OUTLIER[kind]
+    return _taken(
+        *banks.update(bank, known.layout, z, H, R, source, known.settings, outlier=outlier, rare=RARE)
+    )
 
 
 def _taken(bank: Bank, seen: Innovation) -> Taken:
