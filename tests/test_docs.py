@@ -19,7 +19,7 @@ from companion.navigator import own_channel
 from companion.output import source_switch
 from companion.output.gate import MAX_AGE_S, withholding_reason
 from companion.records import Mode, Solution, Trust
-from companion.runtime.core import requested_rates
+from companion.runtime.links import requested_rates
 from companion.units import SECOND_NS
 
 ROOT = Path(__file__).parents[1]

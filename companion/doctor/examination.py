@@ -46,7 +46,7 @@ from companion.link.session import (
 from companion.link.signing import Signing
 from companion.output.source_switch import selected
 from companion.printable import printable
-from companion.runtime.core import requested_rates
+from companion.runtime.links import requested_rates
 from companion.units import SECOND_NS
 
 REQUEST_INTERVAL = 1 * SECOND_NS

@@ -33,11 +33,12 @@ from companion.config.options import configuration_options
 from companion.printable import printable
 from companion.records import Event, Severity
 from companion.runtime.console import Console, terminal_columns
-from companion.runtime.core import CompanionCore, Link
+from companion.runtime.core import CompanionCore
 from companion.runtime.daemon_thread import run_in_daemon_thread
 from companion.runtime.exposure import exposure
 from companion.runtime.kept_parameters import KeptParameters
 from companion.runtime.link_addresses import check_links
+from companion.runtime.links import Link
 from companion.runtime.signing_key import SigningKey
 from companion.runtime.state_file import StateFile
 from companion.runtime.status import Status

@@ -50,7 +50,7 @@ from companion.records import (
     Truth,
     Wind,
 )
-from companion.runtime.core import requested_rates
+from companion.runtime.links import requested_rates
 from companion.units import Floats
 from sitl.flight import FlightPlan, Leg, Trajectory, WindChange, fly_plan
 

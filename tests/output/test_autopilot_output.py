@@ -37,7 +37,8 @@ from companion.records import (
     Trust,
     Truth,
 )
-from companion.runtime.core import CompanionCore, requested_rates
+from companion.runtime.core import CompanionCore
+from companion.runtime.links import requested_rates
 
 SECOND, MS = 1_000_000_000, 1_000_000
 START = 5000 * SECOND

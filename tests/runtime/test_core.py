@@ -31,6 +31,7 @@ from companion.records import (
 from companion.runtime import core
 from companion.runtime.core import CompanionCore
 from companion.runtime.input_monitor import STREAMS
+from companion.runtime.links import requested_rates
 
 CONFIG = Config(
     inertial=InertialConfig(independent=True),
@@ -735,7 +736,7 @@ def test_slow_input_of_the_output_is_named_and_no_key_that_does_not_exist() -> N
 def test_every_requested_stream_has_its_words() -> None:
     for via in ("odometry", "gps_input", "external_position"):
         config = load(pairs=("output.profile=ardupilot", f"output.via={via}"), environment={})
-        assert core.requested_rates(config).keys() <= STREAMS.keys()
+        assert requested_rates(config).keys() <= STREAMS.keys()
 
 
 def test_input_that_never_arrives_is_reported_if_it_is_used() -> None:
