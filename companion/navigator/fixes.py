@@ -91,7 +91,7 @@ def gnss(state: State, record: Gnss, settings: Settings) -> Step:
     if state.reported[GNSS] == EXCLUDED or not taken.accepted:
         out.append(_rejected(state, record, label, GNSS, taken))
         refused_ns = None if taken.by_any else state.refused_ns or record.t_ns
-        state, again = _begun_again(state._replace(refused_ns=refused_ns), record, settings)
+        state, again = _restarted(state._replace(refused_ns=refused_ns), record, settings)
         return nearer(state, settings), [*out, *again]
     since = math.inf if state.gnss_ns is None else (record.t_ns - state.gnss_ns) * 1e-9
     part = min(since, config.correlation_s) / config.correlation_s
@@ -238,28 +238,28 @@ def _begun(state: State, record: Gnss | RsbnFix, settings: Settings) -> State:
     if nominal.interval is not None:
         nominal = own_channel.restart(nominal, nominal.interval.by, nominal.point.v_n[:2])
     nominal = nominal._replace(since=nominal.point)
-    return state._replace(nominal=nominal, bank=settings.model.begin(0.0), begun_ns=record.t_ns)
+    return state._replace(nominal=nominal, bank=settings.model.begin(0.0), started_ns=record.t_ns)
 
 
-def _begun_again(state: State, record: Gnss, settings: Settings) -> Step:
+def _restarted(state: State, record: Gnss, settings: Settings) -> Step:
     """With the position as open as GNSS is far off, once no hypothesis has taken its fixes for too long.
 
     Of two runs of fixes that contradict each other the longer one is believed: a receiver's first fix may be
     kilometres off, and a spoofer that comes later must last longer than the flight before it. Not where a
     beacon bears the position out, nor beside an INS, which shows a jump of GNSS.
     """
-    begun_ns, since_ns = state.begun_ns, state.refused_ns
-    if begun_ns is None or since_ns is None or not settings.model.channel.wind or is_jammed(state):
+    started_ns, since_ns = state.started_ns, state.refused_ns
+    if started_ns is None or since_ns is None or not settings.model.channel.wind or is_jammed(state):
         return state, []
-    last_ns = max(t or begun_ns for t in (state.gnss_ns, state.rsbn_ns))
+    last_ns = max(t or started_ns for t in (state.gnss_ns, state.rsbn_ns))
     refused_ns = record.t_ns - since_ns
-    if refused_ns < max(REFUSED_NS, last_ns - begun_ns) or sources(state, record.t_ns, settings) & FIXES:
+    if refused_ns < max(REFUSED_NS, last_ns - started_ns) or sources(state, record.t_ns, settings) & FIXES:
         return state, []
     assert state.nominal is not None
     centre = estimate(state, settings).x[:2].tolist()
     apart = math.dist(measurements.gnss_apart(record, state.nominal.point), (-centre[0], -centre[1]))
     why = f"no hypothesis explains GNSS, {apart:.0f} m off for {refused_ns * 1e-9:.0f} s: position restarted"
-    state = widened(state, apart)._replace(begun_ns=record.t_ns, refused_ns=None)
+    state = widened(state, apart)._replace(started_ns=record.t_ns, refused_ns=None)
     return state, [Reset(record.t_ns, record.rx_ns, "position", why)]
 
 

@@ -96,7 +96,7 @@ class State(NamedTuple):
     pending: Pending | None = None
     velocity_error: VelocityError | None = None
     gnss_first_ns: int | None = None  # of the first 3D fix
-    begun_ns: int | None = None  # when the position was begun
+    started_ns: int | None = None  # when the position was started
     refused_ns: int | None = None  # since when no hypothesis takes a fix of GNSS
     gnss_ns: int | None = None  # when fixes were last believed
     rsbn_ns: int | None = None
