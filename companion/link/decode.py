@@ -89,6 +89,7 @@ _IN_THE_AIR = frozenset(
         mavlink.MAV_LANDED_STATE_LANDING,
     }
 )
+_RECKONED_FROM_0_DEG7 = 10**7  # DCM that never had a fix reckons from 0, 0; there is no land within 1 deg of it
 _UNIX_AFTER_US = 10**15  # 2001; fewer microseconds are not a date
 
 _INERTIAL_UPDATED = (
@@ -240,6 +241,8 @@ def _home_position(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
 @_of("GLOBAL_POSITION_INT")
 def _global_position(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
     lat, lon = known_position(m)
+    if max(abs(m.lat), abs(m.lon)) < _RECKONED_FROM_0_DEG7:
+        raise InvalidField("no position yet (ArduPilot's DCM reckons from latitude and longitude 0)")
     v_n = vector(m, "vx vy vz", 0.01)
     heading = None if m.hdg == _COURSE_UNKNOWN else wrap_heading(math.radians(m.hdg * 0.01))
     t_ns = _booted(m, rx, sender)

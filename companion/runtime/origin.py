@@ -6,6 +6,9 @@ estimator: their difference is the origin, to 0.2 m r.m.s. (`navigator.local_ori
 only if the last `PAIRS` pairs agree with it. Where they contradict the origin in use, it has changed: the
 stated one replaces it if it agrees, else the origin of the pairs. Each replacement by more than `TOLERANCE_M`
 is a reset (`resets`), which ODOMETRY reports in its reset_counter.
+
+An EKF in constant position mode has no position, and no pairs come before it is given one: started without
+GNSS it would wait for our positions, and we for its. While it states that mode, its origin is used as stated.
 """
 
 from __future__ import annotations
@@ -13,9 +16,18 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+from companion.link.dialect import mavlink
 from companion.nav.geometry import Geodetic, Projection, separation_tuple
 from companion.navigator.local_origin import LIVE_WINDOW_NS, infer_origin
-from companion.records import Event, GlobalPosition, LocalOrigin, LocalPosition, Severity, Stamped
+from companion.records import (
+    Event,
+    FilterStatus,
+    GlobalPosition,
+    LocalOrigin,
+    LocalPosition,
+    Severity,
+    Stamped,
+)
 from companion.units import SECOND_NS
 
 TOLERANCE_M = 5.0
@@ -50,6 +62,7 @@ class OriginCheck:
         self._projection: Projection = "tangent"
         self._local: LocalPosition | None = None
         self._known: GlobalPosition | None = None
+        self._is_without_position = False  # by the autopilot's own statement
         self._pairs: list[Pair] = []
         self._refused: tuple[float, float] | None = None  # a stated origin reported as false
 
@@ -63,11 +76,15 @@ class OriginCheck:
         if isinstance(record, LocalOrigin):
             self._stated = record
             self._projection = record.projection  # type: ignore[assignment]
-            return self._judge(record.rx_ns) if self._has_pairs else self._replaced(record, record.rx_ns)
+            is_judged = self._has_pairs and (self.origin is not None or not self._is_without_position)
+            return self._judge(record.rx_ns) if is_judged else self._replaced(record, record.rx_ns)
         if isinstance(record, LocalPosition):
             self._local = record
         elif isinstance(record, GlobalPosition):
             self._known = record
+        elif isinstance(record, FilterStatus):
+            self._is_without_position = bool(record.flags & mavlink.EKF_CONST_POS_MODE)
+            return []
         else:
             return []
         return self._paired(record.rx_ns)
@@ -75,6 +92,8 @@ class OriginCheck:
     def _paired(self, now_ns: int) -> list[Event]:
         """Use the last two positions as a pair if they are of the same instant."""
         if self._stated is None or self._local is None or self._known is None or not self._has_pairs:
+            return []
+        if self._is_without_position:
             return []
         if self._pairs and 0 <= now_ns - self._pairs[-1].t_ns < PAIR_NS:
             return []

@@ -114,6 +114,7 @@ REJECTED: list[tuple[str, dict[str, Any], str]] = [
     ("GPS_GLOBAL_ORIGIN", {"latitude": 0x7FFFFFFF, "longitude": 1}, "latitude 214"),
     ("HOME_POSITION", {}, "no position yet"),
     ("GLOBAL_POSITION_INT", {"alt": 90}, "no position yet"),
+    ("GLOBAL_POSITION_INT", {"lat": -1460, "lon": -7465}, "reckons from latitude and longitude 0"),
     ("LOCAL_POSITION_NED", {"y": NAN}, "y is nan"),
     ("LOCAL_POSITION_NED", {"vz": -INF}, "vz is -inf"),
     ("ATTITUDE", {"yaw": INF}, "yaw is inf"),

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from companion.nav.geometry import Geodetic, displace, geodetic_to_local
-from companion.records import GlobalPosition, LocalOrigin, LocalPosition
+from companion.records import FilterStatus, GlobalPosition, LocalOrigin, LocalPosition
 from companion.runtime.origin import TOLERANCE_M, OriginCheck
 from companion.units import SECOND_NS
 
@@ -124,6 +124,26 @@ def test_reboot_forgets_the_origin_and_keeps_the_count(autopilot: Autopilot) -> 
     autopilot.check.forget()
     assert autopilot.check.origin is None
     assert autopilot.check.resets == 1
+
+
+def test_an_autopilot_without_a_position_has_its_stated_origin_until_pairs_come(autopilot: Autopilot) -> None:
+    """Flown on ArduPlane without GNSS from the start: it has no position before it is given one."""
+    constant_position, absolute = 167, 831  # EKF_STATUS_REPORT.flags
+    autopilot.take(FilterStatus(autopilot.now, autopilot.now, constant_position, False, 0.0))
+    autopilot.state(TRUE)
+    assert autopilot.off() == 0.0
+    autopilot.state(moved(5000.0))  # not while another one is in use
+    autopilot.state(TRUE)
+    autopilot.origin = moved(5000.0)  # its positions are DCM's
+    autopilot.fly(3.0)
+    autopilot.origin = TRUE
+    assert autopilot.off() == 0.0
+    autopilot.take(FilterStatus(autopilot.now, autopilot.now, absolute, False, 0.0))
+    autopilot.fly(3.0)
+    assert autopilot.off() == 0.0 and autopilot.check.resets == 0
+    autopilot.origin = moved(0.0, 500.0)
+    autopilot.fly(3.0)
+    assert autopilot.off() < TOLERANCE_M and autopilot.check.resets == 1
 
 
 def test_ins_of_its_own_uses_the_stated_origin(autopilot: Autopilot) -> None:
