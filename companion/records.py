@@ -159,10 +159,16 @@ class AirspeedSensor(Stamped, frozen=True, gc=False, tag=True):
 
 
 class Vehicle(Stamped, frozen=True, gc=False, tag=True):
-    """Whether rotors alone hold the vehicle up, and whether it is in the air; None: not stated."""
+    """The kind of vehicle and whether it is in the air; None: not stated.
+
+    `multirotor`: rotors alone hold it up; `fixed_wing`: it has a wing; `hovering`: a VTOL that is not in the
+    flight of an aeroplane.
+    """
 
     multirotor: bool | None = None
     flying: bool | None = None
+    fixed_wing: bool | None = None
+    hovering: bool | None = None
 
 
 class GnssIntegrity(Stamped, frozen=True, gc=False, tag=True):

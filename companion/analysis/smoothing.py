@@ -48,10 +48,12 @@ from companion.navigator import (
 from companion.navigator.channel import Nominal, Transition
 from companion.navigator.hypotheses import BIASES, MOST_BEACONS, VELOCITY, Hypotheses, Model
 from companion.navigator.inertial_track import Point
+from companion.navigator.own_channel import OwnChannel
 from companion.navigator.state import Beacon, Settings, State, hypotheses, levelled, source_name
 from companion.navigator.step import step
 from companion.records import (
     AirData,
+    Attitude,
     Gnss,
     Imu,
     Input,
@@ -440,7 +442,10 @@ class _Path:
             A, B = A[:n, :n], B[int(state.bank.grade[0]), :n, :n]
             Phi, Q, point = A @ Phi, A @ Q @ A.T + B, reached
         predicted, measured = Phi @ before.bank.x[0, :n], True
-        if isinstance(record, RsbnFix | Imu) and (forget := self._renewed(before, n)) is not None:
+        if (
+            isinstance(record, RsbnFix | Imu | Attitude | AirData)
+            and (forget := self._renewed(before, n)) is not None
+        ):
             keep, variance = forget
             predicted, Phi, Q = keep * predicted, keep[:, None] * Phi, Q * np.outer(keep, keep)
             Q = Q + np.diag(variance)
@@ -459,7 +464,7 @@ class _Path:
 
     def _measures(self, before: State, record: Input) -> bool:
         """Whether a record besides the fixes may have been a measurement."""
-        if isinstance(record, Imu):  # of a multirotor's drag
+        if isinstance(record, Imu | Attitude):  # of a multirotor's drag, of a steady airspeed
             return self._state.sensors.measured_ns != before.sensors.measured_ns
         own_position = isinstance(record, LocalPosition) and not self._settings.config.has_own_ins
         return own_position or isinstance(record, MEASURING)
@@ -474,8 +479,11 @@ class _Path:
             if (a.identity, a.place) != (b.identity, b.place):
                 at = slice(known.bias(k), known.bias(k + 1))
                 keep[at], variance[at] = 0.0, np.square(known.biases[BIASES * k : BIASES * (k + 1)])
-        if _uses_drag(self._state) and not _uses_drag(before):
-            keep[own_error_model.SCALE], variance[own_error_model.SCALE] = 0.0, own_error_model.DRAG_SCALE**2
+        airspeed = _airspeed(self._state)
+        if airspeed is not None and _airspeed(before) not in (None, airspeed):
+            assert isinstance(self._settings.model.channel, OwnChannel)
+            sigma = own_error_model.scale_sigma(self._settings.model.channel.settings, airspeed)
+            keep[own_error_model.SCALE], variance[own_error_model.SCALE] = 0.0, sigma**2
         return None if keep.all() else (keep, variance)
 
     def _append(self, point: Point, x: Floats, P: Floats, predicted: Floats, fixed: bool = False) -> None:
@@ -493,9 +501,9 @@ class _Path:
         self._Phi, self._Q = np.eye(n), np.zeros((n, n))
 
 
-def _uses_drag(state: State) -> bool:
+def _airspeed(state: State) -> own_error_model.Airspeed | None:
     interval = state.nominal.interval if state.nominal else None
-    return interval is not None and interval.drag
+    return interval.airspeed if isinstance(interval, own_error_model.Interval) else None
 
 
 def _moved(before: Point, after: Point) -> Floats:

@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 from companion.config import Config
 from companion.config.profiles import PROFILES, FailsafeLimit, RequiredParameter
+from companion.link.decode import FIXED_WINGS, MULTIROTORS
 from companion.link.parameter_client import Value, equal_real32
 from companion.runtime.input_monitor import stream_states
 
@@ -86,14 +87,15 @@ def check_profile(config: Config, make: str) -> list[Finding]:
     return [Finding("output profile", config.output.profile, make, False, advice)]
 
 
-def check_airspeed(config: Config, healthy: bool | None, multirotor: bool = False) -> list[Finding]:
+def check_airspeed(config: Config, healthy: bool | None, vehicle_type: int = 0) -> list[Finding]:
     """Report whether airspeed is measured; `healthy` None where the autopilot did not report it.
 
-    A multirotor's drag is its airspeed.
+    A multirotor's drag is its airspeed; that of a fixed wing without a sensor is taken for steady.
     """
     if config.has_own_ins or not config.uses("air_data"):
         return []
-    if multirotor and not healthy and config.air_data.rotor_drag_per_s and config.uses("imu"):
+    by_drag = vehicle_type in MULTIROTORS and config.air_data.rotor_drag_per_s and config.uses("imu")
+    if by_drag and not healthy:
         return [Finding("airspeed sensor", "none: by the drag of the rotors, in the air", "", None)]
     others = [sensor for sensor in ("IMU",) if config.uses("imu")]
     if config.uses("local_position") and not config.output.feeds_estimator:
@@ -102,6 +104,8 @@ def check_airspeed(config: Config, healthy: bool | None, multirotor: bool = Fals
         text = "not reported: not used"
     elif healthy:
         text = "healthy"
+    elif vehicle_type in FIXED_WINGS:
+        text = "none: taken for steady in the air"
     else:
         text = f"none: reckoning by {' and '.join(others) or 'the last velocity'} only"
     advice = "" if healthy else "without GNSS the wind cannot be separated from the error: add a sensor"

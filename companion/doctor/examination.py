@@ -245,7 +245,7 @@ class Examination:
         return [
             *check_profile(self._config, self.make),
             *check_streams(self._config, self.make, self.session.stream_rates.rates(), self._is_answering),
-            *check_airspeed(self._config, self._airspeed, self._heartbeat.type in MULTIROTORS),
+            *check_airspeed(self._config, self._airspeed, self._heartbeat.type),
             *check_failsafe(self._limits, {name: answer.value for name, answer in self._answers.items()}),
             *check_script(self._config, self.make, self._has_script),
             *check_arming(self.make, self._arming_checks, self._is_answering),

@@ -24,7 +24,7 @@ from companion.importers.foreign_file import (
     steady_steps,
 )
 from companion.importers.ulog_messages import Dropout, LoggedText, Row
-from companion.link.decode import MULTIROTORS
+from companion.link.decode import FIXED_WINGS, MULTIROTORS
 from companion.link.dialect import mavlink
 from companion.link.fields import euler
 from companion.records import (
@@ -211,7 +211,8 @@ def _status(row: Row, t: int) -> Iterator[Stamped]:
 
 
 def _vehicle(row: Row, t: int) -> Iterator[Stamped]:
-    yield Vehicle(t, t, row["system_type"] in MULTIROTORS)
+    kind = row["system_type"]
+    yield Vehicle(t, t, kind in MULTIROTORS, fixed_wing=kind in FIXED_WINGS)
 
 
 def _landed(row: Row, t: int) -> Iterator[Stamped]:

@@ -81,6 +81,8 @@ MULTIROTORS = frozenset(
         mavlink.MAV_TYPE_GENERIC_MULTIROTOR,
     }
 )
+FIXED_WINGS = frozenset({mavlink.MAV_TYPE_FIXED_WING, *range(19, 25)})
+"""19 to 24 are the VTOLs with a wing; releases of pymavlink name them differently."""
 _FLYING = {mavlink.MAV_STATE_BOOT: False, mavlink.MAV_STATE_STANDBY: False, mavlink.MAV_STATE_ACTIVE: True}
 _IN_THE_AIR = frozenset(
     {
@@ -89,7 +91,9 @@ _IN_THE_AIR = frozenset(
         mavlink.MAV_LANDED_STATE_LANDING,
     }
 )
-_RECKONED_FROM_0_DEG7 = 10**7  # DCM that never had a fix reckons from 0, 0; there is no land within 1 deg of it
+_RECKONED_FROM_0_DEG7 = (
+    10**7
+)  # DCM that never had a fix reckons from 0, 0; there is no land within 1 deg of it
 _UNIX_AFTER_US = 10**15  # 2001; fewer microseconds are not a date
 
 _INERTIAL_UPDATED = (
@@ -388,14 +392,16 @@ def _heartbeat(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
     """Decode the kind of vehicle. ArduCopter is active in the air only, others once they are armed."""
     multirotor = m.type in MULTIROTORS
     stated = _FLYING.get(m.system_status) if multirotor and sender.autopilot == "ardupilot" else None
-    return (Vehicle(_unstamped(rx, sender), rx, multirotor, stated),)
+    return (Vehicle(_unstamped(rx, sender), rx, multirotor, stated, m.type in FIXED_WINGS),)
 
 
 @_of("EXTENDED_SYS_STATE")
 def _extended_sys_state(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
     if m.landed_state == mavlink.MAV_LANDED_STATE_UNDEFINED:
         return ()
-    return (Vehicle(_unstamped(rx, sender), rx, flying=m.landed_state in _IN_THE_AIR),)
+    hovering = None if not m.vtol_state else m.vtol_state != mavlink.MAV_VTOL_STATE_FW
+    flying = m.landed_state in _IN_THE_AIR
+    return (Vehicle(_unstamped(rx, sender), rx, flying=flying, hovering=hovering),)
 
 
 @_of("GNSS_INTEGRITY")

@@ -162,6 +162,16 @@ def airspeed(
     return taken._replace(bank=taken.bank._replace(seen=seen))
 
 
+def steady_airspeed(
+    bank: Bank, known: Hypotheses, channel: OwnChannel, V: Vector2, velocity: Vector2, manoeuvre: float
+) -> Taken:
+    """Take the airspeed of a fixed wing without a sensor for steady; arguments as in `airspeed`.
+
+    It is no source that may be false: what it wanders by is a state, and so is its scale.
+    """
+    return _velocity(bank, known, channel.propagator.airspeed_row(velocity, V, manoeuvre))
+
+
 def rotor_drag(
     bank: Bank,
     known: Hypotheses,
@@ -190,9 +200,12 @@ def rotor_drag(
 
 def foreign_velocity(bank: Bank, known: Hypotheses, channel: OwnChannel, apart: Vector2) -> Taken:
     """Take the velocity of the autopilot's own estimator; `apart` is nominal minus foreign (m/s)."""
-    row = own_error_model.foreign_row(channel.settings, apart)
+    return _velocity(bank, known, own_error_model.foreign_row(channel.settings, apart))
+
+
+def _velocity(bank: Bank, known: Hypotheses, row: own_error_model.Row) -> Taken:
     H = np.zeros((2, known.layout.n_base))
-    H[:, : channel.n] = row.H
+    H[:, : row.H.shape[1]] = row.H
     return _take(bank, known, row.y, H, row.R, None, "velocity")
 
 

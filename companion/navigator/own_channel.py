@@ -1,7 +1,7 @@
 """Own channel: dead reckoning by whatever the autopilot's sensors allow, best first.
 
     imu      specific force turned by the autopilot's attitude, from 3.5 Hz up
-    air      airspeed along the nose, where there is a sensor and the aircraft flies
+    air      airspeed along the nose, where the aircraft flies; without a sensor, a steady one
     foreign  velocity of the autopilot's estimator, where it is not fed by us
     hold     the last velocity
 
@@ -23,14 +23,16 @@ from companion.navigator.inertial_track import Point
 from companion.navigator.own_error_model import By, Propagator
 from companion.navigator.strapdown_channel import Strap
 from companion.records import AirData, Gnss, LocalPosition, RsbnFix, Vector2, Vector3
-from companion.units import G0, Floats
+from companion.units import G0, SECOND_NS, Floats
 
 #: A driver that is silent for longer hands over to the next.
 SILENT_NS: dict[By, int] = {"imu": 600_000_000, "air": 1_500_000_000, "foreign": 2_500_000_000, "hold": 0}
 ORDER: tuple[By, ...] = ("imu", "air", "foreign", "hold")
 FRESH_NS = 1_000_000_000  # an attitude older than this turns no airspeed into a velocity
+FLYING_M_S = 8.0  # no steady airspeed is lower
 HOLD_M_S_SQRT_S = 4.0  # a turn of 30 degrees of bank changes the velocity by 5.7 m/s in a second
 SENSOR_NS = 10_000_000_000  # the word of the autopilot that its airspeed sensor is healthy lasts so long
+STEADY_AFTER_NS = 20 * SECOND_NS  # in flight, until the airspeed is steady
 LASTING = 0.5  # share of the velocity error of GNSS that lasts for minutes
 WEIGHTS = (1.0, 0.5, 0.25)  # of `own_error_model.GRADES`
 
@@ -61,7 +63,10 @@ class Sensors(NamedTuple):
     sums: AirspeedSums | None = None  # since airspeed was last a measurement
     measured_ns: int = -SENSOR_NS
     multirotor: bool = False
-    aloft_ns: int | None = None  # since when a multirotor flies, by the autopilot
+    fixed_wing: bool = False
+    hovering: bool = False
+    aloft_ns: int | None = None  # since when it flies without hovering, by the autopilot
+    steady_m_s: float | None = None  # airspeed of a fixed wing without a sensor; its scale is estimated
 
     def last_ns(self, by: By) -> int:
         """When a driver last gave a sample."""
@@ -143,6 +148,14 @@ def drag_is_sensed(s: Sensors, t_ns: int) -> bool:
     return s.multirotor and not _has_airspeed_sensor(s, t_ns) and not (air is not None and air.sensed)
 
 
+def is_steady(s: Sensors, t_ns: int) -> bool:
+    """Whether the airspeed is taken for steady: of a fixed wing whose sensor, if any, is silent."""
+    aloft = s.aloft_ns is not None and t_ns - s.aloft_ns >= STEADY_AFTER_NS
+    air = s.air.air
+    sensed = air is not None and air.sensed is True and t_ns - air.t_ns <= SENSOR_NS
+    return aloft and s.fixed_wing and not sensed and not _has_airspeed_sensor(s, t_ns)
+
+
 def air_velocity(s: Sensors, record: AirData, alt: float) -> Vector2 | None:
     """Velocity through the air, north and east (m/s); None without a fresh attitude."""
     attitude = s.air.attitude
@@ -171,7 +184,7 @@ def restart(nominal: Nominal, by: By, velocity: Vector2) -> Nominal:
     interval = own_error_model.begin(by, velocity)
     if nominal.interval is not None:
         shear = nominal.interval.shear if nominal.pending_s <= 0.0 else 0.0
-        interval = interval._replace(shear=shear, drag=nominal.interval.drag)
+        interval = interval._replace(shear=shear, airspeed=nominal.interval.airspeed)
     return Nominal(point, nominal.a_n, point, interval)
 
 

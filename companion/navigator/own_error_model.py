@@ -54,6 +54,8 @@ from companion.records import Vector2
 from companion.units import G0, Floats
 
 By = Literal["imu", "air", "foreign", "hold"]
+Airspeed = Literal["pitot", "drag", "steady"]
+"""What the velocity through the air is taken from; `scale` is what is wrong with it."""
 
 POSITION, VELOCITY, WIND = slice(0, 2), slice(2, 4), slice(4, 6)
 SCALE, HEADING, CRAB = 6, 7, 8
@@ -65,7 +67,11 @@ N = 22
 AIRSPEED_NOISE_M_S = 1.0  # of half a second's mean: pitot, angle of attack, sideslip
 AIRSPEED_MANOEUVRE_S = 0.2  # and per acceleration; 0.14 to 0.17 in an aerobatic flight (TestLog2)
 LASTING = 2.0  # turbulence by airspeed alone: how many times longer than the gusts it lasts
-DRAG_SCALE, DRAG_SCALE_S = 0.25, 1800.0  # of a multirotor's drag; it changes with speed too
+DRAG_SCALE = 0.25  # of a multirotor's drag; it changes with speed too
+STEADY_SCALE = 0.4  # of an airspeed without a sensor, at first: speed over ground in an unknown wind
+SCALE_CHANGE, SCALE_CHANGE_S = 0.25, 1800.0  # what either may change, and in what time
+#: About it an airspeed without a sensor wanders by so much for so long (UMN: 2.4 m/s within 10 s).
+STEADY_M_S, STEADY_S = 3.5, 8.0
 ALONG = 1.2  # and how much greater it is along the nose than across
 
 
@@ -117,8 +123,8 @@ class Interval(NamedTuple):
     `velocity` (m/s) is the nominal one now; `moved` (m) how far the nominal went. c1, s1 are the integrals of
     cosine and sine of the heading, c2, s2 those of c1, s1; n1, e1 of the acceleration, n2, e2 of n1, e1. For
     `air`, n1 and e1 are the way through the air (m) and `V` is the air velocity at the end. `noise` is the
-    variance of the velocity by the noise of the samples, (m/s)^2, `shear` that of the wind by height. With
-    `drag` the scale is that of a multirotor's drag.
+    variance of the velocity by the noise of the samples, (m/s)^2, `shear` that of the wind by height.
+    `airspeed` is what the velocity through the air is taken from.
     """
 
     by: By
@@ -136,7 +142,7 @@ class Interval(NamedTuple):
     V: Vector2 = (0.0, 0.0)
     noise: float = 0.0
     shear: float = 0.0
-    drag: bool = False
+    airspeed: Airspeed = "pitot"
 
 
 class Row(NamedTuple):
@@ -190,7 +196,7 @@ def add_imu(i: Interval, dt: float, a_n: Vector2, heading: float, noise: float) 
         i.V,
         i.noise + noise,
         i.shear,
-        i.drag,
+        i.airspeed,
     )
 
 
@@ -274,9 +280,13 @@ class Propagator:
         Q = np.zeros((len(GRADES), N, N))
         Q[:, self._diagonal, self._diagonal] = self._density * self._grown(T, decay)
         Q[:, WIND, WIND] += i.shear * np.eye(2)
-        if i.drag:
-            Phi[SCALE, SCALE] = math.exp(-T / DRAG_SCALE_S)
-            Q[:, SCALE, SCALE] = 2.0 * DRAG_SCALE**2 / DRAG_SCALE_S * T
+        if i.airspeed != "pitot":
+            Phi[SCALE, SCALE] = math.exp(-T / SCALE_CHANGE_S)
+            Q[:, SCALE, SCALE] = 2.0 * SCALE_CHANGE**2 / SCALE_CHANGE_S * T
+        if i.airspeed == "steady":
+            stays = math.exp(-T / STEADY_S)
+            Phi[GUST, GUST] = stays * np.eye(2)
+            Q[:, GUST, GUST] = STEADY_M_S**2 * (1.0 - stays * stays) * np.eye(2)
         if i.by == "imu":
             self._inertial(i, T, Phi, Q)
         elif i.by == "air":
@@ -315,7 +325,8 @@ class Propagator:
         Phi[0:4, SCALE] = i.n1, i.e1, n, e
         Phi[0:4, HEADING] = Phi[0:4, CRAB] = -i.e1, i.n1, -e, n
         lasting = s.turbulence_s
-        gust = nose_covariance(i.V, s.gust_m_s, s.gust_m_s / ALONG)
+        along = s.gust_m_s if i.airspeed == "pitot" else STEADY_M_S * math.sqrt(STEADY_S / lasting)
+        gust = nose_covariance(i.V, along, s.gust_m_s / ALONG)
         both = gust * (-lasting * math.expm1(-T / lasting))  # integral of the gust times the gust at the end
         crab = self._density[:, CRAB] * T
         # wind and crab that come up within the interval: the velocity follows
@@ -383,6 +394,11 @@ def nose_covariance(V: Vector2, along: float, across: float) -> Floats:
 # ---------------------------------------------------------------------------------------------------------
 # Measurements
 # ---------------------------------------------------------------------------------------------------------
+
+
+def scale_sigma(settings: Amplitudes, airspeed: Airspeed) -> float:
+    """Standard deviation of the scale when the velocity through the air is first taken from something."""
+    return {"pitot": settings.scale, "drag": DRAG_SCALE, "steady": STEADY_SCALE}[airspeed]
 
 
 def airspeed_variance(manoeuvre: float) -> float:

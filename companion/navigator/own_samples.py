@@ -19,7 +19,7 @@ from companion.navigator import (
 from companion.navigator.channel import Nominal
 from companion.navigator.ground import Ground, ground_phase, is_clear, lifted, wind_shear
 from companion.navigator.own_channel import AirspeedSums, OwnChannel, Sensors
-from companion.navigator.own_error_model import By
+from companion.navigator.own_error_model import Airspeed, By
 from companion.navigator.progress import (
     carried,
     decided,
@@ -62,17 +62,47 @@ def vehicle(state: State, record: Vehicle, settings: Settings) -> Step:
     """Remember whether it is a multirotor, and whether it flies."""
     s = state.sensors
     multirotor = s.multirotor if record.multirotor is None else record.multirotor
+    fixed_wing = s.fixed_wing if record.fixed_wing is None else record.fixed_wing
+    hovering = s.hovering if record.hovering is None else record.hovering
     aloft_ns = s.aloft_ns
     if record.flying is not None:
-        aloft_ns = (aloft_ns or record.t_ns) if record.flying else None
-    return state._replace(sensors=s._replace(multirotor=multirotor, aloft_ns=aloft_ns)), []
+        aloft_ns = (aloft_ns or record.t_ns) if record.flying and not hovering else None
+    s = s._replace(multirotor=multirotor, fixed_wing=fixed_wing, hovering=hovering, aloft_ns=aloft_ns)
+    return state._replace(sensors=s), []
 
 
 def attitude(state: State, record: Attitude, settings: Settings) -> Step:
     """Remember an attitude."""
     s = state.sensors
     s = s._replace(strap=strapdown_channel.sense(s.strap, record), air=air_data_channel.sense(s.air, record))
-    return _straight_on(state._replace(sensors=s), record, settings)
+    state = state._replace(sensors=s)
+    if state.nominal is not None and own_channel.is_steady(s, record.t_ns):
+        return _steady(state, record, settings)
+    return _straight_on(state, record, settings)
+
+
+def _steady(state: State, record: Attitude, settings: Settings) -> Step:
+    """Use a steady airspeed along the nose, as driver or as measurement: a fixed wing without a sensor."""
+    if not settings.config.uses("air_data"):
+        return _straight_on(state, record, settings)
+    state = _airspeed_from("steady", state, settings)
+    s = state.sensors
+    if s.steady_m_s is None:
+        s = s._replace(steady_m_s=max(_estimated_airspeed(state), own_channel.FLYING_M_S))
+    assert s.steady_m_s is not None
+    V = own_error_model.air_velocity(s.steady_m_s, record.pitch, record.heading)
+    if s.leads("air", record.t_ns):
+        return _driven(state._replace(sensors=s._replace(air_ns=record.t_ns)), record, "air", V, settings)
+    state = state._replace(sensors=s)
+    return (_measured(state, record, V, settings) if is_driven_by_imu(state) else state), []
+
+
+def _estimated_airspeed(state: State) -> float:
+    v_n, v_e = estimated_velocity(state)
+    if state.bank is None:
+        return math.hypot(v_n, v_e)
+    wind_n, wind_e = state.bank.x[int(state.bank.L.argmax()), own_error_model.WIND]
+    return math.hypot(v_n - wind_n, v_e - wind_e)
 
 
 def pressure(state: State, record: Pressure, settings: Settings) -> Step:
@@ -126,17 +156,25 @@ def _rotor_drag(state: State, record: Imu, settings: Settings) -> State:
     if taking_off and is_clear(s.ground, height) is False:
         return state  # the ground pushes too
     state = _sheared(state, lifted(s.ground, height))
-    assert state.nominal is not None
-    interval = state.nominal.interval
-    if state.bank is not None and interval is not None and not interval.drag:
-        state = state._replace(
-            bank=banks.renew(state.bank, [own_error_model.SCALE], [own_error_model.DRAG_SCALE]),
-            nominal=state.nominal._replace(interval=interval._replace(drag=True)),
-        )
+    state = _airspeed_from("drag", state, settings)
     force = strapdown_channel.drag_force(s.strap)
     if force is None:
         return state
     return _measured(state, record, (-force[0] / drag, -force[1] / drag), settings)
+
+
+def _airspeed_from(airspeed: Airspeed, state: State, settings: Settings) -> State:
+    """Take the velocity through the air from something, and begin its scale anew if it was another."""
+    nominal = state.nominal
+    if state.bank is None or nominal is None or nominal.interval is None:
+        return state
+    if nominal.interval.airspeed == airspeed:
+        return state
+    sigma = own_error_model.scale_sigma(_own(settings).settings, airspeed)
+    return state._replace(
+        bank=banks.renew(state.bank, [own_error_model.SCALE], [sigma]),
+        nominal=nominal._replace(interval=nominal.interval._replace(airspeed=airspeed)),
+    )
 
 
 def air_data(state: State, record: AirData, settings: Settings) -> Step:
@@ -164,6 +202,7 @@ def air_data(state: State, record: AirData, settings: Settings) -> Step:
     state = state._replace(sensors=s)
     if not ground.flying:
         return _straight_on(state, record, settings)
+    state = _airspeed_from("pitot", state, settings)
     if leads:
         state = state._replace(sensors=s._replace(steady=record))
         return _driven(state, record, "air", V, settings)
@@ -183,7 +222,7 @@ def _sheared(state: State, ground: Ground) -> State:
     return state
 
 
-def _measured(state: State, record: AirData | Imu, V: Vector2, settings: Settings) -> State:
+def _measured(state: State, record: AirData | Attitude | Imu, V: Vector2, settings: Settings) -> State:
     """Use a velocity `V` through the air (m/s) as a measurement, the mean of half a second at once."""
     assert state.nominal is not None
     s, v_n = state.sensors, state.nominal.point.v_n
@@ -203,6 +242,8 @@ def _measured(state: State, record: AirData | Imu, V: Vector2, settings: Setting
     manoeuvre = strapdown_channel.manoeuvre(s.mean_acceleration)
     if isinstance(record, AirData):
         taken = measurements.airspeed(state.bank, known, _own(settings), V, velocity, manoeuvre)
+    elif isinstance(record, Attitude):
+        taken = measurements.steady_airspeed(state.bank, known, _own(settings), V, velocity, manoeuvre)
     else:
         drag, heading = settings.config.air_data.rotor_drag_per_s, s.heading() or 0.0
         taken = measurements.rotor_drag(state.bank, known, V, velocity, manoeuvre, heading, drag)

@@ -83,6 +83,8 @@ FIELDS = {
     "lost": "count of frames missing by their sequence numbers",
     "mode": "basis of the position",
     "multirotor": "whether rotors of fixed pitch hold the vehicle up",
+    "fixed_wing": "whether it has a wing",
+    "hovering": "whether a VTOL is not in the flight of an aeroplane",
     "normalised": "normalised innovation squared, 2 degrees of freedom (no unit)",
     "offset_ns": "ns, the companion's clock minus the autopilot's",
     "optimum_n": "m: north, east; least bound that any estimate could have",

@@ -6,6 +6,7 @@
 GNSS is taken from the navigator, for as long as is asked; then the flight goes on with GNSS up to the next
 minute. The error is the distance from GNSS itself. Beside it stand two rules that need no filter: the
 airspeed along the heading plus the mean wind of the last minute, and straight on with the last velocity.
+Where no airspeed was measured the first rule takes the airspeed and the wind that fit the last two minutes.
 """
 
 from __future__ import annotations
@@ -38,6 +39,7 @@ LASTING_S = (10.0, 30.0, 60.0, 120.0)
 FLYING_M_S = 8.0
 LEARNING_S = 90.0  # in flight with GNSS, before the first outage
 WIND_S = 60.0
+FIT_S, FIT_WEIGHT = 120.0, 0.3  # of a flight without airspeed; and of "no wind" beside its fixes
 GAP_S = 3.0  # the recorded GNSS was lost itself: there is nothing to compare with
 STEP_S = 0.1  # of the rules
 
@@ -50,7 +52,7 @@ class Row(NamedTuple):
     rms_m: float | None
     worst_m: float | None
     within: float | None
-    by_wind_m: float | None  # None: no airspeed or no attitude
+    by_wind_m: float | None  # the first rule; None: no attitude
     straight_on_m: float
 
 
@@ -142,30 +144,49 @@ class Air:
     """The velocity through the air of a flight, north and east (m/s), by airspeed and attitude."""
 
     def __init__(self, records: Sequence[Stamped]) -> None:
-        air = sorted({r.t_ns: r.airspeed for r in records if isinstance(r, AirData)}.items())
         attitude = sorted({r.t_ns: (r.heading, r.pitch) for r in records if isinstance(r, Attitude)}.items())
-        self.known = len(air) > 1 and len(attitude) > 1
+        air = sorted({r.t_ns: r.airspeed for r in records if isinstance(r, AirData)}.items())
+        self.known, self.sensed = len(attitude) > 1, len(air) > 1
         if self.known:
-            self._t, self._speed = np.array(air).T
             self._t_attitude = np.array([t for t, _ in attitude])
             heading, self._pitch = np.array([each for _, each in attitude]).T
             self._heading = np.unwrap(heading)
+        if self.sensed:
+            self._t, self._speed = np.array(air).T
+
+    def nose(self, t_ns: Floats) -> Floats:
+        """Return unit vectors, levelled, (n, 2)."""
+        heading, pitch = (np.interp(t_ns, self._t_attitude, x) for x in (self._heading, self._pitch))
+        level: Floats = np.stack([np.cos(heading), np.sin(heading)], axis=1) * np.cos(pitch)[:, None]
+        return level
 
     def at(self, t_ns: Floats) -> Floats:
         """Return (n, 2)."""
-        heading, pitch = (np.interp(t_ns, self._t_attitude, x) for x in (self._heading, self._pitch))
-        level = np.interp(t_ns, self._t, self._speed) * np.cos(pitch)
-        return np.stack([level * np.cos(heading), level * np.sin(heading)], axis=1)
+        through: Floats = self.nose(t_ns) * np.interp(t_ns, self._t, self._speed)[:, None]
+        return through
 
 
-def by_wind(air: Air, fixes: Fixes, start: float, seconds: float) -> Floats:
-    """Displacement (north, east, m) by airspeed, heading and the mean wind of the last minute."""
-    last = (fixes.v_t_ns > start - WIND_S * SECOND_NS) & (fixes.v_t_ns <= start)
+def by_air(air: Air, fixes: Fixes, start: float, seconds: float) -> Floats:
+    """Displacement (north, east, m) by the first rule."""
+    last = (fixes.v_t_ns > start - (WIND_S if air.sensed else FIT_S) * SECOND_NS) & (fixes.v_t_ns <= start)
     over_ground = np.stack([fixes.v_n[last], fixes.v_e[last]], axis=1)
-    wind = (over_ground - air.at(fixes.v_t_ns[last])).mean(axis=0)
     t = start + np.arange(0.0, seconds, STEP_S) * SECOND_NS
-    moved: Floats = ((air.at(t) + wind) * STEP_S).sum(axis=0)
+    if air.sensed:
+        wind, through = (over_ground - air.at(fixes.v_t_ns[last])).mean(axis=0), air.at(t)
+    else:
+        airspeed, wind = _fitted(over_ground, air.nose(fixes.v_t_ns[last]))
+        through = airspeed * air.nose(t)
+    moved: Floats = ((through + wind) * STEP_S).sum(axis=0)
     return moved
+
+
+def _fitted(over_ground: Floats, nose: Floats) -> tuple[float, Floats]:
+    """Return the airspeed and the wind (2,) that fit velocities over ground best, by least squares (m/s)."""
+    axes = np.tile(np.eye(2), (len(nose), 1))
+    rows = np.column_stack([nose.ravel(), axes])
+    no_wind = FIT_WEIGHT * np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    found = np.linalg.lstsq(np.vstack([rows, no_wind]), np.append(over_ground.ravel(), (0.0, 0.0)))[0]
+    return float(found[0]), found[1:]
 
 
 def straight_on(fixes: Fixes, start: float, seconds: float) -> Floats:
@@ -188,7 +209,7 @@ def study(records: Sequence[Stamped], config: Config, every_s: float, lasting: S
             moved = separation(fixes.at(start + seconds * SECOND_NS), fixes.at(start))[:2]
             rules["straight"].append(math.dist(straight_on(fixes, start, seconds), moved))
             if air.known:
-                rules["wind"].append(math.dist(by_wind(air, fixes, start, seconds), moved))
+                rules["wind"].append(math.dist(by_air(air, fixes, start, seconds), moved))
         errors = np.array([found[seconds] for found in flown if seconds in found]).reshape(-1, 4)
         rows.append(_row(seconds, len(starts), errors, rules["wind"], rules["straight"]))
     return rows
@@ -235,7 +256,8 @@ def command(
 
     LOG is any log that `companion replay` reads. From every minute of the flight on GNSS is withheld for 10,
     30, 60 and 120 s (--lasting), and the solution is compared with GNSS. Beside it: airspeed and heading plus
-    the mean wind of the last minute, and straight on.
+    the mean wind of the last minute (without airspeed: the airspeed and wind that fit the last two minutes
+    best), and straight on.
     """
     config = load(file, {}, pairs=pairs, preset=preset)
     durations = tuple(sorted(set(lasting))) or LASTING_S
@@ -253,7 +275,7 @@ def command(
         click.echo(json.dumps([row._asdict() for row in rows]))
         return
     title = f"Error after an outage of GNSS, m r.m.s. of {rows[0].outages} outages"
-    heads = "s", "companion", "worst", "within 2 sigma", "wind of the last minute", "straight on"
+    heads = "s", "companion", "worst", "within 2 sigma", "by airspeed and wind", "straight on"
     table = number_table(title, *heads, texts=0, caption=note)
     for row in rows:
         table.add_row(

@@ -13,6 +13,7 @@ from companion.doctor.diagnosis import Diagnosis, Finding, check_airspeed
 from companion.doctor.examination import OBSERVE, OBSERVE_LONGER, Examination
 from companion.doctor.rendering import summary
 from companion.link import dialect, frame
+from companion.link.dialect import mavlink
 from companion.link.parameter_client import ATTEMPTS, SILENCE
 from companion.link.signing import Signing
 from sitl.autopilot import SimulatedAutopilot
@@ -390,6 +391,12 @@ def test_autopilot_without_version_is_identified_by_make() -> None:
     assert bench.now < (ATTEMPTS + OBSERVE_LONGER / SECOND + 2) * SECOND
 
 
+def test_the_airspeed_of_a_fixed_wing_without_a_sensor_is_steady() -> None:
+    config = load(None, {}, {}, ["output.profile=ardupilot"])
+    (airspeed,) = check_airspeed(config, False, mavlink.MAV_TYPE_FIXED_WING)
+    assert (airspeed.found, airspeed.is_well) == ("none: taken for steady in the air", None)
+
+
 @pytest.mark.parametrize(
     ("healthy", "pairs", "text"),
     [
@@ -401,5 +408,5 @@ def test_autopilot_without_version_is_identified_by_make() -> None:
 )
 def test_the_airspeed_of_a_multirotor_is_its_drag(healthy: bool | None, pairs: list[str], text: str) -> None:
     config = load(None, {}, {}, ["output.profile=ardupilot", *pairs])
-    (airspeed,) = check_airspeed(config, healthy, multirotor=True)
+    (airspeed,) = check_airspeed(config, healthy, mavlink.MAV_TYPE_QUADROTOR)
     assert (airspeed.found, airspeed.is_well) == (text, None)

@@ -311,32 +311,38 @@ def test_truth_uses_the_integer_position() -> None:
 
 
 @pytest.mark.parametrize(
-    ("autopilot", "kind", "status", "multirotor", "flying"),
+    ("autopilot", "kind", "status", "multirotor", "flying", "fixed_wing"),
     [
-        ("ardupilot", "QUADROTOR", "ACTIVE", True, True),
-        ("ardupilot", "HEXAROTOR", "STANDBY", True, False),
-        ("ardupilot", "QUADROTOR", "BOOT", True, False),
-        ("ardupilot", "OCTOROTOR", "CRITICAL", True, None),  # a failsafe, on the ground or not
-        ("px4", "QUADROTOR", "ACTIVE", True, None),  # armed, perhaps on the ground
-        ("ardupilot", "FIXED_WING", "ACTIVE", False, None),
-        ("ardupilot", "HELICOPTER", "ACTIVE", False, None),
-        ("px4", "VTOL_QUADROTOR", "ACTIVE", False, None),
+        ("ardupilot", "QUADROTOR", "ACTIVE", True, True, False),
+        ("ardupilot", "HEXAROTOR", "STANDBY", True, False, False),
+        ("ardupilot", "QUADROTOR", "BOOT", True, False, False),
+        ("ardupilot", "OCTOROTOR", "CRITICAL", True, None, False),  # a failsafe, on the ground or not
+        ("px4", "QUADROTOR", "ACTIVE", True, None, False),  # armed, perhaps on the ground
+        ("ardupilot", "FIXED_WING", "ACTIVE", False, None, True),
+        ("ardupilot", "HELICOPTER", "ACTIVE", False, None, False),
+        ("px4", "VTOL_QUADROTOR", "ACTIVE", False, None, True),
     ],
 )
 def test_heartbeat_states_the_kind_of_vehicle(
-    autopilot: Autopilot, kind: str, status: str, multirotor: bool, flying: bool | None
+    autopilot: Autopilot, kind: str, status: str, multirotor: bool, flying: bool | None, fixed_wing: bool
 ) -> None:
     fields = {
         "type": getattr(mavlink, f"MAV_TYPE_{kind}"),
         "system_status": getattr(mavlink, f"MAV_STATE_{status}"),
     }
-    assert one("HEARTBEAT", autopilot, **fields) == r.Vehicle(RX, RX, multirotor, flying)
+    assert one("HEARTBEAT", autopilot, **fields) == r.Vehicle(RX, RX, multirotor, flying, fixed_wing)
 
 
 @pytest.mark.parametrize(("landed", "flying"), [(1, False), (2, True), (3, True), (4, True)])
 def test_landed_state(landed: int, flying: bool) -> None:
     assert one("EXTENDED_SYS_STATE", landed_state=landed) == r.Vehicle(RX, RX, flying=flying)
     assert decoded("EXTENDED_SYS_STATE", landed_state=0) == ()
+
+
+@pytest.mark.parametrize(("vtol", "hovering"), [(0, None), (1, True), (2, True), (3, True), (4, False)])
+def test_vtol_state(vtol: int, hovering: bool | None) -> None:
+    """Only as an aeroplane (4) does it fly by its wing; 0: it is no VTOL."""
+    assert one("EXTENDED_SYS_STATE", landed_state=2, vtol_state=vtol).hovering is hovering
 
 
 def test_other_messages_give_no_record() -> None:

@@ -1,0 +1,144 @@
+"""A fixed wing without an airspeed sensor: its airspeed is taken for steady, on a recorded flight."""
+
+from __future__ import annotations
+
+import gzip
+import math
+from functools import lru_cache
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+from msgspec.structs import replace
+
+from companion.analysis.smoothing import smooth_flight
+from companion.config import load
+from companion.navigator import Navigator
+from companion.navigator.own_error_model import (
+    CRAB,
+    HEADING,
+    SCALE,
+    STEADY_M_S,
+    STEADY_S,
+    Amplitudes,
+    N,
+    Propagator,
+    add_velocity,
+    begin,
+)
+from companion.records import AirData, AirspeedSensor, Gnss, Input, Solution, Source, Vehicle
+from companion.study import outages
+
+NS = 1_000_000_000
+FLIGHT = Path(__file__).parents[1] / "data" / "umn_flight_cut.jsonl.gz"
+CONFIG = load(flags={"output.profile": "ardupilot"}, environment={})
+
+
+@lru_cache(maxsize=1)
+def recorded() -> tuple[Input, ...]:
+    """A real fixed wing by attitude, GNSS and airspeed, without an IMU."""
+    decoder: msgspec.json.Decoder[Input] = msgspec.json.Decoder(Input)
+    with gzip.open(FLIGHT) as lines:
+        return tuple(decoder.decode(line) for line in lines)
+
+
+def without_airspeed() -> list[Input]:
+    return [r for r in recorded() if not isinstance(r, AirData)]
+
+
+@pytest.mark.flight
+def test_a_real_fixed_wing_reckons_without_an_airspeed_sensor() -> None:
+    """It is no worse than the rule that fits airspeed and wind to the last two minutes, within its sigmas."""
+    rows = outages.study(without_airspeed(), CONFIG, 60.0, (10.0, 30.0, 60.0, 120.0))
+    for row in rows:
+        assert row.rms_m is not None and row.by_wind_m is not None and row.within is not None
+        assert row.rms_m < row.by_wind_m < 0.3 * row.straight_on_m
+        assert row.within >= 0.9
+
+
+@pytest.mark.flight
+def test_the_airspeed_that_is_found_is_the_measured_one() -> None:
+    """To 10 %, three minutes after take-off; the sensor's own readings are the judge."""
+    navigator = Navigator(CONFIG)
+    for record in without_airspeed():
+        navigator.handle(record)
+        if record.rx_ns > 240 * NS:
+            break
+    state = navigator._state
+    assert state.bank is not None and state.sensors.steady_m_s is not None
+    scale = float(state.bank.x[int(state.bank.L.argmax()), SCALE])
+    measured = [r.airspeed for r in recorded() if isinstance(r, AirData) and 60 < r.t_ns / NS < 240]
+    mean = sum(measured) / len(measured)
+    assert state.sensors.steady_m_s * (1.0 - scale) == pytest.approx(mean, rel=0.1)
+
+
+def uses_air(records: list[Input], until_s: float) -> float:
+    """When a solution is first by the airspeed; inf if none is."""
+    navigator = Navigator(CONFIG)
+    for record in sorted(records, key=lambda record: record.rx_ns):
+        if record.rx_ns > until_s * NS:
+            break
+        for out in navigator.handle(record):
+            if isinstance(out, Solution) and out.sources & Source.AIR_DATA:
+                return out.t_ns / NS
+    return math.inf
+
+
+def stated(**fields: bool) -> list[Input]:
+    """The flight whose vehicle is as stated, every second."""
+    vehicles = [Vehicle(t * NS, t * NS, **fields) for t in range(1, 120)]
+    return [*(r for r in without_airspeed() if not isinstance(r, Vehicle)), *vehicles]
+
+
+def test_it_is_used_of_a_fixed_wing_that_flies_without_a_sensor_only() -> None:
+    flying = stated(fixed_wing=True, flying=True)
+    assert 20.0 < uses_air(flying, 90.0) < 25.0
+    assert (
+        uses_air(flying + [AirspeedSensor(t * NS, t * NS, True) for t in range(1, 90, 5)], 90.0) == math.inf
+    )
+    assert uses_air(stated(fixed_wing=True, flying=False), 90.0) == math.inf
+    assert uses_air(stated(fixed_wing=True, flying=True, hovering=True), 90.0) == math.inf
+    assert uses_air(stated(fixed_wing=False, flying=True), 90.0) == math.inf
+
+
+def test_a_sensor_that_fails_is_replaced_and_one_that_comes_back_is_used_again() -> None:
+    """What is wrong with the scale is begun anew with each: 3 % of a pitot, 40 % of a steady airspeed."""
+    navigator = Navigator(CONFIG)
+    scales: dict[int, float] = {}
+    for record in recorded():
+        if isinstance(record, AirData):
+            if 120 < record.t_ns / NS < 200:
+                continue
+            record = replace(record, airspeed=record.airspeed + 1e-3 * math.sin(record.t_ns))
+        navigator.handle(record)
+        bank = navigator._state.bank
+        if bank is not None:
+            scales[record.rx_ns // NS] = float(bank.P[int(bank.L.argmax()), SCALE, SCALE]) ** 0.5
+        if record.rx_ns > 230 * NS:
+            break
+    assert scales[119] < 0.04 and scales[229] < 0.04
+    assert max(scales[t] for t in range(125, 140)) > 0.1
+    interval = navigator._state.nominal and navigator._state.nominal.interval
+    assert interval is not None and interval.airspeed == "pitot"
+
+
+@pytest.mark.flight
+def test_the_smoother_is_the_two_point_solution_with_a_steady_airspeed_too() -> None:
+    records = [r for r in without_airspeed() if not isinstance(r, Gnss) or not 150 < r.t_ns / NS < 200]
+    runs = smooth_flight((r for r in records if r.rx_ns < 260 * NS), CONFIG, check=True)
+    assert len(runs) == 1 and runs[0].apart_sigma < 1e-6
+
+
+def test_as_the_driver_it_is_off_by_what_it_wanders() -> None:
+    """Along the nose, after a minute: the integral of a Gauss-Markov velocity of STEADY_M_S and STEADY_S."""
+    settings = Amplitudes(wind_change_m_s_sqrt_s=1e-4)
+    V, T, step = (20.0, 0.0), 60.0, 1.0
+    covariance = np.zeros((N, N))
+    for _ in range(round(T / step)):
+        interval = add_velocity(begin("air", V)._replace(airspeed="steady"), step, V)
+        Phi, Q = Propagator(settings).transition(interval)
+        Phi[:, [SCALE, HEADING, CRAB]] = 0.0
+        covariance = Phi @ covariance @ Phi.T + Q[0]
+    exact = 2.0 * STEADY_M_S**2 * STEADY_S * (T - STEADY_S * (1.0 - math.exp(-T / STEADY_S)))
+    assert math.sqrt(covariance[0, 0]) == pytest.approx(math.sqrt(exact), rel=0.1)
