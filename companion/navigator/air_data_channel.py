@@ -13,7 +13,8 @@ from typing import NamedTuple
 
 from companion.nav.geometry import Geodetic
 from companion.navigator.fix_observations import place
-from companion.records import AirData, Attitude, Gnss, Pressure, RsbnFix
+from companion.navigator.height_error import greatest_change
+from companion.records import AirData, Attitude, Gnss, Pressure, Rejection, RsbnFix
 
 P0 = 101_325.0  # [Pa] of the standard atmosphere at sea level
 LAPSE, T0 = 0.0065, 288.15  # [K/m], [K]
@@ -22,14 +23,16 @@ P1, T1, SCALE_M = 22_632.06, 216.65, 6341.62  # there [Pa], [K]; above, the pres
 HEIGHT_EXPONENT = 0.190263  # R L / (g M): T / T0 = (p / P0)^0.19
 DENSITY_EXPONENT = 1.0 - HEIGHT_EXPONENT  # rho / rho0 = (p / P0) / (T / T0)
 CLIMB_S = 2.0  # time constant of the climb taken from the pressure altitude
+STEP_S = 10.0  # a pressure that stepped and stays is used again after so long
 
 
 class Reckoner(NamedTuple):
-    """What is needed to go on: last attitude, airspeed and pressure (Pa), None before one."""
+    """What is needed to go on: last attitude, airspeed and pressure (Pa) with its time, None before one."""
 
     attitude: Attitude | None = None
     air: AirData | None = None
     static: float | None = None
+    static_ns: int = 0
 
 
 def sense(r: Reckoner, record: Attitude | AirData | Pressure) -> Reckoner:
@@ -38,7 +41,25 @@ def sense(r: Reckoner, record: Attitude | AirData | Pressure) -> Reckoner:
         return r._replace(attitude=record)
     if isinstance(record, AirData):
         return r._replace(air=record)
-    return r._replace(static=record.static) if 1e3 < record.static < 2e5 else r
+    return r._replace(static=record.static, static_ns=record.t_ns) if _is_static(record) else r
+
+
+def step(r: Reckoner, record: Pressure) -> Rejection | None:
+    """Reject a pressure whose altitude no aircraft reaches since the last one used."""
+    if r.static is None or not _is_static(record):
+        return None
+    gap_s = (record.t_ns - r.static_ns) * 1e-9
+    change, limit = (
+        abs(pressure_altitude(record.static) - pressure_altitude(r.static)),
+        greatest_change(gap_s),
+    )
+    if change <= limit or gap_s > STEP_S:
+        return None
+    return Rejection(record.t_ns, record.rx_ns, "pressure", "its altitude steps: not used", change, limit)
+
+
+def _is_static(record: Pressure) -> bool:
+    return 1e3 < record.static < 2e5
 
 
 def first_place(fix: Gnss | RsbnFix, static: float | None) -> Geodetic | None:

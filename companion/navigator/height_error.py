@@ -18,6 +18,8 @@ SHARE = 0.08  # one sigma of the error of a climb, as its share
 SHARE_WALK = 1.3e-7  # 1/m: in 3 km of climb the share changes by 2 %
 LEAST_M = 5.0  # one sigma of a height of GNSS, at least
 PATIENCE_NS = 10_000_000_000  # what goes on contradicting for so long is believed
+#: Between two readings no height changes by more: noise, manoeuvres, and a climb or a dive.
+STEP_M, CLIMB_M_S = 20.0, 200.0
 
 
 class Level(NamedTuple):
@@ -31,6 +33,16 @@ class Level(NamedTuple):
     t_ns: int | None = None
     alt: float = 0.0
     refused_ns: int | None = None
+
+
+def greatest_change(dt: float) -> float:
+    """The greatest change (m) of an aircraft's height, as a sensor reads it, in `dt` seconds."""
+    return STEP_M + CLIMB_M_S * dt
+
+
+def stepped(level: Level, up: float) -> Level:
+    """The error after the channel's height stepped by `up` (m), which was no climb."""
+    return level._replace(error=level.error + up, alt=level.alt + up)
 
 
 def at(level: Level, ins: Point) -> Level:

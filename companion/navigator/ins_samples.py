@@ -9,6 +9,7 @@ from typing import Any
 from companion.navigator import (
     air_data_channel,
     corrector_measurements,
+    height_error,
     inertial_track,
     measurements,
     own_channel,
@@ -76,8 +77,11 @@ def position(state: State, record: LocalPosition, settings: Settings) -> Step:
 def _jump_removed(state: State, last: Point, new: Point, record: LocalPosition) -> Step:
     """Move the errors with a jump of the channel; across a silence what is left may be a turn or a step."""
     out = list[Output]()
-    north, east, _ = inertial_track.beyond(last, new)
+    north, east, down = inertial_track.beyond(last, new)
     length, silent = math.hypot(north, east), (new.t_ns - last.t_ns) * 1e-9
+    if abs(down) > height_error.greatest_change(silent):
+        state = state._replace(level=height_error.stepped(state.level, -down))
+        out.append(_channel(record, f"height stepped by {-down:.1f} m"))
     most = inertial_track.unnoticed(silent)
     if length > most:
         state = shifted(state, north, east)
@@ -91,6 +95,8 @@ def _jump_removed(state: State, last: Point, new: Point, record: LocalPosition) 
 def sensed(state: State, record: Attitude | Pressure, settings: Settings) -> Step:
     """Remember attitude and pressure for the airspeed beside an INS."""
     s = state.sensors
+    if isinstance(record, Pressure) and (rejection := air_data_channel.step(s.air, record)) is not None:
+        return state, [rejection]
     return state._replace(sensors=s._replace(air=air_data_channel.sense(s.air, record))), []
 
 

@@ -106,8 +106,11 @@ def _estimated_airspeed(state: State) -> float:
 
 
 def pressure(state: State, record: Pressure, settings: Settings) -> Step:
-    """Remember a static pressure."""
+    """Remember a static pressure, unless its altitude steps."""
     s = state.sensors
+    if (rejection := air_data_channel.step(s.air, record)) is not None:
+        state, out = _straight_on(state, record, settings)
+        return state, [rejection, *out]
     s = s._replace(air=air_data_channel.sense(s.air, record))
     return _straight_on(state._replace(sensors=s), record, settings)
 

@@ -1,4 +1,4 @@
-"""The height error against GNSS on days that are not standard, and fixes that lie."""
+"""The height error against GNSS on days that are not standard, and heights that are false."""
 
 from __future__ import annotations
 
@@ -7,11 +7,22 @@ import math
 import numpy as np
 import pytest
 
-from companion.nav.geometry import Geodetic
-from companion.navigator import height_error
+from companion.config import load
+from companion.nav.geometry import Geodetic, displace
+from companion.navigator import Navigator, height_error
+from companion.navigator.air_data_channel import HEIGHT_EXPONENT, LAPSE, P0, T0, pressure_altitude
 from companion.navigator.height_error import Level
 from companion.navigator.inertial_track import Point
-from companion.records import Gnss
+from companion.records import (
+    AirData,
+    Attitude,
+    Gnss,
+    LocalOrigin,
+    LocalPosition,
+    Pressure,
+    Rejection,
+    Solution,
+)
 
 NS = 1_000_000_000
 GATE = 24.0
@@ -75,3 +86,73 @@ def test_one_false_height_is_refused_and_one_that_stays_believed() -> None:
     stays = np.array(climbed(0.0, 1.0, wrong={k: 300.0 for k in range(200, 2100)}))
     assert abs(stays[205, 0]) < 10.0
     assert stays[-1, 0] == pytest.approx(300.0, abs=20.0)
+
+
+START = Geodetic(1.0, 0.5, 1000.0)
+AIR = load(flags={"output.profile": "ardupilot"}, environment={})
+INS = load(flags={"inertial.independent": True}, environment={})
+
+
+def flown_level(
+    step_m: float, until: float, by_ins: bool, climb: float = 0.0, seconds: int = 40
+) -> tuple[list[float], list[Rejection]]:
+    """Fly north at 30 m/s, by airspeed or by an INS whose height is `step_m` off from 20 s on `until`.
+
+    Return how far each altitude sent is off, and the rejections.
+    """
+    navigator, off, rejections = Navigator(INS if by_ins else AIR), list[float](), list[Rejection]()
+    navigator.handle(LocalOrigin(0, 0, *START, "tangent"))
+    for k in range(10 * seconds):
+        t, t_ns = 0.1 * k, k * NS // 10
+        true = START.alt + climb * t
+        read = true + (step_m if 20.0 <= t < until else 0.0)
+        at = displace(*START, 30.0 * t, 0.0, 0.0)
+        records: list[object] = [
+            Attitude(t_ns, t_ns, 1e-6 * k, 0.0, 0.0),
+            AirData(t_ns, t_ns, 30.0 + 1e-6 * k, true=True, sensed=True),
+            Pressure(t_ns, t_ns, P0 * (1.0 - read * LAPSE / T0) ** (1.0 / HEIGHT_EXPONENT)),
+        ]
+        if by_ins:
+            records = [LocalPosition(t_ns, t_ns, (30.0 * t, 0.0, START.alt - read), (30.0, 0.0, -climb))]
+        if k % 5 == 0:
+            v_n = (30.0, 0.0, -climb)
+            records.append(Gnss(t_ns, t_ns, 0, t_ns // 1000, 3, at.lat, at.lon, true, 1.5, 3.0, v_n=v_n))
+        for out in (out for record in records for out in navigator.handle(record)):  # type: ignore[arg-type]
+            if isinstance(out, Solution):
+                off.append(out.alt_msl - true)
+            elif isinstance(out, Rejection):
+                rejections.append(out)
+    return off, rejections
+
+
+def test_the_pressure_of_a_height_gives_that_height() -> None:
+    assert pressure_altitude(P0 * (1.0 - 5000.0 * LAPSE / T0) ** (1.0 / HEIGHT_EXPONENT)) == pytest.approx(
+        5e3
+    )
+
+
+@pytest.mark.parametrize("by_ins", [False, True], ids=["pressure", "ins"])
+@pytest.mark.parametrize("step_m", [4900.0, -300.0])
+def test_a_height_that_steps_for_a_second_moves_no_altitude_that_is_sent(step_m: float, by_ins: bool) -> None:
+    off, rejections = flown_level(step_m, 21.0, by_ins)
+    assert len(off) > 100
+    assert max(map(abs, off)) < 5.0
+    if not by_ins:
+        assert {each.source for each in rejections} == {"pressure"}
+        assert [each.value for each in rejections] == pytest.approx([abs(step_m)] * 10, rel=1e-6)
+
+
+@pytest.mark.parametrize("by_ins", [False, True], ids=["pressure", "ins"])
+@pytest.mark.parametrize("climb", [100.0, -25.0])
+def test_a_steep_climb_is_no_step(climb: float, by_ins: bool) -> None:
+    """What is left is a delay of some samples."""
+    off, rejections = flown_level(0.0, 0.0, by_ins, climb)
+    assert rejections == []
+    assert max(map(abs, off)) < 0.5 * abs(climb)
+
+
+def test_a_pressure_that_stepped_and_stays_is_used_again() -> None:
+    """After ten seconds; GNSS shows its error after ten more."""
+    off, rejections = flown_level(4900.0, 50.0, by_ins=False, seconds=50)
+    assert len(rejections) == 100
+    assert abs(off[-1]) < 20.0
