@@ -96,6 +96,9 @@ def gnss(state: State, record: Gnss, settings: Settings) -> Step:
     since = math.inf if state.gnss_ns is None else (record.t_ns - state.gnss_ns) * 1e-9
     part = min(since, config.correlation_s) / config.correlation_s
     level = height_error.update(state.level, record, nominal.point, part, GATE_SIGMA**2)
+    if level.refused_ns is not None:
+        off = abs(nominal.point.position.alt - level.error - record.alt_msl)
+        out.append(Rejection(record.t_ns, record.rx_ns, f"height of {label}", "outlier: innovation, m", off))
     pending = None
     if state.false[GNSS] < known.settings.suspect:
         pending = Pending(record, nominal.point, (0.0, 0.0), Source.GNSS)

@@ -17,14 +17,15 @@ DRIFT = 0.0025  # m^2/s
 SHARE = 0.08  # one sigma of the error of a climb, as its share
 SHARE_WALK = 1.3e-7  # 1/m: in 3 km of climb the share changes by 2 %
 LEAST_M = 5.0  # one sigma of a height of GNSS, at least
-PATIENCE_NS = 10_000_000_000  # what goes on contradicting for so long is believed
+PATIENCE_NS = 10_000_000_000  # what goes on contradicting for so long is believed, at least
 #: Between two readings no height changes by more: noise, manoeuvres, and a climb or a dive.
 STEP_M, CLIMB_M_S = 20.0, 200.0
 
 
 class Level(NamedTuple):
     """Height error (m) where the channel was at height `alt` (m) at `t_ns`, and its share of a climb; their
-    covariance (m^2, m, 1). `refused_ns` is since when fixes contradict it.
+    covariance (m^2, m, 1). `refused_ns` is since when fixes contradict it, `patience_ns` for how long these
+    are not believed; `since_ns` is since when the others are, `last` time and height of the last of them.
     """
 
     error: float = 0.0
@@ -33,6 +34,9 @@ class Level(NamedTuple):
     t_ns: int | None = None
     alt: float = 0.0
     refused_ns: int | None = None
+    patience_ns: int = PATIENCE_NS
+    since_ns: int | None = None
+    last: tuple[int, float] = (0, 0.0)
 
 
 def greatest_change(dt: float) -> float:
@@ -64,21 +68,32 @@ def at(level: Level, ins: Point) -> Level:
 def update(level: Level, record: Gnss, ins: Point, part: float, gate: float) -> Level:
     """With the height of one fix, refused if its squared innovation is beyond `gate` times its variance.
 
-    `part` is the share of one independent fix that this one is worth, its noise being correlated.
+    `part` is the share of one independent fix that this one is worth, its noise being correlated. If it is
+    the height of GNSS that stepped, the longer of the two runs of fixes is believed.
     """
-    first = level.t_ns is None
+    first, since_ns = level.t_ns is None, ins.t_ns if level.since_ns is None else level.since_ns
     now = at(level, ins)._replace(t_ns=ins.t_ns, alt=ins.position.alt)
     variance, covariance, of_share = now.covariance
     noise = max(record.sigma_vertical or 0.0, LEAST_M) ** 2
     nu = ins.position.alt - record.alt_msl - now.error
     if not first and not nu * nu <= gate * (variance + noise):
-        since = now.refused_ns or ins.t_ns
-        if ins.t_ns - since < PATIENCE_NS:
-            return now._replace(refused_ns=since)
+        if now.refused_ns is None:
+            last_ns, last_alt = now.last
+            has_stepped = abs(record.alt_msl - last_alt) > greatest_change((record.t_ns - last_ns) * 1e-9)
+            patience_ns = max(PATIENCE_NS, ins.t_ns - since_ns) if has_stepped else PATIENCE_NS
+            now = now._replace(refused_ns=ins.t_ns, patience_ns=patience_ns)
+        if ins.t_ns - (now.refused_ns or 0) < now.patience_ns:
+            return now
         variance += nu * nu  # the claim was wrong
+        since_ns = ins.t_ns
     k = variance / (variance + noise / part)
     k_share = covariance / (variance + noise / part)
     left = ((1.0 - k) * variance, (1.0 - k) * covariance, of_share - k_share * covariance)
     return now._replace(
-        error=now.error + k * nu, share=now.share + k_share * nu, covariance=left, refused_ns=None
+        error=now.error + k * nu,
+        share=now.share + k_share * nu,
+        covariance=left,
+        refused_ns=None,
+        since_ns=since_ns,
+        last=(record.t_ns, record.alt_msl),
     )

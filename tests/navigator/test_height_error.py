@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from companion.config import load
-from companion.nav.geometry import Geodetic, displace
+from companion.nav.geometry import Geodetic, displace, slant_range_azimuth
 from companion.navigator import Navigator, height_error
 from companion.navigator.air_data_channel import HEIGHT_EXPONENT, LAPSE, P0, T0, pressure_altitude
 from companion.navigator.height_error import Level
@@ -21,6 +21,7 @@ from companion.records import (
     LocalPosition,
     Pressure,
     Rejection,
+    RsbnFix,
     Solution,
 )
 
@@ -88,15 +89,32 @@ def test_one_false_height_is_refused_and_one_that_stays_believed() -> None:
     assert stays[-1, 0] == pytest.approx(300.0, abs=20.0)
 
 
+def test_of_two_runs_of_heights_of_gnss_the_longer_one_is_believed() -> None:
+    none = np.array(climbed(0.0, 1.0))
+    minute = np.array(climbed(0.0, 1.0, wrong={k: 3000.0 for k in range(200, 260)}))
+    assert np.abs(minute - none)[:, 0].max() < 2.0  # one sigma of its drift: a minute is missing
+    first = np.array(climbed(0.0, 1.0, wrong={k: 3000.0 for k in range(60)}))
+    assert abs(first[59, 0]) > 2900.0
+    assert np.abs(first[125:300, 0]).max() < 20.0
+
+
 START = Geodetic(1.0, 0.5, 1000.0)
+BEACON = displace(*START, 0.0, 10_000.0, 1000.0)
 AIR = load(flags={"output.profile": "ardupilot"}, environment={})
 INS = load(flags={"inertial.independent": True}, environment={})
 
 
 def flown_level(
-    step_m: float, until: float, by_ins: bool, climb: float = 0.0, seconds: int = 40
+    step_m: float,
+    until: float,
+    by_ins: bool,
+    climb: float = 0.0,
+    seconds: int = 40,
+    gnss_step_m: float = 0.0,
 ) -> tuple[list[float], list[Rejection]]:
     """Fly north at 30 m/s, by airspeed or by an INS whose height is `step_m` off from 20 s on `until`.
+
+    GNSS states a height that is `gnss_step_m` off for the same time. A beacon is 10 km east of the start.
 
     Return how far each altitude sent is off, and the rejections.
     """
@@ -105,8 +123,9 @@ def flown_level(
     for k in range(10 * seconds):
         t, t_ns = 0.1 * k, k * NS // 10
         true = START.alt + climb * t
-        read = true + (step_m if 20.0 <= t < until else 0.0)
-        at = displace(*START, 30.0 * t, 0.0, 0.0)
+        is_false = 20.0 <= t < until
+        read = true + is_false * step_m
+        at = displace(*START, 30.0 * t, 0.0, 0.0)._replace(alt=true)
         records: list[object] = [
             Attitude(t_ns, t_ns, 1e-6 * k, 0.0, 0.0),
             AirData(t_ns, t_ns, 30.0 + 1e-6 * k, true=True, sensed=True),
@@ -116,7 +135,12 @@ def flown_level(
             records = [LocalPosition(t_ns, t_ns, (30.0 * t, 0.0, START.alt - read), (30.0, 0.0, -climb))]
         if k % 5 == 0:
             v_n = (30.0, 0.0, -climb)
-            records.append(Gnss(t_ns, t_ns, 0, t_ns // 1000, 3, at.lat, at.lon, true, 1.5, 3.0, v_n=v_n))
+            alt = true + is_false * gnss_step_m
+            records.append(Gnss(t_ns, t_ns, 0, t_ns // 1000, 3, at.lat, at.lon, alt, 1.5, 3.0, v_n=v_n))
+        if k % 10 == 0:
+            sight = slant_range_azimuth(BEACON, at)
+            sigmas = math.radians(0.125), 100.0
+            records.append(RsbnFix(t_ns, t_ns, 7, *BEACON, sight.azimuth, sight.slant_range, *sigmas))
         for out in (out for record in records for out in navigator.handle(record)):  # type: ignore[arg-type]
             if isinstance(out, Solution):
                 off.append(out.alt_msl - true)
@@ -154,5 +178,14 @@ def test_a_steep_climb_is_no_step(climb: float, by_ins: bool) -> None:
 def test_a_pressure_that_stepped_and_stays_is_used_again() -> None:
     """After ten seconds; GNSS shows its error after ten more."""
     off, rejections = flown_level(4900.0, 50.0, by_ins=False, seconds=50)
-    assert len(rejections) == 100
+    assert [each.source for each in rejections].count("pressure") == 100
     assert abs(off[-1]) < 20.0
+
+
+@pytest.mark.parametrize("by_ins", [False, True], ids=["pressure", "ins"])
+def test_a_height_of_gnss_that_is_false_for_seconds_moves_no_altitude_and_no_range(by_ins: bool) -> None:
+    """Its horizontal position is right; 3 km of height are 720 m of the beacon's slant range."""
+    off, rejections = flown_level(0.0, 35.0, by_ins, seconds=40, gnss_step_m=3000.0)
+    assert max(map(abs, off)) < 5.0
+    assert {each.source for each in rejections} == {"height of gnss 0"}
+    assert [each.value for each in rejections] == pytest.approx([3000.0] * 30, rel=1e-3)
