@@ -173,9 +173,11 @@ def shifted(state: State, north: float, east: float, v_n: Vector2 = (0.0, 0.0), 
     mean = state.velocity_error
     if mean is not None:
         mean = mean._replace(north=mean.north + v_n[0], east=mean.east + v_n[1])
-    pending = state.pending
-    if pending is not None:  # the error that was taken off is that of the nominal trajectory as it is now
-        pending = pending._replace(centre=(pending.centre[0] + north, pending.centre[1] + east))
+    # the error that was taken off is that of the nominal trajectory as it is now
+    pending, half = (
+        each and each._replace(centre=(each.centre[0] + north, each.centre[1] + east))
+        for each in (state.pending, state.half)
+    )
     return state._replace(
         bank=bank,
         moved=(state.moved[0] + north, state.moved[1] + east),
@@ -185,6 +187,7 @@ def shifted(state: State, north: float, east: float, v_n: Vector2 = (0.0, 0.0), 
         gnss_fix=fix,
         velocity_error=mean,
         pending=pending,
+        half=half,
     )
 
 

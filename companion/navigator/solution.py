@@ -12,8 +12,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from companion.config import Config
 from companion.estimate import bank as banks
-from companion.estimate.fusion import Height, NoFix, maximum_likelihood
+from companion.estimate.fusion import Height, NoFix, Observation, maximum_likelihood
 from companion.nav.geometry import displace
 from companion.navigator import fix_observations, height_error, minimax_bound, parallel_filters, trust
 from companion.navigator.hypotheses import GNSS, VELOCITY
@@ -39,6 +40,7 @@ from companion.records import (
     Mode,
     ParallelEstimate,
     Rejection,
+    RsbnFix,
     Solution,
     Source,
     Vector2,
@@ -270,11 +272,15 @@ def resolve_pending(state: State, pending: Pending, settings: Settings) -> Step:
             fix_of_gnss, nominal = state.gnss_fix
             observations += fix_observations.from_gnss(fix_of_gnss, nominal, config.gnss, pending.centre)
             used |= Source.GNSS
+        half = state.half
+        if half is not None and _is_other_half(half, record, used):
+            observations += _other_half(half, pending, config)
+            used |= half.used
     height = Height(0.0, config.inertial.height_sigma_m)
     try:
         fix = maximum_likelihood((*observations, height), start=np.zeros(3))  # type: ignore[arg-type]
     except NoFix:
-        return state, []  # an azimuth or a range alone is no fix
+        return state._replace(half=pending), []  # an azimuth or a range alone is no fix
     east, north, up = (float(c) for c in fix.position)
     correction = (pending.centre[0] - north, pending.centre[1] - east)
     (var_e, cov), var_n = fix.covariance[0, :2].tolist(), float(fix.covariance[1, 1])
@@ -294,8 +300,24 @@ def resolve_pending(state: State, pending: Pending, settings: Settings) -> Step:
         degrees_of_freedom=fix.degrees_of_freedom,
         iterations=fix.iterations,
     )
-    state = state._replace(guarantee=g)
+    state = state._replace(guarantee=g, half=None)
     return _filtered(state, pending, out, used, settings), [out]
+
+
+def _is_other_half(half: Pending, record: RsbnFix, used: Source) -> bool:
+    """Whether `half` is the azimuth to a range, or the reverse, of the same beacon a moment ago."""
+    before = half.record
+    is_near = abs(before.t_ns - record.t_ns) <= TOGETHER_NS
+    return is_near and isinstance(before, RsbnFix) and before.beacon == record.beacon and not half.used & used
+
+
+def _other_half(half: Pending, pending: Pending, config: Config) -> tuple[Observation, ...]:
+    """The observations of `half` about its own nominal point, less the error that `pending` takes off."""
+    assert isinstance(half.record, RsbnFix)
+    north, east = half.centre[0] - pending.centre[0], half.centre[1] - pending.centre[1]
+    point = half.point._replace(position=displace(*half.point.position, north, east, 0.0))
+    found = fix_observations.from_rsbn(half.record, point, config.rsbn)
+    return tuple(z for z in found if half.used & fix_observations.source_of(z))
 
 
 def is_bound_due(state: State) -> bool:

@@ -94,6 +94,7 @@ class State(NamedTuple):
     gnss_taken: Gnss | None = None  # the last one judged by the bank
     gnss_fix: tuple[Gnss, Point] | None = None  # the last one believed
     pending: Pending | None = None
+    half: Pending | None = None  # an azimuth or a range that alone was no fix
     velocity_error: VelocityError | None = None
     gnss_first_ns: int | None = None  # of the first 3D fix
     started_ns: int | None = None  # when the position was started

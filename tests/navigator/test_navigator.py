@@ -786,6 +786,30 @@ def test_azimuth_and_range_in_messages_of_their_own_are_as_one_answer() -> None:
         assert a.sources == b.sources
 
 
+@pytest.mark.parametrize("apart_s", [0.0, 0.4])
+def test_azimuth_and_range_in_messages_of_their_own_are_one_fix(apart_s: float) -> None:
+    """The range is stamped later here than it was measured: by as much the fix may be off."""
+
+    def fixes(is_apart: bool) -> list[Fix]:
+        navigator, records, out = Navigator(CONFIG), list[Any](), list[Any]()
+        for record in (record for moment in flight(42, 20.0, 40.0) for record in moment.records):
+            if is_apart and isinstance(record, RsbnFix):
+                records.append(structs.replace(record, slant_range=None))
+                t_ns = record.t_ns + round(apart_s * NS)
+                record = structs.replace(record, azimuth=None, t_ns=t_ns, rx_ns=t_ns)
+            records.append(record)
+        for record in (origin(), *sorted(records, key=lambda record: record.rx_ns)):
+            out += navigator.handle(record)
+        return [each for each in out if isinstance(each, Fix) and each.t_ns > 22.5 * NS]
+
+    whole, apart = fixes(False), fixes(True)
+    assert len(whole) == len(apart) == 17
+    for a, b in zip(whole, apart, strict=True):
+        assert math.dist(a.correction_n, b.correction_n) < 0.1 + 30.0 * apart_s
+        assert b.covariance == pytest.approx(a.covariance, rel=0.02, abs=100.0)
+        assert a.sources == b.sources
+
+
 @pytest.mark.parametrize("ranged", [True, False], ids=["with a range", "an azimuth alone"])
 def test_in_the_cone_of_silence_an_azimuth_is_no_fix(ranged: bool) -> None:
     """The beacon stands where the aircraft is after 40 s, 1 km up: it crosses the cone in 38 s."""
