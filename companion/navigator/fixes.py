@@ -9,11 +9,11 @@ from companion.estimate.fusion import Azimuth
 from companion.navigator import fix_observations, height_error, measurements, own_channel, scatter
 from companion.navigator.hypotheses import GNSS, MOST_BEACONS, VELOCITY
 from companion.navigator.own_channel import OwnChannel
+from companion.navigator.own_error_model import By
 from companion.navigator.progress import (
     carried,
     decided,
     estimated_velocity,
-    is_driven_by_imu,
     is_silent,
     nearer,
     propagated,
@@ -81,8 +81,10 @@ def gnss(state: State, record: Gnss, settings: Settings) -> Step:
         noise = factor * (sigma**2 + channel.velocity_noise**2)
         velocity = measurements.gnss_velocity(bank, known, channel, record, nominal.point, nominal.a_n, noise)
         bank = velocity.bank
-    state, v_n = _latency_velocity(state._replace(bank=bank), record.t_ns)
-    taken = measurements.gnss_position(bank, known, channel, apart, factor * variance, v_n)
+    is_measured = velocity is not None
+    state, v_n = _latency_velocity(state._replace(bank=bank), record.t_ns, is_measured)
+    shows_latency = is_measured or _driver(state) != "hold"
+    taken = measurements.gnss_position(bank, known, channel, apart, factor * variance, v_n, shows_latency)
     state = state._replace(bank=taken.bank, gnss_taken=record, fixed=True)
     state, out = decided(state, record, settings), list[Output]()
     label = f"gnss {record.receiver}"
@@ -121,17 +123,18 @@ def is_too_soon(record: Gnss, state: State, settings: Settings) -> bool:
     return last is not None and 0.0 <= (record.t_ns - last.t_ns) * 1e-9 < settings.config.gnss.every_s
 
 
-def _latency_velocity(state: State, t_ns: int) -> tuple[State, Vector2]:
+def _latency_velocity(state: State, t_ns: int, is_measured: bool) -> tuple[State, Vector2]:
     """Return the velocity that GNSS latency multiplies in a position, north and east, m/s.
 
     The noise of the estimated velocity is also in the estimated position: as a coefficient it made straight
-    flight seem to measure the latency, as 0.08 s after ten minutes where it was 0. By IMU the nominal
-    velocity is taken less a slow mean of its estimated error; a held velocity is far off in every turn. After
+    flight seem to measure the latency, as 0.08 s after ten minutes where it was 0. By IMU, and by airspeed
+    where GNSS states no velocity (`is_measured`), the nominal velocity is taken less a slow mean of its
+    estimated error; a held velocity is far off in every turn. After
     a silence the velocity must be that of the fix: 5 m/s off in the first of two positions, they seemed to
     measure a latency of 0.13 s.
     """
-    v_n = estimated_velocity(state)
-    if not is_driven_by_imu(state):
+    v_n, by = estimated_velocity(state), _driver(state)
+    if by != "imu" and (is_measured or by not in ("air", "foreign")):
         return state._replace(velocity_error=None), v_n
     assert state.nominal is not None
     nominal, mean = state.nominal.point.v_n, state.velocity_error
@@ -141,6 +144,12 @@ def _latency_velocity(state: State, t_ns: int) -> tuple[State, Vector2]:
         north, east = mean.north + part * (north - mean.north), mean.east + part * (east - mean.east)
     state = state._replace(velocity_error=VelocityError(t_ns, north, east))
     return state, _smooth_velocity(state)
+
+
+def _driver(state: State) -> By | None:
+    """What moves the nominal trajectory of the own channel now; None of an INS."""
+    interval = state.nominal.interval if state.nominal else None
+    return None if interval is None else interval.by
 
 
 def _smooth_velocity(state: State) -> Vector2:

@@ -69,25 +69,33 @@ def gnss_position(
     apart: Vector2,
     variance: float,
     v_n: Vector2,
+    shows_latency: bool = True,
 ) -> Taken:
     """Take the position of a fix: nominal minus GNSS is the error less drift and arm, plus latency times
     speed.
 
     `apart` is GNSS minus nominal (m), `variance` that of its white noise (m^2). The arm is along the
-    course; slower than TURNING_M_S its direction is unknown.
+    course; slower than TURNING_M_S its direction is unknown. Where the velocity `v_n` is known from positions
+    alone a fix does not show the latency (not `shows_latency`): its uncertainty is noise along the course.
     """
     north, east = apart
     H = np.zeros((2, known.layout.n_base))
     H[0, 0] = H[1, 1] = 1.0
     H[:, channel.drift] = -np.eye(2)
-    H[:, channel.latency] = v_n
+    z, R = np.array((-north, -east)), variance * np.eye(2)
+    if shows_latency:
+        H[:, channel.latency] = v_n
+    else:
+        leading, at = int(bank.L.argmax()), channel.latency
+        z -= bank.x[leading, at] * np.array(v_n)
+        R += bank.P[leading, at, at] * np.outer(v_n, v_n)
     if channel.arm is not None:
         speed = math.hypot(*v_n)
         if speed > TURNING_M_S:
             H[:, channel.arm] = -v_n[0] / speed, -v_n[1] / speed
         else:
-            variance += ARM_M**2
-    return _take(bank, known, np.array((-north, -east)), H, variance * np.eye(2), GNSS, "position")
+            R += ARM_M**2 * np.eye(2)
+    return _take(bank, known, z, H, R, GNSS, "position")
 
 
 def other_receiver(bank: Bank, channel: Channel) -> Bank:

@@ -167,6 +167,31 @@ def late(seconds: float, kind: type = Gnss) -> Change:
     return change
 
 
+@pytest.mark.parametrize("seed", [1, pytest.param(3, marks=pytest.mark.long)])
+def test_by_air_data_fixes_without_a_velocity_are_not_made_worse(seed: int) -> None:
+    """GPS_RAW_INT whose vel is unknown; the take-off run, without air data, is no measurement of latency."""
+    fixes = list[Gnss]()
+
+    def position_alone(record: Any) -> Any:
+        if isinstance(record, Gnss):
+            record = replace(record, v_n=None)
+            fixes.append(record)
+        return record
+
+    flown = fly("air", position_alone, rsbn=((0.0, 1e9),), seed=seed)
+    place, radius = np.array([(s.lat, s.lon) for s in flown.solutions]), 6.378e6
+    scale = np.stack([np.full(len(place), radius), radius * np.cos(place[:, 0])], axis=1)
+    truth = place - flown.error_n / scale
+    t = np.array([fix.t_ns for fix in fixes]) / NS
+    is_later = (t > SETTLED_S) & (t < flown.t[-1])
+    at = np.stack([np.interp(t, flown.t, column) for column in truth.T], axis=1)
+    off = (np.array([(fix.lat, fix.lon) for fix in fixes]) - at) * scale[0]
+    own = math.sqrt((off[is_later] ** 2).sum(axis=1).mean())
+    ours = math.sqrt((flown.error[flown.t > SETTLED_S] ** 2).mean())
+    assert 1.0 < own < 4.0
+    assert ours < 1.25 * own
+
+
 FINE = load(
     flags={
         "inertial.independent": True,
