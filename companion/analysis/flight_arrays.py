@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from array import array
 from collections import defaultdict
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Set
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -193,17 +193,20 @@ def collect_flights(
 
     Raises ValueError if there are no records.
     """
-    parts = [_FlightCollector()]
+    parts, reboots_ns = [_FlightCollector()], set[int]()
     for topic, record in records:
-        if isinstance(record, Reboot) and parts[-1].started:
-            parts.append(_FlightCollector())
+        if isinstance(record, Reboot):
+            reboots_ns.add(record.rx_ns)
+            if parts[-1].started:
+                parts.append(_FlightCollector())
         parts[-1].add(topic, record)
     if not parts[0].started:
         raise ValueError(f"{name} contains no records of the companion")
     shift = 0 if unix_ns is None else unix_ns - parts[0].zero_ns
     about = metadata or {}
     return [
-        part.flight(name, (k, len(parts)), shift, about, remarks) for k, part in enumerate(parts, start=1)
+        part.flight(name, (k, len(parts)), shift, about, remarks, reboots_ns)
+        for k, part in enumerate(parts, start=1)
     ]
 
 
@@ -249,13 +252,18 @@ class _FlightCollector:
         shift_ns: int,
         metadata: dict[str, dict[str, str]],
         remarks: tuple[str, ...],
+        reboots_ns: Set[int],
     ) -> Flight:
-        """Return the flight as arrays."""
+        """Return the flight as arrays. What is reset by a reboot, at its time, is part of the reboot."""
         pairs = {topic: _seconds(both, self.zero_ns) for topic, both in sorted(self._times.items())}
         analyses = [gnss_latency.analyze_track(track) for track in self._latency_tracks.tracks()]
-        lines = [_timeline_entry(r, self.zero_ns) for r in self._messages if isinstance(r, Event | Reset)]
+        lines = [
+            _timeline_entry(r, self.zero_ns, reboots_ns)
+            for r in self._messages
+            if isinstance(r, Event | Reset)
+        ]
         glitches = [
-            _timeline_entry(event, self.zero_ns)._replace(kind="glitch")
+            _timeline_entry(event, self.zero_ns, reboots_ns)._replace(kind="glitch")
             for event in gnss_latency.glitch_events(analyses)
         ]
         found = {(line.t, line.text) for line in glitches}  # a replay has logged them already
@@ -279,11 +287,12 @@ class _FlightCollector:
         )
 
 
-def _timeline_entry(record: Event | Reset, zero_ns: int) -> TimelineEntry:
+def _timeline_entry(record: Event | Reset, zero_ns: int, reboots_ns: Set[int]) -> TimelineEntry:
     t = (record.t_ns - zero_ns) * 1e-9
     if isinstance(record, Event):
         return TimelineEntry(t, "event", record.severity, record.text)
-    return TimelineEntry(t, "reset", 4, f"{record.what} reset: {record.reason}")
+    kind = "reboot" if record.rx_ns in reboots_ns else "reset"
+    return TimelineEntry(t, kind, 4, f"{record.what} reset: {record.reason}")
 
 
 def _rejected_measurement(r: Rejection, zero_ns: int) -> RejectedMeasurement:

@@ -148,9 +148,13 @@ def _contradiction(a: Assessment) -> Verdict | None:
 
 
 def _missing(a: Assessment) -> Verdict | None:
-    """A part without an estimate, but for a silence at the end: the autopilot was switched off then."""
+    """A part without an estimate, but for a silence at the end: the autopilot was switched off then.
+
+    One that is switched on again sends a few messages before its reboot is recognised.
+    """
     parts = [p for p in a.phases if p.name == flight_events.NO_ESTIMATE]
-    off = next((s.start for s in a.silences if s.end >= a.flight.seconds), math.inf)
+    end = max(a.flight.seconds - flight_events.PHASE_MIN_S, a.flight.tables["Solution"]["t"].max())
+    off = next((s.start for s in a.silences if s.end >= end), math.inf)
     if parts and parts[-1].start_ns * 1e-9 > off - flight_events.PHASE_MIN_S:
         parts.pop()
     if not parts:

@@ -222,6 +222,27 @@ def test_reboot_splits_a_log_into_flights():
     )  # the outage is in the first flight: here GNSS starts at 0:40
 
 
+def test_the_reset_of_a_reboot_is_no_reset_of_either_flight():
+    """The importer reports it before the reboot, the navigator after it: both flights were cautioned."""
+    rows = rebooted()
+    k, at = next((k, r.rx_ns) for k, r in enumerate(rows) if isinstance(r, Reboot))
+    why = "autopilot 1 rebooted"
+    rows[k : k + 1] = [Reset(at, at, "flight", why), rows[k], Reset(at, at, "sensors", why)]
+
+    def flights_in(rows):
+        return map(assess_flight, collect_flights(((flight_log.topic_of(type(r)), r) for r in rows), "made"))
+
+    for a, what in zip(flights_in(rows), ("flight", "sensors"), strict=True):
+        (line,) = (line for line in a.timeline if "reset" in line.text)
+        assert (line.kind, line.text) == ("reboot", f"{what} reset: {why}")
+        assert judge_flight(a).level == "good" and "reset" not in sentences(a)
+    later = at + 10 * S
+    _, second = flights_in([*rows, Reset(later, later, "bank", "covariance not positive definite")])
+    assert judge_flight(second).reason == (
+        "The estimate was reset, first at 0:10: bank reset: covariance not positive definite."
+    )
+
+
 def silent_flight(start_s, end_s, **kind):
     """The same five minutes; nothing arrives from the autopilot for a part of them."""
     a, b = START + start_s * S, START + end_s * S
@@ -254,6 +275,17 @@ def test_an_autopilot_that_is_switched_off_at_the_end_is_no_reason_for_caution()
     )
     assert a.rows[-1].phase == "no estimate"
     assert judge_flight(a).level == "good"
+
+
+@pytest.mark.parametrize(("after_s", "level"), [(0.1, "good"), (8.0, "caution")])
+def test_a_silence_before_a_reboot_is_none_of_a_flight(after_s, level):
+    """A restarted autopilot sends a few messages before its reboot is recognised; 19 s were cautioned."""
+    a, b = START + 260 * S, START + 279 * S
+    rows = [r for r in flight_records() if r.rx_ns < a]
+    late = (b + round(t * S) for t in np.linspace(0.0, after_s, 5))
+    rows += [LocalPosition(t, t, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)) for t in late]
+    (found,) = collect_flights(((flight_log.topic_of(type(r)), r) for r in rows), "made.mcap")
+    assert judge_flight(assess_flight(found)).level == level
 
 
 def test_every_flight_has_its_own_chapters(tmp_path, monkeypatch):
