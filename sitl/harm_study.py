@@ -53,7 +53,8 @@ WINDOW_S, MOST_RATIO, FREE_M = 10.0, 1.2, 3.0
 INS = ("INS navigation", "INS MEMS")
 OWN = ("air data", "stock")
 CHANNELS = (*INS, *OWN)
-QUICK_MINUTES = 5.0
+SEEDS, MINUTES = 3, 10.0
+QUICK_SEEDS, QUICK_MINUTES = 1, 5.0
 _SUSPECTED = re.compile("(.*) is (?:suspect|excluded):")
 _EXCLUDED, _SET_2 = "gnss is excluded", "EKF source set 2"
 
@@ -350,9 +351,11 @@ def fly_one_recording(data: Path, name: str) -> RecordingResult:
 
 
 @click.command("harm")
-@click.option("--seeds", type=click.IntRange(1), default=3, show_default=True, help="Flights per case.")
-@click.option("--minutes", type=FloatRange(4.0), default=10.0, show_default=True, help="Of each.")
-@click.option("--quick", is_flag=True, help="One seed, five minutes.")
+@click.option("--seeds", type=click.IntRange(1), help=f"Flights per case; default: {SEEDS}.")
+@click.option("--minutes", type=FloatRange(4.0), help=f"Of each; default: {MINUTES:g}.")
+@click.option(
+    "--quick", is_flag=True, help=f"By default {QUICK_SEEDS} flight per case, of {QUICK_MINUTES:g} minutes."
+)
 @click.option("--case", "names", multiple=True, type=click.Choice(list(WRONG)), help="Default: all.")
 @click.option("--channel", "channels", multiple=True, type=click.Choice(CHANNELS), help="Default: all.")
 @click.option(
@@ -367,8 +370,8 @@ def fly_one_recording(data: Path, name: str) -> RecordingResult:
 )
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 def command(
-    seeds: int,
-    minutes: float,
+    seeds: int | None,
+    minutes: float | None,
     quick: bool,
     names: tuple[str, ...],
     channels: tuple[str, ...],
@@ -380,9 +383,12 @@ def command(
 
     Replays every recording too. Exit code 1 if harm is done.
     """
-    if quick:
-        seeds, minutes = 1, QUICK_MINUTES
-    orders = list_orders(names or WRONG, channels or CHANNELS, seeds, minutes)
+    orders = list_orders(
+        dict.fromkeys(names or WRONG),
+        dict.fromkeys(channels or CHANNELS),
+        seeds or (QUICK_SEEDS if quick else SEEDS),
+        minutes or (QUICK_MINUTES if quick else MINUTES),
+    )
     flights: list[HarmResult] = list(_mapped(fly, workers, orders))
     there = list_recordings(data) if data.is_dir() else []
     recordings: list[RecordingResult] = list(_mapped(fly_one_recording, workers, repeat(data), there))

@@ -164,3 +164,22 @@ def test_command_prints_json_and_its_exit_code_tells_harm(tmp_path, monkeypatch)
         assert found["recordings"] == [] and LOGS
     done = CliRunner().invoke(harm_study.command, options[:-1])
     assert "one thing wrong" in done.output and "NO (0 of 1)" in done.output
+
+
+@pytest.mark.parametrize(
+    ("options", "seeds", "minutes"),
+    [
+        ([], 3, 10.0),
+        (["--quick"], 1, 5.0),
+        (["--quick", "--seeds", "2"], 2, 5.0),
+        (["--quick", "--minutes", "7"], 1, 7.0),
+    ],
+)
+def test_what_is_given_beside_quick_is_used(options, seeds, minutes, tmp_path, monkeypatch):
+    flown = []
+    monkeypatch.setattr(harm_study, "fly", lambda o: flown.append(o) or HarmResult(*o[:3], False, False, 0.5))
+    options = [*options, "--case", "nothing"]  # a case given twice is flown once
+    fixed = ["--case", "nothing", "--channel", "stock", "--workers", "0", "--data", str(tmp_path), "--json"]
+    done = CliRunner().invoke(harm_study.command, [*options, *fixed])
+    assert done.exit_code == 0, done.output
+    assert flown == [HarmOrder("nothing", "stock", seed, minutes) for seed in range(1, seeds + 1)]
