@@ -6,6 +6,7 @@ from pathlib import Path
 
 from companion.analysis.replay import create_replay_log
 from companion.analysis.replay_inputs import CONVERTED, input_errors_as_log_errors, is_own_log
+from companion.config import Config
 from companion.importers import sources
 from companion.importers.sources import ImportSummary
 from companion.printable import printable
@@ -13,10 +14,11 @@ from companion.storage.flight_log import topic_of_input
 from companion.storage.reader import LogError, open_log
 
 
-def convert_log(source: Path, output: Path) -> ImportSummary:
+def convert_log(source: Path, output: Path, config: Config | None = None) -> ImportSummary:
     """Write the records of `source` to `output`. Raises LogError if it cannot be read or written.
 
-    Events and rejections of the importer go to topics under /link, as in a replay.
+    `config` selects the vehicle of a telemetry log with several. Events and rejections of the
+    importer go to topics under /link, as in a replay.
     """
     with input_errors_as_log_errors():
         if is_own_log(source):
@@ -24,7 +26,7 @@ def convert_log(source: Path, output: Path) -> ImportSummary:
                 raise LogError(f"{source} is already an MCAP log: nothing to convert")
         if output.resolve() == source.resolve() or output.exists():
             raise LogError(f"{output} already exists: give another name")
-        records = sources.open_source(source)
+        records = sources.open_source(source, (config or Config()).link.system_id or None)
         with create_replay_log(output, {CONVERTED: {"from": printable(source.name)}}) as sink:
             for record in records:
                 sink.record(record, topic_of_input(record))

@@ -62,15 +62,23 @@ def recover_command(log: Path) -> None:
 @group.command("convert")
 @click.argument("source", type=INPUT_PATH)
 @click.option("-o", "--output", type=click.Path(path_type=Path), required=True, help="MCAP file to write.")
-def convert_command(source: Path, output: Path) -> None:
+@click.option(
+    "--config",
+    "config_file",
+    type=click.Path(path_type=Path),
+    help="Configuration; its link.system_id selects the vehicle of a telemetry log with several.",
+)
+def convert_command(source: Path, output: Path, config_file: Path | None) -> None:
     """Convert SOURCE, a log of another recorder, to MCAP.
 
     Writes inputs and truth only, nothing computed.
     """
     from companion.analysis import convert
+    from companion.config import load
 
+    config = load(config_file)
     with show_step(f"convert {source}"):
-        written = convert.convert_log(source, output)
+        written = convert.convert_log(source, output, config)
     click.echo(f"{output}: {written.records} records, {written.reboots} reboots")
 
 

@@ -58,6 +58,10 @@ def test_configuration_selects_the_vehicle_of_a_log_with_two(tmp_path: pathlib.P
     output = tmp_path / "out.mcap"
     run("replay", log, "-o", output, "--with", "link.system_id=2")
     assert {one.roll for one in values(output, r.Attitude)} == {0.5}
+    config_file, converted = tmp_path / "second.toml", tmp_path / "second.mcap"
+    config_file.write_text("[link]\nsystem_id = 2\n")
+    run("log", "convert", log, "-o", converted, "--config", config_file)
+    assert {one.roll for one in values(converted, r.Attitude)} == {0.5}
 
 
 def test_output_has_the_name_of_its_log(tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> None:
