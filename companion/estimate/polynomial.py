@@ -32,6 +32,7 @@ Family = Literal["power", "legendre", "sine", "fourier"]
 FAMILIES: tuple[str, ...] = get_args(Family)
 
 FALSE_ALARM = 1e-3  # probability that `spans` is False although the span is wide enough
+GREATEST = 1e100  # absolute value of a number in the samples
 _GAUSS = np.polynomial.legendre.leggauss(8)  # nodes for each interval between samples
 
 
@@ -361,7 +362,19 @@ def _samples(t: npt.ArrayLike, z: npt.ArrayLike, sigma: npt.ArrayLike, basis: st
         raise ValueError(f"sigma is {sigma.min():g} somewhere: it must be positive")
     if (np.diff(t) < 0.0).any() or t[-1] <= t[0]:
         raise ValueError("the times are not increasing: sort the samples by time")
+    _reject_overflow(t, z, sigma)
     return _Samples(t, z, sigma)
+
+
+def _reject_overflow(t: Floats, z: Floats, sigma: Floats) -> None:
+    """Raise ValueError for numbers whose squares, weighted, are too great for a double."""
+    with np.errstate(over="ignore"):
+        weighted = {"1 / sigma": 1.0 / sigma, "z / sigma": z / sigma}
+    for name, values in {"t": t, "z": z, "sigma": sigma, **weighted}.items():
+        worst = values[np.argmax(np.abs(values))]
+        if abs(worst) > GREATEST:
+            advice = "leave this sample out, or use another unit"
+            raise ValueError(f"{name} is {worst:g} somewhere: at most {GREATEST:g} can be used: {advice}")
 
 
 def _raw(family: Family, u: Floats, r: int) -> Floats:

@@ -36,6 +36,7 @@ from companion.tables import number_table, print_tables
 from companion.units import G0, SECOND_NS, Floats
 
 STATED_SIGMA = 0.10  # [m/s]
+MAX_S, MAX_M_S = 1e9, 1e6  # of the numbers in a recording
 LATITUDE_DEG = -44.0  # DEEPWAVE flew over New Zealand
 UNIT = UnitErrors(
     gyro=0.01 * DEG_PER_HOUR,
@@ -97,6 +98,13 @@ def load(file: Path, every_s: float = 10.0) -> Recording:
             f"{file} is not a recording of velocity errors: after three header lines it needs lines of"
             " seconds, east, north"
         )
+    for number, (t_s, east, north) in enumerate(table[:, :3].tolist(), start=1):
+        if not (0.0 <= t_s <= MAX_S and abs(east) <= MAX_M_S and abs(north) <= MAX_M_S):
+            raise ValueError(
+                f"{file} is not a recording of velocity errors: row {number} is {t_s:g},{east:g},{north:g}:"
+                f" seconds must be from 0 to {MAX_S:g}, errors from {-MAX_M_S:g} to {MAX_M_S:g} m/s:"
+                " leave the row out"
+            )
     seconds = np.unwrap(table[:, 0], period=86_400.0)
     seconds -= seconds[0]
     _, first = np.unique(np.floor(seconds / every_s), return_index=True)

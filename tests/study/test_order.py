@@ -76,6 +76,12 @@ BASES = ("--basis", "power", "--basis", "fourier")
         ("t,z\n1,2\n", (), "give rows of numbers t,z or t,z,sigma"),
         ("1,2,3,4\n", (), "has 4 columns"),
         ("1,2\n0,3\n4,5\n", ("--r-max", 2), "the times are not increasing"),
+        ("0,2\n1,1e300\n2,3\n", ("--r-max", 2), "z is 1e+300 somewhere: at most 1e+100 can be used"),
+        (
+            "0,2\n1,1e300\n2,3\n",
+            ("--r-max", 2, "--track"),
+            "z is 1e+300 somewhere: at most 1e+100 can be used",
+        ),
         ("0,2\n1,3\n", (), "r_max is 12 for 2 samples"),
         ("", (), "samples.csv is empty: give rows of numbers"),
         ("1,2,3\n2,3,3\n", ("--sigma", 3), "samples.csv has a third column, sigma: leave one out"),

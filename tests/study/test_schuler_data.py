@@ -1,6 +1,7 @@
 """Five recorded Schuler periods: accuracy of the prediction and validity of its bound on a real flight."""
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -114,6 +115,26 @@ def test_invalid_recording_is_reported_with_its_name(name, content, tmp_path):
     assert done.exit_code == 2
     assert f"Error: {file} is not a recording of velocity errors: " in done.stderr
     assert len(done.stderr.splitlines()) == 4
+
+
+@pytest.mark.parametrize(
+    ("row", "wanted"),
+    [
+        ("nan,0.1,0.1", "row 2 is nan,0.1,0.1: "),
+        ("1e12,0.1,0.1", "row 2 is 1e+12,0.1,0.1: seconds must be from 0 to 1e+09"),
+        ("11,1e300,0.1", "row 2 is 11,1e+300,0.1: "),
+        (
+            "11,0.1,-inf",
+            "row 2 is 11,0.1,-inf: seconds must be from 0 to 1e+09, errors from -1e+06 to 1e+06 m/s: leave",
+        ),
+    ],
+)
+def test_an_impossible_number_is_reported_with_its_row(row, wanted, tmp_path):
+    """A time that is not a number had a warning of numpy, and a recording of -1.5e8 min."""
+    file = tmp_path / "flight.csv"
+    file.write_text(f"\n\n\n0,0.1,0.1\n{row}\n20,0.1,0.1\n")
+    with pytest.raises(ValueError, match=re.escape(wanted)):
+        load(file)
 
 
 @pytest.mark.shared
