@@ -16,7 +16,7 @@ def make_folder(path: Path) -> None:
 
 def write_whole(path: Path, data: bytes) -> None:
     """Write a file at once: after an error the older one is still there. OSError, always with the path."""
-    target = path.resolve()
+    target = Path(os.path.realpath(path))  # `resolve` rejects a link that leads to itself until Python 3.13
     part = target.with_name(f"{target.name}.part")
     try:
         if target.exists() and not target.is_file():  # a folder, or a device such as /dev/stdout

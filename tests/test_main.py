@@ -418,3 +418,45 @@ def test_full_output_device_is_reported_in_one_sentence(command: list[str]) -> N
         )
     assert done.returncode == 74
     assert done.stderr == "companion: the output: No space left on device\n"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["log", "convert", "LINK.tlog", "-o", "x.mcap"], "LINK.tlog: no such log"),
+        (["fleet", "LOG", "--results", "LINK.csv", "--workers", "0"], "LINK.csv"),
+        (["report", "LOG", "-o", "LINK.html"], None),
+        (["smooth", "LOG", "-o", "LINK.csv"], None),
+        (["log", "export", "LOG", "-o", "LINK.kml"], None),
+    ],
+)
+def test_a_link_that_leads_to_itself_is_named_or_replaced(
+    arguments: list[str], message: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Before Python 3.13 `Path.resolve` has an error of its own for it, which ended in a traceback."""
+    monkeypatch.chdir(tmp_path)
+    (link,) = (Path(word) for word in arguments if word.startswith("LINK"))
+    link.symlink_to(link)
+    done = CliRunner().invoke(cli, [str(CUT) if word == "LOG" else word for word in arguments])
+    if message is None:
+        assert done.exit_code == 0, done.output
+        assert link.is_file() and not link.is_symlink()
+    else:
+        assert isinstance(done.exception, OSError) and message in str(done.exception)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["replay", "LOG", "--rsbn", "FILE"],
+        ["replay", "LOG", "--correctors", "FILE"],
+        ["sitl", "bridge", "--beacons", "FILE"],
+        ["study", "order", "FILE"],
+    ],
+)
+def test_a_table_that_is_no_text_is_named_without_a_codec(arguments: list[str], tmp_path: Path) -> None:
+    table = tmp_path / "table.csv"
+    table.write_bytes(bytes(range(128, 256)))
+    done = CliRunner().invoke(cli, [{"LOG": str(CUT), "FILE": str(table)}.get(x, x) for x in arguments])
+    shown = " ".join(f"{done.output} {done.exception}".split())
+    assert f"{table}: not a text file in UTF-8" in shown and "codec" not in shown

@@ -24,7 +24,7 @@ def convert_log(source: Path, output: Path, config: Config | None = None) -> Imp
         if is_own_log(source):
             with open_log(source):
                 raise LogError(f"{source} is already an MCAP log: nothing to convert")
-        if output.resolve() == source.resolve() or output.exists():
+        if output.exists():
             raise LogError(f"{output} already exists: give another name")
         records = sources.open_source(source, (config or Config()).link.system_id or None)
         with create_replay_log(output, {CONVERTED: {"from": printable(source.name)}}) as sink:

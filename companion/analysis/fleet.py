@@ -12,6 +12,7 @@ rows, `index.html` lists the worst flights first, with links to the reports of t
 from __future__ import annotations
 
 import hashlib
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
@@ -76,7 +77,7 @@ class LogJob(NamedTuple):
 
 def find_logs(folders: Sequence[Path], results: Path) -> list[Path]:
     """Return the logs in the folders and their subfolders, sorted; not those in the folder of the results."""
-    own = results.resolve()
+    own = Path(os.path.realpath(results))
     found = {
         path.resolve()
         for folder in folders

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fcntl
+import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -27,9 +28,9 @@ def reject_own_input(output: Path, *read: Path | None) -> None:
 
 def reject_same_output(outputs: Sequence[Path]) -> None:
     """Raise LogError if two of the outputs are the same file."""
-    named: dict[Path, Path] = {}
+    named: dict[str, Path] = {}
     for output in outputs:
-        if (first := named.setdefault(output.resolve(), output)) is not output:
+        if (first := named.setdefault(os.path.realpath(output), output)) is not output:
             raise LogError(f"{output} would be written twice (also as {first}): give another name")
 
 
@@ -70,6 +71,6 @@ def _has_metadata(log: Path, *names: str) -> bool:
 
 def reject_any_log(output: Path) -> None:
     """Raise LogError if `output`, which will not be a log, is the name of an existing log."""
-    target = output.resolve()
+    target = Path(os.path.realpath(output))
     if target.exists() and (is_own_log(target) or target.suffix.lower() in sources.LOG_SUFFIXES):
         raise LogError(f"{output} is a log and is not overwritten: give another name")

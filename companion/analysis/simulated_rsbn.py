@@ -116,7 +116,9 @@ def read_beacons(path: Path) -> list[ListedBeacon]:
                             raise ValueError(f"id {beacon.number} is given twice")
                 except (TypeError, ValueError) as error:
                     raise LogError(f"{path}, line {reader.line_num} is not a valid beacon: {error}") from None
-    except (OSError, EOFError, UnicodeDecodeError) as error:
+    except UnicodeDecodeError:
+        raise LogError(f"{path}: not a text file in UTF-8; a list of beacons is a CSV file") from None
+    except (OSError, EOFError) as error:
         if isinstance(error, LogError):
             raise
         raise LogError(f"{path} cannot be read: {getattr(error, 'strerror', None) or error}") from None

@@ -71,7 +71,9 @@ def read_correctors(path: Path, start_ns: int) -> list[Stamped]:
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
             rows = list(csv.reader(file))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+    except UnicodeDecodeError:
+        raise ValueError(f"{path}: not a text file in UTF-8; a table of correctors is a CSV file") from None
+    except (OSError, csv.Error) as error:
         why = getattr(error, "strerror", None) or error
         raise ValueError(f"{path}: cannot be read ({why})") from None
     header = tuple(name.strip() for name in rows[0]) if rows else ()

@@ -86,7 +86,8 @@ def read(file: Path, sigma: float | None) -> Samples:
     try:
         table = np.loadtxt(file, delimiter=",", ndmin=2, encoding="utf-8")
     except (ValueError, OSError) as error:
-        why = str(error).rstrip(".")
+        no_text = isinstance(error, UnicodeDecodeError)
+        why = "not a text file in UTF-8" if no_text else str(error).rstrip(".")
         raise ValueError(
             f"{file}: {why}: give rows of numbers t,z or t,z,sigma, without a line of column names"
         ) from None
