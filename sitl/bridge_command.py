@@ -21,6 +21,7 @@ import click
 
 from companion.analysis import simulated_rsbn
 from companion.option_types import FloatRange
+from companion.plausibility import HIGHEST
 from companion.storage.reader import LogError
 from companion.tables import number_table, print_tables
 from companion.transport.address import Address
@@ -149,6 +150,11 @@ def _parse_beacons(positions: tuple[str, ...], file: Path | None) -> tuple[Beaco
                 f"invalid beacon {text!r}: {what}: give -{limit} to {limit} deg", param_hint="--beacon"
             )
         height = alt[0] if alt else 0.0
+        if abs(height) > HIGHEST:
+            raise click.BadParameter(
+                f"invalid beacon {text!r}: height {height:g}: give -{HIGHEST:.0f} to {HIGHEST:.0f} m",
+                param_hint="--beacon",
+            )
         beacons.append(Beacon(number, lat, lon, height, ground_alt=simulated_rsbn.GROUND))
     if file is not None:
         for listed in simulated_rsbn.read_beacons(file):

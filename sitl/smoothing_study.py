@@ -111,7 +111,7 @@ def _normalised_error(e: Floats, P: Floats) -> float:
     help="An inertial channel; default: all.",
 )
 @click.option(
-    "--seeds", type=click.IntRange(min=1), default=1, show_default=True, help="Flights per scenario."
+    "--seeds", type=click.IntRange(1, 10_000), default=1, show_default=True, help="Flights per scenario."
 )
 def command(names: tuple[str, ...], channels: tuple[str, ...], seeds: int) -> None:
     """Compare the smoothed track with the filter by scenario. Exit code 1 if it is worse."""

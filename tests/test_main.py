@@ -87,6 +87,22 @@ def test_seeds_are_not_negative() -> None:
         assert (done.exit_code, "-1 is not in the range x>=0" in done.output) == (2, True), command.name
 
 
+def test_numbers_that_take_memory_have_a_limit() -> None:
+    """A thousand billion flights were listed, or held in one array: MemoryError."""
+    taken = {"seeds", "flights", "runs", "count", "r_max"}
+    counted = {
+        (name, option.name): command
+        for name, command in commands().items()
+        for option in command.params
+        if option.name in taken
+    }
+    assert len(counted) >= 8
+    for (name, option), command in counted.items():
+        flag = "--samples" if option == "count" else f"--{str(option).replace('_', '-')}"
+        done = CliRunner().invoke(command, [flag, "1000000000000"])
+        assert (done.exit_code, "is not in the range" in done.output) == (2, True), name
+
+
 def test_a_seed_without_beacons_is_rejected() -> None:
     seeded = [c for c in commands().values() if has_option(c, "seed") and has_option(c, "beacons")]
     assert {command.name for command in seeded} == {"replay", "outages", "wrong-sensors"}

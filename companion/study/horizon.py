@@ -35,6 +35,7 @@ GRADES_DEG_H = {"navigation": 0.01, "tactical": 1.0, "industrial": 10.0}
 LONGEST_MIN = 24 * 60
 FORCE_STEP_S = 10.0
 MAX_FIXES = 1_000_000  # in the window
+MAX_AHEAD_MIN, MAX_TARGET, MAX_DRIFT_DEG_H = 100_000, 1e12, 1e6
 ALONE = tuple(tuple(float(i == k) for i in range(4)) for k in range(4))  # targets of one state
 WINDOWS = (1.0, 0.5, 0.25)  # of the window, in the plot
 
@@ -78,7 +79,7 @@ class Horizon:
         count = round(window / every) + 1
         if count > MAX_FIXES:
             raise ValueError(
-                f"a window of {window:g} s with a fix every {every:g} s has {count} fixes, at most"
+                f"a window of {window:g} s with a fix every {every:g} s has {count:g} fixes, at most"
                 f" {MAX_FIXES}: give a shorter window or a longer interval"
             )
         tau = np.linspace(-0.5, 0.5, count) * (window * scale.rate)
@@ -180,8 +181,8 @@ def _minutes(context: click.Context, parameter: click.Parameter, text: str) -> l
         given = [float(word) for word in text.split(",")]
     except ValueError:
         raise click.BadParameter(f"{text!r} is neither a number nor a list like 5,10,20") from None
-    if not all(math.isfinite(minute) and minute >= 0.0 for minute in given):
-        raise click.BadParameter(f"{text!r}: give minutes of 0 or more")
+    if not all(0.0 <= minute <= MAX_AHEAD_MIN for minute in given):
+        raise click.BadParameter(f"{text!r}: give minutes from 0 to {MAX_AHEAD_MIN}")
     return given if len(given) > 1 else np.linspace(0.0, given[0], 13).tolist()
 
 
@@ -192,8 +193,15 @@ def _target(context: click.Context, parameter: click.Parameter, text: str | None
         found = [float(word) for word in text.split(",")]
     except ValueError:
         found = []
-    if len(found) != 4 or not all(map(math.isfinite, found)) or not any(found):
-        raise click.BadParameter(f"{text!r}: give four numbers A,B,C,D, not all 0")
+    greatest = max(map(abs, found), default=0.0)
+    if (
+        len(found) != 4
+        or not all(map(math.isfinite, found))
+        or not 1.0 / MAX_TARGET <= greatest <= MAX_TARGET
+    ):
+        raise click.BadParameter(
+            f"{text!r}: give four numbers A,B,C,D, the greatest from {1.0 / MAX_TARGET:g} to {MAX_TARGET:g}"
+        )
     return found
 
 
@@ -205,9 +213,10 @@ def _drift(context: click.Context, parameter: click.Parameter, text: str | None)
         drift = float(text)
     except ValueError:
         drift = math.nan
-    if not (math.isfinite(drift) and drift > 0.0):
+    if not 0.0 < drift <= MAX_DRIFT_DEG_H:
         raise click.BadParameter(
-            f"{text!r} is neither a grade ({', '.join(GRADES_DEG_H)}) nor a drift in deg/h above 0"
+            f"{text!r} is neither a grade ({', '.join(GRADES_DEG_H)}) nor a drift in deg/h above 0, at most"
+            f" {MAX_DRIFT_DEG_H:g}"
         )
     return drift
 

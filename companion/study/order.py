@@ -193,7 +193,9 @@ def short_form(samples: Samples, found: Order) -> int:
     multiple=True,
     help="Basis, may be repeated; default: all.",
 )
-@click.option("--r-max", default=12, show_default=True, help="Greatest number of terms.")
+@click.option(
+    "--r-max", type=click.IntRange(1, 100), default=12, show_default=True, help="Greatest number of terms."
+)
 @click.option(
     "--samples",
     "count",

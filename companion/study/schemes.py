@@ -109,7 +109,9 @@ def distance(fractions: FeedbackFractions, scale: float) -> float:
 
 
 @click.command("schemes")
-@click.option("--seeds", type=click.IntRange(min=1), default=2, show_default=True, help="Flights per cell.")
+@click.option(
+    "--seeds", type=click.IntRange(1, 10_000), default=2, show_default=True, help="Flights per cell."
+)
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 def command(seeds: int, as_json: bool) -> None:
     """Compare correction schemes of an INS by their errors.

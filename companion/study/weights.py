@@ -35,6 +35,7 @@ DEVIATIONS = (0.05, 0.1, 0.2, 0.5)  # the result is the same for both signs
 FACTORS = (0.1, math.sqrt(0.1), 0.5, 2.0, math.sqrt(10.0), 10.0)  # the roots are variances x 0.1 and x 10
 CORRELATIONS = (-0.9, -0.5, 0.5, 0.9)
 PRINTED = (101.139, 100.0)
+GREATEST = 1e50  # absolute value of a number that is given: its square is a double
 _NO_ROW = 1e-18  # claimed over true variance: the range is across the axis to a billionth
 _ISOTROPIC = math.sqrt(200.0)
 #: Variances 500, 10, 200 km^2 as printed; that of RSBN is the one of both axes.
@@ -345,6 +346,8 @@ def parse_reading(text: str, beacons: dict[str, tuple[float, float]]) -> Reading
     if not source or kind not in KINDS:
         raise ValueError(f"{text!r}: give NAME.KIND=VALUE,SIGMA with a kind of {', '.join(KINDS)}")
     value, sigma = _numbers(text, numbers)
+    if 0.0 < sigma < 1.0 / GREATEST:
+        raise ValueError(f"{text!r}: sigma is {sigma:g}: give one from {1.0 / GREATEST:g} to {GREATEST:g}")
     if kind == "azimuth":
         value, sigma = math.radians(value), math.radians(sigma)
     return Reading(source, kind, value, sigma, beacons.get(source, (0.0, 0.0)))
@@ -355,8 +358,8 @@ def _numbers(text: str, numbers: str) -> tuple[float, float]:
         a, b = (float(word) for word in numbers.split(","))
     except ValueError:
         raise ValueError(f"{text!r}: give two numbers after '='") from None
-    if not (math.isfinite(a) and math.isfinite(b)):
-        raise ValueError(f"{text!r}: give two finite numbers after '='")
+    if not (abs(a) <= GREATEST and abs(b) <= GREATEST):
+        raise ValueError(f"{text!r}: give two finite numbers after '=', of at most {GREATEST:g}")
     return a, b
 
 

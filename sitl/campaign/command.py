@@ -238,7 +238,11 @@ def _cell(value: Any) -> str:
 )
 @click.option("--fault", "faults", multiple=True, type=click.Choice(list(FAULT_CASES)), help="Default: all.")
 @click.option(
-    "--seeds", type=click.IntRange(1), default=1, show_default=True, help="Seeds per scenario and fault."
+    "--seeds",
+    type=click.IntRange(1, 10_000),
+    default=1,
+    show_default=True,
+    help="Seeds per scenario and fault.",
 )
 @click.option("--results", type=click.Path(path_type=Path, file_okay=False), default=Path("logs/campaign"))
 @worker_options

@@ -35,7 +35,7 @@ def test_curve_between_minimax_and_kalman() -> None:
 def test_command_reports_invalid_numbers() -> None:
     for arguments, message in (
         (("--window-min", "90"), "90.0 is not in the range 1.0<=x<=60.0"),
-        (("--flights", "1"), "give 2 or more"),
+        (("--flights", "1"), "1 is not in the range 2<=x<=1000"),
     ):
         done = CliRunner().invoke(command, arguments)
         assert done.exit_code == 2

@@ -330,6 +330,7 @@ def test_three_processes_over_tcp_and_udp(entries, tmp_path: Path) -> None:
         (["--beacon", "55.75"], "write it as LAT,LON"),
         (["--beacon", "99,10"], "latitude 99: give -90 to 90 deg"),
         (["--beacon", "10,-190"], "longitude -190: give -180 to 180 deg"),
+        (["--beacon", "10,10,1e300"], "height 1e+300: give -100000 to 100000 m"),
         (["--connect", "nonsense"], "is not a connection string"),
         (["--gnss-on-after", "5"], "give --gnss-off-after"),
         (["--gnss-off-after", "60", "--seconds", "60"], "--gnss-off-after 60 has no effect: the run ends"),

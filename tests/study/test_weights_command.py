@@ -150,6 +150,8 @@ def test_plot(tmp_path):
         (("--correlation=INS.x=0.5",), "no reading ''"),
         (("--reading=A.x=1,2", "--reading=B.azimuth=0,1"), "azimuths that do not meet"),
         (("--reading=A.x=1,2", "--reading=A.range=1,2", "--beacon=A=nan,2"), "'A=nan,2': give two finite"),
+        (("--reading=A.range=1e300,1", "--reading=B.range=1,1"), "'A.range=1e300,1': give two finite"),
+        (("--reading=A.x=1,1e-300", "--reading=B.x=1,1"), "sigma is 1e-300: give one from 1e-50 to 1e+50"),
         (("--beacon=VOR=1,2",), "no reading of beacon VOR"),
         (("--beacon=A=1,2", "--beacon=A=3,2"), "'A=3,2': the place of A is given twice: leave one out"),
         (
