@@ -23,6 +23,7 @@ from companion.importers import dataflash, inertialnav, px4_csv, tlog, ulog
 from companion.importers.foreign_file import MAX_TEXT, Damage, usable
 from companion.link.decode import DECODED, MAKES, Autopilot, Sender, decode
 from companion.link.dialect import MEASUREMENTS, Message, mavlink
+from companion.link.frame import Frame
 from companion.link.session import LinkUp, MessageReceived, Rebooted, SecondAutopilot, Session
 from companion.link.status_text import CHUNK
 from companion.nav.geometry import Projection
@@ -93,10 +94,7 @@ class TlogSource(_Records):
         self._sender = Sender(self._session.clock)
         self._times = tlog.BootTimeBase()
         self._text = ""  # of a STATUSTEXT in several parts
-        stated = any(
-            entry.frame.msgid == mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN for entry in tlog.Tlog(log.data)
-        )
-        self._origin = None if stated else OriginFinder()
+        self._origin = None if log.contains(mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN) else OriginFinder()
 
     def summary(self) -> ImportSummary:
         """Return the counts so far."""
@@ -105,19 +103,21 @@ class TlogSource(_Records):
 
     def _all_records(self) -> Iterator[Stamped]:
         log, session = self.log, self._session
-        doubtful: bytes | None = None  # a frame whose boot time has to be confirmed by the next
+        doubtful: Frame | None = None  # a frame whose boot time has to be confirmed by the next
         for rx_ns, found in log:
             ours = found.system == session.autopilot and found.component == mavlink.MAV_COMP_ID_AUTOPILOT1
             boot_us = tlog.boot_time_us(found) if ours else None
             now_ns = self._times.update(rx_ns // 1000, boot_us)
             if boot_us is not None and doubtful is not None and not self._times.confirmed:
-                self.damage.add(f"a message at {rx_ns} ns", len(doubtful), "its boot time does not continue")
+                self.damage.add(
+                    f"a message at {rx_ns} ns", len(doubtful.raw), "its boot time does not continue"
+                )
                 doubtful = None
             if now_ns is None:
-                doubtful = found.raw
+                doubtful = found
                 continue
-            for raw in (found.raw,) if doubtful is None or boot_us is None else (doubtful, found.raw):
-                for event in session.receive(raw, now_ns):
+            for each in (found,) if doubtful is None or boot_us is None else (doubtful, found):
+                for event in session.receive_frame(each, now_ns):
                     yield from self._records(event)
             doubtful = doubtful if boot_us is None else None
             session.to_send()  # discard replies: there is no link

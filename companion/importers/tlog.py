@@ -65,6 +65,15 @@ class Tlog:
             else:
                 at = self._skip(at)
 
+    def contains(self, msgid: int) -> bool:
+        """Return whether an entry is message `msgid`; a log without any such frame is searched, not read."""
+        v1, v2 = re.escape(bytes((msgid & 0xFF,))), re.escape(msgid.to_bytes(3, "little"))
+        alike = re.compile(b"\xfd(?=.{6}%b)|\xfe(?=.{4}%b)" % (v2, v1), re.DOTALL).finditer(self.data)
+        frames = (frame.parse(self.data, found.start()) for found in alike)
+        return any(isinstance(one, Frame) and one.msgid == msgid for one in frames) and any(
+            entry.frame.msgid == msgid for entry in Tlog(self.data)
+        )
+
     def _us(self, at: int) -> int:
         return int.from_bytes(self.data[at : at + _STAMP], "big")
 

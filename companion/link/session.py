@@ -353,6 +353,13 @@ class Session:
                 self._keep_reader(peer, reader, now_ns)
         return events
 
+    def receive_frame(self, found: Frame, now_ns: int) -> list[Event]:
+        """Process a frame that is parsed already, as `receive` does its bytes; return the events in order."""
+        self._now = now_ns
+        events, self._not_sent = self._not_sent, []
+        self._on_frame(found, None, now_ns, events)
+        return events
+
     def judge(self) -> Callable[[bytes, int], bool]:
         """Return a function of the next bytes of a new sender: whether a frame of them proves it."""
         reader = frame.Reader(counting=False)

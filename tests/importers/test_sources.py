@@ -7,6 +7,7 @@ from collections import Counter
 from itertools import pairwise
 
 import pytest
+from fastcrc import crc16
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
@@ -218,6 +219,29 @@ def test_messages_of_a_beacon_receiver_are_accepted() -> None:
     log = entry(0, heartbeat()) + entry(1, frame.encode(message, 0, 1, 42))
     fixes = [record for record in sources.TlogSource(tlog.Tlog(log)) if isinstance(record, r.RsbnFix)]
     assert [fix.beacon for fix in fixes] == [7]
+
+
+def test_messages_are_found_in_a_log_as_they_are_read() -> None:
+    read_once = {found.frame.msgid for found in tlog.Tlog(CUT)}
+    assert len(read_once) > 10
+    assert {msgid for msgid in dialect.TYPES if tlog.Tlog(CUT).contains(msgid)} == read_once
+
+
+def test_only_entries_of_a_log_count_as_its_messages() -> None:
+    """A frame of MAVLink 1 or 2 counts; one without a time of its own, or with a wrong checksum, does not."""
+    origin = dialect.new("GPS_GLOBAL_ORIGIN", latitude=1, longitude=2, altitude=3)
+    v2, msgid = frame.encode(origin, 0, 1, 1), dialect.id_of(origin)
+    payload = dialect.payload(origin)[: dialect.TYPES[msgid].base_size]
+    head = bytes((len(payload), 0, 1, 1, msgid)) + payload
+    v1 = b"\xfe" + head + crc16.mcrf4xx(head + bytes((dialect.TYPES[msgid].crc_extra,))).to_bytes(2, "little")
+    for body, counts in (
+        (entry(7, v1), True),
+        (entry(7, v2), True),
+        (v2, False),
+        (entry(7, v2[:-1] + b"?"), False),
+    ):
+        log = tlog.Tlog(b"".join([*CLEAN[:7], body, *CLEAN[8:]]))
+        assert log.contains(msgid) == counts == (msgid in {found.frame.msgid for found in log})
 
 
 def test_unstated_origin_is_inferred() -> None:

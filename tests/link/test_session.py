@@ -348,6 +348,33 @@ def test_unknown_messages_are_not_lost_frames(at_once: int, peer: tuple[str, int
     assert session.reader.counts == {(7, 1): frame.Counts(received=10, lost=0)}
 
 
+def contents(event: Event) -> object:
+    if isinstance(event, MessageReceived):
+        return event.received_ns, event.frame, event.from_autopilot, event.peer
+    return event
+
+
+def test_a_parsed_frame_has_the_effects_of_its_bytes() -> None:
+    first, second, lost = Autopilot(), Autopilot(system=9), Autopilot()
+    stream = [first.heartbeat(), second.heartbeat()]
+    for boot in (*range(5000, 8000, 100), *range(100, 3000, 100)):  # with a reboot
+        stream += [first.message("ATTITUDE", time_boot_ms=boot), lost.heartbeat()]
+    stream += [first.message("TIMESYNC", tc1=0, ts1=5), frame.encode(dialect.new("HEARTBEAT"), 0, 7, 191)]
+    of_bytes, of_frames = Session(), Session()
+    seen: set[type] = set()
+    for k, data in enumerate(stream):
+        one, now = frame.parse(data), k * 50 * MS
+        assert isinstance(one, frame.Frame)
+        events = of_bytes.receive(data, now)
+        assert list(map(contents, of_frames.receive_frame(one, now))) == list(map(contents, events))
+        seen |= set(map(type, events))
+        for session in (of_bytes, of_frames):
+            session.poll(now)
+        assert of_frames.to_send() == of_bytes.to_send()
+    assert of_frames.reader.counts == of_bytes.reader.counts and of_bytes.reader.lost > 0
+    assert seen >= {MessageReceived, LinkUp, SecondAutopilot, Rebooted}
+
+
 def test_own_frames_sent_back_are_ignored() -> None:
     session = Session()
     session.poll(0)
