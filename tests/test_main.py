@@ -333,6 +333,7 @@ assert core.has_solution
             ("numpy", "asyncio"),
         ),
         ("import companion.runtime.service", ("scipy", "companion.analysis", "sitl")),
+        ("import sitl.loopback", ("scipy",)),
     ],
 )
 def test_start_imports_only_what_it_needs(code: str, absent: tuple[str, ...]) -> None:

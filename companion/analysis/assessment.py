@@ -11,7 +11,6 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import gammaincinv
 
 from companion.analysis import error_statistics, flight_events
 from companion.analysis.flight_arrays import Flight, Table, TimelineEntry
@@ -58,6 +57,8 @@ class NormalizedErrors(NamedTuple):
 
 def chi2_95(degrees_of_freedom: Floats) -> Floats:
     """Return the 95 % quantile of chi-square."""
+    from scipy.special import gammaincinv  # 0.2 s: for a report with sigmas only
+
     return np.asarray(2.0 * gammaincinv(0.5 * degrees_of_freedom, 0.95), dtype=np.float64)
 
 
