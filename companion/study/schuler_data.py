@@ -146,6 +146,10 @@ def _errors(
     starts: dict[tuple[int, float], Start] = {}
     for span in _windows(recording.t_ns, window_s):
         times, values = t[span], both[span]
+        later = {ahead: int(np.abs(t - (times[-1] + ahead)).argmin()) for ahead in ahead_s}
+        later = {ahead: k for ahead, k in later.items() if abs(t[k] - times[-1] - ahead) <= SLACK_S}
+        if not later:
+            continue
         window = Window.begin(times[0] - 0.5 * NODE_S, law)
         for _ in range(round((times[-1] - times[0]) / NODE_S)):
             window = window.extend(window.t_s[-1] + NODE_S, Phi, B, Q)
@@ -160,19 +164,16 @@ def _errors(
         widening = anchored.grouped.widening
         seconds = times - times[-1]
         fit = np.polyfit(seconds, values, 1)
-        for ahead in ahead_s:
-            later = int(np.abs(t - (times[-1] + ahead)).argmin())
-            if abs(t[later] - times[-1] - ahead) > SLACK_S:
-                continue
-            steps = [step] * round((t[later] - window.t_s[-1]) / NODE_S)
+        for ahead, k in later.items():
+            steps = [step] * round((t[k] - window.t_s[-1]) / NODE_S)
             for axis, target in enumerate(anchored.targets(window, (2, 3), steps)):
                 found = anchored.solve(target, starts.get((axis, ahead)))
                 starts[axis, ahead] = found.start
                 plain = Design.of(schuler_row("mu", -seconds * MEAN_EARTH.rate), 1.0)
                 ls = plain.least_squares(transition(ahead * MEAN_EARTH.rate)[2]).weights @ values[:, axis]
-                line = fit[1, axis] + fit[0, axis] * (t[later] - times[-1])
+                line = fit[1, axis] + fit[0, axis] * (t[k] - times[-1])
                 guesses = (found.kalman.value, found.restricted.value, found.minimax.value, ls, line)
-                error = np.array([*guesses, values[-1, axis]]) - both[later, axis]
+                error = np.array([*guesses, values[-1, axis]]) - both[k, axis]
                 bounds = widening * found.restricted.bound, widening * found.minimax.bound
                 channel = ("north", "east")[axis]
                 errors[channel, ahead].append((*bounds, found.kalman.expected, *error.tolist()))
