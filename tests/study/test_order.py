@@ -104,8 +104,14 @@ def test_options_of_simulated_samples_beside_a_file_are_rejected(tmp_path, optio
     result = run(file, option, value)
     assert result.exit_code == 2
     assert f"{option} {value} has no effect on the samples of {file}: leave out {option}" in result.output
-    drawn = run(file, option, value, "--figures", tmp_path / "figures.png")
-    assert drawn.exit_code == 0, drawn.output  # of simulated samples
+
+
+def test_options_of_simulated_samples_beside_a_file_are_those_of_the_figures(tmp_path):
+    file = tmp_path / "samples.csv"
+    file.write_text("".join(f"{k},{k}\n" for k in range(20)))
+    simulated = ("--signal", "cubic", "--samples", 50, "--seed", 1)
+    drawn = run(file, *simulated, "--figures", tmp_path / "figures.png")
+    assert drawn.exit_code == 0, drawn.output
 
 
 def test_short_form_selects_nine_terms_for_a_cubic():
