@@ -99,11 +99,11 @@ def test_options_and_commands_exist(text: str) -> None:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the files that the pages name, of a flight of 100 s."""
+    """A folder with the files that the pages name, of a flight of 45 s."""
     path = tmp_path_factory.mktemp("docs")
     plan = scenarios.SCENARIOS["short"].plan
-    plan = dataclasses.replace(plan, legs=(*plan.legs[:2], Leg(40, 40, 38, 30)))
-    flight = scenarios.get_scenario("short", plan=plan, gnss_outages=((60.0, 80.0),), rsbn_outages=())
+    plan = dataclasses.replace(plan, legs=(plan.legs[0], Leg(35, 40, 38, 30)))
+    flight = scenarios.get_scenario("short", plan=plan, gnss_outages=((25.0, 35.0),), rsbn_outages=())
     words = ["--scenario", "short", "--logs", str(path / "logs"), "--set", "output.profile=ardupilot"]
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(scenarios.SCENARIOS, "short", flight)
