@@ -21,10 +21,10 @@ RECORDING = ROOT / "tests" / "data" / "dronekit_copter_cut.tlog"
 
 @pytest.fixture(scope="module")
 def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A log of a loopback of two and a half minutes, half a minute of it without GNSS."""
+    """A log of a loopback of two minutes and five seconds, half a minute of it without GNSS."""
     folder = tmp_path_factory.mktemp("examples")
     plan = scenarios.SCENARIOS["short"].plan
-    plan = dataclasses.replace(plan, legs=(*plan.legs[:2], Leg(90, 40, 38, 120)))
+    plan = dataclasses.replace(plan, legs=(*plan.legs[:2], Leg(65, 40, 38, 60)))
     scenario = scenarios.get_scenario("short", plan=plan, gnss_outages=((80.0, 110.0),), rsbn_outages=())
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(scenarios.SCENARIOS, "short", scenario)
