@@ -57,6 +57,8 @@ _STATUS, _GLITCHING = 0x3FF, 1 << 14  # nav_filter_status; its first ten bits ar
 _FLYING = {18: False, 28: True}  # LogEvent: landed, not landed
 _COPTER = ("ArduCopter", "APM:Copter")
 _HELICOPTER = "Frame: HELI"
+_PLANE = ("ArduPlane", "APM:Plane")
+_QUADPLANE = "QuadPlane Frame"  # when it hovers is not logged
 _WEEK_US = 604_800_000_000
 _GPS_EPOCH_US = 315_964_800_000_000  # 1980-01-06, UNIX time
 _LEAP_US = 18_000_000  # GPS - UTC since 2017
@@ -76,6 +78,7 @@ class MessageConverter:
         self._v_n: Vector3 | None = None
         self._differential: float | None = None
         self._has_airspeed = False  # the log has ARSP
+        self._flying: bool | None = None  # by STAT, of a plane
         self._true_v_n: Vector3 | None = None
         self._true: Truth | None = None
         self._first_alt: float | None = None  # m, of the first POS
@@ -212,10 +215,18 @@ class MessageConverter:
         text = str(m.Message)
         if text.startswith((*_COPTER, _HELICOPTER)):
             yield Vehicle(t, t, multirotor=not text.startswith(_HELICOPTER))
+        elif text.startswith((*_PLANE, _QUADPLANE)):
+            yield Vehicle(t, t, fixed_wing=not text.startswith(_QUADPLANE))
         yield Event(t, t, Severity.INFO, text[:MAX_TEXT])
 
     def _landed(self, name: str, m: Message, t: int) -> Iterator[Stamped]:
         if (flying := _FLYING.get(m.Id)) is not None:
+            yield Vehicle(t, t, flying=flying)
+
+    def _flight_state(self, name: str, m: Message, t: int) -> Iterator[Stamped]:
+        flying = bool(m.isFlying)
+        if flying != self._flying:
+            self._flying = flying
             yield Vehicle(t, t, flying=flying)
 
     def _error(self, name: str, m: Message, t: int) -> Iterator[Stamped]:
@@ -240,6 +251,7 @@ _TABLE: dict[str, Callable[[MessageConverter, str, Message, int], Iterator[Stamp
     "MSG": MessageConverter._text,
     "ERR": MessageConverter._error,
     "EV": MessageConverter._landed,
+    "STAT": MessageConverter._flight_state,
 }
 NAMES = tuple(_TABLE)
 

@@ -33,6 +33,7 @@ FORMATS = {
     "SIM2": ("Qffffff", "TimeUS,PN,PE,PD,VN,VE,VD"),
     "MSG": ("QZ", "TimeUS,Message"),
     "EV": ("QB", "TimeUS,Id"),
+    "STAT": ("QBfBB", "TimeUS,isFlying,isFlyProb,Armed,Safety"),
 }
 TYPES = {name: 130 + k for k, name in enumerate(FORMATS)}
 GWK, GMS = 2300, 100_000_000
@@ -142,6 +143,15 @@ def test_a_helicopter_flies_the_same_firmware(tmp_path: pathlib.Path) -> None:
     parts = [message("MSG", 1_100_000, "ArduCopter V4.5.7"), message("MSG", 1_100_001, "Frame: HELI")]
     found = list(sources.open_source(write(tmp_path, definitions(), gps(1_000_000, GMS), *parts)))
     assert [record.multirotor for record in found if isinstance(record, r.Vehicle)] == [True, False]
+
+
+def test_a_plane_flies_by_its_status_and_when_a_quadplane_hovers_is_not_known(tmp_path: pathlib.Path) -> None:
+    parts = [message("MSG", 1_100_000, "ArduPlane V4.7.0-dev (46ae7859)")]
+    parts += [message("STAT", 1_200_000 + k, flying, 0.5, 1, 2) for k, flying in enumerate((0, 0, 1, 1, 0))]
+    parts += [message("MSG", 1_300_000, "QuadPlane Frame: QUAD/X")]
+    found = list(sources.open_source(write(tmp_path, definitions(), gps(1_000_000, GMS), *parts)))
+    vehicles = [(record.fixed_wing, record.flying) for record in found if isinstance(record, r.Vehicle)]
+    assert vehicles == [(True, None), (None, False), (None, True), (None, False), (False, None)]
 
 
 def test_primary_lane_is_converted(tmp_path: pathlib.Path) -> None:
