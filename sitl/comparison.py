@@ -103,7 +103,7 @@ class Comparison:
             return
         true = self._truth_at(estimate.t_ns)
         if true is not None:
-            north, east, _ = separation(estimate.place, true).tolist()
+            north, east, _ = separation(estimate.place, true)
             self.errors.append(
                 PositionError(
                     estimate.t_ns, estimate.source, north, east, estimate.sigma, estimate.bound, true

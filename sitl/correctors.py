@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from companion.nav.earth import OMEGA
-from companion.nav.geometry import Geodetic, ecef_tuple, enu_axes
+from companion.nav.geometry import Geodetic, enu_axes, to_ecef
 from companion.navigator.corrected_ins import CHAIN_BIAS_M
 from companion.records import RangeDifference, SecondIns, Stamped, StarFix
 from companion.units import SECOND_NS, Floats
@@ -71,7 +71,7 @@ def direction(lat: float, lon: float, star_lat: float, star_lon: float) -> Float
     s_e = np.array(
         (math.cos(star_lat) * math.cos(star_lon), math.cos(star_lat) * math.sin(star_lon), math.sin(star_lat))
     )
-    east, north, up = enu_axes(lat, lon) @ s_e
+    east, north, up = np.array(enu_axes(lat, lon)) @ s_e
     return np.array((north, east, -up))
 
 
@@ -81,10 +81,8 @@ def range_differences(aircraft: Aircraft, rng: np.random.Generator) -> list[Rang
     bias = 0.5 * CHAIN_BIAS_M * rng.standard_normal(len(SECONDARIES))
     found = []
     for k, t in enumerate(flight.t.tolist()):
-        here = np.array(
-            ecef_tuple(Geodetic(float(flight.lat[k]), float(flight.lon[k]), float(flight.alt[k])))
-        )
-        d = [float(np.linalg.norm(here - ecef_tuple(place))) for place in (MASTER, *SECONDARIES)]
+        here = np.array(to_ecef(Geodetic(float(flight.lat[k]), float(flight.lon[k]), float(flight.alt[k]))))
+        d = [float(np.linalg.norm(here - to_ecef(place))) for place in (MASTER, *SECONDARIES)]
         t_ns = round(t * SECOND_NS)
         for chain, secondary in enumerate(SECONDARIES):
             value = d[0] - d[chain + 1] + float(bias[chain]) + LINE_SIGMA_M * rng.standard_normal()

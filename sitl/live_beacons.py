@@ -88,5 +88,5 @@ class LiveBeacons:
 def _distance(beacon: Beacon, truth: Truth) -> float:
     """Approximate horizontal distance, m."""
     there = Geodetic(math.radians(beacon.lat_deg), math.radians(beacon.lon_deg), truth.alt)
-    north, east, _ = separation(Geodetic(truth.lat, truth.lon, truth.alt), there).tolist()
+    north, east, _ = separation(Geodetic(truth.lat, truth.lon, truth.alt), there)
     return math.hypot(north, east)

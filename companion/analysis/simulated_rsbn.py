@@ -315,7 +315,7 @@ def ecef(lat: Floats, lon: Floats, alt: Floats) -> Floats:
 
 def sight_from(beacon: Geodetic, place: Floats) -> Sight:
     """Compute `nav.geometry.slant_range_azimuth` for many earth-centred positions (n, 3), with elevations."""
-    east, north, up = enu_axes(beacon.lat, beacon.lon) @ (place - to_ecef(beacon)).T
+    east, north, up = np.array(enu_axes(beacon.lat, beacon.lon)) @ (place - to_ecef(beacon)).T
     level = np.hypot(east, north)
     return Sight(np.arctan2(east, north) % math.tau, np.hypot(level, up), np.arctan2(up, level))
 

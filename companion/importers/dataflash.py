@@ -205,7 +205,7 @@ class MessageConverter:
                 v_n = (0.0, 0.0, 0.0)
             else:
                 moved = separation(Geodetic(lat, lon, m.Alt), Geodetic(last.lat, last.lon, last.alt))
-                north, east, down = (moved / ((t - last.t_ns) * 1e-9)).tolist()
+                north, east, down = (metres / ((t - last.t_ns) * 1e-9) for metres in moved)
                 v_n = north, east, down
         attitude = math.radians(m.Roll), math.radians(m.Pitch), math.radians(m.Yaw) % math.tau
         self._true = Truth(t, t, lat, lon, m.Alt, v_n, attitude)

@@ -2,8 +2,7 @@
 
 It knows the ellipsoid, not motion, time, sensors or errors. A geodetic position is
 `Geodetic(lat, lon, alt)`, radians and metres above WGS84; resulting longitudes are in [-pi, pi).
-Local vectors are numpy arrays of shape (3,), metres; functions named `_tuple` return plain numbers instead,
-ten times faster.
+Vectors are metres: plain numbers, ten times faster than arrays, except in the plane tangent at an origin.
 """
 
 import math
@@ -77,28 +76,8 @@ def wrap_angle(angle: float) -> float:
     return -math.pi if wrapped == math.pi else wrapped
 
 
-def to_ecef(point: Geodetic) -> Floats:
+def to_ecef(point: Geodetic) -> Triple:
     """Convert geodetic to ECEF coordinates.
-
-    Parameters
-    ----------
-    point : Geodetic
-        Position.
-
-    Returns
-    -------
-    (3,)
-        X, Y, Z, m.
-
-    References
-    ----------
-    Groves (2.112).
-    """
-    return np.array(ecef_tuple(point))
-
-
-def ecef_tuple(point: Geodetic) -> Triple:
-    """Convert geodetic to ECEF coordinates in plain numbers.
 
     Parameters
     ----------
@@ -109,6 +88,10 @@ def ecef_tuple(point: Geodetic) -> Triple:
     -------
     tuple of float
         X, Y, Z, m.
+
+    References
+    ----------
+    Groves (2.112).
     """
     lat, lon, alt = point
     R_E = radii(lat).R_E
@@ -159,7 +142,7 @@ def from_ecef(r_e: Floats) -> Geodetic:
     return Geodetic(2.0 * math.atan2(Z, D + hypot), wrap_angle(math.atan2(Y, X)), (k + E2 - 1.0) / k * hypot)
 
 
-def enu_axes(lat: float, lon: float) -> Floats:
+def enu_axes(lat: float, lon: float) -> tuple[Triple, Triple, Triple]:
     """Compute the east, north and up axes in ECEF.
 
     Parameters
@@ -169,24 +152,8 @@ def enu_axes(lat: float, lon: float) -> Floats:
 
     Returns
     -------
-    (3, 3)
-        C_e^enu; its rows are the axes.
-    """
-    return np.array(enu_axes_tuple(lat, lon))
-
-
-def enu_axes_tuple(lat: float, lon: float) -> tuple[Triple, Triple, Triple]:
-    """Compute the east, north and up axes in ECEF in plain numbers.
-
-    Parameters
-    ----------
-    lat, lon : float
-        Geodetic latitude and longitude, rad.
-
-    Returns
-    -------
-    tuple
-        East, north and up axis.
+    tuple of tuple of float
+        East, north and up axis: the rows of C_e^enu.
     """
     sl, cl, so, co = math.sin(lat), math.cos(lat), math.sin(lon), math.cos(lon)
     return (-so, co, 0.0), (-sl * co, -sl * so, cl), (cl * co, cl * so, sl)
@@ -205,8 +172,8 @@ def to_enu(point: Geodetic, origin: Geodetic) -> Floats:
     (3,)
         East, north, up, m.
     """
-    axes: Floats = enu_axes(origin.lat, origin.lon)
-    return axes @ (to_ecef(point) - to_ecef(origin))
+    away: Floats = np.subtract(to_ecef(point), to_ecef(origin))
+    return np.array(enu_axes(origin.lat, origin.lon)) @ away
 
 
 def from_enu(x_enu: Floats, origin: Geodetic) -> Geodetic:
@@ -224,7 +191,7 @@ def from_enu(x_enu: Floats, origin: Geodetic) -> Geodetic:
     Geodetic
         Position.
     """
-    return from_ecef(to_ecef(origin) + enu_axes(origin.lat, origin.lon).T @ x_enu)
+    return from_ecef(to_ecef(origin) + np.array(enu_axes(origin.lat, origin.lon)).T @ x_enu)
 
 
 def displace(lat: float, lon: float, alt: float, north: float, east: float, down: float) -> Geodetic:
@@ -253,26 +220,10 @@ def displace(lat: float, lon: float, alt: float, north: float, east: float, down
     )
 
 
-def separation(point: Geodetic, reference: Geodetic) -> Floats:
+def separation(point: Geodetic, reference: Geodetic) -> Triple:
     """Compute `point` minus `reference` in NED: the inverse of `displace` from `reference`.
 
     An error is computed minus true, so the error of the INS against a fix is `separation(ins, fix)`.
-
-    Parameters
-    ----------
-    point, reference : Geodetic
-        Positions.
-
-    Returns
-    -------
-    (3,)
-        North, east, down, m.
-    """
-    return np.array(separation_tuple(point, reference))
-
-
-def separation_tuple(point: Geodetic, reference: Geodetic) -> Triple:
-    """Compute `separation` in plain numbers.
 
     Parameters
     ----------

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from companion.nav import correctors
-from companion.nav.geometry import Geodetic, ecef_tuple, enu_axes, separation_tuple, wrap_angle
+from companion.nav.geometry import Geodetic, enu_axes, separation, to_ecef, wrap_angle
 from companion.navigator.corrected_ins import CorrectedIns, chain_state
 from companion.navigator.inertial_track import Point
 from companion.records import RangeDifference, SecondIns, StarFix, Vector2
@@ -46,10 +46,10 @@ def range_difference(
     channel: CorrectedIns, corrected: Point, centre: Vector2, record: RangeDifference
 ) -> CorrectorRows:
     """Line of position; `corrected` is the INS less its error `centre` (north, east, m)."""
-    here = np.array(ecef_tuple(corrected.position))
-    axes = enu_axes(corrected.position.lat, corrected.position.lon)
+    here = np.array(to_ecef(corrected.position))
+    axes = np.array(enu_axes(corrected.position.lat, corrected.position.lon))
     a, b = (
-        here - ecef_tuple(Geodetic(*station))
+        here - to_ecef(Geodetic(*station))
         for station in (
             (record.lat_a, record.lon_a, record.alt_a),
             (record.lat_b, record.lon_b, record.alt_b),
@@ -86,7 +86,7 @@ def second_ins(channel: CorrectedIns, point: Point, record: SecondIns) -> Correc
     """Position of the INS less that of a second one."""
     H = correctors.observation_matrix(channel.names, *correctors.second_ins(compared=("dx", "dy")))
     other = Geodetic(record.lat, record.lon, point.position.alt)
-    north, east, _ = separation_tuple(point.position, other)
+    north, east, _ = separation(point.position, other)
     kind = f"second INS {record.ins}"
     return CorrectorRows(np.array((north, east)), H, SECOND_NOISE_M**2 * np.eye(2), kind)
 

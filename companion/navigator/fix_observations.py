@@ -21,7 +21,7 @@ from companion.estimate.fusion import (
     Position,
     Range,
 )
-from companion.nav.geometry import Geodetic, Triple, ecef_tuple, enu_axes_tuple, from_enu, separation_tuple
+from companion.nav.geometry import Geodetic, Triple, enu_axes, from_enu, separation, to_ecef
 from companion.navigator.inertial_track import Point
 from companion.records import Gnss, RsbnFix, Source, Vector2
 from companion.units import Floats
@@ -43,7 +43,7 @@ def from_gnss(
 ) -> tuple[Observation, ...]:
     """A GNSS fix as a position about the nominal point less the error `centre` (north, east, m)."""
     sigma = _stated(record, settings)
-    north, east, _ = separation_tuple(Geodetic(record.lat, record.lon, record.alt_msl), nominal.position)
+    north, east, _ = separation(Geodetic(record.lat, record.lon, record.alt_msl), nominal.position)
     place = (east + centre[1], north + centre[0])
     return (Position(place, ((sigma**2, 0.0), (0.0, sigma**2))),)
 
@@ -89,8 +89,8 @@ def from_rsbn(record: RsbnFix, ins: Point, settings: RsbnConfig) -> tuple[Azimut
     """
     here = ins.position
     (x, y, z), axes_beacon = _on_earth(record.lat, record.lon, record.alt)
-    x_0, y_0, z_0 = ecef_tuple(here)
-    axes = enu_axes_tuple(here.lat, here.lon)
+    x_0, y_0, z_0 = to_ecef(here)
+    axes = enu_axes(here.lat, here.lon)
     place = _times(axes, (x - x_0, y - y_0, z - z_0))
     displaced = displaced_sigma(math.hypot(*ins.v_n[:2]))
     observations: list[Azimuth | Range] = []
@@ -125,7 +125,7 @@ def in_cone_of_silence(z: Azimuth, distance: float | None) -> bool:
 @lru_cache(maxsize=64)
 def _on_earth(lat: float, lon: float, alt: float) -> tuple[Triple, tuple[Triple, Triple, Triple]]:
     """Of a beacon, which stays where it is: ECEF position and axes east, north, up."""
-    return ecef_tuple(Geodetic(lat, lon, alt)), enu_axes_tuple(lat, lon)
+    return to_ecef(Geodetic(lat, lon, alt)), enu_axes(lat, lon)
 
 
 def _times(C: tuple[Triple, Triple, Triple], v: Triple) -> Triple:

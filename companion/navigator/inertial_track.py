@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from companion.nav.geometry import Geodetic, Projection, local_to_geodetic, separation_tuple
+from companion.nav.geometry import Geodetic, Projection, local_to_geodetic, separation
 from companion.records import LocalOrigin, LocalPosition, Vector3
 
 JUMP_M = 5.0  # a step beyond what velocity explains, allowing for JUMP_ACCELERATION
@@ -39,7 +39,7 @@ def beyond(before: Point, after: Point) -> Vector3:
     refer to it, is a step and its return, and moves nothing in the end.
     """
     dt = (after.t_ns - before.t_ns) * 1e-9
-    moved = separation_tuple(after.position, before.position)
+    moved = separation(after.position, before.position)
     north, east, down = (s - 0.5 * (v + w) * dt for s, v, w in zip(moved, before.v_n, after.v_n, strict=True))
     return north, east, down
 

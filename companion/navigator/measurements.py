@@ -16,7 +16,7 @@ import numpy as np
 from companion.estimate import bank as banks
 from companion.estimate.bank import Bank, Innovation
 from companion.estimate.fusion import Azimuth, Range
-from companion.nav.geometry import Geodetic, separation_tuple, wrap_angle
+from companion.nav.geometry import Geodetic, separation, wrap_angle
 from companion.navigator import fix_observations, own_error_model
 from companion.navigator.channel import Channel
 from companion.navigator.corrector_measurements import CorrectorRows
@@ -108,7 +108,7 @@ def other_receiver(bank: Bank, channel: Channel) -> Bank:
 
 def gnss_apart(record: Gnss, nominal: Point) -> Vector2:
     """Return the position of a fix less the nominal one, north and east (m)."""
-    north, east, _ = separation_tuple(Geodetic(record.lat, record.lon, record.alt_msl), nominal.position)
+    north, east, _ = separation(Geodetic(record.lat, record.lon, record.alt_msl), nominal.position)
     return north, east
 
 

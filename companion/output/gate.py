@@ -32,7 +32,7 @@ from typing import NamedTuple
 
 from companion.estimate.bank.settings import DEFAULT
 from companion.link.dialect import Message
-from companion.nav.geometry import Geodetic, displace, separation_tuple, wrap_angle
+from companion.nav.geometry import Geodetic, displace, separation, wrap_angle
 from companion.records import Event, Mode, Severity, Solution, Trust, Vector3
 from companion.units import SECOND_NS
 
@@ -176,7 +176,7 @@ class Gate:
 
     def _begin_at(self, own: Geodetic, here: Position, near: float) -> None:
         """Begin the steps at the autopilot's own position, if it is within `near` of the last one sent, m."""
-        north, east, _ = separation_tuple(own, Geodetic(here.lat, here.lon, here.alt_msl))
+        north, east, _ = separation(own, Geodetic(here.lat, here.lon, here.alt_msl))
         if math.hypot(north - self._left_n[0], east - self._left_n[1]) <= near:
             self._left_n = north, east
 
@@ -198,7 +198,7 @@ def _jump(last: Position, here: Position, dt: float) -> tuple[float, float]:
     """Return `here` from the last position propagated by the mean velocity, m north, east."""
     (v_n, v_e, _), (w_n, w_e, _) = last.v_n, here.v_n
     place = Geodetic(last.lat, last.lon, last.alt_msl)
-    north, east, _ = separation_tuple(Geodetic(here.lat, here.lon, here.alt_msl), place)
+    north, east, _ = separation(Geodetic(here.lat, here.lon, here.alt_msl), place)
     return north - 0.5 * (v_n + w_n) * dt, east - 0.5 * (v_e + w_e) * dt
 
 
@@ -219,7 +219,7 @@ class LocalFrame:
         before, sent = self._last or (position, message)
         is_recent = position.t_ns - before.t_ns <= LOCAL_RECENT_NS
         if is_recent and sent.reset_counter == message.reset_counter:
-            north, east, _ = separation_tuple(
+            north, east, _ = separation(
                 Geodetic(position.lat, position.lon, position.alt_msl),
                 Geodetic(before.lat, before.lon, before.alt_msl),
             )

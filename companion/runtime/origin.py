@@ -17,7 +17,7 @@ import math
 from typing import NamedTuple
 
 from companion.link.dialect import mavlink
-from companion.nav.geometry import Geodetic, Projection, separation_tuple
+from companion.nav.geometry import Geodetic, Projection, separation
 from companion.navigator.local_origin import LIVE_WINDOW_NS, infer_origin
 from companion.records import (
     Event,
@@ -133,5 +133,5 @@ class OriginCheck:
 
 def _apart(a: LocalOrigin, b: LocalOrigin) -> float:
     """Return the horizontal distance of two origins, m."""
-    north, east, _ = separation_tuple(Geodetic(a.lat, a.lon, a.alt_msl), Geodetic(b.lat, b.lon, b.alt_msl))
+    north, east, _ = separation(Geodetic(a.lat, a.lon, a.alt_msl), Geodetic(b.lat, b.lon, b.alt_msl))
     return math.hypot(north, east)

@@ -10,7 +10,7 @@ import pytest
 from msgspec import structs
 
 from companion.config import Config, InertialConfig
-from companion.nav.geometry import Geodetic, displace, ecef_tuple
+from companion.nav.geometry import Geodetic, displace, to_ecef
 from companion.navigator import corrector_measurements as measured
 from companion.navigator.channel import Nominal
 from companion.navigator.corrected_ins import CorrectedIns, corrected_ins
@@ -71,8 +71,8 @@ def test_transition_is_that_of_the_ins_and_of_wandering_biases() -> None:
 @pytest.mark.parametrize("centre", [(0.0, 0.0), (350.0, -200.0)])
 def test_line_of_position_of_a_displaced_ins(centre: tuple[float, float]) -> None:
     model = channel()
-    here = np.array(ecef_tuple(TRUE))
-    d = [float(np.linalg.norm(here - ecef_tuple(Geodetic(*place)))) for place in (MASTER, SECONDARY)]
+    here = np.array(to_ecef(TRUE))
+    d = [float(np.linalg.norm(here - to_ecef(Geodetic(*place)))) for place in (MASTER, SECONDARY)]
     record = RangeDifference(0, 0, 1, *MASTER, *SECONDARY, d[0] - d[1] + 70.0, 50.0)
     point = ins()
     corrected = point._replace(position=displace(*point.position, -centre[0], -centre[1], 0.0))
