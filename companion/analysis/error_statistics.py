@@ -51,11 +51,11 @@ class PhaseErrors(NamedTuple):
     seconds: float
     rms: dict[str, float]
     p95: dict[str, float]
-    bound: float | None
-    share: float | None
-    held: bool | None
-    inside: float | None
-    inside_twice: float | None
+    bound: float | None = None
+    share: float | None = None
+    held: bool | None = None
+    inside: float | None = None
+    inside_twice: float | None = None
     expected: float | None = None
 
     @property
@@ -151,40 +151,28 @@ def summarize_phases(found: dict[str, ErrorSeries], phases: Sequence[FlightPhase
 def _summarize_phase(
     found: dict[str, ErrorSeries], phase: FlightPhase, starting_sources: set[str]
 ) -> PhaseErrors:
-    rms, p95 = {}, {}
-    compared: _Compared | None = None
-    expected = None
+    row = PhaseErrors(phase.name, (phase.end_ns - phase.start_ns) * 1e-9, {}, {})
     for source, e in found.items():
         end_ns = phase.end_ns - PHASE_START_DELAY_NS * (source in starting_sources)
         within = (e.t_ns >= phase.start_ns) & (e.t_ns < end_ns)
         if not within.any():
             continue
         error = e.error[within]
-        rms[source] = root_mean_square(error)
-        p95[source] = float(np.percentile(error, 95.0))
+        row.rms[source] = root_mean_square(error)
+        row.p95[source] = float(np.percentile(error, 95.0))
         if np.isfinite(e.bound[within]).any():
-            compared = _compare_with_bound(error, e.bound[within], e.claimed[within])
+            row = _with_bound(row, error, e.bound[within], e.claimed[within])
         if np.isfinite(e.claimed[within]).any():
-            expected = float(np.sqrt(np.nanmean(e.claimed[within] ** 2)))
-    seconds = (phase.end_ns - phase.start_ns) * 1e-9
-    bounds = compared or _Compared(None, None, None, None, None)
-    return PhaseErrors(phase.name, seconds, rms, p95, *bounds, expected)
+            row = row._replace(expected=float(np.sqrt(np.nanmean(e.claimed[within] ** 2))))
+    return row
 
 
-class _Compared(NamedTuple):
-    bound: float | None
-    share: float | None
-    held: bool | None
-    inside: float | None
-    inside_twice: float | None
-
-
-def _compare_with_bound(error: Floats, bound: Floats, claimed: Floats) -> _Compared:
+def _with_bound(row: PhaseErrors, error: Floats, bound: Floats, claimed: Floats) -> PhaseErrors:
     known = np.isfinite(bound)
     error, bound, claimed = error[known], bound[known], claimed[known]
-    bound_rms = root_mean_square(bound)
+    row = row._replace(bound=(bound_rms := root_mean_square(bound)))
     if np.mean((bound > LIMIT_M) | (bound > USEFUL * claimed)) > 0.5:
-        return _Compared(bound_rms, None, None, None, None)
-    share = root_mean_square(error) / bound_rms
+        return row
     inside, twice = (float(np.mean(error <= k * bound)) for k in (1.0, 2.0))
-    return _Compared(bound_rms, share, inside == 1.0, inside, twice)
+    share = root_mean_square(error) / bound_rms
+    return row._replace(share=share, held=inside == 1.0, inside=inside, inside_twice=twice)
