@@ -32,7 +32,6 @@ from companion.analysis.summary import (
 REJECTED_S = 10.0  # fixes rejected for longer are worth a look
 
 Level = Literal["good", "caution", "fault"]
-WORDS: dict[Level, str] = {"good": "Good", "caution": "Caution", "fault": "Fault"}
 
 
 class Verdict(NamedTuple):
@@ -46,7 +45,7 @@ class Verdict(NamedTuple):
     @property
     def word(self) -> str:
         """The level as the user reads it."""
-        return WORDS[self.level]
+        return self.level.capitalize()
 
 
 def judge_flight(a: Assessment) -> Verdict:
