@@ -7,7 +7,7 @@ show how the result depends on that.
 """
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -107,43 +107,33 @@ class FilterResult(NamedTuple):
 def minimax(model: Example, flights: Flights) -> FilterResult:
     """Run the Kalman filter with the greatest noise within the bounds."""
     Q = kalman.minimax_noise(model.B, model.C, model.Q)
-    x, P = np.broadcast_to(model.x0, flights.x.shape[1:]), model.P0
-    steps = []
-    for z in flights.z:
-        now = kalman.step(x, P, z, model.A, Q, model.H, model.R)
-        x, P = now.x, now.P
-        steps.append((x, None, P))
-    return _collect_result(flights, steps)
+    return _run(model, flights, model.P0, lambda x, P, z: kalman.step(x, P, z, model.A, Q, model.H, model.R))
 
 
 def r1(model: Example, flights: Flights) -> FilterResult:
     """Run the restrictive filter; every flight has its own covariance."""
-    runs, n = flights.x.shape[1:]
-    x, P = np.broadcast_to(model.x0, (runs, n)), np.broadcast_to(model.P0, (runs, n, n))
-
-    def steps() -> Iterator[tuple[Floats, Floats | None, Floats]]:
-        nonlocal x, P
-        for z in flights.z:
-            now = restrictive.step(x, P, z, model.A, model.B, model.Q, model.H, model.R, model.C)
-            x, P = now.x, now.P
-            yield x, now.u, P
-
-    return _collect_result(flights, steps())
+    P0 = np.broadcast_to(model.P0, (flights.x.shape[1], *model.P0.shape))
+    terms = model.A, model.B, model.Q, model.H, model.R, model.C
+    return _run(model, flights, P0, lambda x, P, z: restrictive.step(x, P, z, *terms))
 
 
-def _collect_result(flights: Flights, steps: Any) -> FilterResult:
-    """Collect the estimates, and the NEES by state after the first hour, when all variances have grown."""
-    settled = SAMPLES // 6
-    x, u, by_state, whole = [], [], [], []
-    for t, (x_t, u_t, P_t) in enumerate(steps):
-        x.append(x_t)
-        u.append(u_t)
-        if t >= settled and t % 10 == 0:
-            error = x_t - flights.x[t]
-            by_state.append((error**2 / np.diagonal(P_t, axis1=-2, axis2=-1)).mean(0))
-            whole.append(kalman.nees(error, P_t).mean() / error.shape[-1])
-    inputs = None if u[0] is None else np.array(u)
-    return FilterResult(np.array(x), inputs, np.mean(by_state, 0), float(np.mean(whole)))
+def _run(
+    model: Example, flights: Flights, P: Floats, step: Callable[[Floats, Floats, Floats], Any]
+) -> FilterResult:
+    """Run a filter; the NEES is from after the first hour, when all variances have grown."""
+    x = np.broadcast_to(model.x0, flights.x.shape[1:])
+    estimates, inputs, by_state, whole = [], [], [], []
+    for t, z in enumerate(flights.z):
+        now = step(x, P, z)
+        x, P = now.x, now.P
+        estimates.append(x)
+        inputs.append(getattr(now, "u", None))
+        if t >= SAMPLES // 6 and t % 10 == 0:
+            error = x - flights.x[t]
+            by_state.append((error**2 / np.diagonal(P, axis1=-2, axis2=-1)).mean(0))
+            whole.append(kalman.nees(error, P).mean() / error.shape[-1])
+    u = None if inputs[0] is None else np.array(inputs)
+    return FilterResult(np.array(estimates), u, np.mean(by_state, 0), float(np.mean(whole)))
 
 
 def study(
