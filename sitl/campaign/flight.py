@@ -28,6 +28,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from msgspec.structs import replace
 
 from companion.config import Config, InertialConfig
 from companion.navigator import Navigator
@@ -304,7 +305,7 @@ def fly_bytes(scenario: Scenario, config: Config) -> tuple[World, list[Stamped]]
     )
     kinds = Solution, Rejection, Reset, Event
     outputs = [r for r in flown.records if isinstance(r, kinds)]
-    return flown.autopilot.world, [_at_flight_time(r) for r in outputs]
+    return flown.autopilot.world, [replace(r, t_ns=r.t_ns - loopback.START_NS) for r in outputs]
 
 
 def _disk_faults(scenario: Scenario) -> list[Fault]:
@@ -336,11 +337,6 @@ def _fly_logged(scenario: Scenario, config: Config) -> loopback.LoopbackFlight:
         if not log.close() or log.dropped:
             raise OSError(f"the log lost {log.dropped} messages: {log.trouble or 'full for too long'}")
     return flown
-
-
-def _at_flight_time(record: Stamped) -> Stamped:
-    fields = {name: getattr(record, name) for name in record.__struct_fields__}
-    return type(record)(**{**fields, "t_ns": record.t_ns - loopback.START_NS})
 
 
 def score_flight(order: FlightOrder, world: World, outputs: Sequence[Stamped]) -> FlightResult:
