@@ -35,7 +35,7 @@ from companion.runtime.core import CompanionCore
 from companion.storage.deferred_log import NoLog
 from sitl.autopilot import SimulatedAutopilot
 from sitl.endurance.fuzz_targets import make_frame
-from sitl.endurance.parameter_sweep import CONFIGS, recorded_flight, settings
+from sitl.endurance.parameter_sweep import CONFIGS, param_set, recorded_flight, settings
 from sitl.loopback import LINK, START_NS
 from sitl.scenarios import get_scenario
 
@@ -44,7 +44,6 @@ SETTLE_S, START_S = 8.0, 60.0
 REQUEST_INTERVAL_S = 0.05
 BATCH_S = 0.005
 BOOT_S = 37.25  # of the simulated autopilot at its start
-OURS = {"target_system": 1, "target_component": 191}
 
 
 class Attack(NamedTuple):
@@ -83,9 +82,7 @@ _SETTINGS = tuple(settings())
 
 
 def _param_set(number: int, boot_us: int) -> bytes:
-    setting = _SETTINGS[number * 31 % len(_SETTINGS)]
-    message = dialect.new("PARAM_SET", param_id=setting.name, param_value=setting.value, param_type=9, **OURS)
-    return frame.encode(message, number & 0xFF, 255, 190)
+    return param_set(_SETTINGS[number * 31 % len(_SETTINGS)], number)
 
 
 def _origin(number: int, boot_us: int) -> bytes:

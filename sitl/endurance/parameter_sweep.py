@@ -63,15 +63,15 @@ def settings() -> Iterator[Setting]:
 
 
 @lru_cache
-def recorded_flight(own_ins: bool, duration_s: float = FLIGHT_S) -> tuple[tuple[int, bytes], ...]:
+def recorded_flight(own_ins: bool) -> tuple[tuple[int, bytes], ...]:
     """Fly once and return the autopilot's frames with their arrival times, the GNSS lost at OUTAGE_S."""
     scenario = dataclasses.replace(
-        get_scenario("short"), gnss_outages=((OUTAGE_S, 10 * duration_s),), rsbn_outages=()
+        get_scenario("short"), gnss_outages=((OUTAGE_S, 10 * FLIGHT_S),), rsbn_outages=()
     )
     autopilot = SimulatedAutopilot(scenario, START_NS)
     core = CompanionCore(CONFIGS[0 if own_ins else 1], ValidatingLog(), (LINK,))
     frames, now = list[tuple[int, bytes]](), START_NS
-    while now <= START_NS + round(duration_s * 1e9):
+    while now <= START_NS + round(FLIGHT_S * 1e9):
         for data in autopilot.poll(now):
             frames.append((now, data))
             core.receive(LINK, data, now)
@@ -96,7 +96,7 @@ def fly_with(config: Config, chosen: Iterable[Setting]) -> int:
         if pending and now >= due:
             setting = pending.pop(0)
             due = now + SECOND_NS
-            core.receive(LINK, _param_set(setting, number), now)
+            core.receive(LINK, param_set(setting, number), now)
             after = core.config
             changed += after != before
             before = after
@@ -105,7 +105,8 @@ def fly_with(config: Config, chosen: Iterable[Setting]) -> int:
     return changed
 
 
-def _param_set(setting: Setting, sequence: int) -> bytes:
+def param_set(setting: Setting, sequence: int) -> bytes:
+    """Return the frame of a ground station that sets one parameter."""
     message = dialect.new(
         "PARAM_SET",
         target_system=1,
