@@ -112,7 +112,12 @@ def read_mutants(name: str, count: int, seed: int, keep: Path | None = None) -> 
     with tempfile.TemporaryDirectory(dir="/dev/shm" if Path("/dev/shm").is_dir() else None) as scratch:
         for number in range(count):
             data = mutate(original, rng)
-            outcome, seconds, text = _outcome(read, Path(scratch), file_name, data)
+            path = Path(scratch) / file_name
+            path.write_bytes(data)
+            # a topic is read by its folder
+            outcome, seconds, text = _outcome(read, path.parent if ".csv" in file_name else path)
+            for left in path.parent.iterdir():
+                left.unlink()
             tally[outcome] += 1
             slowest = max(slowest, seconds)
             if outcome == "defects":
@@ -124,40 +129,23 @@ def read_mutants(name: str, count: int, seed: int, keep: Path | None = None) -> 
     return MutantReport(name, count, **tally, slowest_s=slowest, peak_mb=peak, first_defect=first)
 
 
-def _outcome(read: Callable[[Path], None], scratch: Path, name: str, data: bytes) -> tuple[str, float, str]:
+def _outcome(read: Callable[[Path], None], path: Path) -> tuple[str, float, str]:
     """Return "read", "rejected" or "defects", the processor time and what was wrong."""
-    with _files(scratch, name, data) as path:
-        start = time.process_time()
-        signal.setitimer(signal.ITIMER_VIRTUAL, SLOWEST_S)
-        try:
-            read(path)
-        except LogError as error:
-            outcome, text = ("defects", str(error)) if "\n" in str(error) else ("rejected", "")
-        except _TooSlow:
-            outcome, text = "defects", f"took more than {SLOWEST_S:g} s"
-        except Exception as error:
-            outcome, text = "defects", f"{type(error).__name__}: {error}"
-        else:
-            outcome, text = "read", ""
-        finally:
-            signal.setitimer(signal.ITIMER_VIRTUAL, 0.0)
-        return outcome, time.process_time() - start, text
-
-
-class _files:
-    """The mutant as a file in a folder of its own, which it leaves empty; a topic is read by its folder."""
-
-    def __init__(self, scratch: Path, name: str, data: bytes) -> None:
-        self._folder = scratch
-        self._path = scratch / name
-        self._path.write_bytes(data)
-
-    def __enter__(self) -> Path:
-        return self._folder if ".csv" in self._path.name else self._path
-
-    def __exit__(self, *reason: object) -> None:
-        for path in self._folder.iterdir():
-            path.unlink()
+    start = time.process_time()
+    signal.setitimer(signal.ITIMER_VIRTUAL, SLOWEST_S)
+    try:
+        read(path)
+    except LogError as error:
+        outcome, text = ("defects", str(error)) if "\n" in str(error) else ("rejected", "")
+    except _TooSlow:
+        outcome, text = "defects", f"took more than {SLOWEST_S:g} s"
+    except Exception as error:
+        outcome, text = "defects", f"{type(error).__name__}: {error}"
+    else:
+        outcome, text = "read", ""
+    finally:
+        signal.setitimer(signal.ITIMER_VIRTUAL, 0.0)
+    return outcome, time.process_time() - start, text
 
 
 def _run_inside(name: str, count: int, seed: int, keep: Path, results: multiprocessing.Queue) -> None:  # type: ignore[type-arg]
