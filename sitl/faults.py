@@ -216,37 +216,27 @@ def per_record(change: RecordChange) -> Callable[[Sequence[R], Fault, float, Gen
     return stream_fault
 
 
-def repeat_last(stream: Sequence[R], fault: Fault, size: float, rng: Generator) -> list[R]:
-    """Repeat the last record before the window, with its own stamp."""
-    return _replace_in_window(
-        stream, fault, lambda last, record: replace(last, t_ns=record.t_ns, rx_ns=record.rx_ns)
-    )
+def repeat_last(*stamps: str) -> Callable[[Sequence[R], Fault, float, Generator], list[R]]:
+    """Return the stream fault that repeats the last record before the window, of the same beacon.
 
+    Times advance, and the receiver's own stamp if `stamps` names it; an air-data message has none, so it
+    looks new.
+    """
 
-def repeat_last_with_new_stamp(
-    stream: Sequence[Gnss], fault: Fault, size: float, rng: Generator
-) -> list[Gnss]:
-    """Repeat the last fix before the window with advancing stamps."""
-    return _replace_in_window(
-        stream,
-        fault,
-        lambda last, due: replace(last, t_ns=due.t_ns, rx_ns=due.rx_ns, stamp_us=due.stamp_us),
-    )
+    def stream_fault(stream: Sequence[R], fault: Fault, size: float, rng: Generator) -> list[R]:
+        out: list[R] = []
+        last: dict[int | None, R] = {}
+        for record in stream:
+            source = getattr(record, "beacon", None)
+            if fault.covers(record.t_ns):
+                new = {name: getattr(record, name) for name in ("t_ns", "rx_ns", *stamps)}
+                out.append(replace(last.setdefault(source, record), **new))
+            else:
+                last[source] = record
+                out.append(record)
+        return out
 
-
-def _replace_in_window(stream: Sequence[R], fault: Fault, again: Callable[[R, R], R]) -> list[R]:
-    """Replace records in the window by `again(last before it of the same beacon, record due)`."""
-    out: list[R] = []
-    last: dict[int | None, R] = {}
-    for record in stream:
-        source = getattr(record, "beacon", None)
-        if fault.covers(record.t_ns):
-            # an air-data message has no stamp, so it looks new; a fix keeps the receiver's stamp
-            out.append(again(last.setdefault(source, record), record))
-        else:
-            last[source] = record
-            out.append(record)
-    return out
+    return stream_fault
 
 
 def delayed(stream: Sequence[R], fault: Fault, size: float, rng: Generator) -> list[R]:
@@ -302,22 +292,22 @@ RECORD_FAULTS: dict[str, RecordFault] = {
     "gnss-latency": RecordFault(Gnss, 0.2, stamped_late),
     "gnss-lever-arm": RecordFault(Gnss, 5.0, lever_arm),
     "gnss-jam": RecordFault(Gnss, 0.0, per_record(gnss_jam)),
-    "gnss-frozen": RecordFault(Gnss, 0.0, repeat_last),
-    "gnss-stale": RecordFault(Gnss, 0.0, repeat_last_with_new_stamp),
+    "gnss-frozen": RecordFault(Gnss, 0.0, repeat_last()),
+    "gnss-stale": RecordFault(Gnss, 0.0, repeat_last("stamp_us")),
     "gnss-late": RecordFault(Gnss, 5.0, delayed),
     "beacon-bias": RecordFault(RsbnFix, 1000.0, per_record(beacon_bias)),
     "beacon-position": RecordFault(RsbnFix, 3000.0, per_record(beacon_position)),
     "beacon-north": RecordFault(RsbnFix, math.radians(2.0), per_record(beacon_north)),
     "beacon-multipath": RecordFault(RsbnFix, 1500.0, per_record(multipath)),
     "beacon-drop-out": RecordFault(RsbnFix, 0.5, per_record(drop_out)),
-    "beacon-frozen": RecordFault(RsbnFix, 0.0, repeat_last),
+    "beacon-frozen": RecordFault(RsbnFix, 0.0, repeat_last()),
     "beacon-late": RecordFault(RsbnFix, 5.0, delayed),
     "ins-reset": RecordFault(LocalPosition, 200.0, per_record(ins_reset)),
     "ins-drift": RecordFault(LocalPosition, 1.0, per_record(ins_drift)),
-    "ins-frozen": RecordFault(LocalPosition, 0.0, repeat_last),
+    "ins-frozen": RecordFault(LocalPosition, 0.0, repeat_last()),
     "ins-nan": RecordFault(LocalPosition, 0.0, per_record(nan_fields)),
     "airspeed-icing": RecordFault(AirData, 0.5, per_record(icing)),
-    "airspeed-frozen": RecordFault(AirData, 0.0, repeat_last),
+    "airspeed-frozen": RecordFault(AirData, 0.0, repeat_last()),
     "pitot-stuck": RecordFault(AirData, 8.0, per_record(pitot_stuck)),
     "pitot-scale": RecordFault(AirData, 1.5, per_record(pitot_scale)),
     "heading-off": RecordFault(Attitude, math.radians(5.0), per_record(heading_off)),
