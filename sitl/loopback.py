@@ -145,10 +145,7 @@ def truth_function(autopilot: SimulatedAutopilot) -> error_statistics.TruthAt:
 def error_table(flown: LoopbackFlight) -> list[error_statistics.PhaseErrors]:
     """Compute the error table. A phase with fixes starts at the first solution after its first fix."""
     found = error_statistics.horizontal_errors(flown.records, truth_function(flown.autopilot))
-    phases = flown.autopilot.scenario.phases()
-    return error_statistics.summarize_phases(
-        found, [_from_first_fix(phase, flown.records) for phase in phases]
-    )
+    return error_statistics.summarize_phases(found, _phases(flown))
 
 
 class OwnPhase(NamedTuple):
@@ -184,12 +181,9 @@ class PhaseProtection(NamedTuple):
         return self.inside == 1.0
 
 
-def protection_table(
-    flown: LoopbackFlight, rows: Sequence[error_statistics.PhaseErrors]
-) -> list[PhaseProtection | None]:
-    """Compute the protection level of each phase of `rows`; None where there is no solution."""
+def protection_table(flown: LoopbackFlight) -> list[PhaseProtection | None]:
+    """Compute the protection level of each phase of `error_table`; None where there is no solution."""
     truth = truth_function(flown.autopilot)
-    phases = [_from_first_fix(phase, flown.records) for phase in flown.autopilot.scenario.phases()]
     solutions = [r for r in flown.records if isinstance(r, Solution) and r.protection is not None]
     t_ns = np.array([r.t_ns for r in solutions], dtype=np.int64)
     levels = np.array([r.protection for r in solutions], dtype=np.float64)
@@ -197,13 +191,17 @@ def protection_table(
     apart = (separation(place, true) for place, r in zip(places, solutions) if (true := truth(r.t_ns)))
     errors = np.array([math.hypot(north, east) for north, east, _ in apart], dtype=np.float64)
     found: list[PhaseProtection | None] = []
-    for phase, _ in zip(phases, rows, strict=True):
+    for phase in _phases(flown):
         within = (t_ns >= phase.start_ns) & (t_ns < phase.end_ns)
         inside = errors[within] <= levels[within]
         found.append(
             PhaseProtection(float(np.median(levels[within])), float(inside.mean())) if len(inside) else None
         )
     return found
+
+
+def _phases(flown: LoopbackFlight) -> list[error_statistics.FlightPhase]:
+    return [_from_first_fix(phase, flown.records) for phase in flown.autopilot.scenario.phases()]
 
 
 def _from_first_fix(phase: SchedulePhase, records: Iterable[Stamped]) -> error_statistics.FlightPhase:
@@ -287,7 +285,7 @@ def command(
         summary = {"log": str(log.path), "seconds": seconds, "times_real_time": rate}
         phases = [
             row._asdict() | {"protection": level._asdict() | {"held": level.held} if level else None}
-            for row, level in zip(rows, protection_table(flown, rows), strict=True)
+            for row, level in zip(rows, protection_table(flown), strict=True)
         ]
         own = [row._asdict() for row in own_table(flown.autopilot)]
         click.echo(json.dumps({**summary, "phases": phases, "own": own}))
@@ -302,10 +300,6 @@ def _metres(value: float | None) -> str:
     if value is None:
         return "-"
     return f"{value:.1f}" if abs(value) < 100.0 else f"{value:.0f}"
-
-
-def _unless_held(held: bool) -> str:
-    return "" if held else " NO"
 
 
 def _bound(row: error_statistics.PhaseErrors) -> str:
@@ -337,10 +331,10 @@ def _print_table(flown: LoopbackFlight, rows: list[error_statistics.PhaseErrors]
     names = (source.replace(" ", "\n") for source in sources)
     heads = "phase", "min", *names, "expected", "95 %", "protected", "bound"
     table = number_table(f"{scenario.name}: horizontal error, r.m.s. [m]", *heads)
-    for row, level in zip(rows, protection_table(flown, rows), strict=True):
+    for row, level in zip(rows, protection_table(flown), strict=True):
         cells = [_metres(row.rms.get(source)) for source in sources]
         percentile = _metres(row.p95.get(error_statistics.CORRECTED))
-        protected = "-" if level is None else _metres(level.level) + _unless_held(level.held)
+        protected = "-" if level is None else _metres(level.level) + ("" if level.held else " NO")
         bound = _bound(row)
         table.add_row(
             row.phase,
