@@ -18,15 +18,13 @@ from rich.console import Console
 from rich.progress import track
 
 from companion.config import Config, OutputConfig
-from companion.navigator import Navigator
-from companion.navigator.hypotheses import Model
-from companion.records import Solution
 from companion.tables import number_table, print_tables
 from companion.units import Floats
 from sitl.campaign.flight import UNITS
 from sitl.correctors import RECORDS
 from sitl.scenarios import get_scenario
 from sitl.smoothing_study import simulated_gusts
+from sitl.weights_study import navigate
 from sitl.world import World
 
 NAMES = ("none", "airspeed", *RECORDS)
@@ -52,13 +50,7 @@ def fly(world: World, bank: bool = True) -> CorrectedFlight:
     scenario = world.scenario
     unit = structs.replace(UNITS[scenario.grade], independent=True, correctors=scenario.correctors)
     config = Config(inertial=unit, air_data=simulated_gusts(scenario), output=OutputConfig(solution_hz=1.0))
-    navigator = Navigator(config, None if bank else Model(config, plain=0))
-    found = [
-        output
-        for record in world.records()
-        for output in navigator.handle(record)  # type: ignore[arg-type]
-        if isinstance(output, Solution)
-    ]
+    found = navigate(world.records(), config, bank)
     t, error = world.horizontal_errors(found)
     sigma = np.sqrt([s.covariance[0] + s.covariance[3] for s in found])
     return CorrectedFlight(t, error, sigma, np.array([s.protection or math.inf for s in found]))

@@ -81,18 +81,23 @@ def restated(records: Iterable[Stamped], source: str, factor: float) -> Iterable
             yield record
 
 
+def navigate(records: Iterable[Stamped], config: Config, bank: bool) -> list[Solution]:
+    """Return the solutions of the bank of hypotheses, or without `bank` of a single Kalman filter."""
+    navigator = Navigator(config, None if bank else Model(config, plain=0))
+    return [
+        output
+        for record in records
+        for output in navigator.handle(record)  # type: ignore[arg-type]
+        if isinstance(output, Solution)
+    ]
+
+
 def fly(world: World, source: str, factor: float, bank: bool) -> FlownError:
     """Navigate the records of a world with one source's sigma misstated; solutions once a second."""
     scenario = world.scenario
     inertial = structs.replace(UNITS[scenario.grade], independent=True)
     config = stated(Config(inertial=inertial, output=OutputConfig(solution_hz=1.0)), source, factor)
-    navigator = Navigator(config, None if bank else Model(config, plain=0))
-    found = [
-        output
-        for record in restated(world.records(), source, factor)
-        for output in navigator.handle(record)  # type: ignore[arg-type]
-        if isinstance(output, Solution)
-    ]
+    found = navigate(restated(world.records(), source, factor), config, bank)
     t, error = world.horizontal_errors(found)
     phases = [error[(t >= phase.start_s) & (t < phase.end_s)] for phase in scenario.phases()]
     return FlownError(
