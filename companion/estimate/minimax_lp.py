@@ -94,42 +94,6 @@ class LeastSquares(NamedTuple):
     worst: float
 
 
-def worst_case_rms(weights: npt.ArrayLike, sigmas: npt.ArrayLike) -> float:
-    """Compute the r.m.s. error of w . z under the worst correlation, rho = +-sigma sign w.
-
-    Parameters
-    ----------
-    weights : (n,)
-        Weights w.
-    sigmas : (n,) or float
-        R.m.s. errors of the measurements.
-
-    Returns
-    -------
-    float
-        sum sigma |w|.
-    """
-    return float(np.sum(np.abs(np.asarray(weights) * np.asarray(sigmas))))
-
-
-def white_noise_rms(weights: npt.ArrayLike, sigmas: npt.ArrayLike) -> float:
-    """Compute the r.m.s. error of w . z under uncorrelated errors.
-
-    Parameters
-    ----------
-    weights : (n,)
-        Weights w.
-    sigmas : (n,) or float
-        R.m.s. errors of the measurements.
-
-    Returns
-    -------
-    float
-        sqrt(sum sigma^2 w^2).
-    """
-    return float(np.linalg.norm(np.asarray(weights) * np.asarray(sigmas)))
-
-
 def solve(
     rows: npt.ArrayLike, target: npt.ArrayLike, sigmas: npt.ArrayLike, start: Sequence[int] | None = None
 ) -> Minimax:

@@ -14,7 +14,7 @@ from scipy.linalg import expm
 from scipy.optimize import linprog
 
 from companion.estimate.minimax import closed_form, closed_form_tau, continuous_tau
-from companion.estimate.minimax_lp import Infeasible, least_squares, solve, white_noise_rms, worst_case_rms
+from companion.estimate.minimax_lp import Infeasible, least_squares, solve
 from companion.estimate.schuler import (
     ARCSECOND,
     DEG_PER_HOUR,
@@ -28,6 +28,15 @@ from companion.estimate.schuler import (
 REFERENCE = json.loads((Path(__file__).parents[1] / "data" / "minimax.json").read_text())
 REFERENCE_DIGITS = 1e-12
 UNITS = np.eye(4)
+
+
+def worst_case_rms(weights: np.ndarray, sigmas: np.ndarray | float) -> float:
+    """The r.m.s. error of w . z under the worst correlation, rho = +-sigma sign w."""
+    return float(np.abs(weights * sigmas).sum())
+
+
+def white_noise_rms(weights: np.ndarray, sigmas: np.ndarray | float) -> float:
+    return float(np.linalg.norm(weights * sigmas))
 
 
 def sampled(case):
