@@ -1,6 +1,6 @@
 """ArduPilot onboard logs (DataFlash, `.bin` binary or `.log` text) -> records.
 
-    log = dataflash.read(path)
+    log = DataflashLog(path)
     for record in log: ...              # in the order of the file
 
 `dataflash_messages` splits the file into messages; `MessageConverter` turns messages into records and does no
@@ -257,11 +257,12 @@ NAMES = tuple(_TABLE)
 
 
 class DataflashLog:
-    """An opened log, to be iterated once. `reboots` counts decreases of the boot time."""
+    """An opened `.bin` or `.log` file, to be iterated once.
+
+    Raises LogError if it is empty, not a DataFlash log, or unreadable.
+    """
 
     def __init__(self, path: Path) -> None:
-        self.path = path
-        self.reboots = 0
         self.damage = Damage()
         self._data = map_file(path)
         binary = dataflash_messages.is_binary(self._data[:65536])
@@ -277,7 +278,6 @@ class DataflashLog:
         for step in steady_steps(stamped, self.damage):
             t_ns = (epoch_us + step.shift_us + step.boot_us) * 1000
             if step.reboot:
-                self.reboots += 1
                 converter = MessageConverter()
                 yield Reboot(t_ns, t_ns, 1)
             yield from self._converted(converter, step, t_ns)
@@ -320,11 +320,6 @@ def boot_time_us(m: Message) -> int | None:
     if value is None:
         return None
     return int(value) * scale if isinstance(value, int | float) and 0 <= value <= MAX_BOOT_US else -1
-
-
-def read(path: Path) -> DataflashLog:
-    """Open a `.bin` or `.log` file. Raises LogError if it is empty, not a DataFlash log, or unreadable."""
-    return DataflashLog(path)
 
 
 def _finite(value: float) -> float | None:

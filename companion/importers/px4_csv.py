@@ -41,7 +41,7 @@ class _Numbers(dict[str, Any]):
 
 
 class CsvFolder:
-    """The topics of a folder, to be iterated once."""
+    """The topics of a folder, to be iterated once. Raises LogError if no known topic is found."""
 
     def __init__(self, folder: Path) -> None:
         self.damage = Damage()
@@ -81,11 +81,6 @@ class CsvFolder:
                 yield from enumerate(csv.DictReader(lines), start=2)
         except (OSError, EOFError, zlib.error, csv.Error) as error:
             self.damage.add(path.name, 0, f"the rest of the file: {one_line(error)}")
-
-
-def read(folder: Path) -> CsvFolder:
-    """Open the topics in `folder`. Raises LogError if no known topic is found."""
-    return CsvFolder(folder)
 
 
 def _lines(file: BinaryIO, path: Path, damage: Damage) -> Iterator[str]:

@@ -210,13 +210,13 @@ class ForeignLog(Protocol):
 
 
 _READERS: dict[str, Callable[[Path], ForeignLog]] = {
-    ".bin": dataflash.read,
-    ".log": dataflash.read,
-    ".ulg": ulog.read,
+    ".bin": dataflash.DataflashLog,
+    ".log": dataflash.DataflashLog,
+    ".ulg": ulog.UlogFile,
     ".mat": inertialnav.read_matlab,
     ".zip": inertialnav.read_tables,
     "tables": inertialnav.read_tables,  # folders
-    "topics": px4_csv.read,
+    "topics": px4_csv.CsvFolder,
 }
 LOG_SUFFIXES = (".tlog", *(kind for kind in _READERS if kind.startswith(".")))
 """File name suffixes of the logs of other recorders."""

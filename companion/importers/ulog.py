@@ -53,11 +53,10 @@ _UNIX_FROM_US, _UNIX_TO_US = 10**15, 4_102_444_800_000_000  # 2001, 2100
 
 
 class UlogFile:
-    """An opened log, to be iterated once."""
+    """An opened `.ulg`, to be iterated once. Raises LogError if it is not a ULog."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.reboots = 0
         self.damage = Damage()
         self._data = map_file(path)
         if self._data[: len(ulog_messages.MAGIC)] != ulog_messages.MAGIC:
@@ -123,11 +122,6 @@ class UlogFile:
                 self.damage.add(f"topic {name}", 0, f"no field {error}: unsupported PX4 version")
         except (TypeError, ValueError, OverflowError) as error:
             self.damage.add(f"topic {name} at {row.get('timestamp')} us", 0, one_line(error))
-
-
-def read(path: Path) -> UlogFile:
-    """Open a `.ulg`. Raises LogError if it is not a ULog."""
-    return UlogFile(path)
 
 
 def _finite(value: float | None) -> float | None:

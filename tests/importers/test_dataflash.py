@@ -337,7 +337,7 @@ def test_recording_agrees_with_pymavlink(tmp_path: pathlib.Path) -> None:
 
 
 def test_missing_log_is_reported(tmp_path: pathlib.Path) -> None:
-    readers: list[Callable[[pathlib.Path], object]] = [sources.open_source, dataflash.read]
+    readers: list[Callable[[pathlib.Path], object]] = [sources.open_source, dataflash.DataflashLog]
     for read in readers:
         with pytest.raises(LogError, match=r"no such log|No such file"):
             read(tmp_path / "none.bin")
