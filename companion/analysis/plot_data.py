@@ -116,6 +116,6 @@ def thin_line(x: Floats, y: Floats, most: int = MAX_POINTS) -> tuple[Floats, Flo
     return x[keep], y[keep]
 
 
-def subsample(a: Floats, most: int = MAX_POINTS) -> Floats:
-    """Return at most `most` values, evenly spaced."""
-    return a[:: max(1, math.ceil(len(a) / most))]
+def subsample(a: Floats) -> Floats:
+    """Return at most `MAX_POINTS` values, evenly spaced."""
+    return a[:: max(1, math.ceil(len(a) / MAX_POINTS))]

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from companion.analysis import error_statistics, flight_events
 from companion.analysis.assessment import GNSS, SMOOTHED, Assessment, deviation
@@ -157,7 +158,7 @@ def _split_errors(a: Assessment) -> tuple[Floats, Floats]:
     corrected = a.errors.get(error_statistics.CORRECTED)
     if corrected is None:
         return np.zeros(0), np.zeros(0)
-    alone = _during(a, corrected, WITHOUT_FIXES)
+    alone = _without_fixes(a, corrected)
     return corrected.error[~alone], corrected.error[alone]
 
 
@@ -264,7 +265,7 @@ def _bound_sentences(a: Assessment) -> list[str]:
         return ["No guaranteed bound is available."]
     inside = float(np.mean(corrected.error[known] <= corrected.bound[known]))
     broken = [row for row in a.rows if row.held is False]
-    alone = known & _during(a, corrected, WITHOUT_FIXES)
+    alone = known & _without_fixes(a, corrected)
     reached = (
         f" reached {format_length(float(corrected.bound[alone].max()))} without fixes and"
         if alone.any()
@@ -391,12 +392,10 @@ def _anomalies(a: Assessment) -> list[str]:
     return [f"Anomalies: {'; '.join(dict.fromkeys(found))}."] if found else []
 
 
-def _during(
-    a: Assessment, e: error_statistics.ErrorSeries, names: Sequence[str]
-) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+def _without_fixes(a: Assessment, e: error_statistics.ErrorSeries) -> npt.NDArray[np.bool_]:
     inside = np.zeros(len(e.t_ns), dtype=np.bool_)
     for phase in a.phases:
-        if phase.name in names:
+        if phase.name in WITHOUT_FIXES:
             inside |= (e.t_ns >= phase.start_ns) & (e.t_ns < phase.end_ns)
     return inside
 

@@ -67,9 +67,9 @@ def ignore_status(status: Status, now_ns: int) -> None:
 class Service:
     """One run of the companion.
 
-    `on_event` is called for every event, `now` reads the monotonic clock, `base` is the operator's
-    configuration without the values that ground stations set, `kept` the file of those, `deleted` the logs
-    that were deleted and are still to be reported. `on_status` is called once a second.
+    `on_event` is called for every event, `base` is the operator's configuration without the values that
+    ground stations set, `kept` the file of those, `deleted` the logs that were deleted and are still to be
+    reported. `on_status` is called once a second.
     """
 
     def __init__(
@@ -77,7 +77,6 @@ class Service:
         config: Config,
         log: Writer,
         on_event: Callable[[Event], None],
-        now: Callable[[], int] = time.monotonic_ns,
         notifier: SystemdNotifier | None = None,
         base: Config | None = None,
         kept: KeptParameters | None = None,
@@ -97,7 +96,7 @@ class Service:
         self.core = CompanionCore(
             config, self._deferred, self._addresses, signing, self._parameters_file.put, base
         )
-        self._log, self._on_event, self._now = log, on_event, now
+        self._log, self._on_event = log, on_event
         self._connections: dict[str, Connection] = {}
         self._dropped_before: dict[str, int] = {}  # by earlier connections of the link
         self._drop_monitors = {name: DropMonitor(address) for name, address in self._addresses.items()}
@@ -134,7 +133,7 @@ class Service:
             self._connections[name], self._dropped_before[name] = stream, link.dropped
             self._notifier.ready()
             if self._addresses[name].listens:
-                self.core.report(Severity.INFO, f"listening: {self._addresses[name]}", self._now())
+                self.core.report(Severity.INFO, f"listening: {self._addresses[name]}", time.monotonic_ns())
                 self._flush()
             try:
                 await stream.deliver_to(partial(self._receive, link, stream))
@@ -145,16 +144,16 @@ class Service:
 
     def _judge(self, link: Link) -> Callable[[bytes], bool]:
         is_proven = link.session.judge()
-        return lambda data: is_proven(data, self._now())
+        return lambda data: is_proven(data, time.monotonic_ns())
 
     def _receive(self, link: Link, stream: Connection, data: bytes, peer: Hashable) -> None:
-        stream.note(peer, self.core.receive(link.name, data, self._now(), peer))
+        stream.note(peer, self.core.receive(link.name, data, time.monotonic_ns(), peer))
         self._flush()
 
     async def _run_timers(self) -> None:
         """Run periodic work; report changes of the state of the disk and the lines."""
         while True:
-            now = self._now()
+            now = time.monotonic_ns()
             self.core.poll(now)
             if self._log.trouble != self._trouble:
                 self._trouble = self._log.trouble
@@ -171,7 +170,9 @@ class Service:
             if now >= self._next_status_ns:
                 self._next_status_ns = now + STATUS_INTERVAL_NS
                 self._on_status(self.core.status(), now)
-            await asyncio.sleep(max(0.0, min(1e-9 * (self.core.deadline() - self._now()), LOG_CHECK_S)))
+            await asyncio.sleep(
+                max(0.0, min(1e-9 * (self.core.deadline() - time.monotonic_ns()), LOG_CHECK_S))
+            )
 
     async def _save_state_periodically(self) -> None:
         """Save the state that outlives a restart; only this task waits for its disk."""
@@ -190,7 +191,7 @@ class Service:
                 self.core.report(
                     Severity.WARNING,
                     f"parameters: {trouble}; parameters cannot be set until this is resolved",
-                    self._now(),
+                    time.monotonic_ns(),
                 )
             last_reported = trouble
 
@@ -207,7 +208,7 @@ class Service:
                 self.core.report(Severity.WARNING if monitor.is_dropping else Severity.INFO, text, now)
 
     def _flush(self) -> None:
-        now = self._now()
+        now = time.monotonic_ns()
         for name in self._addresses:
             frames = self.core.to_send(name, now)
             stream = self._connections.get(name)
@@ -241,7 +242,7 @@ class Service:
 
     def report(self, text: str) -> None:
         """Log and report a change of links and files."""
-        self.core.report(Severity.NOTICE, text, self._now())
+        self.core.report(Severity.NOTICE, text, time.monotonic_ns())
         self._deferred.flush()
 
 

@@ -125,7 +125,7 @@ def encode_records(records: Iterable[McapRecord]) -> bytes:
     return encoded
 
 
-def encode_chunk(messages: Sequence[Message], level: int = 1) -> tuple[Chunk, list[MessageIndex]]:
+def encode_chunk(messages: Sequence[Message]) -> tuple[Chunk, list[MessageIndex]]:
     """Return the compressed chunk of `messages` (one at least) and its indexes, one for each channel."""
     builder = RecordBuilder()
     entries: defaultdict[int, list[tuple[int, int]]] = defaultdict(list)
@@ -135,7 +135,7 @@ def encode_chunk(messages: Sequence[Message], level: int = 1) -> tuple[Chunk, li
     data = builder.end()
     chunk = Chunk(
         compression="zstd",
-        data=zstandard.ZstdCompressor(level=level).compress(data),
+        data=zstandard.ZstdCompressor(level=1).compress(data),
         message_start_time=min(message.log_time for message in messages),
         message_end_time=max(message.log_time for message in messages),
         uncompressed_crc=zlib.crc32(data),

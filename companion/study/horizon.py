@@ -21,7 +21,6 @@ from companion.estimate.schuler import (
     DEG_PER_HOUR,
     MEAN_EARTH,
     STATE,
-    Scale,
     force_response,
     schuler_row,
     transition,
@@ -69,7 +68,6 @@ class Horizon:
         every: float = 1.0,
         drift: float | None = None,
         velocity: float | None = None,
-        scale: Scale = MEAN_EARTH,
         force: float = 0.0,
     ) -> None:
         if not (window > 0.0 and every > 0.0 and math.isfinite(window / every)):
@@ -82,29 +80,29 @@ class Horizon:
                 f"a window of {window:g} s with a fix every {every:g} s has {count:g} fixes, at most"
                 f" {MAX_FIXES}: give a shorter window or a longer interval"
             )
-        tau = np.linspace(-0.5, 0.5, count) * (window * scale.rate)
-        rows, sigmas = schuler_row("gamma", -tau), np.full(count, sigma / scale.radius)
+        tau = np.linspace(-0.5, 0.5, count) * (window * MEAN_EARTH.rate)
+        rows, sigmas = schuler_row("gamma", -tau), np.full(count, sigma / MEAN_EARTH.radius)
         if velocity is not None:  # the velocity of each fix is measured too
             more = schuler_row("mu", -tau)
             rows = np.vstack([rows, more])
-            sigmas = np.append(sigmas, np.full(count, velocity / (scale.radius * scale.rate)))
+            sigmas = np.append(sigmas, np.full(count, velocity / (MEAN_EARTH.radius * MEAN_EARTH.rate)))
         if drift is not None:  # prior knowledge of the constant, 0 +- drift, is one more measurement
-            rows, sigmas = np.vstack([rows, [0.0, 0.0, 0.0, 1.0]]), np.append(sigmas, drift / scale.rate)
-        self._scale, self._half, self._force = scale, 0.5 * window, force
+            rows, sigmas = np.vstack([rows, [0.0, 0.0, 0.0, 1.0]]), np.append(sigmas, drift / MEAN_EARTH.rate)
+        self._half, self._force = 0.5 * window, force
         self._sigma = sigma
         self._plain = drift is None and velocity is None and force == 0.0
-        t = tau / scale.rate
+        t = tau / MEAN_EARTH.rate
         step = min(FORCE_STEP_S, every)
         self._edges = np.linspace(t[0], t[-1], math.ceil(window / step) + 1)
         effect = np.zeros((len(rows), len(self._edges) - 1 if force else 0))
         if force:
             start, end = self._edges[:-1], self._edges[1:]
             effect[:count] = (
-                force_response("gamma", t[:, None], start, end, 0.5 * window, scale) / scale.radius
+                force_response("gamma", t[:, None], start, end, 0.5 * window, MEAN_EARTH) / MEAN_EARTH.radius
             )
             if velocity is not None:
-                speed = scale.radius * scale.rate
-                response = force_response("mu", t[:, None], start, end, 0.5 * window, scale)
+                speed = MEAN_EARTH.radius * MEAN_EARTH.rate
+                response = force_response("mu", t[:, None], start, end, 0.5 * window, MEAN_EARTH)
                 effect[count : 2 * count] = response / speed
         self._design = Design.of(rows, sigmas, effect, np.full(effect.shape[1], force))
         self._starts: list[Minimax | None] = [None] * 4
@@ -116,10 +114,10 @@ class Horizon:
     def at(self, ahead: float) -> Ahead:
         """Return all bounds at a time ahead [s] after the last fix."""
         position, tilt, velocity, drift = (self._bound(k, ahead) for k in range(4))
-        target, radius = self._target(0, ahead), self._scale.radius
+        target, radius = self._target(0, ahead), MEAN_EARTH.radius
         ls = self._design.least_squares(target)
         worst = radius * float(self._design.worst(ls.weights)) + self._beyond(ALONE[0], ahead)
-        plain = closed_form(2.0 * self._half, ahead, self._sigma, self._scale) if self._plain else None
+        plain = closed_form(2.0 * self._half, ahead, self._sigma, MEAN_EARTH) if self._plain else None
         best = self._starts[0]
         assert best is not None
         return Ahead(
@@ -138,8 +136,8 @@ class Horizon:
         """Return the bound of a' x, with x position (m), tilt (rad), velocity (m/s), drift (rad/s),
         at a time ahead [s]: `target` is a (4,).
         """
-        a = np.array(target) * self._scale.units
-        best = self._design.minimax(a @ transition((self._half + ahead) * self._scale.rate))
+        a = np.array(target) * MEAN_EARTH.units
+        best = self._design.minimax(a @ transition((self._half + ahead) * MEAN_EARTH.rate))
         return best.bound + self._beyond(target, ahead)
 
     def longest(self, limit: float) -> float:
@@ -155,7 +153,7 @@ class Horizon:
 
     def _target(self, k: int, ahead: float) -> Floats:
         # the state in the middle, about which the rows are best conditioned
-        row: Floats = transition((self._half + ahead) * self._scale.rate)[k]
+        row: Floats = transition((self._half + ahead) * MEAN_EARTH.rate)[k]
         return row
 
     def _beyond(self, target: Sequence[float], ahead: float) -> float:
@@ -167,13 +165,13 @@ class Horizon:
         response = np.zeros(len(edges) - 1)
         for name, a in zip(STATE, target, strict=True):
             if a:
-                response += a * force_response(name, end, edges[:-1], edges[1:], self._half, self._scale)
+                response += a * force_response(name, end, edges[:-1], edges[1:], self._half, MEAN_EARTH)
         return self._force * float(np.abs(response).sum())
 
     def _bound(self, k: int, ahead: float) -> float:
         best = self._design.minimax(self._target(k, ahead), self._starts[k])
         self._starts[k] = best
-        return self._scale.units[k] * best.bound + self._beyond(ALONE[k], ahead)
+        return MEAN_EARTH.units[k] * best.bound + self._beyond(ALONE[k], ahead)
 
 
 def _minutes(context: click.Context, parameter: click.Parameter, text: str) -> list[float]:

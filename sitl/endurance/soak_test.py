@@ -60,6 +60,7 @@ FAULT_S = (20.0, 60.0)
 APART_NS = 60 * SECOND_NS  # between two sorties
 MEMORY_GROWTH, RATE_DRIFT = 0.05, 0.01
 LONGEST = 4096  # of a container
+MOST_WAITING_KIB = 32768  # for the log's disk
 SOAK_FAULTS = (*RECORD_FAULTS, *LINK_FAULTS, *AUTOPILOT_FAULTS, "slow-consumer")
 _CONTAINERS = (list, tuple, dict, set, frozenset, deque)
 _OUTSIDE = (types.ModuleType, type, types.FunctionType, types.BuiltinFunctionType, types.CodeType)
@@ -237,7 +238,7 @@ def _trim_memory() -> None:
         trim(0)
 
 
-def find_failures(hours: list[HourStatistics], depth: int = 1 << 25) -> list[str]:
+def find_failures(hours: list[HourStatistics]) -> list[str]:
     """Return one sentence for each limit that was exceeded."""
     first, found = hours[0], []
     quarter = max(1, len(hours) // 4)
@@ -259,7 +260,7 @@ def find_failures(hours: list[HourStatistics], depth: int = 1 << 25) -> list[str
                 found.append(f"hour {hour.hour}: {name} went from {before:g} to {now:g}")
         if hour.longest > LONGEST:
             found.append(f"hour {hour.hour}: a container has {hour.longest} elements (limit {LONGEST})")
-        if hour.waiting_kib > depth / 1024 or hour.dropped:
+        if hour.waiting_kib > MOST_WAITING_KIB or hour.dropped:
             found.append(
                 f"hour {hour.hour}: {hour.waiting_kib:g} KiB waited for the log, {hour.dropped} dropped"
             )
