@@ -27,7 +27,7 @@ def convert_log(source: Path, output: Path, config: Config | None = None) -> Imp
         if output.exists():
             raise LogError(f"{output} already exists: give another name")
         records = sources.open_source(source, (config or Config()).link.system_id or None)
-        with create_replay_log(output, {CONVERTED: {"from": printable(source.name)}}) as sink:
+        with create_replay_log(output, source, {CONVERTED: {"from": printable(source.name)}}) as sink:
             for record in records:
                 sink.record(record, topic_of_input(record))
     return records.summary()

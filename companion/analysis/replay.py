@@ -153,9 +153,9 @@ def replay_foreign(records: Iterable[Stamped], config: Config, sink: Any) -> Rep
 
 @contextmanager
 def create_replay_log(
-    path: Path, described: Mapping[str, Mapping[str, str]], start_ns: int = 0, start_unix_ns: int = 0
+    path: Path, log: Path, described: Mapping[str, Mapping[str, str]]
 ) -> Iterator[flight_log.Writer]:
-    """Create a log for a replay, which waits for the disk instead of dropping messages, and close it.
+    """Create a log made from `log`, which waits for the disk instead of dropping messages, and close it.
 
     If the disk failed for a while and recovered, the number of lost messages is stated on stderr. After an
     exception the log stays ".active": it is incomplete, and an older log of its name is kept.
@@ -164,6 +164,7 @@ def create_replay_log(
     if path.suffix != ".mcap":
         raise LogError(f"{path}: a log is written as .mcap: give a name that ends with it")
     remove_leftover(path)
+    start_ns, start_unix_ns = start_times(log)
     sink = flight_log.Writer(
         path, metadata=described, start_unix_ns=start_unix_ns, start_ns=start_ns, block=True
     )
@@ -266,15 +267,13 @@ def command(
 
 def _replay_as_flown(log: Path, output: Path | None, config: Config) -> ReplayResult:
     """Replay our own log unchanged."""
-    first = next(iter(flight_log.read(log)), None)
-    if first is None:
+    if next(iter(flight_log.read(log)), None) is None:
         raise LogError(f"{log} contains no messages: nothing to replay")
     with show_step(f"replay {log}"), ExitStack() as stack:
         sink = None
         if output is not None:
             described = derived_metadata(config, "replay", log)
-            start_ns = getattr(first.value, "rx_ns", 0)
-            sink = stack.enter_context(create_replay_log(output, described, start_ns, first.log_time))
+            sink = stack.enter_context(create_replay_log(output, log, described))
         found = replay_own(log, config, sink)
     if not found.inputs:
         raise LogError(f"{log} contains no inputs of a navigator: nothing to replay")
@@ -297,7 +296,7 @@ def _replay_changed(
     described = derived_metadata(config, "replay", log)
     with (
         show_step(f"replay {log}"),
-        create_replay_log(output, described, *start_times(log)) as sink,
+        create_replay_log(output, log, described) as sink,
     ):
         found = replay_foreign(_observe(log_inputs.records, tracks, logged, kinds), config, sink)
         analyses = [gnss_latency.analyze_track(track) for track in tracks.tracks()]

@@ -174,7 +174,7 @@ def command(
     for path in paths:
         if path.suffix.lower() == ".mcap":
             described = derived_metadata(config, "smooth", log)
-            with create_replay_log(path, described, start_ns, start_unix_ns) as sink:
+            with create_replay_log(path, log, described) as sink:
                 for record in track.records:
                     sink.record(record)
         elif path.suffix.lower() == ".csv":
