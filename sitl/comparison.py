@@ -45,14 +45,6 @@ class PositionError(NamedTuple):
         return math.hypot(self.north, self.east)
 
 
-class _Estimate(NamedTuple):
-    t_ns: int
-    source: str
-    place: Geodetic
-    sigma: float | None
-    bound: float | None
-
-
 class OutageErrors(NamedTuple):
     """Errors of one source during a GNSS outage, m.
 
@@ -74,7 +66,9 @@ class Comparison:
     def __init__(self) -> None:
         self.errors: list[PositionError] = []
         self._truth: deque[tuple[int, Geodetic]] = deque()
-        self._waiting: deque[_Estimate] = deque(maxlen=MOST_WAITING)
+        self._waiting: deque[tuple[int, str, Geodetic, float | None, float | None]] = deque(
+            maxlen=MOST_WAITING
+        )
 
     def add_truth(self, t_ns: int, place: Geodetic) -> None:
         """Add a truth sample. A sample not later than the last one is ignored."""
@@ -84,7 +78,7 @@ class Comparison:
         while self._truth[0][0] < t_ns - TRUTH_HISTORY_NS:
             self._truth.popleft()
         for _ in range(len(self._waiting)):
-            self._score(self._waiting.popleft())
+            self.add_estimate(*self._waiting.popleft())
 
     def add_estimate(
         self,
@@ -95,20 +89,13 @@ class Comparison:
         bound: float | None = None,
     ) -> None:
         """Add an estimate of `source`, with its stated sigma (m) and guaranteed r.m.s. bound (m)."""
-        self._score(_Estimate(t_ns, source, place, sigma, bound))
-
-    def _score(self, estimate: _Estimate) -> None:
-        if not self._truth or estimate.t_ns > self._truth[-1][0]:
-            self._waiting.append(estimate)
+        if not self._truth or t_ns > self._truth[-1][0]:
+            self._waiting.append((t_ns, source, place, sigma, bound))
             return
-        true = self._truth_at(estimate.t_ns)
+        true = self._truth_at(t_ns)
         if true is not None:
-            north, east, _ = separation(estimate.place, true)
-            self.errors.append(
-                PositionError(
-                    estimate.t_ns, estimate.source, north, east, estimate.sigma, estimate.bound, true
-                )
-            )
+            north, east, _ = separation(place, true)
+            self.errors.append(PositionError(t_ns, source, north, east, sigma, bound, true))
 
     def _truth_at(self, t_ns: int) -> Geodetic | None:
         """Interpolate linearly between two samples; None before the first and in a gap."""
