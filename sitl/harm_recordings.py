@@ -320,16 +320,6 @@ def fly_harm(path: Path, truth_path: Path) -> RecordingResult:
     return judge_recording(name, log, false, truth)
 
 
-def fly_recording(data: Path, name: str) -> RecordingResult:
-    """Fly a recording of the folder `data` by default configuration."""
-    path, config = data / name, Config()
-    if path.suffix == ".tlog":
-        log = fly_frames(tlog.read(path), config)
-    else:
-        log = fly_log(sources.open_source(path), config)
-    return judge_recording(name, log, LOGS[name])
-
-
 def list_recordings(data: Path) -> list[str]:
     """List the recordings that are there."""
     harm = sorted(f"harm/{path.name}" for path in (data / "harm").glob("*.tlog.xz"))
@@ -337,8 +327,12 @@ def list_recordings(data: Path) -> list[str]:
 
 
 def fly_named(data: Path, name: str) -> RecordingResult:
-    """Fly one recording of `list_recordings`."""
+    """Fly one recording of `list_recordings`; those of `LOGS` by default configuration."""
+    path, config = data / name, Config()
     if name.startswith("harm/"):
-        path = data / name
         return fly_harm(path, path.with_name(path.name.replace(".tlog.xz", ".truth.csv.xz")))
-    return fly_recording(data, name)
+    if path.suffix == ".tlog":
+        log = fly_frames(tlog.read(path), config)
+    else:
+        log = fly_log(sources.open_source(path), config)
+    return judge_recording(name, log, LOGS[name])
