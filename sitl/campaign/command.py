@@ -38,7 +38,6 @@ from sitl.campaign.flight import (
     is_sensor_fault,
 )
 
-EX_FAILED = 1
 HEADS = (
     *("fault", "flights", "detected", "median", "slowest", "excluded", "largest before", "largest"),
     *("misleading", "beyond", "wrong", "alarms/h", "bound held", "raised", "harmful", "passed"),
@@ -293,4 +292,4 @@ def command(
     else:
         print_table(lines, limits, Console(width=max(150, Console().width)))
     if not all(line.passed for line in lines):
-        raise SystemExit(EX_FAILED)
+        raise SystemExit(1)
