@@ -37,12 +37,11 @@ from companion.records import (
     Vector3,
     Wind,
 )
-from companion.units import G0
+from companion.units import G0, ZERO_CELSIUS
 
 Message: TypeAlias = Any
 
 _MILLI_G = G0 / 1000
-_ZERO_CELSIUS = 273.15
 _ALWAYS_PRESENT = (
     mavlink.MAV_SYS_STATUS_SENSOR_3D_GYRO
     | mavlink.MAV_SYS_STATUS_SENSOR_3D_ACCEL
@@ -230,7 +229,7 @@ def _pressure(r: Pressure, a: SimulatedSender) -> Message:
         time_boot_ms=a.ms(r.t_ns),
         press_abs=r.static * 0.01,
         press_diff=_or_nan(r.differential) * 0.01,
-        temperature=round((kelvin - _ZERO_CELSIUS) * 100.0),
+        temperature=round((kelvin - ZERO_CELSIUS) * 100.0),
     )
 
 

@@ -50,8 +50,8 @@ from companion.records import (
     Wind,
 )
 from companion.storage.reader import LogError
+from companion.units import ZERO_CELSIUS
 
-_ZERO_CELSIUS = 273.15
 _EKF_ORIGIN = 0  # LogOriginType
 _STATUS, _GLITCHING = 0x3FF, 1 << 14  # nav_filter_status; its first ten bits are EKF_STATUS_FLAGS
 _FLYING = {18: False, 28: True}  # LogEvent: landed, not landed
@@ -189,7 +189,7 @@ class MessageConverter:
 
     def _baro(self, name: str, m: Message, t: int) -> Iterator[Stamped]:
         if getattr(m, "I", 0) == 0 and m.Press > 0.0:
-            yield Pressure(t, t, m.Press, self._differential, m.Temp + _ZERO_CELSIUS)
+            yield Pressure(t, t, m.Press, self._differential, m.Temp + ZERO_CELSIUS)
 
     def _true_velocity(self, name: str, m: Message, t: int) -> Iterator[Stamped]:
         self._true_v_n = m.VN, m.VE, m.VD

@@ -45,10 +45,10 @@ from companion.records import (
     Wind,
 )
 from companion.storage.reader import LogError
+from companion.units import ZERO_CELSIUS
 
 Topic: TypeAlias = Callable[[Row, int], Iterator[Stamped]]
 
-_ZERO_CELSIUS = 273.15
 _UNIX_FROM_US, _UNIX_TO_US = 10**15, 4_102_444_800_000_000  # 2001, 2100
 
 
@@ -193,7 +193,7 @@ def _wind(row: Row, t: int) -> Iterator[Stamped]:
 
 def _pressure(row: Row, t: int) -> Iterator[Stamped]:
     celsius = _finite(row.get("ambient_temperature", row.get("baro_temp_celcius")))
-    kelvin = None if celsius is None else celsius + _ZERO_CELSIUS
+    kelvin = None if celsius is None else celsius + ZERO_CELSIUS
     yield Pressure(t, t, row["baro_pressure_pa"], None, kelvin)
 
 

@@ -56,7 +56,7 @@ from companion.records import (
     Vehicle,
     Wind,
 )
-from companion.units import G0
+from companion.units import G0, ZERO_CELSIUS
 
 Autopilot: TypeAlias = Literal["ardupilot", "px4", "other"]
 #: Autopilot by MAV_AUTOPILOT.
@@ -68,7 +68,6 @@ MAKES: dict[int, Autopilot] = {
 UERE = 4.0
 """User range error, one sigma, m: converts a dilution of precision to metres where a receiver gives no
 accuracy; 7.8 m at 95 % (GPS SPS Performance Standard, 4th edition 2008, table 3.4-1)."""
-_ZERO_CELSIUS = 273.15
 #: MAV_TYPE of vehicles that rotors of fixed pitch hold up.
 MULTIROTORS = frozenset(
     {
@@ -311,7 +310,7 @@ def _highres_imu(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
             differential = optional_number(m, "diff_pressure", 100.0)
         if updated & mavlink.HIGHRES_IMU_UPDATED_TEMPERATURE:
             celsius = optional_number(m, "temperature")
-        kelvin = None if celsius is None else celsius + _ZERO_CELSIUS
+        kelvin = None if celsius is None else celsius + ZERO_CELSIUS
         records += (Pressure(t_ns, rx, static, differential, kelvin),)
     return records
 
@@ -438,7 +437,7 @@ def _wind_cov(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
 @_of("SCALED_PRESSURE")
 def _scaled_pressure(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
     differential = optional_number(m, "press_diff", 100.0)
-    kelvin = m.temperature * 0.01 + _ZERO_CELSIUS
+    kelvin = m.temperature * 0.01 + ZERO_CELSIUS
     return (Pressure(_booted(m, rx, sender), rx, number(m, "press_abs", 100.0), differential, kelvin),)
 
 
