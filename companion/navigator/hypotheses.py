@@ -199,7 +199,7 @@ class Model:
         biases = np.arange(ours, n)
         Q[:, biases, biases] = np.square(known.biases) * (BIAS_HOUR**2 / 3600.0 * dt)
         interval = nominal.interval
-        if interval is None or interval.by != "air":
+        if interval is None or not interval.by_sensed_air:
             Phi = np.eye(n)
             Phi[:ours, :ours] = found.Phi
             return Transition(Phi, Q)

@@ -144,6 +144,11 @@ class Interval(NamedTuple):
     shear: float = 0.0
     airspeed: Airspeed = "pitot"
 
+    @property
+    def by_sensed_air(self) -> bool:
+        """Whether an airspeed that may be false moves the nominal trajectory."""
+        return self.by == "air" and self.airspeed == "pitot"
+
 
 class Row(NamedTuple):
     """y (m,) = H (m, n) x + noise of covariance R (m, m); the innovation is y - H x."""

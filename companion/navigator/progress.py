@@ -95,7 +95,7 @@ def propagated(state: State, settings: Settings) -> State:
     state = state._replace(newborn=None)
     Phi, Q = settings.model.transition(nominal, len(state.beacons))
     bank = banks.propagate(bank, known.layout, nominal.pending_s, Phi, Q)
-    if nominal.interval is not None and nominal.interval.by == "air":
+    if nominal.interval is not None and nominal.interval.by_sensed_air:
         seen = bank.seen.copy()
         seen[AIRSPEED] = bank.t
         bank = bank._replace(seen=seen)

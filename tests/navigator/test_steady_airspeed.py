@@ -15,6 +15,7 @@ from msgspec.structs import replace
 from companion.analysis.smoothing import smooth_flight
 from companion.config import load
 from companion.navigator import Navigator
+from companion.navigator.hypotheses import AIRSPEED
 from companion.navigator.own_error_model import (
     CRAB,
     HEADING,
@@ -121,6 +122,18 @@ def test_a_sensor_that_fails_is_replaced_and_one_that_comes_back_is_used_again()
     assert max(scales[t] for t in range(125, 140)) > 0.1
     interval = navigator._state.nominal and navigator._state.nominal.interval
     assert interval is not None and interval.airspeed == "pitot"
+
+
+def test_an_airspeed_without_a_sensor_is_no_source_that_may_be_false() -> None:
+    navigator = Navigator(CONFIG)
+    for record in without_airspeed():
+        navigator.handle(record)
+        if navigator._state.bank is not None:
+            assert navigator._state.false[AIRSPEED] == 0.0
+        if record.rx_ns > 120 * NS:
+            break
+    assert navigator._state.nominal and navigator._state.nominal.interval
+    assert navigator._state.nominal.interval.airspeed == "steady"
 
 
 @pytest.mark.flight
