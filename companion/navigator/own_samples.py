@@ -26,6 +26,7 @@ from companion.navigator.progress import (
     estimated_velocity,
     is_driven_by_imu,
     propagated,
+    shifted,
     solved_if_due,
 )
 from companion.navigator.state import NEAR_S, Settings, State, Step, hypotheses
@@ -320,6 +321,8 @@ def _driven(state: State, record: Stamped, by: By, sample: Vector2 | None, setti
         state = propagated(carried(state, record.t_ns, settings), settings)._replace(sensors=s)
         assert state.nominal is not None
         velocity = sample if by in ("air", "foreign") and sample else state.nominal.point.v_n[:2]
+        state = _velocity_stepped(state, velocity)
+        assert state.nominal is not None
         nominal = own_channel.restart(state.nominal, by, velocity)
         if by == "imu" and sample:
             nominal = nominal._replace(a_n=sample)
@@ -331,6 +334,14 @@ def _driven(state: State, record: Stamped, by: By, sample: Vector2 | None, setti
     if nominal.pending_s >= NEAR_S:
         state = decided(propagated(state, settings), record, settings)
     return solved_if_due(state, record, settings)
+
+
+def _velocity_stepped(state: State, velocity: Vector2) -> State:
+    """With the errors of another nominal `velocity` (m/s) from now on: the aircraft's is the same."""
+    assert state.nominal is not None
+    north, east, _ = state.nominal.point.v_n
+    step = (velocity[0] - north, velocity[1] - east)
+    return shifted(state, 0.0, 0.0, step)._replace(gnss_fix=state.gnss_fix)
 
 
 def _at_height(nominal: Nominal, s: Sensors) -> Nominal:

@@ -124,6 +124,19 @@ def test_a_sensor_that_fails_is_replaced_and_one_that_comes_back_is_used_again()
     assert interval is not None and interval.airspeed == "pitot"
 
 
+@pytest.mark.parametrize("sensed", [True, False])
+def test_the_velocity_does_not_jump_where_the_airspeed_becomes_the_driver(sensed: bool) -> None:
+    """It is that over ground still, and the nominal one is the one through the air (8 and 14 m/s apart)."""
+    navigator, last = Navigator(CONFIG), None
+    for record in recorded() if sensed else without_airspeed():
+        for out in navigator.handle(record):
+            if isinstance(out, Solution) and out.sources & Source.AIR_DATA:
+                assert last is not None and math.dist(out.v_n[:2], last.v_n[:2]) < 1.0
+                return
+            last = out if isinstance(out, Solution) else last
+    raise AssertionError("no solution by airspeed")
+
+
 def test_an_airspeed_without_a_sensor_is_no_source_that_may_be_false() -> None:
     navigator = Navigator(CONFIG)
     for record in without_airspeed():
