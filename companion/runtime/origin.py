@@ -69,6 +69,7 @@ class OriginCheck:
     def forget(self) -> None:
         """Forget the origin: the autopilot rebooted, or its INS jumped; another one afterwards is a reset."""
         self.origin = self._stated = self._local = self._known = self._refused = None
+        self._is_without_position = False
         self._pairs.clear()
 
     def receive(self, record: Stamped) -> list[Event]:

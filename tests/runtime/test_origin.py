@@ -146,6 +146,17 @@ def test_an_autopilot_without_a_position_has_its_stated_origin_until_pairs_come(
     assert autopilot.off() < TOLERANCE_M and autopilot.check.resets == 1
 
 
+def test_after_a_reboot_nothing_states_that_there_is_no_position(autopilot: Autopilot) -> None:
+    """EKF_STATUS_REPORT may not come again: a stated origin is checked as from the start."""
+    constant_position = 167
+    autopilot.take(FilterStatus(autopilot.now, autopilot.now, constant_position, False, 0.0))
+    autopilot.check.forget()
+    autopilot.state(moved(5000.0))
+    assert autopilot.check.origin is None
+    autopilot.fly(3.0)
+    assert autopilot.off() < TOLERANCE_M
+
+
 def test_ins_of_its_own_uses_the_stated_origin(autopilot: Autopilot) -> None:
     """Its drifting local position and the autopilot's global one are no pair."""
     autopilot.check = OriginCheck(has_pairs=False)
