@@ -29,7 +29,6 @@ from companion.units import G0, SECOND_NS, Floats
 SILENT_NS: dict[By, int] = {"imu": 600_000_000, "air": 1_500_000_000, "foreign": 2_500_000_000, "hold": 0}
 ORDER: tuple[By, ...] = ("imu", "air", "foreign", "hold")
 FRESH_NS = 1_000_000_000  # an attitude older than this turns no airspeed into a velocity
-FLYING_M_S = 8.0  # no steady airspeed is lower
 HOLD_M_S_SQRT_S = 4.0  # a turn of 30 degrees of bank changes the velocity by 5.7 m/s in a second
 SENSOR_NS = 10_000_000_000  # the word of the autopilot that its airspeed sensor is healthy lasts so long
 STEADY_AFTER_NS = 20 * SECOND_NS  # in flight, until the airspeed is steady

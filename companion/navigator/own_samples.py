@@ -17,7 +17,14 @@ from companion.navigator import (
     strapdown_channel,
 )
 from companion.navigator.channel import Nominal
-from companion.navigator.ground import Ground, ground_phase, is_clear, lifted, wind_shear
+from companion.navigator.ground import (
+    FLYING_M_S,
+    Ground,
+    ground_phase,
+    is_clear,
+    lifted,
+    wind_shear,
+)
 from companion.navigator.own_channel import AirspeedSums, OwnChannel, Sensors
 from companion.navigator.own_error_model import Airspeed, By
 from companion.navigator.progress import (
@@ -60,7 +67,7 @@ def airspeed_sensor(state: State, record: AirspeedSensor, settings: Settings) ->
 
 
 def vehicle(state: State, record: Vehicle, settings: Settings) -> Step:
-    """Remember whether it is a multirotor, and whether it flies."""
+    """Remember what kind of vehicle it is, and whether it flies."""
     s = state.sensors
     multirotor = s.multirotor if record.multirotor is None else record.multirotor
     fixed_wing = s.fixed_wing if record.fixed_wing is None else record.fixed_wing
@@ -89,7 +96,7 @@ def _steady(state: State, record: Attitude, settings: Settings) -> Step:
     state = _airspeed_from("steady", state, settings)
     s = state.sensors
     if s.steady_m_s is None:
-        s = s._replace(steady_m_s=max(_estimated_airspeed(state), own_channel.FLYING_M_S))
+        s = s._replace(steady_m_s=max(_estimated_airspeed(state), FLYING_M_S))
     assert s.steady_m_s is not None
     V = own_error_model.air_velocity(s.steady_m_s, record.pitch, record.heading)
     if s.leads("air", record.t_ns):
