@@ -463,7 +463,10 @@ class _Path:
             self._append(state.nominal.point, x, P, predicted, isinstance(record, Gnss | RsbnFix))
 
     def _measures(self, before: State, record: Input) -> bool:
-        """Whether a record besides the fixes may have been a measurement."""
+        """Whether a record besides the fixes may have been a measurement: not if it changes the driver."""
+        was, now = _interval(before), _interval(self._state)
+        if was is not None and now is not None and was.by != now.by:
+            return False
         if isinstance(record, Imu | Attitude):  # of a multirotor's drag, of a steady airspeed
             return self._state.sensors.measured_ns != before.sensors.measured_ns
         own_position = isinstance(record, LocalPosition) and not self._settings.config.has_own_ins
@@ -479,10 +482,10 @@ class _Path:
             if (a.identity, a.place) != (b.identity, b.place):
                 at = slice(known.bias(k), known.bias(k + 1))
                 keep[at], variance[at] = 0.0, np.square(known.biases[BIASES * k : BIASES * (k + 1)])
-        airspeed = _airspeed(self._state)
-        if airspeed is not None and _airspeed(before) not in (None, airspeed):
+        was, now = _interval(before), _interval(self._state)
+        if was is not None and now is not None and was.airspeed != now.airspeed:
             assert isinstance(self._settings.model.channel, OwnChannel)
-            sigma = own_error_model.scale_sigma(self._settings.model.channel.settings, airspeed)
+            sigma = own_error_model.scale_sigma(self._settings.model.channel.settings, now.airspeed)
             keep[own_error_model.SCALE], variance[own_error_model.SCALE] = 0.0, sigma**2
         return None if keep.all() else (keep, variance)
 
@@ -501,9 +504,8 @@ class _Path:
         self._Phi, self._Q = np.eye(n), np.zeros((n, n))
 
 
-def _airspeed(state: State) -> own_error_model.Airspeed | None:
-    interval = state.nominal.interval if state.nominal else None
-    return interval.airspeed if isinstance(interval, own_error_model.Interval) else None
+def _interval(state: State) -> own_error_model.Interval | None:
+    return state.nominal.interval if state.nominal else None
 
 
 def _moved(before: Point, after: Point) -> Floats:
