@@ -147,7 +147,7 @@ def dataflash_with_text_first(tmp_path: pathlib.Path) -> pathlib.Path:
         "FMT, 128, 89, FMT, BBnNZ, Type,Length,Name,Format,Columns",
         "FMT, 130, 50, GPS, QBIHBcLLeee, TimeUS,Status,GMS,GWk,NSats,HDop,Lat,Lng,Alt,Spd,GCrs",
         "FMT, 131, 75, MSG, QZ, TimeUS,Message",
-        "MSG, 1000000, ArduPlane",
+        "MSG, 1000000, Barometer calibrated",
     ]
     lines += [f"GPS, {s}000000, 3, {s}000, 2300, 9, 1.0, 45.0, 7.0, 300.0, 0.0, 0.0" for s in range(31, 42)]
     path = tmp_path / "text_first.log"
