@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import gzip
 import math
 from collections.abc import Iterable, Iterator
 from functools import lru_cache
@@ -29,7 +28,6 @@ from companion.records import (
     Gnss,
     LocalOrigin,
     LocalPosition,
-    Pressure,
     RsbnFix,
     Solution,
     Source,
@@ -38,6 +36,7 @@ from companion.records import (
     Wind,
 )
 from companion.units import Floats
+from tests.recordings import recording
 
 NS = 1_000_000_000
 pytestmark = pytest.mark.flight
@@ -81,11 +80,7 @@ def recorded(records: Iterable[Any]) -> Recorded:
 @lru_cache(maxsize=4)
 def flight(name: str) -> Recorded:
     """A recorded flight cut down to 5 Hz."""
-    with gzip.open(DATA / f"{name}_cut.jsonl.gz") as file:
-        return recorded(msgspec.json.decode(line, type=CUT) for line in file)
-
-
-CUT = Attitude | AirData | Pressure | Truth | Gnss | LocalPosition | GlobalPosition
+    return recorded(recording(name))
 
 
 def with_beacon(flown: Recorded, seed: int, bearing_deg: float, gap: tuple[float, float]) -> Iterator[Any]:

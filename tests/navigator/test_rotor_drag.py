@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import gzip
 import math
 from collections.abc import Callable
-from functools import lru_cache
-from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-import msgspec
 import numpy as np
 import pytest
 from hypothesis import given
@@ -45,20 +41,17 @@ from companion.records import (
     Vehicle,
 )
 from companion.records import Source as Basis
+from tests.recordings import recording
 
 NS = 1_000_000_000
-COPTER = Path(__file__).parents[1] / "data" / "copter_cut.jsonl.gz"
 LOSS_S = 105.0  # since boot; it flies at 2 to 14 m/s
 DEFAULT = load(flags={"output.profile": "ardupilot"}, environment={})
 WITHOUT = load(flags={"output.profile": "ardupilot", "air_data.rotor_drag_per_s": 0.0}, environment={})
 Change = Callable[[Input], Input | None]
 
 
-@lru_cache(maxsize=1)
-def recorded() -> tuple[Input, ...]:
-    decoder: msgspec.json.Decoder[Input] = msgspec.json.Decoder(Input)
-    with gzip.open(COPTER) as lines:
-        return tuple(decoder.decode(line) for line in lines)
+def recorded() -> tuple[Any, ...]:
+    return recording("copter")
 
 
 class Flown(NamedTuple):

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import gzip
 import math
-from functools import lru_cache
-from pathlib import Path
+from typing import Any
 
-import msgspec
 import numpy as np
 import pytest
 from msgspec.structs import replace
@@ -30,18 +27,15 @@ from companion.navigator.own_error_model import (
 )
 from companion.records import AirData, AirspeedSensor, Gnss, Input, Solution, Source, Vehicle
 from companion.study import outages
+from tests.recordings import recording
 
 NS = 1_000_000_000
-FLIGHT = Path(__file__).parents[1] / "data" / "umn_flight_cut.jsonl.gz"
 CONFIG = load(flags={"output.profile": "ardupilot"}, environment={})
 
 
-@lru_cache(maxsize=1)
-def recorded() -> tuple[Input, ...]:
+def recorded() -> tuple[Any, ...]:
     """A real fixed wing by attitude, GNSS and airspeed, without an IMU."""
-    decoder: msgspec.json.Decoder[Input] = msgspec.json.Decoder(Input)
-    with gzip.open(FLIGHT) as lines:
-        return tuple(decoder.decode(line) for line in lines)
+    return recording("umn_flight")
 
 
 def without_airspeed() -> list[Input]:
@@ -104,7 +98,7 @@ def test_it_is_used_of_a_fixed_wing_that_flies_without_a_sensor_only() -> None:
 
 
 def test_a_sensor_that_fails_is_replaced_and_one_that_comes_back_is_used_again() -> None:
-    """What is wrong with the scale is begun anew with each: 3 % of a pitot, 40 % of a steady airspeed."""
+    """What is wrong with the scale starts again with each: 3 % of a pitot, 40 % of a steady airspeed."""
     navigator = Navigator(CONFIG)
     scales: dict[int, float] = {}
     for record in recorded():

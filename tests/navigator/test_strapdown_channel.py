@@ -40,7 +40,6 @@ from companion.records import (
     GlobalPosition,
     Gnss,
     Imu,
-    Input,
     LocalPosition,
     Pressure,
     RsbnFix,
@@ -53,6 +52,7 @@ from companion.records import (
 from companion.runtime.links import requested_rates
 from companion.units import Floats
 from sitl.flight import FlightPlan, Leg, Trajectory, WindChange, fly_plan
+from tests.recordings import recording
 
 NS = 1_000_000_000
 G = 9.80665
@@ -567,9 +567,7 @@ def recorded() -> tuple[tuple[Any, ...], Any]:
 
     The attitude of the cut has no roll and is too slow: the pitch swings by 10 degrees within a second.
     """
-    with gzip.open(DATA / "plane_wind_change_cut.jsonl.gz") as file:
-        decoded = (msgspec.json.decode(line, type=CUT) for line in file)
-        records = [r for r in decoded if not isinstance(r, Attitude)]
+    records = [r for r in recording("plane_wind_change") if not isinstance(r, Attitude)]
     attitudes = [
         Attitude(1_000_000 * t, 1_000_000 * rx, 1e-4 * roll, 1e-4 * pitch, 1e-4 * heading)
         for t, rx, roll, pitch, heading in recorded_rows("attitude")
@@ -692,8 +690,7 @@ def test_recorded_with_a_beacon_and_airspeed_a_step_of_the_wind_is_found(
 @pytest.mark.flight
 def test_recorded_on_px4_its_preset_finds_a_step_of_the_wind() -> None:
     """EKF2 keeps its attitude within 0.3 deg for a quarter of a minute; with 2 deg it is 68 m."""
-    with gzip.open(DATA / "px4_wind_step_cut.jsonl.gz") as file:
-        records = [msgspec.json.decode(line, type=Input | Truth) for line in file]
+    records = list(recording("px4_wind_step"))
     found = navigated(records, interpolated(records), Navigator(load(preset="px4", environment={})))
     minute = (found.t >= LOSS) & (found.t < LOSS + 60.0)
     assert found.error[found.t < LOSS].max() < 3.0

@@ -1,10 +1,8 @@
 """Autopilot output: checked positions, for the right make, and never the autopilot's own position."""
 
-import gzip
 import math
 from collections import Counter
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -22,14 +20,11 @@ from companion.output.gnss_fusion import ESTIMATOR_SENSOR_ENABLE, GnssFusion
 from companion.output.source_switch import Situation
 from companion.records import (
     AirData,
-    Attitude,
     Event,
     GlobalPosition,
     Gnss,
     LocalOrigin,
-    LocalPosition,
     Mode,
-    Pressure,
     RsbnFix,
     Solution,
     Source,
@@ -39,6 +34,7 @@ from companion.records import (
 )
 from companion.runtime.core import CompanionCore
 from companion.runtime.links import requested_rates
+from tests.recordings import recording
 
 SECOND, MS = 1_000_000_000, 1_000_000
 START = 5000 * SECOND
@@ -506,17 +502,12 @@ def test_odometry_beyond_ardupilots_accuracy_limit_is_sent() -> None:
     assert [event.text for event in output.take_events()] == ["sending ODOMETRY"]
 
 
-RECORDED = Attitude | AirData | Pressure | Truth | Gnss | LocalPosition | GlobalPosition
-
-
 def recorded(name: str) -> list[Any]:
     """Read a recorded ArduPlane flight with a GNSS loss, reduced to 5 Hz.
 
     The cut has no SYS_STATUS; in the recording it calls the airspeed sensor healthy from 3 s on.
     """
-    with gzip.open(Path(__file__).parents[1] / "data" / f"{name}_cut.jsonl.gz") as file:
-        records = [msgspec.json.decode(line, type=RECORDED) for line in file]
-    return [msgspec.structs.replace(r, sensed=True) if isinstance(r, AirData) else r for r in records]
+    return [msgspec.structs.replace(r, sensed=True) if isinstance(r, AirData) else r for r in recording(name)]
 
 
 @pytest.mark.flight

@@ -4,7 +4,6 @@ Without the companion the aircraft kept within 2 m. An older companion excluded 
 on the ground, the other 694 m off.
 """
 
-import gzip
 import math
 from collections.abc import Callable
 from pathlib import Path
@@ -16,6 +15,7 @@ from companion.config import load
 from companion.navigator import Navigator
 from companion.records import Attitude, Gnss, Imu, Input, Rejection, Solution
 from sitl import harm_recordings
+from tests.recordings import recording
 
 pytestmark = pytest.mark.flight
 
@@ -66,13 +66,13 @@ def imu_turned(record: Input) -> Input:
 
 
 TURNS = [
-    ("plane_turbulence_cut", None, 5.0),
-    ("plane_turn_cut", None, 5.0),
-    ("plane_take_off_cut", None, 5.0),
-    ("plane_turbulence_cut", heading_off(-20.0), 5.0),
-    ("plane_turn_cut", heading_off(20.0), 5.0),
-    ("plane_turn_cut", imu_turned, 20.0),
-    ("plane_turbulence_cut", imu_turned, 20.0),
+    ("plane_turbulence", None, 5.0),
+    ("plane_turn", None, 5.0),
+    ("plane_take_off", None, 5.0),
+    ("plane_turbulence", heading_off(-20.0), 5.0),
+    ("plane_turn", heading_off(20.0), 5.0),
+    ("plane_turn", imu_turned, 20.0),
+    ("plane_turbulence", imu_turned, 20.0),
 ]
 STATED_FINER = [pytest.param(*case, 0.5, marks=pytest.mark.long) for case in TURNS]
 
@@ -86,7 +86,7 @@ def test_a_turn_in_turbulence_with_a_beacon_leaves_a_healthy_gnss_beyond_doubt(
     # one bank excluded GNSS 89 s after the start of the first log, and led the aircraft 148 m off; a later
     # one held it false with probability 0.998 in the second; another excluded it beside a wrong heading and
     # a wrong IMU, up to 678 m off
-    records = recorded(name)
+    records = recording(name)
     apart, doubt = flown(records if spoil is None else [spoil(r) for r in records], tilt_deg)
     assert len(apart) > 700 and max(apart) < most_m
     assert doubt < 0.05
@@ -95,7 +95,7 @@ def test_a_turn_in_turbulence_with_a_beacon_leaves_a_healthy_gnss_beyond_doubt(
 @pytest.mark.flight
 def test_a_long_straight_course_leaves_the_position_at_a_healthy_gnss() -> None:
     """The simulator's velocity is 0.25 % less than its positions move: 7 m off, with the whole log 13."""
-    apart, doubt = flown(recorded("plane_straight_cut"))
+    apart, doubt = flown(recording("plane_straight"))
     assert len(apart) > 5000 and max(apart) < 4.0
     assert doubt < 0.05
 
@@ -103,12 +103,12 @@ def test_a_long_straight_course_leaves_the_position_at_a_healthy_gnss() -> None:
 @pytest.mark.parametrize(
     ("name", "frozen"),
     [
-        ("plane_turn_cut", False),
-        ("plane_take_off_cut", True),
-        pytest.param("plane_turbulence_cut", False, marks=pytest.mark.long),
-        pytest.param("plane_turbulence_cut", True, marks=pytest.mark.long),
-        pytest.param("plane_turn_cut", True, marks=pytest.mark.long),
-        pytest.param("plane_take_off_cut", False, marks=pytest.mark.long),
+        ("plane_turn", False),
+        ("plane_take_off", True),
+        pytest.param("plane_turbulence", False, marks=pytest.mark.long),
+        pytest.param("plane_turbulence", True, marks=pytest.mark.long),
+        pytest.param("plane_turn", True, marks=pytest.mark.long),
+        pytest.param("plane_take_off", False, marks=pytest.mark.long),
     ],
 )
 def test_an_attitude_that_stops_or_stands_still_leaves_a_healthy_gnss_beyond_doubt(
@@ -116,7 +116,7 @@ def test_an_attitude_that_stops_or_stands_still_leaves_a_healthy_gnss_beyond_dou
 ) -> None:
     # with the last acceleration carried on to each fix GNSS was excluded, up to 402 m off; and no position
     # went out any more
-    records = recorded(name)
+    records = recording(name)
     begin_ns = records[0].rx_ns + (records[-1].rx_ns - records[0].rx_ns) * 3 // 20
     last = next(r for r in records if isinstance(r, Attitude) and r.rx_ns > begin_ns)
     spoilt: list[Input] = []
@@ -128,12 +128,6 @@ def test_an_attitude_that_stops_or_stands_still_leaves_a_healthy_gnss_beyond_dou
     apart, doubt = flown(spoilt)
     assert len(apart) > 700 and max(apart) < 5.0
     assert doubt < 0.05
-
-
-def recorded(name: str) -> list[Input]:
-    decoder = msgspec.json.Decoder(Input)
-    with gzip.open(DATA / f"{name}.jsonl.gz") as lines:
-        return [decoder.decode(line) for line in lines]
 
 
 def flown(records: list[Input], tilt_deg: float = 2.0) -> tuple[list[float], float]:

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import gzip
 import json
 import math
 from pathlib import Path
 
-import msgspec
 import numpy as np
 import pytest
 from click.testing import CliRunner
@@ -17,11 +15,12 @@ from hypothesis import strategies as st
 from companion.analysis.replay_inputs import LogInputs
 from companion.config import Config
 from companion.navigator.strapdown_channel import UPRIGHT, Strap, attitude_matrix, drag_force
-from companion.records import Attitude, Gnss, Imu, Input, Stamped, Vehicle
+from companion.records import Attitude, Gnss, Imu, Stamped, Vehicle
 from companion.storage.reader import LogError
 from companion.study import rotor_drag
 from companion.study.rotor_drag import command, fit, seconds_in_flight
 from companion.units import G0
+from tests.recordings import recording
 
 NS = 1_000_000_000
 DATA = Path(__file__).parents[1] / "data"
@@ -74,9 +73,7 @@ def test_only_seconds_in_flight_count() -> None:
 
 def test_a_recorded_copter_has_the_drag_of_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
     """quad106 of InertialNav; eleven flights of nine others have 0.18 to 0.28."""
-    with gzip.open(DATA / "copter_cut.jsonl.gz") as lines:
-        decoder: msgspec.json.Decoder[Input] = msgspec.json.Decoder(Input)
-        records = [decoder.decode(line) for line in lines]
+    records = list(recording("copter"))
     monkeypatch.setattr(rotor_drag, "open_inputs", lambda log, config: LogInputs(records, dict))
     done = CliRunner().invoke(command, ["quad106.bin", "--json"], catch_exceptions=False)
     found = json.loads(done.stdout)
