@@ -49,6 +49,7 @@ from companion.navigator.channel import Nominal, Transition
 from companion.navigator.hypotheses import BIASES, MOST_BEACONS, VELOCITY, Hypotheses, Model
 from companion.navigator.inertial_track import Point
 from companion.navigator.own_channel import OwnChannel
+from companion.navigator.progress import driver
 from companion.navigator.state import Beacon, Settings, State, hypotheses, levelled, source_name
 from companion.navigator.step import step
 from companion.records import (
@@ -464,8 +465,7 @@ class _Path:
 
     def _measures(self, before: State, record: Input) -> bool:
         """Whether a record besides the fixes may have been a measurement: not if it changes the driver."""
-        was, now = _interval(before), _interval(self._state)
-        if was is not None and now is not None and was.by != now.by:
+        if driver(before) != driver(self._state):
             return False
         if isinstance(record, Imu | Attitude):  # of a multirotor's drag, of a steady airspeed
             return self._state.sensors.measured_ns != before.sensors.measured_ns

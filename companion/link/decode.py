@@ -90,9 +90,8 @@ _IN_THE_AIR = frozenset(
         mavlink.MAV_LANDED_STATE_LANDING,
     }
 )
-_RECKONED_FROM_0_DEG7 = (
-    10**7
-)  # DCM that never had a fix reckons from 0, 0; there is no land within 1 deg of it
+#: ArduPilot's DCM that never had a fix reckons from 0, 0; there is no land within 1 deg of it.
+_RECKONED_FROM_0_DEG7 = 10**7
 _UNIX_AFTER_US = 10**15  # 2001; fewer microseconds are not a date
 
 _INERTIAL_UPDATED = (

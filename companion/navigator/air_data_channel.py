@@ -49,10 +49,8 @@ def step(r: Reckoner, record: Pressure) -> Rejection | None:
     if r.static is None or not _is_static(record):
         return None
     gap_s = (record.t_ns - r.static_ns) * 1e-9
-    change, limit = (
-        abs(pressure_altitude(record.static) - pressure_altitude(r.static)),
-        greatest_change(gap_s),
-    )
+    change = abs(pressure_altitude(record.static) - pressure_altitude(r.static))
+    limit = greatest_change(gap_s)
     if change <= limit or gap_s > STEP_S:
         return None
     return Rejection(record.t_ns, record.rx_ns, "pressure", "its altitude steps: not used", change, limit)

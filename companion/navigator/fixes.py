@@ -9,10 +9,10 @@ from companion.estimate.fusion import Azimuth
 from companion.navigator import fix_observations, height_error, measurements, own_channel, scatter
 from companion.navigator.hypotheses import GNSS, MOST_BEACONS, VELOCITY
 from companion.navigator.own_channel import OwnChannel
-from companion.navigator.own_error_model import By
 from companion.navigator.progress import (
     carried,
     decided,
+    driver,
     estimated_velocity,
     is_silent,
     nearer,
@@ -83,7 +83,7 @@ def gnss(state: State, record: Gnss, settings: Settings) -> Step:
         bank = velocity.bank
     is_measured = velocity is not None
     state, v_n = _latency_velocity(state._replace(bank=bank), record.t_ns, is_measured)
-    shows_latency = is_measured or _driver(state) != "hold"
+    shows_latency = is_measured or driver(state) != "hold"
     taken = measurements.gnss_position(bank, known, channel, apart, factor * variance, v_n, shows_latency)
     state = state._replace(bank=taken.bank, gnss_taken=record, fixed=True)
     state, out = decided(state, record, settings), list[Output]()
@@ -133,7 +133,7 @@ def _latency_velocity(state: State, t_ns: int, is_measured: bool) -> tuple[State
     a silence the velocity must be that of the fix: 5 m/s off in the first of two positions, they seemed to
     measure a latency of 0.13 s.
     """
-    v_n, by = estimated_velocity(state), _driver(state)
+    v_n, by = estimated_velocity(state), driver(state)
     if by != "imu" and (is_measured or by not in ("air", "foreign")):
         return state._replace(velocity_error=None), v_n
     assert state.nominal is not None
@@ -144,12 +144,6 @@ def _latency_velocity(state: State, t_ns: int, is_measured: bool) -> tuple[State
         north, east = mean.north + part * (north - mean.north), mean.east + part * (east - mean.east)
     state = state._replace(velocity_error=VelocityError(t_ns, north, east))
     return state, _smooth_velocity(state)
-
-
-def _driver(state: State) -> By | None:
-    """What moves the nominal trajectory of the own channel now; None of an INS."""
-    interval = state.nominal.interval if state.nominal else None
-    return None if interval is None else interval.by
 
 
 def _smooth_velocity(state: State) -> Vector2:

@@ -30,8 +30,8 @@ from companion.navigator.own_error_model import Airspeed, By
 from companion.navigator.progress import (
     carried,
     decided,
+    driver,
     estimated_velocity,
-    is_driven_by_imu,
     propagated,
     shifted,
     solved_if_due,
@@ -102,7 +102,7 @@ def _steady(state: State, record: Attitude, settings: Settings) -> Step:
     if s.leads("air", record.t_ns):
         return _driven(state._replace(sensors=s._replace(air_ns=record.t_ns)), record, "air", V, settings)
     state = state._replace(sensors=s)
-    return (_measured(state, record, V, settings) if is_driven_by_imu(state) else state), []
+    return (_measured(state, record, V, settings) if driver(state) == "imu" else state), []
 
 
 def _estimated_airspeed(state: State) -> float:
@@ -175,7 +175,7 @@ def _rotor_drag(state: State, record: Imu, settings: Settings) -> State:
 
 
 def _airspeed_from(airspeed: Airspeed, state: State, settings: Settings) -> State:
-    """Take the velocity through the air from something, and begin its scale anew if it was another."""
+    """Take the velocity through the air from something, and start its scale again if it was another."""
     nominal = state.nominal
     if state.bank is None or nominal is None or nominal.interval is None:
         return state
@@ -217,7 +217,7 @@ def air_data(state: State, record: AirData, settings: Settings) -> Step:
     if leads:
         state = state._replace(sensors=s._replace(steady=record))
         return _driven(state, record, "air", V, settings)
-    if not is_driven_by_imu(state):
+    if driver(state) != "imu":
         return state, []
     return _measured(carried(state, record.t_ns, settings), record, V, settings), []
 

@@ -17,6 +17,7 @@ from companion.navigator import minimax_bound, own_channel, parallel_filters
 from companion.navigator.channel import moved
 from companion.navigator.hypotheses import AIRSPEED, JAMMED
 from companion.navigator.inertial_track import Point
+from companion.navigator.own_error_model import By
 from companion.navigator.solution import solve
 from companion.navigator.state import (
     EXCLUDED,
@@ -237,7 +238,7 @@ def estimated_velocity(state: State) -> Vector2:
     return v_n[0] - float(x[2]), v_n[1] - float(x[3])
 
 
-def is_driven_by_imu(state: State) -> bool:
-    """Whether the IMU drives the nominal trajectory now."""
+def driver(state: State) -> By | None:
+    """What moves the nominal trajectory of the own channel now; None of an INS, and before the first fix."""
     interval = state.nominal.interval if state.nominal else None
-    return interval is not None and interval.by == "imu"
+    return None if interval is None else interval.by
