@@ -22,7 +22,7 @@ from companion.navigator.ground import Ground
 from companion.navigator.inertial_track import Point
 from companion.navigator.own_error_model import By, Propagator
 from companion.navigator.strapdown_channel import Strap
-from companion.records import AirData, Gnss, LocalPosition, RsbnFix, Vector2, Vector3
+from companion.records import AirData, AirspeedSensor, Gnss, LocalPosition, RsbnFix, Vector2, Vector3
 from companion.units import G0, SECOND_NS, Floats
 
 #: A driver that is silent for longer hands over to the next.
@@ -127,6 +127,11 @@ class OwnChannel:
         """Phi and Q of the interval."""
         assert nominal.interval is not None
         return Transition(*self.propagator.transition(nominal.interval))
+
+
+def with_airspeed_sensor(s: Sensors, record: AirspeedSensor) -> Sensors:
+    """Remember whether a healthy airspeed sensor is there."""
+    return s._replace(sensor_ns=record.t_ns if record.healthy else None)
 
 
 def airspeed_is_sensed(s: Sensors, record: AirData) -> bool:

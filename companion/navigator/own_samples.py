@@ -62,8 +62,7 @@ STEP_M_S, STEP_M_S2, STEP_GAP_S, STEP_NS = 10.0, 10.0, 1.0, 10 * SECOND_NS
 
 def airspeed_sensor(state: State, record: AirspeedSensor, settings: Settings) -> Step:
     """Remember whether a healthy airspeed sensor is there."""
-    seen = record.t_ns if record.healthy else None
-    return state._replace(sensors=state.sensors._replace(sensor_ns=seen)), []
+    return state._replace(sensors=own_channel.with_airspeed_sensor(state.sensors, record)), []
 
 
 def vehicle(state: State, record: Vehicle, settings: Settings) -> Step:

@@ -15,7 +15,7 @@ import copy
 import json
 import math
 from bisect import bisect_right
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -29,8 +29,9 @@ from companion.config import Config, load
 from companion.config.options import configuration_options
 from companion.nav.geometry import Geodetic, separation
 from companion.navigator import INPUTS_USED, Navigator
+from companion.navigator.own_channel import SENSOR_NS, Sensors, airspeed_is_sensed, with_airspeed_sensor
 from companion.option_types import INPUT_PATH, FloatRange
-from companion.records import AirData, Attitude, Gnss, Reboot, Solution, Stamped, Vehicle
+from companion.records import AirData, AirspeedSensor, Attitude, Gnss, Reboot, Solution, Stamped, Vehicle
 from companion.storage.reader import LogError
 from companion.tables import number_table, print_tables
 from companion.units import SECOND_NS, Floats
@@ -145,14 +146,19 @@ class Air:
 
     def __init__(self, records: Sequence[Stamped]) -> None:
         attitude = sorted({r.t_ns: (r.heading, r.pitch) for r in records if isinstance(r, Attitude)}.items())
-        air = sorted({r.t_ns: r.airspeed for r in records if isinstance(r, AirData)}.items())
-        self.known, self.sensed = len(attitude) > 1, len(air) > 1
+        air = sorted(_sensed_airspeeds(records).items())
+        self.known = len(attitude) > 1
         if self.known:
             self._t_attitude = np.array([t for t, _ in attitude])
             heading, self._pitch = np.array([each for _, each in attitude]).T
             self._heading = np.unwrap(heading)
-        if self.sensed:
-            self._t, self._speed = np.array(air).T
+        columns: Floats = np.array(air, dtype=np.float64).reshape(-1, 2).T
+        self._t, self._speed = columns
+
+    def is_sensed(self, t_ns: float) -> bool:
+        """Whether an airspeed has been measured lately."""
+        k = bisect_right(self._t, t_ns)
+        return k > 0 and bool(t_ns - self._t[k - 1] <= SENSOR_NS)
 
     def nose(self, t_ns: Floats) -> Floats:
         """Return unit vectors, levelled, (n, 2)."""
@@ -166,12 +172,24 @@ class Air:
         return through
 
 
+def _sensed_airspeeds(records: Iterable[Stamped]) -> dict[int, float]:
+    """Return the airspeeds (m/s) that are a sensor's, by time (ns)."""
+    sensors, found = Sensors(), dict[int, float]()
+    for record in records:
+        if isinstance(record, AirspeedSensor):
+            sensors = with_airspeed_sensor(sensors, record)
+        elif isinstance(record, AirData) and airspeed_is_sensed(sensors, record):
+            found[record.t_ns] = record.airspeed
+    return found
+
+
 def by_air(air: Air, fixes: Fixes, start: float, seconds: float) -> Floats:
     """Displacement (north, east, m) by the first rule."""
-    last = (fixes.v_t_ns > start - (WIND_S if air.sensed else FIT_S) * SECOND_NS) & (fixes.v_t_ns <= start)
+    is_sensed = air.is_sensed(start)
+    last = (fixes.v_t_ns > start - (WIND_S if is_sensed else FIT_S) * SECOND_NS) & (fixes.v_t_ns <= start)
     over_ground = np.stack([fixes.v_n[last], fixes.v_e[last]], axis=1)
     t = start + np.arange(0.0, seconds, STEP_S) * SECOND_NS
-    if air.sensed:
+    if is_sensed:
         wind, through = (over_ground - air.at(fixes.v_t_ns[last])).mean(axis=0), air.at(t)
     else:
         airspeed, wind = _fitted(over_ground, air.nose(fixes.v_t_ns[last]))
@@ -256,8 +274,8 @@ def command(
 
     LOG is any log that `companion replay` reads. From every minute of the flight on GNSS is withheld for 10,
     30, 60 and 120 s (--lasting), and the solution is compared with GNSS. Beside it: airspeed and heading plus
-    the mean wind of the last minute (without airspeed: the airspeed and wind that fit the last two minutes
-    best), and straight on.
+    the mean wind of the last minute (without an airspeed sensor: the airspeed and wind that fit the last two
+    minutes best), and straight on.
     """
     config = load(file, {}, pairs=pairs, preset=preset)
     durations = tuple(sorted(set(lasting))) or LASTING_S

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import lzma
 import math
 from itertools import pairwise
 from pathlib import Path
@@ -14,8 +15,9 @@ from msgspec.structs import replace
 
 from companion.command_line import cli
 from companion.config import load
+from companion.importers.sources import open_source
 from companion.nav.geometry import Geodetic, displace
-from companion.records import AirData, Attitude, Gnss, Stamped, Vehicle
+from companion.records import AirData, AirspeedSensor, Attitude, Gnss, Stamped, Vehicle
 from companion.storage.reader import LogError
 from companion.study import outages
 
@@ -93,6 +95,25 @@ def test_a_flight_too_short_is_one_sentence() -> None:
         match=r"no 210 s of flight with GNSS \(stated by the log, or faster than 8 m/s\): choose a longer",
     ):
         CliRunner().invoke(cli, ["study", "outages", str(log)], catch_exceptions=False)
+
+
+@pytest.mark.parametrize("name", ["no_airspeed_sensor", "pitot_stuck"])
+def test_the_rule_uses_an_airspeed_that_the_navigator_takes_as_measured(name: str, tmp_path: Path) -> None:
+    """ArduPlane without a sensor sends its own estimate as VFR_HUD.airspeed."""
+    log = tmp_path / f"{name}.tlog"
+    log.write_bytes(lzma.decompress((DATA / f"{name}_cut.tlog.xz").read_bytes()))
+    records = sorted(open_source(log), key=lambda record: record.rx_ns)
+    assert sum(isinstance(record, AirData) for record in records) > 100
+    air, last_ns = outages.Air(records), max(r.t_ns for r in records if isinstance(r, AirData))
+    assert air.is_sensed(last_ns) == (name != "no_airspeed_sensor")
+
+
+def test_an_airspeed_counts_while_its_sensor_is_healthy() -> None:
+    unstated = [replace(r, sensed=None) if isinstance(r, AirData) else r for r in circling(100.0)]
+    assert not outages.Air(unstated).is_sensed(20 * NS)
+    states = [AirspeedSensor(t * NS, t * NS, t < 50) for t in range(100)]
+    air = outages.Air(sorted([*states, *unstated], key=lambda record: record.rx_ns))
+    assert air.is_sensed(50 * NS) and not air.is_sensed(61 * NS)
 
 
 @pytest.mark.shared
