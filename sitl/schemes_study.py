@@ -64,6 +64,12 @@ def fly(world: World, channel: str, scheme: Any) -> SchemeFlight:
     return SchemeFlight(t, place, bound, root_mean_square(error), len(fixes), joint, rejected)
 
 
+def bound_m(flight: SchemeFlight) -> float | None:
+    """Return the r.m.s. guaranteed bound, m, where it is known; None: never."""
+    known = flight.bound[np.isfinite(flight.bound).all(axis=1)]
+    return root_mean_square(np.hypot(*known.T)) if len(known) else None
+
+
 def apart_m(a: SchemeFlight, b: SchemeFlight) -> tuple[float, float]:
     """Return the r.m.s. and the greatest distance of two flights at the times of both, m."""
     _, i, j = np.intersect1d(a.t_ns, b.t_ns, return_indices=True)
@@ -93,11 +99,11 @@ def command(scenario: str, channels: Sequence[str], seed: int) -> None:
     for channel, scheme in track(cases, "flying", console=Console(stderr=True), transient=True):
         flight = fly(world, channel, scheme)
         apart = apart_m(flight, first.setdefault(channel, flight))
-        bound = float(np.sqrt(np.nanmean(np.sum(flight.bound**2, axis=1))))
+        bound = bound_m(flight)
         table.add_row(
             *(channel, str(scheme), f"{flight.error_rms:.3f}"),
             *(str(n) for n in (flight.fixes, flight.joint, flight.rejected)),
-            *(f"{bound:.3f}", f"{apart[0]:.2g}", f"{apart[1]:.2g}"),
+            *("-" if bound is None else f"{bound:.3f}", f"{apart[0]:.2g}", f"{apart[1]:.2g}"),
             end_section=scheme == SCHEMES[-1],
         )
     print_tables(table)

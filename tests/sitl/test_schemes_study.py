@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
+from sitl import schemes_study
 from sitl.scenarios import get_scenario
 from sitl.schemes_study import SchemeFlight, apart_m, fly
 from sitl.world import World
@@ -39,3 +41,13 @@ def test_schemes_have_the_same_position_and_bound(
     assert both.mean() > 0.5
     ratio = np.hypot(*other.bound[both].T) / np.hypot(*first.bound[both].T)
     assert np.median(np.abs(ratio - 1.0)) < 0.02
+
+
+def test_a_flight_without_a_bound_has_a_dash(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The own channel by IMU has none."""
+    n = 5
+    flight = SchemeFlight(np.arange(n, dtype=float), np.zeros((n, 2)), np.full((n, 2), np.nan), 1.0, n, 0, 0)
+    monkeypatch.setattr(schemes_study, "fly", lambda *_: flight)
+    done = CliRunner().invoke(schemes_study.command, ["--channel", "own"], catch_exceptions=False)
+    rows = [line.split() for line in done.stdout.splitlines() if line.split()[:1] == ["own"]]
+    assert len(rows) == len(schemes_study.SCHEMES) and {row[6] for row in rows} == {"-"}
