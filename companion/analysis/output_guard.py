@@ -16,10 +16,14 @@ from companion.storage.reader import ACTIVE, LogError
 def reject_own_input(output: Path, *read: Path | None) -> None:
     """Raise LogError if `output`, or the name it has while written, is an input file, also through a link.
 
-    An empty name is that of the current folder, and no name of a file.
+    Or if it can be no file: the work before it would be in vain. An empty name is that of the current folder.
     """
-    if not output.name:
+    if not output.name or output.is_dir():
         raise LogError(f"'{output}' as output is a folder: give the name of a file")
+    if not output.parent.is_dir():
+        raise LogError(f"{output} cannot be written: no folder {output.parent}")
+    if not output.exists() and not os.access(output.parent, os.W_OK):
+        raise LogError(f"{output} cannot be written: no permission in folder {output.parent}")
     names = [name for name in (output, output.with_name(output.name + ACTIVE)) if name.exists()]
     for path in read:
         if path is not None and path.exists() and any(name.samefile(path) for name in names):

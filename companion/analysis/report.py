@@ -7,6 +7,7 @@ recorder. Errors are relative to the truth of the log, or else to the track smoo
 from __future__ import annotations
 
 from collections.abc import Sequence
+from importlib.util import find_spec
 from pathlib import Path
 
 import click
@@ -65,6 +66,11 @@ def command(
     for target in outputs:
         reject_own_input(target, *logs, config_file)
         reject_any_log(target)
+    if png is not None and png.exists() and not png.is_dir():
+        raise LogError(f"cannot write the figures to {png}: it is a file; give a folder")
+    for package in ("jinja2", "matplotlib") if pdf or png else ("jinja2",):
+        if find_spec(package) is None:
+            raise LogError(missing_package("a report", package, "report"))
     if changes or config_file:
         _reject_flown(logs)
     config = load(config_file)
@@ -81,8 +87,6 @@ def command(
         try:
             write_whole(output, render_report(_title(_names(logs)), blocks).encode(errors="replace"))
             written = [output, *(write_figures(_all_figures(blocks), pdf, png) if pdf or png else [])]
-        except ModuleNotFoundError as error:
-            raise LogError(missing_package("a report", error.name, "report")) from None
         except OSError as error:
             raise LogError(
                 f"cannot write the report to {error.filename}: {describe_write_error(error)}"

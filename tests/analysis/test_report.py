@@ -884,12 +884,36 @@ def test_report_accepts_as_many_logs_as_there_are_letters(log):
     assert CliRunner().invoke(command, [str(log)] * 27).exit_code == 2
 
 
-def test_unwritable_page_is_reported(log, tmp_path):
-    pytest.importorskip("jinja2")
-    found = CliRunner().invoke(command, [str(log), "-o", str(tmp_path / "no" / "r.html")])
-    assert isinstance(found.exception, LogError)
-    assert str(found.exception).startswith("cannot write the report")
-    assert str(found.exception).endswith(f": no folder {tmp_path / 'no'}")
+@pytest.mark.parametrize(("options", "package"), [((), "jinja2"), (("--pdf", "x.pdf"), "matplotlib")])
+def test_missing_package_is_reported_before_the_work(options, package, log, tmp_path, monkeypatch):
+    monkeypatch.setattr("companion.analysis.report.open_flights", lambda *_: pytest.fail("work was done"))
+    monkeypatch.setattr("companion.analysis.report.find_spec", lambda name: None if name == package else True)
+    with pytest.raises(LogError, match=f"a report needs {package}: run `pip install"):
+        CliRunner().invoke(
+            command, [str(log), "-o", str(tmp_path / "r.html"), *options], catch_exceptions=False
+        )
+
+
+@pytest.mark.parametrize(
+    ("option", "name", "words"),
+    [
+        ("-o", "no/r.html", "cannot be written: no folder"),
+        ("-o", "", "is a folder: give the name of a file"),
+        ("-o", "closed/r.html", "cannot be written: no permission in folder"),
+        ("--pdf", "no/r.pdf", "cannot be written: no folder"),
+        ("--png", "file", "it is a file; give a folder"),
+    ],
+)
+def test_unwritable_output_is_reported_before_the_work(option, name, words, log, tmp_path, monkeypatch):
+    monkeypatch.setattr("companion.analysis.report.open_flights", lambda *_: pytest.fail("work was done"))
+    (tmp_path / "file").write_text("")
+    closed = tmp_path / "closed"
+    closed.mkdir()
+    monkeypatch.setattr(os, "access", lambda path, mode: Path(path) != closed)
+    arguments = [str(log), "-o", str(tmp_path / "r.html"), option, str(tmp_path / name)]
+    with pytest.raises(LogError, match=re.escape(words)) as found:
+        CliRunner().invoke(command, arguments, catch_exceptions=False)
+    assert str(tmp_path / name) in str(found.value)
 
 
 @pytest.mark.parametrize("option", ["-o", "--pdf"])
