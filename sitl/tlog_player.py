@@ -160,7 +160,9 @@ class PlayerRunner(RealTimeRunner):
 @click.command("play")
 @click.argument("log", type=INPUT_PATH)
 @click.option("--connect", default="tcpin:127.0.0.1:5760", show_default=True, help="Link to the client.")
-@click.option("--from", "from_s", type=FloatRange(0.0), default=0.0, help="Start at this second of the log.")
+@click.option(
+    "--from", "from_s", type=FloatRange(0.0, 1e6), default=0.0, help="Start at this second of the log."
+)
 @click.option("--to", "to_s", type=FloatRange(0.0), default=math.inf, help="End at this second of the log.")
 @click.option(
     "--speed",

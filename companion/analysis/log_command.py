@@ -90,7 +90,7 @@ def convert_command(source: Path, output: Path, config_file: Path | None) -> Non
 @click.option(
     "--every",
     "every_s",
-    type=FloatRange(min=0.01),
+    type=FloatRange(0.01, 3600.0),
     default=1.0,
     show_default=True,
     help="Seconds between points.",

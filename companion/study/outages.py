@@ -251,7 +251,7 @@ def _row(
 @click.option(
     "--every",
     "every_s",
-    type=FloatRange(min=1.0),
+    type=FloatRange(1.0, 3600.0),
     default=60.0,
     show_default=True,
     help="Seconds between.",

@@ -114,6 +114,8 @@ def test_a_flight_is_cut_into_legs_with_and_without_fixes(tmp_path):
     }
     assert [len(line) for line in lines["estimate, no fixes"]] == [5]  # 40, 45, 60, 75 s and the last
     assert [len(line) for line in lines["GNSS"]] == [3, 4]  # 0, 15, 30 s; 80, 90, 105 s and the last
+    none = CliRunner().invoke(group, ["export", str(log), "-o", str(out), "--every", "1e300"])
+    assert none.exit_code == 2 and "1e+300 is not in the range" in none.stderr
     lon, lat = features["beacon 7"]["geometry"]["coordinates"]
     assert (math.radians(lat), math.radians(lon)) == pytest.approx((0.971, 0.651), abs=1e-9)
 

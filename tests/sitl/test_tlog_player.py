@@ -105,3 +105,10 @@ def test_invalid_log_is_reported_in_one_line(tmp_path: Path, data: bytes, words:
 def test_missing_log_is_reported() -> None:
     done = CliRunner().invoke(command, ["nothing.tlog"])
     assert done.exit_code == 1 and done.output == "companion: nothing.tlog: no such log\n"
+
+
+def test_a_start_after_every_log_is_rejected(tmp_path: Path) -> None:
+    log = tmp_path / "x.tlog"
+    log.write_bytes(b"")
+    done = CliRunner().invoke(command, [str(log), "--from", "1e300"])
+    assert done.exit_code == 2 and "1e+300 is not in the range" in done.stderr
