@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import difflib
 import os
+import re
 import stat
 import tomllib
 from collections.abc import Iterable, Mapping
@@ -25,6 +26,7 @@ from companion.config.validate import find_conflicts, find_mistakes
 #: Bytes of a file and dots in a line of it: a dotted key takes memory by the square of its parts (60 kB of
 #: them, 3.5 GB).
 MAX_SIZE, MAX_DOTS = 1 << 16, 1000
+MAX_QUOTED = 100  # characters of a line that is quoted in an error
 PREFIX = "COMPANION_"  # every environment variable with this prefix must name a key
 
 
@@ -159,7 +161,7 @@ def _tree(text: str, where: str) -> dict[str, dict[str, Any]]:
     try:
         tree = tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # an integer of thousands of digits is no TOMLDecodeError
-        raise ConfigError(f"{where}: not valid TOML: {error}") from None
+        raise ConfigError(f"{where}: not valid TOML: {error}{_line_of(error, text)}") from None
     for section, table in tree.items():
         if isinstance(table, dict):
             continue
@@ -167,6 +169,15 @@ def _tree(text: str, where: str) -> dict[str, dict[str, Any]]:
             raise ConfigError(f"{where}: `{section}` is a section: write [{section}] and its keys below it")
         raise ConfigError(f"{where}: the key `{section}` is in no section{_sections_of(section)}")
     return tree
+
+
+def _line_of(error: Exception, text: str) -> str:
+    """Return the line that an error of tomllib names, and what is mostly wrong with it."""
+    found = re.search(r"\(at line (\d+),", str(error))
+    line = text.split("\n")[int(found[1]) - 1].strip() if found else ""
+    if not 0 < len(line) <= MAX_QUOTED:
+        return ""
+    return f": `{line}`; write text in quotes, and numbers with a decimal point"
 
 
 def _check_size(size: int, where: str) -> None:
@@ -185,7 +196,7 @@ def _check_keys(tree: Mapping[str, Mapping[str, Any]], where: str) -> None:
                 raise ConfigError(f"{where}: section [{section}] has no key `{key}`{_nearest(key, keys)}")
 
 
-def _did_you_mean(name: str, known: Iterable[str], cutoff: float = 0.4) -> str:
+def _did_you_mean(name: str, known: Iterable[str], cutoff: float = 0.5) -> str:
     close = difflib.get_close_matches(name, list(known), 1, cutoff)
     return f"; did you mean `{close[0]}`?" if close else ""
 

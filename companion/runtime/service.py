@@ -87,7 +87,7 @@ class Service:
         self._deleted = deque[Path]() if deleted is None else deleted
         self._on_status, self._next_status_ns = on_status, 0
         self._notifier = notifier or SystemdNotifier({})
-        self._addresses = {text: Address.parse(text) for text in config.link.connect}
+        self._addresses = {str(address): address for address in map(Address.parse, config.link.connect)}
         self._signing_key = SigningKey.from_config(config)
         signing = self._signing_key.signing if self._signing_key else None
         self._parameters_file = StateFile(Path(name) if (name := config.link.parameters_file) else None)

@@ -82,6 +82,13 @@ def test_interrupt_while_the_log_is_created_is_a_stop(tmp_path: Path, monkeypatc
     assert events[-1].text.startswith("log: closed as ")
 
 
+def test_a_link_has_the_name_of_its_whole_address(tmp_path: Path) -> None:
+    """With the default host too: what is reported of silence has advice for the loopback address."""
+    with log_in(tmp_path) as log:
+        service = Service(load(None, {"link.connect": ("udpin:14550", "tcpin:5760")}, {}), log, print)
+    assert list(service.core.links) == ["udpin:127.0.0.1:14550", "tcpin:127.0.0.1:5760"]
+
+
 def test_udp_autopilot_is_answered_and_logged(tmp_path: Path) -> None:
     port = free_port()
     replies: list[bytes] = []
