@@ -33,11 +33,11 @@ from companion.analysis.verdict import judge_flight
 from companion.analysis.worker_options import worker_options
 from companion.config import Config, load, to_toml
 from companion.importers.foreign_file import one_line
-from companion.optional_dependencies import missing_package
+from companion.optional_dependencies import first_missing, missing_package
 from companion.printable import printable
 from companion.records import Severity
 from companion.storage.reader import LogError
-from companion.write_errors import write_whole
+from companion.write_errors import make_folder, write_whole
 
 SUFFIXES = (".mcap", ".tlog", ".bin", ".ulg", ".log")
 TABLE, PAGE, JOURNAL, REPORTS = "flights.parquet", "index.html", "logs.jsonl", "reports"
@@ -163,7 +163,10 @@ class Fleet:
     """A run over many logs with its results folder."""
 
     def __init__(self, results: Path, config: Config, scheduler: str | None, workers: int) -> None:
-        results.mkdir(parents=True, exist_ok=True)
+        try:
+            make_folder(results)
+        except OSError as error:
+            raise LogError(f"cannot keep results in {results}: {error.strerror}: give --results") from None
         self._results, self._config = results, config
         self._config_digest = _digest(to_toml(config))
         self._scheduler, self._workers = scheduler, workers
@@ -225,12 +228,10 @@ def _safe(name: str) -> str:
 
 
 def write_table(rows: Sequence[FlightRow], path: Path) -> None:
-    """Write the rows as Parquet; the file is replaced at once. Raises LogError if pyarrow is missing."""
-    try:
-        import pyarrow as pa
-        import pyarrow.parquet as pq
-    except ImportError:
-        raise LogError(missing_package("a table of flights", "pyarrow", "fleet")) from None
+    """Write the rows as Parquet; the file is replaced at once."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
     kinds = {str: pa.string(), int: pa.int64(), float: pa.float64()}
     hints = {name: [*get_args(hint), hint][0] for name, hint in get_type_hints(FlightRow).items()}
     schema = pa.schema([(name, kinds[hint]) for name, hint in hints.items()])
@@ -290,6 +291,8 @@ def command(
             f"--config {config_file} has no effect: all logs are our own, assessed as flown; replay them:"
             f" companion replay LOG --config {config_file} -o REPLAY.mcap, then assess the replays"
         )
+    if (package := first_missing("pyarrow", "jinja2")) is not None:
+        raise LogError(missing_package("a table of flights", package, "fleet"))
     columns = TextColumn("{task.description}"), MofNCompleteColumn(), TimeRemainingColumn()
     try:
         fleet = Fleet(results, load(config_file), scheduler, workers)

@@ -23,7 +23,7 @@ def reject_own_input(output: Path, *read: Path | None) -> None:
     if not output.parent.is_dir():
         raise LogError(f"{output} cannot be written: no folder {output.parent}")
     if not output.exists() and not os.access(output.parent, os.W_OK):
-        raise LogError(f"{output} cannot be written: no permission in folder {output.parent}")
+        raise LogError(f"{output} cannot be written: folder {output.parent.absolute()} is not writable")
     names = [name for name in (output, output.with_name(output.name + ACTIVE)) if name.exists()]
     for path in read:
         if path is not None and path.exists() and any(name.samefile(path) for name in names):

@@ -7,7 +7,6 @@ recorder. Errors are relative to the truth of the log, or else to the track smoo
 from __future__ import annotations
 
 from collections.abc import Sequence
-from importlib.util import find_spec
 from pathlib import Path
 
 import click
@@ -26,7 +25,7 @@ from companion.analysis.summary import summarize_flight
 from companion.analysis.verdict import judge_flight
 from companion.config import load
 from companion.option_types import INPUT_PATH
-from companion.optional_dependencies import missing_package
+from companion.optional_dependencies import first_missing, missing_package
 from companion.printable import printable
 from companion.storage.reader import LogError
 from companion.write_errors import describe_write_error, write_whole
@@ -68,9 +67,8 @@ def command(
         reject_any_log(target)
     if png is not None and png.exists() and not png.is_dir():
         raise LogError(f"cannot write the figures to {png}: it is a file; give a folder")
-    for package in ("jinja2", "matplotlib") if pdf or png else ("jinja2",):
-        if find_spec(package) is None:
-            raise LogError(missing_package("a report", package, "report"))
+    if (package := first_missing("jinja2", *(["matplotlib"] if pdf or png else []))) is not None:
+        raise LogError(missing_package("a report", package, "report"))
     if changes or config_file:
         _reject_flown(logs)
     config = load(config_file)

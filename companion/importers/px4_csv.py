@@ -48,7 +48,10 @@ class CsvFolder:
         found = {path.name.split(".")[0]: path for path in sorted(folder.glob("*.csv*"))}
         self._known = [(found[name], topic) for name, topic in ulog.supported_topics(found).items()]
         if not self._known:
-            raise LogError(f"{folder} has no supported topic: it needs {', '.join(ulog.TOPICS)} as CSV")
+            raise LogError(
+                f"{folder} has no topic of PX4 as CSV, such as vehicle_gps_position.csv: give a log, or a"
+                " folder of topics"
+            )
 
     def __iter__(self) -> Iterator[Stamped]:
         """Yield the records of all topics by time."""

@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
+from companion import optional_dependencies
 from companion.analysis import fleet, jobs
 from companion.analysis.fleet import FlightRow
 from companion.analysis.fleet_page import render_page
@@ -38,6 +39,24 @@ def run(*arguments: object) -> str:
     done = CliRunner().invoke(fleet.command, [str(a) for a in arguments], catch_exceptions=False)
     assert done.exit_code == 0, done.output
     return done.output
+
+
+@pytest.mark.parametrize("package", ["pyarrow", "jinja2"])
+def test_missing_package_is_reported_before_the_work(package: str, tmp_path: Path, monkeypatch) -> None:
+    (tmp_path / "x.mcap").touch()
+    monkeypatch.setattr(optional_dependencies, "find_spec", lambda name: None if name == package else True)
+    monkeypatch.setattr(fleet, "Fleet", lambda *_: pytest.fail("work was done"))
+    with pytest.raises(LogError, match=f"a table of flights needs {package}: run `pip install"):
+        CliRunner().invoke(fleet.command, [str(tmp_path)], catch_exceptions=False)
+
+
+def test_results_that_cannot_be_kept_are_one_sentence(tmp_path: Path) -> None:
+    pytest.importorskip("pyarrow")
+    (tmp_path / "x.mcap").touch()
+    (tmp_path / "file").touch()
+    results = tmp_path / "file" / "fleet"
+    with pytest.raises(LogError, match=f"cannot keep results in {results}: Not a directory: give --results"):
+        CliRunner().invoke(fleet.command, [str(tmp_path), "--results", str(results)], catch_exceptions=False)
 
 
 def test_each_log_is_a_row_and_a_bad_one_has_a_reason(logs: Path, tmp_path: Path) -> None:

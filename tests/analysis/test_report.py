@@ -20,6 +20,7 @@ from click.testing import CliRunner
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from companion import optional_dependencies
 from companion.analysis import assessment as assessing
 from companion.analysis import error_statistics
 from companion.analysis.assessment import assess_flight
@@ -887,7 +888,7 @@ def test_report_accepts_as_many_logs_as_there_are_letters(log):
 @pytest.mark.parametrize(("options", "package"), [((), "jinja2"), (("--pdf", "x.pdf"), "matplotlib")])
 def test_missing_package_is_reported_before_the_work(options, package, log, tmp_path, monkeypatch):
     monkeypatch.setattr("companion.analysis.report.open_flights", lambda *_: pytest.fail("work was done"))
-    monkeypatch.setattr("companion.analysis.report.find_spec", lambda name: None if name == package else True)
+    monkeypatch.setattr(optional_dependencies, "find_spec", lambda name: None if name == package else True)
     with pytest.raises(LogError, match=f"a report needs {package}: run `pip install"):
         CliRunner().invoke(
             command, [str(log), "-o", str(tmp_path / "r.html"), *options], catch_exceptions=False
@@ -899,7 +900,7 @@ def test_missing_package_is_reported_before_the_work(options, package, log, tmp_
     [
         ("-o", "no/r.html", "cannot be written: no folder"),
         ("-o", "", "is a folder: give the name of a file"),
-        ("-o", "closed/r.html", "cannot be written: no permission in folder"),
+        ("-o", "closed/r.html", "closed is not writable"),
         ("--pdf", "no/r.pdf", "cannot be written: no folder"),
         ("--png", "file", "it is a file; give a folder"),
     ],
