@@ -15,6 +15,7 @@ from companion.units import Floats
 from companion.write_errors import make_folder, write_whole
 
 INK, GRID, SHADE = "#374151", "#e5e7eb", "#fee2e2"
+LEGEND, HANDLE = 120, 10  # characters in a row of a legend, and what stands before each name
 TICKS_S = (1.0, 5.0, 10.0, 30.0, 60.0, 120.0, 300.0, 600.0, 1800.0, 3600.0)  # steps of a time axis
 
 
@@ -128,8 +129,10 @@ def _paint(figure: Figure, axes: Any) -> None:
     if figure.rows:
         axes.set_yticks(range(1, len(figure.rows) + 1), figure.rows)
         axes.set_ylim(len(figure.rows) + 0.6, 0.4)
-    elif axes.get_legend_handles_labels()[0]:
-        axes.legend(fontsize=7, frameon=False, ncols=4, loc="upper center", bbox_to_anchor=(0.5, -0.15))
+    elif names := axes.get_legend_handles_labels()[1]:
+        columns = max(1, min(4, LEGEND // (max(map(len, names)) + HANDLE)))
+        place = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.15)}
+        axes.legend(fontsize=7, frameon=False, ncols=columns, **place)
 
 
 def _paint_map(figure: Figure, axes: Any) -> None:

@@ -25,13 +25,14 @@ from companion.analysis import assessment as assessing
 from companion.analysis import error_statistics
 from companion.analysis.assessment import assess_flight
 from companion.analysis.convert import convert_log
+from companion.analysis.drawing import write_figures
 from companion.analysis.figures import build_figures
 from companion.analysis.flight_arrays import collect_flights
 from companion.analysis.flight_events import describe_rejections, event_title, topic_name
 from companion.analysis.flights import describe_channel, open_flights
 from companion.analysis.html import ReportBlock, comparison_table, render_report
 from companion.analysis.log_command import group as log_group
-from companion.analysis.plot_data import thin_line
+from companion.analysis.plot_data import Figure, Line, thin_line
 from companion.analysis.replay import command as replay_command
 from companion.analysis.report import blocks_of_log, command, comparison_block
 from companion.analysis.summary import (
@@ -960,6 +961,16 @@ def test_log_that_is_not_closed_has_no_unreadable_bytes(log, tmp_path):
         sink.close(finish=False)
     assert open_flights(active, Config())[0].remarks[0] == "The log was not closed."
     assert "torn (run companion log recover)" in CliRunner().invoke(log_group, ["info", str(active)]).output
+
+
+def test_long_names_of_lines_leave_room_for_the_plot(tmp_path):
+    """Two logs, each link by its address: matplotlib warned, and the legend was wider than the picture."""
+    pytest.importorskip("matplotlib")
+    t = np.arange(5.0)
+    names = [f"{log} udpin:127.0.0.1:14550: clock difference since the start" for log in "ABCD"]
+    lines = [Line(name, t, t, ("#000000", "#ffffff")) for name in names]
+    (path,) = write_figures([Figure("timesync", "Clock", "ms", lines)], None, tmp_path)
+    assert path.stat().st_size
 
 
 def test_file_in_place_of_the_folder_of_figures_is_reported(log, tmp_path):
