@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ipaddress
 import os
+import re
 import socket
 import termios
 from typing import NamedTuple
@@ -16,6 +17,7 @@ BAUD_RATES = {
     if name[0] == "B" and name[1:].isdigit() and name != "B0"
 }
 LOOPBACK = "127.0.0.1"
+NOT_IN_NAMES = re.compile(rb"[^A-Za-z0-9._-]")  # of hosts
 LISTENING = ("udpin", "tcpin")
 KINDS = ("serial", "udpout", "tcp", *LISTENING)
 
@@ -85,7 +87,7 @@ def _is_host(place: str) -> bool:
         elif place.replace(".", "").isdecimal():
             socket.inet_aton(place)
         else:
-            return b"\0" not in place.encode("idna")
+            return NOT_IN_NAMES.search(place.encode("idna")) is None
     except (OSError, ValueError):  # UnicodeError is a ValueError
         return False
     return True

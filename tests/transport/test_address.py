@@ -53,6 +53,9 @@ def test_invalid_ports_and_baud_rates_are_reported() -> None:
         "tcp:300.1.1.1:5760",
         "tcpin:[::g]:5760",
         "tcp:host\0:5760",
+        "udpin:14550,udpin:14551",
+        "udpin://127.0.0.1:14550",
+        "tcp:my host:5760",
     ],
 )
 def test_invalid_host_is_reported(text: str) -> None:
