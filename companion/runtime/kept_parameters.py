@@ -34,11 +34,15 @@ class KeptParameters:
         self._count_path = Path(runtime_folder) / name if runtime_folder else path.with_name(name)
         self._boot_id = boot_id
 
-    def load(self, base: Config, load: Callable[[], Config]) -> tuple[Config, list[str]]:
+    def load(
+        self, base: Config, load: Callable[[], Config], configuration: Path | None = None
+    ) -> tuple[Config, list[str]]:
         """Return the configuration to start with, and what must be reported.
 
-        `base` is the configuration without the kept values, `load` returns the one with them.
+        `base` is the configuration without the kept values, of the file `configuration`; `load` returns the
+        one with them. Raises ConfigError if the path is of something else than kept values.
         """
+        self._check(configuration)
         if not self.path.exists():
             return base, []
         _, failed = self._count()
@@ -61,6 +65,15 @@ class KeptParameters:
         """Forget the failed starts."""
         with contextlib.suppress(OSError):
             self._count_path.unlink(missing_ok=True)
+
+    def _check(self, configuration: Path | None) -> None:
+        """Raise ConfigError if the path is of something else, which would be renamed or replaced."""
+        if self.path.exists() and not self.path.is_file():
+            raise ConfigError(f"link.parameters_file: {self.path} is no regular file: give another name")
+        if configuration is not None and self.path.exists() and self.path.samefile(configuration):
+            raise ConfigError(
+                f"link.parameters_file: {self.path} is the configuration file: give another name"
+            )
 
     def _add(self, number: int) -> None:
         if self.path.exists():

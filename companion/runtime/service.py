@@ -374,7 +374,7 @@ def command(
         kept = KeptParameters(
             Path(base.link.parameters_file), runtime_folder=os.environ.get("RUNTIME_DIRECTORY", "")
         )
-        config, notes = kept.load(base, partial(load_with, kept.path))
+        config, notes = kept.load(base, partial(load_with, kept.path), file)
     writer = StderrWriter()
     console = Console(
         writer.write_line,

@@ -49,7 +49,12 @@ class StateFile:
 
 
 def replace_text(path: Path, text: str) -> None:
-    """Replace a file atomically: a power loss leaves the old text or the new one. Raises OSError."""
+    """Replace a file atomically: a power loss leaves the old text or the new one. Raises OSError.
+
+    A folder or a device, such as /dev/null, is not replaced.
+    """
+    if path.exists() and not path.is_file():
+        raise OSError(errno.EINVAL, "not a regular file", str(path))
     temporary = path.with_name(path.name + ".new")
     with temporary.open("w", encoding="utf-8") as file:
         file.write(text)

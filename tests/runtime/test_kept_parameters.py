@@ -1,10 +1,11 @@
 """Kept parameters are used until two starts with them failed; then they are set aside, with a sentence."""
 
+import os
 from pathlib import Path
 
 import pytest
 
-from companion.config import Config, load
+from companion.config import Config, ConfigError, load
 from companion.runtime.kept_parameters import KeptParameters
 
 
@@ -66,3 +67,31 @@ def test_a_disk_that_cannot_be_written_does_not_prevent_the_start(kept: KeptPara
     for _ in range(4):
         config, notes = start(kept)
         assert config.gnss.sigma_m == 7.0 and notes == []
+
+
+def test_a_folder_is_rejected_and_stays_where_it_is(tmp_path: Path) -> None:
+    """A mistake of the configuration: it was renamed, with all that is in it, and the service started."""
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    with pytest.raises(ConfigError, match=f"link.parameters_file: {folder} is no regular file: give another"):
+        start(KeptParameters(folder, tmp_path / "boot_id"))
+    assert folder.is_dir() and not folder.with_name("folder.rejected").exists()
+
+
+def test_a_device_is_rejected(tmp_path: Path) -> None:
+    fifo = tmp_path / "fifo"
+    os.mkfifo(fifo)
+    with pytest.raises(ConfigError, match="is no regular file"):
+        start(KeptParameters(fifo, tmp_path / "boot_id"))
+    assert fifo.is_fifo()
+
+
+def test_the_configuration_is_no_file_for_parameters(kept: KeptParameters) -> None:
+    """The first value that a station sets would replace all of it."""
+    link = kept.path.with_name("link.toml")
+    link.symlink_to(kept.path)
+    with pytest.raises(ConfigError, match="is the configuration file: give another"):
+        kept.load(Config(), Config, link)
+    link.unlink()
+    link.touch()
+    assert kept.load(Config(), Config, link) == (Config(), [])

@@ -1,5 +1,7 @@
 """State file: atomic writes, errors returned and retried, `put` without disk access."""
 
+import os
+
 import pytest
 
 from companion.runtime import state_file
@@ -56,3 +58,12 @@ def test_interrupted_write_leaves_the_old_text_or_the_new(tmp_path, monkeypatch)
         assert path.read_text() == "old"
     state_file.replace_text(path, "new")
     assert path.read_text() == "new"
+
+
+def test_only_a_regular_file_is_replaced(tmp_path) -> None:
+    """As root /dev/null was replaced by a file (signing.stamp_file)."""
+    fifo = tmp_path / "fifo"
+    os.mkfifo(fifo)
+    with pytest.raises(OSError, match="not a regular file"):
+        state_file.replace_text(fifo, "text")
+    assert fifo.is_fifo() and list(tmp_path.iterdir()) == [fifo]
