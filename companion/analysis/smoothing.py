@@ -359,7 +359,7 @@ class _Path:
                 continue
             P, at = bank.P.copy(), list(jump.states)
             P[:, at, at] += np.square(jump.sigma)
-            self._state = self._state._replace(bank=bank._replace(P=P))
+            self._state = structs.replace(self._state, bank=bank._replace(P=P))
             self._Q[at, at] += np.square(jump.sigma)
 
     def follow(self, record: Input) -> None:
@@ -367,7 +367,7 @@ class _Path:
         if isinstance(record, Tuning):
             self._tune(record)
             return
-        before = self._state._replace(next_ns=NEVER_NS, pending=None)
+        before = structs.replace(self._state, next_ns=NEVER_NS, pending=None)
         self._model.asked.clear()
         after, outputs = guarded(before, record, self._settings, step, record)
         self._state = after if after.bank is not None else self._with_beacons(after)
@@ -414,7 +414,7 @@ class _Path:
 
     def _with_beacons(self, state: State) -> State:
         """With the beacons of the whole flight, as long as there is no bank."""
-        return state._replace(beacons=self._beacons)
+        return structs.replace(state, beacons=self._beacons)
 
     def _close(self) -> None:
         if self.runs and self.runs[-1]:

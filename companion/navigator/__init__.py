@@ -226,7 +226,7 @@ class Navigator:
         """
         pending, outputs = state.pending, list[Output]()
         if pending is not None:
-            state = state._replace(pending=None)
+            state = structs.replace(state, pending=None)
             state, outputs = guarded(state, pending.record, self._settings, resolve_pending, pending)
         if is_bound_due(state):
             state, more = guarded(state, record, self._settings, refresh_bound, record)
@@ -366,7 +366,7 @@ class Navigator:
         answers = now.answers
         if then.anchored is None or then.anchored is not now.anchored:
             answers = tuple(a and a._replace(sought_ns=min(a.sought_ns, then.fixed_ns)) for a in answers)
-        return before._replace(guarantee=then._replace(answers=answers))
+        return structs.replace(before, guarantee=then._replace(answers=answers))
 
     def _with_events(self, outputs: list[Output], record: Input) -> list[Output]:
         """Add an event for each change of the state that leads, and of the solutions' mode."""
@@ -390,15 +390,16 @@ def tuned(state: State, before: Settings, config: Config) -> tuple[Settings, Sta
     """
     settings, old = Settings.of(config), before.config
     if begins_again(old, config):
-        return settings, State()._replace(
+        return settings, State(
             next_ns=state.next_ns, origin=state.origin, sensors=state.sensors, level=state.level
         )
-    state = state._replace(
+    state = structs.replace(
+        state,
         guarantee=minimax_bound.tuned(state.guarantee),
         parallel=state.parallel if config.estimator == old.estimator else None,
     )
     if config.gnss.latency_s != old.gnss.latency_s and state.bank is not None:
-        state = state._replace(bank=other_receiver(state.bank, settings.model.channel))
+        state = structs.replace(state, bank=other_receiver(state.bank, settings.model.channel))
     return settings, state
 
 
@@ -420,7 +421,8 @@ def guarded(
     if after.bank is not None and after.bank is not state.bank and not banks.is_sound(after.bank):
         why = "covariance not positive definite: error state reset"
         outputs = [*outputs, Reset(record.t_ns, record.rx_ns, "bank", why)]
-        after = after._replace(
+        after = structs.replace(
+            after,
             bank=None,
             nominal=None,
             beacons=(),

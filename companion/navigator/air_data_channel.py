@@ -9,7 +9,8 @@ estimates how far off they are. Sideslip and the angle of attack are taken as ze
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+
+from msgspec import Struct, structs
 
 from companion.nav.geometry import Geodetic
 from companion.navigator.fix_observations import place
@@ -26,7 +27,7 @@ CLIMB_S = 2.0  # time constant of the climb taken from the pressure altitude
 STEP_S = 10.0  # a pressure that stepped and stays is used again after so long
 
 
-class Reckoner(NamedTuple):
+class Reckoner(Struct, frozen=True):
     """What is needed to go on: last attitude, airspeed and pressure (Pa) with its time, None before one."""
 
     attitude: Attitude | None = None
@@ -38,10 +39,10 @@ class Reckoner(NamedTuple):
 def sense(r: Reckoner, record: Attitude | AirData | Pressure) -> Reckoner:
     """With one more attitude, airspeed or static pressure."""
     if isinstance(record, Attitude):
-        return r._replace(attitude=record)
+        return structs.replace(r, attitude=record)
     if isinstance(record, AirData):
-        return r._replace(air=record)
-    return r._replace(static=record.static, static_ns=record.t_ns) if _is_static(record) else r
+        return structs.replace(r, air=record)
+    return structs.replace(r, static=record.static, static_ns=record.t_ns) if _is_static(record) else r
 
 
 def step(r: Reckoner, record: Pressure) -> Rejection | None:

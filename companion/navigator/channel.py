@@ -12,6 +12,7 @@ import math
 from typing import NamedTuple, Protocol
 
 import numpy as np
+from msgspec import Struct
 
 from companion.nav.geometry import Geodetic, displace
 from companion.navigator.inertial_track import Point
@@ -30,7 +31,7 @@ class Transition(NamedTuple):
     Q: Floats
 
 
-class Nominal(NamedTuple):
+class Nominal(Struct, frozen=True):
     """Nominal trajectory at `point`, with horizontal acceleration `a_n` (m/s^2).
 
     `since` is where the bank stands; `interval` sums what the error model of the own channel needs of the

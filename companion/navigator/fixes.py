@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 
+from msgspec import structs
+
 from companion.estimate.bank.settings import DEFAULT as THRESHOLDS
 from companion.estimate.fusion import Azimuth
 from companion.navigator import fix_observations, height_error, measurements, own_channel, scatter
@@ -60,7 +62,7 @@ def gnss(state: State, record: Gnss, settings: Settings) -> Step:
     if not record.has_3d_fix or is_too_soon(record, state, settings):
         return state, []
     first_ns = record.t_ns if state.gnss_first_ns is None else state.gnss_first_ns
-    state = _begun(state._replace(gnss_first_ns=first_ns), record, settings)
+    state = _begun(structs.replace(state, gnss_first_ns=first_ns), record, settings)
     if state.nominal is None or state.bank is None or is_silent(state, record.t_ns):
         return state, []
     state = propagated(carried(state, record.t_ns, settings), settings)
@@ -68,7 +70,7 @@ def gnss(state: State, record: Gnss, settings: Settings) -> Step:
     assert state.bank is not None
     assert nominal is not None
     if last is not None and last.receiver != record.receiver:
-        state = state._replace(bank=measurements.other_receiver(state.bank, channel))
+        state = structs.replace(state, bank=measurements.other_receiver(state.bank, channel))
     assert state.bank is not None
     variance = fix_observations.white_sigma(record, config) ** 2
     apart = measurements.gnss_apart(record, nominal.point)
@@ -82,10 +84,10 @@ def gnss(state: State, record: Gnss, settings: Settings) -> Step:
         velocity = measurements.gnss_velocity(bank, known, channel, record, nominal.point, nominal.a_n, noise)
         bank = velocity.bank
     is_measured = velocity is not None
-    state, v_n = _latency_velocity(state._replace(bank=bank), record.t_ns, is_measured)
+    state, v_n = _latency_velocity(structs.replace(state, bank=bank), record.t_ns, is_measured)
     shows_latency = is_measured or driver(state) != "hold"
     taken = measurements.gnss_position(bank, known, channel, apart, factor * variance, v_n, shows_latency)
-    state = state._replace(bank=taken.bank, gnss_taken=record, fixed=True)
+    state = structs.replace(state, bank=taken.bank, gnss_taken=record, fixed=True)
     state, out = decided(state, record, settings), list[Output]()
     label = f"gnss {record.receiver}"
     if velocity is not None and (state.reported[VELOCITY] == EXCLUDED or not velocity.accepted):
@@ -93,7 +95,7 @@ def gnss(state: State, record: Gnss, settings: Settings) -> Step:
     if state.reported[GNSS] == EXCLUDED or not taken.accepted:
         out.append(_rejected(state, record, label, GNSS, taken))
         refused_ns = None if taken.by_any else state.refused_ns or record.t_ns
-        state, again = _restarted(state._replace(refused_ns=refused_ns), record, settings)
+        state, again = _restarted(structs.replace(state, refused_ns=refused_ns), record, settings)
         return nearer(state, settings), [*out, *again]
     since = math.inf if state.gnss_ns is None else (record.t_ns - state.gnss_ns) * 1e-9
     part = min(since, config.correlation_s) / config.correlation_s
@@ -104,7 +106,8 @@ def gnss(state: State, record: Gnss, settings: Settings) -> Step:
     pending = None
     if state.false[GNSS] < known.settings.suspect:
         pending = Pending(record, nominal.point, (0.0, 0.0), Source.GNSS)
-    state = state._replace(
+    state = structs.replace(
+        state,
         gnss_ns=record.t_ns,
         gnss_fix=(record, nominal.point),
         level=level,
@@ -135,14 +138,14 @@ def _latency_velocity(state: State, t_ns: int, is_measured: bool) -> tuple[State
     """
     v_n, by = estimated_velocity(state), driver(state)
     if by != "imu" and (is_measured or by not in ("air", "foreign")):
-        return state._replace(velocity_error=None), v_n
+        return structs.replace(state, velocity_error=None), v_n
     assert state.nominal is not None
     nominal, mean = state.nominal.point.v_n, state.velocity_error
     north, east = nominal[0] - v_n[0], nominal[1] - v_n[1]
     if mean is not None:
         part = -math.expm1(-max(t_ns - mean.t_ns, 0) * 1e-9 / MEAN_S)
         north, east = mean.north + part * (north - mean.north), mean.east + part * (east - mean.east)
-    state = state._replace(velocity_error=VelocityError(t_ns, north, east))
+    state = structs.replace(state, velocity_error=VelocityError(t_ns, north, east))
     return state, _smooth_velocity(state)
 
 
@@ -188,7 +191,7 @@ def rsbn(state: State, record: RsbnFix, settings: Settings) -> Step:
         state, factor = _scattered(state, record, label, (residual,), variance, metres)
         assert state.bank is not None
         taken = measurements.sight(state.bank, known, z, k, factor * variance, centre, point.v_n)
-        state = decided(state._replace(bank=taken.bank), record, settings)
+        state = decided(structs.replace(state, bank=taken.bank), record, settings)
         is_followed |= taken.by_any
         part = Source.AZIMUTH if isinstance(z, Azimuth) else Source.RANGE
         if state.reported[source] == EXCLUDED or not taken.accepted:
@@ -198,15 +201,15 @@ def rsbn(state: State, record: RsbnFix, settings: Settings) -> Step:
     others = tuple(beacon for beacon in before.unfit if beacon[0] != record.beacon)
     if not is_followed:
         count = 1 + dict(before.unfit).get(record.beacon, 0)
-        return before._replace(unfit=((record.beacon, count), *others)[:MOST_BEACONS]), out
-    state = state._replace(fixed=True, unfit=others)
+        return structs.replace(before, unfit=((record.beacon, count), *others)[:MOST_BEACONS]), out
+    state = structs.replace(state, fixed=True, unfit=others)
     if believed:
         pending = Pending(record, point, centre, believed)
-        state = state._replace(rsbn_ns=record.t_ns, pending=pending)
+        state = structs.replace(state, rsbn_ns=record.t_ns, pending=pending)
         if record.azimuth is not None:
-            state = state._replace(azimuth_ns=record.t_ns if believed & Source.AZIMUTH else None)
+            state = structs.replace(state, azimuth_ns=record.t_ns if believed & Source.AZIMUTH else None)
         if record.slant_range is not None:
-            state = state._replace(range_ns=record.t_ns if believed & Source.RANGE else None)
+            state = structs.replace(state, range_ns=record.t_ns if believed & Source.RANGE else None)
     return nearer(state, settings), out
 
 
@@ -220,8 +223,8 @@ def _beacon(state: State, record: RsbnFix, settings: Settings) -> tuple[State, i
         larger = settings.model.with_beacon(bank, len(beacons))
         if not beacons and state.gnss_taken is not None:
             larger = settings.model.doubted(larger)
-        state = state._replace(bank=larger, beacons=(*beacons, new))
-        state = state._replace(false=(*state.false, 0.0, 0.0), reported=(*state.reported, 0, 0))
+        state = structs.replace(state, bank=larger, beacons=(*beacons, new))
+        state = structs.replace(state, false=(*state.false, 0.0, 0.0), reported=(*state.reported, 0, 0))
         return state, len(beacons), out
     if k is None:
         k = min(range(len(beacons)), key=lambda i: beacons[i].last_ns)
@@ -229,9 +232,9 @@ def _beacon(state: State, record: RsbnFix, settings: Settings) -> tuple[State, i
         text = f"beacon {record.beacon} states another position"
         out.append(Event(record.t_ns, record.rx_ns, Severity.NOTICE, text))
     if (new.identity, new.place) != (beacons[k].identity, beacons[k].place):
-        state = state._replace(bank=hypotheses(state, settings).renewed(bank, k))
+        state = structs.replace(state, bank=hypotheses(state, settings).renewed(bank, k))
     beacons[k] = new
-    return state._replace(beacons=tuple(beacons)), k, out
+    return structs.replace(state, beacons=tuple(beacons)), k, out
 
 
 def _begun(state: State, record: Gnss | RsbnFix, settings: Settings) -> State:
@@ -243,8 +246,8 @@ def _begun(state: State, record: Gnss | RsbnFix, settings: Settings) -> State:
         return state
     if nominal.interval is not None:
         nominal = own_channel.restart(nominal, nominal.interval.by, nominal.point.v_n[:2])
-    nominal = nominal._replace(since=nominal.point)
-    return state._replace(nominal=nominal, bank=settings.model.begin(0.0), started_ns=record.t_ns)
+    nominal = structs.replace(nominal, since=nominal.point)
+    return structs.replace(state, nominal=nominal, bank=settings.model.begin(0.0), started_ns=record.t_ns)
 
 
 def _restarted(state: State, record: Gnss, settings: Settings) -> Step:
@@ -265,7 +268,7 @@ def _restarted(state: State, record: Gnss, settings: Settings) -> Step:
     centre = estimate(state, settings).x[:2].tolist()
     apart = math.dist(measurements.gnss_apart(record, state.nominal.point), (-centre[0], -centre[1]))
     why = f"no hypothesis explains GNSS, {apart:.0f} m off for {refused_ns * 1e-9:.0f} s: position restarted"
-    state = widened(state, apart)._replace(started_ns=record.t_ns, refused_ns=None)
+    state = structs.replace(widened(state, apart), started_ns=record.t_ns, refused_ns=None)
     return state, [Reset(record.t_ns, record.rx_ns, "position", why)]
 
 
@@ -287,7 +290,7 @@ def _scattered(
     seen = scatter.observe(
         state.scatter.get(name), record.t_ns, residual, variance, lacking / max(metres, 1.0)
     )
-    return state._replace(scatter={**state.scatter, name: seen}), seen.used
+    return structs.replace(state, scatter={**state.scatter, name: seen}), seen.used
 
 
 def _rejected(

@@ -6,6 +6,8 @@ import math
 from collections.abc import Callable
 from typing import Any
 
+from msgspec import structs
+
 from companion.navigator import (
     air_data_channel,
     corrector_measurements,
@@ -50,14 +52,14 @@ CORRECTOR_AIRSPEED_NS = 5 * SECOND_NS  # gusts last seconds: beside an INS more 
 
 def position(state: State, record: LocalPosition, settings: Settings) -> Step:
     """Move the nominal trajectory to the position of the INS; a step beyond its velocity is a jump."""
-    state = state._replace(local=record)
+    state = structs.replace(state, local=record)
     if state.origin is None:
         waiting = state.waiting_ns or record.t_ns
-        return state._replace(waiting_ns=waiting), []
+        return structs.replace(state, waiting_ns=waiting), []
     new = inertial_track.point(record, state.origin)
     nominal, out = state.nominal, list[Output]()
     if nominal is None:
-        state = state._replace(nominal=Nominal(new, (0.0, 0.0), new), ins=new)
+        state = structs.replace(state, nominal=Nominal(new, (0.0, 0.0), new), ins=new)
         return solved_if_due(state, record, settings)
     last = state.ins or nominal.point
     dt = (new.t_ns - last.t_ns) * 1e-9
@@ -66,8 +68,8 @@ def position(state: State, record: LocalPosition, settings: Settings) -> Step:
     state, out = _jump_removed(state, last, new, record)
     a_n = ((new.v_n[0] - last.v_n[0]) / dt, (new.v_n[1] - last.v_n[1]) / dt)
     assert state.nominal is not None
-    nominal = state.nominal._replace(point=new, a_n=a_n)
-    state = state._replace(nominal=nominal, ins=new)
+    nominal = structs.replace(state.nominal, point=new, a_n=a_n)
+    state = structs.replace(state, nominal=nominal, ins=new)
     if nominal.pending_s >= NEAR_S and state.bank is not None:
         state = decided(propagated(state, settings), record, settings)
     state, more = solved_if_due(state, record, settings)
@@ -80,7 +82,7 @@ def _jump_removed(state: State, last: Point, new: Point, record: LocalPosition) 
     north, east, down = inertial_track.beyond(last, new)
     length, silent = math.hypot(north, east), (new.t_ns - last.t_ns) * 1e-9
     if abs(down) > height_error.greatest_change(silent):
-        state = state._replace(level=height_error.stepped(state.level, -down))
+        state = structs.replace(state, level=height_error.stepped(state.level, -down))
         out.append(_channel(record, f"height stepped by {-down:.1f} m"))
     most = inertial_track.unnoticed(silent)
     if length > most:
@@ -97,7 +99,7 @@ def sensed(state: State, record: Attitude | Pressure, settings: Settings) -> Ste
     s = state.sensors
     if isinstance(record, Pressure) and (rejection := air_data_channel.step(s.air, record)) is not None:
         return state, [rejection]
-    return state._replace(sensors=s._replace(air=air_data_channel.sense(s.air, record))), []
+    return structs.replace(state, sensors=structs.replace(s, air=air_data_channel.sense(s.air, record))), []
 
 
 def airspeed(state: State, record: AirData, settings: Settings) -> Step:
@@ -110,7 +112,7 @@ def airspeed(state: State, record: AirData, settings: Settings) -> Step:
         return state, []
     if record.t_ns - s.measured_ns < CORRECTOR_AIRSPEED_NS:
         return state, []
-    state = state._replace(sensors=s._replace(measured_ns=record.t_ns))
+    state = structs.replace(state, sensors=structs.replace(s, measured_ns=record.t_ns))
     return _corrected_by(state, record, settings, "airspeed")
 
 
@@ -136,7 +138,7 @@ def _corrected_by(state: State, record: Any, settings: Settings, name: str) -> S
             Rejection(record.t_ns, record.rx_ns, name, "star below the horizon or near the zenith")
         ]
     taken = measurements.corrector(state.bank, hypotheses(state, settings), rows)
-    state, out = decided(state._replace(bank=taken.bank), record, settings), list[Output]()
+    state, out = decided(structs.replace(state, bank=taken.bank), record, settings), list[Output]()
     if not taken.accepted:
         why = "outlier: normalised squared innovation"
         out.append(Rejection(record.t_ns, record.rx_ns, name, why, taken.nis))
@@ -153,7 +155,7 @@ def _corrected_by(state: State, record: Any, settings: Settings, name: str) -> S
             config=settings.config,
             channel=settings.model.channel,
         )
-        state = state._replace(parallel=parallel)
+        state = structs.replace(state, parallel=parallel)
     return state, out
 
 

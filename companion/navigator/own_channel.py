@@ -14,6 +14,8 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+from msgspec import Struct, structs
+
 from companion.config import Config
 from companion.navigator import air_data_channel, own_error_model, strapdown_channel
 from companion.navigator.air_data_channel import Reckoner
@@ -45,7 +47,7 @@ class AirspeedSums(NamedTuple):
     air: Vector2
 
 
-class Sensors(NamedTuple):
+class Sensors(Struct, frozen=True):
     """Last readings: IMU and attitude, air data, the foreign velocity, and when each was last of use."""
 
     strap: Strap = Strap()
@@ -131,7 +133,7 @@ class OwnChannel:
 
 def with_airspeed_sensor(s: Sensors, record: AirspeedSensor) -> Sensors:
     """Remember whether a healthy airspeed sensor is there."""
-    return s._replace(sensor_ns=record.t_ns if record.healthy else None)
+    return structs.replace(s, sensor_ns=record.t_ns if record.healthy else None)
 
 
 def airspeed_is_sensed(s: Sensors, record: AirData) -> bool:
@@ -206,7 +208,7 @@ def by_imu(nominal: Nominal, a_n: Vector2, s: Sensors, t_ns: int) -> Nominal:
     dt = (t_ns - nominal.t_ns) * 1e-9
     noise = strapdown_channel.velocity_variance(s.accelerations, s.mean_acceleration, dt)
     interval = own_error_model.add_imu(nominal.interval, dt, a_n, s.heading() or 0.0, noise)
-    return nominal._replace(point=moved(nominal.point, interval.velocity, t_ns), interval=interval)
+    return structs.replace(nominal, point=moved(nominal.point, interval.velocity, t_ns), interval=interval)
 
 
 def by_velocity(nominal: Nominal, velocity: Vector2, t_ns: int) -> Nominal:
@@ -215,4 +217,4 @@ def by_velocity(nominal: Nominal, velocity: Vector2, t_ns: int) -> Nominal:
     assert i is not None
     dt = (t_ns - nominal.t_ns) * 1e-9
     add = own_error_model.add_hold(i, dt) if i.by == "hold" else own_error_model.add_velocity(i, dt, velocity)
-    return nominal._replace(point=moved(nominal.point, add.velocity, t_ns), interval=add)
+    return structs.replace(nominal, point=moved(nominal.point, add.velocity, t_ns), interval=add)

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import math
 
+from msgspec import structs
+
 from companion.estimate import bank as banks
 from companion.navigator import (
     air_data_channel,
@@ -62,7 +64,7 @@ STEP_M_S, STEP_M_S2, STEP_GAP_S, STEP_NS = 10.0, 10.0, 1.0, 10 * SECOND_NS
 
 def airspeed_sensor(state: State, record: AirspeedSensor, settings: Settings) -> Step:
     """Remember whether a healthy airspeed sensor is there."""
-    return state._replace(sensors=own_channel.with_airspeed_sensor(state.sensors, record)), []
+    return structs.replace(state, sensors=own_channel.with_airspeed_sensor(state.sensors, record)), []
 
 
 def vehicle(state: State, record: Vehicle, settings: Settings) -> Step:
@@ -74,15 +76,17 @@ def vehicle(state: State, record: Vehicle, settings: Settings) -> Step:
     aloft_ns = s.aloft_ns
     if record.flying is not None:
         aloft_ns = (aloft_ns or record.t_ns) if record.flying and not hovering else None
-    s = s._replace(multirotor=multirotor, fixed_wing=fixed_wing, hovering=hovering, aloft_ns=aloft_ns)
-    return state._replace(sensors=s), []
+    s = structs.replace(s, multirotor=multirotor, fixed_wing=fixed_wing, hovering=hovering, aloft_ns=aloft_ns)
+    return structs.replace(state, sensors=s), []
 
 
 def attitude(state: State, record: Attitude, settings: Settings) -> Step:
     """Remember an attitude."""
     s = state.sensors
-    s = s._replace(strap=strapdown_channel.sense(s.strap, record), air=air_data_channel.sense(s.air, record))
-    state = state._replace(sensors=s)
+    s = structs.replace(
+        s, strap=strapdown_channel.sense(s.strap, record), air=air_data_channel.sense(s.air, record)
+    )
+    state = structs.replace(state, sensors=s)
     if state.nominal is not None and own_channel.is_steady(s, record.t_ns):
         return _steady(state, record, settings)
     return _straight_on(state, record, settings)
@@ -95,12 +99,14 @@ def _steady(state: State, record: Attitude, settings: Settings) -> Step:
     state = _airspeed_from("steady", state, settings)
     s = state.sensors
     if s.steady_m_s is None:
-        s = s._replace(steady_m_s=max(_estimated_airspeed(state), FLYING_M_S))
+        s = structs.replace(s, steady_m_s=max(_estimated_airspeed(state), FLYING_M_S))
     assert s.steady_m_s is not None
     V = own_error_model.air_velocity(s.steady_m_s, record.pitch, record.heading)
     if s.leads("air", record.t_ns):
-        return _driven(state._replace(sensors=s._replace(air_ns=record.t_ns)), record, "air", V, settings)
-    state = state._replace(sensors=s)
+        return _driven(
+            structs.replace(state, sensors=structs.replace(s, air_ns=record.t_ns)), record, "air", V, settings
+        )
+    state = structs.replace(state, sensors=s)
     return (_measured(state, record, V, settings) if driver(state) == "imu" else state), []
 
 
@@ -118,8 +124,8 @@ def pressure(state: State, record: Pressure, settings: Settings) -> Step:
     if (rejection := air_data_channel.step(s.air, record)) is not None:
         state, out = _straight_on(state, record, settings)
         return state, [rejection, *out]
-    s = s._replace(air=air_data_channel.sense(s.air, record))
-    return _straight_on(state._replace(sensors=s), record, settings)
+    s = structs.replace(s, air=air_data_channel.sense(s.air, record))
+    return _straight_on(structs.replace(state, sensors=s), record, settings)
 
 
 def _straight_on(state: State, record: Stamped, settings: Settings) -> Step:
@@ -136,15 +142,15 @@ def imu(state: State, record: Imu, settings: Settings) -> Step:
         return state, []
     s = state.sensors
     strap = strapdown_channel.receive(s.strap, record)
-    s = s._replace(strap=strap)
+    s = structs.replace(s, strap=strap)
     if strap.why or strap.C_nb is None:
-        return _straight_on(state._replace(sensors=s), record, settings)
+        return _straight_on(structs.replace(state, sensors=s), record, settings)
     now = strapdown_channel.acceleration(strap)
     fresh = record.t_ns - s.imu_ns <= own_channel.SILENT_NS["imu"]
     before = s.accelerations[-2:] if fresh else ()
     mean = strapdown_channel.mean_acceleration(s.mean_acceleration, now, (record.t_ns - s.imu_ns) * 1e-9)
-    s = s._replace(imu_ns=record.t_ns, accelerations=(*before, now), mean_acceleration=mean)
-    state = state._replace(sensors=s)
+    s = structs.replace(s, imu_ns=record.t_ns, accelerations=(*before, now), mean_acceleration=mean)
+    state = structs.replace(state, sensors=s)
     last = before[-1] if before else now
     between = (0.5 * (now[0] + last[0]), 0.5 * (now[1] + last[1]))
     state, outputs = _driven(state, record, "imu", between, settings)
@@ -161,7 +167,7 @@ def _rotor_drag(state: State, record: Imu, settings: Settings) -> State:
     height = None if s.air.static is None else nominal.point.position.alt
     if s.aloft_ns is None:
         parked = Ground(parked_height=height)
-        return state._replace(sensors=s._replace(ground=parked, sums=None))
+        return structs.replace(state, sensors=structs.replace(s, ground=parked, sums=None))
     taking_off = not s.ground.flying and record.t_ns - s.aloft_ns < TAKE_OFF_NS
     if taking_off and is_clear(s.ground, height) is False:
         return state  # the ground pushes too
@@ -181,16 +187,17 @@ def _airspeed_from(airspeed: Airspeed, state: State, settings: Settings) -> Stat
     if nominal.interval.airspeed == airspeed:
         return state
     sigma = own_error_model.scale_sigma(_own(settings).settings, airspeed)
-    return state._replace(
+    return structs.replace(
+        state,
         bank=banks.renew(state.bank, [own_error_model.SCALE], [sigma]),
-        nominal=nominal._replace(interval=nominal.interval._replace(airspeed=airspeed)),
+        nominal=structs.replace(nominal, interval=nominal.interval._replace(airspeed=airspeed)),
     )
 
 
 def air_data(state: State, record: AirData, settings: Settings) -> Step:
     """Use airspeed, as driver or as measurement; on the ground it only shows whether the aircraft flies."""
     s = state.sensors
-    state = state._replace(sensors=s._replace(air=air_data_channel.sense(s.air, record)))
+    state = structs.replace(state, sensors=structs.replace(s, air=air_data_channel.sense(s.air, record)))
     nominal = state.nominal
     if nominal is None or not settings.config.uses("air_data"):
         return state, []
@@ -208,13 +215,13 @@ def air_data(state: State, record: AirData, settings: Settings) -> Step:
     height = None if s.air.static is None else nominal.point.position.alt
     ground = ground_phase(s.ground, record.t_ns * 1e-9, math.hypot(*V), speed, height)
     state = _sheared(state, ground)
-    s = state.sensors._replace(air_ns=record.t_ns if ground.flying else s.air_ns)
-    state = state._replace(sensors=s)
+    s = structs.replace(state.sensors, air_ns=record.t_ns if ground.flying else s.air_ns)
+    state = structs.replace(state, sensors=s)
     if not ground.flying:
         return _straight_on(state, record, settings)
     state = _airspeed_from("pitot", state, settings)
     if leads:
-        state = state._replace(sensors=s._replace(steady=record))
+        state = structs.replace(state, sensors=structs.replace(s, steady=record))
         return _driven(state, record, "air", V, settings)
     if driver(state) != "imu":
         return state, []
@@ -225,10 +232,10 @@ def _sheared(state: State, ground: Ground) -> State:
     """With another phase of the flight, and with what the wind may have changed with height in it."""
     s, nominal = state.sensors, state.nominal
     sheared = wind_shear(s.ground, ground)
-    state = state._replace(sensors=s._replace(ground=ground))
+    state = structs.replace(state, sensors=structs.replace(s, ground=ground))
     if sheared and nominal is not None and nominal.interval is not None:
         interval = nominal.interval._replace(shear=nominal.interval.shear + sheared)
-        state = state._replace(nominal=nominal._replace(interval=interval))
+        state = structs.replace(state, nominal=structs.replace(nominal, interval=interval))
     return state
 
 
@@ -244,7 +251,7 @@ def _measured(state: State, record: AirData | Attitude | Imu, V: Vector2, settin
         (sums.air[0] + V[0], sums.air[1] + V[1]),
     )
     if record.t_ns - sums.start_ns < AIRSPEED_EVERY_NS:
-        return state._replace(sensors=s._replace(sums=sums))
+        return structs.replace(state, sensors=structs.replace(s, sums=sums))
     state = propagated(state, settings)
     assert state.bank is not None
     known, n = hypotheses(state, settings), sums.samples
@@ -258,8 +265,8 @@ def _measured(state: State, record: AirData | Attitude | Imu, V: Vector2, settin
         drag, heading = settings.config.air_data.rotor_drag_per_s, s.heading() or 0.0
         taken = measurements.rotor_drag(state.bank, known, V, velocity, manoeuvre, heading, drag)
     sums = AirspeedSums(record.t_ns, 0, (0.0, 0.0), (0.0, 0.0))
-    sensors = state.sensors._replace(measured_ns=record.t_ns, sums=sums)
-    return decided(state._replace(bank=taken.bank, sensors=sensors), record, settings)
+    sensors = structs.replace(state.sensors, measured_ns=record.t_ns, sums=sums)
+    return decided(structs.replace(state, bank=taken.bank, sensors=sensors), record, settings)
 
 
 def _step(s: Sensors, record: AirData) -> Rejection | None:
@@ -289,14 +296,14 @@ def _blocked_pitot(before: Sensors, record: AirData) -> list[Output]:
 def foreign_position(state: State, record: LocalPosition, settings: Settings) -> Step:
     """Use the velocity of the autopilot's estimator, as driver or as measurement, where we do not feed it."""
     s, config = state.sensors, settings.config
-    state = state._replace(local=record)
+    state = structs.replace(state, local=record)
     if state.origin is None and state.waiting_ns is None:
-        state = state._replace(waiting_ns=record.t_ns)
+        state = structs.replace(state, waiting_ns=record.t_ns)
     if not config.uses("local_position") or config.output.feeds_estimator:
         return state, []
     before = s.foreign
-    s = s._replace(foreign=record, foreign_ns=record.t_ns)
-    state = state._replace(sensors=s)
+    s = structs.replace(s, foreign=record, foreign_ns=record.t_ns)
+    state = structs.replace(state, sensors=s)
     if state.nominal is None:
         return state, []
     velocity = (record.v_n[0], record.v_n[1])
@@ -310,7 +317,7 @@ def foreign_position(state: State, record: LocalPosition, settings: Settings) ->
     v_n = state.nominal.point.v_n
     apart = (v_n[0] - velocity[0], v_n[1] - velocity[1])
     taken = measurements.foreign_velocity(state.bank, hypotheses(state, settings), _own(settings), apart)
-    return decided(state._replace(bank=taken.bank), record, settings), []
+    return decided(structs.replace(state, bank=taken.bank), record, settings), []
 
 
 def _driven(state: State, record: Stamped, by: By, sample: Vector2 | None, settings: Settings) -> Step:
@@ -323,20 +330,22 @@ def _driven(state: State, record: Stamped, by: By, sample: Vector2 | None, setti
         return state, []
     assert nominal.interval is not None
     if nominal.interval.by != by:
-        s = s._replace(sums=None)
-        state = propagated(carried(state, record.t_ns, settings), settings)._replace(sensors=s)
+        s = structs.replace(s, sums=None)
+        state = structs.replace(propagated(carried(state, record.t_ns, settings), settings), sensors=s)
         assert state.nominal is not None
         velocity = sample if by in ("air", "foreign") and sample else state.nominal.point.v_n[:2]
         state = _velocity_stepped(state, velocity)
         assert state.nominal is not None
         nominal = own_channel.restart(state.nominal, by, velocity)
         if by == "imu" and sample:
-            nominal = nominal._replace(a_n=sample)
+            nominal = structs.replace(nominal, a_n=sample)
     elif by == "imu" and sample:
-        nominal = own_channel.by_imu(nominal, sample, s, record.t_ns)._replace(a_n=s.accelerations[-1][:2])
+        nominal = structs.replace(
+            own_channel.by_imu(nominal, sample, s, record.t_ns), a_n=s.accelerations[-1][:2]
+        )
     else:
         nominal = own_channel.by_velocity(nominal, sample or (0.0, 0.0), record.t_ns)
-    state = state._replace(nominal=_at_height(nominal, s))
+    state = structs.replace(state, nominal=_at_height(nominal, s))
     if nominal.pending_s >= NEAR_S:
         state = decided(propagated(state, settings), record, settings)
     return solved_if_due(state, record, settings)
@@ -347,7 +356,7 @@ def _velocity_stepped(state: State, velocity: Vector2) -> State:
     assert state.nominal is not None
     north, east, _ = state.nominal.point.v_n
     step = (velocity[0] - north, velocity[1] - east)
-    return shifted(state, 0.0, 0.0, step)._replace(gnss_fix=state.gnss_fix)
+    return structs.replace(shifted(state, 0.0, 0.0, step), gnss_fix=state.gnss_fix)
 
 
 def _at_height(nominal: Nominal, s: Sensors) -> Nominal:
@@ -361,7 +370,7 @@ def _at_height(nominal: Nominal, s: Sensors) -> Nominal:
     if dt > 0.0:
         climb += min(dt / air_data_channel.CLIMB_S, 0.2) * ((alt - nominal.since.position.alt) / dt - climb)
     v_n = (point.v_n[0], point.v_n[1], -climb)
-    return nominal._replace(point=point._replace(position=point.position._replace(alt=alt), v_n=v_n))
+    return structs.replace(nominal, point=point._replace(position=point.position._replace(alt=alt), v_n=v_n))
 
 
 def _own(settings: Settings) -> OwnChannel:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections import deque
+from collections.abc import Callable
 from itertools import islice
+from operator import attrgetter
 from typing import NamedTuple
 
 from companion.navigator.state import State
@@ -20,8 +22,7 @@ class _Past(NamedTuple):
     before: State | None  # None: dropped; the first one of all has a state
 
 
-def _time(past: _Past) -> int:
-    return past.record.t_ns
+_time: Callable[[_Past], int] = attrgetter("record.t_ns")
 
 
 class PastStates:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from msgspec import structs
 
 from companion.estimate import bank as banks
 from companion.estimate.bank import Bank
@@ -49,10 +50,10 @@ def carried(state: State, t_ns: int, settings: Settings) -> State:
             state = propagated(state, settings)
             assert state.nominal is not None
             nominal = own_channel.restart(state.nominal, "hold", state.nominal.point.v_n[:2])
-        return state._replace(nominal=own_channel.carry_on(nominal, state.sensors, t_ns))
+        return structs.replace(state, nominal=own_channel.carry_on(nominal, state.sensors, t_ns))
     v, a = nominal.point.v_n, nominal.a_n
     point = moved(nominal.point, (v[0] + a[0] * dt, v[1] + a[1] * dt), t_ns)
-    return state._replace(nominal=nominal._replace(point=point))
+    return structs.replace(state, nominal=structs.replace(nominal, point=point))
 
 
 def births_due(state: State, settings: Settings) -> bool:
@@ -69,7 +70,7 @@ def with_births(state: State, record: Stamped, settings: Settings) -> Step:
 
     Until a measurement has judged them, children would raise the protection level.
     """
-    return state._replace(newborn=_born(state, settings)), []
+    return structs.replace(state, newborn=_born(state, settings)), []
 
 
 def _born(state: State, settings: Settings) -> tuple[Bank, Bank]:
@@ -93,7 +94,7 @@ def propagated(state: State, settings: Settings) -> State:
         return state
     _, bank = _born(state, settings)
     known = hypotheses(state, settings)
-    state = state._replace(newborn=None)
+    state = structs.replace(state, newborn=None)
     Phi, Q = settings.model.transition(nominal, len(state.beacons))
     bank = banks.propagate(bank, known.layout, nominal.pending_s, Phi, Q)
     if nominal.interval is not None and nominal.interval.by_sensed_air:
@@ -101,10 +102,10 @@ def propagated(state: State, settings: Settings) -> State:
         seen[AIRSPEED] = bank.t
         bank = bank._replace(seen=seen)
     if nominal.interval is None:
-        return state._replace(bank=bank, nominal=nominal._replace(since=nominal.point))
+        return structs.replace(state, bank=bank, nominal=structs.replace(nominal, since=nominal.point))
     velocity = nominal.point.v_n[:2]
     nominal = own_channel.restart(nominal, nominal.interval.by, velocity)
-    return state._replace(bank=bank, nominal=nominal)
+    return structs.replace(state, bank=bank, nominal=nominal)
 
 
 def decided(state: State, record: Stamped, settings: Settings) -> State:
@@ -125,8 +126,8 @@ def decided(state: State, record: Stamped, settings: Settings) -> State:
         elif p < known.settings.believed:
             reported[i] = 0
     leading = (bank, banks.estimate(bank, known.layout))
-    return state._replace(
-        bank=bank, leading=leading, false=false, reported=tuple(reported), certain_ns=tuple(since)
+    return structs.replace(
+        state, bank=bank, leading=leading, false=false, reported=tuple(reported), certain_ns=tuple(since)
     )
 
 
@@ -151,13 +152,15 @@ def nearer(state: State, settings: Settings) -> State:
     sums = state.sensors.sums
     if sums is not None:  # the samples of airspeed so far are moved with the nominal velocity, not dropped
         mean_sum = (sums.velocity[0] + sums.samples * vn, sums.velocity[1] + sums.samples * ve)
-        state = state._replace(sensors=state.sensors._replace(sums=sums._replace(velocity=mean_sum)))
+        state = structs.replace(
+            state, sensors=structs.replace(state.sensors, sums=sums._replace(velocity=mean_sum))
+        )
     place = displace(*nominal.point.position, n, e, 0.0)
     v = nominal.point.v_n
     velocity = (v[0] + vn, v[1] + ve)
     point = Point(nominal.t_ns, place._replace(alt=nominal.point.position.alt), (*velocity, v[2]))
-    nominal = nominal._replace(point=point, since=point)
-    return state._replace(nominal=own_channel.restart(nominal, by, velocity))
+    nominal = structs.replace(nominal, point=point, since=point)
+    return structs.replace(state, nominal=own_channel.restart(nominal, by, velocity))
 
 
 def shifted(state: State, north: float, east: float, v_n: Vector2 = (0.0, 0.0), t_ns: int = 0) -> State:
@@ -179,7 +182,8 @@ def shifted(state: State, north: float, east: float, v_n: Vector2 = (0.0, 0.0), 
         each and each._replace(centre=(each.centre[0] + north, each.centre[1] + east))
         for each in (state.pending, state.half)
     )
-    return state._replace(
+    return structs.replace(
+        state,
         bank=bank,
         moved=(state.moved[0] + north, state.moved[1] + east),
         protection=protection,
@@ -196,7 +200,7 @@ def widened(state: State, sigma: float) -> State:
     """With an independent position error of one `sigma` (m) more on each axis; bound and filters restart."""
     assert state.bank is not None
     bank = banks.inflate(state.bank, (0, 1), sigma)
-    return state._replace(bank=bank, guarantee=minimax_bound.Guarantee(), parallel=None)
+    return structs.replace(state, bank=bank, guarantee=minimax_bound.Guarantee(), parallel=None)
 
 
 def _fix_shifted(
@@ -215,8 +219,8 @@ def solved_if_due(state: State, record: Stamped, settings: Settings) -> Step:
     state, solution = solve(state, record.rx_ns, settings)
     if solution:
         period = round(1e9 / settings.config.output.pace_hz)
-        state = state._replace(
-            next_ns=max(state.next_ns + period, state.nominal.t_ns if state.nominal else 0)
+        state = structs.replace(
+            state, next_ns=max(state.next_ns + period, state.nominal.t_ns if state.nominal else 0)
         )
     return state, solution
 

@@ -11,6 +11,7 @@ from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
+from msgspec import structs
 
 from companion.config import Config
 from companion.estimate import bank as banks
@@ -74,7 +75,7 @@ def solve(state: State, rx_ns: int, settings: Settings) -> Step:
     rests_on = sources(state, t_ns, settings)
     fixes = rests_on & FIXES
     leading = estimate(state, settings)
-    state = state._replace(leading=(bank, leading))
+    state = structs.replace(state, leading=(bank, leading))
     candidates = _candidates(state, leading.x, leading.P, nominal.pending_s, promised, settings)
     leads = config.leading_estimator
     if (rests_on & Source.GNSS if leads == "restrictive" else fixes) or leads not in candidates:
@@ -85,7 +86,7 @@ def solve(state: State, rx_ns: int, settings: Settings) -> Step:
     if state.protection is None or t_ns - state.protection[0] >= PROTECTION_NS:
         false_sources = tuple((source_name(i, state), p) for i, p in enumerate(state.false))
         radius = banks.protection_level(bank, known.layout, config.integrity.risk, position)
-        state = state._replace(protection=(t_ns, radius, *error))
+        state = structs.replace(state, protection=(t_ns, radius, *error))
     assert state.protection is not None
     # in between the estimate moves: by the triangle inequality the level holds about its new place
     protection = state.protection[1] + math.dist(error, state.protection[2:])
@@ -138,7 +139,7 @@ def solve(state: State, rx_ns: int, settings: Settings) -> Step:
             if (c := candidates.get(name)) is not None
         ),
     )
-    return state._replace(held=held), [solution]
+    return structs.replace(state, held=held), [solution]
 
 
 def _candidates(
@@ -280,7 +281,7 @@ def resolve_pending(state: State, pending: Pending, settings: Settings) -> Step:
     try:
         fix = maximum_likelihood((*observations, height), start=np.zeros(3))  # type: ignore[arg-type]
     except NoFix:
-        return state._replace(half=pending), []  # an azimuth or a range alone is no fix
+        return structs.replace(state, half=pending), []  # an azimuth or a range alone is no fix
     east, north, up = (float(c) for c in fix.position)
     correction = (pending.centre[0] - north, pending.centre[1] - east)
     (var_e, cov), var_n = fix.covariance[0, :2].tolist(), float(fix.covariance[1, 1])
@@ -300,7 +301,7 @@ def resolve_pending(state: State, pending: Pending, settings: Settings) -> Step:
         degrees_of_freedom=fix.degrees_of_freedom,
         iterations=fix.iterations,
     )
-    state = state._replace(guarantee=g, half=None)
+    state = structs.replace(state, guarantee=g, half=None)
     return _filtered(state, pending, out, used, settings), [out]
 
 
@@ -333,7 +334,7 @@ def refresh_bound(state: State, record: Input, settings: Settings) -> Step:
         return state, []
     g = minimax_bound.follow(state.guarantee, nominal, settings.config)
     g = minimax_bound.refresh(g, nominal, settings.config)
-    return (state if g is state.guarantee else state._replace(guarantee=g)), []
+    return (state if g is state.guarantee else structs.replace(state, guarantee=g)), []
 
 
 def _filtered(state: State, pending: Pending, fix: Fix, used: Source, settings: Settings) -> State:
@@ -345,7 +346,7 @@ def _filtered(state: State, pending: Pending, fix: Fix, used: Source, settings: 
     if parallel is None:
         found = estimate(state, settings)
         parallel = parallel_filters.begin(config, channel, point, found.x[:4], found.P[:4, :4])
-        return state._replace(parallel=parallel)
+        return structs.replace(state, parallel=parallel)
     var_n, cov, var_e = fix.covariance
     by_gnss = bool(used & Source.GNSS)
     parallel = parallel_filters.add(
@@ -359,4 +360,4 @@ def _filtered(state: State, pending: Pending, fix: Fix, used: Source, settings: 
         config=config,
         channel=channel,
     )
-    return state._replace(parallel=parallel)
+    return structs.replace(state, parallel=parallel)

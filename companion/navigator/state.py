@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import NamedTuple
 
+from msgspec import Struct
+
 from companion.config import Config
 from companion.estimate import bank as banks
 from companion.estimate.bank import Bank, Estimate
@@ -66,8 +68,8 @@ class VelocityError(NamedTuple):
     east: float
 
 
-class State(NamedTuple):
-    """All that the navigator remembers."""
+class State(Struct, frozen=True):
+    """All that the navigator remembers; to replace a field of a Struct costs a fifth of a NamedTuple's."""
 
     guarantee: Guarantee = Guarantee()
     origin: LocalOrigin | None = None

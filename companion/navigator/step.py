@@ -12,6 +12,8 @@ import math
 from collections.abc import Callable
 from typing import Any
 
+from msgspec import structs
+
 from companion.navigator import fixes, ins_samples, own_samples
 from companion.navigator.local_origin import LIVE_WINDOW_NS, infer_origin
 from companion.navigator.own_channel import OwnChannel, Sensors
@@ -58,7 +60,7 @@ def _origin(state: State, record: LocalOrigin, settings: Settings) -> Step:
         return state, []
     text = "local origin known" if old is None else "local origin changed"
     severity = Severity.INFO if old is None else Severity.WARNING
-    return state._replace(origin=record), [Event(record.t_ns, record.rx_ns, severity, text)]
+    return structs.replace(state, origin=record), [Event(record.t_ns, record.rx_ns, severity, text)]
 
 
 def _global_position(state: State, record: GlobalPosition, settings: Settings) -> Step:
@@ -75,9 +77,9 @@ def _reboot(state: State, record: Reboot, settings: Settings) -> Step:
     why = f"autopilot {record.system} rebooted"
     restarted = state.nominal is not None and record.t_ns < state.nominal.t_ns - SECOND_NS  # a log's clock
     if isinstance(settings.model.channel, OwnChannel) and not restarted:
-        state = state._replace(sensors=Sensors(), gnss_fix=None, local=None)
+        state = structs.replace(state, sensors=Sensors(), gnss_fix=None, local=None)
         return state, [Reset(record.t_ns, record.rx_ns, "sensors", why)]
-    return State()._replace(next_ns=state.next_ns), [Reset(record.t_ns, record.rx_ns, "navigator", why)]
+    return State(next_ns=state.next_ns), [Reset(record.t_ns, record.rx_ns, "navigator", why)]
 
 
 def _time_step(state: State, record: TimeStep, settings: Settings) -> Step:
@@ -89,7 +91,7 @@ def _time_step(state: State, record: TimeStep, settings: Settings) -> Step:
 
 
 def _gnss_integrity(state: State, record: GnssIntegrity, settings: Settings) -> Step:
-    return (state._replace(jammed_ns=record.t_ns) if record.threatened else state), []
+    return (structs.replace(state, jammed_ns=record.t_ns) if record.threatened else state), []
 
 
 _Uses = dict[type, Callable[[State, Any, Settings], Step]]

@@ -18,6 +18,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from msgspec import Struct, structs
 
 from companion.nav.strapdown import rotation_matrix
 from companion.records import Attitude, Imu, Vector2, Vector3
@@ -59,7 +60,7 @@ class Pace(NamedTuple):
         return 1.0 / self.interval if self.heard > FEW and self.interval > 0.0 else 0.0
 
 
-class Strap(NamedTuple):
+class Strap(Struct, frozen=True):
     """What is needed to go on: last sample, attitude at its time, rates, vertical specific force averaged
     (m/s^2, down); why the last sample is of no use.
     """
@@ -78,23 +79,23 @@ def sense(s: Strap, record: Attitude) -> Strap:
     if s.imu is not None:
         dt = (s.imu.t_ns - record.t_ns) * 1e-9
         C_nb = C_nb @ rotation_matrix(np.array(s.imu.w_b) * max(-STALE_S, min(dt, STALE_S)))
-    return s._replace(C_nb=C_nb, attitude_pace=s.attitude_pace.with_one(record.t_ns))
+    return structs.replace(s, C_nb=C_nb, attitude_pace=s.attitude_pace.with_one(record.t_ns))
 
 
 def receive(s: Strap, record: Imu) -> Strap:
     """With one more sample; `why` is empty where it can be used, else a sentence."""
     before = s.imu or record
     dt = (record.t_ns - before.t_ns) * 1e-9
-    s = s._replace(imu_pace=s.imu_pace.with_one(record.t_ns))
+    s = structs.replace(s, imu_pace=s.imu_pace.with_one(record.t_ns))
     if why := _senseless(record):
-        return s._replace(why=why)
+        return structs.replace(s, why=why)
     if s.C_nb is None:
-        return s._replace(why="no attitude is heard")
+        return structs.replace(s, why="no attitude is heard")
     C_nb = s.C_nb @ rotation_matrix(0.5 * (np.array(before.w_b) + record.w_b) * min(dt, STALE_S))
-    s = s._replace(imu=record, C_nb=C_nb)
+    s = structs.replace(s, imu=record, C_nb=C_nb)
     gain = min(dt / VERTICAL_S, 0.1)
-    s = s._replace(down=s.down + gain * (float(C_nb[2] @ record.f_b) - s.down))
-    return s._replace(why=_unfit(s))
+    s = structs.replace(s, down=s.down + gain * (float(C_nb[2] @ record.f_b) - s.down))
+    return structs.replace(s, why=_unfit(s))
 
 
 def acceleration(s: Strap) -> Vector3:

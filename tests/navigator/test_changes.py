@@ -74,5 +74,6 @@ def test_each_change_is_reported_once(case: str) -> None:
 def test_what_began_again_reports_nothing() -> None:
     """After a reset nothing is known of a source: it is neither false nor used again."""
     changes = Changes()
-    texts(changes, believed(EXCLUDED, 0.9995)._replace(scatter=scattered(True, 9.0).scatter))
+    state = State(reported=(EXCLUDED,), false=(0.9995,), scatter=scattered(True, 9.0).scatter)
+    texts(changes, state)
     assert texts(changes, State()) == []

@@ -23,7 +23,7 @@ def record(t_ns: int) -> Pressure:
 
 def before(t_ns: int) -> State:
     """A state that is recognised by its time."""
-    return State()._replace(next_ns=t_ns)
+    return State(next_ns=t_ns)
 
 
 class Kept:

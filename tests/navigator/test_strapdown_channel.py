@@ -151,7 +151,7 @@ def reckoned(flight: Trajectory, records: Iterable[Any], start: float, lasting: 
         if not isinstance(record, Imu):
             if isinstance(record, Attitude):
                 s = strapdown_channel.sense(s, record)
-            sensors = sensors._replace(air=air_data_channel.sense(sensors.air, record))
+            sensors = msgspec.structs.replace(sensors, air=air_data_channel.sense(sensors.air, record))
             continue
         s = strapdown_channel.receive(s, record)
         now = strapdown_channel.acceleration(s)
