@@ -13,14 +13,13 @@ from typing import NamedTuple
 import numpy as np
 
 from companion.estimate.bank.branching import births, returns
-from companion.estimate.bank.layout import NEVER, Bools, Ints, Layout
+from companion.estimate.bank.layout import NEVER, Bools, Layout
 from companion.estimate.bank.reduction import reduce
 from companion.estimate.bank.settings import DEFAULT, Settings
 from companion.estimate.bank.state import Bank, false_rows, normalised
 from companion.units import Floats
 
 LOG_2PI = math.log(2.0 * math.pi)
-BLOCK = 16  # rows
 
 Measurement = tuple[Floats, Floats]
 """z (R, m) and H (R, m, k), linearised for each row."""
@@ -61,32 +60,15 @@ def propagate(bank: Bank, layout: Layout, dt: float, Phi: Floats, Q: Floats) -> 
     Bank : at t + dt.
     """
     R, n = bank.x.shape
-    FT = np.ascontiguousarray(_padded(layout, Phi, dt).T)
+    F, k = _padded(layout, Phi, dt), Q.shape[-1]
+    FT = np.ascontiguousarray(F.T)
     x = bank.x @ FT
-    P = _both_sides(bank.P, FT, Q, bank.grade)
+    P: Floats = F @ (bank.P @ FT)
+    P[:, :k, :k] += Q[bank.grade] if Q.ndim == 3 else Q
     if len(layout.rates):
         diagonal = P.reshape(R, -1)[:, :: n + 1]
         diagonal[:, layout.rates] += bank.noise * dt
     return bank._replace(t=bank.t + dt, x=x, P=P)
-
-
-def _both_sides(P: Floats, FT: Floats, Q: Floats, grade: Ints) -> Floats:
-    """F P F' + Q of all rows, P symmetric.
-
-    Two flat products: (P F')' = F P, so one transposed copy stands in for F @ (.). Some rows at a time, so
-    that what is between stays in the cache.
-    """
-    n, k = len(FT), Q.shape[-1]
-    out = np.empty_like(P)
-    turned = np.empty((min(BLOCK, len(P)), n, n))
-    for a in range(0, len(P), BLOCK):
-        half = P[a : a + BLOCK].reshape(-1, n) @ FT
-        block = turned[: len(half) // n]
-        np.copyto(block, half.reshape(-1, n, n).transpose(0, 2, 1))
-        rows = out[a : a + BLOCK]
-        np.matmul(block.reshape(-1, n), FT, out=rows.reshape(-1, n))
-        rows[:, :k, :k] += Q[grade[a : a + BLOCK]] if Q.ndim == 3 else Q
-    return out
 
 
 def _padded(layout: Layout, Phi: Floats, dt: float) -> Floats:
@@ -160,7 +142,7 @@ def update(
     passed = min((bank.t - bank.born_t) / settings.surprise_gap_s, 1.0)  # since births
     nis = float(step.nis[int(np.argmax(bank.L))]) * passed**2
     may_bear = source is not None and not fixed and not born and settings.surprise < math.inf
-    if may_bear and nis > settings.surprise * step.white.shape[-1]:
+    if may_bear and nis > settings.surprise * step.S.shape[-1]:
         bank = births(bank, layout, settings, reduced=False)
         born = True
         step = innovations(bank)
@@ -171,7 +153,7 @@ def update(
     if refused.any():
         taken = np.where(refused, 0.0, 1.0)
         G, white = G * taken[:, None, None], white * taken[:, None]
-    P = G @ G.transpose(0, 2, 1)
+    P = G @ G.transpose(0, 2, 1).copy()  # of a view, numpy's symmetric product takes three times as long
     np.subtract(bank.P, P, out=P)  # 0.8 MB: another array would push the rest of the flight out of the cache
     x = bank.x + (G @ white[:, :, None])[:, :, 0]
     L = normalised(bank.L + np.maximum(step.log_likelihood, outlier))
@@ -185,7 +167,10 @@ def update(
 
 
 class _Step(NamedTuple):
-    """Per row: covariance S of the innovation, S^-1/2 times it, P H' S^-T/2, NIS, log likelihood."""
+    """Per row: covariance S of the innovation, S^-1/2 times it, P H' S^-T/2, NIS, log likelihood.
+
+    Beyond the components of the innovation `white` and `G` are zero.
+    """
 
     S: Floats
     white: Floats
@@ -228,7 +213,8 @@ def _innovations(bank: Bank, layout: Layout, z: Floats, H: Floats, R: Floats, so
         if not s00.min() > 0.0:
             raise ValueError("covariance not positive definite")
         r0 = np.sqrt(s00)
-        white, G = np.empty((rows, m)), np.empty((rows, n, m))
+        # of one component the second stays zero: BLAS takes five times as long for one column as for two
+        white, G = np.zeros((rows, 2)), np.zeros((rows, n, 2))
         white[:, 0] = nu[:, 0] / r0
         np.divide(PHt[:, :, 0], r0[:, None], out=G[:, :, 0])
         log_root = np.log(r0)
