@@ -9,11 +9,13 @@ from itertools import islice
 from operator import attrgetter
 from typing import NamedTuple
 
+from msgspec import structs
+
 from companion.navigator.state import State
 from companion.records import Input
 
 MOST_KEPT = 1024  # records
-#: A state takes up to 0.9 MB: of those older than DENSE_NS one per SPARSE_NS is kept.
+#: A state takes up to 1.1 MB: of those older than DENSE_NS one per SPARSE_NS is kept.
 DENSE_NS, SPARSE_NS = 500_000_000, 1_000_000_000
 
 
@@ -23,6 +25,14 @@ class _Past(NamedTuple):
 
 
 _time: Callable[[_Past], int] = attrgetter("record.t_ns")
+
+
+def _lean(state: State) -> State:
+    """The state with one bank only: what follows from it is computed again where it is gone back to."""
+    leading = state.leading
+    if leading is not None and leading[0] is not state.bank:
+        leading = None
+    return structs.replace(state, newborn=None, leading=leading)
 
 
 class PastStates:
@@ -76,11 +86,12 @@ class PastStates:
         past, until_ns = self._past, self.last_ns - DENSE_NS
         i = bisect_right(past, self._thinned_ns, key=_time)
         while i < len(past) and _time(past[i]) <= until_ns:
-            self._thinned_ns = _time(past[i])
-            if self._thinned_ns - self._kept_ns >= SPARSE_NS or i <= 1:
+            record, before = past[i]
+            self._thinned_ns = record.t_ns
+            is_kept = self._thinned_ns - self._kept_ns >= SPARSE_NS or i <= 1
+            if is_kept:
                 self._kept_ns = self._thinned_ns
-            else:
-                past[i] = _Past(past[i].record, None)
+            past[i] = _Past(record, _lean(before) if is_kept and before is not None else None)
             i += 1
 
     def keep_last(self, span_ns: int) -> None:

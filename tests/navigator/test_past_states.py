@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from itertools import pairwise
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from companion.estimate.bank import Estimate, Layout, start
 from companion.navigator.past_states import DENSE_NS, MOST_KEPT, SPARSE_NS, PastStates
 from companion.navigator.state import State
 from companion.records import Pressure
@@ -15,6 +17,8 @@ from companion.records import Pressure
 MS = 1_000_000
 LATE_NS = 6_000_000_000
 START_NS = 100 * SPARSE_NS
+LAYOUT = Layout(2, (), (), (), grades=(1.0,))
+ESTIMATE = Estimate(np.zeros(2), np.eye(2), 0, 1.0)
 
 
 def record(t_ns: int) -> Pressure:
@@ -84,6 +88,18 @@ def test_late_records_that_come_often_cost_no_state(late_ms: int) -> None:
         if k % 10 == 9 and late_ms * MS < t_ns - START_NS:
             kept.fold_late(t_ns - late_ms * MS - 1)
         kept.check(20 * MS)
+
+
+def test_a_kept_state_holds_one_bank() -> None:
+    """What is readied or was read off before follows from the bank: a second one takes as much memory."""
+    past = PastStates()
+    now, old = (start(LAYOUT, float(t), np.zeros(2), np.eye(2)) for t in (1, 0))
+    for leading in (old, now):
+        past.append(record(START_NS), State(bank=now, newborn=(now, old), leading=(leading, ESTIMATE)))
+        past.append(record(START_NS + DENSE_NS), State())
+        past.thin_out()
+        state, _ = past.back_to(START_NS - 1)
+        assert state == State(bank=now, leading=(now, ESTIMATE) if leading is now else None)
 
 
 def test_nothing_goes_back_to_what_is_forgotten() -> None:
