@@ -125,7 +125,7 @@ class AutopilotChoice:
     def is_rival(self, system: int, peer: Hashable) -> bool:
         """Whether frames of `system` from `peer` belong to another vehicle."""
         chosen = self.chosen
-        return self.is_candidate(system, peer) and (chosen is None or chosen.system != system)
+        return (chosen is None or chosen.system != system) and self.is_candidate(system, peer)
 
     def receive(
         self, msgid: int, heartbeat: Message | None, system: int, peer: Hashable, now_ns: int

@@ -501,9 +501,9 @@ class Session:
         if before is not None and choice.chosen is not None and before.system != choice.chosen.system:
             self._release(before, now, events)
         key = found.system, peer
-        is_other = choice.is_candidate(*key) and (
+        is_other = (
             choice.chosen is None or (choice.chosen.system, choice.chosen.peer) != key
-        )
+        ) and choice.is_candidate(*key)
         if is_other and key not in self._reported and len(self._reported) < MAX_REPORTED:
             self._reported.add(key)
             events.append(SecondAutopilot(now, found.system, self.autopilot or choice.locked_system or 0))

@@ -61,7 +61,7 @@ def births_due(state: State, settings: Settings) -> bool:
     bank = state.bank
     if bank is None or (state.newborn is not None and state.newborn[0] is bank):
         return False
-    known = hypotheses(state, settings)
+    known = settings.model.hypotheses(len(state.beacons))  # the intervals are those of any hypotheses
     return banks.births_due(bank, known.settings) or banks.jump_births_due(bank, known.layout, known.settings)
 
 
