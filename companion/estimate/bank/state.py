@@ -147,7 +147,7 @@ def false_rows(bank: Bank, layout: Layout, source: int) -> Bools:
     -------
     (R,) booleans.
     """
-    out: Bools = layout.concerns[bank.fault[:, layout.sources[source].group], source]
+    out: Bools = layout.concerns[:, source][bank.fault[:, layout.sources[source].group]]
     return out
 
 
