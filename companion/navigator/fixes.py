@@ -53,6 +53,7 @@ from companion.units import SECOND_NS
 
 GATE_SIGMA = 5.0
 MEAN_S = 60.0  # of the estimated velocity error, for GNSS latency
+FAR_M = 500.0  # within it a jump of the channel explains a fix
 REFUSED_NS = 10 * SECOND_NS  # fixes that no hypothesis takes begin the position again after so long at least
 
 
@@ -87,6 +88,11 @@ def gnss(state: State, record: Gnss, settings: Settings) -> Step:
     state, v_n = _latency_velocity(structs.replace(state, bank=bank), record.t_ns, is_measured)
     shows_latency = is_measured or driver(state) != "hold"
     taken = measurements.gnss_position(bank, known, channel, apart, factor * variance, v_n, shows_latency)
+    restarted = list[Output]()
+    if taken.accepted and not taken.by_former and _apart(state, record, settings) > FAR_M:
+        # only a row that another doubt has made wide enough explains the jump: the position is what is wrong
+        state, restarted = _restarted(state, record, 0, settings)
+        taken = taken._replace(bank=state.bank or bank, accepted=False) if restarted else taken
     state = structs.replace(state, bank=taken.bank, gnss_taken=record, fixed=True)
     state, out = decided(state, record, settings), list[Output]()
     label = f"gnss {record.receiver}"
@@ -94,9 +100,10 @@ def gnss(state: State, record: Gnss, settings: Settings) -> Step:
         out.append(_rejected(state, record, f"velocity of {label}", VELOCITY, velocity))
     if state.reported[GNSS] == EXCLUDED or not taken.accepted:
         out.append(_rejected(state, record, label, GNSS, taken))
-        refused_ns = None if taken.by_any else state.refused_ns or record.t_ns
-        state, again = _restarted(structs.replace(state, refused_ns=refused_ns), record, settings)
-        return nearer(state, settings), [*out, *again]
+        refused_ns = None if taken.accepted or restarted else state.refused_ns or record.t_ns
+        least_ns = max(REFUSED_NS, _before_ns(state))
+        state, again = _restarted(structs.replace(state, refused_ns=refused_ns), record, least_ns, settings)
+        return nearer(state, settings), [*out, *restarted, *again]
     since = math.inf if state.gnss_ns is None else (record.t_ns - state.gnss_ns) * 1e-9
     part = min(since, config.correlation_s) / config.correlation_s
     level = height_error.update(state.level, record, nominal.point, part, GATE_SIGMA**2)
@@ -250,26 +257,36 @@ def _begun(state: State, record: Gnss | RsbnFix, settings: Settings) -> State:
     return structs.replace(state, nominal=nominal, bank=settings.model.begin(0.0), started_ns=record.t_ns)
 
 
-def _restarted(state: State, record: Gnss, settings: Settings) -> Step:
-    """With the position as open as GNSS is far off, once no hypothesis has taken its fixes for too long.
+def _before_ns(state: State) -> int:
+    """How long fixes were believed before those that are refused now."""
+    started_ns = state.started_ns or 0
+    return max(t or started_ns for t in (state.gnss_ns, state.rsbn_ns)) - started_ns
+
+
+def _restarted(state: State, record: Gnss, least_ns: int, settings: Settings) -> Step:
+    """With the position as open as GNSS is far off, once its fixes have been refused for `least_ns`.
 
     Of two runs of fixes that contradict each other the longer one is believed: a receiver's first fix may be
     kilometres off, and a spoofer that comes later must last longer than the flight before it. Not where a
     beacon bears the position out, nor beside an INS, which shows a jump of GNSS.
     """
-    started_ns, since_ns = state.started_ns, state.refused_ns
-    if started_ns is None or since_ns is None or not settings.model.channel.wind or is_jammed(state):
+    since_ns = state.refused_ns
+    if since_ns is None or not settings.model.channel.wind or is_jammed(state):
         return state, []
-    last_ns = max(t or started_ns for t in (state.gnss_ns, state.rsbn_ns))
     refused_ns = record.t_ns - since_ns
-    if refused_ns < max(REFUSED_NS, last_ns - started_ns) or sources(state, record.t_ns, settings) & FIXES:
+    if refused_ns < least_ns or sources(state, record.t_ns, settings) & FIXES:
         return state, []
-    assert state.nominal is not None
-    centre = estimate(state, settings).x[:2].tolist()
-    apart = math.dist(measurements.gnss_apart(record, state.nominal.point), (-centre[0], -centre[1]))
+    apart = _apart(state, record, settings)
     why = f"no hypothesis explains GNSS, {apart:.0f} m off for {refused_ns * 1e-9:.0f} s: position restarted"
     state = structs.replace(widened(state, apart), started_ns=record.t_ns, refused_ns=None)
     return state, [Reset(record.t_ns, record.rx_ns, "position", why)]
+
+
+def _apart(state: State, record: Gnss, settings: Settings) -> float:
+    """How far a fix is from the estimated position, m."""
+    assert state.nominal is not None
+    north, east = estimate(state, settings).x[:2].tolist()
+    return math.dist(measurements.gnss_apart(record, state.nominal.point), (-north, -east))
 
 
 def _scattered(

@@ -53,13 +53,14 @@ CORRECTOR_GATE = 12.5
 
 class Taken(NamedTuple):
     """The bank after a measurement; its normalised squared innovation by the leading row, whether that row
-    took it, and whether any did.
+    took it, whether any did, and whether the row did that led before.
     """
 
     bank: Bank
     nis: float
     accepted: bool
     by_any: bool
+    by_former: bool
 
 
 def gnss_position(
@@ -226,7 +227,7 @@ def corrector(bank: Bank, known: Hypotheses, rows: CorrectorRows) -> Taken:
     )
     outlier = -0.5 * spread - CORRECTOR_GATE * len(rows.z)
     after, seen = banks.update(bank, known.layout, rows.z, H, rows.R, None, known.settings, outlier=outlier)
-    return _taken(after, seen)
+    return _taken(bank, after, seen)
 
 
 def sight(
@@ -294,11 +295,13 @@ def _take(
 ) -> Taken:
     """Update by a measurement whose outliers are those of its `kind`; arguments as of `banks.update`."""
     outlier = OUTLIER[kind]
-    return _taken(
-        *banks.update(bank, known.layout, z, H, R, source, known.settings, outlier=outlier, rare=RARE)
+    after, seen = banks.update(
+        bank, known.layout, z, H, R, source, known.settings, outlier=outlier, rare=RARE
     )
+    return _taken(bank, after, seen)
 
 
-def _taken(bank: Bank, seen: Innovation) -> Taken:
-    refused = seen.refused
-    return Taken(bank, float(seen.nis[seen.leading]), not refused[seen.leading], not refused.all())
+def _taken(before: Bank, after: Bank, seen: Innovation) -> Taken:
+    took = ~seen.refused  # of the rows before, then of their children
+    by_former = bool(took[int(before.L.argmax())])
+    return Taken(after, float(seen.nis[seen.leading]), bool(took[seen.leading]), bool(took.any()), by_former)

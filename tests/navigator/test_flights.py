@@ -12,6 +12,7 @@ from msgspec.structs import replace
 
 from companion.config import Config, load
 from companion.estimate.bank import Bank
+from companion.nav.geometry import displace
 from companion.navigator import Navigator
 from companion.navigator.changes import FALSE_AIRSPEED, USE_AIRSPEED
 from companion.navigator.own_error_model import LATENCY
@@ -284,6 +285,29 @@ def test_a_beacon_whose_place_is_stated_far_off_changes_nothing() -> None:
     assert [event.text for event in wrong.events if event.text.startswith("rsbn 1")] == [
         "rsbn 1 is not used: no answer fits its stated place; check its number and its place"
     ]
+
+
+@pytest.mark.parametrize(
+    ("channel", "jump_m", "seed"), [("air", 600.0, 1), ("air", 520.0, 3), ("imu", 520.0, 1)]
+)
+def test_a_jump_of_gnss_that_stays_makes_nothing_else_false(channel: str, jump_m: float, seed: int) -> None:
+    """It is followed once it has lasted as long as the flight before. A row with a false velocity or airspeed
+    beside had become wide enough before that: either was excluded for a minute, or for good.
+    """
+    jumps_s = 83.0
+
+    def jumped(record: Any) -> Any:
+        if isinstance(record, RsbnFix) or record.t_ns > 2 * (jumps_s + 5.0) * NS:
+            return None
+        if not isinstance(record, Gnss) or record.t_ns < jumps_s * NS:
+            return record
+        place = displace(record.lat, record.lon, record.alt_msl, jump_m, 0.0, 0.0)
+        return replace(record, lat=place.lat, lon=place.lon)
+
+    flown = fly(channel, jumped, legs=FIVE_MINUTES[:4], seed=seed)
+    assert not [event.text for event in flown.events if "suspect" in event.text or "excluded" in event.text]
+    assert {rejection.source for rejection in flown.rejections} == {"gnss 0"}
+    assert np.hypot(*(flown.error_n[-1] - (jump_m, 0.0))) < 10.0
 
 
 @pytest.mark.parametrize("height", [80.0, pytest.param(-80.0, marks=pytest.mark.long)])
