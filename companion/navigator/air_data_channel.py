@@ -45,12 +45,15 @@ def sense(r: Reckoner, record: Attitude | AirData | Pressure) -> Reckoner:
     return structs.replace(r, static=record.static, static_ns=record.t_ns) if _is_static(record) else r
 
 
-def step(r: Reckoner, record: Pressure) -> Rejection | None:
-    """Reject a pressure whose altitude no aircraft reaches since the last one used."""
+def step(r: Reckoner, record: Pressure, climb: float) -> Rejection | None:
+    """Reject a pressure whose altitude no aircraft reaches since the last one used, nor one that climbs as
+    GNSS does, at `climb` (m/s): two sensors that agree are believed.
+    """
     if r.static is None or not _is_static(record):
         return None
     gap_s = (record.t_ns - r.static_ns) * 1e-9
-    change = abs(pressure_altitude(record.static) - pressure_altitude(r.static))
+    up = pressure_altitude(record.static) - pressure_altitude(r.static)
+    change = min(abs(up), abs(up - climb * gap_s))
     limit = greatest_change(gap_s)
     if change <= limit or gap_s > STEP_S:
         return None

@@ -93,7 +93,7 @@ def gnss(state: State, record: Gnss, settings: Settings) -> Step:
         # only a row that another doubt has made wide enough explains the jump: the position is what is wrong
         state, restarted = _restarted(state, record, 0, settings)
         taken = taken._replace(bank=state.bank or bank, accepted=False) if restarted else taken
-    state = structs.replace(state, bank=taken.bank, gnss_taken=record, fixed=True)
+    state = structs.replace(state, bank=taken.bank, gnss_taken=record, gnss_before=last, fixed=True)
     state, out = decided(state, record, settings), list[Output]()
     label = f"gnss {record.receiver}"
     if velocity is not None and (state.reported[VELOCITY] == EXCLUDED or not velocity.accepted):

@@ -20,6 +20,8 @@ LEAST_M = 5.0  # one sigma of a height of GNSS, at least
 PATIENCE_NS = 10_000_000_000  # what goes on contradicting for so long is believed, at least
 #: Between two readings no height changes by more: noise, manoeuvres, and a climb or a dive.
 STEP_M, CLIMB_M_S = 20.0, 200.0
+WEATHER_M = 100.0  # one sigma of a pressure altitude at sea level: 12 hPa
+NEARER_SIGMA = 3.0  # so much nearer to the standard atmosphere a height of GNSS is the likelier one
 
 
 class Level(NamedTuple):
@@ -69,7 +71,8 @@ def update(level: Level, record: Gnss, ins: Point, part: float, gate: float) -> 
     """With the height of one fix, refused if its squared innovation is beyond `gate` times its variance.
 
     `part` is the share of one independent fix that this one is worth, its noise being correlated. If it is
-    the height of GNSS that stepped, the longer of the two runs of fixes is believed.
+    the height of GNSS that stepped, the longer of the two runs of fixes is believed, or the one that is
+    nearer to the standard atmosphere by far.
     """
     first, since_ns = level.t_ns is None, ins.t_ns if level.since_ns is None else level.since_ns
     now = at(level, ins)._replace(t_ns=ins.t_ns, alt=ins.position.alt)
@@ -80,7 +83,9 @@ def update(level: Level, record: Gnss, ins: Point, part: float, gate: float) -> 
         if now.refused_ns is None:
             last_ns, last_alt = now.last
             has_stepped = abs(record.alt_msl - last_alt) > greatest_change((record.t_ns - last_ns) * 1e-9)
-            patience_ns = max(PATIENCE_NS, ins.t_ns - since_ns) if has_stepped else PATIENCE_NS
+            patience_ns = PATIENCE_NS
+            if has_stepped and not _is_nearer(ins.position.alt, ins.position.alt - record.alt_msl, now.error):
+                patience_ns = max(PATIENCE_NS, ins.t_ns - since_ns)
             now = now._replace(refused_ns=ins.t_ns, patience_ns=patience_ns)
         if ins.t_ns - (now.refused_ns or 0) < now.patience_ns:
             return now
@@ -97,3 +102,9 @@ def update(level: Level, record: Gnss, ins: Point, part: float, gate: float) -> 
         since_ns=since_ns,
         last=(record.t_ns, record.alt_msl),
     )
+
+
+def _is_nearer(alt: float, error: float, than: float) -> bool:
+    """Whether a pressure altitude `alt` (m) is in `error` (m) far more likely than in `than`."""
+    sigma2 = WEATHER_M**2 + (SHARE * alt) ** 2
+    return than * than - error * error > NEARER_SIGMA**2 * sigma2

@@ -31,7 +31,7 @@ from companion.navigator.progress import (
     solved_if_due,
     widened,
 )
-from companion.navigator.state import NEAR_S, Settings, State, Step, corrected, hypotheses
+from companion.navigator.state import NEAR_S, Settings, State, Step, corrected, gnss_climb, hypotheses
 from companion.records import (
     AirData,
     Attitude,
@@ -97,8 +97,10 @@ def _jump_removed(state: State, last: Point, new: Point, record: LocalPosition) 
 def sensed(state: State, record: Attitude | Pressure, settings: Settings) -> Step:
     """Remember attitude and pressure for the airspeed beside an INS."""
     s = state.sensors
-    if isinstance(record, Pressure) and (rejection := air_data_channel.step(s.air, record)) is not None:
-        return state, [rejection]
+    if isinstance(record, Pressure):
+        rejection = air_data_channel.step(s.air, record, gnss_climb(state, record.t_ns))
+        if rejection is not None:
+            return state, [rejection]
     return structs.replace(state, sensors=structs.replace(s, air=air_data_channel.sense(s.air, record))), []
 
 

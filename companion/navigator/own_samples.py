@@ -38,7 +38,7 @@ from companion.navigator.progress import (
     shifted,
     solved_if_due,
 )
-from companion.navigator.state import NEAR_S, Settings, State, Step, hypotheses
+from companion.navigator.state import NEAR_S, Settings, State, Step, gnss_climb, hypotheses
 from companion.records import (
     AirData,
     AirspeedSensor,
@@ -121,7 +121,7 @@ def _estimated_airspeed(state: State) -> float:
 def pressure(state: State, record: Pressure, settings: Settings) -> Step:
     """Remember a static pressure, unless its altitude steps."""
     s = state.sensors
-    if (rejection := air_data_channel.step(s.air, record)) is not None:
+    if (rejection := air_data_channel.step(s.air, record, gnss_climb(state, record.t_ns))) is not None:
         state, out = _straight_on(state, record, settings)
         return state, [rejection, *out]
     s = structs.replace(s, air=air_data_channel.sense(s.air, record))

@@ -28,6 +28,7 @@ from companion.units import SECOND_NS
 FIXES = Source.GNSS | Source.AZIMUTH | Source.RANGE
 JAMMED_NS = 10 * SECOND_NS  # the receiver's word lasts so long
 SUSPECT, EXCLUDED = 1, 2
+CLIMB_NS = 2 * SECOND_NS  # fixes farther apart show no climb
 NEAR_S = 0.5  # the bank is at most so far behind: in between the error moves by its velocity
 
 
@@ -94,6 +95,7 @@ class State(Struct, frozen=True):
     scatter: Mapping[str, Scatter] = MappingProxyType({})  # of the measurements, by name
     parallel: Parallel | None = None  # filters beside the bank
     gnss_taken: Gnss | None = None  # the last one judged by the bank
+    gnss_before: Gnss | None = None  # the one before it
     gnss_fix: tuple[Gnss, Point] | None = None  # the last one believed
     pending: Pending | None = None
     half: Pending | None = None  # an azimuth or a range that alone was no fix
@@ -123,6 +125,16 @@ def is_jammed(state: State) -> bool:
     """Whether the receiver reported jamming or spoofing within the last seconds."""
     now = state.nominal.t_ns if state.nominal else 0
     return state.jammed_ns is not None and now - state.jammed_ns < JAMMED_NS
+
+
+def gnss_climb(state: State, t_ns: int) -> float:
+    """Rate of the height of GNSS between its last two fixes, m/s; 0 where these are not recent."""
+    now, before = state.gnss_taken, state.gnss_before
+    if now is None or before is None or now.receiver != before.receiver:
+        return 0.0
+    if not 0 < now.t_ns - before.t_ns <= CLIMB_NS or abs(t_ns - now.t_ns) > CLIMB_NS:
+        return 0.0
+    return (now.alt_msl - before.alt_msl) / ((now.t_ns - before.t_ns) * 1e-9)
 
 
 def has_witness(state: State, settings: Settings) -> bool:

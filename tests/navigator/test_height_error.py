@@ -98,6 +98,29 @@ def test_of_two_runs_of_heights_of_gnss_the_longer_one_is_believed() -> None:
     assert np.abs(first[125:300, 0]).max() < 20.0
 
 
+@pytest.mark.parametrize(("wrong_m", "takes_s"), [(500.0, 10.0), (-800.0, 10.0), (-260.0, 90.0)])
+def test_of_two_runs_the_one_near_the_standard_atmosphere_is_believed_sooner(
+    wrong_m: float, takes_s: float
+) -> None:
+    """The first 90 s are wrong. No weather makes 500 m of a pressure altitude; 260 m it may."""
+    off = np.array(climbed(0.0, 1.0, wrong={k: wrong_m for k in range(90)}))[:, 0]
+    assert abs(off[89] - wrong_m) < 20.0
+    assert np.abs(off[90 + round(takes_s) + 5 : 300]).max() < 20.0
+    assert abs(off[90 + round(takes_s) - 5]) > 0.8 * abs(wrong_m)
+
+
+@pytest.mark.parametrize("truth_m", [250.0, -300.0])
+def test_a_height_of_gnss_that_steps_to_the_standard_atmosphere_within_its_errors_is_not_believed(
+    truth_m: float,
+) -> None:
+    """The channel is off by `truth_m`, as high or low pressure makes it; for a minute GNSS denies that."""
+    level = Level()
+    for t in range(260):
+        alt = 1000.0 - (0.0 if 200 <= t < 260 else truth_m)
+        level = height_error.update(level, fix(float(t), alt), point(float(t), 1000.0), 1.0 / 60.0, GATE)
+    assert level.error == pytest.approx(truth_m, abs=1.0)
+
+
 START = Geodetic(1.0, 0.5, 1000.0)
 BEACON = displace(*START, 0.0, 10_000.0, 1000.0)
 AIR = load(flags={"output.profile": "ardupilot"}, environment={})
@@ -111,10 +134,12 @@ def flown_level(
     climb: float = 0.0,
     seconds: int = 40,
     gnss_step_m: float = 0.0,
+    pressure_hz: int = 10,
 ) -> tuple[list[float], list[Rejection]]:
     """Fly north at 30 m/s, by airspeed or by an INS whose height is `step_m` off from 20 s on `until`.
 
-    GNSS states a height that is `gnss_step_m` off for the same time. A beacon is 10 km east of the start.
+    GNSS states a height that is `gnss_step_m` off for the same time. A beacon is 10 km east of the start. The
+    static pressure comes `pressure_hz` times a second, a divisor of 10.
 
     Return how far each altitude sent is off, and the rejections.
     """
@@ -131,6 +156,8 @@ def flown_level(
             AirData(t_ns, t_ns, 30.0 + 1e-6 * k, true=True, sensed=True),
             Pressure(t_ns, t_ns, P0 * (1.0 - read * LAPSE / T0) ** (1.0 / HEIGHT_EXPONENT)),
         ]
+        if k % (10 // pressure_hz):
+            del records[2]
         if by_ins:
             records = [LocalPosition(t_ns, t_ns, (30.0 * t, 0.0, START.alt - read), (30.0, 0.0, -climb))]
         if k % 5 == 0:
@@ -173,6 +200,16 @@ def test_a_steep_climb_is_no_step(climb: float, by_ins: bool) -> None:
     off, rejections = flown_level(0.0, 0.0, by_ins, climb)
     assert rejections == []
     assert max(map(abs, off)) < 0.5 * abs(climb)
+
+
+@pytest.mark.parametrize(("climb", "pressure_hz"), [(300.0, 2), (300.0, 1), (600.0, 10), (-250.0, 2)])
+def test_a_climb_that_pressure_and_gnss_show_alike_is_no_step(climb: float, pressure_hz: int) -> None:
+    """Both were rejected, and the altitude was kilometres off after ten seconds. A sample's delay is left."""
+    off, rejections = flown_level(0.0, 0.0, False, climb, seconds=24, pressure_hz=pressure_hz)
+    assert max(map(abs, off)) < 1.4 * abs(climb)
+    assert all(
+        each.t_ns <= NS for each in rejections if each.source != "height of gnss 0"
+    )  # GNSS shows its climb by two fixes
 
 
 def test_a_pressure_that_stepped_and_stays_is_used_again() -> None:
