@@ -8,7 +8,8 @@ stated one replaces it if it agrees, else the origin of the pairs. Each replacem
 is a reset (`resets`), which ODOMETRY reports in its reset_counter.
 
 An EKF in constant position mode has no position, and no pairs come before it is given one: started without
-GNSS it would wait for our positions, and we for its. While it states that mode, its origin is used as stated.
+GNSS it would wait for our positions, and we for its. While it states that mode, once in `RECENT_NS` at least,
+its origin is used as stated.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ PAIRS = 3
 PAIR_NS = SECOND_NS // 10
 """At most one pair in this time: PX4 sends GLOBAL_POSITION_INT at 50 Hz."""
 RECENT_NS = 10 * SECOND_NS
-"""Pairs older than this confirm nothing."""
+"""Pairs older than this confirm nothing; nor is an older statement that there is no position used."""
 
 
 class Pair(NamedTuple):
@@ -62,14 +63,14 @@ class OriginCheck:
         self._projection: Projection = "tangent"
         self._local: LocalPosition | None = None
         self._known: GlobalPosition | None = None
-        self._is_without_position = False  # by the autopilot's own statement
+        self._without_position_ns: int | None = None  # when the autopilot last stated so
         self._pairs: list[Pair] = []
         self._refused: tuple[float, float] | None = None  # a stated origin reported as false
 
     def forget(self) -> None:
         """Forget the origin: the autopilot rebooted, or its INS jumped; another one afterwards is a reset."""
         self.origin = self._stated = self._local = self._known = self._refused = None
-        self._is_without_position = False
+        self._without_position_ns = None
         self._pairs.clear()
 
     def receive(self, record: Stamped) -> list[Event]:
@@ -77,24 +78,30 @@ class OriginCheck:
         if isinstance(record, LocalOrigin):
             self._stated = record
             self._projection = record.projection  # type: ignore[assignment]
-            is_judged = self._has_pairs and (self.origin is not None or not self._is_without_position)
+            is_without_position = self._is_without_position(record.rx_ns)
+            is_judged = self._has_pairs and (self.origin is not None or not is_without_position)
             return self._judge(record.rx_ns) if is_judged else self._replaced(record, record.rx_ns)
         if isinstance(record, LocalPosition):
             self._local = record
         elif isinstance(record, GlobalPosition):
             self._known = record
         elif isinstance(record, FilterStatus):
-            self._is_without_position = bool(record.flags & mavlink.EKF_CONST_POS_MODE)
+            is_constant = record.flags & mavlink.EKF_CONST_POS_MODE
+            self._without_position_ns = record.rx_ns if is_constant else None
             return []
         else:
             return []
         return self._paired(record.rx_ns)
 
+    def _is_without_position(self, now_ns: int) -> bool:
+        """Whether the autopilot stated within `RECENT_NS` that it has no position."""
+        return self._without_position_ns is not None and now_ns - self._without_position_ns <= RECENT_NS
+
     def _paired(self, now_ns: int) -> list[Event]:
         """Use the last two positions as a pair if they are of the same instant."""
         if self._stated is None or self._local is None or self._known is None or not self._has_pairs:
             return []
-        if self._is_without_position:
+        if self._is_without_position(now_ns):
             return []
         if self._pairs and 0 <= now_ns - self._pairs[-1].t_ns < PAIR_NS:
             return []

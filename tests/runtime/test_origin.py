@@ -157,6 +157,22 @@ def test_after_a_reboot_nothing_states_that_there_is_no_position(autopilot: Auto
     assert autopilot.off() < TOLERANCE_M
 
 
+def test_the_statement_that_there_is_no_position_ages(autopilot: Autopilot) -> None:
+    """EKF_STATUS_REPORT may stop: the origin was checked no more."""
+    constant_position = 167
+    autopilot.take(FilterStatus(autopilot.now, autopilot.now, constant_position, False, 0.0))
+    autopilot.state(moved(5000.0))
+    autopilot.fly(9.0)
+    assert autopilot.off() == pytest.approx(5000.0, rel=1e-3)
+    autopilot.fly(4.0)
+    assert autopilot.off() < TOLERANCE_M and autopilot.check.resets == 1
+    autopilot.check.forget()
+    autopilot.take(FilterStatus(autopilot.now, autopilot.now, constant_position, False, 0.0))
+    autopilot.now += 11 * SECOND_NS
+    autopilot.state(moved(5000.0))
+    assert autopilot.check.origin is None
+
+
 def test_ins_of_its_own_uses_the_stated_origin(autopilot: Autopilot) -> None:
     """Its drifting local position and the autopilot's global one are no pair."""
     autopilot.check = OriginCheck(has_pairs=False)
