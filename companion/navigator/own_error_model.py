@@ -28,7 +28,8 @@ grades and Q has one layer for each.
 Beside the IMU the part of the wind that lasts a second is a state, `gust`: a step of the wind differs from
 the gust of half a second ago by more than a gust changes, so it shows at once. White noise would hide it for
 ten seconds. By airspeed alone gusts cannot be told from motion: turbulence is white noise there, with its
-part that lasts for seconds.
+part that lasts for seconds. A steady airspeed wanders for longer, along the nose: that is the `gust` then,
+and the velocity of GNSS shows it.
 
 `doppler` is what is wrong with the velocity of GNSS for minutes. As white noise alone a thousand fixes make a
 velocity that is 0.05 m/s off beyond doubt, and then the position of GNSS, which contradicts it, false.
@@ -330,7 +331,7 @@ class Propagator:
         Phi[0:4, SCALE] = i.n1, i.e1, n, e
         Phi[0:4, HEADING] = Phi[0:4, CRAB] = -i.e1, i.n1, -e, n
         lasting = s.turbulence_s
-        along = s.gust_m_s if i.airspeed == "pitot" else STEADY_M_S * math.sqrt(STEADY_S / lasting)
+        along = s.gust_m_s if i.airspeed == "pitot" else 0.0
         gust = nose_covariance(i.V, along, s.gust_m_s / ALONG)
         both = gust * (-lasting * math.expm1(-T / lasting))  # integral of the gust times the gust at the end
         crab = self._density[:, CRAB] * T
@@ -342,6 +343,24 @@ class Propagator:
         Q[:, 2:4, 2:4] += gust + crab[:, None, None] * np.array(((e * e, -n * e), (-n * e, n * n)))
         Q[:, 2, CRAB] = Q[:, CRAB, 2] = -e * crab
         Q[:, 3, CRAB] = Q[:, CRAB, 3] = n * crab
+        if i.airspeed == "steady":
+            self._wandering(i, T, Phi, Q)
+
+    def _wandering(self, i: Interval, T: float, Phi: Floats, Q: Floats) -> None:
+        """What a steady airspeed wanders by, along the nose: as a wind it moves position and velocity."""
+        stays = math.exp(-T / STEADY_S)
+        gone = 1.0 - stays
+        variance = nose_covariance(i.V, STEADY_M_S, 0.0)
+        end, both = (1.0 - stays * stays) * variance, (STEADY_S * gone * gone) * variance
+        Phi[0:2, GUST] = (-STEADY_S * gone) * np.eye(2)
+        Phi[2:4, GUST] = -stays * np.eye(2)
+        Q[:, 0:2, 0:2] += (STEADY_S * (2.0 * T - STEADY_S * gone * (2.0 + gone))) * variance
+        Q[:, 0:2, 2:4] += both
+        Q[:, 2:4, 0:2] += both
+        Q[:, 2:4, 2:4] += end
+        Q[:, GUST, GUST] = end
+        Q[:, GUST, 0:2] = Q[:, 0:2, GUST] = -both
+        Q[:, GUST, 2:4] = Q[:, 2:4, GUST] = -end
 
     def _foreign(self, T: float, Phi: Floats, Q: Floats) -> None:
         at = FOREIGN.start
