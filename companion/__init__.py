@@ -23,7 +23,7 @@ Packages
     records     data types that flow between packages     units       units and constants
     plausibility  limits of the numbers in a record
     config/     configuration and output profiles         transport/  serial, UDP and TCP connections
-    link/       MAVLink: frames, sessions, decoding       nav/        earth, strapdown, INS error model
+    link/       MAVLink: frames, sessions, decoding       nav/        earth, geometry, INS error model
     estimate/   Kalman, minimax, maximum likelihood       navigator/  records in, solutions out; no I/O
     output/     gate and messages to the autopilot        runtime/    core without I/O, asyncio service
     storage/    MCAP flight logs                          importers/  tlog, dataflash, ulog

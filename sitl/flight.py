@@ -149,7 +149,10 @@ def radii(lat: Floats) -> tuple[Floats, Floats]:
 
 
 def gravity(lat: Floats, alt: Floats) -> Floats:
-    """Return normal gravity, m/s^2: `companion.nav.earth.gravity` on arrays."""
+    """Return normal gravity, m/s^2: Somigliana's on the ellipsoid, second order in height above it.
+
+    NIMA TR8350.2 (4-1), (4-3); accurate to 1e-6 m/s^2 up to 20 km.
+    """
     s2 = np.sin(lat) ** 2
     k = B * G_POLE / (A * G_EQUATOR) - 1.0
     m = OMEGA**2 * A**2 * B / GM

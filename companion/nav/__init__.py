@@ -1,8 +1,7 @@
-"""Navigation: the earth, positions, strapdown integration, and linear error models.
+"""Navigation: the earth, positions, and linear error models.
 
-    earth            WGS84 radii, gravity, angular rates; the sphere of the error equations
-    geometry         geodetic, ECEF and local positions, lines of sight, the autopilots' flat earths
-    strapdown        integration of inertial measurements, and its inverse
+    earth            constants and radii of WGS84; the sphere of the error equations
+    geometry         geodetic, ECEF and local positions, lines of sight, rotations, flat earths
     error_model      error equations of an INS, the paper's and the complete ones
     bounded_channel  errors of a channel as unknown but bounded, by grade
     disturbances     slow disturbances, stochastic or bounded, that extend the error state
@@ -18,7 +17,7 @@ from companion.nav import correctors, disturbances, earth
 from companion.nav.correctors import observation_matrix
 from companion.nav.discretization import Discrete, discretise, euler
 from companion.nav.disturbances import Disturbance, Model, compose
-from companion.nav.earth import SPHERE, Radii, RateN, Sphere, earth_rate, gravity, radii, transport_rate
+from companion.nav.earth import SPHERE, Radii, Sphere, radii
 from companion.nav.error_model import (
     INS_STATES,
     Example,
@@ -38,20 +37,12 @@ from companion.nav.geometry import (
     geodetic_to_local,
     local_to_geodetic,
     radio_horizon,
+    rotation_matrix,
     separation,
     slant_range_azimuth,
     to_ecef,
     to_enu,
     wrap_angle,
-)
-from companion.nav.strapdown import (
-    InertialState,
-    StepMeans,
-    combine_two_samples,
-    mechanise,
-    rotation_matrix,
-    rotation_vector,
-    synthesise,
 )
 
 __all__ = [
@@ -61,44 +52,34 @@ __all__ = [
     "Disturbance",
     "Example",
     "Geodetic",
-    "InertialState",
     "LineOfSight",
     "Model",
     "Projection",
     "Radii",
-    "RateN",
     "Sphere",
-    "StepMeans",
     "aircraft_matrix",
     "aircraft_model",
-    "combine_two_samples",
     "compose",
     "correctors",
     "discretise",
     "displace",
     "disturbances",
     "earth",
-    "earth_rate",
     "enu_axes",
     "euler",
     "from_ecef",
     "from_enu",
     "geodetic_to_local",
-    "gravity",
     "local_to_geodetic",
-    "mechanise",
     "observation_matrix",
     "paper_example",
     "paper_model",
     "radii",
     "radio_horizon",
     "rotation_matrix",
-    "rotation_vector",
     "separation",
     "slant_range_azimuth",
-    "synthesise",
     "to_ecef",
     "to_enu",
-    "transport_rate",
     "wrap_angle",
 ]

@@ -1,4 +1,4 @@
-"""Positions and lines of sight: geodetic, ECEF and local frames, and the autopilots' flat earths.
+"""Positions, lines of sight and rotations: geodetic, ECEF and local frames, the autopilots' flat earths.
 
 It knows the ellipsoid, not motion, time, sensors or errors. A geodetic position is
 `Geodetic(lat, lon, alt)`, radians and metres above WGS84; resulting longitudes are in [-pi, pi).
@@ -378,3 +378,33 @@ def _longitude_scale(lat: float) -> float:
 
 def _unknown(projection: str) -> ValueError:
     return ValueError(f"unknown local projection {projection!r}: choose ardupilot, px4 or tangent")
+
+
+def rotation_matrix(vector: Floats) -> Floats:
+    """Compute exp([vector x]): the rotation by |vector| rad about it (Rodrigues).
+
+    Parameters
+    ----------
+    vector : (3,)
+        Rotation vector, rad.
+
+    Returns
+    -------
+    (3, 3)
+        Rotation matrix.
+    """
+    x, y, z = vector.tolist()
+    angle2 = x * x + y * y + z * z
+    if angle2 < 1e-4:  # the series are exact to rounding here, the closed forms are not
+        p = 1.0 - angle2 / 6.0 * (1.0 - angle2 / 20.0 * (1.0 - angle2 / 42.0))
+        q = 0.5 - angle2 / 24.0 * (1.0 - angle2 / 30.0 * (1.0 - angle2 / 56.0))
+    else:
+        a = math.sqrt(angle2)
+        p, q = math.sin(a) / a, (1.0 - math.cos(a)) / angle2
+    return np.array(  # I + p [vector x] + q [vector x]^2
+        [
+            [1.0 - q * (y * y + z * z), q * x * y - p * z, q * x * z + p * y],
+            [q * x * y + p * z, 1.0 - q * (x * x + z * z), q * y * z - p * x],
+            [q * x * z - p * y, q * y * z + p * x, 1.0 - q * (x * x + y * y)],
+        ]
+    )

@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 from msgspec import Struct, structs
 
-from companion.nav.strapdown import rotation_matrix
+from companion.nav.geometry import rotation_matrix
 from companion.records import Attitude, Imu, Vector2, Vector3
 from companion.units import G0, Floats
 

@@ -12,8 +12,7 @@ from companion.nav import correctors
 from companion.nav.correctors import airspeed, observation_matrix, rsbn_azimuth, rsbn_range
 from companion.nav.earth import SPHERE
 from companion.nav.error_model import INS_STATES
-from companion.nav.geometry import Geodetic, displace, slant_range_azimuth, wrap_angle
-from companion.nav.strapdown import rotation_matrix
+from companion.nav.geometry import Geodetic, displace, rotation_matrix, slant_range_azimuth, wrap_angle
 from companion.units import Floats
 
 lat, lon = 0.95, 0.65

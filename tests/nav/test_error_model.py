@@ -24,8 +24,9 @@ from companion.nav.correctors import (
 )
 from companion.nav.earth import SPHERE, SPHERE_KM_H
 from companion.nav.error_model import INS_STATES, aircraft_model, paper_example, paper_model
-from companion.nav.strapdown import navigation_rates, rotation_matrix
+from companion.nav.geometry import rotation_matrix
 from companion.units import Floats
+from tests.nav.strapdown import navigation_rates
 
 GOLDEN: dict[str, Any] = json.loads((Path(__file__).parents[1] / "data" / "error_model.json").read_text())
 speeds = [8.0, 30.0, 250.0]

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.linalg import expm
 
 from companion.nav import earth
 from companion.nav.geometry import (
@@ -18,6 +19,7 @@ from companion.nav.geometry import (
     geodetic_to_local,
     local_to_geodetic,
     radio_horizon,
+    rotation_matrix,
     separation,
     slant_range_azimuth,
     to_ecef,
@@ -228,3 +230,20 @@ def test_radio_horizon_is_the_tangent_line_over_the_four_thirds_earth() -> None:
 def test_wrap(angle: float) -> None:
     assert -math.pi <= wrap_angle(angle) < math.pi
     assert math.remainder(wrap_angle(angle) - angle, math.tau) == pytest.approx(0.0, abs=1e-12)
+
+
+@given(st.tuples(*[st.floats(-1.0, 1.0)] * 3))
+def test_rotation_is_the_exponential_of_its_vector(v: tuple[float, float, float]) -> None:
+    x, y, z = v
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    np.testing.assert_allclose(rotation_matrix(np.array(v)), expm(cross), atol=1e-14)
+
+
+def test_rotation_is_continuous_at_the_end_of_the_series() -> None:
+    for angle in (1e-9, 9.99e-3, 1.001e-2, 1.0):
+        s, c = math.sin(angle), math.cos(angle)
+        np.testing.assert_allclose(
+            rotation_matrix(np.array([0.0, 0.0, angle])),
+            [[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]],
+            atol=1e-16,
+        )

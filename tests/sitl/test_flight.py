@@ -1,9 +1,10 @@
+import math
+
 import numpy as np
 import pytest
 
 from companion.nav import earth
 from companion.nav.geometry import Geodetic, separation
-from companion.nav.strapdown import InertialState, mechanise
 from sitl.flight import (
     CLIMB_RATE,
     FlightPlan,
@@ -16,6 +17,7 @@ from sitl.flight import (
     smooth_step,
 )
 from sitl.scenarios import get_scenario
+from tests.nav.strapdown import InertialState, mechanise
 
 PLAN = FlightPlan(
     (
@@ -86,12 +88,61 @@ def test_interpolation_is_linear_and_headings_wrap(flight):
     assert exact.attitude == pytest.approx(flight.attitude[[0, 17, -1]], abs=1e-12)
 
 
-def test_array_earth_model_agrees_with_nav_earth():
-    lats, alts = np.radians([0.0, 30.0, 59.3, -75.0]), np.array([0.0, 100.0, 1200.0, 9000.0])
-    assert gravity(lats, alts) == pytest.approx([earth.gravity(*p) for p in zip(lats, alts)], rel=1e-14)
+def test_radii_on_arrays_are_those_of_nav_earth():
+    lats = np.radians([0.0, 30.0, 59.3, -75.0])
     assert np.stack(radii(lats), axis=1) == pytest.approx(
         np.array([tuple(earth.radii(lat)) for lat in lats]), rel=1e-14
     )
+
+
+@pytest.mark.parametrize(
+    ("lat_deg", "alt", "published"),
+    [
+        (0.0, 0.0, 9.7803253359),
+        (90.0, 0.0, 9.8321849378),
+        (-90.0, 0.0, 9.8321849378),
+        (45.0, 0.0, 9.8061977694),  # Somigliana with k = 0.00193185265241, TR8350.2 (4-1)
+    ],
+)
+def test_normal_gravity(lat_deg: float, alt: float, published: float) -> None:
+    assert gravity(np.radians(lat_deg), alt) == pytest.approx(published, abs=1e-7)
+
+
+@pytest.mark.parametrize("lat_deg", [0.0, 30.0, 60.0, 90.0])
+def test_gravity_falls_with_height_as_the_exact_field_of_the_ellipsoid(lat_deg: float) -> None:
+    assert gravity(np.radians(lat_deg), 10e3) == pytest.approx(_exact_gravity(lat_deg, 10e3), abs=1e-6)
+
+
+def _exact_gravity(lat_deg: float, alt: float) -> float:
+    """The closed field of a rotating equipotential ellipsoid (Heiskanen and Moritz, Physical Geodesy 2-7)."""
+    lat = math.radians(lat_deg)
+    R_E = earth.radii(lat).R_E
+    x, z = (R_E + alt) * math.cos(lat), ((1 - earth.E2) * R_E + alt) * math.sin(lat)
+    E = math.sqrt(earth.A**2 - earth.B**2)
+
+    def q_of(u: float) -> float:
+        return 0.5 * ((1 + 3 * u**2 / E**2) * math.atan(E / u) - 3 * u / E)
+
+    def potential(x: float, z: float) -> float:
+        d = x * x + z * z - E * E
+        u = math.sqrt(0.5 * d * (1 + math.sqrt(1 + 4 * E * E * z * z / (d * d))))
+        sin2_beta = (z / u) ** 2
+        rotation = earth.OMEGA**2
+        return (
+            earth.GM / E * math.atan(E / u)
+            + 0.5 * rotation * earth.A**2 * q_of(u) / q_of(earth.B) * (sin2_beta - 1 / 3)
+            + 0.5 * rotation * x * x
+        )
+
+    h = 200.0  # fourth-order differences, so that neither rounding nor truncation reaches 1e-7 m/s^2
+
+    def slope(f: object) -> float:
+        assert callable(f)
+        return float(8 * (f(h) - f(-h)) - (f(2 * h) - f(-2 * h))) / (12 * h)
+
+    g_x = slope(lambda d: potential(x + d, z))
+    g_z = slope(lambda d: potential(x, z + d))
+    return math.hypot(g_x, g_z)
 
 
 def test_step_is_smooth_and_monotone():
