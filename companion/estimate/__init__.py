@@ -8,7 +8,6 @@ Linear filtering
     two_point_bvp        block-tridiagonal solver of the two-point boundary value problem
 Bounded disturbances
     restrictive          filter with bounded inputs, one step at a time
-    full_horizon         the exact solution over a record
     bounded_lsq          least squares in a box
 Positions from beacons
     observations         positions, azimuths, ranges and heights as whitened equations
@@ -43,7 +42,6 @@ from companion.estimate import (
     two_point_bvp,
     weights,
 )
-from companion.estimate.full_horizon import FullHorizonEstimate, solve_full_horizon
 from companion.estimate.fusion import (
     Ambiguous,
     Azimuth,
@@ -81,7 +79,6 @@ __all__ = [
     "Design",
     "Estimate",
     "Fix",
-    "FullHorizonEstimate",
     "Height",
     "Infeasible",
     "LeastSquares",
@@ -119,7 +116,6 @@ __all__ = [
     "select_order",
     "smooth_track",
     "smoother",
-    "solve_full_horizon",
     "transition",
     "two_point",
     "two_point_bvp",

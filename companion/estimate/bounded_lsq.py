@@ -1,9 +1,9 @@
-"""Least squares with bounded unknowns: the inner problem of the restrictive filters.
+"""Least squares with bounded unknowns: the inner problem of the restrictive filter.
 
 Inputs are scaled by their bounds, v_i = u_i / C_i, so that the box is always |v_i| <= 1 and C_i = 0 removes
-an input. Small problems are solved by enumeration of active sets, large ones by bounded-variable least
-squares (BVLS). Both return the active set, because the filters' covariance depends on it. The solution is
-unique only where the data determine every input; `prior_information` gives the prior assumed elsewhere.
+an input. It is solved by enumeration of active sets, and the active set is returned, because the filter's
+covariance depends on it. The solution is unique only where the data determine every input;
+`prior_information` gives the prior assumed elsewhere.
 
 It does not know what the inputs are.
 """
@@ -170,43 +170,3 @@ def minimize_quadratic(M: Floats, g: Floats) -> BoxMinimum:
     return BoxMinimum(
         v.T[(*flights, whole, best)], sets.status[best], inverse.T[(*flights, whole, whole, sets.row[best])]
     )
-
-
-def least_squares(D: Floats, r: Floats) -> BoxMinimum:
-    """Minimise 1/2 |r - D v|^2 over |v_i| <= 1 by BVLS.
-
-    The method of Stark and Parker ends on an active set, so that it is as exact as the linear algebra. 600
-    samples of two inputs take about two seconds; an interior-point solver takes 0.2 s and stops 1e-8 short.
-
-    Parameters
-    ----------
-    D : (q, m)
-        Jacobian, of any size.
-    r : (q,)
-        Residuals at v = 0.
-
-    Returns
-    -------
-    BoxMinimum
-        Minimiser, active set and inverse of the free block of D'D (plus prior information).
-
-    Raises
-    ------
-    ValueError
-        If the solver does not converge.
-    """
-    from scipy.optimize import lsq_linear
-
-    m = D.shape[1]
-    M = D.T @ D
-    weight = prior_information(M)
-    if weight.any():
-        D, r, M = np.vstack([D, weight]), np.concatenate([r, np.zeros(m)]), M + weight
-    found = lsq_linear(D, r, (-np.ones(m), np.ones(m)), method="bvls", tol=1e-15, max_iter=10 * m + 100)
-    if found.status <= 0:
-        raise ValueError(f"box problem of {m} inputs did not converge: {found.message}; shorten the horizon")
-    status = found.active_mask.astype(np.int8)
-    free = status == 0
-    inverse = np.zeros((m, m))
-    inverse[np.ix_(free, free)] = np.linalg.inv(M[np.ix_(free, free)])
-    return BoxMinimum(np.where(free, found.x, status), status, inverse)

@@ -7,8 +7,8 @@ axes: `x` of shape (..., n) with one shared `P` of shape (n, n) is a Monte Carlo
 because the gain does not depend on the data; with `P` of shape (..., n, n) every flight has its own.
 
 This is the one implementation of the measurement update in `companion.estimate`: `restrictive`,
-`full_horizon`, `smoother` and `schemes` call it. It does not know what the states mean, and it rejects
-nothing: the `find_*_flaw` functions describe what is wrong with a number, the caller decides.
+`smoother` and `schemes` call it. It does not know what the states mean, and it rejects nothing: the
+`find_*_flaw` functions describe what is wrong with a number, the caller decides.
 """
 
 from dataclasses import dataclass
@@ -273,31 +273,6 @@ def nis_gate(dof: int, false_alarm: float = 1e-3) -> float:
     from scipy.special import chdtri
 
     return float(chdtri(dof, false_alarm))
-
-
-@lru_cache(maxsize=64)
-def consistency_band(dof: int, samples: int, false_alarm: float = 1e-3) -> tuple[float, float]:
-    """Compute two-sided limits for the mean of independent NIS or NEES values.
-
-    Parameters
-    ----------
-    dof : int
-        Components of each value.
-    samples : int
-        Number of values averaged.
-    false_alarm : float
-        Probability that a consistent filter falls outside.
-
-    Returns
-    -------
-    tuple of float
-        Lower and upper limit, dimensionless.
-    """
-    from scipy.special import gammaincinv
-
-    freedom = dof * samples
-    low, high = (2.0 * gammaincinv(0.5 * freedom, p) for p in (0.5 * false_alarm, 1.0 - 0.5 * false_alarm))
-    return float(low) / samples, float(high) / samples
 
 
 def nees(error: Floats, P: Floats) -> Floats:

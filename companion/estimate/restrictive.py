@@ -14,7 +14,7 @@ and then treats the inputs on a bound as known numbers, those inside (f) as unkn
 
 The box problem is solved exactly: clipping the free solution component by component is wrong as soon as D'
 S^-1 D is not diagonal. For C -> 0 and C -> inf the filter is exact. Between them P is conditional on the
-active sets and overconfident: it is not a guarantee. `full_horizon` has the exact solution for comparison.
+active sets and overconfident: it is not a guarantee. The tests compare it with the exact solution.
 
 It does not know what U is. The bounds are those of one step: a finer step with the same C is another problem.
 """

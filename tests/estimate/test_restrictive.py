@@ -8,8 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from companion.estimate import bounded_lsq, full_horizon, kalman, restrictive
+from companion.estimate import bounded_lsq, kalman, restrictive
 from companion.nav.error_model import paper_example
+from tests.estimate import full_horizon
 
 REFERENCE = json.loads((Path(__file__).parents[1] / "data/restrictive.json").read_text())
 SMALL = [pytest.param(case, id=name) for name, case in REFERENCE["small"].items()]
@@ -57,7 +58,7 @@ def test_full_horizon_small(case):
     x0, P0, Z, model = problem(case)
     want = case["exact_restrictive"]
     for t in range(1, len(Z) + 1):
-        record = full_horizon.solve_full_horizon(x0, P0, Z[:t], *model)
+        record = full_horizon.solve(x0, P0, Z[:t], *model)
         np.testing.assert_allclose(record.x[-1], want["X_filter"][t - 1], atol=1e-12)
         np.testing.assert_allclose(record.u[-1], want["U_last"][t - 1], atol=1e-12)
     np.testing.assert_allclose(record.u.ravel(), want["U_smooth_T"], atol=1e-12)
@@ -75,7 +76,7 @@ def test_sixteen_states():
     assert (gather(steps, "status") == SHIP["restrictive_R1_status"]).all()
     np.testing.assert_allclose(np.diag(steps[-1].P), SHIP["restrictive_R1_P60_diag"], atol=1e-9)
     for t, want in zip(SHIP["steps"], SHIP["exact_restrictive"], strict=True):
-        record = full_horizon.solve_full_horizon(x0, P0, Z[:t], *model)
+        record = full_horizon.solve(x0, P0, Z[:t], *model)
         np.testing.assert_allclose(record.x[-1], want, atol=1e-9)
     np.testing.assert_allclose(record.u, SHIP["exact_U_smooth_60"], atol=1e-9)
 
@@ -84,7 +85,7 @@ def test_sixteen_states():
 def test_full_horizon_solves_the_two_point_problem(data):
     """The estimate satisfies the conditions of the optimum, none of which was used to find it."""
     x0, P0, Z, (A, B, Q, H, R, C) = data
-    x, _, u, status, l = full_horizon.solve_full_horizon(x0, P0, Z, A, B, Q, H, R, C)
+    x, _, u, status, l = full_horizon.solve(x0, P0, Z, A, B, Q, H, R, C)
     # adjoint variables in units in which they multiply states of order one
     size = 1.0 + np.abs(l).max(axis=0)
     assert np.abs(x[0] - x0 - P0 @ l[0]).max() < 1e-9
@@ -111,7 +112,7 @@ def test_limits_of_the_bound():
     wide = (A, B, Q, H, R, 1e6 * C)
     loose = run_r1(x0, P0, Z, wide)[-1]
     assert not loose.status.any()
-    np.testing.assert_allclose(loose.x, full_horizon.solve_full_horizon(x0, P0, Z, *wide).x[-1], atol=1e-8)
+    np.testing.assert_allclose(loose.x, full_horizon.solve(x0, P0, Z, *wide).x[-1], atol=1e-8)
 
 
 @pytest.mark.parametrize("C", [[0.0, 0.3], [0.3, 0.3]])
@@ -134,7 +135,7 @@ def test_undetermined_inputs_take_the_minimax_prior(C):
 def test_box_by_enumeration_and_by_bvls_agree(seed, m):
     rng = np.random.default_rng(seed)
     D, r = rng.normal(size=(m + 2, m)), 3 * rng.normal(size=m + 2)
-    small, large = bounded_lsq.minimize_quadratic(D.T @ D, D.T @ r), bounded_lsq.least_squares(D, r)
+    small, large = bounded_lsq.minimize_quadratic(D.T @ D, D.T @ r), full_horizon.least_squares(D, r)
     np.testing.assert_allclose(small.v, large.v, atol=1e-9)
     assert (small.status == large.status).all()
     np.testing.assert_allclose(small.free_inverse, large.free_inverse, rtol=1e-6, atol=1e-9)
@@ -157,7 +158,7 @@ def test_interior_point_solver_agrees():
     solver = piqp.DenseSolver()
     solver.setup(D.T @ D, -D.T @ r, x_l=-np.ones(40), x_u=np.ones(40))
     solver.solve()
-    np.testing.assert_allclose(bounded_lsq.least_squares(D, r).v, solver.result.x, atol=1e-5)
+    np.testing.assert_allclose(full_horizon.least_squares(D, r).v, solver.result.x, atol=1e-5)
 
 
 def test_batch_equals_one_by_one():
