@@ -5,12 +5,11 @@
     error_model      error equations of an INS, the paper's and the complete ones
     bounded_channel  errors of a channel as unknown but bounded, by grade
     disturbances     slow disturbances, stochastic or bounded, that extend the error state
-    correctors       measurement rows of airspeed, logs, GNSS, radio navigation, stars
+    correctors       measurement rows of airspeed, logs, lines of position, stars, a second INS
     discretization   continuous system to one step, exact or Euler
 
 Geodetic positions are radians and metres above WGS84. `_n` is NED, `_b` the body, `_e` ECEF; `C_nb` rotates
-from b to n. Errors are computed minus true. numpy and scipy only, no I/O and no time. Functions of the same
-name in `disturbances` and `correctors` (a wind as a state and as a row) are reached through their modules.
+from b to n. Errors are computed minus true. numpy and scipy only, no I/O and no time.
 """
 
 from companion.nav import correctors, disturbances, earth

@@ -1,25 +1,22 @@
-"""Disturbances of an inertial system and its correctors, one declaration per kind: Poddubny (1.24)-(1.33).
+"""Disturbances of an inertial system and its log, one declaration per kind: Poddubny (1.24)-(1.33).
 
 Every slow disturbance d obeys d' = -a d + w. Its driving noise is declared either
 
 - stochastic: w white of spectral density 2 a sigma^2, so that sigma is the steady deviation (1.25)-(1.32);
 - bounded ("restrictive"): w = u, unknown but |u| <= c (1.33), (1.36); it becomes a column of B.
 
-A constant has a = 0 and is unknown at the start only. The units are those of the INS equations it is
-combined with (`error_model`); the builders here only name states and the states that they drive.
+The units are those of the INS equations it is combined with (`error_model`); the builders here only name
+states and the states that they drive.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import cos, inf, isfinite, sin
+from math import inf, isfinite
 from typing import NamedTuple
 
 import numpy as np
 
 from companion.units import Floats
-
-Feed = tuple[str, str, float]
-"""(driven state, driving state, gain): driven' = ... + gain * driving."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,20 +28,20 @@ class Disturbance:
     states : tuple of str
         Names.
     decay : float
-        a, per unit of time; 0 for a constant.
+        a, per unit of time.
     sigma : float
-        Steady (for a constant: initial) standard deviation, if stochastic.
+        Steady standard deviation, if stochastic.
     bound : float or None
         c of |u| <= c, unit of the state per unit of time, if bounded.
-    feeds : tuple of Feed
-        States driven by the disturbance.
+    drives : tuple of str
+        The state whose rate each contains; none where a corrector contains it.
     """
 
     states: tuple[str, ...]
     decay: float
     sigma: float = 0.0
     bound: float | None = None
-    feeds: tuple[Feed, ...] = ()
+    drives: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         name = "/".join(self.states)
@@ -71,8 +68,6 @@ class Model(NamedTuple):
         Influence of the bounded inputs, 0 or 1.
     C : (m,)
         Bounds of u.
-    sigma : (n,)
-        Steady deviations of the stochastic disturbances, 0 elsewhere: a prior for them.
     """
 
     A: Floats
@@ -80,7 +75,6 @@ class Model(NamedTuple):
     Q: Floats
     B: Floats
     C: Floats
-    sigma: Floats
 
 
 def compose(A_ins: Floats, ins_states: Sequence[str], disturbances: Sequence[Disturbance] = ()) -> Model:
@@ -103,7 +97,7 @@ def compose(A_ins: Floats, ins_states: Sequence[str], disturbances: Sequence[Dis
     Raises
     ------
     ValueError
-        For a name used twice, or a feed from or into an unknown state.
+        For a name used twice, or an unknown state that is driven.
 
     References
     ----------
@@ -115,7 +109,7 @@ def compose(A_ins: Floats, ins_states: Sequence[str], disturbances: Sequence[Dis
         raise ValueError(f"states named twice: {', '.join(repeated)}; give each disturbance unique names")
     index = {s: i for i, s in enumerate(states)}
     n, n_ins = len(states), len(ins_states)
-    A, Q, sigma = np.zeros((n, n)), np.zeros((n, n)), np.zeros(n)
+    A, Q = np.zeros((n, n)), np.zeros((n, n))
     A[:n_ins, :n_ins] = A_ins
     bounded: list[tuple[int, float]] = []
     for d in disturbances:
@@ -123,38 +117,16 @@ def compose(A_ins: Floats, ins_states: Sequence[str], disturbances: Sequence[Dis
             i = index[s]
             A[i, i] = -d.decay
             Q[i, i] = 2.0 * d.decay * d.sigma**2
-            sigma[i] = d.sigma
             if d.bound is not None:
                 bounded.append((i, d.bound))
-        for fed, feeding, gain in d.feeds:
-            if fed not in index or feeding not in index:
-                raise ValueError(f"{feeding} cannot feed {fed}: the model has only {', '.join(states)}")
-            A[index[fed], index[feeding]] += gain
+        for driven, driving in zip(d.drives, d.states):
+            if driven not in index:
+                raise ValueError(f"{driving} cannot drive {driven}: the model has only {', '.join(states)}")
+            A[index[driven], index[driving]] = 1.0
     B = np.zeros((n, len(bounded)))
     for j, (i, _) in enumerate(bounded):
         B[i, j] = 1.0
-    return Model(A, states, Q, B, np.array([c for _, c in bounded]), sigma)
-
-
-def gyro_constant(sigma: float) -> Disturbance:
-    """Declare the constant part of the gyro drift, minus the physical one, as P is.
-
-    Parameters
-    ----------
-    sigma : float
-        Initial standard deviation, rad per unit of time.
-
-    Returns
-    -------
-    Disturbance
-        E0X, E0Y, E0Z.
-
-    References
-    ----------
-    Poddubny (1.27), (1.28).
-    """
-    states = ("E0X", "E0Y", "E0Z")
-    return Disturbance(states, 0.0, sigma, feeds=_pairs(("PX", "PY", "PZ"), states))
+    return Model(A, states, Q, B, np.array([c for _, c in bounded]))
 
 
 def gyro_drift(decay: float, sigma: float = 0.0, bound: float | None = None) -> Disturbance:
@@ -178,8 +150,7 @@ def gyro_drift(decay: float, sigma: float = 0.0, bound: float | None = None) -> 
     ----------
     Poddubny (1.29).
     """
-    states = ("EX", "EY", "EZ")
-    return Disturbance(states, decay, sigma, bound, _pairs(("PX", "PY", "PZ"), states))
+    return Disturbance(("EX", "EY", "EZ"), decay, sigma, bound, ("PX", "PY", "PZ"))
 
 
 def accelerometer_fast(decay: float, sigma: float = 0.0, bound: float | None = None) -> Disturbance:
@@ -199,8 +170,7 @@ def accelerometer_fast(decay: float, sigma: float = 0.0, bound: float | None = N
     ----------
     Poddubny (1.24), (1.25).
     """
-    states = ("AX", "AY")
-    return Disturbance(states, decay, sigma, bound, _pairs(("dVN", "dVE"), states))
+    return Disturbance(("AX", "AY"), decay, sigma, bound, ("dVN", "dVE"))
 
 
 def accelerometer_slow(decay: float, sigma: float = 0.0, bound: float | None = None) -> Disturbance:
@@ -220,8 +190,7 @@ def accelerometer_slow(decay: float, sigma: float = 0.0, bound: float | None = N
     ----------
     Poddubny (1.24), (1.25).
     """
-    states = ("AsX", "AsY")
-    return Disturbance(states, decay, sigma, bound, _pairs(("dVN", "dVE"), states))
+    return Disturbance(("AsX", "AsY"), decay, sigma, bound, ("dVN", "dVE"))
 
 
 def gravity(speed: float, R_G: float, sigma: float = 0.0, bound: float | None = None) -> Disturbance:
@@ -245,8 +214,7 @@ def gravity(speed: float, R_G: float, sigma: float = 0.0, bound: float | None = 
     ----------
     Poddubny (1.26).
     """
-    states = ("GX", "GY")
-    return Disturbance(states, speed / R_G, sigma, bound, _pairs(("dVN", "dVE"), states))
+    return Disturbance(("GX", "GY"), speed / R_G, sigma, bound, ("dVN", "dVE"))
 
 
 def current(
@@ -275,85 +243,3 @@ def current(
     Poddubny (1.30).
     """
     return Disturbance(("VcX", "VcY"), decay + speed / R_c, sigma, bound)
-
-
-def wind(
-    speed: float, decay: float, R_w: float, sigma: float = 0.0, bound: float | None = None
-) -> Disturbance:
-    """Declare the wind with its physical sign, north and east velocity of the air.
-
-    Parameters
-    ----------
-    speed : float
-        Speed of the vehicle.
-    decay : float
-        Decay rate in time, per unit of time.
-    R_w : float
-        Correlation radius.
-    sigma, bound
-        As in `gyro_drift`.
-
-    Returns
-    -------
-    Disturbance
-        wN, wE.
-
-    References
-    ----------
-    Poddubny (1.30), for the wind instead of the current.
-    """
-    return Disturbance(("wN", "wE"), decay + speed / R_w, sigma, bound)
-
-
-def radio_drift(
-    names: Sequence[str], decay: float, sigma: float = 0.0, bound: float | None = None
-) -> Disturbance:
-    """Declare the slow drift of radio lines of position, one state per line.
-
-    Parameters
-    ----------
-    names : sequence of str
-        Names of the states, as given to the correctors.
-    decay, sigma, bound
-        As in `gyro_drift`.
-
-    Returns
-    -------
-    Disturbance
-        One state for each name.
-
-    References
-    ----------
-    Poddubny (1.32).
-    """
-    return Disturbance(tuple(names), decay, sigma, bound)
-
-
-def free_gyro(
-    P: float, decay: float, sigma: float = 0.0, bound: float | None = None
-) -> tuple[Disturbance, Disturbance]:
-    """Declare a free gyro ("artificial star"): axis errors dg, dd and drift b1, b2.
-
-    Parameters
-    ----------
-    P : float
-        Parallactic angle, rad.
-    decay, sigma, bound
-        Of the drift, as in `gyro_drift`.
-
-    Returns
-    -------
-    tuple of Disturbance
-        Axis and drift.
-
-    References
-    ----------
-    Poddubny (1.21), (1.31).
-    """
-    axis = Disturbance(("dg", "dd"), 0.0)
-    feeds = (("dg", "b1", -cos(P)), ("dg", "b2", sin(P)), ("dd", "b1", sin(P)), ("dd", "b2", cos(P)))
-    return axis, Disturbance(("b1", "b2"), decay, sigma, bound, feeds)
-
-
-def _pairs(fed: Sequence[str], feeding: Sequence[str]) -> tuple[Feed, ...]:
-    return tuple((a, b, 1.0) for a, b in zip(fed, feeding, strict=True))

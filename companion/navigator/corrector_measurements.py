@@ -84,7 +84,7 @@ def star(channel: CorrectedIns, corrected: Point, centre: Vector2, record: StarF
 
 def second_ins(channel: CorrectedIns, point: Point, record: SecondIns) -> CorrectorRows:
     """Position of the INS less that of a second one."""
-    H = correctors.observation_matrix(channel.names, *correctors.second_ins(compared=("dx", "dy")))
+    H = correctors.observation_matrix(channel.names, *correctors.second_ins())
     other = Geodetic(record.lat, record.lon, point.position.alt)
     north, east, _ = separation(point.position, other)
     kind = f"second INS {record.ins}"
