@@ -132,7 +132,7 @@ def fly_frames(entries: Iterable[tlog.TlogEntry], config: Config) -> RecordingLo
 
 
 def fly_log(records: Iterable[Stamped], config: Config) -> RecordingLog:
-    """Pass the records of another log to the navigator, and its solutions to the source switch."""
+    """Pass records of any origin to the navigator, and its solutions to the source switch."""
     log, navigator, switch = RecordingLog(), Navigator(config), SourceSwitch()
     next_ns: int | None = None
     for record in records:
@@ -146,15 +146,10 @@ def fly_log(records: Iterable[Stamped], config: Config) -> RecordingLog:
         navigator.settle()
         if next_ns is None or record.rx_ns >= next_ns:
             next_ns = record.rx_ns + SECOND_NS
-            log.set_2_ns += set_2_requests(switch, record.rx_ns)
+            switch.update(record.rx_ns)
+            if any(message.param1 == COMPANION_SET for message in switch.to_send(1, record.rx_ns)):
+                log.set_2_ns.append(record.rx_ns)
     return log
-
-
-def set_2_requests(switch: SourceSwitch, now_ns: int) -> list[int]:
-    """Decide, and return the time if source set 2 is requested now."""
-    switch.update(now_ns)
-    sent = [int(message.param1) for message in switch.to_send(1, now_ns)]
-    return [now_ns] if COMPANION_SET in sent else []
 
 
 # ---------------------------------------------------------------------------------------------------------

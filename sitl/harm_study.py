@@ -30,9 +30,8 @@ from threadpoolctl import threadpool_limits
 
 from companion.config import Config, InertialConfig, OutputConfig
 from companion.nav.geometry import displace
-from companion.navigator import Navigator
 from companion.option_types import FloatRange
-from companion.output.source_switch import SILENT_S, SourceSwitch
+from companion.output.source_switch import SILENT_S
 from companion.records import Event, Gnss, RsbnFix, Solution, Stamped
 from companion.runtime.core import CompanionCore
 from companion.tables import print_tables
@@ -43,7 +42,7 @@ from sitl.beacon import Beacon
 from sitl.campaign.flight import UNITS, sensors_of
 from sitl.faults import Fault
 from sitl.flight import FlightPlan, Leg, WindChange
-from sitl.harm_recordings import RecordingResult, fly_named, list_recordings, set_2_requests
+from sitl.harm_recordings import RecordingResult, fly_log, fly_named, list_recordings
 from sitl.scenarios import Scenario, SensorRates
 from sitl.world import World
 
@@ -225,26 +224,15 @@ _Flown = tuple[World, list[Solution], list[Event], bool, Floats]
 
 
 def _fly_records(scenario: Scenario, order: HarmOrder) -> _Flown:
-    config, world, switch = config_of(order), World(scenario), SourceSwitch()
-    navigator = Navigator(config)
-    solutions, events, set_2, next_ns = list[Solution](), list[Event](), False, 0
-    noisy, rng = WRONG[order.wrong].noisy, np.random.default_rng(order.seed)
-    for record in world.records(sensors_of(config)):
-        if noisy is not None and isinstance(record, noisy):
-            record = noisier(record, rng)
-        if isinstance(record, Gnss):
-            switch.receive(record)
-        for output in navigator.handle(record):  # type: ignore[arg-type]
-            if isinstance(output, Solution):
-                solutions.append(output)
-                switch.note_output(output, True, output.rx_ns)
-            elif isinstance(output, Event):
-                events.append(output)
-        navigator.settle()
-        if record.rx_ns >= next_ns:
-            next_ns = record.rx_ns + SECOND_NS
-            set_2 = bool(set_2_requests(switch, record.rx_ns)) or set_2
-    return world, solutions, events, set_2, _fix_times(world.streams[Gnss])
+    config, world = config_of(order), World(scenario)
+    records: Iterable[Stamped] = world.records(sensors_of(config))
+    if (noisy := WRONG[order.wrong].noisy) is not None:
+        rng = np.random.default_rng(order.seed)
+        records = (noisier(r, rng) if isinstance(r, noisy) else r for r in records)
+    log = fly_log(records, config)
+    solutions = [r for r in log.records if isinstance(r, Solution)]
+    events = [r for r in log.records if isinstance(r, Event)]
+    return world, solutions, events, bool(log.set_2_ns), _fix_times(world.streams[Gnss])
 
 
 def _fix_times(records: Iterable[Stamped]) -> Floats:
