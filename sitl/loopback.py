@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import math
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
@@ -25,7 +24,7 @@ from companion.analysis import error_statistics
 from companion.analysis.summary import format_share
 from companion.config import Config, OutputConfig, load
 from companion.config.options import configuration_options
-from companion.nav.geometry import Geodetic, separation
+from companion.nav.geometry import Geodetic
 from companion.records import Event, Gnss, Rejection, Reset, RsbnFix, Solution, Stamped
 from companion.runtime.core import CompanionCore
 from companion.storage.deferred_log import Log, NoLog
@@ -142,10 +141,19 @@ def truth_function(autopilot: SimulatedAutopilot) -> error_statistics.TruthAt:
     return truth
 
 
+def source_errors(flown: LoopbackFlight) -> dict[str, error_statistics.ErrorSeries]:
+    """Return the horizontal error of every source against the exact truth."""
+    return error_statistics.horizontal_errors(flown.records, truth_function(flown.autopilot))
+
+
 def error_table(flown: LoopbackFlight) -> list[error_statistics.PhaseErrors]:
-    """Compute the error table. A phase with fixes starts at the first solution after its first fix."""
-    found = error_statistics.horizontal_errors(flown.records, truth_function(flown.autopilot))
-    return error_statistics.summarize_phases(found, _phases(flown))
+    """Compute the errors of every source in each phase."""
+    return error_statistics.summarize_phases(source_errors(flown), flown_phases(flown))
+
+
+def flown_phases(flown: LoopbackFlight) -> list[error_statistics.FlightPhase]:
+    """List the phases. One with fixes starts at the first solution after its first fix."""
+    return [_from_first_fix(phase, flown.records) for phase in flown.autopilot.scenario.phases()]
 
 
 class OwnPhase(NamedTuple):
@@ -181,27 +189,20 @@ class PhaseProtection(NamedTuple):
         return self.inside == 1.0
 
 
-def protection_table(flown: LoopbackFlight) -> list[PhaseProtection | None]:
-    """Compute the protection level of each phase of `error_table`; None where there is no solution."""
-    truth = truth_function(flown.autopilot)
-    solutions = [r for r in flown.records if isinstance(r, Solution) and r.protection is not None]
-    t_ns = np.array([r.t_ns for r in solutions], dtype=np.int64)
-    levels = np.array([r.protection for r in solutions], dtype=np.float64)
-    places = (Geodetic(r.lat, r.lon, r.alt_msl) for r in solutions)
-    apart = (separation(place, true) for place, r in zip(places, solutions) if (true := truth(r.t_ns)))
-    errors = np.array([math.hypot(north, east) for north, east, _ in apart], dtype=np.float64)
+def protection_table(
+    corrected: error_statistics.ErrorSeries | None, phases: Sequence[error_statistics.FlightPhase]
+) -> list[PhaseProtection | None]:
+    """Compute the protection level of each phase; None where there is no solution with one."""
+    if corrected is None:
+        return [None] * len(phases)
     found: list[PhaseProtection | None] = []
-    for phase in _phases(flown):
-        within = (t_ns >= phase.start_ns) & (t_ns < phase.end_ns)
-        inside = errors[within] <= levels[within]
-        found.append(
-            PhaseProtection(float(np.median(levels[within])), float(inside.mean())) if len(inside) else None
-        )
+    for phase in phases:
+        within = (corrected.t_ns >= phase.start_ns) & (corrected.t_ns < phase.end_ns)
+        within &= np.isfinite(corrected.protection)
+        levels = corrected.protection[within]
+        inside = corrected.error[within] <= levels
+        found.append(PhaseProtection(float(np.median(levels)), float(inside.mean())) if len(levels) else None)
     return found
-
-
-def _phases(flown: LoopbackFlight) -> list[error_statistics.FlightPhase]:
-    return [_from_first_fix(phase, flown.records) for phase in flown.autopilot.scenario.phases()]
 
 
 def _from_first_fix(phase: SchedulePhase, records: Iterable[Stamped]) -> error_statistics.FlightPhase:
@@ -270,27 +271,24 @@ def command(
         task = progress.add_task(f"flying {chosen.name}", total=chosen.duration_s)
         flown = fly_scenario(chosen, config, log, lambda flown_s: progress.update(task, completed=flown_s))
     seconds = time.perf_counter() - started
-    rows = error_table(flown)
+    errors, phases = source_errors(flown), flown_phases(flown)
+    rows = error_statistics.summarize_phases(errors, phases)
+    levels = protection_table(errors.get(error_statistics.CORRECTED), phases)
     if plot is not None:
         from sitl.loopback_plot import draw
 
-        draw(
-            plot,
-            error_statistics.horizontal_errors(flown.records, truth_function(flown.autopilot)),
-            chosen,
-            START_NS,
-        )
+        draw(plot, errors, chosen, START_NS)
     if as_json:
         rate = chosen.duration_s / seconds
         summary = {"log": str(log.path), "seconds": seconds, "times_real_time": rate}
-        phases = [
+        table = [
             row._asdict() | {"protection": level._asdict() | {"held": level.held} if level else None}
-            for row, level in zip(rows, protection_table(flown), strict=True)
+            for row, level in zip(rows, levels, strict=True)
         ]
         own = [row._asdict() for row in own_table(flown.autopilot)]
-        click.echo(json.dumps({**summary, "phases": phases, "own": own}))
+        click.echo(json.dumps({**summary, "phases": table, "own": own}))
     else:
-        _print_table(flown, rows, seconds)
+        _print_table(flown, rows, levels, seconds)
         click.echo(f"log: {log.path}")
     if log.trouble is not None:
         raise SystemExit(f"companion: the log is incomplete: {log.trouble}")
@@ -321,7 +319,12 @@ def _print_own(rows: list[OwnPhase]) -> None:
     print_tables(table)
 
 
-def _print_table(flown: LoopbackFlight, rows: list[error_statistics.PhaseErrors], seconds: float) -> None:
+def _print_table(
+    flown: LoopbackFlight,
+    rows: list[error_statistics.PhaseErrors],
+    levels: list[PhaseProtection | None],
+    seconds: float,
+) -> None:
     scenario = flown.autopilot.scenario
     sources = [
         s
@@ -331,7 +334,7 @@ def _print_table(flown: LoopbackFlight, rows: list[error_statistics.PhaseErrors]
     names = (source.replace(" ", "\n") for source in sources)
     heads = "phase", "min", *names, "expected", "95 %", "protected", "bound"
     table = number_table(f"{scenario.name}: horizontal error, r.m.s. [m]", *heads)
-    for row, level in zip(rows, protection_table(flown), strict=True):
+    for row, level in zip(rows, levels, strict=True):
         cells = [_metres(row.rms.get(source)) for source in sources]
         percentile = _metres(row.p95.get(error_statistics.CORRECTED))
         protected = "-" if level is None else _metres(level.level) + ("" if level.held else " NO")

@@ -64,7 +64,10 @@ def chi2_95(degrees_of_freedom: Floats) -> Floats:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Assessment:
-    """All numbers of a report on one flight; `errors` by source, times in ns since t = 0."""
+    """All numbers of a report on one flight; `errors` by source, times in ns since t = 0.
+
+    `offset` is that of the solutions from the reference, north and east (m); empty without either.
+    """
 
     flight: Flight
     origin: tuple[float, float]
@@ -72,7 +75,7 @@ class Assessment:
     phases: list[error_statistics.FlightPhase]
     rows: list[error_statistics.PhaseErrors]
     errors: dict[str, error_statistics.ErrorSeries]
-    ins_error: dict[str, Floats]
+    offset: dict[str, Floats]
     normalized_errors: list[NormalizedErrors]
     groups: list[RejectionGroup]
     outages: list[OutageInterval]
@@ -101,7 +104,8 @@ def assess_flight(flight: Flight) -> Assessment:
     """Compute all numbers of the report on `flight`."""
     reference = _select_reference(flight)
     phases = flight_events.split_phases(flight.tables["Solution"], flight.seconds)
-    errors = {} if reference is None else _source_errors(flight, reference)
+    offset = {} if reference is None else _solution_offset(flight, reference)
+    errors = {} if reference is None else _source_errors(flight, reference, offset)
     groups = flight_events.group_rejections(flight)
     silences = flight_events.find_silences(flight)
     outages = flight_events.find_gnss_outages(flight, silences)
@@ -112,8 +116,8 @@ def assess_flight(flight: Flight) -> Assessment:
         phases=phases,
         rows=error_statistics.summarize_phases(errors, phases),
         errors=errors,
-        ins_error=_ins_error(flight, reference),
-        normalized_errors=_normalized_errors(flight, reference),
+        offset=offset,
+        normalized_errors=_normalized_errors(flight, reference, offset),
         groups=groups,
         outages=outages,
         silences=silences,
@@ -179,34 +183,47 @@ def _wrap(angle: Floats) -> Floats:
     return wrapped
 
 
-def _source_errors(flight: Flight, reference: ReferenceTrack) -> dict[str, error_statistics.ErrorSeries]:
-    solution, gnss = flight.tables["Solution"], usable_gnss(flight)
-    bound = np.hypot(solution["bound_north"], solution["bound_east"])
-    claimed = np.sqrt(solution["nn"] + solution["ee"])
-    tracks: list[tuple[str, Table]] = [
-        (error_statistics.CORRECTED, solution),
-        (error_statistics.RSBN, _beacon_positions(flight, reference)),
-    ]
+def _solution_offset(flight: Flight, reference: ReferenceTrack) -> dict[str, Floats]:
+    solution = flight.tables["Solution"]
+    if not len(solution["t"]):
+        return {}
+    offset = _offset_from(reference, solution["t"], solution["lat"], solution["lon"])
+    return dict(zip(("north", "east"), offset, strict=True))
+
+
+def _source_errors(
+    flight: Flight, reference: ReferenceTrack, offset: dict[str, Floats]
+) -> dict[str, error_statistics.ErrorSeries]:
+    found = dict[str, error_statistics.ErrorSeries]()
+    if offset:
+        found |= _solution_errors(flight.tables["Solution"], offset["north"], offset["east"])
+    tracks = [(error_statistics.RSBN, _beacon_positions(flight, reference))]
     if reference.what != GNSS:
-        tracks.append((error_statistics.GNSS, gnss))
-    found = {}
+        tracks.append((error_statistics.GNSS, usable_gnss(flight)))
     for source, table in tracks:
-        north, east = _offset_from(reference, table["t"], table["lat"], table["lon"])
-        sent = (bound, claimed) if table is solution else None
-        found[source] = _error_series(table["t"], np.hypot(north, east), sent)
-        if table is solution:
-            ins = np.hypot(north + table["error_north"], east + table["error_east"])
-            found[error_statistics.INS] = _error_series(table["t"], ins, None)
-            for name, title in error_statistics.FILTERS.items():
-                runs = np.isfinite(table[f"{name}_north"])
-                off_north = (north + table["error_north"] - table[f"{name}_north"])[runs]
-                off_east = (east + table["error_east"] - table[f"{name}_east"])[runs]
-                found[title] = _error_series(table["t"][runs], np.hypot(off_north, off_east), None)
+        off = _offset_from(reference, table["t"], table["lat"], table["lon"])
+        found[source] = _error_series(table["t"], *off)
     return {
         source: found[source]
         for source in error_statistics.SOURCES
         if source in found and len(found[source].t_ns)
     }
+
+
+def _solution_errors(solution: Table, north: Floats, east: Floats) -> dict[str, error_statistics.ErrorSeries]:
+    """Return the errors of the corrected estimate, of the INS and of the filters beside the leader."""
+    t = solution["t"]
+    bound = np.hypot(solution["bound_north"], solution["bound_east"])
+    claimed = np.sqrt(solution["nn"] + solution["ee"])
+    ins_north, ins_east = north + solution["error_north"], east + solution["error_east"]
+    found = {
+        error_statistics.CORRECTED: _error_series(t, north, east, bound, claimed, solution["protection"]),
+        error_statistics.INS: _error_series(t, ins_north, ins_east),
+    }
+    for name, title in error_statistics.FILTERS.items():
+        off = ins_north - solution[f"{name}_north"], ins_east - solution[f"{name}_east"]
+        found[title] = _error_series(t, *off)
+    return found
 
 
 def _beacon_positions(flight: Flight, reference: ReferenceTrack) -> Table:
@@ -223,32 +240,20 @@ def _beacon_positions(flight: Flight, reference: ReferenceTrack) -> Table:
     return {"t": t, "lat": np.array([p.lat for p in positions]), "lon": np.array([p.lon for p in positions])}
 
 
-def _error_series(
-    t: Floats, error: Floats, sent: tuple[Floats, Floats] | None
-) -> error_statistics.ErrorSeries:
+def _error_series(t: Floats, north: Floats, east: Floats, *limits: Floats) -> error_statistics.ErrorSeries:
+    """Return the errors where they are known; `limits`: bound, claim and protection level, if there are."""
+    error = np.hypot(north, east)
     known = np.isfinite(error)
-    bound, claimed = sent or (np.full(len(t), np.nan),) * 2
-    t_ns = np.round(t[known] * 1e9).astype(np.int64)
-    return error_statistics.ErrorSeries(t_ns, error[known], bound[known], claimed[known])
-
-
-def _ins_error(flight: Flight, reference: ReferenceTrack | None) -> dict[str, Floats]:
-    """Return the error of the inertial channel against the reference, at the times of `Solution`."""
-    solution = flight.tables["Solution"]
-    if reference is None or not len(solution["t"]):
-        return {}
-    north, east = _offset_from(reference, solution["t"], solution["lat"], solution["lon"])
-    return {
-        "t": solution["t"],
-        "north": north + solution["error_north"],
-        "east": east + solution["error_east"],
-    }
+    columns = [column[known] for column in limits or (np.full(len(t), np.nan),) * 3]
+    return error_statistics.ErrorSeries(np.round(t[known] * 1e9).astype(np.int64), error[known], *columns)
 
 
 # -- consistency -----------------------------------------------------------------------------------------
 
 
-def _normalized_errors(flight: Flight, reference: ReferenceTrack | None) -> list[NormalizedErrors]:
+def _normalized_errors(
+    flight: Flight, reference: ReferenceTrack | None, offset: dict[str, Floats]
+) -> list[NormalizedErrors]:
     fix, solution = flight.tables["Fix"], flight.tables["Solution"]
     found = []
     if len(fix["t"]):
@@ -268,9 +273,8 @@ def _normalized_errors(flight: Flight, reference: ReferenceTrack | None) -> list
                     fix["degrees_of_freedom"][redundant],
                 )
             )
-    if reference is not None and reference.what == TRUTH and len(solution["t"]):
-        north, east = _offset_from(reference, solution["t"], solution["lat"], solution["lon"])
-        value = _mahalanobis_squared(north, east, solution["nn"], solution["ne"], solution["ee"])
+    if reference is not None and reference.what == TRUTH and offset:
+        value = _mahalanobis_squared(**offset, **{name: solution[name] for name in ("nn", "ne", "ee")})
         known = np.isfinite(value)
         if known.any():
             two = np.full(int(known.sum()), 2.0)

@@ -25,6 +25,7 @@ SOURCES = (INS, GNSS, RSBN, CORRECTED, *FILTERS.values())
 USEFUL = 10.0  # a bound beyond so many times the claimed error is of no use
 LIMIT_M = 5000.0  # as `predictor.limit_m`
 PHASE_START_DELAY_NS = 1_000_000_000  # maximum delay from the validity of a fix to the phase it starts
+_NO_LIMITS = (math.nan, math.nan, math.nan)  # bound, claim and protection level
 _KINDS = ((GNSS, "GNSS"), (RSBN, "RSBN"))  # source, its word in the names of phases
 
 
@@ -65,27 +66,26 @@ class PhaseErrors(NamedTuple):
 
 
 class ErrorSeries(NamedTuple):
-    """Horizontal errors over a flight: times (ns), errors (m), bound and claimed r.m.s. error (m), NaN if
-    there is none.
+    """Horizontal errors over a flight: times (ns), errors (m); bound, claimed r.m.s. error and protection
+    level (m), NaN if there is none.
     """
 
     t_ns: npt.NDArray[np.int64]
     error: Floats
     bound: Floats
     claimed: Floats
+    protection: Floats
 
 
 def horizontal_errors(records: Iterable[Stamped], truth: TruthAt) -> dict[str, ErrorSeries]:
     """Return the horizontal error of every source against `truth`, which returns None where unknown."""
-    found: dict[str, list[tuple[int, float, float, float]]] = defaultdict(list)
+    found: dict[str, list[tuple[float, ...]]] = defaultdict(list)
 
-    def add(
-        source: str, t_ns: int, place: Geodetic, bound: float = math.nan, claimed: float = math.nan
-    ) -> None:
+    def add(source: str, t_ns: int, place: Geodetic, limits: tuple[float, float, float] = _NO_LIMITS) -> None:
         true = truth(t_ns)
         if true is not None:
             north, east, _ = separation(place, true)
-            found[source].append((t_ns, math.hypot(north, east), bound, claimed))
+            found[source].append((t_ns, math.hypot(north, east), *limits))
 
     last: Gnss | None = None
     for record in records:
@@ -93,7 +93,8 @@ def horizontal_errors(records: Iterable[Stamped], truth: TruthAt) -> dict[str, E
             bound = math.nan if record.bound_n is None else math.hypot(*record.bound_n)
             corrected = Geodetic(record.lat, record.lon, record.alt_msl)
             claimed = math.sqrt(record.covariance[0] + record.covariance[3])
-            add(CORRECTED, record.t_ns, corrected, bound, claimed)
+            protection = math.nan if record.protection is None else record.protection
+            add(CORRECTED, record.t_ns, corrected, (bound, claimed, protection))
             inertial = displace(*corrected, *record.error_n, 0.0)
             add(INS, record.t_ns, inertial)
             for p in record.parallel:

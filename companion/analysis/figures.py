@@ -187,9 +187,9 @@ def _inertial(axis: str) -> Callable[[_Axes], Figure]:
                 edge = np.where(without_fixes, estimated + sign * bound, np.nan)
                 if axes.alone and np.isfinite(edge).any():
                     lines.append(axes.line(name, "bound", which, s["t"], edge, dash=True, width=1.0))
-            if a.ins_error and a.reference:
-                against, t = f"{prefix}by {a.reference.what}", a.ins_error["t"]
-                lines.append(axes.line(against, "reference", which, t, a.ins_error[axis], width=2.2))
+            if a.offset and a.reference:
+                against, actual = f"{prefix}by {a.reference.what}", a.offset[axis] + estimated
+                lines.append(axes.line(against, "reference", which, s["t"], actual, width=2.2))
             lines.append(axes.line(f"{prefix}estimated", error_statistics.INS, which, s["t"], estimated))
         return axes.over_time(
             f"inertial_{axis}",

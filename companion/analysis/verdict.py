@@ -98,13 +98,12 @@ def _protection_broken(a: Assessment) -> Verdict | None:
 
     Not stated against GNSS, which may be rejected rightly, nor against a track that GNSS contradicts.
     """
-    if not a.ins_error or a.reference is None or a.reference.what == GNSS:
+    ours = a.errors.get(error_statistics.CORRECTED)
+    if ours is None or a.reference is None or a.reference.what == GNSS:
         return None
     if gnss_contradiction(a) is not None:
         return None
-    solution = a.flight.tables["Solution"]
-    off_north, off_east = (a.ins_error[d] - solution[f"error_{d}"] for d in ("north", "east"))
-    error, level = np.hypot(off_north, off_east), solution["protection"]
+    error, level = ours.error, ours.protection
     beyond = np.flatnonzero(error > level)  # False where one of them is not known
     if not len(beyond):
         return None
@@ -112,7 +111,7 @@ def _protection_broken(a: Assessment) -> Verdict | None:
     off = deviation(a) if a.against_truth else f"{deviation(a)} from {a.reference.what}"
     return Verdict(
         _promise(a),
-        f"The {off} exceeded the protection level at {format_time(solution['t'][k])}: "
+        f"The {off} exceeded the protection level at {format_time(ours.t_ns[k] * 1e-9)}: "
         f"{format_length(error[k])} against {format_length(level[k])}.",
         f"{error[k] / level[k]:.2f} ×",
         "the protection level (limit 1)",

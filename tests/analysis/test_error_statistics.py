@@ -127,7 +127,7 @@ def test_fix_that_starts_a_phase_is_not_counted_in_the_previous_one():
     second = 1_000_000_000
     t = np.arange(0, 20 * second, second // 2)
     t = t[t > 9 * second]  # the first is valid half a second before the phase that it starts
-    fixes = error_statistics.ErrorSeries(t, np.ones(len(t)), *np.full((2, len(t)), np.nan))
+    fixes = error_statistics.ErrorSeries(t, np.ones(len(t)), *np.full((3, len(t)), np.nan))
     phases = [
         error_statistics.FlightPhase("neither", 0, 10 * second),
         error_statistics.FlightPhase("GNSS only", 10 * second, 20 * second),
