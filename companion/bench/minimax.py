@@ -7,12 +7,17 @@ import numpy as np
 from scipy.optimize import linprog
 
 from companion.estimate.minimax import closed_form_tau
-from companion.estimate.minimax_lp import solve
+from companion.estimate.minimax_lp import Design, Minimax
 from companion.estimate.predictor import Step, Window, anchor
 from companion.estimate.schuler import schuler_row
 from companion.nav.bounded_channel import BoundedIns, Motion, UnitErrors
+from companion.units import Floats
 
 NAVIGATION = UnitErrors(4.8e-8, 18_000.0, 5.8e-7, 4.9e-4, 3600.0, 1e-3, 0.5, 1e-4, 9e-4)  # SI
+
+
+def _solve(rows: Floats, target: Floats, start: Minimax | None = None) -> Minimax:
+    return Design.of(rows, 1.0).minimax(target, start)
 
 
 def cases() -> Iterator[tuple[str, Callable[[], object]]]:
@@ -21,9 +26,8 @@ def cases() -> Iterator[tuple[str, Callable[[], object]]]:
     yield "minimax closed form, four targets", partial(closed_form_tau, 1.0, 0.5)
     for n in (1001, 8001):
         rows = schuler_row("gamma", 1.5 - np.linspace(0.0, 1.0, n))
-        start = solve(rows, target, 1.0).active
-        yield f"minimax exchange, {n} samples", partial(solve, rows, target, 1.0)
-        yield f"minimax exchange, {n} samples, warm", partial(solve, rows, target, 1.0, start)
+        yield f"minimax exchange, {n} samples", partial(_solve, rows, target)
+        yield f"minimax exchange, {n} samples, warm", partial(_solve, rows, target, _solve(rows, target))
         both = np.vstack([rows, -rows])  # dual form: ten times faster than the primal
         yield (
             f"minimax HiGHS, {n} samples",

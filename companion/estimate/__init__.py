@@ -52,7 +52,6 @@ from companion.estimate.fusion import (
     Position,
     Range,
     Unobservable,
-    convert_to_position,
     maximum_likelihood,
 )
 from companion.estimate.minimax import ClosedForm, Continuous, closed_form, closed_form_tau, continuous_tau
@@ -102,7 +101,6 @@ __all__ = [
     "closed_form",
     "closed_form_tau",
     "continuous_tau",
-    "convert_to_position",
     "forward_filter",
     "kalman",
     "maximum_likelihood",

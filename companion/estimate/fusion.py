@@ -35,7 +35,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from companion.estimate.initial_position import convert_to_position, find_crossings, mean_position
+from companion.estimate.initial_position import find_crossings, mean_position
 from companion.estimate.levenberg_marquardt import Minimum, NoFix, invert_information, minimize_cost
 from companion.estimate.observations import (
     Azimuth,
@@ -59,7 +59,6 @@ __all__ = [
     "Position",
     "Range",
     "Unobservable",
-    "convert_to_position",
     "maximum_likelihood",
 ]
 

@@ -2,8 +2,8 @@
 
 An azimuth is a ray from its beacon, a range a circle round it, seen from above at a height taken as known.
 Two of them intersect in no, one or two points; where they miss each other by the measurements' errors, a
-point near both is taken. Errors are weighed only in `convert_to_position`, and no intersection is an
-estimate: the directions of a distant beacon are turned to this frame, its tilt is left out.
+point near both is taken. Errors are not weighed, and no intersection is an estimate: the directions of a
+distant beacon are turned to this frame, its tilt is left out.
 """
 
 import math
@@ -18,44 +18,6 @@ from companion.units import Floats
 
 _ABOVE_BEACONS = 1000.0
 """Height above the highest beacon where nothing is known of the height, m."""
-
-
-def convert_to_position(azimuth: Azimuth, range_: Range, up: float = 0.0) -> Position:
-    """Convert one beacon's azimuth and range to a position with its correlated covariance.
-
-        x_P = x_b + d sin A,  y_P = y_b + d cos A,  d = sqrt(D^2 - up^2)
-        covariance = [[s_d^2 s^2 + d^2 s_A^2 c^2, (s_d^2 - d^2 s_A^2) s c], [., s_d^2 c^2 + d^2 s_A^2 s^2]]
-
-    DEPARTS FROM Lukinova, Podgorna, Rogozhin, "the channels x and y are independent": for these two they are
-    not. The azimuth's `axes` are not used.
-
-    Parameters
-    ----------
-    azimuth : Azimuth
-        Azimuth from the beacon.
-    range_ : Range
-        Slant range from the same beacon.
-    up : float
-        Height of the aircraft above the beacon, m, taken as exact.
-
-    Returns
-    -------
-    Position
-        Position (2,) of the aircraft, m.
-
-    Raises
-    ------
-    ValueError
-        If the range is not longer than `up`.
-    """
-    if not range_.value > abs(up):
-        raise ValueError(f"range {range_.value} m is not longer than the height {up} m over the beacon")
-    d = math.sqrt(range_.value**2 - up**2)
-    s, c = math.sin(azimuth.value), math.cos(azimuth.value)
-    vd, vt = (range_.sigma * range_.value / d) ** 2, (d * azimuth.sigma) ** 2
-    x_b = np.asarray(azimuth.beacon, dtype=float)[:2]
-    covariance = [[vd * s * s + vt * c * c, (vd - vt) * s * c], [(vd - vt) * s * c, vd * c * c + vt * s * s]]
-    return Position(x_b + d * np.array([s, c]), np.array(covariance))
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,7 +11,6 @@ This is the one implementation of the measurement update in `companion.estimate`
 `find_*_flaw` functions describe what is wrong with a number, the caller decides.
 """
 
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple, cast
 
@@ -300,69 +299,3 @@ def nees(error: Floats, P: Floats) -> Floats:
     inverse: Floats = np.linalg.pinv(rho, rcond=1e-12, hermitian=True)
     weight: Floats = (e * (inverse @ e[..., None])[..., 0]).sum(-1)
     return weight
-
-
-# Checks of the numbers
-
-
-@dataclass(frozen=True, slots=True)
-class InitialState:
-    """Validated initial state of a filter; ValueError names the flaw.
-
-    Attributes
-    ----------
-    t_ns : int
-        Time, ns.
-    x : (n,)
-        Mean.
-    P : (n, n)
-        Covariance; zero variances are allowed.
-    """
-
-    t_ns: int
-    x: Floats
-    P: Floats
-
-    def __post_init__(self) -> None:
-        if not np.isfinite(self.x).all():
-            raise ValueError("the initial state x is not finite: give every state a finite starting value")
-        if reason := find_covariance_flaw("P0", self.P, len(self.x)):
-            raise ValueError(reason)
-
-
-def find_covariance_flaw(name: str, P: Floats, n: int, *, definite: bool = False) -> str | None:
-    """Describe why P cannot be a covariance.
-
-    Parameters
-    ----------
-    name : str
-        Name of the matrix in the text.
-    P : array
-        Candidate, should be (n, n).
-    n : int
-        Number of variables.
-    definite : bool
-        Also forbid a zero eigenvalue.
-
-    Returns
-    -------
-    str or None
-        The reason, None if P is a covariance.
-    """
-    if P.shape != (n, n):
-        return f"covariance {name} has shape {P.shape}, it must be ({n}, {n})"
-    if not np.isfinite(P).all():
-        return f"covariance {name} is not finite: check the variances it is made of"
-    variance = np.diag(P)
-    if (variance < 0.0).any() or (definite and (variance == 0.0).any()):
-        wanted = "positive" if definite else "not negative"
-        return f"covariance {name} has variance {variance.min():.3g} on its diagonal, it must be {wanted}"
-    scale = np.sqrt(np.where(variance > 0.0, variance, 1.0))
-    rho = P / np.outer(scale, scale)
-    if np.abs(rho - rho.T).max(initial=0.0) > 1e-9:
-        return f"covariance {name} is not symmetric: build it as (P + P') / 2"
-    least = np.linalg.eigvalsh(rho)[0] if n else 1.0
-    if least < -1e-9 or (definite and least < 1e-14):
-        kind = "definite" if definite else "semidefinite"
-        return f"covariance {name} is not positive {kind} (least correlation eigenvalue {least:.3g})"
-    return None

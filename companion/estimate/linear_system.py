@@ -13,7 +13,6 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from companion.estimate import kalman
 from companion.units import Floats
 
 Arrays = Sequence[npt.ArrayLike]
@@ -86,8 +85,12 @@ def make_stages(
     lengths = [len(each) for each in (Phi, Gamma, D, H, R, z)]
     if len(set(lengths)) > 1 or not lengths[0]:
         raise ValueError(f"Phi, Gamma, D, H, R, z have {lengths} entries: give one of each for every step")
-    start = kalman.InitialState(0, np.atleast_1d(np.asarray(m, float)), np.atleast_2d(np.asarray(B, float)))
-    n = len(start.x)
+    mean, covariance = np.atleast_1d(np.asarray(m, float)), np.atleast_2d(np.asarray(B, float))
+    n = len(mean)
+    if not np.isfinite(mean).all():
+        raise ValueError("the initial state x is not finite: give every state a finite starting value")
+    if reason := find_covariance_flaw("P0", covariance, n):
+        raise ValueError(reason)
     stages = []
     for i, parts in enumerate(zip(Phi, Gamma, D, H, R, z, strict=True)):
         stage = _stage(n, *parts)
@@ -95,7 +98,7 @@ def make_stages(
         if flaw:
             raise ValueError(f"entry {i}: {flaw}")
         stages.append(stage)
-    return stages, start.x, start.P
+    return stages, mean, covariance
 
 
 def _stage(
@@ -126,5 +129,43 @@ def _find_flaw(stage: Stage, n: int) -> str | None:
         return f"H {stage.H.shape} does not fit z of {p} numbers and {n} states"
     if not all(np.isfinite(each).all() for each in stage):
         return "a number is not finite: leave the measurement out (z None) or correct the model"
-    noise = kalman.find_covariance_flaw("D", stage.D, q)
-    return noise or (kalman.find_covariance_flaw("R", stage.R, p, definite=True) if p else None)
+    noise = find_covariance_flaw("D", stage.D, q)
+    return noise or (find_covariance_flaw("R", stage.R, p, definite=True) if p else None)
+
+
+def find_covariance_flaw(name: str, P: Floats, n: int, *, definite: bool = False) -> str | None:
+    """Describe why P cannot be a covariance.
+
+    Parameters
+    ----------
+    name : str
+        Name of the matrix in the text.
+    P : array
+        Candidate, should be (n, n).
+    n : int
+        Number of variables.
+    definite : bool
+        Also forbid a zero eigenvalue.
+
+    Returns
+    -------
+    str or None
+        The reason, None if P is a covariance.
+    """
+    if P.shape != (n, n):
+        return f"covariance {name} has shape {P.shape}, it must be ({n}, {n})"
+    if not np.isfinite(P).all():
+        return f"covariance {name} is not finite: check the variances it is made of"
+    variance = np.diag(P)
+    if (variance < 0.0).any() or (definite and (variance == 0.0).any()):
+        wanted = "positive" if definite else "not negative"
+        return f"covariance {name} has variance {variance.min():.3g} on its diagonal, it must be {wanted}"
+    scale = np.sqrt(np.where(variance > 0.0, variance, 1.0))
+    rho = P / np.outer(scale, scale)
+    if np.abs(rho - rho.T).max(initial=0.0) > 1e-9:
+        return f"covariance {name} is not symmetric: build it as (P + P') / 2"
+    least = np.linalg.eigvalsh(rho)[0] if n else 1.0
+    if least < -1e-9 or (definite and least < 1e-14):
+        kind = "definite" if definite else "semidefinite"
+        return f"covariance {name} is not positive {kind} (least correlation eigenvalue {least:.3g})"
+    return None

@@ -31,7 +31,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from companion.estimate.minimax_lp import solve
+from companion.estimate.minimax_lp import Design
 from companion.estimate.schuler import MEAN_EARTH, STATE, Scale, schuler_row, transition
 from companion.estimate.schuler import sine_excess_scalar as u
 from companion.units import Floats
@@ -223,7 +223,7 @@ def continuous_tau(T: float, alpha: float, target: npt.ArrayLike, sigma: float =
     if -T <= alpha <= 0.0:
         x = np.union1d(x, h + alpha)  # inside the window a fix at that instant may be the optimum
     for _ in range(REMEZ_ROUNDS):
-        best = solve(schuler_row("gamma", -x), a_mid, sigma)
+        best = Design.of(schuler_row("gamma", -x), sigma).minimax(a_mid)
         used = np.flatnonzero(np.abs(best.weights) > 1e-12 * np.abs(best.weights).sum())
         times, weights = x[used] + h, best.weights[used]
         peaks = _extrema(x, best.dual)

@@ -27,7 +27,6 @@ target, so its optimal basis is nearly always that of the target too; the exchan
 Unobservable targets raise `Infeasible`. The optimum need not be unique, its value is.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, Self
 
@@ -92,66 +91,6 @@ class LeastSquares(NamedTuple):
     weights: Floats
     claimed: float
     worst: float
-
-
-def solve(
-    rows: npt.ArrayLike, target: npt.ArrayLike, sigmas: npt.ArrayLike, start: Sequence[int] | None = None
-) -> Minimax:
-    """Compute the minimax estimate of one target.
-
-    Parameters
-    ----------
-    rows : (n, m)
-        Measurement rows.
-    target : (m,)
-        Coefficients of the wanted combination of unknowns.
-    sigmas : (n,) or float
-        R.m.s. errors, one a row or one for all.
-    start : sequence of int, optional
-        `active` of a similar problem.
-
-    Returns
-    -------
-    Minimax
-        Weights, bound and certificate.
-
-    Raises
-    ------
-    Infeasible
-        If the rows do not determine the target.
-    ValueError
-        On wrong shapes, numbers that are not finite, or sigmas that are not positive.
-
-    References
-    ----------
-    Matasov, Martirosyan (1.9), (1.10).
-    """
-    return Design.of(rows, sigmas).minimax(target, start)
-
-
-def least_squares(rows: npt.ArrayLike, target: npt.ArrayLike, sigmas: npt.ArrayLike) -> LeastSquares:
-    """Compute the weighted least-squares estimate of one target.
-
-    Parameters
-    ----------
-    rows : (n, m)
-        Measurement rows.
-    target : (m,)
-        Coefficients of the wanted combination of unknowns.
-    sigmas : (n,) or float
-        R.m.s. errors, one a row or one for all.
-
-    Returns
-    -------
-    LeastSquares
-        Weights, claimed and worst error.
-
-    Raises
-    ------
-    Infeasible, ValueError
-        As in `solve`.
-    """
-    return Design.of(rows, sigmas).least_squares(target)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -296,7 +235,7 @@ class Design:
     def minimax(
         self,
         target: npt.ArrayLike,
-        start: Minimax | Sequence[int] | None = None,
+        start: Minimax | None = None,
         through: npt.ArrayLike | None = None,
         tolerance: float = LEVEL_TOLERANCE,
     ) -> Minimax:
@@ -306,8 +245,8 @@ class Design:
         ----------
         target : (m,)
             Coefficients of the wanted combination of unknowns.
-        start : Minimax or sequence of int, optional
-            Solution of a similar problem, or rows to start from, if they are a basis.
+        start : Minimax, optional
+            Solution of a similar problem.
         through : (p,), optional
             Effect g of unit inputs on the target; zero where not given.
         tolerance : float
@@ -317,6 +256,10 @@ class Design:
         -------
         Minimax
             Weights, bound and certificate.
+
+        References
+        ----------
+        Matasov, Martirosyan (1.9), (1.10).
         """
         a, a_q = self.in_coordinates(target)
         g = self._through(through) * self.bounds
@@ -388,16 +331,14 @@ class Design:
             whitened_weights / self.sigmas, float(np.linalg.norm(a_q)), float(np.abs(whitened_weights).sum())
         )
 
-    def _basis(self, start: Minimax | Sequence[int] | None) -> tuple[Indices, Indices]:
+    def _basis(self, start: Minimax | None) -> tuple[Indices, Indices]:
         """Choose independent rows: of `start`, else the extremal nodes of a window, else by pivoting."""
         rank, n = self.q.shape
         none = np.empty(0, dtype=np.intp)
-        if isinstance(start, Minimax):
+        if start is not None:
             rows, inputs = (np.asarray(k, dtype=np.intp) for k in (start.active, start.cancelled))
-        else:
-            rows, inputs = np.asarray([] if start is None else start, dtype=np.intp), none
-        if len(rows) == rank + len(inputs) and self._is_basis(rows, inputs):
-            return rows, inputs
+            if self._is_basis(rows, inputs):
+                return rows, inputs
         nodes = 0.5 * (1.0 - np.cos(np.pi * np.arange(rank) / max(rank - 1, 1)))
         rows = np.round(nodes * (n - 1)).astype(np.intp)
         if not self._is_basis(rows, none):

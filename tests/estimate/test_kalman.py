@@ -11,6 +11,7 @@ from scipy.linalg import block_diag
 from scipy.stats import chi2
 
 from companion.estimate import kalman, restrictive
+from companion.estimate.linear_system import find_covariance_flaw
 from companion.nav.error_model import paper_example
 from tests.estimate import full_horizon
 
@@ -156,12 +157,9 @@ def test_gate_is_chi_square():
         (np.eye(3), "shape"),
     ],
 )
-def test_initial_state_names_the_flaw_of_p0(P, message):
-    with pytest.raises(ValueError, match=message):
-        kalman.InitialState(0, np.zeros(2), P)
+def test_the_flaw_of_a_covariance_is_named(P, message):
+    assert message in find_covariance_flaw("P0", P, 2)
 
 
-def test_initial_state_accepts_exact_alignment_and_rejects_nan():
-    assert kalman.InitialState(0, np.zeros(2), np.zeros((2, 2))).t_ns == 0
-    with pytest.raises(ValueError, match="not finite"):
-        kalman.InitialState(0, np.array([0.0, np.nan]), np.eye(2))
+def test_exact_alignment_is_a_covariance():
+    assert find_covariance_flaw("P0", np.zeros((2, 2)), 2) is None

@@ -14,7 +14,7 @@ from scipy.linalg import expm
 from scipy.optimize import linprog
 
 from companion.estimate.minimax import closed_form, closed_form_tau, continuous_tau
-from companion.estimate.minimax_lp import Infeasible, least_squares, solve
+from companion.estimate.minimax_lp import Design, Infeasible, LeastSquares, Minimax
 from companion.estimate.schuler import (
     ARCSECOND,
     DEG_PER_HOUR,
@@ -28,6 +28,14 @@ from companion.estimate.schuler import (
 REFERENCE = json.loads((Path(__file__).parents[1] / "data" / "minimax.json").read_text())
 REFERENCE_DIGITS = 1e-12
 UNITS = np.eye(4)
+
+
+def solve(rows, target, sigmas, start: Minimax | None = None) -> Minimax:
+    return Design.of(rows, sigmas).minimax(target, start)
+
+
+def least_squares(rows, target, sigmas) -> LeastSquares:
+    return Design.of(rows, sigmas).least_squares(target)
 
 
 def worst_case_rms(weights: np.ndarray, sigmas: np.ndarray | float) -> float:
@@ -241,7 +249,7 @@ def test_exchange_equals_a_linear_programme(problem):
     assert result.bound == pytest.approx(reference.fun, rel=1e-8, abs=1e-12)
     if result.bound:
         proved(result, *scaled, sigmas)
-    again = solve(*scaled, sigmas, start=result.active)
+    again = solve(*scaled, sigmas, start=result)
     assert again.bound == pytest.approx(result.bound, rel=1e-11)
 
 
@@ -300,7 +308,8 @@ def test_every_window_has_a_certificate(exponent, ahead, seed, k):
 def test_bad_start_does_not_change_the_result():
     rows = schuler_row("gamma", 1.5 - np.linspace(0, 1, 101))
     good = solve(rows, UNITS[0], 1.0)
-    for start in ([], [0, 0, 0, 0], [0, 1, 2, 3], [-1, 5, 7, 9], [5, 50, 99, 101], [1, 2, 3]):
+    for rows_of_start in ((), (0, 0, 0, 0), (0, 1, 2, 3), (-1, 5, 7, 9), (5, 50, 99, 101), (1, 2, 3)):
+        start = good._replace(active=rows_of_start)
         assert solve(rows, UNITS[0], 1.0, start).bound == pytest.approx(good.bound, rel=1e-12)
     assert solve(rows, np.zeros(4), 1.0).bound == 0.0
 

@@ -236,6 +236,7 @@ def test_memory_grows_as_the_length(solve: Any) -> None:
         ({4: [0.0] * 10}, "entry 0: covariance R has variance 0"),
         ({2: [-1.0] * 10}, "entry 0: covariance D has variance -1"),
         ({5: [math.nan] * 10}, "entry 0: a number is not finite"),
+        ({6: [math.nan, 0.0]}, "initial state x is not finite"),
         ({7: [[1.0, 2.0], [2.0, 1.0]]}, "P0 is not positive semidefinite"),
     ],
 )
