@@ -1,10 +1,9 @@
 """Strapdown reckoning: accelerometers turned by the autopilot's attitude, an inertial channel of our own.
 
-Specific force is turned to the level frame, gravity and Coriolis are added, and it is integrated over the
-earth (`nav.strapdown`), from the first fix on. The attitude is the autopilot's; the gyros carry it from one
-sample to the next of the IMU. No position and no velocity of the autopilot's comes in. Heights are pressure
-altitudes, as with air data: the vertical channel is unstable alone. What the attitude's error makes of it is
-in `tilterror`.
+Specific force is turned to the level frame and gravity is added; `own_channel` integrates it over the earth,
+from the first fix on. The attitude is the autopilot's; the gyros carry it from one sample to the next of the
+IMU. No position and no velocity of the autopilot's comes in. Heights are pressure altitudes, as with air
+data: the vertical channel is unstable alone. What the attitude's error makes of it is in `own_error_model`.
 
 It needs the IMU at `IMU_HZ` and the attitude at `ATTITUDE_HZ` or more, and says what it does not get. A
 sample at the end of an accelerometer's or gyro's range is not used, and none is while the vertical force,
