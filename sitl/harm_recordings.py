@@ -139,7 +139,7 @@ def fly_log(records: Iterable[Stamped], config: Config) -> RecordingLog:
         log.record(record)
         if isinstance(record, Gnss):
             switch.receive(record)
-        for output in navigator.handle(record):  # type: ignore[arg-type]
+        for output in navigator.handle(record):
             log.record(output)
             if isinstance(output, Solution):
                 switch.note_output(output, True, output.rx_ns)

@@ -49,7 +49,7 @@ def fly(world: World, channel: str, scheme: Any) -> SchemeFlight:
     fixes: list[Fix] = []
     rejected = 0
     for record in world.records(CHANNELS[channel]):
-        for output in navigator.handle(record):  # type: ignore[arg-type]
+        for output in navigator.handle(record):
             if isinstance(output, Solution):
                 solutions.append(output)
             elif isinstance(output, Fix):

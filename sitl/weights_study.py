@@ -85,10 +85,7 @@ def navigate(records: Iterable[Stamped], config: Config, bank: bool) -> list[Sol
     """Return the solutions of the bank of hypotheses, or without `bank` of a single Kalman filter."""
     navigator = Navigator(config, None if bank else Model(config, plain=0))
     return [
-        output
-        for record in records
-        for output in navigator.handle(record)  # type: ignore[arg-type]
-        if isinstance(output, Solution)
+        output for record in records for output in navigator.handle(record) if isinstance(output, Solution)
     ]
 
 

@@ -126,5 +126,5 @@ def _run_navigator(
             sensors.add(sensor)
         yield flight_log.topic_of_input(record), record
         if isinstance(record, INPUTS):
-            for output in navigator.handle(record):  # type: ignore[arg-type]
+            for output in navigator.handle(record):
                 yield flight_log.topic_of(type(output)), output

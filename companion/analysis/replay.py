@@ -126,7 +126,7 @@ def replay_own(path: Path, config: Config, sink: Any = None) -> ReplayResult:
             count.input(entry.value)
             if sink is not None:
                 sink.record(entry.value)
-            ours += navigator.handle(entry.value)  # type: ignore[arg-type]
+            ours += navigator.handle(entry.value)
             for output in ours:
                 count.output(output)
                 if sink is not None:
@@ -145,7 +145,7 @@ def replay_foreign(records: Iterable[Stamped], config: Config, sink: Any) -> Rep
         count.record(record)
         if isinstance(record, INPUTS):
             count.input(record)
-            for output in navigator.handle(record):  # type: ignore[arg-type]
+            for output in navigator.handle(record):
                 count.output(output)
                 sink.record(output)
     return count.result()

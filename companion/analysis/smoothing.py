@@ -158,7 +158,7 @@ class _Witness(Navigator):
         self._last: list[tuple[Bank, Hypotheses] | None] = [None]  # of each run
         self._open: dict[str, int] = {}
 
-    def handle(self, record: Input) -> list[Output]:
+    def handle(self, record: Stamped) -> list[Output]:
         """Return the outputs of one more record."""
         outputs = super().handle(record)
         if isinstance(record, Tuning):
@@ -297,7 +297,7 @@ def _forward_pass(records: Iterable[Stamped], config: Config) -> _Path:
     """Filter the records by one plain path, and return it with the epochs of each run."""
     witness = _Witness(config)
     for record in sorted((r for r in records if isinstance(r, INPUTS_USED)), key=lambda r: r.t_ns):
-        witness.handle(record)  # type: ignore[arg-type]
+        witness.handle(record)
     witness.end()
     path, run = _Path(config, witness), -1
     for t_ns, record, number in witness.folded:

@@ -42,6 +42,7 @@ from companion.records import (
     RsbnFix,
     Severity,
     Solution,
+    Stamped,
     Tuning,
 )
 from companion.units import SECOND_NS
@@ -125,12 +126,12 @@ class Navigator:
         """The settings in force."""
         return self._settings
 
-    def handle(self, record: Input) -> list[Output]:
-        """Return the outputs of one more record."""
+    def handle(self, record: Stamped) -> list[Output]:
+        """Return the outputs of one more record; there are none of a kind that is not used."""
         if isinstance(record, Tuning):
             self._tune(record)
             return []
-        if type(record) not in self._uses:
+        if not self._is_used(record):
             return []
         if not self._channel_reported:
             self._channel_reported = True
@@ -199,6 +200,9 @@ class Navigator:
         self._roll_back_ns = 0
         while self._newest is not None and (self._waiting or self._roll_back is not None):
             self._deferred += self._fold_again(self._newest)
+
+    def _is_used(self, record: Stamped) -> TypeGuard[Input]:
+        return type(record) in self._uses
 
     def _is_wanted(self, record: Gnss) -> bool:
         """Whether a fix is new, and would be used: most are late, and each costs a roll-back.

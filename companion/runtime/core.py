@@ -472,7 +472,7 @@ class CompanionCore:
         self._log.record(record)
         for event in self._origin.receive(record):
             self._emit(event, "/link/Event")
-        for output in self._navigator.handle(record):  # type: ignore[arg-type]
+        for output in self._navigator.handle(record):
             if isinstance(output, Solution):
                 self._send(output, early=isinstance(record, RsbnFix))
             elif isinstance(output, Reset) and isinstance(record, LocalPosition):

@@ -121,7 +121,7 @@ def companion_errors(
     navigator, i = Navigator(config), 0
     for start in starts:
         while i < len(records) and records[i].rx_ns <= start:
-            navigator.handle(records[i])  # type: ignore[arg-type]
+            navigator.handle(records[i])
             i += 1
         alone, found = copy.deepcopy(navigator), dict[float, tuple[float, float, float, float]]()
         end = start + (max(lasting) + 1.0) * SECOND_NS
@@ -130,7 +130,7 @@ def companion_errors(
                 break
             if isinstance(record, Gnss):
                 continue
-            for out in alone.handle(record):  # type: ignore[arg-type]
+            for out in alone.handle(record):
                 if not isinstance(out, Solution):
                     continue
                 for seconds in lasting:

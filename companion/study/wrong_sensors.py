@@ -119,7 +119,7 @@ def fly(wrong: str, records: Sequence[Stamped], fixes: Fixes, config: Config) ->
     """
     navigator, farthest, suspect_ns, excluded_ns, last_ns = Navigator(config), 0.0, 0, 0, 0
     for record in sorted(records, key=lambda record: record.rx_ns):
-        for out in navigator.handle(record):  # type: ignore[arg-type]
+        for out in navigator.handle(record):
             if not isinstance(out, Solution) or out.t_ns < fixes.t_ns[0] + SETTLED_S * SECOND_NS:
                 continue
             passed = min(out.t_ns - (last_ns or out.t_ns), SECOND_NS)

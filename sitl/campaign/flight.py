@@ -293,7 +293,7 @@ def fly_records(scenario: Scenario, config: Config) -> tuple[World, list[Stamped
     world, navigator = World(scenario), Navigator(config)
     outputs: list[Stamped] = []
     for record in world.records(sensors_of(config)):
-        outputs += navigator.handle(record)  # type: ignore[arg-type]
+        outputs += navigator.handle(record)
         navigator.settle()
     return world, outputs
 

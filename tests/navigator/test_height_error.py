@@ -168,7 +168,7 @@ def flown_level(
             sight = slant_range_azimuth(BEACON, at)
             sigmas = math.radians(0.125), 100.0
             records.append(RsbnFix(t_ns, t_ns, 7, *BEACON, sight.azimuth, sight.slant_range, *sigmas))
-        for out in (out for record in records for out in navigator.handle(record)):  # type: ignore[arg-type]
+        for out in (out for record in records for out in navigator.handle(record)):
             if isinstance(out, Solution):
                 off.append(out.alt_msl - true)
             elif isinstance(out, Rejection):

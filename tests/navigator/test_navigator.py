@@ -741,7 +741,7 @@ def test_truth_reaches_nothing() -> None:
     navigator.handle(origin())
     truth = Truth(NS, NS, *ORIGIN, (0.0, 0.0, 0.0))
     before = navigator.state
-    assert navigator.handle(truth) == []  # type: ignore[arg-type]
+    assert navigator.handle(truth) == []
     assert navigator.state is before
 
 
