@@ -165,7 +165,7 @@ class SimulatedAutopilot:
                 if name in RECORDED_MESSAGES:
                     self.outputs.append((now_ns, message := dialect.decode(found)))
                     if self.estimate is not None and name in LOCAL_MESSAGES:
-                        self.estimate.receive(message, self._origin_record(t), t)
+                        self.estimate.receive(message, self.origin_record(t), t)
                 elif name in self._commands:
                     message = dialect.decode(found)
                     if getattr(message, "target_system", 0) in (0, SYSTEM):
@@ -340,9 +340,10 @@ class SimulatedAutopilot:
         return encode(record, self._sender)
 
     def _origin(self, t: int) -> Any:
-        return encode(self._origin_record(t), self._sender)
+        return encode(self.origin_record(t), self._sender)
 
-    def _origin_record(self, t: int) -> LocalOrigin:
+    def origin_record(self, t: int) -> LocalOrigin:
+        """Return the origin of the local position."""
         lat, lon, alt = self._local_origin
         return LocalOrigin(t, t, lat, lon, alt - self.scenario.geoid_height)
 
@@ -426,7 +427,7 @@ class SimulatedAutopilot:
         elif command == mavlink.MAV_CMD_SET_EKF_SOURCE_SET:
             result = mavlink.MAV_RESULT_ACCEPTED
             if self.estimate is not None:
-                self.estimate.receive(message, self._origin_record(t), t)
+                self.estimate.receive(message, self.origin_record(t), t)
         elif (
             command == mavlink.MAV_CMD_EXTERNAL_POSITION_ESTIMATE
             and dialect.id_of(message) == mavlink.MAVLINK_MSG_ID_COMMAND_INT

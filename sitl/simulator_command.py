@@ -11,18 +11,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from typing import Any
 
 import click
 import numpy as np
 
 from companion.link.clock import BootClock
-from companion.nav.geometry import Geodetic, local_to_geodetic, separation
+from companion.nav.geometry import Geodetic
 from companion.option_types import FloatRange
 from companion.transport.address import Address
 from companion.units import SECOND_NS
 from sitl.autopilot import SimulatedAutopilot
 from sitl.bridge_command import command as bridge
+from sitl.positions import position_of
 from sitl.real_time import RealTimeRunner, parse_address
 from sitl.scenarios import SCENARIOS, Scenario, SchedulePhase, parse_scenario
 from sitl.tlog_player import command as play
@@ -55,9 +55,11 @@ class PositionScore:
             if name == "NAVIGATION_STATUS":
                 self._bound = message.bound_horizontal
             elif name in ("GLOBAL_POSITION_SENSOR", "ODOMETRY"):
-                stamp = message.time_usec * 1000
-                self._clock.update(stamp, at_ns)
-                self._errors.append(self._error(self._place(message), self._clock.local(stamp, at_ns)))
+                origin, make = self._autopilot.origin_record(at_ns), self._autopilot.scenario.autopilot
+                if (reported := position_of(message, origin, make)) is not None:
+                    stamp = reported.stamp_ns
+                    self._clock.update(stamp, at_ns)
+                    self._errors.append(self._error(reported.place, self._clock.local(stamp, at_ns)))
         self._autopilot.outputs.clear()
         if self._received_ns is not None and now_ns - self._received_ns > SILENT_AFTER:
             self._received_ns = None
@@ -75,21 +77,9 @@ class PositionScore:
             f"{len(errors)} positions received, error {rms:.1f} m r.m.s., {max(errors):.1f} m at most{bound}"
         )
 
-    def _place(self, message: Any) -> tuple[float, float]:
-        """Latitude and longitude of a message, rad."""
-        if message.get_type() == "GLOBAL_POSITION_SENSOR":
-            return math.radians(message.lat * 1e-7), math.radians(message.lon * 1e-7)
-        x_n = np.array([message.x, message.y, 0.0])
-        projection = self._autopilot.scenario.autopilot
-        lat, lon, _ = local_to_geodetic(projection, self._autopilot.world.origin, x_n)
-        return lat, lon
-
-    def _error(self, place: tuple[float, float], t_ns: int) -> float:
-        lat, lon = place
-        flight = self._autopilot.world.truth_at(np.array([max(t_ns, 0) * 1e-9]))
-        true = Geodetic(float(flight.lat[0]), float(flight.lon[0]), float(flight.alt[0]))
-        north, east, _ = separation(Geodetic(lat, lon, true.alt), true)
-        return math.hypot(north, east)
+    def _error(self, place: Geodetic, t_ns: int) -> float:
+        at = np.array([[max(t_ns, 0) * 1e-9], [place.lat], [place.lon]])
+        return float(np.hypot(*self._autopilot.world.errors_at(*at)[0]))
 
 
 class SimulatorRunner(RealTimeRunner):
