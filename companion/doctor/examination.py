@@ -36,17 +36,11 @@ from companion.link.decode import MAKES, MULTIROTORS, has_airspeed_sensor
 from companion.link.dialect import mavlink, rsbn
 from companion.link.firmware import firmware_of
 from companion.link.parameter_client import Answer, ParameterClient, encoding_of, equal_real32
-from companion.link.session import (
-    LinkUp,
-    MessageReceived,
-    NotUnderstood,
-    SecondAutopilot,
-    Session,
-)
+from companion.link.session import LinkUp, MessageReceived, NotUnderstood, SecondAutopilot
 from companion.link.signing import Signing
 from companion.output.source_switch import selected
 from companion.printable import printable
-from companion.runtime.links import requested_rates
+from companion.runtime.links import open_session
 from companion.units import SECOND_NS
 
 REQUEST_INTERVAL = 1 * SECOND_NS
@@ -67,12 +61,7 @@ class Examination:
 
     def __init__(self, config: Config, signing: Signing | None = None) -> None:
         self._config = config
-        self.session = Session(
-            component=config.link.component_id,
-            autopilot_system=config.link.system_id or None,
-            rates_hz=requested_rates(config),
-            signing=signing,
-        )
+        self.session = open_session(config, signing)
         self.bad = 0  # chunks of bytes that are not frames
         self._reader = frame.Reader()  # for frames with our own id, which the session drops
         self._sent: set[bytes] = set()

@@ -27,13 +27,7 @@ class Link:
 
     def __init__(self, name: str, config: Config, number: int, signing: Signing | None) -> None:
         self.name = name
-        self.session = Session(
-            component=config.link.component_id,
-            autopilot_system=config.link.system_id or None,
-            rates_hz=requested_rates(config),
-            signing=signing,
-            link_id=number,
-        )
+        self.session = open_session(config, signing, number)
         self.sender = Sender(self.session.clock)
         self.pace = Pace()  # of what was asked for on this link
         self.has_bytes = False  # anything was received, MAVLink or not
@@ -62,6 +56,17 @@ class Link:
     def received(self) -> int:
         """Frames received from all senders of this link."""
         return self.session.reader.received
+
+
+def open_session(config: Config, signing: Signing | None, number: int = 0) -> Session:
+    """Open the session of a link, by its number: with the ids and the rates of the configuration."""
+    return Session(
+        component=config.link.component_id,
+        autopilot_system=config.link.system_id or None,
+        rates_hz=requested_rates(config),
+        signing=signing,
+        link_id=number,
+    )
 
 
 def requested_rates(config: Config) -> dict[str, float]:
