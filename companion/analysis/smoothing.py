@@ -34,6 +34,7 @@ from companion.analysis.gusts import Gusts, GustSamples
 from companion.config import Config, parse
 from companion.estimate import bank as banks
 from companion.estimate.bank import Bank
+from companion.estimate.linear_system import LinearSystem
 from companion.estimate.smoother import rts_backward, two_point
 from companion.nav.geometry import displace
 from companion.navigator import (
@@ -561,7 +562,7 @@ def _apart(run: SmoothedRun, epochs: list[_Epoch]) -> float:
             each.append(value)
     later = epochs[1:]
     Phi, Q = [e.Phi for e in later], [e.Q for e in later]
-    found = two_point(Phi, [np.eye(n)] * len(later), Q, H, R, z, epochs[0].x, epochs[0].P)
+    found = two_point(LinearSystem.of(Phi, [np.eye(n)] * len(later), Q, H, R, z, epochs[0].x, epochs[0].P))
     distance = np.abs(found.x + np.array(offsets) - run.x)[:, :2]
     return float((distance / np.sqrt(np.einsum("ijj->ij", found.P[:, :2, :2]))).max())
 

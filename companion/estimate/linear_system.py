@@ -8,7 +8,7 @@ It does not solve anything: see `smoother`.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -51,54 +51,74 @@ class Stage(NamedTuple):
         return self.Gamma @ self.D @ self.Gamma.T
 
 
-def make_stages(
-    Phi: Arrays,
-    Gamma: Arrays,
-    D: Arrays,
-    H: OptionalArrays,
-    R: OptionalArrays,
-    z: OptionalArrays,
-    m: npt.ArrayLike,
-    B: npt.ArrayLike,
-) -> tuple[list[Stage], Floats, Floats]:
-    """Convert lists of matrices to stages and validate them.
+class LinearSystem(NamedTuple):
+    """A system that was checked.
 
-    Parameters
+    Attributes
     ----------
-    Phi, Gamma, D : sequences of N arrays
-        Transition (n, n), influence (n, q_i) and covariance (q_i, q_i) of each stage.
-    H, R, z : sequences of N arrays or None
-        Measurement of x_{i+1}: (p_i, n), (p_i, p_i), (p_i,); None or no rows for no measurement.
+    stages : list of Stage
+        Its N stages.
     m, B : (n,), (n, n)
         Mean and covariance of x_0.
-
-    Returns
-    -------
-    tuple
-        Stages, m and B as float arrays.
-
-    Raises
-    ------
-    ValueError
-        Names the entry that does not fit.
     """
-    lengths = [len(each) for each in (Phi, Gamma, D, H, R, z)]
-    if len(set(lengths)) > 1 or not lengths[0]:
-        raise ValueError(f"Phi, Gamma, D, H, R, z have {lengths} entries: give one of each for every step")
-    mean, covariance = np.atleast_1d(np.asarray(m, float)), np.atleast_2d(np.asarray(B, float))
-    n = len(mean)
-    if not np.isfinite(mean).all():
-        raise ValueError("the initial state x is not finite: give every state a finite starting value")
-    if reason := find_covariance_flaw("P0", covariance, n):
-        raise ValueError(reason)
-    stages = []
-    for i, parts in enumerate(zip(Phi, Gamma, D, H, R, z, strict=True)):
-        stage = _stage(n, *parts)
-        flaw = _find_flaw(stage, n)
-        if flaw:
-            raise ValueError(f"entry {i}: {flaw}")
-        stages.append(stage)
-    return stages, mean, covariance
+
+    stages: list[Stage]
+    m: Floats
+    B: Floats
+
+    @classmethod
+    def of(
+        cls,
+        Phi: Arrays,
+        Gamma: Arrays,
+        D: Arrays,
+        H: OptionalArrays,
+        R: OptionalArrays,
+        z: OptionalArrays,
+        m: npt.ArrayLike,
+        B: npt.ArrayLike,
+    ) -> Self:
+        """Make a system of lists of matrices.
+
+        Dimensions may differ from stage to stage; D and B may be singular, R not.
+
+        Parameters
+        ----------
+        Phi, Gamma, D : sequences of N arrays
+            Transition (n, n), influence (n, q_i) and covariance (q_i, q_i) of the disturbance of each stage.
+        H, R, z : sequences of N arrays or None
+            Measurement of x_{i+1}: (p_i, n), (p_i, p_i), (p_i,); None or no rows for no measurement.
+        m, B : (n,), (n, n)
+            Mean and covariance of x_0.
+
+        Returns
+        -------
+        LinearSystem
+            Stages, m and B as float arrays.
+
+        Raises
+        ------
+        ValueError
+            Names the entry that does not fit.
+        """
+        lengths = [len(each) for each in (Phi, Gamma, D, H, R, z)]
+        if len(set(lengths)) > 1 or not lengths[0]:
+            raise ValueError(
+                f"Phi, Gamma, D, H, R, z have {lengths} entries: give one of each for every step"
+            )
+        mean, covariance = np.atleast_1d(np.asarray(m, float)), np.atleast_2d(np.asarray(B, float))
+        n = len(mean)
+        if not np.isfinite(mean).all():
+            raise ValueError("the initial state x is not finite: give every state a finite starting value")
+        if reason := find_covariance_flaw("P0", covariance, n):
+            raise ValueError(reason)
+        stages = []
+        for i, parts in enumerate(zip(Phi, Gamma, D, H, R, z, strict=True)):
+            stage = _stage(n, *parts)
+            if flaw := _find_flaw(stage, n):
+                raise ValueError(f"entry {i}: {flaw}")
+            stages.append(stage)
+        return cls(stages, mean, covariance)
 
 
 def _stage(

@@ -9,7 +9,7 @@ After Brandin et al., section 6.4, which ends in the two-point boundary problem
     x_{i+1} = Phi_i x_i + Gamma_i D_i Gamma_i' s_i                                          (6.4.12)
     s_i     = Phi_{i+1}' s_{i+1} + H_{i+1}' R_{i+1}^-1 (z_{i+1} - H_{i+1} x_{i+1}),   s_N = 0
 
-and theta_i = D_i Gamma_i' s_i (6.4.11). Two algorithms solve it, and agree:
+where theta_i = D_i Gamma_i' s_i (6.4.11). Two algorithms solve it, and agree:
 
     rts        a Kalman filter forward, then a pass backward
     two_point  the sparse linear system itself (`two_point_bvp`)
@@ -20,9 +20,7 @@ updates are nonlinear or gated.
 DEPARTS FROM section 6.4: "shooting" s forward by Phi^-T is not offered. It multiplies rounding by the
 growth of the unstable adjoint: 1e8 after 120 steps of the smallest example.
 
-The lists Phi, Gamma, D, H, R, z have N entries each; the i-th H, R, z are those of x_{i+1}. Dimensions may
-differ from epoch to epoch; an H of no rows (or z None) is an epoch without measurement. D and B may be
-singular, R not. Memory and time grow as N. It does not know what the states mean and rejects no z.
+Memory and time grow as N. It does not know what the states mean and rejects no z.
 """
 
 from __future__ import annotations
@@ -31,10 +29,9 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from companion.estimate import kalman, two_point_bvp
-from companion.estimate.linear_system import Arrays, OptionalArrays, Stage, make_stages
+from companion.estimate.linear_system import LinearSystem
 from companion.units import Floats
 
 
@@ -49,17 +46,11 @@ class Smoothed(NamedTuple):
         Their covariances.
     s : (N, n)
         Multipliers of (6.4.12).
-    theta : N arrays (q_i,)
-        Disturbances.
-    theta_P : N arrays (q_i, q_i)
-        Their covariances.
     """
 
     x: Floats
     P: Floats
     s: Floats
-    theta: tuple[Floats, ...]
-    theta_P: tuple[Floats, ...]
 
 
 class Trajectory(NamedTuple):
@@ -77,16 +68,7 @@ class Trajectory(NamedTuple):
     P: Floats
 
 
-def rts(
-    Phi: Arrays,
-    Gamma: Arrays,
-    D: Arrays,
-    H: OptionalArrays,
-    R: OptionalArrays,
-    z: OptionalArrays,
-    m: npt.ArrayLike,
-    B: npt.ArrayLike,
-) -> Smoothed:
+def rts(system: LinearSystem) -> Smoothed:
     """Smooth a linear Gaussian system by a filter forward and a pass backward over its innovations nu.
 
     Backward in the multipliers s (Bryson and Frazier, 1963) and the information M of the later measurements,
@@ -101,51 +83,37 @@ def rts(
 
     Parameters
     ----------
-    Phi, Gamma, D : sequences of N arrays
-        Transition (n, n), influence (n, q_i) and covariance (q_i, q_i) of the disturbance of each stage.
-    H, R, z : sequences of N arrays or None
-        Measurement of x_{i+1}: (p_i, n), (p_i, p_i), (p_i,).
-    m, B : (n,), (n, n)
-        Mean and covariance of x_0.
+    system : LinearSystem
+        The system and its measurements.
 
     Returns
     -------
     Smoothed
         Most likely trajectory.
 
-    Raises
-    ------
-    ValueError
-        Names the entry that does not fit.
-
     References
     ----------
     Brandin et al. (6.4.5)-(6.4.12); Bryson, Frazier (1963).
     """
-    stages, m, B = make_stages(Phi, Gamma, D, H, R, z, m, B)
-    N, n = len(stages), len(m)
-    x, P = _filter(stages, m, B)
-    scale = _state_scale(stages, B)
-    s = np.zeros((N, n))
-    theta, theta_P = [m] * N, [B] * N
+    n = len(system.m)
+    x, P = forward_filter(system)
+    scale = _state_scale(system)
+    s = np.zeros((len(system.stages), n))
     back, M = np.zeros(n), np.zeros((n, n))  # Phi' s and the information of the later stages
-    for i in range(N - 1, -1, -1):
-        stage = stages[i]
-        predicted = kalman.predict(x[i], P[i], stage.Phi, stage.Q)
+    for i, stage in reversed(list(enumerate(system.stages))):
         s[i] = back
         x[i + 1] += P[i + 1] @ back
         P[i + 1] = _reduce(P[i + 1], M, scale)
         if len(stage.z):
+            predicted = kalman.predict(x[i], P[i], stage.Phi, stage.Q)
             G = kalman.gain(predicted.P, stage.H, stage.R)
             nu = stage.z - stage.H @ predicted.x
             s[i] = back + stage.H.T @ (G.S_inverse @ nu - G.K.T @ back)
             M = M + stage.H.T @ np.linalg.solve(stage.R, stage.H)
-        L = _reduce(M, predicted.P, 1.0 / scale)
-        theta[i], theta_P[i] = _disturbance(stage, s[i], L)
         back, M = stage.Phi.T @ s[i], stage.Phi.T @ _reduce(M, stage.Q, 1.0 / scale) @ stage.Phi
     x[0] += P[0] @ back
     P[0] = _reduce(P[0], M, scale)
-    return Smoothed(x, P, s, tuple(theta), tuple(theta_P))
+    return Smoothed(x, P, s)
 
 
 def rts_backward(
@@ -190,47 +158,30 @@ def rts_backward(
     return Trajectory(x, P)
 
 
-def forward_filter(
-    Phi: Arrays,
-    Gamma: Arrays,
-    D: Arrays,
-    H: OptionalArrays,
-    R: OptionalArrays,
-    z: OptionalArrays,
-    m: npt.ArrayLike,
-    B: npt.ArrayLike,
-) -> Trajectory:
+def forward_filter(system: LinearSystem) -> Trajectory:
     """Run the Kalman filter of `rts` alone: the estimate available at each epoch in flight.
 
     Parameters
     ----------
-    Phi, Gamma, D, H, R, z, m, B
-        As in `rts`.
+    system : LinearSystem
+        The system and its measurements.
 
     Returns
     -------
     Trajectory
         States given the measurements up to each epoch; the first is the prior.
-
-    Raises
-    ------
-    ValueError
-        Names the entry that does not fit.
     """
-    stages, m, B = make_stages(Phi, Gamma, D, H, R, z, m, B)
-    return _filter(stages, m, B)
+    N, n = len(system.stages), len(system.m)
+    x, P = np.zeros((N + 1, n)), np.zeros((N + 1, n, n))
+    x[0], P[0] = system.m, system.B
+    for i, stage in enumerate(system.stages):
+        x[i + 1], P[i + 1] = kalman.predict(x[i], P[i], stage.Phi, stage.Q)
+        if len(stage.z):
+            x[i + 1], P[i + 1] = kalman.update(x[i + 1], P[i + 1], stage.z, stage.H, stage.R)[:2]
+    return Trajectory(x, P)
 
 
-def two_point(
-    Phi: Arrays,
-    Gamma: Arrays,
-    D: Arrays,
-    H: OptionalArrays,
-    R: OptionalArrays,
-    z: OptionalArrays,
-    m: npt.ArrayLike,
-    B: npt.ArrayLike,
-) -> Smoothed:
+def two_point(system: LinearSystem) -> Smoothed:
     """Smooth a linear Gaussian system by solving (6.4.12), a symmetric block-tridiagonal system.
 
     Nothing is filtered. The unknowns of block i are s_{i-1} and x_i; its inverse holds the covariances of x_i
@@ -238,26 +189,20 @@ def two_point(
 
     Parameters
     ----------
-    Phi, Gamma, D, H, R, z, m, B
-        As in `rts`.
+    system : LinearSystem
+        The system and its measurements.
 
     Returns
     -------
     Smoothed
         Most likely trajectory.
 
-    Raises
-    ------
-    ValueError
-        Names the entry that does not fit.
-
     References
     ----------
     Brandin et al. (6.4.12).
     """
-    stages, m, B = make_stages(Phi, Gamma, D, H, R, z, m, B)
-    N, n = len(stages), len(m)
-    scale = _state_scale(stages, B)
+    (stages, m, B), N, n = system, len(system.stages), len(system.m)
+    scale = _state_scale(system)
     outer = np.outer(scale, scale)
     one = np.eye(n)
     diagonal, lower = np.zeros((N + 1, 2 * n, 2 * n)), np.zeros((N, n, n))
@@ -273,33 +218,13 @@ def two_point(
             right[i + 1, n:] = HP @ stage.z
     y, inverse = two_point_bvp.solve(diagonal, lower, right)
     s, x = y[1:, :n] / scale, y[:, n:] * scale
-    P, L = inverse[:, n:, n:] * outer, -inverse[1:, :n, :n] / outer
-    disturbances = [_disturbance(stage, a, b) for stage, a, b in zip(stages, s, L, strict=True)]
-    theta, theta_P = zip(*disturbances, strict=True)
-    return Smoothed(x, P, s, theta, theta_P)
+    return Smoothed(x, inverse[:, n:, n:] * outer, s)
 
 
-def _filter(stages: list[Stage], m: Floats, B: Floats) -> Trajectory:
-    N, n = len(stages), len(m)
-    x, P = np.zeros((N + 1, n)), np.zeros((N + 1, n, n))
-    x[0], P[0] = m, B
-    for i, stage in enumerate(stages):
-        x[i + 1], P[i + 1] = kalman.predict(x[i], P[i], stage.Phi, stage.Q)
-        if len(stage.z):
-            x[i + 1], P[i + 1] = kalman.update(x[i + 1], P[i + 1], stage.z, stage.H, stage.R)[:2]
-    return Trajectory(x, P)
-
-
-def _state_scale(stages: list[Stage], B: Floats) -> Floats:
+def _state_scale(system: LinearSystem) -> Floats:
     """Choose a scale for each state (n,), so that metres and microradians weigh alike."""
-    variance = np.diag(B) + sum(np.diag(stage.Q) for stage in stages)
+    variance = np.diag(system.B) + sum(np.diag(stage.Q) for stage in system.stages)
     return np.sqrt(np.where(variance > 0.0, variance, 1.0))
-
-
-def _disturbance(stage: Stage, s: Floats, L: Floats) -> tuple[Floats, Floats]:
-    """Compute theta = D Gamma' s (6.4.11) and its covariance from s and the covariance L of s."""
-    DG = stage.D @ stage.Gamma.T
-    return DG @ s, stage.D - DG @ L @ DG.T
 
 
 def _reduce(A: Floats, B: Floats, scale: Floats) -> Floats:

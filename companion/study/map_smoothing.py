@@ -15,6 +15,7 @@ import numpy as np
 from rich.table import Table
 
 from companion.estimate import smoother
+from companion.estimate.linear_system import LinearSystem
 from companion.tables import number_table, print_tables
 from companion.units import Floats
 
@@ -49,12 +50,13 @@ def shooting(z: Floats) -> Floats:
 def solve(z: Floats) -> dict[str, Floats]:
     """Return the states (N + 1, 2) by each algorithm."""
     N = len(z)
-    problem = ([PHI] * N, [GAMMA] * N, [D] * N, [H] * N, [R] * N, [np.atleast_1d(v) for v in z], M, B)
+    readings = [np.atleast_1d(v) for v in z]
+    system = LinearSystem.of([PHI] * N, [GAMMA] * N, [D] * N, [H] * N, [R] * N, readings, M, B)
     return {
-        "two-point": smoother.two_point(*problem).x,
-        "filter + RTS": smoother.rts(*problem).x,
+        "two-point": smoother.two_point(system).x,
+        "filter + RTS": smoother.rts(system).x,
         "shooting": shooting(z),
-        "filter": smoother.forward_filter(*problem).x,
+        "filter": smoother.forward_filter(system).x,
     }
 
 

@@ -14,6 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from companion.estimate import smoother, two_point_bvp
+from companion.estimate.linear_system import LinearSystem
 from companion.nav.discretization import discretise
 from companion.nav.disturbances import accelerometer_slow, gyro_drift
 from companion.nav.error_model import aircraft_model
@@ -38,12 +39,12 @@ def example() -> tuple[Any, ...]:
 
 @pytest.mark.parametrize("solve", [smoother.rts, smoother.two_point])
 def test_reference_values(solve: Any) -> None:
-    found = solve(*example())
+    found = solve(LinearSystem.of(*example()))
     np.testing.assert_allclose(found.x, DATA["x_smooth"], atol=1e-13)
     np.testing.assert_allclose(found.s, DATA["s"], atol=1e-13)
     np.testing.assert_allclose(found.P[0], DATA["P_smooth_0"], atol=1e-14)
     np.testing.assert_allclose(found.x[0], [0.141426184774452, 0.975138510178567], atol=1e-14)
-    forward = smoother.forward_filter(*example())
+    forward = smoother.forward_filter(LinearSystem.of(*example()))
     np.testing.assert_allclose(forward.x, DATA["x_filter"], atol=1e-13)
     np.testing.assert_allclose(found.x[-1], forward.x[-1], atol=1e-13)
     np.testing.assert_allclose(found.P[-1], DATA["P_filter_last"], atol=1e-14)
@@ -51,12 +52,11 @@ def test_reference_values(solve: Any) -> None:
 
 def test_the_equations_of_the_boundary_problem_hold() -> None:
     Phi, Gamma, D, H, _, z, m, B = (np.array(a) for a in example())
-    found = smoother.two_point(*example())
+    found = smoother.two_point(LinearSystem.of(*example()))
     x, s = found.x, [*found.s, np.zeros(2)]
     np.testing.assert_allclose(x[0], B @ Phi[0].T @ s[0] + m, atol=1e-14)
     for i in range(len(z)):
         theta = D[i] @ Gamma[i].T @ s[i]
-        np.testing.assert_allclose(found.theta[i], theta, atol=1e-14)
         np.testing.assert_allclose(x[i + 1], Phi[i] @ x[i] + Gamma[i] @ theta, atol=1e-13)
         seen = H[i].T @ (z[i] - H[i] @ x[i + 1]) / DATA["sigma2"]
         np.testing.assert_allclose(s[i], (Phi[i].T if i < 9 else np.eye(2)) @ s[i + 1] + seen, atol=1e-13)
@@ -83,7 +83,7 @@ def random_problem(seed: int, n: int, N: int, singular: bool) -> tuple[Any, ...]
     return Phi, Gamma, D, H, R, z, rng.standard_normal(n), covariance(n, rank(n))
 
 
-def conditioned(problem: tuple[Any, ...]) -> tuple[Any, Any, Any, Any]:
+def conditioned(problem: tuple[Any, ...]) -> tuple[Any, Any]:
     """Dense conditioning: everything is linear in (x_0, theta), which are conditioned on all of z."""
     Phi, Gamma, D, H, R, z, m, B = problem
     n, N = len(m), len(z)
@@ -112,31 +112,28 @@ def conditioned(problem: tuple[Any, ...]) -> tuple[Any, Any, Any, Any]:
         prior = prior - gain @ S @ gain.T
     x = np.array([M @ mean for M in maps])
     P = np.array([M @ prior @ M.T for M in maps])
-    parts = [slice(starts[i], starts[i + 1]) for i in range(N)]
-    return x, P, [mean[p] for p in parts], [prior[p, p] for p in parts]
+    return x, P
 
 
 @settings(max_examples=60)
 @given(st.integers(0, 10**6), st.integers(1, 5), st.integers(1, 12), st.booleans())
 def test_all_algorithms_agree(seed: int, n: int, N: int, singular: bool) -> None:
     problem = random_problem(seed, n, N, singular)
-    x, P, theta, theta_P = conditioned(problem)
-    ways = [smoother.rts(*problem), smoother.two_point(*problem)]
+    system = LinearSystem.of(*problem)
+    x, P = conditioned(problem)
+    ways = [smoother.rts(system), smoother.two_point(system)]
     for found in ways:
         np.testing.assert_allclose(found.x, x, rtol=AGREE, atol=AGREE)
         np.testing.assert_allclose(found.P, P, rtol=AGREE, atol=AGREE)
         np.testing.assert_allclose(found.s, ways[0].s, rtol=AGREE, atol=AGREE * (1 + abs(ways[0].s).max()))
-        for i in range(N):
-            np.testing.assert_allclose(found.theta[i], theta[i], rtol=AGREE, atol=AGREE)
-            np.testing.assert_allclose(found.theta_P[i], theta_P[i], rtol=AGREE, atol=AGREE)
 
 
 @settings(max_examples=30)
 @given(st.integers(0, 10**6), st.integers(1, 4), st.integers(2, 10))
 def test_rts_equals_the_recursion_of_rauch_tung_and_striebel(seed: int, n: int, N: int) -> None:
     problem = random_problem(seed, n, N, singular=False)
-    Phi, Gamma, D = problem[:3]
-    forward, found = smoother.forward_filter(*problem), smoother.rts(*problem)
+    (Phi, Gamma, D), system = problem[:3], LinearSystem.of(*problem)
+    forward, found = smoother.forward_filter(system), smoother.rts(system)
     x, P = forward.x[-1], forward.P[-1]
     for i in range(N - 1, -1, -1):
         ahead = Phi[i] @ forward.P[i] @ Phi[i].T + Gamma[i] @ D[i] @ Gamma[i].T
@@ -176,8 +173,8 @@ def test_block_elimination_solves_the_whole_system(seed: int, n: int, N: int) ->
 
 
 def test_smoothing_makes_every_variance_smaller() -> None:
-    problem = random_problem(3, 4, 40, singular=False)
-    forward, found = smoother.forward_filter(*problem), smoother.rts(*problem)
+    system = LinearSystem.of(*random_problem(3, 4, 40, singular=False))
+    forward, found = smoother.forward_filter(system), smoother.rts(system)
     for k in range(41):
         assert np.linalg.eigvalsh(forward.P[k] - found.P[k]).min() > -1e-12
     np.testing.assert_allclose(found.x[-1], forward.x[-1], atol=1e-12)
@@ -192,8 +189,10 @@ def test_the_error_model_of_an_ins_for_a_flight() -> None:
     B = np.diag([20.0, 20.0, 0.5, 0.5, 1e-4, 1e-4, 1e-3, 5e-8, 5e-8, 5e-8, 5e-4, 5e-4]) ** 2
     rng = np.random.default_rng(0)
     z = [None if 300 <= i < 600 else 3.0 * rng.standard_normal(2) for i in range(N)]
-    problem = [step.A] * N, [np.eye(12)] * N, [step.Q] * N, [H] * N, [9.0 * np.eye(2)] * N, z, np.zeros(12), B
-    one, other = smoother.rts(*problem), smoother.two_point(*problem)
+    system = LinearSystem.of(
+        [step.A] * N, [np.eye(12)] * N, [step.Q] * N, [H] * N, [9.0 * np.eye(2)] * N, z, np.zeros(12), B
+    )
+    one, other = smoother.rts(system), smoother.two_point(system)
     sigma = np.sqrt(np.einsum("ijj->ij", one.P))
     assert (abs(one.x - other.x) < AGREE * sigma).all()
     assert (abs(one.P - other.P) < AGREE * sigma[:, :, None] * sigma[:, None, :]).all()
@@ -207,7 +206,7 @@ def test_uninformative_prior(solve: Any) -> None:
     z = list(rng.standard_normal((N, 1)))
     step = np.array([[1.0, 1.0], [0.0, 1.0]])
     problem = [step] * N, [np.eye(2)] * N, [np.zeros((2, 2))] * N, [[1.0, 0.0]] * N, [1.0] * N, z
-    found = solve(*problem, np.zeros(2), 1e12 * np.eye(2))
+    found = solve(LinearSystem.of(*problem, np.zeros(2), 1e12 * np.eye(2)))
     A = np.column_stack((np.ones(N), np.arange(1.0, N + 1.0)))
     np.testing.assert_allclose(found.P[0], np.linalg.inv(A.T @ A), rtol=1e-3)
     best = np.linalg.lstsq(A, np.array(z)[:, 0], rcond=None)[0]
@@ -219,9 +218,9 @@ def test_uninformative_prior(solve: Any) -> None:
 def test_memory_grows_as_the_length(solve: Any) -> None:
     peak = []
     for N in (100, 200, 400):
-        problem = random_problem(0, 6, N, singular=False)
+        system = LinearSystem.of(*random_problem(0, 6, N, singular=False))
         tracemalloc.start()
-        solve(*problem)
+        solve(system)
         peak.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
     assert peak[2] < 2.2 * peak[1] < 4.84 * peak[0]
@@ -244,6 +243,5 @@ def test_bad_input_is_reported(change: dict[int, Any], message: str) -> None:
     problem = list(example())
     for k, value in change.items():
         problem[k] = value
-    for solve in (smoother.rts, smoother.two_point):
-        with pytest.raises(ValueError, match=message):
-            solve(*problem)
+    with pytest.raises(ValueError, match=message):
+        LinearSystem.of(*problem)

@@ -13,6 +13,7 @@ from msgspec import structs
 
 from companion.analysis import smoothing
 from companion.config import Config, EstimatorConfig, InertialConfig, to_toml
+from companion.estimate.linear_system import LinearSystem
 from companion.estimate.smoother import forward_filter, rts
 from companion.navigator import Navigator
 from companion.navigator.hypotheses import BIASES
@@ -164,8 +165,9 @@ def optimum_of_straight_flight(seconds: float, step: float = 0.5) -> tuple[float
     bias = math.hypot(force.accelerometer_bias_ug * UG, math.radians(force.tilt_arcsec / 3600.0) * G)
     B = np.diag([1e6, 100.0, bias**2, gnss.correlated_m**2])
     n = round(seconds / step)
-    problem = [Phi] * n, [np.eye(4)] * n, [Q] * n, [H] * n, [R] * n, [np.zeros(2)] * n, np.zeros(4), B
-    filtered, smoothed = forward_filter(*problem), rts(*problem)
+    z = [np.zeros(2)] * n
+    system = LinearSystem.of([Phi] * n, [np.eye(4)] * n, [Q] * n, [H] * n, [R] * n, z, np.zeros(4), B)
+    filtered, smoothed = forward_filter(system), rts(system)
     return math.sqrt(2.0 * filtered.P[1:, 0, 0].mean()), math.sqrt(2.0 * smoothed.P[1:, 0, 0].mean())
 
 
