@@ -103,8 +103,6 @@ class Order(NamedTuple):
         a_r in the orthonormal basis.
     covariance : (r, r)
         Their covariance.
-    cp : (r_max,)
-        Mallows' criterion, the discrete equivalent.
     consistency : float
         RSS / (N - r_max).
     degrees_of_freedom : int
@@ -117,7 +115,6 @@ class Order(NamedTuple):
     criterion: Floats
     coefficients: Floats
     covariance: Floats
-    cp: Floats
     consistency: float
     degrees_of_freedom: int
     basis: Basis
@@ -231,10 +228,8 @@ def select_order(
     criterion = ((beta[:, None] - fits) ** 2).sum(0) - traces[-1] + 2.0 * traces
     residual = y - Q @ b
     rss, N, r = float(residual @ residual), len(z), int(criterion.argmin()) + 1
-    beyond = np.append(np.cumsum(b[:0:-1] ** 2)[::-1], 0.0)  # cost explained by the later functions
-    cp = rss + beyond - N + 2.0 * np.arange(1, r_max + 1)
     V = inverse[:r, :r] @ inverse[:r, :r].T
-    return Order(r, criterion, fits[:r, r - 1], V, cp, rss / (N - r_max), N - r_max, functions)
+    return Order(r, criterion, fits[:r, r - 1], V, rss / (N - r_max), N - r_max, functions)
 
 
 class Track(NamedTuple):
@@ -242,9 +237,9 @@ class Track(NamedTuple):
 
     Attributes
     ----------
-    x : (N, k)
+    x : (N,)
         Values at the times of the samples.
-    sigma : (N, k)
+    sigma : (N,)
         Upper bounds of their standard deviations.
     windows : int
         Number of windows side by side.
@@ -261,7 +256,7 @@ class Track(NamedTuple):
 def smooth_track(
     t: npt.ArrayLike, z: npt.ArrayLike, sigma: npt.ArrayLike, basis: Family = "legendre", r_max: int = 8
 ) -> Track:
-    """Smooth a track of unknown shape, each component on its own.
+    """Smooth a track of unknown shape.
 
     Its span is cut into 1, 2, 4, .. windows until r_max functions explain each to within the noise, or one
     would hold fewer than 2 r_max samples. Windows overlap by half and are blended by cos^2, so that the track
@@ -271,7 +266,7 @@ def smooth_track(
     ----------
     t : (N,)
         Times, s, increasing.
-    z : (N, k)
+    z : (N,)
         Samples.
     sigma : (N,) or float
         Their errors, in the unit of z.
@@ -290,16 +285,12 @@ def smooth_track(
     ValueError
         If the samples are not usable.
     """
-    t, z = np.asarray(t, float), np.asarray(z, float)
-    if z.ndim != 2 or len(z) != t.size:
-        raise ValueError(f"the track z {z.shape} does not fit its times {t.shape}: give one row for each")
-    columns = [_samples(t, column, sigma, basis, r_max) for column in z.T]
-    t, sigma = columns[0].t, columns[0].sigma
+    samples = _samples(t, z, sigma, basis, r_max)
     count = 1
     while True:
-        found, explained = _windowed(t, z, sigma, basis, r_max, count)
+        found, explained = _windowed(samples, basis, r_max, count)
         count *= 2
-        if explained or min(len(t[inside]) for inside in _windows(t, count)) < 2 * r_max:
+        if explained or min(len(samples.t[inside]) for inside in _windows(samples.t, count)) < 2 * r_max:
             return found
 
 
@@ -311,9 +302,8 @@ def _windows(t: Floats, count: int) -> list[slice]:
     return [slice(a, b) for a, b in zip(first, last, strict=True)]
 
 
-def _windowed(
-    t: Floats, z: Floats, sigma: Floats, basis: Family, r_max: int, count: int
-) -> tuple[Track, bool]:
+def _windowed(samples: _Samples, basis: Family, r_max: int, count: int) -> tuple[Track, bool]:
+    t, z, sigma = samples
     x, deviation = np.zeros_like(z), np.zeros_like(z)
     half = (t[-1] - t[0]) / (2 * count)
     rss, degrees_of_freedom = 0.0, 0
@@ -325,19 +315,15 @@ def _windowed(
             weight[u < 1.0] = 1.0
         if j == len(windows) - 1:
             weight[u >= 1.0] = 1.0
-        for k in range(z.shape[1]):
-            order = select_order(t[inside], z[inside, k], sigma[inside], basis, r_max)
-            curve = order.at(t[inside])
-            x[inside, k] += weight * curve.x
-            deviation[inside, k] += weight * curve.sigma
-            if j % 2 == 0:  # windows side by side share no samples
-                rss, degrees_of_freedom = (
-                    rss + order.consistency * order.degrees_of_freedom,
-                    degrees_of_freedom + order.degrees_of_freedom,
-                )
-    return Track(x, deviation, count, rss / degrees_of_freedom), rss <= nis_gate(
-        degrees_of_freedom, FALSE_ALARM
-    )
+        order = select_order(t[inside], z[inside], sigma[inside], basis, r_max)
+        curve = order.at(t[inside])
+        x[inside] += weight * curve.x
+        deviation[inside] += weight * curve.sigma
+        if j % 2 == 0:  # windows side by side share no samples
+            rss += order.consistency * order.degrees_of_freedom
+            degrees_of_freedom += order.degrees_of_freedom
+    explained = rss <= nis_gate(degrees_of_freedom, FALSE_ALARM)
+    return Track(x, deviation, count, rss / degrees_of_freedom), explained
 
 
 class _Samples(NamedTuple):

@@ -328,10 +328,10 @@ def _plot(samples: Samples, rows: Sequence[BasisResult], file: Path) -> None:
 
 def _smooth(samples: Samples, basis: Family, r_max: int, as_json: bool, plot: Path | None) -> None:
     """Smooth a long column in windows; print the result, plot it."""
-    found = smooth_track(samples.t, samples.z[:, None], samples.sigma, basis, r_max)
-    residual = float(np.sqrt(np.mean((samples.z - found.x[:, 0]) ** 2)))
+    found = smooth_track(samples.t, samples.z, samples.sigma, basis, r_max)
+    residual = float(np.sqrt(np.mean((samples.z - found.x) ** 2)))
     if as_json:
-        columns = {"t": samples.t, "z": samples.z, "x": found.x[:, 0], "sigma": found.sigma[:, 0]}
+        columns = {"t": samples.t, "z": samples.z, "x": found.x, "sigma": found.sigma}
         plain: dict[str, Any] = {name: column.tolist() for name, column in columns.items()}
         click.echo(json.dumps({"windows": found.windows, "consistency": found.consistency, **plain}))
     else:
@@ -349,7 +349,7 @@ def _plot_track(samples: Samples, found: Track, file: Path) -> None:
 
     figure = Figure(figsize=(9.0, 4.5), layout="constrained")
     axes = figure.add_subplot()
-    x, sigma = found.x[:, 0], found.sigma[:, 0]
+    x, sigma = found.x, found.sigma
     axes.plot(samples.t, samples.z, ".", color="0.7", markersize=2, label="samples")
     axes.plot(samples.t, x, label=f"smoothed, {found.windows} windows")
     axes.fill_between(samples.t, x - 2.0 * sigma, x + 2.0 * sigma, alpha=0.3, label="two sigma")
