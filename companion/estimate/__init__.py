@@ -54,6 +54,7 @@ from companion.estimate.fusion import (
     Unobservable,
     maximum_likelihood,
 )
+from companion.estimate.kalman import Gaussian
 from companion.estimate.minimax import ClosedForm, Continuous, closed_form, closed_form_tau, continuous_tau
 from companion.estimate.minimax_lp import Design, Infeasible, LeastSquares, Minimax
 from companion.estimate.polynomial import Order, Track, select_order, smooth_track
@@ -61,7 +62,6 @@ from companion.estimate.predictor import Anchored, Estimate, Program, Target, Wi
 from companion.estimate.schuler import MEAN_EARTH, Scale, schuler_row, transition
 from companion.estimate.smoother import (
     Smoothed,
-    Trajectory,
     forward_filter,
     rts,
     rts_backward,
@@ -78,6 +78,7 @@ __all__ = [
     "Design",
     "Estimate",
     "Fix",
+    "Gaussian",
     "Height",
     "Infeasible",
     "LeastSquares",
@@ -92,7 +93,6 @@ __all__ = [
     "Smoothed",
     "Target",
     "Track",
-    "Trajectory",
     "Unobservable",
     "Window",
     "anchor",

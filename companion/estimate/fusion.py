@@ -101,7 +101,7 @@ class Ambiguous(NoFix):
 
 
 class Fix(NamedTuple):
-    """Maximum-likelihood position with the residuals of its observations.
+    """Maximum-likelihood position.
 
     Attributes
     ----------
@@ -115,10 +115,6 @@ class Fix(NamedTuple):
         Steps of the last descent.
     degrees_of_freedom : int
         Of the cost.
-    residuals : tuple of arrays
-        Observed minus computed for each observation in the order given, m or rad.
-    chi_squares : tuple of float
-        Share of each observation in the cost.
     in_cone_of_silence : tuple of int
         Indices of the azimuths left out.
     """
@@ -128,8 +124,6 @@ class Fix(NamedTuple):
     cost: float
     iterations: int
     degrees_of_freedom: int
-    residuals: tuple[Floats, ...]
-    chi_squares: tuple[float, ...]
     in_cone_of_silence: tuple[int, ...]
 
 
@@ -147,7 +141,7 @@ def maximum_likelihood(observations: Sequence[Observation], start: npt.ArrayLike
     Returns
     -------
     Fix
-        Position, covariance and residuals.
+        Position and covariance.
 
     Raises
     ------
@@ -168,15 +162,12 @@ def maximum_likelihood(observations: Sequence[Observation], start: npt.ArrayLike
         raise ValueError(f"start has {len(x0)} coordinates, the observations {model.n}: give as many")
     model, found = _fix_outside_cone(model, None if x0 is None else model.point(x0))
     covariance = np.array(_invert(model, found.at))
-    residuals, shares = model.residuals(found.p)
     return Fix(
         model.place(found.p),
         covariance,
         found.at.cost,
         found.iterations,
         len(found.at.rows) - model.n,
-        residuals,
-        shares,
         tuple(sorted(model.in_cone)),
     )
 

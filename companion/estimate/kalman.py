@@ -19,8 +19,8 @@ import numpy as np
 from companion.units import Floats
 
 
-class Prediction(NamedTuple):
-    """State before the measurement.
+class Gaussian(NamedTuple):
+    """State at one time, or at several.
 
     Attributes
     ----------
@@ -32,30 +32,6 @@ class Prediction(NamedTuple):
 
     x: Floats
     P: Floats
-
-
-class Estimate(NamedTuple):
-    """State after the measurement.
-
-    Attributes
-    ----------
-    x : (..., n)
-        Mean.
-    P : (..., n, n)
-        Covariance.
-    innovation : (..., p)
-        nu = z - H x before the update.
-    S : (..., p, p)
-        Covariance of the innovation.
-    nis : (...,)
-        Normalised innovation squared, nu' S^-1 nu.
-    """
-
-    x: Floats
-    P: Floats
-    innovation: Floats
-    S: Floats
-    nis: Floats
 
 
 class Gain(NamedTuple):
@@ -76,7 +52,7 @@ class Gain(NamedTuple):
     K: Floats
 
 
-def predict(x: Floats, P: Floats, A: Floats, Q: Floats) -> Prediction:
+def predict(x: Floats, P: Floats, A: Floats, Q: Floats) -> Gaussian:
     """Propagate mean and covariance over one step.
 
     Parameters
@@ -92,7 +68,7 @@ def predict(x: Floats, P: Floats, A: Floats, Q: Floats) -> Prediction:
 
     Returns
     -------
-    Prediction
+    Gaussian
         A x and A P A' + Q.
 
     References
@@ -101,10 +77,10 @@ def predict(x: Floats, P: Floats, A: Floats, Q: Floats) -> Prediction:
     """
     Pb = A @ P @ A.mT
     Pb += Q
-    return Prediction(x @ A.mT, Pb)
+    return Gaussian(x @ A.mT, Pb)
 
 
-def update(x: Floats, P: Floats, z: Floats, H: Floats, R: Floats) -> Estimate:
+def update(x: Floats, P: Floats, z: Floats, H: Floats, R: Floats) -> Gaussian:
     """Update mean and covariance by the measurement z = H x + N(0, R).
 
     DEPARTS FROM (2.5): the paper inverts the predicted covariance, which does not exist after exact alignment
@@ -126,20 +102,19 @@ def update(x: Floats, P: Floats, z: Floats, H: Floats, R: Floats) -> Estimate:
 
     Returns
     -------
-    Estimate
-        Updated state with innovation, S and NIS.
+    Gaussian
+        Updated state.
 
     References
     ----------
     Poddubny (2.5).
     """
-    S, S_inverse, K = gain(P, H, R)
+    K = gain(P, H, R).K
     nu = z - x @ H.mT
-    nis = (nu * (S_inverse @ nu[..., None])[..., 0]).sum(-1)
-    return Estimate(x + (K @ nu[..., None])[..., 0], joseph(P, K, H, R), nu, S, nis)
+    return Gaussian(x + (K @ nu[..., None])[..., 0], joseph(P, K, H, R))
 
 
-def step(x: Floats, P: Floats, z: Floats, A: Floats, Q: Floats, H: Floats, R: Floats) -> Estimate:
+def step(x: Floats, P: Floats, z: Floats, A: Floats, Q: Floats, H: Floats, R: Floats) -> Gaussian:
     """Predict over one step and update by its measurement.
 
     Parameters
@@ -153,8 +128,8 @@ def step(x: Floats, P: Floats, z: Floats, A: Floats, Q: Floats, H: Floats, R: Fl
 
     Returns
     -------
-    Estimate
-        X(t+1|t+1), P(t+1|t+1), with innovation, S and NIS.
+    Gaussian
+        X(t+1|t+1), P(t+1|t+1).
 
     References
     ----------

@@ -245,14 +245,14 @@ class Model:
         self.n = max(start, max([3 if place is None else len(place) for place in where]))
         self.beacon_equations: list[BeaconEquation | None] = []
         self.in_cone: frozenset[int] = frozenset()
-        self._linear: list[tuple[int, Row]] = []  # index of the observation; w in place of the residual
+        self._linear: list[Row] = []  # with w in place of the residual
         for i, (z, place) in enumerate(zip(observations, where, strict=True)):
             equation: BeaconEquation | None = None
             if isinstance(z, Height):
                 _check(i, z)
-                self._linear.append((i, (z.value / z.sigma, 0.0, 0.0, 1.0 / z.sigma)))
+                self._linear.append((z.value / z.sigma, 0.0, 0.0, 1.0 / z.sigma))
             elif isinstance(z, Position):
-                self._linear += [(i, row) for row in _whitened(i, z, place or ())]
+                self._linear += _whitened(i, z, place or ())
             else:
                 equation = _beacon_equation(i, z, place or (), self.n)
             self.beacon_equations.append(equation)
@@ -260,7 +260,7 @@ class Model:
     @property
     def linear(self) -> Linearised:
         """Return the positions and heights alone, linearised at the origin."""
-        return Linearised([row for _, row in self._linear], self.n)
+        return Linearised(self._linear, self.n)
 
     def point(self, x: Floats) -> Point:
         """Convert a position to plain numbers.
@@ -307,7 +307,7 @@ class Model:
             Whitened equations, positions and heights first.
         """
         x, y, z = p
-        rows = [(w - a * x - b * y - c * z, a, b, c) for _, (w, a, b, c) in self._linear]
+        rows = [(w - a * x - b * y - c * z, a, b, c) for w, a, b, c in self._linear]
         rows += [
             s.row(p) for i, s in enumerate(self.beacon_equations) if s is not None and i not in self.in_cone
         ]
@@ -350,35 +350,6 @@ class Model:
         other = copy.copy(self)
         other.in_cone = self.in_cone | in_cone
         return other
-
-    def residuals(self, p: Point) -> tuple[tuple[Floats, ...], tuple[float, ...]]:
-        """Compute the residual of each observation and its share of the cost.
-
-        Parameters
-        ----------
-        p : Point
-            Position of the aircraft, m.
-
-        Returns
-        -------
-        tuple
-            Residuals, observed minus computed in the observation's unit, and shares of the cost. An azimuth
-            left out has an empty residual and share 0.
-        """
-        residuals = [np.zeros(0)] * len(self.observations)
-        shares = [0.0] * len(self.observations)
-        for i, (w, a, b, c) in self._linear:
-            shares[i] += (w - a * p[0] - b * p[1] - c * p[2]) ** 2
-        for i, (o, equation) in enumerate(zip(self.observations, self.beacon_equations, strict=True)):
-            if isinstance(o, Position):
-                value = np.asarray(o.value, dtype=float)
-                residuals[i] = value - p[: len(value)]
-            elif isinstance(o, Height):
-                residuals[i] = np.array([o.value - p[2]])
-            elif i not in self.in_cone and equation is not None:
-                r = equation.row(p)[0]
-                residuals[i], shares[i] = np.array([r * equation.sigma]), r * r
-        return tuple(residuals), tuple(shares)
 
 
 def _where(i: int, z: Observation) -> tuple[float, ...] | None:

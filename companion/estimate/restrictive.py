@@ -40,21 +40,12 @@ class RestrictiveEstimate(NamedTuple):
         Inputs of the step, in their own unit.
     status : (..., m)
         -1 or +1 on a bound, 0 inside.
-    innovation : (..., p)
-        nu - D U*, the part that no input can explain.
-    S : (..., p, p)
-        Innovation covariance of the filter with known inputs.
-    nis : (...,)
-        Normalised square of `innovation` by S.
     """
 
     x: Floats
     P: Floats
     u: Floats
     status: bounded_lsq.Status
-    innovation: Floats
-    S: Floats
-    nis: Floats
 
 
 def step(
@@ -105,7 +96,7 @@ def step(
     Poddubny (2.7)-(2.9) and section 2.
     """
     Ax, Pb = kalman.predict(x, P, A, Q)
-    S, S_inverse, K = kalman.gain(Pb, H, R)
+    _, S_inverse, K = kalman.gain(Pb, H, R)
     nu = z - Ax @ H.mT
     BC = B * C
     DC = H @ BC  # inputs in units of their bounds
@@ -114,7 +105,7 @@ def step(
     best = bounded_lsq.minimize_quadratic(
         M + bounded_lsq.prior_information(M, kappa), (SD.mT @ nu[..., None])[..., 0]
     )
-    left = nu - best.v @ DC.T
+    left = nu - best.v @ DC.T  # the part that no input can explain
     W = BC - K @ DC
     rebuilt = kalman.joseph(Pb, K, H, R)
     rebuilt += W @ best.free_inverse @ W.mT
@@ -123,7 +114,4 @@ def step(
         P=rebuilt,
         u=best.v * C,
         status=best.status,
-        innovation=left,
-        S=S,
-        nis=(left * (S_inverse @ left[..., None])[..., 0]).sum(-1),
     )

@@ -31,6 +31,7 @@ from typing import NamedTuple
 import numpy as np
 
 from companion.estimate import kalman, two_point_bvp
+from companion.estimate.kalman import Gaussian
 from companion.estimate.linear_system import LinearSystem
 from companion.units import Floats
 
@@ -51,21 +52,6 @@ class Smoothed(NamedTuple):
     x: Floats
     P: Floats
     s: Floats
-
-
-class Trajectory(NamedTuple):
-    """Means and covariances at N+1 epochs.
-
-    Attributes
-    ----------
-    x : (N+1, n)
-        Means.
-    P : (N+1, n, n)
-        Covariances.
-    """
-
-    x: Floats
-    P: Floats
 
 
 def rts(system: LinearSystem) -> Smoothed:
@@ -118,7 +104,7 @@ def rts(system: LinearSystem) -> Smoothed:
 
 def rts_backward(
     x: Floats, P: Floats, predicted: Sequence[Floats], Phi: Sequence[Floats], Q: Sequence[Floats]
-) -> Trajectory:
+) -> Gaussian:
     """Smooth the stored states of a forward filter by the recursion of Rauch, Tung and Striebel.
 
     Needs nothing of the measurements: the filter's updates may be nonlinear or gated. With
@@ -138,7 +124,7 @@ def rts_backward(
 
     Returns
     -------
-    Trajectory
+    Gaussian
         Smoothed states; the last is the filter's.
 
     References
@@ -155,10 +141,10 @@ def rts_backward(
         J = identity - C @ Phi[k]
         P_k = J @ P[k] @ J.T + C @ (P[k + 1] + Q[k]) @ C.T
         P[k] = 0.5 * (P_k + P_k.T)
-    return Trajectory(x, P)
+    return Gaussian(x, P)
 
 
-def forward_filter(system: LinearSystem) -> Trajectory:
+def forward_filter(system: LinearSystem) -> Gaussian:
     """Run the Kalman filter of `rts` alone: the estimate available at each epoch in flight.
 
     Parameters
@@ -168,7 +154,7 @@ def forward_filter(system: LinearSystem) -> Trajectory:
 
     Returns
     -------
-    Trajectory
+    Gaussian
         States given the measurements up to each epoch; the first is the prior.
     """
     N, n = len(system.stages), len(system.m)
@@ -177,8 +163,8 @@ def forward_filter(system: LinearSystem) -> Trajectory:
     for i, stage in enumerate(system.stages):
         x[i + 1], P[i + 1] = kalman.predict(x[i], P[i], stage.Phi, stage.Q)
         if len(stage.z):
-            x[i + 1], P[i + 1] = kalman.update(x[i + 1], P[i + 1], stage.z, stage.H, stage.R)[:2]
-    return Trajectory(x, P)
+            x[i + 1], P[i + 1] = kalman.update(x[i + 1], P[i + 1], stage.z, stage.H, stage.R)
+    return Gaussian(x, P)
 
 
 def two_point(system: LinearSystem) -> Smoothed:

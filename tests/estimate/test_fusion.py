@@ -185,7 +185,6 @@ def test_agrees_with_scipy_from_poor_starts(n, x, beacons, ins, start, seed):
         assert np.linalg.norm(J_fix @ (fix.position - scipy.x)) < 1e-6
         assert fix.cost <= 2 * scipy.cost * (1 + 1e-9) + 1e-9
         np.testing.assert_allclose(fix.cost, r(fix.position) @ r(fix.position), rtol=1e-9, atol=1e-9)
-        np.testing.assert_allclose(sum(fix.chi_squares), fix.cost, rtol=1e-9, atol=1e-12)
 
 
 def test_errors_and_cost_match_their_distribution():
@@ -332,7 +331,6 @@ class TestOverhead:
         pair = [Azimuth([0, 0, 0], 0.4, SIGMA_A), Range([0, 0, 0], float(np.linalg.norm(x)) + 100.0, 200.0)]
         fix = maximum_likelihood([gnss, *pair])
         assert fix.in_cone_of_silence == (1,)
-        assert (fix.residuals[1].size, fix.chi_squares[1]) == (0, 0.0)
         without = maximum_likelihood([gnss, pair[1]])
         np.testing.assert_allclose(fix.position, without.position, atol=1e-6)
         assert fix.degrees_of_freedom == without.degrees_of_freedom == 1
@@ -353,14 +351,12 @@ class TestOverhead:
         np.testing.assert_allclose(fix.position, 9e4 * np.array([math.sin(2), math.cos(2)]), atol=1e-3)
 
 
-def test_residuals_identify_the_wild_measurement():
+def test_a_wild_measurement_shows_in_the_cost():
     x = np.array([40e3, 30e3])
     A, D = seen([0, 0], x)
     fix = maximum_likelihood(
         [Position(x, np.eye(2) * 1e4), Azimuth([0, 0], A, SIGMA_A), Range([0, 0], D + 5e3, 200.0)]
     )
-    assert int(np.argmax(fix.chi_squares)) == 2
-    assert fix.residuals[2][0] > 3e3
     assert chi2.sf(fix.cost, fix.degrees_of_freedom) < 1e-9
 
 
