@@ -129,7 +129,7 @@ def compose(A_ins: Floats, ins_states: Sequence[str], disturbances: Sequence[Dis
     return Model(A, states, Q, B, np.array([c for _, c in bounded]))
 
 
-def gyro_drift(decay: float, sigma: float = 0.0, bound: float | None = None) -> Disturbance:
+def gyro_drift(decay: float, sigma: float) -> Disturbance:
     """Declare the slowly changing part of the gyro drift.
 
     Parameters
@@ -137,9 +137,7 @@ def gyro_drift(decay: float, sigma: float = 0.0, bound: float | None = None) -> 
     decay : float
         Decay rate, per unit of time.
     sigma : float
-        Steady deviation, if stochastic.
-    bound : float, optional
-        Bound of its rate of change, if bounded.
+        Steady deviation.
 
     Returns
     -------
@@ -150,15 +148,15 @@ def gyro_drift(decay: float, sigma: float = 0.0, bound: float | None = None) -> 
     ----------
     Poddubny (1.29).
     """
-    return Disturbance(("EX", "EY", "EZ"), decay, sigma, bound, ("PX", "PY", "PZ"))
+    return Disturbance(("EX", "EY", "EZ"), decay, sigma, drives=("PX", "PY", "PZ"))
 
 
-def accelerometer_fast(decay: float, sigma: float = 0.0, bound: float | None = None) -> Disturbance:
-    """Declare the fast part of the accelerometer errors; the only one of section 3.
+def accelerometer(decay: float, sigma: float) -> Disturbance:
+    """Declare the accelerometer errors: in section 3 their fast part, in flight the slow one.
 
     Parameters
     ----------
-    decay, sigma, bound
+    decay, sigma : float
         As in `gyro_drift`.
 
     Returns
@@ -170,30 +168,10 @@ def accelerometer_fast(decay: float, sigma: float = 0.0, bound: float | None = N
     ----------
     Poddubny (1.24), (1.25).
     """
-    return Disturbance(("AX", "AY"), decay, sigma, bound, ("dVN", "dVE"))
+    return Disturbance(("AX", "AY"), decay, sigma, drives=("dVN", "dVE"))
 
 
-def accelerometer_slow(decay: float, sigma: float = 0.0, bound: float | None = None) -> Disturbance:
-    """Declare the slow part of the accelerometer errors.
-
-    Parameters
-    ----------
-    decay, sigma, bound
-        As in `gyro_drift`.
-
-    Returns
-    -------
-    Disturbance
-        AsX, AsY.
-
-    References
-    ----------
-    Poddubny (1.24), (1.25).
-    """
-    return Disturbance(("AsX", "AsY"), decay, sigma, bound, ("dVN", "dVE"))
-
-
-def gravity(speed: float, R_G: float, sigma: float = 0.0, bound: float | None = None) -> Disturbance:
+def gravity(speed: float, R_G: float, sigma: float) -> Disturbance:
     """Declare gravity anomalies, stationary in space: decay V/R_G.
 
     Parameters
@@ -202,8 +180,8 @@ def gravity(speed: float, R_G: float, sigma: float = 0.0, bound: float | None = 
         Speed of the vehicle.
     R_G : float
         Correlation radius.
-    sigma, bound
-        As in `gyro_drift`.
+    sigma : float
+        Steady deviation.
 
     Returns
     -------
@@ -214,7 +192,7 @@ def gravity(speed: float, R_G: float, sigma: float = 0.0, bound: float | None = 
     ----------
     Poddubny (1.26).
     """
-    return Disturbance(("GX", "GY"), speed / R_G, sigma, bound, ("dVN", "dVE"))
+    return Disturbance(("GX", "GY"), speed / R_G, sigma, drives=("dVN", "dVE"))
 
 
 def current(
@@ -230,8 +208,10 @@ def current(
         Decay rate in time, per unit of time.
     R_c : float
         Correlation radius.
-    sigma, bound
-        As in `gyro_drift`.
+    sigma : float
+        Steady deviation, if stochastic.
+    bound : float, optional
+        Bound of its rate of change, if bounded.
 
     Returns
     -------

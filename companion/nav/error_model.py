@@ -240,7 +240,7 @@ def paper_example(
     drift = disturbances.gyro_drift(a_E, sigma_E / h)
     others = (
         disturbances.gravity(V, R_G, 1e-5 * sphere.G),
-        disturbances.accelerometer_fast(a_A, 1e-6 * sphere.G),
+        disturbances.accelerometer(a_A, 1e-6 * sphere.G),
     )
 
     def at_sea(current: Disturbance) -> Model:

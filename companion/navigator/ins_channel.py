@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from companion.config import Config
-from companion.nav.disturbances import accelerometer_slow, compose, gyro_drift
+from companion.nav.disturbances import accelerometer, compose, gyro_drift
 from companion.nav.error_model import INS_STATES, aircraft_matrix
 from companion.navigator.channel import DOPPLER_S, Nominal, Transition, discretise
 from companion.units import G0, Floats
@@ -86,7 +86,7 @@ def ins_channel(config: Config) -> InsChannel:
     doppler = LASTING * gnss.sigma_velocity_m_s
     slow = (
         gyro_drift(1.0 / (3600.0 * unit.gyro_correlation_h), drift),
-        accelerometer_slow(1.0 / (3600.0 * unit.accelerometer_correlation_h), bias),
+        accelerometer(1.0 / (3600.0 * unit.accelerometer_correlation_h), bias),
     )
     bare = compose(np.zeros((7, 7)), INS_STATES, slow)
     A, ours = np.zeros((N, N)), len(bare.A)

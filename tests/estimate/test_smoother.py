@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from companion.estimate import smoother, two_point_bvp
 from companion.estimate.linear_system import LinearSystem
 from companion.nav.discretization import discretise
-from companion.nav.disturbances import accelerometer_slow, gyro_drift
+from companion.nav.disturbances import accelerometer, gyro_drift
 from companion.nav.error_model import aircraft_model
 
 DATA = json.loads((pathlib.Path(__file__).parents[1] / "data/map_and_order.json").read_text())["two_state"]
@@ -182,7 +182,7 @@ def test_smoothing_makes_every_variance_smaller() -> None:
 
 def test_the_error_model_of_an_ins_for_a_flight() -> None:
     """Metres, microradians and radians per second in one state, an outage in the middle."""
-    drift, bias = gyro_drift(1.0 / 18000.0, 5e-8), accelerometer_slow(1.0 / 3600.0, 5e-4)
+    drift, bias = gyro_drift(1.0 / 18000.0, 5e-8), accelerometer(1.0 / 3600.0, 5e-4)
     model = aircraft_model(math.radians(60.0), 150.0, 100.0, added=(drift, bias))
     step = discretise(model.A, model.Q + np.diag([0.0, 0.0, 1e-5, 1e-5] + [0.0] * 8), model.B, 2.0)
     N, H = 900, np.eye(2, 12)

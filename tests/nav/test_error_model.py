@@ -68,14 +68,14 @@ def test_golden_airspeed_rows(V: float) -> None:
         1.0,
         0.0,
         V,
-        added=(dist.gyro_drift(1.0), dist.Disturbance(("wN", "wE"), 1.0), *_gravity_and_sensors()),
+        added=(dist.gyro_drift(1.0, 0.0), dist.Disturbance(("wN", "wE"), 1.0), *_gravity_and_sensors()),
     )
     H = observation_matrix(model.states, *airspeed(math.pi / 2, V))
     np.testing.assert_allclose(H, GOLDEN["matrices"][f"H_full V={V:.0f} K=1.570796"], atol=1e-15)
 
 
 def _gravity_and_sensors() -> tuple[dist.Disturbance, ...]:
-    return dist.gravity(30.0, 1e4, 1e-4), dist.accelerometer_fast(20 / 3600, 1e-5)
+    return dist.gravity(30.0, 1e4, 1e-4), dist.accelerometer(20 / 3600, 1e-5)
 
 
 # -- spectra -------------------------------------------------------------------------------------------
