@@ -85,7 +85,7 @@ class LeastSquares(NamedTuple):
     claimed : float
         One sigma if the errors are uncorrelated.
     worst : float
-        R.m.s. error under the worst correlation, sum sigma |w|.
+        R.m.s. error under the worst correlation, sum sigma |w| + sum d |G w|.
     """
 
     weights: Floats
@@ -326,10 +326,8 @@ class Design:
             Weights, claimed and worst error.
         """
         _, a_q = self.in_coordinates(target)
-        whitened_weights = a_q @ self.q
-        return LeastSquares(
-            whitened_weights / self.sigmas, float(np.linalg.norm(a_q)), float(np.abs(whitened_weights).sum())
-        )
+        weights = a_q @ self.q / self.sigmas
+        return LeastSquares(weights, float(np.linalg.norm(a_q)), float(self.worst(weights)))
 
     def _basis(self, start: Minimax | None) -> tuple[Indices, Indices]:
         """Choose independent rows: of `start`, else the extremal nodes of a window, else by pivoting."""

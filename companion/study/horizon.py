@@ -116,7 +116,7 @@ class Horizon:
         position, tilt, velocity, drift = (self._bound(k, ahead) for k in range(4))
         target, radius = self._target(0, ahead), MEAN_EARTH.radius
         ls = self._design.least_squares(target)
-        worst = radius * float(self._design.worst(ls.weights)) + self._beyond(ALONE[0], ahead)
+        worst = radius * ls.worst + self._beyond(ALONE[0], ahead)
         plain = closed_form(2.0 * self._half, ahead, self._sigma, MEAN_EARTH) if self._plain else None
         best = self._starts[0]
         assert best is not None
