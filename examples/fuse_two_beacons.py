@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 
-from companion.estimate import Azimuth, Height, Range, maximum_likelihood
+from companion.estimate.fusion import Azimuth, Height, Range, maximum_likelihood
 
 sigma_azimuth = math.radians(0.125)
 beacons = {"east": (60_000.0, 5_000.0, 200.0), "north": (-10_000.0, 80_000.0, 150.0)}

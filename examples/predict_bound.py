@@ -3,7 +3,7 @@
 The bound is the worst r.m.s. error over every correlation of the fixes' errors (Matasov, Martirosyan, 1997).
 """
 
-from companion.estimate import closed_form
+from companion.estimate.minimax import closed_form
 
 WINDOW_S, SIGMA_M = 15 * 60.0, 30.0  # 30 m fixes for a quarter of an hour
 

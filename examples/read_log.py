@@ -6,7 +6,7 @@ python examples/read_log.py LOG.mcap
 import math
 import sys
 
-from companion.nav import Geodetic, separation
+from companion.nav.geometry import Geodetic, separation
 from companion.records import Solution, Truth
 from companion.storage import flight_log
 

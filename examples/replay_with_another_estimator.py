@@ -10,7 +10,7 @@ import numpy as np
 
 from companion.analysis.replay_inputs import apply_changes, open_inputs
 from companion.config import Config
-from companion.nav import Geodetic, separation
+from companion.nav.geometry import Geodetic, separation
 from companion.navigator import Navigator
 from companion.records import INPUTS, Solution
 

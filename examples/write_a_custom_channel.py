@@ -3,7 +3,7 @@
 import numpy as np
 
 from companion.estimate import bank as banks
-from companion.nav import Geodetic
+from companion.nav.geometry import Geodetic
 from companion.navigator.channel import Channel, Nominal, Transition, discretise, moved
 from companion.navigator.inertial_track import Point
 

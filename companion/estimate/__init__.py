@@ -15,6 +15,7 @@ Positions from beacons
     levenberg_marquardt  minimisation in two or three unknowns
     fusion               maximum-likelihood position and its covariance
     weights              best coefficients for readings of known errors, and departures from them
+    readings             readings of a position whose errors may be correlated, iterated
 Guaranteed prediction
     schuler              dynamics of one horizontal INS error
     minimax_lp           guaranteed linear estimation by exchange
@@ -26,96 +27,6 @@ Faults
     bank                 bank of hypotheses: which source is false, and the protection level
 
 SI and radians, unless a name ends in `_tau` (radians of Schuler phase). numpy and scipy only, no I/O; where a
-function takes a time, it is in ns. `step`, `predict`, `update` and `solve` exist in several modules and are
-reached through them, for example `kalman.update`.
+function takes a time, it is in ns. Names are imported from their modules; `step`, `predict`, `update` and
+`solve` exist in several and are reached through them, for example `kalman.update`.
 """
-
-from companion.estimate import (
-    bank,
-    bounded_lsq,
-    kalman,
-    minimax_lp,
-    predictor,
-    restrictive,
-    schemes,
-    smoother,
-    two_point_bvp,
-    weights,
-)
-from companion.estimate.fusion import (
-    Ambiguous,
-    Azimuth,
-    Fix,
-    Height,
-    NoFix,
-    Observation,
-    Position,
-    Range,
-    Unobservable,
-    maximum_likelihood,
-)
-from companion.estimate.kalman import Gaussian
-from companion.estimate.minimax import ClosedForm, Continuous, closed_form, closed_form_tau, continuous_tau
-from companion.estimate.minimax_lp import Design, Infeasible, LeastSquares, Minimax
-from companion.estimate.polynomial import Order, Track, select_order, smooth_track
-from companion.estimate.predictor import Anchored, Estimate, Program, Target, Window, anchor
-from companion.estimate.schuler import MEAN_EARTH, Scale, schuler_row, transition
-from companion.estimate.smoother import (
-    Smoothed,
-    forward_filter,
-    rts,
-    rts_backward,
-    two_point,
-)
-
-__all__ = [
-    "MEAN_EARTH",
-    "Ambiguous",
-    "Anchored",
-    "Azimuth",
-    "ClosedForm",
-    "Continuous",
-    "Design",
-    "Estimate",
-    "Fix",
-    "Gaussian",
-    "Height",
-    "Infeasible",
-    "LeastSquares",
-    "Minimax",
-    "NoFix",
-    "Observation",
-    "Order",
-    "Position",
-    "Program",
-    "Range",
-    "Scale",
-    "Smoothed",
-    "Target",
-    "Track",
-    "Unobservable",
-    "Window",
-    "anchor",
-    "bank",
-    "bounded_lsq",
-    "closed_form",
-    "closed_form_tau",
-    "continuous_tau",
-    "forward_filter",
-    "kalman",
-    "maximum_likelihood",
-    "minimax_lp",
-    "predictor",
-    "restrictive",
-    "rts",
-    "rts_backward",
-    "schemes",
-    "schuler_row",
-    "select_order",
-    "smooth_track",
-    "smoother",
-    "transition",
-    "two_point",
-    "two_point_bvp",
-    "weights",
-]
