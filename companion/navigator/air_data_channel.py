@@ -23,17 +23,26 @@ TROPOPAUSE = 11_000.0  # [m], where the lapse ends
 P1, T1, SCALE_M = 22_632.06, 216.65, 6341.62  # there [Pa], [K]; above, the pressure falls to 1 / e in [m]
 HEIGHT_EXPONENT = 0.190263  # R L / (g M): T / T0 = (p / P0)^0.19
 DENSITY_EXPONENT = 1.0 - HEIGHT_EXPONENT  # rho / rho0 = (p / P0) / (T / T0)
-CLIMB_S = 2.0  # time constant of the climb taken from the pressure altitude
+CLIMB_S = 0.7  # time constant of the climb taken from the pressure altitude
+CLIMB_NS = 2_000_000_000  # after such a silence of the pressure no climb is known
 STEP_S = 10.0  # a pressure that stepped and stays is used again after so long
 
 
 class Reckoner(Struct, frozen=True):
-    """What is needed to go on: last attitude, airspeed and pressure (Pa) with its time, None before one."""
+    """What is needed to go on: last attitude, airspeed and pressure (Pa) with its time, None before one.
+
+    `climb` is the rate of the pressure altitude (m/s).
+    """
 
     attitude: Attitude | None = None
     air: AirData | None = None
     static: float | None = None
     static_ns: int = 0
+    climb: float = 0.0
+
+    def climb_at(self, t_ns: int) -> float:
+        """The climb (m/s) at `t_ns`: none once the pressure is silent."""
+        return self.climb if t_ns - self.static_ns <= CLIMB_NS else 0.0
 
 
 def sense(r: Reckoner, record: Attitude | AirData | Pressure) -> Reckoner:
@@ -42,7 +51,13 @@ def sense(r: Reckoner, record: Attitude | AirData | Pressure) -> Reckoner:
         return structs.replace(r, attitude=record)
     if isinstance(record, AirData):
         return structs.replace(r, air=record)
-    return structs.replace(r, static=record.static, static_ns=record.t_ns) if _is_static(record) else r
+    if not _is_static(record):
+        return r
+    gap_s, climb = (record.t_ns - r.static_ns) * 1e-9, 0.0
+    if r.static is not None and record.t_ns - r.static_ns <= CLIMB_NS:
+        up = pressure_altitude(record.static) - pressure_altitude(r.static)
+        climb = r.climb + (up - r.climb * gap_s) / (CLIMB_S + gap_s)
+    return structs.replace(r, static=record.static, static_ns=record.t_ns, climb=climb)
 
 
 def step(r: Reckoner, record: Pressure, climb: float) -> Rejection | None:

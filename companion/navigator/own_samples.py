@@ -364,12 +364,8 @@ def _at_height(nominal: Nominal, s: Sensors) -> Nominal:
     if s.air.static is None:
         return nominal
     point = nominal.point
-    dt = (point.t_ns - nominal.since.t_ns) * 1e-9
     alt = air_data_channel.pressure_altitude(s.air.static)
-    climb = -point.v_n[2]
-    if dt > 0.0:
-        climb += min(dt / air_data_channel.CLIMB_S, 0.2) * ((alt - nominal.since.position.alt) / dt - climb)
-    v_n = (point.v_n[0], point.v_n[1], -climb)
+    v_n = (point.v_n[0], point.v_n[1], -s.air.climb_at(point.t_ns))
     return structs.replace(nominal, point=point._replace(position=point.position._replace(alt=alt), v_n=v_n))
 
 

@@ -9,14 +9,15 @@ import pytest
 
 from companion.config import load
 from companion.nav.geometry import Geodetic, displace, slant_range_azimuth
-from companion.navigator import Navigator, height_error
-from companion.navigator.air_data_channel import HEIGHT_EXPONENT, LAPSE, P0, T0, pressure_altitude
+from companion.navigator import Navigator, air_data_channel, height_error
+from companion.navigator.air_data_channel import HEIGHT_EXPONENT, LAPSE, P0, T0, Reckoner, pressure_altitude
 from companion.navigator.height_error import Level
 from companion.navigator.inertial_track import Point
 from companion.records import (
     AirData,
     Attitude,
     Gnss,
+    Imu,
     LocalOrigin,
     LocalPosition,
     Pressure,
@@ -24,6 +25,7 @@ from companion.records import (
     RsbnFix,
     Solution,
 )
+from companion.units import G0
 
 NS = 1_000_000_000
 GATE = 24.0
@@ -174,6 +176,46 @@ def flown_level(
             elif isinstance(out, Rejection):
                 rejections.append(out)
     return off, rejections
+
+
+def climbing(climb: float, pressure_every: int = 1, seconds: int = 40) -> list[Solution]:
+    """Climb north at 15 m/s by an IMU at 20 Hz, a pressure every so many samples, and GNSS between them."""
+    navigator, records = Navigator(load(environment={})), list[object]()
+    for k in range(20 * seconds):
+        t, t_ns = k / 20, k * NS // 20
+        alt = START.alt + climb * t
+        records += [
+            Attitude(t_ns, t_ns, 1e-6 * k, 0.0, 0.0),
+            Imu(t_ns, t_ns, 0, (1e-6 * k, 0.0, -G0), (1e-6 * k, 0.0, 0.0)),
+        ]
+        if k % pressure_every == 0:
+            records.append(Pressure(t_ns, t_ns, P0 * (1.0 - alt * LAPSE / T0) ** (1.0 / HEIGHT_EXPONENT)))
+        if k % 4 == 0:
+            t_ns += NS // 40
+            place = displace(*START, 15.0 * (t + 0.025), 0.0, 0.0)._replace(alt=alt + 0.025 * climb)
+            v_n = (15.0, 0.0, -climb)
+            records.append(Gnss(t_ns, t_ns, 0, t_ns // 1000, 3, *place, 1.5, 3.0, v_n=v_n))
+    outputs = [out for record in records for out in navigator.handle(record)]
+    return [out for out in outputs if isinstance(out, Solution)]
+
+
+@pytest.mark.parametrize("pressure_every", [1, 4])
+@pytest.mark.parametrize("climb", [5.0, -20.0])
+def test_the_vertical_velocity_of_a_steady_climb_is_that_of_the_pressure(
+    climb: float, pressure_every: int
+) -> None:
+    """It was the rate since the last fix, of a height older than that: a fifth too fast."""
+    late = [out for out in climbing(climb, pressure_every) if out.t_ns > 20 * NS]
+    assert len(late) > 50
+    assert [out.v_n[2] for out in late] == pytest.approx([-climb] * len(late), rel=0.01)
+
+
+def test_without_a_pressure_no_climb_is_known() -> None:
+    """A sensor that is silent leaves the last height, and no vertical velocity."""
+    last, silent_ns = air_data_channel.sense(Reckoner(), Pressure(NS, NS, 99e3)), 3 * NS
+    rising = air_data_channel.sense(last, Pressure(NS + NS // 5, NS + NS // 5, 98.9e3))
+    assert rising.climb > 1.0 and rising.climb_at(rising.static_ns) == rising.climb
+    assert rising.climb_at(rising.static_ns + silent_ns) == 0.0
 
 
 def test_the_pressure_of_a_height_gives_that_height() -> None:
