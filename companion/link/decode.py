@@ -300,8 +300,6 @@ def _highres_imu(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
     t_ns = _stamped(m, rx, sender)
     updated = m.fields_updated
     records: tuple[Stamped, ...] = ()
-    if updated & _INERTIAL_UPDATED == _INERTIAL_UPDATED:
-        records += (Imu(t_ns, rx, m.id, vector(m, "xacc yacc zacc"), vector(m, "xgyro ygyro zgyro")),)
     if updated & mavlink.HIGHRES_IMU_UPDATED_ABS_PRESSURE:
         static = number(m, "abs_pressure", 100.0)
         differential = celsius = None
@@ -311,6 +309,8 @@ def _highres_imu(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
             celsius = optional_number(m, "temperature")
         kelvin = None if celsius is None else celsius + ZERO_CELSIUS
         records += (Pressure(t_ns, rx, static, differential, kelvin),)
+    if updated & _INERTIAL_UPDATED == _INERTIAL_UPDATED:  # last: it moves the trajectory, to that height
+        records += (Imu(t_ns, rx, m.id, vector(m, "xacc yacc zacc"), vector(m, "xgyro ygyro zgyro")),)
     return records
 
 

@@ -26,6 +26,7 @@ from companion.records import (
     Imu,
     LocalPosition,
     Output,
+    Pressure,
     Reboot,
     Rejection,
     RsbnFix,
@@ -42,6 +43,9 @@ AIRSPEED_S, ATTITUDE_S = 10.0, 2.0
 ANSWERS, HALF_ANSWERS = 3, 5
 #: Samples of an IMU alike under new times; at rest a simulator's are alike, and their rates are zero.
 SAMPLES = 3
+#: So many of one source are remembered: a beacon's answer comes on two links, and PX4 sends a pressure at
+#: once (HIGHRES_IMU) and again up to 0.2 s later (SCALED_PRESSURE): late, it would cost a roll-back.
+REMEMBERED: dict[type[Stamped], int] = {RsbnFix: 8, Pressure: 32}
 #: Two answers alike and this near are one that came twice, and so are two of anything else: what maps the
 #: autopilot's times is adjusted in between.
 SAME_ANSWER_NS, SAME_NS = 50_000_000, 5_000_000
@@ -104,6 +108,7 @@ LAWS: dict[type[Stamped], Law] = {
         lambda r: (r.airspeed,),
         lambda r, times, lasted_s: r.airspeed > FLYING_M_S and lasted_s >= AIRSPEED_S,
     ),
+    Pressure: Law(lambda r: "pressure", lambda r: (r.static,), lambda r, times, lasted_s: False),
     RsbnFix: Law(lambda r: f"rsbn {r.beacon}", lambda r: (r.azimuth, r.slant_range), _enough),
 }
 
@@ -123,7 +128,7 @@ class StaleDataDetector:
                 self._runs.clear()
             return None
         source, content = law.source(record), law.content(record)
-        if isinstance(record, RsbnFix) and self._came(source, record.t_ns, content):
+        if type(record) in REMEMBERED and self._came(source, record, content):
             return []
         stamp, same = (record.stamp_us, 0) if isinstance(record, Gnss) else (record.t_ns, SAME_NS)
         run = self._runs.get(source)
@@ -143,9 +148,9 @@ class StaleDataDetector:
             )
         return None
 
-    def _came(self, source: str, t_ns: int, content: tuple[Any, ...]) -> bool:
-        """Whether this answer came before, perhaps on another link; else it is remembered."""
-        known = self._answers.setdefault(source, deque(maxlen=8))
+    def _came(self, source: str, record: Stamped, content: tuple[Any, ...]) -> bool:
+        """Whether this came before, on another link or in another message; else it is remembered."""
+        t_ns, known = record.t_ns, self._answers.setdefault(source, deque(maxlen=REMEMBERED[type(record)]))
         if any(abs(t_ns - t) <= SAME_ANSWER_NS and content == c for t, c in known):
             return True
         known.append((t_ns, content))

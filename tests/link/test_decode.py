@@ -204,12 +204,12 @@ def test_both_attitudes_agree() -> None:
 
 def test_highres_imu_gives_the_updated_fields_only() -> None:
     fields = {"zacc": -9.75, "xgyro": 0.5, "abs_pressure": 995.0, "diff_pressure": 1.5, "temperature": 15.0}
-    imu, pressure = decoded("HIGHRES_IMU", "px4", time_usec=5000, id=2, fields_updated=6719 | 0x400, **fields)
+    pressure, imu = decoded("HIGHRES_IMU", "px4", time_usec=5000, id=2, fields_updated=6719 | 0x400, **fields)
     assert imu == r.Imu(BOOT + 5_000_000, RX, 2, (0.0, 0.0, -9.75), (0.5, 0.0, 0.0))
     assert pressure == r.Pressure(BOOT + 5_000_000, RX, 99_500.0, 150.0, 288.15)
     assert decoded("HIGHRES_IMU", fields_updated=0x1C0) == ()
     assert [type(x) for x in decoded("HIGHRES_IMU", fields_updated=63)] == [r.Imu]
-    assert decoded("HIGHRES_IMU", fields_updated=6719)[1].differential is None  # type: ignore[attr-defined]
+    assert decoded("HIGHRES_IMU", fields_updated=6719)[0].differential is None  # type: ignore[attr-defined]
 
 
 def test_scaled_units_are_thousandths() -> None:

@@ -23,6 +23,7 @@ from companion.records import (
     Imu,
     LocalOrigin,
     LocalPosition,
+    Pressure,
     Reboot,
     Rejection,
     RsbnFix,
@@ -127,6 +128,21 @@ def test_an_answer_heard_on_two_links_is_used_once_in_whatever_order() -> None:
     one, two = rsbn(1.0, 1.0, 60e3), rsbn(2.0, 1.01, 60.01e3)
     assert verdicts([one, rsbn(1.001, 1.0, 60e3), two, one, two]) == ["used", "", "used", "", ""]
     assert verdicts([one, rsbn(1.0, 1.0, 60e3, beacon=2)]) == ["used", "used"]
+
+
+def test_a_pressure_that_comes_in_two_messages_is_used_once() -> None:
+    """SCALED_PRESSURE of PX4 repeats a value of HIGHRES_IMU (50 Hz) up to 150 ms later, at its own time."""
+    rng, records = random.Random(2), []
+    for k in range(500):
+        t_ns = k * NS // 50
+        records.append(Pressure(t_ns, t_ns, rng.gauss(99e3, 1.5)))
+        if k % 10 == 0:
+            repeat_ns, rx_ns = t_ns - 28 * NS // 1000, t_ns + 148 * NS // 1000
+            records.append(Pressure(repeat_ns, rx_ns, records[-1].static, 0.0))
+    found = verdicts(sorted(records, key=lambda record: record.rx_ns))
+    assert found.count("used") == 500 and found.count("") == 50
+    level = [Pressure(k * NS // 10, k * NS // 10, 99e3) for k in range(100)]
+    assert set(verdicts(level)) == {"used"}
 
 
 def test_honest_rounding_costs_few_answers() -> None:
