@@ -84,7 +84,10 @@ SURPRISE = (
 #: The attitude, and the IMU with it, becomes worse and better again within a flight: parked, in a climb, in
 #: aerobatics. With 1e-5, as for an INS, a healthy GNSS was excluded beside a wrong IMU or a wrong heading.
 GRADE_CHANGES_H = 10.0
-HEADING_STEPS_H, HEADING_STEP = 1e-2, 0.3  # rad: a compass, or the autopilot resets its heading
+#: A compass, or the autopilot resets its heading (rad). The wind took up what was wrong with it before (m/s).
+HEADING_STEPS_H, HEADING_STEP, HEADING_WIND = 10.0, 0.5, 7.0
+#: Attitude and IMU give a false velocity (m/s): a hard turn with an attitude that is off, another latency.
+VELOCITY_STEPS_H, VELOCITY_STEP = 0.1, 10.0
 JAMMED = 100.0  # times likelier while the receiver itself reports jamming or spoofing
 
 
@@ -257,7 +260,10 @@ def _hypotheses(config: Config, channel: Channel, beacons: int, by_air: bool, wi
         sigmas = (jump,) * 6 if by_air else (jump, jump, GUST_OPEN_M_S, GUST_OPEN_M_S)
         jumps.append(Jump("wind", states, sigmas, rate_h, quota=24, often=True))
     if channel.wind:
-        jumps.append(Jump("heading", (own_error_model.HEADING,), (HEADING_STEP,), HEADING_STEPS_H))
+        turned = (own_error_model.HEADING, *channel.wind)
+        by = (HEADING_STEP, HEADING_WIND, HEADING_WIND)
+        jumps.append(Jump("heading", turned, by, HEADING_STEPS_H))
+        jumps.append(Jump("velocity", (2, 3), (VELOCITY_STEP, VELOCITY_STEP), VELOCITY_STEPS_H))
         # whatever the model does not know: GNSS is believed again after a second or two
         jumps.append(
             Jump(
