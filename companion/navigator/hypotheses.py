@@ -86,6 +86,7 @@ SURPRISE = (
 GRADE_CHANGES_H = 10.0
 #: A compass, or the autopilot resets its heading (rad). The wind took up what was wrong with it before (m/s).
 HEADING_STEPS_H, HEADING_STEP, HEADING_WIND = 10.0, 0.5, 7.0
+AIR_HEADING_STEPS_H = 1e-2  # by airspeed a wrong heading turns no acceleration
 #: Attitude and IMU give a false velocity (m/s): a hard turn with an attitude that is off, another latency.
 VELOCITY_STEPS_H, VELOCITY_STEP = 0.1, 10.0
 JAMMED = 100.0  # times likelier while the receiver itself reports jamming or spoofing
@@ -262,8 +263,9 @@ def _hypotheses(config: Config, channel: Channel, beacons: int, by_air: bool, wi
     if channel.wind:
         turned = (own_error_model.HEADING, *channel.wind)
         by = (HEADING_STEP, HEADING_WIND, HEADING_WIND)
-        jumps.append(Jump("heading", turned, by, HEADING_STEPS_H))
-        jumps.append(Jump("velocity", (2, 3), (VELOCITY_STEP, VELOCITY_STEP), VELOCITY_STEPS_H))
+        heading_h, velocity_h = (AIR_HEADING_STEPS_H, 0.0) if by_air else (HEADING_STEPS_H, VELOCITY_STEPS_H)
+        jumps.append(Jump("heading", turned, by, heading_h))
+        jumps.append(Jump("velocity", (2, 3), (VELOCITY_STEP, VELOCITY_STEP), velocity_h))
         # whatever the model does not know: GNSS is believed again after a second or two
         jumps.append(
             Jump(
