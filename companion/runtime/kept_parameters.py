@@ -42,9 +42,9 @@ class KeptParameters:
         `base` is the configuration without the kept values, of the file `configuration`; `load` returns the
         one with them. Raises ConfigError if the path is of something else than kept values.
         """
-        self._check(configuration)
         if not self.path.exists():
             return base, []
+        self._check(configuration)
         _, failed = self._count()
         if failed >= MAX_FAILED_STARTS:
             return base, [self._set_aside(f"the last {failed} starts with them failed")]
@@ -68,12 +68,13 @@ class KeptParameters:
 
     def _check(self, configuration: Path | None) -> None:
         """Raise ConfigError if the path is of something else, which would be renamed or replaced."""
-        if self.path.exists() and not self.path.is_file():
-            raise ConfigError(f"link.parameters_file: {self.path} is no regular file: give another name")
-        if configuration is not None and self.path.exists() and self.path.samefile(configuration):
-            raise ConfigError(
-                f"link.parameters_file: {self.path} is the configuration file: give another name"
-            )
+        what = ""
+        if not self.path.is_file():
+            what = "no regular file"
+        elif configuration is not None and self.path.samefile(configuration):
+            what = "the configuration file"
+        if what:
+            raise ConfigError(f"link.parameters_file: {self.path} is {what}: give another name")
 
     def _add(self, number: int) -> None:
         if self.path.exists():
