@@ -24,7 +24,7 @@ P1, T1, SCALE_M = 22_632.06, 216.65, 6341.62  # there [Pa], [K]; above, the pres
 HEIGHT_EXPONENT = 0.190263  # R L / (g M): T / T0 = (p / P0)^0.19
 DENSITY_EXPONENT = 1.0 - HEIGHT_EXPONENT  # rho / rho0 = (p / P0) / (T / T0)
 CLIMB_S = 0.7  # time constant of the climb taken from the pressure altitude
-CLIMB_NS = 2_000_000_000  # after such a silence of the pressure no climb is known
+CLIMB_NS = 2_000_000_000  # heights farther apart, of pressure or of GNSS, show no climb
 STEP_S = 10.0  # a pressure that stepped and stays is used again after so long
 
 

@@ -9,7 +9,7 @@ from msgspec import structs
 from companion.estimate.bank.settings import DEFAULT as THRESHOLDS
 from companion.estimate.fusion import Azimuth
 from companion.navigator import fix_observations, height_error, measurements, own_channel, scatter
-from companion.navigator.hypotheses import GNSS, MOST_BEACONS, VELOCITY
+from companion.navigator.hypotheses import CHANNEL_JUMP_M, GNSS, MOST_BEACONS, VELOCITY
 from companion.navigator.own_channel import OwnChannel
 from companion.navigator.progress import (
     carried,
@@ -53,7 +53,7 @@ from companion.units import SECOND_NS
 
 GATE_SIGMA = 5.0
 MEAN_S = 60.0  # of the estimated velocity error, for GNSS latency
-FAR_M = 500.0  # within it a jump of the channel explains a fix
+JUMPED_M = GATE_SIGMA * CHANNEL_JUMP_M  # within it a jump of the channel explains a fix
 REFUSED_NS = 10 * SECOND_NS  # fixes that no hypothesis takes begin the position again after so long at least
 
 
@@ -89,7 +89,7 @@ def gnss(state: State, record: Gnss, settings: Settings) -> Step:
     shows_latency = is_measured or driver(state) != "hold"
     taken = measurements.gnss_position(bank, known, channel, apart, factor * variance, v_n, shows_latency)
     restarted = list[Output]()
-    if taken.accepted and not taken.by_former and _apart(state, record, settings) > FAR_M:
+    if taken.accepted and not taken.by_former and _apart(state, record, settings) > JUMPED_M:
         # only a row that another doubt has made wide enough explains the jump: the position is what is wrong
         state, restarted = _restarted(state, record, 0, settings)
         taken = taken._replace(bank=state.bank or bank, accepted=False) if restarted else taken
@@ -104,24 +104,8 @@ def gnss(state: State, record: Gnss, settings: Settings) -> Step:
         least_ns = max(REFUSED_NS, _before_ns(state))
         state, again = _restarted(structs.replace(state, refused_ns=refused_ns), record, least_ns, settings)
         return nearer(state, settings), [*out, *restarted, *again]
-    since = math.inf if state.gnss_ns is None else (record.t_ns - state.gnss_ns) * 1e-9
-    part = min(since, config.correlation_s) / config.correlation_s
-    level = height_error.update(state.level, record, nominal.point, part, GATE_SIGMA**2)
-    if level.refused_ns is not None:
-        off = abs(nominal.point.position.alt - level.error - record.alt_msl)
-        out.append(Rejection(record.t_ns, record.rx_ns, f"height of {label}", "outlier: innovation, m", off))
-    pending = None
-    if state.false[GNSS] < known.settings.suspect:
-        pending = Pending(record, nominal.point, (0.0, 0.0), Source.GNSS)
-    state = structs.replace(
-        state,
-        gnss_ns=record.t_ns,
-        gnss_fix=(record, nominal.point),
-        level=level,
-        pending=pending,
-        refused_ns=None,
-    )
-    return nearer(state, settings), out
+    state, more = _believed(state, record, settings)
+    return nearer(state, settings), [*out, *more]
 
 
 def is_too_soon(record: Gnss, state: State, settings: Settings) -> bool:
@@ -131,6 +115,31 @@ def is_too_soon(record: Gnss, state: State, settings: Settings) -> bool:
     """
     last = state.gnss_taken
     return last is not None and 0.0 <= (record.t_ns - last.t_ns) * 1e-9 < settings.config.gnss.every_s
+
+
+def _believed(state: State, record: Gnss, settings: Settings) -> Step:
+    """What follows from a fix that is believed: its height is used, and it is a fix of the bound."""
+    config, nominal, out = settings.config.gnss, state.nominal, list[Output]()
+    assert nominal is not None
+    since = math.inf if state.gnss_ns is None else (record.t_ns - state.gnss_ns) * 1e-9
+    part = min(since, config.correlation_s) / config.correlation_s
+    level = height_error.update(state.level, record, nominal.point, part, GATE_SIGMA**2)
+    if level.refused_ns is not None:
+        off = abs(nominal.point.position.alt - level.error - record.alt_msl)
+        source = f"height of gnss {record.receiver}"
+        out.append(Rejection(record.t_ns, record.rx_ns, source, "outlier: innovation, m", off))
+    pending = None
+    if state.false[GNSS] < hypotheses(state, settings).settings.suspect:
+        pending = Pending(record, nominal.point, (0.0, 0.0), Source.GNSS)
+    state = structs.replace(
+        state,
+        gnss_ns=record.t_ns,
+        gnss_fix=(record, nominal.point),
+        level=level,
+        pending=pending,
+        refused_ns=None,
+    )
+    return state, out
 
 
 def _latency_velocity(state: State, t_ns: int, is_measured: bool) -> tuple[State, Vector2]:

@@ -41,7 +41,7 @@ GNSS, AIRSPEED, VELOCITY = range(len(SOURCES))
 CONSISTENT, POSITION_ONLY = 0, 1  # faults of GNSS: its velocity is false too, or true
 GNSS_GROUP, BEACON_GROUP, AIRSPEED_GROUP = 0, 1, 2
 GROUPS = (2, 2, 1)
-CHANNEL_JUMPS_H = 1e-3
+CHANNEL_JUMPS_H, CHANNEL_JUMP_M = 1e-3, 100.0
 INS_JUMPS_H = 0.01  # its position, by a reset of the unit
 #: The velocity of an INS steps (m, m/s), so rarely that a GNSS drawn off by 0.5 m/s is beyond doubt in 2.4 s.
 #: Beacons that contradict are believed within two minutes: without it an INS that drifted excluded all else.
@@ -251,38 +251,12 @@ def _hypotheses(config: Config, channel: Channel, beacons: int, by_air: bool, wi
             ends_h = BEACON_H if name == "elsewhere" else 1.0
             fault = Fault(f"{name} {k}", which, BEACON_H, lies, first, lies, (), ends_h, BEACON_H, quota=4)
             faults.append(fault)
-    jumps = []
-    if channel.wind:
-        jump = config.air_data.wind_jump_m_s
-        rate_h = config.air_data.wind_jumps_per_hour
-        # it is noticed up to a second later: beside the IMU the gust has taken it up until then; by air data
-        # the velocity over ground jumps with the wind
-        states = (*channel.wind, *((2, 3, 0, 1) if by_air else GUST))
-        sigmas = (jump,) * 6 if by_air else (jump, jump, GUST_OPEN_M_S, GUST_OPEN_M_S)
-        jumps.append(Jump("wind", states, sigmas, rate_h, quota=24, often=True))
-    if channel.wind:
-        turned = (own_error_model.HEADING, *channel.wind)
-        by = (HEADING_STEP, HEADING_WIND, HEADING_WIND)
-        heading_h, velocity_h = (AIR_HEADING_STEPS_H, 0.0) if by_air else (HEADING_STEPS_H, VELOCITY_STEPS_H)
-        jumps.append(Jump("heading", turned, by, heading_h))
-        jumps.append(Jump("velocity", (2, 3), (VELOCITY_STEP, VELOCITY_STEP), velocity_h))
-        # whatever the model does not know: GNSS is believed again after a second or two
-        jumps.append(
-            Jump(
-                "channel", (0, 1, 2, 3), (100.0, 100.0, 20.0, 20.0), CHANNEL_JUMPS_H, quota=4, apart_s=APART_S
-            )
-        )
-    else:
-        jumps.append(Jump("channel", (0, 1), (100.0, 100.0), INS_JUMPS_H, quota=2, apart_s=APART_S))
-        states = (0, 1, 2, 3)
-        for name, sigmas, again_h in (("drift", INS_DRIFT, INS_DRIFTS_AGAIN_H), ("misled", INS_MISLED, None)):
-            jumps.append(Jump(name, states, sigmas, INS_DRIFTS_H, quota=2, apart_s=APART_S, again_h=again_h))
     layout = Layout(
         channel.n + BIASES * beacons,
         GROUPS,
         tuple(sources),
         tuple(faults),
-        jumps=tuple(jumps),
+        jumps=_jumps(config, channel, by_air),
         grades=tuple(range(len(channel.grades))),
         orders=ORDERS,
     )
@@ -292,3 +266,29 @@ def _hypotheses(config: Config, channel: Channel, beacons: int, by_air: bool, wi
         switch_h=GRADE_CHANGES_H if channel.wind else DEFAULT.switch_h,
     )
     return Hypotheses(layout, settings, (azimuth_bias, range_bias, LATE_S) * beacons)
+
+
+def _jumps(config: Config, channel: Channel, by_air: bool) -> tuple[Jump, ...]:
+    """What may jump without a source being false."""
+    away, moved = (CHANNEL_JUMP_M, CHANNEL_JUMP_M), (0, 1, 2, 3)
+    if not channel.wind:
+        return (
+            Jump("channel", (0, 1), away, INS_JUMPS_H, quota=2, apart_s=APART_S),
+            Jump("drift", moved, INS_DRIFT, INS_DRIFTS_H, 2, APART_S, again_h=INS_DRIFTS_AGAIN_H),
+            Jump("misled", moved, INS_MISLED, INS_DRIFTS_H, quota=2, apart_s=APART_S),
+        )
+    jump, rate_h = config.air_data.wind_jump_m_s, config.air_data.wind_jumps_per_hour
+    # a wind is noticed up to a second later: beside the IMU the gust has taken it up until then; by air data
+    # the velocity over ground jumps with it
+    states = (*channel.wind, *((2, 3, 0, 1) if by_air else GUST))
+    sigmas = (jump,) * 6 if by_air else (jump, jump, GUST_OPEN_M_S, GUST_OPEN_M_S)
+    turned = (own_error_model.HEADING, *channel.wind)
+    by = (HEADING_STEP, HEADING_WIND, HEADING_WIND)
+    heading_h, velocity_h = (AIR_HEADING_STEPS_H, 0.0) if by_air else (HEADING_STEPS_H, VELOCITY_STEPS_H)
+    return (
+        Jump("wind", states, sigmas, rate_h, quota=24, often=True),
+        Jump("heading", turned, by, heading_h),
+        Jump("velocity", (2, 3), (VELOCITY_STEP, VELOCITY_STEP), velocity_h),
+        # whatever the model does not know: GNSS is believed again after a second or two
+        Jump("channel", moved, (*away, 20.0, 20.0), CHANNEL_JUMPS_H, quota=4, apart_s=APART_S),
+    )

@@ -13,6 +13,7 @@ from companion.estimate import bank as banks
 from companion.estimate.bank import Bank, Estimate
 from companion.nav.geometry import Geodetic, displace
 from companion.navigator import height_error
+from companion.navigator.air_data_channel import CLIMB_NS
 from companion.navigator.channel import Nominal
 from companion.navigator.height_error import Level
 from companion.navigator.hypotheses import SOURCES, Hypotheses, Model
@@ -28,7 +29,6 @@ from companion.units import SECOND_NS
 FIXES = Source.GNSS | Source.AZIMUTH | Source.RANGE
 JAMMED_NS = 10 * SECOND_NS  # the receiver's word lasts so long
 SUSPECT, EXCLUDED = 1, 2
-CLIMB_NS = 2 * SECOND_NS  # fixes farther apart show no climb
 NEAR_S = 0.5  # the bank is at most so far behind: in between the error moves by its velocity
 
 
