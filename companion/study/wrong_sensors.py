@@ -72,6 +72,7 @@ def _azimuth(deg: float) -> Change:
 
 WRONG: dict[str, tuple[type[Stamped], Change]] = {
     "heading off by 20 deg": (Attitude, _heading(20.0)),
+    "heading off by 45 deg": (Attitude, _heading(45.0)),
     "heading off by 90 deg": (Attitude, _heading(90.0)),
     "attitude stuck while the gyros go on": (
         Attitude,
