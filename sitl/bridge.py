@@ -127,8 +127,8 @@ class Bridge:
                 self._send_queues[1].append(found.raw)
             if found.msgid in POSITION_MESSAGES and found.component != mavlink.MAV_COMP_ID_AUTOPILOT1:
                 self._on_companion(found, now_ns)
-            # the companion answers TIMESYNC: there must be one clock
-            if found.msgid != mavlink.MAVLINK_MSG_ID_TIMESYNC:
+            # the companion answers the autopilot's TIMESYNC requests: there must be one clock
+            if found.msgid != mavlink.MAVLINK_MSG_ID_TIMESYNC or dialect.decode(found).tc1:
                 self._on_events(self._session.receive(found.raw, now_ns), now_ns)
 
     def from_companion(self, data: bytes, now_ns: int) -> None:

@@ -148,6 +148,33 @@ def test_an_autopilot_without_a_position_is_not_scored(lat_deg: float, scored: b
     assert any(error.source == AUTOPILOT for error in bridge.comparison.errors) == scored
 
 
+def test_a_simulator_that_stood_still_does_not_shift_the_errors() -> None:
+    """Its clock is late by 0.8 s from then on; by arrivals alone, companion errors at 20 m/s grow by 16 m."""
+    bridge, speed, replies, sequence = Bridge(), 20e7 / 111_320.0, [], itertools.count()
+    for k in range(1, 300):
+        now = START + k * SECOND // 10
+        if 150 <= k < 158:
+            continue  # stands still
+        boot = k * 100 - (800 if k >= 158 else 0)
+        north = round(557_500_000 + speed * boot / 1000)
+        sent = [
+            dialect.new("HEARTBEAT", type=1, autopilot=mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA),
+            dialect.new("GLOBAL_POSITION_INT", time_boot_ms=boot, lat=north, lon=1000, alt=100_000),
+            dialect.new("SIM_STATE", lat=55.75, lon=1e-4, lat_int=north, lon_int=1000),
+            *(dialect.new("TIMESYNC", tc1=boot * 1_000_000, ts1=ts1) for ts1 in replies),
+        ]
+        for message in sent:
+            bridge.from_autopilot(frame.encode(message, next(sequence) % 256, 1, 1), now)
+        estimate = dialect.new(
+            "GLOBAL_POSITION_SENSOR", time_usec=now // 1000, lat=north, lon=1000, alt=100.0, eph=5.0
+        )
+        bridge.from_companion(frame.encode(estimate, k % 256, 1, 191), now)
+        bridge.poll(now)
+        replies = [m.ts1 for m in decoded(bridge.to_autopilot()) if m.get_type() == "TIMESYNC" and not m.tc1]
+    late = [e for e in bridge.comparison.errors if e.source == COMPANION and e.t_ns > START + 20 * SECOND]
+    assert len(late) > 50 and max(math.hypot(e.north, e.east) for e in late) < 2.0  # a round trip: 0.1 s
+
+
 def test_unaided_scores_companion_positions_without_relaying_them(relayed) -> None:
     row = relayed.rows()[COMPANION]
     assert row.samples > 350 and row.within is not None
