@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 SILENT_S = 5.0  # after a longer silence the differences start again
 UNEQUAL = 1.5  # of two distances
-CLIPPED = 6.0  # times the mean
+CLIPPED = 6.0  # times the factor that is used: a source far quieter than it states may become noisy at once
 FIRST, LAST = 4, 40  # measurements that the mean remembers, at the start and later
 UNKNOWN, UNKNOWN_FOR = 9.0, 6  # factor of the first measurements, and their number: four differences
 MOST = 100.0
@@ -62,7 +62,7 @@ def observe(s: Scatter | None, t_ns: int, r: tuple[float, ...], variance: float,
     squares = sum((r2 - 2.0 * r1 + r0) ** 2 for r0, r1, r2 in zip(s.before, s.last, r, strict=True)) / 6.0
     ratio = squares / len(r) / (variance + (a * dt * dt) ** 2 / 6.0)
     many = min(s.many + 1, LAST - FIRST)
-    most = CLIPPED * s.factor if s.many >= FIRST else MOST  # at the start the fixes themselves give the scale
+    most = CLIPPED * s.used if s.many >= FIRST else MOST  # at the start the fixes themselves give the scale
     factor = s.factor + (min(ratio, most) - s.factor) / (FIRST + many)
     noisy = factor > (QUIET if s.noisy else NOISY)
     return s._replace(t_ns=t_ns, last=r, dt=dt, before=s.last, factor=factor, many=many, noisy=noisy)

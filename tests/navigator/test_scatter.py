@@ -51,6 +51,15 @@ def test_noise_greater_than_stated_is_found_within_four_seconds(times: float) ->
     assert np.mean([math.sqrt(s.used) for s in found[20:]]) == pytest.approx(times, rel=0.15)
 
 
+@pytest.mark.parametrize("quiet", [0.03, 0.3])
+def test_noise_of_a_source_that_was_quiet_is_found_nearly_as_soon_as_of_an_honest_one(quiet: float) -> None:
+    # clipped to six times a mean of 0.001, as a simulated receiver's, it was not found after 30 fixes
+    for seed in range(10):
+        before, noisy = noise(200, seed), 3.0 * noise(30, 10 + seed)
+        soonest = observed(np.concatenate([before, noisy]))[-1].used
+        assert observed(np.concatenate([quiet * before, noisy]))[-1].used > 0.6 * soonest
+
+
 SLOW: dict[str, Callable[[Floats], Floats]] = {
     "offset of a kilometre": lambda t: np.full_like(t, 1000.0),
     "drawn off at 5 m/s": lambda t: 5.0 * np.maximum(t - 30.0, 0.0),
