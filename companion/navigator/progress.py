@@ -118,8 +118,9 @@ def decided(state: State, record: Stamped, settings: Settings) -> State:
     before, certain = (*state.reported, *(0,) * n)[:n], (*state.certain_ns, *(0,) * n)[:n]
     reported, since = list(before), list(certain)
     for i, p in enumerate(false):
-        since[i] = (certain[i] or record.t_ns) if bank.excluded[i] else 0
-        if bank.excluded[i] and record.t_ns - since[i] >= CONFIRM_NS:
+        since[i] = (certain[i] or record.t_ns) if p > known.settings.excluded else 0
+        lasts = since[i] > 0 and record.t_ns - since[i] >= CONFIRM_NS
+        if bank.excluded[i] and (lasts or before[i] == EXCLUDED):
             reported[i] = EXCLUDED
         elif bank.excluded[i] or p > known.settings.suspect:
             reported[i] = SUSPECT
