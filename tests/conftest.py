@@ -1,4 +1,6 @@
-"""What tests share: a real browser, headless Chromium driven through its DevTools protocol."""
+"""What tests share: the command line, and a real browser, headless Chromium driven through its DevTools
+protocol.
+"""
 
 from __future__ import annotations
 
@@ -7,10 +9,12 @@ import json
 import os
 import re
 import shutil
+import signal
 import subprocess
+import sys
 import time
 import urllib.request
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +47,28 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 def pytest_collection_finish() -> None:
     """Leave the collected tests, which live to the end, out of every later garbage collection."""
     gc.freeze()
+
+
+@pytest.fixture
+def companion(
+    capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> Callable[..., subprocess.CompletedProcess[str]]:
+    """Call the entry point `companion` in this process: another one takes half a second to start."""
+    from companion.__main__ import main
+
+    def run(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
+        monkeypatch.setattr(sys, "argv", ["companion", *map(str, arguments)])
+        handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+        try:
+            with pytest.raises(SystemExit) as ended:
+                main()
+        finally:
+            for number, handler in handlers.items():
+                signal.signal(number, handler)
+        assert isinstance(ended.value.code, int)
+        return subprocess.CompletedProcess(sys.argv, ended.value.code, *capfd.readouterr())
+
+    return run
 
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")

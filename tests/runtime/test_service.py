@@ -10,6 +10,7 @@ import socket
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -31,22 +32,6 @@ def log_in(folder: Path) -> flight_log.Writer:
     return flight_log.Writer(
         folder / "a.mcap", metadata={}, start_unix_ns=time.time_ns(), start_ns=time.monotonic_ns()
     )
-
-
-def test_flight_loads_only_what_it_needs() -> None:
-    """The companion starts in flight after a power failure: reports, importers and studies stay unloaded."""
-    code = "import sys, companion.runtime.service; print(*sys.modules)"
-    loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-    ashore = ("analysis", "importers", "study", "bench", "doctor")
-    unneeded = (
-        *(f"companion.{name}" for name in ashore),
-        "rich",
-        "matplotlib",
-        "scipy.optimize",
-        "scipy.stats",
-    )
-    assert "companion.navigator" in loaded.split()
-    assert [m for m in loaded.split() if any(f"{m}.".startswith(f"{name}.") for name in unneeded)] == []
 
 
 def serve(tmp_path: Path, connect: tuple[str, ...], play) -> list[Event]:
@@ -212,6 +197,7 @@ def test_missing_serial_device_is_reported_once_and_the_other_link_works(tmp_pat
 
 ENVIRONMENT = {name: value for name, value in os.environ.items() if not name.startswith("COMPANION_")}
 RUN = [sys.executable, "-m", "companion", "run"]
+Companion = Callable[..., subprocess.CompletedProcess[str]]
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
@@ -330,24 +316,20 @@ def test_parameters_of_two_runs_are_both_saved(tmp_path: Path) -> None:
     assert (saved.sigma_m, saved.timeout_s) == (7.0, 5.0)
 
 
-def finished(*arguments: str) -> tuple[int, str]:
-    done = subprocess.run([*RUN, *arguments], capture_output=True, text=True, timeout=120, env=ENVIRONMENT)
-    return done.returncode, done.stderr
-
-
 def test_port_in_use_exits_69_with_one_line(tmp_path: Path) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
         taken.bind((LOOPBACK, 0))
-        code, stderr = finished(
-            "--connect", f"udpin:{LOOPBACK}:{taken.getsockname()[1]}", "--logs", str(tmp_path)
-        )
-    assert code == os.EX_UNAVAILABLE
-    assert sum(line.startswith("companion: cannot listen") for line in stderr.splitlines()) == 1
-    assert "Traceback" not in stderr and "listening:" not in stderr
+        command = [*RUN, "--connect", f"udpin:{LOOPBACK}:{taken.getsockname()[1]}", "--logs", str(tmp_path)]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=120, env=ENVIRONMENT)
+    assert done.returncode == os.EX_UNAVAILABLE
+    assert sum(line.startswith("companion: cannot listen") for line in done.stderr.splitlines()) == 1
+    assert "Traceback" not in done.stderr and "listening:" not in done.stderr
     assert not list(tmp_path.iterdir())  # a failed start leaves no empty log
 
 
-def test_starts_that_fail_for_another_reason_keep_the_parameters(tmp_path: Path) -> None:
+def test_starts_that_fail_for_another_reason_keep_the_parameters(
+    companion: Companion, tmp_path: Path
+) -> None:
     """An address in use, a log folder that cannot be used, no signing key, an invalid link: twice each."""
     values = tmp_path / "set.toml"
     values.write_text("[gnss]\nsigma_m = 7.0\n")
@@ -363,8 +345,8 @@ def test_starts_that_fail_for_another_reason_keep_the_parameters(tmp_path: Path)
             (78, ("--connect", "udp:1.2.3.4")),
         ):
             for _ in range(2):
-                found, stderr = finished(*keep, *arguments)
-                assert found == code and "failed" not in stderr
+                done = companion("run", *keep, *arguments)
+                assert done.returncode == code and "failed" not in done.stderr
     assert values.exists()
 
 
@@ -388,29 +370,29 @@ def test_two_killed_starts_set_the_parameters_aside(tmp_path: Path) -> None:
     assert values.with_name("set.toml.rejected").exists()
 
 
-def test_missing_key_exits_78_and_leaves_no_log(tmp_path: Path) -> None:
-    code, stderr = finished("--set", f"signing.key_file={tmp_path / 'none'}", "--logs", str(tmp_path))
-    assert code == 78 and "signing.key_file" in stderr
+def test_missing_key_exits_78_and_leaves_no_log(companion: Companion, tmp_path: Path) -> None:
+    done = companion("run", "--set", f"signing.key_file={tmp_path / 'none'}", "--logs", tmp_path)
+    assert done.returncode == 78 and "signing.key_file" in done.stderr
     assert not list(tmp_path.iterdir())
 
 
-def test_unwritable_log_folder_exits_73_with_one_line(tmp_path: Path) -> None:
+def test_unwritable_log_folder_exits_73_with_one_line(companion: Companion, tmp_path: Path) -> None:
     folder = tmp_path / "logs"
     if os.geteuid() == 0:  # root may write to any folder, but not into a file
         folder.write_text("no folder")
     else:
         folder.mkdir(mode=0o555)
-    code, stderr = finished("--logs", str(folder))
-    assert code == os.EX_CANTCREAT
-    assert len(stderr.splitlines()) == 1 and str(folder) in stderr
+    done = companion("run", "--logs", folder)
+    assert done.returncode == os.EX_CANTCREAT
+    assert len(done.stderr.splitlines()) == 1 and str(folder) in done.stderr
     if folder.is_file():
-        assert "it is a file; give a folder" in stderr
+        assert "it is a file; give a folder" in done.stderr
 
 
-def test_invalid_link_exits_78_with_one_line(tmp_path: Path) -> None:
-    code, stderr = finished("--connect", "udp:1.2.3.4", "--logs", str(tmp_path))
-    assert code == 78
-    assert len(stderr.splitlines()) == 1 and "link.connect" in stderr
+def test_invalid_link_exits_78_with_one_line(companion: Companion, tmp_path: Path) -> None:
+    done = companion("run", "--connect", "udp:1.2.3.4", "--logs", tmp_path)
+    assert done.returncode == 78
+    assert len(done.stderr.splitlines()) == 1 and "link.connect" in done.stderr
 
 
 def test_every_client_of_a_tcp_link_is_served_without_an_autopilot(tmp_path: Path) -> None:
