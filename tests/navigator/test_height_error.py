@@ -178,7 +178,7 @@ def flown_level(
     return off, rejections
 
 
-def climbing(climb: float, pressure_every: int = 1, seconds: int = 40) -> list[Solution]:
+def climbing(climb: float, pressure_every: int, seconds: int = 32) -> list[Solution]:
     """Climb north at 15 m/s by an IMU at 20 Hz, a pressure every so many samples, and GNSS between them."""
     navigator, records = Navigator(load(environment={})), list[object]()
     for k in range(20 * seconds):
@@ -227,7 +227,7 @@ def test_the_pressure_of_a_height_gives_that_height() -> None:
 @pytest.mark.parametrize("by_ins", [False, True], ids=["pressure", "ins"])
 @pytest.mark.parametrize("step_m", [4900.0, -300.0])
 def test_a_height_that_steps_for_a_second_moves_no_altitude_that_is_sent(step_m: float, by_ins: bool) -> None:
-    off, rejections = flown_level(step_m, 21.0, by_ins)
+    off, rejections = flown_level(step_m, 21.0, by_ins, seconds=25)
     assert len(off) > 100
     assert max(map(abs, off)) < 5.0
     if not by_ins:
@@ -239,7 +239,7 @@ def test_a_height_that_steps_for_a_second_moves_no_altitude_that_is_sent(step_m:
 @pytest.mark.parametrize("climb", [100.0, -25.0])
 def test_a_steep_climb_is_no_step(climb: float, by_ins: bool) -> None:
     """What is left is a delay of some samples."""
-    off, rejections = flown_level(0.0, 0.0, by_ins, climb)
+    off, rejections = flown_level(0.0, 0.0, by_ins, climb, seconds=24)
     assert rejections == []
     assert max(map(abs, off)) < 0.5 * abs(climb)
 

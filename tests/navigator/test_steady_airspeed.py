@@ -71,7 +71,7 @@ def test_the_airspeed_that_is_found_is_the_measured_one() -> None:
 
 
 def uses_air(records: list[Input], until_s: float) -> float:
-    """When a solution is first by the airspeed; inf if none is."""
+    """When a solution is first by the airspeed; inf if none is before `until_s`."""
     navigator = Navigator(CONFIG)
     for record in sorted(records, key=lambda record: record.rx_ns):
         if record.rx_ns > until_s * NS:
@@ -84,19 +84,18 @@ def uses_air(records: list[Input], until_s: float) -> float:
 
 def stated(**fields: bool) -> list[Input]:
     """The flight whose vehicle is as stated, every second."""
-    vehicles = [Vehicle(t * NS, t * NS, **fields) for t in range(1, 120)]
+    vehicles = [Vehicle(t * NS, t * NS, **fields) for t in range(1, 40)]
     return [*(r for r in without_airspeed() if not isinstance(r, Vehicle)), *vehicles]
 
 
 def test_it_is_used_of_a_fixed_wing_that_flies_without_a_sensor_only() -> None:
     flying = stated(fixed_wing=True, flying=True)
-    assert 20.0 < uses_air(flying, 90.0) < 25.0
-    assert (
-        uses_air(flying + [AirspeedSensor(t * NS, t * NS, True) for t in range(1, 90, 5)], 90.0) == math.inf
-    )
-    assert uses_air(stated(fixed_wing=True, flying=False), 90.0) == math.inf
-    assert uses_air(stated(fixed_wing=True, flying=True, hovering=True), 90.0) == math.inf
-    assert uses_air(stated(fixed_wing=False, flying=True), 90.0) == math.inf
+    assert 20.0 < uses_air(flying, 25.0) < 25.0
+    sensors = [AirspeedSensor(t * NS, t * NS, True) for t in range(1, 40, 5)]
+    assert uses_air(flying + sensors, 40.0) == math.inf
+    assert uses_air(stated(fixed_wing=True, flying=False), 40.0) == math.inf
+    assert uses_air(stated(fixed_wing=True, flying=True, hovering=True), 40.0) == math.inf
+    assert uses_air(stated(fixed_wing=False, flying=True), 40.0) == math.inf
 
 
 def test_a_sensor_that_fails_is_replaced_and_one_that_comes_back_is_used_again() -> None:
@@ -105,16 +104,16 @@ def test_a_sensor_that_fails_is_replaced_and_one_that_comes_back_is_used_again()
     scales: dict[int, float] = {}
     for record in recorded():
         if isinstance(record, AirData):
-            if 120 < record.t_ns / NS < 200:
+            if 120 < record.t_ns / NS < 150:
                 continue
             record = replace(record, airspeed=record.airspeed + 1e-3 * math.sin(record.t_ns))
         navigator.handle(record)
         bank = navigator._state.bank
         if bank is not None:
             scales[record.rx_ns // NS] = float(bank.P[int(bank.L.argmax()), SCALE, SCALE]) ** 0.5
-        if record.rx_ns > 230 * NS:
+        if record.rx_ns > 180 * NS:
             break
-    assert scales[119] < 0.04 and scales[229] < 0.04
+    assert scales[119] < 0.04 and scales[179] < 0.04
     assert max(scales[t] for t in range(125, 140)) > 0.1
     interval = navigator._state.nominal and navigator._state.nominal.interval
     assert interval is not None and interval.airspeed == "pitot"
@@ -139,7 +138,7 @@ def test_an_airspeed_without_a_sensor_is_no_source_that_may_be_false() -> None:
         navigator.handle(record)
         if navigator._state.bank is not None:
             assert navigator._state.false[AIRSPEED] == 0.0
-        if record.rx_ns > 120 * NS:
+        if record.rx_ns > 60 * NS:
             break
     assert navigator._state.nominal and navigator._state.nominal.interval
     assert navigator._state.nominal.interval.airspeed == "steady"
@@ -170,12 +169,12 @@ def test_as_the_driver_it_is_off_by_what_it_wanders() -> None:
 START = Geodetic(0.9, 0.6, 500.0)
 
 
-def speeding(seed: int, period_s: float = 30.0) -> Iterator[tuple[Input, Geodetic]]:
+def speeding() -> Iterator[tuple[Input, Geodetic]]:
     """Records of a fixed wing by attitude and GNSS at 1 Hz alone, and where it is: 12 to 26 m/s and back."""
-    rng, north, east, heading = np.random.default_rng(seed), 0.0, 0.0, 0.3
-    for k in range(2400):
+    rng, north, east, heading = np.random.default_rng(1), 0.0, 0.0, 0.3
+    for k in range(1600):
         t, t_ns = 0.1 * k, k * NS // 10
-        speed = 19.0 - 7.0 * math.cos(2.0 * math.pi * t / period_s) if t > 40.0 else 12.0
+        speed = 19.0 - 7.0 * math.cos(2.0 * math.pi * t / 30.0) if t > 40.0 else 12.0
         v_n = np.array((speed * math.cos(heading) + 4.0, speed * math.sin(heading) - 3.0))
         north, east = north + 0.1 * v_n[0], east + 0.1 * v_n[1]
         heading += 0.006 * math.sin(2.0 * math.pi * t / 70.0)
@@ -188,11 +187,10 @@ def speeding(seed: int, period_s: float = 30.0) -> Iterator[tuple[Input, Geodeti
             yield Gnss(t_ns, t_ns, 0, t_ns // 1000, 3, lat, lon, alt, 1.5, 3.0, v_n=(*seen, 0.0)), place
 
 
-@pytest.mark.parametrize("seed", [1, 2])
-def test_a_speed_that_changes_takes_nothing_off_a_healthy_gnss(seed: int) -> None:
+def test_a_speed_that_changes_takes_nothing_off_a_healthy_gnss() -> None:
     """It was 3.2 m off r.m.s. beside a GNSS of 1.2: no velocity was kept from one fix to the next."""
     navigator, own, gnss = Navigator(CONFIG), list[float](), list[float]()
-    for record, place in speeding(seed):
+    for record, place in speeding():
         found = navigator.handle(record)
         if record.t_ns < 80 * NS:
             continue
@@ -201,5 +199,5 @@ def test_a_speed_that_changes_takes_nothing_off_a_healthy_gnss(seed: int) -> Non
         for out in found:
             if isinstance(out, Solution) and out.t_ns == record.t_ns:
                 own.append(math.hypot(*separation(Geodetic(out.lat, out.lon, 0.0), place)[:2]))
-    assert len(own) > 1000
+    assert len(own) > 600
     assert np.sqrt(np.mean(np.square(own))) < 1.2 * np.sqrt(np.mean(np.square(gnss)))

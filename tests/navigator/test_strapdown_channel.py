@@ -747,7 +747,7 @@ def test_nothing_of_the_autopilots_own_position_comes_back_to_it() -> None:
 
 
 def test_late_answers_are_folded_in_at_their_own_time() -> None:
-    in_time = [r for r in with_beacon(1) if LOSS - 15.0 < r.t_ns * 1e-9 < LOSS + 25.0]
+    in_time = [r for r in with_beacon(1) if LOSS - 10.0 < r.t_ns * 1e-9 < LOSS + 15.0]
     late = [
         msgspec.structs.replace(r, rx_ns=r.rx_ns + 4 * NS) if isinstance(r, RsbnFix) else r for r in in_time
     ]

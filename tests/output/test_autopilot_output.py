@@ -241,7 +241,7 @@ def test_falsified_position_reaches_the_output_of_an_independent_ins() -> None:
     config = configured("output.profile=ardupilot", "inertial.independent=true")
     honest, falsified = Flight(config), Flight(config, falsify=falsify_position)
     for flight in (honest, falsified):
-        flight.fly(15.0)
+        flight.fly(8.0)
     assert honest.position_payloads() and falsified.position_payloads() != honest.position_payloads()
 
 
@@ -274,7 +274,7 @@ def test_origin_that_moves_is_followed_with_a_reset() -> None:
             values["x"] -= 111.3
 
     flight.falsify = move
-    flight.fly(40.0)
+    flight.fly(30.0)
     before = [m for at, m in flight.sent if m.get_type() == "ODOMETRY" and at < 20.0]
     after = flight.sent_messages("ODOMETRY", 25.0)
     assert {m.reset_counter for m in before} == {0} and {m.reset_counter for m in after} == {1}
@@ -369,7 +369,7 @@ def test_source_set_is_known_whichever_link_leads() -> None:
         (("main", "radio"), True, 1),
     ):
         flight.links, flight.gnss = links, gnss
-        for _ in range(10):
+        for _ in range(8):
             flight.fly(1.0)
             report(flight)
         assert flight.source_set == leading, (links, gnss)
@@ -381,9 +381,9 @@ def test_source_set_is_known_whichever_link_leads() -> None:
 
 def test_source_switch_can_be_disabled() -> None:
     flight = Flight(configured("output.profile=ardupilot", "output.switch_sources=false"))
-    flight.fly(15.0)
+    flight.fly(8.0)
     flight.gnss = False
-    flight.fly(15.0)
+    flight.fly(8.0)
     assert not [m for m in flight.sent_messages("COMMAND_LONG") if m.command == 42007]
     assert flight.sent_messages("ODOMETRY")
 
@@ -416,7 +416,7 @@ def test_unanswered_source_switch_is_reported() -> None:
 
 def test_no_position_reset_while_the_autopilot_has_gps() -> None:
     flight = Flight(configured("output.profile=ardupilot", "output.via=external_position"))
-    flight.fly(20.0)
+    flight.fly(10.0)
     assert flight.sent_messages("COMMAND_INT") == []
     flight.gnss = False
     flight.fly(20.0)
@@ -440,7 +440,7 @@ def test_rate_of_position_resets_cannot_be_changed() -> None:
 
 def test_gps_input_has_gps_time_and_velocity() -> None:
     flight = Flight(configured("output.profile=ardupilot", "output.via=gps_input"))
-    flight.fly(30.0)
+    flight.fly(15.0)
     m = flight.sent_messages("GPS_INPUT")[-1]
     assert (m.gps_id, m.fix_type, m.time_week) == (1, 3, 2445)
     assert m.time_week_ms == pytest.approx(547_218_000 + 1000 * flight.seconds, abs=2)
