@@ -87,7 +87,7 @@ def test_line_too_slow_by_half_is_fully_used_and_carries_no_old_frame(rate: int)
         line.room, due = int(due), due % 1
         sent = len(line.carried)
         queue.flush()
-        for begin in range(-(-sent // size) * size, len(line.carried) - size + 1, size):
+        for begin in range(sent // size * size, len(line.carried) - size + 1, size):  # whole by now
             made = int.from_bytes(line.carried[begin : begin + size], "big")
             assert 0.01 * (step - made) <= MAX_WAIT_S + 0.03  # the time to pass the line
     carried = len(line.carried) // size
