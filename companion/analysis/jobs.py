@@ -20,7 +20,6 @@ if TYPE_CHECKING:
 
 Job = TypeVar("Job")
 
-RETRIES = 3  # worker losses per job before it counts as failed
 WORKER_LOST = "worker lost"
 SILENT = "100"  # a level above critical: what Dask loses is stated by `run_jobs`
 #: The variable of the environment, which workers inherit, leaves the level of the last two unchanged.
@@ -61,7 +60,7 @@ def run_jobs(
     with interrupt.held():  # an interrupted import ends in another error
         try:
             from dask import config
-            from dask.distributed import Client, LocalCluster
+            from dask.distributed import Client, KilledWorker, LocalCluster
         except ImportError:
             missing = missing_package("work by many processes", "Dask", extra)
             raise ValueError(f"{missing}, or use --workers 0") from None
@@ -86,9 +85,7 @@ def run_jobs(
                     " leave it out for workers on this machine"
                 ) from None
             stack.enter_context(noted)
-        keys = {
-            client.submit(work, job, key=key, retries=RETRIES, pure=False): key for key, job in jobs.items()
-        }
+        keys = {client.submit(work, job, key=key, pure=False): key for key, job in jobs.items()}
         for future in keys:
             future.add_done_callback(finished.put)
         for _ in keys:
@@ -99,7 +96,8 @@ def run_jobs(
                 result = future.result() if failure is None else None
             except CancelledError:
                 raise ValueError("Dask scheduler lost: start again, finished work is kept") from None
-            yield FinishedJob(keys[future], result, "" if failure is None else f"{WORKER_LOST}: {failure}")
+            why = f"{WORKER_LOST}: {failure}" if isinstance(failure, KilledWorker) else repr(failure)
+            yield FinishedJob(keys[future], result, "" if failure is None else why)
             future.release()
     if not finished.empty():
         raise KeyboardInterrupt

@@ -35,6 +35,8 @@ class PlotFolder(click.Path):
         """Convert to the path of a folder that exists."""
         path = Path(os.fsdecode(super().convert(value, param, ctx)))
         _supported_formats()
+        if ctx is not None and ctx.resilient_parsing:  # a shell completes the line: nothing is run
+            return path
         try:
             make_folder(path)
         except OSError as error:

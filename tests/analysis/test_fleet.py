@@ -184,18 +184,27 @@ def test_exit_code_without_any_readable_log(tmp_path: Path) -> None:
     assert f"  {tmp_path / 'x.tlog'}: is not a tlog" in done.output
 
 
-def slow_square(number: int) -> int:
+def slow_square(number: int | Path) -> int:
     time.sleep(0.05)
+    if isinstance(number, Path):
+        with number.open("a") as file:
+            file.write("run\n")
+        raise ValueError("not a number")
     return number * number
 
 
-def test_killed_worker_loses_no_job() -> None:
-    """Two processes, one killed on the way, with results that were not fetched yet."""
+def test_killed_worker_loses_no_job(tmp_path: Path) -> None:
+    """Two processes, one killed on the way, with results that were not fetched yet. A job that raises is not
+    run again, unless its worker was lost."""
     distributed = pytest.importorskip("distributed")
     with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
         pids = [worker.pid for worker in cluster.workers.values()]
         work = jobs.run_jobs(
-            slow_square, {f"job {k}": k for k in range(40)}, cluster.scheduler_address, 0, "fleet"
+            slow_square,
+            {f"job {k}": k for k in range(40)} | {"raises": tmp_path / "runs"},
+            cluster.scheduler_address,
+            0,
+            "fleet",
         )
         done = dict[str, object]()
         for one in work:
@@ -203,7 +212,9 @@ def test_killed_worker_loses_no_job() -> None:
                 time.sleep(1.0)
                 os.kill(pids[0], signal.SIGKILL)
             done[one.key] = one.failure or one.result
+    assert done.pop("raises") == "ValueError('not a number')"
     assert done == {f"job {k}": k * k for k in range(40)}
+    assert len((tmp_path / "runs").read_text().splitlines()) <= 2
 
 
 LOST = """

@@ -40,6 +40,15 @@ def test_file_as_plot_folder_is_rejected(tmp_path: Path) -> None:
         assert done.exit_code == 2 and f"cannot be created: {message}" in done.stderr
 
 
+def test_a_line_that_a_shell_completes_creates_no_folder(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    environment = {"_COMPANION_COMPLETE": "bash_complete", "COMP_CWORD": "5"}
+    environment["COMP_WORDS"] = f"companion study restrictive --plot {tmp_path / 'x'} --"
+    done = CliRunner().invoke(cli, [], prog_name="companion", env=environment)
+    assert "--plot" in done.stdout or "--help" in done.stdout
+    assert not (tmp_path / "x").exists()
+
+
 @pytest.mark.parametrize("command", [*COMMANDS, ["study", "restrictive"]])
 def test_missing_matplotlib_is_reported_with_the_remedy(
     command: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
