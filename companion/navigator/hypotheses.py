@@ -87,8 +87,9 @@ GRADE_CHANGES_H = 10.0
 #: A compass, or the autopilot resets its heading (rad). The wind took up what was wrong with it before (m/s).
 HEADING_STEPS_H, HEADING_STEP, HEADING_WIND = 10.0, 0.5, 7.0
 AIR_HEADING_STEPS_H = 1e-2  # by airspeed a wrong heading turns no acceleration
-#: Attitude and IMU give a false velocity (m/s): a hard turn with an attitude that is off, another latency.
-VELOCITY_STEPS_H, VELOCITY_STEP = 0.1, 10.0
+#: Attitude and IMU give a false velocity (m/s): a turn with an attitude that is off, another latency. Not in
+#: straight flight: a GNSS that was drawn off by 2 m/s, onset and velocity alike, was taken for such a step.
+VELOCITY_STEPS_H, VELOCITY_STEP, TURNING_M_S2 = 0.1, 10.0, 2.0
 JAMMED = 100.0  # times likelier while the receiver itself reports jamming or spoofing
 
 
@@ -156,13 +157,15 @@ class Model:
             config = structs.replace(config, air_data=air)
         self.config, self.plain = config, plain
         self.channel: Channel = corrected_ins(config) if config.has_own_ins else OwnChannel(config)
-        self._known: dict[tuple[int, bool, bool], Hypotheses] = {}
+        self._known: dict[tuple[int, bool, bool, bool], Hypotheses] = {}
 
-    def hypotheses(self, beacons: int, by_air: bool = False, witness: bool = True) -> Hypotheses:
+    def hypotheses(
+        self, beacons: int, by_air: bool = False, witness: bool = True, turning: bool = False
+    ) -> Hypotheses:
         """The hypotheses with so many beacons; `by_air` where airspeed moves the nominal trajectory,
-        `witness` while a source of position other than GNSS is received.
+        `witness` while a source of position other than GNSS is received, `turning` while it is accelerated.
         """
-        key = (beacons, by_air, witness)
+        key = (beacons, by_air, witness, turning)
         if key not in self._known:
             found = _hypotheses(self.config, self.channel, *key)
             if self.plain is not None:
@@ -223,7 +226,9 @@ def only(bank: Bank, row: int) -> Bank:
     return banks.picked(bank, [row])._replace(L=np.zeros(1))
 
 
-def _hypotheses(config: Config, channel: Channel, beacons: int, by_air: bool, witness: bool) -> Hypotheses:
+def _hypotheses(
+    config: Config, channel: Channel, beacons: int, by_air: bool, witness: bool, turning: bool
+) -> Hypotheses:
     azimuth_bias, range_bias = math.radians(config.rsbn.bias_azimuth_deg), config.rsbn.bias_range_m
     sigma_a, sigma_r = math.radians(config.rsbn.sigma_azimuth_deg), config.rsbn.sigma_range_m
     # an air-data or IMU channel alone is no witness against GNSS: its own model may be what is wrong
@@ -256,7 +261,7 @@ def _hypotheses(config: Config, channel: Channel, beacons: int, by_air: bool, wi
         GROUPS,
         tuple(sources),
         tuple(faults),
-        jumps=_jumps(config, channel, by_air),
+        jumps=_jumps(config, channel, by_air, turning),
         grades=tuple(range(len(channel.grades))),
         orders=ORDERS,
     )
@@ -268,7 +273,7 @@ def _hypotheses(config: Config, channel: Channel, beacons: int, by_air: bool, wi
     return Hypotheses(layout, settings, (azimuth_bias, range_bias, LATE_S) * beacons)
 
 
-def _jumps(config: Config, channel: Channel, by_air: bool) -> tuple[Jump, ...]:
+def _jumps(config: Config, channel: Channel, by_air: bool, turning: bool) -> tuple[Jump, ...]:
     """What may jump without a source being false."""
     away, moved = (CHANNEL_JUMP_M, CHANNEL_JUMP_M), (0, 1, 2, 3)
     if not channel.wind:
@@ -284,7 +289,8 @@ def _jumps(config: Config, channel: Channel, by_air: bool) -> tuple[Jump, ...]:
     sigmas = (jump,) * 6 if by_air else (jump, jump, GUST_OPEN_M_S, GUST_OPEN_M_S)
     turned = (own_error_model.HEADING, *channel.wind)
     by = (HEADING_STEP, HEADING_WIND, HEADING_WIND)
-    heading_h, velocity_h = (AIR_HEADING_STEPS_H, 0.0) if by_air else (HEADING_STEPS_H, VELOCITY_STEPS_H)
+    heading_h = AIR_HEADING_STEPS_H if by_air else HEADING_STEPS_H
+    velocity_h = VELOCITY_STEPS_H if turning and not by_air else 0.0
     return (
         Jump("wind", states, sigmas, rate_h, quota=24, often=True),
         Jump("heading", turned, by, heading_h),

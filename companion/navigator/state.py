@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from types import MappingProxyType
 from typing import NamedTuple
@@ -16,7 +17,7 @@ from companion.navigator import height_error
 from companion.navigator.air_data_channel import CLIMB_NS
 from companion.navigator.channel import Nominal
 from companion.navigator.height_error import Level
-from companion.navigator.hypotheses import SOURCES, Hypotheses, Model
+from companion.navigator.hypotheses import SOURCES, TURNING_M_S2, Hypotheses, Model
 from companion.navigator.inertial_track import Point
 from companion.navigator.minimax_bound import Guarantee
 from companion.navigator.own_channel import Sensors
@@ -116,9 +117,11 @@ Step = tuple[State, list[Output]]
 
 def hypotheses(state: State, settings: Settings) -> Hypotheses:
     """The hypotheses with the beacons that are followed, for what moves the nominal trajectory now."""
-    interval = state.nominal.interval if state.nominal else None
+    interval, turning = None, False
+    if state.nominal is not None:
+        interval, turning = state.nominal.interval, math.hypot(*state.nominal.a_n) > TURNING_M_S2
     by_air = interval is not None and interval.by == "air"
-    return settings.model.hypotheses(len(state.beacons), by_air, has_witness(state, settings))
+    return settings.model.hypotheses(len(state.beacons), by_air, has_witness(state, settings), turning)
 
 
 def is_jammed(state: State) -> bool:

@@ -421,8 +421,7 @@ def test_a_false_velocity_of_gnss_that_stops_leaves_no_suspicion() -> None:
     assert (flown.of("trust", 240.0) == Trust.NORMAL).all()
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("channel", ["ins", "imu"])
+@pytest.mark.parametrize("channel", [pytest.param("ins", marks=pytest.mark.long), "imu"])
 def test_a_spoofed_gnss_is_excluded_with_a_beacon_and_comes_back(channel: str) -> None:
     """Drawn off by 2 m/s from 120 s to 210 s, velocity alike."""
     begin, end = 120.0, 210.0
