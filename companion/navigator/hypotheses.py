@@ -90,6 +90,8 @@ AIR_HEADING_STEPS_H = 1e-2  # by airspeed a wrong heading turns no acceleration
 #: Attitude and IMU give a false velocity (m/s): a turn with an attitude that is off, another latency. Not in
 #: straight flight: a GNSS that was drawn off by 2 m/s, onset and velocity alike, was taken for such a step.
 VELOCITY_STEPS_H, VELOCITY_STEP, TURNING_M_S2 = 0.1, 10.0, 2.0
+#: GNSS becomes late (s). In a turn its position and velocity are then off as those of a false GNSS.
+LATENCY_STEPS_H, LATENCY_STEP = 0.1, 0.3
 JAMMED = 100.0  # times likelier while the receiver itself reports jamming or spoofing
 
 
@@ -291,10 +293,12 @@ def _jumps(config: Config, channel: Channel, by_air: bool, turning: bool) -> tup
     by = (HEADING_STEP, HEADING_WIND, HEADING_WIND)
     heading_h = AIR_HEADING_STEPS_H if by_air else HEADING_STEPS_H
     velocity_h = VELOCITY_STEPS_H if turning and not by_air else 0.0
+    latency_h = 0.0 if by_air else LATENCY_STEPS_H
     return (
         Jump("wind", states, sigmas, rate_h, quota=24, often=True),
         Jump("heading", turned, by, heading_h),
         Jump("velocity", (2, 3), (VELOCITY_STEP, VELOCITY_STEP), velocity_h),
+        Jump("latency", (channel.latency,), (LATENCY_STEP,), latency_h),
         # whatever the model does not know: GNSS is believed again after a second or two
         Jump("channel", moved, (*away, 20.0, 20.0), CHANNEL_JUMPS_H, quota=4, apart_s=APART_S),
     )
