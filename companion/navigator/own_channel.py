@@ -66,7 +66,7 @@ class Sensors(Struct, frozen=True):
     multirotor: bool = False
     fixed_wing: bool = False
     hovering: bool = False
-    aloft_ns: int | None = None  # since when it flies without hovering, by the autopilot
+    aloft_ns: int | None = None  # since when it flies, a VTOL as an aeroplane, by the autopilot
     steady_m_s: float | None = None  # airspeed of a fixed wing without a sensor; its scale is estimated
 
     def last_ns(self, by: By) -> int:

@@ -74,8 +74,8 @@ def vehicle(state: State, record: Vehicle, settings: Settings) -> Step:
     fixed_wing = s.fixed_wing if record.fixed_wing is None else record.fixed_wing
     hovering = s.hovering if record.hovering is None else record.hovering
     aloft_ns = s.aloft_ns
-    if record.flying is not None:
-        aloft_ns = (aloft_ns or record.t_ns) if record.flying and not hovering else None
+    if record.flying is not None:  # a copter hovers always, by its own statement
+        aloft_ns = (aloft_ns or record.t_ns) if record.flying and (multirotor or not hovering) else None
     s = structs.replace(s, multirotor=multirotor, fixed_wing=fixed_wing, hovering=hovering, aloft_ns=aloft_ns)
     return structs.replace(state, sensors=s), []
 

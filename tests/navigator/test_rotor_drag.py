@@ -110,6 +110,17 @@ def test_a_real_copter_reckons_by_its_drag() -> None:
 
 
 @pytest.mark.flight
+def test_a_copter_that_states_that_it_hovers_reckons_by_its_drag() -> None:
+    """ArduCopter's EXTENDED_SYS_STATE has the VTOL state of a multicopter: its drag was not used at all."""
+
+    def hovering(record: Input) -> Input:
+        return replace(record, hovering=True) if isinstance(record, Vehicle) else record
+
+    dark = LOSS_S, LOSS_S + 30.0
+    assert fly(DEFAULT, hovering, dark).errors == fly(DEFAULT, dark=dark).errors
+
+
+@pytest.mark.flight
 def test_with_gnss_nothing_is_false_and_nothing_rejected() -> None:
     flown = fly(DEFAULT)
     assert max(flown.false) < 0.5
