@@ -117,9 +117,9 @@ Step = tuple[State, list[Output]]
 
 def hypotheses(state: State, settings: Settings) -> Hypotheses:
     """The hypotheses with the beacons that are followed, for what moves the nominal trajectory now."""
-    interval, turning = None, False
-    if state.nominal is not None:
-        interval, turning = state.nominal.interval, math.hypot(*state.nominal.a_n) > TURNING_M_S2
+    nominal = state.nominal
+    interval = nominal.interval if nominal else None
+    turning = nominal is not None and math.hypot(*nominal.a_n) > TURNING_M_S2
     by_air = interval is not None and interval.by == "air"
     return settings.model.hypotheses(len(state.beacons), by_air, has_witness(state, settings), turning)
 

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from companion.link import dialect, frame
 from companion.link.session import (
+    BadFrame,
     ClockJump,
     ClockRate,
     Event,
@@ -17,6 +18,7 @@ from companion.link.session import (
     LinkUp,
     MappingStepped,
     MessageReceived,
+    NotUnderstood,
     Rebooted,
     SecondAutopilot,
     Session,
@@ -409,7 +411,10 @@ def test_no_input_raises_and_the_deadline_stays_in_the_future(inputs: list[bytes
     session.receive(Autopilot().heartbeat(), 0)
     for one in inputs:
         if isinstance(one, bytes):
-            session.receive(one, now)
+            for event in session.receive(one, now):
+                assert not isinstance(event, NotUnderstood) or isinstance(
+                    event.what, BadFrame | frame.UnknownFrame
+                )
         else:
             now += random.Random(one).randrange(3 * SECOND)
             session.receive(frame_of_anything(one), now)

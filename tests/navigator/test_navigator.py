@@ -828,7 +828,7 @@ def test_azimuth_and_range_in_messages_of_their_own_are_one_fix(apart_s: float) 
 @pytest.mark.parametrize("ranged", [True, False], ids=["with a range", "an azimuth alone"])
 def test_in_the_cone_of_silence_an_azimuth_is_no_fix(ranged: bool) -> None:
     """The beacon stands where the aircraft is after 40 s, 1 km up: it crosses the cone in 38 s."""
-    moments, navigator, heard = flight(60, 15.0, 60.0)[:406], Navigator(CONFIG), {}
+    moments, navigator, used = flight(60, 15.0, 60.0)[:406], Navigator(CONFIG), {}
     beacon = moments[400].truth._replace(alt=0.0)
     navigator.handle(origin())
     for moment in moments:
@@ -844,9 +844,9 @@ def test_in_the_cone_of_silence_an_azimuth_is_no_fix(ranged: bool) -> None:
                 )
             for out in navigator.handle(record):
                 if isinstance(out, Solution):
-                    heard[round(out.t_ns / NS)] = Source(out.sources) & (Source.AZIMUTH | Source.RANGE)
-    assert Source.AZIMUTH in heard[15]
-    assert heard[40] == (Source.RANGE if ranged else Source(0))
+                    used[round(out.t_ns / NS)] = Source(out.sources) & (Source.AZIMUTH | Source.RANGE)
+    assert Source.AZIMUTH in used[15]
+    assert used[40] == (Source.RANGE if ranged else Source(0))
 
 
 def test_what_cannot_be_computed_is_refused_and_the_flight_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
