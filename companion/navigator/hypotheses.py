@@ -88,8 +88,9 @@ GRADE_CHANGES_H = 10.0
 HEADING_STEPS_H, HEADING_STEP, HEADING_WIND = 10.0, 0.5, 7.0
 AIR_HEADING_STEPS_H = 1e-2  # by airspeed a wrong heading turns no acceleration
 #: Attitude and IMU give a false velocity (m/s): a turn with an attitude that is off, another latency. Not in
-#: straight flight: a GNSS that was drawn off by 2 m/s, onset and velocity alike, was taken for such a step.
-VELOCITY_STEPS_H, VELOCITY_STEP, TURNING_M_S2 = 0.1, 10.0, 2.0
+#: straight flight, however it shakes, but where the velocity has changed by so much since the last births: a
+#: GNSS that was drawn off by 2 m/s, onset and velocity alike, was taken for such a step.
+VELOCITY_STEPS_H, VELOCITY_STEP, TURNED_M_S = 0.1, 10.0, 5.0
 #: GNSS becomes late (s). In a turn its position and velocity are then off as those of a false GNSS.
 LATENCY_STEPS_H, LATENCY_STEP = 0.1, 0.3
 JAMMED = 100.0  # times likelier while the receiver itself reports jamming or spoofing
@@ -162,12 +163,13 @@ class Model:
         self._known: dict[tuple[int, bool, bool, bool], Hypotheses] = {}
 
     def hypotheses(
-        self, beacons: int, by_air: bool = False, witness: bool = True, turning: bool = False
+        self, beacons: int, by_air: bool = False, witness: bool = True, has_turned: bool = False
     ) -> Hypotheses:
         """The hypotheses with so many beacons; `by_air` where airspeed moves the nominal trajectory,
-        `witness` while a source of position other than GNSS is received, `turning` while it is accelerated.
+        `witness` while a source of position other than GNSS is received, `has_turned` where the velocity has
+        changed.
         """
-        key = (beacons, by_air, witness, turning)
+        key = (beacons, by_air, witness, has_turned)
         if key not in self._known:
             found = _hypotheses(self.config, self.channel, *key)
             if self.plain is not None:
@@ -229,7 +231,7 @@ def only(bank: Bank, row: int) -> Bank:
 
 
 def _hypotheses(
-    config: Config, channel: Channel, beacons: int, by_air: bool, witness: bool, turning: bool
+    config: Config, channel: Channel, beacons: int, by_air: bool, witness: bool, has_turned: bool
 ) -> Hypotheses:
     azimuth_bias, range_bias = math.radians(config.rsbn.bias_azimuth_deg), config.rsbn.bias_range_m
     sigma_a, sigma_r = math.radians(config.rsbn.sigma_azimuth_deg), config.rsbn.sigma_range_m
@@ -263,7 +265,7 @@ def _hypotheses(
         GROUPS,
         tuple(sources),
         tuple(faults),
-        jumps=_jumps(config, channel, by_air, turning),
+        jumps=_jumps(config, channel, by_air, has_turned),
         grades=tuple(range(len(channel.grades))),
         orders=ORDERS,
     )
@@ -275,7 +277,7 @@ def _hypotheses(
     return Hypotheses(layout, settings, (azimuth_bias, range_bias, LATE_S) * beacons)
 
 
-def _jumps(config: Config, channel: Channel, by_air: bool, turning: bool) -> tuple[Jump, ...]:
+def _jumps(config: Config, channel: Channel, by_air: bool, has_turned: bool) -> tuple[Jump, ...]:
     """What may jump without a source being false."""
     away, moved = (CHANNEL_JUMP_M, CHANNEL_JUMP_M), (0, 1, 2, 3)
     if not channel.wind:
@@ -292,7 +294,7 @@ def _jumps(config: Config, channel: Channel, by_air: bool, turning: bool) -> tup
     turned = (own_error_model.HEADING, *channel.wind)
     by = (HEADING_STEP, HEADING_WIND, HEADING_WIND)
     heading_h = AIR_HEADING_STEPS_H if by_air else HEADING_STEPS_H
-    velocity_h = VELOCITY_STEPS_H if turning and not by_air else 0.0
+    velocity_h = VELOCITY_STEPS_H if has_turned and not by_air else 0.0
     latency_h = 0.0 if by_air else LATENCY_STEPS_H
     return (
         Jump("wind", states, sigmas, rate_h, quota=24, often=True),

@@ -94,7 +94,10 @@ def propagated(state: State, settings: Settings) -> State:
         return state
     _, bank = _born(state, settings)
     known = hypotheses(state, settings)
-    state = structs.replace(state, newborn=None)
+    turned, i = (0.0, 0.0) if bank.born_t != state.bank.born_t else state.turned, nominal.interval
+    if i is not None and i.by == "imu":
+        turned = turned[0] + i.n1, turned[1] + i.e1
+    state = structs.replace(state, newborn=None, turned=turned)
     Phi, Q = settings.model.transition(nominal, len(state.beacons))
     bank = banks.propagate(bank, known.layout, nominal.pending_s, Phi, Q)
     if nominal.interval is not None and nominal.interval.by_sensed_air:

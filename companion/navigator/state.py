@@ -17,7 +17,7 @@ from companion.navigator import height_error
 from companion.navigator.air_data_channel import CLIMB_NS
 from companion.navigator.channel import Nominal
 from companion.navigator.height_error import Level
-from companion.navigator.hypotheses import SOURCES, TURNING_M_S2, Hypotheses, Model
+from companion.navigator.hypotheses import SOURCES, TURNED_M_S, Hypotheses, Model
 from companion.navigator.inertial_track import Point
 from companion.navigator.minimax_bound import Guarantee
 from companion.navigator.own_channel import Sensors
@@ -82,6 +82,7 @@ class State(Struct, frozen=True):
     ins: Point | None = None  # the last sample of an INS; the nominal point may be carried on beyond it
     bank: Bank | None = None
     newborn: tuple[Bank, Bank] | None = None  # a bank, and what it is after the births that are due
+    turned: Vector2 = (0.0, 0.0)  # change of velocity by the IMU since the last births, north and east (m/s)
     leading: tuple[Bank, Estimate] | None = None  # moments of the leading family, and of which bank
     protection: tuple[int, float, float, float] | None = None  # when computed; radius, position error (m)
     fixed: bool = False  # whether a fix was ever used
@@ -119,9 +120,9 @@ def hypotheses(state: State, settings: Settings) -> Hypotheses:
     """The hypotheses with the beacons that are followed, for what moves the nominal trajectory now."""
     nominal = state.nominal
     interval = nominal.interval if nominal else None
-    turning = nominal is not None and math.hypot(*nominal.a_n) > TURNING_M_S2
+    has_turned = math.hypot(*state.turned) > TURNED_M_S
     by_air = interval is not None and interval.by == "air"
-    return settings.model.hypotheses(len(state.beacons), by_air, has_witness(state, settings), turning)
+    return settings.model.hypotheses(len(state.beacons), by_air, has_witness(state, settings), has_turned)
 
 
 def is_jammed(state: State) -> bool:

@@ -434,12 +434,17 @@ def test_a_false_velocity_of_gnss_that_stops_leaves_no_suspicion() -> None:
     assert (flown.of("trust", 240.0) == Trust.NORMAL).all()
 
 
-@pytest.mark.parametrize("channel", [pytest.param("ins", marks=pytest.mark.long), "imu"])
-def test_a_spoofed_gnss_is_excluded_with_a_beacon_and_comes_back(channel: str) -> None:
-    """Drawn off by 2 m/s from 120 s to 210 s, velocity alike."""
+@pytest.mark.parametrize(
+    "channel, shaken", [pytest.param("ins", 0.0, marks=pytest.mark.long), ("imu", 0.0), ("imu", 4.0)]
+)
+def test_a_spoofed_gnss_is_excluded_with_a_beacon_and_comes_back(channel: str, shaken: float) -> None:
+    """Drawn off by 2 m/s from 120 s to 210 s, velocity alike; also where the IMU shakes (m/s^2)."""
     begin, end = 120.0, 210.0
 
     def spoofed(record: Any) -> Any:
+        if isinstance(record, Imu):
+            shake = shaken * math.sin(math.tau * 3.3 * record.t_ns / NS)
+            return replace(record, f_b=(record.f_b[0], record.f_b[1] + shake, record.f_b[2]))
         since = record.t_ns / NS - begin
         if not isinstance(record, Gnss) or not 0.0 <= since < end - begin:
             return record
