@@ -128,6 +128,20 @@ def find_mistakes(config: Config) -> Iterator[tuple[str, str, str]]:
     for section, key in PATHS:
         if "\0" in (path := getattr(getattr(config, section), key)):
             yield section, key, f"{section}.{key} = {path!r} has a null character: remove it"
+        elif path.startswith("~"):
+            yield section, key, f"{section}.{key} = {path!r}: ~ is not expanded; write the whole path"
+    gnss, hz = config.gnss, config.rates.gnss_hz
+    for section, key, value, spacing in (
+        ("gnss", "every_s", gnss.every_s, gnss.every_s),
+        ("rates", "gnss_hz", hz, 1.0 / hz if hz else 0.0),
+    ):
+        if spacing > gnss.timeout_s:
+            yield (
+                section,
+                key,
+                f"{section}.{key} = {value:g} leaves {spacing:.3g} s between fixes, and GNSS counts as "
+                f"absent after gnss.timeout_s = {gnss.timeout_s:g} s: set gnss.timeout_s above {spacing:.3g}",
+            )
     for msgid in config.signing.always_accepted:
         if not 0 <= msgid <= MAX_MESSAGE_ID:
             yield (

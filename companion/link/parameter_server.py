@@ -15,6 +15,7 @@ by the component, and the companion runs with either autopilot. A REAL32 is the 
 
 from __future__ import annotations
 
+import itertools
 import math
 import struct
 from collections.abc import Callable
@@ -23,7 +24,7 @@ from typing import Any, NamedTuple
 import msgspec
 
 from companion.config import Config
-from companion.config.validate import find_conflicts
+from companion.config.validate import find_conflicts, find_mistakes
 from companion.link import dialect
 from companion.link.dialect import Message, mavlink
 from companion.link.frame import Frame
@@ -254,7 +255,7 @@ def _replace_value(config: Config, parameter: Parameter, value: Value) -> Config
     changed = msgspec.structs.replace(section, **{parameter.key: value})
     checked = msgspec.convert(msgspec.to_builtins(changed), type(section))
     whole = msgspec.structs.replace(config, **{parameter.section: checked})
-    for *_, sentence in find_conflicts(whole):
+    for *_, sentence in itertools.chain(find_conflicts(whole), find_mistakes(whole)):
         raise ValueError(sentence)
     return whole
 

@@ -87,7 +87,7 @@ def test_outputs_that_differ_from_the_flight_are_reported(
 ) -> None:
     flight = tmp_path / "flight.mcap"
     replayed(CUT, flight)
-    other = apply_changes(Config(), "every_s=5")
+    other = apply_changes(Config(), "every_s=2")
     monkeypatch.setattr(replay_inputs, "logged_configuration", lambda path: other)
     done = CliRunner().invoke(replay.command, [str(flight)])
     assert done.exit_code == 1

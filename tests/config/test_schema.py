@@ -216,6 +216,14 @@ def test_no_prediction_ahead_and_the_ends_of_the_message_ids_are_accepted() -> N
         (['log.folder=""'], "log.folder = '' names no folder: give one, for example logs"),
         (['log.folder="a\\u0000"'], "log.folder = 'a\\x00' has a null character: remove it"),
         (['signing.stamp_file="\\u0000"'], "signing.stamp_file = '\\x00' has a null character"),
+        (["log.folder=~/logs"], "log.folder = '~/logs': ~ is not expanded; write the whole path"),
+        (["signing.key_file=~pilot/key"], "signing.key_file = '~pilot/key': ~ is not expanded"),
+        (
+            ["gnss.every_s=10"],
+            "gnss.every_s = 10 leaves 10 s between fixes, and GNSS counts as absent after gnss.timeout_s = "
+            "3 s: set gnss.timeout_s above 10",
+        ),
+        (["rates.gnss_hz=0.2"], "rates.gnss_hz = 0.2 leaves 5 s between fixes, and GNSS counts as absent"),
     ],
 )
 def test_invalid_combination_is_reported_in_one_sentence(pairs: list[str], expected: str) -> None:

@@ -222,6 +222,15 @@ def test_invalid_value_is_answered_with_the_value_in_effect(name: str, wish: flo
     assert station.changes == [] and station.saved == []
 
 
+def test_value_that_the_next_start_would_reject_is_rejected() -> None:
+    """Saved, it would be set aside by the next start."""
+    config = parse("[gnss]\nevery_s = 2.0\n", "file")
+    station = Station(config)
+    error, received = station.set("GNSS_TIMEOUT_S", 1.0)
+    assert error.error == OUT_OF_RANGE and received.param_value == value(config, "GNSS_TIMEOUT_S")
+    assert station.saved == [] and station.set("GNSS_TIMEOUT_S", 2.0)[0].param_value == 2.0
+
+
 def test_value_of_another_type_is_rejected() -> None:
     station = Station()
     for kind in (UINT8, INT32, 0, 255):
