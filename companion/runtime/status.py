@@ -46,15 +46,20 @@ class Status(NamedTuple):
         return cls(connected, state, mode, sources, trust, *lengths, missing, slow)
 
     def text(self) -> str:
-        """Return the status in one line: at most 73 characters where not more than one input is missing."""
+        """Return the status in one line: at most 73 characters where not more than one input is missing.
+
+        The inputs come last: where there are many, a terminal cuts them and not the lengths.
+        """
         if not self.connected and self.trust is None:
             return "waiting for an autopilot"
         parts = [" ".join((self.state, self._fixes())).strip()]
-        parts += [f"no {name}" for name in (self.missing if self.connected else ("autopilot",))]
-        parts += [f"slow {name}" for name in self.slow if self.connected]
+        if not self.connected:
+            parts.append("no autopilot")
         lengths = (("sigma", self.sigma), ("HPL", self.protection), ("bound", self.guaranteed))
         if known := [f"{name} {_metres(value)}" for name, value in lengths if value is not None]:
             parts.append(f"{' '.join(known)} m")
+        if self.connected:
+            parts += [f"no {name}" for name in self.missing] + [f"slow {name}" for name in self.slow]
         return ", ".join(parts)
 
     def _fixes(self) -> str:

@@ -123,13 +123,22 @@ def test_whole_status_fits_80_columns_with_one_input_missing(
         status = Status.of(given, connected=True, is_stale=False, missing=(missing,))
         Console(lines.append, 0, columns=80).status(status, 99_999 * SECOND)
         assert lines[0] == f"99999 {status.text()}"  # not cut
-        assert lines[0].endswith(" m") and f"no {missing}, " in lines[0]
+        assert lines[0].endswith(f" m, no {missing}")
 
 
-def test_status_names_the_state_then_what_is_missing_then_lengths() -> None:
+def test_many_slow_inputs_do_not_cut_the_lengths_off() -> None:
+    every = tuple(sorted({stream.what for stream in STREAMS.values()}))
+    lines: list[str] = []
+    status = STATUS._replace(sources=("GNSS", "AZIMUTH", "RANGE"), slow=every)
+    Console(lines.append, 0, columns=80).status(status, 99_999 * SECOND)
+    assert lines[0].startswith("99999 normal GNSS+beacon, sigma 1.2 HPL 53 bound 7.7 m, slow ")
+    assert len(lines[0]) == 79
+
+
+def test_status_names_the_state_then_lengths_then_what_is_missing() -> None:
     assert STATUS.text() == "normal GNSS+range, sigma 1.2 HPL 53 bound 7.7 m"
     both = STATUS._replace(sources=("GNSS", "AZIMUTH", "RANGE"), missing=("airspeed",), slow=("IMU",))
-    assert both.text() == "normal GNSS+beacon, no airspeed, slow IMU, sigma 1.2 HPL 53 bound 7.7 m"
+    assert both.text() == "normal GNSS+beacon, sigma 1.2 HPL 53 bound 7.7 m, no airspeed, slow IMU"
     assert both._replace(connected=False).text().startswith("normal GNSS+beacon, no autopilot, sigma")
     assert Status(True, "no solution", missing=("GNSS",)).text() == "no solution, no GNSS"
 
