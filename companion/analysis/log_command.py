@@ -124,7 +124,8 @@ def export_command(log: Path, output: Path, every_s: float, config_file: Path | 
     with show_step(f"read {log}"):
         flights = open_flights(log, load(config_file))
     for flight in flights:
-        lines, places = export.flight_map(flight, every_s)
+        lines, beacons = export.flight_map(flight, every_s)
+        places += [place for place in beacons if place not in places]
         k, n = flight.part
         tracks += [line._replace(name=f"flight {k}: {line.name}" if n > 1 else line.name) for line in lines]
     export.write_map(output, log.name, tracks, places)

@@ -13,7 +13,7 @@ from companion.analysis.export import Place, Track
 from companion.analysis.log_command import group
 from companion.config import Config
 from companion.nav.geometry import displace
-from companion.records import Gnss, Mode, RsbnFix, Solution
+from companion.records import Gnss, Mode, Reboot, RsbnFix, Solution
 from companion.storage import flight_log
 from companion.storage.reader import LogError
 from companion.storage.run_metadata import run_metadata
@@ -118,6 +118,25 @@ def test_a_flight_is_cut_into_legs_with_and_without_fixes(tmp_path):
     assert none.exit_code == 2 and "1e+300 is not in the range" in none.stderr
     lon, lat = features["beacon 7"]["geometry"]["coordinates"]
     assert (math.radians(lat), math.radians(lon)) == pytest.approx((0.971, 0.651), abs=1e-9)
+
+
+def test_beacons_of_all_flights_of_a_log_are_exported(tmp_path):
+    """Those of the flights before the last reboot were left out."""
+    log, out = tmp_path / "flights.mcap", tmp_path / "flights.geojson"
+    with flight_log.Writer(
+        log, metadata=run_metadata(Config()), start_unix_ns=1_700_000_000 * S, start_ns=0, block=True
+    ) as writer:
+        for k in range(60):
+            t = k * S
+            if k == 30:
+                writer.record(Reboot(t, t, 1))
+            writer.record(Gnss(t, t, 0, k + 1, 3, 0.97, 0.65 + 1e-6 * k, 100.0, 2.0))
+            for beacon in (9, 7 if k < 30 else 8):
+                writer.record(RsbnFix(t, t, beacon, 0.971, 0.651, 30.0, 1.0, 2000.0, 0.002, 100.0))
+    found = CliRunner().invoke(group, ["export", str(log), "-o", str(out)], catch_exceptions=False)
+    assert found.exit_code == 0 and "3 beacons" in found.output
+    names = [f["properties"]["name"] for f in json.loads(out.read_text())["features"]]
+    assert sorted(names) == ["beacon 7", "beacon 8", "beacon 9", "flight 1: GNSS", "flight 2: GNSS"]
 
 
 def test_unknown_suffix_is_reported_in_one_sentence(tmp_path):
