@@ -16,6 +16,7 @@ from companion.link.parameter_client import Value
 from companion.transport.reconnect import Address
 
 NAMES = {"ardupilot": "ArduPilot", "px4": "PX4", "other": "an autopilot of another make"}
+COLUMNS = 80  # the tables fit; in a narrower terminal their cells would be cut to "h…"
 _GOOD, _BAD, _NOTE = "[green]ok[/]", "[bold red]{}[/]", "[dim]-[/]"
 
 
@@ -24,7 +25,8 @@ def _format_value(value: Value | None) -> str:
 
 
 def print_diagnosis(console: Console, config: Config, address: Address, diagnosis: Diagnosis) -> None:
-    """Print a diagnosis."""
+    """Print a diagnosis, at least `COLUMNS` wide: a narrower terminal wraps the lines."""
+    console.width = max(console.width, COLUMNS)
     console.print(heading(config, address, diagnosis), highlight=False)
     if diagnosis.parameters:
         console.print(parameter_table(diagnosis))

@@ -184,11 +184,11 @@ def test_host_that_does_not_answer_is_one_sentence_with_advice(monkeypatch: pyte
 # -- what is shown -------------------------------------------------------------------------------------------
 
 
-def shown(diagnosis: Diagnosis) -> str:
+def shown(diagnosis: Diagnosis, columns: int = 80) -> str:
     config = load(None, {"output.profile": "px4"}, {})
     text = io.StringIO()
     rendering.print_diagnosis(
-        Console(file=text, width=80), config, Address.parse("serial:/dev/ttyAMA0:921600"), diagnosis
+        Console(file=text, width=columns), config, Address.parse("serial:/dev/ttyAMA0:921600"), diagnosis
     )
     return text.getvalue()
 
@@ -206,6 +206,11 @@ def test_every_finding_has_state_numbers_and_advice() -> None:
     assert "wrong" in text and "2.0 Hz" in text and "ATTITUDE: is the line fast" in text
     assert "2 parameters are absent" in text
     assert max(map(len, text.splitlines())) <= 80
+
+
+def test_nothing_is_cut_in_a_narrow_terminal() -> None:
+    bad = diagnosis(Finding("GPS_GLOBAL_ORIGIN", "60.00000, 30.00000", "known", True))
+    assert shown(bad, columns=40) == shown(bad)
 
 
 def test_change_requires_confirmation(monkeypatch: pytest.MonkeyPatch) -> None:
