@@ -38,7 +38,17 @@ from companion.importers import gnss_latency
 from companion.navigator import Navigator
 from companion.option_types import INPUT_PATH
 from companion.printable import printable
-from companion.records import INPUTS, Event, LocalPosition, Reboot, Solution, Stamped
+from companion.records import (
+    INPUTS,
+    Event,
+    LocalPosition,
+    RangeDifference,
+    Reboot,
+    SecondIns,
+    Solution,
+    Stamped,
+    StarFix,
+)
 from companion.storage import flight_log
 from companion.storage.reader import ACTIVE, LogError, is_closed
 from companion.storage.run_metadata import PLATFORM, numerical_platform, run_metadata
@@ -313,6 +323,13 @@ def _replay_changed(
         )
     if log_inputs.outages is not None:
         notes += log_inputs.outages.describe_unused()
+    used = config.inertial.correctors if config.has_own_ins else ()
+    for kind, name in ((StarFix, "stars"), (RangeDifference, "hyperbolic"), (SecondIns, "second_ins")):
+        if tables and kind in kinds and name not in used:
+            notes.append(
+                f"records of {name} have no effect: give --with inertial.independent=true,"
+                f"inertial.correctors={name}"
+            )
     return found, [*notes, *gnss_latency.describe_analyses(analyses)], log_inputs.summary()
 
 

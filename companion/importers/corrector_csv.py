@@ -7,7 +7,7 @@ The header decides which; times are seconds since the first record of the log th
     t_s, ins, lat_deg, lon_deg
 
 For a star, lat_deg and lon_deg are those of the place where it is in the zenith: its declination, and its
-hour angle from Greenwich taken east. azimuth_deg may be empty.
+hour angle from Greenwich taken east. azimuth_deg may be empty; an empty sigma_azimuth_arcsec is 3600.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ Row = Mapping[str, float | None]
 
 
 def _star(t_ns: int, r: Row) -> StarFix:
-    azimuth = r["azimuth_deg"]
+    azimuth, sigma_azimuth = r["azimuth_deg"], r["sigma_azimuth_arcsec"]
     return StarFix(
         t_ns,
         t_ns,
@@ -37,7 +37,7 @@ def _star(t_ns: int, r: Row) -> StarFix:
         altitude=_given(r, "altitude_deg") * _DEG,
         azimuth=None if azimuth is None else azimuth * _DEG,
         sigma_altitude=_given(r, "sigma_altitude_arcsec") * _ARCSEC,
-        sigma_azimuth=(r["sigma_azimuth_arcsec"] or 3600.0) * _ARCSEC,
+        sigma_azimuth=(3600.0 if sigma_azimuth is None else sigma_azimuth) * _ARCSEC,
     )
 
 

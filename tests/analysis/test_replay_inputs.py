@@ -287,6 +287,17 @@ def test_correctors_join_at_seconds_of_the_log(tmp_path):
     assert list(replay_inputs.with_correctors(inputs, []).records) == log
 
 
+def test_correctors_that_the_configuration_does_not_use_are_reported(tmp_path):
+    log, output, table = dataflash_with_text_first(tmp_path), tmp_path / "x.mcap", tmp_path / "second.csv"
+    table.write_text("t_s,ins,lat_deg,lon_deg\n32,0,45,7\n")
+    use = "inertial.independent=true,inertial.correctors=second_ins"
+    unused = [f"records of second_ins have no effect: give --with {use}"]
+    assert report(log, "-o", output, "--correctors", table)["notes"] == unused
+    other = use.replace("second_ins", "stars")
+    assert report(log, "-o", output, "--correctors", table, "--with", other)["notes"] == unused
+    assert report(log, "-o", output, "--correctors", table, "--with", use)["notes"] == []
+
+
 def test_table_that_is_none_of_the_correctors_is_reported(tmp_path):
     table = tmp_path / "stars.csv"
     table.write_text("time,star\n1,2\n")

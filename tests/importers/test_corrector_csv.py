@@ -56,6 +56,7 @@ def test_lines(tmp_path):
         (f"{STAR}\n1,1,100,70,45,200,10,15\n", "line 2: lat is 100 deg"),
         (f"{STAR}\n1,1,,70,45,200,10,15\n", "lat_deg is missing"),
         (f"{LINE}\n2,1,61,26,50,58,27,60,-1234.5,0\n", "sigma is 0; it must be positive"),
+        (f"{STAR}\n1,1,10,70,45,200,10,0\n", "sigma_azimuth is 0; it must be positive"),
     ],
 )
 def test_mistakes_are_reported(tmp_path, text, message):
