@@ -416,8 +416,7 @@ class Fix(Stamped, frozen=True, gc=False, tag=True):
     """Maximum-likelihood radio fix without the INS: correction vector, INS minus fix, north and east (m).
 
     `covariance` is of north, east (upper triangle); `cost` the chi-square of its residuals with
-    `degrees_of_freedom`; `normalised` the NIS of azimuth and range, or of the GNSS position, against the
-    current estimate: chi-square with 2 degrees of freedom.
+    `degrees_of_freedom`.
     """
 
     lat: float
@@ -429,7 +428,6 @@ class Fix(Stamped, frozen=True, gc=False, tag=True):
     cost: float
     degrees_of_freedom: int
     iterations: int
-    normalised: float | None = None
 
 
 class Smoothed(Stamped, frozen=True, gc=False, tag=True):

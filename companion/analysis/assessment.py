@@ -256,30 +256,18 @@ def _normalized_errors(
 ) -> list[NormalizedErrors]:
     fix, solution = flight.tables["Fix"], flight.tables["Solution"]
     found = []
-    if len(fix["t"]):
-        known = np.isfinite(fix["normalised"])
-        found.append(
-            NormalizedErrors("NIS", fix["t"][known], fix["normalised"][known], np.full(int(known.sum()), 2.0))
-        )
-        redundant = fix["degrees_of_freedom"] > 0
-        if (
-            redundant.any() and fix["cost"][redundant].max() > 1e-9
-        ):  # a single GNSS position with a height has no residual
-            found.append(
-                NormalizedErrors(
-                    "lines of position",
-                    fix["t"][redundant],
-                    fix["cost"][redundant],
-                    fix["degrees_of_freedom"][redundant],
-                )
-            )
+    redundant = fix["degrees_of_freedom"] > 0
+    # a single GNSS position with a height has no residual
+    if fix["cost"][redundant].max(initial=0.0) > 1e-9:
+        columns = (fix[name][redundant] for name in ("t", "cost", "degrees_of_freedom"))
+        found.append(NormalizedErrors("lines of position", *columns))
     if reference is not None and reference.what == TRUTH and offset:
         value = _mahalanobis_squared(**offset, **{name: solution[name] for name in ("nn", "ne", "ee")})
         known = np.isfinite(value)
         if known.any():
             two = np.full(int(known.sum()), 2.0)
             found.append(NormalizedErrors("NEES", solution["t"][known], value[known], two))
-    return [series for series in found if len(series.t)]
+    return found
 
 
 def _mahalanobis_squared(north: Floats, east: Floats, nn: Floats, ne: Floats, ee: Floats) -> Floats:

@@ -156,10 +156,10 @@ def _misfit(axes: _Axes) -> Figure:
     lines = []
     for which, a, prefix in axes.each():
         for series in a.normalized_errors:
-            role = roles.get(series.what, error_statistics.GNSS)
             style: Style = "line" if series.what == "NEES" else "dots"
             value = np.maximum(series.value / chi2_95(series.degrees_of_freedom), 1e-4)
-            lines.append(axes.line(prefix + series.what, role, which, series.t, value, style=style))
+            name = prefix + series.what
+            lines.append(axes.line(name, roles[series.what], which, series.t, value, style=style))
     return axes.over_time(
         "consistency",
         "Consistency with the stated sigmas",

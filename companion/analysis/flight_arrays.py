@@ -133,8 +133,8 @@ COLUMNS: dict[type[Stamped], tuple[str, Callable[[Any], tuple[float, ...]]]] = {
         _solution,
     ),
     Fix: (
-        "lat lon sources cost degrees_of_freedom normalised",
-        lambda r: (r.lat, r.lon, r.sources, r.cost, r.degrees_of_freedom, _or_nan(r.normalised)),
+        "lat lon sources cost degrees_of_freedom",
+        lambda r: (r.lat, r.lon, r.sources, r.cost, r.degrees_of_freedom),
     ),
     Gnss: (
         "receiver fix lat lon alt",

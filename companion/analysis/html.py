@@ -286,7 +286,6 @@ def _both(rms: float, p95: float) -> str:
 
 _CONSISTENCY = {
     "NEES": "error of the estimate against the truth",
-    "NIS": "innovation of each fix",
     "lines of position": "residuals of fixes from more of them than are needed",
 }
 

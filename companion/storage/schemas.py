@@ -85,7 +85,6 @@ FIELDS = {
     "multirotor": "whether rotors of fixed pitch hold the vehicle up",
     "fixed_wing": "whether it has a wing",
     "hovering": "whether a VTOL is not in the flight of an aeroplane",
-    "normalised": "normalised innovation squared, 2 degrees of freedom (no unit)",
     "offset_ns": "ns, the companion's clock minus the autopilot's",
     "optimum_n": "m: north, east; least bound that any estimate could have",
     "parallel": "estimates of the filters that run beside the leading estimator",

@@ -128,7 +128,7 @@ def flight_records(
             )
         )
         if k % 5 == 0 and not lost and not glitch:
-            rows.append(Fix(t, t, lat, lon, 100.0, (59.0, 79.0), (4.0, 0.0, 4.0), 2, 0.0, 0, 1, 0.5))
+            rows.append(Fix(t, t, lat, lon, 100.0, (59.0, 79.0), (4.0, 0.0, 4.0), 2, 0.0, 0, 1))
         if k % 25 == 0:
             rows.append(LinkState(t, t, "serial", True, 10 * k, 1, 0, 0, 17 * S + k * 1000, 9_000_000))
             if receiver == 0:
@@ -387,8 +387,6 @@ def test_nees_is_the_normalized_squared_error(assessed):
     (nees,) = (series for series in assessed.normalized_errors if series.what == "NEES")
     assert np.allclose(nees.value, 1.0, atol=1e-3)
     assert nees.inside == 1.0
-    (nis,) = (series for series in assessed.normalized_errors if series.what == "NIS")
-    assert np.allclose(nis.value, 0.5)
 
 
 def test_chi_square_quantiles_match_tables():
@@ -646,8 +644,8 @@ def test_warnings_of_the_events_table_have_their_severity_and_colour():
 
 def test_a_share_below_100_percent_is_not_written_as_100_percent(assessed):
     value = np.where(np.arange(4000) == 7, 99.0, 1.0)
-    nis = assessing.NormalizedErrors("NIS", np.arange(4000.0), value, np.full(4000, 2.0))
-    shown = dataclasses.replace(assessed, normalized_errors=[nis])
+    nees = assessing.NormalizedErrors("NEES", np.arange(4000.0), value, np.full(4000, 2.0))
+    shown = dataclasses.replace(assessed, normalized_errors=[nees])
     page = render_report("r", [ReportBlock(["a"], [shown], [])])
     assert "99.9 %" in page and "100.0 %" not in page
 
