@@ -218,7 +218,6 @@ class Session:
         self,
         *,
         component: int = mavlink.MAV_COMP_ID_ONBOARD_COMPUTER,
-        system: int | None = None,
         autopilot_system: int | None = None,
         rates_hz: Mapping[str, float] | None = None,
         signing: Signing | None = None,
@@ -230,8 +229,6 @@ class Session:
         ----------
         component
             Our component id.
-        system
-            Our system id; if None, the autopilot's (1 until it is known).
         autopilot_system
             If given, any other autopilot is ignored.
         rates_hz
@@ -246,11 +243,7 @@ class Session:
         ValueError
             For ids outside 1-255, unknown message names and rates out of range.
         """
-        for name, value in (
-            ("component", component),
-            ("system", system),
-            ("autopilot_system", autopilot_system),
-        ):
+        for name, value in (("component", component), ("autopilot_system", autopilot_system)):
             if value is not None and not 1 <= value <= 255:
                 raise ValueError(f"{name} {value} is not a MAVLink id: give 1 to 255")
         if not 0 <= link_id <= 255:
@@ -262,7 +255,6 @@ class Session:
         self.clock = BootClock()
         self.stream_rates = StreamRates(_by_id(rates_hz or {}))
         self._unanswered: list[int] = []  # rates requested last: answers come in order and name no message
-        self._system = system
         self._choice = AutopilotChoice(autopilot_system)
         self._readers: dict[Hashable, tuple[frame.Reader, int]] = {}  # by peer, and its last accepted frame
         self._last_received = 0  # from the autopilot
@@ -284,8 +276,8 @@ class Session:
 
     @property
     def system(self) -> int:
-        """Our own system id."""
-        return self._system or self.autopilot or self._choice.required_system or 1
+        """Our own system id: the autopilot's, 1 until it is known."""
+        return self.autopilot or self._choice.required_system or 1
 
     @property
     def autopilot(self) -> int | None:

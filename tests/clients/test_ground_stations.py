@@ -70,7 +70,7 @@ class Vehicle(threading.Thread):
 
     def __init__(self, autopilot: int, signing: Signing | None = None) -> None:
         super().__init__(daemon=True)
-        self.session = Session(system=SYSTEM, component=COMPONENT, signing=signing)
+        self.session = Session(autopilot_system=SYSTEM, component=COMPONENT, signing=signing)
         self.parameters = ParameterServer(COMPONENT, Config())
         self.received: list[str] = []
         self._autopilot = autopilot

@@ -44,7 +44,7 @@ class Station:
         self.link = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.link.bind(("127.0.0.1", port))
         self.link.settimeout(0.02)
-        self.session = Session(system=1, component=191)
+        self.session = Session(autopilot_system=1, component=191)
         self.client: ParameterClient | None = None
         self.capabilities: int | None = None
         self.make: int | None = None

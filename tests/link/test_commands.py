@@ -150,7 +150,8 @@ def test_any_command_has_one_acknowledgement(command: int, params: list[float]) 
 
 
 def test_two_sessions_joined_in_memory() -> None:
-    station, companion = Session(system=255, component=190), Session(system=SYSTEM, component=COMPONENT)
+    station = Session(autopilot_system=255, component=190)
+    companion = Session(autopilot_system=SYSTEM, component=COMPONENT)
     here = commands()
     request = {"command": REQUEST, "param1": 148, "target_system": SYSTEM, "target_component": COMPONENT}
     station.send(dialect.new("COMMAND_LONG", **request))

@@ -394,7 +394,7 @@ def test_acknowledgement_is_passed_up_with_its_frame() -> None:
     ("values", "words"),
     [
         ({"component": 0}, "component 0 is not a MAVLink id"),
-        ({"system": 256}, "system 256 is not a MAVLink id"),
+        ({"autopilot_system": 256}, "autopilot_system 256 is not a MAVLink id"),
         ({"rates_hz": {"LOCAL_POSITION": 1}}, "did you mean LOCAL_POSITION_NED"),
         ({"rates_hz": {"ATTITUDE": 0}}, "a rate of 0 Hz for message 30"),
     ],

@@ -90,7 +90,7 @@ def other_implementation(key: bytes | None) -> common.MAVLink:
 @pytest.mark.parametrize("key", [None, KEY])
 def test_session_and_another_implementation_read_each_other(key: bytes | None) -> None:
     other = other_implementation(key)
-    session = Session(system=1, component=191, signing=at_noon() if key else None, link_id=7)
+    session = Session(component=191, signing=at_noon() if key else None, link_id=7)
     session.poll(0)
     session.send(dialect.new("STATUSTEXT", severity=6, text="ready"))
     for value in range(300):
@@ -107,16 +107,16 @@ def test_session_and_another_implementation_read_each_other(key: bytes | None) -
 
 def test_another_implementation_rejects_our_frames_with_another_key() -> None:
     other = other_implementation(OTHER_KEY)
-    session = Session(system=1, signing=at_noon())
+    session = Session(signing=at_noon())
     session.poll(0)
     with pytest.raises(common.MAVError, match="signature"):
         other.decode(bytearray(session.to_send()[0]))
 
 
 def test_sessions_with_one_key_accept_each_other_and_reject_a_third() -> None:
-    here = Session(system=1, component=191, signing=at_noon())
-    there = Session(system=255, component=190, signing=at_noon())
-    stranger = Session(system=255, component=190, signing=Signing(OTHER_KEY))
+    here = Session(component=191, signing=at_noon())
+    there = Session(autopilot_system=255, component=190, signing=at_noon())
+    stranger = Session(autopilot_system=255, component=190, signing=Signing(OTHER_KEY))
     for second in range(100):
         now = second * SECOND
         for session in (here, there, stranger):
@@ -129,7 +129,7 @@ def test_sessions_with_one_key_accept_each_other_and_reject_a_third() -> None:
 
 
 def test_forged_future_frame_does_not_lock_out_the_genuine_sender() -> None:
-    session = Session(system=1, signing=at_noon())
+    session = Session(signing=at_noon())
     events = []
     for second in range(60):
         now = second * SECOND
@@ -144,7 +144,7 @@ def test_forged_future_frame_does_not_lock_out_the_genuine_sender() -> None:
 
 
 def test_rejected_frames_count_neither_as_received_nor_as_lost() -> None:
-    session, signer, forger = Session(system=1, signing=at_noon()), at_noon(), Signing(OTHER_KEY)
+    session, signer, forger = Session(signing=at_noon()), at_noon(), Signing(OTHER_KEY)
     for sequence in range(100):
         for who, number in ((signer, sequence), (forger, sequence + 50 & 0xFF)):
             sign = lambda data, who=who: who.sign(data, 0, 0)  # noqa: E731
@@ -165,7 +165,7 @@ def test_changed_byte_of_a_genuine_frame_is_detected(at: int, flip: int) -> None
     raw[end - 2 : end] = frame.crc16.mcrf4xx(bytes(raw[1 : end - 2]) + bytes([kind.crc_extra])).to_bytes(
         2, "little"
     )
-    session = Session(system=1, signing=at_noon())
+    session = Session(signing=at_noon())
     events = session.receive(bytes(raw), 0)
     assert bytes(raw) == signed(NOON).raw or not any(isinstance(e, MessageReceived) for e in events)
 
