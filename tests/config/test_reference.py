@@ -65,8 +65,8 @@ def test_stated_range_is_the_one_that_is_enforced(key: Key) -> None:
         whole = int if get_type_hints(kind)[key.name] is int else float
         assert is_valid(whole(low)) and is_valid(whole(high))
         assert not is_valid(whole(low - 1)) and not is_valid(whole(high + 1))
-    elif words[0] == "above" and isinstance(key.default, float):
-        assert is_valid(float(words[1]) + 1e-6) and not is_valid(float(words[1]))
+    elif words[:2] == ["at", "least"]:
+        assert is_valid(int(words[2])) and not is_valid(int(words[2]) - 1)
     elif key.unit == "" and isinstance(key.default, str) and key.allowed != "text":
         assert all(is_valid(choice) for choice in key.allowed.split(", ")) and not is_valid("none of them")
 
