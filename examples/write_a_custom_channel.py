@@ -35,5 +35,5 @@ for t in range(1, 61):
     bank = banks.propagate(bank, layout, 1.0, *channel.transition(Nominal(point, (0.0, 0.0), since)))
     true = np.array([-0.25, 0.1]) * t**2  # the aircraft accelerates, the channel does not
     bank, _ = banks.update(bank, layout, true + rng.normal(0.0, 0.7, 2), H, 0.5 * np.eye(2), 0)
-x, P, _, _ = banks.estimate(bank, layout)
+x, P = banks.estimate(bank, layout)
 print(f"true error {true} m, estimate {x[:2].round(1)} m, sigma {P[0, 0] ** 0.5:.1f} m")

@@ -11,7 +11,8 @@ from msgspec import Struct
 
 from companion.config import Config
 from companion.estimate import bank as banks
-from companion.estimate.bank import Bank, Estimate
+from companion.estimate.bank import Bank
+from companion.estimate.kalman import Gaussian
 from companion.nav.geometry import Geodetic, displace
 from companion.navigator import height_error
 from companion.navigator.air_data_channel import CLIMB_NS
@@ -83,7 +84,7 @@ class State(Struct, frozen=True):
     bank: Bank | None = None
     newborn: tuple[Bank, Bank] | None = None  # a bank, and what it is after the births that are due
     turned: Vector2 = (0.0, 0.0)  # change of velocity by the IMU since the last births, north and east (m/s)
-    leading: tuple[Bank, Estimate] | None = None  # moments of the leading family, and of which bank
+    leading: tuple[Bank, Gaussian] | None = None  # moments of the leading family, and of which bank
     protection: tuple[int, float, float, float] | None = None  # when computed; radius, position error (m)
     fixed: bool = False  # whether a fix was ever used
     beacons: tuple[Beacon, ...] = ()
@@ -166,7 +167,7 @@ def corrected(point: Point, state: State, settings: Settings) -> tuple[Point, Ve
     return point._replace(position=place._replace(alt=point.position.alt)), (north, east)
 
 
-def estimate(state: State, settings: Settings) -> Estimate:
+def estimate(state: State, settings: Settings) -> Gaussian:
     """Moments of the leading explanation."""
     assert state.bank is not None
     if state.leading is not None and state.leading[0] is state.bank:

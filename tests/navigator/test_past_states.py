@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from companion.estimate.bank import Estimate, Layout, start
+from companion.estimate.bank import Layout, start
+from companion.estimate.kalman import Gaussian
 from companion.navigator.past_states import DENSE_NS, MOST_KEPT, SPARSE_NS, PastStates
 from companion.navigator.state import State
 from companion.records import Pressure
@@ -18,7 +19,7 @@ MS = 1_000_000
 LATE_NS = 6_000_000_000
 START_NS = 100 * SPARSE_NS
 LAYOUT = Layout(2, (), (), (), grades=(1.0,))
-ESTIMATE = Estimate(np.zeros(2), np.eye(2), 0, 1.0)
+ESTIMATE = Gaussian(np.zeros(2), np.eye(2))
 
 
 def record(t_ns: int) -> Pressure:

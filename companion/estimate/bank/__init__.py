@@ -51,7 +51,6 @@ from companion.estimate.bank.branching import (
 from companion.estimate.bank.layout import NEVER, NONE, Bools, Fault, Ints, Jump, Layout, Lie, Source
 from companion.estimate.bank.protection import exceedance, level
 from companion.estimate.bank.readout import (
-    Estimate,
     decide,
     estimate,
     explanations,
@@ -80,7 +79,6 @@ __all__ = [
     "NONE",
     "Bank",
     "Bools",
-    "Estimate",
     "Fault",
     "Innovation",
     "Ints",

@@ -48,16 +48,16 @@ class Lie:
 
     Parameters
     ----------
-    offset, rate : one sigma, unit of the measurement and unit/s; a number or one per component of the fault.
+    offset, rate : one sigma per component, unit of the measurement and unit/s.
     noise : random walk of the rate, unit/s/sqrt(s).
     acceleration : one sigma of the constant rate of the rate, unit/s^2; groups of order 3 only.
     share : part of the fault's prior that this scale gets; shares are normalised.
     """
 
-    offset: float | tuple[float, ...]
-    rate: float | tuple[float, ...]
-    noise: float | tuple[float, ...] = 0.0
-    acceleration: float | tuple[float, ...] = 0.0
+    offset: float
+    rate: float
+    noise: float = 0.0
+    acceleration: float = 0.0
     share: float = 1.0
 
 
@@ -227,17 +227,12 @@ class Layout:
         slots = np.concatenate([self.sources[s].slot + np.arange(self.sources[s].dim) for s in f.sources])
         a, d, m = self.starts[g], self.groups[g], len(slots)
         index = np.concatenate((a + slots, a + d + slots))
-        sigma = np.concatenate((_each(lie.offset, m), _each(lie.rate, m)))
+        sigma = [lie.offset, lie.rate]
         if self.sizes[g] == 3 * d:
             index = np.concatenate((index, a + 2 * d + slots))
-            sigma = np.concatenate((sigma, _each(lie.acceleration, m)))
-        elif np.any(lie.acceleration):
+            sigma.append(lie.acceleration)
+        elif lie.acceleration:
             raise ValueError(f"fault {f.name}: an acceleration needs a group of order 3")
-        prior = index, sigma**2, sum(self.groups[:g]) + slots, _each(lie.noise, m) ** 2
+        prior = index, np.repeat(sigma, m) ** 2, sum(self.groups[:g]) + slots, np.full(m, lie.noise) ** 2
         self._priors[fault, lie] = prior
         return prior
-
-
-def _each(value: float | tuple[float, ...], m: int) -> Floats:
-    """(m,) from one number or m numbers."""
-    return np.broadcast_to(np.asarray(value, dtype=np.float64), (m,))

@@ -2,32 +2,14 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
 from companion.estimate.bank.layout import Ints, Layout
 from companion.estimate.bank.protection import exceedance, level
 from companion.estimate.bank.settings import DEFAULT, Settings
 from companion.estimate.bank.state import Bank, false_rows, families
+from companion.estimate.kalman import Gaussian
 from companion.units import Floats
-
-
-class Estimate(NamedTuple):
-    """Moments of the leading explanation.
-
-    Attributes
-    ----------
-    x : (n,) mean.
-    P : (n, n) covariance, spread of the rows' means included.
-    code : code of the explanation, see `explanations`.
-    weight : its weight; 0 if it has no rows left, then `x` and `P` are those of the heaviest row.
-    """
-
-    x: Floats
-    P: Floats
-    code: int
-    weight: float
 
 
 def explanations(bank: Bank, layout: Layout) -> Ints:
@@ -79,8 +61,10 @@ def decide(bank: Bank, layout: Layout, settings: Settings = DEFAULT) -> Bank:
     return bank._replace(leading=leading, excluded=excluded)
 
 
-def estimate(bank: Bank, layout: Layout) -> Estimate:
-    """Return the moments of the leading explanation (see `decide`).
+def estimate(bank: Bank, layout: Layout) -> Gaussian:
+    """Return the moments of the leading explanation (see `decide`), the spread of its rows' means included.
+
+    Those of the heaviest row if it has no rows left.
 
     Parameters
     ----------
@@ -88,13 +72,13 @@ def estimate(bank: Bank, layout: Layout) -> Estimate:
 
     Returns
     -------
-    Estimate
+    Gaussian : of all states.
     """
     w = np.where(explanations(bank, layout) == bank.leading, bank.weights, 0.0)
     total = float(w.sum())
     if total == 0.0:
         i = int(np.argmax(bank.L))
-        return Estimate(bank.x[i], bank.P[i], bank.leading, 0.0)
+        return Gaussian(bank.x[i], bank.P[i])
     w = w / total
     at = w > 1e-9
     w, x = w[at] / w[at].sum(), bank.x[at]
@@ -102,7 +86,7 @@ def estimate(bank: Bank, layout: Layout) -> Estimate:
     d = (x - mean) * np.sqrt(w)[:, None]
     n = len(mean)
     P = (w @ bank.P[at].reshape(len(w), -1)).reshape(n, n) + d.T @ d
-    return Estimate(mean, P, bank.leading, total)
+    return Gaussian(mean, P)
 
 
 def false_probability(bank: Bank, layout: Layout) -> Floats:
