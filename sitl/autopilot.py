@@ -59,10 +59,11 @@ from sitl.faults import (
 from sitl.own_estimate import OwnEstimate
 from sitl.parameters import CAPABILITIES, FIRMWARE, VERSIONS, SimulatedParameters
 from sitl.scenarios import Scenario
-from sitl.world import World
+from sitl.world import BOOT_S, GEOID_M, World
 
 NEVER = 2**63 - 1
 MOST_UNREAD = 1024  # most frames that wait for a slow consumer
+LATENCY_NS, JITTER_S = 4_000_000, 0.002  # of the link to the companion; the mean of an exponential jitter
 SYSTEM, COMPONENT, RECEIVER_COMPONENT = 1, 1, 42
 UNIX_AT_START_NS = 1_767_225_600 * SECOND_NS
 """The simulated date: 1 January 2026."""
@@ -134,7 +135,6 @@ class SimulatedAutopilot:
         self._send_queue: list[tuple[int, int, bytes]] = []  # due, order, frame
         self._frames_sent = 0
         self._last_due = 0
-        self._latency_ns = round(scenario.link.latency_s * 1e9)
         self._generators: dict[int, Callable[[int], Any]] = {
             _msgid("HEARTBEAT"): self._heartbeat,
             _msgid("SYS_STATUS"): self._system_status,
@@ -147,7 +147,7 @@ class SimulatedAutopilot:
                 "ESTIMATOR_STATUS" if scenario.autopilot == "px4" else "EKF_STATUS_REPORT"
             ): self._filter_status,
         }
-        self._boot(-round(scenario.boot_before_s * 1e9), 0)
+        self._boot(-round(BOOT_S * 1e9), 0)
 
     # -- sans-IO interface --------------------------------------------------------------------------------
 
@@ -259,7 +259,7 @@ class SimulatedAutopilot:
         if isinstance(record, Gnss) and not self.parameters.gnss_is_on:
             record = without_fix(record)
         if isinstance(record, Gnss) and record.stamp_us:
-            boot_shift = -round(self.scenario.boot_before_s * 1e6) - self._sender.boot_ns // 1000
+            boot_shift = -round(BOOT_S * 1e6) - self._sender.boot_ns // 1000
             if boot_shift:
                 record = replace(record, stamp_us=max(record.stamp_us + boot_shift, 1))
         if isinstance(record, LocalPosition):
@@ -272,7 +272,7 @@ class SimulatedAutopilot:
         return frame.encode(message, sequence, SYSTEM, component)
 
     def _latency(self) -> int:
-        return self._latency_ns + int(self._rng.exponential(self.scenario.link.jitter_s) * 1e9)
+        return LATENCY_NS + int(self._rng.exponential(JITTER_S) * 1e9)
 
     def _transmit(self, frames: list[bytes], t: int) -> None:
         """Put frames sent at `t` on the link; their order is kept except under the fault "reordering"."""
@@ -334,7 +334,7 @@ class SimulatedAutopilot:
         return encode(AirspeedSensor(t, t, self.scenario.airspeed_sensor), self._sender)
 
     def _system_time(self, t: int) -> Any:
-        boot_shift = -self._sender.boot_ns - round(self.scenario.boot_before_s * 1e9)
+        boot_shift = -self._sender.boot_ns - round(BOOT_S * 1e9)
         jump = max(boot_shift, 0)  # a clock jump moves UNIX time too, a reboot does not
         record = SystemTime(t, t, boot_ns=t - self._sender.boot_ns, unix_ns=UNIX_AT_START_NS + t + jump)
         return encode(record, self._sender)
@@ -345,11 +345,11 @@ class SimulatedAutopilot:
     def origin_record(self, t: int) -> LocalOrigin:
         """Return the origin of the local position."""
         lat, lon, alt = self._local_origin
-        return LocalOrigin(t, t, lat, lon, alt - self.scenario.geoid_height)
+        return LocalOrigin(t, t, lat, lon, alt - GEOID_M)
 
     def _home(self, t: int) -> Any:
         lat, lon, alt = self.world.origin
-        return encode(HomePosition(t, t, lat, lon, alt - self.scenario.geoid_height), self._sender)
+        return encode(HomePosition(t, t, lat, lon, alt - GEOID_M), self._sender)
 
     def _version(self, t: int) -> Any:
         make = self.scenario.autopilot
@@ -381,7 +381,7 @@ class SimulatedAutopilot:
         projection: Any = self.scenario.autopilot
         place: Geodetic = local_to_geodetic(projection, self.world.origin, local.x_n)
         above = place.alt - self.world.origin.alt
-        msl = place.alt - self.scenario.geoid_height
+        msl = place.alt - GEOID_M
         heading = self._newest_record(Attitude, t).heading
         record = GlobalPosition(t, t, place.lat, place.lon, msl, local.v_n, above, heading)
         return encode(record, self._sender)

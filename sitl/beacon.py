@@ -11,13 +11,12 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
-from companion.analysis.simulated_rsbn import Sight, ecef, sight_from
+from companion.analysis import simulated_rsbn
 from companion.nav.geometry import Geodetic
 from companion.records import RsbnFix
 from sitl.flight import Trajectory
-
-_RADIO_R = 4.0 / 3.0 * 6371000.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,8 +24,7 @@ class Beacon:
     """Ground beacon and the errors of its channel.
 
     Sigmas are one sigma (RSBN's published 0.25 degrees and 200 m + 0.03 % of the range are two sigma).
-    `north_deg` is the misalignment of the beacon's north, added to every azimuth. `alt` is above the
-    ellipsoid; `ground_alt` is the height of the smooth earth of the horizon computation.
+    `alt` is above the ellipsoid; `ground_alt` is the height of the smooth earth of the horizon computation.
     """
 
     number: int
@@ -40,27 +38,23 @@ class Beacon:
     sigma_range_share: float = 1.5e-4
     azimuth_step_deg: float = 0.01
     range_step: float = 10.0
-    bias_range: float = 0.0
-    north_deg: float = 0.0
     drop_out: float = 0.01
     silence_deg: float = 45.0
     latency_s: float = 0.15
 
 
-def azimuth_range_elevation(beacon: Beacon, flight: Trajectory) -> Sight:
+def azimuth_range_elevation(beacon: Beacon, flight: Trajectory) -> simulated_rsbn.Sight:
     """Return azimuth in [0, 2 pi) rad, slant range (m) and elevation (rad) of the aircraft at the beacon."""
     place = Geodetic(math.radians(beacon.lat_deg), math.radians(beacon.lon_deg), beacon.alt)
-    return sight_from(place, ecef(flight.lat, flight.lon, flight.alt))
+    there = simulated_rsbn.ecef(flight.lat, flight.lon, flight.alt)
+    return simulated_rsbn.sight_from(place, there)
 
 
-def in_reach(beacon: Beacon, flight: Trajectory) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+def in_reach(beacon: Beacon, flight: Trajectory) -> npt.NDArray[np.bool_]:
     """Return a mask: within the beacon's range limit and above its radio horizon (4/3 earth)."""
-    _, slant, _ = azimuth_range_elevation(beacon, flight)
-    mast = max(beacon.alt - beacon.ground_alt, 0.0)
-    height = np.maximum(flight.alt - beacon.ground_alt, 0.0)
-    horizon = math.sqrt(2.0 * _RADIO_R) * (np.sqrt(height) + math.sqrt(mast))
-    reached: np.ndarray[tuple[int], np.dtype[np.bool_]] = slant <= np.minimum(horizon, beacon.range_limit)
-    return reached
+    slant = azimuth_range_elevation(beacon, flight).slant
+    mast, heights = beacon.alt - beacon.ground_alt, flight.alt - beacon.ground_alt
+    return simulated_rsbn.in_reach(slant, beacon.range_limit, mast, heights)
 
 
 def simulate_answers(
@@ -75,8 +69,8 @@ def simulate_answers(
     sigma_azimuth = math.radians(beacon.sigma_azimuth_deg)
     sigma_range = beacon.sigma_range + beacon.sigma_range_share * slant
     # drawn for every sample, received or not: an outage does not change the noise after it
-    azimuth = azimuth + math.radians(beacon.north_deg) + sigma_azimuth * rng.standard_normal(n)
-    slant = slant + beacon.bias_range + sigma_range * rng.standard_normal(n)
+    azimuth = azimuth + sigma_azimuth * rng.standard_normal(n)
+    slant = slant + sigma_range * rng.standard_normal(n)
     received = in_reach(beacon, flight) & (rng.random(n) >= beacon.drop_out)
     for start, end in outages:
         received &= (flight.t < start) | (flight.t >= end)

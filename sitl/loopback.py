@@ -36,6 +36,7 @@ from companion.units import SECOND_NS
 from sitl.autopilot import UNIX_AT_START_NS, SimulatedAutopilot
 from sitl.own_estimate import unaided_errors
 from sitl.scenarios import SCENARIOS, Scenario, SchedulePhase, parse_scenario
+from sitl.world import GEOID_M
 
 LINK = "sitl"
 START_NS = 1000 * SECOND_NS  # companion's clock at the start of the flight: any value but 0
@@ -132,7 +133,7 @@ def truth_function(autopilot: SimulatedAutopilot) -> error_statistics.TruthAt:
     """Return a function: companion's clock (ns) -> true position, height above mean sea level."""
     times = np.arange(0.0, autopilot.scenario.duration_s, 0.05)
     flight = autopilot.world.truth_at(times)
-    columns = flight.lat, flight.lon, flight.alt - autopilot.scenario.geoid_height
+    columns = flight.lat, flight.lon, flight.alt - GEOID_M
 
     def truth(t_ns: int) -> Geodetic:
         t = (t_ns - START_NS) * 1e-9

@@ -45,14 +45,6 @@ class SensorRates:
 
 
 @dataclass(frozen=True, slots=True)
-class LinkDelay:
-    """Delay from autopilot to companion: latency and mean of the exponential jitter, s."""
-
-    latency_s: float = 0.004
-    jitter_s: float = 0.002
-
-
-@dataclass(frozen=True, slots=True)
 class Scenario:
     """One flight: plan, sensors, outages, faults. The seed determines every random number.
 
@@ -71,15 +63,12 @@ class Scenario:
     gnss: GnssModel = field(default_factory=GnssModel)
     air: AirDataModel = field(default_factory=AirDataModel)
     rates: SensorRates = field(default_factory=SensorRates)
-    link: LinkDelay = field(default_factory=LinkDelay)
     airspeed_sensor: bool = True
     own_estimate: bool = False
     correctors: tuple[str, ...] = ()
     faults: tuple[Fault, ...] = ()
     seed: int = 1
     autopilot: Literal["ardupilot", "px4"] = "ardupilot"
-    geoid_height: float = 16.0
-    boot_before_s: float = 37.25
 
     def __post_init__(self) -> None:
         if self.grade not in GRADES:

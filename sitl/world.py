@@ -36,6 +36,8 @@ from sitl.scenarios import Scenario
 
 #: Kinds of records that the companion receives from every autopilot.
 SENSORS: tuple[type[Stamped], ...] = (LocalPosition, Attitude, Gnss, AirData, Pressure, RsbnFix)
+GEOID_M = 16.0  # height of mean sea level above the ellipsoid
+BOOT_S = 37.25  # the autopilot booted so long before the start
 _TURN = 2.0 * np.pi
 
 
@@ -85,9 +87,8 @@ class World:
 
         They are in order of arrival; invalid local positions are left out.
         """
-        origin, scenario = self.origin, self.scenario
-        height = origin.alt - scenario.geoid_height
-        yield LocalOrigin(0, 0, origin.lat, origin.lon, height, scenario.autopilot)
+        origin = self.origin
+        yield LocalOrigin(0, 0, origin.lat, origin.lon, origin.alt - GEOID_M, self.scenario.autopilot)
         streams = (*(self.streams[kind] for kind in kinds), self.corrections)
         for record in heapq.merge(*streams, key=attrgetter("rx_ns")):
             if not isinstance(record, LocalPosition) or all(map(math.isfinite, record.x_n)):
@@ -146,7 +147,7 @@ class World:
     def _gnss(self, rng: np.random.Generator) -> list[Gnss]:
         model, scenario = self.scenario.gnss, self.scenario
         fixes = sensors.simulate_gnss(self._sampled(scenario.rates.gnss), model, scenario.gnss_outages, rng)
-        stamp_offset = round(scenario.boot_before_s * 1e6)
+        stamp_offset = round(BOOT_S * 1e6)
         stream = []
         last = (self.origin.lat, self.origin.lon, self.origin.alt)
         columns = (fixes.lat.tolist(), fixes.lon.tolist(), fixes.alt.tolist(), fixes.v_n.tolist())
@@ -162,7 +163,7 @@ class World:
                     fix=3 if usable else 1,
                     lat=last[0],
                     lon=last[1],
-                    alt_msl=last[2] - scenario.geoid_height,
+                    alt_msl=last[2] - GEOID_M,
                     alt=last[2],
                     sigma_horizontal=model.sigma_horizontal if usable else None,
                     sigma_vertical=model.sigma_horizontal * model.vertical_ratio if usable else None,
@@ -181,7 +182,7 @@ class World:
         speeds = np.stack(
             [air.equivalent_airspeed, np.hypot(v_n[:, 0], v_n[:, 1]), -v_n[:, 2]], axis=1
         ).tolist()
-        headings, heights = flight.attitude[:, 2].tolist(), (flight.alt - self.scenario.geoid_height).tolist()
+        headings, heights = flight.attitude[:, 2].tolist(), (flight.alt - GEOID_M).tolist()
         sensed = self.scenario.airspeed_sensor
         if not sensed:  # what VFR_HUD then carries: the ground speed of an estimator that knows of no wind
             speeds = [[ground, ground, climb] for _, ground, climb in speeds]

@@ -248,7 +248,7 @@ def simulate_measurements(
     visible = []
     for beacon in beacons:
         geometry = sight_from(Geodetic(beacon.lat, beacon.lon, beacon.alt), place)
-        if (reach := _in_reach(beacon, geometry, alt)).any():
+        if (reach := in_reach(geometry.slant, beacon.range_limit, beacon.alt - GROUND, alt - GROUND)).any():
             visible.append((beacon, geometry, reach))
     if not visible:
         return []
@@ -320,10 +320,12 @@ def sight_from(beacon: Geodetic, place: Floats) -> Sight:
     return Sight(np.arctan2(east, north) % math.tau, np.hypot(level, up), np.arctan2(up, level))
 
 
-def _in_reach(beacon: ListedBeacon, geometry: Sight, alt: Floats) -> npt.NDArray[np.bool_]:
-    near = geometry.slant <= beacon.range_limit
-    if not near.any():
-        return near
-    horizon = np.array([radio_horizon(beacon.alt - GROUND, height) for height in (alt - GROUND).tolist()])
-    reach: npt.NDArray[np.bool_] = near & (geometry.slant <= horizon)
-    return reach
+def in_reach(slant: Floats, limit: float, mast: float, heights: Floats) -> npt.NDArray[np.bool_]:
+    """Return where an aircraft is within a beacon's range limit and above its radio horizon.
+
+    Heights of its antenna, `mast`, and of the aircraft, `heights` (n,), are above the smooth earth, m.
+    """
+    near: npt.NDArray[np.bool_] = slant <= limit
+    if near.any():
+        near &= slant <= [radio_horizon(mast, height) for height in heights.tolist()]
+    return near

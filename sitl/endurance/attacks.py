@@ -38,12 +38,12 @@ from sitl.endurance.fuzz_targets import make_frame
 from sitl.endurance.parameter_sweep import CONFIGS, param_set, recorded_flight, settings
 from sitl.loopback import LINK, START_NS
 from sitl.scenarios import get_scenario
+from sitl.world import BOOT_S
 
 HOST = "127.0.0.1"
 SETTLE_S, START_S = 8.0, 60.0
 REQUEST_INTERVAL_S = 0.05
 BATCH_S = 0.005
-BOOT_S = 37.25  # of the simulated autopilot at its start
 
 
 class Attack(NamedTuple):

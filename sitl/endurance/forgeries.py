@@ -28,6 +28,7 @@ from companion.storage.deferred_log import NoLog
 from companion.units import SECOND_NS
 from sitl.endurance.parameter_sweep import CONFIGS, recorded_flight
 from sitl.loopback import LINK, START_NS
+from sitl.world import BOOT_S
 
 FORGED_FROM_S, INTERVAL_NS = 20.0, SECOND_NS // 10
 KEY, STRANGERS_KEY = bytes(range(32)), bytes(32)
@@ -172,7 +173,7 @@ def together(rows: Sequence[Forger], now: int) -> list[tuple[bytes, Hashable]]:
 
 
 def _boot_ms(now_ns: int) -> int:
-    return (now_ns - START_NS) // 1_000_000 + 37_250  # of the simulated autopilot
+    return (now_ns - START_NS) // 1_000_000 + round(1e3 * BOOT_S)
 
 
 def compare(plain: Sent, disturbed: Sent) -> Effect:
