@@ -102,7 +102,7 @@ def fly_orders(todo: Sequence[FlightOrder], scheduler: str | None, workers: int)
     orders = {order.key: order for order in todo}
     for done in run_jobs(fly_order, orders, scheduler, workers, "campaign"):
         if done.failure:
-            yield FlightResult(done.key, *orders[done.key], 0.0, 0.0, raised=done.failure)
+            yield FlightResult(done.key, *orders[done.key], 0.0, raised=done.failure)
         else:
             yield done.result
 

@@ -23,9 +23,7 @@ from sitl.scenarios import SensorRates, get_scenario
 
 def result(fault: str, seed: int, **changes: object) -> FlightResult:
     order = FlightOrder("one-beacon", fault, seed)
-    return FlightResult(order.key, *order, 720.0, 2.0)._replace(
-        **{"solutions": 3600, "quiet_s": 240.0, **changes}
-    )
+    return FlightResult(order.key, *order, 720.0)._replace(**{"solutions": 3600, "quiet_s": 240.0, **changes})
 
 
 JUMP = FlightOrder("one-beacon", "gnss-jump", 1)
@@ -72,8 +70,7 @@ def test_gross_faults_are_detected_at_once(fault: str) -> None:
 @pytest.mark.flight
 @pytest.mark.long
 def test_same_order_gives_the_same_result() -> None:
-    first, second = (fly_order(JUMP)._replace(took_s=0.0) for _ in range(2))
-    assert first == second
+    assert fly_order(JUMP) == fly_order(JUMP)
 
 
 def test_stored_flights_are_not_repeated(requested: list[FlightOrder], tmp_path: Path) -> None:
@@ -243,7 +240,7 @@ def test_lost_flight_is_repeated_by_the_next_campaign(
 ) -> None:
     (order,) = wanted = [FlightOrder("one-beacon", "none", 1)]
     lost, flown = (
-        FlightResult(order.key, *order, 0.0, 0.0, raised=f"{command.WORKER_LOST}: it died"),
+        FlightResult(order.key, *order, 0.0, raised=f"{command.WORKER_LOST}: it died"),
         result("none", 1),
     )
     for returned in (lost, flown):
