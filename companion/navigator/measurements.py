@@ -159,13 +159,17 @@ def airspeed(
     """
     layout = known.layout
     row = channel.propagator.airspeed_row(velocity, V, manoeuvre)
-    H = np.zeros((len(bank.L), 2, layout.n))
-    H[:, :, : channel.n] = row.H
     speed = max(math.hypot(*V), 1.0)
-    false = (bank.fault[:, AIRSPEED_GROUP] != banks.NONE).astype(np.float64)
     lie = layout.lie_states(AIRSPEED)[0]
-    H[:, 0, lie], H[:, 1, lie] = -false * V[0] / speed, -false * V[1] / speed
-    taken = _take(bank, known, row.y, H, row.R, None, "velocity")
+
+    def seen_by(bank: Bank) -> tuple[Floats, Floats]:
+        H = np.zeros((len(bank.L), 2, layout.n))
+        H[:, :, : channel.n] = row.H
+        false = (bank.fault[:, AIRSPEED_GROUP] != banks.NONE).astype(np.float64)
+        H[:, 0, lie], H[:, 1, lie] = -false * V[0] / speed, -false * V[1] / speed
+        return np.broadcast_to(row.y, (len(bank.L), 2)), H
+
+    taken = _take(bank, known, seen_by, None, row.R, None, "velocity")
     seen = taken.bank.seen.copy()
     seen[AIRSPEED] = taken.bank.t
     return taken._replace(bank=taken.bank._replace(seen=seen))

@@ -109,8 +109,8 @@ def update(
     bank, layout : the bank, propagated to the time of the measurement.
     z : (m,) for all rows, or a function of the bank that returns z (R, m) and H (R, m, k): a measurement that
         is nonlinear, or that depends on the hypothesis.
-    H : (m, k) for all or (R, m, k) per row; k is n_base or n. The lie's columns are filled in here. None
-        where z is a function.
+    H : (m, k) for all rows; k is n_base or n. The lie's columns are filled in here. None where z is a
+        function.
     R : (m, m) covariance of the white noise.
     source : index of the source, None for a measurement that cannot be false.
     settings : births on return and on surprise.
@@ -126,7 +126,6 @@ def update(
     ------
     ValueError : a covariance is not positive definite, or z is no number.
     """
-    fixed = H is not None and H.ndim == 3  # rows must stay as they are
     born = False
 
     def innovations(bank: Bank) -> _Step:
@@ -136,12 +135,12 @@ def update(
             raise ValueError("measurement is not a number")
         return _innovations(bank, layout, z_rows, H_rows, R, source)
 
-    if source is not None and not fixed and bank.t - bank.seen[source] > layout.sources[source].silence_s:
+    if source is not None and bank.t - bank.seen[source] > layout.sources[source].silence_s:
         bank, born = returns(bank, layout, source, settings)
     step = innovations(bank)
     passed = min((bank.t - bank.born_t) / settings.surprise_gap_s, 1.0)  # since births
     nis = float(step.nis[int(np.argmax(bank.L))]) * passed**2
-    may_bear = source is not None and not fixed and not born and settings.surprise < math.inf
+    may_bear = source is not None and not born and settings.surprise < math.inf
     if may_bear and nis > settings.surprise * step.S.shape[-1]:
         bank = births(bank, layout, settings, reduced=False)
         born = True
