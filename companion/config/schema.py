@@ -307,6 +307,11 @@ class Config(Section, frozen=True):
         """Whether the other GNSS receiver may be used; not the one that GPS_INPUT feeds."""
         return self.gnss.second_receiver and self.output.rates_hz["GPS_INPUT"] == 0.0
 
+    @property
+    def uses_local_velocity(self) -> bool:
+        """Whether the own channel may use the velocity of the autopilot's estimator; not if we feed that."""
+        return self.uses("local_position") and not self.output.feeds_estimator
+
     def uses(self, sensor: Sensor) -> bool:
         """Whether the own channel may use a sensor: `inertial.source` allows all or one."""
         return self.inertial.source in ("auto", sensor)

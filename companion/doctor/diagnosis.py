@@ -98,7 +98,7 @@ def check_airspeed(config: Config, healthy: bool | None, vehicle_type: int = 0) 
     if by_drag and not healthy:
         return [Finding("airspeed sensor", "none: by the drag of the rotors, in the air", "", None)]
     others = [sensor for sensor in ("IMU",) if config.uses("imu")]
-    if config.uses("local_position") and not config.output.feeds_estimator:
+    if config.uses_local_velocity:
         others.append("local position")
     if healthy is None:
         text = "not reported: not used"

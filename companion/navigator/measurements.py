@@ -164,7 +164,7 @@ def airspeed(
 
     def seen_by(bank: Bank) -> tuple[Floats, Floats]:
         H = np.zeros((len(bank.L), 2, layout.n))
-        H[:, :, : channel.n] = row.H
+        H[:, :, : channel.n] = row.H[:, : channel.n]
         false = (bank.fault[:, AIRSPEED_GROUP] != banks.NONE).astype(np.float64)
         H[:, 0, lie], H[:, 1, lie] = -false * V[0] / speed, -false * V[1] / speed
         return np.broadcast_to(row.y, (len(bank.L), 2)), H
@@ -182,12 +182,13 @@ def steady_airspeed(
 
     It is no source that may be false: what it wanders by is a state, and so is its scale.
     """
-    return _velocity(bank, known, channel.propagator.airspeed_row(velocity, V, manoeuvre))
+    return _velocity(bank, known, channel, channel.propagator.airspeed_row(velocity, V, manoeuvre))
 
 
 def rotor_drag(
     bank: Bank,
     known: Hypotheses,
+    channel: OwnChannel,
     V: Vector2,
     velocity: Vector2,
     manoeuvre: float,
@@ -204,7 +205,7 @@ def rotor_drag(
     def seen_by(bank: Bank) -> tuple[Floats, Floats]:
         z, own = own_error_model.drag_rows(bank.x, velocity, V, heading, drag_per_s)
         H = np.zeros((len(bank.L), 2, known.layout.n_base))
-        H[:, :, : own.shape[2]] = own
+        H[:, :, : channel.n] = own[:, :, : channel.n]
         return z, H
 
     R = own_error_model.airspeed_variance(manoeuvre) * np.eye(2)
@@ -213,12 +214,12 @@ def rotor_drag(
 
 def foreign_velocity(bank: Bank, known: Hypotheses, channel: OwnChannel, apart: Vector2) -> Taken:
     """Take the velocity of the autopilot's own estimator; `apart` is nominal minus foreign (m/s)."""
-    return _velocity(bank, known, own_error_model.foreign_row(channel.settings, apart))
+    return _velocity(bank, known, channel, own_error_model.foreign_row(channel.settings, apart))
 
 
-def _velocity(bank: Bank, known: Hypotheses, row: own_error_model.Row) -> Taken:
+def _velocity(bank: Bank, known: Hypotheses, channel: OwnChannel, row: own_error_model.Row) -> Taken:
     H = np.zeros((2, known.layout.n_base))
-    H[:, : row.H.shape[1]] = row.H
+    H[:, : channel.n] = row.H[:, : channel.n]
     return _take(bank, known, row.y, H, row.R, None, "velocity")
 
 

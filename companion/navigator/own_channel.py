@@ -119,16 +119,18 @@ class OwnChannel:
             hold_m_s_sqrt_s=HOLD_M_S_SQRT_S,
         )
         self.propagator = Propagator(self.settings)
-        self.n, self.latency = own_error_model.N, own_error_model.LATENCY
+        self.n = own_error_model.N if config.uses_local_velocity else own_error_model.FOREIGN.start
+        self.latency = own_error_model.LATENCY
 
     def prior(self) -> Floats:
         """First covariances (grades, n, n)."""
-        return own_error_model.prior(self.settings)
+        return own_error_model.prior(self.settings)[:, : self.n, : self.n]
 
     def transition(self, nominal: Nominal) -> Transition:
         """Phi and Q of the interval."""
         assert nominal.interval is not None
-        return Transition(*self.propagator.transition(nominal.interval))
+        Phi, Q = self.propagator.transition(nominal.interval)
+        return Transition(Phi[: self.n, : self.n], Q[:, : self.n, : self.n])
 
 
 def with_airspeed_sensor(s: Sensors, record: AirspeedSensor) -> Sensors:

@@ -61,8 +61,8 @@ Airspeed = Literal["pitot", "drag", "steady"]
 POSITION, VELOCITY, WIND = slice(0, 2), slice(2, 4), slice(4, 6)
 SCALE, HEADING, CRAB = 6, 7, 8
 TILT, ACCELEROMETER, DRIFT, GUST = slice(9, 11), slice(11, 13), slice(13, 15), slice(15, 17)
-DOPPLER, FOREIGN = slice(17, 19), slice(19, 21)
-LATENCY = 21
+DOPPLER, LATENCY = slice(17, 19), 19
+FOREIGN = slice(20, 22)  # last: left out where no foreign velocity is used
 N = 22
 
 AIRSPEED_NOISE_M_S = 1.0  # of half a second's mean: pitot, angle of attack, sideslip

@@ -263,7 +263,9 @@ def _measured(state: State, record: AirData | Attitude | Imu, V: Vector2, settin
         taken = measurements.steady_airspeed(state.bank, known, _own(settings), V, velocity, manoeuvre)
     else:
         drag, heading = settings.config.air_data.rotor_drag_per_s, s.heading() or 0.0
-        taken = measurements.rotor_drag(state.bank, known, V, velocity, manoeuvre, heading, drag)
+        taken = measurements.rotor_drag(
+            state.bank, known, _own(settings), V, velocity, manoeuvre, heading, drag
+        )
     sums = AirspeedSums(record.t_ns, 0, (0.0, 0.0), (0.0, 0.0))
     sensors = structs.replace(state.sensors, measured_ns=record.t_ns, sums=sums)
     return decided(structs.replace(state, bank=taken.bank, sensors=sensors), record, settings)
@@ -299,7 +301,7 @@ def foreign_position(state: State, record: LocalPosition, settings: Settings) ->
     state = structs.replace(state, local=record)
     if state.origin is None and state.waiting_ns is None:
         state = structs.replace(state, waiting_ns=record.t_ns)
-    if not config.uses("local_position") or config.output.feeds_estimator:
+    if not config.uses_local_velocity:
         return state, []
     before = s.foreign
     s = structs.replace(s, foreign=record, foreign_ns=record.t_ns)

@@ -140,6 +140,5 @@ def uses(settings: Settings) -> _Uses:
     if not isinstance(settings.model.channel, OwnChannel):
         added = [_CORRECTORS[name] for name in config.inertial.correctors]
         return {kind: use for uses in (_INS, *added) for kind, use in uses.items()}
-    fed = config.output.feeds_estimator or not config.uses("local_position")
-    found = _OWN_FED if fed else _OWN
+    found = _OWN if config.uses_local_velocity else _OWN_FED
     return found if config.uses("imu") else {kind: use for kind, use in found.items() if kind is not Imu}
