@@ -25,6 +25,7 @@ from companion.estimate.bank import (
     Lie,
     Settings,
     Source,
+    Turn,
     enlarge,
     start,
 )
@@ -34,6 +35,7 @@ from companion.navigator.channel import Channel, Nominal, Transition
 from companion.navigator.corrected_ins import corrected_ins
 from companion.navigator.fix_observations import LATE_S
 from companion.navigator.own_channel import OwnChannel
+from companion.units import Floats
 
 POSITION = (0, 1)  # states
 SOURCES = ("gnss", "airspeed", "velocity of gnss")  # then `azimuth(k)` and `range(k)` of each beacon k
@@ -86,6 +88,10 @@ SURPRISE = (
 GRADE_CHANGES_H = 10.0
 #: A compass, or the autopilot resets its heading (rad). The wind took up what was wrong with it before (m/s).
 HEADING_STEPS_H, HEADING_STEP, HEADING_WIND = 10.0, 0.5, 7.0
+#: At the start the heading may be a quarter or half a turn off, by a compass set up wrongly (rad).
+TURNED, TURNED_BY = 1e-3, 0.2
+TURNS = {"turned right": 0.5 * math.pi, "turned left": -0.5 * math.pi, "turned back": math.pi}
+FAR_VERSINE = 0.3  # from 45 deg on a heading is far off
 AIR_HEADING_STEPS_H = 1e-2  # by airspeed a wrong heading turns no acceleration
 #: Attitude and IMU give a false velocity (m/s): a turn with an attitude that is off, another latency. Not in
 #: straight flight, however it shakes, but where the velocity has changed by so much since the last births: a
@@ -183,7 +189,10 @@ class Model:
         layout = self.hypotheses(0).layout
         P = self.channel.prior()
         bank = start(layout, t_s, np.zeros(layout.n_base), P, self.channel.grades)
-        return bank if self.plain is None else only(bank, self.plain)
+        if self.plain is not None:
+            return only(bank, self.plain)
+        turned = {j: TURNED for j, jump in enumerate(layout.jumps) if jump.name in TURNS}
+        return banks.jumped_before(bank, layout, turned)
 
     def with_beacon(self, bank: Bank, beacons: int) -> Bank:
         """The bank with one beacon more than `beacons`, its biases unknown."""
@@ -200,6 +209,17 @@ class Model:
         known, still = self.hypotheses(1), tuple(lie for lie in GNSS_FIRST if lie.rate == STILL)
         lies = {i: still for i, fault in enumerate(known.layout.faults) if fault.sources == (GNSS,)}
         return banks.false_since_first(bank, known.layout, known.settings, lies, DOUBTED, POSITION)
+
+    def undecayed(self, bank: Bank, Phi: Floats) -> Bank:
+        """The bank after Phi, the sine of a heading that is far off as before: its versine does not decay."""
+        if not self.channel.wind:
+            return bank
+        far = bank.x[:, own_error_model.VERSINE] > FAR_VERSINE
+        if not far.any():
+            return bank
+        x = bank.x.copy()
+        x[far, own_error_model.HEADING] /= Phi[own_error_model.HEADING, own_error_model.HEADING]
+        return bank._replace(x=x)
 
     def transition(self, nominal: Nominal, beacons: int) -> Transition:
         """Phi (n, n) and Q (grades, n_base, n_base) over all states, the lies' motion left to the bank."""
@@ -291,14 +311,15 @@ def _jumps(config: Config, channel: Channel, by_air: bool, has_turned: bool) -> 
     # the velocity over ground jumps with it
     states = (*channel.wind, *((2, 3, 0, 1) if by_air else GUST))
     sigmas = (jump,) * 6 if by_air else (jump, jump, GUST_OPEN_M_S, GUST_OPEN_M_S)
-    turned = (own_error_model.HEADING, *channel.wind)
-    by = (HEADING_STEP, HEADING_WIND, HEADING_WIND)
     heading_h = AIR_HEADING_STEPS_H if by_air else HEADING_STEPS_H
     velocity_h = VELOCITY_STEPS_H if has_turned and not by_air else 0.0
     latency_h = 0.0 if by_air else LATENCY_STEPS_H
+    angle = own_error_model.HEADING, own_error_model.VERSINE
+    step, wind = Turn(*angle, HEADING_STEP), (HEADING_WIND, HEADING_WIND)
     return (
         Jump("wind", states, sigmas, rate_h, quota=24, often=True),
-        Jump("heading", turned, by, heading_h),
+        Jump("heading", channel.wind, wind, heading_h, turn=step),
+        *(Jump(name, (), (), 0.0, quota=0, turn=Turn(*angle, TURNED_BY, by)) for name, by in TURNS.items()),
         Jump("velocity", (2, 3), (VELOCITY_STEP, VELOCITY_STEP), velocity_h),
         Jump("latency", (channel.latency,), (LATENCY_STEP,), latency_h),
         # whatever the model does not know: GNSS is believed again after a second or two

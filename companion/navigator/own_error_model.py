@@ -10,20 +10,22 @@ The nominal trajectory is integrated from what the autopilot streams, the best s
 Errors are nominal minus truth, north and east. The wind is the wind itself, not an error.
 
     dp' = dv
-    dv' = tilt + R(heading) accelerometer + heading J a + white           (imu)
-    dv  = -wind + (scale + (heading + crab) J) V + turbulence             (air; not integrated, substituted)
-    dv  = foreign + white                                                 (foreign; substituted)
-    dv' = white                                                           (hold)
+    dv' = tilt + R(heading) accelerometer + (versine + heading J) a + white (imu)
+    dv  = -wind + (scale + versine + (heading + crab) J) V + turbulence     (air; not integrated, substituted)
+    dv  = foreign + white                                                   (foreign; substituted)
+    dv' = white                                                             (hold)
 
 V (2,) is the velocity through the air, a (2,) the acceleration, J = [[0, -1], [1, 0]]. In the substituted
 cases the velocity error is no memory of its own: it follows from the other states at each moment, so the
 sensor is used once. In the IMU case airspeed is a measurement (`airspeed_row`), and a change of wind does
 not move the aircraft: it shows in the difference of accelerometers and airspeed.
 
-`heading` is what is wrong with the heading for minutes, `crab` for seconds (bank-dependent compass error,
-sideslip); only `crab` is not shared with the IMU. `tilt` (m/s^2) is gravity seen through the tilt of the
-attitude. A grade states how many times coarser attitude and IMU are than the settings say; one Phi serves all
-grades and Q has one layer for each.
+`heading` is the sine of what is wrong with the heading for minutes, `versine` is 1 less its cosine: the pair
+is linear at any angle, where the angle alone ends at about 45 deg. That both are of one angle counts where
+the heading steps, along their circle. `versine` is constant, and next to nothing where the heading is little
+off. `crab` is what is wrong for seconds (bank-dependent compass error, sideslip); only `crab` is not shared
+with the IMU. `tilt` (m/s^2) is gravity seen through the tilt of the attitude. A grade states how many times
+coarser attitude and IMU are than the settings say; one Phi serves all grades and Q has one layer for each.
 
 Beside the IMU the part of the wind that lasts a second is a state, `gust`: a step of the wind differs from
 the gust of half a second ago by more than a gust changes, so it shows at once. White noise would hide it for
@@ -61,9 +63,9 @@ Airspeed = Literal["pitot", "drag", "steady"]
 POSITION, VELOCITY, WIND = slice(0, 2), slice(2, 4), slice(4, 6)
 SCALE, HEADING, CRAB = 6, 7, 8
 TILT, ACCELEROMETER, DRIFT, GUST = slice(9, 11), slice(11, 13), slice(13, 15), slice(15, 17)
-DOPPLER, LATENCY = slice(17, 19), 19
-FOREIGN = slice(20, 22)  # last: left out where no foreign velocity is used
-N = 22
+DOPPLER, LATENCY, VERSINE = slice(17, 19), 19, 20
+FOREIGN = slice(21, 23)  # last: left out where no foreign velocity is used
+N = 23
 
 AIRSPEED_NOISE_M_S = 1.0  # of half a second's mean: pitot, angle of attack, sideslip
 AIRSPEED_MANOEUVRE_S = 0.2  # and per acceleration; 0.14 to 0.17 in an aerobatic flight (TestLog2)
@@ -252,6 +254,7 @@ def prior(settings: Amplitudes) -> Floats:
     sigma = np.empty((len(GRADES), N))
     sigma[:, POSITION], sigma[:, VELOCITY], sigma[:, WIND] = s.position_m, s.velocity_m_s, s.wind_m_s
     sigma[:, FOREIGN], sigma[:, LATENCY] = s.foreign_m_s, s.latency_s
+    sigma[:, VERSINE] = 1e-6  # not zero: the smoother inverts the covariance
     for where, _, amplitudes in _correlated(s):
         sigma.T[where] = amplitudes
     return np.asarray(np.square(sigma)[:, :, None] * np.eye(N), dtype=np.float64)
@@ -317,6 +320,7 @@ class Propagator:
         Phi[0:4, 11] = i.c2, i.s2, i.c1, i.s1
         Phi[0:4, 12] = -i.s2, i.c2, -i.s1, i.c1
         Phi[0:4, HEADING] = -i.e2, i.n2, -i.e1, i.n1
+        Phi[0:4, VERSINE] = i.n2, i.e2, i.n1, i.e1
         to_velocity, to_position = tilt * half, tilt * (T * half / 3.0)
         for k in (0, 1):  # the tilt that comes up within the interval
             Q[:, 9 + k, 2 + k] = Q[:, 2 + k, 9 + k] = to_velocity
@@ -328,7 +332,7 @@ class Propagator:
         Phi[2, 2] = Phi[3, 3] = 0.0
         Phi[0, 4] = Phi[1, 5] = -T
         Phi[2, 4] = Phi[3, 5] = -1.0
-        Phi[0:4, SCALE] = i.n1, i.e1, n, e
+        Phi[0:4, SCALE] = Phi[0:4, VERSINE] = i.n1, i.e1, n, e
         Phi[0:4, HEADING] = Phi[0:4, CRAB] = -i.e1, i.n1, -e, n
         lasting = s.turbulence_s
         along = s.gust_m_s if i.airspeed == "pitot" else 0.0
@@ -389,7 +393,7 @@ class Propagator:
         H = np.zeros((2, N))
         H[0, 2] = H[1, 3] = H[0, 4] = H[1, 5] = 1.0
         H[0, GUST.start] = H[1, GUST.start + 1] = 1.0
-        H[:, SCALE] = -V[0], -V[1]
+        H[:, SCALE] = H[:, VERSINE] = -V[0], -V[1]
         H[:, HEADING] = H[:, CRAB] = V[1], -V[0]
         y = np.array((velocity[0] - V[0], velocity[1] - V[1]))
         return Row(y, H, np.eye(2) * airspeed_variance(manoeuvre))
@@ -448,17 +452,21 @@ def drag_rows(
         Turns the error of the accelerometers (rad).
     """
     air = np.array(velocity) - x[:, VELOCITY] - x[:, WIND] - x[:, GUST]  # (rows, 2)
-    scale = 1.0 + x[:, SCALE]
-    turned = np.stack((-air[:, 1], air[:, 0]), axis=1) * scale[:, None]
+    scale, ahead = 1.0 + x[:, SCALE], 1.0 - x[:, VERSINE]
+    angle = x[:, HEADING] + x[:, CRAB]
+    turned = np.stack((-air[:, 1], air[:, 0]), axis=1)
     H = np.zeros((len(x), 2, N))
-    for k in (0, 1):
-        H[:, k, VELOCITY.start + k] = H[:, k, WIND.start + k] = H[:, k, GUST.start + k] = scale
-    H[:, :, SCALE] = -air
-    H[:, :, HEADING] = H[:, :, CRAB] = -turned
+    for north in (VELOCITY.start, WIND.start, GUST.start):
+        H[:, 0, north] = H[:, 1, north + 1] = scale * ahead
+        H[:, 1, north] = scale * angle
+        H[:, 0, north + 1] = -scale * angle
+    predicted = ahead[:, None] * air + angle[:, None] * turned
+    H[:, :, SCALE] = -predicted
+    H[:, :, HEADING] = H[:, :, CRAB] = -scale[:, None] * turned
+    H[:, :, VERSINE] = scale[:, None] * air
     c, s = math.cos(heading) / drag_per_s, math.sin(heading) / drag_per_s
     H[:, :, ACCELEROMETER] = (c, -s), (s, c)
-    angle = (x[:, HEADING] + x[:, CRAB])[:, None]
-    predicted = scale[:, None] * air + angle * turned - x[:, ACCELEROMETER] @ np.array(((c, s), (-s, c)))
+    predicted = scale[:, None] * predicted - x[:, ACCELEROMETER] @ np.array(((c, s), (-s, c)))
     z: Floats = predicted - np.array(V) + np.einsum("rij,rj->ri", H, x[:, :N])
     return z, H
 

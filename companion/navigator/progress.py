@@ -99,7 +99,7 @@ def propagated(state: State, settings: Settings) -> State:
         turned = turned[0] + i.n1, turned[1] + i.e1
     state = structs.replace(state, newborn=None, turned=turned)
     Phi, Q = settings.model.transition(nominal, len(state.beacons))
-    bank = banks.propagate(bank, known.layout, nominal.pending_s, Phi, Q)
+    bank = settings.model.undecayed(banks.propagate(bank, known.layout, nominal.pending_s, Phi, Q), Phi)
     if nominal.interval is not None and nominal.interval.by_sensed_air:
         seen = bank.seen.copy()
         seen[AIRSPEED] = bank.t

@@ -21,6 +21,7 @@ from companion.estimate.bank import (
     Lie,
     Settings,
     Source,
+    Turn,
     protection,
 )
 from companion.estimate.bank.state import normalised
@@ -665,6 +666,20 @@ def test_what_has_jumped_jumps_again_at_a_rate_of_its_own():
     once, again = 1e-6 * 5.0 / HOUR, 10.0 * 5.0 / HOUR
     weights = sorted(bank.weights[bank.since == 10.0])
     assert weights == pytest.approx([once * again, once], rel=1e-6)
+
+
+@given(st.floats(-math.pi, math.pi), st.floats(-math.pi, math.pi))
+def test_an_angle_that_jumps_stays_on_its_circle(angle, by):
+    """The mean is turned, and what is open is the tangent there."""
+    jump = Jump("compass", (), (), 1.0, turn=Turn(0, 1, 0.1, by))
+    layout = replace(scalar_layout(), faults=(), jumps=(jump,))
+    before = np.array([math.sin(angle), 1.0 - math.cos(angle)])
+    bank = b.jumped_before(b.start(layout, 0.0, before, np.eye(2) * 1e-4), layout, {0: 0.2})
+    assert bank.weights == pytest.approx([0.8, 0.2])
+    turned = angle + by
+    np.testing.assert_allclose(bank.x[1, :2], [math.sin(turned), 1.0 - math.cos(turned)], atol=1e-12)
+    tangent = 0.1 * np.array([math.cos(turned), math.sin(turned)])
+    np.testing.assert_allclose(bank.P[1, :2, :2], np.eye(2) * 1e-4 + np.outer(tangent, tangent), atol=1e-12)
 
 
 @pytest.mark.parametrize("often", [False, True])

@@ -1,9 +1,14 @@
 """Priors of the navigator's hypotheses against the risk of the protection level."""
 
+import math
+
+import numpy as np
 import pytest
 
 from companion.config import Config, InertialConfig
-from companion.navigator.hypotheses import GNSS, Model
+from companion.estimate import bank as banks
+from companion.navigator.hypotheses import GNSS, TURNS, Model
+from companion.navigator.own_error_model import HEADING, VERSINE, begin
 
 
 @pytest.mark.parametrize("config", [Config(), Config(inertial=InertialConfig(independent=True))])
@@ -15,3 +20,19 @@ def test_a_lie_that_begins_is_within_the_protection_level_before_there_is_eviden
             born = fault.rate_h * known.settings.birth_s / 3600.0
             total = sum(lie.share for lie in fault.lies)
             assert min(born * lie.share / total for lie in fault.lies) > config.integrity.risk
+
+
+def test_a_heading_that_is_far_off_stays_so_while_parked() -> None:
+    """Ten minutes: with the decay of a heading little off its sine would be 0.37 of what it was."""
+    model = Model(Config())
+    layout, bank = model.hypotheses(0).layout, model.begin(0.0)
+    Phi, Q = model.channel.propagator.transition(begin("hold", (0.0, 0.0))._replace(seconds=5.0))
+    bank = bank._replace(x=bank.x + 0.01 * (np.arange(layout.n) == HEADING))
+    sine = bank.x[:, HEADING]
+    for _ in range(120):
+        bank = model.undecayed(banks.propagate(bank, layout, 5.0, Phi, Q), Phi)
+    turned = bank.event > 0
+    assert turned.sum() == len(TURNS) * 3
+    np.testing.assert_allclose(bank.x[turned, HEADING], sine[turned])
+    np.testing.assert_allclose(bank.x[~turned, HEADING], math.exp(-1.0) * 0.01)
+    np.testing.assert_allclose(np.unique(bank.x[:, VERSINE].round(12)), [0.0, 1.0, 2.0])

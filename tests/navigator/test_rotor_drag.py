@@ -20,7 +20,9 @@ from companion.navigator.hypotheses import AIRSPEED, GNSS, VELOCITY
 from companion.navigator.own_error_model import (
     ACCELEROMETER,
     GUST,
+    HEADING,
     SCALE,
+    VERSINE,
     WIND,
     N,
     drag_rows,
@@ -218,22 +220,32 @@ def test_the_smoother_is_the_two_point_solution_with_drag_too() -> None:
 VECTOR = st.lists(st.floats(-10.0, 10.0), min_size=2, max_size=2).map(np.array)
 
 
-@given(VECTOR, VECTOR, VECTOR, VECTOR, st.floats(-0.5, 1.0), st.floats(-math.pi, math.pi))
+ANGLE = st.floats(-math.pi, math.pi)
+
+
+@given(VECTOR, VECTOR, VECTOR, VECTOR, st.floats(-0.5, 1.0), ANGLE, ANGLE)
 def test_the_row_of_drag_is_its_derivative(
-    over_ground: np.ndarray, error: np.ndarray, wind: np.ndarray, V: np.ndarray, scale: float, heading: float
+    over_ground: np.ndarray,
+    error: np.ndarray,
+    wind: np.ndarray,
+    V: np.ndarray,
+    scale: float,
+    heading: float,
+    off: float,
 ) -> None:
     """z - H x is the predicted drag less the measured one, and H is what it changes by, at that state."""
     x = np.zeros((1, N))
     x[0, SPEED], x[0, WIND], x[0, SCALE], x[0, GUST] = error, wind, scale, 0.3
     x[0, ACCELEROMETER] = 0.1, -0.05
+    x[0, HEADING], x[0, VERSINE] = math.sin(off), 1.0 - math.cos(off)
 
     def innovation(x: np.ndarray) -> np.ndarray:
         z, H = drag_rows(x, tuple(over_ground), tuple(V), heading, 0.2)
         return (z - np.einsum("rij,rj->ri", H, x))[0]
 
     air, f = over_ground - error - wind - 0.3, np.array((0.1, -0.05))
-    turned = np.array(((math.cos(heading), -math.sin(heading)), (math.sin(heading), math.cos(heading)))) @ f
-    np.testing.assert_allclose(innovation(x), (1.0 + scale) * air - turned / 0.2 - V, atol=1e-12)
+    seen = (1.0 + scale) * turned(air, off) - turned(f, heading) / 0.2
+    np.testing.assert_allclose(innovation(x), seen - V, atol=1e-12)
     _, H = drag_rows(x, tuple(over_ground), tuple(V), heading, 0.2)
     step = 1e-6
     for k in range(N):
@@ -241,3 +253,9 @@ def test_the_row_of_drag_is_its_derivative(
         moved[0, k] += step
         slope = (innovation(x) - innovation(moved)) / step
         np.testing.assert_allclose(slope, H[0, :, k], atol=1e-4)
+
+
+def turned(v: np.ndarray, angle: float) -> np.ndarray:
+    """A vector turned to the right, by an angle (rad)."""
+    c, s = math.cos(angle), math.sin(angle)
+    return np.array(((c, -s), (s, c))) @ v

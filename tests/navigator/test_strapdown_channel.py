@@ -221,8 +221,10 @@ def test_a_roll_error_and_a_bias_drift_sideways_by_the_same_law() -> None:
         (own_error_model.ACCELEROMETER.start, 0.05),
         (own_error_model.ACCELEROMETER.start + 1, -0.05),
         (own_error_model.HEADING, 0.03),
+        (own_error_model.HEADING, -1.5),
+        (own_error_model.HEADING, 3.0),
     ],
-    ids=["tilt north", "tilt east", "accelerometer ahead", "accelerometer right", "heading"],
+    ids=["tilt north", "tilt east", "accelerometer ahead", "accelerometer right", *["heading"] * 3],
 )
 def test_the_error_equations_are_those_of_the_integration(state: int, size: float) -> None:
     """One error at a time through a minute of turns, integrated, and by `Propagator.transition`."""
@@ -241,6 +243,8 @@ def test_the_error_equations_are_those_of_the_integration(state: int, size: floa
     x = np.zeros(channel.n)
     for nominal in found.seconds:
         x[state] = size  # constant here
+        if state == own_error_model.HEADING:
+            x[state], x[own_error_model.VERSINE] = math.sin(size), 1.0 - math.cos(size)
         x = channel.transition(nominal).Phi @ x
     some_percent = 0.05  # banked axes are not level
     position = (found.position - exact.position)[-1]

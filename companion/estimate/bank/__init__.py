@@ -47,8 +47,9 @@ from companion.estimate.bank.branching import (
     heard_sources,
     jump_births,
     jump_births_due,
+    jumped_before,
 )
-from companion.estimate.bank.layout import NEVER, NONE, Bools, Fault, Ints, Jump, Layout, Lie, Source
+from companion.estimate.bank.layout import NEVER, NONE, Bools, Fault, Ints, Jump, Layout, Lie, Source, Turn
 from companion.estimate.bank.protection import exceedance, level
 from companion.estimate.bank.readout import (
     decide,
@@ -88,6 +89,7 @@ __all__ = [
     "Measurement",
     "Settings",
     "Source",
+    "Turn",
     "births",
     "births_due",
     "decide",
@@ -104,6 +106,7 @@ __all__ = [
     "is_sound",
     "jump_births",
     "jump_births_due",
+    "jumped_before",
     "level",
     "merge_moments",
     "picked",

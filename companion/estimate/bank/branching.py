@@ -11,11 +11,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from companion.estimate.bank.layout import NEVER, NONE, Layout, Lie
+from companion.estimate.bank.layout import NEVER, NONE, Ints, Layout, Lie, Turn
 from companion.estimate.bank.readout import level_rows
 from companion.estimate.bank.reduction import reduce
 from companion.estimate.bank.settings import DEFAULT, Settings
 from companion.estimate.bank.state import Bank, families, normalised, picked
+from companion.units import Floats
 
 HOUR_S = 3600.0
 
@@ -195,6 +196,22 @@ def false_since_first(
     return reduce(_with_children(bank, layout, children), layout, settings)
 
 
+def jumped_before(bank: Bank, layout: Layout, prior: dict[int, float]) -> Bank:
+    """Bear a child of every row for each of some jumps: what may have jumped before the start.
+
+    Parameters
+    ----------
+    bank, layout : the bank as it starts.
+    prior : probability by jump.
+
+    Returns
+    -------
+    Bank : not reduced.
+    """
+    children = [_Child(p, _log(w), jump=j) for p in range(len(bank.L)) for j, w in prior.items()]
+    return _with_children(bank, layout, children)
+
+
 def _heaviest_of_grades(bank: Bank) -> list[int]:
     """The heaviest row of each grade."""
     heaviest: dict[int, int] = {}
@@ -322,8 +339,23 @@ def _with_children(bank: Bank, layout: Layout, children: list[_Child]) -> Bank:
         elif c.jump != NONE:
             j = layout.jumps[c.jump]
             P[i[:, None], j.states, j.states] += np.square(j.sigma)
+            if j.turn is not None:
+                _turn(x, P, i, j.turn)
             event[i] = layout.jump_event(c.jump)
         else:
             parent = at[i]
             grade[i], since[i], event[i] = c.grade, bank.since[parent], bank.event[parent]
     return grown
+
+
+def _turn(x: Floats, P: Floats, rows: Ints, turn: Turn) -> None:
+    """Turn an angle in some rows, in place."""
+    s, v = turn.sine, turn.versine
+    sine, cosine = x[rows, s], 1.0 - x[rows, v]
+    if turn.mean:
+        by = math.cos(turn.mean), math.sin(turn.mean)
+        sine, cosine = by[0] * sine + by[1] * cosine, by[0] * cosine - by[1] * sine
+        x[rows, s], x[rows, v] = sine, 1.0 - cosine
+    along = turn.sigma * np.stack((cosine, sine), axis=1)
+    both = np.array((s, v))
+    P[rows[:, None, None], both[:, None], both] += along[:, :, None] * along[:, None]

@@ -92,6 +92,22 @@ class Fault:
 
 
 @dataclass(frozen=True, slots=True)
+class Turn:
+    """A jump of an angle whose sine and 1 less its cosine are base states: linear at any angle.
+
+    Parameters
+    ----------
+    sine, versine : indices of the states.
+    sigma, mean : of the jump, rad.
+    """
+
+    sine: int
+    versine: int
+    sigma: float
+    mean: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
 class Jump:
     """A jump of base states (channel, wind): the child's covariance grows once; no source is false.
 
@@ -105,6 +121,7 @@ class Jump:
     apart_s : for so long a row that jumped is an explanation of its own, see `explanations`.
     often : it is born every `Settings.jump_s`: before its birth other states learn wrongly from it.
     again_h : rate after it, 1/h; None: the same. What has jumped may jump back.
+    turn : an angle that jumps too.
     """
 
     name: str
@@ -115,6 +132,7 @@ class Jump:
     apart_s: float = 0.0
     often: bool = False
     again_h: float | None = None
+    turn: Turn | None = None
 
 
 @dataclass(frozen=True)

@@ -20,12 +20,12 @@ def reduce(bank: Bank, layout: Layout, settings: Settings) -> Bank:
     oldest row are kept first, in the young bins the heaviest of each scale, and of each family the heaviest
     of each grade: a family that has lost the right grade loses to one that has it. Protected are the rows
     that carry the weight, the heaviest of each fault, those that set the protection level, and, without a
-    fault and in the leading family, the heaviest of each grade and of each jump. A step of the heading kept
-    beside a false GNSS only proves that; with one grade left beside a false range, GNSS was blamed for
-    what a coarser INS explains. Two faults at once that are less probable than the risk stand behind: with an
-    equal claim they held a third of the rows, and the onsets of a slow lie were lost. A dropped row merges by
-    moments with a row of its label if their weights are alike; else its weight goes to the heaviest of its
-    class.
+    fault and in the leading family, the heaviest of each grade and of each jump; a jump that is not born any
+    more only while it may still be so. A step of the heading kept beside a false GNSS only proves that; with
+    one grade left beside a false range, GNSS was blamed for what a coarser INS explains. Two faults at once
+    that are less probable than the risk stand behind: with an equal claim they held a third of the rows, and
+    the onsets of a slow lie were lost. A dropped row merges by moments with a row of its label if their
+    weights are alike; else its weight goes to the heaviest of its class.
 
     Parameters
     ----------
@@ -82,7 +82,10 @@ def reduce(bank: Bank, layout: Layout, settings: Settings) -> Bank:
             by_fault.add(key[0])
             rank[i] = 0
         event = key[1] // 2
-        if key[0] in whole and event >= first_jump and (key[0], event) not in jumped:
+        may_jump = event >= first_jump and (
+            logs[i] >= settings.class_floor or layout.jumps[event - first_jump].rate_h > 0.0
+        )
+        if may_jump and key[0] in whole and (key[0], event) not in jumped:
             jumped.add((key[0], event))
             rank[i] = 0
         alive = key[0] == 0 or logs[i] >= settings.class_floor
