@@ -33,6 +33,7 @@ from companion.navigator.state import (
 from companion.records import Gnss, Stamped, Vector2
 from companion.units import SECOND_NS
 
+TURN_S = 5.0  # for so long a change of velocity counts
 SILENT_INS_NS = 3 * SECOND_NS // 2
 CONFIRM_NS = SECOND_NS  # one fix in disagreement is an outlier: a source is excluded once it lasts
 FAR_M, FAST_M_S = 500.0, 5.0  # the nominal trajectory is brought back from this far off
@@ -94,9 +95,9 @@ def propagated(state: State, settings: Settings) -> State:
         return state
     _, bank = _born(state, settings)
     known = hypotheses(state, settings)
-    turned, i = (0.0, 0.0) if bank.born_t != state.bank.born_t else state.turned, nominal.interval
-    if i is not None and i.by == "imu":
-        turned = turned[0] + i.n1, turned[1] + i.e1
+    kept, turned, i = math.exp(-nominal.pending_s / TURN_S), state.turned, nominal.interval
+    change = (i.n1, i.e1) if i is not None and i.by == "imu" else (0.0, 0.0)
+    turned = kept * turned[0] + change[0], kept * turned[1] + change[1]
     state = structs.replace(state, newborn=None, turned=turned)
     Phi, Q = settings.model.transition(nominal, len(state.beacons))
     bank = settings.model.undecayed(banks.propagate(bank, known.layout, nominal.pending_s, Phi, Q), Phi)

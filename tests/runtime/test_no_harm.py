@@ -119,6 +119,16 @@ def test_a_heading_that_the_autopilot_aligns_in_the_take_off_leaves_a_healthy_gn
     assert doubt < 0.05
 
 
+def test_a_heading_that_steps_by_90_deg_in_the_take_off_leaves_the_position_at_a_healthy_gnss() -> None:
+    """It may be suspect; it was excluded, 100 m off, where steps of the velocity had to wait for a turn."""
+    records, off = recording("plane_take_off"), heading_off(-90.0)
+    start, end = records[0].rx_ns, records[-1].rx_ns
+    steps_ns = start + round(0.3 * (end - start))
+    apart, doubt = flown([off(r) if r.rx_ns >= steps_ns else r for r in records])
+    assert len(apart) > 700 and max(apart) < 5.0
+    assert doubt < 0.9
+
+
 @pytest.mark.flight
 def test_a_long_straight_course_leaves_the_position_at_a_healthy_gnss() -> None:
     """The simulator's velocity is 0.25 % less than its positions move: 7 m off, with the whole log 13."""
