@@ -96,7 +96,7 @@ AIR_HEADING_STEPS_H = 1e-2  # by airspeed a wrong heading turns no acceleration
 #: Attitude and IMU give a false velocity (m/s): a turn with an attitude that is off, another latency. Not in
 #: straight flight, however it shakes, but where the velocity has changed by so much within seconds: a GNSS
 #: that was drawn off by 2 m/s, onset and velocity alike, was taken for such a step.
-VELOCITY_STEPS_H, VELOCITY_STEP, TURNED_M_S = 0.1, 10.0, 4.0
+VELOCITY_STEPS_H, VELOCITY_STEP, TURNED_M_S = 0.1, 10.0, 2.0
 #: GNSS becomes late (s). In a turn its position and velocity are then off as those of a false GNSS.
 LATENCY_STEPS_H, LATENCY_STEP = 0.1, 0.3
 JAMMED = 100.0  # times likelier while the receiver itself reports jamming or spoofing

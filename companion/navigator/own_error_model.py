@@ -25,7 +25,7 @@ is linear at any angle, where the angle alone ends at about 45 deg. That both ar
 the heading steps, along their circle. `versine` is constant, and next to nothing where the heading is little
 off. `crab` is what is wrong for seconds (bank-dependent compass error, sideslip); only `crab` is not shared
 with the IMU. `tilt` (m/s^2) is gravity seen through the tilt of the attitude. A grade states how many times
-coarser attitude and IMU are than the settings say; one Phi serves all grades and Q has one layer for each.
+coarser attitude and IMU are than the settings; one Phi serves all grades and Q has one layer for each.
 
 Beside the IMU the part of the wind that lasts a second is a state, `gust`: a step of the wind differs from
 the gust of half a second ago by more than a gust changes, so it shows at once. White noise would hide it for
