@@ -18,6 +18,7 @@ from msgspec import structs
 from companion.config import Config
 from companion.estimate import bank as banks
 from companion.estimate.bank import (
+    Angle,
     Bank,
     Fault,
     Jump,
@@ -25,7 +26,6 @@ from companion.estimate.bank import (
     Lie,
     Settings,
     Source,
-    Turn,
     enlarge,
     start,
 )
@@ -86,13 +86,13 @@ SURPRISE = (
 #: The attitude, and the IMU with it, becomes worse and better again within a flight: parked, in a climb, in
 #: aerobatics. With 1e-5, as for an INS, a healthy GNSS was excluded beside a wrong IMU or a wrong heading.
 GRADE_CHANGES_H = 10.0
-#: A compass, or the autopilot resets its heading (rad). The wind took up what was wrong with it before (m/s).
-HEADING_STEPS_H, HEADING_STEP, HEADING_WIND = 10.0, 0.5, 7.0
-#: At the start the heading may be a quarter or half a turn off, by a compass set up wrongly (rad).
-TURNED, TURNED_BY = 1e-3, 0.2
-TURNS = {"turned right": 0.5 * math.pi, "turned left": -0.5 * math.pi, "turned back": math.pi}
-FAR_VERSINE = 0.3  # from 45 deg on a heading is far off
+#: A compass, or the autopilot resets its heading, to any. The wind took up what was wrong with it before, and
+#: in a turn the velocity goes astray before the step is born (m/s).
+HEADING_STEPS_H, HEADING_WIND, HEADING_VELOCITY = 10.0, 7.0, 5.0
 AIR_HEADING_STEPS_H = 1e-2  # by airspeed a wrong heading turns no acceleration
+HEADING_FIRST = 1e-3  # from the start, by a compass set up wrongly
+HEADING = Angle(own_error_model.HEADING, own_error_model.VERSINE)
+FAR_VERSINE = 0.3  # from 45 deg on a heading is far off
 #: Attitude and IMU give a false velocity (m/s): a turn with an attitude that is off, another latency. Not in
 #: straight flight, however it shakes, but where the velocity has changed by so much within seconds: a GNSS
 #: that was drawn off by 2 m/s, onset and velocity alike, was taken for such a step.
@@ -191,8 +191,8 @@ class Model:
         bank = start(layout, t_s, np.zeros(layout.n_base), P, self.channel.grades)
         if self.plain is not None:
             return only(bank, self.plain)
-        turned = {j: TURNED for j, jump in enumerate(layout.jumps) if jump.name in TURNS}
-        return banks.jumped_before(bank, layout, turned)
+        first = {j: HEADING_FIRST for j, jump in enumerate(layout.jumps) if jump.angle}
+        return banks.jumped_before(bank, layout, first)
 
     def with_beacon(self, bank: Bank, beacons: int) -> Bank:
         """The bank with one beacon more than `beacons`, its biases unknown."""
@@ -210,16 +210,19 @@ class Model:
         lies = {i: still for i, fault in enumerate(known.layout.faults) if fault.sources == (GNSS,)}
         return banks.false_since_first(bank, known.layout, known.settings, lies, DOUBTED, POSITION)
 
-    def undecayed(self, bank: Bank, Phi: Floats) -> Bank:
-        """The bank after Phi, the sine of a heading that is far off as before: its versine does not decay."""
+    def on_circle(self, bank: Bank, Phi: Floats) -> Bank:
+        """The bank after Phi, sine and versine of the heading those of one angle.
+
+        The sine of a heading that is far off is as before: its versine does not decay.
+        """
         if not self.channel.wind:
             return bank
-        far = bank.x[:, own_error_model.VERSINE] > FAR_VERSINE
-        if not far.any():
-            return bank
-        x = bank.x.copy()
-        x[far, own_error_model.HEADING] /= Phi[own_error_model.HEADING, own_error_model.HEADING]
-        return bank._replace(x=x)
+        far = bank.x[:, HEADING.versine] > FAR_VERSINE
+        if far.any():
+            x = bank.x.copy()
+            x[far, HEADING.sine] /= Phi[HEADING.sine, HEADING.sine]
+            bank = bank._replace(x=x)
+        return banks.on_circle(bank, HEADING)
 
     def transition(self, nominal: Nominal, beacons: int) -> Transition:
         """Phi (n, n) and Q (grades, n_base, n_base) over all states, the lies' motion left to the bank."""
@@ -311,15 +314,14 @@ def _jumps(config: Config, channel: Channel, by_air: bool, has_turned: bool) -> 
     # the velocity over ground jumps with it
     states = (*channel.wind, *((2, 3, 0, 1) if by_air else GUST))
     sigmas = (jump,) * 6 if by_air else (jump, jump, GUST_OPEN_M_S, GUST_OPEN_M_S)
-    heading_h = AIR_HEADING_STEPS_H if by_air else HEADING_STEPS_H
-    velocity_h = VELOCITY_STEPS_H if has_turned and not by_air else 0.0
     latency_h = 0.0 if by_air else LATENCY_STEPS_H
-    angle = own_error_model.HEADING, own_error_model.VERSINE
-    step, wind = Turn(*angle, HEADING_STEP), (HEADING_WIND, HEADING_WIND)
+    heading_h, velocity_h = (HEADING_STEPS_H, VELOCITY_STEPS_H) if has_turned else (0.0, 0.0)
+    if by_air:
+        heading_h, velocity_h = AIR_HEADING_STEPS_H, 0.0
+    astray = HEADING_WIND, HEADING_WIND, HEADING_VELOCITY, HEADING_VELOCITY
     return (
         Jump("wind", states, sigmas, rate_h, quota=24, often=True),
-        Jump("heading", channel.wind, wind, heading_h, turn=step),
-        *(Jump(name, (), (), 0.0, quota=0, turn=Turn(*angle, TURNED_BY, by)) for name, by in TURNS.items()),
+        Jump("heading", (*channel.wind, 2, 3), astray, heading_h, angle=HEADING),
         Jump("velocity", (2, 3), (VELOCITY_STEP, VELOCITY_STEP), velocity_h),
         Jump("latency", (channel.latency,), (LATENCY_STEP,), latency_h),
         # whatever the model does not know: GNSS is believed again after a second or two

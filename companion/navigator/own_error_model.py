@@ -21,11 +21,11 @@ sensor is used once. In the IMU case airspeed is a measurement (`airspeed_row`),
 not move the aircraft: it shows in the difference of accelerometers and airspeed.
 
 `heading` is the sine of what is wrong with the heading for minutes, `versine` is 1 less its cosine: the pair
-is linear at any angle, where the angle alone ends at about 45 deg. That both are of one angle counts where
-the heading steps, along their circle. `versine` is constant, and next to nothing where the heading is little
-off. `crab` is what is wrong for seconds (bank-dependent compass error, sideslip); only `crab` is not shared
-with the IMU. `tilt` (m/s^2) is gravity seen through the tilt of the attitude. A grade states how many times
-coarser attitude and IMU are than the settings; one Phi serves all grades and Q has one layer for each.
+is linear at any angle, where the angle alone ends at about 45 deg. That both are of one angle is a
+measurement (`estimate.bank.on_circle`). `versine` is constant, and next to nothing where the heading is
+little off. `crab` is what is wrong for seconds (bank-dependent compass error, sideslip); only `crab` is not
+shared with the IMU. `tilt` (m/s^2) is gravity seen through the tilt of the attitude. A grade states how many
+times coarser attitude and IMU are than the settings; one Phi serves all grades and Q has one layer for each.
 
 Beside the IMU the part of the wind that lasts a second is a state, `gust`: a step of the wind differs from
 the gust of half a second ago by more than a gust changes, so it shows at once. White noise would hide it for

@@ -100,7 +100,7 @@ def propagated(state: State, settings: Settings) -> State:
     turned = kept * turned[0] + change[0], kept * turned[1] + change[1]
     state = structs.replace(state, newborn=None, turned=turned)
     Phi, Q = settings.model.transition(nominal, len(state.beacons))
-    bank = settings.model.undecayed(banks.propagate(bank, known.layout, nominal.pending_s, Phi, Q), Phi)
+    bank = settings.model.on_circle(banks.propagate(bank, known.layout, nominal.pending_s, Phi, Q), Phi)
     if nominal.interval is not None and nominal.interval.by_sensed_air:
         seen = bank.seen.copy()
         seen[AIRSPEED] = bank.t

@@ -15,13 +15,13 @@ from companion.estimate import bank as b
 from companion.estimate.bank import (
     EXHAUSTIVE,
     NONE,
+    Angle,
     Fault,
     Jump,
     Layout,
     Lie,
     Settings,
     Source,
-    Turn,
     protection,
 )
 from companion.estimate.bank.state import normalised
@@ -668,18 +668,47 @@ def test_what_has_jumped_jumps_again_at_a_rate_of_its_own():
     assert weights == pytest.approx([once * again, once], rel=1e-6)
 
 
-@given(st.floats(-math.pi, math.pi), st.floats(-math.pi, math.pi))
-def test_an_angle_that_jumps_stays_on_its_circle(angle, by):
-    """The mean is turned, and what is open is the tangent there."""
-    jump = Jump("compass", (), (), 1.0, turn=Turn(0, 1, 0.1, by))
-    layout = replace(scalar_layout(), faults=(), jumps=(jump,))
-    before = np.array([math.sin(angle), 1.0 - math.cos(angle)])
-    bank = b.jumped_before(b.start(layout, 0.0, before, np.eye(2) * 1e-4), layout, {0: 0.2})
+def test_an_angle_that_may_be_any_one_has_the_moments_of_its_circle():
+    """And is correlated with nothing, whatever it was correlated with."""
+    jump = Jump("compass", (), (), 1.0, angle=Angle(0, 2))
+    layout = replace(flight_layout(), n_base=3, faults=(), jumps=(jump,))
+    before = np.array([[4.0, 1.0, 1.0], [1.0, 9.0, 2.0], [1.0, 2.0, 4.0]])
+    bank = b.jumped_before(b.start(layout, 0.0, np.array([0.5, 7.0, 0.1]), before), layout, {0: 0.2})
     assert bank.weights == pytest.approx([0.8, 0.2])
-    turned = angle + by
-    np.testing.assert_allclose(bank.x[1, :2], [math.sin(turned), 1.0 - math.cos(turned)], atol=1e-12)
-    tangent = 0.1 * np.array([math.cos(turned), math.sin(turned)])
-    np.testing.assert_allclose(bank.P[1, :2, :2], np.eye(2) * 1e-4 + np.outer(tangent, tangent), atol=1e-12)
+    angle = np.linspace(0.0, math.tau, 360, endpoint=False)
+    pair = np.stack((np.sin(angle), 1.0 - np.cos(angle)))
+    np.testing.assert_allclose(bank.x[1, [0, 2]], pair.mean(axis=1), atol=1e-12)
+    np.testing.assert_allclose(bank.P[1][np.ix_([0, 2], [0, 2])], np.cov(pair, bias=True), atol=1e-12)
+    np.testing.assert_array_equal(bank.P[1, 1, :3], [0.0, 9.0, 0.0])
+    assert bank.x[1, 1] == 7.0
+
+
+@given(st.floats(-math.pi, math.pi), st.floats(0.01, 0.3), st.floats(0.7, 1.3))
+def test_an_angle_spread_along_its_arc_is_held_to_its_circle(angle, sigma, radius):
+    """Its mean lies within the circle, where that of an arc does; the angle stays as it was."""
+    along, across = (
+        np.array([math.cos(angle), math.sin(angle)]),
+        np.array([math.sin(angle), -math.cos(angle)]),
+    )
+    P = sigma**2 * np.outer(along, along) + np.outer(across, across)
+    mean = np.array([radius * math.sin(angle), 1.0 - radius * math.cos(angle)])
+    layout = replace(flight_layout(), faults=())
+    held = b.on_circle(b.start(layout, 0.0, mean, P), Angle(0, 1))
+    arc = angle + sigma * np.sqrt(2.0) * np.polynomial.hermite.hermgauss(9)[0]
+    weights = np.polynomial.hermite.hermgauss(9)[1] / math.sqrt(math.pi)
+    expected = np.array([weights @ np.sin(arc), 1.0 - weights @ np.cos(arc)])
+    np.testing.assert_allclose(held.x[0, :2], expected, atol=3e-3)
+    assert along @ held.P[0, :2, :2] @ along == pytest.approx(sigma**2)
+    assert across @ held.P[0, :2, :2] @ across <= (0.5 * sigma**2) ** 2 * 2.0 + 1.1e-4
+
+
+def test_of_two_rows_that_fit_alike_that_on_the_circle_is_believed():
+    layout = replace(flight_layout((1.0, 1.0)), faults=())
+    two = b.start(layout, 0.0, np.zeros(2), 0.05**2 * np.eye(2), (0.5, 0.5))
+    two.x[1, 1] = 0.4  # cosine 0.6 at sine 0
+    held = b.on_circle(two, Angle(0, 1))
+    assert held.weights[0] > 0.99
+    np.testing.assert_array_equal(b.on_circle(two._replace(P=0.5 * two.P / 0.05**2), Angle(0, 1)).L, two.L)
 
 
 @pytest.mark.parametrize("often", [False, True])

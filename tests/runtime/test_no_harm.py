@@ -119,14 +119,29 @@ def test_a_heading_that_the_autopilot_aligns_in_the_take_off_leaves_a_healthy_gn
     assert doubt < 0.05
 
 
-def test_a_heading_that_steps_by_90_deg_in_the_take_off_leaves_the_position_at_a_healthy_gnss() -> None:
-    """It may be suspect; it was excluded, 100 m off, where steps of the velocity had to wait for a turn."""
-    records, off = recording("plane_take_off"), heading_off(-90.0)
+@pytest.mark.parametrize(
+    ("name", "degrees", "share"),
+    [
+        ("plane_take_off", -90.0, 0.3),
+        ("plane_take_off", 180.0, 0.3),  # in its strongest acceleration: excluded, 708 m off
+        ("plane_turn", 180.0, 0.6),  # suspect
+        *(
+            pytest.param(name, degrees, share, marks=pytest.mark.long)
+            for name in ("plane_take_off", "plane_turn", "plane_turbulence")
+            for degrees in (-45.0, 45.0, 90.0)
+            for share in (0.3, 0.6)
+        ),
+    ],
+)
+def test_a_heading_that_steps_in_flight_leaves_a_healthy_gnss_beyond_doubt(
+    name: str, degrees: float, share: float
+) -> None:
+    records, off = recording(name), heading_off(degrees)
     start, end = records[0].rx_ns, records[-1].rx_ns
-    steps_ns = start + round(0.3 * (end - start))
+    steps_ns = start + round(share * (end - start))
     apart, doubt = flown([off(r) if r.rx_ns >= steps_ns else r for r in records])
-    assert len(apart) > 700 and max(apart) < 5.0
-    assert doubt < 0.9
+    assert len(apart) > 700 and max(apart) < 6.0
+    assert doubt < 0.05
 
 
 @pytest.mark.flight

@@ -49,7 +49,7 @@ from companion.estimate.bank.branching import (
     jump_births_due,
     jumped_before,
 )
-from companion.estimate.bank.layout import NEVER, NONE, Bools, Fault, Ints, Jump, Layout, Lie, Source, Turn
+from companion.estimate.bank.layout import NEVER, NONE, Angle, Bools, Fault, Ints, Jump, Layout, Lie, Source
 from companion.estimate.bank.protection import exceedance, level
 from companion.estimate.bank.readout import (
     decide,
@@ -59,7 +59,7 @@ from companion.estimate.bank.readout import (
     grade_probability,
     protection_level,
 )
-from companion.estimate.bank.recursion import Innovation, Measurement, propagate, update
+from companion.estimate.bank.recursion import Innovation, Measurement, on_circle, propagate, update
 from companion.estimate.bank.reduction import merge_moments, reduce
 from companion.estimate.bank.settings import EXHAUSTIVE, Settings
 from companion.estimate.bank.state import (
@@ -78,6 +78,7 @@ __all__ = [
     "EXHAUSTIVE",
     "NEVER",
     "NONE",
+    "Angle",
     "Bank",
     "Bools",
     "Fault",
@@ -89,7 +90,6 @@ __all__ = [
     "Measurement",
     "Settings",
     "Source",
-    "Turn",
     "births",
     "births_due",
     "decide",
@@ -109,6 +109,7 @@ __all__ = [
     "jumped_before",
     "level",
     "merge_moments",
+    "on_circle",
     "picked",
     "propagate",
     "protection_level",

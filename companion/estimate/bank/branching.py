@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from companion.estimate.bank.layout import NEVER, NONE, Ints, Layout, Lie, Turn
+from companion.estimate.bank.layout import NEVER, NONE, Angle, Ints, Layout, Lie
 from companion.estimate.bank.readout import level_rows
 from companion.estimate.bank.reduction import reduce
 from companion.estimate.bank.settings import DEFAULT, Settings
@@ -339,8 +339,8 @@ def _with_children(bank: Bank, layout: Layout, children: list[_Child]) -> Bank:
         elif c.jump != NONE:
             j = layout.jumps[c.jump]
             P[i[:, None], j.states, j.states] += np.square(j.sigma)
-            if j.turn is not None:
-                _turn(x, P, i, j.turn)
+            if j.angle is not None:
+                _open(x, P, i, j.angle)
             event[i] = layout.jump_event(c.jump)
         else:
             parent = at[i]
@@ -348,14 +348,9 @@ def _with_children(bank: Bank, layout: Layout, children: list[_Child]) -> Bank:
     return grown
 
 
-def _turn(x: Floats, P: Floats, rows: Ints, turn: Turn) -> None:
-    """Turn an angle in some rows, in place."""
-    s, v = turn.sine, turn.versine
-    sine, cosine = x[rows, s], 1.0 - x[rows, v]
-    if turn.mean:
-        by = math.cos(turn.mean), math.sin(turn.mean)
-        sine, cosine = by[0] * sine + by[1] * cosine, by[0] * cosine - by[1] * sine
-        x[rows, s], x[rows, v] = sine, 1.0 - cosine
-    along = turn.sigma * np.stack((cosine, sine), axis=1)
-    both = np.array((s, v))
-    P[rows[:, None, None], both[:, None], both] += along[:, :, None] * along[:, None]
+def _open(x: Floats, P: Floats, rows: Ints, angle: Angle) -> None:
+    """Any angle in some rows, in place: mean and covariance of the unit circle."""
+    both = np.array(angle)
+    x[rows[:, None], both] = 0.0, 1.0
+    P[rows[:, None], both], P[rows[:, None], :, both] = 0.0, 0.0
+    P[rows[:, None], both, both] = 0.5

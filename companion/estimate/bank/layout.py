@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -91,20 +92,11 @@ class Fault:
     quota: int = 6
 
 
-@dataclass(frozen=True, slots=True)
-class Turn:
-    """A jump of an angle whose sine and 1 less its cosine are base states: linear at any angle.
-
-    Parameters
-    ----------
-    sine, versine : indices of the states.
-    sigma, mean : of the jump, rad.
-    """
+class Angle(NamedTuple):
+    """An angle, as two base states: its sine and 1 less its cosine. Linear at any angle."""
 
     sine: int
     versine: int
-    sigma: float
-    mean: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,7 +113,7 @@ class Jump:
     apart_s : for so long a row that jumped is an explanation of its own, see `explanations`.
     often : it is born every `Settings.jump_s`: before its birth other states learn wrongly from it.
     again_h : rate after it, 1/h; None: the same. What has jumped may jump back.
-    turn : an angle that jumps too.
+    angle : an angle that is any one then.
     """
 
     name: str
@@ -132,7 +124,7 @@ class Jump:
     apart_s: float = 0.0
     often: bool = False
     again_h: float | None = None
-    turn: Turn | None = None
+    angle: Angle | None = None
 
 
 @dataclass(frozen=True)

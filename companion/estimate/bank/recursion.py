@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from companion.estimate.bank.branching import births, returns
-from companion.estimate.bank.layout import NEVER, Bools, Layout
+from companion.estimate.bank.layout import NEVER, Angle, Bools, Layout
 from companion.estimate.bank.reduction import reduce
 from companion.estimate.bank.settings import DEFAULT, Settings
 from companion.estimate.bank.state import Bank, false_rows, normalised
@@ -23,6 +23,9 @@ LOG_2PI = math.log(2.0 * math.pi)
 
 Measurement = tuple[Floats, Floats]
 """z (R, m) and H (R, m, k), linearised for each row."""
+
+#: A mean so near to the centre has no direction; variances of an angle (rad^2) and a radius that are known.
+LEAST_RADIUS, ANGLE_KNOWN, RADIUS_KNOWN = 0.3, 0.1, 1e-4
 
 
 class Innovation(NamedTuple):
@@ -163,6 +166,41 @@ def update(
     bank = bank._replace(L=L, x=x, P=P, seen=seen)
     seen_by = Innovation(step.S, step.nis, born, refused, int(np.argmax(L)))
     return (reduce(bank, layout, settings) if born else bank), seen_by
+
+
+def on_circle(bank: Bank, angle: Angle) -> Bank:
+    """Update by sine^2 + cosine^2 = 1, linearised, the rows that know the angle but not its radius.
+
+    Without it a radius of 0.6 is as good as an angle. Where the angle is spread along its arc the mean lies
+    within the circle.
+
+    Parameters
+    ----------
+    bank, angle : the bank, and an angle of it.
+
+    Returns
+    -------
+    Bank
+    """
+    s, v = angle
+    sine, cosine = bank.x[:, s], 1.0 - bank.x[:, v]
+    radius = np.maximum(np.hypot(sine, cosine), LEAST_RADIUS)
+    us, uc = sine / radius, cosine / radius
+    Ps, Psc, Pc = bank.P[:, s, s], -bank.P[:, s, v], bank.P[:, v, v]
+    along = uc * uc * Ps - 2.0 * us * uc * Psc + us * us * Pc
+    across = us * us * Ps + 2.0 * us * uc * Psc + uc * uc * Pc
+    rows = np.flatnonzero((radius > LEAST_RADIUS) & (along < ANGLE_KNOWN) & (across > RADIUS_KNOWN))
+    if not len(rows):
+        return bank
+    along, across = along[rows], across[rows]
+    innovation = 1.0 - 0.5 * along - radius[rows]
+    S = across + 0.5 * along * along + RADIUS_KNOWN
+    x, P, L = bank.x.copy(), bank.P.copy(), bank.L.copy()
+    PHt = us[rows, None] * P[rows, :, s] - uc[rows, None] * P[rows, :, v]
+    x[rows] += PHt * (innovation / S)[:, None]
+    P[rows] -= PHt[:, :, None] * PHt[:, None] / S[:, None, None]
+    L[rows] -= 0.5 * innovation * innovation / S
+    return bank._replace(x=x, P=P, L=normalised(L))
 
 
 class _Step(NamedTuple):
