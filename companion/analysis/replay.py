@@ -323,6 +323,8 @@ def _replay_changed(
         )
     if log_inputs.outages is not None:
         notes += log_inputs.outages.describe_unused()
+    if log_inputs.correctors is not None:
+        notes += log_inputs.correctors.describe_unused()
     used = config.inertial.correctors if config.has_own_ins else ()
     for kind, name in ((StarFix, "stars"), (RangeDifference, "hyperbolic"), (SecondIns, "second_ins")):
         if tables and kind in kinds and name not in used:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import heapq
 import re
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from itertools import chain
@@ -68,15 +69,50 @@ def _full_name(name: str) -> str:
     raise ConfigError(f"--with {name}: {why}; write it as SECTION.KEY=VALUE, for example gnss.sigma_m=3.0")
 
 
+class CorrectorRows:
+    """Rows of corrector tables (CSV) for a log whose first record arrived at `start_ns`, t_s = 0."""
+
+    def __init__(self, tables: Sequence[Path], start_ns: int) -> None:
+        self._tables = {table: corrector_csv.read_correctors(table, start_ns) for table in tables}
+        self._start_ns = self._end_ns = start_ns
+
+    def merged(self, records: Iterable[Stamped]) -> Iterator[Stamped]:
+        """Yield the records of the log and the rows by time; leave out rows outside the log."""
+        rows = deque(heapq.merge(*self._tables.values(), key=lambda row: row.rx_ns))
+        while rows and rows[0].rx_ns < self._start_ns:
+            rows.popleft()
+        for record in records:
+            while rows and rows[0].rx_ns < record.rx_ns:
+                yield rows.popleft()
+            self._end_ns = max(self._end_ns, record.rx_ns)
+            yield record
+        while rows and rows[0].rx_ns <= self._end_ns:
+            yield rows.popleft()
+
+    def describe_unused(self) -> list[str]:
+        """Describe the rows outside the log, by table, after the records are read."""
+        notes, end_s = [], (self._end_ns - self._start_ns) * 1e-9
+        for table, rows in self._tables.items():
+            outside = [row.rx_ns for row in rows if not self._start_ns <= row.rx_ns <= self._end_ns]
+            if outside:
+                first, last = ((ns - self._start_ns) * 1e-9 for ns in (outside[0], outside[-1]))
+                notes.append(
+                    f"{table}: {len(outside)} of {len(rows)} rows are not used: t_s from {first:.1f} to "
+                    f"{last:.1f}, and the log has 0 to {end_s:.1f} s; check that the table is of this flight"
+                )
+        return notes
+
+
 class LogInputs(NamedTuple):
     """The inputs of a log; `summary` returns the importer's counts after they are read.
 
-    `outages` were removed from them, if any.
+    `outages` were removed from them and the rows of `correctors` added, if any.
     """
 
     records: Iterable[Stamped]
     summary: Callable[[], dict[str, int]]
     outages: simulated_rsbn.OutageFilter | None = None
+    correctors: CorrectorRows | None = None
 
 
 def open_inputs(log: Path, config: Config | None = None) -> LogInputs:
@@ -132,15 +168,14 @@ def input_errors_as_log_errors() -> Iterator[None]:
 
 
 def with_correctors(log_inputs: LogInputs, tables: Sequence[Path]) -> LogInputs:
-    """Add the records of corrector tables (CSV) at their times; t_s = 0 is the first record of the log."""
+    """Add the rows of corrector tables (CSV); t_s = 0 is the first record of the log."""
     records = iter(log_inputs.records)
     first = next(records, None)
     if first is None or not tables:
         return log_inputs._replace(records=[] if first is None else chain([first], records))
     with input_errors_as_log_errors():
-        added = [corrector_csv.read_correctors(table, first.rx_ns) for table in tables]
-    merged = heapq.merge(chain([first], records), *added, key=lambda record: record.rx_ns)
-    return log_inputs._replace(records=merged)
+        correctors = CorrectorRows(tables, first.rx_ns)
+    return log_inputs._replace(records=correctors.merged(chain([first], records)), correctors=correctors)
 
 
 def with_beacons_and_outages(

@@ -298,6 +298,22 @@ def test_correctors_that_the_configuration_does_not_use_are_reported(tmp_path):
     assert report(log, "-o", output, "--correctors", table, "--with", use)["notes"] == []
 
 
+def test_corrector_rows_outside_the_log_are_reported_and_not_used(tmp_path):
+    """A table of another flight went unseen: its rows moved the start and the end of the replay."""
+    log, output, table = dataflash_with_text_first(tmp_path), tmp_path / "x.mcap", tmp_path / "second.csv"
+    use = "inertial.independent=true,inertial.correctors=second_ins"
+    rows = "".join(f"{t_s},0,45,7\n" for t_s in (9001, -40, 0, 32.5, 40, 40.2))
+    table.write_text(f"t_s,ins,lat_deg,lon_deg\n{rows}")
+    result = report(log, "-o", output, "--correctors", table, "--with", use)
+    assert result["notes"] == [
+        f"{table}: 3 of 6 rows are not used: t_s from -40.0 to 9001.0, and the log has 0 to 40.0 s; check "
+        "that the table is of this flight"
+    ]
+    first = next(iter(flight_log.read(output))).value.rx_ns
+    assert [(row.rx_ns - first) * 1e-9 for row in values(output, r.SecondIns)] == [0.0, 32.5, 40.0]
+    assert result["flights"][0]["end_s"] == pytest.approx(40.0)
+
+
 def test_table_that_is_none_of_the_correctors_is_reported(tmp_path):
     table = tmp_path / "stars.csv"
     table.write_text("time,star\n1,2\n")
