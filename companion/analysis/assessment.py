@@ -197,12 +197,14 @@ def _source_errors(
     found = dict[str, error_statistics.ErrorSeries]()
     if offset:
         found |= _solution_errors(flight.tables["Solution"], offset["north"], offset["east"])
-    tracks = [(error_statistics.RSBN, _beacon_positions(flight, reference))]
+    beacons, gnss = _beacon_positions(flight, reference), usable_gnss(flight)
+    off = _offset_from(reference, beacons["t"], beacons["lat"], beacons["lon"])
+    found[error_statistics.RSBN] = _error_series(beacons["t"], *off)
     if reference.what != GNSS:
-        tracks.append((error_statistics.GNSS, usable_gnss(flight)))
-    for source, table in tracks:
-        off = _offset_from(reference, table["t"], table["lat"], table["lon"])
-        found[source] = _error_series(table["t"], *off)
+        off = _offset_from(reference, gnss["t"], gnss["lat"], gnss["lon"])
+        unknown = np.full(len(gnss["t"]), np.nan)
+        claimed = math.sqrt(2.0) * gnss["sigma"]
+        found[error_statistics.GNSS] = _error_series(gnss["t"], *off, unknown, claimed, unknown)
     return {
         source: found[source]
         for source in error_statistics.SOURCES

@@ -163,7 +163,7 @@ def _summarize_phase(
         row.p95[source] = float(np.percentile(error, 95.0))
         if np.isfinite(e.bound[within]).any():
             row = _with_bound(row, error, e.bound[within], e.claimed[within])
-        if np.isfinite(e.claimed[within]).any():
+        if source == CORRECTED and np.isfinite(e.claimed[within]).any():
             row = row._replace(expected=float(np.sqrt(np.nanmean(e.claimed[within] ** 2))))
     return row
 

@@ -137,8 +137,8 @@ COLUMNS: dict[type[Stamped], tuple[str, Callable[[Any], tuple[float, ...]]]] = {
         lambda r: (r.lat, r.lon, r.sources, r.cost, r.degrees_of_freedom),
     ),
     Gnss: (
-        "receiver fix lat lon alt",
-        lambda r: (r.receiver, r.fix, r.lat, r.lon, r.alt_msl),
+        "receiver fix lat lon alt sigma",
+        lambda r: (r.receiver, r.fix, r.lat, r.lon, r.alt_msl, _or_nan(r.sigma_horizontal)),
     ),
     RsbnFix: (
         "beacon lat lon alt azimuth slant",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -25,7 +26,9 @@ from companion.analysis.flight_events import (
 )
 from companion.units import Floats
 
-FAR_M = 30.0  # a greater median distance between GNSS and the smoothed track is a contradiction
+#: GNSS contradicts the smoothed track where it is farther off than `FAR_M`, and than `FAR_TIMES` the r.m.s.
+#: error that it states, for `FAR_S` or longer.
+FAR_M, FAR_TIMES, FAR_S = 30.0, 3.0, 10.0
 SHORT_S = 30.0  # shorter phases are not mentioned
 CHEBYSHEV = 0.75  # least share of moments within twice a valid r.m.s. bound
 LATE_S = 0.1  # smaller GNSS delays are usual
@@ -229,23 +232,40 @@ def _error_sentences(a: Assessment) -> list[str]:
         sentences.append(
             "The smoothed track uses the same fixes and model; what is wrong in both is not visible."
         )
-        if (apart := gnss_contradiction(a)) is not None:
+        if (torn := gnss_contradiction(a)) is not None:
             sentences.append(
-                f"GNSS and the smoothed track differ by {format_length(apart)} (median), because GNSS was "
-                "rejected: one of them is wrong, and the stated distances cannot be trusted."
+                f"From {format_time(torn.start)} to {format_time(torn.end)} GNSS and the smoothed track "
+                f"differ by {format_length(torn.apart)} (median): one of them is wrong, and the distances of "
+                "that time cannot be trusted."
             )
     elif a.reference.what == GNSS:
         sentences.append("GNSS may itself be off; these distances include that.")
     return sentences
 
 
-def gnss_contradiction(a: Assessment) -> float | None:
-    """Return the median distance of GNSS from the smoothed track (m) if one of them must be wrong."""
+class Contradiction(NamedTuple):
+    """Time from `start` to `end` (s) in which GNSS was far off the smoothed track: `apart`, median (m)."""
+
+    start: float
+    end: float
+    apart: float
+
+
+def gnss_contradiction(a: Assessment) -> Contradiction | None:
+    """Return the longest time in which GNSS or the smoothed track must be wrong, if there is one."""
     gnss = a.errors.get(error_statistics.GNSS)
     if gnss is None or a.reference is None or a.reference.what != SMOOTHED:
         return None
-    apart = float(np.median(gnss.error))
-    return apart if apart > FAR_M else None
+    far = gnss.error > np.fmax(FAR_M, FAR_TIMES * gnss.claimed)
+    t, error = gnss.t_ns[far] * 1e-9, gnss.error[far]
+    ends = [0, *np.flatnonzero(np.diff(t) > OUTAGE_MIN_S) + 1, len(t)]
+    spans = [
+        Contradiction(float(t[i]), float(t[j - 1]), float(np.median(error[i:j])))
+        for i, j in pairwise(ends)
+        if j > i
+    ]
+    longest = max(spans, key=lambda span: span.end - span.start, default=None)
+    return None if longest is None or longest.end - longest.start < FAR_S else longest
 
 
 def is_worse_than_inertial(row: error_statistics.PhaseErrors) -> bool:

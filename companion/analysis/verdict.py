@@ -134,13 +134,14 @@ def _worse_than_inertial(a: Assessment) -> Verdict | None:
 
 
 def _contradiction(a: Assessment) -> Verdict | None:
-    apart = gnss_contradiction(a)
-    if apart is None:
+    torn = gnss_contradiction(a)
+    if torn is None:
         return None
     return Verdict(
         "caution",
-        "GNSS and the smoothed track contradict each other: one of them is wrong.",
-        format_length(apart),
+        f"From {format_time(torn.start)} to {format_time(torn.end)} GNSS and the smoothed track contradict "
+        "each other: one of them is wrong.",
+        format_length(torn.apart),
         "between them (median)",
     )
 

@@ -632,6 +632,37 @@ def test_a_distance_beyond_the_protection_level_is_a_caution():
     assert "contradict each other" in judge_flight(torn).reason
 
 
+def with_gnss_off(a, seconds, off=360.0, claimed=math.nan):
+    """The same flight against the smoothed track; for some seconds from the start GNSS is far off it."""
+    gnss = a.errors["GNSS fix"]
+    far = np.where(gnss.t_ns < seconds * S, off, 1.0)
+    gnss = gnss._replace(error=far, claimed=np.full(len(far), claimed))
+    return dataclasses.replace(against(assessing.SMOOTHED, a), errors={**a.errors, "GNSS fix": gnss})
+
+
+def test_a_smoothed_track_far_off_its_fixes_for_seconds_is_no_good_flight(assessed):
+    """The median over the flight had no sight of the first 18 s, and the verdict was good."""
+    torn = with_gnss_off(assessed, 18.0)
+    verdict = judge_flight(torn)
+    assert (verdict.level, verdict.number) == ("caution", "360 m")
+    assert verdict.reason == (
+        "From 0:00 to 0:18 GNSS and the smoothed track contradict each other: one of them is wrong."
+    )
+    assert "From 0:00 to 0:18 GNSS and the smoothed track differ by 360 m (median)" in sentences(torn)
+    for near in (
+        with_gnss_off(assessed, 9.0),  # not for long
+        with_gnss_off(assessed, 18.0, off=29.0),
+        with_gnss_off(assessed, 18.0, claimed=130.0),  # the receiver itself states that much
+    ):
+        assert judge_flight(near).level == "good"
+        assert "differ by" not in sentences(near)
+
+
+def test_the_stated_accuracy_of_fixes_is_that_of_their_errors(assessed):
+    assert assessed.errors["GNSS fix"].claimed == pytest.approx(2.0 * math.sqrt(2.0))
+    assert np.isnan(assessed.errors["GNSS fix"].bound).all()
+
+
 def test_warnings_of_the_events_table_have_their_severity_and_colour():
     pytest.importorskip("jinja2")
     warning = Event(START + S, START + S, 4, "low battery")
