@@ -51,7 +51,7 @@ from companion.navigator.hypotheses import BIASES, MOST_BEACONS, VELOCITY, Hypot
 from companion.navigator.inertial_track import Point
 from companion.navigator.own_channel import OwnChannel
 from companion.navigator.progress import driver
-from companion.navigator.state import Beacon, Settings, State, hypotheses, levelled, source_name
+from companion.navigator.state import Beacon, Settings, State, Step, hypotheses, levelled, source_name
 from companion.navigator.step import step
 from companion.records import (
     AirData,
@@ -147,10 +147,11 @@ class _Folded(NamedTuple):
 
 
 class _Witness(Navigator):
-    """A navigator that notes what its bank decided."""
+    """A navigator that notes what its bank decided. It makes no solutions, on which no decision rests."""
 
     def __init__(self, config: Config) -> None:
         super().__init__(config)
+        self._state = State(next_ns=NEVER_NS)
         self.folded: list[_Folded] = []
         self.gusts = GustSamples()
         self.spans: dict[str, list[tuple[int, int]]] = {}  # when each source was false, by name
@@ -172,6 +173,12 @@ class _Witness(Navigator):
         outputs = super()._fold(record)
         self._note(record)
         return outputs
+
+    def _resolved(self, state: State, record: Input) -> Step:
+        return structs.replace(state, pending=None), []
+
+    def _solved(self, state: State, record: Input) -> Step:
+        return state, []
 
     def _note(self, record: Input) -> None:
         state, t_ns = self._state, record.t_ns

@@ -261,6 +261,9 @@ class Navigator:
         """A solution at once after a beacon's fix."""
         if not isinstance(record, RsbnFix) or state.rsbn_ns != record.t_ns:
             return state, []
+        return self._solved(state, record)
+
+    def _solved(self, state: State, record: Input) -> Step:
         return guarded(state, record, self._settings, _solve, record)
 
     def _tune(self, record: Tuning) -> None:
@@ -350,7 +353,7 @@ class Navigator:
             self._no_late_answers_ns = now.rx_ns + USELESS_TIMES * back.back_ns
         if self._state.rsbn_ns == back.ahead.rsbn_ns:
             return []
-        self._state, outputs = guarded(self._state, now, self._settings, _solve, now)
+        self._state, outputs = self._solved(self._state, now)
         return outputs
 
     def _too_late(self, record: Input) -> list[Output]:

@@ -10,6 +10,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from companion.analysis import smoothing
 from companion.analysis.smoothing import SmoothedRun, smooth_flight
 from companion.config import Config, InertialConfig
 from companion.nav.geometry import (
@@ -24,7 +25,7 @@ from companion.navigator import Navigator
 from companion.navigator.channel import Nominal
 from companion.navigator.inertial_track import Point
 from companion.navigator.ins_channel import N, ins_channel
-from companion.records import Gnss, LocalOrigin, LocalPosition, Reboot, RsbnFix, Solution, TimeStep
+from companion.records import Fix, Gnss, LocalOrigin, LocalPosition, Reboot, RsbnFix, Solution, TimeStep
 
 ORIGIN = Geodetic(math.radians(60.0), math.radians(30.0), 0.0)
 BEACON = Geodetic(math.radians(60.4), math.radians(30.3), 100.0)
@@ -218,6 +219,24 @@ def test_false_velocity_of_gnss_is_left_out_from_its_onset() -> None:
 
 
 @pytest.mark.flight
+def test_first_pass_decides_as_in_flight_and_makes_no_solutions() -> None:
+    records = [  # every third answer of the beacon arrives late, behind what came meanwhile
+        msgspec.structs.replace(r, rx_ns=r.rx_ns + NS) if isinstance(r, RsbnFix) and not k % 3 else r
+        for k, r in enumerate(flight(120, (60, 90)).records)
+    ]
+    navigator, witness = Navigator(CONFIG), smoothing._Witness(CONFIG)
+    flown, noted = [], []
+    for record in sorted(records, key=lambda record: record.rx_ns):
+        flown += navigator.handle(record)
+        noted += witness.handle(record)
+    made = {type(record) for record in flown}
+    assert {Fix, Solution} <= made and not {Fix, Solution} & {type(record) for record in noted}
+    ours, its = navigator.state.bank, witness.state.bank
+    assert ours is not None and its is not None
+    for name in ("L", "x", "P", "grade", "excluded"):
+        assert np.array_equal(getattr(ours, name), getattr(its, name))
+
+
 def test_reboot_starts_a_new_run() -> None:
     flown = flight(300, (0, 0))
     cut = 150 * NS + 1
