@@ -29,7 +29,7 @@ from companion.records import (
     Stamped,
 )
 from companion.storage import flight_log
-from companion.storage.reader import LogError
+from companion.storage.reader import LogError, is_closed
 from companion.storage.run_metadata import run_metadata
 
 MAX_NS = 2**62
@@ -49,20 +49,20 @@ def open_flights(path: Path, config: Config) -> list[Flight]:
     with input_errors_as_log_errors():
         first_unix_ns, remarks = None, list[str]()
         if is_own_log(path):
-            info = flight_log.info(path)
             first = next(iter(flight_log.read(path)), None)
             if first is None:
                 raise LogError(f"{path} contains no messages: nothing to report")
             first_unix_ns = first.log_time
-            if not info.closed:
-                lost = f"; {info.bytes_lost} bytes at its end are unreadable" if info.bytes_lost else ""
+            if not is_closed(path):
+                bytes_lost = flight_log.info(path).bytes_lost
+                lost = f"; {bytes_lost} bytes at its end are unreadable" if bytes_lost else ""
                 remarks.append(f"The log was not closed{lost}.")
             if has_navigator_outputs(path):
                 return collect_flights(
                     _read_outputs(path),
                     path.name,
                     unix_ns=first_unix_ns,
-                    metadata=info.metadata,
+                    metadata=flight_log.metadata(path),
                     remarks=tuple(remarks),
                 )
         sensors = set[str]()

@@ -992,6 +992,12 @@ def test_log_that_is_not_closed_has_no_unreadable_bytes(log, tmp_path):
     assert "torn (run companion log recover)" in CliRunner().invoke(log_group, ["info", str(active)]).output
 
 
+def test_closed_log_is_not_searched_for_bytes_lost(log, monkeypatch):
+    """It has none, and the search reads all of it."""
+    monkeypatch.setattr(flight_log, "info", lambda path: pytest.fail("searched"))
+    assert "configuration" in open_flights(log, Config())[0].metadata
+
+
 def test_long_names_of_lines_leave_room_for_the_plot(tmp_path):
     """Two logs, each link by its address: matplotlib warned, and the legend was wider than the picture."""
     pytest.importorskip("matplotlib")
