@@ -88,7 +88,7 @@ SURPRISE = (
 GRADE_CHANGES_H = 10.0
 #: A compass, or the autopilot resets its heading, to any. The wind took up what was wrong with it before, and
 #: in a turn the velocity goes astray before the step is born (m/s).
-HEADING_STEPS_H, HEADING_WIND, HEADING_VELOCITY = 10.0, 7.0, 5.0
+HEADING_STEPS_H, HEADING_WIND, HEADING_VELOCITY = 1.0, 7.0, 5.0
 AIR_HEADING_STEPS_H = 1e-2  # by airspeed a wrong heading turns no acceleration
 HEADING_FIRST = 1e-3  # from the start, by a compass set up wrongly
 HEADING = Angle(own_error_model.HEADING, own_error_model.VERSINE)

@@ -24,8 +24,9 @@ LOG_2PI = math.log(2.0 * math.pi)
 Measurement = tuple[Floats, Floats]
 """z (R, m) and H (R, m, k), linearised for each row."""
 
-#: A mean so near to the centre has no direction; variances of an angle (rad^2) and a radius that are known.
-LEAST_RADIUS, ANGLE_KNOWN, RADIUS_KNOWN = 0.3, 0.1, 1e-4
+#: A mean so near to the centre has no direction; the variance of an angle that is known (rad^2); that of the
+#: measurement of the radius, and of one that is measured already.
+LEAST_RADIUS, ANGLE_KNOWN, RADIUS_NOISE, RADIUS_KNOWN = 0.3, 0.1, 1e-4, 1e-6
 
 
 class Innovation(NamedTuple):
@@ -194,7 +195,7 @@ def on_circle(bank: Bank, angle: Angle) -> Bank:
         return bank
     along, across = along[rows], across[rows]
     innovation = 1.0 - 0.5 * along - radius[rows]
-    S = across + 0.5 * along * along + RADIUS_KNOWN
+    S = across + 0.5 * along * along + RADIUS_NOISE
     x, P, L = bank.x.copy(), bank.P.copy(), bank.L.copy()
     PHt = us[rows, None] * P[rows, :, s] - uc[rows, None] * P[rows, :, v]
     x[rows] += PHt * (innovation / S)[:, None]
