@@ -5,7 +5,7 @@ The only importer of pymavlink. Its dialect `all` is used: it holds every messag
 compiled cache, and 13 MB. pymavlink's own parser and signature check are not used, see
 `companion.link.frame`.
 
-Our messages are defined in rsbn.xml, a public one that pymavlink lacks in component_metadata.xml.
+Our messages are defined in rsbn.xml, public ones that pymavlink lacks in public.xml.
 `python -m companion.link.dialect` regenerates generated/rsbn_dialect.py from them with the mavgen of the
 installed wheel; `regenerate` writes it to another path.
 
@@ -49,7 +49,7 @@ MEASUREMENTS = {
 }
 
 XML = Path(__file__).with_name("rsbn.xml")
-ADDED_XML = Path(__file__).with_name("component_metadata.xml")
+PUBLIC_XML = Path(__file__).with_name("public.xml")
 
 
 class Field(NamedTuple):
@@ -243,7 +243,7 @@ def regenerate(path: Path) -> None:
     options = mavgen.Opts(os.fspath(path), wire_protocol="2.0", language="Python", validate=True)
     output = io.StringIO()
     with contextlib.redirect_stdout(output):
-        done = mavgen.mavgen(options, [os.fspath(XML), os.fspath(ADDED_XML)])
+        done = mavgen.mavgen(options, [os.fspath(XML), os.fspath(PUBLIC_XML)])
     if not done:
         raise ValueError(f"mavgen rejected {XML.name}: {output.getvalue().strip()}")
 

@@ -26,7 +26,7 @@ from companion.output.gate import (
 )
 from companion.output.gnss_fusion import GnssFusion
 from companion.output.position_reset import PositionReset
-from companion.output.source_switch import BELIEVED, SourceSwitch, selected
+from companion.output.source_switch import BELIEVED, SourceSwitch
 from companion.records import (
     Event,
     FilterStatus,
@@ -98,11 +98,11 @@ class AutopilotOutput:
             self._add_event(self._position_reset.handle_acknowledgement(result, now_ns))
 
     def handle_message(self, message: Message, from_autopilot: bool, system: int, now_ns: int) -> None:
-        """Process a message of another sender that may concern the source set of autopilot `system`."""
+        """Process a message of another sender that may concern what autopilot `system` fuses."""
         if from_autopilot and message.get_type() == "HEARTBEAT":
             is_armed = bool(message.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
             self._source_switch.note_armed(is_armed)
-        elif (by := selected(message, from_autopilot, system)) is not None:
+        elif (by := self._source_switch.selected(message, from_autopilot, system)) is not None:
             self._source_switch.handle_selected(by, now_ns)
 
     def messages(self, solution: Solution, names: Collection[str], receiver: Receiver) -> list[Message]:

@@ -3,20 +3,24 @@
 PX4 has no source sets: it fuses GNSS and our position at once, so a false GNSS draws it off. Its estimator
 takes MAV_CMD_ESTIMATOR_SENSOR_ENABLE (development.xml of 2026; PR 26739 proposed 43005). GNSS is switched
 off only if it is false by the same predicate as on ArduPilot, never because it is lost: if the companion then
-failed, it would stay off. An autopilot that does not know the command is reported. At the start
-it is switched on once: a companion that failed may have left it off.
+failed, it would stay off. An autopilot that does not know the command is reported.
 
-While disarmed it is always on: PX4 stores it in EKF2_SENS_EN then, and when it disarms. The next flight would
-begin without GNSS.
+PX4 reports the state in ESTIMATOR_SENSOR_FUSION_STATUS. What somebody else switched is left as it is. If the
+first reports are made in flight and state that it is off, a companion that failed left it so.
+
+What the companion switched off is on while disarmed: PX4 stores it in EKF2_SENS_EN then, and when it disarms.
+The next flight would begin without GNSS.
 """
 
 from __future__ import annotations
 
 import math
 
+from companion.link.dialect import Message
 from companion.output.source_switch import (
     COMPANION_SET,
     GNSS_SET,
+    REPORTS,
     STEADY_S,
     TO_GNSS,
     Selected,
@@ -31,14 +35,23 @@ _GNSS, _FIRST = 0.0, 0.0  # ESTIMATOR_SENSOR_FUSION_SOURCE_GPS, the first receiv
 
 
 class GnssFusion(SourceSwitch):
-    """Fusion of PX4's first receiver; unknown at the start."""
+    """Fusion of PX4's first receiver; on at the start, unless it is reported off."""
 
     command = ESTIMATOR_SENSOR_ENABLE
     is_silence_judged = False
 
     def __init__(self) -> None:
         super().__init__()
-        self._is_disarmed = False
+        self._wanted = self._leading = GNSS_SET
+        self._is_disarmed: bool | None = None
+        self._is_start = True  # until the state is reported
+
+    @staticmethod
+    def selected(message: Message, from_autopilot: bool, system: int) -> Selected | None:
+        """Return what PX4 reports in `message`, else None."""
+        if not from_autopilot or message.get_type() != "ESTIMATOR_SENSOR_FUSION_STATUS":
+            return None
+        return Selected(GNSS_SET if message.intended[0] & 1 else COMPANION_SET, is_report=True)
 
     def note_armed(self, is_armed: bool) -> None:
         """Note whether the autopilot is armed."""
@@ -54,7 +67,12 @@ class GnssFusion(SourceSwitch):
         return (GNSS_SET, reasons[0]) if reasons else None
 
     def handle_selected(self, by: Selected, now_ns: int) -> None:
-        """Ignore a source set that somebody selects: PX4 has none, and answers "unsupported"."""
+        """Process PX4's report; a source set is ignored: PX4 has none, and answers "unsupported"."""
+        if not by.is_report or self._is_disarmed is None:
+            return
+        is_left_off = self._is_start and not self._is_disarmed
+        super().handle_selected(by._replace(by_script=is_left_off), now_ns)
+        self._is_start = self._is_start and self._reports < REPORTS
 
     def name(self, number: int | None) -> str:
         """Return how a state is reported."""

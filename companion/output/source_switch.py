@@ -180,6 +180,7 @@ class SourceSwitch:
 
     command = mavlink.MAV_CMD_SET_EKF_SOURCE_SET
     is_silence_judged = True
+    selected = staticmethod(selected)
 
     def __init__(self) -> None:
         self._fix, self._no_fix, self._sent = ConditionTimer(), ConditionTimer(), ConditionTimer()
@@ -268,8 +269,9 @@ class SourceSwitch:
         self._required, self._reason = decision
         if self._held is not None:
             if is_new and self._required != self._held:
-                need = f"EKF source set {self._required} needed ({self._reason})"
-                self._add_event(Severity.WARNING, f"{need}, but set {self._held} selected by hand", now_ns)
+                need = f"{self.name(self._required)} needed ({self._reason})"
+                text = f"{need}, but {self.name(self._held)} selected by hand"
+                self._add_event(Severity.WARNING, text, now_ns)
         elif self._required != self._wanted or self._is_again_due(now_ns):
             self._wanted = self._required
             self._tries, self._next_ns = 0, now_ns
@@ -291,11 +293,9 @@ class SourceSwitch:
         before, self._held = self._held, None if by.number == (self._required or GNSS_SET) else by.number
         if self._held == before:
             return
-        if self._held is not None:
-            text = f"EKF source set {by.number} selected by hand: the companion does not switch"
-            self._add_event(Severity.NOTICE, text, now_ns)
-        else:
-            self._add_event(Severity.NOTICE, "the companion switches the EKF source set again", now_ns)
+        what = "switches again" if self._held is None else "does not switch"
+        text = f"{self.name(by.number)} selected by hand: the companion {what}"
+        self._add_event(Severity.NOTICE, text, now_ns)
 
     def handle_acknowledgement(self, command: int, result: int, now_ns: int) -> None:
         """Process the autopilot's COMMAND_ACK of one of our commands."""

@@ -28,7 +28,7 @@ from companion.config.validate import find_conflicts
 from companion.link.beacon_answers import BeaconAnswers
 from companion.link.clock import MAX_LATENESS
 from companion.link.decode import DECODED, MAKES, decode
-from companion.link.dialect import MEASUREMENTS, mavlink
+from companion.link.dialect import MEASUREMENTS, mavlink, rsbn
 from companion.link.firmware import firmware_of
 from companion.link.rate_limiter import RateLimiter
 from companion.link.session import (
@@ -108,6 +108,7 @@ ABOUT_SOURCE_SET = frozenset(
         mavlink.MAVLINK_MSG_ID_HEARTBEAT,
         mavlink.MAVLINK_MSG_ID_STATUSTEXT,
         mavlink.MAVLINK_MSG_ID_NAMED_VALUE_FLOAT,
+        rsbn.MAVLINK_MSG_ID_ESTIMATOR_SENSOR_FUSION_STATUS,
     }
 )
 #: Answers to the parameter check.

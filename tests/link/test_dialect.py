@@ -23,9 +23,9 @@ def test_committed_module_matches_the_xml(tmp_path: Path) -> None:
 
 
 def test_own_messages_use_the_private_range_and_do_not_collide() -> None:
-    component_metadata = 397  # of common.xml; pymavlink's dialects lack it
-    assert set(dialect.rsbn.mavlink_map) == {*range(180000, 180005), component_metadata}
-    assert dialect.TYPES[component_metadata].crc_extra == 182  # as generated from common.xml
+    lacking = {397: 182, 514: 197}  # CRC_EXTRA as generated from common.xml and development.xml
+    assert set(dialect.rsbn.mavlink_map) == {*range(180000, 180005), *lacking}
+    assert {msgid: dialect.TYPES[msgid].crc_extra for msgid in lacking} == lacking
     assert not set(dialect.rsbn.mavlink_map) & set(dialect.mavlink.mavlink_map)
 
 

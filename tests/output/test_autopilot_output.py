@@ -584,10 +584,20 @@ def test_gnss_fusion_of_px4_is_switched_off_only_while_armed(monkeypatch: pytest
     found = Situation(1e3, -1.0, 0.1, gnss_false=0.9999, witness=True, sent_s=1e3, stopped_s=0.0)
     monkeypatch.setattr(GnssFusion, "situation", lambda self, now_ns: found)
     output, receiver = AutopilotOutput(configured("output.profile=px4")), Receiver("px4", 1)
-    for k, (base_mode, enabled) in enumerate(((0, [1.0]), (128, [0.0]), (0, [1.0]))):
+    for k, (base_mode, enabled) in enumerate(((0, []), (128, [0.0]), (0, [1.0]))):
         output.handle_message(dialect.new("HEARTBEAT", base_mode=base_mode), True, 1, START)
         assert [m.param3 for m in output.poll(receiver, START + k * SECOND)] == enabled
         output.handle_acknowledgement(ESTIMATOR_SENSOR_ENABLE, 0, START + k * SECOND)
+
+
+def test_gnss_fusion_of_px4_that_was_off_before_the_flight_stays_off() -> None:
+    flight = Flight(configured("output.profile=px4"), 12)
+    for _ in range(20):
+        flight.fly(1.0)
+        flight.send("ESTIMATOR_SENSOR_FUSION_STATUS", intended=[0, 0, 0, 1, 1, 0, 1, 1, 0])
+    commands = {m.command for m in flight.sent_messages("COMMAND_LONG")}
+    assert flight.position_payloads() and ESTIMATOR_SENSOR_ENABLE not in commands
+    assert flight.texts.count("GNSS fusion off selected by hand: the companion does not switch") == 1
 
 
 @pytest.mark.parametrize("name", sorted(ENCODERS))

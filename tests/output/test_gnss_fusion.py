@@ -5,6 +5,7 @@ from typing import Any
 
 import pytest
 
+from companion.link import dialect
 from companion.output.gnss_fusion import ESTIMATOR_SENSOR_ENABLE, GnssFusion
 from companion.output.source_switch import STEADY_S, Selected, Situation
 
@@ -52,13 +53,11 @@ def requests(switch: Switch, situation: Situation, result: int, at: int) -> list
 
 def test_off_while_false_and_on_again() -> None:
     switch, second = Switch(), 10**9
-    assert requests(switch, WELL, 0, second) == [(43006, 0.0, 0.0, 1.0)]  # another may have left it off
     assert requests(switch, WELL, 0, second) == []
     assert requests(switch, WELL._replace(**FALSE), 0, 2 * second) == [(43006, 0.0, 0.0, 0.0)]
     assert requests(switch, WELL._replace(**FALSE), 0, 9 * second) == []
     assert requests(switch, WELL, 0, 10 * second) == [(43006, 0.0, 0.0, 1.0)]
     assert [event.text for event in switch.take_events()] == [
-        "GNSS fusion on: GNSS has a fix",
         "GNSS fusion off: GNSS is false, using companion",
         "GNSS fusion on: GNSS has a fix",
     ]
@@ -104,7 +103,7 @@ def test_late_acknowledgement_of_off_is_not_one_of_on() -> None:
 
 def test_autopilot_that_does_not_know_the_command_is_reported_once() -> None:
     switch, second = Switch(), 10**9
-    assert len(requests(switch, WELL, 3, second)) == 1
+    assert requests(switch, WELL, 3, second) == []
     assert requests(switch, WELL, 3, 40 * second) == [] and switch.take_events() == []  # it is on
     assert len(requests(switch, WELL._replace(**FALSE), 3, second)) == 1
     assert requests(switch, WELL._replace(**FALSE), 3, 9 * second) == []
@@ -113,8 +112,58 @@ def test_autopilot_that_does_not_know_the_command_is_reported_once() -> None:
     assert event.text.startswith("the autopilot did not accept GNSS fusion off")
 
 
+def report(switch: Switch, is_on: bool, at: int) -> None:
+    """PX4 reports the state of its GNSS fusion, for two seconds."""
+    message = dialect.new("ESTIMATOR_SENSOR_FUSION_STATUS", intended=[is_on, 0, 0, 1, 1, 0, 1, 1, 0])
+    for _ in range(2):
+        by = switch.selected(message, True, 1)
+        assert by is not None
+        switch.handle_selected(by, at)
+
+
+def test_left_off_by_a_companion_that_failed_in_flight() -> None:
+    switch, second = Switch(), 10**9
+    report(switch, False, second)  # not known yet whether it flies
+    switch.note_armed(True)
+    assert requests(switch, WELL, 0, second) == []
+    report(switch, False, second)
+    assert requests(switch, WELL, 0, second) == [(43006, 0.0, 0.0, 1.0)]
+    report(switch, True, 2 * second)
+    assert [event.text for event in switch.take_events()] == ["GNSS fusion on: GNSS has a fix"]
+
+
+def test_choice_of_another_is_respected() -> None:
+    """Off before the flight, on while GNSS is false, and off again in flight."""
+    switch, second = Switch(), 10**9
+    switch.note_armed(False)
+    assert requests(switch, WELL, 0, second) == []
+    report(switch, False, second)
+    assert requests(switch, WELL, 0, second) == []
+    switch.note_armed(True)
+    assert requests(switch, WELL._replace(**FALSE), 0, 100 * second) == []
+    assert requests(switch, WELL, 0, 200 * second) == []
+    report(switch, True, 200 * second)
+    assert requests(switch, WELL._replace(**FALSE), 0, 300 * second) == [(43006, 0.0, 0.0, 0.0)]
+    report(switch, False, 301 * second)
+    report(switch, True, 400 * second)
+    assert requests(switch, WELL._replace(**FALSE), 0, 401 * second) == []
+    assert requests(switch, WELL, 0, 500 * second) == []
+    report(switch, False, 500 * second)
+    assert requests(switch, WELL, 0, 501 * second) == []
+    assert [event.text for event in switch.take_events()] == [
+        "GNSS fusion off selected by hand: the companion does not switch",
+        "GNSS fusion on needed (GNSS has a fix), but GNSS fusion off selected by hand",
+        "GNSS fusion on selected by hand: the companion switches again",
+        "GNSS fusion off: GNSS is false, using companion",
+        "GNSS fusion on selected by hand: the companion does not switch",
+        "GNSS fusion off selected by hand: the companion does not switch",
+    ]
+
+
 def test_source_set_of_another_sender_is_not_the_fusion_of_gnss() -> None:
     switch, second = Switch(), 10**9
+    command = dialect.command_long(1, 42007, param1=2.0)
+    assert switch.selected(command, False, 1) is None
     switch.handle_selected(Selected(2), second)
     assert not switch.is_on_companion
     assert len(requests(switch, WELL._replace(**FALSE), 0, 2 * second)) == 1

@@ -477,7 +477,7 @@ def test_a_persons_choice_is_respected_until_he_hands_back(how: Any) -> None:
     assert flight.sets == [1, 2]
     assert [text for _, text in flight.reports[2:]] == [
         "EKF source set 1 selected by hand: the companion does not switch",
-        "EKF source set 2 needed (GNSS is lost, using companion), but set 1 selected by hand",
+        "EKF source set 2 needed (GNSS is lost, using companion), but EKF source set 1 selected by hand",
     ]
     by_others(flight, *how(2))
     flight.fly(10.0, fix=False)
