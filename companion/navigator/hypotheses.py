@@ -87,7 +87,8 @@ SURPRISE = (
 #: aerobatics. With 1e-5, as for an INS, a healthy GNSS was excluded beside a wrong IMU or a wrong heading.
 GRADE_CHANGES_H = 10.0
 #: A compass, or the autopilot resets its heading, to any. The wind took up what was wrong with it before, and
-#: in a turn the velocity goes astray before the step is born (m/s).
+#: in a turn the velocity goes astray before the step is born (m/s). While GNSS is received, or a pitot that
+#: sticks in the dark is taken for one.
 HEADING_STEPS_H, HEADING_WIND, HEADING_VELOCITY = 1.0, 7.0, 5.0
 AIR_HEADING_STEPS_H = 1e-2  # by airspeed a wrong heading turns no acceleration
 HEADING_FIRST = 1e-3  # from the start, by a compass set up wrongly
@@ -173,7 +174,7 @@ class Model:
     ) -> Hypotheses:
         """The hypotheses with so many beacons; `by_air` where airspeed moves the nominal trajectory,
         `witness` while a source of position other than GNSS is received, `has_turned` where the velocity has
-        changed.
+        changed while GNSS is received.
         """
         key = (beacons, by_air, witness, has_turned)
         if key not in self._known:

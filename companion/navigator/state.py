@@ -18,7 +18,7 @@ from companion.navigator import height_error
 from companion.navigator.air_data_channel import CLIMB_NS
 from companion.navigator.channel import Nominal
 from companion.navigator.height_error import Level
-from companion.navigator.hypotheses import SOURCES, TURNED_M_S, Hypotheses, Model
+from companion.navigator.hypotheses import GNSS, SOURCES, TURNED_M_S, Hypotheses, Model
 from companion.navigator.inertial_track import Point
 from companion.navigator.minimax_bound import Guarantee
 from companion.navigator.own_channel import Sensors
@@ -31,6 +31,7 @@ from companion.units import SECOND_NS
 FIXES = Source.GNSS | Source.AZIMUTH | Source.RANGE
 JAMMED_NS = 10 * SECOND_NS  # the receiver's word lasts so long
 SUSPECT, EXCLUDED = 1, 2
+HEARD_S = 3.0  # a source is received: silent for no longer
 NEAR_S = 0.5  # the bank is at most so far behind: in between the error moves by its velocity
 
 
@@ -121,7 +122,8 @@ def hypotheses(state: State, settings: Settings) -> Hypotheses:
     """The hypotheses with the beacons that are followed, for what moves the nominal trajectory now."""
     nominal = state.nominal
     interval = nominal.interval if nominal else None
-    has_turned = math.hypot(*state.turned) > TURNED_M_S
+    heard = state.bank is not None and state.bank.t - state.bank.seen[GNSS] <= HEARD_S
+    has_turned = heard and math.hypot(*state.turned) > TURNED_M_S
     by_air = interval is not None and interval.by == "air"
     return settings.model.hypotheses(len(state.beacons), by_air, has_witness(state, settings), has_turned)
 

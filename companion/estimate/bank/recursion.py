@@ -24,8 +24,8 @@ LOG_2PI = math.log(2.0 * math.pi)
 Measurement = tuple[Floats, Floats]
 """z (R, m) and H (R, m, k), linearised for each row."""
 
-#: A mean so near to the centre has no direction; the variance of an angle that is known (rad^2); that of the
-#: measurement of the radius, and of one that is measured already.
+#: A mean so near to the centre has no direction; the variance of an angle that is known (rad^2), of the
+#: measurement of the radius, and of a cosine that is known: of a small angle it is taken for 1.
 LEAST_RADIUS, ANGLE_KNOWN, RADIUS_NOISE, RADIUS_KNOWN = 0.3, 0.1, 1e-4, 1e-6
 
 
@@ -190,7 +190,7 @@ def on_circle(bank: Bank, angle: Angle) -> Bank:
     Ps, Psc, Pc = bank.P[:, s, s], -bank.P[:, s, v], bank.P[:, v, v]
     along = uc * uc * Ps - 2.0 * us * uc * Psc + us * us * Pc
     across = us * us * Ps + 2.0 * us * uc * Psc + uc * uc * Pc
-    rows = np.flatnonzero((radius > LEAST_RADIUS) & (along < ANGLE_KNOWN) & (across > RADIUS_KNOWN))
+    rows = np.flatnonzero((radius > LEAST_RADIUS) & (along < ANGLE_KNOWN) & (Pc > RADIUS_KNOWN))
     if not len(rows):
         return bank
     along, across = along[rows], across[rows]
