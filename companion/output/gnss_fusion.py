@@ -5,8 +5,9 @@ takes MAV_CMD_ESTIMATOR_SENSOR_ENABLE (development.xml of 2026; PR 26739 propose
 off only if it is false by the same predicate as on ArduPilot, never because it is lost: if the companion then
 failed, it would stay off. An autopilot that does not know the command is reported.
 
-PX4 reports the state in ESTIMATOR_SENSOR_FUSION_STATUS. What somebody else switched is left as it is. If the
-first reports are made in flight and state that it is off, a companion that failed left it so.
+PX4 reports the state in ESTIMATOR_SENSOR_FUSION_STATUS. If the first reports state that it is off, a
+companion that failed may have left it so, and PX4 stored it at landing: it is switched on once. What somebody
+else switches from then on is left as it is.
 
 What the companion switched off is on while disarmed: PX4 stores it in EKF2_SENS_EN then, and when it disarms.
 The next flight would begin without GNSS.
@@ -35,7 +36,7 @@ _GNSS, _FIRST = 0.0, 0.0  # ESTIMATOR_SENSOR_FUSION_SOURCE_GPS, the first receiv
 
 
 class GnssFusion(SourceSwitch):
-    """Fusion of PX4's first receiver; on at the start, unless it is reported off."""
+    """Fusion of PX4's first receiver; on at the start, or switched on."""
 
     command = ESTIMATOR_SENSOR_ENABLE
     is_silence_judged = False
@@ -43,7 +44,7 @@ class GnssFusion(SourceSwitch):
     def __init__(self) -> None:
         super().__init__()
         self._wanted = self._leading = GNSS_SET
-        self._is_disarmed: bool | None = None
+        self._is_disarmed = False
         self._is_start = True  # until the state is reported
 
     @staticmethod
@@ -68,10 +69,9 @@ class GnssFusion(SourceSwitch):
 
     def handle_selected(self, by: Selected, now_ns: int) -> None:
         """Process PX4's report; a source set is ignored: PX4 has none, and answers "unsupported"."""
-        if not by.is_report or self._is_disarmed is None:
+        if not by.is_report:
             return
-        is_left_off = self._is_start and not self._is_disarmed
-        super().handle_selected(by._replace(by_script=is_left_off), now_ns)
+        super().handle_selected(by._replace(by_script=self._is_start), now_ns)
         self._is_start = self._is_start and self._reports < REPORTS
 
     def name(self, number: int | None) -> str:

@@ -590,11 +590,11 @@ def test_gnss_fusion_of_px4_is_switched_off_only_while_armed(monkeypatch: pytest
         output.handle_acknowledgement(ESTIMATOR_SENSOR_ENABLE, 0, START + k * SECOND)
 
 
-def test_gnss_fusion_of_px4_that_was_off_before_the_flight_stays_off() -> None:
+def test_gnss_fusion_of_px4_that_is_switched_off_before_the_flight_stays_off() -> None:
     flight = Flight(configured("output.profile=px4"), 12)
-    for _ in range(20):
+    for second in range(20):
         flight.fly(1.0)
-        flight.send("ESTIMATOR_SENSOR_FUSION_STATUS", intended=[0, 0, 0, 1, 1, 0, 1, 1, 0])
+        flight.send("ESTIMATOR_SENSOR_FUSION_STATUS", intended=[second < 5, 0, 0, 1, 1, 0, 1, 1, 0])
     commands = {m.command for m in flight.sent_messages("COMMAND_LONG")}
     assert flight.position_payloads() and ESTIMATOR_SENSOR_ENABLE not in commands
     assert flight.texts.count("GNSS fusion off selected by hand: the companion does not switch") == 1

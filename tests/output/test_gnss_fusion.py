@@ -121,15 +121,16 @@ def report(switch: Switch, is_on: bool, at: int) -> None:
         switch.handle_selected(by, at)
 
 
-def test_left_off_by_a_companion_that_failed_in_flight() -> None:
+@pytest.mark.parametrize(("is_armed", "reason"), [(True, "GNSS has a fix"), (False, "disarmed")])
+def test_left_off_by_a_companion_that_failed(is_armed: bool, reason: str) -> None:
+    """In flight, and stored at landing: the next flight would begin without a healthy GNSS."""
     switch, second = Switch(), 10**9
-    report(switch, False, second)  # not known yet whether it flies
-    switch.note_armed(True)
+    switch.note_armed(is_armed)
     assert requests(switch, WELL, 0, second) == []
     report(switch, False, second)
     assert requests(switch, WELL, 0, second) == [(43006, 0.0, 0.0, 1.0)]
     report(switch, True, 2 * second)
-    assert [event.text for event in switch.take_events()] == ["GNSS fusion on: GNSS has a fix"]
+    assert [event.text for event in switch.take_events()] == [f"GNSS fusion on: {reason}"]
 
 
 def test_choice_of_another_is_respected() -> None:
@@ -137,6 +138,7 @@ def test_choice_of_another_is_respected() -> None:
     switch, second = Switch(), 10**9
     switch.note_armed(False)
     assert requests(switch, WELL, 0, second) == []
+    report(switch, True, second)
     report(switch, False, second)
     assert requests(switch, WELL, 0, second) == []
     switch.note_armed(True)
