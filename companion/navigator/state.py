@@ -31,7 +31,6 @@ from companion.units import SECOND_NS
 FIXES = Source.GNSS | Source.AZIMUTH | Source.RANGE
 JAMMED_NS = 10 * SECOND_NS  # the receiver's word lasts so long
 SUSPECT, EXCLUDED = 1, 2
-HEARD_S = 3.0  # a source is received: silent for no longer
 NEAR_S = 0.5  # the bank is at most so far behind: in between the error moves by its velocity
 
 
@@ -122,8 +121,9 @@ def hypotheses(state: State, settings: Settings) -> Hypotheses:
     """The hypotheses with the beacons that are followed, for what moves the nominal trajectory now."""
     nominal = state.nominal
     interval = nominal.interval if nominal else None
-    heard = state.bank is not None and state.bank.t - state.bank.seen[GNSS] <= HEARD_S
-    has_turned = heard and math.hypot(*state.turned) > TURNED_M_S
+    timeout, bank = settings.config.gnss.timeout_s, state.bank
+    is_received = bank is not None and bank.t - bank.seen[GNSS] <= timeout
+    has_turned = is_received and math.hypot(*state.turned) > TURNED_M_S
     by_air = interval is not None and interval.by == "air"
     return settings.model.hypotheses(len(state.beacons), by_air, has_witness(state, settings), has_turned)
 

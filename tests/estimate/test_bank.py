@@ -685,7 +685,7 @@ def test_an_angle_that_may_be_any_one_has_the_moments_of_its_circle():
 
 @given(st.floats(-math.pi, math.pi), st.floats(0.01, 0.3), st.floats(0.7, 1.3))
 def test_an_angle_spread_along_its_arc_is_held_to_its_circle(angle, sigma, radius):
-    """Its mean lies within the circle, where that of an arc does; the angle stays as it was."""
+    """Its mean is within the circle, where that of an arc is; the angle stays as it was."""
     along, across = (
         np.array([math.cos(angle), math.sin(angle)]),
         np.array([math.sin(angle), -math.cos(angle)]),

@@ -140,7 +140,7 @@ def test_a_heading_that_steps_in_flight_leaves_a_healthy_gnss_beyond_doubt(
     start, end = records[0].rx_ns, records[-1].rx_ns
     steps_ns = start + round(share * (end - start))
     apart, doubt = flown([off(r) if r.rx_ns >= steps_ns else r for r in records])
-    assert len(apart) > 700 and max(apart) < 6.0
+    assert len(apart) > 700 and max(apart) < 5.0
     assert doubt < 0.05
 
 

@@ -172,7 +172,7 @@ def update(
 def on_circle(bank: Bank, angle: Angle) -> Bank:
     """Update by sine^2 + cosine^2 = 1, linearised, the rows that know the angle but not its radius.
 
-    Without it a radius of 0.6 is as good as an angle. Where the angle is spread along its arc the mean lies
+    Without it a radius of 0.6 is as good as an angle. Where the angle is spread along its arc the mean is
     within the circle.
 
     Parameters
