@@ -1,11 +1,12 @@
 """Fixed-interval smoothing of a flight: error of the nominal trajectory at every epoch, given all fixes.
 
 A smoother needs one Gaussian path, so the flight is filtered twice by the navigator's own step. The first
-pass is the flight: the bank of hypotheses gives which sources were false, from their onset on, when the wind
-jumped, and which grade of noise was right. Airspeed and GNSS velocity show how strong the gusts were and how
-long they lasted (`analysis.gusts`). The second pass runs a plain Kalman filter with that grade and those
-gusts: it leaves out what was false, widens the wind where it jumped, and takes for all other jumps a random
-walk of their variance. Every step of it is an epoch: at a measurement, or half a second after the last.
+pass is the flight: the bank of hypotheses gives which sources were false and from when on, also where only
+the end of it shows it, when the wind jumped, and which grade of noise was right. Airspeed and GNSS velocity
+show how strong the gusts were and how long they lasted (`analysis.gusts`). The second pass runs a plain
+Kalman filter with that grade and those gusts: it leaves out what was false, widens the wind where it jumped,
+and takes for all other jumps a random walk of their variance. Every step of it is an epoch: at a measurement,
+or half a second after the last.
 
 Backward pass: the recursion of Rauch, Tung and Striebel (1965), which does not need the (nonlinear)
 measurements. With Phi, Q from one epoch to the next, x_{k+1|k} the prediction before the measurement,
@@ -138,6 +139,13 @@ class _Jump(NamedTuple):
     sigma: tuple[float, ...]
 
 
+class _Onset(NamedTuple):
+    """Since when the heaviest row that holds a fault held it, as known at `t_ns`."""
+
+    t_ns: int
+    since_ns: int
+
+
 class _Folded(NamedTuple):
     """A record that the navigator took up, at its own time, and of which run."""
 
@@ -156,6 +164,7 @@ class _Witness(Navigator):
         self.gusts = GustSamples()
         self.spans: dict[str, list[tuple[int, int]]] = {}  # when each source was false, by name
         self.jumps: list[_Jump] = []
+        self._onsets: dict[int, list[_Onset]] = {}  # of each fault, as they came up
         self.beacons: dict[int, Beacon] = {}
         self._last: list[tuple[Bank, Hypotheses] | None] = [None]  # of each run
         self._open: dict[str, int] = {}
@@ -194,15 +203,18 @@ class _Witness(Navigator):
             self._note_gust(state, record)
         for beacon in state.beacons:
             self.beacons.setdefault(beacon.identity, beacon)
-        self._note_false(state, state.bank, known, t_ns)
-        self._note_jump(state.bank, known, t_ns)
+        assert state.nominal is not None
+        bank_ns = state.nominal.since.t_ns
+        self._note_false(state, state.bank, known, t_ns, bank_ns)
+        self._note_jump(state.bank, known, bank_ns)
+        self._note_end(state, state.bank, known, bank_ns)
 
-    def _note_false(self, state: State, bank: Bank, known: Hypotheses, t_ns: int) -> None:
+    def _note_false(self, state: State, bank: Bank, known: Hypotheses, t_ns: int, bank_ns: int) -> None:
         for i, p in enumerate(state.false):
             name = source_name(i, state)
             false = bool(bank.excluded[i]) or p > known.settings.suspect
-            if false and name not in self._open:
-                self._open[name] = t_ns - _age_ns(bank, known, i)
+            if false and (name not in self._open or _holds(bank, known, i)):
+                self._open[name] = bank_ns - _age_ns(bank, known, i)
             elif not false and name in self._open:
                 self.spans.setdefault(name, []).append((self._open.pop(name), t_ns))
 
@@ -217,15 +229,37 @@ class _Witness(Navigator):
         if V is not None and s.ground.flying and s.air_ns == air.t_ns:
             self.gusts.add(record.t_ns * 1e-9, V, record.v_n[:2])
 
-    def _note_jump(self, bank: Bank, known: Hypotheses, t_ns: int) -> None:
+    def _note_jump(self, bank: Bank, known: Hypotheses, bank_ns: int) -> None:
         """Note the jump that the heaviest row holds, if that is what happened to it last."""
         best, layout = int(np.argmax(bank.L)), known.layout
         j = int(bank.event[best]) - 1 - 2 * len(layout.faults)
         if j < 0:
             return
-        at = t_ns - round((bank.t - float(bank.since[best])) * 1e9)
+        at = bank_ns - _age(bank, best)
         if all(abs(at - jump.t_ns) > APART_NS for jump in self.jumps):
             self.jumps.append(_Jump(at, layout.jumps[j].states, layout.jumps[j].sigma))
+
+    def _note_end(self, state: State, bank: Bank, known: Hypotheses, bank_ns: int) -> None:
+        """Note the fault that the heaviest row holds to be over, if that is what happened to it last.
+
+        A lie that nothing contradicted while it lasted is known by its end.
+        """
+        faults, best = known.layout.faults, int(np.argmax(bank.L))
+        f = int(bank.event[best]) - 1 - len(faults)
+        if 0 <= f < len(faults):
+            until = bank_ns - _age(bank, best)
+            onsets = [onset.since_ns for onset in self._onsets.get(f, ()) if onset.t_ns < until]
+            for i in faults[f].sources if onsets else ():
+                spans = self.spans.setdefault(source_name(i, state), [])
+                if all(abs(until - end) > APART_NS for _, end in spans):
+                    spans.append((onsets[-1], until))
+        for f in range(len(faults)):
+            rows = np.flatnonzero(bank.event == 1 + f)
+            if len(rows):
+                onset = _Onset(bank_ns, bank_ns - _age(bank, rows[np.argmax(bank.L[rows])]))
+                before = self._onsets.setdefault(f, [])
+                if not before or abs(onset.since_ns - before[-1].since_ns) > APART_NS:
+                    before.append(onset)
 
     def _close(self, t_ns: int) -> None:
         for name, since in self._open.items():
@@ -250,14 +284,24 @@ class _Witness(Navigator):
         return int(np.argmax(banks.grade_probability(bank, known.layout)))
 
 
+def _holds(bank: Bank, known: Hypotheses, source: int) -> bool:
+    """Whether the last event of the heaviest row is that a source became false."""
+    fault = int(bank.event[int(np.argmax(bank.L))]) - 1
+    return 0 <= fault < len(known.layout.faults) and bool(known.layout.concerns[fault, source])
+
+
 def _age_ns(bank: Bank, known: Hypotheses, source: int) -> int:
     """How long ago a source became false, by the heaviest row whose last event that was; else 0."""
     faults = np.flatnonzero(known.layout.concerns[:-1, source])
     rows = np.flatnonzero(np.isin(bank.event - 1, faults))
     if not len(rows):
         return 0
-    best = rows[np.argmax(bank.L[rows])]
-    return round((bank.t - float(bank.since[best])) * 1e9)
+    return _age(bank, rows[np.argmax(bank.L[rows])])
+
+
+def _age(bank: Bank, row: int) -> int:
+    """How long ago the last event of a row was, ns."""
+    return round((bank.t - float(bank.since[row])) * 1e9)
 
 
 # ---------------------------------------------------------------------------------------------------------

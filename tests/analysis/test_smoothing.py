@@ -198,6 +198,24 @@ def test_false_gnss_is_left_out_from_its_onset() -> None:
 
 
 @pytest.mark.flight
+@pytest.mark.parametrize(("since_s", "until_s"), [(0, 18), (0, 60), (100, 130)])
+def test_a_lie_that_is_known_by_its_end_is_left_out_from_its_onset(since_s: int, until_s: int) -> None:
+    """GNSS is 360 m off for a while, which one beacon every 5 s does not show while it lasts."""
+    flown = flight(300, (0, 0))
+    records = []
+    for record in flown.records:
+        if isinstance(record, Gnss) and since_s * NS <= record.t_ns < until_s * NS:
+            place = displace(record.lat, record.lon, record.alt_msl, 360.0, 0.0, 0.0)
+            record = msgspec.structs.replace(record, lat=place.lat, lon=place.lon)
+        records.append(record)
+    (found,) = smooth_flight(records, CONFIG)
+    away = np.linalg.norm(errors(found, flown)[0][:, :2], axis=1)
+    sigma = np.sqrt(np.einsum("nii->n", found.P[:, :2, :2]))
+    assert away.max() < 60.0
+    assert (away < 4.0 * sigma).all()
+
+
+@pytest.mark.flight
 def test_false_velocity_of_gnss_is_left_out_from_its_onset() -> None:
     """The path is that of a receiver that stops sending a velocity there; its positions are used."""
     flown = flight(300, (0, 0))
