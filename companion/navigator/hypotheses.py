@@ -124,6 +124,20 @@ def beacon_lies(reach: float) -> tuple[Lie, ...]:
     return tuple(Lie(reach * scale, 1e-4 * reach * scale) for scale in (1.0, 10.0))
 
 
+class Situation(NamedTuple):
+    """What the hypotheses depend on.
+
+    How many beacons there are, whether airspeed moves the nominal trajectory, whether a source of position
+    other than GNSS is received, whether GNSS is, and whether the velocity has changed within seconds.
+    """
+
+    beacons: int = 0
+    by_air: bool = False
+    witness: bool = True
+    is_received: bool = False
+    has_turned: bool = False
+
+
 class Hypotheses(NamedTuple):
     """The layout with so many beacons, and the settings of the bank."""
 
@@ -167,27 +181,21 @@ class Model:
             config = structs.replace(config, air_data=air)
         self.config, self.plain = config, plain
         self.channel: Channel = corrected_ins(config) if config.has_own_ins else OwnChannel(config)
-        self._known: dict[tuple[int, bool, bool, bool], Hypotheses] = {}
+        self._known: dict[Situation, Hypotheses] = {}
 
-    def hypotheses(
-        self, beacons: int, by_air: bool = False, witness: bool = True, has_turned: bool = False
-    ) -> Hypotheses:
-        """The hypotheses with so many beacons; `by_air` where airspeed moves the nominal trajectory,
-        `witness` while a source of position other than GNSS is received, `has_turned` where the velocity has
-        changed while GNSS is received.
-        """
-        key = (beacons, by_air, witness, has_turned)
-        if key not in self._known:
-            found = _hypotheses(self.config, self.channel, *key)
+    def hypotheses(self, now: Situation) -> Hypotheses:
+        """The hypotheses of a situation."""
+        if now not in self._known:
+            found = _hypotheses(self.config, self.channel, now)
             if self.plain is not None:
                 layout = replace(found.layout, faults=(), jumps=())
                 found = found._replace(layout=layout, settings=replace(found.settings, switch_h=0.0))
-            self._known[key] = found
-        return self._known[key]
+            self._known[now] = found
+        return self._known[now]
 
     def begin(self, t_s: float) -> Bank:
         """The bank before the first fix."""
-        layout = self.hypotheses(0).layout
+        layout = self.hypotheses(Situation()).layout
         P = self.channel.prior()
         bank = start(layout, t_s, np.zeros(layout.n_base), P, self.channel.grades)
         if self.plain is not None:
@@ -197,7 +205,7 @@ class Model:
 
     def with_beacon(self, bank: Bank, beacons: int) -> Bank:
         """The bank with one beacon more than `beacons`, its biases unknown."""
-        old, new = self.hypotheses(beacons), self.hypotheses(beacons + 1)
+        old, new = (self.hypotheses(Situation(n)) for n in (beacons, beacons + 1))
         return enlarge(bank, old.layout, new.layout, np.square(new.biases[-BIASES:]))
 
     def doubted(self, bank: Bank) -> Bank:
@@ -207,7 +215,7 @@ class Model:
         """
         if not self.channel.wind or self.plain is not None:
             return bank
-        known, still = self.hypotheses(1), tuple(lie for lie in GNSS_FIRST if lie.rate == STILL)
+        known, still = self.hypotheses(Situation(1)), tuple(lie for lie in GNSS_FIRST if lie.rate == STILL)
         lies = {i: still for i, fault in enumerate(known.layout.faults) if fault.sources == (GNSS,)}
         return banks.false_since_first(bank, known.layout, known.settings, lies, DOUBTED, POSITION)
 
@@ -218,16 +226,22 @@ class Model:
         """
         if not self.channel.wind:
             return bank
-        far = bank.x[:, HEADING.versine] > FAR_VERSINE
-        if far.any():
-            x = bank.x.copy()
-            x[far, HEADING.sine] /= Phi[HEADING.sine, HEADING.sine]
-            bank = bank._replace(x=x)
+        if (kept := self.kept(bank, Phi)) is not None:
+            bank = bank._replace(x=kept * bank.x, P=kept[:, :, None] * bank.P * kept[:, None])
         return banks.on_circle(bank, HEADING)
+
+    def kept(self, bank: Bank, Phi: Floats) -> Floats | None:
+        """Factors (R, n) that undo what Phi takes from a heading that is far off; None where none is."""
+        far = bank.x[:, HEADING.versine] > FAR_VERSINE
+        if not far.any():
+            return None
+        factors = np.ones_like(bank.x)
+        factors[far, HEADING.sine] /= Phi[HEADING.sine, HEADING.sine]
+        return factors
 
     def transition(self, nominal: Nominal, beacons: int) -> Transition:
         """Phi (n, n) and Q (grades, n_base, n_base) over all states, the lies' motion left to the bank."""
-        found, known = self.channel.transition(nominal), self.hypotheses(beacons)
+        found, known = self.channel.transition(nominal), self.hypotheses(Situation(beacons))
         ours, n, dt = self.channel.n, known.layout.n_base, nominal.pending_s
         Q = np.zeros((len(found.Q), n, n))
         Q[:, :ours, :ours] = found.Q
@@ -254,13 +268,11 @@ def only(bank: Bank, row: int) -> Bank:
     return banks.picked(bank, [row])._replace(L=np.zeros(1))
 
 
-def _hypotheses(
-    config: Config, channel: Channel, beacons: int, by_air: bool, witness: bool, has_turned: bool
-) -> Hypotheses:
+def _hypotheses(config: Config, channel: Channel, now: Situation) -> Hypotheses:
     azimuth_bias, range_bias = math.radians(config.rsbn.bias_azimuth_deg), config.rsbn.bias_range_m
     sigma_a, sigma_r = math.radians(config.rsbn.sigma_azimuth_deg), config.rsbn.sigma_range_m
     # an air-data or IMU channel alone is no witness against GNSS: its own model may be what is wrong
-    doubt = 1.0 if witness or not channel.wind else 0.0
+    doubt = 1.0 if now.witness or not channel.wind else 0.0
     sources = [
         Source(SOURCES[GNSS], 2, GNSS_GROUP, presumed=True),
         Source(SOURCES[AIRSPEED], 1, AIRSPEED_GROUP, silence_s=SILENCE_S),
@@ -270,10 +282,10 @@ def _hypotheses(
     faults = [
         Fault("gnss", (GNSS,), 7e-4 * doubt, lies, 7e-4 * doubt, GNSS_FIRST, quota=20),
         Fault("gnss position", (GNSS,), 3e-4 * doubt, lies, 3e-4 * doubt, GNSS_FIRST, quota=10),
-        Fault("airspeed", (AIRSPEED,), 1e-2, AIRSPEED_LIES, shock=SHOCK if by_air else (), quota=6),
+        Fault("airspeed", (AIRSPEED,), 1e-2, AIRSPEED_LIES, shock=SHOCK if now.by_air else (), quota=6),
         Fault("velocity of gnss", (VELOCITY,), 1e-2, VELOCITY_LIES, 5e-2, VELOCITY_LIES, quota=12),
     ]
-    for k in range(beacons):
+    for k in range(now.beacons):
         a, r = len(sources), len(sources) + 1
         sources += [Source(f"azimuth {k}", 1, BEACON_GROUP, 0), Source(f"range {k}", 1, BEACON_GROUP, 1)]
         for name, which, lies, first in (
@@ -285,11 +297,11 @@ def _hypotheses(
             fault = Fault(f"{name} {k}", which, BEACON_H, lies, first, lies, (), ends_h, BEACON_H, quota=4)
             faults.append(fault)
     layout = Layout(
-        channel.n + BIASES * beacons,
+        channel.n + BIASES * now.beacons,
         GROUPS,
         tuple(sources),
         tuple(faults),
-        jumps=_jumps(config, channel, by_air, has_turned),
+        jumps=_jumps(config, channel, now),
         grades=tuple(range(len(channel.grades))),
         orders=ORDERS,
     )
@@ -298,10 +310,10 @@ def _hypotheses(
         rows=config.integrity.rows,
         switch_h=GRADE_CHANGES_H if channel.wind else DEFAULT.switch_h,
     )
-    return Hypotheses(layout, settings, (azimuth_bias, range_bias, LATE_S) * beacons)
+    return Hypotheses(layout, settings, (azimuth_bias, range_bias, LATE_S) * now.beacons)
 
 
-def _jumps(config: Config, channel: Channel, by_air: bool, has_turned: bool) -> tuple[Jump, ...]:
+def _jumps(config: Config, channel: Channel, now: Situation) -> tuple[Jump, ...]:
     """What may jump without a source being false."""
     away, moved = (CHANNEL_JUMP_M, CHANNEL_JUMP_M), (0, 1, 2, 3)
     if not channel.wind:
@@ -313,16 +325,23 @@ def _jumps(config: Config, channel: Channel, by_air: bool, has_turned: bool) -> 
     jump, rate_h = config.air_data.wind_jump_m_s, config.air_data.wind_jumps_per_hour
     # a wind is noticed up to a second later: beside the IMU the gust has taken it up until then; by air data
     # the velocity over ground jumps with it
-    states = (*channel.wind, *((2, 3, 0, 1) if by_air else GUST))
-    sigmas = (jump,) * 6 if by_air else (jump, jump, GUST_OPEN_M_S, GUST_OPEN_M_S)
-    latency_h = 0.0 if by_air else LATENCY_STEPS_H
-    heading_h, velocity_h = (HEADING_STEPS_H, VELOCITY_STEPS_H) if has_turned else (0.0, 0.0)
-    if by_air:
+    states = (*channel.wind, *((2, 3, 0, 1) if now.by_air else GUST))
+    sigmas = (jump,) * 6 if now.by_air else (jump, jump, GUST_OPEN_M_S, GUST_OPEN_M_S)
+    latency_h = 0.0 if now.by_air else LATENCY_STEPS_H
+    heading_h = HEADING_STEPS_H if now.is_received else 0.0
+    velocity_h = VELOCITY_STEPS_H if now.is_received and now.has_turned else 0.0
+    if now.by_air:
         heading_h, velocity_h = AIR_HEADING_STEPS_H, 0.0
-    astray = HEADING_WIND, HEADING_WIND, HEADING_VELOCITY, HEADING_VELOCITY
+    astray = HEADING_VELOCITY if now.has_turned else 0.0
     return (
         Jump("wind", states, sigmas, rate_h, quota=24, often=True),
-        Jump("heading", (*channel.wind, 2, 3), astray, heading_h, angle=HEADING),
+        Jump(
+            "heading",
+            (*channel.wind, 2, 3),
+            (HEADING_WIND, HEADING_WIND, astray, astray),
+            heading_h,
+            angle=HEADING,
+        ),
         Jump("velocity", (2, 3), (VELOCITY_STEP, VELOCITY_STEP), velocity_h),
         Jump("latency", (channel.latency,), (LATENCY_STEP,), latency_h),
         # whatever the model does not know: GNSS is believed again after a second or two

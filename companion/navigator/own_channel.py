@@ -35,16 +35,35 @@ HOLD_M_S_SQRT_S = 4.0  # a turn of 30 degrees of bank changes the velocity by 5.
 SENSOR_NS = 10_000_000_000  # the word of the autopilot that its airspeed sensor is healthy lasts so long
 STEADY_AFTER_NS = 20 * SECOND_NS  # in flight, until the airspeed is steady
 LASTING = 0.5  # share of the velocity error of GNSS that lasts for minutes
+ONE_WAY = 0.95  # a mean of half a second is so short, by the lengths of its samples, in a turn at 130 deg/s
 WEIGHTS = (1.0, 0.5, 0.25)  # of `own_error_model.GRADES`
 
 
 class AirspeedSums(NamedTuple):
-    """Sums over the samples since `start_ns`: of nominal velocity and of velocity through the air (m/s)."""
+    """Sums over the samples since `start_ns`: of nominal velocity and of velocity through the air, and of
+    the size of the latter (m/s).
+    """
 
     start_ns: int
-    samples: int
-    velocity: Vector2
-    air: Vector2
+    samples: int = 0
+    velocity: Vector2 = (0.0, 0.0)
+    air: Vector2 = (0.0, 0.0)
+    speed: float = 0.0
+
+    def with_one(self, velocity: Vector2, V: Vector2) -> AirspeedSums:
+        """With one more sample (m/s)."""
+        return AirspeedSums(
+            self.start_ns,
+            self.samples + 1,
+            (self.velocity[0] + velocity[0], self.velocity[1] + velocity[1]),
+            (self.air[0] + V[0], self.air[1] + V[1]),
+            self.speed + math.hypot(*V),
+        )
+
+    @property
+    def is_one_way(self) -> bool:
+        """Whether the samples are of one heading or a turn: a mean over a step of it is of neither."""
+        return math.hypot(*self.air) >= ONE_WAY * self.speed
 
 
 class Sensors(Struct, frozen=True):

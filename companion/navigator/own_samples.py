@@ -243,15 +243,11 @@ def _measured(state: State, record: AirData | Attitude | Imu, V: Vector2, settin
     """Use a velocity `V` through the air (m/s) as a measurement, the mean of half a second at once."""
     assert state.nominal is not None
     s, v_n = state.sensors, state.nominal.point.v_n
-    sums = s.sums or AirspeedSums(record.t_ns, 0, (0.0, 0.0), (0.0, 0.0))
-    sums = AirspeedSums(
-        sums.start_ns,
-        sums.samples + 1,
-        (sums.velocity[0] + v_n[0], sums.velocity[1] + v_n[1]),
-        (sums.air[0] + V[0], sums.air[1] + V[1]),
-    )
+    sums = (s.sums or AirspeedSums(record.t_ns)).with_one((v_n[0], v_n[1]), V)
     if record.t_ns - sums.start_ns < AIRSPEED_EVERY_NS:
         return structs.replace(state, sensors=structs.replace(s, sums=sums))
+    if not isinstance(record, Imu) and not sums.is_one_way:
+        return structs.replace(state, sensors=structs.replace(s, sums=AirspeedSums(record.t_ns)))
     state = propagated(state, settings)
     assert state.bank is not None
     known, n = hypotheses(state, settings), sums.samples
@@ -266,8 +262,7 @@ def _measured(state: State, record: AirData | Attitude | Imu, V: Vector2, settin
         taken = measurements.rotor_drag(
             state.bank, known, _own(settings), V, velocity, manoeuvre, heading, drag
         )
-    sums = AirspeedSums(record.t_ns, 0, (0.0, 0.0), (0.0, 0.0))
-    sensors = structs.replace(state.sensors, measured_ns=record.t_ns, sums=sums)
+    sensors = structs.replace(state.sensors, measured_ns=record.t_ns, sums=AirspeedSums(record.t_ns))
     return decided(structs.replace(state, bank=taken.bank, sensors=sensors), record, settings)
 
 

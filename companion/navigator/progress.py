@@ -16,7 +16,7 @@ from companion.estimate.bank import Bank
 from companion.nav.geometry import displace
 from companion.navigator import minimax_bound, own_channel, parallel_filters
 from companion.navigator.channel import moved
-from companion.navigator.hypotheses import AIRSPEED, JAMMED
+from companion.navigator.hypotheses import AIRSPEED, JAMMED, Situation
 from companion.navigator.inertial_track import Point
 from companion.navigator.own_error_model import By
 from companion.navigator.solution import solve
@@ -62,7 +62,9 @@ def births_due(state: State, settings: Settings) -> bool:
     bank = state.bank
     if bank is None or (state.newborn is not None and state.newborn[0] is bank):
         return False
-    known = settings.model.hypotheses(len(state.beacons))  # the intervals are those of any hypotheses
+    known = settings.model.hypotheses(
+        Situation(len(state.beacons))
+    )  # the intervals are those of any hypotheses
     return banks.births_due(bank, known.settings) or banks.jump_births_due(bank, known.layout, known.settings)
 
 

@@ -18,7 +18,7 @@ from companion.navigator import height_error
 from companion.navigator.air_data_channel import CLIMB_NS
 from companion.navigator.channel import Nominal
 from companion.navigator.height_error import Level
-from companion.navigator.hypotheses import GNSS, SOURCES, TURNED_M_S, Hypotheses, Model
+from companion.navigator.hypotheses import GNSS, SOURCES, TURNED_M_S, Hypotheses, Model, Situation
 from companion.navigator.inertial_track import Point
 from companion.navigator.minimax_bound import Guarantee
 from companion.navigator.own_channel import Sensors
@@ -118,14 +118,17 @@ Step = tuple[State, list[Output]]
 
 
 def hypotheses(state: State, settings: Settings) -> Hypotheses:
-    """The hypotheses with the beacons that are followed, for what moves the nominal trajectory now."""
-    nominal = state.nominal
-    interval = nominal.interval if nominal else None
+    """The hypotheses of the situation."""
+    interval = state.nominal.interval if state.nominal else None
     timeout, bank = settings.config.gnss.timeout_s, state.bank
-    is_received = bank is not None and bank.t - bank.seen[GNSS] <= timeout
-    has_turned = is_received and math.hypot(*state.turned) > TURNED_M_S
-    by_air = interval is not None and interval.by == "air"
-    return settings.model.hypotheses(len(state.beacons), by_air, has_witness(state, settings), has_turned)
+    now = Situation(
+        len(state.beacons),
+        by_air=interval is not None and interval.by == "air",
+        witness=has_witness(state, settings),
+        is_received=bank is not None and bank.t - bank.seen[GNSS] <= timeout,
+        has_turned=math.hypot(*state.turned) > TURNED_M_S,
+    )
+    return settings.model.hypotheses(now)
 
 
 def is_jammed(state: State) -> bool:
