@@ -34,7 +34,7 @@ from msgspec import structs
 from companion.analysis.gusts import Gusts, GustSamples
 from companion.config import Config, parse
 from companion.estimate import bank as banks
-from companion.estimate.bank import Bank
+from companion.estimate.bank import Bank, Jump
 from companion.estimate.linear_system import LinearSystem
 from companion.estimate.smoother import rts_backward, two_point
 from companion.nav.geometry import displace
@@ -76,7 +76,7 @@ from companion.units import SECOND_NS, Floats
 NEVER_NS = 2**63 - 1
 MEASURING = (AirData, RangeDifference, StarFix, SecondIns)  # besides fixes; AirData by itself too
 SAME_TIME_NS = 300_000_000  # in a turn the air velocity changes by less than 2 m/s
-APART_NS = 5 * SECOND_NS  # hypotheses of one wind jump differ by less
+APART_NS = 5 * SECOND_NS  # hypotheses of one jump differ by less
 
 
 class SmoothedRun(NamedTuple):
@@ -131,12 +131,15 @@ def join_runs(runs: Iterable[SmoothedRun]) -> tuple[npt.NDArray[np.int64], Float
 # ---------------------------------------------------------------------------------------------------------
 
 
-class _Jump(NamedTuple):
-    """Base states that jumped at a time, and one sigma of each."""
+class _Jumped(NamedTuple):
+    """Time and kind of a jump."""
 
     t_ns: int
-    states: tuple[int, ...]
-    sigma: tuple[float, ...]
+    jump: Jump
+
+    def is_of(self, other: _Jumped) -> bool:
+        """Whether both are hypotheses of one jump."""
+        return self.jump.name == other.jump.name and abs(self.t_ns - other.t_ns) <= APART_NS
 
 
 class _Onset(NamedTuple):
@@ -163,7 +166,7 @@ class _Witness(Navigator):
         self.folded: list[_Folded] = []
         self.gusts = GustSamples()
         self.spans: dict[str, list[tuple[int, int]]] = {}  # when each source was false, by name
-        self.jumps: list[_Jump] = []
+        self.jumps: list[_Jumped] = []
         self._onsets: dict[int, list[_Onset]] = {}  # of each fault, as they came up
         self.beacons: dict[int, Beacon] = {}
         self._last: list[tuple[Bank, Hypotheses] | None] = [None]  # of each run
@@ -235,9 +238,9 @@ class _Witness(Navigator):
         j = int(bank.event[best]) - 1 - 2 * len(layout.faults)
         if j < 0:
             return
-        at = bank_ns - _age(bank, best)
-        if all(abs(at - jump.t_ns) > APART_NS for jump in self.jumps):
-            self.jumps.append(_Jump(at, layout.jumps[j].states, layout.jumps[j].sigma))
+        found = _Jumped(bank_ns - _age(bank, best), layout.jumps[j])
+        if not any(found.is_of(jumped) for jumped in self.jumps):
+            self.jumps.append(found)
 
     def _note_end(self, state: State, bank: Bank, known: Hypotheses, bank_ns: int) -> None:
         """Note the fault that the heaviest row holds to be over, if that is what happened to it last.
@@ -330,6 +333,15 @@ class _PlainModel(Model):
         self.asked.append((found, nominal.point))
         return found
 
+    def kept(self, bank: Bank, Phi: Floats) -> Floats | None:
+        """Factors of a heading that is far off, noted in Phi and Q."""
+        factors = super().kept(bank, Phi)
+        if factors is not None:
+            (A, B), point = self.asked[-1]
+            D, n = factors[0], len(A)
+            self.asked[-1] = Transition(D[:n, None] * A, D[:n, None] * B * D[:n]), point
+        return factors
+
 
 class _Epoch(NamedTuple):
     """Nominal point and filter state at an epoch; `predicted` is x before the measurement, if there was one.
@@ -390,7 +402,7 @@ class _Path:
         self.runs: list[list[_Epoch]] = []
         self._witness, self.gusts = witness, witness.gusts.estimate()
         self._beacons = tuple(witness.beacons.values())[:MOST_BEACONS]
-        self._jumps = sorted(witness.jumps)
+        self._jumps = sorted(witness.jumps, key=lambda jumped: jumped.t_ns)
         config = self._with_gusts(config)
         self._model = _PlainModel(config, 0, len(self._beacons))
         self._settings = Settings(config, self._model)
@@ -403,16 +415,15 @@ class _Path:
         self._settings = self._settings._replace(model=self._model)
 
     def jump(self, t_ns: int) -> None:
-        """Widen the states that jumped up to `t_ns`."""
-        while self._jumps and self._jumps[0].t_ns <= t_ns:
-            jump = self._jumps.pop(0)
-            bank = self._state.bank
-            if bank is None:
-                continue
-            P, at = bank.P.copy(), list(jump.states)
-            P[:, at, at] += np.square(jump.sigma)
-            self._state = structs.replace(self._state, bank=bank._replace(P=P))
-            self._Q[at, at] += np.square(jump.sigma)
+        """Let the states jump that did up to `t_ns`, from the first fix on."""
+        while (bank := self._state.bank) is not None and self._jumps and self._jumps[0].t_ns <= t_ns:
+            jump = self._jumps.pop(0).jump
+            x, P = bank.x.copy(), bank.P.copy()
+            banks.apply_jump(x, P, np.arange(1), jump)
+            self._state = structs.replace(self._state, bank=bank._replace(x=x, P=P))
+            if jump.angle is not None:  # what was known of it ends here
+                self._Phi[jump.angle, :] = 0.0
+            banks.apply_jump(np.zeros((1, len(self._Q))), self._Q[None], np.arange(1), jump)
 
     def follow(self, record: Input) -> None:
         """Take one more record."""

@@ -12,7 +12,7 @@ import pytest
 
 from companion.analysis import smoothing
 from companion.analysis.smoothing import SmoothedRun, smooth_flight
-from companion.config import Config, InertialConfig
+from companion.config import Config, InertialConfig, load
 from companion.nav.geometry import (
     Geodetic,
     displace,
@@ -25,7 +25,18 @@ from companion.navigator import Navigator
 from companion.navigator.channel import Nominal
 from companion.navigator.inertial_track import Point
 from companion.navigator.ins_channel import N, ins_channel
-from companion.records import Fix, Gnss, LocalOrigin, LocalPosition, Reboot, RsbnFix, Solution, TimeStep
+from companion.records import (
+    Attitude,
+    Fix,
+    Gnss,
+    LocalOrigin,
+    LocalPosition,
+    Reboot,
+    RsbnFix,
+    Solution,
+    TimeStep,
+)
+from tests.recordings import recording
 
 ORIGIN = Geodetic(math.radians(60.0), math.radians(30.0), 0.0)
 BEACON = Geodetic(math.radians(60.4), math.radians(30.3), 100.0)
@@ -213,6 +224,27 @@ def test_a_lie_that_is_known_by_its_end_is_left_out_from_its_onset(since_s: int,
     sigma = np.sqrt(np.einsum("nii->n", found.P[:, :2, :2]))
     assert away.max() < 60.0
     assert (away < 4.0 * sigma).all()
+
+
+@pytest.mark.flight
+@pytest.mark.parametrize(("name", "degrees"), [("plane_take_off", 180.0), ("plane_turbulence", 90.0)])
+def test_a_heading_that_steps_does_not_affect_the_smoothed_track(name: str, degrees: float) -> None:
+    """GNSS is healthy: 435 and 525 m off where the smoother did not let the heading step."""
+    records = recording(name)
+    steps_ns = (records[0].rx_ns + records[-1].rx_ns) // 2
+    turned = [
+        msgspec.structs.replace(r, heading=r.heading + math.radians(degrees))
+        if isinstance(r, Attitude) and r.rx_ns >= steps_ns
+        else r
+        for r in records
+    ]
+    (found,) = smooth_flight(turned, load(flags={"output.profile": "ardupilot"}, environment={}))
+    fixes = np.array([(r.t_ns, r.lat, r.lon) for r in records if isinstance(r, Gnss) and r.has_3d_fix])
+    late = found.t_ns > steps_ns
+    t, lat = found.t_ns[late], found.lat[late]
+    north = lat - np.interp(t, fixes[:, 0], fixes[:, 1])
+    east = (found.lon[late] - np.interp(t, fixes[:, 0], fixes[:, 2])) * np.cos(lat)
+    assert 6.371e6 * np.hypot(north, east).max() < 6.0
 
 
 @pytest.mark.flight

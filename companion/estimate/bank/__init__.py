@@ -41,6 +41,7 @@ protection  protection level of a sum of Gaussians
 """
 
 from companion.estimate.bank.branching import (
+    apply_jump,
     births,
     births_due,
     false_since_first,
@@ -90,6 +91,7 @@ __all__ = [
     "Measurement",
     "Settings",
     "Source",
+    "apply_jump",
     "births",
     "births_due",
     "decide",

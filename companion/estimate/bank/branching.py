@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from companion.estimate.bank.layout import NEVER, NONE, Angle, Ints, Layout, Lie
+from companion.estimate.bank.layout import NEVER, NONE, Ints, Jump, Layout, Lie
 from companion.estimate.bank.readout import level_rows
 from companion.estimate.bank.reduction import reduce
 from companion.estimate.bank.settings import DEFAULT, Settings
@@ -337,10 +337,7 @@ def _with_children(bank: Bank, layout: Layout, children: list[_Child]) -> Bank:
             noise[i[:, None], places] = density
             fault[i, layout.fault_group(c.fault)], event[i], scale[i] = c.fault, 1 + c.fault, c.scale
         elif c.jump != NONE:
-            j = layout.jumps[c.jump]
-            P[i[:, None], j.states, j.states] += np.square(j.sigma)
-            if j.angle is not None:
-                _open(x, P, i, j.angle)
+            apply_jump(x, P, i, layout.jumps[c.jump])
             event[i] = layout.jump_event(c.jump)
         else:
             parent = at[i]
@@ -348,9 +345,22 @@ def _with_children(bank: Bank, layout: Layout, children: list[_Child]) -> Bank:
     return grown
 
 
-def _open(x: Floats, P: Floats, rows: Ints, angle: Angle) -> None:
-    """Any angle in some rows, in place: mean and covariance of the unit circle."""
-    both = np.array(angle)
-    x[rows[:, None], both] = 0.0, 1.0
-    P[rows[:, None], both], P[rows[:, None], :, both] = 0.0, 0.0
-    P[rows[:, None], both, both] = 0.5
+def apply_jump(x: Floats, P: Floats, rows: Ints, jump: Jump) -> None:
+    """Let states jump, in place: more uncertain by its sigmas; its angle has the moments of the unit circle.
+
+    Parameters
+    ----------
+    x, P : (R, n), (R, n, n) mean and covariance.
+    rows : those that jump.
+    jump : what jumps.
+
+    Returns
+    -------
+    None
+    """
+    P[rows[:, None], jump.states, jump.states] += np.square(jump.sigma)
+    if jump.angle is not None:
+        both = np.array(jump.angle)
+        x[rows[:, None], both] = 0.0, 1.0
+        P[rows[:, None], both], P[rows[:, None], :, both] = 0.0, 0.0
+        P[rows[:, None], both, both] = 0.5
