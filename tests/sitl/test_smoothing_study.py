@@ -90,7 +90,7 @@ def test_channel_change_in_flight_splits_the_track_and_sigma_change_does_not() -
     np.testing.assert_array_equal(one.x, same.x)
     first, second = smoothing.smooth_flight([*records, Tuning(at, at, to_toml(AIR))], INS)
     beacons = BIASES * len({r.beacon for r in records if isinstance(r, RsbnFix)})
-    assert (first.x.shape[1], second.x.shape[1]) == (18 + beacons, 22 + beacons)
+    assert (first.x.shape[1], second.x.shape[1]) == (18 + beacons, 21 + beacons)
     assert first.t_ns[-1] <= at < second.t_ns[0] < at + 2 * NS
 
 
