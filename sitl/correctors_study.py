@@ -20,9 +20,9 @@ from rich.progress import track
 from companion.config import Config, OutputConfig
 from companion.tables import number_table, print_tables
 from companion.units import Floats
-from sitl.campaign.flight import UNITS
 from sitl.correctors import RECORDS
 from sitl.scenarios import get_scenario
+from sitl.sensors import GRADES, STATED_GRADES
 from sitl.smoothing_study import simulated_gusts
 from sitl.weights_study import navigate
 from sitl.world import World
@@ -48,7 +48,7 @@ class CorrectedFlight(NamedTuple):
 def fly(world: World, bank: bool = True) -> CorrectedFlight:
     """Navigate the INS of a world with the correctors of its scenario. Without `bank`, one filter."""
     scenario = world.scenario
-    unit = structs.replace(UNITS[scenario.grade], independent=True, correctors=scenario.correctors)
+    unit = structs.replace(STATED_GRADES[scenario.grade], independent=True, correctors=scenario.correctors)
     config = Config(inertial=unit, air_data=simulated_gusts(scenario), output=OutputConfig(solution_hz=1.0))
     found = navigate(world.records(), config, bank)
     t, error = world.horizontal_errors(found)
@@ -58,7 +58,7 @@ def fly(world: World, bank: bool = True) -> CorrectedFlight:
 
 @click.command("correctors")
 @click.option(
-    "--grade", type=click.Choice(list(UNITS)), default="tactical", show_default=True, help="INS grade."
+    "--grade", type=click.Choice(list(GRADES)), default="tactical", show_default=True, help="INS grade."
 )
 @click.option("--name", "names", multiple=True, type=click.Choice(NAMES), help="Corrector; default: each.")
 @click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Seed of the flight.")

@@ -39,11 +39,12 @@ from companion.units import SECOND_NS, Floats
 from sitl import loopback
 from sitl.autopilot import SimulatedAutopilot
 from sitl.beacon import Beacon
-from sitl.campaign.flight import UNITS, sensors_of
+from sitl.campaign.flight import sensors_of
 from sitl.faults import Fault
 from sitl.flight import FlightPlan, Leg, WindChange
 from sitl.harm_recordings import RecordingResult, fly_log, fly_named, list_recordings
 from sitl.scenarios import Scenario, SensorRates
+from sitl.sensors import STATED_GRADES
 from sitl.world import World
 
 START_S = 120.0  # something goes wrong from here on, unless it is wrong from the start
@@ -183,7 +184,7 @@ def config_of(order: HarmOrder) -> Config:
         source="air_data" if order.channel == "air data" else "auto", independent=order.channel in INS
     )
     if wrong.stated != 1.0:
-        true = UNITS["mems" if order.channel == "INS MEMS" else "navigation"]
+        true = STATED_GRADES["mems" if order.channel == "INS MEMS" else "navigation"]
         scaled = (
             "gyro_drift_deg_h",
             "angle_random_walk_deg_sqrt_h",

@@ -17,6 +17,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from companion.config import InertialConfig
 from companion.nav.earth import OMEGA
 from companion.units import Floats
 from sitl.flight import Trajectory, radii, rotation
@@ -61,6 +62,30 @@ GRADES = {
     "tactical": InertialGrade("tactical", 0.1, 0.07, 200.0, 100.0, 1800.0, 0.2, 40.0, 0.2),
     # good MEMS unit (bias instability 0.5 deg/h and 0.05 mg), calibrated in flight, with temperature drift
     "mems": InertialGrade("mems", 1.0, 0.15, 500.0, 120.0, 600.0, 0.4, 120.0, 1.0),
+}
+#: The same grades as `inertial` of a configuration states them: the tilt after levelling holds the
+#: accelerometers' errors too, and what turns with the aircraft is not simulated.
+STATED_GRADES: dict[str, InertialConfig] = {
+    "navigation": InertialConfig(),
+    "tactical": InertialConfig(
+        gyro_drift_deg_h=0.1,
+        gyro_correlation_h=0.5,
+        angle_random_walk_deg_sqrt_h=0.07,
+        accelerometer_bias_ug=200.0,
+        accelerometer_correlation_h=0.5,
+        tilt_arcsec=60.0,
+        heading_arcmin=12.0,
+    ),
+    "mems": InertialConfig(
+        gyro_drift_deg_h=1.0,
+        gyro_correlation_h=0.17,
+        angle_random_walk_deg_sqrt_h=0.15,
+        accelerometer_bias_ug=500.0,
+        accelerometer_correlation_h=0.17,
+        velocity_noise_m_s_sqrt_s=0.0012,
+        tilt_arcsec=160.0,
+        heading_arcmin=60.0,
+    ),
 }
 
 

@@ -31,9 +31,9 @@ from companion.config import AirDataConfig, Config, InertialConfig
 from companion.records import Gnss, Imu, RsbnFix, Stamped
 from companion.tables import number_table, print_tables
 from companion.units import Floats
-from sitl.campaign.flight import UNITS
 from sitl.flight import fly_plan
 from sitl.scenarios import SCENARIOS, Scenario, get_scenario, parse_scenario
+from sitl.sensors import STATED_GRADES
 from sitl.world import SENSORS, World
 
 SAME_SIGMA = 1e-6
@@ -71,7 +71,7 @@ def compare_flight(scenario: Scenario, channel: str) -> SmoothingComparison:
     """Compare filter and smoother with the truth on one flight."""
     world = World(scenario)
     if channel == "ins":
-        inertial = structs.replace(UNITS[scenario.grade], independent=True)
+        inertial = structs.replace(STATED_GRADES[scenario.grade], independent=True)
     else:
         inertial = InertialConfig(source="air_data" if channel == "air_data" else "auto")
     fixes = (*world.streams[Gnss], *world.streams[RsbnFix])

@@ -22,8 +22,8 @@ from companion.navigator import Navigator
 from companion.navigator.hypotheses import Model
 from companion.records import Gnss, RsbnFix, Solution, Stamped
 from companion.tables import number_table, print_tables
-from sitl.campaign.flight import UNITS
 from sitl.scenarios import parse_scenario
+from sitl.sensors import STATED_GRADES
 from sitl.world import World
 
 SOURCES = ("INS", "GNSS", "RSBN")
@@ -92,7 +92,7 @@ def navigate(records: Iterable[Stamped], config: Config, bank: bool) -> list[Sol
 def fly(world: World, source: str, factor: float, bank: bool) -> FlownError:
     """Navigate the records of a world with one source's sigma misstated; solutions once a second."""
     scenario = world.scenario
-    inertial = structs.replace(UNITS[scenario.grade], independent=True)
+    inertial = structs.replace(STATED_GRADES[scenario.grade], independent=True)
     config = stated(Config(inertial=inertial, output=OutputConfig(solution_hz=1.0)), source, factor)
     found = navigate(restated(world.records(), source, factor), config, bank)
     t, error = world.horizontal_errors(found)

@@ -1,7 +1,8 @@
 """Presets: keys for a kind of inertial system or autopilot, overridden by everything else.
 
 The error models of the INS presets are one standard deviation of a unit of that class after alignment and
-calibration in flight (Groves 2013, table 4.1 and section 4.4); the grades of the simulator are the same.
+calibration in flight (Groves 2013, table 4.1 and section 4.4); the simulator's have the same gyros and
+accelerometers.
 The bank of hypotheses corrects a grade that is up to 64 times better than the truth, not one that is worse.
 """
 

@@ -80,30 +80,6 @@ OWN_CHANNEL = {
 }
 """Configuration of scenarios without an INS of their own; the others fly by default."""
 
-#: Stated errors of the simulated grades: residuals after calibration, tilt after levelling.
-UNITS: dict[str, InertialConfig] = {
-    "navigation": InertialConfig(),
-    "tactical": InertialConfig(
-        gyro_drift_deg_h=0.1,
-        gyro_correlation_h=0.5,
-        angle_random_walk_deg_sqrt_h=0.07,
-        accelerometer_bias_ug=200.0,
-        accelerometer_correlation_h=0.5,
-        tilt_arcsec=60.0,
-        heading_arcmin=12.0,
-    ),
-    "mems": InertialConfig(
-        gyro_drift_deg_h=1.0,
-        gyro_correlation_h=0.17,
-        angle_random_walk_deg_sqrt_h=0.15,
-        accelerometer_bias_ug=500.0,
-        accelerometer_correlation_h=0.17,
-        velocity_noise_m_s_sqrt_s=0.0012,
-        tilt_arcsec=160.0,
-        heading_arcmin=60.0,
-    ),
-}
-
 
 class FaultCase(NamedTuple):
     """Fault of a campaign and the source it concerns: prefix of rejections, bits of `Solution.sources`."""

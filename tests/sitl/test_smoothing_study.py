@@ -20,9 +20,8 @@ from companion.navigator.hypotheses import BIASES
 from companion.navigator.own_channel import HOLD_M_S_SQRT_S, OwnChannel
 from companion.records import AirData, RsbnFix, Solution, Tuning
 from sitl import smoothing_study
-from sitl.campaign.flight import UNITS
 from sitl.scenarios import Scenario, SensorRates, get_scenario
-from sitl.sensors import GRADES, UG, G, GnssModel
+from sitl.sensors import GRADES, STATED_GRADES, UG, G, GnssModel
 from sitl.world import World
 
 pytestmark = pytest.mark.flight
@@ -186,7 +185,7 @@ def test_correctors_are_measurements_of_the_smoother_too() -> None:
     world = World(
         get_scenario("short", grade="mems", correctors=used, rates=slow, gnss_outages=lost, beacons=())
     )
-    unit = structs.replace(UNITS["mems"], independent=True, correctors=used)
+    unit = structs.replace(STATED_GRADES["mems"], independent=True, correctors=used)
     (run,) = smoothing.smooth_flight(world.records(), Config(inertial=unit), check=True)
     found = smoothing_study._against_truth(run, world)
     assert math.sqrt(found.smoothed / found.filtered) < 0.4
