@@ -27,7 +27,7 @@ from msgspec.structs import replace
 
 from companion.link import dialect, frame
 from companion.link.dialect import mavlink
-from companion.nav.geometry import Geodetic, displace, geodetic_to_local, local_to_geodetic
+from companion.nav.geometry import displace, geodetic_to_local, local_to_geodetic
 from companion.records import (
     AirData,
     AirspeedSensor,
@@ -311,10 +311,9 @@ class SimulatedAutopilot:
         """Refer the local position to the current origin instead of the world's."""
         if not math.isfinite(record.x_n[0]) or self._local_origin == self.world.origin:
             return record
-        projection: Any = self.scenario.autopilot
-        place = local_to_geodetic(projection, self.world.origin, record.x_n)
-        north, east, down = geodetic_to_local(projection, self._local_origin, place)
-        return replace(record, x_n=(north, east, down))
+        make = self.scenario.autopilot
+        place = local_to_geodetic(make, self.world.origin, record.x_n)
+        return replace(record, x_n=geodetic_to_local(make, self._local_origin, place))
 
     # -- messages without a sensor --------------------------------------------------------------------------
 
@@ -378,8 +377,7 @@ class SimulatedAutopilot:
         local = self._local(t)
         if not math.isfinite(local.x_n[0]):
             return None
-        projection: Any = self.scenario.autopilot
-        place: Geodetic = local_to_geodetic(projection, self.world.origin, local.x_n)
+        place = local_to_geodetic(self.scenario.autopilot, self.world.origin, local.x_n)
         above = place.alt - self.world.origin.alt
         msl = place.alt - GEOID_M
         heading = self._newest_record(Attitude, t).heading

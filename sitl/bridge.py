@@ -28,7 +28,8 @@ from companion.link.clock import BootClock
 from companion.link.decode import MAKES, Sender, decode
 from companion.link.dialect import mavlink, rsbn
 from companion.link.session import LinkLost, LinkUp, MessageReceived, Rebooted, Session
-from companion.nav.geometry import Geodetic, local_to_geodetic
+from companion.nav.geometry import Geodetic
+from companion.navigator import inertial_track
 from companion.records import GlobalPosition, Gnss, LocalOrigin, LocalPosition, Truth
 from companion.units import SECOND_NS
 from sitl.beacon import Beacon
@@ -257,8 +258,7 @@ class Bridge:
         is_global_recent = self._global_ns is not None and record.rx_ns - self._global_ns < SILENT_AFTER
         if is_global_recent or self._origin is None:
             return
-        start = Geodetic(self._origin.lat, self._origin.lon, self._origin.alt_msl)
-        place = local_to_geodetic(self._projection, start, record.x_n)
+        place = inertial_track.point(record, self._origin).position
         self.comparison.add_estimate(record.t_ns, AUTOPILOT, place)
 
     def _on_origin(self, record: LocalOrigin) -> None:
@@ -295,10 +295,6 @@ class Bridge:
         )
 
     # -- sent ---------------------------------------------------------------------------------------------
-
-    @property
-    def _projection(self) -> Any:
-        return "px4" if self._sender.autopilot == "px4" else "ardupilot"
 
     def _ask_for_origin(self) -> None:
         msgid = mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN

@@ -14,7 +14,7 @@ import math
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -22,8 +22,7 @@ from companion.config import Config, OutputConfig
 from companion.importers import sources, tlog
 from companion.link import dialect, frame
 from companion.link.dialect import mavlink
-from companion.nav.geometry import Geodetic, Projection, local_to_geodetic
-from companion.navigator import Navigator
+from companion.navigator import Navigator, inertial_track
 from companion.output.source_switch import COMPANION_SET, SourceSwitch
 from companion.records import (
     Attitude,
@@ -193,11 +192,8 @@ def autopilot_track(records: Sequence[Stamped]) -> Track:
         if isinstance(r, LocalOrigin):
             origin = r
         elif isinstance(r, LocalPosition) and origin is not None:
-            projection = cast(Projection, origin.projection)
-            lat, lon, _ = local_to_geodetic(
-                projection, Geodetic(origin.lat, origin.lon, origin.alt_msl), r.x_n
-            )
-            found.append((r.t_ns * 1e-9, lat, lon))
+            place = inertial_track.point(r, origin).position
+            found.append((r.t_ns * 1e-9, place.lat, place.lon))
     return Track.of(found)
 
 

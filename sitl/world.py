@@ -10,7 +10,6 @@ import heapq
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from operator import attrgetter
-from typing import Literal
 
 import numpy as np
 
@@ -126,8 +125,8 @@ class World:
         flight = self._sampled(self.scenario.rates.local_position)
         error = sensors.interpolate_error(self.inertial_error, flight.t)
         places = np.stack(sensors.displace_positions(flight, error.x_n), axis=1).tolist()
-        projection: Literal["px4", "ardupilot"] = "px4" if self.scenario.autopilot == "px4" else "ardupilot"
-        x_n = [geodetic_to_local(projection, self.origin, Geodetic(*place)) for place in places]
+        make = self.scenario.autopilot
+        x_n = [geodetic_to_local(make, self.origin, Geodetic(*place)) for place in places]
         v_n = (flight.v_n + error.v_n).tolist()
         return [LocalPosition(t, t, x, tuple(v)) for t, x, v in zip(_ns(flight.t), x_n, v_n)]
 
