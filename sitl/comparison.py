@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from companion.analysis.error_statistics import root_mean_square
 from companion.nav.geometry import Geodetic, separation
 from companion.units import SECOND_NS
 
@@ -138,7 +139,7 @@ def outage_table(errors: Sequence[PositionError], start_ns: int, end_ns: int) ->
             OutageErrors(
                 source,
                 {s: found.error if (found := at.get(s)) else None for s in AFTER_S},
-                float(np.sqrt(np.mean(metres**2))),
+                root_mean_square(metres),
                 float(metres.max()),
                 len(inside),
                 sum(stated) / len(stated) if stated else None,

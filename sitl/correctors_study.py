@@ -17,6 +17,7 @@ from msgspec import structs
 from rich.console import Console
 from rich.progress import track
 
+from companion.analysis.error_statistics import root_mean_square
 from companion.config import Config, OutputConfig
 from companion.tables import number_table, print_tables
 from companion.units import Floats
@@ -42,7 +43,7 @@ class CorrectedFlight(NamedTuple):
     def at(self, values: Floats, start_s: float, end_s: float) -> float:
         """Return the r.m.s. of some values between two times."""
         inside = (self.t >= start_s) & (self.t < end_s)
-        return math.sqrt(float(np.mean(values[inside] ** 2)))
+        return root_mean_square(values[inside])
 
 
 def fly(world: World, bank: bool = True) -> CorrectedFlight:

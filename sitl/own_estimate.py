@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from companion.analysis.error_statistics import root_mean_square
 from companion.link.dialect import mavlink
 from companion.nav.geometry import Geodetic, geodetic_to_local
 from companion.records import AirData, Attitude, Gnss, LocalOrigin, LocalPosition
@@ -40,7 +41,7 @@ class OwnErrors(NamedTuple):
         """Return the r.m.s. and the greatest horizontal error between two times, m; NaN without any."""
         within = (self.t >= start_s) & (self.t < end_s)
         size = np.hypot(*self.error_n[within].T)
-        return (float(np.sqrt(np.mean(size**2))), float(size.max())) if len(size) else (np.nan, np.nan)
+        return (root_mean_square(size), float(size.max())) if len(size) else (np.nan, np.nan)
 
 
 class OwnEstimate:

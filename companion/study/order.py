@@ -15,6 +15,7 @@ import click
 import numpy as np
 from click.core import ParameterSource
 
+from companion.analysis.error_statistics import root_mean_square
 from companion.analysis.replay_inputs import input_errors_as_log_errors, is_own_log, open_inputs
 from companion.estimate.polynomial import (
     FAMILIES,
@@ -165,7 +166,7 @@ def study(samples: Samples, bases: Sequence[Family], r_max: int) -> list[BasisRe
         found = select_order(samples.t, samples.z, samples.sigma, basis, r_max)
         error = None
         if samples.truth is not None:
-            error = float(np.sqrt(np.mean((found.at(samples.t).x - samples.truth) ** 2)))
+            error = root_mean_square(found.at(samples.t).x - samples.truth)
         rows.append(BasisResult(basis, found, short_form(samples, found), error))
     return rows
 
@@ -329,7 +330,7 @@ def _plot(samples: Samples, rows: Sequence[BasisResult], file: Path) -> None:
 def _smooth(samples: Samples, basis: Family, r_max: int, as_json: bool, plot: Path | None) -> None:
     """Smooth a long column in windows; print the result, plot it."""
     found = smooth_track(samples.t, samples.z, samples.sigma, basis, r_max)
-    residual = float(np.sqrt(np.mean((samples.z - found.x) ** 2)))
+    residual = root_mean_square(samples.z - found.x)
     if as_json:
         columns = {"t": samples.t, "z": samples.z, "x": found.x, "sigma": found.sigma}
         plain: dict[str, Any] = {name: column.tolist() for name, column in columns.items()}
@@ -338,7 +339,7 @@ def _smooth(samples: Samples, basis: Family, r_max: int, as_json: bool, plot: Pa
         click.echo(
             f"{len(samples.t)} samples in {found.windows} windows of at most {r_max} {basis} functions:"
             f" residual {residual:.4g} r.m.s., RSS/(N - r_max) {found.consistency:.3g} at a noise of"
-            f" {float(np.sqrt(np.mean(samples.sigma**2))):.3g}"
+            f" {root_mean_square(samples.sigma):.3g}"
         )
     if plot is not None:
         _plot_track(samples, found, plot)

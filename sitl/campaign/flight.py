@@ -29,6 +29,7 @@ import numpy as np
 import numpy.typing as npt
 from msgspec.structs import replace
 
+from companion.analysis.error_statistics import root_mean_square
 from companion.config import Config, InertialConfig
 from companion.navigator import Navigator
 from companion.records import Event, Imu, Mode, Rejection, Reset, Solution, Source, Stamped, Trust
@@ -389,4 +390,4 @@ def _reports_fault(record: Any, concerns: str) -> bool:
 
 
 def _rms(values: Floats) -> float | None:
-    return round(float(np.sqrt(np.mean(values**2))), 3) if len(values) else None
+    return round(root_mean_square(values), 3) if len(values) else None
