@@ -186,8 +186,8 @@ class SimulatedAutopilot:
     def poll(self, now_ns: int) -> list[bytes]:
         """Return every frame that arrives at the companion up to `now_ns`, in order."""
         t = min(now_ns, self.end_ns) - self._start_ns
-        while (self._schedule and self._schedule[0][0] <= t) or self._answer_due() <= t:
-            self._emit(min(self._schedule[0][0] if self._schedule else NEVER, self._answer_due()))
+        while (next_t := self._next_emission()) <= t:
+            self._emit(next_t)
         due = []
         while self._send_queue and self._send_queue[0][0] <= now_ns:
             due.append(heapq.heappop(self._send_queue)[2])
@@ -195,8 +195,8 @@ class SimulatedAutopilot:
 
     def deadline(self) -> int:
         """Return the time of the next frame, `NEVER` after the flight."""
-        t = min(self._schedule[0][0] if self._schedule else NEVER, self._answer_due())
-        sending = t + self._start_ns if t + self._start_ns <= self.end_ns else NEVER
+        sending = self._next_emission() + self._start_ns
+        sending = sending if sending <= self.end_ns else NEVER
         return min(sending, self._send_queue[0][0] if self._send_queue else NEVER)
 
     def rates_hz(self) -> dict[str, float]:
@@ -224,7 +224,7 @@ class SimulatedAutopilot:
 
     def _emit(self, t: int) -> None:
         """Send all frames due at `t` over the link."""
-        while self._own_faults and self._own_faults[-1].start_s * 1e9 <= t:
+        if self._own_faults and self._own_faults[-1].start_s * 1e9 <= t:
             self._apply_own_fault(self._own_faults.pop())
             return
         frames = []
@@ -239,6 +239,10 @@ class SimulatedAutopilot:
             frames.append(self._frame(message, RECEIVER_COMPONENT))
             self._next_answer += 1
         self._transmit(frames, t)
+
+    def _next_emission(self) -> int:
+        """Flight time of the next message of a stream or a receiver, `NEVER` without one."""
+        return min(self._schedule[0][0] if self._schedule else NEVER, self._answer_due())
 
     def _answer_due(self) -> int:
         return self._answers[self._next_answer].rx_ns if self._next_answer < len(self._answers) else NEVER

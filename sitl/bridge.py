@@ -151,16 +151,14 @@ class Bridge:
         self._on_events(self._session.poll(now_ns), now_ns)
         if self._session.is_up and self._origin is None and now_ns >= self._origin_at:
             self._origin_at = now_ns + ASK_ORIGIN_EVERY
-            self._ask_for_origin()
-        while self._is_due(self._due, now_ns):
+            msgid = mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN
+            self._session.send_command(mavlink.MAV_CMD_REQUEST_MESSAGE, param1=msgid)
+        while self.connected_ns is not None and self._due and now_ns >= self.connected_ns + self._due[0][0]:
             _, on = self._due.pop(0)
             self._report(f"switching GNSS {'on' if on else 'off'}")
             if self._switch is not None:
                 self._switch.request(on)
-        if self._switch is not None:
-            self._reports += self._switch.poll(now_ns)
-            for message in self._switch.to_send():
-                self._session.send(message)
+        self._poll_switch(now_ns)
         boot_ns, system = self._session.clock.offset(now_ns), self._session.system
         answers = self._beacons.take_due(now_ns, boot_ns, system)
         self._send_queues[0 if self._mode is BridgeMode.SAME else 1].extend(answers)
@@ -184,8 +182,7 @@ class Bridge:
 
     def to_autopilot(self) -> list[bytes]:
         """Return the frames for the autopilot's link, oldest first."""
-        own = self._session.to_send()
-        return [*self._take_frames(0), *own]
+        return [*self._take_frames(0), *self._session.to_send()]
 
     def to_companion(self) -> list[bytes]:
         """Return the frames for the companion's link."""
@@ -195,9 +192,7 @@ class Bridge:
         """Switch GNSS on again; `to_autopilot` returns the last frames."""
         if self._switch is not None and self._switch.is_off:
             self._switch.request(on=True)
-            self._reports += self._switch.poll(now_ns)
-            for message in self._switch.to_send():
-                self._session.send(message)
+            self._poll_switch(now_ns)
 
     def take_reports(self) -> list[str]:
         """Return the lines for the user since the last call."""
@@ -296,12 +291,11 @@ class Bridge:
 
     # -- sent ---------------------------------------------------------------------------------------------
 
-    def _ask_for_origin(self) -> None:
-        msgid = mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN
-        self._session.send_command(mavlink.MAV_CMD_REQUEST_MESSAGE, param1=msgid)
-
-    def _is_due(self, due: list[tuple[int, bool]], now_ns: int) -> bool:
-        return self.connected_ns is not None and bool(due) and now_ns >= self.connected_ns + due[0][0]
+    def _poll_switch(self, now_ns: int) -> None:
+        if self._switch is not None:
+            self._reports += self._switch.poll(now_ns)
+            for message in self._switch.to_send():
+                self._session.send(message)
 
     def _report_errors(self, mark_ns: int) -> None:
         seconds = round((mark_ns - self.outages[-1].lost_ns) * 1e-9)
