@@ -70,7 +70,7 @@ def gnss_position(
     apart: Vector2,
     variance: float,
     v_n: Vector2,
-    shows_latency: bool = True,
+    shows_latency: bool,
 ) -> Taken:
     """Take the position of a fix: nominal minus GNSS is the error less drift and arm, plus latency times
     speed.

@@ -16,6 +16,7 @@ from msgspec import structs
 from companion.config import Config
 from companion.estimate import bank as banks
 from companion.estimate.fusion import Height, NoFix, Observation, maximum_likelihood
+from companion.estimate.kalman import Gaussian
 from companion.nav.geometry import displace
 from companion.navigator import fix_observations, height_error, minimax_bound, parallel_filters, trust
 from companion.navigator.hypotheses import GNSS, VELOCITY
@@ -47,7 +48,7 @@ from companion.records import (
     Vector2,
     Vector3,
 )
-from companion.units import SECOND_NS, Floats
+from companion.units import SECOND_NS
 
 UNCONFIRMED = 0.99  # greatest probability stated of a source that is not excluded
 PROTECTION_NS = SECOND_NS  # how often the protection level is computed
@@ -76,7 +77,7 @@ def solve(state: State, rx_ns: int, settings: Settings) -> Step:
     fixes = rests_on & FIXES
     leading = estimate(state, settings)
     state = structs.replace(state, leading=(bank, leading))
-    candidates = _candidates(state, leading.x, leading.P, nominal.pending_s, promised, settings)
+    candidates = _candidates(state, leading, nominal.pending_s, promised, settings)
     leads = config.leading_estimator
     if (rests_on & Source.GNSS if leads == "restrictive" else fixes) or leads not in candidates:
         leads = "kalman"
@@ -93,7 +94,7 @@ def solve(state: State, rx_ns: int, settings: Settings) -> Step:
     bound_n, velocity_bound_n = _about(error, velocity_error, promised)
     witness = bool(rests_on & (Source.AZIMUTH | Source.RANGE))
     suspicion = _is_suspicious(state, banks.heard_sources(bank, known.layout)[VELOCITY])
-    held = _trust(state, bool(fixes), suspicion, protection, t_ns, settings)
+    held = _trust(state.held, trust.Evidence(bool(fixes), suspicion, protection), t_ns, config)
     north, east, down = point.v_n
     lat, lon, alt = displace(*point.position, -error[0], -error[1], 0.0)
     if abs(lat) > math.pi / 2.0:
@@ -143,11 +144,11 @@ def solve(state: State, rx_ns: int, settings: Settings) -> Step:
 
 
 def _candidates(
-    state: State, x: Floats, P: Floats, dt: float, promised: Guaranteed | None, settings: Settings
+    state: State, leading: Gaussian, dt: float, promised: Guaranteed | None, settings: Settings
 ) -> dict[str, _Estimate]:
     """Error of the channel by each estimator that runs; the bank is `dt` seconds older than the nominal."""
-    n, e, vn, ve = x[:4].tolist()
-    C = P[:4, :4]
+    n, e, vn, ve = leading.x[:4].tolist()
+    C = leading.P[:4, :4]
     (nn, ne, n_vn, n_ve), (_, ee, e_vn, e_ve), (_, _, vnn, vne), (*_, vee) = C.tolist()
     place = (
         nn + dt * (2.0 * n_vn + dt * vnn),
@@ -236,23 +237,14 @@ def _mode(fixes: bool, bound_n: Vector2 | None, protection: float, settings: Set
     return Mode.PREDICTING if bounded or protection <= limit else Mode.UNTRUSTED
 
 
-def _trust(
-    state: State,
-    fixes: bool,
-    suspicion: bool,
-    protection: float,
-    t_ns: int,
-    settings: Settings,
-) -> trust.Held:
+def _trust(held: trust.Held | None, evidence: trust.Evidence, t_ns: int, config: Config) -> trust.Held:
     """How far the output can be trusted."""
-    config = settings.config
-    evidence = trust.Evidence(fixes, suspicion, protection)
     limits = trust.Limits(
         config.integrity.alert_m, config.predictor.limit_m, settle_s=config.integrity.settle_s
     )
-    if state.held is None:
+    if held is None:
         return trust.Held(trust.judge(evidence, limits), t_ns)
-    return trust.turn(state.held, t_ns, evidence, limits)
+    return trust.turn(held, t_ns, evidence, limits)
 
 
 def resolve_pending(state: State, pending: Pending, settings: Settings) -> Step:

@@ -8,11 +8,11 @@ from companion.records import Trust
 
 
 class Evidence(NamedTuple):
-    """What is known at one instant; the protection level in m, None where there is none."""
+    """What is known at one instant; the protection level in m."""
 
     fixes: bool  # a radio fix that is believed, not older than its timeout
     suspicion: bool  # a source is suspect or excluded
-    protection: float | None
+    protection: float
 
 
 class Limits(NamedTuple):
@@ -36,13 +36,10 @@ class Held(NamedTuple):
 
 def judge(evidence: Evidence, limits: Limits, share: float = 1.0) -> Trust:
     """Return the trust that the evidence of one instant justifies, the limits multiplied by `share`."""
-    level = evidence.protection
     if evidence.fixes:
-        safe = level is not None and level <= share * limits.protection
+        safe = evidence.protection <= share * limits.protection
         return Trust.NORMAL if safe and not evidence.suspicion else Trust.DEGRADED
-    if level is None or level > share * limits.coasting:
-        return Trust.UNTRUSTED
-    return Trust.PREDICTING
+    return Trust.UNTRUSTED if evidence.protection > share * limits.coasting else Trust.PREDICTING
 
 
 def turn(held: Held, t_ns: int, evidence: Evidence, limits: Limits) -> Held:

@@ -11,7 +11,7 @@ from companion.records import Trust
 
 NS = 1_000_000_000
 GOOD = Evidence(True, False, 10.0)
-evidence = st.builds(Evidence, st.booleans(), st.booleans(), st.none() | st.floats(0.0, 1e4))
+evidence = st.builds(Evidence, st.booleans(), st.booleans(), st.floats(0.0, 1e4))
 
 
 @settings(max_examples=200)
