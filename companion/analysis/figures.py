@@ -26,10 +26,10 @@ from companion.analysis.plot_data import (
     subsample,
     thin_line,
 )
+from companion.records import Severity, Source
 from companion.units import Floats
 
 MARKS = 60  # events marked in a plot, the most severe first
-WARNING = 4
 
 
 def build_figures(flights: Sequence[Assessment]) -> list[Figure]:
@@ -76,7 +76,7 @@ class _Axes:
 
     def _marks(self) -> tuple[Mark, ...]:
         entries = sorted(self.flights[0].timeline, key=lambda entry: entry.severity)[:MARKS]
-        return tuple(Mark(e.t, e.text, e.severity <= WARNING) for e in sorted(entries))
+        return tuple(Mark(e.t, e.text, e.severity <= Severity.WARNING) for e in sorted(entries))
 
 
 def _seconds(e: error_statistics.ErrorSeries) -> Floats:
@@ -182,9 +182,9 @@ def _inertial(axis: str) -> Callable[[_Axes], Figure]:
         for which, a, prefix in axes.each():
             s = a.flight.tables["Solution"]
             estimated, bound = s[f"error_{axis}"], s[f"bound_{axis}"]
-            without_fixes = s["sources"].astype(int) <= 1
+            alone = flight_events.without_fixes(s)
             for sign, name in ((1.0, f"{prefix}estimated ± bound"), (-1.0, "")):
-                edge = np.where(without_fixes, estimated + sign * bound, np.nan)
+                edge = np.where(alone, estimated + sign * bound, np.nan)
                 if axes.alone and np.isfinite(edge).any():
                     lines.append(axes.line(name, "bound", which, s["t"], edge, dash=True, width=1.0))
             if a.offset and a.reference:
@@ -253,9 +253,9 @@ def _sources(axes: _Axes) -> Figure:
         s = a.flight.tables["Solution"]
         used = s["sources"].astype(int)
         for role, name, on in (
-            (error_statistics.GNSS, "GNSS", (used & 2) != 0),
-            (error_statistics.RSBN, "beacons", (used & 12) != 0),
-            ("bound", "no fixes", (used & 14) == 0),
+            (error_statistics.GNSS, "GNSS", (used & int(Source.GNSS)) != 0),
+            (error_statistics.RSBN, "beacons", (used & int(flight_events.BEACON)) != 0),
+            ("bound", "no fixes", flight_events.without_fixes(s)),
         ):
             if on.any():
                 rows.append(prefix + name)

@@ -29,6 +29,7 @@ from companion.records import (
     Rejection,
     Reset,
     RsbnFix,
+    Severity,
     Solution,
     Stamped,
     Truth,
@@ -292,7 +293,7 @@ def _timeline_entry(record: Event | Reset, zero_ns: int, reboots_ns: Set[int]) -
     if isinstance(record, Event):
         return TimelineEntry(t, "event", record.severity, record.text)
     kind = "reboot" if record.rx_ns in reboots_ns else "reset"
-    return TimelineEntry(t, kind, 4, f"{record.what} reset: {record.reason}")
+    return TimelineEntry(t, kind, Severity.WARNING, f"{record.what} reset: {record.reason}")
 
 
 def _rejected_measurement(r: Rejection, zero_ns: int) -> RejectedMeasurement:

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from companion.analysis import error_statistics
 from companion.analysis.flight_arrays import MODES, Flight, RejectedMeasurement, Stream, Table, TimelineEntry
 from companion.nav.earth import radii
-from companion.records import Mode, Source
+from companion.records import Mode, Severity, Source
 from companion.units import Floats
 
 PHASE_MIN_S = 5.0  # a shorter phase is merged into the previous one, the first into the next
@@ -77,6 +77,12 @@ def beacon_places(flight: Flight) -> list[tuple[int, float, float, float]]:
     first = np.unique(fixes["beacon"], return_index=True)[1]
     columns = (fixes[name][first].tolist() for name in ("beacon", "lat", "lon", "alt"))
     return [(int(identity), lat, lon, alt) for identity, lat, lon, alt in zip(*columns, strict=True)]
+
+
+def without_fixes(solution: Table) -> npt.NDArray[np.bool_]:
+    """Return which rows of "Solution" rest on no fix; airspeed is none."""
+    alone: npt.NDArray[np.bool_] = (solution["sources"].astype(int) & int(Source.GNSS | BEACON)) == 0
+    return alone
 
 
 def rests_on_beacons(flight: Flight) -> npt.NDArray[np.bool_]:
@@ -300,16 +306,21 @@ def build_timeline(
 ) -> list[TimelineEntry]:
     """Merge the log's entries with grouped rejections, outages, silences and the autopilot's glitch flags."""
     lines = [line._replace(text=event_title(line.text)) for line in flight.log_entries]
-    lines += [TimelineEntry(group.start, "rejected", 4, describe_rejections(group)) for group in groups]
+    lines += [
+        TimelineEntry(group.start, "rejected", Severity.WARNING, describe_rejections(group))
+        for group in groups
+    ]
     for gaps, what in ((outages, "no GNSS fix"), (silences, "nothing from the autopilot")):
         lines += [
-            TimelineEntry(gap.start, "outage", 4, f"{what} for the next {gap.end - gap.start:.1f} s")
+            TimelineEntry(
+                gap.start, "outage", Severity.WARNING, f"{what} for the next {gap.end - gap.start:.1f} s"
+            )
             for gap in gaps
         ]
     status = flight.tables["FilterStatus"]
     rises = np.flatnonzero(np.diff(status["gnss_glitch"], prepend=0.0) > 0.0)
     text = "the autopilot's estimator reports a GNSS glitch"
-    lines += [TimelineEntry(float(status["t"][k]), "glitch", 4, text) for k in rises]
+    lines += [TimelineEntry(float(status["t"][k]), "glitch", Severity.WARNING, text) for k in rises]
     return sorted(lines)
 
 

@@ -100,10 +100,8 @@ def _line(
 def _ellipses(plane: Assessment, a: Assessment) -> Line:
     """Draw the guaranteed bound at instants evenly spaced over the phases without fixes."""
     solution = a.flight.tables["Solution"]
-    without_fixes = np.flatnonzero(np.isfinite(solution["bound_north"]) & (solution["sources"] <= 1))
-    chosen = without_fixes[
-        np.linspace(0, len(without_fixes) - 1, min(ELLIPSES, len(without_fixes))).astype(int)
-    ]
+    alone = np.flatnonzero(np.isfinite(solution["bound_north"]) & flight_events.without_fixes(solution))
+    chosen = alone[np.linspace(0, len(alone) - 1, min(ELLIPSES, len(alone))).astype(int)]
     angle = np.append(np.linspace(0.0, math.tau, 49), math.nan)
     north, east = plane.north_east(solution["lat"][chosen], solution["lon"][chosen])
     x = (east[:, None] + solution["bound_east"][chosen, None] * np.sin(angle)).ravel()

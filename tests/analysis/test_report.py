@@ -66,6 +66,7 @@ from companion.records import (
     Reset,
     RsbnFix,
     Solution,
+    Source,
     Truth,
     Tuning,
 )
@@ -120,7 +121,7 @@ def flight_records(
                 covariance=(sigma**2, 0.0, 0.0, sigma**2, 0.0, 25.0),
                 error_n=(ins[0] - error[0], ins[1] - error[1]),
                 velocity_error_n=(0.0, 0.0),
-                sources=1 if lost else 3,
+                sources=more.get("alone", 1) if lost else 3,
                 horizon_s=0.0,
                 bound_n=bound,
                 ahead=(Prediction(60.0, (10.0, 10.0), (5.0, 5.0), (8.0, 8.0)),),
@@ -392,6 +393,16 @@ def test_nees_is_the_normalized_squared_error(assessed):
 def test_chi_square_quantiles_match_tables():
     found = assessing.chi2_95(np.array([1.0, 2.0, 3.0]))
     assert np.allclose(found, [3.841, 5.991, 7.815], atol=1e-3)
+
+
+@pytest.mark.parametrize("alone", [Source.INERTIAL, Source.INERTIAL | Source.AIR_DATA])
+def test_the_bound_is_drawn_where_there_are_no_fixes(alone):
+    found = {figure.key: figure for figure in build_figures([assess_flight(flight(alone=int(alone)))])}
+    (ellipses,) = (line for line in found["map"].lines if line.name == "guaranteed bound")
+    assert np.isnan(ellipses.x).sum() == 9
+    for axis in ("north", "east"):
+        edges = [line for line in found[f"inertial_{axis}"].lines if line.dash]
+        assert [np.isfinite(edge.y).any() for edge in edges] == [True, True]
 
 
 @pytest.mark.parametrize(("size", "held"), [(4.9, False), (5.1, True)])

@@ -22,7 +22,7 @@ from companion.analysis.live.follow import Message
 from companion.analysis.plot_data import COLOURS, Figure, Line, Mark, PlacedName
 from companion.estimate import bank
 from companion.nav.geometry import Geodetic, displace, separation
-from companion.records import Event, Gnss, Mode, Reset, RsbnFix, Solution, Source, Stamped
+from companion.records import Event, Gnss, Mode, Reset, RsbnFix, Severity, Solution, Source, Stamped
 from companion.units import Floats
 
 TRACK_POINTS = 2400
@@ -133,7 +133,7 @@ class Scene:
             case Event():
                 self._events.append((self.t, record.severity, event_title(record.text)))
             case Reset():
-                self._events.append((self.t, 4, f"{record.what} reset: {record.reason}"))
+                self._events.append((self.t, Severity.WARNING, f"{record.what} reset: {record.reason}"))
 
     def _place(self, lat: float, lon: float) -> tuple[float, float]:
         """Return metres east and north of the first position."""
@@ -375,7 +375,9 @@ class Scene:
 
     def _charts(self) -> Iterator[Figure]:
         marks = tuple(
-            Mark(t, text, severity <= 4) for t, severity, text in self._events if t >= self.t - STRIP_S
+            Mark(t, text, severity <= Severity.WARNING)
+            for t, severity, text in self._events
+            if t >= self.t - STRIP_S
         )
         yield Figure(
             "size", "How far the position may be off", "m",
