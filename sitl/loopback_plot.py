@@ -9,10 +9,11 @@ import numpy as np
 from companion.analysis import error_statistics
 from sitl.scenarios import Scenario
 
+#: By source, the uppermost last.
 COLOURS = {
-    error_statistics.INS: "#888888",
-    error_statistics.GNSS: "#2c7fb8",
     error_statistics.RSBN: "#d95f0e",
+    error_statistics.GNSS: "#2c7fb8",
+    error_statistics.INS: "#888888",
     error_statistics.CORRECTED: "#111111",
 }
 SHADES = {"GNSS+RSBN": "#e5f5e0", "GNSS only": "#deebf7", "RSBN only": "#fee6ce", "neither": "#fde0dd"}
@@ -30,17 +31,12 @@ def draw(
         axes.axvspan(phase.start_s / 60.0, phase.end_s / 60.0, color=SHADES[phase.name], lw=0)
         middle = (phase.start_s + phase.end_s) / 120.0
         axes.text(middle, 1.02, phase.name, ha="center", transform=axes.get_xaxis_transform(), fontsize=9)
-    for source in (
-        error_statistics.RSBN,
-        error_statistics.GNSS,
-        error_statistics.INS,
-        error_statistics.CORRECTED,
-    ):
+    for source, colour in COLOURS.items():
         if source in found:
             e = found[source]
             minutes = (e.t_ns - start_ns) / 60e9
             style = {"ls": "", "marker": ".", "ms": 2.0} if "fix" in source else {"lw": 1.6}
-            axes.plot(minutes, np.maximum(e.error, 0.1), color=COLOURS[source], label=source, **style)
+            axes.plot(minutes, np.maximum(e.error, 0.1), color=colour, label=source, **style)
     corrected = found[error_statistics.CORRECTED]
     minutes = (corrected.t_ns - start_ns) / 60e9
     axes.plot(minutes, corrected.bound, color="#c51b8a", lw=1.4, label="guaranteed bound (r.m.s.)")

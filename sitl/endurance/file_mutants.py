@@ -27,7 +27,7 @@ import click
 
 from companion.importers import sources
 from companion.storage.reader import LogError
-from sitl.endurance.fuzz_targets import check_record, read_log
+from sitl.endurance.fuzz_targets import IN_MEMORY, check_record, read_log
 from sitl.endurance.sample_logs import SAMPLES
 
 SLOWEST_S = 2.0
@@ -109,7 +109,7 @@ def read_mutants(name: str, count: int, seed: int, keep: Path | None = None) -> 
     tally = {"read": 0, "rejected": 0, "defects": 0}
     slowest, first = 0.0, ""
     signal.signal(signal.SIGVTALRM, _stop)
-    with tempfile.TemporaryDirectory(dir="/dev/shm" if Path("/dev/shm").is_dir() else None) as scratch:
+    with tempfile.TemporaryDirectory(dir=IN_MEMORY) as scratch:
         for number in range(count):
             data = mutate(original, rng)
             path = Path(scratch) / file_name

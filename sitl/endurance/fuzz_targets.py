@@ -49,6 +49,7 @@ MESSAGE_NAMES = (
 )
 SYSTEMS, COMPONENTS = (1, 2, 255, 0), (1, 42, 191, 190)
 NOISE_BIT, SIGNED_BIT = 0x80, 0x40
+IN_MEMORY = "/dev/shm" if Path("/dev/shm").is_dir() else None  # folder of temporary files
 _LINK = "fuzz"
 _KEY = bytes(range(32))
 
@@ -86,7 +87,7 @@ def script_frames(script: bytes) -> Iterator[tuple[int, bytes]]:
         yield 10 * wait, make_frame(name, payload, who, sequence, signature)
 
 
-def make_frame(name: str, payload: bytes, who: int = 0, sequence: int = 0, signature: bytes = b"") -> bytes:
+def make_frame(name: str, payload: bytes, who: int, sequence: int, signature: bytes = b"") -> bytes:
     """Build a frame with any payload; `who` selects system and component."""
     kind = dialect.type_named(name)
     system, component = SYSTEMS[who & 3], COMPONENTS[who >> 2 & 3]
@@ -339,7 +340,7 @@ def check_signed(data: bytes) -> None:
 
 def check_log(data: bytes) -> None:
     """Check the MCAP reader and recovery: records, or a LogError of one line."""
-    with tempfile.TemporaryDirectory(dir="/dev/shm" if Path("/dev/shm").is_dir() else None) as folder:
+    with tempfile.TemporaryDirectory(dir=IN_MEMORY) as folder:
         path = Path(folder) / "x.mcap.active"
         path.write_bytes(data)
         with contextlib.suppress(LogError):
@@ -382,7 +383,7 @@ def small_log(content: bytes | None = None, chunked: bool = False) -> bytes:
 def check_config(data: bytes) -> None:
     """Check the configuration from any source: it can be written and read again, or ConfigError."""
     text = data.decode("utf-8", "replace")
-    with tempfile.TemporaryDirectory(dir="/dev/shm" if Path("/dev/shm").is_dir() else None) as folder:
+    with tempfile.TemporaryDirectory(dir=IN_MEMORY) as folder:
         path = Path(folder) / "x.toml"
         path.write_bytes(data)
         sources: tuple[Callable[[], Config], ...] = (

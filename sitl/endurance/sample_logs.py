@@ -1,6 +1,6 @@
 """Small valid logs of every format, made here: what the file mutants and the tests start from.
 
-    for name, content in samples().items(): ...      # bytes of one file each
+    file_name, content = SAMPLES["ulg"]              # content() returns the bytes of the file
 
 Each holds a few seconds of one flight: GNSS fixes and local positions, with an origin.
 """
