@@ -19,10 +19,9 @@ from typing import NamedTuple
 
 import click
 import numpy as np
-from rich.console import Console
-from rich.progress import track
 from rich.table import Table
 
+from companion.analysis.progress import show_items
 from companion.estimate.predictor import KAPPA, Step, Window, anchor
 from companion.nav.bounded_channel import BoundedIns, Motion, UnitErrors
 from companion.nav.earth import OMEGA
@@ -283,7 +282,7 @@ def command(
         return
     cases = list(itertools.product(grades, VEHICLES, PATHS, LATITUDES))
     rng, found = np.random.default_rng(seed), list[Ensemble]()
-    for one, vehicle, path, lat in track(cases, "flying", console=Console(stderr=True), transient=True):
+    for one, vehicle, path, lat in show_items(cases, "flying"):
         found += run(one, vehicle, path, lat, 60.0 * window_min, flights, rng)
     if as_json:
         click.echo(json.dumps([{**e._asdict(), "ratio": e.ratio} for e in found]))

@@ -14,10 +14,9 @@ from typing import NamedTuple
 import click
 import numpy as np
 from msgspec import structs
-from rich.console import Console
-from rich.progress import track
 
 from companion.analysis.error_statistics import root_mean_square
+from companion.analysis.progress import show_items
 from companion.config import Config, OutputConfig
 from companion.tables import number_table, print_tables
 from companion.units import Floats
@@ -73,7 +72,7 @@ def command(grade: str, names: tuple[str, ...], seed: int) -> None:
     edges = [0, *MARKS_MIN]
     after = (f"{a}-{b} min after" for a, b in zip(edges, MARKS_MIN))
     table = number_table(title, "corrector", "with GNSS", *after, "within protection")
-    for name in track(names or NAMES, "flying", console=Console(stderr=True), transient=True):
+    for name in show_items(names or NAMES, "flying"):
         used = () if name == "none" else (name,)
         flight = fly(World(dataclasses.replace(scenario, correctors=used)))
         spans = [(60.0, LOSS_S), *((LOSS_S + 60.0 * a, LOSS_S + 60.0 * b) for a, b in zip(edges, MARKS_MIN))]

@@ -12,10 +12,9 @@ from typing import Any, NamedTuple
 
 import click
 import numpy as np
-from rich.console import Console
-from rich.progress import track
 
 from companion.analysis.error_statistics import root_mean_square
+from companion.analysis.progress import show_items
 from companion.config import Config, EstimatorConfig, InertialConfig
 from companion.navigator import Navigator
 from companion.records import Fix, Rejection, Solution, Source
@@ -96,7 +95,7 @@ def command(scenario: str, channels: Sequence[str], seed: int) -> None:
     )
     cases = [(channel, scheme) for channel in channels or OWN_CHANNELS for scheme in SCHEMES]
     first: dict[str, SchemeFlight] = {}
-    for channel, scheme in track(cases, "flying", console=Console(stderr=True), transient=True):
+    for channel, scheme in show_items(cases, "flying"):
         flight = fly(world, channel, scheme)
         apart = apart_m(flight, first.setdefault(channel, flight))
         bound = bound_m(flight)

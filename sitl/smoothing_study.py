@@ -23,9 +23,8 @@ from typing import NamedTuple
 import click
 import numpy as np
 from msgspec import structs
-from rich.console import Console
-from rich.progress import track
 
+from companion.analysis.progress import show_items
 from companion.analysis.smoothing import SmoothedRun, smooth_flight
 from companion.config import AirDataConfig, Config, InertialConfig
 from companion.records import Gnss, Imu, RsbnFix, Stamped
@@ -118,8 +117,7 @@ def command(names: tuple[str, ...], channels: tuple[str, ...], seeds: int) -> No
     scenarios = [parse_scenario(name) for name in names or SCENARIOS]
     cases = [(scenario, channel) for scenario in scenarios for channel in channels or CHANNELS]
     rows = []
-    console = Console(stderr=True)
-    for scenario, channel in track(cases, "smoothing", console=console, transient=True):
+    for scenario, channel in show_items(cases, "smoothing"):
         parts = [
             compare_flight(get_scenario(scenario.name, seed=seed), channel) for seed in range(1, seeds + 1)
         ]

@@ -13,10 +13,9 @@ from typing import NamedTuple
 
 import click
 from msgspec import structs
-from rich.console import Console
-from rich.progress import track
 
 from companion.analysis.error_statistics import root_mean_square
+from companion.analysis.progress import show_items
 from companion.config import Config, InertialConfig, OutputConfig
 from companion.navigator import Navigator
 from companion.navigator.hypotheses import Model
@@ -116,9 +115,8 @@ def command(scenario: str, sources: Sequence[str], seed: int) -> None:
     title = f"{scenario}, seed {seed}: horizontal error, m r.m.s.: bank / one Kalman filter"
     phases = (phase.name for phase in flight.phases())
     table = number_table(title, "source", "stated / true sigma", *phases, "overall")
-    console = Console(stderr=True)
     cases = [(source, factor) for source in sources or SOURCES for factor in FACTORS]
-    for source, factor in track(cases, "flying", console=console, transient=True):
+    for source, factor in show_items(cases, "flying"):
         bank, plain = (fly(world, source, factor, on) for on in (True, False))
         cells = zip((*bank.phases, bank.overall), (*plain.phases, plain.overall), strict=True)
         end = factor == FACTORS[-1]

@@ -19,14 +19,14 @@ from pathlib import Path
 from typing import Any, NamedTuple, get_args, get_type_hints
 
 import click
-from rich.console import Console
-from rich.progress import MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import Progress
 
 from companion.analysis import error_statistics
 from companion.analysis.assessment import Assessment, assess_flight
 from companion.analysis.flights import open_flights
 from companion.analysis.html import BOOTED_NS
 from companion.analysis.jobs import Journal, run_jobs
+from companion.analysis.progress import show_count
 from companion.analysis.replay_inputs import has_navigator_outputs, is_own_log
 from companion.analysis.summary import longest_outage
 from companion.analysis.verdict import judge_flight
@@ -293,10 +293,9 @@ def command(
         )
     if (package := first_missing("pyarrow", "jinja2")) is not None:
         raise LogError(missing_package("a table of flights", package, "fleet"))
-    columns = TextColumn("{task.description}"), MofNCompleteColumn(), TimeRemainingColumn()
     try:
         fleet = Fleet(results, load(config_file), scheduler, workers)
-        with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
+        with show_count() as progress:
             rows = fleet.report(fleet.assess(logs, progress), reports, progress)
     except ValueError as error:
         raise LogError(str(error)) from None

@@ -22,10 +22,10 @@ from typing import Any, NamedTuple
 import click
 import numpy as np
 from rich.console import Console
-from rich.progress import MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
 from companion.analysis.jobs import WORKER_LOST, Journal, run_jobs
+from companion.analysis.progress import show_count
 from companion.analysis.worker_options import worker_options
 from companion.option_types import FloatRange
 from sitl.campaign.flight import (
@@ -119,9 +119,8 @@ def run_campaign(
     path, keys = folder / "flights.jsonl", {order.key for order in wanted}
     known = {result.key: result for result in read_results(path) if result.key in keys}
     todo = [order for order in wanted if order.key not in known]
-    columns = TextColumn("{task.description}"), MofNCompleteColumn(), TimeRemainingColumn()
     journal = Journal(path)
-    with Progress(*columns, console=Console(stderr=True), transient=True, disable=quiet) as progress:
+    with show_count(quiet) as progress:
         task = progress.add_task("flights", total=len(wanted), completed=len(known))
         for result in fly_orders(todo, scheduler, workers):
             if not (result.raised or "").startswith(WORKER_LOST):
