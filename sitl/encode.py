@@ -12,6 +12,7 @@ from collections.abc import Callable
 from typing import Any, Literal, NamedTuple, TypeAlias
 
 from companion.link import dialect
+from companion.link.decode import INERTIAL_UPDATED
 from companion.link.dialect import mavlink, rsbn
 from companion.link.fields import deg_e7
 from companion.nav.geometry import wrap_angle
@@ -49,7 +50,6 @@ _ALWAYS_PRESENT = (
     | mavlink.MAV_SYS_STATUS_SENSOR_ABSOLUTE_PRESSURE
     | mavlink.MAV_SYS_STATUS_SENSOR_GPS
 )
-_INERTIAL_UPDATED = 0x3F  # HIGHRES_IMU_UPDATED_XACC ... ZGYRO
 
 
 class SimulatedSender(NamedTuple):
@@ -107,7 +107,7 @@ def _imu(r: Imu, a: SimulatedSender) -> Message:
         names = ("xacc", "yacc", "zacc", "xgyro", "ygyro", "zgyro")
         values = dict(zip(names, (*r.f_b, *r.w_b)))
         return dialect.new(
-            "HIGHRES_IMU", time_usec=a.us(r.t_ns), id=r.source, fields_updated=_INERTIAL_UPDATED, **values
+            "HIGHRES_IMU", time_usec=a.us(r.t_ns), id=r.source, fields_updated=INERTIAL_UPDATED, **values
         )
     fields = {
         **{f"{axis}acc": round(f / _MILLI_G) for axis, f in zip("xyz", r.f_b)},

@@ -94,7 +94,7 @@ _IN_THE_AIR = frozenset(
 _RECKONED_FROM_0_DEG7 = 10**7
 _UNIX_AFTER_US = 10**15  # 2001; fewer microseconds are not a date
 
-_INERTIAL_UPDATED = (
+INERTIAL_UPDATED = (
     mavlink.HIGHRES_IMU_UPDATED_XACC
     | mavlink.HIGHRES_IMU_UPDATED_YACC
     | mavlink.HIGHRES_IMU_UPDATED_ZACC
@@ -309,7 +309,7 @@ def _highres_imu(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
             celsius = optional_number(m, "temperature")
         kelvin = None if celsius is None else celsius + ZERO_CELSIUS
         records += (Pressure(t_ns, rx, static, differential, kelvin),)
-    if updated & _INERTIAL_UPDATED == _INERTIAL_UPDATED:  # last: it moves the trajectory, to that height
+    if updated & INERTIAL_UPDATED == INERTIAL_UPDATED:  # last: it moves the trajectory, to that height
         records += (Imu(t_ns, rx, m.id, vector(m, "xacc yacc zacc"), vector(m, "xgyro ygyro zgyro")),)
     return records
 
@@ -455,11 +455,7 @@ def _sigma(message: Message, field: str, measured: float | None, configured: flo
     sigma = optional_number(message, field)
     if sigma is None or (sigma <= 0.0 and measured is None):
         return configured
-    if sigma <= 0.0:
-        raise InvalidField(f"{field} {sigma:g} is not positive", sigma, 0.0)
-    if sigma > FARTHEST:
-        raise InvalidField(f"{field} {sigma:g} is beyond the limit {FARTHEST:g}", sigma, FARTHEST)
-    return sigma
+    return _stated_sigma(message, field)
 
 
 @_of("RSBN_MEASUREMENT")
