@@ -23,6 +23,7 @@ from companion.importers.foreign_file import (
     MAX_TEXT,
     Damage,
     Step,
+    finite,
     map_file,
     one_line,
     steady_steps,
@@ -108,7 +109,7 @@ class MessageConverter:
         horizontal, vertical, speed = self._accuracy.get(receiver, (None, None, None))
         if horizontal is None and hdop is not None:
             horizontal = hdop * UERE / math.sqrt(2.0)
-        moving = (m.Spd * math.cos(course), m.Spd * math.sin(course), _finite(getattr(m, "VZ", 0.0)) or 0.0)
+        moving = (m.Spd * math.cos(course), m.Spd * math.sin(course), finite(getattr(m, "VZ", 0.0)) or 0.0)
         yield Gnss(
             t,
             t,
@@ -160,7 +161,7 @@ class MessageConverter:
         if self._is_primary_lane(name, m):
             glitch = bool(m.SS & _GLITCHING)
             flags = (m.SS & _STATUS) | (mavlink.EKF_GPS_GLITCHING if glitch else 0)
-            yield FilterStatus(t, t, flags, glitch, _finite(m.SP) or 0.0)
+            yield FilterStatus(t, t, flags, glitch, finite(m.SP) or 0.0)
 
     def _origin(self, name: str, m: Message, t: int) -> Iterator[Stamped]:
         if m.Type == _EKF_ORIGIN and (m.Lat or m.Lng):
@@ -177,13 +178,13 @@ class MessageConverter:
 
     def _airspeed(self, name: str, m: Message, t: int) -> Iterator[Stamped]:
         if getattr(m, "I", 0) == 0 and name == "ARSP" and math.isfinite(m.Airspeed):
-            self._differential = _finite(getattr(m, "DiffPress", math.nan))
+            self._differential = finite(getattr(m, "DiffPress", math.nan))
             self._has_airspeed = True
             yield AirData(t, t, m.Airspeed, sensed=True)
 
     def _navigation_tuning(self, name: str, m: Message, t: int) -> Iterator[Stamped]:
         """Convert the sensor's airspeed of a plane's NTUN up to 3.x; without a sensor it is 0."""
-        airspeed = _finite(getattr(m, "Arspd", math.nan))
+        airspeed = finite(getattr(m, "Arspd", math.nan))
         if airspeed and not self._has_airspeed:
             yield AirData(t, t, airspeed, sensed=True)
 
@@ -320,10 +321,6 @@ def boot_time_us(m: Message) -> int | None:
     if value is None:
         return None
     return int(value) * scale if isinstance(value, int | float) and 0 <= value <= MAX_BOOT_US else -1
-
-
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None
 
 
 def _positive(value: float) -> float | None:

@@ -10,6 +10,7 @@ Records with a number that is not finite or physically impossible become a `Reje
 from __future__ import annotations
 
 import heapq
+import math
 import mmap
 import struct
 import zipfile
@@ -122,6 +123,11 @@ def one_line(error: Exception) -> str:
     if text and isinstance(error, _OF_A_FILE):
         return text
     return f"{type(error).__name__}: {text}" if text else type(error).__name__
+
+
+def finite(value: float | None) -> float | None:
+    """Return the value, None if it is no finite number."""
+    return value if value is not None and math.isfinite(value) else None
 
 
 class Step(NamedTuple):

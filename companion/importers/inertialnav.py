@@ -75,7 +75,7 @@ def read_matlab(path: Path) -> Recording:
     rows = [
         _rows(name, tables[name], tables[f"{name}_label"].tolist())
         for name in dataflash.NAMES
-        if name in tables and f"{name}_label" in tables
+        if name in tables
     ]
     if not rows:
         raise LogError(f"{path} has no ArduPilot table: it needs GPS, IMU, ATT, ... each with its _label")

@@ -18,6 +18,7 @@ from companion.importers.foreign_file import (
     MAX_STEP_US,
     MAX_TEXT,
     Damage,
+    finite,
     in_order,
     map_file,
     one_line,
@@ -124,10 +125,6 @@ class UlogFile:
             self.damage.add(f"topic {name} at {row.get('timestamp')} us", 0, one_line(error))
 
 
-def _finite(value: float | None) -> float | None:
-    return value if value is not None and math.isfinite(value) else None
-
-
 def _first_field(row: Row, *names: str) -> Any:
     """Return the field under the first of `names` that exists. Raises KeyError if none does."""
     for name in names:
@@ -157,12 +154,12 @@ def _gnss(row: Row, t: int) -> Iterator[Stamped]:
         lat=math.radians(lat),
         lon=math.radians(lon),
         alt_msl=alt_msl,
-        sigma_horizontal=_finite(row.get("eph")),
-        sigma_vertical=_finite(row.get("epv")),
+        sigma_horizontal=finite(row.get("eph")),
+        sigma_vertical=finite(row.get("epv")),
         v_n=(row["vel_n_m_s"], row["vel_e_m_s"], row["vel_d_m_s"]) if row["vel_ned_valid"] else None,
-        sigma_velocity=_finite(row.get("s_variance_m_s")),
+        sigma_velocity=finite(row.get("s_variance_m_s")),
         satellites=int(row["satellites_used"]),
-        hdop=_finite(row.get("hdop")),
+        hdop=finite(row.get("hdop")),
         alt=alt,
     )
 
@@ -179,7 +176,7 @@ def _imu(row: Row, t: int) -> Iterator[Stamped]:
 
 
 def _air_data(row: Row, t: int) -> Iterator[Stamped]:
-    if (speed := _finite(row["true_airspeed_m_s"])) is not None:
+    if (speed := finite(row["true_airspeed_m_s"])) is not None:
         yield AirData(t, t, speed, True, sensed=True)
 
 
@@ -192,7 +189,7 @@ def _wind(row: Row, t: int) -> Iterator[Stamped]:
 
 
 def _pressure(row: Row, t: int) -> Iterator[Stamped]:
-    celsius = _finite(row.get("ambient_temperature", row.get("baro_temp_celcius")))
+    celsius = finite(row.get("ambient_temperature", row.get("baro_temp_celcius")))
     kelvin = None if celsius is None else celsius + ZERO_CELSIUS
     yield Pressure(t, t, row["baro_pressure_pa"], None, kelvin)
 
@@ -200,7 +197,7 @@ def _pressure(row: Row, t: int) -> Iterator[Stamped]:
 def _status(row: Row, t: int) -> Iterator[Stamped]:
     flags = int(row["solution_status_flags"])
     glitch = bool(flags & mavlink.ESTIMATOR_GPS_GLITCH)
-    ratio, accuracy = _finite(row["pos_test_ratio"]) or 0.0, _finite(row["pos_horiz_accuracy"])
+    ratio, accuracy = finite(row["pos_test_ratio"]) or 0.0, finite(row["pos_horiz_accuracy"])
     yield FilterStatus(t, t, flags, glitch, ratio, accuracy)
 
 
