@@ -193,8 +193,7 @@ def protection_table(
         return [None] * len(phases)
     found: list[PhaseProtection | None] = []
     for phase in phases:
-        within = (corrected.t_ns >= phase.start_ns) & (corrected.t_ns < phase.end_ns)
-        within &= np.isfinite(corrected.protection)
+        within = phase.covers(corrected.t) & np.isfinite(corrected.protection)
         levels = corrected.protection[within]
         inside = corrected.error[within] <= levels
         found.append(PhaseProtection(float(np.median(levels)), float(inside.mean())) if len(levels) else None)

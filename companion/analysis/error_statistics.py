@@ -36,6 +36,11 @@ class FlightPhase(NamedTuple):
     start_ns: int
     end_ns: int
 
+    def covers(self, t: Floats) -> npt.NDArray[np.bool_]:
+        """Return which times (s) are in it."""
+        inside: npt.NDArray[np.bool_] = (t >= self.start_ns * 1e-9) & (t < self.end_ns * 1e-9)
+        return inside
+
 
 class PhaseErrors(NamedTuple):
     """Horizontal errors (m) of one phase: r.m.s. and 95th percentile by source, and the guaranteed bound.
@@ -75,6 +80,11 @@ class ErrorSeries(NamedTuple):
     bound: Floats
     claimed: Floats
     protection: Floats
+
+    @property
+    def t(self) -> Floats:
+        """Times, s."""
+        return np.asarray(self.t_ns * 1e-9, dtype=np.float64)
 
 
 def horizontal_errors(records: Iterable[Stamped], truth: TruthAt) -> dict[str, ErrorSeries]:

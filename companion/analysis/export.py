@@ -162,10 +162,8 @@ def flight_map(flight: Flight, every_s: float = 1.0) -> tuple[list[Track], list[
     tracks = []
     for phase in split_phases(solution, flight.seconds):
         start, end = phase.start_ns * 1e-9, phase.end_ns * 1e-9
-        leg = {
-            name: column[(solution["t"] >= start) & (solution["t"] < end)]
-            for name, column in solution.items()
-        }
+        inside = phase.covers(solution["t"])
+        leg = {name: column[inside] for name, column in solution.items()}
         lost = phase.name in WITHOUT_FIXES
         what = "no fixes" if lost else phase.name
         colour = COLOURS["bound" if lost else error_statistics.CORRECTED][0]

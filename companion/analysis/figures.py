@@ -79,10 +79,6 @@ class _Axes:
         return tuple(Mark(e.t, e.text, e.severity <= Severity.WARNING) for e in sorted(entries))
 
 
-def _seconds(e: error_statistics.ErrorSeries) -> Floats:
-    return np.asarray(e.t_ns * 1e-9, dtype=np.float64)
-
-
 # -- errors ----------------------------------------------------------------------------------------------
 
 
@@ -98,11 +94,9 @@ def _error(axes: _Axes) -> Figure:
         for source, name, style in shown if axes.alone else shown[-1:]:
             if (e := a.errors.get(source)) is not None:
                 error = np.maximum(e.error, 0.01)
-                lines.append(axes.line(prefix + name, source, which, _seconds(e), error, style=style))
+                lines.append(axes.line(prefix + name, source, which, e.t, error, style=style))
         if (e := a.errors.get(error_statistics.CORRECTED)) is not None:
-            lines.append(
-                axes.line(f"{prefix}guaranteed bound", "bound", which, _seconds(e), e.bound, dash=True)
-            )
+            lines.append(axes.line(f"{prefix}guaranteed bound", "bound", which, e.t, e.bound, dash=True))
         if axes.alone and np.isfinite((s := a.flight.tables["Solution"])["protection"]).any():
             level = s["protection"]
             lines.append(axes.line("protection level", "second", which, s["t"], level, dash=True, width=1.1))
@@ -138,7 +132,7 @@ def _ratio(axes: _Axes) -> Figure:
         if (e := a.errors.get(error_statistics.CORRECTED)) is not None and np.isfinite(e.bound).any():
             share = np.maximum(e.error / e.bound, 1e-4)
             name = f"{prefix}{what} / bound"
-            lines.append(axes.line(name, error_statistics.CORRECTED, which, _seconds(e), share))
+            lines.append(axes.line(name, error_statistics.CORRECTED, which, e.t, share))
     return axes.over_time(
         "bound",
         f"{what.title()} divided by the guaranteed bound",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from itertools import groupby
 from typing import NamedTuple
 
@@ -83,6 +83,17 @@ def without_fixes(solution: Table) -> npt.NDArray[np.bool_]:
     """Return which rows of "Solution" rest on no fix; airspeed is none."""
     alone: npt.NDArray[np.bool_] = (solution["sources"].astype(int) & int(Source.GNSS | BEACON)) == 0
     return alone
+
+
+def in_phases_without_fixes(
+    phases: Iterable[error_statistics.FlightPhase], t: Floats
+) -> npt.NDArray[np.bool_]:
+    """Return which times (s) are in phases in which no fix was used."""
+    inside = np.zeros(len(t), dtype=np.bool_)
+    for phase in phases:
+        if phase.name in WITHOUT_FIXES:
+            inside |= phase.covers(t)
+    return inside
 
 
 def rests_on_beacons(flight: Flight) -> npt.NDArray[np.bool_]:

@@ -13,7 +13,7 @@ import numpy as np
 from companion.analysis import error_statistics, flight_events
 from companion.analysis.assessment import Assessment
 from companion.analysis.flight_arrays import Table
-from companion.analysis.plot_data import COLOURS, LOGS, Figure, Line, PlacedName, subsample
+from companion.analysis.plot_data import COLOURS, LOGS, Figure, Line, PlacedName, Style, subsample
 from companion.units import Floats
 
 ELLIPSES = 9
@@ -60,9 +60,9 @@ def _context(plane: Assessment, a: Assessment) -> Iterator[Line]:
     """Yield what is drawn below the estimate of a single flight."""
     fix, radio = a.flight.tables["Fix"], flight_events.rests_on_beacons(a.flight)
     at_beacons = {name: fix[name][radio] for name in ("t", "lat", "lon")}
-    yield _line(plane, "beacon positions", error_statistics.RSBN, at_beacons, dots=True)
+    yield _line(plane, "beacon positions", error_statistics.RSBN, at_beacons, "dots")
     yield _ellipses(plane, a)
-    yield _line(plane, "GNSS", error_statistics.GNSS, flight_events.usable_gnss(a.flight), dots=True)
+    yield _line(plane, "GNSS", error_statistics.GNSS, flight_events.usable_gnss(a.flight), "dots")
     if a.reference is not None:
         table = {"t": a.reference.t, "lat": a.reference.lat, "lon": a.reference.lon}
         yield _line(plane, a.reference.what, "reference", table)
@@ -74,10 +74,7 @@ def _estimate(
     """Yield the estimate: legs with fixes, and on top of them those without."""
     solution = a.flight.tables["Solution"]
     t = solution["t"]
-    lost = np.zeros(len(t), dtype=np.bool_)
-    for phase in a.phases:
-        if phase.name in flight_events.WITHOUT_FIXES:
-            lost |= (t >= phase.start_ns * 1e-9) & (t < phase.end_ns * 1e-9)
+    lost = flight_events.in_phases_without_fixes(a.phases, t)
     for name, hidden, role, width in (
         ("estimate", lost, error_statistics.CORRECTED, 2.0),
         (LOST, ~lost, "bound", 3.0),
@@ -89,12 +86,11 @@ def _estimate(
 
 
 def _line(
-    plane: Assessment, name: str, role: str, table: Table, dots: bool = False, width: float = 1.6
+    plane: Assessment, name: str, role: str, table: Table, style: Style = "line", width: float = 1.6
 ) -> Line:
     north, east = plane.north_east(subsample(table["lat"]), subsample(table["lon"]))
     east = np.where(np.isfinite(north), east, np.nan)
-    style = "dots" if dots else "line"
-    return Line(name, east, north, COLOURS[role], style, width=width, t=subsample(table["t"]))  # type: ignore[arg-type]
+    return Line(name, east, north, COLOURS[role], style, width=width, t=subsample(table["t"]))
 
 
 def _ellipses(plane: Assessment, a: Assessment) -> Line:

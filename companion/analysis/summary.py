@@ -9,7 +9,6 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from companion.analysis import error_statistics, flight_events
 from companion.analysis.assessment import GNSS, SMOOTHED, Assessment, deviation
@@ -20,6 +19,7 @@ from companion.analysis.flight_events import (
     WITHOUT_FIXES,
     OutageInterval,
     RejectionGroup,
+    in_phases_without_fixes,
     phase_title,
     source_title,
     usable_gnss,
@@ -161,7 +161,7 @@ def _split_errors(a: Assessment) -> tuple[Floats, Floats]:
     corrected = a.errors.get(error_statistics.CORRECTED)
     if corrected is None:
         return np.zeros(0), np.zeros(0)
-    alone = _without_fixes(a, corrected)
+    alone = in_phases_without_fixes(a.phases, corrected.t)
     return corrected.error[~alone], corrected.error[alone]
 
 
@@ -257,7 +257,7 @@ def gnss_contradiction(a: Assessment) -> Contradiction | None:
     if gnss is None or a.reference is None or a.reference.what != SMOOTHED:
         return None
     far = gnss.error > np.fmax(FAR_M, FAR_TIMES * gnss.claimed)
-    t, error = gnss.t_ns[far] * 1e-9, gnss.error[far]
+    t, error = gnss.t[far], gnss.error[far]
     ends = [0, *np.flatnonzero(np.diff(t) > OUTAGE_MIN_S) + 1, len(t)]
     spans = [
         Contradiction(float(t[i]), float(t[j - 1]), float(np.median(error[i:j])))
@@ -285,7 +285,7 @@ def _bound_sentences(a: Assessment) -> list[str]:
         return ["No guaranteed bound is available."]
     inside = float(np.mean(corrected.error[known] <= corrected.bound[known]))
     broken = [row for row in a.rows if row.held is False]
-    alone = known & _without_fixes(a, corrected)
+    alone = known & in_phases_without_fixes(a.phases, corrected.t)
     reached = (
         f" reached {format_length(float(corrected.bound[alone].max()))} without fixes and"
         if alone.any()
@@ -410,14 +410,6 @@ def _anomalies(a: Assessment) -> list[str]:
         if one.seconds > max(LATE_S, 3.0 * one.sigma)
     ]
     return [f"Anomalies: {'; '.join(dict.fromkeys(found))}."] if found else []
-
-
-def _without_fixes(a: Assessment, e: error_statistics.ErrorSeries) -> npt.NDArray[np.bool_]:
-    inside = np.zeros(len(e.t_ns), dtype=np.bool_)
-    for phase in a.phases:
-        if phase.name in WITHOUT_FIXES:
-            inside |= (e.t_ns >= phase.start_ns) & (e.t_ns < phase.end_ns)
-    return inside
 
 
 def _count_phases(phases: Sequence[object]) -> str:

@@ -187,8 +187,8 @@ def _unlimited(a: Assessment) -> Verdict | None:
     seconds = 0.0
     for row, phase in zip(a.rows, a.phases, strict=True):
         if phase.name in flight_events.WITHOUT_FIXES and row.seconds >= SHORT_S and not row.useful:
-            inside = (solution["t"] >= phase.start_ns * 1e-9) & (solution["t"] < phase.end_ns * 1e-9)
-            seconds += row.seconds * (not np.isfinite(solution["protection"][inside]).any())
+            levels = solution["protection"][phase.covers(solution["t"])]
+            seconds += row.seconds * (not np.isfinite(levels).any())
     if not seconds:
         return None
     return Verdict(
