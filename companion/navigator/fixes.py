@@ -310,9 +310,7 @@ def _scattered(
 
     `metres` is the length of the residual's unit.
     """
-    assert state.nominal is not None
-    interval = state.nominal.interval
-    lacking = scatter.LACKING.get("ins" if interval is None else interval.by, scatter.LACKING_ELSE)
+    lacking = scatter.LACKING.get(driver(state) or "", scatter.LACKING_ELSE)
     seen = scatter.observe(
         state.scatter.get(name), record.t_ns, residual, variance, lacking / max(metres, 1.0)
     )

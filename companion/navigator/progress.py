@@ -18,7 +18,6 @@ from companion.navigator import minimax_bound, own_channel, parallel_filters
 from companion.navigator.channel import moved
 from companion.navigator.hypotheses import AIRSPEED, JAMMED, Situation
 from companion.navigator.inertial_track import Point
-from companion.navigator.own_error_model import By
 from companion.navigator.solution import solve
 from companion.navigator.state import (
     EXCLUDED,
@@ -249,7 +248,6 @@ def estimated_velocity(state: State) -> Vector2:
     return v_n[0] - float(x[2]), v_n[1] - float(x[3])
 
 
-def driver(state: State) -> By | None:
-    """What moves the nominal trajectory of the own channel now; None of an INS, and before the first fix."""
-    interval = state.nominal.interval if state.nominal else None
-    return None if interval is None else interval.by
+def driver(state: State) -> str | None:
+    """What moves the nominal trajectory now; None before there is one."""
+    return None if state.nominal is None else minimax_bound.driver(state.nominal)
