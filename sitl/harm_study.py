@@ -38,12 +38,11 @@ from companion.tables import print_tables
 from companion.units import SECOND_NS, Floats
 from sitl import loopback
 from sitl.autopilot import SimulatedAutopilot
-from sitl.beacon import Beacon
 from sitl.campaign.flight import sensors_of
 from sitl.faults import Fault
-from sitl.flight import FlightPlan, Leg, WindChange
+from sitl.flight import FlightPlan, Leg
 from sitl.harm_recordings import RecordingResult, fly_log, fly_named, list_recordings
-from sitl.scenarios import Scenario, SensorRates
+from sitl.scenarios import EAST_BEACON, TAKE_OFF, WIND, Scenario, SensorRates
 from sitl.sensors import STATED_GRADES
 from sitl.world import World
 
@@ -167,9 +166,9 @@ def scenario_of(order: HarmOrder) -> Scenario:
         rates = SensorRates(hz, local_position=hz, attitude=hz, gnss=hz, air=hz, truth=1.0)
     return Scenario(
         order.wrong,
-        FlightPlan((Leg(10, 40, 0, 0), Leg(50, 40, 38, 0), *turns), winds=(WindChange(0, 4, 5),)),
+        FlightPlan((*TAKE_OFF, *turns), winds=(WIND,)),
         grade="mems" if own or order.channel == "INS MEMS" else "navigation",
-        beacons=(Beacon(1, 60.05, 31.07),),
+        beacons=(EAST_BEACON,),
         rates=rates,
         airspeed_sensor=wrong.airspeed_sensor,
         faults=() if wrong.fault is None else (wrong.fault,),

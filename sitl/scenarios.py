@@ -124,30 +124,31 @@ _LEGS = (
     Leg(360, 250, 36, 600),
 )
 _RETURN_LEGS = (Leg(540, 215, 40, 800), Leg(540, 240, 40, 600))  # extends the flight to an hour
+TAKE_OFF = (Leg(10, 40, 0, 0), Leg(50, 40, 38, 0))
 _SHORT_LEGS = (
-    Leg(10, 40, 0, 0),
-    Leg(50, 40, 38, 0),
+    *TAKE_OFF,
     Leg(120, 40, 38, 120),
     Leg(60, 100, 36, 120),
     Leg(60, 30, 38, 120),
 )
-_WINDS = (WindChange(0, 4, 5), WindChange(1200, 1, 8, 240.0))
+WIND = WindChange(0, 4, 5)
+_WINDS = (WIND, WindChange(1200, 1, 8, 240.0))
 #: East: 60 km from the start, to the right of the path. North: farther on, to the left.
-_EAST_BEACON = Beacon(1, 60.05, 31.07)
+EAST_BEACON = Beacon(1, 60.05, 31.07)
 _NORTH_BEACON = Beacon(2, 60.75, 30.25)
 _PLAN = FlightPlan(_LEGS, winds=_WINDS)
 
 DEFAULT = Scenario(
     "default",
     _PLAN,
-    beacons=(_EAST_BEACON,),
+    beacons=(EAST_BEACON,),
     gnss_outages=((1500.0, 2220.0),),
     rsbn_outages=((900.0, 1500.0), (1920.0, 2220.0)),
 )
 _SHORT_FLIGHT = Scenario(
     "short",
-    FlightPlan(_SHORT_LEGS, winds=(WindChange(0, 4, 5),)),
-    beacons=(_EAST_BEACON,),
+    FlightPlan(_SHORT_LEGS, winds=(WIND,)),
+    beacons=(EAST_BEACON,),
     gnss_outages=((180.0, 270.0),),
     rsbn_outages=((120.0, 180.0), (225.0, 270.0)),
 )
@@ -173,7 +174,7 @@ SCENARIOS: dict[str, Scenario] = {
         _default_with("hour", plan=dataclasses.replace(_PLAN, legs=(*_LEGS, *_RETURN_LEGS))),
         _default_with("tactical", grade="tactical"),
         _default_with("mems", grade="mems"),
-        _default_with("two-beacons", beacons=(_EAST_BEACON, _NORTH_BEACON)),
+        _default_with("two-beacons", beacons=(EAST_BEACON, _NORTH_BEACON)),
         _default_with("no-beacon", beacons=(), rsbn_outages=()),
         _default_with(
             "wind-change",

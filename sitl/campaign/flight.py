@@ -39,8 +39,8 @@ from sitl import loopback
 from sitl.autopilot import UNIX_AT_START_NS
 from sitl.beacon import Beacon
 from sitl.faults import RECORD_FAULTS, Fault, FullDisk
-from sitl.flight import FlightPlan, Leg, WindChange
-from sitl.scenarios import Scenario, SensorRates
+from sitl.flight import FlightPlan, Leg
+from sitl.scenarios import EAST_BEACON, TAKE_OFF, WIND, Scenario, SensorRates
 from sitl.world import SENSORS, World
 
 FAULT_S, OVER_S = 300.0, 540.0
@@ -49,14 +49,13 @@ FAULT_EVENTS = ("the link is late", "the clock of autopilot")  # events that rep
 SUSPICION, EXCLUSION = " is suspect:", " is excluded:"  # after the name of the source, in events
 SETTLED_S = 60.0  # alarms count from here on
 _LEGS = (
-    Leg(10, 40, 0, 0),
-    Leg(50, 40, 38, 0),
+    *TAKE_OFF,
     Leg(360, 40, 38, 400),
     Leg(180, 95, 34, 400),
     Leg(120, 50, 42, 400),
 )
-_PLAN = FlightPlan(_LEGS, winds=(WindChange(0, 4, 5),))
-_EAST_BEACON, _NORTH_BEACON = Beacon(1, 60.05, 31.07), Beacon(2, 60.45, 30.0)
+_PLAN = FlightPlan(_LEGS, winds=(WIND,))
+NORTH_BEACON = Beacon(2, 60.45, 30.0)
 _RATES = SensorRates(imu=1.0, truth=1.0)
 _STOCK_RATES = SensorRates(imu=10.0, truth=1.0)
 _BEACON = Source.AZIMUTH | Source.RANGE
@@ -64,15 +63,15 @@ _BEACON = Source.AZIMUTH | Source.RANGE
 SCENARIOS: dict[str, Scenario] = {
     scenario.name: scenario
     for scenario in (
-        Scenario("one-beacon", _PLAN, beacons=(_EAST_BEACON,), rates=_RATES),
-        Scenario("two-beacons", _PLAN, beacons=(_EAST_BEACON, _NORTH_BEACON), rates=_RATES),
+        Scenario("one-beacon", _PLAN, beacons=(EAST_BEACON,), rates=_RATES),
+        Scenario("two-beacons", _PLAN, beacons=(EAST_BEACON, NORTH_BEACON), rates=_RATES),
         Scenario("no-beacon", _PLAN, rates=_RATES),
-        Scenario("tactical", _PLAN, grade="tactical", beacons=(_EAST_BEACON,), rates=_RATES),
-        Scenario("mems", _PLAN, grade="mems", beacons=(_EAST_BEACON,), rates=_RATES),
+        Scenario("tactical", _PLAN, grade="tactical", beacons=(EAST_BEACON,), rates=_RATES),
+        Scenario("mems", _PLAN, grade="mems", beacons=(EAST_BEACON,), rates=_RATES),
         # without an INS of its own: airspeed, attitude and fixes
-        Scenario("air-data", _PLAN, beacons=(_EAST_BEACON,), rates=_RATES),
+        Scenario("air-data", _PLAN, beacons=(EAST_BEACON,), rates=_RATES),
         # a stock autopilot: all of its sensors
-        Scenario("stock", _PLAN, grade="mems", beacons=(_EAST_BEACON,), rates=_STOCK_RATES),
+        Scenario("stock", _PLAN, grade="mems", beacons=(EAST_BEACON,), rates=_STOCK_RATES),
     )
 }
 OWN_CHANNEL = {

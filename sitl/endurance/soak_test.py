@@ -48,11 +48,11 @@ from companion.storage.run_metadata import run_metadata
 from companion.tables import number_table
 from companion.units import SECOND_NS
 from sitl.autopilot import UNIX_AT_START_NS, SimulatedAutopilot
-from sitl.beacon import Beacon
+from sitl.campaign.flight import NORTH_BEACON
 from sitl.faults import AUTOPILOT_FAULTS, LINK_FAULTS, RECORD_FAULTS, Fault
-from sitl.flight import FlightPlan, Leg, WindChange
+from sitl.flight import FlightPlan, Leg
 from sitl.loopback import LINK, START_NS, fly_connected, simulator_config
-from sitl.scenarios import Scenario, SensorRates
+from sitl.scenarios import EAST_BEACON, TAKE_OFF, WIND, Scenario, SensorRates
 
 SORTIE_S, SORTIES = 900.0, 4  # of an hour
 QUIET_S = 120.0  # not counted as quiet: start of a sortie, and after a fault
@@ -148,12 +148,11 @@ def make_sortie(number: int, seed: int, duration_s: float = SORTIE_S) -> Scenari
     """Make a flight of turns within reach of two beacons, with random faults."""
     rng = random.Random(f"{seed} {number}")
     sides = math.ceil((duration_s - 60.0) / 240.0)
-    legs = [Leg(10, 40, 0, 0), Leg(50, 40, 38, 0)]
-    legs += [Leg((duration_s - 60.0) / sides, (40 + 70 * i) % 360, 38, 100) for i in range(sides)]
+    turns = (Leg((duration_s - 60.0) / sides, (40 + 70 * i) % 360, 38, 100) for i in range(sides))
     return Scenario(
         f"sortie {number}",
-        FlightPlan(tuple(legs), winds=(WindChange(0, 4, 5),)),
-        beacons=(Beacon(1, 60.05, 31.07), Beacon(2, 60.45, 30.0)),
+        FlightPlan((*TAKE_OFF, *turns), winds=(WIND,)),
+        beacons=(EAST_BEACON, NORTH_BEACON),
         rates=SensorRates(imu=1.0, truth=1.0),
         faults=tuple(_scatter_faults(rng, duration_s)),
         seed=rng.randrange(1 << 31),
