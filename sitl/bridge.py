@@ -44,7 +44,6 @@ TRUTH = {"ardupilot": "SIM_STATE", "px4": "HIL_STATE_QUATERNION"}
 TRUTH_HZ = 10.0
 ASK_ORIGIN_EVERY = 3 * SECOND_NS
 SILENT_AFTER = 3 * SECOND_NS
-NOWHERE = 1e-4  # rad, 640 m: so near 0 N 0 E an autopilot states its position before it has one
 AUTOPILOT, COMPANION, RSBN = "autopilot", "companion", "RSBN fix alone"
 
 
@@ -244,8 +243,6 @@ class Bridge:
 
     def _on_global_position(self, record: GlobalPosition) -> None:
         self._global_ns = record.rx_ns
-        if math.hypot(record.lat, record.lon) < NOWHERE:
-            return
         self.comparison.add_estimate(record.t_ns, AUTOPILOT, Geodetic(record.lat, record.lon, record.alt_msl))
 
     def _on_local_position(self, record: LocalPosition) -> None:
