@@ -209,13 +209,13 @@ def run(
                         vehicle,
                         path,
                         lat_deg,
-                        ahead,
-                        kind,
-                        name,
-                        count,
-                        math.hypot(*(e.expected for e in pair)),
-                        math.hypot(*(e.bound for e in pair)),
-                        float(np.sqrt(np.mean(north**2 + east**2))),
+                        ahead_min=ahead,
+                        fix_errors=kind,
+                        estimate=name,
+                        flights=count,
+                        expected=math.hypot(*(e.expected for e in pair)),
+                        bound=math.hypot(*(e.bound for e in pair)),
+                        rms=float(np.sqrt(np.mean(north**2 + east**2))),
                     )
                 )
     return found

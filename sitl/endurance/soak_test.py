@@ -213,19 +213,19 @@ def _measure_hour(
     _trim_memory()  # exclude memory freed by the simulator
     return HourStatistics(
         hour,
-        round(memory_mib(os.getpid()), 1),
-        min(each.objects for each in reached),
-        max(each.longest for each in reached),
-        round(counter.waiting / 1024.0, 1),
-        log.dropped,
-        counter.rate("Solution"),
-        counter.rate("tx"),
-        counter.rate("rx"),
-        counter.quiet_s,
-        counter.counts["Rejection"],
-        counter.counts["Reset"],
-        counter.counts["Event"],
-        round(times_real_time, 1),
+        resident_mib=round(memory_mib(os.getpid()), 1),
+        objects=min(each.objects for each in reached),
+        longest=max(each.longest for each in reached),
+        waiting_kib=round(counter.waiting / 1024.0, 1),
+        dropped=log.dropped,
+        solutions_hz=counter.rate("Solution"),
+        messages_hz=counter.rate("tx"),
+        received_hz=counter.rate("rx"),
+        quiet_s=counter.quiet_s,
+        rejections=counter.counts["Rejection"],
+        resets=counter.counts["Reset"],
+        events=counter.counts["Event"],
+        times_real_time=round(times_real_time, 1),
     )
 
 
@@ -285,9 +285,10 @@ def command(hours: int, seed: int, as_json: bool) -> None:
                 click.echo(f"hour {hour.hour} of {hours}: {hour.resident_mib:g} MiB", err=True)
     if not as_json:
         _print_table(flown)
-    for sentence in find_failures(flown):
+    failures = find_failures(flown)
+    for sentence in failures:
         click.echo(sentence, err=True)
-    if find_failures(flown):
+    if failures:
         raise SystemExit(1)
 
 
