@@ -180,8 +180,6 @@ class _Witness(Navigator):
         return outputs
 
     def _fold(self, record: Input) -> list[Output]:
-        while self.folded and self.folded[-1].t_ns > record.t_ns:
-            self.folded.pop()  # folded again, behind a late record
         outputs = super()._fold(record)
         self._note(record)
         return outputs
