@@ -15,12 +15,13 @@ from __future__ import annotations
 
 import math
 from enum import IntEnum, IntFlag, StrEnum
-from typing import Any, TypeAlias, get_args
+from typing import Any, Literal, TypeAlias, get_args
 
 import msgspec
 
 Vector2: TypeAlias = tuple[float, float]
 Vector3: TypeAlias = tuple[float, float, float]
+Projection: TypeAlias = Literal["ardupilot", "px4", "tangent"]
 
 
 class Stamped(msgspec.Struct, frozen=True, gc=False, omit_defaults=True):
@@ -103,7 +104,7 @@ class LocalOrigin(Stamped, frozen=True, gc=False, tag=True):
     lat: float
     lon: float
     alt_msl: float
-    projection: str = "tangent"
+    projection: Projection = "tangent"
 
 
 class HomePosition(Stamped, frozen=True, gc=False, tag=True):

@@ -24,7 +24,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from companion.nav.geometry import Geodetic, Projection, geodetic_to_local
+from companion.nav.geometry import Geodetic, geodetic_to_local
 from companion.records import Event, Gnss, LocalOrigin, LocalPosition, Reboot, Severity, Stamped
 from companion.units import Floats
 
@@ -127,8 +127,9 @@ class TrackCollector:
             fixes = np.array(self._fixes).reshape(n, 5)
             local = np.array(self._local).reshape(-1, 4)
             at = Geodetic(origin.lat, origin.lon, origin.alt_msl)
-            projection: Projection = origin.projection  # type: ignore[assignment]
-            x = [geodetic_to_local(projection, at, Geodetic(*row))[:2] for row in fixes[:, :3].tolist()]
+            x = [
+                geodetic_to_local(origin.projection, at, Geodetic(*row))[:2] for row in fixes[:, :3].tolist()
+            ]
             t = (np.array(self._fix_t, dtype=np.int64) - zero).astype(np.float64) * 1e-9
             t_local = (np.array(self._local_t, dtype=np.int64) - zero).astype(np.float64) * 1e-9
             self._done.append(

@@ -26,7 +26,6 @@ from companion.link.dialect import MEASUREMENTS, Message, mavlink
 from companion.link.frame import Frame
 from companion.link.session import LinkUp, MessageReceived, Rebooted, SecondAutopilot, Session
 from companion.link.status_text import CHUNK
-from companion.nav.geometry import Projection
 from companion.navigator.local_origin import LOG_WINDOW_NS, infer_origin
 from companion.records import (
     Event,
@@ -34,6 +33,7 @@ from companion.records import (
     GlobalPosition,
     LocalOrigin,
     LocalPosition,
+    Projection,
     Reboot,
     Reset,
     Severity,

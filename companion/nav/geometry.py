@@ -7,15 +7,15 @@ Vectors are metres: plain numbers, ten times faster than arrays, except in the p
 
 import math
 from collections.abc import Sequence
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from companion.nav.earth import E2, A, radii
+from companion.records import Projection
 from companion.units import Floats
 
 Triple = tuple[float, float, float]
-Projection = Literal["ardupilot", "px4", "tangent"]
 
 _ARDUPILOT_R = 0.011131884502145034 * math.degrees(1e7)
 """ArduPilot's LOCATION_SCALING_FACTOR (AP_Common/Location.h), m per 1e-7 degree, as a radius."""

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from companion.nav.geometry import Geodetic, Projection, local_to_geodetic, separation
+from companion.nav.geometry import Geodetic, local_to_geodetic, separation
 from companion.records import LocalOrigin, LocalPosition, Vector3
 
 JUMP_M = 5.0  # a step beyond what velocity explains, allowing for JUMP_ACCELERATION
@@ -27,9 +27,8 @@ class Point(NamedTuple):
 
 def point(record: LocalPosition, origin: LocalOrigin) -> Point:
     """The geodetic point that the autopilot means by its local position."""
-    projection: Projection = origin.projection  # type: ignore[assignment]
     start = Geodetic(origin.lat, origin.lon, origin.alt_msl)
-    return Point(record.t_ns, local_to_geodetic(projection, start, record.x_n), record.v_n)
+    return Point(record.t_ns, local_to_geodetic(origin.projection, start, record.x_n), record.v_n)
 
 
 def beyond(before: Point, after: Point) -> Vector3:

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from companion.nav.geometry import Geodetic, Projection, local_to_geodetic, wrap_angle
-from companion.records import GlobalPosition, LocalOrigin, LocalPosition
+from companion.nav.geometry import Geodetic, local_to_geodetic, wrap_angle
+from companion.records import GlobalPosition, LocalOrigin, LocalPosition, Projection
 
 LIVE_WINDOW_NS = 50_000_000  # in flight both are requested at 10 Hz or more
 LOG_WINDOW_NS = 150_000_000  # recordings may hold both at 1-2 Hz only

@@ -21,7 +21,7 @@ from companion.link.decode import Autopilot
 from companion.link.dialect import mavlink, rsbn
 from companion.link.fields import deg_e7
 from companion.link.firmware import Firmware
-from companion.nav.geometry import Geodetic, Projection, geodetic_to_local
+from companion.nav.geometry import Geodetic, geodetic_to_local
 from companion.output.gate import Position
 from companion.records import PARALLEL, LocalOrigin, Mode, Solution, Source, Trust
 
@@ -168,14 +168,7 @@ def _local(position: Position, receiver: Receiver) -> tuple[float, float, float]
         raise CannotEncode("the autopilot's local origin is not confirmed by its positions")
     point = Geodetic(position.lat, position.lon, position.alt_msl)
     start = Geodetic(origin.lat, origin.lon, origin.alt_msl)
-    return geodetic_to_local(_projection(origin), start, point)
-
-
-def _projection(origin: LocalOrigin) -> Projection:
-    for known in ("ardupilot", "px4", "tangent"):
-        if origin.projection == known:
-            return known
-    raise ValueError(f"unknown local projection {origin.projection!r}: choose ardupilot, px4 or tangent")
+    return geodetic_to_local(origin.projection, start, point)
 
 
 def _covariance(position: Position, receiver: Receiver) -> list[float]:

@@ -18,7 +18,7 @@ import math
 from typing import NamedTuple
 
 from companion.link.dialect import mavlink
-from companion.nav.geometry import Geodetic, Projection, separation
+from companion.nav.geometry import Geodetic, separation
 from companion.navigator.local_origin import LIVE_WINDOW_NS, infer_origin
 from companion.records import (
     Event,
@@ -60,7 +60,6 @@ class OriginCheck:
         self._previous: LocalOrigin | None = None  # the last one in use: a reset is counted against it
         self._has_pairs = has_pairs
         self._stated: LocalOrigin | None = None
-        self._projection: Projection = "tangent"
         self._local: LocalPosition | None = None
         self._known: GlobalPosition | None = None
         self._without_position_ns: int | None = None  # when the autopilot last stated so
@@ -77,7 +76,6 @@ class OriginCheck:
         """Process a record of the autopilot; return what has changed."""
         if isinstance(record, LocalOrigin):
             self._stated = record
-            self._projection = record.projection  # type: ignore[assignment]
             is_without_position = self._is_without_position(record.rx_ns)
             is_judged = self._has_pairs and (self.origin is not None or not is_without_position)
             return self._judge(record.rx_ns) if is_judged else self._replaced(record, record.rx_ns)
@@ -105,7 +103,7 @@ class OriginCheck:
             return []
         if self._pairs and 0 <= now_ns - self._pairs[-1].t_ns < PAIR_NS:
             return []
-        inferred = infer_origin(self._local, self._known, self._projection, LIVE_WINDOW_NS)
+        inferred = infer_origin(self._local, self._known, self._stated.projection, LIVE_WINDOW_NS)
         if inferred is None:
             return []
         self._known = None  # each global position is used once

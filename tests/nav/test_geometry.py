@@ -11,7 +11,6 @@ from scipy.linalg import expm
 from companion.nav import earth
 from companion.nav.geometry import (
     Geodetic,
-    Projection,
     displace,
     enu_axes,
     from_ecef,
@@ -26,6 +25,7 @@ from companion.nav.geometry import (
     to_enu,
     wrap_angle,
 )
+from companion.records import Projection
 
 micrometre = 1e-6
 projections: list[Projection] = ["ardupilot", "px4", "tangent"]

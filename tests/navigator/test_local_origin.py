@@ -4,9 +4,9 @@ import math
 
 import pytest
 
-from companion.nav.geometry import Geodetic, Projection, local_to_geodetic, separation
+from companion.nav.geometry import Geodetic, local_to_geodetic, separation
 from companion.navigator.local_origin import LIVE_WINDOW_NS, LOG_WINDOW_NS, infer_origin
-from companion.records import GlobalPosition, LocalPosition
+from companion.records import GlobalPosition, LocalPosition, Projection
 
 V_N = (30.0, -20.0, 1.0)
 one_millimetre = 1e-3
