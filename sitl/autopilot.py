@@ -126,10 +126,9 @@ class SimulatedAutopilot:
         sensed = {**_SENSED, **_BY_MAKE[scenario.autopilot]}
         self._streams = {_msgid(name): self.world.streams[kind] for name, kind in sensed.items()}
         # of receivers that are components of their own: each record is sent once
-        self._answers = list(
+        self._answers = deque(
             heapq.merge(self.world.streams[RsbnFix], self.world.corrections, key=lambda record: record.rx_ns)
         )
-        self._next_answer = 0
         self.parameters = SimulatedParameters(scenario.autopilot)
         self._gnss_off_ns: int | None = None  # time at which the parameter switched GNSS off
         self._send_queue: list[tuple[int, int, bytes]] = []  # due, order, frame
@@ -235,9 +234,8 @@ class SimulatedAutopilot:
             if message is not None:
                 frames.append(self._frame(message, COMPONENT))
         while self._answer_due() <= t:
-            message = encode(self._answers[self._next_answer], self._sender)
+            message = encode(self._answers.popleft(), self._sender)
             frames.append(self._frame(message, RECEIVER_COMPONENT))
-            self._next_answer += 1
         self._transmit(frames, t)
 
     def _next_emission(self) -> int:
@@ -245,7 +243,7 @@ class SimulatedAutopilot:
         return min(self._schedule[0][0] if self._schedule else NEVER, self._answer_due())
 
     def _answer_due(self) -> int:
-        return self._answers[self._next_answer].rx_ns if self._next_answer < len(self._answers) else NEVER
+        return self._answers[0].rx_ns if self._answers else NEVER
 
     def _message(self, msgid: int, t: int) -> Any:
         """The message of a stream at flight time `t`, None before its first record."""
@@ -300,7 +298,7 @@ class SimulatedAutopilot:
             self._booting_until = start + size_ns
             self._boot(start, self._booting_until)
             while self._answer_due() < self._booting_until:
-                self._next_answer += 1
+                self._answers.popleft()
             return
         if fault.name == "clock-jump":
             self._sender = self._sender._replace(boot_ns=self._sender.boot_ns - size_ns)
