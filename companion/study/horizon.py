@@ -300,6 +300,7 @@ def command(
     except ValueError as error:
         raise click.UsageError(str(error)) from None
     longest = None if limit_m is None else horizon.longest(limit_m)
+    bounds = [] if target is None else [horizon.combination(60.0 * minute, target) for minute in ahead_min]
     if as_json:
         answer: dict[str, Any] = {
             "sigma_m": sigma_m,
@@ -311,16 +312,13 @@ def command(
         if longest is not None:
             answer |= {"limit_m": limit_m, "longest_min": longest / 60.0 if math.isfinite(longest) else None}
         if target is not None:
-            answer["target"] = target
-            answer["target_bound"] = [horizon.combination(60.0 * minute, target) for minute in ahead_min]
+            answer |= {"target": target, "target_bound": bounds}
         click.echo(json.dumps({**answer, "table": [row._asdict() for row in table]}))
     else:
         _print(table, f"{sigma_m:g} m fixes every {every_s:g} s for {window_min:g} min", drift_deg_h)
         if target is not None:
-            bounds = (f"{horizon.combination(60.0 * minute, target):.5g}" for minute in ahead_min)
-            click.echo(
-                f"Bound of {','.join(f'{a:g}' for a in target)} (A,B,C,D) at these times: {', '.join(bounds)}"
-            )
+            named, stated = ",".join(f"{a:g}" for a in target), ", ".join(f"{b:.5g}" for b in bounds)
+            click.echo(f"Bound of {named} (A,B,C,D) at these times: {stated}")
         if longest is not None:
             duration = f"{longest / 60.0:.1f} min" if math.isfinite(longest) else "more than a day"
             click.echo(f"The position bound stays below {limit_m:g} m for {duration} without fixes.")
