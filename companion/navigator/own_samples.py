@@ -38,7 +38,7 @@ from companion.navigator.progress import (
     shifted,
     solved_if_due,
 )
-from companion.navigator.state import NEAR_S, Settings, State, Step, gnss_climb, hypotheses
+from companion.navigator.state import NEAR_S, Settings, State, Step, gnss_climb, hypotheses, with_sensors
 from companion.records import (
     AirData,
     AirspeedSensor,
@@ -76,18 +76,17 @@ def vehicle(state: State, record: Vehicle, settings: Settings) -> Step:
     aloft_ns = s.aloft_ns
     if record.flying is not None:  # a copter hovers always, by its own statement
         aloft_ns = (aloft_ns or record.t_ns) if record.flying and (multirotor or not hovering) else None
-    s = structs.replace(s, multirotor=multirotor, fixed_wing=fixed_wing, hovering=hovering, aloft_ns=aloft_ns)
-    return structs.replace(state, sensors=s), []
+    return with_sensors(
+        state, multirotor=multirotor, fixed_wing=fixed_wing, hovering=hovering, aloft_ns=aloft_ns
+    ), []
 
 
 def attitude(state: State, record: Attitude, settings: Settings) -> Step:
     """Remember an attitude."""
     s = state.sensors
-    s = structs.replace(
-        s, strap=strapdown_channel.sense(s.strap, record), air=air_data_channel.sense(s.air, record)
-    )
-    state = structs.replace(state, sensors=s)
-    if state.nominal is not None and own_channel.is_steady(s, record.t_ns):
+    strap, air = strapdown_channel.sense(s.strap, record), air_data_channel.sense(s.air, record)
+    state = with_sensors(state, strap=strap, air=air)
+    if state.nominal is not None and own_channel.is_steady(state.sensors, record.t_ns):
         return _steady(state, record, settings)
     return _straight_on(state, record, settings)
 
@@ -97,16 +96,13 @@ def _steady(state: State, record: Attitude, settings: Settings) -> Step:
     if not settings.config.uses("air_data"):
         return _straight_on(state, record, settings)
     state = _airspeed_from("steady", state, settings)
-    s = state.sensors
-    if s.steady_m_s is None:
-        s = structs.replace(s, steady_m_s=max(_estimated_airspeed(state), FLYING_M_S))
-    assert s.steady_m_s is not None
-    V = own_error_model.air_velocity(s.steady_m_s, record.pitch, record.heading)
-    if s.leads("air", record.t_ns):
-        return _driven(
-            structs.replace(state, sensors=structs.replace(s, air_ns=record.t_ns)), record, "air", V, settings
-        )
-    state = structs.replace(state, sensors=s)
+    steady_m_s = state.sensors.steady_m_s
+    if steady_m_s is None:
+        steady_m_s = max(_estimated_airspeed(state), FLYING_M_S)
+        state = with_sensors(state, steady_m_s=steady_m_s)
+    V = own_error_model.air_velocity(steady_m_s, record.pitch, record.heading)
+    if state.sensors.leads("air", record.t_ns):
+        return _driven(with_sensors(state, air_ns=record.t_ns), record, "air", V, settings)
     return (_measured(state, record, V, settings) if driver(state) == "imu" else state), []
 
 
@@ -124,8 +120,8 @@ def pressure(state: State, record: Pressure, settings: Settings) -> Step:
     if (rejection := air_data_channel.step(s.air, record, gnss_climb(state, record.t_ns))) is not None:
         state, out = _straight_on(state, record, settings)
         return state, [rejection, *out]
-    s = structs.replace(s, air=air_data_channel.sense(s.air, record))
-    return _straight_on(structs.replace(state, sensors=s), record, settings)
+    air = air_data_channel.sense(s.air, record)
+    return _straight_on(with_sensors(state, air=air), record, settings)
 
 
 def _straight_on(state: State, record: Stamped, settings: Settings) -> Step:
@@ -142,15 +138,15 @@ def imu(state: State, record: Imu, settings: Settings) -> Step:
         return state, []
     s = state.sensors
     strap = strapdown_channel.receive(s.strap, record)
-    s = structs.replace(s, strap=strap)
     if strap.why or strap.C_nb is None:
-        return _straight_on(structs.replace(state, sensors=s), record, settings)
+        return _straight_on(with_sensors(state, strap=strap), record, settings)
     now = strapdown_channel.acceleration(strap)
     fresh = record.t_ns - s.imu_ns <= own_channel.SILENT_NS["imu"]
     before = s.accelerations[-2:] if fresh else ()
     mean = strapdown_channel.mean_acceleration(s.mean_acceleration, now, (record.t_ns - s.imu_ns) * 1e-9)
-    s = structs.replace(s, imu_ns=record.t_ns, accelerations=(*before, now), mean_acceleration=mean)
-    state = structs.replace(state, sensors=s)
+    state = with_sensors(
+        state, strap=strap, imu_ns=record.t_ns, accelerations=(*before, now), mean_acceleration=mean
+    )
     last = before[-1] if before else now
     between = (0.5 * (now[0] + last[0]), 0.5 * (now[1] + last[1]))
     state, outputs = _driven(state, record, "imu", between, settings)
@@ -167,7 +163,7 @@ def _rotor_drag(state: State, record: Imu, settings: Settings) -> State:
     height = None if s.air.static is None else nominal.point.position.alt
     if s.aloft_ns is None:
         parked = Ground(parked_height=height)
-        return structs.replace(state, sensors=structs.replace(s, ground=parked, sums=None))
+        return with_sensors(state, ground=parked, sums=None)
     taking_off = not s.ground.flying and record.t_ns - s.aloft_ns < TAKE_OFF_NS
     if taking_off and is_clear(s.ground, height) is False:
         return state  # the ground pushes too
@@ -197,7 +193,7 @@ def _airspeed_from(airspeed: Airspeed, state: State, settings: Settings) -> Stat
 def air_data(state: State, record: AirData, settings: Settings) -> Step:
     """Use airspeed, as driver or as measurement; on the ground it only shows whether the aircraft flies."""
     s = state.sensors
-    state = structs.replace(state, sensors=structs.replace(s, air=air_data_channel.sense(s.air, record)))
+    state = with_sensors(state, air=air_data_channel.sense(s.air, record))
     nominal = state.nominal
     if nominal is None or not settings.config.uses("air_data"):
         return state, []
@@ -215,14 +211,11 @@ def air_data(state: State, record: AirData, settings: Settings) -> Step:
     height = None if s.air.static is None else nominal.point.position.alt
     ground = ground_phase(s.ground, record.t_ns * 1e-9, math.hypot(*V), speed, height)
     state = _sheared(state, ground)
-    s = structs.replace(state.sensors, air_ns=record.t_ns if ground.flying else s.air_ns)
-    state = structs.replace(state, sensors=s)
     if not ground.flying:
         return _straight_on(state, record, settings)
-    state = _airspeed_from("pitot", state, settings)
+    state = _airspeed_from("pitot", with_sensors(state, air_ns=record.t_ns), settings)
     if leads:
-        state = structs.replace(state, sensors=structs.replace(s, steady=record))
-        return _driven(state, record, "air", V, settings)
+        return _driven(with_sensors(state, steady=record), record, "air", V, settings)
     if driver(state) != "imu":
         return state, []
     return _measured(carried(state, record.t_ns, settings), record, V, settings), []
@@ -232,7 +225,7 @@ def _sheared(state: State, ground: Ground) -> State:
     """With another phase of the flight, and with what the wind may have changed with height in it."""
     s, nominal = state.sensors, state.nominal
     sheared = wind_shear(s.ground, ground)
-    state = structs.replace(state, sensors=structs.replace(s, ground=ground))
+    state = with_sensors(state, ground=ground)
     if sheared and nominal is not None and nominal.interval is not None:
         interval = nominal.interval._replace(shear=nominal.interval.shear + sheared)
         state = structs.replace(state, nominal=structs.replace(nominal, interval=interval))
@@ -245,9 +238,9 @@ def _measured(state: State, record: AirData | Attitude | Imu, V: Vector2, settin
     s, v_n = state.sensors, state.nominal.point.v_n
     sums = (s.sums or AirspeedSums(record.t_ns)).with_one((v_n[0], v_n[1]), V)
     if record.t_ns - sums.start_ns < AIRSPEED_EVERY_NS:
-        return structs.replace(state, sensors=structs.replace(s, sums=sums))
+        return with_sensors(state, sums=sums)
     if not isinstance(record, Imu) and not sums.is_one_way:
-        return structs.replace(state, sensors=structs.replace(s, sums=AirspeedSums(record.t_ns)))
+        return with_sensors(state, sums=AirspeedSums(record.t_ns))
     state = propagated(state, settings)
     assert state.bank is not None
     known, n = hypotheses(state, settings), sums.samples
@@ -262,8 +255,9 @@ def _measured(state: State, record: AirData | Attitude | Imu, V: Vector2, settin
         taken = measurements.rotor_drag(
             state.bank, known, _own(settings), V, velocity, manoeuvre, heading, drag
         )
-    sensors = structs.replace(state.sensors, measured_ns=record.t_ns, sums=AirspeedSums(record.t_ns))
-    return decided(structs.replace(state, bank=taken.bank, sensors=sensors), record, settings)
+    state = structs.replace(state, bank=taken.bank)
+    state = with_sensors(state, measured_ns=record.t_ns, sums=AirspeedSums(record.t_ns))
+    return decided(state, record, settings)
 
 
 def _step(s: Sensors, record: AirData) -> Rejection | None:
@@ -299,8 +293,7 @@ def foreign_position(state: State, record: LocalPosition, settings: Settings) ->
     if not config.uses_local_velocity:
         return state, []
     before = s.foreign
-    s = structs.replace(s, foreign=record, foreign_ns=record.t_ns)
-    state = structs.replace(state, sensors=s)
+    state = with_sensors(state, foreign=record, foreign_ns=record.t_ns)
     if state.nominal is None:
         return state, []
     velocity = (record.v_n[0], record.v_n[1])

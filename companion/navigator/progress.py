@@ -28,6 +28,7 @@ from companion.navigator.state import (
     estimate,
     hypotheses,
     is_jammed,
+    with_sensors,
 )
 from companion.records import Gnss, Stamped, Vector2
 from companion.units import SECOND_NS
@@ -158,9 +159,7 @@ def nearer(state: State, settings: Settings) -> State:
     sums = state.sensors.sums
     if sums is not None:  # the samples of airspeed so far are moved with the nominal velocity, not dropped
         mean_sum = (sums.velocity[0] + sums.samples * vn, sums.velocity[1] + sums.samples * ve)
-        state = structs.replace(
-            state, sensors=structs.replace(state.sensors, sums=sums._replace(velocity=mean_sum))
-        )
+        state = with_sensors(state, sums=sums._replace(velocity=mean_sum))
     place = displace(*nominal.point.position, n, e, 0.0)
     v = nominal.point.v_n
     velocity = (v[0] + vn, v[1] + ve)

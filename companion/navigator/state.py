@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from msgspec import Struct
+from msgspec import Struct, structs
 
 from companion.config import Config
 from companion.estimate import bank as banks
@@ -115,6 +115,11 @@ class State(Struct, frozen=True):
 
 
 Step = tuple[State, list[Output]]
+
+
+def with_sensors(state: State, **changes: Any) -> State:
+    """With these fields of `sensors` replaced."""
+    return structs.replace(state, sensors=structs.replace(state.sensors, **changes))
 
 
 def hypotheses(state: State, settings: Settings) -> Hypotheses:
