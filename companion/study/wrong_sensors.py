@@ -74,6 +74,8 @@ WRONG: dict[str, tuple[type[Stamped], Change]] = {
     "heading off by 20 deg": (Attitude, _heading(20.0)),
     "heading off by 45 deg": (Attitude, _heading(45.0)),
     "heading off by 90 deg": (Attitude, _heading(90.0)),
+    "heading off by 180 deg": (Attitude, _heading(180.0)),
+    "heading stuck": (Attitude, lambda r, held, rng: replace(r, heading=held.heading)),
     "attitude stuck while the gyros go on": (
         Attitude,
         lambda r, held, rng: replace(r, roll=held.roll, pitch=held.pitch, heading=held.heading),
