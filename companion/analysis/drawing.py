@@ -21,7 +21,11 @@ TICKS_S = (1.0, 5.0, 10.0, 30.0, 60.0, 120.0, 300.0, 600.0, 1800.0, 3600.0)  # s
 
 def to_page(figure: Figure) -> dict[str, Any]:
     """Convert a figure to the JSON that `web/view.js` draws."""
-    found = figure._asdict() | {"lines": [_line(line) for line in figure.lines]}
+    lines = [_line(line) for line in figure.lines]
+    if figure.origin is None:
+        for line in lines:
+            line["x"] = _apart_at_gaps(line["x"], line["y"])
+    found = figure._asdict() | {"lines": lines}
     found["marks"] = [[round(mark.t, 2), mark.text, mark.warning] for mark in figure.marks]
     found["places"] = [[place.name, round(place.x, 1), round(place.y, 1)] for place in figure.places]
     del found["title"], found["note"]
@@ -57,6 +61,16 @@ def _rounded(a: Floats) -> list[float | None]:
         else float(f"{v:.4g}")
         for v in values
     ]
+
+
+def _apart_at_gaps(x: Sequence[float], y: Sequence[float | None]) -> list[float]:
+    """Return rounded times, no gap at that of a point: the page would draw nothing up to the next."""
+    apart = list(x[:1])
+    for t, before, after in zip(x[1:], y[:-1], y[1:], strict=True):
+        last = apart[-1]
+        meets = t < last or (t == last and (before is None) != (after is None))
+        apart.append(round(last + 0.001, 3) if meets else t)
+    return apart
 
 
 def write_figures(figures: Sequence[Figure], pdf: Path | None, png: Path | None) -> list[Path]:

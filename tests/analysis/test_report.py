@@ -25,7 +25,7 @@ from companion.analysis import assessment as assessing
 from companion.analysis import error_statistics
 from companion.analysis.assessment import assess_flight
 from companion.analysis.convert import convert_log
-from companion.analysis.drawing import write_figures
+from companion.analysis.drawing import to_page, write_figures
 from companion.analysis.figures import build_figures
 from companion.analysis.flight_arrays import collect_flights
 from companion.analysis.flight_events import describe_rejections, event_title, topic_name
@@ -837,6 +837,41 @@ def test_browser_draws_every_plot_without_console_output(page, width, dark, brow
     assert len(browser.evaluate(seconds)) == plots - 1
     assert browser.console == []
     assert [url for url in browser.requests if not url.startswith(("file:", "data:"))] == []
+
+
+@pytest.mark.parametrize(
+    ("x", "y"),
+    [
+        ([1.0, 11.4201, 11.4203, 90.0], [math.nan, math.nan, 2.0, 2.0]),
+        ([1.0, 11.4201, 11.4203, 90.0], [2.0, 2.0, math.nan, math.nan]),
+        ([11.4148, 11.4151, 11.4152, 11.4153], [1.0, math.nan, 1.0, 1.0]),
+    ],
+)
+def test_a_bar_begins_and_ends_beside_a_gap_that_is_a_moment_away(x, y):
+    """The times of the page are rounded. A gap at the time of a point hid the line up to the next one."""
+    line = Line("beacons", np.array(x), np.array(y), ("#000000", "#ffffff"))
+    (drawn,) = to_page(Figure("sources", "Sources", "", [line]))["lines"]
+    assert drawn["y"] == [None if math.isnan(v) else v for v in y]
+    filled = {t for t, v in zip(drawn["x"], drawn["y"], strict=True) if v is not None}
+    assert not filled & {t for t, v in zip(drawn["x"], drawn["y"], strict=True) if v is None}
+    assert drawn["x"] == sorted(drawn["x"]) and drawn["x"] == pytest.approx(x, abs=0.01)
+
+
+@pytest.mark.parametrize("width", [1280, 390])
+def test_names_of_rows_are_not_cut(page, width, browser):
+    browser.open(page.as_uri(), width)
+    browser.wait_for("document.documentElement?.dataset.drawn")
+    room, wanted = browser.evaluate("""(() => {
+        const chart = Group.last.charts.find((c) => c.figure.rows.length);
+        chart.figure.rows[0] = "rejected: GLOBAL_POSITION_INT";
+        chart.plot.destroy();
+        chart.build();
+        const axis = chart.plot.axes[1], ctx = document.createElement("canvas").getContext("2d");
+        ctx.font = axis.font[0];
+        return [axis._size * devicePixelRatio, ctx.measureText(chart.figure.rows[0]).width];
+    })()""")
+    assert wanted > 100.0
+    assert room >= wanted
 
 
 def test_print_has_every_row_of_long_tables(page, browser):

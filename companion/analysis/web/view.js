@@ -61,6 +61,12 @@ class Group {
 }
 Group.count = 0;
 
+function textWidth(text, font) {
+  const ctx = document.createElement("canvas").getContext("2d");
+  ctx.font = font;
+  return ctx.measureText(text).width;
+}
+
 function legendOf(lines, toggle) {
   const legend = element("div", { class: "legend" });
   lines.forEach((line, k) => {
@@ -126,7 +132,8 @@ class Chart {
     else if (figure.zero) y.range = (u, low, high) => [0, Math.max(1, high * 1.1)];
     const decades = (u, splits) => splits.map((v) => (Math.abs(Math.log10(v) % 1) < 1e-6 ? v : null));
     const filtered = figure.log ? { grid: { ...axis.grid, filter: decades }, ticks: { ...axis.ticks, filter: decades } } : {};
-    const widest = Math.max(0, ...rows.map((name) => name.length));
+    const rowFont = narrow ? FONT.replace("12", "10") : FONT;
+    const widest = Math.max(0, ...rows.map((name) => textWidth(name, rowFont)));
     const options = {
       width: Math.max(200, this.box.clientWidth), height: this.height,
       legend: { show: false },
@@ -147,7 +154,7 @@ class Chart {
       axes: [
         { ...axis, incrs: [0.1, 0.5, 1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 18000], space: narrow ? 46 : 60, values: (u, all, i, space, step) => all.map((v) => clock(v, step < 1)), size: 30 },
         rows.length
-          ? { ...axis, splits: () => rows.map((_, k) => k + 1), values: () => rows, size: Math.min(narrow ? 120 : 190, 14 + 6.6 * widest), font: narrow ? FONT.replace("12", "10") : FONT }
+          ? { ...axis, splits: () => rows.map((_, k) => k + 1), values: () => rows, size: Math.min(this.box.clientWidth / 2, 14 + widest), font: rowFont }
           : { ...axis, ...filtered, label: figure.unit, labelSize: 18, labelFont: FONT, labelGap: 0, size: 50, values: (u, all) => all.map((v) => (v === null ? "" : readable(v))) },
       ],
       hooks: {
