@@ -158,11 +158,11 @@ def is_gnss_velocity(source: str) -> bool:
 
 
 def source_title(source: str) -> str:
-    """Return the name of a source of measurements for the user: GNSS 0, beacon 7 azimuth, airspeed."""
-    _, of, source = source.rpartition("velocity of ")
+    """Return the name of a source of measurements for the user: velocity of GNSS 0, beacon 7 azimuth."""
+    what, of, source = source.rpartition(" of ")
     kind, _, rest = source.partition(" ")
     name = {"gnss": "GNSS", "rsbn": "beacon"}.get(kind.lower(), _NAMES.get(kind, kind))
-    return f"{of}{name} {rest}".strip()
+    return f"{what}{of}{name} {rest}".strip()
 
 
 #: Streams of other instruments, or made by the companion.
@@ -347,6 +347,9 @@ _REASONS = {
     "no channel at its time": ("no inertial channel at its time", ""),
     "excluded: false with probability": ("source excluded", "false with probability {value:.4g}"),
     "outlier: normalised squared innovation": ("outlier", "squared innovation {value:.4g} sigma²"),
+    "outlier: innovation, m": ("outlier", "{value:.1f} m off"),
+    "it steps: not used": ("it steps", "by {value:.1f} m/s (limit {limit:.1f} m/s)"),
+    "its altitude steps: not used": ("its altitude steps", "by {value:.1f} m (limit {limit:.1f} m)"),
     "airspeed too low for the speed over ground: not used": (
         "airspeed too low for the speed over ground",
         "{value:.1f} m/s (limit {limit:g} m/s)",

@@ -295,9 +295,8 @@ def _bound_sentences(a: Assessment) -> list[str]:
     useless = [row.phase for row in a.rows if row.bound is not None and not row.useful]
     found = []
     if useless:
-        found.append(
-            f"No useful guaranteed bound in {_count_phases(useless)}, the first “{phase_title(useless[0])}”."
-        )
+        first = f"{', the first' if len(useless) > 1 else ''} “{phase_title(useless[0])}”"
+        found.append(f"No useful guaranteed bound in {_count_phases(useless)}{first}.")
     if judged and not broken:
         where = "that had one" if inside == 1.0 else f"of the {_count_phases(judged)} in which it is of use"
         found.append(f"The guaranteed bound{reached} held at every instant {where}.")

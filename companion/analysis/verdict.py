@@ -73,9 +73,14 @@ def _bound_broken(a: Assessment) -> Verdict | None:
     return Verdict(
         _promise(a),
         f"The guaranteed bound did not hold in the phase “{flight_events.phase_title(worst.phase)}”.",
-        f"{worst.share:.2f} ×",
+        _times_the_limit(worst.share or 0.0),
         f"the bound (r.m.s. {deviation(a)}; limit 1)",
     )
+
+
+def _times_the_limit(share: float) -> str:
+    """Format what is above 1; a little above is not written as 1."""
+    return f"{max(share, 1.01):.2f} ×"
 
 
 def _moments_beyond_bound(a: Assessment) -> Verdict | None:
@@ -113,7 +118,7 @@ def _protection_broken(a: Assessment) -> Verdict | None:
         _promise(a),
         f"The {off} exceeded the protection level at {format_time(ours.t_ns[k] * 1e-9)}: "
         f"{format_length(error[k])} against {format_length(level[k])}.",
-        f"{error[k] / level[k]:.2f} ×",
+        _times_the_limit(error[k] / level[k]),
         "the protection level (limit 1)",
     )
 

@@ -28,7 +28,7 @@ from companion.analysis.convert import convert_log
 from companion.analysis.drawing import to_page, write_figures
 from companion.analysis.figures import build_figures
 from companion.analysis.flight_arrays import collect_flights
-from companion.analysis.flight_events import describe_rejections, event_title, topic_name
+from companion.analysis.flight_events import describe_rejections, event_title, phase_title, topic_name
 from companion.analysis.flights import describe_channel, open_flights
 from companion.analysis.html import ReportBlock, comparison_table, render_report
 from companion.analysis.log_command import group as log_group
@@ -515,6 +515,7 @@ def test_flights_are_compared_in_one_table_and_in_the_same_axes(assessed):
         ({}, "good", "5.0 m", "GNSS was lost for up to 2 min, and the guaranteed bound held in every phase"),
         ({"bound": (3.0, 3.0)}, "fault", "1.18 ×", "The guaranteed bound did not hold"),
         ({"protection": 4.0}, "fault", "1.25 ×", "exceeded the protection level"),
+        ({"protection": 4.99}, "fault", "1.01 ×", "exceeded the protection level"),
         ({"protection": 5.1}, "good", "5.0 m", "held in every phase"),
         (
             {"error": (30.0, 40.0), "ins": (3.0, 4.0), "bound": None},
@@ -542,6 +543,10 @@ def test_phases_without_a_useful_bound_are_counted():
     verdict = judge_flight(dataclasses.replace(a, rows=rows))
     assert verdict.level == "good"
     assert "held in 2 of 3 phases; it was of no use in the others" in verdict.reason
+    text = sentences(dataclasses.replace(a, rows=rows))
+    assert f"No useful guaranteed bound in 1 phase “{phase_title(rows[1].phase)}”." in text
+    text = sentences(dataclasses.replace(a, rows=[rows[1], rows[1]]))
+    assert f"No useful guaranteed bound in 2 phases, the first “{phase_title(rows[1].phase)}”." in text
 
 
 def test_moments_above_the_bound_are_no_fault():
@@ -578,6 +583,36 @@ def test_rejections_have_units_and_a_single_one_is_not_in_the_lead():
         "GNSS 0 rejected once: too late, 260.6 s old (limit 6 s)"
     )
     assert "rejected" not in sentences(a)
+
+
+@pytest.mark.parametrize(
+    ("source", "reason", "numbers", "shown"),
+    [
+        (
+            "height of gnss 0",
+            "outlier: innovation, m",
+            (31.24,),
+            "height of GNSS 0 rejected once: outlier, 31.2 m off",
+        ),
+        (
+            "airspeed",
+            "it steps: not used",
+            (20.0, 10.5),
+            "airspeed rejected once: it steps, by 20.0 m/s (limit 10.5 m/s)",
+        ),
+        (
+            "pressure",
+            "its altitude steps: not used",
+            (900.0, 200.0),
+            "pressure rejected once: its altitude steps, by 900.0 m (limit 200.0 m)",
+        ),
+    ],
+)
+def test_what_is_rejected_is_in_words_with_its_unit(source, reason, numbers, shown):
+    rejected = Rejection(START, START, source, reason, *numbers)
+    kept = [r for r in flight_records() if not isinstance(r, Rejection)]
+    (group,) = collected([*kept, rejected]).groups
+    assert describe_rejections(group) == shown
 
 
 def with_velocity_rejected(number, every_s=0.5, **kind):
