@@ -19,8 +19,8 @@ def write_whole(path: Path, data: bytes) -> None:
     target = Path(os.path.realpath(path))  # `resolve` rejects a link that leads to itself until Python 3.13
     part = target.with_name(f"{target.name}.part")
     try:
-        if target.exists() and not target.is_file():  # a folder, or a device such as /dev/stdout
-            target.write_bytes(data)
+        if path.exists() and not path.is_file():  # a folder, a device, or a pipe such as /dev/stdout
+            path.write_bytes(data)
             return
         try:
             part.write_bytes(data)

@@ -73,6 +73,7 @@ from companion.records import (
 from companion.storage import flight_log
 from companion.storage.reader import LogError
 from companion.storage.run_metadata import run_metadata
+from companion.write_errors import write_whole
 
 S = 1_000_000_000
 START = 5_000 * S
@@ -1059,6 +1060,15 @@ def test_report_is_written_to_a_device(log):
     pytest.importorskip("jinja2")
     assert CliRunner().invoke(command, [str(log), "-o", os.devnull]).exit_code == 0
     assert not Path(os.devnull).is_file()
+
+
+def test_report_is_written_to_a_pipe():
+    """`-o /dev/stdout | gzip`: the link of a pipe resolves to a name that no file has."""
+    reader, writer = os.pipe()
+    with os.fdopen(reader, "rb") as pipe:
+        write_whole(Path(f"/dev/fd/{writer}"), b"page")
+        os.close(writer)
+        assert pipe.read() == b"page"
 
 
 def test_log_that_is_not_closed_has_no_unreadable_bytes(log, tmp_path):
