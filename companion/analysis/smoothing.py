@@ -37,7 +37,7 @@ from companion.estimate import bank as banks
 from companion.estimate.bank import Bank, Jump
 from companion.estimate.linear_system import LinearSystem
 from companion.estimate.smoother import rts_backward, two_point
-from companion.nav.geometry import displace
+from companion.nav.geometry import displace, separation
 from companion.navigator import (
     INPUTS_USED,
     Navigator,
@@ -571,9 +571,7 @@ def _interval(state: State) -> own_error_model.Interval | None:
 
 def _moved(before: Point, after: Point) -> Floats:
     """How far the nominal trajectory was moved at once: north, east (m), velocity north, east (m/s)."""
-    a, b = before.position, after.position
-    one = displace(*a, 1e3, 1e3, 0.0)  # `displace` is linear
-    north, east = 1e3 * (b.lat - a.lat) / (one.lat - a.lat), 1e3 * (b.lon - a.lon) / (one.lon - a.lon)
+    north, east, _ = separation(after.position, before.position)
     return np.array((north, east, after.v_n[0] - before.v_n[0], after.v_n[1] - before.v_n[1]))
 
 

@@ -307,6 +307,15 @@ def test_a_step_of_time_widens_the_position_in_both_directions() -> None:
     assert wider.max() > 1.05 and wider.min() > 0.999
 
 
+@pytest.mark.parametrize("lon", [math.radians(149.0), math.pi - 1e-6])
+def test_a_correction_of_the_channel_is_the_same_across_the_antimeridian(lon: float) -> None:
+    """Without the wrap the smoothed track was 60 m off there, and not that of the two-point problem."""
+    before = Geodetic(-0.6, lon, 500.0)
+    after = displace(*before, -70.0, 30.0, 0.0)
+    moved = smoothing._moved(Point(0, before, (20.0, 1.0, 0.0)), Point(0, after, (19.0, 3.0, 0.0)))
+    assert moved.tolist() == pytest.approx([-70.0, 30.0, -1.0, 2.0], abs=1e-6)
+
+
 def test_nothing_to_smooth_is_reported_in_one_sentence() -> None:
     with pytest.raises(ValueError, match="nothing to smooth: the records need"):
         smooth_flight([r for r in flight(20, (0, 20)).records], CONFIG)
