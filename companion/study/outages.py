@@ -71,7 +71,7 @@ class Fixes:
         fixes = {r.t_ns: r for r in records if isinstance(r, Gnss) and r.has_3d_fix}
         found = [fixes[t_ns] for t_ns in sorted(fixes)]
         self.t_ns = np.array([r.t_ns for r in found])
-        self.lat, self.lon = np.array([r.lat for r in found]), np.array([r.lon for r in found])
+        self.lat, self.lon = np.array([r.lat for r in found]), np.unwrap([r.lon for r in found])
         moving = [(r.t_ns, r.v_n[0], r.v_n[1]) for r in found if r.v_n is not None]
         columns: Floats = np.array(moving, dtype=np.float64).reshape(-1, 3).T
         self.v_t_ns, self.v_n, self.v_e = columns
@@ -292,7 +292,8 @@ def command(
     if as_json:
         click.echo(json.dumps([row._asdict() for row in rows]))
         return
-    title = f"Error after an outage of GNSS, m r.m.s. of {rows[0].outages} outages"
+    number = rows[0].outages
+    title = f"Error after an outage of GNSS, m r.m.s. of {number} outage{'s' * (number != 1)}"
     heads = "s", "companion", "worst", "within 2 sigma", "by airspeed and wind", "straight on"
     table = number_table(title, *heads, texts=0, caption=note)
     for row in rows:

@@ -16,7 +16,7 @@ from msgspec.structs import replace
 from companion.command_line import cli
 from companion.config import load
 from companion.importers.sources import open_source
-from companion.nav.geometry import Geodetic, displace
+from companion.nav.geometry import Geodetic, displace, separation
 from companion.records import AirData, AirspeedSensor, Attitude, Gnss, Stamped, Vehicle
 from companion.storage.reader import LogError
 from companion.study import outages
@@ -59,6 +59,14 @@ def test_rules_and_companion_on_a_flight_that_is_known() -> None:
         assert row.straight_on_m == pytest.approx(math.hypot(true[0] - arc, true[1]), rel=0.02)
         assert row.rms_m is not None and row.rms_m < 10.0
         assert row.within is not None and row.within > 0.9
+
+
+def test_positions_between_fixes_cross_the_antimeridian() -> None:
+    first, second = (record for record in circling(0.3) if isinstance(record, Gnss))
+    lon = math.pi - 1e-7
+    fixes = outages.Fixes([replace(first, lon=lon), replace(second, lon=-lon)])
+    between = fixes.at((first.t_ns + second.t_ns) / 2)
+    assert separation(between, Geodetic(between.lat, math.pi, 0.0))[1] == pytest.approx(0.0, abs=0.01)
 
 
 def test_no_outage_where_the_recorded_gnss_was_lost() -> None:
