@@ -88,7 +88,8 @@ def describe_channel(config: Config, sensors: Set[str]) -> str:
         if name in sensors and config.uses(name) and (name == "local_position" or "attitude" in sensors)
     ]
     if config.has_own_ins or not used:
-        return "The log has nothing for an inertial channel."
+        kept = "" if config.has_own_ins else " The last velocity is kept from fix to fix."
+        return f"The log has nothing for an inertial channel.{kept}"
     *others, last = (["attitude"] if "attitude" in sensors else []) + [SENSORS[name] for name in used]
     by = f"{', '.join(others)} and {last}" if others else last
     return f"The inertial channel is the companion's own, by the autopilot's {by}."

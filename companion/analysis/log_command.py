@@ -128,6 +128,8 @@ def export_command(log: Path, output: Path, every_s: float, config_file: Path | 
         places += [place for place in beacons if place not in places]
         k, n = flight.part
         tracks += [line._replace(name=f"flight {k}: {line.name}" if n > 1 else line.name) for line in lines]
+    if not tracks and not places:
+        raise LogError(f"{log} has no position, so there is no map: `companion report` names what is missing")
     export.write_map(output, log.name, tracks, places)
     click.echo(f"{output}: {len(tracks)} tracks, {len(places)} beacons")
 

@@ -144,6 +144,16 @@ def test_unknown_suffix_is_reported_in_one_sentence(tmp_path):
         export.write_map(tmp_path / "x.gpx", "m", [])
 
 
+def test_a_log_without_a_position_has_no_map(tmp_path):
+    """It was an empty file, and the exit code 0."""
+    log, out = tmp_path / "f.mcap", tmp_path / "f.kml"
+    with flight_log.Writer(log, metadata=run_metadata(Config()), start_unix_ns=10**18, start_ns=0) as sink:
+        sink.record(Reboot(10**9, 10**9, 10**9))
+    found = CliRunner().invoke(group, ["export", str(log), "-o", str(out)])
+    assert isinstance(found.exception, LogError) and "has no position" in str(found.exception)
+    assert not out.exists()
+
+
 def test_missing_folder_is_named(tmp_path):
     with pytest.raises(LogError, match=r"x\.kml cannot be written: no folder .*none$"):
         export.write_map(tmp_path / "none" / "x.kml", "m", [])

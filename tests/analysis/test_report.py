@@ -1136,6 +1136,7 @@ def test_converted_log_is_reported_as_the_original(tmp_path):
         ("local_position", {}, "by the autopilot's velocity, which may depend"),
         ("imu air_data", {}, "has nothing for an inertial channel."),
         ("attitude", {}, "has nothing for an inertial channel."),
+        ("attitude", {}, "The last velocity is kept from fix to fix."),
         ("attitude imu", {"inertial.independent": True}, "has nothing for an inertial channel."),
         ("local_position", {"inertial.independent": True}, "is the local position of an INS of its own."),
     ],
