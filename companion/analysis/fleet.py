@@ -293,8 +293,9 @@ def command(
         )
     if (package := first_missing("pyarrow", "jinja2")) is not None:
         raise LogError(missing_package("a table of flights", package, "fleet"))
+    config = load(config_file)
     try:
-        fleet = Fleet(results, load(config_file), scheduler, workers)
+        fleet = Fleet(results, config, scheduler, workers)
         with show_count() as progress:
             rows = fleet.report(fleet.assess(logs, progress), reports, progress)
     except ValueError as error:

@@ -18,7 +18,10 @@ if TYPE_CHECKING:
 SHOWN = 1000
 POLICY = "default-src 'none'; style-src 'unsafe-inline'"
 HEADS = ("flight", "verdict", "start, UTC", "lasts", "longest without GNSS")
-MORE_HEADS = ("largest error", "r.m.s.", "INS alone", "bound held in phases", "rejected", "warnings")
+MORE_HEADS = (
+    *("largest error", "r.m.s.", "largest, inertial channel alone"),
+    *("bound held in phases", "rejected", "warnings"),
+)
 
 
 def render_page(rows: Sequence[FlightRow]) -> str:

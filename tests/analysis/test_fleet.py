@@ -18,7 +18,7 @@ from companion import optional_dependencies
 from companion.analysis import fleet, jobs
 from companion.analysis.fleet import FlightRow
 from companion.analysis.fleet_page import render_page
-from companion.config import Config
+from companion.config import Config, ConfigError
 from companion.link import dialect, frame
 from companion.storage.reader import LogError
 from sitl.endurance import sample_logs
@@ -113,6 +113,14 @@ def test_another_configuration_assesses_the_logs_again(logs: Path, tmp_path: Pat
     assert len((results / fleet.JOURNAL).read_text().splitlines()) == 2 * 3
 
 
+def test_an_invalid_configuration_ends_as_in_other_commands(logs: Path, tmp_path: Path) -> None:
+    pytest.importorskip("pyarrow")
+    file = tmp_path / "mine.toml"
+    file.write_text("[gnss]\nsigma_m = -7.5\n")
+    done = CliRunner().invoke(fleet.command, [str(logs), "--config", str(file), "--workers", "0"])
+    assert isinstance(done.exception, ConfigError) and "gnss.sigma_m = -7.5" in str(done.exception)
+
+
 def test_a_configuration_for_logs_of_our_own_is_rejected(tmp_path: Path) -> None:
     (tmp_path / "a.mcap").write_bytes(sample_logs.mcap())
     file = tmp_path / "mine.toml"
@@ -149,7 +157,9 @@ def test_report_of_the_worst_is_linked(logs: Path, tmp_path: Path) -> None:
 
 def test_worst_flight_comes_first_and_text_is_escaped() -> None:
     rows = [
-        FlightRow("x/<!--<script>.mcap", 1, 1, largest_m=3.0, duration_s=60.0, verdict="Good"),
+        FlightRow(
+            "x/<!--<script>.mcap", 1, 1, largest_m=3.0, duration_s=60.0, verdict="Good", ins_largest_m=81.0
+        ),
         FlightRow("unreadable", reason="<b>bad</b>"),
         FlightRow("x/worst.mcap", 1, 1, largest_m=500.0, duration_s=60.0, report="reports/worst.html"),
         FlightRow("x/unknown.mcap", 1, 1, duration_s=60.0),
@@ -160,6 +170,7 @@ def test_worst_flight_comes_first_and_text_is_escaped() -> None:
     page = render_page(ordered)
     assert page.index("worst.mcap") < page.index("&lt;!--&lt;script&gt;.mcap") < page.index("unknown.mcap")
     assert "<td data-label='verdict' class='good'><span title=''>Good</span></td>" in page
+    assert "<td data-label='largest, inertial channel alone'>81.0 m</td>" in page
     assert "<script" not in page and "<b>bad" not in page and "href='reports/worst.html'" in page
 
 
