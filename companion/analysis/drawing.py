@@ -124,7 +124,8 @@ def _paint(figure: Figure, axes: Any) -> None:
             axes.plot(x, y, ".", color=colour, markersize=2.5, alpha=0.7, label=label)
         else:
             style = "--" if line.dash else "-"
-            axes.plot(x, y, style, color=colour, linewidth=0.7 * line.width, label=label)
+            about = {"color": colour, "linewidth": 0.7 * line.width, "label": label}
+            axes.plot(x, y, style, solid_capstyle="butt", **about)  # a bar ends at its last point
     if figure.zero:
         axes.set_ylim(bottom=0.0)
     if figure.view is not None:

@@ -1099,6 +1099,17 @@ def test_long_names_of_lines_leave_room_for_the_plot(tmp_path):
     assert path.stat().st_size
 
 
+def test_bars_of_a_picture_end_at_their_last_points(tmp_path):
+    """The usual cap added 5 s to each end of a bar in a picture of six minutes."""
+    image = pytest.importorskip("matplotlib.image")
+    bar = Line("", np.array([10.0, 40.0]), np.array([2.0, 2.0]), ("#ff0000", "#ff0000"), width=40.0)
+    thin = Line("", np.array([0.0, 50.0]), np.array([1.0, 1.0]), ("#0000ff", "#0000ff"))
+    (path,) = write_figures([Figure("bars", "Bars", "", [bar, thin])], None, tmp_path)
+    red, _, blue = np.moveaxis(image.imread(path)[:, :, :3], -1, 0)
+    wide, long = (np.ptp(np.flatnonzero(k.any(axis=0))) for k in (red - blue > 0.5, blue - red > 0.5))
+    assert wide / long == pytest.approx(30.0 / 50.0, abs=0.01)
+
+
 def test_file_in_place_of_the_folder_of_figures_is_reported(log, tmp_path):
     pytest.importorskip("jinja2")
     pytest.importorskip("matplotlib")
