@@ -80,7 +80,7 @@ def _bound_broken(a: Assessment) -> Verdict | None:
 
 def _times_the_limit(share: float) -> str:
     """Format what is above 1; a little above is not written as 1."""
-    return f"{max(share, 1.01):.2f} ×"
+    return f"{share:.2f} ×" if share >= 1.005 else f"{share:.5f} ×"
 
 
 def _moments_beyond_bound(a: Assessment) -> Verdict | None:
