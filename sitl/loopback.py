@@ -147,6 +147,11 @@ def source_errors(flown: LoopbackFlight) -> dict[str, error_statistics.ErrorSeri
     return error_statistics.horizontal_errors(flown.records, truth_function(flown.autopilot))
 
 
+def error_table(flown: LoopbackFlight) -> list[error_statistics.PhaseErrors]:
+    """Compute the errors of every source in each phase."""
+    return error_statistics.summarize_phases(source_errors(flown), flown_phases(flown))
+
+
 def flown_phases(flown: LoopbackFlight) -> list[error_statistics.FlightPhase]:
     """List the phases. One with fixes starts at the first solution after its first fix."""
     return [_from_first_fix(phase, flown.records) for phase in flown.autopilot.scenario.phases()]

@@ -9,9 +9,9 @@ import pytest
 from click.testing import CliRunner
 
 from companion.analysis import replay
-from companion.analysis.error_statistics import CORRECTED, GNSS, RSBN, summarize_phases
+from companion.analysis.error_statistics import CORRECTED, GNSS, RSBN
 from companion.config import Config
-from sitl.loopback import command, flown_phases, fly_scenario, simulator_config, source_errors
+from sitl.loopback import command, error_table, fly_scenario, simulator_config
 from sitl.scenarios import get_scenario
 
 CONFIG = simulator_config(Config())
@@ -38,7 +38,7 @@ def fly(seed: int) -> tuple[str, list]:
     """Digest of all that was recorded and sent, and error table."""
     log = DigestLog()
     flown = fly_scenario(get_scenario("short", seed=seed), CONFIG, log)
-    return log.digest.hexdigest(), summarize_phases(source_errors(flown), flown_phases(flown))
+    return log.digest.hexdigest(), error_table(flown)
 
 
 @pytest.fixture(scope="module")
