@@ -24,8 +24,10 @@ def reduce(bank: Bank, layout: Layout, settings: Settings) -> Bank:
     more only while it may still be so. A step of the heading kept beside a false GNSS only proves that; with
     one grade left beside a false range, GNSS was blamed for what a coarser INS explains. Two faults at once
     that are less probable than the risk stand behind: with an equal claim they held a third of the rows, and
-    the onsets of a slow lie were lost. A dropped row merges by moments with a row of its label if their
-    weights are alike; else its weight goes to the heaviest of its class.
+    the onsets of a slow lie were lost. So do jumps beside a fault that does not lead, where the quota is the
+    least: those of the wind held all of a range that stepped, no onset was left, and GNSS was blamed. A
+    dropped row merges by moments with a row of its label if their weights are alike; else its weight goes to
+    the heaviest of its class.
 
     Parameters
     ----------
@@ -55,7 +57,7 @@ def reduce(bank: Bank, layout: Layout, settings: Settings) -> Bank:
     keys = list(zip(family.tolist(), label.tolist(), bins.astype(int).tolist()))
     # lists: plain numbers are several times faster than elements of arrays
     logs, since, scales, grade = L.tolist(), bank.since.tolist(), bank.scale.tolist(), bank.grade.tolist()
-    active = (bank.fault != NONE).sum(axis=1).tolist()
+    active, faults = (bank.fault != NONE).sum(axis=1).tolist(), bank.fault.tolist()
     # rank of a row: 0 protected, 1 heaviest of its class, 2 oldest of its class, 3 and 4 others
     rank = [4] * rows
     heaviest: dict[tuple[int, int, int], int] = {}
@@ -88,6 +90,9 @@ def reduce(bank: Bank, layout: Layout, settings: Settings) -> Bank:
         if may_jump and key[0] in whole and (key[0], event) not in jumped:
             jumped.add((key[0], event))
             rank[i] = 0
+        beside = event >= first_jump and key[0] not in whole and active[i] == 1
+        if rank[i] == 1 and beside and _quota(layout, faults[i]) == len(layout.grades) + 1:
+            rank[i] = 2
         alive = key[0] == 0 or logs[i] >= settings.class_floor
         if alive and (active[i] <= 1 or key[0] in whole) and (key[0], grade[i]) not in graded:
             graded.add((key[0], grade[i]))
@@ -109,7 +114,6 @@ def reduce(bank: Bank, layout: Layout, settings: Settings) -> Bank:
             rank[i] = 0
     # quotas: the rows of a family beyond its quota rank behind all others
     used: dict[int, int] = {}
-    faults = bank.fault.tolist()
     score = []
     for i in sorted(range(rows), key=lambda i: (rank[i], place[i])):
         f = keys[i][0]
