@@ -12,7 +12,7 @@ import pytest
 
 from companion.analysis import smoothing
 from companion.analysis.smoothing import SmoothedRun, smooth_flight
-from companion.config import Config, InertialConfig, load
+from companion.config import Config, GnssConfig, InertialConfig, load
 from companion.nav.geometry import (
     Geodetic,
     displace,
@@ -285,6 +285,25 @@ def test_first_pass_decides_as_in_flight_and_makes_no_solutions() -> None:
     assert ours is not None and its is not None
     for name in ("L", "x", "P", "grade", "excluded"):
         assert np.array_equal(getattr(ours, name), getattr(its, name))
+
+
+@pytest.mark.parametrize("latency_s", [0.3, 1.3])
+def test_fixes_that_are_late_as_configured_give_the_same_track(latency_s: float) -> None:
+    """7 m off where what is folded again was followed twice, and the fix too late."""
+    config = msgspec.structs.replace(CONFIG, gnss=GnssConfig(latency_s=latency_s))
+    flown, late_ns = flight(120, (60, 90)), round(latency_s * NS)
+    records = [
+        msgspec.structs.replace(r, t_ns=r.t_ns + late_ns) if isinstance(r, Gnss) else r for r in flown.records
+    ]
+    witness = smoothing._Witness(config)
+    for record in sorted(records, key=lambda r: r.t_ns):
+        witness.handle(record)
+    witness.end()
+    folded = [(f.t_ns, type(f.record)) for f in witness.folded]
+    assert len(folded) == len(set(folded))
+    (found,), plain = smooth_flight(records, config), smoothed(120, (60, 90))
+    np.testing.assert_array_equal(found.t_ns, plain.t_ns)
+    np.testing.assert_array_equal(found.x, plain.x)
 
 
 def test_reboot_starts_a_new_run() -> None:
