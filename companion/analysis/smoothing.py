@@ -343,8 +343,8 @@ class _PlainModel(Model):
         factors = super().kept(bank, Phi)
         if factors is not None:
             (A, B), point = self.asked[-1]
-            D, n = factors[0], len(A)
-            self.asked[-1] = Transition(D[:n, None] * A, D[:n, None] * B * D[:n]), point
+            D, n = factors[0], B.shape[-1]  # of A more where a false airspeed would move the nominal
+            self.asked[-1] = Transition(D[: len(A), None] * A, D[:n, None] * B * D[:n]), point
         return factors
 
 
