@@ -170,7 +170,7 @@ class _Witness(Navigator):
         self._onsets: dict[int, list[_Onset]] = {}  # of each fault, as they came up
         self.beacons: dict[int, Beacon] = {}
         self._last: list[tuple[Bank, Hypotheses] | None] = [None]  # of each run
-        self._open: dict[str, int] = {}
+        self._open: dict[str, _Onset] = {}  # of each source that is false now, as first known
 
     def handle(self, record: Stamped) -> list[Output]:
         """Return the outputs of one more record."""
@@ -219,12 +219,16 @@ class _Witness(Navigator):
 
     def _note_false(self, state: State, bank: Bank, known: Hypotheses, t_ns: int, bank_ns: int) -> None:
         for i, p in enumerate(state.false):
-            name = source_name(i, state)
-            false = bool(bank.excluded[i]) or p > known.settings.suspect
-            if false and (name not in self._open or _holds(bank, known, i)):
-                self._open[name] = bank_ns - _age_ns(bank, known, i)
-            elif not false and name in self._open:
-                self.spans.setdefault(name, []).append((self._open.pop(name), t_ns))
+            name, onset = source_name(i, state), _Onset(bank_ns, bank_ns - _age_ns(bank, known, i))
+            first = self._open.get(name)
+            if bank.excluded[i] or p > known.settings.suspect:
+                if first is None:
+                    self._open[name] = onset
+                elif _holds(bank, known, i) and onset.since_ns <= first.t_ns:  # later: the lie changed
+                    self._open[name] = first._replace(since_ns=onset.since_ns)
+            elif first is not None:
+                del self._open[name]
+                self.spans.setdefault(name, []).append((first.since_ns, t_ns))
 
     def _note_gust(self, state: State, record: Gnss) -> None:
         """Note air and ground velocity, if an airspeed that moves the aircraft is as new as the fix."""
@@ -270,8 +274,8 @@ class _Witness(Navigator):
                     before.append(onset)
 
     def _close(self, t_ns: int) -> None:
-        for name, since in self._open.items():
-            self.spans.setdefault(name, []).append((since, t_ns))
+        for name, onset in self._open.items():
+            self.spans.setdefault(name, []).append((onset.since_ns, t_ns))
         self._open.clear()
 
     def end(self) -> None:
