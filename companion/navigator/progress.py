@@ -62,9 +62,7 @@ def births_due(state: State, settings: Settings) -> bool:
     bank = state.bank
     if bank is None or (state.newborn is not None and state.newborn[0] is bank):
         return False
-    known = settings.model.hypotheses(
-        Situation(len(state.beacons))
-    )  # the intervals are those of any hypotheses
+    known = settings.model.hypotheses(Situation())  # the intervals are those of any
     return banks.births_due(bank, known.settings) or banks.jump_births_due(bank, known.layout, known.settings)
 
 
