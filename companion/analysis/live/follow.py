@@ -37,13 +37,14 @@ class Message(NamedTuple):
 
 
 class FollowedLog:
-    """A log that may still grow. Only complete chunks are read; `ended` when the log was closed.
+    """A log that may still grow. Only complete chunks are read; `ended` when the log was closed, `is_behind`
+    while more of it can be read.
 
     Raises LogError if the file cannot be read or is no MCAP log.
     """
 
     def __init__(self, path: Path) -> None:
-        self.path, self.ended = path, False
+        self.path, self.ended, self.is_behind = path, False, False
         with open_log(path):  # a sentence for the user if it is none
             self._file = path.open("rb", buffering=0)
         self._reader = LogReader(path, self._file, 0)
@@ -53,10 +54,15 @@ class FollowedLog:
         """Close the file."""
         self._file.close()
 
+    def since_write_s(self) -> float:
+        """Return the time since the log was written last; its messages keep the clock of the start."""
+        return max(0.0, time.time() - os.fstat(self._file.fileno()).st_mtime)
+
     def poll(self) -> list[Message]:
         """Return the messages of at most some megabytes of new chunks; may block on the disk."""
         found: list[Message] = []
         reader, start = self._reader, self._reader.end
+        self.is_behind = True
         reader.size = os.fstat(self._file.fileno()).st_size
         for raw in reader.records():
             try:
@@ -68,6 +74,7 @@ class FollowedLog:
                 found.append(Message(channel, message.log_time, message.data))
             if reader.end - start > BLOCK:
                 return found
+        self.is_behind = False
         if not found:
             self.ended = LogReader(self.path, self._file, reader.size).closed
         return found

@@ -30,6 +30,7 @@ STRIP_S, STRIP_STEP_S = 600.0, 0.5
 EVENTS = 200
 SILENT_S = 5.0  # a source is silent after this time
 STALE_S = 3.0  # no solution for so long: the view says so
+NO_DATA, STOPPED = "No data", "Stopped"
 CHI2_95_2 = 5.991
 SUSPECT, EXCLUDED = bank.Settings().suspect, bank.Settings().excluded
 #: Level and title of each `Solution.status_word`; others are a caution by their own name.
@@ -77,9 +78,10 @@ class Strip:
         if not self._rows or t - self._rows[-1][0] >= STRIP_STEP_S:
             self._rows.append((t, math.nan if value is None else value))
 
-    def line(self, name: str, colour: tuple[str, str], **more: Any) -> Line:
-        """Return the strip as a line over time."""
-        t, y = np.array(self._rows, dtype=np.float64).reshape(-1, 2).T
+    def line(self, since: float, name: str, colour: tuple[str, str], **more: Any) -> Line:
+        """Return the strip as a line over time: what is not older than `since` (s)."""
+        rows = [row for row in self._rows if row[0] >= since]
+        t, y = np.array(rows, dtype=np.float64).reshape(-1, 2).T
         return Line(name, t, y, colour, **more)
 
 
@@ -211,27 +213,33 @@ class Scene:
     # -- the page ------------------------------------------------------------------------------------------
 
     def frame(self, behind_s: float | None, ended: bool) -> dict[str, Any]:
-        """Return the whole page. `behind_s`: real time since the newest message (None: playback)."""
+        """Return the whole page. `behind_s`: real time since the log was written last (None: playback)."""
+        now = self.t + (behind_s or 0.0)
+        stopped = ended and behind_s is not None
+        trust = self._trust(now, stopped)
         return {
             "log": self.name,
             "t": round(self.t, 2),
             "behind": None if behind_s is None else round(behind_s, 2),
             "ended": ended,
-            "trust": self._trust(behind_s, ended),
+            "old": trust["word"] in (NO_DATA, STOPPED),
+            "trust": trust,
             "numbers": self._numbers(),
-            "sources": [row._asdict() for row in self._sources()],
+            "sources": [row._asdict() for row in self._sources(now)],
             "events": [[round(t, 1), severity, text] for t, severity, text in reversed(self._events)],
-            "map": self._map(),
+            "map": self._map(now),
             "charts": [to_page(figure) | {"title": figure.title} for figure in self._charts()],
         }
 
-    def _trust(self, behind_s: float | None, ended: bool) -> dict[str, str]:
+    def _trust(self, now: float, stopped: bool) -> dict[str, str]:
+        if stopped:
+            why = f"The companion closed this log {now - self.t:.0f} s ago."
+            return {"level": "caution", "word": STOPPED, "why": why}
         if self._solution is None:
             return {"level": "caution", "word": "No position yet", "why": self._waiting()}
         s, t = self._solution
-        age = self.t - t + (behind_s or 0.0)
-        if age > STALE_S and not ended:
-            return {"level": "fault", "word": "No data", "why": f"The last position is {age:.0f} s old."}
+        if (age := now - t) > STALE_S:
+            return {"level": "fault", "word": NO_DATA, "why": f"The last position is {age:.0f} s old."}
         level, word = NAMED.get(s.status_word, ("caution", s.status_word.capitalize()))
         parts = []
         if s.mode is not Mode.FIXED:
@@ -273,15 +281,14 @@ class Scene:
             ("longitude", f"{math.degrees(s.lon):.5f}°"),
         ]
 
-    def _sources(self) -> Iterator[SourceRow]:
+    def _sources(self, now: float) -> Iterator[SourceRow]:
         """Yield a row for GNSS and for every source that measured; the chart has the same sources."""
         sources = self._solution[0].sources if self._solution else 0
         for key, t in self._measured.items():
-            yield self._row(key, t, bool(sources & BITS[key.rpartition(" ")[2]]))
+            yield self._row(key, None if t is None else now - t, bool(sources & BITS[key.rpartition(" ")[2]]))
 
-    def _row(self, key: str, t: float | None, used: bool) -> SourceRow:
+    def _row(self, key: str, age: float | None, used: bool) -> SourceRow:
         p = self._false.get(key)
-        age = None if t is None else self.t - t
         state, level = ("used", "good") if used else ("not used", "")
         if age is None or age > SILENT_S:
             state, level = "silent", "caution"
@@ -297,13 +304,13 @@ class Scene:
             None if age is None else round(age, 1),
         )
 
-    def _map(self) -> dict[str, Any]:
+    def _map(self, now: float) -> dict[str, Any]:
         lines = [
             self._ins.line("inertial channel alone", COLOURS[error_statistics.INS], width=1.0, dash=True),
             self._received.line("GNSS", COLOURS[error_statistics.GNSS], style="dots"),
             self._fixed.line("estimate", COLOURS[error_statistics.CORRECTED], width=2.0),
             self._lost.line("estimate without fixes", COLOURS["bound"], width=3.0),
-            self._lines_of_position(),
+            self._lines_of_position(now),
             *self._regions(),
         ]
         places = [
@@ -325,13 +332,13 @@ class Scene:
         )  # fmt: skip
         return to_page(figure) | {"aircraft": aircraft, "near": near}
 
-    def _lines_of_position(self) -> Line:
+    def _lines_of_position(self, now: float) -> Line:
         """Return azimuth and range of the beacons that answered lately."""
         xs: list[float] = []
         ys: list[float] = []
         for beacon in self._beacons.values():
             reply, end = beacon.reply, beacon.end
-            if end is None or self.t - beacon.t > SILENT_S:
+            if end is None or now - beacon.t > SILENT_S:
                 continue
             x, y = self._place(reply.lat, reply.lon)
             if reply.azimuth is not None:
@@ -374,50 +381,49 @@ class Scene:
             )
 
     def _charts(self) -> Iterator[Figure]:
+        since = self.t - STRIP_S
         marks = tuple(
-            Mark(t, text, severity <= Severity.WARNING)
-            for t, severity, text in self._events
-            if t >= self.t - STRIP_S
+            Mark(t, text, severity <= Severity.WARNING) for t, severity, text in self._events if t >= since
         )
         yield Figure(
             "size", "How far the position may be off", "m",
             [
-                self._strip("protection").line("protection level", COLOURS["second"], dash=True),
-                self._strip("bound").line("guaranteed bound", COLOURS["bound"], dash=True),
-                self._strip("sigma").line("95 % radius", COLOURS[error_statistics.CORRECTED]),
+                self._strip("protection").line(since, "protection level", COLOURS["second"], dash=True),
+                self._strip("bound").line(since, "guaranteed bound", COLOURS["bound"], dash=True),
+                self._strip("sigma").line(since, "95 % radius", COLOURS[error_statistics.CORRECTED]),
             ],
             log=True, marks=marks,
         )  # fmt: skip
         yield Figure(
             "gnss", "Distance of GNSS from the estimate", "m",
-            [self._strip("gnss").line("GNSS", COLOURS[error_statistics.GNSS])],
+            [self._strip("gnss").line(since, "GNSS", COLOURS[error_statistics.GNSS])],
             zero=True, marks=marks,
         )  # fmt: skip
         yield Figure(
             "false",
             "Probability that a source is false",
             "%",
-            list(self._false_lines()),
+            list(self._false_lines(since)),
             view=(0.0, 100.0),
             marks=marks,
         )
         yield Figure(
             "inertial", "Estimated error of the inertial channel", "m",
             [
-                self._strip("error north").line("north", COLOURS[error_statistics.INS]),
-                self._strip("error east").line("east", COLOURS[error_statistics.INS], dash=True),
+                self._strip("error north").line(since, "north", COLOURS[error_statistics.INS]),
+                self._strip("error east").line(since, "east", COLOURS[error_statistics.INS], dash=True),
             ],
             marks=marks,
         )  # fmt: skip
 
-    def _false_lines(self) -> Iterator[Line]:
+    def _false_lines(self, since: float) -> Iterator[Line]:
         gnss = error_statistics.GNSS
         roles = {"gnss": gnss, "velocity of gnss": gnss, "airspeed": "second"}
         for name in self._measured:
             if strip := self._strips.get(f"false {name}"):
                 colour = COLOURS[roles.get(name, error_statistics.RSBN)]
                 dash = name.startswith("velocity") or name.endswith("range")
-                yield strip.line(source_title(name), colour, dash=dash)
+                yield strip.line(since, source_title(name), colour, dash=dash)
 
 
 class SourceRow(NamedTuple):

@@ -97,6 +97,8 @@ class LiveView:
                 self._scene.add(message)
         if self._foxglove is not None:
             self._foxglove.forward(messages)
+        if messages and isinstance(self._source, FollowedLog) and self._source.is_behind:
+            return b""  # what was written since has not been read yet
         now = time.monotonic()
         if not self._clients or not (messages or now >= self._due):
             return b""
@@ -131,11 +133,8 @@ class LiveView:
                 "word": "Waiting for a flight",
                 "why": f"No log is being written in {self._path}.",
             }
-            return msgspec.json.encode({"trust": waiting})
-        played = isinstance(self._source, PlayedLog)
-        behind = None if played else max(0.0, time.time() - self._scene.log_ns * 1e-9)
-        if behind is not None and behind > 86400.0 * 365.0 / 2.0:
-            behind = None  # a flight in virtual time
+            return msgspec.json.encode({"old": True, "trust": waiting})
+        behind = None if isinstance(self._source, PlayedLog) else self._source.since_write_s()
         return msgspec.json.encode(self._scene.frame(behind, self._source.ended))
 
     async def serve(self, client: ServerConnection) -> None:

@@ -8,10 +8,10 @@
 
   function show(frame) {
     last = performance.now();
-    document.body.classList.remove("gone");
+    document.body.classList.toggle("gone", frame.old);
     trust(frame.trust.level, frame.trust.word, frame.trust.why);
     status.frames = Number(status.frames || 0) + 1;
-    if (frame.log === undefined) return;
+    if (frame.log === undefined) { get("when").textContent = ""; return; }
     status.t = frame.t;
     status.behind = frame.behind ?? "";
     get("log").textContent = frame.log;

@@ -451,7 +451,12 @@ class Plan {
     const inside = px > 8 && py > 8 && px < this.width - 8 && py < this.height - 8;
     ctx.fillStyle = css("--good");
     ctx.beginPath();
-    if (inside) { ctx.moveTo(px, py - 8); ctx.lineTo(px + 7, py + 5); ctx.lineTo(px - 7, py + 5); ctx.fill(); this.text(ctx, name, px + 10, py + 4); return; }
+    if (inside) {
+      ctx.moveTo(px, py - 8); ctx.lineTo(px + 7, py + 5); ctx.lineTo(px - 7, py + 5); ctx.fill();
+      const room = ctx.measureText(name).width;
+      this.text(ctx, name, px + 10 + room < this.width - 50 ? px + 10 : px - 10 - room, py + 4);  // clear of the edge and the buttons
+      return;
+    }
     const dx = px - this.width / 2, dy = py - this.height / 2;
     const k = Math.min((this.width / 2 - 22) / Math.abs(dx || 1e-9), (this.height / 2 - 22) / Math.abs(dy || 1e-9));
     px = this.width / 2 + dx * k; py = this.height / 2 + dy * k;

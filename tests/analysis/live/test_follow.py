@@ -105,6 +105,30 @@ def test_a_finished_log_plays_at_its_pace(tmp_path, monkeypatch):
     source.close()
 
 
+def test_a_log_is_as_old_as_its_last_write(tmp_path, monkeypatch):
+    """Its messages have the clock of its start, which may have been years off: no battery keeps it."""
+    path = tmp_path / "f.mcap"
+    with writer(path) as log:
+        write(log, 0, 10)
+    source = FollowedLog(path)
+    monkeypatch.setattr(time, "time", lambda: path.stat().st_mtime + 7.0)
+    assert source.since_write_s() == 7.0
+    source.close()
+
+
+def test_a_long_log_is_behind_until_all_of_it_is_read(tmp_path, monkeypatch):
+    path, states = tmp_path / "f.mcap", []
+    monkeypatch.setattr("companion.analysis.live.follow.BLOCK", 2000)
+    with writer(path, chunk_bytes=1000) as log:
+        write(log, 0, 400)
+    source = FollowedLog(path)
+    while not source.ended:
+        source.poll()
+        states.append(source.is_behind)
+    assert states[0] and states == sorted(states, reverse=True) and not states[-1]
+    source.close()
+
+
 def test_what_is_to_be_shown_is_found(tmp_path):
     assert find_log(tmp_path) is None
     (tmp_path / "00001-x.mcap").write_bytes(b"x")

@@ -92,6 +92,47 @@ def test_trust_is_a_word(more, behind, level, word):
     assert (found["level"], found["word"]) == (level, word)
 
 
+def test_a_log_that_was_closed_trusts_nothing():
+    """The companion was stopped in flight: the page went on with "Trusted"."""
+    scene = Scene("x")
+    scene.add(message(solution(1.0)))
+    frame = scene.frame(20.0, True)
+    assert frame["old"] and frame["trust"] == {
+        "level": "caution",
+        "word": "Stopped",
+        "why": "The companion closed this log 20 s ago.",
+    }
+    played = scene.frame(None, True)
+    assert (played["old"], played["trust"]["word"]) == (False, "Trusted")
+
+
+def test_sources_grow_old_with_a_log_that_is_not_written():
+    """The companion is killed, which no record states."""
+    scene = Scene("x")
+    scene.add(message(Gnss(S, S, 0, 1, 3, LAT, LON, 300.0)))
+    scene.add(message(RsbnFix(S, S, 7, LAT, LON, 0.0, math.pi / 2, 5000.0, 0.002, 100.0)))
+    scene.add(message(solution(1.0, sources=1 | 2 | 4 | 8)))
+    for behind, state, ends in ((0.5, "used", 29), (30.0, "silent", 0)):
+        frame = scene.frame(behind, False)
+        assert {(row["state"], row["age"]) for row in frame["sources"]} == {(state, behind)}
+        (line,) = (line for line in frame["map"]["lines"] if line["name"] == "lines of position")
+        assert (frame["old"], len(line["x"])) == (not ends, ends)
+
+
+def test_charts_are_of_the_last_ten_minutes():
+    """What is seldom, or is received no more, does not stretch them."""
+    scene = Scene("x")
+    for k in range(1500):
+        false = (("gnss", 0.01),) if k % 2 else ()
+        scene.add(message(solution(k, false_sources=false)))
+        if k < 60:
+            scene.add(message(Gnss(k * S, k * S, 0, k + 1, 3, LAT, LON, 300.0)))
+    charts = {chart["key"]: chart["lines"] for chart in scene.frame(0.1, False)["charts"]}
+    assert charts["gnss"][0]["x"] == []
+    starts = [line["x"][0] for key in ("size", "false", "inertial") for line in charts[key]]
+    assert starts == pytest.approx([1499.0 - 600.0] * len(starts), abs=1.0)
+
+
 def test_nothing_is_trusted_before_a_position():
     trust = Scene("x").frame(0.1, False)["trust"]
     assert (trust["level"], trust["word"], trust["why"]) == (
