@@ -85,7 +85,13 @@ def convert_command(source: Path, output: Path, config_file: Path | None) -> Non
 @group.command("export")
 @click.argument("log", type=INPUT_PATH)
 @click.option(
-    "-o", "--output", type=click.Path(path_type=Path), required=True, help="File to write: .geojson or .kml."
+    "-o",
+    "--output",
+    "outputs",
+    multiple=True,
+    type=click.Path(path_type=Path),
+    required=True,
+    help="File to write, may be repeated: .geojson or .kml.",
 )
 @click.option(
     "--every",
@@ -101,20 +107,22 @@ def convert_command(source: Path, output: Path, config_file: Path | None) -> Non
     type=click.Path(path_type=Path),
     help="Configuration for the log of another recorder.",
 )
-def export_command(log: Path, output: Path, every_s: float, config_file: Path | None) -> None:
+def export_command(log: Path, outputs: tuple[Path, ...], every_s: float, config_file: Path | None) -> None:
     """Export the map of LOG.
 
     It has the estimate by legs with and without fixes, GNSS, truth and beacons.
     """
     from companion.analysis import export
     from companion.analysis.flights import open_flights
-    from companion.analysis.output_guard import reject_any_log, reject_own_input
+    from companion.analysis.output_guard import reject_any_log, reject_own_input, reject_same_output
     from companion.analysis.replay_inputs import has_navigator_outputs
     from companion.config import load
 
-    export.check_suffix(output)
-    reject_own_input(output, log, config_file)
-    reject_any_log(output)
+    for output in outputs:
+        export.check_suffix(output)
+        reject_own_input(output, log, config_file)
+        reject_any_log(output)
+    reject_same_output(outputs)
     if config_file and has_navigator_outputs(log):
         raise LogError(
             f"--config {config_file} has no effect on {log}, which is exported as flown; replay it first:"
@@ -130,8 +138,9 @@ def export_command(log: Path, output: Path, every_s: float, config_file: Path | 
         tracks += [line._replace(name=f"flight {k}: {line.name}" if n > 1 else line.name) for line in lines]
     if not tracks and not places:
         raise LogError(f"{log} has no position, so there is no map: `companion report` names what is missing")
-    export.write_map(output, log.name, tracks, places)
-    click.echo(f"{output}: {len(tracks)} tracks, {len(places)} beacons")
+    for output in outputs:
+        export.write_map(output, log.name, tracks, places)
+        click.echo(f"{output}: {len(tracks)} tracks, {len(places)} beacons")
 
 
 def _print(found: Info) -> None:

@@ -99,8 +99,14 @@ def test_a_flight_is_cut_into_legs_with_and_without_fixes(tmp_path):
                     horizon_s=0.0,
                 )
             )
-    found = CliRunner().invoke(group, ["export", str(log), "-o", str(out)], catch_exceptions=False)
-    assert found.exit_code == 0 and "4 tracks, 1 beacons" in found.output
+    kml = out.with_suffix(".kml")
+    both = ["export", str(log), "-o", str(out), "-o", str(kml)]
+    found = CliRunner().invoke(group, both, catch_exceptions=False)
+    assert found.exit_code == 0
+    assert found.output.splitlines() == [f"{path}: 4 tracks, 1 beacons" for path in (out, kml)]
+    assert kml.read_text().startswith("<?xml")
+    twice = CliRunner().invoke(group, [*both, "-o", str(out)])
+    assert "would be written twice" in str(twice.exception)
     features = {f["properties"]["name"]: f for f in json.loads(out.read_text())["features"]}
     assert set(features) == {"estimate, GNSS", "estimate, no fixes", "GNSS", "beacon 7"}
     lost = features["estimate, no fixes"]
