@@ -168,7 +168,7 @@ def create_replay_log(
     """Create a log made from `log`, which waits for the disk instead of dropping messages, and close it.
 
     If the disk failed for a while and recovered, the number of lost messages is stated on stderr. After an
-    exception the log stays ".active": it is incomplete, and an older log of its name is kept.
+    exception, also Ctrl-C, the log stays ".active", as stderr states: an older log of its name is kept.
     Raises LogError if the disk fails, and unless the name is that of a log: no other command would read it.
     """
     if path.suffix != ".mcap":
@@ -182,6 +182,8 @@ def create_replay_log(
         yield sink
     except BaseException:
         sink.close(finish=False)
+        name = printable(f"{path}{ACTIVE}")
+        click.echo(f"companion: {name} is incomplete: run the command again", err=True)
         raise
     if not sink.close():
         raise LogError(f"{sink.trouble}; {path}{ACTIVE} is incomplete: run the command again")

@@ -264,7 +264,9 @@ def test_replay_that_fails_keeps_the_older_one(tmp_path: Path, monkeypatch: pyte
 
     with monkeypatch.context() as patch:
         patch.setattr(replay.gnss_latency, "glitch_events", interrupt)
-        assert CliRunner().invoke(replay.command, [str(CUT), "-o", str(output)]).exit_code == 1
+        stopped = CliRunner().invoke(replay.command, [str(CUT), "-o", str(output)])
+    assert stopped.exit_code == 1
+    assert f"companion: {output}.active is incomplete: run the command again\n" in stopped.stderr
     assert output.read_bytes() == before
     write = DiskFile.write
 
