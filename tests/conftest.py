@@ -4,7 +4,9 @@ protocol.
 
 from __future__ import annotations
 
+import asyncio
 import gc
+import inspect
 import json
 import os
 import re
@@ -47,6 +49,13 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 def pytest_collection_finish() -> None:
     """Leave the collected tests, which live to the end, out of every later garbage collection."""
     gc.freeze()
+
+
+def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> None:
+    """Run an async test in an event loop, for two minutes at most."""
+    test = pyfuncitem.obj
+    if inspect.iscoroutinefunction(test):
+        pyfuncitem.obj = lambda **arguments: asyncio.run(asyncio.wait_for(test(**arguments), 120.0))
 
 
 @pytest.fixture

@@ -1,12 +1,12 @@
-"""Helpers of tests that use sockets and asyncio: free ports, time limits, waiting for a condition."""
+"""Helpers of tests that use sockets and asyncio: free ports, waiting for a condition."""
 
 from __future__ import annotations
 
 import asyncio
 import itertools
 import socket
-from collections.abc import Callable, Coroutine
-from typing import Any, Protocol
+from collections.abc import Callable
+from typing import Protocol
 
 
 class Readable(Protocol):
@@ -36,16 +36,6 @@ def free_port() -> int:
         mine.detach()  # open until the process ends
         return port
     raise AssertionError("the ports go round")
-
-
-def run(test: Coroutine[Any, Any, None], seconds: float = 120.0) -> None:
-    """Run a test, for `seconds` at most."""
-
-    async def limited() -> None:
-        async with asyncio.timeout(seconds):
-            await test
-
-    asyncio.run(limited())
 
 
 async def until(condition: Callable[[], object], seconds: float = 60.0) -> None:

@@ -10,23 +10,16 @@ import pytest
 from companion.runtime.daemon_thread import run_in_daemon_thread
 
 
-def test_result_arrives_while_the_loop_runs() -> None:
+async def test_result_arrives_while_the_loop_runs() -> None:
     gate = threading.Event()
-
-    async def both() -> str:
-        doing = run_in_daemon_thread(lambda: "done" if gate.wait(30.0) else "late")
-        gate.set()  # only possible if the loop is not blocked
-        return await doing
-
-    assert asyncio.run(both()) == "done"
+    doing = run_in_daemon_thread(lambda: "done" if gate.wait(30.0) else "late")
+    gate.set()  # only possible if the loop is not blocked
+    assert await doing == "done"
 
 
-def test_exception_is_raised_in_the_caller() -> None:
-    async def fail() -> None:
-        await run_in_daemon_thread(lambda: 1 // 0)
-
+async def test_exception_is_raised_in_the_caller() -> None:
     with pytest.raises(ZeroDivisionError):
-        asyncio.run(fail())
+        await run_in_daemon_thread(lambda: 1 // 0)
 
 
 def test_cancelled_work_still_completes() -> None:

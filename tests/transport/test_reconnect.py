@@ -12,21 +12,18 @@ import pytest
 from companion.transport import reconnect
 from companion.transport.address import Address
 from companion.transport.reconnect import CannotListen, back_off, connections
-from tests.network import run, until
+from tests.network import until
 
 
 @pytest.mark.parametrize("kind", ["udpin", "tcpin"])
-def test_port_in_use_is_one_error_without_retry(kind: str) -> None:
-    async def test() -> None:
-        with socket.socket(type=socket.SOCK_DGRAM if kind == "udpin" else socket.SOCK_STREAM) as taken:
-            taken.bind(("127.0.0.1", 0))
-            if kind == "tcpin":
-                taken.listen()
-            address = Address(kind, "127.0.0.1", taken.getsockname()[1])
-            with pytest.raises(CannotListen, match=f"cannot listen on {address}: .*choose another port"):
-                await anext(connections(address, random.random, print))
-
-    run(test())
+async def test_port_in_use_is_one_error_without_retry(kind: str) -> None:
+    with socket.socket(type=socket.SOCK_DGRAM if kind == "udpin" else socket.SOCK_STREAM) as taken:
+        taken.bind(("127.0.0.1", 0))
+        if kind == "tcpin":
+            taken.listen()
+        address = Address(kind, "127.0.0.1", taken.getsockname()[1])
+        with pytest.raises(CannotListen, match=f"cannot listen on {address}: .*choose another port"):
+            await anext(connections(address, random.random, print))
 
 
 def binding(monkeypatch: pytest.MonkeyPatch, *errors: int) -> list[Any]:
@@ -45,48 +42,39 @@ def binding(monkeypatch: pytest.MonkeyPatch, *errors: int) -> list[Any]:
 
 
 @pytest.mark.parametrize("number", [errno.EACCES, errno.EINVAL])
-def test_permanently_unusable_address_is_an_error(monkeypatch: pytest.MonkeyPatch, number: int) -> None:
-    async def test() -> None:
-        called = binding(monkeypatch, number)
-        with pytest.raises(CannotListen, match=rf"{os.strerror(number)}; choose another host or port"):
-            await anext(connections(Address("udpin", "127.0.0.1", 0), random.random, print))
-        assert len(called) == 1
-
-    run(test())
+async def test_permanently_unusable_address_is_an_error(monkeypatch: pytest.MonkeyPatch, number: int) -> None:
+    called = binding(monkeypatch, number)
+    with pytest.raises(CannotListen, match=rf"{os.strerror(number)}; choose another host or port"):
+        await anext(connections(Address("udpin", "127.0.0.1", 0), random.random, print))
+    assert len(called) == 1
 
 
 @pytest.mark.parametrize("kind", ["udpin", "tcpin"])
-def test_address_not_available_yet_is_reported_once_and_retried(
+async def test_address_not_available_yet_is_reported_once_and_retried(
     monkeypatch: pytest.MonkeyPatch, kind: str
 ) -> None:
-    async def test() -> None:
-        reports: list[str] = []
-        called = binding(monkeypatch, *[errno.EADDRNOTAVAIL] * 5)
-        address = Address(kind, "127.0.0.1", 0)
-        links = connections(address, random.random, reports.append)
-        opening = asyncio.ensure_future(anext(links))
-        await until(lambda: len(called) == 6)
-        assert reports == [f"{address}: this computer has no address 127.0.0.1 at present; trying again"]
-        opening.cancel()
-        await asyncio.gather(opening, return_exceptions=True)
-        await links.aclose()
-
-    run(test())
+    reports: list[str] = []
+    called = binding(monkeypatch, *[errno.EADDRNOTAVAIL] * 5)
+    address = Address(kind, "127.0.0.1", 0)
+    links = connections(address, random.random, reports.append)
+    opening = asyncio.ensure_future(anext(links))
+    await until(lambda: len(called) == 6)
+    assert reports == [f"{address}: this computer has no address 127.0.0.1 at present; trying again"]
+    opening.cancel()
+    await asyncio.gather(opening, return_exceptions=True)
+    await links.aclose()
 
 
 @pytest.mark.parametrize("number", [errno.EADDRINUSE, errno.EACCES, errno.EADDRNOTAVAIL])
-def test_failure_to_reopen_is_always_retried(monkeypatch: pytest.MonkeyPatch, number: int) -> None:
-    async def test() -> None:
-        reports: list[str] = []
-        called = binding(monkeypatch, 0, *[number] * 5)
-        links = connections(Address("udpin", "127.0.0.1", 0), random.random, reports.append)
-        (await anext(links)).close()
-        (await anext(links)).close()
-        assert len(called) == 7
-        assert len(reports) == 1 and reports[0].endswith("; trying again")
-        await links.aclose()
-
-    run(test())
+async def test_failure_to_reopen_is_always_retried(monkeypatch: pytest.MonkeyPatch, number: int) -> None:
+    reports: list[str] = []
+    called = binding(monkeypatch, 0, *[number] * 5)
+    links = connections(Address("udpin", "127.0.0.1", 0), random.random, reports.append)
+    (await anext(links)).close()
+    (await anext(links)).close()
+    assert len(called) == 7
+    assert len(reports) == 1 and reports[0].endswith("; trying again")
+    await links.aclose()
 
 
 def test_pauses_double_up_to_their_limit_with_jitter_down_to_a_half() -> None:
@@ -96,19 +84,16 @@ def test_pauses_double_up_to_their_limit_with_jitter_down_to_a_half() -> None:
     assert [next(half) for _ in range(8)] == [p / 2 for p in longest]
 
 
-def test_unknown_host_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
-    async def test() -> None:
-        async def unknown(*_: object, **__: object) -> None:
-            raise socket.gaierror(socket.EAI_NONAME, "Name or service not known")
+async def test_unknown_host_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def unknown(*_: object, **__: object) -> None:
+        raise socket.gaierror(socket.EAI_NONAME, "Name or service not known")
 
-        monkeypatch.setattr(asyncio.get_running_loop(), "getaddrinfo", unknown)
-        reports: list[str] = []
-        waiting = asyncio.ensure_future(
-            anext(connections(Address("tcp", "no.such", 1), lambda: 1.0, reports.append))
-        )
-        await asyncio.sleep(0.5)
-        waiting.cancel()
-        await asyncio.gather(waiting, return_exceptions=True)
-        assert reports == ["tcp:no.such:1: Name or service not known; trying again"]
-
-    run(test())
+    monkeypatch.setattr(asyncio.get_running_loop(), "getaddrinfo", unknown)
+    reports: list[str] = []
+    waiting = asyncio.ensure_future(
+        anext(connections(Address("tcp", "no.such", 1), lambda: 1.0, reports.append))
+    )
+    await asyncio.sleep(0.5)
+    waiting.cancel()
+    await asyncio.gather(waiting, return_exceptions=True)
+    assert reports == ["tcp:no.such:1: Name or service not known; trying again"]

@@ -10,81 +10,72 @@ import pytest
 from companion.transport import connection
 from companion.transport.address import Address
 from companion.transport.reconnect import connect
-from tests.network import free_port, read_exactly, run, until
+from tests.network import free_port, read_exactly, until
 
 
-def test_udp_sends_to_all_peers_and_survives_an_absent_one() -> None:
-    async def test() -> None:
-        early = await connect(Address("udpout", "127.0.0.1", free_port()))
-        for _ in range(3):
-            early.write(b"no peer")
-            await asyncio.sleep(0.01)
-        early.close()
-        server = await connect(Address.parse("udpin:0"))
-        server.write(b"no peer yet")
-        clients = [await connect(Address("udpout", "127.0.0.1", server.port)) for _ in range(3)]
-        for i, client in enumerate(clients):
-            client.write(b"from %d" % i)
-            assert await server.read() == b"from %d" % i
-        clients.pop().close()
-        for _ in range(3):
-            server.write(b"to all")
-        for client in clients:
-            assert await read_exactly(client, 18) == b"to all" * 3
-        for end in (server, *clients):
-            end.close()
-
-    run(test())
+async def test_udp_sends_to_all_peers_and_survives_an_absent_one() -> None:
+    early = await connect(Address("udpout", "127.0.0.1", free_port()))
+    for _ in range(3):
+        early.write(b"no peer")
+        await asyncio.sleep(0.01)
+    early.close()
+    server = await connect(Address.parse("udpin:0"))
+    server.write(b"no peer yet")
+    clients = [await connect(Address("udpout", "127.0.0.1", server.port)) for _ in range(3)]
+    for i, client in enumerate(clients):
+        client.write(b"from %d" % i)
+        assert await server.read() == b"from %d" % i
+    clients.pop().close()
+    for _ in range(3):
+        server.write(b"to all")
+    for client in clients:
+        assert await read_exactly(client, 18) == b"to all" * 3
+    for end in (server, *clients):
+        end.close()
 
 
-def test_burst_of_datagrams_is_read_in_order_with_few_reads(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_burst_of_datagrams_is_read_in_order_with_few_reads(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(connection, "TURN_S", 60.0)  # a busy machine ends turns early
 
-    async def test() -> None:
-        server = await connect(Address.parse("udpin:0"))
-        client = await connect(Address("udpout", "127.0.0.1", server.port))
-        sent = [b"%05d" % i for i in range(200)]
-        for data in sent:
-            client.write(data)
-        reads = 0
-        got = b""
-        while len(got) < 1000:
-            got += await server.read()
-            reads += 1
-        assert got == b"".join(sent)
-        assert reads <= 20
-        server.close()
-        client.close()
-
-    run(test())
+    server = await connect(Address.parse("udpin:0"))
+    client = await connect(Address("udpout", "127.0.0.1", server.port))
+    sent = [b"%05d" % i for i in range(200)]
+    for data in sent:
+        client.write(data)
+    reads = 0
+    got = b""
+    while len(got) < 1000:
+        got += await server.read()
+        reads += 1
+    assert got == b"".join(sent)
+    assert reads <= 20
+    server.close()
+    client.close()
 
 
-def test_datagrams_that_take_long_leave_others_their_turn() -> None:
-    async def test() -> None:
-        server = await connect(Address.parse("udpin:0"))
-        client = await connect(Address("udpout", "127.0.0.1", server.port))
-        loop, in_turn = asyncio.get_running_loop(), [0]  # datagrams taken in each turn of the loop
+async def test_datagrams_that_take_long_leave_others_their_turn() -> None:
+    server = await connect(Address.parse("udpin:0"))
+    client = await connect(Address("udpout", "127.0.0.1", server.port))
+    loop, in_turn = asyncio.get_running_loop(), [0]  # datagrams taken in each turn of the loop
 
-        def begin_turn() -> None:
-            in_turn.append(0)
-            loop.call_soon(begin_turn)
+    def begin_turn() -> None:
+        in_turn.append(0)
+        loop.call_soon(begin_turn)
 
-        def take(data: bytes, sender: object) -> None:
-            in_turn[-1] += 1
-            time.sleep(connection.TURN_S)
+    def take(data: bytes, sender: object) -> None:
+        in_turn[-1] += 1
+        time.sleep(connection.TURN_S)
 
-        begin_turn()
-        delivering = asyncio.ensure_future(server.deliver_to(take))
-        await asyncio.sleep(0)
-        for _ in range(20):
-            client.write(b"datagram")
-        await until(lambda: sum(in_turn) == 20)
-        assert max(in_turn) == 1
-        delivering.cancel()
-        server.close()
-        client.close()
-
-    run(test())
+    begin_turn()
+    delivering = asyncio.ensure_future(server.deliver_to(take))
+    await asyncio.sleep(0)
+    for _ in range(20):
+        client.write(b"datagram")
+    await until(lambda: sum(in_turn) == 20)
+    assert max(in_turn) == 1
+    delivering.cancel()
+    server.close()
+    client.close()
 
 
 def answering(monkeypatch: pytest.MonkeyPatch, *answers: tuple[socket.AddressFamily, str]) -> None:
@@ -94,20 +85,14 @@ def answering(monkeypatch: pytest.MonkeyPatch, *answers: tuple[socket.AddressFam
     monkeypatch.setattr(asyncio.get_running_loop(), "getaddrinfo", getaddrinfo)
 
 
-def test_every_resolved_address_is_tried(monkeypatch: pytest.MonkeyPatch) -> None:
-    async def test() -> None:
-        with socket.create_server(("127.0.0.1", 0)) as server:
-            answering(monkeypatch, *((socket.AF_INET, f"127.0.0.{i}") for i in (3, 2, 1)))
-            link = await connect(Address("tcp", "localhost", server.getsockname()[1]))
-            link.close()
-
-    run(test())
+async def test_every_resolved_address_is_tried(monkeypatch: pytest.MonkeyPatch) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        answering(monkeypatch, *((socket.AF_INET, f"127.0.0.{i}") for i in (3, 2, 1)))
+        link = await connect(Address("tcp", "localhost", server.getsockname()[1]))
+        link.close()
 
 
-def test_first_failure_is_raised_if_no_resolved_address_works(monkeypatch: pytest.MonkeyPatch) -> None:
-    async def test() -> None:
-        answering(monkeypatch, (socket.AF_INET, "127.0.0.1"), (socket.AF_INET, "255.255.255.255"))
-        with pytest.raises(ConnectionRefusedError):
-            await connect(Address("tcp", "localhost", free_port()))
-
-    run(test())
+async def test_first_failure_is_raised_if_no_resolved_address_works(monkeypatch: pytest.MonkeyPatch) -> None:
+    answering(monkeypatch, (socket.AF_INET, "127.0.0.1"), (socket.AF_INET, "255.255.255.255"))
+    with pytest.raises(ConnectionRefusedError):
+        await connect(Address("tcp", "localhost", free_port()))

@@ -16,7 +16,7 @@ from companion.transport.connection import Connection
 from companion.transport.peers import MAX_PEERS, Rank
 from companion.transport.reconnect import connect, connections
 from companion.transport.tcp import PEER_TIMEOUT_S, Listener
-from tests.network import free_port, run, until
+from tests.network import free_port, until
 
 
 @pytest.fixture(autouse=True)
@@ -73,30 +73,27 @@ async def ended(client: Connection) -> None:
             await client.read()
 
 
-def test_tcp_both_ways_and_again_after_a_loss() -> None:
-    async def test() -> None:
-        port = free_port()
-        reports: list[str] = []
-        client = connections(Address("tcp", "127.0.0.1", port), lambda: 1.0, reports.append)
+async def test_tcp_both_ways_and_again_after_a_loss() -> None:
+    port = free_port()
+    reports: list[str] = []
+    client = connections(Address("tcp", "127.0.0.1", port), lambda: 1.0, reports.append)
+    waiting = asyncio.ensure_future(anext(client))
+    await until(lambda: reports)  # no listener yet
+    for turn in (b"one", b"two"):
+        accepting = asyncio.ensure_future(connect(Address("tcpin", "127.0.0.1", port)))
+        near, far = await asyncio.gather(waiting, accepting)
+        near.write(turn)
+        assert await far.read() == turn  # it has accepted: what it writes now reaches a client
+        far.write(turn[::-1])
+        assert await near.read() == turn[::-1]
+        far.close()
+        with pytest.raises(ConnectionError, match=f"tcp:127.0.0.1:{port} was closed by the other side"):
+            await near.read()
         waiting = asyncio.ensure_future(anext(client))
-        await until(lambda: reports)  # no listener yet
-        for turn in (b"one", b"two"):
-            accepting = asyncio.ensure_future(connect(Address("tcpin", "127.0.0.1", port)))
-            near, far = await asyncio.gather(waiting, accepting)
-            near.write(turn)
-            assert await far.read() == turn  # it has accepted: what it writes now reaches a client
-            far.write(turn[::-1])
-            assert await near.read() == turn[::-1]
-            far.close()
-            with pytest.raises(ConnectionError, match=f"tcp:127.0.0.1:{port} was closed by the other side"):
-                await near.read()
-            waiting = asyncio.ensure_future(anext(client))
-        waiting.cancel()
-        await asyncio.gather(waiting, return_exceptions=True)
-        await client.aclose()
-        assert reports[0] == f"tcp:127.0.0.1:{port}: {os.strerror(errno.ECONNREFUSED)}; trying again"
-
-    run(test())
+    waiting.cancel()
+    await asyncio.gather(waiting, return_exceptions=True)
+    await client.aclose()
+    assert reports[0] == f"tcp:127.0.0.1:{port}: {os.strerror(errno.ECONNREFUSED)}; trying again"
 
 
 def option(connection: Connection, name: str) -> int:
@@ -106,157 +103,137 @@ def option(connection: Connection, name: str) -> int:
 
 
 @pytest.mark.skipif(not hasattr(socket, "TCP_USER_TIMEOUT"), reason="as Linux has it")
-def test_lost_peer_detection_is_enabled_on_both_ends() -> None:
+async def test_lost_peer_detection_is_enabled_on_both_ends() -> None:
     """A real loss takes ten seconds and a broken network: only the socket options are checked."""
-
-    async def test() -> None:
-        server = await listen()
-        near = await client_of(server)
-        await until(lambda: bool(server._clients))
-        for end in (near, *server._clients):
-            assert option(end, "TCP_USER_TIMEOUT") == 1000 * PEER_TIMEOUT_S
-            assert option(end, "TCP_KEEPIDLE") + 3 * option(end, "TCP_KEEPINTVL") <= PEER_TIMEOUT_S + 2
-            assert isinstance(end._device, socket.socket)
-            assert end._device.getsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE)
-        near.close()
-        server.close()
-
-    run(test())
+    server = await listen()
+    near = await client_of(server)
+    await until(lambda: bool(server._clients))
+    for end in (near, *server._clients):
+        assert option(end, "TCP_USER_TIMEOUT") == 1000 * PEER_TIMEOUT_S
+        assert option(end, "TCP_KEEPIDLE") + 3 * option(end, "TCP_KEEPINTVL") <= PEER_TIMEOUT_S + 2
+        assert isinstance(end._device, socket.socket)
+        assert end._device.getsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE)
+    near.close()
+    server.close()
 
 
-def test_system_buffers_little_for_a_peer_that_does_not_read() -> None:
-    async def test() -> None:
-        with socket.create_server(("127.0.0.1", 0)) as server:
-            server.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-            near = await connect(Address("tcp", "127.0.0.1", server.getsockname()[1]))
-            far, _ = server.accept()
-            with far:
-                for _ in range(1000):
-                    near.write(bytes(256))
-                    await asyncio.sleep(0)
-                near.close()
-                buffered = 0
-                while data := far.recv(65536):
-                    buffered += len(data)
-        assert buffered < 50_000
-
-    run(test())
+async def test_system_buffers_little_for_a_peer_that_does_not_read() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        server.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        near = await connect(Address("tcp", "127.0.0.1", server.getsockname()[1]))
+        far, _ = server.accept()
+        with far:
+            for _ in range(1000):
+                near.write(bytes(256))
+                await asyncio.sleep(0)
+            near.close()
+            buffered = 0
+            while data := far.recv(65536):
+                buffered += len(data)
+    assert buffered < 50_000
 
 
-def test_all_clients_are_served_and_streams_do_not_mix() -> None:
+async def test_all_clients_are_served_and_streams_do_not_mix() -> None:
     """Eight clients send their bytes one by one, in turn."""
-
-    async def test() -> None:
-        received = Received(server := await listen())
-        clients = [await client_of(server) for _ in range(MAX_PEERS)]
-        sent = [b"frame of %d" % k for k in range(MAX_PEERS)]
-        for at in range(len(sent[0])):
-            for client, data in zip(clients, sent, strict=True):
-                client.write(data[at : at + 1])
-            await asyncio.sleep(0.002)
-        await until(lambda: received.has(*sent))
-        server.write(b"to all")
-        for client in clients:
-            assert await client.read() == b"to all"
-        clients.pop().close()
-        await until(lambda: len(server._clients) == len(clients))
-        server.write(b"again")
-        for client in clients:
-            assert await client.read() == b"again"
-            client.close()
-        await received.close()
-
-    run(test())
+    received = Received(server := await listen())
+    clients = [await client_of(server) for _ in range(MAX_PEERS)]
+    sent = [b"frame of %d" % k for k in range(MAX_PEERS)]
+    for at in range(len(sent[0])):
+        for client, data in zip(clients, sent, strict=True):
+            client.write(data[at : at + 1])
+        await asyncio.sleep(0.002)
+    await until(lambda: received.has(*sent))
+    server.write(b"to all")
+    for client in clients:
+        assert await client.read() == b"to all"
+    clients.pop().close()
+    await until(lambda: len(server._clients) == len(clients))
+    server.write(b"again")
+    for client in clients:
+        assert await client.read() == b"again"
+        client.close()
+    await received.close()
 
 
-def test_a_client_that_only_listens_is_served_and_yields_to_a_valid_frame() -> None:
-    async def test() -> None:
-        received = Received(server := await listen())
-        clients = [await client_of(server) for _ in range(MAX_PEERS)]
-        await until(lambda: len(server._clients) == MAX_PEERS)
-        server.write(b"to all")
-        for client in clients:
-            assert await client.read() == b"to all"
-        for client in clients[1:]:
-            client.write(b"frame")
-        newcomer = await client_of(server)
-        newcomer.write(b"frame of the newcomer")
-        await until(lambda: received.has(b"frame of the newcomer"))
-        await ended(clients[0])
-        server.write(b"next")
-        assert [await client.read() for client in (*clients[1:], newcomer)] == [b"next"] * MAX_PEERS
-        for client in (*clients, newcomer):
-            client.close()
-        await received.close()
-
-    run(test())
+async def test_a_client_that_only_listens_is_served_and_yields_to_a_valid_frame() -> None:
+    received = Received(server := await listen())
+    clients = [await client_of(server) for _ in range(MAX_PEERS)]
+    await until(lambda: len(server._clients) == MAX_PEERS)
+    server.write(b"to all")
+    for client in clients:
+        assert await client.read() == b"to all"
+    for client in clients[1:]:
+        client.write(b"frame")
+    newcomer = await client_of(server)
+    newcomer.write(b"frame of the newcomer")
+    await until(lambda: received.has(b"frame of the newcomer"))
+    await ended(clients[0])
+    server.write(b"next")
+    assert [await client.read() for client in (*clients[1:], newcomer)] == [b"next"] * MAX_PEERS
+    for client in (*clients, newcomer):
+        client.close()
+    await received.close()
 
 
-def test_newcomer_takes_the_place_of_a_silent_client_only_and_the_autopilot_any() -> None:
-    async def test() -> None:
-        received = Received(server := await listen())
-        seconds = 0.0
-        server._places._now = lambda: seconds
-        clients = [await client_of(server) for _ in range(MAX_PEERS)]
-        for client in clients:
-            client.write(b"frame")
-        await until(lambda: len(received.by_sender) == MAX_PEERS)
-        ninth = await client_of(server)
-        ninth.write(b"frame")
-        await ended(ninth)
-        lost = clients.pop(3)  # its network is gone: it neither sends nor closes
-        seconds = tcp.YIELDS_S + 1.0
-        for client in clients:
-            client.write(b"frame")
-        await until(lambda: list(received.by_sender.values()).count(b"frameframe") == len(clients))
-        again = await client_of(server)
-        again.write(b"frame again")
-        await ended(lost)
-        autopilot = await client_of(server)
-        autopilot.write(b"frame of the autopilot")
-        await until(lambda: received.has(b"frame again", b"frame of the autopilot"))
-        await until(lambda: len(server._clients) == MAX_PEERS)
-        server.write(b"to all")
-        assert await autopilot.read() == b"to all"
-        for client in (*clients, lost, ninth, again, autopilot):
-            client.close()
-        await received.close()
-
-    run(test())
+async def test_newcomer_takes_the_place_of_a_silent_client_only_and_the_autopilot_any() -> None:
+    received = Received(server := await listen())
+    seconds = 0.0
+    server._places._now = lambda: seconds
+    clients = [await client_of(server) for _ in range(MAX_PEERS)]
+    for client in clients:
+        client.write(b"frame")
+    await until(lambda: len(received.by_sender) == MAX_PEERS)
+    ninth = await client_of(server)
+    ninth.write(b"frame")
+    await ended(ninth)
+    lost = clients.pop(3)  # its network is gone: it neither sends nor closes
+    seconds = tcp.YIELDS_S + 1.0
+    for client in clients:
+        client.write(b"frame")
+    await until(lambda: list(received.by_sender.values()).count(b"frameframe") == len(clients))
+    again = await client_of(server)
+    again.write(b"frame again")
+    await ended(lost)
+    autopilot = await client_of(server)
+    autopilot.write(b"frame of the autopilot")
+    await until(lambda: received.has(b"frame again", b"frame of the autopilot"))
+    await until(lambda: len(server._clients) == MAX_PEERS)
+    server.write(b"to all")
+    assert await autopilot.read() == b"to all"
+    for client in (*clients, lost, ninth, again, autopilot):
+        client.close()
+    await received.close()
 
 
 @pytest.mark.parametrize("data", [b"", b"junk", b"j" * 4096])
-def test_connections_without_a_frame_do_not_disturb_clients(
+async def test_connections_without_a_frame_do_not_disturb_clients(
     data: bytes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(tcp, "WAIT_S", 0.2)
 
-    async def test() -> None:
-        received = Received(server := await listen())
-        clients = [await client_of(server) for _ in range(MAX_PEERS)]
+    received = Received(server := await listen())
+    clients = [await client_of(server) for _ in range(MAX_PEERS)]
+    for client in clients:
+        client.write(b"frame")
+    await until(lambda: len(received.by_sender) == MAX_PEERS)
+    strangers = []
+    for k in range(200):
+        strangers.append(await client_of(server))
+        strangers[-1].write(data)
+        server.write(b"%03d" % k)
         for client in clients:
-            client.write(b"frame")
-        await until(lambda: len(received.by_sender) == MAX_PEERS)
-        strangers = []
-        for k in range(200):
-            strangers.append(await client_of(server))
-            strangers[-1].write(data)
-            server.write(b"%03d" % k)
-            for client in clients:
-                assert await client.read() == b"%03d" % k
-            assert len(server._clients) <= MAX_PEERS + tcp.MAX_WAITING
-        for stranger in strangers:
-            await ended(stranger)
-        assert len(server._clients) == len(received.by_sender) == MAX_PEERS
-        for client in clients:
-            client.close()
-        await received.close()
-
-    run(test())
+            assert await client.read() == b"%03d" % k
+        assert len(server._clients) <= MAX_PEERS + tcp.MAX_WAITING
+    for stranger in strangers:
+        await ended(stranger)
+    assert len(server._clients) == len(received.by_sender) == MAX_PEERS
+    for client in clients:
+        client.close()
+    await received.close()
 
 
 @pytest.mark.parametrize("number", [17, 40, 200])
-def test_idle_connections_that_hold_on_keep_no_client_with_frames_out(number: int) -> None:
+async def test_idle_connections_that_hold_on_keep_no_client_with_frames_out(number: int) -> None:
     """They connect again whenever they are closed; a client joins, leaves and joins again."""
 
     async def hold_on(server: Listener) -> None:
@@ -267,104 +244,91 @@ def test_idle_connections_that_hold_on_keep_no_client_with_frames_out(number: in
             finally:
                 idle.close()
 
-    async def test() -> None:
-        received = Received(server := await listen())
-        idle = [asyncio.ensure_future(hold_on(server)) for _ in range(number)]
-        await until(lambda: len(server._clients) >= MAX_PEERS)
-        stays = await client_of(server)
-        stays.write(b"frame of one that stays")
-        for turn in (b"frame 1", b"frame 2", b"frame 3"):
-            client = await client_of(server)
-            await asyncio.sleep(0.05)  # as a line does
-            client.write(turn)
-            await until(partial(received.has, b"frame of one that stays", turn))
-            server.write(turn)
-            assert await client.read() == await stays.read() == turn
-            client.close()
-            assert len(server._clients) <= MAX_PEERS + tcp.MAX_WAITING
-        for task in idle:
-            task.cancel()
-        await asyncio.gather(*idle, return_exceptions=True)
-        stays.close()
-        await received.close()
-
-    run(test())
+    received = Received(server := await listen())
+    idle = [asyncio.ensure_future(hold_on(server)) for _ in range(number)]
+    await until(lambda: len(server._clients) >= MAX_PEERS)
+    stays = await client_of(server)
+    stays.write(b"frame of one that stays")
+    for turn in (b"frame 1", b"frame 2", b"frame 3"):
+        client = await client_of(server)
+        await asyncio.sleep(0.05)  # as a line does
+        client.write(turn)
+        await until(partial(received.has, b"frame of one that stays", turn))
+        server.write(turn)
+        assert await client.read() == await stays.read() == turn
+        client.close()
+        assert len(server._clients) <= MAX_PEERS + tcp.MAX_WAITING
+    for task in idle:
+        task.cancel()
+    await asyncio.gather(*idle, return_exceptions=True)
+    stays.close()
+    await received.close()
 
 
-def test_too_many_waiting_clients_close_the_oldest_of_the_host_with_most(
+async def test_too_many_waiting_clients_close_the_oldest_of_the_host_with_most(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(tcp, "MAX_WAITING", 3)
 
-    async def test() -> None:
-        received = Received(server := await listen())
-        established = [await client_of(server) for _ in range(MAX_PEERS)]
-        for client in established:
-            client.write(b"frame")
-        await until(lambda: len(received.by_sender) == MAX_PEERS)
-        waiting = []
-        for k, host in enumerate(["127.0.0.2", "127.0.0.1", "127.0.0.1", "127.0.0.1"]):
-            waiting.append(socket.create_connection(("127.0.0.1", server.port), source_address=(host, 0)))
-            if k < 3:
-                await until(lambda number=MAX_PEERS + k + 1: len(server._clients) == number)
-        waiting[1].settimeout(30.0)
-        assert await asyncio.to_thread(waiting[1].recv, 1) == b""
-        waiting[0].send(b"frame of the oldest")
-        await until(lambda: received.has(b"frame of the oldest"))
-        for client in established:
-            client.close()
-        for sock in waiting:
-            sock.close()
-        await received.close()
-
-    run(test())
-
-
-def test_client_that_does_not_read_delays_no_other() -> None:
-    async def test() -> None:
-        received = Received(server := await listen())
-        reading = await client_of(server)
-        stuck = socket.socket()
-        stuck.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-        with stuck:
-            stuck.connect(("127.0.0.1", server.port))
-            stuck.send(b"frame")
-            reading.write(b"frame")
-            await until(lambda: len(received.by_sender) == 2)
-            for k in range(2000):
-                frame = k.to_bytes(4, "big") * 64
-                server.write(frame)
-                data = b""
-                while len(data) < len(frame):
-                    data += await reading.read()
-                assert data == frame
-            dropped = server.dropped
-            assert dropped > 1000
-        await until(lambda: len(server._clients) == 1)
-        assert server.dropped == dropped
-        reading.close()
-        await received.close()
-
-    run(test())
-
-
-def test_listening_goes_on_after_a_failed_accept(monkeypatch: pytest.MonkeyPatch) -> None:
-    """For example without a free file descriptor."""
-
-    async def test() -> None:
-        server = await listen()
-        real, failures = socket.socket.accept, [errno.EMFILE, errno.ECONNABORTED]
-
-        def accept(sock: socket.socket) -> tuple[socket.socket, Any]:
-            if failures:
-                raise OSError(failures.pop(), "no")
-            return real(sock)
-
-        monkeypatch.setattr(socket.socket, "accept", accept)
-        client = await client_of(server)
+    received = Received(server := await listen())
+    established = [await client_of(server) for _ in range(MAX_PEERS)]
+    for client in established:
         client.write(b"frame")
-        assert await server.read() == b"frame"
+    await until(lambda: len(received.by_sender) == MAX_PEERS)
+    waiting = []
+    for k, host in enumerate(["127.0.0.2", "127.0.0.1", "127.0.0.1", "127.0.0.1"]):
+        waiting.append(socket.create_connection(("127.0.0.1", server.port), source_address=(host, 0)))
+        if k < 3:
+            await until(lambda number=MAX_PEERS + k + 1: len(server._clients) == number)
+    waiting[1].settimeout(30.0)
+    assert await asyncio.to_thread(waiting[1].recv, 1) == b""
+    waiting[0].send(b"frame of the oldest")
+    await until(lambda: received.has(b"frame of the oldest"))
+    for client in established:
         client.close()
-        server.close()
+    for sock in waiting:
+        sock.close()
+    await received.close()
 
-    run(test())
+
+async def test_client_that_does_not_read_delays_no_other() -> None:
+    received = Received(server := await listen())
+    reading = await client_of(server)
+    stuck = socket.socket()
+    stuck.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+    with stuck:
+        stuck.connect(("127.0.0.1", server.port))
+        stuck.send(b"frame")
+        reading.write(b"frame")
+        await until(lambda: len(received.by_sender) == 2)
+        for k in range(2000):
+            frame = k.to_bytes(4, "big") * 64
+            server.write(frame)
+            data = b""
+            while len(data) < len(frame):
+                data += await reading.read()
+            assert data == frame
+        dropped = server.dropped
+        assert dropped > 1000
+    await until(lambda: len(server._clients) == 1)
+    assert server.dropped == dropped
+    reading.close()
+    await received.close()
+
+
+async def test_listening_goes_on_after_a_failed_accept(monkeypatch: pytest.MonkeyPatch) -> None:
+    """For example without a free file descriptor."""
+    server = await listen()
+    real, failures = socket.socket.accept, [errno.EMFILE, errno.ECONNABORTED]
+
+    def accept(sock: socket.socket) -> tuple[socket.socket, Any]:
+        if failures:
+            raise OSError(failures.pop(), "no")
+        return real(sock)
+
+    monkeypatch.setattr(socket.socket, "accept", accept)
+    client = await client_of(server)
+    client.write(b"frame")
+    assert await server.read() == b"frame"
+    client.close()
+    server.close()
