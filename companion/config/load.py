@@ -20,7 +20,7 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_typ
 import msgspec
 
 from companion.config.presets import PRESETS
-from companion.config.schema import Config
+from companion.config.schema import SECTIONS, Config
 from companion.config.validate import find_conflicts, find_mistakes
 
 #: Bytes of a file and dots in a line of it: a dotted key takes memory by the square of its parts (60 kB of
@@ -165,7 +165,7 @@ def _tree(text: str, where: str) -> dict[str, dict[str, Any]]:
     for section, table in tree.items():
         if isinstance(table, dict):
             continue
-        if section in Config.__struct_fields__:
+        if section in SECTIONS:
             raise ConfigError(f"{where}: `{section}` is a section: write [{section}] and its keys below it")
         raise ConfigError(f"{where}: the key `{section}` is in no section{_sections_of(section)}")
     return tree
@@ -186,11 +186,10 @@ def _check_size(size: int, where: str) -> None:
 
 
 def _check_keys(tree: Mapping[str, Mapping[str, Any]], where: str) -> None:
-    sections = Config.__struct_fields__
     for section, table in tree.items():
-        if section not in sections:
-            raise ConfigError(f"{where}: there is no section [{section}]{_nearest(section, sections)}")
-        keys = type(getattr(Config(), section)).__struct_fields__
+        if section not in SECTIONS:
+            raise ConfigError(f"{where}: there is no section [{section}]{_nearest(section, SECTIONS)}")
+        keys = SECTIONS[section].__struct_fields__
         for key in table:
             if key not in keys:
                 raise ConfigError(f"{where}: section [{section}] has no key `{key}`{_nearest(key, keys)}")
@@ -201,21 +200,20 @@ def _did_you_mean(name: str, known: Iterable[str], cutoff: float = 0.5) -> str:
     return f"; did you mean `{close[0]}`?" if close else ""
 
 
-def _nearest(name: str, known: tuple[str, ...]) -> str:
+def _nearest(name: str, known: Iterable[str]) -> str:
     return _did_you_mean(name, known) or f"; it has {', '.join(known)}"
 
 
 def _sections_of(key: str) -> str:
     """Return the advice for a key without its section: every section that has it, or the nearest key."""
-    tables = {name: type(getattr(Config(), name)).__struct_fields__ for name in Config.__struct_fields__}
+    tables = {section: kind.__struct_fields__ for section, kind in SECTIONS.items()}
     close = difflib.get_close_matches(key, sorted({name for names in tables.values() for name in names}), 1)
     found = [f"`{section}.{name}`" for name in close for section in tables if name in tables[section]]
     return f"; did you mean {' or '.join(found)}?" if found else f"; the sections are {', '.join(tables)}"
 
 
 def _nearest_variable(name: str) -> str:
-    tables = {section: type(getattr(Config(), section)) for section in Config.__struct_fields__}
-    known = [f"{PREFIX}{s}__{key}".upper() for s, table in tables.items() for key in table.__struct_fields__]
+    known = [f"{PREFIX}{s}__{key}".upper() for s, kind in SECTIONS.items() for key in kind.__struct_fields__]
     return _did_you_mean(name, known, 0.6) or f"; write it as {PREFIX}SECTION__KEY"
 
 
@@ -269,7 +267,7 @@ def _wanted(kind: Any, value: Any) -> str:
 def _convert(tree: Mapping[str, Mapping[str, Any]], origin: Mapping[tuple[str, str], str]) -> Config:
     sections: dict[str, Any] = {}
     for section, table in tree.items():
-        kind = type(getattr(Config(), section))
+        kind = SECTIONS[section]
         hints = get_type_hints(kind, include_extras=True)
         table = {key: _as_list(value, hints[key]) for key, value in table.items()}
         for key, value in table.items():

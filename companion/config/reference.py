@@ -17,7 +17,7 @@ import msgspec
 
 from companion.config.load import choices
 from companion.config.presets import PRESETS
-from companion.config.schema import Config
+from companion.config.schema import SECTIONS, Config
 
 WIDTH = 100
 #: Advice for a value that follows from a data sheet or a recorded flight.
@@ -297,8 +297,7 @@ class Key(NamedTuple):
 
 def keys() -> Iterator[Key]:
     """Yield all keys in the order of the file."""
-    for section in Config.__struct_fields__:
-        kind = type(getattr(Config(), section))
+    for section, kind in SECTIONS.items():
         hints = get_type_hints(kind, include_extras=True)
         for field in msgspec.structs.fields(kind):
             unit = next((unit for end, unit in UNITS.items() if field.name.endswith(end)), "")
@@ -310,7 +309,7 @@ def keys() -> Iterator[Key]:
 
 def section_summary(section: str) -> str:
     """Return the first paragraph of a section's docstring, on one line."""
-    doc = inspect.getdoc(type(getattr(Config(), section))) or ""
+    doc = inspect.getdoc(SECTIONS[section]) or ""
     return " ".join(doc.partition("\n\n")[0].split())
 
 
@@ -355,7 +354,7 @@ def markdown() -> str:
     for key in keys():
         if key.section != section:
             section = key.section
-            doc = inspect.getdoc(type(getattr(Config(), section))) or ""
+            doc = inspect.getdoc(SECTIONS[section]) or ""
             lines += ["", f"## {section}", "", doc, ""]
             lines += ["| key | default | unit, range | meaning | when to change |", "|---|---|---|---|---|"]
         allowed = ", ".join(part for part in (key.unit, key.allowed) if part)

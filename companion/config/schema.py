@@ -320,3 +320,7 @@ class Config(Section, frozen=True):
     def leading_estimator(self) -> Literal["minimax", "kalman", "restricted", "restrictive"]:
         """The estimator that leads when fixes stop; "auto" is the bank's."""
         return "kalman" if self.estimator.output == "auto" else self.estimator.output
+
+
+#: The type of each section, in the order of the file.
+SECTIONS: Mapping[str, type[Section]] = {field.name: field.type for field in msgspec.structs.fields(Config)}
