@@ -19,6 +19,7 @@ from companion.link.signing import Signing
 from sitl.autopilot import SimulatedAutopilot
 from sitl.scenarios import get_scenario
 from sitl.world import World
+from tests.frames import parsed
 
 SECOND = 1_000_000_000
 STEP = SECOND // 100
@@ -63,9 +64,7 @@ class Bench:
         if self.now >= self.examination.deadline():
             self.examination.poll(self.now)
         for data in self.examination.to_send():
-            found = frame.parse(data)
-            assert isinstance(found, frame.Frame)
-            self.sent.append(found)
+            self.sent.append(parsed(data))
             if passed := self.to_it(data):
                 self.autopilot.receive(passed, self.now)
 
@@ -258,11 +257,10 @@ def test_autopilot_that_drops_unsigned_frames_is_recognised() -> None:
     signing = Signing(bytes(range(32)))
 
     def signed(data: bytes) -> bytes:
-        parsed = frame.parse(data)
-        assert isinstance(parsed, frame.Frame)
-        message = dialect.decode(parsed)
+        unsigned = parsed(data)
+        message = dialect.decode(unsigned)
         sign = lambda raw: signing.sign(raw, 1, bench.now)  # noqa: E731
-        return frame.encode(message, parsed.sequence, parsed.system, parsed.component, sign)
+        return frame.encode(message, unsigned.sequence, unsigned.system, unsigned.component, sign)
 
     bench.to_us, bench.to_it = signed, lambda data: b""
     diagnosis = bench.look()

@@ -10,6 +10,7 @@ from companion.link import dialect, frame
 from companion.link.commands import BURST, CAPABILITIES, RATE_HZ, CommandServer, Result
 from companion.link.rate_limiter import RateLimiter
 from companion.link.session import MessageReceived, Session
+from tests.frames import on_wire
 
 SECOND = 1_000_000_000
 STATUSTEXT, HOME, ODOMETRY, NAVIGATION_STATUS = 253, 242, 331, 180_001
@@ -37,8 +38,7 @@ def ask(
 ) -> list[dialect.Message]:
     values = {f"param{i}": value for i, value in enumerate(params, 1)}
     message = dialect.new(kind, command=command, target_system=system, target_component=component, **values)
-    found = frame.parse(frame.encode(message, 0, 255, 190))
-    assert isinstance(found, frame.Frame)
+    found = on_wire(message, 255, 190)
     replies = to.receive(dialect.decode(found), found, SYSTEM, now, fixed or {})
     for reply in replies:
         frame.encode(reply, 0, SYSTEM, COMPONENT)  # every reply can be encoded

@@ -7,7 +7,7 @@ import pytest
 
 from companion.config import Config
 from companion.link import component_metadata as ftp
-from companion.link import dialect, frame
+from companion.link import dialect
 from companion.link.component_metadata import (
     BURST_PACKETS,
     DATA,
@@ -21,6 +21,7 @@ from companion.link.component_metadata import (
     files,
 )
 from companion.link.parameter_server import parameter_table
+from tests.frames import on_wire
 
 SYSTEM, COMPONENT, SECOND = 1, 191, 1_000_000_000
 LAYOUT = struct.Struct("<HBBBBBxI239s")  # https://mavlink.io/en/services/ftp.html, Payload Format
@@ -39,15 +40,14 @@ class Station:
         request = dialect.new(
             "FILE_TRANSFER_PROTOCOL", target_system=SYSTEM, target_component=component, payload=tuple(packed)
         )
-        received = frame.parse(frame.encode(request, 0, sender, 190))
+        received = on_wire(request, sender, 190)
         return [
             self.read(answer, sender)
             for answer in self.server.receive(dialect.decode(received), received, SYSTEM, self.now)
         ]
 
     def read(self, answer, sender):
-        sent = frame.parse(frame.encode(answer, 0, SYSTEM, COMPONENT))
-        message = dialect.decode(sent)
+        message = dialect.decode(on_wire(answer, SYSTEM, COMPONENT))
         assert (message.target_system, message.target_component) == (sender, 190)
         sequence, session, opcode, size, of, last, at, data = LAYOUT.unpack(bytes(message.payload))
         return (sequence - self.sequence) & 0xFFFF, session, opcode, of, last, at, data[:size]
@@ -118,7 +118,7 @@ def test_a_flood_is_limited_and_another_component_is_not_answered() -> None:
         target_component=COMPONENT,
         payload=(0, 0, 0, 2) + (0,) * 247,
     )
-    received = frame.parse(frame.encode(request, 0, 255, 190))
+    received = on_wire(request, 255, 190)
     answers = [station.server.receive(request, received, SYSTEM, station.now) for _ in range(100)]
     assert sum(map(len, answers)) == REQUESTS_BURST
 

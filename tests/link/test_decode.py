@@ -15,6 +15,7 @@ from companion.link.clock import BootClock
 from companion.link.decode import UERE, Autopilot, Sender, decode
 from companion.link.dialect import mavlink
 from companion.units import G0
+from tests.frames import on_wire
 
 CUT = (pathlib.Path(__file__).parents[1] / "data" / "dronekit_copter_cut.tlog").read_bytes()
 RX = 1_000_000_000_000
@@ -29,8 +30,7 @@ class BootedAt:
 
 
 def decoded(name: str, autopilot: Autopilot = "ardupilot", **fields: Any) -> tuple[r.Stamped, ...]:
-    found = frame.parse(frame.encode(dialect.new(name, **fields), 0, 1, 1))
-    assert isinstance(found, frame.Frame)
+    found = on_wire(dialect.new(name, **fields), 1, 1)
     return decode(dialect.decode(found), RX, Sender(BootedAt(), autopilot))
 
 

@@ -27,17 +27,12 @@ from companion.link.parameter_client import (
     to_wire,
 )
 from companion.link.parameter_server import ParameterServer, parameter_table
+from tests.frames import on_wire
 
 ARDUPILOT, PX4 = 3, 12
 SYSTEM, COMPONENT = 7, 1
 INT8, INT16, INT32 = 2, 4, 6
 REQUEST_READ, SET = 20, 23
-
-
-def on_wire(message: dialect.Message, system: int = SYSTEM, component: int = COMPONENT) -> frame.Frame:
-    found = frame.parse(frame.encode(message, 0, system, component))
-    assert isinstance(found, frame.Frame)
-    return found
 
 
 class Vehicle:
@@ -56,7 +51,7 @@ class Vehicle:
         name = message.param_id
         if name not in self.values:
             if self.errors:
-                return [on_wire(dialect.new("PARAM_ERROR", param_id=name, error=1))]
+                return [on_wire(dialect.new("PARAM_ERROR", param_id=name, error=1), SYSTEM, COMPONENT)]
             return []
         value, kind = self.values[name]
         if found.msgid == SET:
@@ -66,13 +61,8 @@ class Vehicle:
                 self.values[name] = value, kind
         sent = to_wire(value, kind, self.encoding)
         count = len(self.values)
-        return [
-            on_wire(
-                dialect.new(
-                    "PARAM_VALUE", param_id=name, param_value=sent, param_type=kind, param_count=count
-                )
-            )
-        ]
+        fields = {"param_value": sent, "param_type": kind, "param_count": count}
+        return [on_wire(dialect.new("PARAM_VALUE", param_id=name, **fields), SYSTEM, COMPONENT)]
 
 
 def play(
@@ -151,7 +141,8 @@ def test_rejected_change_ends_with_the_value_in_effect() -> None:
     def reject_set(request: frame.Frame) -> list[frame.Frame]:
         if request.msgid == SET:
             message = dialect.decode(request)
-            request = on_wire(dialect.new("PARAM_REQUEST_READ", param_id=message.param_id, param_index=-1))
+            read = dialect.new("PARAM_REQUEST_READ", param_id=message.param_id, param_index=-1)
+            request = on_wire(read, SYSTEM, COMPONENT)
         return vehicle.receive(request)
 
     client.read(["VISO_TYPE"])
@@ -216,9 +207,10 @@ def test_other_components_and_unrequested_parameters_are_ignored() -> None:
     for system, component in ((SYSTEM, 191), (9, COMPONENT)):
         stranger = on_wire(value, system, component)
         assert client.receive(dialect.decode(stranger), stranger) == []
-    other = on_wire(dialect.new("PARAM_VALUE", param_id="STAT_RUNTIME", param_value=5.0, param_type=INT32))
+    runtime = dialect.new("PARAM_VALUE", param_id="STAT_RUNTIME", param_value=5.0, param_type=INT32)
+    other = on_wire(runtime, SYSTEM, COMPONENT)
     assert client.receive(dialect.decode(other), other) == []
-    ours = on_wire(value)
+    ours = on_wire(value, SYSTEM, COMPONENT)
     assert client.receive(dialect.decode(ours), ours) == [("VISO_TYPE", 5, "")]
 
 
@@ -310,6 +302,6 @@ def test_type_that_does_not_fit_four_bytes_is_reported() -> None:
     client = ParameterClient(SYSTEM, COMPONENT, "bytewise")
     client.read(["BIG"])
     client.poll(0)
-    sent = on_wire(dialect.new("PARAM_VALUE", param_id="BIG", param_type=8))
+    sent = on_wire(dialect.new("PARAM_VALUE", param_id="BIG", param_type=8), SYSTEM, COMPONENT)
     (answer,) = client.receive(dialect.decode(sent), sent)
     assert answer.value is None and "type 8" in answer.trouble and client.is_idle

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from companion.config import Config, load, parse
-from companion.link import dialect, frame
+from companion.link import dialect
 from companion.link.parameter_server import (
     DOES_NOT_EXIST,
     OUT_OF_RANGE,
@@ -25,6 +25,7 @@ from companion.link.parameter_server import (
     ParameterServer,
     parameter_table,
 )
+from tests.frames import on_wire
 
 SECOND = 1_000_000_000
 SYSTEM, COMPONENT = 7, 191
@@ -45,18 +46,15 @@ class Station:
 
     def send(self, name: str, system: int = SYSTEM, component: int = COMPONENT, **values: object) -> None:
         message = dialect.new(name, target_system=system, target_component=component, **values)
-        found = frame.parse(frame.encode(message, 0, 255, 190))
-        assert isinstance(found, frame.Frame)
+        found = on_wire(message, 255, 190)
         self.changes += self.parameters.receive(dialect.decode(found), found, SYSTEM, self.now)
 
     def receive_all(self) -> list[dialect.Message]:
         """Return all messages until nothing more is due."""
         received = []
         while True:
-            for message in self.parameters.to_send(self.now):
-                found = frame.parse(frame.encode(message, 0, SYSTEM, COMPONENT))
-                assert isinstance(found, frame.Frame)
-                received.append(dialect.decode(found))
+            sent = self.parameters.to_send(self.now)
+            received += [dialect.decode(on_wire(message, SYSTEM, COMPONENT)) for message in sent]
             if (due := self.parameters.deadline()) is None:
                 return received
             assert due > self.now

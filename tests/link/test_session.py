@@ -24,6 +24,7 @@ from companion.link.session import (
     Session,
     TimesyncOutlier,
 )
+from tests.frames import parsed
 
 MS = 1_000_000
 SECOND = 1000 * MS
@@ -363,8 +364,7 @@ def test_a_parsed_frame_has_the_effects_of_its_bytes() -> None:
     of_bytes, of_frames = Session(), Session()
     seen: set[type] = set()
     for k, data in enumerate(stream):
-        one, now = frame.parse(data), k * 50 * MS
-        assert isinstance(one, frame.Frame)
+        one, now = parsed(data), k * 50 * MS
         events = of_bytes.receive(data, now)
         assert list(map(contents, of_frames.receive_frame(one, now))) == list(map(contents, events))
         seen |= set(map(type, events))

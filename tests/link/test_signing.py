@@ -13,6 +13,7 @@ from companion.link import dialect, frame, signing
 from companion.link.session import FrameRejected, MessageReceived, Session
 from companion.link.signing import AHEAD, BEHIND, LEAD, MAX_TIMESTAMP, SignatureFault, Signing
 from companion.runtime.state_file import replace_text
+from tests.frames import on_wire, parsed
 
 VECTORS = json.loads((pathlib.Path(__file__).parents[1] / "data" / "mavlink_vectors.json").read_text())
 SIGNED = [vector for vector in VECTORS if "key_hex" in vector]
@@ -21,12 +22,6 @@ SECOND = 1_000_000_000  # ns
 TICKS = 100_000  # of a stamp in a second
 NOON_NS = 1_800_000_000 * SECOND  # UNIX
 NOON = (NOON_NS - signing.EPOCH_NS) // 10_000
-
-
-def one(data: bytes) -> frame.Frame:
-    found = frame.parse(data)
-    assert isinstance(found, frame.Frame)
-    return found
 
 
 def signed(
@@ -38,7 +33,9 @@ def signed(
         head = bytes([link]) + stamp.to_bytes(6, "little")
         return head + hashlib.sha256(key + data + head).digest()[:6]
 
-    return one(frame.encode(dialect.new("HEARTBEAT", type=6, mavlink_version=3), 0, system, component, sign))
+    return parsed(
+        frame.encode(dialect.new("HEARTBEAT", type=6, mavlink_version=3), 0, system, component, sign)
+    )
 
 
 def at_noon(**options: object) -> Signing:
@@ -52,7 +49,7 @@ def at_noon(**options: object) -> Signing:
 def test_foreign_signed_frames_are_genuine_with_their_key_only(
     vector: dict[str, str],
 ) -> None:
-    found = one(bytes.fromhex(vector["hex"]))
+    found = parsed(bytes.fromhex(vector["hex"]))
     reason = Signing(bytes.fromhex(vector["key_hex"])).verify(found, 0)
     # one vector has the last timestamp of the 48 bits, after which no other could follow
     assert reason is (SignatureFault.FUTURE if found.raw[-12:-6] == b"\xff" * 6 else None)
@@ -66,7 +63,7 @@ def test_three_vectors_are_signed() -> None:
 @pytest.mark.parametrize("vector", SIGNED[:1], ids=lambda vector: vector["name"])
 def test_signature_equals_that_of_another_implementation(vector: dict[str, str]) -> None:
     raw = bytes.fromhex(vector["hex"])
-    found = one(raw)
+    found = parsed(raw)
     stamp = int.from_bytes(raw[-12:-6], "little")
     signer = Signing(bytes.fromhex(vector["key_hex"]), timestamp=stamp - 1)
     message = dialect.decode(found)
@@ -220,8 +217,8 @@ def test_sent_timestamps_increase_and_follow_the_clock() -> None:
 
 
 def test_unsigned_frames_are_rejected_unless_configured() -> None:
-    heartbeat = one(frame.encode(dialect.new("HEARTBEAT"), 0, 1, 1))
-    radio = one(frame.encode(dialect.new("RADIO_STATUS"), 0, 51, 68))
+    heartbeat = on_wire(dialect.new("HEARTBEAT"), 1, 1)
+    radio = on_wire(dialect.new("RADIO_STATUS"), 51, 68)
     assert at_noon().verify(heartbeat, 0) is SignatureFault.UNSIGNED
     assert at_noon().verify(radio, 0) is None
     assert at_noon(always_accepted=()).verify(radio, 0) is SignatureFault.UNSIGNED
@@ -274,7 +271,7 @@ def test_restarted_peer_is_accepted_at_once() -> None:
 
     def sent(signer: Signing, system: int) -> frame.Frame:
         sign = lambda data: signer.sign(data, 0, SECOND)  # noqa: E731
-        return one(frame.encode(dialect.new("HEARTBEAT"), 0, system, 1, sign))
+        return parsed(frame.encode(dialect.new("HEARTBEAT"), 0, system, 1, sign))
 
     assert here.verify(sent(there, 2), SECOND) is None
     assert there.verify(sent(here, 1), SECOND) is None

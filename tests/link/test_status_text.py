@@ -4,9 +4,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from companion.link import dialect, frame
+from companion.link import dialect
 from companion.link.status_text import BURST, INTERVAL, MAX_LENGTH, StatusText
 from companion.records import Event
+from tests.frames import on_wire
 
 SECOND = 1_000_000_000
 
@@ -16,9 +17,7 @@ def joined(messages: list[dialect.Message]) -> list[tuple[int, str]]:
     texts: list[tuple[int, str]] = []
     parts: dict[int, bytes] = {}
     for message in messages:
-        found = frame.parse(frame.encode(message, 0, 1, 191))
-        assert isinstance(found, frame.Frame)
-        chunk = dialect.decode(found)
+        chunk = dialect.decode(on_wire(message, 1, 191))
         raw = chunk._text_raw
         if chunk.id == 0:
             texts.append((chunk.severity, raw.decode()))

@@ -6,13 +6,13 @@ import pytest
 
 from companion.config import load
 from companion.config.required_parameters import required_parameters
-from companion.link import frame
 from companion.runtime.core import CompanionCore
 from companion.storage.deferred_log import NoLog
 from sitl.autopilot import SimulatedAutopilot
 from sitl.faults import Fault
 from sitl.scenarios import get_scenario
 from sitl.world import World
+from tests.frames import parsed
 
 SECOND = 1_000_000_000
 STEP = SECOND // 50
@@ -53,9 +53,7 @@ class Flight:
             for data in core.to_send("main", now):
                 if not is_deaf:
                     autopilot.receive(data, now)
-                found = frame.parse(data)
-                assert isinstance(found, frame.Frame)
-                self.requests += [found.msgid] if found.msgid in (REQUEST_READ, SET) else []
+                self.requests += {parsed(data).msgid} & {REQUEST_READ, SET}
         self.reports = [event.text for event in core.take_events() if "doctor" in event.text]
         assert autopilot.parameters.values == before and SET not in self.requests
 

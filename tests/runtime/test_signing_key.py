@@ -8,6 +8,7 @@ import pytest
 from companion.link import dialect, frame
 from companion.link.signing import SignatureFault, Signing
 from companion.runtime.signing_key import SET_AFTER_NS, SigningKey, synchronized_time
+from tests.frames import parsed
 
 SECOND, DAY = 10**9, 86_400 * 10**9
 #: GPS time of the autopilot, UNIX nanoseconds.
@@ -18,11 +19,7 @@ KEY = bytes(32)
 def signed_heartbeat(signing: Signing, system: int, now_ns: int) -> frame.Frame:
     """Return a heartbeat signed at `now_ns`, as received."""
     message = dialect.new("HEARTBEAT", type=1, autopilot=3)
-    (found,) = frame.Reader().receive(
-        frame.encode(message, 0, system, 1, lambda data: signing.sign(data, 0, now_ns))
-    )
-    assert isinstance(found, frame.Frame)
-    return found
+    return parsed(frame.encode(message, 0, system, 1, lambda data: signing.sign(data, 0, now_ns)))
 
 
 @pytest.mark.parametrize("behind_ns", [TRUE_NS, 500 * DAY, DAY, -DAY])

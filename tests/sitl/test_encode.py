@@ -5,9 +5,10 @@ import math
 import pytest
 
 from companion import records as r
-from companion.link import dialect, frame
+from companion.link import dialect
 from companion.link.decode import Autopilot, Sender, decode
 from sitl.encode import SimulatedSender, encode
+from tests.frames import on_wire
 
 BOOT = 5_000_000_000
 T = BOOT + 123_456_000_000
@@ -21,8 +22,7 @@ class BootedAt:
 
 
 def encode_and_decode(record: r.Stamped, autopilot: Autopilot) -> tuple[r.Stamped, ...]:
-    found = frame.parse(frame.encode(encode(record, SimulatedSender(autopilot, BOOT)), 0, 1, 1))
-    assert isinstance(found, frame.Frame)
+    found = on_wire(encode(record, SimulatedSender(autopilot, BOOT)), 1, 1)
     return decode(dialect.decode(found), RX, Sender(BootedAt(), autopilot))
 
 
