@@ -483,6 +483,11 @@ class FaultyDisk:
         return getattr(self.disk, name)
 
 
+def log_with_fault(folder, fault, **options):
+    disk = partial(FaultyDisk, fault=fault)
+    return Writer(folder / "x.mcap", metadata={}, fsync_s=0.05, disk=disk, **START, **options)
+
+
 class Blocked:
     """A fault: a write waits from `begin` to `end`; until `works` each one fails, if there is an `error`."""
 
@@ -515,10 +520,7 @@ def test_full_disk_is_reported_and_queued_records_are_not_lost(tmp_path):
     def fault():
         return OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)) if full.is_set() else None
 
-    path = tmp_path / "x.mcap"
-    log = Writer(
-        path, metadata={}, chunk_bytes=500, fsync_s=0.05, disk=lambda p: FaultyDisk(p, fault), **START
-    )
+    log = log_with_fault(tmp_path, fault, chunk_bytes=500)
     written = []
     for phase in range(3):
         full.set() if phase == 1 else full.clear()
@@ -530,7 +532,7 @@ def test_full_disk_is_reported_and_queued_records_are_not_lost(tmp_path):
             assert "No space left on device" in log.trouble
     wait_until(lambda: log.trouble is None)
     assert log.close() and log.dropped == 0
-    assert [e.value for e in read(path)] == written
+    assert [e.value for e in read(tmp_path / "x.mcap")] == written
 
 
 @pytest.mark.parametrize("failures", [1, 2, 5])
@@ -577,15 +579,11 @@ def test_partial_write_that_cannot_be_truncated_is_overwritten(tmp_path, failure
 
 def test_permanently_full_disk_drops_the_oldest_and_counts_them(tmp_path):
     full = threading.Event()
-    log = Writer(
-        tmp_path / "x.mcap",
-        metadata={},
-        chunk_bytes=500,
-        fsync_s=0.05,
-        depth=2000,
-        disk=lambda p: FaultyDisk(p, lambda: OSError(errno.EIO, "broken") if full.is_set() else None),
-        **START,
-    )
+
+    def fault():
+        return OSError(errno.EIO, "broken") if full.is_set() else None
+
+    log = log_with_fault(tmp_path, fault, chunk_bytes=500, depth=2000)
     full.set()
     for i in range(500):
         log.record(imu(i))
@@ -601,15 +599,7 @@ def test_permanently_full_disk_drops_the_oldest_and_counts_them(tmp_path):
 def test_chunk_that_is_being_written_is_the_oldest_and_is_dropped_first(tmp_path, fails):
     """The disk is blocked while the queue overflows. If it then fails, what is kept is without a gap."""
     blocked = Blocked(OSError(errno.EIO, "broken") if fails else None)
-    log = Writer(
-        tmp_path / "x.mcap",
-        metadata={},
-        chunk_bytes=500,
-        fsync_s=0.05,
-        depth=2000,
-        disk=lambda p: FaultyDisk(p, blocked),
-        **START,
-    )
+    log = log_with_fault(tmp_path, blocked, chunk_bytes=500, depth=2000)
     blocked.begin(log)
     for i in range(1, 500):
         log.record(imu(i))
@@ -626,13 +616,7 @@ def test_chunk_that_is_being_written_is_the_oldest_and_is_dropped_first(tmp_path
 
 def test_failed_disk_leaves_a_recoverable_log(tmp_path):
     full = threading.Event()
-    log = Writer(
-        tmp_path / "x.mcap",
-        metadata={},
-        fsync_s=0.05,
-        disk=lambda p: FaultyDisk(p, lambda: OSError(errno.ENOSPC, "full") if full.is_set() else None),
-        **START,
-    )
+    log = log_with_fault(tmp_path, lambda: OSError(errno.ENOSPC, "full") if full.is_set() else None)
     log.record(imu(0))
     wait_until(lambda: info(tmp_path / "x.mcap.active").messages == 1)
     full.set()
@@ -646,14 +630,7 @@ def test_failed_disk_leaves_a_recoverable_log(tmp_path):
 def test_slow_disk_does_not_block_the_caller(tmp_path):
     """The disk is blocked until after the last record; no call of the writer waits for it."""
     blocked = Blocked()
-    log = Writer(
-        tmp_path / "x.mcap",
-        metadata={},
-        chunk_bytes=2000,
-        fsync_s=0.05,
-        disk=lambda p: FaultyDisk(p, blocked),
-        **START,
-    )
+    log = log_with_fault(tmp_path, blocked, chunk_bytes=2000)
     blocked.begin(log)
     i = 1000
     for k in range(1, i):
