@@ -18,9 +18,10 @@ from companion.link.parameter_server import parameter_table
 from companion.navigator import own_channel
 from companion.output import source_switch
 from companion.output.gate import MAX_AGE_S, withholding_reason
-from companion.records import Mode, Solution, Trust
+from companion.records import Trust
 from companion.runtime.links import requested_rates
 from companion.units import SECOND_NS
+from tests.solutions import solution_at
 
 ROOT = Path(__file__).parents[1]
 PAGES = {path.stem: path.read_text() for path in (ROOT / "docs").glob("*.md")}
@@ -89,17 +90,9 @@ def test_link_budget_in_docs(page: str) -> None:
 
 @pytest.mark.parametrize("trust", list(Trust))
 def test_trust_table_in_docs_matches_the_gate(trust: Trust) -> None:
-    solution = Solution(
-        SECOND_NS,
-        SECOND_NS,
-        Mode.FIXED,
-        "kalman",
-        *(1.0, 0.5, 800.0, (30.0, 0.0, 0.0), (16.0, 0.0, 0.0, 16.0, 0.0, 9.0)),
-        *((0.0, 0.0), (0.0, 0.0), 0, 0.0),
-        trust=trust,
-    )
     _, fused, reset = row("outputs", trust.name.lower())
-    assert fused.split(",")[0] == reset == ("withheld" if withholding_reason(solution) else "goes out")
+    is_withheld = withholding_reason(solution_at(SECOND_NS, trust=trust)) is not None
+    assert fused.split(",")[0] == reset == ("withheld" if is_withheld else "goes out")
 
 
 def test_unit_settings_in_docs_match_the_unit() -> None:

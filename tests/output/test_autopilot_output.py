@@ -24,10 +24,8 @@ from companion.records import (
     GlobalPosition,
     Gnss,
     LocalOrigin,
-    Mode,
     RsbnFix,
     Solution,
-    Source,
     SystemTime,
     Trust,
     Truth,
@@ -35,6 +33,7 @@ from companion.records import (
 from companion.runtime.core import CompanionCore
 from companion.runtime.links import requested_rates
 from tests.recordings import recording
+from tests.solutions import solution_at
 
 SECOND, MS = 1_000_000_000, 1_000_000
 START = 5000 * SECOND
@@ -470,26 +469,8 @@ def test_streams_are_requested_at_the_output_rate() -> None:
     )
 
 
-GOOD = Solution(
-    START,
-    START,
-    Mode.FIXED,
-    "kalman",
-    ORIGIN.lat,
-    ORIGIN.lon,
-    800.0,
-    (0.0, 0.0, 0.0),
-    (100.0, 0.0, 0.0, 100.0, 0.0, 25.0),
-    (0.0, 0.0),
-    (0.0, 0.0),
-    int(Source.INERTIAL | Source.AIR_DATA),
-    0.0,
-)
-
-
 def at(seconds: float, **changes: Any) -> Solution:
-    t_ns = START + round(seconds * SECOND)
-    return msgspec.structs.replace(GOOD, t_ns=t_ns, rx_ns=t_ns, **changes)
+    return solution_at(START + round(seconds * SECOND), **{"lat": ORIGIN.lat, "lon": ORIGIN.lon} | changes)
 
 
 def test_odometry_beyond_ardupilots_accuracy_limit_is_sent() -> None:

@@ -14,26 +14,14 @@ from companion.link import dialect
 from companion.nav.geometry import Geodetic, displace, separation
 from companion.output.encode import ENCODERS, CannotEncode, Receiver, encode
 from companion.output.gate import REPORT_INTERVAL_NS, Gate, Position, WithholdingMonitor, withholding_reason
-from companion.records import LocalOrigin, Mode, Solution, Source, Trust
+from companion.records import LocalOrigin, Mode, Solution, Trust
 from tests.frames import on_wire
+from tests.solutions import solution_at
 
 SECOND = 1_000_000_000
 NAN, INF = math.nan, math.inf
-GOOD = Solution(
-    t_ns=100 * SECOND,
-    rx_ns=100 * SECOND,
-    mode=Mode.FIXED,
-    estimator="kalman",
-    lat=1.0,
-    lon=0.5,
-    alt_msl=800.0,
-    v_n=(30.0, 5.0, 0.0),
-    covariance=(16.0, 2.0, 0.0, 25.0, 0.0, 9.0),
-    error_n=(0.0, 0.0),
-    velocity_error_n=(0.0, 0.0),
-    sources=int(Source.INERTIAL | Source.GNSS),
-    horizon_s=0.0,
-    sigma_velocity=0.5,
+GOOD = solution_at(
+    100 * SECOND, v_n=(30.0, 5.0, 0.0), covariance=(16.0, 2.0, 0.0, 25.0, 0.0, 9.0), sigma_velocity=0.5
 )
 
 

@@ -33,8 +33,9 @@ from companion.output.source_switch import (
     required_set,
     selected,
 )
-from companion.records import Gnss, Mode, RsbnFix, Solution
+from companion.records import Gnss, RsbnFix
 from companion.units import SECOND_NS
+from tests.solutions import solution_at
 
 TENTH = SECOND_NS // 10
 ACCEPTED, TEMPORARILY_REJECTED, DENIED, UNSUPPORTED, FAILED = range(5)
@@ -125,26 +126,6 @@ def test_set_1_needs_a_fix_that_is_not_held_false(s: Situation) -> None:
 # ---------------------------------------------------------------------------------------------------------
 
 
-def solution(now: int, gnss_false: float | None, witness: bool) -> Solution:
-    return Solution(
-        now,
-        now,
-        Mode.FIXED,
-        "kalman",
-        1.0,
-        0.5,
-        800.0,
-        (0.0, 0.0, 0.0),
-        (100.0, 0.0, 0.0, 100.0, 0.0, 25.0),
-        (0.0, 0.0),
-        (0.0, 0.0),
-        0,
-        0.0,
-        gnss_false=gnss_false,
-        witness=witness,
-    )
-
-
 def beacon_fix(now: int, off: float) -> RsbnFix:
     """Return an answer of a beacon 60 km to the east, its azimuth off by `off` (m, one sigma is 131 m)."""
     place, beacon = Geodetic(1.0, 0.5, 100.0), displace(1.0, 0.5, 100.0, 0.0, 60e3, 0.0)
@@ -188,7 +169,8 @@ class Flight:
                 is_false = false > 0.9 if contradicted is None else contradicted
                 self.switch.receive(beacon_fix(self.now, 1300.0 if is_false else 0.0))
             if solved:
-                self.switch.note_output(solution(self.now, false, witness), sent, self.now)
+                found = solution_at(self.now, gnss_false=false, witness=witness)
+                self.switch.note_output(found, sent, self.now)
             if solved or k % 10 == 0:
                 self.switch.update(self.now)
             for m in self.switch.to_send(7, self.now):

@@ -12,7 +12,8 @@ from companion.output.gnss_fusion import ESTIMATOR_SENSOR_ENABLE, GnssFusion
 from companion.output.source_switch import Selected, SourceSwitch
 from companion.records import Gnss
 from companion.units import SECOND_NS
-from tests.output.test_source_switch import beacon_fix, solution
+from tests.output.test_source_switch import beacon_fix
+from tests.solutions import solution_at
 
 TENTH = SECOND_NS // 10
 
@@ -60,7 +61,8 @@ class LossyFlight:
                 self.switch.receive(beacon_fix(self.now, 1300.0 if false > 0.9 else 0.0))
             if tick % 10 == 5 and self.is_reported:
                 self.down.send(-self.leading, self.now)
-            self.switch.note_output(solution(self.now, false, True), sent, self.now)
+            found = solution_at(self.now, gnss_false=false, witness=True)
+            self.switch.note_output(found, sent, self.now)
             self.switch.update(self.now)
             self._exchange()
 

@@ -9,6 +9,7 @@ from companion.records import Event, Mode, Severity, Solution, Source, Trust
 from companion.runtime.console import Console
 from companion.runtime.input_monitor import STREAMS
 from companion.runtime.status import Status
+from tests.solutions import solution_at
 
 SECOND = 1_000_000_000
 STATUS = Status(True, "normal", "fixed", ("GNSS", "RANGE"), "normal", 1.234, 52.8, 7.7)
@@ -89,20 +90,11 @@ def test_json_lines_are_objects() -> None:
 def solution(mode: Mode, trust: Trust | None, sources: Source, metres: float) -> Solution:
     """A solution whose lengths have as many digits as `metres`; the sigma of fixes is below 10 m."""
     sigma = 9.8 if sources else metres
-    return Solution(
-        t_ns=SECOND,
-        rx_ns=SECOND,
+    return solution_at(
+        SECOND,
         mode=mode,
-        estimator="kalman",
-        lat=0.7,
-        lon=0.6,
-        alt_msl=1000.0,
-        v_n=(60.0, 0.0, 0.0),
         covariance=(sigma**2, 0.0, 0.0, 0.0, 0.0, 4.0),
-        error_n=(0.0, 0.0),
-        velocity_error_n=(0.0, 0.0),
         sources=Source.INERTIAL | sources,
-        horizon_s=0.0,
         bound_n=(metres, 0.0),
         protection=metres,
         trust=trust,
