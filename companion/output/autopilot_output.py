@@ -156,7 +156,7 @@ class AutopilotOutput:
         is_doubted = (solution.gnss_false or 0.0) >= BELIEVED
         if own is None or not (is_doubted or self._source_switch.is_on_companion):
             return False
-        return distance(own[:2], (position.lat, position.lon)) > SIGMAS * position.sigma
+        return distance(own, position.place) > SIGMAS * position.sigma
 
     def _withholding_reason(self, position: Position, name: str, receiver: Receiver) -> str | None:
         output = self.config.output

@@ -166,9 +166,8 @@ def _local(position: Position, receiver: Receiver) -> tuple[float, float, float]
     origin = receiver.origin
     if origin is None:
         raise CannotEncode("the autopilot's local origin is not confirmed by its positions")
-    point = Geodetic(position.lat, position.lon, position.alt_msl)
     start = Geodetic(origin.lat, origin.lon, origin.alt_msl)
-    return geodetic_to_local(origin.projection, start, point)
+    return geodetic_to_local(origin.projection, start, position.place)
 
 
 def _covariance(position: Position, receiver: Receiver) -> list[float]:

@@ -77,6 +77,11 @@ class Position(NamedTuple):
     resets: int = 0
 
     @property
+    def place(self) -> Geodetic:
+        """Latitude, longitude and altitude."""
+        return Geodetic(self.lat, self.lon, self.alt_msl)
+
+    @property
     def sigma(self) -> float:
         """Standard deviation in the worst horizontal direction, m."""
         nn, ne, ee = self.covariance
@@ -86,7 +91,7 @@ class Position(NamedTuple):
         """Propagate to a time shortly before or after, by the velocity."""
         dt = (t_ns - self.t_ns) * 1e-9
         north, east, down = self.v_n
-        lat, lon, alt = displace(self.lat, self.lon, self.alt_msl, north * dt, east * dt, down * dt)
+        lat, lon, alt = displace(*self.place, north * dt, east * dt, down * dt)
         nn, ne, ee = self.covariance
         unknown = (0.5 * CARRY_ACCELERATION * dt * dt) ** 2
         return self._replace(
@@ -176,7 +181,7 @@ class Gate:
 
     def _begin_at(self, own: Geodetic, here: Position, near: float) -> None:
         """Begin the steps at the autopilot's own position, if it is within `near` of the last one sent, m."""
-        north, east, _ = separation(own, Geodetic(here.lat, here.lon, here.alt_msl))
+        north, east, _ = separation(own, here.place)
         if math.hypot(north - self._left_n[0], east - self._left_n[1]) <= near:
             self._left_n = north, east
 
@@ -188,7 +193,7 @@ class Gate:
         self._resets += 1
         share = max(0.0, 1.0 - self._max_step_m / left)
         self._left_n = north, east = share * self._left_n[0], share * self._left_n[1]
-        lat, lon, _ = displace(here.lat, here.lon, here.alt_msl, north, east, 0.0)
+        lat, lon, _ = displace(*here.place, north, east, 0.0)
         nn, ne, ee = here.covariance
         covariance = nn + north * north, ne + north * east, ee + east * east
         return here._replace(lat=lat, lon=lon, covariance=covariance, resets=self._resets)
@@ -197,8 +202,7 @@ class Gate:
 def _jump(last: Position, here: Position, dt: float) -> tuple[float, float]:
     """Return `here` from the last position propagated by the mean velocity, m north, east."""
     (v_n, v_e, _), (w_n, w_e, _) = last.v_n, here.v_n
-    place = Geodetic(last.lat, last.lon, last.alt_msl)
-    north, east, _ = separation(Geodetic(here.lat, here.lon, here.alt_msl), place)
+    north, east, _ = separation(here.place, last.place)
     return north - 0.5 * (v_n + w_n) * dt, east - 0.5 * (v_e + w_e) * dt
 
 
@@ -219,10 +223,7 @@ class LocalFrame:
         before, sent = self._last or (position, message)
         is_recent = position.t_ns - before.t_ns <= LOCAL_RECENT_NS
         if is_recent and sent.reset_counter == message.reset_counter:
-            north, east, _ = separation(
-                Geodetic(position.lat, position.lon, position.alt_msl),
-                Geodetic(before.lat, before.lon, before.alt_msl),
-            )
+            north, east, _ = separation(position.place, before.place)
             off = math.hypot(message.x - sent.x - north, message.y - sent.y - east)
             if not off <= LOCAL_TOLERANCE_M + PROJECTION_ERROR * math.hypot(north, east):
                 return "local coordinates moved otherwise than the position"
@@ -230,10 +231,10 @@ class LocalFrame:
         return None
 
 
-def distance(a: tuple[float, float], b: tuple[float, float]) -> float:
-    """Return the distance of two points (latitude and longitude, rad) on a sphere, m; error at most 0.6 %."""
-    half_lat, half_lon = 0.5 * (b[0] - a[0]), 0.5 * wrap_angle(b[1] - a[1])
-    h = math.sin(half_lat) ** 2 + math.cos(a[0]) * math.cos(b[0]) * math.sin(half_lon) ** 2
+def distance(a: Geodetic, b: Geodetic) -> float:
+    """Return the distance of two points on a sphere, m, whatever their altitudes; error at most 0.6 %."""
+    half_lat, half_lon = 0.5 * (b.lat - a.lat), 0.5 * wrap_angle(b.lon - a.lon)
+    h = math.sin(half_lat) ** 2 + math.cos(a.lat) * math.cos(b.lat) * math.sin(half_lon) ** 2
     return 2.0 * 6_371_000.0 * math.asin(min(1.0, math.sqrt(h)))
 
 

@@ -61,7 +61,7 @@ class PositionReset:
         if there is None or self._correct_ns is None:
             return "no recent position received from the autopilot"
         drift = WIND_ERROR * (now - self._correct_ns) * 1e-9
-        away = distance(there[:2], (position.lat, position.lon))
+        away = distance(there, position.place)
         if away > SIGMAS * position.sigma + drift + JUMP_MARGIN_M:
             return "further from the autopilot's position than its possible drift"
         return None

@@ -156,7 +156,7 @@ def test_jump_goes_out_in_steps_each_counted() -> None:
         sent = gate.admit(solution)
         assert isinstance(sent, Position)
         true = Geodetic(solution.lat, solution.lon, solution.alt_msl)
-        north, east, _ = separation(Geodetic(sent.lat, sent.lon, sent.alt_msl), true)
+        north, east, _ = separation(sent.place, true)
         left = min(10.0 * k - 35.0, 0.0)
         assert (north, east) == (pytest.approx(0.0, abs=0.01), pytest.approx(left, abs=0.01))
         assert sent.resets == min(k, 4)
@@ -174,9 +174,7 @@ def test_steps_begin_at_the_autopilots_own_position_if_it_follows(own_east, firs
     sent = gate.admit(good, Geodetic(own.lat, own.lon, own.alt_msl))
     assert isinstance(sent, Position)
     true = Geodetic(good.lat, good.lon, good.alt_msl)
-    assert separation(Geodetic(sent.lat, sent.lon, sent.alt_msl), true)[1] == pytest.approx(
-        first_east, abs=0.1
-    )
+    assert separation(sent.place, true)[1] == pytest.approx(first_east, abs=0.1)
 
 
 def test_noise_within_the_accuracy_is_no_reset() -> None:
