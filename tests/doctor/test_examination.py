@@ -389,22 +389,19 @@ def test_autopilot_without_version_is_identified_by_make() -> None:
     assert bench.now < (ATTEMPTS + OBSERVE_LONGER / SECOND + 2) * SECOND
 
 
-def test_the_airspeed_of_a_fixed_wing_without_a_sensor_is_steady() -> None:
-    config = load(None, {}, {}, ["output.profile=ardupilot"])
-    (airspeed,) = check_airspeed(config, False, mavlink.MAV_TYPE_FIXED_WING)
-    assert (airspeed.found, airspeed.is_well) == ("none: taken for steady in the air", None)
-
-
 @pytest.mark.parametrize(
-    ("healthy", "pairs", "text"),
+    ("vehicle_type", "healthy", "pairs", "text"),
     [
-        (False, [], "none: by the drag of the rotors, in the air"),
-        (None, [], "none: by the drag of the rotors, in the air"),
-        (True, [], "healthy"),
-        (False, ["air_data.rotor_drag_per_s=0"], "none: reckoning by IMU only"),
+        (mavlink.MAV_TYPE_FIXED_WING, False, [], "none: taken for steady in the air"),
+        (mavlink.MAV_TYPE_QUADROTOR, False, [], "none: by the drag of the rotors, in the air"),
+        (mavlink.MAV_TYPE_QUADROTOR, None, [], "none: by the drag of the rotors, in the air"),
+        (mavlink.MAV_TYPE_QUADROTOR, True, [], "healthy"),
+        (mavlink.MAV_TYPE_QUADROTOR, False, ["air_data.rotor_drag_per_s=0"], "none: reckoning by IMU only"),
     ],
 )
-def test_the_airspeed_of_a_multirotor_is_its_drag(healthy: bool | None, pairs: list[str], text: str) -> None:
+def test_airspeed_is_found_by_sensor_and_vehicle(
+    vehicle_type: int, healthy: bool | None, pairs: list[str], text: str
+) -> None:
     config = load(None, {}, {}, ["output.profile=ardupilot", *pairs])
-    (airspeed,) = check_airspeed(config, healthy, mavlink.MAV_TYPE_QUADROTOR)
+    (airspeed,) = check_airspeed(config, healthy, vehicle_type)
     assert (airspeed.found, airspeed.is_well) == (text, None)
