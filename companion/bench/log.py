@@ -1,11 +1,10 @@
 """Benchmark of the flight log: writing and reading, compared with the mcap package on the same data."""
 
 import atexit
-import itertools
 import shutil
 import tempfile
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 from mcap.reader import make_reader
@@ -26,11 +25,11 @@ def imu(i: int) -> Imu:
     return Imu(t_ns, t_ns + 1_000_017, 0, (0.1 * i, 0.2, -9.81), (1e-3 / (i + 1), 2e-3, 0.0))
 
 
-def write(path: Path, messages: int) -> None:
-    """Write a closed log of `messages` records."""
+def write(path: Path, records: Iterable[Imu]) -> None:
+    """Write a closed log of records."""
     with Writer(path, metadata={}, start_unix_ns=10**18, start_ns=0, block=True) as log:
-        for i in range(messages):
-            log.record(imu(i))
+        for one in records:
+            log.record(one)
 
 
 def cases() -> Iterator[tuple[str, Callable[[], object]]]:
@@ -38,19 +37,15 @@ def cases() -> Iterator[tuple[str, Callable[[], object]]]:
     folder = Path(tempfile.mkdtemp())
     atexit.register(shutil.rmtree, folder, True)
     path = folder / "read.mcap"
-    write(path, READ)
-    count = itertools.count()
+    write(path, map(imu, range(READ)))
+    written = folder / "written.mcap"
     endless = Writer(folder / "endless.mcap", metadata={}, start_unix_ns=10**18, start_ns=0)
     atexit.register(endless.close)
     record, records = imu(7), [imu(i) for i in range(MESSAGES)]
 
     def ours() -> None:
-        with Writer(
-            folder / f"{next(count)}.mcap", metadata={}, start_unix_ns=10**18, start_ns=0, block=True
-        ) as log:
-            for one in records:
-                log.record(one)
-        log.path.unlink()
+        write(written, records)
+        written.unlink()
 
     def package() -> None:
         with (folder / "package.mcap").open("wb") as stream:
