@@ -200,10 +200,10 @@ def test_autopilot_that_reads_seldom_does_not_change_the_offset(every_s: int) ->
 
 
 class LateLink:
-    """An autopilot at the other end of a link with variable delay, simulated in steps of `every_ms`."""
+    """An autopilot at the other end of a link with variable delay, simulated in steps of 50 ms."""
 
-    def __init__(self, answers: bool = True, every_ms: int = 50) -> None:
-        self.clock, self.offset, self.answers, self.every_ms = BootClock(), OFFSET, answers, every_ms
+    def __init__(self, answers: bool = True) -> None:
+        self.clock, self.offset, self.answers = BootClock(), OFFSET, answers
         self.late = 0
         self.ms = 0
         self.arriving: list[tuple[int, int, int]] = []  # when, requested (or 0), stamp or reading
@@ -219,7 +219,7 @@ class LateLink:
             self.arriving.append((self.sent_by, 0, now - self.offset))
             if self.answers and self.ms % 1000 == 0:
                 self.arriving.append((self.sent_by, self.clock.request(now), now - self.offset + MS))
-            self.ms += self.every_ms
+            self.ms += 50
             while self.arriving and self.arriving[0][0] <= now:
                 at, requested, reading = self.arriving.pop(0)
                 if requested:

@@ -38,9 +38,7 @@ class Rates(NamedTuple):
     w_in_n: Floats
 
 
-def navigation_rates(
-    lat: float, alt: float, v_n: Floats, f_n: Floats, sphere: wgs84.Sphere | None = None
-) -> Rates:
+def navigation_rates(lat: float, alt: float, v_n: Floats, f_n: Floats, sphere: wgs84.Sphere | None) -> Rates:
     """The navigation equations in continuous time, on WGS84 or a sphere: Groves (5.54), (5.56)."""
     vN, vE, vD = v_n.tolist()
     R_N, R_E = wgs84.radii(lat) if sphere is None else (sphere.R, sphere.R)

@@ -85,8 +85,8 @@ def imu(i: int) -> r.Imu:
     return r.Imu(T + i * 10**7, T + i * 10**7 + 11, 0, (0.1 * i, 0.2, -9.81), (1e-3 / (i + 1), 2e-3, 0.0))
 
 
-def wait_until(condition, seconds: float = 60.0) -> None:
-    end = time.monotonic() + seconds
+def wait_until(condition) -> None:
+    end = time.monotonic() + 60.0
     while not condition():
         assert time.monotonic() < end, "condition not met in time"
         time.sleep(0.01)
