@@ -42,6 +42,7 @@ BEACON = Geodetic(math.radians(60.05), math.radians(31.07), 80.0)
 SPEED, HEIGHT, WIND_EAST = 30.0, 800.0, 4.0
 UTC_S = 1_795_248_000
 Frame = tuple[str, bytes]
+OURS = {"target_system": 1, "target_component": 191}
 AIRSPEED_SENSOR = {f"onboard_control_sensors_{name}": 16 for name in ("present", "enabled", "health")}
 
 
@@ -100,7 +101,7 @@ class Flight:
                 self.payloads.append((message.get_type(), found.payload))
                 if message.get_type() == "COMMAND_LONG" and message.command == 42007 and self.answers:
                     self.source_set = int(message.param1)
-                    self.send("COMMAND_ACK", command=42007, result=0, target_system=1, target_component=191)
+                    self.send("COMMAND_ACK", command=42007, result=0, **OURS)
 
     @property
     def seconds(self) -> float:
@@ -292,11 +293,9 @@ def test_core_rejects_a_configuration_with_feedback() -> None:
 def test_profile_monitor_rejects_requests_for_position_messages(msgid: int) -> None:
     flight = Flight(configured())
     flight.fly(3.0)
-    flight.send(
-        "COMMAND_LONG", target_system=1, target_component=191, command=511, param1=msgid, param2=100_000
-    )
+    flight.send("COMMAND_LONG", command=511, param1=msgid, param2=100_000, **OURS)
     values = {"param_id": "ODOMETRY_HZ", "param_value": 5.0, "param_type": 9}
-    flight.send("PARAM_SET", target_system=1, target_component=191, **values)
+    flight.send("PARAM_SET", **OURS, **values)
     denied = [m.result for m in flight.sent_messages("COMMAND_ACK")]
     flight.fly(5.0)
     assert denied == [3]
@@ -309,7 +308,7 @@ def test_ground_station_can_lower_the_output_rate() -> None:
     flight = Flight(configured("output.profile=ardupilot"))
     flight.fly(10.0)
     values = {"param_id": "ODOMETRY_HZ", "param_value": 5.0, "param_type": 9}
-    flight.send("PARAM_SET", target_system=1, target_component=191, **values)
+    flight.send("PARAM_SET", **OURS, **values)
     start = flight.seconds
     flight.fly(10.0)
     assert len(flight.sent_messages("ODOMETRY", start)) == pytest.approx(50, abs=5)
@@ -430,7 +429,7 @@ def test_rate_of_position_resets_cannot_be_changed() -> None:
     flight.fly(10.0)
     flight.gnss = False
     flight.fly(3.0)
-    flight.send("COMMAND_LONG", target_system=1, target_component=191, command=511, param1=75, param2=50_000)
+    flight.send("COMMAND_LONG", command=511, param1=75, param2=50_000, **OURS)
     flight.fly(10.0)
     assert [m.result for m in flight.sent_messages("COMMAND_ACK")] == [3]
     at = [at for at, m in flight.sent if m.get_type() == "COMMAND_INT"]

@@ -43,6 +43,7 @@ BOOT = START - 30 * SECOND
 ORIGIN = Geodetic(math.radians(60.0), math.radians(30.0), 50.0)
 BEACON = Geodetic(math.radians(60.05), math.radians(31.07), 80.0)
 V_NORTH, HEIGHT = 40.0, 800.0
+OURS = {"target_system": 1, "target_component": 191}
 
 
 class Log:
@@ -404,9 +405,8 @@ def test_a_station_gets_copies_of_the_feed_on_its_own_link_and_does_not_change_i
     flight, results = Flight("main", "station"), []
 
     def ask(link: str, interval_us: float) -> None:
-        fields = {"target_system": 1, "target_component": 191, "command": 511}
-        fields |= {"param1": dialect.type_named("ODOMETRY").msgid, "param2": interval_us}
-        command = flight.frame("COMMAND_LONG", system=255, component=190, **fields)
+        fields = {"command": 511, "param1": dialect.type_named("ODOMETRY").msgid, "param2": interval_us}
+        command = flight.frame("COMMAND_LONG", system=255, component=190, **OURS, **fields)
         flight.core.receive(link, command, flight.now)
         sent = decoded(flight.core.to_send(link, flight.now))
         results.extend(m.result for m in sent if m.get_type() == "COMMAND_ACK")
@@ -447,8 +447,8 @@ def test_a_parameter_that_changes_is_reported_with_its_sender() -> None:
     flight = Flight()
     flight.fly(3.0)
     for value in (3.0, 3.0, 2.5):
-        fields = {"target_system": 1, "target_component": 191, "param_id": "GNSS_SIGMA_M", "param_type": 9}
-        flight.send("PARAM_SET", system=254, component=190, param_value=value, **fields)
+        fields = {"param_id": "GNSS_SIGMA_M", "param_value": value, "param_type": 9}
+        flight.send("PARAM_SET", system=254, component=190, **OURS, **fields)
     assert [text for text in event_texts(flight) if "GNSS_SIGMA_M" in text] == [
         "GNSS_SIGMA_M set from 2 to 3 by 254",
         "GNSS_SIGMA_M set from 3 to 2.5 by 254",
@@ -459,16 +459,8 @@ def test_faster_output_requests_a_faster_inertial_channel() -> None:
     flight = Flight()
     flight.fly(3.0)
     before = len(flight.sent)
-    flight.send(
-        "PARAM_SET",
-        system=255,
-        component=190,
-        target_system=1,
-        target_component=191,
-        param_id=b"ODOMETRY_HZ",
-        param_value=20.0,
-        param_type=9,
-    )
+    fields = {"param_id": b"ODOMETRY_HZ", "param_value": 20.0, "param_type": 9}
+    flight.send("PARAM_SET", system=255, component=190, **OURS, **fields)
     flight.fly(1.0)
     requests = [m for _, m in flight.sent[before:] if m.get_type() == "COMMAND_LONG" and m.command == 511]
     local = dialect.type_named("LOCAL_POSITION_NED").msgid
@@ -621,9 +613,6 @@ class Station:
         return decoded(self._flight.core.to_send(self._link, self._flight.now))
 
 
-OURS = {"target_system": 1, "target_component": 191}
-
-
 def test_station_on_a_link_without_an_autopilot_is_served() -> None:
     flight = Flight("main", "station")
     station = Station(flight, "station")
@@ -675,7 +664,7 @@ def test_ping_and_mission_list_are_answered() -> None:
     station = Station(flight, "station")
     (ping,) = [m for m in station.send("PING", time_usec=123, seq=9) if m.get_type() == "PING"]
     assert (ping.time_usec, ping.seq, ping.target_system, ping.target_component) == (123, 9, 255, 190)
-    assert not [m for m in station.send("PING", seq=9, target_system=1, target_component=191)]
+    assert not [m for m in station.send("PING", seq=9, **OURS)]
     (count,) = station.send("MISSION_REQUEST_LIST", mission_type=1, **OURS)
     assert (count.get_type(), count.count, count.mission_type) == ("MISSION_COUNT", 0, 1)
     assert station.send("MISSION_REQUEST_LIST", target_system=1, target_component=1) == []
