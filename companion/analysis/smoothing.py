@@ -204,6 +204,7 @@ class _Witness(Navigator):
         self.folded.append(_Folded(t_ns, record, len(self._last) - 1))
         if state.bank is None:
             self._close(t_ns)
+            self._onsets.clear()  # another bank has other faults
             return
         known = hypotheses(state, self.settings)
         self._last[-1] = state.bank, known
