@@ -48,7 +48,7 @@ from companion.navigator import (
     tuned,
 )
 from companion.navigator.channel import Nominal, Transition
-from companion.navigator.hypotheses import BIASES, MOST_BEACONS, VELOCITY, Hypotheses, Model
+from companion.navigator.hypotheses import BIASES, MOST_BEACONS, MOST_WIDER, VELOCITY, Hypotheses, Model
 from companion.navigator.inertial_track import Point
 from companion.navigator.own_channel import OwnChannel
 from companion.navigator.progress import driver
@@ -349,7 +349,8 @@ class _PlainModel(Model):
         if factors is not None:
             (A, B), point = self.asked[-1]
             D, n = factors[0], B.shape[-1]  # of A more where a false airspeed would move the nominal
-            self.asked[-1] = Transition(D[: len(A), None] * A, D[:n, None] * B * D[:n]), point
+            wider = np.minimum(D[:n], MOST_WIDER)
+            self.asked[-1] = Transition(D[: len(A), None] * A, wider[:, None] * B * wider), point
         return factors
 
 

@@ -94,6 +94,7 @@ AIR_HEADING_STEPS_H = 1e-2  # by airspeed a wrong heading turns no acceleration
 HEADING_FIRST = 1e-3  # from the start, by a compass set up wrongly
 HEADING = Angle(own_error_model.HEADING, own_error_model.VERSINE)
 FAR_VERSINE = 0.3  # from 45 deg on a heading is far off
+MOST_WIDER = 2.0  # of its sigma what a silence of minutes took is undone, not what came up in hours of it
 #: Attitude and IMU give a false velocity (m/s): a turn with an attitude that is off, another latency. Not in
 #: straight flight, however it shakes, but where the velocity has changed by so much within seconds: a GNSS
 #: that was drawn off by 2 m/s, onset and velocity alike, was taken for such a step.
@@ -227,7 +228,8 @@ class Model:
         if not self.channel.wind:
             return bank
         if (kept := self.kept(bank, Phi)) is not None:
-            bank = bank._replace(x=kept * bank.x, P=kept[:, :, None] * bank.P * kept[:, None])
+            wider = np.minimum(kept, MOST_WIDER)
+            bank = bank._replace(x=kept * bank.x, P=wider[:, :, None] * bank.P * wider[:, None])
         return banks.on_circle(bank, HEADING)
 
     def kept(self, bank: Bank, Phi: Floats) -> Floats | None:
@@ -236,7 +238,7 @@ class Model:
         if not far.any():
             return None
         factors = np.ones_like(bank.x)
-        factors[far, HEADING.sine] /= Phi[HEADING.sine, HEADING.sine]
+        factors[far, HEADING.sine] /= max(Phi[HEADING.sine, HEADING.sine], 1e-300)
         return factors
 
     def transition(self, nominal: Nominal, beacons: int) -> Transition:
