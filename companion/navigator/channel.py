@@ -49,6 +49,11 @@ class Nominal(Struct, frozen=True):
         return self.point.t_ns
 
     @property
+    def driver(self) -> str:
+        """What moves it: a driver of the own channel, or "ins"."""
+        return "ins" if self.interval is None else self.interval.by
+
+    @property
     def pending_s(self) -> float:
         """Seconds since the bank was propagated."""
         return (self.point.t_ns - self.since.t_ns) * 1e-9

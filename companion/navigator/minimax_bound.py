@@ -172,7 +172,7 @@ def is_due(g: Guarantee, nominal: Nominal) -> bool:
 
 def _is_behind(g: Guarantee, nominal: Nominal) -> bool:
     reach = g.reach
-    if driver(nominal) != g.by:
+    if nominal.driver != g.by:
         return True
     return reach is not None and not 0.0 <= (nominal.point.t_ns - reach.at.t_ns) * 1e-9 < CHUNK_S
 
@@ -184,16 +184,11 @@ def _has_work(g: Guarantee, nominal: Nominal) -> bool:
     return abs(nominal.t_ns - g.worked_ns) >= PIECE_NS
 
 
-def driver(nominal: Nominal) -> str:
-    """What moves the nominal trajectory: a driver of the own channel, or "ins"."""
-    return "ins" if nominal.interval is None else nominal.interval.by
-
-
 def follow(g: Guarantee, nominal: Nominal, config: Config) -> Guarantee:
     """Extend the transition to the nominal point, and the window when a bin is over."""
     if not _is_behind(g, nominal):
         return g
-    by, point, reach = driver(nominal), nominal.point, g.reach
+    by, point, reach = nominal.driver, nominal.point, g.reach
     channel = law(config, by, point.v_n)
     if channel is None:
         return Guarantee(by)

@@ -247,4 +247,4 @@ def estimated_velocity(state: State) -> Vector2:
 
 def driver(state: State) -> str | None:
     """What moves the nominal trajectory now; None before there is one."""
-    return None if state.nominal is None else minimax_bound.driver(state.nominal)
+    return None if state.nominal is None else state.nominal.driver

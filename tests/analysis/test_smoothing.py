@@ -202,10 +202,10 @@ def test_false_gnss_is_left_out_from_its_onset(rate: float, step: float) -> None
     out from the onset on, not only from the moment at which the navigator noticed.
     """
     flown = flight(300, (0, 0))
-    begun, steps, records = 150 * NS, 250 * NS, []
+    begins, steps, records = 150 * NS, 250 * NS, []
     for record in flown.records:
-        if isinstance(record, Gnss) and record.t_ns > begun:
-            away = rate * (record.t_ns - begun) / NS + step * (record.t_ns > steps)
+        if isinstance(record, Gnss) and record.t_ns > begins:
+            away = rate * (record.t_ns - begins) / NS + step * (record.t_ns > steps)
             place = displace(record.lat, record.lon, record.alt_msl, away, 0.0, 0.0)
             record = msgspec.structs.replace(record, lat=place.lat, lon=place.lon)
         records.append(record)

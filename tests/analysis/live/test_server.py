@@ -23,6 +23,7 @@ from companion.records import Event, Gnss, Mode, Solution, Trust
 from companion.storage import flight_log
 from companion.storage.reader import LogError
 from tests.network import free_port
+from tests.solutions import solution_at
 
 pytest.importorskip("websockets")
 S = 1_000_000_000
@@ -139,19 +140,9 @@ def test_page_follows_a_flight_and_survives_a_kill(tmp_path, browser):
 @pytest.mark.parametrize("width", [360, 1180, 1420])
 def test_the_longest_coordinates_fit_their_tiles(tmp_path, browser, width):
     path = tmp_path / "south.mcap"
-    place = (math.radians(-77.70486), math.radians(-179.08532), 100.0)
+    place = {"lat": math.radians(-77.70486), "lon": math.radians(-179.08532), "alt_msl": 100.0}
     with flight_log.Writer(path, metadata={}, start_unix_ns=0, start_ns=0) as log:
-        log.record(
-            Solution(
-                *(S, S, Mode.FIXED, "kalman", *place),
-                v_n=(0.0, 20.0, 0.0),
-                covariance=(25.0, 0.0, 0.0, 25.0, 0.0, 25.0),
-                error_n=(3.0, 4.0),
-                velocity_error_n=(0.0, 0.0),
-                sources=3,
-                horizon_s=0.0,
-            )
-        )
+        log.record(solution_at(S, **place))
     with Live(path, free_port()) as live:
         browser.open(live.url, width)
         browser.wait_for("document.getElementById('numbers')?.textContent.includes('-179.08532°')")
