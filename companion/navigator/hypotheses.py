@@ -258,10 +258,8 @@ class Model:
         Phi = np.eye(known.layout.n)
         Phi[:ours, :ours] = found.Phi
         lie = known.layout.lie_states(AIRSPEED)[0]
-        speed = math.hypot(*interval.V)
-        if speed > 1.0:
-            nose = np.array(interval.V) / speed
-            Phi[0:2, lie], Phi[2:4, lie] = nose * dt, nose
+        nose = np.array(interval.V) / math.hypot(*interval.V)
+        Phi[0:2, lie], Phi[2:4, lie] = nose * dt, nose
         return Transition(Phi, Q)
 
 

@@ -159,7 +159,7 @@ def airspeed(
     """
     layout = known.layout
     row = channel.propagator.airspeed_row(velocity, V, manoeuvre)
-    speed = max(math.hypot(*V), 1.0)
+    speed = math.hypot(*V)
     lie = layout.lie_states(AIRSPEED)[0]
 
     def seen_by(bank: Bank) -> tuple[Floats, Floats]:

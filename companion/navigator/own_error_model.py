@@ -69,6 +69,7 @@ N = 23
 
 AIRSPEED_NOISE_M_S = 1.0  # of half a second's mean: pitot, angle of attack, sideslip
 AIRSPEED_MANOEUVRE_S = 0.2  # and per acceleration; 0.14 to 0.17 in an aerobatic flight (TestLog2)
+LEAST_M_S = 0.1  # of an airspeed
 LASTING = 2.0  # turbulence by airspeed alone: how many times longer than the gusts it lasts
 DRAG_SCALE = 0.25  # of a multirotor's drag; it changes with speed too
 STEADY_SCALE = 0.4  # of an airspeed without a sensor, at first: speed over ground in an unknown wind
@@ -167,8 +168,11 @@ class Row(NamedTuple):
 
 
 def air_velocity(true_airspeed: float, pitch: float, heading: float) -> Vector2:
-    """Velocity through the air along the nose, north and east, m/s."""
-    level = true_airspeed * math.cos(pitch)
+    """Velocity through the air along the nose, north and east, m/s.
+
+    Never zero: what a false airspeed of zero is off by has the direction of the nose.
+    """
+    level = max(true_airspeed, LEAST_M_S) * math.cos(pitch)
     return level * math.cos(heading), level * math.sin(heading)
 
 

@@ -7,8 +7,11 @@ import pytest
 
 from companion.config import Config, InertialConfig
 from companion.estimate import bank as banks
-from companion.navigator.hypotheses import GNSS, Model, Situation
-from companion.navigator.own_error_model import HEADING, VERSINE, begin
+from companion.nav.geometry import Geodetic
+from companion.navigator.channel import Nominal
+from companion.navigator.hypotheses import AIRSPEED, GNSS, Model, Situation
+from companion.navigator.inertial_track import Point
+from companion.navigator.own_error_model import HEADING, VERSINE, air_velocity, begin
 
 
 @pytest.mark.parametrize("config", [Config(), Config(inertial=InertialConfig(independent=True))])
@@ -36,3 +39,14 @@ def test_a_heading_that_is_far_off_stays_so_while_parked() -> None:
     np.testing.assert_allclose(bank.x[turned, HEADING], sine[turned])
     np.testing.assert_allclose(bank.x[~turned, HEADING], math.exp(-1.0) * 0.01)
     np.testing.assert_allclose(np.unique(bank.x[:, VERSINE].round(12)), [0.0, 1.0])
+
+
+@pytest.mark.parametrize("airspeed", [0.0, 0.5, 22.0])
+def test_a_false_airspeed_moves_the_position_along_the_nose(airspeed: float) -> None:
+    """One of zero too: its direction was lost, and what it was off by came out as wind, 1377 m in 3 s."""
+    model, heading = Model(Config()), 2.0
+    V = air_velocity(airspeed, 0.1, heading)
+    since, point = (Point(t_ns, Geodetic(0.9, 0.5, 100.0), (*V, 0.0)) for t_ns in (0, 10**9))
+    Phi, _ = model.transition(Nominal(point, (0.0, 0.0), since, begin("air", V)._replace(seconds=1.0)), 0)
+    lie = model.hypotheses(Situation()).layout.lie_states(AIRSPEED)[0]
+    np.testing.assert_allclose(Phi[0:4, lie], 2 * [math.cos(heading), math.sin(heading)])
