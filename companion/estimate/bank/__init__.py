@@ -50,7 +50,19 @@ from companion.estimate.bank.branching import (
     jump_births_due,
     jumped_before,
 )
-from companion.estimate.bank.layout import NEVER, NONE, Angle, Bools, Fault, Ints, Jump, Layout, Lie, Source
+from companion.estimate.bank.layout import (
+    FOR_EVER_S,
+    NEVER,
+    NONE,
+    Angle,
+    Bools,
+    Fault,
+    Ints,
+    Jump,
+    Layout,
+    Lie,
+    Source,
+)
 from companion.estimate.bank.protection import exceedance, level
 from companion.estimate.bank.readout import (
     decide,
@@ -77,6 +89,7 @@ from companion.estimate.bank.state import (
 
 __all__ = [
     "EXHAUSTIVE",
+    "FOR_EVER_S",
     "NEVER",
     "NONE",
     "Angle",

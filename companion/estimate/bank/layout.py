@@ -19,6 +19,8 @@ NONE = -1
 """Index of "no fault"; arrays over faults have their last entry for it."""
 NEVER = -math.inf
 """Time of a measurement that never came, and the logarithm of zero."""
+FOR_EVER_S = 1e15
+"""How long the rate of a lie lasts that does not decay."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,6 +146,8 @@ class Layout:
     position : indices of the two base states whose radial error the protection level bounds.
     orders : 2 or 3 per group; 2 by default. A lie that accelerates steadily pays in every fix for a wandering
         rate, but only once for an acceleration of its own.
+    rates_s : for how long a rate lasts (s), one per group; for ever by default. What an instrument is off by
+        does not grow for ever: beside base states that may jump, both would grow against each other.
     """
 
     n_base: int
@@ -154,10 +158,12 @@ class Layout:
     grades: tuple[float, ...] = (1.0, 4.0, 16.0, 64.0)
     position: tuple[int, int] = (0, 1)
     orders: tuple[int, ...] = ()
+    rates_s: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        if self.orders and len(self.orders) != len(self.groups):
-            raise ValueError(f"orders {self.orders}: give one for each of {len(self.groups)} groups, or none")
+        for name, given in (("orders", self.orders), ("rates_s", self.rates_s)):
+            if given and len(given) != len(self.groups):
+                raise ValueError(f"{name} {given}: give one for each of {len(self.groups)} groups, or none")
         for s in self.sources:
             if s.slot + s.dim > self.groups[s.group]:
                 raise ValueError(f"source {s.name}: group {s.group} has {self.groups[s.group]} offsets only")
@@ -191,6 +197,12 @@ class Layout:
         return np.array(
             [a + d + k for a, d in zip(self.starts, self.groups) for k in range(d)], dtype=np.int64
         )
+
+    @cached_property
+    def rate_times(self) -> Floats:
+        """For how long each rate lasts (s), in the order of `rates`."""
+        times = self.rates_s or (FOR_EVER_S,) * len(self.groups)
+        return np.repeat(times, self.groups)
 
     @cached_property
     def accelerations(self) -> tuple[Ints, Ints, Ints]:
