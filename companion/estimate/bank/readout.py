@@ -79,13 +79,12 @@ def estimate(bank: Bank, layout: Layout) -> Gaussian:
     if total == 0.0:
         i = int(np.argmax(bank.L))
         return Gaussian(bank.x[i], bank.P[i])
-    w = w / total
-    at = w > 1e-9
-    w, x = w[at] / w[at].sum(), bank.x[at]
-    mean = w @ x
-    d = (x - mean) * np.sqrt(w)[:, None]
+    w = np.where(w > 1e-9 * total, w, 0.0)
+    w /= w.sum()
+    mean = w @ bank.x
+    d = (bank.x - mean) * np.sqrt(w)[:, None]
     n = len(mean)
-    P = (w @ bank.P[at].reshape(len(w), -1)).reshape(n, n) + d.T @ d
+    P = (w @ bank.P.reshape(len(w), -1)).reshape(n, n) + d.T @ d
     return Gaussian(mean, P)
 
 

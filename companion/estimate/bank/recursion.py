@@ -64,15 +64,28 @@ def propagate(bank: Bank, layout: Layout, dt: float, Phi: Floats, Q: Floats) -> 
     Bank : at t + dt.
     """
     R, n = bank.x.shape
-    F, k = _padded(layout, Phi, dt), Q.shape[-1]
-    FT = np.ascontiguousarray(F.T)
-    x = bank.x @ FT
-    P: Floats = F @ (bank.P @ FT)
-    P[:, :k, :k] += Q[bank.grade] if Q.ndim == 3 else Q
+    F = _padded(layout, Phi, dt)
+    P = _transformed(bank.P, F)
+    i, j = np.nonzero(Q.any(axis=0) if Q.ndim == 3 else Q)
+    flat = P.reshape(R, -1)
+    flat[:, i * n + j] += Q[:, i, j][bank.grade] if Q.ndim == 3 else Q[i, j]
     if len(layout.rates):
-        diagonal = P.reshape(R, -1)[:, :: n + 1]
-        diagonal[:, layout.rates] += bank.noise * dt
-    return bank._replace(t=bank.t + dt, x=x, P=P)
+        flat[:, (n + 1) * layout.rates] += bank.noise * dt
+    return bank._replace(t=bank.t + dt, x=bank.x @ F.T, P=P)
+
+
+def _transformed(P: Floats, F: Floats) -> Floats:
+    """F P F' of all rows. Most states only decay: the others' rows of F are multiplied alone."""
+    decay = F.diagonal()
+    mixed = np.flatnonzero((F - np.diag(decay)).any(axis=1))
+    Fm = F[mixed]
+    FmP = Fm @ P
+    across = FmP * decay
+    across[:, :, mixed] = FmP @ Fm.T
+    out: Floats = P * np.outer(decay, decay)
+    out[:, mixed] = across
+    out[:, :, mixed] = across.transpose(0, 2, 1)
+    return out
 
 
 def _padded(layout: Layout, Phi: Floats, dt: float) -> Floats:
@@ -186,23 +199,23 @@ def on_circle(bank: Bank, angle: Angle) -> Bank:
     Bank
     """
     s, v = angle
-    sine, cosine = bank.x[:, s], 1.0 - bank.x[:, v]
+    rows = np.flatnonzero(bank.P[:, v, v] > RADIUS_KNOWN)
+    sine, cosine = bank.x[rows, s], 1.0 - bank.x[rows, v]
     radius = np.maximum(np.hypot(sine, cosine), LEAST_RADIUS)
     us, uc = sine / radius, cosine / radius
-    Ps, Psc, Pc = bank.P[:, s, s], -bank.P[:, s, v], bank.P[:, v, v]
+    Ps, Psc, Pc = bank.P[rows, s, s], -bank.P[rows, s, v], bank.P[rows, v, v]
     along = uc * uc * Ps - 2.0 * us * uc * Psc + us * us * Pc
-    across = us * us * Ps + 2.0 * us * uc * Psc + uc * uc * Pc
-    rows = np.flatnonzero((radius > LEAST_RADIUS) & (along < ANGLE_KNOWN) & (Pc > RADIUS_KNOWN))
-    if not len(rows):
+    known = (radius > LEAST_RADIUS) & (along < ANGLE_KNOWN)
+    if not known.any():
         return bank
-    along, across = along[rows], across[rows]
-    innovation = 1.0 - 0.5 * along - radius[rows]
-    S = across + 0.5 * along * along + RADIUS_NOISE
+    across = us * us * Ps + 2.0 * us * uc * Psc + uc * uc * Pc
+    innovation = 1.0 - 0.5 * along - radius
+    precision = np.where(known, 1.0 / (across + 0.5 * along * along + RADIUS_NOISE), 0.0)
     x, P, L = bank.x.copy(), bank.P.copy(), bank.L.copy()
-    PHt = us[rows, None] * P[rows, :, s] - uc[rows, None] * P[rows, :, v]
-    x[rows] += PHt * (innovation / S)[:, None]
-    P[rows] -= PHt[:, :, None] * PHt[:, None] / S[:, None, None]
-    L[rows] -= 0.5 * innovation * innovation / S
+    PHt = us[:, None] * P[rows, :, s] - uc[:, None] * P[rows, :, v]
+    x[rows] += PHt * (precision * innovation)[:, None]
+    P[rows] -= PHt[:, :, None] * PHt[:, None] * precision[:, None, None]
+    L[rows] -= 0.5 * precision * innovation * innovation
     return bank._replace(x=x, P=P, L=normalised(L))
 
 
