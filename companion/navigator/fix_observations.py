@@ -54,13 +54,17 @@ def white_sigma(record: Gnss, settings: GnssConfig) -> float:
     return max(math.sqrt(stated**2 - settings.sigma_m**2), settings.sigma_m / 3.0)
 
 
-def velocity_sigma(record: Gnss, first_ns: int, settings: GnssConfig, before: Gnss | None = None) -> float:
+def velocity_sigma(
+    record: Gnss, first_ns: int, settings: GnssConfig, before: Gnss | None = None, share: float = 1.0
+) -> float:
     """One sigma an axis (m/s) of a fix's velocity.
 
-    The receiver's first fix was at `first_ns`; `before` is the last one that was used, if there is one.
+    The receiver's first fix was at `first_ns`; `before` is the last one that was used, if there is one. Of
+    what is stated a `share` is used.
     """
-    stated = record.sigma_velocity
-    if stated is None:
+    if record.sigma_velocity is not None:
+        stated = share * record.sigma_velocity
+    else:
         stated = SETTLING_M_S if (record.t_ns - first_ns) * 1e-9 < SETTLING_S else 0.0
     if before is not None and _is_course_held(before, record):
         assert record.v_n is not None

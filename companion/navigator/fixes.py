@@ -77,10 +77,12 @@ def gnss(state: State, record: Gnss, settings: Settings) -> Step:
     apart = measurements.gnss_apart(record, nominal.point)
     still = (apart[0] + state.moved[0], apart[1] + state.moved[1])  # as if the nominal had never jumped
     state, factor = _scattered(state, record, "gnss", still, variance)
+    state = _velocity_scattered(state, record)
     bank, velocity = state.bank, None
     assert bank is not None
     if config.use_velocity and record.v_n is not None:  # first: the position needs it
-        sigma = fix_observations.velocity_sigma(record, first_ns, config, last)
+        share = state.velocity_scatter.quiet if state.velocity_scatter else 1.0
+        sigma = fix_observations.velocity_sigma(record, first_ns, config, last, share)
         noise = factor * (sigma**2 + channel.velocity_noise**2)
         velocity = measurements.gnss_velocity(bank, known, channel, record, nominal.point, nominal.a_n, noise)
         bank = velocity.bank
@@ -315,6 +317,19 @@ def _scattered(
         state.scatter.get(name), record.t_ns, residual, variance, lacking / max(metres, 1.0)
     )
     return structs.replace(state, scatter={**state.scatter, name: seen}), seen.used
+
+
+def _velocity_scattered(state: State, record: Gnss) -> State:
+    """With one more velocity of GNSS, beside that of an INS or the IMU."""
+    before, stated = state.gnss_taken, record.sigma_velocity
+    is_other = before is not None and before.receiver != record.receiver
+    if driver(state) not in scatter.LACKING or is_other or stated is None or record.v_n is None:
+        return structs.replace(state, velocity_scatter=None)
+    assert state.nominal is not None
+    v_n = state.nominal.point.v_n
+    residual = (v_n[0] - record.v_n[0], v_n[1] - record.v_n[1])
+    seen = scatter.observe(state.velocity_scatter, record.t_ns, residual, stated**2, 0.0)
+    return structs.replace(state, velocity_scatter=seen)
 
 
 def _rejected(

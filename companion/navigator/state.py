@@ -96,6 +96,7 @@ class State(Struct, frozen=True):
     level: Level = Level()
     moved: Vector2 = (0.0, 0.0)  # sum of the jumps of the nominal trajectory, north and east (m)
     scatter: Mapping[str, Scatter] = MappingProxyType({})  # of the measurements, by name
+    velocity_scatter: Scatter | None = None  # of the velocity of GNSS
     parallel: Parallel | None = None  # filters beside the bank
     gnss_taken: Gnss | None = None  # the last one judged by the bank
     gnss_before: Gnss | None = None  # the one before it

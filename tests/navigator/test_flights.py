@@ -468,6 +468,57 @@ def test_a_spoofed_gnss_is_excluded_with_a_beacon_and_comes_back(channel: str, s
     assert flown.error[flown.t > back + 20.0].max() < 10.0
 
 
+STATED_M_S = 0.5  # where the velocity of the simulated receiver is good to 0.1 m/s
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_velocity_that_is_better_than_stated_shows_a_spoofer_at_once(seed: int) -> None:
+    """Drawn off east by 2 m/s. With the sigma that is stated it was not excluded within 85 s."""
+    begin, end = 120.0, 180.0
+
+    def spoofed(record: Any) -> Any:
+        if not isinstance(record, Gnss) or record.v_n is None:
+            return record
+        since = record.t_ns / NS - begin
+        off = 2.0 if 0.0 <= since < end - begin else 0.0
+        return replace(
+            record,
+            lon=record.lon + off * since / (6.378e6 * math.cos(record.lat)),
+            v_n=(record.v_n[0], record.v_n[1] + off, record.v_n[2]),
+            sigma_velocity=STATED_M_S,
+        )
+
+    flown = fly("imu", spoofed, FIVE_MINUTES[:4], seed=seed)
+    excluded = next(e.t_ns / NS for e in flown.events if e.text.startswith("gnss is excluded"))
+    assert begin < excluded < begin + 10.0
+    assert flown.error[flown.t > SETTLED_S].max() < 40.0
+
+
+LASTING_S = {"as noisy as stated": 0.0, "wrong for 5 s": 5.0, "wrong for 20 s": 20.0}
+
+
+@pytest.mark.parametrize("worse", LASTING_S)
+def test_a_velocity_that_becomes_as_bad_as_stated_does_not_make_gnss_suspect(worse: str) -> None:
+    rng, lasting, error, last = np.random.default_rng(1), LASTING_S[worse], np.zeros(2), 0.0
+
+    def changed(record: Any) -> Any:
+        nonlocal error, last
+        if not isinstance(record, Gnss) or record.v_n is None:
+            return record
+        t = record.t_ns / NS
+        kept = math.exp(-(t - last) / lasting) if lasting else 0.0
+        last = t
+        if t > 120.0:
+            error = kept * error + STATED_M_S * math.sqrt(1.0 - kept**2) * rng.standard_normal(2)
+        north, east, down = record.v_n
+        return replace(record, v_n=(north + error[0], east + error[1], down), sigma_velocity=STATED_M_S)
+
+    flown = fly("imu", changed)
+    assert not any(event.text.startswith("gnss is") for event in flown.events)
+    assert flown.error[flown.t > SETTLED_S].max() < 10.0
+    assert np.mean([flown.nees(t) for t in range(60, 290, 10)]) < 3.0
+
+
 @pytest.mark.parametrize("channel", ["ins", "imu", "air"])
 def test_a_gnss_that_stops_is_no_step_of_the_output(channel: str) -> None:
     """What the output moves beyond its velocity, from one solution to the next, is no more than before."""

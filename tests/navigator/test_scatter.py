@@ -116,3 +116,19 @@ def test_a_silence_and_an_unequal_distance_begin_anew() -> None:
 def test_a_source_is_noisy_once_until_it_is_quiet_again() -> None:
     noisy = [s.noisy for s in observed(np.concatenate([noise(100), 4.0 * noise(100, 2), noise(300, 3)]))]
     assert [b for a, b in pairwise(noisy) if a != b] == [True, False]
+
+
+@pytest.mark.parametrize("sigma, share", [(0.3, 1.0), (0.1, 0.3), (0.02, 0.06)])
+def test_of_a_velocity_that_scatters_less_than_stated_less_is_used_once_that_is_known(
+    sigma: float, share: float
+) -> None:
+    """Stated 0.5 m/s; as much as one and a half times the scatter is used, never more than is stated."""
+    found = observed(sigma * noise(), sigma=0.5)
+    assert all(s.quiet == 1.0 for s in found[: scatter.LAST - scatter.FIRST])
+    assert np.median([s.quiet for s in found[-100:]]) == pytest.approx(share, rel=0.15)
+
+
+def test_a_velocity_that_becomes_as_noisy_as_stated_is_used_so_within_ten_fixes() -> None:
+    found = observed(np.concatenate([0.1 * noise(200), noise(200, 2)]))
+    assert found[199].quiet < 0.2
+    assert found[210].quiet > 0.5
