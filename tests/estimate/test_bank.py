@@ -711,6 +711,26 @@ def test_of_two_rows_that_fit_alike_that_on_the_circle_is_believed():
     np.testing.assert_array_equal(b.on_circle(two._replace(P=0.5 * two.P / 0.05**2), Angle(0, 1)).L, two.L)
 
 
+@pytest.mark.parametrize("cosine", [0.0, 0.15, 0.25])
+def test_a_mean_near_the_centre_that_is_known_is_no_angle(cosine):
+    """A copter's hover: an IMU that measures nothing, cosine 0.15, was likelier than the angle."""
+    layout = replace(flight_layout((1.0, 1.0)), faults=())
+    two = b.start(layout, 0.0, np.zeros(2), 0.07**2 * np.eye(2), (0.01, 0.99))
+    two.x[1, :2] = -0.03, 1.0 - cosine
+    assert b.on_circle(two, Angle(0, 1)).weights[0] > 0.99
+
+
+def test_what_is_known_of_an_angle_in_part_costs_no_weight():
+    """Nothing is known of it; or its sine alone, and which side of the circle it is on is open."""
+    layout = replace(flight_layout((1.0, 1.0, 1.0)), faults=())
+    bank = b.start(layout, 0.0, np.zeros(2), 1e-8 * np.eye(2), (0.4, 0.3, 0.3))
+    bank.x[1:, 1] = 1.0
+    bank.P[1, :2, :2], bank.P[2, :2, :2] = 0.5 * np.eye(2), np.diag([0.01, 0.5])
+    for _ in range(100):
+        bank = b.on_circle(bank, Angle(0, 1))
+    np.testing.assert_allclose(bank.weights, [0.4, 0.3, 0.3])
+
+
 @pytest.mark.parametrize("often", [False, True])
 def test_a_jump_born_often_has_the_same_prior_and_its_onset_is_found_sooner(often):
     jump = Jump("drift", (1,), (5.0,), 10.0, often=often)

@@ -25,8 +25,9 @@ Measurement = tuple[Floats, Floats]
 """z (R, m) and H (R, m, k), linearised for each row."""
 
 #: A mean so near to the centre has no direction; the variance of an angle that is known (rad^2), of the
-#: measurement of the radius, and of a cosine that is known: of a small angle it is taken for 1.
-LEAST_RADIUS, ANGLE_KNOWN, RADIUS_NOISE, RADIUS_KNOWN = 0.3, 0.1, 1e-4, 1e-6
+#: measurement of the radius, and of a cosine that is known: of a small angle it is taken for 1. A row without
+#: a direction is none of an angle where the square of its radius is further off, in variances.
+LEAST_RADIUS, ANGLE_KNOWN, RADIUS_NOISE, RADIUS_KNOWN, NO_ANGLE = 0.3, 0.1, 1e-4, 1e-6, 9.0
 
 
 class Innovation(NamedTuple):
@@ -188,7 +189,8 @@ def on_circle(bank: Bank, angle: Angle) -> Bank:
     """Update by sine^2 + cosine^2 = 1, linearised, the rows that know the angle but not its radius.
 
     Without it a radius of 0.6 is as good as an angle. Where the angle is spread along its arc the mean is
-    within the circle.
+    within the circle. A mean near the centre has no direction: the square of its radius, to second order,
+    moves nothing, and costs weight only where it fits no angle.
 
     Parameters
     ----------
@@ -206,7 +208,11 @@ def on_circle(bank: Bank, angle: Angle) -> Bank:
     Ps, Psc, Pc = bank.P[rows, s, s], -bank.P[rows, s, v], bank.P[rows, v, v]
     along = uc * uc * Ps - 2.0 * us * uc * Psc + us * us * Pc
     known = (radius > LEAST_RADIUS) & (along < ANGLE_KNOWN)
-    if not known.any():
+    second = 1.0 - sine * sine - cosine * cosine - Ps - Pc
+    expected = 4.0 * (sine * sine * Ps + 2.0 * sine * cosine * Psc + cosine * cosine * Pc)
+    expected += 2.0 * (Ps * Ps + 2.0 * Psc * Psc + Pc * Pc) + RADIUS_NOISE
+    no_angle = ~known & (second * second > NO_ANGLE * expected)
+    if not (known | no_angle).any():
         return bank
     across = us * us * Ps + 2.0 * us * uc * Psc + uc * uc * Pc
     innovation = 1.0 - 0.5 * along - radius
@@ -215,7 +221,7 @@ def on_circle(bank: Bank, angle: Angle) -> Bank:
     PHt = us[:, None] * P[rows, :, s] - uc[:, None] * P[rows, :, v]
     x[rows] += PHt * (precision * innovation)[:, None]
     P[rows] -= PHt[:, :, None] * PHt[:, None] * precision[:, None, None]
-    L[rows] -= 0.5 * precision * innovation * innovation
+    L[rows] -= 0.5 * np.where(no_angle, second * second / expected, precision * innovation * innovation)
     return bank._replace(x=x, P=P, L=normalised(L))
 
 
