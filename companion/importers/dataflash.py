@@ -60,6 +60,7 @@ _COPTER = ("ArduCopter", "APM:Copter")
 _HELICOPTER = "Frame: HELI"
 _PLANE = ("ArduPlane", "APM:Plane")
 _QUADPLANE = "QuadPlane Frame"  # when it hovers is not logged
+FLYING_M_S, LANDED_M_S = 10.0, 3.0  # of a plane whose log does not state that it flies
 _WEEK_US = 604_800_000_000
 _GPS_EPOCH_US = 315_964_800_000_000  # 1980-01-06, UNIX time
 _LEAP_US = 18_000_000  # GPS - UTC since 2017
@@ -79,7 +80,8 @@ class MessageConverter:
         self._v_n: Vector3 | None = None
         self._differential: float | None = None
         self._has_airspeed = False  # the log has ARSP
-        self._flying: bool | None = None  # by STAT, of a plane
+        self._flying: bool | None = None  # of a plane, by STAT
+        self._by_speed = False  # of a plane whose log has no STAT (2014), by its speed over ground
         self._true_v_n: Vector3 | None = None
         self._true: Truth | None = None
         self._first_alt: float | None = None  # m, of the first POS
@@ -126,6 +128,10 @@ class MessageConverter:
             satellites=int(m.NSats),
             hdop=hdop,
         )
+        flying = m.Spd > (LANDED_M_S if self._flying else FLYING_M_S)
+        if self._by_speed and flying != self._flying:
+            self._flying = flying
+            yield Vehicle(t, t, flying=flying)
 
     def _gps_accuracy(self, name: str, m: Message, t: int) -> Iterator[Stamped]:
         receiver = getattr(m, "I", 0 if name == "GPA" else 1)
@@ -217,6 +223,7 @@ class MessageConverter:
         if text.startswith((*_COPTER, _HELICOPTER)):
             yield Vehicle(t, t, multirotor=not text.startswith(_HELICOPTER))
         elif text.startswith((*_PLANE, _QUADPLANE)):
+            self._by_speed = self._flying is None
             yield Vehicle(t, t, fixed_wing=not text.startswith(_QUADPLANE))
         yield Event(t, t, Severity.INFO, text[:MAX_TEXT])
 
@@ -225,7 +232,7 @@ class MessageConverter:
             yield Vehicle(t, t, flying=flying)
 
     def _flight_state(self, name: str, m: Message, t: int) -> Iterator[Stamped]:
-        flying = bool(m.isFlying)
+        flying, self._by_speed = bool(m.isFlying), False
         if flying != self._flying:
             self._flying = flying
             yield Vehicle(t, t, flying=flying)

@@ -62,9 +62,11 @@ def message(name: str, *values: object) -> bytes:
     return packed(TYPES[name], FORMATS[name][0], values)
 
 
-def gps(us: int, ms: int, lat: float = 45.0, status: int = 3, receiver: int = 0) -> bytes:
+def gps(
+    us: int, ms: int, lat: float = 45.0, status: int = 3, receiver: int = 0, speed: float = 10.0
+) -> bytes:
     return message(
-        *("GPS", us, receiver, status, ms, GWK, 10, 0.8, lat, 7.0, 300.0, 10.0, 90.0, -1.0, 0.0, 1)
+        *("GPS", us, receiver, status, ms, GWK, 10, 0.8, lat, 7.0, 300.0, speed, 90.0, -1.0, 0.0, 1)
     )
 
 
@@ -152,6 +154,21 @@ def test_a_plane_flies_by_its_status_and_when_a_quadplane_hovers_is_not_known(tm
     found = list(sources.open_source(write(tmp_path, definitions(), gps(1_000_000, GMS), *parts)))
     vehicles = [(record.fixed_wing, record.flying) for record in found if isinstance(record, r.Vehicle)]
     assert vehicles == [(True, None), (None, False), (None, True), (None, False), (False, None)]
+
+
+@pytest.mark.parametrize("has_status", [False, True])
+def test_a_plane_whose_log_has_no_status_flies_while_it_is_fast(
+    tmp_path: pathlib.Path, has_status: bool
+) -> None:
+    speeds = [0.0, 9.0, 14.0, 5.0, 2.0, 12.0]
+    parts = [message("MSG", 1_050_000, "ArduPlane V3.2.0")]
+    parts += [message("STAT", 1_060_000, 0, 0.0, 1, 2)] if has_status else []
+    parts += [
+        gps(1_100_000 + 100_000 * k, GMS + 200 + 200 * k, speed=speed) for k, speed in enumerate(speeds)
+    ]
+    found = list(sources.open_source(write(tmp_path, definitions(), gps(1_000_000, GMS), *parts)))
+    flying = [record.flying for record in found if isinstance(record, r.Vehicle)]
+    assert flying == [None, False, *([] if has_status else [True, False, True])]
 
 
 def test_primary_lane_is_converted(tmp_path: pathlib.Path) -> None:
