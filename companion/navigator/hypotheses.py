@@ -131,7 +131,8 @@ class Situation(NamedTuple):
     """What the hypotheses depend on.
 
     How many beacons there are, whether airspeed moves the nominal trajectory, whether a source of position
-    other than GNSS is received, whether GNSS is, and whether the velocity has changed within seconds.
+    other than GNSS is received, whether GNSS is, whether the velocity has changed within seconds, and whether
+    the aircraft flies where its nose points.
     """
 
     beacons: int = 0
@@ -139,6 +140,7 @@ class Situation(NamedTuple):
     witness: bool = True
     is_received: bool = False
     has_turned: bool = False
+    along_nose: bool = True
 
 
 class Hypotheses(NamedTuple):
@@ -331,7 +333,7 @@ def _jumps(config: Config, channel: Channel, now: Situation) -> tuple[Jump, ...]
     states = (*channel.wind, *((2, 3, 0, 1) if now.by_air else GUST))
     sigmas = (jump,) * 6 if now.by_air else (jump, jump, GUST_OPEN_M_S, GUST_OPEN_M_S)
     latency_h = 0.0 if now.by_air else LATENCY_STEPS_H
-    heading_h = HEADING_STEPS_H if now.is_received else 0.0
+    heading_h = HEADING_STEPS_H if now.is_received and (now.has_turned or now.along_nose) else 0.0
     velocity_h = VELOCITY_STEPS_H if now.is_received and now.has_turned else 0.0
     if now.by_air:
         heading_h, velocity_h = AIR_HEADING_STEPS_H, 0.0

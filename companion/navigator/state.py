@@ -133,6 +133,7 @@ def hypotheses(state: State, settings: Settings) -> Hypotheses:
         witness=has_witness(state, settings),
         is_received=bank is not None and bank.t - bank.seen[GNSS] <= timeout,
         has_turned=math.hypot(*state.turned) > TURNED_M_S,
+        along_nose=not state.sensors.multirotor and not state.sensors.hovering,
     )
     return settings.model.hypotheses(now)
 
