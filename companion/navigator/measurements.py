@@ -217,6 +217,11 @@ def foreign_velocity(bank: Bank, known: Hypotheses, channel: OwnChannel, apart: 
     return _velocity(bank, known, channel, own_error_model.foreign_row(channel.settings, apart))
 
 
+def standing(bank: Bank, known: Hypotheses, channel: OwnChannel, velocity: Vector2) -> Taken:
+    """Take a nominal `velocity` (m/s) for the error: the aircraft stands."""
+    return _velocity(bank, known, channel, own_error_model.standing_row(velocity))
+
+
 def _velocity(bank: Bank, known: Hypotheses, channel: OwnChannel, row: own_error_model.Row) -> Taken:
     H = np.zeros((2, known.layout.n_base))
     H[:, : channel.n] = row.H[:, : channel.n]

@@ -66,6 +66,14 @@ class AirspeedSums(NamedTuple):
         return math.hypot(*self.air) >= ONE_WAY * self.speed
 
 
+class Standing(NamedTuple):
+    """Since when nothing moves the IMU, whether GNSS has shown so, and when that was last used."""
+
+    since_ns: int
+    is_shown: bool = False
+    used_ns: int = -SENSOR_NS
+
+
 class Sensors(Struct, frozen=True):
     """Last readings: IMU and attitude, air data, the foreign velocity, and when each was last of use."""
 
@@ -85,6 +93,8 @@ class Sensors(Struct, frozen=True):
     multirotor: bool = False
     fixed_wing: bool = False
     hovering: bool = False
+    landed: bool = False  # by the autopilot's statement
+    standing: Standing | None = None
     aloft_ns: int | None = None  # since when it flies, a VTOL as an aeroplane, by the autopilot
     steady_m_s: float | None = None  # airspeed of a fixed wing without a sensor; its scale is estimated
 

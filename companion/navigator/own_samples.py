@@ -27,7 +27,7 @@ from companion.navigator.ground import (
     lifted,
     wind_shear,
 )
-from companion.navigator.own_channel import AirspeedSums, OwnChannel, Sensors
+from companion.navigator.own_channel import AirspeedSums, OwnChannel, Sensors, Standing
 from companion.navigator.own_error_model import Airspeed, By
 from companion.navigator.progress import (
     carried,
@@ -57,6 +57,9 @@ from companion.units import SECOND_NS
 AIRSPEED_EVERY_NS = 500_000_000  # gusts are correlated: more often adds nothing
 FOREIGN_EVERY_NS = SECOND_NS
 TAKE_OFF_NS = 10 * SECOND_NS  # a multirotor is off the ground after it, at whatever height
+#: Parked: mean acceleration and rates that a wrong attitude, a bias or an engine may show; speed of a GNSS
+#: that stands.
+STILL_M_S2, STILL_RAD_S, STANDS_M_S, STANDING_EVERY_NS = 0.6, 0.05, 0.7, 2 * SECOND_NS
 BLOCKED_M_S = 5.0  # slower, in flight, a pitot is blocked
 #: Between two samples, up to so far apart, no airspeed changes by more; one that did is not used for so long.
 STEP_M_S, STEP_M_S2, STEP_GAP_S, STEP_NS = 10.0, 10.0, 1.0, 10 * SECOND_NS
@@ -73,11 +76,17 @@ def vehicle(state: State, record: Vehicle, settings: Settings) -> Step:
     multirotor = s.multirotor if record.multirotor is None else record.multirotor
     fixed_wing = s.fixed_wing if record.fixed_wing is None else record.fixed_wing
     hovering = s.hovering if record.hovering is None else record.hovering
+    landed = s.landed if record.flying is None else not record.flying
     aloft_ns = s.aloft_ns
     if record.flying is not None:  # a copter hovers always, by its own statement
         aloft_ns = (aloft_ns or record.t_ns) if record.flying and (multirotor or not hovering) else None
     return with_sensors(
-        state, multirotor=multirotor, fixed_wing=fixed_wing, hovering=hovering, aloft_ns=aloft_ns
+        state,
+        multirotor=multirotor,
+        fixed_wing=fixed_wing,
+        hovering=hovering,
+        landed=landed,
+        aloft_ns=aloft_ns,
     ), []
 
 
@@ -150,7 +159,35 @@ def imu(state: State, record: Imu, settings: Settings) -> Step:
     last = before[-1] if before else now
     between = (0.5 * (now[0] + last[0]), 0.5 * (now[1] + last[1]))
     state, outputs = _driven(state, record, "imu", between, settings)
-    return _rotor_drag(state, record, settings), outputs
+    return _standing(_rotor_drag(state, record, settings), record, settings), outputs
+
+
+def _standing(state: State, record: Imu, settings: Settings) -> State:
+    """Use that a parked aircraft stands, where GNSS showed it to stand before it was lost.
+
+    Parked by the autopilot's statement and by the IMU alone it may be carried by a ship or a car.
+    """
+    s, fix = state.sensors, state.gnss_taken
+    n, e, _ = s.mean_acceleration
+    if not s.landed or math.hypot(n, e) > STILL_M_S2 or max(map(abs, record.w_b)) > STILL_RAD_S:
+        return state if s.standing is None else with_sensors(state, standing=None)
+    standing = s.standing or Standing(record.t_ns)
+    if fix is not None and fix.v_n is not None and fix.t_ns >= standing.since_ns:
+        stands = math.hypot(*fix.v_n[:2]) < STANDS_M_S
+        standing = standing._replace(is_shown=True) if stands else Standing(record.t_ns)
+    silent_ns = record.t_ns - (fix.t_ns if fix else 0)
+    state = with_sensors(state, standing=standing)
+    if not standing.is_shown or min(silent_ns, record.t_ns - standing.used_ns) < STANDING_EVERY_NS:
+        return state
+    state = propagated(state, settings)
+    assert state.bank is not None
+    assert state.nominal is not None
+    v_n = state.nominal.point.v_n
+    taken = measurements.standing(state.bank, hypotheses(state, settings), _own(settings), (v_n[0], v_n[1]))
+    state = with_sensors(
+        structs.replace(state, bank=taken.bank), standing=standing._replace(used_ns=record.t_ns)
+    )
+    return decided(state, record, settings)
 
 
 def _rotor_drag(state: State, record: Imu, settings: Settings) -> State:

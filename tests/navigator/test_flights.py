@@ -28,6 +28,7 @@ from companion.records import (
     Solution,
     Source,
     Trust,
+    Vehicle,
 )
 from companion.units import Floats
 from sitl.beacon import Beacon
@@ -101,6 +102,7 @@ def fly(
     seed: int = 1,
     winds: tuple[WindChange, ...] = (WindChange(0, 4, 5),),
     beacon: Beacon = FAR,
+    navigator: Navigator | None = None,
     **scenario: Any,
 ) -> Flown:
     """Fly a scenario with every record changed, or dropped where None comes back."""
@@ -118,7 +120,7 @@ def fly(
             **scenario,
         )
     )
-    navigator, outputs = Navigator(config or chosen), list[Any]()
+    navigator, outputs = navigator or Navigator(config or chosen), list[Any]()
     for record in world.records(kinds):
         changed = change(record)
         outputs += [] if changed is None else navigator.handle(changed)
@@ -517,6 +519,26 @@ def test_a_velocity_that_becomes_as_bad_as_stated_does_not_make_gnss_suspect(wor
     assert not any(event.text.startswith("gnss is") for event in flown.events)
     assert flown.error[flown.t > SETTLED_S].max() < 10.0
     assert np.mean([flown.nees(t) for t in range(60, 290, 10)]) < 3.0
+
+
+@pytest.mark.parametrize(
+    "flying, speed, stands", [(False, 0.0, True), (True, 0.0, False), (None, 0.0, False), (False, 8.0, False)]
+)
+def test_what_is_parked_stands_where_gnss_showed_it_to(
+    flying: bool | None, speed: float, stands: bool
+) -> None:
+    """Parked by its autopilot, on a ship of 8 m/s too: the IMU is as still."""
+    navigator = Navigator(OWN)
+    navigator.handle(Vehicle(1, 1, flying=flying, fixed_wing=True))
+    legs = (Leg(150, 40, speed, 0),)
+    flown = fly("imu", legs=legs, gnss_until=60.0, rsbn=((0.0, 1e9),), navigator=navigator)
+    sigma = np.sqrt([c[0] for c in flown.of("covariance", 145.0)])
+    if stands:
+        assert np.ptp(flown.error[flown.t > 61.0]) < 0.5
+        assert sigma.max() < 5.0
+    else:
+        assert sigma.min() > 100.0
+        assert np.hypot(*flown.velocity_error_n[-1]) < 1.0
 
 
 @pytest.mark.parametrize("channel", ["ins", "imu", "air"])
