@@ -80,8 +80,8 @@ class MessageConverter:
         self._v_n: Vector3 | None = None
         self._differential: float | None = None
         self._has_airspeed = False  # the log has ARSP
-        self._flying: bool | None = None  # of a plane, by STAT
-        self._by_speed = False  # of a plane whose log has no STAT (2014), by its speed over ground
+        self._is_plane = self._has_status = False  # the log names ArduPlane; it has STAT, which 2014 had not
+        self._flying: bool | None = None  # of a plane, by STAT, or by its speed over ground
         self._true_v_n: Vector3 | None = None
         self._true: Truth | None = None
         self._first_alt: float | None = None  # m, of the first POS
@@ -128,10 +128,8 @@ class MessageConverter:
             satellites=int(m.NSats),
             hdop=hdop,
         )
-        flying = m.Spd > (LANDED_M_S if self._flying else FLYING_M_S)
-        if self._by_speed and flying != self._flying:
-            self._flying = flying
-            yield Vehicle(t, t, flying=flying)
+        if self._is_plane and not self._has_status:
+            yield from self._flies(m.Spd > (LANDED_M_S if self._flying else FLYING_M_S), t)
 
     def _gps_accuracy(self, name: str, m: Message, t: int) -> Iterator[Stamped]:
         receiver = getattr(m, "I", 0 if name == "GPA" else 1)
@@ -223,7 +221,7 @@ class MessageConverter:
         if text.startswith((*_COPTER, _HELICOPTER)):
             yield Vehicle(t, t, multirotor=not text.startswith(_HELICOPTER))
         elif text.startswith((*_PLANE, _QUADPLANE)):
-            self._by_speed = self._flying is None
+            self._is_plane = True
             yield Vehicle(t, t, fixed_wing=not text.startswith(_QUADPLANE))
         yield Event(t, t, Severity.INFO, text[:MAX_TEXT])
 
@@ -232,7 +230,10 @@ class MessageConverter:
             yield Vehicle(t, t, flying=flying)
 
     def _flight_state(self, name: str, m: Message, t: int) -> Iterator[Stamped]:
-        flying, self._by_speed = bool(m.isFlying), False
+        self._has_status = True
+        yield from self._flies(bool(m.isFlying), t)
+
+    def _flies(self, flying: bool, t: int) -> Iterator[Stamped]:
         if flying != self._flying:
             self._flying = flying
             yield Vehicle(t, t, flying=flying)

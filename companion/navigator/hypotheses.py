@@ -54,8 +54,8 @@ INS_MISLED = (100.0, 100.0, 1.0, 1.0)
 BEACON_PLACE = 0.03  # its position is stated wrongly: likelier than a GNSS captured before the first fix
 BEACON_H = 2e-4  # a beacon steps, or is elsewhere, so often in an hour; it does not drift
 ORDERS = (3, 2, 2)  # GNSS may be drawn off with an acceleration
-#: A false airspeed does not grow for ever: with a heading that stuck, it grew against the wind to 274 m/s.
-RATES_S = (banks.FOR_EVER_S, banks.FOR_EVER_S, 30.0)
+#: The error of an airspeed is bounded: with a heading that stuck, it grew against the wind to 274 m/s.
+RATE_CORRELATION_S = (banks.NO_DECAY_S, banks.NO_DECAY_S, 30.0)
 APART_S = 10.0  # the estimate does not follow a jump of the channel while another explanation is likelier
 SILENCE_S = 5.0  # airspeed that is not used for longer is not judged
 MOST_BEACONS = 8  # followed at once: the work grows with their number
@@ -308,7 +308,7 @@ def _hypotheses(config: Config, channel: Channel, now: Situation) -> Hypotheses:
         jumps=_jumps(config, channel, now),
         grades=tuple(range(len(channel.grades))),
         orders=ORDERS,
-        rates_s=RATES_S,
+        rate_correlation_s=RATE_CORRELATION_S,
     )
     settings = Settings(
         surprise=SURPRISE,

@@ -47,6 +47,7 @@ OUTLIER = {
 }
 
 
+STANDING_M_S = 0.1  # noise of a velocity that is zero
 #: Half the normalised squared innovation of a corrector's component at which it is an outlier: five sigma.
 CORRECTOR_GATE = 12.5
 
@@ -217,9 +218,11 @@ def foreign_velocity(bank: Bank, known: Hypotheses, channel: OwnChannel, apart: 
     return _velocity(bank, known, channel, own_error_model.foreign_row(channel.settings, apart))
 
 
-def standing(bank: Bank, known: Hypotheses, channel: OwnChannel, velocity: Vector2) -> Taken:
+def standing(bank: Bank, known: Hypotheses, velocity: Vector2) -> Taken:
     """Take a nominal `velocity` (m/s) for the error: the aircraft stands."""
-    return _velocity(bank, known, channel, own_error_model.standing_row(velocity))
+    H = np.zeros((2, known.layout.n_base))
+    H[0, 2] = H[1, 3] = 1.0
+    return _take(bank, known, np.array(velocity), H, STANDING_M_S**2 * np.eye(2), None, "velocity")
 
 
 def _velocity(bank: Bank, known: Hypotheses, channel: OwnChannel, row: own_error_model.Row) -> Taken:

@@ -23,6 +23,7 @@ from companion.navigator.channel import DOPPLER_S, Nominal, Transition, moved
 from companion.navigator.ground import Ground
 from companion.navigator.inertial_track import Point
 from companion.navigator.own_error_model import By, Propagator
+from companion.navigator.standing import Standing
 from companion.navigator.strapdown_channel import Strap
 from companion.records import AirData, AirspeedSensor, Gnss, LocalPosition, RsbnFix, Vector2, Vector3
 from companion.units import G0, SECOND_NS, Floats
@@ -64,14 +65,6 @@ class AirspeedSums(NamedTuple):
     def is_one_way(self) -> bool:
         """Whether the samples are of one heading or a turn: a mean over a step of it is of neither."""
         return math.hypot(*self.air) >= ONE_WAY * self.speed
-
-
-class Standing(NamedTuple):
-    """Since when nothing moves the IMU, whether GNSS has shown so, and when that was last used."""
-
-    since_ns: int
-    is_shown: bool = False
-    used_ns: int = -SENSOR_NS
 
 
 class Sensors(Struct, frozen=True):

@@ -70,7 +70,6 @@ N = 23
 AIRSPEED_NOISE_M_S = 1.0  # of half a second's mean: pitot, angle of attack, sideslip
 AIRSPEED_MANOEUVRE_S = 0.2  # and per acceleration; 0.14 to 0.17 in an aerobatic flight (TestLog2)
 LEAST_M_S = 0.1  # of an airspeed
-STANDING_M_S = 0.1  # noise of a velocity that is zero
 LASTING = 2.0  # turbulence by airspeed alone: how many times longer than the gusts it lasts
 DRAG_SCALE = 0.25  # of a multirotor's drag; it changes with speed too
 STEADY_SCALE = 0.4  # of an airspeed without a sensor, at first: speed over ground in an unknown wind
@@ -483,10 +482,3 @@ def foreign_row(settings: Amplitudes, apart: Vector2) -> Row:
     H[0, 2] = H[1, 3] = 1.0
     H[0, at] = H[1, at + 1] = -1.0
     return Row(np.array(apart), H, np.eye(2) * settings.foreign_noise_m_s**2)
-
-
-def standing_row(velocity: Vector2) -> Row:
-    """Return the row of an aircraft that stands: its nominal velocity (m/s) is the error."""
-    H = np.zeros((2, N))
-    H[0, 2] = H[1, 3] = 1.0
-    return Row(np.array(velocity), H, np.eye(2) * STANDING_M_S**2)

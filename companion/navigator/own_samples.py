@@ -16,6 +16,7 @@ from companion.navigator import (
     measurements,
     own_channel,
     own_error_model,
+    standing,
     strapdown_channel,
 )
 from companion.navigator.channel import Nominal
@@ -27,7 +28,7 @@ from companion.navigator.ground import (
     lifted,
     wind_shear,
 )
-from companion.navigator.own_channel import AirspeedSums, OwnChannel, Sensors, Standing
+from companion.navigator.own_channel import AirspeedSums, OwnChannel, Sensors
 from companion.navigator.own_error_model import Airspeed, By
 from companion.navigator.progress import (
     carried,
@@ -38,7 +39,16 @@ from companion.navigator.progress import (
     shifted,
     solved_if_due,
 )
-from companion.navigator.state import NEAR_S, Settings, State, Step, gnss_climb, hypotheses, with_sensors
+from companion.navigator.state import (
+    NEAR_S,
+    Settings,
+    State,
+    Step,
+    gnss_climb,
+    gnss_is_received,
+    hypotheses,
+    with_sensors,
+)
 from companion.records import (
     AirData,
     AirspeedSensor,
@@ -57,9 +67,6 @@ from companion.units import SECOND_NS
 AIRSPEED_EVERY_NS = 500_000_000  # gusts are correlated: more often adds nothing
 FOREIGN_EVERY_NS = SECOND_NS
 TAKE_OFF_NS = 10 * SECOND_NS  # a multirotor is off the ground after it, at whatever height
-#: Parked: mean acceleration and rates that a wrong attitude, a bias or an engine may show; speed of a GNSS
-#: that stands.
-STILL_M_S2, STILL_RAD_S, STANDS_M_S, STANDING_EVERY_NS = 0.6, 0.05, 0.7, 2 * SECOND_NS
 BLOCKED_M_S = 5.0  # slower, in flight, a pitot is blocked
 #: Between two samples, up to so far apart, no airspeed changes by more; one that did is not used for so long.
 STEP_M_S, STEP_M_S2, STEP_GAP_S, STEP_NS = 10.0, 10.0, 1.0, 10 * SECOND_NS
@@ -163,31 +170,22 @@ def imu(state: State, record: Imu, settings: Settings) -> Step:
 
 
 def _standing(state: State, record: Imu, settings: Settings) -> State:
-    """Use that a parked aircraft stands, where GNSS showed it to stand before it was lost.
-
-    Parked by the autopilot's statement and by the IMU alone it may be carried by a ship or a car.
-    """
-    s, fix = state.sensors, state.gnss_taken
-    n, e, _ = s.mean_acceleration
-    if not s.landed or math.hypot(n, e) > STILL_M_S2 or max(map(abs, record.w_b)) > STILL_RAD_S:
-        return state if s.standing is None else with_sensors(state, standing=None)
-    standing = s.standing or Standing(record.t_ns)
-    if fix is not None and fix.v_n is not None and fix.t_ns >= standing.since_ns:
-        stands = math.hypot(*fix.v_n[:2]) < STANDS_M_S
-        standing = standing._replace(is_shown=True) if stands else Standing(record.t_ns)
-    silent_ns = record.t_ns - (fix.t_ns if fix else 0)
-    state = with_sensors(state, standing=standing)
-    if not standing.is_shown or min(silent_ns, record.t_ns - standing.used_ns) < STANDING_EVERY_NS:
+    """Use that a parked aircraft stands, while GNSS is not received."""
+    s = state.sensors
+    now = standing.follow(s.standing, record, s.landed, s.mean_acceleration, state.gnss_taken)
+    if now != s.standing:
+        state = with_sensors(state, standing=now)
+    if state.bank is None or state.nominal is None or now is None or not now.is_due(record.t_ns):
+        return state
+    if gnss_is_received(state, settings):
         return state
     state = propagated(state, settings)
     assert state.bank is not None
     assert state.nominal is not None
     v_n = state.nominal.point.v_n
-    taken = measurements.standing(state.bank, hypotheses(state, settings), _own(settings), (v_n[0], v_n[1]))
-    state = with_sensors(
-        structs.replace(state, bank=taken.bank), standing=standing._replace(used_ns=record.t_ns)
-    )
-    return decided(state, record, settings)
+    taken = measurements.standing(state.bank, hypotheses(state, settings), (v_n[0], v_n[1]))
+    state = with_sensors(state, standing=now._replace(measured_ns=record.t_ns))
+    return decided(structs.replace(state, bank=taken.bank), record, settings)
 
 
 def _rotor_drag(state: State, record: Imu, settings: Settings) -> State:

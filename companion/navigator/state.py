@@ -126,16 +126,21 @@ def with_sensors(state: State, **changes: Any) -> State:
 def hypotheses(state: State, settings: Settings) -> Hypotheses:
     """The hypotheses of the situation."""
     interval = state.nominal.interval if state.nominal else None
-    timeout, bank = settings.config.gnss.timeout_s, state.bank
     now = Situation(
         len(state.beacons),
         by_air=interval is not None and interval.by == "air",
         witness=has_witness(state, settings),
-        is_received=bank is not None and bank.t - bank.seen[GNSS] <= timeout,
+        is_received=gnss_is_received(state, settings),
         has_turned=math.hypot(*state.turned) > TURNED_M_S,
         along_nose=not state.sensors.multirotor and not state.sensors.hovering,
     )
     return settings.model.hypotheses(now)
+
+
+def gnss_is_received(state: State, settings: Settings) -> bool:
+    """Whether a fix was used within `gnss.timeout_s`."""
+    bank = state.bank
+    return bank is not None and bool(bank.t - bank.seen[GNSS] <= settings.config.gnss.timeout_s)
 
 
 def is_jammed(state: State) -> bool:

@@ -817,7 +817,7 @@ def test_velocity_and_acceleration_of_a_lie_are_seen():
 def test_a_rate_that_decays_moves_its_offset_by_its_integral():
     """In steps of any length; a rate of another group lasts for ever."""
     sources = (Source("airspeed", 1, 0), Source("gnss", 1, 1))
-    layout = Layout(1, (1, 1), sources, (), grades=(1.0,), rates_s=(30.0, b.FOR_EVER_S))
+    layout = Layout(1, (1, 1), sources, (), grades=(1.0,), rate_correlation_s=(30.0, b.NO_DECAY_S))
     bank = b.start(layout, 0.0, np.zeros(1), np.eye(1))
     bank = bank._replace(x=np.array([[0.0, 1.0, 0.5, 1.0, 0.5]]))
     for dt in (0.1, 7.0, 20.9):
@@ -825,8 +825,8 @@ def test_a_rate_that_decays_moves_its_offset_by_its_integral():
     lasting = math.exp(-28.0 / 30.0)
     expected = [0.0, 1.0 + 0.5 * 30.0 * (1.0 - lasting), 0.5 * lasting, 1.0 + 0.5 * 28.0, 0.5]
     np.testing.assert_allclose(bank.x[0], expected, rtol=1e-12)
-    with pytest.raises(ValueError, match="rates_s"):
-        replace(layout, rates_s=(30.0,))
+    with pytest.raises(ValueError, match="rate_correlation_s"):
+        replace(layout, rate_correlation_s=(30.0,))
 
 
 def test_a_receiver_that_reports_jamming_raises_the_prior():

@@ -163,12 +163,13 @@ def test_a_plane_whose_log_has_no_status_flies_while_it_is_fast(
     speeds = [0.0, 9.0, 14.0, 5.0, 2.0, 12.0]
     parts = [message("MSG", 1_050_000, "ArduPlane V3.2.0")]
     parts += [message("STAT", 1_060_000, 0, 0.0, 1, 2)] if has_status else []
-    parts += [
-        gps(1_100_000 + 100_000 * k, GMS + 200 + 200 * k, speed=speed) for k, speed in enumerate(speeds)
-    ]
+    for k, speed in enumerate(speeds):
+        parts.append(gps(1_100_000 + 100_000 * k, GMS + 200 + 200 * k, speed=speed))
+        parts.append(message("MSG", 1_110_000 + 100_000 * k, "ArduPlane V3.2.0"))  # again for a station
     found = list(sources.open_source(write(tmp_path, definitions(), gps(1_000_000, GMS), *parts)))
-    flying = [record.flying for record in found if isinstance(record, r.Vehicle)]
-    assert flying == [None, False, *([] if has_status else [True, False, True])]
+    stated = [record.flying for record in found if isinstance(record, r.Vehicle)]
+    flying = [state for state in stated if state is not None]
+    assert flying == [False, *([] if has_status else [True, False, True])]
 
 
 def test_primary_lane_is_converted(tmp_path: pathlib.Path) -> None:

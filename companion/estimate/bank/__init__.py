@@ -51,8 +51,8 @@ from companion.estimate.bank.branching import (
     jumped_before,
 )
 from companion.estimate.bank.layout import (
-    FOR_EVER_S,
     NEVER,
+    NO_DECAY_S,
     NONE,
     Angle,
     Bools,
@@ -89,9 +89,9 @@ from companion.estimate.bank.state import (
 
 __all__ = [
     "EXHAUSTIVE",
-    "FOR_EVER_S",
     "NEVER",
     "NONE",
+    "NO_DECAY_S",
     "Angle",
     "Bank",
     "Bools",

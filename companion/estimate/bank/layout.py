@@ -19,8 +19,8 @@ NONE = -1
 """Index of "no fault"; arrays over faults have their last entry for it."""
 NEVER = -math.inf
 """Time of a measurement that never came, and the logarithm of zero."""
-FOR_EVER_S = 1e15
-"""How long the rate of a lie lasts that does not decay."""
+NO_DECAY_S = 1e15
+"""Correlation time of a rate that does not decay."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,8 +146,8 @@ class Layout:
     position : indices of the two base states whose radial error the protection level bounds.
     orders : 2 or 3 per group; 2 by default. A lie that accelerates steadily pays in every fix for a wandering
         rate, but only once for an acceleration of its own.
-    rates_s : for how long a rate lasts (s), one per group; for ever by default. What an instrument is off by
-        does not grow for ever: beside base states that may jump, both would grow against each other.
+    rate_correlation_s : correlation time of the rates (s), one per group; by default they do not decay. The
+        error of an instrument is bounded: beside base states that jump, both would grow against each other.
     """
 
     n_base: int
@@ -158,10 +158,10 @@ class Layout:
     grades: tuple[float, ...] = (1.0, 4.0, 16.0, 64.0)
     position: tuple[int, int] = (0, 1)
     orders: tuple[int, ...] = ()
-    rates_s: tuple[float, ...] = ()
+    rate_correlation_s: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        for name, given in (("orders", self.orders), ("rates_s", self.rates_s)):
+        for name, given in (("orders", self.orders), ("rate_correlation_s", self.rate_correlation_s)):
             if given and len(given) != len(self.groups):
                 raise ValueError(f"{name} {given}: give one for each of {len(self.groups)} groups, or none")
         for s in self.sources:
@@ -199,9 +199,9 @@ class Layout:
         )
 
     @cached_property
-    def rate_times(self) -> Floats:
-        """For how long each rate lasts (s), in the order of `rates`."""
-        times = self.rates_s or (FOR_EVER_S,) * len(self.groups)
+    def rate_correlation_times(self) -> Floats:
+        """Correlation time of each rate (s), in the order of `rates`."""
+        times = self.rate_correlation_s or (NO_DECAY_S,) * len(self.groups)
         return np.repeat(times, self.groups)
 
     @cached_property

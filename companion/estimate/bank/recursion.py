@@ -96,7 +96,7 @@ def _padded(layout: Layout, Phi: Floats, dt: float) -> Floats:
     F[:k, :k] = Phi
     lies = np.arange(layout.n_base, n)
     F[lies, lies] = 1.0
-    times = layout.rate_times
+    times = layout.rate_correlation_times
     F[layout.rates, layout.rates] = np.exp(-dt / times)
     F[layout.offsets, layout.rates] = -times * np.expm1(-dt / times)
     if layout.accelerations[0].size:
