@@ -205,17 +205,23 @@ async def test_newcomer_takes_the_place_of_a_silent_client_only_and_the_autopilo
     await received.close()
 
 
+async def full_server() -> tuple[Listener, Received, list[Connection]]:
+    """A listener with as many clients as may send frames."""
+    received = Received(server := await listen())
+    clients = [await client_of(server) for _ in range(MAX_PEERS)]
+    for client in clients:
+        client.write(b"frame")
+    await until(lambda: len(received.by_sender) == MAX_PEERS)
+    return server, received, clients
+
+
 @pytest.mark.parametrize("data", [b"", b"junk", b"j" * 4096])
 async def test_connections_without_a_frame_do_not_disturb_clients(
     data: bytes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(tcp, "WAIT_S", 0.2)
 
-    received = Received(server := await listen())
-    clients = [await client_of(server) for _ in range(MAX_PEERS)]
-    for client in clients:
-        client.write(b"frame")
-    await until(lambda: len(received.by_sender) == MAX_PEERS)
+    server, received, clients = await full_server()
     strangers = []
     for k in range(200):
         strangers.append(await client_of(server))
@@ -270,11 +276,7 @@ async def test_too_many_waiting_clients_close_the_oldest_of_the_host_with_most(
 ) -> None:
     monkeypatch.setattr(tcp, "MAX_WAITING", 3)
 
-    received = Received(server := await listen())
-    established = [await client_of(server) for _ in range(MAX_PEERS)]
-    for client in established:
-        client.write(b"frame")
-    await until(lambda: len(received.by_sender) == MAX_PEERS)
+    server, received, established = await full_server()
     waiting = []
     for k, host in enumerate(["127.0.0.2", "127.0.0.1", "127.0.0.1", "127.0.0.1"]):
         waiting.append(socket.create_connection(("127.0.0.1", server.port), source_address=(host, 0)))
