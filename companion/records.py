@@ -281,6 +281,13 @@ class Tuning(Stamped, frozen=True, gc=False, tag=True):
     toml: str
 
 
+class Resumed(Stamped, frozen=True, gc=False, tag=True):
+    """A run of the service ended in flight: its configuration, as TOML, and its navigator's state."""
+
+    toml: str
+    state: bytes
+
+
 class Truth(Stamped, frozen=True, gc=False, tag=True):
     """True state from a simulator; logged and used for scoring, never passed to the navigator."""
 
@@ -517,6 +524,7 @@ Input: TypeAlias = (
     | Reboot
     | TimeStep
     | Tuning
+    | Resumed
 )
 Output: TypeAlias = Solution | Fix | Rejection | Reset | Event
 Record: TypeAlias = Input | Output | LinkState | Truth | Smoothed

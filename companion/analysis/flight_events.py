@@ -166,7 +166,7 @@ def source_title(source: str) -> str:
 
 
 #: Streams of other instruments, or made by the companion.
-_NOT_OF_THE_AUTOPILOT = ("RsbnFix", "StarFix", "RangeDifference", "SecondIns", "Tuning")
+_NOT_OF_THE_AUTOPILOT = ("RsbnFix", "StarFix", "RangeDifference", "SecondIns", "Tuning", "Resumed")
 
 
 def find_silences(flight: Flight) -> list[OutageInterval]:
@@ -273,6 +273,7 @@ _NAMES = {
     "SecondIns": "second INS",
     "StarFix": "star fixes",
     "Tuning": "changed parameters",
+    "Resumed": "state of the run before",
     "Reboot": "reboots",
     "TimeStep": "steps of the autopilot's time",
     "Event": "events",

@@ -64,6 +64,7 @@ from companion.records import (
     Output,
     RangeDifference,
     Reset,
+    Resumed,
     RsbnFix,
     SecondIns,
     Stamped,
@@ -173,7 +174,9 @@ class _Witness(Navigator):
         self._open: dict[str, _Onset] = {}  # of each source that is false now, as first known
 
     def handle(self, record: Stamped) -> list[Output]:
-        """Return the outputs of one more record."""
+        """Return the outputs of one more record; what was flown before the log is not smoothed."""
+        if isinstance(record, Resumed):
+            return []
         outputs = super().handle(record)
         if isinstance(record, Tuning):
             self._note(record)

@@ -16,9 +16,9 @@ from typing import Any, NamedTuple, TypeGuard
 
 from msgspec import structs
 
-from companion.config import Config, parse
+from companion.config import Config, ConfigError, parse
 from companion.estimate import bank as banks
-from companion.navigator import minimax_bound
+from companion.navigator import kept_state, minimax_bound
 from companion.navigator.changes import Changes
 from companion.navigator.fixes import is_too_soon
 from companion.navigator.hypotheses import Model
@@ -39,6 +39,7 @@ from companion.records import (
     Output,
     Rejection,
     Reset,
+    Resumed,
     RsbnFix,
     Severity,
     Solution,
@@ -131,6 +132,8 @@ class Navigator:
         if isinstance(record, Tuning):
             self._tune(record)
             return []
+        if isinstance(record, Resumed):
+            return self._with_events(self._resume(record), record)
         if not self._is_used(record):
             return []
         if not self._channel_reported:
@@ -279,6 +282,26 @@ class Navigator:
         same = config.has_own_ins == before.config.has_own_ins
         self._channel_reported = self._channel_reported and same
         self._past.forget()
+
+    def _resume(self, record: Resumed) -> list[Output]:
+        """Go on with the state of the run before, or report why not."""
+        try:
+            before = Settings.of(parse(record.toml, "the run before"))
+            state = kept_state.decode(record.state, before)
+            if begins_again(before.config, self._settings.config):
+                raise ValueError("it is of another inertial channel")
+            assert state.nominal is not None
+            age_s, limit_s = (record.t_ns - state.nominal.t_ns) * 1e-9, kept_state.MOST_AGE_S
+            if not 0.0 <= age_s <= limit_s:
+                raise ValueError(f"it is {age_s:.0f} s old, and the limit is {limit_s:.0f} s")
+        except (ConfigError, ValueError) as error:
+            text = f"the state of the run before is not used: {error}"
+            return [Event(record.t_ns, record.rx_ns, Severity.NOTICE, text)]
+        self.finish()
+        _, self._state = tuned(state, before, self._settings.config)
+        self._past.forget()
+        text = f"navigation goes on after a restart, {age_s:.1f} s later"
+        return [Event(record.t_ns, record.rx_ns, Severity.NOTICE, text)]
 
     def _queue_late(self, record: Input) -> list[Output]:
         """Let a late record join the roll-back in progress or wait for the next one, or reject it."""

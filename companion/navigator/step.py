@@ -35,6 +35,7 @@ from companion.records import (
     RangeDifference,
     Reboot,
     Reset,
+    Resumed,
     RsbnFix,
     SecondIns,
     Severity,
@@ -130,7 +131,7 @@ _OWN: _Uses = {
 
 _ABOUT_LOCAL = (LocalPosition, GlobalPosition, LocalOrigin)
 _OWN_FED: _Uses = {kind: use for kind, use in _OWN.items() if kind not in _ABOUT_LOCAL}
-INPUTS_USED = tuple({*_INS, *_OWN, *(kind for use in _CORRECTORS.values() for kind in use), Tuning})
+INPUTS_USED = tuple({*_INS, *_OWN, *(kind for use in _CORRECTORS.values() for kind in use), Tuning, Resumed})
 """Kinds of records that a navigator may use."""
 
 

@@ -48,7 +48,7 @@ from companion.link.session import (
     TimesyncOutlier,
 )
 from companion.link.signing import Signing
-from companion.navigator import Navigator
+from companion.navigator import Navigator, kept_state
 from companion.output.autopilot_output import AutopilotOutput
 from companion.output.encode import Receiver, named_values, navigation_status
 from companion.output.pace import Pace
@@ -62,6 +62,7 @@ from companion.records import (
     Reboot,
     Rejection,
     Reset,
+    Resumed,
     RsbnFix,
     Severity,
     Solution,
@@ -72,6 +73,7 @@ from companion.records import (
 )
 from companion.runtime.ground_station_services import STATUS, GroundStationServices, feed_periods_ns
 from companion.runtime.input_monitor import InputMonitor
+from companion.runtime.kept_run import Flown
 from companion.runtime.links import Link, requested_rates
 from companion.runtime.origin import OriginCheck
 from companion.runtime.parameter_check import ParameterCheck
@@ -83,6 +85,7 @@ from companion.units import SECOND_NS
 ORIGIN_REQUEST_INTERVAL = 3 * SECOND_NS
 FIRMWARE_REQUESTS = 10
 STALE_AFTER = 2 * SECOND_NS
+SAME_BOOT_NS = 3 * SECOND_NS  # of an autopilot's clock beside ours, before a restart and after it
 REPORT_INTERVAL = 10 * SECOND_NS
 #: Bytes per second, at once and in all of frames that are logged though they are not used: those of stations,
 #: other vehicles and strangers. A flood must not fill the disk with them.
@@ -136,16 +139,18 @@ class CompanionCore:
         signing: Signing | None = None,
         save: Callable[[str], None] = lambda text: None,
         base: Config | None = None,
+        flown: Flown | None = None,
     ) -> None:
         """Raises ConfigError for an invalid configuration, such as feeding back the autopilot's own position.
 
         `save` stores the TOML of the values that ground stations set beyond `base`; it may raise OSError.
+        `flown` is what the run before left: it is gone on with if the autopilot has not booted since.
         """
         for *_, sentence in find_conflicts(config):
             raise ConfigError(sentence)
         self._config = config
         self._log = log
-        self._navigator = Navigator(config)
+        self._navigator, self._flown = Navigator(config), flown
         self.links = {name: Link(name, config, number, signing) for number, name in enumerate(links)}
         self._output = AutopilotOutput(config)
         self._services = GroundStationServices(config, {STATUS: self._latest_status}, save, base)
@@ -199,6 +204,14 @@ class CompanionCore:
     def has_solution(self) -> bool:
         """Whether a solution was computed within the last seconds."""
         return self._solution is not None and not self._stale
+
+    def flown(self, now_ns: int) -> Flown | None:
+        """Return what the next run needs to go on with this flight; None without a recent solution."""
+        link = self._last_used
+        booted_ns = link.session.clock.offset(now_ns) if link else None
+        if booted_ns is None or not self.has_solution:
+            return None
+        return Flown(booted_ns, to_toml(self._config), kept_state.encode(self._navigator.state))
 
     def settle(self) -> None:
         """Run deferred work after the output has been sent; otherwise the next record runs it."""
@@ -409,7 +422,10 @@ class CompanionCore:
             self._emit_output_events()
         if msgid not in DECODED or link.repeats_attitude(msgid, event.received_ns):
             return
-        for record in decode(event.message, event.received_ns, link.sender):
+        records = decode(event.message, event.received_ns, link.sender)
+        if self._flown is not None:
+            self._resume(self._flown, link, event.received_ns)
+        for record in records:
             self._output.receive(record)
             if link.session.clock.rate > 1.0:
                 continue
@@ -417,6 +433,15 @@ class CompanionCore:
             is_rejected = self._on_record(record)
             if is_rejected and msgid in MEASUREMENTS:
                 self._answers.note_rejected(_receiver_of(link, event), event.received_ns)
+
+    def _resume(self, flown: Flown, link: Link, now_ns: int) -> None:
+        """Go on with the flight of the run before, once the autopilot shows that it has not booted since."""
+        booted_ns = link.session.clock.offset(now_ns)
+        if booted_ns is None:
+            return
+        self._flown = None
+        if abs(booted_ns - flown.booted_ns) <= SAME_BOOT_NS:
+            self._on_record(Resumed(now_ns, now_ns, flown.toml, flown.state))
 
     def _is_received_elsewhere(self, link: Link) -> bool:
         """Whether another link receives the same autopilot."""

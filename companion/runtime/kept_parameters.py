@@ -19,10 +19,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 from companion.config import Config, ConfigError
-from companion.runtime.state_file import replace_text
+from companion.runtime.state_file import BOOT_ID, boot_id, replace_text
 
 MAX_FAILED_STARTS = 2
-BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 
 
 class KeptParameters:
@@ -84,10 +83,7 @@ class KeptParameters:
 
     def _count(self) -> tuple[str, int]:
         """Return the id of this boot and its number of unconfirmed starts."""
-        try:
-            boot = self._boot_id.read_text("ascii").strip()
-        except (OSError, ValueError):
-            boot = "unknown"
+        boot = boot_id(self._boot_id)
         try:
             before, number = self._count_path.read_text("ascii").split()
             return boot, int(number) if before == boot else 0

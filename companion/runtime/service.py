@@ -37,6 +37,7 @@ from companion.runtime.core import CompanionCore
 from companion.runtime.daemon_thread import run_in_daemon_thread
 from companion.runtime.exposure import exposure
 from companion.runtime.kept_parameters import KeptParameters
+from companion.runtime.kept_run import KEEP_AFTER_S, KEEP_S, Flown, KeptRun
 from companion.runtime.link_addresses import check_links
 from companion.runtime.links import Link
 from companion.runtime.signing_key import SigningKey
@@ -69,7 +70,8 @@ class Service:
 
     `on_event` is called for every event, `base` is the operator's configuration without the values that
     ground stations set, `kept` the file of those, `deleted` the logs that were deleted and are still to be
-    reported. `on_status` is called once a second.
+    reported. `on_status` is called once a second. `kept_run` is the file of what the next run needs of the
+    flight, `flown` what the run before left there.
     """
 
     def __init__(
@@ -82,8 +84,10 @@ class Service:
         kept: KeptParameters | None = None,
         deleted: deque[Path] | None = None,
         on_status: Callable[[Status, int], None] = ignore_status,
+        kept_run: KeptRun | None = None,
+        flown: Flown | None = None,
     ) -> None:
-        self._kept = kept
+        self._kept, self._kept_run = kept, kept_run
         self._deleted = deque[Path]() if deleted is None else deleted
         self._on_status, self._next_status_ns = on_status, 0
         self._notifier = notifier or SystemdNotifier({})
@@ -94,7 +98,7 @@ class Service:
         self._save_lock = threading.Lock()
         self._deferred = DeferredLog(log)
         self.core = CompanionCore(
-            config, self._deferred, self._addresses, signing, self._parameters_file.put, base
+            config, self._deferred, self._addresses, signing, self._parameters_file.put, base, flown
         )
         self._log, self._on_event = log, on_event
         self._connections: dict[str, Connection] = {}
@@ -114,6 +118,7 @@ class Service:
                 running += [
                     tasks.create_task(self._run_timers()),
                     tasks.create_task(self._save_state_periodically()),
+                    tasks.create_task(self._keep_flight_periodically()),
                 ]
                 await stopped.wait()
                 self._notifier.stopping()
@@ -195,6 +200,22 @@ class Service:
                 )
             last_reported = trouble
 
+    async def _keep_flight_periodically(self) -> None:
+        """Keep what the next run needs of the flight; only this task waits for its disk."""
+        if self._kept_run is None:
+            return
+        solved_s, trouble = 0.0, ""
+        while True:
+            await asyncio.sleep(KEEP_S)
+            flown = self.core.flown(time.monotonic_ns())
+            solved_s += KEEP_S if flown else 0.0
+            if flown is None or solved_s < KEEP_AFTER_S:
+                continue
+            before, trouble = trouble, await run_in_daemon_thread(partial(self._kept_run.keep, flown))
+            if trouble and trouble != before:
+                text = f"{trouble}; after a restart in flight navigation would begin again"
+                self.core.report(Severity.WARNING, text, time.monotonic_ns())
+
     def _count_dropped(self) -> None:
         for name, stream in self._connections.items():
             self.core.links[name].dropped = self._dropped_before[name] + stream.dropped
@@ -275,6 +296,7 @@ async def run(
         on_delete=deleted.append,
     )
     service, has_data = None, True
+    kept_run = KeptRun(Path(settings.folder))
     try:
         if kept is not None:
             kept.count_start()
@@ -287,6 +309,8 @@ async def run(
             kept=kept,
             deleted=deleted,
             on_status=on_status,
+            kept_run=kept_run,
+            flown=kept_run.take(config),
         )
         service.core.report(Severity.INFO, f"companion {__version__}: log {log.path}", time.monotonic_ns())
         for address in map(Address.parse, config.link.connect):
@@ -301,6 +325,7 @@ async def run(
         threading.Thread(target=recover, name="recover", daemon=True).start()
         gc.freeze()  # what was imported stays: looking through all of it for cycles takes 25 ms
         await service.serve(stopped)
+        kept_run.end()
         with contextlib.suppress(TimeoutError):
             await asyncio.wait_for(run_in_daemon_thread(service.save_state), STOP_TIMEOUT_S)
             await asyncio.wait_for(run_in_daemon_thread(service.confirm_parameters), STOP_TIMEOUT_S)

@@ -14,6 +14,16 @@ import os
 import threading
 from pathlib import Path
 
+BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
+
+
+def boot_id(path: Path = BOOT_ID) -> str:
+    """Return the id of this boot of the computer; "unknown" where the system does not state it."""
+    try:
+        return path.read_text("ascii").strip()
+    except (OSError, ValueError):
+        return "unknown"
+
 
 class StateFile:
     """Text of one file; with `path` None nothing is stored."""

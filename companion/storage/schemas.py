@@ -115,6 +115,7 @@ FIELDS = {
     "spoofing": "GPS_SPOOFING_STATE of MAVLink",
     "star": "number of the star",
     "stamp_us": "us, time of the receiver as sent",
+    "state": "state of the navigator in an earlier run, as base64",
     "static": "Pa",
     "step_s": "s by which the autopilot's times map later than before",
     "system": "MAVLink system number",

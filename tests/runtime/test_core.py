@@ -22,6 +22,7 @@ from companion.records import (
     Reboot,
     Rejection,
     Reset,
+    Resumed,
     RsbnFix,
     Severity,
     Solution,
@@ -506,6 +507,37 @@ def test_navigation_restarts_after_a_reboot() -> None:
     assert sum("rebooted" in e.text for e in flight.log.of(Event)) == 1
     assert flight.log.of(Solution)[-1].rx_ns > flight.now - SECOND
     assert any(at > flight.now - SECOND for at in flight.times_sent("ODOMETRY"))
+
+
+def killed_and_begun_again(seconds: float, autopilot_boots: bool = False) -> tuple[Flight, Flight]:
+    """A flight, and the one of a second core that was given what the first one kept."""
+    first, second = Flight(), Flight()
+    first.fly(40)
+    second.core = CompanionCore(CONFIG, second.log, ("main",), flown=first.core.flown(first.now))
+    second.now = first.now + round(seconds * SECOND)
+    second.boot = second.now - 20 * SECOND if autopilot_boots else first.boot
+    second.fly(1)
+    return first, second
+
+
+def test_a_companion_that_was_killed_goes_on_with_the_flight() -> None:
+    first, second = killed_and_begun_again(6.0)
+    (kept,) = second.log.of(Resumed)
+    assert "navigation goes on after a restart, 6.1 s later" in event_texts(second)
+    before, after = first.log.of(Solution)[-1], second.log.of(Solution)[0]
+    assert after.gnss_false == before.gnss_false
+    assert after.t_ns - kept.t_ns < SECOND
+
+
+def test_what_was_kept_is_not_of_use_to_an_autopilot_that_booted_since() -> None:
+    _, second = killed_and_begun_again(6.0, autopilot_boots=True)
+    assert not second.log.of(Resumed)
+    assert not [text for text in event_texts(second) if "restart" in text]
+
+
+def test_before_a_solution_nothing_is_kept() -> None:
+    flight = Flight()
+    assert flight.core.flown(flight.now) is None
 
 
 def test_version_of_another_autopilot_is_requested_again() -> None:

@@ -19,6 +19,7 @@ from companion.config import load
 from companion.link import dialect, frame
 from companion.records import Event, LinkState
 from companion.runtime import service
+from companion.runtime.kept_run import Flown, KeptRun
 from companion.runtime.service import Service
 from companion.storage import flight_log, retention
 from companion.transport.reconnect import Address, CannotListen
@@ -348,6 +349,32 @@ def test_starts_that_fail_for_another_reason_keep_the_parameters(
                 done = companion("run", *keep, *arguments)
                 assert done.returncode == code and "failed" not in done.stderr
     assert values.exists()
+
+
+def test_the_flight_is_kept_for_the_next_run_until_this_one_ends(tmp_path: Path, monkeypatch) -> None:
+    """And a folder that cannot be written is reported once."""
+    monkeypatch.setattr(service, "KEEP_S", 0.01)
+    monkeypatch.setattr(service, "KEEP_AFTER_S", 0.05)
+    monkeypatch.delenv("RUNTIME_DIRECTORY", raising=False)
+    folder = tmp_path / "kept"
+    kept, flown, events = KeptRun(folder), Flown(0, "", b"state"), list[Event]()
+
+    async def fly() -> None:
+        with log_in(tmp_path) as log:
+            stopped = asyncio.Event()
+            config = load(None, {"link.connect": (f"udpin:{LOOPBACK}:{free_port()}",)}, {})
+            flying = Service(config, log, events.append, kept_run=kept)
+            monkeypatch.setattr(flying.core, "flown", lambda now_ns: flown)
+            serving = asyncio.create_task(flying.serve(stopped))
+            await until(lambda: any("restart in flight" in event.text for event in events))
+            folder.mkdir()
+            await until(kept.path.exists)
+            stopped.set()
+            await serving
+
+    asyncio.run(fly())
+    assert kept.path.exists()  # as after a kill: to end it is up to `run`
+    assert len([event for event in events if str(kept.path) in event.text]) == 1
 
 
 def test_two_killed_starts_set_the_parameters_aside(tmp_path: Path) -> None:
