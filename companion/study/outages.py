@@ -1,7 +1,7 @@
 """`companion study outages`: what a recorded flight would have been worth without GNSS, from every minute on.
 
     companion study outages flight.ulg
-    companion study outages flight.tlog --rsbn beacons.csv --lasting 60 --lasting 300
+    companion study outages flights/*.bin --rsbn beacons.csv --lasting 60 --lasting 300
 
 GNSS is taken from the navigator, for as long as is asked; then the flight goes on with GNSS up to the next
 minute. The error is the distance from GNSS itself. Beside it stand two rules that need no filter: the
@@ -14,6 +14,7 @@ from __future__ import annotations
 import copy
 import json
 import math
+import sys
 from bisect import bisect_right
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
@@ -21,6 +22,8 @@ from typing import NamedTuple
 
 import click
 import numpy as np
+from rich.markup import escape
+from rich.table import Table
 
 from companion.analysis.beacon_options import beacon_options
 from companion.analysis.error_statistics import root_mean_square
@@ -31,6 +34,7 @@ from companion.nav.geometry import Geodetic, separation
 from companion.navigator import INPUTS_USED, Navigator
 from companion.navigator.own_channel import SENSOR_NS, Sensors, airspeed_is_sensed, with_airspeed_sensor
 from companion.option_types import INPUT_PATH, FloatRange
+from companion.printable import printable
 from companion.records import AirData, AirspeedSensor, Attitude, Gnss, Reboot, Solution, Stamped, Vehicle
 from companion.storage.reader import LogError
 from companion.tables import number_table, print_tables
@@ -48,6 +52,7 @@ STEP_S = 0.1  # of the rules
 class Row(NamedTuple):
     """Errors after outages of one duration: r.m.s. and greatest (m), and the share within 2 sigma an axis."""
 
+    log: str
     lasting_s: float
     outages: int
     rms_m: float | None
@@ -213,7 +218,9 @@ def straight_on(fixes: Fixes, start: float, seconds: float) -> Floats:
     return np.array([fixes.v_n[k], fixes.v_e[k]]) * seconds
 
 
-def study(records: Sequence[Stamped], config: Config, every_s: float, lasting: Sequence[float]) -> list[Row]:
+def study(
+    log: str, records: Sequence[Stamped], config: Config, every_s: float, lasting: Sequence[float]
+) -> list[Row]:
     """Return a row for every duration; none if no outage fits into the flight."""
     fixes, air = Fixes(records), Air(records)
     starts = fixes.starts(every_s, max(lasting))
@@ -229,12 +236,12 @@ def study(records: Sequence[Stamped], config: Config, every_s: float, lasting: S
             if air.known:
                 rules["wind"].append(math.dist(by_air(air, fixes, start, seconds), moved))
         errors = np.array([found[seconds] for found in flown if seconds in found]).reshape(-1, 4)
-        rows.append(_row(seconds, len(starts), errors, rules["wind"], rules["straight"]))
+        rows.append(_row(log, seconds, len(starts), errors, rules["wind"], rules["straight"]))
     return rows
 
 
 def _row(
-    seconds: float, outages: int, errors: Floats, by_wind_m: list[float], straight_on_m: list[float]
+    log: str, seconds: float, outages: int, errors: Floats, by_wind_m: list[float], straight_on_m: list[float]
 ) -> Row:
     rms_m = worst_m = within = None
     if len(errors):
@@ -242,11 +249,11 @@ def _row(
         rms_m, worst_m = root_mean_square(distance), float(distance.max())
         within = float((np.abs(errors[:, :2]) <= 2.0 * errors[:, 2:]).mean())
     wind = root_mean_square(np.array(by_wind_m)) if by_wind_m else None
-    return Row(seconds, outages, rms_m, worst_m, within, wind, root_mean_square(np.array(straight_on_m)))
+    return Row(log, seconds, outages, rms_m, worst_m, within, wind, root_mean_square(np.array(straight_on_m)))
 
 
 @click.command("outages")
-@click.argument("log", type=INPUT_PATH)
+@click.argument("logs", type=INPUT_PATH, nargs=-1, required=True, metavar="LOG...")
 @click.option("--lasting", type=FloatRange(1.0, 3600.0), multiple=True, help="Seconds; may be repeated.")
 @click.option(
     "--every",
@@ -260,7 +267,7 @@ def _row(
 @configuration_options
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 def command(
-    log: Path,
+    logs: tuple[Path, ...],
     lasting: tuple[float, ...],
     every_s: float,
     beacons: Path | None,
@@ -270,38 +277,65 @@ def command(
     pairs: tuple[str, ...],
     as_json: bool,
 ) -> None:
-    """Take GNSS from a recorded flight, again and again.
+    """Take GNSS from recorded flights, again and again.
 
     LOG is any log that `companion replay` reads. From every minute of the flight on GNSS is withheld for 10,
     30, 60 and 120 s (--lasting), and the solution is compared with GNSS. Beside it: airspeed and heading plus
     the mean wind of the last minute (without an airspeed sensor: the airspeed and wind that fit the last two
-    minutes best), and straight on.
+    minutes best), and straight on. Exit code 1 if a log is refused; the others are studied.
     """
     config = load(file, {}, pairs=pairs, preset=preset)
     durations = tuple(sorted(set(lasting))) or LASTING_S
-    with input_errors_as_log_errors():
-        inputs, note = with_beacons_and_outages(log, beacons, (), seed, config)
-        records = [r for r in inputs.records if isinstance(r, INPUTS_USED) and not isinstance(r, Reboot)]
-    records.sort(key=lambda record: record.rx_ns)
-    rows = study(records, config, every_s, durations)
+    rows, notes, refused = list[Row](), list[str](), list[LogError]()
+    for log in logs:
+        try:
+            found, note = _flown_without(log, beacons, seed, config, every_s, durations)
+        except LogError as error:
+            refused.append(error)
+            continue
+        rows += found
+        notes.append(note)
     if not rows:
-        raise LogError(
-            f"{log}: no {LEARNING_S + max(durations):.0f} s of flight with GNSS (stated by the log, or "
-            f"faster than {FLYING_M_S:g} m/s): choose a longer flight, or a shorter --lasting"
-        )
+        raise refused[0]
     if as_json:
         click.echo(json.dumps([row._asdict() for row in rows]))
-        return
-    number = rows[0].outages
-    title = f"Error after an outage of GNSS, m r.m.s. of {number} outage{'s' * (number != 1)}"
-    heads = "s", "companion", "worst", "within 2 sigma", "by airspeed and wind", "straight on"
-    table = number_table(title, *heads, texts=0, caption=note)
+    else:
+        print_tables(_table(rows, notes))
+    for reason in refused:
+        click.echo(f"companion: {reason}", err=True)
+    if refused:
+        sys.exit(1)
+
+
+def _table(rows: Sequence[Row], notes: Iterable[str]) -> Table:
+    heads = "log", "s", "outages", "companion", "worst", "within 2 sigma", "by airspeed and wind"
+    title = "Error after an outage of GNSS, m r.m.s."
+    table = number_table(title, *heads, "straight on", caption="\n".join(filter(None, dict.fromkeys(notes))))
     for row in rows:
         table.add_row(
+            escape(printable(row.log)),
             f"{row.lasting_s:g}",
+            f"{row.outages}",
             *("-" if x is None else f"{x:.0f}" for x in (row.rms_m, row.worst_m)),
             "-" if row.within is None else f"{100.0 * row.within:.0f} %",
             "-" if row.by_wind_m is None else f"{row.by_wind_m:.0f}",
             f"{row.straight_on_m:.0f}",
         )
-    print_tables(table)
+    return table
+
+
+def _flown_without(
+    log: Path, beacons: Path | None, seed: int, config: Config, every_s: float, lasting: Sequence[float]
+) -> tuple[list[Row], str]:
+    """The rows of one log, and a note on its beacons. Raises LogError."""
+    with input_errors_as_log_errors():
+        inputs, note = with_beacons_and_outages(log, beacons, (), seed, config)
+        records = [r for r in inputs.records if isinstance(r, INPUTS_USED) and not isinstance(r, Reboot)]
+    records.sort(key=lambda record: record.rx_ns)
+    rows = study(log.name, records, config, every_s, lasting)
+    if not rows:
+        raise LogError(
+            f"{log}: no {LEARNING_S + max(lasting):.0f} s of flight with GNSS (stated by the log, or "
+            f"faster than {FLYING_M_S:g} m/s): choose a longer flight, or a shorter --lasting"
+        )
+    return rows, note

@@ -47,7 +47,7 @@ def without_airspeed() -> list[Input]:
 @pytest.mark.flight
 def test_a_real_fixed_wing_reckons_without_an_airspeed_sensor() -> None:
     """It is no worse than the rule that fits airspeed and wind to the last two minutes, within its sigmas."""
-    rows = outages.study(without_airspeed(), CONFIG, 60.0, (10.0, 30.0, 60.0, 120.0))
+    rows = outages.study("", without_airspeed(), CONFIG, 60.0, (10.0, 30.0, 60.0, 120.0))
     for row in rows:
         assert row.rms_m is not None and row.by_wind_m is not None and row.within is not None
         assert row.rms_m < row.by_wind_m < 0.3 * row.straight_on_m

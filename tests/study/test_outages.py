@@ -18,6 +18,7 @@ from companion.config import load
 from companion.importers.sources import open_source
 from companion.nav.geometry import Geodetic, displace, separation
 from companion.records import AirData, AirspeedSensor, Attitude, Gnss, Stamped, Vehicle
+from companion.storage.flight_log import Writer
 from companion.storage.reader import LogError
 from companion.study import outages
 
@@ -49,7 +50,7 @@ def circling(seconds: float, lost: tuple[float, float] = (0.0, 0.0)) -> list[Sta
 @pytest.mark.flight
 def test_rules_and_companion_on_a_flight_that_is_known() -> None:
     config = load(flags={"inertial.source": "air_data"}, environment={})
-    rows = outages.study(circling(330.0), config, 60.0, (10.0, 60.0))
+    rows = outages.study("", circling(330.0), config, 60.0, (10.0, 60.0))
     assert [row.outages for row in rows] == [3, 3]
     for row in rows:
         assert row.by_wind_m is not None and row.by_wind_m < 3.0
@@ -103,6 +104,23 @@ def test_a_flight_too_short_is_one_sentence() -> None:
         match=r"no 210 s of flight with GNSS \(stated by the log, or faster than 8 m/s\): choose a longer",
     ):
         CliRunner().invoke(cli, ["study", "outages", str(log)], catch_exceptions=False)
+
+
+@pytest.mark.flight
+def test_of_several_logs_each_has_its_rows_and_its_reason(tmp_path: Path) -> None:
+    """A name is printed as it is; a log that is refused costs the others nothing."""
+    log, short = tmp_path / "[b]circle.mcap", DATA / "dronekit_copter_cut.tlog"
+    with Writer(log, metadata={}, start_unix_ns=NS, start_ns=0) as writer:
+        for record in circling(130.0):
+            writer.record(record)
+    words = ["study", "outages", str(log), str(short), "--lasting", "10"]
+    done = CliRunner().invoke(cli, [*words, "--json"], catch_exceptions=False)
+    assert [(row["log"], row["lasting_s"], row["outages"]) for row in json.loads(done.stdout)] == [
+        (log.name, 10.0, 1)
+    ]
+    assert done.exit_code == 1
+    assert done.stderr.startswith(f"companion: {short}: no 100 s of flight with GNSS")
+    assert log.name in CliRunner().invoke(cli, words).stdout
 
 
 @pytest.mark.parametrize("name", ["no_airspeed_sensor", "pitot_stuck"])
