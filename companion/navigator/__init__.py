@@ -133,7 +133,7 @@ class Navigator:
             self._tune(record)
             return []
         if isinstance(record, Resumed):
-            return self._with_events(self._resume(record), record)
+            return self._resume(record) + self._with_events([], record)
         if not self._is_used(record):
             return []
         if not self._channel_reported:
