@@ -7,6 +7,7 @@ the guaranteed bound, which begins again, and the filters beside the bank, which
 from __future__ import annotations
 
 from typing import Any
+from zlib import crc32
 
 import msgspec
 import numpy as np
@@ -17,6 +18,7 @@ from companion.navigator.minimax_bound import Guarantee
 from companion.navigator.state import Settings, State, hypotheses
 
 MOST_ROWS = 32  # of the bank: 0.3 MB
+CRC_BYTES = 4
 MOST_AGE_S = 60.0  # of a state that is gone on with: its velocity held, one sigma of the position is 1 km
 
 
@@ -37,11 +39,15 @@ def encode(state: State) -> bytes:
         pending=None,
         half=None,
     )
-    return _encoder.encode(kept)
+    data: bytes = _encoder.encode(kept)
+    return crc32(data).to_bytes(CRC_BYTES, "little") + data
 
 
 def decode(data: bytes, settings: Settings) -> State:
     """Return the state that `encode` was given under the same settings. Raises ValueError if it is none."""
+    crc, data = data[:CRC_BYTES], data[CRC_BYTES:]
+    if crc32(data).to_bytes(CRC_BYTES, "little") != crc:
+        raise ValueError("it is damaged")
     try:
         state = _decoder.decode(data)
     except msgspec.MsgspecError as error:
