@@ -48,7 +48,15 @@ from companion.navigator import (
     tuned,
 )
 from companion.navigator.channel import Nominal, Transition
-from companion.navigator.hypotheses import BIASES, MOST_BEACONS, MOST_WIDER, VELOCITY, Hypotheses, Model
+from companion.navigator.hypotheses import (
+    BIASES,
+    HEADING,
+    MOST_BEACONS,
+    MOST_WIDER,
+    VELOCITY,
+    Hypotheses,
+    Model,
+)
 from companion.navigator.inertial_track import Point
 from companion.navigator.own_channel import OwnChannel
 from companion.navigator.progress import driver
@@ -346,15 +354,16 @@ class _PlainModel(Model):
         self.asked.append((found, nominal.point))
         return found
 
-    def kept(self, bank: Bank, Phi: Floats) -> Floats | None:
-        """Factors of a heading that is far off, noted in Phi and Q."""
-        factors = super().kept(bank, Phi)
-        if factors is not None:
-            (A, B), point = self.asked[-1]
-            D, n = factors[0], B.shape[-1]  # of A more where a false airspeed would move the nominal
-            wider = np.minimum(D[:n], MOST_WIDER)
-            self.asked[-1] = Transition(D[: len(A), None] * A, wider[:, None] * B * wider), point
-        return factors
+    def kept(self, Phi: Floats) -> float:
+        """Factor of a heading that is far off, noted in Phi and Q."""
+        kept = super().kept(Phi)
+        (A, B), point = self.asked[-1]
+        A, B, wider, sine = A.copy(), B.copy(), min(kept, MOST_WIDER), HEADING.sine
+        A[sine] *= kept
+        B[:, sine] *= wider
+        B[:, :, sine] *= wider
+        self.asked[-1] = Transition(A, B), point
+        return kept
 
 
 class _Epoch(NamedTuple):

@@ -231,19 +231,20 @@ class Model:
         """
         if not self.channel.wind:
             return bank
-        if (kept := self.kept(bank, Phi)) is not None:
-            wider = np.minimum(kept, MOST_WIDER)
-            bank = bank._replace(x=kept * bank.x, P=wider[:, :, None] * bank.P * wider[:, None])
+        far = np.flatnonzero(bank.x[:, HEADING.versine] > FAR_VERSINE)
+        if far.size:
+            kept = self.kept(Phi)
+            wider, sine = min(kept, MOST_WIDER), HEADING.sine
+            x, P = bank.x.copy(), bank.P.copy()
+            x[far, sine] *= kept
+            P[far, sine] *= wider
+            P[far, :, sine] *= wider
+            bank = bank._replace(x=x, P=P)
         return banks.on_circle(bank, HEADING)
 
-    def kept(self, bank: Bank, Phi: Floats) -> Floats | None:
-        """Factors (R, n) that undo what Phi takes from a heading that is far off; None where none is."""
-        far = bank.x[:, HEADING.versine] > FAR_VERSINE
-        if not far.any():
-            return None
-        factors = np.ones_like(bank.x)
-        factors[far, HEADING.sine] /= max(Phi[HEADING.sine, HEADING.sine], 1e-300)
-        return factors
+    def kept(self, Phi: Floats) -> float:
+        """Factor that undoes what Phi takes from the sine of a heading that is far off."""
+        return float(1.0 / max(Phi[HEADING.sine, HEADING.sine], 1e-300))
 
     def transition(self, nominal: Nominal, beacons: int) -> Transition:
         """Phi (n, n) and Q (grades, n_base, n_base) over all states, the lies' motion left to the bank."""
