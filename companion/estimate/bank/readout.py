@@ -74,18 +74,23 @@ def estimate(bank: Bank, layout: Layout) -> Gaussian:
     -------
     Gaussian : of all states.
     """
-    w = np.where(explanations(bank, layout) == bank.leading, bank.weights, 0.0)
-    total = float(w.sum())
-    if total == 0.0:
-        i = int(np.argmax(bank.L))
-        return Gaussian(bank.x[i], bank.P[i])
-    w = np.where(w > 1e-9 * total, w, 0.0)
-    w /= w.sum()
+    w = _leading_weights(bank, layout)
     mean = w @ bank.x
     d = (bank.x - mean) * np.sqrt(w)[:, None]
     n = len(mean)
     P = (w @ bank.P.reshape(len(w), -1)).reshape(n, n) + d.T @ d
     return Gaussian(mean, P)
+
+
+def _leading_weights(bank: Bank, layout: Layout) -> Floats:
+    """Weights of the rows of the leading explanation, their sum 1; the heaviest row's if it has none."""
+    w = np.where(explanations(bank, layout) == bank.leading, bank.weights, 0.0)
+    total = float(w.sum())
+    if total == 0.0:
+        w[int(np.argmax(bank.L))] = total = 1.0
+    w = np.where(w > 1e-9 * total, w, 0.0)
+    out: Floats = w / w.sum()
+    return out
 
 
 def false_probability(bank: Bank, layout: Layout) -> Floats:
@@ -155,7 +160,7 @@ def about_estimate(bank: Bank, layout: Layout, about: Floats | None = None) -> t
     (R, 2) means and (R, 2, 2) covariances.
     """
     at = list(layout.position)
-    centre = estimate(bank, layout).x[at] if about is None else about
+    centre = (_leading_weights(bank, layout) @ bank.x)[at] if about is None else about
     return bank.x[:, at] - centre, bank.P[:, at][:, :, at]
 
 

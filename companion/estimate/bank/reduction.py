@@ -48,7 +48,6 @@ def reduce(bank: Bank, layout: Layout, settings: Settings) -> Bank:
     # ties (children of one parent) in an order that does not depend on where the rows stand
     ties = (bank.since, bank.scale, bank.event, family, np.round(-L, 9))
     order = np.lexsort(ties).tolist()
-    place = np.argsort(order).tolist()
     # lies that may change their rate are a class of their own: they pay more, and must outlive what they beat
     bends = bank.noise.any(axis=1)
     if layout.accelerations[2].size:
@@ -57,7 +56,9 @@ def reduce(bank: Bank, layout: Layout, settings: Settings) -> Bank:
     keys = list(zip(family.tolist(), label.tolist(), bins.astype(int).tolist()))
     # lists: plain numbers are several times faster than elements of arrays
     logs, since, scales, grade = L.tolist(), bank.since.tolist(), bank.scale.tolist(), bank.grade.tolist()
-    active, faults = (bank.fault != NONE).sum(axis=1).tolist(), bank.fault.tolist()
+    active = (bank.fault != NONE).sum(axis=1).tolist()
+    faults = dict(zip(family.tolist(), bank.fault.tolist()))
+    quota = {code: _quota(layout, fault) for code, fault in faults.items()}
     # rank of a row: 0 protected, 1 heaviest of its class, 2 oldest of its class, 3 and 4 others
     rank = [4] * rows
     heaviest: dict[tuple[int, int, int], int] = {}
@@ -91,7 +92,7 @@ def reduce(bank: Bank, layout: Layout, settings: Settings) -> Bank:
             jumped.add((key[0], event))
             rank[i] = 0
         beside = event >= first_jump and key[0] not in whole and active[i] == 1
-        if rank[i] == 1 and beside and _quota(layout, faults[i]) == len(layout.grades) + 1:
+        if rank[i] == 1 and beside and quota[key[0]] == len(layout.grades) + 1:
             rank[i] = 2
         alive = key[0] == 0 or logs[i] >= settings.class_floor
         if alive and (active[i] <= 1 or key[0] in whole) and (key[0], grade[i]) not in graded:
@@ -113,17 +114,14 @@ def reduce(bank: Bank, layout: Layout, settings: Settings) -> Bank:
         if before < 1.0 - settings.dropped:
             rank[i] = 0
     # quotas: the rows of a family beyond its quota rank behind all others
-    used: dict[int, int] = {}
-    score = []
-    for i in sorted(range(rows), key=lambda i: (rank[i], place[i])):
+    used = dict.fromkeys(quota, 0)
+    for i in sorted(order, key=rank.__getitem__):
         f = keys[i][0]
-        used[f] = used.get(f, 0) + 1
-        over = rank[i] > 0 and used[f] > _quota(layout, faults[i])
-        score.append((rank[i] + (3 if over else 0), place[i], i))
-    score.sort()
-    keep = sorted(i for _, _, i in score[: settings.rows])
-    dropped = sorted((i for _, _, i in score[settings.rows :]), key=lambda i: place[i])
-    return _merged(bank, keep, dropped, keys, settings)
+        used[f] += 1
+        if rank[i] and used[f] > quota[f]:
+            rank[i] += 3
+    kept = set(sorted(order, key=rank.__getitem__)[: settings.rows])
+    return _merged(bank, sorted(kept), [i for i in order if i not in kept], keys, settings)
 
 
 def _quota(layout: Layout, fault: list[int]) -> int:
