@@ -170,10 +170,7 @@ def airspeed(
         H[:, 0, lie], H[:, 1, lie] = -false * V[0] / speed, -false * V[1] / speed
         return np.broadcast_to(row.y, (len(bank.L), 2)), H
 
-    taken = _take(bank, known, seen_by, None, row.R, None, "velocity")
-    seen = taken.bank.seen.copy()
-    seen[AIRSPEED] = taken.bank.t
-    return taken._replace(bank=taken.bank._replace(seen=seen))
+    return _take(bank, known, seen_by, None, row.R, AIRSPEED, "velocity", has_lie=True)
 
 
 def steady_airspeed(
@@ -305,11 +302,12 @@ def _take(
     R: Floats,
     source: int | None,
     kind: str,
+    has_lie: bool = False,
 ) -> Taken:
     """Update by a measurement whose outliers are those of its `kind`; arguments as of `banks.update`."""
     outlier = OUTLIER[kind]
     after, seen = banks.update(
-        bank, known.layout, z, H, R, source, known.settings, outlier=outlier, rare=RARE
+        bank, known.layout, z, H, R, source, known.settings, outlier=outlier, rare=RARE, has_lie=has_lie
     )
     return _taken(bank, after, seen)
 

@@ -933,6 +933,27 @@ def test_a_function_is_linearised_again_about_rows_that_surprise_bore():
     assert len(after.L) == len(innovation.nis) > len(bank.L)
 
 
+@pytest.mark.parametrize("z", [0.3, 50.0])
+def test_a_measurement_that_has_the_columns_of_the_lie_itself_is_one_of_its_source(z):
+    """It surprises as another does: an onset of that moment is among what explains it."""
+    layout = flight_layout()
+    bank = b.start(layout, 0.0, np.zeros(2), np.eye(2))._replace(t=5.0, seen=np.full(2, 5.0))
+    bank = b.births(bank, layout)._replace(t=10.0, seen=np.full(2, 10.0))
+
+    def lying(bank):
+        H_rows = np.zeros((len(bank.L), 1, layout.n))
+        H_rows[:, 0, 0] = 1.0
+        (lie,) = layout.lie_states(0)
+        H_rows[:, 0, lie] = bank.fault[:, 0] != NONE
+        return np.full((len(bank.L), 1), z), H_rows
+
+    one, first = b.update(bank, layout, np.array([z]), H, R, 0, Settings(rows=64))
+    other, second = b.update(bank, layout, lying, None, R, 0, Settings(rows=64), has_lie=True)
+    assert first.born == second.born == (z > 1.0)
+    for a, c in zip(one, other):
+        np.testing.assert_allclose(a, c, atol=1e-12)
+
+
 def with_jump(layout):
     return replace(layout, jumps=(Jump("channel", (0,), (20.0,), 20.0),))
 

@@ -385,11 +385,9 @@ def test_without_gnss_a_false_airspeed_must_be_taken_out_of_use(gnss_until: floa
     assert all(len(FALSE_AIRSPEED + name) <= 50 for name in USE_AIRSPEED.values())  # one STATUSTEXT
 
 
-@pytest.mark.long
-@pytest.mark.xfail(strict=True, raises=AssertionError, reason="a wind of 33 m/s: docs/limits.md")
-@pytest.mark.parametrize("seed", [2, 4])
+@pytest.mark.parametrize("seed", [2, *(pytest.param(seed, marks=pytest.mark.long) for seed in (1, 3, 4))])
 def test_a_stuck_pitot_is_excluded_beside_a_healthy_gnss(seed: int) -> None:
-    """In a wide turn, 2 deg/s, a wind that is redrawn every few seconds explains it as well."""
+    """In a wide turn, 2 deg/s: as no onset was born as it stuck, a wind redrawn every few seconds was it."""
     stuck = after(120.0, AirData, airspeed=noisy(8.0))
     flown = fly("imu", stuck, legs=FIVE_MINUTES[:4], seed=seed)
     assert any(event.text.startswith("airspeed is excluded") for event in flown.events)

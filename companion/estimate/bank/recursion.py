@@ -116,6 +116,7 @@ def update(
     settings: Settings = DEFAULT,
     outlier: float = NEVER,
     rare: float = math.inf,
+    has_lie: bool = False,
 ) -> tuple[Bank, Innovation]:
     """Update all rows by one measurement z = H x + lie + white noise, and reweight them.
 
@@ -129,8 +130,8 @@ def update(
     bank, layout : the bank, propagated to the time of the measurement.
     z : (m,) for all rows, or a function of the bank that returns z (R, m) and H (R, m, k): a measurement that
         is nonlinear, or that depends on the hypothesis.
-    H : (m, k) for all rows; k is n_base or n. The lie's columns are filled in here. None where z is a
-        function.
+    H : (m, k) for all rows; k is n_base or n. The lie's columns are filled in here, unless `has_lie`. None
+        where z is a function.
     R : (m, m) covariance of the white noise.
     source : index of the source, None for a measurement that cannot be false.
     settings : births on return and on surprise.
@@ -153,7 +154,7 @@ def update(
         assert H_rows is not None
         if not np.isfinite(z_rows).all():
             raise ValueError("measurement is not a number")
-        return _innovations(bank, layout, z_rows, H_rows, R, source)
+        return _innovations(bank, layout, z_rows, H_rows, R, None if has_lie else source)
 
     if source is not None and bank.t - bank.seen[source] > layout.sources[source].silence_s:
         bank, born = returns(bank, layout, source, settings)
