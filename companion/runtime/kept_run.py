@@ -20,6 +20,7 @@ import msgspec
 from companion import __version__
 from companion.config import Config, ConfigError, parse
 from companion.runtime.state_file import BOOT_ID, boot_id
+from companion.storage.reader import open_regular
 
 NAME = "companion.flight"
 KEEP_S = 2.0
@@ -50,7 +51,8 @@ class KeptRun:
     def take(self, config: Config) -> Flown | None:
         """Return what the run before left, if it was of this boot, this version and the same links."""
         try:
-            found = msgspec.msgpack.decode(self.path.read_bytes(), type=_File)
+            with open_regular(self.path) as file:
+                found = msgspec.msgpack.decode(file.read(), type=_File)
             links = parse(found.flown.toml, str(self.path)).link.connect
         except (OSError, msgspec.MsgspecError, ConfigError):
             return None

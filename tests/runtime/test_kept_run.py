@@ -1,5 +1,6 @@
 """What a run keeps of a flight: taken once, by the next run of the same boot, version and links."""
 
+import os
 from pathlib import Path
 
 import pytest
@@ -65,6 +66,11 @@ def test_it_is_of_this_boot_this_version_and_these_links_only(
 @pytest.mark.parametrize("data", [b"", b"\x00", b"{}", bytes(1000)])
 def test_what_is_no_such_file_is_not_used(tmp_path: Path, boot: Path, data: bytes) -> None:
     (tmp_path / kept_run.NAME).write_bytes(data)
+    assert KeptRun(tmp_path, boot).take(CONFIG) is None
+
+
+def test_a_pipe_in_its_place_does_not_hold_up_the_start(tmp_path: Path, boot: Path) -> None:
+    os.mkfifo(tmp_path / kept_run.NAME)
     assert KeptRun(tmp_path, boot).take(CONFIG) is None
 
 
