@@ -277,12 +277,17 @@ class Session:
     @property
     def system(self) -> int:
         """Our own system id: the autopilot's, 1 until it is known."""
-        return self.autopilot or self._choice.required_system or 1
+        return self.autopilot or self.required_system or 1
 
     @property
     def autopilot(self) -> int | None:
         """The autopilot's system id, None before it was received."""
         return self._choice.chosen.system if self._choice.chosen else None
+
+    @property
+    def required_system(self) -> int | None:
+        """The only system id that an autopilot of ours may have; None: any."""
+        return self._choice.required_system
 
     @property
     def autopilot_type(self) -> int:

@@ -125,7 +125,10 @@ def describe_silence(link: str, session: Session, has_bytes: bool) -> str:
         reasons = ", ".join(reason.name.lower() for reason in session.rejected)
         return f"frames rejected ({reasons}); let it sign with the key of signing.key_file"
     if senders := [f"{system}/{component}" for system, component in session.reader.counts]:
-        return f"received only {', '.join(senders)}; check the autopilot's connection and link.system_id"
+        advice = "check the autopilot's connection"
+        if session.required_system is not None:
+            advice += f"; link.system_id = {session.required_system} must be its system id, or 0 for any"
+        return f"received only {', '.join(senders)}; {advice}"
     if has_bytes:
         return "bytes but no MAVLink received; check that the other side sends MAVLink, at the same baud rate"
     advice = NOTHING_ARRIVES.get(link.split(":")[0], "check the address, and that the other side runs")

@@ -726,6 +726,25 @@ def test_silence_is_reported_once_with_what_to_check() -> None:
     assert flight.core.status().text() == "waiting for an autopilot"
 
 
+@pytest.mark.parametrize(
+    ("system_id", "kind", "advice"),
+    [
+        (0, {"type": 26, "autopilot": 8}, ""),
+        (5, {"type": 1, "autopilot": 3}, "; link.system_id = 5 must be its system id, or 0 for any"),
+    ],
+)
+def test_system_id_is_reported_where_it_excludes_an_autopilot(
+    system_id: int, kind: dict[str, int], advice: str
+) -> None:
+    flight = Flight(config=load(pairs=(f"link.system_id={system_id}",), environment={}))
+    for _ in range(60):
+        flight.now += 100 * MS
+        flight.send("HEARTBEAT", system=7, **kind)
+        flight.core.poll(flight.now)
+    expected = f"main: no autopilot in 5 s: received only 7/1; check the autopilot's connection{advice}"
+    assert expected in event_texts(flight)
+
+
 def test_input_that_stops_is_reported_once_and_again_when_it_is_back(monkeypatch: pytest.MonkeyPatch) -> None:
     flight = Flight()
     flight.fly(20.0)
