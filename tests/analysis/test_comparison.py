@@ -8,23 +8,10 @@ from msgspec import structs
 
 from companion.analysis.comparison import POSITION_M, OutputComparison
 from companion.estimate.predictor import RESTRICTED_TOLERANCE
-from companion.records import Event, Mode, Prediction, Rejection, Solution
+from companion.records import Event, Prediction, Rejection, Solution
+from tests.solutions import solution_at
 
-SOLUTION = Solution(
-    t_ns=1,
-    rx_ns=2,
-    mode=Mode.FIXED,
-    estimator="kalman",
-    lat=1.0,
-    lon=0.5,
-    alt_msl=100.0,
-    v_n=(20.0, -3.0, 0.1),
-    covariance=(4.0, 0.0, 0.0, 4.0, 0.0, 9.0),
-    error_n=(1.0, 2.0),
-    velocity_error_n=(0.1, 0.2),
-    sources=3,
-    horizon_s=0.2,
-)
+SOLUTION = solution_at(1, rx_ns=2, v_n=(20.0, -3.0, 0.1), error_n=(1.0, 2.0))
 METRE = 1.0 / 6.4e6
 
 

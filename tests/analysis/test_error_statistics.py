@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 
 from companion.analysis import error_statistics
 from companion.nav.geometry import Geodetic, displace, separation, slant_range_azimuth
-from companion.records import Gnss, Mode, RsbnFix, Solution
+from companion.records import Gnss, RsbnFix, Solution
+from tests.solutions import solution_at
 
 PLACE = Geodetic(math.radians(60.0), math.radians(30.0), 800.0)
 SECOND = 1_000_000_000
@@ -21,23 +22,15 @@ def truth(t_ns: int) -> Geodetic | None:
 
 def solution(t: float, north: float, east: float, error_n=(30.0, -40.0), bound_n=None) -> Solution:
     lat, lon, alt = displace(*PLACE, north, east, 0.0)
-    t_ns = round(t * SECOND)
     covariance = (1.0, 0.0, 0.0, 1.0, 0.0, 1.0)
-    return Solution(
-        t_ns,
-        t_ns,
-        Mode.FIXED,
-        "kalman",
-        lat,
-        lon,
-        alt,
-        (0.0,) * 3,
-        covariance,
-        error_n,
-        (0.0, 0.0),
-        1,
-        0.0,
-        bound_n,
+    return solution_at(
+        round(t * SECOND),
+        lat=lat,
+        lon=lon,
+        alt_msl=alt,
+        covariance=covariance,
+        error_n=error_n,
+        bound_n=bound_n,
     )
 
 

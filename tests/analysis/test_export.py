@@ -13,10 +13,11 @@ from companion.analysis.export import Place, Track
 from companion.analysis.log_command import group
 from companion.config import Config
 from companion.nav.geometry import displace
-from companion.records import Gnss, Mode, Reboot, RsbnFix, Solution
+from companion.records import Gnss, Mode, Reboot, RsbnFix
 from companion.storage import flight_log
 from companion.storage.reader import LogError
 from companion.storage.run_metadata import run_metadata
+from tests.solutions import solution_at
 
 S = 1_000_000_000
 SPACES = {"k": "http://www.opengis.net/kml/2.2", "gx": "http://www.google.com/kml/ext/2.2"}
@@ -89,14 +90,13 @@ def test_a_flight_is_cut_into_legs_with_and_without_fixes(tmp_path):
             if k % 50 == 0:
                 writer.record(RsbnFix(t, t, 7, 0.971, 0.651, 30.0, 1.0, 2000.0, 0.002, 100.0))
             writer.record(
-                Solution(
-                    *(t, t, Mode.PREDICTING if lost else Mode.FIXED, "kalman", lat, lon, 100.0),
-                    v_n=(0.0, 20.0, 0.0),
-                    covariance=(25.0, 0.0, 0.0, 25.0, 0.0, 25.0),
-                    error_n=(0.0, 0.0),
-                    velocity_error_n=(0.0, 0.0),
+                solution_at(
+                    t,
+                    mode=Mode.PREDICTING if lost else Mode.FIXED,
+                    lat=lat,
+                    lon=lon,
+                    alt_msl=100.0,
                     sources=1 if lost else 3,
-                    horizon_s=0.0,
                 )
             )
     kml = out.with_suffix(".kml")

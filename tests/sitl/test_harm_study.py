@@ -22,6 +22,7 @@ from sitl.harm_study import (
     scenario_of,
     worst_ratio,
 )
+from tests.solutions import solution_at
 
 S = 1_000_000_000
 
@@ -32,12 +33,7 @@ def fix(t_s: float, **changes) -> Gnss:
 
 
 def solution(t_s: float, north: float = 0.0) -> Solution:
-    t = round(t_s * S)
-    return Solution(
-        t_ns=t, rx_ns=t, mode="fixed", estimator="kalman", lat=1.0 + north / 6.37e6, lon=0.5, alt_msl=0.0,
-        v_n=(0.0, 0.0, 0.0), covariance=(1.0, 0.0, 0.0, 1.0, 0.0, 1.0), error_n=(0.0, 0.0),
-        velocity_error_n=(0.0, 0.0), sources=1, horizon_s=0.0,
-    )  # fmt: skip
+    return solution_at(round(t_s * S), lat=1.0 + north / 6.37e6, lon=0.5, alt_msl=0.0)
 
 
 def test_ratio_is_that_of_the_worst_ten_seconds_less_three_metres():

@@ -8,8 +8,9 @@ import pytest
 from companion.analysis.live.follow import Channel, Message
 from companion.analysis.live.scene import Scene
 from companion.nav.geometry import displace
-from companion.records import Event, Gnss, Mode, RsbnFix, Solution, Trust, encode
+from companion.records import Event, Gnss, Mode, RsbnFix, Trust, encode
 from companion.storage.flight_log import topic_of
+from tests.solutions import solution_at
 
 S = 1_000_000_000
 LAT, LON = 0.97, 0.65
@@ -23,20 +24,15 @@ def message(record):
 def solution(t, east=0.0, north=0.0, **more):
     place = displace(LAT, LON, 0.0, north, east, 0.0)
     fields = {
-        "mode": Mode.FIXED,
-        "estimator": "kalman",
         "alt_msl": 300.0,
         "v_n": (0.0, 20.0, 0.0),
         "covariance": (4.0, 0.0, 0.0, 9.0, 0.0, 25.0),
         "error_n": (30.0, 40.0),
-        "velocity_error_n": (0.0, 0.0),
-        "sources": 3,
-        "horizon_s": 0.0,
         "bound_n": (30.0, 40.0),
         "protection": 80.0,
         "trust": Trust.NORMAL,
     }
-    return Solution(round(t * S), round(t * S), lat=place.lat, lon=place.lon, **(fields | more))
+    return solution_at(round(t * S), lat=place.lat, lon=place.lon, **(fields | more))
 
 
 def test_an_hour_is_no_bigger_than_a_few_minutes():

@@ -68,14 +68,14 @@ def fly(log, first, count):
         t = k * S // 5
         log.record(Gnss(t, t, 0, k + 1, 3, 0.97, 0.65 + 1e-6 * k, 100.0, 2.0))
         log.record(
-            Solution(
-                *(t, t, Mode.FIXED, "kalman", 0.97, 0.65 + 1e-6 * k, 100.0),
+            solution_at(
+                t,
+                lat=0.97,
+                lon=0.65 + 1e-6 * k,
+                alt_msl=100.0,
                 v_n=(0.0, 20.0, 0.0),
                 covariance=(25.0, 0.0, 0.0, 25.0, 0.0, 25.0),
                 error_n=(3.0, 4.0),
-                velocity_error_n=(0.0, 0.0),
-                sources=3,
-                horizon_s=0.0,
                 protection=80.0,
                 trust=Trust.NORMAL,
                 false_sources=(("gnss", 0.01),),
