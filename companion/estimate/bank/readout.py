@@ -177,8 +177,6 @@ def level_rows(bank: Bank, layout: Layout, count: int, risk: float) -> Ints:
     -------
     (count,) indices of rows.
     """
-    if count == 0:
-        return np.zeros(0, dtype=np.int64)
     d, C = about_estimate(bank, layout)
     w = bank.weights
     r = level(w, d, C, risk)

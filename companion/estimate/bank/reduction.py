@@ -61,7 +61,6 @@ def reduce(bank: Bank, layout: Layout, settings: Settings) -> Bank:
     quota = {code: _quota(layout, fault) for code, fault in faults.items()}
     # rank of a row: 0 protected, 1 heaviest of its class, 2 oldest of its class, 3 and 4 others
     rank = [4] * rows
-    heaviest: dict[tuple[int, int, int], int] = {}
     oldest: dict[tuple[int, int, int], int] = {}
     whole = {0, keys[order[0]][0]}  # families that keep each grade and jump: nothing false, and the leading
     by_fault: set[int] = set()
@@ -71,10 +70,9 @@ def reduce(bank: Bank, layout: Layout, settings: Settings) -> Bank:
     graded: set[tuple[int, int]] = set()
     for i in order:
         key = keys[i]
-        if key not in heaviest:
-            heaviest[key] = i
-            rank[i] = 1
         j = oldest.get(key)
+        if j is None:
+            rank[i] = 1
         if j is None or since[i] < since[j]:
             oldest[key] = i
         scale = (*key, scales[i])
