@@ -435,8 +435,7 @@ def tuned(state: State, before: Settings, config: Config) -> tuple[Settings, Sta
 
 def begins_again(old: Config, new: Config) -> bool:
     """Return whether the states of the bank mean something else: those of another inertial channel."""
-    same = (old.inertial, old.strapdown, old.has_own_ins) == (new.inertial, new.strapdown, new.has_own_ins)
-    return not same
+    return (old.inertial, old.strapdown, old.has_own_ins) != (new.inertial, new.strapdown, new.has_own_ins)
 
 
 def guarded(
@@ -469,9 +468,8 @@ def _channel_event(record: Input, settings: Settings) -> Event:
     """Report which inertial channel is corrected: before its first sample, so what it may use."""
     if isinstance(settings.model.channel, OwnChannel):
         config = settings.config
-        allowed = [name for name in ("imu", "air_data", "local_position") if config.uses(name)]
-        if config.output.feeds_estimator and "local_position" in allowed:
-            allowed.remove("local_position")
+        allowed: list[str] = [name for name in ("imu", "air_data") if config.uses(name)]
+        allowed += ["local_position"] * config.uses_local_velocity
         text = f"inertial channel: own, by what arrives of {', '.join(a.replace('_', ' ') for a in allowed)}"
         if "imu" in allowed:
             text += "; no guaranteed bound by imu"

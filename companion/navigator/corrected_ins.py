@@ -95,21 +95,19 @@ def corrected_ins(config: Config) -> InsChannel | CorrectedIns:
 
 def _extra_states(config: Config) -> ExtraStates:
     air, used = config.air_data, config.inertial.correctors
-    names, density, sigma = list[str](), list[float](), list[float]()
+    names, rate, density, sigma = list[str](), list[float](), list[float](), list[float]()
     if "airspeed" in used:
         wind = air.wind_walk_m_s_sqrt_s**2
         names += ["wN", "wE", "scale"]
+        rate += [0.0] * 3
         density += [wind, wind, 0.0]
         sigma += [air.wind_m_s, air.wind_m_s, 0.01 * air.airspeed_percent]
     if "hyperbolic" in used:
         names += [f"chain{k}" for k in range(CHAINS)]
+        rate += [-1.0 / CHAIN_S] * CHAINS
         density += [2.0 * CHAIN_BIAS_M**2 / CHAIN_S] * CHAINS
         sigma += [CHAIN_BIAS_M] * CHAINS
-    A = np.zeros((len(names), len(names)))
-    index = {name: i for i, name in enumerate(names)}
-    for k in range(CHAINS if "hyperbolic" in used else 0):
-        A[index[f"chain{k}"], index[f"chain{k}"]] = -1.0 / CHAIN_S
-    return ExtraStates(tuple(names), A, np.array(density), np.array(sigma))
+    return ExtraStates(tuple(names), np.diag(rate), np.array(density), np.array(sigma))
 
 
 def chain_state(k: int) -> str:

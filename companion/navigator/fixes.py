@@ -211,11 +211,10 @@ def rsbn(state: State, record: RsbnFix, settings: Settings) -> Step:
         taken = measurements.sight(state.bank, known, z, k, factor * variance, centre, point.v_n)
         state = decided(structs.replace(state, bank=taken.bank), record, settings)
         is_followed |= taken.by_any
-        part = Source.AZIMUTH if isinstance(z, Azimuth) else Source.RANGE
         if state.reported[source] == EXCLUDED or not taken.accepted:
             out.append(_rejected(state, record, label, source, taken))
         elif state.false[source] < known.settings.suspect:
-            believed |= part
+            believed |= fix_observations.source_of(z)
     others = tuple(beacon for beacon in before.unfit if beacon[0] != record.beacon)
     if not is_followed:
         count = 1 + dict(before.unfit).get(record.beacon, 0)

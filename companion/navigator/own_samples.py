@@ -154,7 +154,7 @@ def imu(state: State, record: Imu, settings: Settings) -> Step:
         return state, []
     s = state.sensors
     strap = strapdown_channel.receive(s.strap, record)
-    if strap.why or strap.C_nb is None:
+    if strap.why:
         return _straight_on(with_sensors(state, strap=strap), record, settings)
     now = strapdown_channel.acceleration(strap)
     fresh = record.t_ns - s.imu_ns <= own_channel.SILENT_NS["imu"]

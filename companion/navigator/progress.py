@@ -101,14 +101,13 @@ def propagated(state: State, settings: Settings) -> State:
     state = structs.replace(state, newborn=None, turned=turned)
     Phi, Q = settings.model.transition(nominal, len(state.beacons))
     bank = settings.model.on_circle(banks.propagate(bank, known.layout, nominal.pending_s, Phi, Q), Phi)
-    if nominal.interval is not None and nominal.interval.by_sensed_air:
+    if i is None:
+        return structs.replace(state, bank=bank, nominal=structs.replace(nominal, since=nominal.point))
+    if i.by_sensed_air:
         seen = bank.seen.copy()
         seen[AIRSPEED] = bank.t
         bank = bank._replace(seen=seen)
-    if nominal.interval is None:
-        return structs.replace(state, bank=bank, nominal=structs.replace(nominal, since=nominal.point))
-    velocity = nominal.point.v_n[:2]
-    nominal = own_channel.restart(nominal, nominal.interval.by, velocity)
+    nominal = own_channel.restart(nominal, i.by, nominal.point.v_n[:2])
     return structs.replace(state, bank=bank, nominal=nominal)
 
 
