@@ -40,7 +40,7 @@ from companion.units import Floats
 POSITION = (0, 1)  # states
 SOURCES = ("gnss", "airspeed", "velocity of gnss")  # then `azimuth(k)` and `range(k)` of each beacon k
 GNSS, AIRSPEED, VELOCITY = range(len(SOURCES))
-CONSISTENT, POSITION_ONLY = 0, 1  # faults of GNSS: its velocity is false too, or true
+CONSISTENT = 0  # fault of GNSS: its velocity is false too
 GNSS_GROUP, BEACON_GROUP, AIRSPEED_GROUP = 0, 1, 2
 GROUPS = (2, 2, 1)
 CHANNEL_JUMPS_H, CHANNEL_JUMP_M = 1e-3, 100.0
@@ -82,9 +82,8 @@ VELOCITY_LIES = (Lie(0.3, 0.003), Lie(3.0, 0.03), Lie(0.3, 0.03, noise=0.01))  #
 GUST = tuple(range(own_error_model.GUST.start, own_error_model.GUST.stop))
 GUST_OPEN_M_S = 3.0  # what the gust may have taken up of a step of the wind
 SHOCK = ((0, 15.0), (1, 15.0), (2, 15.0), (3, 15.0))  # of a false airspeed that moves the nominal: m, m/s
-SURPRISE = (
-    5.0  # a step of 5 m/s beside gusts of 1.2 is one: an onset that is born late explains half of it as wind
-)
+#: A step of 5 m/s beside gusts of 1.2 is one: an onset that is born late explains half of it as wind.
+SURPRISE = 5.0
 #: The attitude, and the IMU with it, becomes worse and better again within a flight: parked, in a climb, in
 #: aerobatics. With 1e-5, as for an INS, a healthy GNSS was excluded beside a wrong IMU or a wrong heading.
 GRADE_CHANGES_H = 10.0
