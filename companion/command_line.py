@@ -67,14 +67,13 @@ class LazyGroup(click.Group):
     def __init__(
         self,
         table: dict[str, str],
-        plugins: str | None = None,
+        plugins: str,
         sections: Mapping[str, Collection[str]] = MappingProxyType({"Commands": ()}),
         **settings: object,
     ) -> None:
         super().__init__(**settings)  # type: ignore[arg-type]
-        self._table, self._sections = dict(table), sections
-        if plugins:
-            self._table |= {entry.name: entry.value for entry in entry_points(group=plugins)}
+        self._table = table | {entry.name: entry.value for entry in entry_points(group=plugins)}
+        self._sections = sections
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         """Return all names, sorted."""
