@@ -130,8 +130,8 @@ class Situation(NamedTuple):
     """What the hypotheses depend on.
 
     How many beacons there are, whether airspeed moves the nominal trajectory, whether a source of position
-    other than GNSS is received, whether GNSS is, whether the velocity has changed within seconds, and whether
-    the aircraft flies where its nose points.
+    other than GNSS is received, whether GNSS is, whether the velocity has changed within seconds, whether
+    the aircraft flies where its nose points, and whether it flies at all.
     """
 
     beacons: int = 0
@@ -140,6 +140,7 @@ class Situation(NamedTuple):
     is_received: bool = False
     has_turned: bool = False
     along_nose: bool = True
+    is_aloft: bool = True
 
 
 class Hypotheses(NamedTuple):
@@ -338,6 +339,8 @@ def _jumps(config: Config, channel: Channel, now: Situation) -> tuple[Jump, ...]
     if now.by_air:
         heading_h, velocity_h = AIR_HEADING_STEPS_H, 0.0
     astray = HEADING_VELOCITY if now.has_turned else 0.0
+    if not now.is_aloft:  # nothing shows the wind: jumps of minutes on the ground held half of the rows
+        rate_h = 0.0
     return (
         Jump("wind", states, sigmas, rate_h, quota=24, often=True),
         Jump(

@@ -41,8 +41,9 @@ PATIENCE_S = 3.0
 AIRSPEED_S, ATTITUDE_S = 10.0, 2.0
 #: Answers of a beacon alike under new times: with azimuth and range, with one of them.
 ANSWERS, HALF_ANSWERS = 3, 5
-#: Samples of an IMU alike under new times; at rest a simulator's are alike, and their rates are zero.
-SAMPLES = 3
+#: Samples of an IMU alike under new times. At rest a simulator's are alike: their rates are zero, or drift to
+#: 4 mrad/s and change within 4.6 s (ArduPilot's, rounded to 1 mrad/s).
+SAMPLES, TURNING_RAD_S, RESTING_S = 3, 0.005, 6.0
 #: So many of one source are remembered: a beacon's answer comes on two links, and PX4 sends a pressure at
 #: once (HIGHRES_IMU) and again up to 0.2 s later (SCALED_PRESSURE): late, it would cost a roll-back.
 REMEMBERED: dict[type[Stamped], int] = {RsbnFix: 8, Pressure: 32}
@@ -77,6 +78,11 @@ def _moves(v_n: tuple[float, ...] | None) -> bool:
     return v_n is not None and math.hypot(*v_n) > MOVING_M_S
 
 
+def _turns(record: Imu, lasted_s: float) -> bool:
+    rate = max(map(abs, record.w_b))
+    return rate > TURNING_RAD_S or (rate > 0.0 and lasted_s >= RESTING_S)
+
+
 def _enough(record: RsbnFix, times: int, lasted_s: float) -> bool:
     whole = record.azimuth is not None and record.slant_range is not None
     return times >= (ANSWERS if whole else HALF_ANSWERS)
@@ -96,7 +102,7 @@ LAWS: dict[type[Stamped], Law] = {
     Imu: Law(
         lambda r: f"imu {r.source}",
         lambda r: (r.f_b, r.w_b),
-        lambda r, times, lasted_s: any(r.w_b) and times >= SAMPLES,
+        lambda r, times, lasted_s: times >= SAMPLES and _turns(r, lasted_s),
     ),
     Attitude: Law(
         lambda r: "attitude",

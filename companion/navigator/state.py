@@ -125,14 +125,15 @@ def with_sensors(state: State, **changes: Any) -> State:
 
 def hypotheses(state: State, settings: Settings) -> Hypotheses:
     """The hypotheses of the situation."""
-    interval = state.nominal.interval if state.nominal else None
+    interval, s = state.nominal.interval if state.nominal else None, state.sensors
     now = Situation(
         len(state.beacons),
         by_air=interval is not None and interval.by == "air",
         witness=has_witness(state, settings),
         is_received=gnss_is_received(state, settings),
         has_turned=math.hypot(*state.turned) > TURNED_M_S,
-        along_nose=not state.sensors.multirotor and not state.sensors.hovering,
+        along_nose=not s.multirotor and not s.hovering,
+        is_aloft=not s.landed or s.ground.flying,
     )
     return settings.model.hypotheses(now)
 

@@ -123,6 +123,14 @@ def test_samples_of_an_imu_alike_are_an_imu_that_hangs_unless_it_rests(w_b, stal
     assert ("used" in found[SAMPLES - 1 :]) is not stale
 
 
+def test_an_imu_that_hangs_with_hardly_a_rate_is_found_after_seconds() -> None:
+    """Parked, ArduPilot's gyros drift to 4 mrad/s, and samples are alike for up to 4.6 s."""
+    w_b = (0.0, 0.004, -0.001)
+    found = verdicts([Imu(i * NS // 20, i * NS // 20, 0, (0.3, 0.1, -9.8), w_b) for i in range(200)])
+    assert set(found[: 20 * 5]) == {"used"}
+    assert "used" not in found[20 * 6 :]
+
+
 def test_an_answer_heard_on_two_links_is_used_once_in_whatever_order() -> None:
     """Counted twice it would claim to be better by the root of two."""
     one, two = rsbn(1.0, 1.0, 60e3), rsbn(2.0, 1.01, 60.01e3)
