@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -47,6 +48,9 @@ OUTLIER = {
 }
 
 
+#: Normalised squared innovation per component of an airspeed that bears onsets at once: a pitot that sticks.
+#: An IMU that was turned surprises it less; with 5, as for a fix, a healthy GNSS was doubted beside one.
+AIRSPEED_SURPRISE = 40.0
 STANDING_M_S = 0.1  # noise of a velocity that is zero
 #: Half the normalised squared innovation of a corrector's component at which it is an outlier: five sigma.
 CORRECTOR_GATE = 12.5
@@ -170,6 +174,7 @@ def airspeed(
         H[:, 0, lie], H[:, 1, lie] = -false * V[0] / speed, -false * V[1] / speed
         return np.broadcast_to(row.y, (len(bank.L), 2)), H
 
+    known = known._replace(settings=replace(known.settings, surprise=AIRSPEED_SURPRISE))
     return _take(bank, known, seen_by, None, row.R, AIRSPEED, "velocity", has_lie=True)
 
 

@@ -8,6 +8,7 @@ from msgspec import structs
 from companion.config import load
 from companion.navigator import Navigator
 from companion.navigator.standing import EVERY_NS, Standing, follow
+from companion.navigator.state import hypotheses
 from companion.records import Attitude, Gnss, Imu, Vehicle
 
 NS = 1_000_000_000
@@ -64,3 +65,23 @@ def test_a_parked_navigator_that_lost_its_bank_goes_on(lost: dict[str, None]) ->
     assert standing.measured_ns > 28 * NS
     navigator._state = structs.replace(navigator._state, **lost)
     still(30.0, 40.0, False)
+
+
+@pytest.mark.parametrize("landed", [True, False])
+def test_minutes_on_the_ground_take_no_rows_for_steps_of_the_wind(landed: bool) -> None:
+    """Nothing shows it there: they held half of the rows, and the step of the wind in flight none."""
+    navigator = Navigator(load(flags={"output.profile": "ardupilot"}, environment={}))
+    navigator.handle(Vehicle(1, 1, flying=not landed))
+    for k in range(20, 20 * 60):
+        t_ns = k * NS // 20
+        navigator.handle(Attitude(t_ns, t_ns, 1e-4 * (k % 7), 0.0, 1.0))
+        navigator.handle(imu(k / 20, 1e-4 * (k % 5)))
+        if k % 10 == 0:
+            navigator.handle(fix(k / 20, 0.01 * (k % 3)))
+    bank = navigator.state.bank
+    assert bank is not None
+    layout = hypotheses(navigator.state, navigator.settings).layout
+    (wind,) = (j for j, jump in enumerate(layout.jumps) if jump.name == "wind")
+    rows = int((bank.event == layout.jump_event(wind)).sum())
+    assert (rows == 0) is landed
+    assert landed or rows > 20
