@@ -77,6 +77,7 @@ EVERY_KIND = [
     r.Reboot(T + 31, T + 31, 1),
     r.TimeStep(T + 31, T + 31, 1, 0.625),
     r.Tuning(T + 32, T + 32, '[gnss]\nsigma_m = 3.0\n'),
+    r.Resumed(T + 33, T + 33, '[gnss]\nsigma_m = 3.0\n', bytes(range(256))),
     r.Truth(T + 32, T + 32, 0.9, -2.1, 333.0, (1.0, 2.0, 3.0), (0.1, 0.2, 0.3)),
 ]  # fmt: skip
 
