@@ -42,7 +42,7 @@ BYTES = kept_state.encode(STATE)
 
 
 def resumed(data: bytes, later_s: float = 5.0, config: Config = OWN) -> tuple[Navigator, list[Output]]:
-    """A navigator that was given the bytes, and what it said."""
+    """A navigator that was given the bytes, and its outputs."""
     assert STATE.nominal is not None
     navigator, t_ns = Navigator(OWN), STATE.nominal.t_ns + round(later_s * NS)
     return navigator, navigator.handle(Resumed(t_ns, t_ns, to_toml(config), data))
@@ -88,10 +88,10 @@ def test_damaged_bytes_are_refused(at: int, value: int) -> None:
 
 
 class Restarted:
-    """A navigator that is stopped in flight and begun again, from what it kept or from nothing."""
+    """A navigator that is stopped in flight and started again, from what it kept unless it forgets."""
 
-    def __init__(self, config: Config, anew: bool = False) -> None:
-        self._config, self._anew = config, anew
+    def __init__(self, config: Config, forgets: bool = False) -> None:
+        self._config, self._forgets = config, forgets
         self._navigator = Navigator(config)
         self._kept: bytes | None = None
         self._is_second = False
@@ -104,15 +104,15 @@ class Restarted:
             return []
         if t_s >= AGAIN_S and not self._is_second:
             self._is_second, self._navigator = True, Navigator(self._config)
-            if not self._anew:
+            if not self._forgets:
                 assert self._kept is not None
                 kept = Resumed(record.t_ns, record.rx_ns, to_toml(self._config), self._kept)
                 outputs = self._navigator.handle(kept)
         return outputs + self._navigator.handle(record)
 
 
-def restarted(channel: str, anew: bool = False, **flight: Any) -> Flown:
-    navigator: Any = Restarted(CHANNELS[channel][0], anew)
+def restarted(channel: str, forgets: bool = False, **flight: Any) -> Flown:
+    navigator: Any = Restarted(CHANNELS[channel][0], forgets)
     return fly(channel, navigator=navigator, seed=2, **flight)
 
 
@@ -136,8 +136,8 @@ def test_beside_a_false_gnss_it_stays_excluded() -> None:
     flown = restarted("imu", change=drawn_off(2.0))
     assert "gnss is excluded: false with probability 1.0000" in [e.text for e in flown.events]
     assert flown.error[flown.t > AGAIN_S].max() < 60.0
-    anew = restarted("imu", anew=True, change=drawn_off(2.0))
-    assert anew.error[anew.t > AGAIN_S].max() > 150.0
+    lost = restarted("imu", forgets=True, change=drawn_off(2.0))
+    assert lost.error[lost.t > AGAIN_S].max() > 150.0
 
 
 @pytest.mark.flight
@@ -146,7 +146,7 @@ def test_without_gnss_and_beacon_the_position_goes_on(channel: str) -> None:
     """As if the companion had not been stopped, but for the eleven seconds in which nothing was measured."""
     dark: dict[str, Any] = {"gnss_until": FALSE_S, "rsbn": NO_BEACON}
     flown, whole = restarted(channel, **dark), fly(channel, seed=2, **dark)
-    assert not restarted(channel, anew=True, **dark).of("lat", AGAIN_S).size
+    assert not restarted(channel, forgets=True, **dark).of("lat", AGAIN_S).size
     late = flown.t > AGAIN_S
     assert flown.t[late][0] < AGAIN_S + 1.0
     assert flown.error[-1] < whole.error[-1] + 100.0
