@@ -518,6 +518,35 @@ def test_an_attitude_that_stops_ends_the_integration() -> None:
     assert found.sigma[-1] > 100.0
 
 
+@pytest.mark.parametrize(
+    ("what", "rate_deg", "is_wrong"),
+    [("roll", 11.0, True), ("pitch", -8.0, True), ("roll", 2.5, False), ("heading", 40.0, False)],
+)
+def test_an_attitude_is_not_used_whose_tilt_turns_against_the_gyros(
+    what: str, rate_deg: float, is_wrong: bool
+) -> None:
+    """It turns for five seconds; a heading may, for the bank models that."""
+    strap, whys = strapdown_channel.Strap(), dict[float, str]()
+    for r in [r for r in felt(circles(), 125.0, every=2) if r.t_ns < 160 * NS]:
+        t = r.t_ns * 1e-9
+        if isinstance(r, Imu):
+            strap = strapdown_channel.receive(strap, r)
+            whys[t] = strap.why
+        elif isinstance(r, Attitude):
+            off = math.radians(rate_deg) * min(max(t - 130.0, 0.0), 5.0)
+            strap = strapdown_channel.sense(
+                strap, msgspec.structs.replace(r, **{what: getattr(r, what) + off})
+            )
+    unused = {t: why for t, why in whys.items() if why and t > 127.0}
+    if not is_wrong:
+        assert not unused
+        return
+    assert all("against the gyros" in why for why in unused.values())
+    assert 130.0 < min(unused) < 135.0
+    assert max(unused) - 135.0 > strapdown_channel.WRONG_S
+    assert max(unused) < 155.0
+
+
 def test_only_the_imu_configured_is_heard() -> None:
     flight = circles()
     records = lost(flight)

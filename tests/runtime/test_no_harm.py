@@ -204,6 +204,29 @@ def test_an_attitude_that_stops_or_stands_still_leaves_a_healthy_gnss_beyond_dou
     assert doubt < 0.05
 
 
+@pytest.mark.parametrize(
+    "name",
+    [
+        "plane_turn",
+        *(pytest.param(n, marks=pytest.mark.long) for n in ("plane_turbulence", "plane_take_off")),
+    ],
+)
+def test_a_roll_that_runs_away_leaves_the_position_at_a_healthy_gnss(name: str) -> None:
+    """It turns by 20 deg/s to 80 deg, as that of a copter whose compass compensation was no number."""
+    records = recording(name)
+    begin_ns = records[0].rx_ns + (records[-1].rx_ns - records[0].rx_ns) * 3 // 20
+    spoilt: list[Input] = []
+    for r in records:
+        if isinstance(r, Attitude) and r.rx_ns > begin_ns:
+            off = math.radians(20.0) * min((r.rx_ns - begin_ns) * 1e-9, 4.0)
+            spoilt.append(msgspec.structs.replace(r, roll=r.roll + off))
+        else:
+            spoilt.append(r)
+    apart, doubt = flown(spoilt)
+    assert len(apart) > 600 and max(apart) < 5.0
+    assert doubt < 0.05
+
+
 def test_a_gnss_that_becomes_late_in_a_turn_stays_beyond_doubt() -> None:
     """A QuadPlane with a beacon: GNSS, 0.1 s late, is 0.4 s late from the 36th second on.
 
