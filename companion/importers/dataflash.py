@@ -6,8 +6,9 @@
 `dataflash_messages` splits the file into messages; `MessageConverter` turns messages into records and does no
 I/O, so that other formats with the same messages can use it. Arrival and validity are the same instant, as
 the log is written on board: UNIX time if the log has a GPS time, else time since boot. Only the primary lane
-of the filter is converted, EKF3 (XKF) before EKF2 (NKF). Names and units are those of the @LoggerMessage
-comments in ArduPilot's sources.
+of the filter is converted, EKF3 (XKF) before EKF2 (NKF): the core of column C, or, before ArduPilot 4.1,
+messages 1 to 5 are lane 0 and 6 to 9 lane 1. Names and units are those of the @LoggerMessage comments in
+ArduPilot's sources.
 """
 
 from __future__ import annotations
@@ -148,7 +149,8 @@ class MessageConverter:
         """Return whether the message is of the primary lane of the filter in use."""
         if name.startswith("X"):
             self._filter = "XKF1"
-        return name[0] == self._filter[0] and getattr(m, "C", 0) == self._lane
+        lane = getattr(m, "C", int(name[3] > "5"))
+        return name[0] == self._filter[0] and lane == self._lane
 
     def _local(self, name: str, m: Message, t: int) -> Iterator[Stamped]:
         if self._is_primary_lane(name, m):
@@ -246,9 +248,9 @@ _TABLE: dict[str, Callable[[MessageConverter, str, Message, int], Iterator[Stamp
     **dict.fromkeys(("GPS", "GPS2"), MessageConverter._gps),
     **dict.fromkeys(("GPA", "GPA2"), MessageConverter._gps_accuracy),
     **dict.fromkeys(("IMU", "IMU2", "IMU3"), MessageConverter._imu),
-    **dict.fromkeys(("XKF1", "NKF1"), MessageConverter._local),
-    **dict.fromkeys(("XKF2", "NKF2"), MessageConverter._wind),
-    **dict.fromkeys(("XKF4", "NKF4"), MessageConverter._status),
+    **dict.fromkeys(("XKF1", "NKF1", "XKF6", "NKF6"), MessageConverter._local),
+    **dict.fromkeys(("XKF2", "NKF2", "XKF7", "NKF7"), MessageConverter._wind),
+    **dict.fromkeys(("XKF4", "NKF4", "XKF9", "NKF9"), MessageConverter._status),
     "ATT": MessageConverter._attitude,
     "ORGN": MessageConverter._origin,
     "POS": MessageConverter._global,

@@ -188,6 +188,29 @@ def test_primary_lane_is_converted(tmp_path: pathlib.Path) -> None:
     assert (found.flags, found.gnss_glitch, found.position_ratio) == (0x3F | 32768, True, 0.25)
 
 
+@pytest.mark.parametrize("kind", ["NKF", "XKF"])
+def test_primary_lane_is_converted_by_number_where_messages_have_no_core(
+    tmp_path: pathlib.Path, kind: str
+) -> None:
+    """Before ArduPilot 4.1 messages 1, 2, 4 are lane 0, and 6, 7, 9 lane 1."""
+    lines = ["FMT, 128, 89, FMT, BBnNZ, Type,Length,Name,Format,Columns"]
+    for k in (1, 6):
+        lines += [f"FMT, {140 + k}, 0, {kind}{k}, Qffffff, TimeUS,VN,VE,VD,PN,PE,PD"]
+        lines += [f"FMT, {141 + k}, 0, {kind}{k + 1}, Qcc, TimeUS,VWN,VWE"]
+        lines += [f"FMT, {143 + k}, 0, {kind}{k + 3}, QcHb, TimeUS,SP,SS,PI"]
+    for second, primary in ((1, 0), (2, 1), (3, 0)):
+        us = second * 1_000_000
+        for k in (1, 6):  # the number is that of the message and the second
+            lines += [f"{kind}{k + 3}, {us}, {k}{second}, 831, {primary}"]
+        for k in (1, 6):
+            lines += [f"{kind}{k}, {us}, 1, 2, 3, {k}{second}, 0, 0", f"{kind}{k + 1}, {us}, {k}{second}, 0"]
+    path = write(tmp_path, "\n".join([*lines, ""]).encode(), name="flight.log")
+    records = list(sources.open_source(path))
+    assert [h.x_n[0] for h in records if isinstance(h, r.LocalPosition)] == [11, 62, 13]
+    assert [h.v_n[0] for h in records if isinstance(h, r.Wind)] == [11, 62, 13]
+    assert [h.position_ratio for h in records if isinstance(h, r.FilterStatus)] == [11, 62, 13]
+
+
 def test_truth_velocity_is_derived_from_positions(tmp_path: pathlib.Path) -> None:
     parts = [
         message("SIM", us, 0.0, 0.0, 0.0, 100.0, lat, 7.0)
