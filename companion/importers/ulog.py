@@ -50,6 +50,7 @@ from companion.units import ZERO_CELSIUS
 
 Topic: TypeAlias = Callable[[Row, int], Iterator[Stamped]]
 
+_AIRSPEED_SENSORS = 1, 2, 3  # airspeed_source, selected_airspeed_index
 _UNIX_FROM_US, _UNIX_TO_US = 10**15, 4_102_444_800_000_000  # 2001, 2100
 
 
@@ -176,7 +177,9 @@ def _imu(row: Row, t: int) -> Iterator[Stamped]:
 
 
 def _air_data(row: Row, t: int) -> Iterator[Stamped]:
-    if (speed := finite(row["true_airspeed_m_s"])) is not None:
+    """Convert the airspeed of a sensor, not one that PX4 computes: ground speed minus wind, or synthetic."""
+    source = row.get("airspeed_source", row.get("selected_airspeed_index", _AIRSPEED_SENSORS[0]))
+    if source in _AIRSPEED_SENSORS and (speed := finite(row["true_airspeed_m_s"])) is not None:
         yield AirData(t, t, speed, True, sensed=True)
 
 

@@ -20,6 +20,7 @@ CODES = {
     "float": "f",
     "double": "d",
     "int32_t": "i",
+    "int8_t": "b",
     "uint8_t": "B",
     "bool": "?",
     "uint32_t": "I",
@@ -49,6 +50,7 @@ TOPICS = {
     "vehicle_attitude": "uint64_t timestamp;float[4] q;",
     "sensor_combined": "uint64_t timestamp;float[3] gyro_rad;float[3] accelerometer_m_s2;",
     "airspeed": "uint64_t timestamp;float true_airspeed_m_s;",
+    "airspeed_validated": "uint64_t timestamp;float true_airspeed_m_s;int8_t airspeed_source;",
     "wind": "uint64_t timestamp;float windspeed_north;float windspeed_east;"
     "float variance_north;float variance_east;",
     "vehicle_air_data": "uint64_t timestamp;float baro_pressure_pa;float baro_temp_celcius;",
@@ -172,6 +174,22 @@ def test_old_and_new_gps_fields_agree(tmp_path: pathlib.Path) -> None:
     (before,) = sources.open_source(write(tmp_path, definitions("sensor_gps") + old))
     (now,) = sources.open_source(write(tmp_path, definitions("vehicle_gps_position") + fix(2_000_000, 47.0)))
     assert before == now
+
+
+@pytest.mark.parametrize("field", ["airspeed_source", "selected_airspeed_index"])  # since PX4 1.17, before
+def test_validated_airspeed_is_used_where_a_sensor_measures_it(
+    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch, field: str
+) -> None:
+    monkeypatch.setitem(
+        TOPICS, "airspeed_validated", f"uint64_t timestamp;float true_airspeed_m_s;int8_t {field};"
+    )
+    none, ground_minus_wind, sensors, synthetic = -1, 0, (1, 2, 3), 4
+    content = definitions("airspeed", "airspeed_validated") + data("airspeed", 2_000_000, 99.0)
+    for k, source in enumerate((none, ground_minus_wind, *sensors, synthetic)):
+        content += data("airspeed_validated", 2_000_000 + k, 10.0 + source, source)
+    records = list(sources.open_source(write(tmp_path, content)))
+    found = [(h.airspeed, h.true, h.sensed) for h in records if isinstance(h, r.AirData)]
+    assert found == [(11.0, True, True), (12.0, True, True), (13.0, True, True)]
 
 
 def test_torn_log_is_read_up_to_the_damage(tmp_path: pathlib.Path) -> None:
