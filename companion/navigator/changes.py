@@ -10,23 +10,30 @@ import math
 
 from companion.navigator.hypotheses import AIRSPEED
 from companion.navigator.minimax_bound import Guarantee
+from companion.navigator.own_channel import Sensors
 from companion.navigator.scatter import Scatter
 from companion.navigator.state import EXCLUDED, FIXES, SUSPECT, Settings, State, source_name, sources
 from companion.records import Event, Mode, Output, Severity, Solution, Source, Stamped
+from companion.units import SECOND_NS
 
 #: An autopilot checks its airspeed sensor against GPS only: ArduPlane dived to the ground for speed in 67 s.
 FALSE_AIRSPEED = "switch the airspeed sensor off"
 USE_AIRSPEED = {"ardupilot": ": ARSPD_USE 0", "px4": ": FW_USE_AIRSPD 0"}
 UNFIT_ANSWERS = 10  # of a beacon, none of which fits, until it is reported
+#: The IMU is reported as not used once it has not been for so long, and as used again once it has been. A
+#: stream that is slow at the start is requested again within the first.
+IMU_UNUSED_NS, IMU_USED_NS = 12 * SECOND_NS, 60 * SECOND_NS
 
 
 class Changes:
-    """What was last reported of sources, of their scatter, of the guaranteed bound and of the mode."""
+    """What was last reported of sources, their scatter, the IMU, the guaranteed bound and the mode."""
 
     def __init__(self) -> None:
         self._beliefs: tuple[int, ...] = ()  # `State.reported`
         self._scatter: dict[str, bool] = {}  # whether each source is noisy
         self._unfit: set[int] = set()  # beacons that are reported to fit nothing
+        self._imu_is_used = True
+        self._imu_changed_ns: int | None = None  # since when the IMU is not as reported
         self._wider = False  # whether the guaranteed bound is
         self._mode = Mode.INITIALISING, Source(0)  # and the fixes that the solution rests on
 
@@ -45,11 +52,31 @@ class Changes:
             text = "is not used: no answer fits its stated place; check its number and its place"
             found.append((Severity.WARNING, f"rsbn {beacon} {text}"))
         self._unfit = unfit
+        found += self._of_imu(state.sensors, record.t_ns, settings)
         g = state.guarantee
         if g.anchored is not None and (g.widening > 1.0) != self._wider:
             self._wider = not self._wider
             found.append((Severity.NOTICE, _of_bound(g)))
         return [Event(record.t_ns, record.rx_ns, severity, text) for severity, text in found]
+
+    def _of_imu(self, s: Sensors, t_ns: int, settings: Settings) -> list[tuple[Severity, str]]:
+        """Report whether the IMU is used, if it arrives; the streams report one that never does."""
+        is_used = not s.is_silent("imu", t_ns)
+        is_expected = settings.config.uses("imu") and s.strap.imu_pace.heard > 0
+        if is_used == self._imu_is_used or not is_expected:
+            self._imu_changed_ns = None
+            return []
+        if self._imu_changed_ns is None:
+            self._imu_changed_ns = t_ns
+        if t_ns - self._imu_changed_ns < (IMU_USED_NS if is_used else IMU_UNUSED_NS):
+            return []
+        self._imu_is_used, self._imu_changed_ns = is_used, None
+        if is_used:
+            return [(Severity.NOTICE, "IMU is used again")]
+        silent_s = (t_ns - s.imu_ns) * 1e-9
+        return [
+            (Severity.WARNING, f"IMU is not used: {s.strap.why or f'no new sample for {silent_s:.0f} s'}")
+        ]
 
     def of_mode(self, solution: Solution) -> list[Output]:
         """Return an event if the mode of a solution is another, or the fixes that it rests on are."""

@@ -77,7 +77,7 @@ class Strap(Struct, frozen=True):
     down: float = -G0
     tilting: Vector2 = (0.0, 0.0)
     wrong_ns: int | None = None
-    why: str = "no IMU is heard"
+    why: str = "no IMU arrives"
 
 
 def sense(s: Strap, record: Attitude) -> Strap:
@@ -118,7 +118,7 @@ def receive(s: Strap, record: Imu) -> Strap:
     if why := _senseless(record):
         return structs.replace(s, why=why)
     if s.C_nb is None:
-        return structs.replace(s, why="no attitude is heard")
+        return structs.replace(s, why="no attitude arrives")
     C_nb = s.C_nb @ rotation_matrix(0.5 * (np.array(before.w_b) + record.w_b) * min(dt, STALE_S))
     s = structs.replace(s, imu=record, C_nb=C_nb)
     gain = min(dt / VERTICAL_S, 0.1)
@@ -198,11 +198,11 @@ def attitude_matrix(record: Attitude) -> Floats:
 def _senseless(record: Imu) -> str:
     force, rate = max(map(abs, record.f_b)), max(map(abs, record.w_b))
     if not math.isfinite(sum(record.f_b) + sum(record.w_b)):
-        return "the IMU sends what is no number"
+        return "it sends what is no number"
     if force > F_MAX:
-        return f"a specific force of {force:.0f} m/s^2 is at the end of an accelerometer's range"
+        return f"its specific force of {force:.0f} m/s^2 is at the end of the range, {F_MAX:.0f} m/s^2"
     if rate > W_MAX:
-        return f"an angular rate of {rate:.1f} rad/s is at the end of a gyro's range"
+        return f"its angular rate of {rate:.1f} rad/s is at the end of the range, {W_MAX:.1f} rad/s"
     return ""
 
 
@@ -213,18 +213,18 @@ def _unfit(s: Strap) -> str:
         return "the rates of IMU and attitude are not known yet"
     if s.imu_pace.hz < LEAST * IMU_HZ or s.attitude_pace.hz < LEAST * ATTITUDE_HZ:
         return (
-            f"IMU at {s.imu_pace.hz:.1f} Hz and attitude at {s.attitude_pace.hz:.1f} Hz are too slow, "
-            f"it takes {IMU_HZ:.0f} and {ATTITUDE_HZ:.0f} Hz"
+            f"IMU at {s.imu_pace.hz:.1f} Hz and attitude at {s.attitude_pace.hz:.1f} Hz are too slow "
+            f"(at least {LEAST * IMU_HZ:.1f} and {LEAST * ATTITUDE_HZ:.1f} Hz)"
         )
     silent = (s.imu.t_ns - s.attitude_pace.t_ns) * 1e-9
     if silent > STALE_S:
-        return f"no attitude for {silent:.1f} s"
+        return f"no attitude for {silent:.1f} s (limit {STALE_S:.1f} s)"
     if s.wrong_ns is not None and s.imu.t_ns - s.wrong_ns < WRONG_S * SECOND_NS:
         limit = math.degrees(TILTING_RAD_S)
         return f"the attitude is wrong: its tilt turns by more than {limit:.0f} deg/s against the gyros"
     if abs(s.down + G0) > VERTICAL * G0:
         return (
-            f"the specific force upwards averages {-s.down:.1f} m/s^2 where gravity is 9.8: "
-            "units or orientation of the IMU are wrong"
+            f"its specific force upwards averages {-s.down:.1f} m/s^2 where gravity is 9.8: "
+            "units or orientation are wrong"
         )
     return ""

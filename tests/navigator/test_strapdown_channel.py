@@ -37,6 +37,7 @@ from companion.navigator.inertial_track import Point
 from companion.records import (
     AirData,
     Attitude,
+    Event,
     GlobalPosition,
     Gnss,
     Imu,
@@ -435,11 +436,14 @@ UPWARDS: dict[str, Any] = {"f": lambda f: [-x for x in f]}
 @pytest.mark.parametrize(
     ("how", "word"),
     [
-        ({"f": lambda f: (157.0, f[1], f[2])}, "accelerometer's range"),
-        (BEYOND_GYROS, "gyro's range"),
-        ({"f": lambda f: [100.0 * x for x in f]}, "accelerometer's range"),  # sensor units for m/s^2
+        ({"f": lambda f: (157.0, f[1], f[2])}, "force of 157 m/s^2 is at the end of the range, 156 m/s^2"),
+        (BEYOND_GYROS, "rate of 35.0 rad/s is at the end of the range, 34.7 rad/s"),
+        (
+            {"f": lambda f: [100.0 * x for x in f]},
+            "m/s^2 is at the end of the range",
+        ),  # sensor units for m/s^2
         ({"f": lambda f: [x / G for x in f]}, "where gravity is 9.8"),  # g for m/s^2
-        (UPWARDS, "units or orientation of the IMU are wrong"),
+        (UPWARDS, "units or orientation are wrong"),
     ],
 )
 def test_what_makes_no_sense_is_not_used(how: dict[str, Any], word: str) -> None:
@@ -471,6 +475,44 @@ def test_what_is_no_number_is_no_sense_either() -> None:
     assert "no number" in strapdown_channel.receive(strapdown_channel.Strap(), wrong).why
 
 
+def hanging(r: Imu) -> Imu:
+    return msgspec.structs.replace(r, f_b=(0.1, 0.2, -G), w_b=(0.0, 0.1, 0.2))
+
+
+def spoilt(r: Imu) -> Imu:
+    return msgspec.structs.replace(r, w_b=(0.0, 35.0, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("wrong", "sample", "expected"),
+    [
+        ((), spoilt, []),
+        ([(130.0, 139.0)], spoilt, []),
+        (
+            [(130.0, 150.0)],
+            spoilt,
+            ["not used: its angular rate of 35.0 rad/s is at the end of the range, 34.7 rad/s", "used again"],
+        ),
+        ([(130.0, 150.0)], hanging, ["not used: no new sample for 13 s", "used again"]),
+        (
+            [(110.0 + 20.0 * k, 125.0 + 20.0 * k) for k in range(9)],  # off and on
+            hanging,
+            ["not used: no new sample for 13 s"],
+        ),
+    ],
+    ids=["healthy", "short", "beyond the range", "hangs", "off and on"],
+)
+def test_an_imu_that_is_not_used_for_long_is_reported_and_so_is_its_return(
+    wrong: list[tuple[float, float]], sample: Any, expected: list[str]
+) -> None:
+    navigator, texts = Navigator(STRAPDOWN), list[str]()
+    for record in felt(circles(), 90.0):
+        if isinstance(record, Imu) and any(a < record.t_ns * 1e-9 <= b for a, b in wrong):
+            record = sample(record)
+        texts += [e.text for e in navigator.handle(record) if isinstance(e, Event) and "IMU" in e.text]
+    assert texts == [f"IMU is {text}" for text in expected]
+
+
 def thinned(records: Iterable[Any], kind: type, every: int) -> Iterator[Any]:
     count = 0
     for record in records:
@@ -486,8 +528,8 @@ def thinned(records: Iterable[Any], kind: type, every: int) -> Iterator[Any]:
     [
         (Imu, 20, "IMU at 2.5 Hz and attitude at 10.0 Hz are too slow"),
         (Attitude, 10, "IMU at 50.0 Hz and attitude at 1.0 Hz are too slow"),
-        (Attitude, 10**6, "no attitude is heard"),
-        (Imu, 10**6, "no IMU is heard"),
+        (Attitude, 10**6, "no attitude arrives"),
+        (Imu, 10**6, "no IMU arrives"),
     ],
 )
 def test_too_slow_a_stream_is_not_integrated(kind: type, every: int, word: str) -> None:
