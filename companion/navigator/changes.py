@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 
-from companion.navigator.hypotheses import AIRSPEED
+from companion.navigator.hypotheses import AIRSPEED, GNSS, VELOCITY
 from companion.navigator.minimax_bound import Guarantee
 from companion.navigator.own_channel import Sensors
 from companion.navigator.scatter import Scatter
@@ -29,7 +29,7 @@ class Changes:
     """What was last reported of sources, their scatter, the IMU, the guaranteed bound and the mode."""
 
     def __init__(self) -> None:
-        self._beliefs: tuple[int, ...] = ()  # `State.reported`
+        self._beliefs: tuple[int, ...] = ()  # `State.reported`, as far as it was announced
         self._scatter: dict[str, bool] = {}  # whether each source is noisy
         self._unfit: set[int] = set()  # beacons that are reported to fit nothing
         self._imu_is_used = True
@@ -40,9 +40,10 @@ class Changes:
     def of_state(self, state: State, record: Stamped, settings: Settings) -> list[Output]:
         """Return an event for each change of the state that leads, after `record`."""
         found: list[tuple[Severity, str]] = []
-        if state.reported != self._beliefs:
-            found += _of_beliefs(self._beliefs, state, record.t_ns, settings)
-            self._beliefs = state.reported
+        beliefs = _announced(self._beliefs, state.reported)
+        if beliefs != self._beliefs:
+            found += _of_beliefs(self._beliefs, beliefs, state, record.t_ns, settings)
+            self._beliefs = beliefs
         for name, scatter in state.scatter.items():
             if scatter.noisy != self._scatter.get(name, False):
                 self._scatter[name] = scatter.noisy
@@ -95,11 +96,18 @@ class Changes:
         return [Event(solution.t_ns, solution.rx_ns, severity, f"navigation {solution.mode}: {why}")]
 
 
+def _announced(before: tuple[int, ...], now: tuple[int, ...]) -> tuple[int, ...]:
+    """Return what is reported `now`; the velocity of GNSS is not used again while GNSS is in doubt."""
+    if len(before) <= VELOCITY or len(now) <= VELOCITY or not now[GNSS] or now[VELOCITY]:
+        return now
+    return (*now[:VELOCITY], before[VELOCITY], *now[VELOCITY + 1 :])
+
+
 def _of_beliefs(
-    before: tuple[int, ...], state: State, t_ns: int, settings: Settings
+    before: tuple[int, ...], after: tuple[int, ...], state: State, t_ns: int, settings: Settings
 ) -> list[tuple[Severity, str]]:
     found: list[tuple[Severity, str]] = []
-    for i, (now, p) in enumerate(zip(state.reported, state.false, strict=True)):
+    for i, (now, p) in enumerate(zip(after, state.false, strict=True)):
         if now == (before[i] if i < len(before) else 0):
             continue
         text = {

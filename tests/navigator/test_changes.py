@@ -31,6 +31,10 @@ def believed(number: int, false: float) -> State:
     return State(reported=(number,), false=(false,))
 
 
+def doubted(gnss: int, velocity: int) -> State:
+    return State(reported=(gnss, 0, velocity), false=(0.9995, 0.0, 0.9995))
+
+
 def scattered(noisy: bool, factor: float) -> State:
     return State(scatter={"gnss": Scatter(0, (0.0, 0.0), factor=factor, noisy=noisy)})
 
@@ -45,6 +49,15 @@ CASES = {
         (believed(SUSPECT, 0.62), ["gnss is suspect: false with probability 0.62"]),
         (believed(EXCLUDED, 0.9995), ["gnss is excluded: false with probability 0.9995"]),
         (believed(0, 0.01), ["gnss is used again"]),
+    ],
+    "velocity": [
+        (doubted(0, 0), []),
+        (doubted(0, EXCLUDED), ["velocity of gnss is excluded: false with probability 0.9995"]),
+        (doubted(SUSPECT, 0), ["gnss is suspect: false with probability 1.00"]),
+        (doubted(EXCLUDED, 0), ["gnss is excluded: false with probability 0.9995"]),
+        (doubted(0, 0), ["gnss is used again", "velocity of gnss is used again"]),
+        (doubted(0, SUSPECT), ["velocity of gnss is suspect: false with probability 1.00"]),
+        (doubted(0, 0), ["velocity of gnss is used again"]),
     ],
     "scatter": [
         (scattered(False, 3.0), []),
