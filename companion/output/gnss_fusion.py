@@ -3,7 +3,8 @@
 PX4 has no source sets: it fuses GNSS and our position at once, so a false GNSS draws it off. Its estimator
 takes MAV_CMD_ESTIMATOR_SENSOR_ENABLE (development.xml of 2026; PR 26739 proposed 43005). GNSS is switched
 off only if it is false by the same predicate as on ArduPilot, never because it is lost: if the companion then
-failed, it would stay off. An autopilot that does not know the command is reported.
+failed, it would stay off. That it is lost is only reported. An autopilot that does not know the command is
+reported.
 
 PX4 reports the state in ESTIMATOR_SENSOR_FUSION_STATUS. If the first reports state that it is off, a
 companion that failed may have left it so, and PX4 stored it at landing: it is switched on once. What somebody
@@ -20,6 +21,7 @@ import math
 from companion.link.dialect import Message
 from companion.output.source_switch import (
     COMPANION_SET,
+    GNSS_LOST,
     GNSS_SET,
     REPORTS,
     STEADY_S,
@@ -29,6 +31,7 @@ from companion.output.source_switch import (
     SourceSwitch,
     is_held_false,
 )
+from companion.records import Severity
 
 ESTIMATOR_SENSOR_ENABLE = 43006
 """MAV_CMD_ESTIMATOR_SENSOR_ENABLE: source, instance, enable, estimator instance. Not in the dialect yet."""
@@ -46,6 +49,7 @@ class GnssFusion(SourceSwitch):
         self._wanted = self._leading = GNSS_SET
         self._is_disarmed = False
         self._is_start = True  # until the state is reported
+        self._is_lost = False  # GNSS, as last reported
 
     @staticmethod
     def selected(message: Message, from_autopilot: bool, system: int) -> Selected | None:
@@ -57,6 +61,18 @@ class GnssFusion(SourceSwitch):
     def note_armed(self, is_armed: bool) -> None:
         """Note whether the autopilot is armed."""
         self._is_disarmed = not is_armed
+
+    def update(self, now_ns: int) -> None:
+        """Decide, and report that GNSS is lost or back: without a command no text of a switch does."""
+        super().update(now_ns)
+        s = self.situation(now_ns)
+        back = TO_GNSS[0]
+        if not self._is_lost and s.sent_s >= STEADY_S and GNSS_LOST.holds(s):
+            self._is_lost = True
+            self._add_event(Severity.NOTICE, GNSS_LOST.reason, now_ns)
+        elif self._is_lost and back.holds(s):
+            self._is_lost = False
+            self._add_event(Severity.NOTICE, back.reason, now_ns)
 
     def required(self, s: Situation) -> tuple[int, str] | None:
         """Return `COMPANION_SET` where GNSS must be off, `GNSS_SET` where on, and the reason."""

@@ -114,9 +114,10 @@ def is_held_false(s: Situation) -> bool:
     return s.gnss_false is not None and s.gnss_false > FALSE and s.witness
 
 
+GNSS_LOST = Predicate("no fix", lambda s: s.no_fix_s >= NO_FIX_S, "GNSS is lost, using companion")
 #: Set 2 needs our position and one of these.
 TO_COMPANION = (
-    Predicate("no fix", lambda s: s.no_fix_s >= NO_FIX_S, "GNSS is lost, using companion"),
+    GNSS_LOST,
     Predicate("receiver silent", lambda s: s.silent_s >= SILENT_S, "GNSS receiver silent, using companion"),
     Predicate("GNSS false", is_held_false, "GNSS is false, using companion"),
 )

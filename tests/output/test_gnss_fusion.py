@@ -63,6 +63,23 @@ def test_off_while_false_and_on_again() -> None:
     ]
 
 
+def test_gnss_that_is_lost_and_back_is_reported_once_and_switches_nothing() -> None:
+    """PX4 goes on by our position of itself; the pilot must know."""
+    switch, second = Switch(), 10**9
+    lost = WELL._replace(fix_s=-1.0, no_fix_s=2.0, gnss_false=None)
+    back = WELL._replace(no_fix_s=-1.0)
+    situations = [
+        *(WELL, lost._replace(no_fix_s=1.9), lost._replace(sent_s=-1.0), lost, lost),
+        *(back._replace(fix_s=4.9), back._replace(gnss_false=0.5), back, back, lost),
+    ]
+    assert [requests(switch, now, 0, k * second) for k, now in enumerate(situations, 1)] == [[]] * 10
+    assert [(event.rx_ns // second, event.text) for event in switch.take_events()] == [
+        (4, "GNSS is lost, using companion"),
+        (8, "GNSS has a fix"),
+        (10, "GNSS is lost, using companion"),
+    ]
+
+
 def test_on_while_disarmed() -> None:
     """PX4 stores it in EKF2_SENS_EN when it disarms. The next flight would begin without GNSS."""
     switch, second = Switch(), 10**9
