@@ -702,6 +702,19 @@ def test_ping_and_mission_list_are_answered() -> None:
     assert station.send("MISSION_REQUEST_LIST", target_system=1, target_component=1) == []
 
 
+def test_texts_that_nobody_receives_delay_none_for_the_pilot() -> None:
+    """The service reports its addresses and its log before the autopilot is there."""
+    flight = Flight()
+    for k in range(6):
+        flight.core.report(Severity.WARNING, f"of the service, {k}", flight.now)
+    flight.send("HEARTBEAT", autopilot=3, type=1, mavlink_version=3)
+    flight.core.report(Severity.INFO, "of the flight", flight.now)
+    flight.collect()
+    texts = [m.text for _, m in flight.sent if m.get_type() == "STATUSTEXT"]
+    assert texts == ["autopilot 1 connected (ardupilot)", "of the flight"]
+    assert len([e for e in flight.log.of(Event) if "of the service" in e.text]) == 6
+
+
 def test_status_text_names_no_link() -> None:
     flight = Flight("udpin:127.0.0.1:14550")
     flight.core.receive("udpin:127.0.0.1:14550", flight.frame("HEARTBEAT", type=1, autopilot=3), flight.now)
