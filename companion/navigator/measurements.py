@@ -195,6 +195,7 @@ def rotor_drag(
     V: Vector2,
     velocity: Vector2,
     manoeuvre: float,
+    scatter: float,
     heading: float,
     drag_per_s: float,
 ) -> Taken:
@@ -202,7 +203,7 @@ def rotor_drag(
 
     A constant error along the velocity, as a pitot's, would stand for drag that is not quite linear: it was
     held false beside a healthy GNSS. `V` and `velocity` as in `own_error_model.drag_rows`, `manoeuvre` as in
-    `airspeed`.
+    `airspeed`; `scatter` is the variance of `V` on each axis, (m/s)^2, by the noise of the accelerometers.
     """
 
     def seen_by(bank: Bank) -> tuple[Floats, Floats]:
@@ -211,7 +212,7 @@ def rotor_drag(
         H[:, :, : channel.n] = own[:, :, : channel.n]
         return z, H
 
-    R = own_error_model.airspeed_variance(manoeuvre) * np.eye(2)
+    R = (own_error_model.airspeed_variance(manoeuvre) + scatter) * np.eye(2)
     return _take(bank, known, seen_by, None, R, None, "velocity")
 
 

@@ -41,30 +41,39 @@ WEIGHTS = (1.0, 0.5, 0.25)  # of `own_error_model.GRADES`
 
 
 class AirspeedSums(NamedTuple):
-    """Sums over the samples since `start_ns`: of nominal velocity and of velocity through the air, and of
-    the size of the latter (m/s).
+    """Sums over the samples since `start_ns`: nominal velocity, velocity through the air, size of the latter
+    (m/s), squares of its steps (m^2/s^2); `last` is its last sample, for the next step.
     """
 
     start_ns: int
+    last: Vector2 | None = None
     samples: int = 0
     velocity: Vector2 = (0.0, 0.0)
     air: Vector2 = (0.0, 0.0)
     speed: float = 0.0
+    steps: float = 0.0
 
     def with_one(self, velocity: Vector2, V: Vector2) -> AirspeedSums:
         """With one more sample (m/s)."""
         return AirspeedSums(
             self.start_ns,
+            V,
             self.samples + 1,
             (self.velocity[0] + velocity[0], self.velocity[1] + velocity[1]),
             (self.air[0] + V[0], self.air[1] + V[1]),
             self.speed + math.hypot(*V),
+            self.steps + (0.0 if self.last is None else math.dist(self.last, V) ** 2),
         )
 
     @property
     def is_one_way(self) -> bool:
         """Whether the samples are of one heading or a turn: a mean over a step of it is of neither."""
         return math.hypot(*self.air) >= ONE_WAY * self.speed
+
+    @property
+    def scatter(self) -> float:
+        """Variance of the mean velocity through the air on each axis, (m/s)^2, if samples are white noise."""
+        return self.steps / (4.0 * self.samples**2)
 
 
 class Sensors(Struct, frozen=True):

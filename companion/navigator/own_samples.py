@@ -275,23 +275,23 @@ def _measured(state: State, record: AirData | Attitude | Imu, V: Vector2, settin
     if record.t_ns - sums.start_ns < AIRSPEED_EVERY_NS:
         return with_sensors(state, sums=sums)
     if not isinstance(record, Imu) and not sums.is_one_way:
-        return with_sensors(state, sums=AirspeedSums(record.t_ns))
+        return with_sensors(state, sums=AirspeedSums(record.t_ns, V))
     state = propagated(state, settings)
     assert state.bank is not None
     known, n = hypotheses(state, settings), sums.samples
-    V, velocity = (sums.air[0] / n, sums.air[1] / n), (sums.velocity[0] / n, sums.velocity[1] / n)
+    mean, velocity = (sums.air[0] / n, sums.air[1] / n), (sums.velocity[0] / n, sums.velocity[1] / n)
     manoeuvre = strapdown_channel.manoeuvre(s.mean_acceleration)
     if isinstance(record, AirData):
-        taken = measurements.airspeed(state.bank, known, _own(settings), V, velocity, manoeuvre)
+        taken = measurements.airspeed(state.bank, known, _own(settings), mean, velocity, manoeuvre)
     elif isinstance(record, Attitude):
-        taken = measurements.steady_airspeed(state.bank, known, _own(settings), V, velocity, manoeuvre)
+        taken = measurements.steady_airspeed(state.bank, known, _own(settings), mean, velocity, manoeuvre)
     else:
         drag, heading = settings.config.air_data.rotor_drag_per_s, s.heading() or 0.0
         taken = measurements.rotor_drag(
-            state.bank, known, _own(settings), V, velocity, manoeuvre, heading, drag
+            state.bank, known, _own(settings), mean, velocity, manoeuvre, sums.scatter, heading, drag
         )
     state = structs.replace(state, bank=taken.bank)
-    state = with_sensors(state, measured_ns=record.t_ns, sums=AirspeedSums(record.t_ns))
+    state = with_sensors(state, measured_ns=record.t_ns, sums=AirspeedSums(record.t_ns, V))
     return decided(state, record, settings)
 
 
