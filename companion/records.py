@@ -154,9 +154,13 @@ class Pressure(Stamped, frozen=True, gc=False, tag=True):
 
 
 class AirspeedSensor(Stamped, frozen=True, gc=False, tag=True):
-    """Whether the autopilot has an airspeed sensor that is present, enabled and healthy."""
+    """Whether the autopilot has an airspeed sensor that is present, enabled and healthy.
+
+    `used`: by SYS_STATUS, whether it uses the sensor that is present; None: not stated.
+    """
 
     healthy: bool
+    used: bool | None = None
 
 
 class Vehicle(Stamped, frozen=True, gc=False, tag=True):

@@ -382,7 +382,9 @@ def has_airspeed_sensor(m: Message) -> bool:
 
 @_of("SYS_STATUS")
 def _sys_status(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
-    return (AirspeedSensor(_unstamped(rx, sender), rx, has_airspeed_sensor(m)),)
+    healthy = has_airspeed_sensor(m)
+    present = m.onboard_control_sensors_present & mavlink.MAV_SYS_STATUS_SENSOR_DIFFERENTIAL_PRESSURE
+    return (AirspeedSensor(_unstamped(rx, sender), rx, healthy, healthy if present else None),)
 
 
 @_of("HEARTBEAT")

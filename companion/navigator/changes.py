@@ -10,7 +10,7 @@ import math
 
 from companion.navigator.hypotheses import AIRSPEED, GNSS, VELOCITY
 from companion.navigator.minimax_bound import Guarantee
-from companion.navigator.own_channel import Sensors
+from companion.navigator.own_channel import SENSOR_NS, SILENT_NS, Sensors, airspeed_is_sensed
 from companion.navigator.scatter import Scatter
 from companion.navigator.state import EXCLUDED, FIXES, SUSPECT, Settings, State, source_name, sources
 from companion.records import Event, Mode, Output, Severity, Solution, Source, Stamped
@@ -20,20 +20,41 @@ from companion.units import SECOND_NS
 FALSE_AIRSPEED = "switch the airspeed sensor off"
 USE_AIRSPEED = {"ardupilot": ": ARSPD_USE 0", "px4": ": FW_USE_AIRSPD 0"}
 UNFIT_ANSWERS = 10  # of a beacon, none of which fits, until it is reported
-#: The IMU is reported as not used once it has not been for so long, and as used again once it has been. A
+#: A sensor is reported as not used once it has not been for so long, and as used again once it has been. A
 #: stream that is slow at the start is requested again within the first.
-IMU_UNUSED_NS, IMU_USED_NS = 12 * SECOND_NS, 60 * SECOND_NS
+UNUSED_NS, USED_NS = 12 * SECOND_NS, 60 * SECOND_NS
+
+
+class _Use:
+    """Whether a sensor is used, as last reported, and since when it is not as reported."""
+
+    def __init__(self, name: str) -> None:
+        self._name, self._is_used = name, True
+        self._changed_ns: int | None = None
+
+    def update(self, is_used: bool, why_not: str, t_ns: int) -> list[tuple[Severity, str]]:
+        """Return the report that is due, if any; `why_not` is empty while the sensor is not expected."""
+        if is_used == self._is_used or not (is_used or why_not):
+            self._changed_ns = None
+            return []
+        if self._changed_ns is None:
+            self._changed_ns = t_ns
+        if t_ns - self._changed_ns < (USED_NS if is_used else UNUSED_NS):
+            return []
+        self._is_used, self._changed_ns = is_used, None
+        if is_used:
+            return [(Severity.NOTICE, f"{self._name} is used again")]
+        return [(Severity.WARNING, f"{self._name} is not used: {why_not}")]
 
 
 class Changes:
-    """What was last reported of sources, their scatter, the IMU, the guaranteed bound and the mode."""
+    """What was last reported of sources, their scatter, sensors, the guaranteed bound and the mode."""
 
     def __init__(self) -> None:
         self._beliefs: tuple[int, ...] = ()  # `State.reported`, as far as it was announced
         self._scatter: dict[str, bool] = {}  # whether each source is noisy
         self._unfit: set[int] = set()  # beacons that are reported to fit nothing
-        self._imu_is_used = True
-        self._imu_changed_ns: int | None = None  # since when the IMU is not as reported
+        self._imu, self._pitot = _Use("IMU"), _Use("airspeed")
         self._wider = False  # whether the guaranteed bound is
         self._mode = Mode.INITIALISING, Source(0)  # and the fixes that the solution rests on
 
@@ -53,31 +74,23 @@ class Changes:
             text = "is not used: no answer fits its stated place; check its number and its place"
             found.append((Severity.WARNING, f"rsbn {beacon} {text}"))
         self._unfit = unfit
-        found += self._of_imu(state.sensors, record.t_ns, settings)
+        found += self._of_sensors(state.sensors, record.t_ns, settings)
         g = state.guarantee
         if g.anchored is not None and (g.widening > 1.0) != self._wider:
             self._wider = not self._wider
             found.append((Severity.NOTICE, _of_bound(g)))
         return [Event(record.t_ns, record.rx_ns, severity, text) for severity, text in found]
 
-    def _of_imu(self, s: Sensors, t_ns: int, settings: Settings) -> list[tuple[Severity, str]]:
-        """Report whether the IMU is used, if it arrives; the streams report one that never does."""
-        is_used = not s.is_silent("imu", t_ns)
-        is_expected = settings.config.uses("imu") and s.strap.imu_pace.heard > 0
-        if is_used == self._imu_is_used or not is_expected:
-            self._imu_changed_ns = None
-            return []
-        if self._imu_changed_ns is None:
-            self._imu_changed_ns = t_ns
-        if t_ns - self._imu_changed_ns < (IMU_USED_NS if is_used else IMU_UNUSED_NS):
-            return []
-        self._imu_is_used, self._imu_changed_ns = is_used, None
-        if is_used:
-            return [(Severity.NOTICE, "IMU is used again")]
-        silent_s = (t_ns - s.imu_ns) * 1e-9
-        return [
-            (Severity.WARNING, f"IMU is not used: {s.strap.why or f'no new sample for {silent_s:.0f} s'}")
-        ]
+    def _of_sensors(self, s: Sensors, t_ns: int, settings: Settings) -> list[tuple[Severity, str]]:
+        """Report whether IMU and airspeed are used, once they came; the streams report what never does."""
+        uses, imu, pitot = settings.config.uses, "", ""
+        if uses("imu") and s.strap.imu_pace.heard > 0 and s.is_silent("imu", t_ns):
+            imu = s.strap.why or f"no new sample for {(t_ns - s.imu_ns) * 1e-9:.0f} s"
+        if uses("air_data") and s.pitot_ns > 0 and s.ground.flying and not s.landed:
+            pitot = _why_no_airspeed(s, t_ns)
+        return self._imu.update(not s.is_silent("imu", t_ns), imu, t_ns) + self._pitot.update(
+            t_ns - s.pitot_ns <= SILENT_NS["air"], pitot, t_ns
+        )
 
     def of_mode(self, solution: Solution) -> list[Output]:
         """Return an event if the mode of a solution is another, or the fixes that it rests on are."""
@@ -94,6 +107,17 @@ class Changes:
             why = "no fixes"
         severity = Severity.WARNING if solution.mode is Mode.UNTRUSTED else Severity.NOTICE
         return [Event(solution.t_ns, solution.rx_ns, severity, f"navigation {solution.mode}: {why}")]
+
+
+def _why_no_airspeed(s: Sensors, t_ns: int) -> str:
+    air = s.air.air
+    if s.unused_ns is not None and t_ns - s.unused_ns <= SENSOR_NS:
+        return "the autopilot does not use its sensor"
+    if air is None or t_ns - air.t_ns > SILENT_NS["air"]:
+        return f"no new reading for {(t_ns - s.pitot_ns) * 1e-9:.0f} s"
+    if not airspeed_is_sensed(s, air):
+        return "the autopilot calls its sensor unhealthy"
+    return f"{air.airspeed:.0f} m/s is too low for the speed over ground"
 
 
 def _announced(before: tuple[int, ...], now: tuple[int, ...]) -> tuple[int, ...]:

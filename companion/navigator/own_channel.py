@@ -83,6 +83,8 @@ class Sensors(Struct, frozen=True):
     air: Reckoner = Reckoner()
     ground: Ground = Ground()
     sensor_ns: int | None = None  # when the autopilot last called its airspeed sensor healthy
+    unused_ns: int | None = None  # when it last stated that it does not use it
+    pitot_ns: int = -SENSOR_NS  # when the airspeed of a sensor was last used
     steady: AirData | None = None  # the last airspeed that moved the position
     foreign: LocalPosition | None = None
     imu_ns: int = -SENSOR_NS
@@ -165,12 +167,20 @@ class OwnChannel:
 
 
 def with_airspeed_sensor(s: Sensors, record: AirspeedSensor) -> Sensors:
-    """Remember whether a healthy airspeed sensor is there."""
-    return structs.replace(s, sensor_ns=record.t_ns if record.healthy else None)
+    """Remember whether a healthy airspeed sensor is there, and whether the autopilot uses it."""
+    unused_ns = s.unused_ns
+    if record.used is not None:
+        unused_ns = None if record.used else record.t_ns
+    return structs.replace(s, sensor_ns=record.t_ns if record.healthy else None, unused_ns=unused_ns)
 
 
 def airspeed_is_sensed(s: Sensors, record: AirData) -> bool:
-    """Whether the airspeed is a sensor's: without one VFR_HUD carries the estimator's own number."""
+    """Whether the airspeed is of a sensor that the autopilot uses too, as far as it states that.
+
+    Without one VFR_HUD carries the estimator's own number.
+    """
+    if s.unused_ns is not None and record.t_ns - s.unused_ns <= SENSOR_NS:
+        return False
     return _has_airspeed_sensor(s, record.t_ns) if record.sensed is None else record.sensed
 
 
@@ -188,11 +198,9 @@ def drag_is_sensed(s: Sensors, t_ns: int) -> bool:
 
 
 def is_steady(s: Sensors, t_ns: int) -> bool:
-    """Whether the airspeed is taken for steady: of a fixed wing whose sensor, if any, is silent."""
+    """Whether the airspeed is taken for steady: of a fixed wing, no sensor's having been used lately."""
     aloft = s.aloft_ns is not None and t_ns - s.aloft_ns >= STEADY_AFTER_NS
-    air = s.air.air
-    sensed = air is not None and air.sensed is True and t_ns - air.t_ns <= SENSOR_NS
-    return aloft and s.fixed_wing and not sensed and not _has_airspeed_sensor(s, t_ns)
+    return aloft and s.fixed_wing and t_ns - s.pitot_ns > SENSOR_NS
 
 
 def air_velocity(s: Sensors, record: AirData, alt: float) -> Vector2 | None:

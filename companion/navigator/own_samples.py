@@ -248,7 +248,8 @@ def air_data(state: State, record: AirData, settings: Settings) -> Step:
     state = _sheared(state, ground)
     if not ground.flying:
         return _straight_on(state, record, settings)
-    state = _airspeed_from("pitot", with_sensors(state, air_ns=record.t_ns), settings)
+    state = with_sensors(state, air_ns=record.t_ns, pitot_ns=record.t_ns)
+    state = _airspeed_from("pitot", state, settings)
     if leads:
         return _driven(with_sensors(state, steady=record), record, "air", V, settings)
     if driver(state) != "imu":

@@ -125,6 +125,7 @@ FIELDS = {
     "toml": "the whole configuration as TOML",
     "true": "whether the airspeed is true, else indicated or equivalent",
     "trust": "0 normal, 1 degraded, 2 predicting, 3 untrusted",
+    "used": "whether the autopilot uses the sensor, null if not stated",
     "unix_ns": "ns since 1970-01-01 UTC",
     "v_n": "m/s: north, east, down",
     "value": "value that was judged, in its unit",

@@ -261,7 +261,7 @@ def test_airspeed_sensor_is_healthy_only_if_present_enabled_and_healthy(
 ) -> None:
     bits = {"present": present, "enabled": enabled, "health": health}
     status = one("SYS_STATUS", **{f"onboard_control_sensors_{name}": value for name, value in bits.items()})
-    assert status == r.AirspeedSensor(RX, RX, healthy)
+    assert status == r.AirspeedSensor(RX, RX, healthy, healthy if present else None)
 
 
 @pytest.mark.parametrize(

@@ -27,7 +27,7 @@ from companion.navigator.own_error_model import (
     add_velocity,
     begin,
 )
-from companion.records import AirData, AirspeedSensor, Attitude, Gnss, Input, Solution, Source, Vehicle
+from companion.records import AirData, AirspeedSensor, Attitude, Event, Gnss, Input, Solution, Source, Vehicle
 from companion.study import outages
 from tests.recordings import recording
 
@@ -88,11 +88,9 @@ def stated(**fields: bool) -> list[Input]:
     return [*(r for r in without_airspeed() if not isinstance(r, Vehicle)), *vehicles]
 
 
-def test_it_is_used_of_a_fixed_wing_that_flies_without_a_sensor_only() -> None:
+def test_it_is_used_of_a_fixed_wing_that_flies_only() -> None:
     flying = stated(fixed_wing=True, flying=True)
     assert 20.0 < uses_air(flying, 25.0) < 25.0
-    sensors = [AirspeedSensor(t * NS, t * NS, True) for t in range(1, 40, 5)]
-    assert uses_air(flying + sensors, 40.0) == math.inf
     assert uses_air(stated(fixed_wing=True, flying=False), 40.0) == math.inf
     assert uses_air(stated(fixed_wing=True, flying=True, hovering=True), 40.0) == math.inf
     assert uses_air(stated(fixed_wing=False, flying=True), 40.0) == math.inf
@@ -117,6 +115,54 @@ def test_a_sensor_that_fails_is_replaced_and_one_that_comes_back_is_used_again()
     assert max(scales[t] for t in range(125, 140)) > 0.1
     interval = navigator._state.nominal and navigator._state.nominal.interval
     assert interval is not None and interval.airspeed == "pitot"
+
+
+def taken_from(changed: list[Input], until_s: float) -> tuple[dict[int, str], list[str]]:
+    """What the airspeed is taken from, by the second, and what is reported of it."""
+    navigator, found, texts = Navigator(CONFIG), dict[int, str](), list[str]()
+    for record in changed:
+        for out in navigator.handle(record):
+            if isinstance(out, Event) and "used" in out.text:
+                texts.append(out.text)
+        nominal = navigator._state.nominal
+        if nominal is not None and nominal.interval is not None:
+            found[record.rx_ns // NS] = nominal.interval.airspeed
+        if record.rx_ns > until_s * NS:
+            break
+    return found, texts
+
+
+def test_a_pitot_that_sticks_is_replaced_though_the_autopilot_calls_it_healthy() -> None:
+    changed: list[Input] = []
+    for record in recorded():
+        if isinstance(record, AirData):
+            changed.append(AirspeedSensor(record.t_ns, record.rx_ns, True))
+            if record.t_ns > 120 * NS:
+                record = replace(record, airspeed=12.0, sensed=True)
+        changed.append(record)
+    found, texts = taken_from(changed, 160.0)
+    assert found[119] == "pitot"
+    assert found[145] == found[159] == "steady"
+    assert [text.rsplit(" ", 2)[0] for text in texts] == ["airspeed is not used: no new reading for"]
+
+
+def test_a_sensor_that_the_autopilot_does_not_use_is_replaced() -> None:
+    """ArduPlane switches one off that fails (SYS_STATUS); its driver calls it healthy (AIRSPEED)."""
+    changed: list[Input] = []
+    for record in recorded():
+        if isinstance(record, AirData):
+            used = not 120 < record.t_ns / NS < 150
+            changed.append(AirspeedSensor(record.t_ns, record.rx_ns, used, used))
+            changed.append(AirspeedSensor(record.t_ns, record.rx_ns, True))
+            record = replace(record, airspeed=record.airspeed + 1e-3 * math.sin(record.t_ns))
+        changed.append(record)
+    found, texts = taken_from(changed, 220.0)
+    assert found[119] == found[179] == "pitot"
+    assert found[135] == found[149] == "steady"
+    assert texts == [
+        "airspeed is not used: the autopilot does not use its sensor",
+        "airspeed is used again",
+    ]
 
 
 @pytest.mark.parametrize("sensed", [True, False])

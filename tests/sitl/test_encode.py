@@ -41,7 +41,7 @@ RECORDS = {
     "global position": r.GlobalPosition(T, RX, LAT, LON, 588.59, (20.0, -3.25, 0.5), 12.345, 4.5),
     "global position without heading": r.GlobalPosition(T, RX, LAT, LON, 588.59, (20.0, -3.25, 0.5), 12.345),
     "air data": r.AirData(RX, RX, 25.5, False, 24.0, -1.5, math.radians(90.0), 600.0),
-    "airspeed sensor": r.AirspeedSensor(RX, RX, True),
+    "airspeed sensor": r.AirspeedSensor(RX, RX, True, True),
     "no airspeed sensor": r.AirspeedSensor(RX, RX, False),
     "wind": r.Wind(RX, RX, (-7.0, 3.0, 0.5)),
     "pressure": r.Pressure(T, RX, 95_552.5, 125.0, 298.15),

@@ -55,7 +55,7 @@ EVERY_KIND = [
     r.Wind(T + 16, T + 17, (3.0, -4.0, 0.1)),
     r.Pressure(T + 18, T + 19, 101325.0, None, 288.15),
     r.FilterStatus(T + 20, T + 21, 831, False, 0.05),
-    r.AirspeedSensor(T + 20, T + 21, True),
+    r.AirspeedSensor(T + 20, T + 21, True, True),
     r.Vehicle(T + 20, T + 21, multirotor=True, flying=False),
     r.GnssIntegrity(T + 20, T + 21, 0, 1, 2),
     r.SystemTime(T + 22, T + 23, 10**9),
