@@ -112,7 +112,8 @@ def smooth_flight(records: Iterable[Stamped], config: Config, check: bool = Fals
 
     With `check` every run is solved a second time as a two-point boundary problem.
 
-    A run ends where the bank begins again: reboot of an INS, change of the error model by the operator.
+    A run ends where the bank begins again or has other states: reboot of an INS, change of the error model or
+    of the feed by the operator.
 
     Raises ValueError if the navigator never had an estimate: no nominal trajectory, or no fix.
     """
@@ -482,14 +483,18 @@ class _Path:
         before = self._settings
         config = self._with_gusts(parse(record.toml, "parameters in the log"))
         self._settings, state = tuned(self._state, before, config)
-        grade = self._model.grade
-        if begins_again(before.config, config):  # the next run brings its grade
+        grade, is_wider = self._model.grade, self._settings.model.channel.n != before.model.channel.n
+        again = begins_again(before.config, config)
+        if again or is_wider:
             self.end()
             self._close()
+        if again:  # the next run brings its grade
             grade = 0
         self._model = _PlainModel(self._settings.config, grade, len(self._beacons))
         self._settings = self._settings._replace(model=self._model)
         self._state = state if state.bank is not None else self._with_beacons(state)
+        if is_wider and state.bank is not None:
+            self._open()
 
     def _with_gusts(self, config: Config) -> Config:
         """With the gusts that the flight shows."""

@@ -18,14 +18,14 @@ from msgspec import structs
 
 from companion.config import Config, ConfigError, parse
 from companion.estimate import bank as banks
-from companion.navigator import kept_state, minimax_bound
+from companion.navigator import kept_state, minimax_bound, own_channel
 from companion.navigator.changes import Changes
 from companion.navigator.fixes import is_too_soon
 from companion.navigator.hypotheses import Model
 from companion.navigator.measurements import other_receiver
 from companion.navigator.own_channel import OwnChannel
 from companion.navigator.past_states import PastStates
-from companion.navigator.progress import SILENT_INS_NS, births_due, with_births
+from companion.navigator.progress import SILENT_INS_NS, births_due, propagated, with_births
 from companion.navigator.receiver_choice import ReceiverChoice
 from companion.navigator.solution import is_bound_due, refresh_bound, resolve_pending, solve
 from companion.navigator.stale_data import REPORT_EVERY, StaleDataDetector
@@ -424,13 +424,29 @@ def tuned(state: State, before: Settings, config: Config) -> tuple[Settings, Sta
             next_ns=state.next_ns, origin=state.origin, sensors=state.sensors, level=state.level
         )
     state = structs.replace(
-        state,
+        _refitted(state, before, settings),
         guarantee=minimax_bound.tuned(state.guarantee),
         parallel=state.parallel if config.estimator == old.estimator else None,
     )
     if config.gnss.latency_s != old.gnss.latency_s and state.bank is not None:
         state = structs.replace(state, bank=other_receiver(state.bank, settings.model.channel))
     return settings, state
+
+
+def _refitted(state: State, before: Settings, settings: Settings) -> State:
+    """With or without the states of the autopilot's velocity: it is used only while we do not feed it."""
+    channel, was = settings.model.channel, before.model.channel.n
+    if state.bank is None or state.nominal is None or channel.n == was:
+        return state
+    if state.nominal.driver == "foreign":
+        state = propagated(state, before)
+        assert state.nominal is not None
+        held = own_channel.restart(state.nominal, "hold", state.nominal.point.v_n[:2])
+        state = structs.replace(state, nominal=held)
+    assert state.bank is not None
+    first = min(channel.n, was)
+    bank = banks.exchange(state.bank, slice(first, was), channel.prior()[0].diagonal()[first:])
+    return structs.replace(state, bank=bank)
 
 
 def begins_again(old: Config, new: Config) -> bool:

@@ -78,6 +78,7 @@ from companion.estimate.bank.settings import EXHAUSTIVE, Settings
 from companion.estimate.bank.state import (
     Bank,
     enlarge,
+    exchange,
     families,
     inflate,
     is_sound,
@@ -111,6 +112,7 @@ __all__ = [
     "enlarge",
     "estimate",
     "exceedance",
+    "exchange",
     "explanations",
     "false_probability",
     "false_since_first",
