@@ -54,7 +54,7 @@ class KeptRun:
             with open_regular(self.path) as file:
                 found = msgspec.msgpack.decode(file.read(), type=_File)
             links = parse(found.flown.toml, str(self.path)).link.connect
-        except (OSError, msgspec.MsgspecError, ConfigError):
+        except (OSError, msgspec.MsgspecError, UnicodeError, RecursionError, ConfigError):
             return None
         finally:
             self._remove()
@@ -66,8 +66,9 @@ class KeptRun:
         new = self.path.with_name(NAME + ".new")
         try:
             new.write_bytes(msgspec.msgpack.encode(_File(boot_id(self._boot), __version__, flown)))
-            if not self._ended:
-                os.replace(new, self.path)
+            os.replace(new, self.path)
+            if self._ended:  # meanwhile
+                self._remove()
         except OSError as error:
             return f"cannot write {self.path}: {error.strerror or error}"
         return ""

@@ -297,6 +297,7 @@ async def run(
     )
     service, has_data = None, True
     kept_run = KeptRun(Path(settings.folder))
+    flown = kept_run.take(config)
     try:
         if kept is not None:
             kept.count_start()
@@ -310,7 +311,7 @@ async def run(
             deleted=deleted,
             on_status=on_status,
             kept_run=kept_run,
-            flown=kept_run.take(config),
+            flown=flown,
         )
         service.core.report(Severity.INFO, f"companion {__version__}: log {log.path}", time.monotonic_ns())
         for address in map(Address.parse, config.link.connect):
@@ -329,7 +330,9 @@ async def run(
         with contextlib.suppress(TimeoutError):
             await asyncio.wait_for(run_in_daemon_thread(service.save_state), STOP_TIMEOUT_S)
             await asyncio.wait_for(run_in_daemon_thread(service.confirm_parameters), STOP_TIMEOUT_S)
-    except (CannotListen, ConfigError, SystemExit):
+    except (CannotListen, ConfigError, SystemExit) as error:
+        if flown is not None and isinstance(error, CannotListen):  # it was not used
+            kept_run.keep(flown)
         if kept is not None:  # neither the values' fault (`load` has checked them) nor a stop is one
             kept.withdraw_start()
         # an empty log would count in log.maximum_files

@@ -44,7 +44,21 @@ def test_a_run_that_ended_as_requested_leaves_nothing(tmp_path: Path, boot: Path
     kept.keep(FLOWN)
     kept.end()
     kept.keep(FLOWN)  # was on its way to the disk
-    assert KeptRun(tmp_path, boot).take(CONFIG) is None
+    assert [path.name for path in tmp_path.iterdir()] == ["boot_id"]
+
+
+def test_a_run_that_ends_while_its_file_is_replaced_leaves_nothing(
+    tmp_path: Path, boot: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kept, replace = KeptRun(tmp_path, boot), os.replace
+
+    def slow(new: Path, path: Path) -> None:
+        kept.end()
+        replace(new, path)
+
+    monkeypatch.setattr(os, "replace", slow)
+    assert kept.keep(FLOWN) == ""
+    assert [path.name for path in tmp_path.iterdir()] == ["boot_id"]
 
 
 def test_it_is_of_this_boot_this_version_and_these_links_only(
@@ -63,7 +77,11 @@ def test_it_is_of_this_boot_this_version_and_these_links_only(
     assert taken() is None
 
 
-@pytest.mark.parametrize("data", [b"", b"\x00", b"{}", bytes(1000)])
+@pytest.mark.parametrize(
+    "data",
+    [b"", b"\x00", b"{}", bytes(1000), b"\x83\xa4boot\xa1\xff", b"\x81\xa3abc" + b"\x91" * 100_000],
+    ids=["empty", "number", "text", "zeros", "no UTF-8", "nested"],
+)
 def test_what_is_no_such_file_is_not_used(tmp_path: Path, boot: Path, data: bytes) -> None:
     (tmp_path / kept_run.NAME).write_bytes(data)
     assert KeptRun(tmp_path, boot).take(CONFIG) is None

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from companion.config import load
+from companion.config import load, to_toml
 from companion.link import dialect, frame
 from companion.records import Event, LinkState
 from companion.runtime import service
@@ -375,6 +375,19 @@ def test_the_flight_is_kept_for_the_next_run_until_this_one_ends(tmp_path: Path,
     asyncio.run(fly())
     assert kept.path.exists()  # as after a kill: to end it is up to `run`
     assert len([event for event in events if str(kept.path) in event.text]) == 1
+
+
+def test_a_start_that_cannot_listen_leaves_the_flight_to_the_next(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.delenv("RUNTIME_DIRECTORY", raising=False)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
+        taken.bind((LOOPBACK, 0))
+        links = (f"udpin:{LOOPBACK}:{taken.getsockname()[1]}",)
+        config = load(None, {"link.connect": links, "log.folder": str(tmp_path)}, {})
+        flown = Flown(0, to_toml(config), b"state")
+        KeptRun(tmp_path).keep(flown)
+        with pytest.raises(CannotListen):
+            asyncio.run(service.run(config, lambda event: None))
+    assert KeptRun(tmp_path).take(config) == flown
 
 
 def test_two_killed_starts_set_the_parameters_aside(tmp_path: Path) -> None:
