@@ -208,10 +208,12 @@ class CompanionCore:
     def flown(self, now_ns: int) -> Flown | None:
         """Return what the next run needs to go on with this flight; None without a recent solution."""
         link = self._last_used
-        booted_ns = link.session.clock.offset(now_ns) if link else None
-        if booted_ns is None or not self.has_solution:
+        if link is None or not self.has_solution:
             return None
-        return Flown(booted_ns, to_toml(self._config), kept_state.encode(self._navigator.state))
+        system, booted_ns = link.session.autopilot, link.session.clock.offset(now_ns)
+        if system is None or booted_ns is None:
+            return None
+        return Flown(system, booted_ns, to_toml(self._config), kept_state.encode(self._navigator.state))
 
     def settle(self) -> None:
         """Run deferred work after the output has been sent; otherwise the next record runs it."""
@@ -437,7 +439,7 @@ class CompanionCore:
     def _resume(self, flown: Flown, link: Link, now_ns: int) -> None:
         """Go on with the flight of the run before, once the autopilot shows that it has not booted since."""
         booted_ns = link.session.clock.offset(now_ns)
-        if booted_ns is None:
+        if booted_ns is None or link.session.autopilot != flown.system:
             return
         self._flown = None
         if abs(booted_ns - flown.booted_ns) <= SAME_BOOT_NS:

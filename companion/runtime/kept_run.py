@@ -28,8 +28,9 @@ KEEP_AFTER_S = 30.0  # of solutions: what is wrong with a state that was gone on
 
 
 class Flown(msgspec.Struct, frozen=True):
-    """The autopilot's boot on our clock (ns), our configuration as TOML, and the navigator's state."""
+    """The autopilot's system id and boot on our clock (ns), our configuration as TOML, and the state."""
 
+    system: int
     booted_ns: int
     toml: str
     state: bytes

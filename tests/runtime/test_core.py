@@ -68,16 +68,17 @@ class Flight:
     def __init__(self, *links: str, config: Config = CONFIG) -> None:
         self.log = Log()
         self.core = CompanionCore(config, self.log, links or ("main",))
-        self.now, self.boot, self.sends_origin = START, BOOT, True
+        self.now, self.boot, self.sends_origin, self.system = START, BOOT, True, 1
         self.sent: list[tuple[int, dialect.Message]] = []
         self._sequence = 0
         self._reader = frame.Reader()
 
-    def frame(self, name: str, system: int = 1, component: int = 1, **values: object) -> bytes:
+    def frame(self, name: str, system: int | None = None, component: int = 1, **values: object) -> bytes:
         self._sequence = self._sequence + 1 & 0xFF
-        return frame.encode(dialect.new(name, **values), self._sequence, system, component)
+        message = dialect.new(name, **values)
+        return frame.encode(message, self._sequence, self.system if system is None else system, component)
 
-    def send(self, name: str, system: int = 1, component: int = 1, **values: object) -> None:
+    def send(self, name: str, system: int | None = None, component: int = 1, **values: object) -> None:
         self.receive(self.frame(name, system, component, **values))
 
     def receive(self, data: bytes) -> None:
@@ -509,12 +510,14 @@ def test_navigation_restarts_after_a_reboot() -> None:
     assert any(at > flight.now - SECOND for at in flight.times_sent("ODOMETRY"))
 
 
-def killed_and_begun_again(seconds: float, autopilot_boots: bool = False) -> tuple[Flight, Flight]:
+def killed_and_begun_again(
+    seconds: float, autopilot_boots: bool = False, system: int = 1
+) -> tuple[Flight, Flight]:
     """A flight, and the one of a second core that was given what the first one kept."""
     first, second = Flight(), Flight()
     first.fly(40)
     second.core = CompanionCore(CONFIG, second.log, ("main",), flown=first.core.flown(first.now))
-    second.now = first.now + round(seconds * SECOND)
+    second.now, second.system = first.now + round(seconds * SECOND), system
     second.boot = second.now - 20 * SECOND if autopilot_boots else first.boot
     second.fly(1)
     return first, second
@@ -533,6 +536,13 @@ def test_what_was_kept_is_not_of_use_to_an_autopilot_that_booted_since() -> None
     _, second = killed_and_begun_again(6.0, autopilot_boots=True)
     assert not second.log.of(Resumed)
     assert not [text for text in event_texts(second) if "restart" in text]
+
+
+def test_what_was_kept_is_not_of_use_beside_another_autopilot_that_booted_together() -> None:
+    """As those of a swarm do; the one that was flown may still come."""
+    _, second = killed_and_begun_again(6.0, system=2)
+    assert second.core.links["main"].session.autopilot == 2
+    assert not second.log.of(Resumed)
 
 
 def test_before_a_solution_nothing_is_kept() -> None:

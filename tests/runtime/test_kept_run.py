@@ -10,7 +10,7 @@ from companion.runtime import kept_run
 from companion.runtime.kept_run import Flown, KeptRun
 
 CONFIG = Config()
-FLOWN = Flown(-5, to_toml(CONFIG), bytes(range(256)))
+FLOWN = Flown(1, -5, to_toml(CONFIG), bytes(range(256)))
 
 
 @pytest.fixture(autouse=True)

@@ -357,7 +357,7 @@ def test_the_flight_is_kept_for_the_next_run_until_this_one_ends(tmp_path: Path,
     monkeypatch.setattr(service, "KEEP_AFTER_S", 0.05)
     monkeypatch.delenv("RUNTIME_DIRECTORY", raising=False)
     folder = tmp_path / "kept"
-    kept, flown, events = KeptRun(folder), Flown(0, "", b"state"), list[Event]()
+    kept, flown, events = KeptRun(folder), Flown(1, 0, "", b"state"), list[Event]()
 
     async def fly() -> None:
         with log_in(tmp_path) as log:
@@ -383,7 +383,7 @@ def test_a_start_that_cannot_listen_leaves_the_flight_to_the_next(tmp_path: Path
         taken.bind((LOOPBACK, 0))
         links = (f"udpin:{LOOPBACK}:{taken.getsockname()[1]}",)
         config = load(None, {"link.connect": links, "log.folder": str(tmp_path)}, {})
-        flown = Flown(0, to_toml(config), b"state")
+        flown = Flown(1, 0, to_toml(config), b"state")
         KeptRun(tmp_path).keep(flown)
         with pytest.raises(CannotListen):
             asyncio.run(service.run(config, lambda event: None))
