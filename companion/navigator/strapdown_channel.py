@@ -28,6 +28,7 @@ LEAST = 0.7  # of which so much must come: streams are asked for again below it
 FEW = 5  # samples that show no rate yet
 SLOWEST_S = 2.0  # a longer interval is a silence and shows no rate either
 STALE_S = 1.0  # an attitude older than this is not carried on by gyros
+GAP_S = 0.3  # between samples of the IMU: within a longer gap its rates are not known
 F_MAX = 0.995 * 16.0 * G0  # [m/s^2] the range of common accelerometers
 W_MAX = 0.995 * math.radians(2000.0)  # [rad/s] and gyros
 VERTICAL = 0.5  # of gravity, by which the vertical force may differ from it
@@ -65,13 +66,15 @@ class Pace(NamedTuple):
 
 
 class Strap(Struct, frozen=True):
-    """What is needed to go on: last sample, attitude at its time, rates, vertical specific force averaged
-    (m/s^2, down); how fast the tilt is corrected against the gyros, about north and east (rad/s), and when
-    that was last too fast; why the last sample is of no use.
+    """What is needed to go on: last sample; attitude, and the time that it is of; when samples came again
+    after a gap; rates, vertical specific force averaged (m/s^2, down); how fast the tilt is corrected against
+    the gyros, about north and east (rad/s), when that was last too fast; why the last sample is of no use.
     """
 
     imu: Imu | None = None
     C_nb: Floats | None = None
+    C_ns: int = 0
+    gap_ns: int = 0
     imu_pace: Pace = Pace()
     attitude_pace: Pace = Pace()
     down: float = -G0
@@ -82,12 +85,11 @@ class Strap(Struct, frozen=True):
 
 def sense(s: Strap, record: Attitude) -> Strap:
     """With one more attitude."""
-    C_nb = attitude_matrix(record)
-    if s.imu is not None:
-        dt = (s.imu.t_ns - record.t_ns) * 1e-9
-        C_nb = C_nb @ rotation_matrix(np.array(s.imu.w_b) * max(-STALE_S, min(dt, STALE_S)))
+    C_nb, C_ns = attitude_matrix(record), record.t_ns
+    if s.imu is not None and (dt := (s.imu.t_ns - record.t_ns) * 1e-9) >= -GAP_S:
+        C_nb, C_ns = C_nb @ rotation_matrix(np.array(s.imu.w_b) * min(dt, STALE_S)), s.imu.t_ns
         s = _judged(s, C_nb, record.t_ns)
-    return structs.replace(s, C_nb=C_nb, attitude_pace=s.attitude_pace.with_one(record.t_ns))
+    return structs.replace(s, C_nb=C_nb, C_ns=C_ns, attitude_pace=s.attitude_pace.with_one(record.t_ns))
 
 
 def _judged(s: Strap, C_nb: Floats, t_ns: int) -> Strap:
@@ -95,11 +97,10 @@ def _judged(s: Strap, C_nb: Floats, t_ns: int) -> Strap:
 
     Only the tilt is judged: a heading that steps is modelled by the bank.
     """
-    assert s.imu is not None
-    dt, silent_s = (t_ns - s.attitude_pace.t_ns) * 1e-9, (t_ns - s.imu.t_ns) * 1e-9
-    if s.C_nb is None or dt <= 0.0:
+    dt = (t_ns - s.attitude_pace.t_ns) * 1e-9
+    if s.C_nb is None or dt <= 0.0 or s.gap_ns > s.attitude_pace.t_ns:
         return s
-    if max(dt, silent_s) > STALE_S:
+    if dt > STALE_S:
         return structs.replace(s, tilting=(0.0, 0.0))
     turned = C_nb @ s.C_nb.T
     gain = (1.0 - math.exp(-dt / TILTING_S)) / dt
@@ -115,12 +116,15 @@ def receive(s: Strap, record: Imu) -> Strap:
     before = s.imu or record
     dt = (record.t_ns - before.t_ns) * 1e-9
     s = structs.replace(s, imu_pace=s.imu_pace.with_one(record.t_ns))
+    if dt > GAP_S:
+        s, before = structs.replace(s, gap_ns=record.t_ns), record
     if why := _senseless(record):
         return structs.replace(s, why=why)
     if s.C_nb is None:
         return structs.replace(s, why="no attitude arrives")
-    C_nb = s.C_nb @ rotation_matrix(0.5 * (np.array(before.w_b) + record.w_b) * min(dt, STALE_S))
-    s = structs.replace(s, imu=record, C_nb=C_nb)
+    since = min((record.t_ns - s.C_ns) * 1e-9, STALE_S)
+    C_nb = s.C_nb @ rotation_matrix(0.5 * (np.array(before.w_b) + record.w_b) * since)
+    s = structs.replace(s, imu=record, C_nb=C_nb, C_ns=record.t_ns)
     gain = min(dt / VERTICAL_S, 0.1)
     s = structs.replace(s, down=s.down + gain * (float(C_nb[2] @ record.f_b) - s.down))
     return structs.replace(s, why=_unfit(s))

@@ -589,6 +589,29 @@ def test_an_attitude_is_not_used_whose_tilt_turns_against_the_gyros(
     assert max(unused) < 155.0
 
 
+@pytest.mark.parametrize("gap_s", [0.5, 0.9, 1.3, 3.0])
+@pytest.mark.parametrize("attitude_too", [False, True])
+def test_a_roll_that_ends_within_a_gap_of_the_imu_is_no_wrong_attitude(
+    gap_s: float, attitude_too: bool
+) -> None:
+    """The rates before the gap are not those within: an attitude is not carried by them."""
+    strap, roll = strapdown_channel.Strap(), 0.0
+    for k in range(2000):
+        t_ns, t = k * NS // 100, 0.01 * k
+        rate = math.radians(90.0) if 10.0 <= t < 10.7 else 0.0
+        roll += 0.01 * rate
+        is_lost = 10.5 < t < 10.5 + gap_s
+        attitude = Attitude(t_ns, t_ns, roll, 0.0, 0.0)
+        if k % 10 == 0 and not (is_lost and attitude_too):
+            strap = strapdown_channel.sense(strap, attitude)
+        if k % 5 == 2 and not is_lost:
+            x, y, z = strapdown_channel.attitude_matrix(attitude).T @ (0.0, 0.0, -9.80665)
+            strap = strapdown_channel.receive(strap, Imu(t_ns, t_ns, 0, (x, y, z), (rate, 0.0, 0.0)))
+            if t > 1.0:
+                assert not strap.why
+                assert np.abs(strapdown_channel.acceleration(strap)).max() < 0.1
+
+
 def test_only_the_imu_configured_is_heard() -> None:
     flight = circles()
     records = lost(flight)
