@@ -54,11 +54,12 @@ REPORT_EVERY = SECOND_NS
 
 
 class Run(NamedTuple):
-    """Equal records of one source: their content, first and last time, and how often the time changed."""
+    """Equal records of one source: their content, their last time, and how often the time changed."""
 
     content: tuple[Any, ...]
     stamp: int
     since_ns: int  # arrival of the first
+    stamped_ns: int  # arrival of the first under the last time
     times: int = 1  # under times of their own
     reported_ns: int | None = None
 
@@ -139,15 +140,17 @@ class StaleDataDetector:
         stamp, same = (record.stamp_us, 0) if isinstance(record, Gnss) else (record.t_ns, SAME_NS)
         run = self._runs.get(source)
         if run is None or content != run.content:
-            self._runs[source] = Run(content, stamp, record.rx_ns)
+            self._runs[source] = Run(content, stamp, record.rx_ns, record.rx_ns)
             return None
-        lasted_s = (record.rx_ns - run.since_ns) * 1e-9
         if abs(stamp - run.stamp) <= same:  # no news; but a sensor that is well would have some by now
             claimed = not isinstance(record, Gnss) or record.has_3d_fix
+            lasted_s = (record.rx_ns - run.stamped_ns) * 1e-9
             if claimed and lasted_s > PATIENCE_S:
                 return self._rejection(record, source, run, lasted_s, "its time stands still")
             return None
-        run = self._runs[source] = run._replace(stamp=stamp, times=run.times + 1)
+        run = run._replace(stamp=stamp, stamped_ns=record.rx_ns, times=run.times + 1)
+        self._runs[source] = run
+        lasted_s = (record.rx_ns - run.since_ns) * 1e-9
         if law.stale(record, run.times, lasted_s):
             return self._rejection(
                 record, source, run, lasted_s, "it is frozen: old numbers under a new time"

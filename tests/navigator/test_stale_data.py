@@ -101,6 +101,12 @@ def test_a_fix_repeated_at_the_streams_rate_is_silent_and_one_for_ever_is_told()
     assert set(verdicts(lost)) == {"used"}  # without a fix the last numbers may stay
 
 
+def test_a_parked_receiver_whose_fixes_are_repeated_is_well() -> None:
+    """Its numbers stay, as a simulator's do; its time goes on, on a stream of twice its rate."""
+    parked = [gnss(0.1 * i, 1.0, stamp=0.2 * (i // 2), v_n=PARKED) for i in range(100)]
+    assert set(verdicts(parked)) == {"used"}
+
+
 def test_a_fix_frozen_under_new_stamps_is_told_at_once() -> None:
     found = verdicts([gnss(0.2 * i, 1.0) for i in range(10)])
     assert found[0] == "used" and "frozen" in found[1] and "used" not in found[1:]
