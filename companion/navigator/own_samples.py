@@ -13,6 +13,7 @@ from msgspec import structs
 from companion.estimate import bank as banks
 from companion.navigator import (
     air_data_channel,
+    height_error,
     measurements,
     own_channel,
     own_error_model,
@@ -137,7 +138,12 @@ def pressure(state: State, record: Pressure, settings: Settings) -> Step:
         state, out = _straight_on(state, record, settings)
         return state, [rejection, *out]
     air = air_data_channel.sense(s.air, record)
-    return _straight_on(with_sensors(state, air=air), record, settings)
+    state = with_sensors(state, air=air)
+    if s.air.static is None and state.nominal is not None:
+        nominal = _at_height(state.nominal, state.sensors)
+        up = nominal.point.position.alt - state.nominal.point.position.alt
+        state = structs.replace(state, nominal=nominal, level=height_error.stepped(state.level, up))
+    return _straight_on(state, record, settings)
 
 
 def _straight_on(state: State, record: Stamped, settings: Settings) -> Step:

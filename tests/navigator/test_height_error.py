@@ -178,6 +178,30 @@ def flown_level(
     return off, rejections
 
 
+def test_the_first_pressure_after_the_first_fix_moves_no_altitude_that_is_sent() -> None:
+    """A telemetry log began with a fix; the pressure, of a height 130 m lower, came 0.15 s later."""
+    navigator, alts, rejections = Navigator(load(environment={})), list[float](), list[Rejection]()
+    for k in range(20 * 20):
+        t_ns = k * NS // 20
+        records: list[object] = [
+            Attitude(t_ns, t_ns, 1e-6 * k, 0.0, 0.0),
+            Imu(t_ns, t_ns, 0, (1e-6 * k, 0.0, -G0), (1e-6 * k, 0.0, 0.0)),
+        ]
+        if k % 4 == 0:
+            place = displace(*START, 0.75 * k, 0.0, 0.0)._replace(alt=START.alt + 130.0)
+            records.append(Gnss(t_ns, t_ns, 0, t_ns // 1000, 3, *place, 1.5, 3.0, v_n=(15.0, 0.0, 0.0)))
+        if k >= 3:
+            static = P0 * (1.0 - (START.alt + 1e-3 * (k % 7)) * LAPSE / T0) ** (1.0 / HEIGHT_EXPONENT)
+            records.append(Pressure(t_ns, t_ns, static))
+        for out in (out for record in records for out in navigator.handle(record)):
+            if isinstance(out, Solution):
+                alts.append(out.alt_msl)
+            elif isinstance(out, Rejection):
+                rejections.append(out)
+    assert rejections == []
+    assert alts == pytest.approx([START.alt + 130.0] * len(alts), abs=1.0)
+
+
 def climbing(climb: float, pressure_every: int, seconds: int = 32) -> list[Solution]:
     """Climb north at 15 m/s by an IMU at 20 Hz, a pressure every so many samples, and GNSS between them."""
     navigator, records = Navigator(load(environment={})), list[object]()
