@@ -101,6 +101,8 @@ def vehicle(state: State, record: Vehicle, settings: Settings) -> Step:
 def attitude(state: State, record: Attitude, settings: Settings) -> Step:
     """Remember an attitude."""
     s = state.sensors
+    if record.t_ns == s.strap.attitude_pace.t_ns:  # it came twice
+        return state, []
     strap, air = strapdown_channel.sense(s.strap, record), air_data_channel.sense(s.air, record)
     state = with_sensors(state, strap=strap, air=air)
     if state.nominal is not None and own_channel.is_steady(state.sensors, record.t_ns):
@@ -156,9 +158,9 @@ def _straight_on(state: State, record: Stamped, settings: Settings) -> Step:
 def imu(state: State, record: Imu, settings: Settings) -> Step:
     """Move the nominal trajectory by the specific force, in the level frame."""
     config = settings.config
-    if record.source != config.strapdown.imu:
-        return state, []
     s = state.sensors
+    if record.source != config.strapdown.imu or record.t_ns == s.strap.imu_pace.t_ns:  # it came twice
+        return state, []
     strap = strapdown_channel.receive(s.strap, record)
     if strap.why:
         return _straight_on(with_sensors(state, strap=strap), record, settings)
@@ -234,6 +236,8 @@ def _airspeed_from(airspeed: Airspeed, state: State, settings: Settings) -> Stat
 def air_data(state: State, record: AirData, settings: Settings) -> Step:
     """Use airspeed, as driver or as measurement; on the ground it only shows whether the aircraft flies."""
     s = state.sensors
+    if s.air.air is not None and record.t_ns == s.air.air.t_ns:  # it came twice
+        return state, []
     state = with_sensors(state, air=air_data_channel.sense(s.air, record))
     nominal = state.nominal
     if nominal is None or not settings.config.uses("air_data"):

@@ -47,7 +47,9 @@ def test_samples_before_and_behind_a_step_are_not(degrees: float, before: int) -
     assert not sums_of(*before * [0.0], *(10 - before) * [degrees]).is_one_way
 
 
-def flown(*switched: tuple[float, Config], lost_s: float = math.inf, kinds: Any = Input) -> list[Solution]:
+def flown(
+    *switched: tuple[float, Config], lost_s: float = math.inf, kinds: Any = Input, copies: int = 1
+) -> list[Solution]:
     """Solutions of a flight; each switch is the time (s) from which another configuration is in force."""
     navigator, found, waiting = Navigator(switched[0][1]), list[Solution](), list(switched)
     records = [r for r in recording("plane_take_off") if not isinstance(r, Truth) and isinstance(r, kinds)]
@@ -56,7 +58,7 @@ def flown(*switched: tuple[float, Config], lost_s: float = math.inf, kinds: Any 
         if waiting and seconds >= waiting[0][0]:
             navigator.handle(Tuning(record.t_ns, record.rx_ns, to_toml(waiting.pop(0)[1])))
         if seconds < lost_s or not isinstance(record, Gnss | RsbnFix):
-            outputs = navigator.handle(record)
+            outputs = [out for _ in range(copies) for out in navigator.handle(record)]
             assert not [out for out in outputs if isinstance(out, Rejection) and "computed" in out.reason]
             found += [out for out in outputs if isinstance(out, Solution)]
     return found
@@ -88,3 +90,9 @@ def test_beyond_the_velocity_of_the_autopilot_the_last_one_is_held_with_its_erro
     before = [out for out in fed if out.sigma_velocity < 2.0]
     assert fed[-1].t_ns - before[-1].t_ns > 5e9
     assert fed[-1].sigma_velocity > 4.0
+
+
+def test_records_that_a_router_sends_twice_count_once() -> None:
+    """The scatter of its samples is the noise of the IMU, and their rate shows whether it is fast enough."""
+    once, twice = (flown((0.0, FED), lost_s=40.0, copies=copies) for copies in (1, 2))
+    assert once == twice
