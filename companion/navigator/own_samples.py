@@ -236,7 +236,8 @@ def _airspeed_from(airspeed: Airspeed, state: State, settings: Settings) -> Stat
 def air_data(state: State, record: AirData, settings: Settings) -> Step:
     """Use airspeed, as driver or as measurement; on the ground it only shows whether the aircraft flies."""
     s = state.sensors
-    if s.air.air is not None and record.t_ns == s.air.air.t_ns:  # it came twice
+    last = s.air.air
+    if last is not None and (record.t_ns, record.airspeed) == (last.t_ns, last.airspeed):  # it came twice
         return state, []
     state = with_sensors(state, air=air_data_channel.sense(s.air, record))
     nominal = state.nominal
