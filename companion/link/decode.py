@@ -389,13 +389,9 @@ def _sys_status(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
 
 @_of("HEARTBEAT")
 def _heartbeat(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
-    """Decode the kind of vehicle. ArduCopter and ArduPlane are active in the air only, others once armed.
-
-    Of a VTOL plane nothing follows from it: it may hover.
-    """
+    """Decode the kind of vehicle. ArduCopter is active in the air only, others once they are armed."""
     multirotor = m.type in MULTIROTORS
-    states = (multirotor or m.type == mavlink.MAV_TYPE_FIXED_WING) and sender.autopilot == "ardupilot"
-    stated = _FLYING.get(m.system_status) if states else None
+    stated = _FLYING.get(m.system_status) if multirotor and sender.autopilot == "ardupilot" else None
     return (Vehicle(_unstamped(rx, sender), rx, multirotor, stated, m.type in FIXED_WINGS),)
 
 

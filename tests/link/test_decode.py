@@ -318,9 +318,7 @@ def test_truth_uses_the_integer_position() -> None:
         ("ardupilot", "QUADROTOR", "BOOT", True, False, False),
         ("ardupilot", "OCTOROTOR", "CRITICAL", True, None, False),  # a failsafe, on the ground or not
         ("px4", "QUADROTOR", "ACTIVE", True, None, False),  # armed, perhaps on the ground
-        ("ardupilot", "FIXED_WING", "ACTIVE", False, True, True),
-        ("ardupilot", "FIXED_WING", "STANDBY", False, False, True),
-        ("ardupilot", "VTOL_QUADROTOR", "ACTIVE", False, None, True),  # it may hover
+        ("ardupilot", "FIXED_WING", "ACTIVE", False, None, True),
         ("ardupilot", "HELICOPTER", "ACTIVE", False, None, False),
         ("px4", "VTOL_QUADROTOR", "ACTIVE", False, None, True),
     ],
