@@ -141,7 +141,7 @@ def pressure(state: State, record: Pressure, settings: Settings) -> Step:
         return state, [rejection, *out]
     air = air_data_channel.sense(s.air, record)
     state = with_sensors(state, air=air)
-    if s.air.static is None and state.nominal is not None:
+    if s.air.static is None and state.nominal is not None and state.level.t_ns is not None:
         nominal = _at_height(state.nominal, state.sensors)
         up = nominal.point.position.alt - state.nominal.point.position.alt
         state = structs.replace(state, nominal=nominal, level=height_error.stepped(state.level, up))
