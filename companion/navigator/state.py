@@ -161,11 +161,18 @@ def gnss_climb(state: State, t_ns: int) -> float:
 
 
 def has_witness(state: State, settings: Settings) -> bool:
-    """Whether a beacon was received within its timeout, or the receiver reports jamming or spoofing."""
+    """Whether a beacon was received within its timeout, or the receiver reports jamming or spoofing.
+
+    A beacon is none beside a steady airspeed alone, which is off by the whole change of the speed: what it
+    contradicts is not GNSS.
+    """
     if state.bank is None:
         return False
     if is_jammed(state):
         return True
+    interval = state.nominal.interval if state.nominal else None
+    if interval is not None and interval.by == "air" and interval.airspeed == "steady":
+        return False
     now = state.nominal.t_ns if state.nominal else 0
     timeout = round(1e9 * settings.config.rsbn.timeout_s)
     return any(now - beacon.last_ns < timeout for beacon in state.beacons)

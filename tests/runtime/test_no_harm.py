@@ -4,6 +4,7 @@ Without the companion the aircraft kept within 2 m. An older companion excluded 
 on the ground, the other 694 m off.
 """
 
+import lzma
 import math
 from collections.abc import Callable
 from pathlib import Path
@@ -12,8 +13,11 @@ import msgspec
 import pytest
 
 from companion.config import load
-from companion.navigator import Navigator
-from companion.records import Attitude, Gnss, Imu, Input, Rejection, Solution
+from companion.importers import tlog
+from companion.importers.sources import TlogSource
+from companion.navigator import INPUTS_USED, Navigator
+from companion.records import Attitude, Gnss, Imu, Input, Rejection, Solution, Vehicle
+from companion.units import SECOND_NS
 from sitl import harm_recordings
 from tests.recordings import recording
 
@@ -44,6 +48,22 @@ def test_healthy_gnss_is_kept_and_leads(name: str, monkeypatch: pytest.MonkeyPat
     assert result.refused_s <= harm_recordings.MOST_REFUSED_S
     assert result.truth_m is not None and result.truth_m < 3.0
     assert result.corrected_m is not None and result.corrected_m < 3.0
+
+
+def test_a_speed_that_changes_leaves_a_healthy_gnss_beyond_doubt_where_it_is_taken_for_steady() -> None:
+    """No airspeed sensor, IMU at 1 Hz, one beacon, 13 to 37 m/s over ground within a minute.
+
+    Where it is stated to fly, GNSS was excluded for two minutes, 118 m off.
+    """
+    data = lzma.decompress((DATA / "no_airspeed_sensor_cut.tlog.xz").read_bytes())
+    records = TlogSource(tlog.Tlog(data))
+    inputs = [r for r in records if isinstance(r, INPUTS_USED) and not isinstance(r, Vehicle)]
+    aloft = range(inputs[0].rx_ns + 30 * SECOND_NS, inputs[-1].rx_ns, SECOND_NS)
+    inputs += [Vehicle(t, t, fixed_wing=True, flying=True) for t in aloft]
+    apart, doubt = flown(sorted(inputs, key=lambda r: r.rx_ns))
+    assert len(apart) > 1500
+    assert sum(a > 10.0 for a in apart) < 0.01 * len(apart)
+    assert doubt < 0.05
 
 
 def heading_off(degrees: float):
