@@ -10,7 +10,7 @@ import math
 
 from companion.navigator.hypotheses import AIRSPEED, GNSS, VELOCITY
 from companion.navigator.minimax_bound import Guarantee
-from companion.navigator.own_channel import SENSOR_NS, SILENT_NS, Sensors, airspeed_is_sensed
+from companion.navigator.own_channel import SILENT_NS, Sensors, airspeed_is_sensed, is_switched_off
 from companion.navigator.scatter import Scatter
 from companion.navigator.state import EXCLUDED, FIXES, SUSPECT, Settings, State, source_name, sources
 from companion.records import Event, Mode, Output, Severity, Solution, Source, Stamped
@@ -111,7 +111,7 @@ class Changes:
 
 def _why_no_airspeed(s: Sensors, t_ns: int) -> str:
     air = s.air.air
-    if s.unused_ns is not None and t_ns - s.unused_ns <= SENSOR_NS:
+    if is_switched_off(s, t_ns):
         return "the autopilot does not use its sensor"
     if air is None or t_ns - air.t_ns > SILENT_NS["air"]:
         return f"no new reading for {(t_ns - s.pitot_ns) * 1e-9:.0f} s"

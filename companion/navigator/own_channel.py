@@ -179,9 +179,14 @@ def airspeed_is_sensed(s: Sensors, record: AirData) -> bool:
 
     Without one VFR_HUD carries the estimator's own number.
     """
-    if s.unused_ns is not None and record.t_ns - s.unused_ns <= SENSOR_NS:
+    if is_switched_off(s, record.t_ns):
         return False
     return _has_airspeed_sensor(s, record.t_ns) if record.sensed is None else record.sensed
+
+
+def is_switched_off(s: Sensors, t_ns: int) -> bool:
+    """Whether the autopilot states that it does not use the airspeed sensor that it has."""
+    return s.unused_ns is not None and t_ns - s.unused_ns <= SENSOR_NS
 
 
 def _has_airspeed_sensor(s: Sensors, t_ns: int) -> bool:
@@ -191,10 +196,11 @@ def _has_airspeed_sensor(s: Sensors, t_ns: int) -> bool:
 def drag_is_sensed(s: Sensors, t_ns: int) -> bool:
     """Whether the accelerometers show the velocity through the air: of a multirotor, in flight.
 
-    One with an airspeed sensor has that instead.
+    One with an airspeed sensor has that instead, unless the autopilot does not use it.
     """
     air = s.air.air
-    return s.multirotor and not _has_airspeed_sensor(s, t_ns) and not (air is not None and air.sensed)
+    has_sensor = _has_airspeed_sensor(s, t_ns) or (air is not None and air.sensed is True)
+    return s.multirotor and (not has_sensor or is_switched_off(s, t_ns))
 
 
 def is_steady(s: Sensors, t_ns: int) -> bool:

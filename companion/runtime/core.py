@@ -514,7 +514,7 @@ class CompanionCore:
         self._log.record(record, channel)
         if isinstance(record, Event):
             self._events.append(record)
-            # one that nobody receives would use up the rate of those that follow
+            # without a receiver it would use up the rate of those that follow
             if self.leading_link is not None or any(link.stations for link in self.links.values()):
                 text = self._without_link_names(printable(record.text))
                 self._services.report(msgspec.structs.replace(record, text=text), record.rx_ns)

@@ -227,6 +227,21 @@ def test_a_multirotor_with_an_airspeed_sensor_uses_that_though_nothing_states_th
     assert used
 
 
+def test_a_multirotor_whose_autopilot_does_not_use_its_airspeed_sensor_uses_its_drag() -> None:
+    """Neither was used: the airspeed because of the autopilot, the drag because of the sensor."""
+    added: list[Input] = []
+    for t in range(80, 400):
+        t_ns = t * NS // 5
+        added += [AirspeedSensor(t_ns, t_ns, False, False), AirspeedSensor(t_ns, t_ns, True)]
+        added.append(AirData(t_ns, t_ns, 12.0 + 0.1 * (t % 7), sensed=True))
+    navigator, last = Navigator(DEFAULT), None
+    for record in sorted((*recorded()[:1500], *added), key=lambda record: record.t_ns):
+        last = next((o for o in navigator.handle(record) if isinstance(o, Solution)), last)
+    assert last is not None and last.sources & Basis.AIR_DATA
+    nominal = navigator._state.nominal
+    assert nominal is not None and nominal.interval is not None and nominal.interval.airspeed == "drag"
+
+
 @pytest.mark.parametrize(("height", "begins_s"), [(2.0, 30.0), (20.0, 20.0)])
 def test_while_it_takes_off_it_is_not_used(height: float, begins_s: float) -> None:
     """The ground pushes too: up to 5 m above it, or for ten seconds."""
