@@ -101,8 +101,6 @@ def vehicle(state: State, record: Vehicle, settings: Settings) -> Step:
 def attitude(state: State, record: Attitude, settings: Settings) -> Step:
     """Remember an attitude."""
     s = state.sensors
-    if record.t_ns == s.strap.attitude_pace.t_ns:  # it came twice
-        return state, []
     strap, air = strapdown_channel.sense(s.strap, record), air_data_channel.sense(s.air, record)
     state = with_sensors(state, strap=strap, air=air)
     if state.nominal is not None and own_channel.is_steady(state.sensors, record.t_ns):
@@ -159,7 +157,7 @@ def imu(state: State, record: Imu, settings: Settings) -> Step:
     """Move the nominal trajectory by the specific force, in the level frame."""
     config = settings.config
     s = state.sensors
-    if record.source != config.strapdown.imu or record.t_ns == s.strap.imu_pace.t_ns:  # it came twice
+    if record.source != config.strapdown.imu:
         return state, []
     strap = strapdown_channel.receive(s.strap, record)
     if strap.why:
@@ -236,9 +234,6 @@ def _airspeed_from(airspeed: Airspeed, state: State, settings: Settings) -> Stat
 def air_data(state: State, record: AirData, settings: Settings) -> Step:
     """Use airspeed, as driver or as measurement; on the ground it only shows whether the aircraft flies."""
     s = state.sensors
-    last = s.air.air
-    if last is not None and (record.t_ns, record.airspeed) == (last.t_ns, last.airspeed):  # it came twice
-        return state, []
     state = with_sensors(state, air=air_data_channel.sense(s.air, record))
     nominal = state.nominal
     if nominal is None or not settings.config.uses("air_data"):

@@ -3,11 +3,12 @@
     outputs = detector.judge(record)      # None: use the record; else drop it and return these outputs
 
 Streams repeat: an autopilot sends its last fix at the stream's rate, a router sends every frame twice, a
-receiver that hangs goes on with its last numbers under new times. A repeat with the old time is dropped,
-and reported only if it lasts. The same numbers under a new time are another matter. No two readings
-of a noisy sensor are alike to the last bit, and what moves is not where it was: a position that stands still
-at a speed is false at once, an attitude or an airspeed after seconds, a beacon's answer (rounded to 10 m and
-0.01 degrees: two running are alike once in 1500) and a sample of an IMU that turns at the third of a kind.
+receiver that hangs goes on with its last numbers under new times. A repeat with the old time is dropped, and
+reported only if it lasts; one of GNSS is passed on, for it shows that the receiver is there. The same numbers
+under a new time are another matter. No two readings of a noisy sensor are alike to the last bit, and what
+moves is not where it was: a position that stands still at a speed is false at once, an attitude or an
+airspeed after seconds, a beacon's answer (rounded to 10 m and 0.01 degrees: two running are alike once in
+1500) and a sample of an IMU that turns at the third of a kind.
 
 It knows no other record than the one before of the same source, and no clock but their times.
 """
@@ -147,7 +148,7 @@ class StaleDataDetector:
             lasted_s = (record.rx_ns - run.stamped_ns) * 1e-9
             if claimed and lasted_s > PATIENCE_S:
                 return self._rejection(record, source, run, lasted_s, "its time stands still")
-            return None
+            return None if isinstance(record, Gnss) else []
         run = run._replace(stamp=stamp, stamped_ns=record.rx_ns, times=run.times + 1)
         self._runs[source] = run
         lasted_s = (record.rx_ns - run.since_ns) * 1e-9
