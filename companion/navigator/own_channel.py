@@ -199,8 +199,8 @@ def drag_is_sensed(s: Sensors, t_ns: int) -> bool:
     One with an airspeed sensor has that instead, unless the autopilot does not use it.
     """
     air = s.air.air
-    has_sensor = _has_airspeed_sensor(s, t_ns) or (air is not None and air.sensed is True)
-    return s.multirotor and (not has_sensor or is_switched_off(s, t_ns))
+    senses = air is not None and air.sensed is True and t_ns - air.t_ns <= SENSOR_NS
+    return s.multirotor and (not (senses or _has_airspeed_sensor(s, t_ns)) or is_switched_off(s, t_ns))
 
 
 def is_steady(s: Sensors, t_ns: int) -> bool:

@@ -205,7 +205,7 @@ def test_the_scatter_of_a_mean_is_that_of_its_samples(noise: float, speed: float
         (Vehicle(15 * NS, 15 * NS, multirotor=False),),
         (Vehicle(15 * NS, 15 * NS, flying=False),),
         tuple(AirspeedSensor(t * NS, t * NS, True) for t in range(15, 215, 5)),
-        (AirData(15 * NS, 15 * NS, 3.0, sensed=True),),
+        tuple(AirData(t * NS, t * NS, 3.0 + 0.1 * (t % 7), sensed=True) for t in range(15, 215, 5)),
     ],
 )
 def test_it_is_used_of_flying_multirotors_without_an_airspeed_sensor_only(added: tuple[Input, ...]) -> None:
@@ -213,6 +213,18 @@ def test_it_is_used_of_flying_multirotors_without_an_airspeed_sensor_only(added:
     for record in sorted((*recorded()[:1500], *added), key=lambda record: record.t_ns):
         last = next((o for o in navigator.handle(record) if isinstance(o, Solution)), last)
     assert last is not None and not last.sources & Basis.AIR_DATA
+
+
+def test_it_is_used_again_once_the_airspeed_sensor_is_silent() -> None:
+    navigator, used_ns = Navigator(DEFAULT), list[int]()
+    airspeed = [AirData(t * NS // 5, t * NS // 5, 3.0 + 0.1 * (t % 7), sensed=True) for t in range(75, 125)]
+    for record in sorted((*recorded()[:2000], *airspeed), key=lambda record: record.t_ns):
+        for out in navigator.handle(record):
+            if isinstance(out, Solution) and out.sources & Basis.AIR_DATA:
+                used_ns.append(out.t_ns)
+    nominal = navigator._state.nominal
+    assert nominal is not None and nominal.interval is not None and nominal.interval.airspeed == "drag"
+    assert used_ns and min(used_ns) > airspeed[-1].t_ns + 10 * NS
 
 
 def test_a_multirotor_with_an_airspeed_sensor_uses_that_though_nothing_states_that_it_flies() -> None:
