@@ -420,9 +420,7 @@ def tuned(state: State, before: Settings, config: Config) -> tuple[Settings, Sta
     """
     settings, old = Settings.of(config), before.config
     if begins_again(old, config):
-        return settings, State(
-            next_ns=state.next_ns, origin=state.origin, sensors=state.sensors, level=state.level
-        )
+        return settings, afresh(state)
     state = structs.replace(
         _refitted(state, before, settings),
         guarantee=minimax_bound.tuned(state.guarantee),
@@ -431,6 +429,11 @@ def tuned(state: State, before: Settings, config: Config) -> tuple[Settings, Sta
     if config.gnss.latency_s != old.gnss.latency_s and state.bank is not None:
         state = structs.replace(state, bank=other_receiver(state.bank, settings.model.channel))
     return settings, state
+
+
+def afresh(state: State) -> State:
+    """What is left of a state where the estimate begins again."""
+    return State(next_ns=state.next_ns, origin=state.origin, sensors=state.sensors, level=state.level)
 
 
 def _refitted(state: State, before: Settings, settings: Settings) -> State:
@@ -466,17 +469,7 @@ def guarded(
     if after.bank is not None and after.bank is not state.bank and not banks.is_sound(after.bank):
         why = "covariance not positive definite: error state reset"
         outputs = [*outputs, Reset(record.t_ns, record.rx_ns, "bank", why)]
-        after = structs.replace(
-            after,
-            bank=None,
-            nominal=None,
-            beacons=(),
-            false=(),
-            reported=(),
-            certain_ns=(),
-            parallel=None,
-            fixed=False,
-        )
+        after = afresh(after)
     return after, outputs
 
 

@@ -932,3 +932,7 @@ def test_a_state_gone_wrong_is_begun_anew_and_said(monkeypatch: pytest.MonkeyPat
     assert {out.what for out in resets} == {"bank"}
     last_moment, last = [(m, out) for m, out in outs if isinstance(out, Solution)][-1]
     assert distance(last, last_moment.truth) < 10.0
+    solutions = [out for _, out in outs if isinstance(out, Solution)]
+    again = next(out for out in solutions if out.t_ns > resets[-1].t_ns)
+    assert again.t_ns - resets[-1].t_ns < 0.4 * NS  # by the next fix, however soon after the last
+    assert again.protection == pytest.approx(solutions[0].protection, rel=0.2)  # nothing before it counts
