@@ -15,7 +15,7 @@ from companion.estimate import bank
 from companion.link.decode import DECODED
 from companion.link.dialect import TYPES, rsbn, type_named
 from companion.link.parameter_server import parameter_table
-from companion.navigator import own_channel
+from companion.navigator import own_channel, own_error_model
 from companion.output import source_switch
 from companion.output.gate import MAX_AGE_S, withholding_reason
 from companion.records import Trust
@@ -183,8 +183,8 @@ def test_source_set_table_in_docs_has_the_times_of_the_code() -> None:
 
 def test_drivers_in_docs_are_those_of_the_own_channel() -> None:
     named = [(cells[0].strip("`"), cells[2]) for cells in rows("estimators") if cells[0].startswith("`")]
-    drivers = [(by, f"{own_channel.SILENT_NS[by] / 1e9:g} s") for by in own_channel.ORDER[:-1]]
-    assert named == [*drivers, (own_channel.ORDER[-1], "")]
+    drivers = [(by, f"{own_channel.SILENT_NS[by] / 1e9:g} s") for by in own_channel.ORDER]
+    assert named == [*drivers, *((by, "") for by in own_error_model.HELD)]
 
 
 def test_probabilities_in_docs_are_the_settings_of_the_bank() -> None:

@@ -444,7 +444,7 @@ def _refitted(state: State, before: Settings, settings: Settings) -> State:
     if state.nominal.driver == "foreign":
         state = propagated(state, before)
         assert state.nominal is not None
-        held = own_channel.restart(state.nominal, "hold", state.nominal.point.v_n[:2])
+        held = own_channel.restart(state.nominal, state.sensors.held, state.nominal.point.v_n[:2])
         state = structs.replace(state, nominal=held)
     assert state.bank is not None
     first = min(channel.n, was)

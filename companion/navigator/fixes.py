@@ -11,6 +11,7 @@ from companion.estimate.fusion import Azimuth
 from companion.navigator import fix_observations, height_error, measurements, own_channel, scatter
 from companion.navigator.hypotheses import CHANNEL_JUMP_M, GNSS, MOST_BEACONS, VELOCITY
 from companion.navigator.own_channel import OwnChannel
+from companion.navigator.own_error_model import HELD
 from companion.navigator.progress import (
     carried,
     decided,
@@ -88,7 +89,7 @@ def gnss(state: State, record: Gnss, settings: Settings) -> Step:
         bank = velocity.bank
     is_measured = velocity is not None
     state, v_n = _latency_velocity(structs.replace(state, bank=bank), record.t_ns, is_measured)
-    shows_latency = is_measured or driver(state) != "hold"
+    shows_latency = is_measured or driver(state) not in HELD
     taken = measurements.gnss_position(bank, known, channel, apart, factor * variance, v_n, shows_latency)
     restarted = list[Output]()
     if taken.accepted and not taken.by_former and _apart(state, record, settings) > JUMPED_M:

@@ -194,16 +194,15 @@ def rotor_drag(
     channel: OwnChannel,
     V: Vector2,
     velocity: Vector2,
-    manoeuvre: float,
-    scatter: float,
+    variance: float,
     heading: float,
     drag_per_s: float,
 ) -> Taken:
     """Take the velocity through the air by a multirotor's drag. It is no source that may be false.
 
     A constant error along the velocity, as a pitot's, would stand for drag that is not quite linear: it was
-    held false beside a healthy GNSS. `V` and `velocity` as in `own_error_model.drag_rows`, `manoeuvre` as in
-    `airspeed`; `scatter` is the variance of `V` on each axis, (m/s)^2, by the noise of the accelerometers.
+    held false beside a healthy GNSS. `V` and `velocity` as in `own_error_model.drag_rows`; `variance` is that
+    of `V` on each axis, (m/s)^2.
     """
 
     def seen_by(bank: Bank) -> tuple[Floats, Floats]:
@@ -212,8 +211,7 @@ def rotor_drag(
         H[:, :, : channel.n] = own[:, :, : channel.n]
         return z, H
 
-    R = (own_error_model.airspeed_variance(manoeuvre) + scatter) * np.eye(2)
-    return _take(bank, known, seen_by, None, R, None, "velocity")
+    return _take(bank, known, seen_by, None, variance * np.eye(2), None, "velocity")
 
 
 def foreign_velocity(bank: Bank, known: Hypotheses, channel: OwnChannel, apart: Vector2) -> Taken:

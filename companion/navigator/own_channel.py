@@ -3,7 +3,7 @@
     imu      specific force turned by the autopilot's attitude, from 3.5 Hz up
     air      airspeed along the nose, where the aircraft flies; without a sensor, a steady one
     foreign  velocity of the autopilot's estimator, where it is not fed by us
-    hold     the last velocity
+    hold     the last velocity; hover: a multirotor's, which returns to zero
 
 Airspeed or a multirotor's drag beside the IMU, and the foreign velocity beside any, are measurements (see
 `own_error_model`). No position of the autopilot's is used, and no velocity of an estimator that we feed.
@@ -29,8 +29,8 @@ from companion.records import AirData, AirspeedSensor, Gnss, LocalPosition, Rsbn
 from companion.units import G0, SECOND_NS, Floats
 
 #: A driver that is silent for longer hands over to the next.
-SILENT_NS: dict[By, int] = {"imu": 600_000_000, "air": 1_500_000_000, "foreign": 2_500_000_000, "hold": 0}
-ORDER: tuple[By, ...] = ("imu", "air", "foreign", "hold")
+SILENT_NS: dict[By, int] = {"imu": 600_000_000, "air": 1_500_000_000, "foreign": 2_500_000_000}
+ORDER: tuple[By, ...] = ("imu", "air", "foreign")  # or the velocity is held
 FRESH_NS = 1_000_000_000  # an attitude older than this turns no airspeed into a velocity
 HOLD_M_S_SQRT_S = 4.0  # a turn of 30 degrees of bank changes the velocity by 5.7 m/s in a second
 SENSOR_NS = 10_000_000_000  # the word of the autopilot that its airspeed sensor is healthy lasts so long
@@ -102,17 +102,22 @@ class Sensors(Struct, frozen=True):
     aloft_ns: int | None = None  # since when it flies, a VTOL as an aeroplane, by the autopilot
     steady_m_s: float | None = None  # airspeed of a fixed wing without a sensor; its scale is estimated
 
+    @property
+    def held(self) -> By:
+        """How the velocity is held without a driver."""
+        return "hover" if self.multirotor or self.hovering else "hold"
+
     def last_ns(self, by: By) -> int:
         """When a driver last gave a sample."""
-        return {"imu": self.imu_ns, "air": self.air_ns, "foreign": self.foreign_ns, "hold": 0}[by]
+        return {"imu": self.imu_ns, "air": self.air_ns, "foreign": self.foreign_ns}[by]
 
     def is_silent(self, by: By, t_ns: int) -> bool:
-        """Whether a driver has given no sample for too long; to go straight on needs none."""
-        return by != "hold" and t_ns - self.last_ns(by) > SILENT_NS[by]
+        """Whether a driver has given no sample for too long; to hold the velocity needs none."""
+        return by in ORDER and t_ns - self.last_ns(by) > SILENT_NS[by]
 
     def leads(self, by: By, t_ns: int) -> bool:
         """Whether no better driver than `by` gives samples now."""
-        better = ORDER[: ORDER.index(by)]
+        better = ORDER[: ORDER.index(by)] if by in ORDER else ORDER
         return all(self.is_silent(b, t_ns) for b in better)
 
     def heading(self) -> float | None:
@@ -225,7 +230,7 @@ def begin(s: Sensors, fix: Gnss | RsbnFix) -> Nominal | None:
         return None
     v = (fix.v_n if isinstance(fix, Gnss) else None) or (0.0, 0.0, 0.0)
     point = Point(fix.t_ns, place, (v[0], v[1], 0.0))
-    return Nominal(point, (0.0, 0.0), point, own_error_model.begin("hold", (v[0], v[1])))
+    return Nominal(point, (0.0, 0.0), point, own_error_model.begin(s.held, (v[0], v[1])))
 
 
 def restart(nominal: Nominal, by: By, velocity: Vector2) -> Nominal:
@@ -263,5 +268,6 @@ def by_velocity(nominal: Nominal, velocity: Vector2, t_ns: int) -> Nominal:
     i = nominal.interval
     assert i is not None
     dt = (t_ns - nominal.t_ns) * 1e-9
-    add = own_error_model.add_hold(i, dt) if i.by == "hold" else own_error_model.add_velocity(i, dt, velocity)
+    is_held = i.by in own_error_model.HELD
+    add = own_error_model.add_held(i, dt) if is_held else own_error_model.add_velocity(i, dt, velocity)
     return structs.replace(nominal, point=moved(nominal.point, add.velocity, t_ns), interval=add)

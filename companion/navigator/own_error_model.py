@@ -6,6 +6,7 @@ The nominal trajectory is integrated from what the autopilot streams, the best s
     air      the velocity through the air: airspeed along the nose
     foreign  the velocity of another estimator (LOCAL_POSITION_NED not fed by us)
     hold     the last velocity
+    hover    the last velocity of a multirotor, which returns to zero
 
 Errors are nominal minus truth, north and east. The wind is the wind itself, not an error.
 
@@ -14,6 +15,7 @@ Errors are nominal minus truth, north and east. The wind is the wind itself, not
     dv  = -wind + (scale + versine + (heading + crab) J) V + turbulence     (air; not integrated, substituted)
     dv  = foreign + white                                                   (foreign; substituted)
     dv' = white                                                             (hold)
+    dv' = -dv / HOVER_S + white                                             (hover; the nominal one as well)
 
 V (2,) is the velocity through the air, a (2,) the acceleration, J = [[0, -1], [1, 0]]. In the substituted
 cases the velocity error is no memory of its own: it follows from the other states at each moment, so the
@@ -56,7 +58,8 @@ import numpy as np
 from companion.records import Vector2
 from companion.units import G0, Floats
 
-By = Literal["imu", "air", "foreign", "hold"]
+By = Literal["imu", "air", "foreign", "hold", "hover"]
+HELD: tuple[By, By] = ("hold", "hover")  # without a driver
 Airspeed = Literal["pitot", "drag", "steady"]
 """What the velocity through the air is taken from; `scale` is what is wrong with it."""
 
@@ -76,6 +79,8 @@ STEADY_SCALE = 0.4  # of an airspeed without a sensor, at first: speed over grou
 SCALE_CHANGE, SCALE_CHANGE_S = 0.25, 1800.0  # what either may change, and in what time
 #: About it an airspeed without a sensor wanders by so much for so long (UMN: 2.4 m/s within 10 s).
 STEADY_M_S, STEADY_S = 3.5, 8.0
+#: Speed of a multirotor on each axis, one sigma, and for how long it keeps a velocity.
+HOVER_M_S, HOVER_S = 5.0, 12.0
 ALONG = 1.2  # and how much greater it is along the nose than across
 
 
@@ -221,10 +226,16 @@ def add_velocity(i: Interval, dt: float, velocity: Vector2) -> Interval:
     )
 
 
-def add_hold(i: Interval, dt: float) -> Interval:
-    """Go straight on for `dt` (s)."""
+def add_held(i: Interval, dt: float) -> Interval:
+    """Go straight on for `dt` (s), a multirotor ever more slowly."""
+    kept, way = (
+        (math.exp(-dt / HOVER_S), -HOVER_S * math.expm1(-dt / HOVER_S)) if i.by == "hover" else (1.0, dt)
+    )
+    n, e = i.velocity
     return i._replace(
-        moved=(i.moved[0] + i.velocity[0] * dt, i.moved[1] + i.velocity[1] * dt), seconds=i.seconds + dt
+        velocity=(kept * n, kept * e),
+        moved=(i.moved[0] + n * way, i.moved[1] + e * way),
+        seconds=i.seconds + dt,
     )
 
 
@@ -306,6 +317,8 @@ class Propagator:
             self._air(i, T, Phi, Q)
         elif i.by == "foreign":
             self._foreign(T, Phi, Q)
+        elif i.by == "hover":
+            self._hovering(T, Phi, Q)
         else:
             _velocity_noise(Phi, Q, T, self.settings.hold_m_s_sqrt_s**2 * self._coarser2)
         return Phi, Q
@@ -356,19 +369,27 @@ class Propagator:
 
     def _wandering(self, i: Interval, T: float, Phi: Floats, Q: Floats) -> None:
         """What a steady airspeed wanders by, along the nose: as a wind it moves position and velocity."""
-        stays = math.exp(-T / STEADY_S)
-        gone = 1.0 - stays
+        stays, way, *grown = _first_order(T, STEADY_S)
         variance = nose_covariance(i.V, STEADY_M_S, 0.0)
-        end, both = (1.0 - stays * stays) * variance, (STEADY_S * gone * gone) * variance
-        Phi[0:2, GUST] = (-STEADY_S * gone) * np.eye(2)
+        moved, both, end = (factor * variance for factor in grown)
+        Phi[0:2, GUST] = -way * np.eye(2)
         Phi[2:4, GUST] = -stays * np.eye(2)
-        Q[:, 0:2, 0:2] += (STEADY_S * (2.0 * T - STEADY_S * gone * (2.0 + gone))) * variance
+        Q[:, 0:2, 0:2] += moved
         Q[:, 0:2, 2:4] += both
         Q[:, 2:4, 0:2] += both
         Q[:, 2:4, 2:4] += end
         Q[:, GUST, GUST] = end
         Q[:, GUST, 0:2] = Q[:, 0:2, GUST] = -both
         Q[:, GUST, 2:4] = Q[:, 2:4, GUST] = -end
+
+    def _hovering(self, T: float, Phi: Floats, Q: Floats) -> None:
+        stays, way, *grown = _first_order(T, HOVER_S)
+        moved, both, end = (factor * HOVER_M_S**2 for factor in grown)
+        for k in (0, 1):
+            Phi[k, 2 + k], Phi[2 + k, 2 + k] = way, stays
+            Q[:, k, k] = moved
+            Q[:, k, 2 + k] = Q[:, 2 + k, k] = both
+            Q[:, 2 + k, 2 + k] = end
 
     def _foreign(self, T: float, Phi: Floats, Q: Floats) -> None:
         at = FOREIGN.start
@@ -401,6 +422,20 @@ class Propagator:
         H[:, HEADING] = H[:, CRAB] = V[1], -V[0]
         y = np.array((velocity[0] - V[0], velocity[1] - V[1]))
         return Row(y, H, np.eye(2) * airspeed_variance(manoeuvre))
+
+
+def _first_order(T: float, tau: float) -> tuple[float, float, float, float, float]:
+    """Return of a velocity that is correlated over `tau` what stays of it after `T` seconds and how far 1 m/s
+    moves; and what unit variance adds to position, covariance and velocity.
+    """
+    stays, gone = math.exp(-T / tau), -math.expm1(-T / tau)
+    return (
+        stays,
+        tau * gone,
+        tau * (2.0 * T - tau * gone * (2.0 + gone)),
+        tau * gone * gone,
+        1.0 - stays * stays,
+    )
 
 
 def _velocity_noise(Phi: Floats, Q: Floats, T: float, density: Floats) -> None:

@@ -30,7 +30,7 @@ from companion.navigator.ground import (
     wind_shear,
 )
 from companion.navigator.own_channel import AirspeedSums, OwnChannel, Sensors
-from companion.navigator.own_error_model import Airspeed, By
+from companion.navigator.own_error_model import HELD, Airspeed, By
 from companion.navigator.progress import (
     carried,
     decided,
@@ -148,9 +148,10 @@ def pressure(state: State, record: Pressure, settings: Settings) -> Step:
 
 def _straight_on(state: State, record: Stamped, settings: Settings) -> Step:
     """Without a driver the nominal trajectory goes straight on, by whatever sample is still there."""
-    if not state.sensors.leads("hold", record.t_ns):
+    held = state.sensors.held
+    if not state.sensors.leads(held, record.t_ns):
         return state, []
-    return _driven(state, record, "hold", None, settings)
+    return _driven(state, record, held, None, settings)
 
 
 def imu(state: State, record: Imu, settings: Settings) -> Step:
@@ -161,7 +162,10 @@ def imu(state: State, record: Imu, settings: Settings) -> Step:
         return state, []
     strap = strapdown_channel.receive(s.strap, record)
     if strap.why:
-        return _straight_on(with_sensors(state, strap=strap), record, settings)
+        state, outputs = _straight_on(with_sensors(state, strap=strap), record, settings)
+        if strap.is_slow and driver(state) in HELD:
+            state = _rotor_drag(state, record, settings)
+        return state, outputs
     now = strapdown_channel.acceleration(strap)
     fresh = record.t_ns - s.imu_ns <= own_channel.SILENT_NS["imu"]
     before = s.accelerations[-2:] if fresh else ()
@@ -285,18 +289,17 @@ def _measured(state: State, record: AirData | Attitude | Imu, V: Vector2, settin
         return with_sensors(state, sums=AirspeedSums(record.t_ns, V))
     state = propagated(state, settings)
     assert state.bank is not None
-    known, n = hypotheses(state, settings), sums.samples
+    bank, known, n = state.bank, hypotheses(state, settings), sums.samples
     mean, velocity = (sums.air[0] / n, sums.air[1] / n), (sums.velocity[0] / n, sums.velocity[1] / n)
-    manoeuvre = strapdown_channel.manoeuvre(s.mean_acceleration)
+    manoeuvre = strapdown_channel.manoeuvre(s.mean_acceleration) if driver(state) == "imu" else 0.0
     if isinstance(record, AirData):
-        taken = measurements.airspeed(state.bank, known, _own(settings), mean, velocity, manoeuvre)
+        taken = measurements.airspeed(bank, known, _own(settings), mean, velocity, manoeuvre)
     elif isinstance(record, Attitude):
-        taken = measurements.steady_airspeed(state.bank, known, _own(settings), mean, velocity, manoeuvre)
+        taken = measurements.steady_airspeed(bank, known, _own(settings), mean, velocity, manoeuvre)
     else:
         drag, heading = settings.config.air_data.rotor_drag_per_s, s.heading() or 0.0
-        taken = measurements.rotor_drag(
-            state.bank, known, _own(settings), mean, velocity, manoeuvre, sums.scatter, heading, drag
-        )
+        variance = own_error_model.airspeed_variance(manoeuvre) + sums.scatter
+        taken = measurements.rotor_drag(bank, known, _own(settings), mean, velocity, variance, heading, drag)
     state = structs.replace(state, bank=taken.bank)
     state = with_sensors(state, measured_ns=record.t_ns, sums=AirspeedSums(record.t_ns, V))
     return decided(state, record, settings)

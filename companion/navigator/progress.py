@@ -50,7 +50,7 @@ def carried(state: State, t_ns: int, settings: Settings) -> State:
         if state.sensors.is_silent(nominal.interval.by, t_ns):
             state = propagated(state, settings)
             assert state.nominal is not None
-            nominal = own_channel.restart(state.nominal, "hold", state.nominal.point.v_n[:2])
+            nominal = own_channel.restart(state.nominal, state.sensors.held, state.nominal.point.v_n[:2])
         return structs.replace(state, nominal=own_channel.carry_on(nominal, state.sensors, t_ns))
     v, a = nominal.point.v_n, nominal.a_n
     point = moved(nominal.point, (v[0] + a[0] * dt, v[1] + a[1] * dt), t_ns)

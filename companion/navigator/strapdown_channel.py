@@ -68,7 +68,8 @@ class Pace(NamedTuple):
 class Strap(Struct, frozen=True):
     """What is needed to go on: last sample; attitude, and the time that it is of; when samples came again
     after a gap; rates, vertical specific force averaged (m/s^2, down); how fast the tilt is corrected against
-    the gyros, about north and east (rad/s), when that was last too fast; why the last sample is of no use.
+    the gyros, about north and east (rad/s), when that was last too fast; why the last sample moves nothing,
+    and whether only because samples or attitudes are too few.
     """
 
     imu: Imu | None = None
@@ -81,6 +82,7 @@ class Strap(Struct, frozen=True):
     tilting: Vector2 = (0.0, 0.0)
     wrong_ns: int | None = None
     why: str = "no IMU arrives"
+    is_slow: bool = False
 
 
 def sense(s: Strap, record: Attitude) -> Strap:
@@ -118,16 +120,16 @@ def receive(s: Strap, record: Imu) -> Strap:
     s = structs.replace(s, imu_pace=s.imu_pace.with_one(record.t_ns))
     if dt > GAP_S:
         s, before = structs.replace(s, gap_ns=record.t_ns), record
-    if why := _senseless(record):
-        return structs.replace(s, why=why)
-    if s.C_nb is None:
-        return structs.replace(s, why="no attitude arrives")
+    if why := _senseless(record) or ("no attitude arrives" if s.C_nb is None else ""):
+        return structs.replace(s, why=why, is_slow=False)
+    assert s.C_nb is not None
     since = min((record.t_ns - s.C_ns) * 1e-9, STALE_S)
     C_nb = s.C_nb @ rotation_matrix(0.5 * (np.array(before.w_b) + record.w_b) * since)
     s = structs.replace(s, imu=record, C_nb=C_nb, C_ns=record.t_ns)
     gain = min(dt / VERTICAL_S, 0.1)
     s = structs.replace(s, down=s.down + gain * (float(C_nb[2] @ record.f_b) - s.down))
-    return structs.replace(s, why=_unfit(s))
+    why, slow = _unfit(s), _slow(s)
+    return structs.replace(s, why=why or slow, is_slow=bool(slow and not why))
 
 
 def acceleration(s: Strap) -> Vector3:
@@ -213,13 +215,6 @@ def _senseless(record: Imu) -> str:
 def _unfit(s: Strap) -> str:
     """Why nothing can be made of the sample heard last, though it makes sense alone."""
     assert s.imu is not None
-    if min(s.imu_pace.heard, s.attitude_pace.heard) <= FEW:
-        return "the rates of IMU and attitude are not known yet"
-    if s.imu_pace.hz < LEAST * IMU_HZ or s.attitude_pace.hz < LEAST * ATTITUDE_HZ:
-        return (
-            f"IMU at {s.imu_pace.hz:.1f} Hz and attitude at {s.attitude_pace.hz:.1f} Hz are too slow "
-            f"(at least {LEAST * IMU_HZ:.1f} and {LEAST * ATTITUDE_HZ:.1f} Hz)"
-        )
     silent = (s.imu.t_ns - s.attitude_pace.t_ns) * 1e-9
     if silent > STALE_S:
         return f"no attitude for {silent:.1f} s (limit {STALE_S:.1f} s)"
@@ -230,5 +225,17 @@ def _unfit(s: Strap) -> str:
         return (
             f"its specific force upwards averages {-s.down:.1f} m/s^2 where gravity is 9.8: "
             "units or orientation are wrong"
+        )
+    return ""
+
+
+def _slow(s: Strap) -> str:
+    """Why too few samples or attitudes arrive to move the nominal trajectory."""
+    if min(s.imu_pace.heard, s.attitude_pace.heard) <= FEW:
+        return "the rates of IMU and attitude are not known yet"
+    if s.imu_pace.hz < LEAST * IMU_HZ or s.attitude_pace.hz < LEAST * ATTITUDE_HZ:
+        return (
+            f"IMU at {s.imu_pace.hz:.1f} Hz and attitude at {s.attitude_pace.hz:.1f} Hz are too slow "
+            f"(at least {LEAST * IMU_HZ:.1f} and {LEAST * ATTITUDE_HZ:.1f} Hz)"
         )
     return ""

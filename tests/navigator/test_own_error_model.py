@@ -4,16 +4,22 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from companion.config import Config
 from companion.navigator.own_channel import OwnChannel
 from companion.navigator.own_error_model import (
     GUST,
+    HOVER_M_S,
+    POSITION,
     USUAL,
+    VELOCITY,
     Amplitudes,
     N,
     Propagator,
     Row,
+    add_held,
     add_imu,
     begin,
     prior,
@@ -43,6 +49,33 @@ def test_two_intervals_beside_the_imu_are_one() -> None:
     (first, q1), (second, q2), (whole, q) = over(0.2), over(0.6), over(0.8)
     assert first * second == pytest.approx(whole)
     assert second * second * q1 + q2 == pytest.approx(q)
+
+
+@given(
+    first=st.floats(0.01, 5.0),
+    second=st.floats(0.01, 5.0),
+    v=st.tuples(st.floats(-20, 20), st.floats(-20, 20)),
+)
+def test_a_multirotor_that_is_held_in_two_intervals_is_held_in_one(
+    first: float, second: float, v: tuple[float, float]
+) -> None:
+    """Its errors are propagated as the difference of two nominal trajectories is."""
+    propagator, interval = Propagator(Amplitudes()), begin("hover", v)
+    both = first + second
+    (A, Qa), (B, Qb), (C, Qc) = (
+        propagator.transition(interval._replace(seconds=T)) for T in (first, second, both)
+    )
+    own = slice(POSITION.start, VELOCITY.stop)
+    np.testing.assert_allclose((B @ A)[own, own], C[own, own], atol=1e-12)
+    np.testing.assert_allclose((B @ Qa @ B.T + Qb)[:, own, own], Qc[:, own, own], atol=1e-9)
+    held = add_held(add_held(interval, first), second)
+    np.testing.assert_allclose((*held.moved, *held.velocity), C[own, own] @ (0.0, 0.0, *v), atol=1e-12)
+    assert held.seconds == pytest.approx(both)
+
+
+def test_the_speed_of_a_multirotor_that_is_held_is_bounded() -> None:
+    _, Q = Propagator(Amplitudes()).transition(begin("hover", (0.0, 0.0))._replace(seconds=600.0))
+    np.testing.assert_allclose(np.diagonal(Q[:, VELOCITY, VELOCITY], axis1=1, axis2=2), HOVER_M_S**2)
 
 
 def test_a_step_of_the_wind_shows_in_the_first_airspeed_after_it() -> None:
