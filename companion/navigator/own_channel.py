@@ -76,6 +76,15 @@ class AirspeedSums(NamedTuple):
         return self.steps / (4.0 * self.samples**2)
 
 
+class Wind(NamedTuple):
+    """The wind as it was estimated beside a pitot at `t_ns`: north and east (m/s), variance on each axis."""
+
+    t_ns: int
+    north: float
+    east: float
+    variance: float
+
+
 class Sensors(Struct, frozen=True):
     """Last readings: IMU and attitude, air data, the foreign velocity, and when each was last of use."""
 
@@ -85,6 +94,7 @@ class Sensors(Struct, frozen=True):
     sensor_ns: int | None = None  # when the autopilot last called its airspeed sensor healthy
     unused_ns: int | None = None  # when it last stated that it does not use it
     pitot_ns: int = -SENSOR_NS  # when the airspeed of a sensor was last used
+    winds: tuple[Wind, ...] = ()  # of the last half minute beside a pitot that was used
     steady: AirData | None = None  # the last airspeed that moved the position
     foreign: LocalPosition | None = None
     imu_ns: int = -SENSOR_NS

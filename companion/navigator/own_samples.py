@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 from msgspec import structs
 
 from companion.estimate import bank as banks
@@ -29,7 +30,7 @@ from companion.navigator.ground import (
     lifted,
     wind_shear,
 )
-from companion.navigator.own_channel import AirspeedSums, OwnChannel, Sensors
+from companion.navigator.own_channel import AirspeedSums, OwnChannel, Sensors, Wind
 from companion.navigator.own_error_model import HELD, Airspeed, By
 from companion.navigator.progress import (
     carried,
@@ -45,6 +46,7 @@ from companion.navigator.state import (
     Settings,
     State,
     Step,
+    estimate,
     gnss_climb,
     gnss_is_received,
     hypotheses,
@@ -69,6 +71,8 @@ AIRSPEED_EVERY_NS = 500_000_000  # gusts are correlated: more often adds nothing
 FOREIGN_EVERY_NS = SECOND_NS
 TAKE_OFF_NS = 10 * SECOND_NS  # a multirotor is off the ground after it, at whatever height
 BLOCKED_M_S = 5.0  # slower, in flight, a pitot is blocked
+#: A pitot that fails is used for some seconds more, and the wind with it: that of so long ago comes after it.
+WIND_EVERY_NS, WINDS_NS, WIND_CHANGED_M_S = 10 * SECOND_NS, 30 * SECOND_NS, 1.0
 #: Between two samples, up to so far apart, no airspeed changes by more; one that did is not used for so long.
 STEP_M_S, STEP_M_S2, STEP_GAP_S, STEP_NS = 10.0, 10.0, 1.0, 10 * SECOND_NS
 
@@ -228,11 +232,32 @@ def _airspeed_from(airspeed: Airspeed, state: State, settings: Settings) -> Stat
     if nominal.interval.airspeed == airspeed:
         return state
     sigma = own_error_model.scale_sigma(_own(settings).settings, airspeed)
-    return structs.replace(
-        state,
-        bank=banks.renew(state.bank, [own_error_model.SCALE], [sigma]),
-        nominal=structs.replace(nominal, interval=nominal.interval._replace(airspeed=airspeed)),
+    bank = banks.renew(state.bank, [own_error_model.SCALE], [sigma])
+    if nominal.interval.airspeed == "pitot" and state.sensors.winds:
+        bank = _with_wind(bank, state.sensors.winds[0])
+    nominal = structs.replace(nominal, interval=nominal.interval._replace(airspeed=airspeed))
+    return with_sensors(
+        structs.replace(state, bank=bank, nominal=nominal), sums=None, winds=(), steady_m_s=None
     )
+
+
+def _with_wind(bank: banks.Bank, wind: Wind) -> banks.Bank:
+    at = own_error_model.WIND
+    sigma = math.sqrt(wind.variance + WIND_CHANGED_M_S**2)
+    bank = banks.renew(bank, range(at.start, at.stop), (sigma, sigma))
+    return banks.shift(bank, np.array((*(0.0,) * at.start, wind.north, wind.east)))
+
+
+def _wind_noted(state: State, t_ns: int, settings: Settings) -> State:
+    """Remember the wind beside a pitot that is used."""
+    winds = state.sensors.winds
+    if state.bank is None or (winds and t_ns - winds[-1].t_ns < WIND_EVERY_NS):
+        return state
+    x, P = estimate(state, settings)
+    north, east = own_error_model.WIND.start, own_error_model.WIND.start + 1
+    wind = Wind(t_ns, float(x[north]), float(x[east]), float(0.5 * (P[north, north] + P[east, east])))
+    kept = (w for w in winds if t_ns - w.t_ns <= WINDS_NS)
+    return with_sensors(state, winds=(*kept, wind))
 
 
 def air_data(state: State, record: AirData, settings: Settings) -> Step:
@@ -259,7 +284,7 @@ def air_data(state: State, record: AirData, settings: Settings) -> Step:
     if not ground.flying:
         return _straight_on(state, record, settings)
     state = with_sensors(state, air_ns=record.t_ns, pitot_ns=record.t_ns)
-    state = _airspeed_from("pitot", state, settings)
+    state = _wind_noted(_airspeed_from("pitot", state, settings), record.t_ns, settings)
     if leads:
         return _driven(with_sensors(state, steady=record), record, "air", V, settings)
     if driver(state) != "imu":
