@@ -79,8 +79,7 @@ STEADY_SCALE = 0.4  # of an airspeed without a sensor, at first: speed over grou
 SCALE_CHANGE, SCALE_CHANGE_S = 0.25, 1800.0  # what either may change, and in what time
 #: About it an airspeed without a sensor wanders by so much for so long (UMN: 2.4 m/s within 10 s).
 STEADY_M_S, STEADY_S = 3.5, 8.0
-#: Speed of a multirotor on each axis, one sigma, and for how long it keeps a velocity.
-HOVER_M_S, HOVER_S = 5.0, 12.0
+HOVER_S = 5.0  # for so long a multirotor keeps a velocity
 ALONG = 1.2  # and how much greater it is along the nose than across
 
 
@@ -384,7 +383,8 @@ class Propagator:
 
     def _hovering(self, T: float, Phi: Floats, Q: Floats) -> None:
         stays, way, *grown = _first_order(T, HOVER_S)
-        moved, both, end = (factor * HOVER_M_S**2 for factor in grown)
+        variance = 0.5 * HOVER_S * self.settings.hold_m_s_sqrt_s**2 * self._coarser2
+        moved, both, end = (factor * variance for factor in grown)
         for k in (0, 1):
             Phi[k, 2 + k], Phi[2 + k, 2 + k] = way, stays
             Q[:, k, k] = moved

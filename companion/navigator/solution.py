@@ -22,7 +22,7 @@ from companion.navigator import fix_observations, height_error, minimax_bound, p
 from companion.navigator.hypotheses import GNSS, VELOCITY
 from companion.navigator.minimax_bound import Guaranteed, Linear
 from companion.navigator.own_channel import OwnChannel
-from companion.navigator.own_error_model import HOVER_M_S, HOVER_S
+from companion.navigator.own_error_model import HELD
 from companion.navigator.state import (
     EXCLUDED,
     FIXES,
@@ -190,9 +190,7 @@ def _velocity_growth(state: State, dt: float, settings: Settings) -> float:
         return -(model.gust_m_s**2) * math.expm1(-2.0 * dt / model.turbulence_s)
     if nominal.interval.by == "foreign":
         return model.foreign_noise_m_s**2
-    if nominal.interval.by == "hover":
-        return -(HOVER_M_S**2) * math.expm1(-2.0 * dt / HOVER_S)
-    return model.hold_m_s_sqrt_s**2 * dt if nominal.interval.by == "hold" else 0.0
+    return model.hold_m_s_sqrt_s**2 * dt if nominal.interval.by in HELD else 0.0
 
 
 def _about(

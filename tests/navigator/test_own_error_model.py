@@ -11,11 +11,12 @@ from companion.config import Config
 from companion.navigator.own_channel import OwnChannel
 from companion.navigator.own_error_model import (
     GUST,
-    HOVER_M_S,
+    HOVER_S,
     POSITION,
     USUAL,
     VELOCITY,
     Amplitudes,
+    By,
     N,
     Propagator,
     Row,
@@ -73,9 +74,13 @@ def test_a_multirotor_that_is_held_in_two_intervals_is_held_in_one(
     assert held.seconds == pytest.approx(both)
 
 
-def test_the_speed_of_a_multirotor_that_is_held_is_bounded() -> None:
-    _, Q = Propagator(Amplitudes()).transition(begin("hover", (0.0, 0.0))._replace(seconds=600.0))
-    np.testing.assert_allclose(np.diagonal(Q[:, VELOCITY, VELOCITY], axis1=1, axis2=2), HOVER_M_S**2)
+def test_a_multirotor_that_is_held_changes_as_any_aircraft_at_once_and_stays_slow() -> None:
+    def grown(by: By, seconds: float) -> float:
+        _, Q = Propagator(Amplitudes()).transition(begin(by, (0.0, 0.0))._replace(seconds=seconds))
+        return float(Q[0, VELOCITY.start, VELOCITY.start])
+
+    assert grown("hover", 0.01) == pytest.approx(grown("hold", 0.01), rel=0.01)
+    assert grown("hover", 600.0) == pytest.approx(grown("hold", 0.5 * HOVER_S))
 
 
 def test_a_step_of_the_wind_shows_in_the_first_airspeed_after_it() -> None:
