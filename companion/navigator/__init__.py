@@ -145,6 +145,8 @@ class Navigator:
             record = structs.replace(record, t_ns=record.t_ns - self._gnss_latency_ns)
         stale = self._stale_data.judge(record)
         if stale is not None:
+            if stale:
+                self._changes.of_stale(record)
             return stale
         self.settle()
         if isinstance(record, Gnss):

@@ -7,13 +7,14 @@ that is new. So no record reports what it changes: the state after it is compare
 from __future__ import annotations
 
 import math
+import re
 
 from companion.navigator.hypotheses import AIRSPEED, GNSS, VELOCITY
 from companion.navigator.minimax_bound import Guarantee
 from companion.navigator.own_channel import SILENT_NS, Sensors, airspeed_is_sensed, is_switched_off
 from companion.navigator.scatter import Scatter
 from companion.navigator.state import EXCLUDED, FIXES, SUSPECT, Settings, State, source_name, sources
-from companion.records import Event, Mode, Output, Severity, Solution, Source, Stamped
+from companion.records import AirData, Event, Mode, Output, Severity, Solution, Source, Stamped
 from companion.units import SECOND_NS
 
 #: An autopilot checks its airspeed sensor against GPS only: ArduPlane dived to the ground for speed in 67 s.
@@ -23,28 +24,38 @@ UNFIT_ANSWERS = 10  # of a beacon, none of which fits, until it is reported
 #: A sensor is reported as not used once it has not been for so long, and as used again once it has been. A
 #: stream that is slow at the start is requested again within the first.
 UNUSED_NS, USED_NS = 12 * SECOND_NS, 60 * SECOND_NS
+STUCK_NS = 3 * SECOND_NS // 2  # a stale reading is reported once a second
 
 
 class _Use:
-    """Whether a sensor is used, as last reported, and since when it is not as reported."""
+    """Why a sensor is not used, as last reported, and since when that is otherwise."""
 
     def __init__(self, name: str) -> None:
-        self._name, self._is_used = name, True
+        self._name, self._why = name, ""  # without its numbers; empty while the sensor is used
         self._changed_ns: int | None = None
 
     def update(self, is_used: bool, why_not: str, t_ns: int) -> list[tuple[Severity, str]]:
         """Return the report that is due, if any; `why_not` is empty while the sensor is not expected."""
-        if is_used == self._is_used or not (is_used or why_not):
+        why = "" if is_used else _kind(why_not)
+        if why == self._why or not (is_used or why):
             self._changed_ns = None
             return []
         if self._changed_ns is None:
             self._changed_ns = t_ns
         if t_ns - self._changed_ns < (USED_NS if is_used else UNUSED_NS):
             return []
-        self._is_used, self._changed_ns = is_used, None
+        self._why, self._changed_ns = why, None
         if is_used:
             return [(Severity.NOTICE, f"{self._name} is used again")]
         return [(Severity.WARNING, f"{self._name} is not used: {why_not}")]
+
+    def is_reported(self, why_not: str) -> bool:
+        """Whether this reason is the one that was last reported."""
+        return self._why == _kind(why_not)
+
+
+def _kind(why: str) -> str:
+    return re.sub(r"[\d.]+", "", why)
 
 
 class Changes:
@@ -55,6 +66,8 @@ class Changes:
         self._scatter: dict[str, bool] = {}  # whether each source is noisy
         self._unfit: set[int] = set()  # beacons that are reported to fit nothing
         self._imu, self._pitot = _Use("IMU"), _Use("airspeed")
+        self._stuck: AirData | None = None  # the last airspeed that was dropped as stale
+        self._is_advised = False  # to switch the airspeed sensor off
         self._wider = False  # whether the guaranteed bound is
         self._mode = Mode.INITIALISING, Source(0)  # and the fixes that the solution rests on
 
@@ -74,23 +87,38 @@ class Changes:
             text = "is not used: no answer fits its stated place; check its number and its place"
             found.append((Severity.WARNING, f"rsbn {beacon} {text}"))
         self._unfit = unfit
-        found += self._of_sensors(state.sensors, record.t_ns, settings)
+        found += self._of_sensors(state, record.t_ns, settings)
         g = state.guarantee
         if g.anchored is not None and (g.widening > 1.0) != self._wider:
             self._wider = not self._wider
             found.append((Severity.NOTICE, _of_bound(g)))
         return [Event(record.t_ns, record.rx_ns, severity, text) for severity, text in found]
 
-    def _of_sensors(self, s: Sensors, t_ns: int, settings: Settings) -> list[tuple[Severity, str]]:
-        """Report whether IMU and airspeed are used, once they came; the streams report what never does."""
-        uses, imu, pitot = settings.config.uses, "", ""
+    def of_stale(self, record: Stamped) -> None:
+        """Remember a record that was dropped as stale: no state shows it."""
+        if isinstance(record, AirData):
+            self._stuck = record
+
+    def _of_sensors(self, state: State, t_ns: int, settings: Settings) -> list[tuple[Severity, str]]:
+        """Report whether IMU and airspeed are used, once they came; the streams report what never does.
+
+        Without GNSS nothing but this shows an autopilot that its airspeed sensor is false.
+        """
+        s, uses, imu, pitot, is_false = state.sensors, settings.config.uses, "", "", False
         if uses("imu") and s.strap.imu_pace.heard > 0 and s.is_silent("imu", t_ns):
             imu = s.strap.why or f"no new sample for {(t_ns - s.imu_ns) * 1e-9:.0f} s"
         if uses("air_data") and s.pitot_ns > 0 and s.ground.flying and not s.landed:
-            pitot = _why_no_airspeed(s, t_ns)
-        return self._imu.update(not s.is_silent("imu", t_ns), imu, t_ns) + self._pitot.update(
-            t_ns - s.pitot_ns <= SILENT_NS["air"], pitot, t_ns
+            pitot, is_false = _why_no_airspeed(s, self._stuck, t_ns)
+        is_used = t_ns - s.pitot_ns <= SILENT_NS["air"]
+        found = self._imu.update(not s.is_silent("imu", t_ns), imu, t_ns) + self._pitot.update(
+            is_used, pitot, t_ns
         )
+        if not (is_false and self._pitot.is_reported(pitot)):
+            self._is_advised = self._is_advised and not is_used
+        elif not self._is_advised and not sources(state, t_ns, settings) & Source.GNSS:
+            self._is_advised = True
+            found.append((Severity.WARNING, _advice(settings)))
+        return found
 
     def of_mode(self, solution: Solution) -> list[Output]:
         """Return an event if the mode of a solution is another, or the fixes that it rests on are."""
@@ -109,15 +137,22 @@ class Changes:
         return [Event(solution.t_ns, solution.rx_ns, severity, f"navigation {solution.mode}: {why}")]
 
 
-def _why_no_airspeed(s: Sensors, t_ns: int) -> str:
+def _why_no_airspeed(s: Sensors, stuck: AirData | None, t_ns: int) -> tuple[str, bool]:
+    """Why no airspeed is used, and whether it is false while the autopilot uses it."""
     air = s.air.air
     if is_switched_off(s, t_ns):
-        return "the autopilot does not use its sensor"
+        return "the autopilot does not use its sensor", False
+    if stuck is not None and t_ns - stuck.t_ns <= STUCK_NS and (air is None or air.t_ns < stuck.t_ns):
+        return f"it stands still at {stuck.airspeed:.0f} m/s", True
     if air is None or t_ns - air.t_ns > SILENT_NS["air"]:
-        return f"no new reading for {(t_ns - s.pitot_ns) * 1e-9:.0f} s"
+        return f"no new reading for {(t_ns - s.pitot_ns) * 1e-9:.0f} s", False
     if not airspeed_is_sensed(s, air):
-        return "the autopilot calls its sensor unhealthy"
-    return f"{air.airspeed:.0f} m/s is too low for the speed over ground"
+        return "the autopilot calls its sensor unhealthy", False
+    return f"{air.airspeed:.0f} m/s is too low for the speed over ground", True
+
+
+def _advice(settings: Settings) -> str:
+    return FALSE_AIRSPEED + USE_AIRSPEED.get(settings.config.output.profile, "")
 
 
 def _announced(before: tuple[int, ...], now: tuple[int, ...]) -> tuple[int, ...]:
@@ -135,7 +170,7 @@ def _of_beliefs(
         if now == (before[i] if i < len(before) else 0):
             continue
         text = {
-            0: "is used again",
+            0: "is used again" if i < len(before) and before[i] == EXCLUDED else "is no longer suspect",
             SUSPECT: f"is suspect: false with probability {p:.2f}",
             EXCLUDED: f"is excluded: false with probability {p:.4f}",
         }[now]
@@ -143,8 +178,7 @@ def _of_beliefs(
         found.append((severity, f"{source_name(i, state)} {text}"))
         by_gnss = sources(state, t_ns, settings) & Source.GNSS
         if i == AIRSPEED and now == EXCLUDED and not by_gnss:
-            text = FALSE_AIRSPEED + USE_AIRSPEED.get(settings.config.output.profile, "")
-            found.append((Severity.WARNING, text))
+            found.append((Severity.WARNING, _advice(settings)))
     return found
 
 

@@ -57,7 +57,7 @@ CASES = {
         (doubted(EXCLUDED, 0), ["gnss is excluded: false with probability 0.9995"]),
         (doubted(0, 0), ["gnss is used again", "velocity of gnss is used again"]),
         (doubted(0, SUSPECT), ["velocity of gnss is suspect: false with probability 1.00"]),
-        (doubted(0, 0), ["velocity of gnss is used again"]),
+        (doubted(0, 0), ["velocity of gnss is no longer suspect"]),
     ],
     "scatter": [
         (scattered(False, 3.0), []),

@@ -705,7 +705,7 @@ def test_each_change_of_belief_is_reported_once_beside_late_answers(late_s: floa
         due = [waiting.pop(0)] if waiting and waiting[0].rx_ns <= record.rx_ns else []
         for out in (out for each in (*due, record) for out in navigator.handle(each)):
             if isinstance(out, Event) and (
-                found := re.match("(.*) is (excluded|suspect|used again)", out.text)
+                found := re.match("(.*) is (excluded|suspect|used again|no longer suspect)", out.text)
             ):
                 reported.append((found[1], found[2]))
     names = [source_name(i, navigator.state) for i in range(len(navigator.state.reported))]
@@ -714,7 +714,8 @@ def test_each_change_of_belief_is_reported_once_beside_late_answers(late_s: floa
         words = [word for of, word in reported if of == source]
         assert all(a != b for a, b in pairwise(words)), (source, words)
         number = navigator.state.reported[names.index(source)]
-        assert words[-1] == {0: "used again", SUSPECT: "suspect", EXCLUDED: "excluded"}[number]
+        states = {"used again": 0, "no longer suspect": 0, "suspect": SUSPECT, "excluded": EXCLUDED}
+        assert states[words[-1]] == number
 
 
 def test_an_answer_that_fits_nothing_displaces_no_beacon() -> None:

@@ -123,7 +123,7 @@ def taken_from(changed: list[Input], until_s: float) -> tuple[dict[int, str], li
     navigator, found, texts = Navigator(CONFIG), dict[int, str](), list[str]()
     for record in changed:
         for out in navigator.handle(record):
-            if isinstance(out, Event) and "used" in out.text:
+            if isinstance(out, Event) and ("used" in out.text or "switch" in out.text):
                 texts.append(out.text)
         nominal = navigator._state.nominal
         if nominal is not None and nominal.interval is not None:
@@ -133,18 +133,41 @@ def taken_from(changed: list[Input], until_s: float) -> tuple[dict[int, str], li
     return found, texts
 
 
-def test_a_pitot_that_sticks_is_replaced_though_the_autopilot_calls_it_healthy() -> None:
+@pytest.mark.parametrize("lost_s", [math.inf, 150.0])
+def test_a_pitot_that_sticks_is_replaced_though_the_autopilot_calls_it_healthy(lost_s: float) -> None:
+    """Without GNSS it flies by it: the pilot must switch it off."""
     changed: list[Input] = []
     for record in recorded():
         if isinstance(record, AirData):
             changed.append(AirspeedSensor(record.t_ns, record.rx_ns, True))
             if record.t_ns > 120 * NS:
                 record = replace(record, airspeed=12.0, sensed=True)
-        changed.append(record)
+        if not isinstance(record, Gnss) or record.t_ns < lost_s * NS:
+            changed.append(record)
     found, texts = taken_from(changed, 160.0)
     assert found[119] == "pitot"
     assert found[145] == found[159] == "steady"
-    assert [text.rsplit(" ", 2)[0] for text in texts] == ["airspeed is not used: no new reading for"]
+    advice = ["switch the airspeed sensor off: ARSPD_USE 0"] if lost_s < 160.0 else []
+    assert texts == ["airspeed is not used: it stands still at 12 m/s", *advice]
+
+
+def test_a_pitot_that_the_autopilot_takes_again_without_gnss_is_reported_again() -> None:
+    """ArduPlane switches one off that sticks, and on again as GNSS is lost."""
+    changed: list[Input] = []
+    for record in recorded():
+        t = record.t_ns / NS
+        if isinstance(record, AirData):
+            used = not 125.0 < t < 150.0
+            changed.append(AirspeedSensor(record.t_ns, record.rx_ns, used, used))
+            if t > 120.0:
+                record = replace(record, airspeed=12.0, sensed=True)
+        if not isinstance(record, Gnss) or t < 150.0:
+            changed.append(record)
+    assert taken_from(changed, 180.0)[1] == [
+        "airspeed is not used: the autopilot does not use its sensor",
+        "airspeed is not used: it stands still at 12 m/s",
+        "switch the airspeed sensor off: ARSPD_USE 0",
+    ]
 
 
 def test_a_sensor_that_the_autopilot_does_not_use_is_replaced() -> None:
