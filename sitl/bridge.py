@@ -39,7 +39,7 @@ from sitl.live_beacons import LiveBeacons
 from sitl.positions import POSITION_MESSAGES, affects_estimator, position_of
 
 COMPONENT = mavlink.MAV_COMP_ID_ONBOARD_COMPUTER3
-RATES_HZ = {"GLOBAL_POSITION_INT": 5.0}
+RATES_HZ = {"GLOBAL_POSITION_INT": 5.0, "GPS_RAW_INT": 2.0}
 TRUTH = {"ardupilot": "SIM_STATE", "px4": "HIL_STATE_QUATERNION"}
 TRUTH_HZ = 10.0
 ASK_ORIGIN_EVERY = 3 * SECOND_NS

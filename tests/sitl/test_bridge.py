@@ -225,13 +225,22 @@ def test_positions_are_relayed_by_default(entries) -> None:
 
 def test_only_the_truth_that_the_autopilot_has_is_requested(relayed) -> None:
     """ArduPilot reports each request for a message that it does not have on every ground station."""
-    asked = {
+    assert "SIM_STATE" in requested(relayed)
+    assert "HIL_STATE_QUATERNION" not in requested(relayed)
+
+
+def requested(flight: BridgeFlight) -> set[str]:
+    return {
         dialect.TYPES[round(message.param1)].name
-        for message in decoded(relayed.to_player)
+        for message in decoded(flight.to_player)
         if message.get_type() == "COMMAND_LONG" and message.command == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL
     }
-    assert "SIM_STATE" in asked
-    assert "HIL_STATE_QUATERNION" not in asked
+
+
+def test_beside_a_companion_it_requests_what_it_needs_itself(entries) -> None:
+    """Without GPS_RAW_INT it reported GNSS as available throughout an outage."""
+    flight = BridgeFlight(entries[: len(entries) // 4], Bridge([EAST], mode=BridgeMode.BESIDE))
+    assert {"GPS_RAW_INT", "GLOBAL_POSITION_INT", "SIM_STATE"} <= requested(flight)
 
 
 def test_beside_mode_sends_only_untimed_answers(entries) -> None:
