@@ -48,6 +48,11 @@ class Residuals:
                 self._mean += (old - self._mean) / self._weight
 
     @property
+    def last_ns(self) -> int:
+        """Time of the last one."""
+        return self._window[-1][0]
+
+    @property
     def significance(self) -> float:
         """By how many sigmas the window differs from the earlier mean, at the time of the last fix."""
         if len(self._window) < LEAST:
@@ -62,13 +67,14 @@ class BeaconWitness:
     def __init__(self) -> None:
         self._fix: Gnss | None = None
         self._residuals: dict[tuple[int, str], Residuals] = {}
+        self._answered_ns = 0  # time of the last answer of any beacon
 
     def receive(self, record: Gnss | RsbnFix, is_believed: bool) -> None:
         """Process a fix; `is_believed`: the navigator believes GNSS."""
         if isinstance(record, Gnss):
             self._fix = record if record.has_3d_fix else None
             return
-        fix = self._fix
+        fix, self._answered_ns = self._fix, record.t_ns
         if fix is None or abs(dt := (record.t_ns - fix.t_ns) * 1e-9) > APART_S:
             return
         north, east, _ = fix.v_n or (0.0, 0.0, 0.0)
@@ -86,8 +92,9 @@ class BeaconWitness:
 
     @property
     def contradicts(self) -> bool:
-        """Whether a beacon contradicted GNSS when it was last received."""
-        return any(residuals.significance > SIGMAS for residuals in self._residuals.values())
+        """Whether a beacon contradicts GNSS; one that was last compared before the window does not."""
+        since_ns = self._answered_ns - WINDOW_NS
+        return any(r.last_ns >= since_ns and r.significance > SIGMAS for r in self._residuals.values())
 
     def _add(self, record: RsbnFix, component: str, residual: float, is_believed: bool) -> None:
         track = self._residuals.setdefault((record.beacon, component), Residuals())

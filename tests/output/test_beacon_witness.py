@@ -72,3 +72,23 @@ def test_nothing_is_said_without_a_beacon_or_without_a_fix() -> None:
         fix = RsbnFix(now + k * SECOND_NS, now, 7, *BEACON, 1.0, 1e3, SIGMA_AZIMUTH, SIGMA_RANGE)
         flight.witness.receive(fix, is_believed=True)
     assert not flight.witness.contradicts
+
+
+def test_a_beacon_that_is_no_longer_received_contradicts_nothing() -> None:
+    """One that lied and fell silent was the witness for the whole flight, beside others that agree."""
+    flight = Flight(1)
+    flight.fly(60)
+    flight.range = 3000.0
+    flight.fly(25)
+    assert flight.witness.contradicts
+    other = displace(*BEACON, 20e3, 0.0, 0.0)
+    for k in range(21):
+        flight.seconds += 1.0
+        now = round(flight.seconds * SECOND_NS) + 10**12
+        true = displace(*START, 25.0 * flight.seconds, 0.0, 300.0)
+        fix = Gnss(now, now, 0, now // 1000, 3, *true, v_n=(25.0, 0.0, 0.0))
+        flight.witness.receive(fix, is_believed=True)
+        line = slant_range_azimuth(other, true)
+        answer = RsbnFix(now, now, 8, *other, line.azimuth, line.slant_range, SIGMA_AZIMUTH, SIGMA_RANGE)
+        flight.witness.receive(answer, is_believed=True)
+        assert flight.witness.contradicts == (k < 20)
