@@ -261,9 +261,11 @@ def resolve_pending(state: State, pending: Pending, settings: Settings) -> Step:
             for z in fix_observations.from_rsbn(record, point, config.rsbn)
             if used & fix_observations.source_of(z)
         )
-        if state.gnss_fix is not None and abs(state.gnss_fix[0].t_ns - record.t_ns) <= TOGETHER_NS:
+        is_believed = (_gnss_false(state) or 0.0) < hypotheses(state, settings).settings.suspect
+        by_gnss = state.gnss_fix if is_believed else None
+        if by_gnss is not None and abs(by_gnss[0].t_ns - record.t_ns) <= TOGETHER_NS:
             # the correction nominal minus GNSS of a moment ago holds now: the error drifts by metres a minute
-            fix_of_gnss, nominal = state.gnss_fix
+            fix_of_gnss, nominal = by_gnss
             observations += fix_observations.from_gnss(fix_of_gnss, nominal, config.gnss, pending.centre)
             used |= Source.GNSS
         half = state.half

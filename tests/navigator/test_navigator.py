@@ -29,6 +29,7 @@ from companion.nav.geometry import (
 )
 from companion.navigator import Navigator, measurements, past_states
 from companion.navigator.channel import Nominal
+from companion.navigator.hypotheses import GNSS
 from companion.navigator.inertial_track import Point
 from companion.navigator.ins_channel import ins_channel
 from companion.navigator.state import EXCLUDED, SUSPECT, source_name
@@ -824,6 +825,25 @@ def test_azimuth_and_range_in_messages_of_their_own_are_one_fix(apart_s: float) 
         assert math.dist(a.correction_n, b.correction_n) < 0.1 + 30.0 * apart_s
         assert b.covariance == pytest.approx(a.covariance, rel=0.02, abs=100.0)
         assert a.sources == b.sources
+
+
+def test_a_gnss_that_is_suspect_joins_no_fix_of_a_beacon() -> None:
+    """With the answer it was one, 35 m off with a sigma of 2 m, and in the window of the guaranteed bound."""
+    navigator, joined = Navigator(CONFIG), dict[bool, int]()
+    navigator.handle(origin())
+    for record in (record for moment in flight(60, 60.0, 60.0)[:300] for record in moment.records):
+        if isinstance(record, Gnss) and record.t_ns > 20 * NS:
+            off = 15.0 * (record.t_ns / NS - 20.0)
+            record = structs.replace(record, lat=record.lat + off / 6.4e6)
+        navigator.handle(record)
+        before = navigator.state
+        navigator.settle()
+        if isinstance(record, RsbnFix):
+            is_suspect = before.false[GNSS] > 0.5
+            for fix in navigator._deferred:
+                assert not (is_suspect and isinstance(fix, Fix) and fix.sources & Source.GNSS)
+                joined[is_suspect] = joined.get(is_suspect, 0) + isinstance(fix, Fix)
+    assert joined == {False: 21, True: 9}
 
 
 @pytest.mark.parametrize("ranged", [True, False], ids=["with a range", "an azimuth alone"])
