@@ -29,7 +29,9 @@ def wind_shear(before: Ground, after: Ground) -> float:
     return SHEAR_M_S**2 * math.log(max(after.climbed / before.climbed, 1.0))
 
 
-def ground_phase(g: Ground, t: float, airspeed: float, speed: float, height: float | None) -> Ground:
+def ground_phase(
+    g: Ground, t: float, airspeed: float, speed: float, height: float | None, hovers: bool = False
+) -> Ground:
     """Follow parking, ground roll and flight.
 
     Airspeed is used only in flight: parked it measures nothing, and in the ground roll the wheels, not the
@@ -47,12 +49,14 @@ def ground_phase(g: Ground, t: float, airspeed: float, speed: float, height: flo
         True airspeed and speed over ground (m/s).
     height
         Pressure altitude (m), if any.
+    hovers
+        Whether the autopilot states that it hovers: slow, but not parked.
     """
     if airspeed < PARKED_M_S and speed < PARKED_M_S:
         since = t if g.slow_since is None else g.slow_since
         if g.flying and t - since < PARKED_S:
             return g._replace(slow_since=since)
-        return Ground(False, since, height)
+        return g._replace(flying=False, slow_since=since) if hovers else Ground(False, since, height)
     clear = is_clear(g, height)
     flying = g.flying or (airspeed > FLYING_M_S and (speed > PARKED_M_S if clear is None else clear))
     return lifted(g, height) if flying else Ground(False, None, g.parked_height, g.climbed)

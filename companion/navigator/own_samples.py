@@ -280,7 +280,8 @@ def air_data(state: State, record: AirData, settings: Settings) -> Step:
     if s.ground.flying and leads and (step := _step(s, record)) is not None:
         return state, [step]
     height = None if s.air.static is None else nominal.point.position.alt
-    ground = ground_phase(s.ground, record.t_ns * 1e-9, math.hypot(*V), speed, height)
+    hovers = s.hovering and not s.landed
+    ground = ground_phase(s.ground, record.t_ns * 1e-9, math.hypot(*V), speed, height, hovers)
     state = _sheared(state, ground)
     if not ground.flying:
         return _straight_on(state, record, settings)

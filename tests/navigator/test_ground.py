@@ -6,7 +6,11 @@ import math
 
 import pytest
 
+from companion.config import load
+from companion.navigator import Navigator
 from companion.navigator.ground import CLEAR_M, SHEAR_M_S, SHEAR_TOP_M, Ground, ground_phase, wind_shear
+from companion.records import AirData, Attitude, Gnss, Pressure, Vehicle
+from companion.units import SECOND_NS
 
 
 def phases(*samples: tuple[float, float, float | None]) -> list[bool]:
@@ -55,3 +59,25 @@ def test_a_pitot_behind_a_running_propeller_is_no_flight() -> None:
 @pytest.mark.parametrize("seconds", [9, 11])
 def test_a_flight_ends_after_ten_slow_seconds(seconds: int) -> None:
     assert phases((20.0, 20.0, None), *[(1.0, 1.0, None)] * (seconds + 1))[-1] == (seconds < 10)
+
+
+@pytest.mark.parametrize("states", [True, False])
+def test_a_vtol_that_hovers_is_not_parked(states: bool) -> None:
+    """In a cruise at the height of the hover its airspeed was not used."""
+    navigator = Navigator(load(flags={"output.profile": "ardupilot"}, environment={}))
+    for k in range(600):
+        t_ns, cruises = (k + 1) * SECOND_NS // 10, k >= 450
+        static = 101_325.0 - (600.0 if k >= 150 else 0.0) - 1e-3 * k  # 50 m up
+        speed = 20.0 if cruises else 0.0
+        navigator.handle(Attitude(t_ns, t_ns, 0.0, 0.0, 1e-6 * k))
+        if k % 5:
+            continue
+        if states:
+            vehicle = Vehicle(t_ns, t_ns, fixed_wing=True, flying=k >= 150, hovering=not cruises)
+            navigator.handle(vehicle)
+        north = 0.1 * speed * max(k - 450, 0) / 6.4e6
+        fix = Gnss(t_ns, t_ns, 0, t_ns // 1000, 3, 0.9 + north, 0.6, 100.0, 1.5, 3.0, v_n=(speed, 0.0, 0.0))
+        for record in (Pressure(t_ns, t_ns, static), fix):
+            navigator.handle(record)
+        navigator.handle(AirData(t_ns, t_ns, speed + 1e-3 * math.sin(k), sensed=True))
+    assert navigator.state.sensors.ground.flying == states
