@@ -37,7 +37,7 @@ class Reckoner(Struct, frozen=True):
     attitude: Attitude | None = None
     air: AirData | None = None
     static: float | None = None
-    static_ns: int = 0
+    static_ns: int = -5 * CLIMB_NS
     climb: float = 0.0
 
     def climb_at(self, t_ns: int) -> float:

@@ -33,6 +33,7 @@ from companion.navigator.state import (
     VelocityError,
     corrected,
     estimate,
+    held_s,
     hypotheses,
     is_jammed,
     source_name,
@@ -126,7 +127,8 @@ def _believed(state: State, record: Gnss, settings: Settings) -> Step:
     assert nominal is not None
     since = math.inf if state.gnss_ns is None else (record.t_ns - state.gnss_ns) * 1e-9
     part = min(since, config.correlation_s) / config.correlation_s
-    level = height_error.update(state.level, record, nominal.point, part, GATE_SIGMA**2)
+    held = held_s(state, nominal.t_ns)
+    level = height_error.update(state.level, record, nominal.point, part, GATE_SIGMA**2, held)
     if level.refused_ns is not None:
         off = abs(nominal.point.position.alt - level.error - record.alt_msl)
         source = f"height of gnss {record.receiver}"

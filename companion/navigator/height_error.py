@@ -22,6 +22,8 @@ PATIENCE_NS = 10_000_000_000  # what goes on contradicting for so long is believ
 #: Between two readings no height changes by more: noise, manoeuvres, and a climb or a dive.
 STEP_M, CLIMB_M_S = 20.0, 200.0
 WEATHER_M = 100.0  # one sigma of a pressure altitude at sea level: 12 hPa
+#: A height that no pressure follows climbs or sinks by so much (m/s), one sigma, for so long (s).
+HELD_M_S, HELD_S = 10.0, 30.0
 NEARER_SIGMA = 3.0  # so much nearer to the standard atmosphere a height of GNSS is the likelier one
 
 
@@ -52,13 +54,17 @@ def stepped(level: Level, up: float) -> Level:
     return level._replace(error=level.error + up, alt=level.alt + up)
 
 
-def at(level: Level, ins: Point) -> Level:
-    """The error at the time and height of `ins`; before the first fix it is what it is everywhere."""
+def at(level: Level, ins: Point, held_s: float = 0.0) -> Level:
+    """The error at the time and height of `ins`; before the first fix it is what it is everywhere.
+
+    For `held_s` nothing has measured the height.
+    """
     if level.t_ns is None:
         return level
     climb, dt = ins.position.alt - level.alt, (ins.t_ns - level.t_ns) * 1e-9
     variance, covariance, of_share = level.covariance
     variance += climb * (2.0 * covariance + climb * of_share) + DRIFT * max(dt, 0.0)
+    variance += (HELD_M_S * min(held_s, HELD_S)) ** 2
     covariance += climb * of_share
     return level._replace(
         error=level.error + climb * level.share,
@@ -68,15 +74,15 @@ def at(level: Level, ins: Point) -> Level:
     )
 
 
-def update(level: Level, record: Gnss, ins: Point, part: float, gate: float) -> Level:
+def update(level: Level, record: Gnss, ins: Point, part: float, gate: float, held_s: float = 0.0) -> Level:
     """With the height of one fix, refused if its squared innovation is beyond `gate` times its variance.
 
     `part` is the share of one independent fix that this one is worth, its noise being correlated. If it is
     the height of GNSS that stepped, the longer of the two runs of fixes is believed, or the one that is
-    nearer to the standard atmosphere by far.
+    nearer to the standard atmosphere by far. A height that was held for `held_s` is that of the fix.
     """
     first, since_ns = level.t_ns is None, ins.t_ns if level.since_ns is None else level.since_ns
-    now = at(level, ins)._replace(t_ns=ins.t_ns, alt=ins.position.alt)
+    now = at(level, ins, held_s)._replace(t_ns=ins.t_ns, alt=ins.position.alt)
     variance, covariance, of_share = now.covariance
     noise = max(record.sigma_vertical or 0.0, LEAST_M) ** 2
     nu = ins.position.alt - record.alt_msl - now.error
@@ -92,17 +98,13 @@ def update(level: Level, record: Gnss, ins: Point, part: float, gate: float) -> 
             return now
         variance += nu * nu  # the claim was wrong
         since_ns = ins.t_ns
+    now = now._replace(refused_ns=None, since_ns=since_ns, last=(record.t_ns, record.alt_msl))
+    if held_s > 0.0:
+        return now._replace(error=now.error + nu, covariance=(noise, 0.0, of_share))
     k = variance / (variance + noise / part)
     k_share = covariance / (variance + noise / part)
     left = ((1.0 - k) * variance, (1.0 - k) * covariance, of_share - k_share * covariance)
-    return now._replace(
-        error=now.error + k * nu,
-        share=now.share + k_share * nu,
-        covariance=left,
-        refused_ns=None,
-        since_ns=since_ns,
-        last=(record.t_ns, record.alt_msl),
-    )
+    return now._replace(error=now.error + k * nu, share=now.share + k_share * nu, covariance=left)
 
 
 def _is_nearer(alt: float, error: float, than: float) -> bool:

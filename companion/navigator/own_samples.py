@@ -21,6 +21,7 @@ from companion.navigator import (
     standing,
     strapdown_channel,
 )
+from companion.navigator.air_data_channel import CLIMB_NS
 from companion.navigator.channel import Nominal
 from companion.navigator.ground import (
     FLYING_M_S,
@@ -49,6 +50,7 @@ from companion.navigator.state import (
     estimate,
     gnss_climb,
     gnss_is_received,
+    held_s,
     hypotheses,
     with_sensors,
 )
@@ -143,11 +145,14 @@ def pressure(state: State, record: Pressure, settings: Settings) -> Step:
         state, out = _straight_on(state, record, settings)
         return state, [rejection, *out]
     air = air_data_channel.sense(s.air, record)
+    held, before = held_s(state, record.t_ns), state.nominal
     state = with_sensors(state, air=air)
-    if s.air.static is None and state.nominal is not None and state.level.t_ns is not None:
-        nominal = _at_height(state.nominal, state.sensors)
-        up = nominal.point.position.alt - state.nominal.point.position.alt
-        state = structs.replace(state, nominal=nominal, level=height_error.stepped(state.level, up))
+    fixed_ns = state.level.t_ns
+    if before is not None and fixed_ns is not None and fixed_ns - s.air.static_ns > CLIMB_NS:
+        # the height has been that of the fixes, and goes on from there
+        nominal, level = _at_height(before, state.sensors), height_error.at(state.level, before.point, held)
+        level = height_error.stepped(level, nominal.point.position.alt - before.point.position.alt)
+        state = structs.replace(state, nominal=nominal, level=level)
     return _straight_on(state, record, settings)
 
 

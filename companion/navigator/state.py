@@ -178,6 +178,14 @@ def has_witness(state: State, settings: Settings) -> bool:
     return any(now - beacon.last_ns < timeout for beacon in state.beacons)
 
 
+def held_s(state: State, t_ns: int) -> float:
+    """How long neither a pressure nor a fix has measured the height, s; 0 while pressures come."""
+    static_ns = state.sensors.air.static_ns
+    if state.nominal is None or state.nominal.interval is None or t_ns - static_ns <= CLIMB_NS:
+        return 0.0
+    return max(t_ns - max(static_ns, state.level.t_ns or 0), 0) * 1e-9
+
+
 def levelled(point: Point, state: State) -> Point:
     """The nominal point at the height corrected by GNSS."""
     lat, lon, alt = point.position
