@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import asyncio
 import os
-import socket
 import struct
 import sys
 import time
@@ -27,8 +26,7 @@ from companion.printable import printable
 from companion.runtime.exposure import exposure
 from companion.runtime.input_monitor import describe_silence
 from companion.runtime.signing_key import SigningKey
-from companion.transport.connection import reason
-from companion.transport.reconnect import Address, CannotListen, Connection, connect
+from companion.transport.reconnect import Address, CannotListen, Connection, connect, describe_failure
 
 CONNECT_TIMEOUT_S = 10.0
 #: Limit on the examination and on setting parameters, however slow the line is.
@@ -182,17 +180,7 @@ def describe_open_error(address: Address, error: OSError) -> str:
     """Describe why a link cannot be opened, and what to do."""
     if isinstance(error, CannotListen):  # it names the address
         return f"{error.strerror}; is `companion run` still running?"
-    return f"{address}: {reason(error)}{_advice(error)}"
-
-
-def _advice(error: OSError) -> str:
-    if isinstance(error, PermissionError):
-        return "; add this user to the group of the serial port (usually dialout) and log in again"
-    if isinstance(error, ConnectionRefusedError):
-        return "; start the program that listens there, or give another port"
-    if isinstance(error, socket.gaierror):
-        return "; check the host name, or give an IP address"
-    return ""
+    return describe_failure(address, error)
 
 
 @click.command("doctor")

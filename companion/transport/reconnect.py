@@ -14,6 +14,7 @@ async for connection in connections(Address.parse("udpin:127.0.0.1:14550"), rand
 from __future__ import annotations
 
 import asyncio
+import socket
 from collections.abc import AsyncIterator, Callable, Iterator
 
 from companion.transport.address import Address
@@ -31,6 +32,7 @@ __all__ = [
     "cannot_listen",
     "connect",
     "connections",
+    "describe_failure",
     "pair",
 ]
 
@@ -85,7 +87,7 @@ async def connections(
         except OSError as error:
             if is_first and isinstance(error, CannotListen):
                 raise
-            line = f"{address}: {reason(error)}; trying again"
+            line = f"{describe_failure(address, error)}; trying again"
             if line != last_report:
                 report(line)
             last_report = line
@@ -99,6 +101,21 @@ async def connections(
                 pauses = back_off(random)
         is_first = False
         await asyncio.sleep(next(pauses))
+
+
+def describe_failure(address: Address, error: OSError) -> str:
+    """Describe why a link cannot be opened, and what to do."""
+    return f"{address}: {reason(error)}{_advice(address, error)}"
+
+
+def _advice(address: Address, error: OSError) -> str:
+    if isinstance(error, PermissionError) and address.kind == "serial":
+        return "; add this user to the group of the serial port (usually dialout) and log in again"
+    if isinstance(error, ConnectionRefusedError):
+        return "; start the program that listens there, or give another port"
+    if isinstance(error, socket.gaierror):
+        return "; check the host name, or give an IP address"
+    return ""
 
 
 def back_off(random: Callable[[], float]) -> Iterator[float]:

@@ -3,6 +3,7 @@ and exit codes. Only the observation times are shortened."""
 
 import asyncio
 import contextlib
+import errno
 import io
 import json
 import os
@@ -145,7 +146,9 @@ def test_missing_or_forbidden_device_is_one_sentence() -> None:
     assert "no such device; see `ls /dev/serial/by-id`" in line(
         doctor("--connect", "serial:/dev/ttyNONE:57600")
     )
-    assert "dialout" in command._advice(PermissionError(13, "Permission denied"))
+    denied = PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+    text = command.describe_open_error(Address("serial", "/dev/ttyNONE", 57600), denied)
+    assert "add this user to the group of the serial port (usually dialout)" in text
 
 
 def test_yes_without_apply_and_an_empty_link_are_rejected() -> None:

@@ -96,4 +96,5 @@ async def test_unknown_host_is_reported(monkeypatch: pytest.MonkeyPatch) -> None
     await asyncio.sleep(0.5)
     waiting.cancel()
     await asyncio.gather(waiting, return_exceptions=True)
-    assert reports == ["tcp:no.such:1: Name or service not known; trying again"]
+    advice = "check the host name, or give an IP address"
+    assert reports == [f"tcp:no.such:1: Name or service not known; {advice}; trying again"]

@@ -77,6 +77,22 @@ async def test_busy_device_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
             await connect(Address("serial", "/dev/ttyFC", 57600))
 
 
+async def test_forbidden_device_is_reported_with_the_group(monkeypatch: pytest.MonkeyPatch) -> None:
+    def forbidden(*_: object) -> int:
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+
+    reports: list[str] = []
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "open", forbidden)
+        links = connections(Address("serial", "/dev/ttyFC", 57600), lambda: 1.0, reports.append)
+        waiting = asyncio.ensure_future(anext(links))
+        await until(lambda: reports)
+    waiting.cancel()
+    await asyncio.gather(waiting, return_exceptions=True)
+    (report,) = reports
+    assert "add this user to the group of the serial port (usually dialout)" in report
+
+
 async def test_full_line_does_not_block() -> None:
     master, slave = pty.openpty()
     line = await connect(Address("serial", os.ttyname(slave), 57600))

@@ -93,7 +93,8 @@ async def test_tcp_both_ways_and_again_after_a_loss() -> None:
     waiting.cancel()
     await asyncio.gather(waiting, return_exceptions=True)
     await client.aclose()
-    assert reports[0] == f"tcp:127.0.0.1:{port}: {os.strerror(errno.ECONNREFUSED)}; trying again"
+    advice = "start the program that listens there, or give another port"
+    assert reports[0] == f"tcp:127.0.0.1:{port}: {os.strerror(errno.ECONNREFUSED)}; {advice}; trying again"
 
 
 def option(connection: Connection, name: str) -> int:
