@@ -615,7 +615,9 @@ class CompanionCore:
             events = self._inputs.update(leading.session, self._config, leading.sender.autopilot, now_ns)
         else:
             silent = [
-                (name, link.session, link.has_bytes) for name, link in self.links.items() if not link.stations
+                (name, link.session, link.has_bytes)
+                for name, link in self.links.items()
+                if link.is_open and not link.stations
             ]
             events = self._inputs.report_silence(silent, now_ns)
         for event in events:

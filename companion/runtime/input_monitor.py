@@ -176,10 +176,12 @@ class InputMonitor:
         return events
 
     def report_silence(self, sessions: Collection[tuple[str, Session, bool]], now_ns: int) -> list[Event]:
-        """Return one report for each link once no autopilot has been received since the start.
+        """Return one report for each link once no autopilot has been received since the first was open.
 
-        `sessions` has the name and session of each link, and whether bytes arrived.
+        `sessions` has the name and session of each open link, and whether bytes arrived.
         """
+        if not sessions:
+            return []
         self._start_ns = now_ns if self._start_ns is None else self._start_ns
         if self._silence_reported or now_ns - self._start_ns < NO_AUTOPILOT_AFTER:
             return []

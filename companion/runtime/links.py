@@ -30,6 +30,7 @@ class Link:
         self.session = open_session(config, signing, number)
         self.sender = Sender(self.session.clock)
         self.pace = Pace()  # of what was asked for on this link
+        self.is_open = True  # cleared by the service while the address cannot be opened
         self.has_bytes = False  # anything was received, MAVLink or not
         self.stations: set[int] = set()  # the ground stations received
         self.standing = 0  # how well it works: 2 in both directions, 1 from the autopilot, 0 it is quiet

@@ -133,7 +133,9 @@ class Service:
         """Serve one link; reopen it whenever it fails."""
         link = self.core.links[name]
         judge = partial(self._judge, link)
+        link.is_open = False
         async for stream in connections(self._addresses[name], random.random, self.report, judge):
+            link.is_open = True
             link.session.reader.close()  # what is left of a frame of the connection before
             self._connections[name], self._dropped_before[name] = stream, link.dropped
             self._notifier.ready()
@@ -146,6 +148,7 @@ class Service:
                 self.report(f"{error}; reopening")
             self._count_dropped()
             del self._connections[name]
+            link.is_open = False
 
     def _judge(self, link: Link) -> Callable[[bytes], bool]:
         is_proven = link.session.judge()

@@ -749,6 +749,19 @@ def test_silence_is_reported_once_with_what_to_check() -> None:
     assert flight.core.status().text() == "waiting for an autopilot"
 
 
+def test_silence_is_counted_from_the_time_at_which_the_link_is_open() -> None:
+    flight = Flight("serial:/dev/ttyS0:57600")
+    (link,) = flight.core.links.values()
+    link.is_open = False
+    for number in range(200):
+        link.is_open = number >= 100
+        flight.now += 100 * MS
+        flight.core.poll(flight.now)
+        assert event_texts(flight) == [] or number >= 150
+    (text,) = event_texts(flight)
+    assert "no autopilot in 5 s: no data received; check the wiring" in text
+
+
 @pytest.mark.parametrize(
     ("system_id", "kind", "advice"),
     [

@@ -187,6 +187,7 @@ def test_missing_serial_device_is_reported_once_and_the_other_link_works(tmp_pat
 
             await until(has_replies)
             await asyncio.sleep(1.0)  # several attempts
+            assert [link.is_open for link in service.core.links.values()] == [False, True]
 
     events = serve(tmp_path, (missing, f"udpin:{LOOPBACK}:{port}"), play)
     assert sum("ttyNONE" in event.text for event in events) == 1
