@@ -277,6 +277,8 @@ _NAMES = {
     "Reboot": "reboots",
     "TimeStep": "steps of the autopilot's time",
     "Event": "events",
+    "/link/Event": "events of the link",
+    "/link/Rejection": "rejections of the link",
     "Reset": "resets",
     "Smoothed": "smoothed track",
     "Truth": "true position",
@@ -287,7 +289,7 @@ def topic_name(topic: str) -> str:
     """Return the name of a topic for the user."""
     kind = topic.rsplit("/", 1)[-1]
     return (
-        _NAMES.get(kind, kind)
+        _NAMES.get(topic, _NAMES.get(kind, kind))
         if topic.startswith(("/in/", "/out/", "/link/", "/truth/"))
         else topic.lstrip("/")
     )

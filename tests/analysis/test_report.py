@@ -731,6 +731,8 @@ def test_a_share_below_100_percent_is_not_written_as_100_percent(assessed):
 def test_every_kind_of_record_has_a_name_for_users():
     for kind in (*INPUTS, *OUTPUTS, Truth):
         assert topic_name(flight_log.topic_of(kind)) != kind.__name__, kind
+    for kind in (Event, Rejection):
+        assert topic_name(f"/link/{kind.__name__}") != topic_name(flight_log.topic_of(kind))
 
 
 def test_a_flight_of_no_consequence_is_judged_by_its_reset():
