@@ -158,7 +158,7 @@ def command(
     runner.autopilot.is_armed = not disarmed
     minutes = chosen.duration_s / 60.0
     click.echo(
-        f"{chosen.name}: {minutes:.0f} min as {chosen.autopilot} over {address}; stop with ^C", err=True
+        f"{chosen.name}: {minutes:.0f} min as {chosen.autopilot} over {address}; stop with Ctrl-C", err=True
     )
     runner.run_command()
 

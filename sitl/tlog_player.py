@@ -190,5 +190,5 @@ def command(log: Path, connect: str, from_s: float, to_s: float, speed: float) -
         address,
         lambda text: click.echo(text, err=True),
     )
-    click.echo(f"playing {log} over {address}; stop with ^C", err=True)
+    click.echo(f"playing {log} over {address}; stop with Ctrl-C", err=True)
     runner.run_command()
