@@ -362,7 +362,9 @@ def _vfr_hud(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
 
 @_of("AIRSPEED")
 def _airspeed(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
-    """Sent only where there is a sensor; so is the word that it fails."""
+    """Sent only where there is a sensor; so is the word that it fails. Of a second one only while in use."""
+    if m.id > 0 and not m.flags & mavlink.AIRSPEED_SENSOR_USING:
+        return ()
     t_ns, healthy = _unstamped(rx, sender), not m.flags & mavlink.AIRSPEED_SENSOR_UNHEALTHY
     state = AirspeedSensor(t_ns, rx, healthy)
     if not healthy:

@@ -243,6 +243,8 @@ def test_airspeed_message_is_of_a_sensor_and_tells_its_health() -> None:
     assert sensor == r.AirspeedSensor(RX, RX, True)
     assert air == r.AirData(RX, RX, 25.0, sensed=True)
     assert decoded("AIRSPEED", airspeed=63.5, flags=1) == (r.AirspeedSensor(RX, RX, False),)
+    assert decoded("AIRSPEED", id=1, airspeed=8.0, flags=0) == ()  # of two sensors the one that is not used
+    assert decoded("AIRSPEED", id=1, airspeed=25.0, flags=2) == (sensor, air)
     assert one("VFR_HUD", airspeed=25.0).sensed is None  # it may be the estimator's own number
 
 
