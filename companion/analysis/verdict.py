@@ -30,6 +30,7 @@ from companion.analysis.summary import (
 )
 
 REJECTED_S = 10.0  # fixes rejected for longer are worth a look
+LEAST_S = 10.0  # a shorter estimate is not judged
 
 Level = Literal["good", "caution", "fault"]
 
@@ -259,6 +260,14 @@ def _no_reference(a: Assessment) -> Verdict | None:
     return Verdict("caution", "There is nothing to compare the estimate with.", "unknown", "accuracy")
 
 
+def _too_short(a: Assessment) -> Verdict | None:
+    seconds = sum(row.seconds for row in a.rows if row.phase != flight_events.NO_ESTIMATE)
+    if seconds >= LEAST_S:
+        return None
+    reason = f"There is an estimate of {format_duration(seconds)}: less than {LEAST_S:.0f} s show nothing."
+    return Verdict("caution", reason, format_duration(seconds), "with an estimate")
+
+
 def _kept(a: Assessment) -> Verdict:
     worst = worst_of(a).estimate
     happened = describe_gnss(a)
@@ -295,6 +304,7 @@ _RULES: tuple[Callable[[Assessment], Verdict | None], ...] = (
     _unlimited,
     _rejections,
     _torn_or_reset,
+    _too_short,
 )
 
 

@@ -538,6 +538,14 @@ def test_verdict_names_the_number_that_decides(kind, level, number, reason):
     assert reason in verdict.reason
 
 
+def test_an_estimate_of_seconds_is_not_judged():
+    verdict = judge_flight(collected([r for r in flight_records() if r.t_ns < START + 5 * S]))
+    assert (verdict.level, verdict.what) == ("caution", "with an estimate")
+    assert "less than 10 s show nothing" in verdict.reason
+    longer = judge_flight(collected([r for r in flight_records() if r.t_ns < START + 15 * S]))
+    assert longer.level == "good"
+
+
 def test_phases_without_a_useful_bound_are_counted():
     a = assess_flight(flight(protection=9.0))
     rows = [a.rows[0], a.rows[1]._replace(held=None, share=None, inside=None), a.rows[2]]
