@@ -595,7 +595,7 @@ class CompanionCore:
         return int(mavlink.MAV_STATE_CRITICAL if self._stale or untrusted else mavlink.MAV_STATE_ACTIVE)
 
     def _report_staleness(self, now_ns: int) -> None:
-        """Report when solutions stop and resume: the inertial channel stopped or froze."""
+        """Report when solutions stop and resume: the channel stopped, or no fix begins the estimate again."""
         if self._solution is None:
             return
         age = now_ns - self._solution.rx_ns
@@ -603,8 +603,9 @@ class CompanionCore:
             return
         self._stale = not self._stale
         if self._stale:
-            text = f"no solution for {age / SECOND_NS:.0f} s: no data from the inertial channel"
-            self.report(Severity.ERROR, text, now_ns)
+            has_begun = self._navigator.state.fixed
+            why = "no data from the inertial channel" if has_begun else "no fix to begin again from"
+            self.report(Severity.ERROR, f"no solution for {age / SECOND_NS:.0f} s: {why}", now_ns)
         else:
             self.report(Severity.NOTICE, "solutions resumed", now_ns)
 

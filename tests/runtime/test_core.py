@@ -510,6 +510,17 @@ def test_navigation_restarts_after_a_reboot() -> None:
     assert any(at > flight.now - SECOND for at in flight.times_sent("ODOMETRY"))
 
 
+def test_after_a_reboot_without_a_fix_the_fix_is_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The channel arrives all the time."""
+    flight = Flight()
+    send = flight.send
+    flight.fly(6.0)
+    flight.boot = flight.now - SECOND
+    monkeypatch.setattr(flight, "send", lambda name, **values: name == "GPS_RAW_INT" or send(name, **values))
+    flight.fly(6.0)
+    assert "no solution for 2 s: no fix to begin again from" in event_texts(flight)
+
+
 def killed_and_begun_again(
     seconds: float, autopilot_boots: bool = False, system: int = 1
 ) -> tuple[Flight, Flight]:
