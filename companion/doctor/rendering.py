@@ -78,7 +78,8 @@ def summary(config: Config, diagnosis: Diagnosis) -> str:
     """Return what is not well, one line each."""
     lines = []
     if there := sum(found.has is not None for found in diagnosis.wrong_parameters):
-        lines.append(f"{_number(there, 'parameter')} wrong: --apply sets them, after confirmation.")
+        when = "once it is disarmed" if diagnosis.identity.is_armed else "after confirmation"
+        lines.append(f"{_number(there, 'parameter')} wrong: --apply sets them, {when}.")
     is_answering = all(found.what not in ("answers", "signing") for found in diagnosis.problems)
     if is_answering and (absent := len(diagnosis.wrong_parameters) - there):
         lines.append(

@@ -222,8 +222,10 @@ def test_change_requires_confirmation(monkeypatch: pytest.MonkeyPatch) -> None:
     assert command.confirm_change(diagnosis(), yes=True) == ""
     assert "nothing to set" in command.confirm_change(diagnosis(has=None), yes=True)
     assert "nothing to set" in command.confirm_change(diagnosis(has=1), yes=True)
-    armed = Identity(1, "px4", "fixed wing", "", is_armed=True)
-    assert "armed" in command.confirm_change(diagnosis()._replace(identity=armed), yes=True)
+    armed = diagnosis()._replace(identity=Identity(1, "px4", "fixed wing", "", is_armed=True))
+    assert "armed" in command.confirm_change(armed, yes=True)
+    assert "--apply sets them, after confirmation" in shown(diagnosis())
+    assert "--apply sets them, once it is disarmed" in shown(armed)
 
 
 def test_well_diagnosis_is_stated() -> None:
