@@ -8,12 +8,11 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
 from msgspec import structs
 
-from companion.estimate import bank as banks
 from companion.navigator import (
     air_data_channel,
+    air_velocity,
     height_error,
     measurements,
     own_channel,
@@ -31,8 +30,8 @@ from companion.navigator.ground import (
     lifted,
     wind_shear,
 )
-from companion.navigator.own_channel import AirspeedSums, OwnChannel, Sensors, Wind
-from companion.navigator.own_error_model import HELD, Airspeed, By
+from companion.navigator.own_channel import Sensors
+from companion.navigator.own_error_model import HELD, By
 from companion.navigator.progress import (
     carried,
     decided,
@@ -47,11 +46,11 @@ from companion.navigator.state import (
     Settings,
     State,
     Step,
-    estimate,
     gnss_climb,
     gnss_is_received,
     held_s,
     hypotheses,
+    own,
     with_sensors,
 )
 from companion.records import (
@@ -69,13 +68,9 @@ from companion.records import (
 )
 from companion.units import SECOND_NS
 
-AIRSPEED_EVERY_NS = 500_000_000  # gusts are correlated: more often adds nothing
 FOREIGN_EVERY_NS = SECOND_NS
-SAMPLE_M_S = 5.0  # of the velocity by single samples of drag: 2.4 to 8.6 m/s in six recorded copters
 TAKE_OFF_NS = 10 * SECOND_NS  # a multirotor is off the ground after it, at whatever height
 BLOCKED_M_S = 5.0  # slower, in flight, a pitot is blocked
-#: A pitot that fails is used for some seconds more, and the wind with it: that of so long ago comes after it.
-WIND_EVERY_NS, WINDS_NS, WIND_CHANGED_M_S = 10 * SECOND_NS, 30 * SECOND_NS, 1.0
 #: Between two samples, up to so far apart, no airspeed changes by more; one that did is not used for so long.
 STEP_M_S, STEP_M_S2, STEP_GAP_S, STEP_NS = 10.0, 10.0, 1.0, 10 * SECOND_NS
 
@@ -119,23 +114,15 @@ def _steady(state: State, record: Attitude, settings: Settings) -> Step:
     """Use a steady airspeed along the nose, as driver or as measurement: a fixed wing without a sensor."""
     if not settings.config.uses("air_data"):
         return _straight_on(state, record, settings)
-    state = _airspeed_from("steady", state, settings)
+    state = air_velocity.taken_from("steady", state, settings)
     steady_m_s = state.sensors.steady_m_s
     if steady_m_s is None:
-        steady_m_s = max(_estimated_airspeed(state), FLYING_M_S)
+        steady_m_s = max(air_velocity.estimated_airspeed(state), FLYING_M_S)
         state = with_sensors(state, steady_m_s=steady_m_s)
     V = own_error_model.air_velocity(steady_m_s, record.pitch, record.heading)
     if state.sensors.leads("air", record.t_ns):
         return _driven(with_sensors(state, air_ns=record.t_ns), record, "air", V, settings)
-    return (_measured(state, record, V, settings) if driver(state) == "imu" else state), []
-
-
-def _estimated_airspeed(state: State) -> float:
-    v_n, v_e = estimated_velocity(state)
-    if state.bank is None:
-        return math.hypot(v_n, v_e)
-    wind_n, wind_e = state.bank.x[int(state.bank.L.argmax()), own_error_model.WIND]
-    return math.hypot(v_n - wind_n, v_e - wind_e)
+    return (air_velocity.measured(state, record, V, settings) if driver(state) == "imu" else state), []
 
 
 def pressure(state: State, record: Pressure, settings: Settings) -> Step:
@@ -223,47 +210,11 @@ def _rotor_drag(state: State, record: Imu, settings: Settings) -> State:
     if taking_off and is_clear(s.ground, height) is False:
         return state  # the ground pushes too
     state = _sheared(state, lifted(s.ground, height))
-    state = _airspeed_from("drag", state, settings)
+    state = air_velocity.taken_from("drag", state, settings)
     force = strapdown_channel.drag_force(s.strap)
     if force is None:
         return state
-    return _measured(state, record, (-force[0] / drag, -force[1] / drag), settings)
-
-
-def _airspeed_from(airspeed: Airspeed, state: State, settings: Settings) -> State:
-    """Take the velocity through the air from something, and start its scale again if it was another."""
-    nominal = state.nominal
-    if state.bank is None or nominal is None or nominal.interval is None:
-        return state
-    if nominal.interval.airspeed == airspeed:
-        return state
-    sigma = own_error_model.scale_sigma(_own(settings).settings, airspeed)
-    bank = banks.renew(state.bank, [own_error_model.SCALE], [sigma])
-    if nominal.interval.airspeed == "pitot" and state.sensors.winds:
-        bank = _with_wind(bank, state.sensors.winds[0])
-    nominal = structs.replace(nominal, interval=nominal.interval._replace(airspeed=airspeed))
-    return with_sensors(
-        structs.replace(state, bank=bank, nominal=nominal), sums=None, winds=(), steady_m_s=None
-    )
-
-
-def _with_wind(bank: banks.Bank, wind: Wind) -> banks.Bank:
-    at = own_error_model.WIND
-    sigma = math.sqrt(wind.variance + WIND_CHANGED_M_S**2)
-    bank = banks.renew(bank, range(at.start, at.stop), (sigma, sigma))
-    return banks.shift(bank, np.array((*(0.0,) * at.start, wind.north, wind.east)))
-
-
-def _wind_noted(state: State, t_ns: int, settings: Settings) -> State:
-    """Remember the wind beside a pitot that is used."""
-    winds = state.sensors.winds
-    if state.bank is None or (winds and t_ns - winds[-1].t_ns < WIND_EVERY_NS):
-        return state
-    x, P = estimate(state, settings)
-    north, east = own_error_model.WIND.start, own_error_model.WIND.start + 1
-    wind = Wind(t_ns, float(x[north]), float(x[east]), float(0.5 * (P[north, north] + P[east, east])))
-    kept = (w for w in winds if t_ns - w.t_ns <= WINDS_NS)
-    return with_sensors(state, winds=(*kept, wind))
+    return air_velocity.measured(state, record, (-force[0] / drag, -force[1] / drag), settings)
 
 
 def air_data(state: State, record: AirData, settings: Settings) -> Step:
@@ -291,12 +242,13 @@ def air_data(state: State, record: AirData, settings: Settings) -> Step:
     if not ground.flying:
         return _straight_on(state, record, settings)
     state = with_sensors(state, air_ns=record.t_ns, pitot_ns=record.t_ns)
-    state = _wind_noted(_airspeed_from("pitot", state, settings), record.t_ns, settings)
+    state = air_velocity.taken_from("pitot", state, settings)
+    state = air_velocity.with_wind_noted(state, record.t_ns, settings)
     if leads:
         return _driven(with_sensors(state, steady=record), record, "air", V, settings)
     if driver(state) != "imu":
         return state, []
-    return _measured(carried(state, record.t_ns, settings), record, V, settings), []
+    return air_velocity.measured(carried(state, record.t_ns, settings), record, V, settings), []
 
 
 def _sheared(state: State, ground: Ground) -> State:
@@ -308,35 +260,6 @@ def _sheared(state: State, ground: Ground) -> State:
         interval = nominal.interval._replace(shear=nominal.interval.shear + sheared)
         state = structs.replace(state, nominal=structs.replace(nominal, interval=interval))
     return state
-
-
-def _measured(state: State, record: AirData | Attitude | Imu, V: Vector2, settings: Settings) -> State:
-    """Use a velocity `V` through the air (m/s) as a measurement, the mean of half a second at once."""
-    assert state.nominal is not None
-    s, v_n = state.sensors, state.nominal.point.v_n
-    sums = (s.sums or AirspeedSums(record.t_ns)).with_one((v_n[0], v_n[1]), V)
-    if record.t_ns - sums.start_ns < AIRSPEED_EVERY_NS:
-        return with_sensors(state, sums=sums)
-    if not isinstance(record, Imu) and not sums.is_one_way:
-        return with_sensors(state, sums=AirspeedSums(record.t_ns, V))
-    state = propagated(state, settings)
-    assert state.bank is not None
-    bank, known, n = state.bank, hypotheses(state, settings), sums.samples
-    mean, velocity = (sums.air[0] / n, sums.air[1] / n), (sums.velocity[0] / n, sums.velocity[1] / n)
-    by_imu = driver(state) == "imu"
-    manoeuvre = strapdown_channel.manoeuvre(s.mean_acceleration) if by_imu else 0.0
-    if isinstance(record, AirData):
-        taken = measurements.airspeed(bank, known, _own(settings), mean, velocity, manoeuvre)
-    elif isinstance(record, Attitude):
-        taken = measurements.steady_airspeed(bank, known, _own(settings), mean, velocity, manoeuvre)
-    else:
-        drag, heading = settings.config.air_data.rotor_drag_per_s, s.heading() or 0.0
-        variance = own_error_model.airspeed_variance(manoeuvre) + sums.scatter
-        variance += 0.0 if by_imu else SAMPLE_M_S**2
-        taken = measurements.rotor_drag(bank, known, _own(settings), mean, velocity, variance, heading, drag)
-    state = structs.replace(state, bank=taken.bank)
-    state = with_sensors(state, measured_ns=record.t_ns, sums=AirspeedSums(record.t_ns, V))
-    return decided(state, record, settings)
 
 
 def _step(s: Sensors, record: AirData) -> Rejection | None:
@@ -385,7 +308,7 @@ def foreign_position(state: State, record: LocalPosition, settings: Settings) ->
     assert state.nominal is not None
     v_n = state.nominal.point.v_n
     apart = (v_n[0] - velocity[0], v_n[1] - velocity[1])
-    taken = measurements.foreign_velocity(state.bank, hypotheses(state, settings), _own(settings), apart)
+    taken = measurements.foreign_velocity(state.bank, hypotheses(state, settings), own(settings), apart)
     return decided(structs.replace(state, bank=taken.bank), record, settings), []
 
 
@@ -436,8 +359,3 @@ def _at_height(nominal: Nominal, s: Sensors) -> Nominal:
     alt = air_data_channel.pressure_altitude(s.air.static)
     v_n = (point.v_n[0], point.v_n[1], -s.air.climb_at(point.t_ns))
     return structs.replace(nominal, point=point._replace(position=point.position._replace(alt=alt), v_n=v_n))
-
-
-def _own(settings: Settings) -> OwnChannel:
-    assert isinstance(settings.model.channel, OwnChannel)
-    return settings.model.channel

@@ -21,7 +21,7 @@ from companion.navigator.height_error import Level
 from companion.navigator.hypotheses import GNSS, SOURCES, TURNED_M_S, Hypotheses, Model, Situation
 from companion.navigator.inertial_track import Point
 from companion.navigator.minimax_bound import Guarantee
-from companion.navigator.own_channel import Sensors
+from companion.navigator.own_channel import OwnChannel, Sensors
 from companion.navigator.parallel_filters import Parallel
 from companion.navigator.scatter import Scatter
 from companion.navigator.trust import Held
@@ -176,6 +176,12 @@ def has_witness(state: State, settings: Settings) -> bool:
     now = state.nominal.t_ns if state.nominal else 0
     timeout = round(1e9 * settings.config.rsbn.timeout_s)
     return any(now - beacon.last_ns < timeout for beacon in state.beacons)
+
+
+def own(settings: Settings) -> OwnChannel:
+    """The own channel, where its samples are handled."""
+    assert isinstance(settings.model.channel, OwnChannel)
+    return settings.model.channel
 
 
 def held_s(state: State, t_ns: int) -> float:

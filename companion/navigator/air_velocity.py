@@ -1,0 +1,100 @@
+"""Velocity through the air, of a pitot, a multirotor's drag or a steady airspeed, as a measurement.
+
+Samples of half a second are one measurement. Where another sensor gives it, its scale starts again; where a
+pitot was given up, the wind is that of half a minute before.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from msgspec import structs
+
+from companion.estimate import bank as banks
+from companion.navigator import measurements, own_error_model, strapdown_channel
+from companion.navigator.own_channel import AirspeedSums, Wind
+from companion.navigator.own_error_model import Airspeed
+from companion.navigator.progress import decided, driver, estimated_velocity, propagated
+from companion.navigator.state import Settings, State, estimate, hypotheses, own, with_sensors
+from companion.records import AirData, Attitude, Imu, Vector2
+from companion.units import SECOND_NS
+
+AIRSPEED_EVERY_NS = 500_000_000  # gusts are correlated: more often adds nothing
+SAMPLE_M_S = 5.0  # of the velocity by single samples of drag: 2.4 to 8.6 m/s in six recorded copters
+#: A pitot that fails is used for some seconds more, and the wind with it: that of so long ago comes after it.
+WIND_EVERY_NS, WINDS_NS, WIND_CHANGED_M_S = 10 * SECOND_NS, 30 * SECOND_NS, 1.0
+
+
+def taken_from(airspeed: Airspeed, state: State, settings: Settings) -> State:
+    """Take the velocity through the air from something, and start its scale again if it was another."""
+    nominal = state.nominal
+    if state.bank is None or nominal is None or nominal.interval is None:
+        return state
+    if nominal.interval.airspeed == airspeed:
+        return state
+    sigma = own_error_model.scale_sigma(own(settings).settings, airspeed)
+    bank = banks.renew(state.bank, [own_error_model.SCALE], [sigma])
+    if nominal.interval.airspeed == "pitot" and state.sensors.winds:
+        bank = _with_wind(bank, state.sensors.winds[0])
+    nominal = structs.replace(nominal, interval=nominal.interval._replace(airspeed=airspeed))
+    return with_sensors(
+        structs.replace(state, bank=bank, nominal=nominal), sums=None, winds=(), steady_m_s=None
+    )
+
+
+def _with_wind(bank: banks.Bank, wind: Wind) -> banks.Bank:
+    at = own_error_model.WIND
+    sigma = math.sqrt(wind.variance + WIND_CHANGED_M_S**2)
+    bank = banks.renew(bank, range(at.start, at.stop), (sigma, sigma))
+    return banks.shift(bank, np.array((*(0.0,) * at.start, wind.north, wind.east)))
+
+
+def with_wind_noted(state: State, t_ns: int, settings: Settings) -> State:
+    """Remember the wind beside a pitot that is used."""
+    winds = state.sensors.winds
+    if state.bank is None or (winds and t_ns - winds[-1].t_ns < WIND_EVERY_NS):
+        return state
+    x, P = estimate(state, settings)
+    north, east = own_error_model.WIND.start, own_error_model.WIND.start + 1
+    wind = Wind(t_ns, float(x[north]), float(x[east]), float(0.5 * (P[north, north] + P[east, east])))
+    kept = (w for w in winds if t_ns - w.t_ns <= WINDS_NS)
+    return with_sensors(state, winds=(*kept, wind))
+
+
+def measured(state: State, record: AirData | Attitude | Imu, V: Vector2, settings: Settings) -> State:
+    """Use a velocity `V` through the air (m/s) as a measurement, the mean of half a second at once."""
+    assert state.nominal is not None
+    s, v_n = state.sensors, state.nominal.point.v_n
+    sums = (s.sums or AirspeedSums(record.t_ns)).with_one((v_n[0], v_n[1]), V)
+    if record.t_ns - sums.start_ns < AIRSPEED_EVERY_NS:
+        return with_sensors(state, sums=sums)
+    if not isinstance(record, Imu) and not sums.is_one_way:
+        return with_sensors(state, sums=AirspeedSums(record.t_ns, V))
+    state = propagated(state, settings)
+    assert state.bank is not None
+    bank, known, n = state.bank, hypotheses(state, settings), sums.samples
+    mean, velocity = (sums.air[0] / n, sums.air[1] / n), (sums.velocity[0] / n, sums.velocity[1] / n)
+    by_imu = driver(state) == "imu"
+    manoeuvre = strapdown_channel.manoeuvre(s.mean_acceleration) if by_imu else 0.0
+    if isinstance(record, AirData):
+        taken = measurements.airspeed(bank, known, own(settings), mean, velocity, manoeuvre)
+    elif isinstance(record, Attitude):
+        taken = measurements.steady_airspeed(bank, known, own(settings), mean, velocity, manoeuvre)
+    else:
+        drag, heading = settings.config.air_data.rotor_drag_per_s, s.heading() or 0.0
+        variance = own_error_model.airspeed_variance(manoeuvre) + sums.scatter
+        variance += 0.0 if by_imu else SAMPLE_M_S**2
+        taken = measurements.rotor_drag(bank, known, own(settings), mean, velocity, variance, heading, drag)
+    state = structs.replace(state, bank=taken.bank)
+    state = with_sensors(state, measured_ns=record.t_ns, sums=AirspeedSums(record.t_ns, V))
+    return decided(state, record, settings)
+
+
+def estimated_airspeed(state: State) -> float:
+    """Return the estimated speed through the air, m/s; that over ground before there is a wind."""
+    v_n, v_e = estimated_velocity(state)
+    if state.bank is None:
+        return math.hypot(v_n, v_e)
+    wind_n, wind_e = state.bank.x[int(state.bank.L.argmax()), own_error_model.WIND]
+    return math.hypot(v_n - wind_n, v_e - wind_e)
