@@ -24,7 +24,7 @@ UNFIT_ANSWERS = 10  # of a beacon, none of which fits, until it is reported
 #: A sensor is reported as not used once it has not been for so long, and as used again once it has been. A
 #: stream that is slow at the start is requested again within the first.
 UNUSED_NS, USED_NS = 12 * SECOND_NS, 60 * SECOND_NS
-STUCK_NS = 3 * SECOND_NS // 2  # a stale reading is reported once a second
+STUCK_NS = 5 * SECOND_NS // 2  # stale readings of 1 Hz are reported every second or two
 
 
 class _Use:
