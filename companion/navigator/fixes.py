@@ -33,6 +33,7 @@ from companion.navigator.state import (
     VelocityError,
     corrected,
     estimate,
+    gnss_is_believed,
     held_s,
     hypotheses,
     is_jammed,
@@ -134,7 +135,7 @@ def _believed(state: State, record: Gnss, settings: Settings) -> Step:
         source = f"height of gnss {record.receiver}"
         out.append(Rejection(record.t_ns, record.rx_ns, source, "outlier: innovation, m", off))
     pending = None
-    if state.false[GNSS] < hypotheses(state, settings).settings.suspect:
+    if gnss_is_believed(state, settings):
         pending = Pending(record, nominal.point, (0.0, 0.0), Source.GNSS)
     state = structs.replace(
         state,

@@ -227,9 +227,7 @@ def add_velocity(i: Interval, dt: float, velocity: Vector2) -> Interval:
 
 def add_held(i: Interval, dt: float) -> Interval:
     """Go straight on for `dt` (s), a multirotor ever more slowly."""
-    kept, way = (
-        (math.exp(-dt / HOVER_S), -HOVER_S * math.expm1(-dt / HOVER_S)) if i.by == "hover" else (1.0, dt)
-    )
+    kept, way = _first_order(dt, HOVER_S)[:2] if i.by == "hover" else (1.0, dt)
     n, e = i.velocity
     return i._replace(
         velocity=(kept * n, kept * e),

@@ -153,10 +153,9 @@ def _straight_on(state: State, record: Stamped, settings: Settings) -> Step:
 
 def imu(state: State, record: Imu, settings: Settings) -> Step:
     """Move the nominal trajectory by the specific force, in the level frame."""
-    config = settings.config
-    s = state.sensors
-    if record.source != config.strapdown.imu:
+    if record.source != settings.config.strapdown.imu:
         return state, []
+    s = state.sensors
     strap = strapdown_channel.receive(s.strap, record)
     if strap.why:
         state, outputs = _straight_on(with_sensors(state, strap=strap), record, settings)

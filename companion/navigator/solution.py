@@ -31,6 +31,7 @@ from companion.navigator.state import (
     State,
     Step,
     estimate,
+    gnss_is_believed,
     held_s,
     hypotheses,
     levelled,
@@ -262,8 +263,7 @@ def resolve_pending(state: State, pending: Pending, settings: Settings) -> Step:
             for z in fix_observations.from_rsbn(record, point, config.rsbn)
             if used & fix_observations.source_of(z)
         )
-        is_believed = (_gnss_false(state) or 0.0) < hypotheses(state, settings).settings.suspect
-        by_gnss = state.gnss_fix if is_believed else None
+        by_gnss = state.gnss_fix if gnss_is_believed(state, settings) else None
         if by_gnss is not None and abs(by_gnss[0].t_ns - record.t_ns) <= TOGETHER_NS:
             # the correction nominal minus GNSS of a moment ago holds now: the error drifts by metres a minute
             fix_of_gnss, nominal = by_gnss

@@ -144,6 +144,11 @@ def gnss_is_received(state: State, settings: Settings) -> bool:
     return bank is not None and bool(bank.t - bank.seen[GNSS] <= settings.config.gnss.timeout_s)
 
 
+def gnss_is_believed(state: State, settings: Settings) -> bool:
+    """Whether GNSS is not even suspect."""
+    return not state.false or state.false[GNSS] < hypotheses(state, settings).settings.suspect
+
+
 def is_jammed(state: State) -> bool:
     """Whether the receiver reported jamming or spoofing within the last seconds."""
     now = state.nominal.t_ns if state.nominal else 0
