@@ -366,10 +366,19 @@ class Navigator:
             if is_late:
                 if _is_old_answer(record):
                     back.used.add(self._state.rsbn_ns == record.t_ns)
-                last = self._last_solution_ns
-                outputs += [out for out in found if not isinstance(out, Solution) or out.t_ns > last]
+                outputs += self._not_superseded(found, now.rx_ns)
                 outputs += resolved
         return outputs if back.again else outputs + self._end_roll_back(back, now)
+
+    def _not_superseded(self, found: list[Output], now_ns: int) -> list[Output]:
+        """The outputs of a late record, without solutions older than the last one; others are of `now_ns`."""
+        outputs = list[Output]()
+        for out in found:
+            if not isinstance(out, Solution):
+                outputs.append(out)
+            elif out.t_ns > self._last_solution_ns:
+                outputs.append(structs.replace(out, rx_ns=now_ns))
+        return outputs
 
     def _end_roll_back(self, back: _RollBack, now: Input) -> list[Output]:
         """Let solutions come from the state with the late records; the first at once if it has a new fix."""

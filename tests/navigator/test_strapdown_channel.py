@@ -6,6 +6,7 @@ import gzip
 import heapq
 import itertools
 import math
+import random
 from collections.abc import Iterable, Iterator
 from functools import lru_cache
 from pathlib import Path
@@ -854,6 +855,21 @@ def test_late_answers_are_folded_in_at_their_own_time() -> None:
     prompt, found = navigated(in_time, truth), navigated(late, truth)
     assert found.error[-1] <= 3.0 * found.sigma[-1]
     assert abs(found.sigma[-1] - prompt.sigma[-1]) < 20.0  # four seconds more without a fix
+
+
+def test_solutions_of_bunches_out_of_order_arrive_in_order() -> None:
+    """A link delivers what it held back at once, in any order: no solution is older than the one before."""
+    records = [r for r in with_beacon(1) if LOSS - 10.0 < r.t_ns * 1e-9 < LOSS + 15.0]
+    shuffled, bunch_ns = list[Any](), NS // 5
+    for _, bunch in itertools.groupby(records, key=lambda r: r.rx_ns // bunch_ns):
+        held = list(bunch)
+        random.Random(len(shuffled)).shuffle(held)
+        end_ns = (held[0].rx_ns // bunch_ns + 1) * bunch_ns
+        shuffled += [msgspec.structs.replace(r, rx_ns=end_ns + k * 100_000) for k, r in enumerate(held)]
+    navigator = Navigator(STRAPDOWN)
+    found = [out for r in shuffled for out in navigator.handle(r) if isinstance(out, Solution)]
+    assert len(found) > 200
+    assert all(a.rx_ns <= b.rx_ns and a.t_ns < b.t_ns for a, b in itertools.pairwise(found))
 
 
 # ---------------------------------------------------------------------------------------------------------
