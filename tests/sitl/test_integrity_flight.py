@@ -4,13 +4,19 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import math
 
 import pytest
 
 from companion.config import Config, InertialConfig
+from companion.navigator import Navigator
+from companion.records import Solution
+from companion.units import SECOND_NS
 from sitl import loopback
 from sitl.campaign import flight
 from sitl.campaign.flight import SCENARIOS, FlightOrder, FlightResult, fly_order
+from sitl.faults import Fault
+from sitl.world import World
 
 pytestmark = pytest.mark.flight
 HARMLESS_M = 300.0
@@ -92,6 +98,21 @@ def test_guaranteed_bound_does_not_use_suspected_sources() -> None:
     assert result.rms_error is not None and result.rms_bound is not None
     assert result.rms_error <= result.rms_bound
     assert result.misleading_s == 0.0
+
+
+def test_a_beacon_that_answered_before_gnss_does_not_make_the_sigma_of_a_spoofed_flight_greater() -> None:
+    """It cannot exclude that GNSS was off by 60 m from its first fix on: 15 m of sigma, and PX4 lagged."""
+    spoof = Fault("gnss-spoof", 100.0, 540.0, 2.0)
+    spoofed = dataclasses.replace(SCENARIOS["stock"], seed=1, faults=(spoof,), gnss_outages=((0.0, 15.0),))
+    config = flight.config_of("stock")
+    navigator, found = Navigator(config), list[Solution]()
+    for record in World(spoofed).records(flight.sensors_of(config)):
+        if record.t_ns > 112 * SECOND_NS:
+            break
+        found += [out for out in navigator.handle(record) if isinstance(out, Solution)]
+        navigator.settle()
+    assert found[-1].gnss_false is not None and found[-1].gnss_false > 0.999
+    assert math.sqrt(max(found[-1].covariance[0], found[-1].covariance[3])) < 7.0
 
 
 @pytest.mark.long
