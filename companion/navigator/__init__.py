@@ -185,11 +185,11 @@ class Navigator:
 
     @property
     def births_due(self) -> bool:
-        """Whether hypotheses are to be born: the next measurement does it if `bear` does not."""
+        """Whether hypotheses are to be born or reduced: the next measurement does it if `bear` does not."""
         return births_due(self.state, self._settings)
 
     def bear(self) -> None:
-        """Ready the births that are due: 5 ms in which no answer waits. It changes no output."""
+        """Do half of the births that are due: 3 ms in which no answer waits. It changes no output."""
         if self._newest is None or not self.births_due:
             return
         state, outputs = guarded(self.state, self._newest, self._settings, with_births, self._newest)

@@ -12,7 +12,6 @@ import numpy as np
 from msgspec import structs
 
 from companion.estimate import bank as banks
-from companion.estimate.bank import Bank
 from companion.nav.geometry import displace
 from companion.navigator import minimax_bound, own_channel, parallel_filters
 from companion.navigator.channel import moved
@@ -22,6 +21,7 @@ from companion.navigator.solution import solve
 from companion.navigator.state import (
     EXCLUDED,
     SUSPECT,
+    Newborn,
     Settings,
     State,
     Step,
@@ -59,32 +59,47 @@ def carried(state: State, t_ns: int, settings: Settings) -> State:
 
 def births_due(state: State, settings: Settings) -> bool:
     """Whether births are due and not readied."""
-    bank = state.bank
-    if bank is None or (state.newborn is not None and state.newborn[0] is bank):
+    if state.bank is None:
         return False
+    if (ready := _readied(state)) is not None:
+        return not ready.is_reduced
     known = settings.model.hypotheses(Situation())  # the intervals are those of any
+    bank = state.bank
     return banks.births_due(bank, known.settings) or banks.jump_births_due(bank, known.layout, known.settings)
 
 
 def with_births(state: State, record: Stamped, settings: Settings) -> Step:
-    """Deferred update: ready the births that are due, for the next propagation.
+    """Deferred update: ready the births that are due, for the next propagation, or reduce those readied.
 
     Until a measurement has judged them, children would raise the protection level.
     """
-    return structs.replace(state, newborn=_born(state, settings)), []
+    ready = _readied(state)
+    newborn = _born(state, settings) if ready is None else _reduced(ready, state, settings)
+    return structs.replace(state, newborn=newborn), []
 
 
-def _born(state: State, settings: Settings) -> tuple[Bank, Bank]:
-    """The bank, and the bank after the births that are due."""
+def _readied(state: State) -> Newborn | None:
+    newborn = state.newborn
+    return newborn if newborn is not None and newborn.parent is state.bank else None
+
+
+def _born(state: State, settings: Settings) -> Newborn:
+    """The bank after the births that are due, where any are; not reduced."""
     bank = state.bank
     assert bank is not None
-    if state.newborn is not None and state.newborn[0] is bank:
-        return state.newborn
     known = hypotheses(state, settings)
     if not banks.births_due(bank, known.settings):
-        return bank, banks.jump_births(bank, known.layout, known.settings)
+        return Newborn(bank, banks.jump_births(bank, known.layout, known.settings), is_reduced=True)
     factor = {0: JAMMED, 1: JAMMED} if is_jammed(state) else None
-    return bank, banks.births(bank, known.layout, known.settings, factor)
+    grown = banks.births(bank, known.layout, known.settings, factor, reduced=False)
+    return Newborn(bank, grown, is_reduced=False)
+
+
+def _reduced(newborn: Newborn, state: State, settings: Settings) -> Newborn:
+    if newborn.is_reduced:
+        return newborn
+    known = hypotheses(state, settings)
+    return newborn._replace(bank=banks.reduce(newborn.bank, known.layout, known.settings), is_reduced=True)
 
 
 def propagated(state: State, settings: Settings) -> State:
@@ -93,7 +108,7 @@ def propagated(state: State, settings: Settings) -> State:
     assert nominal is not None
     if state.bank is None or nominal.pending_s <= 0.0:
         return state
-    _, bank = _born(state, settings)
+    bank = _reduced(_readied(state) or _born(state, settings), state, settings).bank
     known = hypotheses(state, settings)
     kept, turned, i = math.exp(-nominal.pending_s / TURN_S), state.turned, nominal.interval
     change = (i.n1, i.e1) if i is not None and i.by == "imu" else (0.0, 0.0)

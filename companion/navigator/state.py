@@ -71,6 +71,14 @@ class VelocityError(NamedTuple):
     east: float
 
 
+class Newborn(NamedTuple):
+    """What the bank `parent` is after the births that are due, before its rows are reduced or after."""
+
+    parent: Bank
+    bank: Bank
+    is_reduced: bool
+
+
 class State(Struct, frozen=True):
     """All that the navigator remembers; to replace a field of a Struct costs a fifth of a NamedTuple's."""
 
@@ -82,7 +90,7 @@ class State(Struct, frozen=True):
     nominal: Nominal | None = None
     ins: Point | None = None  # the last sample of an INS; the nominal point may be carried on beyond it
     bank: Bank | None = None
-    newborn: tuple[Bank, Bank] | None = None  # a bank, and what it is after the births that are due
+    newborn: Newborn | None = None
     turned: Vector2 = (0.0, 0.0)  # change of velocity by the IMU within seconds, north and east (m/s)
     leading: tuple[Bank, Gaussian] | None = None  # moments of the leading family, and of which bank
     protection: tuple[int, float, float, float] | None = None  # when computed; radius, position error (m)

@@ -246,8 +246,16 @@ class Service:
             self._notifier.alive(now)
         self.core.settle()
         self._deferred.flush()
-        if self.core.births_due:  # a turn of their own: they take as long as an answer
-            asyncio.get_running_loop().call_soon(self.core.bear)
+        self._bear_soon()
+
+    def _bear_soon(self) -> None:
+        """Let births have turns of their own: each half takes as long as an answer."""
+        if self.core.births_due:
+            asyncio.get_running_loop().call_soon(self._bear)
+
+    def _bear(self) -> None:
+        self.core.bear()
+        self._bear_soon()
 
     def save_state(self) -> str | None:
         """Save the timestamp and the parameters; return the error of the parameters' disk, None if saved.

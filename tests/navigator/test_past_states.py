@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from companion.estimate.bank import Layout, start
 from companion.estimate.kalman import Gaussian
 from companion.navigator.past_states import DENSE_NS, MOST_KEPT, SPARSE_NS, PastStates
-from companion.navigator.state import State
+from companion.navigator.state import Newborn, State
 from companion.records import Pressure
 
 MS = 1_000_000
@@ -96,7 +96,10 @@ def test_a_kept_state_holds_one_bank() -> None:
     past = PastStates()
     now, old = (start(LAYOUT, float(t), np.zeros(2), np.eye(2)) for t in (1, 0))
     for leading in (old, now):
-        past.append(record(START_NS), State(bank=now, newborn=(now, old), leading=(leading, ESTIMATE)))
+        past.append(
+            record(START_NS),
+            State(bank=now, newborn=Newborn(now, old, is_reduced=True), leading=(leading, ESTIMATE)),
+        )
         past.append(record(START_NS + DENSE_NS), State())
         past.thin_out()
         state, _ = past.back_to(START_NS - 1)
