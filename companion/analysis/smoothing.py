@@ -47,6 +47,7 @@ from companion.navigator import (
     own_error_model,
     tuned,
 )
+from companion.navigator.air_velocity import Renewal, renewal
 from companion.navigator.channel import Nominal, Transition
 from companion.navigator.hypotheses import (
     BIASES,
@@ -58,7 +59,6 @@ from companion.navigator.hypotheses import (
     Model,
 )
 from companion.navigator.inertial_track import Point
-from companion.navigator.own_channel import OwnChannel
 from companion.navigator.progress import driver
 from companion.navigator.state import Beacon, Settings, State, Step, hypotheses, levelled, source_name
 from companion.navigator.step import step
@@ -529,15 +529,14 @@ class _Path:
         assert state.bank is not None
         assert state.nominal is not None
         x, P = state.bank.x[0, :n], state.bank.P[0, :n, :n]
-        Phi, Q, point = np.eye(n), np.zeros((n, n)), before.nominal.point
+        Phi, Q, point, predicted = np.eye(n), np.zeros((n, n)), before.nominal.point, before.bank.x[0, :n]
+        if (new := self._other_airspeed(before)) is not None:
+            Phi, Q, predicted = new.F, new.D, new.F @ predicted + new.c
         for (A, B), reached in self._model.asked:
             A, B = A[:n, :n], B[int(state.bank.grade[0]), :n, :n]
-            Phi, Q, point = A @ Phi, A @ Q @ A.T + B, reached
-        predicted, measured = Phi @ before.bank.x[0, :n], True
-        if (
-            isinstance(record, RsbnFix | Imu | Attitude | AirData)
-            and (forget := self._renewed(before, n)) is not None
-        ):
+            Phi, Q, point, predicted = A @ Phi, A @ Q @ A.T + B, reached, A @ predicted
+        measured = True
+        if isinstance(record, RsbnFix) and (forget := self._renewed(before, n)) is not None:
             keep, variance = forget
             predicted, Phi, Q = keep * predicted, keep[:, None] * Phi, Q * np.outer(keep, keep)
             Q = Q + np.diag(variance)
@@ -564,8 +563,8 @@ class _Path:
         return own_position or isinstance(record, MEASURING)
 
     def _renewed(self, before: State, n: int) -> tuple[Floats, Floats] | None:
-        """Zeros (n,) for states forgotten by a beacon that moved or took the place of another, or by a drag
-        that takes the place of airspeed, and ones; and new variances (n,).
+        """Zeros (n,) for states forgotten by a beacon that moved or took the place of another, and ones; and
+        new variances (n,).
         """
         keep, variance = np.ones(n), np.zeros(n)
         known = hypotheses(self._state, self._settings)
@@ -573,12 +572,14 @@ class _Path:
             if (a.identity, a.place) != (b.identity, b.place):
                 at = slice(known.bias(k), known.bias(k + 1))
                 keep[at], variance[at] = 0.0, np.square(known.biases[BIASES * k : BIASES * (k + 1)])
-        was, now = _interval(before), _interval(self._state)
-        if was is not None and now is not None and was.airspeed != now.airspeed:
-            assert isinstance(self._settings.model.channel, OwnChannel)
-            sigma = own_error_model.scale_sigma(self._settings.model.channel.settings, now.airspeed)
-            keep[own_error_model.SCALE], variance[own_error_model.SCALE] = 0.0, sigma**2
         return None if keep.all() else (keep, variance)
+
+    def _other_airspeed(self, before: State) -> Renewal | None:
+        """What began again because the velocity through the air is taken from something else now."""
+        was, now = _interval(before), _interval(self._state)
+        if was is None or now is None or was.airspeed == now.airspeed:
+            return None
+        return renewal(now.airspeed, before, self._settings)
 
     def _append(self, point: Point, x: Floats, P: Floats, predicted: Floats, fixed: bool = False) -> None:
         """Append an epoch, or merge it into the last one: a second measurement at the same instant."""

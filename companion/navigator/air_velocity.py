@@ -7,18 +7,20 @@ pitot was given up, the wind is that of half a minute before.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from msgspec import structs
 
 from companion.estimate import bank as banks
 from companion.navigator import measurements, own_error_model, strapdown_channel
+from companion.navigator.ground import FLYING_M_S
 from companion.navigator.own_channel import AirspeedSums, Wind
-from companion.navigator.own_error_model import Airspeed
-from companion.navigator.progress import decided, driver, estimated_velocity, propagated
+from companion.navigator.own_error_model import LEAST_M_S, Airspeed
+from companion.navigator.progress import decided, driver, propagated
 from companion.navigator.state import Settings, State, estimate, hypotheses, own, with_sensors
 from companion.records import AirData, Attitude, Imu, Vector2
-from companion.units import SECOND_NS
+from companion.units import SECOND_NS, Floats
 
 AIRSPEED_EVERY_NS = 500_000_000  # gusts are correlated: more often adds nothing
 SAMPLE_M_S = 5.0  # of the velocity by single samples of drag: 2.4 to 8.6 m/s in six recorded copters
@@ -26,28 +28,58 @@ SAMPLE_M_S = 5.0  # of the velocity by single samples of drag: 2.4 to 8.6 m/s in
 WIND_EVERY_NS, WINDS_NS, WIND_CHANGED_M_S = 10 * SECOND_NS, 30 * SECOND_NS, 1.0
 
 
+class Renewal(NamedTuple):
+    """What begins again with another airspeed: errors x become F x + c, and D is added to their covariance.
+
+    `steady_m_s` is the size of a steady airspeed.
+    """
+
+    F: Floats
+    c: Floats
+    D: Floats
+    steady_m_s: float | None
+
+
 def taken_from(airspeed: Airspeed, state: State, settings: Settings) -> State:
     """Take the velocity through the air from something, and start its scale again if it was another."""
-    nominal = state.nominal
-    if state.bank is None or nominal is None or nominal.interval is None:
+    new = renewal(airspeed, state, settings)
+    if new is None or state.bank is None or state.nominal is None:
         return state
-    if nominal.interval.airspeed == airspeed:
-        return state
-    sigma = own_error_model.scale_sigma(own(settings).settings, airspeed)
-    bank = banks.renew(state.bank, [own_error_model.SCALE], [sigma])
-    if nominal.interval.airspeed == "pitot" and state.sensors.winds:
-        bank = _with_wind(bank, state.sensors.winds[0])
-    nominal = structs.replace(nominal, interval=nominal.interval._replace(airspeed=airspeed))
-    return with_sensors(
-        structs.replace(state, bank=bank, nominal=nominal), sums=None, winds=(), steady_m_s=None
+    bank = banks.propagate(state.bank, hypotheses(state, settings).layout, 0.0, new.F, new.D)
+    interval = state.nominal.interval and state.nominal.interval._replace(airspeed=airspeed)
+    state = structs.replace(
+        state, bank=banks.shift(bank, new.c), nominal=structs.replace(state.nominal, interval=interval)
     )
+    return with_sensors(state, sums=None, winds=(), steady_m_s=new.steady_m_s)
 
 
-def _with_wind(bank: banks.Bank, wind: Wind) -> banks.Bank:
-    at = own_error_model.WIND
-    sigma = math.sqrt(wind.variance + WIND_CHANGED_M_S**2)
-    bank = banks.renew(bank, range(at.start, at.stop), (sigma, sigma))
-    return banks.shift(bank, np.array((*(0.0,) * at.start, wind.north, wind.east)))
+def renewal(airspeed: Airspeed, state: State, settings: Settings) -> Renewal | None:
+    """What begins again if the velocity through the air is taken from `airspeed`; None if it is already.
+
+    A steady airspeed is that of velocity and wind: its scale is as wrong as they are. As an error of its own
+    it held a wind of 17 m/s to be 1 +- 3 m/s, and the pitot that came back to be false.
+    """
+    bank, nominal, winds = state.bank, state.nominal, state.sensors.winds
+    if bank is None or nominal is None or nominal.interval is None or nominal.interval.airspeed == airspeed:
+        return None
+    n, scale, wind = hypotheses(state, settings).layout.n_base, own_error_model.SCALE, own_error_model.WIND
+    F, c, D, steady_m_s = np.eye(n), np.zeros(n), np.zeros((n, n)), None
+    if nominal.interval.airspeed == "pitot" and winds:
+        F[wind] = 0.0
+        c[wind] = winds[0].north, winds[0].east
+        D[wind, wind] = (winds[0].variance + WIND_CHANGED_M_S**2) * np.eye(2)
+    F[scale] = 0.0
+    if airspeed == "steady":
+        x = F @ bank.x[int(bank.L.argmax()), :n] + c
+        air = np.array(nominal.point.v_n[:2]) - x[own_error_model.VELOCITY] - x[wind]
+        steady_m_s = max(math.hypot(*air), FLYING_M_S)
+        of = np.zeros(n)
+        of[own_error_model.VELOCITY] = of[wind] = air / max(math.hypot(*air), LEAST_M_S) / steady_m_s
+        F[scale], c[scale] = of @ F, of @ (c - x)
+        D[scale] = D[:, scale] = of @ D
+        D[scale, scale] = of @ D @ of
+    D[scale, scale] += own_error_model.scale_sigma(own(settings).settings, airspeed) ** 2
+    return Renewal(F, c, D, steady_m_s)
 
 
 def with_wind_noted(state: State, t_ns: int, settings: Settings) -> State:
@@ -89,12 +121,3 @@ def measured(state: State, record: AirData | Attitude | Imu, V: Vector2, setting
     state = structs.replace(state, bank=taken.bank)
     state = with_sensors(state, measured_ns=record.t_ns, sums=AirspeedSums(record.t_ns, V))
     return decided(state, record, settings)
-
-
-def estimated_airspeed(state: State) -> float:
-    """Return the estimated speed through the air, m/s; that over ground before there is a wind."""
-    v_n, v_e = estimated_velocity(state)
-    if state.bank is None:
-        return math.hypot(v_n, v_e)
-    wind_n, wind_e = state.bank.x[int(state.bank.L.argmax()), own_error_model.WIND]
-    return math.hypot(v_n - wind_n, v_e - wind_e)

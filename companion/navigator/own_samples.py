@@ -116,9 +116,8 @@ def _steady(state: State, record: Attitude, settings: Settings) -> Step:
         return _straight_on(state, record, settings)
     state = air_velocity.taken_from("steady", state, settings)
     steady_m_s = state.sensors.steady_m_s
-    if steady_m_s is None:
-        steady_m_s = max(air_velocity.estimated_airspeed(state), FLYING_M_S)
-        state = with_sensors(state, steady_m_s=steady_m_s)
+    if steady_m_s is None:  # there is no wind yet
+        steady_m_s = max(math.hypot(*estimated_velocity(state)), FLYING_M_S)
     V = own_error_model.air_velocity(steady_m_s, record.pitch, record.heading)
     if state.sensors.leads("air", record.t_ns):
         return _driven(with_sensors(state, air_ns=record.t_ns), record, "air", V, settings)
