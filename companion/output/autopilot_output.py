@@ -37,6 +37,7 @@ from companion.records import (
     Stamped,
     SystemTime,
 )
+from companion.units import SECOND_NS
 
 DISPLAY_NAMES = {RESET: "external position"}
 NOT_FUSED = frozenset({RESET, MESSAGES["gps_input"]})
@@ -124,8 +125,11 @@ class AutopilotOutput:
                     if reason is None:
                         encoded[name] = message
             self._add_event(self._monitor.update(DISPLAY_NAMES.get(name, name), reason, now))
-        if by_set := PROFILES[self.config.output.profile].switched.intersection(names):
-            self._source_switch.note_output(solution, not by_set.isdisjoint(encoded), now)
+        switched = PROFILES[self.config.output.profile].switched
+        if by_set := switched.intersection(names):
+            hz = max(self.config.output.rates_hz[name] for name in switched)
+            period_ns = round(SECOND_NS / hz) if hz > 0.0 else 0
+            self._source_switch.note_output(solution, not by_set.isdisjoint(encoded), now, period_ns)
         return list(encoded.values())
 
     def poll(self, receiver: Receiver, now_ns: int) -> list[Message]:

@@ -34,7 +34,7 @@ FIX_S = 5.0  # the receiver has had a fix for so long
 STOPPED_S = 2.0  # our position has not gone out for so long
 FALSE, BELIEVED = DEFAULT.excluded, DEFAULT.believed  # probability that GNSS is false, as in the navigator
 FRESH_S = 60.0  # a solution older than this says nothing about GNSS
-MAX_GAP_NS = SECOND_NS  # a longer gap interrupts
+MAX_GAP_NS = SECOND_NS  # a longer gap interrupts, or two periods of a slower output
 RETRY_NS = SECOND_NS
 MAX_TRIES = 10
 AGAIN_NS = 30 * SECOND_NS  # after so many tries without an answer: the link may have been lost
@@ -187,6 +187,7 @@ class SourceSwitch:
         self._fix, self._no_fix, self._sent = ConditionTimer(), ConditionTimer(), ConditionTimer()
         self._receiver, self._receiver_ns = 0, 0  # its number, and when it last reported: 0 for never
         self._sent_ns: int | None = None
+        self._slack_ns = 0  # by which two positions of a slow output may be further apart than `MAX_GAP_NS`
         self._solution: Solution | None = None
         self._witness = BeaconWitness()
         self._required: int | None = None
@@ -217,10 +218,11 @@ class SourceSwitch:
         self._fix.update(record.has_3d_fix, now, 3 * SECOND_NS)
         self._no_fix.update(not record.has_3d_fix, now, 3 * SECOND_NS)
 
-    def note_output(self, solution: Solution, sent: bool, now_ns: int) -> None:
-        """Note a solution and whether its position went out."""
+    def note_output(self, solution: Solution, sent: bool, now_ns: int, period_ns: int = 0) -> None:
+        """Note a solution and whether its position went out, one of those due every `period_ns`."""
         self._solution = solution
-        self._sent.update(sent, now_ns)
+        self._slack_ns = max(0, 2 * period_ns - MAX_GAP_NS)
+        self._sent.update(sent, now_ns, MAX_GAP_NS + self._slack_ns)
         if sent:
             self._sent_ns = now_ns
 
@@ -232,14 +234,15 @@ class SourceSwitch:
         solution, patience = self._solution, 3 * SECOND_NS
         fresh = solution is not None and (now_ns - solution.rx_ns) * 1e-9 <= FRESH_S
         silent = (now_ns - self._receiver_ns) * 1e-9 if self._receiver_ns else -1.0
+        stopped_ns = -SECOND_NS if self._sent_ns is None else max(0, now_ns - self._sent_ns - self._slack_ns)
         return Situation(
             fix_s=self._fix.held_s(now_ns, patience),
             no_fix_s=self._no_fix.held_s(now_ns, patience),
             silent_s=silent,
             gnss_false=solution.gnss_false if fresh and solution is not None else None,
             witness=fresh and solution is not None and solution.witness and self._witness.contradicts,
-            sent_s=self._sent.held_s(now_ns),
-            stopped_s=-1.0 if self._sent_ns is None else (now_ns - self._sent_ns) * 1e-9,
+            sent_s=self._sent.held_s(now_ns, MAX_GAP_NS + self._slack_ns),
+            stopped_s=stopped_ns * 1e-9,
         )
 
     @property

@@ -386,6 +386,24 @@ def test_source_switch_can_be_disabled() -> None:
     assert flight.sent_messages("ODOMETRY")
 
 
+@pytest.mark.parametrize("hz", [0.8, 0.2])
+def test_source_set_follows_gnss_by_a_slow_output(hz: float) -> None:
+    """A second between two positions was a gap: set 2 was never requested, and nothing was said."""
+    flight = Flight(configured("output.profile=ardupilot", f"output.odometry_hz={hz}"))
+    flight.fly(20.0)
+    flight.gnss = False
+    flight.fly(20.0)
+    assert flight.source_set == 2
+    flight.gnss = True
+    flight.fly(10.0)
+    assert flight.source_set == 1
+    assert [t for t in flight.texts if "source set" in t] == [
+        "EKF source set 1: GNSS has a fix",
+        "EKF source set 2: GNSS is lost, using companion",
+        "EKF source set 1: GNSS has a fix",
+    ]
+
+
 @pytest.mark.parametrize("via", ["gps_input", "external_position"])
 def test_source_set_is_the_pilots_where_none_carries_our_position(via: str) -> None:
     flight = Flight(configured("output.profile=ardupilot", f"output.via={via}"))
