@@ -133,9 +133,13 @@ class AutopilotOutput:
         return list(encoded.values())
 
     def poll(self, receiver: Receiver, now_ns: int) -> list[Message]:
-        """Return the commands that are due; call it once a second and after every solution."""
+        """Return the commands that are due; call it once a second and after every solution.
+
+        An autopilot that was taken off GNSS is put back on it also once our positions are switched off.
+        """
         output = self.config.output
-        if not output.switches_sources or not output.fits(receiver.autopilot):
+        is_to_return = output.switch_sources and self._source_switch.has_left_gnss
+        if not (output.switches_sources or is_to_return) or not output.fits(receiver.autopilot):
             return []
         self._source_switch.update(now_ns)
         return self._source_switch.to_send(receiver.system, now_ns)

@@ -250,6 +250,12 @@ class SourceSwitch:
         """Whether our position leads: acknowledged by the autopilot, or selected by somebody else."""
         return self._leading == COMPANION_SET
 
+    @property
+    def has_left_gnss(self) -> bool:
+        """Whether it may have taken the autopilot off GNSS, and nobody else has selected that."""
+        is_left = self.is_on_companion and self._held is None
+        return self._required is not None and (is_left or COMPANION_SET in self._unconfirmed)
+
     def required(self, s: Situation) -> tuple[int, str] | None:
         """Return the source set that must lead and the reason; None where the present one stays."""
         return required_set(s)

@@ -386,6 +386,34 @@ def test_source_switch_can_be_disabled() -> None:
     assert flight.sent_messages("ODOMETRY")
 
 
+def test_gnss_that_is_back_leads_again_after_our_positions_were_switched_off() -> None:
+    """A ground station sets ODOMETRY_HZ to 0 on set 2: the autopilot stayed there, without a position."""
+    flight = Flight(configured("output.profile=ardupilot"))
+    flight.fly(10.0)
+    flight.gnss = False
+    flight.fly(10.0)
+    assert flight.source_set == 2
+    flight.send("PARAM_SET", **OURS, param_id="ODOMETRY_HZ", param_value=0.0, param_type=9)
+    flight.fly(3.0)
+    flight.gnss = True
+    flight.fly(10.0)
+    assert flight.source_set == 1
+    flight.gnss = False
+    flight.fly(10.0)
+    assert flight.source_set == 1
+
+
+def test_gnss_of_px4_is_on_after_our_positions_were_switched_off(monkeypatch: pytest.MonkeyPatch) -> None:
+    """PX4 stores the state when it is disarmed: the next flight began without GNSS."""
+    found = Situation(1e3, -1.0, 0.1, gnss_false=0.9999, witness=True, sent_s=1e3, stopped_s=0.0)
+    monkeypatch.setattr(GnssFusion, "situation", lambda self, now_ns: found)
+    output, receiver = AutopilotOutput(configured("output.profile=px4")), Receiver("px4", 1)
+    assert [m.param3 for m in output.poll(receiver, START)] == [0.0]  # and its answer is lost
+    output.tune(configured("output.profile=px4", "output.global_position_sensor_hz=0"))
+    output.handle_message(dialect.new("HEARTBEAT", base_mode=0), True, 1, START)
+    assert [m.param3 for m in output.poll(receiver, START + SECOND)] == [1.0]
+
+
 @pytest.mark.parametrize("hz", [0.8, 0.2])
 def test_source_set_follows_gnss_by_a_slow_output(hz: float) -> None:
     """A second between two positions was a gap: set 2 was never requested, and nothing was said."""
