@@ -4,8 +4,9 @@ A source set is a matter of the aircraft's safety, so "GNSS is false" is not lef
 channels are models (flown on ArduPlane: a turn in turbulence was taken for a GNSS that drifts). Here every
 azimuth and range is compared with the one that the GNSS fix of the same instant predicts. The mean of the
 last `WINDOW_NS` must differ from the earlier mean, of when GNSS was believed, by more than `SIGMAS` of both
-means: a constant error of the beacon cancels. At 60 km (131 m across) 2 m/s are seen after 45 s (at most
-75 s), and a healthy GNSS is contradicted 0.03 % of the time.
+means: a constant error of the beacon cancels. An answer that came before counts once, as in the navigator: a
+network that sends all twice would make the mean look surer than it is. At 60 km (131 m across) 2 m/s are seen
+after 45 s (at most 75 s), and a healthy GNSS is contradicted 0.03 % of the time.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from collections import deque
 
 from companion.nav.geometry import Geodetic, displace, slant_range_azimuth, wrap_angle
 from companion.navigator.fix_observations import displaced_sigma
+from companion.navigator.stale_data import StaleDataDetector
 from companion.records import Gnss, RsbnFix
 from companion.units import SECOND_NS
 
@@ -66,6 +68,7 @@ class BeaconWitness:
 
     def __init__(self) -> None:
         self._fix: Gnss | None = None
+        self._stale_data = StaleDataDetector()
         self._residuals: dict[tuple[int, str], Residuals] = {}
         self._answered_ns = 0  # time of the last answer of any beacon
 
@@ -73,6 +76,8 @@ class BeaconWitness:
         """Process a fix; `is_believed`: the navigator believes GNSS."""
         if isinstance(record, Gnss):
             self._fix = record if record.has_3d_fix else None
+            return
+        if self._stale_data.judge(record) is not None:
             return
         fix, self._answered_ns = self._fix, record.t_ns
         if fix is None or abs(dt := (record.t_ns - fix.t_ns) * 1e-9) > APART_S:

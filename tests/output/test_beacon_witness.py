@@ -18,7 +18,8 @@ SIGMA_AZIMUTH, SIGMA_RANGE = math.radians(0.125), 109.0
 class Flight:
     """60 km west of a beacon, 25 m/s to the north; an answer a second."""
 
-    def __init__(self, seed: int, azimuth_deg: float = 0.0, range_m: float = 0.0) -> None:
+    def __init__(self, seed: int, azimuth_deg: float = 0.0, range_m: float = 0.0, copies: int = 1) -> None:
+        self.copies = copies
         self.witness, self.rng, self.seconds = BeaconWitness(), np.random.default_rng(seed), 0.0
         self.azimuth, self.range = math.radians(azimuth_deg), range_m
 
@@ -36,9 +37,10 @@ class Flight:
             line = slant_range_azimuth(BEACON, true)
             azimuth = line.azimuth + self.azimuth + SIGMA_AZIMUTH * self.rng.standard_normal()
             slant = line.slant_range + self.range + SIGMA_RANGE * self.rng.standard_normal()
-            self.witness.receive(
-                RsbnFix(now, now, 7, *BEACON, azimuth, slant, SIGMA_AZIMUTH, SIGMA_RANGE), is_believed
-            )
+            for copy in range(self.copies):  # the clock of the link is adjusted in between
+                t = now + copy * SECOND_NS // 1000
+                answer = RsbnFix(t, t, 7, *BEACON, azimuth, slant, SIGMA_AZIMUTH, SIGMA_RANGE)
+                self.witness.receive(answer, is_believed)
             if first is None and self.witness.contradicts:
                 first = k
         return first
@@ -62,6 +64,34 @@ def test_healthy_gnss_is_hardly_ever_contradicted(azimuth_deg: float, range_m: f
         flight = Flight(seed, azimuth_deg, range_m)
         contradicted += sum(flight.fly(1) is not None for _ in range(1200))
     assert contradicted <= 0.01 * 3600
+
+
+@pytest.mark.parametrize("copies", [2, 5])
+def test_answers_that_come_more_than_once_are_no_more_certain(copies: int) -> None:
+    """A network sends all twice, or a receiver repeats its answer: 5 and 25 % of the time."""
+    contradicted = 0
+    for seed in range(3):
+        flight = Flight(seed, copies=copies)
+        contradicted += sum(flight.fly(1) is not None for _ in range(1200))
+    assert contradicted <= 0.01 * 3600
+
+
+def test_a_receiver_that_hangs_contradicts_nothing() -> None:
+    """Its last answer goes on under new times, while the aircraft flies 3 km on."""
+    flight = Flight(1)
+    flight.fly(60)
+    receive = flight.witness.receive
+    last = slant_range_azimuth(BEACON, displace(*START, 25.0 * flight.seconds, 0.0, 300.0))
+
+    def hang(record: Gnss | RsbnFix, is_believed: bool) -> None:
+        if isinstance(record, RsbnFix):
+            at = record.t_ns, record.rx_ns
+            frozen = last.azimuth, last.slant_range, SIGMA_AZIMUTH, SIGMA_RANGE
+            record = RsbnFix(*at, 7, *BEACON, *frozen)
+        receive(record, is_believed)
+
+    flight.witness.receive = hang  # type: ignore[method-assign]
+    assert flight.fly(120) is None
 
 
 def test_nothing_is_said_without_a_beacon_or_without_a_fix() -> None:
