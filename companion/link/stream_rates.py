@@ -102,6 +102,8 @@ class StreamRates:
                 if stream.measured_hz == 0.0 and stream.count and stream.check_at - now > stream.window:
                     # it arrives again: measure now, not at the end of a long pause
                     stream.count, stream.since, stream.check_at = 0, now, now + stream.window
+                elif self._is_enough(stream, now):
+                    stream.check_at = now  # likewise
                 if stream.check_at <= now and self._check(stream, now):
                     due.append((msgid, stream.asked_hz))
         return due
@@ -114,6 +116,12 @@ class StreamRates:
     def rates(self) -> dict[int, tuple[float, float | None]]:
         """Return the requested and the last measured rate (None: not measured yet), Hz, by message id."""
         return {msgid: (s.rate_hz, s.measured_hz) for msgid, s in self._rates.items()}
+
+    @staticmethod
+    def _is_enough(stream: StreamRate, now: int) -> bool:
+        """Whether `stream` has arrived as often as requested, for a window at least since the last check."""
+        elapsed = now - stream.since
+        return elapsed >= stream.window and stream.count * SECOND_NS >= ENOUGH * stream.asked_hz * elapsed
 
     def _check(self, stream: StreamRate, now: int) -> bool:
         """Close the window of `stream`; return whether its rate must be requested again."""

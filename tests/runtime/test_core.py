@@ -809,6 +809,19 @@ def test_input_that_stops_is_reported_once_and_again_when_it_is_back(monkeypatch
     ]
 
 
+@pytest.mark.parametrize("after_s", [20.5, 21.5, 22.5, 23.5, 24.5])
+def test_an_outage_of_five_seconds_is_no_slow_input(after_s: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Across two windows it left the rate of the second standing for 10 s: `is slow`, long after it."""
+    flight = Flight()
+    flight.fly(after_s)
+    monkeypatch.setattr(flight, "send", lambda name, **values: None)
+    flight.fly(4.8)
+    monkeypatch.undo()
+    flight.fly(30.0)
+    assert not [text for text in event_texts(flight) if "GPS_RAW_INT" in text]
+    assert flight.core.status().slow == ()
+
+
 def test_slow_input_of_the_output_is_named_and_no_key_that_does_not_exist() -> None:
     flight = Flight(config=load(pairs=("output.profile=ardupilot",), environment={}))
     for _ in range(30):
