@@ -16,14 +16,17 @@ RECEIVER_MESSAGES = ("GPS_RAW_INT", "GPS2_RAW")  # by number
 
 
 class _Reports:
-    """Reports of one receiver by their arrival, ns: the last one, and the first of the present run."""
+    """Reports of one receiver by their arrival, ns: the last one, and the first of the present runs."""
 
     def __init__(self) -> None:
         self.last_ns: int | None = None
         self.has_fix = False
         self.since_ns = 0  # since when with a fix, or without
+        self.began_ns = 0  # since when without a silence
 
     def note(self, record: Gnss) -> None:
+        if self.is_silent(record.rx_ns):
+            self.began_ns = record.rx_ns
         if self.is_silent(record.rx_ns) or record.has_3d_fix != self.has_fix:
             self.has_fix, self.since_ns = record.has_3d_fix, record.rx_ns
         self.last_ns = record.rx_ns
@@ -60,7 +63,7 @@ class ReceiverChoice:
         if self._is_second:
             why = self._reason_to_return(first, second, now)
         elif second.has_fix and not second.is_silent(now) and now - self._first_ns >= SILENT_NS:
-            why = self._reason_to_leave(first, now)
+            why = self._reason_to_leave(first, second, now)
         if why is None:
             return is_preferred != self._is_second, []
         self._is_second = not self._is_second
@@ -75,7 +78,7 @@ class ReceiverChoice:
             return "has a fix again"
         return "has a fix, the other none" if second.is_silent(now_ns) or not second.has_fix else None
 
-    def _reason_to_leave(self, first: _Reports, now_ns: int) -> str | None:
-        if first.is_silent(now_ns):
-            return "is silent"
+    def _reason_to_leave(self, first: _Reports, second: _Reports, now_ns: int) -> str | None:
+        if first.is_silent(now_ns):  # alone: after a silence of the link either may come first
+            return "is silent" if now_ns - second.began_ns >= SILENT_NS else None
         return "has no fix" if not first.has_fix and now_ns - first.since_ns >= NO_FIX_NS else None

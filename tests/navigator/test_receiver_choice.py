@@ -67,6 +67,19 @@ def test_a_silent_first_receiver_is_replaced_before_it_is_called_silent() -> Non
     assert why == "GPS_RAW_INT is silent: GPS2_RAW is used"
 
 
+@pytest.mark.parametrize("until", [23.1, 23.3, 23.5])
+def test_a_silence_of_both_is_the_links(until: float) -> None:
+    """The second, heard first after 3 s, was used for 5 s: two texts, and the drift of GNSS unknown again."""
+
+    def both(t: float) -> int | None:
+        return None if 20.0 <= t < until else 3
+
+    assert chosen(both, both, 40.0) == []
+    ((lost, why),) = chosen(lambda t: 3 if t < 20.0 else None, both, 40.0)  # the first is gone for good
+    assert until + 2.4 <= lost < until + SILENT_S
+    assert why == "GPS_RAW_INT is silent: GPS2_RAW is used"
+
+
 def test_a_second_receiver_without_a_fix_or_flickering_changes_nothing() -> None:
     assert chosen(lambda t: 3, lambda t: 3, 30.0) == []
     assert chosen(lambda t: 3 if t < 10.0 else 1, lambda t: 1, 30.0) == []
