@@ -572,7 +572,7 @@ class CompanionCore:
         return Receiver(
             link.sender.autopilot,
             link.session.autopilot or 0,
-            origin=self._origin.origin,
+            origin=self._origin.undoubted,
             origin_resets=self._origin.resets,
             sensor_id=self._config.output.global_position_sensor_id,
             unix_ns=self._output.unix_ns,

@@ -64,12 +64,18 @@ class OriginCheck:
         self._known: GlobalPosition | None = None
         self._without_position_ns: int | None = None  # when the autopilot last stated so
         self._pairs: list[Pair] = []
+        self._is_doubted = False  # the last pair contradicts the origin
         self._refused: tuple[float, float] | None = None  # a stated origin reported as false
+
+    @property
+    def undoubted(self) -> LocalOrigin | None:
+        """The origin, unless the last pair contradicts it: it may have moved a moment ago."""
+        return None if self._is_doubted else self.origin
 
     def forget(self) -> None:
         """Forget the origin: the autopilot rebooted, or its INS jumped; another one afterwards is a reset."""
         self.origin = self._stated = self._local = self._known = self._refused = None
-        self._without_position_ns = None
+        self._without_position_ns, self._is_doubted = None, False
         self._pairs.clear()
 
     def receive(self, record: Stamped) -> list[Event]:
@@ -78,9 +84,11 @@ class OriginCheck:
             self._stated = record
             is_without_position = self._is_without_position(record.rx_ns)
             is_judged = self._has_pairs and (self.origin is not None or not is_without_position)
-            return self._judge(record.rx_ns) if is_judged else self._replaced(record, record.rx_ns)
+            return [] if is_judged else self._replaced(record, record.rx_ns)
         if isinstance(record, LocalPosition):
             self._local = record
+            if self._pairs and record.rx_ns - self._pairs[-1].t_ns > RECENT_NS:
+                self._is_doubted = False
         elif isinstance(record, GlobalPosition):
             self._known = record
         elif isinstance(record, FilterStatus):
@@ -108,6 +116,7 @@ class OriginCheck:
             return []
         self._known = None  # each global position is used once
         self._pairs = [*self._pairs[1 - PAIRS :], Pair(now_ns, inferred)]
+        self._is_doubted = self.origin is not None and _apart(self.origin, inferred) > TOLERANCE_M
         return self._judge(now_ns)
 
     def _judge(self, now_ns: int) -> list[Event]:
@@ -128,6 +137,7 @@ class OriginCheck:
     def _replaced(self, new: LocalOrigin, now_ns: int) -> list[Event]:
         """Use another origin; one that moved is a reset."""
         old, self.origin, self._previous = self._previous, new, new
+        self._is_doubted = False
         moved = 0.0 if old is None else _apart(old, new)
         if moved <= TOLERANCE_M:
             return []

@@ -100,6 +100,31 @@ def test_true_change_is_followed_and_counted(autopilot: Autopilot, is_stated: bo
     assert autopilot.off() < 0.5
     assert autopilot.check.resets == 1
     assert autopilot.texts[-1] == "local origin moved by 1000 m: position reset"
+    assert len(autopilot.texts) == (1 if is_stated else 2)  # the origin that was stated last is true, or not
+
+
+def test_an_origin_that_the_last_pair_contradicts_is_not_used(autopilot: Autopilot) -> None:
+    """For 1.5 s our positions went out 1 km off."""
+    autopilot.state(TRUE)
+    autopilot.fly(10.0)
+    autopilot.origin = moved(800.0, 600.0)
+    for k in range(20):
+        autopilot.fly(0.1)
+        used = autopilot.check.undoubted
+        assert used is None or (k >= 2 and autopilot.off() < 0.5)
+    assert autopilot.check.undoubted is not None
+
+
+def test_an_origin_is_doubted_no_longer_than_pairs_are_recent(autopilot: Autopilot) -> None:
+    autopilot.state(TRUE)
+    autopilot.fly(10.1)
+    autopilot.place = displace(*autopilot.place, 300.0, 0.0, 0.0)
+    autopilot.take(GlobalPosition(autopilot.now, autopilot.now, *autopilot.place, SPEED, 100.0))
+    assert autopilot.check.undoubted is None
+    for _ in range(101):
+        autopilot.now += SECOND_NS // 10
+        autopilot.take(LocalPosition(autopilot.now, autopilot.now, (0.0, 0.0, 0.0), SPEED))
+    assert autopilot.check.undoubted is not None
 
 
 def test_one_pair_across_a_jump_of_the_estimator_changes_nothing(autopilot: Autopilot) -> None:
