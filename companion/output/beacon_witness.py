@@ -25,6 +25,7 @@ SIGMAS = 3.0
 LEAST = 10  # fixes in the window
 MOST = 300  # fixes that the earlier mean remembers
 APART_S = 1.0  # a GNSS fix further from the beacon's time predicts nothing
+FIXES, FIXES_APART_NS = 128, SECOND_NS // 10  # kept for answers that arrive late: 13 s or more
 
 
 class Residuals:
@@ -67,7 +68,7 @@ class BeaconWitness:
     """Comparison of all beacons with the autopilot's first receiver."""
 
     def __init__(self) -> None:
-        self._fix: Gnss | None = None
+        self._fixes: deque[Gnss] = deque(maxlen=FIXES)
         self._stale_data = StaleDataDetector()
         self._residuals: dict[tuple[int, str], Residuals] = {}
         self._answered_ns = 0  # time of the last answer of any beacon
@@ -75,11 +76,15 @@ class BeaconWitness:
     def receive(self, record: Gnss | RsbnFix, is_believed: bool) -> None:
         """Process a fix; `is_believed`: the navigator believes GNSS."""
         if isinstance(record, Gnss):
-            self._fix = record if record.has_3d_fix else None
+            if not record.has_3d_fix:
+                self._fixes.clear()
+            elif not self._fixes or abs(record.t_ns - self._fixes[-1].t_ns) >= FIXES_APART_NS:
+                self._fixes.append(record)
             return
         if self._stale_data.judge(record) is not None:
             return
-        fix, self._answered_ns = self._fix, record.t_ns
+        self._answered_ns = record.t_ns
+        fix = min(self._fixes, key=lambda each: abs(record.t_ns - each.t_ns), default=None)
         if fix is None or abs(dt := (record.t_ns - fix.t_ns) * 1e-9) > APART_S:
             return
         north, east, _ = fix.v_n or (0.0, 0.0, 0.0)

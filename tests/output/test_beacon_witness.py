@@ -56,6 +56,27 @@ def test_gnss_drawn_off_is_seen_before_150_m(seed: int, pull: tuple[float, float
     assert flight.fly(300, pull, is_believed=False) == 0  # and stays seen
 
 
+@pytest.mark.parametrize("late_s", [1.5, 5.0])
+@pytest.mark.parametrize("seed", range(3))
+def test_gnss_drawn_off_is_seen_by_answers_that_arrive_late(seed: int, late_s: float) -> None:
+    """By a link of their own: they were compared with the last fix only, so with none."""
+    flight, waiting = Flight(seed), list[RsbnFix]()
+    receive, late_ns = flight.witness.receive, round(late_s * SECOND_NS)
+
+    def hold(record: Gnss | RsbnFix, is_believed: bool) -> None:
+        if isinstance(record, RsbnFix):
+            waiting.append(record)
+            return
+        while waiting and record.t_ns - waiting[0].t_ns >= late_ns:
+            receive(waiting.pop(0), is_believed)
+        receive(record, is_believed)
+
+    flight.witness.receive = hold  # type: ignore[method-assign]
+    assert flight.fly(120) is None
+    seen = flight.fly(150, (2.0, 0.0))
+    assert seen is not None and 2.0 * (seen - late_s) < 150.0
+
+
 @pytest.mark.parametrize(("azimuth_deg", "range_m"), [(0.0, 0.0), (0.125, 0.0), (0.0, 100.0)])
 def test_healthy_gnss_is_hardly_ever_contradicted(azimuth_deg: float, range_m: float) -> None:
     """Noise and a constant error of one sigma: together with a wrong navigator this must not happen."""
