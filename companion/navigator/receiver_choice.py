@@ -76,7 +76,8 @@ class ReceiverChoice:
             return None
         if now_ns - first.since_ns >= STEADY_NS:
             return "has a fix again"
-        return "has a fix, the other none" if second.is_silent(now_ns) or not second.has_fix else None
+        is_silent = second.is_silent(now_ns) and now_ns - first.began_ns >= SILENT_NS
+        return "has a fix, the other none" if is_silent or not second.has_fix else None
 
     def _reason_to_leave(self, first: _Reports, second: _Reports, now_ns: int) -> str | None:
         if first.is_silent(now_ns):  # alone: after a silence of the link either may come first

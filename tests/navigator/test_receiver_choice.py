@@ -80,6 +80,17 @@ def test_a_silence_of_both_is_the_links(until: float) -> None:
     assert why == "GPS_RAW_INT is silent: GPS2_RAW is used"
 
 
+def test_after_a_silence_of_the_link_the_first_with_a_new_fix_is_not_trusted_sooner() -> None:
+    """Heard first, it was used at once: `has a fix, the other none`."""
+
+    def first(t: float) -> int | None:
+        return None if 20.0 <= t < 23.1 else 1 if 10.0 <= t < 20.0 else 3
+
+    (_, _), (back, why) = chosen(first, lambda t: None if 20.0 <= t < 23.1 else 3, 40.0)
+    assert 28.1 <= back < 29.0
+    assert why == "GPS_RAW_INT has a fix again: GPS_RAW_INT is used"
+
+
 def test_a_second_receiver_without_a_fix_or_flickering_changes_nothing() -> None:
     assert chosen(lambda t: 3, lambda t: 3, 30.0) == []
     assert chosen(lambda t: 3 if t < 10.0 else 1, lambda t: 1, 30.0) == []
