@@ -41,6 +41,8 @@ from companion.units import SECOND_NS
 DRIFT = 100e-6
 #: Two stamps older than the newest one by this much mean a reboot.
 BACK = 3 * SECOND_NS
+#: for so long at least: a link that stalled may deliver what it held back twice.
+BACK_LASTS = SECOND_NS // 10
 #: Without TIMESYNC the envelope follows the least delay of this window,
 WINDOW = 20 * SECOND_NS
 #: but rises no faster than a simulator's clock may run slow.
@@ -142,7 +144,7 @@ class BootClock:
         self._last_difference = 0  # arrival - stamp of the last message
         # (arrival, arrival - stamp) of the last WINDOW, increasing in both: the first is the least
         self._least: deque[tuple[int, int]] = deque()
-        self._back: tuple[int, int] | None = None  # a stamp that went back, and its arrival - stamp
+        self._back: tuple[int, int, int] | None = None  # a stamp that went back, arrival, arrival - stamp
         self._samples: deque[TimesyncSample] = deque(maxlen=8)
         self._best: TimesyncSample | None = None
         self._unix_minus_boot: int | None = None
@@ -158,8 +160,11 @@ class BootClock:
         """Process the stamp of a message that was stamped when sent; return a detected clock change."""
         difference, change = received - boot, None
         if boot < self._newest - BACK or self._booted_in_silence(boot, received):
-            before, self._back = self._back, (boot, difference)
-            if before is None or boot < before[0] or abs(difference - before[1]) > BACK:
+            before = self._back
+            if before is None or boot < before[0] or abs(difference - before[2]) > BACK:
+                self._back = boot, received, difference
+                return None
+            if received - before[1] < BACK_LASTS:
                 return None
             is_young = boot <= received - self._newest_received + MAX_LATENESS
             change = ClockChange.REBOOTED if is_young else ClockChange.SET

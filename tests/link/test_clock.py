@@ -134,6 +134,17 @@ def test_reboot_resets_the_clock_and_a_reordered_stamp_does_not() -> None:
     assert clock.local(UNIX_0, 151 * SECOND_NS + OFFSET) == 151 * SECOND_NS + OFFSET
 
 
+def test_what_a_stalled_link_delivers_twice_sets_no_clock() -> None:
+    """It was reported as a clock that jumped back by 4.8 s, and all of it was dated so."""
+    clock = BootClock()
+    for i in range(200):
+        clock.update(i * 100 * MS, OFFSET + i * 100 * MS)
+    held = range(20_000 * MS, 24_800 * MS, 100 * MS)
+    for arrival in (24_800 * MS, 24_850 * MS):
+        assert not any(clock.update(boot, OFFSET + arrival) for boot in held)
+    assert abs((clock.offset(OFFSET + 25 * SECOND_NS) or 0) - OFFSET) < 100 * MS
+
+
 def test_delayed_and_false_old_stamps_are_not_a_reboot() -> None:
     clock = BootClock()
     for i in range(100, 200):
