@@ -235,6 +235,8 @@ class Bridge:
     def _on_truth(self, truth: Truth) -> None:
         if self._truth_ns is None:
             self._report("receiving the simulator's truth")
+            if why := self._beacons.describe_unreached(truth):
+                self._report(f"no beacon answers here: {why}")
         self._truth_ns = truth.t_ns
         self.comparison.add_truth(truth.t_ns, Geodetic(truth.lat, truth.lon, truth.alt))
         for fix in self._beacons.answers_to(truth):

@@ -16,6 +16,7 @@ from collections.abc import Sequence
 import numpy as np
 from msgspec.structs import replace
 
+from companion.analysis import simulated_rsbn
 from companion.link import frame
 from companion.nav.geometry import Geodetic, separation
 from companion.records import RsbnFix, Truth
@@ -63,6 +64,22 @@ class LiveBeacons:
                 self._count += 1
                 fixes.append(fix)
         return fixes
+
+    def describe_unreached(self, truth: Truth) -> str:
+        """Describe the nearest beacon if it is out of reach at this position, else return nothing."""
+        listed = [
+            simulated_rsbn.ListedBeacon(
+                beacon.number,
+                math.radians(beacon.lat_deg),
+                math.radians(beacon.lon_deg),
+                beacon.alt,
+                beacon.range_limit,
+            )
+            for beacon in self._beacons
+        ]
+        lat, lon, alt = (np.array([value]) for value in (truth.lat, truth.lon, truth.alt))
+        here = simulated_rsbn.AircraftTrack(np.array([truth.t_ns]), lat, lon, alt, "")
+        return simulated_rsbn.describe_unreached(listed, here)
 
     def take_due(self, now_ns: int, boot_ns: int | None, system: int) -> list[bytes]:
         """Return the frames of the answers due at `now_ns`.

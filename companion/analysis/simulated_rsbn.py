@@ -260,6 +260,27 @@ def simulate_measurements(
     return sorted(found, key=lambda answer: (answer.rx_ns, answer.beacon))
 
 
+def describe_unreached(beacons: Sequence[ListedBeacon], track: AircraftTrack) -> str:
+    """Describe the beacon that comes nearest to being received; empty if one is in reach."""
+    place = ecef(track.lat, track.lon, track.alt)
+    passes = []
+    for beacon in beacons:
+        slant = sight_from(Geodetic(beacon.lat, beacon.lon, beacon.alt), place).slant
+        k = int(np.argmin(slant))
+        horizon = radio_horizon(beacon.alt - GROUND, float(track.alt[k]) - GROUND)
+        limit, what = min((beacon.range_limit, "range limit"), (horizon, "radio horizon"))
+        passes.append((float(slant[k]) - limit, limit, what, beacon))
+    if not passes or min(passes)[0] <= 0.0:
+        return ""
+    beyond, limit, what, nearest = min(passes)
+    lat_deg, lon_deg = math.degrees(nearest.lat), math.degrees(nearest.lon)
+    return (
+        f"the nearest, {nearest.number} at {lat_deg:.7g}, {lon_deg:.7g} deg and {nearest.alt:.6g} m, is"
+        f" {round((beyond + limit) / 1e3, 1):.6g} km away, its {what} is {limit / 1e3:.3g} km;"
+        " check its numbers, in degrees and metres"
+    )
+
+
 class Sight(NamedTuple):
     """Azimuth in [0, 2 pi) rad, slant range (m) and elevation (rad) at a beacon, each (n,)."""
 

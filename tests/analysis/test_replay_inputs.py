@@ -169,6 +169,14 @@ def test_outage_counts_from_the_first_record_as_the_report_does(tmp_path: pathli
     assert (flight["start_s"], flight["end_s"]) == (pytest.approx(30.0), pytest.approx(40.0))
 
 
+def test_beacon_out_of_reach_is_described_in_a_note(tmp_path: pathlib.Path) -> None:
+    (exchanged := tmp_path / "exchanged.csv").write_text("id,lat_deg,lon_deg,alt_m\n5,7.0,45.0,300\n")
+    result = report(dataflash_with_text_first(tmp_path), "-o", tmp_path / "x.mcap", "--rsbn", exchanged)
+    (note,) = result["notes"]
+    assert note.startswith(f"no beacon of {exchanged} is received along the log's own smoothed track")
+    assert ": the nearest, 5 at 7, 45 deg and 300 m, is 5" in note
+
+
 @pytest.mark.flight
 def test_simulated_measurements_depend_on_the_seed(tmp_path: pathlib.Path, beacons: pathlib.Path) -> None:
     one, same, other = (tmp_path / name for name in ("one.mcap", "same.mcap", "other.mcap"))

@@ -56,6 +56,26 @@ def test_noise_depends_on_seed_and_beacon() -> None:
     assert [answer.rx_ns for answer in both] == sorted(answer.rx_ns for answer in both)
 
 
+@pytest.mark.parametrize(
+    ("beacon", "named"),
+    [  # a sign forgotten, in radians, in kilometres, under the ground
+        (NEAR._replace(lon=1.62), "7 at 45.26367, 92.81916 deg and 300 m, is 9005.3 km away"),
+        (
+            NEAR._replace(lat=math.radians(0.79), lon=math.radians(-1.62)),
+            "7 at 0.79, -1.62 deg and 300 m, is 9000 km",
+        ),
+        (NEAR._replace(range_limit=0.37), "its range limit is 0.00037 km; check its numbers"),
+        (NEAR._replace(lat=0.84, alt=-6000.0), "and -6000 m, is 350.3 km away, its radio horizon is 226 km"),
+    ],
+)
+def test_beacon_out_of_reach_is_described_with_its_limit(
+    beacon: simulated_rsbn.ListedBeacon, named: str
+) -> None:
+    assert not simulated_rsbn.simulate_measurements([beacon], track())
+    assert named in simulated_rsbn.describe_unreached([beacon], track())
+    assert simulated_rsbn.describe_unreached([beacon, NEAR], track()) == ""
+
+
 def test_only_beacons_above_the_horizon_and_within_range_are_received() -> None:
     low, beacon = track(alt=20.0), Geodetic(0.785, -1.632, 1.0)
     fixes = {
