@@ -65,6 +65,9 @@ def command(
     for target in outputs:
         reject_own_input(target, *logs, config_file)
         reject_any_log(target)
+    _check_suffix(output, "a report", ".html", ".htm")
+    if pdf is not None:
+        _check_suffix(pdf, "the PDF of the figures", ".pdf")
     if png is not None and png.exists() and not png.is_dir():
         raise LogError(f"cannot write the figures to {png}: it is a file; give a folder")
     if (package := first_missing("jinja2", *(["matplotlib"] if pdf or png else []))) is not None:
@@ -96,6 +99,12 @@ def command(
             click.echo(f"{head}{verdict.word}: {printable(verdict.reason)} {verdict.number} {verdict.what}.")
             click.echo(printable(" ".join(summarize_flight(flight))))
     click.echo(f"written: {', '.join(str(path) for path in written)}")
+
+
+def _check_suffix(path: Path, what: str, *suffixes: str) -> None:
+    """Raise LogError if `path` has the suffix of another format: no viewer would open it."""
+    if path.suffix and path.suffix.lower() not in suffixes:
+        raise LogError(f"{path}: {what} is written as {suffixes[0]}: give a name that ends with it")
 
 
 def _reject_flown(logs: Sequence[Path]) -> None:

@@ -1023,7 +1023,9 @@ def test_missing_package_is_reported_before_the_work(options, package, log, tmp_
         ("-o", "no/r.html", "cannot be written: no folder"),
         ("-o", "", "is a folder: give the name of a file"),
         ("-o", "closed/r.html", "closed is not writable"),
+        ("-o", "r.pdf", "r.pdf: a report is written as .html: give a name that ends with it"),
         ("--pdf", "no/r.pdf", "cannot be written: no folder"),
+        ("--pdf", "f.html", "f.html: the PDF of the figures is written as .pdf: give a name"),
         ("--png", "file", "it is a file; give a folder"),
     ],
 )
