@@ -175,9 +175,10 @@ def _line_of(error: Exception, text: str) -> str:
     """Return the line that an error of tomllib names, and what is mostly wrong with it."""
     found = re.search(r"\(at line (\d+),", str(error))
     line = text.split("\n")[int(found[1]) - 1].strip() if found else ""
-    if not 0 < len(line) <= MAX_QUOTED:
-        return ""
-    return f": `{line}`; write text in quotes, and numbers with a decimal point"
+    quoted = f": `{line}`" if 0 < len(line) <= MAX_QUOTED else ""
+    if re.match(r"Cannot (overwrite|declare|mutate)", str(error)):
+        return f"{quoted}; a key or section is given twice: keep one"
+    return f"{quoted}; write text in quotes, and numbers with a decimal point" if quoted else ""
 
 
 def _check_size(size: int, where: str) -> None:
