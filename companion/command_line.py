@@ -6,6 +6,7 @@ entry points, so that nothing here imports it: on an aircraft it need not be ins
 
 from __future__ import annotations
 
+import difflib
 import importlib
 import os
 import re
@@ -78,6 +79,17 @@ class LazyGroup(click.Group):
     def list_commands(self, ctx: click.Context) -> list[str]:
         """Return all names, sorted."""
         return sorted({*self._table, *self.commands})
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """Find the command; an unknown name is reported with the nearest one."""
+        name = args[0]
+        if self.get_command(ctx, name) is None and (
+            close := difflib.get_close_matches(name, self.list_commands(ctx), 1)
+        ):
+            ctx.fail(f"No such command {name!r}; did you mean {close[0]}?")
+        return super().resolve_command(ctx, args)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         """Import and return the command of that name."""

@@ -34,6 +34,16 @@ def test_help_lists_every_command() -> None:
     assert [line for line in lines if line and not line.startswith(" ")] == ["Look:", "Study:", "Develop:"]
 
 
+@pytest.mark.parametrize(
+    ("arguments", "nearest"),
+    [(["rum"], "run"), (["check_config"], "check-config"), (["study", "outage"], "outages")],
+)
+def test_unknown_command_suggests_the_nearest(arguments: list[str], nearest: str) -> None:
+    done = CliRunner().invoke(cli, arguments)
+    assert done.exit_code == 2
+    assert f"No such command {arguments[-1]!r}; did you mean {nearest}?" in done.output
+
+
 @pytest.mark.parametrize("arguments", [[], ["study"], ["log"], *([name] for name in COMMANDS)])
 def test_help_fits_80_columns(arguments: list[str]) -> None:
     done = CliRunner().invoke(cli, [*arguments, "--help"], terminal_width=80)
