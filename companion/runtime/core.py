@@ -4,7 +4,7 @@
     core.poll(now_ns)                    # no later than core.deadline()
     core.to_send(link, now_ns)           # after either: the frames to write to a link
     core.settle()                        # then, if there is time: deferred work
-    core.bear()                          # and births of hypotheses, while core.births_due
+    core.bear()                          # and births of hypotheses, twice if core.births_due
 
 The asyncio service and the virtual-time loopback drive the same object. It holds no navigation state. It
 decides which senders are accepted (one autopilot, any beacon receiver), what is logged and when a solution is

@@ -246,16 +246,14 @@ class Service:
             self._notifier.alive(now)
         self.core.settle()
         self._deferred.flush()
-        self._bear_soon()
-
-    def _bear_soon(self) -> None:
-        """Let births have turns of their own: each half takes as long as an answer."""
-        if self.core.births_due:
+        if self.core.births_due:  # two turns of their own: each half takes as long as an answer
             asyncio.get_running_loop().call_soon(self._bear)
 
     def _bear(self) -> None:
+        """Do one half and let the other follow, no more: births that fail stay due."""
         self.core.bear()
-        self._bear_soon()
+        if self.core.births_due:
+            asyncio.get_running_loop().call_soon(self.core.bear)
 
     def save_state(self) -> str | None:
         """Save the timestamp and the parameters; return the error of the parameters' disk, None if saved.

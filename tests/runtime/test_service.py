@@ -505,3 +505,27 @@ def test_stalled_tcp_peer_drops_the_oldest_frames_and_they_are_counted(tmp_path:
     assert sum("the line is too slow" in event.text for event in events) == 1
     states = dropped_by(tmp_path / "a.mcap")
     assert states == sorted(states) and states[-1] > 1000
+
+
+def test_births_that_stay_due_take_two_turns_and_no_more(tmp_path: Path) -> None:
+    """Where they fail, and before the first record after a restart, they stay due: it span at full load."""
+    turns = 0
+
+    class Unable:
+        births_due = True
+
+        def bear(self) -> None:
+            nonlocal turns
+            turns += 1
+
+        def settle(self) -> None: ...
+
+    async def flush(service: Service) -> None:
+        service._flush()
+        await asyncio.sleep(0.05)
+
+    with log_in(tmp_path) as log:
+        service = Service(load(None, {"link.connect": ("udpin:14550",)}, {}), log, print)
+        service.core._navigator = Unable()  # type: ignore[assignment]
+        asyncio.run(flush(service))
+    assert turns == 2
