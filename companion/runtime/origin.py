@@ -80,6 +80,8 @@ class OriginCheck:
 
     def receive(self, record: Stamped) -> list[Event]:
         """Process a record of the autopilot; return what has changed."""
+        if self._pairs and record.rx_ns - self._pairs[-1].t_ns > RECENT_NS:
+            self._is_doubted = False
         if isinstance(record, LocalOrigin):
             self._stated = record
             is_without_position = self._is_without_position(record.rx_ns)
@@ -87,8 +89,6 @@ class OriginCheck:
             return [] if is_judged else self._replaced(record, record.rx_ns)
         if isinstance(record, LocalPosition):
             self._local = record
-            if self._pairs and record.rx_ns - self._pairs[-1].t_ns > RECENT_NS:
-                self._is_doubted = False
         elif isinstance(record, GlobalPosition):
             self._known = record
         elif isinstance(record, FilterStatus):

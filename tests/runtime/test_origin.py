@@ -127,6 +127,20 @@ def test_an_origin_is_doubted_no_longer_than_pairs_are_recent(autopilot: Autopil
     assert autopilot.check.undoubted is not None
 
 
+def test_nor_where_the_autopilot_has_no_local_position_any_more(autopilot: Autopilot) -> None:
+    """An EKF in constant position mode sends none and waits for our positions: it waited for ever."""
+    constant_position = 167
+    autopilot.state(TRUE)
+    autopilot.fly(10.1)
+    autopilot.place = displace(*autopilot.place, 300.0, 0.0, 0.0)
+    autopilot.take(GlobalPosition(autopilot.now, autopilot.now, *autopilot.place, SPEED, 100.0))
+    assert autopilot.check.undoubted is None
+    for _ in range(11):
+        autopilot.now += SECOND_NS
+        autopilot.take(FilterStatus(autopilot.now, autopilot.now, constant_position, False, 0.0))
+    assert autopilot.check.undoubted is not None
+
+
 def test_one_pair_across_a_jump_of_the_estimator_changes_nothing(autopilot: Autopilot) -> None:
     """The estimator is reset by 300 m between the local and the global position."""
     autopilot.state(TRUE)
