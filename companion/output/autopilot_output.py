@@ -82,6 +82,8 @@ class AutopilotOutput:
             if self._receivers.takes(record)[0]:
                 self._position_reset.receive(record)
                 self._source_switch.receive(record)
+            elif self.config.uses_second_receiver:
+                self._source_switch.note_other(record)
         elif isinstance(record, GlobalPosition | FilterStatus):
             self._position_reset.receive(record)
         elif isinstance(record, RsbnFix):

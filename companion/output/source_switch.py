@@ -94,7 +94,7 @@ class Situation(NamedTuple):
 
     fix_s: float  # the receiver has had a fix
     no_fix_s: float  # the receiver has reported no fix
-    silent_s: float  # nothing was received from a receiver that was received before
+    silent_s: float  # nothing was received from a receiver that was, nor a fix of the other
     gnss_false: float | None  # probability, None without a recent solution
     witness: bool  # a beacon is received and believed, and itself contradicts GNSS
     sent_s: float  # our position has gone out
@@ -186,6 +186,7 @@ class SourceSwitch:
     def __init__(self) -> None:
         self._fix, self._no_fix, self._sent = ConditionTimer(), ConditionTimer(), ConditionTimer()
         self._receiver, self._receiver_ns = 0, 0  # its number, and when it last reported: 0 for never
+        self._other_fix_ns = 0  # when a receiver that is not in use last reported a fix
         self._sent_ns: int | None = None
         self._slack_ns = 0  # by which two positions of a slow output may be further apart than `MAX_GAP_NS`
         self._solution: Solution | None = None
@@ -218,6 +219,11 @@ class SourceSwitch:
         self._fix.update(record.has_3d_fix, now, 3 * SECOND_NS)
         self._no_fix.update(not record.has_3d_fix, now, 3 * SECOND_NS)
 
+    def note_other(self, record: Gnss) -> None:
+        """Note what a receiver reports that is not in use: with its fix the autopilot has GNSS."""
+        if record.has_3d_fix:
+            self._other_fix_ns = record.rx_ns
+
     def note_output(self, solution: Solution, sent: bool, now_ns: int, period_ns: int = 0) -> None:
         """Note a solution and whether its position went out, one of those due every `period_ns`."""
         self._solution = solution
@@ -233,7 +239,8 @@ class SourceSwitch:
         """Return the facts at `now_ns`."""
         solution, patience = self._solution, 3 * SECOND_NS
         fresh = solution is not None and (now_ns - solution.rx_ns) * 1e-9 <= FRESH_S
-        silent = (now_ns - self._receiver_ns) * 1e-9 if self._receiver_ns else -1.0
+        heard_ns = max(self._receiver_ns, self._other_fix_ns)
+        silent = (now_ns - heard_ns) * 1e-9 if self._receiver_ns else -1.0
         stopped_ns = -SECOND_NS if self._sent_ns is None else max(0, now_ns - self._sent_ns - self._slack_ns)
         return Situation(
             fix_s=self._fix.held_s(now_ns, patience),

@@ -137,6 +137,21 @@ def test_neither_the_receiver_that_gps_input_feeds_nor_one_switched_off_is_used(
             assert choice.takes(fix(1, t + 0.1, 3)) == (False, [])
 
 
+def test_set_2_is_not_requested_while_the_second_has_a_fix_and_waits_for_the_first() -> None:
+    """The first fails as the link loses 2.4 s of both: the second waits as long, the switch but 3 s."""
+    output, requested = AutopilotOutput(CONFIG), list[float]()
+    for k in range(400):
+        t, at = 0.1 * k, round(0.1 * k * SECOND_NS)
+        if k % 2 == 0 and k < 200:
+            output.receive(fix(0, t, 3))
+        if k % 5 == 0 and not 200 < k < 225:
+            output.receive(fix(1, t, 3))
+        output._source_switch._sent.update(True, at)
+        output._source_switch.update(at)
+        requested += [m.param1 for m in output._source_switch.to_send(1, at) if m.command == 42007]
+    assert set(requested) == {1}
+
+
 def test_a_flight_goes_on_with_gnss_by_the_second_and_source_set_2_is_never_requested() -> None:
     """The second receiver is 3 m off the first; the first is lost for good after a minute."""
     navigator, output = Navigator(CONFIG), AutopilotOutput(CONFIG)
