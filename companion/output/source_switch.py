@@ -241,6 +241,7 @@ class SourceSwitch:
         fresh = solution is not None and (now_ns - solution.rx_ns) * 1e-9 <= FRESH_S
         heard_ns = max(self._receiver_ns, self._other_fix_ns)
         silent = (now_ns - heard_ns) * 1e-9 if self._receiver_ns else -1.0
+        sent_s = self._sent.held_s(now_ns, MAX_GAP_NS + self._slack_ns) - self._slack_ns * 1e-9
         stopped_ns = -SECOND_NS if self._sent_ns is None else max(0, now_ns - self._sent_ns - self._slack_ns)
         return Situation(
             fix_s=self._fix.held_s(now_ns, patience),
@@ -248,7 +249,7 @@ class SourceSwitch:
             silent_s=silent,
             gnss_false=solution.gnss_false if fresh and solution is not None else None,
             witness=fresh and solution is not None and solution.witness and self._witness.contradicts,
-            sent_s=self._sent.held_s(now_ns, MAX_GAP_NS + self._slack_ns),
+            sent_s=max(-1.0, sent_s),  # a single position of a slow output is not steady
             stopped_s=stopped_ns * 1e-9,
         )
 

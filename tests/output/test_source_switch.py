@@ -557,3 +557,15 @@ def test_the_scripts_report_of_our_set_is_no_choice_where_its_acknowledgement_wa
 )
 def test_other_messages_select_nothing(name: str, fields: dict[str, Any], from_autopilot: bool) -> None:
     assert selected(dialect.new(name, **fields), from_autopilot, 1) is None
+
+
+def test_a_single_position_of_a_slow_output_is_not_steady() -> None:
+    """At 0.2 Hz set 2 was requested 3 s after the only one, for ten seconds."""
+    switch, period_ns = SourceSwitch(), 5 * SECOND_NS
+    switch.note_output(solution_at(SECOND_NS), True, SECOND_NS, period_ns)
+    for k in range(1, 20):
+        assert switch.situation(SECOND_NS * k).sent_s < STEADY_S
+    for k in range(4):
+        now = (100 + 5 * k) * SECOND_NS
+        switch.note_output(solution_at(now), True, now, period_ns)
+    assert switch.situation(now).sent_s >= STEADY_S
