@@ -41,7 +41,7 @@ from companion.units import SECOND_NS
 DRIFT = 100e-6
 #: Two stamps older than the newest one by this much mean a reboot.
 BACK = 3 * SECOND_NS
-#: for so long at least: a link that stalled may deliver what it held back twice.
+#: for so long at least where no silence came before: a link that stalled may deliver what it held back twice.
 BACK_LASTS = SECOND_NS // 10
 #: Without TIMESYNC the envelope follows the least delay of this window,
 WINDOW = 20 * SECOND_NS
@@ -164,7 +164,7 @@ class BootClock:
             if before is None or boot < before[0] or abs(difference - before[2]) > BACK:
                 self._back = boot, received, difference
                 return None
-            if received - before[1] < BACK_LASTS:
+            if received - self._newest_received < SECOND_NS and received - before[1] < BACK_LASTS:
                 return None
             is_young = boot <= received - self._newest_received + MAX_LATENESS
             change = ClockChange.REBOOTED if is_young else ClockChange.SET
