@@ -41,8 +41,9 @@ from companion.units import SECOND_NS
 DRIFT = 100e-6
 #: Two stamps older than the newest one by this much mean a reboot.
 BACK = 3 * SECOND_NS
-#: for so long at least where no silence came before: a link that stalled may deliver what it held back twice.
-BACK_LASTS = SECOND_NS // 10
+#: apart by this at least, and arriving in step, where no silence came before: a link that stalled may deliver
+#: what it held back twice, all at once.
+BACK_APART = SECOND_NS // 100
 #: Without TIMESYNC the envelope follows the least delay of this window,
 WINDOW = 20 * SECOND_NS
 #: but rises no faster than a simulator's clock may run slow.
@@ -164,7 +165,8 @@ class BootClock:
             if before is None or boot < before[0] or abs(difference - before[2]) > BACK:
                 self._back = boot, received, difference
                 return None
-            if received - self._newest_received < SECOND_NS and received - before[1] < BACK_LASTS:
+            apart, in_step = boot - before[0], 2 * (received - before[1]) >= boot - before[0]
+            if received - self._newest_received < SECOND_NS and not (apart >= BACK_APART and in_step):
                 return None
             is_young = boot <= received - self._newest_received + MAX_LATENESS
             change = ClockChange.REBOOTED if is_young else ClockChange.SET
