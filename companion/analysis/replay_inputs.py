@@ -203,13 +203,14 @@ def with_beacons_and_outages(
         track = simulated_rsbn.extract_track(open_inputs(log, config).records, config)
         measurements = simulated_rsbn.simulate_measurements(listed, track, seed)
         numbers = sorted({answer.beacon for answer in measurements})
-        why = "" if measurements else simulated_rsbn.describe_unreached(listed, track)
         note = (
             f"{len(measurements)} RSBN measurements of {len(numbers)} beacons"
             f" ({', '.join(map(str, numbers))}) simulated along {track.origin}, seed {seed}"
             if measurements
-            else f"no beacon of {beacons} is received along {track.origin}{': ' * bool(why)}{why}"
+            else f"no beacon of {beacons} is received along {track.origin}"
         )
+        if not measurements and (why := simulated_rsbn.describe_unreached(listed, track)):
+            note += f": {why}"
         merged = heapq.merge(merged, measurements, key=lambda record: record.rx_ns)  # type: ignore[assignment]
     removing = simulated_rsbn.OutageFilter(outages, first.rx_ns)
     return LogInputs(removing.left(merged), log_inputs.summary, removing), note

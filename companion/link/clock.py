@@ -41,8 +41,8 @@ from companion.units import SECOND_NS
 DRIFT = 100e-6
 #: Two stamps older than the newest one by this much mean a reboot.
 BACK = 3 * SECOND_NS
-#: apart by this at least, and arriving in step, where no silence came before: a link that stalled may deliver
-#: what it held back twice, all at once.
+#: They are apart by this at least, and arrive in step, where no silence came before: a link that stalled may
+#: deliver what it held back twice, all at once.
 BACK_APART = SECOND_NS // 100
 #: Without TIMESYNC the envelope follows the least delay of this window,
 WINDOW = 20 * SECOND_NS
@@ -145,7 +145,7 @@ class BootClock:
         self._last_difference = 0  # arrival - stamp of the last message
         # (arrival, arrival - stamp) of the last WINDOW, increasing in both: the first is the least
         self._least: deque[tuple[int, int]] = deque()
-        self._back: tuple[int, int, int] | None = None  # a stamp that went back, arrival, arrival - stamp
+        self._back: tuple[int, int] | None = None  # a stamp that went back, and its arrival
         self._samples: deque[TimesyncSample] = deque(maxlen=8)
         self._best: TimesyncSample | None = None
         self._unix_minus_boot: int | None = None
@@ -161,12 +161,13 @@ class BootClock:
         """Process the stamp of a message that was stamped when sent; return a detected clock change."""
         difference, change = received - boot, None
         if boot < self._newest - BACK or self._booted_in_silence(boot, received):
-            before = self._back
-            if before is None or boot < before[0] or abs(difference - before[2]) > BACK:
-                self._back = boot, received, difference
+            first = self._back
+            if first is None or boot < first[0] or abs(difference - (first[1] - first[0])) > BACK:
+                self._back = boot, received
                 return None
-            apart, in_step = boot - before[0], 2 * (received - before[1]) >= boot - before[0]
-            if received - self._newest_received < SECOND_NS and not (apart >= BACK_APART and in_step):
+            apart = boot - first[0]
+            is_in_step = apart >= BACK_APART and 2 * (received - first[1]) >= apart
+            if received - self._newest_received < SECOND_NS and not is_in_step:
                 return None
             is_young = boot <= received - self._newest_received + MAX_LATENESS
             change = ClockChange.REBOOTED if is_young else ClockChange.SET

@@ -77,8 +77,8 @@ GNSS_FIRST = (
     Lie(300.0, STILL, share=0.05),
     Lie(2000.0, STILL, share=0.05),
 )
-#: Its lie changes so often. With 1, a GNSS that was off by 60 m from its first fix on, which a beacon that
-#: answered before it cannot exclude, came near to one that is drawn off now: 15 m of sigma instead of 5.
+#: Its lie changes so often in an hour. With 1, a GNSS that was off by 60 m from its first fix on, which a
+#: beacon that answered before it cannot exclude, came near to one drawn off now: 15 m of sigma, not 5.
 GNSS_CHANGES_H = 0.1
 AIRSPEED_LIES = (Lie(3.0, 0.03), Lie(15.0, 0.3))  # m/s, m/s^2
 VELOCITY_LIES = (Lie(0.3, 0.003), Lie(3.0, 0.03), Lie(0.3, 0.03, noise=0.01))  # m/s, m/s^2
@@ -279,8 +279,9 @@ def only(bank: Bank, row: int) -> Bank:
 def _hypotheses(config: Config, channel: Channel, now: Situation) -> Hypotheses:
     azimuth_bias, range_bias = math.radians(config.rsbn.bias_azimuth_deg), config.rsbn.bias_range_m
     sigma_a, sigma_r = math.radians(config.rsbn.sigma_azimuth_deg), config.rsbn.sigma_range_m
-    # an air-data or IMU channel alone is no witness against GNSS: its own model may be what is wrong
-    both_h, alone_h = (7e-4, 3e-4) if now.witness or not channel.wind else (0.0, 0.0)
+    # GNSS, or its position alone: onsets in an hour, and as probable from its first fix on. An air-data or
+    # IMU channel alone is no witness against it: its own model may be what is wrong
+    both, alone = (7e-4, 3e-4) if now.witness or not channel.wind else (0.0, 0.0)
     sources = [
         Source(SOURCES[GNSS], 2, GNSS_GROUP, presumed=True),
         Source(SOURCES[AIRSPEED], 1, AIRSPEED_GROUP, silence_s=SILENCE_S),
@@ -288,8 +289,8 @@ def _hypotheses(config: Config, channel: Channel, now: Situation) -> Hypotheses:
     ]
     lies = gnss_lies(ACCELERATED if channel.wind else ACCELERATED_GENTLY)
     faults = [
-        Fault("gnss", (GNSS,), both_h, lies, both_h, GNSS_FIRST, (), 1.0, GNSS_CHANGES_H, 20),
-        Fault("gnss position", (GNSS,), alone_h, lies, alone_h, GNSS_FIRST, (), 1.0, GNSS_CHANGES_H, 10),
+        Fault("gnss", (GNSS,), both, lies, both, GNSS_FIRST, (), 1.0, GNSS_CHANGES_H, 20),
+        Fault("gnss position", (GNSS,), alone, lies, alone, GNSS_FIRST, (), 1.0, GNSS_CHANGES_H, 10),
         Fault("airspeed", (AIRSPEED,), 1e-2, AIRSPEED_LIES, shock=SHOCK if now.by_air else (), quota=6),
         Fault("velocity of gnss", (VELOCITY,), 1e-2, VELOCITY_LIES, 5e-2, VELOCITY_LIES, quota=12),
     ]

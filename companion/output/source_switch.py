@@ -239,8 +239,8 @@ class SourceSwitch:
         """Return the facts at `now_ns`."""
         solution, patience = self._solution, 3 * SECOND_NS
         fresh = solution is not None and (now_ns - solution.rx_ns) * 1e-9 <= FRESH_S
-        heard_ns = max(self._receiver_ns, self._other_fix_ns)
-        silent = (now_ns - heard_ns) * 1e-9 if self._receiver_ns else -1.0
+        received_ns = max(self._receiver_ns, self._other_fix_ns)
+        silent = (now_ns - received_ns) * 1e-9 if self._receiver_ns else -1.0
         sent_s = self._sent.held_s(now_ns, MAX_GAP_NS + self._slack_ns) - self._slack_ns * 1e-9
         stopped_ns = -SECOND_NS if self._sent_ns is None else max(0, now_ns - self._sent_ns - self._slack_ns)
         return Situation(
@@ -260,7 +260,7 @@ class SourceSwitch:
 
     @property
     def has_left_gnss(self) -> bool:
-        """Whether it may have taken the autopilot off GNSS, and nobody else has selected that."""
+        """Whether it may have taken the autopilot off GNSS, and no other has selected that."""
         is_left = self.is_on_companion and self._held is None
         return self._required is not None and (is_left or COMPANION_SET in self._unconfirmed)
 

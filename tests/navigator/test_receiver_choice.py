@@ -69,7 +69,7 @@ def test_a_silent_first_receiver_is_replaced_before_it_is_called_silent() -> Non
 
 @pytest.mark.parametrize("until", [23.1, 23.3, 23.5])
 def test_a_silence_of_both_is_the_links(until: float) -> None:
-    """The second, heard first after 3 s, was used for 5 s: two texts, and the drift of GNSS unknown again."""
+    """The second, received first after 3 s, was used for 5 s: two texts, the drift of GNSS unknown again."""
 
     def both(t: float) -> int | None:
         return None if 20.0 <= t < until else 3
@@ -81,7 +81,7 @@ def test_a_silence_of_both_is_the_links(until: float) -> None:
 
 
 def test_after_a_silence_of_the_link_the_first_with_a_new_fix_is_not_trusted_sooner() -> None:
-    """Heard first, it was used at once: `has a fix, the other none`."""
+    """Received first, it was used at once: `has a fix, the other none`."""
 
     def first(t: float) -> int | None:
         return None if 20.0 <= t < 23.1 else 1 if 10.0 <= t < 20.0 else 3

@@ -416,7 +416,7 @@ def test_gnss_of_px4_is_on_after_our_positions_were_switched_off(monkeypatch: py
 
 @pytest.mark.parametrize("hz", [0.8, 0.2])
 def test_source_set_follows_gnss_by_a_slow_output(hz: float) -> None:
-    """A second between two positions was a gap: set 2 was never requested, and nothing was said."""
+    """A second between two positions was a gap: set 2 was never requested, and nothing reported."""
     flight = Flight(configured("output.profile=ardupilot", f"output.odometry_hz={hz}"))
     flight.fly(20.0)
     flight.gnss = False

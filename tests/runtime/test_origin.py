@@ -115,11 +115,16 @@ def test_an_origin_that_the_last_pair_contradicts_is_not_used(autopilot: Autopil
     assert autopilot.check.undoubted is not None
 
 
-def test_an_origin_is_doubted_no_longer_than_pairs_are_recent(autopilot: Autopilot) -> None:
+def jump_between_positions(autopilot: Autopilot) -> None:
+    """After 10 s the estimator is reset by 300 m between the local and the global position."""
     autopilot.state(TRUE)
     autopilot.fly(10.1)
     autopilot.place = displace(*autopilot.place, 300.0, 0.0, 0.0)
     autopilot.take(GlobalPosition(autopilot.now, autopilot.now, *autopilot.place, SPEED, 100.0))
+
+
+def test_an_origin_is_doubted_no_longer_than_pairs_are_recent(autopilot: Autopilot) -> None:
+    jump_between_positions(autopilot)
     assert autopilot.check.undoubted is None
     for _ in range(101):
         autopilot.now += SECOND_NS // 10
@@ -130,10 +135,7 @@ def test_an_origin_is_doubted_no_longer_than_pairs_are_recent(autopilot: Autopil
 def test_nor_where_the_autopilot_has_no_local_position_any_more(autopilot: Autopilot) -> None:
     """An EKF in constant position mode sends none and waits for our positions: it waited for ever."""
     constant_position = 167
-    autopilot.state(TRUE)
-    autopilot.fly(10.1)
-    autopilot.place = displace(*autopilot.place, 300.0, 0.0, 0.0)
-    autopilot.take(GlobalPosition(autopilot.now, autopilot.now, *autopilot.place, SPEED, 100.0))
+    jump_between_positions(autopilot)
     assert autopilot.check.undoubted is None
     for _ in range(11):
         autopilot.now += SECOND_NS
@@ -142,11 +144,7 @@ def test_nor_where_the_autopilot_has_no_local_position_any_more(autopilot: Autop
 
 
 def test_one_pair_across_a_jump_of_the_estimator_changes_nothing(autopilot: Autopilot) -> None:
-    """The estimator is reset by 300 m between the local and the global position."""
-    autopilot.state(TRUE)
-    autopilot.fly(10.1)
-    autopilot.place = displace(*autopilot.place, 300.0, 0.0, 0.0)
-    autopilot.take(GlobalPosition(autopilot.now, autopilot.now, *autopilot.place, SPEED, 100.0))
+    jump_between_positions(autopilot)
     autopilot.fly(10.0)
     assert (autopilot.off(), autopilot.check.resets, autopilot.texts) == (0.0, 0, [])
 

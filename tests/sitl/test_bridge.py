@@ -221,8 +221,8 @@ def test_events_are_reported(relayed) -> None:
 def test_beacon_out_of_reach_is_reported(entries, relayed) -> None:
     exchanged = Beacon(1, EAST.lon_deg, EAST.lat_deg, alt=200.0)
     flight = BridgeFlight(entries[:300], Bridge([exchanged]))
-    (said,) = [text for text in flight.reports if "beacon" in text]
-    assert said.startswith("no beacon answers here: the nearest, 1 at 38.57, 55.75 deg and 200 m, is 2")
+    (text,) = [text for text in flight.reports if "beacon" in text]
+    assert text.startswith("no beacon answers here: the nearest, 1 at 38.57, 55.75 deg and 200 m, is 2")
     assert not [text for text in relayed.reports if "beacon" in text]
 
 
