@@ -6,6 +6,7 @@ log can end an element or begin one.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from datetime import UTC, datetime
 from importlib.resources import files
@@ -19,6 +20,9 @@ from companion.analysis.flight_arrays import TimelineEntry
 from companion.analysis.flight_events import phase_title, reason_title, source_title, topic_name
 from companion.analysis.plot_data import Figure
 from companion.analysis.summary import (
+    BY_BEACONS,
+    WITH_GNSS,
+    WITHOUT,
     count_held,
     describe_outage,
     describe_worst,
@@ -26,7 +30,7 @@ from companion.analysis.summary import (
     format_length,
     format_share,
     format_time,
-    rms_by_fixes,
+    rms_by_source,
     summarize_flight,
     worst_of,
 )
@@ -176,24 +180,33 @@ def _tiles(a: Assessment) -> list[tuple[str, str]]:
 
 def comparison_table(block: ReportBlock) -> Table:
     """Return a row for each flight of a block: verdict, duration, outage, errors."""
-    rows = []
+    rows: list[Sequence[str | Cell]] = []
     for a, name in zip(block.flights, block.names, strict=True):
         verdict = judge_flight(a)
         reference = NO_NUMBER if a.reference is None else a.reference.what
-        with_fixes, without = rms_by_fixes(a)
+        rms = rms_by_source(a)
         rows.append(
             (
                 name,
                 Cell(verdict.word, verdict.level),
                 format_duration(a.flight.seconds),
                 describe_outage(a),
-                format_length(with_fixes),
-                format_length(without),
+                *(format_length(rms.get(how, math.nan)) for how in (WITH_GNSS, BY_BEACONS, WITHOUT)),
                 format_length(worst_of(a).estimate),
                 reference,
             )
         )
-    head = ("log", "verdict", "lasts", "GNSS lost for", "r.m.s. with fixes", "without", "greatest", "against")
+    head = (
+        "log",
+        "verdict",
+        "lasts",
+        "GNSS lost for",
+        f"r.m.s. {WITH_GNSS}",
+        BY_BEACONS,
+        WITHOUT,
+        "greatest",
+        "against",
+    )
     same = len({a.reference.what if a.reference else "" for a in block.flights}) == 1
     note = "" if same else "The logs have different references; compare with care."
     return Table(head, rows, "cards", note, "Comparison")

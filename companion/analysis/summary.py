@@ -70,11 +70,12 @@ def format_share(share: float) -> str:
 
 class Worst(NamedTuple):
     """The greatest horizontal distances of a flight, m: of the estimate from the reference and its time (s),
-    of GNSS from the estimate or the reference. NaN if unknown."""
+    of GNSS from the estimate or the reference, of the estimate as it started. NaN if unknown."""
 
     estimate: float
     t: float
     gnss: float
+    starting: float
 
 
 def worst_of(a: Assessment) -> Worst:
@@ -82,12 +83,21 @@ def worst_of(a: Assessment) -> Worst:
     corrected, gnss = a.errors.get(error_statistics.CORRECTED), a.errors.get(error_statistics.GNSS)
     far = [group.metres for group in a.groups if group.source.lower().startswith("gnss")]
     far += [float(gnss.error.max())] if gnss is not None else []
-    k = 0 if corrected is None else int(np.argmax(corrected.error))
-    return Worst(
-        math.nan if corrected is None else float(corrected.error[k]),
-        math.nan if corrected is None else corrected.t_ns[k] * 1e-9,
-        max((d for d in far if math.isfinite(d)), default=math.nan),
-    )
+    farthest = max((d for d in far if math.isfinite(d)), default=math.nan)
+    if corrected is None:
+        return Worst(math.nan, math.nan, farthest, math.nan)
+    first = int(np.searchsorted(corrected.t_ns, _started_ns(a)))
+    first = first if first < len(corrected.t_ns) else 0
+    k = first + int(np.argmax(corrected.error[first:]))
+    starting = float(corrected.error[:first].max()) if first else math.nan
+    return Worst(float(corrected.error[k]), corrected.t_ns[k] * 1e-9, farthest, starting)
+
+
+def _started_ns(a: Assessment) -> int:
+    """Return when the first fixes of GNSS followed a short time with beacons alone, 0 if they did not."""
+    names = [_rests_on(phase.name) for phase in a.phases[:2]]
+    start = a.phases[0].end_ns
+    return start if names == [BY_BEACONS, WITH_GNSS] and start < SHORT_S * 1e9 else 0
 
 
 def describe_worst(a: Assessment) -> str:
@@ -150,19 +160,31 @@ def _absent_gnss(a: Assessment) -> str:
     return "received without a fix" if len(a.flight.tables["Gnss"]["t"]) else "never received"
 
 
-def rms_by_fixes(a: Assessment) -> tuple[float, float]:
-    """Return the r.m.s. distance from the reference with fixes and without, m; NaN if there is none."""
-    with_fixes, without = (root_mean_square(error) if len(error) else math.nan for error in _split_errors(a))
-    return with_fixes, without
+#: What the position of a phase rests on, as the sentences name it.
+RESTS_ON = (WITH_GNSS, BY_BEACONS, WITHOUT, OTHERWISE) = (
+    "with GNSS",
+    "by beacons alone",
+    "without fixes",
+    "at other times",
+)
 
 
-def _split_errors(a: Assessment) -> tuple[Floats, Floats]:
-    """Return the errors of the corrected estimate, with fixes and without."""
+def rms_by_source(a: Assessment) -> dict[str, float]:
+    """Return the r.m.s. distance from the reference (m) by what the position rests on, where there is any."""
     corrected = a.errors.get(error_statistics.CORRECTED)
     if corrected is None:
-        return np.zeros(0), np.zeros(0)
-    alone = in_phases_without_fixes(a.phases, corrected.t)
-    return corrected.error[~alone], corrected.error[alone]
+        return {}
+    errors: dict[str, list[Floats]] = {}
+    for phase in a.phases:
+        errors.setdefault(_rests_on(phase.name), []).append(corrected.error[phase.covers(corrected.t)])
+    found = {how: np.concatenate(errors[how]) for how in RESTS_ON if how in errors}
+    return {how: root_mean_square(error) for how, error in found.items() if len(error)}
+
+
+def _rests_on(phase: str) -> str:
+    if phase in WITHOUT_FIXES:
+        return WITHOUT
+    return WITH_GNSS if "GNSS" in phase else BY_BEACONS if "RSBN" in phase else OTHERWISE
 
 
 def _seconds_without_fixes(a: Assessment) -> float:
@@ -213,8 +235,7 @@ def _error_sentences(a: Assessment) -> list[str]:
     corrected = a.errors.get(error_statistics.CORRECTED)
     if corrected is None or a.reference is None:
         return ["There is nothing to compare the estimate with: its accuracy is unknown."]
-    found = zip(_split_errors(a), ("with fixes", "without"), strict=True)
-    parts = [f"{format_length(root_mean_square(error))} {how}" for error, how in found if len(error)]
+    parts = [f"{format_length(rms)} {how}" for how, rms in rms_by_source(a).items()]
     ins = a.errors.get(error_statistics.INS)
     beside = (
         f"; the inertial channel alone {format_length(root_mean_square(ins.error))}"
@@ -224,9 +245,10 @@ def _error_sentences(a: Assessment) -> list[str]:
     subject = f"The {deviation(a)} of the estimate"
     subject += "" if a.against_truth else f" from {a.reference.what}"
     worst = worst_of(a)
+    before = f", {format_length(worst.starting)} before GNSS" if math.isfinite(worst.starting) else ""
     sentences = [
-        f"{subject} was {' and '.join(parts)} (r.m.s.), {format_length(worst.estimate)} at most "
-        f"({format_time(worst.t)}){beside}."
+        f"{subject} was {', '.join(parts)} (r.m.s.), {format_length(worst.estimate)} at most "
+        f"({format_time(worst.t)}{before}){beside}."
     ]
     if a.reference.what == SMOOTHED:
         sentences.append(

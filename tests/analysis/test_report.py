@@ -41,7 +41,7 @@ from companion.analysis.summary import (
     format_duration,
     format_length,
     format_time,
-    rms_by_fixes,
+    rms_by_source,
     summarize_flight,
     worst_of,
 )
@@ -368,9 +368,9 @@ def test_the_last_moment_belongs_to_the_last_phase():
     rows[-1] = msgspec.structs.replace(rows[-1], lat=far.lat, lon=far.lon)
     a = collected(rows)
     assert [phase.name for phase in a.phases] == ["GNSS", "prediction"]
-    with_fixes, without = rms_by_fixes(a)
-    assert with_fixes == pytest.approx(5.0, abs=0.1)
-    assert without == a.rows[-1].rms[error_statistics.CORRECTED]
+    rms = rms_by_source(a)
+    assert rms["with GNSS"] == pytest.approx(5.0, abs=0.1)
+    assert (without := rms["without fixes"]) == a.rows[-1].rms[error_statistics.CORRECTED]
     assert without == pytest.approx(math.sqrt((149 * 5.0**2 + 500.0**2) / 150), rel=1e-3)
 
 
@@ -420,7 +420,7 @@ def test_summary_describes_the_flight(assessed):
     for words in (
         "The log covers 5 min.",
         "GNSS was lost once, for 2 min (from 2:00 to 4:00).",
-        "error of the estimate was 5.0 m with fixes and 5.0 m without (r.m.s.), 5.0 m at most (",
+        "error of the estimate was 5.0 m with GNSS, 5.0 m without fixes (r.m.s.), 5.0 m at most (",
         "); the inertial channel alone 100 m",
         "10 fixes were rejected, from 1:00 to 1:02",
     ):
@@ -502,7 +502,8 @@ def test_flights_are_compared_in_one_table_and_in_the_same_axes(assessed):
     (block,) = comparison_block(logs, ["one", "two", "three"])
     table = comparison_table(block)
     assert [row[0] for row in table.rows] == ["A: one", "B: two", "C: three"]
-    assert [row[4:7] for row in table.rows] == [("5.0 m",) * 3, ("10.0 m",) * 3, ("5.0 m",) * 3]
+    off = [(m, "–", m, m) for m in ("5.0 m", "10.0 m", "5.0 m")]
+    assert [row[4:8] for row in table.rows] == off
     for figure in block.figures:
         assert {line.name[:2] for line in figure.lines} == {"A ", "B ", "C "}
 
@@ -774,6 +775,25 @@ def test_a_flight_without_an_estimate_names_what_is_missing(kinds, wanted):
     assert (verdict.level, verdict.number) == ("fault", "0")
     assert wanted in verdict.reason
     assert not re.search("compare|bound|error", sentences(assess_flight(empty)))
+
+
+@pytest.mark.parametrize(
+    ("seconds", "greatest", "before"), [(10, "5.0 m", ", 299 m before GNSS)"), (60, "299 m", ")")]
+)
+def test_the_greatest_error_is_not_that_of_a_single_beacon_before_gnss(seconds, greatest, before):
+    """A beacon alone for seconds before GNSS is a start; for a minute it is a part of the flight."""
+    rows = flight_records()
+    for k, row in enumerate(rows):
+        if isinstance(row, Solution) and row.t_ns < START + seconds * S:
+            far = displace(row.lat, row.lon, 0.0, 0.0, 295.0, 0.0)
+            beacons = Source.AZIMUTH | Source.RANGE
+            rows[k] = msgspec.structs.replace(row, lat=far.lat, lon=far.lon, sources=beacons)
+    a = collected(rows)
+    assert [phase.name for phase in a.phases] == ["RSBN", "GNSS", "prediction", "GNSS"]
+    assert format_length(worst_of(a).estimate) == greatest
+    (found,) = [text for text in summarize_flight(a) if "(r.m.s.)" in text]
+    assert "by beacons alone" in found
+    assert re.search(rf"{greatest} at most \(\d+:\d\d{re.escape(before)}", found)
 
 
 def test_no_number_of_the_text_is_greater_than_the_cards(assessed):
