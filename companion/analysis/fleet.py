@@ -257,7 +257,11 @@ def _write_all(rows: Sequence[FlightRow], results: Path) -> Iterator[Path]:
 @click.command("fleet")
 @click.argument("folders", type=click.Path(path_type=Path, exists=True), nargs=-1, required=True)
 @click.option(
-    "--results", type=click.Path(path_type=Path, file_okay=False), default=Path("fleet"), show_default=True
+    "-o",
+    "--results",
+    type=click.Path(path_type=Path, file_okay=False),
+    default=Path("fleet"),
+    show_default=True,
 )
 @worker_options
 @click.option(

@@ -242,7 +242,9 @@ def _cell(value: Any) -> str:
     show_default=True,
     help="Seeds per scenario and fault.",
 )
-@click.option("--results", type=click.Path(path_type=Path, file_okay=False), default=Path("logs/campaign"))
+@click.option(
+    "-o", "--results", type=click.Path(path_type=Path, file_okay=False), default=Path("logs/campaign")
+)
 @worker_options
 @click.option("--harmless-m", type=FloatRange(0.0), default=CampaignLimits().harmless_m, show_default=True)
 @click.option("--misleading", type=FloatRange(0.0), default=CampaignLimits().misleading, show_default=True)

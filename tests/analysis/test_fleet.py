@@ -62,7 +62,7 @@ def test_results_that_cannot_be_kept_are_one_sentence(tmp_path: Path) -> None:
 def test_each_log_is_a_row_and_a_bad_one_has_a_reason(logs: Path, tmp_path: Path) -> None:
     parquet = pytest.importorskip("pyarrow.parquet")
     results = tmp_path / "results"
-    shown = run(logs, "--results", results, "--workers", 0, "--reports", 0)
+    shown = run(logs, "-o", results, "--workers", 0, "--reports", 0)
     assert "3 logs: 2 flights" in shown and "1 logs not readable" in shown
     table = parquet.read_table(results / fleet.TABLE).to_pylist()
     assert {Path(row["log"]).name: row["reason"] for row in table} == {
