@@ -309,7 +309,7 @@ def command(
     good = [row for row in rows if row.reason is None]
     hours = sum(row.duration_s for row in good) / 3600.0
     click.echo(
-        f"{len(logs)} logs: {len(good)} flights of {hours:.1f} h, {len(rows) - len(good)} logs not readable"
+        f"{len(logs)} logs: {len(good)} flights of {hours:.1f} h, {len(rows) - len(good)} not readable"
     )
     for row in good[:5]:
         worst = "no reference" if row.largest_m is None else f"largest error {row.largest_m:.1f} m"

@@ -63,7 +63,7 @@ def test_each_log_is_a_row_and_a_bad_one_has_a_reason(logs: Path, tmp_path: Path
     parquet = pytest.importorskip("pyarrow.parquet")
     results = tmp_path / "results"
     shown = run(logs, "-o", results, "--workers", 0, "--reports", 0)
-    assert "3 logs: 2 flights" in shown and "1 logs not readable" in shown
+    assert "3 logs: 2 flights" in shown and "1 not readable" in shown
     table = parquet.read_table(results / fleet.TABLE).to_pylist()
     assert {Path(row["log"]).name: row["reason"] for row in table} == {
         "a.tlog": None,
