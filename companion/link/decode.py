@@ -362,12 +362,16 @@ def _vfr_hud(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
 
 @_of("AIRSPEED")
 def _airspeed(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
-    """Sent only where there is a sensor; so is the word that it fails. Of a second one only while in use."""
-    if m.id > 0 and not m.flags & mavlink.AIRSPEED_SENSOR_USING:
+    """Sent only where there is a sensor; so is the word that it fails. Of a second one only while in use.
+
+    The airspeed is that of the sensor in use: the first of two may be the one that fails.
+    """
+    in_use = bool(m.flags & mavlink.AIRSPEED_SENSOR_USING)
+    if m.id > 0 and not in_use:
         return ()
     t_ns, healthy = _unstamped(rx, sender), not m.flags & mavlink.AIRSPEED_SENSOR_UNHEALTHY
     state = AirspeedSensor(t_ns, rx, healthy)
-    if not healthy:
+    if not healthy or not in_use:
         return (state,)
     return state, AirData(t_ns, rx, number(m, "airspeed", limit=FASTEST), sensed=True)
 

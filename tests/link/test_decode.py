@@ -121,7 +121,7 @@ REJECTED: list[tuple[str, dict[str, Any], str]] = [
     ("ATTITUDE_QUATERNION", {}, "length 0"),
     ("ATTITUDE_QUATERNION", {"q1": NAN}, "q1 is nan"),
     ("HIGHRES_IMU", {"fields_updated": 63, "zgyro": NAN}, "zgyro is nan"),
-    ("AIRSPEED", {"airspeed": NAN}, "airspeed is nan"),
+    ("AIRSPEED", {"airspeed": NAN, "flags": 2}, "airspeed is nan"),
     ("WIND", {"direction": NAN}, "direction is nan"),
     ("WIND_COV", {"wind_x": NAN}, "wind_x is nan"),
     ("SCALED_PRESSURE", {"press_abs": INF}, "press_abs is inf"),
@@ -245,6 +245,7 @@ def test_airspeed_message_is_of_a_sensor_and_tells_its_health() -> None:
     assert decoded("AIRSPEED", airspeed=63.5, flags=1) == (r.AirspeedSensor(RX, RX, False),)
     assert decoded("AIRSPEED", id=1, airspeed=8.0, flags=0) == ()  # of two sensors the one that is not used
     assert decoded("AIRSPEED", id=1, airspeed=25.0, flags=2) == (sensor, air)
+    assert decoded("AIRSPEED", airspeed=8.0, flags=0) == (sensor,)  # nor is the first one where that is it
     assert one("VFR_HUD", airspeed=25.0).sensed is None  # it may be the estimator's own number
 
 
