@@ -105,11 +105,14 @@ FIELDS: dict[str, Callable[[float], dict[str, Any]]] = {
     "LOCAL_POSITION_NED": lambda t: {
         "time_boot_ms": _ms(t), "x": V_NORTH * t, "z": -HEIGHT, "vx": V_NORTH
     },
-    "ATTITUDE": lambda t: {"time_boot_ms": _ms(t), "pitch": 0.03},
-    "VFR_HUD": lambda t: {"airspeed": V_NORTH, "groundspeed": V_NORTH, "alt": HEIGHT, "heading": 0},
-    "RAW_IMU": lambda t: {"time_usec": _ms(t) * 1000, "zacc": -1000},
+    # numbers that stand still would be rejected
+    "ATTITUDE": lambda t: {"time_boot_ms": _ms(t), "pitch": 0.03 + 0.001 * math.sin(t)},
+    "VFR_HUD": lambda t: {
+        "airspeed": V_NORTH + 0.3 * math.sin(t), "groundspeed": V_NORTH, "alt": HEIGHT, "heading": 0
+    },
+    "RAW_IMU": lambda t: {"time_usec": _ms(t) * 1000, "zacc": -1000 + round(20.0 * math.sin(5.0 * t))},
     "HIGHRES_IMU": lambda t: {
-        "time_usec": _ms(t) * 1000, "zacc": -9.81, "abs_pressure": 920.0, "temperature": 20.0,
+        "time_usec": _ms(t) * 1000, "zacc": -9.81 + 0.2 * math.sin(5.0 * t), "abs_pressure": 920.0, "temperature": 20.0,
         "fields_updated": 63,
     },
     "SCALED_PRESSURE": lambda t: {"time_boot_ms": _ms(t), "press_abs": 920.0, "temperature": 2000},
