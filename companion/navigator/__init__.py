@@ -492,7 +492,7 @@ def _channel_event(record: Input, settings: Settings) -> Event:
         allowed += ["local_position"] * config.uses_local_velocity
         text = f"inertial channel: own, by what arrives of {', '.join(a.replace('_', ' ') for a in allowed)}"
         if "imu" in allowed:
-            text += "; no guaranteed bound by imu"
+            text += "; guaranteed bound by airspeed" if "air_data" in allowed else "; no guaranteed bound"
     else:
         text = "inertial channel: local position of an INS of its own"
     return Event(record.t_ns, record.rx_ns, Severity.INFO, text)

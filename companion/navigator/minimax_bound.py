@@ -14,7 +14,7 @@ window contradict what is stated, all bounds are wider by their ratio, and an ev
 
 An INS has the errors of its unit (`nav.bounded_channel`). Dead reckoning by airspeed and a foreign velocity
 have a velocity error that wanders and jumps. Strapdown with the autopilot's attitude has no bound: nothing
-bounds the error of that attitude in a turn.
+bounds the error of that attitude in a turn. The own channel reckons by airspeed alone beside it for this.
 """
 
 from __future__ import annotations
@@ -113,6 +113,14 @@ class Linear(NamedTuple):
     bound_n: Vector2
     velocity_bound_n: Vector2
 
+    def about(self, apart: Vector2, velocity_apart: Vector2) -> Linear:
+        """The same of another trajectory, from which this one is so far apart (m, m/s)."""
+        (n, e), (vn, ve) = self.error_n, self.velocity_error_n
+        return self._replace(
+            error_n=(n - apart[0], e - apart[1]),
+            velocity_error_n=(vn - velocity_apart[0], ve - velocity_apart[1]),
+        )
+
 
 class Guaranteed(NamedTuple):
     """Estimates of the channel's error now, and the bounds of all quantities of the first."""
@@ -120,6 +128,11 @@ class Guaranteed(NamedTuple):
     restricted: Linear
     minimax: Linear
     bounds: Bounds
+
+    def about(self, apart: Vector2, velocity_apart: Vector2) -> Guaranteed:
+        """The same of another trajectory, from which the one of the window is so far apart (m, m/s)."""
+        restricted, minimax = (each.about(apart, velocity_apart) for each in (self.restricted, self.minimax))
+        return Guaranteed(restricted, minimax, self.bounds)
 
 
 def law(config: Config, by: str, v_n: tuple[float, ...] = (0.0, 0.0)) -> Channel | None:

@@ -264,6 +264,20 @@ def carry_on(nominal: Nominal, s: Sensors, t_ns: int) -> Nominal:
     return by_velocity(nominal, nominal.interval.velocity, t_ns)
 
 
+def reckoned(before: Nominal | None, start: Point, velocity: Vector2, t_ns: int) -> Nominal:
+    """Go on to `t_ns` by the velocity through the air (m/s) alone; after a silence begin again at `start`."""
+    if before is None or is_old(before, t_ns):
+        point = Point(t_ns, start.position, (*velocity, 0.0))
+    else:
+        point = moved(before.point, velocity, t_ns)
+    return Nominal(point, (0.0, 0.0), point, own_error_model.begin("air", velocity))
+
+
+def is_old(by_air: Nominal, t_ns: int) -> bool:
+    """Whether reckoning by airspeed has had no sample for too long."""
+    return t_ns - by_air.t_ns > SILENT_NS["air"]
+
+
 def by_imu(nominal: Nominal, a_n: Vector2, s: Sensors, t_ns: int) -> Nominal:
     """Go on to `t_ns` by the mean acceleration `a_n` (m/s^2)."""
     assert nominal.interval is not None

@@ -242,6 +242,8 @@ def air_data(state: State, record: AirData, settings: Settings) -> Step:
     state = with_sensors(state, air_ns=record.t_ns, pitot_ns=record.t_ns)
     state = air_velocity.taken_from("pitot", state, settings)
     state = air_velocity.with_wind_noted(state, record.t_ns, settings)
+    reckoned = own_channel.reckoned(state.reckoned, nominal.point, V, record.t_ns)
+    state = structs.replace(state, reckoned=reckoned)
     if leads:
         return _driven(with_sensors(state, steady=record), record, "air", V, settings)
     if driver(state) != "imu":

@@ -188,7 +188,9 @@ def shifted(state: State, north: float, east: float, v_n: Vector2 = (0.0, 0.0), 
     protection = state.protection
     if protection is not None:
         protection = (*protection[:2], protection[2] + north, protection[3] + east)
-    promise = minimax_bound.shift(state.guarantee, north, east, v_n)
+    promise = state.guarantee
+    if promise.by != "air":  # that is of a trajectory of its own
+        promise = minimax_bound.shift(promise, north, east, v_n)
     parallel = state.parallel and parallel_filters.shift(state.parallel, north, east)
     fix = state.gnss_fix and _fix_shifted(*state.gnss_fix, north, east, v_n, t_ns)
     mean = state.velocity_error

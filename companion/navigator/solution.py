@@ -17,10 +17,19 @@ from companion.config import Config
 from companion.estimate import bank as banks
 from companion.estimate.fusion import Height, NoFix, Observation, maximum_likelihood
 from companion.estimate.kalman import Gaussian
-from companion.nav.geometry import displace
-from companion.navigator import fix_observations, height_error, minimax_bound, parallel_filters, trust
-from companion.navigator.hypotheses import GNSS, VELOCITY
-from companion.navigator.minimax_bound import Guaranteed, Linear
+from companion.nav.geometry import displace, separation
+from companion.navigator import (
+    fix_observations,
+    height_error,
+    minimax_bound,
+    own_channel,
+    parallel_filters,
+    trust,
+)
+from companion.navigator.channel import Nominal, moved
+from companion.navigator.hypotheses import AIRSPEED, GNSS, VELOCITY
+from companion.navigator.inertial_track import Point
+from companion.navigator.minimax_bound import Guarantee, Guaranteed, Linear
 from companion.navigator.own_channel import OwnChannel
 from companion.navigator.own_error_model import HELD
 from companion.navigator.state import (
@@ -75,7 +84,7 @@ def solve(state: State, rx_ns: int, settings: Settings) -> Step:
     config, known = settings.config, hypotheses(state, settings)
     point = levelled(nominal.point, state)
     t_ns = point.t_ns
-    promised = minimax_bound.guaranteed(state.guarantee, t_ns)
+    promised = guaranteed(state, point)
     rests_on = sources(state, t_ns, settings)
     fixes = rests_on & FIXES
     leading = estimate(state, settings)
@@ -282,7 +291,9 @@ def resolve_pending(state: State, pending: Pending, settings: Settings) -> Step:
     correction = (pending.centre[0] - north, pending.centre[1] - east)
     (var_e, cov), var_n = fix.covariance[0, :2].tolist(), float(fix.covariance[1, 1])
     sigma = (math.sqrt(var_n), math.sqrt(var_e))
-    g = minimax_bound.add_fix(state.guarantee, record.t_ns, correction, sigma)
+    apart, _ = _apart(state, point._replace(position=displace(*point.position, *pending.centre, 0.0)))
+    of_bounded = (correction[0] + apart[0], correction[1] + apart[1])
+    g = minimax_bound.add_fix(state.guarantee, record.t_ns, of_bounded, sigma)
     lat, lon, alt = displace(*point.position, north, east, -up)
     out = Fix(
         t_ns=record.t_ns,
@@ -317,19 +328,55 @@ def _other_half(half: Pending, pending: Pending, config: Config) -> tuple[Observ
     return tuple(z for z in found if half.used & fix_observations.source_of(z))
 
 
+def _bounded(state: State) -> Nominal | None:
+    """The trajectory whose error is bounded: in the own channel that by airspeed alone.
+
+    Nothing bounds the attitude that turns the IMU's forces, nor an airspeed that is steady or excluded.
+    """
+    nominal, by_air = state.nominal, state.reckoned
+    if nominal is None or nominal.driver not in ("imu", "air"):
+        return nominal
+    is_excluded = bool(state.reported) and state.reported[AIRSPEED] == EXCLUDED
+    if by_air is None or is_excluded or own_channel.is_old(by_air, nominal.t_ns):
+        return None
+    return by_air
+
+
+def _apart(state: State, nominal: Point) -> tuple[Vector2, Vector2]:
+    """How far the bounded trajectory is from a point of the nominal one, north and east (m), and by velocity
+    (m/s).
+    """
+    bounded = _bounded(state)
+    if bounded is None or bounded is state.nominal:
+        return (0.0, 0.0), (0.0, 0.0)
+    v_n = bounded.point.v_n
+    north, east, _ = separation(moved(bounded.point, v_n[:2], nominal.t_ns).position, nominal.position)
+    return (north, east), (v_n[0] - nominal.v_n[0], v_n[1] - nominal.v_n[1])
+
+
+def guaranteed(state: State, nominal: Point) -> Guaranteed | None:
+    """The guaranteed estimates of the nominal error now."""
+    found = None if _bounded(state) is None else minimax_bound.guaranteed(state.guarantee, nominal.t_ns)
+    return found and found.about(*_apart(state, nominal))
+
+
 def is_bound_due(state: State) -> bool:
     """Whether `refresh_bound` has anything to do."""
-    nominal = state.nominal
-    return nominal is not None and state.fixed and minimax_bound.is_due(state.guarantee, nominal)
+    bounded = _bounded(state)
+    if bounded is None:
+        return bool(state.guarantee.by)
+    return state.fixed and minimax_bound.is_due(state.guarantee, bounded)
 
 
 def refresh_bound(state: State, record: Input, settings: Settings) -> Step:
     """Deferred update: extend the window of the guaranteed bound, and do one piece of its work."""
-    nominal = state.nominal
-    if nominal is None or not state.fixed:
+    bounded = _bounded(state)
+    if bounded is None:
+        return structs.replace(state, guarantee=Guarantee()), []
+    if not state.fixed:
         return state, []
-    g = minimax_bound.follow(state.guarantee, nominal, settings.config)
-    g = minimax_bound.refresh(g, nominal, settings.config)
+    g = minimax_bound.follow(state.guarantee, bounded, settings.config)
+    g = minimax_bound.refresh(g, bounded, settings.config)
     return (state if g is state.guarantee else structs.replace(state, guarantee=g)), []
 
 

@@ -88,6 +88,7 @@ class State(Struct, frozen=True):
     waiting_ns: int | None = None  # since when a channel cannot begin
     sensors: Sensors = Sensors()
     nominal: Nominal | None = None
+    reckoned: Nominal | None = None  # by airspeed alone, in the own channel: the guaranteed bound is of it
     ins: Point | None = None  # the last sample of an INS; the nominal point may be carried on beyond it
     bank: Bank | None = None
     newborn: Newborn | None = None

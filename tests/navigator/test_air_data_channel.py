@@ -306,7 +306,7 @@ def test_another_channel_in_flight_begins_anew() -> None:
         reported += [out.text for out in outs if isinstance(out, Event) and "inertial channel" in out.text]
         solutions += sum(isinstance(out, Solution) for out in outs)
     assert reported == [
-        "inertial channel: own, by what arrives of imu, air data; no guaranteed bound by imu",
+        "inertial channel: own, by what arrives of imu, air data; guaranteed bound by airspeed",
         "inertial channel: local position of an INS of its own",
     ]
     assert solutions > 100

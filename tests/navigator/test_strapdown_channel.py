@@ -24,17 +24,22 @@ from companion.analysis import simulated_rsbn
 from companion.analysis.error_statistics import position_from_beacon
 from companion.config import load
 from companion.importers import sources
-from companion.nav.geometry import Geodetic, from_enu, separation, slant_range_azimuth
+from companion.nav.geometry import Geodetic, displace, from_enu, separation, slant_range_azimuth
 from companion.navigator import (
     INPUTS_USED,
     Navigator,
     air_data_channel,
     own_channel,
     own_error_model,
+    solution,
     strapdown_channel,
 )
 from companion.navigator.channel import Nominal
+from companion.navigator.hypotheses import AIRSPEED
 from companion.navigator.inertial_track import Point
+from companion.navigator.minimax_bound import Guarantee
+from companion.navigator.progress import shifted
+from companion.navigator.state import EXCLUDED
 from companion.records import (
     AirData,
     Attitude,
@@ -721,6 +726,11 @@ def with_beacon(seed: int, gap: tuple[float, float] = (0.0, 0.0), flown: Any = r
     return heard
 
 
+def sensing(records: Iterable[Any]) -> list[Any]:
+    """The airspeed is of a sensor, which the recording does not state."""
+    return [msgspec.structs.replace(r, sensed=True) if isinstance(r, AirData) else r for r in records]
+
+
 def rms(x: npt.ArrayLike) -> float:
     return float(np.sqrt(np.mean(np.square(x))))
 
@@ -765,10 +775,7 @@ def test_recorded_with_a_beacon_and_airspeed_a_step_of_the_wind_is_found(
     """
     config, found = load(flags={"output.profile": "ardupilot"}, environment={}), list[Flown]()
     for seed in range(3):
-        records = (
-            msgspec.structs.replace(r, sensed=True) if isinstance(r, AirData) else r
-            for r in with_beacon(seed, flown=flown)
-        )
+        records = sensing(with_beacon(seed, flown=flown))
         found.append(navigated(records, flown()[1], Navigator(config)))
 
     def between(start: float, end: float) -> tuple[float, float]:
@@ -784,6 +791,86 @@ def test_recorded_with_a_beacon_and_airspeed_a_step_of_the_wind_is_found(
     assert between(0.0, 60.0)[0] < 40.0
     assert between(60.0, 120.0)[0] < 40.0
     assert between(120.0, math.inf)[0] < 40.0
+
+
+class Promised(NamedTuple):
+    """By the linear estimate of the guaranteed bound: time (ns), position, and bound north and east (m)."""
+
+    t_ns: int
+    place: Geodetic
+    bound_n: tuple[float, float]
+
+
+def promised(records: Iterable[Any], navigator: Navigator) -> Iterator[Promised]:
+    """Each half minute. The linear estimate is the nominal position less its error of the channel."""
+    due_ns = 0
+    for record in records:
+        navigator.handle(record)
+        navigator.settle()
+        state, t_ns = navigator.state, record.t_ns
+        if state.nominal is None or t_ns < due_ns:
+            continue
+        found = solution.guaranteed(state, state.nominal.point)
+        if found is not None:
+            due_ns = t_ns + 30 * NS
+            north, east = found.restricted.error_n
+            place = displace(*state.nominal.point.position, -north, -east, 0.0)
+            yield Promised(state.nominal.t_ns, place, found.restricted.bound_n)
+
+
+@pytest.mark.flight
+def test_the_guaranteed_bound_beside_the_imu_is_that_of_airspeed_alone() -> None:
+    """The same linear estimate of the same fixes; the IMU moves another nominal trajectory."""
+    records, by = sensing(with_beacon(0)), list[list[Promised]]()
+    for source in ("auto", "air_data"):
+        config = load(flags={"output.profile": "ardupilot", "inertial.source": source}, environment={})
+        by.append(list(promised(records, Navigator(config))))
+    assert len(by[0]) > 8
+    for beside, alone in zip(*by, strict=True):
+        apart = math.hypot(*separation(beside.place, alone.place)[:2])
+        assert abs(beside.t_ns - alone.t_ns) < NS
+        assert beside.bound_n == pytest.approx(alone.bound_n, rel=0.05)
+        assert apart < 0.1 * math.hypot(*alone.bound_n)
+
+
+@pytest.mark.flight
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.long) for seed in (1, 2))])
+def test_recorded_beside_the_imu_the_guaranteed_bound_holds(seed: int) -> None:
+    """Without a fix in the second minute without GNSS; the wind steps by 7 m/s as it is lost."""
+    config = load(flags={"output.profile": "ardupilot"}, environment={})
+    found = navigated(sensing(with_beacon(seed, (60.0, 120.0))), recorded()[1], Navigator(config))
+    known = found.t > LOSS - 60.0
+    assert np.all(np.isfinite(found.bound[known]))
+    for start, end in ((-60.0, 0.0), (0.0, 60.0), (60.0, 120.0), (120.0, math.inf)):
+        phase = (found.t >= LOSS + start) & (found.t < LOSS + end)
+        assert rms(found.error[phase]) < rms(found.bound[phase])
+
+
+@pytest.mark.flight
+def test_an_airspeed_that_is_false_or_silent_has_no_guaranteed_bound() -> None:
+    config = load(flags={"output.profile": "ardupilot"}, environment={})
+    navigator = Navigator(config)
+    records = [r for r in sensing(with_beacon(0)) if r.t_ns < (LOSS - 30.0) * NS]
+    navigated(records, recorded()[1], navigator)
+    navigator.finish()
+    state, settings = navigator.state, navigator.settings
+    assert state.nominal is not None and state.nominal.driver == "imu"
+    point = state.nominal.point
+    before = solution.guaranteed(state, point)
+    assert before is not None
+    moved = solution.guaranteed(shifted(state, 300.0, -40.0), point)
+    assert moved is not None  # a nominal trajectory that is moved leaves the bound as it is
+    assert moved.restricted.bound_n == before.restricted.bound_n
+    reported = list(state.reported)
+    reported[AIRSPEED] = EXCLUDED
+    false = msgspec.structs.replace(state, reported=tuple(reported))
+    later = point._replace(t_ns=point.t_ns + 2 * NS)
+    silent = msgspec.structs.replace(state, nominal=msgspec.structs.replace(state.nominal, point=later))
+    for without in (false, silent):
+        assert solution.guaranteed(without, point) is None
+        after, _ = solution.refresh_bound(without, records[-1], settings)
+        assert after.guarantee == Guarantee()
+        assert not solution.is_bound_due(after)
 
 
 @pytest.mark.flight
