@@ -112,8 +112,8 @@ FIELDS: dict[str, Callable[[float], dict[str, Any]]] = {
     },
     "RAW_IMU": lambda t: {"time_usec": _ms(t) * 1000, "zacc": -1000 + round(20.0 * math.sin(5.0 * t))},
     "HIGHRES_IMU": lambda t: {
-        "time_usec": _ms(t) * 1000, "zacc": -9.81 + 0.2 * math.sin(5.0 * t), "abs_pressure": 920.0, "temperature": 20.0,
-        "fields_updated": 63,
+        "time_usec": _ms(t) * 1000, "zacc": -9.81 + 0.2 * math.sin(5.0 * t), "abs_pressure": 920.0,
+        "temperature": 20.0, "fields_updated": 63,
     },
     "SCALED_PRESSURE": lambda t: {"time_boot_ms": _ms(t), "press_abs": 920.0, "temperature": 2000},
     "GPS_RAW_INT": lambda t: {
