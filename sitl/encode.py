@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any, Literal, NamedTuple, TypeAlias
+from typing import Any, Literal, NamedTuple
 
 from companion.link import dialect
 from companion.link.decode import INERTIAL_UPDATED
-from companion.link.dialect import mavlink, rsbn
+from companion.link.dialect import Message, mavlink, rsbn
 from companion.link.fields import deg_e7
 from companion.nav.geometry import wrap_angle
 from companion.records import (
@@ -39,8 +39,6 @@ from companion.records import (
     Wind,
 )
 from companion.units import G0, ZERO_CELSIUS
-
-Message: TypeAlias = Any
 
 _MILLI_G = G0 / 1000
 _ALWAYS_PRESENT = (

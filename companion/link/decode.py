@@ -16,10 +16,9 @@ from collections.abc import Callable
 from typing import Literal, NamedTuple, Protocol, TypeAlias
 
 from companion.link import dialect
-from companion.link.dialect import mavlink, rsbn
+from companion.link.dialect import Message, mavlink, rsbn
 from companion.link.fields import (
     InvalidField,
-    Message,
     accuracy,
     dilution,
     euler,

@@ -7,11 +7,9 @@ it must be present. Knows no message and no record.
 from __future__ import annotations
 
 import math
-from typing import Any, TypeAlias
 
+from companion.link.dialect import Message
 from companion.records import Vector3
-
-Message: TypeAlias = Any
 
 _DOP_UNKNOWN = 99.0  # NMEA's 99.99 means "none", and no fix is computed at such a geometry
 

@@ -14,18 +14,16 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple, TypeAlias
+from typing import NamedTuple
 
 from companion.link import dialect
 from companion.link.decode import Autopilot
-from companion.link.dialect import mavlink, rsbn
+from companion.link.dialect import Message, mavlink, rsbn
 from companion.link.fields import deg_e7
 from companion.link.firmware import Firmware
 from companion.nav.geometry import Geodetic, geodetic_to_local
 from companion.output.gate import Position
 from companion.records import PARALLEL, LocalOrigin, Mode, Solution, Source, Trust
-
-Message: TypeAlias = Any
 
 ARDUPILOT_MAX_SIGMA_M = 100.0
 """ArduPilot's filter limits every position sigma to this value, so a greater one cannot be stated."""
