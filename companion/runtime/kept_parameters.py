@@ -27,10 +27,10 @@ MAX_FAILED_STARTS = 2
 class KeptParameters:
     """The parameters file of one service and the count of its unconfirmed starts."""
 
-    def __init__(self, path: Path, boot_id: Path = BOOT_ID, runtime_folder: str = "") -> None:
+    def __init__(self, path: Path, boot_id: Path = BOOT_ID) -> None:
         self.path = path
-        name = path.name + ".starts"
-        self._count_path = Path(runtime_folder) / name if runtime_folder else path.with_name(name)
+        folder = Path(os.environ.get("RUNTIME_DIRECTORY") or path.parent)
+        self._count_path = folder / f"{path.name}.starts"
         self._boot_id = boot_id
 
     def load(

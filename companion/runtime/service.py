@@ -408,9 +408,7 @@ def command(
     base = config = load_with(None)
     kept, notes = None, list[str]()
     if base.link.parameters_file:
-        kept = KeptParameters(
-            Path(base.link.parameters_file), runtime_folder=os.environ.get("RUNTIME_DIRECTORY", "")
-        )
+        kept = KeptParameters(Path(base.link.parameters_file))
         config, notes = kept.load(base, partial(load_with, kept.path), file)
     writer = StderrWriter()
     console = Console(

@@ -17,7 +17,7 @@ from pathlib import Path
 BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 
 
-def boot_id(path: Path = BOOT_ID) -> str:
+def boot_id(path: Path) -> str:
     """Return the id of this boot of the computer; "unknown" where the system does not state it."""
     try:
         return path.read_text("ascii").strip()
