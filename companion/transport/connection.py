@@ -215,14 +215,6 @@ def socket_connection(name: str, sock: socket.socket) -> Connection:
     return Connection(name, sock, lambda: sock.recv(READ_SIZE), sock.send)
 
 
-def pair() -> tuple[Connection, Connection]:
-    """Return the two ends of a connection in memory."""
-    one, other = socket.socketpair()
-    one.setblocking(False)
-    other.setblocking(False)
-    return socket_connection("memory", one), socket_connection("memory", other)
-
-
 def reason(error: OSError) -> str:
     """Return the system's text of an error; an error without a number already has a text of ours."""
     if isinstance(error, TimeoutError) and not error.errno:

@@ -18,7 +18,7 @@ import socket
 from collections.abc import AsyncIterator, Callable, Iterator
 
 from companion.transport.address import Address
-from companion.transport.connection import Connection, pair, reason
+from companion.transport.connection import Connection, reason
 from companion.transport.serial_line import open_serial
 from companion.transport.sockets import CannotListen, cannot_listen, open_socket
 from companion.transport.tcp import Judge, Listener, tcp_connection
@@ -33,7 +33,6 @@ __all__ = [
     "connect",
     "connections",
     "describe_failure",
-    "pair",
 ]
 
 MIN_PAUSE, MAX_PAUSE = 0.25, 10.0

@@ -1,11 +1,19 @@
 """Open connections: both directions, their end, full lines and slow readers."""
 
 import asyncio
+import socket
 
 import pytest
 
 from companion.transport import connection
-from companion.transport.connection import Connection, pair
+from companion.transport.connection import Connection, socket_connection
+
+
+def pair() -> tuple[Connection, Connection]:
+    one, other = socket.socketpair()
+    one.setblocking(False)
+    other.setblocking(False)
+    return socket_connection("memory", one), socket_connection("memory", other)
 
 
 async def test_memory_pair_carries_both_ways_and_reports_its_end() -> None:
