@@ -150,8 +150,7 @@ class Bridge:
         self._on_events(self._session.poll(now_ns), now_ns)
         if self._session.is_up and self._origin is None and now_ns >= self._origin_at:
             self._origin_at = now_ns + ASK_ORIGIN_EVERY
-            msgid = mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN
-            self._session.send_command(mavlink.MAV_CMD_REQUEST_MESSAGE, param1=msgid)
+            self._session.request_message(mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN)
         while self.connected_ns is not None and self._due and now_ns >= self.connected_ns + self._due[0][0]:
             _, on = self._due.pop(0)
             self._report(f"switching GNSS {'on' if on else 'off'}")

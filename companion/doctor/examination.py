@@ -120,9 +120,9 @@ class Examination:
         if now_ns >= self._next_request_ns:
             self._next_request_ns = now_ns + REQUEST_INTERVAL
             if self._version is None:
-                self._request_message(mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION)
+                self.session.request_message(mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION)
             if self._origin is None:
-                self._request_message(mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN)
+                self.session.request_message(mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN)
             if self.make == "ardupilot" and not self._arming_checks and not self._identity().is_armed:
                 self.session.send_command(mavlink.MAV_CMD_RUN_PREARM_CHECKS)
         if self._client is None and (self._version is not None or now_ns - self._start >= VERSION_TIMEOUT):
@@ -209,9 +209,6 @@ class Examination:
             self._limits = failsafe_limits(self._config, self.make, self._heartbeat.type in MULTIROTORS)
             self._client.read(p.name for p in self._needed)
             self._client.read(p.name for p in self._limits)
-
-    def _request_message(self, msgid: int) -> None:
-        self.session.send_command(mavlink.MAV_CMD_REQUEST_MESSAGE, param1=msgid)
 
     # -- findings -------------------------------------------------------------------------------------------
 

@@ -449,6 +449,10 @@ class Session:
         """Queue COMMAND_LONG to the autopilot."""
         self.send(dialect.command_long(self.autopilot or 0, command, **parameters))
 
+    def request_message(self, msgid: int) -> None:
+        """Queue a request to the autopilot to send a message once."""
+        self.send_command(mavlink.MAV_CMD_REQUEST_MESSAGE, param1=msgid)
+
     def to_send(self) -> list[bytes]:
         """Return and clear the queued frames, oldest first."""
         sent, self._send_queue = self._send_queue, []

@@ -237,7 +237,7 @@ class CompanionCore:
             link.standing = 0 if is_quiet else 1 + link.session.is_answered(now_ns)
             if link is self.leading_link and self._origin.origin is None and now_ns >= link.origin_request_ns:
                 link.origin_request_ns = now_ns + ORIGIN_REQUEST_INTERVAL
-                self._request_message(link, mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN)
+                link.session.request_message(mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN)
         self._report_change_of_lead(now_ns)
         if (leading := self.leading_link) is not None:
             for event in self._parameter_check.poll(now_ns):
@@ -310,7 +310,7 @@ class CompanionCore:
                 self._lock_links(now_ns)
                 # the origin may have changed during the silence
                 if link is self.leading_link and self._origin.origin is not None:
-                    self._request_message(link, mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN)
+                    link.session.request_message(mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN)
             elif isinstance(event, LinkLost):
                 silence_s = (now_ns - event.last_received_ns) / SECOND_NS
                 text = f"{link.name}: autopilot {event.system} silent for {silence_s:.0f} s"
@@ -649,10 +649,7 @@ class CompanionCore:
         for link in self.links.values():
             if link.session.is_up and link.firmware is None and link.firmware_requests < FIRMWARE_REQUESTS:
                 link.firmware_requests += 1
-                self._request_message(link, mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION)
-
-    def _request_message(self, link: Link, msgid: int) -> None:
-        link.session.send_command(mavlink.MAV_CMD_REQUEST_MESSAGE, param1=msgid)
+                link.session.request_message(mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION)
 
     def _link_state(self, link: Link, now_ns: int) -> LinkState:
         clock = link.session.clock
