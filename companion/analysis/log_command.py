@@ -14,8 +14,9 @@ from rich.table import Table
 from companion.analysis.progress import show_step
 from companion.option_types import INPUT_PATH, FloatRange
 from companion.printable import printable
-from companion.storage.flight_log import Info, info, recover
+from companion.storage.flight_log import Info, info
 from companion.storage.reader import LogError
+from companion.storage.recovery import recover
 
 
 @click.group("log")

@@ -29,22 +29,7 @@ from companion.records import BY_NAME, INPUTS, OUTPUTS, Event, LinkState, Stampe
 from companion.storage import location_fix, schemas
 from companion.storage.mcap_file import Disk, DiskFile, McapFile, sync_folder
 from companion.storage.reader import ACTIVE, DamagedError, LogError, LogReader, open_log
-from companion.storage.recovery import Recovered, recover
 from companion.write_errors import describe_write_error
-
-__all__ = [
-    "Entry",
-    "Info",
-    "LogError",
-    "Recovered",
-    "Writer",
-    "info",
-    "metadata",
-    "read",
-    "recover",
-    "topic_of",
-    "topic_of_input",
-]
 
 MAP_PERIOD_NS = 500_000_000
 """Minimum interval of positions on the /map topics."""

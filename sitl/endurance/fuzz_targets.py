@@ -35,6 +35,7 @@ from companion.runtime.core import CompanionCore
 from companion.storage import flight_log
 from companion.storage.mcap_file import MAGIC, encode_records
 from companion.storage.reader import LogError
+from companion.storage.recovery import recover
 
 MILLI = 1_000_000
 START_NS = 1000 * 1000 * MILLI
@@ -350,7 +351,7 @@ def check_log(data: bytes) -> None:
 def read_log(path: Path) -> None:
     """Read an MCAP log in every way. LogError, of one line, if any of them fails."""
     failed: LogError | None = None
-    for look in (_read_records, flight_log.info, flight_log.metadata, flight_log.recover):
+    for look in (_read_records, flight_log.info, flight_log.metadata, recover):
         try:
             look(path)
         except LogError as error:

@@ -7,7 +7,8 @@ from click.testing import CliRunner
 
 from companion.analysis.log_command import group
 from companion.records import Event
-from companion.storage.flight_log import LogError, Writer
+from companion.storage.flight_log import Writer
+from companion.storage.reader import LogError
 
 
 @pytest.fixture

@@ -21,6 +21,8 @@ from companion.runtime import state_file
 from companion.runtime.service import Service
 from companion.storage import flight_log
 from companion.storage.mcap_file import DiskFile
+from companion.storage.reader import LogError
+from companion.storage.recovery import recover
 from companion.storage.retention import create_log
 from companion.transport.reconnect import Address, connect
 from sitl.autopilot import SimulatedAutopilot
@@ -307,10 +309,10 @@ def test_missing_end_is_recovered_without_space_for_a_copy(small_disk) -> None:
     torn = torn_log(small_disk)
     (small_disk / "ballast").write_bytes(bytes(free(small_disk) - 20_000))
     size = torn.stat().st_size
-    with pytest.raises(flight_log.LogError, match="cannot write the recovered log"):
-        flight_log.recover(torn, reserve=20_000)
+    with pytest.raises(LogError, match="cannot write the recovered log"):
+        recover(torn, reserve=20_000)
     assert torn.stat().st_size <= size  # no part of the end was written
-    assert flight_log.recover(torn, reserve=10_000).messages == 1000
+    assert recover(torn, reserve=10_000).messages == 1000
     assert {path.name for path in small_disk.iterdir()} == {"20260101T000000Z.mcap", "ballast"}
     assert flight_log.info(small_disk / "20260101T000000Z.mcap").closed
     assert free(small_disk) >= 10_000
@@ -322,9 +324,9 @@ def test_failed_recovery_copy_is_removed_and_keeps_the_reserve(small_disk) -> No
     content[len(content) // 2] ^= 0xFF  # damaged: the end alone is not sufficient
     torn.write_bytes(content)
     (small_disk / "ballast").write_bytes(bytes(1_300_000))
-    with pytest.raises(flight_log.LogError, match="cannot write the recovered log"):
-        flight_log.recover(torn, reserve=200_000)
+    with pytest.raises(LogError, match="cannot write the recovered log"):
+        recover(torn, reserve=200_000)
     assert {path.name for path in small_disk.iterdir()} == {torn.name, "ballast"}
     assert torn.read_bytes() == content
     (small_disk / "ballast").unlink()
-    assert 500 < flight_log.recover(torn, reserve=200_000).messages < 1000
+    assert 500 < recover(torn, reserve=200_000).messages < 1000

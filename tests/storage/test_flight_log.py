@@ -35,9 +35,10 @@ from mcap.stream_reader import StreamReader
 from companion import records as r
 from companion.analysis.log_command import group
 from companion.storage import flight_log, location_fix, retention
-from companion.storage.flight_log import LogError, Writer, info, metadata, read, recover
+from companion.storage.flight_log import Writer, info, metadata, read
 from companion.storage.mcap_file import MAGIC, DiskFile, encode_records
-from companion.storage.reader import open_log
+from companion.storage.reader import LogError, open_log
+from companion.storage.recovery import recover
 
 SUITE = Path(__file__).parents[1] / "data" / "mcap_conformance.tar.xz"
 START = {"start_unix_ns": 1_700_000_000_000_000_000, "start_ns": 12_345_678_901}

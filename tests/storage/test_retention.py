@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 
 from companion.records import Reset
 from companion.storage import retention
-from companion.storage.flight_log import LogError, Writer, info
+from companion.storage.flight_log import Writer, info
+from companion.storage.reader import LogError
 
 MIB = 1 << 20
 NS = 10**9

@@ -12,7 +12,7 @@ from pymavlink.generator import mavparse
 from companion import records as r
 from companion.link.generated import rsbn_dialect
 from companion.storage import location_fix, retention, schemas
-from companion.storage.flight_log import recover
+from companion.storage.recovery import recover
 
 S = 1_000_000_000
 UNITS = ("m", "rad", "ns", "us", "s", "m/s", "Pa", "K", "count", "m^2", "m/s^2", "rad/s")

@@ -17,6 +17,7 @@ from companion.records import AirData
 from companion.storage import flight_log
 from companion.storage.mcap_file import MAGIC, encode_records
 from companion.storage.reader import LogError
+from companion.storage.recovery import recover
 from sitl.endurance import fuzz_targets
 from sitl.endurance.fuzz import TARGET_NAMES
 from sitl.endurance.fuzz_targets import TARGETS
@@ -119,7 +120,7 @@ def test_torn_log_is_recovered_up_to_a_damaged_schema(tmp_path) -> None:
     bad = struct.pack("<BQHI", Opcode.SCHEMA, 6, 1, 1 << 30)
     path = tmp_path / "x.mcap.active"
     path.write_bytes(torn(Chunk("", bad, 0, 0, uncompressed_crc=0, uncompressed_size=len(bad))))
-    assert flight_log.recover(path).messages == 0
+    assert recover(path).messages == 0
     assert flight_log.info(tmp_path / "x.mcap").closed
 
 
