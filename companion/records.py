@@ -5,7 +5,7 @@ A record does not depend on MAVLink, files or estimators. Every record starts wi
     t_ns     time of validity, integer nanoseconds on the companion's monotonic clock
     rx_ns    time of arrival, same clock (equal to t_ns for records made by the companion)
 
-A missing value is `None`, never NaN, so that JSON preserves a record bit for bit (`encode`, `decode`) and a
+A missing value is `None`, never NaN, so that JSON preserves a record bit for bit (`encode`, `DECODERS`) and a
 log replays exactly. Vectors are tuples in the frame of their suffix. A covariance is the upper triangle, row
 by row. Positions are geodetic: latitude and longitude in radians, altitude in metres above the WGS84
 ellipsoid, or above mean sea level with `msl` in the name (the geoid is not known on board).
@@ -538,7 +538,8 @@ OUTPUTS: tuple[type[Stamped], ...] = get_args(Output)
 BY_NAME: dict[str, type[Stamped]] = {kind.__name__: kind for kind in get_args(Record)}
 
 _encoder = msgspec.json.Encoder()
-_decoders: dict[str, msgspec.json.Decoder[Any]] = {
+#: Decoders of the JSON of `encode`, by the name of the record's type.
+DECODERS: dict[str, msgspec.json.Decoder[Any]] = {
     name: msgspec.json.Decoder(kind) for name, kind in BY_NAME.items()
 }
 
@@ -546,8 +547,3 @@ _decoders: dict[str, msgspec.json.Decoder[Any]] = {
 def encode(record: Stamped) -> bytes:
     """Encode a record as JSON; doubles are preserved bit for bit."""
     return _encoder.encode(record)
-
-
-def decode(name: str, data: bytes) -> Any:
-    """Decode a record of type `name` from its JSON."""
-    return _decoders[name].decode(data)

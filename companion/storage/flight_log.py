@@ -25,7 +25,7 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Message, Schema
 
 from companion import __version__
-from companion.records import BY_NAME, INPUTS, OUTPUTS, Event, LinkState, Stamped, Truth, encode
+from companion.records import BY_NAME, DECODERS, INPUTS, OUTPUTS, Event, LinkState, Stamped, Truth, encode
 from companion.storage import location_fix, schemas
 from companion.storage.mcap_file import Disk, DiskFile, McapFile, sync_folder
 from companion.storage.reader import ACTIVE, DamagedError, LogError, LogReader, open_log
@@ -425,7 +425,7 @@ def _decoder(source: LogReader, number: int, raw: bool) -> tuple[str, Callable[[
         raise DamagedError(f"a message is on channel {number}, which is not defined")
     channel = source.channels[number]
     schema = source.schemas[channel.schema_id].name if channel.schema_id else ""
-    kind = BY_NAME.get(schema)
-    if raw or kind is None or channel.message_encoding != "json":
+    decoder = DECODERS.get(schema)
+    if raw or decoder is None or channel.message_encoding != "json":
         return channel.topic, None
-    return channel.topic, msgspec.json.Decoder(kind).decode
+    return channel.topic, decoder.decode

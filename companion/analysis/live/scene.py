@@ -22,7 +22,7 @@ from companion.analysis.live.follow import Message
 from companion.analysis.plot_data import COLOURS, Figure, Line, Mark, PlacedName
 from companion.estimate import bank
 from companion.nav.geometry import Geodetic, displace, separation
-from companion.records import Event, Gnss, Mode, Reset, RsbnFix, Severity, Solution, Source, Stamped
+from companion.records import DECODERS, Event, Gnss, Mode, Reset, RsbnFix, Severity, Solution, Source
 from companion.units import Floats
 
 TRACK_POINTS = 2400
@@ -41,8 +41,7 @@ BITS = {
     "range": Source.RANGE,
     "airspeed": Source.AIR_DATA,
 }  # by the last word of the source's name
-_SHOWN: tuple[type[Stamped], ...] = (Solution, Gnss, RsbnFix, Event, Reset)
-_decoders = {kind.__name__: msgspec.json.Decoder(kind) for kind in _SHOWN}
+_SHOWN = ("Solution", "Gnss", "RsbnFix", "Event", "Reset")
 
 
 class Track:
@@ -118,11 +117,11 @@ class Scene:
             self._first_ns = message.log_ns
         self.log_ns = max(self.log_ns, message.log_ns)
         self.t = (self.log_ns - self._first_ns) * 1e-9
-        decoder = _decoders.get(message.channel.schema)
-        if decoder is None or not message.channel.topic.startswith(("/in/", "/out/", "/link/")):
+        kind, topic = message.channel.schema, message.channel.topic
+        if kind not in _SHOWN or not topic.startswith(("/in/", "/out/", "/link/")):
             return
         try:
-            record = decoder.decode(message.content)
+            record = DECODERS[kind].decode(message.content)
         except msgspec.MsgspecError:
             return  # of another version: not shown
         match record:
