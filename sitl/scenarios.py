@@ -18,7 +18,7 @@ import click
 from sitl.beacon import Beacon
 from sitl.faults import Fault
 from sitl.flight import FlightPlan, Leg, WindChange
-from sitl.sensors import GRADES, AirDataModel, GnssModel
+from sitl.sensors import GRADES
 
 TimeSpans = tuple[tuple[float, float], ...]
 
@@ -60,8 +60,6 @@ class Scenario:
     beacons: tuple[Beacon, ...] = ()
     gnss_outages: TimeSpans = ()
     rsbn_outages: TimeSpans = ()
-    gnss: GnssModel = field(default_factory=GnssModel)
-    air: AirDataModel = field(default_factory=AirDataModel)
     rates: SensorRates = field(default_factory=SensorRates)
     airspeed_sensor: bool = True
     own_estimate: bool = False

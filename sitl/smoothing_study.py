@@ -32,7 +32,7 @@ from companion.tables import number_table, print_tables
 from companion.units import Floats
 from sitl.flight import fly_plan
 from sitl.scenarios import SCENARIOS, Scenario, get_scenario, parse_scenario
-from sitl.sensors import STATED_GRADES
+from sitl.sensors import STATED_GRADES, AirDataModel
 from sitl.world import SENSORS, World
 
 SAME_SIGMA = 1e-6
@@ -62,7 +62,7 @@ class SmoothingComparison(NamedTuple):
 def simulated_gusts(scenario: Scenario) -> AirDataConfig:
     """Return the air-data model with the turbulence of the simulator: Dryden's, of correlation time L / V."""
     speed = float(np.mean(fly_plan(scenario.plan).airspeed))
-    air = scenario.air
+    air = AirDataModel()
     return AirDataConfig(gust_m_s=air.turbulence_m_s, gust_s=air.turbulence_length_m / speed)
 
 

@@ -144,7 +144,7 @@ class World:
         ]
 
     def _gnss(self, rng: np.random.Generator) -> list[Gnss]:
-        model, scenario = self.scenario.gnss, self.scenario
+        model, scenario = sensors.GnssModel(), self.scenario
         fixes = sensors.simulate_gnss(self._sampled(scenario.rates.gnss), model, scenario.gnss_outages, rng)
         stamp_offset = round(BOOT_S * 1e6)
         stream = []
@@ -176,7 +176,7 @@ class World:
 
     def _air(self, rng: np.random.Generator) -> dict[type[Stamped], Sequence[Stamped]]:
         flight = self._sampled(self.scenario.rates.air)
-        air = sensors.simulate_air_data(flight, self.scenario.air, rng)
+        air = sensors.simulate_air_data(flight, sensors.AirDataModel(), rng)
         v_n = flight.v_n + sensors.interpolate_error(self.inertial_error, flight.t).v_n
         speeds = np.stack(
             [air.equivalent_airspeed, np.hypot(v_n[:, 0], v_n[:, 1]), -v_n[:, 2]], axis=1
