@@ -132,7 +132,7 @@ def fly_connected(
 def truth_function(autopilot: SimulatedAutopilot) -> error_statistics.TruthAt:
     """Return a function: companion's clock (ns) -> true position, height above mean sea level."""
     times = np.arange(0.0, autopilot.scenario.duration_s, 0.05)
-    flight = autopilot.world.truth_at(times)
+    flight = autopilot.world.flight.at(times)
     columns = flight.lat, flight.lon, flight.alt - GEOID_M
 
     def truth(t_ns: int) -> Geodetic:

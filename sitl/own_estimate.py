@@ -55,7 +55,7 @@ class OwnEstimate:
         self._world, self._version = world, version
         count = int(world.scenario.duration_s * RATE_HZ)
         self._t = np.arange(1, count + 1) / RATE_HZ
-        truth = world.truth_at(np.concatenate(([0.0], self._t)))
+        truth = world.flight.at(np.concatenate(([0.0], self._t)))
         rng = np.random.default_rng([world.scenario.seed, 2])
         bias = IMU_BIAS * rng.standard_normal(2) / RATE_HZ
         noise = IMU_NOISE / np.sqrt(RATE_HZ) * rng.standard_normal((count, 2))

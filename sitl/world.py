@@ -93,13 +93,9 @@ class World:
             if not isinstance(record, LocalPosition) or all(map(math.isfinite, record.x_n)):
                 yield record
 
-    def truth_at(self, t: Floats) -> Trajectory:
-        """Return the truth at flight times `t` (s)."""
-        return self.flight.at(t)
-
     def errors_at(self, t: Floats, lat: Floats, lon: Floats) -> Floats:
         """Return the errors north and east (n, 2) m of positions (n,) rad at flight times `t` (n,) s."""
-        truth = self.truth_at(t)
+        truth = self.flight.at(t)
         R_N, R_E = radii(truth.lat)
         north = (lat - truth.lat) * (R_N + truth.alt)
         east = np.remainder(lon - truth.lon + np.pi, _TURN) - np.pi

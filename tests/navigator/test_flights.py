@@ -126,7 +126,7 @@ def fly(
         outputs += [] if changed is None else navigator.handle(changed)
     solutions = [out for out in outputs if isinstance(out, Solution)]
     t = np.array([s.t_ns for s in solutions]) / NS
-    truth = world.truth_at(t)
+    truth = world.flight.at(t)
     place = np.array([(s.lat, s.lon) for s in solutions])
     radius = 6.378e6
     north, east = (place[:, 0] - truth.lat) * radius, (place[:, 1] - truth.lon) * radius * np.cos(truth.lat)
