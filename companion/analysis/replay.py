@@ -14,7 +14,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import click
 
@@ -50,6 +50,7 @@ from companion.records import (
     StarFix,
 )
 from companion.storage import flight_log
+from companion.storage.deferred_log import Log, NoLog
 from companion.storage.reader import ACTIVE, LogError, is_closed
 from companion.storage.run_metadata import PLATFORM, numerical_platform, run_metadata
 
@@ -121,7 +122,7 @@ class _ReplayCounter:
         )
 
 
-def replay_own(path: Path, config: Config, sink: Any = None) -> ReplayResult:
+def replay_own(path: Path, config: Config, sink: Log) -> ReplayResult:
     """Replay the inputs of our own log and compare the outputs with those of the flight."""
     navigator, count = Navigator(config), _ReplayCounter()
     comparison = OutputComparison(flight_log.metadata(path).get(PLATFORM) == numerical_platform())
@@ -134,20 +135,18 @@ def replay_own(path: Path, config: Config, sink: Any = None) -> ReplayResult:
         if entry.topic.startswith("/in/") and isinstance(entry.value, Stamped):
             comparison.add(flown, ours)
             count.input(entry.value)
-            if sink is not None:
-                sink.record(entry.value)
+            sink.record(entry.value)
             ours += navigator.handle(entry.value)
             for output in ours:
                 count.output(output)
-                if sink is not None:
-                    sink.record(output)
+                sink.record(output)
         elif entry.topic.startswith("/out/") and isinstance(entry.value, Stamped):
             flown.append(entry.value)
     comparison.add(flown, ours)
     return count.result(comparison)
 
 
-def replay_foreign(records: Iterable[Stamped], config: Config, sink: Any) -> ReplayResult:
+def replay_foreign(records: Iterable[Stamped], config: Config, sink: Log) -> ReplayResult:
     """Replay the records of another recorder's log and write inputs and outputs to `sink`."""
     navigator, count = Navigator(config), _ReplayCounter()
     for record in records:
@@ -282,7 +281,7 @@ def _replay_as_flown(log: Path, output: Path | None, config: Config) -> ReplayRe
     if next(iter(flight_log.read(log)), None) is None:
         raise LogError(f"{log} contains no messages: nothing to replay")
     with show_step(f"replay {log}"), ExitStack() as stack:
-        sink = None
+        sink: Log = NoLog()
         if output is not None:
             described = derived_metadata(config, "replay", log)
             sink = stack.enter_context(create_replay_log(output, log, described))

@@ -20,6 +20,7 @@ from companion.command_line import cli
 from companion.config import Config
 from companion.records import Event, Reboot, Reset
 from companion.storage import flight_log
+from companion.storage.deferred_log import NoLog
 from companion.storage.mcap_file import DiskFile
 from companion.storage.reader import LogError
 from companion.storage.run_metadata import logged_configuration
@@ -59,7 +60,8 @@ def test_damaged_log_with_reboot_is_read_to_the_end(tmp_path: Path) -> None:
 
 def test_output_of_a_replay_replays_bit_for_bit(tmp_path: Path) -> None:
     replayed(CUT, tmp_path / "out.mcap")
-    found = replay.replay_own(tmp_path / "out.mcap", logged_configuration(tmp_path / "out.mcap"))
+    config = logged_configuration(tmp_path / "out.mcap")
+    found = replay.replay_own(tmp_path / "out.mcap", config, NoLog())
     assert found.different == 0 and found.compared
 
 
