@@ -71,11 +71,6 @@ class TlogPlayer:
         self._reader = frame.Reader()
         self._answers: list[bytes] = []
 
-    @property
-    def end_ns(self) -> int:
-        """Time at which the last frame is due."""
-        return self._schedule[-1][0]
-
     def poll(self, now_ns: int) -> list[bytes]:
         """Return the answers to requests and every frame due."""
         due, self._answers = self._answers, []
