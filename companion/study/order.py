@@ -360,10 +360,10 @@ def _plot_track(samples: Samples, found: Track, file: Path) -> None:
     figure.savefig(file)
 
 
-def errors_by_order(samples: Samples, basis: Family, r_max: int) -> tuple[Floats, Floats]:
-    """Return the r.m.s. methodical and random error (r_max,) of the fit with 1 to r_max terms."""
+def errors_by_order(samples: Samples, r_max: int) -> tuple[Floats, Floats]:
+    """Return the r.m.s. methodical and random error (r_max,) of the fit with 1 to r_max Legendre terms."""
     assert samples.truth is not None
-    Psi = orthonormal_basis(samples.t, samples.sigma, basis, r_max)(samples.t) / samples.sigma[:, None]
+    Psi = orthonormal_basis(samples.t, samples.sigma, "legendre", r_max)(samples.t) / samples.sigma[:, None]
     truth, methodical, random = samples.truth / samples.sigma, [], []
     for r in range(1, r_max + 1):
         P = Psi[:, :r] @ np.linalg.pinv(Psi[:, :r])
@@ -387,7 +387,7 @@ def draw_figures(samples: Samples, r_max: int, file: Path) -> None:
     power.set(title="6.5.1 power: t^m", xlabel="t / T")
     sine.set(title="6.5.2 trigonometric: sin(pi m t / T)", xlabel="t / T")
     legendre.set(title="6.5.3 Legendre, orthonormal", xlabel="t / T")
-    methodical, random = errors_by_order(samples, "legendre", r_max)
+    methodical, random = errors_by_order(samples, r_max)
     terms = np.arange(1, r_max + 1)
     errors.semilogy(terms, np.maximum(methodical, 1e-4), label="methodical")
     errors.semilogy(terms, random, label="random")

@@ -26,7 +26,7 @@ def test_expected_error_is_that_of_the_flights() -> None:
 
 
 def test_curve_between_minimax_and_kalman() -> None:
-    points = curve(GRADES["navigation"], 900.0, 600.0)
+    points = curve(GRADES["navigation"], 900.0)
     expected, bound = [p.expected for p in points], [p.bound for p in points]
     assert bound == sorted(bound)
     assert expected == sorted(expected, reverse=True)

@@ -162,7 +162,7 @@ def test_noise_is_estimated_beside_a_smooth_function():
 def test_errors_by_order_are_those_of_many_fits():
     """The methodical and the random error add up to what a hundred seeds have, term by term."""
     one = synthetic("cubic", 101, 0.2, 0)
-    predicted = np.hypot(*errors_by_order(one, "legendre", 6))
+    predicted = np.hypot(*errors_by_order(one, 6))
     squares = np.zeros(6)
     for seed in range(100):
         samples = synthetic("cubic", 101, 0.2, seed)
@@ -173,7 +173,7 @@ def test_errors_by_order_are_those_of_many_fits():
             squares[r - 1] += np.mean((Psi[:, :r] @ a * samples.sigma - samples.truth) ** 2)
     np.testing.assert_allclose(np.sqrt(squares / 100), predicted, rtol=0.05)
     assert predicted.argmin() == 3  # four terms
-    assert math.isclose(errors_by_order(one, "legendre", 6)[0][3], 0.0, abs_tol=1e-9)
+    assert math.isclose(errors_by_order(one, 6)[0][3], 0.0, abs_tol=1e-9)
 
 
 def test_figures(tmp_path):
