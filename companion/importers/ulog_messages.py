@@ -155,7 +155,7 @@ def messages(
                 yield Dropout(at, data[body] | data[body + 1] << 8)
             elif kind == _FLAGS:
                 appended = _appended_offsets(data[body : body + 40], end)
-        except (KeyError, LookupError, struct.error) as error:
+        except (LookupError, struct.error) as error:
             damage.add(f"byte {at}", size, one_line(error))
         at += size
 
