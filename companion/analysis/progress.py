@@ -32,7 +32,7 @@ def show_items(items: Sequence[Item], what: str) -> Iterable[Item]:
     return bars.track(items, what, console=Console(stderr=True), transient=True)
 
 
-def show_count(quiet: bool = False) -> bars.Progress:
+def show_count() -> bars.Progress:
     """Return the progress of many jobs: how many are done, and the time that remains."""
     columns = bars.TextColumn("{task.description}"), bars.MofNCompleteColumn(), bars.TimeRemainingColumn()
-    return bars.Progress(*columns, console=Console(stderr=True), transient=True, disable=quiet)
+    return bars.Progress(*columns, console=Console(stderr=True), transient=True)

@@ -108,11 +108,7 @@ def fly_orders(todo: Sequence[FlightOrder], scheduler: str | None, workers: int)
 
 
 def run_campaign(
-    wanted: Sequence[FlightOrder],
-    folder: Path,
-    scheduler: str | None = None,
-    workers: int = 0,
-    quiet: bool = False,
+    wanted: Sequence[FlightOrder], folder: Path, scheduler: str | None = None, workers: int = 0
 ) -> list[FlightResult]:
     """Fly the flights without a result in `folder`; return the results of all wanted flights."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -120,7 +116,7 @@ def run_campaign(
     known = {result.key: result for result in read_results(path) if result.key in keys}
     todo = [order for order in wanted if order.key not in known]
     journal = Journal(path)
-    with show_count(quiet) as progress:
+    with show_count() as progress:
         task = progress.add_task("flights", total=len(wanted), completed=len(known))
         for result in fly_orders(todo, scheduler, workers):
             if not (result.raised or "").startswith(WORKER_LOST):

@@ -75,12 +75,12 @@ def test_same_order_gives_the_same_result() -> None:
 
 def test_stored_flights_are_not_repeated(requested: list[FlightOrder], tmp_path: Path) -> None:
     """After an interruption with an incomplete last line, that flight and the missing ones are flown."""
-    assert command.run_campaign(ORDERS, tmp_path, quiet=True) == RESULTS
+    assert command.run_campaign(ORDERS, tmp_path) == RESULTS
     path = tmp_path / "flights.jsonl"
     lines = path.read_bytes().splitlines(keepends=True)
     assert len(lines) == 2
     path.write_bytes(lines[0] + lines[1][:25])
-    assert command.run_campaign(ORDERS, tmp_path, quiet=True) == RESULTS
+    assert command.run_campaign(ORDERS, tmp_path) == RESULTS
     assert requested == [*ORDERS, ORDERS[1]]
     assert [json.loads(line)["key"] for line in path.read_bytes().splitlines()] == [r.key for r in RESULTS]
 
@@ -226,7 +226,7 @@ def test_dask_returns_every_flight_and_that_of_a_killed_worker_too(
 
     monkeypatch.setattr(command, "fly_order", fly)
     wanted = [FlightOrder("nowhere", "none", seed) for seed in range(1, 7)]
-    results = command.run_campaign(wanted, tmp_path, workers=1, quiet=True)
+    results = command.run_campaign(wanted, tmp_path, workers=1)
     assert killed.exists()
     assert [r.key for r in results] == [order.key for order in wanted]
     assert all(r.raised and "scenarios are" in r.raised for r in results)
@@ -245,5 +245,5 @@ def test_lost_flight_is_repeated_by_the_next_campaign(
     )
     for returned in (lost, flown):
         monkeypatch.setattr(command, "fly_orders", lambda *_, returned=returned: iter([returned]))
-        assert command.run_campaign(wanted, tmp_path, quiet=True) == [returned]
+        assert command.run_campaign(wanted, tmp_path) == [returned]
     assert command.read_results(tmp_path / "flights.jsonl") == [flown]
