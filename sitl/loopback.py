@@ -24,6 +24,7 @@ from companion.analysis import error_statistics
 from companion.analysis.summary import format_share
 from companion.config import Config, OutputConfig, load
 from companion.config.options import configuration_options
+from companion.config.required_parameters import required_parameters
 from companion.nav.geometry import Geodetic
 from companion.records import Event, Gnss, Rejection, Reset, RsbnFix, Solution, Stamped
 from companion.runtime.core import CompanionCore
@@ -96,6 +97,8 @@ def fly_scenario(
 ) -> LoopbackFlight:
     """Fly `scenario` from start to end; call `progress` with the seconds flown once per second of flight."""
     autopilot, collected = SimulatedAutopilot(scenario, START_NS), CollectingLog(log)
+    needs = required_parameters(config, scenario.autopilot)
+    autopilot.parameters.values |= {need.name: need.value for need in needs}  # it is prepared
     core = CompanionCore(config, collected, (LINK,))
     fly_connected(autopilot, core, START_NS, progress)
     return LoopbackFlight(autopilot, collected.records, core)

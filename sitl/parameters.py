@@ -44,7 +44,7 @@ VERSIONS = {"ardupilot": FIRMWARE[0] << 24 | FIRMWARE[1] << 16, "px4": 1 << 24 |
 
 
 class SimulatedParameters:
-    """Parameter values of an autopilot of this make ("ardupilot" or "px4")."""
+    """Parameter values of an autopilot of this make ("ardupilot" or "px4"); not prepared for our position."""
 
     def __init__(self, make: str) -> None:
         self.values = dict(_PX4 if make == "px4" else _ARDUPILOT)

@@ -13,7 +13,7 @@ Message fields and frames belong to `output.encode`; reading and setting paramet
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Literal, NamedTuple, TypeAlias
 
 Name: TypeAlias = Literal["monitor", "ardupilot", "px4", "custom"]
@@ -81,6 +81,11 @@ _EXTERNAL_NAVIGATION = (
     RequiredParameter("EK3_SRC2_VELZ", 0, "source set 2: no vertical velocity, none is sent"),
     RequiredParameter("EK3_SRC2_YAW", 1, "source set 2: heading from the compass, none is sent"),
 )
+TAKES_POSITION: Mapping[str, Callable[[float], bool]] = {
+    "VISO_TYPE": lambda value: value != 0.0,
+    "EK3_SRC2_POSXY": lambda value: value == 6.0,
+}
+"""Whether source set 2 has our position by the value of a parameter; it leads without any otherwise."""
 _SECOND_RECEIVER = (
     RequiredParameter("GPS2_TYPE", 14, "the second receiver is GPS_INPUT", reboot=True),
     RequiredParameter("GPS_AUTO_SWITCH", 1, "use the better receiver, so ours when the first loses its fix"),

@@ -195,6 +195,7 @@ class SourceSwitch:
         self._wanted: int | None = None
         self._leading: int | None = None
         self._held: int | None = None
+        self._lack, self._lack_reported = "", ""
         self._reported, self._reports = Selected(0), 0  # the last report of the script, how often in a row
         self._reason = ""
         self._tries = 0
@@ -234,6 +235,10 @@ class SourceSwitch:
 
     def note_armed(self, is_armed: bool) -> None:
         """Ignore whether it is armed: ArduPilot stores no source set."""
+
+    def note_lack(self, lack: str) -> None:
+        """Note why the autopilot cannot take our position; empty if it can."""
+        self._lack = lack
 
     def situation(self, now_ns: int) -> Situation:
         """Return the facts at `now_ns`."""
@@ -279,10 +284,14 @@ class SourceSwitch:
     def update(self, now_ns: int) -> None:
         """Decide by the table; call it at least once a second, with or without solutions."""
         decision = self.required(self.situation(now_ns))
+        if decision is not None and decision[0] == COMPANION_SET and self._lack:
+            self._report_lack(now_ns)
+            decision = None
         if decision is None:
             if self._next_ns is not None:  # stop requesting it; whether it was accepted is not known
                 self._wanted = self._next_ns = None
             return
+        self._lack_reported = ""
         is_new = decision[0] != self._required
         self._required, self._reason = decision
         if self._held is not None:
@@ -369,6 +378,12 @@ class SourceSwitch:
         """Return the events since the last call."""
         taken, self._events = self._events, []
         return taken
+
+    def _report_lack(self, now_ns: int) -> None:
+        if self._lack != self._lack_reported:
+            self._lack_reported = self._lack
+            text = f"{self.name(COMPANION_SET)} needed, but {self._lack}: run companion doctor"
+            self._add_event(Severity.WARNING, text, now_ns)
 
     def _give_up(self, why: str, now_ns: int) -> None:
         self._next_ns = None

@@ -559,7 +559,7 @@ class CompanionCore:
 
     def _steer(self, link: Link, now_ns: int) -> None:
         """Request the EKF source set that must lead, with or without a solution."""
-        for message in self._output.poll(self._receiver(link), now_ns):
+        for message in self._output.poll(self._receiver(link), now_ns, self._parameter_check.lack):
             link.session.send(message)
         self._emit_output_events()
 

@@ -1,14 +1,15 @@
 """Parameter check: the autopilot parameters that the output profile requires. No I/O.
 
-ArduPilot silently drops an ODOMETRY that it is not configured for. So the parameters are read whenever the
-autopilot connects or reboots, and wrong ones are reported in one event. Nothing is set here; use
-`companion doctor` on the ground.
+ArduPilot silently drops an ODOMETRY that it is not configured for, and accepts source set 2 all the same. So
+the parameters are read whenever the autopilot connects or reboots, and wrong ones are reported in one event.
+Those that set 2 needs are followed when they change later. Nothing is set here; use `companion doctor` on the
+ground.
 """
 
 from __future__ import annotations
 
 from companion.config import Config
-from companion.config.profiles import RequiredParameter
+from companion.config.profiles import TAKES_POSITION, RequiredParameter
 from companion.config.required_parameters import required_parameters
 from companion.link.decode import MAKES
 from companion.link.dialect import Message, mavlink
@@ -37,6 +38,8 @@ class ParameterCheck:
         """Process a message from the autopilot."""
         if self._client is not None:
             self._answers |= {answer.name: answer for answer in self._client.receive(message, frame)}
+        elif message.get_type() == "PARAM_VALUE":
+            self._follow(message.param_id, message.param_value)
 
     def poll(self, now_ns: int) -> list[Event]:
         """Make the requests that are due; return an event once all parameters are read."""
@@ -56,6 +59,23 @@ class ParameterCheck:
         state = f"cannot be read ({trouble})" if has is None else f"is {has:g}"
         text = f"{wrong[0].name} {state}, needs {wrong[0].value:g}{more}: run companion doctor"
         return [Event(now_ns, now_ns, Severity.WARNING, text)]
+
+    @property
+    def lack(self) -> str:
+        """Why source set 2 of ArduPilot has no position of ours; empty if it has, or that is not known."""
+        for name, takes in TAKES_POSITION.items():
+            answer = self._answers.get(name)
+            if answer is not None and answer.value is not None and not takes(answer.value):
+                return f"{name} is {answer.value:g}"
+        return ""
+
+    def _follow(self, name: str, value: float) -> None:
+        """Note the value of a parameter that changed; one that needs a reboot gives a position after that."""
+        need = next((each for each in self._needed if each.name == name), None)
+        if need is None or (takes := TAKES_POSITION.get(name)) is None:
+            return
+        if not (need.reboot and takes(value)):
+            self._answers[name] = Answer(name, value)
 
     def to_send(self) -> list[Message]:
         """Return the messages to be sent now."""

@@ -211,6 +211,20 @@ def test_set_2_on_gnss_loss_and_set_1_on_its_return() -> None:
     ]
 
 
+def test_set_2_is_not_requested_while_it_has_no_position_of_ours() -> None:
+    flight = Flight()
+    flight.fly(30.0)
+    flight.switch.note_lack("EK3_SRC2_POSXY is 0")
+    flight.fly(60.0, fix=False)
+    assert flight.sets == [1]
+    assert [text for _, text in flight.reports[1:]] == [
+        "EKF source set 2 needed, but EK3_SRC2_POSXY is 0: run companion doctor"
+    ]
+    flight.switch.note_lack("")
+    flight.fly(10.0, fix=False)
+    assert flight.sets == [1, 2]
+
+
 def test_silent_receiver() -> None:
     flight = Flight()
     silent = flight.fly(30.0)
