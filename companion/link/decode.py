@@ -81,6 +81,19 @@ MULTIROTORS = frozenset(
 )
 FIXED_WINGS = frozenset({mavlink.MAV_TYPE_FIXED_WING, *range(19, 25)})
 """19 to 24 are the VTOLs with a wing; releases of pymavlink name them differently."""
+#: Modes of a quadplane in which its rotors hold it up. Its HEARTBEAT has the type of a fixed wing.
+_BY_ROTORS = frozenset(
+    {
+        mavlink.PLANE_MODE_QSTABILIZE,
+        mavlink.PLANE_MODE_QHOVER,
+        mavlink.PLANE_MODE_QLOITER,
+        mavlink.PLANE_MODE_QLAND,
+        mavlink.PLANE_MODE_QRTL,
+        mavlink.PLANE_MODE_QAUTOTUNE,
+        mavlink.PLANE_MODE_QACRO,
+        mavlink.PLANE_MODE_LOITER_ALT_QLAND,
+    }
+)
 _FLYING = {mavlink.MAV_STATE_BOOT: False, mavlink.MAV_STATE_STANDBY: False, mavlink.MAV_STATE_ACTIVE: True}
 _IN_THE_AIR = frozenset(
     {
@@ -394,10 +407,12 @@ def _sys_status(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
 
 @_of("HEARTBEAT")
 def _heartbeat(m: Message, rx: int, sender: Sender) -> tuple[Stamped, ...]:
-    """Decode the kind of vehicle. ArduCopter is active in the air only, others once they are armed."""
-    multirotor = m.type in MULTIROTORS
-    stated = _FLYING.get(m.system_status) if multirotor and sender.autopilot == "ardupilot" else None
-    return (Vehicle(_unstamped(rx, sender), rx, multirotor, stated, m.type in FIXED_WINGS),)
+    """Decode the kind of vehicle. ArduCopter and ArduPlane are active in the air only, others once armed."""
+    multirotor, fixed_wing, flying = m.type in MULTIROTORS, m.type in FIXED_WINGS, None
+    if sender.autopilot == "ardupilot" and (multirotor or fixed_wing):
+        flying = _FLYING.get(m.system_status)
+        fixed_wing = fixed_wing and m.custom_mode not in _BY_ROTORS
+    return (Vehicle(_unstamped(rx, sender), rx, multirotor, flying, fixed_wing),)
 
 
 @_of("EXTENDED_SYS_STATE")

@@ -321,7 +321,10 @@ def test_truth_uses_the_integer_position() -> None:
         ("ardupilot", "QUADROTOR", "BOOT", True, False, False),
         ("ardupilot", "OCTOROTOR", "CRITICAL", True, None, False),  # a failsafe, on the ground or not
         ("px4", "QUADROTOR", "ACTIVE", True, None, False),  # armed, perhaps on the ground
-        ("ardupilot", "FIXED_WING", "ACTIVE", False, None, True),
+        ("ardupilot", "FIXED_WING", "ACTIVE", False, True, True),
+        ("ardupilot", "FIXED_WING", "STANDBY", False, False, True),  # armed or not
+        ("ardupilot", "FIXED_WING", "CRITICAL", False, None, True),
+        ("px4", "FIXED_WING", "ACTIVE", False, None, True),  # armed, perhaps on the ground
         ("ardupilot", "HELICOPTER", "ACTIVE", False, None, False),
         ("px4", "VTOL_QUADROTOR", "ACTIVE", False, None, True),
     ],
@@ -334,6 +337,15 @@ def test_heartbeat_states_the_kind_of_vehicle(
         "system_status": getattr(mavlink, f"MAV_STATE_{status}"),
     }
     assert one("HEARTBEAT", autopilot, **fields) == r.Vehicle(RX, RX, multirotor, flying, fixed_wing)
+
+
+@pytest.mark.parametrize("mode", ["QSTABILIZE", "QHOVER", "QLOITER", "QLAND", "QRTL", "QACRO"])
+def test_a_quadplane_that_hovers_does_not_fly_by_its_wing(mode: str) -> None:
+    """Its HEARTBEAT has the type of a fixed wing (ArduPlane, Q_MAV_TYPE 0) and it is active."""
+    fields = {"type": mavlink.MAV_TYPE_FIXED_WING, "system_status": mavlink.MAV_STATE_ACTIVE}
+    hovering = one("HEARTBEAT", **fields, custom_mode=getattr(mavlink, f"PLANE_MODE_{mode}"))
+    assert (hovering.flying, hovering.fixed_wing) == (True, False)
+    assert one("HEARTBEAT", **fields, custom_mode=mavlink.PLANE_MODE_FLY_BY_WIRE_A).fixed_wing
 
 
 @pytest.mark.parametrize(("landed", "flying"), [(1, False), (2, True), (3, True), (4, True)])
