@@ -94,15 +94,21 @@ def messages(
     appended: list[int] = []  # where data was appended to a log that may be torn there, descending
     at, end = _HEADER_SIZE, len(data)
 
-    def size_at(place: int) -> int:
-        """Return the size of the message at `place`, 0 if none begins there."""
+    def size_at(place: int, before: int = 0) -> int:
+        """Return the size of the message at `place`, 0 if none begins there.
+
+        The message at `before`, if any, may be the subscription of which it is the first row.
+        """
         if place + 3 > end:
             return 0
         size, kind = _HEAD.unpack_from(data, place)
         if size < _SMALLEST.get(kind, 1 << 16) or place + 3 + size > end:
             return 0
         if kind == _DATA:
-            found = subscribed.get(data[place + 3] | data[place + 4] << 8)
+            number = data[place + 3 : place + 5]
+            if before and data[before + 2] == _SUBSCRIPTION and data[before + 4 : before + 6] == number:
+                return int(size) + 3
+            found = subscribed.get(number[0] | number[1] << 8)
             if found is None or not found[0].shortest + 2 <= size <= found[0].longest + 2:
                 return 0
         elif kind == _SYNCHRONISATION and data[place + 3 : place + 11] != _SYNC:
@@ -113,7 +119,7 @@ def messages(
         """Return where the next message begins that is followed by another or the end."""
         while place < end:
             size = size_at(place)
-            if size and (place + size == end or size_at(place + size)):
+            if size and (place + size == end or size_at(place + size, place)):
                 return place
             place += 1
         return end
@@ -126,7 +132,7 @@ def messages(
             damage.add(f"byte {at}", appended[-1] - at, "torn before the data appended later")
             at = appended.pop()
             continue
-        if not size or (at + size < end and not size_at(at + size)):
+        if not size or (at + size < end and not size_at(at + size, at)):
             following = next_message(at + 1)
             if not size or following < at + size:  # a message that lost bytes holds the next one
                 damage.add(f"byte {at}", following - at, "not a message")

@@ -192,6 +192,22 @@ def test_validated_airspeed_is_used_where_a_sensor_measures_it(
     assert found == [(11.0, True, True), (12.0, True, True), (13.0, True, True)]
 
 
+def test_a_subscription_whose_number_is_the_letter_of_a_message_is_read() -> None:
+    """As of topic 77, "M", in sample_px4_events.ulg of pyulog: "A", 0, "M" look like a message of 65 bytes.
+
+    Another message began behind those, so the subscription was held to be damaged, and its rows were lost.
+    """
+    number, name = ord("M"), b"airspeed"
+    subscription = message("A", struct.pack("<BH", 0, number) + name)
+    more = 2 + 68 - len(subscription) - 17  # bytes: the first row ends where the 65 bytes would
+    row = message("D", struct.pack("<HQf", number, 2_000_000, 20.0) + bytes(more))
+    text = message("L", struct.pack("<BQ", ord("6"), 2_000_000) + b"airborne")
+    content = definitions() + message("F", f"airspeed:{TOPICS['airspeed']}uint8_t[{more}] more;".encode())
+    damage = Damage()
+    found = list(ulog_messages.messages(content + subscription + row + text + row, {"airspeed"}, damage))
+    assert (len(found), damage.parts) == (3, 0)
+
+
 def test_torn_log_is_read_up_to_the_damage(tmp_path: pathlib.Path) -> None:
     records = list(sources.open_source(write(tmp_path, flight()[:-30])))
     assert sum(isinstance(record, r.Gnss) for record in records) == 1
