@@ -15,6 +15,7 @@ from typing import Any, TypeAlias
 
 from companion.importers import ulog_messages
 from companion.importers.foreign_file import (
+    MAX_BACK_US,
     MAX_STEP_US,
     MAX_TEXT,
     Damage,
@@ -65,6 +66,7 @@ class UlogFile:
             raise LogError(f"{path} is not a ULog: wrong magic bytes at its beginning")
         self._faulty: set[str] = set()  # topics without a required field
         self._start_us = self._clock_start_us()
+        self._stale_us = 0  # what is older was published before the log began
 
     def __iter__(self) -> Iterator[Stamped]:
         """Yield records by time. Rows of a topic without a required field are not converted."""
@@ -76,13 +78,17 @@ class UlogFile:
 
     def _survey(self) -> tuple[dict[str, Topic], int]:
         """Return the topics to convert, and UNIX time minus boot time (0 if no GPS provides it)."""
-        seen, epoch_us = set[str](), 0
+        seen, epoch_us, stale, rows = set[str](), 0, 0, 0
+        began_us = int.from_bytes(self._data[8:16], "little") - self._start_us - MAX_BACK_US
         for found in ulog_messages.messages(self._data, TOPICS, Damage()):
             if isinstance(found, ulog_messages.TopicRow):
                 seen.add(found.topic)
                 utc, boot = found.row.get("time_utc_usec"), self._boot_us(found)
+                stale, rows = stale + (boot is not None and 0 <= boot < began_us), rows + 1
                 if type(utc) is int and boot is not None and _UNIX_FROM_US < utc < _UNIX_TO_US and boot >= 0:
                     epoch_us = epoch_us or utc - min(boot, utc)
+        if 2 * stale < rows:  # or the start that the header states is damaged
+            self._stale_us = began_us
         found_topics = supported_topics(seen)
         if not found_topics:
             needed = ", ".join(TOPICS)
@@ -110,10 +116,12 @@ class UlogFile:
         return start - MAX_STEP_US if _UNIX_FROM_US < start < _UNIX_TO_US else 0
 
     def _boot_us(self, found: ulog_messages.TopicRow | LoggedText | Dropout) -> int | None:
+        """Return the stamp; none of what was last published before the log began, which it begins with."""
         if isinstance(found, Dropout):
             return None
         stamp = found.boot_us if isinstance(found, LoggedText) else found.row.get("timestamp")
-        return stamp - self._start_us if type(stamp) is int else -1
+        boot_us = stamp - self._start_us if type(stamp) is int else -1
+        return None if 0 <= boot_us < self._stale_us else boot_us
 
     def _converted(self, name: str, topic: Topic, row: Row, t_ns: int) -> Iterator[Stamped]:
         try:
