@@ -183,10 +183,11 @@ class MessageConverter:
             yield GlobalPosition(t, t, lat, lon, m.Alt, self._v_n, above_home)
 
     def _airspeed(self, name: str, m: Message, t: int) -> Iterator[Stamped]:
-        if getattr(m, "I", 0) == 0 and name == "ARSP" and math.isfinite(m.Airspeed):
+        """Convert the primary sensor; its airspeed is no sensor's to rely on where unhealthy or not used."""
+        if getattr(m, "I", 0) == getattr(m, "Pri", 0) and math.isfinite(m.Airspeed):
             self._differential = finite(getattr(m, "DiffPress", math.nan))
             self._has_airspeed = True
-            yield AirData(t, t, m.Airspeed, sensed=True)
+            yield AirData(t, t, m.Airspeed, sensed=bool(getattr(m, "H", 1) and getattr(m, "U", 1)))
 
     def _navigation_tuning(self, name: str, m: Message, t: int) -> Iterator[Stamped]:
         """Convert the sensor's airspeed of a plane's NTUN up to 3.x; without a sensor it is 0."""

@@ -5,6 +5,7 @@ import math
 import pathlib
 import struct
 from collections.abc import Callable
+from types import SimpleNamespace
 
 import pytest
 
@@ -170,6 +171,25 @@ def test_a_plane_whose_log_has_no_status_flies_while_it_is_fast(
     stated = [record.flying for record in found if isinstance(record, r.Vehicle)]
     flying = [state for state in stated if state is not None]
     assert flying == [False, *([] if has_status else [True, False, True])]
+
+
+def test_the_airspeed_is_that_of_the_primary_sensor() -> None:
+    """As since ArduPlane 3.9 (Pri); its first sensor's was taken, though blocked and no longer used."""
+    converter, found = dataflash.MessageConverter(), list[r.Stamped]()
+    for sensor, airspeed, healthy in ((0, 3.0, 0), (1, 21.0, 1)):
+        row = SimpleNamespace(I=sensor, Airspeed=airspeed, DiffPress=250.0, U=healthy, H=healthy, Pri=1)
+        found += converter.records("ARSP", row, 1_000)
+    assert found == [r.AirData(1_000, 1_000, 21.0, sensed=True)]
+
+
+@pytest.mark.parametrize(("used", "healthy"), [(0, 1), (1, 0)])
+def test_the_airspeed_of_a_sensor_that_is_unhealthy_or_not_used_is_none_of_a_sensor(
+    used: int, healthy: int
+) -> None:
+    """As in flight, by SYS_STATUS."""
+    row = SimpleNamespace(I=0, Airspeed=21.0, DiffPress=250.0, U=used, H=healthy, Pri=0)
+    (air,) = dataflash.MessageConverter().records("ARSP", row, 1_000)
+    assert air == r.AirData(1_000, 1_000, 21.0, sensed=False)
 
 
 def test_primary_lane_is_converted(tmp_path: pathlib.Path) -> None:
