@@ -28,6 +28,7 @@ from msgspec.structs import replace
 from companion.link import dialect, frame
 from companion.link.dialect import mavlink
 from companion.nav.geometry import displace, geodetic_to_local, local_to_geodetic
+from companion.navigator.ground import FLYING_M_S
 from companion.records import (
     AirData,
     AirspeedSensor,
@@ -320,14 +321,16 @@ class SimulatedAutopilot:
     # -- messages without a sensor --------------------------------------------------------------------------
 
     def _heartbeat(self, t: int) -> Any:
-        px4 = self.scenario.autopilot == "px4"
+        """PX4 is active once it is armed, ArduPlane while it flies."""
+        px4, flight = self.scenario.autopilot == "px4", self.world.flight
+        is_active = px4 or np.interp(t * 1e-9, flight.t, flight.airspeed) > FLYING_M_S
         return dialect.new(
             "HEARTBEAT",
             type=mavlink.MAV_TYPE_FIXED_WING,
             autopilot=mavlink.MAV_AUTOPILOT_PX4 if px4 else mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA,
             base_mode=_BASE_MODE | (mavlink.MAV_MODE_FLAG_SAFETY_ARMED if self.is_armed else 0),
             custom_mode=10,
-            system_status=mavlink.MAV_STATE_ACTIVE,
+            system_status=mavlink.MAV_STATE_ACTIVE if is_active else mavlink.MAV_STATE_STANDBY,
             mavlink_version=3,
         )
 
