@@ -609,5 +609,6 @@ def _by_age(age_s: Floats) -> npt.NDArray[np.intp]:
 
 def _groups(number: npt.NDArray[np.intp]) -> Floats:
     """One 1 in each row: the group of that row, the oldest first within the order of their numbers."""
-    group: Floats = (number[:, None] == np.unique(number)).astype(np.float64)
+    present = np.flatnonzero(np.bincount(number))  # np.unique imports numpy.ma, 8 ms in flight
+    group: Floats = (number[:, None] == present).astype(np.float64)
     return group

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from scipy.linalg import qr
 from scipy.optimize import linprog
 
 from companion.estimate import minimax_lp
@@ -124,3 +125,11 @@ def test_inputs_are_checked() -> None:
         Design.of(rows, 1.0, np.ones((3, 1)), [-1.0])
     with pytest.raises(ValueError, match="one for each input"):
         Design.of(rows, 1.0, np.ones((3, 2)), [1.0, 1.0]).minimax([1.0], through=[1.0])
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_the_columns_to_start_from_are_those_of_a_pivoted_qr(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    r = int(rng.integers(1, 9))
+    q = rng.standard_normal((r, 40)) * 10.0 ** rng.uniform(-3.0, 3.0, 40)
+    assert minimax_lp.independent_columns(q).tolist() == qr(q, mode="r", pivoting=True)[-1][:r].tolist()
