@@ -30,6 +30,8 @@ from companion.navigator.ground import (
     lifted,
     wind_shear,
 )
+from companion.navigator.inertial_track import Point
+from companion.navigator.minimax_bound import Guarantee
 from companion.navigator.own_channel import Sensors
 from companion.navigator.own_error_model import HELD, By
 from companion.navigator.progress import (
@@ -242,13 +244,21 @@ def air_data(state: State, record: AirData, settings: Settings) -> Step:
     state = with_sensors(state, air_ns=record.t_ns, pitot_ns=record.t_ns)
     state = air_velocity.taken_from("pitot", state, settings)
     state = air_velocity.with_wind_noted(state, record.t_ns, settings)
-    reckoned = own_channel.reckoned(state.reckoned, nominal.point, V, record.t_ns)
-    state = structs.replace(state, reckoned=reckoned)
+    state = _reckoned(state, nominal.point, V, record.t_ns)
     if leads:
         return _driven(with_sensors(state, steady=record), record, "air", V, settings)
     if driver(state) != "imu":
         return state, []
     return air_velocity.measured(carried(state, record.t_ns, settings), record, V, settings), []
+
+
+def _reckoned(state: State, start: Point, V: Vector2, t_ns: int) -> State:
+    """With the trajectory by airspeed alone; where that begins again, so does the window of its bound."""
+    before, guarantee = state.reckoned, state.guarantee
+    if guarantee.by == "air" and (before is None or own_channel.is_old(before, t_ns)):
+        guarantee = Guarantee()
+    after = own_channel.reckoned(before, start, V, t_ns)
+    return structs.replace(state, reckoned=after, guarantee=guarantee)
 
 
 def _sheared(state: State, ground: Ground) -> State:

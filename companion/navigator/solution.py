@@ -138,7 +138,7 @@ def solve(state: State, rx_ns: int, settings: Settings) -> Step:
         velocity_bound_n=velocity_bound_n,
         disagreement=_disagreement(candidates),
         inertial_age_s=max(0.0, (rx_ns - t_ns) * 1e-9),
-        ahead=minimax_bound.ahead(state.guarantee, config),
+        ahead=minimax_bound.ahead(_guarantee(state), config),
         sigma_velocity=math.hypot(math.sqrt(velocity_variance), settings.model.channel.velocity_noise),
         protection=protection,
         trust=held.trust,
@@ -356,8 +356,14 @@ def _apart(state: State, nominal: Point) -> tuple[Vector2, Vector2]:
 
 def guaranteed(state: State, nominal: Point) -> Guaranteed | None:
     """The guaranteed estimates of the nominal error now."""
-    found = None if _bounded(state) is None else minimax_bound.guaranteed(state.guarantee, nominal.t_ns)
+    found = minimax_bound.guaranteed(_guarantee(state), nominal.t_ns)
     return found and found.about(*_apart(state, nominal))
+
+
+def _guarantee(state: State) -> Guarantee:
+    """That of the trajectory that is bounded now; none where another was until this record."""
+    bounded, g = _bounded(state), state.guarantee
+    return g if bounded is not None and bounded.driver == g.by else Guarantee()
 
 
 def is_bound_due(state: State) -> bool:

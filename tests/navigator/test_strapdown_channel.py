@@ -873,6 +873,45 @@ def test_an_airspeed_that_is_false_or_silent_has_no_guaranteed_bound() -> None:
         assert not solution.is_bound_due(after)
 
 
+def until(end: float) -> tuple[Navigator, list[Any]]:
+    """A navigator with a bound at `end` (s), and the records behind it."""
+    navigator = Navigator(load(flags={"output.profile": "ardupilot"}, environment={}))
+    records = sensing(with_beacon(0))
+    navigated((r for r in records if r.t_ns < end * NS), recorded()[1], navigator)
+    navigator.settle()
+    state = navigator.state
+    assert state.nominal is not None and state.nominal.driver == "imu"
+    assert solution.guaranteed(state, state.nominal.point) is not None
+    return navigator, [r for r in records if r.t_ns >= end * NS]
+
+
+@pytest.mark.flight
+def test_an_airspeed_that_comes_back_begins_another_guaranteed_bound() -> None:
+    """Though no other sample has come since it counts as silent: it goes on from another place."""
+    navigator, behind = until(LOSS - 30.0)
+    assert navigator.state.reckoned is not None
+    silent_ns = navigator.state.reckoned.t_ns + own_channel.SILENT_NS["air"]
+    others = [r for r in behind if r.t_ns < silent_ns and not isinstance(r, AirData)]
+    air = next(r for r in behind if isinstance(r, AirData))
+    back_ns = silent_ns + 1
+    navigated([*others, msgspec.structs.replace(air, t_ns=back_ns, rx_ns=back_ns)], recorded()[1], navigator)
+    navigator.settle()
+    state = navigator.state
+    assert state.nominal is not None and state.reckoned is not None and state.reckoned.t_ns == back_ns
+    assert solution.guaranteed(state, state.nominal.point) is None
+
+
+@pytest.mark.flight
+def test_a_velocity_that_is_held_has_no_bound_of_the_airspeed_before_it() -> None:
+    """Nor in the first solution: the window is dropped after that."""
+    navigator, _ = until(LOSS - 30.0)
+    state, settings = navigator.state, navigator.settings
+    assert state.nominal is not None
+    held = own_channel.restart(state.nominal, "hold", state.nominal.point.v_n[:2])
+    _, (out,) = solution.solve(msgspec.structs.replace(state, nominal=held), held.t_ns, settings)
+    assert isinstance(out, Solution) and out.bound_n is None and out.ahead == ()
+
+
 @pytest.mark.flight
 def test_recorded_on_px4_its_preset_finds_a_step_of_the_wind() -> None:
     """EKF2 keeps its attitude within 0.3 deg for a quarter of a minute; with 2 deg it is 68 m."""
