@@ -331,13 +331,15 @@ def _other_half(half: Pending, pending: Pending, config: Config) -> tuple[Observ
 def _bounded(state: State) -> Nominal | None:
     """The trajectory whose error is bounded: in the own channel that by airspeed alone.
 
-    Nothing bounds the attitude that turns the IMU's forces, nor an airspeed that is steady or excluded.
+    Nothing bounds the attitude that turns the IMU's forces, nor an airspeed that is steady or excluded; nor
+    what rotors do beside the nose.
     """
     nominal, by_air = state.nominal, state.reckoned
     if nominal is None or nominal.driver not in ("imu", "air"):
         return nominal
     is_excluded = bool(state.reported) and state.reported[AIRSPEED] == EXCLUDED
-    if by_air is None or is_excluded or own_channel.is_old(by_air, nominal.t_ns):
+    by_rotors = state.sensors.multirotor or state.sensors.hovering
+    if by_air is None or is_excluded or by_rotors or own_channel.is_old(by_air, nominal.t_ns):
         return None
     return by_air
 

@@ -39,7 +39,7 @@ from companion.navigator.hypotheses import AIRSPEED
 from companion.navigator.inertial_track import Point
 from companion.navigator.minimax_bound import Guarantee
 from companion.navigator.progress import shifted
-from companion.navigator.state import EXCLUDED
+from companion.navigator.state import EXCLUDED, with_sensors
 from companion.records import (
     AirData,
     Attitude,
@@ -910,6 +910,16 @@ def test_a_velocity_that_is_held_has_no_bound_of_the_airspeed_before_it() -> Non
     held = own_channel.restart(state.nominal, "hold", state.nominal.point.v_n[:2])
     _, (out,) = solution.solve(msgspec.structs.replace(state, nominal=held), held.t_ns, settings)
     assert isinstance(out, Solution) and out.bound_n is None and out.ahead == ()
+
+
+@pytest.mark.flight
+@pytest.mark.parametrize("by", ["multirotor", "hovering"])
+def test_rotors_move_an_aircraft_beside_its_nose_and_nothing_bounds_it(by: str) -> None:
+    navigator, _ = until(LOSS - 30.0)
+    state = with_sensors(navigator.state, **{by: True})
+    assert state.nominal is not None
+    assert solution.guaranteed(state, state.nominal.point) is None
+    assert solution.is_bound_due(state)
 
 
 @pytest.mark.flight
