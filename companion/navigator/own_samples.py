@@ -92,6 +92,8 @@ def vehicle(state: State, record: Vehicle, settings: Settings) -> Step:
     aloft_ns = s.aloft_ns
     if record.flying is not None:  # a copter hovers always, by its own statement
         aloft_ns = (aloft_ns or record.t_ns) if record.flying and (multirotor or not hovering) else None
+    if aloft_ns is not None and fixed_wing and not s.fixed_wing:  # until now its rotors held it up
+        aloft_ns = record.t_ns
     return with_sensors(
         state,
         multirotor=multirotor,

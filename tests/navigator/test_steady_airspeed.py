@@ -101,6 +101,15 @@ def test_it_is_used_of_a_fixed_wing_that_flies_only() -> None:
     assert uses_air(stated(fixed_wing=False, flying=True), 40.0) == math.inf
 
 
+def test_a_quadplane_that_leaves_a_mode_of_its_rotors_has_no_steady_airspeed_for_twenty_seconds() -> None:
+    """By its HEARTBEAT alone: it gathers speed first."""
+    others = [r for r in without_airspeed() if not isinstance(r, Vehicle)]
+    vehicles = [
+        Vehicle(t * NS, t * NS, multirotor=False, flying=True, fixed_wing=t >= 30) for t in range(1, 60)
+    ]
+    assert 50.0 <= uses_air([*others, *vehicles], 55.0) < 55.0
+
+
 def test_a_sensor_that_fails_is_replaced_and_one_that_comes_back_is_used_again() -> None:
     """What is wrong with the scale starts again with each: 3 % of a pitot, 40 % of a steady airspeed."""
     navigator = Navigator(CONFIG)
