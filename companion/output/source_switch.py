@@ -283,15 +283,18 @@ class SourceSwitch:
 
     def update(self, now_ns: int) -> None:
         """Decide by the table; call it at least once a second, with or without solutions."""
-        decision = self.required(self.situation(now_ns))
+        situation = self.situation(now_ns)
+        decision = self.required(situation)
         if decision is not None and decision[0] == COMPANION_SET and self._lack:
             self._report_lack(now_ns)
-            decision = None
+            is_to_return = self.has_left_gnss and not is_held_false(situation)
+            decision = (GNSS_SET, self._lack) if is_to_return else None
+        elif decision is not None:
+            self._lack_reported = ""
         if decision is None:
             if self._next_ns is not None:  # stop requesting it; whether it was accepted is not known
                 self._wanted = self._next_ns = None
             return
-        self._lack_reported = ""
         is_new = decision[0] != self._required
         self._required, self._reason = decision
         if self._held is not None:

@@ -225,6 +225,23 @@ def test_set_2_is_not_requested_while_it_has_no_position_of_ours() -> None:
     assert flight.sets == [1, 2]
 
 
+@pytest.mark.parametrize("lie", [False, True])
+def test_set_2_whose_lack_is_found_too_late_is_left_again(lie: bool) -> None:
+    """The parameters are read after it was requested, or change. A GNSS held false is worse than none."""
+    flight = Flight()
+    flight.fly(30.0)
+    dark: dict[str, Any] = {"false": 1.0 - 1e-6} if lie else {"fix": False}
+    flight.fly(30.0, **dark)
+    assert flight.sets == [1, 2]
+    flight.switch.note_lack("EK3_SRC2_POSXY is 0")
+    flight.fly(60.0, **dark)
+    assert flight.sets == ([1, 2] if lie else [1, 2, 1])
+    assert [text for _, text in flight.reports[2:]] == [
+        "EKF source set 2 needed, but EK3_SRC2_POSXY is 0: run companion doctor",
+        *([] if lie else ["EKF source set 1: EK3_SRC2_POSXY is 0"]),
+    ]
+
+
 def test_silent_receiver() -> None:
     flight = Flight()
     silent = flight.fly(30.0)
