@@ -96,8 +96,8 @@ def worst_of(a: Assessment) -> Worst:
 def _started_ns(a: Assessment) -> int:
     """Return when the first fixes of GNSS followed a short time with beacons alone, 0 if they did not."""
     names = [_rests_on(phase.name) for phase in a.phases[:2]]
-    start = a.phases[0].end_ns
-    return start if names == [BY_BEACONS, WITH_GNSS] and start < SHORT_S * 1e9 else 0
+    _, start_ns, end_ns = a.phases[0]
+    return end_ns if names == [BY_BEACONS, WITH_GNSS] and end_ns - start_ns < SHORT_S * 1e9 else 0
 
 
 def describe_worst(a: Assessment) -> str:
