@@ -255,12 +255,22 @@ def air_data(state: State, record: AirData, settings: Settings) -> Step:
 
 
 def _reckoned(state: State, start: Point, V: Vector2, t_ns: int) -> State:
-    """With the trajectory by airspeed alone; where that begins again, so does the window of its bound."""
+    """With the trajectory by airspeed alone; where that begins again, so does the window of its bound.
+
+    A sample that steps is left out, as where it moves the position.
+    """
     before, guarantee = state.reckoned, state.guarantee
-    if guarantee.by == "air" and (before is None or own_channel.is_old(before, t_ns)):
-        guarantee = Guarantee()
+    if before is None or own_channel.is_old(before, t_ns):
+        guarantee = Guarantee() if guarantee.by == "air" else guarantee
+    elif abs(math.hypot(*V) - math.hypot(*before.point.v_n[:2])) > _step_limit(t_ns - before.t_ns):
+        return state
     after = own_channel.reckoned(before, start, V, t_ns)
     return structs.replace(state, reckoned=after, guarantee=guarantee)
+
+
+def _step_limit(gap_ns: int) -> float:
+    """The greatest change of an airspeed in a time, m/s."""
+    return STEP_M_S + STEP_M_S2 * gap_ns * 1e-9
 
 
 def _sheared(state: State, ground: Ground) -> State:
@@ -283,7 +293,7 @@ def _step(s: Sensors, record: AirData) -> Rejection | None:
     if last is None or before is None or record.true != last.true:
         return None
     gap_s = (record.t_ns - before.t_ns) * 1e-9
-    step, limit = abs(record.airspeed - last.airspeed), STEP_M_S + STEP_M_S2 * gap_s
+    step, limit = abs(record.airspeed - last.airspeed), _step_limit(record.t_ns - before.t_ns)
     if step <= limit or gap_s > STEP_GAP_S or record.t_ns - last.t_ns > STEP_NS:
         return None
     return Rejection(record.t_ns, record.rx_ns, "airspeed", "it steps: not used", step, limit)

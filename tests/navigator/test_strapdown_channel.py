@@ -902,6 +902,26 @@ def test_an_airspeed_that_comes_back_begins_another_guaranteed_bound() -> None:
 
 
 @pytest.mark.flight
+def test_an_airspeed_that_steps_does_not_move_what_is_bounded() -> None:
+    """For a second 90 m/s where it flies at 23: the estimate was 70 m off, its bound 43 m."""
+    navigator, behind = until(LOSS - 20.0)
+    for record in behind:
+        if isinstance(record, AirData) and record.t_ns < (LOSS - 19.0) * NS:
+            record = msgspec.structs.replace(record, airspeed=90.0)
+        navigator.handle(record)
+        navigator.settle()
+        if record.t_ns > (LOSS - 18.0) * NS:
+            break
+    state = navigator.state
+    assert state.nominal is not None
+    found = solution.guaranteed(state, state.nominal.point)
+    assert found is not None
+    place = displace(*state.nominal.point.position, *(-e for e in found.restricted.error_n), 0.0)
+    error = separation(place, recorded()[1](state.nominal.t_ns))
+    assert math.hypot(*error[:2]) < math.hypot(*found.restricted.bound_n)
+
+
+@pytest.mark.flight
 def test_a_velocity_that_is_held_has_no_bound_of_the_airspeed_before_it() -> None:
     """Nor in the first solution: the window is dropped after that."""
     navigator, _ = until(LOSS - 30.0)
