@@ -17,6 +17,7 @@ from typing import NamedTuple
 from msgspec import Struct, structs
 
 from companion.config import Config
+from companion.nav.geometry import separation
 from companion.navigator import air_data_channel, own_error_model, strapdown_channel
 from companion.navigator.air_data_channel import Reckoner
 from companion.navigator.channel import DOPPLER_S, Nominal, Transition, moved
@@ -264,18 +265,38 @@ def carry_on(nominal: Nominal, s: Sensors, t_ns: int) -> Nominal:
     return by_velocity(nominal, nominal.interval.velocity, t_ns)
 
 
-def reckoned(before: Nominal | None, start: Point, velocity: Vector2, t_ns: int) -> Nominal:
-    """Go on to `t_ns` by the velocity through the air (m/s) alone; after a silence begin again at `start`."""
-    if before is None or is_old(before, t_ns):
-        point = Point(t_ns, start.position, (*velocity, 0.0))
-    else:
-        point = moved(before.point, velocity, t_ns)
-    return Nominal(point, (0.0, 0.0), point, own_error_model.begin("air", velocity))
+class Reckoned(NamedTuple):
+    """Reckoning by airspeed alone: the nominal place at its last sample with the velocity through the air,
+    and how far from there it is, north and east (m): by wind 72 km in two hours, too far for one plane.
+    """
+
+    track: Nominal
+    apart: Vector2
 
 
-def is_old(by_air: Nominal, t_ns: int) -> bool:
+def reckoned(before: Reckoned | None, nominal: Point, velocity: Vector2, t_ns: int) -> Reckoned:
+    """Go on to `t_ns` by the velocity through the air (m/s) alone; after a silence begin again."""
+    nominal = moved(nominal, nominal.v_n[:2], t_ns)
+    is_new = before is None or is_old(before, t_ns)
+    apart = (0.0, 0.0) if before is None or is_new else apart_from(before, nominal, velocity)
+    point = nominal._replace(v_n=(*velocity, 0.0))
+    return Reckoned(Nominal(point, (0.0, 0.0), point, own_error_model.begin("air", velocity)), apart)
+
+
+def apart_from(by_air: Reckoned, nominal: Point, velocity: Vector2) -> Vector2:
+    """How far reckoning by airspeed, now at `velocity` (m/s), is from a nominal point, north and east (m)."""
+    last = by_air.track.point
+    half_s = 0.5e-9 * (nominal.t_ns - last.t_ns)
+    north, east, _ = separation(nominal.position, last.position)
+    return (
+        by_air.apart[0] + half_s * (last.v_n[0] + velocity[0]) - north,
+        by_air.apart[1] + half_s * (last.v_n[1] + velocity[1]) - east,
+    )
+
+
+def is_old(by_air: Reckoned, t_ns: int) -> bool:
     """Whether reckoning by airspeed has had no sample for too long."""
-    return t_ns - by_air.t_ns > SILENT_NS["air"]
+    return t_ns - by_air.track.t_ns > SILENT_NS["air"]
 
 
 def by_imu(nominal: Nominal, a_n: Vector2, s: Sensors, t_ns: int) -> Nominal:

@@ -262,8 +262,10 @@ def _reckoned(state: State, start: Point, V: Vector2, t_ns: int) -> State:
     before, guarantee = state.reckoned, state.guarantee
     if before is None or own_channel.is_old(before, t_ns):
         guarantee = Guarantee() if guarantee.by == "air" else guarantee
-    elif abs(math.hypot(*V) - math.hypot(*before.point.v_n[:2])) > _step_limit(t_ns - before.t_ns):
-        return state
+    else:
+        step = abs(math.hypot(*V) - math.hypot(*before.track.point.v_n[:2]))
+        if step > _step_limit(t_ns - before.track.t_ns):
+            return state
     after = own_channel.reckoned(before, start, V, t_ns)
     return structs.replace(state, reckoned=after, guarantee=guarantee)
 

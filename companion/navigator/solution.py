@@ -17,7 +17,7 @@ from companion.config import Config
 from companion.estimate import bank as banks
 from companion.estimate.fusion import Height, NoFix, Observation, maximum_likelihood
 from companion.estimate.kalman import Gaussian
-from companion.nav.geometry import displace, separation
+from companion.nav.geometry import displace
 from companion.navigator import (
     fix_observations,
     height_error,
@@ -26,7 +26,7 @@ from companion.navigator import (
     parallel_filters,
     trust,
 )
-from companion.navigator.channel import Nominal, moved
+from companion.navigator.channel import Nominal
 from companion.navigator.hypotheses import AIRSPEED, GNSS, VELOCITY
 from companion.navigator.inertial_track import Point
 from companion.navigator.minimax_bound import Guarantee, Guaranteed, Linear
@@ -341,19 +341,19 @@ def _bounded(state: State) -> Nominal | None:
     by_rotors = state.sensors.multirotor or state.sensors.hovering
     if by_air is None or is_excluded or by_rotors or own_channel.is_old(by_air, nominal.t_ns):
         return None
-    return by_air
+    return by_air.track
 
 
 def _apart(state: State, nominal: Point) -> tuple[Vector2, Vector2]:
     """How far the bounded trajectory is from a point of the nominal one, north and east (m), and by velocity
     (m/s).
     """
-    bounded = _bounded(state)
-    if bounded is None or bounded is state.nominal:
+    by_air, bounded = state.reckoned, _bounded(state)
+    if by_air is None or bounded is not by_air.track:
         return (0.0, 0.0), (0.0, 0.0)
-    v_n = bounded.point.v_n
-    north, east, _ = separation(moved(bounded.point, v_n[:2], nominal.t_ns).position, nominal.position)
-    return (north, east), (v_n[0] - nominal.v_n[0], v_n[1] - nominal.v_n[1])
+    north, east, _ = bounded.point.v_n
+    away = own_channel.apart_from(by_air, nominal, (north, east))
+    return away, (north - nominal.v_n[0], east - nominal.v_n[1])
 
 
 def guaranteed(state: State, nominal: Point) -> Guaranteed | None:

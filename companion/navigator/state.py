@@ -21,7 +21,7 @@ from companion.navigator.height_error import Level
 from companion.navigator.hypotheses import GNSS, SOURCES, TURNED_M_S, Hypotheses, Model, Situation
 from companion.navigator.inertial_track import Point
 from companion.navigator.minimax_bound import Guarantee
-from companion.navigator.own_channel import OwnChannel, Sensors
+from companion.navigator.own_channel import OwnChannel, Reckoned, Sensors
 from companion.navigator.parallel_filters import Parallel
 from companion.navigator.scatter import Scatter
 from companion.navigator.trust import Held
@@ -88,7 +88,7 @@ class State(Struct, frozen=True):
     waiting_ns: int | None = None  # since when a channel cannot begin
     sensors: Sensors = Sensors()
     nominal: Nominal | None = None
-    reckoned: Nominal | None = None  # by airspeed alone, in the own channel: the guaranteed bound is of it
+    reckoned: Reckoned | None = None  # by airspeed alone, in the own channel: the guaranteed bound is of it
     ins: Point | None = None  # the last sample of an INS; the nominal point may be carried on beyond it
     bank: Bank | None = None
     newborn: Newborn | None = None

@@ -34,7 +34,7 @@ from companion.navigator import (
     solution,
     strapdown_channel,
 )
-from companion.navigator.channel import Nominal
+from companion.navigator.channel import Nominal, moved
 from companion.navigator.hypotheses import AIRSPEED
 from companion.navigator.inertial_track import Point
 from companion.navigator.minimax_bound import Guarantee
@@ -818,6 +818,18 @@ def promised(records: Iterable[Any], navigator: Navigator) -> Iterator[Promised]
             yield Promised(state.nominal.t_ns, place, found.restricted.bound_n)
 
 
+def test_reckoning_by_airspeed_does_not_depend_on_where_the_wind_would_have_left_it() -> None:
+    """Two hours east at 60 deg north in a wind of 10 m/s: 72 km away, meridians would turn it by 1.1 deg."""
+    velocity, wind, by_air = (0.0, 25.0), (10.0, 0.0), None
+    point = Point(0, Geodetic(math.radians(60.0), 0.0, 300.0), (*velocity, 0.0))
+    through_air = (velocity[0] - wind[0], velocity[1] - wind[1])
+    for second in range(7201):
+        by_air = own_channel.reckoned(by_air, point, through_air, second * NS)
+        point = moved(point, velocity, (second + 1) * NS)
+    assert by_air is not None
+    assert by_air.apart == pytest.approx((-72_000.0, 0.0), abs=1.0)
+
+
 @pytest.mark.flight
 def test_the_guaranteed_bound_beside_the_imu_is_that_of_airspeed_alone() -> None:
     """The same linear estimate of the same fixes; the IMU moves another nominal trajectory."""
@@ -890,14 +902,14 @@ def test_an_airspeed_that_comes_back_begins_another_guaranteed_bound() -> None:
     """Though no other sample has come since it counts as silent: it goes on from another place."""
     navigator, behind = until(LOSS - 30.0)
     assert navigator.state.reckoned is not None
-    silent_ns = navigator.state.reckoned.t_ns + own_channel.SILENT_NS["air"]
+    silent_ns = navigator.state.reckoned.track.t_ns + own_channel.SILENT_NS["air"]
     others = [r for r in behind if r.t_ns < silent_ns and not isinstance(r, AirData)]
     air = next(r for r in behind if isinstance(r, AirData))
     back_ns = silent_ns + 1
     navigated([*others, msgspec.structs.replace(air, t_ns=back_ns, rx_ns=back_ns)], recorded()[1], navigator)
     navigator.settle()
     state = navigator.state
-    assert state.nominal is not None and state.reckoned is not None and state.reckoned.t_ns == back_ns
+    assert state.nominal is not None and state.reckoned is not None and state.reckoned.track.t_ns == back_ns
     assert solution.guaranteed(state, state.nominal.point) is None
 
 
