@@ -221,11 +221,12 @@ def straight_on(fixes: Fixes, start: float, seconds: float) -> Floats:
 def study(
     log: str, records: Sequence[Stamped], config: Config, every_s: float, lasting: Sequence[float]
 ) -> list[Row]:
-    """Return a row for every duration; none if no outage fits into the flight."""
+    """Return a row for every duration of which an outage fits into the flight."""
     fixes, air = Fixes(records), Air(records)
-    starts = fixes.starts(every_s, max(lasting))
-    if not starts:
+    lasting = [seconds for seconds in lasting if fixes.starts(every_s, seconds)]
+    if not lasting:
         return []
+    starts = fixes.starts(every_s, max(lasting))
     flown = list(companion_errors(records, fixes, config, starts, lasting))
     rows = []
     for seconds in lasting:
@@ -335,7 +336,11 @@ def _flown_without(
     rows = study(log.name, records, config, every_s, lasting)
     if not rows:
         raise LogError(
-            f"{log}: no {LEARNING_S + max(lasting):.0f} s of flight with GNSS (stated by the log, or "
+            f"{log}: no {LEARNING_S + min(lasting):.0f} s of flight with GNSS (stated by the log, or "
             f"faster than {FLYING_M_S:g} m/s): choose a longer flight, or a shorter --lasting"
         )
+    missing = [f"{seconds:g}" for seconds in lasting if seconds not in {row.lasting_s for row in rows}]
+    if missing:
+        short = f"{escape(printable(log.name))} is too short for {', '.join(missing)} s"
+        note = "\n".join(filter(None, (note, short)))
     return rows, note
