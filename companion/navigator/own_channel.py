@@ -275,10 +275,9 @@ class Reckoned(NamedTuple):
 
 
 def reckoned(before: Reckoned | None, nominal: Point, velocity: Vector2, t_ns: int) -> Reckoned:
-    """Go on to `t_ns` by the velocity through the air (m/s) alone; after a silence begin again."""
+    """Go on to `t_ns` by the velocity through the air (m/s) alone, or begin at the nominal place."""
     nominal = moved(nominal, nominal.v_n[:2], t_ns)
-    is_new = before is None or is_old(before, t_ns)
-    apart = (0.0, 0.0) if before is None or is_new else apart_from(before, nominal, velocity)
+    apart = (0.0, 0.0) if before is None else apart_from(before, nominal, velocity)
     point = nominal._replace(v_n=(*velocity, 0.0))
     return Reckoned(Nominal(point, (0.0, 0.0), point, own_error_model.begin("air", velocity)), apart)
 

@@ -261,6 +261,7 @@ def _reckoned(state: State, start: Point, V: Vector2, t_ns: int) -> State:
     """
     before, guarantee = state.reckoned, state.guarantee
     if before is None or own_channel.is_old(before, t_ns):
+        before = None
         guarantee = Guarantee() if guarantee.by == "air" else guarantee
     else:
         step = abs(math.hypot(*V) - math.hypot(*before.track.point.v_n[:2]))
