@@ -11,22 +11,23 @@ PARKED_S = 10.0  # [s] of it
 CLEAR_M = 5.0  # [m] from the last parked height: the wheels are off the ground
 #: The wind grows with the logarithm of the height: by about a quarter of itself from 20 to 100 m.
 SHEAR_M_S, SHEAR_TOP_M = 2.0, 200.0  # [m/s] for a height e times as great; [m] above it is as it is
+SAME_WIND = 1.25  # a height so many times smaller has the same wind
 
 
 class Ground(NamedTuple):
     """Flying or not, since when slow (s, None if not slow), the height (m) where it was last parked, and the
-    greatest distance (m) from that since lift-off.
+    height (m) above that whose wind was the last one measured.
     """
 
     flying: bool = False
     slow_since: float | None = None
     parked_height: float | None = None
-    climbed: float = CLEAR_M
+    wind_height: float = CLEAR_M
 
 
 def wind_shear(before: Ground, after: Ground) -> float:
     """Variance of what the wind may have changed with height between two phases, (m/s)^2 an axis."""
-    return SHEAR_M_S**2 * math.log(max(after.climbed / before.climbed, 1.0))
+    return SHEAR_M_S**2 * abs(math.log(after.wind_height / before.wind_height)) if after.flying else 0.0
 
 
 def ground_phase(
@@ -59,7 +60,7 @@ def ground_phase(
         return g._replace(flying=False, slow_since=since) if hovers else Ground(False, since, height)
     clear = is_clear(g, height)
     flying = g.flying or (airspeed > FLYING_M_S and (speed > PARKED_M_S if clear is None else clear))
-    return lifted(g, height) if flying else Ground(False, None, g.parked_height, g.climbed)
+    return sunk(lifted(g, height), height) if flying else Ground(False, None, g.parked_height, g.wind_height)
 
 
 def is_clear(g: Ground, height: float | None) -> bool | None:
@@ -73,8 +74,24 @@ def is_clear(g: Ground, height: float | None) -> bool | None:
 
 
 def lifted(g: Ground, height: float | None) -> Ground:
-    """In flight, at a pressure altitude (m), if any."""
-    climbed = g.climbed
-    if g.parked_height is not None and height is not None:
-        climbed = max(climbed, min(abs(height - g.parked_height), SHEAR_TOP_M))
-    return Ground(True, None, g.parked_height, climbed)
+    """In flight, at a pressure altitude (m), if any: the wind is open where it is higher than before.
+
+    Not where it sinks: a multirotor works near the ground, and each descent would open the wind anew (an
+    octocopter without GNSS for a minute 47 m off, not 20).
+    """
+    above = _above(g, height)
+    wind_height = g.wind_height if above is None else max(g.wind_height, above)
+    return Ground(True, None, g.parked_height, wind_height)
+
+
+def sunk(g: Ground, height: float | None) -> Ground:
+    """The same, the wind open too where it is lower: for a landing."""
+    above = _above(g, height)
+    return g if above is None else g._replace(wind_height=min(g.wind_height, SAME_WIND * above))
+
+
+def _above(g: Ground, height: float | None) -> float | None:
+    """Height above the ground (m) within the limits between which the wind changes with it."""
+    if g.parked_height is None or height is None:
+        return None
+    return min(max(abs(height - g.parked_height), CLEAR_M), SHEAR_TOP_M)

@@ -8,7 +8,16 @@ import pytest
 
 from companion.config import load
 from companion.navigator import Navigator
-from companion.navigator.ground import CLEAR_M, SHEAR_M_S, SHEAR_TOP_M, Ground, ground_phase, wind_shear
+from companion.navigator.ground import (
+    CLEAR_M,
+    SAME_WIND,
+    SHEAR_M_S,
+    SHEAR_TOP_M,
+    Ground,
+    ground_phase,
+    lifted,
+    wind_shear,
+)
 from companion.records import AirData, Attitude, Gnss, Pressure, Vehicle
 from companion.units import SECOND_NS
 
@@ -32,18 +41,44 @@ def test_below_the_parked_height_it_flies_too() -> None:
     assert phases((0.5, 0.0, 100.0), (25.0, 24.0, 100.0 - CLEAR_M - 0.1))[-1]
 
 
-def test_the_wind_is_as_open_after_many_small_steps_of_height_as_after_one() -> None:
-    def variance(step: float) -> float:
-        g, total = Ground(False, None, 100.0), 0.0
-        for k in range(1, round(300.0 / step) + 1):
-            after = ground_phase(g, 0.1 * k, 25.0, 25.0, 100.0 + step * k)
-            total, g = total + wind_shear(g, after), after
-        return total
+def opened(g: Ground, heights: list[float]) -> float:
+    """Variance of the wind's change over a flight by airspeed through these pressure altitudes."""
+    total = 0.0
+    for k, height in enumerate(heights):
+        after = ground_phase(g, 0.1 * k, 25.0, 25.0, height)
+        total, g = total + wind_shear(g, after), after
+    return total
 
-    assert variance(1.0) == pytest.approx(variance(300.0), rel=1e-12)
-    assert variance(1.0) == pytest.approx(SHEAR_M_S**2 * math.log(SHEAR_TOP_M / CLEAR_M))
+
+@pytest.mark.parametrize("step", [1.0, 300.0])
+def test_the_wind_is_as_open_after_many_small_steps_of_height_as_after_one(step: float) -> None:
+    climb = [100.0 + step * k for k in range(1, round(300.0 / step) + 1)]
+    up = SHEAR_M_S**2 * math.log(SHEAR_TOP_M / CLEAR_M)
+    assert opened(Ground(False, None, 100.0), climb) == pytest.approx(up, rel=1e-12)
+    high = Ground(True, None, 100.0, SHEAR_TOP_M)
+    down = SHEAR_M_S**2 * math.log(SHEAR_TOP_M / CLEAR_M / SAME_WIND)
+    assert opened(high, [*reversed(climb), 100.0]) == pytest.approx(down, rel=1e-12)
+
+
+def test_a_little_up_and_down_leaves_the_wind_as_it_is() -> None:
     level = Ground(True, None, 100.0, 80.0)
-    assert wind_shear(level, ground_phase(level, 1.0, 25.0, 25.0, 170.0)) == 0.0  # up and down in cruise
+    assert opened(level, [180.0 - 80.0 * (1.0 - 1.0 / SAME_WIND), 180.0] * 50) == pytest.approx(
+        0.0, abs=1e-12
+    )
+    assert opened(level, [140.0]) > 0.0
+    assert wind_shear(level, lifted(level, 140.0)) == 0.0  # a multirotor works near the ground
+
+
+def test_parked_after_a_landing_the_wind_is_as_it_was() -> None:
+    level = Ground(
+        True,
+        None,
+        100.0,
+        80.0,
+    )
+    parked = ground_phase(level._replace(flying=False), 0.0, 0.0, 0.0, 100.0)
+    assert not parked.flying
+    assert wind_shear(level, parked) == 0.0
 
 
 def test_without_a_pressure_it_flies_once_it_moves() -> None:
