@@ -109,7 +109,7 @@ class Sensors(Struct, frozen=True):
     fixed_wing: bool = False
     hovering: bool = False
     landed: bool = False  # by the autopilot's statement
-    standing: Standing | None = None
+    standing: Standing = Standing()
     aloft_ns: int | None = None  # since when it flies, a VTOL as an aeroplane, by the autopilot
     steady_m_s: float | None = None  # airspeed of a fixed wing without a sensor; its scale is estimated
 

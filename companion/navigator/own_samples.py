@@ -180,11 +180,12 @@ def imu(state: State, record: Imu, settings: Settings) -> Step:
 
 def _standing(state: State, record: Imu, settings: Settings) -> State:
     """Use that a parked aircraft stands, while GNSS is not received."""
-    s = state.sensors
-    now = standing.follow(s.standing, record, s.landed, s.mean_acceleration, state.gnss_taken)
+    s, nominal = state.sensors, state.nominal
+    height = 0.0 if nominal is None else nominal.point.position.alt
+    now = standing.follow(s.standing, record, s.landed, s.mean_acceleration, height, state.gnss_taken)
     if now != s.standing:
         state = with_sensors(state, standing=now)
-    if state.bank is None or state.nominal is None or now is None or not now.is_due(record.t_ns):
+    if state.bank is None or nominal is None or not now.is_due(record.t_ns):
         return state
     if gnss_is_received(state, settings):
         return state

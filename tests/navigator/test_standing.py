@@ -25,23 +25,60 @@ def fix(t_s: float, speed: float) -> Gnss:
     return Gnss(t_ns, t_ns, 0, t_ns // 1000, 3, 0.8, 0.1, 300.0, v_n=(speed, 0.0, 0.0))
 
 
+def stood(*samples: tuple[float, bool, float, float, Gnss | None]) -> Standing:
+    """The standing after these samples: time (s), landed, acceleration ahead, height, the last fix."""
+    now = Standing()
+    for t_s, landed, ahead, height, last in samples:
+        now = follow(now, imu(t_s), landed, (ahead, 0.0, 0.0), height, last)
+    return now
+
+
 def test_it_stands_once_a_fix_has_shown_no_speed_since_it_is_still() -> None:
-    still = follow(None, imu(10.0), True, LEVEL, fix(9.0, 0.0))
-    assert still == Standing(10 * NS)  # the fix is older
-    shown = follow(still, imu(11.0), True, LEVEL, fix(10.5, 0.2))
-    assert shown is not None
+    still = (10.0, True, 0.0, 0.0, fix(9.0, 0.0))
+    assert not stood(still).is_due(10 * NS)  # the fix is older
+    shown = stood(still, (11.0, True, 0.0, 0.0, fix(10.5, 0.2)))
     assert shown.is_due(11 * NS)
     assert not shown._replace(measured_ns=11 * NS).is_due(11 * NS + EVERY_NS - 1)
-    assert follow(shown, imu(60.0), True, LEVEL, fix(10.5, 0.2)) == shown  # GNSS is lost
+    assert follow(shown, imu(60.0), True, LEVEL, 0.0, fix(10.5, 0.2)) == shown  # GNSS is lost
 
 
 @pytest.mark.parametrize("landed, w, ahead", [(False, 0.0, 0.0), (True, 0.1, 0.0), (True, 0.0, 1.0)])
 def test_what_may_fly_or_is_moved_does_not_stand(landed: bool, w: float, ahead: float) -> None:
-    assert follow(Standing(0, True), imu(1.0, w), landed, (ahead, 0.0, 0.0), None) is None
+    moved = follow(Standing(0, is_shown=True), imu(1.0, w), landed, (ahead, 0.0, 0.0), 0.0, None)
+    assert not moved.is_due(100 * NS)
 
 
 def test_on_a_ship_that_sails_it_does_not_stand() -> None:
-    assert follow(Standing(0), imu(1.1), True, LEVEL, fix(1.0, 8.0)) == Standing(round(1.1 * NS))
+    assert not stood((1.0, True, 0.0, 0.0, None), (1.1, True, 0.0, 0.0, fix(1.0, 8.0))).is_due(100 * NS)
+
+
+PARKED = (1.0, True, 0.0, 0.0, fix(0.0, 0.0)), (2.0, True, 0.0, 0.0, fix(1.5, 0.0))
+FLIES = (30.0, False, 3.0, 50.0, fix(30.0, 20.0))
+LANDED = tuple((60.0 + k, True, 0.0, -5.0, fix(40.0, 20.0)) for k in range(11))
+
+
+def test_landed_without_gnss_it_stands_as_where_it_took_off() -> None:
+    landed = stood(*PARKED, FLIES, *LANDED)
+    assert landed.is_due(70 * NS)
+    assert not landed.is_due(70 * NS - 1)  # not for ten seconds yet
+    carried = (71.0, True, 1.0, -5.0, None)
+    assert not stood(*PARKED, FLIES, *LANDED, carried, (72.0, True, 0.0, -5.0, None)).is_due(99 * NS)
+
+
+def test_off_a_ship_that_sails_it_may_land_on_one() -> None:
+    sails = (2.0, True, 0.0, 0.0, fix(1.5, 8.0))
+    assert not stood(PARKED[0], sails, FLIES, *LANDED).is_due(99 * NS)
+
+
+def test_towed_while_gnss_is_lost_it_does_not_stand() -> None:
+    towed = [(10.0, True, 1.0, 0.0, fix(1.5, 0.0)), *((20.0 + k, True, 0.0, 0.0, None) for k in range(20))]
+    assert not stood(*PARKED, *towed).is_due(99 * NS)
+
+
+def test_what_glides_down_does_not_stand() -> None:
+    """An autopilot without GNSS and airspeed may take a glide for a landing."""
+    glide = [(60.0 + k, True, 0.0, 100.0 - k, fix(40.0, 20.0)) for k in range(60)]
+    assert not any(stood(*PARKED, FLIES, *glide[:k]).is_due((60 + k) * NS) for k in range(1, 60))
 
 
 @pytest.mark.parametrize("lost", [{"bank": None, "nominal": None}, {"gnss_taken": None}])
