@@ -19,6 +19,7 @@ from msgspec import structs
 from companion.config import Config, ConfigError, parse
 from companion.estimate import bank as banks
 from companion.navigator import kept_state, minimax_bound, own_channel
+from companion.navigator.bounded_trajectory import is_bound_due, refresh_bound, resolve_pending
 from companion.navigator.changes import Changes
 from companion.navigator.fixes import is_too_soon
 from companion.navigator.hypotheses import Model
@@ -27,7 +28,7 @@ from companion.navigator.own_channel import OwnChannel
 from companion.navigator.past_states import PastStates
 from companion.navigator.progress import SILENT_INS_NS, births_due, propagated, with_births
 from companion.navigator.receiver_choice import ReceiverChoice
-from companion.navigator.solution import is_bound_due, refresh_bound, resolve_pending, solve
+from companion.navigator.solution import solve
 from companion.navigator.stale_data import REPORT_EVERY, StaleDataDetector
 from companion.navigator.state import Settings, State, Step
 from companion.navigator.step import INPUTS_USED, uses

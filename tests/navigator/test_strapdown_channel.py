@@ -29,6 +29,7 @@ from companion.navigator import (
     INPUTS_USED,
     Navigator,
     air_data_channel,
+    bounded_trajectory,
     own_channel,
     own_error_model,
     solution,
@@ -810,7 +811,7 @@ def promised(records: Iterable[Any], navigator: Navigator) -> Iterator[Promised]
         state, t_ns = navigator.state, record.t_ns
         if state.nominal is None or t_ns < due_ns:
             continue
-        found = solution.guaranteed(state, state.nominal.point)
+        found = bounded_trajectory.guaranteed(state, state.nominal.point)
         if found is not None:
             due_ns = t_ns + 30 * NS
             north, east = found.restricted.error_n
@@ -868,9 +869,9 @@ def test_an_airspeed_that_is_false_or_silent_has_no_guaranteed_bound() -> None:
     state, settings = navigator.state, navigator.settings
     assert state.nominal is not None and state.nominal.driver == "imu"
     point = state.nominal.point
-    before = solution.guaranteed(state, point)
+    before = bounded_trajectory.guaranteed(state, point)
     assert before is not None
-    moved = solution.guaranteed(shifted(state, 300.0, -40.0), point)
+    moved = bounded_trajectory.guaranteed(shifted(state, 300.0, -40.0), point)
     assert moved is not None  # a nominal trajectory that is moved leaves the bound as it is
     assert moved.restricted.bound_n == before.restricted.bound_n
     reported = list(state.reported)
@@ -879,10 +880,10 @@ def test_an_airspeed_that_is_false_or_silent_has_no_guaranteed_bound() -> None:
     later = point._replace(t_ns=point.t_ns + 2 * NS)
     silent = msgspec.structs.replace(state, nominal=msgspec.structs.replace(state.nominal, point=later))
     for without in (false, silent):
-        assert solution.guaranteed(without, point) is None
-        after, _ = solution.refresh_bound(without, records[-1], settings)
+        assert bounded_trajectory.guaranteed(without, point) is None
+        after, _ = bounded_trajectory.refresh_bound(without, records[-1], settings)
         assert after.guarantee == Guarantee()
-        assert not solution.is_bound_due(after)
+        assert not bounded_trajectory.is_bound_due(after)
 
 
 def until(end: float) -> tuple[Navigator, list[Any]]:
@@ -893,7 +894,7 @@ def until(end: float) -> tuple[Navigator, list[Any]]:
     navigator.settle()
     state = navigator.state
     assert state.nominal is not None and state.nominal.driver == "imu"
-    assert solution.guaranteed(state, state.nominal.point) is not None
+    assert bounded_trajectory.guaranteed(state, state.nominal.point) is not None
     return navigator, [r for r in records if r.t_ns >= end * NS]
 
 
@@ -910,7 +911,7 @@ def test_an_airspeed_that_comes_back_begins_another_guaranteed_bound() -> None:
     navigator.settle()
     state = navigator.state
     assert state.nominal is not None and state.reckoned is not None and state.reckoned.track.t_ns == back_ns
-    assert solution.guaranteed(state, state.nominal.point) is None
+    assert bounded_trajectory.guaranteed(state, state.nominal.point) is None
 
 
 @pytest.mark.flight
@@ -926,7 +927,7 @@ def test_an_airspeed_that_steps_does_not_move_what_is_bounded() -> None:
             break
     state = navigator.state
     assert state.nominal is not None
-    found = solution.guaranteed(state, state.nominal.point)
+    found = bounded_trajectory.guaranteed(state, state.nominal.point)
     assert found is not None
     place = displace(*state.nominal.point.position, *(-e for e in found.restricted.error_n), 0.0)
     error = separation(place, recorded()[1](state.nominal.t_ns))
@@ -950,8 +951,8 @@ def test_rotors_move_an_aircraft_beside_its_nose_and_nothing_bounds_it(by: str) 
     navigator, _ = until(LOSS - 30.0)
     state = with_sensors(navigator.state, **{by: True})
     assert state.nominal is not None
-    assert solution.guaranteed(state, state.nominal.point) is None
-    assert solution.is_bound_due(state)
+    assert bounded_trajectory.guaranteed(state, state.nominal.point) is None
+    assert bounded_trajectory.is_bound_due(state)
 
 
 @pytest.mark.flight
