@@ -195,7 +195,7 @@ class SourceSwitch:
         self._wanted: int | None = None
         self._leading: int | None = None
         self._held: int | None = None
-        self._lack, self._lack_reported = "", ""
+        self._lack_reported = ""
         self._reported, self._reports = Selected(0), 0  # the last report of the script, how often in a row
         self._reason = ""
         self._tries = 0
@@ -235,10 +235,6 @@ class SourceSwitch:
 
     def note_armed(self, is_armed: bool) -> None:
         """Ignore whether it is armed: ArduPilot stores no source set."""
-
-    def note_lack(self, lack: str) -> None:
-        """Note why the autopilot cannot take our position; empty if it can."""
-        self._lack = lack
 
     def situation(self, now_ns: int) -> Situation:
         """Return the facts at `now_ns`."""
@@ -281,14 +277,17 @@ class SourceSwitch:
         """Return the parameters of the command that selects a source set."""
         return {"param1": number}
 
-    def update(self, now_ns: int) -> None:
-        """Decide by the table; call it at least once a second, with or without solutions."""
+    def update(self, now_ns: int, lack: str = "") -> None:
+        """Decide by the table; call it at least once a second, with or without solutions.
+
+        `lack`: why the autopilot cannot take our position, empty if it can.
+        """
         situation = self.situation(now_ns)
         decision = self.required(situation)
-        if decision is not None and decision[0] == COMPANION_SET and self._lack:
-            self._report_lack(now_ns)
+        if decision is not None and decision[0] == COMPANION_SET and lack:
+            self._report_lack(lack, now_ns)
             is_to_return = self.has_left_gnss and not is_held_false(situation)
-            decision = (GNSS_SET, self._lack) if is_to_return else None
+            decision = (GNSS_SET, lack) if is_to_return else None
         elif decision is not None:
             self._lack_reported = ""
         if decision is None:
@@ -382,10 +381,10 @@ class SourceSwitch:
         taken, self._events = self._events, []
         return taken
 
-    def _report_lack(self, now_ns: int) -> None:
-        if self._lack != self._lack_reported:
-            self._lack_reported = self._lack
-            text = f"{self.name(COMPANION_SET)} needed, but {self._lack}: run companion doctor"
+    def _report_lack(self, lack: str, now_ns: int) -> None:
+        if lack != self._lack_reported:
+            self._lack_reported = lack
+            text = f"{self.name(COMPANION_SET)} needed, but {lack}: run companion doctor"
             self._add_event(Severity.WARNING, text, now_ns)
 
     def _give_up(self, why: str, now_ns: int) -> None:

@@ -143,6 +143,7 @@ class Flight:
     def __init__(self, answer: int | None = ACCEPTED, sends_when_asked: bool = False) -> None:
         self.switch, self.now, self.answer = SourceSwitch(), 10**12, answer
         self.sends_when_asked = sends_when_asked
+        self.lack = ""
         self.requests: list[tuple[float, int, int]] = []
         self.asked: list[float] = []
         self.reports: list[tuple[float, str]] = []
@@ -172,7 +173,7 @@ class Flight:
                 found = solution_at(self.now, gnss_false=false, witness=witness)
                 self.switch.note_output(found, sent, self.now)
             if solved or k % 10 == 0:
-                self.switch.update(self.now)
+                self.switch.update(self.now, self.lack)
             for m in self.switch.to_send(7, self.now):
                 if m.command == mavlink.MAV_CMD_REQUEST_MESSAGE:
                     assert (m.target_system, m.param1) == (7, mavlink.MAVLINK_MSG_ID_GPS_RAW_INT)
@@ -214,13 +215,13 @@ def test_set_2_on_gnss_loss_and_set_1_on_its_return() -> None:
 def test_set_2_is_not_requested_while_it_has_no_position_of_ours() -> None:
     flight = Flight()
     flight.fly(30.0)
-    flight.switch.note_lack("EK3_SRC2_POSXY is 0")
+    flight.lack = "EK3_SRC2_POSXY is 0"
     flight.fly(60.0, fix=False)
     assert flight.sets == [1]
     assert [text for _, text in flight.reports[1:]] == [
         "EKF source set 2 needed, but EK3_SRC2_POSXY is 0: run companion doctor"
     ]
-    flight.switch.note_lack("")
+    flight.lack = ""
     flight.fly(10.0, fix=False)
     assert flight.sets == [1, 2]
 
@@ -233,7 +234,7 @@ def test_set_2_whose_lack_is_found_too_late_is_left_again(lie: bool) -> None:
     dark: dict[str, Any] = {"false": 1.0 - 1e-6} if lie else {"fix": False}
     flight.fly(30.0, **dark)
     assert flight.sets == [1, 2]
-    flight.switch.note_lack("EK3_SRC2_POSXY is 0")
+    flight.lack = "EK3_SRC2_POSXY is 0"
     flight.fly(60.0, **dark)
     assert flight.sets == ([1, 2] if lie else [1, 2, 1])
     assert [text for _, text in flight.reports[2:]] == [
