@@ -39,7 +39,7 @@ from companion.records import Severity
 from companion.storage.reader import LogError
 from companion.write_errors import make_folder, write_whole
 
-SUFFIXES = (".mcap", ".tlog", ".bin", ".ulg", ".log")
+SUFFIXES = (".mcap", ".tlog", ".bin", ".ulg", ".ulog", ".log")
 TABLE, PAGE, JOURNAL, REPORTS = "flights.parquet", "index.html", "logs.jsonl", "reports"
 
 

@@ -213,6 +213,7 @@ _READERS: dict[str, Callable[[Path], ForeignLog]] = {
     ".bin": dataflash.DataflashLog,
     ".log": dataflash.DataflashLog,
     ".ulg": ulog.UlogFile,
+    ".ulog": ulog.UlogFile,
     ".mat": inertialnav.read_matlab,
     ".zip": inertialnav.read_tables,
     "tables": inertialnav.read_tables,  # folders

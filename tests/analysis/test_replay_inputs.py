@@ -219,7 +219,7 @@ def test_keys_with_and_without_section() -> None:
         assert "--set" not in str(caught.value)
 
 
-@pytest.mark.parametrize("name", ["a.tlog", "a.bin", "a.log", "a.ulg", "a.mat", "a.zip", "a.mcap"])
+@pytest.mark.parametrize("name", ["a.tlog", "a.bin", "a.log", "a.ulg", "a.ulog", "a.mat", "a.zip", "a.mcap"])
 @pytest.mark.parametrize("content", [None, b"", b"something else " * 400])
 def test_unreadable_log_is_reported_in_one_sentence(
     tmp_path: pathlib.Path, name: str, content: bytes | None

@@ -374,7 +374,7 @@ def test_quote_in_a_topic_loses_at_most_its_line(quote: str, tmp_path: pathlib.P
     assert len(found) >= 19
 
 
-@pytest.mark.parametrize("name", ["x.ulg", "x.bin", "x.tlog", "x.mat", "x.zip", "x.mcap"])
+@pytest.mark.parametrize("name", ["x.ulg", "x.ulog", "x.bin", "x.tlog", "x.mat", "x.zip", "x.mcap"])
 def test_pipe_is_rejected_without_waiting_for_its_writer(name: str, tmp_path: pathlib.Path) -> None:
     os.mkfifo(tmp_path / name)
     with pytest.raises(LogError, match=f"{name}.*not a regular file"):
