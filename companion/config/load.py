@@ -178,7 +178,8 @@ def _line_of(error: Exception, text: str) -> str:
     quoted = f": `{line}`" if 0 < len(line) <= MAX_QUOTED else ""
     if re.match(r"Cannot (overwrite|declare|mutate)", str(error)):
         return f"{quoted}; a key or section is given twice: keep one"
-    return f"{quoted}; write text in quotes, and numbers with a decimal point" if quoted else ""
+    advice = "; write text in quotes, numbers with a decimal point, and a switch as true or false"
+    return f"{quoted}{advice}" if quoted else ""
 
 
 def _check_size(size: int, where: str) -> None:
@@ -197,8 +198,9 @@ def _check_keys(tree: Mapping[str, Mapping[str, Any]], where: str) -> None:
 
 
 def _did_you_mean(name: str, known: Iterable[str], cutoff: float = 0.5) -> str:
-    close = difflib.get_close_matches(name, list(known), 1, cutoff)
-    return f"; did you mean `{close[0]}`?" if close else ""
+    spelt = {word.lower(): word for word in known}
+    close = difflib.get_close_matches(name.lower(), list(spelt), 1, cutoff)
+    return f"; did you mean `{spelt[close[0]]}`?" if close else ""
 
 
 def _nearest(name: str, known: Iterable[str]) -> str:

@@ -110,6 +110,18 @@ def test_unknown_preset_names_the_nearest() -> None:
         load(preset="px5", environment={})
 
 
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        (["--preset", "px4", "--preset", "mems"], "--preset mems: --preset px4 is given too: leave one out"),
+        (["--config", "a.toml", "--config", "b.toml"], "--config b.toml: --config a.toml is given too"),
+    ],
+)
+def test_a_second_preset_or_file_is_rejected(options: list[str], expected: str) -> None:
+    done = CliRunner().invoke(cli, ["doctor", *options])
+    assert isinstance(done.exception, ConfigError) and expected in str(done.exception)
+
+
 def test_presets_of_a_stock_autopilot_never_take_its_position_for_an_ins() -> None:
     for name in ("stock-autopilot", "px4"):
         assert not load(preset=name, environment={}).has_own_ins
