@@ -62,8 +62,10 @@ class TlogPlayer:
             if 0 <= e.rx_ns - first_ns < (to_s - from_s) * 1e9 and e.frame.msgid not in ANSWERS
         ]
         if not self._schedule:
+            lasts_s = (entries[-1].rx_ns - entries[0].rx_ns) * 1e-9
             raise ValueError(
-                "no messages of the autopilot in this part of the log: choose another --from and --to"
+                f"no messages of the autopilot in this part of the log, which lasts {lasts_s:.0f} s: "
+                "choose another --from and --to"
             )
         self._known = {e.frame.msgid for e in ours}
         self._next = 0

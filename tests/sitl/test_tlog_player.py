@@ -51,6 +51,12 @@ def test_part_of_the_log_is_played() -> None:
     assert 0 <= played[0][0] < SECOND and 9 * SECOND < played[-1][0] < 10 * SECOND
 
 
+def test_a_part_beyond_the_log_is_rejected_with_its_length() -> None:
+    lasts_s = (ENTRIES[-1].rx_ns - ENTRIES[0].rx_ns) / SECOND
+    with pytest.raises(ValueError, match=f"this part of the log, which lasts {lasts_s:.0f} s: choose"):
+        TlogPlayer(ENTRIES, from_s=5000.0)
+
+
 def test_only_autopilot_frames_without_old_answers_are_played() -> None:
     """The log also holds frames of a ground station and answers to it."""
     played = [found for _, found in play_all(TlogPlayer(DRONEKIT))]
