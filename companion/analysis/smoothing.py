@@ -4,9 +4,9 @@ A smoother needs one Gaussian path, so the flight is filtered twice by the navig
 pass is the flight: the bank of hypotheses gives which sources were false and from when on, also where only
 the end of it shows it, when the wind jumped, and which grade of noise was right. Airspeed and GNSS velocity
 show how strong the gusts were and how long they lasted (`analysis.gusts`). The second pass runs a plain
-Kalman filter with that grade and those gusts: it leaves out what was false, widens the wind where it jumped,
-and takes for all other jumps a random walk of their variance. Every step of it is an epoch: at a measurement,
-or half a second after the last.
+Kalman filter with that grade and those gusts: it leaves out what was false or an outlier, takes every other
+fix, widens the wind where it jumped, and takes for all other jumps a random walk of their variance. Every
+step of it is an epoch: at a measurement, or half a second after the last.
 
 Backward pass: the recursion of Rauch, Tung and Striebel (1965), which does not need the (nonlinear)
 measurements. With Phi, Q from one epoch to the next, x_{k+1|k} the prediction before the measurement,
@@ -71,6 +71,7 @@ from companion.records import (
     LocalPosition,
     Output,
     RangeDifference,
+    Rejection,
     Reset,
     Resumed,
     RsbnFix,
@@ -160,11 +161,14 @@ class _Onset(NamedTuple):
 
 
 class _Folded(NamedTuple):
-    """A record that the navigator took up, at its own time, and of which run."""
+    """A record that the navigator took up, at its own time, of which run, and the sources in it that were
+    rejected.
+    """
 
     t_ns: int
     record: Input
     run: int
+    rejected: frozenset[str]
 
 
 class _Witness(Navigator):
@@ -188,12 +192,12 @@ class _Witness(Navigator):
             return []
         outputs = super().handle(record)
         if isinstance(record, Tuning):
-            self._note(record)
+            self._note(record, [])
         return outputs
 
     def _fold(self, record: Input) -> list[Output]:
         outputs = super()._fold(record)
-        self._note(record)
+        self._note(record, outputs)
         return outputs
 
     def _begin_roll_back(self) -> list[Output]:
@@ -209,11 +213,12 @@ class _Witness(Navigator):
     def _solved(self, state: State, record: Input) -> Step:
         return state, []
 
-    def _note(self, record: Input) -> None:
+    def _note(self, record: Input, outputs: list[Output]) -> None:
         state, t_ns = self._state, record.t_ns
         if state.bank is None and self._last[-1] is not None:
             self._last.append(None)
-        self.folded.append(_Folded(t_ns, record, len(self._last) - 1))
+        rejected = frozenset(o.source for o in outputs if isinstance(o, Rejection) and o.t_ns == t_ns)
+        self.folded.append(_Folded(t_ns, record, len(self._last) - 1, rejected))
         if state.bank is None:
             self._close(t_ns)
             self._onsets.clear()  # another bank has other faults
@@ -388,30 +393,35 @@ def _forward_pass(records: Iterable[Stamped], config: Config) -> _Path:
         witness.handle(record)
     witness.end()
     path, run = _Path(config, witness), -1
-    for t_ns, record, number in witness.folded:
-        if number != run:
-            run = number
+    for folded in witness.folded:
+        if folded.run != run:
+            run = folded.run
             path.begin(run)
-        path.jump(t_ns)
-        kept = _believed(record, witness)
+        path.jump(folded.t_ns)
+        kept = _believed(folded, witness)
         if kept is not None:
             path.follow(kept)
     path.end()
     return path
 
 
-def _believed(record: Input, witness: _Witness) -> Input | None:
-    """The record without what was false; None if nothing is left."""
+def _believed(folded: _Folded, witness: _Witness) -> Input | None:
+    """The record without what was false or rejected; None if nothing is left."""
+    record, rejected = folded.record, folded.rejected
+
+    def is_left_out(source: str, receiver: str = "") -> bool:
+        return source + receiver in rejected or witness.was_false(source, record.t_ns)
+
     if isinstance(record, Gnss):
-        if witness.was_false("gnss", record.t_ns):
+        receiver = f" {record.receiver}"
+        if is_left_out("gnss", receiver):
             return None
-        false = witness.was_false("velocity of gnss", record.t_ns)
-        return structs.replace(record, v_n=None) if false else record
+        return structs.replace(record, v_n=None) if is_left_out("velocity of gnss", receiver) else record
     if not isinstance(record, RsbnFix):
         return record
-    if witness.was_false(f"rsbn {record.beacon} azimuth", record.t_ns):
+    if is_left_out(f"rsbn {record.beacon} azimuth"):
         record = structs.replace(record, azimuth=None)
-    if witness.was_false(f"rsbn {record.beacon} range", record.t_ns):
+    if is_left_out(f"rsbn {record.beacon} range"):
         record = structs.replace(record, slant_range=None)
     return None if record.azimuth is None and record.slant_range is None else record
 

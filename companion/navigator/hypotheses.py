@@ -152,6 +152,7 @@ class Hypotheses(NamedTuple):
     layout: Layout
     settings: Settings
     biases: tuple[float, ...]  # one sigma of each bias state: azimuth (rad), range (m), time (s), by beacon
+    judged: bool = False  # no fix is an outlier: another bank has left out what was false
 
     def azimuth(self, k: int) -> int:
         """Source of beacon k's azimuth."""
@@ -197,7 +198,8 @@ class Model:
             found = _hypotheses(self.config, self.channel, now)
             if self.plain is not None:
                 layout = replace(found.layout, faults=(), jumps=())
-                found = found._replace(layout=layout, settings=replace(found.settings, switch_h=0.0))
+                settings = replace(found.settings, switch_h=0.0)
+                found = found._replace(layout=layout, settings=settings, judged=True)
             self._known[now] = found
         return self._known[now]
 

@@ -309,7 +309,8 @@ def _take(
     has_lie: bool = False,
 ) -> Taken:
     """Update by a measurement whose outliers are those of its `kind`; arguments as of `banks.update`."""
-    outlier = OUTLIER[kind]
+    is_judged = known.judged and source not in (None, AIRSPEED)
+    outlier = banks.NEVER if is_judged else OUTLIER[kind]
     after, seen = banks.update(
         bank, known.layout, z, H, R, source, known.settings, outlier=outlier, rare=RARE, has_lie=has_lie
     )
