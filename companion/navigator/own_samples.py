@@ -168,9 +168,14 @@ def imu(state: State, record: Imu, settings: Settings) -> Step:
     now = strapdown_channel.acceleration(strap)
     fresh = record.t_ns - s.imu_ns <= own_channel.SILENT_NS["imu"]
     before = s.accelerations[-2:] if fresh else ()
-    mean = strapdown_channel.mean_acceleration(s.mean_acceleration, now, (record.t_ns - s.imu_ns) * 1e-9)
+    dt = (record.t_ns - s.imu_ns) * 1e-9
     state = with_sensors(
-        state, strap=strap, imu_ns=record.t_ns, accelerations=(*before, now), mean_acceleration=mean
+        state,
+        strap=strap,
+        imu_ns=record.t_ns,
+        accelerations=(*before, now),
+        mean_acceleration=strapdown_channel.lasting(s.mean_acceleration, now, dt),
+        mean_force=strapdown_channel.lasting(s.mean_force, record.f_b, dt),
     )
     last = before[-1] if before else now
     between = (0.5 * (now[0] + last[0]), 0.5 * (now[1] + last[1]))
@@ -182,7 +187,8 @@ def _standing(state: State, record: Imu, settings: Settings) -> State:
     """Use that a parked aircraft stands, while GNSS is not received."""
     s, nominal = state.sensors, state.nominal
     height = 0.0 if nominal is None else nominal.point.position.alt
-    now = standing.follow(s.standing, record, s.landed, s.mean_acceleration, height, state.gnss_taken)
+    means = s.mean_acceleration, s.mean_force
+    now = standing.follow(s.standing, record, s.landed, *means, height, state.gnss_taken)
     if now != s.standing:
         state = with_sensors(state, standing=now)
     if state.bank is None or nominal is None or not now.is_due(record.t_ns):

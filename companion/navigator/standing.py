@@ -20,11 +20,13 @@ LANDED_NS, LEVEL_M = 10 * SECOND_NS, 3.0
 
 
 class Standing(NamedTuple):
-    """Since when nothing moves the IMU (None: it is moved, or may fly) and the height (m) then, whether a fix
-    has shown no speed since, or had before, whether it has flown since that, and the last measurement.
+    """Since when nothing moves the IMU (None: it is moved, or may fly), the specific force at which it stands
+    (m/s^2), the height then (m), whether a fix has shown no speed since, or had before, whether it has flown
+    since that, and the last measurement.
     """
 
     since_ns: int | None = None
+    force_b: Vector3 = (0.0, 0.0, 0.0)
     height: float = 0.0
     is_shown: bool = False
     was_shown: bool = False
@@ -42,9 +44,18 @@ class Standing(NamedTuple):
 
 
 def follow(
-    before: Standing, record: Imu, landed: bool, mean: Vector3, height: float, fix: Gnss | None
+    before: Standing,
+    record: Imu,
+    landed: bool,
+    acceleration_n: Vector3,
+    force_b: Vector3,
+    height: float,
+    fix: Gnss | None,
 ) -> Standing:
     """Return the standing after one more IMU sample.
+
+    The acceleration shows that nothing moves it; once it stands, the specific force. The attitude runs off by
+    five degrees where an autopilot without GNSS is fed positions that wander.
 
     Parameters
     ----------
@@ -52,21 +63,22 @@ def follow(
         What was returned for the last sample.
     landed
         Whether the autopilot states that it does not fly.
-    mean
-        Mean acceleration, north, east and down (m/s^2).
+    acceleration_n, force_b
+        Means of the last seconds: acceleration north, east and down, specific force in the body (m/s^2).
     height
         Pressure altitude, m.
     fix
         The last one of GNSS.
     """
-    if not landed or math.hypot(*mean[:2]) > STILL_M_S2 or max(map(abs, record.w_b)) > STILL_RAD_S:
-        is_carried = landed and before.has_landed(record.t_ns)
-        has_flown = not landed or (before.has_flown and not is_carried)
+    stands = before.is_shown or before.has_landed(record.t_ns)
+    pushed = math.dist(force_b, before.force_b) if stands else math.hypot(*acceleration_n[:2])
+    if not landed or pushed > STILL_M_S2 or max(map(abs, record.w_b)) > STILL_RAD_S:
+        has_flown = not landed or (before.has_flown and not stands)  # or it is carried off
         moved = before._replace(since_ns=None, is_shown=False, has_flown=has_flown)
         return before if moved == before else moved
-    now = before
+    now = before if stands else before._replace(force_b=force_b)
     if now.since_ns is None or (not now.is_shown and abs(height - now.height) > LEVEL_M):
-        now = before._replace(since_ns=record.t_ns, height=height)
+        now = now._replace(since_ns=record.t_ns, height=height)
     assert now.since_ns is not None
     if fix is None or fix.v_n is None or fix.t_ns < now.since_ns:
         return now

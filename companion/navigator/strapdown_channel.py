@@ -158,11 +158,11 @@ def drag_force(s: Strap, least: float = UPRIGHT) -> Vector2 | None:
     return (d * x - c * y) / upright, (a * y - b * x) / upright
 
 
-def mean_acceleration(mean: Vector3, a: Vector3, dt: float) -> Vector3:
-    """Mean acceleration of the last `MANOEUVRE_S` with one more sample: that of gusts averages out."""
+def lasting(mean: Vector3, a: Vector3, dt: float) -> Vector3:
+    """Mean of the last `MANOEUVRE_S` with one more sample: an acceleration by gusts averages out."""
     gain = min(dt / MANOEUVRE_S, 1.0)
-    n, e, d = mean
-    return n + gain * (a[0] - n), e + gain * (a[1] - e), d + gain * (a[2] - d)
+    x, y, z = mean
+    return x + gain * (a[0] - x), y + gain * (a[1] - y), z + gain * (a[2] - z)
 
 
 def manoeuvre(mean: Vector3) -> float:

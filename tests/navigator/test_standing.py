@@ -25,11 +25,14 @@ def fix(t_s: float, speed: float) -> Gnss:
     return Gnss(t_ns, t_ns, 0, t_ns // 1000, 3, 0.8, 0.1, 300.0, v_n=(speed, 0.0, 0.0))
 
 
+REST = (0.0, 0.0, -9.80665)
+
+
 def stood(*samples: tuple[float, bool, float, float, Gnss | None]) -> Standing:
     """The standing after these samples: time (s), landed, acceleration ahead, height, the last fix."""
     now = Standing()
     for t_s, landed, ahead, height, last in samples:
-        now = follow(now, imu(t_s), landed, (ahead, 0.0, 0.0), height, last)
+        now = follow(now, imu(t_s), landed, (ahead, 0.0, 0.0), (ahead, 0.0, REST[2]), height, last)
     return now
 
 
@@ -39,13 +42,20 @@ def test_it_stands_once_a_fix_has_shown_no_speed_since_it_is_still() -> None:
     shown = stood(still, (11.0, True, 0.0, 0.0, fix(10.5, 0.2)))
     assert shown.is_due(11 * NS)
     assert not shown._replace(measured_ns=11 * NS).is_due(11 * NS + EVERY_NS - 1)
-    assert follow(shown, imu(60.0), True, LEVEL, 0.0, fix(10.5, 0.2)) == shown  # GNSS is lost
+    assert follow(shown, imu(60.0), True, LEVEL, REST, 0.0, fix(10.5, 0.2)) == shown  # GNSS is lost
 
 
 @pytest.mark.parametrize("landed, w, ahead", [(False, 0.0, 0.0), (True, 0.1, 0.0), (True, 0.0, 1.0)])
 def test_what_may_fly_or_is_moved_does_not_stand(landed: bool, w: float, ahead: float) -> None:
-    moved = follow(Standing(0, is_shown=True), imu(1.0, w), landed, (ahead, 0.0, 0.0), 0.0, None)
+    still = Standing(0, REST, is_shown=True)
+    moved = follow(still, imu(1.0, w), landed, (ahead, 0.0, 0.0), (ahead, 0.0, REST[2]), 0.0, None)
     assert not moved.is_due(100 * NS)
+
+
+def test_an_attitude_that_runs_off_moves_nothing() -> None:
+    """Landed in ArduPlane's SITL on source set 2 the attitude runs off by five degrees."""
+    still = Standing(0, REST, is_shown=True)
+    assert follow(still, imu(1.0), True, (0.85, 0.0, 0.0), REST, 0.0, None) == still
 
 
 def test_on_a_ship_that_sails_it_does_not_stand() -> None:

@@ -359,14 +359,14 @@ def test_noise_of_a_manoeuvre_is_a_share_of_what_lasts_whatever_its_direction(
     """A pull counts as a turn does; what changes its sign every sample, as a gust, hardly counts."""
     steps = round(20.0 / dt)
     a = (load * math.cos(direction), 0.0, load * math.sin(direction))
-    lasting = gusts = STRAIGHT
+    turn = gusts = STRAIGHT
     for k in range(steps):
-        lasting = strapdown_channel.mean_acceleration(lasting, a, dt)
+        turn = strapdown_channel.lasting(turn, a, dt)
         sign = (-1.0) ** k
-        gusts = strapdown_channel.mean_acceleration(gusts, (sign * a[0], 0.0, sign * a[2]), dt)
+        gusts = strapdown_channel.lasting(gusts, (sign * a[0], 0.0, sign * a[2]), dt)
     above = max(load - strapdown_channel.MANOEUVRE_M_S2, 0.0)
     expected = (strapdown_channel.MANOEUVRE_SQRT_S * above) ** 2
-    found = strapdown_channel.velocity_variance((a, a, a), lasting, dt) / dt
+    found = strapdown_channel.velocity_variance((a, a, a), turn, dt) / dt
     assert found == pytest.approx(expected, rel=0.01, abs=1e-6)
     assert strapdown_channel.velocity_variance((a, a, a), gusts, dt) / dt <= 0.01 * expected + 1e-12
 
