@@ -78,7 +78,9 @@ def _reboot(state: State, record: Reboot, settings: Settings) -> Step:
     why = f"autopilot {record.system} rebooted"
     restarted = state.nominal is not None and record.t_ns < state.nominal.t_ns - SECOND_NS  # a log's clock
     if isinstance(settings.model.channel, OwnChannel) and not restarted:
-        state = structs.replace(state, sensors=Sensors(), gnss_fix=None, local=None)
+        # the scale in the bank is that of the steady airspeed it was estimated with
+        sensors = Sensors(steady_m_s=state.sensors.steady_m_s)
+        state = structs.replace(state, sensors=sensors, gnss_fix=None, local=None)
         return state, [Reset(record.t_ns, record.rx_ns, "sensors", why)]
     return State(next_ns=state.next_ns), [Reset(record.t_ns, record.rx_ns, "navigator", why)]
 

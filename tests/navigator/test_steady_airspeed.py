@@ -14,7 +14,7 @@ from msgspec.structs import replace
 from companion.analysis.smoothing import smooth_flight
 from companion.config import load
 from companion.nav.geometry import Geodetic, displace, separation
-from companion.navigator import Navigator
+from companion.navigator import Navigator, own_channel
 from companion.navigator.hypotheses import AIRSPEED
 from companion.navigator.own_error_model import (
     CRAB,
@@ -29,7 +29,18 @@ from companion.navigator.own_error_model import (
     add_velocity,
     begin,
 )
-from companion.records import AirData, AirspeedSensor, Attitude, Event, Gnss, Input, Solution, Source, Vehicle
+from companion.records import (
+    AirData,
+    AirspeedSensor,
+    Attitude,
+    Event,
+    Gnss,
+    Input,
+    Reboot,
+    Solution,
+    Source,
+    Vehicle,
+)
 from companion.study import outages
 from sitl.campaign.flight import SCENARIOS, config_of, sensors_of
 from sitl.flight import FlightPlan, Leg, WindChange
@@ -186,6 +197,25 @@ def test_a_pitot_that_the_autopilot_takes_again_without_gnss_is_reported_again()
         "airspeed is not used: it stands still at 12 m/s",
         "switch the airspeed sensor off: ARSPD_USE 0",
     ]
+
+
+@pytest.mark.flight
+def test_an_autopilot_that_restarts_in_flight_leaves_the_steady_airspeed_as_it_was() -> None:
+    """It was the speed over ground then, with the scale of the one before: a healthy GNSS was doubted."""
+    records = [r for r in stated(fixed_wing=True, flying=True) if not 200 < r.t_ns / NS < 204]
+    records += [Reboot(204 * NS, 204 * NS, 1), Vehicle(205 * NS, 205 * NS, fixed_wing=True, flying=True)]
+    navigator, found, before = Navigator(CONFIG), list[float](), None
+    for record in sorted(records, key=lambda record: record.rx_ns):
+        if record.rx_ns > 260 * NS:
+            break
+        navigator.handle(record)
+        if isinstance(record, Reboot):
+            before = navigator.state.sensors.steady_m_s
+        found.append(max(navigator.state.false, default=0.0))
+    after = navigator.state.sensors
+    assert own_channel.is_steady(after, record.t_ns)
+    assert before is not None and after.steady_m_s == before
+    assert max(found) < 0.5
 
 
 def test_a_sensor_that_the_autopilot_does_not_use_is_replaced() -> None:
