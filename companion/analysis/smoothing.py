@@ -59,6 +59,7 @@ from companion.navigator.hypotheses import (
     Model,
 )
 from companion.navigator.inertial_track import Point
+from companion.navigator.measurements import receiver_states
 from companion.navigator.progress import driver
 from companion.navigator.state import Beacon, Settings, State, Step, hypotheses, levelled, source_name
 from companion.navigator.step import step
@@ -494,6 +495,11 @@ class _Path:
         config = self._with_gusts(parse(record.toml, "parameters in the log"))
         self._settings, state = tuned(self._state, before, config)
         grade, is_wider = self._model.grade, self._settings.model.channel.n != before.model.channel.n
+        if self._state.bank is not None and config.gnss.latency_s != before.config.gnss.latency_s:
+            keep, variance = np.ones(len(self._Q)), np.zeros(len(self._Q))
+            self._forget_receiver(keep, variance)
+            self._Phi = keep[:, None] * self._Phi
+            self._Q = self._Q * np.outer(keep, keep) + np.diag(variance)
         again = begins_again(before.config, config)
         if again or is_wider:
             self.end()
@@ -546,22 +552,28 @@ class _Path:
             A, B = A[:n, :n], B[int(state.bank.grade[0]), :n, :n]
             Phi, Q, point, predicted = A @ Phi, A @ Q @ A.T + B, reached, A @ predicted
         measured = True
-        if isinstance(record, RsbnFix) and (forget := self._renewed(before, n)) is not None:
-            keep, variance = forget
-            predicted, Phi, Q = keep * predicted, keep[:, None] * Phi, Q * np.outer(keep, keep)
-            Q = Q + np.diag(variance)
+        keep, variance = self._renewed(before, n)
+        predicted, Phi = keep * predicted, keep[:, None] * Phi
+        Q = Q * np.outer(keep, keep) + np.diag(variance)
+        is_widened = isinstance(record, TimeStep) or any(isinstance(output, Reset) for output in outputs)
+        opened = np.zeros(n)
         if isinstance(record, Gnss | RsbnFix):
             # the fix may have moved the nominal trajectory, and its error with it
             predicted = predicted + np.pad(_moved(point, state.nominal.point), (0, n - 4))
+            if is_widened:  # behind the measurement: what comes after shows nothing of the position before
+                ahead = Phi @ before.bank.P[0, :n, :n] @ Phi.T + Q
+                opened[:2] = (P - ahead).diagonal()[:2]
         elif not self._measures(before, record):
             measured, predicted = False, x
-            if isinstance(record, TimeStep) or any(isinstance(output, Reset) for output in outputs):
-                # widened; perhaps, if the INS jumped
+            if is_widened:  # perhaps, if the INS jumped
                 P_before = before.bank.P[0, :n, :n]
                 Q = P - Phi @ P_before @ Phi.T
         self._Phi, self._Q = Phi @ self._Phi, Phi @ self._Q @ Phi.T + Q
         if measured or self._model.asked:
-            self._append(state.nominal.point, x, P, predicted, isinstance(record, Gnss | RsbnFix))
+            self._append(
+                state.nominal.point, x, P - np.diag(opened), predicted, isinstance(record, Gnss | RsbnFix)
+            )
+            self._Q += np.diag(opened)
 
     def _measures(self, before: State, record: Input) -> bool:
         """Whether a record besides the fixes may have been a measurement: not if it changes the driver."""
@@ -572,17 +584,25 @@ class _Path:
         own_position = isinstance(record, LocalPosition) and not self._settings.config.has_own_ins
         return own_position or isinstance(record, MEASURING)
 
-    def _renewed(self, before: State, n: int) -> tuple[Floats, Floats] | None:
-        """Zeros (n,) for states forgotten by a beacon that moved or took the place of another, and ones; and
-        new variances (n,).
+    def _renewed(self, before: State, n: int) -> tuple[Floats, Floats]:
+        """Zeros (n,) for states forgotten by a beacon that moved or took the place of another, and by another
+        receiver; ones for the others; and new variances (n,).
         """
         keep, variance = np.ones(n), np.zeros(n)
-        known = hypotheses(self._state, self._settings)
-        for k, (a, b) in enumerate(zip(before.beacons, self._state.beacons, strict=True)):
+        known, state = hypotheses(self._state, self._settings), self._state
+        for k, (a, b) in enumerate(zip(before.beacons, state.beacons, strict=True)):
             if (a.identity, a.place) != (b.identity, b.place):
                 at = slice(known.bias(k), known.bias(k + 1))
                 keep[at], variance[at] = 0.0, np.square(known.biases[BIASES * k : BIASES * (k + 1)])
-        return None if keep.all() else (keep, variance)
+        last, now = before.gnss_taken, state.gnss_taken
+        if last is not None and now is not None and last.receiver != now.receiver:
+            self._forget_receiver(keep, variance)
+        return keep, variance
+
+    def _forget_receiver(self, keep: Floats, variance: Floats) -> None:
+        channel = self._settings.model.channel
+        at = receiver_states(channel)
+        keep[at], variance[at] = 0.0, channel.prior()[0].diagonal()[at]
 
     def _other_airspeed(self, before: State) -> Renewal | None:
         """What began again because the velocity through the air is taken from something else now."""
@@ -679,4 +699,5 @@ def _equivalent_measurement(
     H = np.linalg.lstsq(P / np.outer(scale, scale), L, rcond=None)[0].T
     nu = np.linalg.lstsq(L, (x_after - x) / scale, rcond=None)[0]
     H = H / scale
-    return H, np.eye(len(H)) - H @ P @ H.T, nu + H @ x
+    R = np.eye(len(H)) - H @ P @ H.T
+    return H, 0.5 * (R + R.T), nu + H @ x

@@ -105,11 +105,16 @@ def gnss_position(
 
 
 def other_receiver(bank: Bank, channel: Channel) -> Bank:
-    """Forget drift, lasting velocity error, latency and lever arm: the next fix is another receiver's."""
+    """Forget `receiver_states`: the next fix is another receiver's."""
+    states = receiver_states(channel)
+    return banks.renew(bank, states, np.sqrt(channel.prior()[0].diagonal()[states]).tolist())
+
+
+def receiver_states(channel: Channel) -> list[int]:
+    """Drift, lasting velocity error, latency and lever arm of a receiver."""
     base = range(channel.n)
     arm = [] if channel.arm is None else [channel.arm]
-    states = [*base[channel.drift], *base[channel.doppler], channel.latency, *arm]
-    return banks.renew(bank, states, np.sqrt(channel.prior()[0].diagonal()[states]).tolist())
+    return [*base[channel.drift], *base[channel.doppler], channel.latency, *arm]
 
 
 def gnss_apart(record: Gnss, nominal: Point) -> Vector2:

@@ -388,6 +388,45 @@ def test_a_step_of_time_widens_the_position_in_both_directions() -> None:
     assert wider.max() > 1.05 and wider.min() > 0.999
 
 
+def fixed_wing(until_s: float) -> list[Any]:
+    """A recorded fixed wing, whose first fix is at 9 s."""
+    return [record for record in recording("umn_flight") if record.rx_ns < until_s * NS]
+
+
+FIXED_WING = load(flags={"output.profile": "ardupilot"}, environment={})
+
+
+@pytest.mark.flight
+def test_another_receiver_is_the_two_point_solution_too() -> None:
+    """What was learnt of the first one, its drift and its latency, says nothing about the second."""
+    records = []
+    for record in fixed_wing(150.0):
+        if isinstance(record, Gnss) and record.t_ns > 100 * NS:
+            records.append(msgspec.structs.replace(record, fix=1, v_n=None))
+            record = msgspec.structs.replace(record, receiver=1)
+        records.append(record)
+    (found,) = smooth_flight(records, FIXED_WING, check=True)
+    assert found.apart_sigma < 1e-6
+
+
+@pytest.mark.flight
+def test_a_position_that_is_restarted_leaves_the_track_before_it_alone() -> None:
+    """The first fixes are 30 km off. It was drawn to where the others are, 25 km off with 5 m of sigma."""
+    first_ns = min(r.t_ns for r in fixed_wing(60.0) if isinstance(r, Gnss) and r.has_3d_fix)
+    records = []
+    for record in fixed_wing(60.0):
+        if isinstance(record, Gnss) and record.has_3d_fix and record.t_ns < first_ns + 15 * NS:
+            place = displace(record.lat, record.lon, record.alt_msl, 30e3, 0.0, 0.0)
+            record = msgspec.structs.replace(record, lat=place.lat)
+        records.append(record)
+    (found,) = smooth_flight(records, FIXED_WING, check=True)
+    restarted = int(np.argmax(np.linalg.norm(found.x[:, :2], axis=1) > 10e3))
+    moved = np.linalg.norm((found.x - found.x_filter)[:restarted, :2], axis=1)
+    assert found.t_ns[restarted - 1] - first_ns > 29 * NS
+    assert (moved < 3.0 * np.sqrt(found.P_filter[:restarted, 0, 0])).all()
+    assert found.apart_sigma < 1e-2
+
+
 @pytest.mark.parametrize("lon", [math.radians(149.0), math.pi - 1e-6])
 def test_a_correction_of_the_channel_is_the_same_across_the_antimeridian(lon: float) -> None:
     """Without the wrap the smoothed track was 60 m off there, and not that of the two-point problem."""
