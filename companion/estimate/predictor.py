@@ -421,7 +421,9 @@ class Anchored(NamedTuple):
     """Program of a window, on the state at its last fix, and what carries targets there.
 
     Estimates are sought among those that weigh neighbouring fixes alike, on `grouped`: a sixth of the fixes,
-    a hundredth of the work. Their errors are computed on `program`, where they are exact.
+    a hundredth of the work. Their errors are computed on `program`, where they are exact: there a force in
+    the interval of a fix counts too, from the fix on. Sought with it, a force that is constant over a group
+    would be told from the means of the fixes.
 
     Attributes
     ----------
@@ -431,7 +433,7 @@ class Anchored(NamedTuple):
     grouped : Program
         The same with means of fixes, and with a force that is constant over longer intervals.
     fixes, inputs : (n, k), (p, l)
-        The groups, as in `Program.grouped`.
+        Groups of the fixes, as in `Program.grouped`; of the inputs those of the states alone.
     node, t_s : int, float
         Node and time of the last fix.
     back : (m, m)
@@ -560,45 +562,84 @@ def anchor(window: Window, law: Law) -> Anchored:
     """
     if not window.fixes:
         raise ValueError("the window has no fixes; give one or more")
-    last, first = window.fixes[-1].node, window.fixes[0].node
+    first, last = window.fixes[0].node, window.fixes[-1].node
     back = _solve(window.C[last], np.eye(law.n))
+    ends = np.array([window.t_s[f.node] for f in window.fixes])
+    begins = np.array([window.t_s[max(f.node - 1, 0)] for f in window.fixes])
+    taken = np.array([f.t_s for f in window.fixes])
+    noise = _noise(window, law)
+    program = _program(window, law, back, taken.clip(begins, ends), noise)
+    each = [len(f.values) for f in window.fixes]
+    fixes = _groups(np.repeat(_by_age(window.t_s[last] - taken), each) * 512 + _kinds(window))
+    fixes /= program.sigmas[:, None] ** 2
+    fixes /= fixes.sum(axis=0)
+    held = np.arange(law.n - law.free)
+    force = np.repeat(_by_age(window.t_s[last] - np.array(window.t_s[first + 1 : last + 1])), 2) * 2
+    force += np.arange(len(force)) % 2
+    alike = _groups(np.concatenate([force, force.max(initial=0) + 1 + held]))
+    grouped = _program(window, law, back, ends, noise).grouped(fixes, alike)
+    inputs = np.zeros((len(program.bounds), alike.shape[1]))  # no force before the anchor is in a target
+    inputs[len(inputs) - len(held) :] = alike[len(force) :]
+    return Anchored(program, grouped, fixes, inputs, last, window.t_s[last], back, law)
+
+
+def _program(window: Window, law: Law, back: Floats, seen_s: Floats, noise: Floats) -> Program:
+    """The program whose fixes show the state at the times `seen_s`, the unknown force constant in between."""
+    first, last, free, n = window.fixes[0].node, window.fixes[-1].node, law.free, law.n
     rows = np.concatenate([f.rows for f in window.fixes]) @ back
     each = [len(f.values) for f in window.fixes]
-    node = np.repeat([f.node for f in window.fixes], each)
+    seen = np.repeat(seen_s, each)
     values = np.concatenate([f.values for f in window.fixes])
     sigmas = np.concatenate([f.sigmas for f in window.fixes])
-    steps = np.arange(first + 1, last + 1)
-    free, n = law.free, law.n
-    states = rows[:, free:]
-    effect = np.concatenate([window.C[last] @ window.S[i] for i in steps] or [np.zeros((n, 0))], axis=1)
-    G = -rows @ effect
-    G[node[:, None] >= np.repeat(steps, 2)] = 0.0  # a force before the fix is in the state that it measures
-    edges = np.array(window.t_s[first : last + 1])
-    age = 0.5 * (edges[1:] + edges[:-1]) - window.t_s[last]
+    silent = {*range(first, last)} - {f.node for f in window.fixes}
+    cuts = np.array(sorted({*seen_s.tolist(), *(window.t_s[i] for i in (*silent, last))}))
+    effect = np.diff(_effect_until(window, cuts), axis=0)
+    G = -rows @ np.concatenate([window.C[last] @ one for one in effect] or [np.zeros((n, 0))], axis=1)
+    G[seen[:, None] > np.repeat(cuts[:-1], 2)] = (
+        0.0  # a force before the fix is in the state that it measures
+    )
+    age = 0.5 * (cuts[1:] + cuts[:-1]) - window.t_s[last]
     d, F = np.repeat(law.bound(age), 2), np.kron(law.covariance(age), np.eye(2))
-    inputs = np.concatenate([G, states], axis=1)
+    inputs = np.concatenate([G, rows[:, free:]], axis=1)
     sigma = window.sigma[last][free:]
     U = np.zeros((len(d) + n - free,) * 2)
     U[: len(d), : len(d)] = F
     at = np.arange(len(d), len(U))
     U[at, at] = sigma**2
-    t = np.repeat([f.t_s for f in window.fixes], each)
-    component = np.concatenate([np.arange(k) for k in each])
-    size = np.rint(np.log(sigmas / sigmas.min()) / math.log(UNLIKE)).astype(np.intp).clip(0, 63)
-    kind = component * 64 + size  # fixes as unlike as that are of different sources
+    return Program(rows[:, :free], values, sigmas, inputs, np.concatenate([d, sigma]), U, noise)
+
+
+def _noise(window: Window, law: Law) -> Floats:
+    """Covariance of the fixes' errors."""
+    each = [len(f.values) for f in window.fixes]
+    t, kind = np.repeat([f.t_s for f in window.fixes], each), _kinds(window)
     decay = np.exp(-np.abs(t[:, None] - t) / max(law.correlation_s, 1e-3))
     noise = np.where(kind[:, None] == kind, (1.0 - WHITE) * decay, 0.0) + WHITE * np.eye(len(t))
+    sigmas = np.concatenate([f.sigmas for f in window.fixes])
     noise *= sigmas[:, None] * sigmas
-    program = Program(rows[:, :free], values, sigmas, inputs, np.concatenate([d, sigma]), U, noise)
-    age = window.t_s[last] - t
-    fixes = _groups(_by_age(age) * 512 + kind) / sigmas[:, None] ** 2
-    fixes /= fixes.sum(axis=0)
-    held = np.arange(n - free)
-    force = np.repeat(_by_age(window.t_s[last] - np.array(window.t_s[first + 1 : last + 1])), 2) * 2
-    force += np.arange(len(force)) % 2
-    alike = _groups(np.concatenate([force, force.max(initial=0) + 1 + held]))
-    grouped = program.grouped(fixes, alike)
-    return Anchored(program, grouped, fixes, alike, last, window.t_s[last], back, law)
+    return noise
+
+
+def _effect_until(window: Window, t_s: Floats) -> Floats:
+    """Effect (k, m, 2) of a unit input from the first node to some times (k,), carried to the epoch."""
+    S = np.array(window.S)
+    S[0] = 0.0
+    S, nodes = np.cumsum(S, axis=0), np.array(window.t_s)
+    if len(nodes) < 2:
+        return np.zeros((len(t_s), *S.shape[1:]))
+    k = np.searchsorted(nodes, t_s).clip(1, len(nodes) - 1)
+    share = ((t_s - nodes[k - 1]) / (nodes[k] - nodes[k - 1]))[:, None, None]
+    until: Floats = S[k - 1] + share * (S[k] - S[k - 1])
+    return until
+
+
+def _kinds(window: Window) -> npt.NDArray[np.intp]:
+    """Number of the component and the size of each fix: those as unlike are of different sources."""
+    sigmas = np.concatenate([f.sigmas for f in window.fixes])
+    component = np.concatenate([np.arange(len(f.values)) for f in window.fixes])
+    size = np.rint(np.log(sigmas / sigmas.min()) / math.log(UNLIKE)).astype(np.intp).clip(0, 63)
+    kind: npt.NDArray[np.intp] = component * 64 + size
+    return kind
 
 
 def _by_age(age_s: Floats) -> npt.NDArray[np.intp]:

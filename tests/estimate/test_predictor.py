@@ -233,6 +233,30 @@ def test_dead_reckoning_has_its_own_law() -> None:
     assert wander < bound < 2.0 * wander
 
 
+@pytest.mark.parametrize("before_s", [6.0, 1.0])
+def test_what_comes_up_between_a_fix_and_the_end_of_its_interval_counts(before_s: float) -> None:
+    """A velocity error that wanders, integrated by the estimate's own weights on the fixes.
+
+    The bound of an airspeed channel was a quarter below what is attained.
+    """
+    law, at_rest = BoundedDrift(8.0, 0.1, wander=0.7, wander_s=20.0, correlation_s=5.0), (0.0, 0.0)
+    window, times, end = Window.begin(0.0, law), np.arange(10.0, 310.0, 10.0) - before_s, 300.0
+    position = np.eye(law.n)[:2]
+    position[:, 2:4] = -before_s * np.eye(2)
+    for t in times:
+        window = window.extend(t + before_s, *law.step(Motion(0.8, at_rest, at_rest, 10.0)))
+        window = window.with_fix(t, position @ window.C[-1], np.zeros(2), np.full(2, 2.0), 3600.0)
+    anchored = anchor(window, law)
+    solved = anchored.solve(anchored.targets(window, (0,))[0])
+    s = np.arange(times[0], end, 0.05) + 0.025
+    for found in solved[:3]:
+        north = found.weights[::2]
+        left = np.array([north[times <= at].sum() for at in s])
+        constant = abs(north @ (end - times)) * window.sigma[-1][2]
+        worst = np.abs(north).sum() * 2.0 + np.abs(left) @ law.bound(s - end) * 0.05 + constant
+        assert worst * (1.0 - 1e-3) < found.bound < 1.01 * worst
+
+
 def test_without_fixes_there_is_nothing_to_predict() -> None:
     law = BoundedIns(NAVIGATION)
     with pytest.raises(ValueError, match="no fixes"):
