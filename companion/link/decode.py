@@ -136,8 +136,8 @@ class Sender(NamedTuple):
 
     clock: Clock
     autopilot: Autopilot = "other"
-    sigma_azimuth: float = math.radians(0.25)
-    sigma_range: float = 200.0
+    sigma_azimuth: float = math.radians(0.125)
+    sigma_range: float = 100.0
 
 
 _Decoder: TypeAlias = Callable[[Message, int, Sender], tuple[Stamped, ...]]

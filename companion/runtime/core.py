@@ -74,7 +74,7 @@ from companion.records import (
 from companion.runtime.ground_station_services import STATUS, GroundStationServices, feed_periods_ns
 from companion.runtime.input_monitor import InputMonitor
 from companion.runtime.kept_run import Flown
-from companion.runtime.links import Link, requested_rates
+from companion.runtime.links import Link
 from companion.runtime.origin import OriginCheck
 from companion.runtime.parameter_check import ParameterCheck
 from companion.runtime.status import Status
@@ -402,7 +402,7 @@ class CompanionCore:
                 config = self._config = changes[-1].config
                 self._output.tune(config)
                 for each in self.links.values():
-                    each.session.set_rates(requested_rates(config), event.received_ns)
+                    each.tune(config, event.received_ns)
                 self._on_record(Tuning(event.received_ns, event.received_ns, to_toml(config)))
         is_duplicate = self._is_duplicate(link) and msgid not in MEASUREMENTS
         if msgid in ABOUT_SOURCE_SET and link.session.is_up and not (event.from_autopilot and is_duplicate):

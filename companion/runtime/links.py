@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 
 from companion.config import Config
@@ -29,6 +30,7 @@ class Link:
         self.name = name
         self.session = open_session(config, signing, number)
         self.sender = Sender(self.session.clock)
+        self._state_sigmas(config)
         self.pace = Pace()  # of what was asked for on this link
         self.is_open = True  # cleared by the service while the address cannot be opened
         self.has_bytes = False  # anything was received, MAVLink or not
@@ -41,6 +43,16 @@ class Link:
         self.firmware: Firmware | None = None
         self.firmware_requests = 0
         self._euler_ns: int | None = None  # when ATTITUDE was last received
+
+    def tune(self, config: Config, now_ns: int) -> None:
+        """Go on with another configuration."""
+        self.session.set_rates(requested_rates(config), now_ns)
+        self._state_sigmas(config)
+
+    def _state_sigmas(self, config: Config) -> None:
+        """State the sigmas of beacon answers that have none."""
+        sigma_azimuth, sigma_range = math.radians(config.rsbn.sigma_azimuth_deg), config.rsbn.sigma_range_m
+        self.sender = self.sender._replace(sigma_azimuth=sigma_azimuth, sigma_range=sigma_range)
 
     def repeats_attitude(self, msgid: int, now_ns: int) -> bool:
         """Whether this is ATTITUDE_QUATERNION beside ATTITUDE: PX4 sends both, at 50 Hz."""

@@ -480,6 +480,27 @@ def test_garbage_and_unknown_messages_are_counted_and_navigation_continues() -> 
     assert len(flight.log.of(Solution)) >= solutions + 14
 
 
+def test_an_answer_without_sigmas_has_those_configured() -> None:
+    """Also once a ground station has set them."""
+    flight = Flight(
+        config=load(environment={}, pairs=("rsbn.sigma_azimuth_deg=0.05", "rsbn.sigma_range_m=30"))
+    )
+
+    def sigmas() -> tuple[float, float]:
+        flight.fly(1.0)
+        flight.rsbn(sigma_azimuth=math.nan, sigma_range=math.nan)
+        (*_, fix) = flight.log.of(RsbnFix)
+        return math.degrees(fix.sigma_azimuth), fix.sigma_range
+
+    assert sigmas() == pytest.approx((0.05, 30.0))
+    values = {"RSBN_AZIMUTH_DEG": 0.5, "RSBN_RANGE_M": 300.0}
+    for name, value in values.items():
+        flight.send(
+            "PARAM_SET", system=255, component=190, **OURS, param_id=name, param_value=value, param_type=9
+        )
+    assert sigmas() == pytest.approx((0.5, 300.0))
+
+
 @pytest.mark.parametrize("name", ["LOCAL_POSITION_NED", "RSBN_MEASUREMENT", "GPS_RAW_INT"])
 def test_non_finite_fields_cause_one_rejection(name: str) -> None:
     flight = Flight()
