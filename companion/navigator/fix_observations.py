@@ -97,17 +97,23 @@ def from_rsbn(record: RsbnFix, ins: Point, settings: RsbnConfig) -> tuple[Azimut
     axes = enu_axes(here.lat, here.lon)
     place = _times(axes, (x - x_0, y - y_0, z - z_0))
     displaced = displaced_sigma(math.hypot(*ins.v_n[:2]))
+    sigma_azimuth, sigma_range = beacon_sigmas(record, settings)
     observations: list[Azimuth | Range] = []
     if record.azimuth is not None:
-        sigma = max(record.sigma_azimuth, math.radians(settings.sigma_azimuth_deg))
-        sigma = math.hypot(sigma, displaced / max(math.hypot(*place), 1.0))
+        sigma = math.hypot(sigma_azimuth, displaced / max(math.hypot(*place), 1.0))
         turned = tuple([_times(axes, axis) for axis in axes_beacon])  # C_e^b C_enu^e, row by row
         observations.append(Azimuth(place, record.azimuth, sigma, turned))
     if record.slant_range is not None:
-        floor = settings.sigma_range_m + 0.01 * settings.sigma_range_percent * record.slant_range
-        sigma = math.hypot(max(record.sigma_range, floor), displaced)
+        sigma = math.hypot(sigma_range, displaced)
         observations.append(Range(place, record.slant_range, sigma))
     return tuple(observations)
+
+
+def beacon_sigmas(record: RsbnFix, settings: RsbnConfig) -> tuple[float, float]:
+    """Standard deviations of azimuth (rad) and slant range (m): as stated, but not below the floors."""
+    share = 0.01 * settings.sigma_range_percent * (record.slant_range or 0.0)
+    least_azimuth, least_range = math.radians(settings.sigma_azimuth_deg), settings.sigma_range_m + share
+    return max(record.sigma_azimuth, least_azimuth), max(record.sigma_range, least_range)
 
 
 def displaced_sigma(speed: float) -> float:

@@ -10,9 +10,12 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Collection
 
+from msgspec import structs
+
 from companion.config import Config
 from companion.config.profiles import MESSAGES, PROFILES, RESET
 from companion.link.dialect import Message, mavlink
+from companion.navigator.fix_observations import beacon_sigmas
 from companion.navigator.receiver_choice import ReceiverChoice
 from companion.output.encode import CannotEncode, Receiver, encode
 from companion.output.gate import (
@@ -87,7 +90,10 @@ class AutopilotOutput:
         elif isinstance(record, GlobalPosition | FilterStatus):
             self._position_reset.receive(record)
         elif isinstance(record, RsbnFix):
-            self._source_switch.receive(record)
+            sigma_azimuth, sigma_range = beacon_sigmas(record, self.config.rsbn)
+            self._source_switch.receive(
+                structs.replace(record, sigma_azimuth=sigma_azimuth, sigma_range=sigma_range)
+            )
 
     def handle_reboot(self) -> None:
         """Reset what was known of the autopilot; it has rebooted."""

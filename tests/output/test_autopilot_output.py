@@ -440,6 +440,32 @@ def test_source_set_is_the_pilots_where_none_carries_our_position(via: str) -> N
     assert flight.source_set == 3
 
 
+@pytest.mark.parametrize("pull", [0.0, 5.0])
+def test_answers_that_claim_too_small_a_sigma_do_not_contradict_gnss(pull: float) -> None:
+    """The floors of [rsbn] hold for the beacon's own word too; one that contradicts GNSS is still heard."""
+    output, rng = AutopilotOutput(configured("output.profile=ardupilot")), np.random.default_rng(1)
+    origin = LocalOrigin(START, START, ORIGIN.lat, ORIGIN.lon, ORIGIN.alt, "ardupilot")
+    receiver, sets = Receiver("ardupilot", 1, origin), list[float]()
+    for second in range(180):
+        now, is_doubted = START + second * SECOND, second >= 60
+        place = displace(*ORIGIN, 0.0, SPEED * second, -HEIGHT)
+        seen = displace(*place, pull * max(0, second - 60), 0.0, 0.0)
+        output.receive(Gnss(now, now, 0, now // 1000, 3, *seen, v_n=(0.0, SPEED, 0.0)))
+        true = slant_range_azimuth(BEACON, place)
+        azimuth = true.azimuth + math.radians(0.125) * rng.standard_normal()
+        away = true.slant_range + 100.0 * rng.standard_normal()
+        output.receive(RsbnFix(now, now, 1, *BEACON, azimuth, away, math.radians(0.01), 10.0))
+        for tick in range(10):
+            at = {"lat": place.lat, "lon": place.lon, "alt_msl": place.alt, "v_n": (0.0, SPEED, 0.0)}
+            false = 0.9995 if is_doubted else 0.0
+            solution = solution_at(now + tick * SECOND // 10, gnss_false=false, witness=is_doubted, **at)
+            output.messages(solution, ["ODOMETRY"], receiver)
+            for command in output.poll(receiver, solution.rx_ns):
+                sets.append(command.param1)
+                output.handle_acknowledgement(command.command, 0, solution.rx_ns)
+    assert sets == ([1.0, 2.0] if pull else [1.0])
+
+
 def test_beacon_before_the_first_gnss_fix() -> None:
     flight = Flight(configured("output.profile=ardupilot"))
     flight.gnss = False
