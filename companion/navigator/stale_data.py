@@ -52,6 +52,7 @@ REMEMBERED: dict[type[Stamped], int] = {RsbnFix: 8, Pressure: 32}
 #: autopilot's times is adjusted in between.
 SAME_ANSWER_NS, SAME_NS = 50_000_000, 5_000_000
 REPORT_EVERY = SECOND_NS
+MOST_SOURCES = 256  # remembered; a receiver in error, or a stranger, may name 65536 beacons
 
 
 class Run(NamedTuple):
@@ -136,6 +137,8 @@ class StaleDataDetector:
                 self._runs.clear()
             return None
         source, content = law.source(record), law.content(record)
+        if source not in self._runs:
+            self._make_room()
         if type(record) in REMEMBERED and self._came(source, record, content):
             return []
         stamp, same = (record.stamp_us, 0) if isinstance(record, Gnss) else (record.t_ns, SAME_NS)
@@ -165,6 +168,12 @@ class StaleDataDetector:
             return True
         known.append((t_ns, content))
         return False
+
+    def _make_room(self) -> None:
+        """Forget the source that brought nothing new for the longest, if there are too many."""
+        if len(self._runs) >= MOST_SOURCES:
+            del self._runs[min(self._runs, key=lambda source: self._runs[source].stamped_ns)]
+            self._answers = {source: known for source, known in self._answers.items() if source in self._runs}
 
     def _rejection(self, record: Stamped, source: str, run: Run, lasted_s: float, why: str) -> list[Output]:
         if run.reported_ns is not None and record.rx_ns - run.reported_ns < REPORT_EVERY:

@@ -25,6 +25,7 @@ SIGMAS = 3.0
 LEAST = 10  # fixes in the window
 MOST = 300  # fixes that the earlier mean remembers
 APART_S = 1.0  # a GNSS fix further from the beacon's time predicts nothing
+MOST_TRACKS = 128  # two of each beacon
 FIXES, FIXES_APART_NS = 128, SECOND_NS // 10  # kept for answers that arrive late: 13 s or more
 
 
@@ -107,5 +108,17 @@ class BeaconWitness:
         return any(r.last_ns >= since_ns and r.significance > SIGMAS for r in self._residuals.values())
 
     def _add(self, record: RsbnFix, component: str, residual: float, is_believed: bool) -> None:
-        track = self._residuals.setdefault((record.beacon, component), Residuals())
-        track.add(record.t_ns, residual, is_believed)
+        key = record.beacon, component
+        if key not in self._residuals and not self._has_room(record.t_ns):
+            return
+        self._residuals.setdefault(key, Residuals()).add(record.t_ns, residual, is_believed)
+
+    def _has_room(self, t_ns: int) -> bool:
+        """Return whether one more can be compared, in the place of one that has been silent, if need be."""
+        if len(self._residuals) < MOST_TRACKS:
+            return True
+        oldest = min(self._residuals, key=lambda key: self._residuals[key].last_ns)
+        if t_ns - self._residuals[oldest].last_ns <= WINDOW_NS:
+            return False
+        del self._residuals[oldest]
+        return True

@@ -2,6 +2,7 @@
 
 import math
 import random
+import tracemalloc
 
 import pytest
 
@@ -12,6 +13,7 @@ from companion.navigator.stale_data import (
     ANSWERS,
     ATTITUDE_S,
     HALF_ANSWERS,
+    MOST_SOURCES,
     PATIENCE_S,
     SAMPLES,
     StaleDataDetector,
@@ -204,3 +206,21 @@ def test_the_navigator_takes_nothing_of_a_channel_that_froze() -> None:
         after += out
     assert {(out.source, out.reason[:12]) for out in reported} == {("inertial channel", "it is frozen")}
     assert max(out.t_ns for out in after if isinstance(out, Solution)) <= 10 * NS + NS // 10
+
+
+def test_beacons_by_the_thousand_are_forgotten_and_a_frozen_one_is_seen_among_them() -> None:
+    detector, found = StaleDataDetector(), []
+    tracemalloc.start()
+    try:
+        for k in range(20 * MOST_SOURCES):
+            t = 0.025 * k
+            assert detector.judge(rsbn(t, 1.0 + 1e-5 * k, 5e4, beacon=100 + k)) is None
+            if k % 40 == 0:
+                found.append(detector.judge(rsbn(t, 1.0, 4e4)))
+            if k == 2 * MOST_SOURCES:
+                before, _ = tracemalloc.get_traced_memory()
+        after, _ = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert found[: ANSWERS - 1] == [None] * (ANSWERS - 1) and None not in found[ANSWERS - 1 :]
+    assert after - before < 200_000

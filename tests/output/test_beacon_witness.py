@@ -1,12 +1,13 @@
 """Beacon witness: a GNSS that is drawn off is seen in time; a beacon's constant error and noise are not."""
 
 import math
+import tracemalloc
 
 import numpy as np
 import pytest
 
 from companion.nav.geometry import Geodetic, displace, slant_range_azimuth
-from companion.output.beacon_witness import BeaconWitness
+from companion.output.beacon_witness import MOST_TRACKS, WINDOW_NS, BeaconWitness
 from companion.records import Gnss, RsbnFix
 from companion.units import SECOND_NS
 
@@ -143,3 +144,26 @@ def test_a_beacon_that_is_no_longer_received_contradicts_nothing() -> None:
         answer = RsbnFix(now, now, 8, *other, line.azimuth, line.slant_range, SIGMA_AZIMUTH, SIGMA_RANGE)
         flight.witness.receive(answer, is_believed=True)
         assert flight.witness.contradicts == (k < 20)
+
+
+def test_beacons_by_the_thousand_displace_none_that_answers() -> None:
+    """Anyone may name 65536 beacons; compared with all of them, a solution would take 0.1 s and 0.3 GB."""
+    flight = Flight(1)
+    flight.fly(60)
+    tracemalloc.start()
+    try:
+        for k in range(20 * MOST_TRACKS):
+            now = round((flight.seconds + 0.025 * (k % 40)) * SECOND_NS) + 10**12
+            answer = RsbnFix(now, now, 100 + k, *BEACON, 4.71, 6e4 + k, SIGMA_AZIMUTH, SIGMA_RANGE)
+            flight.witness.receive(answer, is_believed=True)
+            if k % 40 == 39:
+                flight.fly(1)
+            if k == 2 * MOST_TRACKS:
+                before, _ = tracemalloc.get_traced_memory()
+        after, _ = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert after - before < 50_000
+    flight.fly(round(WINDOW_NS / SECOND_NS) + 1)
+    assert not flight.witness.contradicts
+    assert flight.fly(150, (2.0, 0.0)) is not None
