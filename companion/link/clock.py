@@ -228,6 +228,10 @@ class BootClock:
         self._requests.append(now)
         return now
 
+    def has_requested(self, stamp: int) -> bool:
+        """Whether a request of ours with this stamp is not answered yet."""
+        return stamp in self._requests
+
     def update_timesync(self, requested: int, reading: int, now: int) -> bool:
         """Process a TIMESYNC answer; return whether it is used.
 

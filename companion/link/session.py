@@ -570,7 +570,8 @@ class Session:
             if limiter.take(now):
                 self.send(dialect.new("TIMESYNC", tc1=max(now, 1), ts1=message.ts1))
         elif from_autopilot:
-            self._answered = now
+            if self.clock.has_requested(message.ts1):  # else the answer to another station
+                self._answered = now
             before, rate = self.clock.offset(now), self.clock.rate
             self.clock.update_timesync(message.ts1, message.tc1, now)
             if self.clock.rate != rate:

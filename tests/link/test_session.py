@@ -149,6 +149,19 @@ def test_timesync_finds_the_boot_time_through_a_slow_link() -> None:
     assert session.clock.local(505 * SECOND, 10 * SECOND) - 5 * SECOND == pytest.approx(40 * MS, abs=11 * MS)
 
 
+def test_an_answer_to_another_station_is_none_to_us() -> None:
+    """A link on which the autopilot does not hear us must not lead because it hears a station."""
+    session, peer = Session(), Autopilot()
+    run(session, peer, 0, 3)
+    assert session.is_answered(3 * SECOND)
+    peer.answers = False
+    for second in range(3, 20):
+        run(session, peer, second * SECOND, 1)
+        to_station = peer.message("TIMESYNC", tc1=second * SECOND, ts1=123_456_789_000 + second)
+        session.receive(to_station, (second + 1) * SECOND)
+    assert session.is_up and not session.is_answered(20 * SECOND)
+
+
 def test_timesync_request_is_answered_at_once() -> None:
     session, peer = Session(), Autopilot()
     session.receive(peer.heartbeat() + peer.message("TIMESYNC", ts1=4242), 9 * SECOND)
