@@ -7,6 +7,6 @@ link_addresses            addresses of the links checked before a start
 ground_station_services   commands, parameters and STATUSTEXT for ground stations
 parameter_check           autopilot parameters checked at the start of a flight
 signing_key, state_file   state that outlives a restart
-daemon_thread, stderr_writer    blocking work outside the event loop
+stderr_writer             lines to stderr outside the event loop
 systemd                   readiness and watchdog notification
 """

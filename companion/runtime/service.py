@@ -34,7 +34,6 @@ from companion.printable import printable
 from companion.records import Event, Severity
 from companion.runtime.console import Console, terminal_columns
 from companion.runtime.core import CompanionCore
-from companion.runtime.daemon_thread import run_in_daemon_thread
 from companion.runtime.exposure import exposure
 from companion.runtime.kept_parameters import KeptParameters
 from companion.runtime.kept_run import KEEP_AFTER_S, KEEP_S, Flown, KeptRun
@@ -50,6 +49,7 @@ from companion.storage.flight_log import Writer
 from companion.storage.reader import LogError
 from companion.storage.retention import create_log, recover_unclosed
 from companion.storage.run_metadata import run_metadata
+from companion.transport.daemon_thread import run_in_daemon_thread
 from companion.transport.drop_monitor import DropMonitor
 from companion.transport.reconnect import Address, CannotListen, Connection, cannot_listen, connections
 

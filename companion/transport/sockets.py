@@ -5,10 +5,12 @@ from __future__ import annotations
 import asyncio
 import errno
 import socket
+from functools import partial
 from typing import Any
 
 from companion.transport.address import Address
 from companion.transport.connection import reason
+from companion.transport.daemon_thread import run_in_daemon_thread
 
 CONNECT_TIMEOUT = 10.0
 #: Clients that the system completes while the event loop is busy.
@@ -38,7 +40,9 @@ async def open_socket(address: Address) -> socket.socket:
     some of its addresses.
     """
     kind = socket.SOCK_DGRAM if address.kind.startswith("udp") else socket.SOCK_STREAM
-    found = await asyncio.get_running_loop().getaddrinfo(address.place, address.number, type=kind)
+    # the pool of the loop's `getaddrinfo` would keep the process from its end while no name server answers
+    find = partial(socket.getaddrinfo, address.place, address.number, type=kind)
+    found = await run_in_daemon_thread(find)
     failed: list[OSError] = []
     # MAVLink programs use IPv4: of `localhost`, try 127.0.0.1 before ::1
     for family, _, _, _, where in sorted(found, key=lambda answer: answer[0] != socket.AF_INET):

@@ -85,10 +85,10 @@ def test_pauses_double_up_to_their_limit_with_jitter_down_to_a_half() -> None:
 
 
 async def test_unknown_host_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
-    async def unknown(*_: object, **__: object) -> None:
+    def unknown(*_: object, **__: object) -> None:
         raise socket.gaierror(socket.EAI_NONAME, "Name or service not known")
 
-    monkeypatch.setattr(asyncio.get_running_loop(), "getaddrinfo", unknown)
+    monkeypatch.setattr(socket, "getaddrinfo", unknown)
     reports: list[str] = []
     waiting = asyncio.ensure_future(
         anext(connections(Address("tcp", "no.such", 1), lambda: 1.0, reports.append))

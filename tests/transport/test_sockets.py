@@ -2,6 +2,8 @@
 
 import asyncio
 import socket
+import subprocess
+import sys
 import time
 from typing import Any
 
@@ -79,10 +81,10 @@ async def test_datagrams_that_take_long_leave_others_their_turn() -> None:
 
 
 def answering(monkeypatch: pytest.MonkeyPatch, *answers: tuple[socket.AddressFamily, str]) -> None:
-    async def getaddrinfo(_: str, port: int, *, type: socket.SocketKind) -> list[Any]:
+    def getaddrinfo(_: str, port: int, *, type: socket.SocketKind) -> list[Any]:
         return [(family, type, 0, "", (host, port)) for family, host in answers]
 
-    monkeypatch.setattr(asyncio.get_running_loop(), "getaddrinfo", getaddrinfo)
+    monkeypatch.setattr(socket, "getaddrinfo", getaddrinfo)
 
 
 async def test_every_resolved_address_is_tried(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -96,3 +98,18 @@ async def test_first_failure_is_raised_if_no_resolved_address_works(monkeypatch:
     answering(monkeypatch, (socket.AF_INET, "127.0.0.1"), (socket.AF_INET, "255.255.255.255"))
     with pytest.raises(ConnectionRefusedError):
         await connect(Address("tcp", "localhost", free_port()))
+
+
+def test_silent_name_server_does_not_block_process_exit() -> None:
+    code = """
+import asyncio, contextlib, socket, threading
+from companion.transport.address import Address
+from companion.transport.reconnect import connect
+socket.getaddrinfo = lambda *_, **__: threading.Event().wait()
+async def main():
+    with contextlib.suppress(TimeoutError):
+        await asyncio.wait_for(connect(Address("tcp", "station.example", 5760)), 0.01)
+asyncio.run(main())
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=100)
+    assert (done.returncode, done.stderr) == (0, "")

@@ -7,7 +7,7 @@ import threading
 
 import pytest
 
-from companion.runtime.daemon_thread import run_in_daemon_thread
+from companion.transport.daemon_thread import run_in_daemon_thread
 
 
 async def test_result_arrives_while_the_loop_runs() -> None:
@@ -41,7 +41,7 @@ def test_cancelled_work_still_completes() -> None:
 def test_endless_work_does_not_block_process_exit() -> None:
     code = """
 import asyncio, contextlib, threading
-from companion.runtime.daemon_thread import run_in_daemon_thread
+from companion.transport.daemon_thread import run_in_daemon_thread
 async def main():
     with contextlib.suppress(TimeoutError):
         await asyncio.wait_for(run_in_daemon_thread(threading.Event().wait), 0.01)

@@ -2,8 +2,8 @@
 
     trouble = await run_in_daemon_thread(write)
 
-`asyncio.to_thread` uses a pool that is joined when the process exits; with a disk that never responds the
-process would not exit.
+`asyncio.to_thread` uses a pool that is joined when the process exits; with a disk or a name server that never
+responds the process would not exit.
 """
 
 from __future__ import annotations
