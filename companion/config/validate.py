@@ -128,6 +128,8 @@ def find_mistakes(config: Config) -> Iterator[tuple[str, str, str]]:
     for section, key in PATHS:
         if "\0" in (path := getattr(getattr(config, section), key)):
             yield section, key, f"{section}.{key} = {path!r} has a null character: remove it"
+        elif path.encode(errors="replace").decode() != path:  # bytes of a command line
+            yield section, key, f"{section}.{key} = {path!r} is not UTF-8: give another name"
         elif path.startswith("~"):
             yield section, key, f"{section}.{key} = {path!r}: ~ is not expanded; write the whole path"
     gnss, hz = config.gnss, config.rates.gnss_hz

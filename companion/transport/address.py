@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ipaddress
-import os
 import re
 import socket
 import termios
@@ -74,7 +73,7 @@ class Address(NamedTuple):
 
 def _is_device(place: str) -> bool:
     try:
-        return b"\0" not in os.fsencode(place)
+        return b"\0" not in place.encode()
     except UnicodeError:
         return False
 

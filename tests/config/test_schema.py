@@ -226,6 +226,7 @@ def test_no_prediction_ahead_and_the_ends_of_the_message_ids_are_accepted() -> N
         (['log.folder=""'], "log.folder = '' names no folder: give one, for example logs"),
         (['log.folder="a\\u0000"'], "log.folder = 'a\\x00' has a null character: remove it"),
         (['signing.stamp_file="\\u0000"'], "signing.stamp_file = '\\x00' has a null character"),
+        (["log.folder=a\udcff"], "log.folder = 'a\\udcff' is not UTF-8: give another name"),
         (["log.folder=~/logs"], "log.folder = '~/logs': ~ is not expanded; write the whole path"),
         (["signing.key_file=~pilot/key"], "signing.key_file = '~pilot/key': ~ is not expanded"),
         (

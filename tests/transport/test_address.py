@@ -54,6 +54,7 @@ NO_DEVICE = "is not a device name"
         ("tcp:my host:5760", NO_HOST),
         ("serial:/dev/tty\0x:57600", NO_DEVICE),
         ("serial:/dev/tty\ud800:57600", NO_DEVICE),
+        ("serial:/dev/tty\udcff:57600", NO_DEVICE),
     ],
 )
 def test_error_quotes_the_invalid_string_and_states_the_mistake(text: str, words: str) -> None:
