@@ -4,7 +4,9 @@
     signing.set_time(unix_ns, now_ns)           # whenever a trusted clock is read
     tail = signing.sign(data, link_id, now_ns)  # 13 bytes after a frame whose flags mark it as signed
     fault = signing.verify(frame, now_ns)       # None: accepted
-    if signing.needs_saving: replace_text(stamp_path, f"{signing.timestamp_to_save()}\n")
+    if signing.needs_saving:
+        replace_text(stamp_path, f"{(timestamp := signing.timestamp_to_save())}\n")
+        signing.note_saved(timestamp)
 
 After https://mavlink.io/en/guide/message_signing.html. One object serves all links that share a key, so that
 a frame received on one link cannot be replayed on another. The hash is verified first: only a frame made by a
@@ -147,9 +149,12 @@ class Signing:
         return self._newest >= self._saved - BEHIND
 
     def timestamp_to_save(self) -> int:
-        """Return the timestamp to write to disk now, and mark it as saved."""
-        self._saved = self._newest + LEAD
-        return self._saved
+        """Return the timestamp to write to disk now; call `note_saved` with it once it is there."""
+        return self._newest + LEAD
+
+    def note_saved(self, timestamp: int) -> None:
+        """Note what is on disk."""
+        self._saved = timestamp
 
     def _hash(self, data: bytes) -> bytes:
         digest = self._key.copy()

@@ -184,7 +184,7 @@ class Service:
 
     async def _save_state_periodically(self) -> None:
         """Save the state that outlives a restart; only this task waits for its disk."""
-        last_reported: str | None = None
+        reported: list[str] = []
         solved_s = 0.0
         while True:
             await asyncio.sleep(SAVE_INTERVAL_S)
@@ -194,14 +194,10 @@ class Service:
                     await run_in_daemon_thread(self.confirm_parameters)
             if self._signing_key is not None:
                 self._signing_key.follow_system_time()
-            trouble = await run_in_daemon_thread(self.save_state)
-            if trouble is not None and trouble != last_reported:
-                self.core.report(
-                    Severity.WARNING,
-                    f"parameters: {trouble}; parameters cannot be set until this is resolved",
-                    time.monotonic_ns(),
-                )
-            last_reported = trouble
+            before, reported = reported, await run_in_daemon_thread(self.save_state)
+            for text in reported:
+                if text not in before:
+                    self.core.report(Severity.WARNING, text, time.monotonic_ns())
 
     async def _keep_flight_periodically(self) -> None:
         """Keep what the next run needs of the flight; only this task waits for its disk."""
@@ -255,15 +251,20 @@ class Service:
         if self.core.births_due:
             asyncio.get_running_loop().call_soon(self.core.bear)
 
-    def save_state(self) -> str | None:
-        """Save the timestamp and the parameters; return the error of the parameters' disk, None if saved.
+    def save_state(self) -> list[str]:
+        """Save the timestamp and the parameters; return a sentence for each that the disk did not take.
 
         Blocks on the disk and on another call in progress.
         """
         with self._save_lock:
-            if self._signing_key is not None:
-                self._signing_key.save_timestamp()
-            return self._parameters_file.write()
+            troubles = list[str]()
+            if self._signing_key is not None and (trouble := self._signing_key.save_timestamp()):
+                troubles.append(
+                    f"signing: {trouble}; after a restart frames of this run may be accepted again"
+                )
+            if trouble := self._parameters_file.write():
+                troubles.append(f"parameters: {trouble}; parameters cannot be set until this is resolved")
+            return troubles
 
     def confirm_parameters(self) -> None:
         """Accept the parameters set by ground stations: the service works with them. Blocks on the disk."""

@@ -2,7 +2,7 @@
 
     key = SigningKey.from_config(config)    # None: no signing
     key.follow_system_time()                # every second
-    key.save_timestamp()                    # in a thread: blocks on the disk
+    trouble = key.save_timestamp()          # in a thread: blocks on the disk
 
 With a system clock that is behind, every frame of an autopilot on GPS time would be from the future, and ours
 from the past. A plausible date is no proof of a correct clock: a board without a battery starts with the time
@@ -17,7 +17,6 @@ protect the clock, like ours, kill a process that makes this call.
 
 from __future__ import annotations
 
-import contextlib
 import os
 import sys
 import time
@@ -85,8 +84,13 @@ class SigningKey:
         if (unix_ns := self._system_time()) is not None:
             self.signing.set_time(unix_ns, time.monotonic_ns())
 
-    def save_timestamp(self) -> None:
-        """Store the timestamp; if the disk fails, signed links start a minute late after the next start."""
+    def save_timestamp(self) -> str | None:
+        """Store the timestamp; return the error if the disk failed (the next call retries), else None."""
         if self.signing.needs_saving:
-            with contextlib.suppress(OSError):
-                replace_text(self._stamp, f"{self.signing.timestamp_to_save()}\n")
+            timestamp = self.signing.timestamp_to_save()
+            try:
+                replace_text(self._stamp, f"{timestamp}\n")
+            except OSError as error:
+                return f"cannot write {self._stamp}: {error.strerror or error}"
+            self.signing.note_saved(timestamp)
+        return None

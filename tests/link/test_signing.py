@@ -245,7 +245,7 @@ def test_nothing_accepted_before_a_restart_is_accepted_after_it(
             accepted.append(received)
         here.sign(b"", 0, now)
         if here.needs_saving:
-            disk = here.timestamp_to_save()
+            here.note_saved(disk := here.timestamp_to_save())
         assert (
             disk > max([here.time(0), *(int.from_bytes(a.raw[-12:-6], "little") for a in accepted)]) + BEHIND
         )

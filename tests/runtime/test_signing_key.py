@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from companion.link import dialect, frame
-from companion.link.signing import SignatureFault, Signing
+from companion.link.signing import SignatureFault, Signing, load_timestamp
 from companion.runtime.signing_key import SET_AFTER_NS, SigningKey, synchronized_time
 from tests.frames import parsed
 
@@ -64,3 +64,18 @@ def test_clock_that_was_never_set_is_not_used(tmp_path: Path, monkeypatch: pytes
     assert synchronized_time("darwin", str(tmp_path)) is None
     monkeypatch.setattr(time, "time_ns", lambda: TRUE_NS)
     assert synchronized_time("darwin", str(tmp_path / "absent")) == TRUE_NS
+
+
+def test_timestamp_that_the_disk_does_not_take_is_reported_and_tried_again(tmp_path: Path) -> None:
+    """What is not stored could be replayed after a restart."""
+    autopilot, folder = Signing(KEY), tmp_path / "full"
+    autopilot.set_time(TRUE_NS, 0)
+    key = SigningKey(Signing(KEY), folder / "stamp", lambda: None)
+    received = signed_heartbeat(autopilot, 1, SECOND)
+    assert key.signing.verify(received, SECOND) is None
+    for _ in range(2):
+        assert key.save_timestamp() == f"cannot write {folder / 'stamp'}: No such file or directory"
+    folder.mkdir()
+    assert key.save_timestamp() is None
+    after = Signing(KEY, timestamp=load_timestamp(folder / "stamp"))
+    assert after.verify(received, 2 * SECOND) is SignatureFault.OLD
