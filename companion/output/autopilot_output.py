@@ -140,16 +140,17 @@ class AutopilotOutput:
             self._source_switch.note_output(solution, not by_set.isdisjoint(encoded), now, period_ns)
         return list(encoded.values())
 
-    def poll(self, receiver: Receiver, now_ns: int, lack: str = "") -> list[Message]:
+    def poll(self, receiver: Receiver, now_ns: int, lack: str = "", is_lossy: bool = False) -> list[Message]:
         """Return the commands that are due; call it once a second and after every solution.
 
         An autopilot that was taken off GNSS is put back on it also once our positions are switched off.
-        `lack`: why it cannot take them, empty if it can.
+        `lack`: why it cannot take them, empty if it can. `is_lossy`: much of what it sends does not arrive.
         """
         output = self.config.output
         is_to_return = output.switch_sources and self._source_switch.has_left_gnss
         if not (output.switches_sources or is_to_return) or not output.fits(receiver.autopilot):
             return []
+        self._source_switch.note_losses(is_lossy)
         self._source_switch.update(now_ns, lack)
         return self._source_switch.to_send(receiver.system, now_ns)
 

@@ -11,7 +11,8 @@ A set that somebody else selected (the pilot's switch, a ground station) is left
 until a person selects the one that the table requires at that time, or the autopilot reboots.
 
 ArduPilot sends GPS_RAW_INT whatever its receiver does, so a receiver that seems silent is mostly a stream
-that another station has slowed down: the message is requested before the silence counts.
+that another station has slowed down: the message is requested before the silence counts. Nor does it count
+while the link loses half of the frames.
 """
 
 from __future__ import annotations
@@ -196,6 +197,7 @@ class SourceSwitch:
         self._leading: int | None = None
         self._held: int | None = None
         self._lack_reported = ""
+        self._is_lossy = False
         self._reported, self._reports = Selected(0), 0  # the last report of the script, how often in a row
         self._reason = ""
         self._tries = 0
@@ -236,12 +238,17 @@ class SourceSwitch:
     def note_armed(self, is_armed: bool) -> None:
         """Ignore whether it is armed: ArduPilot stores no source set."""
 
+    def note_losses(self, is_lossy: bool) -> None:
+        """Note whether much of what the autopilot sends does not arrive: then silence is the link's."""
+        self._is_lossy = is_lossy
+
     def situation(self, now_ns: int) -> Situation:
         """Return the facts at `now_ns`."""
         solution, patience = self._solution, 3 * SECOND_NS
         fresh = solution is not None and (now_ns - solution.rx_ns) * 1e-9 <= FRESH_S
         received_ns = max(self._receiver_ns, self._other_fix_ns)
-        silent = (now_ns - received_ns) * 1e-9 if self._receiver_ns else -1.0
+        is_judged = self._receiver_ns and not self._is_lossy
+        silent = (now_ns - received_ns) * 1e-9 if is_judged else -1.0
         sent_s = self._sent.held_s(now_ns, MAX_GAP_NS + self._slack_ns) - self._slack_ns * 1e-9
         stopped_ns = -SECOND_NS if self._sent_ns is None else max(0, now_ns - self._sent_ns - self._slack_ns)
         return Situation(

@@ -248,6 +248,8 @@ class CompanionCore:
             self._next_state_ns = now_ns + SECOND_NS
             self._request_firmware()
             self._report_staleness(now_ns)
+            for link in self.links.values():
+                link.note_frames()
             if leading is not None:
                 self._steer(leading, now_ns)
             self._report_missing_inputs(now_ns)
@@ -559,7 +561,8 @@ class CompanionCore:
 
     def _steer(self, link: Link, now_ns: int) -> None:
         """Request the EKF source set that must lead, with or without a solution."""
-        for message in self._output.poll(self._receiver(link), now_ns, self._parameter_check.lack):
+        lack, is_lossy = self._parameter_check.lack, link.is_lossy
+        for message in self._output.poll(self._receiver(link), now_ns, lack, is_lossy):
             link.session.send(message)
         self._emit_output_events()
 

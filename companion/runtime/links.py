@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
+from collections import Counter, deque
 
 from companion.config import Config
 from companion.config.profiles import MESSAGES, RESET
@@ -42,6 +42,7 @@ class Link:
         self.origin_request_ns = 0  # when the local origin is requested next
         self.firmware: Firmware | None = None
         self.firmware_requests = 0
+        self._frames = deque[tuple[int, int]](maxlen=4)  # received and lost, by the second
         self._euler_ns: int | None = None  # when ATTITUDE was last received
 
     def tune(self, config: Config, now_ns: int) -> None:
@@ -59,6 +60,16 @@ class Link:
         if msgid == ATTITUDE:
             self._euler_ns = now_ns
         return msgid == QUATERNION and self._euler_ns is not None and now_ns - self._euler_ns < ATTITUDE_NS
+
+    def note_frames(self) -> None:
+        """Note how many frames arrived and were lost; call it once a second."""
+        self._frames.append((self.received, self.lost))
+
+    @property
+    def is_lossy(self) -> bool:
+        """Whether half of the frames of the last three seconds were lost, or none arrived."""
+        received, lost = self._frames[0] if self._frames else (-1, 0)
+        return self.lost - lost >= self.received - received
 
     @property
     def lost(self) -> int:

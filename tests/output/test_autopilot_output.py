@@ -1,6 +1,7 @@
 """Autopilot output: checked positions, for the right make, and never the autopilot's own position."""
 
 import math
+import random
 from collections import Counter
 from collections.abc import Callable
 from typing import Any
@@ -688,3 +689,29 @@ def test_reset_after_a_reboot_requires_a_new_gps_message() -> None:
     assert output.messages(at(10.0), ["COMMAND_INT"], receiver) == []
     assert "no GPS message" in output.take_events()[-1].text
     assert output.unix_ns == UTC_S * 10**9 - START  # the time of day remains valid
+
+
+def test_a_link_that_loses_most_frames_is_no_silent_receiver() -> None:
+    """GNSS is healthy, and our positions go on by the IMU and the beacon."""
+    chance = random.Random(5)
+
+    class LossyFlight(Flight):
+        loss = 0.0
+
+        def send(self, name: str, /, **values: Any) -> None:
+            self._sequence += 1
+            is_gnss = name == "GPS_RAW_INT" and self.loss > 0.0
+            if not is_gnss and chance.random() >= self.loss:
+                self._sequence -= 1
+                super().send(name, **values)
+
+    flight = LossyFlight(configured("output.profile=ardupilot"))
+    flight.fly(15.0)
+    flight.loss = 0.65
+    sent = len(flight.sent_messages("ODOMETRY"))
+    flight.fly(6.0)
+    assert len(flight.sent_messages("ODOMETRY")) > sent + 15
+    assert flight.source_set == 1
+    flight.loss = 1e-9  # the others arrive: it is the receiver
+    flight.fly(6.0)
+    assert flight.source_set == 2
