@@ -119,6 +119,8 @@ class Amplitudes(NamedTuple):
         return LASTING * self.gust_s
 
 
+#: Nodes and weights of Gauss's integral from 0 to 1.
+GAUSS = ((0.5 - math.sqrt(0.15), 5.0 / 18.0), (0.5, 8.0 / 18.0), (0.5 + math.sqrt(0.15), 5.0 / 18.0))
 #: How many times coarser than the settings attitude, IMU and a held velocity are.
 GRADES = (1.0, 4.0, 8.0)
 #: The coarsest grade is no finer than that of these: that the settings are wrong is a hypothesis too.
@@ -326,7 +328,7 @@ class Propagator:
         return np.where(self._rate > 0.0, (1.0 - decay * decay) / (2.0 * rate), T)
 
     def _inertial(self, i: Interval, T: float, Phi: Floats, Q: Floats) -> None:
-        half, tilt = 0.5 * T * T, self._density[:, 9]
+        half, tilt = 0.5 * T * T, self._density[:, TILT.start]
         noise = self.settings.velocity_noise_m_s_sqrt_s**2 + (i.noise / T if T > 0.0 else 0.0)
         _velocity_noise(Phi, Q, T, noise * self._coarser2)
         Phi[0, 9] = Phi[1, 10] = half
@@ -335,10 +337,11 @@ class Propagator:
         Phi[0:4, 12] = -i.s2, i.c2, -i.s1, i.c1
         Phi[0:4, HEADING] = -i.e2, i.n2, -i.e1, i.n1
         Phi[0:4, VERSINE] = i.n2, i.e2, i.n1, i.e1
-        to_velocity, to_position = tilt * half, tilt * (T * half / 3.0)
+        come_up = tilt[:, None, None] * _come_up(T, self.settings.tilt_s)
         for k in (0, 1):  # the tilt that comes up within the interval
-            Q[:, 9 + k, 2 + k] = Q[:, 2 + k, 9 + k] = to_velocity
-            Q[:, 9 + k, k] = Q[:, k, 9 + k] = to_position
+            at = np.array((k, 2 + k, 9 + k))
+            Q[:, 9 + k, 9 + k] = 0.0
+            Q[:, at[:, None], at] += come_up
 
     def _air(self, i: Interval, T: float, Phi: Floats, Q: Floats) -> None:
         s = self.settings
@@ -434,6 +437,20 @@ def _first_order(T: float, tau: float) -> tuple[float, float, float, float, floa
         tau * gone * gone,
         1.0 - stays * stays,
     )
+
+
+def _come_up(T: float, tau: float) -> Floats:
+    """Covariance (3, 3) of position, velocity and acceleration by an acceleration that is correlated over
+    `tau` and driven by white noise of unit density for `T` seconds. As a Gram matrix it is never indefinite.
+    """
+    F = np.empty((3, 3))
+    for row, (share, weight) in zip(F, GAUSS, strict=True):
+        age = share * T  # from when it came up to the end
+        way = -tau * math.expm1(-age / tau)
+        row[:] = tau * (age - way), way, math.exp(-age / tau)
+        row *= math.sqrt(weight * T)
+    covariance: Floats = F.T @ F
+    return covariance
 
 
 def _velocity_noise(Phi: Floats, Q: Floats, T: float, density: Floats) -> None:

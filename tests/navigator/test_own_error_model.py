@@ -8,11 +8,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from companion.config import Config
+from companion.nav.discretization import discretise
 from companion.navigator.own_channel import OwnChannel
 from companion.navigator.own_error_model import (
     GUST,
     HOVER_S,
     POSITION,
+    TILT,
     USUAL,
     VELOCITY,
     Amplitudes,
@@ -50,6 +52,21 @@ def test_two_intervals_beside_the_imu_are_one() -> None:
     (first, q1), (second, q2), (whole, q) = over(0.2), over(0.6), over(0.8)
     assert first * second == pytest.approx(whole)
     assert second * second * q1 + q2 == pytest.approx(q)
+
+
+@pytest.mark.parametrize(("noise", "tilt_s"), [(0.15, 30.0), (1e-6, 30.0), (1e-6, 1.0), (1e-6, 3600.0)])
+def test_a_tilt_that_comes_up_moves_velocity_and_position(noise: float, tilt_s: float) -> None:
+    """As by Van Loan's integral; without the two, an IMU stated as quiet had negative variances."""
+    settings = Amplitudes(velocity_noise_m_s_sqrt_s=noise, tilt_s=tilt_s)
+    interval = add_imu(begin("imu", (20.0, 0.0)), 0.5, (0.0, 0.0), 0.0, 0.0)
+    at = np.array([POSITION.start, VELOCITY.start, TILT.start])
+    Q = Propagator(settings).transition(interval)[1][0][np.ix_(at, at)]
+    A = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, -1.0 / tilt_s]])
+    density = np.diag([0.0, noise**2, 2.0 * settings.tilt**2 / tilt_s])
+    exact = discretise(A, density, np.zeros((3, 0)), 0.5).Q
+    size = np.sqrt(np.outer(exact.diagonal(), exact.diagonal()))
+    np.testing.assert_allclose(Q / size, exact / size, atol=1e-4)
+    assert np.linalg.eigvalsh(Q / size)[0] > 0.0
 
 
 @given(
