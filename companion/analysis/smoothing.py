@@ -57,6 +57,7 @@ from companion.navigator.hypotheses import (
     VELOCITY,
     Hypotheses,
     Model,
+    Situation,
 )
 from companion.navigator.inertial_track import Point
 from companion.navigator.measurements import receiver_states
@@ -346,6 +347,7 @@ class _PlainModel(Model):
     def __init__(self, config: Config, grade: int, beacons: int) -> None:
         super().__init__(config, plain=grade)
         self.grade, self.beacons = grade, beacons
+        self.judged = False  # the record that is taken next, by the first pass
         self.asked: list[tuple[Transition, Point]] = []
 
     def begin(self, t_s: float) -> Bank:
@@ -354,6 +356,10 @@ class _PlainModel(Model):
         for k in range(self.beacons):
             bank = self.with_beacon(bank, k)
         return bank
+
+    def hypotheses(self, now: Situation) -> Hypotheses:
+        """The hypotheses of a situation; what the first pass took is no outlier."""
+        return super().hypotheses(now)._replace(judged=self.judged)
 
     def transition(self, nominal: Nominal, beacons: int) -> Transition:
         """Phi and Q, noted."""
@@ -401,30 +407,35 @@ def _forward_pass(records: Iterable[Stamped], config: Config) -> _Path:
         path.jump(folded.t_ns)
         kept = _believed(folded, witness)
         if kept is not None:
-            path.follow(kept)
+            path.follow(kept, judged=_position(kept) not in folded.rejected)
     path.end()
     return path
 
 
 def _believed(folded: _Folded, witness: _Witness) -> Input | None:
-    """The record without what was false or rejected; None if nothing is left."""
+    """The record without what was false, or a velocity or sight that was rejected; None if nothing is left.
+
+    A position that was rejected is left to the plain filter: of a run of them the position is restarted.
+    """
     record, rejected = folded.record, folded.rejected
-
-    def is_left_out(source: str, receiver: str = "") -> bool:
-        return source + receiver in rejected or witness.was_false(source, record.t_ns)
-
     if isinstance(record, Gnss):
-        receiver = f" {record.receiver}"
-        if is_left_out("gnss", receiver):
+        if witness.was_false("gnss", record.t_ns):
             return None
-        return structs.replace(record, v_n=None) if is_left_out("velocity of gnss", receiver) else record
+        false = witness.was_false("velocity of gnss", record.t_ns)
+        false = false or f"velocity of {_position(record)}" in rejected
+        return structs.replace(record, v_n=None) if false else record
     if not isinstance(record, RsbnFix):
         return record
-    if is_left_out(f"rsbn {record.beacon} azimuth"):
-        record = structs.replace(record, azimuth=None)
-    if is_left_out(f"rsbn {record.beacon} range"):
-        record = structs.replace(record, slant_range=None)
+    for part, empty in (("azimuth", {"azimuth": None}), ("range", {"slant_range": None})):
+        name = f"rsbn {record.beacon} {part}"
+        if name in rejected or witness.was_false(name, record.t_ns):
+            record = structs.replace(record, **empty)
     return None if record.azimuth is None and record.slant_range is None else record
+
+
+def _position(record: Input) -> str:
+    """Name of the position of a receiver in a Rejection; empty for other records."""
+    return f"gnss {record.receiver}" if isinstance(record, Gnss) else ""
 
 
 class _Path:
@@ -460,13 +471,14 @@ class _Path:
                 self._Phi[jump.angle, :] = 0.0
             banks.apply_jump(np.zeros((1, len(self._Q))), self._Q[None], np.arange(1), jump)
 
-    def follow(self, record: Input) -> None:
-        """Take one more record."""
+    def follow(self, record: Input, judged: bool) -> None:
+        """Take one more record; `judged`: the first pass took what is in it."""
         if isinstance(record, Tuning):
             self._tune(record)
             return
         before = structs.replace(self._state, next_ns=NEVER_NS, pending=None)
         self._model.asked.clear()
+        self._model.judged = judged
         after, outputs = guarded(before, record, self._settings, step, record)
         self._state = after if after.bank is not None else self._with_beacons(after)
         if after.bank is None or after.nominal is None:

@@ -152,7 +152,7 @@ class Hypotheses(NamedTuple):
     layout: Layout
     settings: Settings
     biases: tuple[float, ...]  # one sigma of each bias state: azimuth (rad), range (m), time (s), by beacon
-    judged: bool = False  # no fix is an outlier: another bank has left out what was false
+    judged: bool = False  # the fix is no outlier: another bank has taken it
 
     def azimuth(self, k: int) -> int:
         """Source of beacon k's azimuth."""
@@ -198,8 +198,7 @@ class Model:
             found = _hypotheses(self.config, self.channel, now)
             if self.plain is not None:
                 layout = replace(found.layout, faults=(), jumps=())
-                settings = replace(found.settings, switch_h=0.0)
-                found = found._replace(layout=layout, settings=settings, judged=True)
+                found = found._replace(layout=layout, settings=replace(found.settings, switch_h=0.0))
             self._known[now] = found
         return self._known[now]
 
