@@ -510,8 +510,7 @@ class _Path:
         if self._state.bank is not None and config.gnss.latency_s != before.config.gnss.latency_s:
             keep, variance = np.ones(len(self._Q)), np.zeros(len(self._Q))
             self._forget_receiver(keep, variance)
-            self._Phi = keep[:, None] * self._Phi
-            self._Q = self._Q * np.outer(keep, keep) + np.diag(variance)
+            self._Phi, self._Q = _forgotten(self._Phi, self._Q, keep, variance)
         again = begins_again(before.config, config)
         if again or is_wider:
             self.end()
@@ -565,8 +564,8 @@ class _Path:
             Phi, Q, point, predicted = A @ Phi, A @ Q @ A.T + B, reached, A @ predicted
         measured = True
         keep, variance = self._renewed(before, n)
-        predicted, Phi = keep * predicted, keep[:, None] * Phi
-        Q = Q * np.outer(keep, keep) + np.diag(variance)
+        if not keep.all():
+            predicted, (Phi, Q) = keep * predicted, _forgotten(Phi, Q, keep, variance)
         is_widened = isinstance(record, TimeStep) or any(isinstance(output, Reset) for output in outputs)
         opened = np.zeros(n)
         if isinstance(record, Gnss | RsbnFix):
@@ -636,6 +635,11 @@ class _Path:
         else:
             epochs.append(_Epoch(point, x, P, predicted, self._Phi, self._Q, fixed))
         self._Phi, self._Q = np.eye(n), np.zeros((n, n))
+
+
+def _forgotten(Phi: Floats, Q: Floats, keep: Floats, variance: Floats) -> tuple[Floats, Floats]:
+    """Phi and Q behind which some states (zeros of `keep`) begin again with a variance."""
+    return keep[:, None] * Phi, Q * np.outer(keep, keep) + np.diag(variance)
 
 
 def _interval(state: State) -> own_error_model.Interval | None:

@@ -423,7 +423,7 @@ class Anchored(NamedTuple):
     Estimates are sought among those that weigh neighbouring fixes alike, on `grouped`: a sixth of the fixes,
     a hundredth of the work. Their errors are computed on `program`, where they are exact: there a force in
     the interval of a fix counts too, from the fix on. Sought with it, a force that is constant over a group
-    would be told from the means of the fixes.
+    would be separated from the means of the fixes.
 
     Attributes
     ----------
@@ -567,10 +567,11 @@ def anchor(window: Window, law: Law) -> Anchored:
     ends = np.array([window.t_s[f.node] for f in window.fixes])
     begins = np.array([window.t_s[max(f.node - 1, 0)] for f in window.fixes])
     taken = np.array([f.t_s for f in window.fixes])
-    noise = _noise(window, law)
+    kind = _kinds(window)
+    noise = _noise(window, law, kind)
     program = _program(window, law, back, taken.clip(begins, ends), noise)
     each = [len(f.values) for f in window.fixes]
-    fixes = _groups(np.repeat(_by_age(window.t_s[last] - taken), each) * 512 + _kinds(window))
+    fixes = _groups(np.repeat(_by_age(window.t_s[last] - taken), each) * 512 + kind)
     fixes /= program.sigmas[:, None] ** 2
     fixes /= fixes.sum(axis=0)
     held = np.arange(law.n - law.free)
@@ -595,9 +596,8 @@ def _program(window: Window, law: Law, back: Floats, seen_s: Floats, noise: Floa
     cuts = np.array(sorted({*seen_s.tolist(), *(window.t_s[i] for i in (*silent, last))}))
     effect = np.diff(_effect_until(window, cuts), axis=0)
     G = -rows @ np.concatenate([window.C[last] @ one for one in effect] or [np.zeros((n, 0))], axis=1)
-    G[seen[:, None] > np.repeat(cuts[:-1], 2)] = (
-        0.0  # a force before the fix is in the state that it measures
-    )
+    before = seen[:, None] > np.repeat(cuts[:-1], 2)
+    G[before] = 0.0  # a force before the fix is in the state that it measures
     age = 0.5 * (cuts[1:] + cuts[:-1]) - window.t_s[last]
     d, F = np.repeat(law.bound(age), 2), np.kron(law.covariance(age), np.eye(2))
     inputs = np.concatenate([G, rows[:, free:]], axis=1)
@@ -609,10 +609,10 @@ def _program(window: Window, law: Law, back: Floats, seen_s: Floats, noise: Floa
     return Program(rows[:, :free], values, sigmas, inputs, np.concatenate([d, sigma]), U, noise)
 
 
-def _noise(window: Window, law: Law) -> Floats:
+def _noise(window: Window, law: Law, kind: npt.NDArray[np.intp]) -> Floats:
     """Covariance of the fixes' errors."""
     each = [len(f.values) for f in window.fixes]
-    t, kind = np.repeat([f.t_s for f in window.fixes], each), _kinds(window)
+    t = np.repeat([f.t_s for f in window.fixes], each)
     decay = np.exp(-np.abs(t[:, None] - t) / max(law.correlation_s, 1e-3))
     noise = np.where(kind[:, None] == kind, (1.0 - WHITE) * decay, 0.0) + WHITE * np.eye(len(t))
     sigmas = np.concatenate([f.sigmas for f in window.fixes])

@@ -76,7 +76,7 @@ def is_clear(g: Ground, height: float | None) -> bool | None:
 def lifted(g: Ground, height: float | None) -> Ground:
     """In flight, at a pressure altitude (m), if any: the wind is open where it is higher than before.
 
-    Not where it sinks: a multirotor works near the ground, and each descent would open the wind anew (an
+    Not where it sinks: a multirotor works near the ground, and each descent would open the wind again (an
     octocopter without GNSS for a minute 47 m off, not 20).
     """
     above = _above(g, height)

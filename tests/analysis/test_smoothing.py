@@ -398,7 +398,7 @@ FIXED_WING = load(flags={"output.profile": "ardupilot"}, environment={})
 
 @pytest.mark.flight
 def test_another_receiver_is_the_two_point_solution_too() -> None:
-    """What was learnt of the first one, its drift and its latency, says nothing about the second."""
+    """What was estimated of the first one, its drift and its latency, does not hold for the second."""
     records = []
     for record in fixed_wing(150.0):
         if isinstance(record, Gnss) and record.t_ns > 100 * NS:

@@ -150,7 +150,7 @@ def test_timesync_finds_the_boot_time_through_a_slow_link() -> None:
 
 
 def test_an_answer_to_another_station_is_none_to_us() -> None:
-    """A link on which the autopilot does not hear us must not lead because it hears a station."""
+    """A link on which the autopilot does not receive us must not lead because it answers a station."""
     session, peer = Session(), Autopilot()
     run(session, peer, 0, 3)
     assert session.is_answered(3 * SECOND)

@@ -443,7 +443,7 @@ def test_source_set_is_the_pilots_where_none_carries_our_position(via: str) -> N
 
 @pytest.mark.parametrize("pull", [0.0, 5.0])
 def test_answers_that_claim_too_small_a_sigma_do_not_contradict_gnss(pull: float) -> None:
-    """The floors of [rsbn] hold for the beacon's own word too; one that contradicts GNSS is still heard."""
+    """The floors of [rsbn] hold for the beacon's own word too; one that contradicts GNSS still counts."""
     output, rng = AutopilotOutput(configured("output.profile=ardupilot")), np.random.default_rng(1)
     origin = LocalOrigin(START, START, ORIGIN.lat, ORIGIN.lon, ORIGIN.alt, "ardupilot")
     receiver, sets = Receiver("ardupilot", 1, origin), list[float]()
