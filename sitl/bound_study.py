@@ -236,7 +236,7 @@ def curve(grade: InertialGrade, window_s: float) -> list[CurvePoint]:
     window, steps = window_along(flight, law, window_s)
     anchored = anchor(window, law)
     target = anchored.targets(window, (0,), steps)[0]
-    coarse = target._replace(g=anchored.inputs.T @ target.g)
+    coarse = anchored.coarse(target)
     best, _ = anchored.grouped.minimax(coarse)
     kalman = anchored.grouped.bayes(coarse)
     most = kalman.bound / best.bound

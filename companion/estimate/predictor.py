@@ -131,29 +131,15 @@ class Program:
         """Covariance of the fixes at given x, R + G U G' (n, n)."""
         return self.noise + self.crossed @ self.inputs.T
 
-    def grouped(self, fixes: Floats, inputs: Floats) -> Program:
-        """Replace fixes and inputs by fewer.
-
-        Parameters
-        ----------
-        fixes : (n, k)
-            Weights of the fixes in each mean; columns add up to one.
-        inputs : (p, l)
-            Inputs that are taken as equal: one 1 in each row.
-
-        Returns
-        -------
-        Program
-            Program of k fixes and l inputs.
-        """
-        mean = inputs / inputs.sum(axis=0)
+    def grouped(self, fixes: Floats) -> Program:
+        """Replace fixes by their means with weights (n, k), whose columns add up to one."""
         return Program(
             fixes.T @ self.rows,
             fixes.T @ self.values,
             fixes.T @ self.sigmas,
-            fixes.T @ (self.inputs @ inputs),
-            mean.T @ self.bounds,
-            mean.T @ self.covariance @ mean,
+            fixes.T @ self.inputs,
+            self.bounds,
+            self.covariance,
             fixes.T @ self.noise @ fixes,
         )
 
@@ -432,8 +418,8 @@ class Anchored(NamedTuple):
         the states with a bound.
     grouped : Program
         The same with means of fixes, and with a force that is constant over longer intervals.
-    fixes, inputs : (n, k), (p, l)
-        Groups of the fixes, as in `Program.grouped`; of the inputs those of the states alone.
+    fixes : (n, k)
+        Weights of the fixes in each mean.
     node, t_s : int, float
         Node and time of the last fix.
     back : (m, m)
@@ -445,7 +431,6 @@ class Anchored(NamedTuple):
     program: Program
     grouped: Program
     fixes: Floats
-    inputs: Floats
     node: int
     t_s: float
     back: Floats
@@ -473,12 +458,16 @@ class Anchored(NamedTuple):
         Infeasible
             If the fixes do not determine the target.
         """
-        coarse = target._replace(g=self.inputs.T @ target.g)
+        coarse = self.coarse(target)
         kalman = self.grouped.bayes(coarse)
         best, basis = self.grouped.minimax(coarse, start[0] if start else None, tolerance)
         restricted, mu = self.grouped.restricted(coarse, best, start=start[1] if start else None)
         k, m, r = (self.program.judge(self.fixes @ e.weights, target) for e in (kalman, best, restricted))
         return Solved(k, m, r, basis.gap, (basis, (mu, restricted.weights)))
+
+    def coarse(self, target: Target) -> Target:
+        """The target on the inputs of `grouped`: no force before the anchor is in one."""
+        return target._replace(g=target.g[len(self.program.bounds) - len(self.grouped.bounds) :])
 
     def carried(self, solved: Solved, rate: Solved | None, seconds: float, target: Target) -> Solved:
         """Judge the estimates of a target anew for a time `seconds` later, without seeking better ones.
@@ -564,49 +553,49 @@ def anchor(window: Window, law: Law) -> Anchored:
         raise ValueError("the window has no fixes; give one or more")
     first, last = window.fixes[0].node, window.fixes[-1].node
     back = _solve(window.C[last], np.eye(law.n))
+    nodes = np.array(window.t_s[first : last + 1])
     ends = np.array([window.t_s[f.node] for f in window.fixes])
     begins = np.array([window.t_s[max(f.node - 1, 0)] for f in window.fixes])
-    taken = np.array([f.t_s for f in window.fixes])
+    taken = np.array([f.t_s for f in window.fixes]).clip(begins, ends)
     kind = _kinds(window)
     noise = _noise(window, law, kind)
-    program = _program(window, law, back, taken.clip(begins, ends), noise)
+    silent = {*nodes[:-1].tolist()} - {*ends.tolist()}
+    cuts = np.array(sorted({*taken.tolist(), *silent, nodes[-1]}))
+    program = _program(window, law, back, taken, cuts, noise)
     each = [len(f.values) for f in window.fixes]
-    fixes = _groups(np.repeat(_by_age(window.t_s[last] - taken), each) * 512 + kind)
+    fixes = _groups(np.repeat(_by_age(nodes[-1] - taken), each) * 512 + kind)
     fixes /= program.sigmas[:, None] ** 2
     fixes /= fixes.sum(axis=0)
-    held = np.arange(law.n - law.free)
-    force = np.repeat(_by_age(window.t_s[last] - np.array(window.t_s[first + 1 : last + 1])), 2) * 2
-    force += np.arange(len(force)) % 2
-    alike = _groups(np.concatenate([force, force.max(initial=0) + 1 + held]))
-    grouped = _program(window, law, back, ends, noise).grouped(fixes, alike)
-    inputs = np.zeros((len(program.bounds), alike.shape[1]))  # no force before the anchor is in a target
-    inputs[len(inputs) - len(held) :] = alike[len(force) :]
-    return Anchored(program, grouped, fixes, inputs, last, window.t_s[last], back, law)
+    is_cut = np.diff(_by_age(nodes[-1] - nodes[1:]), prepend=-1, append=-2) != 0
+    grouped = _program(window, law, back, ends, nodes[is_cut], noise).grouped(fixes)
+    return Anchored(program, grouped, fixes, last, window.t_s[last], back, law)
 
 
-def _program(window: Window, law: Law, back: Floats, seen_s: Floats, noise: Floats) -> Program:
-    """The program whose fixes show the state at the times `seen_s`, the unknown force constant in between."""
-    first, last, free, n = window.fixes[0].node, window.fixes[-1].node, law.free, law.n
+def _program(
+    window: Window, law: Law, back: Floats, seen_s: Floats, cuts_s: Floats, noise: Floats
+) -> Program:
+    """The program whose fixes show the state at times `seen_s`, with a force constant between the cuts."""
+    last, free, n = window.fixes[-1].node, law.free, law.n
     rows = np.concatenate([f.rows for f in window.fixes]) @ back
     each = [len(f.values) for f in window.fixes]
-    seen = np.repeat(seen_s, each)
-    values = np.concatenate([f.values for f in window.fixes])
-    sigmas = np.concatenate([f.sigmas for f in window.fixes])
-    silent = {*range(first, last)} - {f.node for f in window.fixes}
-    cuts = np.array(sorted({*seen_s.tolist(), *(window.t_s[i] for i in (*silent, last))}))
-    effect = np.diff(_effect_until(window, cuts), axis=0)
-    G = -rows @ np.concatenate([window.C[last] @ one for one in effect] or [np.zeros((n, 0))], axis=1)
-    before = seen[:, None] > np.repeat(cuts[:-1], 2)
-    G[before] = 0.0  # a force before the fix is in the state that it measures
-    age = 0.5 * (cuts[1:] + cuts[:-1]) - window.t_s[last]
-    d, F = np.repeat(law.bound(age), 2), np.kron(law.covariance(age), np.eye(2))
-    inputs = np.concatenate([G, rows[:, free:]], axis=1)
-    sigma = window.sigma[last][free:]
-    U = np.zeros((len(d) + n - free,) * 2)
-    U[: len(d), : len(d)] = F
-    at = np.arange(len(d), len(U))
-    U[at, at] = sigma**2
-    return Program(rows[:, :free], values, sigmas, inputs, np.concatenate([d, sigma]), U, noise)
+    until = (window.C[last] @ _effect_until(window, np.append(cuts_s, seen_s))).transpose(1, 0, 2)
+    at_cuts = (rows @ until[:, : len(cuts_s)].reshape(n, -1)).reshape(len(rows), -1, 2)
+    at_fix = np.einsum("in,nij->ij", rows, np.repeat(until[:, len(cuts_s) :], each, axis=1))
+    later = np.repeat(seen_s, each)[:, None] < cuts_s  # a force before the fix is in the state it measures
+    effect = -np.diff(np.where(later[..., None], at_cuts, at_fix[:, None]), axis=1)
+    age = 0.5 * (cuts_s[1:] + cuts_s[:-1]) - window.t_s[last]
+    d, sigma = np.repeat(law.bound(age), 2), window.sigma[last][free:]
+    U = np.diag(np.concatenate([0.0 * d, sigma**2]))
+    U[: len(d) : 2, : len(d) : 2] = U[1 : len(d) : 2, 1 : len(d) : 2] = law.covariance(age)
+    return Program(
+        rows[:, :free],
+        np.concatenate([f.values for f in window.fixes]),
+        np.concatenate([f.sigmas for f in window.fixes]),
+        np.concatenate([effect.reshape(len(rows), len(d)), rows[:, free:]], axis=1),
+        np.concatenate([d, sigma]),
+        U,
+        noise,
+    )
 
 
 def _noise(window: Window, law: Law, kind: npt.NDArray[np.intp]) -> Floats:

@@ -182,7 +182,7 @@ def test_an_exchange_that_is_stopped_gives_an_estimate_of_the_target(monkeypatch
     anchored = anchor(window, law)
     program = anchored.grouped
     for wanted in anchored.targets(window, (0, 7)):
-        target = wanted._replace(g=anchored.inputs.T @ wanted.g)
+        target = anchored.coarse(wanted)
         least = program.minimax(target)[0].bound
         for exchanges in range(1, 60):
             monkeypatch.setattr(minimax_lp, "EXCHANGES_MAX", exchanges)
