@@ -111,7 +111,9 @@ def messages(
             found = subscribed.get(number[0] | number[1] << 8)
             if found is None or not found[0].shortest + 2 <= size <= found[0].longest + 2:
                 return 0
-        elif kind == _SYNCHRONISATION and data[place + 3 : place + 11] != _SYNC:
+        elif (kind == _SYNCHRONISATION and data[place + 3 : place + 11] != _SYNC) or (
+            kind == _FLAGS and place != _HEADER_SIZE  # the first message states what the log needs
+        ):
             return 0
         return int(size) + 3
 

@@ -315,6 +315,16 @@ def test_many_subscriptions_of_a_topic_share_its_layout() -> None:
     assert damage.parts == 0 and peak < 5e6
 
 
+def test_damage_that_looks_like_flags_does_not_reject_the_log(tmp_path: pathlib.Path) -> None:
+    """Flags are the first message: a log was rejected whole for random bytes behind its last row."""
+    *whole, last = sources.open_source(write(tmp_path, flight()))
+    for flags in (bytes(range(1, 41)), bytes(16) + struct.pack("<3Q", len(flight()) + 20, 0, 0)):
+        content = flight() + message("B", flags) + fix(2_300_000, 47.00002)
+        *records, fixed, event = sources.open_source(write(tmp_path, content))
+        assert [*whole, last] == records
+        assert isinstance(fixed, r.Gnss) and "1 part of 43 bytes was not read" in event.text  # type: ignore[attr-defined]
+
+
 def test_data_appended_after_a_tear_is_read(tmp_path: pathlib.Path) -> None:
     """The logger states where it appended data to a log that a crash had cut."""
     plain = flight()
