@@ -119,6 +119,8 @@ class TlogSource(_Records):
             for each in (found,) if doubtful is None or boot_us is None else (doubtful, found):
                 for event in session.receive_frame(each, now_ns):
                     yield from self._records(event)
+            if session.is_confirmed:  # another vehicle later in the log has its own clock, origin and flight
+                session.lock_to_system(session.autopilot, now_ns)
             doubtful = doubtful if boot_us is None else None
             session.to_send()  # discard replies: there is no link
         if log.corrupt:
@@ -149,7 +151,8 @@ class TlogSource(_Records):
                 yield Reset(at_ns, at_ns, "flight", f"autopilot {system} rebooted: its boot time decreased")
                 yield Reboot(at_ns, at_ns, system)
             case SecondAutopilot(at_ns, system, kept):
-                text = f"autopilot {system} ignored: autopilot {kept} is in use; link.system_id selects one"
+                used = kept or self._session.required_system  # 0: that one has not been received yet
+                text = f"autopilot {system} ignored: autopilot {used} is in use; link.system_id selects one"
                 yield Event(at_ns, at_ns, Severity.WARNING, text)
 
     def _status_text(self, message: Message, rx_ns: int) -> Iterator[Event]:

@@ -195,6 +195,29 @@ def test_messages_of_one_boot_time_keep_their_order() -> None:
     assert (times[-1] - times[0]) * 1e-9 == pytest.approx(0.95, abs=0.01)
 
 
+@pytest.mark.parametrize("system", [None, 2])
+def test_a_log_of_two_vehicles_gives_one_flight(system: int | None) -> None:
+    """A station that stays on records one aircraft after the other: the second was taken for the first."""
+
+    def flown(vehicle: int, start_us: int, boot_ms: int) -> bytes:
+        messages = [dialect.new("HEARTBEAT", type=1, autopilot=3)]
+        messages += [
+            dialect.new("ATTITUDE", time_boot_ms=boot_ms + 100 * k, roll=vehicle) for k in range(200)
+        ]
+        return b"".join(
+            (start_us + 100_000 * k).to_bytes(8, "big") + frame.encode(one, k % 256, vehicle, 1)
+            for k, one in enumerate(messages)
+        )
+
+    log = flown(1, START_US, 500_000) + flown(2, START_US + 300_000_000, 60_000)
+    records = list(sources.TlogSource(tlog.Tlog(log), system))
+    attitudes = [record for record in records if isinstance(record, r.Attitude)]
+    assert [record.roll for record in attitudes] == [system or 1] * 200
+    ignored = [record.text for record in records if isinstance(record, r.Event) and "ignored" in record.text]
+    other, used = (1, 2) if system else (2, 1)
+    assert ignored == [f"autopilot {other} ignored: autopilot {used} is in use; link.system_id selects one"]
+
+
 def test_text_of_the_autopilot_is_an_event() -> None:
     def text(part: bytes, number: int = 0, sequence: int = 0) -> bytes:
         message = dialect.new("STATUSTEXT", severity=4, text=part, id=number, chunk_seq=sequence)
