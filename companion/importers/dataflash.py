@@ -129,7 +129,7 @@ class MessageConverter:
             satellites=int(m.NSats),
             hdop=hdop,
         )
-        if self._is_plane and not self._has_status:
+        if self._is_plane and not self._has_status and fix >= mavlink.GPS_FIX_TYPE_3D_FIX:
             yield from self._flies(m.Spd > (LANDED_M_S if self._flying else FLYING_M_S), t)
 
     def _gps_accuracy(self, name: str, m: Message, t: int) -> Iterator[Stamped]:

@@ -173,6 +173,17 @@ def test_a_plane_whose_log_has_no_status_flies_while_it_is_fast(
     assert flying == [False, *([] if has_status else [True, False, True])]
 
 
+def test_a_plane_does_not_land_where_a_receiver_has_no_fix(tmp_path: pathlib.Path) -> None:
+    """Its speed is 0 then: of a second receiver indoors, or where GNSS is lost in flight."""
+    parts = [message("MSG", 1_050_000, "ArduPlane V3.2.0"), gps(1_100_000, GMS + 200, speed=14.0)]
+    parts += [
+        gps(1_200_000, GMS + 400, status=1, speed=0.0),
+        gps(1_250_000, 0, status=0, receiver=1, speed=0.0),
+    ]
+    found = list(sources.open_source(write(tmp_path, definitions(), gps(1_000_000, GMS), *parts)))
+    assert [x.flying for x in found if isinstance(x, r.Vehicle) and x.flying is not None] == [True]
+
+
 def test_the_airspeed_is_that_of_the_primary_sensor() -> None:
     """As since ArduPlane 3.9 (Pri); its first sensor's was taken, though blocked and no longer used."""
     converter, found = dataflash.MessageConverter(), list[r.Stamped]()
