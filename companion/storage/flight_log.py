@@ -135,8 +135,8 @@ class Writer:
         self._append(number, record.rx_ns, record.t_ns, encode(record))
         due = self._map_due.get(kind)
         if due is not None and not due - MAP_PERIOD_NS <= record.t_ns < due:
-            self._map_due[kind] = record.t_ns + MAP_PERIOD_NS
             for topic, fix in location_fix.to_location_fixes(record, record.t_ns + self._shift):
+                self._map_due[kind] = record.t_ns + MAP_PERIOD_NS
                 number = self._ids.get(topic) or self._channel_of_map(topic)
                 self._append(number, record.rx_ns, record.t_ns, msgspec.json.encode(fix))
         elif kind is Event:

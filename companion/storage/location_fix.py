@@ -70,7 +70,7 @@ def to_location_fixes(record: Stamped, unix_ns: int) -> list[tuple[str, Location
     match record:
         case Truth():
             return [("/map/truth", _fix(stamp, record.lat, record.lon, record.alt))]
-        case Gnss():
+        case Gnss() if record.has_3d_fix:  # without a fix most receivers state 0, 0
             alt = record.alt_msl
             h, v = record.sigma_horizontal, record.sigma_vertical
             if h is None or v is None:

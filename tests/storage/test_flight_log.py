@@ -5,6 +5,7 @@ import errno
 import io
 import itertools
 import json
+import math
 import os
 import resource
 import signal
@@ -168,6 +169,22 @@ def test_map_positions_are_limited_to_two_per_second(tmp_path):
     assert set(corrected) == set(location_fix.SCHEMA["properties"])
     start_s, _ = divmod(START["start_unix_ns"] + 30, 10**9)
     assert corrected["timestamp"]["sec"] == start_s
+
+
+def test_receiver_without_a_fix_is_not_on_the_map(tmp_path):
+    """It states latitude and longitude 0, and must not take the place of one that has a fix."""
+    path = tmp_path / "x.mcap"
+    fix = next(one for one in EVERY_KIND if isinstance(one, r.Gnss))
+
+    with Writer(path, metadata={}, **START) as log:
+        for t_ns in range(T, T + 10**9, 10**8):
+            log.record(
+                msgspec.structs.replace(fix, t_ns=t_ns, rx_ns=t_ns, receiver=1, fix=1, lat=0.0, lon=0.0)
+            )
+            log.record(msgspec.structs.replace(fix, t_ns=t_ns, rx_ns=t_ns, receiver=0))
+    found = [json.loads(entry.value) for entry in read(path) if entry.topic == "/map/gnss"]
+    assert [one["latitude"] for one in found] == [pytest.approx(math.degrees(fix.lat))] * 2
+    assert info(path).counts["/in/Gnss"] == 20
 
 
 def test_implausible_times_round_trip(tmp_path):
