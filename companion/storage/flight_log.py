@@ -262,7 +262,7 @@ class Writer:
             file.write(self._attachments)
             file.sync()
         except OSError as error:
-            raise LogError(f"cannot write a log to {active}: {describe_write_error(error)}") from None
+            raise LogError(f"cannot write a log to {active}: {describe_write_error(error)}") from error
         return file
 
     def _write_loop(self) -> None:

@@ -60,17 +60,24 @@ def create_log(
             f"cannot keep logs in {folder}: deleting all of them would not leave {min_free >> 20} MiB free; "
             "none was deleted. Free space on the disk, or lower log.minimum_free_mib"
         )
-    return Writer(
-        path,
-        metadata=metadata,
-        start_unix_ns=start_unix_ns,
-        start_ns=start_ns,
-        chunk_bytes=chunk_bytes,
-        fsync_s=fsync_s,
-        block=block,
-        disk=partial(DiskFile, reserve=min_free, relieve=partial(make_room, folder, on_delete=on_delete)),
-        attachments=[schemas.dialect_attachment(start_unix_ns)],
-    )
+    disk = partial(DiskFile, reserve=min_free, relieve=partial(make_room, folder, on_delete=on_delete))
+    while True:
+        try:
+            return Writer(
+                path,
+                metadata=metadata,
+                start_unix_ns=start_unix_ns,
+                start_ns=start_ns,
+                chunk_bytes=chunk_bytes,
+                fsync_s=fsync_s,
+                block=block,
+                disk=disk,
+                attachments=[schemas.dialect_attachment(start_unix_ns)],
+            )
+        except LogError as error:
+            if not isinstance(error.__cause__, FileExistsError):
+                raise
+        path = _next_path(folder, start_unix_ns)  # a process that started in the same second has taken it
 
 
 def recover_unclosed(

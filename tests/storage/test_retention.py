@@ -92,6 +92,20 @@ def test_new_log_number_follows_the_greatest(tmp_path):
     assert write_log(tmp_path) == "100003-19700101T000000Z.mcap"
 
 
+def test_processes_that_start_in_one_second_each_have_a_log(tmp_path, monkeypatch):
+    free = retention._next_path
+
+    def taken_meanwhile(folder: Path, start_unix_ns: int) -> Path:
+        path = free(folder, start_unix_ns)
+        if not names(folder):
+            (folder / f"{path.name}.active").touch()
+        return path
+
+    monkeypatch.setattr(retention, "_next_path", taken_meanwhile)
+    assert write_log(tmp_path) == "00002-19700101T000000Z.mcap"
+    assert names(tmp_path) == ["00001-19700101T000000Z.mcap.active", "00002-19700101T000000Z.mcap"]
+
+
 def test_unreachable_limit_deletes_nothing(tmp_path, monkeypatch):
     made = [write_log(tmp_path, i) for i in range(5)]
     SimulatedDisk(monkeypatch, tmp_path, 100 * MIB, taken=90 * MIB)
