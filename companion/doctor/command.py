@@ -19,7 +19,7 @@ from rich.console import Console
 from companion.config import Config, ConfigError, load
 from companion.config.options import configuration_options
 from companion.config.profiles import PROFILES
-from companion.doctor.diagnosis import Diagnosis, Finding
+from companion.doctor.diagnosis import SEVERAL, Diagnosis, Finding
 from companion.doctor.examination import Examination
 from companion.doctor.rendering import as_json, change_summary, parameter_table, print_diagnosis
 from companion.printable import printable
@@ -137,6 +137,8 @@ def confirm_change(diagnosis: Diagnosis, yes: bool) -> str:
         return "there is nothing to set"
     if diagnosis.identity.is_armed:
         return ARMED
+    if any(found.what == SEVERAL for found in diagnosis.problems):
+        return "several autopilots are received; set link.system_id to the intended one"
     if yes:
         return ""
     if not _is_interactive():

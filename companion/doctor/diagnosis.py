@@ -16,6 +16,8 @@ from companion.runtime.input_monitor import stream_states
 
 #: ArduPilot's text after VISO_TYPE was set and before the reboot.
 NOT_REBOOTED = "VisOdom: out of memory"
+#: The finding on other autopilots: nothing is set on the one that happens to be heard first.
+SEVERAL = "autopilots"
 
 
 class ParameterFinding(NamedTuple):

@@ -18,6 +18,7 @@ from companion.config import Config
 from companion.config.profiles import MESSAGES, FailsafeLimit, RequiredParameter
 from companion.config.required_parameters import failsafe_limits, required_parameters
 from companion.doctor.diagnosis import (
+    SEVERAL,
     Diagnosis,
     Finding,
     Identity,
@@ -283,7 +284,7 @@ class Examination:
         if self._others:
             others = ", ".join(map(str, sorted({*self._others, session.autopilot or 0})))
             advice = "set link.system_id to the intended one"
-            found.append(Finding("autopilots", others, "one", bool(self._config.link.system_id), advice))
+            found.append(Finding(SEVERAL, others, "one", bool(self._config.link.system_id), advice))
         if refused := session.rejected.total():
             found.append(
                 Finding(
