@@ -5,7 +5,7 @@ Values only: `examination` observes, `rendering` shows.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Set
+from collections.abc import Iterable, Mapping, Sequence, Set
 from typing import NamedTuple
 
 from companion.config import Config
@@ -16,6 +16,8 @@ from companion.runtime.input_monitor import stream_states
 
 #: ArduPilot's text after VISO_TYPE was set and before the reboot.
 NOT_REBOOTED = "VisOdom: out of memory"
+#: Index of the source in PX4's ESTIMATOR_SENSOR_FUSION_STATUS that a message of ours is.
+PX4_SOURCES = {"GLOBAL_POSITION_SENSOR": 3, "ODOMETRY": 2, "VISION_POSITION_ESTIMATE": 2}
 #: The finding on other autopilots: nothing is set on the one that happens to be heard first.
 SEVERAL = "autopilots"
 
@@ -140,6 +142,20 @@ def check_arming(make: str, failing: Set[str], is_answering: bool) -> list[Findi
         advice = "reboot the autopilot: VISO_TYPE takes effect after it"
         found.append(Finding("reboot", "needed", "done", False, advice))
     return found
+
+
+def check_fusion(config: Config, make: str, intended: Sequence[int]) -> list[Finding]:
+    """Report whether PX4 is set to fuse our position; `intended` as in ESTIMATOR_SENSOR_FUSION_STATUS.
+
+    For right parameters: they may wait for a reboot, and EKF2_SENS_EN, or a command, may leave it out.
+    """
+    rates = config.output.rates_hz
+    source = next((index for message, index in PX4_SOURCES.items() if rates[message] > 0.0), None)
+    if make != "px4" or source is None or not intended:
+        return []
+    advice = "reboot the autopilot; if it stays off, EKF2_SENS_EN switches this source off"
+    is_on = bool(intended[source] & 1)
+    return [Finding("fusion of our position", "on" if is_on else "off", "on", is_on, advice)]
 
 
 def check_answers(is_answering: bool, is_signing: bool) -> list[Finding]:

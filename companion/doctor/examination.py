@@ -28,6 +28,7 @@ from companion.doctor.diagnosis import (
     check_arming,
     check_failsafe,
     check_feeders,
+    check_fusion,
     check_profile,
     check_script,
     check_streams,
@@ -73,6 +74,7 @@ class Examination:
         self._heartbeat = dialect.new("HEARTBEAT")
         self._version: Any = None
         self._origin: Any = None
+        self._fusion: tuple[int, ...] = ()  # what PX4's estimator is set to fuse
         self._airspeed: bool | None = None  # whether the airspeed sensor is healthy
         self._has_script = False  # the source set script of deploy/ardupilot reports
         self._is_signing = False  # the autopilot signs its frames
@@ -193,6 +195,8 @@ class Examination:
             self._version = event.message
         elif event.frame.msgid == mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN:
             self._origin = event.message
+        elif event.frame.msgid == rsbn.MAVLINK_MSG_ID_ESTIMATOR_SENSOR_FUSION_STATUS:
+            self._fusion = tuple(event.message.intended)
         elif event.frame.msgid == mavlink.MAVLINK_MSG_ID_SYS_STATUS:
             self._airspeed = has_airspeed_sensor(event.message)
         elif (by := selected(event.message, event.from_autopilot, 0)) is not None and by.is_report:
@@ -227,6 +231,10 @@ class Examination:
             found.append(ParameterFinding(need, answer.value, answer.trouble))
         return tuple(found)
 
+    def _has_parameters(self) -> bool:
+        """Whether the autopilot has every required parameter as it must be."""
+        return all(found.is_well for found in self._parameters())
+
     def _findings(self, now: int) -> list[Finding]:
         beacons = ", ".join(map(str, sorted(self._beacons)))
         return [
@@ -235,6 +243,7 @@ class Examination:
             *check_airspeed(self._config, self._airspeed, self._heartbeat.type),
             *check_failsafe(self._limits, {name: answer.value for name, answer in self._answers.items()}),
             *check_script(self._config, self.make, self._has_script),
+            *(check_fusion(self._config, self.make, self._fusion) if self._has_parameters() else ()),
             *check_arming(self.make, self._arming_checks, self._is_answering),
             *check_answers(self._is_answering, self._is_signing),
             *check_feeders(self._feeders),

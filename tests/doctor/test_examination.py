@@ -221,6 +221,33 @@ def test_failsafe_that_ends_a_flight_without_gnss_is_shown_and_never_set() -> No
     assert "COM_POS_LOW_EPH" not in {finding.what for finding in other.look().findings}
 
 
+def fusion(*intended: int) -> bytes:
+    return frame.encode(dialect.new("ESTIMATOR_SENSOR_FUSION_STATUS", intended=list(intended)), 0, 1, 1)
+
+
+@pytest.mark.parametrize(
+    ("pairs", "off", "on"),
+    [
+        ([], [1, 1, 0, 0, 1, 1, 1, 1, 0], [1, 1, 0, 1, 1, 1, 1, 1, 0]),  # of PX4, before and after its reboot
+        (["output.via=odometry"], [1, 1, 0, 1, 1, 1, 1, 1, 0], [1, 1, 1, 0, 1, 1, 1, 1, 0]),
+    ],
+)
+def test_right_parameters_of_px4_that_have_no_effect_yet_are_a_problem(
+    pairs: list[str], off: list[int], on: list[int]
+) -> None:
+    bench = Bench("px4", profile("px4", *pairs))
+    while bench.now < SECOND:
+        bench.step()
+    bench.injected.append(fusion(*off))
+    assert "fusion of our position" not in problems(bench.look())  # the parameters are wrong: that is said
+    after = bench.change()
+    assert problems(after) - {"frames lost"} == {"fusion of our position"}
+    assert "reboot" in found(after, "fusion of our position").advice
+    bench.injected.append(fusion(*on))
+    bench.step()
+    assert found(bench.examination.diagnosis(bench.now), "fusion of our position").is_well
+
+
 def test_airspeed_sensor_of_the_autopilot_is_found() -> None:
     assert found(Bench("ardupilot").look(), "airspeed sensor").found == "healthy"
 
