@@ -41,13 +41,13 @@ class RequiredParameter(NamedTuple):
 
 class FailsafeLimit(NamedTuple):
     """Limit of an autopilot's failsafe: the least value with which it flies on by our position (-1: none),
-    what it does by another, and whether multirotors alone have it. The user decides on it.
+    what it does by another, and whether it has it while it hovers only. The user decides on it.
     """
 
     name: str
     value: float
     otherwise: str
-    multirotor: bool = False
+    hovering: bool = False
 
     def is_met(self, has: float) -> bool:
         """Whether the autopilot's value lets it fly on."""
@@ -103,8 +103,12 @@ _AUXILIARY_POSITION = (
 )
 _PX4_FAILSAFE = (
     FailsafeLimit("COM_POS_LOW_EPH", -1.0, "{} m: it returns home once its own accuracy is worse"),
-    FailsafeLimit("COM_POS_FS_EPH", -1.0, "{} m: it lands once its own accuracy is 2.5 times worse", True),
-    FailsafeLimit("EKF2_NOAID_TOUT", 1e7, "{} us: it descends when no position comes for so long", True),
+    FailsafeLimit(
+        "COM_POS_FS_EPH", -1.0, "{} m: hovering it lands once its own accuracy is 2.5 times worse", True
+    ),
+    FailsafeLimit(
+        "EKF2_NOAID_TOUT", 1e7, "{} us: hovering it descends when no position comes for so long", True
+    ),
 )
 
 PROFILES: Mapping[Name, Profile] = {

@@ -23,12 +23,15 @@ def required_parameters(config: Config, autopilot: str | None = None) -> tuple[R
     return tuple(found.values())
 
 
-def failsafe_limits(config: Config, autopilot: str, is_multirotor: bool) -> tuple[FailsafeLimit, ...]:
-    """Return the limits of the failsafe of the make `autopilot` that matter if it is fed by `config`."""
+def failsafe_limits(config: Config, autopilot: str, hovers: bool) -> tuple[FailsafeLimit, ...]:
+    """Return the limits of the failsafe of the make `autopilot` that matter if it is fed by `config`.
+
+    `hovers`: it is a multirotor, or a VTOL with a wing.
+    """
     if not config.output.feeds_estimator:
         return ()
     limits = _profile(config, autopilot).failsafe
-    return tuple(limit for limit in limits if is_multirotor or not limit.multirotor)
+    return tuple(limit for limit in limits if hovers or not limit.hovering)
 
 
 def _profile(config: Config, autopilot: str | None) -> Profile:

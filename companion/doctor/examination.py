@@ -34,7 +34,7 @@ from companion.doctor.diagnosis import (
     check_streams,
 )
 from companion.link import dialect, frame
-from companion.link.decode import MAKES, MULTIROTORS, has_airspeed_sensor
+from companion.link.decode import MAKES, MULTIROTORS, VTOLS, has_airspeed_sensor
 from companion.link.dialect import mavlink, rsbn
 from companion.link.firmware import firmware_of
 from companion.link.parameter_client import Answer, ParameterClient, encoding_of, equal_real32
@@ -211,14 +211,16 @@ class Examination:
         self._client = ParameterClient(self.session.autopilot or 0, mavlink.MAV_COMP_ID_AUTOPILOT1, encoding)
         if self._config.output.fits(self.make):
             self._needed = required_parameters(self._config, self.make)
-            self._limits = failsafe_limits(self._config, self.make, self._heartbeat.type in MULTIROTORS)
+            hovers = self._heartbeat.type in MULTIROTORS | VTOLS
+            self._limits = failsafe_limits(self._config, self.make, hovers)
             self._client.read(p.name for p in self._needed)
             self._client.read(p.name for p in self._limits)
 
     # -- findings -------------------------------------------------------------------------------------------
 
     def _identity(self) -> Identity:
-        vehicle = dialect.entry_name("MAV_TYPE", self._heartbeat.type)
+        kind = self._heartbeat.type
+        vehicle = "VTOL with a wing" if kind in VTOLS else dialect.entry_name("MAV_TYPE", kind)
         firmware = None if self._version is None else firmware_of(self._version)
         version = "" if firmware is None else str(firmware)
         armed = bool(self._heartbeat.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)

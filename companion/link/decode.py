@@ -79,8 +79,9 @@ MULTIROTORS = frozenset(
         mavlink.MAV_TYPE_GENERIC_MULTIROTOR,
     }
 )
-FIXED_WINGS = frozenset({mavlink.MAV_TYPE_FIXED_WING, *range(19, 25)})
-"""19 to 24 are the VTOLs with a wing; releases of pymavlink name them differently."""
+#: The VTOLs with a wing; releases of pymavlink name them differently.
+VTOLS = frozenset(range(19, 25))
+FIXED_WINGS = frozenset({mavlink.MAV_TYPE_FIXED_WING, *VTOLS})
 #: Modes of a quadplane in which its rotors hold it up. Its HEARTBEAT has the type of a fixed wing.
 _BY_ROTORS = frozenset(
     {

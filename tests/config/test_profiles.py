@@ -92,7 +92,7 @@ def test_profile_custom_requires_the_parameters_of_the_connected_make() -> None:
 
 
 @pytest.mark.parametrize(
-    ("pairs", "make", "is_multirotor", "names"),
+    ("pairs", "make", "hovers", "names"),
     [
         ([], "px4", True, set()),
         (["output.profile=ardupilot"], "ardupilot", True, set()),
@@ -102,8 +102,8 @@ def test_profile_custom_requires_the_parameters_of_the_connected_make() -> None:
         (["output.profile=custom", "output.odometry_hz=5"], "other", True, set()),
     ],
 )
-def test_failsafe_limits(pairs: list[str], make: str, is_multirotor: bool, names: set[str]) -> None:
-    limits = failsafe_limits(configured(*pairs), make, is_multirotor)
+def test_failsafe_limits(pairs: list[str], make: str, hovers: bool, names: set[str]) -> None:
+    limits = failsafe_limits(configured(*pairs), make, hovers)
     assert {limit.name for limit in limits} == names
     for limit in limits:  # its value lets the autopilot fly on, and PX4's default does not
         default = {"COM_POS_LOW_EPH": 50.0, "COM_POS_FS_EPH": 5.0, "EKF2_NOAID_TOUT": 5e6}[limit.name]

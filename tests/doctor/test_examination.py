@@ -221,6 +221,27 @@ def test_failsafe_that_ends_a_flight_without_gnss_is_shown_and_never_set() -> No
     assert "COM_POS_LOW_EPH" not in {finding.what for finding in other.look().findings}
 
 
+@pytest.mark.parametrize(("vehicle_type", "vehicle"), [(22, "VTOL with a wing"), (2, "quadrotor")])
+def test_failsafe_of_what_hovers_is_shown(vehicle_type: int, vehicle: str) -> None:
+    """PX4 requires the accuracy of COM_POS_FS_EPH of a VTOL too, while it hovers."""
+    bench = Bench("px4")
+    bench.autopilot.parameters.values |= {"COM_POS_FS_EPH": 5.0, "EKF2_NOAID_TOUT": 5000000}
+
+    def retyped(data: bytes) -> bytes:
+        one = parsed(data)
+        if one.msgid != mavlink.MAVLINK_MSG_ID_HEARTBEAT:
+            return data
+        message = dialect.decode(one)
+        message.type = vehicle_type
+        return frame.encode(message, one.sequence, one.system, one.component)
+
+    bench.to_us = retyped
+    diagnosis = bench.look()
+    assert diagnosis.identity.vehicle == vehicle
+    for name in ("COM_POS_LOW_EPH", "COM_POS_FS_EPH", "EKF2_NOAID_TOUT"):
+        assert found(diagnosis, name).is_well is None
+
+
 def fusion(*intended: int) -> bytes:
     return frame.encode(dialect.new("ESTIMATOR_SENSOR_FUSION_STATUS", intended=list(intended)), 0, 1, 1)
 
