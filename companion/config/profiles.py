@@ -102,7 +102,9 @@ _AUXILIARY_POSITION = (
     RequiredParameter("EKF2_AGP0_CTRL", 1, "fuse its horizontal position", reboot=True),
 )
 _PX4_FAILSAFE = (
-    FailsafeLimit("COM_POS_LOW_EPH", -1.0, "{} m: it returns home once its own accuracy is worse"),
+    FailsafeLimit(
+        "COM_POS_LOW_EPH", -1.0, "{} m: COM_POS_LOW_ACT (3: it returns home) once its own accuracy is worse"
+    ),
     FailsafeLimit(
         "COM_POS_FS_EPH", -1.0, "{} m: hovering it lands once its own accuracy is 2.5 times worse", True
     ),
