@@ -280,7 +280,8 @@ class Examination:
         if self._origin is not None:
             place = f"{self._origin.latitude * 1e-7:.5f}, {self._origin.longitude * 1e-7:.5f}"
         advice = "wait under an open sky for the first 3D fix"
-        found.append(Finding("GPS_GLOBAL_ORIGIN", place, "known", self._origin is not None, advice))
+        is_known = True if self._origin is not None else False if self._is_answering else None
+        found.append(Finding("GPS_GLOBAL_ORIGIN", place, "known", is_known, advice))
         who = f"{session.system}/{session.component}"
         advice = "another component uses our id; stop `companion run` or set link.component_id"
         found.append(

@@ -41,7 +41,8 @@ def parameter_table(diagnosis: Diagnosis) -> Table:
         numeric = column in ("has", "needs")
         table.add_column(column, justify="right" if numeric else "left", no_wrap=column in ("", "parameter"))
     for found in diagnosis.parameters:
-        state = _GOOD if found.is_well else _BAD.format("absent" if found.has is None else "wrong")
+        unread = "absent" if _is_answering(diagnosis) else "unread"
+        state = _GOOD if found.is_well else _BAD.format(unread if found.has is None else "wrong")
         why = found.need.why + (" (after a reboot)" if found.need.reboot else "")
         if found.trouble:
             why = f"[red]{found.trouble}[/]; {why}"
@@ -80,8 +81,7 @@ def summary(config: Config, diagnosis: Diagnosis) -> str:
     if there := sum(found.has is not None for found in diagnosis.wrong_parameters):
         when = "once it is disarmed" if diagnosis.identity.is_armed else "after confirmation"
         lines.append(f"{_number(there, 'parameter')} wrong: --apply sets them, {when}.")
-    is_answering = all(found.what not in ("answers", "signing") for found in diagnosis.problems)
-    if is_answering and (absent := len(diagnosis.wrong_parameters) - there):
+    if _is_answering(diagnosis) and (absent := len(diagnosis.wrong_parameters) - there):
         lines.append(
             f"{_number(absent, 'parameter')} absent: update the firmware, or use a build with this feature."
         )
@@ -98,6 +98,11 @@ def summary(config: Config, diagnosis: Diagnosis) -> str:
                 "navigation-ins, tactical-ins or mems, by its data sheet."
             )
     return "\n".join(lines)
+
+
+def _is_answering(diagnosis: Diagnosis) -> bool:
+    """Whether the autopilot answers at all: silence is no missing parameter."""
+    return all(found.what not in ("answers", "signing") for found in diagnosis.problems)
 
 
 def _number(count: int, noun: str) -> str:

@@ -211,6 +211,12 @@ def test_every_finding_has_state_numbers_and_advice() -> None:
     assert max(map(len, text.splitlines())) <= 80
 
 
+def test_a_parameter_of_an_autopilot_that_answers_nothing_is_not_called_absent() -> None:
+    silent = Finding("answers", "none", "to our requests", False, "check the line from our TX")
+    text = shown(diagnosis(silent, has=None, trouble="no answer"))
+    assert "absent" not in text and "unread" in text
+
+
 def test_nothing_is_cut_in_a_narrow_terminal() -> None:
     bad = diagnosis(Finding("GPS_GLOBAL_ORIGIN", "60.00000, 30.00000", "known", True))
     assert shown(bad, columns=40) == shown(bad)

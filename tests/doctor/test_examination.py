@@ -327,6 +327,15 @@ def test_line_that_carries_nothing_of_ours_is_recognised(make: str) -> None:
     assert "absent" not in summary(bench.config, diagnosis)
 
 
+def test_origin_that_is_requested_in_vain_is_no_missing_fix() -> None:
+    """PX4 sends its origin on request alone: where no request arrives, nobody has to wait for a fix."""
+    bench = Bench("px4")
+    bench.to_it, bench.to_us = lambda data: b"", without("GPS_GLOBAL_ORIGIN")
+    diagnosis = bench.look()
+    assert found(diagnosis, "GPS_GLOBAL_ORIGIN").is_well is None
+    assert "open sky" not in summary(bench.config, diagnosis)
+
+
 def test_another_position_source_is_a_problem() -> None:
     bench = Bench("ardupilot")
     while bench.now < SECOND:
