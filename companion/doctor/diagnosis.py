@@ -16,6 +16,9 @@ from companion.runtime.input_monitor import stream_states
 
 #: ArduPilot's text after VISO_TYPE was set and before the reboot.
 NOT_REBOOTED = "VisOdom: out of memory"
+#: What to check of a stream that is too slow, and of one of which nothing arrives.
+SLOW = "the line is too slow, or a ground station sets other rates"
+NOTHING = "nothing arrives: the sensor (for positions of the EKF: a fix) is missing, or a router drops it"
 #: Index of the source in PX4's ESTIMATOR_SENSOR_FUSION_STATUS that a message of ours is.
 PX4_SOURCES = {"GLOBAL_POSITION_SENSOR": 3, "ODOMETRY": 2, "VISION_POSITION_ESTIMATE": 2}
 #: The finding on other autopilots: nothing is set on the one that happens to be heard first.
@@ -189,7 +192,7 @@ def check_streams(
     found = []
     for state in stream_states(config, make, rates):
         is_well = state.is_enough or (False if state.is_used and is_answering else None)
-        advice = "" if state.is_enough else "the line is too slow, or a ground station sets other rates"
+        advice = "" if state.is_enough else SLOW if state.measured else NOTHING
         has, needs = f"{state.measured or 0.0:.1f} Hz", f"{state.requested:g} Hz"
         found.append(Finding(state.name, has, needs, is_well, advice))
     return found

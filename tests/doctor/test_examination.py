@@ -180,6 +180,14 @@ def test_missing_message_is_found(dropped: str, what: str) -> None:
     assert bench.now >= OBSERVE_LONGER  # it waited longer
 
 
+def test_stream_of_which_nothing_arrives_is_not_called_slow() -> None:
+    """As LOCAL_POSITION_NED of ArduPlane, which has not had its first fix."""
+    bench = Bench("ardupilot", profile("monitor"))
+    bench.to_us = without("LOCAL_POSITION_NED")
+    advice = found(bench.look(), "LOCAL_POSITION_NED").advice
+    assert "slow" not in advice and "fix" in advice
+
+
 @pytest.mark.parametrize(
     ("source", "imu", "airspeed"),
     [("auto", False, False), ("air_data", None, False), ("imu", False, None)],
