@@ -66,13 +66,17 @@ def load(
     """
     tree: dict[str, dict[str, Any]] = {}
     origin: dict[tuple[str, str], str] = {}
-    for name, value in _preset(preset).items():
+    started = _preset(preset)
+    for name, value in started.items():
         section, _, key = name.partition(".")
         tree.setdefault(section, {})[key] = value
         origin[section, key] = f"preset {preset}"
     for source in (path, tuned):
         if source is not None:
-            for section, table in _read(source).items():
+            found = _read(source)
+            if source is path:
+                _check_preset(preset, started, found, path)
+            for section, table in found.items():
                 tree.setdefault(section, {}).update(table)
                 origin |= {(section, key): str(source) for key in table}
     for name, text in (os.environ if environment is None else environment).items():
@@ -130,6 +134,23 @@ def _preset(name: str | None) -> Mapping[str, Any]:
     if name not in PRESETS:
         raise ConfigError(f"--preset {name}: not one of {', '.join(PRESETS)}{_did_you_mean(name, PRESETS)}")
     return PRESETS[name].values
+
+
+def _check_preset(
+    preset: str | None, values: Mapping[str, Any], file: Mapping[str, Mapping[str, Any]], path: Path
+) -> None:
+    """Refuse a file that takes away what the preset is for: its first key. One with every key does."""
+    other = []
+    for name, value in values.items():
+        section, _, key = name.partition(".")
+        if file.get(section, {}).get(key, value) != value:
+            other.append(name)
+    if other and other[0] == next(iter(values)):
+        keys = " and ".join(filter(None, (", ".join(other[:-1]), other[-1])))
+        raise ConfigError(
+            f"--preset {preset} has no effect: {path} overrides its {keys}; remove "
+            f"{'them' if other[1:] else 'it'} from the file, or leave the preset out"
+        )
 
 
 def _read(path: Path) -> dict[str, dict[str, Any]]:

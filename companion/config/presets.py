@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 
 class Preset(NamedTuple):
-    """What a preset is for, and its values by "section.key"."""
+    """What a preset is for, and its values by "section.key": without the first it is for nothing."""
 
     text: str
     values: Mapping[str, Any]

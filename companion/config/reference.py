@@ -340,7 +340,8 @@ reported in one sentence with the nearest valid key, and the service does not st
 
 The commands `run`, `check-config`, `doctor`, `signing init`, `loopback`, `study outages`,
 `study rotor-drag` and `study wrong-sensors` have `--preset NAME` and `--set`. A preset sets the keys below;
-everything else, the file included, overrides it. `companion doctor` recommends one.
+everything else, the file included, overrides it; a file that overrides the first of them is rejected.
+`companion doctor` recommends one. `companion check-config --defaults --preset NAME` writes a file with it.
 """
 
 

@@ -105,6 +105,19 @@ def test_file_and_flags_override_a_preset(tmp_path: Path) -> None:
     assert config.inertial.accelerometer_bias_ug == PRESETS["mems"].values["inertial.accelerometer_bias_ug"]
 
 
+@pytest.mark.parametrize("preset", PRESETS)
+def test_a_file_that_takes_a_preset_away_is_rejected(preset: str, tmp_path: Path) -> None:
+    """The file of `check-config --defaults` has every key: with it the service sent nothing."""
+    file = tmp_path / "companion.toml"
+    file.write_text(CliRunner().invoke(cli, ["check-config", "--defaults"]).output)
+    with pytest.raises(ConfigError) as caught:
+        load(file, preset=preset, environment={})
+    assert f"--preset {preset} has no effect: {file} overrides its " in str(caught.value)
+    assert all(name in str(caught.value) for name in PRESETS[preset].values)
+    file.write_text(CliRunner().invoke(cli, ["check-config", "--defaults", "--preset", preset]).output)
+    assert load(file, preset=preset, environment={}) == load(preset=preset, environment={})
+
+
 def test_unknown_preset_names_the_nearest() -> None:
     with pytest.raises(ConfigError, match="did you mean `px4`"):
         load(preset="px5", environment={})
