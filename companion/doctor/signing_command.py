@@ -81,7 +81,7 @@ async def give_key(stream: Connection, config: Config, key: bytes) -> int:
         raise CannotSetUp("no autopilot found; check the link with companion doctor")
     if armed:
         raise CannotSetUp("the vehicle is armed; set up signing while disarmed")
-    stamp = (time.time_ns() - EPOCH_NS) // TICK_NS
+    stamp = max(0, time.time_ns() - EPOCH_NS) // TICK_NS  # a board without a battery may be in 1970
     system = session.autopilot or 0
     for _ in range(2):
         session.send(

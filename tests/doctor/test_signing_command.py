@@ -75,6 +75,15 @@ def test_both_ends_have_the_key_and_nobody_else(tmp_path: Path, port: int) -> No
     assert read_key(path) == autopilot.key
 
 
+def test_a_clock_that_was_never_set_is_no_hindrance(
+    tmp_path: Path, port: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(signing_command.time, "time_ns", lambda: 100 * 10**9)
+    monkeypatch.setattr(signing_command, "ANSWER_S", 1.0)
+    done = with_autopilot(SigningAutopilot(port), tmp_path / "key")
+    assert done.exit_code == 0, done.output
+
+
 def test_an_existing_key_is_not_replaced(tmp_path: Path) -> None:
     path = tmp_path / "key"
     assert "key (new, mode 0600)" in init(path, "--no-autopilot").output
