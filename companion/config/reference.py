@@ -229,7 +229,10 @@ TEXTS: dict[str, dict[str, tuple[str, str]]] = {
             "NAVIGATION_STATUS to every link.",
             "the line is slow: 0, or a display needs more",
         ),
-        "global_position_sensor_id": ("`id` of GLOBAL_POSITION_SENSOR.", "EKF2_AGP0_ID of PX4 is another"),
+        "global_position_sensor_id": (
+            "`id` of GLOBAL_POSITION_SENSOR; 0 is none to PX4.",
+            "EKF2_AGP0_ID of PX4 is another",
+        ),
     },
     "log": {
         "folder": ("Folder of the flight logs.", "logs go to another disk"),

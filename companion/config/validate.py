@@ -113,6 +113,13 @@ def find_mistakes(config: Config) -> Iterator[tuple[str, str, str]]:
             "component_id",
             "link.component_id = 1 is the component of the autopilot: give another, for example 191",
         )
+    is_sent = config.output.rates_hz[MESSAGES["global_position_sensor"]] > 0.0
+    if is_sent and config.output.global_position_sensor_id == 0:
+        yield (
+            "output",
+            "global_position_sensor_id",
+            "output.global_position_sensor_id = 0: EKF2_AGP0_ID = 0 is PX4's for no sensor; give 1 to 255",
+        )
     if list(ahead) != (ascending := sorted(set(ahead))):
         yield (
             "predictor",

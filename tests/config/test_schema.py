@@ -234,6 +234,10 @@ def test_no_prediction_ahead_and_the_ends_of_the_message_ids_are_accepted() -> N
             "gnss.every_s = 10 leaves 10 s between fixes, and GNSS counts as absent after gnss.timeout_s = "
             "3 s: set gnss.timeout_s above 10",
         ),
+        (
+            ["output.profile=px4", "output.global_position_sensor_id=0"],
+            "output.global_position_sensor_id = 0: EKF2_AGP0_ID = 0 is PX4's for no sensor",
+        ),
         (["rates.gnss_hz=0.2"], "rates.gnss_hz = 0.2 leaves 5 s between fixes, and GNSS counts as absent"),
     ],
 )
