@@ -28,7 +28,7 @@ from companion.analysis.html import BOOTED_NS
 from companion.analysis.jobs import Journal, run_jobs
 from companion.analysis.progress import show_count
 from companion.analysis.replay_inputs import has_navigator_outputs, is_own_log
-from companion.analysis.summary import longest_outage, worst_of
+from companion.analysis.summary import longest_outage, rms_after_start, worst_of
 from companion.analysis.verdict import judge_flight
 from companion.analysis.worker_options import worker_options
 from companion.config import Config, load, to_toml
@@ -120,7 +120,7 @@ def _row(name: str, a: Assessment) -> FlightRow:
         solutions=len(a.flight.tables["Solution"]["t"]),
         gnss_outage_s=round(longest_outage(a), 3),
         reference=a.reference and a.reference.what,
-        rms_m=None if corrected is None else error_statistics.root_mean_square(corrected.error),
+        rms_m=rms_after_start(a, error_statistics.CORRECTED),
         largest_m=None if corrected is None else worst_of(a).estimate,
         ins_largest_m=None if ins is None else float(ins.error.max()),
         phases_held=sum(held),

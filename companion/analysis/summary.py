@@ -86,11 +86,22 @@ def worst_of(a: Assessment) -> Worst:
     farthest = max((d for d in far if math.isfinite(d)), default=math.nan)
     if corrected is None:
         return Worst(math.nan, math.nan, farthest, math.nan)
-    first = int(np.searchsorted(corrected.t_ns, _started_ns(a)))
-    first = first if first < len(corrected.t_ns) else 0
+    first = _first_counted(a, corrected)
     k = first + int(np.argmax(corrected.error[first:]))
     starting = float(corrected.error[:first].max()) if first else math.nan
     return Worst(float(corrected.error[k]), corrected.t_ns[k] * 1e-9, farthest, starting)
+
+
+def rms_after_start(a: Assessment, source: str) -> float | None:
+    """Return the r.m.s. distance of a source from the reference over what `worst_of` counts, m."""
+    series = a.errors.get(source)
+    return None if series is None else root_mean_square(series.error[_first_counted(a, series) :])
+
+
+def _first_counted(a: Assessment, series: error_statistics.ErrorSeries) -> int:
+    """Return the index of the first error that counts: not one of a start by beacons alone."""
+    first = int(np.searchsorted(series.t_ns, _started_ns(a)))
+    return first if first < len(series.t_ns) else 0
 
 
 def _started_ns(a: Assessment) -> int:
@@ -170,13 +181,18 @@ RESTS_ON = (WITH_GNSS, BY_BEACONS, WITHOUT, OTHERWISE) = (
 
 
 def rms_by_source(a: Assessment) -> dict[str, float]:
-    """Return the r.m.s. distance from the reference (m) by what the position rests on, where there is any."""
+    """Return the r.m.s. distance from the reference (m) by what the position rests on, where there is any.
+
+    As in `worst_of`, a start by beacons alone does not count.
+    """
     corrected = a.errors.get(error_statistics.CORRECTED)
     if corrected is None:
         return {}
+    first = _first_counted(a, corrected)
+    t, error = corrected.t[first:], corrected.error[first:]
     errors: dict[str, list[Floats]] = {}
     for phase in a.phases:
-        errors.setdefault(_rests_on(phase.name), []).append(corrected.error[phase.covers(corrected.t)])
+        errors.setdefault(_rests_on(phase.name), []).append(error[phase.covers(t)])
     found = {how: np.concatenate(errors[how]) for how in RESTS_ON if how in errors}
     return {how: root_mean_square(error) for how, error in found.items() if len(error)}
 
@@ -236,12 +252,8 @@ def _error_sentences(a: Assessment) -> list[str]:
     if corrected is None or a.reference is None:
         return ["There is nothing to compare the estimate with: its accuracy is unknown."]
     parts = [f"{format_length(rms)} {how}" for how, rms in rms_by_source(a).items()]
-    ins = a.errors.get(error_statistics.INS)
-    beside = (
-        f"; the inertial channel alone {format_length(root_mean_square(ins.error))}"
-        if ins is not None
-        else ""
-    )
+    ins = rms_after_start(a, error_statistics.INS)
+    beside = "" if ins is None else f"; the inertial channel alone {format_length(ins)}"
     subject = f"The {deviation(a)} of the estimate"
     subject += "" if a.against_truth else f" from {a.reference.what}"
     worst = worst_of(a)

@@ -41,6 +41,7 @@ from companion.analysis.summary import (
     format_duration,
     format_length,
     format_time,
+    rms_after_start,
     rms_by_source,
     summarize_flight,
     worst_of,
@@ -797,8 +798,10 @@ def test_the_greatest_error_is_not_that_of_a_single_beacon_before_gnss(first, se
     assert [phase.name for phase in a.phases] == ["RSBN", "GNSS", "prediction", "GNSS"]
     assert format_length(worst_of(a).estimate) == greatest
     (found,) = [text for text in summarize_flight(a) if "(r.m.s.)" in text]
-    assert "by beacons alone" in found
+    assert ("by beacons alone" in found) == (before == ")")
     assert re.search(rf"{greatest} at most \(\d+:\d\d{re.escape(before)}", found)
+    assert max(rms_by_source(a).values()) <= worst_of(a).estimate
+    assert rms_after_start(a, error_statistics.CORRECTED) <= worst_of(a).estimate
 
 
 def test_no_number_of_the_text_is_greater_than_the_cards(assessed):
