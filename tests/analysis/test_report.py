@@ -48,6 +48,7 @@ from companion.analysis.summary import (
 )
 from companion.analysis.verdict import judge_flight
 from companion.config import Config, load, to_toml
+from companion.nav.earth import radii
 from companion.nav.geometry import displace
 from companion.records import (
     INPUTS,
@@ -946,6 +947,24 @@ def test_names_of_rows_are_not_cut(page, width, browser):
     })()""")
     assert wanted > 100.0
     assert room >= wanted
+
+
+@pytest.mark.parametrize("lat_deg", [0.0, -35.0, 60.0])
+def test_the_map_reads_the_coordinates_of_its_points(page, lat_deg, browser):
+    """With 111320 m in every degree a point 50 km off was read up to 340 m off."""
+    R_N, R_E = radii(math.radians(lat_deg))
+    lat = lat_deg + math.degrees(50_000.0 / R_N)
+    lon = 149.0 + math.degrees(30_000.0 / (R_E * math.cos(math.radians(lat_deg))))
+    browser.open(page.as_uri())
+    browser.wait_for("document.documentElement?.dataset.drawn")
+    text = browser.evaluate(f"""(() => {{
+        const map = Group.last.maps[0];
+        map.figure.origin = [{lat_deg}, 149.0];
+        map.figure.lines = [{{ name: "point", x: [30000], y: [50000], t: [0], colour: ["#000", "#fff"] }}];
+        map.read(...map.pixel(30000, 50000));
+        return map.hover.querySelector("i").textContent;
+    }})()""")
+    assert [float(part) for part in text.replace("°", "").split(",")] == pytest.approx([lat, lon], abs=2e-5)
 
 
 def test_print_has_every_row_of_long_tables(page, browser):

@@ -32,6 +32,13 @@ function element(tag, attributes = {}, ...children) {
   return found;
 }
 
+/** Metres in a degree north and east at a latitude (deg), WGS 84: those that the map was made with. */
+function metresPerDegree(lat) {
+  const radian = Math.PI / 180, e2 = 0.00669437999014, w = 1 - e2 * Math.sin(lat * radian) ** 2;
+  const radius = 6378137 / Math.sqrt(w);
+  return [radius * (1 - e2) / w * radian, radius * Math.cos(lat * radian) * radian];
+}
+
 /** Index of the value nearest to t in an increasing list. */
 function nearest(list, t) {
   let low = 0, high = list.length - 1;
@@ -382,8 +389,8 @@ class Plan {
     });
     this.hover.hidden = !best;
     if (!best) return;
-    const [line, i] = best, [lat, lon] = this.figure.origin, metres = 111320;
-    const north = lat + line.y[i] / metres, east = lon + line.x[i] / (metres * Math.cos((lat * Math.PI) / 180));
+    const [line, i] = best, [lat, lon] = this.figure.origin, [perNorth, perEast] = metresPerDegree(lat);
+    const north = lat + line.y[i] / perNorth, east = lon + line.x[i] / perEast;
     this.hover.replaceChildren(element("b", {}, line.name), `${clock(line.t[i], true)} min:s`, element("i", {}, `${north.toFixed(5)}°, ${east.toFixed(5)}°`));
     this.hover.style.left = `${Math.min(px + 14, this.width - 170)}px`;
     this.hover.style.top = `${Math.max(4, py - 60)}px`;
