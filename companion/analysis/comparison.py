@@ -44,7 +44,7 @@ class OutputComparison:
             self.apart_m = max(self.apart_m, apart)
             if then != again and (self.exact or apart > POSITION_M or not _close_records(then, again)):
                 self.different += 1
-                self.first = self.first or _shortened(f"in flight {then}, now {again}")
+                self.first = self.first or _describe(then, again)
         flown.clear()
         now.clear()
 
@@ -79,5 +79,14 @@ def _close(a: Any, b: Any, relative: float) -> bool:
     return bool(a == b)
 
 
-def _shortened(text: str) -> str:
-    return text if len(text) <= SHOWN else f"{text[:SHOWN]} ..."
+def _describe(then: Any, again: Any) -> str:
+    """Describe how two outputs differ: by the fields that differ, if both are of one kind."""
+    if type(then) is not type(again):
+        return f"in flight {_shortened(str(then), SHOWN // 2)}, now {_shortened(str(again), SHOWN // 2)}"
+    pairs = ((name, getattr(then, name), getattr(again, name)) for name in then.__struct_fields__)
+    apart = "; ".join(f"{name} in flight {a!r}, now {b!r}" for name, a, b in pairs if a != b)
+    return _shortened(f"{type(then).__name__}, t_ns {then.t_ns}: {apart}")
+
+
+def _shortened(text: str, most: int = SHOWN) -> str:
+    return text if len(text) <= most else f"{text[:most]} ..."

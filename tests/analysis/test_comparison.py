@@ -63,3 +63,16 @@ def test_the_first_difference_is_shortened() -> None:
     found = compare(True, structs.replace(SOLUTION, lat=1.1))
     assert found.first is not None
     assert len(found.first) < 320
+
+
+def test_the_first_difference_is_shown_with_both_values() -> None:
+    """Of a Solution 300 characters are not even all of the one in flight."""
+    found = compare(True, structs.replace(SOLUTION, protection=41.5, horizon_s=2.0))
+    apart = "horizon_s in flight 0.0, now 2.0; protection in flight None, now 41.5"
+    assert found.first == f"Solution, t_ns 1: {apart}"
+    text = "inertial channel: own, by what arrives of imu, air data; no guaranteed bound by "
+    found = compare(True, Event(1, 2, 6, f"{text}IMU"), Event(1, 2, 6, f"{text}imu"))
+    assert found.first is not None and f"{text}imu" in found.first and f"{text}IMU" in found.first
+    missing = OutputComparison(True)
+    missing.add([SOLUTION], [])
+    assert missing.first is not None and missing.first.endswith(", now None") and len(missing.first) < 320
