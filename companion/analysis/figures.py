@@ -95,7 +95,7 @@ def _error(axes: _Axes) -> Figure:
             if (e := a.errors.get(source)) is not None:
                 error = np.maximum(e.error, 0.01)
                 lines.append(axes.line(prefix + name, source, which, e.t, error, style=style))
-        if (e := a.errors.get(error_statistics.CORRECTED)) is not None:
+        if (e := a.errors.get(error_statistics.CORRECTED)) is not None and np.isfinite(e.bound).any():
             lines.append(axes.line(f"{prefix}guaranteed bound", "bound", which, e.t, e.bound, dash=True))
         if axes.alone and np.isfinite((s := a.flight.tables["Solution"])["protection"]).any():
             level = s["protection"]
@@ -108,7 +108,7 @@ def _error(axes: _Axes) -> Figure:
         else f"Distance from {' or '.join(references) or 'a reference'}",
         "m",
         lines,
-        f"Logarithmic. Shaded: no fixes. {_limits(axes)}",
+        f"Logarithmic. {'Shaded: no fixes. ' * axes.alone}{_limits(axes)}",
         log=True,
     )
 

@@ -376,6 +376,17 @@ def test_the_last_moment_belongs_to_the_last_phase():
     assert without == pytest.approx(math.sqrt((149 * 5.0**2 + 500.0**2) / 150), rel=1e-3)
 
 
+def test_a_figure_names_only_what_it_draws(assessed):
+    """A flight without a bound had one in its legend; flights that are compared have no shaded times."""
+    bare = collected(
+        msgspec.structs.replace(r, bound_n=None) if isinstance(r, Solution) else r for r in flight_records()
+    )
+    for flights, bounds in (([assessed], 1), ([bare], 0), ([assessed, bare], 1)):
+        (figure,) = (figure for figure in build_figures(flights) if figure.key == "error")
+        assert sum(line.name.endswith("guaranteed bound") for line in figure.lines) == bounds
+        assert ("Shaded" in figure.note) == bool(figure.spans)
+
+
 @pytest.mark.parametrize("seconds", [3, 12, 121])
 def test_a_steady_message_has_one_rate_to_the_end_of_the_chart(seconds):
     """Five estimates a second."""
