@@ -978,6 +978,22 @@ def test_the_map_reads_the_coordinates_of_its_points(page, lat_deg, browser):
     assert [float(part) for part in text.replace("°", "").split(",")] == pytest.approx([lat, lon], abs=2e-5)
 
 
+@pytest.mark.parametrize("width", [1280, 390])
+def test_a_beacon_beyond_the_map_is_clear_of_the_buttons(page, width, browser):
+    """Its arrow and its name were behind them."""
+    browser.open(page.as_uri(), width)
+    browser.wait_for("document.documentElement?.dataset.drawn")
+    reached, buttons = browser.evaluate("""(() => {
+        const map = Group.last.maps[0], reached = [], buttons = map.box.querySelector(".buttons").offsetLeft;
+        const real = map.canvas.getContext("2d"), note = (x) => reached.push(x);
+        const ctx = { beginPath() {}, fill() {}, moveTo: note, lineTo: note, measureText: (t) => real.measureText(t) };
+        map.text = (c, text, x) => note(x + real.measureText(text).width);
+        for (const py of [-500, 0, 150, 250, 400, 5000]) map.place(ctx, "beacon 12", ...map.world(9000, py));
+        return [Math.max(...reached), buttons];
+    })()""")
+    assert 250.0 < reached <= buttons
+
+
 def test_print_has_every_row_of_long_tables(page, browser):
     browser.open(page.as_uri())
     browser.wait_for("document.documentElement?.dataset.drawn")

@@ -465,13 +465,14 @@ class Plan {
       return;
     }
     const dx = px - this.width / 2, dy = py - this.height / 2;
-    const k = Math.min((this.width / 2 - 22) / Math.abs(dx || 1e-9), (this.height / 2 - 22) / Math.abs(dy || 1e-9));
+    const side = dx > 0 ? 60 : 22;  // right of it are the buttons
+    const k = Math.min((this.width / 2 - side) / Math.abs(dx || 1e-9), (this.height / 2 - 22) / Math.abs(dy || 1e-9));
     px = this.width / 2 + dx * k; py = this.height / 2 + dy * k;
     const angle = Math.atan2(dy, dx), at = (r, a) => [px + r * Math.cos(angle + a), py + r * Math.sin(angle + a)];
     ctx.moveTo(...at(11, 0)); ctx.lineTo(...at(8, 2.4)); ctx.lineTo(...at(8, -2.4)); ctx.fill();
     const km = Math.hypot(x - this.view.x, y - this.view.y) / 1000, label = `${name}, ${km >= 10 ? km.toFixed(0) : km.toFixed(1)} km`;
     const room = ctx.measureText(label).width;
-    this.text(ctx, label, Math.min(Math.max(4, px - room / 2), this.width - room - 4), py > this.height / 2 ? py - 14 : py + 24);
+    this.text(ctx, label, Math.min(Math.max(4, px - room / 2), this.width - room - 50), py > this.height / 2 ? py - 14 : py + 24);
   }
 
   aircraft(ctx, x, y, heading) {
