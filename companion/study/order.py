@@ -28,12 +28,13 @@ from companion.estimate.polynomial import (
 )
 from companion.importers.sources import LOG_SUFFIXES
 from companion.option_types import FloatRange
-from companion.records import Stamped
+from companion.records import Gnss, Stamped
 from companion.storage import flight_log
 from companion.study.plot_options import PLOT_FILE
 from companion.tables import number_table, print_tables
 from companion.units import Floats
 
+OF_A_FIX = ("lat", "lon", "alt_msl", "v_n", "alt")  # fields of Gnss that are nothing without one
 SPAN_S = 10.0
 SIGMA = 0.2
 
@@ -113,6 +114,8 @@ def read_log(log: Path, topic: str, field: str, sigma: float | None) -> Samples:
             names.add(where)
             if topic in (where, type(record).__name__):
                 value = _field(record, field)
+                if isinstance(record, Gnss) and not record.has_3d_fix and field.split(".")[0] in OF_A_FIX:
+                    continue
                 if value is not None and math.isfinite(value):
                     values.append((record.t_ns, value))
     if not values:

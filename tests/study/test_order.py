@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from companion.records import Gnss
+from companion.study import order
 from companion.study.order import Samples, command, errors_by_order, noise_of, read_log, study, synthetic
 
 
@@ -139,6 +141,15 @@ def test_column_of_a_log(log):
         assert 0.0 < samples.sigma[0] < 1.0  # m/s, of an airspeed sensor
     east = read_log(log, "Gnss", "v_n.1", 0.1)
     assert set(east.sigma) == {0.1}
+
+
+def test_a_receiver_without_a_fix_has_no_position(monkeypatch):
+    """It sends 0 deg and 0 m: samples, and an estimate of the noise, of nothing."""
+    rows = [Gnss(k * 10**9, 0, 0, 0, 3 * (k > 3), 0.9 * (k > 3), 0.6, 150.0 * (k > 3)) for k in range(20)]
+    monkeypatch.setattr(order, "_messages", lambda log: (("/in/Gnss", row) for row in rows))
+    assert set(read_log(pathlib.Path("x"), "Gnss", "alt_msl", 1.0).z) == {150.0}
+    assert read_log(pathlib.Path("x"), "Gnss", "lat", None).sigma[0] < 1e-8
+    assert set(read_log(pathlib.Path("x"), "Gnss", "fix", 1.0).z) == {0.0, 3.0}
 
 
 def test_track_of_a_log_is_cut_into_windows(log, tmp_path):
