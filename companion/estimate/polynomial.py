@@ -51,6 +51,10 @@ class Curve(NamedTuple):
     sigma: Floats
 
 
+class DependentFunctions(ValueError):
+    """The samples are too unevenly spread to tell the functions apart."""
+
+
 class Basis(NamedTuple):
     """Orthonormal functions psi_j (6.5.6): a family on [start, start + span], times `mix`.
 
@@ -178,7 +182,7 @@ def orthonormal_basis(t: Floats, sigma: Floats, family: Family, r: int) -> Basis
     start, span = float(t[0]), float(t[-1] - t[0])
     R = np.linalg.qr(root[:, None] * _raw(family, (nodes - start) / span, r), mode="r")
     if np.linalg.cond(R) > 1e12:
-        raise ValueError(f"{r} functions of the {family} basis are nearly dependent: take fewer")
+        raise DependentFunctions(f"{r} functions of the {family} basis are nearly dependent: take fewer")
     return Basis(family, start, span, np.linalg.inv(R * np.sign(np.diag(R))[:, None]))
 
 
@@ -218,7 +222,9 @@ def select_order(
     functions = orthonormal_basis(t, sigma, basis, r_max)
     Q, R = np.linalg.qr(functions(t) / sigma[:, None])  # C_r = R_r' R_r, never formed
     if np.linalg.cond(R) > 1e8:
-        raise ValueError(f"the samples do not distinguish {r_max} functions of the {basis} basis: take fewer")
+        raise DependentFunctions(
+            f"the samples do not distinguish {r_max} functions of the {basis} basis: take fewer"
+        )
     y = z / sigma
     b = Q.T @ y
     inverse = np.linalg.inv(R)  # inverse of a leading block is the leading block
@@ -259,8 +265,9 @@ def smooth_track(
     """Smooth a track of unknown shape.
 
     Its span is cut into 1, 2, 4, .. windows until r_max functions explain each to within the noise, or one
-    would hold fewer than 2 r_max samples. Windows overlap by half and are blended by cos^2, so that the track
-    has no joints; their sigmas are blended in the same way, an upper bound.
+    would hold fewer than 2 r_max samples, or, beside a gap, too unevenly spread ones. Windows overlap by half
+    and are blended by cos^2, so that the track has no joints; their sigmas are blended in the same way, an
+    upper bound.
 
     Parameters
     ----------
@@ -286,12 +293,17 @@ def smooth_track(
         If the samples are not usable.
     """
     samples = _samples(t, z, sigma, basis, r_max)
-    count = 1
-    while True:
-        found, explained = _windowed(samples, basis, r_max, count)
+    found, explained = _windowed(samples, basis, r_max, 1)
+    count = 2
+    while not explained and all(
+        inside.stop - inside.start >= 2 * r_max for inside in _windows(samples.t, count)
+    ):
+        try:
+            found, explained = _windowed(samples, basis, r_max, count)
+        except DependentFunctions:
+            break
         count *= 2
-        if explained or min(len(samples.t[inside]) for inside in _windows(samples.t, count)) < 2 * r_max:
-            return found
+    return found
 
 
 def _windows(t: Floats, count: int) -> list[slice]:

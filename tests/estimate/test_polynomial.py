@@ -127,6 +127,17 @@ def test_an_unknown_track_is_smoothed_without_joints() -> None:
     assert abs(np.diff(found.x, 2)).max() < 3.0 * abs(np.diff(truth, 2)).max() + 0.1
 
 
+def test_a_track_with_a_gap_is_cut_as_far_as_its_samples_allow() -> None:
+    """Of two windows the second would have two samples, a gap, and fifty in its last eighth."""
+    rng = np.random.default_rng(1)
+    t = np.arange(0.0, 160.0, 0.2)
+    t = t[(t < 80.3) | (t > 150.0)]
+    truth = 50.0 * np.sin(t / 3.0)
+    found = smooth_track(t, truth + rng.standard_normal(truth.shape), 1.0, r_max=12)
+    assert found.windows == 1
+    assert np.isfinite(found.x).all() and found.consistency > 2.0
+
+
 def test_a_simple_track_takes_one_window() -> None:
     rng = np.random.default_rng(1)
     t = np.arange(0.0, 60.0)
