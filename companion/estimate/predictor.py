@@ -369,7 +369,7 @@ class Window(NamedTuple):
         """Append a fix in the interval that ends at the last node; drop those `span_s` before it."""
         fix = Fix(t_s, len(self.t_s) - 1, rows, values, sigmas)
         kept = [f for f in self.fixes if f.t_s >= t_s - span_s]
-        first = max(kept[0].node - 1, 0) if kept else len(self.t_s) - 1
+        first = max((kept[0].node if kept else len(self.t_s) - 1) - 1, 0)
         fixes = tuple(f._replace(node=f.node - first) for f in (*kept, fix))
         return Window(self.t_s[first:], self.C[first:], self.S[first:], self.sigma[first:], self.P, fixes)
 

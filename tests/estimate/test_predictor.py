@@ -233,14 +233,16 @@ def test_dead_reckoning_has_its_own_law() -> None:
     assert wander < bound < 2.0 * wander
 
 
+@pytest.mark.parametrize("count", [30, 2, 1])
 @pytest.mark.parametrize("before_s", [6.0, 1.0])
-def test_what_comes_up_between_a_fix_and_the_end_of_its_interval_counts(before_s: float) -> None:
+def test_what_comes_up_between_a_fix_and_the_end_of_its_interval_counts(before_s: float, count: int) -> None:
     """A velocity error that wanders, integrated by the estimate's own weights on the fixes.
 
-    The bound of an airspeed channel was a quarter below what is attained.
+    The bound of an airspeed channel was a quarter below what is attained; of a window of one fix too.
     """
     law, at_rest = BoundedDrift(8.0, 0.1, wander=0.7, wander_s=20.0, correlation_s=5.0), (0.0, 0.0)
-    window, times, end = Window.begin(0.0, law), np.arange(10.0, 310.0, 10.0) - before_s, 300.0
+    window, end = Window.begin(0.0, law), 10.0 * count
+    times = np.arange(10.0, end + 5.0, 10.0) - before_s
     position = np.eye(law.n)[:2]
     position[:, 2:4] = -before_s * np.eye(2)
     for t in times:
@@ -255,6 +257,16 @@ def test_what_comes_up_between_a_fix_and_the_end_of_its_interval_counts(before_s
         constant = abs(north @ (end - times)) * window.sigma[-1][2]
         worst = np.abs(north).sum() * 2.0 + np.abs(left) @ law.bound(s - end) * 0.05 + constant
         assert worst * (1.0 - 1e-3) < found.bound < 1.01 * worst
+
+
+def test_a_first_fix_after_all_others_are_dropped_keeps_its_interval() -> None:
+    law, at_rest = BoundedDrift(8.0, 0.1, wander=0.7, wander_s=20.0, correlation_s=5.0), (0.0, 0.0)
+    window = Window.begin(0.0, law)
+    for t in (10.0, 20.0, 30.0):
+        window = window.extend(t, *law.step(Motion(0.8, at_rest, at_rest, 10.0)))
+        window = window.with_fix(t - 5.0, np.eye(law.n)[:2] @ window.C[-1], np.zeros(2), np.full(2, 2.0), 3.0)
+        assert window.t_s == (t - 10.0, t)
+        assert [fix.node for fix in window.fixes] == [1]
 
 
 def test_without_fixes_there_is_nothing_to_predict() -> None:
