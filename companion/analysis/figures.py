@@ -23,6 +23,7 @@ from companion.analysis.plot_data import (
     Line,
     Mark,
     Style,
+    cut_at_gaps,
     subsample,
     thin_line,
 )
@@ -51,13 +52,21 @@ class _Axes:
         yield from zip(range(len(self.flights)), self.flights, self.prefixes, strict=True)
 
     def line(self, name: str, role: str, which: int, t: Floats, y: Floats, **more: object) -> Line:
-        """Build a line over time, in order of time."""
-        if len(t) > 1 and not (np.diff(t) > 0.0).all():
-            t, last = np.unique(t[::-1], return_index=True)  # of two at the same time the later one holds
-            y = y[::-1][last]
-        x, y = thin_line(np.asarray(t, dtype=np.float64), y)
-        colour = COLOURS[role] if self.alone else LOGS[which % len(LOGS)]
-        return Line(name, x, y, colour, **more)  # type: ignore[arg-type]
+        """Build a line over time, in order of time, with a gap where nothing came."""
+        t, y = _in_order(t, y)
+        x, y = thin_line(t, y)
+        if more.get("style") != "dots":
+            x, y = cut_at_gaps(x, t, flight_events.longest_step(t), y)
+        return Line(name, x, y, self._colour(role, which), **more)  # type: ignore[arg-type]
+
+    def bar(self, name: str, role: str, which: int, t: Floats, y: Floats) -> Line:
+        """Build a bar over time: from and to where y is known and something came."""
+        t, y = _in_order(t, y)
+        x, y = thin_line(*_runs(*cut_at_gaps(t, t, flight_events.longest_step(t), y)))
+        return Line(name, x, y, self._colour(role, which), width=8.0)
+
+    def _colour(self, role: str, which: int) -> tuple[str, str]:
+        return COLOURS[role] if self.alone else LOGS[which % len(LOGS)]
 
     def over_time(
         self, key: str, title: str, unit: str, lines: list[Line], note: str = "", **more: object
@@ -77,6 +86,15 @@ class _Axes:
     def _marks(self) -> tuple[Mark, ...]:
         entries = sorted(self.flights[0].timeline, key=lambda entry: entry.severity)[:MARKS]
         return tuple(Mark(e.t, e.text, e.severity <= Severity.WARNING) for e in sorted(entries))
+
+
+def _in_order(t: Floats, y: Floats) -> tuple[Floats, Floats]:
+    """Return times and values in order of time; of two at the same time the later one holds."""
+    t = np.asarray(t, dtype=np.float64)
+    if len(t) > 1 and not (np.diff(t) > 0.0).all():
+        t, last = np.unique(t[::-1], return_index=True)
+        y = y[::-1][last]
+    return t, y
 
 
 # -- errors ----------------------------------------------------------------------------------------------
@@ -254,8 +272,7 @@ def _sources(axes: _Axes) -> Figure:
             if on.any():
                 rows.append(prefix + name)
                 y = np.where(on, float(len(rows)), np.nan)
-                t, y = _runs(s["t"], y)
-                lines.append(axes.line(rows[-1], role, which, t, y, width=8.0))
+                lines.append(axes.bar(rows[-1], role, which, s["t"], y))
         for source in dict.fromkeys(r.source for r in a.flight.rejections):
             rows.append(f"{prefix}rejected: {flight_events.source_title(source)}")
             t = subsample(np.array([r.t for r in a.flight.rejections if r.source == source]))

@@ -103,11 +103,16 @@ def rests_on_beacons(flight: Flight) -> npt.NDArray[np.bool_]:
     return found
 
 
+def longest_step(t: Floats) -> float:
+    """Return the longest time between two rows of a table that follow each other without a gap, s."""
+    return max(PHASE_MIN_S, 3.0 * float(np.median(np.diff(t)))) if len(t) > 1 else PHASE_MIN_S
+
+
 def split_phases(solution: Table, seconds: float) -> list[error_statistics.FlightPhase]:
     """Split the flight into phases by the sources of the position: fixes, prediction, untrusted, or none."""
     names, starts = list[str](), list[float]()
     times = np.maximum.accumulate(solution["t"])
-    longest = max(PHASE_MIN_S, 3.0 * float(np.median(np.diff(times)))) if len(times) > 1 else PHASE_MIN_S
+    longest = longest_step(times)
     t = times.tolist()
     for mode, sources, now, later in zip(solution["mode"], solution["sources"], t, [*t[1:], seconds]):
         missing = later - now > longest

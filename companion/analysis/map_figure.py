@@ -13,7 +13,16 @@ import numpy as np
 from companion.analysis import error_statistics, flight_events
 from companion.analysis.assessment import Assessment
 from companion.analysis.flight_arrays import Table
-from companion.analysis.plot_data import COLOURS, LOGS, Figure, Line, PlacedName, Style, subsample
+from companion.analysis.plot_data import (
+    COLOURS,
+    LOGS,
+    Figure,
+    Line,
+    PlacedName,
+    Style,
+    cut_at_gaps,
+    subsample,
+)
 from companion.units import Floats
 
 ELLIPSES = 9
@@ -88,9 +97,13 @@ def _estimate(
 def _line(
     plane: Assessment, name: str, role: str, table: Table, style: Style = "line", width: float = 1.6
 ) -> Line:
-    north, east = plane.north_east(subsample(table["lat"]), subsample(table["lon"]))
+    t, lat, lon = (subsample(table[column]) for column in ("t", "lat", "lon"))
+    if style != "dots":
+        times = np.maximum.accumulate(table["t"])
+        t, lat, lon = cut_at_gaps(t, times, flight_events.longest_step(times), lat, lon)
+    north, east = plane.north_east(lat, lon)
     east = np.where(np.isfinite(north), east, np.nan)
-    return Line(name, east, north, COLOURS[role], style, width=width, t=subsample(table["t"]))
+    return Line(name, east, north, COLOURS[role], style, width=width, t=t)
 
 
 def _ellipses(plane: Assessment, a: Assessment) -> Line:

@@ -116,6 +116,17 @@ def thin_line(x: Floats, y: Floats, most: int = MAX_POINTS) -> tuple[Floats, Flo
     return x[keep], y[keep]
 
 
+def cut_at_gaps(kept: Floats, times: Floats, longest: float, *columns: Floats) -> tuple[Floats, ...]:
+    """Return the `kept` of `times` and the columns of these, with NaN in the steps longer than `longest` (s).
+
+    A line is not drawn there.
+    """
+    long = np.flatnonzero(np.diff(times) > longest)
+    middles = 0.5 * (times[long] + times[long + 1])
+    at = np.searchsorted(kept, middles)
+    return np.insert(kept, at, middles), *(np.insert(column, at, np.nan) for column in columns)
+
+
 def subsample(a: Floats) -> Floats:
     """Return at most `MAX_POINTS` values, evenly spaced."""
     return a[:: max(1, math.ceil(len(a) / MAX_POINTS))]

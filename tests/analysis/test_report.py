@@ -387,6 +387,20 @@ def test_a_figure_names_only_what_it_draws(assessed):
         assert ("Shaded" in figure.note) == bool(figure.spans)
 
 
+def test_nothing_is_drawn_where_nothing_came():
+    """The autopilot is silent for a minute: a line across it would be an estimate that there was not."""
+    a = collected([r for r in flight_records() if not 30.0 < (r.rx_ns - START) / S < 90.0])
+    assert [phase.name for phase in a.phases][:3] == ["GNSS", "no estimate", "GNSS"]
+    found = {figure.key: figure for figure in build_figures([a])}
+    for key in ("map", "error", "bound", "consistency", "inertial_north", "inertial_east", "sources"):
+        for line in found[key].lines:
+            t, y = line.t if key == "map" else line.x, line.y
+            if line.style == "dots" or t is None:
+                continue
+            drawn = np.isfinite(y[:-1] + y[1:])
+            assert drawn.any() and not drawn[(t[:-1] < 60.0) & (t[1:] > 60.0)].any(), (key, line.name)
+
+
 @pytest.mark.parametrize("seconds", [3, 12, 121])
 def test_a_steady_message_has_one_rate_to_the_end_of_the_chart(seconds):
     """Five estimates a second."""
