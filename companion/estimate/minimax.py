@@ -171,8 +171,8 @@ def closed_form_tau(T: float, alpha: float, sigma: float = 1.0) -> ClosedForm:
     bounds = np.array([u(c) - c * versine, math.sin(c), _cos_difference(t1, c), math.cos(t1)])
     bounds = sigma / D * np.abs(bounds)
     alternating = weights * (1.0, -1.0, 1.0, -1.0)
-    alternating *= np.sign(alternating.sum(axis=1, keepdims=True))
-    holds = (alternating.min(axis=1) >= -1e-14 * np.abs(weights).sum(axis=1)) & (h + t1 < 2.0 * math.pi)
+    least = np.maximum(alternating.min(axis=1), -alternating.max(axis=1))
+    holds = (least >= -1e-14 * np.abs(weights).sum(axis=1)) & (h + t1 < 2.0 * math.pi)
     instants = np.tile(times, (4, 1))
     for k in np.flatnonzero(~holds):
         optimum = continuous_tau(T, alpha, np.eye(4)[k], sigma)

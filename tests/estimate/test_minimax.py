@@ -153,6 +153,16 @@ def test_closed_form_equals_the_general_solver_everywhere(T, alpha):
             assert (result.instants[k] == result.times).all()
 
 
+@pytest.mark.parametrize("T", [0.02, 0.7, 2.0, 6.3, 9.0])
+def test_closed_form_in_the_middle_of_the_window_is_the_optimum(T):
+    """There the alternating sum of the weights of gamma and phi is zero, and so are the printed bounds."""
+    result = closed_form_tau(T, -0.5 * T)
+    assert {"gamma", "phi"} <= set(result.fallback)
+    for k in range(4):
+        assert result.bounds[k] == pytest.approx(np.abs(result.weights[k]).sum(), rel=REFERENCE_DIGITS)
+        assert result.bounds[k] == pytest.approx(continuous_tau(T, -0.5 * T, UNITS[k]).bound, rel=1e-9)
+
+
 def test_closed_form_is_accurate_in_a_very_short_window():
     """h -> 0: chi -> T/4 and the bounds go as powers of T: the channel becomes a cubic."""
     short, shorter = closed_form_tau(1e-5, 0.0), closed_form_tau(5e-6, 0.0)
