@@ -319,7 +319,8 @@ def local_to_geodetic(projection: Projection, origin: Geodetic, x_n: Sequence[fl
         if c == 0.0:
             return Geodetic(lat_0, lon_0, alt_0 - down)
         x, y = north / _PX4_R * math.sin(c) / c, east / _PX4_R * math.sin(c) / c
-        lat = math.asin(math.cos(c) * math.sin(lat_0) + x * math.cos(lat_0))
+        sine = math.cos(c) * math.sin(lat_0) + x * math.cos(lat_0)
+        lat = math.asin(max(-1.0, min(sine, 1.0)))  # beyond 1 by rounding at a pole
         dlon = math.atan2(y, math.cos(lat_0) * math.cos(c) - x * math.sin(lat_0))
         return Geodetic(lat, wrap_angle(lon_0 + dlon), alt_0 - down)
     if projection == "tangent":

@@ -192,6 +192,15 @@ def test_px4_at_its_origin() -> None:
     np.testing.assert_array_equal(geodetic_to_local("px4", origin, origin), np.zeros(3))
 
 
+@pytest.mark.parametrize("lat_deg", range(1, 90))
+def test_px4_reaches_a_pole(lat_deg: int) -> None:
+    for sign in (1.0, -1.0):
+        origin = degrees(sign * lat_deg, 8.0, 0.0)
+        north = (sign * math.pi / 2 - origin.lat) * 6371000.0
+        pole = local_to_geodetic("px4", origin, (north, 0.0, 0.0))
+        assert pole.lat == pytest.approx(sign * math.pi / 2, abs=1e-7)
+
+
 def test_the_flat_earths_disagree_by_more_than_a_beacon_error() -> None:
     """Why the projection is an input: 100 km north of the origin they are hundreds of metres apart."""
     origin, x_n = degrees(50.0, 10.0, 0.0), np.array([100e3, 0.0, 0.0])
