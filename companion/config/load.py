@@ -66,17 +66,13 @@ def load(
     """
     tree: dict[str, dict[str, Any]] = {}
     origin: dict[tuple[str, str], str] = {}
-    started = _preset(preset)
-    for name, value in started.items():
+    for name, value in _preset(preset).items():
         section, _, key = name.partition(".")
         tree.setdefault(section, {})[key] = value
         origin[section, key] = f"preset {preset}"
     for source in (path, tuned):
         if source is not None:
-            found = _read(source)
-            if source is path:
-                _check_preset(preset, started, found, path)
-            for section, table in found.items():
+            for section, table in _read(source).items():
                 tree.setdefault(section, {}).update(table)
                 origin |= {(section, key): str(source) for key in table}
     for name, text in (os.environ if environment is None else environment).items():
@@ -102,6 +98,7 @@ def load(
             raise ConfigError(f"--set {pair}: {section}.{key} is given twice, also as {first}: leave one out")
         tree.setdefault(section, {})[key] = _parse_value(text.strip())
         origin[section, key] = f"--set {pair}"
+    _check_preset(preset, tree, origin, path)
     config = _convert(tree, origin)
     _refuse(find_mistakes(config), origin)
     return config
@@ -137,19 +134,22 @@ def _preset(name: str | None) -> Mapping[str, Any]:
 
 
 def _check_preset(
-    preset: str | None, values: Mapping[str, Any], file: Mapping[str, Mapping[str, Any]], path: Path
+    preset: str | None,
+    tree: Mapping[str, Mapping[str, Any]],
+    origin: Mapping[tuple[str, str], str],
+    path: Path | None,
 ) -> None:
     """Refuse a file that takes away what the preset is for: its first key. One with every key does."""
+    values = _preset(preset)
     other = []
     for name, value in values.items():
         section, _, key = name.partition(".")
-        if file.get(section, {}).get(key, value) != value:
+        if origin[section, key] == str(path) and tree[section][key] != value:
             other.append(name)
-    if other and other[0] == next(iter(values)):
-        keys = " and ".join(filter(None, (", ".join(other[:-1]), other[-1])))
+    if next(iter(values), None) in other:
         raise ConfigError(
-            f"--preset {preset} has no effect: {path} overrides its {keys}; remove "
-            f"{'them' if other[1:] else 'it'} from the file, or leave the preset out"
+            f"--preset {preset} has no effect: {path} overrides its {', '.join(other)}; "
+            "remove that from the file, or leave the preset out"
         )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any, get_type_hints
 
@@ -114,6 +115,9 @@ def test_a_file_that_takes_a_preset_away_is_rejected(preset: str, tmp_path: Path
         load(file, preset=preset, environment={})
     assert f"--preset {preset} has no effect: {file} overrides its " in str(caught.value)
     assert all(name in str(caught.value) for name in PRESETS[preset].values)
+    (first, value), *_ = PRESETS[preset].values.items()
+    given_back = load(file, pairs=[f"{first}={json.dumps(value)}"], preset=preset, environment={})
+    assert given_back == load(file, pairs=[f"{first}={json.dumps(value)}"], environment={})
     file.write_text(CliRunner().invoke(cli, ["check-config", "--defaults", "--preset", preset]).output)
     assert load(file, preset=preset, environment={}) == load(preset=preset, environment={})
 
