@@ -21,7 +21,7 @@ SLOW = "the line is too slow, or a ground station sets other rates"
 NOTHING = "nothing arrives: the sensor (for positions of the EKF: a fix) is missing, or a router drops it"
 #: Index of the source in PX4's ESTIMATOR_SENSOR_FUSION_STATUS that a message of ours is.
 PX4_SOURCES = {"GLOBAL_POSITION_SENSOR": 3, "ODOMETRY": 2, "VISION_POSITION_ESTIMATE": 2}
-#: The finding on other autopilots: nothing is set on the one that happens to be heard first.
+#: The finding on other autopilots: nothing is set on the one that happens to come first.
 SEVERAL = "autopilots"
 
 

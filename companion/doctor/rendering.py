@@ -40,8 +40,8 @@ def parameter_table(diagnosis: Diagnosis) -> Table:
     for column in ("", "parameter", "has", "needs", "why"):
         numeric = column in ("has", "needs")
         table.add_column(column, justify="right" if numeric else "left", no_wrap=column in ("", "parameter"))
+    unread = "absent" if _is_answering(diagnosis) else "unread"
     for found in diagnosis.parameters:
-        unread = "absent" if _is_answering(diagnosis) else "unread"
         state = _GOOD if found.is_well else _BAD.format(unread if found.has is None else "wrong")
         why = found.need.why + (" (after a reboot)" if found.need.reboot else "")
         if found.trouble:

@@ -52,7 +52,7 @@ class Curve(NamedTuple):
 
 
 class DependentFunctions(ValueError):
-    """The samples are too unevenly spread to tell the functions apart."""
+    """The samples are too unevenly spread to distinguish the functions."""
 
 
 class Basis(NamedTuple):

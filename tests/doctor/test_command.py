@@ -234,7 +234,7 @@ def test_change_requires_confirmation(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "--apply sets them, once it is disarmed" in shown(armed)
 
 
-def test_nothing_is_set_on_whichever_of_two_vehicles_is_heard_first() -> None:
+def test_nothing_is_set_on_whichever_of_two_vehicles_comes_first() -> None:
     two = diagnosis(Finding("autopilots", "1, 2", "one", False, "set link.system_id"))
     assert "set link.system_id" in command.confirm_change(two, yes=True)
     chosen = diagnosis(Finding("autopilots", "1, 2", "one", True))

@@ -268,7 +268,7 @@ def test_right_parameters_of_px4_that_have_no_effect_yet_are_a_problem(
     while bench.now < SECOND:
         bench.step()
     bench.injected.append(fusion(*off))
-    assert "fusion of our position" not in problems(bench.look())  # the parameters are wrong: that is said
+    assert "fusion of our position" not in problems(bench.look())  # wrong parameters are reported
     after = bench.change()
     assert problems(after) - {"frames lost"} == {"fusion of our position"}
     assert "reboot" in found(after, "fusion of our position").advice
@@ -336,7 +336,7 @@ def test_line_that_carries_nothing_of_ours_is_recognised(make: str) -> None:
 
 
 def test_origin_that_is_requested_in_vain_is_no_missing_fix() -> None:
-    """PX4 sends its origin on request alone: where no request arrives, nobody has to wait for a fix."""
+    """PX4 sends its origin on request alone: where no request arrives, there is no fix to wait for."""
     bench = Bench("px4")
     bench.to_it, bench.to_us = lambda data: b"", without("GPS_GLOBAL_ORIGIN")
     diagnosis = bench.look()
