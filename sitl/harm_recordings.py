@@ -17,13 +17,17 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from msgspec.structs import replace
 
 from companion.config import Config, OutputConfig
+from companion.config.profiles import PROFILES
 from companion.importers import sources, tlog
 from companion.link import dialect, frame
 from companion.link.dialect import mavlink
 from companion.navigator import Navigator, inertial_track
-from companion.output.source_switch import COMPANION_SET, SourceSwitch
+from companion.output.autopilot_output import AutopilotOutput
+from companion.output.encode import Receiver
+from companion.output.source_switch import COMPANION_SET
 from companion.records import (
     Attitude,
     Event,
@@ -39,6 +43,8 @@ from companion.runtime.core import CompanionCore
 from companion.units import SECOND_NS, Floats
 
 LINK = "main"
+BESIDE = OutputConfig(profile="ardupilot")
+_SWITCHED = PROFILES["ardupilot"].switched
 START_NS = SECOND_NS  # companion's clock at the first frame
 TRUTH_LATE_S = 0.10  # the simulator's time is so much behind the autopilot's time since boot
 MOST_REFUSED_S, MOST_WORSE_M = 2.0, 1.0
@@ -78,13 +84,20 @@ class RecordingResult(NamedTuple):
 
 
 class RecordingLog:
-    """Log in memory: records, what was sent to the autopilot as a command, and its time since boot."""
+    """Log in memory: records, requests for source set 2, and the autopilot's time since boot.
 
-    def __init__(self) -> None:
+    Whatever the flight is configured to send, an output for ArduPilot runs beside it with all records, to
+    show when set 2 would be requested. Its origin is the first fix, and no parameter is wrong.
+    """
+
+    def __init__(self, config: Config) -> None:
         self.records: list[Stamped] = []
         self.boot_ms: list[tuple[int, int]] = []  # flight time (ns) and time since boot (ms)
         self.set_2_ns: list[int] = []
         self._boot_ms = 0
+        self._output = AutopilotOutput(replace(config, output=BESIDE))
+        self._receiver = Receiver(autopilot="ardupilot", system=1)
+        self._next_ns = 0
 
     def record(self, record: Stamped, channel: str | None = None) -> None:
         """Keep the record; pair the flight time of an attitude with its time since boot."""
@@ -92,6 +105,7 @@ class RecordingLog:
             self.records.append(record)
         elif isinstance(record, Attitude) and self._boot_ms:
             self.boot_ms.append((record.t_ns, self._boot_ms))
+        self._follow(record)
 
     def frame(self, link: str, outgoing: bool, data: bytes, t_ns: int) -> None:
         """Note requests for source set 2, and the time since boot of an ATTITUDE."""
@@ -100,13 +114,27 @@ class RecordingLog:
             return
         if not outgoing and found.msgid == mavlink.MAVLINK_MSG_ID_ATTITUDE:
             self._boot_ms = dialect.decode(found).time_boot_ms
-        elif outgoing and found.msgid == mavlink.MAVLINK_MSG_ID_COMMAND_LONG and is_set_2(found):
-            self.set_2_ns.append(t_ns)
+        elif outgoing and found.msgid == mavlink.MAVLINK_MSG_ID_COMMAND_LONG:
+            self._note_requests([dialect.decode(found)], t_ns)
+
+    def _follow(self, record: Stamped) -> None:
+        """Pass a record to the output beside; its commands are decided once a second, as in the core."""
+        self._output.receive(record)
+        if isinstance(record, Gnss) and record.has_3d_fix and self._receiver.origin is None:
+            origin = LocalOrigin(record.t_ns, record.rx_ns, record.lat, record.lon, record.alt_msl)
+            self._receiver = self._receiver._replace(origin=origin)
+        if isinstance(record, Solution):
+            self._output.messages(record, _SWITCHED, self._receiver)
+        if record.rx_ns >= self._next_ns:
+            self._next_ns = record.rx_ns + SECOND_NS
+            self._note_requests(self._output.poll(self._receiver, record.rx_ns), record.rx_ns)
+
+    def _note_requests(self, messages: Iterable[dialect.Message], t_ns: int) -> None:
+        self.set_2_ns += [t_ns for message in messages if is_set_2(message)]
 
 
-def is_set_2(found: frame.Frame) -> bool:
+def is_set_2(message: dialect.Message) -> bool:
     """Whether a COMMAND_LONG requests source set 2."""
-    message = dialect.decode(found)
     return bool(
         message.command == mavlink.MAV_CMD_SET_EKF_SOURCE_SET and int(message.param1) == COMPANION_SET
     )
@@ -114,7 +142,7 @@ def is_set_2(found: frame.Frame) -> bool:
 
 def fly_frames(entries: Iterable[tlog.TlogEntry], config: Config) -> RecordingLog:
     """Pass the frames of a telemetry log to the companion's core at the times they were received."""
-    log = RecordingLog()
+    log = RecordingLog(config)
     core = CompanionCore(config, log, (LINK,))
     offset: int | None = None
     for rx_ns, found in entries:
@@ -131,23 +159,13 @@ def fly_frames(entries: Iterable[tlog.TlogEntry], config: Config) -> RecordingLo
 
 
 def fly_log(records: Iterable[Stamped], config: Config) -> RecordingLog:
-    """Pass records of any origin to the navigator, and its solutions to the source switch."""
-    log, navigator, switch = RecordingLog(), Navigator(config), SourceSwitch()
-    next_ns: int | None = None
+    """Pass records of any origin to the navigator."""
+    log, navigator = RecordingLog(config), Navigator(config)
     for record in records:
         log.record(record)
-        if isinstance(record, Gnss):
-            switch.receive(record)
         for output in navigator.handle(record):
             log.record(output)
-            if isinstance(output, Solution):
-                switch.note_output(output, True, output.rx_ns)
         navigator.settle()
-        if next_ns is None or record.rx_ns >= next_ns:
-            next_ns = record.rx_ns + SECOND_NS
-            switch.update(record.rx_ns)
-            if any(message.param1 == COMPANION_SET for message in switch.to_send(1, record.rx_ns)):
-                log.set_2_ns.append(record.rx_ns)
     return log
 
 
@@ -297,7 +315,7 @@ def read_truth(path: Path) -> tuple[Track, float | None]:
 def fly_harm(path: Path, truth_path: Path) -> RecordingResult:
     """Fly a recording of `harm` with the profile it was flown with, and judge it against the truth."""
     data = lzma.decompress(path.read_bytes())
-    log = fly_frames(tlog.Tlog(data), Config(output=OutputConfig(profile="ardupilot")))
+    log = fly_frames(tlog.Tlog(data), Config(output=BESIDE))
     name = f"harm/{path.name.removesuffix('.tlog.xz')}"
     truth, false = None, []
     if truth_path.exists() and log.boot_ms:

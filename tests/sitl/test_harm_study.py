@@ -2,15 +2,26 @@
 
 import json
 import math
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from companion.config import Config
 from companion.records import Event, GlobalPosition, Gnss, Rejection, Solution
 from sitl import harm_study
-from sitl.harm_recordings import LOGS, RecordingLog, Track, judge_recording, longest_refusal
+from sitl.campaign.flight import sensors_of
+from sitl.faults import Fault
+from sitl.harm_recordings import (
+    LOGS,
+    RecordingLog,
+    Track,
+    fly_log,
+    judge_recording,
+    longest_refusal,
+)
 from sitl.harm_study import (
     CHANNELS,
     WRONG,
@@ -22,6 +33,7 @@ from sitl.harm_study import (
     scenario_of,
     worst_ratio,
 )
+from sitl.world import World
 from tests.solutions import solution_at
 
 S = 1_000_000_000
@@ -107,6 +119,21 @@ def test_a_false_velocity_of_gnss_does_not_exclude_its_position(channel):
     assert found.passed and "velocity of gnss" in found.suspected
 
 
+@pytest.mark.flight
+@pytest.mark.parametrize("feeds", [True, False])
+def test_set_2_is_seen_where_it_is_due_whatever_the_flight_sends(feeds, monkeypatch):
+    """GNSS drawn off by 2 m/s, or without a fix: a study that never sees set 2 shows nothing."""
+    monkeypatch.setitem(WRONG, "a false GNSS", harm_study.Wrong(feeds=feeds))
+    order = HarmOrder("a false GNSS", "INS navigation", 1, 4.0)
+    for fault, earliest_s, latest_s in (
+        (Fault("gnss-spoof", 120.0, math.inf, 2.0), 125.0, 200.0),
+        (Fault("gnss-jam", 120.0), 121.0, 124.0),
+    ):
+        scenario, config = replace(scenario_of(order), faults=(fault,)), config_of(order)
+        log = fly_log(World(scenario).records(sensors_of(config)), config)
+        assert log.set_2_ns and earliest_s <= log.set_2_ns[0] / S <= latest_s
+
+
 def test_exception_in_a_flight_is_a_result(monkeypatch):
     monkeypatch.setattr(harm_study, "scenario_of", lambda order: 1 / 0)
     result = fly(HarmOrder("nothing", "stock", 1, 5.0))
@@ -121,7 +148,7 @@ def test_longest_refusal_lasts_until_a_fix_is_used():
 
 
 def test_recording_is_judged_by_what_was_done_to_healthy_fixes():
-    log = RecordingLog()
+    log = RecordingLog(Config())
     for k in range(60):
         log.record(solution(k, 2.0))
         log.record(fix(k))
@@ -129,7 +156,7 @@ def test_recording_is_judged_by_what_was_done_to_healthy_fixes():
     found = judge_recording("a", log, ())
     assert found.corrected_m == pytest.approx(2.0) and found.autopilot_m == pytest.approx(0.5)
     assert not found.passed  # worse than the autopilot by more than a metre
-    better = RecordingLog()
+    better = RecordingLog(Config())
     better.records = [r for r in log.records if not isinstance(r, GlobalPosition)]
     assert judge_recording("a", better, ()).passed
     better.set_2_ns = [30 * S]
