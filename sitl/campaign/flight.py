@@ -357,7 +357,7 @@ def score_flight(order: FlightOrder, world: World, outputs: Sequence[Stamped]) -
         last_m=round(float(error[-1]), 2),
         normal_m=largest((t >= start) & (trust == Trust.NORMAL)),
         misleading_s=seconds(beyond & ~flagged & settled),
-        beyond_s=seconds(beyond & (trust == Trust.DEGRADED) & settled),
+        beyond_s=seconds(beyond & flagged & settled),
         alarms=sum(SETTLED_S <= r.t_ns * 1e-9 < start for r in exclusions),
         wrong=sum(r.t_ns * 1e-9 >= start for r in wrong),
         quiet_s=seconds(settled & (t < start)),

@@ -12,13 +12,24 @@ import pytest
 from click.testing import CliRunner
 
 from companion.config import Config
-from companion.records import Event, Solution
+from companion.records import Event, Solution, Trust
+from companion.units import SECOND_NS
 from sitl import loopback
 from sitl.campaign import command, flight
 from sitl.campaign.command import CampaignLimits
-from sitl.campaign.flight import FAULT_CASES, SCENARIOS, FlightOrder, FlightResult, fly_order
+from sitl.campaign.flight import (
+    FAULT_CASES,
+    SCENARIOS,
+    FlightOrder,
+    FlightResult,
+    fly_order,
+    scenario_of,
+    score_flight,
+)
 from sitl.faults import NAMES, Fault
 from sitl.scenarios import SensorRates, get_scenario
+from sitl.world import World
+from tests.solutions import solution_at
 
 
 def result(fault: str, seed: int, **changes: object) -> FlightResult:
@@ -106,6 +117,15 @@ def test_table_applies_the_limits() -> None:
     assert (bias.detected, bias.harmful, bias.misleading, bias.alarms_per_hour) == (0, 1, 1, 15.0)
     assert not bias.passed
     assert jam.bound_held is False
+
+
+def test_an_error_above_the_protection_level_is_misleading_or_flagged() -> None:
+    """Regression: one under an untrusted position was neither."""
+    order = FlightOrder("one-beacon", "none", 1)
+    trusts = [Trust.UNTRUSTED] * 5 + [Trust.DEGRADED] * 3 + [Trust.PREDICTING] * 2
+    far = [solution_at(t * SECOND_NS, protection=5001.0, trust=trust) for t, trust in enumerate(trusts, 100)]
+    scored = score_flight(order, World(scenario_of(order)), far)
+    assert (scored.beyond_s, scored.misleading_s) == (8.0, 1.0)  # the last one ends the flight
 
 
 @pytest.mark.flight
