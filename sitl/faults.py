@@ -246,12 +246,15 @@ def delayed(stream: Sequence[R], fault: Fault, size: float, rng: Generator) -> l
     return sorted(moved, key=lambda r: r.rx_ns)
 
 
-def stamped_late(stream: Sequence[R], fault: Fault, size: float, rng: Generator) -> list[R]:
-    """Delay records by `size` seconds and stamp them at their arrival, as a receiver without a stamp does."""
+def stamped_late(stream: Sequence[Gnss], fault: Fault, size: float, rng: Generator) -> list[Gnss]:
+    """Delay fixes by `size` seconds and stamp them at their arrival, as a receiver without a stamp does."""
     delay = round(size * 1e9)
-    return [
-        replace(r, t_ns=r.t_ns + delay, rx_ns=r.rx_ns + delay) if fault.covers(r.t_ns) else r for r in stream
-    ]
+
+    def late(r: Gnss) -> Gnss:
+        stamp_us = r.stamp_us and r.stamp_us + delay // 1000  # 0: none
+        return replace(r, t_ns=r.t_ns + delay, rx_ns=r.rx_ns + delay, stamp_us=stamp_us)
+
+    return sorted((late(r) if fault.covers(r.t_ns) else r for r in stream), key=lambda r: r.rx_ns)
 
 
 def lever_arm(stream: Sequence[Gnss], fault: Fault, size: float, rng: Generator) -> list[Gnss]:

@@ -141,6 +141,9 @@ def test_latency_moves_stamp_and_arrival():
     before, after = apply_fault("gnss-latency", 0.3)
     assert {a.t_ns - b.t_ns for a, b in zip(after[20:39], before[20:39])} == {3 * S // 10}
     assert all(a.rx_ns == a.t_ns and a.lat == b.lat for a, b in zip(after, before, strict=True))
+    assert {a.stamp_us - a.t_ns // 1000 for a in after} == {0}
+    _, after = apply_fault("gnss-latency", 1.5)
+    assert [fix.rx_ns for fix in after] == sorted(fix.rx_ns for fix in after)
 
 
 def test_pitot_and_heading():
