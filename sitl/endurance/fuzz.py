@@ -63,6 +63,7 @@ def run_inside(name: str, seconds: int, inputs: Path) -> None:
 )
 def main(names: tuple[str, ...], seconds: int, inputs: Path, replay: Path | None) -> None:
     """Fuzz the companion's byte inputs. Exit code 1 if a target failed."""
+    names = names or TARGET_NAMES
     if replay is not None:
         from sitl.endurance import fuzz_targets
 
@@ -73,10 +74,8 @@ def main(names: tuple[str, ...], seconds: int, inputs: Path, replay: Path | None
         raise SystemExit(
             "companion: atheris is not installed; `make fuzz` installs it, or pip install '.[fuzz]'"
         )
-    broken = [name for name in names or TARGET_NAMES if fuzz_target(name, seconds, inputs)]
-    click.echo(
-        f"{len(names or TARGET_NAMES)} targets, {seconds} s each; failed: {', '.join(broken) or 'none'}"
-    )
+    broken = [name for name in names if fuzz_target(name, seconds, inputs)]
+    click.echo(f"{len(names)} targets, {seconds} s each; failed: {', '.join(broken) or 'none'}")
     if broken:
         raise SystemExit(1)
 

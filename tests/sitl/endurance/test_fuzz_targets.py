@@ -5,6 +5,7 @@ import tracemalloc
 
 import pytest
 import zstandard
+from click.testing import CliRunner
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.opcode import Opcode
@@ -18,15 +19,25 @@ from companion.storage import flight_log
 from companion.storage.mcap_file import MAGIC, encode_records
 from companion.storage.reader import LogError
 from companion.storage.recovery import recover
-from sitl.endurance import fuzz_targets
-from sitl.endurance.fuzz import TARGET_NAMES
+from sitl.endurance import fuzz, fuzz_targets
 from sitl.endurance.fuzz_targets import TARGETS
 
 MIB = 1 << 20
 
 
 def test_fuzzer_lists_every_target() -> None:
-    assert tuple(TARGETS) == TARGET_NAMES
+    assert tuple(TARGETS) == fuzz.TARGET_NAMES
+
+
+@pytest.mark.parametrize("options", [[], ["--target", "log"]])
+def test_replay_gives_the_input_to_its_target(options: list[str], monkeypatch, tmp_path) -> None:
+    """Regression: without --target to none, and exit code 0."""
+    replayed: list[bytes] = []
+    monkeypatch.setitem(TARGETS, "log", fuzz_targets.Target(replayed.append, list))
+    path = tmp_path / "crash"
+    path.write_bytes(b"")
+    done = CliRunner().invoke(fuzz.main, [*options, "--replay", str(path)])
+    assert (done.exit_code, replayed) == (0, [b""])
 
 
 @pytest.mark.parametrize("name", TARGETS)
