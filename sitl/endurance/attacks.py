@@ -35,7 +35,7 @@ from companion.runtime.core import CompanionCore
 from companion.storage.deferred_log import NoLog
 from sitl.autopilot import SimulatedAutopilot
 from sitl.endurance.fuzz_targets import make_frame
-from sitl.endurance.parameter_sweep import CONFIGS, param_set, recorded_flight, settings
+from sitl.endurance.parameter_sweep import CONFIGS, at_extremes, at_limits, param_set, recorded_flight
 from sitl.loopback import LINK, START_NS
 from sitl.scenarios import get_scenario
 from sitl.world import BOOT_S
@@ -78,7 +78,7 @@ def _answer(late_us: int) -> Callable[[int, int], bytes]:
     return make
 
 
-_SETTINGS = tuple(settings())
+_SETTINGS = (*at_limits(), *at_extremes())
 
 
 def _param_set(number: int, boot_us: int) -> bytes:

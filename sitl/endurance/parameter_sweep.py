@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import random
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -55,11 +55,14 @@ def limits(parameter: Parameter) -> tuple[float, ...]:
     return float(least), float(greatest)
 
 
-def settings() -> Iterator[Setting]:
-    """Yield every parameter at both limits and at all extremes."""
-    for parameter in parameter_table():
-        for value in (*limits(parameter), *EXTREMES):
-            yield Setting(parameter.name, value)
+def at_limits() -> list[Setting]:
+    """Return every parameter at its least and at its greatest value."""
+    return [Setting(p.name, value) for p in parameter_table() for value in limits(p)]
+
+
+def at_extremes() -> list[Setting]:
+    """Return every parameter at all extremes."""
+    return [Setting(p.name, value) for p in parameter_table() for value in EXTREMES]
 
 
 @lru_cache
@@ -83,8 +86,12 @@ def recorded_flight(own_ins: bool) -> tuple[tuple[int, bytes], ...]:
 
 
 def fly_with(config: Config, chosen: Iterable[Setting]) -> int:
-    """Fly and set the parameters one after another, a second apart; return how many were changed."""
+    """Fly and set the parameters one after another, a second apart; return how many were changed.
+
+    Raises ValueError if a value out of its limits changed anything, or if a message could not be sent.
+    """
     core = CompanionCore(config, ValidatingLog(), (LINK,))
+    allowed = {parameter.name: limits(parameter) for parameter in parameter_table()}
     pending = list(chosen)
     before, changed, due = config, 0, START_NS + round(SET_AT_S * 1e9)
     for number, (now, data) in enumerate(recorded_flight(config.inertial.independent)):
@@ -97,9 +104,11 @@ def fly_with(config: Config, chosen: Iterable[Setting]) -> int:
             setting = pending.pop(0)
             due = now + SECOND_NS
             core.receive(LINK, param_set(setting, number), now)
-            after = core.config
-            changed += after != before
-            before = after
+            if core.config != before:
+                least, greatest = allowed[setting.name]
+                if not least <= setting.value <= greatest:
+                    raise ValueError(f"{setting} was accepted; its limits are {least:g} and {greatest:g}")
+                before, changed = core.config, changed + 1
     if core.links[LINK].not_sent:
         raise ValueError(f"not sent: {dict(core.links[LINK].not_sent)}")
     return changed
@@ -123,13 +132,13 @@ def param_set(setting: Setting, sequence: int) -> bytes:
 @click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True)
 def main(several: int, seed: int) -> None:
     """Set every parameter to its limits and beyond in flight. Exit code 1 if a flight failed."""
-    everything, rng = list(settings()), random.Random(seed)
+    extremes, rng = at_extremes(), random.Random(seed)
     flights: list[tuple[Config, list[Setting]]] = []
     for config in CONFIGS:
-        flights += [(config, [setting]) for setting in everything if setting.value not in EXTREMES]
-        # what is out of the limits changes nothing, so many are set in one flight
-        beyond = [s for s in everything if s.value in EXTREMES or math.isnan(s.value)]
-        flights += [(config, beyond[at : at + 30]) for at in range(0, len(beyond), 30)]
+        flights += [(config, [setting]) for setting in at_limits()]
+        # most are out of the limits and change nothing, so many are set in one flight
+        flights += [(config, extremes[at : at + 30]) for at in range(0, len(extremes), 30)]
+    everything = at_limits() + extremes
     flights += [(rng.choice(CONFIGS), rng.sample(everything, 10)) for _ in range(several)]
     changed, failed = 0, list[str]()
     for number, (config, chosen) in enumerate(flights):
