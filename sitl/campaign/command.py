@@ -76,17 +76,16 @@ class FaultSummary(NamedTuple):
 def list_orders(scenarios: Iterable[str], faults: Iterable[str], seeds: int) -> list[FlightOrder]:
     """List the flights, seeds outermost: an interrupted campaign has covered all cases.
 
-    Faults of the link and of the autopilot and delays do not depend on grade and beacons: they are flown in
-    the first scenario only. A fault is not flown in a scenario without the sensor that it concerns.
+    A fault is not flown in a scenario without the sensor that it concerns. Faults of the link and of the
+    autopilot and delays do not depend on grade and beacons: they are flown in the first of the others only.
     """
     names, kinds = list(dict.fromkeys(scenarios)), list(dict.fromkeys(faults))
+    concerned = {f: [s for s in names if is_applicable(s, f)] for f in kinds}
+    for f in kinds:
+        if not is_sensor_fault(f) or f.endswith("-late"):
+            del concerned[f][1:]
     every = itertools.product(range(1, seeds + 1), names, kinds)
-    once = {f for f in kinds if not is_sensor_fault(f) or f.endswith("-late")}
-    return [
-        FlightOrder(s, f, seed)
-        for seed, s, f in every
-        if (s == names[0] or f not in once) and (is_applicable(s, f) or len(names) == 1)
-    ]
+    return [FlightOrder(s, f, seed) for seed, s, f in every if s in concerned[f]]
 
 
 def read_results(path: Path) -> list[FlightResult]:
@@ -270,6 +269,8 @@ def command(
         raise click.UsageError(f"--report {page}: the tables are Markdown: give a file that ends with .md")
     limits = CampaignLimits(harmless_m, misleading, alarms_per_hour)
     wanted = list_orders(scenarios or SCENARIOS, faults or FAULT_CASES, seeds)
+    if not wanted:
+        raise click.UsageError("no flight: the scenarios do not have the sensor that the faults concern")
     try:
         flown = run_campaign(wanted, results, scheduler, workers)
         if page is not None:

@@ -204,6 +204,23 @@ def test_a_case_given_twice_is_flown_once() -> None:
     assert command.list_orders(["one-beacon"] * 2, ["none"] * 2, 1) == [FlightOrder("one-beacon", "none", 1)]
 
 
+@pytest.mark.parametrize(
+    ("scenarios", "fault"),
+    [(["no-beacon", "one-beacon", "mems"], "beacon-late"), (["air-data", "one-beacon"], "ins-nan")],
+)
+def test_a_fault_is_flown_once_in_the_first_scenario_that_it_concerns(
+    scenarios: list[str], fault: str
+) -> None:
+    """Regression: in none, where it does not concern the first scenario, and the campaign passed."""
+    assert command.list_orders(scenarios, [fault], 1) == [FlightOrder("one-beacon", fault, 1)]
+
+
+def test_a_campaign_without_a_flight_is_rejected(tmp_path: Path) -> None:
+    options = ["--scenario", "no-beacon", "--fault", "beacon-bias", "--results", str(tmp_path)]
+    done = CliRunner().invoke(command.command, options)
+    assert done.exit_code == 2 and "no flight" in done.output
+
+
 @pytest.mark.parametrize("name", ["x.txt", "flight.mcap", "folder.md", ""])
 def test_a_report_that_is_no_markdown_is_rejected_before_the_flights(
     name: str, tmp_path: Path, requested: list[FlightOrder]
