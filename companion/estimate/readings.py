@@ -139,7 +139,7 @@ def error_covariance(
                 f"correlation of {a} and {b} is {rho:g}: give two readings and a number in (-1, 1)"
             )
         C[index[a], index[b]] = C[index[b], index[a]] = rho
-    if np.linalg.eigvalsh(C)[0] < 1e-12:
+    if (np.linalg.eigvalsh(C) < 1e-12).any():
         raise ValueError("these correlations cannot occur together: their matrix is not positive definite")
     sigma = np.array([reading.sigma for reading in readings])
     R: Floats = C * np.outer(sigma, sigma)
@@ -262,7 +262,7 @@ def axis_rows(readings: Sequence[Reading], axis: Literal["x", "y"]) -> AxisRows:
         names.append(reading.source)
         values.append(value)
         rows.append(row)
-    return AxisRows(tuple(names), np.array(values), np.reshape(rows, (-1, len(readings))))
+    return AxisRows(tuple(names), np.array(values), np.reshape(rows, (len(rows), len(readings))))
 
 
 def _observations(readings: Sequence[Reading]) -> list[Observation]:

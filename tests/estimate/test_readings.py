@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from companion.estimate.fusion import Azimuth, Position, Range, maximum_likelihood
-from companion.estimate.readings import Reading, error_covariance, estimate_joint, predict_readings
+from companion.estimate.readings import Reading, axis_rows, error_covariance, estimate_joint, predict_readings
 
 READINGS = (
     Reading("INS", "x", 99_950.0, 1500.0),
@@ -71,3 +71,11 @@ def test_correlations_that_cannot_occur_together():
     pairs = {("INS.x", "GNSS.x"): 0.9, ("GNSS.x", "GNSS.y"): 0.9, ("INS.x", "GNSS.y"): -0.9}
     with pytest.raises(ValueError, match="cannot occur together"):
         error_covariance(READINGS, pairs)
+
+
+def test_without_readings_there_is_nothing_to_estimate():
+    R = error_covariance([])
+    assert R.shape == (0, 0)
+    assert axis_rows([], "x").T.shape == (0, 0)
+    with pytest.raises(ValueError, match="no observations"):
+        estimate_joint([], R)
