@@ -154,7 +154,7 @@ def orthonormal_basis(t: Floats, sigma: Floats, family: Family, r: int) -> Basis
     Parameters
     ----------
     t : (N,)
-        Times of the samples, s, increasing.
+        Times of the samples, s, not decreasing.
     sigma : (N,)
         Their errors.
     family : {"power", "legendre", "sine", "fourier"}
@@ -194,7 +194,7 @@ def select_order(
     Parameters
     ----------
     t : (N,)
-        Times, s, increasing.
+        Times, s, not decreasing.
     z : (N,)
         Samples.
     sigma : (N,) or float
@@ -272,7 +272,7 @@ def smooth_track(
     Parameters
     ----------
     t : (N,)
-        Times, s, increasing.
+        Times, s, not decreasing.
     z : (N,)
         Samples.
     sigma : (N,) or float
@@ -358,8 +358,10 @@ def _samples(t: npt.ArrayLike, z: npt.ArrayLike, sigma: npt.ArrayLike, basis: st
         raise ValueError("a sample is not finite: leave it out")
     if (sigma <= 0.0).any():
         raise ValueError(f"sigma is {sigma.min():g} somewhere: it must be positive")
-    if (np.diff(t) < 0.0).any() or t[-1] <= t[0]:
+    if (np.diff(t) < 0.0).any():
         raise ValueError("the times are not increasing: sort the samples by time")
+    if t[0] == t[-1]:
+        raise DependentFunctions(f"all samples are of one time, {t[0]:g} s: give samples of several times")
     _reject_overflow(t, z, sigma)
     return _Samples(t, z, sigma)
 

@@ -138,6 +138,15 @@ def test_a_track_with_a_gap_is_cut_as_far_as_its_samples_allow() -> None:
     assert np.isfinite(found.x).all() and found.consistency > 2.0
 
 
+def test_a_track_whose_samples_in_a_window_are_of_one_time_is_cut_no_further() -> None:
+    rng = np.random.default_rng(1)
+    t = np.concatenate((np.linspace(0.0, 10.0, 100), np.full(40, 15.0), np.linspace(20.0, 30.0, 100)))
+    truth = 50.0 * np.sin(3.0 * t)
+    found = smooth_track(t, truth + rng.standard_normal(t.shape), 1.0)
+    assert found.windows == 2
+    assert np.isfinite(found.x).all() and found.consistency > 2.0
+
+
 def test_a_simple_track_takes_one_window() -> None:
     rng = np.random.default_rng(1)
     t = np.arange(0.0, 60.0)
@@ -154,6 +163,7 @@ def test_a_simple_track_takes_one_window() -> None:
         ([0, 1, 2], [1, 2], 1.0, "power", 2, "do not fit"),
         ([0, 1, 2], [1, 2, 3], 1.0, "power", 3, "r_max is 3 for 3 samples"),
         ([0, 2, 1], [1, 2, 3], 1.0, "power", 2, "the times are not increasing"),
+        ([7, 7, 7], [1, 2, 3], 1.0, "power", 2, "all samples are of one time, 7 s"),
         ([0, 1, 2], [1, 2, math.nan], 1.0, "power", 2, "not finite"),
         ([0, 1, 2], [1, 2, 3], 0.0, "power", 2, "must be positive"),
         ([0, 1, 1e300], [1, 2, 3], 1.0, "power", 2, r"t is 1e\+300 somewhere"),
