@@ -126,7 +126,7 @@ def _cross(a: _Line, b: _Line) -> list[complex]:
 def _ray_ray(a: _Ray, b: _Ray) -> list[complex]:
     between = b.beacon - a.beacon
     sine = (a.direction.conjugate() * b.direction).imag
-    if abs(sine) < 1e-9:
+    if between == 0.0 or abs(sine) < 1e-9:
         return []
     t = (between.conjugate() * b.direction).imag / sine
     return [a.beacon + t * a.direction]

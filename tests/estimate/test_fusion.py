@@ -311,6 +311,11 @@ class TestUnobservable:
         with pytest.raises(Unobservable, match=r"azimuth 30\.00 deg"):
             maximum_likelihood([Azimuth([0, 0], math.radians(210.0), SIGMA_A)])
 
+    def test_two_azimuths_of_one_beacon(self):
+        with pytest.raises(Unobservable, match=r"azimuth 30\.00 deg: add") as e:
+            maximum_likelihood([Azimuth([0, 0], math.radians(A), SIGMA_A) for A in (29.9, 30.1)])
+        assert e.value.directions.shape == (1, 2)
+
     def test_no_height(self):
         with pytest.raises(Unobservable, match="the vertical: add a Height"):
             maximum_likelihood([Position([0, 0], np.eye(2)), Azimuth([9e4, 0, 0], -math.pi / 2, SIGMA_A)])
