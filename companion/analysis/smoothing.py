@@ -1,23 +1,16 @@
 """Fixed-interval smoothing of a flight: error of the nominal trajectory at every epoch, given all fixes.
 
 A smoother needs one Gaussian path, so the flight is filtered twice by the navigator's own step. The first
-pass is the flight: the bank of hypotheses gives which sources were false and from when on, also where only
-the end of it shows it, when the wind jumped, and which grade of noise was right. Airspeed and GNSS velocity
-show how strong the gusts were and how long they lasted (`analysis.gusts`). The second pass runs a plain
-Kalman filter with that grade and those gusts: it leaves out what was false or an outlier, takes every other
-fix, widens the wind where it jumped, and takes for all other jumps a random walk of their variance. Every
-step of it is an epoch: at a measurement, or half a second after the last.
+pass (`analysis.first_pass`) is the flight: it decides what was false, when states jumped, and which grade of
+noise and which gusts were right. The second pass runs a plain Kalman filter with that grade and those gusts:
+it leaves out what was false or an outlier, takes every other fix, widens the wind where it jumped, and takes
+for all other jumps a random walk of their variance. Every step of it is an epoch: at a measurement, or half a
+second after the last.
 
-Backward pass: the recursion of Rauch, Tung and Striebel (1965), which does not need the (nonlinear)
-measurements. With Phi, Q from one epoch to the next, x_{k+1|k} the prediction before the measurement,
-P_{k+1|k} = Phi P_k Phi' + Q and C = P_k Phi' P_{k+1|k}^-1,
-
-    x_{k|N} = x_k + C (x_{k+1|N} - x_{k+1|k})
-    P_{k|N} = (I - C Phi) P_k (I - C Phi)' + C (P_{k+1|N} + Q) C'
-
-The last epoch equals the filter. The track is the nominal trajectory minus its smoothed error; heights are
-those of the filter. Memory grows linearly with the duration of the flight. The covariance is that of the
-plain path alone: it knows nothing of the chance that the first pass decided wrongly.
+The backward pass is `estimate.smoother.rts_backward`, which does not need the (nonlinear) measurements. The
+last epoch equals the filter. The track is the nominal trajectory minus its smoothed error; heights are those
+of the filter. Memory grows linearly with the duration of the flight. The covariance is that of the plain path
+alone: it knows nothing of the chance that the first pass decided wrongly.
 """
 
 from __future__ import annotations
@@ -31,22 +24,15 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import structs
 
-from companion.analysis.gusts import Gusts, GustSamples
+from companion.analysis.first_pass import NEVER_NS, FirstPass
+from companion.analysis.gusts import Gusts
 from companion.config import Config, parse
 from companion.estimate import bank as banks
-from companion.estimate.bank import Bank, Jump
+from companion.estimate.bank import Bank
 from companion.estimate.linear_system import LinearSystem
 from companion.estimate.smoother import rts_backward, two_point
 from companion.nav.geometry import displace, separation
-from companion.navigator import (
-    INPUTS_USED,
-    Navigator,
-    begins_again,
-    guarded,
-    own_channel,
-    own_error_model,
-    tuned,
-)
+from companion.navigator import INPUTS_USED, begins_again, guarded, own_error_model, tuned
 from companion.navigator.air_velocity import Renewal, renewal
 from companion.navigator.channel import Nominal, Transition
 from companion.navigator.hypotheses import (
@@ -54,7 +40,6 @@ from companion.navigator.hypotheses import (
     HEADING,
     MOST_BEACONS,
     MOST_WIDER,
-    VELOCITY,
     Hypotheses,
     Model,
     Situation,
@@ -62,7 +47,7 @@ from companion.navigator.hypotheses import (
 from companion.navigator.inertial_track import Point
 from companion.navigator.measurements import receiver_states
 from companion.navigator.progress import driver
-from companion.navigator.state import Beacon, Settings, State, Step, hypotheses, levelled, source_name
+from companion.navigator.state import Settings, State, hypotheses, levelled
 from companion.navigator.step import step
 from companion.records import (
     AirData,
@@ -73,9 +58,7 @@ from companion.records import (
     LocalPosition,
     Output,
     RangeDifference,
-    Rejection,
     Reset,
-    Resumed,
     RsbnFix,
     SecondIns,
     Stamped,
@@ -83,12 +66,9 @@ from companion.records import (
     TimeStep,
     Tuning,
 )
-from companion.units import SECOND_NS, Floats
+from companion.units import Floats
 
-NEVER_NS = 2**63 - 1
 MEASURING = (AirData, RangeDifference, StarFix, SecondIns)  # besides fixes; AirData by itself too
-SAME_TIME_NS = 300_000_000  # in a turn the air velocity changes by less than 2 m/s
-APART_NS = 5 * SECOND_NS  # hypotheses of one jump differ by less
 
 
 class SmoothedRun(NamedTuple):
@@ -137,203 +117,6 @@ def join_runs(runs: Iterable[SmoothedRun]) -> tuple[npt.NDArray[np.int64], Float
     """Concatenate the tracks of all runs: t_ns, lat, lon, alt_msl, each (n,)."""
     t_ns, lat, lon, alt = zip(*(run[:4] for run in runs), strict=True)
     return np.concatenate(t_ns), np.concatenate(lat), np.concatenate(lon), np.concatenate(alt)
-
-
-# ---------------------------------------------------------------------------------------------------------
-# First pass: what was false
-# ---------------------------------------------------------------------------------------------------------
-
-
-class _Jumped(NamedTuple):
-    """Time and kind of a jump."""
-
-    t_ns: int
-    jump: Jump
-
-    def is_of(self, other: _Jumped) -> bool:
-        """Whether both are hypotheses of one jump."""
-        return self.jump.name == other.jump.name and abs(self.t_ns - other.t_ns) <= APART_NS
-
-
-class _Onset(NamedTuple):
-    """Since when the heaviest row that holds a fault held it, as known at `t_ns`."""
-
-    t_ns: int
-    since_ns: int
-
-
-class _Folded(NamedTuple):
-    """A record that the navigator took up, at its own time, of which run, and the sources in it that were
-    rejected.
-    """
-
-    t_ns: int
-    record: Input
-    run: int
-    rejected: frozenset[str]
-
-
-class _Witness(Navigator):
-    """A navigator that notes what its bank decided. It makes no solutions, on which no decision rests."""
-
-    def __init__(self, config: Config) -> None:
-        super().__init__(config)
-        self._state = State(next_ns=NEVER_NS)
-        self.folded: list[_Folded] = []
-        self.gusts = GustSamples()
-        self.spans: dict[str, list[tuple[int, int]]] = {}  # when each source was false, by name
-        self.jumps: list[_Jumped] = []
-        self._onsets: dict[int, list[_Onset]] = {}  # of each fault, as they came up
-        self.beacons: dict[int, Beacon] = {}
-        self._last: list[tuple[Bank, Hypotheses] | None] = [None]  # of each run
-        self._open: dict[str, _Onset] = {}  # of each source that is false now, as first known
-
-    def handle(self, record: Stamped) -> list[Output]:
-        """Return the outputs of one more record; what was flown before the log is not smoothed."""
-        if isinstance(record, Resumed):
-            return []
-        outputs = super().handle(record)
-        if isinstance(record, Tuning):
-            self._note(record, [])
-        return outputs
-
-    def _fold(self, record: Input) -> list[Output]:
-        outputs = super()._fold(record)
-        self._note(record, outputs)
-        return outputs
-
-    def _begin_roll_back(self) -> list[Output]:
-        """Drop what is folded again, behind a fix that `gnss.latency_s` makes late."""
-        past = len(self._past)
-        outputs = super()._begin_roll_back()
-        del self.folded[len(self.folded) - (past - len(self._past)) :]
-        return outputs
-
-    def _resolved(self, state: State, record: Input) -> Step:
-        return structs.replace(state, pending=None), []
-
-    def _solved(self, state: State, record: Input) -> Step:
-        return state, []
-
-    def _note(self, record: Input, outputs: list[Output]) -> None:
-        state, t_ns = self._state, record.t_ns
-        if state.bank is None and self._last[-1] is not None:
-            self._last.append(None)
-        rejected = frozenset(o.source for o in outputs if isinstance(o, Rejection) and o.t_ns == t_ns)
-        self.folded.append(_Folded(t_ns, record, len(self._last) - 1, rejected))
-        if state.bank is None:
-            self._close(t_ns)
-            self._onsets.clear()  # another bank has other faults
-            return
-        known = hypotheses(state, self.settings)
-        self._last[-1] = state.bank, known
-        if isinstance(record, Gnss):
-            self._note_gust(state, record)
-        for beacon in state.beacons:
-            self.beacons.setdefault(beacon.identity, beacon)
-        assert state.nominal is not None
-        bank_ns = state.nominal.since.t_ns
-        self._note_false(state, state.bank, known, t_ns, bank_ns)
-        self._note_jump(state.bank, known, bank_ns)
-        self._note_end(state, state.bank, known, bank_ns)
-
-    def _note_false(self, state: State, bank: Bank, known: Hypotheses, t_ns: int, bank_ns: int) -> None:
-        for i, p in enumerate(state.false):
-            name, onset = source_name(i, state), _Onset(bank_ns, bank_ns - _age_ns(bank, known, i))
-            first = self._open.get(name)
-            if bank.excluded[i] or p > known.settings.suspect:
-                if first is None:
-                    self._open[name] = onset
-                elif _holds(bank, known, i) and onset.since_ns <= first.t_ns:  # later: the lie changed
-                    self._open[name] = first._replace(since_ns=onset.since_ns)
-            elif first is not None:
-                del self._open[name]
-                self.spans.setdefault(name, []).append((first.since_ns, t_ns))
-
-    def _note_gust(self, state: State, record: Gnss) -> None:
-        """Note air and ground velocity, if an airspeed that moves the aircraft is as new as the fix."""
-        s, air = state.sensors, state.sensors.air.air
-        if record.v_n is None or air is None or abs(record.t_ns - air.t_ns) > SAME_TIME_NS:
-            return
-        if state.reported and state.reported[VELOCITY]:
-            return
-        V = own_channel.air_velocity(s, air, state.nominal.point.position.alt) if state.nominal else None
-        if V is not None and s.ground.flying and s.air_ns == air.t_ns:
-            self.gusts.add(record.t_ns * 1e-9, V, record.v_n[:2])
-
-    def _note_jump(self, bank: Bank, known: Hypotheses, bank_ns: int) -> None:
-        """Note the jump that the heaviest row holds, if that is what happened to it last."""
-        best, layout = int(np.argmax(bank.L)), known.layout
-        j = int(bank.event[best]) - 1 - 2 * len(layout.faults)
-        if j < 0:
-            return
-        found = _Jumped(bank_ns - _age(bank, best), layout.jumps[j])
-        if not any(found.is_of(jumped) for jumped in self.jumps):
-            self.jumps.append(found)
-
-    def _note_end(self, state: State, bank: Bank, known: Hypotheses, bank_ns: int) -> None:
-        """Note the fault that the heaviest row holds to be over, if that is what happened to it last.
-
-        A lie that nothing contradicted while it lasted is known by its end.
-        """
-        faults, best = known.layout.faults, int(np.argmax(bank.L))
-        f = int(bank.event[best]) - 1 - len(faults)
-        if 0 <= f < len(faults):
-            until = bank_ns - _age(bank, best)
-            onsets = [onset.since_ns for onset in self._onsets.get(f, ()) if onset.t_ns < until]
-            for i in faults[f].sources if onsets else ():
-                spans = self.spans.setdefault(source_name(i, state), [])
-                if all(abs(until - end) > APART_NS for _, end in spans):
-                    spans.append((onsets[-1], until))
-        for f in range(len(faults)):
-            rows = np.flatnonzero(bank.event == 1 + f)
-            if len(rows):
-                onset = _Onset(bank_ns, bank_ns - _age(bank, rows[np.argmax(bank.L[rows])]))
-                before = self._onsets.setdefault(f, [])
-                if not before or abs(onset.since_ns - before[-1].since_ns) > APART_NS:
-                    before.append(onset)
-
-    def _close(self, t_ns: int) -> None:
-        for name, onset in self._open.items():
-            self.spans.setdefault(name, []).append((onset.since_ns, t_ns))
-        self._open.clear()
-
-    def end(self) -> None:
-        """Fold what waits, and close what is still open."""
-        self.finish()
-        self._close(NEVER_NS)
-
-    def was_false(self, name: str, t_ns: int) -> bool:
-        """Whether a source was false at a time, as known in the end."""
-        return any(since <= t_ns < until for since, until in self.spans.get(name, ()))
-
-    def grade(self, run: int) -> int:
-        """The grade that won in a run."""
-        last = self._last[run]
-        if last is None:
-            return 0
-        bank, known = last
-        return int(np.argmax(banks.grade_probability(bank, known.layout)))
-
-
-def _holds(bank: Bank, known: Hypotheses, source: int) -> bool:
-    """Whether the last event of the heaviest row is that a source became false."""
-    fault = int(bank.event[int(np.argmax(bank.L))]) - 1
-    return 0 <= fault < len(known.layout.faults) and bool(known.layout.concerns[fault, source])
-
-
-def _age_ns(bank: Bank, known: Hypotheses, source: int) -> int:
-    """How long ago a source became false, by the heaviest row whose last event that was; else 0."""
-    faults = np.flatnonzero(known.layout.concerns[:-1, source])
-    rows = np.flatnonzero(np.isin(bank.event - 1, faults))
-    if not len(rows):
-        return 0
-    return _age(bank, rows[np.argmax(bank.L[rows])])
-
-
-def _age(bank: Bank, row: int) -> int:
-    """How long ago the last event of a row was, ns."""
-    return round((bank.t - float(bank.since[row])) * 1e9)
 
 
 # ---------------------------------------------------------------------------------------------------------
@@ -395,47 +178,21 @@ class _Epoch(NamedTuple):
 
 def _forward_pass(records: Iterable[Stamped], config: Config) -> _Path:
     """Filter the records by one plain path, and return it with the epochs of each run."""
-    witness = _Witness(config)
+    first = FirstPass(config)
     for record in sorted((r for r in records if isinstance(r, INPUTS_USED)), key=lambda r: r.t_ns):
-        witness.handle(record)
-    witness.end()
-    path, run = _Path(config, witness), -1
-    for folded in witness.folded:
+        first.handle(record)
+    first.end()
+    path, run = _Path(config, first), -1
+    for folded in first.folded:
         if folded.run != run:
             run = folded.run
             path.begin(run)
-        path.jump(folded.t_ns)
-        kept = _believed(folded, witness)
+        path.jump(folded.record.t_ns)
+        kept = first.believed(folded)
         if kept is not None:
-            path.follow(kept, judged=_position(kept) not in folded.rejected)
+            path.follow(kept, judged=not folded.has_rejected_position)
     path.end()
     return path
-
-
-def _believed(folded: _Folded, witness: _Witness) -> Input | None:
-    """The record without what was false, or a velocity or sight that was rejected; None if nothing is left.
-
-    A position that was rejected is left to the plain filter: of a run of them the position is restarted.
-    """
-    record, rejected = folded.record, folded.rejected
-    if isinstance(record, Gnss):
-        if witness.was_false("gnss", record.t_ns):
-            return None
-        false = witness.was_false("velocity of gnss", record.t_ns)
-        false = false or f"velocity of {_position(record)}" in rejected
-        return structs.replace(record, v_n=None) if false else record
-    if not isinstance(record, RsbnFix):
-        return record
-    for part, empty in (("azimuth", {"azimuth": None}), ("range", {"slant_range": None})):
-        name = f"rsbn {record.beacon} {part}"
-        if name in rejected or witness.was_false(name, record.t_ns):
-            record = structs.replace(record, **empty)
-    return None if record.azimuth is None and record.slant_range is None else record
-
-
-def _position(record: Input) -> str:
-    """Name of the position of a receiver in a Rejection; empty for other records."""
-    return f"gnss {record.receiver}" if isinstance(record, Gnss) else ""
 
 
 class _Path:
@@ -444,11 +201,11 @@ class _Path:
     `_Phi`, `_Q`: from the last epoch to where the bank stands now.
     """
 
-    def __init__(self, config: Config, witness: _Witness) -> None:
+    def __init__(self, config: Config, first: FirstPass) -> None:
         self.runs: list[list[_Epoch]] = []
-        self._witness, self.gusts = witness, witness.gusts.estimate()
-        self._beacons = tuple(witness.beacons.values())[:MOST_BEACONS]
-        self._jumps = sorted(witness.jumps, key=lambda jumped: jumped.t_ns)
+        self._first, self.gusts = first, first.gusts.estimate()
+        self._beacons = tuple(first.beacons.values())[:MOST_BEACONS]
+        self._jumps = sorted(first.jumps, key=lambda jumped: jumped.t_ns)
         config = self._with_gusts(config)
         self._model = _PlainModel(config, 0, len(self._beacons))
         self._settings = Settings(config, self._model)
@@ -457,7 +214,7 @@ class _Path:
 
     def begin(self, run: int) -> None:
         """Go on with the grade of another run."""
-        self._model = _PlainModel(self._settings.config, self._witness.grade(run), len(self._beacons))
+        self._model = _PlainModel(self._settings.config, self._first.grade(run), len(self._beacons))
         self._settings = self._settings._replace(model=self._model)
 
     def jump(self, t_ns: int) -> None:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from companion.analysis import smoothing
+from companion.analysis.first_pass import FirstPass
 from companion.analysis.smoothing import SmoothedRun, smooth_flight
 from companion.config import Config, GnssConfig, InertialConfig, load, to_toml
 from companion.nav.geometry import (
@@ -320,14 +321,14 @@ def test_first_pass_decides_as_in_flight_and_makes_no_solutions() -> None:
         msgspec.structs.replace(r, rx_ns=r.rx_ns + NS) if isinstance(r, RsbnFix) and not k % 3 else r
         for k, r in enumerate(flight(120, (60, 90)).records)
     ]
-    navigator, witness = Navigator(CONFIG), smoothing._Witness(CONFIG)
+    navigator, first = Navigator(CONFIG), FirstPass(CONFIG)
     flown, noted = [], []
     for record in sorted(records, key=lambda record: record.rx_ns):
         flown += navigator.handle(record)
-        noted += witness.handle(record)
+        noted += first.handle(record)
     made = {type(record) for record in flown}
     assert {Fix, Solution} <= made and not {Fix, Solution} & {type(record) for record in noted}
-    ours, its = navigator.state.bank, witness.state.bank
+    ours, its = navigator.state.bank, first.state.bank
     assert ours is not None and its is not None
     for name in ("L", "x", "P", "grade", "excluded"):
         assert np.array_equal(getattr(ours, name), getattr(its, name))
@@ -341,11 +342,11 @@ def test_fixes_that_are_late_as_configured_give_the_same_track(latency_s: float)
     records = [
         msgspec.structs.replace(r, t_ns=r.t_ns + late_ns) if isinstance(r, Gnss) else r for r in flown.records
     ]
-    witness = smoothing._Witness(config)
+    first = FirstPass(config)
     for record in sorted(records, key=lambda r: r.t_ns):
-        witness.handle(record)
-    witness.end()
-    folded = [(f.t_ns, type(f.record)) for f in witness.folded]
+        first.handle(record)
+    first.end()
+    folded = [(f.record.t_ns, type(f.record)) for f in first.folded]
     assert len(folded) == len(set(folded))
     (found,), plain = smooth_flight(records, config), smoothed(120, (60, 90))
     np.testing.assert_array_equal(found.t_ns, plain.t_ns)
