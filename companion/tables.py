@@ -22,6 +22,6 @@ def print_tables(*tables: Table) -> None:
     """Print tables at their natural width."""
     for table in tables:
         table.box, table.padding, table.show_edge = SIMPLE_HEAD, (0, 1, 0, 0), False
-        console = Console()
+        console = Console(markup=False)  # a bracket is text: a unit, a file name
         natural = Measurement.get(console, console.options.update(width=_WIDEST), table).maximum
-        Console(width=max(console.width, natural)).print(table)
+        Console(width=max(console.width, natural), markup=False).print(table)

@@ -22,7 +22,6 @@ from typing import NamedTuple
 
 import click
 import numpy as np
-from rich.markup import escape
 from rich.table import Table
 
 from companion.analysis.beacon_options import beacon_options
@@ -314,7 +313,7 @@ def _table(rows: Sequence[Row], notes: Iterable[str]) -> Table:
     table = number_table(title, *heads, "straight on", caption="\n".join(filter(None, dict.fromkeys(notes))))
     for row in rows:
         table.add_row(
-            escape(printable(row.log)),
+            printable(row.log),
             f"{row.lasting_s:g}",
             f"{row.outages}",
             *("-" if x is None else f"{x:.0f}" for x in (row.rms_m, row.worst_m)),
@@ -341,6 +340,6 @@ def _flown_without(
         )
     missing = [f"{seconds:g}" for seconds in lasting if seconds not in {row.lasting_s for row in rows}]
     if missing:
-        short = f"{escape(printable(log.name))} is too short for {', '.join(missing)} s"
+        short = f"{printable(log.name)} is too short for {', '.join(missing)} s"
         note = "\n".join(filter(None, (note, short)))
     return rows, note
