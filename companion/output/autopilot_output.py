@@ -150,8 +150,7 @@ class AutopilotOutput:
         is_to_return = output.switch_sources and self._source_switch.has_left_gnss
         if not (output.switches_sources or is_to_return) or not output.fits(receiver.autopilot):
             return []
-        self._source_switch.note_losses(is_lossy)
-        self._source_switch.update(now_ns, lack)
+        self._source_switch.update(now_ns, lack, is_lossy)
         return self._source_switch.to_send(receiver.system, now_ns)
 
     def take_events(self) -> list[Event]:

@@ -62,9 +62,9 @@ class GnssFusion(SourceSwitch):
         """Note whether the autopilot is armed."""
         self._is_disarmed = not is_armed
 
-    def update(self, now_ns: int, lack: str = "") -> None:
+    def update(self, now_ns: int, lack: str = "", is_lossy: bool = False) -> None:
         """Decide, and report that GNSS is lost or back: without a command no text of a switch does."""
-        super().update(now_ns, lack)
+        super().update(now_ns, lack, is_lossy)
         s = self.situation(now_ns)
         back = TO_GNSS[0]
         if not self._is_lost and s.sent_s >= STEADY_S and GNSS_LOST.holds(s):

@@ -197,7 +197,6 @@ class SourceSwitch:
         self._leading: int | None = None
         self._held: int | None = None
         self._lack_reported = ""
-        self._is_lossy = False
         self._reported, self._reports = Selected(0), 0  # the last report of the script, how often in a row
         self._reason = ""
         self._tries = 0
@@ -238,17 +237,12 @@ class SourceSwitch:
     def note_armed(self, is_armed: bool) -> None:
         """Ignore whether it is armed: ArduPilot stores no source set."""
 
-    def note_losses(self, is_lossy: bool) -> None:
-        """Note whether much of what the autopilot sends does not arrive: then silence is the link's."""
-        self._is_lossy = is_lossy
-
     def situation(self, now_ns: int) -> Situation:
         """Return the facts at `now_ns`."""
         solution, patience = self._solution, 3 * SECOND_NS
         fresh = solution is not None and (now_ns - solution.rx_ns) * 1e-9 <= FRESH_S
         received_ns = max(self._receiver_ns, self._other_fix_ns)
-        is_judged = self._receiver_ns and not self._is_lossy
-        silent = (now_ns - received_ns) * 1e-9 if is_judged else -1.0
+        silent = (now_ns - received_ns) * 1e-9 if self._receiver_ns else -1.0
         sent_s = self._sent.held_s(now_ns, MAX_GAP_NS + self._slack_ns) - self._slack_ns * 1e-9
         stopped_ns = -SECOND_NS if self._sent_ns is None else max(0, now_ns - self._sent_ns - self._slack_ns)
         return Situation(
@@ -284,12 +278,15 @@ class SourceSwitch:
         """Return the parameters of the command that selects a source set."""
         return {"param1": number}
 
-    def update(self, now_ns: int, lack: str = "") -> None:
+    def update(self, now_ns: int, lack: str = "", is_lossy: bool = False) -> None:
         """Decide by the table; call it at least once a second, with or without solutions.
 
-        `lack`: why the autopilot cannot take our position, empty if it can.
+        `lack`: why the autopilot cannot take our position, empty if it can. `is_lossy`: much of what it sends
+        does not arrive, so that silence is the link's.
         """
         situation = self.situation(now_ns)
+        if is_lossy:
+            situation = situation._replace(silent_s=-1.0)
         decision = self.required(situation)
         if decision is not None and decision[0] == COMPANION_SET and lack:
             self._report_lack(lack, now_ns)
