@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 import csv
+import itertools
 import json
 import math
 import os
@@ -133,8 +134,13 @@ def _print(tables: list[tuple[str, list[OutageErrors]]]) -> None:
 
 
 def _parse_beacons(positions: tuple[str, ...], file: Path | None) -> tuple[Beacon, ...]:
+    """Return the beacons of both options. One without a number that fits the message gets a free one."""
+    # a VOR or DME alone is not enough
+    listed = [b for b in simulated_rsbn.read_beacons(file) if b.azimuth and b.ranging] if file else []
+    taken = {beacon.number for beacon in listed}
+    free = (number for number in itertools.count(1) if number not in taken)
     beacons = []
-    for number, text in enumerate(positions, start=1):
+    for text in positions:
         try:
             lat, lon, *alt = map(float, text.split(","))
             if len(alt) > 1 or not all(map(math.isfinite, (lat, lon, *alt))):
@@ -155,15 +161,11 @@ def _parse_beacons(positions: tuple[str, ...], file: Path | None) -> tuple[Beaco
                 f"invalid beacon {text!r}: height {height:g}: give -{HIGHEST:.0f} to {HIGHEST:.0f} m",
                 param_hint="--beacon",
             )
-        beacons.append(Beacon(number, lat, lon, height, ground_alt=simulated_rsbn.GROUND))
-    if file is not None:
-        for listed in simulated_rsbn.read_beacons(file):
-            if not (listed.azimuth and listed.ranging):
-                continue  # a VOR or DME alone is not enough
-            lat, lon = math.degrees(listed.lat), math.degrees(listed.lon)
-            beacons.append(
-                Beacon(listed.number, lat, lon, listed.alt, simulated_rsbn.GROUND, listed.range_limit)
-            )
+        beacons.append(Beacon(next(free), lat, lon, height, ground_alt=simulated_rsbn.GROUND))
+    for b in listed:
+        number = b.number if b.number <= simulated_rsbn.MAX_NUMBER else next(free)
+        lat, lon = math.degrees(b.lat), math.degrees(b.lon)
+        beacons.append(Beacon(number, lat, lon, b.alt, simulated_rsbn.GROUND, b.range_limit))
     return tuple(beacons)
 
 

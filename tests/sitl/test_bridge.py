@@ -415,6 +415,19 @@ def test_bridge_and_replay_use_the_same_radio_horizon(height: float, tmp_path) -
     assert typed.ground_alt == read.ground_alt == simulated_rsbn.GROUND
 
 
+def test_each_beacon_has_a_number_of_its_own_that_fits_the_message(tmp_path: Path) -> None:
+    """Regression: ids of OurAirports are beyond 65535, where the bridge ended; typed ones began at 1 too."""
+    path = tmp_path / "navaids.csv"
+    rows = "90000,VOR-DME,55.8,38.5,100", "1,VOR-DME,55.9,38.4,100"
+    path.write_text("\n".join(("id,type,latitude_deg,longitude_deg,elevation_ft", *rows)))
+    beacons = bridge_command._parse_beacons(("55.75,38.57",), path)
+    assert [(b.number, b.lat_deg) for b in beacons] == [
+        (2, 55.75),
+        (3, pytest.approx(55.8)),
+        (1, pytest.approx(55.9)),
+    ]
+
+
 def test_missing_autopilot_is_reported() -> None:
     link = f"udpin:{LOOPBACK}:{free_port()}"
     done = CliRunner().invoke(command, ["--connect", link, "--seconds", "1"])
