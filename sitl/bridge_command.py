@@ -38,14 +38,17 @@ TRUTH_COLUMNS = ("true_lat_deg", "true_lon_deg", "true_alt_m")
 
 
 class BridgeRunner(RealTimeRunner):
-    """One run over two links, or over one without relaying. `store` receives every new error."""
+    """One run over two links, or over one without relaying. `store` receives every new error.
+
+    Seconds count from the first message of the autopilot, until then from the start of the run.
+    """
 
     def __init__(
         self,
         bridge: Bridge,
         addresses: Sequence[Address],
         report: Callable[[float, str], None],
-        store: Callable[[Sequence[PositionError]], None],
+        store: Callable[[Sequence[PositionError], int], None],
         seconds: float,
     ) -> None:
         super().__init__(addresses, lambda text: report(1e-9 * self._elapsed_ns(), text))
@@ -63,6 +66,7 @@ class BridgeRunner(RealTimeRunner):
 
     def _receive(self, link: int, data: bytes) -> None:
         self._feed[link](data, time.monotonic_ns())
+        self.started_ns = self._bridge.connected_ns or self.started_ns
 
     def _flush(self) -> None:
         self._send(self._bridge.to_autopilot(), 0)
@@ -71,28 +75,27 @@ class BridgeRunner(RealTimeRunner):
             self._report(line)
         scored = self._bridge.comparison.errors
         if len(scored) > self._stored:
-            self._store(scored[self._stored :])
+            self._store(scored[self._stored :], self.started_ns)
             self._stored = len(scored)
 
 
 class ErrorFile:
-    """CSV file of all errors in `folder`; times are seconds since `start_ns`. Raises OSError."""
+    """CSV file of all errors in `folder`. Raises OSError."""
 
-    def __init__(self, folder: Path, start_ns: int) -> None:
+    def __init__(self, folder: Path) -> None:
         make_folder(folder)
         self.path = folder / f"{datetime.now(UTC):bridge-%Y%m%dT%H%M%SZ}.csv"
         self._file: TextIO = self.path.open("x", newline="", buffering=1)
-        self._start_ns = start_ns
         self._lines = csv.writer(self._file)
         self._lines.writerow((*COLUMNS, *TRUTH_COLUMNS))
 
-    def store(self, scored: Sequence[PositionError]) -> None:
-        """Append errors to the file."""
+    def store(self, scored: Sequence[PositionError], start_ns: int) -> None:
+        """Append errors to the file; times are seconds since `start_ns`."""
         for s in scored:
             metres = (s.north, s.east, s.error, s.sigma, s.bound)
             numbers = ("" if value is None else f"{value:.2f}" for value in metres)
             place = (f"{math.degrees(angle):.7f}" for angle in (s.true.lat, s.true.lon))
-            t_s = f"{(s.t_ns - self._start_ns) * 1e-9:.3f}"
+            t_s = f"{(s.t_ns - start_ns) * 1e-9:.3f}"
             self._lines.writerow((t_s, s.source, *numbers, *place, f"{s.true.alt:.1f}"))
 
     def close(self) -> None:
@@ -236,7 +239,7 @@ def command(
         sys.exit(1)
     bridge = Bridge(beacons, GnssSchedule(gnss_off_after, gnss_on_after), mode, unaided, seed)
     try:
-        record = ErrorFile(folder, time.monotonic_ns()) if folder else None
+        record = ErrorFile(folder) if folder else None
     except OSError as error:
         click.echo(f"companion: {folder} cannot be written: {error.strerror}", err=True)
         sys.exit(os.EX_CANTCREAT)
@@ -244,7 +247,7 @@ def command(
         bridge,
         (autopilot, other) if other else (autopilot,),
         lambda t, text: click.echo(f"{t:8.1f} s  {text}", err=True),
-        record.store if record else lambda scored: None,
+        record.store if record else lambda scored, start_ns: None,
         seconds,
     )
     try:

@@ -11,6 +11,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from click.testing import CliRunner
@@ -23,7 +24,7 @@ from companion.link.dialect import mavlink
 from companion.records import Event, RsbnFix, Solution, Truth
 from companion.runtime.core import CompanionCore
 from companion.storage import flight_log
-from sitl import bridge_command
+from sitl import bridge_command, real_time
 from sitl.beacon import Beacon
 from sitl.bridge import AUTOPILOT, COMPANION, RSBN, Bridge, BridgeMode, GnssSchedule
 from sitl.bridge_command import command
@@ -413,6 +414,32 @@ def test_bridge_and_replay_use_the_same_radio_horizon(height: float, tmp_path) -
     listed.write_text(f"id,lat_deg,lon_deg,alt_m\n1,55.75,38.57,{height}\n")
     typed, read = bridge_command._parse_beacons((f"55.75,38.57,{height}",), listed)
     assert typed.ground_alt == read.ground_alt == simulated_rsbn.GROUND
+
+
+def test_seconds_count_from_the_first_message_of_the_autopilot(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Regression: the run and its lines counted from the start of the bridge, GNSS off from the message."""
+    now = START
+    clock = SimpleNamespace(monotonic_ns=lambda: now)
+    monkeypatch.setattr(bridge_command, "time", clock)
+    monkeypatch.setattr(real_time, "time", clock)
+    shown: list[tuple[float, str]] = []
+    bridge = Bridge(schedule=GnssSchedule(9.0))
+    address = bridge_command.parse_address("tcp:127.0.0.1:5760")
+    run = bridge_command.BridgeRunner(
+        bridge, (address,), lambda t, text: shown.append((t, text)), print, 10.0
+    )
+    steps = run._steps()
+    next(steps)
+    now += 8 * SECOND
+    heartbeat = dialect.new("HEARTBEAT", type=mavlink.MAV_TYPE_FIXED_WING, autopilot=3)
+    run._receive(0, frame.encode(heartbeat, 0, 1, 1))
+    next(steps)
+    now += 9 * SECOND
+    assert next(steps) <= 1.0
+    assert shown[0] == (0.0, "connected to autopilot 1 (ardupilot)")
+    assert (9.0, "switching GNSS off") in shown
+    now += SECOND
+    assert next(steps, None) is None
 
 
 def test_each_beacon_has_a_number_of_its_own_that_fits_the_message(tmp_path: Path) -> None:
