@@ -21,13 +21,12 @@ from typing import Any, NamedTuple
 
 import click
 import numpy as np
-from rich.console import Console
-from rich.table import Table
 
 from companion.analysis.jobs import WORKER_LOST, Journal, run_jobs
 from companion.analysis.progress import show_count
 from companion.analysis.worker_options import worker_options
 from companion.option_types import FloatRange
+from companion.tables import number_table, print_tables
 from sitl.campaign.flight import (
     FAULT_CASES,
     SCENARIOS,
@@ -169,16 +168,14 @@ def _summarise_fault(fault: str, flights: list[FlightResult], limits: CampaignLi
     )
 
 
-def print_table(lines: Sequence[FaultSummary], limits: CampaignLimits, console: Console) -> None:
+def print_table(lines: Sequence[FaultSummary], limits: CampaignLimits) -> None:
     """Print the table."""
-    flights, failed = sum(line.flights for line in lines), sum(not line.passed for line in lines)
-    grid = Table(title=f"{flights} flights; horizontal errors in m, times to detect in s")
-    for head in HEADS:
-        grid.add_column(head, justify="left" if head == "fault" else "right", no_wrap=head == "fault")
+    flights, passed = sum(line.flights for line in lines), sum(line.passed for line in lines)
+    table = number_table(f"{flights} flights; horizontal errors in m, times to detect in s", *HEADS)
     for line in lines:
-        grid.add_row(*(_cell(value) for value in line))
-    console.print(grid)
-    console.print(f"{_explain_limits(limits)} {len(lines) - failed} of {len(lines)} passed.", soft_wrap=True)
+        table.add_row(*(_cell(value) for value in line))
+    print_tables(table)
+    click.echo(f"{_explain_limits(limits)} {passed} of {len(lines)} passed.")
 
 
 def markdown_report(results: Sequence[FlightResult], limits: CampaignLimits, made_by: str) -> str:
@@ -288,6 +285,6 @@ def command(
     if as_json:
         click.echo(json.dumps([line._asdict() for line in lines]))
     else:
-        print_table(lines, limits, Console(width=max(150, Console().width)))
+        print_table(lines, limits)
     if not all(line.passed for line in lines):
         raise SystemExit(1)

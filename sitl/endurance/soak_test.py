@@ -36,7 +36,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import click
-from rich.console import Console
 
 from companion.bench.live import memory_mib
 from companion.config import Config
@@ -45,7 +44,7 @@ from companion.records import Stamped
 from companion.runtime.core import CompanionCore
 from companion.storage.flight_log import Writer
 from companion.storage.run_metadata import run_metadata
-from companion.tables import number_table
+from companion.tables import number_table, print_tables
 from companion.units import SECOND_NS
 from sitl.autopilot import UNIX_AT_START_NS, SimulatedAutopilot
 from sitl.campaign.flight import NORTH_BEACON
@@ -298,4 +297,4 @@ def _print_table(hours: list[HourStatistics]) -> None:
     table = number_table(title, *heads, texts=0)
     for hour in hours:
         table.add_row(*(f"{value:g}" if isinstance(value, float) else str(value) for value in hour))
-    Console(width=max(150, Console().width)).print(table)
+    print_tables(table)

@@ -246,6 +246,13 @@ def test_exit_code_follows_the_limits(tmp_path: Path) -> None:
     assert "gnss-jump" in strict.output
 
 
+@pytest.mark.usefixtures("requested")
+def test_heads_of_the_table_are_not_cut(tmp_path: Path) -> None:
+    options = ["--scenario", "one-beacon", "--fault", "none", "--workers", "0", "--results", str(tmp_path)]
+    shown = CliRunner().invoke(command.command, options).output
+    assert [head for head in command.HEADS if head not in shown] == []
+
+
 def test_dask_returns_every_flight_and_that_of_a_killed_worker_too(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
