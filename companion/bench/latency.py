@@ -140,23 +140,23 @@ class _Autopilot:
         self._sequence = 0
 
     def fly(self) -> None:
-        """Wait for the next tenth of a second, send the messages that are due, discard the replies."""
+        """Wait for the next tenth of a second, send the messages that are due, leave time for them."""
         self._next += ROUND_S
         time.sleep(max(0.0, self._start + self._next - time.perf_counter()))
         self._send_round()
         time.sleep(0.1 * ROUND_S)
-        self._drain()
 
     def rsbn_frame(self) -> bytes:
         """Return the frame of a beacon measurement without errors, valid now."""
         return self._frame("RSBN_MEASUREMENT")
 
     def time_response(self, answer: bytes) -> float:
-        """Send a beacon measurement. Return the seconds until the corrected estimate arrives.
+        """Send a beacon measurement. Return the seconds until the corrected estimate arrives after it.
 
         The flight goes on meanwhile: an estimate that is not due yet (its message has a rate) leaves with the
         next local position. Raises TimeoutError if none arrives.
         """
+        self._drain()
         start = now = time.perf_counter()
         self._sock.send(answer)
         while now - start < PATIENCE_S:

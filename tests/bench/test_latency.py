@@ -63,6 +63,20 @@ def test_flight_goes_on_while_an_estimate_is_awaited(clock):
     assert autopilot.time_response(autopilot.rsbn_frame()) == pytest.approx(latency.ROUND_S, abs=0.02)
 
 
+def test_an_estimate_that_came_before_the_measurement_is_none_of_it(clock):
+    """Regression: on a busy computer that of the local position came during the pause, and was timed."""
+    before: list[bytes] = []
+
+    class Late(Service):
+        def recv(self, size: int) -> bytes:
+            return before.pop() if before else super().recv(size)
+
+    autopilot = latency._Autopilot(Late())
+    autopilot.fly()
+    before.append(frame.encode(dialect.new("ODOMETRY"), 0, 1, 1))
+    assert autopilot.time_response(autopilot.rsbn_frame()) == pytest.approx(latency.ROUND_S, abs=0.02)
+
+
 def test_an_estimate_that_never_comes_is_one_sentence(clock):
     autopilot = latency._Autopilot(Service(sends=False))
     autopilot.fly()
