@@ -131,7 +131,10 @@ def test_gnss_errors_match_stated_sigmas_and_outages_have_no_fix(flight):
     assert np.std(north) == pytest.approx(model.sigma_horizontal, rel=0.1)
     assert np.std(east) == pytest.approx(model.sigma_horizontal, rel=0.1)
     assert np.std(white) == pytest.approx(
-        math.sqrt(2 * model.white_m**2 + 2 * model.correlated_m**2 * (1 - math.exp(-0.2 / 120))), rel=0.05
+        math.sqrt(
+            2 * model.white_m**2 + 2 * model.correlated_m**2 * (1 - math.exp(-0.2 / model.correlation_s))
+        ),
+        rel=0.05,
     )
     assert not fixes.usable[(at.t >= 100.0) & (at.t < 160.0)].any()
     assert fixes.usable.sum() == len(at.t) - 300

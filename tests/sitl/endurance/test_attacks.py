@@ -1,4 +1,4 @@
-"""Floods cost little processor time and do not change the rate of the output (in virtual time)."""
+"""Floods do not change the rate of the output (in virtual time)."""
 
 import pytest
 
