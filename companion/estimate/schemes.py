@@ -113,7 +113,7 @@ class SchemeState(NamedTuple):
 def step(
     state: SchemeState, u: Floats, Z: Floats | None, plant: Plant, fractions: FeedbackFractions = FEEDFORWARD
 ) -> SchemeState:
-    """Mechanise one step, update by a fix, and fractions back.
+    """Mechanise one step, update by a fix, and feed fractions of the estimate back.
 
     Parameters
     ----------
