@@ -170,7 +170,7 @@ def create_replay_log(
     exception, also Ctrl-C, the log stays ".active", as stderr states: an older log of its name is kept.
     Raises LogError if the disk fails, and unless the name is that of a log: no other command would read it.
     """
-    if path.suffix != ".mcap":
+    if path.suffix.lower() != ".mcap":
         raise LogError(f"{path}: a log is written as .mcap: give a name that ends with it")
     remove_leftover(path)
     start_ns, start_unix_ns = start_times(log)

@@ -132,13 +132,14 @@ def open_inputs(log: Path, config: Config | None = None) -> LogInputs:
 
 def is_own_log(log: Path) -> bool:
     """Return whether the file name is that of our own log (MCAP)."""
-    return log.suffix == ".mcap" or log.name.endswith(f".mcap{ACTIVE}")
+    return log.name.lower().endswith((".mcap", f".mcap{ACTIVE}"))
 
 
 def default_output(log: Path, kind: str) -> Path:
     """Return the name of the log of a `kind` made from `log`, in the current folder: NAME.KIND.mcap."""
     name = log.resolve().name if log.is_dir() else log.stem
-    return Path(f"{log.name.split('.mcap')[0] if is_own_log(log) else name}.{kind}.mcap")
+    own = re.split(r"\.mcap", log.name, maxsplit=1, flags=re.IGNORECASE)[0]
+    return Path(f"{own if is_own_log(log) else name}.{kind}.mcap")
 
 
 def has_navigator_outputs(log: Path) -> bool:

@@ -248,7 +248,7 @@ def open_log(path: str | os.PathLike[str]) -> Iterator[LogReader]:
         if not magic:
             raise LogError(f"{path} is empty: nothing was recorded")
         if not MAGIC.startswith(magic):
-            is_named_so = path.suffix in (".mcap", ACTIVE)
+            is_named_so = path.suffix.lower() in (".mcap", ACTIVE)
             advice = "" if is_named_so else "; convert it first with `companion log convert`"
             raise LogError(f"{path} is not an MCAP log (it does not begin with MCAP's magic){advice}")
         first = next(LogReader(path, file, size).records(), None)

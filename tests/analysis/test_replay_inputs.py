@@ -72,12 +72,21 @@ def test_output_has_the_name_of_its_log(tmp_path: pathlib.Path, monkeypatch: pyt
         "a.b.tlog": "a.b",
         "../a.mcap": "a",
         "a.mcap.active": "a",
+        "A.b.MCAP": "A.b",
+        "A.MCAP.active": "A",
         ".": "topics",
         "..": "flight.2024-05-01",
         str(folder): "flight.2024-05-01",
     }.items():
         found = replay_inputs.default_output(pathlib.Path(log), "replay")
         assert found == pathlib.Path(f"{name}.replay.mcap")
+
+
+def test_log_with_an_ending_in_capitals_is_written_and_read(tmp_path: pathlib.Path) -> None:
+    converted, replayed = tmp_path / "FLIGHT.MCAP", tmp_path / "AGAIN.MCAP"
+    run("log", "convert", FLIGHT, "-o", converted)
+    run("replay", converted, "-o", replayed)
+    assert values(replayed, r.Gnss) == values(converted, r.Gnss) != []
 
 
 @pytest.fixture
