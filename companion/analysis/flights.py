@@ -12,6 +12,7 @@ from pathlib import Path
 
 from companion.analysis.flight_arrays import Flight, collect_flights
 from companion.analysis.replay_inputs import (
+    DERIVED,
     has_navigator_outputs,
     input_errors_as_log_errors,
     is_own_log,
@@ -44,7 +45,7 @@ SENSORS: dict[Sensor, str] = {
 def open_flights(path: Path, config: Config) -> list[Flight]:
     """Return the flights in the log at `path`; `config` is used if the navigator has to be run.
 
-    Raises LogError if the file cannot be read or is empty.
+    Raises LogError if the file cannot be read, is empty or was made by `smooth`.
     """
     with input_errors_as_log_errors():
         first_unix_ns, remarks = None, list[str]()
@@ -52,6 +53,12 @@ def open_flights(path: Path, config: Config) -> list[Flight]:
             first = next(iter(flight_log.read(path)), None)
             if first is None:
                 raise LogError(f"{path} contains no messages: nothing to report")
+            derived = flight_log.metadata(path).get(DERIVED, {})
+            if derived.get("by") == "smooth":
+                raise LogError(
+                    f"{path} has a smoothed track and no estimate: give the log that it was made from, "
+                    f"{derived.get('from')}"
+                )
             first_unix_ns = first.log_time
             if not is_closed(path):
                 bytes_lost = flight_log.info(path).bytes_lost

@@ -12,8 +12,10 @@ import pytest
 from click.testing import CliRunner
 
 from companion.analysis import smoothing
+from companion.analysis.flights import open_flights
 from companion.analysis.replay_inputs import open_inputs
 from companion.analysis.smooth_command import ELLIPSE_95, command
+from companion.config import Config
 from companion.link import dialect, frame
 from companion.records import Smoothed
 from companion.storage import flight_log
@@ -75,6 +77,12 @@ def test_maps_have_track_and_ellipses(written):
     assert np.ptp(north) / 2 == pytest.approx(ELLIPSE_95 * math.sqrt(nn), rel=0.02)
     assert np.ptp(east) / 2 == pytest.approx(ELLIPSE_95 * math.sqrt(ee), rel=0.02)
     assert len(ElementTree.parse(paths[".kml"]).getroot()[0]) == 2 + len(ellipses)
+
+
+def test_report_on_the_track_names_the_log_that_it_was_made_from(written):
+    paths, _ = written
+    with pytest.raises(LogError, match=r"no estimate: give .* from, plane\.tlog"):
+        open_flights(paths[".mcap"], Config())
 
 
 def test_two_point_form_agrees(written):
