@@ -30,6 +30,7 @@ from companion.units import Floats
 #: error that it states, for `FAR_S` or longer.
 FAR_M, FAR_TIMES, FAR_S = 30.0, 3.0, 10.0
 SHORT_S = 30.0  # shorter phases are not mentioned
+BEGIN_S = 120.0  # until then an INS that starts without an error has not drifted
 CHEBYSHEV = 0.75  # least share of moments within twice a valid r.m.s. bound
 LATE_S = 0.1  # smaller GNSS delays are usual
 CONSISTENT = 0.85  # least share of normalized errors within their 95 % limit
@@ -302,6 +303,18 @@ def gnss_contradiction(a: Assessment) -> Contradiction | None:
     return None if longest is None or longest.end - longest.start < FAR_S else longest
 
 
+def worse_than_inertial(a: Assessment) -> list[error_statistics.PhaseErrors]:
+    """Return the phases in which the estimate was worse than the inertial channel alone.
+
+    Not one within the first `BEGIN_S`: a simulated INS starts without an error, and no fix is as good.
+    """
+    return [
+        row
+        for row, phase in zip(a.rows, a.phases, strict=True)
+        if phase.end_ns * 1e-9 > BEGIN_S and is_worse_than_inertial(row)
+    ]
+
+
 def is_worse_than_inertial(row: error_statistics.PhaseErrors) -> bool:
     """Return whether in a phase worth mentioning the estimate was worse than the inertial channel alone.
 
@@ -410,22 +423,18 @@ def _other_rejections(a: Assessment) -> list[str]:
 
 
 def _anomalies(a: Assessment) -> list[str]:
-    found = []
-    for row in a.rows:
-        ins, corrected = row.rms.get(error_statistics.INS), row.rms.get(error_statistics.CORRECTED)
-        if row.seconds < SHORT_S or ins is None or corrected is None:
-            continue
-        if is_worse_than_inertial(row):
-            found.append(
-                f"in the phase “{phase_title(row.phase)}” the estimate ({format_length(corrected)}) was "
-                f"worse than the inertial channel alone ({format_length(ins)})"
-            )
-        if row.inside_twice is not None and row.inside_twice < CHEBYSHEV:
-            found.append(
-                f"in the phase “{phase_title(row.phase)}” the {deviation(a)} was within twice the bound of "
-                f"its moment only {format_share(row.inside_twice)} of the time, where at least 75 % are "
-                "expected"
-            )
+    found = [
+        f"in the phase “{phase_title(row.phase)}” the estimate "
+        f"({format_length(row.rms[error_statistics.CORRECTED])}) was worse than the inertial channel alone "
+        f"({format_length(row.rms[error_statistics.INS])})"
+        for row in worse_than_inertial(a)
+    ]
+    found += [
+        f"in the phase “{phase_title(row.phase)}” the {deviation(a)} was within twice the bound of its "
+        f"moment only {format_share(row.inside_twice)} of the time, where at least 75 % are expected"
+        for row in a.rows
+        if row.seconds >= SHORT_S and row.inside_twice is not None and row.inside_twice < CHEBYSHEV
+    ]
     for series in a.normalized_errors:
         if series.inside < CONSISTENT:
             share = format_share(series.inside)

@@ -25,7 +25,7 @@ from companion.analysis.summary import (
     format_share,
     format_time,
     gnss_contradiction,
-    is_worse_than_inertial,
+    worse_than_inertial,
     worst_of,
 )
 
@@ -125,7 +125,7 @@ def _protection_broken(a: Assessment) -> Verdict | None:
 
 
 def _worse_than_inertial(a: Assessment) -> Verdict | None:
-    worse = [row for row in a.rows if is_worse_than_inertial(row)]
+    worse = worse_than_inertial(a)
     if not worse or a.reference is None or a.reference.what == GNSS:
         return None
     row = max(worse, key=lambda row: row.rms[error_statistics.CORRECTED])

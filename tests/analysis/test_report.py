@@ -499,6 +499,14 @@ def test_estimate_worse_than_the_inertial_channel_is_an_anomaly():
     )
 
 
+def test_the_first_minutes_are_not_compared_with_an_ins_that_starts_without_error():
+    rows = list(flight_records(error=(3.0, 4.0), ins=(0.0, 0.0)))
+    short = collected(r for r in rows if r.rx_ns < START + 60 * S)
+    assert judge_flight(short).level == "good"
+    assert "worse than the inertial channel" not in sentences(short)
+    assert "worse than the inertial channel" in judge_flight(collected(rows)).reason
+
+
 def test_a_phase_without_an_estimate_is_not_compared_with_the_inertial_channel():
     """The autopilot is silent for a minute; the first estimate after it, 400 m off, belongs to that phase."""
     start, end = START + 60 * S, START + 110 * S
@@ -582,7 +590,7 @@ def test_phases_without_a_useful_bound_are_counted():
     assert "held in 2 of 3 phases; it was of no use in the others" in verdict.reason
     text = sentences(dataclasses.replace(a, rows=rows))
     assert f"No useful guaranteed bound in 1 phase “{phase_title(rows[1].phase)}”." in text
-    text = sentences(dataclasses.replace(a, rows=[rows[1], rows[1]]))
+    text = sentences(dataclasses.replace(a, rows=[rows[1]] * 2, phases=[a.phases[1]] * 2))
     assert f"No useful guaranteed bound in 2 phases, the first “{phase_title(rows[1].phase)}”." in text
 
 
