@@ -18,7 +18,7 @@ from companion.analysis.convert import convert_log
 from companion.analysis.replay_inputs import apply_changes
 from companion.command_line import cli
 from companion.config import Config
-from companion.records import Event, Reboot, Reset
+from companion.records import Event, Reboot, Reset, Solution, Stamped
 from companion.storage import flight_log
 from companion.storage.deferred_log import NoLog
 from companion.storage.mcap_file import DiskFile
@@ -63,6 +63,19 @@ def test_output_of_a_replay_replays_bit_for_bit(tmp_path: Path) -> None:
     config = logged_configuration(tmp_path / "out.mcap")
     found = replay.replay_own(tmp_path / "out.mcap", config, NoLog())
     assert found.different == 0 and found.compared
+
+
+def test_outputs_beyond_the_end_of_a_cut_log_are_no_difference(tmp_path: Path) -> None:
+    whole, cut = tmp_path / "whole.mcap", tmp_path / "cut.mcap"
+    replayed(CUT, whole)
+    entries = [entry for entry in flight_log.read(whole) if isinstance(entry.value, Stamped)]
+    last = max(k for k, entry in enumerate(entries) if isinstance(entry.value, Solution))
+    about = flight_log.metadata(whole)
+    with flight_log.Writer(cut, metadata=about, start_unix_ns=10**18, start_ns=0, block=True) as log:
+        for entry in entries[:last]:
+            log.record(entry.value, entry.topic)
+    found = replay.replay_own(cut, logged_configuration(whole), NoLog())
+    assert found.compared and found.first_difference is None
 
 
 def test_configuration_is_stored_in_the_log(tmp_path: Path) -> None:
