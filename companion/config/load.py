@@ -275,9 +275,11 @@ def _interval(limit: msgspec.Meta) -> str:
 
 
 def _wanted(kind: Any, value: Any) -> str:
-    """Return what to give for a number, or true or false; empty for another kind of key."""
+    """Return what to give for a number, text, or true or false; empty for another kind of key."""
     if kind is bool:
         return "give true or false"
+    if kind in (str, tuple[str, ...]):
+        return "give text in quotes"
     if get_origin(kind) is not Annotated or get_args(kind)[0] not in (int, float):
         return ""
     base, limit = get_args(kind)

@@ -39,6 +39,7 @@ def test_flags_override_environment_overrides_file(tmp_path: Path) -> None:
         ),
         ("[gnss]\nsigma_m = -1", "gnss.sigma_m = -1 is invalid: give a number from 0.01 to 1000"),
         ("[gnss]\nsigma_m = nan", "gnss.sigma_m = nan is invalid: give a number from 0.01 to 1000"),
+        ("[log]\nfolder = 3", "log.folder = 3 is invalid: give text in quotes"),
         (
             "[gnss]\nsigma_m = 'two'",
             "gnss.sigma_m = 'two' is invalid: give a number from 0.01 to 1000, without quotes",
@@ -58,7 +59,7 @@ def test_flags_override_environment_overrides_file(tmp_path: Path) -> None:
         ),
         ("[log]\nmaximum_files = 0", "log.maximum_files = 0 is invalid: give a whole number of at least 1"),
         ("[log]\nminimum_free_mib = 1.5", "give a whole number of at least 0"),
-        ("[link]\nconnect = 3", "link.connect = [3] is invalid: expected str, got int"),
+        ("[link]\nconnect = 3", "link.connect = [3] is invalid: give text in quotes"),
         ("[estimator]\nparallel = 'minmax_filter'", "is not one of minimax_filter, restrictive"),
         ("link = 3", "`link` is a section: write [link] and its keys below it"),
         ("sigma_m = 2", "the key `sigma_m` is in no section; did you mean `gnss.sigma_m`?"),
