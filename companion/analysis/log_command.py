@@ -148,7 +148,7 @@ def _print(found: Info) -> None:
     console = Console()
     rate = 1.0 / found.duration_s if found.duration_s > 0 else 0.0
     lost = f"{found.bytes_lost} bytes unreadable; " if found.bytes_lost else ""
-    state = "closed" if found.closed else f"torn ({lost}run companion log recover)"
+    state = "closed" if found.closed else f"torn, or still written ({lost}run companion log recover)"
     name = escape(printable(str(found.path)))
     console.print(f"[bold]{name}[/]  {found.bytes / 1e6:.3f} MB, {state}", soft_wrap=True)
     if found.messages:
