@@ -232,13 +232,11 @@ class Navigator:
     def _resolved(self, state: State, record: Input) -> Step:
         """Do the deferred update left by `record`, the last one of `state`.
 
-        The fix is added to the window of the guaranteed bound. A piece of that bound's work is done a moment
-        later, in a turn that takes no fix.
+        The fix is added to the window of the guaranteed bound, and one piece of that bound's work is done.
         """
         pending, outputs = state.pending, list[Output]()
         if pending is not None:
-            rested = minimax_bound.rested(state.guarantee, pending.record.t_ns)
-            state = structs.replace(state, pending=None, guarantee=rested)
+            state = structs.replace(state, pending=None)
             state, outputs = guarded(state, pending.record, self._settings, resolve_pending, pending)
         if is_bound_due(state):
             state, more = guarded(state, record, self._settings, refresh_bound, record)

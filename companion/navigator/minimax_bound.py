@@ -38,7 +38,6 @@ SILENT_S = 60.0  # after a longer silence of the channel a new window begins
 STRAIGHT_S = 30.0  # steps ahead, straight on
 UNLIKE = 2.0  # a fix this many times better or worse than its bin begins a new one
 PIECE_NS = SECOND_NS // 10  # at most one piece of work so often
-REST_NS = PIECE_NS // 5  # and none so shortly after a fix, which takes a turn of the event loop by itself
 #: Estimates of a target are sought once the window has new fixes, and so often without. In between those of
 #: now are carried on by those of the velocity, and judged again so often.
 NOW_NS, SELDOM_NS, JUDGED_NS = 3 * SECOND_NS, 10 * SECOND_NS, SECOND_NS
@@ -196,11 +195,6 @@ def _has_work(g: Guarantee, nominal: Nominal) -> bool:
     if window is None or g.reach is None or not window.fixes:
         return False
     return abs(nominal.t_ns - g.worked_ns) >= PIECE_NS
-
-
-def rested(g: Guarantee, t_ns: int) -> Guarantee:
-    """Put the next piece of work off: a fix was taken at `t_ns`."""
-    return g._replace(worked_ns=max(g.worked_ns, t_ns - PIECE_NS + REST_NS))
 
 
 def follow(g: Guarantee, nominal: Nominal, config: Config) -> Guarantee:

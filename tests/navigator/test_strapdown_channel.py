@@ -20,7 +20,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.signal import lfilter
 
-import companion.navigator
 from companion.analysis import simulated_rsbn
 from companion.analysis.error_statistics import position_from_beacon
 from companion.config import load
@@ -31,7 +30,6 @@ from companion.navigator import (
     Navigator,
     air_data_channel,
     bounded_trajectory,
-    minimax_bound,
     own_channel,
     own_error_model,
     solution,
@@ -934,32 +932,6 @@ def test_an_airspeed_that_steps_does_not_move_what_is_bounded() -> None:
     place = displace(*state.nominal.point.position, *(-e for e in found.restricted.error_n), 0.0)
     error = separation(place, recorded()[1](state.nominal.t_ns))
     assert math.hypot(*error[:2]) < math.hypot(*found.restricted.bound_n)
-
-
-@pytest.mark.flight
-def test_a_record_that_takes_a_fix_does_no_piece_of_the_bound(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Both in one turn of the event loop took 13 to 18 ms. A piece that is overdue comes 20 ms later."""
-    navigator, behind = until(LOSS - 30.0)
-    did: list[str] = []
-
-    def note(module: Any, name: str, what: str) -> None:
-        real = getattr(module, name)
-        monkeypatch.setattr(module, name, lambda *args: did.append(what) or real(*args))
-
-    note(companion.navigator, "resolve_pending", "fix")
-    for name in ("anchor", "_solved", "_carried"):  # every piece is one of them
-        note(minimax_bound, name, "piece")
-    seen: list[set[str]] = []
-    for record in behind[:1500]:
-        if isinstance(record, Gnss | RsbnFix):
-            overdue = navigator.state.guarantee._replace(worked_ns=0)
-            navigator._state = msgspec.structs.replace(navigator.state, guarantee=overdue)
-        did.clear()
-        navigator.handle(record)
-        navigator.settle()
-        seen.append(set(did))
-    assert seen.count({"fix"}) > 50 and seen.count({"piece"}) > 50
-    assert {"fix", "piece"} not in seen
 
 
 @pytest.mark.flight
