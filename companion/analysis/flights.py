@@ -12,8 +12,8 @@ from pathlib import Path
 
 from companion.analysis.flight_arrays import Flight, collect_flights
 from companion.analysis.replay_inputs import (
+    CONVERTED,
     DERIVED,
-    has_navigator_outputs,
     input_errors_as_log_errors,
     is_own_log,
     open_inputs,
@@ -53,7 +53,8 @@ def open_flights(path: Path, config: Config) -> list[Flight]:
             first = next(iter(flight_log.read(path)), None)
             if first is None:
                 raise LogError(f"{path} contains no messages: nothing to report")
-            derived = flight_log.metadata(path).get(DERIVED, {})
+            about = flight_log.metadata(path)
+            derived = about.get(DERIVED, {})
             if derived.get("by") == "smooth":
                 raise LogError(
                     f"{path} has a smoothed track and no estimate: give the log that it was made from, "
@@ -64,12 +65,12 @@ def open_flights(path: Path, config: Config) -> list[Flight]:
                 bytes_lost = flight_log.info(path).bytes_lost
                 lost = f"; {bytes_lost} bytes at its end are unreadable" if bytes_lost else ""
                 remarks.append(f"The log was not closed{lost}.")
-            if has_navigator_outputs(path):
+            if CONVERTED not in about:
                 return collect_flights(
                     _read_outputs(path),
                     path.name,
                     unix_ns=first_unix_ns,
-                    metadata=flight_log.metadata(path),
+                    metadata=about,
                     remarks=tuple(remarks),
                 )
         sensors = set[str]()
