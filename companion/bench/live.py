@@ -30,17 +30,17 @@ from companion.tables import number_table
 
 FLIGHT_S = 20.0
 SETTLE_S = 10.0  # the first fix
-TICK_S = 0.01
 TURNS = "turns.npy"
 
 
 class Stream(NamedTuple):
-    """Rates of a stock autopilot, Hz by message: those that the companion uses, and others."""
+    """What a stock autopilot sends: rates in Hz by message, those that the companion uses and others."""
 
     autopilot: int
     profile: str
     used: dict[str, float]
     unused: dict[str, float]
+    datagram_s: float = 0.01  # what is due within that time comes in one datagram
 
 
 STREAMS = {
@@ -62,6 +62,7 @@ STREAMS = {
          "POSITION_TARGET_LOCAL_NED": 10, "GLOBAL_POSITION_INT": 50},
     ),
 }  # fmt: skip
+STREAMS["PX4, a message a datagram"] = STREAMS["PX4, stock rates"]._replace(datagram_s=0.0)
 
 
 class Cost(NamedTuple):
@@ -87,10 +88,10 @@ def measure() -> list[Cost]:
                     "asyncio and pymavlink": stack.enter_context(peer(set(), _bare, True)),
                     "asyncio alone": stack.enter_context(peer(set(), _bare, False)),
                 }
-                flight = fly(stream)
-                _send_until(flight, [sock for sock, _ in peers.values()], SETTLE_S)
+                flight, socks = fly(stream), [sock for sock, _ in peers.values()]
+                _send_until(SETTLE_S, flight, stream.datagram_s, socks)
                 before = {pid: processor_s(pid) for _, pid in peers.values()}
-                _send_until(flight, [sock for sock, _ in peers.values()], SETTLE_S + FLIGHT_S)
+                _send_until(SETTLE_S + FLIGHT_S, flight, stream.datagram_s, socks)
                 costs = [
                     Cost(name, process, 100.0 * (processor_s(pid) - before[pid]) / FLIGHT_S, memory_mib(pid))
                     for process, (_, pid) in peers.items()
@@ -120,7 +121,7 @@ def in_one_go(stream: Stream) -> float:
     """Return the processor seconds for a second of flight where nothing waits for the next datagram."""
     core = CompanionCore(load(None, {"output.profile": stream.profile}, {}), NoLog())
     spent = 0.0
-    for t, data in datagrams(fly(stream), SETTLE_S + FLIGHT_S):
+    for t, data in datagrams(fly(stream), stream.datagram_s, SETTLE_S + FLIGHT_S):
         now = round(1e9 * (t + 1.0))
         begin = time.process_time()
         core.receive("main", data, now)
@@ -133,13 +134,15 @@ def in_one_go(stream: Stream) -> float:
     return spent / FLIGHT_S
 
 
-def datagrams(flight: Iterator[tuple[float, bytes]], end: float) -> Iterator[tuple[float, bytes]]:
-    """Yield the frames of every TICK_S of the flight in one datagram, and when it is due (s), up to `end`."""
+def datagrams(
+    flight: Iterator[tuple[float, bytes]], length_s: float, end: float
+) -> Iterator[tuple[float, bytes]]:
+    """Yield the frames of every `length_s` in one datagram, and when it is due (s), up to `end`."""
     waiting: list[bytes] = []
     tick: float | None = None
     for t, data in flight:
         tick = t if tick is None else tick
-        if t >= tick + TICK_S:
+        if t >= tick + length_s:
             yield t, b"".join(waiting)
             waiting, tick = [], t
         waiting.append(data)
@@ -162,10 +165,12 @@ def fly(stream: Stream) -> Iterator[tuple[float, bytes]]:
         sequence = sequence + 1 & 0xFF
 
 
-def _send_until(flight: Iterator[tuple[float, bytes]], socks: list[Any], end: float) -> None:
+def _send_until(
+    end: float, flight: Iterator[tuple[float, bytes]], datagram_s: float, socks: list[Any]
+) -> None:
     """Send the datagrams due before `end` of the flight; discard what comes back."""
     start: float | None = None
-    for t, data in datagrams(flight, end):
+    for t, data in datagrams(flight, datagram_s, end):
         start = time.perf_counter() - t if start is None else start
         time.sleep(max(0.0, start + t - time.perf_counter()))
         for sock in socks:
