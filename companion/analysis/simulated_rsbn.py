@@ -111,6 +111,8 @@ def read_beacons(path: Path) -> list[ListedBeacon]:
             found = dict[int, ListedBeacon]()
             for row in reader:
                 try:
+                    if None in row:
+                        raise ValueError("it has more columns than the header; write decimals with a point")
                     for beacon in read(row):
                         if found.setdefault(beacon.number, beacon) is not beacon:
                             raise ValueError(f"id {beacon.number} is given twice")
@@ -118,7 +120,7 @@ def read_beacons(path: Path) -> list[ListedBeacon]:
                     raise LogError(f"{path}, line {reader.line_num} is not a valid beacon: {error}") from None
     except UnicodeDecodeError:
         raise LogError(f"{path}: not a text file in UTF-8; a list of beacons is a CSV file") from None
-    except (OSError, EOFError) as error:
+    except (OSError, EOFError, csv.Error) as error:
         if isinstance(error, LogError):
             raise
         raise LogError(f"{path} cannot be read: {getattr(error, 'strerror', None) or error}") from None

@@ -241,6 +241,8 @@ def test_beacon_list_may_have_a_byte_order_mark(tmp_path: pathlib.Path) -> None:
         ("id,lat_deg,lon_deg,alt_m,range_m\n1,45,-93,3,inf\n", "line 2 .*: range_m inf is not finite"),
         ("id,lat_deg,lon_deg,alt_m,range_m\n1,45,-93,3,0\n", "line 2 .*: range_m 0 is not above 0"),
         ("id;lat_deg;lon_deg;alt_m\n1;45;-93;3\n", "columns .* separated by commas"),
+        ("id,lat_deg,lon_deg,alt_m\n1,45,5,-93,3\n", "line 2 .*: it has more columns than the header; write"),
+        ("a" * 200_000, "cannot be read: field larger than field limit"),
     ],
 )
 def test_invalid_beacon_list_is_reported_in_one_sentence(
