@@ -146,12 +146,14 @@ class InputMonitor:
         self._arrived: set[str] = set()
         self._bad_since: dict[str, int] = {}
         self._reported: set[str] = set()
-        self._start_ns: int | None = None
-        self._silence_reported = False
+        self._was_connected = False
+        self._open_since: dict[str, int] = {}
+        self._silence_since: dict[tuple[str, bool, bool, bool], int] = {}
+        self._silence_reported: set[tuple[str, bool, bool, bool]] = set()
 
     def update(self, session: Session, config: Config, make: str, now_ns: int) -> list[Event]:
         """Return what went missing or came back on a link whose autopilot is received."""
-        self._silence_reported = True  # of the start; a link lost later is an event of its own
+        self._was_connected = True  # a link lost later is an event of its own
         events, missing, slow = list[Event](), list[str](), list[str]()
         for state in stream_states(config, make, session.stream_rates.rates()):
             if not state.is_used or state.measured is None:
@@ -176,26 +178,25 @@ class InputMonitor:
         return events
 
     def report_silence(self, sessions: Collection[tuple[str, Session, bool]], now_ns: int) -> list[Event]:
-        """Return one report for each link once no autopilot has been received since the first was open.
+        """Return why an open link has no autopilot, again when something else arrives on it for five seconds.
 
         `sessions` has the name and session of each open link, and whether bytes arrived.
         """
-        if not sessions:
+        if self._was_connected:
             return []
-        self._start_ns = now_ns if self._start_ns is None else self._start_ns
-        if self._silence_reported or now_ns - self._start_ns < NO_AUTOPILOT_AFTER:
-            return []
-        self._silence_reported = True
-        seconds = (now_ns - self._start_ns) / SECOND_NS
-        return [
-            Event(
-                now_ns,
-                now_ns,
-                Severity.WARNING,
-                f"{name}: no autopilot in {seconds:.0f} s: {describe_silence(name, session, has_bytes)}",
-            )
-            for name, session, has_bytes in sessions
-        ]
+        events = list[Event]()
+        for name, session, has_bytes in sessions:
+            open_ns = self._open_since.setdefault(name, now_ns)
+            state = (name, bool(session.rejected), bool(session.reader.counts), has_bytes)
+            since_ns = self._silence_since.setdefault(state, now_ns)
+            if state in self._silence_reported or now_ns - since_ns < NO_AUTOPILOT_AFTER:
+                continue
+            self._silence_reported.add(state)
+            seconds = (now_ns - open_ns) / SECOND_NS
+            what = describe_silence(name, session, has_bytes)
+            text = f"{name}: no autopilot in {seconds:.0f} s: {what}"
+            events.append(Event(now_ns, now_ns, Severity.WARNING, text))
+        return events
 
     def _trouble(self, state: StreamState, stream: Stream) -> str:
         if state.measured:

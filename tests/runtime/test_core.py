@@ -794,6 +794,33 @@ def test_silence_is_counted_from_the_time_at_which_the_link_is_open() -> None:
     assert "no autopilot in 5 s: no data received; check the wiring" in text
 
 
+def test_silence_is_reported_again_when_something_else_arrives() -> None:
+    flight = Flight(config=load(pairs=("link.system_id=5",), environment={}))
+    for number in range(400):
+        flight.now += 100 * MS
+        if number >= 100:
+            flight.receive(b"\x00\xff" * 8)
+        if number >= 200:
+            flight.send("HEARTBEAT", system=7, type=1, autopilot=3)
+        flight.core.poll(flight.now)
+    nothing, no_mavlink, other_vehicle = (text for text in event_texts(flight) if "no autopilot" in text)
+    assert "no autopilot in 5 s: no data received" in nothing
+    assert "no autopilot in 15 s: bytes but no MAVLink received" in no_mavlink
+    assert "no autopilot in 25 s: received only 7/1" in other_vehicle
+
+
+def test_silence_of_a_link_that_opens_later_is_reported() -> None:
+    flight = Flight("udpin:127.0.0.1:14550", "serial:/dev/ttyS0:57600")
+    serial = flight.core.links["serial:/dev/ttyS0:57600"]
+    for number in range(200):
+        serial.is_open = number >= 100
+        flight.now += 100 * MS
+        flight.core.poll(flight.now)
+    network, line = event_texts(flight)
+    assert network.startswith("udpin:127.0.0.1:14550: no autopilot in 5 s")
+    assert line.startswith("serial:/dev/ttyS0:57600: no autopilot in 5 s")
+
+
 @pytest.mark.parametrize(
     ("system_id", "kind", "advice"),
     [
