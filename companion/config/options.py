@@ -20,7 +20,7 @@ def configuration_options(command: Command) -> Command:
     file = click.option(
         "--config",
         "file",
-        type=click.Path(path_type=Path),
+        type=click.Path(path_type=Path, readable=False),  # `load` reports it, with its exit code
         multiple=True,
         callback=_only_one,
         help="TOML file; see check-config.",
