@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 from pathlib import Path
 
@@ -36,4 +37,6 @@ def describe_write_error(error: OSError) -> str:
     """Return why a file cannot be written."""
     if isinstance(error, FileNotFoundError) and error.filename:
         return f"no folder {Path(error.filename).parent}"
+    if isinstance(error, PermissionError) or error.errno == errno.EROFS:
+        return f"{error.strerror}; give a folder that may be written"
     return error.strerror or str(error)

@@ -23,7 +23,7 @@ from companion.storage.flight_log import Writer
 from companion.storage.mcap_file import DiskFile
 from companion.storage.reader import ACTIVE, LogError
 from companion.storage.recovery import Recovered, recover
-from companion.write_errors import make_folder
+from companion.write_errors import describe_write_error, make_folder
 
 _LOG_NAME = re.compile(r"(?:(\d{5,})-)?(\d{8}T\d{6}Z)(?:-(\d+))?(?:\.recovered)?\.mcap(?:\.active)?")
 
@@ -54,7 +54,7 @@ def create_log(
         has_space = make_room(folder, min_free, max_files - 1, on_delete)
         path = _next_path(folder, start_unix_ns)
     except OSError as error:
-        raise LogError(f"cannot keep logs in {folder}: {error.strerror or error}") from None
+        raise LogError(f"cannot keep logs in {folder.absolute()}: {describe_write_error(error)}") from None
     if not has_space:
         raise LogError(
             f"cannot keep logs in {folder}: deleting all of them would not leave {min_free >> 20} MiB free; "

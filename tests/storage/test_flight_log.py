@@ -690,6 +690,16 @@ def test_file_size_limit_of_the_kernel_is_survived(tmp_path):
     assert [e.value for e in read(path)] == [imu(k) for k in range(i)]
 
 
+@pytest.mark.parametrize("code", [errno.EACCES, errno.EROFS])
+def test_folder_without_the_right_to_write_is_reported_with_its_path_and_what_to_do(monkeypatch, code):
+    def fail(folder):
+        raise OSError(code, os.strerror(code), str(folder))
+
+    monkeypatch.setattr(retention, "make_folder", fail)
+    with pytest.raises(LogError, match=rf"cannot keep logs in {Path.cwd()}/logs: .*; give a folder that may"):
+        retention.create_log("logs", metadata={}, **START)
+
+
 def test_unwritable_folder_is_reported_in_one_sentence(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(LogError, match=r"cannot keep logs in .*: it is a file; give a folder"):
