@@ -27,7 +27,8 @@ def reject_own_input(output: Path, *read: Path | None) -> None:
     names = [name for name in (output, output.with_name(output.name + ACTIVE)) if name.exists()]
     for path in read:
         if path is not None and path.exists() and any(name.samefile(path) for name in names):
-            raise LogError(f"{output} is an input (as {path}) and is not overwritten: give another name")
+            named = "" if path == output else f" (as {path})"
+            raise LogError(f"{output} is an input{named} and is not overwritten: give another name")
 
 
 def reject_same_output(outputs: Sequence[Path]) -> None:

@@ -92,8 +92,8 @@ def _moments_beyond_bound(a: Assessment) -> Verdict | None:
     worst = min(beyond, key=lambda row: row.inside or 0.0)
     return Verdict(
         "caution",
-        f"At moments the {deviation(a)} was above the guaranteed bound, which is one on its r.m.s.; most "
-        f"often in the phase “{flight_events.phase_title(worst.phase)}”.",
+        f"At moments the {deviation(a)} was above the guaranteed bound, which limits its r.m.s. only; "
+        f"most often in the phase “{flight_events.phase_title(worst.phase)}”.",
         format_share(worst.inside or 0.0),
         "of this phase within the bound",
     )
