@@ -63,7 +63,14 @@ def table(title: str, times: dict[str, list[float]]) -> Table:
     is_flag=True,
     help="Print JSON: seconds per call, every round; of live a row a process.",
 )
-def command(names: tuple[str, ...], as_json: bool) -> None:
+@click.option(
+    "--flight-s",
+    type=click.FloatRange(1.0, 36_000.0),
+    default=20.0,
+    show_default=True,
+    help="Length of each flight of live, s.",
+)
+def command(names: tuple[str, ...], as_json: bool, flight_s: float) -> None:
     """Time the parts of the companion, interleaved in one run.
 
     NAMES are the parts; default: all except latency and live.
@@ -76,7 +83,7 @@ def command(names: tuple[str, ...], as_json: bool) -> None:
     for name in names or MODULES:
         module = import_module(f"companion.bench.{name}")
         if name == "live":
-            costs = module.measure()
+            costs = module.measure(flight_s)
             found[name] = [cost._asdict() for cost in costs]
             tables.append(module.table(costs))
         elif name == "latency":

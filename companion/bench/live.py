@@ -2,7 +2,7 @@
 
 A complete `companion run` (log on, real sockets), a bare asyncio receiver with pymavlink's parser and one
 that only receives run in processes of their own and get the same stream. An aircraft flies north at 40 m/s
-with GNSS and a beacon. Each stream is flown for FLIGHT_S; the processor time of all threads of each process
+with GNSS and a beacon. The processor time of all threads of each process
 is read from the kernel, that of the turns of the companion's event loop is measured in it.
 """
 
@@ -12,6 +12,7 @@ import asyncio
 import os
 import tempfile
 import time
+from array import array
 from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -28,7 +29,6 @@ from companion.runtime.core import CompanionCore
 from companion.storage.deferred_log import NoLog
 from companion.tables import number_table
 
-FLIGHT_S = 20.0
 SETTLE_S = 10.0  # the first fix
 TURNS = "turns.npy"
 
@@ -77,8 +77,12 @@ class Cost(NamedTuple):
     turn_ms: float | None = None
 
 
-def measure() -> list[Cost]:
-    """Measure the companion beside bare receivers, and the companion where nothing waits."""
+def measure(flight_s: float) -> list[Cost]:
+    """Measure the companion beside bare receivers, and the companion where nothing waits.
+
+    Each stream is flown for `flight_s` seconds once it has settled.
+    """
+    end = SETTLE_S + flight_s
     found = []
     for name, stream in STREAMS.items():
         with tempfile.TemporaryDirectory() as logs:
@@ -91,14 +95,14 @@ def measure() -> list[Cost]:
                 flight, socks = fly(stream), [sock for sock, _ in peers.values()]
                 _send_until(SETTLE_S, flight, stream.datagram_s, socks)
                 before = {pid: processor_s(pid) for _, pid in peers.values()}
-                _send_until(SETTLE_S + FLIGHT_S, flight, stream.datagram_s, socks)
+                _send_until(end, flight, stream.datagram_s, socks)
                 costs = [
-                    Cost(name, process, 100.0 * (processor_s(pid) - before[pid]) / FLIGHT_S, memory_mib(pid))
+                    Cost(name, process, 100.0 * (processor_s(pid) - before[pid]) / flight_s, memory_mib(pid))
                     for process, (_, pid) in peers.items()
                 ]
             turn_ms = 1e3 * float(np.percentile(np.load(Path(logs, TURNS)), 99.9))
             found += [costs[0]._replace(turn_ms=turn_ms), *costs[1:]]
-            found.append(Cost(name, "companion in one go, no log", 100.0 * in_one_go(stream)))
+            found.append(Cost(name, "companion in one go, no log", 100.0 * in_one_go(stream, flight_s)))
     return found
 
 
@@ -117,11 +121,11 @@ def table(costs: list[Cost]) -> Table:
     return shown
 
 
-def in_one_go(stream: Stream) -> float:
+def in_one_go(stream: Stream, flight_s: float) -> float:
     """Return the processor seconds for a second of flight where nothing waits for the next datagram."""
     core = CompanionCore(load(None, {"output.profile": stream.profile}, {}), NoLog())
     spent = 0.0
-    for t, data in datagrams(fly(stream), stream.datagram_s, SETTLE_S + FLIGHT_S):
+    for t, data in datagrams(fly(stream), stream.datagram_s, SETTLE_S + flight_s):
         now = round(1e9 * (t + 1.0))
         begin = time.process_time()
         core.receive("main", data, now)
@@ -131,7 +135,7 @@ def in_one_go(stream: Stream) -> float:
         core.settle()
         core.bear()
         spent += (time.process_time() - begin) * (t >= SETTLE_S)
-    return spent / FLIGHT_S
+    return spent / flight_s
 
 
 def datagrams(
@@ -200,7 +204,7 @@ def memory_mib(pid: int) -> float:
 
 
 def _companion(port: int, logs: str, profile: str) -> None:
-    turns: list[float] = []
+    turns = array("d")
 
     class Turn(asyncio.Handle):  # the loop's own, timed
         def _run(self) -> None:
