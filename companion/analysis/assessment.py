@@ -121,10 +121,7 @@ def assess_flight(flight: Flight) -> Assessment:
         groups=groups,
         outages=outages,
         silences=silences,
-        rates=[
-            flight_events.message_rate(topic, stream, flight_events.message_latency(flight, topic)[1])
-            for topic, stream in flight.streams.items()
-        ],
+        rates=[flight_events.message_rate(flight, topic) for topic in flight.streams],
         timeline=flight_events.build_timeline(flight, groups, outages, silences),
     )
 

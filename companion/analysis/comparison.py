@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable
 from itertools import zip_longest
 from typing import Any
 
@@ -59,10 +58,9 @@ def _distance(a: Stamped | None, b: Stamped | None) -> float:
 def _close_records(a: Any, b: Any, relative: float = RELATIVE) -> bool:
     if type(a) is not type(b):
         return False
-    names: Iterable[str] = a.__struct_fields__
     return all(
         _close(getattr(a, name), getattr(b, name), RESTRICTED_TOLERANCE if name in BOUNDS else relative)
-        for name in names
+        for name in a.__struct_fields__
         if name not in ANGLES
     )
 

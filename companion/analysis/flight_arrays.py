@@ -105,23 +105,10 @@ def _solution(r: Solution) -> tuple[float, ...]:
     flat = (number for one in ahead for number in one)
     beside = {p.estimator: p.error_n for p in r.parallel}
     parallel = (number for name in PARALLEL for number in beside.get(name, (math.nan, math.nan)))
-    c = r.covariance
-    mode = float(MODES.index(r.mode))
-    level = _or_nan(r.protection)
+    nn, ne, _, ee, *_ = r.covariance
     return (
-        mode,
-        r.lat,
-        r.lon,
-        r.alt_msl,
-        c[0],
-        c[1],
-        c[3],
-        *r.error_n,
-        float(r.sources),
-        *bound,
-        level,
-        *flat,
-        *parallel,
+        *(float(MODES.index(r.mode)), r.lat, r.lon, r.alt_msl, nn, ne, ee),
+        *(*r.error_n, float(r.sources), *bound, _or_nan(r.protection), *flat, *parallel),
     )
 
 

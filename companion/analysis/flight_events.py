@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from companion.analysis import error_statistics
-from companion.analysis.flight_arrays import MODES, Flight, RejectedMeasurement, Stream, Table, TimelineEntry
+from companion.analysis.flight_arrays import MODES, Flight, RejectedMeasurement, Table, TimelineEntry
 from companion.nav.earth import radii
 from companion.records import Mode, Severity, Source
 from companion.units import Floats
@@ -300,9 +300,9 @@ def topic_name(topic: str) -> str:
     )
 
 
-def message_rate(topic: str, stream: Stream, latency: Floats) -> MessageRate:
-    """Compute the statistics of one topic; `latency` (s) is that of its new messages."""
-    rx = stream.rx
+def message_rate(flight: Flight, topic: str) -> MessageRate:
+    """Compute the statistics of one topic; the latency is that of its new messages."""
+    rx, (_, latency) = flight.streams[topic].rx, message_latency(flight, topic)
     gaps = np.diff(rx)
     worst = int(np.argmax(gaps)) if len(gaps) else 0
     span = float(rx[-1] - rx[0])

@@ -99,7 +99,7 @@ class Summary(NamedTuple):
 
 
 class Chapter(NamedTuple):
-    """A chapter of the page: id, title, figures with their ids, tables, folded texts, remarks."""
+    """A chapter of the page: id, title, figures with their ids, tables, folded texts."""
 
     anchor: str
     title: str

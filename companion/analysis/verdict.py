@@ -242,16 +242,16 @@ def _rejections(a: Assessment) -> Verdict | None:
     )
 
 
-def _torn_or_reset(a: Assessment) -> Verdict | None:
+def _reset(a: Assessment) -> Verdict | None:
     resets = [line for line in a.timeline if line.kind == "reset"]
-    if resets:
-        return Verdict(
-            "caution",
-            f"The estimate was reset, first at {format_time(resets[0].t)}: {resets[0].text}.",
-            str(len(resets)),
-            "resets" if len(resets) > 1 else "reset",
-        )
-    return None
+    if not resets:
+        return None
+    return Verdict(
+        "caution",
+        f"The estimate was reset, first at {format_time(resets[0].t)}: {resets[0].text}.",
+        str(len(resets)),
+        "resets" if len(resets) > 1 else "reset",
+    )
 
 
 def _no_reference(a: Assessment) -> Verdict | None:
@@ -303,7 +303,7 @@ _RULES: tuple[Callable[[Assessment], Verdict | None], ...] = (
     _inconsistent,
     _unlimited,
     _rejections,
-    _torn_or_reset,
+    _reset,
     _too_short,
 )
 
