@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, NamedTuple, get_args, get_type_hints
@@ -23,11 +23,13 @@ from rich.progress import Progress
 
 from companion.analysis import error_statistics
 from companion.analysis.assessment import Assessment, assess_flight
+from companion.analysis.fleet_page import render_page
 from companion.analysis.flights import open_flights
-from companion.analysis.html import BOOTED_NS
+from companion.analysis.html import BOOTED_NS, render_report
 from companion.analysis.jobs import Journal, run_jobs
 from companion.analysis.progress import show_count
 from companion.analysis.replay_inputs import has_navigator_outputs, is_own_log
+from companion.analysis.report import blocks_of_log
 from companion.analysis.summary import longest_outage, rms_after_start, worst_of
 from companion.analysis.verdict import judge_flight
 from companion.analysis.worker_options import worker_options
@@ -132,9 +134,6 @@ def _row(name: str, a: Assessment) -> FlightRow:
 
 def write_report(job: LogJob) -> str:
     """Write the report of a log; return why it could not be written, "" if it was."""
-    from companion.analysis.html import render_report
-    from companion.analysis.report import blocks_of_log
-
     assert job.report is not None
     try:
         page = render_report(job.path.name, blocks_of_log(open_flights(job.path, job.config)))
@@ -245,15 +244,6 @@ def _storable(value: Any) -> Any:
     return value.encode(errors="replace").decode() if isinstance(value, str) else value
 
 
-def _write_all(rows: Sequence[FlightRow], results: Path) -> Iterator[Path]:
-    from companion.analysis.fleet_page import render_page
-
-    write_table(rows, results / TABLE)
-    yield results / TABLE
-    write_whole(results / PAGE, render_page(rows).encode(errors="replace"))
-    yield results / PAGE
-
-
 @click.command("fleet")
 @click.argument("folders", type=click.Path(path_type=Path, exists=True), nargs=-1, required=True)
 @click.option(
@@ -305,7 +295,8 @@ def command(
     except ValueError as error:
         raise LogError(str(error)) from None
     rows = worst_first(rows)
-    written = list(_write_all(rows, results))
+    write_table(rows, results / TABLE)
+    write_whole(results / PAGE, render_page(rows).encode(errors="replace"))
     good = [row for row in rows if row.reason is None]
     hours = sum(row.duration_s for row in good) / 3600.0
     click.echo(
@@ -316,6 +307,6 @@ def command(
         click.echo(f"  {printable(row.log)}: {row.verdict}, {worst}")
     for row in [row for row in rows if row.reason is not None][:5]:
         click.echo(f"  {printable(row.log)}: {printable(row.reason or '')}")
-    click.echo(f"written: {', '.join(map(str, written))}")
+    click.echo(f"written: {results / TABLE}, {results / PAGE}")
     if not good:
         raise SystemExit(1)
