@@ -10,7 +10,6 @@ import re
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
 
@@ -170,13 +169,12 @@ def input_errors_as_log_errors() -> Iterator[None]:
 
 def with_correctors(log_inputs: LogInputs, tables: Sequence[Path]) -> LogInputs:
     """Add the rows of corrector tables (CSV); t_s = 0 is the first record of the log."""
-    records = iter(log_inputs.records)
-    first = next(records, None)
+    first, records = sources.read_ahead(log_inputs.records)
     if first is None or not tables:
-        return log_inputs._replace(records=[] if first is None else chain([first], records))
+        return log_inputs._replace(records=records)
     with input_errors_as_log_errors():
         correctors = CorrectorRows(tables, first.rx_ns)
-    return log_inputs._replace(records=correctors.merged(chain([first], records)), correctors=correctors)
+    return log_inputs._replace(records=correctors.merged(records), correctors=correctors)
 
 
 def with_beacons_and_outages(
@@ -195,11 +193,10 @@ def with_beacons_and_outages(
     log_inputs = open_inputs(log, config)
     if not listed and not outages:
         return log_inputs, ""
-    records = iter(log_inputs.records)
-    first = next(records, None)
+    first, merged = sources.read_ahead(log_inputs.records)
     if first is None:
         raise LogError(f"{log} contains no messages: nothing to replay")
-    merged, note = chain([first], records), ""
+    note = ""
     if listed:
         track = simulated_rsbn.extract_track(open_inputs(log, config).records, config)
         measurements = simulated_rsbn.simulate_measurements(listed, track, seed)
@@ -212,6 +209,6 @@ def with_beacons_and_outages(
         )
         if not measurements and (why := simulated_rsbn.describe_unreached(listed, track)):
             note += f": {why}"
-        merged = heapq.merge(merged, measurements, key=lambda record: record.rx_ns)  # type: ignore[assignment]
+        merged = heapq.merge(merged, measurements, key=lambda record: record.rx_ns)
     removing = simulated_rsbn.OutageFilter(outages, first.rx_ns)
     return LogInputs(removing.left(merged), log_inputs.summary, removing), note

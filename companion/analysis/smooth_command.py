@@ -12,7 +12,6 @@ import csv
 import math
 from collections.abc import Iterator, Sequence
 from io import StringIO
-from itertools import chain, islice
 from pathlib import Path
 from typing import NamedTuple
 
@@ -36,6 +35,7 @@ from companion.analysis.replay_inputs import (
 )
 from companion.analysis.smoothing import SmoothedRun, smooth_flight
 from companion.config import ConfigError
+from companion.importers import sources
 from companion.nav.geometry import Geodetic, displace
 from companion.option_types import INPUT_PATH
 from companion.records import Smoothed
@@ -162,13 +162,13 @@ def command(
     config = choose_configuration(log, config_file, changes)
     with input_errors_as_log_errors(), show_step(f"smooth {log}"):
         try:
-            records = iter(open_inputs(log, config).records)
-            first = list(islice(records, 1))
-            runs = smooth_flight(chain(first, records), config, check=check)
+            first, records = sources.read_ahead(open_inputs(log, config).records)
+            runs = smooth_flight(records, config, check=check)
         except ConfigError:
             raise
         except ValueError as error:
             raise LogError(f"{log}: {error}") from None
+    assert first is not None  # without a record there is nothing to smooth
     track = collect(runs)
     start_ns, start_unix_ns = start_times(log)
     for path in paths:
@@ -178,7 +178,7 @@ def command(
                 for record in track.records:
                     sink.record(record)
         elif path.suffix.lower() == ".csv":
-            write_csv(path, track, first[0].rx_ns, start_ns, start_unix_ns)
+            write_csv(path, track, first.rx_ns, start_ns, start_unix_ns)
         else:
             write_map(path, f"{log.name}, smoothed", list(map_tracks(track, start_ns, start_unix_ns)))
         click.echo(f"{path}: {len(track.records)} points")

@@ -59,6 +59,13 @@ class ImportSummary(NamedTuple):
     records: int
 
 
+def read_ahead(records: Iterable[Stamped]) -> tuple[Stamped | None, Iterator[Stamped]]:
+    """Return the first record, None without one, and an iterator over all records, the first included."""
+    rest = iter(records)
+    first = next(rest, None)
+    return first, rest if first is None else chain((first,), rest)
+
+
 class _Records:
     """Usable records of a log, read once and counted."""
 
@@ -69,8 +76,7 @@ class _Records:
 
     def read_first(self) -> None:
         """Read the first record ahead. Raises LogError if nothing can be read."""
-        first = next(self._usable, None)
-        self._usable = self._usable if first is None else chain((first,), self._usable)
+        _, self._usable = read_ahead(self._usable)
 
     def __iter__(self) -> Iterator[Stamped]:
         """Yield the records in the order of the log, damage as an event at the end."""
