@@ -14,7 +14,7 @@ from companion.storage.flight_log import topic_of_input
 from companion.storage.reader import LogError, open_log
 
 
-def convert_log(source: Path, output: Path, config: Config | None = None) -> ImportSummary:
+def convert_log(source: Path, output: Path, config: Config) -> ImportSummary:
     """Write the records of `source` to `output`. Raises LogError if it cannot be read or written.
 
     `config` selects the vehicle of a telemetry log with several. Events and rejections of the
@@ -26,7 +26,7 @@ def convert_log(source: Path, output: Path, config: Config | None = None) -> Imp
                 raise LogError(f"{source} is already an MCAP log: nothing to convert")
         if output.exists():
             raise LogError(f"{output} already exists: give another name")
-        records = sources.open_source(source, (config or Config()).link.system_id or None)
+        records = sources.open_source(source, config.link.system_id or None)
         with create_replay_log(output, source, {CONVERTED: {"from": printable(source.name)}}) as sink:
             for record in records:
                 sink.record(record, topic_of_input(record))

@@ -58,7 +58,7 @@ class Place(NamedTuple):
     lat: float
     lon: float
     colour: str
-    about: Mapping[str, Any] = MappingProxyType({})
+    about: Mapping[str, Any]
 
 
 def write_map(path: Path, title: str, tracks: Sequence[Track], places: Sequence[Place] = ()) -> None:
@@ -153,7 +153,7 @@ def to_kml(title: str, tracks: Iterable[Track], places: Iterable[Place] = ()) ->
     return '<?xml version="1.0" encoding="UTF-8"?>\n' + ElementTree.tostring(root, "unicode") + "\n"
 
 
-def flight_map(flight: Flight, every_s: float = 1.0) -> tuple[list[Track], list[Place]]:
+def flight_map(flight: Flight, every_s: float) -> tuple[list[Track], list[Place]]:
     """Return what a flight shows on a map: legs of the estimate by their fixes, GNSS, truth, beacons.
 
     At most one point in `every_s` seconds.

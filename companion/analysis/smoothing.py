@@ -173,7 +173,7 @@ class _Epoch(NamedTuple):
     predicted: Floats
     Phi: Floats
     Q: Floats
-    fixed: bool = False
+    fixed: bool
 
 
 def _forward_pass(records: Iterable[Stamped], config: Config) -> _Path:

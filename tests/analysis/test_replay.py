@@ -220,7 +220,7 @@ def test_name_of_a_log_may_be_of_any_bytes(tmp_path: Path) -> None:
     shutil.copy(CUT, log)
     replayed(log, tmp_path / "out.mcap")
     assert flight_log.metadata(tmp_path / "out.mcap")["derived"]["from"] == r"flight \udcff\n.tlog"
-    convert_log(log, tmp_path / "in.mcap")
+    convert_log(log, tmp_path / "in.mcap", Config())
     assert flight_log.metadata(tmp_path / "in.mcap")["converted"]["from"] == r"flight \udcff\n.tlog"
 
 

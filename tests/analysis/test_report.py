@@ -1233,7 +1233,7 @@ def test_file_in_place_of_the_folder_of_figures_is_reported(log, tmp_path):
 
 def test_converted_log_is_reported_as_the_original(tmp_path):
     folder, log = Path(__file__).parents[1] / "data" / "umn_fixed_wing_cut", tmp_path / "umn.mcap"
-    convert_log(folder, log)
+    convert_log(folder, log, Config())
     (direct,), (converted,) = open_flights(folder, Config()), open_flights(log, Config())
     for name, table in direct.tables.items():
         for column in table:
