@@ -106,7 +106,7 @@ class MessageConverter:
             fix >= mavlink.GPS_FIX_TYPE_2D_FIX and m.Lat == m.Lng == 0.0
         ):
             return
-        week, ms = getattr(m, "GWk", getattr(m, "Week", 0)), getattr(m, "GMS", getattr(m, "TimeMS", 0))
+        week, ms = _gps_time(m)
         course = math.radians(m.GCrs)
         hdop = m.HDop if 0.0 < m.HDop < 99.0 else None
         horizontal, vertical, speed = self._accuracy.get(receiver, (None, None, None))
@@ -286,7 +286,8 @@ class DataflashLog:
     def __iter__(self) -> Iterator[Stamped]:
         """Yield records in the order of the file. Messages without a required column are not converted."""
         epoch_us, converter = self._epoch_us(), MessageConverter()
-        stamped = ((boot_time_us(m), place, (name, m)) for place, name, m in self._messages(NAMES))
+        messages = self._messages(NAMES, self.damage)
+        stamped = ((boot_time_us(m), place, (name, m)) for place, name, m in messages)
         for step in steady_steps(stamped, self.damage):
             t_ns = (epoch_us + step.shift_us + step.boot_us) * 1000
             if step.reboot:
@@ -294,9 +295,8 @@ class DataflashLog:
                 yield Reboot(t_ns, t_ns, 1)
             yield from self._converted(converter, step, t_ns)
 
-    def _messages(self, names: Collection[str], damage: Damage | None = None) -> Iterator[FoundMessage]:
-        found = self.damage if damage is None else damage
-        return dataflash_messages.messages(self._data, names, found, binary=self._binary)
+    def _messages(self, names: Collection[str], damage: Damage) -> Iterator[FoundMessage]:
+        return dataflash_messages.messages(self._data, names, damage, binary=self._binary)
 
     def _converted(self, converter: MessageConverter, step: Step, t_ns: int) -> Iterator[Stamped]:
         name, message = step.item
@@ -312,11 +312,16 @@ class DataflashLog:
     def _epoch_us(self) -> int:
         """Return UNIX time minus boot time by the first GPS fix; 0 if there is none."""
         for _, _, m in self._messages(("GPS",), Damage()):
-            week, ms = getattr(m, "GWk", getattr(m, "Week", 0)), getattr(m, "GMS", getattr(m, "TimeMS", 0))
+            week, ms = _gps_time(m)
             has_fix = getattr(m, "Status", 0) >= mavlink.GPS_FIX_TYPE_3D_FIX and 0 < week < _MAX_WEEK
             if has_fix and (boot_us := boot_time_us(m)) is not None and 0 <= boot_us <= MAX_BOOT_US:
                 return _GPS_EPOCH_US + int(week) * _WEEK_US + int(ms) * 1000 - _LEAP_US - boot_us
         return 0
+
+
+def _gps_time(m: Message) -> tuple[float, float]:
+    """Return week and milliseconds of the week of a GPS message."""
+    return getattr(m, "GWk", getattr(m, "Week", 0)), getattr(m, "GMS", getattr(m, "TimeMS", 0))
 
 
 def boot_time_us(m: Message) -> int | None:

@@ -260,24 +260,20 @@ def _truth_topics() -> dict[str, Topic]:
     }
 
 
-def _stateless(topic: Topic) -> Callable[[], Topic]:
-    return lambda: topic
-
-
 TOPICS: dict[str, Callable[[], Topic]] = {
     "vehicle_local_position": _local_positions,
-    "vehicle_gps_position": _stateless(_gnss),
-    "sensor_gps": _stateless(_gnss),
-    "vehicle_attitude": _stateless(_attitude),
-    "sensor_combined": _stateless(_imu),
-    "airspeed_validated": _stateless(_air_data),
-    "airspeed": _stateless(_air_data),
-    "wind": _stateless(_wind),
-    "wind_estimate": _stateless(_wind),
-    "vehicle_air_data": _stateless(_pressure),
-    "estimator_status": _stateless(_status),
-    "vehicle_status": _stateless(_vehicle),
-    "vehicle_land_detected": _stateless(_landed),
+    "vehicle_gps_position": lambda: _gnss,
+    "sensor_gps": lambda: _gnss,
+    "vehicle_attitude": lambda: _attitude,
+    "sensor_combined": lambda: _imu,
+    "airspeed_validated": lambda: _air_data,
+    "airspeed": lambda: _air_data,
+    "wind": lambda: _wind,
+    "wind_estimate": lambda: _wind,
+    "vehicle_air_data": lambda: _pressure,
+    "estimator_status": lambda: _status,
+    "vehicle_status": lambda: _vehicle,
+    "vehicle_land_detected": lambda: _landed,
 }
 """Topics that are converted, each with the maker of its conversion."""
 
