@@ -61,6 +61,14 @@ class Row(NamedTuple):
     straight_on_m: float
 
 
+def flight_of(log: Path, beacons: Path | None, seed: int, config: Config) -> tuple[list[Stamped], str]:
+    """Return the inputs of a log with simulated beacons, and a note on these. Raises LogError."""
+    with input_errors_as_log_errors():
+        inputs, note = with_beacons_and_outages(log, beacons, (), seed, config)
+        used = [r for r in inputs.records if isinstance(r, INPUTS_USED) and not isinstance(r, Reboot)]
+    return used, note
+
+
 class Fixes:
     """The GNSS fixes of a flight: times (ns), positions (rad) and velocities (m/s) of those with one.
 
@@ -328,9 +336,7 @@ def _flown_without(
     log: Path, beacons: Path | None, seed: int, config: Config, every_s: float, lasting: Sequence[float]
 ) -> tuple[list[Row], str]:
     """The rows of one log, and a note on its beacons. Raises LogError."""
-    with input_errors_as_log_errors():
-        inputs, note = with_beacons_and_outages(log, beacons, (), seed, config)
-        records = [r for r in inputs.records if isinstance(r, INPUTS_USED) and not isinstance(r, Reboot)]
+    records, note = flight_of(log, beacons, seed, config)
     records.sort(key=lambda record: record.rx_ns)
     rows = study(log.name, records, config, every_s, lasting)
     if not rows:

@@ -20,16 +20,15 @@ import numpy as np
 from msgspec.structs import replace
 
 from companion.analysis.beacon_options import beacon_options
-from companion.analysis.replay_inputs import input_errors_as_log_errors, with_beacons_and_outages
 from companion.config import Config, load
 from companion.config.options import configuration_options
 from companion.estimate.bank.settings import DEFAULT as THRESHOLDS
 from companion.nav.geometry import Geodetic, separation, wrap_angle
-from companion.navigator import INPUTS_USED, Navigator
+from companion.navigator import Navigator
 from companion.option_types import INPUT_PATH, FloatRange
-from companion.records import AirData, Attitude, Imu, Reboot, RsbnFix, Solution, Stamped
+from companion.records import AirData, Attitude, Imu, RsbnFix, Solution, Stamped
 from companion.storage.reader import LogError
-from companion.study.outages import Fixes
+from companion.study.outages import Fixes, flight_of
 from companion.tables import number_table, print_tables
 from companion.units import SECOND_NS
 
@@ -176,9 +175,7 @@ def command(
     has the greatest distance of the position from GNSS, and for how long GNSS was suspect and excluded.
     """
     config = load(file, {}, pairs=pairs, preset=preset)
-    with input_errors_as_log_errors():
-        inputs, note = with_beacons_and_outages(log, beacons, (), seed, config)
-        records = [r for r in inputs.records if isinstance(r, INPUTS_USED) and not isinstance(r, Reboot)]
+    records, note = flight_of(log, beacons, seed, config)
     if not len(Fixes(records).t_ns):
         raise LogError(f"{log}: no GNSS fix to compare with: choose a flight with GNSS")
     end_s = (records[-1].rx_ns - records[0].rx_ns) / SECOND_NS
