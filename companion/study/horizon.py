@@ -114,7 +114,7 @@ class Horizon:
     def at(self, ahead: float) -> Ahead:
         """Return all bounds at a time ahead [s] after the last fix."""
         position, tilt, velocity, drift = (self._bound(k, ahead) for k in range(4))
-        target, radius = self._target(0, ahead), MEAN_EARTH.radius
+        target, radius = self._transition(ahead)[0], MEAN_EARTH.radius
         ls = self._design.least_squares(target)
         worst = radius * ls.worst + self._beyond(ALONE[0], ahead)
         plain = closed_form(2.0 * self._half, ahead, self._sigma, MEAN_EARTH) if self._plain else None
@@ -137,7 +137,7 @@ class Horizon:
         at a time ahead [s]: `target` is a (4,).
         """
         a = np.array(target) * MEAN_EARTH.units
-        best = self._design.minimax(a @ transition((self._half + ahead) * MEAN_EARTH.rate))
+        best = self._design.minimax(a @ self._transition(ahead))
         return best.bound + self._beyond(target, ahead)
 
     def longest(self, limit: float) -> float:
@@ -151,10 +151,9 @@ class Horizon:
             (60.0 * minute - s for s in range(1, 61) if self.position(60.0 * minute - s) <= limit), 0.0
         )
 
-    def _target(self, k: int, ahead: float) -> Floats:
-        # the state in the middle, about which the rows are best conditioned
-        row: Floats = transition((self._half + ahead) * MEAN_EARTH.rate)[k]
-        return row
+    def _transition(self, ahead: float) -> Floats:
+        # from the state in the middle, about which the rows are best conditioned
+        return transition((self._half + ahead) * MEAN_EARTH.rate)
 
     def _beyond(self, target: Sequence[float], ahead: float) -> float:
         """Worst error of a combination of the states, SI, by the force after the last fix."""
@@ -169,7 +168,7 @@ class Horizon:
         return self._force * float(np.abs(response).sum())
 
     def _bound(self, k: int, ahead: float) -> float:
-        best = self._design.minimax(self._target(k, ahead), self._starts[k])
+        best = self._design.minimax(self._transition(ahead)[k], self._starts[k])
         self._starts[k] = best
         return MEAN_EARTH.units[k] * best.bound + self._beyond(ALONE[k], ahead)
 

@@ -75,6 +75,17 @@ TRUTHS = {
 }
 
 
+#: Key of a row, title of its table, and format of its numbers.
+TABLES = (
+    ("ratio", "rms error, minimax / restrictive (above 1: restrictive better)", ".2f"),
+    ("rms_minimax", "rms error of the minimax filter, km, h, rad", ".2e"),
+    ("rms_restrictive", "rms error of the restrictive filter", ".2e"),
+    ("rms_free", "rms error of the INS without correction", ".2e"),
+    ("nees_minimax", "mean error^2 / variance, minimax (1: consistent)", ".1f"),
+    ("nees_restrictive", "mean error^2 / variance, restrictive", ".1f"),
+)
+
+
 class Flights(NamedTuple):
     """Truth x (T, runs, n), inputs u (T, runs, m), measurements z (T, runs, p); the first axis is time."""
 
@@ -136,20 +147,25 @@ def _run(
     return FilterResult(np.array(estimates), u, np.mean(by_state, 0), float(np.mean(whole)))
 
 
-def study(
-    name: str, runs: int, seed: int
-) -> tuple[dict[str, Any], Flights, FilterResult, FilterResult, Example]:
+class Comparison(NamedTuple):
+    """Flights by a model, and the results of both filters."""
+
+    model: Example
+    flights: Flights
+    minimax: FilterResult
+    restrictive: FilterResult
+
+
+def study(name: str, runs: int, seed: int) -> tuple[dict[str, Any], Comparison]:
     """Compute one row: rms errors over all runs and six hours, ratio, inputs on the bound, consistency."""
     truth = TRUTHS[name]
     model = paper_example(exact=truth.exact, sigma_E=truth.sigma_E)
     rng = np.random.default_rng([seed, list(TRUTHS).index(name)])
     flights = simulate_flights(model, truth, runs, rng)
-    minimax_result, restrictive_result = minimax(model, flights), r1(model, flights)
-    rms = [
-        np.sqrt(np.mean((f.x - flights.x) ** 2, axis=(0, 1))) for f in (minimax_result, restrictive_result)
-    ]
-    assert restrictive_result.u is not None
-    share = np.abs(restrictive_result.u) / model.C
+    found = Comparison(model, flights, minimax(model, flights), r1(model, flights))
+    rms = [np.sqrt(np.mean((f.x - flights.x) ** 2, axis=(0, 1))) for f in (found.minimax, found.restrictive)]
+    assert found.restrictive.u is not None
+    share = np.abs(found.restrictive.u) / model.C
     row = {
         "truth": name,
         "title": truth.title,
@@ -161,12 +177,12 @@ def study(
         "rms_free": np.sqrt(np.mean(flights.x**2, axis=(0, 1))).tolist(),
         "on_bound": float((share >= 1.0).mean()),
         "near_bound": float((share >= NEAR).mean()),
-        "nees_minimax": minimax_result.nees.tolist(),
-        "nees_restrictive": restrictive_result.nees.tolist(),
-        "nees_minimax_per_dimension": minimax_result.nees_all,
-        "nees_restrictive_per_dimension": restrictive_result.nees_all,
+        "nees_minimax": found.minimax.nees.tolist(),
+        "nees_restrictive": found.restrictive.nees.tolist(),
+        "nees_minimax_per_dimension": found.minimax.nees_all,
+        "nees_restrictive_per_dimension": found.restrictive.nees_all,
     }
-    return row, flights, minimax_result, restrictive_result, model
+    return row, found
 
 
 def build_table(rows: list[dict[str, Any]], key: str, title: str, number: str) -> Table:
@@ -184,18 +200,12 @@ def axis_label(state: str) -> str:
     return f"{state}, {units.get(state[:2]) or units[state[0]]}"
 
 
-def draw(
-    folder: Path,
-    name: str,
-    flights: Flights,
-    minimax_result: FilterResult,
-    restrictive_result: FilterResult,
-    model: Example,
-) -> None:
+def draw(folder: Path, name: str, found: Comparison) -> None:
     """Draw figures 1-10 of the paper for the first run: measurements, inputs, estimates, errors."""
     from matplotlib.figure import Figure
 
-    assert restrictive_result.u is not None
+    model, flights, u = found.model, found.flights, found.restrictive.u
+    assert u is not None
     states, hours = [axis_label(state) for state in model.states], model.dt * np.arange(len(flights.z))
     groups = [range(i, min(i + 4, len(states))) for i in range(0, len(states), 4)]
 
@@ -213,11 +223,11 @@ def draw(
     save(
         2,
         [
-            (f"U{i + 1}, km/h", {"true": flights.u[:, 0, i], "restrictive": restrictive_result.u[:, 0, i]})
+            (f"U{i + 1}, km/h", {"true": flights.u[:, 0, i], "restrictive": u[:, 0, i]})
             for i in range(flights.u.shape[-1])
         ],
     )
-    x, k, r = (f[:, 0] for f in (flights.x, minimax_result.x, restrictive_result.x))
+    x, k, r = (f[:, 0] for f in (flights.x, found.minimax.x, found.restrictive.x))
     for number, group in enumerate(groups):
         curves = [(states[i], {"true": x[:, i], "restrictive": r[:, i], "minimax": k[:, i]}) for i in group]
         errors = [
@@ -253,21 +263,14 @@ def command(names: tuple[str, ...], runs: int, seed: int, as_json: bool, plot: P
     with show_step("fly") as step:
         for name in names or tuple(TRUTHS):
             step(f"fly: {name}")
-            row, flights, minimax_result, restrictive_result, model = study(name, runs, seed)
+            row, found = study(name, runs, seed)
             rows.append(row)
             if plot:
-                draw(plot, name, flights, minimax_result, restrictive_result, model)
+                draw(plot, name, found)
     if as_json:
         click.echo(json.dumps(rows))
         return
-    print_tables(
-        build_table(rows, "ratio", "rms error, minimax / restrictive (above 1: restrictive better)", ".2f")
-    )
-    print_tables(build_table(rows, "rms_minimax", "rms error of the minimax filter, km, h, rad", ".2e"))
-    print_tables(build_table(rows, "rms_restrictive", "rms error of the restrictive filter", ".2e"))
-    print_tables(build_table(rows, "rms_free", "rms error of the INS without correction", ".2e"))
-    print_tables(build_table(rows, "nees_minimax", "mean error^2 / variance, minimax (1: consistent)", ".1f"))
-    print_tables(build_table(rows, "nees_restrictive", "mean error^2 / variance, restrictive", ".1f"))
+    print_tables(*(build_table(rows, *table) for table in TABLES))
     for row in rows:
         click.echo(
             f"{row['title']}: U on the bound in {row['on_bound']:.0%} of steps, "
