@@ -298,15 +298,9 @@ def read_truth(path: Path) -> tuple[Track, float | None]:
     """Return the truth over the time since boot (s, rad), and the time since boot at which `t` is zero."""
     text = lzma.decompress(path.read_bytes()).decode()
     rows: list[dict[str, Any]] = list(csv.DictReader(io.StringIO(text)))
-    track = Track.of(
-        (
-            float(row["sim"]) + TRUTH_LATE_S,
-            math.radians(float(row["lat"])),
-            math.radians(float(row["lon"])),
-        )
-        for row in rows
-    )
     boot = [float(row["sim"]) + TRUTH_LATE_S for row in rows]
+    places = ((math.radians(float(row["lat"])), math.radians(float(row["lon"]))) for row in rows)
+    track = Track.of((boot_s, *place) for boot_s, place in zip(boot, places))
     t = [float(row["t"]) for row in rows]
     zero = next((b for (a, b), (x, y) in zip(pairwise(boot), pairwise(t)) if x < 0.0 <= y), None)
     return track, zero

@@ -16,11 +16,11 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from itertools import repeat
+from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypeVar
 
 import click
 import numpy as np
@@ -34,7 +34,7 @@ from companion.option_types import FloatRange
 from companion.output.source_switch import SILENT_S
 from companion.records import Event, Gnss, RsbnFix, Solution, Stamped
 from companion.runtime.core import CompanionCore
-from companion.tables import print_tables
+from companion.tables import number_table, print_tables
 from companion.units import SECOND_NS, Floats
 from sitl import loopback
 from sitl.autopilot import SimulatedAutopilot
@@ -45,6 +45,9 @@ from sitl.harm_recordings import RecordingResult, fly_log, fly_named, list_recor
 from sitl.scenarios import EAST_BEACON, TAKE_OFF, WIND, Scenario, SensorRates
 from sitl.sensors import STATED_GRADES
 from sitl.world import World
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
 
 START_S = 120.0  # something goes wrong from here on, unless it is wrong from the start
 GNSS_NOISE_M = 0.8  # white noise of the simulated receiver, one sigma per axis
@@ -323,13 +326,12 @@ def list_orders(names: Iterable[str], channels: Iterable[str], seeds: int, minut
     ]
 
 
-def _mapped(function: Callable[..., Any], workers: int, *columns: Iterable[Any]) -> Iterator[Any]:
+def _mapped(function: Callable[[Item], Result], workers: int, items: Sequence[Item]) -> list[Result]:
     """Map in `workers` processes, in this one with 0."""
     if workers == 0:
-        yield from map(function, *columns)
-        return
+        return list(map(function, items))
     with ProcessPoolExecutor(workers) as pool:
-        yield from pool.map(function, *columns)
+        return list(pool.map(function, items))
 
 
 def fly_one_recording(data: Path, name: str) -> RecordingResult:
@@ -377,9 +379,9 @@ def command(
         seeds or (QUICK_SEEDS if quick else SEEDS),
         minutes or (QUICK_MINUTES if quick else MINUTES),
     )
-    flights: list[HarmResult] = list(_mapped(fly, workers, orders))
+    flights = _mapped(fly, workers, orders)
     there = list_recordings(data) if data.is_dir() else []
-    recordings: list[RecordingResult] = list(_mapped(fly_one_recording, workers, repeat(data), there))
+    recordings = _mapped(partial(fly_one_recording, data), workers, there)
     if as_json:
         rows = [result._asdict() | {"passed": result.passed} for result in flights]
         click.echo(json.dumps({"flights": rows, "recordings": [r._asdict() for r in recordings]}))
@@ -427,10 +429,8 @@ def _print_flights(flights: list[HarmResult]) -> None:
 
 
 def _print_recordings(recordings: list[RecordingResult]) -> None:
-    table = Table(title="recordings; medians against GNSS in m, times in s")
     heads = ("recording", "fixes", "refused", "corrected", "autopilot", "truth", "set 2", "passed")
-    for head in heads:
-        table.add_column(head, justify="left" if head == "recording" else "right", overflow="fold")
+    table = number_table("recordings; medians against GNSS in m, times in s", *heads)
     for r in recordings:
         table.add_row(
             r.name.rsplit("/", 1)[-1].split(".")[0],

@@ -7,6 +7,7 @@ flight takes seconds and is reproducible. The table at the end compares every so
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
 import time
 from collections import Counter
@@ -211,18 +212,14 @@ def protection_table(
 def _from_first_fix(phase: SchedulePhase, records: Iterable[Stamped]) -> error_statistics.FlightPhase:
     start, end = (START_NS + round(s * SECOND_NS) for s in (phase.start_s, phase.end_s))
     kinds = tuple(kind for name, kind in (("GNSS", Gnss), ("RSBN", RsbnFix)) if name in phase.name)
+    begin = start
     if kinds:
-        records = iter(records)
-        next(
-            (
-                r
-                for r in records
-                if isinstance(r, kinds) and r.t_ns >= start and getattr(r, "has_3d_fix", True)
-            ),
-            None,
+        since = itertools.dropwhile(
+            lambda r: not (isinstance(r, kinds) and r.t_ns >= start and getattr(r, "has_3d_fix", True)),
+            records,
         )
-        start = next((r.t_ns for r in records if isinstance(r, Solution)), start)
-    return error_statistics.FlightPhase(phase.name, min(start, end), end)
+        begin = next((r.t_ns for r in since if isinstance(r, Solution)), start)
+    return error_statistics.FlightPhase(phase.name, min(begin, end), end)
 
 
 @click.command("loopback")
