@@ -87,12 +87,14 @@ def list_orders(scenarios: Iterable[str], faults: Iterable[str], seeds: int) -> 
     return [FlightOrder(s, f, seed) for seed, s, f in every if s in concerned[f]]
 
 
-def read_results(path: Path) -> list[FlightResult]:
-    """Read the results of a file; an incomplete last line is removed, so that lines can be appended."""
+def results_in(journal: Journal) -> list[FlightResult]:
+    """Return the results of a journal. Raises ValueError if it has others."""
     try:
-        return [FlightResult(**entry) for entry in Journal(path).entries]
+        return [FlightResult(**entry) for entry in journal.entries]
     except TypeError as error:
-        raise ValueError(f"{path}: invalid result ({error}); choose another --results folder") from None
+        raise ValueError(
+            f"{journal.path}: invalid result ({error}); choose another --results folder"
+        ) from None
 
 
 def fly_orders(todo: Sequence[FlightOrder], scheduler: str | None, workers: int) -> Iterator[FlightResult]:
@@ -110,10 +112,9 @@ def run_campaign(
 ) -> list[FlightResult]:
     """Fly the flights without a result in `folder`; return the results of all wanted flights."""
     folder.mkdir(parents=True, exist_ok=True)
-    path, keys = folder / "flights.jsonl", {order.key for order in wanted}
-    known = {result.key: result for result in read_results(path) if result.key in keys}
+    journal, keys = Journal(folder / "flights.jsonl"), {order.key for order in wanted}
+    known = {result.key: result for result in results_in(journal) if result.key in keys}
     todo = [order for order in wanted if order.key not in known]
-    journal = Journal(path)
     with show_count() as progress:
         task = progress.add_task("flights", total=len(wanted), completed=len(known))
         for result in fly_orders(todo, scheduler, workers):

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
+from companion.analysis.jobs import Journal
 from companion.config import Config
 from companion.records import Event, Solution, Trust
 from companion.units import SECOND_NS
@@ -35,6 +36,12 @@ from tests.solutions import solution_at
 def result(fault: str, seed: int, **changes: object) -> FlightResult:
     order = FlightOrder("one-beacon", fault, seed)
     return FlightResult(order.key, *order, 720.0)._replace(**{"solutions": 3600, "quiet_s": 240.0, **changes})
+
+
+def flown(fault: str, scenario: str = "one-beacon") -> FlightResult:
+    found = fly_order(FlightOrder(scenario, fault, 1))
+    assert found.raised is None
+    return found
 
 
 JUMP = FlightOrder("one-beacon", "gnss-jump", 1)
@@ -62,8 +69,7 @@ def requested(monkeypatch: pytest.MonkeyPatch) -> list[FlightOrder]:
 @pytest.mark.flight
 @pytest.mark.long
 def test_flight_without_faults_has_no_alarms_and_small_errors() -> None:
-    quiet = fly_order(FlightOrder("one-beacon", "none", 1))
-    assert quiet.raised is None
+    quiet = flown("none")
     assert quiet.largest_m < 15.0
     assert (quiet.detected_s, quiet.excluded_s, quiet.alarms, quiet.misleading_s) == (None, None, 0, 0.0)
 
@@ -72,8 +78,7 @@ def test_flight_without_faults_has_no_alarms_and_small_errors() -> None:
 @pytest.mark.long
 @pytest.mark.parametrize("fault", ["gnss-jump", "ins-reset", "beacon-bias"])
 def test_gross_faults_are_detected_at_once(fault: str) -> None:
-    found = fly_order(FlightOrder("one-beacon", fault, 1))
-    assert found.raised is None
+    found = flown(fault)
     assert found.detected_s is not None and found.detected_s < 10.0
     assert found.before_m < 100.0
 
@@ -132,10 +137,9 @@ def test_an_error_above_the_protection_level_is_misleading_or_flagged() -> None:
 @pytest.mark.long
 def test_slow_consumer_does_not_shift_the_clock() -> None:
     """Regression: reading every ten seconds shifted the clock by half a second, and GNSS was excluded."""
-    flown = fly_order(FlightOrder("one-beacon", "slow-consumer", 1))
-    assert flown.raised is None
-    assert (flown.excluded_s, flown.wrong, flown.alarms) == (None, 0, 0)
-    assert flown.largest_m < 15.0
+    found = flown("slow-consumer")
+    assert (found.excluded_s, found.wrong, found.alarms) == (None, 0, 0)
+    assert found.largest_m < 15.0
 
 
 @pytest.mark.flight
@@ -148,31 +152,28 @@ def test_late_link_and_clock_jump_are_reported_without_position_error(scenario: 
     """Regression: a late link shifted the clock, and a clock set back counted as a reboot: 220 m of error,
     GNSS excluded. The same happened where the error of the restarted channel was five times its sigma.
     """
-    flown = fly_order(FlightOrder(scenario, name, 1))
-    assert flown.raised is None
-    assert (flown.excluded_s, flown.wrong, flown.alarms, flown.misleading_s) == (None, 0, 0, 0.0)
-    assert flown.detected_s is not None and flown.detected_s < 10.0
-    assert flown.largest_m < 15.0
+    found = flown(name, scenario)
+    assert (found.excluded_s, found.wrong, found.alarms, found.misleading_s) == (None, 0, 0, 0.0)
+    assert found.detected_s is not None and found.detected_s < 10.0
+    assert found.largest_m < 15.0
 
 
 @pytest.mark.flight
 @pytest.mark.long
 def test_an_ins_that_drifts_and_stops_is_not_trusted_beyond_its_level() -> None:
     """Regression: that its velocity steps twice was as good as excluded: level 31 m, error 243 m."""
-    flown = fly_order(FlightOrder("no-beacon", "ins-drift", 1))
-    assert flown.raised is None
-    assert flown.largest_m > 200.0
-    assert (flown.misleading_s, flown.beyond_s) == (0.0, 0.0)
+    found = flown("ins-drift", "no-beacon")
+    assert found.largest_m > 200.0
+    assert (found.misleading_s, found.beyond_s) == (0.0, 0.0)
 
 
 @pytest.mark.flight
 @pytest.mark.long
 @pytest.mark.parametrize("name", ["gnss-stale", "beacon-frozen", "ins-frozen"])
 def test_stale_data_with_new_stamps_is_detected_at_once(name: str) -> None:
-    flown = fly_order(FlightOrder("one-beacon", name, 1))
-    assert flown.raised is None
-    assert flown.detected_s is not None and flown.detected_s < 3.0
-    assert flown.largest_m < 100.0
+    found = flown(name)
+    assert found.detected_s is not None and found.detected_s < 3.0
+    assert found.largest_m < 100.0
 
 
 @pytest.mark.flight
@@ -191,9 +192,9 @@ def test_stop_and_resumption_of_solutions_are_reported() -> None:
 
 
 def test_campaign_covers_every_simulator_fault() -> None:
-    flown = {kind.fault.name for kind in FAULT_CASES.values() if kind.fault}
+    covered = {kind.fault.name for kind in FAULT_CASES.values() if kind.fault}
     # a byte fault, covered by the tests of the frame reader, and one that the harm study flies
-    assert set(NAMES) - flown <= {"cut", "gnss-velocity"}
+    assert set(NAMES) - covered <= {"cut", "gnss-velocity"}
     for name in SCENARIOS:
         for fault in FAULT_CASES:
             assert flight.scenario_of(FlightOrder(name, fault, 1)).duration_s >= 600.0
@@ -274,7 +275,7 @@ def test_dask_returns_every_flight_and_that_of_a_killed_worker_too(
     assert killed.exists()
     assert [r.key for r in results] == [order.key for order in wanted]
     assert all(r.raised and "scenarios are" in r.raised for r in results)
-    assert sorted(command.read_results(tmp_path / "flights.jsonl")) == sorted(results)
+    assert sorted(command.results_in(Journal(tmp_path / "flights.jsonl"))) == sorted(results)
     lines = (tmp_path / "flights.jsonl").read_bytes().splitlines()
     assert sorted(json.loads(line)["seed"] for line in lines) == [1, 2, 3, 4, 5, 6]
 
@@ -283,11 +284,9 @@ def test_lost_flight_is_repeated_by_the_next_campaign(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (order,) = wanted = [FlightOrder("one-beacon", "none", 1)]
-    lost, flown = (
-        FlightResult(order.key, *order, 0.0, raised=f"{command.WORKER_LOST}: it died"),
-        result("none", 1),
-    )
-    for returned in (lost, flown):
+    lost = FlightResult(order.key, *order, 0.0, raised=f"{command.WORKER_LOST}: it died")
+    whole = result("none", 1)
+    for returned in (lost, whole):
         monkeypatch.setattr(command, "fly_orders", lambda *_, returned=returned: iter([returned]))
         assert command.run_campaign(wanted, tmp_path) == [returned]
-    assert command.read_results(tmp_path / "flights.jsonl") == [flown]
+    assert command.results_in(Journal(tmp_path / "flights.jsonl")) == [whole]
