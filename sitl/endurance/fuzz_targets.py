@@ -16,8 +16,9 @@ import contextlib
 import math
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from fastcrc import crc16
 from mcap.records import Channel, Chunk, Header, McapRecord, Message, Metadata, Schema
@@ -98,60 +99,44 @@ def make_frame(name: str, payload: bytes, who: int, sequence: int, signature: by
     return b"\xfd" + body + check.to_bytes(2, "little") + signature
 
 
-def script_entry(message: dialect.Message, wait_ms: int = 0, who: int = 0) -> bytes:
-    """Encode `message` as a script entry; the inverse of `script_frames`."""
-    name = dialect.TYPES[dialect.id_of(message)].name
-    payload = dialect.payload(message).rstrip(b"\0")
+def script_entry(name: str, wait_ms: int = 0, who: int = 0, **values: Any) -> bytes:
+    """Encode a message with these fields as a script entry; the inverse of `script_frames`."""
+    payload = dialect.payload(dialect.new(name, **values)).rstrip(b"\0")
     return bytes((MESSAGE_NAMES.index(name), who, 0, wait_ms // 10, len(payload))) + payload
 
 
 def flight_script(seconds: int = 8) -> bytes:
     """Short flight: autopilot, origin, inertial positions, air data, GNSS and RSBN fixes."""
-    new = dialect.new
+    lon, lat_0, ardupilot = 300_000_000, 600_000_000, mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA
     entries = [
-        script_entry(
-            new("HEARTBEAT", type=mavlink.MAV_TYPE_FIXED_WING, autopilot=mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA)
-        ),
-        script_entry(new("GPS_GLOBAL_ORIGIN", latitude=600_000_000, longitude=300_000_000, altitude=10_000)),
+        script_entry("HEARTBEAT", type=mavlink.MAV_TYPE_FIXED_WING, autopilot=ardupilot),
+        script_entry("GPS_GLOBAL_ORIGIN", latitude=lat_0, longitude=lon, altitude=10_000),
     ]
     for i in range(2 * seconds):
         ms, x = 500 * i + 60_000, 20.0 * i
-        lat = 600_000_000 + round(x / 0.0111)
+        fix = {"lat": lat_0 + round(x / 0.0111), "lon": lon + 500, "alt": 410_000, "eph": 80, "vel": 4000}
         entries += [
-            script_entry(new("SYSTEM_TIME", time_boot_ms=ms), 500),
-            script_entry(new("LOCAL_POSITION_NED", time_boot_ms=ms, x=x, y=3.0, z=-400.0, vx=40.0, vy=0.1)),
-            script_entry(new("ATTITUDE", time_boot_ms=ms, roll=0.01 * i, yaw=0.1)),
-            script_entry(new("SCALED_PRESSURE", time_boot_ms=ms, press_abs=960.0, temperature=1000)),
-            script_entry(new("VFR_HUD", airspeed=40.0 + 0.1 * i, heading=5, alt=400.0)),
-            script_entry(
-                new(
-                    "GPS_RAW_INT",
-                    time_usec=1000 * ms,
-                    fix_type=mavlink.GPS_FIX_TYPE_3D_FIX,
-                    lat=lat,
-                    lon=300_000_500,
-                    alt=410_000,
-                    eph=80,
-                    vel=4000,
-                )
-            ),
+            script_entry("SYSTEM_TIME", 500, time_boot_ms=ms),
+            script_entry("LOCAL_POSITION_NED", time_boot_ms=ms, x=x, y=3.0, z=-400.0, vx=40.0, vy=0.1),
+            script_entry("ATTITUDE", time_boot_ms=ms, roll=0.01 * i, yaw=0.1),
+            script_entry("SCALED_PRESSURE", time_boot_ms=ms, press_abs=960.0, temperature=1000),
+            script_entry("VFR_HUD", airspeed=40.0 + 0.1 * i, heading=5, alt=400.0),
+            script_entry("GPS_RAW_INT", time_usec=1000 * ms, fix_type=mavlink.GPS_FIX_TYPE_3D_FIX, **fix),
         ]
         if i % 2:
             entries.append(
                 script_entry(
-                    new(
-                        "RSBN_MEASUREMENT",
-                        time_usec=1000 * ms,
-                        beacon_id=1,
-                        status=rsbn.RSBN_STATUS_AZIMUTH_VALID | rsbn.RSBN_STATUS_RANGE_VALID,
-                        azimuth=4.615 - 1e-5 * i,
-                        sigma_azimuth=2e-3,
-                        sigma_range=100.0,
-                        slant_range=60_000.0 - i,
-                        beacon_lat=600_500_000,
-                        beacon_lon=310_700_000,
-                    ),
+                    "RSBN_MEASUREMENT",
                     who=4,
+                    time_usec=1000 * ms,
+                    beacon_id=1,
+                    status=rsbn.RSBN_STATUS_AZIMUTH_VALID | rsbn.RSBN_STATUS_RANGE_VALID,
+                    azimuth=4.615 - 1e-5 * i,
+                    sigma_azimuth=2e-3,
+                    sigma_range=100.0,
+                    slant_range=60_000.0 - i,
+                    beacon_lat=600_500_000,
+                    beacon_lon=310_700_000,
                 )
             )
     return b"".join(entries)
@@ -159,61 +144,27 @@ def flight_script(seconds: int = 8) -> bytes:
 
 def _ground_station_script() -> bytes:
     """Requests of a ground station, and a second autopilot."""
-    new, ours = dialect.new, {"target_system": 1, "target_component": 191}
+    wing, interval_us, gnss_sigma = mavlink.MAV_TYPE_FIXED_WING, 1e5, b"GNSS_SIGMA_M"
+    odometry, version = mavlink.MAVLINK_MSG_ID_ODOMETRY, mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION
+    interval, request = mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, mavlink.MAV_CMD_REQUEST_MESSAGE
+    asked = partial(script_entry, who=14, target_system=1, target_component=191)
     return b"".join(
         (
-            script_entry(
-                new("HEARTBEAT", type=mavlink.MAV_TYPE_FIXED_WING, autopilot=mavlink.MAV_AUTOPILOT_PX4)
-            ),
-            script_entry(
-                new(
-                    "HEARTBEAT",
-                    type=mavlink.MAV_TYPE_FIXED_WING,
-                    autopilot=mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA,
-                ),
-                20,
-                who=1,
-            ),
-            script_entry(new("TIMESYNC", ts1=5), 20),
-            script_entry(new("TIMESYNC", tc1=60_000_000_000, ts1=START_NS), 20),
-            script_entry(
-                new(
-                    "COMMAND_LONG",
-                    command=mavlink.MAV_CMD_SET_MESSAGE_INTERVAL,
-                    param1=mavlink.MAVLINK_MSG_ID_ODOMETRY,
-                    param2=1e5,
-                    **ours,
-                ),
-                20,
-                who=14,
-            ),
-            script_entry(
-                new(
-                    "COMMAND_LONG",
-                    command=mavlink.MAV_CMD_REQUEST_MESSAGE,
-                    param1=mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION,
-                    **ours,
-                ),
-                20,
-                who=14,
-            ),
-            script_entry(
-                new("COMMAND_INT", command=mavlink.MAV_CMD_COMPONENT_ARM_DISARM, **ours), 20, who=14
-            ),
-            script_entry(new("PARAM_REQUEST_LIST", **ours), 20, who=14),
-            script_entry(
-                new("PARAM_REQUEST_READ", param_id=b"GNSS_SIGMA_M", param_index=-1, **ours), 20, who=14
-            ),
-            script_entry(
-                new(
-                    "PARAM_SET",
-                    param_id=b"GNSS_SIGMA_M",
-                    param_value=3.0,
-                    param_type=mavlink.MAV_PARAM_TYPE_REAL32,
-                    **ours,
-                ),
+            script_entry("HEARTBEAT", type=wing, autopilot=mavlink.MAV_AUTOPILOT_PX4),
+            script_entry("HEARTBEAT", 20, 1, type=wing, autopilot=mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA),
+            script_entry("TIMESYNC", 20, ts1=5),
+            script_entry("TIMESYNC", 20, tc1=60_000_000_000, ts1=START_NS),
+            asked("COMMAND_LONG", 20, command=interval, param1=odometry, param2=interval_us),
+            asked("COMMAND_LONG", 20, command=request, param1=version),
+            asked("COMMAND_INT", 20, command=mavlink.MAV_CMD_COMPONENT_ARM_DISARM),
+            asked("PARAM_REQUEST_LIST", 20),
+            asked("PARAM_REQUEST_READ", 20, param_id=gnss_sigma, param_index=-1),
+            asked(
+                "PARAM_SET",
                 1000,
-                who=14,
+                param_id=gnss_sigma,
+                param_value=3.0,
+                param_type=mavlink.MAV_PARAM_TYPE_REAL32,
             ),
         )
     )
