@@ -44,6 +44,7 @@ SPEED, HEIGHT, WIND_EAST = 30.0, 800.0, 4.0
 UTC_S = 1_795_248_000
 Frame = tuple[str, bytes]
 OURS = {"target_system": 1, "target_component": 191}
+HAS_FIX, LOST = "EKF source set 1: GNSS has a fix", "EKF source set 2: GNSS is lost, using companion"
 AIRSPEED_SENSOR = {f"onboard_control_sensors_{name}": 16 for name in ("present", "enabled", "health")}
 
 
@@ -112,7 +113,8 @@ class Flight:
         x_n = np.array([SPEED * self.seconds, WIND_EAST * self.seconds, -HEIGHT])
         return local_to_geodetic("ardupilot", ORIGIN, x_n)
 
-    def fly(self, seconds: float) -> None:
+    def fly(self, seconds: float, gnss: bool | None = None) -> None:
+        self.gnss = self.gnss if gnss is None else gnss
         for _ in range(round(10 * seconds)):
             self.now += 100 * MS
             self.ticks += 1
@@ -231,8 +233,7 @@ def test_autopilot_position_never_reaches_the_output(
     honest, falsified = Flight(config, autopilot), Flight(config, autopilot, falsify_position)
     for flight in (honest, falsified):
         flight.fly(15.0)
-        flight.gnss = False
-        flight.fly(15.0)
+        flight.fly(15.0, gnss=False)
     assert len(honest.position_payloads()) >= (6 if via == "external_position" else 50)
     assert falsified.position_payloads() == honest.position_payloads()
 
@@ -342,14 +343,9 @@ def test_ardupilot_source_set_follows_gnss() -> None:
         if m.get_type() == "ODOMETRY"
     ]
     assert max(error[100:]) < 30.0
-    flight.gnss = True
-    flight.fly(10.0)
+    flight.fly(10.0, gnss=True)
     assert flight.source_set == 1
-    assert [t for t in flight.texts if "source set" in t] == [
-        "EKF source set 1: GNSS has a fix",
-        "EKF source set 2: GNSS is lost, using companion",
-        "EKF source set 1: GNSS has a fix",
-    ]
+    assert [t for t in flight.texts if "source set" in t] == [HAS_FIX, LOST, HAS_FIX]
 
 
 def test_source_set_is_known_whichever_link_leads() -> None:
@@ -372,17 +368,13 @@ def test_source_set_is_known_whichever_link_leads() -> None:
             flight.fly(1.0)
             report(flight)
         assert flight.source_set == leading, (links, gnss)
-    assert [t for t in flight.texts if "source set" in t] == [
-        "EKF source set 1: GNSS has a fix",
-        *("EKF source set 2: GNSS is lost, using companion", "EKF source set 1: GNSS has a fix") * 2,
-    ]
+    assert [t for t in flight.texts if "source set" in t] == [HAS_FIX, *(LOST, HAS_FIX) * 2]
 
 
 def test_source_switch_can_be_disabled() -> None:
     flight = Flight(configured("output.profile=ardupilot", "output.switch_sources=false"))
     flight.fly(8.0)
-    flight.gnss = False
-    flight.fly(8.0)
+    flight.fly(8.0, gnss=False)
     assert not [m for m in flight.sent_messages("COMMAND_LONG") if m.command == 42007]
     assert flight.sent_messages("ODOMETRY")
 
@@ -391,16 +383,13 @@ def test_gnss_that_is_back_leads_again_after_our_positions_were_switched_off() -
     """A ground station sets ODOMETRY_HZ to 0 on set 2: the autopilot stayed there, without a position."""
     flight = Flight(configured("output.profile=ardupilot"))
     flight.fly(10.0)
-    flight.gnss = False
-    flight.fly(10.0)
+    flight.fly(10.0, gnss=False)
     assert flight.source_set == 2
     flight.send("PARAM_SET", **OURS, param_id="ODOMETRY_HZ", param_value=0.0, param_type=9)
     flight.fly(3.0)
-    flight.gnss = True
-    flight.fly(10.0)
+    flight.fly(10.0, gnss=True)
     assert flight.source_set == 1
-    flight.gnss = False
-    flight.fly(10.0)
+    flight.fly(10.0, gnss=False)
     assert flight.source_set == 1
 
 
@@ -420,17 +409,11 @@ def test_source_set_follows_gnss_by_a_slow_output(hz: float) -> None:
     """A second between two positions was a gap: set 2 was never requested, and nothing reported."""
     flight = Flight(configured("output.profile=ardupilot", f"output.odometry_hz={hz}"))
     flight.fly(20.0)
-    flight.gnss = False
-    flight.fly(20.0)
+    flight.fly(20.0, gnss=False)
     assert flight.source_set == 2
-    flight.gnss = True
-    flight.fly(10.0)
+    flight.fly(10.0, gnss=True)
     assert flight.source_set == 1
-    assert [t for t in flight.texts if "source set" in t] == [
-        "EKF source set 1: GNSS has a fix",
-        "EKF source set 2: GNSS is lost, using companion",
-        "EKF source set 1: GNSS has a fix",
-    ]
+    assert [t for t in flight.texts if "source set" in t] == [HAS_FIX, LOST, HAS_FIX]
 
 
 @pytest.mark.parametrize("via", ["gps_input", "external_position"])
@@ -469,10 +452,8 @@ def test_answers_that_claim_too_small_a_sigma_do_not_contradict_gnss(pull: float
 
 def test_beacon_before_the_first_gnss_fix() -> None:
     flight = Flight(configured("output.profile=ardupilot"))
-    flight.gnss = False
-    flight.fly(10.0)
-    flight.gnss = True
-    flight.fly(10.0)
+    flight.fly(10.0, gnss=False)
+    flight.fly(10.0, gnss=True)
     assert "navigation fixed: azimuth and range fixes" in flight.texts
     assert "navigation fixed: gnss and azimuth and range fixes" in flight.texts
     assert flight.source_set == 1
@@ -489,8 +470,7 @@ def test_no_position_reset_while_the_autopilot_has_gps() -> None:
     flight = Flight(configured("output.profile=ardupilot", "output.via=external_position"))
     flight.fly(10.0)
     assert flight.sent_messages("COMMAND_INT") == []
-    flight.gnss = False
-    flight.fly(20.0)
+    flight.fly(20.0, gnss=False)
     sent = flight.sent_messages("COMMAND_INT")
     assert 15 <= len(sent) <= 19  # 1 Hz, also after a beacon fix
     assert {m.command for m in sent} == {43003}
@@ -500,8 +480,7 @@ def test_no_position_reset_while_the_autopilot_has_gps() -> None:
 def test_rate_of_position_resets_cannot_be_changed() -> None:
     flight = Flight(configured("output.profile=ardupilot", "output.via=external_position"))
     flight.fly(10.0)
-    flight.gnss = False
-    flight.fly(3.0)
+    flight.fly(3.0, gnss=False)
     flight.send("COMMAND_LONG", command=511, param1=75, param2=50_000, **OURS)
     flight.fly(10.0)
     assert [m.result for m in flight.sent_messages("COMMAND_ACK")] == [3]

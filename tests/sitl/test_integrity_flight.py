@@ -30,6 +30,13 @@ def flown(fault: str, seed: int = 1) -> FlightResult:
     return result
 
 
+def flown_within_its_level(scenario: str, fault: str, seed: int = 1) -> FlightResult:
+    result = fly_order(FlightOrder(scenario, fault, seed))
+    assert result.raised is None
+    assert (result.misleading_s, result.beyond_s) == (0.0, 0.0)
+    return result
+
+
 @pytest.mark.parametrize(
     ("fault", "seed"), [pytest.param("gnss-spoof-2", 1, marks=pytest.mark.long), ("gnss-spoof-5", 1)]
 )
@@ -53,18 +60,14 @@ def test_slow_spoofing_beside_one_beacon_stays_within_the_protection_level() -> 
 @pytest.mark.long
 def test_an_onset_without_evidence_is_within_the_protection_level() -> None:
     """0.5 m/s beside a stock autopilot and one beacon: at a risk of 1e-7 beyond it for up to 30 s."""
-    result = fly_order(FlightOrder("stock", "gnss-spoof-0.5", 5))
-    assert result.raised is None
-    assert (result.misleading_s, result.beyond_s) == (0.0, 0.0)
+    flown_within_its_level("stock", "gnss-spoof-0.5", 5)
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("scenario", ["mems", "air-data", "stock"])
 def test_gnss_that_is_false_from_the_first_fix_stays_within_the_protection_level(scenario: str) -> None:
     """By 450 m, until 540 s: a beacon at a wrong place looks the same and is likelier; both are possible."""
-    result = fly_order(FlightOrder(scenario, "gnss-first-450", 1))
-    assert result.raised is None
-    assert (result.misleading_s, result.beyond_s) == (0.0, 0.0)
+    result = flown_within_its_level(scenario, "gnss-first-450")
     assert result.last_m < 10.0  # by the honest GNSS again
 
 
@@ -119,9 +122,7 @@ def test_a_beacon_that_answered_before_gnss_does_not_make_the_sigma_of_a_spoofed
 @pytest.mark.parametrize("scenario", ["one-beacon", "two-beacons", "mems"])
 def test_ins_that_drifts_does_not_exclude_gnss_and_beacons_for_ever(scenario: str) -> None:
     """1 m/s for 4 min: GNSS looks drawn off until the beacons contradict (236 m and no end before)."""
-    result = fly_order(FlightOrder(scenario, "ins-drift", 1))
-    assert result.raised is None
-    assert (result.misleading_s, result.beyond_s) == (0.0, 0.0)
+    result = flown_within_its_level(scenario, "ins-drift")
     assert result.largest_m < 120.0
     assert result.last_m < 10.0  # by GNSS again
 
@@ -157,9 +158,7 @@ def test_gnss_that_is_drawn_off_gently_is_found_within_60_m(scenario: str) -> No
 @pytest.mark.parametrize("scenario", ["tactical", "mems"])
 def test_gnss_that_drew_an_ins_off_unnoticed_is_believed_once_it_is_true_again(scenario: str) -> None:
     """It was excluded as it returned by 87 m, then the beacon too: 232 m off beyond a level of 63 m."""
-    result = fly_order(FlightOrder(scenario, "gnss-accelerate", 1))
-    assert result.raised is None
-    assert (result.misleading_s, result.beyond_s) == (0.0, 0.0)
+    result = flown_within_its_level(scenario, "gnss-accelerate")
     assert result.largest_m < 100.0
     assert result.last_m < 10.0
 
@@ -170,8 +169,6 @@ def test_onsets_of_a_slow_lie_are_kept() -> None:
 
     About half of such flights show it within four minutes, by the noise; the others stay within the level.
     """
-    result = fly_order(FlightOrder("stock", "gnss-spoof-0.5", 1))
-    assert result.raised is None
+    result = flown_within_its_level("stock", "gnss-spoof-0.5")
     assert result.detected_s is not None
-    assert (result.misleading_s, result.beyond_s) == (0.0, 0.0)
     assert result.normal_m < 130.0
