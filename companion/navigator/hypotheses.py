@@ -1,9 +1,9 @@
 """What may be wrong: the layout of the navigator's bank, its priors, and beacons as they appear.
 
 Base states are those of the channel, then the biases of each beacon, by identity: of its azimuth, of its
-range, and of the time of its answers. GNSS,
-beacons and airspeed have a group of lie states each, so that one source of each kind may be false at once. Of
-GNSS either the position, with its velocity or alone, or the velocity alone is false.
+range, and of the time of its answers. GNSS, airspeed and each beacon have a group of lie states, so that all
+of them may be false at once. Of GNSS either the position, with its velocity or alone, or the velocity alone
+is false; of a beacon its azimuth, its range, or both by its place.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ SOURCES = ("gnss", "airspeed", "velocity of gnss")  # then `azimuth(k)` and `ran
 GNSS, AIRSPEED, VELOCITY = range(len(SOURCES))
 CONSISTENT = 0  # fault of GNSS: its velocity is false too
 GNSS_GROUP, BEACON_GROUP, AIRSPEED_GROUP = 0, 1, 2
-GROUPS = (2, 2, 1)
+GROUPS = (2, 2, 1)  # then two of each further beacon
 CHANNEL_JUMPS_H, CHANNEL_JUMP_M = 1e-3, 100.0
 INS_JUMPS_H = 0.01  # its position, by a reset of the unit
 #: The velocity of an INS steps (m, m/s), so rarely that a GNSS drawn off by 0.5 m/s is beyond doubt in 2.4 s.
@@ -277,6 +277,11 @@ def only(bank: Bank, row: int) -> Bank:
     return banks.picked(bank, [row])._replace(L=np.zeros(1))
 
 
+def _beacon_group(k: int) -> int:
+    """Group of the lie states of beacon k: with one for all, GNSS was blamed for the second that is wrong."""
+    return BEACON_GROUP if k == 0 else len(GROUPS) + k - 1
+
+
 def _hypotheses(config: Config, channel: Channel, now: Situation) -> Hypotheses:
     azimuth_bias, range_bias = math.radians(config.rsbn.bias_azimuth_deg), config.rsbn.bias_range_m
     sigma_a, sigma_r = math.radians(config.rsbn.sigma_azimuth_deg), config.rsbn.sigma_range_m
@@ -297,7 +302,8 @@ def _hypotheses(config: Config, channel: Channel, now: Situation) -> Hypotheses:
     ]
     for k in range(now.beacons):
         a, r = len(sources), len(sources) + 1
-        sources += [Source(f"azimuth {k}", 1, BEACON_GROUP, 0), Source(f"range {k}", 1, BEACON_GROUP, 1)]
+        group = _beacon_group(k)
+        sources += [Source(f"azimuth {k}", 1, group, 0), Source(f"range {k}", 1, group, 1)]
         for name, which, lies, first in (
             ("azimuth", (a,), beacon_lies(3.0 * sigma_a), 1e-3),
             ("range", (r,), beacon_lies(3.0 * sigma_r), 1e-3),
@@ -306,15 +312,16 @@ def _hypotheses(config: Config, channel: Channel, now: Situation) -> Hypotheses:
             ends_h = BEACON_H if name == "elsewhere" else 1.0
             fault = Fault(f"{name} {k}", which, BEACON_H, lies, first, lies, (), ends_h, BEACON_H, quota=4)
             faults.append(fault)
+    further = max(now.beacons - 1, 0)  # the first beacon's group is there without one
     layout = Layout(
         channel.n + BIASES * now.beacons,
-        GROUPS,
+        GROUPS + (2,) * further,
         tuple(sources),
         tuple(faults),
         jumps=_jumps(config, channel, now),
         grades=tuple(range(len(channel.grades))),
-        orders=ORDERS,
-        rate_correlation_s=RATE_CORRELATION_S,
+        orders=ORDERS + (2,) * further,
+        rate_correlation_s=RATE_CORRELATION_S + (banks.NO_DECAY_S,) * further,
     )
     settings = Settings(
         surprise=SURPRISE,

@@ -24,7 +24,6 @@ from companion.navigator.corrector_measurements import CorrectorRows
 from companion.navigator.hypotheses import (
     AIRSPEED,
     AIRSPEED_GROUP,
-    BEACON_GROUP,
     CONSISTENT,
     GNSS,
     GNSS_GROUP,
@@ -267,14 +266,15 @@ def sight(
     that of its noise, the unknown height included.
     """
     layout = known.layout
-    place = layout.starts[BEACON_GROUP] + np.arange(2)
-    own_slot = place[0 if isinstance(z, Azimuth) else 1]  # the bank fills in a one here
     source = known.azimuth(beacon) if isinstance(z, Azimuth) else known.range(beacon)
+    group = layout.sources[source].group
+    place = layout.starts[group] + np.arange(2)
+    own_slot = place[0 if isinstance(z, Azimuth) else 1]  # the bank fills in a one here
     first = known.bias(beacon)
     bias, late = first + (0 if isinstance(z, Azimuth) else 1), first + 2
 
     def linearised(bank: Bank) -> tuple[Floats, Floats]:
-        elsewhere = (bank.fault[:, BEACON_GROUP] == known.elsewhere(beacon)).astype(np.float64)
+        elsewhere = (bank.fault[:, group] == known.elsewhere(beacon)).astype(np.float64)
         x = bank.x[:, :2] + elsewhere[:, None] * bank.x[:, place]
         at = np.zeros((len(x), 3))
         at[:, 0], at[:, 1] = centre[1] - x[:, 1], centre[0] - x[:, 0]  # east, north of the plane's origin

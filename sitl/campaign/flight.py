@@ -3,7 +3,7 @@
 Sensor faults are applied to records, which are passed directly to the navigator, without messages and link:
 ten minutes take about two seconds. Faults of the link and of the autopilot are applied to bytes in the whole
 loopback. The fault starts after five minutes, in which the filters converge; three minutes follow for
-recovery. A fault of the beacon is one of all beacons: two that are wrong alike outvote GNSS.
+recovery. A fault of the beacon is one of all beacons.
 
 Workers, files and tables belong to `sitl.campaign.command`. A fault counts as
 

@@ -958,14 +958,19 @@ def with_jump(layout):
     return replace(layout, jumps=(Jump("channel", (0,), (20.0,), 20.0),))
 
 
+@pytest.mark.parametrize("groups", [(1, 1), (1,)])
 @pytest.mark.parametrize("seed", range(3))
-def test_enlarged_equals_a_bank_that_had_the_states_from_the_start(seed):
+def test_enlarged_equals_a_bank_that_had_the_states_from_the_start(seed, groups):
     rng = np.random.default_rng(seed)
     small = with_jump(scalar_layout(death_h=5.0))
     beacon = Fault("beacon", (1,), 10.0, (Lie(20.0, 0.1),), 0.01, (Lie(50.0, 0.1),), death_h=5.0)
-    small = replace(small, groups=(1, 1))
+    small = replace(small, groups=groups)
     large = replace(
-        small, n_base=4, sources=(*small.sources, Source("beacon", 1, 1)), faults=(*small.faults, beacon)
+        small,
+        n_base=4,
+        groups=(1, 1),
+        sources=(*small.sources, Source("beacon", 1, 1)),
+        faults=(*small.faults, beacon),
     )
     settings, bias = Settings(rows=24), np.array([9.0, 0.25])
     grown = b.start(small, 0.0, np.zeros(2), np.eye(2))
@@ -979,6 +984,7 @@ def test_enlarged_equals_a_bank_that_had_the_states_from_the_start(seed):
             grown = b.enlarge(grown, small, large, bias)
             np.testing.assert_allclose(grown.L, whole.L, atol=1e-10)
             np.testing.assert_array_equal(grown.event, whole.event)
+            np.testing.assert_array_equal(b.families(grown), b.families(whole))
         layout = small if k < 30 else large
         if k:
             n = layout.n_base

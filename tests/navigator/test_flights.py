@@ -102,6 +102,7 @@ def fly(
     seed: int = 1,
     winds: tuple[WindChange, ...] = (WindChange(0, 4, 5),),
     beacon: Beacon = FAR,
+    others: tuple[Beacon, ...] = (),
     navigator: Navigator | None = None,
     **scenario: Any,
 ) -> Flown:
@@ -112,7 +113,7 @@ def fly(
         Scenario(
             "test",
             FlightPlan(legs, winds=winds),
-            beacons=(beacon,),
+            beacons=(beacon, *others),
             rates=SensorRates(imu=20.0, truth=1.0, gnss=2.0),
             gnss_outages=outages,
             rsbn_outages=rsbn,
@@ -259,6 +260,41 @@ def test_a_healthy_gnss_is_never_excluded(channel: str, wrong: str) -> None:
     if channel != "air":  # there a false airspeed moves the nominal trajectory until the next fix
         assert flown.error[flown.t > SETTLED_S].max() < 10.0 + late_m
     assert np.all(flown.error <= flown.protection)
+
+
+@pytest.mark.parametrize(
+    "channel", ["air", *(pytest.param(name, marks=pytest.mark.long) for name in ("imu", "ins"))]
+)
+def test_beacons_whose_places_are_exchanged_leave_a_healthy_gnss_beyond_doubt(channel: str) -> None:
+    """Two, 5 km apart. With one false beacon at a time GNSS was excluded at the fifth answer, 5 km off."""
+    other = Beacon(2, FAR.lat_deg + 0.045, FAR.lon_deg)
+
+    def exchanged(record: Any) -> Any:
+        if not isinstance(record, RsbnFix):
+            return record
+        return replace(record, lat=math.radians((FAR if record.beacon == other.number else other).lat_deg))
+
+    flown = fly(channel, exchanged, legs=FIVE_MINUTES[:3], others=(other,))
+    assert flown.of("gnss_false").max() < 0.5
+    assert flown.error[flown.t > SETTLED_S].max() < 10.0
+
+
+@pytest.mark.parametrize("channel", ["air", pytest.param("imu", marks=pytest.mark.long)])
+def test_two_beacons_that_become_wrong_in_different_ways_are_both_excluded(channel: str) -> None:
+    north = Beacon(2, 60.45, 30.0)
+
+    def wrong(record: Any) -> Any:
+        if not isinstance(record, RsbnFix) or record.t_ns < 90 * NS:
+            return record
+        if record.beacon == north.number:
+            return replace(record, slant_range=record.slant_range + 200.0)
+        return replace(record, azimuth=record.azimuth + math.radians(1.0))
+
+    flown = fly(channel, wrong, legs=FIVE_MINUTES[:4], others=(north,))
+    excluded = {event.text.split(" is excluded")[0] for event in flown.events if "is excluded" in event.text}
+    assert excluded == {"rsbn 1 azimuth", "rsbn 2 range"}
+    assert flown.of("gnss_false", SETTLED_S).max() < 0.5
+    assert flown.error[flown.t > SETTLED_S].max() < 10.0
 
 
 @pytest.mark.parametrize("channel", ["imu", pytest.param("ins", marks=pytest.mark.long)])

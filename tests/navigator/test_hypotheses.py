@@ -7,9 +7,10 @@ import pytest
 
 from companion.config import Config, InertialConfig
 from companion.estimate import bank as banks
+from companion.estimate.bank.state import FAULT_CODES
 from companion.nav.geometry import Geodetic
 from companion.navigator.channel import Nominal
-from companion.navigator.hypotheses import AIRSPEED, GNSS, Model, Situation
+from companion.navigator.hypotheses import AIRSPEED, GNSS, MOST_BEACONS, Model, Situation
 from companion.navigator.inertial_track import Point
 from companion.navigator.own_error_model import HEADING, VERSINE, air_velocity, begin
 
@@ -63,3 +64,19 @@ def test_a_hovering_copter_shows_no_step_of_its_heading_but_where_its_velocity_c
     assert steps(along_nose=True)
     assert steps(along_nose=False, has_turned=True)
     assert not steps(along_nose=False)
+
+
+def test_as_many_beacons_as_are_followed_may_all_be_false_at_once() -> None:
+    """The codes of such an explanation are those of plain integers: none is cut off."""
+    model = Model(Config())
+    layout, bank = model.hypotheses(Situation(MOST_BEACONS)).layout, model.begin(0.0)
+    for k in range(MOST_BEACONS):
+        bank = model.with_beacon(bank, k)
+    false = {layout.fault_group(f): f for f in range(len(layout.faults))}
+    bank = bank._replace(fault=bank.fault * 0 + [false[g] for g in range(len(layout.groups))])
+    code = sum((f + 1) * FAULT_CODES**g for g, f in false.items())
+    assert max(false.values()) + 1 < FAULT_CODES
+    assert banks.families(bank).tolist() == [code] * len(bank.L)
+    assert set(banks.explanations(bank, layout).tolist()) == {code * (len(layout.jumps) + 1)}
+    is_beacon = [source.name.startswith(("azimuth", "range")) for source in layout.sources]
+    np.testing.assert_allclose(banks.false_probability(bank, layout)[is_beacon], 1.0)

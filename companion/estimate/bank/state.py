@@ -11,6 +11,8 @@ import numpy as np
 from companion.estimate.bank.layout import NEVER, NONE, Bools, Ints, Layout
 from companion.units import Floats
 
+FAULT_CODES = 64  # at least as many as faults, "none" included
+
 
 class Bank(NamedTuple):
     """R hypotheses of n states at time t.
@@ -127,11 +129,9 @@ def families(bank: Bank) -> Ints:
 
     Returns
     -------
-    (R,) codes; 0 is "nothing false".
+    (R,) codes; 0 is "nothing false". They are the same with groups added behind.
     """
-    code = np.zeros(len(bank.L), dtype=np.int64)
-    for g in range(bank.fault.shape[1]):
-        code = code * 64 + bank.fault[:, g] + 1
+    code: Ints = (bank.fault + 1) @ FAULT_CODES ** np.arange(bank.fault.shape[1])
     return code
 
 
@@ -245,12 +245,12 @@ def exchange(bank: Bank, states: slice, variance: Floats) -> Bank:
 
 
 def enlarge(bank: Bank, old: Layout, new: Layout, variance: Floats) -> Bank:
-    """Add base states of the given variances, and the sources and faults that `new` has beyond `old`.
+    """Add base states of the given variances, and the sources, faults and groups that `new` has beyond `old`.
 
     Parameters
     ----------
     bank, old : the bank and its layout.
-    new : the same sources, faults and jumps first, in the same order.
+    new : the same sources, faults, groups and jumps first, in the same order.
     variance : (new.n_base - old.n_base,) of the states that are added behind the base states.
 
     Returns
@@ -258,7 +258,7 @@ def enlarge(bank: Bank, old: Layout, new: Layout, variance: Floats) -> Bank:
     Bank : in the layout `new`.
     """
     rows, k = len(bank.L), new.n_base - old.n_base
-    at = np.concatenate((np.arange(old.n_base), np.arange(old.n_base + k, new.n)))
+    at = np.concatenate((np.arange(old.n_base), np.arange(old.n_base, old.n) + k))
     x, P = np.zeros((rows, new.n)), np.zeros((rows, new.n, new.n))
     x[:, at] = bank.x
     P[:, at[:, None], at] = bank.P
@@ -270,9 +270,12 @@ def enlarge(bank: Bank, old: Layout, new: Layout, variance: Floats) -> Bank:
     event = bank.event + np.where(
         bank.event > 2 * was, 2 * (now - was), np.where(bank.event > was, now - was, 0)
     )
+    groups, offsets = len(new.groups) - len(old.groups), len(new.offsets) - len(old.offsets)
     return bank._replace(
         x=x,
         P=P,
+        fault=np.pad(bank.fault, ((0, 0), (0, groups)), constant_values=NONE),
+        noise=np.pad(bank.noise, ((0, 0), (0, offsets))),
         event=event,
         seen=np.concatenate((bank.seen, np.full(more, NEVER))),
         excluded=np.concatenate((bank.excluded, np.zeros(more, dtype=np.bool_))),
