@@ -18,13 +18,12 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from functools import lru_cache
 from pathlib import Path
 from typing import NamedTuple
 
 import click
-from rich.console import Console
 from rich.table import Table
 
 from companion.bench.live import memory_mib, processor_s
@@ -33,6 +32,7 @@ from companion.link.dialect import mavlink, rsbn
 from companion.option_types import FloatRange
 from companion.runtime.core import CompanionCore
 from companion.storage.deferred_log import NoLog
+from companion.tables import print_tables
 from sitl.autopilot import SimulatedAutopilot
 from sitl.endurance.fuzz_targets import make_frame
 from sitl.endurance.parameter_sweep import CONFIGS, at_extremes, at_limits, param_set, recorded_flight
@@ -122,6 +122,7 @@ ATTACKS: dict[str, Attack] = {
     "empty datagrams": Attack(1000.0, lambda number, boot_us: b""),
     "TCP connections": Attack(1000.0, lambda number, boot_us: b"", tcp=True),
 }
+VIRTUAL = [name for name, attack in ATTACKS.items() if not attack.tcp and not attack.first]
 
 
 class Phase(NamedTuple):
@@ -343,26 +344,32 @@ def stop_during_start(times: int) -> list[int]:
     return codes
 
 
+def _virtual_costs(only: Collection[str]) -> Table:
+    table = Table("attack", "per second", "processor", "longest call", "ODOMETRY")
+    flown = [name for name in VIRTUAL if not only or name in only]
+    if not flown:
+        raise click.UsageError(f"--only {', '.join(only)}: not flown in virtual time: leave out --virtual")
+    for name in flown:
+        share, longest_ms, hz = virtual_cost(name)
+        row = f"{100.0 * share:.1f} %", f"{longest_ms:.1f} ms", f"{hz:.1f} Hz"
+        table.add_row(name, f"{ATTACKS[name].rate_hz:g}", *row)
+    return table
+
+
 @click.command()
 @click.option("--seconds", type=FloatRange(1.0), default=15.0, show_default=True, help="Of each phase.")
-@click.option("--only", type=click.Choice([*ATTACKS, "term"]), multiple=True)
+@click.option(
+    "--only", type=click.Choice([*ATTACKS, "term"]), multiple=True, help="May be repeated; default: all."
+)
 @click.option("--virtual", is_flag=True, help="In virtual time: the processor time alone, on any machine.")
 def main(seconds: float, only: tuple[str, ...], virtual: bool) -> None:
     """Attack a running service and print what it costs."""
     if virtual:
-        costs = Table("attack", "per second", "processor", "longest call", "ODOMETRY")
-        for name, attack in ATTACKS.items():
-            if not attack.tcp and not attack.first:
-                share, longest_ms, hz = virtual_cost(name)
-                row = f"{attack.rate_hz:g}", f"{100.0 * share:.1f} %", f"{longest_ms:.1f} ms", f"{hz:.1f} Hz"
-                costs.add_row(name, *row)
-        Console(width=100).print(costs)
+        print_tables(_virtual_costs(only))
         return
     columns = "attack", "per second", "processor", "memory", "ODOMETRY", "p99 of delay", "unanswered", "exit"
     table = Table(*columns, caption="each value: quiet, then attacked")
-    for name in only or ATTACKS:
-        if name == "term":
-            continue
+    for name in [name for name in ATTACKS if not only or name in only]:
         quiet, attacked, rate_hz, code = fly(name, seconds)
         table.add_row(
             name,
@@ -375,7 +382,8 @@ def main(seconds: float, only: tuple[str, ...], virtual: bool) -> None:
             str(code),
         )
         click.echo(f"{name}: done", err=True)
-    Console(width=130).print(table)
+    if table.rows:
+        print_tables(table)
     if not only or "term" in only:
         click.echo(f"SIGTERM during the start, exit codes: {stop_during_start(10)}")
 

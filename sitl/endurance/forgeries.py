@@ -16,7 +16,6 @@ from functools import partial
 from typing import NamedTuple, TypeAlias
 
 import click
-from rich.console import Console
 from rich.table import Table
 
 from companion.config import Config
@@ -25,6 +24,7 @@ from companion.link.dialect import mavlink, rsbn
 from companion.link.signing import Signing
 from companion.runtime.core import CompanionCore
 from companion.storage.deferred_log import NoLog
+from companion.tables import print_tables
 from companion.units import SECOND_NS
 from sitl.endurance.parameter_sweep import CONFIGS, recorded_flight
 from sitl.loopback import LINK, START_NS
@@ -190,7 +190,7 @@ def compare(plain: Sent, disturbed: Sent) -> Effect:
 
 
 @click.command()
-@click.option("--only", help="One row of the table.")
+@click.option("--only", type=click.Choice([*FORGERIES]), help="One message; default: all.")
 def main(only: str | None) -> None:
     """Print the effect of every forged message, by sender, on an unsigned and on a signed link."""
     config = CONFIGS[1]
@@ -211,7 +211,7 @@ def main(only: str | None) -> None:
                 effect.event.removeprefix(f"{LINK}: ")[:60],
                 on_signed,
             )
-    Console(width=150).print(table)
+    print_tables(table)
 
 
 if __name__ == "__main__":

@@ -1,8 +1,9 @@
 """What strangers can do: nothing on a signed link, no displacement from an address of their own."""
 
 import pytest
+from click.testing import CliRunner
 
-from sitl.endurance.forgeries import FORGERIES, KEY, SENDERS, STRANGERS_KEY, Sent, compare, fly, forger
+from sitl.endurance.forgeries import FORGERIES, KEY, SENDERS, STRANGERS_KEY, Sent, compare, fly, forger, main
 from sitl.endurance.parameter_sweep import CONFIGS
 
 CONFIG = CONFIGS[1]
@@ -35,3 +36,9 @@ def test_positions_are_not_moved_from_another_address(plain: Sent, sender: str) 
     effect = compare(plain, fly(CONFIG, lambda now: [frame for row in rows for frame in row(now)]))
     assert effect.displaced_m < 1.0
     assert effect.share > 0.95
+
+
+def test_an_unknown_message_is_named() -> None:
+    """Regression: a traceback, after two flights."""
+    done = CliRunner().invoke(main, ["--only", "TERM"])
+    assert (done.exit_code, "'TERM' is not one of 'HEARTBEAT'" in done.output) == (2, True)
