@@ -342,7 +342,7 @@ def fly_one_recording(data: Path, name: str) -> RecordingResult:
 
 @click.command("harm")
 @click.option("--seeds", type=click.IntRange(1, 10_000), help=f"Flights per case; default: {SEEDS}.")
-@click.option("--minutes", type=FloatRange(4.0, 1440.0), help=f"Of each; default: {MINUTES:g}.")
+@click.option("--minutes", type=FloatRange(4.0, 1440.0), help=f"Of each flight; default: {MINUTES:g}.")
 @click.option(
     "--quick", is_flag=True, help=f"By default {QUICK_SEEDS} flight per case, of {QUICK_MINUTES:g} minutes."
 )

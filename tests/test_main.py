@@ -19,7 +19,7 @@ from companion import __version__
 from companion.command_line import cli
 from companion.config import ConfigError
 from companion.option_types import FloatRange
-from sitl.endurance import attacks, file_mutants, forged_frames, parameter_sweep
+from sitl.endurance import attacks, file_mutants, forged_frames, forgeries, fuzz, parameter_sweep
 
 COMMANDS = ("bench", "check-config", "doctor", "log", "loopback", "replay", "run", "sitl")
 CUT = Path(__file__).parent / "data" / "dronekit_copter_cut.tlog"
@@ -84,9 +84,21 @@ def has_option(command: click.Command, name: str) -> bool:
     return name in {option.name for option in command.params}
 
 
+TOOLS = [tool.main for tool in (attacks, file_mutants, forged_frames, forgeries, fuzz, parameter_sweep)]
+
+
+def test_every_option_has_a_help_text() -> None:
+    missing = [
+        (command.name, *option.opts)
+        for command in [*commands().values(), *TOOLS]
+        for option in command.params
+        if isinstance(option, click.Option) and not option.help
+    ]
+    assert missing == []
+
+
 def test_seeds_are_not_negative() -> None:
-    tools = [file_mutants.main, forged_frames.main, parameter_sweep.main]
-    seeded = [command for command in [*commands().values(), *tools] if has_option(command, "seed")]
+    seeded = [command for command in [*commands().values(), *TOOLS] if has_option(command, "seed")]
     assert len(seeded) >= 15
     for command in seeded:
         done = CliRunner().invoke(command, ["--seed", "-1"])
@@ -132,9 +144,8 @@ def test_a_number_of_workers_beside_a_scheduler_is_rejected() -> None:
 
 def test_no_number_is_nan() -> None:
     """Infinity only where it is the default: no end."""
-    tools = [attacks.main, file_mutants.main, forged_frames.main, parameter_sweep.main]
     checked = set()
-    for command in [*commands().values(), *tools]:
+    for command in [*commands().values(), *TOOLS]:
         context = click.Context(command)
         for option in command.params:
             if isinstance(option.type, click.types.FloatParamType):

@@ -252,6 +252,7 @@ def _storable(value: Any) -> Any:
     type=click.Path(path_type=Path, file_okay=False),
     default=Path("fleet"),
     show_default=True,
+    help="Folder to write to.",
 )
 @worker_options
 @click.option(

@@ -34,7 +34,12 @@ from companion.write_errors import describe_write_error, write_whole
 @click.command("report")
 @click.argument("logs", type=INPUT_PATH, nargs=-1, required=True, metavar="LOG...")
 @click.option(
-    "-o", "--output", type=click.Path(path_type=Path), default=Path("report.html"), show_default=True
+    "-o",
+    "--output",
+    type=click.Path(path_type=Path),
+    default=Path("report.html"),
+    show_default=True,
+    help="Page to write.",
 )
 @click.option("--pdf", type=click.Path(path_type=Path), help="Also write the figures to this PDF.")
 @click.option("--png", type=click.Path(path_type=Path), help="Also write each figure to this folder.")
@@ -44,7 +49,9 @@ from companion.write_errors import describe_write_error, write_whole
     type=click.Path(path_type=Path),
     help="Configuration for the log of another recorder.",
 )
-@click.option("--with", "changes", multiple=True, metavar="KEY=VALUE,...", help="Change these keys of it.")
+@click.option(
+    "--with", "changes", multiple=True, metavar="KEY=VALUE,...", help="Change these configuration keys."
+)
 def command(
     logs: tuple[Path, ...],
     output: Path,

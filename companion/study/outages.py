@@ -262,14 +262,19 @@ def _row(
 
 @click.command("outages")
 @click.argument("logs", type=INPUT_PATH, nargs=-1, required=True, metavar="LOG...")
-@click.option("--lasting", type=FloatRange(1.0, 3600.0), multiple=True, help="Seconds; may be repeated.")
+@click.option(
+    "--lasting",
+    type=FloatRange(1.0, 3600.0),
+    multiple=True,
+    help="Duration of an outage [s]; may be repeated.",
+)
 @click.option(
     "--every",
     "every_s",
     type=FloatRange(1.0, 3600.0),
     default=60.0,
     show_default=True,
-    help="Seconds between.",
+    help="Seconds between the starts of outages.",
 )
 @beacon_options
 @configuration_options

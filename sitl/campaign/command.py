@@ -236,13 +236,34 @@ def _cell(value: Any) -> str:
     help="Seeds per scenario and fault.",
 )
 @click.option(
-    "-o", "--results", type=click.Path(path_type=Path, file_okay=False), default=Path("logs/campaign")
+    "-o",
+    "--results",
+    type=click.Path(path_type=Path, file_okay=False),
+    default=Path("logs/campaign"),
+    show_default=True,
+    help="Folder; flights with a result in it are not repeated.",
 )
 @worker_options
-@click.option("--harmless-m", type=FloatRange(0.0), default=CampaignLimits().harmless_m, show_default=True)
-@click.option("--misleading", type=FloatRange(0.0), default=CampaignLimits().misleading, show_default=True)
 @click.option(
-    "--alarms-per-hour", type=FloatRange(0.0), default=CampaignLimits().alarms_per_hour, show_default=True
+    "--harmless-m",
+    type=FloatRange(0.0),
+    default=CampaignLimits().harmless_m,
+    show_default=True,
+    help="Limit of the error while a fault is undetected or trust is normal [m].",
+)
+@click.option(
+    "--misleading",
+    type=FloatRange(0.0),
+    default=CampaignLimits().misleading,
+    show_default=True,
+    help="Limit of the share of flights with an error above the protection level, not flagged.",
+)
+@click.option(
+    "--alarms-per-hour",
+    type=FloatRange(0.0),
+    default=CampaignLimits().alarms_per_hour,
+    show_default=True,
+    help="Limit of the false alarms per hour.",
 )
 @click.option("--report", "page", type=click.Path(path_type=Path), help="Write the tables to this .md file.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
@@ -276,6 +297,11 @@ def command(
                 f"--{name} {value}"
                 for name, many in (("scenario", scenarios), ("fault", faults))
                 for value in many
+            ]
+            options += [
+                f"--{name.replace('_', '-')} {value}"
+                for name, value in limits._asdict().items()
+                if value != CampaignLimits._field_defaults[name]
             ]
             made_by = " ".join(["companion campaign", *options, f"--seeds {seeds} --report {page}"])
             page.parent.mkdir(parents=True, exist_ok=True)

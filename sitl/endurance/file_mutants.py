@@ -174,8 +174,14 @@ def run_formats(names: tuple[str, ...], count: int, seed: int, keep: Path) -> It
 @click.command()
 @click.option("--format", "names", multiple=True, type=click.Choice(tuple(SAMPLES)), help="Default: all.")
 @click.option("--mutants", type=click.IntRange(1), default=20_000, show_default=True, help="Per format.")
-@click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True)
-@click.option("--keep", type=click.Path(path_type=Path, file_okay=False), default=Path("logs/mutants"))
+@click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Seed of the mutants.")
+@click.option(
+    "--keep",
+    type=click.Path(path_type=Path, file_okay=False),
+    default=Path("logs/mutants"),
+    show_default=True,
+    help="Folder for the mutants with a defect.",
+)
 def main(names: tuple[str, ...], mutants: int, seed: int, keep: Path) -> None:
     """Read mutated logs of every format. Exit code 1 on a defect."""
     failed = False

@@ -98,8 +98,12 @@ def fly(config: Config, seed: int, frames: int) -> int:
 
 
 @click.command()
-@click.option("--frames", type=click.IntRange(1), default=10_000_000, show_default=True)
-@click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Of the first flight.")
+@click.option(
+    "--frames", type=click.IntRange(1), default=10_000_000, show_default=True, help="Number of them."
+)
+@click.option(
+    "--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Seed of the first flight."
+)
 def main(frames: int, seed: int) -> None:
     """Fly with forged frames until `--frames` were received. Exit code 1 if a flight failed."""
     total, failed, started = 0, 0, time.monotonic()

@@ -57,7 +57,13 @@ def run_inside(name: str, seconds: int, inputs: Path) -> None:
 @click.command()
 @click.option("--target", "names", multiple=True, type=click.Choice(TARGET_NAMES), help="Default: all.")
 @click.option("--seconds", type=click.IntRange(1), default=60, show_default=True, help="Per target.")
-@click.option("--inputs", type=click.Path(path_type=Path, file_okay=False), default=Path("logs/fuzz"))
+@click.option(
+    "--inputs",
+    type=click.Path(path_type=Path, file_okay=False),
+    default=Path("logs/fuzz"),
+    show_default=True,
+    help="Folder of the inputs found.",
+)
 @click.option(
     "--replay", type=click.Path(path_type=Path, exists=True, dir_okay=False), help="Run this input once."
 )

@@ -195,9 +195,11 @@ def _compare_with_log(
 
 
 @click.command("kills")
-@click.option("--times", type=click.IntRange(1), default=200, show_default=True)
-@click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True)
-@click.option("--at-once", type=click.IntRange(1), default=2, show_default=True)
+@click.option("--times", type=click.IntRange(1), default=200, show_default=True, help="Number of kills.")
+@click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Seed of the times.")
+@click.option(
+    "--at-once", type=click.IntRange(1), default=2, show_default=True, help="Services that run at once."
+)
 def command(times: int, seed: int, at_once: int) -> None:
     """Kill the service in flight at random times; check its log.
 

@@ -128,8 +128,16 @@ def param_set(setting: Setting, sequence: int) -> bytes:
 
 
 @click.command()
-@click.option("--several", type=click.IntRange(0), default=100, show_default=True, help="Flights with ten.")
-@click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True)
+@click.option(
+    "--several",
+    type=click.IntRange(0),
+    default=100,
+    show_default=True,
+    help="Number of flights with ten settings each.",
+)
+@click.option(
+    "--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Seed of these flights."
+)
 def main(several: int, seed: int) -> None:
     """Set every parameter to its limits and beyond in flight. Exit code 1 if a flight failed."""
     extremes, rng = at_extremes(), random.Random(seed)

@@ -266,8 +266,10 @@ def find_failures(hours: list[HourStatistics]) -> list[str]:
 
 
 @click.command("soak")
-@click.option("--hours", type=click.IntRange(1), default=24, show_default=True)
-@click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True)
+@click.option("--hours", type=click.IntRange(1), default=24, show_default=True, help="Hours of flight.")
+@click.option(
+    "--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Seed of flights and faults."
+)
 @click.option("--json", "as_json", is_flag=True, help="Print JSON, one line per hour.")
 def command(hours: int, seed: int, as_json: bool) -> None:
     """Fly for hours with random faults.

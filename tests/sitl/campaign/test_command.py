@@ -242,9 +242,13 @@ def test_exit_code_follows_the_limits(tmp_path: Path) -> None:
     events = CliRunner().invoke(command.command, options)
     assert events.exit_code == 0, events.output
     assert [line["fault"] for line in json.loads(events.stdout)] == ["none", "gnss-jump"]
-    strict = CliRunner().invoke(command.command, [*options[:-1], "--harmless-m", "0.001"])
+    page = tmp_path / "campaign.md"
+    limits = ["--harmless-m", "0.001"]
+    strict = CliRunner().invoke(command.command, [*options[:-1], *limits, "--report", str(page)])
     assert strict.exit_code == 1
     assert "gnss-jump" in strict.output
+    made_by = "--scenario one-beacon --fault none --fault gnss-jump --harmless-m 0.001 --seeds 1"
+    assert f"    companion campaign {made_by} --report {page}\n" in page.read_text()
 
 
 @pytest.mark.usefixtures("requested")
