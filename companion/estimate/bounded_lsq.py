@@ -106,7 +106,7 @@ def active_sets(m: int) -> ActiveSets:
         All 3^m candidates; there are only 2^m different sets of free inputs.
     """
     statuses = sorted(product((0, -1, 1), repeat=m), key=lambda s: sum(map(abs, s)))
-    status = np.array(statuses, np.int8).reshape(-1, m)
+    status = np.array(statuses, np.int8).reshape(len(statuses), m)
     free = status == 0
     return ActiveSets(status, free.astype(np.int8), free @ (1 << np.arange(m)))
 
@@ -160,12 +160,13 @@ def minimize_quadratic(M: Floats, g: Floats) -> BoxMinimum:
     each = np.empty((m, *g.shape))
     each.T[...] = M
     inverse = free_set_inverses(each)
-    shape = (-1, m) + (1,) * (g.ndim - 1)
+    shape = (*sets.status.shape,) + (1,) * (g.ndim - 1)
     status, free = sets.status.reshape(shape), sets.free.reshape(shape)
     pull = g - np.add.reduce(status[:, None] * each, 2)
     v = status + np.add.reduce(inverse[sets.row] * pull[:, None], 2)
     slope = g - np.add.reduce(v[:, None] * each, 2)  # gradient: points out of the box at an active bound
-    best = np.maximum.reduce(free * (np.abs(v) - 1.0) - status * slope, 1).argmin(0).T
+    violation = free * (np.abs(v) - 1.0) - status * slope
+    best = np.maximum.reduce(violation, 1, initial=-np.inf).argmin(0).T
     flights, whole = tuple(np.indices(best.shape, sparse=True)), slice(None)
     return BoxMinimum(
         v.T[(*flights, whole, best)], sets.status[best], inverse.T[(*flights, whole, whole, sets.row[best])]

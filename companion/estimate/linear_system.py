@@ -134,10 +134,11 @@ def _stage(
     if influence.ndim < 2:
         influence = influence.reshape(-1, 1)  # one disturbance
     noise = np.atleast_2d(np.asarray(D, float))
-    if z is None or H is None or R is None or np.size(H) == 0:
-        return Stage(transition, influence, noise, np.zeros((0, n)), np.zeros((0, 0)), np.zeros(0))
-    matrix = np.atleast_2d(np.asarray(H, float))
-    covariance, value = np.atleast_2d(np.asarray(R, float)), np.atleast_1d(np.asarray(z, float))
+    if z is None:
+        H, R, z = None, None, ()
+    matrix = np.zeros((0, n)) if H is None or np.size(H) == 0 else np.atleast_2d(np.asarray(H, float))
+    covariance = np.zeros((0, 0)) if R is None else np.atleast_2d(np.asarray(R, float))
+    value = np.atleast_1d(np.asarray(z, float))
     return Stage(transition, influence, noise, matrix, covariance, value)
 
 

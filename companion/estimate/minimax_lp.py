@@ -257,6 +257,13 @@ class Design:
         Minimax
             Weights, bound and certificate.
 
+        Raises
+        ------
+        Infeasible
+            If the rows do not determine the target.
+        ValueError
+            On wrong numbers or shapes, or if inputs act on the target and all rows are zero.
+
         References
         ----------
         Matasov, Martirosyan (1.9), (1.10).
@@ -266,6 +273,8 @@ class Design:
         weights = np.zeros(len(self.sigmas))
         if not (a_q.any() or g.any()):
             return Minimax(weights, 0.0, np.zeros_like(a), 0.0, ())
+        if not len(self.q):
+            raise ValueError("all rows are zero; give one that measures an unknown")
         rows, inputs = self._basis(start)
         best = _exchange(self.q, self.inputs, a_q, g, rows, inputs, tolerance)
         bound = best.cost

@@ -355,6 +355,8 @@ class Window(NamedTuple):
 
     def extend(self, t_s: float, Phi: Floats, B: Floats, Q: Floats) -> Window:
         """Append a node: transition (m, m), effect (m, 2) of a unit input and noise (m, m) since the last."""
+        if not t_s > self.t_s[-1]:
+            raise ValueError(f"node at {t_s:g} s, the last is at {self.t_s[-1]:g} s; give a later one")
         C, P = Phi @ self.C[-1], Phi @ self.P @ Phi.T + Q
         S = _solve(C, B)
         return self._replace(

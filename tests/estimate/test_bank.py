@@ -776,6 +776,9 @@ def test_nonsense_is_rejected():
         b.update(bank, layout, np.array([math.nan]), H, R, 0)
     with pytest.raises(ValueError, match="not positive definite"):
         b.update(bank._replace(P=-bank.P), layout, np.array([0.0]), H, R, 0)
+    for m in (1, 2, 3):
+        with pytest.raises(ValueError, match="not positive definite"):
+            b.update(bank, layout, np.zeros(m), np.ones((m, 2)), np.full((m, m), math.nan), None)
     with pytest.raises(ValueError, match="offsets only"):
         Layout(2, (1,), (Source("a", 2, 0),), ())
 

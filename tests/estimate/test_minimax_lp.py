@@ -125,6 +125,8 @@ def test_inputs_are_checked() -> None:
         Design.of(rows, 1.0, np.ones((3, 1)), [-1.0])
     with pytest.raises(ValueError, match="one for each input"):
         Design.of(rows, 1.0, np.ones((3, 2)), [1.0, 1.0]).minimax([1.0], through=[1.0])
+    with pytest.raises(ValueError, match="all rows are zero"):
+        Design.of(0.0 * rows, 1.0, np.ones((3, 1)), [1.0]).minimax([0.0], through=[1.0])
 
 
 @pytest.mark.parametrize("seed", range(20))

@@ -269,6 +269,13 @@ def test_a_first_fix_after_all_others_are_dropped_keeps_its_interval() -> None:
         assert [fix.node for fix in window.fixes] == [1]
 
 
+def test_two_nodes_of_one_time_are_rejected() -> None:
+    law = BoundedDrift(8.0, 0.1)
+    step = law.step(Motion(0.8, WEST, WEST, 10.0))
+    with pytest.raises(ValueError, match="node at 10 s, the last is at 10 s"):
+        Window.begin(0.0, law).extend(10.0, *step).extend(10.0, *step)
+
+
 def test_without_fixes_there_is_nothing_to_predict() -> None:
     law = BoundedIns(NAVIGATION)
     with pytest.raises(ValueError, match="no fixes"):

@@ -101,14 +101,15 @@ def test_full_horizon_solves_the_two_point_problem(data):
 
 
 def test_limits_of_the_bound():
-    """Zero bounds: the filter without inputs. Wide bounds: unknown inputs, R1 and the full horizon agree."""
+    """No inputs or zero bounds: the Kalman filter. Wide: unknown inputs, R1 and the full horizon agree."""
     x0, P0, Z, (A, B, Q, H, R, C) = ship()
-    tight = run_r1(x0, P0, Z, (A, B, Q, H, R, 0 * C))[-1]
     x, P = x0, P0
     for z in Z:
         x, P, *_ = kalman.step(x, P, z, A, Q, H, R)
-    np.testing.assert_allclose(tight.x, x, atol=1e-10)
-    np.testing.assert_allclose(tight.P, P, atol=1e-10)
+    for inputs, bounds in ((B, 0 * C), (B[:, :0], C[:0])):
+        tight = run_r1(x0, P0, Z, (A, inputs, Q, H, R, bounds))[-1]
+        np.testing.assert_allclose(tight.x, x, atol=1e-10)
+        np.testing.assert_allclose(tight.P, P, atol=1e-10)
     wide = (A, B, Q, H, R, 1e6 * C)
     loose = run_r1(x0, P0, Z, wide)[-1]
     assert not loose.status.any()

@@ -232,6 +232,8 @@ def test_memory_grows_as_the_length(solve: Any) -> None:
         ({5: [1.0, 2.0]}, "entries: give one of each"),
         ({0: [np.eye(3)] * 10}, r"entry 0: Phi \(3, 3\)"),
         ({3: [np.eye(2)] * 10}, "entry 0: H"),
+        ({3: [None] * 10}, r"entry 0: H \(0, 2\) does not fit z of 1 numbers"),
+        ({4: [None] * 10}, r"entry 0: covariance R has shape \(0, 0\), it must be \(1, 1\)"),
         ({4: [0.0] * 10}, "entry 0: covariance R has variance 0"),
         ({2: [-1.0] * 10}, "entry 0: covariance D has variance -1"),
         ({5: [math.nan] * 10}, "entry 0: a number is not finite"),

@@ -295,5 +295,7 @@ def _innovations(bank: Bank, layout: Layout, z: Floats, H: Floats, R: Floats, so
         white = np.linalg.solve(root, nu[:, :, None])[:, :, 0]
         G = np.linalg.solve(root, PHt_T).transpose(0, 2, 1)
         log_root = np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)
+        if not np.isfinite(log_root).all():  # LAPACK accepts NaN
+            raise ValueError("covariance not positive definite")
     nis = (white * white).sum(axis=1)
     return _Step(S, white, G, nis, -0.5 * (nis + m * LOG_2PI) - log_root)
