@@ -1,5 +1,7 @@
 """Fuzz targets on mutated valid inputs; `make fuzz` runs them longer, guided by coverage."""
 
+import contextlib
+import math
 import struct
 import tracemalloc
 
@@ -67,6 +69,24 @@ def test_seed_scripts_reach_the_solution() -> None:
         for seed in TARGETS["onboard"].seeds():
             TARGETS["onboard"].check(seed)
     assert {"Solution", "Fix", "RsbnFix", "Tuning", "AirData", "Pressure"} <= kinds
+
+
+@pytest.mark.parametrize(
+    ("name", "fields", "wrong"),
+    [
+        ("ODOMETRY", {"vx": math.nan, "pose_covariance": [0.0] * 15 + [math.nan] * 6}, []),
+        ("ODOMETRY", {"vx": math.inf, "z": math.nan}, ["z[0]", "vx[0]"]),
+        ("ODOMETRY", {"pose_covariance": [math.nan] + [0.0] * 20}, ["pose_covariance[0]"]),
+        ("GPS_INPUT", {"vn": math.nan, "horiz_accuracy": math.inf}, ["vn[0]", "horiz_accuracy[0]"]),
+    ],
+)
+def test_a_number_that_means_nothing_is_not_sent(name: str, fields: dict, wrong: list[str]) -> None:
+    """Regression: of a sent message only x, y, lat and lon were looked at."""
+    message = dialect.new(name, **fields)
+    assert fuzz_targets.wrong_numbers(message) == wrong
+    log, data = fuzz_targets.ValidatingLog(), frame.encode(message, 0, 1, 191)
+    with pytest.raises(AssertionError) if wrong else contextlib.nullcontext():
+        log.frame("link", True, data, 0)
 
 
 EDITS = st.lists(st.tuples(st.integers(0, 1 << 16), st.integers(0, 255), st.integers(0, 3)), max_size=12)
