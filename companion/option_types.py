@@ -11,7 +11,10 @@ import click
 
 
 class InputPath(click.Path):
-    """Path of a file or folder to read. An empty one is rejected: pathlib takes it for the current folder."""
+    """Path of a file or folder to read. An empty one is rejected: pathlib takes it for the current folder.
+
+    A file that cannot be read is reported by its reader, with that one's exit code.
+    """
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
         """Convert to a path."""
@@ -20,7 +23,7 @@ class InputPath(click.Path):
         return Path(os.fsdecode(super().convert(value, param, ctx)))
 
 
-INPUT_PATH = InputPath()
+INPUT_PATH = InputPath(readable=False)
 
 
 class FloatRange(click.FloatRange):

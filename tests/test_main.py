@@ -1,6 +1,7 @@
 """Command line: help, output and exit codes."""
 
 import contextlib
+import errno
 import json
 import os
 import re
@@ -167,6 +168,24 @@ def test_an_empty_name_is_not_the_current_folder() -> None:
                     argument.type.convert("", argument, click.Context(command))
                 checked.add(name)
     assert {"report", "replay", "log info", "live", "fleet", "study outages", "sitl play"} < checked
+
+
+def test_a_configuration_that_cannot_be_read_exits_78(
+    companion: Companion, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Regression: 2, that of a wrong option."""
+    path = tmp_path / "x.toml"
+    path.touch()
+    monkeypatch.setattr(os, "access", lambda *_: False)  # root may read every file
+    monkeypatch.setattr(Path, "open", unreadable)
+    for arguments in (["check-config"], ["run", "--config"], ["replay", str(CUT), "--config"]):
+        done = companion(*arguments, path)
+        sentence = f"companion: {path}: cannot be read (Permission denied)\n"
+        assert (done.returncode, done.stderr) == (78, sentence)
+
+
+def unreadable(*_: object, **__: object) -> None:
+    raise PermissionError(errno.EACCES, "Permission denied")
 
 
 @pytest.mark.parametrize(("end", "code"), [("inf", 1), ("nan", 2), ("-inf", 2)])

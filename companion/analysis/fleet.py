@@ -35,6 +35,7 @@ from companion.analysis.verdict import judge_flight
 from companion.analysis.worker_options import worker_options
 from companion.config import Config, load, to_toml
 from companion.importers.foreign_file import one_line
+from companion.option_types import INPUT_PATH
 from companion.optional_dependencies import first_missing, missing_package
 from companion.printable import printable
 from companion.records import Severity
@@ -261,7 +262,7 @@ def _storable(value: Any) -> Any:
 @click.option(
     "--config",
     "config_file",
-    type=click.Path(path_type=Path),
+    type=INPUT_PATH,
     help="Configuration for the logs of other recorders.",
 )
 def command(

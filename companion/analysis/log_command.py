@@ -66,7 +66,7 @@ def recover_command(log: Path) -> None:
 @click.option(
     "--config",
     "config_file",
-    type=click.Path(path_type=Path),
+    type=INPUT_PATH,
     help="Configuration; its link.system_id selects the vehicle of a telemetry log with several.",
 )
 def convert_command(source: Path, output: Path, config_file: Path | None) -> None:
@@ -105,7 +105,7 @@ def convert_command(source: Path, output: Path, config_file: Path | None) -> Non
 @click.option(
     "--config",
     "config_file",
-    type=click.Path(path_type=Path),
+    type=INPUT_PATH,
     help="Configuration for the log of another recorder.",
 )
 def export_command(log: Path, outputs: tuple[Path, ...], every_s: float, config_file: Path | None) -> None:

@@ -199,7 +199,7 @@ def derived_metadata(config: Config, by: str, log: Path) -> dict[str, dict[str, 
 @click.command("replay")
 @click.argument("log", type=INPUT_PATH)
 @click.option("-o", "--output", type=click.Path(path_type=Path), help="MCAP file to write.")
-@click.option("--config", "config_file", type=click.Path(path_type=Path), help="Use this configuration.")
+@click.option("--config", "config_file", type=INPUT_PATH, help="Use this configuration.")
 @click.option(
     "--with", "changes", multiple=True, metavar="KEY=VALUE,...", help="Change these configuration keys."
 )

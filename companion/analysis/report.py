@@ -46,7 +46,7 @@ from companion.write_errors import describe_write_error, write_whole
 @click.option(
     "--config",
     "config_file",
-    type=click.Path(path_type=Path),
+    type=INPUT_PATH,
     help="Configuration for the log of another recorder.",
 )
 @click.option(

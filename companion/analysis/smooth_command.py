@@ -136,7 +136,7 @@ def _ellipse(unix_ns: int, centre: Geodetic, covariance: Floats) -> Track:
     type=click.Path(path_type=Path),
     help=f"File to write, may be repeated: {', '.join(FORMATS)}. Default: NAME.smoothed.mcap.",
 )
-@click.option("--config", "config_file", type=click.Path(path_type=Path), help="Use this configuration.")
+@click.option("--config", "config_file", type=INPUT_PATH, help="Use this configuration.")
 @click.option(
     "--with", "changes", multiple=True, metavar="KEY=VALUE,...", help="Change these configuration keys."
 )

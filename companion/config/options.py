@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any, TypeVar
 
 import click
 
 from companion.config.load import ConfigError
 from companion.config.presets import PRESETS
+from companion.option_types import INPUT_PATH
 
 T = TypeVar("T")
 Command = TypeVar("Command", bound=Callable[..., Any])
@@ -20,7 +20,7 @@ def configuration_options(command: Command) -> Command:
     file = click.option(
         "--config",
         "file",
-        type=click.Path(path_type=Path, readable=False),  # `load` reports it, with its exit code
+        type=INPUT_PATH,
         multiple=True,
         callback=_only_one,
         help="TOML file; see check-config.",

@@ -10,14 +10,14 @@ import msgspec
 from companion.config import ConfigError, load, to_toml
 from companion.config.options import override_options
 from companion.config.reference import commented_toml
-from companion.option_types import InputPath
+from companion.option_types import INPUT_PATH
 from companion.printable import printable
 from companion.runtime.link_addresses import check_links
 from companion.runtime.signing_key import read_configured_key
 
 
 @click.command("check-config")
-@click.argument("file", type=InputPath(readable=False), required=False)
+@click.argument("file", type=INPUT_PATH, required=False)
 @click.option("--defaults", is_flag=True, help="Print every key with its comment, as a file to start from.")
 @override_options
 @click.option("--json", "as_json", is_flag=True, help="Print the configuration in force as JSON.")

@@ -1,6 +1,5 @@
 """Command check-config: rejects what `run` rejects, and only warns of files of another computer."""
 
-import errno
 import os
 from pathlib import Path
 
@@ -35,20 +34,6 @@ def test_links_that_run_rejects_are_rejected(links: list[str], expected: str) ->
 def test_different_links_are_accepted() -> None:
     links = ("udpin:14550", "udpin:14551", "tcpin:14550", "udpin:0.0.0.0:14550", "serial:/dev/ttyS0:57600")
     check_links(Config(link=LinkConfig(connect=links)))
-
-
-def test_unreadable_file_is_an_invalid_configuration(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    def fail(*_: object, **__: object) -> None:
-        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
-
-    file = tmp_path / "companion.toml"
-    file.touch()
-    monkeypatch.setattr(os, "access", lambda *_, **__: False)
-    monkeypatch.setattr(Path, "open", fail)
-    for arguments in (["check-config", str(file)], ["run", "--config", str(file)]):
-        done = CliRunner().invoke(cli, arguments)
-        assert isinstance(done.exception, ConfigError), arguments
-        assert str(done.exception) == f"{file}: cannot be read (Permission denied)"
 
 
 def test_unreadable_signing_key_is_only_a_warning(tmp_path: Path) -> None:
