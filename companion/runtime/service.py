@@ -140,7 +140,8 @@ class Service:
             self._connections[name], self._dropped_before[name] = stream, link.dropped
             self._notifier.ready()
             if self._addresses[name].listens:
-                self.core.report(Severity.INFO, f"listening: {self._addresses[name]}", time.monotonic_ns())
+                address = self._addresses[name]._replace(number=stream.port)  # 0 asks for any free one
+                self.core.report(Severity.INFO, f"listening: {address}", time.monotonic_ns())
                 self._flush()
             try:
                 await stream.deliver_to(partial(self._receive, link, stream))

@@ -151,6 +151,16 @@ def test_only_loopback_addresses_listen_unless_configured(
     assert [e.text for e in events if "listening" in e.text] == [f"listening: {Address.parse(address)}"]
 
 
+@pytest.mark.parametrize("kind", ["udpin", "tcpin"])
+def test_a_port_that_the_system_chose_is_reported(tmp_path: Path, kind: str) -> None:
+    async def play(service: Service, events: list[Event]) -> None:
+        await until(lambda: any("listening" in event.text for event in events))
+
+    events = serve(tmp_path, (f"{kind}:{LOOPBACK}:0",), play)
+    (port,) = [e.text.rpartition(":")[2] for e in events if "listening" in e.text]
+    assert int(port) > 0
+
+
 def test_listening_is_reported_only_once_the_socket_is_bound(tmp_path: Path) -> None:
     async def play(service: Service, events: list[Event]) -> None:
         await until(lambda: any("at present; trying again" in event.text for event in events))
