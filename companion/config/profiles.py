@@ -41,17 +41,21 @@ class RequiredParameter(NamedTuple):
 
 class FailsafeLimit(NamedTuple):
     """Limit of an autopilot's failsafe: the least value with which it flies on by our position (-1: none),
-    what it does by another, and whether it has it while it hovers only. The user decides on it.
+    what it does by another, whether it has it while it hovers only, and whether 0 means none too. The user
+    decides on it.
     """
 
     name: str
     value: float
     otherwise: str
     hovering: bool = False
+    zero_is_none: bool = False
 
     def is_met(self, has: float) -> bool:
         """Whether the autopilot's value lets it fly on."""
-        return has < 0.0 if self.value < 0.0 else has >= self.value
+        if self.value < 0.0:
+            return has < 0.0 or (has == 0.0 and self.zero_is_none)
+        return has >= self.value
 
 
 class OutputMethod(NamedTuple):
@@ -103,7 +107,10 @@ _AUXILIARY_POSITION = (
 )
 _PX4_FAILSAFE = (
     FailsafeLimit(
-        "COM_POS_LOW_EPH", -1.0, "{} m: COM_POS_LOW_ACT (3: it returns home) once its own accuracy is worse"
+        "COM_POS_LOW_EPH",
+        -1.0,
+        "{} m: COM_POS_LOW_ACT (3: it returns home) once its own accuracy is worse",
+        zero_is_none=True,
     ),
     FailsafeLimit(
         "COM_POS_FS_EPH", -1.0, "{} m: hovering it lands once its own accuracy is 2.5 times worse", True

@@ -108,6 +108,7 @@ def test_failsafe_limits(pairs: list[str], make: str, hovers: bool, names: set[s
     for limit in limits:  # its value lets the autopilot fly on, and PX4's default does not
         default = {"COM_POS_LOW_EPH": 50.0, "COM_POS_FS_EPH": 5.0, "EKF2_NOAID_TOUT": 5e6}[limit.name]
         assert limit.is_met(limit.value) and not limit.is_met(default)
+        assert limit.is_met(0.0) == (limit.name == "COM_POS_LOW_EPH")  # PX4 tests it only above 0
 
 
 outputs = st.builds(
