@@ -19,8 +19,16 @@ from itertools import chain
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
-from companion.importers import dataflash, inertialnav, px4_csv, tlog, ulog
-from companion.importers.foreign_file import MAX_TEXT, Damage, usable
+from companion.importers import (
+    dataflash,
+    dataflash_messages,
+    inertialnav,
+    px4_csv,
+    tlog,
+    ulog,
+    ulog_messages,
+)
+from companion.importers.foreign_file import MAX_TEXT, Damage, map_file, usable
 from companion.link.decode import DECODED, MAKES, Autopilot, Sender, decode
 from companion.link.dialect import MEASUREMENTS, Message, mavlink
 from companion.link.frame import Frame
@@ -39,6 +47,7 @@ from companion.records import (
     Severity,
     Stamped,
 )
+from companion.storage.mcap_file import MAGIC
 from companion.storage.reader import LogError
 
 _STATUSTEXT: int = mavlink.MAVLINK_MSG_ID_STATUSTEXT
@@ -228,6 +237,12 @@ _READERS: dict[str, Callable[[Path], ForeignLog]] = {
     "tables": inertialnav.read_tables,  # folders
     "topics": px4_csv.CsvFolder,
 }
+#: Suffixes of the formats that begin with bytes of their own.
+_BEGINNINGS: dict[bytes, tuple[str, ...]] = {
+    MAGIC: (".mcap",),
+    ulog_messages.MAGIC: (".ulg", ".ulog"),
+    dataflash_messages.HEAD + b"\x80": (".bin", ".log"),
+}
 LOG_SUFFIXES = (".tlog", *(kind for kind in _READERS if kind.startswith(".")))
 """File name suffixes of the logs of other recorders."""
 
@@ -246,6 +261,11 @@ def open_source(
     if kind not in LOG_SUFFIXES and not path.is_dir():
         known = ", ".join((*others, *LOG_SUFFIXES))
         raise LogError(f"{path}: unknown file type; give {known} or a folder of topics")
+    if path.is_file():
+        start = map_file(path)[: len(MAGIC)]
+        for magic, suffixes in _BEGINNINGS.items():
+            if start.startswith(magic) and kind not in suffixes:
+                raise LogError(f"{path} is a {suffixes[0]} log by its content: give it that ending")
     if path.is_dir():
         kind = "tables" if inertialnav.has_tables(path) else "topics"
     source: TlogSource | OnboardSource

@@ -296,6 +296,23 @@ def test_invalid_tlog_is_reported_in_one_sentence(tmp_path: pathlib.Path) -> Non
             sources.open_source(path)
 
 
+@pytest.mark.parametrize(
+    ("name", "start", "suffix"),
+    [
+        ("x.bin", b"\x89MCAP0\r\n", ".mcap"),
+        ("x.tlog", b"ULog\x01\x125", ".ulg"),
+        ("x.zip", b"\xa3\x95\x80\x80", ".bin"),
+    ],
+)
+def test_another_format_than_that_of_its_ending_is_named(
+    name: str, start: bytes, suffix: str, tmp_path: pathlib.Path
+) -> None:
+    path = tmp_path / name
+    path.write_bytes(start + bytes(100))
+    with pytest.raises(LogError, match=rf"{name} is a \{suffix} log by its content: give it that ending"):
+        sources.open_source(path)
+
+
 def test_log_without_the_autopilot_states_so(tmp_path: pathlib.Path) -> None:
     path = tmp_path / "flight.tlog"
     path.write_bytes(b"".join(CLEAN))
