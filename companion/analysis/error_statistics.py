@@ -141,9 +141,9 @@ def intersect_azimuth_range(beacon: Geodetic, azimuth: float, slant_range: float
     return place
 
 
-def root_mean_square(x: Floats) -> float:
+def root_mean_square(x: npt.ArrayLike) -> float:
     """Return the r.m.s. of all numbers of an array, in their unit."""
-    return float(np.sqrt(np.mean(x**2)))
+    return float(np.sqrt(np.mean(np.square(x))))
 
 
 def summarize_phases(found: dict[str, ErrorSeries], phases: Sequence[FlightPhase]) -> list[PhaseErrors]:

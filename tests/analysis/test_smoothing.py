@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from companion.analysis import smoothing
+from companion.analysis.error_statistics import root_mean_square as rms
 from companion.analysis.first_pass import FirstPass
 from companion.analysis.smoothing import SmoothedRun, smooth_flight
 from companion.config import Config, GnssConfig, InertialConfig, load, to_toml
@@ -109,10 +110,6 @@ def errors(found: SmoothedRun, flown: SimulatedFlight) -> tuple[Any, Any]:
     """Return the errors (N, n) of the smoothed and of the filtered states."""
     true = np.array([flown.error[int(t)] for t in found.t_ns])
     return found.x[:, :N] - true, found.x_filter[:, :N] - true
-
-
-def rms(e: Any) -> float:
-    return float(np.sqrt(np.mean(np.square(e))))
 
 
 @pytest.mark.flight

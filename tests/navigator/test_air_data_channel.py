@@ -11,10 +11,10 @@ from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
-import numpy.typing as npt
 import pytest
 
 from companion.analysis.error_statistics import position_from_beacon
+from companion.analysis.error_statistics import root_mean_square as rms
 from companion.config import Config, load, to_toml
 from companion.importers import sources
 from companion.nav.geometry import Geodetic, displace, from_enu, separation, slant_range_azimuth
@@ -125,10 +125,6 @@ def flown_on(flown: Recorded, navigator: Navigator, records: Iterable[Any]) -> E
                 sigma = math.sqrt(out.covariance[0] + out.covariance[3])
                 rows.append((flown.since(out), math.hypot(north, east), sigma))
     return Errors(*np.array(rows).T)
-
-
-def rms(x: npt.ArrayLike) -> float:
-    return float(np.sqrt(np.mean(np.square(x))))
 
 
 def raw_rms(flown: Recorded, records: Iterable[Any], start: float, end: float) -> float:

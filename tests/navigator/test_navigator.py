@@ -16,6 +16,7 @@ import pytest
 from msgspec import structs
 
 import companion.navigator as navigator_module
+from companion.analysis.error_statistics import root_mean_square as rms
 from companion.config import Config, InertialConfig, load, to_toml
 from companion.estimate.fusion import Azimuth
 from companion.link.parameter_server import PARAMETERS
@@ -124,10 +125,6 @@ def flown_in_order(gnss_until: float) -> tuple[Navigator, list[list[Any]]]:
 def distance(solution: Solution, truth: Geodetic) -> float:
     north, east, _ = separation(Geodetic(solution.lat, solution.lon, solution.alt_msl), truth)
     return math.hypot(north, east)
-
-
-def rms(values: list[float]) -> float:
-    return math.sqrt(sum(v * v for v in values) / len(values))
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
-import numpy.typing as npt
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -22,6 +21,7 @@ from scipy.signal import lfilter
 
 from companion.analysis import simulated_rsbn
 from companion.analysis.error_statistics import position_from_beacon
+from companion.analysis.error_statistics import root_mean_square as rms
 from companion.config import load
 from companion.importers import sources
 from companion.nav.geometry import Geodetic, displace, from_enu, separation, slant_range_azimuth
@@ -730,10 +730,6 @@ def with_beacon(seed: int, gap: tuple[float, float] = (0.0, 0.0), flown: Any = r
 def sensing(records: Iterable[Any]) -> list[Any]:
     """The airspeed is of a sensor, which the recording does not state."""
     return [msgspec.structs.replace(r, sensed=True) if isinstance(r, AirData) else r for r in records]
-
-
-def rms(x: npt.ArrayLike) -> float:
-    return float(np.sqrt(np.mean(np.square(x))))
 
 
 def raw_rms(records: Iterable[Any], start: float) -> float:
