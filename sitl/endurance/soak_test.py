@@ -13,7 +13,8 @@ minutes apart, about 14 per hour. Each hour yields one line with memory, queues 
     queues     the longest container in the companion, and the bytes that wait for the log's disk: bounded
     rates      in the quiet time between faults: of solutions and of messages received within 1 % of the first
                hour; of messages sent within 1 % beyond the 5 % that may leave early (`output.pace`), which
-               depends on the phase of the beacons' answers in each sortie
+               depends on the phase of the beacons' answers in each sortie. The first hour has at least what
+               is configured: its own fault would be the measure of all others
 
 Virtual time: a day takes about three quarters of an hour.
 """
@@ -243,6 +244,10 @@ def find_failures(hours: list[HourStatistics]) -> list[str]:
     fewest, last = (min(hour.objects for hour in part) for part in (hours[:quarter], hours[-quarter:]))
     if last > fewest * (1.0 + MEMORY_GROWTH):
         found.append(f"hour {hours[-quarter].hour}: objects grew from {fewest} to {last}")
+    configured = simulator_config(Config()).output.rates_hz.values()
+    for name, least in (("solutions_hz", max(configured)), ("messages_hz", sum(configured))):
+        if (rate := getattr(first, name)) < least:
+            found.append(f"hour {first.hour}: {name} is {rate:g} (configured {least:g})")
     for hour in hours:
         if hour.resident_mib > first.resident_mib * (1.0 + MEMORY_GROWTH):
             found.append(

@@ -63,6 +63,15 @@ def test_growth_is_reported() -> None:
         assert word in sentence and sentence.startswith("hour 2: ")
 
 
+@pytest.mark.parametrize("change", [{"solutions_hz": 4.9}, {"messages_hz": 7.9}])
+def test_rates_that_are_low_from_the_start_are_reported(change: dict[str, float]) -> None:
+    """Regression: a day without any solution passed, as its hours were alike."""
+    low = GOOD._replace(**change)
+    (sentence,) = find_failures([low, low._replace(hour=2)])
+    ((name, rate),) = change.items()
+    assert sentence.startswith(f"hour 1: {name} is {rate} (configured ")
+
+
 def test_a_leak_is_found_among_counts_that_differ_by_a_tenth() -> None:
     def day(leak: int) -> list[HourStatistics]:
         """A count differs by a tenth from hour to hour, in no order."""
