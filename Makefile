@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help loopback test tests flights all-flights lint fuzz kills soak docs pictures lock clean
+.PHONY: help loopback test tests flights all-flights lint fuzz kills soak docs pictures lock oldest clean
 
 # one worker more than processors: many tests wait for a process or a disk
 WORKERS := $(shell echo $$(($$(getconf _NPROCESSORS_ONLN) + 1)))
@@ -82,6 +82,11 @@ lock: ## regenerate requirements.lock from pyproject.toml (needs uv)
 	uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-emit-index-url \
 	  --no-annotate --no-header $(foreach e,dev plot report live foxglove campaign fleet,--extra $(e)) \
 	  -o requirements.lock pyproject.toml
+
+oldest: ## tests with the oldest dependencies that pyproject.toml allows (needs uv)
+	uv venv --quiet --clear build/oldest
+	uv pip install --quiet --python build/oldest --resolution lowest-direct -e '.[dev,report,live,fleet,campaign]'
+	build/oldest/bin/python -m pytest -n $(WORKERS) --dist worksteal -m "not flight"
 
 clean: ## remove the environment and tool caches
 	rm -rf $(VENV) build *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -16,6 +16,7 @@ from typing import Any
 import click
 from rich.table import Table
 
+from companion.option_types import FloatRange
 from companion.tables import number_table, print_tables
 
 SERVICES = ("latency", "live")
@@ -65,7 +66,7 @@ def table(title: str, times: dict[str, list[float]]) -> Table:
 )
 @click.option(
     "--flight-s",
-    type=click.FloatRange(1.0, 36_000.0),
+    type=FloatRange(1.0, 36_000.0),
     default=20.0,
     show_default=True,
     help="Length of each flight of live, s.",
