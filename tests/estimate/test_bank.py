@@ -783,6 +783,16 @@ def test_nonsense_is_rejected():
         Layout(2, (1,), (Source("a", 2, 0),), ())
 
 
+@pytest.mark.parametrize("many", [{"faults": 64}, {"groups": 11}, {"groups": 10, "jumps": 7}])
+def test_a_layout_whose_explanations_have_no_codes_of_their_own_is_rejected(many):
+    layout = scalar_layout()
+    kinds = {"faults": layout.faults[0], "groups": 1, "jumps": Jump("channel", (0,), (20.0,), 20.0)}
+    given = {name: (kinds[name],) * n for name, n in many.items()}
+    with pytest.raises(ValueError, match="give at most 63 faults"):
+        replace(layout, **given)
+    replace(layout, **{name: things[1:] for name, things in given.items()})
+
+
 def test_velocity_and_acceleration_of_a_lie_are_seen():
     lie = Lie(3.0, 0.3, acceleration=0.02)
     layout = Layout(

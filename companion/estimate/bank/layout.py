@@ -17,6 +17,8 @@ Bools = npt.NDArray[np.bool_]
 
 NONE = -1
 """Index of "no fault"; arrays over faults have their last entry for it."""
+FAULT_CODES = 64
+"""More than there are faults: the base of the code of an explanation."""
 NEVER = -math.inf
 """Time of a measurement that never came, and the logarithm of zero."""
 NO_DECAY_S = 1e15
@@ -170,6 +172,10 @@ class Layout:
         for f in self.faults:
             if len({self.sources[s].group for s in f.sources}) != 1:
                 raise ValueError(f"fault {f.name}: its sources must stand in one group")
+        explanations = (len(self.jumps) + 1) * FAULT_CODES ** len(self.groups)  # each has a code of 64 bits
+        if len(self.faults) >= FAULT_CODES or explanations >= 1 << 63:
+            given = f"{len(self.faults)} faults, {len(self.groups)} groups, {len(self.jumps)} jumps"
+            raise ValueError(f"{given}: give at most {FAULT_CODES - 1} faults, and ten groups with six jumps")
 
     @cached_property
     def sizes(self) -> tuple[int, ...]:

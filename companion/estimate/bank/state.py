@@ -8,10 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from companion.estimate.bank.layout import NEVER, NONE, Bools, Ints, Layout
+from companion.estimate.bank.layout import FAULT_CODES, NEVER, NONE, Bools, Ints, Layout
 from companion.units import Floats
-
-FAULT_CODES = 64  # at least as many as faults, "none" included
 
 
 class Bank(NamedTuple):
