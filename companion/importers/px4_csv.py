@@ -1,5 +1,6 @@
-"""PX4 topics as CSV files in a folder (`vehicle_gps_position.csv.gz`, ..., as named by ulog2csv) -> records.
+"""PX4 topics as CSV files in a folder (`vehicle_gps_position.csv.gz`, ...) -> records.
 
+The files may be named as by ulog2csv (`flight_vehicle_gps_position_0.csv`: log, topic, instance), of one log.
 Each file is one uORB topic, `timestamp` in microseconds since boot, converted as in a ULog of any version of
 PX4. The rows of all topics are merged by time; arrival and validity are the same instant, as the log is
 written on board. A row that is not one of its topic is skipped and reported.
@@ -11,7 +12,7 @@ import csv
 import gzip
 import heapq
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO, TypeAlias, cast
 
@@ -45,12 +46,12 @@ class CsvFolder:
 
     def __init__(self, folder: Path) -> None:
         self.damage = Damage()
-        found = {path.name.split(".")[0]: path for path in sorted(folder.glob("*.csv*"))}
+        found = _by_topic(sorted(folder.glob("*.csv*")))
         self._known = [(found[name], topic) for name, topic in ulog.supported_topics(found).items()]
         if not self._known:
             raise LogError(
                 f"{folder} has no topic of PX4 as CSV, such as vehicle_gps_position.csv: give a log, or a"
-                " folder of topics"
+                " folder of the topics of one log"
             )
 
     def __iter__(self) -> Iterator[Stamped]:
@@ -84,6 +85,16 @@ class CsvFolder:
                 yield from enumerate(csv.DictReader(lines), start=2)
         except (OSError, EOFError, zlib.error, csv.Error) as error:
             self.damage.add(path.name, 0, f"the rest of the file: {one_line(error)}")
+
+
+def _by_topic(paths: Sequence[Path]) -> dict[str, Path]:
+    """Return the files by topic, without the name of a log that they all begin with."""
+    names = {path.name.partition(".csv")[0].removesuffix("_0"): path for path in paths}
+    first = min(names, default="")
+    begins = ["", *(first[:i] for i, letter in enumerate(first, start=1) if letter == "_")]
+    shared = [begin for begin in begins if all(name.startswith(begin) for name in names)]
+    found = [{name.removeprefix(begin): path for name, path in names.items()} for begin in shared]
+    return max(found, key=lambda files: len(ulog.supported_topics(files)))
 
 
 def _lines(file: BinaryIO, path: Path, damage: Damage) -> Iterator[str]:

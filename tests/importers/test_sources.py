@@ -397,6 +397,22 @@ def test_csv_topics_of_any_px4_version_are_read(tmp_path: pathlib.Path) -> None:
     assert pressure == r.Pressure(9_000_000, 9_000_000, 90_000.0, None, pytest.approx(293.15))
 
 
+def test_csv_topics_as_ulog2csv_names_them_are_read(tmp_path: pathlib.Path) -> None:
+    """It writes LOG_TOPIC_INSTANCE.csv; wind of airspeed_wind is of another filter."""
+    attitude = "timestamp,q[0],q[1],q[2],q[3]\n1000,1,0,0,0"
+    wind = "timestamp,windspeed_north,windspeed_east,variance_north,variance_east\n2000,3,-4,0.5,0.5"
+    tables = {"vehicle_attitude_0": attitude, "wind_0": wind, "wind_1": wind, "airspeed_wind_0": wind}
+    for name, table in tables.items():
+        (tmp_path / f"log_1_wind_{name}.csv").write_text(table)
+    kinds = [r.Attitude, r.Wind]
+    assert [type(record) for record in sources.open_source(tmp_path)] == kinds
+    (tmp_path / "log_1_wind_wind_0.csv").unlink()
+    assert [type(record) for record in sources.open_source(tmp_path)] == kinds[:1]
+    (tmp_path / "log_2_vehicle_attitude_0.csv").write_text(attitude)
+    with pytest.raises(LogError, match="give a log, or a folder of the topics of one log"):
+        sources.open_source(tmp_path)
+
+
 def test_csv_topic_without_a_column_is_reported_once(tmp_path: pathlib.Path) -> None:
     (tmp_path / "vehicle_attitude.csv").write_text("timestamp,q[0]\n" + "1000,1\n" * 50)
     (tmp_path / "airspeed.csv").write_text("timestamp,true_airspeed_m_s\n2000,15")
