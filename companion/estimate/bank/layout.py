@@ -174,8 +174,8 @@ class Layout:
                 raise ValueError(f"fault {f.name}: its sources must stand in one group")
         explanations = (len(self.jumps) + 1) * FAULT_CODES ** len(self.groups)  # each has a code of 64 bits
         if len(self.faults) >= FAULT_CODES or explanations >= 1 << 63:
-            given = f"{len(self.faults)} faults, {len(self.groups)} groups, {len(self.jumps)} jumps"
-            raise ValueError(f"{given}: give at most {FAULT_CODES - 1} faults, and ten groups with six jumps")
+            many = f"{len(self.faults)} faults, {len(self.groups)} groups, {len(self.jumps)} jumps"
+            raise ValueError(f"{many}: give at most {FAULT_CODES - 1} faults, and ten groups with six jumps")
 
     @cached_property
     def sizes(self) -> tuple[int, ...]:
