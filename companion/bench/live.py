@@ -2,8 +2,8 @@
 
 A complete `companion run` (log on, real sockets), a bare asyncio receiver with pymavlink's parser and one
 that only receives run in processes of their own and get the same stream. An aircraft flies north at 40 m/s
-with GNSS and a beacon. The processor time of all threads of each process
-is read from the kernel, that of the turns of the companion's event loop is measured in it.
+with GNSS and a beacon. The processor time of all threads of each process is read from the kernel, that of
+the turns of the companion's event loop is measured in it.
 """
 
 from __future__ import annotations
