@@ -30,7 +30,7 @@ from companion.navigator.progress import SILENT_INS_NS, births_due, propagated, 
 from companion.navigator.receiver_choice import ReceiverChoice
 from companion.navigator.solution import solve
 from companion.navigator.stale_data import REPORT_EVERY, StaleDataDetector
-from companion.navigator.state import Settings, State, Step
+from companion.navigator.state import Settings, State, Step, afresh
 from companion.navigator.step import INPUTS_USED, uses
 from companion.plausibility import ImplausibleField, implausible_field
 from companion.records import (
@@ -441,11 +441,6 @@ def tuned(state: State, before: Settings, config: Config) -> tuple[Settings, Sta
     if config.gnss.latency_s != old.gnss.latency_s and state.bank is not None:
         state = structs.replace(state, bank=other_receiver(state.bank, settings.model.channel))
     return settings, state
-
-
-def afresh(state: State) -> State:
-    """What is left of a state where the estimate begins again."""
-    return State(next_ns=state.next_ns, origin=state.origin, sensors=state.sensors, level=state.level)
 
 
 def _refitted(state: State, before: Settings, settings: Settings) -> State:

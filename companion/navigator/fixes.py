@@ -6,10 +6,11 @@ import math
 
 from msgspec import structs
 
+from companion.estimate import bank as banks
 from companion.estimate.bank.settings import DEFAULT as THRESHOLDS
 from companion.estimate.fusion import Azimuth
 from companion.navigator import fix_observations, height_error, measurements, own_channel, scatter
-from companion.navigator.hypotheses import CHANNEL_JUMP_M, GNSS, MOST_BEACONS, VELOCITY
+from companion.navigator.hypotheses import CHANNEL_JUMP_M, GNSS, MOST_BEACONS, POSITION, VELOCITY
 from companion.navigator.own_channel import OwnChannel
 from companion.navigator.own_error_model import HELD
 from companion.navigator.progress import (
@@ -31,6 +32,7 @@ from companion.navigator.state import (
     State,
     Step,
     VelocityError,
+    afresh,
     corrected,
     estimate,
     gnss_is_believed,
@@ -57,6 +59,10 @@ from companion.units import SECOND_NS
 GATE_SIGMA = 5.0
 MEAN_S = 60.0  # of the estimated velocity error, for GNSS latency
 JUMPED_M = GATE_SIGMA * CHANNEL_JUMP_M  # within it a jump of the channel explains a fix
+#: One sigma of a position that begins at a beacon's answer: several times what its place may be off by.
+BEACON_FIRST_M = 10_000.0
+#: At twice as much a beacon that is elsewhere is less likely than an outlier of GNSS: the bank blamed GNSS.
+BEACON_REACH_M = 6000.0
 REFUSED_NS = 10 * SECOND_NS  # fixes that no hypothesis takes begin the position again after so long at least
 
 
@@ -65,6 +71,8 @@ def gnss(state: State, record: Gnss, settings: Settings) -> Step:
     config, last = settings.config.gnss, state.gnss_taken
     if not record.has_3d_fix or is_too_soon(record, state, settings):
         return state, []
+    if _is_beyond_reach(state, record, settings):
+        return _left_for_gnss(state, record, settings)
     first_ns = record.t_ns if state.gnss_first_ns is None else state.gnss_first_ns
     state = _begun(structs.replace(state, gnss_first_ns=first_ns), record, settings)
     if state.nominal is None or state.bank is None or is_silent(state, record.t_ns):
@@ -183,8 +191,8 @@ def _smooth_velocity(state: State) -> Vector2:
 def rsbn(state: State, record: RsbnFix, settings: Settings) -> Step:
     """Use a beacon's answer: azimuth and slant range are measurements of the bank.
 
-    A beacon is followed from the first answer on that any hypothesis can take: one whose place is stated
-    500 km off proves nothing, and would only raise the protection level by what it might have shown.
+    A beacon is followed from the first answer on that the leading hypothesis can take, azimuth and range. Of
+    one whose place is stated 13 or 22 km off either agreed by chance, and in the end GNSS was blamed.
     """
     state = _begun(state, record, settings)
     name = f"rsbn {record.beacon}"
@@ -199,11 +207,13 @@ def rsbn(state: State, record: RsbnFix, settings: Settings) -> Step:
     assert state.bank is not None
     point, centre = corrected(nominal.point, state, settings)
     point = point._replace(v_n=(*_smooth_velocity(state), point.v_n[2]))
-    known, believed = hypotheses(state, settings), Source(0)
+    known, measured, believed = hypotheses(state, settings), Source(0), Source(0)
+    fits = list[bool]()
     height = settings.config.inertial.height_sigma_m
     for z in fix_observations.from_rsbn(record, point, settings.config.rsbn):
         if isinstance(z, Azimuth) and fix_observations.in_cone_of_silence(z, record.slant_range):
             continue
+        measured |= fix_observations.source_of(z)
         source = known.azimuth(k) if isinstance(z, Azimuth) else known.range(k)
         label = source_name(source, state)
         metres = fix_observations.distance(z) if isinstance(z, Azimuth) else 1.0
@@ -214,16 +224,20 @@ def rsbn(state: State, record: RsbnFix, settings: Settings) -> Step:
         assert state.bank is not None
         taken = measurements.sight(state.bank, known, z, k, factor * variance, centre, point.v_n)
         state = decided(structs.replace(state, bank=taken.bank), record, settings)
-        is_followed |= taken.by_any
+        fits.append(taken.accepted)
         if state.reported[source] == EXCLUDED or not taken.accepted:
             out.append(_rejected(state, record, label, source, taken))
         elif state.false[source] < known.settings.suspect:
             believed |= fix_observations.source_of(z)
     others = tuple(beacon for beacon in before.unfit if beacon[0] != record.beacon)
-    if not is_followed:
+    if not is_followed and not (fits and all(fits)):
         count = 1 + dict(before.unfit).get(record.beacon, 0)
         return structs.replace(before, unfit=((record.beacon, count), *others)[:MOST_BEACONS]), out
     state = structs.replace(state, fixed=True, unfit=others)
+    if believed and believed == measured:
+        beacons = list(state.beacons)
+        beacons[k] = beacons[k]._replace(believed=True)
+        state = structs.replace(state, beacons=tuple(beacons))
     if believed:
         pending = Pending(record, point, centre, believed)
         state = structs.replace(state, rsbn_ns=record.t_ns, pending=pending)
@@ -268,7 +282,40 @@ def _begun(state: State, record: Gnss | RsbnFix, settings: Settings) -> State:
     if nominal.interval is not None:
         nominal = own_channel.restart(nominal, nominal.interval.by, nominal.point.v_n[:2])
     nominal = structs.replace(nominal, since=nominal.point)
-    return structs.replace(state, nominal=nominal, bank=settings.model.begin(0.0), started_ns=record.t_ns)
+    bank = settings.model.begin(0.0)
+    if isinstance(record, RsbnFix) and settings.model.channel.wind:
+        bank = banks.inflate(bank, POSITION, BEACON_FIRST_M)
+    return structs.replace(state, nominal=nominal, bank=bank, started_ns=record.t_ns)
+
+
+def _is_beyond_reach(state: State, record: Gnss, settings: Settings) -> bool:
+    """Whether a first fix of GNSS contradicts a position of one beacon by more than the bank can weigh.
+
+    Not where two beacons agree: then GNSS is what is wrong.
+    """
+    if state.gnss_taken is not None or state.bank is None or not settings.model.channel.wind:
+        return False
+    since_ns = record.t_ns - round(1e9 * settings.config.rsbn.timeout_s)
+    believed = [beacon for beacon in state.beacons if beacon.believed and beacon.last_ns >= since_ns]
+    return len(believed) < 2 and _apart(state, record, settings) > BEACON_REACH_M
+
+
+def _left_for_gnss(state: State, record: Gnss, settings: Settings) -> Step:
+    """Begin again at GNSS once it has contradicted for a while: a receiver's first fix may be the wrong one.
+
+    A beacon that is not where it states is likelier than a GNSS that is false from its first fix on.
+    """
+    apart = _apart(state, record, settings)
+    since_ns = record.t_ns if state.refused_ns is None else state.refused_ns
+    if record.t_ns - since_ns < REFUSED_NS or is_jammed(state):
+        why = "contradicts for less than 10 s a position that began at a beacon, m"
+        rejection = Rejection(
+            record.t_ns, record.rx_ns, f"gnss {record.receiver}", why, apart, BEACON_REACH_M
+        )
+        return structs.replace(state, refused_ns=since_ns), [rejection]
+    why = f"GNSS is {apart:.0f} m off a position that began at a beacon: begun again at GNSS"
+    state, out = gnss(afresh(state), record, settings)
+    return state, [Reset(record.t_ns, record.rx_ns, "position", why), *out]
 
 
 def _before_ns(state: State) -> int:

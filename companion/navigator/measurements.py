@@ -57,13 +57,12 @@ CORRECTOR_GATE = 12.5
 
 class Taken(NamedTuple):
     """The bank after a measurement; its normalised squared innovation by the leading row, whether that row
-    took it, whether any did, and whether the row did that led before.
+    took it, and whether the row did that led before.
     """
 
     bank: Bank
     nis: float
     accepted: bool
-    by_any: bool
     by_former: bool
 
 
@@ -325,4 +324,4 @@ def _take(
 def _taken(before: Bank, after: Bank, seen: Innovation) -> Taken:
     took = ~seen.refused  # of the rows before, then of their children
     by_former = bool(took[int(before.L.argmax())])
-    return Taken(after, float(seen.nis[seen.leading]), bool(took[seen.leading]), bool(took.any()), by_former)
+    return Taken(after, float(seen.nis[seen.leading]), bool(took[seen.leading]), by_former)

@@ -47,11 +47,12 @@ class Settings(NamedTuple):
 
 
 class Beacon(NamedTuple):
-    """A beacon that is followed: its identity and place, and when it last answered."""
+    """A beacon that is followed: identity, place, when it answered last; whether all of that was believed."""
 
     identity: int
     place: tuple[float, float, float]
     last_ns: int
+    believed: bool = False
 
 
 class Pending(NamedTuple):
@@ -125,6 +126,11 @@ class State(Struct, frozen=True):
 
 
 Step = tuple[State, list[Output]]
+
+
+def afresh(state: State) -> State:
+    """What is left of a state where the estimate begins again."""
+    return State(next_ns=state.next_ns, origin=state.origin, sensors=state.sensors, level=state.level)
 
 
 def with_sensors(state: State, **changes: Any) -> State:

@@ -262,21 +262,80 @@ def test_a_healthy_gnss_is_never_excluded(channel: str, wrong: str) -> None:
     assert np.all(flown.error <= flown.protection)
 
 
+NEAR = Beacon(2, FAR.lat_deg + 0.045, FAR.lon_deg)
+AWAY = Beacon(2, FAR.lat_deg + 0.2, FAR.lon_deg)
+
+
+def misplaced(other: Beacon) -> Change:
+    """FAR is stated where `other` is, which is stated where FAR is."""
+    stated = {FAR.number: other, other.number: FAR}
+
+    def change(record: Any) -> Any:
+        if not isinstance(record, RsbnFix):
+            return record
+        return replace(record, lat=math.radians(stated[record.beacon].lat_deg))
+
+    return change
+
+
 @pytest.mark.parametrize(
     "channel", ["air", *(pytest.param(name, marks=pytest.mark.long) for name in ("imu", "ins"))]
 )
 def test_beacons_whose_places_are_exchanged_leave_a_healthy_gnss_beyond_doubt(channel: str) -> None:
     """Two, 5 km apart. With one false beacon at a time GNSS was excluded at the fifth answer, 5 km off."""
-    other = Beacon(2, FAR.lat_deg + 0.045, FAR.lon_deg)
-
-    def exchanged(record: Any) -> Any:
-        if not isinstance(record, RsbnFix):
-            return record
-        return replace(record, lat=math.radians((FAR if record.beacon == other.number else other).lat_deg))
-
-    flown = fly(channel, exchanged, legs=FIVE_MINUTES[:3], others=(other,))
+    flown = fly(channel, misplaced(NEAR), legs=FIVE_MINUTES[:3], others=(NEAR,))
     assert flown.of("gnss_false").max() < 0.5
     assert flown.error[flown.t > SETTLED_S].max() < 10.0
+
+
+@pytest.mark.parametrize(
+    ("channel", "other", "exchanged"),
+    [
+        ("air", NEAR, True),
+        ("air", AWAY, False),
+        *(
+            pytest.param(*case, marks=pytest.mark.long)
+            for case in (
+                ("air", NEAR, False),
+                ("air", AWAY, True),
+                ("imu", NEAR, True),
+                ("imu", NEAR, False),
+                ("imu", AWAY, True),
+                ("imu", AWAY, False),
+                ("ins", NEAR, True),
+                ("ins", NEAR, False),
+                ("ins", AWAY, True),
+                ("ins", AWAY, False),
+            )
+        ),
+    ],
+)
+def test_gnss_is_followed_where_beacons_at_wrong_places_answered_before_its_first_fix(
+    channel: str, other: Beacon, exchanged: bool
+) -> None:
+    """One 22 km off kept GNSS from being used for ever; two that were exchanged 5 km apart excluded it."""
+    wrong = misplaced(other)
+    flown = fly(
+        channel,
+        lambda record: None if isinstance(record, Gnss) and record.t_ns < 20 * NS else wrong(record),
+        legs=FIVE_MINUTES[:3],
+        others=(other,) if exchanged else (),
+    )
+    assert flown.of("gnss_false", 20.0).max() < 0.5
+    assert flown.error[flown.t > SETTLED_S].max() < 10.0
+
+
+def test_two_beacons_that_agree_are_not_left_for_a_first_fix_of_gnss_22_km_away() -> None:
+    north = Beacon(2, 60.45, 30.0)
+
+    def captured(record: Any) -> Any:
+        if not isinstance(record, Gnss):
+            return record
+        return None if record.t_ns < 20 * NS else replace(record, lat=record.lat + math.radians(0.2))
+
+    flown = fly("air", captured, legs=FIVE_MINUTES[:3], others=(north,))
+    assert flown.error[flown.t > SETTLED_S].max() < 300.0
+    assert np.all(flown.error <= flown.protection)
 
 
 @pytest.mark.parametrize("channel", ["air", pytest.param("imu", marks=pytest.mark.long)])

@@ -145,16 +145,15 @@ def returns(bank: Bank, layout: Layout, source: int, settings: Settings) -> tupl
     Bank, bool : the bank to be updated, not yet reduced, and whether children were born.
     """
     children: list[_Child] = []
-    order = np.argsort(-bank.L)
-    for p in order[: max(settings.parents, len(layout.grades))] if settings.parents else order:
+    for p in _parents(bank, layout, settings):
         for f, fault in enumerate(layout.faults):
             if source not in fault.sources:
                 continue
             now = bank.fault[p, layout.fault_group(f)]
             if now == NONE:
-                children += _lie_children(int(p), f, fault.first_lies, fault.first)
+                children += _lie_children(p, f, fault.first_lies, fault.first)
             elif now == f:
-                children += _lie_children(int(p), f, fault.first_lies, 0.3)
+                children += _lie_children(p, f, fault.first_lies, 0.3)
     grown = _with_children(bank, layout, children)
     if len(grown.L) == len(bank.L):
         return bank, False
