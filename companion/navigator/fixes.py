@@ -207,13 +207,14 @@ def rsbn(state: State, record: RsbnFix, settings: Settings) -> Step:
     assert state.bank is not None
     point, centre = corrected(nominal.point, state, settings)
     point = point._replace(v_n=(*_smooth_velocity(state), point.v_n[2]))
-    known, measured, believed = hypotheses(state, settings), Source(0), Source(0)
-    fits = list[bool]()
+    known = hypotheses(state, settings)
+    measured = accepted = believed = Source(0)
     height = settings.config.inertial.height_sigma_m
     for z in fix_observations.from_rsbn(record, point, settings.config.rsbn):
         if isinstance(z, Azimuth) and fix_observations.in_cone_of_silence(z, record.slant_range):
             continue
-        measured |= fix_observations.source_of(z)
+        part = fix_observations.source_of(z)
+        measured |= part
         source = known.azimuth(k) if isinstance(z, Azimuth) else known.range(k)
         label = source_name(source, state)
         metres = fix_observations.distance(z) if isinstance(z, Azimuth) else 1.0
@@ -224,13 +225,13 @@ def rsbn(state: State, record: RsbnFix, settings: Settings) -> Step:
         assert state.bank is not None
         taken = measurements.sight(state.bank, known, z, k, factor * variance, centre, point.v_n)
         state = decided(structs.replace(state, bank=taken.bank), record, settings)
-        fits.append(taken.accepted)
+        accepted |= part if taken.accepted else Source(0)
         if state.reported[source] == EXCLUDED or not taken.accepted:
             out.append(_rejected(state, record, label, source, taken))
         elif state.false[source] < known.settings.suspect:
-            believed |= fix_observations.source_of(z)
+            believed |= part
     others = tuple(beacon for beacon in before.unfit if beacon[0] != record.beacon)
-    if not is_followed and not (fits and all(fits)):
+    if not is_followed and not (accepted and accepted == measured):
         count = 1 + dict(before.unfit).get(record.beacon, 0)
         return structs.replace(before, unfit=((record.beacon, count), *others)[:MOST_BEACONS]), out
     state = structs.replace(state, fixed=True, unfit=others)
@@ -301,19 +302,17 @@ def _is_beyond_reach(state: State, record: Gnss, settings: Settings) -> bool:
 
 
 def _left_for_gnss(state: State, record: Gnss, settings: Settings) -> Step:
-    """Begin again at GNSS once it has contradicted for a while: a receiver's first fix may be the wrong one.
+    """Begin again at GNSS once it has contradicted for `REFUSED_NS`: its own first fix may be the wrong one.
 
     A beacon that is not where it states is likelier than a GNSS that is false from its first fix on.
     """
     apart = _apart(state, record, settings)
     since_ns = record.t_ns if state.refused_ns is None else state.refused_ns
     if record.t_ns - since_ns < REFUSED_NS or is_jammed(state):
-        why = "contradicts for less than 10 s a position that began at a beacon, m"
-        rejection = Rejection(
-            record.t_ns, record.rx_ns, f"gnss {record.receiver}", why, apart, BEACON_REACH_M
-        )
+        label, why = f"gnss {record.receiver}", "contradicts a position that began at a beacon, m"
+        rejection = Rejection(record.t_ns, record.rx_ns, label, why, apart, BEACON_REACH_M)
         return structs.replace(state, refused_ns=since_ns), [rejection]
-    why = f"GNSS is {apart:.0f} m off a position that began at a beacon: begun again at GNSS"
+    why = f"GNSS is {apart:.0f} m off a position that began at a beacon: position restarted"
     state, out = gnss(afresh(state), record, settings)
     return state, [Reset(record.t_ns, record.rx_ns, "position", why), *out]
 

@@ -313,7 +313,7 @@ def test_beacons_whose_places_are_exchanged_leave_a_healthy_gnss_beyond_doubt(ch
 def test_gnss_is_followed_where_beacons_at_wrong_places_answered_before_its_first_fix(
     channel: str, other: Beacon, exchanged: bool
 ) -> None:
-    """One 22 km off kept GNSS from being used for ever; two that were exchanged 5 km apart excluded it."""
+    """One 22 km off kept GNSS out of use for good; two that were exchanged 5 km apart excluded it."""
     wrong = misplaced(other)
     flown = fly(
         channel,
