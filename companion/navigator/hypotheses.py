@@ -173,7 +173,7 @@ class Hypotheses(NamedTuple):
 
     def elsewhere(self, k: int) -> int:
         """Fault that beacon k is not where it states."""
-        return 6 + 3 * k
+        return 6 + 4 * k
 
 
 class Model:
@@ -312,6 +312,8 @@ def _hypotheses(config: Config, channel: Channel, now: Situation) -> Hypotheses:
             ends_h = BEACON_H if name == "elsewhere" else 1.0
             fault = Fault(f"{name} {k}", which, BEACON_H, lies, first, lies, (), ends_h, BEACON_H, quota=4)
             faults.append(fault)
+        parts = len(faults) - 3, len(faults) - 2
+        faults.append(Fault(f"azimuth and range {k}", (a, r), 0.0, (), change_h=0.0, quota=4, of=parts))
     further = max(now.beacons - 1, 0)  # the first beacon's group is there without one
     layout = Layout(
         channel.n + BIASES * now.beacons,

@@ -45,6 +45,14 @@ def two_sources(**change):
     return Layout(2, (1, 1), (Source("a", 1, 0), Source("b", 1, 1)), faults, grades=(1.0,))
 
 
+def two_in_one_group():
+    """The same, in one group with a fault that is both of them together."""
+    layout = two_sources()
+    together = Fault("both", (0, 1), 0.0, (), death_h=0.0, change_h=0.0, of=(0, 1))
+    sources = Source("a", 1, 0, 0), Source("b", 1, 0, 1)
+    return replace(layout, groups=(2,), sources=sources, faults=(*layout.faults, together))
+
+
 PHI = np.array([[1.0, 1.0], [0.0, 1.0]])
 Q = np.diag([0.01, 0.002])
 H = np.array([[1.0, 0.0]])
@@ -184,15 +192,15 @@ def fly_two(layout, za, zb, settings):
     return bank
 
 
+@pytest.mark.parametrize("layout", [two_sources(), two_in_one_group()], ids=["two groups", "one group"])
 @pytest.mark.parametrize("seed", range(3))
-def test_two_faults_equal_enumeration_and_pruning_stays_near(seed):
+def test_two_faults_equal_enumeration_and_pruning_stays_near(seed, layout):
     rng = np.random.default_rng(seed)
     T = 8
     truth = np.cumsum(0.2 * rng.standard_normal(T))
     za, zb = truth + 0.7 * rng.standard_normal(T), truth + 0.7 * rng.standard_normal(T)
     za[4:] += (0.0, 5.0, 2.5)[seed]
-    layout = two_sources()
-    want = two_source_enumeration(za, zb, layout)
+    want = two_source_enumeration(za, zb, two_sources())
     pa = want[True, False] + want[True, True]
     pb = want[False, True] + want[True, True]
     exact = fly_two(layout, za, zb, EXHAUSTIVE)
@@ -781,6 +789,10 @@ def test_nonsense_is_rejected():
             b.update(bank, layout, np.zeros(m), np.ones((m, 2)), np.full((m, m), math.nan), None)
     with pytest.raises(ValueError, match="offsets only"):
         Layout(2, (1,), (Source("a", 2, 0),), ())
+    layout = two_in_one_group()
+    for of in ((0,), (0, 2), (0, 3)):
+        with pytest.raises(ValueError, match="fault both: of"):
+            replace(layout, faults=(*layout.faults[:2], replace(layout.faults[2], of=of)))
 
 
 @pytest.mark.parametrize("many", [{"faults": 64}, {"groups": 11}, {"groups": 10, "jumps": 7}])

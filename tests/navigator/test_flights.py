@@ -338,6 +338,29 @@ def test_two_beacons_that_agree_are_not_left_for_a_first_fix_of_gnss_22_km_away(
     assert np.all(flown.error <= flown.protection)
 
 
+@pytest.mark.parametrize(
+    ("channel", "azimuth_s", "range_s"),
+    [
+        ("air", 100.0, 160.0),
+        *(
+            pytest.param(*case, marks=pytest.mark.long)
+            for case in (("air", 160.0, 100.0), ("imu", 100.0, 160.0))
+        ),
+    ],
+)
+def test_a_beacon_whose_azimuth_and_range_become_wrong_one_after_the_other_leaves_gnss_beyond_doubt(
+    channel: str, azimuth_s: float, range_s: float
+) -> None:
+    """A state could hold one of them false: at the second GNSS was excluded, 278 m off by air data."""
+    azimuth = after(azimuth_s, RsbnFix, azimuth=lambda a: (a + math.radians(1.0)) % math.tau)
+    slant_range = after(range_s, RsbnFix, slant_range=lambda d: d - 200.0)
+    flown = fly(channel, lambda record: slant_range(azimuth(record)))
+    assert flown.of("gnss_false", 30.0).max() < 0.5
+    assert flown.error[flown.t > SETTLED_S].max() < 10.0
+    excluded = {event.text.split(" is excluded")[0] for event in flown.events if "is excluded" in event.text}
+    assert excluded == {"rsbn 1 azimuth", "rsbn 1 range"}
+
+
 @pytest.mark.parametrize("channel", ["air", pytest.param("imu", marks=pytest.mark.long)])
 def test_two_beacons_that_become_wrong_in_different_ways_are_both_excluded(channel: str) -> None:
     north = Beacon(2, 60.45, 30.0)

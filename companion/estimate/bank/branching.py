@@ -28,6 +28,7 @@ class _Child(NamedTuple):
     log_prior: float
     fault: int = NONE
     lie: Lie | None = None
+    drawn: int = NONE  # the fault whose lie is drawn: another than `fault` where that is of two
     scale: int = 0
     ends: bool = False
     undone: tuple[int, ...] = ()
@@ -89,6 +90,9 @@ def births(
             elif now == f:
                 children.append(_Child(int(p), _log(min(fault.death_h * hours, 0.5)), f, ends=True))
                 children += _lie_children(int(p), f, fault.lies, fault.change_h * hours)
+            elif (both := layout.joint.get((int(now), f))) is not None:  # the second of two is added
+                second = _lie_children(int(p), f, fault.lies, fault.rate_h * factor.get(f, 1.0) * hours)
+                children += [child._replace(fault=both) for child in second]
         children += [_jump_child(bank, layout, int(p), j) for j in range(len(layout.jumps))]
     if any(heard):
         children += _grade_children(bank, layout, settings, hours)
@@ -222,7 +226,9 @@ def _heaviest_of_grades(bank: Bank) -> list[int]:
 def _lie_children(parent: int, fault: int, lies: tuple[Lie, ...], prior: float) -> list[_Child]:
     """Children of one parent for one fault, one for each scale of the lie."""
     total = sum(lie.share for lie in lies)
-    return [_Child(parent, _log(prior * lie.share / total), fault, lie, i) for i, lie in enumerate(lies)]
+    return [
+        _Child(parent, _log(prior * lie.share / total), fault, lie, fault, i) for i, lie in enumerate(lies)
+    ]
 
 
 def _jump_child(bank: Bank, layout: Layout, parent: int, jump: int) -> _Child:
@@ -325,8 +331,8 @@ def _with_children(bank: Bank, layout: Layout, children: list[_Child]) -> Bank:
             noise[i, a : a + layout.groups[g]] = 0.0
             fault[i, g], event[i], scale[i] = NONE, 1 + F + c.fault, 0
         elif c.lie is not None:
-            index, variance, places, density = layout.lie_prior(c.fault, c.lie)
-            for state, sigma in layout.faults[c.fault].shock:
+            index, variance, places, density = layout.lie_prior(c.drawn, c.lie)
+            for state, sigma in layout.faults[c.drawn].shock:
                 P[i, state, state] += sigma**2
             P[i[:, None], index, index] += variance
             for state, lie, s2 in zip(c.undone, index.tolist(), variance.tolist()):

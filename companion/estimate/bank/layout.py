@@ -82,6 +82,7 @@ class Fault:
     death_h : rate at which the fault ends, 1/h.
     change_h : rate at which the lie changes (a new offset and rate on top of the old), 1/h.
     quota : rows the fault may hold at least, when rows are short.
+    of : indices of two faults that this one is together: it is born of one by the lies of the other.
     """
 
     name: str
@@ -94,6 +95,7 @@ class Fault:
     death_h: float = 1.0
     change_h: float = 1.0
     quota: int = 6
+    of: tuple[int, ...] = ()
 
 
 class Angle(NamedTuple):
@@ -172,6 +174,9 @@ class Layout:
         for f in self.faults:
             if len({self.sources[s].group for s in f.sources}) != 1:
                 raise ValueError(f"fault {f.name}: its sources must stand in one group")
+            parts = [s for i in f.of if i < len(self.faults) for s in self.faults[i].sources]
+            if f.of and (len(f.of) != 2 or sorted(parts) != sorted(f.sources)):
+                raise ValueError(f"fault {f.name}: of {f.of}: give two faults that have its sources together")
         explanations = (len(self.jumps) + 1) * FAULT_CODES ** len(self.groups)  # each has a code of 64 bits
         if len(self.faults) >= FAULT_CODES or explanations >= 1 << 63:
             many = f"{len(self.faults)} faults, {len(self.groups)} groups, {len(self.jumps)} jumps"
@@ -226,6 +231,12 @@ class Layout:
         for i, f in enumerate(self.faults):
             table[i, list(f.sources)] = True
         return table
+
+    @cached_property
+    def joint(self) -> dict[tuple[int, int], int]:
+        """The fault that two faults are together, in either order."""
+        pairs = ((i, f.of) for i, f in enumerate(self.faults) if f.of)
+        return {pair: i for i, (a, b) in pairs for pair in ((a, b), (b, a))}
 
     def lie_states(self, source: int) -> Ints:
         """State indices of the offsets of a source's lie."""
