@@ -19,9 +19,9 @@ ANSWERS_HZ, ANSWERS_BURST, MAX_RECEIVERS = 10.0, 20, 4
 REJECTED_NS = SECOND_NS // 2  # wait after a rejected answer
 MAX_WAITING = 8  # beacons of a receiver that wait for their turn
 SILENT_NS = 3 * SECOND_NS  # a receiver silent for longer gives up its beacon
-RATE_REASON = (
-    f"more than {ANSWERS_HZ:g} per second, or 2 while they are rejected, or {MAX_RECEIVERS} receivers"
-)
+RATE_REASON = f"more than {ANSWERS_HZ:g} per second, or {MAX_RECEIVERS} receivers"
+TURN_REASON = f"its receiver waits {REJECTED_NS / SECOND_NS:g} s after a rejected answer, its beacons in turn"
+"""Not worth a report: two honest beacons come to it, and each rejected answer is reported itself."""
 
 
 class BeaconAnswers:
@@ -41,8 +41,10 @@ class BeaconAnswers:
 
     def refusal(self, receiver: Hashable, source: str, now_ns: int) -> str | None:
         """Return why an answer of a source ("beacon 7", "star 2") is not used, None if it is."""
-        if not self._has_turn(receiver, source, now_ns) or not self._limiter.take(receiver, now_ns):
+        if not self._limiter.take(receiver, now_ns):
             return RATE_REASON
+        if not self._has_turn(receiver, source, now_ns):
+            return TURN_REASON
         if self.followed(source, now_ns) not in (None, receiver):
             return f"{source} is received by another receiver"
         if source not in self._followed:  # bounded by the rate of new ones

@@ -37,6 +37,8 @@ from companion.navigator.state import (
     estimate,
     held_s,
     hypotheses,
+    is_contradicted,
+    is_jammed,
     levelled,
     source_name,
     sources,
@@ -73,9 +75,11 @@ def solve(state: State, rx_ns: int, settings: Settings) -> Step:
     config, known = settings.config, hypotheses(state, settings)
     point = levelled(nominal.point, state)
     t_ns = point.t_ns
-    promised = bounded_trajectory.guaranteed(state, point)
     rests_on = sources(state, t_ns, settings)
-    fixes = rests_on & FIXES
+    against = None if is_jammed(state) else is_contradicted(state, t_ns, settings)
+    # neither the beacon nor a bound that rests on it holds while GNSS contradicts it
+    fixes = Source(0) if against else rests_on & FIXES
+    promised = None if against else bounded_trajectory.guaranteed(state, point)
     leading = estimate(state, settings)
     state = structs.replace(state, leading=(bank, leading))
     candidates = _candidates(state, leading, nominal.pending_s, promised, settings)
@@ -92,6 +96,7 @@ def solve(state: State, rx_ns: int, settings: Settings) -> Step:
     assert state.protection is not None
     # in between the estimate moves: by the triangle inequality the level holds about its new place
     protection = state.protection[1] + math.dist(error, state.protection[2:])
+    protection += against.apart_m if against else 0.0
     bound_n, velocity_bound_n = _about(error, velocity_error, promised)
     witness = bool(rests_on & (Source.AZIMUTH | Source.RANGE))
     suspicion = _is_suspicious(state, banks.heard_sources(bank, known.layout)[VELOCITY])
@@ -105,7 +110,7 @@ def solve(state: State, rx_ns: int, settings: Settings) -> Step:
     solution = Solution(
         t_ns=t_ns,
         rx_ns=rx_ns,
-        mode=_mode(bool(fixes), bound_n, protection, settings),
+        mode=Mode.UNTRUSTED if against else _mode(bool(fixes), bound_n, protection, settings),
         estimator=leads,
         lat=lat,
         lon=lon,

@@ -30,6 +30,7 @@ from companion.units import SECOND_NS
 
 FIXES = Source.GNSS | Source.AZIMUTH | Source.RANGE
 JAMMED_NS = 10 * SECOND_NS  # the receiver's word lasts so long
+REFUSED_NS = 10 * SECOND_NS  # fixes that no hypothesis takes begin the position again after so long at least
 SUSPECT, EXCLUDED = 1, 2
 NEAR_S = 0.5  # the bank is at most so far behind: in between the error moves by its velocity
 
@@ -53,6 +54,14 @@ class Beacon(NamedTuple):
     place: tuple[float, float, float]
     last_ns: int
     believed: bool = False
+
+
+class Contradiction(NamedTuple):
+    """A first GNSS that contradicts a position of one beacon: since when, when last, by how much (m)."""
+
+    since_ns: int
+    last_ns: int
+    apart_m: float
 
 
 class Pending(NamedTuple):
@@ -116,6 +125,7 @@ class State(Struct, frozen=True):
     velocity_error: VelocityError | None = None
     gnss_first_ns: int | None = None  # of the first 3D fix
     started_ns: int | None = None  # when the position was started
+    contradiction: Contradiction | None = None
     refused_ns: int | None = None  # since when no hypothesis takes a fix of GNSS
     gnss_ns: int | None = None  # when fixes were last believed
     rsbn_ns: int | None = None
@@ -168,6 +178,15 @@ def is_jammed(state: State) -> bool:
     """Whether the receiver reported jamming or spoofing within the last seconds."""
     now = state.nominal.t_ns if state.nominal else 0
     return state.jammed_ns is not None and now - state.jammed_ns < JAMMED_NS
+
+
+def is_contradicted(state: State, t_ns: int, settings: Settings) -> Contradiction | None:
+    """The contradiction of a first GNSS that is still received; None if there is none."""
+    found = state.contradiction
+    if found is None or state.gnss_taken is not None:
+        return None
+    received_ns = max(REFUSED_NS, round(1e9 * settings.config.gnss.timeout_s))
+    return found if t_ns - found.last_ns <= received_ns else None
 
 
 def gnss_climb(state: State, t_ns: int) -> float:

@@ -35,6 +35,7 @@ from companion.records import (
     FilterStatus,
     GlobalPosition,
     Gnss,
+    Reset,
     RsbnFix,
     Solution,
     Stamped,
@@ -77,7 +78,7 @@ class AutopilotOutput:
         self.config, self._receivers = config, self._receivers.tuned(config)
 
     def receive(self, record: Stamped) -> None:
-        """Process a record from the autopilot or a beacon."""
+        """Process a record from the autopilot or a beacon, or a reset of the navigator."""
         if isinstance(record, SystemTime):
             if record.unix_ns is not None:
                 self.unix_ns = record.unix_ns - record.t_ns
@@ -94,6 +95,8 @@ class AutopilotOutput:
             self._source_switch.receive(
                 structs.replace(record, sigma_azimuth=sigma_azimuth, sigma_range=sigma_range)
             )
+        elif isinstance(record, Reset) and record.what == "position":
+            self._gate.begin_again()
 
     def handle_reboot(self) -> None:
         """Reset what was known of the autopilot; it has rebooted."""

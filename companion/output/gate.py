@@ -22,6 +22,9 @@ as an outlier. An autopilot that takes `reset_counter` gets such a jump in steps
 each a reset: a reset changes the position only, while a slope would be taken for a velocity. They begin at
 the autopilot's own position, as its filter lags behind ours. What is left of the jump is stated in the
 covariance.
+
+Where the navigator has given up its position, the next solution is compared with none, and goes out whole:
+in steps of 10 m a jump of 20 km would take minutes, in which the old position steers.
 """
 
 from __future__ import annotations
@@ -178,6 +181,11 @@ class Gate:
                     self._begin_at(own, here, SIGMAS * self._last.sigma + room)
         self._last, self._is_gnss_false = here, is_false
         return self._stepped(here)
+
+    def begin_again(self) -> None:
+        """Compare the next solution with none: the navigator has given up the position of those before."""
+        if self._last is not None:
+            self._last, self._left_n, self._resets = None, (0.0, 0.0), self._resets + 1
 
     def _begin_at(self, own: Geodetic, here: Position, near: float) -> None:
         """Begin the steps at the autopilot's own position, if it is within `near` of the last one sent, m."""

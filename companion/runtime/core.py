@@ -25,7 +25,7 @@ import msgspec
 from companion.config import Config, ConfigError, to_toml
 from companion.config.profiles import RESET
 from companion.config.validate import find_conflicts
-from companion.link.beacon_answers import BeaconAnswers
+from companion.link.beacon_answers import TURN_REASON, BeaconAnswers
 from companion.link.clock import MAX_LATENESS
 from companion.link.decode import DECODED, MAKES, decode
 from companion.link.dialect import MEASUREMENTS, mavlink, rsbn
@@ -469,9 +469,10 @@ class CompanionCore:
         why = self._answers.refusal(receiver, source, event.received_ns)
         if why is not None:
             self.rejected["beacon answers not used"] += 1
-            sender = f"{event.frame.system}/{event.frame.component}"
-            text = f"{link.name}: beacon answers of {sender} not used: {why}"
-            self._report_excess(text, "answers", event.received_ns)
+            if why != TURN_REASON:
+                sender = f"{event.frame.system}/{event.frame.component}"
+                text = f"{link.name}: beacon answers of {sender} not used: {why}"
+                self._report_excess(text, "answers", event.received_ns)
         return why is None
 
     def _may_log_unused(self, link: Link, event: MessageReceived) -> bool:
@@ -505,8 +506,10 @@ class CompanionCore:
         for output in self._navigator.handle(record):
             if isinstance(output, Solution):
                 self._send(output, early=isinstance(record, RsbnFix))
-            elif isinstance(output, Reset) and isinstance(record, LocalPosition):
-                self._origin.forget()  # it may have moved: do not use it until received again
+            elif isinstance(output, Reset):
+                self._output.receive(output)
+                if isinstance(record, LocalPosition):
+                    self._origin.forget()  # it may have moved: do not use it until received again
             # a late record folded again in this call is not this sender's
             is_rejected |= isinstance(output, Rejection) and output.rx_ns == record.rx_ns
             self._emit(output)

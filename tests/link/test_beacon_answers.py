@@ -2,7 +2,14 @@
 
 import pytest
 
-from companion.link.beacon_answers import MAX_RECEIVERS, MAX_WAITING, REJECTED_NS, SILENT_NS, BeaconAnswers
+from companion.link.beacon_answers import (
+    MAX_RECEIVERS,
+    MAX_WAITING,
+    REJECTED_NS,
+    SILENT_NS,
+    TURN_REASON,
+    BeaconAnswers,
+)
 from companion.units import SECOND_NS
 
 MILLI = SECOND_NS // 1000
@@ -55,6 +62,19 @@ def test_beacons_whose_answers_are_rejected_keep_no_other_of_the_receiver_out(
                 used.append(second)
     assert len(used) >= 100 // (false + 1) - 2
     assert used[-1] > 100 - 2 * (false + 1)
+
+
+def test_two_honest_beacons_that_are_rejected_are_not_called_too_many() -> None:
+    """Then "more than 10 per second, or 2 while they are rejected" was reported every 11 s."""
+    answers, reasons = BeaconAnswers(), set[str | None]()
+    for second in range(60):
+        for k in range(2):
+            now = (1000 * second + 10 * k) * MILLI
+            why = answers.refusal("receiver", f"beacon {k}", now)
+            reasons.add(why)
+            if why is None:
+                answers.note_rejected("receiver", now)
+    assert reasons == {None, TURN_REASON}
 
 
 def test_a_beacon_that_waits_and_is_silent_keeps_no_other_out() -> None:

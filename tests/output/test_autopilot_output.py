@@ -283,6 +283,29 @@ def test_origin_that_moves_is_followed_with_a_reset() -> None:
     assert after[-1].x == pytest.approx(SPEED * flight.seconds - 111.3, abs=5.0)
 
 
+@pytest.mark.flight
+def test_where_a_first_gnss_contradicts_a_beacon_nothing_is_sent_until_the_position_begins_again() -> None:
+    """A beacon stated 22 km off. 88 positions of the wrong place went out, then none for 47 s."""
+
+    def move(name: str, values: dict[str, Any]) -> None:
+        if name == "RSBN_MEASUREMENT":
+            values["beacon_lat"] += 2_000_000
+
+    flight = Flight(configured("output.profile=ardupilot"), falsify=move)
+    flight.fly(20.0, gnss=False)
+    assert flight.source_set == 2
+    flight.fly(14.0, gnss=True)
+    sent = [(at, m) for at, m in flight.sent if m.get_type() == "ODOMETRY"]
+    wrong = [at for at, m in sent if abs(m.x - SPEED * at) > 10e3]
+    right = [at for at, m in sent if math.hypot(m.x - SPEED * at, m.y - WIND_EAST * at) < 20.0]
+    assert len(wrong) + len(right) == len(sent)
+    assert wrong and wrong[-1] < 20.3
+    assert 29.5 < right[0] < 30.6
+    assert {m.reset_counter for at, m in sent if at < 25.0} == {0}
+    assert {m.reset_counter for at, m in sent if at > 25.0} == {1}
+    assert flight.source_set == 1
+
+
 def test_core_rejects_a_configuration_with_feedback() -> None:
     config = Config(
         output=OutputConfig(profile="ardupilot"), inertial=InertialConfig(source="local_position")

@@ -146,6 +146,18 @@ def test_jump_within_the_old_accuracy_counts_as_a_reset() -> None:
     assert isinstance(on, Position) and on.resets == 1
 
 
+def test_where_the_position_was_given_up_the_next_one_goes_out_whole_and_is_counted() -> None:
+    gate = Gate(10.0)
+    gate.begin_again()  # nothing was sent: nothing to count
+    first = gate.admit(GOOD)
+    gate.begin_again()
+    second = gate.admit(moved(0.1, north=22e3))
+    assert isinstance(first, Position) and first.resets == 0
+    assert isinstance(second, Position) and second.resets == 1
+    assert second.place[:2] == pytest.approx((moved(0.1, north=22e3).lat, moved(0.1, north=22e3).lon))
+    assert isinstance(gate.admit(moved(0.2, north=23e3)), str)
+
+
 def test_jump_goes_out_in_steps_each_counted() -> None:
     """35 m in steps of 10: four resets, the truth within the stated accuracy, then exactly the solution."""
     gate, poor = Gate(10.0), (2e3, 0.0, 0.0, 2e3, 0.0, 9.0)
