@@ -312,9 +312,12 @@ def _left_for_gnss(state: State, record: Gnss, settings: Settings) -> Step:
     since_ns = before.since_ns if before else record.t_ns
     if record.t_ns - since_ns < REFUSED_NS or is_jammed(state):
         label, why = f"gnss {record.receiver}", "contradicts a position that began at a beacon, m"
-        rejection = Rejection(record.t_ns, record.rx_ns, label, why, apart, BEACON_REACH_M)
+        out: list[Output] = [Rejection(record.t_ns, record.rx_ns, label, why, apart, BEACON_REACH_M)]
+        if before is None:
+            text = f"{label} is {apart:.0f} m off the beacon's position: one of them is wrong"
+            out.append(Event(record.t_ns, record.rx_ns, Severity.WARNING, text))
         now = Contradiction(since_ns, record.t_ns, apart)
-        return structs.replace(state, contradiction=now), [rejection]
+        return structs.replace(state, contradiction=now), out
     why = f"GNSS is {apart:.0f} m off a position that began at a beacon: position restarted"
     state, out = gnss(afresh(state), record, settings)
     return state, [Reset(record.t_ns, record.rx_ns, "position", why), *out]

@@ -303,6 +303,7 @@ def test_where_a_first_gnss_contradicts_a_beacon_nothing_is_sent_until_the_posit
     assert 29.5 < right[0] < 30.6
     assert {m.reset_counter for at, m in sent if at < 25.0} == {0}
     assert {m.reset_counter for at, m in sent if at > 25.0} == {1}
+    assert sum("m off the beacon's position: one of them is wrong" in text for text in flight.texts) == 1
     assert flight.source_set == 1
 
 
