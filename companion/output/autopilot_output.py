@@ -44,6 +44,9 @@ from companion.records import (
 from companion.units import SECOND_NS
 
 DISPLAY_NAMES = {RESET: "external position"}
+OUT_OF_DRIFT = "the autopilot cannot have drifted there since its last GPS fix"
+"""Soon after GNSS was lost the autopilot's own position is better than one so far off: that of a beacon at a
+wrong place took an ArduPlane 22 km off."""
 NOT_FUSED = frozenset({RESET, MESSAGES["gps_input"]})
 """A reset is no series of measurements; a receiver's accuracy is judged by limits of its own."""
 
@@ -124,7 +127,9 @@ class AutopilotOutput:
         encoded = dict[str, Message]()
         for name in names:
             reason = (
-                position if isinstance(position, str) else self._withholding_reason(position, name, receiver)
+                position
+                if isinstance(position, str)
+                else self._withholding_reason(position, solution, name, receiver)
             )
             if isinstance(position, Position) and reason is None:
                 try:
@@ -178,10 +183,15 @@ class AutopilotOutput:
             return False
         return distance(own, position.place) > SIGMAS * position.sigma
 
-    def _withholding_reason(self, position: Position, name: str, receiver: Receiver) -> str | None:
+    def _withholding_reason(
+        self, position: Position, solution: Solution, name: str, receiver: Receiver
+    ) -> str | None:
         output = self.config.output
         if not output.fits(receiver.autopilot):
             return f"the autopilot is not {output.profile}: set output.profile"
+        is_undoubted = (solution.gnss_false or 0.0) < BELIEVED  # the last fix, from which it drifts
+        if is_undoubted and self._position_reset.is_out_of_drift(position):
+            return OUT_OF_DRIFT
         return self._position_reset.withholding_reason(position) if name == RESET else None
 
     def _add_event(self, event: Event | None) -> None:
