@@ -278,6 +278,20 @@ def lever_arm(stream: Sequence[Gnss], fault: Fault, size: float, rng: Generator)
     return out
 
 
+def beacons_anywhere(stream: Sequence[RsbnFix], fault: Fault, size: float, rng: Generator) -> list[RsbnFix]:
+    """State each beacon at a wrong place, 1 km to `size` metres off, each scale of distance alike."""
+    off: dict[int, tuple[float, float]] = {}
+    out = []
+    for fix in stream:
+        if fix.beacon not in off:
+            away, bearing = 1000.0 * (size / 1000.0) ** rng.random(), math.tau * rng.random()
+            off[fix.beacon] = away * math.cos(bearing), away * math.sin(bearing)
+        there = displace(fix.lat, fix.lon, fix.alt, *off[fix.beacon], 0.0)
+        is_wrong = fault.covers(fix.t_ns) and fault.beacon in (None, fix.beacon)
+        out.append(replace(fix, lat=there.lat, lon=there.lon) if is_wrong else fix)
+    return out
+
+
 class RecordFault(NamedTuple):
     """Record fault: kind of record, default size, function."""
 
@@ -300,6 +314,7 @@ RECORD_FAULTS: dict[str, RecordFault] = {
     "gnss-late": RecordFault(Gnss, 5.0, delayed),
     "beacon-bias": RecordFault(RsbnFix, 1000.0, per_record(beacon_bias)),
     "beacon-position": RecordFault(RsbnFix, 3000.0, per_record(beacon_position)),
+    "beacon-anywhere": RecordFault(RsbnFix, 160e3, beacons_anywhere),
     "beacon-north": RecordFault(RsbnFix, math.radians(2.0), per_record(beacon_north)),
     "beacon-multipath": RecordFault(RsbnFix, 1500.0, per_record(multipath)),
     "beacon-drop-out": RecordFault(RsbnFix, 0.5, per_record(drop_out)),

@@ -82,11 +82,15 @@ OWN_CHANNEL = {
 
 
 class FaultCase(NamedTuple):
-    """Fault of a campaign and the source it concerns: prefix of rejections, bits of `Solution.sources`."""
+    """Fault of a campaign and the source it concerns: prefix of rejections, bits of `Solution.sources`.
+
+    `also`: what else is not as usual.
+    """
 
     fault: Fault | None
     concerns: str = ""
     bits: Source = Source(0)
+    also: tuple[Fault, ...] = ()
 
 
 def _case(name: str, size: float | None = None, end_s: float = OVER_S, start_s: float = FAULT_S) -> FaultCase:
@@ -126,6 +130,10 @@ FAULT_CASES: dict[str, FaultCase] = {
     "beacon-bias-300": _case("beacon-bias", 300.0),
     "beacon-position": _case("beacon-position"),
     "beacon-place": _case("beacon-position", 3000.0, math.inf, 0.0),
+    "beacon-anywhere": _case("beacon-anywhere", None, math.inf, 0.0),
+    "beacon-anywhere-first": FaultCase(
+        Fault("beacon-anywhere", 0.0), "rsbn", _BEACON, (Fault("gnss-jam", 0.0, 30.0),)
+    ),
     "beacon-north": _case("beacon-north"),
     "beacon-north-1": _case("beacon-north", math.radians(1.0)),
     "beacon-north-5": _case("beacon-north", math.radians(5.0)),
@@ -212,8 +220,9 @@ def scenario_of(order: FlightOrder) -> Scenario:
             f"flight {order.key}: unknown scenario or fault; scenarios are {', '.join(SCENARIOS)}; "
             f"faults are {', '.join(FAULT_CASES)}"
         )
-    base, fault = SCENARIOS[order.scenario], FAULT_CASES[order.fault].fault
-    return dataclasses.replace(base, faults=(fault,) if fault else (), seed=order.seed)
+    base, kind = SCENARIOS[order.scenario], FAULT_CASES[order.fault]
+    faults = (kind.fault, *kind.also) if kind.fault else kind.also
+    return dataclasses.replace(base, faults=faults, seed=order.seed)
 
 
 def config_of(scenario: str) -> Config:

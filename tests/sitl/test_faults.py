@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from companion.link import dialect, frame
+from companion.nav.geometry import Geodetic, separation
 from companion.records import AirData, Attitude, Gnss, LocalPosition, RsbnFix
 from sitl.faults import (
     AUTOPILOT_FAULTS,
@@ -101,6 +102,23 @@ def test_beacon_bias_north_and_position_faults():
     assert after[25].azimuth == pytest.approx(3.05)
     _, after = apply_fault("beacon-position", 3000.0)
     assert (after[25].lat - 1.0) * 6.385e6 == pytest.approx(3000.0, rel=5e-3)
+
+
+def test_each_beacon_is_stated_at_a_wrong_place_of_its_own():
+    """The same from answer to answer; each scale of distance as often as another."""
+    away = []
+    for seed in range(200):
+        order = Fault("beacon-anywhere", 20.0, 40.0)
+        after = apply_record_faults(RsbnFix, stream_of(RsbnFix), (order,), RNG(seed))[20:40]
+        places = {(r.beacon, round(r.lat, 7), round(r.lon, 7)) for r in after}
+        assert len(places) == 2
+        for _, *there in places:
+            north, east, _ = separation(Geodetic(1.0, 0.5, 0.0), Geodetic(*there, 0.0))
+            away.append(math.hypot(north, east))
+    assert min(away) >= 1000.0 and max(away) <= 161e3
+    assert np.quantile(away, [0.25, 0.5, 0.75]) == pytest.approx(
+        1000.0 * 160.0 ** np.array([0.25, 0.5, 0.75]), rel=0.3
+    )
 
 
 def test_multipath_lengthens_some_ranges():
