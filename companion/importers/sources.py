@@ -103,6 +103,8 @@ class TlogSource(_Records):
     def __init__(
         self, log: tlog.Tlog, autopilot_system: int | None = None, path: Path = Path("the tlog")
     ) -> None:
+        if autopilot_system is not None:
+            _check_autopilot(log, autopilot_system, path)
         super().__init__(path, self._all_records(), Damage())
         self.log = log
         self._session = Session(autopilot_system=autopilot_system)
@@ -245,6 +247,19 @@ _BEGINNINGS: dict[bytes, tuple[str, ...]] = {
 }
 LOG_SUFFIXES = (".tlog", *(kind for kind in _READERS if kind.startswith(".")))
 """File name suffixes of the logs of other recorders."""
+
+
+def _check_autopilot(log: tlog.Tlog, wanted: int, path: Path) -> None:
+    """Check that a log has this autopilot. Raises LogError, with those that it has."""
+    systems = set[int]()
+    for entry in tlog.Tlog(log.data):
+        if entry.frame.component == mavlink.MAV_COMP_ID_AUTOPILOT1:
+            if entry.frame.system == wanted:
+                return
+            systems.add(entry.frame.system)
+    has = " and ".join(map(str, sorted(systems)))
+    if has:
+        raise LogError(f"{path}: no autopilot {wanted}, but {has}: set link.system_id, or leave it out")
 
 
 def open_source(
